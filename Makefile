@@ -1,0 +1,31 @@
+# make demo runs the main job, make test passes the tests; each target is a line or two one could type by hand.
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+
+.PHONY: setup demo test test-gpu lint bench clean
+
+setup: $(VENV)/.installed
+
+$(VENV)/.installed: pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install -q -c constraints.txt -e ".[dev]"
+	touch $@
+
+demo: setup
+	$(MAKE) -C examples/falling_toys NGFF=$(abspath $(BIN))/ngff
+
+test: setup
+	$(BIN)/python -m pytest
+
+test-gpu:
+	$(PYTHON) -m pytest -m gpu
+
+lint: setup
+	$(BIN)/ruff check .
+
+bench: setup
+	$(BIN)/ngff-lab bench
+
+clean:
+	$(MAKE) -C examples/falling_toys clean

@@ -1,0 +1,1 @@
+"""Command lines only: parse, make one Options, call one run()."""

@@ -1,0 +1,1 @@
+"""Pairs of files to metrics."""

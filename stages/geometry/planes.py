@@ -1,0 +1,80 @@
+"""Planes: normal . x = offset."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+
+class Plane(NamedTuple):
+    """The points x with normal . x = offset; `normal` has unit length."""
+
+    normal: Tensor  # (3,)
+    offset: float
+
+    def heights(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
+        """Signed distances, positive on the side the normal points to."""
+        return points @ self.normal - self.offset
+
+
+def fit(points: Float[Tensor, "n 3"], weights: Float[Tensor, "n"] | None = None) -> Plane:
+    """Least-squares plane of three points or more; the sign of its normal is arbitrary."""
+    w = torch.ones_like(points[:, 0]) if weights is None else weights
+    centre = (points * w[:, None]).sum(0) / w.sum()
+    centred = points - centre
+    normal = torch.linalg.eigh((centred * w[:, None]).mT @ centred).eigenvectors[:, 0]
+    return Plane(normal, float(normal @ centre))
+
+
+def through(triples: Float[Tensor, "k 3 3"]) -> tuple[Float[Tensor, "k 3"], Float[Tensor, "k"]]:
+    """Unit normals and offsets of planes through three points each; points in a line give a zero normal."""
+    a, b, c = triples.unbind(1)
+    normals = torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=1)
+    return normals, (normals * a).sum(1)
+
+
+def ransac(
+    points: Float[Tensor, "n 3"],
+    threshold: float,
+    weights: Float[Tensor, "n"] | None = None,
+    allowed: Callable[[Float[Tensor, "k 3"]], Bool[Tensor, "k"]] | None = None,
+    trials: int = 2000,
+    seed: int = 0,
+) -> tuple[Plane, Bool[Tensor, "n"]] | None:
+    """The plane with most weight of points within `threshold`, and those points; nothing if none is allowed.
+
+    `allowed` says which unit normals may win; each candidate is offered with both signs, and the sign
+    that it accepts is kept. Source: Fischler and Bolles 1981, "Random sample consensus".
+    """
+    if len(points) < 3:
+        return None
+    weights = torch.ones_like(points[:, 0]) if weights is None else weights
+    generator = torch.Generator().manual_seed(seed)
+    some = torch.multinomial(weights.cpu().double(), min(len(points), 20_000), generator=generator).to(points.device)
+    draw = torch.randint(len(some), (trials, 3), generator=generator).to(points.device)
+    normals, offsets = through(points[some][draw])
+    normals, offsets = torch.cat([normals, -normals]), torch.cat([offsets, -offsets])
+    good = normals.norm(dim=1) > 0.5
+    if allowed is not None:
+        good &= allowed(normals)
+    if not good.any():
+        return None
+    normals, offsets = normals[good], offsets[good]
+    score = torch.cat([
+        ((points[some] @ n.mT - d).abs() < threshold).double().mean(0)
+        for n, d in zip(normals.split(256), offsets.split(256), strict=True)
+    ])  # fmt: skip  # `some` was drawn by weight, so a plain count is a weighted one
+    best = int(score.argmax())
+    plane = Plane(normals[best], float(offsets[best]))
+    for _ in range(3):
+        inside = plane.heights(points).abs() < threshold
+        if int(inside.sum()) < 3:
+            break
+        better = fit(points[inside], weights[inside])
+        flip = -1.0 if float(better.normal @ plane.normal) < 0 else 1.0
+        plane = Plane(better.normal * flip, better.offset * flip)
+    return plane, plane.heights(points).abs() < threshold

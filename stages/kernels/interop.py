@@ -1,0 +1,48 @@
+"""Warp on PyTorch's tensors, device and CUDA stream."""
+
+import os
+from functools import cache
+
+import torch
+import warp as wp
+
+wp.config.log_level = wp.LOG_ERROR
+
+
+@cache
+def _ready() -> None:
+    """Initialise Warp once; its native code reports a missing CUDA driver straight to descriptor 2,
+    which is no news on a laptop, so that descriptor looks away for a moment."""
+    if torch.cuda.is_available():
+        wp.init()
+        return
+    stderr, null = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(null, 2)
+    try:
+        wp.init()
+    finally:
+        os.dup2(stderr, 2)
+        os.close(stderr)
+        os.close(null)
+
+
+def view(tensor: torch.Tensor, dtype=None) -> wp.array:
+    """The tensor as a Warp array over the same memory (no copy, no gradient).
+
+    `dtype` is a Warp type such as wp.vec3 when the last dimensions form a vector or matrix.
+    """
+    _ready()
+    return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False)
+
+
+def device_of(tensor: torch.Tensor) -> str:
+    """Warp's name of the tensor's device."""
+    return str(tensor.device) if tensor.is_cuda else "cpu"
+
+
+def launch(kernel: wp.Kernel, dim, inputs: list, outputs: list = (), device: str = "cpu") -> None:
+    """Launch on PyTorch's current stream, so the two libraries need no synchronisation."""
+    _ready()
+    stream = wp.stream_from_torch(torch.cuda.current_stream(device)) if device != "cpu" else None
+    wp.launch(kernel, dim=dim, inputs=list(inputs), outputs=list(outputs), device=device, stream=stream,
+              record_tape=False)

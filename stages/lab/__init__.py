@@ -1,0 +1,1 @@
+"""What ngff-lab does: it may call any stage, no stage imports it."""

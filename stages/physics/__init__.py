@@ -1,0 +1,1 @@
+"""Engines, materials and force prompts shared by simulate and by dataset making."""

@@ -1,0 +1,1 @@
+"""traj.h5 or scene.ply to MP4 or PNG."""

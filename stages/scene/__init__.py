@@ -1,0 +1,1 @@
+"""The data model, and the only code that knows a file format."""

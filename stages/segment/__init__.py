@@ -1,0 +1,1 @@
+"""scene.ply to scene.ply with object ids."""

@@ -1,0 +1,1 @@
+"""scene.ply to traj.h5."""

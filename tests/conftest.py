@@ -1,0 +1,76 @@
+"""Tiny scenes built in memory, the devices present, and skips for data that may be absent."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from stages.geometry.cameras import intrinsics, orbit
+from stages.scene.cameras import Cameras
+from stages.scene.gaussians import Gaussians, concatenate
+from stages.scene.scene import Scene, SceneObject
+
+torch.set_num_threads(2)
+DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
+SHARED = Path(__file__).resolve().parents[1].parent / "shared"
+
+
+@pytest.fixture(params=DEVICES)
+def device(request) -> str:
+    return request.param
+
+
+@pytest.fixture
+def shared() -> Path:
+    """Real photos and splats that are not ours to ship."""
+    if not (SHARED / "data").is_dir():
+        pytest.skip("the shared data are not on this machine")
+    return SHARED
+
+
+def random_gaussians(n: int, seed: int = 0, degree: int = 0, size: float = 0.05) -> Gaussians:
+    """Gaussians in the unit cube around the origin."""
+    rng = torch.Generator().manual_seed(seed)
+    quats = torch.nn.functional.normalize(torch.randn(n, 4, generator=rng), dim=1)
+    return Gaussians(
+        torch.rand(n, 3, generator=rng) - 0.5,
+        quats,
+        size * (0.2 + torch.rand(n, 3, generator=rng)),
+        0.1 + 0.8 * torch.rand(n, generator=rng),
+        0.3 * torch.randn(n, (degree + 1) ** 2, 3, generator=rng),
+        torch.zeros(n, dtype=torch.int64),
+    )
+
+
+def ring(count: int = 6, size: int = 64, target: float = 0.0) -> Cameras:
+    """Cameras around the vertical through the origin, two units away."""
+    viewmats = orbit(count, torch.tensor([0.0, 0, target]), radius=2.0, elevation=25.0)
+    K = intrinsics(size, size, 1.5 * size)
+    sizes = torch.full((count, 2), size)
+    return Cameras(viewmats, K.expand(count, 3, 3).clone(), sizes, tuple(f"{i:02d}.png" for i in range(count)))
+
+
+def ball(centre: tuple, radius: float, n: int, colour: tuple, object_id: int, seed: int = 0) -> Gaussians:
+    """A shell of small opaque Gaussians."""
+    rng = torch.Generator().manual_seed(seed)
+    dirs = torch.nn.functional.normalize(torch.randn(n, 3, generator=rng), dim=1)
+    sh = ((torch.tensor(colour) - 0.5) / 0.28209479177387814).expand(n, 1, 3).clone()
+    return Gaussians(
+        torch.tensor(centre) + radius * dirs, torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1),
+        torch.full((n, 3), 1.2 * radius * (4 / n) ** 0.5), torch.full((n,), 0.9), sh, torch.full((n,), object_id),
+    )  # fmt: skip
+
+
+@pytest.fixture
+def two_balls() -> Scene:
+    """A red and a green ball above a grey floor at z = 0, and six cameras."""
+    grid = torch.cartesian_prod(torch.linspace(-1, 1, 30), torch.linspace(-1, 1, 30))
+    floor = Gaussians(
+        torch.cat([grid, torch.zeros(900, 1)], 1), torch.tensor([[1.0, 0, 0, 0]]).repeat(900, 1),
+        torch.tensor([[0.04, 0.04, 0.002]]).repeat(900, 1), torch.full((900,), 0.9), torch.zeros(900, 1, 3),
+        torch.zeros(900, dtype=torch.int64),
+    )  # fmt: skip
+    red = ball((-0.3, 0.0, 0.15), 0.15, 400, (0.9, 0.1, 0.1), 1)
+    green = ball((0.3, 0.0, 0.40), 0.12, 400, (0.1, 0.8, 0.1), 2, seed=1)
+    objects = (SceneObject(1, "red ball", "rubber"), SceneObject(2, "green ball", "rubber"))
+    return Scene(concatenate([floor, red, green]), objects, ring(target=0.1), 0.0)

@@ -54,7 +54,8 @@ def ransac(
         return None
     weights = torch.ones_like(points[:, 0]) if weights is None else weights
     generator = torch.Generator().manual_seed(seed)
-    some = torch.multinomial(weights.cpu().double(), min(len(points), 20_000), generator=generator).to(points.device)
+    count = min(len(points), 20_000)
+    some = torch.multinomial(weights.cpu().double(), count, replacement=True, generator=generator).to(points.device)
     draw = torch.randint(len(some), (trials, 3), generator=generator).to(points.device)
     normals, offsets = through(points[some][draw])
     normals, offsets = torch.cat([normals, -normals]), torch.cat([offsets, -offsets])

@@ -1,0 +1,125 @@
+"""Videos, folders of pictures and single pictures: PSNR and SSIM of each frame."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import zip_longest
+from pathlib import Path
+
+import cv2
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from tqdm import tqdm
+
+from stages.errors import InputError
+from stages.evaluate.options import EvaluateOptions
+from stages.evaluate.result import Curve, Pair, Result
+from stages.scene.images import VIDEOS, list_photos, read_image, read_video, video_info
+
+WINDOW, SIGMA = 11, 1.5  # of SSIM [px]
+SHOWN = 4  # pairs of frames in the report
+
+Image = Float[Tensor, "h w 3"]
+
+
+def psnr(predicted: Image, truth: Image) -> float:
+    """Peak signal to noise ratio [dB] for values in 0..1; infinite for identical pictures."""
+    error = (predicted.double() - truth.double()).square().mean()
+    return float(-10 * torch.log10(error))
+
+
+def ssim(predicted: Image, truth: Image) -> float:
+    """Structural similarity for values in 0..1, mean over channels and over windows wholly inside the picture.
+
+    Source: Wang et al. 2004, "Image quality assessment", eq. 13: Gaussian window 11 x 11, sigma 1.5,
+    K1 = 0.01, K2 = 0.03.
+    """
+    x, y = predicted.double(), truth.double()
+    mean_x, mean_y, square_x, square_y, product = (_blur(image) for image in (x, y, x * x, y * y, x * y))
+    var_x, var_y, covariance = square_x - mean_x**2, square_y - mean_y**2, product - mean_x * mean_y
+    c1, c2 = 0.01**2, 0.03**2
+    luminance = (2 * mean_x * mean_y + c1) / (mean_x**2 + mean_y**2 + c1)
+    structure = (2 * covariance + c2) / (var_x + var_y + c2)
+    return float((luminance * structure).mean())
+
+
+def _blur(image: Image) -> Float[Tensor, "h2 w2 3"]:
+    """Gaussian means of the windows that lie inside."""
+    edge = WINDOW // 2
+    blurred = cv2.GaussianBlur(image.numpy(), (WINDOW, WINDOW), SIGMA)
+    return torch.from_numpy(blurred[edge:-edge, edge:-edge])
+
+
+def compare(prediction: Path, truth: Path, options: EvaluateOptions) -> Result:
+    """Frame by frame, in order."""
+    notes = _check_rates(prediction, truth)
+    total = options.frames or _count(truth)
+    chosen = set(torch.linspace(0, total - 1, min(SHOWN, total)).round().int().tolist())
+    scores, pairs = [], []
+    frames = zip_longest(_frames(prediction), _frames(truth))
+    for i, (mine, true) in enumerate(tqdm(frames, total=total, unit="frame")):
+        if options.frames is not None and i == options.frames:
+            break
+        if mine is None or true is None:
+            raise _lengths(prediction, truth, i, options)
+        _check_sizes(prediction, truth, mine, true)
+        scores.append((psnr(mine, true), ssim(mine, true)))
+        if i in chosen:
+            pairs.append(Pair(f"frame {i}: PSNR {scores[-1][0]:.2f} dB, SSIM {scores[-1][1]:.3f}", mine, true))
+    if options.frames is not None and len(scores) < options.frames:
+        raise InputError(f"--frames {options.frames}: both have only {len(scores)} frames; give {len(scores)} or fewer")
+    if options.frames is not None:
+        notes.append(f"only the first {options.frames} frames were compared, as asked by --frames")
+    values = torch.tensor(scores, dtype=torch.float64)
+    overall = {"PSNR": float(values[:, 0].mean()), "SSIM": float(values[:, 1].mean()), "frames": len(scores)}
+    curves = [Curve(name, values[:, i].tolist()) for i, name in enumerate(("PSNR", "SSIM"))]
+    return Result("pictures", overall, {}, notes, curves, "PSNR [dB] of each frame", pairs=pairs)
+
+
+def _frames(path: Path) -> Iterator[Image]:
+    if path.is_dir():
+        return (read_image(photo) for photo in list_photos(path))
+    return read_video(path) if path.suffix.lower() in VIDEOS else iter([read_image(path)])
+
+
+def _count(path: Path) -> int:
+    """Number of frames, for the progress bar and for choosing what to show."""
+    if path.is_dir():
+        return len(list_photos(path))
+    return max(video_info(path)[0], 1) if path.suffix.lower() in VIDEOS else 1
+
+
+def _check_rates(prediction: Path, truth: Path) -> list[str]:
+    """Videos must play equally fast; folders have no rate, but equal names are worth having."""
+    if all(p.is_file() and p.suffix.lower() in VIDEOS for p in (prediction, truth)):
+        mine, true = video_info(prediction)[1], video_info(truth)[1]
+        if abs(mine - true) > 1e-3 * true:
+            raise InputError(
+                f"{prediction}: {mine:g} frames a second, but {truth} has {true:g}; "
+                f"render one of them again with `ngff render --fps {true:g}`"
+            )
+        return []
+    if prediction.is_dir() and truth.is_dir():
+        names = [[p.stem for p in list_photos(folder)] for folder in (prediction, truth)]
+        alike = names[0] == names[1]
+        return ["pictures were matched by name" if alike else "pictures were matched by order, since names differ"]
+    return []
+
+
+def _lengths(prediction: Path, truth: Path, shared: int, options: EvaluateOptions) -> InputError:
+    counts = f"{prediction}: {_count(prediction)} frames, but {truth} has {_count(truth)}"
+    if options.frames is not None:
+        return InputError(f"{counts}; --frames {options.frames} is more than both have, give {shared} or fewer")
+    return InputError(f"{counts}; give --frames {shared} to compare the first {shared}")
+
+
+def _check_sizes(prediction: Path, truth: Path, mine: Tensor, true: Tensor) -> None:
+    if mine.shape != true.shape:
+        (h, w), (h2, w2) = mine.shape[:2], true.shape[:2]
+        raise InputError(
+            f"{prediction}: pictures of {w}x{h}, but {truth} has {w2}x{h2}; "
+            f"render again with the same view and `--resolution {max(w2, h2)}`"
+        )
+    if min(mine.shape[:2]) < WINDOW:
+        raise InputError(f"{prediction}: pictures smaller than {WINDOW} pixels have no SSIM; render them larger")

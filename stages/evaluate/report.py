@@ -1,0 +1,118 @@
+"""A report in one HTML file: table, curves as inline SVG, pictures inline."""
+
+from __future__ import annotations
+
+import base64
+import math
+import tempfile
+from html import escape
+from pathlib import Path
+
+from jaxtyping import Float
+from torch import Tensor
+
+from stages.evaluate.result import Curve, Pair, Result, show
+from stages.scene.files import replacing
+from stages.scene.images import resize, write_png
+
+WIDTH, HEIGHT, LEFT, BOTTOM = 720, 280, 60, 36  # of the plot [px]; margins for the labels
+INKS = ("#1f6fb4", "#d1491f", "#2e8b57", "#8e44ad", "#b8860b", "#16808a", "#c2185b", "#5d6d7e")
+PICTURE = 420  # longest side of a picture in the report [px]
+STYLE = """
+body { font: 15px/1.5 system-ui, sans-serif; max-width: 900px; margin: 2em auto; padding: 0 1em; color: #222 }
+table { border-collapse: collapse } th, td { padding: .25em .9em; text-align: right; border-bottom: 1px solid #ddd }
+th:first-child, td:first-child { text-align: left } figure { margin: 1.2em 0 } img { max-width: 49% }
+figcaption, .notes { color: #555 } svg text { font: 12px system-ui, sans-serif; fill: #444 }
+"""
+
+
+def write_report(path: Path, result: Result, prediction: Path, truth: Path) -> None:
+    """Everything in one file that opens anywhere."""
+    title = f"{Path(prediction).name} against {Path(truth).name}"
+    body = [f"<h1>{escape(title)}</h1>", _table(result)]
+    body += [f'<p class="notes">{escape(note)}</p>' for note in result.notes]
+    body += [_plot(result)] if result.curves and len(result.curves[0].values) > 1 else []
+    body += [_figure(pair) for pair in result.pairs]
+    head = f'<meta charset="utf-8"><title>{escape(title)}</title><style>{STYLE}</style>'
+    with replacing(path) as part:
+        part.write_text(f"<!doctype html>\n<html><head>{head}</head><body>\n" + "\n".join(body) + "\n</body></html>\n")
+
+
+def _table(result: Result) -> str:
+    columns = result.columns()
+    head = "".join(f"<th>{escape(c)}</th>" for c in ["", *columns])
+    rows = [
+        f"<tr><td>{escape(name)}</td>{''.join(f'<td>{show(row.get(c))}</td>' for c in columns)}</tr>"
+        for name, row in result.rows()
+    ]
+    return f"<table><tr>{head}</tr>{''.join(rows)}</table>"
+
+
+def _plot(result: Result) -> str:
+    """The first curve's unit is the axis; curves of another unit (SSIM beside PSNR) stay in the JSON."""
+    curves = [c for c in result.curves if c.name != "SSIM"]
+    count = len(curves[0].values)
+    top = _round_up(max((v for c in curves for v in c.values if math.isfinite(v)), default=1.0))
+    seconds = (count - 1) / result.fps if result.fps else None
+    across = [_tick(LEFT + f * (WIDTH - LEFT - 10), _time(f, count, seconds)) for f in (0.0, 0.25, 0.5, 0.75, 1.0)]
+    up = [_level(f, f * top) for f in (0.0, 0.5, 1.0)]
+    lines = [_line(c, top, INKS[i % len(INKS)]) for i, c in enumerate(curves)]
+    names = " ".join(
+        f'<span style="color:{INKS[i % len(INKS)]}">&#9632; {escape(c.name)}</span>' for i, c in enumerate(curves)
+    )
+    svg = f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img">{"".join(up + across + lines)}</svg>'
+    return f"<figure>{svg}<figcaption>{escape(result.curve_title)}: {names}</figcaption></figure>"
+
+
+def _line(curve: Curve, top: float, ink: str) -> str:
+    count = len(curve.values)
+    points = [
+        f"{LEFT + i / (count - 1) * (WIDTH - LEFT - 10):.1f},{_y(v / top):.1f}"
+        for i, v in enumerate(curve.values) if math.isfinite(v)
+    ]  # fmt: skip
+    return f'<polyline points="{" ".join(points)}" fill="none" stroke="{ink}" stroke-width="2"/>'
+
+
+def _y(fraction: float) -> float:
+    return HEIGHT - BOTTOM - fraction * (HEIGHT - BOTTOM - 16)
+
+
+def _level(fraction: float, value: float) -> str:
+    y = _y(fraction)
+    rule = f'<line x1="{LEFT}" x2="{WIDTH - 10}" y1="{y:.1f}" y2="{y:.1f}" stroke="#ddd"/>'
+    return f'{rule}<text x="{LEFT - 6}" y="{y + 4:.1f}" text-anchor="end">{value:.3g}</text>'
+
+
+def _tick(x: float, text: str) -> str:
+    return f'<text x="{x:.1f}" y="{HEIGHT - 12}" text-anchor="middle">{text}</text>'
+
+
+def _time(fraction: float, count: int, seconds: float | None) -> str:
+    return f"{fraction * (count - 1):.0f}" if seconds is None else f"{fraction * seconds:.2g} s"
+
+
+def _round_up(value: float) -> float:
+    """The next 1, 2 or 5 times a power of ten."""
+    if value <= 0:
+        return 1.0
+    step = 10.0 ** math.floor(math.log10(value))
+    return next(m * step for m in (1, 2, 5, 10) if m * step >= value * (1 - 1e-9))
+
+
+def _figure(pair: Pair) -> str:
+    """Prediction left, truth right."""
+    images = "".join(f'<img alt="{name}" src="data:image/png;base64,{_png(image)}"> ' for name, image in
+                     (("prediction", pair.predicted), ("truth", pair.truth)))  # fmt: skip
+    return f"<figure>{images}<figcaption>prediction, truth; {escape(pair.caption)}</figcaption></figure>"
+
+
+def _png(image: Float[Tensor, "h w 3"]) -> str:
+    """Base64 of a PNG no larger than a report needs."""
+    h, w = image.shape[:2]
+    shrink = min(1.0, PICTURE / max(h, w))
+    if shrink < 1:
+        image = resize(image, max(1, round(w * shrink)), max(1, round(h * shrink)))
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "picture.png"
+        write_png(path, image)
+        return base64.b64encode(path.read_bytes()).decode()

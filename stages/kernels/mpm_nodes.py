@@ -1,0 +1,143 @@
+"""Rows of grid nodes as vectors: the inner loops of the particle-grid transfers, in C++.
+
+A node is four floats: x, y, z of velocity or momentum, and mass. On the CPU a row of four nodes is one 16-lane vector
+(Warp brings the compiler); three of them carry weight. On CUDA a node is one 16-byte load or one vector atomic.
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+mat43 = wp.types.matrix(shape=(4, 3), dtype=float)
+
+
+@wp.func_native("""
+    // weight: rows x, y, z; columns the three nodes. Returns sum w v and sum w v (offset along x, y, z).
+    wp::mat_t<4, 3, wp::float32> out;
+    const float* base = (const float*)(velocity.data + first);
+#if !defined(__CUDA_ARCH__)
+    typedef float lanes __attribute__((ext_vector_type(16), aligned(4)));
+    const float a = weight.data[2][0], b = weight.data[2][1], c = weight.data[2][2];
+    const float z = -fx.c[2];
+    const lanes wz = {a, a, a, a, b, b, b, b, c, c, c, c, 0, 0, 0, 0};
+    lanes V = 0, X = 0, Y = 0;
+    for (int i = 0; i < 3; ++i) {
+        lanes row = 0, rowY = 0;
+        for (int j = 0; j < 3; ++j) {
+            const lanes v = *(const lanes*)(base + 4 * (i * stride_x + j * stride_y));
+            row += weight.data[1][j] * v;
+            rowY += (weight.data[1][j] * (j - fx.c[1])) * v;
+        }
+        V += weight.data[0][i] * row;
+        X += (weight.data[0][i] * (i - fx.c[0])) * row;
+        Y += weight.data[0][i] * rowY;
+    }
+    const lanes wZ = {a * z, a * z, a * z, a * z, b * (z + 1), b * (z + 1), b * (z + 1), b * (z + 1),
+                      c * (z + 2), c * (z + 2), c * (z + 2), c * (z + 2), 0, 0, 0, 0};
+    const lanes Z = V * wZ;
+    V *= wz; X *= wz; Y *= wz;
+    for (int n = 0; n < 3; ++n) {
+        out.data[0][n] = V[n] + V[n + 4] + V[n + 8];
+        out.data[1][n] = X[n] + X[n + 4] + X[n + 8];
+        out.data[2][n] = Y[n] + Y[n + 4] + Y[n + 8];
+        out.data[3][n] = Z[n] + Z[n + 4] + Z[n + 8];
+    }
+#else
+    for (int r = 0; r < 4; ++r) for (int n = 0; n < 3; ++n) out.data[r][n] = 0.0f;
+    for (int i = 0; i < 3; ++i) for (int j = 0; j < 3; ++j) for (int k = 0; k < 3; ++k) {
+        const float4 v = ((const float4*)base)[i * stride_x + j * stride_y + k];
+        const float w = weight.data[0][i] * weight.data[1][j] * weight.data[2][k];
+        const float wv[3] = {w * v.x, w * v.y, w * v.z};
+        const float d[3] = {i - fx.c[0], j - fx.c[1], k - fx.c[2]};
+        for (int n = 0; n < 3; ++n) {
+            out.data[0][n] += wv[n];
+            for (int r = 0; r < 3; ++r) out.data[r + 1][n] += wv[n] * d[r];
+        }
+    }
+#endif
+    return out;
+""")
+def gather_nodes(
+    velocity: wp.array[wp.vec4], first: int, stride_x: int, stride_y: int, weight: wp.mat33, fx: wp.vec3
+) -> mat43: ...
+
+
+@wp.func_native("""
+    // affine: row 0 is momentum and mass at the particle, rows 1 to 3 its change a node along x, y, z.
+    float* base = (float*)(momentum.data + first);
+#if !defined(__CUDA_ARCH__)
+    typedef float quad __attribute__((ext_vector_type(4), aligned(4)));
+    typedef float lanes __attribute__((ext_vector_type(16), aligned(4)));
+    const quad P = *(const quad*)affine.data[0], X = *(const quad*)affine.data[1];
+    const quad Y = *(const quad*)affine.data[2], Z = *(const quad*)affine.data[3];
+    const quad corner = P - fx.c[0] * X - fx.c[1] * Y - fx.c[2] * Z;
+    const quad k1 = corner + Z, k2 = k1 + Z;
+    const float a = weight.data[2][0], b = weight.data[2][1], c = weight.data[2][2];
+    const lanes wz = {a, a, a, a, b, b, b, b, c, c, c, c, 0, 0, 0, 0};
+    const quad none = 0;
+    lanes row = wz * __builtin_shufflevector(__builtin_shufflevector(corner, k1, 0, 1, 2, 3, 4, 5, 6, 7),
+                                             __builtin_shufflevector(k2, none, 0, 1, 2, 3, 4, 5, 6, 7),
+                                             0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+    const lanes stepX = wz * __builtin_shufflevector(X, X, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3);
+    const lanes stepY = wz * __builtin_shufflevector(Y, Y, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3);
+    for (int i = 0; i < 3; ++i) {
+        lanes value = row;
+        for (int j = 0; j < 3; ++j) {
+            lanes* node = (lanes*)(base + 4 * (i * stride_x + j * stride_y));
+            *node += (weight.data[0][i] * weight.data[1][j]) * value;
+            value += stepY;
+        }
+        row += stepX;
+    }
+#else
+    for (int i = 0; i < 3; ++i) for (int j = 0; j < 3; ++j) for (int k = 0; k < 3; ++k) {
+        const float w = weight.data[0][i] * weight.data[1][j] * weight.data[2][k];
+        const float d[3] = {i - fx.c[0], j - fx.c[1], k - fx.c[2]};
+        float value[4];
+        for (int n = 0; n < 4; ++n)
+            value[n] = w * (affine.data[0][n] + d[0] * affine.data[1][n] + d[1] * affine.data[2][n]
+                            + d[2] * affine.data[3][n]);
+        float* node = base + 4 * (i * stride_x + j * stride_y + k);
+#if __CUDA_ARCH__ >= 900
+        atomicAdd((float4*)node, make_float4(value[0], value[1], value[2], value[3]));
+#else
+        for (int n = 0; n < 4; ++n) atomicAdd(node + n, value[n]);
+#endif
+    }
+#endif
+""")
+def scatter_nodes(
+    momentum: wp.array[wp.vec4], first: int, stride_x: int, stride_y: int, weight: wp.mat33, fx: wp.vec3,
+    affine: wp.mat44,
+): ...  # fmt: skip
+
+
+@wp.func_native("""
+    // four nodes: sum the copies, clear them, divide by mass
+    float* to = (float*)(velocity.data + first);
+#if !defined(__CUDA_ARCH__)
+    typedef float lanes __attribute__((ext_vector_type(16), aligned(4)));
+    typedef int signs __attribute__((ext_vector_type(16)));
+    lanes sum = 0;
+    for (int c = 0; copies >> c; ++c)
+        if ((copies >> c) & 1) {
+            lanes* from = (lanes*)(momentum.data + (size_t)c * count + first);
+            sum += *from;
+            *from = 0;
+        }
+    const lanes mass = __builtin_shufflevector(sum, sum, 3, 3, 3, 3, 7, 7, 7, 7, 11, 11, 11, 11, 15, 15, 15, 15);
+    const lanes safe = __builtin_elementwise_max(mass, (lanes)1e-30f);
+    *(lanes*)to = sum / safe;
+#else
+    for (int n = 0; n < 4; ++n) {
+        float4* from = (float4*)(momentum.data + first) + n;
+        const float4 s = *from;
+        *from = make_float4(0.0f, 0.0f, 0.0f, 0.0f);
+        const float inverse = 1.0f / fmaxf(s.w, 1e-30f);
+        ((float4*)to)[n] = make_float4(s.x * inverse, s.y * inverse, s.z * inverse, s.w > 0.0f ? 1.0f : 0.0f);
+    }
+#endif
+""")
+def velocity_of_row(
+    momentum: wp.array[wp.vec4], velocity: wp.array[wp.vec4], first: int, count: int, copies: int
+): ...  # copies: bit c is set where copy c, which starts at node c count, has something

@@ -1,0 +1,15 @@
+"""What an engine yields for every frame."""
+
+from dataclasses import dataclass
+
+from jaxtyping import Float
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class State:
+    """One frame of a rollout, in scene units."""
+
+    positions: Float[Tensor, "p 3"]  # of the keypoints
+    com: Float[Tensor, "o 3"]  # centre of mass of each object, in the order of scene.objects
+    rotation: Float[Tensor, "o 4"]  # w x y z relative to rest

@@ -1,0 +1,309 @@
+"""Dense depth by multi-view matching: plane sweep, semi-global smoothing, refinement, consistency.
+
+For each photo, depths are hypothesised on a grid of inverse depth; other photos are warped to it and
+compared by normalised cross-correlation (Collins 1996, "A space-sweep approach to true multi-image
+matching"). A second sweep along the normal of the supporting plane scores what lies flat, which a
+fronto-parallel window sees distorted (Gallup et al. 2007, "Real-time plane-sweeping stereo with multiple
+sweeping directions"). Costs are smoothed by semi-global matching (Hirschmueller 2008, eq. 13), which
+also carries depth across areas without texture; what other photos do not confirm is dropped.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float
+from torch import Tensor
+from tqdm import tqdm
+
+from stages.geometry.cameras import centres, depths, resize
+from stages.geometry.planes import Plane
+from stages.reconstruct.photos import Views
+from stages.reconstruct.sfm import SparseModel
+
+SOURCES = 4  # photos compared with each
+CHECKS = 10  # photos asked to confirm each
+MOST_LABELS = 192  # depth hypotheses a pixel
+STEP_PENALTY, JUMP_PENALTY = 0.03, 0.25  # of semi-global matching, on costs 0..1
+DEPTH_TOLERANCE, PIXEL_TOLERANCE = 0.01, 1.5  # a photo confirms a depth within this share and this many pixels
+
+
+@dataclass(frozen=True)
+class DepthMap:
+    """Depth along the viewing axis in one photo; `support` counts the other photos that confirm it."""
+
+    depth: Float[Tensor, "h w"]
+    support: Float[Tensor, "h w"]
+
+
+def estimate(views: Views, model: SparseModel, plane: Plane | None, device: str = "cpu") -> list[DepthMap]:
+    """A depth map of every view, cross-checked against the others. `plane` is the supporting plane, if known."""
+    sources = choose_sources(model)
+    raw = []
+    for i in tqdm(range(len(views)), desc="matching depth", unit="photo", leave=False):
+        raw.append(_one_view(views, model, i, sources[i], plane, device))
+    more, checked = choose_sources(model, CHECKS), []
+    for i in range(len(views)):
+        others = {*sources[i], *more[i], *(j for j in range(len(views)) if i in sources[j])}
+        checked.append(confirm(raw, views, i, sorted(others)))
+    return checked
+
+
+def choose_sources(model: SparseModel, count: int = SOURCES) -> list[list[int]]:
+    """For every view, those that share most points with it under a useful angle (best near 10 degrees).
+
+    Score as in Yao et al. 2018, "MVSNet", sec. 4.1: a Gaussian in the angle, narrower below its centre.
+    """
+    eyes, c = centres(model.cameras.viewmats), len(model.cameras)
+    sees = torch.zeros(c, len(model.points), dtype=torch.bool)
+    sees[model.seen_view, model.seen_point] = True
+    out = []
+    for i in range(c):
+        score = torch.zeros(c)
+        for j in range(c):
+            shared = model.points[sees[i] & sees[j]]
+            if i == j or not len(shared):
+                continue
+            a, b = F.normalize(eyes[i] - shared, dim=1), F.normalize(eyes[j] - shared, dim=1)
+            angle = torch.rad2deg(torch.acos((a * b).sum(1).clamp(-1, 1)))
+            width = torch.where(angle < 10.0, 5.0, 15.0)
+            score[j] = torch.exp(-((angle - 10) ** 2) / (2 * width**2)).sum()
+        best = score.topk(min(count, c - 1))
+        chosen = [j for j, s in zip(best.indices.tolist(), best.values.tolist(), strict=True) if s > 0]
+        near = (eyes - eyes[i]).norm(dim=1).argsort().tolist()
+        out.append(chosen or [j for j in near if j != i][:count])
+    return out
+
+
+def _one_view(views: Views, model: SparseModel, i: int, sources: list[int], plane, device: str) -> Float[Tensor, "h w"]:
+    """Depth of view i before cross-checking: swept at half size, refined at full size."""
+    half = _Stereo(views, i, sources, 0.5, device)
+    low, high = _range(views, model, i)
+    labels = half.labels(low, high)
+    cost = half.cost(1 / labels[:, None, None].expand(-1, *half.size))
+    eye = centres(views.cameras.viewmats[i : i + 1])[0]
+    if plane is not None and plane.heights(eye) > 0:
+        normal = (views.cameras.viewmats[i, :3, :3] @ plane.normal).to(device)
+        cost = torch.minimum(cost, _slanted_cost(half, labels, normal, float(plane.heights(eye))))
+    index = smooth(cost)
+    inverse = labels[0] + index * (labels[1] - labels[0])
+    full = _Stereo(views, i, sources, 1.0, device)
+    inverse = F.interpolate(inverse[None, None], full.size, mode="bilinear", align_corners=False)[0, 0]
+    step = float(labels[1] - labels[0])
+    for share in (0.5, 0.2):
+        inverse = _refined(full, inverse, share * step)
+    return (1 / inverse.clamp(min=float(labels[0]) / 2)).cpu()
+
+
+def _range(views: Views, model: SparseModel, i: int) -> tuple[float, float]:
+    """Nearest and farthest depth to try [scene units], from the sparse points of the view with some room."""
+    seen = model.seen_point[model.seen_view == i]
+    z = depths(model.points[seen if len(seen) >= 10 else slice(None)], views.cameras.viewmats[i])
+    z = z[z > 0]
+    if not len(z):
+        raise ValueError(f"no point lies before camera {i}")
+    return 0.8 * float(z.quantile(0.01)), 3 * float(z.quantile(0.99))
+
+
+class _Stereo:
+    """A reference photo and its sources at one size, ready to score depth hypotheses."""
+
+    def __init__(self, views: Views, i: int, sources: list[int], share: float, device: str):
+        self.reference, K = _grey(views, i, share, device)
+        self.size = self.reference.shape
+        viewmat = views.cameras.viewmats[i].to(device)
+        y, x = torch.meshgrid(*(torch.arange(s, device=device) + 0.5 for s in self.size), indexing="ij")
+        self.rays = torch.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], torch.ones_like(x)])
+        self.moments = _moments(self.reference[None])
+        self.sources = []
+        for j in sources:
+            image, K_j = _grey(views, j, share, device)
+            motion = views.cameras.viewmats[j].to(device) @ torch.linalg.inv(viewmat)
+            rotated = (K_j @ motion[:3, :3] @ self.rays.flatten(1)).unflatten(1, self.size)
+            self.sources.append((image, rotated, K_j @ motion[:3, 3]))
+
+    def labels(self, near: float, far: float) -> Float[Tensor, "d"]:
+        """Inverse depths from far to near, so close that the best pixel of any source moves by at most one."""
+        ends = []
+        for _, rotated, shift in self.sources:
+            pixel = [(rotated * z + shift[:, None, None]) for z in (near, far)]
+            ends.append((pixel[0][:2] / pixel[0][2:] - pixel[1][:2] / pixel[1][2:]).norm(dim=0).median())
+        count = int(torch.stack(ends).max().clamp(32, MOST_LABELS))
+        return torch.linspace(1 / far, 1 / near, count, device=self.rays.device)
+
+    def cost(self, depth: Float[Tensor, "d h w"], chunk: int = 8) -> Float[Tensor, "d h w"]:
+        """0 (alike) to 1 (unrelated) for each hypothesis: the mean over the better half of the sources.
+
+        The worse half may be where the point is hidden.
+        """
+        keep = max(1, (len(self.sources) + 1) // 2)
+        out = []
+        for part in depth.split(chunk):
+            scores = torch.stack([self._correlation(part, *source) for source in self.sources])
+            out.append(1 - scores.topk(keep, dim=0).values.mean(0).clamp(0, 1))
+        return torch.cat(out)
+
+    def _correlation(self, depth, image, rotated, shift) -> Float[Tensor, "d h w"]:
+        """Normalised cross-correlation of windows; 0 where the source does not see the point."""
+        point = rotated * depth[:, None] + shift[:, None, None]
+        z = point[:, 2].clamp_min(1e-6)
+        height, width = image.shape
+        grid = torch.stack([point[:, 0] / z * (2 / width) - 1, point[:, 1] / z * (2 / height) - 1], -1)
+        batch = image.expand(len(depth), 1, height, width)
+        warped = F.grid_sample(batch, grid, mode="bilinear", padding_mode="border", align_corners=False)[:, 0]
+        seen = (grid.abs() < 1).all(-1) & (point[:, 2] > 0)
+        mean, variance = _moments(warped)
+        cross = _box(warped * self.reference) - mean * self.moments[0]
+        return torch.where(seen, cross / (variance * self.moments[1]).sqrt(), torch.zeros_like(cross))
+
+
+def _grey(views: Views, i: int, share: float, device: str) -> tuple[Float[Tensor, "h w"], Float[Tensor, "3 3"]]:
+    """The photo in grey at a share of its size, and its K."""
+    image = views.image(i, device) @ torch.tensor([0.299, 0.587, 0.114], device=device)
+    height, width = image.shape
+    size = max(8, round(height * share)), max(8, round(width * share))
+    if size != (height, width):
+        image = F.interpolate(image[None, None], size, mode="area")[0, 0]
+    return image, resize(views.cameras.Ks[i], size[1] / width, size[0] / height).to(device)
+
+
+def _box(images: Float[Tensor, "d h w"]) -> Float[Tensor, "d h w"]:
+    """Mean over 5 x 5 pixels, edges repeated; by shifted sums, ten times as fast as a pooling layer on a CPU."""
+    padded = F.pad(images[None], (2, 2, 2, 2), mode="replicate")[0]
+    pairs = padded[..., :-1] + padded[..., 1:]
+    rows = pairs[..., :-3] + pairs[..., 2:-1]
+    rows += padded[..., 4:]
+    pairs = rows[:, :-1] + rows[:, 1:]
+    total = pairs[:, :-3] + pairs[:, 2:-1]
+    total += rows[:, 4:]
+    return total.mul_(1 / 25)
+
+
+def _moments(images: Float[Tensor, "d h w"]) -> tuple[Tensor, Tensor]:
+    """Mean and variance over the window; a floor of 2 grey levels keeps noise from counting as texture."""
+    mean = _box(images)
+    return mean, (_box(images * images) - mean * mean).clamp_min(0) + (2 / 255) ** 2
+
+
+def _slanted_cost(
+    stereo: _Stereo, labels: Float[Tensor, "d"], normal: Float[Tensor, "3"], height: float
+) -> Float[Tensor, "d h w"]:
+    """Cost of each (label, pixel) if the surface there is parallel to the supporting plane.
+
+    `normal` is the plane's in camera axes, pointing up, `height` the camera's distance from it. Swept over
+    planes from a little below it to halfway up to the camera, then read off at the depth of each label:
+    a ray meets the plane at h below the camera at depth h / slope.
+    """
+    slope = -(normal[:, None, None] * stereo.rays).sum(0)
+    facing = slope > 0.1  # planes seen more edge-on than about 6 degrees say nothing
+    if facing.float().mean() < 0.02:
+        return torch.ones(len(labels), *stereo.size, device=labels.device)
+    slope = slope.clamp_min(0.1)
+    step = (labels[1] - labels[0]) / slope[facing].median()
+    low, high = 1 / (1.2 * height), 1 / (0.5 * height)
+    inverse = torch.linspace(low, high, int(((high - low) / step).clamp(16, MOST_LABELS)), device=labels.device)
+    cost = stereo.cost((1 / inverse)[:, None, None] / slope)
+    at = (labels[:, None, None] / slope - low) / (inverse[1] - inverse[0])
+    known = (at >= 0) & (at <= len(inverse) - 1) & facing
+    left = at.clamp(0, len(inverse) - 1.001)
+    row = left.long()
+    read = torch.lerp(cost.gather(0, row), cost.gather(0, row + 1), left - row)
+    return torch.where(known, read, torch.ones_like(read))
+
+
+def smooth(cost: Float[Tensor, "d h w"]) -> Float[Tensor, "h w"]:
+    """The label (with its fraction) of each pixel by semi-global matching along rows and columns."""
+    lines = cost.permute(2, 1, 0).contiguous()  # (w, h, d): a step along the row is one slice
+    total = _passes(lines).transpose(0, 1)
+    total = total + _passes(lines.transpose(0, 1).contiguous())
+    best = total.argmin(-1)
+    centre = best.clamp(1, total.shape[-1] - 2)[..., None]
+    before, here, after = (total.gather(-1, centre + k)[..., 0] for k in (-1, 0, 1))
+    bend = (before - 2 * here + after).clamp_min(1e-6)
+    fraction = ((before - after) / (2 * bend)).clamp(-0.5, 0.5)
+    return torch.where(best == centre[..., 0], best + fraction, best.to(fraction))
+
+
+def _passes(lines: Float[Tensor, "l m d"]) -> Float[Tensor, "l m d"]:
+    """Path costs along the first dimension, forward plus backward."""
+    total = torch.zeros_like(lines)
+    for order in (range(len(lines)), range(len(lines) - 1, -1, -1)):
+        previous = None
+        for k in order:
+            if previous is None:
+                path = lines[k]
+            else:
+                least = previous.min(-1, keepdim=True).values
+                near = F.pad(previous, (1, 1), value=float("inf"))
+                near = torch.minimum(near[:, :-2], near[:, 2:]) + STEP_PENALTY
+                path = lines[k] + torch.minimum(torch.minimum(previous, near), least + JUMP_PENALTY) - least
+            total[k] += path
+            previous = path
+    return total
+
+
+def _refined(stereo: _Stereo, inverse: Float[Tensor, "h w"], step: float) -> Float[Tensor, "h w"]:
+    """Inverse depth moved by up to two steps to where the sources match best.
+
+    Neighbours are warped with their own depth, so slanted surfaces keep their slant. Costs are averaged
+    over a window, and staying costs least, so areas without texture stay as they are.
+    """
+    moves = torch.arange(-2, 3, device=inverse.device, dtype=inverse.dtype)
+    hypotheses = (inverse + moves[:, None, None] * step).clamp_min(1e-6)
+    cost = _box(stereo.cost(1 / hypotheses)) + 0.02 * moves.abs()[:, None, None]
+    best = cost.argmin(0, keepdim=True)
+    centre = best.clamp(1, 3)
+    before, here, after = (cost.gather(0, centre + k) for k in (-1, 0, 1))
+    fraction = ((before - after) / (2 * (before - 2 * here + after).clamp_min(1e-6))).clamp(-0.5, 0.5)
+    move = torch.where(best == centre, best + fraction, best.to(fraction))[0] - 2
+    return inverse + move * step
+
+
+def confirm(maps: list[Tensor], views: Views, i: int, others: list[int]) -> DepthMap:
+    """Depth of view i averaged with that of the views that confirm it, and how many do.
+
+    A view confirms a point if its own depth there agrees within DEPTH_TOLERANCE and leads back to
+    within PIXEL_TOLERANCE of the pixel (Galliani et al. 2015, "Massively parallel multiview stereopsis", sec. 4).
+    """
+    depth, K, viewmat = maps[i], views.cameras.Ks[i], views.cameras.viewmats[i]
+    pixels, points = unproject(depth, K, viewmat)
+    total, support = depth.clone(), torch.zeros_like(depth)
+    for j in others:
+        there, seen = look_up(maps[j], points, views.cameras.Ks[j], views.cameras.viewmats[j])
+        back = torch.cat([there, torch.ones_like(there[..., :1])], -1) @ viewmat.mT
+        z = back[..., 2]
+        landed = back[..., :2] / z[..., None].clamp_min(1e-9) * K.diagonal()[:2] + K[:2, 2]
+        close = (landed - pixels).norm(dim=-1) < PIXEL_TOLERANCE
+        agrees = seen & close & ((z - depth).abs() < DEPTH_TOLERANCE * depth)
+        total += torch.where(agrees, z, torch.zeros_like(z))
+        support += agrees
+    return DepthMap(total / (1 + support), support)
+
+
+def unproject(
+    depth: Float[Tensor, "h w"], K: Float[Tensor, "3 3"], viewmat: Float[Tensor, "4 4"]
+) -> tuple[Float[Tensor, "h w 2"], Float[Tensor, "h w 3"]]:
+    """Pixel centres and the world points at their depth."""
+    y, x = torch.meshgrid(*(torch.arange(s, device=depth.device) + 0.5 for s in depth.shape), indexing="ij")
+    pixels = torch.stack([x, y], -1)
+    camera = torch.cat([(pixels - K[:2, 2]) / K.diagonal()[:2], torch.ones_like(x)[..., None]], -1) * depth[..., None]
+    return pixels, (camera - viewmat[:3, 3]) @ viewmat[:3, :3]
+
+
+def look_up(
+    depth: Float[Tensor, "h w"], points: Float[Tensor, "*b 3"], K: Float[Tensor, "3 3"], viewmat: Float[Tensor, "4 4"]
+) -> tuple[Float[Tensor, "*b 3"], Bool[Tensor, "*b"]]:
+    """The world point that a view sees where `points` fall in it, and whether they fall inside."""
+    camera = points @ viewmat[:3, :3].mT + viewmat[:3, 3]
+    z = camera[..., 2]
+    xy = camera[..., :2] / z[..., None].clamp_min(1e-9) * K.diagonal()[:2] + K[:2, 2]
+    height, width = depth.shape
+    inside = (z > 0) & (xy >= 0).all(-1) & (xy[..., 0] < width) & (xy[..., 1] < height)
+    column = xy[..., 0].nan_to_num().clamp(0, width - 1).long()
+    row = xy[..., 1].nan_to_num().clamp(0, height - 1).long()
+    d = depth[row, column]
+    # the ray through the exact place, the depth of the pixel it falls in
+    seen = torch.cat([(xy - K[:2, 2]) / K.diagonal()[:2], torch.ones_like(d)[..., None]], -1) * d[..., None]
+    return (seen - viewmat[:3, 3]) @ viewmat[:3, :3], inside

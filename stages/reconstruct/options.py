@@ -1,0 +1,54 @@
+"""What a user can choose about reconstruction."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from stages.errors import InputError
+
+BACKENDS = {"classic": "stages.reconstruct.classic:reconstruct"}
+
+
+@dataclass(frozen=True)
+class Quality:
+    """What a word like "normal" stands for."""
+
+    side: int  # longest side the photos are worked at [px]
+    gaussians: int  # how many to start from
+    steps: int  # photometric steps, each on one photo
+    degree: int  # of the spherical harmonics
+
+
+QUALITIES = {
+    "draft": Quality(side=512, gaussians=50_000, steps=300, degree=0),
+    "normal": Quality(side=640, gaussians=90_000, steps=800, degree=1),
+    "high": Quality(side=1024, gaussians=300_000, steps=6000, degree=2),
+}
+
+
+@dataclass(frozen=True)
+class ReconstructOptions:
+    backend: str = "classic"
+    cameras: Path | None = None  # known cameras: a nerfstudio transforms.json or a COLMAP model folder
+    holdout: int = 0  # keep every N-th photo out of the Gaussians and report on it; 0 keeps none out
+    quality: str = "normal"
+    resolution: int | None = None  # longest side the photos are worked at [px]; by default the quality's
+    seed: int = 0
+    device: str = "auto"
+
+    def __post_init__(self):
+        if self.quality not in QUALITIES:
+            raise InputError(f"--quality {self.quality}: choose from {', '.join(QUALITIES)}")
+        if self.holdout < 0 or self.holdout == 1:
+            raise InputError(f"--holdout {self.holdout}: give 0 for none, or 2 or more for every N-th photo")
+        if self.resolution is not None and not 64 <= self.resolution <= 4096:
+            raise InputError(f"--resolution {self.resolution}: the longest side must be 64 to 4096 pixels")
+
+    @property
+    def level(self) -> Quality:
+        return QUALITIES[self.quality]
+
+    @property
+    def side(self) -> int:
+        return self.resolution or self.level.side

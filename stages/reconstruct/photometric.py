@@ -1,0 +1,182 @@
+"""Gaussians fitted to the photos by gradient descent through the rasteriser.
+
+Loss, learning rates and the reasons for them follow Kerbl et al. 2023, "3D Gaussian Splatting", sec. 5 and
+its code; unlike there the Gaussians already lie on matched surfaces, so some hundred steps are enough on a CPU.
+The number of steps is fixed beforehand, never by the clock, so a seed gives the same scene again.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from tqdm import tqdm
+
+from stages.geometry.cameras import centres
+from stages.geometry.rotations import matrix
+from stages.kernels.ssim import ssim
+from stages.raster.rasterise import rasterise
+from stages.reconstruct.photos import Views
+from stages.scene.gaussians import Gaussians
+
+STRUCTURE = 0.2  # weight of 1 - SSIM against L1
+RATES = {"scales": 5e-3, "quats": 2e-3, "opacities": 3e-2, "base": 5e-3, "rest": 2.5e-4, "gains": 2e-3}
+MOVE = 2e-4  # of the means, times the cameras' distance; falls to a hundredth of it
+FAINT = 0.02  # Gaussians of less opacity are dropped
+SPLITS = (0.2, 0.4)  # after these shares of the steps, Gaussians where detail is missing are split
+SPLIT_SHARE = 0.08  # of the Gaussians, each time
+
+
+@dataclass
+class _Fit:
+    """What is optimised: one tensor for each learning rate, and Adam's moments for them."""
+
+    values: dict[str, Tensor]
+    optimiser: torch.optim.Optimizer
+
+    @classmethod
+    def start(cls, gaussians: Gaussians, views: int, reach: float) -> _Fit:
+        values = {
+            "means": gaussians.means,
+            "scales": gaussians.scales.log(),
+            "quats": gaussians.quats,
+            "opacities": gaussians.opacities.clamp(1e-4, 1 - 1e-4).logit(),
+            "base": gaussians.sh[:, :1],
+            "rest": gaussians.sh[:, 1:],
+            "gains": torch.zeros(views, 3, device=gaussians.means.device),  # logarithms, one a photo and channel
+        }
+        values = {name: value.clone().requires_grad_() for name, value in values.items() if value.numel()}
+        rates = {**RATES, "means": MOVE * reach}
+        groups = [{"params": [value], "lr": rates[name], "name": name} for name, value in values.items()]
+        return cls(values, torch.optim.Adam(groups, eps=1e-15, fused=True))
+
+    def gaussians(self) -> Gaussians:
+        """As the rasteriser wants them, with gradients."""
+        v = self.values
+        sh = torch.cat([v["base"], v["rest"]], 1) if "rest" in v else v["base"]
+        ids = torch.zeros(len(sh), dtype=torch.int64, device=sh.device)
+        quats = F.normalize(v["quats"], dim=1)
+        return Gaussians(v["means"], quats, v["scales"].exp(), v["opacities"].sigmoid(), sh, ids)
+
+    def gain(self, view: int) -> Float[Tensor, "3"]:
+        """Exposure of a photo relative to the mean of all."""
+        return (self.values["gains"][view] - self.values["gains"].mean(0)).exp()
+
+    def rows(self, index: Int[Tensor, "m"], fresh: Int[Tensor, "k"] | None = None) -> None:
+        """Keeps (or repeats) these Gaussians with their moments; those at positions `fresh` start with none."""
+        for group in self.optimiser.param_groups:
+            if group["name"] == "gains":
+                continue
+            old = group["params"][0]
+            new = old.detach()[index].clone().requires_grad_()
+            state = self.optimiser.state.pop(old, None)
+            if state:
+                for key in ("exp_avg", "exp_avg_sq"):
+                    state[key] = state[key][index].clone()
+                    if fresh is not None:
+                        state[key][fresh] = 0
+                self.optimiser.state[new] = state
+            group["params"][0] = self.values[group["name"]] = new
+
+
+def refine(
+    gaussians: Gaussians, views: Views, steps: int, reach: float, seed: int = 0, device: str = "cpu"
+) -> Gaussians:
+    """Gaussians that render more like the photos.
+
+    One photo a step, in random order without repeats. `reach` is the cameras' typical distance [scene units].
+    The background is a random grey in every step, so what the photos show opaque becomes opaque.
+    """
+    fit = _Fit.start(gaussians.to(device), len(views), reach)
+    generator = torch.Generator().manual_seed(seed)
+    splits = {round(share * steps) for share in SPLITS if steps >= 200}
+    pull = torch.zeros(len(gaussians), device=device)
+    order: list[int] = []
+    with tqdm(range(steps), desc="fitting photos", unit="step", leave=False) as bar:
+        for step in bar:
+            order = order or torch.randperm(len(views), generator=generator).tolist()
+            loss = _step(fit, views, order.pop(), float(torch.rand((), generator=generator)), device)
+            pull += fit.values["means"].grad.norm(dim=1)
+            fit.optimiser.step()
+            fit.optimiser.param_groups[0]["lr"] = MOVE * reach * 0.01 ** (step / steps)
+            if step in splits:
+                _split(fit, pull, generator)
+                pull = torch.zeros(len(fit.values["means"]), device=device)
+            if step % 20 == 0:
+                bar.set_postfix(loss=f"{loss:.4f}")
+    return _finished(fit, views, pull > 0, reach)
+
+
+def _step(fit: _Fit, views: Views, view: int, grey: float, device: str) -> float:
+    """Gradients of the loss on one photo."""
+    photo = views.image(view, device)
+    height, width = photo.shape[:2]
+    background = torch.full((3,), grey, device=device)
+    cameras = views.cameras[[view]]
+    rendering = rasterise(
+        fit.gaussians(), cameras.viewmats.to(device), cameras.Ks.to(device), width, height, background
+    )  # fmt: skip
+    image = rendering.rgb[0] * fit.gain(view)
+    loss = (1 - STRUCTURE) * (image - photo).abs().mean() + STRUCTURE * (1 - ssim(image, photo))
+    fit.optimiser.zero_grad(set_to_none=True)
+    loss.backward()
+    return loss.item()
+
+
+def _split(fit: _Fit, pull: Float[Tensor, "n"], generator: torch.Generator) -> None:
+    """Drops faint Gaussians and splits those pulled about most into two smaller ones, as in sec. 5.2 of the source.
+
+    The pull, in image space, is the gradient on the mean times the Gaussian's size: how much the photos
+    would gain if it moved by its own width.
+    """
+    v = {name: value.detach() for name, value in fit.values.items()}
+    alive = v["opacities"].sigmoid() > FAINT
+    size = v["scales"].exp().max(1).values
+    count = int(SPLIT_SHARE * int(alive.sum()))
+    chosen = torch.where(alive, pull * size, -torch.ones_like(pull)).topk(count).indices
+    keep = torch.cat([alive.nonzero()[:, 0], chosen])
+    first = torch.searchsorted(alive.nonzero()[:, 0], chosen)  # where the kept halves now are
+    second = torch.arange(len(keep) - count, len(keep), device=keep.device)
+    offset = torch.randn(count, 3, generator=generator).to(size.device) * v["scales"][chosen].exp()
+    offset = _turned(v["quats"][chosen], offset)
+    fit.rows(keep, torch.cat([first, second]))
+    with torch.no_grad():
+        fit.values["means"][first] += 0.7 * offset
+        fit.values["means"][second] -= 0.7 * offset
+        for rows in (first, second):
+            fit.values["scales"][rows] -= 0.47  # 1.6 times smaller
+
+
+def _turned(quats: Float[Tensor, "n 4"], vectors: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+    return (matrix(quats) @ vectors[..., None])[..., 0]
+
+
+def _finished(fit: _Fit, views: Views, touched: Bool[Tensor, "n"], reach: float) -> Gaussians:
+    """Without what is faint, what no photo saw, what grew out of proportion, and what hangs before a lens."""
+    done = fit.gaussians()
+    done = Gaussians(*(getattr(done, field.name).detach().cpu() for field in fields(Gaussians)))
+    eyes = centres(views.cameras.viewmats)
+    close = torch.cdist(done.means, eyes).min(1).values < 0.1 * reach
+    distance = (done.means - eyes.mean(0)).norm(dim=1)
+    huge = done.scales.max(1).values > 0.1 * distance.clamp_min(reach)
+    keep = (done.opacities > FAINT) & touched.cpu() & ~close & ~huge
+    return done[keep & done.means.isfinite().all(1)]
+
+
+def score(gaussians: Gaussians, views: Views, index: list[int], device: str = "cpu") -> tuple[float, float]:
+    """Mean PSNR [dB] and SSIM of the renders of these views against their photos, exposure not adapted."""
+    psnrs, ssims = [], []
+    gaussians = gaussians.to(device)
+    with torch.no_grad():
+        for i in index:
+            photo, cameras = views.image(i, device), views.cameras[[i]]
+            height, width = photo.shape[:2]
+            black = torch.zeros(3, device=device)
+            rendering = rasterise(gaussians, cameras.viewmats.to(device), cameras.Ks.to(device), width, height, black)
+            image = rendering.rgb[0].clamp(0, 1)
+            psnrs.append(-10 * (image - photo).square().mean().clamp_min(1e-10).log10())
+            ssims.append(ssim(image, photo))
+    return float(torch.stack(psnrs).mean()), float(torch.stack(ssims).mean())

@@ -1,0 +1,40 @@
+"""Gaussians that float around an object without being part of it."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from stages.geometry.neighbours import knn
+from stages.scene.gaussians import Gaussians
+
+
+def floaters(g: Gaussians, limit: float = 3.5) -> Bool[Tensor, "n"]:
+    """Gaussians of objects that are far from the rest of their object, lonely, or larger than it.
+
+    Far is a modified z-score of the distance to the median centre above `limit` (Iglewicz and Hoaglin 1993)
+    together with fewer neighbours than usual: the end of a rope is far, but not alone. Lonely is the same
+    score, on the logarithm of the distance to the eighth neighbour, twice as high.
+    """
+    out = ~(g.means.isfinite().all(1) & g.scales.isfinite().all(1) & g.opacities.isfinite()) & (g.object_id > 0)
+    for number in g.object_id.unique().tolist():
+        members = torch.nonzero((g.object_id == number) & ~out)[:, 0]
+        if number == 0 or len(members) < 16:
+            continue
+        means = g.means[members]
+        centre = means.median(0).values
+        far = score((means - centre).norm(dim=1))
+        alone = score(knn(means, means, 9)[0][:, -1].clamp_min(1e-12).log())
+        core = means[far <= limit]
+        size = float((core.amax(0) - core.amin(0)).norm()) if len(core) else 0.0
+        blur = g.scales[members].amax(1) > max(0.35 * size, 1e-12)
+        out[members[((far > limit) & (alone > 0.5 * limit)) | (alone > 2 * limit) | (blur & (size > 0))]] = True
+    return out
+
+
+def score(values: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
+    """Modified z-score above the median: 0.6745 (x - median) / MAD."""
+    off = values - values.median()
+    mad = off.abs().median()
+    return 0.6745 * off / mad.clamp_min(1e-3 * values.median().abs().clamp_min(1e-12))

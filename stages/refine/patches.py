@@ -1,0 +1,40 @@
+"""Flat Gaussians on surfaces that nobody saw."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from stages.geometry.harmonics import rgb_to_sh
+from stages.geometry.rotations import quaternion
+from stages.scene.gaussians import Gaussians
+
+ACROSS, THICK = 0.65, 0.12  # standard deviations of a patch, as a share of the spacing: no holes, little overlap
+
+
+def patches(
+    points: Float[Tensor, "m 3"],
+    normals: Float[Tensor, "m 3"],
+    rgb: Float[Tensor, "m 3"],
+    spacing: float,
+    object_id: int,
+    opacity: float = 0.97,
+) -> Gaussians:
+    """Opaque discs of one colour, square to the normals, for points about `spacing` apart."""
+    count = len(points)
+    normals = torch.nn.functional.normalize(normals, dim=1)
+    helper = torch.eye(3)[normals.abs().argmin(1)] if count else torch.zeros(0, 3)
+    u = torch.nn.functional.normalize(torch.linalg.cross(helper, normals), dim=1)
+    R = torch.stack([u, torch.linalg.cross(normals, u), normals], -1)
+    scales = spacing * torch.tensor([ACROSS, ACROSS, THICK])
+    return Gaussians(
+        points.float(), quaternion(R) if count else torch.zeros(0, 4), scales.repeat(count, 1).float(),
+        torch.full((count,), opacity), rgb_to_sh(rgb.clamp(0, 1)).float(),
+        torch.full((count,), object_id, dtype=torch.int64),
+    )  # fmt: skip
+
+
+def none_like(g: Gaussians) -> Gaussians:
+    """No Gaussians, in the shape of `g`."""
+    return g[torch.zeros(len(g), dtype=torch.bool)]

@@ -1,0 +1,70 @@
+"""labelled.ply -> refined.ply"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from tqdm import tqdm
+
+from stages.backends import choose, pick_device
+from stages.errors import InputError
+from stages.geometry.neighbours import knn
+from stages.physics.grouping import complete as take_halo
+from stages.physics.support import find_support
+from stages.refine.background import fill
+from stages.refine.options import BACKENDS, RefineOptions
+from stages.refine.outliers import floaters
+from stages.refine.patches import none_like
+from stages.refine.sight import Sight, agreement
+from stages.scene.files import provenance
+from stages.scene.gaussians import Gaussians, concatenate
+from stages.scene.scene import Scene
+from stages.scene.scene_ply import read_scene, write_scene
+
+log = logging.getLogger(__name__)
+
+
+def run(scene: Path, out: Path, options: RefineOptions = RefineOptions()) -> None:  # noqa: B008 -- frozen
+    """Objects without floaters, closed all around, and the table beneath them filled: labelled.ply -> refined.ply."""
+    pick_device(options.device)  # refuses a GPU that is not there; the work itself is light and stays on the CPU
+    whole = read_scene(scene)
+    if not bool((whole.gaussians.object_id > 0).any()):
+        raise InputError(f"{scene}: has no objects; label them with `ngff segment {scene} -o labelled.ply` first")
+    refined = refine(whole, options)
+    facts = {**provenance("refine", [Path(scene)], options), "scene": whole.provenance}
+    write_scene(out, replace(refined, provenance=facts))
+    psnr = agreement(whole, refined)
+    seen = "" if psnr is None else f"; in the views of the photos it equals the input to {psnr:.1f} dB"
+    log.info("%s: %d Gaussians, from %d%s", out, len(refined.gaussians), len(whole.gaussians), seen)
+
+
+def refine(scene: Scene, options: RefineOptions = RefineOptions()) -> Scene:  # noqa: B008 -- frozen
+    """The three steps on every object. What the photos show stays as it is; only the unseen is added."""
+    completer = choose(BACKENDS, options.completer)
+    support = find_support(scene, seed=options.seed)
+    g = take_halo(scene.gaussians, support, _reach(scene.gaussians))
+    stray = floaters(g, options.outliers) if options.outliers else torch.zeros(len(g), dtype=torch.bool)
+    scene = replace(scene, gaussians=g[~stray])
+    sight = Sight.of(scene)
+    numbers = [i for i in scene.gaussians.object_id.unique().tolist() if i > 0]
+    made = concatenate([completer(scene, i, sight, support, options) for i in tqdm(numbers, unit="object")])
+    made = made[sight.hidden(scene.gaussians, made)]
+    for i in numbers:
+        count = int((made.object_id == i).sum())
+        log.info("  %d  %s: %d Gaussians close its unseen sides", i, scene.name_of(i), count)
+    below = none_like(made)
+    if options.background and support is not None:
+        below = fill(scene, sight, support, options.seed)
+    log.info("  %d floaters taken away, %d Gaussians fill the table", int(stray.sum()), len(below))
+    return replace(scene, gaussians=concatenate([scene.gaussians, made, below]))
+
+
+def _reach(g: Gaussians) -> float:
+    """How far a halo of stray Gaussians reaches around the objects: three times their usual spacing."""
+    labelled = g.means[(g.object_id > 0) & g.means.isfinite().all(1)]
+    if len(labelled) < 5:
+        return 0.0
+    return 3 * float(knn(labelled, labelled[:: max(1, len(labelled) // 20_000)], 4)[0][:, -1].median())

@@ -1,0 +1,64 @@
+"""What stands behind the objects: the scene's own surroundings, another scene, a colour or a photo."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from stages.errors import InputError
+from stages.render.options import hex_colour
+from stages.scene.gaussians import Gaussians, concatenate
+from stages.scene.images import PHOTOS, read_image, resize
+from stages.scene.scene_ply import read_scene
+
+log = logging.getLogger(__name__)
+WHITE = (1.0, 1.0, 1.0)
+
+
+@dataclass(frozen=True)
+class Backdrop:
+    """`own`: keep the scene's background Gaussians; without, they make way for `gaussians`, `photo` or `colour`."""
+
+    own: bool = True
+    gaussians: Gaussians | None = None
+    photo: Float[Tensor, "h w 3"] | None = None
+    colour: tuple[float, float, float] = WHITE
+
+    def around(self, g: Gaussians) -> Gaussians:
+        """What is to be drawn when the scene holds `g`; a scene without objects is kept whole."""
+        objects = g if self.own or not (g.object_id > 0).any() else g[g.object_id > 0]
+        return objects if self.gaussians is None else concatenate([self.gaussians.to(g.means.device), objects])
+
+    def behind(self, width: int, height: int) -> Float[Tensor, "h w 3"]:
+        """The picture seen where nothing stands in front; a photo covers it, centred."""
+        if self.photo is None:
+            return torch.tensor(self.colour).expand(height, width, 3)
+        h, w = self.photo.shape[:2]
+        factor = max(width / w, height / h)
+        grown = resize(self.photo, max(width, round(w * factor)), max(height, round(h * factor)))
+        top, left = (grown.shape[0] - height) // 2, (grown.shape[1] - width) // 2
+        return grown[top : top + height, left : left + width]
+
+
+def open_backdrop(choice: str | None) -> Backdrop:
+    """From the value of --background; of a scene with objects only what belongs to none of them is taken."""
+    if choice is None:
+        return Backdrop()
+    if choice.startswith("#"):
+        return Backdrop(own=False, colour=hex_colour(choice))
+    suffix = Path(choice).suffix.lower()
+    if suffix == ".ply":
+        g = read_scene(Path(choice)).gaussians
+        if (g.object_id == 0).any():
+            g = g[g.object_id == 0]
+        else:
+            log.info("%s: all of its Gaussians belong to objects; all of them form the background", choice)
+        return Backdrop(own=False, gaussians=g)
+    if suffix in PHOTOS:
+        return Backdrop(own=False, photo=read_image(Path(choice)))
+    raise InputError(f"--background {choice}: give a scene.ply, a colour such as #336699, or a photo")

@@ -1,0 +1,85 @@
+"""Camera paths of the user's own: a JSON list of cameras, smoothly connected.
+
+Each entry is {rotation (3x3, camera to world), position, width, height, fx, fy} as in the public NGFF files
+(principal point at the centre), or {viewmat (4x4, world to camera), K, size}.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import torch
+from scipy.interpolate import PchipInterpolator
+from scipy.spatial.transform import Rotation, Slerp
+
+from stages.errors import InputError
+from stages.geometry.cameras import centres
+from stages.geometry.rotations import nearest
+from stages.scene.cameras import Cameras
+from stages.scene.files import must_exist
+
+WHAT = "a camera path (.json: a list of {rotation, position, width, height, fx, fy} or of {viewmat, K, size})"
+
+
+def read_path(path: str | Path) -> Cameras:
+    """The cameras of a path file; all must have the size of the first."""
+    path = Path(path)
+    must_exist(path, WHAT)
+    try:
+        rows = json.loads(path.read_text())
+        if not isinstance(rows, list) or not rows:
+            raise TypeError("not a list of cameras")
+        entries = [_entry(row) for row in rows]
+        viewmats, Ks = (torch.from_numpy(np.stack([e[i] for e in entries])).float() for i in (0, 1))
+        sizes = torch.tensor([entry[2] for entry in entries])
+    except (ValueError, KeyError, TypeError, np.linalg.LinAlgError) as error:
+        raise InputError(f"{path}: cannot be followed ({error!r}); {WHAT} is expected") from error
+    if not (sizes == sizes[0]).all() or not (sizes > 0).all():
+        raise InputError(f"{path}: cameras of different or zero size; a film has one size, so give all the same")
+    if not (viewmats.isfinite().all() and Ks.isfinite().all() and (Ks[:, [0, 1], [0, 1]] > 0).all()):
+        raise InputError(f"{path}: a number is not finite, or a focal length not above 0; correct the camera path")
+    return Cameras(viewmats, Ks, sizes, tuple(f"{path.stem} {i}" for i in range(len(entries))))
+
+
+def _entry(row: dict) -> tuple[np.ndarray, np.ndarray, list[int]]:
+    """viewmat, K, size of one camera in either form."""
+    if "viewmat" in row:
+        viewmat, K = np.array(row["viewmat"], np.float64).reshape(4, 4), np.array(row["K"], np.float64).reshape(3, 3)
+        width, height = row["size"]
+    else:
+        R = np.array(row["rotation"], np.float64).reshape(3, 3).T  # camera to world, turned round
+        viewmat = np.eye(4)
+        viewmat[:3, :3], viewmat[:3, 3] = R, -R @ np.array(row["position"], np.float64).reshape(3)
+        width, height = row["width"], row["height"]
+        K = np.array([[row["fx"], 0, width / 2], [0, row["fy"], height / 2], [0, 0, 1]], np.float64)
+    R = viewmat[:3, :3]
+    if np.abs(R @ R.T - np.eye(3)).max() > 1e-2 or np.linalg.det(R) < 0:
+        raise ValueError("a rotation is not orthonormal")
+    viewmat[:3, :3] = nearest(torch.from_numpy(R)).numpy()
+    return viewmat, K, [int(width), int(height)]
+
+
+def follow(cameras: Cameras, frames: int) -> Cameras:
+    """`frames` viewpoints from the first camera to the last, evenly in the order given; one camera stands still.
+
+    Rotations turn at even speed between neighbours (slerp), positions and lenses by monotone cubics, which pass
+    through every camera and do not overshoot.
+    """
+    c = len(cameras)
+    width_height = cameras.sizes[:1].expand(frames, 2)
+    if c == 1:
+        return Cameras(
+            cameras.viewmats.expand(frames, 4, 4), cameras.Ks.expand(frames, 3, 3), width_height, cameras.names * frames
+        )
+    at = np.linspace(0, c - 1, frames) if frames > 1 else np.array([0.0])
+    knots = np.arange(c)
+    R = Slerp(knots, Rotation.from_matrix(cameras.viewmats[:, :3, :3].double().numpy()))(at).as_matrix()
+    eyes = PchipInterpolator(knots, centres(cameras.viewmats).double().numpy())(at)
+    viewmats = np.tile(np.eye(4), (frames, 1, 1))
+    viewmats[:, :3, :3], viewmats[:, :3, 3] = R, -(R @ eyes[..., None])[..., 0]
+    Ks = PchipInterpolator(knots, cameras.Ks.double().numpy())(at)
+    return Cameras(
+        torch.from_numpy(viewmats).float(), torch.from_numpy(Ks).float(), width_height, ("",) * frames
+    )

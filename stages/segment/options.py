@@ -1,0 +1,54 @@
+"""What a user can choose about segmentation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from stages.errors import InputError
+
+BACKENDS = {
+    "geometric": "stages.segment.geometric:segment",
+    "masks": "stages.segment.masks:segment",
+    "boxes": "stages.segment.boxes:segment",
+}
+
+
+@dataclass(frozen=True)
+class SegmentOptions:
+    backend: str = "geometric"  # --masks and --boxes choose their own
+    masks: Path | None = None  # folder of label images, named as the photos: 0 background, 1... the objects
+    boxes: Path | None = None  # prompts.json in the public format: boxes in the first view
+    names: str = ""  # "1=duck,2=bowl" in place of the names found
+    max_objects: int = 24
+    min_size: float = 0.03  # of an object, along its longest side [distance of the cameras from what they look at]
+    detail: float = 0.33  # how unlike two regions may be and still be one object; smaller gives more objects
+    seed: int = 0
+    device: str = "auto"
+
+    def __post_init__(self):
+        if self.masks is not None and self.boxes is not None:
+            raise InputError("--masks and --boxes: give one of them")
+        if self.max_objects < 1:
+            raise InputError(f"--max-objects {self.max_objects}: must be 1 or more")
+        if not 0 < self.min_size < 1:
+            raise InputError(f"--min-size {self.min_size}: must be between 0 and 1, such as 0.03")
+        if not 0 < self.detail < 2:
+            raise InputError(f"--detail {self.detail}: must be between 0 and 2, such as 0.33")
+        self.renamed  # noqa: B018 -- a bad name is found before work starts
+
+    @property
+    def chosen(self) -> str:
+        """The backend that the options ask for."""
+        return "masks" if self.masks is not None else "boxes" if self.boxes is not None else self.backend
+
+    @property
+    def renamed(self) -> dict[int, str]:
+        """Names by object number."""
+        names = {}
+        for part in filter(None, (p.strip() for p in self.names.split(","))):
+            number, sign, name = part.partition("=")
+            if not sign or not number.strip().isdecimal() or int(number) < 1 or not name.strip():
+                raise InputError(f'--names {self.names}: {part!r} is not NUMBER=NAME; write "1=duck,2=bowl"')
+            names[int(number)] = name.strip()
+        return names

@@ -1,0 +1,62 @@
+"""scene.ply -> labelled.ply"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+from pathlib import Path
+
+from stages.backends import choose, pick_device
+from stages.errors import InputError
+from stages.scene.files import provenance
+from stages.scene.scene import Scene
+from stages.scene.scene_ply import read_scene, write_scene
+from stages.segment.options import BACKENDS, SegmentOptions
+
+log = logging.getLogger(__name__)
+
+
+def run(scene: Path, out: Path, options: SegmentOptions = SegmentOptions()) -> None:  # noqa: B008 -- frozen
+    """Which Gaussians are one object: scene.ply -> labelled.ply. A line for each object goes to stderr."""
+    segment = choose(BACKENDS, options.chosen)
+    pick_device(options.device)  # refuses a GPU that is not there; the work itself is light and stays on the CPU
+    whole = read_scene(scene)
+    labelled = renamed(segment(whole, options), options)
+    inputs = [Path(p) for p in (scene, options.boxes) if p is not None]
+    facts = {**provenance("segment", inputs, options), "scene": whole.provenance}
+    write_scene(out, replace(labelled, provenance=facts))
+    report(labelled)
+    log.info("%s: %d objects", out, len(labelled.objects))
+    if not labelled.objects:
+        log.warning("%s: no objects were found; try --masks, or --min-size %g", scene, options.min_size / 2)
+
+
+def renamed(scene: Scene, options: SegmentOptions) -> Scene:
+    """The names that the user gave, in place of those found."""
+    have = {o.id for o in scene.objects}
+    for number in options.renamed:
+        if number not in have:
+            raise InputError(f"--names {options.names}: there is no object {number}; found were {_listed(scene)}")
+    return replace(scene, objects=tuple(replace(o, name=options.renamed.get(o.id, o.name)) for o in scene.objects))
+
+
+def _listed(scene: Scene) -> str:
+    return ", ".join(f"{o.id} ({o.name})" for o in scene.objects) or "none"
+
+
+def report(scene: Scene) -> None:
+    """One line an object: number, name, count and size."""
+    g = scene.gaussians
+    for o in scene.objects:
+        means = g.means[g.object_id == o.id].double().numpy()
+        if not len(means):
+            log.info("  %d  %s: not seen in the scene", o.id, o.name)
+            continue
+        size = (_quantile(means, 0.99) - _quantile(means, 0.01)) * scene.metres_per_unit * 100
+        log.info("  %d  %s: %d Gaussians, %.1f x %.1f x %.1f cm", o.id, o.name, len(means), *size)
+
+
+def _quantile(values, share: float):
+    import numpy as np
+
+    return np.quantile(values, share, axis=0)

@@ -1,0 +1,68 @@
+"""What a user can choose about simulation."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+from stages.errors import InputError
+
+BACKENDS = {"mpm": "stages.simulate.mpm:rollout"}
+
+
+@dataclass(frozen=True)
+class Quality:
+    """What a word like "normal" stands for."""
+
+    particles: int  # of all objects together; grid spacing follows, at eight in a full cell
+    substep: float  # shortest one worth taking [s]: materials too stiff for it are softened
+
+
+QUALITIES = {
+    "draft": Quality(particles=6_000, substep=3e-4),
+    "normal": Quality(particles=20_000, substep=1.5e-4),
+    "high": Quality(particles=120_000, substep=2e-5),
+}
+
+
+@dataclass(frozen=True)
+class SimulateOptions:
+    steps: int = 100  # frames, the first being the start
+    dt: float = 0.02  # time between frames [s]
+    engine: str = "mpm"
+    gravity: float = 9.81  # downwards [m/s^2]
+    quality: str = "normal"
+    material: tuple[str, ...] = ()  # OBJECT=MATERIAL
+    materials: Path | None = None  # JSON {object name or id: material name or {E, nu, density, friction}}
+    force: tuple[str, ...] = ()  # "object=2 force=0,0,8 from=0.1 to=0.3", or torque=, and at= for a place
+    forces: Path | None = None  # JSON in the public format; its obj_id 0 is object 1
+    pin: tuple[str, ...] = ()  # objects that stay where they are
+    velocity: tuple[str, ...] = ()  # "object=1 0,0,2" at the start [scene units/s]
+    lift: tuple[str, ...] = ()  # HEIGHT for all or OBJECT=HEIGHT [scene units]
+    floor: float | None = None  # height of the floor [scene units]; by default the scene's
+    friction: float | None = None  # Coulomb coefficient at floor and walls; by default each material's
+    box: str | None = None  # floor, walls and ceiling: x0,y0,z0,x1,y1,z1 [scene units]; by default around the objects
+    keypoints: int = 1024  # most keypoints an object
+    seed: int = 0
+    device: str = "auto"
+
+    def __post_init__(self):
+        if self.quality not in QUALITIES:
+            raise InputError(f"--quality {self.quality}: choose from {', '.join(QUALITIES)}")
+        if self.steps < 1:
+            raise InputError(f"--steps {self.steps}: at least 1 frame is needed")
+        if not 1e-5 <= self.dt <= 1:
+            raise InputError(f"--dt {self.dt}: the time between frames must be between 0.00001 and 1 s")
+        if not (math.isfinite(self.gravity) and abs(self.gravity) < 1e4):
+            raise InputError(f"--gravity {self.gravity}: give metres per second squared, such as 9.81")
+        if self.friction is not None and not 0 <= self.friction < 100:
+            raise InputError(f"--friction {self.friction}: must be 0 or more")
+        if not 8 <= self.keypoints <= 100_000:
+            raise InputError(f"--keypoints {self.keypoints}: must be 8 to 100000")
+        if self.floor is not None and not math.isfinite(self.floor):
+            raise InputError(f"--floor {self.floor}: must be a finite height")
+
+    @property
+    def level(self) -> Quality:
+        return QUALITIES[self.quality]

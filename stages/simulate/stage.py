@@ -1,0 +1,66 @@
+"""scene.ply -> traj.h5"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from tqdm import tqdm
+
+from stages.backends import choose
+from stages.errors import InputError
+from stages.physics import forces
+from stages.physics.keypoints import bind, choose_keypoints
+from stages.scene.files import provenance
+from stages.scene.scene import Scene
+from stages.scene.scene_ply import read_scene
+from stages.scene.trajectory import Motion, TrajectoryWriter
+from stages.simulate.options import BACKENDS, SimulateOptions
+
+log = logging.getLogger(__name__)
+
+
+def run(scene: Path, out: Path, options: SimulateOptions = SimulateOptions()) -> None:  # noqa: B008 -- frozen
+    """Roll the objects of a scene forward in time: scene.ply -> traj.h5."""
+    rollout = choose(BACKENDS, options.engine)
+    world = with_objects(read_scene(scene), scene)
+    prompts = forces.parse(
+        world.objects, Path(scene).stem, options.force, options.forces, options.pin, options.velocity, options.lift
+    )
+    inputs = [Path(p) for p in (scene, options.materials, options.forces) if p is not None]
+    world = replace(world, provenance={**provenance("simulate", inputs, options), "scene": world.provenance})
+    keypoints = choose_keypoints(world, options.keypoints, options.seed)
+    gravity = (0.0, 0.0, -options.gravity / world.metres_per_unit)
+    motion = Motion(options.dt, gravity, options.engine, prompts.as_dicts())
+    states = rollout(world, keypoints, prompts, options)
+    start, furthest = None, 0.0
+    with TrajectoryWriter(out, world, motion, keypoints, bind(world, keypoints)) as trajectory:
+        for state in tqdm(states, total=options.steps, unit="frame"):
+            trajectory.append(state.positions, state.com, state.rotation)
+            start = state.positions if start is None else start
+            furthest = max(furthest, float((state.positions - start).norm(dim=1).max()))
+    size = float((keypoints.rest.amax(0) - keypoints.rest.amin(0)).max())
+    if furthest < 0.02 * size and not prompts:
+        log.info("everything is at rest (nothing moved by more than %.2g); try --lift 0.3 or a --force", furthest)
+    log.info("%s: %d frames, %.2f s", out, options.steps, options.steps * options.dt)
+
+
+def with_objects(scene: Scene, path: Path) -> Scene:
+    """The scene with every object that has Gaussians; one without labels is grouped on the way."""
+    have = set(scene.gaussians.object_id.unique().tolist())
+    present = tuple(o for o in scene.objects if o.id in have)
+    for o in scene.objects:
+        if o.id not in have:
+            log.warning("object %d (%s) has no Gaussians and is left out", o.id, o.name)
+    if present:
+        return replace(scene, objects=present)
+    from stages.physics.grouping import group  # noqa: PLC0415 -- only unlabelled scenes need it
+
+    grouped = group(scene)
+    if not grouped.objects or not torch.any(grouped.gaussians.object_id > 0):
+        raise InputError(f"{path}: no objects were found in it; label them with `ngff segment`")
+    names = ", ".join(f"{o.id} ({o.name})" for o in grouped.objects)
+    log.info("%s has no objects yet; grouped it into %d: %s", path, len(grouped.objects), names)
+    return grouped

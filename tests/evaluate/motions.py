@@ -1,0 +1,54 @@
+"""Trajectories of the two balls whose motion is known in closed form."""
+
+from dataclasses import replace
+
+import torch
+
+from stages.geometry.rotations import matrix
+from stages.physics.keypoints import bind
+from stages.scene.trajectory import Keypoints, Motion, TrajectoryWriter
+
+
+def turn(angle: float) -> torch.Tensor:
+    """About an axis that is none of the coordinate axes [rad]."""
+    axis = torch.tensor([1.0, 2, 2]) / 3
+    half = torch.tensor(angle / 2)
+    return matrix(torch.cat([half.cos()[None], half.sin() * axis]))
+
+
+def moved(points, object_id, t: int, spin: float = 0.15, speed: float = 0.03):
+    """Both objects turn about their centres and drift apart along y, the second twice as fast."""
+    out = points.clone()
+    for id, centre in ((1, torch.tensor([-0.3, 0.0, 0.15])), (2, torch.tensor([0.3, 0.0, 0.40]))):
+        mine = object_id == id
+        drift = torch.tensor([0.0, speed * t * id, -0.01 * t])
+        out[mine] = (points[mine] - centre) @ turn(spin * t).mT + centre + drift
+    return out
+
+
+def write(path, scene, seed: int = 0, count: int = 100, frames: int = 12, dt: float = 0.02, change=None, **motion):
+    """`count` keypoints an object, drawn by `seed`; `change` alters the moved keypoints."""
+    g = scene.gaussians
+    rng = torch.Generator().manual_seed(seed)
+    rows = [ids[torch.randperm(len(ids), generator=rng)[:count]] for ids in
+            ((g.object_id == o.id).nonzero()[:, 0] for o in scene.objects)]  # fmt: skip
+    rows = torch.cat(rows)
+    keypoints = Keypoints(g.means[rows], g.object_id[rows])
+    with TrajectoryWriter(path, scene, Motion(dt, (0.0, 0.0, -9.81), "test"), keypoints, bind(scene, keypoints)) as out:
+        for t in range(frames):
+            positions = moved(keypoints.rest, keypoints.object_id, t, **motion)
+            com = torch.stack([positions[keypoints.object_id == o.id].mean(0) for o in scene.objects])
+            positions = positions if change is None else change(positions)
+            out.append(positions, com, torch.tensor([[1.0, 0, 0, 0]]).repeat(len(scene.objects), 1))
+    return path
+
+
+def renamed(scene, names):
+    return replace(scene, objects=tuple(replace(o, name=n) for o, n in zip(scene.objects, names, strict=True)))
+
+
+def elsewhere(scene, similarity):
+    """The same scene in another world."""
+    g = scene.gaussians
+    g = replace(g, means=similarity(g.means), scales=g.scales * similarity.scale)
+    return replace(scene, gaussians=g, cameras=scene.cameras.moved(similarity))

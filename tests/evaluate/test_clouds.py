@@ -1,0 +1,59 @@
+from dataclasses import replace
+
+import pytest
+import torch
+
+from stages.errors import InputError
+from stages.evaluate.clouds import chamfer, label_iou, nearest
+from stages.evaluate.options import EvaluateOptions
+from stages.evaluate.stage import run
+from stages.geometry.similarity import Similarity
+from stages.scene.scene_ply import write_scene
+from tests.evaluate.motions import elsewhere, turn
+
+
+def test_chamfer_by_hand():
+    mine = torch.tensor([[0.0, 0, 0], [1, 0, 0]])
+    true = torch.tensor([[0.0, 0, 3]])
+    # (0,0,0) is 3 away, (1,0,0) is sqrt 10; back, the nearest to (0,0,3) is 3 away
+    found = chamfer(nearest(mine, true), nearest(true, mine))
+    there = (3 + 10**0.5) / 2
+    assert found == pytest.approx({"chamfer": (there + 3) / 2, "to_truth": there, "to_prediction": 3})
+
+
+def test_label_iou_by_hand():
+    true = torch.tensor([1, 1, 1, 1, 2, 2, 0, 0, 3])
+    found = torch.tensor([7, 7, 7, 0, 5, 5, 5, 0, 0])
+    # object 1: 3 of 4; object 2: 2 of 3; object 3: not found
+    assert label_iou(found, true) == {1: (7, 0.75), 2: (5, pytest.approx(2 / 3)), 3: (0, 0.0)}
+
+
+def evaluate(tmp_path, mine, true, **options):
+    write_scene(tmp_path / "mine.ply", mine)
+    write_scene(tmp_path / "true.ply", true)
+    return run(tmp_path / "mine.ply", tmp_path / "true.ply", tmp_path / "m.json", EvaluateOptions(**options))
+
+
+def test_a_scene_against_itself(tmp_path, two_balls):
+    overall = evaluate(tmp_path, two_balls, two_balls)["overall"]
+    assert overall == pytest.approx({"chamfer": 0, "to_truth": 0, "to_prediction": 0, "colour": 0, "IoU": 1,
+                                     "Gaussians": 1700})  # fmt: skip
+
+
+def test_haze_does_not_count_and_colour_does(tmp_path, two_balls):
+    g = two_balls.gaussians
+    opacities, means, sh = g.opacities.clone(), g.means.clone(), g.sh.clone()
+    opacities[:100], means[:100] = 0.05, means[:100] + 5.0  # thin and far away
+    sh += 0.1 / 0.28209479177387814  # a tenth brighter everywhere; none is near white but the balls' 0.9 and 0.1
+    mine = replace(two_balls, gaussians=replace(g, opacities=opacities, means=means, sh=sh))
+    true = replace(two_balls, gaussians=g)
+    overall = evaluate(tmp_path, mine, true)["overall"]
+    assert overall["to_truth"] == 0 and 0 < overall["to_prediction"] < 0.1
+    assert overall["colour"] == pytest.approx(0.1, abs=1e-4)
+
+
+def test_another_world_needs_align(tmp_path, two_balls):
+    away = Similarity(0.3, turn(1.0), torch.tensor([4.0, 5.0, 6.0]))
+    with pytest.raises(InputError, match="another frame of reference.*--align"):
+        evaluate(tmp_path, elsewhere(two_balls, away), two_balls)
+    assert evaluate(tmp_path, elsewhere(two_balls, away), two_balls, align=True)["overall"]["chamfer"] < 1e-5

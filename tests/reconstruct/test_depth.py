@@ -1,0 +1,81 @@
+"""Depth by matching against a ray-cast scene of known depth."""
+
+import pytest
+import torch
+
+from stages.geometry.planes import Plane
+from stages.reconstruct import depth as stereo
+from stages.reconstruct.photos import Views
+from stages.reconstruct.sfm import SparseModel
+from stages.scene.cameras import Lenses
+from tests.reconstruct.raycast import arc, photograph
+
+
+def sparse(cameras, truth, step: int = 12) -> SparseModel:
+    """True points on a grid in every view, each seen by the views it falls in."""
+    points = []
+    for i in range(len(cameras)):
+        _, world = stereo.unproject(truth[i], cameras.Ks[i], cameras.viewmats[i])
+        points.append(world[::step, ::step].reshape(-1, 3))
+    points = torch.cat(points)
+    poses = zip(truth, cameras.Ks, cameras.viewmats, strict=True)
+    seen = torch.stack([stereo.look_up(depth, points, K, viewmat)[1] for depth, K, viewmat in poses])
+    view, point = seen.nonzero().T
+    return SparseModel(cameras, Lenses(torch.zeros(len(cameras), 5)), points, point, view)
+
+
+@pytest.fixture(scope="module")
+def block():
+    cameras = arc(5)
+    photos, truth = zip(*(photograph(cameras, i) for i in range(len(cameras))), strict=True)
+    views = Views(tuple((p * 255).round().to(torch.uint8) for p in photos), cameras)
+    return views, truth, sparse(cameras, truth)
+
+
+def test_depth_is_right_where_others_confirm_it(block):
+    views, truth, model = block
+    maps = stereo.estimate(views, model, Plane(torch.tensor([0.0, 0, 1]), 0.0))
+    for found, true in zip(maps, truth, strict=True):
+        sure = found.support >= 2
+        error = ((found.depth - true).abs() / true)[sure]
+        assert sure.float().mean() > 0.6
+        # a tenth of a pixel between neighbours (12 degrees apart) is 0.25 % of the depth
+        assert error.median() < 0.0025
+        assert (error < 0.02).float().mean() > 0.97
+
+
+def test_most_of_the_sources_are_neighbours(block):
+    _, _, model = block
+    sources = stereo.choose_sources(model, 2)
+    assert set(sources[2]) == {1, 3}
+    assert all(i not in chosen for i, chosen in enumerate(sources))
+
+
+def test_smoothing_fills_a_gap_and_keeps_an_edge():
+    # Left half at label 3, right half at label 8; in a band of columns all labels cost the same.
+    cost = torch.full((12, 20, 40), 0.6)
+    cost[3, :, :20] = 0
+    cost[8, :, 20:] = 0
+    cost[:, :, 5:12] = 0.3
+    label = stereo.smooth(cost)
+    assert (label[:, :18] - 3).abs().max() < 0.6
+    assert (label[:, 22:] - 8).abs().max() < 0.6
+
+
+def test_a_depth_no_other_view_shares_is_not_confirmed(block):
+    views, truth, _ = block
+    wrong = [t.clone() for t in truth]
+    wrong[0] = truth[0] * 1.1
+    assert (stereo.confirm(wrong, views, 0, [1, 2]).support >= 2).float().mean() < 0.02
+    assert (stereo.confirm(list(truth), views, 0, [1, 2]).support >= 2).float().mean() > 0.7
+
+
+def test_unprojected_pixels_project_back(block):
+    views, truth, _ = block
+    pixels, points = stereo.unproject(truth[1], views.cameras.Ks[1], views.cameras.viewmats[1])
+    camera = points @ views.cameras.viewmats[1][:3, :3].T + views.cameras.viewmats[1][:3, 3]
+    torch.testing.assert_close(camera[..., 2], truth[1], rtol=1e-5, atol=1e-5)
+    there, inside = stereo.look_up(truth[1], points, views.cameras.Ks[1], views.cameras.viewmats[1])
+    assert inside.float().mean() > 0.99
+    torch.testing.assert_close(there[inside], points[inside], rtol=1e-4, atol=1e-3)
+    assert pixels[0, 0].tolist() == [0.5, 0.5]

@@ -1,0 +1,98 @@
+"""From depth to Gaussians."""
+
+import pytest
+import torch
+
+from stages.geometry.rotations import matrix
+from stages.reconstruct import initialise
+from stages.reconstruct.depth import DepthMap
+from stages.reconstruct.initialise import Cloud
+from stages.reconstruct.photos import Views
+from tests.reconstruct.raycast import arc, photograph
+
+
+def flat_cloud(n: int = 400, spacing: float = 0.1) -> Cloud:
+    """A square grid in the plane z = 0."""
+    side = round(n**0.5)
+    grid = spacing * torch.cartesian_prod(torch.arange(side), torch.arange(side)).float()
+    points = torch.cat([grid, torch.zeros(n, 1)], 1)
+    up = torch.tensor([[0.0, 0, 1]]).repeat(n, 1)
+    return Cloud(points, up, torch.full((n, 3), 0.25), torch.full((n,), spacing), torch.full((n,), 2.0))
+
+
+@pytest.fixture(scope="module")
+def block():
+    """Three views with their true depth, all of it confirmed."""
+    cameras = arc(3, (80, 60))
+    photos, truth = zip(*(photograph(cameras, i) for i in range(3)), strict=True)
+    views = Views(tuple((p * 255).round().to(torch.uint8) for p in photos), cameras)
+    return views, [DepthMap(d, torch.full_like(d, 2.0)) for d in truth]
+
+
+def test_discs_lie_flat_and_as_wide_as_their_spacing():
+    gaussians = initialise.to_gaussians(flat_cloud(), torch.full((400,), 0.8), degree=1)
+    inner = (gaussians.means[:, :2] > 0.15).all(1) & (gaussians.means[:, :2] < 1.75).all(1)
+    torch.testing.assert_close(gaussians.scales[inner, 0], torch.full((int(inner.sum()),), 0.06))
+    assert (gaussians.scales[:, 2] < 0.25 * gaussians.scales[:, 0]).all()
+    torch.testing.assert_close(gaussians.sh[:, 0] * 0.28209479 + 0.5, torch.full((400, 3), 0.25))
+    assert gaussians.sh.shape == (400, 4, 3) and not gaussians.sh[:, 1:].any()
+
+
+def test_turns_carry_z_to_the_normal():
+    normals = torch.nn.functional.normalize(torch.randn(50, 3, generator=torch.Generator().manual_seed(0)), dim=1)
+    normals[0], normals[1] = torch.tensor([0.0, 0, 1]), torch.tensor([0.0, 0, -1])
+    torch.testing.assert_close(matrix(initialise.turns(normals))[:, :, 2], normals, rtol=0, atol=1e-5)
+
+
+def test_lifted_normals_point_up_on_the_table(block):
+    views, maps = block
+    cloud = initialise.lift(views, 0, maps[0].depth, maps[0].support)
+    table = (cloud.points[:, 2].abs() < 1e-3) & (cloud.points[:, :2].abs() > 0.4).any(1)
+    assert table.sum() > 500
+    assert (cloud.normals[table, 2] > 0.99).float().mean() > 0.9
+
+
+def test_thinning_meets_the_target_and_keeps_the_colours():
+    cloud = flat_cloud(10_000, 0.01)
+    few = initialise.thin(cloud, 1000, torch.zeros(3), radius=100.0)
+    assert 250 < len(few) <= 1100  # cells are powers of two, so in the plane their number jumps by four
+    torch.testing.assert_close(few.colours, torch.full((len(few), 3), 0.25))
+    torch.testing.assert_close(few.points[:, 2], torch.zeros(len(few)))
+
+
+def test_thinning_is_finer_in_focus():
+    cloud = flat_cloud(10_000, 0.01)  # a square of side 1 from the origin
+    few = initialise.thin(cloud, 2000, torch.zeros(3), radius=0.6)
+    near, far = few.points.norm(dim=1) < 0.2, few.points.norm(dim=1) > 0.8
+    before = cloud.points.norm(dim=1)
+    assert near.sum() / (before < 0.2).sum() > 2 * far.sum() / (before > 0.8).sum()
+
+
+def test_a_point_before_a_confirmed_surface_is_an_intruder(block):
+    views, maps = block
+    eye = -views.cameras.viewmats[0][:3, :3].T @ views.cameras.viewmats[0][:3, 3]
+    floater = torch.lerp(eye, torch.tensor([0.0, 0, 0.2]), 0.7)
+    count = initialise.intrusions(torch.stack([floater, torch.tensor([0.0, 0, 0.2])]), views, maps, least=1)
+    assert count[0] >= 1 and count[1] == 0
+
+
+def test_interpolated_depth_joins_what_is_known():
+    depth = torch.full((32, 48), 2.0)
+    sure = torch.ones(32, 48, dtype=torch.bool)
+    sure[8:20, 10:30] = False
+    depth[~sure] = 77.0
+    torch.testing.assert_close(initialise.interpolate(depth, sure), torch.full((32, 48), 2.0), rtol=1e-3, atol=0)
+
+
+def test_holes_are_filled_and_covered_places_are_not(block):
+    views, maps = block
+    half = [DepthMap(m.depth, torch.where(torch.arange(80) < 40, m.support, torch.zeros_like(m.support))) for m in maps]
+    cloud = initialise.fuse(views, half, least=1)
+    more = initialise.fill(views, half, cloud, None, least=1, far=5.0)
+    assert len(more) > 50
+    for i in range(3):
+        before, after = (
+            initialise.covered(views, i, initialise.to_gaussians(c, torch.full((len(c),), 0.8), 0)).float().mean()
+            for c in (cloud, initialise.join([cloud, more]))
+        )
+        assert after > max(0.95, float(before))

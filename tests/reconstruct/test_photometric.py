@@ -1,0 +1,82 @@
+"""Fitting Gaussians to photos."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from stages.raster.rasterise import rasterise
+from stages.reconstruct import photometric
+from stages.reconstruct.photos import Views
+from stages.scene.gaussians import Gaussians, concatenate
+from tests.conftest import ball, random_gaussians, ring
+
+
+def photographed(gaussians: Gaussians, cameras) -> Views:
+    width, height = cameras.sizes[0].tolist()
+    with torch.no_grad():
+        images = rasterise(gaussians, cameras.viewmats, cameras.Ks, width, height, torch.zeros(3)).rgb
+    return Views(tuple((image.clamp(0, 1) * 255).round().to(torch.uint8) for image in images), cameras)
+
+
+@pytest.fixture(scope="module")
+def target() -> tuple[Gaussians, Views]:
+    inner = random_gaussians(300, seed=1)
+    gaussians = concatenate([inner, ball((0.0, 0.0, 0.0), 4.0, 500, (0.3, 0.4, 0.5), 0)])  # every pixel shows something
+    return gaussians, photographed(gaussians, ring(6, 48))
+
+
+def test_wrong_colours_are_put_right(target):
+    true, views = target
+    start = replace(true, sh=true.sh + 1)
+    before, _ = photometric.score(start, views, list(range(6)))
+    after, _ = photometric.score(photometric.refine(start, views, 150, 2.0), views, list(range(6)))
+    assert after > before + 6
+
+
+def test_the_same_seed_gives_the_same_gaussians(target):
+    true, views = target
+    first, second = (photometric.refine(true, views, 12, 2.0, seed=3) for _ in range(2))
+    for name in ("means", "quats", "scales", "opacities", "sh"):
+        torch.testing.assert_close(getattr(first, name), getattr(second, name), rtol=0, atol=1e-6)
+
+
+def test_a_darker_photo_is_taken_as_exposure(target):
+    true, views = target
+    images = list(views.images)
+    images[0] = (images[0].float() * 0.6).to(torch.uint8)
+    fit = photometric._Fit.start(true, 6, 2.0)
+    for _ in range(100):
+        for view in (0, 3):
+            photometric._step(fit, Views(tuple(images), views.cameras), view, 0.0, "cpu")
+            fit.values["means"].grad.zero_()
+            fit.optimiser.step()
+    assert float(fit.gain(0).detach().mean()) < float(fit.gain(3).detach().mean())
+
+
+def test_what_was_lost_is_dropped():
+    true = random_gaussians(60, seed=2)
+    cameras = ring(4, 48)
+    views = photographed(true, cameras)
+    behind = true.means.clone()
+    behind[:5] = torch.tensor([0.0, 0, 50.0])  # far above all cameras, seen by none
+    opacities = true.opacities.clone()
+    opacities[5:10] = 1e-3
+    start = Gaussians(behind, true.quats, true.scales, opacities, true.sh, true.object_id)
+    done = photometric.refine(start, views, 5, 2.0)
+    assert len(done) <= 50
+    assert done.means[:, 2].max() < 10
+
+
+def test_splitting_keeps_the_mass_and_shrinks_the_halves():
+    start = random_gaussians(100, seed=3)
+    fit = photometric._Fit.start(start, 1, 1.0)
+    pull = torch.zeros(100)
+    pull[7] = 1.0
+    fit.values["means"].grad = torch.zeros(100, 3)
+    photometric._split(fit, pull / fit.values["scales"].detach().exp().max(1).values, torch.Generator().manual_seed(0))
+    after = fit.gaussians()
+    count = int(photometric.SPLIT_SHARE * 100)
+    assert len(after) == 100 + count
+    torch.testing.assert_close((after.means[7] + after.means[100]) / 2, start.means[7], rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(after.scales[100], start.scales[7] / 1.6, rtol=1e-2, atol=0)

@@ -1,0 +1,119 @@
+"""Structure from motion: its pieces, and what it says when photos do not connect."""
+
+import logging
+
+import pytest
+import torch
+
+from stages.errors import InputError
+from stages.geometry.cameras import centres
+from stages.geometry.similarity import umeyama
+from stages.reconstruct import features, sfm
+from stages.reconstruct.photos import Photos, read_photos, undistort
+from stages.scene.cameras import Lenses
+from stages.scene.images import write_png
+from tests.reconstruct.raycast import arc, photograph
+
+
+def as_photos(cameras, folder) -> Photos:
+    images = tuple((photograph(cameras, i)[0] * 255).round().to(torch.uint8) for i in range(len(cameras)))
+    return Photos(images, cameras.names, (0.0,) * len(images), folder)
+
+
+def test_blank_photos_are_refused_in_one_sentence(tmp_path):
+    blank = Photos(
+        tuple(torch.full((120, 160, 3), 128, dtype=torch.uint8) for _ in range(4)),
+        tuple("abcd"), (0.0,) * 4, tmp_path / "photos",
+    )  # fmt: skip
+    with pytest.raises(InputError, match=r"photos: no two photos show the same things.*take 10 or more"):
+        sfm.solve(blank)
+
+
+def test_cameras_of_a_ray_cast_scene_are_recovered(tmp_path):
+    true = arc(6, (320, 240))
+    model = sfm.solve(as_photos(true, tmp_path))
+    assert model.cameras.names == true.names
+    move = umeyama(centres(model.cameras.viewmats), centres(true.viewmats))
+    found = move.viewmats(model.cameras.viewmats)
+    steps = [v[1:, :3, :3] @ v[:-1, :3, :3].mT for v in (found, true.viewmats)]  # from each camera to the next
+    turn = steps[0] @ steps[1].mT
+    angle = torch.rad2deg(torch.acos(((turn.diagonal(dim1=1, dim2=2).sum(1) - 1) / 2).clamp(-1, 1)))
+    assert angle.median() < 0.3
+    assert (centres(found) - centres(true.viewmats)).norm(dim=1).max() < 0.02  # 1.2 % of the distance
+    assert abs(float(model.cameras.Ks[0, 0, 0] / true.Ks[0, 0, 0]) - 1) < 0.03
+
+
+def test_the_same_seed_gives_the_same_cameras(tmp_path):
+    photos = as_photos(arc(3, (240, 180), sweep=30.0), tmp_path)
+    first, second = (sfm.solve(photos, seed=4) for _ in range(2))
+    assert torch.equal(first.cameras.viewmats, second.cameras.viewmats)
+    assert torch.equal(first.points, second.points)
+
+
+def test_known_cameras_are_kept_and_give_points_on_the_surfaces(tmp_path):
+    cameras = arc(4, (240, 180), sweep=40.0)
+    model = sfm.triangulate(as_photos(cameras, tmp_path), cameras, Lenses(torch.zeros(4, 5)))
+    assert torch.equal(model.cameras.viewmats, cameras.viewmats)
+    outside = (model.points[:, :2].abs() > 0.3).any(1)
+    assert outside.sum() > 30
+    assert model.points[outside, 2].abs().median() < 0.003
+
+
+def test_cameras_of_other_photos_are_noticed(tmp_path):
+    cameras = arc(4, (240, 180), sweep=40.0)
+    photos = as_photos(cameras, tmp_path)
+    with pytest.raises(InputError, match="the given cameras are .* px off"):
+        sfm.triangulate(photos, cameras[[3, 2, 1, 0]], Lenses(torch.zeros(4, 5)))
+
+
+def test_mutual_matches_by_hand():
+    a = torch.nn.functional.normalize(torch.tensor([[1.0, 0, 0], [0, 1, 0], [1, 1, 0.01]]), dim=1)
+    b = torch.nn.functional.normalize(torch.tensor([[0.02, 1, 0], [1, 0.01, 0], [0, 0, 1.0]]), dim=1)
+    # the third of a lies between two of b, which the ratio test refuses
+    assert features.match(a, b).tolist() == [[0, 1], [1, 0]]
+
+
+def test_many_photos_are_not_all_compared(monkeypatch):
+    monkeypatch.setattr(features, "EXHAUSTIVE", 10)
+    generator = torch.Generator().manual_seed(0)
+    found = [(None, torch.nn.functional.normalize(torch.randn(30, 16, generator=generator), dim=1)) for _ in range(40)]
+    found[39] = found[0]  # the walk ends where it began
+    chosen = features.pairs(found, neighbours=3, similar=2)
+    assert (0, 39) in chosen
+    assert all((i, i + 1) in chosen for i in range(39))
+    assert len(chosen) < 40 * 39 / 4
+
+
+def test_distortion_is_undone(tmp_path):
+    # Straight lines of a chart seen through k1 = -0.2 become straight again.
+    size, K = (200, 150), torch.tensor([[180.0, 0, 100], [0, 180, 75], [0, 0, 1]])
+    y, x = torch.meshgrid(torch.arange(150) + 0.5, torch.arange(200) + 0.5, indexing="ij")
+    u, v = (x - 100) / 180, (y - 75) / 180
+    du, dv = u.clone(), v.clone()
+    for _ in range(20):  # where the pinhole point of each distorted pixel is
+        r2 = du**2 + dv**2
+        du, dv = u / (1 - 0.2 * r2), v / (1 - 0.2 * r2)
+    image = (torch.sigmoid((du - 0.3) * 60)[..., None].expand(-1, -1, 3) * 255).to(torch.uint8)
+    cameras = arc(1, size)
+    cameras.Ks[0] = K
+    photos = Photos((image,), cameras.names, (0.0,), tmp_path)
+    views = undistort(photos, cameras, Lenses(torch.tensor([[-0.2, 0, 0, 0, 0]])), side=200)
+    edge = (views.images[0][..., 0].float() / 255 > 0.5).float().argmax(1) + 0.0
+    at = (edge - views.cameras.Ks[0][0, 2]) / views.cameras.Ks[0][0, 0]
+    assert (at - 0.3).abs().max() < 1.5 / 180
+
+
+def test_other_files_in_the_folder_are_counted(tmp_path, caplog):
+    for name in ("b.png", "a.png"):
+        write_png(tmp_path / name, torch.rand(20, 30, 3))
+    (tmp_path / "notes.txt").write_text("not a photo")
+    with caplog.at_level(logging.INFO):
+        photos = read_photos(tmp_path)
+    assert photos.names == ("a.png", "b.png") and photos.size(0) == (30, 20)
+    assert "1 other file" in caplog.text
+
+
+def test_one_photo_is_not_enough(tmp_path):
+    write_png(tmp_path / "a.png", torch.rand(20, 30, 3))
+    with pytest.raises(InputError, match="holds one photo"):
+        read_photos(tmp_path)

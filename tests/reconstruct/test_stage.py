@@ -1,0 +1,105 @@
+"""photos/ -> scene.ply, whole."""
+
+import dataclasses
+import logging
+
+import pytest
+import torch
+
+from stages.errors import InputError
+from stages.geometry.cameras import centres
+from stages.reconstruct import options as choices
+from stages.reconstruct.options import ReconstructOptions
+from stages.reconstruct.stage import run
+from stages.scene.scene_ply import read_scene
+from tests.reconstruct.raycast import BLOCK, arc, write_set
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A ray-cast set with its true cameras, reconstructed small."""
+    folder = tmp_path_factory.mktemp("set")
+    cameras = write_set(folder, arc(7, (160, 120), sweep=70.0))
+    out = folder / "scene.ply"
+    small = {"draft": dataclasses.replace(choices.QUALITIES["draft"], gaussians=6000, steps=120)}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(choices, "QUALITIES", {**choices.QUALITIES, **small})
+        run(folder / "images", out, ReconstructOptions(cameras=cameras, holdout=3, quality="draft"))
+    return folder, read_scene(out)
+
+
+def test_the_table_is_level_and_at_zero(made):
+    _, scene = made
+    assert scene.floor == 0.0
+    outside = (scene.gaussians.means[:, :2].norm(dim=1) > 0.45) & (scene.gaussians.means[:, :2].norm(dim=1) < 0.9)
+    assert scene.gaussians.means[outside, 2].abs().median() < 0.006  # 1.6 away, matched to a quarter of a pixel
+
+
+def test_the_block_stands_there_in_its_size(made):
+    _, scene = made
+    means = scene.gaussians.means
+    top = ((means[:, 2] - BLOCK[2]).abs() < 0.03) & (means[:, :2].norm(dim=1) < 0.45)
+    assert top.sum() > 100
+    side = (means[top, :2].quantile(0.95, dim=0) - means[top, :2].quantile(0.05, dim=0)).sort().values
+    # nine tenths of the two sides, which may have turned about the vertical
+    assert 0.3 < float(side[0]) < 0.6 and 0.35 < float(side[1]) < 0.7
+
+
+def test_given_cameras_keep_scale_and_names(made):
+    _, scene = made
+    assert scene.cameras.names == tuple(f"photo_{i:02d}.png" for i in range(7))
+    eyes, true = centres(scene.cameras.viewmats), centres(arc(7, sweep=70.0).viewmats)
+    torch.testing.assert_close(torch.pdist(eyes), torch.pdist(true), rtol=1e-4, atol=1e-4)
+    assert "transforms.json" in scene.scale["source"]
+
+
+def test_photos_kept_out_look_right_too(made, capsys, caplog):
+    from stages.reconstruct.photometric import score
+    from stages.reconstruct.photos import Views
+    from stages.scene.images import read_image
+
+    folder, scene = made
+    images = tuple((read_image(folder / "images" / n) * 255).round().to(torch.uint8) for n in scene.cameras.names)
+    views = Views(images, scene.cameras)
+    held, _ = score(scene.gaussians, views, [3])
+    assert held > 19
+    assert scene.provenance["options"]["holdout"] == 3
+
+
+def test_held_out_photos_are_reported_on_stdout(tmp_path, capsys, caplog, monkeypatch):
+    cameras = write_set(tmp_path, arc(5, (96, 72), sweep=40.0))
+    tiny = dataclasses.replace(choices.QUALITIES["draft"], gaussians=2000, steps=5)
+    monkeypatch.setitem(choices.QUALITIES, "draft", tiny)
+    with caplog.at_level(logging.INFO):
+        run(tmp_path / "images", tmp_path / "s.ply", ReconstructOptions(cameras=cameras, holdout=4, quality="draft"))
+    out = capsys.readouterr().out
+    assert out.startswith("held-out photos: 2  PSNR ") and len(out.splitlines()) == 1
+    assert "5 of 5 photos" in caplog.text
+
+
+def test_cameras_of_other_photos_are_named(tmp_path):
+    write_set(tmp_path / "one", arc(3, (64, 48)))
+    cameras = write_set(tmp_path / "two", arc(3, (64, 48)))
+    cameras.write_text(cameras.read_text().replace("photo_", "other_"))
+    with pytest.raises(InputError, match=r"transforms.json: names 0 of the photos.*photo_00.png"):
+        run(tmp_path / "one" / "images", tmp_path / "s.ply", ReconstructOptions(cameras=cameras))
+    assert not (tmp_path / "s.ply").exists()
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [({"quality": "best"}, "draft, normal, high"), ({"holdout": 1}, "2 or more"), ({"resolution": 8}, "64 to 4096")],
+)
+def test_options_that_make_no_sense(wrong, words):
+    with pytest.raises(InputError, match=words):
+        ReconstructOptions(**wrong)
+
+
+def test_real_photos_are_all_placed(shared):
+    """The published figure for this set is 11 of 11."""
+    from stages.reconstruct.photos import read_photos
+    from stages.reconstruct.sfm import solve
+
+    model = solve(read_photos(shared / "data" / "photos" / "kermit" / "images"))
+    assert len(model.cameras) == 11
+    assert len(model.points) > 500

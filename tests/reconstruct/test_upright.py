@@ -1,0 +1,94 @@
+"""Up, floor and scale of point sets whose stance is known."""
+
+import math
+
+import pytest
+import torch
+
+from stages.geometry.cameras import centres, look_at, orbit
+from stages.geometry.rotations import matrix
+from stages.geometry.similarity import Similarity
+from stages.reconstruct import upright
+
+
+def tabletop(seed: int = 0) -> torch.Tensor:
+    """A table of half side 0.5 at z = 0 with 1 mm of noise, a box on it, and a floor far below."""
+    generator = torch.Generator().manual_seed(seed)
+    rand = lambda n: torch.rand(n, 3, generator=generator) - 0.5  # noqa: E731
+    table = rand(4000) * torch.tensor([1.0, 1, 0])
+    table[:, 2] += 0.001 * torch.randn(4000, generator=generator)
+    box = rand(3000) * torch.tensor([0.3, 0.1, 0.3]) + torch.tensor([0.0, 0.1, 0.15])
+    floor = rand(8000) * torch.tensor([4.0, 4, 0]) - torch.tensor([0, 0, 0.7])
+    return torch.cat([table, box, floor])
+
+
+def one_sided() -> torch.Tensor:
+    """Five cameras on one side, pitched 30 degrees down: their mean up leans by as much."""
+    return orbit(5, torch.tensor([0.0, 0, 0.1]), 1.0, elevation=30.0, azimuth=10.0, sweep=50.0)
+
+
+def all_round() -> torch.Tensor:
+    return orbit(8, torch.tensor([0.0, 0, 0.1]), 1.0, elevation=30.0)
+
+
+def displaced(points, viewmats, seed: int):
+    """The same scene in an arbitrary frame of half the size, as structure from motion returns it."""
+    generator = torch.Generator().manual_seed(seed)
+    R = matrix(torch.randn(4, generator=generator))
+    move = Similarity(0.5, R, torch.randn(3, generator=generator))
+    return move(points), move.viewmats(viewmats), move
+
+
+@pytest.mark.parametrize("cameras", [one_sided(), all_round()], ids=["side", "ring"])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_table_becomes_level_at_zero(cameras, seed):
+    points, viewmats, move = displaced(tabletop(), cameras, seed)
+    focus = move(torch.tensor([0.0, 0, 0.1]))
+    ground = upright.find_ground(points, viewmats, focus, seed)
+    world = upright.to_world(ground, points, viewmats, metric=False)
+    tilt = math.degrees(math.acos(min(1.0, float((world.rotation @ move.rotation)[2, 2]))))
+    assert tilt < 0.5
+    table = world(points)[:4000]
+    assert table[:, 2].abs().median() < 0.002
+    assert abs(float(table[:, 2].mean())) < 0.002
+
+
+def test_focus_scale_and_heading():
+    points, viewmats, move = displaced(tabletop(), one_sided(), 2)
+    focus = move(torch.tensor([0.0, 0, 0.1]))
+    ground = upright.find_ground(points, viewmats, focus)
+    world = upright.to_world(ground, points, viewmats, metric=False)
+    torch.testing.assert_close(world(focus)[:2], torch.zeros(2), rtol=0, atol=1e-4)
+    eyes = world(centres(viewmats))
+    assert abs(float((eyes - world(focus)).norm(dim=1).median()) - 1) < 1e-3
+    assert abs(float(eyes[0, 0])) < 1e-3 and eyes[0, 1] < 0  # the first camera is on the -y side
+    assert torch.det(world.rotation) > 0.999
+
+
+def test_given_cameras_keep_their_metres():
+    points, viewmats, move = displaced(tabletop(), one_sided(), 3)
+    ground = upright.find_ground(points, viewmats, move(torch.tensor([0.0, 0, 0.1])))
+    assert upright.to_world(ground, points, viewmats, metric=True).scale == 1.0
+
+
+def test_a_wall_is_not_a_floor():
+    # An object on a wall, seen by level cameras: no plane may be called the floor, and up is the cameras' own.
+    generator = torch.Generator().manual_seed(0)
+    wall = torch.rand(5000, 3, generator=generator) * torch.tensor([2.0, 0, 2]) + torch.tensor([-1.0, 1, -1])
+    bump = 0.2 * torch.randn(2000, 3, generator=generator)
+    eyes = torch.stack([torch.linspace(-0.5, 0.5, 6), torch.full((6,), -1.0), torch.zeros(6)], 1)
+    viewmats = look_at(eyes, torch.zeros(6, 3))
+    ground = upright.find_ground(torch.cat([wall, bump]), viewmats, torch.zeros(3))
+    assert ground.plane is None
+    assert float(ground.up[2]) > 0.999
+
+
+def test_level_cameras_all_round_say_which_way_is_up():
+    ring = orbit(8, torch.zeros(3), 2.0, elevation=50.0)
+    assert float(upright.level_up(ring)[2]) > 0.9999
+
+
+def test_focus_is_ahead_of_the_cameras():
+    viewmats = orbit(8, torch.tensor([1.0, 2, 3]), 2.0, elevation=20.0)
+    focus = upright.focus_of(viewmats, torch.full((8,), 2.0))
+    torch.testing.assert_close(focus, torch.tensor([1.0, 2, 3]), rtol=0, atol=1e-4)

@@ -1,0 +1,21 @@
+"""Trajectories of the two balls."""
+
+import torch
+
+from stages.physics.keypoints import bind
+from stages.scene.trajectory import Keypoints, Motion, TrajectoryWriter
+
+
+def rising(path, scene, frames: int = 5, step: float = 0.01, forces: tuple = ()):
+    """Both balls rise by `step` a frame, 50 frames a second."""
+    g = scene.gaussians
+    rows = torch.cat([(g.object_id == o.id).nonzero()[:60, 0] for o in scene.objects])
+    keypoints = Keypoints(g.means[rows], g.object_id[rows])
+    motion = Motion(0.02, (0.0, 0.0, 0.0), "test", forces)
+    centres = torch.stack([g.means[g.object_id == o.id].mean(0) for o in scene.objects])
+    turns = torch.tensor([[1.0, 0, 0, 0]]).repeat(len(scene.objects), 1)
+    with TrajectoryWriter(path, scene, motion, keypoints, bind(scene, keypoints)) as out:
+        for t in range(frames):
+            up = torch.tensor([0.0, 0.0, step * t])
+            out.append(keypoints.rest + up, centres + up, turns)
+    return path

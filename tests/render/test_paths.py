@@ -1,0 +1,163 @@
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from stages.errors import InputError
+from stages.geometry.cameras import centres, depths, project
+from stages.render.footage import Footage
+from stages.render.path_file import follow, read_path
+from stages.render.paths import camera_path, find_camera
+from stages.render.subject import Subject, aim, common, extent, subject_of
+from tests.conftest import ring
+
+BOX = Subject(torch.tensor([0.0, 0.0, 0.1]), torch.tensor([0.3, 0.3, 0.2]))
+
+
+def angles(a, b, about):
+    """Between the directions in which `about` sees the points a and b [degrees]."""
+    u, v = (torch.nn.functional.normalize(x - about, dim=1) for x in (a, b))
+    return torch.rad2deg(torch.acos((u @ v.mT).clamp(-1, 1)))
+
+
+def test_novel_keeps_near_the_photos_but_repeats_none():
+    cameras = ring(24, target=0.1)
+    path = camera_path("novel", cameras, BOX, 50, 640)
+    away = angles(centres(path.viewmats), centres(cameras.viewmats), BOX.centre)
+    assert away.min() > 2 and away.min(1).values.max() < 12
+    steps = angles(centres(path.viewmats), centres(path.viewmats), BOX.centre).diagonal(1)
+    assert steps.max() < 2 and 10 < steps.sum() < 31  # gentle, yet it moves
+    assert steps[0] < 0.2 * steps[24] and steps[-1] < 0.2 * steps[24]  # starts and stops softly
+
+
+def test_novel_follows_a_camera_man_with_one_photo():
+    cameras = ring(1, target=0.1)
+    path = camera_path("novel", cameras, BOX, 10, 640)
+    away = angles(centres(path.viewmats), centres(cameras.viewmats), BOX.centre)
+    assert away.min() > 2 and away.max() < 7
+
+
+@pytest.mark.parametrize("view", ["novel", "orbit"])
+@pytest.mark.parametrize("cameras", [None, ring(8, target=0.1)], ids=["no photos", "photos"])
+def test_the_subject_fills_the_picture_and_stays_in_it(view, cameras):
+    path = camera_path(view, cameras, BOX, 12, 640)
+    corners, largest = BOX.corners(), 0.0
+    for viewmat, K, (w, h) in zip(path.viewmats, path.Ks, path.sizes.tolist(), strict=True):
+        assert max(w, h) == 640 and (depths(corners, viewmat) > 0).all()
+        offset = (project(corners, viewmat, K) / torch.tensor([w / 2, h / 2]) - 1).abs()
+        largest = max(largest, float(offset.max()))
+    assert largest == pytest.approx(0.9, abs=1e-4)
+
+
+def test_an_orbit_goes_once_around_and_closes():
+    path = camera_path("orbit", None, BOX, 36, 640)
+    eyes = centres(path.viewmats)
+    assert torch.allclose(angles(eyes, eyes.roll(-1, 0), BOX.centre).diagonal(),
+                          torch.tensor(10.0 * 0.906), atol=0.1)  # fmt: skip  # cos 25 degrees: above the horizon
+    elevation = torch.asin((eyes - BOX.centre)[:, 2] / (eyes - BOX.centre).norm(dim=1))
+    assert torch.allclose(torch.rad2deg(elevation), torch.tensor(25.0), atol=0.01)
+
+
+def test_a_stored_camera_keeps_its_rays_at_any_resolution():
+    cameras = ring(6, size=65)
+    path = camera_path("input:2", cameras, BOX, 3, 200)
+    assert len(path) == 3 and path.sizes.tolist() == [[200, 200]] * 3
+    point = torch.tensor([[0.2, 0.1, 0.0]])
+    before = project(point, cameras.viewmats[2], cameras.Ks[2]) / 65
+    after = project(point, path.viewmats[1], path.Ks[1]) / 200
+    torch.testing.assert_close(after, before)
+
+
+def test_cameras_by_number_and_by_name():
+    cameras = ring(6)
+    assert find_camera(cameras, "4") == 4
+    assert find_camera(cameras, "03.png") == 3 and find_camera(cameras, "03") == 3
+    for key in ("6", "-1", "kitchen.jpg"):
+        with pytest.raises(InputError, match="cameras 0 to 5, and photos such as 00.png"):
+            find_camera(cameras, key)
+    with pytest.raises(InputError, match="holds no cameras; use --view novel"):
+        find_camera(None, "0")
+
+
+def public(cameras, width=640, height=480):
+    c2w = torch.linalg.inv(cameras.viewmats)
+    return [{"rotation": m[:3, :3].tolist(), "position": m[:3, 3].tolist(), "width": width, "height": height,
+             "fx": 700.0, "fy": 710.0} for m in c2w]  # fmt: skip
+
+
+def test_path_files_in_both_forms_agree(tmp_path):
+    cameras = ring(5)
+    rows = public(cameras)
+    K = [[700.0, 0, 320], [0, 710, 240], [0, 0, 1]]
+    (tmp_path / "a.json").write_text(json.dumps(rows))
+    (tmp_path / "b.json").write_text(
+        json.dumps([{"viewmat": v.tolist(), "K": K, "size": [640, 480]} for v in cameras.viewmats])
+    )
+    a, b = read_path(tmp_path / "a.json"), read_path(tmp_path / "b.json")
+    torch.testing.assert_close(a.viewmats, b.viewmats, atol=1e-5, rtol=0)
+    torch.testing.assert_close(a.viewmats, cameras.viewmats, atol=1e-5, rtol=0)
+    assert torch.equal(a.Ks, b.Ks) and torch.equal(a.sizes, b.sizes)
+
+
+def test_a_path_passes_through_its_cameras_and_a_single_one_stands_still(tmp_path):
+    cameras = ring(5)
+    through = follow(cameras, 17)
+    torch.testing.assert_close(through.viewmats[::4], cameras.viewmats, atol=1e-5, rtol=0)
+    R = through.viewmats[:, :3, :3]
+    torch.testing.assert_close(R @ R.mT, torch.eye(3).expand(17, 3, 3), atol=1e-5, rtol=0)
+    (tmp_path / "one.json").write_text(json.dumps(public(cameras)[:1]))
+    still = camera_path(str(tmp_path / "one.json"), None, BOX, 9, 320)
+    assert still.sizes.tolist() == [[320, 240]] * 9 and (still.viewmats == still.viewmats[0]).all()
+    assert float(still.Ks[0, 0, 0]) == 350
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [("", "is empty"), ("not json", "cannot be followed"), ("{}", "cannot be followed"), ("[]", "cannot be followed"),
+     ('[{"rotation": [[1,0,0],[0,1,0],[0,0,2]], "position": [0,0,0], "width": 4, "height": 4, "fx": 1, "fy": 1}]',
+      "not orthonormal"),
+     ('[{"rotation": [[1,0,0],[0,1,0],[0,0,1]], "position": [0,0,0], "width": 0, "height": 4, "fx": 1, "fy": 1}]',
+      "zero size")],
+)  # fmt: skip
+def test_a_path_file_that_cannot_be_followed(tmp_path, text, says):
+    (tmp_path / "p.json").write_text(text)
+    with pytest.raises(InputError, match=says) as caught:
+        read_path(tmp_path / "p.json")
+    assert "\n" not in str(caught.value)
+
+
+def test_extent_does_not_mind_stray_points():
+    points = torch.rand(10_000, 3, generator=torch.Generator().manual_seed(0))
+    points[:100] += 1000
+    found = extent(points)
+    assert (found.centre - 0.5).abs().max() < 0.02
+    assert found.half.tolist() == pytest.approx([0.5] * 3, rel=0.03)
+
+
+def test_cameras_aim_at_a_point(two_balls):
+    found = aim(ring(8, target=0.3))
+    np.testing.assert_allclose(found.centre.numpy(), [0, 0, 0.3], atol=1e-4)
+    assert aim(two_balls.cameras[[0, 0]]) is None  # one axis has no point of its own
+    line = two_balls.cameras[[0, 0, 0]]
+    line.viewmats[:, 0, 3] += torch.tensor([-0.1, 0.0, 0.1])  # side by side, looking the same way
+    g = two_balls.gaussians
+    assert aim(line) is None and common(line, g[g.object_id > 0].means).centre[2] == pytest.approx(0.25, abs=0.15)
+    assert (subject_of(Footage(two_balls)).centre - torch.tensor([0.05, 0.0, 0.25])).abs().max() < 0.15
+
+
+def test_an_object_far_from_where_the_photos_look_is_scenery(two_balls):
+    g = two_balls.gaussians
+    means = g.means.clone()
+    means[g.object_id == 2] += torch.tensor([3.0, 0.0, 0.0])
+    found = subject_of(Footage(replace(two_balls, gaussians=replace(g, means=means))))
+    assert (found.centre - torch.tensor([-0.3, 0.0, 0.15])).abs().max() < 0.02
+    alone = replace(two_balls, gaussians=replace(g, means=means), cameras=None)
+    assert float(subject_of(Footage(alone)).half[0]) > 1.5
+
+
+def test_objects_pull_the_aim_of_the_photos_only_a_little(two_balls):
+    found = subject_of(Footage(replace(two_balls, cameras=ring(6, target=-0.4))))
+    assert float(found.centre[2]) == pytest.approx(0.26, abs=0.05)
+    assert -0.2 < float(found.target[2]) < 0.0  # from -0.4 toward 0.26, as far as 0.35 of two thirds

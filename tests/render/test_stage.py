@@ -1,0 +1,196 @@
+import json
+import re
+from dataclasses import replace
+
+import av
+import cv2
+import pytest
+import torch
+
+from stages.errors import InputError
+from stages.render.draw import depth_colours, depth_range, palette
+from stages.render.options import RenderOptions
+from stages.render.overlay import tile
+from stages.render.stage import run
+from stages.scene.images import read_image, read_labels, read_video, write_png
+from stages.scene.scene_ply import write_scene
+from tests.render.motions import rising
+
+RED, GREEN = torch.tensor([0.9, 0.1, 0.1]), torch.tensor([0.1, 0.8, 0.1])
+
+
+@pytest.fixture
+def scene(tmp_path, two_balls):
+    write_scene(tmp_path / "scene.ply", two_balls)
+    return tmp_path / "scene.ply"
+
+
+@pytest.fixture
+def trajectory(tmp_path, two_balls):
+    push = {"kind": "force", "object_id": 1, "force": [0, 0, 8.0], "start": 0.0, "end": 0.05, "at": None}
+    return rising(tmp_path / "traj.h5", two_balls, frames=6, forces=(push,))
+
+
+def options(**choices):
+    return RenderOptions(**{"resolution": 96, "device": "cpu", **choices})
+
+
+def picture(source, out, **choices):
+    return read_image(run(source, out, options(**choices)))
+
+
+def share(image, colour, within=0.15):
+    """Of the pixels that have about this colour."""
+    return float(((image - torch.as_tensor(colour)).abs().amax(-1) < within).float().mean())
+
+
+def rows_of(image, colour):
+    return ((image - colour).abs().amax(-1) < 0.2).nonzero()[:, 0].float().mean()
+
+
+def test_a_film_plays_at_the_rate_of_the_trajectory_and_says_what_made_it(trajectory, capsys):
+    out = run(trajectory, None, options())
+    assert out == trajectory.with_name("traj_novel.mp4") and capsys.readouterr().out.strip() == str(out)
+    with av.open(str(out)) as file:
+        stream = file.streams.video[0]
+        assert (stream.codec_context.name, stream.pix_fmt, stream.average_rate, stream.frames) == \
+            ("h264", "yuv420p", 50, 6)  # fmt: skip
+        assert max(stream.width, stream.height) == 96
+    facts = json.loads(out.with_name("traj_novel.mp4.json").read_text())
+    assert facts["command"] == "render" and facts["inputs"][0]["name"] == "traj.h5" and facts["frames"] == 6
+
+
+def test_what_rises_rises_in_the_film_and_what_stands_stands(tmp_path, two_balls):
+    source = rising(tmp_path / "traj.h5", two_balls, frames=6, step=0.04)
+    frames = list(read_video(run(source, None, options(view="input:0", resolution=128))))
+    heights = [float(rows_of(frame, GREEN)) for frame in frames]
+    assert all(b < a - 0.5 for a, b in zip(heights, heights[1:], strict=False))
+    assert (frames[0] - frames[5])[-20:].abs().mean() < 0.02  # the floor in front
+
+
+def test_the_first_frame_is_the_scene_at_rest(scene, trajectory, tmp_path):
+    still = picture(scene, tmp_path / "a.png", view="input:1")
+    first = picture(trajectory, tmp_path / "b.png", view="input:1", frame=0)
+    assert torch.equal(still, first) and share(still, RED) > 0.005 and share(still, GREEN) > 0.005
+
+
+def test_a_png_of_a_film_is_a_sheet_of_moments(trajectory, tmp_path):
+    sheet = picture(trajectory, tmp_path / "sheet.png", view="input:0")
+    assert sheet.shape == (2 * 48, 4 * 48, 3)  # six frames in two rows of four
+    assert share(sheet[48:, 96:], (1.0, 1.0, 1.0), 0.01) == 1  # two cells are left over
+
+
+def test_all_views_in_one_picture(scene, tmp_path):
+    sheet = picture(scene, tmp_path / "all.png", view="all")
+    assert sheet.shape == (2 * 64, 3 * 64, 3)
+    one = picture(scene, tmp_path / "one.png", view="input:4", resolution=64)
+    assert torch.equal(sheet[64:, 64:128], one)
+    assert run(scene, None, options(view="all")).name == "scene_all.png"
+
+
+def test_a_film_of_all_views_and_one_along_a_path(trajectory, tmp_path, two_balls):
+    frames = list(read_video(run(trajectory, None, options(view="all"))))
+    assert len(frames) == 6 and frames[0].shape == (2 * 64, 3 * 64, 3)
+    K = [[90.0, 0, 32], [0, 90, 24], [0, 0, 1]]
+    rows = [{"viewmat": v.tolist(), "K": K, "size": [64, 48]} for v in two_balls.cameras.viewmats[:3]]
+    (tmp_path / "walk.json").write_text(json.dumps(rows))
+    out = run(trajectory, None, options(view=str(tmp_path / "walk.json")))
+    frames = list(read_video(out))
+    assert out.name == "traj_walk.mp4" and frames[0].shape == (72, 96, 3)
+    assert (frames[0] - frames[5]).abs().mean() > 0.02  # seen from elsewhere
+
+
+@pytest.mark.parametrize("view", ["novel", "orbit"])
+def test_a_scene_without_cameras_or_objects_can_be_filmed(tmp_path, two_balls, view):
+    g = two_balls.gaussians
+    plain = replace(two_balls, gaussians=replace(g, object_id=g.object_id * 0), objects=(), cameras=None, floor=None)
+    write_scene(tmp_path / "plain.ply", plain)
+    image = picture(tmp_path / "plain.ply", tmp_path / "p.png", view=view)
+    assert share(image, RED) > 0.002 and share(image, GREEN) > 0.002
+
+
+def test_backgrounds_replace_the_surroundings_of_the_objects(scene, tmp_path, two_balls):
+    blue = (0.2, 0.4, 0.6)
+    own = picture(scene, tmp_path / "own.png", view="input:0")
+    plain = picture(scene, tmp_path / "plain.png", view="input:0", background="#336699")
+    assert share(plain, blue, 0.01) > 0.6 and share(own, blue) == 0
+    assert share(plain, RED) > 0.03 and share(own, RED) > 0.03
+    photo = torch.zeros(40, 80, 3)
+    photo[:, 40:] = 1.0
+    write_png(tmp_path / "photo.png", photo)
+    behind = picture(scene, tmp_path / "c.png", view="input:0", background=str(tmp_path / "photo.png"))
+    assert share(behind[:, :20], (0.0, 0.0, 0.0), 0.01) > 0.9 and share(behind[:, -20:], (1.0, 1.0, 1.0), 0.01) > 0.9
+    g = two_balls.gaussians
+    floor = replace(g, sh=torch.full_like(g.sh, 10.0))[g.object_id == 0]  # white
+    write_scene(tmp_path / "floor.ply", replace(two_balls, gaussians=floor, objects=()))
+    other = picture(scene, tmp_path / "o.png", view="input:0", background=str(tmp_path / "floor.ply"))
+    assert share(other, (1.0, 1.0, 1.0), 0.1) > 0.6 and share(other, RED) > 0.005
+
+
+def test_ids_are_flat_and_keep_their_colours(scene, tmp_path):
+    image = picture(scene, tmp_path / "ids.png", view="input:0", ids=True)
+    first, second = palette(torch.tensor([1, 2]))
+    assert share(image, first, 0.05) > 0.005 and share(image, second, 0.05) > 0.005
+    many = palette(torch.arange(1, 13))
+    assert (torch.cdist(many, many) + torch.eye(12)).min() > 0.12
+    assert torch.equal(palette(torch.tensor([9, 2]))[1], second)
+
+
+def test_depth_is_metric_in_a_png_and_coloured_in_a_film(scene, trajectory, tmp_path):
+    run(scene, tmp_path / "d.png", options(view="input:0", depth=True))
+    depth = read_labels(tmp_path / "d.png").float() / 1000
+    assert cv2.imread(str(tmp_path / "d.png"), cv2.IMREAD_UNCHANGED).dtype == "uint16"
+    assert float(depth[48, 48]) == pytest.approx(2.0, abs=0.25)  # the camera is 2 from the point it aims at
+    assert json.loads((tmp_path / "d.png.json").read_text())["depth_unit"] == 1e-3
+    out = run(trajectory, None, options(depth=True))
+    facts = json.loads(out.with_name(out.name + ".json").read_text())
+    assert out.name == "traj_novel_depth.mp4" and 0.5 < facts["depth_near"] < facts["depth_far"] < 5
+
+
+def test_depth_colours_go_from_bright_to_dark():
+    image = depth_colours(torch.tensor([[1.0, 2.0, 3.0, 0.0]]), depth_range([torch.tensor([[1.0, 3.0]])]))
+    light = image.sum(-1)[0]
+    assert light[0] > light[1] > light[2] > light[3] == 0
+
+
+def test_arrows_are_drawn_while_a_force_acts(trajectory, tmp_path):
+    orange = torch.tensor([1.0, 122 / 255, 20 / 255])
+    for frame, there in ((0, True), (5, False)):
+        plain = picture(trajectory, tmp_path / "a.png", view="input:0", frame=frame)
+        drawn = picture(trajectory, tmp_path / "b.png", view="input:0", frame=frame, show_forces=True)
+        assert (share(drawn, orange, 0.1) > 0.001) == there and torch.equal(plain, drawn) != there
+
+
+def test_tiles_of_different_shape_stand_in_the_middle():
+    sheet = tile([torch.zeros(4, 4, 3), torch.zeros(2, 4, 3)], 2)
+    assert sheet.shape == (4, 8, 3)
+    assert sheet[:, 4:, 0].tolist() == [[1] * 4, [0] * 4, [0] * 4, [1] * 4]
+
+
+def test_a_film_of_given_rate_keeps_its_speed(trajectory, tmp_path):
+    out = run(trajectory, tmp_path / "slow.mp4", options(fps=25.0))
+    with av.open(str(out)) as file:
+        assert (file.streams.video[0].frames, file.streams.video[0].average_rate) == (3, 25)
+
+
+@pytest.mark.parametrize(
+    ("choices", "says"),
+    [({"view": "sideways"}, "choose from novel"), ({"view": "input:"}, "which camera"), ({"resolution": 4}, "16 to"),
+     ({"fps": 0.0}, "--fps"), ({"depth": True, "ids": True}, "choose one"), ({"background": "#12"}, "#rrggbb")],
+)  # fmt: skip
+def test_options_that_cannot_be(choices, says):
+    with pytest.raises(InputError, match=says):
+        RenderOptions(**choices)
+
+
+@pytest.mark.parametrize(
+    ("out", "choices", "says"),
+    [("a.gif", {}, r"\.mp4 or \.png"), ("a.png", {"view": "input:99"}, "cameras 0 to 5"),
+     ("a.png", {"view": "nowhere.json"}, "no such file"), ("a.png", {"frame": 1}, "has no frames"),
+     ("a.png", {"background": "x.txt"}, "give a scene.ply, a colour"), ("no/a.png", {}, "there is no folder"),
+     ("no/a.mp4", {}, "there is no folder")],
+)  # fmt: skip
+def test_a_mistake_is_told_in_one_sentence_and_leaves_nothing(scene, tmp_path, out, choices, says):
+    with pytest.raises(InputError, match=says) as caught:
+        run(scene, tmp_path / out, options(**choices))
+    assert not re.search("\n", str(caught.value)) and [p.name for p in tmp_path.iterdir()] == ["scene.ply"]

@@ -2,98 +2,135 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy import ndimage
 from torch import Tensor
 
+from stages.geometry.harmonics import C0
 from stages.geometry.neighbours import knn
 from stages.physics.support import Support
 from stages.raster.rasterise import rasterise
-from stages.refine.patches import none_like, patches
+from stages.refine.patches import patches
 from stages.refine.sight import Sight
-from stages.scene.gaussians import Gaussians
+from stages.scene.gaussians import Gaussians, concatenate
 from stages.scene.scene import Scene
 
 MOST = 512  # cells along the longer side of the picture of the table
+MARGIN = 0.06  # around what is under an object [view radii]
+OTHER = 12.0  # CIELAB distance from which a colour is not the table's
 COVERED = 0.75  # alpha above which the table is there
 
 
-def fill(scene: Scene, sight: Sight, support: Support, seed: int = 0) -> Gaussians:
-    """Flat Gaussians on the plane where objects hide it: under them, with a margin, and where they stood in the way.
+@dataclass(frozen=True)
+class Picture:
+    """The table from above; a pixel is a cell, rows go along -y."""
 
-    The table is drawn from above without the objects; holes in its picture are inpainted from their rims, with
-    the grain of the table around. Places that a camera sees through, past the table's edge, stay open.
+    corner: Float[Tensor, "2"]  # x of the first column's edge, y of the first row's
+    cell: float
+    rgb: Float[np.ndarray, "h w 3"]
+    alpha: Float[np.ndarray, "h w"]
+
+    def rows_columns(self, points: Float[Tensor, "n d"]) -> tuple[np.ndarray, np.ndarray]:
+        """Cell of each point, clamped to the picture."""
+        row = ((self.corner[1] - points[:, 1]) / self.cell).floor().clamp(0, self.alpha.shape[0] - 1)
+        column = ((points[:, 0] - self.corner[0]) / self.cell).floor().clamp(0, self.alpha.shape[1] - 1)
+        return row.long().numpy(), column.long().numpy()
+
+    def centres(self, mask: np.ndarray) -> Float[Tensor, "m 2"]:
+        row, column = (torch.from_numpy(i) for i in np.nonzero(mask))
+        return torch.stack([self.corner[0] + (column + 0.5) * self.cell, self.corner[1] - (row + 0.5) * self.cell], 1)
+
+
+def fill(scene: Scene, sight: Sight, support: Support, seed: int = 0) -> Scene:
+    """The scene with flat Gaussians on the plane where objects hide it: under them, with a margin.
+
+    The table is drawn from above without the objects; holes in its picture, and all that is directly under
+    an object, are inpainted from their rims, with the grain of the table around. What little of the table
+    was seen under an object in another colour, its shadow or its own colour, is taken away. Places that a
+    camera sees through, past the table's edge, stay open.
     """
-    g = scene.gaussians
-    h = support.heights(g.means)
-    near = (h.abs() < 2 * support.tolerance) & (g.scales.amax(1) < 0.1 * support.view.radius) & (g.opacities > 0.05)
-    table = g[(g.object_id == 0) & near & support.inside(g.means, 0.05 * support.view.radius)]
+    g, R = scene.gaussians, support.view.radius
+    flat = (support.heights(g.means).abs() < 2 * support.tolerance) & (g.scales.amax(1) < 0.1 * R)
+    flat &= (g.object_id == 0) & (g.opacities > 0.05) & support.inside(g.means, 0.05 * R)
     things = g.means[(g.object_id > 0) & g.means.isfinite().all(1)]
-    things = things[support.inside(things, 0.05 * support.view.radius)]
-    if len(table) < 50 or not len(things):
-        return none_like(g)
-    picture = _picture(table, things, support)
+    things = things[support.inside(things, 0.05 * R)]
+    picture = _picture(g[flat], things, support) if int(flat.sum()) >= 50 and len(things) else None
     if picture is None:
-        return none_like(g)
-    low, cell, rgb, alpha, centres = picture
-    wanted = _wanted(things, support, low, cell, alpha.shape) & support.inside(centres).numpy().reshape(alpha.shape)
-    hole = wanted & (alpha < COVERED)
-    points = torch.cat([centres, support.surface(centres)[:, None]], 1)
-    through = np.zeros(alpha.shape, bool)
-    where = torch.from_numpy(hole.reshape(-1))
-    through.reshape(-1)[hole.reshape(-1)] = sight.empty(points[where], 2 * support.tolerance + cell).numpy()
-    hole &= ~ndimage.binary_opening(through, iterations=1)
-    if not hole.any():
-        return none_like(g)
-    colour = inpaint(rgb, hole, alpha >= COVERED, seed)
-    take = torch.from_numpy(hole.reshape(-1))
-    up = torch.tensor([[0.0, 0, 1]]).expand(int(take.sum()), 3)
-    return patches(points[take], up, torch.from_numpy(colour.reshape(-1, 3))[take], cell, 0)
+        return scene
+    under = _under(things, support, picture)
+    near = ndimage.distance_transform_edt(~under) <= MARGIN * R / picture.cell
+    near &= _table(support, picture, sight, near)
+    hole, known = near & (picture.alpha < COVERED), picture.alpha >= COVERED
+    colour = inpaint(picture.rgb, hole | under, known & ~ndimage.binary_dilation(under, iterations=2), seed)
+    stale = torch.nonzero(flat)[:, 0]
+    cells = picture.rows_columns(g.means[stale])
+    differ = np.linalg.norm(_lab(g[stale]) - cv2.cvtColor(colour, cv2.COLOR_RGB2LAB)[cells], axis=1) > OTHER
+    gone = torch.zeros(len(g), dtype=torch.bool)
+    gone[stale[torch.from_numpy(differ & (under & near)[cells])]] = True
+    new = hole | _emptied(gone, g, picture, near)
+    points = picture.centres(new)
+    points = torch.cat([points, support.surface(points)[:, None]], 1)
+    up = torch.tensor([[0.0, 0, 1]]).expand(len(points), 3)
+    more = patches(points, up, torch.from_numpy(colour[new]), picture.cell, 0)
+    return replace(scene, gaussians=concatenate([g[~gone], more]))
 
 
-def _picture(table: Gaussians, things: Float[Tensor, "m 3"], support: Support):
-    """The table from above around all things: corner, cell, rgb (h, w, 3), alpha (h, w), cell centres (h w, 2).
+def _lab(g: Gaussians) -> np.ndarray:
+    rgb = (g.sh[:, 0] * C0 + 0.5).clamp(0, 1).numpy().astype(np.float32)
+    return cv2.cvtColor(rgb[None], cv2.COLOR_RGB2LAB)[0].reshape(-1, 3)
 
-    The camera is so high that the view is all but parallel; a pixel is a cell, rows go along -y.
-    """
-    margin = 0.08 * support.view.radius
+
+def _emptied(gone: Bool[Tensor, "n"], g: Gaussians, picture: Picture, near: np.ndarray) -> np.ndarray:
+    """Cells that lost a Gaussian as large as themselves, and their neighbours."""
+    cells = np.zeros(picture.alpha.shape, bool)
+    cells[picture.rows_columns(g.means[gone])] = True
+    wide = float(g.scales[gone].amax(1).median()) / picture.cell if bool(gone.any()) else 0.0
+    return ndimage.binary_dilation(cells, iterations=max(1, min(6, round(2 * wide)))) & near
+
+
+def _table(support: Support, picture: Picture, sight: Sight, near: np.ndarray) -> np.ndarray:
+    """Cells of the table, without those that cameras see through."""
+    out = np.zeros(near.shape, bool)
+    points = picture.centres(near)
+    points = torch.cat([points, support.surface(points)[:, None]], 1)
+    through = np.zeros(near.shape, bool)
+    through[near] = sight.empty(points, 2 * support.tolerance + picture.cell).numpy()
+    out[near] = support.inside(points).numpy()
+    return out & ~ndimage.binary_opening(through)
+
+
+def _picture(table: Gaussians, things: Float[Tensor, "m 3"], support: Support) -> Picture | None:
+    """The table from above around all things, from so high that the view is all but parallel."""
+    margin = 1.3 * MARGIN * support.view.radius
     low, high = things[:, :2].amin(0) - margin, things[:, :2].amax(0) + margin
     longest = float((high - low).max())
     if not 1e-9 < longest < 1e9:
         return None
-    some = table.means[:: max(1, len(table) // 5000)]
-    spacing = float(knn(table.means, some, 4)[0][:, -1].median())
+    spacing = float(knn(table.means, table.means[:: max(1, len(table) // 5000)], 4)[0][:, -1].median())
     cell = max(longest / MOST, spacing)
     width, height = (((high - low) / cell).ceil().long().clamp_min(2)).tolist()
     away = 50 * longest
     top = float(support.surface((low + high)[None] / 2))
-    viewmat = torch.tensor([[1.0, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, top + away], [0, 0, 0, 1]])
-    viewmat[:2, 3] = -viewmat[:2, :2] @ torch.tensor([float(low[0]), float(high[1])])
+    viewmat = torch.tensor([[1.0, 0, 0, -float(low[0])], [0, -1, 0, float(high[1])], [0, 0, -1, top + away], [0, 0, 0, 1]])
     K = torch.tensor([[away / cell, 0, 0], [0, away / cell, 0], [0, 0, 1.0]])
     with torch.no_grad():
         drawn = rasterise(table, viewmat[None], K[None], width, height)
     alpha = drawn.alpha[0]
     rgb = (drawn.rgb[0] / alpha.clamp_min(1e-3)[..., None]).clamp(0, 1)
-    x = low[0] + (torch.arange(width) + 0.5) * cell
-    y = high[1] - (torch.arange(height) + 0.5) * cell
-    centres = torch.stack([x.repeat(height), y.repeat_interleave(width)], 1)
-    corner = torch.stack([low[0], high[1]])
-    return corner, cell, rgb.numpy().astype(np.float32), alpha.numpy(), centres
+    return Picture(torch.stack([low[0], high[1]]), cell, rgb.numpy().astype(np.float32), alpha.numpy())
 
 
-def _wanted(things: Tensor, support: Support, corner: Tensor, cell: float, shape: tuple[int, int]) -> np.ndarray:
-    """Cells that a thing covers or is so near to that it may have hidden them."""
+def _under(things: Float[Tensor, "m 3"], support: Support, picture: Picture) -> np.ndarray:
+    """Cells directly under things that stand or hang low."""
     low = support.heights(things) < 0.3 * support.view.radius
-    column = ((things[low, 0] - corner[0]) / cell).floor().long().clamp(0, shape[1] - 1)
-    row = ((corner[1] - things[low, 1]) / cell).floor().long().clamp(0, shape[0] - 1)
-    under = np.zeros(shape, bool)
-    under[row.numpy(), column.numpy()] = True
-    reach = 0.06 * support.view.radius / cell
-    under = ndimage.binary_fill_holes(ndimage.binary_closing(np.pad(under, 8), iterations=4)[8:-8, 8:-8])
-    return ndimage.distance_transform_edt(~under) <= reach
+    under = np.zeros(picture.alpha.shape, bool)
+    under[picture.rows_columns(things[low])] = True
+    return ndimage.binary_fill_holes(ndimage.binary_closing(np.pad(under, 8), iterations=4)[8:-8, 8:-8])
 
 
 def inpaint(rgb: np.ndarray, hole: np.ndarray, known: np.ndarray, seed: int) -> np.ndarray:

@@ -17,7 +17,6 @@ from stages.physics.support import find_support
 from stages.refine.background import fill
 from stages.refine.options import BACKENDS, RefineOptions
 from stages.refine.outliers import floaters
-from stages.refine.patches import none_like
 from stages.refine.sight import Sight, agreement
 from stages.scene.files import provenance
 from stages.scene.gaussians import Gaussians, concatenate
@@ -55,11 +54,11 @@ def refine(scene: Scene, options: RefineOptions = RefineOptions()) -> Scene:  # 
     for i in numbers:
         count = int((made.object_id == i).sum())
         log.info("  %d  %s: %d Gaussians close its unseen sides", i, scene.name_of(i), count)
-    below = none_like(made)
-    if options.background and support is not None:
-        below = fill(scene, sight, support, options.seed)
-    log.info("  %d floaters taken away, %d Gaussians fill the table", int(stray.sum()), len(below))
-    return replace(scene, gaussians=concatenate([scene.gaussians, made, below]))
+    closed = replace(scene, gaussians=concatenate([scene.gaussians, made]))
+    filled = fill(closed, sight, support, options.seed) if options.background and support is not None else closed
+    new = len(filled.gaussians) - len(closed.gaussians)
+    log.info("  %d floaters taken away, %d Gaussians more for the table", int(stray.sum()), new)
+    return filled
 
 
 def _reach(g: Gaussians) -> float:

@@ -69,6 +69,14 @@ def write_png(path: Path, image: Float[Tensor, "h w 3"]) -> None:
     _write_pixels(path, cv2.cvtColor(to_bytes(image), cv2.COLOR_RGB2BGR))
 
 
+def write_jpeg(path: Path, image: Float[Tensor, "h w 3"], quality: int = 92) -> None:
+    """An 8-bit JPEG, for photos."""
+    pixels = cv2.cvtColor(to_bytes(image), cv2.COLOR_RGB2BGR)
+    _, data = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    with replacing(path) as part:
+        part.write_bytes(data.tobytes())
+
+
 def write_labels(path: Path, labels: Int[Tensor, "h w"]) -> None:
     """A one-channel PNG of integers, 16 bit when 8 are too few."""
     top = int(labels.max()) if labels.numel() else 0

@@ -42,7 +42,8 @@ def test_no_file_outside_the_list_of_folders():
 
 
 def test_help_is_quick_and_imports_nothing_heavy():
-    code = "import sys; sys.argv = ['ngff', '--help']\ntry:\n import ngff_cli.app as a; a.main()\nexcept SystemExit: pass\n"
+    code = "import sys; sys.argv = ['ngff', '--help']\nimport ngff_cli.app as a\n"
+    code += "try:\n a.main()\nexcept SystemExit: pass\n"
     code += "print(sorted({'torch', 'warp', 'cv2', 'pycolmap', 'h5py', 'numpy'} & set(sys.modules)))"
     start = time.perf_counter()
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True)

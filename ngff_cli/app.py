@@ -1,0 +1,217 @@
+"""`ngff`: six commands from photos to video, each reading and writing files."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from typer import Argument, Option
+
+from ngff_cli.options import Commands, Device, SceneIn, Seed, set_up_logging
+from stages.evaluate.options import EvaluateOptions
+from stages.reconstruct.options import BACKENDS as RECONSTRUCT
+from stages.reconstruct.options import QUALITIES, ReconstructOptions
+from stages.refine.options import BACKENDS as REFINE
+from stages.refine.options import RefineOptions
+from stages.render.options import VIEWS, RenderOptions
+from stages.segment.options import BACKENDS as SEGMENT
+from stages.segment.options import SegmentOptions
+from stages.simulate.options import BACKENDS as SIMULATE
+from stages.simulate.options import SimulateOptions
+
+app = typer.Typer(cls=Commands, no_args_is_help=True, rich_markup_mode=None, add_completion=False)
+QUALITY_HELP = " | ".join(QUALITIES)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        from stages.scene.files import ngff_version
+
+        print(f"ngff {ngff_version()}")
+        raise typer.Exit
+
+
+@app.callback()
+def ngff(
+    verbose: Annotated[bool, Option("-v", "--verbose", help="say more about what is done")] = False,
+    version: Annotated[bool, Option("--version", callback=_version, is_eager=True, help="print the version")] = False,
+) -> None:
+    """From a folder of photos to a video of what happens next.
+
+    ngff reconstruct photos/ -o scene.ply; ngff simulate scene.ply -o traj.h5; ngff render traj.h5
+    """
+    set_up_logging(verbose)
+
+
+@app.command()
+def reconstruct(
+    imgs: Annotated[Path, Argument(metavar="PHOTOS", help="folder of photos, or a video", show_default=False)],
+    out: Annotated[Path, Option("-o", "--out", help="scene to write (.ply)")] = Path("scene.ply"),
+    backend: Annotated[str, Option(help=" | ".join(RECONSTRUCT))] = ReconstructOptions.backend,
+    cameras: Annotated[
+        Path | None, Option(help="known cameras: transforms.json or a COLMAP model folder")
+    ] = ReconstructOptions.cameras,
+    holdout: Annotated[
+        int, Option(help="keep every N-th photo out and report PSNR and SSIM on it")
+    ] = ReconstructOptions.holdout,
+    quality: Annotated[str, Option(help=QUALITY_HELP)] = ReconstructOptions.quality,
+    resolution: Annotated[
+        int | None, Option(help="longest side the photos are worked at [px]")
+    ] = ReconstructOptions.resolution,
+    seed: Seed = ReconstructOptions.seed,
+    device: Device = ReconstructOptions.device,
+) -> None:
+    """Gaussians of what photos show: PHOTOS -> SCENE.ply.
+
+    Cameras are found from the photos unless given; the scene is turned upright, its floor at z = 0.
+    """
+    from stages.reconstruct.stage import run
+
+    run(imgs, out, ReconstructOptions(backend, cameras, holdout, quality, resolution, seed, device))
+
+
+@app.command()
+def segment(
+    scene: SceneIn,
+    out: Annotated[Path, Option("-o", "--out", help="labelled scene to write (.ply)")] = Path("labelled.ply"),
+    backend: Annotated[str, Option(help=" | ".join(SEGMENT))] = SegmentOptions.backend,
+    masks: Annotated[
+        Path | None, Option(help="folder of label images named as the photos (0 background, 1... objects)")
+    ] = SegmentOptions.masks,
+    boxes: Annotated[Path | None, Option(help="prompts.json: boxes and names in view 0")] = SegmentOptions.boxes,
+    names: Annotated[str, Option(help='names of your own: "1=duck,2=bowl"')] = SegmentOptions.names,
+    max_objects: Annotated[int, Option(help="most objects to find")] = SegmentOptions.max_objects,
+    min_size: Annotated[
+        float, Option(help="smallest object, along its longest side [distance of the cameras]")
+    ] = SegmentOptions.min_size,
+    detail: Annotated[
+        float, Option(help="how unlike two regions may be and still be one object; smaller gives more objects")
+    ] = SegmentOptions.detail,
+    seed: Seed = SegmentOptions.seed,
+    device: Device = SegmentOptions.device,
+) -> None:
+    """Which Gaussians are one object: SCENE.ply -> LABELLED.ply (object_id: 0 background, 1... objects)."""
+    from stages.segment.stage import run
+
+    options = SegmentOptions(backend, masks, boxes, names, max_objects, min_size, detail, seed, device)
+    run(scene, out, options)
+
+
+@app.command()
+def refine(
+    scene: SceneIn,
+    out: Annotated[Path, Option("-o", "--out", help="refined scene to write (.ply)")] = Path("refined.ply"),
+    completer: Annotated[str, Option(help=" | ".join(REFINE))] = RefineOptions.completer,
+    outliers: Annotated[
+        float, Option(help="robust deviations beyond which a Gaussian is a floater; 0 keeps all")
+    ] = RefineOptions.outliers,
+    background: Annotated[bool, Option(help="fill the table under and behind objects")] = RefineOptions.background,
+    resolution: Annotated[
+        int, Option(help="cells along an object's longest side when its unseen sides are closed")
+    ] = RefineOptions.resolution,
+    seed: Seed = RefineOptions.seed,
+    device: Device = RefineOptions.device,
+) -> None:
+    """Whole objects on a whole table: LABELLED.ply -> REFINED.ply."""
+    from stages.refine.stage import run
+
+    run(scene, out, RefineOptions(completer, outliers, background, resolution, seed, device))
+
+
+@app.command()
+def simulate(
+    scene: SceneIn,
+    out: Annotated[Path, Option("-o", "--out", help="trajectory to write (.h5)")] = Path("traj.h5"),
+    steps: Annotated[int, Option(help="frames, the first being the start")] = SimulateOptions.steps,
+    dt: Annotated[float, Option(help="time between frames [s]")] = SimulateOptions.dt,
+    engine: Annotated[str, Option(help=" | ".join(SIMULATE))] = SimulateOptions.engine,
+    gravity: Annotated[float, Option(help="downwards [m/s^2]")] = SimulateOptions.gravity,
+    quality: Annotated[str, Option(help=QUALITY_HELP)] = SimulateOptions.quality,
+    material: Annotated[list[str] | None, Option(help="OBJECT=MATERIAL, such as duck=rubber; repeatable")] = None,
+    materials: Annotated[
+        Path | None, Option(help="JSON: object name or id to a material's name or {E, nu, density, friction}")
+    ] = SimulateOptions.materials,
+    force: Annotated[
+        list[str] | None, Option(help='"object=2 force=0,0,8 from=0.1 to=0.3" [N, s]; also torque= and at=x,y,z')
+    ] = None,
+    forces: Annotated[Path | None, Option(help="JSON of force prompts in the public format")] = SimulateOptions.forces,
+    pin: Annotated[list[str] | None, Option(help="object that stays where it is; repeatable")] = None,
+    velocity: Annotated[list[str] | None, Option(help='start velocity: "object=1 0,0,2" [units/s]; repeatable')] = None,
+    lift: Annotated[list[str] | None, Option(help="HEIGHT for all, or OBJECT=HEIGHT [units]; repeatable")] = None,
+    floor: Annotated[float | None, Option(help="height of the floor; by default the scene's")] = SimulateOptions.floor,
+    friction: Annotated[
+        float | None, Option(help="Coulomb coefficient at floor and walls; by default each material's")
+    ] = SimulateOptions.friction,
+    box: Annotated[
+        str | None, Option(help="floor, walls and ceiling: x0,y0,z0,x1,y1,z1; by default around the objects")
+    ] = SimulateOptions.box,
+    keypoints: Annotated[int, Option(help="most keypoints an object")] = SimulateOptions.keypoints,
+    seed: Seed = SimulateOptions.seed,
+    device: Device = SimulateOptions.device,
+) -> None:
+    """Roll the objects of a scene forward in time: SCENE.ply -> TRAJ.h5."""
+    from stages.simulate.stage import run
+
+    lists = [tuple(given or ()) for given in (material, force, pin, velocity, lift)]
+    run(scene, out, SimulateOptions(
+        steps, dt, engine, gravity, quality, lists[0], materials, lists[1], forces, lists[2], lists[3], lists[4],
+        floor, friction, box, keypoints, seed, device,
+    ))  # fmt: skip
+
+
+@app.command()
+def render(
+    source: Annotated[Path, Argument(metavar="TRAJ.h5|SCENE.ply", help="what to draw", show_default=False)],
+    out: Annotated[
+        Path | None, Option("-o", "--out", help=".mp4 or .png; by default beside the input, and printed")
+    ] = None,
+    view: Annotated[str, Option(help=VIEWS)] = RenderOptions.view,
+    resolution: Annotated[int, Option(help="longest side [px]")] = RenderOptions.resolution,
+    fps: Annotated[float | None, Option(help="frames a second; motion keeps its speed")] = RenderOptions.fps,
+    background: Annotated[
+        str | None, Option(help="scene.ply, #rrggbb or a photo in place of the scene's own")
+    ] = RenderOptions.background,
+    depth: Annotated[bool, Option("--depth", help="draw depth: colours in MP4, 16 bit in PNG")] = RenderOptions.depth,
+    ids: Annotated[bool, Option("--ids", help="draw each object in a flat colour")] = RenderOptions.ids,
+    show_forces: Annotated[
+        bool, Option("--show-forces", help="arrows where force prompts act")
+    ] = RenderOptions.show_forces,
+    frame: Annotated[
+        int | None, Option(help="stop the motion at this frame; -1 is the last")
+    ] = RenderOptions.frame,
+    device: Device = RenderOptions.device,
+) -> None:
+    """Film a trajectory or a scene: TRAJ.h5 or SCENE.ply -> MP4 or PNG."""
+    from stages.render.stage import run
+
+    run(source, out, RenderOptions(view, resolution, fps, background, depth, ids, show_forces, frame, device))
+
+
+@app.command()
+def evaluate(
+    prediction: Annotated[
+        Path, Argument(metavar="PREDICTION", help=".h5, .ply, .mp4 or a folder of PNGs", show_default=False)
+    ],
+    against: Annotated[Path, Option("--against", help="the truth, of the same kind", show_default=False)],
+    out: Annotated[
+        Path | None, Option("-o", "--out", help="metrics.json to write; by default beside the prediction")
+    ] = None,
+    align: Annotated[
+        bool, Option("--align", help="bring the prediction into the truth's world first, by shared cameras or objects")
+    ] = EvaluateOptions.align,
+    frames: Annotated[int | None, Option(help="compare only the first N frames")] = EvaluateOptions.frames,
+    resample: Annotated[
+        bool, Option("--resample", help="interpolate the predicted motion at the truth's times")
+    ] = EvaluateOptions.resample,
+    objects: Annotated[str, Option(help="compare only these of the truth: duck,ball")] = EvaluateOptions.objects,
+    report: Annotated[
+        Path | None, Option(help="also write an HTML page with curves and pictures")
+    ] = EvaluateOptions.report,
+) -> None:
+    """How near a prediction comes to the truth: a table, and METRICS.json."""
+    from stages.evaluate.stage import run
+
+    run(prediction, against, out, EvaluateOptions(align, frames, resample, objects, report))
+
+
+def main() -> None:
+    app()

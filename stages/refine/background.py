@@ -22,6 +22,7 @@ from stages.scene.scene import Scene
 
 MOST = 512  # cells along the longer side of the picture of the table
 MARGIN = 0.06  # around what is under an object [view radii]
+BARELY = 1.0  # weight in a view below which a Gaussian is not missed there [px of the small images]
 OTHER = 12.0  # CIELAB distance from which a colour is not the table's
 COVERED = 0.75  # alpha above which the table is there
 
@@ -50,9 +51,9 @@ def fill(scene: Scene, sight: Sight, support: Support, seed: int = 0) -> Scene:
     """The scene with flat Gaussians on the plane where objects hide it: under them, with a margin.
 
     The table is drawn from above without the objects; holes in its picture, and all that is directly under
-    an object, are inpainted from their rims, with the grain of the table around. What little of the table
-    was seen under an object in another colour, its shadow or its own colour, is taken away. Places that a
-    camera sees through, past the table's edge, stay open.
+    an object, are inpainted from their rims, with the grain of the table around. Gaussians of another
+    colour on the plane under an object, its shadow or a part of it that was missed, are taken away if they
+    are hardly seen. Places that a camera sees through, past the table's edge, stay open.
     """
     g, R = scene.gaussians, support.view.radius
     flat = (support.heights(g.means).abs() < 2 * support.tolerance) & (g.scales.amax(1) < 0.1 * R)
@@ -64,14 +65,17 @@ def fill(scene: Scene, sight: Sight, support: Support, seed: int = 0) -> Scene:
         return scene
     under = _under(things, support, picture)
     near = ndimage.distance_transform_edt(~under) <= MARGIN * R / picture.cell
-    near &= _table(support, picture, sight, near)
-    hole, known = near & (picture.alpha < COVERED), picture.alpha >= COVERED
+    near[near] = support.inside(picture.centres(near)).numpy()
+    known = picture.alpha >= COVERED
+    hole = near & ~known
+    hole &= ~_open(support, picture, sight, hole)
     colour = inpaint(picture.rgb, hole | under, known & ~ndimage.binary_dilation(under, iterations=2), seed)
     stale = torch.nonzero(flat)[:, 0]
     cells = picture.rows_columns(g.means[stale])
     differ = np.linalg.norm(_lab(g[stale]) - cv2.cvtColor(colour, cv2.COLOR_RGB2LAB)[cells], axis=1) > OTHER
     gone = torch.zeros(len(g), dtype=torch.bool)
     gone[stale[torch.from_numpy(differ & (under & near)[cells])]] = True
+    gone &= sight.weight < BARELY if len(sight.weight) else True
     new = hole | _emptied(gone, g, picture, near)
     points = picture.centres(new)
     points = torch.cat([points, support.surface(points)[:, None]], 1)
@@ -93,15 +97,13 @@ def _emptied(gone: Bool[Tensor, "n"], g: Gaussians, picture: Picture, near: np.n
     return ndimage.binary_dilation(cells, iterations=max(1, min(6, round(2 * wide)))) & near
 
 
-def _table(support: Support, picture: Picture, sight: Sight, near: np.ndarray) -> np.ndarray:
-    """Cells of the table, without those that cameras see through."""
-    out = np.zeros(near.shape, bool)
-    points = picture.centres(near)
+def _open(support: Support, picture: Picture, sight: Sight, hole: np.ndarray) -> np.ndarray:
+    """Holes that cameras see through: there is no table."""
+    points = picture.centres(hole)
     points = torch.cat([points, support.surface(points)[:, None]], 1)
-    through = np.zeros(near.shape, bool)
-    through[near] = sight.empty(points, 2 * support.tolerance + picture.cell).numpy()
-    out[near] = support.inside(points).numpy()
-    return out & ~ndimage.binary_opening(through)
+    through = np.zeros(hole.shape, bool)
+    through[hole] = sight.empty(points, 2 * support.tolerance + picture.cell).numpy()
+    return ndimage.binary_opening(through)
 
 
 def _picture(table: Gaussians, things: Float[Tensor, "m 3"], support: Support) -> Picture | None:
@@ -116,7 +118,8 @@ def _picture(table: Gaussians, things: Float[Tensor, "m 3"], support: Support) -
     width, height = (((high - low) / cell).ceil().long().clamp_min(2)).tolist()
     away = 50 * longest
     top = float(support.surface((low + high)[None] / 2))
-    viewmat = torch.tensor([[1.0, 0, 0, -float(low[0])], [0, -1, 0, float(high[1])], [0, 0, -1, top + away], [0, 0, 0, 1]])
+    viewmat = torch.diag(torch.tensor([1.0, -1, -1, 1]))
+    viewmat[:3, 3] = torch.tensor([-float(low[0]), float(high[1]), top + away])
     K = torch.tensor([[away / cell, 0, 0], [0, away / cell, 0], [0, 0, 1.0]])
     with torch.no_grad():
         drawn = rasterise(table, viewmat[None], K[None], width, height)

@@ -24,21 +24,23 @@ class Sight:
 
     views: list[tuple[Tensor, Tensor, int, int]]  # viewmat, K, width, height
     depth: list[Float[Tensor, "h w"]]
+    weight: Float[Tensor, "n"]  # of each Gaussian in the view where it weighs most [px]; empty without views
 
     @staticmethod
     @torch.no_grad()
     def of(scene: Scene) -> Sight:
         """Depths drawn from the scene itself; each pixel takes the least of its neighbours, to be careful."""
         if scene.cameras is None or not len(scene.cameras):
-            return Sight([], [])
-        views = small(scene.cameras)
-        maps = []
+            return Sight([], [], torch.zeros(0))
+        views, maps = small(scene.cameras), []
+        weight = torch.zeros(len(scene.gaussians))
         for viewmat, K, width, height in views:
             drawn = rasterise(scene.gaussians, viewmat[None], K[None], width, height)
             depth = torch.where(drawn.alpha[0] > 0.9, drawn.depth[0], 0.0)
             depth = torch.where(drawn.alpha[0] < 0.05, FAR, depth)
             maps.append(-torch.nn.functional.max_pool2d(-depth[None], 3, 1, 1)[0])
-        return Sight(views, maps)
+            weight = torch.maximum(weight, visibility(scene.gaussians, viewmat, K, width, height)[1])
+        return Sight(views, maps, weight)
 
     def empty(self, points: Float[Tensor, "n 3"], margin: float) -> Bool[Tensor, "n"]:
         """Points that a camera sees more than `margin` in front of the surface behind them.

@@ -54,11 +54,12 @@ def refine(scene: Scene, options: RefineOptions = RefineOptions()) -> Scene:  # 
     for i in numbers:
         count = int((made.object_id == i).sum())
         log.info("  %d  %s: %d Gaussians close its unseen sides", i, scene.name_of(i), count)
-    closed = replace(scene, gaussians=concatenate([scene.gaussians, made]))
-    filled = fill(closed, sight, support, options.seed) if options.background and support is not None else closed
-    new = len(filled.gaussians) - len(closed.gaussians)
+    filled = scene
+    if options.background and support is not None:
+        filled = fill(scene, sight, support, options.seed)
+    new = len(filled.gaussians) - len(scene.gaussians)
     log.info("  %d floaters taken away, %d Gaussians more for the table", int(stray.sum()), new)
-    return filled
+    return replace(filled, gaussians=concatenate([filled.gaussians, made]))
 
 
 def _reach(g: Gaussians) -> float:

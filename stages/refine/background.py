@@ -11,8 +11,8 @@ from jaxtyping import Bool, Float
 from scipy import ndimage
 from torch import Tensor
 
-from stages.geometry.harmonics import C0
 from stages.geometry.neighbours import knn
+from stages.physics.grouping import lab_of
 from stages.physics.support import Support
 from stages.raster.rasterise import rasterise
 from stages.refine.patches import patches
@@ -72,7 +72,7 @@ def fill(scene: Scene, sight: Sight, support: Support, seed: int = 0) -> Scene:
     colour = inpaint(picture.rgb, hole | under, known & ~ndimage.binary_dilation(under, iterations=2), seed)
     stale = torch.nonzero(flat)[:, 0]
     cells = picture.rows_columns(g.means[stale])
-    differ = np.linalg.norm(_lab(g[stale]) - cv2.cvtColor(colour, cv2.COLOR_RGB2LAB)[cells], axis=1) > OTHER
+    differ = np.linalg.norm(lab_of(g[stale]).numpy() - cv2.cvtColor(colour, cv2.COLOR_RGB2LAB)[cells], axis=1) > OTHER
     gone = torch.zeros(len(g), dtype=torch.bool)
     gone[stale[torch.from_numpy(differ & (under & near)[cells])]] = True
     gone &= sight.weight < BARELY if len(sight.weight) else True
@@ -82,11 +82,6 @@ def fill(scene: Scene, sight: Sight, support: Support, seed: int = 0) -> Scene:
     up = torch.tensor([[0.0, 0, 1]]).expand(len(points), 3)
     more = patches(points, up, torch.from_numpy(colour[new]), picture.cell, 0)
     return replace(scene, gaussians=concatenate([g[~gone], more]))
-
-
-def _lab(g: Gaussians) -> np.ndarray:
-    rgb = (g.sh[:, 0] * C0 + 0.5).clamp(0, 1).numpy().astype(np.float32)
-    return cv2.cvtColor(rgb[None], cv2.COLOR_RGB2LAB)[0].reshape(-1, 3)
 
 
 def _emptied(gone: Bool[Tensor, "n"], g: Gaussians, picture: Picture, near: np.ndarray) -> np.ndarray:

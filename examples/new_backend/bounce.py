@@ -1,0 +1,50 @@
+"""A simulator of one's own: every object a rigid body that falls and bounces. python bounce.py scene.ply traj.h5"""
+
+import sys
+from pathlib import Path
+
+import torch
+
+from stages.physics.keypoints import bind, choose_keypoints
+from stages.scene.files import provenance
+from stages.scene.scene import Scene
+from stages.scene.scene_ply import read_scene
+from stages.scene.trajectory import Motion, TrajectoryWriter
+
+DT, FRAMES, RESTITUTION = 0.02, 100, 0.6
+
+
+def heights(start: float, gravity: float, substeps: int = 20) -> list[float]:
+    """Height above the floor in every frame: semi-implicit Euler, and a bounce that loses energy [scene units]."""
+    z, v, out = start, 0.0, []
+    for _ in range(FRAMES):
+        out.append(z)
+        for _ in range(substeps):
+            v -= gravity * DT / substeps
+            z += v * DT / substeps
+            if z < 0:
+                z, v = 0.0, -RESTITUTION * v
+    return out
+
+
+def simulate(scene: Scene, out: Path) -> None:
+    """scene.ply with labelled objects -> traj.h5, which `ngff render` draws like any other."""
+    keypoints = choose_keypoints(scene, 512, seed=0)
+    gravity = 9.81 / scene.metres_per_unit
+    of = [keypoints.object_id == o.id for o in scene.objects]
+    paths = [heights(float(keypoints.rest[mask, 2].min()) - scene.floor, gravity) for mask in of]
+    upright = torch.tensor([[1.0, 0, 0, 0]]).repeat(len(of), 1)
+    motion = Motion(DT, (0.0, 0.0, -gravity), "bounce")
+    with TrajectoryWriter(out, scene, motion, keypoints, bind(scene, keypoints)) as traj:
+        for t in range(FRAMES):
+            positions = keypoints.rest.clone()
+            for mask, path in zip(of, paths, strict=True):
+                positions[mask, 2] += path[t] - path[0]
+            traj.append(positions, torch.stack([positions[mask].mean(0) for mask in of]), upright)
+    assert all(path[-1] < max(path[0], 0.05) + 1e-6 for path in paths)  # nothing ends higher than it began
+
+
+if __name__ == "__main__":
+    source, target = Path(sys.argv[1]), Path(sys.argv[2])
+    simulate(read_scene(source), target)
+    print(target, provenance("bounce", [source])["inputs"])

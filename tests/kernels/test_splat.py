@@ -39,7 +39,8 @@ def relative(ours, theirs) -> float:
 @pytest.mark.parametrize("closer", [0.0, 1.7], ids=["outside", "inside the cloud"])
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_projection_equals_its_reference(degree, closer):
-    camera, tensors = view_of(random_gaussians(203, degree=degree), closer)
+    # inside, large ones centred far outside the image reach into it, where the Jacobian is taken at the border
+    camera, tensors = view_of(random_gaussians(203, degree=degree, size=0.25 if closer else 0.05), closer)
     tensors = [t.clone().requires_grad_() for t in tensors]
     exact = [t.detach().double().requires_grad_() for t in tensors]
     splats, theirs = project(camera, *tensors)[0], project_reference(camera, *exact)

@@ -1,0 +1,152 @@
+"""The segment stage: its three ways to find objects, and its messages."""
+
+import json
+import logging
+from dataclasses import replace
+
+import pytest
+import torch
+
+from stages.errors import InputError
+from stages.geometry.cameras import project
+from stages.raster.rasterise import visibility
+from stages.scene.images import write_labels
+from stages.scene.scene_ply import read_scene, write_scene
+from stages.segment.masks import elect, without_outliers
+from stages.segment.options import SegmentOptions
+from stages.segment.stage import run
+from tests.segment.tabletop import best_overlap, three_apart
+
+
+@pytest.fixture(scope="module")
+def truth():
+    return three_apart(noise=0.001)
+
+
+@pytest.fixture
+def scene_file(truth, tmp_path):
+    path = tmp_path / "scene.ply"
+    blank = replace(truth.gaussians, object_id=torch.zeros_like(truth.gaussians.object_id))
+    write_scene(path, replace(truth, gaussians=blank))
+    return path
+
+
+def true_masks(scene):
+    """A label image for each camera: the object that each pixel shows."""
+    masks = []
+    for viewmat, K, size in zip(scene.cameras.viewmats, scene.cameras.Ks, scene.cameras.sizes, strict=True):
+        index, _ = visibility(scene.gaussians, viewmat, K, *size.tolist())
+        masks.append(torch.where(index >= 0, scene.gaussians.object_id[index.clamp_min(0)], 0))
+    return masks
+
+
+def write_masks(folder, scene, masks):
+    folder.mkdir()
+    for name, mask in zip(scene.cameras.names, masks, strict=True):
+        write_labels(folder / name.replace(".jpg", ".png"), mask)
+    return folder
+
+
+def test_geometric_writes_labels_names_cameras_and_where_they_come_from(scene_file, truth, tmp_path, caplog):
+    out = tmp_path / "labelled.ply"
+    with caplog.at_level(logging.INFO):
+        run(scene_file, out, SegmentOptions(names="1=tower of jelly"))
+    labelled = read_scene(out)
+    assert min(best_overlap(labelled.gaussians.object_id, truth.gaussians.object_id).values()) >= 0.9
+    assert labelled.objects[0].name == "tower of jelly"
+    assert len(labelled.cameras) == len(truth.cameras)
+    assert labelled.provenance["command"] == "segment"
+    assert "tower of jelly" in caplog.text and " cm" in caplog.text
+
+
+def test_masks_with_wrong_pixels_are_outvoted(scene_file, truth, tmp_path):
+    rng = torch.Generator().manual_seed(0)
+    masks = true_masks(truth)
+    for mask in masks:  # a tenth of all pixels say anything
+        wrong = torch.rand(mask.shape, generator=rng) < 0.1
+        mask[wrong] = torch.randint(0, 4, (int(wrong.sum()),), generator=rng)
+    masks[2] = masks[2].roll(25, 1)  # and one photo is off altogether
+    folder = write_masks(tmp_path / "masks", truth, masks)
+    (folder / "names.json").write_text(json.dumps({"1": "duck", "3": "tower"}))
+    run(scene_file, tmp_path / "out.ply", SegmentOptions(masks=folder))
+    labelled = read_scene(tmp_path / "out.ply")
+    assert [o.name for o in labelled.objects] == ["duck", "object_2", "tower"]
+    for i in (1, 2, 3):
+        mine, theirs = labelled.gaussians.object_id == i, truth.gaussians.object_id == i
+        assert float((mine & theirs).sum() / (mine | theirs).sum()) >= 0.9
+
+
+def test_a_tie_goes_to_the_neighbours(truth):
+    votes = torch.nn.functional.one_hot(truth.gaussians.object_id, 4).float()
+    tied = torch.nonzero(truth.gaussians.object_id == 2)[::7, 0]
+    votes[tied] = 1.0
+    unseen = torch.nonzero(truth.gaussians.object_id == 3)[::7, 0]
+    votes[unseen] = 0.0
+    ids = elect(truth, votes)
+    assert float((ids == truth.gaussians.object_id).float().mean()) > 0.995
+
+
+def test_outliers_by_the_modified_z_score():
+    # distances 1, 2, 3, 4, 100 from the median: median 3, MAD 1, so 0.6745 * 97 > 3.5 and 0.6745 * 2 is not
+    x = torch.tensor([0.0, -1, 1, -2, 2, -3, 3, -4, 4, 100])
+    means = torch.stack([x, torch.zeros(10), torch.zeros(10)], 1)
+    ids = without_outliers(means, torch.ones(10, dtype=torch.int64))
+    assert ids.tolist() == [1] * 9 + [0]
+
+
+def test_boxes_name_the_groups_that_fill_them(scene_file, truth, tmp_path):
+    rows = []
+    for i in (2, 1):
+        pixel = project(truth.gaussians.means[truth.gaussians.object_id == i], truth.cameras.viewmats[0],
+                        truth.cameras.Ks[0])  # fmt: skip
+        rows.append([*pixel.amin(0).tolist(), *pixel.amax(0).tolist()])
+    prompts = tmp_path / "prompts.json"
+    prompts.write_text(json.dumps({"bbox": rows, "text": ["a blue egg", "a red block"], "center_point": []}))
+    run(scene_file, tmp_path / "out.ply", SegmentOptions(boxes=prompts))
+    labelled = read_scene(tmp_path / "out.ply")
+    assert [(o.id, o.name) for o in labelled.objects] == [(1, "a blue egg"), (2, "a red block")]
+    for found, true in ((1, 2), (2, 1)):
+        mine, theirs = labelled.gaussians.object_id == found, truth.gaussians.object_id == true
+        assert float((mine & theirs).sum() / (mine | theirs).sum()) >= 0.9
+
+
+@pytest.mark.parametrize(
+    ("prepare", "says"),
+    [
+        (lambda p: {"masks": p / "nowhere"}, "is no folder"),
+        (lambda p: (p / "m").mkdir() or {"masks": p / "m"}, "no label image is named as a photo"),
+        (lambda p: {"boxes": p / "nowhere.json"}, "no such file"),
+        (lambda p: (p / "b.json").write_text("{}") and {"boxes": p / "b.json"}, "is not a prompts file"),
+        (lambda p: (p / "b.json").write_text('{"bbox": [[5, 5, 1, 1]], "text": ["x"]}') and {"boxes": p / "b.json"},
+         "has no area"),
+        (lambda p: {"names": "9=duck"}, "there is no object 9"),
+    ],
+)  # fmt: skip
+def test_a_mistake_is_one_sentence_and_nothing_is_written(scene_file, tmp_path, prepare, says):
+    with pytest.raises(InputError, match=says):
+        run(scene_file, tmp_path / "out.ply", SegmentOptions(**prepare(tmp_path)))
+    assert not (tmp_path / "out.ply").exists()
+
+
+def test_masks_of_other_proportions_are_refused(scene_file, truth, tmp_path):
+    folder = write_masks(tmp_path / "masks", truth, [torch.ones(80, 160, dtype=torch.int64)] * len(truth.cameras))
+    with pytest.raises(InputError, match="proportions"):
+        run(scene_file, tmp_path / "out.ply", SegmentOptions(masks=folder))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "says"),
+    [({"names": "duck"}, "NUMBER=NAME"), ({"max_objects": 0}, "max-objects"), ({"min_size": 2.0}, "min-size"),
+     ({"detail": 0.0}, "detail"), ({"masks": "a", "boxes": "b"}, "one of them")],
+)  # fmt: skip
+def test_options_check_themselves(wrong, says):
+    with pytest.raises(InputError, match=says):
+        SegmentOptions(**wrong)
+
+
+def test_an_empty_table_has_no_objects_and_says_so(truth, tmp_path, caplog):
+    bare = replace(truth, gaussians=truth.gaussians[truth.gaussians.object_id == 0])
+    write_scene(tmp_path / "bare.ply", bare)
+    run(tmp_path / "bare.ply", tmp_path / "out.ply")
+    assert read_scene(tmp_path / "out.ply").objects == ()
+    assert "no objects were found" in caplog.text

@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: setup demo test test-gpu lint bench clean
+.PHONY: setup demo test test-gpu lint clean
 
 setup: $(VENV)/.installed
 
@@ -23,9 +23,6 @@ test-gpu:
 
 lint: setup
 	$(BIN)/ruff check .
-
-bench: setup
-	$(BIN)/ngff-lab bench
 
 clean:
 	$(MAKE) -C examples/falling_toys clean

@@ -78,7 +78,8 @@ def coloured_wall() -> Gaussians:
 
     flat = sheet(1.4, 0.8, 0.015)
     x, y, _ = flat.points.unbind(1)
-    upright = Surface(torch.stack([x, torch.full_like(x, 0.75), y + 0.4], 1), torch.tensor([[0.0, -1, 0]]).repeat(len(x), 1))
+    points = torch.stack([x, torch.full_like(x, 0.75), y + 0.4], 1)
+    upright = Surface(points, torch.tensor([[0.0, -1, 0]]).repeat(len(x), 1))
     return coloured(upright, (0.8, 0.8, 0.75), 0)
 
 

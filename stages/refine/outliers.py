@@ -29,7 +29,9 @@ def floaters(g: Gaussians, limit: float = 3.5) -> Bool[Tensor, "n"]:
         core = means[far <= limit]
         size = float((core.amax(0) - core.amin(0)).norm()) if len(core) else 0.0
         blur = g.scales[members].amax(1) > max(0.35 * size, 1e-12)
-        out[members[((far > limit) & (alone > 0.5 * limit)) | (alone > 2 * limit) | (blur & (size > 0))]] = True
+        stray = ((far > limit) & (alone > 0.5 * limit)) | (alone > 2 * limit) | (blur & (size > 0))
+        if float(stray.float().mean()) < 0.5:  # what most of it is, is the object
+            out[members[stray]] = True
     return out
 
 

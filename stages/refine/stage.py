@@ -17,6 +17,7 @@ from stages.physics.support import find_support
 from stages.refine.background import fill
 from stages.refine.options import BACKENDS, RefineOptions
 from stages.refine.outliers import floaters
+from stages.refine.patches import none_like
 from stages.refine.sight import Sight, agreement
 from stages.scene.files import provenance
 from stages.scene.gaussians import Gaussians, concatenate
@@ -49,7 +50,8 @@ def refine(scene: Scene, options: RefineOptions = RefineOptions()) -> Scene:  # 
     scene = replace(scene, gaussians=g[~stray])
     sight = Sight.of(scene)
     numbers = [i for i in scene.gaussians.object_id.unique().tolist() if i > 0]
-    made = concatenate([completer(scene, i, sight, support, options) for i in tqdm(numbers, unit="object")])
+    made = [completer(scene, i, sight, support, options) for i in tqdm(numbers, unit="object")]
+    made = concatenate([none_like(scene.gaussians), *made])
     made = made[sight.hidden(scene.gaussians, made)]
     for i in numbers:
         count = int((made.object_id == i).sum())

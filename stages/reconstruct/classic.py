@@ -52,7 +52,9 @@ def reconstruct(photos: Photos, options: ReconstructOptions) -> Reconstruction:
     gaussians = _cropped(_moved(gaussians, move), move(ground.focus), move.scale * ground.radius)
     views = dataclasses.replace(views, cameras=views.cameras.moved(move))
     reach = move.scale * ground.radius
-    gaussians = photometric.refine(gaussians, views[trained], options.level.steps, reach, options.seed, device)
+    steps = options.steps(len(used), device)
+    known = [torch.where(m.support >= least, m.depth * move.scale, torch.zeros_like(m.depth)) for m in maps]
+    gaussians = photometric.refine(gaussians, views[trained], steps, reach, options.seed, device, known)
     facts = {"upright": _plain(move), "supporting_plane": ground.plane is not None}
     scene = Scene(gaussians, cameras=views.cameras, floor=0.0, scale=_scale(options), provenance=facts)
     return Reconstruction(scene, views, trained, held)

@@ -16,14 +16,15 @@ class Quality:
 
     side: int  # longest side the photos are worked at [px]
     gaussians: int  # how many to start from
-    steps: int  # photometric steps, each on one photo
+    steps: int  # photometric steps on a CPU, each on one photo; many photos get up to twice as many
+    steps_cuda: int  # the same on a GPU
     degree: int  # of the spherical harmonics
 
 
 QUALITIES = {
-    "draft": Quality(side=512, gaussians=50_000, steps=300, degree=0),
-    "normal": Quality(side=640, gaussians=90_000, steps=800, degree=1),
-    "high": Quality(side=1024, gaussians=300_000, steps=6000, degree=2),
+    "draft": Quality(side=512, gaussians=50_000, steps=300, steps_cuda=1000, degree=0),
+    "normal": Quality(side=640, gaussians=90_000, steps=800, steps_cuda=3000, degree=1),
+    "high": Quality(side=1024, gaussians=300_000, steps=3000, steps_cuda=10_000, degree=2),
 }
 
 
@@ -52,3 +53,8 @@ class ReconstructOptions:
     @property
     def side(self) -> int:
         return self.resolution or self.level.side
+
+    def steps(self, photos: int, device: str) -> int:
+        """Photometric steps: fixed by quality, device and photo count, so that a seed gives the same scene again."""
+        base = self.level.steps_cuda if device == "cuda" else self.level.steps
+        return base * min(max(photos, 20), 40) // 20

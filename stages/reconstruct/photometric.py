@@ -7,6 +7,7 @@ The number of steps is fixed beforehand, never by the clock, so a seed gives the
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import torch
@@ -24,6 +25,7 @@ from stages.scene.gaussians import Gaussians
 
 STRUCTURE = 0.2  # weight of 1 - SSIM against L1
 RATES = {"scales": 5e-3, "quats": 2e-3, "opacities": 3e-2, "base": 5e-3, "rest": 2.5e-4, "gains": 2e-3}
+DEPTH = 0.1  # weight of the error in inverse depth, in units of one over the cameras' distance
 MOVE = 2e-4  # of the means, times the cameras' distance; falls to a hundredth of it
 FAINT = 0.02  # Gaussians of less opacity are dropped
 SPLITS = (0.2, 0.4)  # after these shares of the steps, Gaussians where detail is missing are split
@@ -36,6 +38,7 @@ class _Fit:
 
     values: dict[str, Tensor]
     optimiser: torch.optim.Optimizer
+    reach: float  # of the cameras [scene units]
 
     @classmethod
     def start(cls, gaussians: Gaussians, views: int, reach: float) -> _Fit:
@@ -51,7 +54,7 @@ class _Fit:
         values = {name: value.clone().requires_grad_() for name, value in values.items() if value.numel()}
         rates = {**RATES, "means": MOVE * reach}
         groups = [{"params": [value], "lr": rates[name], "name": name} for name, value in values.items()]
-        return cls(values, torch.optim.Adam(groups, eps=1e-15, fused=True))
+        return cls(values, torch.optim.Adam(groups, eps=1e-15, fused=True), reach)
 
     def gaussians(self) -> Gaussians:
         """As the rasteriser wants them, with gradients."""
@@ -83,11 +86,18 @@ class _Fit:
 
 
 def refine(
-    gaussians: Gaussians, views: Views, steps: int, reach: float, seed: int = 0, device: str = "cpu"
+    gaussians: Gaussians,
+    views: Views,
+    steps: int,
+    reach: float,
+    seed: int = 0,
+    device: str = "cpu",
+    depths: Sequence[Float[Tensor, "h w"]] = (),
 ) -> Gaussians:
     """Gaussians that render more like the photos.
 
     One photo a step, in random order without repeats. `reach` is the cameras' typical distance [scene units].
+    `depths` of the views, 0 where unknown, hold the surfaces where matching found them.
     The background is a random grey in every step, so what the photos show opaque becomes opaque.
     """
     fit = _Fit.start(gaussians.to(device), len(views), reach)
@@ -98,7 +108,8 @@ def refine(
     with tqdm(range(steps), desc="fitting photos", unit="step", leave=False) as bar:
         for step in bar:
             order = order or torch.randperm(len(views), generator=generator).tolist()
-            loss = _step(fit, views, order.pop(), float(torch.rand((), generator=generator)), device)
+            view, grey = order.pop(), float(torch.rand((), generator=generator))
+            loss = _step(fit, views, view, grey, device, reach / depths[view] if depths else None)
             pull += fit.values["means"].grad.norm(dim=1)
             fit.optimiser.step()
             fit.optimiser.param_groups[0]["lr"] = MOVE * reach * 0.01 ** (step / steps)
@@ -110,8 +121,10 @@ def refine(
     return _finished(fit, views, pull > 0, reach)
 
 
-def _step(fit: _Fit, views: Views, view: int, grey: float, device: str) -> float:
-    """Gradients of the loss on one photo."""
+def _step(
+    fit: _Fit, views: Views, view: int, grey: float, device: str, inverse: Float[Tensor, "h w"] | None = None
+) -> float:
+    """Gradients of the loss on one photo; `inverse` is its inverse depth times the reach, inf where unknown."""
     photo = views.image(view, device)
     height, width = photo.shape[:2]
     background = torch.full((3,), grey, device=device)
@@ -121,6 +134,10 @@ def _step(fit: _Fit, views: Views, view: int, grey: float, device: str) -> float
     )  # fmt: skip
     image = rendering.rgb[0] * fit.gain(view)
     loss = (1 - STRUCTURE) * (image - photo).abs().mean() + STRUCTURE * (1 - ssim(image, photo))
+    if inverse is not None:
+        error = fit.reach / rendering.depth[0].clamp_min(0.1 * fit.reach) - inverse.to(device)
+        known = error.isfinite() & (rendering.alpha[0] > 0.5)
+        loss = loss + DEPTH * torch.where(known, error, torch.zeros_like(error)).abs().mean()
     fit.optimiser.zero_grad(set_to_none=True)
     loss.backward()
     return loss.item()

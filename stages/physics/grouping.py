@@ -192,7 +192,7 @@ def complete(g: Gaussians, support: Support | None, reach: float) -> Gaussians:
     is nearer to the object than to the table around.
     """
     ids = g.object_id.clone()
-    labelled = torch.nonzero(ids > 0)[:, 0]
+    labelled = torch.nonzero((ids > 0) & g.means.isfinite().all(1))[:, 0]
     free = torch.nonzero((ids == 0) & g.means.isfinite().all(1) & (g.scales.amax(1) < 3 * reach))[:, 0]
     if not len(labelled) or not len(free):
         return g
@@ -224,7 +224,7 @@ def _fill_hulls(g: Gaussians, ids: Int[Tensor, "n"], free: Int[Tensor, "m"], sup
     counts = torch.bincount(ids)
     for number in [i for i in counts.argsort().tolist() if i > 0 and counts[i] >= 8]:
         rest = free[ids[free] == 0]
-        own = g.means[ids == number]
+        own = g.means[(ids == number) & g.means.isfinite().all(1)]
         if support is not None and float(support.heights(own).quantile(0.02)) < 3 * support.tolerance:
             foot = own[support.heights(own) < 6 * support.tolerance]
             own = torch.cat([own, torch.cat([foot[:, :2], support.surface(foot)[:, None]], 1)])

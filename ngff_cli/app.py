@@ -18,7 +18,9 @@ from stages.segment.options import SegmentOptions
 from stages.simulate.options import BACKENDS as SIMULATE
 from stages.simulate.options import SimulateOptions
 
-app = typer.Typer(cls=Commands, no_args_is_help=True, rich_markup_mode=None, add_completion=False)
+app = typer.Typer(
+    cls=Commands, no_args_is_help=True, rich_markup_mode=None, add_completion=False, pretty_exceptions_enable=False
+)
 QUALITY_HELP = " | ".join(QUALITIES)
 
 

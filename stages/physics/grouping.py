@@ -5,16 +5,15 @@ from __future__ import annotations
 import logging
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy.spatial import ConvexHull, QhullError
 from torch import Tensor
 
-from stages.geometry.harmonics import C0
+from stages.geometry.cameras import centres
 from stages.geometry.neighbours import knn
 from stages.geometry.rotations import matrix
+from stages.physics.growing import complete, lab_of, table_colour
 from stages.physics.naming import names_of
 from stages.physics.regions import Merging, Voxels, edges_of, small_regions
 from stages.physics.sight import seen_from
@@ -24,6 +23,10 @@ from stages.scene.scene import Scene, SceneObject
 
 log = logging.getLogger(__name__)
 MOST_VOXELS = 60_000
+CROWD = 0.3  # Gaussians that a voxel of a real surface holds at least, of those usual near the focus
+HIGH = 0.4  # what hangs higher above the table than this is no thing on it [view radii]
+LOW = 0.05  # what ends lower than this and has the table's colour is a bump of the table [view radii]
+LARGE = 0.4  # longest side of a thing that stands out of its surroundings [view radii]
 
 
 @dataclass(frozen=True)
@@ -32,7 +35,7 @@ class Grouping:
 
     max_objects: int = 24
     min_size: float = 0.03  # of an object, along its longest side [distance of the cameras from the focus]
-    detail: float = 0.33  # regions that differ less than this are one object; smaller gives more objects
+    detail: float = 0.41  # regions that differ less than this are one object; smaller gives more objects
     seed: int = 0
 
 
@@ -54,17 +57,15 @@ def group(scene: Scene, grouping: Grouping = Grouping()) -> Scene:
     voxels, owner = _voxels(g[index], view, None if seen is None else seen[index])
     edges = edges_of(voxels)
     least = max(4, int((grouping.min_size * view.radius / voxels.size) ** 2))
-    things = Merging(voxels, edges, small_regions(voxels, edges), least, grouping.detail).run()
-    things = _objects(voxels, np.bincount(owner[owner >= 0], minlength=len(voxels)), things, view, support, grouping)
+    regions = small_regions(voxels, edges)
+    things = Merging(voxels, edges, regions, least, grouping.detail, LARGE * view.radius).run()
+    count = np.bincount(owner[owner >= 0], minlength=len(voxels)) * _thinning(voxels, scene, view)
+    if support is not None:
+        things = _without_skirts(voxels, things, table_colour(g, support), support)
+    things = _objects(voxels, count, things, view, support, grouping)
     g.object_id[index] = torch.from_numpy(np.where(owner >= 0, things[owner], 0))
     g = complete(g, support, 2 * voxels.size)
     return named(replace(scene, gaussians=g), support)
-
-
-def lab_of(g: Gaussians) -> Float[Tensor, "n 3"]:
-    """Base colours in CIELAB."""
-    rgb = (g.sh[:, 0] * C0 + 0.5).nan_to_num(0.5).clamp(0, 1).numpy().astype(np.float32)
-    return torch.from_numpy(cv2.cvtColor(rgb[None], cv2.COLOR_RGB2LAB)[0].reshape(-1, 3))
 
 
 def _candidates(g: Gaussians, view: View, support: Support | None) -> Int[Tensor, "m"]:
@@ -158,6 +159,36 @@ def _normals(g: Gaussians, points: Tensor, owner: Tensor, count: Tensor, seen: T
     return normals * torch.where((normals * toward).sum(1, keepdim=True) < 0, -1.0, 1.0)
 
 
+def _thinning(voxels: Voxels, scene: Scene, view: View) -> np.ndarray:
+    """How much thinner than usual Gaussians lie, being farther from the nearest camera: distance squared."""
+    if scene.cameras is None or not len(scene.cameras):
+        return np.ones(len(voxels))
+    distance, _ = knn(centres(scene.cameras.viewmats), torch.from_numpy(voxels.points).float(), 1)
+    return (distance[:, 0] / view.radius).clamp(0.5, 2).square().numpy()
+
+
+def _without_skirts(
+    voxels: Voxels, things: np.ndarray, table: Float[Tensor, "bx by 3"], support: Support
+) -> np.ndarray:
+    """Things that are pieces of the table (-1): low, and of its colour, or nearly so in the shade of a larger thing."""
+    points = torch.from_numpy(voxels.points).float()
+    h = support.heights(points).numpy() / support.view.radius
+    around = table[tuple((support.cells(points) // 3).T)].numpy()
+    unlike = np.linalg.norm(voxels.lab - around, axis=1)
+    _, column = np.unique(np.floor(voxels.points[:, :2] / (4 * voxels.size)), axis=0, return_inverse=True)
+    column, size = column.reshape(-1), np.bincount(things[things >= 0])
+    out = things.copy()
+    for thing in np.unique(things[things >= 0]):
+        members = things == thing
+        if np.percentile(h[members], 95) > LOW:
+            continue
+        above = np.isin(column, column[members]) & (things >= 0) & (size[things] > 3 * size[thing])
+        shaded = len(np.unique(column[above])) > 0.5 * len(np.unique(column[members]))
+        if np.median(unlike[members]) < (25 if shaded else 10):
+            out[members] = -1
+    return out
+
+
 def _objects(
     voxels: Voxels, count: np.ndarray, things: np.ndarray, view: View, support: Support | None, grouping: Grouping
 ) -> np.ndarray:
@@ -167,75 +198,26 @@ def _objects(
     """
     points = torch.from_numpy(voxels.points).float()
     off = np.zeros(len(voxels), bool)
+    h = np.zeros(len(voxels))
     if support is not None:
-        h = support.heights(points)
-        off = (~support.inside(points) | (h < -2 * support.tolerance)).numpy()
+        h = support.heights(points).numpy()
+        off = ~support.inside(points).numpy() | (h < -2 * support.tolerance)
+    near = np.linalg.norm(voxels.points - view.focus.numpy(), axis=1) < 0.3 * view.radius
+    crowd = CROWD * np.median(count[near]) if near.any() else 0.0
     smallest = grouping.min_size * view.radius
     found = []
-    for thing in range(things.max() + 1):
+    for thing in np.unique(things[things >= 0]):
         members = things == thing
         low, high = np.percentile(voxels.points[members], (2, 98), axis=0)
         sized = smallest <= (high - low).max() < 1.2 * view.radius
         enough = members.sum() >= max(8, 0.35 * (smallest / voxels.size) ** 2)
-        if sized and enough and off[members].mean() < 0.4 and count[members].mean() > 1.3:
+        here = off[members].mean() < 0.4 and h[members].min() < HIGH * view.radius
+        if sized and enough and here and count[members].mean() > crowd:
             found.append((int(members.sum()), thing))
     out = np.zeros(len(voxels), np.int64)
     for number, (_, thing) in enumerate(sorted(found, reverse=True)[: grouping.max_objects], start=1):
         out[things == thing] = number
     return out
-
-
-def complete(g: Gaussians, support: Support | None, reach: float) -> Gaussians:
-    """Objects made whole: faint and stray Gaussians within them, and their feet, take the nearest object's number.
-
-    `reach` [scene units] is how near is near. Close to the plane a Gaussian is the object's when its colour
-    is nearer to the object than to the table around.
-    """
-    ids = g.object_id.clone()
-    labelled = torch.nonzero((ids > 0) & g.means.isfinite().all(1))[:, 0]
-    free = torch.nonzero((ids == 0) & g.means.isfinite().all(1) & (g.scales.amax(1) < 3 * reach))[:, 0]
-    if not len(labelled) or not len(free):
-        return g
-    distance, nearest = knn(g.means[labelled], g.means[free], 1)
-    nearest = labelled[nearest[:, 0]]
-    allowed = torch.ones(len(free), dtype=torch.bool)
-    if support is not None:
-        h = support.heights(g.means[free])
-        table = _table_colour(g, support)[tuple((support.cells(g.means[free]) // 3).T)]
-        lab = lab_of(g)
-        mine = (lab[free] - lab[nearest]).norm(dim=1) < 0.7 * (lab[free] - table).norm(dim=1)
-        allowed = (h > support.tolerance) | (mine & (h > -0.5 * support.tolerance))
-    take = allowed & (distance[:, 0] < reach)
-    ids[free[take]] = ids[nearest[take]]
-    return replace(g, object_id=_fill_hulls(g, ids, free[allowed], support))
-
-
-def _table_colour(g: Gaussians, support: Support) -> Float[Tensor, "bx by 3"]:
-    """Usual colour of the table, in blocks of 3 x 3 cells."""
-    on = (support.heights(g.means).abs() < support.tolerance) & (g.object_id == 0) & g.means.isfinite().all(1)
-    return windowed(cell_medians(support, g.means[on], lab_of(g[on]), 3), reach=3)
-
-
-def _fill_hulls(g: Gaussians, ids: Int[Tensor, "n"], free: Int[Tensor, "m"], support: Support | None) -> Tensor:
-    """Those of the `free` Gaussians inside one object's convex hull (down to the plane, if it stands on it) join it.
-
-    The smallest object goes first.
-    """
-    counts = torch.bincount(ids)
-    for number in [i for i in counts.argsort().tolist() if i > 0 and counts[i] >= 8]:
-        rest = free[ids[free] == 0]
-        own = g.means[(ids == number) & g.means.isfinite().all(1)]
-        if support is not None and float(support.heights(own).quantile(0.02)) < 3 * support.tolerance:
-            foot = own[support.heights(own) < 6 * support.tolerance]
-            own = torch.cat([own, torch.cat([foot[:, :2], support.surface(foot)[:, None]], 1)])
-        rest = rest[((g.means[rest] > own.amin(0)) & (g.means[rest] < own.amax(0))).all(1)]
-        try:
-            hull = ConvexHull(own.double().numpy()).equations
-        except (QhullError, ValueError):
-            continue
-        inside = (g.means[rest].double().numpy() @ hull[:, :3].T + hull[:, 3]).max(1, initial=-np.inf) < 1e-9
-        ids[rest[torch.from_numpy(inside)]] = number
-    return ids
 
 
 def named(scene: Scene, support: Support | None) -> Scene:

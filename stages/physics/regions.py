@@ -119,8 +119,8 @@ class Border:
 class Merging:
     """Regions merged two at a time, the two that most look like one thing first."""
 
-    def __init__(self, voxels: Voxels, edges: Edges, labels: np.ndarray, least: int, limit: float):
-        self.voxels, self.least, self.limit = voxels, least, limit
+    def __init__(self, voxels: Voxels, edges: Edges, labels: np.ndarray, least: int, limit: float, large: float):
+        self.voxels, self.least, self.limit, self.large = voxels, least, limit, large
         self.palette = _palette(voxels.lab)
         soft = _soft_bins(voxels.lab, self.palette)
         order = np.argsort(labels, kind="stable")
@@ -162,8 +162,13 @@ class Merging:
         hollow = self._hollow(one, two)
         colour = unlike * (0.35 + 0.1 * step) * min(0.6 + 20 * hollow, 1.4)
         shape = 1.5 * valley + 0.2 * neck + 3 * hollow
-        value = colour + shape * (0.2 + 0.8 * unlike) - 0.5 * min(within, 1.0)
+        value = colour + shape * (0.2 + 0.8 * unlike) - 0.5 * min(within, 1.0) + self._too_large(one, two)
         return value - (0.5 if small < self.least else 0.0)
+
+    def _too_large(self, one: Region, two: Region) -> float:
+        """Things that one picks up are not as large as what the cameras look at: from `large` on it speaks against."""
+        corners = np.concatenate([one.corners, two.corners])
+        return float(np.clip(np.ptp(corners, axis=0).max() / self.large - 1, 0, 1))
 
     def _hollow(self, one: Region, two: Region) -> float:
         """How much deeper their points lie in the hull of both than in their own, as a share of the smaller's size."""

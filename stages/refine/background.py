@@ -12,7 +12,7 @@ from scipy import ndimage
 from torch import Tensor
 
 from stages.geometry.neighbours import knn
-from stages.physics.grouping import lab_of
+from stages.physics.growing import lab_of
 from stages.physics.support import Support
 from stages.raster.rasterise import rasterise
 from stages.refine.patches import patches

@@ -104,6 +104,8 @@ def _body(
     if support is not None:
         other &= (support.heights(everything.means) > support.tolerance) | (everything.object_id > 0)
     taken = grid.cells_of(everything.means[other])
+    others = everything[(everything.object_id != number) & (everything.object_id > 0)]
+    inside &= _nearer_to(own, others, centres, inside)
     body = inside.numpy().reshape(grid.shape)
     if sight.views:
         cells = torch.nonzero(inside)[:, 0]
@@ -115,6 +117,16 @@ def _body(
     body = ndimage.binary_opening(body & ~taken, iterations=1) | occupied
     parts, _ = ndimage.label(body)
     return np.isin(parts, np.unique(parts[occupied]))
+
+
+def _nearer_to(own: Gaussians, others: Gaussians, points: Tensor, asked: Tensor) -> Tensor:
+    """Of the points `asked` for, those nearer to the object than to any other."""
+    low, high = points.amin(0), points.amax(0)
+    others = others[((others.means > low) & (others.means < high)).all(1)]
+    out = asked.clone()
+    if len(others) and bool(asked.any()):
+        out[asked] = knn(own.means, points[asked], 1)[0][:, 0] <= knn(others.means, points[asked], 1)[0][:, 0]
+    return out
 
 
 def _standing(own: Gaussians, support: Support | None) -> np.ndarray:

@@ -12,7 +12,7 @@ from tqdm import tqdm
 from stages.backends import choose, pick_device
 from stages.errors import InputError
 from stages.geometry.neighbours import knn
-from stages.physics.grouping import complete as take_halo
+from stages.physics.growing import complete as take_halo
 from stages.physics.support import find_support
 from stages.refine.background import fill
 from stages.refine.options import BACKENDS, RefineOptions

@@ -16,7 +16,7 @@ from stages.errors import InputError
 from stages.geometry.cameras import depths, project
 from stages.geometry.cameras import resize as resize_K
 from stages.geometry.neighbours import knn
-from stages.physics.grouping import complete
+from stages.physics.growing import complete
 from stages.physics.support import find_support
 from stages.raster.rasterise import rasterise, visibility
 from stages.scene.images import PHOTOS, read_labels

@@ -22,7 +22,7 @@ class SegmentOptions:
     names: str = ""  # "1=duck,2=bowl" in place of the names found
     max_objects: int = 24
     min_size: float = 0.03  # of an object, along its longest side [distance of the cameras from what they look at]
-    detail: float = 0.33  # how unlike two regions may be and still be one object; smaller gives more objects
+    detail: float = 0.41  # how unlike two regions may be and still be one object; smaller gives more objects
     seed: int = 0
     device: str = "auto"
 
@@ -34,7 +34,7 @@ class SegmentOptions:
         if not 0 < self.min_size < 1:
             raise InputError(f"--min-size {self.min_size}: must be between 0 and 1, such as 0.03")
         if not 0 < self.detail < 2:
-            raise InputError(f"--detail {self.detail}: must be between 0 and 2, such as 0.33")
+            raise InputError(f"--detail {self.detail}: must be between 0 and 2, such as 0.4")
         self.renamed  # noqa: B018 -- a bad name is found before work starts
 
     @property

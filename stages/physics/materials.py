@@ -37,6 +37,7 @@ PAPER = "GSCollision, E and density as published (Poisson 0.3); friction and los
 MATERIALS: Mapping[str, Material] = {
     # rubber: Poisson 0.49 in the handbook; 0.45 keeps pressure waves, and so the substep, affordable
     "rubber": Material(2e6, 930.0, 0.45, 0.8, 0.15, ASHBY + ": natural rubber 1.5-2.5 MPa"),
+    "common": Material(1.9e5, 540.0, 0.3, 0.5, 0.15, "geometric mean of the ten objects of GSCollision"),
     "soft": Material(3e4, 120.0, 0.2, 0.6, 0.3, GIBSON + ": stuffing as a very open soft foam"),
     "foam": Material(1e5, 50.0, 0.2, 0.7, 0.3, ASHBY + ": flexible polymer foam 0.04-1 MPa, 38-70 kg/m3"),
     "cloth": Material(3e3, 100.0, 0.3, 0.5, 0.4, PAPER + ": cloth"),
@@ -72,7 +73,7 @@ ALIASES = {
     "fruit": ["apple", "banana", "orange", "lemon", "pear"],
     "ball": ["soccer", "football", "basketball"],
 }
-GUESS = "soft"
+GUESS = "common"
 
 
 @dataclass(frozen=True)

@@ -130,15 +130,27 @@ def _nearer_to(own: Gaussians, others: Gaussians, points: Tensor, asked: Tensor)
 
 
 def _standing(own: Gaussians, support: Support | None) -> np.ndarray:
-    """The object's points, and below its lowest part the points on the plane that it stands on."""
+    """The object's points, and below its lowest part the points on the plane that it stands on.
+
+    One that would tip over as seen must be held by what nobody saw: then below all of it.
+    """
     points = own.means
     if support is not None:
         h = support.heights(points)
-        height = float(h.max())
-        low = h < max(3 * support.tolerance, 0.15 * height)
+        low = h < max(3 * support.tolerance, 0.15 * float(h.max()))
         if float(h.min()) < 3 * support.tolerance:
-            points = torch.cat([points, torch.cat([points[low, :2], support.surface(points[low])[:, None]], 1)])
+            foot = points if _tips(points[:, :2], points[low, :2]) else points[low]
+            points = torch.cat([points, torch.cat([foot[:, :2], support.surface(foot)[:, None]], 1)])
     return points.double().numpy()
+
+
+def _tips(points: Float[Tensor, "n 2"], base: Float[Tensor, "m 2"]) -> bool:
+    """Whether the middle of the points lies outside the convex hull of what stands on the plane."""
+    try:
+        hull = ConvexHull(base.double().numpy()).equations
+    except (QhullError, ValueError):
+        return False
+    return bool((hull[:, :2] @ points.double().mean(0).numpy() + hull[:, 2]).max() > 0)
 
 
 def _hull_test(points: np.ndarray, queries: Float[Tensor, "c 3"], margin: float) -> np.ndarray:

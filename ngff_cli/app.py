@@ -164,7 +164,7 @@ def simulate(
 def render(
     source: Annotated[Path, Argument(metavar="TRAJ.h5|SCENE.ply", help="what to draw", show_default=False)],
     out: Annotated[
-        Path | None, Option("-o", "--out", help=".mp4 or .png; by default beside the input, and printed")
+        Path | None, Option("-o", "--out", help=".mp4, .png or .jpg; by default beside the input, and printed")
     ] = None,
     view: Annotated[str, Option(help=VIEWS)] = RenderOptions.view,
     resolution: Annotated[int, Option(help="longest side [px]")] = RenderOptions.resolution,

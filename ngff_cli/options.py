@@ -1,6 +1,7 @@
 """What the two command lines share: argument types, and how errors reach the user."""
 
 import logging
+import os
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -17,6 +18,8 @@ Verbose = Annotated[bool, typer.Option("-v", "--verbose", help="say more about w
 
 def set_up_logging(verbose: bool) -> None:
     """Messages to stderr, past any progress bar; results alone go to stdout."""
+    if not sys.stderr.isatty():  # in a log, a line of progress now and then will do
+        os.environ.setdefault("TQDM_MININTERVAL", "10")
     logging.basicConfig(format="%(message)s", stream=sys.stderr, level=logging.WARNING, force=True)
     for name in ("stages", "ngff_cli"):
         logging.getLogger(name).setLevel(logging.DEBUG if verbose else logging.INFO)

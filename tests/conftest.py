@@ -63,6 +63,10 @@ def ball(centre: tuple, radius: float, n: int, colour: tuple, object_id: int, se
 
 @pytest.fixture
 def two_balls() -> Scene:
+    return two_balls_scene()
+
+
+def two_balls_scene() -> Scene:
     """A red and a green ball above a grey floor at z = 0, and six cameras."""
     grid = torch.cartesian_prod(torch.linspace(-1, 1, 30), torch.linspace(-1, 1, 30))
     floor = Gaussians(

@@ -25,7 +25,7 @@ from stages.render.subject import subject_of
 from stages.scene.cameras import Cameras
 from stages.scene.files import provenance, replacing
 from stages.scene.gaussians import Gaussians
-from stages.scene.images import VideoWriter, write_depth, write_png
+from stages.scene.images import VideoWriter, write_depth, write_jpeg, write_png
 
 log = logging.getLogger(__name__)
 MOMENTS, ACROSS = 12, 4  # of a contact sheet
@@ -42,8 +42,8 @@ def run(source: Path, out: Path | None, options: RenderOptions) -> Path:
     device = pick_device(options.device)
     footage = open_footage(source, options.frame, device)
     out = Path(out) if out is not None else _beside(source, footage, options)
-    if out.suffix.lower() not in (".mp4", ".png"):
-        raise InputError(f"{out}: pictures are written as .mp4 or .png; give it one of these endings")
+    if out.suffix.lower() not in (".mp4", ".png", ".jpg"):
+        raise InputError(f"{out}: pictures are written as .mp4, .png or .jpg; give it one of these endings")
     studio = Studio(footage, options, open_backdrop(options.background), device)
     made = (film if out.suffix.lower() == ".mp4" else still)(out, studio)
     used = [Path(p) for p in (source, options.background, options.view) if p is not None and Path(p).is_file()]
@@ -135,10 +135,11 @@ def still(out: Path, studio: Studio) -> dict:
         views, columns = list(_moments(studio)), ACROSS
     else:
         views, columns = studio.seen(0.0, studio.cameras(1, options.resolution), [0]), 1
-    if options.depth and len(views) == 1:
+    if options.depth and len(views) == 1 and out.suffix.lower() == ".png":
         return _write_depth(out, views[0].depth)
     span = depth_range([v.depth for v in views]) if options.depth else None
-    write_png(out, studio.picture(views, span, columns))
+    write = write_jpeg if out.suffix.lower() == ".jpg" else write_png
+    write(out, studio.picture(views, span, columns))
     return {"views": len(views), **_depth_facts(span)}
 
 

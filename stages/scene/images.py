@@ -122,9 +122,12 @@ class VideoWriter:
         self._file.mux(self._stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(pixels), format="rgb24")))
 
     def __exit__(self, kind, error, trace) -> None:
-        if kind is None and self._stream is not None:
-            self._file.mux(self._stream.encode())
-        self._file.close()
+        try:
+            if kind is None and self._stream is not None:
+                self._file.mux(self._stream.encode())
+            self._file.close()
+        except OSError as failed:
+            kind, error, trace = type(failed), failed, failed.__traceback__
         self._replacing.__exit__(kind, error, trace)
 
 

@@ -12,6 +12,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import logging
 from dataclasses import dataclass, fields
@@ -85,6 +86,36 @@ class Trajectory:
         return Gaussians(**parts, opacities=g.opacities, sh=g.sh, object_id=g.object_id)
 
 
+class _Careful(io.FileIO):
+    """A file to which HDF5 writes without ever hearing of an error, which it does not survive; `error` remembers it."""
+
+    error: OSError | None = None
+
+    def write(self, data) -> int:
+        rest = memoryview(data).cast("B")
+        while len(rest) and self.error is None:
+            try:
+                rest = rest[super().write(rest) :]
+            except OSError as error:
+                self.error = error
+        return len(data)
+
+    def truncate(self, size: int | None = None) -> int:
+        try:
+            return super().truncate(size)
+        except OSError as error:
+            self.error = self.error or error
+            return size or 0
+
+    def flush(self) -> None:
+        """Nothing is held back."""
+
+    def check(self) -> None:
+        """Raises OSError if anything could not be written."""
+        if self.error is not None:
+            raise self.error
+
+
 class TrajectoryWriter:
     """Writes a trajectory frame by frame; the file takes its name when all is well.
 
@@ -99,9 +130,13 @@ class TrajectoryWriter:
         self._replacing = replacing(self.path)
         self._part = self._replacing.__enter__()
         try:
-            self._file = h5py.File(self._part, "w")
+            self._raw = _Careful(self._part, "w+b")
+            self._file = h5py.File(self._raw, "w")
             _write_rest(self._file, *self._contents)
+            self._raw.check()
         except BaseException as error:
+            if hasattr(self, "_file"):
+                self._close()
             self._replacing.__exit__(type(error), error, error.__traceback__)
             raise
         return self
@@ -114,10 +149,17 @@ class TrajectoryWriter:
             data = self._file[name]
             data.resize(self.frames + 1, axis=0)
             data[self.frames] = row.detach().cpu().numpy()
+        self._raw.check()
         self.frames += 1
 
-    def __exit__(self, kind, error, trace) -> None:
+    def _close(self) -> None:
         self._file.close()
+        self._raw.close()
+
+    def __exit__(self, kind, error, trace) -> None:
+        self._close()
+        if kind is None and self._raw.error is not None:
+            kind, error = OSError, self._raw.error
         if kind is not None and issubclass(kind, InputError) and self.frames:
             kept = self.path.with_name(f"{self.path.stem}.partial.h5")
             self._part.replace(kept)

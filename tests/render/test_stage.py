@@ -83,6 +83,8 @@ def test_a_png_of_a_film_is_a_sheet_of_moments(trajectory, tmp_path):
 def test_all_views_in_one_picture(scene, tmp_path):
     sheet = picture(scene, tmp_path / "all.png", view="all")
     assert sheet.shape == (2 * 64, 3 * 64, 3)
+    small = picture(scene, tmp_path / "all.jpg", view="all")
+    assert small.shape == sheet.shape and (small - sheet).abs().mean() < 0.02
     one = picture(scene, tmp_path / "one.png", view="input:4", resolution=64)
     assert torch.equal(sheet[64:, 64:128], one)
     assert run(scene, None, options(view="all")).name == "scene_all.png"

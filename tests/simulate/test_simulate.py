@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from stages.errors import InputError
+from stages.physics.materials import GUESS
 from stages.scene.gaussians import concatenate
 from stages.scene.scene import Scene, SceneObject
 from stages.scene.scene_ply import read_scene, write_scene
@@ -60,7 +61,7 @@ def test_the_first_frame_is_the_scene_and_falling_is_a_parabola(balls, caplog):
     assert float(t.com[-1, 1, 2] - t.com[0, 1, 2]) == pytest.approx(-9.81 * 0.1**2 / 2, rel=0.02)
     assert shift(t, 1).norm() < SAG  # stands
     assert (t.binding.index[t.scene.gaussians.object_id == 0] == -1).all()
-    assert "material not known, taking soft" in caplog.text and "substep" in caplog.text
+    assert f"material not known, taking {GUESS}" in caplog.text and "substep" in caplog.text
     assert t.scene.provenance["command"] == "simulate"
 
 

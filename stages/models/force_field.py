@@ -1,0 +1,256 @@
+"""Our force field: rigid bodies that deform, moved by learned forces where they touch.
+
+What physics says is built in, what it leaves open is learned: bodies turn on SO(3) with their inertia tensor; a contact
+force acts on both bodies, opposite and at one place, so linear and angular momentum are kept; nothing depends on the
+directions of the axes, the order of things, or padding; no body gets deeper into the floor or a wall than `SINK`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from stages.geometry.rotations import matrix, multiply, quaternion
+from stages.models.dynamics import FRAME, Dynamics
+from stages.models.places import Moving, pair_places, plane_places
+from stages.models.pushes import Pushes
+from stages.models.rigid import fitted, limited, spin_of, turned
+from stages.models.shape import Shape, shape_of
+from stages.models.stress import Stress, bounded, projected
+from stages.models.touch import Touch
+from stages.models.vectors import mlp
+from stages.models.world import World, centre
+
+SINK = 0.03  # deepest that a point may get into the floor or a wall [m]
+RISE = 1.0  # fastest that a body is pushed out from deeper [m/s]
+FASTEST, WILDEST = 8.0, 60.0  # speed [m/s] and spin [rad/s] are kept below
+HOLD = 0.05  # strongest grip of the floor [m/s]
+
+
+class BodyState(NamedTuple):
+    """Bodies, their points displaced in their own frame."""
+
+    com: Float[Tensor, "b o 3"]  # [m]
+    quat: Float[Tensor, "b o 4"]  # w x y z, relative to rest
+    velocity: Float[Tensor, "b o 3"]  # [m/s]
+    momentum: Float[Tensor, "b o 3"]  # angular, about the centre of mass, per unit of mass, world axes [m^2/s]
+    u: Float[Tensor, "b o n 3"]  # displacement from rest [m]
+    du: Float[Tensor, "b o n 3"]  # its rate [m/s]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What a rollout computes once."""
+
+    shape: Shape
+    code: Float[Tensor, "b o h"]  # shape and material of an object, as the network sees it
+    stiffness: Float[Tensor, "b o"]  # of the displacements [1/s^2]
+    damping: Float[Tensor, "b o"]  # [1/s]
+
+
+class Rates(NamedTuple):
+    """What acts, per unit of mass."""
+
+    force: Float[Tensor, "b o 3"]  # [m/s^2]
+    torque: Float[Tensor, "b o 3"]  # about the centre of mass [m^2/s^2]
+    stress: Float[Tensor, "b o n 3"]  # in the object's frame [m/s^2]
+    grip: Float[Tensor, "b o 1"]  # speed below which the floor holds a body [m/s]
+
+
+class ForceField(Dynamics):
+    """`ngff`, the default."""
+
+    told = frozenset({"points", "share", "mass", "E", "nu", "friction", "velocity", "spin", "gravity", "box"})
+
+    def __init__(self, hidden: int = 64, deform: bool = True):
+        super().__init__()
+        self.config = {"hidden": hidden, "deform": deform}
+        h = hidden
+        self.point = mlp(13, h, h)
+        self.code = mlp(2 * h, h, h)
+        self.pairs, self.planes = Touch(8, 7, h, partner=True), Touch(6, 5, h, partner=False)
+        self.status = mlp(3 * h, h, h)
+        self.between, self.against = mlp(4 * h, h, h), mlp(2 * h, h, h)
+        self.hold = nn.Linear(h, 1)
+        nn.init.constant_(self.hold.bias, -3.0)
+        self.stress = Stress(h) if deform else None
+
+    def prepare(self, world: World) -> Scene:
+        shape = shape_of(world)
+        code = self._encode(shape)
+        if self.stress is None:
+            return Scene(shape, code, torch.zeros_like(world.mass), torch.zeros_like(world.mass))
+        return Scene(shape, code, *self.stress.springs(code))
+
+    def _encode(self, shape: Shape) -> Float[Tensor, "b o h"]:
+        """From numbers that no rotation changes: points in any order, and the material."""
+        w, size = shape.world, shape.size
+        moments = (torch.linalg.eigvalsh(shape.inverse) * size[..., None] ** 2).log()
+        mass = w.mass.clamp_min(1e-6)
+        stiffness = (w.E * size / mass).log() / 5  # square of a frequency
+        whole = torch.stack([size.log(), w.E.log10() - 5, w.nu, w.friction, mass.log(), stiffness], -1)
+        whole = torch.cat([whole, moments], -1)[:, :, None].expand(*shape.spacing.shape, -1)
+        arm, normal = shape.arm / size[..., None, None], shape.normal
+        each = [arm.norm(dim=-1), normal.norm(dim=-1), (arm * normal).sum(-1), shape.spacing / size[..., None]]
+        x = self.point(torch.cat([torch.stack(each, -1), whole], -1))
+        most = x.masked_fill(~w.valid[..., None], -torch.inf).amax(2)
+        most = torch.where(w.present[..., None], most, 0.0)
+        return self.code(torch.cat([(w.share[..., None] * x).sum(2), most], -1))
+
+    def start(self, scene: Scene) -> BodyState:
+        w, shape = scene.shape.world, scene.shape
+        quat = torch.zeros_like(w.mass)[..., None].repeat(1, 1, 4)
+        quat[..., 0] = 1
+        momentum = torch.linalg.solve(shape.inverse, w.spin[..., None])[..., 0]
+        rest = torch.zeros_like(shape.arm)
+        return BodyState(centre(w, w.points), quat, w.velocity, momentum, rest, rest)
+
+    def observe(
+        self, scene: Scene, points: Float[Tensor, "b o n 3"], speed: Float[Tensor, "b o n 3"]
+    ) -> BodyState:
+        shape = scene.shape
+        m = fitted(shape.world.share, shape.arm, shape.inverse, points, speed)
+        u, du = (m.u, m.du) if self.stress is not None else (torch.zeros_like(m.u), torch.zeros_like(m.du))
+        return BodyState(m.com, quaternion(m.R), m.velocity, m.momentum, projected(shape, u), projected(shape, du))
+
+    def points(self, scene: Scene, state: BodyState) -> Float[Tensor, "b o n 3"]:
+        return state.com[:, :, None] + (scene.shape.arm + state.u) @ matrix(state.quat).mT
+
+    def derivative(self, scene: Scene, t: Tensor | float, state: BodyState, pushes: Pushes) -> BodyState:
+        free = ~pushes.pinned[..., None]
+        state = _held(state, free)
+        moving = self._moving(scene, state)
+        rates = self._rates(scene, state, moving, pushes, t, 0.0)
+        lost = 1 - self._slowed(scene, rates, state.velocity, moving.spin, FRAME)
+        spin = torch.cat([torch.zeros_like(moving.spin[..., :1]), moving.spin], -1)
+        stress = rates.stress - scene.stiffness[..., None, None] * state.u - scene.damping[..., None, None] * state.du
+        ahead = state.velocity * (1 - lost) + FRAME * rates.force
+        guard = self._guarded(scene, moving.points, ahead, FRAME) - ahead
+        force = rates.force + (guard - lost * state.velocity) / FRAME
+        torque = rates.torque - lost * state.momentum / FRAME
+        spun = multiply(spin, state.quat) / 2
+        return BodyState(state.velocity, spun, force * free, torque * free, state.du, stress * free[..., None])
+
+    def step(self, scene: Scene, state: BodyState, t: Tensor | float, dt: float, pushes: Pushes) -> BodyState:
+        """Half a drift, the forces, half a drift.
+
+        Second order; exact for a parabola. As forces act at one place on both bodies and arms are those of the middle
+        of the step, it keeps linear and angular momentum to rounding. Springs and dampers are taken implicitly.
+        """
+        free = ~pushes.pinned[..., None]
+        half = self._drifted(scene, _held(state, free), dt / 2)
+        moving = self._moving(scene, half)
+        rates = self._rates(scene, half, moving, pushes, t, dt)
+        momentum = half.momentum + dt * rates.torque
+        spin = spin_of(momentum, scene.shape.inverse, moving.R)
+        slower = WILDEST / spin.norm(dim=-1, keepdim=True).clamp_min(WILDEST)
+        momentum, spin = momentum * slower, spin * slower
+        velocity = limited(half.velocity + dt * rates.force, FASTEST)
+        kept = self._slowed(scene, rates, velocity, spin, dt)
+        velocity, momentum, spin = velocity * kept, momentum * kept, spin * kept
+        turning = torch.linalg.cross(spin[:, :, None].expand_as(moving.arm), moving.arm)
+        velocity = self._guarded(scene, moving.points + dt / 2 * turning, velocity, dt / 2)
+        k, c = scene.stiffness[..., None, None], scene.damping[..., None, None]
+        du = (half.du + dt * (rates.stress - k * half.u)) / (1 + dt * c + dt * dt / 2 * k)
+        kicked = half._replace(velocity=velocity, momentum=momentum, du=bounded(scene.shape, du / FASTEST) * FASTEST)
+        return self._drifted(scene, _held(kicked, free), dt / 2)
+
+    def _drifted(self, scene: Scene, state: BodyState, dt: float) -> BodyState:
+        """Motion without forces. The spin is that of the middle of the way (second order)."""
+        inverse, L = scene.shape.inverse, state.momentum
+        spin = spin_of(L, inverse, matrix(state.quat))
+        spin = spin_of(L, inverse, matrix(turned(state.quat, dt / 2 * spin)))
+        return state._replace(
+            com=state.com + dt * state.velocity, quat=turned(state.quat, dt * spin),
+            u=bounded(scene.shape, state.u + dt * state.du),
+        )  # fmt: skip
+
+    def _moving(self, scene: Scene, state: BodyState) -> Moving:
+        """Where everything is in the world, and how it moves."""
+        R = matrix(state.quat)
+        spin = spin_of(state.momentum, scene.shape.inverse, R)
+        arm = (scene.shape.arm + state.u) @ R.mT
+        velocity = state.velocity[:, :, None] + torch.linalg.cross(spin[:, :, None].expand_as(arm), arm)
+        return Moving(R, spin, state.com, state.velocity, arm, state.com[:, :, None] + arm,
+                      velocity + state.du @ R.mT, scene.shape.normal @ R.mT)  # fmt: skip
+
+    def _rates(
+        self, scene: Scene, state: BodyState, moving: Moving, pushes: Pushes, t: Tensor | float, dt: float
+    ) -> Rates:
+        """Contact, pushes, gravity and stress."""
+        w = scene.shape.world
+        force, torque, touch, grip = self._contact(scene, moving, pushes)
+        pushed, twisted = pushes.wrench(moving.points, moving.com, t, dt)
+        mass = w.mass[..., None].clamp_min(1e-6)
+        force = force + pushed / mass + w.gravity[:, None]
+        torque = torque + twisted / mass
+        if self.stress is None:
+            return Rates(force, torque, torch.zeros_like(touch), grip)
+        gravity = (moving.R.mT @ w.gravity[:, None, :, None])[..., 0]
+        stress = self.stress(scene.shape, scene.code, state.u, state.du, touch @ moving.R, gravity)
+        return Rates(force, torque, stress, grip)
+
+    def _contact(
+        self, scene: Scene, moving: Moving, pushes: Pushes
+    ) -> tuple[Float[Tensor, "b o 3"], Float[Tensor, "b o 3"], Float[Tensor, "b o n 3"], Float[Tensor, "b o 1"]]:
+        """Force and torque on each object and what its points feel, per unit of mass; and the grip of the floor."""
+        shape, code = scene.shape, scene.code
+        w, others, back = shape.world, shape.others, shape.back
+        pairs, planes = pair_places(shape, moving), plane_places(shape, moving)
+        said, weight, heard = self.pairs.listen(pairs, w.share, code, code[:, others])
+        said_w, weight_w, heard_w = self.planes.listen(planes, w.share, code)
+        status = self.status(torch.cat([code, heard.sum(2), heard_w.sum(2)], -1))
+        own = status[:, :, None].expand_as(heard)
+        context = self.between(torch.cat([heard, heard[:, others, back], own, status[:, others]], -1))
+        context_w = self.against(torch.cat([heard_w, status[:, :, None].expand_as(heard_w)], -1))
+        a = weight[..., None] * self.pairs.answer(said, context, pairs.vectors)
+        a_w = weight_w[..., None] * self.planes.answer(said_w, context_w, planes.vectors)
+        mass, light = w.mass.clamp_min(1e-6), 1 / w.mass.clamp_min(1e-6) * ~pushes.pinned
+        reduced = 1 / (light[:, :, None] + light[:, others]).clamp_min(1e-9)  # a pinned body weighs as much as it likes
+        F = reduced[..., None, None] * a
+        middle = moving.points[:, :, None] - pairs.vectors[..., 0, :] * (0.05 / 2)
+        torque = torch.linalg.cross(middle - moving.com[:, :, None, None], F).sum((2, 3))
+        counter = torch.linalg.cross(middle - moving.com[:, others][:, :, :, None], F).sum(3)
+        force = F.sum((2, 3)) - torch.einsum("bimd,imj->bjd", F.sum(3), shape.chosen)
+        torque = torque - torch.einsum("bimd,imj->bjd", counter, shape.chosen)
+        torque = torque / mass[..., None] + torch.linalg.cross(moving.arm[:, :, None].expand_as(a_w), a_w).sum((2, 3))
+        felt = (reduced / mass[..., None])[..., None, None] * a
+        touch = (felt.sum(2) + a_w.sum(2)) / w.share.clamp_min(1e-9)[..., None]
+        touch = torch.where(w.valid[..., None], touch, 0.0)
+        grip = HOLD * torch.sigmoid(self.hold(status)) * weight_w[:, :, 0].sum(-1, keepdim=True)
+        return force / mass[..., None] + a_w.sum((2, 3)), torque, touch, grip
+
+    def _slowed(
+        self, scene: Scene, rates: Rates, velocity: Float[Tensor, "b o 3"], spin: Float[Tensor, "b o 3"], dt: float
+    ) -> Float[Tensor, "b o 1"]:
+        """By how much dry friction slows a body: next to nothing when fast, to rest when slower than its grip.
+
+        Forces that are only nearly in balance would let bodies creep for ever.
+        """
+        turning = scene.shape.size[..., None].square() * spin.square().sum(-1, keepdim=True)
+        moving = velocity.square().sum(-1, keepdim=True) + turning
+        return (moving + 1e-12) / (moving + 1e-12 + dt / FRAME * rates.grip.square())
+
+    def _guarded(
+        self, scene: Scene, points: Float[Tensor, "b o n 3"], velocity: Float[Tensor, "b o 3"], dt: float
+    ) -> Float[Tensor, "b o 3"]:
+        """Velocities with which no point gets deeper than SINK into floor, walls or ceiling within dt."""
+        w = scene.shape.world
+        hidden = ~w.valid[..., None]
+        lowest = points.masked_fill(hidden, torch.inf).amin(2)
+        highest = points.masked_fill(hidden, -torch.inf).amax(2)
+        up = (w.box[:, None, 0] - SINK - lowest) / dt
+        down = (w.box[:, None, 1] + SINK - highest) / dt
+        velocity = torch.maximum(velocity, up.clamp(max=RISE))
+        return torch.minimum(velocity, down.clamp(min=-RISE))
+
+
+def _held(state: BodyState, free: Bool[Tensor, "b o 1"]) -> BodyState:
+    """Whoever is pinned does not move."""
+    return state._replace(
+        velocity=state.velocity * free, momentum=state.momentum * free, du=state.du * free[..., None]
+    )

@@ -1,13 +1,14 @@
-"""Moving particles on a grid: MLS-MPM with APIC transfers and quadratic B-splines.
+"""Moving particles on a grid: MLS-MPM with APIC transfers and quadratic B-splines, for any number of scenes at once.
 
-A step is two launches. `particle_step` gathers velocities from the grid, moves the particles and scatters their
-momentum and stress for the next step; `grid_step` turns momentum into velocity and applies floor and walls.
-The grid is dense in memory, but only blocks of 4x4x4 nodes that particles can reach are read, written and cleared.
+Here is what both launch orders share. kernels/mpm_fused.py does a whole step in one launch, which is fastest on a GPU;
+kernels/mpm_split.py does particles and grid in turn, which is fastest on a CPU, where the division by mass and the
+walls would otherwise be done 27 times a particle instead of once a node.
 
-Several CPU threads may scatter at once, each into its own copy of the momentum; a block knows which copies it needs.
+The grids are dense in memory, but only blocks of 4x4x4 nodes that particles can reach are read, written and cleared.
 
 Source: Hu et al. 2018, "A Moving Least Squares Material Point Method", eq. 16-18 and its 88-line code;
-Jiang et al. 2015, "The Affine Particle-In-Cell Method".
+Jiang et al. 2015, "The Affine Particle-In-Cell Method"; Jiang et al. 2017, "An angular momentum conserving affine
+particle-in-cell method" (RPIC damping).
 """
 
 from __future__ import annotations
@@ -16,198 +17,124 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from stages.kernels.mpm_nodes import gather_nodes, scatter_nodes, velocity_of_row
+from stages.kernels.mpm_grid import BLOCK, Grid, first_node, within
+from stages.kernels.mpm_nodes import mat43
 
-BLOCK = 4  # nodes along the edge of a block
-PAD = 4  # nodes outside the walls on every side: room for the stencil of a particle pressed into a wall
 HELD = 1e4  # a held particle weighs this much more on the grid, so that others stop at it
-STALE, LOST = 0, 1  # slots of the alarm
+FREE, GUIDED, LOST = 0, 1, 2  # values of `held`: moved by the grid, by its own velocity, not at all any more
+
 
 @wp.struct
-class Grid:
-    """Node (i, j, k) lies at origin + dx (i, j, k) and is number (i ny + j) nz + k."""
+class Rows:
+    """The particles of all scenes, sorted by cell. `order` is the row that each had at first."""
 
-    origin: wp.vec3
-    dx: float
-    nodes: wp.vec3i  # multiples of BLOCK
-    low: wp.vec3i  # first node inside the walls; nodes up to and including `low` feel the wall
-    high: wp.vec3i
-
-
-@wp.func
-def _weights(fx: wp.vec3) -> wp.mat33:
-    """Quadratic B-spline: rows are axes; fx in [0.5, 1.5) is the distance to the first node."""
-    w = wp.mat33()
-    for axis in range(3):
-        f = fx[axis]
-        w[axis, 0] = 0.5 * (1.5 - f) * (1.5 - f)
-        w[axis, 1] = 0.75 - (f - 1.0) * (f - 1.0)
-        w[axis, 2] = 0.5 * (f - 0.5) * (f - 0.5)
-    return w
-
-
-@wp.func
-def _kirchhoff(F: wp.mat33, rate: wp.mat33, stiffness: wp.vec3) -> wp.mat33:
-    """Neo-Hookean with Kelvin-Voigt damping: tau = mu (F F^T - I) + lambda log(J) I + eta (dv/dx + transpose).
-
-    `stiffness` is mu, lambda, eta. An inverted J counts as nearly flat, so that tau stays finite.
-    Source: Bonet and Wood 2008, "Nonlinear Continuum Mechanics for Finite Element Analysis", eq. 6.29.
-    """
-    J = wp.max(wp.determinant(F), 0.05)
-    one = wp.identity(n=3, dtype=float)
-    elastic = stiffness[0] * (F * wp.transpose(F) - one) + stiffness[1] * wp.log(J) * one
-    return elastic + stiffness[2] * (rate + wp.transpose(rate))
+    count: int
+    x: wp.array[wp.vec3]
+    v: wp.array[wp.vec3]
+    C: wp.array[wp.mat33]
+    F: wp.array[wp.mat33]
+    mass: wp.array[float]
+    volume: wp.array[float]
+    stiffness: wp.array[wp.vec3]
+    friction: wp.array[float]
+    held: wp.array[wp.int8]
+    model: wp.array[wp.int8]  # see mpm_materials.py
+    plastic: wp.array[wp.vec3]
+    state: wp.array[float]
+    push: wp.array[wp.vec3]  # accelerations
+    scene: wp.array[int]
+    order: wp.array[int]
+    home: wp.array[wp.vec3i]  # stencil when the list of blocks was made
+    lost: wp.array[int]  # a scene: lowest `order` of its lost particles
 
 
-@wp.kernel
-def particle_step(
-    grid: Grid, start: int, gather: int, scatter: int, dt: float,
-    velocity: wp.array[wp.vec4], momentum: wp.array[wp.vec4], copy: int,
-    x: wp.array[wp.vec3], v: wp.array[wp.vec3], C: wp.array[wp.mat33], F: wp.array[wp.mat33],
-    mass: wp.array[float], volume: wp.array[float], stiffness: wp.array[wp.vec3], push: wp.array[wp.vec3],
-    held: wp.array[wp.int8], home: wp.array[wp.vec3i], alarm: wp.array[int],
-):  # fmt: skip
-    """Particles start + tid. `copy` is the first node of the momentum copy to scatter into; `push` an acceleration."""
-    i = start + wp.tid()
-    stride_y = grid.nodes[2]
-    stride_x = grid.nodes[1] * grid.nodes[2]
-    p = x[i]
-    vel = v[i]
-    B = C[i]
-    Fi = F[i]
-    inverse = 1.0 / grid.dx
-    if gather > 0 and held[i] == wp.int8(0):
-        g = (p - grid.origin) * inverse
-        base = wp.vec3i(int(g[0] - 0.5), int(g[1] - 0.5), int(g[2] - 0.5))
-        fx = wp.vec3(g[0] - float(base[0]), g[1] - float(base[1]), g[2] - float(base[2]))
-        # a particle out of bounds was reported when it got there, and scattered nothing
-        if base[0] >= 0 and base[0] <= grid.nodes[0] - 4 and base[1] >= 0 and base[1] <= grid.nodes[1] - 4 and \
-                base[2] >= 0 and base[2] <= grid.nodes[2] - 4:
-            first = base[0] * stride_x + base[1] * stride_y + base[2]
-            s = gather_nodes(velocity, first, stride_x, stride_y, _weights(fx), fx)
-            vel = wp.vec3(s[0, 0], s[0, 1], s[0, 2])
-            k = 4.0 * inverse
-            B = wp.mat33(k * s[1, 0], k * s[2, 0], k * s[3, 0], k * s[1, 1], k * s[2, 1], k * s[3, 1],
-                         k * s[1, 2], k * s[2, 2], k * s[3, 2])  # fmt: skip
-            p = p + dt * vel
-            Fi = Fi + dt * (B * Fi)
-            x[i] = p
-            v[i] = vel
-            C[i] = B
-            F[i] = Fi
-    if scatter > 0:
-        g = (p - grid.origin) * inverse
-        top = wp.vec3(float(grid.nodes[0] - 4), float(grid.nodes[1] - 4), float(grid.nodes[2] - 4))
-        if not (g[0] >= 1.0 and g[0] < top[0] and g[1] >= 1.0 and g[1] < top[1] and g[2] >= 1.0 and g[2] < top[2]):
-            alarm[LOST] = i + 1  # also when a coordinate is not a number
-            return
-        base = wp.vec3i(int(g[0] - 0.5), int(g[1] - 0.5), int(g[2] - 0.5))
-        fx = wp.vec3(g[0] - float(base[0]), g[1] - float(base[1]), g[2] - float(base[2]))
-        if wp.max(wp.max(wp.abs(base[0] - home[i][0]), wp.abs(base[1] - home[i][1])), wp.abs(base[2] - home[i][2])) > 1:
-            alarm[STALE] = 1
-        m = mass[i]
-        A = m * B - (dt * volume[i] * 4.0 * inverse * inverse) * _kirchhoff(Fi, B, stiffness[i])
-        A = A * grid.dx
-        q = m * (vel + dt * push[i])
-        if held[i] != wp.int8(0):
-            m = m * HELD
-            q = wp.vec3()
-            A = wp.mat33()
-        affine = wp.mat44(q[0], q[1], q[2], m, A[0, 0], A[1, 0], A[2, 0], 0.0, A[0, 1], A[1, 1], A[2, 1], 0.0,
-                          A[0, 2], A[1, 2], A[2, 2], 0.0)  # fmt: skip
-        first = copy + base[0] * stride_x + base[1] * stride_y + base[2]
-        scatter_nodes(momentum, first, stride_x, stride_y, _weights(fx), fx, affine)
+@wp.struct
+class Moved:
+    """A particle on its way through a step; `alive` when it has something to scatter."""
+
+    x: wp.vec3
+    v: wp.vec3
+    C: wp.mat33
+    F: wp.mat33
+    alive: bool
 
 
 @wp.func
-def _contact(v: wp.vec3, normal: wp.vec3, friction: float) -> wp.vec3:
-    """Velocity after a wall with unit `normal` (into the box) stops what moves into it.
-
-    Coulomb: the change along the wall is at most friction x the change across it, whatever the time step.
-    """
-    across = wp.dot(v, normal)
-    if across >= 0.0:
-        return v
-    along = v - across * normal
-    speed = wp.length(along)
-    if speed <= -friction * across:
-        return wp.vec3()
-    return along * (1.0 + friction * across / speed)
-
-
-@wp.kernel
-def grid_step(
-    grid: Grid, start: int, momentum: wp.array[wp.vec4], velocity: wp.array[wp.vec4], friction: wp.array[float],
-    blocks: wp.array[wp.vec2i],
-):  # fmt: skip
-    """One row of four nodes of an active block; `blocks` holds the block's first node and which copies it needs."""
-    t = start + wp.tid()
-    block = blocks[t // (BLOCK * BLOCK)]
-    row = t % (BLOCK * BLOCK)
-    stride_y = grid.nodes[2]
-    stride_x = grid.nodes[1] * stride_y
-    corner = block[0]
-    i = corner // stride_x + row // BLOCK
-    j = (corner // stride_y) % grid.nodes[1] + row % BLOCK
-    k = corner % stride_y
-    first = i * stride_x + j * stride_y + k
-    velocity_of_row(momentum, velocity, first, grid.nodes[0] * stride_x, block[1])
-    inside = i > grid.low[0] and i < grid.high[0] and j > grid.low[1] and j < grid.high[1]
-    if inside and k > grid.low[2] and k + BLOCK <= grid.high[2]:
-        return
-    for n in range(BLOCK):
-        u = velocity[first + n]
-        v = wp.vec3(u[0], u[1], u[2])
-        mu = friction[first + n]
-        if k + n <= grid.low[2]:
-            v = _contact(v, wp.vec3(0.0, 0.0, 1.0), mu)
-        if k + n >= grid.high[2]:
-            v = _contact(v, wp.vec3(0.0, 0.0, -1.0), mu)
-        if j <= grid.low[1]:
-            v = _contact(v, wp.vec3(0.0, 1.0, 0.0), mu)
-        if j >= grid.high[1]:
-            v = _contact(v, wp.vec3(0.0, -1.0, 0.0), mu)
-        if i <= grid.low[0]:
-            v = _contact(v, wp.vec3(1.0, 0.0, 0.0), mu)
-        if i >= grid.high[0]:
-            v = _contact(v, wp.vec3(-1.0, 0.0, 0.0), mu)
-        velocity[first + n] = wp.vec4(v[0], v[1], v[2], u[3])
+def moved(grid: Grid, x: wp.vec3, F: wp.mat33, s: mat43, dt: float) -> Moved:
+    """A particle a step further, by sums over its stencil; one that would leave the grid stays, and is not alive."""
+    out = Moved()
+    k = 4.0 / grid.dx
+    out.v = wp.vec3(s[0, 0], s[0, 1], s[0, 2])
+    out.C = wp.mat33(k * s[1, 0], k * s[2, 0], k * s[3, 0], k * s[1, 1], k * s[2, 1], k * s[3, 1],
+                     k * s[1, 2], k * s[2, 2], k * s[3, 2])  # fmt: skip
+    out.x = x + dt * out.v
+    out.F = F + dt * (out.C * F)
+    out.alive = within(grid, (out.x - grid.origin) / grid.dx)
+    if not out.alive:
+        return stopped(x, F)
+    return out
 
 
-@wp.kernel
-def mark_blocks(
-    grid: Grid, start: int, bit: int, x: wp.array[wp.vec3], home: wp.array[wp.vec3i], marks: wp.array3d[int]
-):
-    """Blocks that a particle reaches while it stays within one cell of where it is now."""
-    i = start + wp.tid()
-    g = (x[i] - grid.origin) / grid.dx
-    base = wp.vec3i(int(g[0] - 0.5), int(g[1] - 0.5), int(g[2] - 0.5))
-    home[i] = base
-    lo = wp.vec3i(wp.max(base[0] - 1, 0), wp.max(base[1] - 1, 0), wp.max(base[2] - 1, 0))
-    hi = wp.vec3i(wp.min(base[0] + 3, grid.nodes[0] - 1), wp.min(base[1] + 3, grid.nodes[1] - 1),
-                  wp.min(base[2] + 3, grid.nodes[2] - 1))  # fmt: skip
-    for a in range(lo[0] // BLOCK, hi[0] // BLOCK + 1):
-        for b in range(lo[1] // BLOCK, hi[1] // BLOCK + 1):
-            for c in range(lo[2] // BLOCK, hi[2] // BLOCK + 1):
-                if marks[a, b, c] & bit == 0:
-                    wp.atomic_or(marks, a, b, c, bit)
+@wp.func
+def stopped(x: wp.vec3, F: wp.mat33) -> Moved:
+    """A particle that is lost."""
+    out = Moved()
+    out.x = x
+    out.F = F
+    out.alive = False
+    return out
 
 
-@wp.kernel
-def mark_friction(grid: Grid, x: wp.array[wp.vec3], mu: wp.array[float], friction: wp.array[float]):
-    """Nodes at floor and walls take the largest friction coefficient among the particles that may touch them."""
+@wp.func
+def guided(grid: Grid, x: wp.vec3, v: wp.vec3, C: wp.mat33, F: wp.mat33, dt: float) -> Moved:
+    """A particle that goes its own way for `dt` [s]; 0 to take it as it is."""
+    out = Moved()
+    out.x = x + dt * v
+    out.v = v
+    out.C = C
+    out.F = F
+    out.alive = within(grid, (out.x - grid.origin) / grid.dx)
+    if not out.alive:
+        return stopped(x, F)
+    return out
+
+
+@wp.func
+def lose(held: wp.array[wp.int8], lost: wp.array[int], i: int, scene: int, order: int):
+    """Note that particle i is lost, and the first of its scene."""
+    held[i] = wp.int8(LOST)
+    wp.atomic_min(lost, scene, order)
+
+
+@wp.func
+def carried(
+    dx: float, now: Moved, tau: wp.mat33, mass: float, volume: float, viscosity: float, push: wp.vec3, held: int,
+    dt: float, damping: float,
+) -> wp.mat44:  # fmt: skip
+    """What a particle brings to the grid: row 0 momentum and mass, rows 1 to 3 the change a node along x, y, z."""
+    both = now.C + wp.transpose(now.C)
+    A = (dx * mass) * (now.C - (0.5 * damping) * both) - (dt * 4.0 / dx * volume) * (tau + viscosity * both)
+    m = mass
+    q = m * (now.v + dt * push)
+    if held != FREE:
+        m = m * HELD
+        q = m * now.v
+        A = wp.mat33()
+    return wp.mat44(q[0], q[1], q[2], m, A[0, 0], A[1, 0], A[2, 0], 0.0, A[0, 1], A[1, 1], A[2, 1], 0.0,
+                    A[0, 2], A[1, 2], A[2, 2], 0.0)  # fmt: skip
+
+
+@wp.kernel(enable_backward=False)
+def sort_keys(grid: Grid, rows: Rows, keys: wp.array[int]):
+    """Cells in an order that keeps neighbours together: by scene, by block, within the block. Lost particles last."""
     i = wp.tid()
-    g = (x[i] - grid.origin) / grid.dx
-    base = wp.vec3i(int(g[0] - 0.5), int(g[1] - 0.5), int(g[2] - 0.5))
-    near = bool(False)  # noqa: UP018 -- Warp takes a literal for a constant
-    for axis in range(3):
-        near = near or base[axis] <= grid.low[axis] + 2 or base[axis] + 4 >= grid.high[axis]
-    if not near:
+    if rows.held[i] == wp.int8(LOST):
+        keys[i] = 2147483647
         return
-    for a in range(wp.max(base[0] - 1, 0), wp.min(base[0] + 4, grid.nodes[0])):
-        for b in range(wp.max(base[1] - 1, 0), wp.min(base[1] + 4, grid.nodes[1])):
-            for c in range(wp.max(base[2] - 1, 0), wp.min(base[2] + 4, grid.nodes[2])):
-                wp.atomic_max(friction, (a * grid.nodes[1] + b) * grid.nodes[2] + c, mu[i])
+    b = first_node((rows.x[i] - grid.origin) / grid.dx)
+    n = wp.vec3i(grid.nodes[0] // BLOCK, grid.nodes[1] // BLOCK, grid.nodes[2] // BLOCK)
+    block = ((rows.scene[i] * n[0] + b[0] // BLOCK) * n[1] + b[1] // BLOCK) * n[2] + b[2] // BLOCK
+    keys[i] = ((block * BLOCK + b[0] % BLOCK) * BLOCK + b[1] % BLOCK) * BLOCK + b[2] % BLOCK
 
 
 def substep_reference(

@@ -44,7 +44,12 @@ mat43 = wp.types.matrix(shape=(4, 3), dtype=float)
     }
 #else
     for (int r = 0; r < 4; ++r) for (int n = 0; n < 3; ++n) out.data[r][n] = 0.0f;
-    for (int i = 0; i < 3; ++i) for (int j = 0; j < 3; ++j) for (int k = 0; k < 3; ++k) {
+#pragma unroll
+    for (int i = 0; i < 3; ++i)
+#pragma unroll
+    for (int j = 0; j < 3; ++j)
+#pragma unroll
+    for (int k = 0; k < 3; ++k) {
         const float4 v = ((const float4*)base)[i * stride_x + j * stride_y + k];
         const float w = weight.data[0][i] * weight.data[1][j] * weight.data[2][k];
         const float wv[3] = {w * v.x, w * v.y, w * v.z};
@@ -64,8 +69,10 @@ def gather_nodes(
 
 @wp.func_native("""
     // affine: row 0 is momentum and mass at the particle, rows 1 to 3 its change a node along x, y, z.
+    // first < 0: nothing to scatter.
     float* base = (float*)(momentum.data + first);
 #if !defined(__CUDA_ARCH__)
+    if (first < 0) return;
     typedef float quad __attribute__((ext_vector_type(4), aligned(4)));
     typedef float lanes __attribute__((ext_vector_type(16), aligned(4)));
     const quad P = *(const quad*)affine.data[0], X = *(const quad*)affine.data[1];
@@ -90,19 +97,50 @@ def gather_nodes(
         row += stepX;
     }
 #else
-    for (int i = 0; i < 3; ++i) for (int j = 0; j < 3; ++j) for (int k = 0; k < 3; ++k) {
+    // Lanes of a warp whose particles share a cell, next to each other when sorted, add up before they touch memory:
+    // lane l sums lanes l to l + 7 of its run, and every eighth lane of a run writes. All 32 lanes must get here.
+    const unsigned all = 0xffffffffu;
+    const int lane = threadIdx.x & 31;
+    const int before = __shfl_up_sync(all, first, 1);
+    const unsigned heads = __ballot_sync(all, lane == 0 || before != first);
+    const int start = 31 - __clz(heads & (all >> (31 - lane)));
+    const int rank = lane - start;
+    const bool far1 = __any_sync(all, rank >= 1), far2 = __any_sync(all, rank >= 2), far4 = __any_sync(all, rank >= 4);
+    const unsigned after = heads & ~(all >> (31 - lane));
+    const int left = (after ? __ffs(after) - 1 : 32) - lane;  // lanes of the run from this one on
+    const bool writes = first >= 0 && (rank & 7) == 0;
+#pragma unroll
+    for (int i = 0; i < 3; ++i)
+#pragma unroll
+    for (int j = 0; j < 3; ++j)
+#pragma unroll
+    for (int k = 0; k < 3; ++k) {
         const float w = weight.data[0][i] * weight.data[1][j] * weight.data[2][k];
         const float d[3] = {i - fx.c[0], j - fx.c[1], k - fx.c[2]};
         float value[4];
         for (int n = 0; n < 4; ++n)
             value[n] = w * (affine.data[0][n] + d[0] * affine.data[1][n] + d[1] * affine.data[2][n]
                             + d[2] * affine.data[3][n]);
-        float* node = base + 4 * (i * stride_x + j * stride_y + k);
+        if (far1) for (int n = 0; n < 4; ++n) {
+            const float other = __shfl_down_sync(all, value[n], 1);
+            value[n] += left > 1 ? other : 0.0f;
+        }
+        if (far2) for (int n = 0; n < 4; ++n) {
+            const float other = __shfl_down_sync(all, value[n], 2);
+            value[n] += left > 2 ? other : 0.0f;
+        }
+        if (far4) for (int n = 0; n < 4; ++n) {
+            const float other = __shfl_down_sync(all, value[n], 4);
+            value[n] += left > 4 ? other : 0.0f;
+        }
+        if (writes) {
+            float* node = base + 4 * (i * stride_x + j * stride_y + k);
 #if __CUDA_ARCH__ >= 900
-        atomicAdd((float4*)node, make_float4(value[0], value[1], value[2], value[3]));
+            atomicAdd((float4*)node, make_float4(value[0], value[1], value[2], value[3]));
 #else
-        for (int n = 0; n < 4; ++n) atomicAdd(node + n, value[n]);
+            for (int n = 0; n < 4; ++n) atomicAdd(node + n, value[n]);
 #endif
+        }
     }
 #endif
 """)
@@ -141,3 +179,42 @@ def scatter_nodes(
 def velocity_of_row(
     momentum: wp.array[wp.vec4], velocity: wp.array[wp.vec4], first: int, count: int, copies: int
 ): ...  # copies: bit c is set where copy c, which starts at node c count, has something
+
+
+@wp.func_native("""
+    // as gather_nodes, from momentum: a node's velocity is momentum by mass
+    wp::mat_t<4, 3, wp::float32> out;
+    for (int r = 0; r < 4; ++r) for (int n = 0; n < 3; ++n) out.data[r][n] = 0.0f;
+    const float* base = (const float*)(momentum.data + first);
+#pragma unroll
+    for (int i = 0; i < 3; ++i)
+#pragma unroll
+    for (int j = 0; j < 3; ++j) {
+        const float wij = weight.data[0][i] * weight.data[1][j];
+        const float* row = base + 4 * (i * stride_x + j * stride_y);
+        float sum[3] = {0.0f, 0.0f, 0.0f}, tilt[3] = {0.0f, 0.0f, 0.0f};
+#pragma unroll
+        for (int k = 0; k < 3; ++k) {
+#if defined(__CUDA_ARCH__)
+            const float4 node = ((const float4*)row)[k];
+            const float m = __fdividef(wij * weight.data[2][k], fmaxf(node.w, 1e-30f));
+            const float u[3] = {m * node.x, m * node.y, m * node.z};
+#else
+            const float* node = row + 4 * k;
+            const float m = wij * weight.data[2][k] / (node[3] > 1e-30f ? node[3] : 1e-30f);
+            const float u[3] = {m * node[0], m * node[1], m * node[2]};
+#endif
+            for (int n = 0; n < 3; ++n) { sum[n] += u[n]; tilt[n] += u[n] * (k - fx.c[2]); }
+        }
+        for (int n = 0; n < 3; ++n) {
+            out.data[0][n] += sum[n];
+            out.data[1][n] += sum[n] * (i - fx.c[0]);
+            out.data[2][n] += sum[n] * (j - fx.c[1]);
+            out.data[3][n] += tilt[n];
+        }
+    }
+    return out;
+""")
+def gather_momentum(
+    momentum: wp.array[wp.vec4], first: int, stride_x: int, stride_y: int, weight: wp.mat33, fx: wp.vec3
+) -> mat43: ...

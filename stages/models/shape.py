@@ -11,6 +11,7 @@ from torch import Tensor
 from stages.models.world import World, inertia, offsets
 
 NEIGHBOURS = 12  # keypoints that make a normal
+MOST = 16_384  # small matrices at a time: CUDA's solver fails on 65,536
 
 
 @dataclass(frozen=True)
@@ -55,8 +56,8 @@ def _surface(
     cloud = torch.gather(arm[:, :, None].expand(*index.shape[:3], *arm.shape[2:]), 3, rows)
     weight = there.to(arm) / there.sum(-1, keepdim=True).clamp_min(1)
     cloud = (cloud - (weight[..., None] * cloud).sum(-2, keepdim=True)) * weight[..., None].sqrt()
-    _, axes = torch.linalg.eigh(cloud.mT @ cloud)
-    normal = axes[..., 0]
+    spread = (cloud.mT @ cloud).flatten(0, 2).split(MOST)
+    normal = torch.cat([torch.linalg.eigh(s).eigenvectors[..., 0] for s in spread]).reshape(arm.shape)
     side = (normal * arm).sum(-1) / (0.1 * size[..., None])
     close = near[..., 1:5]
     spacing = close.masked_fill(~close.isfinite(), 0).sum(-1) / close.isfinite().sum(-1).clamp_min(1)

@@ -20,15 +20,17 @@ from stages.physics import mpm
 from stages.physics.forces import Force, Prompts, vector
 from stages.physics.keypoints import nearest_weights
 from stages.physics.materials import Choice, choose_materials
+from stages.physics.mpm_refine import halved
 from stages.physics.particles import Bodies, sample
 from stages.physics.skinning import rotations
 from stages.physics.state import State
 from stages.scene.scene import Scene, SceneObject
 from stages.scene.trajectory import Keypoints
-from stages.simulate.options import SimulateOptions
+from stages.simulate.options import Quality, SimulateOptions
 
 log = logging.getLogger(__name__)
 NEAR = 8  # particles that a keypoint follows
+FINE = 2e-5  # shortest substep worth taking on a GPU [s]
 
 
 @dataclass(frozen=True)
@@ -51,10 +53,13 @@ def rollout(scene: Scene, keypoints: Keypoints, prompts: Prompts, options: Simul
     Raises InputError when a body leaves the box or its motion is no longer finite.
     """
     unit, device = scene.metres_per_unit, pick_device(options.device)
+    level, fine = options.level, device != "cpu" and options.quality != "draft"
+    if fine:  # it costs seconds there: bodies at twice the resolution, and stiffer
+        level = replace(level, substep=min(level.substep, FINE))
     materials = choose_materials(scene.objects, options.material, options.materials)
-    stage = set_up(scene, prompts, options)
+    stage = set_up(scene, prompts, options, fine)
     body, dx = stage.bodies.body, 2 * stage.bodies.spacing * unit
-    particles = _particles(scene, stage, materials, prompts, options)
+    particles = _particles(scene, stage, materials, prompts, options, level)
     # particles keep a spacing inside of what they stand for, on the floor as well
     low = (*stage.box.low[:2], stage.box.low[2] + stage.bodies.spacing)
     box = mpm.Box(tuple(unit * v for v in low), tuple(unit * v for v in stage.box.high))
@@ -67,7 +72,7 @@ def rollout(scene: Scene, keypoints: Keypoints, prompts: Prompts, options: Simul
     substeps = solver.substeps(options.dt, gravity)
     log.info(
         "%d particles, grid spacing %.3g m, %d nodes, substep %.3g s (%d a frame; more where things move fast)",
-        len(particles), dx, math.prod(solver.grid.nodes), options.dt / substeps, substeps,
+        len(particles), dx, solver.grid.count, options.dt / substeps, substeps,
     )  # fmt: skip
 
     def states() -> Iterator[State]:
@@ -93,9 +98,11 @@ def _went_wrong(o: SceneObject, time: float) -> InputError:
     )
 
 
-def set_up(scene: Scene, prompts: Prompts, options: SimulateOptions) -> Stage:
+def set_up(scene: Scene, prompts: Prompts, options: SimulateOptions, fine: bool = False) -> Stage:
     """Particles, and the box they live in; what hovers or sinks a little at the floor is settled onto it."""
     bodies = sample(scene, options.level.particles, options.seed)
+    if fine:
+        bodies = halved(bodies, options.seed)
     count, h = len(scene.objects), bodies.spacing
     lift = torch.zeros(count, 3)
     for row, o in enumerate(scene.objects):
@@ -168,13 +175,14 @@ def _box(x: Float[Tensor, "p 3"], floor: float, h: float) -> mpm.Box:
 
 
 def _particles(
-    scene: Scene, stage: Stage, materials: dict[int, Choice], prompts: Prompts, options: SimulateOptions
-) -> mpm.Particles:
+    scene: Scene, stage: Stage, materials: dict[int, Choice], prompts: Prompts, options: SimulateOptions,
+    level: Quality,
+) -> mpm.Particles:  # fmt: skip
     """Particles in metres, with each object's material, made soft enough for the quality's substep."""
     unit, body = scene.metres_per_unit, stage.bodies.body
     h, volume = stage.bodies.spacing * unit, stage.bodies.volume * unit**3
-    fastest = 0.85 * mpm.SAFETY * 2 * h / options.level.substep
-    rows = torch.zeros(len(scene.objects), 5)  # E density nu viscosity friction
+    fastest = 0.85 * mpm.SAFETY * 2 * h / level.substep
+    rows = torch.zeros(len(scene.objects), 9)  # E density nu viscosity friction model, and its three numbers
     velocity, held = torch.zeros(len(scene.objects), 3), torch.zeros(len(scene.objects), dtype=torch.int8)
     for row, o in enumerate(scene.objects):
         choice = materials[o.id]
@@ -183,9 +191,10 @@ def _particles(
         size = unit * float((stage.bodies.x[body == row].amax(0) - stage.bodies.x[body == row].amin(0)).max())
         # loss factor of a bar's slowest vibration, omega = pi c / L (damping E omega_1 / omega is Kelvin-Voigt's)
         viscosity = m.loss * E * size / (math.pi * math.sqrt(E / m.density))
-        viscosity = min(viscosity, 0.85 * mpm.VISCOUS * m.density * (2 * h) ** 2 / options.level.substep)
+        viscosity = min(viscosity, 0.85 * mpm.VISCOUS * m.density * (2 * h) ** 2 / level.substep)
         friction = m.friction if options.friction is None else options.friction
-        rows[row] = torch.tensor([E, m.density, m.nu, viscosity, friction])
+        rows[row] = torch.tensor([E, m.density, m.nu, viscosity, friction, mpm.MODELS[m.model],
+                                  *mpm.numbers(m.model, m.plastic, E / m.E)])  # fmt: skip
         velocity[row] = unit * torch.tensor(prompts.velocity.get(o.id, (0.0, 0.0, 0.0)))
         held[row] = o.id in prompts.pinned
         mass = float(m.density * volume[body == row].sum())
@@ -195,8 +204,9 @@ def _particles(
         if m.E > E:
             what += f"; E {m.E:.2g} softened to {E:.2g} Pa at this quality"
         log.info("%s", what)
-    E, density, nu, viscosity, friction = rows[body].unbind(1)
+    E, density, nu, viscosity, friction, model = rows[body, :6].unbind(1)
     particles = mpm.at_rest(stage.start * unit, volume, density, E, nu, viscosity, friction)
+    particles.model, particles.plastic = model.to(torch.int8), rows[body, 6:].contiguous()
     particles.v, particles.held = velocity[body] * (held[body] == 0)[:, None], held[body]
     return particles
 

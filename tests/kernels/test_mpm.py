@@ -6,8 +6,9 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from stages.kernels.mpm import PAD, substep_reference
-from stages.physics import mpm
+from stages.kernels.mpm import substep_reference
+from stages.kernels.mpm_grid import PAD
+from stages.physics import mpm, mpm_split
 from tests.conftest import DEVICES
 
 DX, DT, FRICTION = 0.1, 1e-3, 0.4
@@ -51,8 +52,8 @@ def test_the_same_bytes_whatever_the_number_of_threads(monkeypatch):
     push = torch.tensor([0.0, 0.0, -9.81]).repeat(300, 1)
     results = []
     for threads in (1, 3):
-        crew = mpm._Crew(threads)
-        monkeypatch.setattr(mpm, "_crew", partial(getattr, SimpleNamespace(crew=crew), "crew"))
+        crew = mpm_split._Crew(threads)
+        monkeypatch.setattr(mpm_split, "_crew", partial(getattr, SimpleNamespace(crew=crew), "crew"))
         solver = mpm.Solver(cloud(), mpm.Box((0, 0, 0), (1, 1, 1)), DX)
         for _ in range(3):
             solver.advance(0.01, push)
@@ -64,4 +65,4 @@ def test_a_step_leaves_the_grid_clean():
     # what one substep scattered must not come back in a later one, also where particles have moved on
     solver = mpm.Solver(cloud(), mpm.Box((0, 0, 0), (1, 1, 1)), DX)
     solver.advance(0.05, torch.zeros(300, 3))
-    assert not solver._momentum.any()
+    assert not solver._order._momentum.any()

@@ -187,7 +187,7 @@ def test_options_that_cannot_be(choices, says):
 
 @pytest.mark.parametrize(
     ("out", "choices", "says"),
-    [("a.gif", {}, r"\.mp4 or \.png"), ("a.png", {"view": "input:99"}, "cameras 0 to 5"),
+    [("a.gif", {}, r"\.mp4, \.png or \.jpg"), ("a.png", {"view": "input:99"}, "cameras 0 to 5"),
      ("a.png", {"view": "nowhere.json"}, "no such file"), ("a.png", {"frame": 1}, "has no frames"),
      ("a.png", {"background": "x.txt"}, "give a scene.ply, a colour"), ("no/a.png", {}, "there is no folder"),
      ("no/a.mp4", {}, "there is no folder")],

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from stages.errors import InputError
+from stages.physics.forces import Prompts
 from stages.physics.materials import GUESS
 from stages.scene.gaussians import concatenate
 from stages.scene.scene import Scene, SceneObject
@@ -15,7 +16,7 @@ from stages.scene.scene_ply import read_scene, write_scene
 from stages.scene.trajectory import Trajectory, read_trajectory
 from stages.simulate import mpm as engine
 from stages.simulate.options import QUALITIES, Quality, SimulateOptions
-from stages.simulate.stage import run
+from stages.simulate.stage import run, with_objects
 from tests.conftest import ball
 
 # The ball weighs about 9 kg and touches in one point: by Hertz it gives way by 5 mm, twice that where it swings, and by
@@ -184,3 +185,28 @@ def test_wrong_options(options, message):
 def test_an_unknown_engine(balls):
     with pytest.raises(InputError, match="no backend called 'magic'; choose from mpm"):
         roll(balls, engine="magic")
+
+
+def test_at_twice_the_resolution_bodies_stand_where_they_did(balls):
+    stage = engine.set_up(with_objects(read_scene(balls), balls), Prompts(), SimulateOptions(quality="draft"))
+    fine = engine.set_up(with_objects(read_scene(balls), balls), Prompts(), SimulateOptions(quality="draft"), True)
+    assert fine.bodies.spacing == stage.bodies.spacing / 2 and len(fine.start) > 6 * len(stage.start)
+    # both stand on the floor, as seen
+    for s in (stage, fine):
+        assert float(s.start[s.bodies.body == 0, 2].quantile(0.01)) == pytest.approx(1.5 * s.bodies.spacing, rel=0.3)
+
+
+@pytest.mark.gpu
+def test_on_a_gpu_bodies_fall_and_stand_as_on_a_cpu(balls):
+    if not torch.cuda.is_available():
+        pytest.skip("needs an NVIDIA GPU")
+    cpu, gpu = roll(balls), roll(balls, device="cuda", quality="normal")
+    assert shift(gpu, 1).norm() < SAG
+    assert float(shift(gpu, 2)[2]) == pytest.approx(float(shift(cpu, 2)[2]), rel=0.02)
+
+
+@pytest.mark.parametrize("material", ["sand", "snow", "plasticine", "dough"])
+def test_what_yields_falls_like_anything_else_and_sand_slumps(balls, material):
+    t = roll(balls, material=(f"thing={material}", "1=sand"), steps=15)
+    assert float(shift(t, 2, 5)[2]) == pytest.approx(-9.81 * 0.1**2 / 2, rel=0.03)
+    assert float(t.com[-1, 0, 2]) < 0.8 * float(t.com[0, 0, 2])  # a ball of sand does not stay a ball

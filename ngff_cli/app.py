@@ -147,6 +147,9 @@ def simulate(
         str | None, Option(help="floor, walls and ceiling: x0,y0,z0,x1,y1,z1; by default around the objects")
     ] = SimulateOptions.box,
     keypoints: Annotated[int, Option(help="most keypoints an object")] = SimulateOptions.keypoints,
+    weights: Annotated[
+        Path | None, Option(help="of a learned engine (.safetensors with its card, or a public .pth); by default ours")
+    ] = SimulateOptions.weights,
     seed: Seed = SimulateOptions.seed,
     device: Device = SimulateOptions.device,
 ) -> None:
@@ -156,7 +159,7 @@ def simulate(
     lists = [tuple(given or ()) for given in (material, force, pin, velocity, lift)]
     run(scene, out, SimulateOptions(
         steps, dt, engine, gravity, quality, lists[0], materials, lists[1], forces, lists[2], lists[3], lists[4],
-        floor, friction, box, keypoints, seed, device,
+        floor, friction, box, keypoints, weights, seed, device,
     ))  # fmt: skip
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import torch
@@ -12,6 +13,18 @@ from torch import Tensor
 from stages.geometry.harmonics import rgb_to_sh
 from stages.geometry.rotations import quaternion
 from stages.scene.gaussians import Gaussians
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """PyTorch on one thread: the vector and scalar forms of sin or pow differ in the last bit, and how many threads
+    share a tensor decides which element meets which."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 @dataclass(frozen=True)
@@ -105,8 +118,14 @@ def noise(points: Float[Tensor, "n 3"], size: float, seed: int) -> Float[Tensor,
     return total
 
 
-def to_gaussians(surface: Surface, rgb: Float[Tensor, "n 3"], object_id: int, opacity: float = 0.95) -> Gaussians:
-    """Flat Gaussians that cover the surface without holes: discs of 0.7 times the local spacing."""
+def to_gaussians(
+    surface: Surface, rgb: Float[Tensor, "n 3"], object_id: int, opacity: float = 0.95, width: float = 0.7,
+    widest: float = 0.05,
+) -> Gaussians:  # fmt: skip
+    """Flat Gaussians that cover the surface without holes: discs of `width` times the local spacing.
+
+    A spacing above `widest` [m], as lone points have, counts as `widest`.
+    """
     from stages.geometry.neighbours import spacing
 
     n = len(surface.points)
@@ -114,8 +133,8 @@ def to_gaussians(surface: Surface, rgb: Float[Tensor, "n 3"], object_id: int, op
     helper = torch.where((normal[:, :1].abs() < 0.9), torch.tensor([1.0, 0, 0]), torch.tensor([0.0, 1, 0]))
     u = torch.nn.functional.normalize(torch.linalg.cross(helper, normal), dim=1)
     R = torch.stack([u, torch.linalg.cross(normal, u), normal], -1)
-    s = spacing(surface.points, 4).clamp_max(0.05)
+    s = spacing(surface.points, 4).clamp_max(widest)
     return Gaussians(
-        surface.points.contiguous(), quaternion(R), torch.stack([0.7 * s, 0.7 * s, 0.15 * s], 1),
+        surface.points.contiguous(), quaternion(R), torch.stack([width * s, width * s, 0.15 * s], 1),
         torch.full((n,), opacity), rgb_to_sh(rgb.clamp(0.02, 0.98)), torch.full((n,), object_id),
     )  # fmt: skip

@@ -8,7 +8,10 @@ from pathlib import Path
 
 from stages.errors import InputError
 
-BACKENDS = {"mpm": "stages.simulate.mpm:rollout"}
+BACKENDS = {
+    "mpm": "stages.simulate.mpm:rollout",
+    **{name: "stages.simulate.learned:rollout" for name in ("ngff",)},
+}
 
 
 @dataclass(frozen=True)
@@ -44,6 +47,7 @@ class SimulateOptions:
     friction: float | None = None  # Coulomb coefficient at floor and walls; by default each material's
     box: str | None = None  # floor, walls and ceiling: x0,y0,z0,x1,y1,z1 [scene units]; by default around the objects
     keypoints: int = 1024  # most keypoints an object
+    weights: Path | None = None  # of a learned engine: .safetensors with its card, or a public checkpoint (.pth)
     seed: int = 0
     device: str = "auto"
 

@@ -1,0 +1,213 @@
+"""Training of a dynamics model: motions in, weights and their card out."""
+
+from __future__ import annotations
+
+import logging
+import math
+import shlex
+import signal
+import sys
+import time
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import torch
+from tqdm import tqdm
+
+from stages.backends import pick_device
+from stages.errors import InputError
+from stages.evaluate.dynamics import all_metrics
+from stages.lab.motions import Motions
+from stages.lab.scenes import groups_of
+from stages.lab.training_data import UNSEEN, Pieces, read_groups, recipe, split
+from stages.lab.training_roll import Roll
+from stages.lab.training_state import Trainee
+from stages.lab.training_team import Team, team
+from stages.models.weights import build, save
+from stages.scene.files import ngff_version
+
+log = logging.getLogger(__name__)
+SHARES = (0.35, 0.35, 0.3)  # of the budget, for three horizons
+CHECKS = 24  # how often to validate, and to write a checkpoint, in the whole run
+LINE = (
+    "{minutes:6.1f} min {step:7d} steps  horizon {horizon:2d}  loss {loss:.4f}  "
+    "RMSE {RMSE:.4f}  FPE {FPE:.4f}  R {R:.3f}"
+)
+FRAMES = 80  # of the rollouts that choose the weights
+
+
+@dataclass(frozen=True)
+class TrainOptions:
+    """How to train."""
+
+    minutes: float = 20.0  # budget, validation included
+    steps: int = 0  # the budget in steps of the optimizer instead, when not 0: the same on every machine
+    batch: int = 32  # scenes a step
+    keypoints: int = 256  # of an object
+    lr: float = 1e-3  # highest rate
+    horizons: str = "8,20,40"  # frames that a rollout goes on for, one phase each
+    hidden: int = 0  # width of the network; 0: the model's own
+    root: bool = False  # loss: root of the squared error of each scene
+    groups: str = "3_0..3_8"  # files to learn from; the last scenes of the last choose the best weights
+    compiled: bool = False  # compile a step first: a minute or so, then faster; for GPUs
+    seed: int = 0
+    device: str = "auto"
+
+    def __post_init__(self):
+        if self.minutes <= 0 or self.steps < 0 or min(self.batch, self.keypoints) < 1 or self.lr <= 0:
+            raise InputError("--minutes, --batch, --keypoints and --lr must be positive, --steps at least 0")
+        if min(self.frames) < 1:
+            raise InputError(f"--horizons takes frames, such as 8,20,40, not {self.horizons!r}")
+
+    @property
+    def frames(self) -> tuple[int, ...]:
+        """The horizons."""
+        try:
+            return tuple(int(word) for word in self.horizons.split(","))
+        except ValueError as error:
+            raise InputError(f"--horizons takes frames, such as 8,20,40, not {self.horizons!r}") from error
+
+    def horizon(self, progress: float) -> int:
+        """Frames to roll out at this share of the budget."""
+        n = len(self.frames)
+        ends = [sum(SHARES[: i + 1]) if n == len(SHARES) else (i + 1) / n for i in range(n)]
+        return self.frames[min(sum(progress >= e for e in ends), n - 1)]
+
+    def rate(self, progress: float, step: int) -> float:
+        """Learning rate: a short rise, then half a cosine down to a hundredth."""
+        return self.lr * min(1.0, (step + 1) / 200) * (0.01 + 0.99 * (1 + math.cos(math.pi * min(progress, 1.0))) / 2)
+
+
+def run(model: str, data: Path, out: Path, options: TrainOptions = TrainOptions(), resume: bool = False) -> list[str]:
+    """Train on the groups in a folder; the best weights go to OUT and their card beside it. Lines of result.
+
+    OUT with the suffix .ckpt is what `resume` goes on from; with the same options the curve is the same as without
+    the interruption. Raises InputError for missing or unfit files.
+    """
+    out = Path(out)
+    if not out.parent.is_dir():
+        raise InputError(f"{out}: there is no folder {out.parent}; make it first")
+    groups = groups_of(options.groups)
+    known, unseen = split(read_groups(data, groups, options.keypoints), UNSEEN)
+    if known.points.shape[1] <= max(options.frames):
+        raise InputError(f"--horizons: the motions have {known.points.shape[1]} frames; take shorter ones")
+    with team(pick_device(options.device), options.batch) as crew:
+        trainee = _trainee(model, out, options, crew.device, resume)
+        if crew.leads:
+            log.info("%s, %s parameters: learns from %d scenes, chosen by %d", model,
+                     f"{sum(p.numel() for p in trainee.params):,}", len(known), len(unseen))  # fmt: skip
+        job = Job(trainee, Pieces(known, crew.device), unseen.to(crew.device), options, crew, out, _key(model, options))
+        finished = job.run()
+        if not crew.leads:
+            return []
+        best = trainee.best_row()
+        card = {
+            "command": shlex.join(["ngff-lab", *sys.argv[1:]]), "ngff": ngff_version(), "torch": torch.__version__,
+            "device": torch.cuda.get_device_name() if crew.device == "cuda" else "cpu", "processes": crew.size,
+            "options": asdict(options), "data": recipe(data, groups), "scenes": len(known),
+            "scenes to choose by": len(unseen), "finished": finished, "minutes": trainee.elapsed / 60,
+            "steps": trainee.step, "validation": best, "curve": trainee.curve,
+        }  # fmt: skip
+        save(out, model, trainee.best_model(), card)
+    ended = "" if finished else " (stopped before the end; go on with --resume)"
+    return [f"{out}: RMSE {best['RMSE']:.4f}  FPE {best['FPE']:.4f}  R {best['R']:.3f} over {FRAMES} frames of "
+            f"unseen scenes, after {best['minutes']:.1f} of {trainee.elapsed / 60:.1f} min{ended}"]  # fmt: skip
+
+
+def _trainee(model: str, out: Path, options: TrainOptions, device: str, resume: bool) -> Trainee:
+    """A new model, or one from its checkpoint."""
+    torch.manual_seed(options.seed)
+    network = build(model, **({"hidden": options.hidden} if options.hidden else {})).to(device)
+    trainee = Trainee(network, options.lr, options.seed)
+    if resume:
+        trainee.load(out.with_suffix(".ckpt"), _key(model, options))
+        log.info("going on from step %d, %.1f min", trainee.step, trainee.elapsed / 60)
+    return trainee
+
+
+def _key(model: str, options: TrainOptions) -> dict:
+    """What must be the same for a checkpoint to be gone on from."""
+    return {"model": model, **{k: v for k, v in asdict(options).items() if k != "device"}}
+
+
+@dataclass
+class Job:
+    """One run of training, by one process or several."""
+
+    trainee: Trainee
+    pieces: Pieces
+    unseen: Motions
+    options: TrainOptions
+    team: Team
+    out: Path
+    key: dict
+
+    def run(self) -> bool:
+        """Go on until the budget is used up (True) or somebody asks to stop (False)."""
+        trainee, options, part = self.trainee, self.options, self.team.rows(self.options.batch)
+        self.clock = time.perf_counter() - trainee.elapsed
+        roll, horizon, done = None, 0, self.progress()
+        with _asked_to_stop() as asked, tqdm(
+            total=1.0, bar_format="{l_bar}{bar}| {elapsed}", disable=not self.team.leads
+        ) as bar:
+            while done < 1 and not self.team.agreed(len(asked)):
+                if options.horizon(done) != horizon:
+                    roll, horizon = None, options.horizon(done)  # the memory of the old graph goes first
+                    roll = Roll(trainee.model, self.pieces.motions.dt, options.root, compiled=options.compiled)
+                loss, grads = roll(self.pieces.draw(options.batch, horizon, trainee.generator, part))
+                *grads, loss = self.team.mean([*grads, loss.clone()])  # a graph writes the next loss in the same place
+                trainee.update(grads, options.rate(done, trainee.step))
+                trainee.losses.append(loss)
+                before, done = done, self.progress()
+                if math.floor(done * CHECKS) > math.floor(before * CHECKS):
+                    self.check(horizon)
+                    done = self.progress()
+                bar.update(min(done, 1.0) - bar.n)
+        if not trainee.curve:
+            self.check(horizon)
+        if self.team.leads:
+            trainee.save(self.out.with_suffix(".ckpt"), self.key)
+        return done >= 1
+
+    def progress(self) -> float:
+        """Share of the budget that is used up."""
+        trainee, options = self.trainee, self.options
+        trainee.elapsed = self.team.agreed(time.perf_counter() - self.clock)
+        return trainee.step / options.steps if options.steps else trainee.elapsed / (60 * options.minutes)
+
+    def check(self, horizon: int) -> None:
+        """A line of the curve, and a checkpoint."""
+        if not self.team.leads:
+            self.trainee.losses = []
+            self.trainee.curve.append({})
+            return
+        self.trainee.note({"horizon": horizon, **validate(self.trainee.ema, self.unseen)})
+        self.trainee.save(self.out.with_suffix(".ckpt"), self.key)
+        log.info(LINE.format(**self.trainee.curve[-1]))
+
+
+@contextmanager
+def _asked_to_stop():
+    """A list that is no longer empty once the process is asked to terminate, as `timeout` does."""
+    asked: list[int] = []
+    before = signal.signal(signal.SIGTERM, lambda number, _: asked.append(number))
+    try:
+        yield asked
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+@torch.no_grad()
+def validate(model: torch.nn.Module, scenes: Motions, frames: int = FRAMES, batch: int = 100) -> dict[str, float]:
+    """Metrics of full rollouts from rest, averaged over the scenes; an RMSE that is not finite is infinite."""
+    model.eval()
+    frames = min(frames, scenes.points.shape[1])
+    world, rows = scenes.world(), []
+    for first in range(0, len(scenes), batch):
+        some = world[first : first + batch]
+        truth = scenes.points[first : first + batch, :frames]
+        rows.append(all_metrics(model.rollout(some, frames, scenes.dt), truth, some.valid))
+    mean = {k: torch.cat([r[k] for r in rows]).nanmean().item() for k in ("RMSE", "FPE", "PCE", "R", "R_pooled")}
+    worst = torch.cat([r["RMSE"] for r in rows])
+    return mean if bool(worst.isfinite().all()) else {**mean, "RMSE": math.inf}

@@ -1,0 +1,100 @@
+"""Motions for training: which scenes are learned from, which choose the best weights, and short pieces of them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import h5py
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from stages.errors import InputError
+from stages.lab.motions import Motions, joined, read_motions
+from stages.models.world import World
+from stages.scene.files import sha256
+
+UNSEEN = 100  # scenes at the end of the last group that only choose among weights
+
+
+@dataclass(frozen=True)
+class Piece:
+    """A batch of short motions."""
+
+    world: World  # at rest, as of the first frame of the whole motion
+    points: Float[Tensor, "b o n 3"]  # where they start [m]
+    speed: Float[Tensor, "b o n 3"]  # [m/s]
+    truth: Float[Tensor, "b t o n 3"]  # the frames after the start [m]
+
+
+def home(folder: Path) -> Path:
+    """Where the motions of a data set lie: in the folder `motions`, or right there."""
+    inner = Path(folder) / "motions"
+    return inner if inner.is_dir() else Path(folder)
+
+
+def read_groups(folder: Path, names: Sequence[str], keypoints: int) -> Motions:
+    """Scenes of NAME.h5 in a folder, with the first `keypoints` of each object. Raises InputError for missing files."""
+    folder = home(folder)
+    missing = [f"{name}.h5" for name in names if not (folder / f"{name}.h5").is_file()]
+    if missing:
+        raise InputError(f"{folder}: there is no {', '.join(missing)}; make the groups with `ngff-lab dataset`, or "
+                         "name those that are there")  # fmt: skip
+    parts = []
+    for name in names:
+        part = read_motions(folder / f"{name}.h5")
+        if part.points.shape[3] < keypoints:
+            raise InputError(f"{folder / name}.h5: has {part.points.shape[3]} keypoints an object; ask for at most so "
+                             f"many, not {keypoints}")  # fmt: skip
+        parts.append(replace(part, points=part.points[:, :, :, :keypoints].clone()))
+    odd = next((n for n, p in zip(names, parts, strict=True) if p.points.shape[1] != parts[0].points.shape[1]), None)
+    if odd:
+        raise InputError(f"{folder / odd}.h5: has another number of frames than {names[0]}.h5; use groups of one kind")
+    return joined(parts)
+
+
+def split(motions: Motions, unseen: int) -> tuple[Motions, Motions]:
+    """Scenes to learn from, and the last ones to choose by."""
+    count = max(1, min(unseen, len(motions) // 3))
+    if len(motions) < 2:
+        raise InputError("two scenes are the least that can be trained on: one to learn from, one to choose by")
+    return motions[: len(motions) - count], motions[len(motions) - count :]
+
+
+def recipe(folder: Path, names: Sequence[str]) -> list[dict]:
+    """What the card of weights says about each file they were trained on."""
+    files = []
+    for name in names:
+        path = home(folder) / f"{name}.h5"
+        with h5py.File(path, "r") as file:
+            made = json.loads(file.attrs.get("provenance", "{}"))
+        files.append({"name": path.name, "sha256": sha256(path), "made": made})
+    return files
+
+
+class Pieces:
+    """Random pieces of scenes that lie in the memory of a device."""
+
+    def __init__(self, motions: Motions, device: torch.device | str):
+        self.motions = motions.to(device)
+        self.world = self.motions.world()
+
+    def draw(self, count: int, horizon: int, generator: torch.Generator, part: slice = slice(None)) -> Piece:
+        """`count` random scenes from random frames on, for `horizon` frames after the first; a part of them."""
+        points = self.motions.points
+        frames = points.shape[1]
+        row = torch.randint(len(points), (count,), generator=generator)
+        start = torch.randint(frames - horizon, (count,), generator=generator)
+        return self.take(row[part].to(points.device), start[part].to(points.device), horizon)
+
+    def take(self, row: Tensor, start: Tensor, horizon: int) -> Piece:
+        """Those scenes from those frames on; speeds are central differences, and 0 at frame 0, where all rest."""
+        points, dt = self.motions.points, self.motions.dt
+        frames = start[:, None] + torch.arange(1, horizon + 1, device=start.device)
+        truth = points[row[:, None], frames]
+        speed = (truth[:, 0] - points[row, (start - 1).clamp_min(0)]) / (2 * dt)
+        speed = torch.where((start > 0)[:, None, None, None], speed, 0.0)
+        return Piece(self.world[row], points[row, start], speed, truth)

@@ -1,0 +1,172 @@
+"""Loss and gradient of a batch: a rollout over some frames and back, on a GPU replayed as one CUDA graph.
+
+What a model computes once for a scene (`prepare`, `observe`) decomposes matrices, for which the host must wait, so it
+stays outside of the graph; gradients are carried on by hand from the graph into it.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from dataclasses import fields, is_dataclass, replace
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from stages.lab.training_data import Piece
+from stages.models.dynamics import Dynamics
+from stages.models.pushes import Pushes
+
+log = logging.getLogger(__name__)
+UNIT = 0.01  # errors count in centimetres: gradients of order one
+FINE = 0.1  # errors below a millimetre no longer matter to the root [UNIT]
+
+
+class Unpushed(Pushes):
+    """No pushes, without the work of adding up none (which makes the host wait)."""
+
+    @classmethod
+    def amid(cls, valid: Bool[Tensor, "b o n"], like: Tensor) -> Unpushed:
+        b, o, _ = valid.shape
+        whole, real, vector = valid.new_zeros(b, 0, dtype=torch.int64), like.new_zeros(b, 0), like.new_zeros(b, 0, 3)
+        return cls(whole, vector, vector, real, real, whole, valid.new_zeros(b, o))
+
+    def wrench(self, points: Tensor, com: Tensor, t: Tensor | float, dt: float = 0.0) -> tuple[Tensor, Tensor]:
+        return torch.zeros_like(com), torch.zeros_like(com)
+
+    def acceleration(self, world: Any, points: Tensor, t: Tensor | float, dt: float = 0.0) -> Tensor:
+        return torch.zeros_like(points)
+
+
+def loss_of(
+    predicted: Float[Tensor, "b t o n 3"], truth: Float[Tensor, "b t o n 3"], valid: Bool[Tensor, "b o n"], root: bool
+) -> Float[Tensor, ""]:
+    """Mean squared coordinate error [cm^2] of the keypoints that are there; with `root` the mean RMSE [cm]."""
+    squared = ((predicted - truth) / UNIT).square().mean((1, 4))
+    each = torch.where(valid, squared, 0.0).sum((1, 2)) / valid.sum((1, 2)).clamp_min(1)
+    return (each + FINE**2).sqrt().mean() if root else each.mean()
+
+
+class Roll:
+    """Call it with batches of one size and horizon: the loss, and its gradient for each of the model's parameters."""
+
+    def __init__(self, model: Dynamics, dt: float, root: bool = False, graph: bool = True, compiled: bool = False):
+        self.model, self.dt, self.root = model, dt, root
+        self.advance = torch.compile(_advance, fullgraph=True, dynamic=False) if compiled else _advance
+        self.params = [p for p in model.parameters() if p.requires_grad]
+        self.wanted = graph and self.params[0].is_cuda
+        self.graph: torch.cuda.CUDAGraph | None = None
+
+    def __call__(self, piece: Piece) -> tuple[Float[Tensor, ""], list[Tensor]]:
+        scene = self.model.prepare(piece.world)
+        with torch.no_grad():
+            state = self.model.observe(scene, piece.points, piece.speed)
+        given = (scene, state, piece.truth, piece.world.valid)
+        if self.wanted and self.graph is None:
+            self._capture(given)
+        if self.graph is None:
+            loss, grads = self._compiled(given)
+        else:
+            for kept, new in zip(tensors(self.kept), tensors(given), strict=True):
+                kept.data.copy_(new.detach())
+            self.graph.replay()
+            loss, grads = self.result
+        return loss, self._carried(scene, grads)
+
+    def _walk(self, given: tuple) -> tuple[Tensor, list[Tensor | None]]:
+        """Loss, and gradients of the parameters, then of what was prepared."""
+        scene, state, truth, valid = given
+        free = [x.detach().requires_grad_(x.requires_grad) for x in tensors(scene)]
+        scene = rebuilt(scene, iter(free))
+        # so that the first step is like the others to a compiler
+        state = rebuilt(state, (x.detach().requires_grad_() for x in tensors(state)))
+        pushes = Unpushed.amid(valid, truth)
+        frames = []
+        for _ in range(truth.shape[1]):
+            state, points = self.advance(self.model, scene, state, self.dt, pushes)
+            frames.append(points)
+        loss = loss_of(torch.stack(frames, 1), truth, valid, self.root)
+        wanted = self.params + [x for x in free if x.requires_grad]
+        return loss.detach(), list(torch.autograd.grad(loss, wanted, allow_unused=True))
+
+    def _compiled(self, given: tuple) -> tuple[Tensor, list[Tensor | None]]:
+        """The walk; where it cannot be compiled, say so and go on without."""
+        try:
+            return self._walk(given)
+        except Exception as error:  # a compiler fails in many ways
+            if self.advance is _advance:
+                raise
+            log.info("cannot be compiled, going on without: %s", str(error).strip().splitlines()[0])
+            self.advance = _advance
+            return self._walk(given)
+
+    def _carried(self, scene: Any, grads: list[Tensor | None]) -> list[Tensor]:
+        """Gradients of the parameters, with those that come through the prepared scene."""
+        own, inner = grads[: len(self.params)], grads[len(self.params) :]
+        prepared = [(x, g) for x, g in zip([x for x in tensors(scene) if x.requires_grad], inner, strict=True)
+                    if g is not None]  # fmt: skip
+        more = [None] * len(own)
+        if prepared:
+            outputs, weights = zip(*prepared, strict=True)
+            more = torch.autograd.grad(outputs, self.params, weights, allow_unused=True)
+        return [_sum(p, a, b) for p, a, b in zip(self.params, own, more, strict=True)]
+
+    def _capture(self, given: tuple) -> None:
+        """Record the walk; where that fails, say so and go on without."""
+        self.wanted = False
+        # leaves with memory of their own, which the graph reads
+        kept = [x.detach().clone(memory_format=torch.contiguous_format).requires_grad_(x.requires_grad)
+                for x in tensors(given)]  # fmt: skip
+        kept = rebuilt(given, iter(kept))
+        try:
+            side = torch.cuda.Stream()
+            side.wait_stream(torch.cuda.current_stream())
+            with torch.cuda.stream(side):
+                for _ in range(2):
+                    self._compiled(kept)
+            torch.cuda.current_stream().wait_stream(side)
+            graph = torch.cuda.CUDAGraph()
+            with torch.cuda.graph(graph):
+                self.result = self._walk(kept)
+            self.graph, self.kept = graph, kept
+        except RuntimeError as error:
+            torch.cuda.synchronize()
+            log.info("no CUDA graph, going on step by step: %s", str(error).splitlines()[0])
+
+
+def _advance(model: Dynamics, scene: Any, state: tuple, dt: float, pushes: Pushes) -> tuple[tuple, Tensor]:
+    """The next state and where its points are; without pushes the time does not matter."""
+    state = model.step(scene, state, 0.0, dt, pushes)
+    return state, model.points(scene, state)
+
+
+def tensors(tree: Any) -> Iterator[Tensor]:
+    """All tensors in tuples and dataclasses, in order."""
+    if isinstance(tree, Tensor):
+        yield tree
+    elif is_dataclass(tree):
+        for f in fields(tree):
+            yield from tensors(getattr(tree, f.name))
+    elif isinstance(tree, tuple):
+        for x in tree:
+            yield from tensors(x)
+
+
+def rebuilt(tree: Any, new: Iterator[Tensor]) -> Any:
+    """The same with other tensors."""
+    if isinstance(tree, Tensor):
+        return next(new)
+    if is_dataclass(tree):
+        return replace(tree, **{f.name: rebuilt(getattr(tree, f.name), new) for f in fields(tree)})
+    if isinstance(tree, tuple):
+        parts = [rebuilt(x, new) for x in tree]
+        return type(tree)(*parts) if hasattr(tree, "_fields") else tuple(parts)
+    return tree
+
+
+def _sum(like: Tensor, a: Tensor | None, b: Tensor | None) -> Tensor:
+    if a is None and b is None:
+        return torch.zeros_like(like)
+    return a if b is None else b if a is None else a + b

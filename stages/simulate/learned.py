@@ -1,0 +1,180 @@
+"""The learned force field as an engine: the scene is taken to the size, gravity and place of the model's world.
+
+Motion under gravity looks the same at any size when times grow with the root of lengths over gravity, so a scene
+is made as large as what the model was trained on, given its gravity, and taken back. With lengths s times longer and
+gravity g' instead of g: times are sqrt(s g / g') longer, masses s^3, Young's moduli s g' / g, forces s^3 g' / g.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from stages.backends import pick_device
+from stages.errors import InputError
+from stages.models import weights
+from stages.models.dynamics import FRAME, Dynamics
+from stages.models.pushes import Pushes
+from stages.models.world import FLOOR, World, centre
+from stages.physics.forces import Prompts
+from stages.physics.materials import choose_materials
+from stages.physics.skinning import rotations
+from stages.physics.state import State
+from stages.scene.scene import Scene
+from stages.scene.trajectory import Keypoints
+from stages.simulate.mpm import Stage, set_up
+from stages.simulate.options import SimulateOptions
+
+log = logging.getLogger(__name__)
+SIZE = 0.55  # usual longest side of an object in training [m]
+SIZES = (0.25, 1.2)  # and the smallest and largest
+MOST = 6  # objects that scenes of the benchmark have
+FALL = 5.0  # gravity in training [m/s^2]
+FAST = 5.0  # speeds that falls reach there [m/s]
+FAR = 100.0  # walls where there are none [m]
+
+
+@dataclass(frozen=True)
+class Frame:
+    """From the scene to the model's world and back."""
+
+    length: float  # model metres in a scene unit
+    time: float  # model seconds in a second
+    mass: float  # model kilograms in a kilogram
+    stress: float  # model pascals in a pascal
+    origin: Float[Tensor, "3"]  # where the model's world has its point (0, 0, FLOOR) [scene units]
+    gravity: float  # in the model's world, downwards [m/s^2]
+
+    @staticmethod
+    def of(keypoints: list[Float[Tensor, "k 3"]], floor: float, unit: float, gravity: float) -> Frame:
+        """`keypoints` of each object and `floor` in scene units, `unit` metres each."""
+        sides = torch.stack([(p.amax(0) - p.amin(0)).amax() for p in keypoints])
+        length = SIZE / float(sides.median().clamp_min(1e-9))
+        scale = length / unit
+        fall = math.copysign(FALL, gravity) if abs(gravity) > 1e-3 else 0.0
+        quick = fall / gravity if fall else 1.0  # without weight, time is as it is
+        middle = torch.cat(keypoints).mean(0)
+        origin = torch.tensor([float(middle[0]), float(middle[1]), floor])
+        return Frame(length, math.sqrt(scale / quick), scale**3, scale * quick, origin, fall)
+
+    def inside(self, points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
+        """Scene units to model metres."""
+        return (points - self.origin) * self.length + torch.tensor([0.0, 0.0, FLOOR])
+
+
+def rollout(scene: Scene, keypoints: Keypoints, prompts: Prompts, options: SimulateOptions) -> Iterator[State]:
+    """One state a frame, the first being the start. Raises InputError when the motion is no longer finite."""
+    device = pick_device(options.device)
+    model, card = weights.load(weights.find(options.engine, options.weights), device)
+    if card.get("warning"):
+        log.warning("%s", card["warning"])
+    stage = set_up(scene, prompts, options)
+    ids = [o.id for o in scene.objects]
+    each = [keypoints.rest[keypoints.object_id == i] for i in ids]
+    frame = Frame.of(each, stage.box.low[2], scene.metres_per_unit, options.gravity)
+    world = _world(scene, each, stage, frame, prompts, options)
+    _warn(world, model, frame)
+    pushes = Pushes.of(world, _scaled(prompts, frame, stage, ids), ids)
+    steps = max(1, math.ceil(options.dt * frame.time / FRAME - 1e-6))
+    log.info("%s (%s): %d objects, %d keypoints, %.3g times as large and %.3g times slower, %d steps a frame",
+             options.engine, card["sha256"][:8], len(ids), len(keypoints.rest), frame.length / scene.metres_per_unit,
+             frame.time, steps)  # fmt: skip
+    lifted = keypoints.rest + stage.lift[[ids.index(int(i)) for i in keypoints.object_id]]
+
+    @torch.no_grad()
+    def states() -> Iterator[State]:
+        place, pushed = world.to(device), pushes.to(device)
+        prepared = model.prepare(place)
+        state, dt = model.start(prepared), options.dt * frame.time / steps
+        first = model.points(prepared, state)
+        for n in range(options.steps):
+            points = model.points(prepared, state)
+            if not bool(points.isfinite().all()):
+                raise InputError(f"the motion ceased to be finite at {n * options.dt:.2f} s; use a smaller --velocity "
+                                 "or --force, or --engine mpm")  # fmt: skip
+            yield _state(keypoints, ids, lifted, place, (points - first) / frame.length, stage)
+            for k in range(steps if n < options.steps - 1 else 0):
+                state = model.step(prepared, state, (n * steps + k) * dt, dt, pushed)
+
+    return states()
+
+
+def _world(
+    scene: Scene, each: list[Tensor], stage: Stage, frame: Frame, prompts: Prompts, options: SimulateOptions
+) -> World:
+    """The objects where they start, in the model's world."""
+    materials = choose_materials(scene.objects, options.material, options.materials)
+    most = max(len(p) for p in each)
+    points, valid = torch.zeros(1, len(each), most, 3), torch.zeros(1, len(each), most, dtype=torch.bool)
+    mass, E, nu, friction = torch.ones(4, 1, len(each))
+    velocity = torch.zeros(1, len(each), 3)
+    for row, (o, p) in enumerate(zip(scene.objects, each, strict=True)):
+        points[0, row, : len(p)] = frame.inside(p + stage.lift[row] + stage.settled[row])
+        valid[0, row, : len(p)] = True
+        choice = materials[o.id]
+        volume = float(stage.bodies.volume[stage.bodies.body == row].sum()) * scene.metres_per_unit**3
+        mass[0, row] = choice.material.density * volume * frame.mass
+        E[0, row], nu[0, row] = choice.material.E * frame.stress, choice.material.nu
+        friction[0, row] = choice.material.friction if options.friction is None else options.friction
+        velocity[0, row] = torch.tensor(prompts.velocity.get(o.id, (0.0, 0.0, 0.0))) * frame.length / frame.time
+        guess = f"; material not known, taking {choice.name} (--material {o.id}=... changes it)" * choice.guessed
+        log.info("object %d (%s): %s, %.3g kg%s", o.id, o.name, choice.name, mass[0, row] / frame.mass, guess)
+    low, high = torch.tensor([-FAR, -FAR, FLOOR]), torch.full((3,), FAR)
+    if options.box:
+        low, high = (frame.inside(torch.tensor(corner)) for corner in (stage.box.low, stage.box.high))
+    gravity = torch.tensor([0.0, 0.0, -frame.gravity])
+    return World.of(points, valid, mass=mass, E=E, nu=nu, friction=friction, velocity=velocity, gravity=gravity,
+                    box=torch.stack([low, high]))  # fmt: skip
+
+
+def _scaled(prompts: Prompts, frame: Frame, stage: Stage, ids: list[int]) -> Prompts:
+    """Pushes in the model's units."""
+    metres = frame.mass ** (1 / 3)
+    newtons = frame.mass * metres / frame.time**2
+
+    def scaled(f):
+        at = None
+        if f.at is not None:
+            row = ids.index(f.object_id)
+            at = tuple(frame.inside(torch.tensor(f.at) + stage.lift[row] + stage.settled[row]).tolist())
+        return replace(
+            f, force=tuple(newtons * v for v in f.force), torque=tuple(newtons * metres * v for v in f.torque),
+            start=f.start * frame.time, end=f.end * frame.time, at=at,
+        )  # fmt: skip
+
+    return replace(prompts, forces=tuple(scaled(f) for f in prompts.forces))
+
+
+def _warn(world: World, model: Dynamics, frame: Frame) -> None:
+    """What the model has not seen in training, or does not hear of."""
+    points = world.points[0]
+    hidden = ~world.valid[0, ..., None]
+    sides = (points.masked_fill(hidden, -torch.inf).amax(1) - points.masked_fill(hidden, torch.inf).amin(1)).amax(1)
+    if float(sides.max() / sides.min()) > SIZES[1] / SIZES[0]:
+        log.warning("the largest object is %.1f times as long as the smallest, and in training never more than %.1f; "
+                    "compare with --engine mpm", sides.max() / sides.min(), SIZES[1] / SIZES[0])  # fmt: skip
+    if len(sides) > MOST:
+        log.warning("%d objects; the model was tested with up to %d, so compare with --engine mpm", len(sides), MOST)
+    if float(world.velocity.norm(dim=-1).max()) > FAST:
+        log.warning("an object starts faster than any in training; compare with --engine mpm")
+    for name in sorted({"mass", "E", "friction", "gravity"} - model.told):
+        log.warning("this model is not told the %s", name)
+
+
+def _state(
+    keypoints: Keypoints, ids: list[int], lifted: Float[Tensor, "p 3"], world: World, moved: Float[Tensor, "1 o n 3"],
+    stage: Stage,
+) -> State:  # fmt: skip
+    """Keypoints have `moved` [scene units] since the start, where they are exactly as seen, but for the lift."""
+    positions, moved = lifted.clone(), moved.cpu()
+    for row, i in enumerate(ids):
+        mine = keypoints.object_id == i
+        positions[mine] += moved[0, row, : int(mine.sum())]
+    start = torch.stack([lifted[keypoints.object_id == i].mean(0) for i in ids])
+    return State(positions, start + centre(world.to("cpu"), moved)[0], rotations(keypoints, positions, ids))

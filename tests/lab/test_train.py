@@ -1,0 +1,300 @@
+"""Training: pieces, loss, gradients, steps, checkpoints, and the command."""
+
+import math
+import os
+import signal
+import socket
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from torch.testing import assert_close
+from typer.testing import CliRunner
+
+from ngff_cli.lab import app
+from stages.errors import InputError
+from stages.lab import train
+from stages.lab.motions import Motions, write_motions
+from stages.lab.train import TrainOptions, run, validate
+from stages.lab.training_data import Pieces, read_groups, split
+from stages.lab.training_roll import Roll, Unpushed, loss_of
+from stages.lab.training_state import LIMIT, Trainee
+from stages.models.pushes import Pushes
+from stages.models.weights import MODELS, build, load
+from stages.models.world import BOX, GRAVITY
+
+DT = 0.02
+FLOOR = BOX[0][2]
+
+
+def falling(scenes: int = 6, frames: int = 12, objects: int = 2, n: int = 8, seed: int = 0) -> Motions:
+    """Balls of points that fall from different heights and stay where their lowest point meets the floor."""
+    rng = torch.Generator().manual_seed(seed)
+    shape = 0.1 * torch.nn.functional.normalize(torch.randn(scenes, objects, n, 3, generator=rng), dim=-1)
+    centre = torch.rand(scenes, objects, 3, generator=rng) - 0.5
+    centre[..., 2] = FLOOR + 0.1 + 0.1 * torch.rand(scenes, objects, generator=rng)
+    start = centre[:, :, None] + shape
+    fallen = -GRAVITY[2] * (DT * torch.arange(frames)).square() / 2
+    room = start[..., 2].amin(-1) - FLOOR
+    points = start[:, None].repeat(1, frames, 1, 1, 1)
+    points[..., 2] -= torch.minimum(fallen[None, :, None], room[:, None])[..., None]
+    one = torch.ones(scenes, objects)
+    ids = torch.arange(objects).expand(scenes, objects).clone()
+    return Motions(tuple(map(str, range(scenes))), ids, points, 0.1 * one, 1e5 * one, 0.3 * one, 0.5 * one, DT,
+                   GRAVITY, BOX)  # fmt: skip
+
+
+def without_last(motions: Motions) -> Motions:
+    """The last object of scene 0 is padding."""
+    ids, points = motions.objects.clone(), motions.points.clone()
+    ids[0, -1], points[0, :, -1] = -1, 0
+    return replace(motions, objects=ids, points=points)
+
+
+@pytest.fixture
+def data(tmp_path: Path) -> Path:
+    """A folder with two groups."""
+    (tmp_path / "data" / "motions").mkdir(parents=True)
+    for seed, name in enumerate(("3_0", "3_1")):
+        made = {"command": f"made {name}"}
+        write_motions(tmp_path / "data" / "motions" / f"{name}.h5", falling(frames=6, seed=seed), made)
+    return tmp_path / "data"
+
+
+@pytest.fixture(autouse=True)
+def few_checks(monkeypatch):
+    monkeypatch.setattr(train, "CHECKS", 4)
+
+
+QUICK = TrainOptions(steps=12, batch=2, keypoints=8, horizons="2,3", hidden=8, groups="3_0..3_1", device="cpu")
+
+
+def test_pieces_start_with_the_speed_of_free_fall():
+    motions = falling(frames=6)
+    piece = Pieces(motions, "cpu").take(torch.tensor([1, 4]), torch.tensor([0, 2]), 3)
+    assert_close(piece.points, torch.stack([motions.points[1, 0], motions.points[4, 2]]))
+    assert_close(piece.truth, torch.stack([motions.points[1, 1:4], motions.points[4, 3:6]]))
+    assert_close(piece.speed[0], torch.zeros(2, 8, 3))
+    # central differences are exact for a parabola: only rounding of positions near 1, over 2 dt, is left
+    assert_close(piece.speed[1], torch.tensor([0.0, 0.0, GRAVITY[2] * 2 * DT]).expand(2, 8, 3), rtol=0, atol=1e-5)
+
+
+def test_pieces_never_reach_past_the_last_frame():
+    pieces, rng = Pieces(falling(frames=5), "cpu"), torch.Generator().manual_seed(0)
+    starts = {float(pieces.draw(1, 3, rng).speed[0, 0, 0, 2]) for _ in range(40)}
+    assert len(starts) == 2  # frames 0 and 1 are all that leave 3 more
+
+
+def test_a_centimetre_in_one_coordinate_is_a_third_of_a_square_centimetre():
+    truth = torch.zeros(1, 2, 2, 4, 3)
+    valid = torch.tensor([[[True] * 4, [False] * 4]])
+    predicted = truth.clone()
+    predicted[:, :, 0, :, 2] = 0.01
+    predicted[:, :, 1] = 7.0  # padding does not count
+    assert_close(loss_of(predicted, truth, valid, root=False), torch.tensor(1 / 3))
+    assert_close(loss_of(predicted, truth, valid, root=True), torch.tensor((1 / 3 + 0.01) ** 0.5))
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_gradients_are_those_of_the_rollout(name):
+    """The prepared scene is cut off and its gradient carried on by hand; the model's own rollout knows no cut."""
+    torch.manual_seed(0)
+    model = build(name, hidden=8).eval()  # no dropout
+    pieces = Pieces(without_last(falling()), "cpu")
+    piece = pieces.take(torch.tensor([0, 3]), torch.tensor([0, 5]), 3)
+    loss, grads = Roll(model, DT)(piece)
+    predicted = model.rollout(piece.world, 4, DT, start=(piece.points, piece.speed))[:, 1:]
+    whole = loss_of(predicted, piece.truth, piece.world.valid, False)
+    whole.backward()
+    assert_close(loss, whole.detach())
+    assert sum(float(g.abs().sum()) for g in grads) > 0
+    for p, g in zip(model.parameters(), grads, strict=True):
+        assert_close(g, torch.zeros_like(p) if p.grad is None else p.grad, rtol=1e-4, atol=1e-6)
+
+
+def test_no_pushes_are_no_pushes():
+    world = without_last(falling()).world()
+    ours, none = Unpushed.amid(world.valid, world.points), Pushes.none(world)
+    assert_close(ours.acceleration(world, world.points, 0.0), none.acceleration(world, world.points, 0.0))
+    com = torch.zeros(6, 2, 3)
+    assert_close(ours.wrench(world.points, com, 0.0, DT), none.wrench(world.points, com, 0.0, DT))
+
+
+def test_a_step_without_finite_gradients_changes_nothing():
+    trainee = Trainee(build("gcn", hidden=8), 1e-2, 0)
+    good = [torch.ones_like(p) for p in trainee.params]
+    trainee.update(good, 1e-2)
+    before = [p.detach().clone() for p in trainee.params]
+    usual = trainee.usual.clone()
+    trainee.update([torch.full_like(good[0], math.nan), *good[1:]], 1e-2)
+    assert all(torch.equal(a, b) for a, b in zip(before, trainee.params, strict=True))
+    assert torch.equal(usual, trainee.usual)
+    trainee.update(good, 1e-2)
+    assert not any(torch.equal(a, b) for a, b in zip(before, trainee.params, strict=True))
+
+
+def test_an_outlier_is_cut_to_twice_the_usual_norm():
+    trainee = Trainee(build("gcn", hidden=8), 1e-3, 0)
+    good = [torch.ones_like(p) for p in trainee.params]
+    trainee.update(good, 1e-3)
+    usual = float(trainee.usual)
+    trainee.update([1e4 * g for g in good], 1e-3)
+    assert float(torch.stack([p.grad.square().sum() for p in trainee.params]).sum().sqrt()) == pytest.approx(
+        LIMIT * usual, rel=1e-4
+    )
+    assert float(trainee.usual) == pytest.approx(usual * (0.99 + 0.01 * LIMIT), rel=1e-4)
+
+
+def test_training_teaches_to_fall(tmp_path):
+    """A graph network knows nothing of gravity at first."""
+    write_motions(tmp_path / "3_0.h5", falling(scenes=30, n=6, frames=6), {})
+    options = replace(QUICK, steps=80, batch=8, keypoints=6, horizons="1", lr=2e-2, hidden=16, groups="3_0")
+    torch.manual_seed(options.seed)
+    unseen = split(read_groups(tmp_path, ["3_0"], 6), 100)[1]
+    before = validate(build("gcn", hidden=16), unseen)["RMSE"]
+    run("gcn", tmp_path, tmp_path / "gcn.safetensors", options)
+    card = load(tmp_path / "gcn.safetensors")[1]
+    assert card["validation"]["RMSE"] < 0.2 * before
+    assert card["curve"][-1]["loss"] < 0.1 * card["curve"][0]["loss"]
+
+
+def test_the_card_says_what_made_the_weights(data, tmp_path):
+    lines = run("gcn", data, tmp_path / "a.safetensors", QUICK)
+    model, card = load(tmp_path / "a.safetensors")
+    assert str(tmp_path / "a.safetensors") in lines[0]
+    assert [f["made"]["command"] for f in card["data"]] == ["made 3_0", "made 3_1"]
+    assert (card["scenes"], card["scenes to choose by"], card["steps"], card["finished"]) == (8, 4, 12, True)
+    assert card["options"]["seed"] == 0 and card["config"]["hidden"] == 8
+    assert [row["horizon"] for row in card["curve"]] == [2, 2, 3, 3]
+    unseen = split(read_groups(data, ["3_0", "3_1"], 8), 100)[1]
+    assert card["validation"]["RMSE"] == min(row["RMSE"] for row in card["curve"])
+    assert validate(model, unseen)["RMSE"] == pytest.approx(card["validation"]["RMSE"], rel=1e-6)
+
+
+@pytest.mark.parametrize("after", [1, 5])
+def test_a_run_that_was_stopped_goes_on_to_the_same_curve(data, tmp_path, monkeypatch, after):
+    run("pointformer", data, tmp_path / "whole.safetensors", QUICK)  # with dropout
+    with monkeypatch.context() as patch:
+        update = Trainee.update
+
+        def stopped(self, grads, lr):
+            update(self, grads, lr)
+            if self.step == after:
+                os.kill(os.getpid(), signal.SIGTERM)
+
+        patch.setattr(Trainee, "update", stopped)
+        lines = run("pointformer", data, tmp_path / "parts.safetensors", QUICK)
+    assert "--resume" in lines[0] and not load(tmp_path / "parts.safetensors")[1]["finished"]
+    run("pointformer", data, tmp_path / "parts.safetensors", QUICK, resume=True)
+    (a, whole), (b, parts) = (load(tmp_path / f"{name}.safetensors") for name in ("whole", "parts"))
+    assert parts["finished"] and parts["steps"] == 12
+    extra = [row for row in parts["curve"] if row["step"] not in {row["step"] for row in whole["curve"]}]
+    assert len(extra) == (after == 1)  # stopped before the first line: one is needed to save weights at all
+
+    def curve(card):
+        return [{k: v for k, v in row.items() if k not in ("minutes", "loss")} for row in card["curve"]
+                if row not in extra]  # fmt: skip
+
+    assert curve(whole) == curve(parts)
+    for p, q in zip(a.parameters(), b.parameters(), strict=True):
+        assert torch.equal(p, q)
+
+
+def test_a_checkpoint_of_something_else_is_refused(data, tmp_path):
+    out = tmp_path / "a.safetensors"
+    with pytest.raises(InputError, match="no such file"):
+        run("gcn", data, out, QUICK, resume=True)
+    run("gcn", data, out, replace(QUICK, steps=2))
+    with pytest.raises(InputError, match="another steps, lr"):
+        run("gcn", data, out, replace(QUICK, lr=0.1), resume=True)
+    out.with_suffix(".ckpt").write_bytes(b"broken")
+    with pytest.raises(InputError, match="checkpoint"):
+        run("gcn", data, out, QUICK, resume=True)
+
+
+def test_an_rmse_that_is_not_finite_is_the_worst():
+    class Lost:
+        def eval(self):
+            pass
+
+        def rollout(self, world, frames, dt):
+            points = world.points[:, None].repeat(1, frames, 1, 1, 1)
+            points[0] = math.nan
+            return points
+
+    assert validate(Lost(), falling())["RMSE"] == math.inf
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"groups": "3_0..3_2"}, "3_2.h5"),
+        ({"keypoints": 9}, "8 keypoints"),
+        ({"horizons": "3,8"}, "6 frames"),
+        ({"horizons": "8,x"}, "--horizons"),
+        ({"lr": 0.0}, "--lr"),
+    ],
+)
+def test_what_cannot_be_trained_on_is_said(data, tmp_path, change, message):
+    with pytest.raises(InputError, match=message):
+        run("ngff", data, tmp_path / "a.safetensors", replace(QUICK, **change))
+    assert not (tmp_path / "a.safetensors").exists()
+
+
+def test_the_command_trains(data, tmp_path):
+    out = tmp_path / "gcn.safetensors"
+    words = f"--steps 2 --batch 2 --keypoints 8 --horizons 2 --hidden 8 --groups 3_0,3_1 --device cpu -o {out}"
+    result = CliRunner().invoke(app, ["train", "gcn", "--data", str(data), *words.split()])
+    assert result.exit_code == 0, result.output
+    assert "RMSE" in result.stdout
+    assert load(out)[1]["steps"] == 2
+
+
+def test_two_processes_train_as_one_with_the_whole_batch(data, tmp_path):
+    """Each takes half of every batch, and gradients are averaged: only the order of sums differs."""
+    words = ["train", "gcn", "--data", str(data), "--device", "cpu"]
+    words += ["--steps", "6", "--batch", "4", "--keypoints", "8", "--horizons", "3", "--hidden", "8"]
+    words += ["--groups", "3_0,3_1"]
+    assert CliRunner().invoke(app, [*words, "-o", str(tmp_path / "one.safetensors")]).exit_code == 0
+    command = f"from ngff_cli.lab import app; app({[*words, '-o', str(tmp_path / 'two.safetensors')]!r})"
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        place = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(probe.getsockname()[1]), "OMP_NUM_THREADS": "1"}
+    crew = [
+        subprocess.Popen([sys.executable, "-c", command], stderr=subprocess.PIPE, text=True,
+                         env={**os.environ, **place, "WORLD_SIZE": "2", "RANK": str(i), "LOCAL_RANK": str(i)})
+        for i in range(2)
+    ]  # fmt: skip
+    for process in crew:
+        assert process.wait(60) == 0, process.stderr.read()
+    (one, _), (two, card) = (load(tmp_path / f"{name}.safetensors") for name in ("one", "two"))
+    assert card["processes"] == 2 and card["steps"] == 6
+    for p, q in zip(one.parameters(), two.parameters(), strict=True):
+        assert_close(p, q, rtol=1e-3, atol=1e-5)
+
+
+def test_a_batch_that_cannot_be_shared_is_said(data, tmp_path, monkeypatch):
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    with pytest.raises(InputError, match="multiple of 2"):
+        run("gcn", data, tmp_path / "a.safetensors", replace(QUICK, batch=3))
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("name", MODELS)
+def test_a_cuda_graph_gives_the_same(name):
+    if not torch.cuda.is_available():
+        pytest.skip("needs an NVIDIA GPU")
+    torch.manual_seed(0)
+    model = build(name, hidden=16).cuda().eval()
+    pieces, rng = Pieces(without_last(falling()), "cuda"), torch.Generator().manual_seed(0)
+    recorded, plain = Roll(model, DT), Roll(model, DT, graph=False)
+    for _ in range(3):
+        piece = pieces.draw(4, 3, rng)
+        (loss, grads), (loss_, grads_) = recorded(piece), plain(piece)
+        assert recorded.graph is not None
+        assert_close(loss, loss_)
+        for a, b in zip(grads, grads_, strict=True):
+            assert_close(a, b, rtol=1e-3, atol=1e-5)

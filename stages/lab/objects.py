@@ -94,13 +94,16 @@ def run(
     from stages.scene.files import provenance
     from stages.scene.images import write_jpeg
 
+    if meshes and options.only:
+        raise InputError("--only names objects of the data set and --from meshes; give one of the two")
     out, pictures = Path(out), []
     sources = {_mesh_name(path): path for path in meshes} or dict.fromkeys(options.names)
     if len(sources) < len(meshes):
         raise InputError(f"--from: two meshes would both be written to {out}/<name>; rename one of them or its folder")
     for name, path in tqdm(sources.items(), desc="objects", unit="object"):
         g = make_object(name) if path is None else _from_mesh(path, options)
-        write_object(out / name, g, name, provenance("objects", [path] if path else [], options))
+        made_by = provenance("objects", [path], options) if path else provenance("objects", [])
+        write_object(out / name, g, name, made_by)  # the same bytes whatever else was asked for
         if sheet:
             pictures.append(portrait(g, ELEVATION.get(name, 24.0) if path is None else 24.0, name))
         sides = " x ".join(f"{side:.2f}" for side in (g.means.amax(0) - g.means.amin(0)).tolist())

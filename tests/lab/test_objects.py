@@ -265,6 +265,17 @@ def test_cameras_look_at_the_object():
     assert row["fx"] == 960
 
 
+def test_same_file_whatever_else_is_made(tmp_path):
+    for folder, only in (("a", "duck"), ("b", "panda,duck")):
+        assert CliRunner().invoke(app, ["objects", str(tmp_path / folder), "--only", only]).exit_code == 0
+    assert (tmp_path / "a/duck" / PLY).read_bytes() == (tmp_path / "b/duck" / PLY).read_bytes()
+
+
 def test_command_refuses_names_it_does_not_know(tmp_path):
     done = CliRunner().invoke(app, ["objects", str(tmp_path), "--only", "duck,goose"])
+    assert done.exit_code == 2 and not list(tmp_path.iterdir())
+
+
+def test_command_refuses_meshes_and_names_together(tmp_path):
+    done = CliRunner().invoke(app, ["objects", str(tmp_path), "--only", "duck", "--from", "x.obj"])
     assert done.exit_code == 2 and not list(tmp_path.iterdir())

@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 from scipy import ndimage
+from scipy.spatial import ConvexHull, QhullError
 from torch import Tensor
 
 from stages.errors import InputError
@@ -53,14 +54,15 @@ def sample(scene: Scene, count: int, seed: int = 0) -> Bodies:
     Raises InputError for an object without a single usable Gaussian.
     """
     clouds = [surface(scene, o.id, seed) for o in scene.objects]
+    stood = scene.cameras is not None  # and held still for the photos
     gaps = [_gap(c) for c in clouds]
     extent = max(float((c.max(0) - c.min(0)).max()) for c in clouds)
     # closing bridges eight voxels; finer ones would take a sparse object apart
     finest = max(extent / ALONG, max(gaps) / 8, 1e-4 * scene_size(scene), 1e-9)
     h = max(extent / 40, finest)
     for _ in range(5):  # filled bodies hold ~ h^-3 voxels, shells ~ h^-2
-        solids = [_solid(c, h, gap, scene.floor) for c, gap in zip(clouds, gaps, strict=True)]
-        voxels = _apart([v for v, _ in solids])
+        solids = [_solid(c, h, gap, scene.floor, stood) for c, gap in zip(clouds, gaps, strict=True)]
+        voxels = _apart([v for v, _, _ in solids])
         ratio = sum(map(len, voxels)) / count
         if 0.9 < ratio < 1.05 or (ratio < 1 and h <= finest):
             break
@@ -68,7 +70,11 @@ def sample(scene: Scene, count: int, seed: int = 0) -> Bodies:
     rng = np.random.default_rng(seed)
     points = [(v + 0.5 + 0.5 * (rng.random(v.shape) - 0.5)) * h for v in voxels]
     body = torch.arange(len(points)).repeat_interleave(torch.tensor([len(p) for p in points]))
-    volume = h**3 * torch.tensor([share for _, share in solids])[body]
+    volume = h**3 * torch.tensor([share for _, share, _ in solids])[body]
+    for o, (_, _, held) in zip(scene.objects, solids, strict=True):
+        if held:
+            log.info("object %d (%s) would tip over as far as it was seen, and yet it stood: it is taken to reach down "
+                     "to the floor where no camera saw (`ngff refine` looks closer)", o.id, o.name)  # fmt: skip
     return Bodies(torch.from_numpy(np.concatenate(points)).float(), body, volume, h)
 
 
@@ -124,8 +130,13 @@ def inliers(points: Float[Tensor, "n 3"]) -> Tensor:
     return 0.6745 * (distance - middle) <= OUTLIER * spread.clamp_min(1e-12 + 1e-3 * float(middle))
 
 
-def _solid(points: np.ndarray, h: float, gap: float, floor: float | None) -> tuple[np.ndarray, float]:
-    """Voxels (m, 3) of edge h, as integers, inside a closed and filled body, and the volume that each stands for."""
+def _solid(
+    points: np.ndarray, h: float, gap: float, floor: float | None, stood: bool
+) -> tuple[np.ndarray, float, bool]:
+    """Voxels (m, 3) of edge h, as integers, inside a closed and filled body, and the volume that each stands for.
+
+    What `stood` on the floor in photos but would tip over is filled down to the floor, which the last value tells.
+    """
     cells = np.floor(points / h).astype(np.int64)
     margin = 6  # room for closing
     low = cells.min(0) - margin
@@ -136,6 +147,11 @@ def _solid(points: np.ndarray, h: float, gap: float, floor: float | None) -> tup
     standing = floor is not None and abs(float(low[2]) + margin - floor / h) < 4
     body = _largest(_fill(shell, bridge, standing))
     body = _trimmed(body, points / h - low)
+    held = stood and standing and _tips(body)
+    if held:
+        bottom = int(np.flatnonzero(body.any((0, 1)))[0])
+        body = np.flip(np.logical_or.accumulate(np.flip(body, 2), 2), 2)  # something of it is above
+        body[:, :, :bottom] = False
     thin = body & ~ndimage.binary_opening(body, CUBE)
     if thin.any():
         body |= ndimage.binary_dilation(thin, CROSS)
@@ -145,7 +161,18 @@ def _solid(points: np.ndarray, h: float, gap: float, floor: float | None) -> tup
     inside = body & ~_thick_skin(body)
     if inside.sum() < FEWEST:
         inside = body
-    return np.argwhere(inside) + low, float(body.sum() / inside.sum())
+    return np.argwhere(inside) + low, float(body.sum() / inside.sum()), held
+
+
+def _tips(body: np.ndarray) -> bool:
+    """Whether the middle of the voxels lies outside the convex hull of the lowest four layers."""
+    at = np.argwhere(body)
+    base = at[at[:, 2] < at[:, 2].min() + 4, :2]
+    try:
+        hull = ConvexHull(base).equations
+    except (QhullError, ValueError):
+        return False
+    return bool((hull[:, :2] @ at[:, :2].mean(0) + hull[:, 2]).max() > 0)
 
 
 def _gap(points: np.ndarray) -> float:

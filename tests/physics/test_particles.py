@@ -1,6 +1,7 @@
 """Gaussians to particles: volumes, hollows, sheets, overlaps, and input that makes no sense."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -9,6 +10,7 @@ from stages.errors import InputError
 from stages.physics.particles import FEWEST, inliers, sample
 from stages.scene.gaussians import Gaussians, concatenate
 from stages.scene.scene import Scene, SceneObject
+from tests.conftest import ring
 
 
 def splats(means: torch.Tensor, id: int = 1, scale: float = 0.003) -> Gaussians:
@@ -115,3 +117,17 @@ def test_an_object_without_a_single_number_is_an_error():
 def test_outliers_are_what_lies_far_out():
     points = torch.cat([sphere(1000), torch.full((3, 3), 5.0)])
     assert inliers(points).tolist() == [True] * 1000 + [False] * 3
+
+
+@pytest.mark.parametrize(("photographed", "held"), [(True, True), (False, False)])
+def test_what_leaned_on_something_unseen_in_photos_is_held(photographed, held, caplog):
+    """A slab that leans over by twice its thickness: its middle is not above its foot."""
+    caplog.set_level("INFO")
+    rng = torch.Generator().manual_seed(0)
+    p = torch.rand(12000, 3, generator=rng) * torch.tensor([0.06, 0.2, 0.3])
+    leaning = splats(p + p[:, 2:] * torch.tensor([0.8, 0, 0]))
+    bodies = sample(replace(scene(leaning, floor=0.0), cameras=ring() if photographed else None), 8000)
+    under = (bodies.x[:, 0] > 0.2) & (bodies.x[:, 2] < 0.1)
+    assert bool(under.any()) == held and ("would tip over" in caplog.text) == held
+    upright = sample(replace(scene(splats(p), floor=0.0), cameras=ring() if photographed else None), 8000)
+    assert float(upright.volume.sum()) == pytest.approx(0.06 * 0.2 * 0.3, rel=0.25)

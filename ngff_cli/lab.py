@@ -15,7 +15,7 @@ app = typer.Typer(
 
 @app.callback()
 def lab() -> None:
-    """Beside the pipeline: make example data, and see what works on this machine."""
+    """Beside the pipeline: make data, train, measure, and see what works on this machine."""
     set_up_logging(False)
 
 

@@ -14,6 +14,7 @@ def examine() -> Iterator[str]:
     yield _line(True, "ngff", f"{ngff_version()}, Python {platform.python_version()}, {platform.platform(terse=True)}")
     for check in (_torch, _gpu, _gsplat, _warp, _colmap, _codec, _disk):
         yield _line(*check())
+    yield from _weights()
 
 
 def _line(works: bool, subject: str, finding: str) -> str:
@@ -76,6 +77,21 @@ def _codec() -> tuple[bool, str, str]:
 
     works = "libx264" in av.codecs_available
     return works, "H.264", f"PyAV {av.__version__}" + ("" if works else " lacks libx264: reinstall it from its wheel")
+
+
+def _weights() -> Iterator[str]:
+    """Of the models that `simulate` can use."""
+    from stages.errors import InputError
+    from stages.models.weights import find, load
+    from stages.simulate.options import BACKENDS
+
+    for name in BACKENDS.keys() - {"mpm"}:
+        try:
+            path = find(name)
+            card = load(path)[1]
+            yield _line(True, "weights", f"{name}: {path.name} of {path.parent.name}/, sha256 {card['sha256'][:8]}")
+        except InputError as error:
+            yield _line(False, "weights", str(error))
 
 
 def _disk() -> tuple[bool, str, str]:

@@ -6,7 +6,8 @@
 
 Physics as published: fixed corotated bodies, transfer damping 0.9, walls that keep 0.9 of the tangential speed every
 substep of 1e-4 s, gravity 5 m/s^2, frames of 0.02 s; Gaussians of the surface are the particles, and bodies are
-hollow. The grid may be coarser than the published one, and then fewer Gaussians are particles: see docs/dataset.md.
+hollow. The grid may be coarser than the published one, and then fewer Gaussians are particles: see
+stages/lab/results/dataset.md.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from tqdm import tqdm
 from stages.backends import pick_device
 from stages.errors import InputError
 from stages.geometry.neighbours import knn
-from stages.lab.motions import Motions, joined, read_motions, write_motions
+from stages.lab.motions import Motions, joined, write_motions
 from stages.lab.objects import OBJECTS, ObjectKind, make_object
 from stages.lab.scenes import Config, Extent, configs_of, groups_of, read_configs, write_configs
 from stages.physics import mpm
@@ -249,8 +250,3 @@ def _shard(text: str) -> tuple[int, int]:
     if not (slash and part.isdigit() and parts.isdigit() and 1 <= int(part) <= int(parts)):
         raise InputError(f"--shard {text}: write i/n with i from 1 to n, such as 2/5")
     return int(part) - 1, int(parts)
-
-
-def load(folder: Path, groups: str) -> Motions:
-    """Groups of a data set, together. Raises InputError for what is missing."""
-    return joined([read_motions(Path(folder) / "motions" / f"{g}.h5") for g in groups_of(groups)])

@@ -1,6 +1,6 @@
-"""The MPM solver against theory: the figure of docs/mpm.md, and what tests measure at one setting each.
+"""The MPM solver against theory: the figure of stages/lab/results/mpm.md, and what tests measure at one setting each.
 
-    python -m stages.lab.validate_mpm docs/mpm.png
+    python -m stages.lab.validate_mpm stages/lab/results/mpm.png
 
 Every function makes a small scene whose outcome is known, and returns what was measured beside what should be.
 """

@@ -8,6 +8,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from typing import Any, ClassVar, NamedTuple
 
@@ -22,7 +23,7 @@ from stages.models.world import World, offsets
 FRAME = 0.02  # time between the frames that maps from frame to frame were made for [s]
 
 
-class Dynamics(nn.Module):
+class Dynamics(nn.Module, ABC):
     """A model of how keypoints move. A model defines `start`, `observe`, `derivative` and `points`.
 
     `told` are the fields of World that reach the model; the rest it cannot know about, and whoever runs it can warn.
@@ -36,21 +37,21 @@ class Dynamics(nn.Module):
         """The `scene` of the other methods: the world, with whatever a model computes once for a rollout."""
         return world
 
+    @abstractmethod
     def start(self, scene: Any) -> tuple:
         """The state at time 0: a NamedTuple of tensors with the batch first."""
-        raise NotImplementedError
 
+    @abstractmethod
     def observe(self, scene: Any, points: Float[Tensor, "b o n 3"], speed: Float[Tensor, "b o n 3"]) -> tuple:
         """The state in which keypoints are at `points` [m] and move with `speed` [m/s]: to start amid a motion."""
-        raise NotImplementedError
 
+    @abstractmethod
     def derivative(self, scene: Any, t: Tensor | float, state: tuple, pushes: Pushes) -> tuple:
         """Rate of change of the state [per s] at time t [s]."""
-        raise NotImplementedError
 
+    @abstractmethod
     def points(self, scene: Any, state: tuple) -> Float[Tensor, "b o n 3"]:
         """Where the keypoints are in a state [m]."""
-        raise NotImplementedError
 
     def step(self, scene: Any, state: tuple, t: Tensor | float, dt: float, pushes: Pushes) -> tuple:
         """The state dt [s] later. Unless a model knows better: one explicit Euler step."""

@@ -18,12 +18,12 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 from scipy import ndimage
-from scipy.spatial import ConvexHull, QhullError
 from torch import Tensor
 
 from stages.errors import InputError
 from stages.geometry.neighbours import knn
 from stages.geometry.rotations import matrix
+from stages.physics.support import tips
 from stages.scene.gaussians import Gaussians
 from stages.scene.scene import Scene
 
@@ -147,7 +147,8 @@ def _solid(
     standing = floor is not None and abs(float(low[2]) + margin - floor / h) < 4
     body = _largest(_fill(shell, bridge, standing))
     body = _trimmed(body, points / h - low)
-    held = stood and standing and _tips(body)
+    at = torch.from_numpy(np.argwhere(body)).float()
+    held = stood and standing and tips(at[:, :2], at[at[:, 2] < at[:, 2].min() + 4, :2])
     if held:
         bottom = int(np.flatnonzero(body.any((0, 1)))[0])
         body = np.flip(np.logical_or.accumulate(np.flip(body, 2), 2), 2)  # something of it is above
@@ -162,17 +163,6 @@ def _solid(
     if inside.sum() < FEWEST:
         inside = body
     return np.argwhere(inside) + low, float(body.sum() / inside.sum()), held
-
-
-def _tips(body: np.ndarray) -> bool:
-    """Whether the middle of the voxels lies outside the convex hull of the lowest four layers."""
-    at = np.argwhere(body)
-    base = at[at[:, 2] < at[:, 2].min() + 4, :2]
-    try:
-        hull = ConvexHull(base).equations
-    except (QhullError, ValueError):
-        return False
-    return bool((hull[:, :2] @ at[:, :2].mean(0) + hull[:, 2]).max() > 0)
 
 
 def _gap(points: np.ndarray) -> float:

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
+from scipy.spatial import ConvexHull, QhullError
 from torch import Tensor
 
 from stages.geometry.cameras import centres
@@ -255,3 +256,12 @@ def _region(bare: Support, band: Float[Tensor, "n 3"]) -> Bool[Tensor, "gx gy"]:
 def _disc(radius: int) -> np.ndarray:
     x = np.arange(-radius, radius + 1)
     return x[:, None] ** 2 + x[None] ** 2 <= radius**2
+
+
+def tips(points: Float[Tensor, "n 2"], base: Float[Tensor, "m 2"]) -> bool:
+    """Whether a body falls over: the middle of its points lies outside the convex hull of those it stands on."""
+    try:
+        hull = ConvexHull(base.double().numpy()).equations
+    except (QhullError, ValueError):  # it stands on a line, or on next to nothing
+        return False
+    return bool((hull[:, :2] @ points.double().mean(0).numpy() + hull[:, 2]).max() > 0)

@@ -14,7 +14,7 @@ from torch import Tensor
 from stages.geometry.harmonics import C0
 from stages.geometry.neighbours import knn
 from stages.geometry.rotations import matrix
-from stages.physics.support import Support
+from stages.physics.support import Support, tips
 from stages.refine.options import RefineOptions
 from stages.refine.patches import none_like, patches
 from stages.refine.sight import Sight
@@ -139,18 +139,9 @@ def _standing(own: Gaussians, support: Support | None) -> np.ndarray:
         h = support.heights(points)
         low = h < max(3 * support.tolerance, 0.15 * float(h.max()))
         if float(h.min()) < 3 * support.tolerance:
-            foot = points if _tips(points[:, :2], points[low, :2]) else points[low]
+            foot = points if tips(points[:, :2], points[low, :2]) else points[low]
             points = torch.cat([points, torch.cat([foot[:, :2], support.surface(foot)[:, None]], 1)])
     return points.double().numpy()
-
-
-def _tips(points: Float[Tensor, "n 2"], base: Float[Tensor, "m 2"]) -> bool:
-    """Whether the middle of the points lies outside the convex hull of what stands on the plane."""
-    try:
-        hull = ConvexHull(base.double().numpy()).equations
-    except (QhullError, ValueError):
-        return False
-    return bool((hull[:, :2] @ points.double().mean(0).numpy() + hull[:, 2]).max() > 0)
 
 
 def _hull_test(points: np.ndarray, queries: Float[Tensor, "c 3"], margin: float) -> np.ndarray:

@@ -59,6 +59,23 @@ def reconstruct(
     resolution: Annotated[
         int | None, Option(help="longest side the photos are worked at [px]")
     ] = ReconstructOptions.resolution,
+    scale_reference: Annotated[
+        str, Option(help='a length in metres: "photos=A.jpg,B.jpg distance=0.5" between two cameras, or "distance=0.6" '
+                         "from the cameras to what they look at")
+    ] = ReconstructOptions.scale_reference,
+    resume: Annotated[
+        bool, Option("--resume", help="go on from the finished steps of a run that was cut off")
+    ] = ReconstructOptions.resume,
+    weights: Annotated[
+        Path | None, Option(help="weights of pi3 or pi3-splat (.safetensors, .pth); by default looked for in "
+                            "$NGFF_WEIGHTS and ~/.cache/ngff")
+    ] = ReconstructOptions.weights,
+    download: Annotated[
+        bool, Option("--download", help="fetch those weights if they are not here (CC BY-NC; needs the extra hub)")
+    ] = ReconstructOptions.download,
+    iterations: Annotated[
+        int | None, Option(help="photometric steps, 0 for none; by default the quality's")
+    ] = ReconstructOptions.iterations,
     seed: Seed = ReconstructOptions.seed,
     device: Device = ReconstructOptions.device,
 ) -> None:
@@ -68,7 +85,10 @@ def reconstruct(
     """
     from stages.reconstruct.stage import run
 
-    run(imgs, out, ReconstructOptions(backend, cameras, holdout, quality, resolution, seed, device))
+    run(imgs, out, ReconstructOptions(
+        backend, cameras, holdout, quality, resolution, scale_reference, resume, weights, download, iterations, seed,
+        device,
+    ))  # fmt: skip
 
 
 @app.command()
@@ -103,6 +123,12 @@ def refine(
     scene: SceneIn,
     out: Annotated[Path, Option("-o", "--out", help="refined scene to write (.ply)")] = Path("refined.ply"),
     completer: Annotated[str, Option(help=" | ".join(REFINE))] = RefineOptions.completer,
+    library: Annotated[
+        Path | None, Option(help="folder of whole objects (.ply); the one that fits is put in a seen part's place")
+    ] = RefineOptions.library,
+    keep_raw: Annotated[
+        bool, Option("--keep-raw", help="of K objects, keep them as they were too: ids K+1 to 2K")
+    ] = RefineOptions.keep_raw,
     outliers: Annotated[
         float, Option(help="robust deviations beyond which a Gaussian is a floater; 0 keeps all")
     ] = RefineOptions.outliers,
@@ -116,7 +142,7 @@ def refine(
     """Whole objects on a whole table: LABELLED.ply -> REFINED.ply."""
     from stages.refine.stage import run
 
-    run(scene, out, RefineOptions(completer, outliers, background, resolution, seed, device))
+    run(scene, out, RefineOptions(completer, library, keep_raw, outliers, background, resolution, seed, device))
 
 
 @app.command()
@@ -165,7 +191,10 @@ def simulate(
 
 @app.command()
 def render(
-    source: Annotated[Path, Argument(metavar="TRAJ.h5|SCENE.ply", help="what to draw", show_default=False)],
+    source: Annotated[
+        list[Path], Argument(metavar="TRAJ.h5|SCENE.ply", help="what to draw; several with --side-by-side",
+                             show_default=False)
+    ],
     out: Annotated[
         Path | None, Option("-o", "--out", help=".mp4, .png or .jpg; by default beside the input, and printed")
     ] = None,
@@ -183,12 +212,17 @@ def render(
     frame: Annotated[
         int | None, Option(help="stop the motion at this frame; -1 is the last")
     ] = RenderOptions.frame,
+    side_by_side: Annotated[
+        bool, Option("--side-by-side", help="several files in one picture, with the same camera")
+    ] = RenderOptions.side_by_side,
     device: Device = RenderOptions.device,
 ) -> None:
     """Film a trajectory or a scene: TRAJ.h5 or SCENE.ply -> MP4 or PNG."""
     from stages.render.stage import run
 
-    run(source, out, RenderOptions(view, resolution, fps, background, depth, ids, show_forces, frame, device))
+    run(source, out, RenderOptions(
+        view, resolution, fps, background, depth, ids, show_forces, frame, side_by_side, device,
+    ))  # fmt: skip
 
 
 @app.command()

@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from ngff_cli.options import Commands, Device, Seed, set_up_logging
+from stages.errors import InputError
 from stages.lab.objects import ObjectsOptions
 
 app = typer.Typer(
@@ -57,19 +58,80 @@ def replay(
 def dataset(
     out: Annotated[Path, typer.Argument(metavar="FOLDER", help="where the data set goes; what is there is kept")],
     groups: Annotated[str, typer.Option(help="which groups of scenes, such as 3_0..3_9,4,6")] = "3_0..3_9,4,6",
+    only: Annotated[str, typer.Option(help="parts, with commas between: motions, scenes, mpm, initial, dynamic, "
+                                      "objects, backgrounds, scene_configs")] = "motions",
     frames: Annotated[int, typer.Option(help="frames of 0.02 s")] = 100,
-    keypoints: Annotated[int, typer.Option(help="of each object")] = 2048,
+    keypoints: Annotated[int, typer.Option(help="of each object, in motions")] = 2048,
     dx: Annotated[float, typer.Option(help="spacing of the grid [m]; published: 0.02")] = 0.02,
     spacing: Annotated[float, typer.Option(help="between particles on a surface [m]")] = 0.009,
     substep: Annotated[float, typer.Option(help="[s]; published: 1e-4")] = 1e-4,
+    nudge: Annotated[float, typer.Option(help="put objects aside by so much [m]; see `statistics --against`")] = 0.0,
+    exact: Annotated[bool, typer.Option("--exact", help="the same bytes in every run on a GPU too, in twice the time; "
+                                        "with mpm or dynamic it always is so")] = False,
+    views: Annotated[str, typer.Option(help="of videos: some of 0,4,...,96, or all")] = "all",
+    backgrounds: Annotated[str, typer.Option(help="of videos: some of table0,...,table7, or all")] = "all",
+    resolution: Annotated[int, typer.Option(help="of videos [px]")] = 448,
     shard: Annotated[str, typer.Option(help="i/n: the i-th of n equal parts of the groups")] = "1/1",
     limit: Annotated[int, typer.Option(help="scenes of each group; 0: all")] = 0,
+    check: Annotated[bool, typer.Option("--check", help="only see that all files are as they were written")] = False,
+    ray: Annotated[str, typer.Option(help="a Ray cluster to run on: local, auto or an address; all its machines see "
+                                     "FOLDER under the same path, have the same ngff, and make a group each")] = "",
     device: Device = "auto",
 ) -> None:
-    """Simulate GSCollision: scene configurations and the motion of all keypoints."""
-    from stages.lab.dataset import DatasetOptions, run
+    """Make GSCollision: scenes, their motion, and videos, in the published layout."""
+    from stages.lab import dataset, on_ray
+    from stages.lab.dataset_options import DatasetOptions
 
-    run(out, DatasetOptions(groups, frames, keypoints, dx, spacing, substep, shard, limit, device))
+    options = DatasetOptions(groups, only, frames, keypoints, dx, spacing, substep, nudge, exact, views,
+                             backgrounds, resolution, shard, limit, device)  # fmt: skip
+    if check:
+        dataset.check(out)
+    elif ray:
+        on_ray.run(out, options, ray)
+    else:
+        dataset.run(out, options)
+
+
+@app.command("import")
+def import_(
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="mpm/<group>/<scene> of GSCollision, with %04d.h5")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="trajectory to write (.h5)")] = Path("traj.h5"),
+    scene: Annotated[Path | None, typer.Option(help="its point_cloud.ply; else scenes/<group>/<scene>/ beside mpm/ is "
+                                               "searched")] = None,
+    keypoints: Annotated[int, typer.Option(help="of each object, at most")] = 2048,
+) -> None:
+    """Turn a published scene of GSCollision into a trajectory that `ngff render` and `ngff evaluate` read."""
+    from stages.lab.importer import run
+
+    print(run(folder, out, scene, keypoints))
+
+
+@app.command()
+def statistics(
+    data: Annotated[Path, typer.Argument(metavar="FOLDER", help="data set, as `ngff-lab dataset` writes")],
+    out: Annotated[Path | None, typer.Option("-o", "--out", help="the numbers as JSON")] = None,
+    groups: Annotated[str, typer.Option(help="which groups of scenes")] = "3_0..3_9,4,6",
+    keypoints: Annotated[int, typer.Option(help="of each object to look at, at most")] = 512,
+    against: Annotated[Path | None, typer.Option(help="the same scenes made with --nudge: how predictable they are, "
+                                                 "instead")] = None,
+    sheet: Annotated[Path | None, typer.Option(help="picture of some scenes to write (.jpg)")] = None,
+    scenes: Annotated[int, typer.Option(help="in the picture, a row each")] = 10,
+    device: Device = "auto",
+) -> None:
+    """What happens in the scenes of a data set: falls, contacts, tipping, rest; or how predictable it is."""
+    from stages.lab import predictability, scene_statistics
+    from stages.lab.scenes import groups_of
+
+    if against is not None:
+        lines = predictability.run(data, against, out, min(keypoints, 256), device)
+    else:
+        lines = scene_statistics.run(data, out, groups_of(groups), keypoints, device)
+    for line in lines:
+        print(line)
+    if sheet is not None:
+        from stages.lab.contact_sheet import SheetOptions, write_sheet
+
+        write_sheet(data, sheet, SheetOptions(tuple(groups_of(groups)), scenes, device))
 
 
 @app.command()
@@ -113,6 +175,47 @@ def train(
 
 
 @app.command()
+def card(
+    cards: Annotated[list[Path], typer.Argument(metavar="CARD.json", help="beside weights; several are compared")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="the curves (.png)")] = Path("training.png"),
+    half: Annotated[bool, typer.Option("--half", help="also store their weights in 16 bits, to be shipped")] = False,
+) -> None:
+    """Plot how weights were trained: loss and scores by minute."""
+    from stages.lab.card import run
+
+    for line in run(cards, out, half):
+        print(line)
+
+
+@app.command("train-splatter")
+def train_splatter(
+    data: Annotated[Path, typer.Argument(metavar="FOLDER", help="scenes (.ply), and folders of photos with their "
+                                         "cameras (transforms.json or a COLMAP model)")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="weights of pi3-splat to write (.safetensors)")],
+    weights: Annotated[
+        Path | None, typer.Option(help="weights of pi3 or pi3-splat to start from; by default looked for")
+    ] = None,
+    steps: Annotated[int, typer.Option(help="of the optimizer")] = 20_000,
+    views: Annotated[int, typer.Option(help="that Gaussians are made of in a step; one more is drawn")] = 4,
+    side: Annotated[int, typer.Option(help="longest side of an image [px]")] = 448,
+    depth: Annotated[
+        str, typer.Option(help="where Gaussians lie: network, or given (true depth, of scenes alone)")
+    ] = "network",
+    width: Annotated[
+        int, typer.Option(help="a small random network so wide instead of weights, to try things out")
+    ] = 0,
+    lr: Annotated[float, typer.Option(help="highest learning rate")] = 1e-4,
+    seed: Seed = 0,
+    device: Device = "auto",
+) -> None:
+    """Train pi3-splat's head of Gaussians; the rest of the network stays as it is."""
+    from stages.lab.train_splatter import SplatterOptions, run
+
+    for line in run(data, out, SplatterOptions(steps, views, side, depth, width, lr, seed, device), weights):
+        print(line, flush=True)
+
+
+@app.command()
 def objects(
     out: Annotated[Path, typer.Argument(metavar="FOLDER", help="where a folder for each object goes")],
     only: Annotated[str, typer.Option(help="some of the ten, such as ball,duck")] = ObjectsOptions.only,
@@ -143,6 +246,49 @@ def backgrounds(
         print(line, flush=True)
 
 
+@app.command()
+def heldout(
+    out: Annotated[Path, typer.Argument(metavar="FOLDER", help="of a data set; what is there is kept")],
+    meshes: Annotated[list[Path], typer.Option("--from", metavar="MESH", help="a mesh (.obj .glb .ply ...) instead of "
+                                               "the eight shapes; may be repeated")] = [],  # noqa: B006
+    scenes: Annotated[int, typer.Option(help="how many")] = 100,
+    objects: Annotated[int, typer.Option(help="in each scene")] = 3,
+    frames: Annotated[int, typer.Option(help="of 0.02 s")] = 100,
+    keypoints: Annotated[int, typer.Option(help="of each object")] = 2048,
+    dx: Annotated[float, typer.Option(help="spacing of the grid [m]")] = 0.02,
+    spacing: Annotated[float, typer.Option(help="between particles on a surface [m]")] = 0.009,
+    substep: Annotated[float, typer.Option(help="[s]")] = 1e-4,
+    size: Annotated[float, typer.Option(help="longest side of a mesh [m]")] = 0.5,
+    device: Device = "auto",
+) -> None:
+    """Simulate scenes of objects that no model learns from, as the group heldout of a data set."""
+    from stages.lab.heldout import HeldoutOptions, run
+
+    print(run(out, HeldoutOptions(scenes, objects, frames, keypoints, dx, spacing, substep, size, device), meshes))
+
+
+@app.command("estimate-materials")
+def estimate_materials(
+    video: Annotated[Path, typer.Argument(metavar="VIDEO.mp4", help="things that move")],
+    out: Annotated[
+        Path, typer.Option("-o", "--out", help="for `ngff simulate --materials` (.json)")
+    ] = Path("materials.json"),
+    objects: Annotated[
+        str, typer.Option(help="names, such as duck,ball, or the scene.ply that has them; by default the model's")
+    ] = "",
+    model: Annotated[str, typer.Option(help="one that sees images; by default $OPENAI_MODEL")] = "",
+    timeout: Annotated[float, typer.Option(help="longest to wait for an answer [s]")] = 120.0,
+) -> None:
+    """Ask a vision-language model what the things in a video are made of.
+
+    Any endpoint that speaks OpenAI's protocol: $OPENAI_BASE_URL, with the key $OPENAI_API_KEY if it wants one.
+    """
+    from stages.lab.estimate import EstimateOptions, run
+
+    for line in run(video, out, EstimateOptions(objects, model, timeout)):
+        print(line)
+
+
 bench = typer.Typer(cls=Commands, no_args_is_help=True, rich_markup_mode=None)
 app.add_typer(bench, name="bench")
 
@@ -166,20 +312,158 @@ def bench_mpm(
         print(line, flush=True)
 
 
+@bench.command("raster")
+def bench_raster(
+    out: Annotated[Path | None, typer.Option("-o", "--out", help="the numbers as JSON")] = None,
+    repeat: Annotated[int, typer.Option(help="timed calls of each; the fastest counts")] = 15,
+    shrink: Annotated[int, typer.Option(help="divide Gaussians and pixels by this, for a quick look")] = 1,
+) -> None:
+    """The CPU rasteriser: frames a second and time on one thread, beside one thread a pixel."""
+    from stages.lab.bench_raster import BenchOptions, run
+
+    for line in run(out, BenchOptions(repeat, shrink)):
+        print(line, flush=True)
+
+
+@bench.command("reconstruct")
+def bench_reconstruct(
+    sets: Annotated[list[Path], typer.Argument(metavar="PHOTOSET...", help="folders with images/ and cameras.json")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="the results as JSON, added to what is there")] = Path(
+        "reconstruct.json"
+    ),
+    quality: Annotated[str, typer.Option(help="of the reconstruction")] = "normal",
+    holdout: Annotated[int, typer.Option(help="keep every N-th photo out")] = 8,
+    device: Device = "auto",
+) -> None:
+    """Photos to Gaussians: cameras against reference cameras, photos kept out, time and memory."""
+    from stages.lab.bench_reconstruct import BenchOptions, run
+
+    for line in run(sets, out, BenchOptions(quality, holdout, device)):
+        print(line, flush=True)
+
+
+@bench.command("pi3")
+def bench_pi3(
+    device: Device = "auto",
+    views: Annotated[list[int], typer.Option(help="photos at a time; may be repeated")] = [1, 8, 20, 50],  # noqa: B006
+    size: Annotated[int, typer.Option(help="side of the photos, a multiple of 14 [px]")] = 448,
+    repeat: Annotated[int, typer.Option(help="timed passes of each")] = 3,
+    splats: Annotated[bool, typer.Option("--splats", help="with the head of Gaussians")] = False,
+) -> None:
+    """π³ at its published size with random weights: seconds and memory, beside attention written out."""
+    from stages.lab.bench_pi3 import BenchOptions, run
+
+    for line in run(BenchOptions(device, tuple(views), size, repeat, splats)):
+        print(line, flush=True)
+
+
+@bench.command("segment")
+def bench_segment(
+    source: Annotated[str, typer.Option(help="what is segmented: truth | photos")] = "truth",
+    scenes: Annotated[int, typer.Option(help="scenes of each kind, apart and touching")] = 4,
+    photos: Annotated[int, typer.Option(help="photos a scene")] = 24,
+    quality: Annotated[str, typer.Option(help="of the reconstruction from photos")] = "draft",
+    out: Annotated[Path | None, typer.Option("-o", "--out", help="the numbers as JSON")] = None,
+    device: Device = "auto",
+) -> None:
+    """Objects found without labels: overlap with the truth, apart and touching."""
+    from stages.lab.bench_segment import BenchOptions, run
+
+    for line in run(out, BenchOptions(scenes, source, photos, quality, device)):
+        print(line, flush=True)
+
+
+@bench.command("refine")
+def bench_refine(
+    scenes: Annotated[int, typer.Option(help="scenes, of objects apart")] = 4,
+    photos: Annotated[int, typer.Option(help="photos a scene")] = 24,
+    out: Annotated[Path | None, typer.Option("-o", "--out", help="the numbers as JSON")] = None,
+) -> None:
+    """Holes that lifted objects leave: the table there beside the true one, from new views."""
+    from stages.lab.bench_refine import BenchOptions, run
+
+    for line in run(out, BenchOptions(scenes, photos)):
+        print(line, flush=True)
+
+
 @bench.command("dynamics")
 def bench_dynamics(
-    data: Annotated[Path, typer.Option(help="folder of motions, as `ngff-lab dataset` writes")],
-    weights: Annotated[Path, typer.Option(help="folder of weights (.safetensors), all of which are measured")],
-    out: Annotated[Path, typer.Option("-o", "--out", help="the results as JSON")] = Path("results.json"),
+    data: Annotated[Path | None, typer.Option(help="folder of motions, as `ngff-lab dataset` writes")] = None,
+    weights: Annotated[
+        Path | None, typer.Option(help="folder of weights (.safetensors), all of which are measured; by default ours")
+    ] = None,
+    out: Annotated[
+        Path, typer.Option("-o", "--out", help="the results (.json); table (.md) and plots (.png) go beside it")
+    ] = Path("results.json"),
+    nudged: Annotated[
+        Path | None, typer.Option(help="the same scenes with starts moved by 1 mm, as another data set")
+    ] = None,
+    results: Annotated[
+        Path | None, typer.Option("--from", help="only table and plots, from these results (.json)")
+    ] = None,
     keypoints: Annotated[int, typer.Option(help="of each object")] = 256,
     limit: Annotated[int, typer.Option(help="scenes of each split; 0: all")] = 0,
+    mpm: Annotated[
+        int, typer.Option(help="scenes of each split for mpm-estimated, simulated on the way; 0: without that row")
+    ] = 100,
     device: Device = "auto",
 ) -> None:
     """The dynamics models on motion that they have not seen."""
-    from stages.lab.bench_dynamics import BenchOptions, run
+    from stages.lab.bench_dynamics import BenchOptions, again, run
+    from stages.models.weights import HERE
 
-    for line in run(data, weights, out, BenchOptions(keypoints, limit, device=device)):
+    if results is None and data is None:
+        raise InputError("--data: name the folder of motions to measure on, or --from results to draw again")
+    for line in (
+        again(results) if results is not None
+        else run(data, weights or HERE, out, BenchOptions(keypoints, limit, mpm, device=device), nudged)
+    ):
         print(line)
+
+
+@bench.command("rollout")
+def bench_rollout(
+    out: Annotated[Path, typer.Option("-o", "--out", help="the results as JSON")] = Path("rollout.json"),
+    weights: Annotated[Path | None, typer.Option(help="of our force field (.safetensors); those that ship")] = None,
+    keypoints: Annotated[int, typer.Option(help="of each of three objects")] = 2048,
+    steps: Annotated[int, typer.Option(help="of 0.02 s")] = 100,
+    scenes: Annotated[list[int], typer.Option(help="at once; may be repeated; none: 1, and 64 on a GPU")] = [],  # noqa: B006
+    repeat: Annotated[int, typer.Option(help="timed rollouts, of which the median counts")] = 5,
+    device: Device = "auto",
+) -> None:
+    """The learned force field: time a rollout, and the published model and MPM beside it."""
+    from stages.lab.bench_rollout import BenchOptions, run
+
+    for line in run(out, BenchOptions(weights, keypoints, steps, tuple(scenes), repeat, device)):
+        print(line, flush=True)
+
+
+@bench.command("register")
+def bench_register(
+    only: Annotated[str, typer.Option(help="some of the ten objects, such as ball,duck")] = "",
+    trials: Annotated[int, typer.Option(help="parts of each object")] = 10,
+    out: Annotated[Path | None, typer.Option("-o", "--out", help="all trials as JSON")] = None,
+    seed: Seed = 0,
+) -> None:
+    """Registration of a part to the whole, beside plain ICP and splatreg."""
+    from stages.lab.bench_register import BenchOptions, run
+
+    for line in run(out, BenchOptions(only, trials, seed=seed)):
+        print(line, flush=True)
+
+
+@bench.command("complete")
+def bench_complete(
+    placed: Annotated[str, typer.Option(help="objects of the scene")] = "panda,duck",
+    known: Annotated[str, typer.Option(help="objects of the library; by default all ten")] = "",
+    out: Annotated[Path | None, typer.Option("-o", "--out", help="the figures as JSON")] = None,
+    seed: Seed = 0,
+) -> None:
+    """What completing objects does to their surfaces, to pictures from behind, and to how they fall."""
+    from stages.lab.bench_complete import BenchOptions, run
+
+    for line in run(out, BenchOptions(placed, known, seed=seed)):
+        print(line, flush=True)
 
 
 def main() -> None:

@@ -11,7 +11,10 @@ A file NAME.h5 holds one group of scenes:
 from __future__ import annotations
 
 import json
+import os
+import zlib
 from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
@@ -27,6 +30,7 @@ from stages.scene.files import must_exist, replacing
 
 FORMAT, VERSION = "ngff-motions", 1
 STEP = 1e-4  # of the stored positions [m]: they reach 3.2 m from the origin
+LEVEL = 1  # of compression
 WHAT = "simulated motion (.h5), such as `ngff-lab dataset` writes"
 
 
@@ -88,20 +92,69 @@ def joined(parts: Sequence[Motions]) -> Motions:
     return replace(parts[0], names=tuple(n for p in parts for n in p.names), **tensors)
 
 
+class MotionsWriter:
+    """Writes the scenes of a group batch by batch: positions in steps of 0.1 mm, complete or not at all.
+
+    Scenes are compressed by threads while the next batch is simulated; all have the same shape.
+    """
+
+    def __init__(self, path: Path, provenance: dict):
+        self.path, self._provenance = Path(path), provenance
+        self._parts: list[Motions] = []
+        self._packed: list[Future[bytes]] = []
+        self._pool = ThreadPoolExecutor(min(8, os.cpu_count() or 1))
+
+    def __enter__(self) -> MotionsWriter:
+        return self
+
+    def append(self, part: Motions) -> None:
+        steps = (part.points / STEP).round().clamp(-32767, 32767).to(torch.int16).cpu().numpy()
+        self._packed += [self._pool.submit(_deflated, scene) for scene in steps]
+        self._parts.append(replace(part, points=torch.empty(*part.points.shape[:-1], 0)))  # the shape is enough
+
+    def __exit__(self, kind, error, trace) -> None:
+        with self._pool as pool:
+            if kind is not None:
+                pool.shutdown(wait=True, cancel_futures=True)
+            else:
+                self._write()
+
+    def _write(self) -> None:
+        count = sum(len(p) for p in self._parts)
+        if not count:
+            raise InputError(f"{self.path}: no scene ended well; make --substep shorter or --dx as published")
+        first = self._parts[0]
+        with replacing(self.path) as part, h5py.File(part, "w") as file:
+            file.attrs.update(format=FORMAT, version=VERSION, dt=first.dt, gravity=first.gravity, box=first.box,
+                              provenance=json.dumps(self._provenance))  # fmt: skip
+            file.create_dataset("names", data=[n for p in self._parts for n in p.names], dtype=h5py.string_dtype())
+            shape = (*first.points.shape[1:4], 3)
+            data = file.create_dataset("points", (count, *shape), "<i2", chunks=(1, *shape), compression="gzip",
+                                       compression_opts=LEVEL, shuffle=True)  # fmt: skip
+            for row, packed in enumerate(self._packed):
+                data.id.write_direct_chunk((row, 0, 0, 0, 0), packed.result())
+            data.attrs["step"] = STEP
+            for name in TENSORS:
+                if name != "points":
+                    file[name] = torch.cat([getattr(p, name) for p in self._parts]).cpu().numpy()
+
+
+def _deflated(steps: np.ndarray) -> bytes:
+    """A chunk as HDF5's shuffle and gzip filters make it: all low bytes, all high bytes, compressed."""
+    shuffled = np.ascontiguousarray(steps, "<i2").view(np.uint8).reshape(-1, 2).T
+    return zlib.compress(shuffled.tobytes(), LEVEL)
+
+
 def write_motions(path: Path, motions: Motions, provenance: dict) -> None:
-    """Atomically, compressed, positions in steps of 0.1 mm."""
-    with replacing(path) as part, h5py.File(part, "w") as file:
-        file.attrs.update(format=FORMAT, version=VERSION, dt=motions.dt, gravity=motions.gravity, box=motions.box,
-                          provenance=json.dumps(provenance))  # fmt: skip
-        file.create_dataset("names", data=list(motions.names), dtype=h5py.string_dtype())
-        steps = (motions.points / STEP).round().clamp(-32767, 32767).cpu().numpy().astype(np.int16)
-        chunk = (1, *steps.shape[1:])
-        packed = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
-        data = file.create_dataset("points", data=steps, chunks=chunk, **packed)
-        data.attrs["step"] = STEP
-        for name in TENSORS:
-            if name != "points":
-                file[name] = getattr(motions, name).cpu().numpy()
+    """A group in one piece."""
+    with MotionsWriter(path, provenance) as file:
+        file.append(motions)
+
+
+def made_by(path: Path) -> dict:
+    """What a file of motions says of its making."""
+    with h5py.File(must_exist(path, WHAT), "r") as file:
+        return json.loads(file.attrs.get("provenance", "{}"))
 
 
 def read_motions(path: Path) -> Motions:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,11 +22,12 @@ class ObjectKind:
 
     name: str
     id: int  # as in scene_object_idxs
-    scale: float  # longest side in a scene [scene units]; as made it is 1
+    scale: float  # in a scene, of the object as made
     E: float  # Young's modulus [Pa]
     density: float  # [kg/m^3]
     prompt: str
     make: str  # module:function
+    side: float = 1.0  # longest side as made [scene units]
 
 
 HARD, SOFT, FIGURES, PHONE = (f"stages.lab.object_{kind}" for kind in ("vessels", "soft", "figures", "phone"))
@@ -35,7 +36,7 @@ OBJECTS = {
     for kind in (
         ObjectKind("ball", 0, 0.4, 8e5, 600.0, "a pokemon ball", f"{HARD}:ball"),
         ObjectKind("bowl", 2, 0.5, 1e7, 800.0, "a blue bowl with cloud", f"{HARD}:bowl"),
-        ObjectKind("can", 3, 1.0, 1e6, 800.0, "a cola", f"{HARD}:can"),
+        ObjectKind("can", 3, 1.0, 1e6, 800.0, "a cola", f"{HARD}:can", 0.4),  # a metre of it fits nowhere
         ObjectKind("cloth", 4, 1.0, 3e3, 100.0, "a yellow t-shirt with an owl", f"{SOFT}:cloth"),
         ObjectKind("duck", 7, 0.3, 3e5, 300.0, "a rubber duck", f"{HARD}:duck"),
         ObjectKind("miku", 9, 0.6, 1e5, 400.0, "a hatsune miku", f"{FIGURES}:miku"),
@@ -68,7 +69,7 @@ class ObjectsOptions:
 
 
 def make_object(name: str) -> Gaussians:
-    """An object of OBJECTS: SH degree 2, object_id 1, bounding box around the origin, longest side 1.
+    """An object of OBJECTS: SH degree 2, object_id 1, bounding box around the origin.
 
     The same Gaussians at every call; the scale of a scene is not applied.
     """
@@ -76,7 +77,9 @@ def make_object(name: str) -> Gaussians:
 
     make = choose({kind.name: kind.make for kind in OBJECTS.values()}, _known(name))
     with one_thread():
-        return make()
+        g = make()
+    side = OBJECTS[name].side
+    return replace(g, means=g.means * side, scales=g.scales * side)
 
 
 def _known(name: str) -> str:

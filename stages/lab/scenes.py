@@ -10,7 +10,8 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -44,14 +45,18 @@ class Extent:
     points: np.ndarray  # (n, 3)
     scale: float
 
-    @property
+    @cached_property
     def half(self) -> np.ndarray:
         return np.abs(self.points).max(0)
 
-    @property
+    @cached_property
     def radius(self) -> float:
         """Half the diagonal of the bounding box."""
         return float(np.linalg.norm(self.half))
+
+    @cached_property
+    def tree(self) -> cKDTree:
+        return cKDTree(self.points)
 
 
 def configs_of(group: str, extents: Mapping[int, Extent]) -> dict[str, Config]:
@@ -59,6 +64,17 @@ def configs_of(group: str, extents: Mapping[int, Extent]) -> dict[str, Config]:
     count, first = objects_in(group), 300 * int(group.split("_")[1]) if "_" in group else 0
     made = (sample_scene(first + i, count, extents) for i in range(SCENES[group]))
     return {c.name: c for c in made}
+
+
+def nudged(configs: Mapping[str, Config], by: float) -> dict[str, Config]:
+    """The same scenes with every object put aside by `by` [m], each in a direction of its own."""
+    out = {}
+    for name, c in configs.items():
+        rng = np.random.default_rng([SEED, len(c.ids), int(name.partition("_")[0]), 1])
+        aside = rng.normal(size=(len(c.ids), 3))
+        moved = np.array(c.translation) + by * aside / np.linalg.norm(aside, axis=1, keepdims=True)
+        out[name] = replace(c, translation=tuple(tuple(p) for p in moved.tolist()))
+    return out
 
 
 def objects_in(group: str) -> int:
@@ -85,17 +101,16 @@ def sample_scene(index: int, count: int, extents: Mapping[int, Extent]) -> Confi
     """Scene `index` with `count` objects."""
     rng = np.random.default_rng([SEED, count, index])
     ids = sorted(extents)
-    trees = {i: cKDTree(e.points) for i, e in extents.items()}
     while True:
         chosen = [int(i) for i in rng.choice(ids, count)]
-        at = _placed(rng, chosen, extents, trees)
+        at = _placed(rng, chosen, extents)
         if at is not None:
             names = "_".join(str(i) for i in chosen)
             places = tuple(tuple(float(v) for v in p) for p in at)
             return Config(f"{index}_{names}", tuple(chosen), places, tuple(extents[i].scale for i in chosen))
 
 
-def _placed(rng, chosen: list[int], extents: Mapping[int, Extent], trees: Mapping[int, cKDTree]) -> list | None:
+def _placed(rng, chosen: list[int], extents: Mapping[int, Extent]) -> list | None:
     """Offsets of the objects, the first at the origin; None where one found no room."""
     at = [np.zeros(3)]
     for k, i in enumerate(chosen[1:], start=1):
@@ -105,7 +120,7 @@ def _placed(rng, chosen: list[int], extents: Mapping[int, Extent], trees: Mappin
             p = np.append(at[near][:2] + rng.uniform(-1, 1, 2) * aside, rng.uniform(-REACH, REACH))
             if np.abs(p).max() + extents[i].radius > REACH:
                 continue
-            if all(_apart(p - q, extents[i], extents[j], trees[j]) for q, j in zip(at, chosen, strict=False)):
+            if all(_apart(p - q, extents[i], extents[j]) for q, j in zip(at, chosen, strict=False)):
                 at.append(p)
                 break
         else:
@@ -113,14 +128,14 @@ def _placed(rng, chosen: list[int], extents: Mapping[int, Extent], trees: Mappin
     return at
 
 
-def _apart(offset: np.ndarray, mine: Extent, theirs: Extent, tree: cKDTree) -> bool:
+def _apart(offset: np.ndarray, mine: Extent, theirs: Extent) -> bool:
     """Whether bounding boxes do not overlap, and centres and points keep their distance."""
     if (np.abs(offset) < mine.half + theirs.half).all() or np.linalg.norm(offset) < GAP:
         return False
     near = (np.abs(mine.points + offset) < theirs.half + GAP).all(1)
     if not near.any():
         return True
-    distance, _ = tree.query(mine.points[near] + offset, distance_upper_bound=GAP)
+    distance, _ = theirs.tree.query(mine.points[near] + offset, distance_upper_bound=GAP)
     return not np.isfinite(distance).any()
 
 

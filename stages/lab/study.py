@@ -13,7 +13,8 @@ import numpy as np
 import torch
 
 from stages.backends import pick_device
-from stages.lab.dataset import Asset, Fineness, assets, count_at, extents, simulate, volumes
+from stages.lab.dataset_assets import Asset, Fineness, assets, count_at, extents, volumes
+from stages.lab.dataset_simulation import simulate
 from stages.lab.motions import Motions, joined
 from stages.lab.scenes import Config, configs_of
 from stages.scene.files import replacing
@@ -89,7 +90,7 @@ def _thinned(a: Asset, fineness: Fineness) -> Asset:
 
 def _measured(configs, things, fineness: Fineness, device: str, truth: Motions | None) -> tuple[Motions, Row]:
     start = time.perf_counter()
-    made = joined(list(simulate(configs, things, fineness, FRAMES, KEYPOINTS, device)))
+    made = joined([m.to("cpu") for m in simulate(configs, things, fineness, FRAMES, KEYPOINTS, device)])
     seconds = time.perf_counter() - start
     count = np.mean([sum(len(things[i].points) for i in c.ids) for c in configs.values()])
     cells = np.mean([float(a.volume.sum()) for a in things.values()]) / fineness.dx**3

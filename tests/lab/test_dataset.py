@@ -1,15 +1,31 @@
+import inspect
 import json
+from dataclasses import fields
 from itertools import combinations
 
+import h5py
 import numpy as np
 import pytest
 import torch
 
+from ngff_cli import lab
 from stages.errors import InputError
-from stages.lab import dataset
-from stages.lab.dataset import Asset, DatasetOptions, Fineness, simulate, volumes
+from stages.lab import dataset, dataset_assets
+from stages.lab.dataset_assets import Asset, Fineness, volumes
+from stages.lab.dataset_options import DatasetOptions
+from stages.lab.dataset_simulation import simulate
 from stages.lab.motions import STEP, joined, read_motions, write_motions
-from stages.lab.scenes import REACH, SCENES, Config, configs_of, groups_of, read_configs, sample_scene, write_configs
+from stages.lab.scenes import (
+    REACH,
+    SCENES,
+    Config,
+    configs_of,
+    groups_of,
+    nudged,
+    read_configs,
+    sample_scene,
+    write_configs,
+)
 from stages.lab.training_data import read_groups
 
 COARSE = Fineness(dx=0.08, spacing=0.03, substep=5e-4)
@@ -33,7 +49,7 @@ def things():
 
 @pytest.fixture(scope="module")
 def extents(things):
-    return dataset.extents(things)
+    return dataset_assets.extents(things)
 
 
 @pytest.mark.parametrize("count", [2, 3, 6])
@@ -94,6 +110,11 @@ def test_motions_round_trip(tmp_path, things):
                                 COARSE, 4, 60, "cpu")))  # fmt: skip
     write_motions(tmp_path / "m.h5", made, {"command": "test"})
     back = read_motions(tmp_path / "m.h5")
+    with h5py.File(tmp_path / "m.h5", "r+") as file:  # HDF5's own filters would store the same
+        chunk = file["points"].id.read_direct_chunk((0, 0, 0, 0, 0))[1]
+        file["points"][...] = file["points"][...]
+        assert len(file["points"].id.read_direct_chunk((0, 0, 0, 0, 0))[1]) == pytest.approx(len(chunk), rel=0.05)
+        assert file["points"].compression == "gzip" and file["points"].shuffle and file["points"].dtype == "<i2"
     assert (back.points - made.points).abs().max() <= 0.51 * STEP
     assert back.names == made.names and back.gravity == made.gravity and torch.equal(back.mass, made.mass)
     (tmp_path / "text.h5").write_text("no")
@@ -105,7 +126,8 @@ def test_run_writes_resumes_and_shards(tmp_path, things, monkeypatch, capsys):
     for group in ("3_0", "4"):
         monkeypatch.setitem(SCENES, group, 3)
     monkeypatch.setattr(dataset, "assets", lambda fineness, least, kept: things)
-    options = DatasetOptions("3_0,4", 3, 50, COARSE.dx, COARSE.spacing, COARSE.substep, limit=2, device="cpu")
+    options = DatasetOptions("3_0,4", "motions", 3, 50, COARSE.dx, COARSE.spacing, COARSE.substep, limit=2,
+                             device="cpu")  # fmt: skip
     dataset.run(tmp_path, options)
     files = {g: (tmp_path / "motions" / f"{g}.h5").read_bytes() for g in ("3_0", "4")}
     assert "3_0: 2 scenes" in capsys.readouterr().out and len(read_groups(tmp_path, ["3_0", "4"], 50)) == 4
@@ -119,11 +141,11 @@ def test_run_writes_resumes_and_shards(tmp_path, things, monkeypatch, capsys):
 
 
 def test_particles_are_kept_and_read_again(tmp_path, monkeypatch):
-    monkeypatch.setattr(dataset, "OBJECTS", {"duck": dataset.OBJECTS["duck"]})
+    monkeypatch.setattr(dataset_assets, "OBJECTS", {"duck": dataset_assets.OBJECTS["duck"]})
     fine = Fineness(dx=0.03, spacing=0.03)
-    made = dataset.assets(fine, 64, tmp_path / "p.npz")
-    monkeypatch.setattr(dataset, "make_object", None)  # must not be needed again
-    again = dataset.assets(fine, 64, tmp_path / "p.npz")
+    made = dataset_assets.assets(fine, 64, tmp_path / "p.npz")
+    monkeypatch.setattr(dataset_assets, "make_object", None)  # must not be needed again
+    again = dataset_assets.assets(fine, 64, tmp_path / "p.npz")
     assert torch.equal(made[7].points, again[7].points) and made[7].mass == again[7].mass
     size = made[7].points.amax(0) - made[7].points.amin(0)
     assert float(size.max()) == pytest.approx(0.3, rel=0.04)
@@ -131,4 +153,21 @@ def test_particles_are_kept_and_read_again(tmp_path, monkeypatch):
     assert float(gap.median()) == pytest.approx(0.03, rel=0.35)
     (tmp_path / "p.npz").write_text("no")
     with pytest.raises(InputError, match="p.npz"):
-        dataset.assets(fine, 64, tmp_path / "p.npz")
+        dataset_assets.assets(fine, 64, tmp_path / "p.npz")
+
+
+def test_the_command_has_every_option_with_its_default():
+    command = inspect.signature(lab.dataset).parameters
+    for field in fields(DatasetOptions):
+        assert command[field.name].default == field.default, field.name
+    assert set(command) - {f.name for f in fields(DatasetOptions)} == {"out", "check", "ray"}
+
+
+def test_nudged_scenes_start_so_much_aside(extents, monkeypatch):
+    monkeypatch.setitem(SCENES, "3_0", 3)
+    configs = configs_of("3_0", extents)
+    moved = nudged(configs, 1e-3)
+    assert moved == nudged(configs, 1e-3) and set(moved) == set(configs)
+    apart = np.array([np.subtract(moved[n].translation, c.translation) for n, c in configs.items()]).reshape(-1, 3)
+    np.testing.assert_allclose(np.linalg.norm(apart, axis=1), 1e-3, rtol=1e-9)
+    assert np.linalg.matrix_rank(apart) == 3  # each in a direction of its own

@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from dataclasses import fields
+from dataclasses import fields, replace
 from functools import cache
 
 import numpy as np
@@ -23,7 +23,14 @@ from stages.lab.shapes import Surface, to_gaussians
 from stages.scene.gaussians import Gaussians
 from stages.scene.scene_ply import read_scene
 
-made = cache(make_object)
+
+@cache
+def made(name: str) -> Gaussians:
+    """An object in units of its longest side."""
+    g, side = make_object(name), OBJECTS[name].side
+    return replace(g, means=g.means / side, scales=g.scales / side)
+
+
 NAMES = list(OBJECTS)
 CLOSED = {"ball": 0.4, "can": 0.4, "duck": 0.15, "panda": 0.1, "phone": 0.1, "pillow": 0.2}  # of the box, at least
 
@@ -58,6 +65,8 @@ def test_registry_holds_the_published_ids_scales_and_materials():
     assert rows[11] == ("phone", 0.4, 2e7, 2600.0)
     assert rows[7] == ("duck", 0.3, 3e5, 300.0)
     assert OBJECTS["cloth"].prompt == "a yellow t-shirt with an owl"
+    can = make_object("can").means
+    assert (can.amax(0) - can.amin(0)).max() == pytest.approx(0.4)
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -40,9 +40,11 @@ def device_of(tensor: torch.Tensor) -> str:
     return str(tensor.device) if tensor.is_cuda else "cpu"
 
 
-def launch(kernel: wp.Kernel, dim, inputs: list, outputs: list = (), device: str = "cpu") -> None:
-    """Launch on PyTorch's current stream, so the two libraries need no synchronisation."""
+def launch(
+    kernel: wp.Kernel, dim, inputs: list, outputs: list = (), device: str = "cpu", block_dim: int = 256
+) -> None:  # fmt: skip
+    """Launch on PyTorch's current stream, so the two libraries need no synchronisation; threads a block on a GPU."""
     _ready()
     stream = wp.stream_from_torch(torch.cuda.current_stream(device)) if device != "cpu" else None
     wp.launch(kernel, dim=dim, inputs=list(inputs), outputs=list(outputs), device=device, stream=stream,
-              record_tape=False)
+              record_tape=False, block_dim=block_dim)

@@ -182,7 +182,8 @@ def velocity_of_row(
 
 
 @wp.func_native("""
-    // as gather_nodes, from momentum: a node's velocity is momentum by mass
+    // as gather_nodes, from momentum: a node's velocity is momentum by mass; the lowest `under` layers of nodes feel
+    // the floor, as mpm_grid.at_walls says, without a loop around it
     wp::mat_t<4, 3, wp::float32> out;
     for (int r = 0; r < 4; ++r) for (int n = 0; n < 3; ++n) out.data[r][n] = 0.0f;
     const float* base = (const float*)(momentum.data + first);
@@ -198,12 +199,21 @@ def velocity_of_row(
 #if defined(__CUDA_ARCH__)
             const float4 node = ((const float4*)row)[k];
             const float m = __fdividef(wij * weight.data[2][k], fmaxf(node.w, 1e-30f));
-            const float u[3] = {m * node.x, m * node.y, m * node.z};
+            float u[3] = {m * node.x, m * node.y, m * node.z};
 #else
             const float* node = row + 4 * k;
             const float m = wij * weight.data[2][k] / (node[3] > 1e-30f ? node[3] : 1e-30f);
-            const float u[3] = {m * node[0], m * node[1], m * node[2]};
+            float u[3] = {m * node[0], m * node[1], m * node[2]};
 #endif
+            if (k < under && u[2] < 0.0f) {
+                float left = keep;
+                if (keep < 0.0f) {
+                    const float speed = sqrtf(u[0] * u[0] + u[1] * u[1]);
+                    const float stop = -friction.data[first + i * stride_x + j * stride_y + k] * u[2];
+                    left = speed > stop ? 1.0f - stop / speed : 0.0f;
+                }
+                u[0] *= left; u[1] *= left; u[2] = 0.0f;
+            }
             for (int n = 0; n < 3; ++n) { sum[n] += u[n]; tilt[n] += u[n] * (k - fx.c[2]); }
         }
         for (int n = 0; n < 3; ++n) {
@@ -216,5 +226,6 @@ def velocity_of_row(
     return out;
 """)
 def gather_momentum(
-    momentum: wp.array[wp.vec4], first: int, stride_x: int, stride_y: int, weight: wp.mat33, fx: wp.vec3
-) -> mat43: ...
+    momentum: wp.array[wp.vec4], friction: wp.array[float], first: int, stride_x: int, stride_y: int, weight: wp.mat33,
+    fx: wp.vec3, under: int, keep: float,
+) -> mat43: ...  # fmt: skip

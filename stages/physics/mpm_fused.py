@@ -9,7 +9,7 @@ import torch
 import warp as wp
 
 from stages.kernels.interop import launch, view
-from stages.kernels.mpm_fused import Touched, clear_touched, fused_step
+from stages.kernels.mpm_fused import THREADS, Touched, clear_touched, fused_step
 from stages.kernels.mpm_grid import BLOCK
 from stages.physics.mpm_rows import Rows
 
@@ -91,4 +91,4 @@ class FusedOrder:
         inputs = [self.grid, self.rows.struct, self._sweep_from, sweepers, gather, scatter, step - 1,
                   view(self._clock), self.damping, read, write, stale, view(self._friction), self._touched,
                   self._obstacles, self._scale]  # fmt: skip
-        launch(self._kernel, self._sweep_from + sweepers, inputs, device=self.device)
+        launch(self._kernel, self._sweep_from + sweepers, inputs, device=self.device, block_dim=THREADS)

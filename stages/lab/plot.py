@@ -1,10 +1,10 @@
-"""Small diagrams for the docs, drawn with OpenCV: marks for what was measured, a line for theory."""
+"""Small diagrams for the docs, drawn with OpenCV: marks for what was measured, a line for theory, or several curves."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import cv2
@@ -14,35 +14,57 @@ from stages.scene.files import replacing
 
 WIDTH, HEIGHT, MARGIN = 460, 300, 52  # of a panel [px]
 INK, BLUE, RED, GRID = (40, 40, 40), (176, 92, 20), (40, 40, 200), (225, 225, 225)  # BGR
+COLOURS = ((40, 40, 200), (176, 92, 20), (44, 160, 44), (14, 127, 255), (189, 103, 148), (75, 86, 140), (194, 119, 227),
+           (110, 110, 110), (34, 189, 188), (207, 190, 23))  # of curves, BGR
+STRIP = 20  # height of a line of the legend [px]
 Points = Sequence[tuple[float, float]]
 
 
 @dataclass(frozen=True)
 class Panel:
-    """One diagram. With `log` both axes are logarithmic, and points must be positive."""
+    """One diagram, an empty place without points. With `log` both axes are logarithmic, and points must be positive."""
 
     title: str
-    measured: Points
+    measured: Points = ()
     expected: Points = ()
     log: bool = False
     theory: str = "theory"  # what the line is called
+    curves: Mapping[str, Points] = field(default_factory=dict)  # of one name: of one colour in all panels
 
 
 def draw(out: Path, panels: Sequence[Panel], columns: int = 3) -> None:
-    """Panels in rows, as a PNG."""
+    """Panels in rows, as a PNG; below them, what the colours of curves mean."""
+    names = list(dict.fromkeys(name for panel in panels for name in panel.curves))
+    colours = {name: COLOURS[i % len(COLOURS)] for i, name in enumerate(names)}
     rows = [list(panels[i : i + columns]) for i in range(0, len(panels), columns)]
     blank = np.full((HEIGHT, WIDTH, 3), 255, np.uint8)
-    image = np.vstack([np.hstack([*map(_panel, row), *[blank] * (columns - len(row))]) for row in rows])
+    cells = [[*(_panel(p, colours) for p in row), *[blank] * (columns - len(row))] for row in rows]
+    image = np.vstack([*map(np.hstack, cells), _legend(colours, columns * WIDTH)])
     ok, png = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 9])
     assert ok
     with replacing(out) as part:
         part.write_bytes(png.tobytes())
 
 
-def _panel(panel: Panel) -> np.ndarray:
+def _legend(colours: Mapping[str, tuple[int, int, int]], width: int) -> np.ndarray:
+    """Names of curves with a piece of each, in as many lines as they need."""
+    lines, x = [np.full((STRIP, width, 3), 255, np.uint8)], MARGIN
+    for name, colour in colours.items():
+        if x > MARGIN and x + 40 + 8 * len(name) > width:
+            lines, x = [*lines, np.full((STRIP, width, 3), 255, np.uint8)], MARGIN
+        cv2.line(lines[-1], (x, STRIP // 2), (x + 24, STRIP // 2), colour, 2, cv2.LINE_AA)
+        _text(lines[-1], name, (x + 30, STRIP // 2 + 4))
+        x += 40 + 8 * len(name)
+    return np.vstack(lines)[: STRIP * len(lines) if colours else 0]
+
+
+def _panel(panel: Panel, colours: Mapping[str, tuple[int, int, int]]) -> np.ndarray:
     image = np.full((HEIGHT, WIDTH, 3), 255, np.uint8)
     scale = np.log10 if panel.log else np.asarray
-    both = scale(np.array([*panel.measured, *panel.expected], float))
+    every = [*panel.measured, *panel.expected, *(point for curve in panel.curves.values() for point in curve)]
+    if not every:
+        return image
+    both = scale(np.array(every, float))
     low, high = both.min(0), both.max(0)
     if not panel.log:
         low, high = np.minimum(low, 0), np.maximum(high, 0)
@@ -66,11 +88,15 @@ def _panel(panel: Panel) -> np.ndarray:
                 _text(image, text, (MARGIN - 6 - 7 * len(text), HEIGHT - MARGIN - at + 4))
     if len(panel.expected):
         cv2.polylines(image, [place(panel.expected)], False, RED, 1, cv2.LINE_AA)
-    for x, y in place(panel.measured):
+    for name, points in panel.curves.items():
+        if len(points):
+            cv2.polylines(image, [place(points)], False, colours[name], 2, cv2.LINE_AA)
+    for x, y in place(panel.measured) if len(panel.measured) else ():
         cv2.circle(image, (int(x), int(y)), 4, BLUE, -1, cv2.LINE_AA)
     cv2.rectangle(image, (MARGIN, 34), (WIDTH - 16, HEIGHT - MARGIN), INK, 1)
     _text(image, panel.title, (MARGIN, 22), 0.44)
-    _text(image, "o measured" + (f"   - {panel.theory}" if len(panel.expected) else ""), (MARGIN, HEIGHT - 12))
+    if len(panel.measured):
+        _text(image, "o measured" + (f"   - {panel.theory}" if len(panel.expected) else ""), (MARGIN, HEIGHT - 12))
     return image
 
 

@@ -6,6 +6,11 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from stages.kernels.compilers import TRITON
+
+if TRITON:
+    from stages.kernels.nearest import nearest as searched
+
 MANY = 500  # points of a scene from which on it pays, on a CPU, to look before measuring
 
 Found = tuple[Float[Tensor, "b o o n"], Int[Tensor, "b o o n"]]
@@ -18,8 +23,10 @@ def nearest(points: Float[Tensor, "b o n 3"], valid: Bool[Tensor, "b o n"], reac
     The distance is infinite where it is not below `reach`, to the own object, to padding and from padding; the index
     then means nothing.
     """
+    if TRITON and points.is_cuda and points.dtype == torch.float32:
+        return searched(points, valid, reach)
     few = points.shape[1] * points.shape[2] < MANY
-    search = _measured if few or points.device.type != "cpu" else _culled
+    search = _measured if few or points.is_cuda else _culled
     distance, index = search(points, valid, reach)
     return distance.masked_fill(distance >= reach, torch.inf), index
 
@@ -33,7 +40,6 @@ def _measured(points: Float[Tensor, "b o n 3"], valid: Bool[Tensor, "b o n"], re
     x = torch.where(valid[..., None], points - middle[:, None, None], 0.0)
     with torch.autocast(x.device.type, enabled=False):
         half = torch.where(valid, x.float().square().sum(-1) / 2, torch.inf)
-        # |p - q|^2 / 2 - |p|^2 / 2 orders the points q for each p
         gap = half[:, None, :, None] - torch.einsum("bind,bjmd->bijnm", x.float(), x.float())
     index = gap.argmin(-1)
     scene = torch.arange(len(x), device=x.device)[:, None, None, None]
@@ -57,12 +63,19 @@ def _culled(points: Float[Tensor, "b o n 3"], valid: Bool[Tensor, "b o n"], reac
         mine, theirs = inside[s, i, j].nonzero()[:, 0], inside[s, j, i].nonzero()[:, 0]
         if not len(theirs):
             continue
-        gap = torch.cdist(points[s, i, mine], points[s, j, theirs], compute_mode="donot_use_mm_for_euclid_dist")
-        distance[s, i, j, mine], which = gap.min(1)
-        index[s, i, j, mine] = theirs[which]
-        distance[s, j, i, theirs], which = gap.min(0)
-        index[s, j, i, theirs] = mine[which]
+        x, y = points[s, i, mine], points[s, j, theirs]
+        which = _closest(x, y)
+        distance[s, i, j, mine], index[s, i, j, mine] = (x - y[which]).norm(dim=-1), theirs[which]
+        which = _closest(y, x)
+        distance[s, j, i, theirs], index[s, j, i, theirs] = (y - x[which]).norm(dim=-1), mine[which]
     return distance, index
+
+
+def _closest(x: Float[Tensor, "p 3"], y: Float[Tensor, "q 3"]) -> Int[Tensor, "p"]:
+    """Which of y is nearest to each of x; |x - y|^2 / 2 - |x|^2 / 2 orders them, from one matrix product."""
+    middle = y.mean(0)
+    x, y = x - middle, y - middle
+    return torch.addmm(y.square().sum(-1) / 2, x, y.T, alpha=-1).argmin(-1)
 
 
 def near_walls(

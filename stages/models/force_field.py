@@ -7,7 +7,7 @@ directions of the axes, the order of things, or padding; no body gets deeper int
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
@@ -15,14 +15,15 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from stages.geometry.rotations import matrix, multiply, quaternion
+from stages.kernels.compilers import TRITON
 from stages.models.dynamics import FRAME, Dynamics
 from stages.models.places import Moving, pair_places, plane_places
 from stages.models.pushes import Pushes
-from stages.models.rigid import fitted, limited, spin_of, turned
+from stages.models.rigid import drift, fitted, limited, pose, spin_of
 from stages.models.shape import Shape, shape_of
 from stages.models.stress import Stress, bounded, projected
 from stages.models.touch import Touch
-from stages.models.vectors import mlp
+from stages.models.vectors import apply, mlp
 from stages.models.world import World, centre
 
 SINK = 0.03  # deepest that a point may get into the floor or a wall [m]
@@ -81,6 +82,8 @@ class ForceField(Dynamics):
 
     def prepare(self, world: World) -> Scene:
         shape = shape_of(world)
+        if TRITON and shape.blur.is_cuda and shape.blur.dtype == torch.float32 and not torch.is_grad_enabled():
+            shape = replace(shape, blur=shape.blur.half())  # reading it takes the longest of a step of many scenes
         code = self._encode(shape)
         if self.stress is None:
             return Scene(shape, code, torch.zeros_like(world.mass), torch.zeros_like(world.mass))
@@ -118,7 +121,7 @@ class ForceField(Dynamics):
         return BodyState(m.com, quaternion(m.R), m.velocity, m.momentum, projected(shape, u), projected(shape, du))
 
     def points(self, scene: Scene, state: BodyState) -> Float[Tensor, "b o n 3"]:
-        return state.com[:, :, None] + (scene.shape.arm + state.u) @ matrix(state.quat).mT
+        return state.com[:, :, None] + apply(matrix(state.quat)[:, :, None], scene.shape.arm + state.u)
 
     def derivative(self, scene: Scene, t: Tensor | float, state: BodyState, pushes: Pushes) -> BodyState:
         free = ~pushes.pinned[..., None]
@@ -160,23 +163,18 @@ class ForceField(Dynamics):
         return self._drifted(scene, _held(kicked, free), dt / 2)
 
     def _drifted(self, scene: Scene, state: BodyState, dt: float) -> BodyState:
-        """Motion without forces. The spin is that of the middle of the way (second order)."""
-        inverse, L = scene.shape.inverse, state.momentum
-        spin = spin_of(L, inverse, matrix(state.quat))
-        spin = spin_of(L, inverse, matrix(turned(state.quat, dt / 2 * spin)))
-        return state._replace(
-            com=state.com + dt * state.velocity, quat=turned(state.quat, dt * spin),
-            u=bounded(scene.shape, state.u + dt * state.du),
-        )  # fmt: skip
+        """Motion without forces."""
+        com, quat = drift(state.com, state.quat, state.velocity, state.momentum, scene.shape.inverse, dt)
+        return state._replace(com=com, quat=quat, u=bounded(scene.shape, state.u + dt * state.du))
 
     def _moving(self, scene: Scene, state: BodyState) -> Moving:
         """Where everything is in the world, and how it moves."""
-        R = matrix(state.quat)
-        spin = spin_of(state.momentum, scene.shape.inverse, R)
-        arm = (scene.shape.arm + state.u) @ R.mT
+        R, spin = pose(state.quat, state.momentum, scene.shape.inverse)
+        turn = R[:, :, None]
+        arm = apply(turn, scene.shape.arm + state.u)
         velocity = state.velocity[:, :, None] + torch.linalg.cross(spin[:, :, None].expand_as(arm), arm)
         return Moving(R, spin, state.com, state.velocity, arm, state.com[:, :, None] + arm,
-                      velocity + state.du @ R.mT, scene.shape.normal @ R.mT)  # fmt: skip
+                      velocity + apply(turn, state.du), apply(turn, scene.shape.normal))  # fmt: skip
 
     def _rates(
         self, scene: Scene, state: BodyState, moving: Moving, pushes: Pushes, t: Tensor | float, dt: float
@@ -190,8 +188,9 @@ class ForceField(Dynamics):
         torque = torque + twisted / mass
         if self.stress is None:
             return Rates(force, torque, torch.zeros_like(touch), grip)
-        gravity = (moving.R.mT @ w.gravity[:, None, :, None])[..., 0]
-        stress = self.stress(scene.shape, scene.code, state.u, state.du, touch @ moving.R, gravity)
+        inwards = moving.R.mT
+        gravity, touch = apply(inwards, w.gravity[:, None]), apply(inwards[:, :, None], touch)
+        stress = self.stress(scene.shape, scene.code, state.u, state.du, touch, gravity)
         return Rates(force, torque, stress, grip)
 
     def _contact(
@@ -207,16 +206,17 @@ class ForceField(Dynamics):
         own = status[:, :, None].expand_as(heard)
         context = self.between(torch.cat([heard, heard[:, others, back], own, status[:, others]], -1))
         context_w = self.against(torch.cat([heard_w, status[:, :, None].expand_as(heard_w)], -1))
-        a = weight[..., None] * self.pairs.answer(said, context, pairs.vectors)
-        a_w = weight_w[..., None] * self.planes.answer(said_w, context_w, planes.vectors)
+        a = self.pairs.answer(said, weight, context, pairs.vectors)
+        a_w = self.planes.answer(said_w, weight_w, context_w, planes.vectors)
         mass, light = w.mass.clamp_min(1e-6), 1 / w.mass.clamp_min(1e-6) * ~pushes.pinned
         reduced = 1 / (light[:, :, None] + light[:, others]).clamp_min(1e-9)  # a pinned body weighs as much as it likes
         F = reduced[..., None, None] * a
         middle = moving.points[:, :, None] - pairs.vectors[..., 0, :] * (0.05 / 2)
         torque = torch.linalg.cross(middle - moving.com[:, :, None, None], F).sum((2, 3))
         counter = torch.linalg.cross(middle - moving.com[:, others][:, :, :, None], F).sum(3)
-        force = F.sum((2, 3)) - torch.einsum("bimd,imj->bjd", F.sum(3), shape.chosen)
-        torque = torque - torch.einsum("bimd,imj->bjd", counter, shape.chosen)
+        F = F.sum(3)
+        force = F.sum(2) - F[:, others, back].sum(2)
+        torque = torque - counter[:, others, back].sum(2)
         torque = torque / mass[..., None] + torch.linalg.cross(moving.arm[:, :, None].expand_as(a_w), a_w).sum((2, 3))
         felt = (reduced / mass[..., None])[..., None, None] * a
         touch = (felt.sum(2) + a_w.sum(2)) / w.share.clamp_min(1e-9)[..., None]

@@ -69,6 +69,8 @@ class Pushes:
         self, points: Float[Tensor, "b o n 3"], com: Float[Tensor, "b o 3"], t: Tensor | float, dt: float = 0.0
     ) -> tuple[Float[Tensor, "b o 3"], Float[Tensor, "b o 3"]]:
         """Force [N] and torque about the centre of mass [N m] on each object, its keypoints being at `points`."""
+        if not self.object.shape[1]:
+            return torch.zeros_like(com), torch.zeros_like(com)
         on = self.acting(t, dt)[..., None]
         force, torque = on * self.force, on * self.torque
         scene = torch.arange(len(points), device=points.device)[:, None]

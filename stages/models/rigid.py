@@ -8,7 +8,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from stages.geometry.rotations import multiply, nearest
+from stages.geometry.rotations import matrix, multiply, nearest
+from stages.kernels import rigid as kernels
+from stages.models.vectors import apply
 
 
 def exponential(turn: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 4"]:
@@ -29,7 +31,35 @@ def spin_of(
     momentum: Float[Tensor, "*b 3"], inverse: Float[Tensor, "*b 3 3"], R: Float[Tensor, "*b 3 3"]
 ) -> Float[Tensor, "*b 3"]:
     """Angular velocity [rad/s], world axes, of an angular momentum per mass [m^2/s]; `inverse` inertia at rest."""
-    return (R @ (inverse @ (R.mT @ momentum[..., None])))[..., 0]
+    return apply(R, apply(inverse, apply(R.mT, momentum)))
+
+
+def pose(
+    quat: Float[Tensor, "*b 4"], momentum: Float[Tensor, "*b 3"], inverse: Float[Tensor, "*b 3 3"]
+) -> tuple[Float[Tensor, "*b 3 3"], Float[Tensor, "*b 3"]]:
+    """Rotation matrices, and spins as `spin_of` has them."""
+    if _at_once(quat):
+        return kernels.pose(quat, momentum, inverse)
+    R = matrix(quat)
+    return R, spin_of(momentum, inverse, R)
+
+
+def drift(
+    com: Float[Tensor, "*b 3"], quat: Float[Tensor, "*b 4"], velocity: Float[Tensor, "*b 3"],
+    momentum: Float[Tensor, "*b 3"], inverse: Float[Tensor, "*b 3 3"], dt: float,
+) -> tuple[Float[Tensor, "*b 3"], Float[Tensor, "*b 4"]]:  # fmt: skip
+    """Centres of mass and orientations after dt [s] without forces. The spin is that of the middle of the way (second
+    order)."""
+    if _at_once(quat):
+        return kernels.drift(com, quat, velocity, momentum, inverse, dt)
+    spin = pose(quat, momentum, inverse)[1]
+    spin = pose(turned(quat, dt / 2 * spin), momentum, inverse)[1]
+    return com + dt * velocity, turned(quat, dt * spin)
+
+
+def _at_once(x: Tensor) -> bool:
+    """Whether one kernel can do it."""
+    return x.dtype == torch.float32 and not torch.is_grad_enabled()
 
 
 def limited(x: Float[Tensor, "*b 3"], most: float) -> Float[Tensor, "*b 3"]:

@@ -6,8 +6,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from stages.kernels.compilers import TRITON
 from stages.models.shape import Shape
-from stages.models.vectors import mlp, products, weigh
+from stages.models.vectors import apply, chain, mlp, weigh
+
+if TRITON:
+    from stages.kernels.thin import thin_product
 
 STIFFEST = 2500.0  # [1/s^2]: a swing of an eighth of a second, six frames
 THICKEST = 100.0  # damping [1/s]
@@ -39,18 +43,25 @@ class Stress(nn.Module):
         """
         size = shape.size[..., None, None]
         share = shape.world.share[..., None]
-        felt = shape.blur @ torch.cat([touch, u, du], -1)
+        felt = _blurred(shape.blur, torch.cat([touch, u, du], -1))
         virial = torch.einsum("boni,bonj->boij", share * touch, shape.arm) / size**2
         arm = shape.arm / size
         moving = torch.stack([
             20 * u, 2 * du, 20 * (u - felt[..., 3:6]), 2 * (du - felt[..., 6:]), felt[..., :3] / 10,
-            shape.arm @ (virial + virial.mT) / 10,
+            apply((virial + virial.mT)[:, :, None], shape.arm) / 10,
         ], -2)  # fmt: skip
         vectors = torch.cat([moving, torch.stack([shape.normal, arm], -2)], -2)
         pull = (arm * gravity[:, :, None] / 5).sum(-1, keepdim=True)
-        x = self.see(torch.cat([products(vectors), pull], -1)) + self.own(code)[:, :, None]
+        said = chain(pull, (self.see, self.say[0], self.say[2]), vectors, self.own(code)[:, :, None])
         # only what vanishes at rest: an untouched body stays as it is
-        return projected(shape, 10 * weigh(self.say(torch.nn.functional.silu(x)), moving))
+        return projected(shape, 10 * weigh(said, moving))
+
+
+def _blurred(blur: Float[Tensor, "b o n n"], x: Float[Tensor, "b o n 9"]) -> Float[Tensor, "b o n 9"]:
+    """blur @ x."""
+    if blur.dtype == torch.float16 and not torch.is_grad_enabled():
+        return thin_product(blur, x)
+    return (x.mT @ blur.to(x).mT).mT  # on a CPU twice as fast as what it means
 
 
 def projected(shape: Shape, field: Float[Tensor, "b o n 3"]) -> Float[Tensor, "b o n 3"]:
@@ -58,7 +69,7 @@ def projected(shape: Shape, field: Float[Tensor, "b o n 3"]) -> Float[Tensor, "b
     share = shape.world.share[..., None]
     field = field - (share * field).sum(2, keepdim=True)
     momentum = (share * torch.linalg.cross(shape.arm, field)).sum(2)
-    turn = (shape.inverse @ momentum[..., None])[..., 0]
+    turn = apply(shape.inverse, momentum)
     field = field - torch.linalg.cross(turn[:, :, None].expand_as(field), shape.arm)
     return torch.where(shape.world.valid[..., None], field, 0.0)
 

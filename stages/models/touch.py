@@ -6,13 +6,14 @@ answers with a force: a weighted sum of the vectors it saw.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from stages.models.vectors import mlp, products, weigh
+from stages.models.vectors import chain, mlp, weigh
 
 GRIP = 2e-3  # share of an object in contact at which it is felt by half
 STRENGTH = 20.0  # acceleration that a vector of length 1 stands for [m/s^2]
@@ -48,20 +49,41 @@ class Touch(nn.Module):
         Weights of an object sum to 1 in firm contact and go to 0 with its last gate, so that neither the number of
         keypoints nor a distant one matters.
         """
-        x = self.see(torch.cat([products(places.vectors), places.scalars], -1))
-        x = x + self.own(own)[:, :, None, None]
+        known = self.own(own)[:, :, None, None]
         if self.other is not None:
-            x = x + self.other(other)[:, :, :, None]
-        x = self.hear(torch.nn.functional.silu(x))
+            known = known + self.other(other)[:, :, :, None]
+        x = _at(places.gate > 0, self._heard, places.vectors, places.scalars, known)
         attention = torch.exp(4 * torch.tanh(x[..., -1] / 4))
         weight = places.gate * share[:, :, None] * attention
         weight = weight / (weight.sum(-1, keepdim=True) + GRIP)
         return x[..., :-1], weight, (weight[..., None] * x[..., :-1]).sum(-2)
 
+    def _heard(self, vectors: Tensor, scalars: Tensor, known: Tensor, near: Tensor | None = None) -> Tensor:
+        return chain(scalars, (self.see, self.hear[0], self.hear[2]), vectors, known, near=near)
+
     def answer(
-        self, message: Float[Tensor, "b o m n h"], context: Float[Tensor, "b o m h"],
+        self, message: Float[Tensor, "b o m n h"], weight: Float[Tensor, "b o m n"], context: Float[Tensor, "b o m h"],
         vectors: Float[Tensor, "b o m n k 3"],
     ) -> Float[Tensor, "b o m n 3"]:  # fmt: skip
-        """Acceleration at every place [m/s^2], not yet weighted."""
-        x = torch.nn.functional.silu(message + self.tell(context)[:, :, :, None])
-        return STRENGTH * weigh(self.say(x), vectors)
+        """Acceleration by every place, weighted [m/s^2]."""
+        told = self.tell(context)[:, :, :, None]
+        return _at(weight > 0, self._said, message, told, vectors, weight[..., None])
+
+    def _said(
+        self, message: Tensor, told: Tensor, vectors: Tensor, weight: Tensor, near: Tensor | None = None
+    ) -> Tensor:
+        said = chain(message, (self.say[0], self.say[2]), known=told, active=True, near=near)
+        return weight * STRENGTH * weigh(said, vectors)
+
+
+def _at(near: Bool[Tensor, "b o m n"], f: Callable[..., Tensor], *given: Tensor) -> Float[Tensor, "b o m n _"]:
+    """What f makes of the rows of `given`, which matters only where near: a CPU takes out those rows, then 0 elsewhere.
+
+    A GPU does not: it would have to tell the host how many rows there are.
+    """
+    if near.is_cuda or torch.compiler.is_compiling():
+        return f(*given, near)
+    rows, n = near.flatten().nonzero()[:, 0], near.shape[-1]
+    each = [x.expand(*near.shape[:3], *x.shape[3:]).flatten(0, 3) for x in given]
+    found = f(*(x[rows if len(x) == near.numel() else rows // n] for x in each))
+    return found.new_zeros(near.numel(), found.shape[-1]).index_copy(0, rows, found).unflatten(0, near.shape)

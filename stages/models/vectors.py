@@ -5,16 +5,24 @@ Source: Villar et al. 2021, "Scalars are universal: equivariant machine learning
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
+from torch.nn.functional import silu
+
+from stages.kernels.compilers import TRITON
+
+if TRITON:
+    from stages.kernels.perceptron import WIDEST, perceptron
 
 
 def products(vectors: Float[Tensor, "*b k 3"]) -> Float[Tensor, "*b g"]:
     """All k (k + 1) / 2 inner products, those of large vectors compressed to their logarithm."""
     k = vectors.shape[-2]
     row, column = torch.triu_indices(k, k, device=vectors.device)
-    return torch.asinh((vectors @ vectors.mT)[..., row, column])
+    return torch.asinh((vectors[..., row, :] * vectors[..., column, :]).sum(-1))
 
 
 def weigh(weights: Float[Tensor, "*b k"], vectors: Float[Tensor, "*b k 3"]) -> Float[Tensor, "*b 3"]:
@@ -22,18 +30,56 @@ def weigh(weights: Float[Tensor, "*b k"], vectors: Float[Tensor, "*b k 3"]) -> F
     return (weights[..., None] * vectors).sum(-2)
 
 
+def apply(M: Float[Tensor, "*#b 3 3"], x: Float[Tensor, "*#b 3"]) -> Float[Tensor, "*#b 3"]:
+    """M x. For so small a product a sum is faster than a call of a library, and a compiler can fuse it."""
+    return (M * x[..., None, :]).sum(-1)
+
+
 def length(x: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
     """The norm, with a gradient at zero."""
     return (x.square().sum(-1) + 1e-12).sqrt()
 
 
-def mlp(inner: int, hidden: int, outer: int, quiet: float = 1.0) -> nn.Sequential:
+def chain(
+    x: Float[Tensor, "*b i"], layers: Sequence[nn.Linear], vectors: Float[Tensor, "*b v 3"] | None = None,
+    known: Float[Tensor, "*#b k"] | None = None, active: bool = False, near: Bool[Tensor, "*b"] | None = None,
+) -> Float[Tensor, "*b j"]:  # fmt: skip
+    """Linear layers with SiLU between, in one kernel where that can be (on CUDA, without gradients).
+
+    Products of `vectors` go before x. `known`, the same along the last of the dimensions b, is added to the result of
+    the first layer, or, if `active`, to x, which is then activated too. Where not `near` the result may be 0 instead.
+    """
+    fused = TRITON and x.is_cuda and x.dtype == torch.float32 and not torch.is_grad_enabled()
+    if fused and len(layers) in (2, 3) and max(layer.out_features for layer in layers) <= WIDEST:
+        if known is not None:
+            known = known.expand(*x.shape[:-2], 1, known.shape[-1]).flatten(0, -2)
+        vectors = None if vectors is None else vectors.flatten(0, -3)
+        near = None if near is None else near.flatten()
+        weights, biases = [layer.weight for layer in layers], [layer.bias for layer in layers]
+        return perceptron(x.flatten(0, -2), weights, biases, vectors, known, near, active).unflatten(0, x.shape[:-1])
+    if vectors is not None:
+        x = torch.cat([products(vectors), x], -1)
+    known = 0.0 if known is None else known
+    y = layers[0](silu(x + known)) if active else layers[0](x) + known
+    for layer in layers[1:]:
+        y = layer(silu(y))
+    return y
+
+
+class Perceptron(nn.Sequential):
+    """Linear, SiLU, Linear."""
+
+    def forward(self, x: Float[Tensor, "*b i"]) -> Float[Tensor, "*b j"]:
+        return chain(x, (self[0], self[2]))
+
+
+def mlp(inner: int, hidden: int, outer: int, quiet: float = 1.0) -> Perceptron:
     """Linear, SiLU, Linear; `quiet` scales what comes out at first."""
     last = nn.Linear(hidden, outer)
     with torch.no_grad():
         last.weight *= quiet
         last.bias *= quiet
-    return nn.Sequential(nn.Linear(inner, hidden), nn.SiLU(), last)
+    return Perceptron(nn.Linear(inner, hidden), nn.SiLU(), last)
 
 
 def fade(x: Float[Tensor, "*b"], start: float, end: float) -> Float[Tensor, "*b"]:

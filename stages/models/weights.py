@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 from collections.abc import Mapping
 from pathlib import Path
 
 import torch
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
+from safetensors.torch import save as to_bytes
 from torch import Tensor
 
 from stages.backends import choose
@@ -55,12 +57,47 @@ def save(path: Path, name: str, model: Dynamics, card: Mapping | None = None, ha
     path = Path(path)
     state = {k: v.detach().cpu().contiguous() for k, v in model.state_dict().items()}
     if half:
-        state = {k: v.half() if v.is_floating_point() else v for k, v in state.items()}
+        state = {k: v.half() if v.is_floating_point() and v.half().isfinite().all() else v for k, v in state.items()}
     with replacing(path) as part:
-        save_file(state, part)
-    facts = {"model": name, "config": model.config, "sha256": sha256(path)}
-    with replacing(path.with_suffix(".json")) as part:
-        part.write_text(json.dumps({**(card or {}), **facts}, indent=2) + "\n")
+        part.write_bytes(to_bytes(state))  # save_file makes files that only their owner may read
+    write_card(path.with_suffix(".json"), {**(card or {}), "model": name, "config": model.config,
+                                           "sha256": sha256(path)})  # fmt: skip
+
+
+def halve(path: Path) -> None:
+    """Weights rewritten in 16 bits, for shipping: that costs nothing measurable (tests/models/test_shipped.py)."""
+    model, card = load(path)
+    save(path, card["model"], model, card, half=True)
+
+
+def write_card(path: Path, card: Mapping) -> None:
+    """A line for each entry, and for each row of a table; numbers of eight digits; of data, only what differs."""
+    facts = dict(card)
+    if facts.get("data"):
+        first, *others = facts["data"]
+        made = first.get("made", {})
+        facts["data"] = [first, *({**row, "made": _unlike(row.get("made", {}), made)} for row in others)]
+    lines = []
+    for key, value in _rounded(facts).items():
+        table = isinstance(value, list) and value and isinstance(value[0], dict)
+        rows = ",\n  ".join(map(json.dumps, value)) if table else ""
+        lines.append(f" {json.dumps(key)}: " + (f"[\n  {rows}\n ]" if table else json.dumps(value)))
+    with replacing(path) as part:
+        part.write_text("{\n" + ",\n".join(lines) + "\n}\n")
+
+
+def _unlike(row: Mapping, first: Mapping) -> dict:
+    """The entries that are not those of the first row."""
+    return {k: v for k, v in row.items() if k not in first or first[k] != v}
+
+
+def _rounded(value: object) -> object:
+    """Floats with eight significant digits, wherever they are; None for what JSON has no number for."""
+    if isinstance(value, float):
+        return float(f"{value:.8g}") if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {k: _rounded(v) for k, v in value.items()}
+    return [_rounded(v) for v in value] if isinstance(value, (list, tuple)) else value
 
 
 def load(path: Path, device: torch.device | str = "cpu") -> tuple[Dynamics, dict]:

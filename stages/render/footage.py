@@ -39,10 +39,15 @@ class Footage:
     def fps(self) -> float:
         return 1 / self.trajectory.motion.dt if self.moves else FPS
 
+    @property
+    def duration(self) -> float:
+        """From the first stored frame to the last [s]."""
+        return (len(self.trajectory) - 1) / self.fps if self.moves else 0.0
+
     def times(self, fps: float | None) -> list[float]:
         """When the frames of a film are taken [s]; the trajectory's own frames at its own rate."""
         fps = fps or self.fps
-        duration = (len(self.trajectory) - 1) / self.fps if self.moves else SECONDS - 1 / fps
+        duration = self.duration if self.moves else SECONDS - 1 / fps
         return [i / fps for i in range(int(duration * fps + 1e-6) + 1)]
 
     def index(self, time: float) -> float:

@@ -21,6 +21,7 @@ class RenderOptions:
     ids: bool = False  # draw each object in its own flat colour
     show_forces: bool = False  # arrows where force prompts act
     frame: int | None = None  # stop the motion at this frame; -1 is the last
+    side_by_side: bool = False  # several files in one picture, under the same camera
     device: str = "auto"
 
     def __post_init__(self):

@@ -64,13 +64,15 @@ def draw_arrows(image: Image, cameras: Cameras, index: int, arrows: list[tuple[T
     return torch.from_numpy(pixels).float() / 255
 
 
-def caption(image: Image, text: str) -> Image:
-    """White on a dark label in the upper left corner."""
+def caption(image: Image, text: str, below: bool = False) -> Image:
+    """White on a dark label in the upper left corner, or in the lower left one."""
     pixels = np.ascontiguousarray(to_bytes(image))
     font, size = cv2.FONT_HERSHEY_SIMPLEX, max(max(image.shape[:2]) / 800, 0.4)
-    (width, height), below = cv2.getTextSize(text, font, size, 1)
-    cv2.rectangle(pixels, (0, 0), (width + 12, height + below + 8), (30, 30, 30), cv2.FILLED)
-    cv2.putText(pixels, text, (6, height + 6), font, size, (255, 255, 255), 1, cv2.LINE_AA)
+    (width, height), descent = cv2.getTextSize(text, font, size, 1)
+    tall = height + descent + 8
+    top = len(pixels) - tall if below else 0
+    cv2.rectangle(pixels, (0, top), (width + 12, top + tall), (30, 30, 30), cv2.FILLED)
+    cv2.putText(pixels, text, (6, top + height + 6), font, size, (255, 255, 255), 1, cv2.LINE_AA)
     return torch.from_numpy(pixels).float() / 255
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -59,6 +60,16 @@ def subject_of(footage: Footage) -> Subject:
         return found
     pull = found.centre - aimed.centre
     return replace(found, aim=aimed.centre + pull * min(1.0, LEASH * aimed.radius / float(pull.norm().clamp_min(1e-9))))
+
+
+def joint(subjects: Sequence[Subject]) -> Subject:
+    """The box around several subjects; the camera aims at the middle of what they would have it aim at."""
+    if len(subjects) == 1:
+        return subjects[0]
+    low = torch.stack([s.centre - s.half for s in subjects]).amin(0)
+    high = torch.stack([s.centre + s.half for s in subjects]).amax(0)
+    aims = torch.stack([s.target for s in subjects])
+    return Subject((low + high) / 2, (high - low) / 2, aims.mean(0))
 
 
 def _places(footage: Footage, seen: Gaussians, ids: Int[Tensor, "o"]) -> Float[Tensor, "_ 3"]:

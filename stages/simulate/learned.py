@@ -1,8 +1,9 @@
 """The learned force field as an engine: the scene is taken to the size, gravity and place of the model's world.
 
-Motion under gravity looks the same at any size when times grow with the root of lengths over gravity, so a scene
-is made as large as what the model was trained on, given its gravity, and taken back. With lengths s times longer and
-gravity g' instead of g: times are sqrt(s g / g') longer, masses s^3, Young's moduli s g' / g, forces s^3 g' / g.
+Motion under gravity looks the same at any size when times grow with the root of lengths over gravity. So a scene of
+things larger or smaller than the model was trained on is made as large, given its gravity, and taken back. With lengths
+s times longer and gravity g' instead of g: times are sqrt(s g / g') longer, masses s^3, Young's moduli s g' / g, forces
+s^3 g' / g.
 """
 
 from __future__ import annotations
@@ -21,12 +22,13 @@ from stages.errors import InputError
 from stages.models import weights
 from stages.models.dynamics import FRAME, Dynamics
 from stages.models.pushes import Pushes
-from stages.models.world import FLOOR, World, centre
+from stages.models.stepper import Stepper
+from stages.models.world import FLOOR, World, centre, offsets
 from stages.physics.forces import Prompts
 from stages.physics.materials import choose_materials
 from stages.physics.skinning import rotations
 from stages.physics.state import State
-from stages.scene.scene import Scene
+from stages.scene.scene import Scene, SceneObject
 from stages.scene.trajectory import Keypoints
 from stages.simulate.mpm import Stage, set_up
 from stages.simulate.options import SimulateOptions
@@ -35,6 +37,8 @@ log = logging.getLogger(__name__)
 SIZE = 0.55  # usual longest side of an object in training [m]
 SIZES = (0.25, 1.2)  # and the smallest and largest
 MOST = 6  # objects that scenes of the benchmark have
+THIN = 0.044  # thickness of the thinnest, the cloth [m]
+STIFF = (3e3, 2e7)  # softest and stiffest [Pa]
 FALL = 5.0  # gravity in training [m/s^2]
 FAST = 5.0  # speeds that falls reach there [m/s]
 FAR = 100.0  # walls where there are none [m]
@@ -55,8 +59,9 @@ class Frame:
     def of(keypoints: list[Float[Tensor, "k 3"]], floor: float, unit: float, gravity: float) -> Frame:
         """`keypoints` of each object and `floor` in scene units, `unit` metres each."""
         sides = torch.stack([(p.amax(0) - p.amin(0)).amax() for p in keypoints])
-        length = SIZE / float(sides.median().clamp_min(1e-9))
-        scale = length / unit
+        size = unit * float(sides.median().clamp_min(1e-9))
+        scale = 1.0 if SIZES[0] <= size <= SIZES[1] else SIZE / size
+        length = scale * unit
         fall = math.copysign(FALL, gravity) if abs(gravity) > 1e-3 else 0.0
         quick = fall / gravity if fall else 1.0  # without weight, time is as it is
         middle = torch.cat(keypoints).mean(0)
@@ -79,7 +84,7 @@ def rollout(scene: Scene, keypoints: Keypoints, prompts: Prompts, options: Simul
     each = [keypoints.rest[keypoints.object_id == i] for i in ids]
     frame = Frame.of(each, stage.box.low[2], scene.metres_per_unit, options.gravity)
     world = _world(scene, each, stage, frame, prompts, options)
-    _warn(world, model, frame)
+    _warn(world, model)
     pushes = Pushes.of(world, _scaled(prompts, frame, stage, ids), ids)
     steps = max(1, math.ceil(options.dt * frame.time / FRAME - 1e-6))
     log.info("%s (%s): %d objects, %d keypoints, %.3g times as large and %.3g times slower, %d steps a frame",
@@ -87,20 +92,17 @@ def rollout(scene: Scene, keypoints: Keypoints, prompts: Prompts, options: Simul
              frame.time, steps)  # fmt: skip
     lifted = keypoints.rest + stage.lift[[ids.index(int(i)) for i in keypoints.object_id]]
 
-    @torch.no_grad()
     def states() -> Iterator[State]:
-        place, pushed = world.to(device), pushes.to(device)
-        prepared = model.prepare(place)
-        state, dt = model.start(prepared), options.dt * frame.time / steps
-        first = model.points(prepared, state)
+        place = world.to(device)
+        stepper = Stepper(model, place, options.dt * frame.time / steps, pushes.to(device))
+        first = stepper.points.clone()
         for n in range(options.steps):
-            points = model.points(prepared, state)
-            if not bool(points.isfinite().all()):
+            if not bool(stepper.points.isfinite().all()):
                 raise InputError(f"the motion ceased to be finite at {n * options.dt:.2f} s; use a smaller --velocity "
                                  "or --force, or --engine mpm")  # fmt: skip
-            yield _state(keypoints, ids, lifted, place, (points - first) / frame.length, stage)
-            for k in range(steps if n < options.steps - 1 else 0):
-                state = model.step(prepared, state, (n * steps + k) * dt, dt, pushed)
+            yield _state(keypoints, ids, lifted, place, (stepper.points - first) / frame.length, stage)
+            for _ in range(steps if n < options.steps - 1 else 0):
+                stepper.step()
 
     return states()
 
@@ -120,7 +122,7 @@ def _world(
         choice = materials[o.id]
         volume = float(stage.bodies.volume[stage.bodies.body == row].sum()) * scene.metres_per_unit**3
         mass[0, row] = choice.material.density * volume * frame.mass
-        E[0, row], nu[0, row] = choice.material.E * frame.stress, choice.material.nu
+        E[0, row], nu[0, row] = _known_stiffness(o, choice.material.E * frame.stress), choice.material.nu
         friction[0, row] = choice.material.friction if options.friction is None else options.friction
         velocity[0, row] = torch.tensor(prompts.velocity.get(o.id, (0.0, 0.0, 0.0))) * frame.length / frame.time
         guess = f"; material not known, taking {choice.name} (--material {o.id}=... changes it)" * choice.guessed
@@ -131,6 +133,15 @@ def _world(
     gravity = torch.tensor([0.0, 0.0, -frame.gravity])
     return World.of(points, valid, mass=mass, E=E, nu=nu, friction=friction, velocity=velocity, gravity=gravity,
                     box=torch.stack([low, high]))  # fmt: skip
+
+
+def _known_stiffness(o: SceneObject, E: float) -> float:
+    """Young's modulus [Pa] as the model is told it: beyond those of training, the nearest of them."""
+    told = min(max(E, STIFF[0]), STIFF[1])
+    if not STIFF[0] / 2 <= E <= 50 * STIFF[1]:  # far beyond the stiffest all bodies look rigid, and this is no loss
+        log.warning("object %d (%s): %.2g Pa (at this size) is far from the %.2g to %.2g Pa of training, and taken as "
+                    "%.2g Pa; compare with --engine mpm", o.id, o.name, E, *STIFF, told)  # fmt: skip
+    return told
 
 
 def _scaled(prompts: Prompts, frame: Frame, stage: Stage, ids: list[int]) -> Prompts:
@@ -151,7 +162,7 @@ def _scaled(prompts: Prompts, frame: Frame, stage: Stage, ids: list[int]) -> Pro
     return replace(prompts, forces=tuple(scaled(f) for f in prompts.forces))
 
 
-def _warn(world: World, model: Dynamics, frame: Frame) -> None:
+def _warn(world: World, model: Dynamics) -> None:
     """What the model has not seen in training, or does not hear of."""
     points = world.points[0]
     hidden = ~world.valid[0, ..., None]
@@ -159,12 +170,23 @@ def _warn(world: World, model: Dynamics, frame: Frame) -> None:
     if float(sides.max() / sides.min()) > SIZES[1] / SIZES[0]:
         log.warning("the largest object is %.1f times as long as the smallest, and in training never more than %.1f; "
                     "compare with --engine mpm", sides.max() / sides.min(), SIZES[1] / SIZES[0])  # fmt: skip
+    thin = thickness(world)[0]
+    if float(thin.min()) < THIN / 1.5:
+        log.warning("an object is %.2g times thinner than any in training; it may sink into others, so "
+                    "compare with --engine mpm", THIN / float(thin.min().clamp_min(1e-6)))  # fmt: skip
     if len(sides) > MOST:
         log.warning("%d objects; the model was tested with up to %d, so compare with --engine mpm", len(sides), MOST)
     if float(world.velocity.norm(dim=-1).max()) > FAST:
         log.warning("an object starts faster than any in training; compare with --engine mpm")
     for name in sorted({"mass", "E", "friction", "gravity"} - model.told):
         log.warning("this model is not told the %s", name)
+
+
+def thickness(world: World) -> Float[Tensor, "b o"]:
+    """That of a slab whose points spread as an object's do across its thinnest direction [m]."""
+    arm = offsets(world, world.points)
+    spread = torch.einsum("bon,boni,bonj->boij", world.share, arm, arm)
+    return (12 * torch.linalg.eigvalsh(spread)[..., 0].clamp_min(0)).sqrt()
 
 
 def _state(

@@ -1,12 +1,13 @@
 """Weights on disk: round trips, and one clear sentence for what is wrong."""
 
 import json
+import math
 
 import pytest
 import torch
 
 from stages.errors import InputError
-from stages.models.weights import MODELS, build, find, load, save
+from stages.models.weights import MODELS, build, find, halve, load, save
 from tests.models.worlds import SMALL, crowd
 
 
@@ -30,8 +31,10 @@ def test_every_model_is_tested():
 
 def test_half_precision_is_half_the_file_and_nearly_the_model(tmp_path):
     model = build("gcn").eval()
-    save(tmp_path / "a.safetensors", "gcn", model)
-    save(tmp_path / "b.safetensors", "gcn", model, half=True)
+    for name in "ab":
+        save(tmp_path / f"{name}.safetensors", "gcn", model, {"minutes": 2.0})
+    halve(tmp_path / "b.safetensors")
+    assert load(tmp_path / "b.safetensors")[1]["minutes"] == 2.0
     sizes = [(tmp_path / f"{n}.safetensors").stat().st_size for n in "ab"]
     assert sizes[1] < 0.55 * sizes[0]
     for (_, p), (_, q) in zip(
@@ -39,6 +42,25 @@ def test_half_precision_is_half_the_file_and_nearly_the_model(tmp_path):
     ):
         assert q.dtype == torch.float32
         torch.testing.assert_close(q, p, rtol=1e-3, atol=1e-6)
+
+
+def test_numbers_too_large_for_16_bits_are_kept_whole(tmp_path):
+    model = build("gcn", hidden=8, layers=1)
+    with torch.no_grad():
+        next(model.parameters()).view(-1)[0] = 1e6
+    save(tmp_path / "a.safetensors", "gcn", model, half=True)
+    assert float(next(load(tmp_path / "a.safetensors")[0].parameters()).view(-1)[0]) == 1e6
+
+
+def test_a_card_is_short_and_says_the_same(tmp_path):
+    made = {"command": "dataset", "options": {"dx": 0.02}}
+    data = [{"name": f"3_{i}.h5", "sha256": "ab" * 32, "made": {**made, "inputs": [i]}} for i in range(3)]
+    curve = [{"minutes": i / 3, "loss": math.nan if i else 1.0} for i in range(2)]
+    save(tmp_path / "a.safetensors", "gcn", build("gcn", hidden=8), {"data": data, "curve": curve, "empty": []})
+    card = load(tmp_path / "a.safetensors")[1]
+    assert card["data"][0] == data[0] and card["data"][2]["made"] == {"inputs": [2]} and card["empty"] == []
+    assert card["curve"] == [{"minutes": 0.0, "loss": 1.0}, {"minutes": 0.33333333, "loss": None}]
+    assert len((tmp_path / "a.json").read_text().splitlines()) == 2 + 5 + 4 + 4
 
 
 @pytest.fixture

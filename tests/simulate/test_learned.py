@@ -5,9 +5,13 @@ import pytest
 import torch
 
 from stages.errors import InputError
-from stages.models.weights import build, save
+from stages.geometry.rotations import matrix
+from stages.models.weights import HERE, build, find, save
+from stages.models.world import FLOOR, World
+from stages.scene.scene import SceneObject
 from stages.scene.scene_ply import write_scene
 from stages.scene.trajectory import read_trajectory
+from stages.simulate.learned import Frame, _known_stiffness, _warn, thickness
 from stages.simulate.options import SimulateOptions
 from stages.simulate.stage import run
 
@@ -57,6 +61,69 @@ def test_pinned_objects_stay_and_fewer_frames_a_second_are_the_same_motion(two_b
     coarse = roll(two_balls, tmp_path, untrained, lift=("2=2",), pin=("1",), dt=0.05, steps=3)
     assert float(shift(coarse, 1)[2]) == pytest.approx(float(shift(t, 1)[2]), rel=0.01)
     assert math.isclose(coarse.motion.dt, 0.05)
+
+
+def elsewhere(scene, unit, floor):
+    """The same things in units of `unit` metres, on a floor at another height."""
+    g = scene.gaussians
+    up = torch.tensor([0.0, 0.0, floor])
+    g = replace(g, means=g.means / unit + up, scales=g.scales / unit)
+    return replace(scene, gaussians=g, cameras=None, floor=floor, scale={"metres_per_unit": unit, "source": "test"})
+
+
+@pytest.mark.parametrize(("unit", "floor", "apart"), [(0.1, 0.0, 1e-4), (1.0, 7.0, 0.01)])
+def test_units_and_the_height_of_the_floor_do_not_matter(two_balls, tmp_path, unit, floor, apart):
+    """With the weights that ship. Where the floor cuts the voxels (of 2 cm) that decide on what lies on it moves."""
+    shipped = find("ngff", HERE)
+    here = roll(two_balls, tmp_path, shipped, steps=8)
+    there = roll(elsewhere(two_balls, unit, floor), tmp_path, shipped, steps=8)
+    moved = here.positions - here.positions[0]
+    assert moved.norm(dim=-1).max() > 0.02  # the green ball falls, the red one lies
+    torch.testing.assert_close(unit * (there.positions - there.positions[0]), moved, rtol=0, atol=apart)
+
+
+@pytest.mark.parametrize(("size", "scale"), [(0.5, 1.0), (0.26, 1.0), (0.05, 11.0), (5.5, 0.1)])
+def test_things_of_sizes_known_from_training_keep_their_size(size, scale):
+    cube = size * torch.tensor([[0.0, 0, 0], [1, 1, 1]])
+    frame = Frame.of([cube, cube], 2.0, 1.0, 5.0)
+    assert frame.length == pytest.approx(scale, rel=1e-4) and frame.mass == pytest.approx(scale**3, rel=1e-3)
+    assert frame.time == pytest.approx(scale**0.5, rel=1e-3) and frame.stress == pytest.approx(scale, rel=1e-3)
+    assert float(frame.inside(torch.tensor([0.0, 0, 2.0]))[2]) == pytest.approx(FLOOR)
+
+
+def test_thickness_is_that_of_a_slab():
+    x, y = torch.linspace(-0.5, 0.5, 20), torch.linspace(-0.3, 0.3, 12)
+    slab = torch.cartesian_prod(x, y, torch.linspace(-0.01, 0.01, 30))
+    tilted = slab @ matrix(torch.tensor([0.9, 0.3, -0.2, 0.1]) / 0.95**0.5).mT
+    assert float(thickness(World.of(tilted[None, None]))) == pytest.approx(0.02, rel=0.05)
+
+
+class Deaf:
+    told = frozenset({"mass", "E", "friction"})
+
+
+@pytest.mark.parametrize(("change", "says"), [
+    ({"count": 7}, "7 objects; the model was tested with up to 6"), ({"speed": 9.0}, "faster than any in training"),
+    ({"flat": 0.05}, "thinner than any in training"), ({"grow": 8.0}, "times as long as the smallest"),
+    ({}, "not told the gravity"),
+])  # fmt: skip
+def test_what_was_not_seen_in_training_is_warned_of(caplog, change, says):
+    count = change.get("count", 3)
+    points = 0.3 * torch.rand(1, count, 50, 3, generator=torch.Generator().manual_seed(0))
+    points[:, 0, :2] = torch.tensor([[0.0, 0, 0], [0.3, 0.3, 0.3]])
+    points[:, 1, :2] = points[:, 0, :2]
+    points[:, 0] *= change.get("grow", 1.0)
+    points[:, 1, :, 2] *= change.get("flat", 1.0)
+    velocity = torch.tensor([change.get("speed", 0.0), 0, 0])
+    _warn(World.of(points, velocity=velocity), Deaf())
+    assert len(caplog.records) == (1 if not change else 2)
+    assert says in caplog.text
+
+
+def test_stiffness_beyond_training_is_the_nearest_and_said(caplog):
+    o = SceneObject(1, "thing")
+    assert [_known_stiffness(o, E) for E in (2e3, 1e5, 7e8)] == [3e3, 1e5, 2e7] and not caplog.records
+    assert _known_stiffness(o, 50.0) == 3e3 and _known_stiffness(o, 7e10) == 2e7 and len(caplog.records) == 2
 
 
 def test_missing_weights_are_said(two_balls, tmp_path):

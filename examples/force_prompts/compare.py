@@ -1,0 +1,77 @@
+"""A pillow pushed up and a cloth pulled left, by the learned force field and by MPM: python compare.py OUT
+
+Writes OUT/<name>_ngff.h5, OUT/<name>_mpm.h5 and OUT/<name>.mp4, in which they stand side by side; `ngff evaluate` says
+by how much they differ. The pushes are in pillow_up.json and cloth_left.json. With the commands alone:
+
+    ngff simulate pillow.ply --engine ngff --forces pillow_up.json -o pillow_ngff.h5
+    ngff simulate pillow.ply --engine mpm --forces pillow_up.json -o pillow_mpm.h5
+    ngff evaluate pillow_ngff.h5 --against pillow_mpm.h5
+    ngff render pillow_mpm.h5 pillow_ngff.h5 --side-by-side --show-forces -o pillow.mp4
+"""
+
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from stages.evaluate.options import EvaluateOptions
+from stages.evaluate.stage import run as evaluate
+from stages.lab.objects import OBJECTS, make_object
+from stages.lab.shapes import sheet, to_gaussians
+from stages.render.options import RenderOptions
+from stages.render.stage import run as render
+from stages.scene.gaussians import concatenate
+from stages.scene.scene import Scene, SceneObject
+from stages.scene.scene_ply import write_scene
+from stages.scene.trajectory import read_trajectory
+from stages.simulate.options import SimulateOptions
+from stages.simulate.stage import run as simulate
+
+HERE = Path(__file__).parent
+PUSHES = {"pillow": ("pillow_up.json", (0.0, 0.0, 1.0)), "cloth": ("cloth_left.json", (-1.0, 0.0, 0.0))}
+KEPT = 6  # every so many Gaussians of an object
+
+
+def scene(name: str) -> Scene:
+    """An object of the data set, in its usual size, lying on a floor."""
+    g = make_object(name)[::KEPT]
+    scale = OBJECTS[name].scale
+    means = scale * g.means
+    means = means - torch.tensor([0.0, 0.0, float(means[:, 2].min())])
+    thing = replace(g, means=means, scales=1.3 * KEPT**0.5 * scale * g.scales)
+    floor = sheet(3.0, 3.0, 0.03).moved((0.0, 0.0, -0.02))  # drawn a little lower, as soft things sag into it
+    tiles = (floor.points[:, :2] / 0.3).floor().sum(1).remainder(2)[:, None]
+    table = to_gaussians(floor, 0.55 + 0.2 * tiles.expand(-1, 3), 0, width=0.8, widest=0.1)
+    table = replace(table, sh=torch.nn.functional.pad(table.sh, (0, 0, 0, thing.sh.shape[1] - 1)))
+    return Scene(concatenate([table, thing]), (SceneObject(1, name),), None, 0.0)
+
+
+def compare(name: str, out: Path, steps: int = 60, **options) -> tuple[dict, dict]:
+    """Metrics of ngff against mpm, and how far along the push each engine carried the object, at most [m]."""
+    forces, along = PUSHES[name]
+    write_scene(out / f"{name}.ply", scene(name))
+    files = {engine: out / f"{name}_{engine}.h5" for engine in ("mpm", "ngff")}
+    for engine, file in files.items():
+        chosen = SimulateOptions(steps=steps, engine=engine, forces=HERE / forces, **options)
+        simulate(out / f"{name}.ply", file, chosen)
+    evaluate(files["ngff"], files["mpm"], out / f"{name}.json", EvaluateOptions())
+    moved = {}
+    for engine, file in files.items():
+        com = read_trajectory(file).com[:, 0]
+        moved[engine] = float(((com - com[0]) @ torch.tensor(along)).max())
+    return json.loads((out / f"{name}.json").read_text()), moved
+
+
+def main(out: Path) -> None:
+    for name in PUSHES:
+        _, moved = compare(name, out)
+        files = [out / f"{name}_{engine}.h5" for engine in ("mpm", "ngff")]
+        render(files, out / f"{name}.mp4", RenderOptions(side_by_side=True, show_forces=True, resolution=480))
+        print(name, *(f"{engine}: {m:.3f} m along the push" for engine, m in moved.items()))
+        assert moved["mpm"] > 0.05  # it follows; the weights that ship keep what lies on the floor from rising
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))

@@ -1,0 +1,81 @@
+"""For every point of an object the nearest point of each other object, by measuring all distances that matter.
+
+The kernel is written in Triton (see `compilers`), which is imported with this module.
+"""
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+BLOCK, CHUNK = 16, 128  # points that search together, and points that each looks at in one go
+
+
+@triton.jit
+def _search(points, low, high, distance, index, reach, o, n, BLOCK: tl.constexpr, CHUNK: tl.constexpr):
+    blocks = tl.cdiv(n, BLOCK)
+    pair, block = tl.program_id(0) // blocks, tl.program_id(0) % blocks
+    i, j = pair // o, (pair // (o * o)) * o + pair % o  # rows of objects of the same scene
+    r = block * BLOCK + tl.arange(0, BLOCK)
+    p = points + 3 * i * n + r
+    far = float("inf")
+    x, y, z = (tl.load(p, mask=r < n, other=far), tl.load(p + n, mask=r < n, other=far),
+               tl.load(p + 2 * n, mask=r < n, other=far))  # fmt: skip
+    look = (i != j) & (x > tl.load(low + 3 * j) - reach) & (x < tl.load(high + 3 * j) + reach)
+    look &= (y > tl.load(low + 3 * j + 1) - reach) & (y < tl.load(high + 3 * j + 1) + reach)
+    look &= (z > tl.load(low + 3 * j + 2) - reach) & (z < tl.load(high + 3 * j + 2) + reach)
+    column = tl.arange(0, CHUNK)
+    least = tl.full([BLOCK, CHUNK], far, tl.float32)
+    which = tl.zeros([BLOCK, CHUNK], tl.int32)
+    if tl.sum(look.to(tl.int32)) > 0:
+        for first in range(0, n, CHUNK):
+            s = first + column
+            q = points + 3 * j * n + s
+            dx = x[:, None] - tl.load(q, mask=s < n, other=far)[None, :]
+            dy = y[:, None] - tl.load(q + n, mask=s < n, other=far)[None, :]
+            dz = z[:, None] - tl.load(q + 2 * n, mask=s < n, other=far)[None, :]
+            squared = dx * dx + dy * dy + dz * dz
+            nearer = squared < least
+            least = tl.where(nearer, squared, least)
+            which = tl.where(nearer, first, which)
+    best = tl.min(least, 1)
+    which = tl.min(tl.where(least == best[:, None], which + column[None, :], n), 1)
+    best = tl.where(look & (best < reach * reach), tl.sqrt(best), far)
+    tl.store(distance + pair * n + r, best, mask=r < n)
+    tl.store(index + pair * n + r, tl.minimum(which, n - 1).to(tl.int64), mask=r < n)
+
+
+@torch.library.custom_op("ngff::nearest", mutates_args=())
+def _nearest(points: Tensor, low: Tensor, high: Tensor, reach: float) -> tuple[Tensor, Tensor]:
+    b, o, _, n = points.shape
+    distance = points.new_empty(b, o, o, n)
+    index = torch.empty(b, o, o, n, dtype=torch.int64, device=points.device)
+    grid = (b * o * o * triton.cdiv(n, BLOCK),)
+    _search[grid](points, low, high, distance, index, reach, o, n, BLOCK, CHUNK)
+    return distance, index
+
+
+@_nearest.register_fake
+def _(points: Tensor, low: Tensor, high: Tensor, reach: float) -> tuple[Tensor, Tensor]:
+    b, o, _, n = points.shape
+    return points.new_empty(b, o, o, n), torch.empty(b, o, o, n, dtype=torch.int64, device=points.device)
+
+
+def nearest(points: Tensor, valid: Tensor, reach: float) -> tuple[Tensor, Tensor]:
+    """For point n of object i and every object j: the distance [m] to j's nearest point, and which one that is.
+
+    `points` (b o n 3) in single precision, `valid` (b o n); both results (b o o n). The distance is infinite where it
+    is not below `reach`, to the own object, to padding and from padding; the index then means nothing.
+    """
+    hidden = ~valid[..., None]
+    placed = points.masked_fill(hidden, torch.inf)  # padding is far from everything, and sees nothing
+    low, high = placed.amin(2), points.masked_fill(hidden, -torch.inf).amax(2)
+    return _nearest(placed.mT.contiguous(), low, high, reach)
+
+
+def nearest_reference(points: Tensor, valid: Tensor, reach: float) -> tuple[Tensor, Tensor]:
+    """The same from a table of all distances, in any precision."""
+    distance = (points[:, :, None, :, None] - points[:, None, :, None]).norm(dim=-1)
+    distance, index = distance.masked_fill(~valid[:, None, :, None], torch.inf).min(-1)
+    own = torch.eye(points.shape[1], dtype=torch.bool, device=points.device)[:, :, None]
+    return distance.masked_fill(own | ~valid[:, :, None] | (distance >= reach), torch.inf), index

@@ -1,0 +1,139 @@
+"""What vectors show and a small perceptron makes of it, for many rows in one launch; only results go to memory.
+
+The kernel is written in Triton (see `compilers`), which is imported with this module.
+"""
+
+from collections.abc import Sequence
+from typing import Optional
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+from torch.nn.functional import linear, silu
+
+WIDEST = 128  # layers that are not the input: their weights and a block of rows stay on the chip
+CHUNK = 64  # columns of the input at a time
+FEW = 65_536  # rows that are cut into small blocks, so that all processors have some
+
+
+@triton.jit
+def _component(vectors, r, there, i, VECTORS: tl.constexpr):
+    at = vectors + (r * VECTORS + i) * 3
+    return (tl.load(at, mask=there, other=0.0), tl.load(at + 1, mask=there, other=0.0),
+            tl.load(at + 2, mask=there, other=0.0))  # fmt: skip
+
+
+@triton.jit
+def _layer(h, weight, bias, INNER: tl.constexpr, OUTER: tl.constexpr, I: tl.constexpr, O: tl.constexpr,
+           PRECISION: tl.constexpr):  # fmt: skip
+    """The linear layer after an activation; I and O are the widths, padded."""
+    i, o = tl.arange(0, I), tl.arange(0, O)
+    h = h * tl.sigmoid(h)
+    W = tl.load(weight + o[None, :] * INNER + i[:, None], mask=(i[:, None] < INNER) & (o[None, :] < OUTER), other=0.0)
+    b = tl.load(bias + o, mask=o < OUTER, other=0.0)
+    return tl.dot(h, W, input_precision=PRECISION) + b[None, :]
+
+
+@triton.jit
+def _perceptron(
+    x, vectors, known, near, w0, b0, w1, b1, w2, b2, out, rows, each, VECTORS: tl.constexpr, COLUMNS: tl.constexpr,
+    HIDDEN: tl.constexpr, MIDDLE: tl.constexpr, OUTER: tl.constexpr, KNOWN: tl.constexpr, NEAR: tl.constexpr,
+    ACTIVE: tl.constexpr, DEEP: tl.constexpr, PRECISION: tl.constexpr, BLOCK: tl.constexpr, K: tl.constexpr,
+    H: tl.constexpr, M: tl.constexpr, O: tl.constexpr,
+):  # fmt: skip
+    r = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    there = r < rows
+    o, h = tl.arange(0, O), tl.arange(0, H)
+    to, store = out + r[:, None] * OUTER + o[None, :], there[:, None] & (o[None, :] < OUTER)
+    wanted = BLOCK
+    if NEAR:
+        wanted = tl.sum(tl.load(near + r, mask=there, other=0).to(tl.int32))
+    if wanted == 0:
+        tl.store(to, tl.zeros([BLOCK, O], tl.float32), mask=store)
+    else:
+        PRODUCTS: tl.constexpr = VECTORS * (VECTORS + 1) // 2
+        INNER: tl.constexpr = PRODUCTS + COLUMNS
+        y = tl.zeros([BLOCK, H], tl.float32)
+        for i in range(VECTORS):  # not unrolled: that would need more registers than there are
+            ax, ay, az = _component(vectors, r, there, i, VECTORS)
+            for j in range(i, VECTORS):
+                bx, by, bz = _component(vectors, r, there, j, VECTORS)
+                p = ax * bx + ay * by + az * bz
+                size = tl.log(tl.abs(p) + tl.sqrt(p * p + 1))  # asinh, but for the sign
+                seen = tl.where(p < 0, -size, size)
+                column = i * VECTORS - i * (i - 1) // 2 + j - i
+                y += seen[:, None] * tl.load(w0 + h * INNER + column, mask=h < HIDDEN, other=0.0)[None, :]
+        for first in range(0, COLUMNS, K):
+            k = first + tl.arange(0, K)
+            inside = there[:, None] & (k[None, :] < COLUMNS)
+            part = tl.load(x + r[:, None] * COLUMNS + k[None, :], mask=inside, other=0.0)
+            if ACTIVE:
+                if KNOWN:
+                    part += tl.load(known + (r // each)[:, None] * COLUMNS + k[None, :], mask=inside, other=0.0)
+                part = part * tl.sigmoid(part)
+            W = tl.load(w0 + h[None, :] * INNER + PRODUCTS + k[:, None],
+                        mask=(k[:, None] < COLUMNS) & (h[None, :] < HIDDEN), other=0.0)  # fmt: skip
+            y += tl.dot(part, W, input_precision=PRECISION)
+        y += tl.load(b0 + h, mask=h < HIDDEN, other=0.0)[None, :]
+        if KNOWN and not ACTIVE:
+            wide = there[:, None] & (h[None, :] < HIDDEN)
+            y += tl.load(known + (r // each)[:, None] * HIDDEN + h[None, :], mask=wide, other=0.0)
+        if DEEP:
+            y = _layer(y, w1, b1, HIDDEN, MIDDLE, H, M, PRECISION)
+            y = _layer(y, w2, b2, MIDDLE, OUTER, M, O, PRECISION)
+        else:
+            y = _layer(y, w1, b1, HIDDEN, OUTER, H, O, PRECISION)
+        tl.store(to, y, mask=store)
+
+
+@torch.library.custom_op("ngff::perceptron", mutates_args=())
+def _fused(
+    x: Tensor, vectors: Optional[Tensor], known: Optional[Tensor], near: Optional[Tensor], active: bool,  # noqa: UP045
+    weights: Sequence[Tensor], biases: Sequence[Tensor],
+) -> Tensor:  # fmt: skip
+    rows, widths = len(x), [w.shape[0] for w in weights]
+    out = x.new_empty(rows, widths[-1])
+    columns = x.shape[1]
+    K, H, M, O = (max(16, triton.next_power_of_2(w)) for w in (min(columns, CHUNK), widths[0], widths[-2], widths[-1]))
+    precision = "tf32x3" if torch.get_float32_matmul_precision() == "highest" else "tf32"
+    block = 32 if rows <= FEW else 64
+    layers = [t for pair in zip(weights, biases, strict=True) for t in pair]
+    _perceptron[(triton.cdiv(rows, block),)](
+        x, vectors, known, near, *layers[:4], *layers[-2:], out, rows, 1 if known is None else rows // len(known),
+        0 if vectors is None else vectors.shape[1], columns, widths[0], widths[-2], widths[-1], known is not None,
+        near is not None, active, len(weights) == 3, precision, block, K, H, M, O,
+    )  # fmt: skip
+    return out
+
+
+@_fused.register_fake
+def _(x, vectors, known, near, active, weights, biases):
+    return x.new_empty(len(x), weights[-1].shape[0])
+
+
+def perceptron(
+    x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor], vectors: Tensor | None = None,
+    known: Tensor | None = None, near: Tensor | None = None, active: bool = False,
+) -> Tensor:  # fmt: skip
+    """Two or three linear layers with SiLU between, in single precision; without gradients.
+
+    Before the columns of `x` (r, i) the first layer sees the asinh of the products of `vectors` (r, v, 3) with each
+    other. Rows come in groups of one size, and to a group belongs a row of `known` (g, _): it is added to the first
+    layer's result, or, if `active`, to `x`, which then is activated too. `near` (r) are the rows that matter: others
+    may come out as 0. With torch.set_float32_matmul_precision("high") products are rounded as tf32 has it.
+    """
+    x, vectors, known, near = (t if t is None else t.contiguous() for t in (x, vectors, known, near))
+    return _fused(x, vectors, known, near, active, list(weights), list(biases))
+
+
+def perceptron_reference(x, weights, biases, vectors=None, known=None, near=None, active: bool = False) -> Tensor:
+    """The same layer by layer, in any precision, for all rows."""
+    if vectors is not None:
+        i, j = torch.triu_indices(vectors.shape[1], vectors.shape[1], device=x.device)
+        x = torch.cat([torch.asinh((vectors @ vectors.mT)[:, i, j]), x], -1)
+    known = 0.0 if known is None else known.repeat_interleave(len(x) // len(known), 0)
+    y = linear(silu(x + known), weights[0], biases[0]) if active else linear(x, weights[0], biases[0]) + known
+    for w, b in zip(weights[1:], biases[1:], strict=True):
+        y = linear(silu(y), w, b)
+    return y

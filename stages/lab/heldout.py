@@ -1,0 +1,148 @@
+"""Scenes of objects that no model learns from: shapes made in code, or any meshes.
+
+    OUT/scene_configs/heldout.json     where every object starts, sampled as for the data set
+    OUT/motions/heldout.h5             keypoints in every frame, as `ngff-lab dataset` writes
+    OUT/particles_heldout.npz          the objects as particles, kept for the next run
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from tqdm import tqdm
+
+from stages.backends import pick_device
+from stages.errors import InputError
+from stages.lab.dataset_assets import SUBSTEP, Asset, Fineness, count_at, extents, volumes
+from stages.lab.dataset_simulation import simulate
+from stages.lab.heldout_shapes import KINDS, surface
+from stages.lab.motions import MotionsWriter
+from stages.lab.scenes import Config, sample_scene, write_configs
+from stages.lab.shapes import one_thread
+from stages.physics.keypoints import farthest_points
+from stages.physics.materials import choose_materials
+from stages.scene.files import provenance, replacing
+from stages.scene.scene import SceneObject
+
+log = logging.getLogger(__name__)
+GROUP = "heldout"
+FIRST = 10_000  # index of the first scene: none of the data set has it, so seeds and names differ
+MESH = 100  # id of the first mesh
+DENSE = 30_000  # points of a shape that particles are chosen among
+STIFFEST = 2e7  # that the published substep bears, as of the phone [Pa]
+
+
+@dataclass(frozen=True)
+class HeldoutOptions:
+    """What decides the data."""
+
+    scenes: int = 100
+    objects: int = 3  # in each scene
+    frames: int = 100
+    keypoints: int = 2048
+    dx: float = 0.02
+    spacing: float = 0.009
+    substep: float = SUBSTEP
+    size: float = 0.5  # longest side of a mesh [m]
+    device: str = "auto"
+
+    def __post_init__(self):
+        if self.scenes < 1 or not 1 <= self.objects <= 6:
+            raise InputError(f"--scenes {self.scenes} --objects {self.objects}: at least one scene, of 1 to 6 objects")
+        if not 0.1 <= self.size <= 1.0:
+            raise InputError(f"--size {self.size}: meshes are put into a room of 2 m; give 0.1 to 1 m")
+
+    @property
+    def fineness(self) -> Fineness:
+        return Fineness(self.dx, self.spacing, self.substep)
+
+
+def run(out: Path, options: HeldoutOptions = HeldoutOptions(), meshes: list[Path] | None = None) -> str:
+    """Write the group; what is there is left as it is. A line about it."""
+    file, motions = Path(out) / "scene_configs" / f"{GROUP}.json", Path(out) / "motions" / f"{GROUP}.h5"
+    if motions.exists():
+        return f"{motions}: is there"
+    for folder in (file.parent, motions.parent):
+        folder.mkdir(parents=True, exist_ok=True)
+    device, start = pick_device(options.device), time.perf_counter()
+    if meshes:
+        things = mesh_assets(meshes, options)
+    else:
+        things = assets(options.fineness, options.keypoints, Path(out) / f"particles_{GROUP}.npz")
+    configs = configs_of(things, options.scenes, options.objects)
+    write_configs(file, configs)
+    made, count = provenance("heldout", [file, *(meshes or [])], options), 0
+    bar = tqdm(total=len(configs), desc=GROUP, unit="scene")
+    with bar, MotionsWriter(motions, made) as writer:
+        for part in simulate(configs, things, options.fineness, options.frames, options.keypoints, device):
+            writer.append(part)
+            count += len(part)
+            bar.update(len(part))
+    return f"{motions}: {count} scenes of {len(things)} objects in {time.perf_counter() - start:.0f} s"
+
+
+def configs_of(things: Mapping[int, Asset], scenes: int, objects: int) -> dict[str, Config]:
+    """Scenes by the sampling of the data set, with seeds of their own."""
+    room = extents(things)
+    made = (sample_scene(FIRST + i, objects, room) for i in tqdm(range(scenes), desc="placing", unit="scene"))
+    return {c.name: c for c in made}
+
+
+def assets(fineness: Fineness, least: int, kept: Path | None = None) -> dict[int, Asset]:
+    """The eight kinds by id; `kept` is a file (.npz) to read their particles from, or to write them to."""
+    key = f"spacing {fineness.spacing} least {least}"
+    points = _read(kept, key) if kept is not None and kept.exists() else None
+    if points is None:
+        bar = tqdm(KINDS.items(), desc="objects", unit="object")
+        points = {name: _chosen(kind.scale * surface(kind, DENSE), fineness, least) for name, kind in bar}
+        if kept is not None:
+            with replacing(kept) as part:
+                np.savez(part, key=key, **{name: p.numpy() for name, p in points.items()})
+    return {kind.id: _asset(kind.id, kind.scale, points[name], kind.E, kind.density, fineness)
+            for name, kind in KINDS.items()}  # fmt: skip
+
+
+def _read(kept: Path, key: str) -> dict[str, Tensor] | None:
+    """What was kept, if it was chosen in the same way."""
+    try:
+        with np.load(kept) as file:
+            return {name: torch.from_numpy(file[name]) for name in KINDS} if str(file["key"]) == key else None
+    except (KeyError, OSError, ValueError) as error:
+        raise InputError(f"{kept}: cannot be read ({error}); remove it and it is made again") from error
+
+
+def mesh_assets(meshes: list[Path], options: HeldoutOptions) -> dict[int, Asset]:
+    """Meshes as objects 100, 101, ...; the names of file and folder tell what each is made of."""
+    from stages.lab.meshes import read_mesh  # noqa: PLC0415 -- needs an optional extra
+
+    things = {}
+    for id, path in enumerate(tqdm(meshes, desc="meshes", unit="mesh"), start=MESH):
+        name = f"{Path(path).resolve().parent.name} {Path(path).stem}"
+        choice = choose_materials([SceneObject(id, name)])[id]
+        E = min(choice.material.E, STIFFEST)
+        log.info("%s: %s%s, E %.3g Pa", name, choice.name, " (a guess)" * choice.guessed, E)
+        points = options.size * read_mesh(path, DENSE).means
+        points = _chosen(points, options.fineness, options.keypoints)
+        things[id] = _asset(id, options.size, points, E, choice.material.density, options.fineness)
+    return things
+
+
+def _chosen(points: Float[Tensor, "n 3"], fineness: Fineness, least: int) -> Float[Tensor, "p 3"]:
+    """Some of the points, each the farthest from those before it."""
+    if len(points) < least:
+        raise InputError(f"--keypoints {least}: there are only {len(points)} points of an object")
+    count = min(len(points), max(least, count_at(points, fineness.spacing)))
+    with one_thread():
+        return points[farthest_points(points, count)]
+
+
+def _asset(id: int, scale: float, points: Tensor, E: float, density: float, fineness: Fineness) -> Asset:
+    return Asset(id, scale, points, volumes(points, fineness.dx), E, density)

@@ -1,0 +1,129 @@
+"""Objects that no model learns from."""
+
+import json
+
+import pytest
+import torch
+from typer.testing import CliRunner
+
+from ngff_cli.lab import app
+from stages.errors import InputError
+from stages.lab import heldout
+from stages.lab.dataset_assets import Fineness
+from stages.lab.heldout import GROUP, HeldoutOptions, assets, configs_of, run
+from stages.lab.heldout_shapes import KINDS, surface
+from stages.lab.motions import read_motions
+from stages.lab.objects import OBJECTS
+from stages.lab.scenes import read_configs
+
+FINENESS = Fineness(0.1, 0.06, 5e-4)
+COARSE = {"keypoints": 40, "dx": 0.1, "spacing": 0.06, "substep": 5e-4, "frames": 3, "device": "cpu"}
+
+
+def test_none_of_them_is_an_object_of_the_data_set():
+    assert not KINDS.keys() & OBJECTS.keys()
+    assert not {k.id for k in KINDS.values()} & {k.id for k in OBJECTS.values()}
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_points_lie_evenly_on_the_shape(name):
+    points = surface(KINDS[name], 2000)
+    sides = points.amax(0) - points.amin(0)
+    assert len(points) == 2000 and float(sides.max()) == pytest.approx(1.0)
+    assert (points.amax(0) + points.amin(0)).abs().max() < 1e-5
+    gap = torch.cdist(points, points).fill_diagonal_(9).min(1).values
+    # a tenth of the points at random would lie closer than a fifth of the median to another: here fewer do
+    assert float((gap < 0.2 * gap.median()).float().mean()) < 0.01 and float(gap.max()) < 4 * float(gap.median())
+
+
+def test_a_ball_is_round_and_a_knot_is_one_piece():
+    ball = surface(KINDS["soccer"], 1000)
+    assert (ball.norm(dim=1) - 0.5).abs().max() < 2e-3
+    knot = surface(KINDS["rope2"], 600)
+    near = torch.cdist(knot, knot) < 0.11
+    reached = torch.zeros(600, dtype=torch.bool)
+    reached[0] = True
+    for _ in range(100):
+        reached = (near & reached).any(1)
+    assert reached.all()
+
+
+@pytest.fixture(scope="module")
+def kept(tmp_path_factory):
+    """Particles of all shapes, chosen among few points."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(heldout, "DENSE", 2000)
+        path = tmp_path_factory.mktemp("held") / "p.npz"
+        assets(FINENESS, 40, path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def things(kept):
+    return assets(FINENESS, 40, kept)
+
+
+def test_scenes_of_the_group_are_sampled_as_those_of_the_data_set(things):
+    configs = configs_of(things, 3, 3)
+    assert configs == configs_of(things, 3, 3) and [n.split("_")[0] for n in configs] == ["10000", "10001", "10002"]
+    for c in configs.values():
+        assert len(c.ids) == 3 and c.translation[0] == (0.0, 0.0, 0.0) and set(c.ids) <= {k.id for k in KINDS.values()}
+
+
+def test_the_group_is_written_and_kept(things, tmp_path, monkeypatch):
+    monkeypatch.setattr(heldout, "assets", lambda *_: things)
+    options = HeldoutOptions(scenes=2, **COARSE)
+    assert "2 scenes of 8 objects" in run(tmp_path, options)
+    made = read_motions(tmp_path / "motions" / f"{GROUP}.h5")
+    assert made.points.shape == (2, 3, 3, 40, 3) and list(made.names) == list(
+        read_configs(tmp_path / "scene_configs" / f"{GROUP}.json")
+    )
+    kinds = {k.id: k for k in KINDS.values()}
+    for row, ids in enumerate(made.objects.tolist()):
+        assert [float(E) for E in made.E[row]] == [kinds[i].E for i in ids]
+    # everything but what rests on something falls: 5 m/s^2 for two frames
+    dropped = (made.points[:, 0, :, :, 2] - made.points[:, 2, :, :, 2]).amax()
+    assert float(dropped) == pytest.approx(5 / 2 * 0.04**2, rel=0.15, abs=2e-4)
+    assert "is there" in run(tmp_path, options)
+
+
+def test_particles_are_kept_and_read_again(things, kept, tmp_path, monkeypatch):
+    monkeypatch.setattr(heldout, "surface", None)  # must not be needed again
+    again = assets(FINENESS, 40, kept)
+    assert all(torch.equal(things[i].points, again[i].points) for i in things) and len(again) == 8
+    (tmp_path / "p.npz").write_text("no")
+    with pytest.raises(InputError, match="p.npz"):
+        assets(FINENESS, 40, tmp_path / "p.npz")
+
+
+def test_meshes_take_the_place_of_the_shapes(tmp_path, caplog):
+    trimesh = pytest.importorskip("trimesh")
+    (tmp_path / "pillow").mkdir()
+    trimesh.creation.box((2.0, 1.0, 0.5)).export(tmp_path / "pillow" / "mesh.obj")
+    trimesh.creation.icosphere(2, 3.0).export(tmp_path / "steel_thing.stl")
+    args = ["heldout", str(tmp_path), "--scenes", "1", "--objects", "2", "--size", "0.3", "--device", "cpu"]
+    for key in ("keypoints", "dx", "spacing", "substep", "frames"):
+        args += [f"--{key}", str(COARSE[key])]
+    for mesh in ("pillow/mesh.obj", "steel_thing.stl"):
+        args += ["--from", str(tmp_path / mesh)]
+    done = CliRunner().invoke(app, args)
+    assert done.exit_code == 0 and "1 scenes of 2 objects" in done.stdout, done.stderr
+    made = read_motions(tmp_path / "motions" / f"{GROUP}.h5")
+    sides = made.points[0, 0].amax(1) - made.points[0, 0].amin(1)
+    for id, row in zip(made.objects[0].tolist(), sides.tolist(), strict=True):
+        expected = [0.3, 0.15, 0.075] if id == 100 else [0.3] * 3
+        assert row == pytest.approx(expected, abs=0.03)
+    told = dict(zip(made.objects[0].tolist(), made.E[0].tolist(), strict=True))
+    stiffness = {100: 1e4, 101: 2e7}  # a pillow; steel, as far as the solver goes
+    assert told.items() <= stiffness.items()
+    config = json.loads((tmp_path / "scene_configs" / f"{GROUP}.json").read_text())
+    assert len(config) == 1
+
+
+@pytest.mark.parametrize(
+    ("choices", "says"),
+    [({"scenes": 0}, "at least one scene"), ({"objects": 9}, "1 to 6 objects"), ({"size": 3.0}, "--size 3.0")],
+)
+def test_options_that_cannot_be(choices, says):
+    with pytest.raises(InputError, match=says):
+        HeldoutOptions(**choices)

@@ -1,0 +1,95 @@
+"""What the weights that ship promise, whenever they are trained again."""
+
+import copy
+
+import pytest
+import torch
+
+from stages.lab.shapes import one_thread
+from stages.models.weights import HERE, find, load
+from stages.models.world import World, centre
+
+DT = 0.02
+MOST = 6e6  # bytes of all weights and cards
+SINK = 0.035  # deepest into the floor [m]: what the model promises, and a little for rounding
+
+
+def box(half, n, seed):
+    """Points on the surface of a box."""
+    rng = torch.Generator().manual_seed(seed)
+    p = torch.rand(n, 3, generator=rng) * 2 - 1
+    axis = torch.randint(3, (n,), generator=rng)
+    p[torch.arange(n), axis] = p[torch.arange(n), axis].sign()
+    return p * torch.tensor(half)
+
+
+@pytest.fixture(scope="module")
+def model():
+    return load(find("ngff", HERE))[0]
+
+
+@pytest.fixture(scope="module")
+def dropped(model):
+    """Soft, usual and stiff boxes that fall on each other, for 20 seconds, and their world."""
+    n, E = 48, torch.tensor([[5e3], [1e5], [1e7]]).expand(3, 2)
+    lower, upper = box((0.25, 0.2, 0.15), n, 0), box((0.15, 0.15, 0.2), n, 1)
+    points = torch.stack([lower + torch.tensor([0.0, 0, -0.5]), upper + torch.tensor([0.06, 0.04, 0.1])])
+    world = World.of(points.expand(3, 2, n, 3), E=E, mass=torch.tensor([0.6, 0.3]), friction=torch.tensor(1.0))
+    with torch.inference_mode(), one_thread():  # tensors this small are not worth sharing
+        return world, model.rollout(world, 1000)
+
+
+def test_a_thousand_steps_stay_finite_and_above_the_floor(dropped):
+    world, points = dropped
+    assert points.isfinite().all()
+    assert float(points[..., 2].amin() - world.floor[0]) > -SINK
+
+
+def test_what_has_fallen_comes_to_rest(dropped):
+    world, points = dropped
+    com = torch.stack([centre(world, p) for p in points.unbind(1)], 1)
+    speed = com.diff(dim=1).norm(dim=-1) / DT
+    assert speed[:, :40].amax() > 1  # it did fall
+    # a hundredth of that, averaged over the last second
+    assert float(speed[:, -50:].mean(1).max()) < 0.02
+    assert float((com[:, -1] - com[:, -250])[..., :2].norm(dim=-1).max()) < 0.05  # and lies where it lay 5 s before
+
+
+@pytest.mark.parametrize("E", [(1e4, 1e6), (1e6, 1e7)])
+def test_momentum_of_two_free_bodies_that_collide_is_kept(model, E):
+    a, b = box((0.15, 0.15, 0.15), 96, 1), box((0.1, 0.12, 0.25), 96, 2)
+    points = torch.stack([a + torch.tensor([-0.4, 0, 0.5]), b + torch.tensor([0.4, 0.05, 0.55])])[None]
+    mass, velocity = torch.tensor([[0.5, 0.3]]), torch.tensor([[[1.5, 0, 0], [-1.0, 0.2, 0]]])
+    world = World.of(points, E=torch.tensor([E]), mass=mass, velocity=velocity, gravity=torch.zeros(3))
+    with torch.inference_mode(), one_thread():
+        com = torch.stack([centre(world, p) for p in model.rollout(world, 40).unbind(1)], 1)
+    v = com.diff(dim=1) / DT
+    momentum = (mass[..., None] * v).sum(2)[0]
+    assert (v[0, -1] - v[0, 0]).norm(dim=-1).min() > 0.2  # they did collide
+    scale = float((mass * velocity.norm(dim=-1)).sum())
+    assert (momentum - momentum[0]).norm(dim=-1).max() < 0.01 * scale
+
+
+def test_rounding_to_16_bits_costs_nothing_that_can_be_measured(model, dropped):
+    """Weights changed by as much as rounding changes them fall the same way, to a millimetre or so in 0.8 s."""
+    world, points = dropped
+    rng = torch.Generator().manual_seed(0)
+    other = copy.deepcopy(model)
+    with torch.no_grad():
+        for p in other.parameters():
+            p *= 1 + (2 * torch.rand(p.shape, generator=rng) - 1) * 2**-11
+    with torch.inference_mode(), one_thread():
+        again = other.rollout(world, 40)
+    assert float((again - points[:, :40]).square().mean().sqrt()) < 2e-3
+
+
+def test_all_weights_and_cards_together_are_small():
+    assert sum(f.stat().st_size for f in HERE.iterdir()) <= MOST
+    assert {f.stem for f in HERE.glob("*.safetensors")} == {f.stem for f in HERE.glob("*.json")}
+
+
+@pytest.mark.parametrize("file", sorted(HERE.glob("*.safetensors")), ids=lambda f: f.stem)
+def test_every_weight_that_ships_loads_and_is_of_16_bits(file):
+    _, card = load(file)
+    assert file.stat().st_size < 2.2 * sum(p.numel() for p in load(file)[0].parameters()) + 20_000
+    assert card["minutes"] > 0 and card["curve"]

@@ -112,16 +112,17 @@ def _fill(
 
 @dataclass(frozen=True)
 class Bins:
-    """The splats of every bin of BIN x BIN pixels, row by row, nearest first."""
+    """The splats of every bin of side x side pixels, row by row, nearest first."""
 
     members: Tensor  # (m,) int32, indices of splats
     starts: Tensor  # (bins + 1,) int32, bin b holds members[starts[b]:starts[b + 1]]
     width: int  # [px]
     height: int
+    side: int = BIN
 
     @property
     def across(self) -> int:
-        return -(-self.width // BIN)
+        return -(-self.width // self.side)
 
     def pieces(self, count: int, work: Tensor | None = None) -> list[int]:
         """Bounds of at most that many runs of bins with about equal work, by default the number of members."""
@@ -131,9 +132,9 @@ class Bins:
         return sorted({0, *cuts.tolist(), len(work)})
 
 
-def fill_bins(keys: Tensor, rects: Tensor, width: int, height: int) -> Bins:
-    """Bins of splats from the keys and rectangles that `project` returns."""
-    n, across, down = len(keys), -(-width // BIN), -(-height // BIN)
+def fill_bins(keys: Tensor, rects: Tensor, width: int, height: int, side: int = BIN) -> Bins:
+    """Bins of splats from the keys and rectangles that `project` returns, or rectangles in bins of another side."""
+    n, across, down = len(keys), -(-width // side), -(-height // side)
     bins = across * down
     order, scratch = torch.empty(n, dtype=torch.int32), torch.empty(3 * n, dtype=torch.int32)
     total = torch.zeros(1, dtype=torch.int32)
@@ -149,7 +150,7 @@ def fill_bins(keys: Tensor, rects: Tensor, width: int, height: int) -> Bins:
     counts.copy_((ends - counts.T.reshape(-1)).view(bins, pieces).T)
     members = torch.empty(int(ends[-1]), dtype=torch.int32)
     run(_fill, list(range(pieces + 1)), [*walk, view(members)])
-    return Bins(members, starts, width, height)
+    return Bins(members, starts, width, height, side)
 
 
 def fill_bins_reference(splats: Tensor) -> Tensor:

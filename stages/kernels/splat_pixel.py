@@ -11,7 +11,7 @@ import warp as wp
 from torch import Tensor
 
 from stages.kernels.interop import device_of, launch, view
-from stages.kernels.splat_blend import CLOSED, SOLID
+from stages.kernels.splat_blocks import CLOSED, SOLID
 from stages.kernels.splat_project import FAINTEST
 
 wp.set_module_options({"enable_backward": False})

@@ -15,6 +15,7 @@ from stages.geometry.neighbours import knn
 from stages.physics.growing import lab_of
 from stages.physics.support import Support
 from stages.raster.rasterise import rasterise
+from stages.refine.inpaint import inpaint
 from stages.refine.patches import patches
 from stages.refine.sight import Sight
 from stages.scene.gaussians import Gaussians, concatenate
@@ -51,7 +52,7 @@ def fill(scene: Scene, sight: Sight, support: Support, seed: int = 0) -> Scene:
     """The scene with flat Gaussians on the plane where objects hide it: under them, with a margin.
 
     The table is drawn from above without the objects; holes in its picture, and all that is directly under
-    an object, are inpainted from their rims, with the grain of the table around. Gaussians of another
+    an object, are inpainted in the table's own texture. Gaussians of another
     colour on the plane under an object, its shadow or a part of it that was missed, are taken away if they
     are hardly seen. Places that a camera sees through, past the table's edge, stay open.
     """
@@ -129,25 +130,3 @@ def _under(things: Float[Tensor, "m 3"], support: Support, picture: Picture) -> 
     under = np.zeros(picture.alpha.shape, bool)
     under[picture.rows_columns(things[low])] = True
     return ndimage.binary_fill_holes(ndimage.binary_closing(np.pad(under, 8), iterations=4)[8:-8, 8:-8])
-
-
-def inpaint(rgb: np.ndarray, hole: np.ndarray, known: np.ndarray, seed: int) -> np.ndarray:
-    """Colours in the holes: smooth from their rims (Telea 2004), plus fine grain copied from known places.
-
-    Cells that are neither hole nor known are of no use as a source, so they are treated as holes too.
-    """
-    gap = ~known | hole
-    if not (~gap).any():
-        return rgb
-    pixels = (rgb * 255).round().astype(np.uint8)
-    smooth = cv2.inpaint(pixels, gap.astype(np.uint8), 4, cv2.INPAINT_TELEA).astype(np.float32) / 255
-    weight = cv2.GaussianBlur((~gap).astype(np.float32), (0, 0), 3)
-    blurred = cv2.GaussianBlur(rgb * (~gap)[..., None], (0, 0), 3) / np.maximum(weight, 1e-3)[..., None]
-    grain = (rgb - blurred)[~gap]
-    keep = np.abs(grain).max(1) <= np.quantile(np.abs(grain).max(1), 0.95)  # edges are no grain
-    rng = np.random.default_rng(seed)
-    soft = cv2.GaussianBlur(smooth, (0, 0), 1.5)  # Telea's streaks
-    out = np.where(gap[..., None], soft, rgb)
-    pick = rng.integers(0, int(keep.sum()), int(gap.sum()))
-    out[gap] += 0.7 * grain[keep][pick]
-    return out.clip(0, 1)

@@ -9,7 +9,6 @@ import torch
 from stages.errors import InputError
 from stages.geometry.cameras import intrinsics, look_at
 from stages.raster.rasterise import rasterise
-from stages.refine.background import inpaint
 from stages.refine.options import RefineOptions
 from stages.refine.outliers import floaters
 from stages.refine.sight import agreement
@@ -113,16 +112,6 @@ def test_floaters_are_found_and_the_end_of_a_rope_is_not():
     found = floaters(concatenate([rope, stray]))
     assert found[-5:].all()
     assert int(found[:-5].sum()) < 12
-
-
-def test_holes_are_filled_with_the_colours_of_their_rim():
-    x = torch.linspace(0.2, 0.8, 60).numpy()
-    rgb = (x[None, :, None] + 0 * x[:, None, None]).repeat(3, 2).astype("float32")  # brighter to the right
-    hole = torch.zeros(60, 60, dtype=torch.bool).numpy()
-    hole[20:40, 20:40] = True
-    filled = inpaint(rgb, hole, ~hole, 0)
-    assert abs(filled - rgb)[hole].max() < 0.12
-    assert (filled[~hole] == rgb[~hole]).all()
 
 
 @pytest.mark.parametrize("kind", ["point", "few", "same place", "sheet", "line", "huge", "zero", "nan", "far apart"])

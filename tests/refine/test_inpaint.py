@@ -1,0 +1,70 @@
+"""Holes in pictures: light without a seam, texture that goes on, and pictures that make no sense."""
+
+import numpy as np
+import pytest
+
+from stages.refine.inpaint import inpaint
+
+SIDE = 96
+
+
+def middle(size: int = 24) -> np.ndarray:
+    hole = np.zeros((SIDE, SIDE), bool)
+    at = slice(SIDE // 2 - size // 2, SIDE // 2 + size // 2)
+    hole[at, at] = True
+    return hole
+
+
+def filled(rgb: np.ndarray, hole: np.ndarray) -> np.ndarray:
+    """What is inpainted when the hole holds a colour that must not come out."""
+    return inpaint(np.where(hole[..., None], np.float32([1, 0, 1]), rgb).astype(np.float32), hole, ~hole, 0)
+
+
+def psnr(one: np.ndarray, two: np.ndarray) -> float:
+    return -10 * float(np.log10(np.square(one - two).mean()))
+
+
+def test_light_goes_on_without_a_seam():
+    x = np.linspace(0.2, 0.8, SIDE, dtype=np.float32)
+    rgb = np.stack([np.broadcast_to(x, (SIDE, SIDE))] * 3, -1)
+    out = filled(rgb, middle())
+    assert np.abs(out - rgb)[middle()].max() < 0.03
+    assert (out[~middle()] == rgb[~middle()]).all()
+
+
+@pytest.mark.parametrize("shade", [0.0, 0.3], ids=["even", "lit from one side"])
+def test_a_chequered_cloth_goes_on(shade):
+    """A period of 12 cells: what is copied must be in step with what is around, at both sides of the hole."""
+    y, x = np.mgrid[:SIDE, :SIDE]
+    value = 0.3 + 0.4 * ((x // 6 + y // 6) % 2) + shade * x / SIDE
+    rgb = np.stack([value, 0.5 * value, 0.8 * value], -1).astype(np.float32)
+    assert psnr(filled(rgb, middle())[middle()], rgb[middle()]) > 27
+
+
+def test_grain_stays_grainy():
+    """Noise cannot be foretold, but its strength can: a smooth patch would be seen at once."""
+    rgb = 0.5 + 0.1 * np.random.default_rng(0).standard_normal((SIDE, SIDE, 3)).astype(np.float32)
+    out = filled(rgb.clip(0, 1), middle())
+    assert 0.06 < out[middle()].std() < 0.14
+
+
+@pytest.mark.parametrize(
+    ("shape", "known"),
+    [((1, 1), "none"), ((2, 3), "half"), ((5, 200), "half"), ((64, 64), "none"), ((64, 64), "all"),
+     ((64, 64), "one"), ((64, 64), "scattered")],
+)  # fmt: skip
+def test_pictures_with_little_to_go_by_are_filled_somehow(shape, known):
+    rng = np.random.default_rng(0)
+    rgb = rng.random((*shape, 3), np.float32)
+    mask = np.broadcast_to({
+        "none": False, "all": True, "half": np.arange(shape[1]) < shape[1] // 2,
+        "one": np.arange(np.prod(shape)).reshape(shape) == 77, "scattered": rng.random(shape) < 0.1,
+    }[known], shape)  # fmt: skip
+    out = inpaint(rgb, ~mask, mask, 0)
+    assert out.shape == rgb.shape and np.isfinite(out).all() and out.min() >= 0 and out.max() <= 1
+    assert (out[mask] == rgb[mask]).all()
+
+
+def test_the_same_seed_gives_the_same_picture():
+    rgb = np.random.default_rng(0).random((SIDE, SIDE, 3)).astype(np.float32)
+    assert (filled(rgb, middle()) == filled(rgb, middle())).all()

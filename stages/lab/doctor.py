@@ -15,6 +15,7 @@ def examine() -> Iterator[str]:
     for check in (_torch, _gpu, _gsplat, _warp, _colmap, _codec, _disk):
         yield _line(*check())
     yield from _weights()
+    yield from _pi3()
 
 
 def _line(works: bool, subject: str, finding: str) -> str:
@@ -92,6 +93,22 @@ def _weights() -> Iterator[str]:
             yield _line(True, "weights", f"{name}: {path.name} of {path.parent.name}/, sha256 {card['sha256'][:8]}")
         except InputError as error:
             yield _line(False, "weights", str(error))
+
+
+def _pi3() -> Iterator[str]:
+    """Of the networks that `reconstruct` can use; told apart by their files' names, which loading checks."""
+    from stages.errors import InputError
+    from stages.models.pi3.weights import PUBLISHED, find
+
+    for name in PUBLISHED:
+        try:
+            path = find(name)
+            yield _line(True, name, f"{path}, {path.stat().st_size / 1e9:.1f} GB")
+        except InputError as error:
+            yield _line(False, name, str(error))
+    hub = _installed("huggingface_hub")
+    yield _line(True, "hub", f"huggingface_hub {hub}" if hub else "absent, and needed for --download alone: "
+                "`pip install 'ngff[hub]'`")  # fmt: skip
 
 
 def _disk() -> tuple[bool, str, str]:

@@ -2,76 +2,45 @@
 
 from __future__ import annotations
 
-import dataclasses
 import logging
-from pathlib import Path
 
 import torch
 from torch import Tensor
 
+from stages.backends import pick_device
 from stages.errors import InputError
 from stages.geometry.cameras import depths, resize
-from stages.geometry.rotations import multiply, quaternion
-from stages.geometry.similarity import Similarity
-from stages.reconstruct import depth, initialise, photometric, sfm, upright
+from stages.reconstruct import depth, sfm, upright
+from stages.reconstruct.finish import Found, finish
 from stages.reconstruct.options import ReconstructOptions
 from stages.reconstruct.photos import Photos, Reconstruction, Views, undistort
+from stages.reconstruct.steps import Steps
 from stages.scene.cameras import Cameras, Lenses, read_cameras
-from stages.scene.gaussians import Gaussians, concatenate
-from stages.scene.scene import Scene
 
 log = logging.getLogger(__name__)
-FAR = 3.0  # what has no depth is put so many camera distances away
-FARTHEST = 10.0  # Gaussians farther from the focus than so many camera distances are dropped
 
 
-def reconstruct(photos: Photos, options: ReconstructOptions) -> Reconstruction:
+def reconstruct(photos: Photos, options: ReconstructOptions, steps: Steps) -> Reconstruction:
     """Gaussians of what the photos show, upright, with the cameras that took them."""
-    device = _device(options.device)
-    model, photos = _cameras(photos, options, device)
+    device = pick_device(options.device)
+    model, photos = _cameras(photos, options, device, steps)
     views = undistort(photos, model.cameras, model.lenses, options.side)
     focus = upright.focus_of(model.cameras.viewmats, _typical_depths(model))
-    first = upright.find_ground(model.points, model.cameras.viewmats, focus, options.seed)
+    ground = upright.find_ground(model.points, model.cameras.viewmats, focus, options.seed)
     trained, held = _split(views, options.holdout)
-    part = _restrict(model, trained)
-    used = views[trained]
-    maps = depth.estimate(used, part, first.plane, device)
+    used, part = views[trained], _restrict(model, trained)
+    maps = steps.kept("depth", lambda: depth.estimate(used, part, ground.plane, device), (depth.DepthMap,))
     least = 2 if len(used) > 3 else 1
-    cloud = initialise.fuse(used, maps, least)
-    if len(cloud) < 1000:
-        raise InputError(f"{photos.source}: the photos agree on the depth of too few places; {sfm.ADVICE}")
-    log.info("%d depth samples confirmed by %d or more other photos", len(cloud), least)
-    cloud = initialise.thin(cloud, options.level.gaussians, focus, first.radius)
-    ground = upright.find_ground(cloud.points, used.cameras.viewmats, focus, options.seed)
-    if ground.plane is None:
-        log.info("no supporting plane found: up is how the cameras were held, the floor is at the lowest points")
-    else:
-        log.info("the supporting plane holds %.0f %% of the points in focus", 100 * ground.share)
-    move = upright.to_world(ground, cloud.points, used.cameras.viewmats, metric=options.cameras is not None)
-    gaussians = _first_gaussians(used, maps, cloud, ground, least, options)
-    gaussians = _cropped(_moved(gaussians, move), move(ground.focus), move.scale * ground.radius)
-    views = dataclasses.replace(views, cameras=views.cameras.moved(move))
-    reach = move.scale * ground.radius
-    steps = options.steps(len(used), device)
-    known = [torch.where(m.support >= least, m.depth * move.scale, torch.zeros_like(m.depth)) for m in maps]
-    gaussians = photometric.refine(gaussians, views[trained], steps, reach, options.seed, device, known)
-    facts = {"upright": _plain(move), "supporting_plane": ground.plane is not None}
-    scene = Scene(gaussians, cameras=views.cameras, floor=0.0, scale=_scale(options), provenance=facts)
-    return Reconstruction(scene, views, trained, held)
+    found = Found(photos.source, views, trained, held, maps, least, focus, ground.radius, dropped=model.dropped)
+    return finish(found, options, steps, device)
 
 
-def _device(name: str) -> str:
-    if name == "auto":
-        return "cuda" if torch.cuda.is_available() else "cpu"
-    if name == "cuda" and not torch.cuda.is_available():
-        raise InputError("--device cuda: no CUDA device is available here; use --device cpu")
-    return name
-
-
-def _cameras(photos: Photos, options: ReconstructOptions, device: str) -> tuple[sfm.SparseModel, Photos]:
+def _cameras(
+    photos: Photos, options: ReconstructOptions, device: str, steps: Steps
+) -> tuple[sfm.SparseModel, Photos]:
     """Cameras and sparse points: solved for, or triangulated with the cameras that the user gave."""
     if options.cameras is None:
-        return sfm.solve(photos, options.seed, device), photos
+        return sfm.solve(photos, options.seed, device, steps), photos
     cameras, lenses = read_cameras(options.cameras)
     row = {name: i for i, name in enumerate(cameras.names)}
     both = [i for i, name in enumerate(photos.names) if name in row]
@@ -85,7 +54,7 @@ def _cameras(photos: Photos, options: ReconstructOptions, device: str) -> tuple[
     photos = photos[both]
     rows = [row[name] for name in photos.names]
     cameras, lenses = _in_pixels_of(photos, cameras[rows]), Lenses(lenses.coefficients[rows])
-    return sfm.triangulate(photos, cameras, lenses, options.seed), photos
+    return sfm.triangulate(photos, cameras, lenses, options.seed, steps), photos
 
 
 def _in_pixels_of(photos: Photos, cameras: Cameras) -> Cameras:
@@ -121,39 +90,3 @@ def _restrict(model: sfm.SparseModel, index: list[int]) -> sfm.SparseModel:
         model.cameras[index], Lenses(model.lenses.coefficients[index]), model.points,
         model.seen_point[keep], new[model.seen_view[keep]],
     )  # fmt: skip
-
-
-def _first_gaussians(
-    views: Views, maps: list[depth.DepthMap], cloud: initialise.Cloud, ground: upright.Ground, least: int, options
-) -> Gaussians:
-    """Confirmed points, and fainter, sparser ones where the photos show something no depth was confirmed at."""
-    more = initialise.fill(views, maps, cloud, ground.plane, least, FAR * ground.radius)
-    more = initialise.thin(more, options.level.gaussians // 4, ground.focus, ground.radius)
-    log.info("%d Gaussians on confirmed surfaces, %d on surfaces filled in", len(cloud), len(more))
-    degree = options.level.degree
-    parts = [initialise.to_gaussians(cloud, torch.full((len(cloud),), 0.8), degree)]
-    if len(more) > 10:
-        parts.append(initialise.to_gaussians(more, torch.full((len(more),), 0.5), degree))
-    return concatenate(parts)
-
-
-def _moved(gaussians: Gaussians, move: Similarity) -> Gaussians:
-    """Before any colour depends on direction, so the harmonics need no turning."""
-    turn = quaternion(move.rotation).expand(len(gaussians), 4)
-    means, scales = move(gaussians.means), gaussians.scales * move.scale
-    return dataclasses.replace(gaussians, means=means, quats=multiply(turn, gaussians.quats), scales=scales)
-
-
-def _cropped(gaussians: Gaussians, focus: Tensor, radius: float) -> Gaussians:
-    """Without what lies absurdly far away."""
-    return gaussians[(gaussians.means - focus).norm(dim=1) < FARTHEST * radius]
-
-
-def _scale(options: ReconstructOptions) -> dict:
-    if options.cameras is not None:
-        return {"metres_per_unit": 1.0, "source": f"cameras in {Path(options.cameras).name}, taken as metres"}
-    return {"metres_per_unit": 1.0, "source": "assumed: cameras about 1 m from the scene"}
-
-
-def _plain(move: Similarity) -> dict:
-    return {"scale": move.scale, "rotation": move.rotation.tolist(), "translation": move.translation.tolist()}

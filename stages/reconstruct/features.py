@@ -5,27 +5,29 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+import torch.nn.functional as F
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 from tqdm import tqdm
 
 from stages.reconstruct.photos import Photos
 
 SIDE = 1024  # features are found in photos of at most this size [px]
-MOST = 6000  # features kept a photo, the largest first
+MOST, MOST_OF_MANY = 6000, 3000  # features kept a photo, the largest first; time to match grows with the square
 EXHAUSTIVE = 60  # up to so many photos all pairs are compared
 RATIO = 0.8  # best match against second best, as Lowe 2004 proposes
 FARTHEST = 0.7  # largest distance between matching descriptors of unit length
 
-Feature = tuple[np.ndarray, Tensor]  # keypoints (k, 4) in pixels of the photo, centres at +0.5; descriptors (k, 128)
+Feature = tuple[Tensor, Tensor]  # keypoints (k, 4) in pixels of the photo, centres at +0.5; descriptors (k, 128), bytes
 
 
-def extract(photos: Photos, device: str = "cpu") -> list[Feature]:
-    """SIFT keypoints (x, y, scale, orientation) and root-SIFT descriptors of unit length of every photo."""
+def extract(photos: Photos) -> list[Feature]:
+    """SIFT keypoints (x, y, scale, orientation) and root-SIFT descriptors of every photo."""
     import pycolmap
 
     options = pycolmap.FeatureExtractionOptions(use_gpu=False, num_threads=1)
     extractor = pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
+    most = MOST if len(photos) <= EXHAUSTIVE else MOST_OF_MANY
     out = []
     for image in tqdm(photos.images, desc="finding features", unit="photo", leave=False):
         grey = cv2.cvtColor(image.numpy(), cv2.COLOR_RGB2GRAY)
@@ -34,28 +36,32 @@ def extract(photos: Photos, device: str = "cpu") -> list[Feature]:
             grey = cv2.resize(grey, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
         keypoints, descriptors = extractor.extract_from_uint8_array(np.ascontiguousarray(grey))
         table = pycolmap.keypoints_to_matrix(keypoints).reshape(-1, 4)
-        vectors = torch.from_numpy(np.asarray(descriptors.data, np.float32).reshape(len(table), 128))
-        largest = np.argsort(-table[:, 2], kind="stable")[:MOST]
+        largest = np.argsort(-table[:, 2], kind="stable")[:most]
         table = table[largest] / np.array([shrink, shrink, shrink, 1], np.float32)
-        vectors = torch.nn.functional.normalize(vectors[torch.from_numpy(largest)], dim=1)
-        out.append((table, vectors.to(device)))
+        vectors = np.asarray(descriptors.data, np.uint8).reshape(-1, 128)[largest]
+        out.append((torch.from_numpy(table), torch.from_numpy(vectors)))
     return out
 
 
-def pairs(features: list[Feature], neighbours: int = 8, similar: int = 20) -> list[tuple[int, int]]:
+def unit(descriptors: UInt8[Tensor, "k d"]) -> Float[Tensor, "k d"]:
+    """Descriptors of unit length."""
+    return F.normalize(descriptors.float(), dim=1)
+
+
+def pairs(vectors: list[Float[Tensor, "_ d"]], neighbours: int = 8, similar: int = 20) -> list[tuple[int, int]]:
     """All pairs of few photos; of many, those near in order and those that look alike.
 
     Looking alike is the number of matches among the 200 largest features of each photo.
     Source: Wu 2013, "Towards linear-time incremental structure from motion", preemptive matching.
     """
-    n = len(features)
+    n = len(vectors)
     if n <= EXHAUSTIVE:
         return [(i, j) for i in range(n) for j in range(i + 1, n)]
     chosen = {(i, i + step) for step in range(1, neighbours + 1) for i in range(n - step)}
     likeness = torch.zeros(n, n)
     for i in tqdm(range(n), desc="choosing pairs", unit="photo", leave=False):
         for j in range(i + 1, n):
-            likeness[i, j] = likeness[j, i] = len(match(features[i][1][:200], features[j][1][:200]))
+            likeness[i, j] = likeness[j, i] = len(match(vectors[i][:200], vectors[j][:200]))
     best = likeness.topk(min(similar, n - 1), dim=1)
     for i in range(n):
         alike = best.indices[i][best.values[i] >= 4].tolist()

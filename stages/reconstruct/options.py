@@ -6,8 +6,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from stages.errors import InputError
+from stages.reconstruct.scale import parse_scale
 
-BACKENDS = {"classic": "stages.reconstruct.classic:reconstruct"}
+BACKENDS = {
+    "classic": "stages.reconstruct.classic:reconstruct",
+    "pi3": "stages.reconstruct.learned:pi3",
+    "pi3-splat": "stages.reconstruct.learned:pi3_splat",
+}
+MONOCULAR = {"pi3", "pi3-splat"}  # backends that one photo is enough for
 
 
 @dataclass(frozen=True)
@@ -24,7 +30,7 @@ class Quality:
 QUALITIES = {
     "draft": Quality(side=512, gaussians=50_000, steps=300, steps_cuda=1000, degree=0),
     "normal": Quality(side=640, gaussians=90_000, steps=800, steps_cuda=3000, degree=1),
-    "high": Quality(side=1024, gaussians=300_000, steps=3000, steps_cuda=10_000, degree=2),
+    "high": Quality(side=1024, gaussians=300_000, steps=3000, steps_cuda=5000, degree=2),
 }
 
 
@@ -35,6 +41,11 @@ class ReconstructOptions:
     holdout: int = 0  # keep every N-th photo out of the Gaussians and report on it; 0 keeps none out
     quality: str = "normal"
     resolution: int | None = None  # longest side the photos are worked at [px]; by default the quality's
+    scale_reference: str = ""  # a measured length, as scale.parse_scale reads it; empty: the scale is chosen
+    resume: bool = False  # go on from the finished steps of a run that was cut off
+    weights: Path | None = None  # of pi3 and pi3-splat: a file, or a folder with one; by default looked for
+    download: bool = False  # fetch those weights where they are not here
+    iterations: int | None = None  # photometric steps; by default the quality's; 0 for none
     seed: int = 0
     device: str = "auto"
 
@@ -45,6 +56,9 @@ class ReconstructOptions:
             raise InputError(f"--holdout {self.holdout}: give 0 for none, or 2 or more for every N-th photo")
         if self.resolution is not None and not 64 <= self.resolution <= 4096:
             raise InputError(f"--resolution {self.resolution}: the longest side must be 64 to 4096 pixels")
+        parse_scale(self.scale_reference)
+        if self.iterations is not None and self.iterations < 0:
+            raise InputError(f"--iterations {self.iterations}: give 0 for none, or more")
 
     @property
     def level(self) -> Quality:
@@ -56,5 +70,7 @@ class ReconstructOptions:
 
     def steps(self, photos: int, device: str) -> int:
         """Photometric steps: fixed by quality, device and photo count, so that a seed gives the same scene again."""
+        if self.iterations is not None:
+            return self.iterations
         base = self.level.steps_cuda if device == "cuda" else self.level.steps
         return base * min(max(photos, 20), 40) // 20

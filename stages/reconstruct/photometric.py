@@ -8,7 +8,7 @@ The number of steps is fixed beforehand, never by the clock, so a seed gives the
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import torch
 import torch.nn.functional as F
@@ -100,7 +100,11 @@ def refine(
     `depths` of the views, 0 where unknown, hold the surfaces where matching found them.
     The background is a random grey in every step, so what the photos show opaque becomes opaque.
     """
+    if not steps:
+        return gaussians
     fit = _Fit.start(gaussians.to(device), len(views), reach)
+    near = replace(views, images=tuple(image.to(device) for image in views.images))
+    inverse = [(reach / depth).to(device) for depth in depths]
     generator = torch.Generator().manual_seed(seed)
     splits = {round(share * steps) for share in SPLITS if steps >= 200}
     pull = torch.zeros(len(gaussians), device=device)
@@ -109,7 +113,7 @@ def refine(
         for step in bar:
             order = order or torch.randperm(len(views), generator=generator).tolist()
             view, grey = order.pop(), float(torch.rand((), generator=generator))
-            loss = _step(fit, views, view, grey, device, reach / depths[view] if depths else None)
+            loss = _step(fit, near, view, grey, device, inverse[view] if inverse else None)
             pull += fit.values["means"].grad.norm(dim=1)
             fit.optimiser.step()
             fit.optimiser.param_groups[0]["lr"] = MOVE * reach * 0.01 ** (step / steps)
@@ -117,14 +121,14 @@ def refine(
                 _split(fit, pull, generator)
                 pull = torch.zeros(len(fit.values["means"]), device=device)
             if step % 20 == 0:
-                bar.set_postfix(loss=f"{loss:.4f}")
+                bar.set_postfix(loss=f"{loss.item():.4f}")
     return _finished(fit, views, pull > 0, reach)
 
 
 def _step(
     fit: _Fit, views: Views, view: int, grey: float, device: str, inverse: Float[Tensor, "h w"] | None = None
-) -> float:
-    """Gradients of the loss on one photo; `inverse` is its inverse depth times the reach, inf where unknown."""
+) -> Float[Tensor, ""]:
+    """The loss on one photo, and its gradients; `inverse` is its inverse depth times the reach, inf where unknown."""
     photo = views.image(view, device)
     height, width = photo.shape[:2]
     background = torch.full((3,), grey, device=device)
@@ -135,12 +139,12 @@ def _step(
     image = rendering.rgb[0] * fit.gain(view)
     loss = (1 - STRUCTURE) * (image - photo).abs().mean() + STRUCTURE * (1 - ssim(image, photo))
     if inverse is not None:
-        error = fit.reach / rendering.depth[0].clamp_min(0.1 * fit.reach) - inverse.to(device)
+        error = fit.reach / rendering.depth[0].clamp_min(0.1 * fit.reach) - inverse
         known = error.isfinite() & (rendering.alpha[0] > 0.5)
         loss = loss + DEPTH * torch.where(known, error, torch.zeros_like(error)).abs().mean()
     fit.optimiser.zero_grad(set_to_none=True)
     loss.backward()
-    return loss.item()
+    return loss.detach()  # a number in Python would wait for the GPU
 
 
 def _split(fit: _Fit, pull: Float[Tensor, "n"], generator: torch.Generator) -> None:

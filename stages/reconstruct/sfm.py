@@ -9,8 +9,7 @@ from __future__ import annotations
 
 import logging
 import tempfile
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -20,13 +19,15 @@ from torch import Tensor
 from tqdm import tqdm
 
 from stages.errors import InputError
-from stages.reconstruct import features
+from stages.reconstruct import matching
+from stages.reconstruct.matching import Pair
 from stages.reconstruct.photos import Photos
+from stages.reconstruct.steps import Steps
 from stages.scene.cameras import Cameras, Lenses
 
 log = logging.getLogger(__name__)
 MISFIT = 0.006  # share of the photo's width by which given cameras may miss the matches (4 px of 640)
-Pair = tuple[int, int, np.ndarray, np.ndarray]  # two photos and the pixels (k, 2) in each that match
+STILL = 0.005  # share of the photo's width; where most matches of most pairs move less, the camera stood still
 ADVICE = "take 10 or more sharp photos, each showing at least two thirds of what the one before it shows"
 
 
@@ -39,44 +40,94 @@ class SparseModel:
     points: Float[Tensor, "m 3"]
     seen_point: Int[Tensor, "k"]  # observation: this point ...
     seen_view: Int[Tensor, "k"]  # ... is seen by this camera
+    dropped: dict[str, str] = field(default_factory=dict)  # photos left out, and why
 
 
-def solve(photos: Photos, seed: int = 0, device: str = "cpu") -> SparseModel:
+def solve(photos: Photos, seed: int = 0, device: str = "cpu", steps: Steps | None = None) -> SparseModel:
     """Cameras of as many photos as can be connected."""
+    steps = steps or Steps()
+    _quiet(seed)
+    database = matching.compare(photos, matching.guessed_cameras(photos), steps, seed, device)
+    return steps.kept("model", lambda: _mapped(photos, database, seed), (SparseModel, Cameras, Lenses))
+
+
+def _mapped(photos: Photos, database: Path, seed: int) -> SparseModel:
+    """The largest model that the verified matches in the database allow."""
     import pycolmap
 
-    _quiet(seed)
-    with tempfile.TemporaryDirectory() as folder:
-        database = Path(folder) / "database.db"
-        matched = _fill(database, photos, _guessed_cameras(photos), seed, device)
-        if not matched:
-            raise InputError(f"{photos.source}: no two photos show the same things clearly enough; {ADVICE}")
-        options = pycolmap.IncrementalPipelineOptions(random_seed=seed, num_threads=1, extract_colors=False)
-        options.min_model_size = min(3, len(photos))
-        options.multiple_models = True
-        with tqdm(total=len(photos), desc="placing photos", unit="photo", leave=False) as bar:
-            models = pycolmap.incremental_mapping(
-                database, folder, folder, options,
-                initial_image_pair_callback=lambda: bar.update(2), next_image_callback=lambda: bar.update(1),
-            )  # fmt: skip
+    pairs = matching.connected(database)
+    if not pairs:
+        raise InputError(f"{photos.source}: no two photos show the same things clearly enough; {ADVICE}")
+    if _stood_still(pairs, photos):
+        raise InputError(
+            f"{photos.source}: the camera hardly moved between the photos; walk around the things, or, if they turn on "
+            "a turntable, put it before a plain backdrop without pattern, so that only the things are matched"
+        )
+    options = _mapping(photos, seed)
+    with tempfile.TemporaryDirectory() as folder, tqdm(
+        total=len(photos), desc="placing photos", unit="photo", leave=False
+    ) as bar:
+        models = pycolmap.incremental_mapping(
+            database, folder, folder, options,
+            initial_image_pair_callback=lambda: bar.update(2), next_image_callback=lambda: bar.update(1),
+        )  # fmt: skip
     best = max(models.values(), key=lambda m: (m.num_reg_images(), m.num_points3D()), default=None)
     if best is None or best.num_reg_images() < 2 or best.num_points3D() < 50:
         raise InputError(f"{photos.source}: the photos overlap too little to find where they were taken from; {ADVICE}")
-    model = _from_colmap(best)
-    missing = sorted(set(photos.names) - set(model.cameras.names))
+    model = _from_colmap(best, _why_dropped(photos, pairs, best, models))
     log.info(
         "placed %d of %d photos, %d points, mean reprojection error %.2f px",
         len(model.cameras), len(photos), len(model.points), best.compute_mean_reprojection_error(),
     )  # fmt: skip
-    if missing:
-        log.info("not placed, and left out: %s", ", ".join(missing))
     return model
 
 
-def triangulate(photos: Photos, cameras: Cameras, lenses: Lenses, seed: int = 0) -> SparseModel:
+def _mapping(photos: Photos, seed: int):
+    """COLMAP's defaults, on one thread, and for very few photos too."""
+    import pycolmap
+
+    options = pycolmap.IncrementalPipelineOptions(random_seed=seed, num_threads=1, extract_colors=False)
+    options.min_model_size = min(3, len(photos))
+    options.triangulation.ignore_two_view_tracks = len(photos) > 3  # few photos have no others
+    return options
+
+
+def _stood_still(pairs: list[Pair], photos: Photos) -> bool:
+    """Whether the matches of most pairs stay where they are in the photo."""
+    moved = [np.median(np.linalg.norm(a - b, axis=1)) / max(photos.size(i)) for i, j, a, b in pairs]
+    return float(np.median(moved)) < STILL
+
+
+def _why_dropped(photos: Photos, pairs: list[Pair], best, models: dict) -> dict[str, str]:
+    """What is known about why each photo that is not in the best model is not."""
+    placed = {best.images[i].name for i in best.reg_image_ids()}
+    others = [{m.images[i].name for i in m.reg_image_ids()} for m in models.values() if m is not best]
+    common = np.zeros((len(photos), len(photos)), int)
+    for i, j, a, _ in pairs:
+        common[i, j] = common[j, i] = len(a)
+    inside = [i for i, name in enumerate(photos.names) if name in placed]
+    why = {}
+    for i, name in enumerate(photos.names):
+        if name in placed:
+            continue
+        most = int(common[i, inside].max())
+        together = next((group - placed - {name} for group in others if name in group), set())
+        if together:
+            why[name] = f"goes with {', '.join(sorted(together))} but not with the rest"
+        elif most == 0:
+            why[name] = "shows nothing that was recognised in the other photos, or is blurred, dark or plain"
+        else:
+            why[name] = f"has at most {most} points in common with any placed photo, too few or too much in line"
+    return why
+
+
+def triangulate(
+    photos: Photos, cameras: Cameras, lenses: Lenses, seed: int = 0, steps: Steps | None = None
+) -> SparseModel:
     """Sparse points for cameras that are known; `photos` and `cameras` in the same order, K in their pixels."""
     import pycolmap
 
+    steps = steps or Steps()
     _quiet(seed)
     known = []
     for i in range(len(photos)):
@@ -84,23 +135,23 @@ def triangulate(photos: Photos, cameras: Cameras, lenses: Lenses, seed: int = 0)
         width, height = photos.size(i)
         params = [K[0][0], K[1][1], K[0][2], K[1][2], *k[:4], k[4], 0, 0, 0]
         known.append(pycolmap.Camera(model="FULL_OPENCV", width=width, height=height, params=params, camera_id=i + 1))
-    with tempfile.TemporaryDirectory() as folder:
-        database = Path(folder) / "database.db"
-        pairs = _fill(database, photos, known, seed, "cpu")
-        if not pairs:
-            raise InputError(f"{photos.source}: no two photos show the same things clearly enough; {ADVICE}")
-        error = epipolar_error(cameras, known, pairs)
-        if error > MISFIT * max(photos.size(0)):
-            raise InputError(
-                f"{photos.source}: the given cameras are {error:.0f} px off what the photos show; check that they "
-                "belong to these photos (OpenGL axes and pixels of the stored photos in transforms.json)"
-            )
-        model = pycolmap.Reconstruction()
-        for i, (name, viewmat) in enumerate(zip(photos.names, cameras.viewmats, strict=True)):
-            model.add_camera_with_trivial_rig(known[i])
-            image = pycolmap.Image(name=name, keypoints=np.zeros((0, 2)), camera_id=i + 1, image_id=i + 1)
-            model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(viewmat[:3].double().numpy()))
-        options = pycolmap.IncrementalPipelineOptions(random_seed=seed, num_threads=1, extract_colors=False)
+    database = matching.compare(photos, known, steps, seed, "cpu")
+    pairs = matching.connected(database)
+    if not pairs:
+        raise InputError(f"{photos.source}: no two photos show the same things clearly enough; {ADVICE}")
+    error = epipolar_error(cameras, known, pairs)
+    if error > MISFIT * max(photos.size(0)):
+        raise InputError(
+            f"{photos.source}: the given cameras are {error:.0f} px off what the photos show; check that they "
+            "belong to these photos (OpenGL axes and pixels of the stored photos in transforms.json)"
+        )
+    model = pycolmap.Reconstruction()
+    for i, (name, viewmat) in enumerate(zip(photos.names, cameras.viewmats, strict=True)):
+        model.add_camera_with_trivial_rig(known[i])
+        image = pycolmap.Image(name=name, keypoints=np.zeros((0, 2)), camera_id=i + 1, image_id=i + 1)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(viewmat[:3].double().numpy()))
+    options = _mapping(photos, seed)
+    with tempfile.TemporaryDirectory() as folder, steps.timed("model"):
         done = pycolmap.triangulate_points(model, database, folder, folder, options=options)
     if done.num_points3D() < 50:
         raise InputError(f"{photos.source}: the photos overlap too little to find depth; {ADVICE}")
@@ -134,80 +185,7 @@ def _quiet(seed: int) -> None:
     pycolmap.set_random_seed(seed)
 
 
-def _guessed_cameras(photos: Photos) -> list:
-    """One camera for all photos of a size: the median EXIF focal length, else 1.2 times the longer side.
-
-    The k1 of SIMPLE_RADIAL is enough for phones and cameras; one shared camera holds weak geometry together.
-    """
-    import pycolmap
-
-    groups: dict[tuple[int, int], list[float]] = {}
-    for i in range(len(photos)):
-        groups.setdefault(photos.size(i), []).append(photos.focals[i])
-    cameras = {}
-    for k, (size, focals) in enumerate(groups.items()):
-        known = [f for f in focals if f > 0]
-        focal = float(np.median(known)) if known else 1.2 * max(size)
-        cameras[size] = pycolmap.Camera(
-            model="SIMPLE_RADIAL", width=size[0], height=size[1],
-            params=[focal, size[0] / 2, size[1] / 2, 0.0], camera_id=k + 1,
-        )  # fmt: skip
-        cameras[size].has_prior_focal_length = bool(known)
-    return [cameras[photos.size(i)] for i in range(len(photos))]
-
-
-def _fill(path: Path, photos: Photos, cameras: list, seed: int, device: str) -> list[Pair]:
-    """A COLMAP database with features and verified matches, and the pairs that have enough of them."""
-    import pycolmap
-
-    found = features.extract(photos, device)
-    database = pycolmap.Database.open(path)
-    for camera in {c.camera_id: c for c in cameras}.values():
-        database.write_camera(camera, use_camera_id=True)
-        rig = pycolmap.Rig(rig_id=camera.camera_id)
-        rig.add_ref_sensor(camera.sensor_id)
-        database.write_rig(rig, use_rig_id=True)
-    for i, (name, camera) in enumerate(zip(photos.names, cameras, strict=True)):
-        image = pycolmap.Image(name=name, keypoints=np.zeros((0, 2)), camera_id=camera.camera_id, image_id=i + 1)
-        database.write_image(image, use_image_id=True)
-        frame = pycolmap.Frame(frame_id=i + 1, rig_id=camera.camera_id)
-        frame.add_data_id(image.data_id)
-        database.write_frame(frame, use_frame_id=True)
-        database.write_keypoints(i + 1, found[i][0])
-    connected = []
-    for i, j, matches, geometry in _compare(found, cameras, seed):
-        database.write_matches(i + 1, j + 1, matches)
-        database.write_two_view_geometry(i + 1, j + 1, geometry)
-        inlier = np.asarray(geometry.inlier_matches)
-        if len(inlier):
-            connected.append((i, j, found[i][0][inlier[:, 0], :2], found[j][0][inlier[:, 1], :2]))
-    database.close()
-    return connected
-
-
-def _compare(found: list[features.Feature], cameras: list, seed: int) -> list[tuple]:
-    """Matches and two-view geometry of all pairs worth comparing, verified in the background while more are matched."""
-    import pycolmap
-
-    options = pycolmap.TwoViewGeometryOptions()
-    options.ransac.random_seed = seed
-    options.ransac.max_num_trials = 3000  # a pair that needs more shares too little to be of use
-    pixels = [table[:, :2].astype(np.float64) for table, _ in found]
-
-    def verify(i: int, j: int, matches: np.ndarray) -> tuple:
-        geometry = pycolmap.estimate_two_view_geometry(cameras[i], pixels[i], cameras[j], pixels[j], matches, options)
-        return i, j, matches, geometry
-
-    pending = []
-    with ThreadPoolExecutor(1) as background:
-        for i, j in tqdm(features.pairs(found), desc="matching photos", unit="pair", leave=False):
-            matches = features.match(found[i][1], found[j][1]).numpy().astype(np.uint32)
-            if len(matches) >= options.min_num_inliers:
-                pending.append(background.submit(verify, i, j, matches))
-        return [job.result() for job in pending]
-
-
-def _from_colmap(model) -> SparseModel:
+def _from_colmap(model, dropped: dict[str, str] | None = None) -> SparseModel:
     """Ours from COLMAP's objects, photos in order of name."""
     images = sorted((model.images[i] for i in model.reg_image_ids()), key=lambda image: image.name)
     row = {image.image_id: i for i, image in enumerate(images)}
@@ -230,5 +208,5 @@ def _from_colmap(model) -> SparseModel:
     )  # fmt: skip
     return SparseModel(
         cameras, Lenses(torch.tensor(lenses, dtype=torch.float32)), torch.from_numpy(np.array(points)).float(),
-        torch.tensor(seen_point), torch.tensor(seen_view),
+        torch.tensor(seen_point), torch.tensor(seen_view), dropped or {},
     )  # fmt: skip

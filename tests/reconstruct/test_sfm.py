@@ -1,7 +1,5 @@
 """Structure from motion: its pieces, and what it says when photos do not connect."""
 
-import logging
-
 import pytest
 import torch
 
@@ -9,9 +7,8 @@ from stages.errors import InputError
 from stages.geometry.cameras import centres
 from stages.geometry.similarity import umeyama
 from stages.reconstruct import features, sfm
-from stages.reconstruct.photos import Photos, read_photos, undistort
+from stages.reconstruct.photos import Photos, undistort
 from stages.scene.cameras import Lenses
-from stages.scene.images import write_png
 from tests.reconstruct.raycast import arc, photograph
 
 
@@ -76,7 +73,7 @@ def test_mutual_matches_by_hand():
 def test_many_photos_are_not_all_compared(monkeypatch):
     monkeypatch.setattr(features, "EXHAUSTIVE", 10)
     generator = torch.Generator().manual_seed(0)
-    found = [(None, torch.nn.functional.normalize(torch.randn(30, 16, generator=generator), dim=1)) for _ in range(40)]
+    found = [torch.nn.functional.normalize(torch.randn(30, 16, generator=generator), dim=1) for _ in range(40)]
     found[39] = found[0]  # the walk ends where it began
     chosen = features.pairs(found, neighbours=3, similar=2)
     assert (0, 39) in chosen
@@ -101,19 +98,3 @@ def test_distortion_is_undone(tmp_path):
     edge = (views.images[0][..., 0].float() / 255 > 0.5).float().argmax(1) + 0.0
     at = (edge - views.cameras.Ks[0][0, 2]) / views.cameras.Ks[0][0, 0]
     assert (at - 0.3).abs().max() < 1.5 / 180
-
-
-def test_other_files_in_the_folder_are_counted(tmp_path, caplog):
-    for name in ("b.png", "a.png"):
-        write_png(tmp_path / name, torch.rand(20, 30, 3))
-    (tmp_path / "notes.txt").write_text("not a photo")
-    with caplog.at_level(logging.INFO):
-        photos = read_photos(tmp_path)
-    assert photos.names == ("a.png", "b.png") and photos.size(0) == (30, 20)
-    assert "1 other file" in caplog.text
-
-
-def test_one_photo_is_not_enough(tmp_path):
-    write_png(tmp_path / "a.png", torch.rand(20, 30, 3))
-    with pytest.raises(InputError, match="holds one photo"):
-        read_photos(tmp_path)

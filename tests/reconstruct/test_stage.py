@@ -35,6 +35,14 @@ def test_the_table_is_level_and_at_zero(made):
     assert scene.gaussians.means[outside, 2].abs().median() < 0.006  # 1.6 away, matched to a quarter of a pixel
 
 
+def test_up_and_floor_are_those_of_the_truth(made):
+    from stages.lab.bench_reconstruct import upright_error
+
+    _, scene = made
+    tilt, floor = upright_error(scene.cameras, arc(7, (160, 120), sweep=70.0), scene.floor, 0.0)
+    assert tilt < 0.5 and floor < 0.3  # degrees, % of the scene's size
+
+
 def test_the_block_stands_there_in_its_size(made):
     _, scene = made
     means = scene.gaussians.means
@@ -97,9 +105,74 @@ def test_options_that_make_no_sense(wrong, words):
 
 def test_real_photos_are_all_placed(shared):
     """The published figure for this set is 11 of 11."""
-    from stages.reconstruct.photos import read_photos
+    from stages.reconstruct.reading import read_photos
     from stages.reconstruct.sfm import solve
 
     model = solve(read_photos(shared / "data" / "photos" / "kermit" / "images"))
     assert len(model.cameras) == 11
     assert len(model.points) > 500
+
+
+def small(monkeypatch, steps: int = 5) -> None:
+    """Draft quality so small that a whole run takes seconds."""
+    tiny = dataclasses.replace(choices.QUALITIES["draft"], gaussians=2000, steps=steps)
+    monkeypatch.setitem(choices.QUALITIES, "draft", tiny)
+
+
+def test_a_run_that_was_stopped_goes_on_from_its_finished_steps(tmp_path, monkeypatch, caplog):
+    from stages.reconstruct import depth, features, photometric, sfm
+
+    cameras = write_set(tmp_path, arc(4, (96, 72), sweep=40.0))
+    small(monkeypatch)
+    options = ReconstructOptions(cameras=cameras, quality="draft")
+
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(photometric, "refine", stop)
+        with pytest.raises(KeyboardInterrupt):
+            run(tmp_path / "images", tmp_path / "s.ply", options)
+    left = tmp_path / ".steps-s.ply"
+    assert {p.name for p in left.iterdir()} == {"key", "features.pt", "matches.db", "depth.pt"}
+    with monkeypatch.context() as patch:
+        for module, name in ((features, "extract"), (features, "match"), (depth, "estimate"), (sfm, "solve")):
+            patch.setattr(module, name, stop)
+        report = run(tmp_path / "images", tmp_path / "s.ply", dataclasses.replace(options, resume=True))
+    assert not left.exists() and "depth" not in report.seconds
+    run(tmp_path / "images", tmp_path / "t.ply", options)
+    resumed, whole = read_scene(tmp_path / "s.ply"), read_scene(tmp_path / "t.ply")
+    torch.testing.assert_close(resumed.gaussians.means, whole.gaussians.means, rtol=0, atol=1e-5)
+
+
+def test_a_mistake_leaves_nothing_behind(tmp_path, monkeypatch):
+    cameras = write_set(tmp_path, arc(4, (96, 72), sweep=40.0))
+    small(monkeypatch)
+    for names, words in (("photo_00.png,x.png", "found for x.png"), ("photo_00.png,photo_00.png", "the same place")):
+        wrong = ReconstructOptions(cameras=cameras, quality="draft", scale_reference=f"photos={names} distance=1")
+        with pytest.raises(InputError, match=words):
+            run(tmp_path / "images", tmp_path / "s.ply", wrong)
+    assert {p.name for p in tmp_path.iterdir()} == {"images", "transforms.json"}
+
+
+def test_a_measured_distance_between_two_photos_gives_metres(tmp_path, monkeypatch):
+    cameras = write_set(tmp_path, arc(4, (96, 72), sweep=40.0))
+    small(monkeypatch)
+    known = "photos=photo_00.png,photo_03.png distance=0.25"
+    run(tmp_path / "images", tmp_path / "s.ply", ReconstructOptions(
+        cameras=cameras, quality="draft", scale_reference=known
+    ))  # fmt: skip
+    scene = read_scene(tmp_path / "s.ply")
+    eyes = centres(scene.cameras.viewmats)
+    assert float((eyes[0] - eyes[3]).norm()) * scene.metres_per_unit == pytest.approx(0.25, rel=1e-4)
+    assert known in scene.scale["source"]
+
+
+def test_the_end_says_what_would_be_better(tmp_path, monkeypatch, caplog):
+    cameras = write_set(tmp_path, arc(4, (96, 72), sweep=40.0))
+    small(monkeypatch)
+    with caplog.at_level(logging.INFO):
+        report = run(tmp_path / "images", tmp_path / "s.ply", ReconstructOptions(cameras=cameras, quality="draft"))
+    assert "GB of memory" in caplog.text and "to improve it: 4 photos are few" in caplog.text
+    assert any("between where photo_00.png and photo_03.png were taken" in sentence for sentence in report.advice)
+    assert report.placed == report.photos == 4 and report.held_out is None and report.memory > 0.1

@@ -1,0 +1,44 @@
+"""Sizes of the network; the defaults are the published ones."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Pi3Config:
+    width: int = 1024  # features of a token
+    head: int = 64  # features of an attention head
+    encoder_depth: int = 24  # blocks that see one photo
+    decoder_depth: int = 36  # blocks that see one photo and all photos in turn
+    head_depth: int = 5  # blocks of each decoder of an output
+    camera_width: int = 512
+    table: int = 37  # side of the learned table of places [patches]
+    splat_widths: tuple[int, int, int] = (512, 512, 256)  # of the splat head's layers on the patch grid
+    splat_features: int = 128  # and on the pixel grid, from tokens and from colours each
+
+    @classmethod
+    def of(cls, shapes: Mapping[str, Tensor]) -> Pi3Config:
+        """The sizes that a state dict (names as in π³) was made with; raises KeyError where it is of another model."""
+
+        def depth(prefix: str) -> int:
+            return sum(name.startswith(prefix) and name.endswith(".norm1.weight") for name in shapes)
+
+        splat = {}
+        if "feature_head.down_proj.weight" in shapes:
+            convs = [f"feature_head.upsample_proj.model.{i}.weight" for i in (0, 5, 10)]
+            splat = {"splat_widths": tuple(len(shapes[name]) for name in convs),
+                     "splat_features": len(shapes["feature_head.conv_net.layers.0.0.weight"])}  # fmt: skip
+        return cls(
+            width=shapes["register_token"].shape[-1],
+            head=len(shapes["decoder.0.attn.q_norm.weight"]),
+            encoder_depth=depth("encoder.blocks."),
+            decoder_depth=depth("decoder."),
+            head_depth=depth("point_decoder.blocks."),
+            camera_width=len(shapes["camera_head.fc_t.weight"][0]),
+            table=round((shapes["encoder.pos_embed"].shape[1] - 1) ** 0.5),
+            **splat,
+        )

@@ -1,0 +1,60 @@
+"""Photos as a network wants them: one size for all, sides multiples of a patch, few enough pixels."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from stages.models.pi3.dinov2 import PATCH
+from stages.reconstruct.photos import Photos
+from stages.scene.images import resize
+
+MOST_PIXELS = 201_000  # a photo, as the published model was run (448 x 448 for a square one)
+
+
+def network_size(width: int, height: int, longest: int | None = None) -> tuple[int, int]:
+    """Width and height, multiples of 14, of the largest image no larger than the photo, MOST_PIXELS, or `longest`.
+
+    Of the multiples around the exact size those with most pixels are taken.
+    """
+    shrink = min(1.0, (MOST_PIXELS / (width * height)) ** 0.5, (longest or width + height) / max(width, height))
+    choices = []
+    for side in (width, height):
+        patches = int(side * shrink + 1e-6) // PATCH
+        choices.append([n * PATCH for n in (patches, patches + 1) if n and n * PATCH <= min(side, longest or side)])
+    fitting = [(w, h) for w, h in product(*choices) if w * h <= MOST_PIXELS]
+    return max(fitting, key=lambda size: size[0] * size[1], default=(PATCH, PATCH))
+
+
+def crops(photos: Photos, longest: int | None = None) -> list[UInt8[Tensor, "_ _ 3"]]:
+    """The middle of every photo, in the proportions of the network's size for the median photo.
+
+    So the optical axis stays in the centre and pixels stay square.
+    """
+    width, height = common_size(photos, longest)
+    out = []
+    for image in photos.images:
+        h, w = image.shape[:2]
+        shrink = min(w / width, h / height)
+        wide, high = min(w, round(width * shrink)), min(h, round(height * shrink))
+        top, left = (h - high) // 2, (w - wide) // 2
+        out.append(image[top : top + high, left : left + wide].contiguous())
+    return out
+
+
+def common_size(photos: Photos, longest: int | None = None) -> tuple[int, int]:
+    """The network's size (width, height) for the photo whose proportions are the median."""
+    sizes = sorted((photos.size(i) for i in range(len(photos))), key=lambda size: size[0] / size[1])
+    return network_size(*sizes[len(sizes) // 2], longest)
+
+
+def resized(image: UInt8[Tensor, "h w 3"], width: int, height: int) -> UInt8[Tensor, "h2 w2 3"]:
+    return (resize(image.float() / 255, width, height) * 255).round().clamp(0, 255).to(torch.uint8)
+
+
+def batch(images: list[UInt8[Tensor, "_ _ 3"]], size: tuple[int, int]) -> Float[Tensor, "v 3 h w"]:
+    """Images of one proportion at the network's size (width, height), RGB in 0..1."""
+    return torch.stack([resize(image.float() / 255, *size) for image in images]).permute(0, 3, 1, 2).contiguous()

@@ -1,0 +1,107 @@
+"""Which photos show the same things: features, matches and two-view geometry in a COLMAP database."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from stages.reconstruct import features
+from stages.reconstruct.photos import Photos
+from stages.reconstruct.steps import Steps
+
+Pair = tuple[int, int, np.ndarray, np.ndarray]  # two photos and the pixels (k, 2) in each that match
+
+
+def compare(photos: Photos, cameras: list, steps: Steps, seed: int, device: str) -> Path:
+    """A COLMAP database of the photos, taken by pycolmap `cameras` (one a photo), ready to be mapped."""
+
+    def write(path: Path) -> None:
+        found = steps.kept("features", lambda: features.extract(photos))
+        with steps.timed("matches"):
+            _fill(path, photos, cameras, found, seed, device)
+
+    return steps.file("matches.db", write)
+
+
+def guessed_cameras(photos: Photos) -> list:
+    """One camera for all photos of a size and EXIF focal length; without that 1.2 times the longer side.
+
+    The k1 of SIMPLE_RADIAL is enough for phones and cameras; one shared camera holds weak geometry together.
+    """
+    import pycolmap
+
+    kinds = [(photos.size(i), round(photos.focals[i])) for i in range(len(photos))]
+    cameras = {}
+    for k, (size, focal) in enumerate(dict.fromkeys(kinds)):
+        camera = pycolmap.Camera(
+            model="SIMPLE_RADIAL", width=size[0], height=size[1],
+            params=[focal or 1.2 * max(size), size[0] / 2, size[1] / 2, 0.0], camera_id=k + 1,
+        )  # fmt: skip
+        camera.has_prior_focal_length = focal > 0
+        cameras[size, focal] = camera
+    return [cameras[kind] for kind in kinds]
+
+
+def connected(database: Path) -> list[Pair]:
+    """The pairs of photos with enough verified matches; photos count from 0 in the order they were compared."""
+    import pycolmap
+
+    file = pycolmap.Database.open(database)
+    pixels = {image.image_id: file.read_keypoints(image.image_id)[:, :2] for image in file.read_all_images()}
+    out = []
+    for pair, geometry in zip(*file.read_two_view_geometries(), strict=True):
+        i, j = pycolmap.pair_id_to_image_pair(pair)
+        rows = np.asarray(geometry.inlier_matches)
+        if len(rows):
+            out.append((i - 1, j - 1, pixels[i][rows[:, 0]], pixels[j][rows[:, 1]]))
+    file.close()
+    return out
+
+
+def _fill(path: Path, photos: Photos, cameras: list, found: list[features.Feature], seed: int, device: str) -> None:
+    """Writes cameras, photos, keypoints, matches and verified matches."""
+    import pycolmap
+
+    database = pycolmap.Database.open(path)
+    for camera in {c.camera_id: c for c in cameras}.values():
+        database.write_camera(camera, use_camera_id=True)
+        rig = pycolmap.Rig(rig_id=camera.camera_id)
+        rig.add_ref_sensor(camera.sensor_id)
+        database.write_rig(rig, use_rig_id=True)
+    for i, (name, camera) in enumerate(zip(photos.names, cameras, strict=True)):
+        image = pycolmap.Image(name=name, keypoints=np.zeros((0, 2)), camera_id=camera.camera_id, image_id=i + 1)
+        database.write_image(image, use_image_id=True)
+        frame = pycolmap.Frame(frame_id=i + 1, rig_id=camera.camera_id)
+        frame.add_data_id(image.data_id)
+        database.write_frame(frame, use_frame_id=True)
+        database.write_keypoints(i + 1, found[i][0].numpy())
+    for i, j, matches, geometry in _verified(found, cameras, seed, device):
+        database.write_matches(i + 1, j + 1, matches)
+        database.write_two_view_geometry(i + 1, j + 1, geometry)
+    database.close()
+
+
+def _verified(found: list[features.Feature], cameras: list, seed: int, device: str) -> list[tuple]:
+    """Matches and two-view geometry of all pairs worth comparing, verified in the background while more are matched."""
+    import pycolmap
+
+    options = pycolmap.TwoViewGeometryOptions()
+    options.ransac.random_seed = seed
+    options.ransac.max_num_trials = 3000  # a pair that needs more shares too little to be of use
+    pixels = [table[:, :2].double().numpy() for table, _ in found]
+    vectors = [features.unit(descriptors).to(device) for _, descriptors in found]
+
+    def verify(i: int, j: int, matches: np.ndarray) -> tuple:
+        geometry = pycolmap.estimate_two_view_geometry(cameras[i], pixels[i], cameras[j], pixels[j], matches, options)
+        return i, j, matches, geometry
+
+    pending = []
+    with ThreadPoolExecutor(1) as background:
+        for i, j in tqdm(features.pairs(vectors), desc="matching photos", unit="pair", leave=False):
+            matches = features.match(vectors[i], vectors[j]).numpy().astype(np.uint32)
+            if len(matches) >= options.min_num_inliers:
+                pending.append(background.submit(verify, i, j, matches))
+        return [job.result() for job in pending]

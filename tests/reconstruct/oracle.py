@@ -1,0 +1,49 @@
+"""What a perfect network would say of ray-cast photos: true depth, cameras and, if wanted, Gaussians."""
+
+import torch
+
+from stages.models.pi3.network import Geometry
+from stages.models.pi3.splat import CHANNELS
+from stages.reconstruct import crops
+from stages.reconstruct.depth import unproject
+from stages.reconstruct.photos import Photos
+from stages.scene.cameras import Cameras
+from stages.scene.images import to_bytes
+from tests.reconstruct.raycast import photograph
+
+C0 = 0.28209479177387814
+
+
+def photos_of(cameras: Cameras, folder) -> Photos:
+    images = tuple(torch.from_numpy(to_bytes(photograph(cameras, i)[0])) for i in range(len(cameras)))
+    return Photos(images, cameras.names, (0.0,) * len(cameras), folder)
+
+
+def truth(cameras: Cameras, scale: float, seed: int = 0) -> Geometry:
+    """Geometry at the size of the cameras' images, in a frame of its own: turned, moved and `scale` times as large."""
+    turn = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(seed)))[0]
+    turn = turn * torch.linalg.det(turn)
+    points, poses = [], []
+    for i in range(len(cameras)):
+        _, depth = photograph(cameras, i)
+        _, local = unproject(depth, cameras.Ks[i], torch.eye(4))
+        pose = torch.linalg.inv(cameras.viewmats[i])
+        moved = torch.eye(4)
+        moved[:3, :3] = turn @ pose[:3, :3]
+        moved[:3, 3] = scale * turn @ pose[:3, 3] + 1.0
+        points.append(scale * local)
+        poses.append(moved)
+    points = torch.stack(points)
+    return Geometry(points, torch.full(points.shape[:3], 0.9), torch.stack(poses))
+
+
+def true_splats(photos: Photos, size: tuple[int, int], geometry: Geometry, focal: float) -> torch.Tensor:
+    """Raw numbers of Gaussians as large as a pixel, in the pixel's colour, nearly opaque."""
+    images = crops.batch(list(photos.images), size).permute(0, 2, 3, 1)
+    raw = torch.zeros(*images.shape[:3], CHANNELS)
+    raw[..., 0] = 4.0
+    wanted = 0.7 * geometry.points[..., 2] / focal / 0.001  # what softplus has to give
+    raw[..., 1:4] = torch.where(wanted > 20, wanted, wanted.expm1().clamp_min(1e-6).log())[..., None]
+    raw[..., 7] = 1.0
+    raw[..., 8::9] = (images - 0.5) / C0
+    return raw

@@ -1,0 +1,97 @@
+"""What to do better next time, for cameras whose places are known; and lengths that the user measured."""
+
+import pytest
+import torch
+
+from stages.errors import InputError
+from stages.geometry.cameras import intrinsics, orbit
+from stages.reconstruct.advice import advise, widest_gap
+from stages.reconstruct.options import ReconstructOptions
+from stages.reconstruct.scale import parse_scale
+from stages.scene.cameras import Cameras
+
+
+def around(count: int, sweep: float = 360.0, elevation: float = 30.0, azimuth: float = 0.0) -> Cameras:
+    viewmats = orbit(count, torch.zeros(3), 2.0, elevation, azimuth=azimuth, sweep=sweep)
+    sizes = torch.tensor([[64, 48]] * count)
+    Ks = intrinsics(64, 48, 60.0).expand(count, 3, 3)
+    return Cameras(viewmats, Ks, sizes, tuple(f"{i}.jpg" for i in range(count)))
+
+
+def told(cameras: Cameras, confirmed: float = 0.8, supported: bool = True, dropped=None, sharp=None) -> str:
+    sharp = torch.ones(len(cameras)) if sharp is None else sharp
+    return "\n".join(
+        advise(cameras, torch.zeros(3), torch.full((len(cameras),), confirmed), sharp, supported, dropped or {})
+    )
+
+
+def test_nothing_is_said_of_a_good_set():
+    assert told(around(24)) == ""
+
+
+def test_the_side_that_was_not_seen_is_named_by_the_photos_at_its_ends():
+    # 13 photos, 20 degrees apart: 240 degrees are seen, and the gap runs from the last to the first.
+    cameras = around(13, sweep=260.0)
+    gap, before, after = widest_gap(cameras, torch.zeros(3))
+    assert gap == pytest.approx(120, abs=0.1) and {before, after} == {"0.jpg", "12.jpg"}
+    assert "120 degrees between where" in told(cameras) and "about 7 more photos" in told(cameras)
+
+
+def test_the_gap_is_found_across_the_turn_of_the_angle():
+    cameras = around(10, sweep=300.0, azimuth=100.0)  # 30 degrees apart
+    assert widest_gap(cameras, torch.zeros(3))[0] == pytest.approx(90, abs=0.1)
+
+
+@pytest.mark.parametrize(("elevation", "words"), [(8.0, "from low down"), (70.0, "steeply down"), (35.0, "")])
+def test_one_height_only_is_noticed(elevation, words):
+    assert words in told(around(24, elevation=elevation))
+    if not words:
+        assert told(around(24, elevation=elevation)) == ""
+
+
+def test_what_went_wrong_is_said():
+    assert "7 photos are few" in told(around(7))
+    assert "no table or floor" in told(around(24), supported=False)
+    assert "only 20 %" in told(around(24), confirmed=0.2) and "glass" in told(around(24), confirmed=0.2)
+    sharp = torch.ones(24)
+    sharp[3] = 0.1
+    assert "blurred beside the others: 3.jpg;" in told(around(24), sharp=sharp)
+
+
+def test_photos_left_out_are_named_with_the_reason_but_not_without_end():
+    text = told(around(24), dropped={f"{i:03d}.jpg": "is blank" for i in range(30)})
+    assert "000.jpg was left out: it is blank" in text and "25 more photos were left out" in text
+    assert text.startswith("only 24 of 54 photos show enough of the same things")
+    assert len(text.splitlines()) == 7
+
+
+def test_a_length_between_two_cameras_or_to_the_scene():
+    cameras = around(4)  # a quarter turn apart on a circle of radius 2 cos 30
+    known = parse_scale("photos=0.jpg,1.jpg distance=0.5")
+    assert known.measured(cameras, 2.0) == pytest.approx(2 * 3**0.5 / 2 * 2**0.5, rel=1e-5)
+    assert parse_scale("distance=0.6").measured(cameras, 2.0) == 2.0
+    assert parse_scale("photos=IMG 1.jpg,IMG 2.jpg distance=1e-1").photos == ("IMG 1.jpg", "IMG 2.jpg")
+    assert parse_scale("") is None
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("object=1 height=0.12", "only once segmented"),
+        ("distance=far", "in metres"),
+        ("distance=-1", "more than 0"),
+        ("photos=a.jpg distance=1", "in metres"),
+        ("0.5", "in metres"),
+    ],
+)
+def test_lengths_that_make_no_sense(text, words):
+    with pytest.raises(InputError, match=words):
+        ReconstructOptions(scale_reference=text)
+
+
+def test_cameras_of_a_length_must_be_there_and_apart():
+    cameras = around(4)
+    with pytest.raises(InputError, match="no camera found for 9.jpg"):
+        parse_scale("photos=0.jpg,9.jpg distance=1").measured(cameras, 2.0)
+    with pytest.raises(InputError, match="nearly the same place"):
+        parse_scale("photos=0.jpg,0.jpg distance=1").measured(cameras, 2.0)

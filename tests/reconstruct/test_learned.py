@@ -1,0 +1,158 @@
+"""Photos -> scene.ply with a network: all that comes after it tested with the truth in its place."""
+
+import dataclasses
+
+import pytest
+import torch
+import torch.nn.functional as F
+from safetensors.torch import save_file
+
+from stages.errors import InputError
+from stages.geometry.cameras import centres
+from stages.geometry.similarity import umeyama
+from stages.models.pi3.network import Pi3, halve
+from stages.models.pi3.splat import Pi3Splat
+from stages.reconstruct import learned
+from stages.reconstruct import options as choices
+from stages.reconstruct.options import ReconstructOptions
+from stages.reconstruct.photometric import score
+from stages.reconstruct.stage import run
+from stages.reconstruct.steps import Steps
+from stages.scene.scene_ply import read_scene
+from tests.models.pi3.test_network import TINY, random_weights
+from tests.models.pi3.test_splat import TINY_SPLAT
+from tests.reconstruct.oracle import photos_of, true_splats, truth
+from tests.reconstruct.raycast import BLOCK, arc, write_set
+
+SIZE = (112, 84)  # multiples of a patch, so that the network's images are the photos
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    """Tensors are tiny here, and two threads would only wait for each other."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch):
+    draft = dataclasses.replace(choices.QUALITIES["draft"], gaussians=5000, steps=40)
+    monkeypatch.setitem(choices.QUALITIES, "draft", draft)
+
+
+def assembled(tmp_path, count=4, splats=False, noise=0.0, **given):
+    """A scene from true geometry in a frame and unit of its own."""
+    cameras = arc(count, SIZE, sweep=70.0)
+    photos, geometry = photos_of(cameras, tmp_path), truth(cameras, scale=3.7)
+    if noise:  # smooth, as errors of networks are
+        coarse = noise * torch.randn(count, 1, 6, 8, generator=torch.Generator().manual_seed(3))
+        wobble = 1 + F.interpolate(coarse, geometry.points.shape[1:3], mode="bicubic")[:, 0]
+        geometry = dataclasses.replace(geometry, points=geometry.points * wobble[..., None])
+    raw = true_splats(photos, SIZE, geometry, float(cameras.Ks[0, 0, 0])) if splats else None
+    options = ReconstructOptions(**{"quality": "draft", **given})
+    made = learned.assemble(photos, list(photos.images), geometry, raw, options, Steps(), "cpu")
+    return made, cameras
+
+
+def to_truth(made, cameras):
+    """The similarity from the scene to the true world, by the cameras."""
+    return umeyama(centres(made.scene.cameras.viewmats), centres(cameras.viewmats))
+
+
+def surface_error(points: torch.Tensor) -> torch.Tensor:
+    """Distance of points of the true world from the table or the block on it."""
+    a, b, top = BLOCK
+    outside = (points[:, :2].abs() - torch.tensor([a, b])).clamp_min(0).norm(dim=1)
+    block = torch.hypot(outside, (points[:, 2] - top).clamp_min(0))
+    inside = torch.stack([a - points[:, 0].abs(), b - points[:, 1].abs(), top - points[:, 2]]).abs().amin(0)
+    return torch.minimum(torch.where(block > 0, block, inside), points[:, 2].abs())
+
+
+@pytest.mark.parametrize("splats", [False, True], ids=["pi3", "pi3-splat"])
+def test_a_true_answer_gives_the_true_scene(tmp_path, splats):
+    made, cameras = assembled(tmp_path, splats=splats, iterations=0)
+    back = to_truth(made, cameras)
+    assert surface_error(back(made.scene.gaussians.means)).quantile(0.9) < 0.02
+    torch.testing.assert_close(back(centres(made.scene.cameras.viewmats)), centres(cameras.viewmats), atol=1e-3, rtol=0)
+    torch.testing.assert_close(made.scene.cameras.Ks, cameras.Ks, rtol=2e-3, atol=0.1)
+    up = back.rotation @ torch.tensor([0.0, 0, 1])
+    assert up[2] > 0.9998  # a degree
+    assert abs(float(back(torch.zeros(1, 3))[0, 2])) < 0.01  # the floor is the table
+    assert score(made.scene.gaussians, made.views, made.trained)[0] > 17  # the photos' mean colour alone scores 12.6
+
+
+def test_noise_of_two_percent_is_survived_and_fitting_improves_the_picture(tmp_path):
+    plain, cameras = assembled(tmp_path, noise=0.02, iterations=0, holdout=3)
+    fitted, _ = assembled(tmp_path, noise=0.02, iterations=60, holdout=3)
+    assert plain.held == [0, 3]
+    before, after = (score(made.scene.gaussians, made.views, made.held)[0] for made in (plain, fitted))
+    assert after > before + 0.5
+    assert surface_error(to_truth(fitted, cameras)(fitted.scene.gaussians.means)).median() < 0.03
+
+
+def test_one_photo_is_enough(tmp_path):
+    made, cameras = assembled(tmp_path, count=1, iterations=0, holdout=3)
+    assert made.trained == [0] and not made.held
+    scale = 1.6 / float(centres(made.scene.cameras.viewmats)[0].norm())
+    assert float(centres(made.scene.cameras.viewmats)[0, 2]) * scale == pytest.approx(
+        float(centres(cameras.viewmats)[0, 2]), rel=0.1
+    )  # as high above the table as it was
+    assert score(made.scene.gaussians, made.views, [0])[0] > 17
+
+
+def test_few_gaussians_of_a_network_look_like_the_many_they_stand_for(tmp_path):
+    many, _ = assembled(tmp_path, count=2, splats=True, iterations=0, quality="high")
+    few, _ = assembled(tmp_path, count=2, splats=True, iterations=0)
+    assert len(few.scene.gaussians) <= 1.25 * 5000 < len(many.scene.gaussians)
+    loss = score(many.scene.gaussians, many.views, [1])[0] - score(few.scene.gaussians, few.views, [1])[0]
+    assert loss < 1
+
+
+@pytest.mark.parametrize("name", ["pi3", "pi3-splat"])
+@pytest.mark.parametrize("count", [1, 3])
+def test_whole_runs_with_a_tiny_network(tmp_path, monkeypatch, name, count):
+    """What random weights say makes no sense, but every step is walked: photos, file of weights, network, scene.ply."""
+    write_set(tmp_path, arc(count, (170, 120)))
+    model = random_weights(Pi3(TINY) if name == "pi3" else Pi3Splat(TINY_SPLAT), size=0.05)
+    point_head = getattr(model.encoder, "point_head", None) or model.point_head
+    point_head.proj.weight.data *= 0.01  # so that neighbouring pixels are at nearly one depth
+    point_head.proj.bias.data *= 0.01
+    save_file(model.state_dict(), tmp_path / f"{name}.safetensors")
+    monkeypatch.setenv("NGFF_WEIGHTS", str(tmp_path))
+    report = run(tmp_path / "images", tmp_path / "s.ply", ReconstructOptions(name, quality="draft", iterations=3))
+    scene = read_scene(tmp_path / "s.ply")
+    assert report.placed == count == len(scene.cameras) and len(scene.gaussians) > 0
+    assert scene.gaussians.means.isfinite().all() and scene.floor == 0.0
+    assert scene.provenance["options"]["backend"] == name
+
+
+def test_what_is_missing_or_does_not_go_together_is_said(tmp_path, monkeypatch):
+    monkeypatch.setenv("NGFF_WEIGHTS", str(tmp_path / "none"))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "none"))
+    cameras = write_set(tmp_path, arc(2, (64, 48)))
+    for options, words in (
+        (ReconstructOptions("pi3"), "no weights in .*huggingface.co/yyfz233/Pi3"),
+        (ReconstructOptions("pi3-splat", weights=tmp_path / "w.pth", download=True), "w.pth: no such file"),
+        (ReconstructOptions("pi3", cameras=cameras), "--cameras: --backend pi3 finds cameras itself"),
+    ):
+        with pytest.raises(InputError, match=words):
+            run(tmp_path / "images", tmp_path / "s.ply", options)
+    assert not (tmp_path / "s.ply").exists()
+
+
+@torch.no_grad()
+def test_sixteen_bit_stays_near_thirty_two():
+    """As on a GPU, but on the CPU."""
+    model = random_weights(Pi3(TINY), size=0.1)
+    images = torch.rand(3, 3, 56, 42, generator=torch.Generator().manual_seed(0))
+    exact = model(images)
+    with torch.autocast("cpu", torch.bfloat16):
+        coarse = model(images)
+        again = halve(model)(images)
+    torch.testing.assert_close(again.points, coarse.points)
+    assert model.camera_head.fc_t.weight.dtype == torch.float32 != model.decoder[0].mlp.fc1.weight.dtype
+    assert coarse.points.dtype == coarse.poses.dtype == torch.float32
+    torch.testing.assert_close(coarse.points, exact.points, rtol=0.1, atol=0.1)
+    torch.testing.assert_close(coarse.poses, exact.poses, rtol=0.1, atol=0.1)

@@ -1,0 +1,223 @@
+"""What users put into a folder, and what phones film."""
+
+import logging
+from fractions import Fraction
+
+import av
+import cv2
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from stages.errors import InputError
+from stages.reconstruct import reading
+from stages.reconstruct.reading import read_photos
+
+MILLISECOND = Fraction(1, 1000)
+rng = np.random.default_rng(0)
+
+
+def picture(width: int = 96, height: int = 64) -> np.ndarray:
+    """Coloured blobs, RGB bytes: left half reddish, right half bluish."""
+    small = rng.integers(0, 120, (height // 8, width // 8, 3), dtype=np.uint8)
+    pixels = cv2.resize(small, (width, height), interpolation=cv2.INTER_CUBIC)
+    pixels[:, : width // 2, 0] |= 128
+    pixels[:, width // 2 :, 2] |= 128
+    return pixels
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Two photos that are well, and room for others."""
+    for name in ("a.jpg", "b.jpg"):
+        Image.fromarray(picture()).save(tmp_path / name, quality=95)
+    return tmp_path
+
+
+def mean_of_left(image: torch.Tensor) -> torch.Tensor:
+    return image[:, : image.shape[1] // 2].float().mean((0, 1))
+
+
+KINDS = {
+    "sixteen bit": lambda path, pixels: cv2.imwrite(str(path / "c.png"), pixels[..., ::-1].astype(np.uint16) * 257),
+    "alpha": lambda path, pixels: Image.fromarray(np.dstack([pixels, pixels[..., 0] // 2])).save(path / "c.png"),
+    "CMYK": lambda path, pixels: Image.fromarray(pixels).convert("CMYK").save(path / "c.jpg", quality=95),
+    "TIFF": lambda path, pixels: Image.fromarray(pixels).save(path / "c.tiff"),
+    "WebP": lambda path, pixels: Image.fromarray(pixels).save(path / "c.webp", quality=95),
+    "upper case": lambda path, pixels: Image.fromarray(pixels).save(path / "c.JPG", quality=95),
+    "unicode and spaces": lambda path, pixels: Image.fromarray(pixels).save(path / "c Küche 写真 №1.jpg", quality=95),
+}
+
+
+@pytest.mark.parametrize("kind", list(KINDS))
+def test_colours_come_through_whatever_the_kind_of_file(folder, kind):
+    pixels = picture()
+    KINDS[kind](folder, pixels)
+    photos = read_photos(folder)
+    assert len(photos) == 3
+    true = torch.from_numpy(pixels)
+    torch.testing.assert_close(mean_of_left(photos.images[2]), mean_of_left(true), rtol=0, atol=4.0)
+
+
+def test_grey_photos_become_three_equal_channels(folder):
+    Image.fromarray(picture()[..., 1]).save(folder / "c.png")
+    image = read_photos(folder).images[2]
+    assert image.shape[2] == 3 and torch.equal(image[..., 0], image[..., 2])
+
+
+def test_photos_are_turned_as_their_exif_says(folder):
+    pixels = picture()
+    exif = Image.Exif()
+    exif[0x0112] = 6  # stored lying on its side: to be turned a quarter clockwise
+    Image.fromarray(np.ascontiguousarray(np.rot90(pixels))).save(folder / "c.jpg", exif=exif, quality=95)
+    photos = read_photos(folder)
+    assert photos.size(2) == (96, 64)
+    torch.testing.assert_close(
+        mean_of_left(photos.images[2]), mean_of_left(torch.from_numpy(pixels)), rtol=0, atol=4.0
+    )
+
+
+def test_sizes_and_cameras_may_be_mixed(folder):
+    from stages.reconstruct.matching import guessed_cameras
+
+    exif = Image.Exif()
+    exif.get_ifd(0x8769)[0xA405] = 50  # 35 mm equivalent focal length
+    for name, size in (("c.jpg", (64, 96)), ("d.jpg", (128, 96)), ("e.jpg", (96, 64))):
+        Image.fromarray(picture(*size)).save(folder / name, exif=exif)
+    photos = read_photos(folder)
+    cameras = guessed_cameras(photos)
+    assert cameras[0].camera_id == cameras[1].camera_id
+    assert len({c.camera_id for c in cameras}) == 4  # e.jpg has the size of a.jpg, but its focal length is known
+    assert cameras[4].has_prior_focal_length and not cameras[0].has_prior_focal_length
+    assert cameras[4].mean_focal_length() == pytest.approx(50 / 36 * 96, rel=0.05)
+
+
+def test_large_photos_are_kept_smaller_and_their_focal_length_with_them(tmp_path):
+    exif = Image.Exif()
+    exif.get_ifd(0x8769)[0xA405] = 36  # as wide as the film: the focal length is the width
+    for name in ("a.jpg", "b.jpg"):
+        Image.fromarray(picture(2400, 1600)).save(tmp_path / name, exif=exif)
+    photos = read_photos(tmp_path)
+    assert photos.size(0) == (1600, 1067)
+    assert photos.focals[0] == pytest.approx(1600, rel=0.05)
+    assert read_photos(tmp_path, side=1800).size(0) == (1800, 1200)
+
+
+def test_photos_that_cannot_be_read_are_named_and_left_out(folder, caplog):
+    whole = (folder / "a.jpg").read_bytes()
+    (folder / "c.jpg").write_bytes(whole[: len(whole) // 2])
+    (folder / "d.jpg").write_bytes(b"")
+    (folder / "e.jpg").write_bytes(b"no photo")
+    Image.fromarray(picture()).save(folder / "f.png")
+    (folder / "f.png").write_bytes((folder / "f.png").read_bytes()[:-300])
+    photos = read_photos(folder)
+    assert photos.names == ("a.jpg", "b.jpg")
+    for said in ("c.jpg: breaks off", "d.jpg: is empty", "e.jpg: is not an image", "f.png: breaks off"):
+        assert said in caplog.text
+    (folder / "b.jpg").unlink()
+    with pytest.raises(InputError, match="holds one photo that can be read"):
+        read_photos(folder)
+    (folder / "a.jpg").unlink()
+    with pytest.raises(InputError, match="c.jpg: breaks off"):
+        read_photos(folder)
+
+
+def test_a_film_behind_the_photo_does_not_make_it_broken(folder):
+    thumbnail, whole = (folder / "a.jpg").read_bytes(), (folder / "b.jpg").read_bytes()
+    header = b"\xff\xe1" + (len(thumbnail) + 2).to_bytes(2, "big") + thumbnail
+    (folder / "c.jpg").write_bytes(whole[:2] + header + whole[2:] + b"ftypmp42 a film" * 1000)
+    assert len(read_photos(folder)) == 3
+    cut = (whole[:2] + header + whole[2:])[: -len(whole) // 2]  # the thumbnail's end is not the photo's
+    (folder / "c.jpg").write_bytes(cut)
+    assert len(read_photos(folder)) == 2
+
+
+def test_kinds_that_need_converting_are_named(tmp_path, caplog):
+    (tmp_path / "IMG_1.HEIC").write_bytes(b"heic")
+    (tmp_path / "IMG_2.HEIC").write_bytes(b"heic")
+    with pytest.raises(InputError, match="holds 2 HEIC photos, which cannot be read; convert them to JPEG"):
+        read_photos(tmp_path)
+    for name in ("a.png", "b.png"):
+        Image.fromarray(picture()).save(tmp_path / name)
+    assert len(read_photos(tmp_path)) == 2
+    assert "2 HEIC photos are left out" in caplog.text
+
+
+def test_of_very_many_photos_the_sharpest_of_each_span_is_taken(tmp_path, monkeypatch, caplog):
+    monkeypatch.setattr(reading, "MOST", 4)
+    for i in range(12):
+        pixels = picture() if i % 3 == 1 else np.full((64, 96, 3), 90, np.uint8)
+        Image.fromarray(pixels).save(tmp_path / f"{i:02d}.png")
+    with caplog.at_level(logging.INFO):
+        photos = read_photos(tmp_path)
+    assert photos.names == ("01.png", "04.png", "07.png", "10.png")
+    assert "of 12 photos the sharpest 4" in caplog.text
+
+
+def film(path, times: list[float], size: tuple[int, int] = (96, 64), blurred: tuple[int, ...] = ()) -> None:
+    """A video with frames at these times [s]; the red channel tells the time, a tenth of a second a level."""
+    with av.open(str(path), "w") as file:
+        stream = file.add_stream("libx264", rate=1000, options={"crf": "10", "g": "10"})
+        stream.width, stream.height, stream.pix_fmt = *size, "yuv420p"
+        stream.codec_context.time_base = MILLISECOND
+        texture = picture(*size)
+        for i, time in enumerate(times):
+            pixels = cv2.GaussianBlur(texture, (0, 0), 4) if i in blurred else texture.copy()
+            pixels[..., 0] = round(time * 10)
+            frame = av.VideoFrame.from_ndarray(pixels, format="rgb24")
+            frame.pts, frame.time_base = round(time * 1000), MILLISECOND
+            file.mux(stream.encode(frame))
+        file.mux(stream.encode())
+
+
+def test_frames_of_a_variable_rate_are_taken_by_time(tmp_path, monkeypatch):
+    # Ten frames a second for 4 s, then one a second for 16 s: by number, two thirds would be from the first fifth.
+    monkeypatch.setattr(reading, "FRAMES", (10, 10))
+    film(tmp_path / "v.mp4", [0.1 * i for i in range(40)] + [4.0 + i for i in range(17)])
+    photos = read_photos(tmp_path / "v.mp4")
+    times = torch.tensor([float(image[..., 0].float().mean()) / 10 for image in photos.images])
+    assert len(photos) == 10
+    assert (times < 4).sum() <= 3 and float((times[1:] - times[:-1]).max()) < 4.5
+
+
+def test_blurred_frames_are_passed_over(tmp_path, monkeypatch):
+    monkeypatch.setattr(reading, "FRAMES", (5, 5))
+    film(tmp_path / "v.mp4", [0.1 * i for i in range(25)], blurred=tuple(i for i in range(25) if i % 5 != 2))
+    names = read_photos(tmp_path / "v.mp4").names
+    assert [int(name[6:]) % 5 for name in names] == [2] * 5
+
+
+def test_a_4k_video_is_read_at_the_size_that_is_kept(tmp_path):
+    film(tmp_path / "v.mp4", [0.1 * i for i in range(3)], size=(3840, 2160))
+    photos = read_photos(tmp_path / "v.mp4")
+    assert len(photos) == 3 and photos.size(0) == (1600, 900)
+
+
+def test_a_video_cut_off_in_a_copy_is_refused_or_used_as_far_as_it_goes(tmp_path):
+    film(tmp_path / "v.mp4", [0.1 * i for i in range(10)])
+    whole = (tmp_path / "v.mp4").read_bytes()
+    (tmp_path / "cut.mp4").write_bytes(whole[: len(whole) // 2])  # its table of frames is at the end
+    with pytest.raises(InputError, match="cut.mp4: is not a video that can be read"):
+        read_photos(tmp_path / "cut.mp4")
+
+
+def test_one_frame_is_no_video(tmp_path):
+    film(tmp_path / "v.mp4", [0.0])
+    with pytest.raises(InputError, match="has 1 frame; a video that moves around"):
+        read_photos(tmp_path / "v.mp4")
+
+
+def test_other_files_in_the_folder_are_counted(folder, caplog):
+    (folder / "notes.txt").write_text("not a photo")
+    (folder / ".DS_Store").write_text("hidden")
+    with caplog.at_level(logging.INFO):
+        photos = read_photos(folder)
+    assert photos.names == ("a.jpg", "b.jpg") and photos.size(0) == (96, 64)
+    assert "1 other file" in caplog.text
+
+
+def test_one_photo_is_not_enough(tmp_path):
+    Image.fromarray(picture()).save(tmp_path / "a.png")
+    with pytest.raises(InputError, match="holds one photo; at least 2"):
+        read_photos(tmp_path)

@@ -1,0 +1,94 @@
+"""Photo sets as people really take them: each is placed, or refused in one sentence that says what to try."""
+
+import pytest
+import torch
+
+from stages.errors import InputError
+from stages.geometry.cameras import centres
+from stages.geometry.similarity import umeyama
+from stages.reconstruct import sfm
+from stages.reconstruct.photos import Photos
+from tests.reconstruct.raycast import arc, photograph, texture
+
+
+def as_photos(images: list[torch.Tensor], names: tuple[str, ...], folder) -> Photos:
+    images = tuple((image * 255).round().to(torch.uint8) for image in images)
+    return Photos(images, names, (0.0,) * len(images), folder)
+
+
+def noisy(image: torch.Tensor, seed: int) -> torch.Tensor:
+    return (image + 0.01 * torch.randn(image.shape, generator=torch.Generator().manual_seed(seed))).clamp(0, 1)
+
+
+def with_person(image: torch.Tensor, seed: int) -> torch.Tensor:
+    """Something stands before a fifth of the photo that no other photo shows, at a place of its own."""
+    height, width = image.shape[:2]
+    h, w = height // 2, width * 2 // 5
+    generator = torch.Generator().manual_seed(seed)
+    top, left = (int(torch.randint(0, n, (), generator=generator)) for n in (height - h, width - w))
+    v, u = torch.meshgrid(torch.linspace(-1, 1, h), torch.linspace(-1, 1, w), indexing="ij")
+    out = image.clone()
+    out[top : top + h, left : left + w] = texture(u, v, seed=100 + seed)
+    return out
+
+
+def worst_place(model: sfm.SparseModel, true) -> float:
+    """Largest distance of a camera from its true place, after alignment [scene units]."""
+    rows = [true.names.index(name) for name in model.cameras.names]
+    found, there = centres(model.cameras.viewmats), centres(true.viewmats)[rows]
+    return float((umeyama(found, there)(found) - there).norm(dim=1).max())
+
+
+def test_two_photos_are_enough_for_cameras(tmp_path):
+    true = arc(2, (320, 240), sweep=30.0)
+    model = sfm.solve(as_photos([photograph(true, i)[0] for i in range(2)], true.names, tmp_path))
+    assert len(model.cameras) == 2 and len(model.points) >= 50
+
+
+def test_people_walking_through_do_not_move_the_cameras(tmp_path):
+    true = arc(6, (320, 240))
+    images = [photograph(true, i)[0] for i in range(6)]
+    crowded = [with_person(image, i) if i % 2 else image for i, image in enumerate(images)]
+    model = sfm.solve(as_photos(crowded, true.names, tmp_path))
+    assert len(model.cameras) == 6
+    assert worst_place(model, true) < 0.03  # the cameras are 1.6 away
+
+
+def test_a_blank_photo_and_one_of_something_else_are_left_out_with_the_reason(tmp_path):
+    true = arc(4, (320, 240), sweep=40.0)
+    images = [photograph(true, i)[0] for i in range(4)]
+    v, u = torch.meshgrid(torch.linspace(-1, 1, 240), torch.linspace(-1.3, 1.3, 320), indexing="ij")
+    others = [torch.full((240, 320, 3), 0.5), texture(u, v, seed=9)]
+    names = (*true.names, "blank.png", "elsewhere.png")
+    model = sfm.solve(as_photos([*images, *others], names, tmp_path))
+    assert model.cameras.names == true.names
+    assert set(model.dropped) == {"blank.png", "elsewhere.png"}
+    assert "blurred, dark or plain" in model.dropped["blank.png"]
+
+
+def test_a_camera_that_stands_still_is_told_from_one_that_moves(tmp_path):
+    # As on a turntable before a patterned wall: the wall's matches say that nothing moves.
+    true = arc(1, (320, 240))
+    still = photograph(true, 0)[0]
+    images = [with_person(noisy(still, i), i) for i in range(5)]
+    with pytest.raises(InputError, match="camera hardly moved between the photos; walk around.*plain backdrop"):
+        sfm.solve(as_photos(images, tuple("abcde"), tmp_path))
+
+
+def test_photos_of_different_things_are_refused(tmp_path):
+    v, u = torch.meshgrid(torch.linspace(-1, 1, 120), torch.linspace(-1.3, 1.3, 160), indexing="ij")
+    images = [texture(u, v, seed=20 + i) for i in range(4)]
+    with pytest.raises(InputError, match="no two photos show the same|overlap too little"):
+        sfm.solve(as_photos(images, tuple("abcd"), tmp_path))
+
+
+def test_two_rooms_give_the_larger_and_name_the_rest(tmp_path):
+    # As a video with a cut: four photos of one place, three of another.
+    first, second = arc(4, (320, 240), sweep=40.0), arc(3, (320, 240), sweep=30.0)
+    images = [photograph(first, i)[0] for i in range(4)]
+    images += [1 - photograph(second, i)[0].flip(0, 1) for i in range(3)]  # upside down and negative: nothing in common
+    names = tuple(f"{i}.png" for i in range(7))
+    model = sfm.solve(as_photos(images, names, tmp_path))
+    assert model.cameras.names == names[:4]
+    assert set(model.dropped) == set(names[4:])
+    assert all("goes with" in why or "nothing that was recognised" in why for why in model.dropped.values())

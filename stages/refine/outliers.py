@@ -9,8 +9,10 @@ from torch import Tensor
 from stages.geometry.neighbours import knn
 from stages.scene.gaussians import Gaussians
 
+EVEN = 0.2  # least deviation of the logarithm of distances: an even surface's corners are not lonely
 
-def floaters(g: Gaussians, limit: float = 3.5) -> Bool[Tensor, "n"]:
+
+def floaters(g: Gaussians, limit: float = 3.0) -> Bool[Tensor, "n"]:
     """Gaussians of objects that are far from the rest of their object, lonely, or larger than it.
 
     Far is a modified z-score of the distance to the median centre above `limit` (Iglewicz and Hoaglin 1993)
@@ -25,7 +27,7 @@ def floaters(g: Gaussians, limit: float = 3.5) -> Bool[Tensor, "n"]:
         means = g.means[members]
         centre = means.median(0).values
         far = score((means - centre).norm(dim=1))
-        alone = score(knn(means, means, 9)[0][:, -1].clamp_min(1e-12).log())
+        alone = score(knn(means, means, 9)[0][:, -1].clamp_min(1e-12).log(), EVEN)
         core = means[far <= limit]
         size = float((core.amax(0) - core.amin(0)).norm()) if len(core) else 0.0
         blur = g.scales[members].amax(1) > max(0.35 * size, 1e-12)
@@ -35,8 +37,9 @@ def floaters(g: Gaussians, limit: float = 3.5) -> Bool[Tensor, "n"]:
     return out
 
 
-def score(values: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
-    """Modified z-score above the median: 0.6745 (x - median) / MAD."""
+def score(values: Float[Tensor, "n"], least: float | None = None) -> Float[Tensor, "n"]:
+    """Modified z-score above the median: 0.6745 (x - median) / MAD, with a MAD of `least` at least."""
     off = values - values.median()
-    mad = off.abs().median()
-    return 0.6745 * off / mad.clamp_min(1e-3 * values.median().abs().clamp_min(1e-12))
+    if least is None:
+        least = 1e-3 * max(abs(float(values.median())), 1e-12)
+    return 0.6745 * off / off.abs().median().clamp_min(least)

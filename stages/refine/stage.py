@@ -43,7 +43,7 @@ def run(scene: Path, out: Path, options: RefineOptions = RefineOptions()) -> Non
 
 def refine(scene: Scene, options: RefineOptions = RefineOptions()) -> Scene:  # noqa: B008 -- frozen
     """The three steps on every object. What the photos show stays as it is; only the unseen is added."""
-    completer = choose(BACKENDS, options.completer)
+    completer = choose(BACKENDS, options.chosen)
     support = find_support(scene, seed=options.seed)
     g = take_halo(scene.gaussians, support, _reach(scene.gaussians))
     stray = floaters(g, options.outliers) if options.outliers else torch.zeros(len(g), dtype=torch.bool)
@@ -61,7 +61,17 @@ def refine(scene: Scene, options: RefineOptions = RefineOptions()) -> Scene:  # 
         filled = fill(scene, sight, support, options.seed)
     new = len(filled.gaussians) - len(scene.gaussians)
     log.info("  %d floaters taken away, %d Gaussians more for the table", int(stray.sum()), new)
-    return replace(filled, gaussians=concatenate([filled.gaussians, made]))
+    whole = replace(filled, gaussians=concatenate([filled.gaussians, made]))
+    return with_raw(whole, scene) if options.keep_raw else whole
+
+
+def with_raw(whole: Scene, raw: Scene) -> Scene:
+    """The K objects of a scene, and as K + 1 to 2 K those of another state of it, under their names with "(raw)"."""
+    g = raw.gaussians[raw.gaussians.object_id > 0]
+    count = int(g.object_id.max())
+    copies = tuple(replace(o, id=o.id + count, name=f"{o.name} (raw)") for o in whole.objects)
+    both = concatenate([whole.gaussians, replace(g, object_id=g.object_id + count)])
+    return replace(whole, gaussians=both, objects=whole.objects + copies)
 
 
 def _reach(g: Gaussians) -> float:

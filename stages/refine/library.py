@@ -1,0 +1,131 @@
+"""Unseen sides from a library of whole objects: the asset that fits what was seen is put in its place.
+
+What the photos saw stays as they showed it; the asset gives the rest, its colours shifted to agree at the seam.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from stages.errors import InputError
+from stages.geometry.harmonics import rotate_sh
+from stages.geometry.neighbours import knn
+from stages.geometry.rotations import multiply, quaternion
+from stages.geometry.similarity import Similarity
+from stages.physics.support import Support
+from stages.refine.options import RefineOptions
+from stages.refine.patches import none_like
+from stages.refine.register import Registration, approach, rough_fit, settle
+from stages.refine.register_cloud import Cloud
+from stages.refine.sight import Sight
+from stages.scene.gaussians import Gaussians
+from stages.scene.scene import Scene
+from stages.scene.scene_ply import read_scene
+
+log = logging.getLogger(__name__)
+FIT = 0.8  # a lower fit is another object
+THROUGH = 0.1  # share of an asset that cameras may see through before it cannot be the object
+TRIED = 2  # assets that are registered exactly, of those that fit best roughly
+SEEN = 0.02  # distance from the part within which the asset is not needed [diameters]
+SOLID = 0.1  # opacity of Gaussians that count as surface
+
+
+def complete(scene: Scene, number: int, sight: Sight, support: Support | None, options: RefineOptions) -> Gaussians:
+    """Gaussians of the best asset of `options.library` where the object was not seen; none when nothing fits."""
+    g = scene.gaussians
+    own = g[(g.object_id == number) & (g.opacities > SOLID) & g.means.isfinite().all(1)]
+    name = scene.name_of(number)
+    found = best(own, library(options.library), options.seed) if len(own) >= 100 else None
+    if found is None:
+        log.info("  %d  %s: left alone: too little of it to compare with the library", number, name)
+        return none_like(g)
+    asset, whole, how = found
+    placed = moved(whole, how.similarity)
+    through = _seen_through(placed, sight)
+    fits = how.fit >= FIT and through <= THROUGH
+    verdict = "put in its place" if fits else f"left alone: {FIT} and at most {THROUGH:.0%} are needed"
+    log.info(
+        "  %d  %s: %s of the library fits to %.2f, %.0f %% of it is seen through; %s",
+        number, name, asset, how.fit, 100 * through, verdict,
+    )  # fmt: skip
+    return added(own, placed, number) if fits else none_like(g)
+
+
+@lru_cache(maxsize=1)
+def library(folder: Path) -> dict[str, tuple[Gaussians, Cloud]]:
+    """Whole objects by name: FOLDER/NAME.ply, or FOLDER/NAME/.../*.ply as trainers and `ngff-lab objects` write."""
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise InputError(f"{folder}: is no folder; --library takes whole objects, such as `ngff-lab objects` writes")
+    files = {p.stem: p for p in sorted(folder.glob("*.ply"))}
+    files.update({p.relative_to(folder).parts[0]: p for p in sorted(folder.glob("*/**/*.ply"))})  # the last iteration
+    if not files:
+        raise InputError(f"{folder}: holds no .ply; --library takes whole objects, such as `ngff-lab objects` writes")
+    out = {}
+    for name, path in files.items():
+        g = read_scene(path).gaussians
+        g = g[(g.opacities > SOLID) & g.scales.isfinite().all(1)]
+        if len(g) < 100:
+            raise InputError(f"{path}: {len(g)} solid Gaussians are no object; take it out of the library")
+        out[name] = g, Cloud.of(g)
+    return out
+
+
+def best(
+    own: Gaussians, assets: dict[str, tuple[Gaussians, Cloud]], seed: int = 0
+) -> tuple[str, Gaussians, Registration] | None:
+    """Name, Gaussians and registration of the asset that fits best: all roughly, the most promising exactly."""
+    part = Cloud.of(own, seed)
+    rough = {name: approach(part, cloud, seed) for name, (_, cloud) in assets.items()}
+    fits = {name: rough_fit(poses, part, assets[name][1]) for name, poses in rough.items() if len(poses)}
+    promising = sorted(fits, key=fits.get, reverse=True)[:TRIED]
+    settled = {name: settle(rough[name], part, assets[name][1], seed) for name in promising}
+    if not settled:
+        return None
+    winner = max(settled, key=lambda name: settled[name].fit)
+    return winner, assets[winner][0], settled[winner]
+
+
+def moved(g: Gaussians, similarity: Similarity) -> Gaussians:
+    """The same Gaussians elsewhere, turned and grown, highlights included."""
+    R = similarity.rotation
+    return replace(
+        g, means=similarity(g.means), quats=multiply(quaternion(R).expand(len(g), 4), g.quats),
+        scales=similarity.scale * g.scales, sh=rotate_sh(g.sh, R.expand(len(g), 3, 3)),
+    )  # fmt: skip
+
+
+def _seen_through(placed: Gaussians, sight: Sight) -> float:
+    """Share of the Gaussians where the cameras see nothing."""
+    if not sight.views:
+        return 0.0
+    size = float((placed.means.amax(0) - placed.means.amin(0)).norm())
+    return float(sight.empty(placed.means, 0.03 * size).float().mean())
+
+
+def added(own: Gaussians, placed: Gaussians, number: int) -> Gaussians:
+    """The asset's Gaussians away from those of the object, in the light of the photos."""
+    size = float((placed.means.amax(0) - placed.means.amin(0)).norm())
+    near = knn(own.means, placed.means, 1)[0][:, 0] < SEEN * size
+    if not near.any():
+        return none_like(own)
+    sh = placed.sh.clone()
+    sh[:, 0] += _shift(own, placed[near], placed.means)
+    rest = replace(placed, sh=sh, object_id=torch.full((len(placed),), number, dtype=own.object_id.dtype))
+    return rest[~near]
+
+
+def _shift(own: Gaussians, seen: Gaussians, at: Float[Tensor, "n 3"], among: int = 64) -> Float[Tensor, "n 3"]:
+    """What the photos make of the asset's colours, averaged over the nearest places where both are known."""
+    _, mine = knn(own.means, seen.means, 8)
+    difference = own.sh[mine, 0].mean(1) - seen.sh[:, 0]
+    distance, index = knn(seen.means, at, among)
+    weight = 1 / distance.clamp_min(1e-9)
+    return (difference[index] * weight[..., None]).sum(1) / weight.sum(1, keepdim=True)

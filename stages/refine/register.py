@@ -1,0 +1,159 @@
+"""A part of an object found on the whole of it: the similarity that puts the whole where the part is.
+
+Features are matched, many threes of matches give a guess each, the best guesses are polished, in the end against the
+whole with as much noise as the part has. Colours count all along. The part may be any 60 % of the surface, of any
+size, turned any way.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from stages.geometry.rotations import matrix, nearest
+from stages.geometry.similarity import Similarity
+from stages.refine.register_cloud import COLOUR, REACH, Cloud
+from stages.refine.register_guess import Poses, guesses, misfit
+from stages.scene.gaussians import Gaussians
+
+LEAST = 100  # points of a part, or there is nothing to go by
+PLANE = 0.7  # weight of the distance along the normal; along the surface it is the rest, or plain parts would hold all
+RELIT = 15 * COLOUR  # most that light may shift a colour; more is another colour
+
+
+@dataclass(frozen=True)
+class Registration:
+    """Where the whole is."""
+
+    similarity: Similarity  # whole to part
+    fit: float  # 1: every point of the part is on the whole, in place and colour; 0: none within 6 % of the diameter
+
+
+def register(part: Gaussians, whole: Gaussians, seed: int = 0) -> Registration | None:
+    """Put `whole` where `part` is; nothing when no three features agree."""
+    return register_clouds(Cloud.of(part, seed), Cloud.of(whole, seed), seed)
+
+
+def register_clouds(part: Cloud, whole: Cloud, seed: int = 0) -> Registration | None:
+    """As `register`, for clouds made before."""
+    rough = approach(part, whole, seed)
+    return settle(rough, part, whole, seed) if len(rough) else None
+
+
+def approach(part: Cloud, whole: Cloud, seed: int = 0) -> Poses:
+    """The few most promising poses, the best first, about 3 degrees off; none where no features agree."""
+    if min(len(part.points), len(whole.points)) < LEAST:
+        return Poses(torch.zeros(0), torch.zeros(0, 3, 3), torch.zeros(0, 3))
+    poses = guesses(part, whole, seed)
+    if not len(poses):
+        return poses
+    tree, order = whole.tree(), _order(part, seed)
+    poses = _best(poses, part, tree, order[:60], 200)
+    poses = _best(poses, part, tree, order[:300], 200).distinct(12, 8.0, 0.05)
+    poses = polish(poses, part, order[:300], whole, tree, 10, 0.03)
+    return _best(poses, part, tree, order[:1000], 12).distinct(2, 4.0, 0.02)
+
+
+def settle(poses: Poses, part: Cloud, whole: Cloud, seed: int = 0) -> Registration:
+    """The best of rough poses and some around them, as exact as the part allows."""
+    order, size = _order(part, seed), float(poses.scale[0])
+    noise, tint = _difference(poses[:1], part, whole)
+    noisy = whole.as_seen(size * noise, tint, REACH * size, seed)
+    tree = noisy.tree()
+    poses = polish(poses.shaken(5, seed), part, order[:700], noisy, tree, 10, 0.03)
+    poses = _best(poses, part, tree, order, 1)
+    for _ in range(3):  # what is polished is not quite what is judged, so the way there may have been better
+        poses = Poses.joined(poses, polish(poses[-1:], part, order[:2500], noisy, tree, 7, 0.02))
+    poses = _best(poses, part, tree, order, 1)
+    fit = 1 - float(misfit(poses, part.points, part.colours, tree))
+    return Registration(_in_the_scene(poses, part, whole), fit)
+
+
+def rough_fit(poses: Poses, part: Cloud, whole: Cloud) -> float:
+    """Fit of the first of rough poses; 0 without any."""
+    return 1 - float(misfit(poses[:1], part.points, part.colours, whole.tree())) if len(poses) else 0.0
+
+
+def _order(part: Cloud, seed: int) -> Int[Tensor, "n"]:
+    """The part's points shuffled, so that the first few are anywhere."""
+    return torch.randperm(len(part.points), generator=torch.Generator().manual_seed(seed))
+
+
+def _best(poses: Poses, part: Cloud, tree: cKDTree, some: Int[Tensor, "k"], most: int) -> Poses:
+    """The `most` that fit best, in order, judged by `some` points."""
+    worth = misfit(poses, part.points[some], part.colours[some], tree)
+    return poses[worth.topk(min(most, len(poses)), largest=False).indices]
+
+
+def _difference(pose: Poses, part: Cloud, whole: Cloud) -> tuple[float, Float[Tensor, "3"]]:
+    """Of a part from its whole: standard deviation off the surface [diameters of the part], and median colour.
+
+    Noise makes a thin thing thicker and its rim wider; a whole as noisy as the part is wider by as much. And the part
+    may be seen in another light, though not in any.
+    """
+    moved = pose(part.raw[:3000])[0]
+    _, index = cKDTree(whole.points.numpy()).query(moved.numpy(), workers=2)
+    off = ((moved - whole.points[index]) * whole.normals[index]).sum(1)
+    tint = (part.raw_colours[:3000] - whole.colours[index]).median(0).values
+    return 1.4826 * float(off.abs().median()) / float(pose.scale[0]), tint.clamp(-RELIT, RELIT)
+
+
+def polish(
+    poses: Poses, part: Cloud, some: Int[Tensor, "k"], whole: Cloud, tree: cKDTree, rounds: int, floor: float
+) -> Poses:
+    """Gauss-Newton on the robust one-sided coloured Chamfer distance, all poses at once.
+
+    Nearest neighbours are taken in place and colour; their distance counts mostly along the normal (Chen and Medioni
+    1992) and with weight 1 / (1 + (d / tau)^2)^2 (Geman and McClure 1985), tau being 2.5 times the median distance or
+    `floor` [diameters]. It is measured in the part's own units: in the whole's, to shrink would always look better.
+    """
+    x, colours = part.points[some].double(), part.colours[some].double()
+    targets, normals = whole.points.double(), whole.normals.double()
+    poses = Poses(poses.scale.double(), poses.rotation.double(), poses.translation.double())
+    for _ in range(rounds):
+        y = poses(x)
+        distance, index = tree.query(torch.cat([y, colours.expand_as(y)], 2).numpy(), workers=2)
+        distance, index = torch.from_numpy(distance), torch.from_numpy(index)
+        tau = (2.5 * distance.median(1, keepdim=True).values).clamp_min(floor)
+        step = _step(y, y - targets[index], normals[index], 1 / (1 + (distance / tau).square()))
+        poses = _moved(poses, y.mean(1), step)
+        if float(step.abs().max()) < 2e-5:
+            break
+    return Poses(poses.scale.float(), nearest(poses.rotation).float(), poses.translation.float())
+
+
+def _step(
+    y: Float[Tensor, "h k 3"], error: Float[Tensor, "h k 3"], normals: Float[Tensor, "h k 3"], weight: Tensor
+) -> Float[Tensor, "h 7"]:
+    """Turn [rad], shift and log scale about the mean of y that lessen the weighted errors the most."""
+    arm = y - y.mean(1, keepdim=True)
+    axes = [(normals, PLANE), *((axis.expand_as(y), 1 - PLANE) for axis in torch.eye(3).double())]
+    system = torch.zeros(len(y), 8, 8, dtype=torch.float64)
+    for axis, share in axes:
+        along = [((arm - error) * axis).sum(2, keepdim=True), (error * axis).sum(2, keepdim=True)]
+        rows = torch.cat([torch.linalg.cross(arm, axis), axis, *along], 2) * (share**0.5 * weight[..., None])
+        system += rows.mT @ rows
+    H, slope = system[:, :7, :7], system[:, :7, 7]
+    damping = 1e-9 * H.diagonal(dim1=1, dim2=2).mean(1)
+    return -torch.linalg.solve(H + damping[:, None, None] * torch.eye(7).double(), slope).clamp(-0.5, 0.5)
+
+
+def _moved(poses: Poses, about: Float[Tensor, "h 3"], step: Float[Tensor, "h 7"]) -> Poses:
+    """Poses after a step of Gauss-Newton."""
+    angle = step[:, :3].norm(dim=1, keepdim=True).clamp_min(1e-12)
+    turn = matrix(torch.cat([(angle / 2).cos(), step[:, :3] / angle * (angle / 2).sin()], 1))
+    grown = step[:, 6].exp()
+    arm = (turn @ (poses.translation - about)[..., None])[..., 0]
+    return Poses(poses.scale * grown, turn @ poses.rotation, grown[:, None] * arm + about + step[:, 3:6])
+
+
+def _in_the_scene(pose: Poses, part: Cloud, whole: Cloud) -> Similarity:
+    """Whole to part in the units of the scene, from part to whole in normalised frames."""
+    scale, R = float(pose.scale[0]), pose.rotation[0].mT
+    grown = part.diameter / (scale * whole.diameter)
+    shift = part.centre - part.diameter / scale * R @ pose.translation[0] - grown * R @ whole.centre
+    return Similarity(grown, R, shift)

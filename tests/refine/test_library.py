@@ -1,0 +1,122 @@
+"""The library completer: what fits is put in place, what does not is left alone, the photos' look stays."""
+
+import logging
+from dataclasses import replace
+
+import pytest
+import torch
+
+from stages.errors import InputError
+from stages.evaluate.clouds import chamfer, nearest
+from stages.geometry.cameras import centres, intrinsics, look_at
+from stages.geometry.harmonics import C0
+from stages.geometry.rotations import matrix
+from stages.geometry.similarity import Similarity
+from stages.lab.shapes import ellipsoid
+from stages.raster.rasterise import rasterise
+from stages.refine.library import moved
+from stages.refine.options import RefineOptions
+from stages.refine.sight import Sight
+from stages.refine.stage import refine, run
+from stages.scene.gaussians import concatenate
+from stages.scene.scene import Scene, SceneObject
+from stages.scene.scene_ply import read_scene, write_scene
+from tests.conftest import random_gaussians
+from tests.refine.things import thing
+from tests.segment.tabletop import coloured, scene_of, table
+
+SIZE, TURN = 0.3, matrix(torch.tensor([0.9, 0.0, 0.0, 0.4]))
+PLACE = Similarity(SIZE, TURN, torch.tensor([0.02, -0.03, 0.1 * SIZE]))
+DARK = 0.85  # the photos show the thing in less light than the library
+
+
+@pytest.fixture(scope="module")
+def truth():
+    return moved(thing(), PLACE)
+
+
+@pytest.fixture(scope="module")
+def seen(truth) -> Scene:
+    """The thing on a table as four cameras on one side see it, darker than in the library."""
+    black = -0.5 / C0
+    scene = scene_of(table(0.02), replace(truth, sh=black + DARK * (truth.sh - black)))
+    all_round = scene.cameras
+    ahead = torch.nonzero(centres(all_round.viewmats)[:, 1] < -0.1)[:, 0]
+    cameras = replace(
+        all_round, viewmats=all_round.viewmats[ahead], Ks=all_round.Ks[ahead], sizes=all_round.sizes[ahead],
+        names=tuple(all_round.names[i] for i in ahead.tolist()),
+    )  # fmt: skip
+    scene = replace(scene, objects=(SceneObject(1, "thing"),), cameras=cameras)
+    g = scene.gaussians
+    return replace(scene, gaussians=g[(Sight.of(scene).weight > 0.02) | (g.object_id == 0)])
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    home = tmp_path_factory.mktemp("library")
+    write_scene(home / "thing.ply", Scene(thing()))
+    nested = home / "egg/point_cloud/iteration_30000"
+    nested.mkdir(parents=True)
+    write_scene(nested / "point_cloud.ply", Scene(coloured(ellipsoid((0.3, 0.25, 0.5), 4000), (0.9, 0.9, 0.85), 1)))
+    return home
+
+
+@pytest.fixture(scope="module")
+def whole(seen, folder) -> Scene:
+    return refine(seen, RefineOptions(library=folder, background=False, keep_raw=True))
+
+
+def test_the_thing_is_whole_where_it_was_not_seen(seen, whole, truth):
+    before, after = (s.gaussians.means[s.gaussians.object_id == 1] for s in (seen, whole))
+    far = [chamfer(nearest(p, truth.means), nearest(truth.means, p)) for p in (before, after)]
+    assert far[1]["to_prediction"] < 0.2 * far[0]["to_prediction"]
+    assert far[1]["to_truth"] < 0.01 * SIZE
+
+
+def test_it_is_as_dark_as_in_the_photos(whole, truth):
+    g = whole.gaussians[whole.gaussians.object_id == 1]
+    back = g[g.means[:, 1] > 0.045]
+    there = nearest(back.means, truth.means).index
+    rgb, bright = (x.sh[:, 0] * C0 + 0.5 for x in (back, truth[there]))
+    assert float(rgb.sum() / bright.sum()) == pytest.approx(DARK, abs=0.06)
+
+
+def test_raw_objects_are_kept_behind_the_completed_ones(seen, whole):
+    assert [(o.id, o.name) for o in whole.objects] == [(1, "thing"), (2, "thing (raw)")]
+    raw = whole.gaussians.means[whole.gaussians.object_id == 2]
+    assert len(raw) <= int((seen.gaussians.object_id == 1).sum())
+    assert len(raw) < int((whole.gaussians.object_id == 1).sum())
+
+
+def test_a_stranger_is_left_alone_and_it_is_said(folder, caplog):
+    strange = coloured(ellipsoid((0.05, 0.05, 0.12), 3000).moved((0, 0, 0.12)), (0.1, 0.7, 0.7), 1)
+    scene = replace(scene_of(table(0.02), strange), objects=(SceneObject(1, "bottle"),))
+    with caplog.at_level(logging.INFO):
+        refined = refine(scene, RefineOptions(library=folder, background=False))
+    assert int((refined.gaussians.object_id == 1).sum()) <= len(strange)
+    assert "bottle" in caplog.text and "left alone" in caplog.text
+
+
+def test_a_moved_object_looks_as_before_from_a_camera_moved_with_it():
+    g = random_gaussians(200, degree=2)
+    there = Similarity(1.7, matrix(torch.tensor([0.5, 0.3, -0.6, 0.2])), torch.tensor([1.0, -2.0, 0.5]))
+    viewmat, K = look_at(torch.tensor([2.0, 1.0, 1.5]), torch.zeros(3))[None], intrinsics(48, 48, 60.0)[None]
+    before = rasterise(g, viewmat, K, 48, 48).rgb
+    after = rasterise(moved(g, there), there.viewmats(viewmat), K, 48, 48).rgb
+    torch.testing.assert_close(before, after, rtol=0, atol=2e-3)
+
+
+def test_what_is_no_library_is_said(seen, tmp_path):
+    write_scene(tmp_path / "labelled.ply", seen)
+    for folder, says in ((tmp_path / "none", "is no folder"), (tmp_path / "empty", "holds no .ply")):
+        (tmp_path / "empty").mkdir(exist_ok=True)
+        with pytest.raises(InputError, match=says):
+            run(tmp_path / "labelled.ply", tmp_path / "out.ply", RefineOptions(library=folder))
+    with pytest.raises(InputError, match="--library"):
+        RefineOptions(completer="library")
+
+
+def test_the_output_says_which_library(seen, folder, tmp_path):
+    write_scene(tmp_path / "labelled.ply", replace(seen, gaussians=concatenate([seen.gaussians[::4]])))
+    run(tmp_path / "labelled.ply", tmp_path / "out.ply", RefineOptions("none", library=folder, background=False))
+    assert read_scene(tmp_path / "out.ply").provenance["options"]["library"] == str(folder)

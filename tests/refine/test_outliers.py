@@ -1,0 +1,39 @@
+"""Floaters go, and nothing else."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from stages.geometry.neighbours import knn
+from stages.refine.outliers import EVEN, floaters, score
+from stages.scene.gaussians import Gaussians, concatenate
+from tests.segment.tabletop import block, egg
+
+
+def with_floaters(body: Gaussians, count: int = 60) -> Gaussians:
+    """A body and stray Gaussians around it, alone or in pairs, as bad matches leave them."""
+    rng = torch.Generator().manual_seed(0)
+    size = float((body.means.amax(0) - body.means.amin(0)).norm())
+    out = torch.nn.functional.normalize(torch.randn(count, 3, generator=rng), dim=1)
+    far = size * (0.8 + 2 * torch.rand(count, 1, generator=rng))
+    stray = replace(body[torch.arange(count)], means=body.means.mean(0) + far * out)
+    stray.means[1::2] = stray.means[::2] + 0.02 * size
+    return concatenate([body, stray])
+
+
+@pytest.mark.parametrize("kind", ["block", "egg", "rod"])
+def test_what_is_left_has_no_floaters_beyond_three_robust_deviations(kind):
+    body = {
+        "block": lambda: block((0.0, 0.0), (0.2, 0.16, 0.12), (0.8, 0.1, 0.1), 1),
+        "egg": lambda: egg((0.0, 0.0, 0.1), (0.06, 0.06, 0.09), (0.1, 0.2, 0.8), 1),
+        "rod": lambda: block((0.0, 0.0), (0.6, 0.03, 0.03), (0.1, 0.6, 0.2), 1),
+    }[kind]()
+    g = with_floaters(body)
+    found = floaters(g)
+    assert found[len(body) :].all()
+    assert float(found[: len(body)].float().mean()) < 0.01
+    left = g.means[~found]
+    far = score((left - left.median(0).values).norm(dim=1))
+    alone = score(knn(left, left, 9)[0][:, -1].log(), EVEN)
+    assert not ((far > 3) & (alone > 3)).any()

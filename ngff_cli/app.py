@@ -108,13 +108,16 @@ def segment(
     detail: Annotated[
         float, Option(help="how unlike two regions may be and still be one object; smaller gives more objects")
     ] = SegmentOptions.detail,
+    scale_reference: Annotated[
+        str, Option(help='a length measured on an object, which gives metres: "object=1 height=0.12" (or length=)')
+    ] = SegmentOptions.scale_reference,
     seed: Seed = SegmentOptions.seed,
     device: Device = SegmentOptions.device,
 ) -> None:
     """Which Gaussians are one object: SCENE.ply -> LABELLED.ply (object_id: 0 background, 1... objects)."""
     from stages.segment.stage import run
 
-    options = SegmentOptions(backend, masks, boxes, names, max_objects, min_size, detail, seed, device)
+    options = SegmentOptions(backend, masks, boxes, names, max_objects, min_size, detail, scale_reference, seed, device)
     run(scene, out, options)
 
 

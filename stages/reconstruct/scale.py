@@ -50,7 +50,7 @@ def parse_scale(text: str) -> ScaleReference | None:
     if not text:
         return None
     if "object" in text and "photos" not in text:
-        raise InputError(f"--scale-reference {text!r}: objects are known only once segmented; here give {FORMS}")
+        raise InputError(f"--scale-reference {text!r}: objects are known only once segmented, where the same option takes them; here give {FORMS}")
     found = FORM.fullmatch(text.strip())
     try:
         distance = float(found["distance"])

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from stages.errors import InputError
+from stages.segment.scale import parse_scale
 
 BACKENDS = {
     "geometric": "stages.segment.geometric:segment",
@@ -23,6 +24,7 @@ class SegmentOptions:
     max_objects: int = 24
     min_size: float = 0.03  # of an object, along its longest side [distance of the cameras from what they look at]
     detail: float = 0.41  # how unlike two regions may be and still be one object; smaller gives more objects
+    scale_reference: str = ""  # "object=1 height=0.12": a length that was measured [m]
     seed: int = 0
     device: str = "auto"
 
@@ -35,7 +37,7 @@ class SegmentOptions:
             raise InputError(f"--min-size {self.min_size}: must be between 0 and 1, such as 0.03")
         if not 0 < self.detail < 2:
             raise InputError(f"--detail {self.detail}: must be between 0 and 2, such as 0.4")
-        self.renamed  # noqa: B018 -- a bad name is found before work starts
+        self.renamed, parse_scale(self.scale_reference)  # noqa: B018 -- what is bad is found before work starts
 
     @property
     def chosen(self) -> str:

@@ -12,6 +12,7 @@ from stages.scene.files import provenance
 from stages.scene.scene import Scene
 from stages.scene.scene_ply import read_scene, write_scene
 from stages.segment.options import BACKENDS, SegmentOptions
+from stages.segment.scale import parse_scale
 
 log = logging.getLogger(__name__)
 
@@ -22,6 +23,8 @@ def run(scene: Path, out: Path, options: SegmentOptions = SegmentOptions()) -> N
     pick_device(options.device)  # refuses a GPU that is not there; the work itself is light and stays on the CPU
     whole = read_scene(scene)
     labelled = renamed(segment(whole, options), options)
+    known = parse_scale(options.scale_reference)
+    labelled = known.applied(labelled) if known else labelled
     inputs = [Path(p) for p in (scene, options.boxes) if p is not None]
     facts = {**provenance("segment", inputs, options), "scene": whole.provenance}
     write_scene(out, replace(labelled, provenance=facts))

@@ -59,6 +59,15 @@ def test_geometric_writes_labels_names_cameras_and_where_they_come_from(scene_fi
     assert "tower of jelly" in caplog.text and " cm" in caplog.text
 
 
+@pytest.mark.parametrize(("side", "axes"), [("height", [2]), ("length", [0, 1, 2])])
+def test_a_measured_object_gives_metres(scene_file, truth, tmp_path, side, axes):
+    masks = write_masks(tmp_path / "masks", truth, true_masks(truth))
+    run(scene_file, tmp_path / "out.ply", SegmentOptions(masks=masks, scale_reference=f"object=2 {side}=0.6"))
+    means = truth.gaussians.means[truth.gaussians.object_id == 2][:, axes]
+    units = float((means.amax(0) - means.amin(0)).max())
+    assert read_scene(tmp_path / "out.ply").metres_per_unit == pytest.approx(0.6 / units, rel=0.05)
+
+
 def test_masks_with_wrong_pixels_are_outvoted(scene_file, truth, tmp_path):
     rng = torch.Generator().manual_seed(0)
     masks = true_masks(truth)
@@ -120,6 +129,7 @@ def test_boxes_name_the_groups_that_fill_them(scene_file, truth, tmp_path):
         (lambda p: (p / "b.json").write_text('{"bbox": [[5, 5, 1, 1]], "text": ["x"]}') and {"boxes": p / "b.json"},
          "has no area"),
         (lambda p: {"names": "9=duck"}, "there is no object 9"),
+        (lambda p: {"scale_reference": "object=9 height=0.1"}, "there is no object 9"),
     ],
 )  # fmt: skip
 def test_a_mistake_is_one_sentence_and_nothing_is_written(scene_file, tmp_path, prepare, says):
@@ -136,8 +146,9 @@ def test_masks_of_other_proportions_are_refused(scene_file, truth, tmp_path):
 
 @pytest.mark.parametrize(
     ("wrong", "says"),
-    [({"names": "duck"}, "NUMBER=NAME"), ({"max_objects": 0}, "max-objects"), ({"min_size": 2.0}, "min-size"),
-     ({"detail": 0.0}, "detail"), ({"masks": "a", "boxes": "b"}, "one of them")],
+    [({"names": "duck"}, "NUMBER=NAME"), ({"scale_reference": "duck=0.1"}, "object=1 height=0.12"),
+     ({"scale_reference": "object=1 height=0"}, "more than 0"), ({"max_objects": 0}, "max-objects"),
+     ({"min_size": 2.0}, "min-size"), ({"detail": 0.0}, "detail"), ({"masks": "a", "boxes": "b"}, "one of them")],
 )  # fmt: skip
 def test_options_check_themselves(wrong, says):
     with pytest.raises(InputError, match=says):

@@ -1,0 +1,52 @@
+"""What the user knows about the size of an object: photos alone have no scale."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from stages.errors import InputError
+
+if TYPE_CHECKING:
+    from stages.scene.scene import Scene
+
+FORM = re.compile(r"object=(?P<object>[0-9]+)\s+(?P<side>height|length)=(?P<metres>[0-9.eE+-]+)")
+OUTERMOST = 0.005  # of an object's Gaussians at either end do not count
+
+
+@dataclass(frozen=True)
+class ScaleReference:
+    """A length that was measured: how high an object stands, or its longest side in x, y and z."""
+
+    object: int
+    side: str  # height | length
+    metres: float
+
+    def applied(self, scene: Scene) -> Scene:
+        """The scene with its `metres_per_unit` set by the object. Raises InputError when there is none."""
+        means = scene.gaussians.means[scene.gaussians.object_id == self.object].double()
+        if len(means) < 2:
+            have = ", ".join(f"{o.id} ({o.name})" for o in scene.objects) or "none"
+            raise InputError(f"--scale-reference: there is no object {self.object} in the scene; found were {have}")
+        sides = means.quantile(1 - OUTERMOST, dim=0) - means.quantile(OUTERMOST, dim=0)
+        units = float(sides[2] if self.side == "height" else sides.max())
+        if units <= 0:
+            raise InputError(f"--scale-reference: object {self.object} has no {self.side} in the scene; name another")
+        source = f"--scale-reference object={self.object} {self.side}={self.metres:g}"
+        return replace(scene, scale={"metres_per_unit": self.metres / units, "source": source})
+
+
+def parse_scale(text: str) -> ScaleReference | None:
+    """From the form of the command line; None for an empty text."""
+    if not text:
+        return None
+    found = FORM.fullmatch(text.strip())
+    try:
+        metres = float(found["metres"])
+    except (TypeError, ValueError) as error:
+        raise InputError(f'--scale-reference {text!r}: write "object=1 height=0.12" or "object=1 length=0.2", in '
+                         "metres") from error  # fmt: skip
+    if not 0 < metres < 1e5:
+        raise InputError(f"--scale-reference {text!r}: the length must be more than 0 and less than 100,000 m")
+    return ScaleReference(int(found["object"]), found["side"], metres)

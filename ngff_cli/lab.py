@@ -359,17 +359,14 @@ def bench_pi3(
 
 @bench.command("segment")
 def bench_segment(
-    source: Annotated[str, typer.Option(help="what is segmented: truth | photos")] = "truth",
     scenes: Annotated[int, typer.Option(help="scenes of each kind, apart and touching")] = 4,
-    photos: Annotated[int, typer.Option(help="photos a scene")] = 24,
-    quality: Annotated[str, typer.Option(help="of the reconstruction from photos")] = "draft",
+    photos: Annotated[int, typer.Option(help="photos whose cameras a scene has")] = 24,
     out: Annotated[Path | None, typer.Option("-o", "--out", help="the numbers as JSON")] = None,
-    device: Device = "auto",
 ) -> None:
     """Objects found without labels: overlap with the truth, apart and touching."""
     from stages.lab.bench_segment import BenchOptions, run
 
-    for line in run(out, BenchOptions(scenes, source, photos, quality, device)):
+    for line in run(out, BenchOptions(scenes, photos)):
         print(line, flush=True)
 
 

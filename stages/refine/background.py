@@ -25,7 +25,7 @@ MOST = 512  # cells along the longer side of the picture of the table
 MARGIN = 0.06  # around what is under an object [view radii]
 BARELY = 1.0  # weight in a view below which a Gaussian is not missed there [px of the small images]
 OTHER = 12.0  # CIELAB distance from which a colour is not the table's
-COVERED = 0.75  # alpha above which the table is there
+COVERED = 0.92  # alpha above which the table is there
 
 
 @dataclass(frozen=True)

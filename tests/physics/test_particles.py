@@ -1,6 +1,7 @@
 """Gaussians to particles: volumes, hollows, sheets, overlaps, and input that makes no sense."""
 
 import math
+import time
 from dataclasses import replace
 
 import pytest
@@ -77,6 +78,7 @@ def test_overlapping_objects_share_no_voxel():
 
 
 NAN, INF = float("nan"), float("inf")
+MOST_SECONDS = 60.0  # of processor time: twenty times what the slowest takes
 BAD = {
     "a point": lambda: splats(torch.zeros(1, 3)),
     "the same point many times": lambda: splats(torch.zeros(500, 3)),
@@ -88,6 +90,12 @@ BAD = {
     "all transparent": lambda: Gaussians(*splats(sphere(200)).__dict__.values()).__class__(
         **{**splats(sphere(200)).__dict__, "opacities": torch.zeros(200)}
     ),
+    "a plane": lambda: splats(torch.rand(3000, 3) * torch.tensor([1.0, 1, 0])),
+    "a plane a thousand times as large": lambda: splats(1000 * torch.rand(3000, 3) * torch.tensor([1.0, 1, 0])),
+    "a few huge discs": lambda: splats(sphere(8), scale=50.0),
+    "sizes of zero": lambda: splats(sphere(3000), scale=0.0),
+    "needles": lambda: replace(splats(sphere(3000)), scales=torch.tensor([[5.0, 1e-9, 1e-9]]).repeat(3000, 1)),
+    "nothing finite but one": lambda: splats(torch.cat([torch.full((500, 3), NAN), torch.zeros(1, 3)])),
     "a speck far away": lambda: concatenate([splats(sphere(2000)), splats(torch.full((3, 3), 50.0))]),
 }
 
@@ -102,8 +110,10 @@ def broken(**fields: list) -> Gaussians:
 
 @pytest.mark.parametrize("name", BAD)
 def test_every_object_gets_some_particles(name):
+    start = time.process_time()
     bodies = sample(scene(splats(sphere(2000) + 0.5), Gaussians(**{
         **BAD[name]().__dict__, "object_id": torch.full((len(BAD[name]()),), 2)})), 4000)  # fmt: skip
+    assert time.process_time() - start < MOST_SECONDS
     counts = bodies.body.bincount(minlength=2)
     assert counts.min() >= FEWEST and len(bodies.x) < 20_000
     assert bodies.x.isfinite().all() and bodies.spacing > 0

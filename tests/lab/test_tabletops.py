@@ -1,0 +1,101 @@
+"""Scenes with known truth, and the two benchmarks that use them, on objects that are quick to make."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial import cKDTree
+
+from stages.errors import InputError
+from stages.lab import bench_refine, bench_segment, tabletops
+from stages.lab.backgrounds import TOP
+from stages.lab.objects import OBJECTS
+from stages.lab.tabletops import CONTACT, EACH, GAP, REACH, tabletop
+from stages.scene.gaussians import Gaussians
+from tests.segment.tabletop import block
+
+COLOURS = {name: rgb for name, rgb in zip(
+    OBJECTS, [(0.8, 0.1, 0.1), (0.2, 0.4, 0.9), (0.7, 0.1, 0.1), (0.9, 0.8, 0.1), (0.9, 0.7, 0.1), (0.1, 0.7, 0.7),
+              (0.1, 0.1, 0.1), (0.3, 0.1, 0.4), (0.1, 0.2, 0.6), (0.6, 0.4, 0.2)], strict=True)}  # fmt: skip
+
+
+def simple(name: str) -> Gaussians:
+    """A block of longest side 1 in the object's place, around the origin."""
+    g = block((0.0, 0.0), (1.0, 0.8, 0.7), COLOURS[name], 1, spacing=0.05)
+    return replace(g, means=g.means - torch.tensor([0, 0, 0.35]))
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch):
+    monkeypatch.setattr(tabletops, "make_object", simple)
+    tabletops._resting.cache_clear()
+    yield
+    tabletops._resting.cache_clear()
+
+
+def gaps(scene) -> np.ndarray:
+    """Least distances between the objects of a scene (o, o), inf on the diagonal."""
+    g = scene.gaussians
+    clouds = [g.means[g.object_id == i].numpy() for i in range(1, EACH + 1)]
+    out = np.full((EACH, EACH), np.inf)
+    for i in range(EACH):
+        for j in range(i):
+            out[i, j] = out[j, i] = cKDTree(clouds[i]).query(clouds[j])[0].min()
+    return out
+
+
+def test_two_scenes_show_all_ten_objects_resting_on_the_table():
+    scenes = [tabletop("apart", i) for i in (0, 1)]
+    assert sorted(o.name for s in scenes for o in s.objects) == sorted(OBJECTS)
+    for scene in scenes:
+        g = scene.gaussians
+        for i in range(1, EACH + 1):
+            mine = g.means[g.object_id == i]
+            assert float(mine[:, 2].min()) == pytest.approx(TOP, abs=0.005)
+            assert float(mine[:, :2].norm(dim=1).max()) < 1.5 * REACH
+        assert gaps(scene).min() > 0.9 * GAP
+
+
+@pytest.mark.parametrize("index", [0, 3])
+def test_touching_things_touch_and_do_not_overlap(index):
+    between = gaps(tabletop("touching", index))
+    assert (between.min(1) < CONTACT + 0.003).all()  # every one has a neighbour that it touches
+    assert between.min() > 0.2 * CONTACT
+    assert between[:3, 3:].min() > 0.9 * GAP  # and the two groups stand apart
+
+
+def test_the_same_scene_again_is_the_same():
+    one, two = (tabletop("touching", 1).gaussians for _ in range(2))
+    assert torch.equal(one.means, two.means) and torch.equal(one.object_id, two.object_id)
+
+
+def test_overlap_by_hand():
+    truth = torch.tensor([1, 1, 1, 1, 2, 2, 0, 0])
+    found = torch.tensor([3, 3, 3, 0, 3, 5, 5, 0])
+    # object 1: 3 of (4 + 4 - 3) with thing 3; object 2: 1 of 3 with thing 5, 1 of 5 with thing 3
+    assert bench_segment.overlaps(found, truth) == pytest.approx({1: 3 / 5, 2: 1 / 3})
+    assert bench_segment.overlaps(torch.zeros(8, dtype=torch.int64), truth) == {1: 0.0, 2: 0.0}
+
+
+@pytest.mark.slow
+def test_the_segment_report_finds_blocks_apart(tmp_path):
+    lines = list(bench_segment.run(tmp_path / "s.json", bench_segment.BenchOptions(scenes=1)))
+    kept = json.loads((tmp_path / "s.json").read_text())
+    assert set(kept["mean_iou"]) == set(tabletops.KINDS) and len(lines) == 5
+    assert kept["mean_iou"]["apart"] > 0.9
+
+
+@pytest.mark.slow
+def test_a_filled_hole_is_nearer_to_the_truth_than_an_open_one():
+    row = bench_refine.measure(0, photos=8)
+    assert row["pixels"] > 500
+    assert row["after_db"] > row["before_db"] + 6
+    assert row["elsewhere_db"] > 32  # a hole has a rim
+
+
+@pytest.mark.parametrize("wrong", [{"scenes": 0}, {"photos": 3}])
+def test_options_check_themselves(wrong):
+    with pytest.raises(InputError):
+        bench_segment.BenchOptions(**wrong)

@@ -1,0 +1,81 @@
+"""The bench judges rightly: exact answers have no error, turns that cannot be seen are none, ICP finds what is near."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from stages.geometry.harmonics import rgb_to_sh
+from stages.geometry.rotations import matrix
+from stages.geometry.similarity import Similarity
+from stages.lab import bench_register
+from stages.lab.bench_register import BenchOptions, about_z, angle, errors, icp, inverse, run, trial
+from stages.lab.shapes import ellipsoid
+from tests.refine.things import somewhere, thing
+from tests.segment.tabletop import coloured
+
+
+@pytest.fixture(scope="module")
+def can():
+    """A grey cylinder-like egg; `painted` has one side red."""
+    return coloured(ellipsoid((0.3, 0.3, 0.5), 8000), (0.5, 0.5, 0.5), 1, grain=0.0)
+
+
+def turned_about_z(pose: Similarity, degrees: float) -> Similarity:
+    half = torch.deg2rad(torch.tensor(degrees / 2))
+    about = matrix(torch.stack([half.cos(), torch.tensor(0.0), torch.tensor(0.0), half.sin()]))
+    return Similarity(pose.scale, pose.rotation @ about, pose.translation)
+
+
+def test_the_truth_has_no_error_and_what_is_off_has_as_much_as_it_is_off(can):
+    given = trial(can, 0, BenchOptions())
+    exact = errors(given.truth, given, can, revolved=True)
+    assert max(exact.values()) < 0.1
+    larger = given.truth._replace(scale=1.05 * given.truth.scale)
+    assert errors(larger, given, can, revolved=False)["scale"] == pytest.approx(5, abs=1e-3)
+    off = turned_about_z(given.truth, 20.0)
+    assert errors(off, given, can, revolved=False)["rotation up to symmetry"] == pytest.approx(20, abs=0.1)
+
+
+def test_a_turn_that_nobody_can_see_is_no_error_and_one_of_a_painted_side_is(can):
+    given = trial(can, 0, BenchOptions())
+    off = turned_about_z(given.truth, 90.0)
+    assert errors(off, given, can, revolved=True)["rotation up to symmetry"] < 0.1
+    red = torch.where(can.means[:, :1] > 0, torch.tensor([0.9, 0.1, 0.1]), torch.tensor([0.5, 0.5, 0.5]))
+    painted = replace(can, sh=rgb_to_sh(red))
+    assert errors(off, given, painted, revolved=True)["rotation up to symmetry"] == pytest.approx(90, abs=0.1)
+
+
+def test_a_part_is_the_share_of_the_whole_that_was_asked_for_where_the_truth_puts_it(can):
+    given = trial(can, 1, BenchOptions(missing=0.4, noise=0.0, tint=0.0))
+    assert len(given.part) == round(0.6 * len(can))
+    torch.testing.assert_close(given.part.means, given.truth(can.means[given.seen]))
+    torch.testing.assert_close(given.part.sh, can.sh[given.seen])
+
+
+def test_the_turn_about_z_is_taken_apart_from_the_rest():
+    a = matrix(torch.tensor([0.9, 0.0, 0.0, 0.3]))
+    assert angle(a @ about_z(a).mT) < 0.1
+    x = matrix(torch.tensor([0.9, 0.3, 0.0, 0.0]))
+    assert angle(about_z(x)) < 0.1
+
+
+def test_there_and_back_is_nowhere():
+    pose = somewhere(2)
+    points = torch.randn(5, 3)
+    torch.testing.assert_close(inverse(pose)(pose(points)), points, rtol=0, atol=1e-5)
+
+
+def test_icp_finds_a_whole_that_is_turned_a_little():
+    whole = thing(0.02)
+    pose = Similarity(1.3, matrix(torch.tensor([1.0, 0.02, 0.03, -0.02])), torch.tensor([0.2, 0.1, 0.0]))
+    found = icp(replace(whole, means=pose(whole.means)), whole)
+    assert (found(whole.means) - pose(whole.means)).norm(dim=1).mean() < 0.03
+
+
+def test_a_run_counts_and_writes(tmp_path, monkeypatch):
+    monkeypatch.setattr(bench_register, "make_object", lambda name: thing(0.02))
+    monkeypatch.setattr(bench_register, "methods", lambda: {"ICP": icp})
+    lines = list(run(tmp_path / "out.json", BenchOptions("duck", 1)))
+    assert lines[0].split() == ["right", "of", "1", "ICP"] and lines[1].split()[0] == "duck"
+    assert '"method": "ICP"' in (tmp_path / "out.json").read_text()

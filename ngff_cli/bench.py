@@ -1,0 +1,181 @@
+"""`ngff-lab bench`: how good and how fast things are, beside a peer in the same run."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ngff_cli.options import Commands, Device, Seed
+from stages.errors import InputError
+
+app = typer.Typer(cls=Commands, no_args_is_help=True, rich_markup_mode=None)
+
+
+@app.callback()
+def _bench() -> None:
+    """Measure beside a peer in the same run."""
+
+
+@app.command("mpm")
+def bench_mpm(
+    device: Device = "auto",
+    particles: Annotated[list[int], typer.Option(help="particles a scene; may be repeated")] = [6_144, 20_000, 250_000],  # noqa: B006
+    scenes: Annotated[int, typer.Option(help="scenes a batch; 0: what suits the device")] = 0,
+    frames: Annotated[int, typer.Option(help="frames of 200 substeps to time")] = 10,
+) -> None:
+    """The MPM solver: time a substep, scenes a minute, and the plain three-kernel form."""
+    from stages.lab.bench_mpm import BenchOptions, run
+
+    for line in run(BenchOptions(device, tuple(particles), scenes, frames)):
+        print(line, flush=True)
+
+
+@app.command("raster")
+def bench_raster(
+    out: Annotated[Path | None, typer.Option("-o", "--out", help="the numbers as JSON")] = None,
+    repeat: Annotated[int, typer.Option(help="timed calls of each; the fastest counts")] = 15,
+    shrink: Annotated[int, typer.Option(help="divide Gaussians and pixels by this, for a quick look")] = 1,
+) -> None:
+    """The CPU rasteriser: frames a second and time on one thread, beside one thread a pixel."""
+    from stages.lab.bench_raster import BenchOptions, run
+
+    for line in run(out, BenchOptions(repeat, shrink)):
+        print(line, flush=True)
+
+
+@app.command("reconstruct")
+def bench_reconstruct(
+    sets: Annotated[list[Path], typer.Argument(metavar="PHOTOSET...", help="folders with images/ and cameras.json")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="the results as JSON, added to what is there")] = Path(
+        "reconstruct.json"
+    ),
+    quality: Annotated[str, typer.Option(help="of the reconstruction")] = "normal",
+    holdout: Annotated[int, typer.Option(help="keep every N-th photo out")] = 8,
+    device: Device = "auto",
+) -> None:
+    """Photos to Gaussians: cameras against reference cameras, photos kept out, time and memory."""
+    from stages.lab.bench_reconstruct import BenchOptions, run
+
+    for line in run(sets, out, BenchOptions(quality, holdout, device)):
+        print(line, flush=True)
+
+
+@app.command("pi3")
+def bench_pi3(
+    device: Device = "auto",
+    views: Annotated[list[int], typer.Option(help="photos at a time; may be repeated")] = [1, 8, 20, 50],  # noqa: B006
+    size: Annotated[int, typer.Option(help="side of the photos, a multiple of 14 [px]")] = 448,
+    repeat: Annotated[int, typer.Option(help="timed passes of each")] = 3,
+    splats: Annotated[bool, typer.Option("--splats", help="with the head of Gaussians")] = False,
+) -> None:
+    """π³ at its published size with random weights: seconds and memory, beside attention written out."""
+    from stages.lab.bench_pi3 import BenchOptions, run
+
+    for line in run(BenchOptions(device, tuple(views), size, repeat, splats)):
+        print(line, flush=True)
+
+
+@app.command("segment")
+def bench_segment(
+    scenes: Annotated[int, typer.Option(help="scenes of each kind, apart and touching")] = 4,
+    photos: Annotated[int, typer.Option(help="photos whose cameras a scene has")] = 24,
+    out: Annotated[Path | None, typer.Option("-o", "--out", help="the numbers as JSON")] = None,
+) -> None:
+    """Objects found without labels: overlap with the truth, apart and touching."""
+    from stages.lab.bench_segment import BenchOptions, run
+
+    for line in run(out, BenchOptions(scenes, photos)):
+        print(line, flush=True)
+
+
+@app.command("refine")
+def bench_refine(
+    scenes: Annotated[int, typer.Option(help="scenes, of objects apart")] = 4,
+    photos: Annotated[int, typer.Option(help="photos a scene")] = 24,
+    out: Annotated[Path | None, typer.Option("-o", "--out", help="the numbers as JSON")] = None,
+) -> None:
+    """Holes that lifted objects leave: the table there beside the true one, from new views."""
+    from stages.lab.bench_refine import BenchOptions, run
+
+    for line in run(out, BenchOptions(scenes, photos)):
+        print(line, flush=True)
+
+
+@app.command("dynamics")
+def bench_dynamics(
+    data: Annotated[Path | None, typer.Option(help="folder of motions, as `ngff-lab dataset` writes")] = None,
+    weights: Annotated[
+        Path | None, typer.Option(help="folder of weights (.safetensors), all of which are measured; by default ours")
+    ] = None,
+    out: Annotated[
+        Path, typer.Option("-o", "--out", help="the results (.json); table (.md) and plots (.png) go beside it")
+    ] = Path("results.json"),
+    nudged: Annotated[
+        Path | None, typer.Option(help="the same scenes with starts moved by 1 mm, as another data set")
+    ] = None,
+    results: Annotated[
+        Path | None, typer.Option("--from", help="only table and plots, from these results (.json)")
+    ] = None,
+    keypoints: Annotated[int, typer.Option(help="of each object")] = 256,
+    limit: Annotated[int, typer.Option(help="scenes of each split; 0: all")] = 0,
+    mpm: Annotated[
+        int, typer.Option(help="scenes of each split for mpm-estimated, simulated on the way; 0: without that row")
+    ] = 100,
+    device: Device = "auto",
+) -> None:
+    """The dynamics models on motion that they have not seen."""
+    from stages.lab.bench_dynamics import BenchOptions, again, run
+    from stages.models.weights import HERE
+
+    if results is None and data is None:
+        raise InputError("--data: name the folder of motions to measure on, or --from results to draw again")
+    for line in (
+        again(results) if results is not None
+        else run(data, weights or HERE, out, BenchOptions(keypoints, limit, mpm, device=device), nudged)
+    ):
+        print(line)
+
+
+@app.command("rollout")
+def bench_rollout(
+    out: Annotated[Path, typer.Option("-o", "--out", help="the results as JSON")] = Path("rollout.json"),
+    weights: Annotated[Path | None, typer.Option(help="of our force field (.safetensors); those that ship")] = None,
+    keypoints: Annotated[int, typer.Option(help="of each of three objects")] = 2048,
+    steps: Annotated[int, typer.Option(help="of 0.02 s")] = 100,
+    scenes: Annotated[list[int], typer.Option(help="at once; may be repeated; none: 1, and 64 on a GPU")] = [],  # noqa: B006
+    repeat: Annotated[int, typer.Option(help="timed rollouts, of which the median counts")] = 5,
+    device: Device = "auto",
+) -> None:
+    """The learned force field: time a rollout, and the published model and MPM beside it."""
+    from stages.lab.bench_rollout import BenchOptions, run
+
+    for line in run(out, BenchOptions(weights, keypoints, steps, tuple(scenes), repeat, device)):
+        print(line, flush=True)
+
+
+@app.command("register")
+def bench_register(
+    only: Annotated[str, typer.Option(help="some of the ten objects, such as ball,duck")] = "",
+    trials: Annotated[int, typer.Option(help="parts of each object")] = 10,
+    out: Annotated[Path | None, typer.Option("-o", "--out", help="all trials as JSON")] = None,
+    seed: Seed = 0,
+) -> None:
+    """Registration of a part to the whole, beside plain ICP and splatreg."""
+    from stages.lab.bench_register import BenchOptions, run
+
+    for line in run(out, BenchOptions(only, trials, seed=seed)):
+        print(line, flush=True)
+
+
+@app.command("complete")
+def bench_complete(
+    placed: Annotated[str, typer.Option(help="objects of the scene")] = "panda,duck",
+    known: Annotated[str, typer.Option(help="objects of the library; by default all ten")] = "",
+    out: Annotated[Path | None, typer.Option("-o", "--out", help="the figures as JSON")] = None,
+    seed: Seed = 0,
+) -> None:
+    """What completing objects does to their surfaces, to pictures from behind, and to how they fall."""
+    from stages.lab.bench_complete import BenchOptions, run
+
+    for line in run(out, BenchOptions(placed, known, seed=seed)):
+        print(line, flush=True)

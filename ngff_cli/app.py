@@ -9,6 +9,7 @@ from typer import Argument, Option
 from ngff_cli.options import Commands, Device, SceneIn, Seed, set_up_logging
 from stages.evaluate.options import EvaluateOptions
 from stages.reconstruct.options import BACKENDS as RECONSTRUCT
+from stages.reconstruct.options import EXTRACTORS as MATCHERS
 from stages.reconstruct.options import QUALITIES, ReconstructOptions
 from stages.refine.options import BACKENDS as REFINE
 from stages.refine.options import RefineOptions
@@ -49,6 +50,9 @@ def reconstruct(
     imgs: Annotated[Path, Argument(metavar="PHOTOS", help="folder of photos, or a video", show_default=False)],
     out: Annotated[Path, Option("-o", "--out", help="scene to write (.ply)")] = Path("scene.ply"),
     backend: Annotated[str, Option(help=" | ".join(RECONSTRUCT))] = ReconstructOptions.backend,
+    matcher: Annotated[
+        str, Option(help=" | ".join(MATCHERS) + ": how photos are compared; the second finds more in few photos")
+    ] = ReconstructOptions.matcher,
     cameras: Annotated[
         Path | None, Option(help="known cameras: transforms.json or a COLMAP model folder")
     ] = ReconstructOptions.cameras,
@@ -86,8 +90,8 @@ def reconstruct(
     from stages.reconstruct.stage import run
 
     run(imgs, out, ReconstructOptions(
-        backend, cameras, holdout, quality, resolution, scale_reference, resume, weights, download, iterations, seed,
-        device,
+        backend, matcher, cameras, holdout, quality, resolution, scale_reference, resume, weights, download, iterations,
+        seed, device,
     ))  # fmt: skip
 
 

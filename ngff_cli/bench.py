@@ -160,7 +160,7 @@ def bench_register(
     out: Annotated[Path | None, typer.Option("-o", "--out", help="all trials as JSON")] = None,
     seed: Seed = 0,
 ) -> None:
-    """Registration of a part to the whole, beside plain ICP and splatreg."""
+    """Registration of a part to the whole, beside plain ICP."""
     from stages.lab.bench_register import BenchOptions, run
 
     for line in run(out, BenchOptions(only, trials, seed=seed)):

@@ -1,4 +1,4 @@
-"""Registration of a part of an object to the whole, beside plain ICP and the package splatreg, on the same parts.
+"""Registration of a part of an object to the whole, beside plain ICP on the same parts.
 
 A part lacks 40 % of the surface, cut off along a plane or bitten out around a point, has noise, and is turned, scaled
 and shifted at random. Right is 2 degrees, 2 % of scale and 1 % of the diameter, up to the symmetry of what is seen.
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -19,7 +19,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from stages.geometry.harmonics import C0, rgb_to_sh
-from stages.geometry.rotations import matrix, nearest
+from stages.geometry.rotations import matrix
 from stages.geometry.similarity import Similarity, umeyama
 from stages.lab import bench
 from stages.lab.objects import ObjectsOptions, make_object
@@ -31,7 +31,6 @@ from stages.scene.gaussians import Gaussians
 LIMITS = {"rotation": 2.0, "scale": 2.0, "shift": 1.0}  # [deg], [%], [% of the diameter]
 ROUND = ("ball", "bowl", "can")  # their shape is one of revolution about z; what is painted on them is not
 ALIKE = 0.002  # rms change of place and colour that a turn about z may make unnoticed [diameters]
-SHOWN = 4000  # Gaussians that splatreg is given of each: on a CPU more takes minutes
 
 
 @dataclass(frozen=True)
@@ -144,38 +143,17 @@ def inverse(pose: Similarity) -> Similarity:
     return Similarity(1 / pose.scale, back, -back @ pose.translation / pose.scale)
 
 
-def splatreg(part: Gaussians, whole: Gaussians, seed: int = 0) -> Similarity:
-    """The package's registrar for clouds that overlap in part, with scale."""
-    from splatreg.api import register as their_register
-    from splatreg.core.types import Gaussians as Theirs
-
-    rng = torch.Generator().manual_seed(seed)
-    given = []
-    for g in (whole, part):
-        g = g[torch.randperm(len(g), generator=rng)[:SHOWN]]
-        given.append(Theirs(g.means, g.quats, g.scales, g.opacities, (g.sh[:, 0] * C0 + 0.5).clamp(0, 1)))
-    T = their_register(*given, init="fast", transform="sim3", quality="low").T.float()
-    scale = float(torch.det(T[:3, :3]).abs() ** (1 / 3))
-    return inverse(Similarity(scale, nearest(T[:3, :3] / scale), T[:3, 3]))
-
-
 def ours(part: Gaussians, whole: Gaussians, seed: int = 0) -> Similarity:
     found = register(part, whole, seed)
     return found.similarity if found else Similarity(1.0, torch.eye(3), torch.zeros(3))
 
 
-def methods() -> dict[str, Callable[[Gaussians, Gaussians, int], Similarity]]:
-    """Those that can run here."""
-    try:
-        import splatreg as _  # noqa: F401
-    except ImportError:
-        return {"ours": ours, "ICP": icp}
-    return {"ours": ours, "ICP": icp, "splatreg": splatreg}
+METHODS = {"ours": ours, "ICP": icp}  # (part, whole, seed) -> whole to part
 
 
 def run(out: Path | None, options: BenchOptions = BenchOptions()) -> Iterator[str]:  # noqa: B008 -- frozen
     """Measure every method on the same parts; a line for each object, and all trials as JSON."""
-    names, compared = ObjectsOptions(options.only).names, methods()
+    names, compared = ObjectsOptions(options.only).names, METHODS
     yield f"{'right of ' + str(options.trials):14}" + "".join(f"{name:>12}" for name in compared)
     rows = []
     for name in names:
@@ -192,8 +170,6 @@ def run(out: Path | None, options: BenchOptions = BenchOptions()) -> Iterator[st
         yield f"{name:14}" + "".join(f"{count:12d}" for count in right.values())
     summary = {m: summarised([r for r in rows if r["method"] == m]) for m in compared}
     yield from (f"{m}: {json.dumps(facts)}" for m, facts in summary.items())
-    if "splatreg" not in compared:
-        yield "splatreg is not installed, so it was left out: `pip install splatreg`"
     if out:
         facts = {"machine": bench.machine("cpu"), "options": asdict(options), "limits": LIMITS, "summary": summary}
         with replacing(out) as part:

@@ -40,7 +40,7 @@ def _cameras(
 ) -> tuple[sfm.SparseModel, Photos]:
     """Cameras and sparse points: solved for, or triangulated with the cameras that the user gave."""
     if options.cameras is None:
-        return sfm.solve(photos, options.seed, device, steps), photos
+        return sfm.solve(photos, options.seed, device, steps, options.matcher), photos
     cameras, lenses = read_cameras(options.cameras)
     row = {name: i for i, name in enumerate(cameras.names)}
     both = [i for i, name in enumerate(photos.names) if name in row]
@@ -54,7 +54,7 @@ def _cameras(
     photos = photos[both]
     rows = [row[name] for name in photos.names]
     cameras, lenses = _in_pixels_of(photos, cameras[rows]), Lenses(lenses.coefficients[rows])
-    return sfm.triangulate(photos, cameras, lenses, options.seed, steps), photos
+    return sfm.triangulate(photos, cameras, lenses, options.seed, steps, options.matcher), photos
 
 
 def _in_pixels_of(photos: Photos, cameras: Cameras) -> Cameras:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import cv2
 import numpy as np
 import torch
@@ -21,7 +23,7 @@ FARTHEST = 0.7  # largest distance between matching descriptors of unit length
 Feature = tuple[Tensor, Tensor]  # keypoints (k, 4) in pixels of the photo, centres at +0.5; descriptors (k, 128), bytes
 
 
-def extract(photos: Photos) -> list[Feature]:
+def extract(photos: Photos, device: str = "cpu") -> list[Feature]:
     """SIFT keypoints (x, y, scale, orientation) and root-SIFT descriptors of every photo."""
     import pycolmap
 
@@ -80,3 +82,9 @@ def match(a: Float[Tensor, "n d"], b: Float[Tensor, "m d"]) -> Int[Tensor, "k 2"
     distance = (2 - 2 * best).clamp_min(0).sqrt()
     keep = (to_a[to_b[:, 0]] == index) & (distance[:, 0] < FARTHEST) & (distance[:, 0] < RATIO * distance[:, 1])
     return torch.stack([index[keep], to_b[keep, 0]], 1).cpu()
+
+
+def comparer(found: list[Feature], sizes: list[tuple[int, int]], device: str) -> Callable[[int, int], Tensor]:
+    """A function of two photos' numbers that gives the rows of `match`."""
+    vectors = [unit(descriptors).to(device) for _, descriptors in found]
+    return lambda i, j: match(vectors[i], vectors[j])

@@ -8,20 +8,25 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
+from stages.backends import choose
 from stages.reconstruct import features
+from stages.reconstruct.options import COMPARERS, EXTRACTORS
 from stages.reconstruct.photos import Photos
 from stages.reconstruct.steps import Steps
 
 Pair = tuple[int, int, np.ndarray, np.ndarray]  # two photos and the pixels (k, 2) in each that match
 
 
-def compare(photos: Photos, cameras: list, steps: Steps, seed: int, device: str) -> Path:
+def compare(
+    photos: Photos, cameras: list, steps: Steps, seed: int, device: str, matcher: str = "sift"
+) -> Path:
     """A COLMAP database of the photos, taken by pycolmap `cameras` (one a photo), ready to be mapped."""
+    extract = choose(EXTRACTORS, matcher)
 
     def write(path: Path) -> None:
-        found = steps.kept("features", lambda: features.extract(photos))
+        found = steps.kept("features", lambda: extract(photos, device))
         with steps.timed("matches"):
-            _fill(path, photos, cameras, found, seed, device)
+            _fill(path, photos, cameras, found, seed, device, matcher)
 
     return steps.file("matches.db", write)
 
@@ -61,7 +66,9 @@ def connected(database: Path) -> list[Pair]:
     return out
 
 
-def _fill(path: Path, photos: Photos, cameras: list, found: list[features.Feature], seed: int, device: str) -> None:
+def _fill(
+    path: Path, photos: Photos, cameras: list, found: list[features.Feature], seed: int, device: str, matcher: str
+) -> None:
     """Writes cameras, photos, keypoints, matches and verified matches."""
     import pycolmap
 
@@ -78,13 +85,13 @@ def _fill(path: Path, photos: Photos, cameras: list, found: list[features.Featur
         frame.add_data_id(image.data_id)
         database.write_frame(frame, use_frame_id=True)
         database.write_keypoints(i + 1, found[i][0].numpy())
-    for i, j, matches, geometry in _verified(found, cameras, seed, device):
+    for i, j, matches, geometry in _verified(found, cameras, seed, device, matcher):
         database.write_matches(i + 1, j + 1, matches)
         database.write_two_view_geometry(i + 1, j + 1, geometry)
     database.close()
 
 
-def _verified(found: list[features.Feature], cameras: list, seed: int, device: str) -> list[tuple]:
+def _verified(found: list[features.Feature], cameras: list, seed: int, device: str, matcher: str) -> list[tuple]:
     """Matches and two-view geometry of all pairs worth comparing, verified in the background while more are matched."""
     import pycolmap
 
@@ -92,7 +99,8 @@ def _verified(found: list[features.Feature], cameras: list, seed: int, device: s
     options.ransac.random_seed = seed
     options.ransac.max_num_trials = 3000  # a pair that needs more shares too little to be of use
     pixels = [table[:, :2].double().numpy() for table, _ in found]
-    vectors = [features.unit(descriptors).to(device) for _, descriptors in found]
+    vectors = [features.unit(descriptors) for _, descriptors in found]
+    same = choose(COMPARERS, matcher)(found, [(c.width, c.height) for c in cameras], device)
 
     def verify(i: int, j: int, matches: np.ndarray) -> tuple:
         geometry = pycolmap.estimate_two_view_geometry(cameras[i], pixels[i], cameras[j], pixels[j], matches, options)
@@ -101,7 +109,7 @@ def _verified(found: list[features.Feature], cameras: list, seed: int, device: s
     pending = []
     with ThreadPoolExecutor(1) as background:
         for i, j in tqdm(features.pairs(vectors), desc="matching photos", unit="pair", leave=False):
-            matches = features.match(vectors[i], vectors[j]).numpy().astype(np.uint32)
+            matches = same(i, j).numpy().astype(np.uint32)
             if len(matches) >= options.min_num_inliers:
                 pending.append(background.submit(verify, i, j, matches))
         return [job.result() for job in pending]

@@ -13,6 +13,14 @@ BACKENDS = {
     "pi3": "stages.reconstruct.learned:pi3",
     "pi3-splat": "stages.reconstruct.learned:pi3_splat",
 }
+EXTRACTORS = {
+    "sift": "stages.reconstruct.features:extract",
+    "aliked-lightglue": "stages.reconstruct.features_learned:extract",
+}
+COMPARERS = {
+    "sift": "stages.reconstruct.features:comparer",
+    "aliked-lightglue": "stages.reconstruct.features_learned:comparer",
+}
 MONOCULAR = {"pi3", "pi3-splat"}  # backends that one photo is enough for
 
 
@@ -37,6 +45,7 @@ QUALITIES = {
 @dataclass(frozen=True)
 class ReconstructOptions:
     backend: str = "classic"
+    matcher: str = "sift"  # of photos, for the classic backend
     cameras: Path | None = None  # known cameras: a nerfstudio transforms.json or a COLMAP model folder
     holdout: int = 0  # keep every N-th photo out of the Gaussians and report on it; 0 keeps none out
     quality: str = "normal"
@@ -50,6 +59,8 @@ class ReconstructOptions:
     device: str = "auto"
 
     def __post_init__(self):
+        if self.matcher not in EXTRACTORS:
+            raise InputError(f"--matcher {self.matcher}: choose from {', '.join(EXTRACTORS)}")
         if self.quality not in QUALITIES:
             raise InputError(f"--quality {self.quality}: choose from {', '.join(QUALITIES)}")
         if self.holdout < 0 or self.holdout == 1:

@@ -50,7 +50,8 @@ def parse_scale(text: str) -> ScaleReference | None:
     if not text:
         return None
     if "object" in text and "photos" not in text:
-        raise InputError(f"--scale-reference {text!r}: objects are known only once segmented, where the same option takes them; here give {FORMS}")
+        raise InputError(f"--scale-reference {text!r}: objects are known only once segmented, and `ngff segment` has the "
+                         f"same option; here give {FORMS}")  # fmt: skip
     found = FORM.fullmatch(text.strip())
     try:
         distance = float(found["distance"])

@@ -43,11 +43,13 @@ class SparseModel:
     dropped: dict[str, str] = field(default_factory=dict)  # photos left out, and why
 
 
-def solve(photos: Photos, seed: int = 0, device: str = "cpu", steps: Steps | None = None) -> SparseModel:
+def solve(
+    photos: Photos, seed: int = 0, device: str = "cpu", steps: Steps | None = None, matcher: str = "sift"
+) -> SparseModel:
     """Cameras of as many photos as can be connected."""
     steps = steps or Steps()
     _quiet(seed)
-    database = matching.compare(photos, matching.guessed_cameras(photos), steps, seed, device)
+    database = matching.compare(photos, matching.guessed_cameras(photos), steps, seed, device, matcher)
     return steps.kept("model", lambda: _mapped(photos, database, seed), (SparseModel, Cameras, Lenses))
 
 
@@ -122,7 +124,7 @@ def _why_dropped(photos: Photos, pairs: list[Pair], best, models: dict) -> dict[
 
 
 def triangulate(
-    photos: Photos, cameras: Cameras, lenses: Lenses, seed: int = 0, steps: Steps | None = None
+    photos: Photos, cameras: Cameras, lenses: Lenses, seed: int = 0, steps: Steps | None = None, matcher: str = "sift"
 ) -> SparseModel:
     """Sparse points for cameras that are known; `photos` and `cameras` in the same order, K in their pixels."""
     import pycolmap
@@ -135,7 +137,7 @@ def triangulate(
         width, height = photos.size(i)
         params = [K[0][0], K[1][1], K[0][2], K[1][2], *k[:4], k[4], 0, 0, 0]
         known.append(pycolmap.Camera(model="FULL_OPENCV", width=width, height=height, params=params, camera_id=i + 1))
-    database = matching.compare(photos, known, steps, seed, "cpu")
+    database = matching.compare(photos, known, steps, seed, "cpu", matcher)
     pairs = matching.connected(database)
     if not pairs:
         raise InputError(f"{photos.source}: no two photos show the same things clearly enough; {ADVICE}")

@@ -75,7 +75,7 @@ def test_icp_finds_a_whole_that_is_turned_a_little():
 
 def test_a_run_counts_and_writes(tmp_path, monkeypatch):
     monkeypatch.setattr(bench_register, "make_object", lambda name: thing(0.02))
-    monkeypatch.setattr(bench_register, "methods", lambda: {"ICP": icp})
+    monkeypatch.setattr(bench_register, "METHODS", {"ICP": icp})
     lines = list(run(tmp_path / "out.json", BenchOptions("duck", 1)))
     assert lines[0].split() == ["right", "of", "1", "ICP"] and lines[1].split()[0] == "duck"
     assert '"method": "ICP"' in (tmp_path / "out.json").read_text()

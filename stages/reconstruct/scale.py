@@ -50,8 +50,8 @@ def parse_scale(text: str) -> ScaleReference | None:
     if not text:
         return None
     if "object" in text and "photos" not in text:
-        raise InputError(f"--scale-reference {text!r}: objects are known only once segmented, and `ngff segment` has the "
-                         f"same option; here give {FORMS}")  # fmt: skip
+        raise InputError(f"--scale-reference {text!r}: objects are known only once segmented, and `ngff segment` has "
+                         f"the same option; here give {FORMS}")  # fmt: skip
     found = FORM.fullmatch(text.strip())
     try:
         distance = float(found["distance"])

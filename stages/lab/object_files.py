@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -45,7 +46,9 @@ def camera_rows(viewmats: Float[Tensor, "c 4 4"], size: int) -> list[dict]:
 
 
 def portrait(g: Gaussians, elevation: float, label: str, size: int = 280) -> Float[Tensor, "h w 3"]:
-    """An object of longest side 1 around the origin, on white ground with its shadow, from above view 0."""
+    """An object around the origin, as large as fits, on white ground with its shadow, from above view 0."""
+    side = float((g.means.amax(0) - g.means.amin(0)).max())
+    g = replace(g, means=g.means / side, scales=g.scales / side)
     eye = 2.2 * _direction(elevation)
     return _photo(concatenate([_ground(g), g]), eye, torch.zeros(3), size, size, 1.6 * size, label)
 

@@ -7,8 +7,6 @@ stays outside of the graph; gradients are carried on by hand from the graph into
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
-from dataclasses import fields, is_dataclass, replace
 from typing import Any
 
 import torch
@@ -18,6 +16,7 @@ from torch import Tensor
 from stages.lab.training_data import Piece
 from stages.models.dynamics import Dynamics
 from stages.models.pushes import Pushes
+from stages.models.trees import rebuilt, tensors
 
 log = logging.getLogger(__name__)
 UNIT = 0.01  # errors count in centimetres: gradients of order one
@@ -140,30 +139,6 @@ def _advance(model: Dynamics, scene: Any, state: tuple, dt: float, pushes: Pushe
     """The next state and where its points are; without pushes the time does not matter."""
     state = model.step(scene, state, 0.0, dt, pushes)
     return state, model.points(scene, state)
-
-
-def tensors(tree: Any) -> Iterator[Tensor]:
-    """All tensors in tuples and dataclasses, in order."""
-    if isinstance(tree, Tensor):
-        yield tree
-    elif is_dataclass(tree):
-        for f in fields(tree):
-            yield from tensors(getattr(tree, f.name))
-    elif isinstance(tree, tuple):
-        for x in tree:
-            yield from tensors(x)
-
-
-def rebuilt(tree: Any, new: Iterator[Tensor]) -> Any:
-    """The same with other tensors."""
-    if isinstance(tree, Tensor):
-        return next(new)
-    if is_dataclass(tree):
-        return replace(tree, **{f.name: rebuilt(getattr(tree, f.name), new) for f in fields(tree)})
-    if isinstance(tree, tuple):
-        parts = [rebuilt(x, new) for x in tree]
-        return type(tree)(*parts) if hasattr(tree, "_fields") else tuple(parts)
-    return tree
 
 
 def _sum(like: Tensor, a: Tensor | None, b: Tensor | None) -> Tensor:

@@ -18,8 +18,7 @@ from tqdm import tqdm
 
 from stages.errors import InputError
 from stages.reconstruct.photos import Photos
-from stages.scene.files import must_exist
-from stages.scene.images import PHOTOS, VIDEOS, list_photos, read_image, to_bytes
+from stages.scene.images import PHOTOS, VIDEOS, list_photos, open_video, read_image, to_bytes
 
 log = logging.getLogger(__name__)
 MOST = 200  # photos used of a folder: about what a table top can make use of, and what bounds time and memory
@@ -139,7 +138,7 @@ def _exif_focal(file: Path) -> float:
 
 def _from_video(path: Path, side: int) -> list[Taken]:
     """The video is cut into spans of equal time, and the sharpest frame of each is taken."""
-    with _open(path) as file:
+    with open_video(path) as file:
         times = sorted(float(p.pts * p.time_base) for p in file.demux(video=0) if p.pts is not None)
     length = times[-1] - times[0] if times else 0.0
     spans = int(min(max(length * FRAMES_A_SECOND, FRAMES[0]), FRAMES[1], len(times)))
@@ -150,23 +149,11 @@ def _from_video(path: Path, side: int) -> list[Taken]:
     return best
 
 
-def _open(path: Path) -> av.container.InputContainer:
-    must_exist(path, "a video")
-    try:
-        file = av.open(str(path))
-    except (av.FFmpegError, OSError) as error:
-        raise InputError(f"{path}: is not a video that can be read") from error
-    if not file.streams.video:
-        file.close()
-        raise InputError(f"{path}: holds no video stream")
-    return file
-
-
 def _frames(path: Path, times: list[float], spans: int, side: int) -> Iterator[tuple[int, Taken]]:
     """Up to LOOKED_AT frames of each span, upright, with the span they fall in. A damaged end is left out."""
     seen: Counter[int] = Counter()
     due = max(1, len(times) // max(1, spans * LOOKED_AT))
-    with _open(path) as file:
+    with open_video(path) as file:
         file.streams.video[0].thread_type = "AUTO"
         bar = tqdm(file.decode(video=0), total=len(times), desc="reading video", unit="frame", leave=False)
         try:

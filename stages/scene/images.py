@@ -133,14 +133,14 @@ class VideoWriter:
 
 def video_info(path: Path) -> tuple[int, float]:
     """Number of frames (as counted by the container, 0 when it does not say) and frames a second."""
-    with _open_video(path) as file:
+    with open_video(path) as file:
         stream = file.streams.video[0]
         return stream.frames, float(stream.average_rate or 0)
 
 
 def read_video(path: Path) -> Iterator[Float[Tensor, "h w 3"]]:
     """The frames of a video in order."""
-    with _open_video(path) as file:
+    with open_video(path) as file:
         try:
             for frame in file.decode(video=0):
                 yield torch.from_numpy(frame.to_ndarray(format="rgb24").astype(np.float32) / 255)
@@ -148,7 +148,8 @@ def read_video(path: Path) -> Iterator[Float[Tensor, "h w 3"]]:
             raise InputError(f"{path}: the video breaks off or is damaged ({error.strerror})") from error
 
 
-def _open_video(path: Path):
+def open_video(path: Path) -> av.container.InputContainer:
+    """To be decoded. Raises InputError for what is no video."""
     must_exist(path, "a video")
     try:
         file = av.open(str(path))

@@ -23,22 +23,6 @@ UNIT = 0.01  # errors count in centimetres: gradients of order one
 FINE = 0.1  # errors below a millimetre no longer matter to the root [UNIT]
 
 
-class Unpushed(Pushes):
-    """No pushes, without the work of adding up none (which makes the host wait)."""
-
-    @classmethod
-    def amid(cls, valid: Bool[Tensor, "b o n"], like: Tensor) -> Unpushed:
-        b, o, _ = valid.shape
-        whole, real, vector = valid.new_zeros(b, 0, dtype=torch.int64), like.new_zeros(b, 0), like.new_zeros(b, 0, 3)
-        return cls(whole, vector, vector, real, real, whole, valid.new_zeros(b, o))
-
-    def wrench(self, points: Tensor, com: Tensor, t: Tensor | float, dt: float = 0.0) -> tuple[Tensor, Tensor]:
-        return torch.zeros_like(com), torch.zeros_like(com)
-
-    def acceleration(self, world: Any, points: Tensor, t: Tensor | float, dt: float = 0.0) -> Tensor:
-        return torch.zeros_like(points)
-
-
 def loss_of(
     predicted: Float[Tensor, "b t o n 3"], truth: Float[Tensor, "b t o n 3"], valid: Bool[Tensor, "b o n"], root: bool
 ) -> Float[Tensor, ""]:
@@ -81,7 +65,7 @@ class Roll:
         scene = rebuilt(scene, iter(free))
         # so that the first step is like the others to a compiler
         state = rebuilt(state, (x.detach().requires_grad_() for x in tensors(state)))
-        pushes = Unpushed.amid(valid, truth)
+        pushes = Pushes.nobody(valid, truth)
         frames = []
         for _ in range(truth.shape[1]):
             state, points = self.advance(self.model, scene, state, self.dt, pushes)

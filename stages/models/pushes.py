@@ -28,10 +28,14 @@ class Pushes:
     @classmethod
     def none(cls, world: World) -> Pushes:
         """Nobody is pushed or held."""
-        b, o, _, _ = world.points.shape
-        whole, real = world.valid.new_zeros(b, 0, dtype=torch.int64), world.points.new_zeros(b, 0)
-        vector, free = world.points.new_zeros(b, 0, 3), world.valid.new_zeros(b, o)
-        return cls(whole, vector, vector, real, real, whole, free)
+        return cls.nobody(world.valid, world.points)
+
+    @classmethod
+    def nobody(cls, valid: Bool[Tensor, "b o n"], like: Tensor) -> Pushes:
+        """The same for objects of whose world only `valid` is at hand, in the precision of `like`."""
+        b, o, _ = valid.shape
+        whole, real, vector = valid.new_zeros(b, 0, dtype=torch.int64), like.new_zeros(b, 0), like.new_zeros(b, 0, 3)
+        return cls(whole, vector, vector, real, real, whole, valid.new_zeros(b, o))
 
     @classmethod
     def of(cls, world: World, prompts: Prompts, ids: list[int]) -> Pushes:
@@ -84,6 +88,8 @@ class Pushes:
         self, world: World, points: Float[Tensor, "b o n 3"], t: Tensor | float, dt: float = 0.0
     ) -> Float[Tensor, "b o n 3"]:
         """What the pushes add to the acceleration of every keypoint, taking each object as rigid [m/s^2]."""
+        if not self.object.shape[1]:
+            return torch.zeros_like(points)
         com = centre(world, points)
         force, torque = self.wrench(points, com, t, dt)
         arm = torch.where(world.valid[..., None], points - com[:, :, None], 0.0)

@@ -20,7 +20,7 @@ from stages.lab import train
 from stages.lab.motions import Motions, write_motions
 from stages.lab.train import TrainOptions, run, validate
 from stages.lab.training_data import Pieces, read_groups, split
-from stages.lab.training_roll import Roll, Unpushed, loss_of
+from stages.lab.training_roll import Roll, loss_of
 from stages.lab.training_state import LIMIT, Trainee
 from stages.models.pushes import Pushes
 from stages.models.weights import MODELS, build, load
@@ -117,10 +117,15 @@ def test_gradients_are_those_of_the_rollout(name):
 
 def test_no_pushes_are_no_pushes():
     world = without_last(falling()).world()
-    ours, none = Unpushed.amid(world.valid, world.points), Pushes.none(world)
-    assert_close(ours.acceleration(world, world.points, 0.0), none.acceleration(world, world.points, 0.0))
+    none, idle = Pushes.nobody(world.valid, world.points), Pushes.none(world)
+    # a push of no strength goes all the way that a real one goes
+    weak = replace(idle, object=idle.object.new_zeros(6, 1), point=idle.point.new_zeros(6, 1) - 1,
+                   force=torch.zeros(6, 1, 3), torque=torch.zeros(6, 1, 3), start=torch.zeros(6, 1),
+                   end=torch.ones(6, 1))  # fmt: skip
     com = torch.zeros(6, 2, 3)
-    assert_close(ours.wrench(world.points, com, 0.0, DT), none.wrench(world.points, com, 0.0, DT))
+    for pushes in (none, idle):
+        assert_close(pushes.acceleration(world, world.points, 0.0), weak.acceleration(world, world.points, 0.0))
+        assert_close(pushes.wrench(world.points, com, 0.0, DT), weak.wrench(world.points, com, 0.0, DT))
 
 
 def test_a_step_without_finite_gradients_changes_nothing():

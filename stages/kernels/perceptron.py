@@ -55,15 +55,16 @@ def _perceptron(
         PRODUCTS: tl.constexpr = VECTORS * (VECTORS + 1) // 2
         INNER: tl.constexpr = PRODUCTS + COLUMNS
         y = tl.zeros([BLOCK, H], tl.float32)
-        for i in range(VECTORS):  # not unrolled: that would need more registers than there are
-            ax, ay, az = _component(vectors, r, there, i, VECTORS)
-            for j in range(i, VECTORS):
-                bx, by, bz = _component(vectors, r, there, j, VECTORS)
-                p = ax * bx + ay * by + az * bz
-                size = tl.log(tl.abs(p) + tl.sqrt(p * p + 1))  # asinh, but for the sign
-                seen = tl.where(p < 0, -size, size)
-                column = i * VECTORS - i * (i - 1) // 2 + j - i
-                y += seen[:, None] * tl.load(w0 + h * INNER + column, mask=h < HIDDEN, other=0.0)[None, :]
+        if VECTORS:
+            for i in range(VECTORS):  # not unrolled: that would need more registers than there are
+                ax, ay, az = _component(vectors, r, there, i, VECTORS)
+                for j in range(i, VECTORS):
+                    bx, by, bz = _component(vectors, r, there, j, VECTORS)
+                    p = ax * bx + ay * by + az * bz
+                    size = tl.log(tl.abs(p) + tl.sqrt(p * p + 1))  # asinh, but for the sign
+                    seen = tl.where(p < 0, -size, size)
+                    column = i * VECTORS - i * (i - 1) // 2 + j - i
+                    y += seen[:, None] * tl.load(w0 + h * INNER + column, mask=h < HIDDEN, other=0.0)[None, :]
         for first in range(0, COLUMNS, K):
             k = first + tl.arange(0, K)
             inside = there[:, None] & (k[None, :] < COLUMNS)

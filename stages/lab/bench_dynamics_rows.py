@@ -21,7 +21,6 @@ from stages.geometry.rotations import nearest
 from stages.lab import bench
 from stages.lab.dataset_assets import Asset, Fineness, assets
 from stages.lab.dataset_simulation import simulate
-from stages.lab.estimate import PAPER
 from stages.lab.motions import Motions, joined
 from stages.lab.objects import OBJECTS
 from stages.lab.scenes import Config, read_configs
@@ -30,6 +29,12 @@ from stages.models.world import World
 
 log = logging.getLogger(__name__)
 Predict = Callable[[Motions], Float[Tensor, "s t o n 3"]]
+# E [Pa] and density [kg/m^3] of the objects of GSCollision as the paper's vision-language model estimated them
+ESTIMATED = {
+    "ball": (573343.68, 1300.0), "bowl": (859029.80, 1200.0), "can": (19714313.88, 1060.0), "cloth": (2257.12, 100.0),
+    "duck": (4828.29, 1100.0), "miku": (2114.27, 150.0), "panda": (2114.27, 150.0), "phone": (2e7, 2700.0),
+    "pillow": (2000.0, 50.0), "rope": (573343.68, 1000.0),
+}  # fmt: skip
 
 
 def fall(some: Motions) -> Float[Tensor, "s t o n 3"]:
@@ -89,7 +94,7 @@ def common(motions: Motions, made: Motions) -> Motions:
 def estimated(things: Mapping[int, Asset]) -> dict[int, Asset]:
     """The objects with Young's moduli and densities as the paper's vision-language model saw them."""
     names = {kind.id: name for name, kind in OBJECTS.items()}
-    return {i: replace(a, E=PAPER[names[i]][0], density=PAPER[names[i]][1]) for i, a in things.items()}
+    return {i: replace(a, E=ESTIMATED[names[i]][0], density=ESTIMATED[names[i]][1]) for i, a in things.items()}
 
 
 class Resimulation:

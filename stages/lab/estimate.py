@@ -23,12 +23,6 @@ from stages.scene.scene_ply import read_scene
 log = logging.getLogger(__name__)
 RANGES = {"E": (1e2, 1e12), "density": (5.0, 25_000.0)}  # from foams and gels to metals [Pa] [kg/m^3]
 UNITS = {"E": "Pa", "density": "kg/m^3"}
-# E [Pa] and density [kg/m^3] of the objects of GSCollision as the paper's vision-language model estimated them
-PAPER = {
-    "ball": (573343.68, 1300.0), "bowl": (859029.80, 1200.0), "can": (19714313.88, 1060.0), "cloth": (2257.12, 100.0),
-    "duck": (4828.29, 1100.0), "miku": (2114.27, 150.0), "panda": (2114.27, 150.0), "phone": (2e7, 2700.0),
-    "pillow": (2000.0, 50.0), "rope": (573343.68, 1000.0),
-}  # fmt: skip
 PROMPT = """\
 These {frames} frames, evenly spaced in time, are from one video of things that fall, collide and deform. {which}
 

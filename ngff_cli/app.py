@@ -103,7 +103,19 @@ def segment(
     masks: Annotated[
         Path | None, Option(help="folder of label images named as the photos (0 background, 1... objects)")
     ] = SegmentOptions.masks,
-    boxes: Annotated[Path | None, Option(help="prompts.json: boxes and names in view 0")] = SegmentOptions.boxes,
+    boxes: Annotated[
+        Path | None, Option(help="prompts.json: boxes and names in view 0; for sam2 also points")
+    ] = SegmentOptions.boxes,
+    photos: Annotated[
+        Path | None, Option(help="of sam2: folder of the scene's photos, else the scene is drawn from its cameras")
+    ] = SegmentOptions.photos,
+    weights: Annotated[
+        Path | None, Option(help="of sam2: folder with config.json and model.safetensors; by default sam2/ in "
+                            "$NGFF_WEIGHTS and ~/.cache/ngff")
+    ] = SegmentOptions.weights,
+    download: Annotated[
+        bool, Option("--download", help="fetch the weights of sam2 if they are not here (0.9 GB, Apache-2.0)")
+    ] = SegmentOptions.download,
     names: Annotated[str, Option(help='names of your own: "1=duck,2=bowl"')] = SegmentOptions.names,
     max_objects: Annotated[int, Option(help="most objects to find")] = SegmentOptions.max_objects,
     min_size: Annotated[
@@ -121,8 +133,10 @@ def segment(
     """Which Gaussians are one object: SCENE.ply -> LABELLED.ply (object_id: 0 background, 1... objects)."""
     from stages.segment.stage import run
 
-    options = SegmentOptions(backend, masks, boxes, names, max_objects, min_size, detail, scale_reference, seed, device)
-    run(scene, out, options)
+    run(scene, out, SegmentOptions(
+        backend, masks, boxes, photos, weights, download, names, max_objects, min_size, detail, scale_reference, seed,
+        device,
+    ))  # fmt: skip
 
 
 @app.command()
@@ -133,6 +147,15 @@ def refine(
     library: Annotated[
         Path | None, Option(help="folder of whole objects (.ply); the one that fits is put in a seen part's place")
     ] = RefineOptions.library,
+    photos: Annotated[
+        Path | None, Option(help="of diffsplat: folder of the scene's photos, else objects are drawn as Gaussians")
+    ] = RefineOptions.photos,
+    weights: Annotated[
+        Path | None, Option(help="of diffsplat: folder of its weights; by default looked for in $NGFF_WEIGHTS")
+    ] = RefineOptions.weights,
+    download: Annotated[
+        bool, Option("--download", help="of diffsplat: fetch those weights if they are not here (MIT, OpenRAIL-M)")
+    ] = RefineOptions.download,
     keep_raw: Annotated[
         bool, Option("--keep-raw", help="of K objects, keep them as they were too: ids K+1 to 2K")
     ] = RefineOptions.keep_raw,
@@ -149,7 +172,9 @@ def refine(
     """Whole objects on a whole table: LABELLED.ply -> REFINED.ply."""
     from stages.refine.stage import run
 
-    run(scene, out, RefineOptions(completer, library, keep_raw, outliers, background, resolution, seed, device))
+    run(scene, out, RefineOptions(
+        completer, library, photos, weights, download, keep_raw, outliers, background, resolution, seed, device,
+    ))  # fmt: skip
 
 
 @app.command()

@@ -79,12 +79,14 @@ def bench_pi3(
 def bench_segment(
     scenes: Annotated[int, typer.Option(help="scenes of each kind, apart and touching")] = 4,
     photos: Annotated[int, typer.Option(help="photos whose cameras a scene has")] = 24,
+    weights: Annotated[Path | None, typer.Option(help="of sam2; looked for, and left out where there are none")] = None,
     out: Annotated[Path | None, typer.Option("-o", "--out", help="the numbers as JSON")] = None,
+    device: Device = "auto",
 ) -> None:
-    """Objects found without labels: overlap with the truth, apart and touching."""
+    """Objects found by geometry, from masks that are true or partly wrong, and by sam2: overlap with the truth."""
     from stages.lab.bench_segment import BenchOptions, run
 
-    for line in run(out, BenchOptions(scenes, photos)):
+    for line in run(out, BenchOptions(scenes, photos, weights, device)):
         print(line, flush=True)
 
 
@@ -169,7 +171,9 @@ def bench_register(
 
 @app.command("complete")
 def bench_complete(
-    placed: Annotated[str, typer.Option(help="objects of the scene")] = "panda,duck",
+    scene: Annotated[
+        list[str], typer.Option(help="objects of a scene, with commas between; may be repeated")
+    ] = ["panda,duck", "can,miku", "bowl,phone"],  # noqa: B006
     known: Annotated[str, typer.Option(help="objects of the library; by default all ten")] = "",
     out: Annotated[Path | None, typer.Option("-o", "--out", help="the figures as JSON")] = None,
     seed: Seed = 0,
@@ -177,5 +181,5 @@ def bench_complete(
     """What completing objects does to their surfaces, to pictures from behind, and to how they fall."""
     from stages.lab.bench_complete import BenchOptions, run
 
-    for line in run(out, BenchOptions(placed, known, seed=seed)):
+    for line in run(out, BenchOptions(tuple(scene), known, seed=seed)):
         print(line, flush=True)

@@ -1,6 +1,6 @@
-"""What completing objects is worth: a scene seen from one side, refined in three ways, beside the truth.
+"""What completing objects is worth: scenes seen from one side, refined in three ways, beside the truth.
 
-Two objects stand on a table, ten cameras look from the front, and what they see is kept, with some noise. Measured
+A few objects stand on a table, ten cameras look from the front, and what they see is kept, with some noise. Measured
 are the surfaces (Chamfer distance), pictures from behind (PSNR), and where the objects fall and roll to (RMSE).
 """
 
@@ -13,12 +13,14 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import torch
+from jaxtyping import Bool
+from torch import Tensor
 
 from stages.evaluate import trajectories
 from stages.evaluate.clouds import chamfer, nearest
 from stages.evaluate.options import EvaluateOptions
 from stages.evaluate.pictures import psnr
-from stages.geometry.cameras import intrinsics, orbit
+from stages.geometry.cameras import depths, intrinsics, orbit, project
 from stages.geometry.rotations import matrix
 from stages.geometry.similarity import Similarity
 from stages.lab import bench
@@ -27,7 +29,6 @@ from stages.lab.shapes import sheet, to_gaussians
 from stages.raster.rasterise import rasterise, visibility
 from stages.refine.library import moved
 from stages.refine.options import RefineOptions
-from stages.refine.sight import Sight
 from stages.refine.stage import refine
 from stages.scene.cameras import Cameras
 from stages.scene.files import replacing
@@ -40,13 +41,14 @@ from stages.simulate.stage import run as simulate
 SIZE = 0.3  # longest side of an object [m]
 VIEW, BEHIND = 320, 6  # pixels a side; cameras that the truth is compared from
 FRONT, BACK = -45.0, 135.0  # azimuth of the middle camera: it stands on the +y axis, or on -y
-SHOWING = 0.5  # weight in a view from which a Gaussian is seen, and not just through another [px]
+SKIN = 0.03 * SIZE  # depth behind the drawn surface up to which a Gaussian belongs to it [m]
 WAYS = ("none", "close", "library")
+FIGURES = ("chamfer_mm", "psnr_behind_db", "motion_rmse_mm")
 
 
 @dataclass(frozen=True)
 class BenchOptions:
-    placed: str = "panda,duck"  # the objects of the scene
+    scenes: tuple[str, ...] = ("panda,duck", "can,miku", "bowl,phone")  # the objects of each
     known: str = ""  # those of the library; empty: all ten
     thin: int = 2  # every so manieth Gaussian of an object is used
     noise: float = 0.003  # standard deviation of place [longest sides]
@@ -55,10 +57,10 @@ class BenchOptions:
     seed: int = 0
 
 
-def truth(options: BenchOptions) -> Scene:
+def truth(placed: str, options: BenchOptions) -> Scene:
     """The objects side by side, turned about the vertical, on a grey table whose top is z = 0."""
     rng = torch.Generator().manual_seed(options.seed)
-    names = ObjectsOptions(options.placed).names
+    names = ObjectsOptions(placed).names
     table = sheet(1.6, 1.6, 0.012)
     parts = [to_gaussians(table, torch.full((len(table.points), 3), 0.55), 0, 0.9)]
     for i, name in enumerate(names):
@@ -88,10 +90,24 @@ def cameras(count: int, azimuth: float, elevation: float, sweep: float = 120.0) 
 def photographed(scene: Scene, options: BenchOptions) -> Scene:
     """What the cameras see of the objects, with noise; the table is left whole."""
     g = scene.gaussians
-    seen = g[(Sight.of(scene).weight > SHOWING) | (g.object_id == 0)]
+    seen = g[shown(scene) | (g.object_id == 0)]
     error = SIZE * options.noise * torch.randn(seen.means.shape, generator=torch.Generator().manual_seed(options.seed))
     return replace(scene, gaussians=replace(seen, means=torch.where(seen.object_id[:, None] > 0, seen.means + error,
                                                                      seen.means)))  # fmt: skip
+
+
+@torch.no_grad()
+def shown(scene: Scene) -> Bool[Tensor, "n"]:
+    """Gaussians that lie on the surface that a camera sees; how large they are does not matter."""
+    g = scene.gaussians
+    out = torch.zeros(len(g), dtype=torch.bool)
+    for viewmat, K in zip(scene.cameras.viewmats, scene.cameras.Ks, strict=True):
+        surface = rasterise(g, viewmat[None], K[None], VIEW, VIEW).depth[0]
+        pixel = project(g.means, viewmat, K).floor().long()
+        inside = ((pixel >= 0) & (pixel < VIEW)).all(1)
+        x, y = pixel[inside].T
+        out[inside] |= depths(g.means[inside], viewmat) < surface[y, x] + SKIN
+    return out
 
 
 def distance(scene: Scene, true: Scene) -> float:
@@ -113,26 +129,40 @@ def psnr_behind(scene: Scene, true: Scene) -> float:
 
 
 def run(out: Path | None, options: BenchOptions = BenchOptions()) -> Iterator[str]:  # noqa: B008 -- frozen
-    """A line for each way of refining, and all figures as JSON."""
-    true = truth(options)
-    seen, rows = photographed(true, options), {}
+    """A line for each scene and way of refining, the means over the scenes, and all figures as JSON."""
+    yield f"{'scene':16}{'completer':12}{'Chamfer [mm]':>14}{'PSNR behind [dB]':>18}{'RMSE of motion [mm]':>21}"
+    scenes = {}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         _library(folder / "library", options)
-        _fall(true, folder / "truth", options)
-        yield f"{'completer':12}{'Chamfer [mm]':>14}{'PSNR behind [dB]':>18}{'RMSE of motion [mm]':>21}"
-        for way in WAYS:
-            chosen = RefineOptions(way, folder / "library" if way == "library" else None, background=False)
-            scene = refine(seen, chosen)
-            _fall(scene, folder / way, options)
-            motion = trajectories.compare(folder / f"{way}.h5", folder / "truth.h5", EvaluateOptions())
-            row = distance(scene, true), psnr_behind(scene, true), 1000 * motion.overall["RMSE"]
-            rows[way] = dict(zip(("chamfer_mm", "psnr_behind_db", "motion_rmse_mm"), row, strict=True))
-            yield f"{way:12}{row[0]:14.2f}{row[1]:18.2f}{row[2]:21.1f}"
+        for placed in options.scenes:
+            scenes[placed] = {}
+            for way, row in measured(placed, folder, options):
+                scenes[placed][way] = row
+                yield _line(placed, way, row)
+    means = {way: {f: sum(s[way][f] for s in scenes.values()) / len(scenes) for f in FIGURES} for way in WAYS}
+    yield from (_line("mean", way, row) for way, row in means.items())
     if out:
+        facts = {"command": "ngff-lab bench complete", "machine": bench.machine("cpu"), "options": asdict(options)}
         with replacing(out) as part:
-            part.write_text(json.dumps({"machine": bench.machine("cpu"), "options": asdict(options), "ways": rows},
-                                       indent=1) + "\n")  # fmt: skip
+            part.write_text(json.dumps({**facts, "scenes": scenes, "mean": means}, indent=1) + "\n")
+
+
+def measured(placed: str, folder: Path, options: BenchOptions) -> Iterator[tuple[str, dict[str, float]]]:
+    """The figures of each way of refining one scene."""
+    true = truth(placed, options)
+    seen = photographed(true, options)
+    _fall(true, folder / "truth", options)
+    for way in WAYS:
+        scene = refine(seen, RefineOptions(way, folder / "library" if way == "library" else None, background=False))
+        _fall(scene, folder / way, options)
+        motion = trajectories.compare(folder / f"{way}.h5", folder / "truth.h5", EvaluateOptions())
+        row = distance(scene, true), psnr_behind(scene, true), 1000 * motion.overall["RMSE"]
+        yield way, {name: round(value, 3) for name, value in zip(FIGURES, row, strict=True)}
+
+
+def _line(scene: str, way: str, row: dict[str, float]) -> str:
+    return f"{scene:16}{way:12}{row['chamfer_mm']:14.2f}{row['psnr_behind_db']:18.2f}{row['motion_rmse_mm']:21.1f}"
 
 
 def _library(folder: Path, options: BenchOptions) -> None:

@@ -3,10 +3,17 @@
 import platform
 import shutil
 from collections.abc import Iterator
+from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from stages.scene.files import ngff_version
+
+OPTIONAL = {  # packages, what needs them, and the extra that brings them
+    "huggingface_hub": ("--download", "hub"),
+    "transformers": ("segment --backend sam2", "sam2"),
+    "diffusers": ("refine --completer diffsplat", "diffsplat"),
+}
 
 
 def examine() -> Iterator[str]:
@@ -15,7 +22,7 @@ def examine() -> Iterator[str]:
     for check in (_torch, _gpu, _gsplat, _warp, _colmap, _codec, _disk):
         yield _line(*check())
     yield from _weights()
-    yield from _pi3()
+    yield from _published()
 
 
 def _line(works: bool, subject: str, finding: str) -> str:
@@ -95,20 +102,25 @@ def _weights() -> Iterator[str]:
             yield _line(False, "weights", str(error))
 
 
-def _pi3() -> Iterator[str]:
-    """Of the networks that `reconstruct` can use; told apart by their files' names, which loading checks."""
+def _published() -> Iterator[str]:
+    """Of the networks that others trained; told apart by their files' names, which loading checks."""
     from stages.errors import InputError
-    from stages.models.pi3.weights import PUBLISHED, find
+    from stages.models.diffsplat import weights as diffsplat
+    from stages.models.pi3 import weights as pi3
+    from stages.models.sam2 import weights as sam2
+    from stages.reconstruct import features_learned as matcher
 
-    for name in PUBLISHED:
+    finders = {name: partial(pi3.find, name) for name in pi3.PUBLISHED}
+    finders |= {name: partial(matcher.weights, file) for name, file in matcher.FILES.items()}
+    for name, find in {**finders, "sam2": sam2.find, "diffsplat": lambda: diffsplat.find().gsvae}.items():
         try:
-            path = find(name)
+            path = find()
             yield _line(True, name, f"{path}, {path.stat().st_size / 1e9:.1f} GB")
         except InputError as error:
             yield _line(False, name, str(error))
-    hub = _installed("huggingface_hub")
-    yield _line(True, "hub", f"huggingface_hub {hub}" if hub else "absent, and needed for --download alone: "
-                "`pip install 'ngff[hub]'`")  # fmt: skip
+    for package, (what, extra) in OPTIONAL.items():
+        found = _installed(package) or f"absent, and needed for {what} alone: `pip install 'ngff[{extra}]'`"
+        yield _line(True, "package", f"{package} {found}")
 
 
 def _disk() -> tuple[bool, str, str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 
 import torch
 from jaxtyping import Float
@@ -16,6 +17,7 @@ STEP = 15.0  # between neighbouring photos, as matching likes it [degrees]
 FEW = 10  # photos
 UNCONFIRMED = 0.35  # less of the photos with a depth that others confirm means plain, shiny or clear things
 BLURRED = 0.2  # of the median sharpness
+REASONS, NAMED = 5, 3  # of photos left out: how many are told, and photos named for each
 
 
 def advise(
@@ -35,10 +37,7 @@ def advise(
     if len(dropped) > len(cameras):
         out.append(f"only {len(cameras)} of {len(cameras) + len(dropped)} photos show enough of the same things: take "
                    "them closer together, each showing two thirds of what the one before it shows")  # fmt: skip
-    out += [f"{name} was left out: it {why}" for name, why in list(dropped.items())[:5]]
-    if len(dropped) > 5:
-        out.append(f"{len(dropped) - 5} more photos were left out, for like reasons")
-    out += _around(cameras, focus) + _heights(cameras, focus)
+    out += _left_out(dropped) + _around(cameras, focus) + _heights(cameras, focus)
     if len(cameras) < FEW:
         out.append(f"{len(cameras)} photos are few: {FEW} to 30 from all around show more sides and fit better")
     blurred = [cameras.names[i] for i in (sharpness < BLURRED * sharpness.median()).nonzero()[:, 0].tolist()]
@@ -52,6 +51,22 @@ def advise(
         )
     if not supported:
         out.append("no table or floor was found, z = 0 is at the lowest points: show more of what the things rest on")
+    return out
+
+
+def _left_out(dropped: dict[str, str]) -> list[str]:
+    """A sentence for each reason, with the photos that it holds for."""
+    photos = defaultdict(list)
+    for name, why in dropped.items():
+        photos[why].append(name)
+    out = []
+    for why, names in list(photos.items())[:REASONS]:
+        more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+        verb, each = ("was", "it") if len(names) == 1 else ("were", "each")
+        out.append(f"{', '.join(names[:NAMED])}{more} {verb} left out: {each} {why}")
+    if len(photos) > REASONS:
+        rest = sum(len(names) for names in list(photos.values())[REASONS:])
+        out.append(f"{rest} more photos were left out, for like reasons")
     return out
 
 

@@ -60,6 +60,7 @@ def finish(found: Found, options: ReconstructOptions, steps: Steps, device: str)
         log.info("%d depth samples confirmed by %d or more other photos", len(cloud), least)
         cloud = initialise.thin(cloud, options.level.gaussians, found.focus, found.radius)
         ground = upright.find_ground(cloud.points, used.cameras.viewmats, found.focus, options.seed)
+        ground = upright.settled(ground, cloud.points, options.seed)
         if ground.plane is None:
             log.info("no supporting plane found: up is how the cameras were held, the floor is at the lowest points")
         else:

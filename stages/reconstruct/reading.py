@@ -18,6 +18,7 @@ from tqdm import tqdm
 
 from stages.errors import InputError
 from stages.reconstruct.photos import Photos
+from stages.scene.files import must_exist
 from stages.scene.images import PHOTOS, VIDEOS, list_photos, open_video, read_image, to_bytes
 
 log = logging.getLogger(__name__)
@@ -76,14 +77,16 @@ def _from_folder(folder: Path, side: int, least: int) -> list[Taken]:
 
 def _files(folder: Path) -> list[Path]:
     """The photos' files; what else lies there is counted, and kinds that would need converting are named."""
-    files = [p for p in folder.iterdir() if p.is_file() and p.name[0] != "."] if folder.is_dir() else []
-    kinds = Counter(p.suffix.lower() for p in files)
+    inside = [p for p in sorted(folder.iterdir()) if p.name[0] != "."] if folder.is_dir() else []
+    kinds = Counter(p.suffix.lower() for p in inside if p.is_file())
     foreign = {kind: kinds[kind] for kind in sorted({*PHONE, *RAW} & kinds.keys())}
     advice = "convert them to JPEG first, as photo apps do on export"
     if PHONE & foreign.keys():
         advice += ' (heif-convert, or sips on a Mac; a phone set to "most compatible" takes JPEG)'
     if foreign and not PHOTOS & kinds.keys():
         raise InputError(f"{folder}: holds {_counted(foreign)} photos, which cannot be read; {advice}")
+    if not PHOTOS & kinds.keys() and (instead := next(filter(_is_source, inside), None)):
+        raise InputError(f"{folder}: holds no photos itself; give {instead}")
     files = list_photos(folder)
     if foreign:
         log.warning("%s: %s photos are left out; %s", folder, _counted(foreign), advice)
@@ -91,6 +94,13 @@ def _files(folder: Path) -> list[Path]:
     if others > 0:
         log.info("%s: %d photos; %d other files left alone", folder, len(files), others)
     return files
+
+
+def _is_source(path: Path) -> bool:
+    """Whether this is a video, or a folder with photos in it."""
+    if path.is_dir():
+        return any(p.suffix.lower() in PHOTOS and p.is_file() for p in path.iterdir())
+    return path.suffix.lower() in VIDEOS
 
 
 def _counted(kinds: dict[str, int]) -> str:
@@ -101,11 +111,14 @@ def _readable(files: list[Path], side: int, unread: dict[str, str]) -> Iterator[
     """Each photo with its place in the list; what is wrong with the others goes to `unread`."""
     for i, file in enumerate(tqdm(files, desc="reading photos", unit="photo", leave=False)):
         try:
-            if _cut_off(file):
+            if _cut_off(must_exist(file, "a photo")):
                 raise InputError(f"{file}: breaks off before its end; copy it again from where it came")
             image = read_image(file)
         except InputError as error:
             unread[file.name] = str(error)
+            continue
+        except cv2.error:  # by its header it has more pixels than OpenCV takes, 2^30
+            unread[file.name] = f"{file}: is damaged, or far too large; photos of 4000 pixels or less will do"
             continue
         bounded = _bounded(to_bytes(image), side)
         yield i, Taken(file.name, bounded, _exif_focal(file) * max(bounded.shape[:2]) / max(image.shape[:2]))

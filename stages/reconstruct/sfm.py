@@ -113,9 +113,9 @@ def _why_dropped(photos: Photos, pairs: list[Pair], best, models: dict) -> dict[
         if name in placed:
             continue
         most = int(common[i, inside].max())
-        together = next((group - placed - {name} for group in others if name in group), set())
-        if together:
-            why[name] = f"goes with {', '.join(sorted(together))} but not with the rest"
+        together = next((group - placed for group in others if name in group), set())
+        if len(together) > 1:
+            why[name] = f"is one of {len(together)} photos that go with each other but not with the rest"
         elif most == 0:
             why[name] = "shows nothing that was recognised in the other photos, or is blurred, dark or plain"
         else:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 import torch.nn.functional as F
@@ -14,6 +14,7 @@ from stages.geometry.planes import Plane, ransac
 from stages.geometry.similarity import Similarity
 
 LEAST = ((0.5, 0.04), (0.05, 0.3))  # cosine of the cameras' pitch, and share of the points in focus, a plane needs
+BELOW, ABOVE, PATCH = 0.08, 0.03, 0.04  # of the first plane, where it is looked for again; side of a patch [radii]
 
 
 @dataclass(frozen=True)
@@ -44,7 +45,7 @@ def find_ground(
     """
     eyes = centres(viewmats)
     radius = float((eyes - focus).norm(dim=1).median())
-    near = 1 / (1 + ((points - focus).norm(dim=1) / (0.5 * radius)) ** 4)
+    near = _nearness(points, focus, radius)
     for least_up, least_share in LEAST:
         found = ransac(points, 0.01 * radius, near, lambda n, up=least_up: _holds_level(n, viewmats, up), seed=seed)
         if found is None:
@@ -55,6 +56,29 @@ def find_ground(
         if share >= least_share and above > 0.5:
             return Ground(plane.normal, plane, focus, radius, share)
     return Ground(level_up(viewmats), None, focus, radius)
+
+
+def settled(ground: Ground, points: Float[Tensor, "n 3"], seed: int = 0) -> Ground:
+    """The plane again, by area: each patch of surface counts once, however many points its pattern gave.
+
+    Patterned tops, of a keyboard and of a book, may hold more points than the bare table under them and tilt the
+    first plane. It is looked for less far above than below, since what is above may be a tray.
+    """
+    if ground.plane is None:
+        return ground
+    heights = ground.plane.heights(points) / ground.radius
+    band = points[(heights > -BELOW) & (heights < ABOVE)]
+    _, patch, count = (band / (PATCH * ground.radius)).floor().long().unique(
+        dim=0, return_inverse=True, return_counts=True
+    )
+    weights = _nearness(band, ground.focus, ground.radius) / count[patch]
+    found = ransac(band, 0.005 * ground.radius, weights, lambda n: n @ ground.up > 0.99, seed=seed)
+    return ground if found is None else replace(ground, up=found[0].normal, plane=found[0])
+
+
+def _nearness(points: Float[Tensor, "n 3"], focus: Float[Tensor, "3"], radius: float) -> Float[Tensor, "n"]:
+    """Weights that fall to a half at half the cameras' distance."""
+    return 1 / (1 + ((points - focus).norm(dim=1) / (0.5 * radius)) ** 4)
 
 
 def _holds_level(normals: Float[Tensor, "k 3"], viewmats: Float[Tensor, "c 4 4"], least_up: float) -> Bool[Tensor, "k"]:

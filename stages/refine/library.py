@@ -22,7 +22,7 @@ from stages.geometry.similarity import Similarity
 from stages.physics.support import Support
 from stages.refine.options import RefineOptions
 from stages.refine.patches import none_like
-from stages.refine.register import Registration, approach, rough_fit, settle
+from stages.refine.register import LEAST, Registration, approach, rough_fit, settle
 from stages.refine.register_cloud import Cloud
 from stages.refine.sight import Sight
 from stages.scene.gaussians import Gaussians
@@ -39,23 +39,31 @@ SOLID = 0.1  # opacity of Gaussians that count as surface
 
 def complete(scene: Scene, number: int, sight: Sight, support: Support | None, options: RefineOptions) -> Gaussians:
     """Gaussians of the best asset of `options.library` where the object was not seen; none when nothing fits."""
-    g = scene.gaussians
-    own = g[(g.object_id == number) & (g.opacities > SOLID) & g.means.isfinite().all(1)]
-    name = scene.name_of(number)
-    found = best(own, library(options.library), options.seed) if len(own) >= 100 else None
+    own = solid(scene, number)
+    found = best(own, library(options.library), options.seed) if len(own) >= LEAST else None
     if found is None:
-        log.info("  %d  %s: left alone: too little of it to compare with the library", number, name)
-        return none_like(g)
+        log.info("  %d  %s: left alone: too little of it to compare with the library", number, scene.name_of(number))
+        return none_like(own)
     asset, whole, how = found
+    gained, verdict = put(whole, how, own, sight, FIT)
+    log.info("  %d  %s: %s of the library %s", number, scene.name_of(number), asset, verdict)
+    return gained
+
+
+def solid(scene: Scene, number: int) -> Gaussians:
+    """The Gaussians of an object that count as its surface."""
+    g = scene.gaussians
+    return g[(g.object_id == number) & (g.opacities > SOLID) & g.means.isfinite().all(1)]
+
+
+def put(whole: Gaussians, how: Registration, own: Gaussians, sight: Sight, least: float) -> tuple[Gaussians, str]:
+    """What a registered whole adds to its part, and why: nothing when it fits less than `least` or is seen through."""
     placed = moved(whole, how.similarity)
     through = _seen_through(placed, sight)
-    fits = how.fit >= FIT and through <= THROUGH
-    verdict = "put in its place" if fits else f"left alone: {FIT} and at most {THROUGH:.0%} are needed"
-    log.info(
-        "  %d  %s: %s of the library fits to %.2f, %.0f %% of it is seen through; %s",
-        number, name, asset, how.fit, 100 * through, verdict,
-    )  # fmt: skip
-    return added(own, placed, number) if fits else none_like(g)
+    fits = how.fit >= least and through <= THROUGH
+    verdict = "put in its place" if fits else f"left alone: {least} and at most {THROUGH:.0%} are needed"
+    gained = added(own, placed, int(own.object_id[0])) if fits else none_like(own)
+    return gained, f"fits to {how.fit:.2f}, {100 * through:.0f} % of it is seen through; {verdict}"
 
 
 @lru_cache(maxsize=1)

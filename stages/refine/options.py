@@ -11,6 +11,7 @@ from stages.errors import InputError
 BACKENDS = {
     "close": "stages.refine.close:complete",
     "library": "stages.refine.library:complete",
+    "diffsplat": "stages.refine.diffsplat:complete",
     "none": "stages.refine.close:nothing",
 }
 
@@ -19,6 +20,9 @@ BACKENDS = {
 class RefineOptions:
     completer: str = "close"  # a library chooses its own
     library: Path | None = None  # folder of whole objects, each a .ply or a folder with one
+    photos: Path | None = None  # those the scene was made from, to show DiffSplat; by default drawn from the Gaussians
+    weights: Path | None = None  # folder of DiffSplat's; by default looked for
+    download: bool = False  # fetch those weights where they are not here
     keep_raw: bool = False  # of K objects, keep those without their completion as K + 1 to 2 K
     outliers: float = 3.0  # robust deviations beyond which a Gaussian is a floater; 0 keeps all
     background: bool = True  # fill the table under and behind objects
@@ -29,6 +33,8 @@ class RefineOptions:
     def __post_init__(self):
         if self.completer == "library" and self.library is None:
             raise InputError("--completer library: name its folder with --library, such as `ngff-lab objects` writes")
+        if self.completer != "diffsplat" and (self.photos or self.weights or self.download):
+            raise InputError("--photos, --weights and --download are of --completer diffsplat: add that or leave them")
         if not 0 <= self.outliers < 1000:
             raise InputError(f"--outliers {self.outliers}: give 0 to keep all, or robust deviations such as 3")
         if not 8 <= self.resolution <= 96:

@@ -22,6 +22,7 @@ from stages.scene.gaussians import Gaussians
 
 LEAST = 100  # points of a part, or there is nothing to go by
 PLANE = 0.7  # weight of the distance along the normal; along the surface it is the rest, or plain parts would hold all
+AROUND = 300  # poses tried around one that was given
 RELIT = 15 * COLOUR  # most that light may shift a colour; more is another colour
 
 
@@ -33,22 +34,29 @@ class Registration:
     fit: float  # 1: every point of the part is on the whole, in place and colour; 0: none within 6 % of the diameter
 
 
-def register(part: Gaussians, whole: Gaussians, seed: int = 0) -> Registration | None:
-    """Put `whole` where `part` is; nothing when no three features agree."""
-    return register_clouds(Cloud.of(part, seed), Cloud.of(whole, seed), seed)
+def register(
+    part: Gaussians, whole: Gaussians, seed: int = 0, hint: Similarity | None = None
+) -> Registration | None:
+    """Put `whole` where `part` is, perhaps near a `hint`; nothing when no three features agree and none was given."""
+    return register_clouds(Cloud.of(part, seed), Cloud.of(whole, seed), seed, hint)
 
 
-def register_clouds(part: Cloud, whole: Cloud, seed: int = 0) -> Registration | None:
+def register_clouds(part: Cloud, whole: Cloud, seed: int = 0, hint: Similarity | None = None) -> Registration | None:
     """As `register`, for clouds made before."""
-    rough = approach(part, whole, seed)
+    rough = approach(part, whole, seed, hint)
     return settle(rough, part, whole, seed) if len(rough) else None
 
 
-def approach(part: Cloud, whole: Cloud, seed: int = 0) -> Poses:
-    """The few most promising poses, the best first, about 3 degrees off; none where no features agree."""
+def approach(part: Cloud, whole: Cloud, seed: int = 0, hint: Similarity | None = None) -> Poses:
+    """The few most promising poses, the best first, about 3 degrees off; none where no features agree.
+
+    With a `hint`, whole to part, those tried are the ones around it too.
+    """
     if min(len(part.points), len(whole.points)) < LEAST:
         return Poses(torch.zeros(0), torch.zeros(0, 3, 3), torch.zeros(0, 3))
     poses = guesses(part, whole, seed)
+    if hint is not None:
+        poses = Poses.joined(in_clouds(hint, part, whole).shaken(AROUND, seed), poses)
     if not len(poses):
         return poses
     tree, order = whole.tree(), _order(part, seed)
@@ -149,6 +157,14 @@ def _moved(poses: Poses, about: Float[Tensor, "h 3"], step: Float[Tensor, "h 7"]
     grown = step[:, 6].exp()
     arm = (turn @ (poses.translation - about)[..., None])[..., 0]
     return Poses(poses.scale * grown, turn @ poses.rotation, grown[:, None] * arm + about + step[:, 3:6])
+
+
+def in_clouds(place: Similarity, part: Cloud, whole: Cloud) -> Poses:
+    """Part to whole in normalised frames, from whole to part in the units of the scene."""
+    R = place.rotation.mT
+    scale = part.diameter / (place.scale * whole.diameter)
+    middle = (R @ (part.centre - place.translation) / place.scale - whole.centre) / whole.diameter
+    return Poses(torch.tensor([scale]), R[None], middle[None])
 
 
 def _in_the_scene(pose: Poses, part: Cloud, whole: Cloud) -> Similarity:

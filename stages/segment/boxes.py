@@ -2,54 +2,27 @@
 
 from __future__ import annotations
 
-import json
 import logging
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import replace
 
 import torch
 from jaxtyping import Float
-from torch import Tensor
 
 from stages.errors import InputError
 from stages.geometry.cameras import depths, project
 from stages.physics.grouping import Grouping, group
-from stages.scene.files import must_exist
 from stages.scene.scene import Scene, SceneObject
 from stages.segment.options import SegmentOptions
+from stages.segment.prompts import read_prompts
 
 log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class Prompts:
-    """Boxes x0 y0 x1 y1 and names, one row an object."""
-
-    boxes: Float[Tensor, "o 4"]  # [px] of view 0
-    names: tuple[str, ...]
-
-
-def read_prompts(path: Path) -> Prompts:
-    """prompts.json in the public format: {"center_point": [[u, v]..], "bbox": [[x0, y0, x1, y1]..], "text": [..]}."""
-    must_exist(path, "a prompts.json with bbox and text")
-    try:
-        data = json.loads(Path(path).read_text())
-        boxes = torch.tensor(data["bbox"], dtype=torch.float32).reshape(-1, 4)
-        names = tuple(str(name) for name in data.get("text") or [f"object_{i + 1}" for i in range(len(boxes))])
-    except (ValueError, KeyError, TypeError, AttributeError, RuntimeError) as error:
-        raise InputError(
-            f'{path}: is not a prompts file ({error!r}); write {{"bbox": [[x0, y0, x1, y1]], "text": ["duck"]}}'
-        ) from error
-    if not len(boxes) or len(names) != len(boxes):
-        raise InputError(f"{path}: {len(boxes)} boxes and {len(names)} names; give as many of each, and at least one")
-    if not bool((boxes[:, 2:] > boxes[:, :2]).all()):
-        raise InputError(f"{path}: a box has no area; the order is x0, y0, x1, y1 in pixels of the first photo")
-    return Prompts(boxes, names)
 
 
 def segment(scene: Scene, options: SegmentOptions) -> Scene:
     """For each box the group, or the few groups, that together fill it best; the rest is background."""
     prompts = read_prompts(options.boxes)
+    if prompts.boxes is None:
+        raise InputError(f"{options.boxes}: has points and no bbox; points are for --backend sam2")
     if scene.cameras is None or not len(scene.cameras):
         raise InputError("--boxes: the scene has no cameras; use one that `ngff reconstruct` wrote")
     fine = Grouping(max(options.max_objects, 4 * len(prompts.names)), 0.5 * options.min_size, options.detail)

@@ -12,14 +12,18 @@ BACKENDS = {
     "geometric": "stages.segment.geometric:segment",
     "masks": "stages.segment.masks:segment",
     "boxes": "stages.segment.boxes:segment",
+    "sam2": "stages.segment.sam2:segment",
 }
 
 
 @dataclass(frozen=True)
 class SegmentOptions:
-    backend: str = "geometric"  # --masks and --boxes choose their own
+    backend: str = "geometric"  # --masks chooses its own, and --boxes too, unless this is sam2
     masks: Path | None = None  # folder of label images, named as the photos: 0 background, 1... the objects
-    boxes: Path | None = None  # prompts.json in the public format: boxes in the first view
+    boxes: Path | None = None  # prompts.json in the public format: boxes (for sam2 also points) in the first view
+    photos: Path | None = None  # folder of those the scene was made from, to show sam2; by default the scene is drawn
+    weights: Path | None = None  # of sam2: model.safetensors, its config.json beside it, or the folder of both
+    download: bool = False  # fetch those weights where they are not here
     names: str = ""  # "1=duck,2=bowl" in place of the names found
     max_objects: int = 24
     min_size: float = 0.03  # of an object, along its longest side [distance of the cameras from what they look at]
@@ -31,6 +35,10 @@ class SegmentOptions:
     def __post_init__(self):
         if self.masks is not None and self.boxes is not None:
             raise InputError("--masks and --boxes: give one of them")
+        if self.backend == "sam2" and self.masks is not None:
+            raise InputError("--backend sam2 makes masks itself; give no --masks, or leave --backend out")
+        if self.backend != "sam2" and (self.photos or self.weights or self.download):
+            raise InputError("--photos, --weights and --download are of --backend sam2: add that or leave them")
         if self.max_objects < 1:
             raise InputError(f"--max-objects {self.max_objects}: must be 1 or more")
         if not 0 < self.min_size < 1:
@@ -42,6 +50,8 @@ class SegmentOptions:
     @property
     def chosen(self) -> str:
         """The backend that the options ask for."""
+        if self.backend == "sam2":
+            return "sam2"
         return "masks" if self.masks is not None else "boxes" if self.boxes is not None else self.backend
 
     @property

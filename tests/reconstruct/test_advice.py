@@ -59,10 +59,16 @@ def test_what_went_wrong_is_said():
 
 
 def test_photos_left_out_are_named_with_the_reason_but_not_without_end():
-    text = told(around(24), dropped={f"{i:03d}.jpg": "is blank" for i in range(30)})
-    assert "000.jpg was left out: it is blank" in text and "25 more photos were left out" in text
-    assert text.startswith("only 24 of 54 photos show enough of the same things")
-    assert len(text.splitlines()) == 7
+    text = told(around(24), dropped={"a.jpg": "is dark", **{f"{i:03d}.jpg": "is blank" for i in range(30)}})
+    assert text.splitlines() == [
+        "only 24 of 55 photos show enough of the same things: take them closer together, each showing two thirds of "
+        "what the one before it shows",
+        "a.jpg was left out: it is dark",
+        "000.jpg, 001.jpg, 002.jpg and 27 more were left out: each is blank",
+    ]
+    text = told(around(24), dropped={f"{i}.jpg": f"has {i} points in common" for i in range(8)})
+    assert len(text.splitlines()) == 6 and "4.jpg was left out: it has 4" in text
+    assert text.endswith("3 more photos were left out, for like reasons")
 
 
 def test_a_length_between_two_cameras_or_to_the_scene():

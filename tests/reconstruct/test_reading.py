@@ -1,6 +1,8 @@
 """What users put into a folder, and what phones film."""
 
 import logging
+import struct
+import zlib
 from fractions import Fraction
 
 import av
@@ -123,6 +125,40 @@ def test_photos_that_cannot_be_read_are_named_and_left_out(folder, caplog):
         read_photos(folder)
 
 
+def test_whatever_else_is_called_a_photo_is_named_and_left_out(folder, caplog):
+    (folder / "folder.jpg").mkdir()
+    (folder / "link.jpg").symlink_to(folder / "gone.jpg")
+    (folder / "phone.jpg").write_bytes(b"\0\0\0\x18ftypheic" + bytes(500))  # HEIC under another name
+    (folder / "huge.png").write_bytes(png_that_claims(60_000, 60_000))
+    photos = read_photos(folder)
+    assert photos.names == ("a.jpg", "b.jpg")
+    for said in ("folder.jpg: is a folder", "link.jpg: no such file", "phone.jpg: is not an image", "huge.png: is dam"):
+        assert said in caplog.text
+
+
+def png_that_claims(width: int, height: int) -> bytes:
+    """A header without the pixels it speaks of."""
+    chunks = [(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)), (b"IDAT", zlib.compress(b"0"))]
+    out = b"\x89PNG\r\n\x1a\n"
+    for kind, data in (*chunks, (b"IEND", b"")):
+        out += struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+    return out
+
+
+def test_the_folder_or_video_that_was_meant_is_named(tmp_path):
+    (tmp_path / "day 1" / "images").mkdir(parents=True)
+    Image.fromarray(picture()).save(tmp_path / "day 1" / "images" / "a.png")
+    with pytest.raises(InputError, match="day 1: holds no photos itself; give .*images"):
+        read_photos(tmp_path / "day 1")
+    (tmp_path / "films").mkdir()
+    (tmp_path / "films" / "IMG 7.MOV").write_bytes(b"film")
+    with pytest.raises(InputError, match="films: holds no photos itself; give .*IMG 7.MOV"):
+        read_photos(tmp_path / "films")
+    (tmp_path / "none").mkdir()
+    with pytest.raises(InputError, match="none: no photos in it; these kinds are read"):
+        read_photos(tmp_path / "none")
+
+
 def test_a_film_behind_the_photo_does_not_make_it_broken(folder):
     thumbnail, whole = (folder / "a.jpg").read_bytes(), (folder / "b.jpg").read_bytes()
     header = b"\xff\xe1" + (len(thumbnail) + 2).to_bytes(2, "big") + thumbnail
@@ -153,6 +189,17 @@ def test_of_very_many_photos_the_sharpest_of_each_span_is_taken(tmp_path, monkey
         photos = read_photos(tmp_path)
     assert photos.names == ("01.png", "04.png", "07.png", "10.png")
     assert "of 12 photos the sharpest 4" in caplog.text
+
+
+def test_five_hundred_photos_are_held_to_a_number_and_a_size(tmp_path, monkeypatch):
+    monkeypatch.setattr(reading, "SIDES", (160, 64))
+    pixels = picture(96, 64)
+    for i in range(500):
+        cv2.imwrite(str(tmp_path / f"{i:03d}.jpg"), pixels)
+    photos = read_photos(tmp_path)
+    assert len(photos) == reading.MOST == 200
+    assert all(max(photos.size(i)) == 64 for i in range(200))
+    assert int(photos.names[0][:3]) < 3 and int(photos.names[-1][:3]) > 496  # from the whole walk
 
 
 def film(path, times: list[float], size: tuple[int, int] = (96, 64), blurred: tuple[int, ...] = ()) -> None:
@@ -186,6 +233,20 @@ def test_blurred_frames_are_passed_over(tmp_path, monkeypatch):
     film(tmp_path / "v.mp4", [0.1 * i for i in range(25)], blurred=tuple(i for i in range(25) if i % 5 != 2))
     names = read_photos(tmp_path / "v.mp4").names
     assert [int(name[6:]) % 5 for name in names] == [2] * 5
+
+
+@pytest.mark.parametrize(("matrix", "turned"), [((0, 1, -1, 0), -1), ((0, -1, 1, 0), 1), ((-1, 0, 0, -1), 2)])
+def test_a_phone_held_upright_films_lying_and_says_so(tmp_path, matrix, turned):
+    film(tmp_path / "v.mp4", [0.1 * i for i in range(3)])
+    stored = read_photos(tmp_path / "v.mp4").images
+    data = (tmp_path / "v.mp4").read_bytes()
+    a, b, c, d = (65536 * k for k in matrix)  # 16.16 fixed point, rows of a matrix that acts on row vectors
+    level = struct.pack(">9i", 65536, 0, 0, 0, 65536, 0, 0, 0, 1 << 30)
+    at = data.index(level, data.index(b"tkhd"))  # in the header of the track, ISO/IEC 14496-12
+    (tmp_path / "v.mp4").write_bytes(data[:at] + struct.pack(">9i", a, b, 0, c, d, 0, 0, 0, 1 << 30) + data[at + 36 :])
+    photos = read_photos(tmp_path / "v.mp4")
+    for image, before in zip(photos.images, stored, strict=True):
+        assert torch.equal(image, torch.rot90(before, turned))
 
 
 def test_a_4k_video_is_read_at_the_size_that_is_kept(tmp_path):

@@ -81,6 +81,15 @@ def test_many_photos_are_not_all_compared(monkeypatch):
     assert len(chosen) < 40 * 39 / 4
 
 
+def test_pairs_grow_with_the_number_of_photos_even_where_all_look_alike(monkeypatch):
+    monkeypatch.setattr(features, "EXHAUSTIVE", 20)
+    n, generator = 60, torch.Generator().manual_seed(0)
+    same = torch.nn.functional.normalize(torch.randn(30, 16, generator=generator), dim=1)
+    chosen = features.pairs([same] * n)
+    assert len(set(chosen)) == len(chosen) <= (8 + 20) * n < n * (n - 1) / 2
+    assert len(features.pairs([same] * 20)) == 20 * 19 / 2
+
+
 def test_distortion_is_undone(tmp_path):
     # Straight lines of a chart seen through k1 = -0.2 become straight again.
     size, K = (200, 150), torch.tensor([[180.0, 0, 100], [0, 180, 75], [0, 0, 1]])

@@ -44,13 +44,29 @@ def displaced(points, viewmats, seed: int):
 def test_the_table_becomes_level_at_zero(cameras, seed):
     points, viewmats, move = displaced(tabletop(), cameras, seed)
     focus = move(torch.tensor([0.0, 0, 0.1]))
-    ground = upright.find_ground(points, viewmats, focus, seed)
+    ground = upright.settled(upright.find_ground(points, viewmats, focus, seed), points, seed)
     world = upright.to_world(ground, points, viewmats, metric=False)
     tilt = math.degrees(math.acos(min(1.0, float((world.rotation @ move.rotation)[2, 2]))))
     assert tilt < 0.5
     table = world(points)[:4000]
     assert table[:, 2].abs().median() < 0.002
     assert abs(float(table[:, 2].mean())) < 0.002
+
+
+def test_patterned_tops_do_not_tilt_a_bare_table():
+    # A keyboard and a book, 15 and 35 mm high, with ten times the points of the table that they lie on.
+    generator = torch.Generator().manual_seed(0)
+    rand = lambda n: torch.rand(n, 3, generator=generator) - 0.5  # noqa: E731
+    table = rand(900) * torch.tensor([1.2, 0.8, 0.0])
+    keyboard = rand(5000) * torch.tensor([0.15, 0.45, 0]) + torch.tensor([-0.25, 0, 0.015])
+    book = rand(4000) * torch.tensor([0.2, 0.25, 0]) + torch.tensor([0.3, 0.1, 0.035])
+    points = torch.cat([table, keyboard, book])
+    points += 0.001 * torch.randn(points.shape, generator=generator)
+    first = upright.find_ground(points, all_round(), torch.zeros(3))
+    ground = upright.settled(first, points)
+    lean = lambda up: math.degrees(math.acos(min(1.0, float(up[2]))))  # noqa: E731
+    assert lean(first.up) > 2
+    assert lean(ground.up) < 0.3 and abs(float(ground.plane.heights(torch.zeros(3)))) < 0.002
 
 
 def test_focus_scale_and_heading():

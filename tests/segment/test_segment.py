@@ -12,9 +12,9 @@ from stages.geometry.cameras import project
 from stages.raster.rasterise import visibility
 from stages.scene.images import write_labels
 from stages.scene.scene_ply import read_scene, write_scene
-from stages.segment.masks import elect, without_outliers
 from stages.segment.options import SegmentOptions
 from stages.segment.stage import run
+from stages.segment.vote import elect, pooled, tempered, without_outliers
 from tests.segment.tabletop import best_overlap, three_apart
 
 
@@ -85,6 +85,18 @@ def test_masks_with_wrong_pixels_are_outvoted(scene_file, truth, tmp_path):
         assert float((mine & theirs).sum() / (mine | theirs).sum()) >= 0.9
 
 
+def test_most_photos_missing_and_numbers_mixed_up_in_some_are_outvoted(scene_file, truth, tmp_path):
+    masks = true_masks(truth)
+    masks[3] = torch.tensor([0, 2, 3, 1])[masks[3]]  # a tool that numbered one photo in another order
+    some = [1, 3, 5, 6, 7]
+    folder = write_masks(tmp_path / "masks", replace(truth, cameras=truth.cameras[some]), [masks[i] for i in some])
+    run(scene_file, tmp_path / "out.ply", SegmentOptions(masks=folder))
+    found = read_scene(tmp_path / "out.ply").gaussians.object_id
+    for i in (1, 2, 3):
+        mine, theirs = found == i, truth.gaussians.object_id == i
+        assert float((mine & theirs).sum() / (mine | theirs).sum()) >= 0.9
+
+
 def test_a_tie_goes_to_the_neighbours(truth):
     votes = torch.nn.functional.one_hot(truth.gaussians.object_id, 4).float()
     tied = torch.nonzero(truth.gaussians.object_id == 2)[::7, 0]
@@ -93,6 +105,35 @@ def test_a_tie_goes_to_the_neighbours(truth):
     votes[unseen] = 0.0
     ids = elect(truth, votes)
     assert float((ids == truth.gaussians.object_id).float().mean()) > 0.995
+
+
+def test_a_gaussian_without_a_place_stays_background(truth):
+    votes = torch.nn.functional.one_hot(truth.gaussians.object_id, 4).float()
+    means = truth.gaussians.means.clone()
+    lost = torch.nonzero(truth.gaussians.object_id == 2)[:3, 0]
+    means[lost], votes[lost] = torch.nan, 0.0
+    nowhere = replace(truth, gaussians=replace(truth.gaussians, means=means))
+    ids = elect(nowhere, pooled(means, votes))
+    assert (ids[lost] == 0).all() and float((ids == truth.gaussians.object_id).float().mean()) > 0.99
+
+
+def test_one_near_view_does_not_overrule_two_far_ones():
+    near, far = torch.tensor([[0.0, 90.0, 0.0]]), torch.tensor([[0.0, 0.0, 30.0]])
+    assert int((near + 2 * far).argmax(1)) == 1  # by pixels it would
+    assert int((tempered(near) + 2 * tempered(far)).argmax(1)) == 2  # 9.5 against 11.0
+    torch.testing.assert_close(tempered(torch.tensor([[1.0, 3.0]])), torch.tensor([[0.5, 1.5]]))
+    assert tempered(torch.zeros(1, 3)).tolist() == [[0.0, 0.0, 0.0]]
+
+
+def test_neighbours_pool_their_votes_but_not_across_a_gap():
+    x = torch.cat([torch.arange(9.0), 100 + torch.arange(9.0)])
+    votes = torch.zeros(18, 2)
+    votes[:9, 0], votes[9:, 1] = 1.0, 1.0
+    votes[4] = torch.tensor([0.0, 3.0])  # noise
+    out = pooled(torch.stack([x, torch.zeros(18), torch.zeros(18)], 1), votes)
+    assert out[4].tolist() == [8.0, 3.0] and out[13].tolist() == [0.0, 9.0]
+    alone = pooled(torch.stack([x, torch.zeros(18), torch.zeros(18)], 1)[:10], votes[:10])
+    assert alone[9].tolist() == [0.0, 1.0]  # its nearest are far away
 
 
 def test_outliers_by_the_modified_z_score():
@@ -148,7 +189,8 @@ def test_masks_of_other_proportions_are_refused(scene_file, truth, tmp_path):
     ("wrong", "says"),
     [({"names": "duck"}, "NUMBER=NAME"), ({"scale_reference": "duck=0.1"}, "object=1 height=0.12"),
      ({"scale_reference": "object=1 height=0"}, "more than 0"), ({"max_objects": 0}, "max-objects"),
-     ({"min_size": 2.0}, "min-size"), ({"detail": 0.0}, "detail"), ({"masks": "a", "boxes": "b"}, "one of them")],
+     ({"min_size": 2.0}, "min-size"), ({"detail": 0.0}, "detail"), ({"masks": "a", "boxes": "b"}, "one of them"),
+     ({"backend": "sam2", "masks": "a"}, "makes masks itself"), ({"weights": "a"}, "of --backend sam2")],
 )  # fmt: skip
 def test_options_check_themselves(wrong, says):
     with pytest.raises(InputError, match=says):

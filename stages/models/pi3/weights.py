@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +12,7 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from stages.errors import InputError
+from stages.models.hub import Source, folders
 from stages.models.pi3.config import Pi3Config
 from stages.models.pi3.network import Pi3
 from stages.models.pi3.splat import Pi3Splat
@@ -22,27 +22,17 @@ SUFFIXES = (".safetensors", ".pth", ".pt", ".ckpt", ".bin")
 
 
 @dataclass(frozen=True)
-class Published:
+class Published(Source):
     """A network, and where its makers put the weights."""
 
     network: type[nn.Module]
     prefix: str  # before the names that π³ itself uses
-    repository: str  # on huggingface.co
-    size: str
-    licence: str
 
 
 PUBLISHED = {
-    "pi3": Published(Pi3, "", "yyfz233/Pi3", "3.8 GB", "CC BY-NC 4.0"),
-    "pi3-splat": Published(Pi3Splat, "encoder.", "lishiqianhugh/Pi3_splat", "4.2 GB", "that of π³, CC BY-NC 4.0"),
+    "pi3": Published("yyfz233/Pi3", "3.8 GB", "CC BY-NC 4.0", Pi3, ""),
+    "pi3-splat": Published("lishiqianhugh/Pi3_splat", "4.2 GB", "that of π³, CC BY-NC 4.0", Pi3Splat, "encoder."),
 }
-
-
-def folders() -> list[Path]:
-    """Where weights are looked for; what is downloaded goes into the first."""
-    given = os.environ.get("NGFF_WEIGHTS")
-    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "ngff"
-    return [*([Path(given)] if given else []), cache]
 
 
 def find(name: str, given: Path | None = None) -> Path:

@@ -1,0 +1,53 @@
+"""What the user points at: a box or a point for each object, in the first view."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from stages.errors import InputError
+from stages.scene.files import must_exist
+
+
+@dataclass(frozen=True)
+class Prompts:
+    """One row an object; boxes, or points, or both are there."""
+
+    boxes: Float[Tensor, "o 4"] | None  # x0 y0 x1 y1 [px] of view 0
+    points: Float[Tensor, "o 2"] | None  # x y inside the object [px] of view 0
+    names: tuple[str, ...]
+
+
+def read_prompts(path: Path) -> Prompts:
+    """prompts.json in the public format: {"bbox": [[x0, y0, x1, y1]..], "center_point": [[u, v]..], "text": [..]}.
+
+    Either of the first two may be absent or empty. Raises InputError for what is no such file.
+    """
+    must_exist(path, "a prompts.json with bbox or center_point, and text")
+    try:
+        data = json.loads(Path(path).read_text())
+        boxes = torch.tensor(data.get("bbox") or [], dtype=torch.float32).reshape(-1, 4)
+        points = torch.tensor(data.get("center_point") or [], dtype=torch.float32).reshape(-1, 2)
+        count = len(boxes) or len(points)
+        names = tuple(str(name) for name in data.get("text") or [f"object_{i + 1}" for i in range(count)])
+    except (ValueError, KeyError, TypeError, AttributeError, RuntimeError) as error:
+        raise _wrong(path, repr(error)) from error
+    if not count:
+        raise _wrong(path, "neither a bbox nor a center_point")
+    if {len(boxes), len(points), len(names)} - {0, count}:
+        raise InputError(f"{path}: {len(boxes)} boxes, {len(points)} points and {len(names)} names; give as many of "
+                         "each, or of boxes or points none")  # fmt: skip
+    if not bool((boxes[:, 2:] > boxes[:, :2]).all()):
+        raise InputError(f"{path}: a box has no area; the order is x0, y0, x1, y1 in pixels of the first photo")
+    return Prompts(boxes if len(boxes) else None, points if len(points) else None, names)
+
+
+def _wrong(path: Path, what: str) -> InputError:
+    return InputError(
+        f'{path}: is not a prompts file ({what}); write {{"bbox": [[x0, y0, x1, y1]], "text": ["duck"]}}'
+    )

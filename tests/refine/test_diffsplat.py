@@ -1,0 +1,146 @@
+"""The generating completer: true maps in the network's place end where the object is; a network of noise is refused."""
+
+import logging
+from dataclasses import replace
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from stages.errors import InputError
+from stages.evaluate.clouds import nearest
+from stages.geometry.cameras import intrinsics
+from stages.geometry.harmonics import C0
+from stages.geometry.rotations import matrix
+from stages.geometry.similarity import Similarity
+from stages.lab.shapes import ellipsoid
+from stages.models.diffsplat.maps import FOCAL, RADIUS, SCALES, cameras, to_gaussians
+from stages.raster.rasterise import rasterise
+from stages.refine import diffsplat
+from stages.refine.library import moved, solid
+from stages.refine.options import RefineOptions
+from stages.refine.portrait import portrait
+from stages.refine.register import register
+from stages.refine.register_cloud import Cloud
+from stages.refine.sight import Sight
+from stages.refine.stage import refine, run
+from stages.scene.gaussians import Gaussians
+from stages.scene.scene import Scene, SceneObject
+from stages.scene.scene_ply import read_scene, write_scene
+from tests.refine.things import thing
+from tests.segment.tabletop import coloured, scene_of, table
+
+SIDE = 128
+PLACE = Similarity(0.3, matrix(torch.tensor([0.9, 0.0, 0.0, 0.4])), torch.tensor([0.02, -0.03, 0.04]))
+OFF = Similarity(0.94, matrix(torch.tensor([1.0, 0.02, -0.03, 0.02])), torch.tensor([0.03, -0.02, 0.03]))  # 5 degrees
+
+
+@pytest.fixture(scope="module")
+def truth() -> Gaussians:
+    return moved(thing(), PLACE)
+
+
+@pytest.fixture(scope="module")
+def seen(truth) -> Scene:
+    """What three cameras on one side see of the thing on a table."""
+    scene = scene_of(table(0.02), truth)
+    scene = replace(scene, cameras=scene.cameras[:3], objects=(SceneObject(1, "toy_thing"),))
+    g = scene.gaussians
+    return replace(scene, gaussians=g[(Sight.of(scene).weight > 0.02) | (g.object_id == 0)])
+
+
+def maps_of(g: Gaussians, elevation: float) -> torch.Tensor:
+    """The maps that a perfect network would answer with: colour and depth drawn by DiffSplat's own cameras."""
+    viewmats = cameras(elevation)
+    # corner pixels lie on the picture's corners
+    K = intrinsics(SIDE, SIDE, FOCAL * (SIDE - 1)).expand(4, 3, 3)
+    drawn = rasterise(g, viewmats, K, SIDE, SIDE)
+    maps = torch.zeros(4, 12, SIDE, SIDE)
+    maps[:, :3] = 2 * drawn.rgb.permute(0, 3, 1, 2) / drawn.alpha[:, None].clamp_min(0.5) - 1
+    maps[:, 3:6] = 2 * (SCALES[1] - 0.006) / (SCALES[1] - SCALES[0]) - 1
+    maps[:, 6] = 1
+    maps[:, 10] = torch.where(drawn.alpha > 0.9, 0.9, -1.0)
+    maps[:, 11] = drawn.depth - RADIUS
+    return maps.clamp(-1, 1)
+
+
+@pytest.fixture(scope="module")
+def perfect(seen, truth):
+    """In the network's place: the true object, a little off from where the portrait's camera says it is."""
+    place = portrait(seen, solid(seen, 1), SIDE).place
+    R = place.rotation.mT
+    back = Similarity(1 / place.scale, R, -(R @ place.translation) / place.scale)
+
+    def generate(image, elevation, prompt, seed):
+        assert image.shape == (SIDE, SIDE, 3) and prompt == "toy thing"
+        return to_gaussians(maps_of(moved(moved(truth, back), OFF), elevation), cameras(elevation))
+
+    return SimpleNamespace(side=SIDE, generate=generate)
+
+
+@pytest.fixture(scope="module")
+def whole(seen, perfect) -> Scene:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(diffsplat, "_model", lambda *_: perfect)
+        return refine(seen, RefineOptions("diffsplat", background=False, keep_raw=True))
+
+
+def test_the_thing_is_whole_where_it_was_not_seen(seen, whole, truth):
+    all_round = scene_of(table(0.02), truth)
+    outside = all_round.gaussians.means[(Sight.of(all_round).weight > 0.02) & (all_round.gaussians.object_id == 1)]
+    before, after = (s.gaussians.means[s.gaussians.object_id == 1] for s in (seen, whole))
+    far = [nearest(outside, points).distance for points in (before, after)]
+    assert far[1].mean() < 0.3 * far[0].mean() and far[1].mean() < 0.02 * PLACE.scale
+    assert nearest(after, truth.means).distance.quantile(0.95) < 0.02 * PLACE.scale
+
+
+def test_its_colours_are_right_all_around(whole, truth):
+    g = whole.gaussians[whole.gaussians.object_id == 1]
+    index = nearest(g.means, truth.means).index
+    error = (g.sh[:, 0] - truth.sh[index, 0]).abs().mean(1) * C0
+    assert error.median() < 0.05
+
+
+def test_the_raw_thing_stands_beside_it(seen, whole):
+    assert [o.name for o in whole.objects] == ["toy_thing", "toy_thing (raw)"]
+    counts = [int((whole.gaussians.object_id == i).sum()) for i in (1, 2)]
+    assert counts[0] > counts[1] > 100
+
+
+def test_a_hint_helps_where_nothing_stands_out():
+    """A plain cylinder's part has no features to match; near a hint it is found."""
+    plain = coloured(ellipsoid((0.2, 0.3, 0.5), 8000), (0.5, 0.5, 0.5), 1, grain=0.0)
+    there = Similarity(0.4, matrix(torch.tensor([0.8, 0.2, -0.3, 0.1])), torch.tensor([0.2, 0.1, 0.3]))
+    part = moved(plain, there)[plain.means[:, 0] > -0.05]
+    near = Similarity(0.4 * 1.05, there.rotation @ OFF.rotation, there.translation + 0.01)
+    found = register(part, plain, hint=near)
+    assert found.similarity.scale == pytest.approx(0.4, rel=0.03)
+    assert (found.similarity(plain.means) - there(plain.means)).norm(dim=1).mean() < 0.02 * Cloud.of(part).diameter
+
+
+def test_without_weights_it_is_one_sentence(seen, tmp_path, monkeypatch):
+    monkeypatch.setenv("NGFF_WEIGHTS", str(tmp_path / "none"))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    write_scene(tmp_path / "scene.ply", seen)
+    with pytest.raises(InputError, match="chenguolin/DiffSplat"):
+        run(tmp_path / "scene.ply", tmp_path / "out.ply", RefineOptions("diffsplat"))
+    assert not (tmp_path / "out.ply").exists()
+    with pytest.raises(InputError, match="--completer diffsplat"):
+        RefineOptions(photos=tmp_path)
+
+
+def test_a_network_of_noise_adds_nothing_and_it_is_said(seen, tmp_path, caplog, monkeypatch):
+    """Random weights in the published layout, through the same loader, sampler (of fewer steps) and registration."""
+    pytest.importorskip("diffusers")
+    pytest.importorskip("transformers")
+    from stages.models.diffsplat import network
+    from tests.models.diffsplat.tiny import published
+
+    monkeypatch.setattr(network, "STEPS", 3)
+    write_scene(tmp_path / "scene.ply", seen)
+    with caplog.at_level(logging.INFO):
+        options = RefineOptions("diffsplat", weights=published(tmp_path / "weights"), background=False, device="cpu")
+        run(tmp_path / "scene.ply", tmp_path / "out.ply", options)
+    assert "left alone" in caplog.text and "DiffSplat made of" in caplog.text
+    before, after = (int((s.gaussians.object_id == 1).sum()) for s in (seen, read_scene(tmp_path / "out.ply")))
+    assert after <= before

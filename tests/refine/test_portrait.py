@@ -1,0 +1,113 @@
+"""Portraits: the photo turned to the object is what a camera turned to it sees, and tells where the object belongs."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from stages.errors import InputError
+from stages.geometry.cameras import centres, intrinsics, look_at, orbit, project
+from stages.geometry.rotations import matrix
+from stages.geometry.similarity import Similarity
+from stages.models.diffsplat.maps import FOCAL, cameras
+from stages.raster.rasterise import rasterise
+from stages.refine.library import moved, solid
+from stages.refine.portrait import FILLS, portrait
+from stages.scene.cameras import Cameras
+from stages.scene.images import write_png
+from stages.scene.scene import Scene, SceneObject
+from tests.refine.things import thing
+from tests.segment.tabletop import scene_of, table
+
+SIDE = 96
+PLACE = Similarity(0.3, matrix(torch.tensor([0.9, 0.0, 0.0, 0.4])), torch.tensor([0.08, -0.05, 0.04]))
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    """The thing on a table, to one side in all pictures, from 25 degrees up, and once from far above."""
+    viewmats = orbit(6, torch.tensor([0.0, 0, 0.1]), 1.0, 25.0)
+    steep = orbit(1, torch.tensor([0.0, 0, 0.1]), 0.8, 85.0)
+    K = intrinsics(320, 240, 340.0)
+    many = Cameras(torch.cat([viewmats, steep]), K.expand(7, 3, 3).clone(), torch.tensor([[320, 240]] * 7),
+                   tuple(f"{i}.jpg" for i in range(7)))  # fmt: skip
+    made = scene_of(table(0.02), moved(thing(0.02), PLACE))
+    return replace(made, objects=(SceneObject(1, "thing"),), cameras=many)
+
+
+@pytest.fixture(scope="module")
+def photos(scene, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("photos")
+    c = scene.cameras
+    for viewmat, K, name in zip(c.viewmats, c.Ks, c.names, strict=True):
+        drawn = rasterise(scene.gaussians, viewmat[None], K[None], 320, 240).rgb[0]
+        write_png(folder / name.replace("jpg", "png"), drawn)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def shown(scene, photos):
+    return portrait(scene, solid(scene, 1), SIDE, photos)
+
+
+def outline(image) -> tuple[float, float, float, float]:
+    rows, columns = torch.nonzero((image < 0.9).any(2), as_tuple=True)
+    return float(columns.min()), float(rows.min()), float(columns.max() + 1), float(rows.max() + 1)
+
+
+def test_it_is_alone_centred_and_fills_four_fifths(shown):
+    left, top, right, bottom = outline(shown.image)
+    assert max(right - left, bottom - top) == pytest.approx(FILLS * SIDE, abs=3)
+    assert (left + right) / 2 == pytest.approx(SIDE / 2, abs=2) and (top + bottom) / 2 == pytest.approx(SIDE / 2, abs=2)
+    assert bool((shown.image[[0, 0, -1, -1], [0, -1, 0, -1]] == 1).all())
+
+
+def test_a_turned_photo_is_what_a_turned_camera_sees(scene, shown):
+    """The object drawn by itself, by the camera that `place` says: in the photo's place, turned to place(0)."""
+    eye = centres(scene.cameras.viewmats[int(shown.name[0])][None])[0]
+    viewmat, distance = look_at(eye, shown.place.translation), float((eye - shown.place.translation).norm())
+    focal = FOCAL * SIDE * distance / (1.4 * shown.place.scale)
+    own = scene.gaussians[scene.gaussians.object_id == 1]
+    K = intrinsics(4 * SIDE, 4 * SIDE, 4 * focal)
+    white = torch.ones(3)
+    fine = rasterise(own, viewmat[None], K[None], 4 * SIDE, 4 * SIDE, white).rgb[0]
+    direct = torch.nn.functional.avg_pool2d(fine.permute(2, 0, 1), 4).permute(1, 2, 0)
+    error = (direct - shown.image).square().mean()
+    assert -10 * math.log10(error) > 27  # the photo is coarser than the portrait
+
+
+def test_without_photos_it_is_drawn_from_the_gaussians(scene, shown):
+    drawn = portrait(scene, solid(scene, 1), SIDE)
+    assert -10 * math.log10((drawn.image - shown.image).square().mean()) > 25
+    assert drawn.elevation == pytest.approx(shown.elevation)
+
+
+def test_its_camera_is_the_first_of_the_network(scene, shown):
+    """Points near the object's middle lie in the same pixels for the camera in the scene and for DiffSplat's first."""
+    eye = centres(scene.cameras.viewmats[int(shown.name[0])][None])[0]
+    middle = shown.place.translation
+    up = (eye - middle)[2] / (eye - middle).norm()
+    assert shown.elevation == pytest.approx(math.degrees(math.asin(up)), abs=1e-3)
+    near = 0.01 * torch.randn(20, 3, generator=torch.Generator().manual_seed(0))
+    focal = FOCAL * SIDE * float((eye - middle).norm()) / (1.4 * shown.place.scale)
+    theirs = project(near, cameras(shown.elevation)[0], intrinsics(SIDE, SIDE, FOCAL * SIDE))
+    ours = project(shown.place(near), look_at(eye, middle), intrinsics(SIDE, SIDE, focal))
+    assert (theirs - SIDE / 2).norm(dim=1).max() > 1
+    torch.testing.assert_close(theirs, ours, rtol=0, atol=0.03)
+
+
+def test_the_camera_far_above_is_not_asked_and_the_one_that_sees_it_whole_is(scene, photos):
+    cut = scene.cameras.viewmats.clone()
+    others = [i for i in range(6) if i != 2]
+    cut[others, 0, 3] += 0.55  # now at the edge of all pictures but one
+    off, own = replace(scene, cameras=replace(scene.cameras, viewmats=cut)), solid(scene, 1)
+    assert portrait(off, own, SIDE, photos).name == "2.jpg"
+    for few in (scene.cameras[[6]], None):
+        assert portrait(replace(scene, cameras=few), own, SIDE) is None
+
+
+def test_photos_of_something_else_are_refused(scene, tmp_path):
+    write_png(tmp_path / "other.png", torch.zeros(4, 4, 3))
+    with pytest.raises(InputError, match="holds no photo of the scene, such as 0.jpg"):
+        portrait(scene, solid(scene, 1), SIDE, tmp_path)

@@ -1,0 +1,162 @@
+"""segment --backend sam2 with a tiny random network, through the loader and the code that the published one takes."""
+
+import json
+from dataclasses import replace
+from functools import partial
+
+import pytest
+import torch
+
+from stages.errors import InputError
+from stages.scene.images import write_png
+from stages.scene.scene_ply import read_scene, write_scene
+from stages.segment import sam2
+from stages.segment.options import SegmentOptions
+from stages.segment.pictures import drawn, pictures
+from stages.segment.prompts import read_prompts
+from stages.segment.stage import run
+from tests.segment.tabletop import three_apart
+
+pytest.importorskip("transformers")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread():
+    """Matrices this small cost less than telling a second thread of them."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="module")
+def truth():
+    return three_apart(noise=0.001)
+
+
+@pytest.fixture
+def scene_file(truth, tmp_path):
+    path = tmp_path / "scene.ply"
+    blank = replace(truth.gaussians, object_id=torch.zeros_like(truth.gaussians.object_id))
+    write_scene(path, replace(truth, gaussians=blank))
+    return path
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory):
+    from tests.models.sam2.tiny import saved
+
+    return saved(tmp_path_factory.mktemp("sam2"))
+
+
+@pytest.fixture
+def photos(truth, tmp_path):
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for view, name in enumerate(truth.cameras.names):
+        write_png(folder / name.replace(".jpg", ".png"), drawn(truth, view))
+    return folder
+
+
+def prompts_file(path, **data):
+    path.write_text(json.dumps(data))
+    return path
+
+
+BOXES = {"bbox": [[10, 20, 60, 90], [80, 60, 150, 120]], "text": ["egg", "block"]}
+POINTS = {"center_point": [[40, 60], [100, 90]], "bbox": []}
+
+
+@pytest.mark.parametrize("prompts", [BOXES, POINTS], ids=["boxes", "points"])
+def test_prompts_become_objects_by_their_names(scene_file, truth, weights, photos, tmp_path, prompts):
+    """Random masks label something; which, only real weights know. All else is as in earnest."""
+    boxes = prompts_file(tmp_path / "p.json", **prompts)
+    run(scene_file, tmp_path / "out.ply", SegmentOptions("sam2", boxes=boxes, photos=photos, weights=weights))
+    labelled = read_scene(tmp_path / "out.ply")
+    names = prompts.get("text", ["object_1", "object_2"])
+    assert labelled.objects and all(o.name == names[o.id - 1] for o in labelled.objects)
+    assert set(labelled.gaussians.object_id.unique().tolist()) == {0, *(o.id for o in labelled.objects)}
+    assert [row["name"] for row in labelled.provenance["inputs"]] == ["scene.ply", "p.json", "photos"]
+
+
+def test_drawings_stand_in_for_photos(truth, photos):
+    """A PNG of the drawing rounds to 8 bits; else the network sees the same."""
+    shown, read = pictures(truth), pictures(truth, photos)
+    assert shown.views == read.views == list(range(len(truth.cameras)))
+    torch.testing.assert_close(shown.image(3), read.image(3), rtol=0, atol=0.51 / 255)
+
+
+def test_some_photos_may_be_missing_but_not_the_prompted_one(scene_file, truth, weights, photos, tmp_path):
+    (photos / "03.png").unlink()
+    assert pictures(truth, photos).views == [0, 1, 2, 4, 5, 6, 7]
+    boxes = prompts_file(tmp_path / "p.json", **BOXES)
+    options = SegmentOptions("sam2", boxes=boxes, photos=photos, weights=weights)
+    run(scene_file, tmp_path / "out.ply", options)
+    (photos / "00.png").unlink()
+    with pytest.raises(InputError, match="lacks 00.jpg, the photo that --boxes is about"):
+        run(scene_file, tmp_path / "other.ply", options)
+
+
+def test_without_prompts_a_network_that_is_sure_of_nothing_finds_no_objects(
+    scene_file, weights, tmp_path, caplog, monkeypatch
+):
+    from stages.models.sam2.automatic import Automatic, propose
+    from stages.segment import discover
+
+    monkeypatch.setattr(discover, "propose", partial(propose, options=Automatic(grid=4)))
+    run(scene_file, tmp_path / "out.ply", SegmentOptions("sam2", weights=weights))
+    assert read_scene(tmp_path / "out.ply").objects == ()
+    assert "no objects were found" in caplog.text
+
+
+def test_without_weights_one_sentence_says_what_to_fetch_and_where(scene_file, tmp_path, monkeypatch):
+    monkeypatch.setenv("NGFF_WEIGHTS", str(tmp_path / "weights"))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    with pytest.raises(InputError, match=r"facebook/sam2.1-hiera-large \(0.9 GB.* into .*weights/sam2.*--download"):
+        run(scene_file, tmp_path / "out.ply", SegmentOptions("sam2"))
+    assert not (tmp_path / "out.ply").exists()
+
+
+def test_weights_are_fetched_only_when_asked_and_absent(weights, tmp_path, monkeypatch):
+    monkeypatch.setenv("NGFF_WEIGHTS", str(tmp_path / "weights"))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(sam2, "download", lambda: "fetched")
+    assert sam2._weights(SegmentOptions("sam2", download=True)) == "fetched"
+    assert sam2._weights(SegmentOptions("sam2", weights=weights, download=True)) == weights / "model.safetensors"
+    with pytest.raises(InputError, match="no config.json"):
+        sam2._weights(SegmentOptions("sam2", weights=tmp_path, download=True))
+
+
+def test_photos_of_other_proportions_are_refused(scene_file, truth, weights, photos, tmp_path):
+    write_png(photos / "05.png", drawn(truth, 5)[:80])
+    boxes = prompts_file(tmp_path / "p.json", **BOXES)
+    with pytest.raises(InputError, match="--photos: 05.jpg is 160x80, in the scene 160x160.*drawn instead"):
+        run(scene_file, tmp_path / "out.ply", SegmentOptions("sam2", boxes=boxes, photos=photos, weights=weights))
+
+
+@pytest.mark.parametrize(
+    ("data", "says"),
+    [
+        ({"text": ["duck"]}, "neither a bbox nor a center_point"),
+        ({**BOXES, "center_point": [[1, 2]]}, "2 boxes, 1 points and 2 names"),
+        ({"center_point": [[1, 2, 3]]}, "is not a prompts file"),
+        ({"bbox": [[5, 5, 1, 9]]}, "no area"),
+    ],
+)
+def test_prompts_that_cannot_be_meant(tmp_path, data, says):
+    with pytest.raises(InputError, match=says):
+        read_prompts(prompts_file(tmp_path / "p.json", **data))
+
+
+def test_points_are_for_sam2_alone(scene_file, tmp_path):
+    boxes = prompts_file(tmp_path / "p.json", **POINTS)
+    with pytest.raises(InputError, match="points are for --backend sam2"):
+        run(scene_file, tmp_path / "out.ply", SegmentOptions(boxes=boxes))
+
+
+def test_what_the_network_is_told_lies_where_the_user_pointed(truth, tmp_path):
+    box, point = (sam2.clicks_of(read_prompts(prompts_file(tmp_path / "p.json", **p)), truth)[0]
+                  for p in (BOXES, POINTS))  # fmt: skip
+    torch.testing.assert_close(box.points, torch.tensor([[10 / 160, 20 / 160], [60 / 160, 90 / 160]]))
+    torch.testing.assert_close(point.points, torch.tensor([[40 / 160, 60 / 160]]))
+    assert box.labels.tolist() == [2, 3] and point.labels.tolist() == [1]

@@ -24,8 +24,8 @@ log = logging.getLogger(__name__)
 def segment(scene: Scene, options: SegmentOptions) -> Scene:
     """The objects that the prompts show in the first view, or, without prompts, whatever stands on the table.
 
-    The network sees the photos, or the scene drawn where there are none. Memory: its weights, one picture, and about
-    20 MB an object, however many photos there are.
+    The network sees the photos, or the scene drawn where there are none. Memory: its weights, about 1 GB at work, one
+    photo, and 20 MB an object, however many photos there are.
     """
     if scene.cameras is None or not len(scene.cameras):
         raise InputError("--backend sam2: the scene has no cameras; use one that `ngff reconstruct` wrote")

@@ -5,6 +5,7 @@ import logging
 
 import pytest
 import torch
+from PIL import Image
 
 from stages.errors import InputError
 from stages.geometry.cameras import centres
@@ -12,7 +13,7 @@ from stages.reconstruct import options as choices
 from stages.reconstruct.options import ReconstructOptions
 from stages.reconstruct.stage import run
 from stages.scene.scene_ply import read_scene
-from tests.reconstruct.raycast import BLOCK, arc, write_set
+from tests.reconstruct.raycast import BLOCK, arc, photograph, write_set
 
 
 @pytest.fixture(scope="module")
@@ -153,6 +154,32 @@ def test_a_mistake_leaves_nothing_behind(tmp_path, monkeypatch):
         with pytest.raises(InputError, match=words):
             run(tmp_path / "images", tmp_path / "s.ply", wrong)
     assert {p.name for p in tmp_path.iterdir()} == {"images", "transforms.json"}
+
+
+def test_a_folder_of_mixed_kinds_with_spaces_and_unicode_in_every_name(tmp_path, monkeypatch):
+    # Landscape and portrait, large and small, grey, CMYK, lying on its side: three cameras to be told apart.
+    folder = tmp_path / "Küche 写真 № 1"
+    folder.mkdir()
+    small(monkeypatch)
+    wide, tall = arc(6, (320, 240), sweep=50.0), arc(6, (240, 320), sweep=50.0)
+    for i in range(6):
+        pixels = (photograph(tall if i == 5 else wide, i)[0] * 255).round().byte().numpy()
+        picture, exif = Image.fromarray(pixels), Image.Exif()
+        if i == 1:
+            picture = picture.convert("L")
+        elif i == 2:
+            picture = picture.convert("CMYK")
+        elif i == 3:
+            exif[0x0112], picture = 6, picture.rotate(90, expand=True)
+        elif i == 4:
+            picture = picture.resize((400, 300), Image.LANCZOS)
+        picture.save(folder / f"foto {i} ä.jpg", quality=95, exif=exif)
+    out = tmp_path / "scène 1.ply"
+    report = run(folder, out, ReconstructOptions(quality="draft", resolution=128))
+    assert report.placed == 6 and {p.name for p in tmp_path.iterdir()} == {folder.name, out.name}
+    scene = read_scene(out)
+    assert scene.cameras.names == tuple(f"foto {i} ä.jpg" for i in range(6))
+    assert scene.cameras.sizes.tolist() == [[128, 96]] * 5 + [[96, 128]]
 
 
 def test_a_measured_distance_between_two_photos_gives_metres(tmp_path, monkeypatch):

@@ -19,7 +19,7 @@ from stages.models.sam2.network import INSIDE, side_of
 class Automatic:
     """How many clicks, and what a mask must reach."""
 
-    grid: int = 32  # clicks along each side of the photo
+    grid: int = 16  # clicks along each side; published is 32, but here several photos are asked about one scene
     at_once: int = 16  # clicks decoded together, each in about 30 MB
     iou: float = 0.8  # that the network itself predicts for the mask
     stability: float = 0.95  # overlap of the mask drawn tighter and drawn looser

@@ -160,6 +160,7 @@ def train(
     hidden: Annotated[int, typer.Option(help="width of the network; 0: the model's own")] = 0,
     horizons: Annotated[str, typer.Option(help="frames to roll out in each phase")] = "8,20,40",
     root: Annotated[bool, typer.Option("--root", help="loss: the RMSE of each scene, not its square")] = False,
+    memory: Annotated[float, typer.Option(help="share of a gradient that goes back by another frame")] = 0.9,
     groups: Annotated[str, typer.Option(help="of scenes; the last 100 choose the best weights")] = "3_0..3_8",
     compiled: Annotated[bool, typer.Option("--compiled", help="compile a step first; for GPUs")] = False,
     seed: Seed = 0,
@@ -169,7 +170,9 @@ def train(
     """Train a dynamics model on simulated motion."""
     from stages.lab.train import TrainOptions, run
 
-    options = TrainOptions(minutes, steps, batch, keypoints, lr, horizons, hidden, root, groups, compiled, seed, device)
+    options = TrainOptions(
+        minutes, steps, batch, keypoints, lr, horizons, hidden, root, memory, groups, compiled, seed, device
+    )
     for line in run(model, data, out, options, resume):
         print(line)
 

@@ -49,6 +49,7 @@ class TrainOptions:
     horizons: str = "8,20,40"  # frames that a rollout goes on for, one phase each
     hidden: int = 0  # width of the network; 0: the model's own
     root: bool = False  # loss: root of the squared error of each scene
+    memory: float = 0.9  # share of a gradient that goes back by another frame
     groups: str = "3_0..3_8"  # files to learn from; the last scenes of the last choose the best weights
     compiled: bool = False  # compile a step first: a minute or so, then faster; for GPUs
     seed: int = 0
@@ -57,6 +58,8 @@ class TrainOptions:
     def __post_init__(self):
         if self.minutes <= 0 or self.steps < 0 or min(self.batch, self.keypoints) < 1 or self.lr <= 0:
             raise InputError("--minutes, --batch, --keypoints and --lr must be positive, --steps at least 0")
+        if not 0 <= self.memory <= 1:
+            raise InputError(f"--memory {self.memory}: must be between 0 and 1")
         if min(self.frames) < 1:
             raise InputError(f"--horizons takes frames, such as 8,20,40, not {self.horizons!r}")
 
@@ -74,9 +77,9 @@ class TrainOptions:
         ends = [sum(SHARES[: i + 1]) if n == len(SHARES) else (i + 1) / n for i in range(n)]
         return self.frames[min(sum(progress >= e for e in ends), n - 1)]
 
-    def rate(self, progress: float, step: int) -> float:
-        """Learning rate: a short rise, then half a cosine down to a hundredth."""
-        return self.lr * min(1.0, (step + 1) / 200) * (0.01 + 0.99 * (1 + math.cos(math.pi * min(progress, 1.0))) / 2)
+    def rate(self, progress: float) -> float:
+        """Learning rate: half a cosine down to a hundredth."""
+        return self.lr * (0.01 + 0.99 * (1 + math.cos(math.pi * min(progress, 1.0))) / 2)
 
 
 def run(model: str, data: Path, out: Path, options: TrainOptions = TrainOptions(), resume: bool = False) -> list[str]:
@@ -97,7 +100,8 @@ def run(model: str, data: Path, out: Path, options: TrainOptions = TrainOptions(
         if crew.leads:
             log.info("%s, %s parameters: learns from %d scenes, chosen by %d", model,
                      f"{sum(p.numel() for p in trainee.params):,}", len(known), len(unseen))  # fmt: skip
-        job = Job(trainee, Pieces(known, crew.device), unseen.to(crew.device), options, crew, out, _key(model, options))
+        pieces = Pieces(known, crew.device, trainee.model)
+        job = Job(trainee, pieces, unseen.to(crew.device), options, crew, out, _key(model, options))
         finished = job.run()
         if not crew.leads:
             return []
@@ -154,10 +158,11 @@ class Job:
             while done < 1 and not self.team.agreed(len(asked)):
                 if options.horizon(done) != horizon:
                     roll, horizon = None, options.horizon(done)  # the memory of the old graph goes first
-                    roll = Roll(trainee.model, self.pieces.motions.dt, options.root, compiled=options.compiled)
+                    roll = Roll(trainee.model, self.pieces.motions.dt, options.root, options.memory, compiled=options.compiled)
+                    trainee.anew(horizon)
                 loss, grads = roll(self.pieces.draw(options.batch, horizon, trainee.generator, part))
                 *grads, loss = self.team.mean([*grads, loss.clone()])  # a graph writes the next loss in the same place
-                trainee.update(grads, options.rate(done, trainee.step))
+                trainee.update(grads, options.rate(done))
                 trainee.losses.append(loss)
                 before, done = done, self.progress()
                 if math.floor(done * CHECKS) > math.floor(before * CHECKS):
@@ -178,13 +183,14 @@ class Job:
 
     def check(self, horizon: int) -> None:
         """A line of the curve, and a checkpoint."""
-        if not self.team.leads:
-            self.trainee.losses = []
-            self.trainee.curve.append({})
-            return
-        self.trainee.note({"horizon": horizon, **validate(self.trainee.ema, self.unseen)})
-        self.trainee.save(self.out.with_suffix(".ckpt"), self.key)
-        log.info(LINE.format(**self.trainee.curve[-1]))
+        trainee, leads = self.trainee, self.team.leads
+        found = validate(trainee.ema, self.unseen) if leads else {}
+        trainee.note({"horizon": horizon, **found, "RMSE": self.team.agreed(found.get("RMSE", 0.0))})
+        if leads:
+            trainee.save(self.out.with_suffix(".ckpt"), self.key)
+            log.info(LINE.format(**trainee.curve[-1]))
+            if trainee.curve[-1]["skipped"]:
+                log.warning("%d steps had no finite gradients and changed nothing", trainee.curve[-1]["skipped"])
 
 
 @contextmanager

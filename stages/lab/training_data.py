@@ -6,6 +6,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import h5py
 import torch
@@ -14,6 +15,7 @@ from torch import Tensor
 
 from stages.errors import InputError
 from stages.lab.motions import Motions, joined, read_motions
+from stages.models.dynamics import Dynamics
 from stages.models.world import World
 from stages.scene.files import sha256
 
@@ -25,6 +27,7 @@ class Piece:
     """A batch of short motions."""
 
     world: World  # at rest, as of the first frame of the whole motion
+    rest: Any  # what the model computes of it once and for all
     points: Float[Tensor, "b o n 3"]  # where they start [m]
     speed: Float[Tensor, "b o n 3"]  # [m/s]
     truth: Float[Tensor, "b t o n 3"]  # the frames after the start [m]
@@ -78,9 +81,10 @@ def recipe(folder: Path, names: Sequence[str]) -> list[dict]:
 class Pieces:
     """Random pieces of scenes that lie in the memory of a device."""
 
-    def __init__(self, motions: Motions, device: torch.device | str):
+    def __init__(self, motions: Motions, device: torch.device | str, model: Dynamics):
         self.motions = motions.to(device)
         self.world = self.motions.world()
+        self.rest = model.rest(self.world)
 
     def draw(self, count: int, horizon: int, generator: torch.Generator, part: slice = slice(None)) -> Piece:
         """`count` random scenes from random frames on, for `horizon` frames after the first; a part of them."""
@@ -97,4 +101,4 @@ class Pieces:
         truth = points[row[:, None], frames]
         speed = (truth[:, 0] - points[row, (start - 1).clamp_min(0)]) / (2 * dt)
         speed = torch.where((start > 0)[:, None, None, None], speed, 0.0)
-        return Piece(self.world[row], points[row, start], speed, truth)
+        return Piece(self.world[row], self.rest[row], points[row, start], speed, truth)

@@ -33,24 +33,34 @@ def loss_of(
 
 
 class Roll:
-    """Call it with batches of one size and horizon: the loss, and its gradient for each of the model's parameters."""
+    """Call it with batches of one size and horizon: the loss, and its gradient for each of the model's parameters.
 
-    def __init__(self, model: Dynamics, dt: float, root: bool = False, graph: bool = True, compiled: bool = False):
-        self.model, self.dt, self.root = model, dt, root
+    Going back by a frame a gradient keeps the share `memory`: through contacts it grows, and over many frames explodes.
+    """
+
+    def __init__(
+        self, model: Dynamics, dt: float, root: bool = False, memory: float = 1.0, graph: bool = True,
+        compiled: bool = False,
+    ):  # fmt: skip
+        self.model, self.dt, self.root, self.memory = model, dt, root, memory
         self.advance = torch.compile(_advance, fullgraph=True, dynamic=False) if compiled else _advance
+        self.compiling = compiled
         self.params = [p for p in model.parameters() if p.requires_grad]
         self.wanted = graph and self.params[0].is_cuda
         self.graph: torch.cuda.CUDAGraph | None = None
 
     def __call__(self, piece: Piece) -> tuple[Float[Tensor, ""], list[Tensor]]:
-        scene = self.model.prepare(piece.world)
+        scene = self.model.informed(piece.rest)
         with torch.no_grad():
             state = self.model.observe(scene, piece.points, piece.speed)
         given = (scene, state, piece.truth, piece.world.valid)
+        if self.compiling:
+            self._check(given)
+            self.compiling = False
         if self.wanted and self.graph is None:
             self._capture(given)
         if self.graph is None:
-            loss, grads = self._compiled(given)
+            loss, grads = self._walk(given)
         else:
             for kept, new in zip(tensors(self.kept), tensors(given), strict=True):
                 kept.data.copy_(new.detach())
@@ -68,22 +78,24 @@ class Roll:
         pushes = Pushes.nobody(valid, truth)
         frames = []
         for _ in range(truth.shape[1]):
-            state, points = self.advance(self.model, scene, state, self.dt, pushes)
+            state = rebuilt(state, (torch.lerp(x.detach(), x, self.memory) for x in tensors(state)))
+            *moved, points = self.advance(self.model, scene, state, self.dt, pushes)
+            state = rebuilt(state, iter(moved))
             frames.append(points)
         loss = loss_of(torch.stack(frames, 1), truth, valid, self.root)
         wanted = self.params + [x for x in free if x.requires_grad]
         return loss.detach(), list(torch.autograd.grad(loss, wanted, allow_unused=True))
 
-    def _compiled(self, given: tuple) -> tuple[Tensor, list[Tensor | None]]:
-        """The walk; where it cannot be compiled, say so and go on without."""
+    def _check(self, given: tuple) -> None:
+        """Compile; where that fails or gives no finite gradients, say so and go on without."""
         try:
-            return self._walk(given)
+            if all(bool(g.isfinite().all()) for g in self._walk(given)[1] if g is not None):
+                return
+            why = "gives gradients that are not finite"
         except Exception as error:  # a compiler fails in many ways
-            if self.advance is _advance:
-                raise
-            log.info("cannot be compiled, going on without: %s", str(error).strip().splitlines()[0])
-            self.advance = _advance
-            return self._walk(given)
+            why = f"fails ({str(error).strip().splitlines()[0]})"
+        log.warning("compiling the step %s: going on without", why)
+        self.advance = _advance
 
     def _carried(self, scene: Any, grads: list[Tensor | None]) -> list[Tensor]:
         """Gradients of the parameters, with those that come through the prepared scene."""
@@ -108,7 +120,7 @@ class Roll:
             side.wait_stream(torch.cuda.current_stream())
             with torch.cuda.stream(side):
                 for _ in range(2):
-                    self._compiled(kept)
+                    self._walk(kept)
             torch.cuda.current_stream().wait_stream(side)
             graph = torch.cuda.CUDAGraph()
             with torch.cuda.graph(graph):
@@ -119,10 +131,13 @@ class Roll:
             log.info("no CUDA graph, going on step by step: %s", str(error).splitlines()[0])
 
 
-def _advance(model: Dynamics, scene: Any, state: tuple, dt: float, pushes: Pushes) -> tuple[tuple, Tensor]:
-    """The next state and where its points are; without pushes the time does not matter."""
+def _advance(model: Dynamics, scene: Any, state: tuple, dt: float, pushes: Pushes) -> tuple[Tensor, ...]:
+    """The tensors of the next state and where its points are; without pushes the time does not matter.
+
+    One flat tuple: PyTorch 2.11 compiles a named tuple that comes out of a `_replace` to an empty one.
+    """
     state = model.step(scene, state, 0.0, dt, pushes)
-    return state, model.points(scene, state)
+    return (*state, model.points(scene, state))
 
 
 def _sum(like: Tensor, a: Tensor | None, b: Tensor | None) -> Tensor:

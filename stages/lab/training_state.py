@@ -16,6 +16,8 @@ from stages.scene.files import must_exist, replacing
 EMA = 0.999  # of the running mean of the weights, from a few thousand steps on
 LIMIT = 2.0  # gradients are cut to so many times their usual norm
 MEMORY = 0.99  # of the usual norm
+WARM = 200  # steps until the full rate
+LOST = 1.25  # times the lowest RMSE so far, from which on training has gone astray
 
 
 class Trainee:
@@ -26,11 +28,14 @@ class Trainee:
         self.ema = copy.deepcopy(model).eval().requires_grad_(False)
         self.best = copy.deepcopy(self.ema.state_dict())
         self.params = [p for p in model.parameters() if p.requires_grad]
-        self.optimizer = torch.optim.AdamW(self.params, lr, weight_decay=1e-4, fused=True)
+        self.optimizer = torch.optim.AdamW(self.params, lr, betas=(0.9, 0.99), weight_decay=1e-4, fused=True)
         self.usual = self.params[0].new_zeros(())
         self.generator = torch.Generator().manual_seed(seed)
         self.step, self.elapsed, self.curve = 0, 0.0, []
         self.losses: list[Tensor] = []  # since the last line of the curve
+        self.skipped = self.params[0].new_zeros(())  # steps without finite gradients since then
+        self.caution, self.since = 1.0, 0  # what the rate is multiplied with, and the step it began to rise at
+        self.horizon = 0  # frames of the rollouts that the moments are of
         self.ahead: torch.cuda.Event | None = None
 
     @torch.no_grad()
@@ -46,8 +51,9 @@ class Trainee:
         for p, g in zip(self.params, grads, strict=True):
             p.grad = torch.where(finite, g * scale, 0.0)
         for group in self.optimizer.param_groups:
-            group["lr"] = lr
+            group["lr"] = lr * self.caution * min(1.0, (self.step - self.since + 1) / WARM)
         self.optimizer.found_inf = (~finite).float()  # fused AdamW then leaves everything as it is
+        self.skipped += ~finite
         self.optimizer.grad_scale = None
         self.optimizer.step()
         self.step += 1
@@ -60,13 +66,40 @@ class Trainee:
             self.ahead.record()
 
     def note(self, row: dict) -> None:
-        """A line of the curve; weights with the lowest RMSE so far are kept."""
+        """A line of the curve; weights with the lowest RMSE so far are kept.
+
+        Gone astray, training goes on from those, at half the rate: long rollouts can explode on the way back.
+        """
         mean = torch.stack(self.losses).nanmean().item() if self.losses else math.nan
-        row = {"minutes": self.elapsed / 60, "step": self.step, "loss": mean, **row}
+        row = {"minutes": self.elapsed / 60, "step": self.step, "loss": mean, "caution": self.caution,
+               "skipped": int(self.skipped), **row}  # fmt: skip
         self.losses = []
-        if row["RMSE"] <= min((r["RMSE"] for r in self.curve), default=math.inf):
-            self.best = copy.deepcopy(self.ema.state_dict())
+        self.skipped.zero_()
+        lowest = min((r["RMSE"] for r in self.curve), default=math.inf)
         self.curve.append(row)
+        if row["RMSE"] <= lowest:
+            self.best = copy.deepcopy(self.ema.state_dict())
+        elif not row["RMSE"] < LOST * lowest:
+            self._rewind()
+
+    def _rewind(self) -> None:
+        self.model.load_state_dict(self.best)
+        self.ema.load_state_dict(self.best)
+        self.caution /= 2
+        self._forget()
+
+    def anew(self, horizon: int) -> None:
+        """Begin with rollouts of so many frames: gradients of another size need other moments, and a slow start."""
+        if self.horizon not in (0, horizon):
+            self._forget()
+        self.horizon = horizon
+
+    def _forget(self) -> None:
+        self.since = self.step
+        self.usual.zero_()
+        for moments in self.optimizer.state.values():
+            for x in moments.values():
+                x.zero_()
 
     def best_row(self) -> dict:
         return min(self.curve, key=lambda r: r["RMSE"])
@@ -82,7 +115,8 @@ class Trainee:
             "key": key, "model": self.model.state_dict(), "ema": self.ema.state_dict(), "best": self.best,
             "optimizer": self.optimizer.state_dict(), "usual": self.usual, "generator": self.generator.get_state(),
             "random": torch.get_rng_state(), "step": self.step, "elapsed": self.elapsed, "curve": self.curve,
-            "losses": self.losses,
+            "losses": self.losses, "skipped": self.skipped, "caution": self.caution, "since": self.since,
+            "horizon": self.horizon,
             "cuda": torch.cuda.get_rng_state() if self.usual.is_cuda else None,
         }  # fmt: skip
         with replacing(path) as part:
@@ -103,7 +137,8 @@ class Trainee:
         self.ema.load_state_dict(state["ema"])
         self.optimizer.load_state_dict(state["optimizer"])
         self.best, self.usual, self.curve = state["best"], state["usual"], state["curve"]
-        self.losses = state["losses"]
+        self.losses, self.caution, self.since = state["losses"], state["caution"], state["since"]
+        self.horizon, self.skipped = state["horizon"], state["skipped"]
         self.step, self.elapsed = state["step"], state["elapsed"]
         self.generator.set_state(state["generator"].cpu())
         torch.set_rng_state(state["random"].cpu())

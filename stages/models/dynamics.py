@@ -33,9 +33,17 @@ class Dynamics(nn.Module, ABC):
     told: ClassVar[frozenset[str]] = frozenset()
     config: dict
 
+    def rest(self, world: World) -> Any:
+        """What can be computed of a world without any parameter; it can be indexed by scenes as a world can."""
+        return world
+
     def prepare(self, world: World) -> Any:
         """The `scene` of the other methods: the world, with whatever a model computes once for a rollout."""
-        return world
+        return self.informed(self.rest(world))
+
+    def informed(self, rest: Any) -> Any:
+        """The second half of `prepare`, which depends on parameters."""
+        return rest
 
     @abstractmethod
     def start(self, scene: Any) -> tuple:

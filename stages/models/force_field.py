@@ -13,16 +13,17 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
+from torch.nn.functional import softplus
 
 from stages.geometry.rotations import matrix, multiply, quaternion
 from stages.kernels.compilers import TRITON
 from stages.models.dynamics import FRAME, Dynamics
-from stages.models.places import Moving, pair_places, plane_places
+from stages.models.places import CLOSE, LEVER, Moving, floor_places, pair_places, wall_places
 from stages.models.pushes import Pushes
 from stages.models.rigid import drift, fitted, limited, pose, spin_of
 from stages.models.shape import Shape, shape_of
 from stages.models.stress import Stress, bounded, projected
-from stages.models.touch import Touch
+from stages.models.touch import Places, Touch
 from stages.models.vectors import apply, mlp
 from stages.models.world import World, centre
 
@@ -73,20 +74,24 @@ class ForceField(Dynamics):
         h = hidden
         self.point = mlp(13, h, h)
         self.code = mlp(2 * h, h, h)
-        self.pairs, self.planes = Touch(8, 7, h, partner=True), Touch(6, 5, h, partner=False)
+        self.pairs, self.planes = Touch(10, 7, h, partner=True), Touch(8, 5, h, partner=False)
         self.status = mlp(3 * h, h, h)
         self.between, self.against = mlp(4 * h, h, h), mlp(2 * h, h, h)
         self.hold = nn.Linear(h, 1)
         nn.init.constant_(self.hold.bias, -3.0)
         self.stress = Stress(h) if deform else None
 
-    def prepare(self, world: World) -> Scene:
+    def rest(self, world: World) -> Shape:
         shape = shape_of(world)
         if TRITON and shape.blur.is_cuda and shape.blur.dtype == torch.float32 and not torch.is_grad_enabled():
             shape = replace(shape, blur=shape.blur.half())  # reading it takes the longest of a step of many scenes
+        return shape
+
+    def informed(self, shape: Shape) -> Scene:
         code = self._encode(shape)
         if self.stress is None:
-            return Scene(shape, code, torch.zeros_like(world.mass), torch.zeros_like(world.mass))
+            none = torch.zeros_like(shape.world.mass)
+            return Scene(shape, code, none, none)
         return Scene(shape, code, *self.stress.springs(code))
 
     def _encode(self, shape: Shape) -> Float[Tensor, "b o h"]:
@@ -173,7 +178,8 @@ class ForceField(Dynamics):
         turn = R[:, :, None]
         arm = apply(turn, scene.shape.arm + state.u)
         velocity = state.velocity[:, :, None] + torch.linalg.cross(spin[:, :, None].expand_as(arm), arm)
-        return Moving(R, spin, state.com, state.velocity, arm, state.com[:, :, None] + arm,
+        inverse = R @ scene.shape.inverse @ R.mT
+        return Moving(R, inverse, spin, state.com, state.velocity, arm, state.com[:, :, None] + arm,
                       velocity + apply(turn, state.du), apply(turn, scene.shape.normal))  # fmt: skip
 
     def _rates(
@@ -199,30 +205,35 @@ class ForceField(Dynamics):
         """Force and torque on each object and what its points feel, per unit of mass; and the grip of the floor."""
         shape, code = scene.shape, scene.code
         w, others, back = shape.world, shape.others, shape.back
-        pairs, planes = pair_places(shape, moving), plane_places(shape, moving)
-        said, weight, heard = self.pairs.listen(pairs, w.share, code, code[:, others])
-        said_w, weight_w, heard_w = self.planes.listen(planes, w.share, code)
-        status = self.status(torch.cat([code, heard.sum(2), heard_w.sum(2)], -1))
-        own = status[:, :, None].expand_as(heard)
+        pairs, floor, wall = pair_places(shape, moving), floor_places(shape, moving), wall_places(shape, moving)
+        said, weight, heard = self.pairs.listen(pairs, _shares(w, pairs), code, code[:, others])
+        said_f, weight_f, heard_f = self.planes.listen(floor, _shares(w, floor), code)
+        said_w, weight_w, heard_w = self.planes.listen(wall, _shares(w, wall), code)
+        status = self.status(torch.cat([code, heard.sum(2), heard_f[:, :, 0] + heard_w[:, :, 0]], -1))
+        own, mine = status[:, :, None].expand_as(heard), status[:, :, None]
         context = self.between(torch.cat([heard, heard[:, others, back], own, status[:, others]], -1))
-        context_w = self.against(torch.cat([heard_w, status[:, :, None].expand_as(heard_w)], -1))
+        context_f, context_w = (self.against(torch.cat([h, mine], -1)) for h in (heard_f, heard_w))
         a = self.pairs.answer(said, weight, context, pairs.vectors)
-        a_w = self.planes.answer(said_w, weight_w, context_w, planes.vectors)
+        a_f = _pushed(self.planes.answer(said_f, weight_f, context_f, floor.vectors), floor, weight_f)
+        a_w = _pushed(self.planes.answer(said_w, weight_w, context_w, wall.vectors), wall, weight_w)
         mass, light = w.mass.clamp_min(1e-6), 1 / w.mass.clamp_min(1e-6) * ~pushes.pinned
         reduced = 1 / (light[:, :, None] + light[:, others]).clamp_min(1e-9)  # a pinned body weighs as much as it likes
         F = reduced[..., None, None] * a
-        middle = moving.points[:, :, None] - pairs.vectors[..., 0, :] * (0.05 / 2)
+        middle = moving.com[:, :, None, None] + pairs.vectors[..., 4, :] * LEVER - pairs.vectors[..., 0, :] * (CLOSE / 2)
         torque = torch.linalg.cross(middle - moving.com[:, :, None, None], F).sum((2, 3))
         counter = torch.linalg.cross(middle - moving.com[:, others][:, :, :, None], F).sum(3)
         F = F.sum(3)
         force = F.sum(2) - F[:, others, back].sum(2)
         torque = torque - counter[:, others, back].sum(2)
-        torque = torque / mass[..., None] + torch.linalg.cross(moving.arm[:, :, None].expand_as(a_w), a_w).sum((2, 3))
-        felt = (reduced / mass[..., None])[..., None, None] * a
-        touch = (felt.sum(2) + a_w.sum(2)) / w.share.clamp_min(1e-9)[..., None]
-        touch = torch.where(w.valid[..., None], touch, 0.0)
-        grip = HOLD * torch.sigmoid(self.hold(status)) * weight_w[:, :, 0].sum(-1, keepdim=True)
-        return force / mass[..., None] + a_w.sum((2, 3)), torque, touch, grip
+        ground = torch.cat([a_f, a_w], 3)[:, :, 0]
+        arms = torch.cat([floor.vectors[..., 3, :], wall.vectors[..., 3, :]], 3)[:, :, 0] * LEVER
+        torque = torque / mass[..., None] + torch.linalg.cross(arms, ground).sum(2)
+        felt = torch.cat([((reduced / mass[..., None])[..., None, None] * a).flatten(2, 3), ground], 2)
+        rows = torch.cat([pairs.row.flatten(2), floor.row[:, :, 0], wall.row[:, :, 0]], 2)
+        touch = torch.zeros_like(moving.arm).scatter_add(2, rows[..., None].expand_as(felt), felt)
+        touch = torch.where(w.valid[..., None], touch / w.share.clamp_min(1e-9)[..., None], 0.0)
+        grip = HOLD * torch.sigmoid(self.hold(status)) * weight_f[:, :, 0].sum(-1, keepdim=True)
+        return force / mass[..., None] + ground.sum(2), torque, touch, grip
 
     def _slowed(
         self, scene: Scene, rates: Rates, velocity: Float[Tensor, "b o 3"], spin: Float[Tensor, "b o 3"], dt: float
@@ -254,3 +265,17 @@ def _held(state: BodyState, free: Bool[Tensor, "b o 1"]) -> BodyState:
     return state._replace(
         velocity=state.velocity * free, momentum=state.momentum * free, du=state.du * free[..., None]
     )
+
+
+def _shares(world: World, places: Places) -> Float[Tensor, "b o m n"]:
+    """Of an object's mass, where it touches."""
+    return world.share[:, :, None].expand(*places.row.shape[:3], -1).gather(-1, places.row)
+
+
+def _pushed(
+    a: Float[Tensor, "b o 1 n 3"], places: Places, weight: Float[Tensor, "b o 1 n"]
+) -> Float[Tensor, "b o 1 n 3"]:
+    """Floor and walls push, and do not pull."""
+    normal, unit = places.vectors[..., 0, :], weight[..., None].clamp_min(1e-9)
+    along = (a * normal).sum(-1, keepdim=True)
+    return a + (unit * softplus(along / unit) - along) * normal

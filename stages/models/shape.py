@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float, Int
@@ -11,6 +11,7 @@ from torch import Tensor
 from stages.models.world import World, inertia, offsets
 
 NEIGHBOURS = 12  # keypoints that make a normal
+BLUR = (0.12, 0.4)  # radii of neighbourhoods, in sizes of the object
 MOST = 16_384  # small matrices at a time: CUDA's solver fails on 65,536
 
 
@@ -24,9 +25,14 @@ class Shape:
     spacing: Float[Tensor, "b o n"]  # distance to the nearest keypoints [m]
     size: Float[Tensor, "b o"]  # radius of gyration [m]
     inverse: Float[Tensor, "b o 3 3"]  # of the inertia tensor per unit of mass [1/m^2]
-    blur: Float[Tensor, "b o n n"]  # weights that average over the neighbourhood of a keypoint; perhaps 16-bit
+    blur: Float[Tensor, "b o s n n"]  # weights that average over neighbourhoods of a keypoint, one for each of BLUR; perhaps 16-bit
     others: Int[Tensor, "o m"]  # for each object the rows of the others
     back: Int[Tensor, "o m"]  # others[others[i, k], back[i, k]] is i
+
+    def __getitem__(self, rows: slice | Tensor) -> Shape:
+        """Some of the scenes, still a batch."""
+        each = ("world", "arm", "normal", "spacing", "size", "inverse", "blur")
+        return replace(self, **{name: getattr(self, name)[rows] for name in each})
 
 
 @torch.no_grad()
@@ -36,7 +42,8 @@ def shape_of(world: World) -> Shape:
     size = (world.share * arm.square().sum(-1)).sum(-1).clamp_min(1e-8).sqrt()
     gap = _gaps(arm).masked_fill_(~(world.valid[:, :, None] & world.valid[..., None]), torch.inf)
     normal, spacing = _surface(arm, gap, size)
-    blur = torch.exp(-((gap / (0.3 * size[..., None, None])) ** 2)) * world.share[:, :, None]
+    reach = gap.new_tensor(BLUR)[:, None, None] * size[..., None, None, None]
+    blur = torch.exp(-((gap[:, :, None] / reach) ** 2)) * world.share[:, :, None, None]
     blur = blur / blur.sum(-1, keepdim=True).clamp_min(1e-12)
     others, back = _others(world.valid.shape[1], arm.device)
     inverse = torch.linalg.inv(inertia(world.share, arm))

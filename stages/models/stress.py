@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from stages.kernels.compilers import TRITON
-from stages.models.shape import Shape
+from stages.models.shape import BLUR, Shape
 from stages.models.vectors import apply, chain, mlp, weigh
 
 if TRITON:
@@ -15,7 +15,10 @@ if TRITON:
 
 STIFFEST = 2500.0  # [1/s^2]: a swing of an eighth of a second, six frames
 THICKEST = 100.0  # damping [1/s]
-FARTHEST = 0.3  # a point can be displaced by so much of the object's size, times two
+HARDEST, HEAVIEST = 8.0, 0.8  # of springs and dampers, so weak that steps of a frame are stable
+FARTHEST = 1.5  # a point can be displaced by so many sizes of its object
+SCALES = 1 + len(BLUR)  # at which displacements are seen: whole, and in neighbourhoods
+KINDS = 3 * SCALES + 3  # of vectors
 
 
 class Stress(nn.Module):
@@ -23,9 +26,9 @@ class Stress(nn.Module):
 
     def __init__(self, hidden: int):
         super().__init__()
-        self.see = nn.Linear(8 * 9 // 2 + 1, hidden)
+        self.see = nn.Linear(KINDS * (KINDS + 1) // 2, hidden)
         self.own = nn.Linear(hidden, hidden)
-        self.say = mlp(hidden, hidden, 6, quiet=0.1)
+        self.say = mlp(hidden, hidden, 3 * SCALES, quiet=0.1)
         self.spring = mlp(hidden, hidden, 2)
 
     def springs(self, code: Float[Tensor, "b o h"]) -> tuple[Float[Tensor, "b o"], Float[Tensor, "b o"]]:
@@ -43,25 +46,30 @@ class Stress(nn.Module):
         """
         size = shape.size[..., None, None]
         share = shape.world.share[..., None]
-        felt = _blurred(shape.blur, torch.cat([touch, u, du], -1))
+        felt = _blurred(shape.blur, torch.cat([touch, u, du], -1)).unflatten(-1, (3, 3))  # b o n s 3 3
+        pushed, mean_u, mean_du = felt.unbind(-2)
         virial = torch.einsum("boni,bonj->boij", share * touch, shape.arm) / size**2
         arm = shape.arm / size
-        moving = torch.stack([
-            20 * u, 2 * du, 20 * (u - felt[..., 3:6]), 2 * (du - felt[..., 6:]), felt[..., :3] / 10,
-            apply((virial + virial.mT)[:, :, None], shape.arm) / 10,
-        ], -2)  # fmt: skip
-        vectors = torch.cat([moving, torch.stack([shape.normal, arm], -2)], -2)
-        pull = (arm * gravity[:, :, None] / 5).sum(-1, keepdim=True)
-        said = chain(pull, (self.see, self.say[0], self.say[2]), vectors, self.own(code)[:, :, None])
-        # only what vanishes at rest: an untouched body stays as it is
+        springs = torch.cat([u[..., None, :], u[..., None, :] - mean_u], -2)
+        dampers = torch.cat([du[..., None, :], du[..., None, :] - mean_du], -2)
+        spread = apply((virial + virial.mT)[:, :, None], shape.arm)[..., None, :]
+        moving = torch.cat([20 * springs, 2 * dampers, pushed / 10, spread / 10], -2)
+        still = torch.stack([shape.normal, arm, (gravity / 5)[:, :, None].expand_as(arm)], -2)
+        said = chain(arm[..., :0], (self.see, self.say[0], self.say[2]), torch.cat([moving, still], -2),
+                     self.own(code)[:, :, None])  # fmt: skip
+        # only what vanishes at rest: an untouched body stays as it is; springs pull back and dampers slow
+        pull, slow, drive = said.unflatten(-1, (3, SCALES)).unbind(-2)
+        said = torch.cat([-HARDEST * torch.sigmoid(pull - 3), -HEAVIEST * torch.sigmoid(slow - 2), drive], -1)
         return projected(shape, 10 * weigh(said, moving))
 
 
-def _blurred(blur: Float[Tensor, "b o n n"], x: Float[Tensor, "b o n 9"]) -> Float[Tensor, "b o n 9"]:
-    """blur @ x."""
+def _blurred(blur: Float[Tensor, "b o s n n"], x: Float[Tensor, "b o n 9"]) -> Float[Tensor, "b o n s 9"]:
+    """Averages of x over the neighbourhoods of each point."""
     if blur.dtype == torch.float16 and not torch.is_grad_enabled():
-        return thin_product(blur, x)
-    return (x.mT @ blur.to(x).mT).mT  # on a CPU twice as fast as what it means
+        s = blur.shape[2]
+        rows = blur.flatten(2, 3)  # all neighbourhoods at once
+        return thin_product(rows, x).unflatten(2, (s, -1)).transpose(2, 3)
+    return (x.mT[:, :, None] @ blur.to(x).mT).permute(0, 1, 4, 2, 3)  # on a CPU twice as fast as what it means
 
 
 def projected(shape: Shape, field: Float[Tensor, "b o n 3"]) -> Float[Tensor, "b o n 3"]:
@@ -76,6 +84,6 @@ def projected(shape: Shape, field: Float[Tensor, "b o n 3"]) -> Float[Tensor, "b
 
 def bounded(shape: Shape, u: Float[Tensor, "b o n 3"]) -> Float[Tensor, "b o n 3"]:
     """Displacements kept below a share of the object's size, all of an object by the same factor."""
-    most = 2 * FARTHEST * shape.size
+    most = FARTHEST * shape.size
     largest = u.square().sum(-1).amax(-1).clamp_min(1e-12).sqrt()
     return u * (most / torch.maximum(largest, most))[..., None, None]

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from stages.models.vectors import chain, mlp, weigh
@@ -26,6 +26,7 @@ class Places:
     vectors: Float[Tensor, "b o m n k 3"]  # in units in which they are of order one
     scalars: Float[Tensor, "b o m n s"]
     gate: Float[Tensor, "b o m n"]  # 1 near, 0 far
+    row: Int[Tensor, "b o m n"]  # which keypoints of the object these are
 
 
 class Touch(nn.Module):
@@ -41,7 +42,7 @@ class Touch(nn.Module):
         self.say = mlp(hidden, hidden, vectors, quiet=0.1)
 
     def listen(
-        self, places: Places, share: Float[Tensor, "b o n"], own: Float[Tensor, "b o h"],
+        self, places: Places, share: Float[Tensor, "b o m n"], own: Float[Tensor, "b o h"],
         other: Float[Tensor, "b o m h"] | None = None,
     ) -> tuple[Float[Tensor, "b o m n h"], Float[Tensor, "b o m n"], Float[Tensor, "b o m h"]]:  # fmt: skip
         """What each place has to say, its weight, and what the object hears from all places together.
@@ -54,7 +55,7 @@ class Touch(nn.Module):
             known = known + self.other(other)[:, :, :, None]
         x = _at(places.gate > 0, self._heard, places.vectors, places.scalars, known)
         attention = torch.exp(4 * torch.tanh(x[..., -1] / 4))
-        weight = places.gate * share[:, :, None] * attention
+        weight = places.gate * share * attention
         weight = weight / (weight.sum(-1, keepdim=True) + GRIP)
         return x[..., :-1], weight, (weight[..., None] * x[..., :-1]).sum(-2)
 

@@ -18,10 +18,18 @@ from stages.geometry.rotations import matrix
 from stages.lab import bench_dynamics, bench_dynamics_rows
 from stages.lab.bench_dynamics import FALL, MPM, NUDGED, RIGID, SPLITS, BenchOptions, measured, run, scenes_of
 from stages.lab.bench_dynamics_report import markdown, table
-from stages.lab.bench_dynamics_rows import Resimulation, common, estimated, fall, free_fall, rigid, same_scenes
+from stages.lab.bench_dynamics_rows import (
+    ESTIMATED,
+    Resimulation,
+    common,
+    estimated,
+    fall,
+    free_fall,
+    rigid,
+    same_scenes,
+)
 from stages.lab.dataset_assets import Asset, Fineness, volumes
 from stages.lab.dataset_simulation import simulate
-from stages.lab.estimate import PAPER
 from stages.lab.motions import Motions, joined, write_motions
 from stages.lab.plot import HEIGHT, STRIP, WIDTH
 from stages.lab.scenes import Config, write_configs
@@ -249,7 +257,7 @@ def simulated(tmp_path, monkeypatch):
 def test_estimated_materials_take_the_place_of_the_true_ones(simulated):
     _, things = simulated
     guess = estimated(things)
-    assert (guess[0].E, guess[0].density) == PAPER["ball"] and (guess[7].E, guess[7].density) == PAPER["duck"]
+    assert (guess[0].E, guess[0].density) == ESTIMATED["ball"] and (guess[7].E, guess[7].density) == ESTIMATED["duck"]
     assert torch.equal(guess[0].points, things[0].points) and guess[7].mass == pytest.approx(
         things[7].mass * 1100 / 500, rel=1e-6
     )

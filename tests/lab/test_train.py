@@ -21,7 +21,7 @@ from stages.lab.motions import Motions, write_motions
 from stages.lab.train import TrainOptions, run, validate
 from stages.lab.training_data import Pieces, read_groups, split
 from stages.lab.training_roll import Roll, loss_of
-from stages.lab.training_state import LIMIT, Trainee
+from stages.lab.training_state import LIMIT, WARM, Trainee
 from stages.models.pushes import Pushes
 from stages.models.weights import MODELS, build, load
 from stages.models.world import BOX, GRAVITY
@@ -74,7 +74,7 @@ QUICK = TrainOptions(steps=12, batch=2, keypoints=8, horizons="2,3", hidden=8, g
 
 def test_pieces_start_with_the_speed_of_free_fall():
     motions = falling(frames=6)
-    piece = Pieces(motions, "cpu").take(torch.tensor([1, 4]), torch.tensor([0, 2]), 3)
+    piece = Pieces(motions, "cpu", build("ngff", hidden=8)).take(torch.tensor([1, 4]), torch.tensor([0, 2]), 3)
     assert_close(piece.points, torch.stack([motions.points[1, 0], motions.points[4, 2]]))
     assert_close(piece.truth, torch.stack([motions.points[1, 1:4], motions.points[4, 3:6]]))
     assert_close(piece.speed[0], torch.zeros(2, 8, 3))
@@ -83,7 +83,7 @@ def test_pieces_start_with_the_speed_of_free_fall():
 
 
 def test_pieces_never_reach_past_the_last_frame():
-    pieces, rng = Pieces(falling(frames=5), "cpu"), torch.Generator().manual_seed(0)
+    pieces, rng = Pieces(falling(frames=5), "cpu", build("gcn", hidden=8)), torch.Generator().manual_seed(0)
     starts = {float(pieces.draw(1, 3, rng).speed[0, 0, 0, 2]) for _ in range(40)}
     assert len(starts) == 2  # frames 0 and 1 are all that leave 3 more
 
@@ -103,7 +103,7 @@ def test_gradients_are_those_of_the_rollout(name):
     """The prepared scene is cut off and its gradient carried on by hand; the model's own rollout knows no cut."""
     torch.manual_seed(0)
     model = build(name, hidden=8).eval()  # no dropout
-    pieces = Pieces(without_last(falling()), "cpu")
+    pieces = Pieces(without_last(falling()), "cpu", model)
     piece = pieces.take(torch.tensor([0, 3]), torch.tensor([0, 5]), 3)
     loss, grads = Roll(model, DT)(piece)
     predicted = model.rollout(piece.world, 4, DT, start=(piece.points, piece.speed))[:, 1:]
@@ -113,6 +113,47 @@ def test_gradients_are_those_of_the_rollout(name):
     assert sum(float(g.abs().sum()) for g in grads) > 0
     for p, g in zip(model.parameters(), grads, strict=True):
         assert_close(g, torch.zeros_like(p) if p.grad is None else p.grad, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize(("broken", "why"), [(True, "fails"), (False, "not finite")])
+def test_what_cannot_be_compiled_is_done_without(monkeypatch, caplog, broken, why):
+    """Neither a compiler that fails nor one whose gradients are wrong stops training, or makes it a waste of time."""
+
+    def compile(function, **_):
+        def wrong(*given):
+            if broken:
+                raise IndexError("tuple index out of range")
+            *state, points = function(*given)
+            return (*state, points * torch.nan)
+
+        return wrong
+
+    torch.manual_seed(0)
+    model = build("gcn", hidden=8).eval()
+    piece = Pieces(without_last(falling()), "cpu", model).take(torch.tensor([0]), torch.tensor([0]), 2)
+    with monkeypatch.context() as patch:
+        patch.setattr(torch, "compile", compile)
+        loss, grads = Roll(model, DT, compiled=True)(piece)
+    assert why in caplog.text
+    plain, true = Roll(model, DT)(piece)
+    assert_close(loss, plain)
+    for a, b in zip(grads, true, strict=True):
+        assert_close(a, b)
+
+
+def test_gradients_fade_on_their_way_back():
+    """Of the third frame's error, what comes back through two frames counts 0.9^2 as much."""
+    torch.manual_seed(0)
+    model = build("gcn", hidden=8).eval()
+    piece = Pieces(without_last(falling()), "cpu", model).take(torch.tensor([0]), torch.tensor([0]), 3)
+
+    def gradient(memory):
+        return torch.cat([g.flatten() for g in Roll(model, DT, memory=memory)(piece)[1]])
+
+    none, full = gradient(0.0), gradient(1.0)
+    far = [(gradient(m) - none).norm() for m in (0.25, 0.5)]
+    assert none.norm() > 0 and (full - none).norm() > 0
+    assert 2 <= far[1] / far[0] <= 4  # of one frame back half as much, of two a quarter
 
 
 def test_no_pushes_are_no_pushes():
@@ -137,6 +178,8 @@ def test_a_step_without_finite_gradients_changes_nothing():
     trainee.update([torch.full_like(good[0], math.nan), *good[1:]], 1e-2)
     assert all(torch.equal(a, b) for a, b in zip(before, trainee.params, strict=True))
     assert torch.equal(usual, trainee.usual)
+    trainee.note({"RMSE": 1.0})
+    assert trainee.curve[-1]["skipped"] == 1
     trainee.update(good, 1e-2)
     assert not any(torch.equal(a, b) for a, b in zip(before, trainee.params, strict=True))
 
@@ -151,6 +194,40 @@ def test_an_outlier_is_cut_to_twice_the_usual_norm():
         LIMIT * usual, rel=1e-4
     )
     assert float(trainee.usual) == pytest.approx(usual * (0.99 + 0.01 * LIMIT), rel=1e-4)
+
+
+def test_training_gone_astray_goes_on_from_the_best_at_half_the_rate():
+    trainee = Trainee(build("gcn", hidden=8), 1e-2, 0)
+    good = [torch.ones_like(p) for p in trainee.params]
+    trainee.update(good, 1e-2)
+    trainee.note({"RMSE": 0.1})
+    best = {k: v.clone() for k, v in trainee.best.items()}
+    trainee.update(good, 1e-2)
+    trainee.note({"RMSE": 0.12})  # a little worse: so it goes
+    assert trainee.caution == 1.0
+    assert not all(torch.equal(v, best[k]) for k, v in trainee.model.state_dict().items())
+    trainee.update(good, 1e-2)
+    trainee.note({"RMSE": math.inf})
+    assert trainee.caution == 0.5
+    for network in (trainee.model, trainee.ema):
+        assert all(torch.equal(v, best[k]) for k, v in network.state_dict().items())
+    trainee.update(good, 1e-2)
+    assert trainee.optimizer.param_groups[0]["lr"] == pytest.approx(0.5e-2 / WARM)
+    moved = max(float((p.detach() - best[n]).abs().max()) for n, p in trainee.model.named_parameters())
+    assert moved == pytest.approx(0.5e-2 / WARM, rel=0.01)  # as a first step: nothing of the old moments is left
+
+
+def test_longer_rollouts_begin_anew():
+    trainee = Trainee(build("gcn", hidden=8), 1e-2, 0)
+    trainee.anew(8)
+    for _ in range(WARM):
+        trainee.update([torch.ones_like(p) for p in trainee.params], 1e-2)
+    assert trainee.optimizer.param_groups[0]["lr"] == 1e-2
+    before = [p.detach().clone() for p in trainee.params]
+    trainee.anew(20)
+    trainee.update([100 * torch.ones_like(p) for p in trainee.params], 1e-2)
+    step = max(float((p.detach() - q).abs().max()) for p, q in zip(trainee.params, before, strict=True))
+    assert step == pytest.approx(1e-2 / WARM, rel=0.01)  # however much larger gradients have become
 
 
 def test_training_teaches_to_fall(tmp_path):
@@ -294,7 +371,7 @@ def test_a_cuda_graph_gives_the_same(name):
         pytest.skip("needs an NVIDIA GPU")
     torch.manual_seed(0)
     model = build(name, hidden=16).cuda().eval()
-    pieces, rng = Pieces(without_last(falling()), "cuda"), torch.Generator().manual_seed(0)
+    pieces, rng = Pieces(without_last(falling()), "cuda", model), torch.Generator().manual_seed(0)
     recorded, plain = Roll(model, DT), Roll(model, DT, graph=False)
     for _ in range(3):
         piece = pieces.draw(4, 3, rng)

@@ -184,7 +184,7 @@ def _rolled(model: Dynamics) -> Predict:
 
 
 def _seconds(model: Dynamics, motions: Motions, device: str) -> float:
-    """Wall time of TIMED steps of one scene, as `ngff simulate` rolls it out [s]; what is recorded once is not counted."""
+    """Wall time of TIMED steps of one scene, as the command rolls it out [s], without what is recorded once."""
     one = motions[:1].world()
     stepper = Stepper(model, one, motions.dt)
 

@@ -158,7 +158,8 @@ class Job:
             while done < 1 and not self.team.agreed(len(asked)):
                 if options.horizon(done) != horizon:
                     roll, horizon = None, options.horizon(done)  # the memory of the old graph goes first
-                    roll = Roll(trainee.model, self.pieces.motions.dt, options.root, options.memory, compiled=options.compiled)
+                    dt = self.pieces.motions.dt
+                    roll = Roll(trainee.model, dt, options.root, options.memory, compiled=options.compiled)
                     trainee.anew(horizon)
                 loss, grads = roll(self.pieces.draw(options.batch, horizon, trainee.generator, part))
                 *grads, loss = self.team.mean([*grads, loss.clone()])  # a graph writes the next loss in the same place

@@ -219,7 +219,8 @@ class ForceField(Dynamics):
         mass, light = w.mass.clamp_min(1e-6), 1 / w.mass.clamp_min(1e-6) * ~pushes.pinned
         reduced = 1 / (light[:, :, None] + light[:, others]).clamp_min(1e-9)  # a pinned body weighs as much as it likes
         F = reduced[..., None, None] * a
-        middle = moving.com[:, :, None, None] + pairs.vectors[..., 4, :] * LEVER - pairs.vectors[..., 0, :] * (CLOSE / 2)
+        middle = moving.com[:, :, None, None] + pairs.vectors[..., 4, :] * LEVER
+        middle = middle - pairs.vectors[..., 0, :] * (CLOSE / 2)
         torque = torch.linalg.cross(middle - moving.com[:, :, None, None], F).sum((2, 3))
         counter = torch.linalg.cross(middle - moving.com[:, others][:, :, :, None], F).sum(3)
         F = F.sum(3)

@@ -93,7 +93,8 @@ def _response(inverse: Float[Tensor, "*#b 3 3"], arm: Float[Tensor, "*#b 3"]) ->
     """How fast a point of a body moves after an impulse on it, for unit mass: 1 - [r] J^-1 [r]."""
     r = arm[..., None, :]
     turned = torch.linalg.cross(*torch.broadcast_tensors(inverse, r))  # J^-1 [r], by rows
-    return torch.eye(3, dtype=arm.dtype, device=arm.device) - torch.linalg.cross(*torch.broadcast_tensors(r, turned.mT)).mT
+    turned = torch.linalg.cross(*torch.broadcast_tensors(r, turned.mT)).mT
+    return torch.eye(3, dtype=arm.dtype, device=arm.device) - turned
 
 
 def _answers(K: Float[Tensor, "*b 3 3"], *motions: Float[Tensor, "*b 3"]) -> list[Float[Tensor, "*b 3"]]:

@@ -25,7 +25,7 @@ class Shape:
     spacing: Float[Tensor, "b o n"]  # distance to the nearest keypoints [m]
     size: Float[Tensor, "b o"]  # radius of gyration [m]
     inverse: Float[Tensor, "b o 3 3"]  # of the inertia tensor per unit of mass [1/m^2]
-    blur: Float[Tensor, "b o s n n"]  # weights that average over neighbourhoods of a keypoint, one for each of BLUR; perhaps 16-bit
+    blur: Float[Tensor, "b o s n n"]  # weights that average over the neighbourhoods of BLUR; perhaps 16-bit
     others: Int[Tensor, "o m"]  # for each object the rows of the others
     back: Int[Tensor, "o m"]  # others[others[i, k], back[i, k]] is i
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,6 +25,10 @@ class Sizes:
     frames: int
     keypoints: int
     resolution: int
+
+    def config(self, objects: int) -> float:
+        """Of a scene in the JSON of its group."""
+        return 42 + 100 * objects
 
     def motion(self, objects: int) -> float:
         """Of the keypoints of a scene."""
@@ -53,33 +56,35 @@ def wanted(layout: Layout, options: DatasetOptions) -> dict[str, float]:
     each = sum(counts) / max(len(counts), 1)  # Gaussians of an object, on average
     views, tables = len(options.cameras), len(options.tables)
     out = {}
-    for part in ("motions", "scenes", "mpm", "initial", "dynamic"):
+    for part in ("scene_configs", "motions", "scenes", "mpm", "initial", "dynamic"):
         if part not in options.parts:
             continue
-        total = there = 0.0
+        out[part] = 0.0
         for group in options.mine:
             scenes, objects = min(SCENES[group], options.limit or SCENES[group]), objects_in(group)
-            total += scenes * {
-                "motions": sizes.motion(objects), "scenes": sizes.scene(objects * each),
-                "mpm": sizes.mpm(objects * each), "initial": tables * sizes.initial(views),
-                "dynamic": tables * views * sizes.video(),
+            total = {
+                "scene_configs": SCENES[group] * sizes.config(objects), "motions": scenes * sizes.motion(objects),
+                "scenes": scenes * sizes.scene(objects * each), "mpm": scenes * sizes.mpm(objects * each),
+                "initial": scenes * tables * sizes.initial(views),
+                "dynamic": scenes * tables * views * sizes.video(),
             }[part]  # fmt: skip
-            there += _size([layout.motions(group)] if part == "motions" else [layout.root / part / group])
-        out[part] = max(total - there, 0.0)
+            file = {"scene_configs": layout.config(group), "motions": layout.motions(group)}.get(part)
+            there = total * file.exists() if file else _size(layout.root / part / group)  # a file that exists is whole
+            out[part] += max(total - there, 0.0)
     return out
 
 
-def _size(places: Iterable[Path]) -> int:
-    files = (p for place in places for p in ([place] if place.is_file() else place.rglob("*")) if p.is_file())
-    return sum(p.stat().st_size for p in files)
+def _size(folder: Path) -> int:
+    return sum(p.stat().st_size for p in folder.rglob("*") if p.is_file())
 
 
 def must_fit(root: Path, parts: dict[str, float]) -> None:
-    """Print what each part will take; raise InputError when the disk has less."""
+    """Print what each part that is missing will take; raise InputError when the disk has less."""
     total, free = sum(parts.values()), shutil.disk_usage(root).free
-    print(f"{root}: about {human(total)} will be written ("
-          + ", ".join(f"{part} {human(size)}" for part, size in parts.items()) + f"), {human(free)} are free",
-          flush=True)  # fmt: skip
+    if not total:
+        return
+    missing = ", ".join(f"{part} {human(size)}" for part, size in parts.items() if size)
+    print(f"{root}: about {human(total)} will be written ({missing}), {human(free)} are free", flush=True)
     if total > 0.98 * free:
         raise InputError(f"{root}: about {human(total)} are needed and {human(free)} are free; choose fewer parts "
                          "(--only), --groups, --views or --backgrounds, or a larger disk")  # fmt: skip

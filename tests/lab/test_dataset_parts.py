@@ -190,6 +190,14 @@ def test_what_is_there_is_not_counted_again(data):
     assert before["dynamic"] == 2 * 2 * 32**2 * 100 * dataset_sizes.STILL  # 2 scenes, 2 views
     left = dataset_sizes.wanted(dataset_layout.Layout(data), OPTIONS)
     assert left["mpm"] < 0.15 * 2 * dataset_sizes.Sizes(3, 64, 32).mpm(1800)
+    assert left["scene_configs"] == 0  # a file that is there is whole
+
+
+def test_what_is_missing_is_told_and_nothing_when_nothing_is(tmp_path, capsys):
+    dataset_sizes.must_fit(tmp_path, {"scene_configs": 64_400.0, "motions": 0.0})
+    assert ": about 64.4 kB will be written (scene_configs 64.4 kB), " in capsys.readouterr().out
+    dataset_sizes.must_fit(tmp_path, {"motions": 0.0})
+    assert not capsys.readouterr().out
 
 
 def test_sizes_are_about_right(data):
@@ -198,6 +206,8 @@ def test_sizes_are_about_right(data):
     with h5py.File(folder / "opacity.h5") as file:
         count = len(file["opacity"])
     assert sum(p.stat().st_size for p in folder.iterdir()) == pytest.approx(sizes.mpm(count), rel=0.15)
+    config = data / "scene_configs" / "3_9.json"
+    assert config.stat().st_size == pytest.approx(2 * sizes.config(3), rel=0.15)
 
 
 @pytest.mark.parametrize("options", [{"only": "videos"}, {"views": "3"}, {"backgrounds": "table9"}, {"resolution": 33},

@@ -52,11 +52,13 @@ def bench_reconstruct(
     quality: Annotated[str, typer.Option(help="of the reconstruction")] = "normal",
     holdout: Annotated[int, typer.Option(help="keep every N-th photo out")] = 8,
     device: Device = "auto",
+    matcher: Annotated[str, typer.Option(help="of photos: sift or aliked-lightglue")] = "sift",
+    cameras: Annotated[bool, typer.Option("--cameras", help="end with the cameras, to compare matchers")] = False,
 ) -> None:
     """Photos to Gaussians: cameras against reference cameras, photos kept out, time and memory."""
     from stages.lab.bench_reconstruct import BenchOptions, run
 
-    for line in run(sets, out, BenchOptions(quality, holdout, device)):
+    for line in run(sets, out, BenchOptions(quality, holdout, device, matcher, cameras)):
         print(line, flush=True)
 
 

@@ -54,7 +54,7 @@ def attend_with(model: nn.Module, attend: Callable) -> None:
 def measure(model: nn.Module, views: int, size: int, at_once: int, device: str, repeat: int) -> tuple[float, float]:
     """Median seconds of a forward pass, and the most memory allocated in it, weights included [bytes; nan on a CPU].
 
-    Both are nan where memory is too small.
+    Raises torch.OutOfMemoryError where memory is too small; what was allocated is free again then.
     """
     images = torch.rand(views, 3, size, size, device=device)
     half, gpu = device != "cpu", device != "cpu"
@@ -65,8 +65,6 @@ def measure(model: nn.Module, views: int, size: int, at_once: int, device: str, 
             model(images, at_once)
             seconds = bench.seconds(lambda: model(images, at_once), device, repeat)
         return seconds, torch.cuda.max_memory_allocated() if gpu else float("nan")
-    except torch.OutOfMemoryError:
-        return float("nan"), float("nan")
     finally:
         gc.collect()
         if gpu:
@@ -89,13 +87,20 @@ def run(options: BenchOptions, config: Pi3Config = Pi3Config()) -> Iterator[str]
         at_once = memory.plan(config, views, size, options.splats, half, memory.free(device))
         said = weights + memory.activations(config, views, *size, at_once, options.splats, half)
         attend_with(model, nn.functional.scaled_dot_product_attention)
-        seconds, most = measure(model, views, options.size, at_once, device, options.repeat)
+        try:
+            seconds, most = measure(model, views, options.size, at_once, device, options.repeat)
+        except torch.OutOfMemoryError:
+            yield f"views {views:>3}  out of memory (estimate {_gb(said)})"
+            continue
         yield f"views {views:>3}  {seconds:8.3f} s  {_gb(most)} (estimate {_gb(said)})  {views / seconds:6.1f} photos/s"
         attend_with(model, naive)
-        if not half and _table(config, views, options.size) > 0.5 * (memory.free(device) or 0):
-            yield "           attention written out: its table does not fit"  # a CPU would swap, not fail
+        try:
+            if not half and _table(config, views, options.size) > 0.5 * (memory.free(device) or 0):
+                raise torch.OutOfMemoryError  # a CPU would swap, not fail
+            slow, more = measure(model, views, options.size, at_once, device, options.repeat)
+        except torch.OutOfMemoryError:
+            yield "           attention written out: out of memory"
             continue
-        slow, more = measure(model, views, options.size, at_once, device, options.repeat)
         yield f"           attention written out: {slow:8.3f} s  {_gb(more)}, {slow / seconds:.1f} times our time"
 
 

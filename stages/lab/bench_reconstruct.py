@@ -41,6 +41,14 @@ class BenchOptions:
     quality: str = "normal"
     holdout: int = 8
     device: str = "auto"
+    matcher: str = "sift"
+    cameras: bool = False  # end with them: no Gaussians, to compare matchers
+
+    def key(self, folder: Path) -> str:
+        """The name of a set's row in the results."""
+        matcher = "" if self.matcher == "sift" else f", {self.matcher}"
+        cameras = ", cameras" if self.cameras else ""
+        return f"{folder.resolve().name}, {self.quality}, {pick_device(self.device)}{matcher}{cameras}"
 
 
 @dataclass(frozen=True)
@@ -54,15 +62,21 @@ class PoseError:
 
 
 def run(sets: list[Path], out: Path, options: BenchOptions) -> Iterator[str]:
-    """A line a set, and all figures in a JSON file, which keeps the rows of sets that are not measured now."""
+    """A line a set, and all figures in a JSON file, which keeps the rows of sets that are not measured now.
+
+    A set of which nothing can be made has a row that says why.
+    """
     if not sets:
         raise InputError("name one or more photo sets: a folder with images/ and, if there are any, cameras.json")
     photos = {folder: photo_folder(folder) for folder in map(Path, sets)}
     rows = json.loads(out.read_text())["sets"] if out.exists() else {}
     yield f"{'set':14s} {'photos':7s} {'rotation':>9s} {'shift':>7s} {'held-out':>19s} {'wall':>6s} {'CPU':>8s}  memory"
     for folder, images in photos.items():
-        row = measured_alone(folder, images, options)
-        rows[f"{folder.resolve().name}, {options.quality}, {row['device']}"] = row
+        try:
+            row = measured_alone(folder, images, options)
+        except InputError as error:
+            row = {"failed": str(error).removeprefix(f"{images}: ")}
+        rows[options.key(folder)] = row
         with replacing(out) as part:
             part.write_text(json.dumps({"sets": rows}, indent=1) + "\n")
         yield _line(folder.resolve().name, row)
@@ -86,28 +100,48 @@ def photo_folder(folder: Path) -> Path:
 
 def measure(folder: Path, images: Path, options: BenchOptions) -> dict:
     """One set reconstructed and compared with what is known about it."""
+    logging.basicConfig(format="%(message)s", level=logging.WARNING)
+    logging.getLogger("stages").setLevel(logging.INFO)
+    facts, found, floor = (_cameras if options.cameras else _scene)(images, options)
+    device = pick_device(options.device)
+    row = {**facts, "device": device, "cpu_seconds": time.process_time(), "machine": machine(device)}
+    if (folder / "cameras.json").exists():
+        reference, _ = read_cameras(folder / "cameras.json")
+        row["poses"] = asdict(pose_error(found, reference))
+        if floor is not None and (folder / "truth.h5").exists():
+            from stages.scene.trajectory import read_trajectory
+
+            true = read_trajectory(folder / "truth.h5").scene.floor
+            row["tilt"], row["floor"] = upright_error(found, reference, floor, true)
+    return row
+
+
+def _scene(images: Path, options: BenchOptions) -> tuple[dict, Cameras, float | None]:
+    """The report of a whole reconstruction, its cameras, and the height of its floor."""
     from stages.reconstruct.options import ReconstructOptions
     from stages.reconstruct.stage import run as reconstruct
 
-    logging.basicConfig(format="%(message)s", level=logging.WARNING)
-    logging.getLogger("stages").setLevel(logging.INFO)
+    chosen = ReconstructOptions(
+        quality=options.quality, holdout=options.holdout, device=options.device, matcher=options.matcher
+    )
     with tempfile.TemporaryDirectory() as place:
-        scene = Path(place) / "scene.ply"
-        report = reconstruct(
-            images, scene, ReconstructOptions(quality=options.quality, holdout=options.holdout, device=options.device)
-        )
-        found = read_scene(scene)
-    device = pick_device(options.device)
-    row = {**asdict(report), "device": device, "cpu_seconds": time.process_time(), "machine": machine(device)}
-    if (folder / "cameras.json").exists():
-        reference, _ = read_cameras(folder / "cameras.json")
-        row["poses"] = asdict(pose_error(found.cameras, reference))
-        if (folder / "truth.h5").exists():
-            from stages.scene.trajectory import read_trajectory
+        path = Path(place) / "scene.ply"
+        report = reconstruct(images, path, chosen)
+        scene = read_scene(path)
+    return asdict(report), scene.cameras, scene.floor
 
-            floor = read_trajectory(folder / "truth.h5").scene.floor
-            row["tilt"], row["floor"] = upright_error(found.cameras, reference, found.floor, floor)
-    return row
+
+def _cameras(images: Path, options: BenchOptions) -> tuple[dict, Cameras, None]:
+    """The part of such a report that cameras have, and the cameras, in a world that is not yet upright."""
+    from stages.reconstruct import sfm
+    from stages.reconstruct.options import ReconstructOptions
+    from stages.reconstruct.reading import read_photos
+    from stages.reconstruct.steps import Steps, peak_memory
+
+    photos, steps = read_photos(images, ReconstructOptions(quality=options.quality).side), Steps()
+    model = sfm.solve(photos, 0, pick_device(options.device), steps, options.matcher)
+    facts = {"photos": len(photos), "placed": len(model.cameras), "dropped": model.dropped, "held_out": None}
+    return {**facts, "seconds": steps.seconds, "memory": peak_memory()}, model.cameras, None
 
 
 def pose_error(found: Cameras, reference: Cameras) -> PoseError:
@@ -165,6 +199,8 @@ def angle(R: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b"]:
 
 
 def _line(name: str, row: dict) -> str:
+    if "failed" in row:
+        return f"{name:14s} {row['failed']}"
     poses = row.get("poses")
     turned = f"{poses['rotation']:5.2f} deg {poses['shift']:5.2f} %" if poses else f"{'-':>9s} {'-':>7s}"
     stance = f"; tilt {row['tilt']:.2f} deg, floor off by {row['floor']:.2f} %" if "tilt" in row else ""

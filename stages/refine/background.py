@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import cv2
@@ -23,7 +24,8 @@ from stages.scene.scene import Scene
 
 MOST = 512  # cells along the longer side of the picture of the table
 MARGIN = 0.06  # around what is under an object [view radii]
-BARELY = 1.0  # weight in a view below which a Gaussian is not missed there [px of the small images]
+FEW = 0.25  # share of the cameras that look at a place, below which the table there counts as not seen
+GRAZING = 0.03  # depth that a pixel of table spans at a flat angle [view radii]
 OTHER = 12.0  # CIELAB distance from which a colour is not the table's
 COVERED = 0.92  # alpha above which the table is there
 
@@ -47,14 +49,19 @@ class Picture:
         row, column = (torch.from_numpy(i) for i in np.nonzero(mask))
         return torch.stack([self.corner[0] + (column + 0.5) * self.cell, self.corner[1] - (row + 0.5) * self.cell], 1)
 
+    def on(self, support: Support, mask: np.ndarray) -> Float[Tensor, "m 3"]:
+        """Centres of cells, on the surface."""
+        points = self.centres(mask)
+        return torch.cat([points, support.surface(points)[:, None]], 1)
+
 
 def fill(scene: Scene, sight: Sight, support: Support, seed: int = 0) -> Scene:
     """The scene with flat Gaussians on the plane where objects hide it: under them, with a margin.
 
-    The table is drawn from above without the objects; holes in its picture, and all that is directly under
-    an object, are inpainted in the table's own texture. Gaussians of another
-    colour on the plane under an object, its shadow or a part of it that was missed, are taken away if they
-    are hardly seen. Places that a camera sees through, past the table's edge, stay open.
+    The table is drawn from above without the objects, and its holes are inpainted in its own texture: those under
+    an object, and those around it that are hidden. Under an object few cameras see the table; what lies there in
+    another colour is its shadow, or a part of it that was missed, and goes. Places that a camera sees through, or
+    where it sees no table, past the edge, stay open.
     """
     g, R = scene.gaussians, support.view.radius
     flat = (support.heights(g.means).abs() < 2 * support.tolerance) & (g.scales.amax(1) < 0.1 * R)
@@ -67,22 +74,40 @@ def fill(scene: Scene, sight: Sight, support: Support, seed: int = 0) -> Scene:
     under = _under(things, support, picture)
     near = ndimage.distance_transform_edt(~under) <= MARGIN * R / picture.cell
     near[near] = support.inside(picture.centres(near)).numpy()
-    known = picture.alpha >= COVERED
-    hole = near & ~known
-    hole &= ~_open(support, picture, sight, hole)
-    colour = inpaint(picture.rgb, hole | under, known & ~ndimage.binary_dilation(under, iterations=2), seed)
-    stale = torch.nonzero(flat)[:, 0]
-    cells = picture.rows_columns(g.means[stale])
-    differ = np.linalg.norm(lab_of(g[stale]).numpy() - cv2.cvtColor(colour, cv2.COLOR_RGB2LAB)[cells], axis=1) > OTHER
-    gone = torch.zeros(len(g), dtype=torch.bool)
-    gone[stale[torch.from_numpy(differ & (under & near)[cells])]] = True
-    gone &= sight.weight < BARELY if len(sight.weight) else True
+    hidden = _each(near, picture, support, lambda points: sight.share(points, GRAZING * R) < FEW)
+    known, blind = picture.alpha >= COVERED, under & hidden
+    hole = near & ~known & (under | hidden)
+    width = 2 * support.tolerance + picture.cell
+    hole &= ~ndimage.binary_opening(_each(hole, picture, support, lambda points: sight.empty(points, width)))
+    colour = inpaint(picture.rgb, hole | blind, known & ~ndimage.binary_dilation(blind, iterations=2), seed)
+    gone = _remains(g, flat, picture, colour, blind)
     new = hole | _emptied(gone, g, picture, near)
-    points = picture.centres(new)
-    points = torch.cat([points, support.surface(points)[:, None]], 1)
+    points = picture.on(support, new)
     up = torch.tensor([[0.0, 0, 1]]).expand(len(points), 3)
     more = patches(points, up, torch.from_numpy(colour[new]), picture.cell, 0)
     return replace(scene, gaussians=concatenate([g[~gone], more]))
+
+
+def _each(
+    cells: Bool[np.ndarray, "h w"], picture: Picture, support: Support, test: Callable[[Tensor], Tensor]
+) -> Bool[np.ndarray, "h w"]:
+    """Those of the cells whose place on the surface passes a test."""
+    out = np.zeros(cells.shape, bool)
+    out[cells] = test(picture.on(support, cells)).numpy()
+    return out
+
+
+def _remains(
+    g: Gaussians, flat: Bool[Tensor, "n"], picture: Picture, colour: np.ndarray, blind: np.ndarray
+) -> Bool[Tensor, "n"]:
+    """Gaussians of the plane in blind cells whose colour is not the table's there."""
+    rows = torch.nonzero(flat)[:, 0]
+    cells = picture.rows_columns(g.means[rows])
+    table = cv2.cvtColor(colour, cv2.COLOR_RGB2LAB)[cells]
+    differ = np.linalg.norm(lab_of(g[rows]).numpy() - table, axis=1) > OTHER
+    gone = torch.zeros(len(g), dtype=torch.bool)
+    gone[rows[torch.from_numpy(differ & blind[cells])]] = True
+    return gone
 
 
 def _emptied(gone: Bool[Tensor, "n"], g: Gaussians, picture: Picture, near: np.ndarray) -> np.ndarray:
@@ -91,15 +116,6 @@ def _emptied(gone: Bool[Tensor, "n"], g: Gaussians, picture: Picture, near: np.n
     cells[picture.rows_columns(g.means[gone])] = True
     wide = float(g.scales[gone].amax(1).median()) / picture.cell if bool(gone.any()) else 0.0
     return ndimage.binary_dilation(cells, iterations=max(1, min(6, round(2 * wide)))) & near
-
-
-def _open(support: Support, picture: Picture, sight: Sight, hole: np.ndarray) -> np.ndarray:
-    """Holes that cameras see through: there is no table."""
-    points = picture.centres(hole)
-    points = torch.cat([points, support.surface(points)[:, None]], 1)
-    through = np.zeros(hole.shape, bool)
-    through[hole] = sight.empty(points, 2 * support.tolerance + picture.cell).numpy()
-    return ndimage.binary_opening(through)
 
 
 def _picture(table: Gaussians, things: Float[Tensor, "m 3"], support: Support) -> Picture | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
@@ -48,13 +49,26 @@ class Sight:
         Of six cameras or more two must agree, since one may have a floater's depth.
         """
         count = torch.zeros(len(points), dtype=torch.int64)
+        for inside, z, depth in self._depths(points):
+            count[inside] += (z < depth - margin).long()
+        return count >= (2 if len(self.views) >= 6 else 1)
+
+    def share(self, points: Float[Tensor, "n 3"], margin: float) -> Float[Tensor, "n"]:
+        """Of the cameras that have a point in their picture, how many see it: nothing is `margin` in front of it."""
+        seen, framed = torch.zeros(len(points)), torch.zeros(len(points))
+        for inside, z, depth in self._depths(points):
+            framed += inside
+            seen[inside] += (depth > z - margin).float()
+        return seen / framed.clamp_min(1)
+
+    def _depths(self, points: Float[Tensor, "n 3"]) -> Iterator[tuple[Bool[Tensor, "n"], Tensor, Tensor]]:
+        """For each view which points are in its picture, their depth, and that of the surface drawn there."""
         for (viewmat, K, width, height), depth in zip(self.views, self.depth, strict=True):
             z = depths(points, viewmat)
             pixel = project(points, viewmat, K).nan_to_num(-1).clamp(-1, 1e6).floor().long()
             inside = (z > 0.01) & (pixel >= 0).all(1) & (pixel[:, 0] < width) & (pixel[:, 1] < height)
             x, y = pixel[inside].T
-            count[inside] += (z[inside] < depth[y, x] - margin).long()
-        return count >= (2 if len(self.views) >= 6 else 1)
+            yield inside, z[inside], depth[y, x]
 
     def hidden(self, scene: Gaussians, more: Gaussians, most: float = 0.3) -> Bool[Tensor, "m"]:
         """Which of the Gaussians that might be added to the scene hardly change what the cameras see.

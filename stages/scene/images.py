@@ -34,9 +34,7 @@ def list_photos(folder: Path) -> list[Path]:
 def read_image(path: Path) -> Float[Tensor, "h w 3"]:
     """RGB in 0..1, turned upright by its EXIF tag; alpha is dropped, 16 bits are kept to float precision."""
     must_exist(path, "an image")
-    pixels = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
-    if pixels is None:
-        raise InputError(f"{path}: is not an image that can be read; convert it to JPEG or PNG")
+    pixels = _decode(path, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
     top = np.iinfo(pixels.dtype).max if pixels.dtype.kind == "u" else 1.0
     return torch.from_numpy(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB).astype(np.float32) / np.float32(top))
 
@@ -44,12 +42,21 @@ def read_image(path: Path) -> Float[Tensor, "h w 3"]:
 def read_labels(path: Path) -> Int[Tensor, "h w"]:
     """A label image: one integer a pixel (8 or 16 bit, one channel)."""
     must_exist(path, "a label image")
-    pixels = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
-    if pixels is None:
-        raise InputError(f"{path}: is not an image that can be read")
+    pixels = _decode(path, cv2.IMREAD_UNCHANGED)
     if pixels.ndim != 2:
         raise InputError(f"{path}: has {pixels.shape[2]} channels; a label image has one, with the object's number")
     return torch.from_numpy(pixels.astype(np.int64))
+
+
+def _decode(path: Path, flags: int) -> np.ndarray:
+    """Pixels of an image file, colours as BGR. Raises InputError where OpenCV finds none."""
+    try:
+        pixels = cv2.imdecode(np.fromfile(path, np.uint8), flags)
+    except cv2.error as error:  # by its header it has more pixels than OpenCV takes, 2^30
+        raise InputError(f"{path}: is damaged, or far too large; images of 4000 pixels or less will do") from error
+    if pixels is None:
+        raise InputError(f"{path}: is not an image that can be read; convert it to JPEG or PNG")
+    return pixels
 
 
 def resize(image: Float[Tensor, "h w c"], width: int, height: int) -> Float[Tensor, "h2 w2 c"]:

@@ -3,6 +3,7 @@ import torch
 import torch.nn.functional as F
 
 from stages.errors import InputError
+from stages.lab import bench_pi3
 from stages.lab.bench_pi3 import BenchOptions, attend_with, measure, naive, run
 from stages.models.pi3.network import Pi3
 from tests.models.pi3.test_network import TINY, random_weights, views
@@ -33,6 +34,20 @@ def test_a_line_for_each_number_of_views_and_its_peer(splats):
     lines = list(run(BenchOptions("cpu", (1, 2), 28, 1, splats), TINY_SPLAT))
     assert len(lines) == 6 and lines[1].startswith("Pi3Splat" if splats else "Pi3,")
     assert all("attention written out" in line for line in lines[3::2])
+
+
+def test_memory_that_is_too_small_is_said(monkeypatch):
+    """The scores of all pairs of tokens fit no memory, then nothing does."""
+
+    def table(*_):
+        raise torch.OutOfMemoryError
+
+    monkeypatch.setattr(bench_pi3, "naive", table)
+    lines = list(run(BenchOptions("cpu", (1,), 28, 1), TINY))[2:]
+    assert " s " in lines[0] and lines[1].endswith("attention written out: out of memory")
+    monkeypatch.setattr(bench_pi3, "measure", table)
+    (line,) = list(run(BenchOptions("cpu", (3,), 28, 1), TINY))[2:]
+    assert line.startswith("views   3  out of memory (estimate") and "nan" not in line
 
 
 def test_time_is_that_of_the_network():

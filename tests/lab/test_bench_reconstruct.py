@@ -13,6 +13,7 @@ from stages.geometry.similarity import Similarity
 from stages.lab import bench_reconstruct as bench
 from stages.scene.cameras import Cameras
 from tests.conftest import ring
+from tests.reconstruct.raycast import arc, write_set
 
 
 def elsewhere(cameras: Cameras, seed: int = 0) -> Cameras:
@@ -90,9 +91,31 @@ def test_rows_of_other_sets_are_kept(tmp_path, monkeypatch):
     monkeypatch.setattr(bench, "measured_alone", lambda *_: report)
     for name in ("one", "two"):
         (tmp_path / name).mkdir()
-        lines = list(bench.run([tmp_path / name], tmp_path / "r.json", bench.BenchOptions()))
+        lines = list(bench.run([tmp_path / name], tmp_path / "r.json", bench.BenchOptions(device="cpu")))
     assert "5/  5" in lines[1] and "20.00 dB" in lines[1]
     assert set(json.loads((tmp_path / "r.json").read_text())["sets"]) == {"one, normal, cpu", "two, normal, cpu"}
+
+
+def test_what_fails_has_a_row_that_says_why_and_matchers_have_rows_of_their_own(tmp_path, monkeypatch):
+    (tmp_path / "set").mkdir()
+    monkeypatch.setattr(bench, "measured_alone", bench.measure)  # a process is not needed to fail
+    for matcher in ("sift", "aliked-lightglue"):
+        options = bench.BenchOptions(device="cpu", matcher=matcher)
+        lines = list(bench.run([tmp_path / "set"], tmp_path / "r.json", options))
+        assert lines[1].startswith("set ") and "no photos" in lines[1]
+    rows = json.loads((tmp_path / "r.json").read_text())["sets"]
+    assert set(rows) == {"set, normal, cpu", "set, normal, cpu, aliked-lightglue"}
+    assert str(tmp_path) not in str(rows)
+
+
+def test_cameras_alone_are_compared_with_those_that_took_the_photos(tmp_path, monkeypatch):
+    write_set(tmp_path / "set", arc(4, (240, 180), sweep=40.0)).rename(tmp_path / "set" / "cameras.json")
+    monkeypatch.setattr(bench, "measured_alone", bench.measure)
+    lines = list(bench.run([tmp_path / "set"], tmp_path / "r.json", bench.BenchOptions(device="cpu", cameras=True)))
+    row = json.loads((tmp_path / "r.json").read_text())["sets"]["set, normal, cpu, cameras"]
+    assert row["placed"] == row["photos"] == row["poses"]["cameras"] == 4 and "4/  4" in lines[1]
+    assert row["poses"]["rotation"] < 0.5 and row["poses"]["shift"] < 2.0
+    assert set(row["seconds"]) == {"features", "matches", "model"}  # and nothing after them
 
 
 def test_orbits_lie_level():

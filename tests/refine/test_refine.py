@@ -7,19 +7,22 @@ import pytest
 import torch
 
 from stages.errors import InputError
-from stages.geometry.cameras import intrinsics, look_at
+from stages.geometry.cameras import centres, intrinsics, look_at
+from stages.lab.shapes import ellipsoid, sheet
 from stages.raster.rasterise import rasterise
 from stages.refine.options import RefineOptions
 from stages.refine.outliers import floaters
-from stages.refine.sight import agreement
+from stages.refine.sight import Sight, agreement
 from stages.refine.stage import refine, run
+from stages.scene.cameras import Cameras
 from stages.scene.gaussians import concatenate
 from stages.scene.scene import Scene, SceneObject
 from stages.scene.scene_ply import read_scene, write_scene
 from tests.conftest import random_gaussians
-from tests.segment.tabletop import WOOD, block, coloured, scene_of, table
+from tests.segment.tabletop import WOOD, block, coloured, round_about, scene_of, table
 
 SIDES = (0.2, 0.16, 0.12)
+REMAINS = {-0.035: (0.8, 0.7, 0.1), 0.035: (0.08, 0.08, 0.08)}  # y [m]: colour
 
 
 def photographed() -> Scene:
@@ -72,6 +75,64 @@ def test_the_table_under_a_lifted_object_is_there_and_has_its_colour(before, aft
     assert torch.allclose(rgb, torch.tensor(WOOD), atol=0.08)
 
 
+def test_parts_of_an_object_that_were_left_on_the_table_do_not_stay_beneath_it():
+    """A block stands on two rails, and what cameras saw between them lies on the table's plane in yellow and black."""
+    top, rails = table(), [block((0.0, y), (0.2, 0.02, 0.07), (0.8, 0.1, 0.1), 1) for y in (-0.07, 0.07)]
+    body = block((0.0, 0.0), SIDES, (0.8, 0.1, 0.1), 1)
+    body = replace(body, means=body.means + torch.tensor([0, 0, 0.07]))
+    hidden = (top.means[:, 0].abs() < 0.1) & (top.means[:, 1].abs() < 0.08)
+    left = [coloured(sheet(0.2, 0.07, 0.012).moved((0.0, y, 0.0)), rgb, 0) for y, rgb in REMAINS.items()]
+    scene = scene_of(top[~hidden], body, *rails, *left)
+    high, low = round_about(12, elevation=50.0), round_about(2, elevation=20.0)  # the low ones look along the rails
+    fields = [torch.cat([getattr(high, f), getattr(low, f)]) for f in ("viewmats", "Ks", "sizes")]
+    scene = replace(scene, cameras=Cameras(*fields, tuple(f"{i}.jpg" for i in range(14))))
+    weight = Sight.of(scene).weight[-2 * len(left[0].means) :]
+    assert float((weight > 1).float().mean()) > 0.3  # many of them are seen, between the rails
+    refined = refine(scene, RefineOptions(completer="none"))
+    for y, rgb in REMAINS.items():
+        above, target = (0.07, y, 1.0), (0.05, y, 0.0)
+        assert torch.allclose(seen(scene, above, 0, target)[0], torch.tensor(rgb), atol=0.1)
+        now, alpha = seen(refined, above, 0, target)
+        assert alpha > 0.9 and torch.allclose(now, torch.tensor(WOOD), atol=0.08)
+
+
+def test_the_table_ends_where_it_ended():
+    """In the corner of an L-shaped table a block stands at the edge; past it cameras see the floor."""
+    top = table()
+    floor = coloured(sheet(2.0, 2.0, 0.03).moved((0.0, 0.0, -0.4)), (0.3, 0.3, 0.35), 0)
+    thing = block((-0.04, -0.04), (0.08, 0.08, 0.1), (0.1, 0.2, 0.8), 1)
+    kept = (top.means[:, 0] < 0.02) | (top.means[:, 1] < 0.02)
+    under = ((top.means[:, :2] + 0.04).abs() < 0.035).all(1)
+    scene = scene_of(top[kept & ~under], floor, thing)
+    refined = refine(scene, RefineOptions(completer="none"))
+    level = refined.gaussians.means[refined.gaussians.means[:, 2].abs() < 0.02]
+    assert not bool((level[:, :2] > 0.035).all(1).any())
+    assert seen(refined, (0.0, -0.04, 1.0), 0, (-0.04, -0.04, 0.0))[1] > 0.9
+
+
+def passes(eyes: torch.Tensor, places: torch.Tensor, grown: float) -> torch.Tensor:
+    """(c, n): whether the line from each eye to each place misses the block, by the method of slabs."""
+    low = torch.tensor([-SIDES[0] / 2, -SIDES[1] / 2, 0.0]) - grown
+    high = torch.tensor([SIDES[0] / 2, SIDES[1] / 2, SIDES[2]]) + grown
+    ahead = places[None] - eyes[:, None]
+    one, two = (low - eyes)[:, None] / ahead, (high - eyes)[:, None] / ahead
+    return torch.minimum(one, two).amax(2) > torch.maximum(one, two).amin(2).clamp_max(1.0)
+
+
+def test_the_share_of_cameras_that_see_a_place(before):
+    """Beside the block a place is seen by those cameras that it does not stand in the way of."""
+    places = 0.36 * torch.rand(60, 3, generator=torch.Generator().manual_seed(0)) - 0.18
+    places[:, 2] = 0.0
+    places = places[((places[:, 0].abs() > 0.13) | (places[:, 1].abs() > 0.11))]
+    eyes = centres(before.cameras.viewmats)
+    least, most = (passes(eyes, places, grown).float().mean(0) for grown in (0.02, -0.005))
+    found = Sight.of(before).share(places, 0.02)
+    assert bool((found >= least - 1e-6).all() and (found <= most + 1e-6).all())
+    assert bool((least == most).float().mean() > 0.3) and float(least.min()) < 0.7 < float(most.max())
+    inside = torch.tensor([[0.0, 0.0, 0.0], [0.05, -0.04, 0.0]])
+    assert float(Sight.of(before).share(inside, 0.02).max()) == 0.0
+
+
 def test_what_the_photos_show_stays(before, after):
     assert agreement(before, after) > 35
 
@@ -91,8 +152,6 @@ def test_new_gaussians_stay_above_the_table_and_within_the_object(before, after)
 
 
 def test_a_bowl_stays_open_where_cameras_look_into_it():
-    from stages.lab.shapes import ellipsoid
-
     shell = ellipsoid((0.1, 0.1, 0.1), 4000).moved((0.0, 0, 0.1))
     bowl = coloured(shell.kept(shell.points[:, 2] < 0.08), (0.1, 0.3, 0.7), 1)
     refined = refine(scene_of(table(), bowl))

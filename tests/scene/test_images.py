@@ -1,3 +1,6 @@
+import struct
+import zlib
+
 import av
 import cv2
 import numpy as np
@@ -56,4 +59,15 @@ def test_a_file_that_is_no_picture(tmp_path, reader):
     path = tmp_path / "x.png"
     path.write_bytes(b"nonsense" * 50)
     with pytest.raises(InputError, match="can be read|is damaged"):
+        reader(path)
+
+
+@pytest.mark.parametrize("reader", [read_image, read_labels])
+def test_a_picture_with_too_many_pixels_is_named(tmp_path, reader):
+    path = tmp_path / "x.png"
+    write_png(path, torch.zeros(4, 4, 3))
+    data = path.read_bytes()
+    header = struct.pack(">4sIIBBBBB", b"IHDR", 1 << 16, 1 << 16, 8, 2, 0, 0, 0)
+    path.write_bytes(data[:12] + header + struct.pack(">I", zlib.crc32(header)) + data[33:])
+    with pytest.raises(InputError, match="x.png: is damaged, or far too large"):
         reader(path)

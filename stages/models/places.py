@@ -13,7 +13,7 @@ from stages.models.contact import nearest
 from stages.models.dynamics import FRAME
 from stages.models.shape import Shape
 from stages.models.touch import Places
-from stages.models.vectors import fade, length
+from stages.models.vectors import fade, length, symmetric_solve
 
 NEAR, FAR = 0.04, 0.1  # a contact is full below and none above, now or a frame ahead [m]
 SEEN = 0.2  # farther things are not looked at, however fast they come: at 5 m/s they are contacts a frame later [m]
@@ -73,7 +73,7 @@ def pair_places(shape: Shape, moving: Moving) -> Places:
     K = K + (1 - light) * _response(moving.inverse[:, others][:, :, :, None], there[..., 9:12])
     vectors = torch.stack([
         way / CLOSE, here[..., 6:9], there[..., 6:9], pass_by, here[..., 9:12] / LEVER, there[..., 9:12] / LEVER,
-        apart, gravity, *_answers(K, pass_by, there[..., 6:9]),
+        apart, gravity, *symmetric_solve(K, pass_by, there[..., 6:9]),
     ], -2)  # fmt: skip
     sizes = torch.stack([shape.size[:, :, None].expand(b, o, m), shape.size[:, others]], -1).log()
     scalars = torch.cat([
@@ -95,14 +95,6 @@ def _response(inverse: Float[Tensor, "*#b 3 3"], arm: Float[Tensor, "*#b 3"]) ->
     turned = torch.linalg.cross(*torch.broadcast_tensors(inverse, r))  # J^-1 [r], by rows
     turned = torch.linalg.cross(*torch.broadcast_tensors(r, turned.mT)).mT
     return torch.eye(3, dtype=arm.dtype, device=arm.device) - turned
-
-
-def _answers(K: Float[Tensor, "*b 3 3"], *motions: Float[Tensor, "*b 3"]) -> list[Float[Tensor, "*b 3"]]:
-    """The impulses that change the velocity of a place by these: K^-1 v. K is symmetric and at least the identity."""
-    a, b, c = K.unbind(-2)
-    ab, bc, ca = torch.linalg.cross(a, b), torch.linalg.cross(b, c), torch.linalg.cross(c, a)
-    det = (a * bc).sum(-1, keepdim=True)
-    return [(v[..., :1] * bc + v[..., 1:2] * ca + v[..., 2:] * ab) / det for v in motions]
 
 
 def floor_places(shape: Shape, moving: Moving) -> Places:
@@ -152,7 +144,7 @@ def _plane(
     gate = torch.where(state[..., 10] > 0, fade(torch.minimum(height, ahead), NEAR, FAR), 0.0)
     K = _response(moving.inverse[:, :, None], arm)
     vectors = torch.stack([
-        normal, state[..., 3:6], speed, arm / LEVER, whole, gravity, *_answers(K, speed, normal)
+        normal, state[..., 3:6], speed, arm / LEVER, whole, gravity, *symmetric_solve(K, speed, normal)
     ], -2)  # fmt: skip
     scalars = torch.stack([
         (height / CLOSE).clamp(-2, 2), (ahead / CLOSE).clamp(-2, 2), gate, state[..., 9] / CLOSE,

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from stages.models.vectors import symmetric_solve
 from stages.models.world import World, centre, inertia
 from stages.physics.forces import Prompts
 
@@ -93,7 +94,7 @@ class Pushes:
         com = centre(world, points)
         force, torque = self.wrench(points, com, t, dt)
         arm = torch.where(world.valid[..., None], points - com[:, :, None], 0.0)
-        turning = torch.linalg.solve(inertia(world.share, arm), torque[..., None])[..., 0]
+        (turning,) = symmetric_solve(inertia(world.share, arm), torque)
         spun = torch.linalg.cross(turning[:, :, None].expand_as(arm), arm)
         return torch.where(world.valid[..., None], (force[:, :, None] + spun) / world.mass[..., None, None], 0.0)
 

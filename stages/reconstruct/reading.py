@@ -117,9 +117,6 @@ def _readable(files: list[Path], side: int, unread: dict[str, str]) -> Iterator[
         except InputError as error:
             unread[file.name] = str(error)
             continue
-        except cv2.error:  # by its header it has more pixels than OpenCV takes, 2^30
-            unread[file.name] = f"{file}: is damaged, or far too large; photos of 4000 pixels or less will do"
-            continue
         bounded = _bounded(to_bytes(image), side)
         yield i, Taken(file.name, bounded, _exif_focal(file) * max(bounded.shape[:2]) / max(image.shape[:2]))
 

@@ -1,7 +1,6 @@
 """segment --backend sam2 with a tiny random network, through the loader and the code that the published one takes."""
 
 import json
-from dataclasses import replace
 from functools import partial
 
 import pytest
@@ -9,13 +8,12 @@ import torch
 
 from stages.errors import InputError
 from stages.scene.images import write_png
-from stages.scene.scene_ply import read_scene, write_scene
+from stages.scene.scene_ply import read_scene
 from stages.segment import sam2
 from stages.segment.options import SegmentOptions
 from stages.segment.pictures import drawn, pictures
 from stages.segment.prompts import read_prompts
 from stages.segment.stage import run
-from tests.segment.tabletop import three_apart
 
 pytest.importorskip("transformers")
 
@@ -27,19 +25,6 @@ def one_thread():
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(before)
-
-
-@pytest.fixture(scope="module")
-def truth():
-    return three_apart(noise=0.001)
-
-
-@pytest.fixture
-def scene_file(truth, tmp_path):
-    path = tmp_path / "scene.ply"
-    blank = replace(truth.gaussians, object_id=torch.zeros_like(truth.gaussians.object_id))
-    write_scene(path, replace(truth, gaussians=blank))
-    return path
 
 
 @pytest.fixture(scope="module")

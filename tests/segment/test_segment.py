@@ -15,20 +15,7 @@ from stages.scene.scene_ply import read_scene, write_scene
 from stages.segment.options import SegmentOptions
 from stages.segment.stage import run
 from stages.segment.vote import elect, pooled, tempered, without_outliers
-from tests.segment.tabletop import best_overlap, three_apart
-
-
-@pytest.fixture(scope="module")
-def truth():
-    return three_apart(noise=0.001)
-
-
-@pytest.fixture
-def scene_file(truth, tmp_path):
-    path = tmp_path / "scene.ply"
-    blank = replace(truth.gaussians, object_id=torch.zeros_like(truth.gaussians.object_id))
-    write_scene(path, replace(truth, gaussians=blank))
-    return path
+from tests.segment.tabletop import best_overlap
 
 
 def true_masks(scene):

@@ -253,8 +253,9 @@ class ForceField(Dynamics):
         """Velocities with which no point gets deeper than SINK into floor, walls or ceiling within dt."""
         w = scene.shape.world
         hidden = ~w.valid[..., None]
-        lowest = points.masked_fill(hidden, torch.inf).amin(2)
-        highest = points.masked_fill(hidden, -torch.inf).amax(2)
+        # not amin: compiled, its gradient looks for the value again and, rounded otherwise, may not find it
+        lowest = points.masked_fill(hidden, torch.inf).min(2).values
+        highest = points.masked_fill(hidden, -torch.inf).max(2).values
         up = (w.box[:, None, 0] - SINK - lowest) / dt
         down = (w.box[:, None, 1] + SINK - highest) / dt
         velocity = torch.maximum(velocity, up.clamp(max=RISE))

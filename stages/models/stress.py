@@ -83,7 +83,7 @@ def projected(shape: Shape, field: Float[Tensor, "b o n 3"]) -> Float[Tensor, "b
 
 
 def bounded(shape: Shape, u: Float[Tensor, "b o n 3"]) -> Float[Tensor, "b o n 3"]:
-    """Displacements kept below a share of the object's size, all of an object by the same factor, as if it were given."""
+    """Displacements kept below a share of the object's size, all of an object by the same, given factor."""
     most = FARTHEST * shape.size
     largest = u.detach().square().sum(-1).amax(-1).sqrt()
     return u * (most / torch.maximum(largest, most))[..., None, None]

@@ -159,7 +159,9 @@ def train(
     lr: Annotated[float, typer.Option(help="highest learning rate")] = 1e-3,
     hidden: Annotated[int, typer.Option(help="width of the network; 0: the model's own")] = 0,
     horizons: Annotated[str, typer.Option(help="frames to roll out in each phase")] = "8,20,40",
-    root: Annotated[bool, typer.Option("--root", help="loss: the RMSE of each scene, not its square")] = False,
+    loss: Annotated[
+        str, typer.Option(help="square: squared error | scene: RMSE of a scene | axes: RMSE of an object's axis")
+    ] = "scene",
     memory: Annotated[float, typer.Option(help="share of a gradient that goes back by another frame")] = 0.9,
     groups: Annotated[str, typer.Option(help="of scenes; the last 100 choose the best weights")] = "3_0..3_8",
     compiled: Annotated[bool, typer.Option("--compiled", help="compile a step first; for GPUs")] = False,
@@ -171,7 +173,7 @@ def train(
     from stages.lab.train import TrainOptions, run
 
     options = TrainOptions(
-        minutes, steps, batch, keypoints, lr, horizons, hidden, root, memory, groups, compiled, seed, device
+        minutes, steps, batch, keypoints, lr, horizons, hidden, loss, memory, groups, compiled, seed, device
     )
     for line in run(model, data, out, options, resume):
         print(line)

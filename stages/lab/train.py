@@ -21,7 +21,7 @@ from stages.evaluate.dynamics import all_metrics
 from stages.lab.motions import Motions
 from stages.lab.scenes import groups_of
 from stages.lab.training_data import UNSEEN, Pieces, read_groups, recipe, split
-from stages.lab.training_roll import Roll
+from stages.lab.training_roll import LOSSES, Roll
 from stages.lab.training_state import Trainee
 from stages.lab.training_team import Team, team
 from stages.models.weights import build, save
@@ -48,7 +48,7 @@ class TrainOptions:
     lr: float = 1e-3  # highest rate
     horizons: str = "8,20,40"  # frames that a rollout goes on for, one phase each
     hidden: int = 0  # width of the network; 0: the model's own
-    root: bool = False  # loss: root of the squared error of each scene
+    loss: str = "scene"  # one of training_roll.LOSSES
     memory: float = 0.9  # share of a gradient that goes back by another frame
     groups: str = "3_0..3_8"  # files to learn from; the last scenes of the last choose the best weights
     compiled: bool = False  # compile a step first: a minute or so, then faster; for GPUs
@@ -60,6 +60,8 @@ class TrainOptions:
             raise InputError("--minutes, --batch, --keypoints and --lr must be positive, --steps at least 0")
         if not 0 <= self.memory <= 1:
             raise InputError(f"--memory {self.memory}: must be between 0 and 1")
+        if self.loss not in LOSSES:
+            raise InputError(f"--loss {self.loss}: choose from {', '.join(LOSSES)}")
         if min(self.frames) < 1:
             raise InputError(f"--horizons takes frames, such as 8,20,40, not {self.horizons!r}")
 
@@ -159,7 +161,7 @@ class Job:
                 if options.horizon(done) != horizon:
                     roll, horizon = None, options.horizon(done)  # the memory of the old graph goes first
                     dt = self.pieces.motions.dt
-                    roll = Roll(trainee.model, dt, options.root, options.memory, compiled=options.compiled)
+                    roll = Roll(trainee.model, dt, options.loss, options.memory, compiled=options.compiled)
                     trainee.anew(horizon)
                 loss, grads = roll(self.pieces.draw(options.batch, horizon, trainee.generator, part))
                 *grads, loss = self.team.mean([*grads, loss.clone()])  # a graph writes the next loss in the same place

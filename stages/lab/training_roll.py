@@ -20,16 +20,27 @@ from stages.models.trees import rebuilt, tensors
 
 log = logging.getLogger(__name__)
 UNIT = 0.01  # errors count in centimetres: gradients of order one
+LOSSES = ("square", "scene", "axes")
 FINE = 0.1  # errors below a millimetre no longer matter to the root [UNIT]
 
 
 def loss_of(
-    predicted: Float[Tensor, "b t o n 3"], truth: Float[Tensor, "b t o n 3"], valid: Bool[Tensor, "b o n"], root: bool
+    predicted: Float[Tensor, "b t o n 3"], truth: Float[Tensor, "b t o n 3"], valid: Bool[Tensor, "b o n"], kind: str
 ) -> Float[Tensor, ""]:
-    """Mean squared coordinate error [cm^2] of the keypoints that are there; with `root` the mean RMSE [cm]."""
-    squared = ((predicted - truth) / UNIT).square().mean((1, 4))
-    each = torch.where(valid, squared, 0.0).sum((1, 2)) / valid.sum((1, 2)).clamp_min(1)
-    return (each + FINE**2).sqrt().mean() if root else each.mean()
+    """Error of the keypoints that are there, one of LOSSES.
+
+    "square" is the mean squared coordinate error [cm^2], "scene" the mean RMSE of a scene [cm], and "axes" the mean
+    RMSE of each axis of each object [cm], in which little motion counts as much as the fall.
+    """
+    squared = ((predicted - truth) / UNIT).square().mean(1)
+    squared = torch.where(valid[..., None], squared, 0.0)
+    if kind == "axes":
+        count = valid.sum(2)
+        each = squared.sum(2) / count.clamp_min(1)[..., None]
+        root = (each + FINE**2).sqrt()
+        return (root.mean(-1) * (count > 0)).sum() / (count > 0).sum().clamp_min(1)
+    each = squared.mean(-1).sum((1, 2)) / valid.sum((1, 2)).clamp_min(1)
+    return (each + FINE**2).sqrt().mean() if kind == "scene" else each.mean()
 
 
 class Roll:
@@ -39,10 +50,10 @@ class Roll:
     """
 
     def __init__(
-        self, model: Dynamics, dt: float, root: bool = False, memory: float = 1.0, graph: bool = True,
+        self, model: Dynamics, dt: float, loss: str = "square", memory: float = 1.0, graph: bool = True,
         compiled: bool = False,
     ):  # fmt: skip
-        self.model, self.dt, self.root, self.memory = model, dt, root, memory
+        self.model, self.dt, self.loss, self.memory = model, dt, loss, memory
         self.advance = torch.compile(_advance, fullgraph=True, dynamic=False) if compiled else _advance
         self.compiling = compiled
         self.params = [p for p in model.parameters() if p.requires_grad]
@@ -82,7 +93,7 @@ class Roll:
             *moved, points = self.advance(self.model, scene, state, self.dt, pushes)
             state = rebuilt(state, iter(moved))
             frames.append(points)
-        loss = loss_of(torch.stack(frames, 1), truth, valid, self.root)
+        loss = loss_of(torch.stack(frames, 1), truth, valid, self.loss)
         wanted = self.params + [x for x in free if x.requires_grad]
         return loss.detach(), list(torch.autograd.grad(loss, wanted, allow_unused=True))
 

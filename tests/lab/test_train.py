@@ -94,8 +94,9 @@ def test_a_centimetre_in_one_coordinate_is_a_third_of_a_square_centimetre():
     predicted = truth.clone()
     predicted[:, :, 0, :, 2] = 0.01
     predicted[:, :, 1] = 7.0  # padding does not count
-    assert_close(loss_of(predicted, truth, valid, root=False), torch.tensor(1 / 3))
-    assert_close(loss_of(predicted, truth, valid, root=True), torch.tensor((1 / 3 + 0.01) ** 0.5))
+    assert_close(loss_of(predicted, truth, valid, "square"), torch.tensor(1 / 3))
+    assert_close(loss_of(predicted, truth, valid, "scene"), torch.tensor((1 / 3 + 0.01) ** 0.5))
+    assert_close(loss_of(predicted, truth, valid, "axes"), torch.tensor((0.1 + 0.1 + 1.01**0.5) / 3))
 
 
 @pytest.mark.parametrize("name", MODELS)

@@ -19,6 +19,13 @@ class Similarity(NamedTuple):
     def __call__(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
         return self.scale * points @ self.rotation.mT + self.translation
 
+    def inverse(self) -> "Similarity":
+        R = self.rotation.mT
+        return Similarity(1 / self.scale, R, -(R @ self.translation) / self.scale)
+
+    def to(self, device: str | torch.device) -> "Similarity":
+        return Similarity(self.scale, self.rotation.to(device), self.translation.to(device))
+
     def viewmats(self, viewmats: Float[Tensor, "c 4 4"]) -> Float[Tensor, "c 4 4"]:
         """World-to-camera matrices that see the transformed world in the same pixels, depths times scale."""
         out = viewmats.clone()

@@ -18,6 +18,7 @@ from stages.physics.naming import names_of
 from stages.physics.regions import Merging, Voxels, edges_of, small_regions
 from stages.physics.sight import seen_from
 from stages.physics.support import Support, View, cell_medians, find_support, view_of, windowed
+from stages.physics.wall import find_wall, laid_down
 from stages.scene.gaussians import Gaussians
 from stages.scene.scene import Scene, SceneObject
 
@@ -27,6 +28,7 @@ CROWD = 0.3  # Gaussians that a voxel of a real surface holds at least, of those
 HIGH = 0.4  # what hangs higher above the table than this is no thing on it [view radii]
 LOW = 0.05  # what ends lower than this and has the table's colour is a bump of the table [view radii]
 LARGE = 0.4  # longest side of a thing that stands out of its surroundings [view radii]
+ON_WALL = 0.9  # the same of what hangs on a wall, where photos are of one thing rather than of many [view radii]
 
 
 @dataclass(frozen=True)
@@ -43,29 +45,40 @@ def group(scene: Scene, grouping: Grouping = Grouping()) -> Scene:
     """The scene with an object_id for every Gaussian (0 for the background) and its objects, largest first.
 
     The supporting plane is taken away, what is left is cut into small even regions, and these are merged
-    while they look like one thing. Things that mostly lie outside the table are background.
+    while they look like one thing. Things that mostly lie outside the table are background. Where there is
+    a wall and no floor, what hangs on it is found in the same way.
     """
     view = view_of(scene)
-    support = find_support(scene, view, grouping.seed)
+    wall = find_wall(scene, view, grouping.seed)
+    if wall is None:
+        support = find_support(scene, view, grouping.seed)
+        return named(replace(scene, gaussians=_grouped(scene, view, support, grouping, LARGE)), support)
+    laid = laid_down(scene, wall)
+    view = view_of(laid)
+    ids = _grouped(laid, view, find_support(laid, view, grouping.seed), grouping, ON_WALL).object_id
+    return named(replace(scene, gaussians=replace(scene.gaussians, object_id=ids)), None)
+
+
+def _grouped(scene: Scene, view: View, support: Support | None, grouping: Grouping, large: float) -> Gaussians:
+    """The scene's Gaussians with object numbers; nothing is larger than about `large` view radii."""
     g = replace(scene.gaussians, object_id=torch.zeros(len(scene.gaussians), dtype=torch.int64))
     index = _candidates(g, view, support)
     index = index[_crowded(g.means[index], view)]
     if len(index) < 20:
         log.info("nothing stands on the supporting plane: no objects")
-        return replace(scene, gaussians=g, objects=())
+        return g
     seen = seen_from(g, scene.cameras) if scene.cameras is not None and len(scene.cameras) else None
     voxels, owner = _voxels(g[index], view, None if seen is None else seen[index])
     edges = edges_of(voxels)
     least = max(4, int((grouping.min_size * view.radius / voxels.size) ** 2))
     regions = small_regions(voxels, edges)
-    things = Merging(voxels, edges, regions, least, grouping.detail, LARGE * view.radius).run()
+    things = Merging(voxels, edges, regions, least, grouping.detail, large * view.radius).run()
     count = np.bincount(owner[owner >= 0], minlength=len(voxels)) * _thinning(voxels, scene, view)
     if support is not None:
         things = _without_skirts(voxels, things, table_colour(g, support), support)
     things = _objects(voxels, count, things, view, support, grouping)
     g.object_id[index] = torch.from_numpy(np.where(owner >= 0, things[owner], 0))
-    g = complete(g, support, 2 * voxels.size)
-    return named(replace(scene, gaussians=g), support)
+    return complete(g, support, 2 * voxels.size)
 
 
 def _candidates(g: Gaussians, view: View, support: Support | None) -> Int[Tensor, "m"]:

@@ -7,12 +7,13 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.spatial import ConvexHull, QhullError
 from torch import Tensor
 
 from stages.geometry.harmonics import C0
 from stages.geometry.neighbours import knn
+from stages.geometry.rotations import matrix
 from stages.physics.support import Support, cell_medians, windowed
 from stages.scene.gaussians import Gaussians
 
@@ -40,15 +41,16 @@ def complete(g: Gaussians, support: Support | None, reach: float) -> Gaussians:
     nearer to the object than to the table around; so an object grows along its flat parts.
     """
     finite = g.means.isfinite().all(1)
+    large = g.scales.amax(1) >= 3 * reach
     start = torch.nonzero((g.object_id > 0) & finite)[:, 0]
-    free = torch.nonzero((g.object_id == 0) & finite & (g.scales.amax(1) < 3 * reach))[:, 0]
+    free = torch.nonzero((g.object_id == 0) & finite & ~large)[:, 0]
     if not len(start) or not len(free):
         return g
     ids = _grow(g, support, start, free, reach)
-    rest = free[ids[free] == 0]
+    rest = torch.nonzero((ids == 0) & finite & g.scales.isfinite().all(1) & g.quats.isfinite().all(1))[:, 0]
     if support is not None:
         rest = rest[support.heights(g.means[rest]) > support.tolerance]
-    return replace(g, object_id=_fill_hulls(g, ids, rest, support))
+    return replace(g, object_id=_fill_hulls(g, ids, rest, large, support))
 
 
 def _grow(
@@ -80,9 +82,12 @@ def _grow(
     return ids
 
 
-def _fill_hulls(g: Gaussians, ids: Int[Tensor, "n"], free: Int[Tensor, "m"], support: Support | None) -> Tensor:
+def _fill_hulls(
+    g: Gaussians, ids: Int[Tensor, "n"], free: Int[Tensor, "m"], large: Bool[Tensor, "n"], support: Support | None
+) -> Int[Tensor, "n"]:
     """Those of the `free` Gaussians inside one object's convex hull (down to the plane, if it stands on it) join it.
 
+    Of a `large` one all within a deviation must be inside: a blur that photos of the surface do not tell from it.
     The smallest object goes first.
     """
     counts = torch.bincount(ids)
@@ -97,6 +102,9 @@ def _fill_hulls(g: Gaussians, ids: Int[Tensor, "n"], free: Int[Tensor, "m"], sup
             hull = ConvexHull(own.double().numpy()).equations
         except (QhullError, ValueError):
             continue
-        inside = (g.means[rest].double().numpy() @ hull[:, :3].T + hull[:, 3]).max(1, initial=-np.inf) < 1e-9
-        ids[rest[torch.from_numpy(inside)]] = number
+        height = g.means[rest].double().numpy() @ hull[:, :3].T + hull[:, 3]
+        blurs = rest[large[rest]]
+        axes = matrix(g.quats[blurs]) * g.scales[blurs][:, None]
+        height[large[rest].numpy()] += np.linalg.norm(hull[:, :3] @ axes.double().numpy(), axis=2)
+        ids[rest[torch.from_numpy(height.max(1, initial=-np.inf) < 1e-9)]] = number
     return ids

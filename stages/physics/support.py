@@ -108,7 +108,7 @@ def find_support(scene: Scene, view: View | None = None, seed: int = 0) -> Suppo
     """The surface at `scene.floor`, or the largest level one near the focus; None where there is none."""
     view = view or view_of(scene)
     g, R = scene.gaussians, view.radius
-    points = g.means[_solid(g, R) & ((g.means - view.focus)[:, :2].norm(dim=1) < REACH * R)]
+    points = g.means[solid(g, R) & ((g.means - view.focus)[:, :2].norm(dim=1) < REACH * R)]
     floor = scene.floor if scene.floor is not None else _level(points, view, seed)
     if floor is None or not np.isfinite(floor):
         return None
@@ -128,7 +128,7 @@ def find_support(scene: Scene, view: View | None = None, seed: int = 0) -> Suppo
     return found if found.region.any() else None
 
 
-def _solid(g: Gaussians, radius: float) -> Bool[Tensor, "n"]:
+def solid(g: Gaussians, radius: float) -> Bool[Tensor, "n"]:
     """Gaussians that are part of something: finite, not transparent, not a blur over the whole scene."""
     return g.means.isfinite().all(1) & (g.opacities > 0.1) & (g.scales.amax(1) < 0.2 * radius)
 

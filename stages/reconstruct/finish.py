@@ -12,9 +12,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from stages.errors import InputError
-from stages.geometry.harmonics import rotate_sh
-from stages.geometry.rotations import multiply, quaternion
-from stages.geometry.similarity import Similarity
 from stages.reconstruct import initialise, photometric, upright
 from stages.reconstruct.advice import advise
 from stages.reconstruct.depth import DepthMap
@@ -23,7 +20,7 @@ from stages.reconstruct.photos import Reconstruction, Views
 from stages.reconstruct.reading import sharpness
 from stages.reconstruct.scale import parse_scale
 from stages.reconstruct.steps import Steps
-from stages.scene.gaussians import Gaussians, concatenate
+from stages.scene.gaussians import Gaussians, concatenate, moved
 from stages.scene.scene import Scene
 
 log = logging.getLogger(__name__)
@@ -48,7 +45,10 @@ class Found:
 
 
 def finish(found: Found, options: ReconstructOptions, steps: Steps, device: str) -> Reconstruction:
-    """The scene: z up, the floor at z = 0; the cameras about 1 from the focus, or as far as cameras given say."""
+    """The scene: z up, the cameras about 1 from the focus, or as far as cameras given say.
+
+    The plane that things stand on is z = 0; where there is none, the lowest points are, and the scene has no floor.
+    """
     used, least = found.views[found.trained], found.least
     known = parse_scale(options.scale_reference)
     length = known.measured(found.views.cameras, found.radius) if known else None
@@ -62,7 +62,7 @@ def finish(found: Found, options: ReconstructOptions, steps: Steps, device: str)
         ground = upright.find_ground(cloud.points, used.cameras.viewmats, found.focus, options.seed)
         ground = upright.settled(ground, cloud.points, options.seed)
         if ground.plane is None:
-            log.info("no supporting plane found: up is how the cameras were held, the floor is at the lowest points")
+            log.info("no supporting plane found: up is how the cameras were held, z = 0 is at the lowest points")
         else:
             log.info("the supporting plane holds %.0f %% of the points in focus", 100 * ground.share)
         move = upright.to_world(ground, cloud.points, used.cameras.viewmats, metric=options.cameras is not None)
@@ -82,7 +82,8 @@ def finish(found: Found, options: ReconstructOptions, steps: Steps, device: str)
     upright_by = {"scale": move.scale, "rotation": move.rotation.tolist(), "translation": move.translation.tolist()}
     facts = {"upright": upright_by, "supporting_plane": ground.plane is not None}
     scale = _scale(options, length and move.scale * length)
-    scene = Scene(gaussians, cameras=views.cameras, floor=0.0, scale=scale, provenance=facts)
+    floor = None if ground.plane is None else 0.0
+    scene = Scene(gaussians, cameras=views.cameras, floor=floor, scale=scale, provenance=facts)
     confirmed = torch.stack([(m.support >= least).float().mean() for m in found.maps])
     sharp = torch.tensor([sharpness(image) for image in used.images])
     advice = advise(views.cameras[found.trained], focus, confirmed, sharp, ground.plane is not None, found.dropped)
@@ -96,16 +97,6 @@ def filled_in(
     more = initialise.fill(views, maps, cloud, ground.plane, least, FAR * ground.radius)
     more = initialise.thin(more, options.level.gaussians // 4, ground.focus, ground.radius)
     return [initialise.to_gaussians(more, torch.full((len(more),), 0.5), 0)] if len(more) > 10 else []
-
-
-def moved(gaussians: Gaussians, move: Similarity) -> Gaussians:
-    """With colours that depend on direction turned along."""
-    turn = quaternion(move.rotation).expand(len(gaussians), 4)
-    R = move.rotation.expand(len(gaussians), 3, 3)
-    return dataclasses.replace(
-        gaussians, means=move(gaussians.means), quats=multiply(turn, gaussians.quats),
-        scales=gaussians.scales * move.scale, sh=rotate_sh(gaussians.sh, R),
-    )  # fmt: skip
 
 
 def _scale(options: ReconstructOptions, units: float | None) -> dict:

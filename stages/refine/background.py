@@ -26,6 +26,7 @@ MOST = 512  # cells along the longer side of the picture of the table
 MARGIN = 0.06  # around what is under an object [view radii]
 FEW = 0.25  # share of the cameras that look at a place, below which the table there counts as not seen
 GRAZING = 0.03  # depth that a pixel of table spans at a flat angle [view radii]
+GAP = 0.03  # places that cameras see through are narrower where the reconstruction is at fault [view radii]
 OTHER = 12.0  # CIELAB distance from which a colour is not the table's
 COVERED = 0.92  # alpha above which the table is there
 
@@ -36,6 +37,7 @@ class Picture:
 
     corner: Float[Tensor, "2"]  # x of the first column's edge, y of the first row's
     cell: float
+    top: float  # height of the surface in the middle
     rgb: Float[np.ndarray, "h w 3"]
     alpha: Float[np.ndarray, "h w"]
 
@@ -78,10 +80,12 @@ def fill(scene: Scene, sight: Sight, support: Support, seed: int = 0) -> Scene:
     known, blind = picture.alpha >= COVERED, under & hidden
     hole = near & ~known & (under | hidden)
     width = 2 * support.tolerance + picture.cell
-    hole &= ~ndimage.binary_opening(_each(hole, picture, support, lambda points: sight.empty(points, width)))
+    empty = _each(hole, picture, support, lambda points: sight.empty(points, width))
+    hole &= ~ndimage.binary_opening(empty, iterations=max(1, round(GAP * R / picture.cell / 2)))
     colour = inpaint(picture.rgb, hole | blind, known & ~ndimage.binary_dilation(blind, iterations=2), seed)
     gone = _remains(g, flat, picture, colour, blind)
-    new = hole | _emptied(gone, g, picture, near)
+    left = _drawn(g[flat & ~gone], picture.corner, picture.cell, picture.top, picture.alpha.shape)
+    new = hole | (near & known & (left.alpha < COVERED))
     points = picture.on(support, new)
     up = torch.tensor([[0.0, 0, 1]]).expand(len(points), 3)
     more = patches(points, up, torch.from_numpy(colour[new]), picture.cell, 0)
@@ -110,16 +114,8 @@ def _remains(
     return gone
 
 
-def _emptied(gone: Bool[Tensor, "n"], g: Gaussians, picture: Picture, near: np.ndarray) -> np.ndarray:
-    """Cells that lost a Gaussian as large as themselves, and their neighbours."""
-    cells = np.zeros(picture.alpha.shape, bool)
-    cells[picture.rows_columns(g.means[gone])] = True
-    wide = float(g.scales[gone].amax(1).median()) / picture.cell if bool(gone.any()) else 0.0
-    return ndimage.binary_dilation(cells, iterations=max(1, min(6, round(2 * wide)))) & near
-
-
 def _picture(table: Gaussians, things: Float[Tensor, "m 3"], support: Support) -> Picture | None:
-    """The table from above around all things, from so high that the view is all but parallel."""
+    """The table from above around all things."""
     margin = 1.3 * MARGIN * support.view.radius
     low, high = things[:, :2].amin(0) - margin, things[:, :2].amax(0) + margin
     longest = float((high - low).max())
@@ -128,16 +124,22 @@ def _picture(table: Gaussians, things: Float[Tensor, "m 3"], support: Support) -
     spacing = float(knn(table.means, table.means[:: max(1, len(table) // 5000)], 4)[0][:, -1].median())
     cell = max(longest / MOST, spacing)
     width, height = (((high - low) / cell).ceil().long().clamp_min(2)).tolist()
-    away = 50 * longest
     top = float(support.surface((low + high)[None] / 2))
+    return _drawn(table, torch.stack([low[0], high[1]]), cell, top, (height, width))
+
+
+def _drawn(table: Gaussians, corner: Float[Tensor, "2"], cell: float, top: float, shape: tuple[int, int]) -> Picture:
+    """The picture with this corner, cell and shape (rows, columns), from so high that the view is all but parallel."""
+    height, width = shape
+    away = 50 * max(shape) * cell
     viewmat = torch.diag(torch.tensor([1.0, -1, -1, 1]))
-    viewmat[:3, 3] = torch.tensor([-float(low[0]), float(high[1]), top + away])
+    viewmat[:3, 3] = torch.tensor([-float(corner[0]), float(corner[1]), top + away])
     K = torch.tensor([[away / cell, 0, 0], [0, away / cell, 0], [0, 0, 1.0]])
     with torch.no_grad():
         drawn = rasterise(table, viewmat[None], K[None], width, height)
     alpha = drawn.alpha[0]
     rgb = (drawn.rgb[0] / alpha.clamp_min(1e-3)[..., None]).clamp(0, 1)
-    return Picture(torch.stack([low[0], high[1]]), cell, rgb.numpy().astype(np.float32), alpha.numpy())
+    return Picture(corner, cell, top, rgb.numpy().astype(np.float32), alpha.numpy())
 
 
 def _under(things: Float[Tensor, "m 3"], support: Support, picture: Picture) -> np.ndarray:

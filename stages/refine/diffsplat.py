@@ -29,7 +29,8 @@ FIT = 0.5  # a lower fit is another object; true maps in the network's place rea
 
 def complete(scene: Scene, number: int, sight: Sight, support: Support | None, options: RefineOptions) -> Gaussians:
     """Gaussians of the generated object where the photos did not see it; none when it does not fit what they saw."""
-    model = _model(options.weights, options.download, options.device)
+    device = pick_device(options.device)
+    model = _model(options.weights, options.download, device)
     own, name = solid(scene, number), scene.name_of(number)
     shown = portrait(scene, own, model.side, options.photos) if len(own) >= LEAST else None
     if shown is None:
@@ -41,7 +42,7 @@ def complete(scene: Scene, number: int, sight: Sight, support: Support | None, o
     said = "" if name == f"object_{number}" else name.replace("_", " ")  # a number says nothing
     made = model.generate(shown.image, shown.elevation, said, options.seed)
     made = made[made.opacities > SOLID]
-    how = register(own, made, options.seed, shown.place) if len(made) >= LEAST else None
+    how = register(own.to(device), made.to(device), options.seed, shown.place) if len(made) >= LEAST else None
     if how is None:
         log.info("  %d  %s: left alone: what DiffSplat made of %s is no solid object", number, name, shown.name)
         return none_like(own)
@@ -53,7 +54,7 @@ def complete(scene: Scene, number: int, sight: Sight, support: Support | None, o
 @lru_cache(maxsize=1)
 def _model(weights: Path | None, download: bool, device: str):
     """The network, once for all objects; fetched first when the user asked for that and it is not there."""
-    return load(_files(weights, download), pick_device(device))
+    return load(_files(weights, download), device)
 
 
 def _files(weights: Path | None, download: bool) -> Files:

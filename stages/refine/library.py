@@ -14,18 +14,16 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from stages.backends import pick_device
 from stages.errors import InputError
-from stages.geometry.harmonics import rotate_sh
 from stages.geometry.neighbours import knn
-from stages.geometry.rotations import multiply, quaternion
-from stages.geometry.similarity import Similarity
 from stages.physics.support import Support
 from stages.refine.options import RefineOptions
 from stages.refine.patches import none_like
 from stages.refine.register import LEAST, Registration, approach, rough_fit, settle
 from stages.refine.register_cloud import Cloud
 from stages.refine.sight import Sight
-from stages.scene.gaussians import Gaussians
+from stages.scene.gaussians import Gaussians, moved
 from stages.scene.scene import Scene
 from stages.scene.scene_ply import read_scene
 
@@ -40,7 +38,7 @@ SOLID = 0.1  # opacity of Gaussians that count as surface
 def complete(scene: Scene, number: int, sight: Sight, support: Support | None, options: RefineOptions) -> Gaussians:
     """Gaussians of the best asset of `options.library` where the object was not seen; none when nothing fits."""
     own = solid(scene, number)
-    found = best(own, library(options.library), options.seed) if len(own) >= LEAST else None
+    found = best(own, options) if len(own) >= LEAST else None
     if found is None:
         log.info("  %d  %s: left alone: too little of it to compare with the library", number, scene.name_of(number))
         return none_like(own)
@@ -58,7 +56,7 @@ def solid(scene: Scene, number: int) -> Gaussians:
 
 def put(whole: Gaussians, how: Registration, own: Gaussians, sight: Sight, least: float) -> tuple[Gaussians, str]:
     """What a registered whole adds to its part, and why: nothing when it fits less than `least` or is seen through."""
-    placed = moved(whole, how.similarity)
+    placed = moved(whole, how.similarity.to(whole.means.device))
     through = _seen_through(placed, sight)
     fits = how.fit >= least and through <= THROUGH
     verdict = "put in its place" if fits else f"left alone: {least} and at most {THROUGH:.0%} are needed"
@@ -67,8 +65,11 @@ def put(whole: Gaussians, how: Registration, own: Gaussians, sight: Sight, least
 
 
 @lru_cache(maxsize=1)
-def library(folder: Path) -> dict[str, tuple[Gaussians, Cloud]]:
-    """Whole objects by name: FOLDER/NAME.ply, or FOLDER/NAME/.../*.ply as trainers and `ngff-lab objects` write."""
+def library(folder: Path, device: str) -> dict[str, tuple[Gaussians, Cloud]]:
+    """Whole objects by name: FOLDER/NAME.ply, or FOLDER/NAME/.../*.ply as trainers and `ngff-lab objects` write.
+
+    Their clouds are on `device`, ready to be registered; their Gaussians stay on the CPU.
+    """
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError(f"{folder}: is no folder; --library takes whole objects, such as `ngff-lab objects` writes")
@@ -82,15 +83,14 @@ def library(folder: Path) -> dict[str, tuple[Gaussians, Cloud]]:
         g = g[(g.opacities > SOLID) & g.scales.isfinite().all(1)]
         if len(g) < 100:
             raise InputError(f"{path}: {len(g)} solid Gaussians are no object; take it out of the library")
-        out[name] = g, Cloud.of(g)
+        out[name] = g, Cloud.of(g.to(device))
     return out
 
 
-def best(
-    own: Gaussians, assets: dict[str, tuple[Gaussians, Cloud]], seed: int = 0
-) -> tuple[str, Gaussians, Registration] | None:
+def best(own: Gaussians, options: RefineOptions) -> tuple[str, Gaussians, Registration] | None:
     """Name, Gaussians and registration of the asset that fits best: all roughly, the most promising exactly."""
-    part = Cloud.of(own, seed)
+    device, seed = pick_device(options.device), options.seed
+    assets, part = library(options.library, device), Cloud.of(own.to(device), seed)
     rough = {name: approach(part, cloud, seed) for name, (_, cloud) in assets.items()}
     fits = {name: rough_fit(poses, part, assets[name][1]) for name, poses in rough.items() if len(poses)}
     promising = sorted(fits, key=fits.get, reverse=True)[:TRIED]
@@ -99,15 +99,6 @@ def best(
         return None
     winner = max(settled, key=lambda name: settled[name].fit)
     return winner, assets[winner][0], settled[winner]
-
-
-def moved(g: Gaussians, similarity: Similarity) -> Gaussians:
-    """The same Gaussians elsewhere, turned and grown, highlights included."""
-    R = similarity.rotation
-    return replace(
-        g, means=similarity(g.means), quats=multiply(quaternion(R).expand(len(g), 4), g.quats),
-        scales=similarity.scale * g.scales, sh=rotate_sh(g.sh, R.expand(len(g), 3, 3)),
-    )  # fmt: skip
 
 
 def _seen_through(placed: Gaussians, sight: Sight) -> float:

@@ -2,7 +2,7 @@
 
 Features are matched, many threes of matches give a guess each, the best guesses are polished, in the end against the
 whole with as much noise as the part has. Colours count all along. The part may be any 60 % of the surface, of any
-size, turned any way.
+size, turned any way. All is done on the device where the Gaussians are.
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, Int
-from scipy.spatial import cKDTree
 from torch import Tensor
 
+from stages.geometry.neighbours import Products, Tree, searchable
 from stages.geometry.rotations import matrix, nearest
 from stages.geometry.similarity import Similarity
 from stages.refine.register_cloud import COLOUR, REACH, Cloud
@@ -88,10 +88,11 @@ def rough_fit(poses: Poses, part: Cloud, whole: Cloud) -> float:
 
 def _order(part: Cloud, seed: int) -> Int[Tensor, "n"]:
     """The part's points shuffled, so that the first few are anywhere."""
-    return torch.randperm(len(part.points), generator=torch.Generator().manual_seed(seed))
+    order = torch.randperm(len(part.points), generator=torch.Generator().manual_seed(seed))
+    return order.to(part.points.device)
 
 
-def _best(poses: Poses, part: Cloud, tree: cKDTree, some: Int[Tensor, "k"], most: int) -> Poses:
+def _best(poses: Poses, part: Cloud, tree: Tree | Products, some: Int[Tensor, "k"], most: int) -> Poses:
     """The `most` that fit best, in order, judged by `some` points."""
     worth = misfit(poses, part.points[some], part.colours[some], tree)
     return poses[worth.topk(min(most, len(poses)), largest=False).indices]
@@ -104,14 +105,14 @@ def _difference(pose: Poses, part: Cloud, whole: Cloud) -> tuple[float, Float[Te
     may be seen in another light, though not in any.
     """
     moved = pose(part.raw[:3000])[0]
-    _, index = cKDTree(whole.points.numpy()).query(moved.numpy(), workers=2)
+    index = searchable(whole.points).query(moved)[1][:, 0]
     off = ((moved - whole.points[index]) * whole.normals[index]).sum(1)
     tint = (part.raw_colours[:3000] - whole.colours[index]).median(0).values
     return 1.4826 * float(off.abs().median()) / float(pose.scale[0]), tint.clamp(-RELIT, RELIT)
 
 
 def polish(
-    poses: Poses, part: Cloud, some: Int[Tensor, "k"], whole: Cloud, tree: cKDTree, rounds: int, floor: float
+    poses: Poses, part: Cloud, some: Int[Tensor, "k"], whole: Cloud, tree: Tree | Products, rounds: int, floor: float
 ) -> Poses:
     """Gauss-Newton on the robust one-sided coloured Chamfer distance, all poses at once.
 
@@ -124,8 +125,7 @@ def polish(
     poses = Poses(poses.scale.double(), poses.rotation.double(), poses.translation.double())
     for _ in range(rounds):
         y = poses(x)
-        distance, index = tree.query(torch.cat([y, colours.expand_as(y)], 2).numpy(), workers=2)
-        distance, index = torch.from_numpy(distance), torch.from_numpy(index)
+        distance, index = (found[..., 0] for found in tree.query(torch.cat([y, colours.expand_as(y)], 2)))
         tau = (2.5 * distance.median(1, keepdim=True).values).clamp_min(floor)
         step = _step(y, y - targets[index], normals[index], 1 / (1 + (distance / tau).square()))
         poses = _moved(poses, y.mean(1), step)
@@ -139,15 +139,15 @@ def _step(
 ) -> Float[Tensor, "h 7"]:
     """Turn [rad], shift and log scale about the mean of y that lessen the weighted errors the most."""
     arm = y - y.mean(1, keepdim=True)
-    axes = [(normals, PLANE), *((axis.expand_as(y), 1 - PLANE) for axis in torch.eye(3).double())]
-    system = torch.zeros(len(y), 8, 8, dtype=torch.float64)
+    axes = [(normals, PLANE), *((axis.expand_as(y), 1 - PLANE) for axis in torch.eye(3).to(y))]
+    system = y.new_zeros(len(y), 8, 8)
     for axis, share in axes:
         along = [((arm - error) * axis).sum(2, keepdim=True), (error * axis).sum(2, keepdim=True)]
         rows = torch.cat([torch.linalg.cross(arm, axis), axis, *along], 2) * (share**0.5 * weight[..., None])
         system += rows.mT @ rows
     H, slope = system[:, :7, :7], system[:, :7, 7]
     damping = 1e-9 * H.diagonal(dim1=1, dim2=2).mean(1)
-    return -torch.linalg.solve(H + damping[:, None, None] * torch.eye(7).double(), slope).clamp(-0.5, 0.5)
+    return -torch.linalg.solve(H + damping[:, None, None] * torch.eye(7).to(y), slope).clamp(-0.5, 0.5)
 
 
 def _moved(poses: Poses, about: Float[Tensor, "h 3"], step: Float[Tensor, "h 7"]) -> Poses:
@@ -161,10 +161,11 @@ def _moved(poses: Poses, about: Float[Tensor, "h 3"], step: Float[Tensor, "h 7"]
 
 def in_clouds(place: Similarity, part: Cloud, whole: Cloud) -> Poses:
     """Part to whole in normalised frames, from whole to part in the units of the scene."""
+    place = place.to(part.centre.device)
     R = place.rotation.mT
     scale = part.diameter / (place.scale * whole.diameter)
     middle = (R @ (part.centre - place.translation) / place.scale - whole.centre) / whole.diameter
-    return Poses(torch.tensor([scale]), R[None], middle[None])
+    return Poses(torch.tensor([scale]).to(R), R[None], middle[None])
 
 
 def _in_the_scene(pose: Poses, part: Cloud, whole: Cloud) -> Similarity:

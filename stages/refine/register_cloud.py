@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 import cv2
 import torch
 from jaxtyping import Float, Int
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from stages.geometry.harmonics import C0
+from stages.geometry.neighbours import Products, Tree, searchable
 from stages.scene.gaussians import Gaussians
 
 MOST = 30_000  # points that are smoothed from
@@ -23,7 +23,10 @@ LIGHT = 0.6  # weight of lightness, which shading changes, beside hue
 
 @dataclass(frozen=True)
 class Cloud:
-    """Points of an object after x -> (x - centre) / diameter, and the same object with all its noise."""
+    """Points of an object after x -> (x - centre) / diameter, and the same object with all its noise.
+
+    What is drawn at random is drawn on the CPU, so that a seed gives the same cloud on every device.
+    """
 
     points: Float[Tensor, "n 3"]
     normals: Float[Tensor, "n 3"]  # of either sign
@@ -38,7 +41,7 @@ class Cloud:
         """Opacities, sizes and view dependence do not count; g must have at least two points apart."""
         generator = torch.Generator().manual_seed(seed)
         centre, across = g.means.median(0).values, diameter(g.means)
-        some = torch.randperm(len(g), generator=generator)[:MOST]
+        some = torch.randperm(len(g), generator=generator)[:MOST].to(g.means.device)
         points = (g.means[some] - centre) / across
         colours = lab(g.sh[some, 0] * C0 + 0.5)
         return Cloud(*smoothed(points, colours, REACH), points, colours, centre, across)
@@ -46,19 +49,19 @@ class Cloud:
     def as_seen(self, sigma: float, tint: Float[Tensor, "3"], reach: float, seed: int = 0) -> Cloud:
         """The same object by a sensor with errors of standard deviation `sigma` [diameters], in a tinted light."""
         error = sigma * torch.randn(self.raw.shape, generator=torch.Generator().manual_seed(seed))
-        points, normals, colours = smoothed(self.raw + error, self.raw_colours + tint, reach)
+        points, normals, colours = smoothed(self.raw + error.to(self.raw), self.raw_colours + tint, reach)
         return replace(self, points=points, normals=normals, colours=colours)
 
-    def tree(self) -> cKDTree:
+    def tree(self) -> Tree | Products:
         """For nearest points in place and colour together."""
-        return cKDTree(torch.cat([self.points, self.colours], 1).numpy())
+        return searchable(torch.cat([self.points, self.colours], 1))
 
 
 def lab(rgb: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-    """CIELAB in diameters."""
-    pixels = rgb.clamp(0, 1).float().numpy()[None]
+    """CIELAB in diameters; worked out on the CPU."""
+    pixels = rgb.clamp(0, 1).float().cpu().numpy()[None]
     values = torch.from_numpy(cv2.cvtColor(pixels, cv2.COLOR_RGB2LAB)[0])
-    return values * torch.tensor([LIGHT, 1.0, 1.0]) * COLOUR
+    return (values * torch.tensor([LIGHT, 1.0, 1.0]) * COLOUR).to(rgb.device)
 
 
 def diameter(points: Float[Tensor, "n 3"]) -> float:
@@ -75,10 +78,8 @@ def smoothed(
 ) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 3"], Float[Tensor, "m 3"]]:
     """Evenly spread points moved onto the plane of their neighbours, its normals, and mean colours."""
     picked = thinned(points, POINTS)
-    distance, index = cKDTree(points.numpy()).query(points[picked].numpy(), NEIGHBOURS, distance_upper_bound=reach)
-    index = torch.from_numpy(index)
-    near = (torch.from_numpy(distance) < reach)[..., None].float()
-    index = index.clamp(max=len(points) - 1)
+    distance, index = searchable(points).query(points[picked], NEIGHBOURS, reach)
+    near = distance.isfinite()[..., None].float()
     count = near.sum(1)
     middle = (points[index] * near).sum(1) / count
     centred = (points[index] - middle[:, None]) * near
@@ -98,5 +99,5 @@ def thinned(points: Float[Tensor, "n 3"], count: int) -> Int[Tensor, "m"]:
         _, owner = torch.unique((cells[:, 0] * 4096 + cells[:, 1]) * 4096 + cells[:, 2], return_inverse=True)
         filled = int(owner.max()) + 1
         cell = max(cell * (filled / count) ** 0.5, 1e-3)
-    first = torch.full((filled,), len(points))
-    return first.scatter_reduce_(0, owner, torch.arange(len(points)), "amin")
+    first = owner.new_full((filled,), len(points))
+    return first.scatter_reduce_(0, owner, torch.arange(len(points), device=owner.device), "amin")

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 
-import numpy as np
 import torch
 from jaxtyping import Float, Int
-from scipy.spatial import cKDTree
 from torch import Tensor
 
+from stages.geometry.neighbours import Products, Tree
 from stages.geometry.rotations import matrix, nearest
 from stages.refine.register_cloud import COLOUR, Cloud
 
@@ -56,38 +55,37 @@ class Poses:
     def shaken(self, copies: int, seed: int) -> Poses:
         """These, and `copies` of each about 5 degrees, 4 % of size and 2 % of the diameter off, about the origin."""
         rng = torch.Generator().manual_seed(seed)
-        some = self[torch.arange(len(self)).repeat(copies)]
+        at = self.scale.device
+        some = self[torch.arange(len(self), device=at).repeat(copies)]
         quats = torch.nn.functional.pad(0.025 * torch.randn(len(some), 3, generator=rng), (1, 0), value=1.0)
-        turn, grown = matrix(quats), (0.04 * torch.randn(len(some), generator=rng)).exp()
-        shift = 0.01 * torch.randn(len(some), 3, generator=rng)
+        turn, grown = matrix(quats).to(at), (0.04 * torch.randn(len(some), generator=rng)).exp().to(at)
+        shift = 0.01 * torch.randn(len(some), 3, generator=rng).to(at)
         moved = grown[:, None] * (turn @ some.translation[..., None])[..., 0] + shift
         return Poses.joined(self, Poses(some.scale * grown, turn @ some.rotation, moved))
 
     def distinct(self, most: int, degrees: float, far: float) -> Poses:
         """The first `most` that differ from all before them by an angle or a shift."""
+        traces = self.rotation.flatten(1) @ self.rotation.flatten(1).mT
+        turned = torch.rad2deg(((traces - 1) / 2).clamp(-1, 1).arccos())
+        shifted = (self.translation[:, None] - self.translation).norm(dim=2)
+        alike = ((turned < degrees) & (shifted < far)).tolist()  # one copy; to ask a GPU for each would take longer
         kept: list[int] = []
         for i in range(len(self)):
-            turn = torch.einsum("hij,ij->h", self.rotation[kept], self.rotation[i])
-            turned = torch.rad2deg(((turn - 1) / 2).clamp(-1, 1).arccos())
-            shifted = (self.translation[kept] - self.translation[i]).norm(dim=1)
-            if not bool(((turned < degrees) & (shifted < far)).any()):
+            if len(kept) < most and not any(alike[i][j] for j in kept):
                 kept.append(i)
-            if len(kept) == most:
-                break
-        return self[torch.tensor(kept, dtype=torch.int64)]
+        return self[torch.tensor(kept, dtype=torch.int64).to(self.scale.device)]
 
 
 def misfit(
-    poses: Poses, points: Float[Tensor, "n 3"], colours: Float[Tensor, "n 3"], tree: cKDTree
+    poses: Poses, points: Float[Tensor, "n 3"], colours: Float[Tensor, "n 3"], tree: Tree | Products
 ) -> Float[Tensor, "h"]:
     """Mean squared distance, in place and colour, of the part's points from the whole, in units of WORST^2: 0 to 1.
 
     One-sided, as what the part lacks says nothing, and cut off, as what is not of the object says little.
     """
     moved = poses(points)
-    joint = torch.cat([moved, colours.expand_as(moved)], 2)
-    distance, _ = tree.query(joint.numpy(), workers=2, distance_upper_bound=WORST)
-    return torch.from_numpy(np.minimum(distance, WORST) / WORST).float().square().mean(1)
+    distance, _ = tree.query(torch.cat([moved, colours.expand_as(moved)], 2), within=WORST)
+    return (distance[..., 0].clamp_max(WORST) / WORST).square().mean(1)
 
 
 def describe(cloud: Cloud, at: Int[Tensor, "k"], unit: float) -> Float[Tensor, "k f"]:
@@ -99,7 +97,7 @@ def describe(cloud: Cloud, at: Int[Tensor, "k"], unit: float) -> Float[Tensor, "
     x, colour, q = cloud.points, cloud.colours / COLOUR, cloud.points[at]
     squared = torch.cdist(q, x).square()
     second = (x[:, :, None] * x[:, None]).flatten(1)
-    values = torch.cat([torch.ones(len(x), 1), x, second, colour, colour.square()], 1)
+    values = torch.cat([x.new_ones(len(x), 1), x, second, colour, colour.square()], 1)
     out = []
     for r in (unit * radius for radius in RADII):
         sums = (1 - squared / r**2).clamp_min(0) @ values
@@ -121,16 +119,16 @@ def guesses(part: Cloud, whole: Cloud, seed: int = 0, most: int = 6000) -> Poses
     Source: Fischler and Bolles 1981; agreement of edges before fitting as in Rusu et al. 2009, "Fast point feature
     histograms (FPFH) for 3D registration".
     """
-    generator = torch.Generator().manual_seed(seed)
-    targets = torch.randperm(len(whole.points), generator=generator)[:TARGETS]
-    keypoints = torch.randperm(len(part.points), generator=generator)[:KEYPOINTS]
+    generator, at = torch.Generator().manual_seed(seed), part.points.device
+    targets = torch.randperm(len(whole.points), generator=generator)[:TARGETS].to(at)
+    keypoints = torch.randperm(len(part.points), generator=generator)[:KEYPOINTS].to(at)
     features = describe(whole, targets, 1.0)
     found = []
     for size in SIZES:
         like = torch.cdist(describe(part, keypoints, size), features)
         choices = targets[like.topk(min(CHOICES, len(targets)), dim=1, largest=False).indices]
-        three = torch.randint(len(keypoints), (DRAWS, 3), generator=generator)
-        which = torch.randint(choices.shape[1], (DRAWS, 3), generator=generator)
+        three = torch.randint(len(keypoints), (DRAWS, 3), generator=generator).to(at)
+        which = torch.randint(choices.shape[1], (DRAWS, 3), generator=generator).to(at)
         found.append(_agreeing(part, whole, keypoints[three], choices[three, which], size))
     a, b = (torch.cat(side) for side in zip(*found, strict=True))
     poses = Poses.fitted(a, b)

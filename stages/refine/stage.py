@@ -13,14 +13,15 @@ from stages.backends import choose, pick_device
 from stages.errors import InputError
 from stages.geometry.neighbours import knn
 from stages.physics.growing import complete as take_halo
-from stages.physics.support import find_support
+from stages.physics.support import Support, find_support, view_of
+from stages.physics.wall import find_wall, laid_down
 from stages.refine.background import fill
 from stages.refine.options import BACKENDS, RefineOptions
 from stages.refine.outliers import floaters
 from stages.refine.patches import none_like
 from stages.refine.sight import Sight, agreement
 from stages.scene.files import provenance
-from stages.scene.gaussians import Gaussians, concatenate
+from stages.scene.gaussians import Gaussians, concatenate, moved
 from stages.scene.scene import Scene
 from stages.scene.scene_ply import read_scene, write_scene
 
@@ -29,7 +30,7 @@ log = logging.getLogger(__name__)
 
 def run(scene: Path, out: Path, options: RefineOptions = RefineOptions()) -> None:  # noqa: B008 -- frozen
     """Objects without floaters, closed all around, and the table beneath them filled: labelled.ply -> refined.ply."""
-    pick_device(options.device)  # refuses a GPU that is not there; the work itself is light and stays on the CPU
+    pick_device(options.device)  # refuses a GPU that is not there; only registration and DiffSplat use one
     whole = read_scene(scene)
     if not bool((whole.gaussians.object_id > 0).any()):
         raise InputError(f"{scene}: has no objects; label them with `ngff segment {scene} -o labelled.ply` first")
@@ -42,9 +43,21 @@ def run(scene: Path, out: Path, options: RefineOptions = RefineOptions()) -> Non
 
 
 def refine(scene: Scene, options: RefineOptions = RefineOptions()) -> Scene:  # noqa: B008 -- frozen
-    """The three steps on every object. What the photos show stays as it is; only the unseen is added."""
+    """The three steps on every object. What the photos show stays as it is; only the unseen is added.
+
+    Where things hang on a wall, and there is no floor, it is done with the wall lying down, and turned back.
+    """
+    wall = find_wall(scene, view_of(scene), options.seed)
+    if wall is None:
+        return _refined(scene, find_support(scene, seed=options.seed), options)
+    laid = laid_down(scene, wall)
+    done = _refined(laid, find_support(laid, seed=options.seed), options)
+    return replace(done, gaussians=moved(done.gaussians, wall.inverse()), cameras=scene.cameras, floor=scene.floor)
+
+
+def _refined(scene: Scene, support: Support | None, options: RefineOptions) -> Scene:
+    """The three steps for things on `support`."""
     completer = choose(BACKENDS, options.chosen)
-    support = find_support(scene, seed=options.seed)
     g = take_halo(scene.gaussians, support, _reach(scene.gaussians))
     stray = floaters(g, options.outliers) if options.outliers else torch.zeros(len(g), dtype=torch.bool)
     scene = replace(scene, gaussians=g[~stray])

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+
+from stages.geometry.harmonics import rotate_sh
+from stages.geometry.rotations import multiply, quaternion
+from stages.geometry.similarity import Similarity
 
 
 @dataclass(frozen=True)
@@ -38,3 +42,12 @@ def concatenate(parts: Sequence[Gaussians]) -> Gaussians:
     padded = [torch.nn.functional.pad(part.sh, (0, 0, 0, k - part.sh.shape[1])) for part in parts]
     joined = {f.name: torch.cat([getattr(p, f.name) for p in parts]) for f in fields(Gaussians) if f.name != "sh"}
     return Gaussians(sh=torch.cat(padded), **joined)
+
+
+def moved(g: Gaussians, similarity: Similarity) -> Gaussians:
+    """The same Gaussians elsewhere, turned and grown; colours that depend on direction turn along."""
+    R = similarity.rotation
+    return replace(
+        g, means=similarity(g.means), quats=multiply(quaternion(R).expand(len(g), 4), g.quats),
+        scales=similarity.scale * g.scales, sh=rotate_sh(g.sh, R.expand(len(g), 3, 3)),
+    )  # fmt: skip

@@ -1,5 +1,6 @@
 """The bench judges rightly: exact answers have no error, turns that cannot be seen are none, ICP finds what is near."""
 
+import json
 from dataclasses import replace
 
 import pytest
@@ -8,7 +9,7 @@ import torch
 from stages.geometry.harmonics import rgb_to_sh
 from stages.geometry.rotations import matrix
 from stages.geometry.similarity import Similarity
-from stages.lab import bench_register
+from stages.lab import bench, bench_register
 from stages.lab.bench_register import BenchOptions, about_z, angle, errors, icp, inverse, run, trial
 from stages.lab.shapes import ellipsoid
 from tests.refine.things import somewhere, thing
@@ -76,6 +77,7 @@ def test_icp_finds_a_whole_that_is_turned_a_little():
 def test_a_run_counts_and_writes(tmp_path, monkeypatch):
     monkeypatch.setattr(bench_register, "make_object", lambda name: thing(0.02))
     monkeypatch.setattr(bench_register, "METHODS", {"ICP": icp})
-    lines = list(run(tmp_path / "out.json", BenchOptions("duck", 1)))
+    lines = list(run(tmp_path / "out.json", BenchOptions("duck", 1, device="cpu")))
     assert lines[0].split() == ["right", "of", "1", "ICP"] and lines[1].split()[0] == "duck"
-    assert '"method": "ICP"' in (tmp_path / "out.json").read_text()
+    facts = json.loads((tmp_path / "out.json").read_text())
+    assert facts["machine"] == bench.machine("cpu") and [row["method"] for row in facts["trials"]] == ["ICP"]

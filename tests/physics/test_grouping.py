@@ -5,7 +5,9 @@ from dataclasses import replace
 import pytest
 import torch
 
+from stages.lab.shapes import ellipsoid
 from stages.physics.grouping import Grouping, group
+from stages.physics.growing import complete
 from stages.physics.support import find_support, view_of
 from stages.scene.gaussians import Gaussians, concatenate
 from stages.scene.scene import Scene
@@ -94,6 +96,16 @@ def test_faint_gaussians_inside_an_object_are_its_own():
     red = ids[scene.gaussians.object_id.argmax()]
     assert float((ids[-40:] == ids[torch.nonzero(scene.gaussians.object_id == 1)[50, 0]]).float().mean()) > 0.95
     assert red > 0
+
+
+def test_a_blur_within_an_object_is_its_own_and_one_that_reaches_out_is_not():
+    shell = coloured(ellipsoid((1.0, 1.0, 1.0), 2000), (0.8, 0.1, 0.1), 1)
+    blurs = random_gaussians(3)
+    scales = torch.tensor([[0.4, 0.3, 0.3], [0.4, 0.3, 0.3], [0.4, 0.3, torch.inf]])
+    centres = torch.tensor([[0.1, 0.0, 0.2], [0.75, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    blurs = replace(blurs, means=centres, scales=scales, object_id=torch.zeros(3, dtype=torch.int64))
+    whole = complete(concatenate([shell, blurs, replace(shell[:20], object_id=torch.zeros(20).long())]), None, 0.1)
+    assert whole.object_id[len(shell) :][:3].tolist() == [1, 0, 0]
 
 
 def test_the_plane_is_found_without_being_told():

@@ -102,6 +102,14 @@ def test_one_photo_is_enough(tmp_path):
     assert score(made.scene.gaussians, made.views, [0])[0] > 17
 
 
+def test_without_a_supporting_plane_there_is_no_floor(tmp_path, monkeypatch):
+    assert assembled(tmp_path, count=2, iterations=0)[0].scene.floor == 0.0
+    monkeypatch.setattr("stages.reconstruct.upright.LEAST", ())  # no plane is good enough
+    made, _ = assembled(tmp_path, count=2, iterations=0)
+    assert made.scene.floor is None
+    assert any("no table or floor" in sentence for sentence in made.advice)
+
+
 def test_few_gaussians_of_a_network_look_like_the_many_they_stand_for(tmp_path):
     many, _ = assembled(tmp_path, count=2, splats=True, iterations=0, quality="high")
     few, _ = assembled(tmp_path, count=2, splats=True, iterations=0)

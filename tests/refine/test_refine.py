@@ -8,6 +8,9 @@ import torch
 
 from stages.errors import InputError
 from stages.geometry.cameras import centres, intrinsics, look_at
+from stages.geometry.neighbours import knn
+from stages.geometry.rotations import matrix
+from stages.geometry.similarity import Similarity
 from stages.lab.shapes import ellipsoid, sheet
 from stages.raster.rasterise import rasterise
 from stages.refine.options import RefineOptions
@@ -15,7 +18,7 @@ from stages.refine.outliers import floaters
 from stages.refine.sight import Sight, agreement
 from stages.refine.stage import refine, run
 from stages.scene.cameras import Cameras
-from stages.scene.gaussians import concatenate
+from stages.scene.gaussians import concatenate, moved
 from stages.scene.scene import Scene, SceneObject
 from stages.scene.scene_ply import read_scene, write_scene
 from tests.conftest import random_gaussians
@@ -94,6 +97,18 @@ def test_parts_of_an_object_that_were_left_on_the_table_do_not_stay_beneath_it()
         assert torch.allclose(seen(scene, above, 0, target)[0], torch.tensor(rgb), atol=0.1)
         now, alpha = seen(refined, above, 0, target)
         assert alpha > 0.9 and torch.allclose(now, torch.tensor(WOOD), atol=0.08)
+
+
+def test_where_a_large_remain_goes_the_table_is_whole(before):
+    # beneath the block three wide yellow Gaussians in one place, and many small ones beside it
+    small = coloured(sheet(0.05, 0.12, 0.01).moved((-0.06, 0.0, 0.0)), (0.8, 0.7, 0.1), 0)
+    wide = replace(small[:3], means=torch.tensor([[0.03, 0.0, 0.0]]).repeat(3, 1), opacities=torch.full((3,), 0.999))
+    wide = replace(wide, scales=torch.tensor([[0.05, 0.05, 0.002]]).repeat(3, 1))
+    scene = replace(before, gaussians=concatenate([before.gaussians, small, wide]))
+    above, target = (0.09, 0.0, 1.0), (0.07, 0.0, 0.0)
+    assert seen(scene, above, 0, target)[0][2] < 0.2
+    colour, alpha = seen(refine(scene, RefineOptions(completer="none")), above, 0, target)
+    assert alpha > 0.95 and torch.allclose(colour, torch.tensor(WOOD), atol=0.08)
 
 
 def test_the_table_ends_where_it_ended():
@@ -222,3 +237,17 @@ def test_options_check_themselves(wrong, says):
 def test_an_unknown_completer_is_named(before):
     with pytest.raises(InputError, match="no backend called 'magic'"):
         refine(before, RefineOptions(completer="magic"))
+
+
+def test_the_wall_behind_what_hangs_on_it_is_filled(before):
+    # the block and its table turned by a quarter about x: what was up is now -y, and there is no floor
+    turn = Similarity(1.0, matrix(torch.tensor([0.5**0.5, 0.5**0.5, 0.0, 0.0])), torch.zeros(3))
+    hung = replace(before, gaussians=moved(before.gaussians, turn), cameras=before.cameras.moved(turn), floor=None)
+    done = refine(hung)
+    in_front = (0.0, -0.6, 0.05)
+    assert seen(hung, in_front, 0)[1] < 0.1
+    colour, alpha = seen(done, in_front, 0)
+    assert alpha > 0.95 and float((colour / alpha - torch.tensor(WOOD)).abs().max()) < 0.05
+    assert done.floor is None and torch.equal(done.cameras.viewmats, hung.cameras.viewmats)
+    kept = done.gaussians.means[: len(hung.gaussians)]
+    assert float(knn(kept, hung.gaussians.means[::50], 1)[0].max()) < 1e-6  # turned there and back

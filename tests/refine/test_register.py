@@ -5,11 +5,16 @@ from dataclasses import replace
 import pytest
 import torch
 
+from stages.geometry.neighbours import Products
+from stages.geometry.rotations import matrix
 from stages.lab.bench_register import BenchOptions, errors, trial
 from stages.lab.shapes import ellipsoid
+from stages.refine import register as registration
+from stages.refine import register_cloud
 from stages.refine.register import register
 from stages.refine.register_cloud import Cloud, diameter
 from stages.refine.register_guess import Poses, describe
+from tests.conftest import DEVICES
 from tests.refine.things import degrees_between, somewhere, thing
 from tests.segment.tabletop import coloured
 
@@ -34,6 +39,30 @@ def test_a_noisy_part_is_found_within_the_limits(whole, number):
     assert len(given.part) == round(0.6 * len(whole))
     wrong = errors(register(given.part, whole).similarity, given, whole, revolved=False)
     assert wrong["rotation"] < 2 and wrong["scale"] < 2 and wrong["shift"] < 1
+
+
+def test_the_way_of_a_gpu_finds_the_same(whole, monkeypatch):
+    monkeypatch.setattr(register_cloud, "POINTS", 1500)  # all products are many for a CPU
+    given = trial(whole, 1, BenchOptions())
+    expected = register(given.part, whole)
+    for module in (registration, register_cloud):
+        monkeypatch.setattr(module, "searchable", Products)
+    found = register(given.part, whole)
+    assert degrees_between(found.similarity.rotation, expected.similarity.rotation) < 0.5
+    assert found.similarity.scale == pytest.approx(expected.similarity.scale, rel=5e-3)
+    assert found.fit == pytest.approx(expected.fit, abs=0.01)
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif("cuda" not in DEVICES, reason="no NVIDIA GPU")
+def test_what_lies_on_a_gpu_is_registered_there(whole):
+    given = trial(whole, 1, BenchOptions())
+    near = given.truth._replace(scale=1.02 * given.truth.scale)  # on the CPU, as a camera would tell it
+    for hint in (None, near):
+        found = register(given.part.to("cuda"), whole.to("cuda"), hint=hint).similarity
+        assert found.rotation.is_cuda and found.translation.is_cuda
+        wrong = errors(found.to("cpu"), given, whole, revolved=False)
+        assert wrong["rotation"] < 2 and wrong["scale"] < 2 and wrong["shift"] < 1
 
 
 def test_another_thing_fits_less(whole):
@@ -72,6 +101,13 @@ def test_poses_are_fitted_exactly():
     poses = Poses.fitted(a, truth(a))
     torch.testing.assert_close(poses.scale, torch.full((4,), truth.scale), rtol=1e-4, atol=0)
     torch.testing.assert_close(poses.rotation, truth.rotation.expand(4, 3, 3), rtol=0, atol=1e-4)
+
+
+def test_of_poses_that_are_alike_the_first_is_kept():
+    turns = matrix(torch.tensor([[1.0, 0, 0, a] for a in (0.0, 0.01, 0.3, 0.0, 0.31)]))  # 0, 1, 33, 0 and 34 degrees
+    shift = torch.tensor([[0.0, 0, 0], [0, 0, 0], [0, 0, 0], [0, 0.1, 0], [0, 0, 0]])
+    kept = Poses(torch.arange(5.0), turns, shift).distinct(3, degrees=5.0, far=0.05)
+    assert kept.scale.tolist() == [0.0, 2.0, 3.0]
 
 
 def test_the_diameter_of_a_box_is_its_diagonal():

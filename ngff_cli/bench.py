@@ -62,6 +62,25 @@ def bench_reconstruct(
         print(line, flush=True)
 
 
+@app.command("appearance")
+def bench_appearance(
+    sets: Annotated[list[Path], typer.Argument(metavar="PHOTOSET...", help="folders of photos, or with images/")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="the results as JSON, added to what is there")] = Path(
+        "appearance.json"
+    ),
+    quality: Annotated[str, typer.Option(help="of the reconstruction")] = "high",
+    holdout: Annotated[int, typer.Option(help="keep every N-th photo out")] = 8,
+    models: Annotated[
+        Path | None, typer.Option(help="folder that keeps cameras and sparse points from run to run")
+    ] = None,
+) -> None:
+    """Photos kept out, drawn by our Gaussians and by those of gsplat's default recipe after the same seconds."""
+    from stages.lab.bench_appearance import BenchOptions, run
+
+    for line in run(sets, out, BenchOptions(quality, holdout, models)):
+        print(line, flush=True)
+
+
 @app.command("pi3")
 def bench_pi3(
     device: Device = "auto",
@@ -163,11 +182,12 @@ def bench_register(
     trials: Annotated[int, typer.Option(help="parts of each object")] = 10,
     out: Annotated[Path | None, typer.Option("-o", "--out", help="all trials as JSON")] = None,
     seed: Seed = 0,
+    device: Device = "auto",
 ) -> None:
     """Registration of a part to the whole, beside plain ICP."""
     from stages.lab.bench_register import BenchOptions, run
 
-    for line in run(out, BenchOptions(only, trials, seed=seed)):
+    for line in run(out, BenchOptions(only, trials, seed=seed, device=device)):
         print(line, flush=True)
 
 

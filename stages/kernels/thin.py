@@ -8,12 +8,13 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-ROWS, CHUNK = 32, 128
+ROWS, CHUNK = 64, 128
 MOST = 16  # columns
 
 
 @triton.jit
-def _thin(A, x, out, n, k, c, ROWS: tl.constexpr, CHUNK: tl.constexpr, COLUMNS: tl.constexpr):
+def product(A, high, low, out, n, k, c, ROWS: tl.constexpr, CHUNK: tl.constexpr, COLUMNS: tl.constexpr):
+    """Of matrices (n, k) and columns (c, k), the sum of two, all in half precision, sums in single; out (c, n)."""
     blocks = tl.cdiv(n, ROWS)
     matrix, block = (tl.program_id(0) // blocks).to(tl.int64), tl.program_id(0) % blocks
     r, col = block * ROWS + tl.arange(0, ROWS), tl.arange(0, COLUMNS)
@@ -21,28 +22,31 @@ def _thin(A, x, out, n, k, c, ROWS: tl.constexpr, CHUNK: tl.constexpr, COLUMNS: 
     for first in range(0, k, CHUNK):
         s = first + tl.arange(0, CHUNK)
         a = tl.load(A + matrix * n * k + r[:, None] * k + s[None, :], mask=(r[:, None] < n) & (s[None, :] < k),
-                    other=0.0).to(tl.float32)  # fmt: skip
-        b = tl.load(x + matrix * k * c + s[:, None] * c + col[None, :], mask=(s[:, None] < k) & (col[None, :] < c),
                     other=0.0)  # fmt: skip
-        # half precision is exact in tf32, and so are the two parts of x but for its last bits
-        high = (b.to(tl.int32, bitcast=True) & -8192).to(tl.float32, bitcast=True)
-        total += tl.dot(a, high, input_precision="tf32") + tl.dot(a, b - high, input_precision="tf32")
-    tl.store(out + matrix * n * c + r[:, None] * c + col[None, :], total, mask=(r[:, None] < n) & (col[None, :] < c))
+        at, some = matrix * k * c + s[:, None] + col[None, :] * k, (s[:, None] < k) & (col[None, :] < c)
+        total = tl.dot(a, tl.load(high + at, mask=some, other=0.0), total)
+        total = tl.dot(a, tl.load(low + at, mask=some, other=0.0), total)
+    tl.store(out + matrix * n * c + r[:, None] + col[None, :] * n, total, mask=(r[:, None] < n) & (col[None, :] < c))
 
 
 @torch.library.custom_op("ngff::thin_product", mutates_args=())
-def _product(A: Tensor, x: Tensor) -> Tensor:
+def product_of(A: Tensor, high: Tensor, low: Tensor) -> Tensor:
     g, n, k = A.shape
-    out = x.new_empty(g, n, x.shape[-1])
-    _thin[(g * triton.cdiv(n, ROWS),)](A, x, out, n, k, x.shape[-1], ROWS, CHUNK, MOST, num_stages=4)
+    out = torch.empty(g, high.shape[1], n, dtype=torch.float32, device=A.device)
+    product[(g * triton.cdiv(n, ROWS),)](A, high, low, out, n, k, high.shape[1], ROWS, CHUNK, MOST, num_stages=4)
     return out
 
 
-@_product.register_fake
-def _(A: Tensor, x: Tensor) -> Tensor:
-    return x.new_empty(*A.shape[:2], x.shape[-1])
+@product_of.register_fake
+def _(A: Tensor, high: Tensor, low: Tensor) -> Tensor:
+    return torch.empty(A.shape[0], high.shape[1], A.shape[1], dtype=torch.float32, device=A.device)
 
 
 def thin_product(A: Tensor, x: Tensor) -> Tensor:
     """A @ x in single precision for A (..., n, k) in half precision and x (..., k, c) of at most MOST columns c."""
-    return _product(A.flatten(0, -3).contiguous(), x.flatten(0, -3).contiguous()).unflatten(0, A.shape[:-2])
+    columns = x.flatten(0, -3).mT
+    scale = columns.abs().amax(-1, keepdim=True).clamp_min(1e-30) / 1024
+    columns = (columns / scale).contiguous()
+    high = columns.half()  # two numbers of half precision hold 22 bits
+    out = product_of(A.flatten(0, -3).contiguous(), high, (columns - high).half()) * scale
+    return out.mT.unflatten(0, A.shape[:-2])

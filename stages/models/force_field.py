@@ -126,6 +126,10 @@ class ForceField(Dynamics):
         return BodyState(m.com, quaternion(m.R), m.velocity, m.momentum, projected(shape, u), projected(shape, du))
 
     def points(self, scene: Scene, state: BodyState) -> Float[Tensor, "b o n 3"]:
+        if self._fused(scene):
+            from stages.models.fused_step import points
+
+            return points(scene, state)
         return state.com[:, :, None] + apply(matrix(state.quat)[:, :, None], scene.shape.arm + state.u)
 
     def derivative(self, scene: Scene, t: Tensor | float, state: BodyState, pushes: Pushes) -> BodyState:
@@ -149,6 +153,10 @@ class ForceField(Dynamics):
         Second order; exact for a parabola. As forces act at one place on both bodies and arms are those of the middle
         of the step, it keeps linear and angular momentum to rounding. Springs and dampers are taken implicitly.
         """
+        if self._fused(scene):
+            from stages.models.fused_step import step
+
+            return step(self, scene, state, t, dt, pushes)
         free = ~pushes.pinned[..., None]
         half = self._drifted(scene, _held(state, free), dt / 2)
         moving = self._moving(scene, half)
@@ -166,6 +174,15 @@ class ForceField(Dynamics):
         du = (half.du + dt * (rates.stress - k * half.u)) / (1 + dt * c + dt * dt / 2 * k)
         kicked = half._replace(velocity=velocity, momentum=momentum, du=bounded(scene.shape, du / FASTEST) * FASTEST)
         return self._drifted(scene, _held(kicked, free), dt / 2)
+
+    def _fused(self, scene: Scene) -> bool:
+        """Whether there are kernels that do all of a step: on CUDA without gradients, for the usual sizes."""
+        arm = scene.shape.arm
+        if not TRITON or not arm.is_cuda or torch.is_grad_enabled() or torch.compiler.is_compiling():
+            return False
+        from stages.models.fused_step import fits
+
+        return fits(self, scene)
 
     def _drifted(self, scene: Scene, state: BodyState, dt: float) -> BodyState:
         """Motion without forces."""

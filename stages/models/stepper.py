@@ -6,7 +6,7 @@
         stepper.points  # where the keypoints are now
 
 A step of a model is hundreds of small kernels, whose launches take ten times as long as their work. A CUDA graph
-launches them all at once; compiled first, they are some dozens.
+launches them all at once.
 """
 
 from __future__ import annotations
@@ -30,16 +30,12 @@ class Stepper:
     """A scene that moves on by dt [s] with every `step`; on other devices than CUDA simply the model's own step.
 
     `state`, `points` and `pushes` are tensors that stay where they are: their contents change, and `pushes` may be
-    written to between steps. `compiled` takes a minute the first time that a machine sees a model and a shape of the
-    scene, and seconds later.
+    written to between steps.
     """
 
     @torch.no_grad()
-    def __init__(
-        self, model: Dynamics, world: World, dt: float = FRAME, pushes: Pushes | None = None, compiled: bool = False
-    ):
+    def __init__(self, model: Dynamics, world: World, dt: float = FRAME, pushes: Pushes | None = None):
         self.model, self.dt = model, dt
-        self.advance = torch.compile(_advance, fullgraph=True, dynamic=False) if compiled else _advance
         self.graph: torch.cuda.CUDAGraph | None = None
         given = self._given(world, pushes)
         new = (x.clone(memory_format=torch.contiguous_format) for x in tensors(given))
@@ -75,10 +71,10 @@ class Stepper:
             mine.copy_(new)
 
     def _step(self) -> None:
-        self.advance(self.model, self.scene, self.state, self.points, self.pushes, self.time, self.dt)
+        _advance(self.model, self.scene, self.state, self.points, self.pushes, self.time, self.dt)
 
     def _record(self) -> None:
-        """Capture a step, after two that compile, load and tune whatever is used."""
+        """Capture a step, after two that load and tune whatever is used."""
         side = torch.cuda.Stream()
         side.wait_stream(torch.cuda.current_stream())
         with torch.cuda.stream(side):
@@ -96,17 +92,16 @@ def _advance(
 ) -> None:
     """A step in place; `time` counts steps, so that it stays exact."""
     new = model.step(scene, state, time.to(state[0]) * dt, dt, pushes)
-    for old, x in zip((*state, points), (*new, model.points(scene, new)), strict=True):
-        old.copy_(x)
+    torch._foreach_copy_([*state, points], [*new, model.points(scene, new)])  # on a GPU all in one kernel
     time += 1
 
 
 @torch.no_grad()
 def rollout(
-    model: Dynamics, world: World, steps: int, dt: float = FRAME, pushes: Pushes | None = None, compiled: bool = False
+    model: Dynamics, world: World, steps: int, dt: float = FRAME, pushes: Pushes | None = None
 ) -> Float[Tensor, "b t o n 3"]:
     """What `model.rollout` gives, with the speed of a Stepper: keypoints in `steps` frames, the first the start."""
-    out = frames(Stepper(model, world, dt, pushes, compiled), steps)
+    out = frames(Stepper(model, world, dt, pushes), steps)
     return out.masked_fill_(~world.valid[:, None, ..., None], 0.0)
 
 

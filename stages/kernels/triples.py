@@ -1,0 +1,178 @@
+"""Vectors of three numbers in Triton's kernels: tuples of tensors of one shape; matrices are nine, by rows."""
+
+import triton
+import triton.language as tl
+
+
+@triton.jit
+def load3(at, stride, mask, other=0.0):
+    """The numbers at `at` and one and two strides farther."""
+    return (tl.load(at, mask=mask, other=other), tl.load(at + stride, mask=mask, other=other),
+            tl.load(at + 2 * stride, mask=mask, other=other))  # fmt: skip
+
+
+@triton.jit
+def store3(at, stride, a, mask):
+    tl.store(at, a[0], mask=mask)
+    tl.store(at + stride, a[1], mask=mask)
+    tl.store(at + 2 * stride, a[2], mask=mask)
+
+
+@triton.jit
+def row3(at):
+    return (tl.load(at), tl.load(at + 1), tl.load(at + 2))
+
+
+@triton.jit
+def write3(at, a):
+    tl.store(at, a[0])
+    tl.store(at + 1, a[1])
+    tl.store(at + 2, a[2])
+
+
+@triton.jit
+def load4(at):
+    return (tl.load(at), tl.load(at + 1), tl.load(at + 2), tl.load(at + 3))
+
+
+@triton.jit
+def write4(at, q):
+    write3(at, q)
+    tl.store(at + 3, q[3])
+
+
+@triton.jit
+def row9(at):
+    return (tl.load(at), tl.load(at + 1), tl.load(at + 2), tl.load(at + 3), tl.load(at + 4), tl.load(at + 5),
+            tl.load(at + 6), tl.load(at + 7), tl.load(at + 8))  # fmt: skip
+
+
+@triton.jit
+def write9(at, M):
+    for i in tl.static_range(9):
+        tl.store(at + i, M[i])
+
+
+@triton.jit
+def add(a, b):
+    return (a[0] + b[0], a[1] + b[1], a[2] + b[2])
+
+
+@triton.jit
+def sub(a, b):
+    return (a[0] - b[0], a[1] - b[1], a[2] - b[2])
+
+
+@triton.jit
+def scaled(s, a):
+    return (s * a[0], s * a[1], s * a[2])
+
+
+@triton.jit
+def dot(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@triton.jit
+def cross(a, b):
+    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
+
+
+@triton.jit
+def times(M, a):
+    """M a."""
+    return (M[0] * a[0] + M[1] * a[1] + M[2] * a[2], M[3] * a[0] + M[4] * a[1] + M[5] * a[2],
+            M[6] * a[0] + M[7] * a[1] + M[8] * a[2])  # fmt: skip
+
+
+@triton.jit
+def back(M, a):
+    """M^T a."""
+    return (M[0] * a[0] + M[3] * a[1] + M[6] * a[2], M[1] * a[0] + M[4] * a[1] + M[7] * a[2],
+            M[2] * a[0] + M[5] * a[1] + M[8] * a[2])  # fmt: skip
+
+
+@triton.jit
+def conjugated(R, M):
+    """R M R^T."""
+    a = times(R, (M[0], M[3], M[6]))  # columns of R M
+    b = times(R, (M[1], M[4], M[7]))
+    c = times(R, (M[2], M[5], M[8]))
+    x = times(R, (a[0], b[0], c[0]))  # rows of the result
+    y = times(R, (a[1], b[1], c[1]))
+    z = times(R, (a[2], b[2], c[2]))
+    return (x[0], x[1], x[2], y[0], y[1], y[2], z[0], z[1], z[2])
+
+
+@triton.jit
+def solved(K, a, b):
+    """K^-1 a and K^-1 b of a symmetric K (xx, xy, xz, yy, yz, zz), by Cramer's rule."""
+    x, y, z = (K[0], K[1], K[2]), (K[1], K[3], K[4]), (K[2], K[4], K[5])
+    yz, zx, xy = cross(y, z), cross(z, x), cross(x, y)
+    det = dot(x, yz)
+    return (
+        scaled(1 / det, add(add(scaled(a[0], yz), scaled(a[1], zx)), scaled(a[2], xy))),
+        scaled(1 / det, add(add(scaled(b[0], yz), scaled(b[1], zx)), scaled(b[2], xy))),
+    )
+
+
+@triton.jit
+def _larger(ax, ay, az, bx, by, bz):
+    return tl.maximum(ax, bx), tl.maximum(ay, by), tl.maximum(az, bz)
+
+
+@triton.jit
+def _both(ax, ay, az, bx, by, bz):
+    return ax + bx, ay + by, az + bz
+
+
+@triton.jit
+def sum3(a):
+    """The sum over the first dimension, of all three numbers at once."""
+    return tl.reduce((a[0], a[1], a[2]), 0, _both)
+
+
+@triton.jit
+def max3(a):
+    return tl.reduce((a[0], a[1], a[2]), 0, _larger)
+
+
+@triton.jit
+def where3(mask, a, other):
+    return (tl.where(mask, a[0], other), tl.where(mask, a[1], other), tl.where(mask, a[2], other))
+
+
+@triton.jit
+def rotation(q):
+    """The matrix of a quaternion w x y z of any length."""
+    s = 1 / tl.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
+    w, x, y, z = q[0] * s, q[1] * s, q[2] * s, q[3] * s
+    return (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+            2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+            2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y))  # fmt: skip
+
+
+@triton.jit
+def turned(q, turn):
+    """A quaternion after a rotation vector about world axes [rad], of unit length."""
+    half = tl.sqrt(dot(turn, turn) + 1e-24) / 2
+    a, v = tl.cos(half), scaled(tl.sin(half) / half / 2, turn)
+    u = (q[1], q[2], q[3])
+    w = a * q[0] - dot(v, u)
+    x, y, z = add(add(scaled(a, u), scaled(q[0], v)), cross(v, u))
+    s = 1 / tl.sqrt(w * w + x * x + y * y + z * z)
+    return (w * s, x * s, y * s, z * s)
+
+
+@triton.jit
+def spinning(q, momentum, inverse):
+    """Spin [rad/s] at an orientation, from angular momentum and the inverse of the inertia at rest."""
+    R = rotation(q)
+    return times(R, times(inverse, back(R, momentum)))
+
+
+@triton.jit
+def drifted(com, q, velocity, momentum, inverse, dt):
+    """Centre of mass and orientation dt [s] later without forces; the spin is that of the middle of the way."""
+    middle = turned(q, scaled(dt / 2, spinning(q, momentum, inverse)))
+    return add(com, scaled(dt, velocity)), turned(q, scaled(dt, spinning(middle, momentum, inverse)))

@@ -101,13 +101,14 @@ def bench_segment(
     scenes: Annotated[int, typer.Option(help="scenes of each kind, apart and touching")] = 4,
     photos: Annotated[int, typer.Option(help="photos whose cameras a scene has")] = 24,
     weights: Annotated[Path | None, typer.Option(help="of sam2; looked for, and left out where there are none")] = None,
+    reconstruct: Annotated[bool, typer.Option("--reconstruct", help="also after reconstruction from photos")] = False,
     out: Annotated[Path | None, typer.Option("-o", "--out", help="the numbers as JSON")] = None,
     device: Device = "auto",
 ) -> None:
     """Objects found by geometry, from masks that are true or partly wrong, and by sam2: overlap with the truth."""
     from stages.lab.bench_segment import BenchOptions, run
 
-    for line in run(out, BenchOptions(scenes, photos, weights, device)):
+    for line in run(out, BenchOptions(scenes, photos, weights, device, reconstruct)):
         print(line, flush=True)
 
 

@@ -2,12 +2,14 @@
 
 The scenes are five of the ten objects on one of the eight tables, apart or touching; `segment` gets the true Gaussians
 without their labels, and the cameras. Masks are the true ones, or true ones made wrong, to see what the vote over views
-makes of them; beside it stands the same without a vote. SAM 2.1 takes part where its weights are here.
+makes of them; beside it stands the same without a vote. SAM 2.1 takes part where its weights are here. On request
+photos of each scene are reconstructed, and overlaps are counted in pixels of what is found there.
 """
 
 from __future__ import annotations
 
 import json
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -22,6 +24,7 @@ from tqdm import tqdm
 from stages.backends import pick_device
 from stages.errors import InputError
 from stages.lab import bench
+from stages.lab.photographed import label_images, rebuilt
 from stages.lab.tabletops import KINDS, tabletop
 from stages.models.sam2 import weights as sam2_weights
 from stages.physics.grouping import group
@@ -44,6 +47,7 @@ class BenchOptions:
     photos: int = 24  # whose cameras the scene has
     weights: Path | None = None  # of SAM 2.1; by default looked for
     device: str = "auto"  # of SAM 2.1
+    reconstruct: bool = False  # photos of each scene, too: minutes a scene
 
     def __post_init__(self):
         if not 1 <= self.scenes <= 100 or not 8 <= self.photos <= 200:
@@ -53,7 +57,7 @@ class BenchOptions:
 def overlaps(found: Int[torch.Tensor, "n"], truth: Int[torch.Tensor, "n"]) -> dict[int, float]:
     """For each true object the intersection over union with the found object that fits it best; 0 is no object.
 
-    `found` and `truth` number the same Gaussians.
+    `found` and `truth` number the same Gaussians, or the same pixels.
     """
     table = torch.zeros(int(truth.max()) + 1, int(found.max()) + 1)
     table.view(-1).index_add_(0, truth * table.shape[1] + found, torch.ones(len(truth)))
@@ -116,11 +120,31 @@ def measure(kind: str, index: int, photos: int, model=None) -> list[dict]:
     for way, find in ways.items():
         start = time.perf_counter()
         found = find()
-        took = time.perf_counter() - start
-        named = {scene.name_of(i): round(value, 3) for i, value in overlaps(found, truth).items()}
-        rows.append({"kind": kind, "scene": index, "way": way, "iou": named, "found": len(found.unique()) - 1,
-                     "mean": float(np.mean(list(named.values()))), "seconds": round(took, 1)})  # fmt: skip
+        rows.append(_row(kind, index, way, scene, found, truth, start))
     return rows
+
+
+def measure_rebuilt(kind: str, index: int, photos: int) -> dict:
+    """Overlaps in the pixels of the photos that could be placed, after their reconstruction; its time is counted.
+
+    Where none can be placed nothing is found.
+    """
+    scene, start = tabletop(kind, index, photos), time.perf_counter()
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            found = group(rebuilt(scene, Path(folder)))
+        names, labels = found.cameras.names, label_images(found, found.cameras.names)
+        truth = label_images(scene, names)
+    except InputError:
+        names, truth = (), scene.gaussians.object_id
+        labels = torch.zeros_like(truth)
+    return {**_row(kind, index, "reconstructed", scene, labels, truth, start), "placed": len(names)}
+
+
+def _row(kind: str, index: int, way: str, scene: Scene, found: Tensor, truth: Tensor, start: float) -> dict:
+    named = {scene.name_of(i): round(value, 3) for i, value in overlaps(found, truth).items()}
+    return {"kind": kind, "scene": index, "way": way, "iou": named, "found": len(found.unique()) - 1,
+            "mean": float(np.mean(list(named.values()))), "seconds": round(time.perf_counter() - start, 1)}  # fmt: skip
 
 
 def run(out: Path | None = None, options: BenchOptions = BenchOptions()) -> Iterator[str]:  # noqa: B008 -- frozen
@@ -137,6 +161,7 @@ def run(out: Path | None = None, options: BenchOptions = BenchOptions()) -> Iter
     for kind in KINDS:
         for i in tqdm(range(options.scenes), desc=kind, unit="scene"):
             rows += measure(kind, i, options.photos, model)
+            rows += [measure_rebuilt(kind, i, options.photos)] if options.reconstruct else []
             for row in rows[-len({r["way"] for r in rows}) :]:
                 listed = ", ".join(f"{n} {v:.2f}" for n, v in row["iou"].items())
                 yield f"{kind} {i}, {row['way']}: mean {row['mean']:.3f}; {listed}"

@@ -93,6 +93,9 @@ def _around(
     eyes = subject.target + distance[:, None] * torch.cat([flat, elevation.sin()[:, None]], 1)
     viewmats = look_at(eyes, subject.target.expand_as(eyes))
     fitting = _fitting(viewmats, subject, width, height)
+    if fitting < ZOOM[0] * focal:  # what is lifted high would be cut off: then it is the middle of the picture
+        viewmats = look_at(eyes, subject.centre.expand_as(eyes))
+        fitting = _fitting(viewmats, subject, width, height)
     focal = min(max(fitting, ZOOM[0] * focal), ZOOM[1] * focal)
     return _repeat(viewmats, intrinsics(width, height, focal), width, height)
 

@@ -55,7 +55,7 @@ def subject_of(footage: Footage) -> Subject:
     ids = _central(seen, aimed)
     if not len(ids):
         return aimed or extent(seen.means)
-    found = extent(_places(footage, seen, ids))
+    found = _box(footage, seen, ids)
     if aimed is None:
         return found
     pull = found.centre - aimed.centre
@@ -72,15 +72,15 @@ def joint(subjects: Sequence[Subject]) -> Subject:
     return Subject((low + high) / 2, (high - low) / 2, aims.mean(0))
 
 
-def _places(footage: Footage, seen: Gaussians, ids: Int[Tensor, "o"]) -> Float[Tensor, "_ 3"]:
-    """Where these objects are in the course of the film."""
+def _box(footage: Footage, seen: Gaussians, ids: Int[Tensor, "o"]) -> Subject:
+    """Where these objects are in the course of the film, and where they start: what is lifted is not up for long."""
     trajectory = footage.trajectory
     if trajectory is not None:
         moving = torch.isin(trajectory.keypoints.object_id, ids)
         if moving.any():
             shown = trajectory.positions if footage.moves else trajectory.positions[[footage.frozen or 0]]
-            return shown[:, moving].reshape(-1, 3)
-    return seen.means[torch.isin(seen.object_id, ids)]
+            return joint([extent(shown[:, moving].reshape(-1, 3)), extent(shown[0, moving])])
+    return extent(seen.means[torch.isin(seen.object_id, ids)])
 
 
 def _central(g: Gaussians, aimed: Subject | None) -> Int[Tensor, "o"]:

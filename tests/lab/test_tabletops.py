@@ -9,11 +9,15 @@ import torch
 from scipy.spatial import cKDTree
 
 from stages.errors import InputError
-from stages.lab import bench_refine, bench_segment, tabletops
+from stages.geometry.rotations import matrix
+from stages.geometry.similarity import Similarity
+from stages.lab import bench_refine, bench_segment, photographed, tabletops
 from stages.lab.backgrounds import TOP
 from stages.lab.objects import OBJECTS
 from stages.lab.tabletops import CONTACT, EACH, GAP, REACH, tabletop
-from stages.scene.gaussians import Gaussians
+from stages.scene.gaussians import Gaussians, moved
+from stages.scene.scene import Scene
+from stages.scene.scene_ply import write_scene
 from tests.segment.tabletop import block, three_apart
 
 COLOURS = {name: rgb for name, rgb in zip(
@@ -90,6 +94,29 @@ def test_the_segment_report_finds_blocks_apart_and_the_vote_mends_wrong_masks(tm
         assert by["masks"] > 0.7 and by["masks"] > by["masks, 20% wrong"] > by["masks, 40% wrong"]
         assert by["masks, 20% wrong"] > by["masks, 20% wrong, no vote"] + 0.2
     assert means["apart"]["geometric"] > 0.9
+
+
+def test_what_is_reconstructed_is_judged_in_the_photos_that_were_placed(monkeypatch):
+    def perfect(photos, out, options):
+        """The scene itself, elsewhere and without labels, as seen by all cameras but the first."""
+        assert len(list(photos.iterdir())) == 8
+        scene = tabletop("apart", 0, 8)
+        move = Similarity(0.5, matrix(torch.tensor([0.8, 0.0, 0.0, 0.6])), torch.tensor([0.1, 0.2, -0.5 * TOP]))
+        g = moved(replace(scene.gaussians, object_id=torch.zeros_like(scene.gaussians.object_id)), move)
+        write_scene(out, Scene(g, cameras=scene.cameras[list(range(1, 8))].moved(move), floor=0.0))
+
+    monkeypatch.setattr(photographed, "reconstruct", perfect)
+    row = bench_segment.measure_rebuilt("apart", 0, 8)
+    assert row["placed"] == 7 and row["mean"] > 0.9
+
+
+def test_where_no_photo_can_be_placed_nothing_is_found(monkeypatch):
+    def hopeless(photos, out, options):
+        raise InputError(f"{photos}: no two photos show the same things")
+
+    monkeypatch.setattr(photographed, "reconstruct", hopeless)
+    row = bench_segment.measure_rebuilt("apart", 0, 8)
+    assert row["placed"] == 0 and row["mean"] == 0.0 and len(row["iou"]) == EACH
 
 
 def test_sam2_takes_part_where_its_weights_are(tmp_path, monkeypatch):

@@ -7,11 +7,12 @@ import torch
 
 from stages.errors import InputError
 from stages.geometry.cameras import centres, depths, project
-from stages.render.footage import Footage
+from stages.render.footage import Footage, open_footage
 from stages.render.path_file import follow, read_path
 from stages.render.paths import camera_path, find_camera
 from stages.render.subject import Subject, aim, common, extent, subject_of
 from tests.conftest import ring
+from tests.render.motions import rising
 
 BOX = Subject(torch.tensor([0.0, 0.0, 0.1]), torch.tensor([0.3, 0.3, 0.2]))
 
@@ -161,3 +162,15 @@ def test_objects_pull_the_aim_of_the_photos_only_a_little(two_balls):
     found = subject_of(Footage(replace(two_balls, cameras=ring(6, target=-0.4))))
     assert float(found.centre[2]) == pytest.approx(0.26, abs=0.05)
     assert -0.2 < float(found.target[2]) < 0.0  # from -0.4 toward 0.26, as far as 0.35 of two thirds
+
+
+def test_what_is_lifted_is_in_the_picture_from_the_start(tmp_path, two_balls):
+    # the balls fall by 0.6 within a twentieth of the film, to where the cameras look
+    footage = open_footage(rising(tmp_path / "t.h5", two_balls, 40, 0.0), None, "cpu")
+    positions = footage.trajectory.positions.clone()
+    positions[:2, :, 2] += torch.tensor([[0.6], [0.3]])
+    footage = replace(footage, trajectory=replace(footage.trajectory, positions=positions))
+    path = camera_path("novel", two_balls.cameras, subject_of(footage), 40, 640)
+    for i in range(40):
+        inside = ((project(positions[i], path.viewmats[i], path.Ks[i]) / path.sizes[i] - 0.5).abs() < 0.5).all(1)
+        assert float(inside.float().mean()) > 0.95

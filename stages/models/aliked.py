@@ -1,8 +1,8 @@
 """ALIKED: keypoints and descriptors of an image by a small network with deformable convolutions.
 
 Source: Zhao et al. 2023, "ALIKED: A lighter keypoint and descriptor extraction network via deformable
-transformation", aliked-n16. Modules carry the published names, so that the published weights load. Deformable
-convolution is written with grid_sample, which every PyTorch has.
+transformation", aliked-n16 and -n16rot. Modules carry the published names, so that the published weights load.
+Deformable convolution is written with grid_sample, which every PyTorch has.
 """
 
 from __future__ import annotations

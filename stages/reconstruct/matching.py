@@ -98,8 +98,8 @@ def _verified(found: list[features.Feature], cameras: list, seed: int, device: s
     options = pycolmap.TwoViewGeometryOptions()
     options.ransac.random_seed = seed
     options.ransac.max_num_trials = 3000  # a pair that needs more shares too little to be of use
-    pixels = [table[:, :2].double().numpy() for table, _ in found]
-    vectors = [features.unit(descriptors) for _, descriptors in found]
+    pixels = [table[:, :2].double().numpy() for table, *_ in found]
+    vectors = [features.unit(descriptors) for _, descriptors, *_ in found]
     same = choose(COMPARERS, matcher)(found, [(c.width, c.height) for c in cameras], device)
 
     def verify(i: int, j: int, matches: np.ndarray) -> tuple:

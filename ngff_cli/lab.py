@@ -264,12 +264,14 @@ def heldout(
     spacing: Annotated[float, typer.Option(help="between particles on a surface [m]")] = 0.009,
     substep: Annotated[float, typer.Option(help="[s]")] = 1e-4,
     size: Annotated[float, typer.Option(help="longest side of a mesh [m]")] = 0.5,
+    shapes: Annotated[int, typer.Option(help="so many objects at random to learn from, as the group varied")] = 0,
     device: Device = "auto",
 ) -> None:
-    """Simulate scenes of objects that no model learns from, as the group heldout of a data set."""
+    """Simulate scenes of other objects than the ten: by default of eight that no model learns from."""
     from stages.lab.heldout import HeldoutOptions, run
 
-    print(run(out, HeldoutOptions(scenes, objects, frames, keypoints, dx, spacing, substep, size, device), meshes))
+    options = HeldoutOptions(scenes, objects, frames, keypoints, dx, spacing, substep, size, shapes, device)
+    print(run(out, options, meshes))
 
 
 @app.command("estimate-materials")

@@ -1,8 +1,10 @@
-"""Scenes of objects that no model learns from: shapes made in code, or any meshes.
+"""Scenes of other objects than the ten: eight that no model learns from, any meshes, or varied ones to learn from.
 
     OUT/scene_configs/heldout.json     where every object starts, sampled as for the data set
     OUT/motions/heldout.h5             keypoints in every frame, as `ngff-lab dataset` writes
     OUT/particles_heldout.npz          the objects as particles, kept for the next run
+
+With shapes at random the group is called varied.
 """
 
 from __future__ import annotations
@@ -23,18 +25,19 @@ from stages.backends import pick_device
 from stages.errors import InputError
 from stages.lab.dataset_assets import SUBSTEP, Asset, Fineness, count_at, extents, volumes
 from stages.lab.dataset_simulation import simulate
-from stages.lab.heldout_shapes import KINDS, surface
+from stages.lab.heldout_shapes import KINDS, Kind, surface
 from stages.lab.motions import MotionsWriter
 from stages.lab.scenes import Config, sample_scene, write_configs
 from stages.lab.shapes import one_thread
+from stages.lab.varied_shapes import kinds
 from stages.physics.keypoints import farthest_points
 from stages.physics.materials import choose_materials
 from stages.scene.files import provenance, replacing
 from stages.scene.scene import SceneObject
 
 log = logging.getLogger(__name__)
-GROUP = "heldout"
-FIRST = 10_000  # index of the first scene: none of the data set has it, so seeds and names differ
+GROUP, VARIED = "heldout", "varied"
+FIRST = {GROUP: 10_000, VARIED: 20_000}  # index of the first scene, and so its seed: none of the data set has it
 MESH = 100  # id of the first mesh
 DENSE = 30_000  # points of a shape that particles are chosen among
 STIFFEST = 2e7  # that the published substep bears, as of the phone [Pa]
@@ -52,13 +55,20 @@ class HeldoutOptions:
     spacing: float = 0.009
     substep: float = SUBSTEP
     size: float = 0.5  # longest side of a mesh [m]
+    shapes: int = 0  # drawn at random, with their materials, instead of the eight
     device: str = "auto"
 
     def __post_init__(self):
         if self.scenes < 1 or not 1 <= self.objects <= 6:
             raise InputError(f"--scenes {self.scenes} --objects {self.objects}: at least one scene, of 1 to 6 objects")
+        if not 0 <= self.shapes <= 1000:
+            raise InputError(f"--shapes {self.shapes}: 0 for the eight, or up to 1000 at random")
         if not 0.1 <= self.size <= 1.0:
             raise InputError(f"--size {self.size}: meshes are put into a room of 2 m; give 0.1 to 1 m")
+
+    @property
+    def group(self) -> str:
+        return VARIED if self.shapes else GROUP
 
     @property
     def fineness(self) -> Fineness:
@@ -67,7 +77,10 @@ class HeldoutOptions:
 
 def run(out: Path, options: HeldoutOptions = HeldoutOptions(), meshes: list[Path] | None = None) -> str:
     """Write the group; what is there is left as it is. A line about it."""
-    file, motions = Path(out) / "scene_configs" / f"{GROUP}.json", Path(out) / "motions" / f"{GROUP}.h5"
+    group = options.group
+    file, motions = Path(out) / "scene_configs" / f"{group}.json", Path(out) / "motions" / f"{group}.h5"
+    if meshes and options.shapes:
+        raise InputError("--from and --shapes: choose one; meshes take the place of shapes")
     if motions.exists():
         return f"{motions}: is there"
     for folder in (file.parent, motions.parent):
@@ -76,11 +89,12 @@ def run(out: Path, options: HeldoutOptions = HeldoutOptions(), meshes: list[Path
     if meshes:
         things = mesh_assets(meshes, options)
     else:
-        things = assets(options.fineness, options.keypoints, Path(out) / f"particles_{GROUP}.npz")
-    configs = configs_of(things, options.scenes, options.objects)
+        table = kinds(options.shapes) if options.shapes else KINDS
+        things = assets(table, options.fineness, options.keypoints, Path(out) / f"particles_{group}.npz")
+    configs = configs_of(things, options.scenes, options.objects, FIRST[group])
     write_configs(file, configs)
     made, count = provenance("heldout", [file, *(meshes or [])], options), 0
-    bar = tqdm(total=len(configs), desc=GROUP, unit="scene")
+    bar = tqdm(total=len(configs), desc=group, unit="scene")
     with bar, MotionsWriter(motions, made) as writer:
         for part in simulate(configs, things, options.fineness, options.frames, options.keypoints, device):
             writer.append(part)
@@ -89,32 +103,37 @@ def run(out: Path, options: HeldoutOptions = HeldoutOptions(), meshes: list[Path
     return f"{motions}: {count} scenes of {len(things)} objects in {time.perf_counter() - start:.0f} s"
 
 
-def configs_of(things: Mapping[int, Asset], scenes: int, objects: int) -> dict[str, Config]:
+def configs_of(
+    things: Mapping[int, Asset], scenes: int, objects: int, first: int = FIRST[GROUP]
+) -> dict[str, Config]:
     """Scenes by the sampling of the data set, with seeds of their own."""
     room = extents(things)
-    made = (sample_scene(FIRST + i, objects, room) for i in tqdm(range(scenes), desc="placing", unit="scene"))
+    made = (sample_scene(first + i, objects, room) for i in tqdm(range(scenes), desc="placing", unit="scene"))
     return {c.name: c for c in made}
 
 
-def assets(fineness: Fineness, least: int, kept: Path | None = None) -> dict[int, Asset]:
-    """The eight kinds by id; `kept` is a file (.npz) to read their particles from, or to write them to."""
+def assets(
+    table: Mapping[str, Kind], fineness: Fineness, least: int, kept: Path | None = None
+) -> dict[int, Asset]:
+    """Objects by id; `kept` is a file (.npz) to read their particles from, or to write them to."""
     key = f"spacing {fineness.spacing} least {least}"
-    points = _read(kept, key) if kept is not None and kept.exists() else None
+    points = _read(kept, key, table) if kept is not None and kept.exists() else None
     if points is None:
-        bar = tqdm(KINDS.items(), desc="objects", unit="object")
+        bar = tqdm(table.items(), desc="objects", unit="object")
         points = {name: _chosen(kind.scale * surface(kind, DENSE), fineness, least) for name, kind in bar}
         if kept is not None:
             with replacing(kept) as part:
                 np.savez(part, key=key, **{name: p.numpy() for name, p in points.items()})
     return {kind.id: _asset(kind.id, kind.scale, points[name], kind.E, kind.density, fineness)
-            for name, kind in KINDS.items()}  # fmt: skip
+            for name, kind in table.items()}  # fmt: skip
 
 
-def _read(kept: Path, key: str) -> dict[str, Tensor] | None:
+def _read(kept: Path, key: str, table: Mapping[str, Kind]) -> dict[str, Tensor] | None:
     """What was kept, if it was chosen in the same way."""
     try:
         with np.load(kept) as file:
-            return {name: torch.from_numpy(file[name]) for name in KINDS} if str(file["key"]) == key else None
+            there = str(file["key"]) == key and table.keys() <= set(file.files)
+            return {name: torch.from_numpy(file[name]) for name in table} if there else None
     except (KeyError, OSError, ValueError) as error:
         raise InputError(f"{kept}: cannot be read ({error}); remove it and it is made again") from error
 

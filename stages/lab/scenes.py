@@ -84,14 +84,15 @@ def objects_in(group: str) -> int:
     return int(group.split("_")[0])
 
 
-def groups_of(text: str) -> list[str]:
-    """ "3_0..3_2,4" -> ["3_0", "3_1", "3_2", "4"]."""
+def groups_of(text: str, more: tuple[str, ...] = ()) -> list[str]:
+    """ "3_0..3_2,4" -> ["3_0", "3_1", "3_2", "4"]; `more` are names of others that may be asked for."""
     out: list[str] = []
     for part in text.split(","):
         span = re.fullmatch(r"(\d)_(\d)\.\.\1_(\d)", part.strip())
         names = [f"{span[1]}_{i}" for i in range(int(span[2]), int(span[3]) + 1)] if span else [part.strip()]
         for name in names:
-            objects_in(name)
+            if name not in more:
+                objects_in(name)
             if name not in out:
                 out.append(name)
     return out

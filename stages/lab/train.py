@@ -18,6 +18,7 @@ from tqdm import tqdm
 from stages.backends import pick_device
 from stages.errors import InputError
 from stages.evaluate.dynamics import all_metrics
+from stages.lab.heldout import VARIED
 from stages.lab.motions import Motions
 from stages.lab.scenes import groups_of
 from stages.lab.training_data import UNSEEN, Pieces, read_groups, recipe, split
@@ -93,7 +94,7 @@ def run(model: str, data: Path, out: Path, options: TrainOptions = TrainOptions(
     out = Path(out)
     if not out.parent.is_dir():
         raise InputError(f"{out}: there is no folder {out.parent}; make it first")
-    groups = groups_of(options.groups)
+    groups = groups_of(options.groups, more=(VARIED,))
     known, unseen = split(read_groups(data, groups, options.keypoints), UNSEEN)
     if known.points.shape[1] <= max(options.frames):
         raise InputError(f"--horizons: the motions have {known.points.shape[1]} frames; take shorter ones")

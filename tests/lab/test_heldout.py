@@ -14,7 +14,8 @@ from stages.lab.heldout import GROUP, HeldoutOptions, assets, configs_of, run
 from stages.lab.heldout_shapes import KINDS, surface
 from stages.lab.motions import read_motions
 from stages.lab.objects import OBJECTS
-from stages.lab.scenes import read_configs
+from stages.lab.scenes import groups_of, read_configs
+from stages.lab.varied_shapes import kinds
 
 FINENESS = Fineness(0.1, 0.06, 5e-4)
 COARSE = {"keypoints": 40, "dx": 0.1, "spacing": 0.06, "substep": 5e-4, "frames": 3, "device": "cpu"}
@@ -54,13 +55,13 @@ def kept(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(heldout, "DENSE", 2000)
         path = tmp_path_factory.mktemp("held") / "p.npz"
-        assets(FINENESS, 40, path)
+        assets(KINDS, FINENESS, 40, path)
     return path
 
 
 @pytest.fixture(scope="module")
 def things(kept):
-    return assets(FINENESS, 40, kept)
+    return assets(KINDS, FINENESS, 40, kept)
 
 
 def test_scenes_of_the_group_are_sampled_as_those_of_the_data_set(things):
@@ -89,11 +90,11 @@ def test_the_group_is_written_and_kept(things, tmp_path, monkeypatch):
 
 def test_particles_are_kept_and_read_again(things, kept, tmp_path, monkeypatch):
     monkeypatch.setattr(heldout, "surface", None)  # must not be needed again
-    again = assets(FINENESS, 40, kept)
+    again = assets(KINDS, FINENESS, 40, kept)
     assert all(torch.equal(things[i].points, again[i].points) for i in things) and len(again) == 8
     (tmp_path / "p.npz").write_text("no")
     with pytest.raises(InputError, match="p.npz"):
-        assets(FINENESS, 40, tmp_path / "p.npz")
+        assets(KINDS, FINENESS, 40, tmp_path / "p.npz")
 
 
 def test_meshes_take_the_place_of_the_shapes(tmp_path, caplog):
@@ -118,6 +119,28 @@ def test_meshes_take_the_place_of_the_shapes(tmp_path, caplog):
     assert told.items() <= stiffness.items()
     config = json.loads((tmp_path / "scene_configs" / f"{GROUP}.json").read_text())
     assert len(config) == 1
+
+
+def test_varied_objects_are_within_what_the_ten_span_and_the_same_again():
+    table = kinds(18)
+    assert list(kinds(5).values()) != [] and [k.E for k in kinds(5).values()] == [k.E for k in table.values()][:5]
+    for name, kind in table.items():
+        points = surface(kind, 800)
+        sides = points.amax(0) - points.amin(0)
+        assert float(sides.max()) == pytest.approx(1.0) and float(sides.min()) > 0.02, name
+        assert kind.shape()(torch.tensor([[0.6, 0.6, 0.6]])) > 0  # inside of the cube where surfaces are looked for
+        assert 0.3 <= kind.scale <= 1 and 100 <= kind.density <= 2700 and 10 <= kind.E / kind.density <= 7400
+    assert len({k.id for k in table.values()} | {k.id for k in KINDS.values()}) == 18 + 8
+
+
+def test_varied_objects_become_a_group_that_training_takes(tmp_path, monkeypatch):
+    monkeypatch.setattr(heldout, "DENSE", 2000)
+    assert "2 scenes of 3 objects" in run(tmp_path, HeldoutOptions(scenes=2, shapes=3, **COARSE))
+    made = read_motions(tmp_path / "motions" / "varied.h5")
+    assert made.points.shape == (2, 3, 3, 40, 3) and bool((made.objects >= 1000).all())
+    assert groups_of("varied,3_0", more=("varied",)) == ["varied", "3_0"]
+    with pytest.raises(InputError, match="there are"):
+        groups_of("varied")
 
 
 @pytest.mark.parametrize(

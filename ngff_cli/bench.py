@@ -185,7 +185,7 @@ def bench_register(
     seed: Seed = 0,
     device: Device = "auto",
 ) -> None:
-    """Registration of a part to the whole, beside plain ICP."""
+    """Registration of a part to the whole, beside plain ICP and splatreg."""
     from stages.lab.bench_register import BenchOptions, run
 
     for line in run(out, BenchOptions(only, trials, seed=seed, device=device)):

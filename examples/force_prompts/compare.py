@@ -65,12 +65,13 @@ def compare(name: str, out: Path, steps: int = 60, **options) -> tuple[dict, dic
 
 
 def main(out: Path) -> None:
+    out.mkdir(parents=True, exist_ok=True)
     for name in PUSHES:
         _, moved = compare(name, out)
         files = [out / f"{name}_{engine}.h5" for engine in ("mpm", "ngff")]
         render(files, out / f"{name}.mp4", RenderOptions(side_by_side=True, show_forces=True, resolution=480))
         print(name, *(f"{engine}: {m:.3f} m along the push" for engine, m in moved.items()))
-        assert moved["mpm"] > 0.05  # it follows; the weights that ship keep what lies on the floor from rising
+        assert min(moved.values()) > 0.05  # both follow the push
 
 
 if __name__ == "__main__":

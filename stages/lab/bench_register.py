@@ -1,4 +1,4 @@
-"""Registration of a part of an object to the whole, beside plain ICP, on the CPU, on the same parts.
+"""Registration of a part of an object to the whole, beside plain ICP and the package splatreg, on the same parts.
 
 A part lacks 40 % of the surface, cut off along a plane or bitten out around a point, has noise, and is turned, scaled
 and shifted at random. Right is 2 degrees, 2 % of scale and 1 % of the diameter, up to the symmetry of what is seen.
@@ -10,6 +10,8 @@ import json
 import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
+from importlib.metadata import version
+from importlib.util import find_spec
 from pathlib import Path
 
 import torch
@@ -20,7 +22,7 @@ from tqdm import tqdm
 
 from stages.backends import pick_device
 from stages.geometry.harmonics import C0, rgb_to_sh
-from stages.geometry.rotations import matrix
+from stages.geometry.rotations import matrix, multiply, nearest, quaternion
 from stages.geometry.similarity import Similarity, umeyama
 from stages.lab import bench
 from stages.lab.objects import ObjectsOptions, make_object
@@ -32,6 +34,8 @@ from stages.scene.gaussians import Gaussians
 LIMITS = {"rotation": 2.0, "scale": 2.0, "shift": 1.0}  # [deg], [%], [% of the diameter]
 ROUND = ("ball", "bowl", "can")  # their shape is one of revolution about z; what is painted on them is not
 ALIKE = 0.002  # rms change of place and colour that a turn about z may make unnoticed [diameters]
+SHOWN = 400  # Gaussians that splatreg is given of each; its time grows with the square
+RADIUS = 0.14  # rms radius of the object that splatreg's tolerances, such as 2 cm for an inlier, are made for [m]
 
 
 @dataclass(frozen=True)
@@ -67,7 +71,8 @@ def trial(whole: Gaussians, number: int, options: BenchOptions) -> Trial:
     rgb = whole.sh[seen, 0] * C0 + 0.5 + options.tint * torch.randn(len(seen), 3, generator=rng)
     scale = float(2 ** (2 * torch.rand(1, generator=rng) - 1))
     truth = Similarity(scale, matrix(torch.randn(4, generator=rng)), 3 * torch.randn(3, generator=rng))
-    part = replace(whole[seen], means=truth(noisy), scales=scale * whole.scales[seen], sh=rgb_to_sh(rgb))
+    quats = multiply(quaternion(truth.rotation).expand(len(seen), 4), whole.quats[seen])
+    part = replace(whole[seen], means=truth(noisy), quats=quats, scales=scale * whole.scales[seen], sh=rgb_to_sh(rgb))
     return Trial(part, truth, seen)
 
 
@@ -150,7 +155,36 @@ def ours(part: Gaussians, whole: Gaussians, seed: int = 0) -> Similarity:
     return found.similarity.to("cpu") if found else Similarity(1.0, torch.eye(3), torch.zeros(3))
 
 
+def splatreg(part: Gaussians, whole: Gaussians, seed: int = 0) -> Similarity:
+    """The package's pose of a known object that is seen in part, with scale.
+
+    `features` is the start it has for parts. The others end in least squares that count on the whole being there, and
+    shrink or blow up what they are given. Its sweep over rotations keeps the scale at which it starts, so both are
+    given in one size; on one thread, as its products are so small that two threads take several times as long.
+    """
+    from splatreg import Gaussians as Theirs
+    from splatreg import estimate_object_pose
+
+    rng, threads = torch.Generator().manual_seed(seed), torch.get_num_threads()
+    given, units = [], []
+    for g in (whole, part):
+        g = g[torch.randperm(len(g), generator=rng)[:SHOWN].to(g.means.device)]
+        unit = RADIUS / float((g.means - g.means.mean(0)).square().sum(1).mean().sqrt())
+        rgb = (g.sh[:, 0] * C0 + 0.5).clamp(0, 1)
+        given.append(Theirs(g.means * unit, g.quats, g.scales * unit, g.opacities, rgb))
+        units.append(unit)
+    torch.set_num_threads(1)
+    try:
+        T = estimate_object_pose(*given, init="features", transform="sim3").T_SO.detach().cpu()
+    finally:
+        torch.set_num_threads(threads)
+    scale = float(torch.det(T[:3, :3]).abs() ** (1 / 3))
+    return Similarity(scale * units[0] / units[1], nearest(T[:3, :3] / scale), T[:3, 3] / units[1])
+
+
 METHODS = {"ours": ours, "ICP": icp}  # (part, whole, seed) -> whole to part, on the CPU
+if find_spec("splatreg"):
+    METHODS["splatreg"] = splatreg
 
 
 def run(out: Path | None, options: BenchOptions = BenchOptions()) -> Iterator[str]:  # noqa: B008 -- frozen
@@ -175,8 +209,12 @@ def run(out: Path | None, options: BenchOptions = BenchOptions()) -> Iterator[st
         yield f"{name:14}" + "".join(f"{count:12d}" for count in right.values())
     summary = {m: summarised([r for r in rows if r["method"] == m]) for m in compared}
     yield from (f"{m}: {json.dumps(facts)}" for m, facts in summary.items())
+    if "splatreg" not in compared:
+        yield "splatreg is not installed and left out; `pip install --no-deps splatreg` adds it (all it needs is here)"
     if out:
         facts = {"machine": bench.machine(device), "options": asdict(options), "limits": LIMITS, "summary": summary}
+        if "splatreg" in compared:
+            facts["splatreg"] = {"version": version("splatreg"), "Gaussians": SHOWN}
         with replacing(out) as part:
             part.write_text(json.dumps({**facts, "trials": [_rounded(r) for r in rows]}, indent=1) + "\n")
 

@@ -1,16 +1,18 @@
 """The bench judges rightly: exact answers have no error, turns that cannot be seen are none, ICP finds what is near."""
 
 import json
+import sys
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
 
 from stages.geometry.harmonics import rgb_to_sh
 from stages.geometry.rotations import matrix
-from stages.geometry.similarity import Similarity
+from stages.geometry.similarity import Similarity, umeyama
 from stages.lab import bench, bench_register
-from stages.lab.bench_register import BenchOptions, about_z, angle, errors, icp, inverse, run, trial
+from stages.lab.bench_register import BenchOptions, about_z, angle, errors, icp, inverse, run, splatreg, trial
 from stages.lab.shapes import ellipsoid
 from tests.refine.things import somewhere, thing
 from tests.segment.tabletop import coloured
@@ -74,6 +76,45 @@ def test_icp_finds_a_whole_that_is_turned_a_little():
     assert (found(whole.means) - pose(whole.means)).norm(dim=1).mean() < 0.03
 
 
+@pytest.fixture
+def stand_in(monkeypatch):
+    """A module in splatreg's place that matches by colour and answers as splatreg does: model to observation, 4x4."""
+
+    def estimate_object_pose(model, observation, *, init, transform):
+        assert (init, transform) == ("features", "sim3") and torch.get_num_threads() == 1
+        for g in (model, observation):
+            assert not g.log_scales and (g.colors >= 0).all() and (g.colors <= 1).all()
+            assert (g.means - g.means.mean(0)).square().sum(1).mean().sqrt() == pytest.approx(0.14, rel=1e-4)
+        pose = umeyama(model.means, observation.means[torch.cdist(model.colors, observation.colors).argmin(1)])
+        T = torch.eye(4)
+        T[:3, :3], T[:3, 3] = pose.scale * pose.rotation, pose.translation
+        return SimpleNamespace(T_SO=T)
+
+    def gaussians(means, quats, scales, opacities, colors=None, log_scales=False):
+        return SimpleNamespace(means=means, colors=colors, scales=scales, log_scales=log_scales)
+
+    module = SimpleNamespace(Gaussians=gaussians, estimate_object_pose=estimate_object_pose)
+    monkeypatch.setitem(sys.modules, "splatreg", module)
+
+
+def test_splatreg_is_handed_what_it_wants_and_its_answer_is_turned_into_ours(can, stand_in):
+    rng, threads = torch.Generator().manual_seed(0), torch.get_num_threads()
+    whole = can[torch.randperm(len(can), generator=rng)[: bench_register.SHOWN]]
+    whole = replace(whole, sh=rgb_to_sh(torch.rand(len(whole), 3, generator=rng)))
+    pose = somewhere(3)
+    found = splatreg(replace(whole, means=pose(whole.means), scales=pose.scale * whole.scales), whole)
+    torch.testing.assert_close(found(whole.means), pose(whole.means), rtol=0, atol=1e-4)
+    assert found.scale == pytest.approx(pose.scale, rel=1e-4) and torch.get_num_threads() == threads
+
+
+def test_the_real_splatreg_finds_a_whole_that_is_turned_and_scaled():
+    pytest.importorskip("splatreg")
+    whole, pose = thing(0.02), somewhere(1)
+    whole = whole[torch.randperm(len(whole), generator=torch.Generator().manual_seed(0))[: bench_register.SHOWN]]
+    found = splatreg(replace(whole, means=pose(whole.means), scales=pose.scale * whole.scales), whole)
+    torch.testing.assert_close(found(whole.means), pose(whole.means), rtol=0, atol=1e-3)
+
+
 def test_a_run_counts_and_writes(tmp_path, monkeypatch):
     monkeypatch.setattr(bench_register, "make_object", lambda name: thing(0.02))
     monkeypatch.setattr(bench_register, "METHODS", {"ICP": icp})
@@ -81,3 +122,4 @@ def test_a_run_counts_and_writes(tmp_path, monkeypatch):
     assert lines[0].split() == ["right", "of", "1", "ICP"] and lines[1].split()[0] == "duck"
     facts = json.loads((tmp_path / "out.json").read_text())
     assert facts["machine"] == bench.machine("cpu") and [row["method"] for row in facts["trials"]] == ["ICP"]
+    assert "splatreg is not installed" in lines[-1] and "pip install --no-deps splatreg" in lines[-1]

@@ -125,7 +125,7 @@ def icp(part: Gaussians, whole: Gaussians, seed: int = 0) -> Similarity:
         scale = float((y - y.mean(0)).norm(dim=1).mean() / (x - x.mean(0)).norm(dim=1).mean())
         ends.append(_iterate(Similarity(scale, start, y.mean(0) - scale * start @ x.mean(0)), x, y, tree, 6))
     pose = min(ends, key=lambda end: end[0])[1]
-    return inverse(_iterate(pose, x, y, tree, 40)[1])
+    return _iterate(pose, x, y, tree, 40)[1].inverse()
 
 
 def _iterate(pose: Similarity, x: Tensor, y: Tensor, tree: cKDTree, rounds: int) -> tuple[float, Similarity]:
@@ -143,11 +143,6 @@ def _right_angles() -> Iterator[Float[Tensor, "3 3"]]:
             R = torch.eye(3)[list(order)] * signs[:, None]
             if torch.det(R) > 0:
                 yield R
-
-
-def inverse(pose: Similarity) -> Similarity:
-    back = pose.rotation.mT
-    return Similarity(1 / pose.scale, back, -back @ pose.translation / pose.scale)
 
 
 def ours(part: Gaussians, whole: Gaussians, seed: int = 0) -> Similarity:

@@ -27,7 +27,7 @@ from stages.lab.dataset_assets import SUBSTEP, Asset, Fineness, count_at, extent
 from stages.lab.dataset_simulation import simulate
 from stages.lab.heldout_shapes import KINDS, Kind, surface
 from stages.lab.motions import MotionsWriter
-from stages.lab.scenes import Config, sample_scene, write_configs
+from stages.lab.scenes import VARIED, Config, sample_scene, write_configs
 from stages.lab.shapes import one_thread
 from stages.lab.varied_shapes import kinds
 from stages.physics.keypoints import farthest_points
@@ -36,7 +36,7 @@ from stages.scene.files import provenance, replacing
 from stages.scene.scene import SceneObject
 
 log = logging.getLogger(__name__)
-GROUP, VARIED = "heldout", "varied"
+GROUP = "heldout"
 FIRST = {GROUP: 10_000, VARIED: 20_000}  # index of the first scene, and so its seed: none of the data set has it
 MESH = 100  # id of the first mesh
 DENSE = 30_000  # points of a shape that particles are chosen among

@@ -25,6 +25,7 @@ REACH = 0.9  # bounding spheres stay within this cube [m]
 GAP = 0.05  # least distance between points of two objects, and between centres [m]
 ASIDE = 0.1  # how far aside of the object it is put near, in scenes of up to 4 [m]
 TRIES = 500  # for an object, before the scene is begun again
+VARIED = "varied"  # group of scenes with objects at random, which belong to no published set
 SCENES = {**{f"3_{i}": 300 for i in range(10)}, "4": 100, "6": 100}  # groups, and how many scenes each has
 
 

@@ -18,9 +18,8 @@ from tqdm import tqdm
 from stages.backends import pick_device
 from stages.errors import InputError
 from stages.evaluate.dynamics import all_metrics
-from stages.lab.heldout import VARIED
 from stages.lab.motions import Motions
-from stages.lab.scenes import groups_of
+from stages.lab.scenes import VARIED, groups_of
 from stages.lab.training_data import UNSEEN, Pieces, read_groups, recipe, split
 from stages.lab.training_roll import LOSSES, Roll
 from stages.lab.training_state import Trainee

@@ -12,7 +12,7 @@ from stages.geometry.harmonics import rgb_to_sh
 from stages.geometry.rotations import matrix
 from stages.geometry.similarity import Similarity, umeyama
 from stages.lab import bench, bench_register
-from stages.lab.bench_register import BenchOptions, about_z, angle, errors, icp, inverse, run, splatreg, trial
+from stages.lab.bench_register import BenchOptions, about_z, angle, errors, icp, run, splatreg, trial
 from stages.lab.shapes import ellipsoid
 from tests.refine.things import somewhere, thing
 from tests.segment.tabletop import coloured
@@ -66,7 +66,7 @@ def test_the_turn_about_z_is_taken_apart_from_the_rest():
 def test_there_and_back_is_nowhere():
     pose = somewhere(2)
     points = torch.randn(5, 3)
-    torch.testing.assert_close(inverse(pose)(pose(points)), points, rtol=0, atol=1e-5)
+    torch.testing.assert_close(pose.inverse()(pose(points)), points, rtol=0, atol=1e-5)
 
 
 def test_icp_finds_a_whole_that_is_turned_a_little():

@@ -160,6 +160,31 @@ def bench_dynamics(
         print(line)
 
 
+@app.command("ablation")
+def bench_ablation(
+    data: Annotated[Path, typer.Option(help="folder of motions, as `ngff-lab dataset` writes")],
+    out: Annotated[
+        Path, typer.Option("-o", "--out", help="the results (.json), added to what is there; a table (.md) goes beside")
+    ] = Path("ablation.json"),
+    only: Annotated[str, typer.Option(help="some of the choices, such as full,reaction")] = "",
+    steps: Annotated[int, typer.Option(help="of training, for each choice")] = 1500,
+    batch: Annotated[int, typer.Option(help="scenes a step")] = 64,
+    keypoints: Annotated[int, typer.Option(help="of each object")] = 256,
+    horizons: Annotated[str, typer.Option(help="frames to roll out in each phase")] = "8,20",
+    groups: Annotated[str, typer.Option(help="of scenes to learn from")] = "3_0..3_8",
+    test: Annotated[str, typer.Option(help="group of scenes to score on")] = "3_9",
+    compiled: Annotated[bool, typer.Option("--compiled", help="compile a step first; for GPUs")] = False,
+    seed: Seed = 0,
+    device: Device = "auto",
+) -> None:
+    """Our force field trained without each of its choices in turn: what they are worth."""
+    from stages.lab.bench_ablation import BenchOptions, run
+
+    options = BenchOptions(steps, batch, keypoints, horizons, groups, test, compiled, seed, device)
+    for line in run(data, out, options, only):
+        print(line, flush=True)
+
+
 @app.command("rollout")
 def bench_rollout(
     out: Annotated[Path, typer.Option("-o", "--out", help="the results as JSON")] = Path("rollout.json"),

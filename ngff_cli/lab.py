@@ -167,6 +167,9 @@ def train(
     compiled: Annotated[bool, typer.Option("--compiled", help="compile a step first; for GPUs")] = False,
     seed: Seed = 0,
     device: Device = "auto",
+    start: Annotated[
+        Path | None, typer.Option("--from", help="weights (.safetensors) to begin with")
+    ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="go on from the .ckpt beside the weights")] = False,
 ) -> None:
     """Train a dynamics model on simulated motion."""
@@ -175,7 +178,7 @@ def train(
     options = TrainOptions(
         minutes, steps, batch, keypoints, lr, horizons, hidden, loss, memory, groups, compiled, seed, device
     )
-    for line in run(model, data, out, options, resume):
+    for line in run(model, data, out, options, resume, start):
         print(line)
 
 

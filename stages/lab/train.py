@@ -24,7 +24,7 @@ from stages.lab.training_data import UNSEEN, Pieces, read_groups, recipe, split
 from stages.lab.training_roll import LOSSES, Roll
 from stages.lab.training_state import Trainee
 from stages.lab.training_team import Team, team
-from stages.models.weights import build, save
+from stages.models.weights import build, load, save
 from stages.scene.files import ngff_version
 
 log = logging.getLogger(__name__)
@@ -84,11 +84,15 @@ class TrainOptions:
         return self.lr * (0.01 + 0.99 * (1 + math.cos(math.pi * min(progress, 1.0))) / 2)
 
 
-def run(model: str, data: Path, out: Path, options: TrainOptions = TrainOptions(), resume: bool = False) -> list[str]:
+def run(
+    model: str, data: Path, out: Path, options: TrainOptions = TrainOptions(), resume: bool = False,
+    start: Path | None = None,
+) -> list[str]:  # fmt: skip
     """Train on the groups in a folder; the best weights go to OUT and their card beside it. Lines of result.
 
     OUT with the suffix .ckpt is what `resume` goes on from; with the same options the curve is the same as without
-    the interruption. Raises InputError for missing or unfit files.
+    the interruption. `start` are weights to begin with, whose card becomes a part of the new one. Raises InputError
+    for missing or unfit files.
     """
     out = Path(out)
     if not out.parent.is_dir():
@@ -98,12 +102,12 @@ def run(model: str, data: Path, out: Path, options: TrainOptions = TrainOptions(
     if known.points.shape[1] <= max(options.frames):
         raise InputError(f"--horizons: the motions have {known.points.shape[1]} frames; take shorter ones")
     with team(pick_device(options.device), options.batch) as crew:
-        trainee = _trainee(model, out, options, crew.device, resume)
+        trainee, before = _trainee(model, out, options, crew.device, resume, start)
         if crew.leads:
             log.info("%s, %s parameters: learns from %d scenes, chosen by %d", model,
                      f"{sum(p.numel() for p in trainee.params):,}", len(known), len(unseen))  # fmt: skip
         pieces = Pieces(known, crew.device, trainee.model)
-        job = Job(trainee, pieces, unseen.to(crew.device), options, crew, out, _key(model, options))
+        job = Job(trainee, pieces, unseen.to(crew.device), options, crew, out, _key(model, options, before))
         finished = job.run()
         if not crew.leads:
             return []
@@ -113,7 +117,7 @@ def run(model: str, data: Path, out: Path, options: TrainOptions = TrainOptions(
             "device": torch.cuda.get_device_name() if crew.device == "cuda" else "cpu", "processes": crew.size,
             "options": asdict(options), "data": recipe(data, groups), "scenes": len(known),
             "scenes to choose by": len(unseen), "finished": finished, "minutes": trainee.elapsed / 60,
-            "steps": trainee.step, "validation": best, "curve": trainee.curve,
+            "steps": trainee.step, "validation": best, "curve": trainee.curve, **before,
         }  # fmt: skip
         save(out, model, trainee.best_model(), card)
     ended = "" if finished else " (stopped before the end; go on with --resume)"
@@ -121,20 +125,31 @@ def run(model: str, data: Path, out: Path, options: TrainOptions = TrainOptions(
             f"unseen scenes, after {best['minutes']:.1f} of {trainee.elapsed / 60:.1f} min{ended}"]  # fmt: skip
 
 
-def _trainee(model: str, out: Path, options: TrainOptions, device: str, resume: bool) -> Trainee:
-    """A new model, or one from its checkpoint."""
+def _trainee(
+    model: str, out: Path, options: TrainOptions, device: str, resume: bool, start: Path | None
+) -> tuple[Trainee, dict]:
+    """A model that is new, from other weights, or from its checkpoint; and what its card says of those weights."""
     torch.manual_seed(options.seed)
-    network = build(model, **({"hidden": options.hidden} if options.hidden else {})).to(device)
+    before = {}
+    if start is None:
+        network = build(model, **({"hidden": options.hidden} if options.hidden else {})).to(device)
+    else:
+        network, card = load(start, device)
+        if card["model"] != model or options.hidden not in (0, network.config.get("hidden")):
+            raise InputError(f"{start}: holds {card['model']} {network.config}, not what is to be trained; leave "
+                             "--hidden out and name weights of the same model")  # fmt: skip
+        before = {"before": {k: v for k, v in card.items() if k not in ("model", "config")}}
     trainee = Trainee(network, options.lr, options.seed)
     if resume:
-        trainee.load(out.with_suffix(".ckpt"), _key(model, options))
+        trainee.load(out.with_suffix(".ckpt"), _key(model, options, before))
         log.info("going on from step %d, %.1f min", trainee.step, trainee.elapsed / 60)
-    return trainee
+    return trainee, before
 
 
-def _key(model: str, options: TrainOptions) -> dict:
+def _key(model: str, options: TrainOptions, before: dict) -> dict:
     """What must be the same for a checkpoint to be gone on from."""
-    return {"model": model, **{k: v for k, v in asdict(options).items() if k != "device"}}
+    start = before.get("before", {}).get("sha256")
+    return {"model": model, "from": start, **{k: v for k, v in asdict(options).items() if k != "device"}}
 
 
 @dataclass

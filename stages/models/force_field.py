@@ -241,8 +241,8 @@ class ForceField(Dynamics):
         torque = torch.linalg.cross(middle - moving.com[:, :, None, None], F).sum((2, 3))
         counter = torch.linalg.cross(middle - moving.com[:, others][:, :, :, None], F).sum(3)
         F = F.sum(3)
-        force = F.sum(2) - F[:, others, back].sum(2)
-        torque = torque - counter[:, others, back].sum(2)
+        force = F.sum(2) - self._returned(shape, F)
+        torque = torque - self._returned(shape, counter)
         ground = torch.cat([a_f, a_w], 3)[:, :, 0]
         arms = torch.cat([floor.vectors[..., 3, :], wall.vectors[..., 3, :]], 3)[:, :, 0] * LEVER
         torque = torque / mass[..., None] + torch.linalg.cross(arms, ground).sum(2)
@@ -252,6 +252,10 @@ class ForceField(Dynamics):
         touch = torch.where(w.valid[..., None], touch / w.share.clamp_min(1e-9)[..., None], 0.0)
         grip = HOLD * torch.sigmoid(self.hold(status)) * weight_f[:, :, 0].sum(-1, keepdim=True)
         return force / mass[..., None] + ground.sum(2), torque, touch, grip
+
+    def _returned(self, shape: Shape, x: Float[Tensor, "b o m c"]) -> Float[Tensor, "b o c"]:
+        """What the others get from each object where they touch it: by that it is pushed back."""
+        return x[:, shape.others, shape.back].sum(2)
 
     def _slowed(
         self, scene: Scene, rates: Rates, velocity: Float[Tensor, "b o 3"], spin: Float[Tensor, "b o 3"], dt: float

@@ -286,6 +286,23 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_curve(data, tmp_path, monkey
         assert torch.equal(p, q)
 
 
+def test_training_begins_with_other_weights_and_tells_of_them(data, tmp_path):
+    first, second = tmp_path / "first.safetensors", tmp_path / "second.safetensors"
+    run("gcn", data, first, QUICK)
+    still = replace(QUICK, steps=1, lr=1e-9, hidden=0)
+    run("gcn", data, second, still, start=first)
+    (a, before), (b, card) = load(first), load(second)
+    assert card["before"]["curve"] == before["curve"] and card["before"]["sha256"] == before["sha256"]
+    for p, q in zip(a.parameters(), b.parameters(), strict=True):
+        assert_close(p, q, rtol=0, atol=1e-8)
+    run("gcn", data, second, still, resume=True, start=first)
+    with pytest.raises(InputError, match="another from"):
+        run("gcn", data, second, still, resume=True)
+    for wrong in ({"model": "ngff"}, {"model": "gcn", "options": replace(still, hidden=16)}):
+        with pytest.raises(InputError, match="first.safetensors: holds gcn"):
+            run(**{"data": data, "out": second, "options": still, "start": first, **wrong})
+
+
 def test_a_checkpoint_of_something_else_is_refused(data, tmp_path):
     out = tmp_path / "a.safetensors"
     with pytest.raises(InputError, match="no such file"):

@@ -40,18 +40,20 @@ class DepthMap:
 
 def estimate(views: Views, model: SparseModel, plane: Plane | None, device: str = "cpu") -> list[DepthMap]:
     """A depth map of every view, cross-checked against the others. `plane` is the supporting plane, if known."""
-    sources = choose_sources(model)
+    more = choose_sources(model, CHECKS)
+    sources = [best[:SOURCES] for best in more]
     raw = []
     for i in tqdm(range(len(views)), desc="matching depth", unit="photo", leave=False):
         raw.append(_one_view(views, model, i, sources[i], plane, device))
-    more, checked = choose_sources(model, CHECKS), []
+    checked = []
     for i in range(len(views)):
-        others = {*sources[i], *more[i], *(j for j in range(len(views)) if i in sources[j])}
-        checked.append(confirm(raw, views, i, sorted(others)))
+        others = {*more[i], *(j for j in range(len(views)) if i in sources[j])}
+        found = confirm(raw, views, i, sorted(others))
+        checked.append(DepthMap(found.depth.cpu(), found.support.cpu()))
     return checked
 
 
-def choose_sources(model: SparseModel, count: int = SOURCES) -> list[list[int]]:
+def choose_sources(model: SparseModel, count: int) -> list[list[int]]:
     """For every view, those that share most points with it under a useful angle (best near 10 degrees).
 
     Score as in Yao et al. 2018, "MVSNet", sec. 4.1: a Gaussian in the angle, narrower below its centre.
@@ -94,7 +96,7 @@ def _one_view(views: Views, model: SparseModel, i: int, sources: list[int], plan
     step = float(labels[1] - labels[0])
     for share in (0.5, 0.2):
         inverse = _refined(full, inverse, share * step)
-    return (1 / inverse.clamp(min=float(labels[0]) / 2)).cpu()
+    return 1 / inverse.clamp(min=float(labels[0]) / 2)
 
 
 def _range(views: Views, model: SparseModel, i: int) -> tuple[float, float]:
@@ -267,11 +269,13 @@ def confirm(maps: list[Tensor], views: Views, i: int, others: list[int]) -> Dept
     A view confirms a point if its own depth there agrees within DEPTH_TOLERANCE and leads back to
     within PIXEL_TOLERANCE of the pixel (Galliani et al. 2015, "Massively parallel multiview stereopsis", sec. 4).
     """
-    depth, K, viewmat = maps[i], views.cameras.Ks[i], views.cameras.viewmats[i]
+    depth, cameras = maps[i], views.cameras
+    Ks, viewmats = cameras.Ks.to(depth), cameras.viewmats.to(depth)
+    K, viewmat = Ks[i], viewmats[i]
     pixels, points = unproject(depth, K, viewmat)
     total, support = depth.clone(), torch.zeros_like(depth)
     for j in others:
-        there, seen = look_up(maps[j], points, views.cameras.Ks[j], views.cameras.viewmats[j])
+        there, seen = look_up(maps[j], points, Ks[j], viewmats[j])
         back = torch.cat([there, torch.ones_like(there[..., :1])], -1) @ viewmat.mT
         z = back[..., 2]
         landed = back[..., :2] / z[..., None].clamp_min(1e-9) * K.diagonal()[:2] + K[:2, 2]

@@ -23,7 +23,7 @@ from stages.models import weights
 from stages.models.dynamics import FRAME, Dynamics
 from stages.models.pushes import Pushes
 from stages.models.stepper import Stepper
-from stages.models.world import FLOOR, World, centre, offsets
+from stages.models.world import FLOOR, World, centre
 from stages.physics.forces import Prompts
 from stages.physics.materials import choose_materials
 from stages.physics.skinning import rotations
@@ -38,6 +38,7 @@ SIZE = 0.55  # usual longest side of an object in training [m]
 SIZES = (0.25, 1.2)  # and the smallest and largest
 MOST = 6  # objects that scenes of the benchmark have
 THIN = 0.044  # thickness of the thinnest, the cloth [m]
+WALL = 0.015  # volume over surface of bodies in training, all of which are hollow or thin [m]
 STIFF = (3e3, 2e7)  # softest and stiffest [Pa]
 FALL = 5.0  # gravity in training [m/s^2]
 FAST = 5.0  # speeds that falls reach there [m/s]
@@ -122,7 +123,10 @@ def _world(
         choice = materials[o.id]
         volume = float(stage.bodies.volume[stage.bodies.body == row].sum()) * scene.metres_per_unit**3
         mass[0, row] = choice.material.density * volume * frame.mass
-        E[0, row], nu[0, row] = _known_stiffness(o, choice.material.E * frame.stress), choice.material.nu
+        a, b, c = _sides(points[0, row, : len(p)]).tolist()
+        wall = volume * frame.mass / (2 * (a * b + b * c + c * a))
+        E[0, row] = _known_stiffness(o, choice.material.E * frame.stress, wall)
+        nu[0, row] = choice.material.nu
         friction[0, row] = choice.material.friction if options.friction is None else options.friction
         velocity[0, row] = torch.tensor(prompts.velocity.get(o.id, (0.0, 0.0, 0.0))) * frame.length / frame.time
         guess = f"; material not known, taking {choice.name} (--material {o.id}=... changes it)" * choice.guessed
@@ -135,9 +139,13 @@ def _world(
                     box=torch.stack([low, high]))  # fmt: skip
 
 
-def _known_stiffness(o: SceneObject, E: float) -> float:
-    """Young's modulus [Pa] as the model is told it: beyond those of training, the nearest of them."""
-    told = min(max(E, STIFF[0]), STIFF[1])
+def _known_stiffness(o: SceneObject, E: float, wall: float) -> float:
+    """Young's modulus [Pa] as the model is told it: of a body as stiff whose volume over surface is as in training.
+
+    Walls and boards resist bending by the cube of their thickness, so what is solid is told to be stiffer. Beyond the
+    stiffness of training it is the nearest there.
+    """
+    told = min(max(E * max(wall / WALL, 1.0) ** 3, STIFF[0]), STIFF[1])
     if not STIFF[0] / 2 <= E <= 50 * STIFF[1]:  # far beyond the stiffest all bodies look rigid, and this is no loss
         log.warning("object %d (%s): %.2g Pa (at this size) is far from the %.2g to %.2g Pa of training, and taken as "
                     "%.2g Pa; compare with --engine mpm", o.id, o.name, E, *STIFF, told)  # fmt: skip
@@ -170,10 +178,10 @@ def _warn(world: World, model: Dynamics) -> None:
     if float(sides.max() / sides.min()) > SIZES[1] / SIZES[0]:
         log.warning("the largest object is %.1f times as long as the smallest, and in training never more than %.1f; "
                     "compare with --engine mpm", sides.max() / sides.min(), SIZES[1] / SIZES[0])  # fmt: skip
-    thin = thickness(world)[0]
-    if float(thin.min()) < THIN / 1.5:
+    thin = min(float(_sides(p[seen])[0]) for p, seen in zip(points, world.valid[0], strict=True))
+    if thin < THIN / 1.5:
         log.warning("an object is %.2g times thinner than any in training; it may sink into others, so "
-                    "compare with --engine mpm", THIN / float(thin.min().clamp_min(1e-6)))  # fmt: skip
+                    "compare with --engine mpm", THIN / thin)  # fmt: skip
     if len(sides) > MOST:
         log.warning("%d objects; the model was tested with up to %d, so compare with --engine mpm", len(sides), MOST)
     if float(world.velocity.norm(dim=-1).max()) > FAST:
@@ -182,11 +190,9 @@ def _warn(world: World, model: Dynamics) -> None:
         log.warning("this model is not told the %s", name)
 
 
-def thickness(world: World) -> Float[Tensor, "b o"]:
-    """That of a slab whose points spread as an object's do across its thinnest direction [m]."""
-    arm = offsets(world, world.points)
-    spread = torch.einsum("bon,boni,bonj->boij", world.share, arm, arm)
-    return (12 * torch.linalg.eigvalsh(spread)[..., 0].clamp_min(0)).sqrt()
+def _sides(points: Float[Tensor, "n 3"]) -> Float[Tensor, "3"]:
+    """Of a block whose points spread as these do, the shortest first."""
+    return (12 * torch.linalg.eigvalsh(points.T.cov(correction=0)).clamp_min(1e-12)).sqrt()
 
 
 def _state(

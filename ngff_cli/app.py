@@ -16,7 +16,6 @@ from stages.refine.options import RefineOptions
 from stages.render.options import VIEWS, RenderOptions
 from stages.segment.options import BACKENDS as SEGMENT
 from stages.segment.options import SegmentOptions
-from stages.simulate.options import BACKENDS as SIMULATE
 from stages.simulate.options import SimulateOptions
 
 app = typer.Typer(
@@ -183,7 +182,9 @@ def simulate(
     out: Annotated[Path, Option("-o", "--out", help="trajectory to write (.h5)")] = Path("traj.h5"),
     steps: Annotated[int, Option(help="frames, the first being the start")] = SimulateOptions.steps,
     dt: Annotated[float, Option(help="time between frames [s]")] = SimulateOptions.dt,
-    engine: Annotated[str, Option(help=" | ".join(SIMULATE))] = SimulateOptions.engine,
+    engine: Annotated[
+        str, Option(help="ngff: the learned force field, for elastic bodies | mpm: a solver, for any material")
+    ] = SimulateOptions.engine,
     gravity: Annotated[float, Option(help="downwards [m/s^2]")] = SimulateOptions.gravity,
     quality: Annotated[str, Option(help=QUALITY_HELP)] = SimulateOptions.quality,
     material: Annotated[list[str] | None, Option(help="OBJECT=MATERIAL, such as duck=rubber; repeatable")] = None,

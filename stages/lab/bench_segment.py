@@ -27,9 +27,9 @@ from stages.lab import bench
 from stages.lab.photographed import label_images, rebuilt
 from stages.lab.tabletops import KINDS, tabletop
 from stages.models.sam2 import weights as sam2_weights
-from stages.physics.grouping import group
 from stages.scene.files import replacing
 from stages.scene.scene import Scene
+from stages.segment.geometric import segment
 from stages.segment.options import SegmentOptions
 from stages.segment.pictures import pictures
 from stages.segment.sam2 import labelled
@@ -113,7 +113,7 @@ def measure(kind: str, index: int, photos: int, model=None) -> list[dict]:
     scene = tabletop(kind, index, photos)
     truth = scene.gaussians.object_id
     blank = replace(scene, gaussians=replace(scene.gaussians, object_id=torch.zeros_like(truth)), objects=())
-    ways = {"geometric": lambda: group(blank).gaussians.object_id, **by_masks(blank, truth, index)}
+    ways = {"geometric": lambda: segment(blank, SegmentOptions()).gaussians.object_id, **by_masks(blank, truth, index)}
     if model is not None:
         ways["sam2"] = lambda: by_sam2(blank, model)
     rows = []
@@ -132,7 +132,7 @@ def measure_rebuilt(kind: str, index: int, photos: int) -> dict:
     scene, start = tabletop(kind, index, photos), time.perf_counter()
     try:
         with tempfile.TemporaryDirectory() as folder:
-            found = group(rebuilt(scene, Path(folder)))
+            found = segment(rebuilt(scene, Path(folder)), SegmentOptions())
         names, labels = found.cameras.names, label_images(found, found.cameras.names)
         truth = label_images(scene, names)
     except InputError:

@@ -66,4 +66,4 @@ def _truth(scene: Scene, out: Path) -> None:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "toys.ply"
         write_scene(path, replace(scene, gaussians=toys[torch.arange(0, len(toys), 3)]))
-        simulate(path, out, SimulateOptions(quality="normal", keypoints=256))
+        simulate(path, out, SimulateOptions(engine="mpm", keypoints=256))

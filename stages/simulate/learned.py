@@ -25,7 +25,7 @@ from stages.models.pushes import Pushes
 from stages.models.stepper import Stepper
 from stages.models.world import FLOOR, World, centre
 from stages.physics.forces import Prompts
-from stages.physics.materials import choose_materials
+from stages.physics.materials import PLASTIC, choose_materials
 from stages.physics.skinning import rotations
 from stages.physics.state import State
 from stages.scene.scene import Scene, SceneObject
@@ -129,6 +129,9 @@ def _world(
         nu[0, row] = choice.material.nu
         friction[0, row] = choice.material.friction if options.friction is None else options.friction
         velocity[0, row] = torch.tensor(prompts.velocity.get(o.id, (0.0, 0.0, 0.0))) * frame.length / frame.time
+        if choice.material.model in PLASTIC:
+            log.warning("object %d (%s): %s yields or flows, which the learned field does not know; take --engine mpm",
+                        o.id, o.name, choice.name)  # fmt: skip
         guess = f"; material not known, taking {choice.name} (--material {o.id}=... changes it)" * choice.guessed
         log.info("object %d (%s): %s, %.3g kg%s", o.id, o.name, choice.name, mass[0, row] / frame.mass, guess)
     low, high = torch.tensor([-FAR, -FAR, FLOOR]), torch.full((3,), FAR)

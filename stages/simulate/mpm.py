@@ -16,6 +16,7 @@ from torch import Tensor
 
 from stages.backends import pick_device
 from stages.errors import InputError
+from stages.geometry.neighbours import knn
 from stages.physics import mpm
 from stages.physics.forces import Force, Prompts, vector
 from stages.physics.keypoints import nearest_weights
@@ -30,6 +31,7 @@ from stages.simulate.options import Quality, SimulateOptions
 
 log = logging.getLogger(__name__)
 NEAR = 8  # particles that a keypoint follows
+TOUCH, STUCK = 3.0, 0.1  # spacings within which bodies touch; share of a body that does so and holds it
 FINE = 2e-5  # shortest substep worth taking on a GPU [s]
 
 
@@ -65,6 +67,7 @@ def rollout(scene: Scene, keypoints: Keypoints, prompts: Prompts, options: Simul
     box = mpm.Box(tuple(unit * v for v in low), tuple(unit * v for v in stage.box.high))
     solver = mpm.Solver(particles, box, dx, device)
     ids = [o.id for o in scene.objects]
+    _tell_stuck(scene, stage, prompts)
     pushes = [_Push(f, particles, stage, ids.index(f.object_id)) for f in prompts.forces]
     follow = _follow(scene, keypoints, stage.bodies)
     gravity = torch.tensor([0.0, 0.0, -options.gravity]).repeat(len(particles), 1)
@@ -209,6 +212,23 @@ def _particles(
     particles.model, particles.plastic = model.to(torch.int8), rows[body, 6:].contiguous()
     particles.v, particles.held = velocity[body] * (held[body] == 0)[:, None], held[body]
     return particles
+
+
+def _tell_stuck(scene: Scene, stage: Stage, prompts: Prompts) -> None:
+    """Warns of what is to be pushed and touches others: with one velocity at each node, bodies hold each other."""
+    x, body = stage.start, stage.bodies.body
+    pushed = {f.object_id for f in prompts.forces} | set(prompts.velocity)
+    for row, o in enumerate(scene.objects):
+        mine = body == row
+        if o.id not in pushed or bool(mine.all()):
+            continue
+        distance, nearest = knn(x[~mine], x[mine], 1)
+        touching = distance[:, 0] < TOUCH * stage.bodies.spacing
+        if float(touching.float().mean()) > STUCK:
+            others = body[~mine][nearest[touching, 0]].unique().tolist()
+            log.warning("object %d (%s) touches %s: what touches on MPM's grid neither slips nor parts easily, and a "
+                        "push may do less than it should; --quality high helps, and --engine ngff knows no such hold",
+                        o.id, o.name, ", ".join(str(scene.objects[i].id) for i in others))  # fmt: skip
 
 
 class _Push:

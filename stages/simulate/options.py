@@ -9,8 +9,8 @@ from pathlib import Path
 from stages.errors import InputError
 
 BACKENDS = {
+    "ngff": "stages.simulate.learned:rollout",
     "mpm": "stages.simulate.mpm:rollout",
-    **{name: "stages.simulate.learned:rollout" for name in ("ngff",)},
 }
 
 
@@ -33,7 +33,7 @@ QUALITIES = {
 class SimulateOptions:
     steps: int = 100  # frames, the first being the start
     dt: float = 0.02  # time between frames [s]
-    engine: str = "mpm"
+    engine: str = "ngff"
     gravity: float = 9.81  # downwards [m/s^2]
     quality: str = "normal"
     material: tuple[str, ...] = ()  # OBJECT=MATERIAL

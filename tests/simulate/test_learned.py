@@ -134,6 +134,11 @@ def test_what_is_solid_is_told_to_be_stiffer():
     assert _known_stiffness(o, 1e4, WALL / 2) == 1e4 and _known_stiffness(o, 1e6, 10 * WALL) == STIFF[1]
 
 
+def test_what_flows_is_for_mpm(two_balls, tmp_path, untrained, caplog):
+    roll(two_balls, tmp_path, untrained, material=("1=sand",), steps=2)
+    assert "object 1 (red ball): sand yields or flows" in caplog.text and "--engine mpm" in caplog.text
+
+
 def test_a_solid_ball_lands_and_keeps_its_shape(two_balls, tmp_path):
     """With the weights that ship, which have learned from hollow bodies: of rubber, from 0.3 m."""
     t = roll(two_balls, tmp_path, find("ngff", HERE), lift=("0.3",), material=("1=rubber", "2=rubber"), steps=30)

@@ -43,7 +43,8 @@ def balls(tmp_path) -> Path:
 
 def roll(scene: Path, **options) -> Trajectory:
     out = scene.with_name("traj.h5")
-    run(scene, out, SimulateOptions(**{"quality": "draft", "steps": 6, "keypoints": 64, "device": "cpu", **options}))
+    chosen = {"engine": "mpm", "quality": "draft", "steps": 6, "keypoints": 64, "device": "cpu"}
+    run(scene, out, SimulateOptions(**{**chosen, **options}))
     return read_trajectory(out)
 
 
@@ -111,6 +112,19 @@ def test_stiff_materials_are_softened_by_name(balls, caplog):
     caplog.set_level(logging.INFO)
     roll(balls, steps=2, material=("thing=steel",))
     assert "object 2 (thing): steel" in caplog.text and "2.1e+11 softened to" in caplog.text
+
+
+@pytest.mark.parametrize(("gap", "told"), [(0.0, True), (0.3, False)])
+def test_a_push_on_what_leans_on_another_is_told_to_be_held(tmp_path, caplog, gap, told):
+    """Two boards back to back touch with half of their matter; a hand's breadth apart they do not."""
+    u = torch.cartesian_prod(torch.linspace(-0.15, 0.15, 25), torch.linspace(0.02, 0.32, 25))
+    low, high = (ball((x, 0.0, 0.2), 0.1, len(u), (0.5, 0.5, 0.5), i) for i, x in ((1, 0.0), (2, 0.0)))
+    low.means[:] = torch.cat([torch.zeros(len(u), 1), u], 1)
+    high.means[:] = low.means + torch.tensor([0.05 + gap, 0.0, 0.0])
+    path = tmp_path / "boards.ply"
+    write_scene(path, Scene(concatenate([low, high]), (SceneObject(1, "a"), SceneObject(2, "b")), None, 0.0))
+    roll(path, steps=1, force=("object=2 force=1,0,0",))
+    assert ("object 2 (b) touches 1" in caplog.text) == told and "object 1 (a) touches" not in caplog.text
 
 
 def test_nothing_moves_gives_a_hint(balls, caplog):
@@ -183,7 +197,7 @@ def test_wrong_options(options, message):
 
 
 def test_an_unknown_engine(balls):
-    with pytest.raises(InputError, match="no backend called 'magic'; choose from mpm"):
+    with pytest.raises(InputError, match="no backend called 'magic'; choose from ngff, mpm"):
         roll(balls, engine="magic")
 
 

@@ -95,6 +95,8 @@ def _fused(
 ) -> Tensor:  # fmt: skip
     rows, widths = len(x), [w.shape[0] for w in weights]
     out = x.new_empty(rows, widths[-1])
+    if not rows:
+        return out
     columns = x.shape[1]
     K, H, M, O = (max(16, triton.next_power_of_2(w)) for w in (min(columns, CHUNK), widths[0], widths[-2], widths[-1]))
     precision = "tf32x3" if torch.get_float32_matmul_precision() == "highest" else "tf32"

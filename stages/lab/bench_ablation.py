@@ -30,6 +30,7 @@ from stages.scene.files import replacing
 
 log = logging.getLogger(__name__)
 METRICS = ("RMSE", "FPE", "R")
+CHECKS = 6  # of the weights, in one training: the best are scored
 
 
 @dataclass(frozen=True)
@@ -49,7 +50,7 @@ class BenchOptions:
     def training(self) -> TrainOptions:
         return TrainOptions(
             steps=self.steps, batch=self.batch, keypoints=self.keypoints, horizons=self.horizons, loss="axes",
-            groups=self.groups, compiled=self.compiled, seed=self.seed, device=self.device,
+            groups=self.groups, compiled=self.compiled, seed=self.seed, device=self.device, checks=CHECKS,
         )  # fmt: skip
 
 

@@ -174,5 +174,7 @@ def _library(folder: Path, options: BenchOptions) -> None:
 def _fall(scene: Scene, path: Path, options: BenchOptions) -> None:
     """Let the objects go from a height: PATH.h5."""
     write_scene(path.with_suffix(".ply"), scene)
-    chosen = SimulateOptions(steps=options.frames, engine="mpm", quality="draft", lift=(str(options.lift),), keypoints=256)
+    chosen = SimulateOptions(
+        steps=options.frames, engine="mpm", quality="draft", lift=(str(options.lift),), keypoints=256
+    )
     simulate(path.with_suffix(".ply"), path.with_suffix(".h5"), chosen)

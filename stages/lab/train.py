@@ -29,7 +29,6 @@ from stages.scene.files import ngff_version
 
 log = logging.getLogger(__name__)
 SHARES = (0.35, 0.35, 0.3)  # of the budget, for three horizons
-CHECKS = 24  # how often to validate, and to write a checkpoint, in the whole run
 LINE = (
     "{minutes:6.1f} min {step:7d} steps  horizon {horizon:2d}  loss {loss:.4f}  "
     "RMSE {RMSE:.4f}  FPE {FPE:.4f}  R {R:.3f}"
@@ -54,6 +53,7 @@ class TrainOptions:
     compiled: bool = False  # compile a step first: a minute or so, then faster; for GPUs
     seed: int = 0
     device: str = "auto"
+    checks: int = 24  # how often to validate, and to write a checkpoint, in the whole run
 
     def __post_init__(self):
         if self.minutes <= 0 or self.steps < 0 or min(self.batch, self.keypoints) < 1 or self.lr <= 0:
@@ -183,7 +183,7 @@ class Job:
                 trainee.update(grads, options.rate(done))
                 trainee.losses.append(loss)
                 before, done = done, self.progress()
-                if math.floor(done * CHECKS) > math.floor(before * CHECKS):
+                if math.floor(done * options.checks) > math.floor(before * options.checks):
                     self.check(horizon)
                     done = self.progress()
                 bar.update(min(done, 1.0) - bar.n)

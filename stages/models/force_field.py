@@ -7,7 +7,7 @@ directions of the axes, the order of things, or padding; no body gets deeper int
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -25,7 +25,7 @@ from stages.models.shape import Shape, shape_of
 from stages.models.stress import Stress, bounded, projected
 from stages.models.touch import Places, Touch
 from stages.models.vectors import apply, mlp
-from stages.models.world import World, centre
+from stages.models.world import World, centre, inertia
 
 SINK = 0.03  # deepest that a point may get into the floor or a wall [m]
 RISE = 1.0  # fastest that a body is pushed out from deeper [m/s]
@@ -82,10 +82,8 @@ class ForceField(Dynamics):
         self.stress = Stress(h) if deform else None
 
     def rest(self, world: World) -> Shape:
-        shape = shape_of(world)
-        if TRITON and shape.blur.is_cuda and shape.blur.dtype == torch.float32 and not torch.is_grad_enabled():
-            shape = replace(shape, blur=shape.blur.half())  # reading it takes the longest of a step of many scenes
-        return shape
+        usual = world.points.is_cuda and world.points.dtype == torch.float32 and not torch.is_grad_enabled()
+        return shape_of(world, half=TRITON and usual)  # reading neighbourhoods takes the longest of a step of many
 
     def informed(self, shape: Shape) -> Scene:
         code = self._encode(shape)
@@ -97,7 +95,7 @@ class ForceField(Dynamics):
     def _encode(self, shape: Shape) -> Float[Tensor, "b o h"]:
         """From numbers that no rotation changes: points in any order, and the material."""
         w, size = shape.world, shape.size
-        moments = (torch.linalg.eigvalsh(shape.inverse) * size[..., None] ** 2).log()
+        moments = (shape.principal * size[..., None] ** 2).log()
         mass = w.mass.clamp_min(1e-6)
         stiffness = (w.E * size / mass).log() / 5  # square of a frequency
         whole = torch.stack([size.log(), w.E.log10() - 5, w.nu, w.friction, mass.log(), stiffness], -1)
@@ -113,7 +111,7 @@ class ForceField(Dynamics):
         w, shape = scene.shape.world, scene.shape
         quat = torch.zeros_like(w.mass)[..., None].repeat(1, 1, 4)
         quat[..., 0] = 1
-        momentum = torch.linalg.solve(shape.inverse, w.spin[..., None])[..., 0]
+        momentum = apply(inertia(w.share, shape.arm), w.spin)
         rest = torch.zeros_like(shape.arm)
         return BodyState(centre(w, w.points), quat, w.velocity, momentum, rest, rest)
 

@@ -1,4 +1,5 @@
-"""Rollouts at the speed of the device: on CUDA a step is recorded once and replayed, without Python in between.
+"""Rollouts at the speed of the device: on CUDA preparing a scene and a step are recorded once and replayed, without
+Python in between.
 
     stepper = Stepper(model, world)
     for _ in range(steps):
@@ -11,7 +12,7 @@ launches them all at once.
 
 from __future__ import annotations
 
-import logging
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -22,8 +23,6 @@ from stages.models.dynamics import FRAME, Dynamics
 from stages.models.pushes import Pushes
 from stages.models.trees import rebuilt, tensors
 from stages.models.world import World
-
-log = logging.getLogger(__name__)
 
 
 class Stepper:
@@ -36,55 +35,69 @@ class Stepper:
     @torch.no_grad()
     def __init__(self, model: Dynamics, world: World, dt: float = FRAME, pushes: Pushes | None = None):
         self.model, self.dt = model, dt
-        self.graph: torch.cuda.CUDAGraph | None = None
-        given = self._given(world, pushes)
-        new = (x.clone(memory_format=torch.contiguous_format) for x in tensors(given))
-        self.scene, self.state, self.points, self.pushes, self.time = rebuilt(given, new)
+        given = world, Pushes.none(world) if pushes is None else pushes
+        self.world, self.pushes = _copy(given)
+        self.time = torch.zeros((), dtype=torch.int64, device=world.points.device)
+        self.scene, state, points = self._given()
+        self.state, self.points = _copy((state, points))
+        self.begin, self.advance = self._begin, self._step
         if self.time.is_cuda:
-            self._record()
-            self._load(given)
+            self.begin = _recorded(self._begin)
+            self.advance = _recorded(self._step)
+            self.begin()
 
     @torch.no_grad()
     def step(self) -> None:
         """Go on by dt."""
-        if self.graph is None:
-            self._step()
-        else:
-            self.graph.replay()
+        self.advance()
 
     @torch.no_grad()
     def restart(self, world: World, pushes: Pushes | None = None) -> None:
         """Begin anew, with a world and pushes of the same shapes."""
-        self._load(self._given(world, pushes))
+        _load((self.world, self.pushes), (world, Pushes.none(world) if pushes is None else pushes))
+        self.begin()
 
-    def _given(self, world: World, pushes: Pushes | None) -> tuple[Any, tuple, Tensor, Pushes, Tensor]:
-        scene = self.model.prepare(world)
+    def _given(self) -> tuple[Any, tuple, Tensor]:
+        """The scene, its state at time 0, and where the keypoints are."""
+        scene = self.model.prepare(self.world)
         state = self.model.start(scene)
-        pushes = Pushes.none(world) if pushes is None else pushes
-        return scene, state, self.model.points(scene, state), pushes, state[0].new_zeros((), dtype=torch.int64)
+        return scene, state, self.model.points(scene, state)
 
-    def _load(self, given: tuple) -> None:
-        kept = tensors((self.scene, self.state, self.points, self.pushes, self.time))
-        for mine, new in zip(kept, tensors(given), strict=True):
-            if mine.shape != new.shape:
-                raise ValueError(f"made for {tuple(mine.shape)}, not {tuple(new.shape)}")
-            mine.copy_(new)
+    def _begin(self) -> None:
+        self.scene, state, points = self._given()  # a recorded scene lies in the memory of its graph
+        _load((self.state, self.points), (state, points))
+        self.time.zero_()
 
     def _step(self) -> None:
         _advance(self.model, self.scene, self.state, self.points, self.pushes, self.time, self.dt)
 
-    def _record(self) -> None:
-        """Capture a step, after two that load and tune whatever is used."""
-        side = torch.cuda.Stream()
-        side.wait_stream(torch.cuda.current_stream())
-        with torch.cuda.stream(side):
-            for _ in range(2):
-                self._step()
-        torch.cuda.current_stream().wait_stream(side)
-        graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(graph):
-            self._step()
-        self.graph = graph
+
+def _copy(tree: Any) -> Any:
+    """The same with tensors of their own, each one block of memory."""
+    return rebuilt(tree, (x.clone(memory_format=torch.contiguous_format) for x in tensors(tree)))
+
+
+def _load(mine: tuple, new: tuple) -> None:
+    for x, y in zip(tensors(mine), tensors(new), strict=True):
+        if x.shape != y.shape:
+            raise ValueError(f"made for {tuple(x.shape)}, not {tuple(y.shape)}")
+    torch._foreach_copy_(list(tensors(mine)), list(tensors(new)))  # on a GPU all in one kernel
+
+
+def _recorded(work: Callable[[], None]) -> Callable[[], None]:
+    """What replays the launches of `work`. It is also done, twice before, to load and tune whatever it uses, and after,
+    as recording alone leaves what it makes empty."""
+    side = torch.cuda.Stream()
+    side.wait_stream(torch.cuda.current_stream())
+    with torch.cuda.stream(side):
+        for _ in range(2):
+            work()
+    torch.cuda.current_stream().wait_stream(side)
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        work()
+    graph.replay()
+    return graph.replay
 
 
 def _advance(

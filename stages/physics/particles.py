@@ -34,6 +34,7 @@ OUTLIER = 3.5  # robust z-score of the distance to the median centre (Iglewicz a
 FEWEST = 40  # particles of an object
 ALONG = 300  # most voxels along an object
 SAMPLES = 1_000_000  # most points taken from the Gaussians of an object
+LEAKS, WIDER = (2, 3, 4, 5, 6, 8), 1.5  # half widths of holes in shells [voxels]; hollows are so much wider
 CROSS = ndimage.generate_binary_structure(3, 1)
 CUBE = np.ones((2, 2, 2), bool)
 
@@ -179,17 +180,50 @@ def _fill(shell: np.ndarray, gap: int, standing: bool) -> np.ndarray:
     sealed = wide.copy()
     if standing:
         sealed[:, :, : layers[0] + 1] = True
-    labels, _ = ndimage.label(~sealed)
-    outside = np.isin(labels, np.unique(np.concatenate([labels[0].ravel(), labels[-1].ravel(), labels[:, 0].ravel(),
-                                                        labels[:, -1].ravel(), labels[..., -1].ravel()])))  # fmt: skip
-    outside &= ~sealed
+    outside = _outside(~sealed)
     enclosed = ~(outside | sealed)
     grown = ndimage.binary_dilation(enclosed, CROSS, iterations=gap) & wide if enclosed.any() else enclosed
     closed = ndimage.binary_erosion(wide, CROSS, iterations=gap)
     body = shell | closed | enclosed | (grown & ~ndimage.binary_dilation(outside, CROSS, iterations=gap))
+    walls = shell | closed
+    walls[:, :, : layers[0] + 1] |= standing
+    body |= _cavities(walls)
     if standing:
         body[:, :, : layers[0]] = False
     return body
+
+
+def _cavities(walls: np.ndarray) -> np.ndarray:
+    """Hollows that leak, if they are WIDER than their leaks: a jug is filled, a mug or a bowl is not.
+
+    Photos leave holes in the shells of things, which would crumple like paper bags if they were left hollow.
+    """
+    room = LEAKS[-1]  # around it, for what leads outside
+    walls = np.pad(walls, room, mode="edge")  # the floor goes on
+    away = ndimage.distance_transform_edt(~walls)
+    filled = np.zeros_like(walls)
+    for leak in LEAKS:
+        free = away > leak
+        outside = _outside(free)
+        hollow = _touched(free & ~outside, away >= WIDER * leak)
+        if hollow.any():  # back to the walls and into every corner, but not out through the leaks
+            filled |= _touched(~walls & (ndimage.distance_transform_edt(~outside) > leak + 1), hollow)
+    return filled[room:-room, room:-room, room:-room]
+
+
+def _touched(free: np.ndarray, seeds: np.ndarray) -> np.ndarray:
+    """The connected parts of the free voxels that hold a seed."""
+    labels, count = ndimage.label(free)
+    kept = np.zeros(count + 1, bool)
+    kept[labels[free & seeds]] = True
+    return kept[labels]
+
+
+def _outside(free: np.ndarray) -> np.ndarray:
+    """What of the free voxels is connected with the faces of the grid."""
+    faces = np.ones_like(free)
+    faces[1:-1, 1:-1, 1:-1] = False
+    return _touched(free, faces)
 
 
 def _trimmed(body: np.ndarray, points: np.ndarray) -> np.ndarray:

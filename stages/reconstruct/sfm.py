@@ -75,7 +75,7 @@ def _mapped(photos: Photos, database: Path, seed: int) -> SparseModel:
         )  # fmt: skip
     best = max(models.values(), key=lambda m: (m.num_reg_images(), m.num_points3D()), default=None)
     if best is None or best.num_reg_images() < 2 or best.num_points3D() < 50:
-        raise InputError(f"{photos.source}: the photos overlap too little to find where they were taken from; {ADVICE}")
+        raise InputError(f"{photos.source}: {_unplaced(len(photos), len(pairs))}")
     model = _from_colmap(best, _why_dropped(photos, pairs, best, models))
     log.info(
         "placed %d of %d photos, %d points, mean reprojection error %.2f px",
@@ -92,6 +92,16 @@ def _mapping(photos: Photos, seed: int):
     options.min_model_size = min(3, len(photos))
     options.triangulation.ignore_two_view_tracks = len(photos) > 3  # few photos have no others
     return options
+
+
+def _unplaced(photos: int, pairs: int) -> str:
+    """Why no cameras were found for photos of which so many pairs match: too few do, or what they match misleads."""
+    if pairs < 2 * photos:
+        return f"the photos overlap too little to find where they were taken from; {ADVICE}"
+    return (
+        f"{pairs} pairs of photos match, but from no places would the camera see all that; where a pattern repeats "
+        "(tiles, a checked cloth) each piece is taken for another: cover it, with newspaper for instance"
+    )
 
 
 def _stood_still(pairs: list[Pair], photos: Photos) -> bool:

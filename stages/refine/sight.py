@@ -70,15 +70,18 @@ class Sight:
             x, y = pixel[inside].T
             yield inside, z[inside], depth[y, x]
 
-    def hidden(self, scene: Gaussians, more: Gaussians, most: float = 0.3) -> Bool[Tensor, "m"]:
+    def hidden(self, scene: Gaussians, more: Gaussians, most: float = 0.3, leak: float = 0.1) -> Bool[Tensor, "m"]:
         """Which of the Gaussians that might be added to the scene hardly change what the cameras see.
 
-        `most` is the weight in pixels (of the small images) that one may have in a view.
+        One may weigh `most` pixels (of the small images) in a view; or, since fur lets a little through and a patch
+        behind it is wide, the share `leak` of what it would weigh with nothing in front.
         """
         keep = torch.ones(len(more), dtype=torch.bool)
         joint = concatenate([scene, more])
         for viewmat, K, width, height in self.views:
-            keep &= visibility(joint, viewmat, K, width, height)[1][len(scene) :] <= most
+            weight = visibility(joint, viewmat, K, width, height)[1][len(scene) :]
+            bare = visibility(more, viewmat, K, width, height)[1]
+            keep &= weight <= (leak * bare).clamp_min(most)
         return keep
 
 

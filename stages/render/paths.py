@@ -10,6 +10,7 @@ from torch import Tensor
 
 from stages.errors import InputError
 from stages.geometry.cameras import centres, intrinsics, look_at, resize
+from stages.render.pan import pan
 from stages.render.path_file import follow, read_path
 from stages.render.subject import Subject
 from stages.scene.cameras import Cameras
@@ -90,13 +91,14 @@ def _around(
         distance = torch.full_like(azimuth, subject.radius * math.hypot(1, 2 * focal / (FILL * min(width, height))))
     elevation = elevation.clamp(math.radians(-80), math.radians(80))  # an upright camera cannot look straight down
     flat = torch.stack([azimuth.cos(), azimuth.sin()], 1) * elevation.cos()[:, None]
-    eyes = subject.target + distance[:, None] * torch.cat([flat, elevation.sin()[:, None]], 1)
-    viewmats = look_at(eyes, subject.target.expand_as(eyes))
-    fitting = _fitting(viewmats, subject, width, height)
+    arms = distance[:, None] * torch.cat([flat, elevation.sin()[:, None]], 1)
+    aim = subject.target
+    fitting = _fitting(look_at(subject.target + arms, aim.expand_as(arms)), subject, width, height)
     if fitting < ZOOM[0] * focal:  # what is lifted high would be cut off: then it is the middle of the picture
-        viewmats = look_at(eyes, subject.centre.expand_as(eyes))
-        fitting = _fitting(viewmats, subject, width, height)
-    focal = min(max(fitting, ZOOM[0] * focal), ZOOM[1] * focal)
+        aim = subject.centre
+        fitting = _fitting(look_at(subject.target + arms, aim.expand_as(arms)), subject, width, height)
+    wanted = min(max(fitting, ZOOM[0] * focal), ZOOM[1] * focal)
+    viewmats, focal = pan(subject, arms, aim, (width, height), wanted)
     return _repeat(viewmats, intrinsics(width, height, focal), width, height)
 
 

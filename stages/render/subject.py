@@ -17,9 +17,12 @@ from stages.scene.gaussians import Gaussians
 KEPT = (0.05, 0.95)  # quantiles of each coordinate that count as the extent
 VISIBLE = 0.1  # opacity
 ASTRAY = 2.0  # radii of what the cameras look at (two thirds of their distance): objects farther off are scenery
+GONE = 4.0  # radii of what the cameras look at, whose distance is three: farther off a thing has left the scene
 LEASH = 0.35  # radii of what the cameras look at: the aim stays within this of theirs
 SCRAP = 0.05  # of the Gaussians of the largest object; smaller ones do not direct the camera
 MANY = 200_000  # points are thinned to about this many
+MOMENTS, FOLLOWED = 60, 3000  # most times at which what moves must be in the picture, and points of it
+STIRS = 0.1  # of the size of what is shown; what moves less needs no attention
 
 
 @dataclass(frozen=True)
@@ -29,6 +32,7 @@ class Subject:
     centre: Float[Tensor, "3"]
     half: Float[Tensor, "3"]  # from the centre to the faces
     aim: Float[Tensor, "3"] | None = None  # where to look, if not at the centre
+    moving: Float[Tensor, "t m 3"] | None = None  # points of what moves, at even times of the film
 
     @property
     def target(self) -> Float[Tensor, "3"]:
@@ -59,7 +63,16 @@ def subject_of(footage: Footage) -> Subject:
     if aimed is None:
         return found
     pull = found.centre - aimed.centre
-    return replace(found, aim=aimed.centre + pull * min(1.0, LEASH * aimed.radius / float(pull.norm().clamp_min(1e-9))))
+    pull = pull * min(1.0, LEASH * aimed.radius / float(pull.norm().clamp_min(1e-9)))
+    return replace(found, aim=aimed.centre + pull, moving=_near(found.moving, aimed))
+
+
+def _near(moving: Float[Tensor, "t m 3"] | None, aimed: Subject) -> Float[Tensor, "t m 3"] | None:
+    """What leaves the scene is not chased: such points count as if they were in the middle."""
+    if moving is None:
+        return None
+    gone = (moving - aimed.centre).norm(dim=2, keepdim=True) > GONE * aimed.radius
+    return torch.where(gone, aimed.centre, moving)
 
 
 def joint(subjects: Sequence[Subject]) -> Subject:
@@ -69,7 +82,10 @@ def joint(subjects: Sequence[Subject]) -> Subject:
     low = torch.stack([s.centre - s.half for s in subjects]).amin(0)
     high = torch.stack([s.centre + s.half for s in subjects]).amax(0)
     aims = torch.stack([s.target for s in subjects])
-    return Subject((low + high) / 2, (high - low) / 2, aims.mean(0))
+    moving = [s.moving for s in subjects if s.moving is not None]
+    times = max(map(len, moving), default=0)
+    moving = torch.cat([m[_even(len(m), times)] for m in moving], 1) if moving else None
+    return Subject((low + high) / 2, (high - low) / 2, aims.mean(0), moving)
 
 
 def _box(footage: Footage, seen: Gaussians, ids: Int[Tensor, "o"]) -> Subject:
@@ -78,9 +94,22 @@ def _box(footage: Footage, seen: Gaussians, ids: Int[Tensor, "o"]) -> Subject:
     if trajectory is not None:
         moving = torch.isin(trajectory.keypoints.object_id, ids)
         if moving.any():
-            shown = trajectory.positions if footage.moves else trajectory.positions[[footage.frozen or 0]]
-            return joint([extent(shown[:, moving].reshape(-1, 3)), extent(shown[0, moving])])
+            shown = (trajectory.positions if footage.moves else trajectory.positions[[footage.frozen or 0]])[:, moving]
+            box = joint([extent(shown.reshape(-1, 3)), extent(shown[0])])
+            return replace(box, moving=_moving(shown, STIRS * box.radius))
     return extent(seen.means[torch.isin(seen.object_id, ids)])
+
+
+def _moving(shown: Float[Tensor, "t p 3"], least: float) -> Float[Tensor, "t m 3"] | None:
+    """Those of the points that move by more than `least`, thinned in time and number."""
+    shown = shown[_even(len(shown), min(len(shown), MOMENTS))]
+    shown = shown[:, (shown - shown[0]).norm(dim=2).amax(0) > least]
+    return shown[:, _even(shown.shape[1], min(shown.shape[1], FOLLOWED))] if shown.shape[1] else None
+
+
+def _even(have: int, count: int) -> Int[Tensor, "c"]:
+    """`count` indices from the first to the last of `have`."""
+    return torch.linspace(0, max(have - 1, 0), count).round().long()
 
 
 def _central(g: Gaussians, aimed: Subject | None) -> Int[Tensor, "o"]:

@@ -2,11 +2,23 @@
 
 from __future__ import annotations
 
-from stages.physics.grouping import Grouping, group
+from dataclasses import replace
+
+from stages.physics.grouping import Grouping, group, named
+from stages.physics.support import find_support, view_of
+from stages.physics.wall import find_wall
 from stages.scene.scene import Scene
+from stages.segment.bodies import joined
 from stages.segment.options import SegmentOptions
+from stages.segment.rims import redrawn
 
 
 def segment(scene: Scene, options: SegmentOptions) -> Scene:
-    """What stands on the supporting plane, grouped by position, colour and shape."""
-    return group(scene, Grouping(options.max_objects, options.min_size, options.detail, options.seed))
+    """What stands on the supporting plane: grouped by position, colour and shape; made whole; its rims redrawn."""
+    grouped = group(scene, Grouping(options.max_objects, options.min_size, options.detail, options.seed))
+    view = view_of(scene)
+    support = find_support(scene, view, options.seed)
+    if not grouped.objects or support is None or find_wall(scene, view, options.seed) is not None:
+        return grouped
+    whole = replace(grouped, gaussians=joined(grouped.gaussians, support))
+    return named(replace(whole, gaussians=redrawn(whole, support)), support)

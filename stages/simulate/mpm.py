@@ -227,7 +227,7 @@ def _tell_stuck(scene: Scene, stage: Stage, prompts: Prompts) -> None:
         if float(touching.float().mean()) > STUCK:
             others = body[~mine][nearest[touching, 0]].unique().tolist()
             log.warning("object %d (%s) touches %s: what touches on MPM's grid neither slips nor parts easily, and a "
-                        "push may do less than it should; --quality high helps, and --engine ngff knows no such hold",
+                        "push may do less than it should; compare with --engine ngff",
                         o.id, o.name, ", ".join(str(scene.objects[i].id) for i in others))  # fmt: skip
 
 

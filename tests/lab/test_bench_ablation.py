@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 from ngff_cli.lab import app
 from stages.errors import InputError
-from stages.lab import train
+from stages.lab import bench_ablation
 from stages.lab.ablation import CHOICES, IMPULSES
 from stages.lab.bench_ablation import BenchOptions, run
 from stages.lab.motions import write_motions
@@ -109,7 +109,7 @@ def test_other_options_change_one_thing_each():
 
 
 def test_choices_are_trained_scored_and_kept(data, tmp_path, monkeypatch):
-    monkeypatch.setattr(train, "CHECKS", 1)
+    monkeypatch.setattr(bench_ablation, "CHECKS", 1)
     for name in set(CHOICES) - {"full", "reaction", "keypoints"}:
         monkeypatch.delitem(CHOICES, name)
     out = tmp_path / "ablation.json"
@@ -135,7 +135,7 @@ def test_results_of_something_else_are_kept(data, tmp_path):
 
 
 def test_the_command(data, tmp_path, monkeypatch):
-    monkeypatch.setattr(train, "CHECKS", 1)
+    monkeypatch.setattr(bench_ablation, "CHECKS", 1)
     words = "--steps 1 --batch 2 --keypoints 8 --horizons 1 --groups 3_0 --test 3_1 --device cpu --only materials"
     call = ["bench", "ablation", "--data", str(data), "-o", str(tmp_path / "a.json"), *words.split()]
     result = CliRunner().invoke(app, call)

@@ -16,7 +16,6 @@ from typer.testing import CliRunner
 
 from ngff_cli.lab import app
 from stages.errors import InputError
-from stages.lab import train
 from stages.lab.motions import Motions, write_motions
 from stages.lab.train import TrainOptions, run, validate
 from stages.lab.training_data import Pieces, read_groups, split
@@ -64,12 +63,9 @@ def data(tmp_path: Path) -> Path:
     return tmp_path / "data"
 
 
-@pytest.fixture(autouse=True)
-def few_checks(monkeypatch):
-    monkeypatch.setattr(train, "CHECKS", 4)
-
-
-QUICK = TrainOptions(steps=12, batch=2, keypoints=8, horizons="2,3", hidden=8, groups="3_0..3_1", device="cpu")
+QUICK = TrainOptions(
+    steps=12, batch=2, keypoints=8, horizons="2,3", hidden=8, groups="3_0..3_1", device="cpu", checks=4
+)
 
 
 def test_pieces_start_with_the_speed_of_free_fall():

@@ -52,11 +52,34 @@ def test_an_open_bowl_stays_hollow():
     assert not inside.any()
 
 
+def test_a_shell_with_a_hole_is_filled_up_to_the_hole():
+    """Photos leave a third of the way across open: a hollow three times as wide as its leak."""
+    points = sphere()
+    holed = points[points[:, 2] < 0.1 * math.cos(math.asin(1 / 3))]
+    bodies = sample(scene(splats(holed)), 8000)
+    closed = sample(scene(splats(points)), 8000)
+    assert float(bodies.volume.sum()) == pytest.approx(float(closed.volume.sum()), rel=0.08)
+    over = bodies.x[bodies.x[:, :2].norm(dim=1) < 0.02]
+    assert 0.06 < float(over[:, 2].max()) < 0.1  # and nothing pours out
+
+
+def test_a_mug_stays_hollow():
+    rng = torch.Generator().manual_seed(0)
+    turn, up = 2 * math.pi * torch.rand(6000, generator=rng), 0.12 * torch.rand(6000, generator=rng)
+    side = torch.stack([0.05 * turn.cos(), 0.05 * turn.sin(), up], 1)
+    disc = 0.05 * torch.rand(1500, generator=rng).sqrt()[:, None] * torch.stack([turn.cos(), turn.sin()], 1)[:1500]
+    mug = torch.cat([side, torch.cat([disc, torch.zeros(1500, 1)], 1)])
+    for floor in (0.0, None):
+        bodies = sample(scene(splats(mug), floor=floor), 8000)
+        inside = (bodies.x[:, :2].norm(dim=1) < 0.03) & (bodies.x[:, 2] > 0.03)
+        assert not inside.any()
+
+
 def test_the_floor_closes_what_stands_on_it():
     points = sphere()
-    cut = splats(points[points[:, 2] > -0.07] + torch.tensor([0, 0, 0.07]))
+    cut = splats(points[points[:, 2] > -0.05] + torch.tensor([0, 0, 0.05]))
     standing, flying = (sample(scene(cut, floor=floor), 8000) for floor in (0.0, -1.0))
-    middle = torch.tensor([0.0, 0, 0.07])
+    middle = torch.tensor([0.0, 0, 0.05])
     assert ((standing.x - middle).norm(dim=1) < 0.04).sum() > 100
     assert not ((flying.x - middle).norm(dim=1) < 0.04).any()
 

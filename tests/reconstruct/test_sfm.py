@@ -63,6 +63,12 @@ def test_cameras_of_other_photos_are_noticed(tmp_path):
         sfm.triangulate(photos, cameras[[3, 2, 1, 0]], Lenses(torch.zeros(4, 5)))
 
 
+def test_matches_that_no_cameras_explain_are_put_down_to_a_repeated_pattern():
+    assert "overlap too little" in sfm._unplaced(photos=24, pairs=30)  # each with the next, and little more
+    assert "a pattern repeats" in sfm._unplaced(photos=24, pairs=162)  # a checked tablecloth seen from all sides
+    assert "overlap too little" in sfm._unplaced(photos=3, pairs=3)
+
+
 def test_mutual_matches_by_hand():
     a = torch.nn.functional.normalize(torch.tensor([[1.0, 0, 0], [0, 1, 0], [1, 1, 0.01]]), dim=1)
     b = torch.nn.functional.normalize(torch.tensor([[0.02, 1, 0], [1, 0.01, 0], [0, 0, 1.0]]), dim=1)

@@ -12,9 +12,10 @@ from stages.geometry.neighbours import knn
 from stages.geometry.rotations import matrix
 from stages.geometry.similarity import Similarity
 from stages.lab.shapes import ellipsoid, sheet
-from stages.raster.rasterise import rasterise
+from stages.raster.rasterise import rasterise, visibility
 from stages.refine.options import RefineOptions
 from stages.refine.outliers import floaters
+from stages.refine.patches import patches
 from stages.refine.sight import Sight, agreement
 from stages.refine.stage import refine, run
 from stages.scene.cameras import Cameras
@@ -146,6 +147,20 @@ def test_the_share_of_cameras_that_see_a_place(before):
     assert bool((least == most).float().mean() > 0.3) and float(least.min()) < 0.7 < float(most.max())
     inside = torch.tensor([[0.0, 0.0, 0.0], [0.05, -0.04, 0.0]])
     assert float(Sight.of(before).share(inside, 0.02).max()) == 0.0
+
+
+def test_wide_patches_behind_fur_are_hidden_and_before_it_they_are_not():
+    x = torch.cartesian_prod(torch.linspace(-0.2, 0.2, 41), torch.linspace(-0.2, 0.2, 41))
+    up = torch.tensor([0.0, 0.0, 1.0])
+    flat = torch.cat([x, torch.zeros(len(x), 1)], 1)
+    fur = patches(flat, up.expand(len(x), 3), torch.full((len(x), 3), 0.5), 0.01, 1)
+    wide = patches(torch.tensor([[0, 0, -0.05], [0, 0, 0.05]]), up.expand(2, 3), torch.zeros(2, 3), 0.1, 1)
+    eye = torch.tensor([[0.0, 0.01, 1.0]])
+    viewmats, Ks = look_at(eye, torch.zeros(1, 3)), intrinsics(200, 200, 300.0)[None]
+    scene = Scene(fur, cameras=Cameras(viewmats, Ks, torch.tensor([[200, 200]]), ("a",)))
+    _, weight = visibility(concatenate([fur, wide[:1]]), viewmats[0], Ks[0], 200, 200)
+    assert float(weight[-1]) > 0.3  # [px]: a little through each of many pixels
+    assert Sight.of(scene).hidden(fur, wide).tolist() == [True, False]
 
 
 def test_what_the_photos_show_stays(before, after):

@@ -174,3 +174,34 @@ def test_what_is_lifted_is_in_the_picture_from_the_start(tmp_path, two_balls):
     for i in range(40):
         inside = ((project(positions[i], path.viewmats[i], path.Ks[i]) / path.sizes[i] - 0.5).abs() < 0.5).all(1)
         assert float(inside.float().mean()) > 0.95
+
+
+@pytest.mark.parametrize("jump", [(0.0, 0.0, 0.9), (0.5, -0.5, 0.0)], ids=["high up", "to the side"])
+def test_what_moves_stays_in_the_picture_however_far(tmp_path, two_balls, jump):
+    """Far above what the photos show, or far to the side of it, and back."""
+    footage = open_footage(rising(tmp_path / "t.h5", two_balls, 40, 0.0), None, "cpu")
+    positions = footage.trajectory.positions.clone()
+    positions += 4 * (torch.linspace(0, 1, 40) - torch.linspace(0, 1, 40) ** 2)[:, None, None] * torch.tensor(jump)
+    footage = replace(footage, trajectory=replace(footage.trajectory, positions=positions))
+    still = camera_path("novel", two_balls.cameras, subject_of(Footage(two_balls)), 40, 640)
+    path = camera_path("novel", two_balls.cameras, subject_of(footage), 40, 640)
+    assert float(path.Ks[0, 0, 0]) >= 0.75 * float(still.Ks[0, 0, 0]) / 1.6  # no fish eye
+    for i in range(40):
+        inside = ((project(positions[i], path.viewmats[i], path.Ks[i]) / path.sizes[i] - 0.5).abs() < 0.5).all(1)
+        assert bool((depths(positions[i], path.viewmats[i]) > 0).all()) and bool(inside.all())
+
+
+def test_what_leaves_the_scene_is_not_chased(tmp_path, two_balls):
+    footage = open_footage(rising(tmp_path / "t.h5", two_balls, 40, 5.0), None, "cpu")
+    path = camera_path("novel", two_balls.cameras, subject_of(footage), 40, 640)
+    assert bool((path.viewmats[:, 2, 2] < 0.5).all())  # z of where they look: at most 30 degrees up
+    reach = (centres(two_balls.cameras.viewmats)[:, :2].norm(dim=1)).max()
+    assert float(centres(path.viewmats)[:, :2].norm(dim=1).max()) < 1.6 * float(reach)
+
+
+def test_a_film_is_framed_as_before_where_all_that_moves_is_in_it(two_balls):
+    subject = subject_of(Footage(two_balls))
+    inner = subject.centre + 0.3 * (subject.corners() - subject.centre)
+    plain, moving = (camera_path("novel", two_balls.cameras, s, 9, 640) for s in
+                     (subject, replace(subject, moving=inner.expand(5, 8, 3))))  # fmt: skip
+    assert torch.equal(plain.viewmats, moving.viewmats) and torch.equal(plain.Ks, moving.Ks)

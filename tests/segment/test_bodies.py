@@ -1,0 +1,61 @@
+"""Which parts are one body: shapes in each other's arms, or hanging, on a table; colours play no part."""
+
+import torch
+
+from stages.lab.shapes import box, ellipsoid
+from stages.physics.support import find_support
+from stages.segment.bodies import joined
+from tests.segment.tabletop import coloured, scene_of, table
+
+
+def brick(low: tuple, high: tuple, object_id: int):
+    sides = tuple(b - a for a, b in zip(low, high, strict=True))
+    middle = tuple((a + b) / 2 for a, b in zip(low, high, strict=True))
+    return coloured(box(sides, 0.007).moved(middle), (0.5, 0.5, 0.5), object_id)
+
+
+def ball(centre: tuple, radius: float, object_id: int):
+    return coloured(ellipsoid((radius,) * 3, 1500).moved(centre), (0.5, 0.5, 0.5), object_id)
+
+
+def bodies(*parts) -> set[frozenset[int]]:
+    """Objects by the numbers of the parts that they are made of."""
+    scene = scene_of(table(), *parts)
+    parts, ids = scene.gaussians.object_id, joined(scene.gaussians, find_support(scene)).object_id
+    mine = {n: int(ids[parts == n].unique()) for n in parts.unique().tolist()}
+    return {frozenset(n for n in mine if mine[n] == k) for k in set(mine.values())} - {frozenset({0})}
+
+
+def test_arms_around_a_belly_are_one_body_with_it():
+    belly = coloured(ellipsoid((0.06, 0.06, 0.1), 2500).moved((0.0, 0.0, 0.1)), (0.5, 0.5, 0.5), 1)
+    sides = [brick((-0.065, y, 0.07), (0.065, y + 0.02, 0.11), 2) for y in (-0.065, 0.045)]
+    front = [brick((x, -0.045, 0.07), (x + 0.02, 0.045, 0.11), 2) for x in (-0.065, 0.045)]
+    legs = [brick((0.045, y, 0.0), (0.065, y + 0.02, 0.07), 2) for y in (-0.065, 0.045)]  # they stand by themselves
+    assert bodies(belly, *sides, *front, *legs) == {frozenset({1, 2})}
+
+
+def test_things_pushed_together_stay_two():
+    side_by_side = brick((-0.1, -0.05, 0.0), (0.0, 0.05, 0.1), 1), brick((0.003, -0.05, 0.0), (0.1, 0.05, 0.1), 2)
+    assert bodies(*side_by_side) == {frozenset({1}), frozenset({2})}
+    assert bodies(side_by_side[0], ball((0.06, 0.0, 0.06), 0.058, 2)) == {frozenset({1}), frozenset({2})}
+
+
+def test_a_ball_in_a_corner_is_in_the_hull_of_the_corner_but_not_the_corner_in_its():
+    corner = brick((-0.1, -0.1, 0.0), (0.1, -0.07, 0.1), 1), brick((-0.1, -0.07, 0.0), (-0.07, 0.1, 0.1), 1)
+    assert bodies(*corner, ball((-0.02, -0.02, 0.045), 0.045, 2)) == {frozenset({1}), frozenset({2})}
+
+
+def test_what_lies_on_a_thing_is_another_and_what_hangs_from_it_is_not():
+    post = brick((-0.03, -0.03, 0.0), (0.03, 0.03, 0.2), 1)
+    on_top = ball((0.0, 0.0, 0.25), 0.05, 2)
+    assert bodies(post, on_top) == {frozenset({1}), frozenset({2})}
+    plait = brick((0.032, -0.02, 0.06), (0.07, 0.02, 0.21), 2)  # at its side, and not down to the table
+    assert bodies(post, plait) == {frozenset({1, 2})}
+    leaning = brick((0.032, -0.02, 0.0), (0.07, 0.02, 0.15), 2)
+    assert bodies(post, leaning) == {frozenset({1}), frozenset({2})}
+
+
+def test_gaussians_without_a_place_keep_their_number():
+    scene = scene_of(table(), brick((-0.1, -0.05, 0.0), (0.0, 0.05, 0.1), 1))
+    scene.gaussians.means[-3:] = torch.nan
+    assert torch.equal(joined(scene.gaussians, find_support(scene)).object_id, scene.gaussians.object_id)

@@ -1,0 +1,88 @@
+"""Rims redrawn: labels that were made wrong near the border of an object come back, and no others change."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from stages.physics.sight import seen_from
+from stages.physics.support import find_support
+from stages.segment.rims import SEEN, redrawn
+from tests.segment.tabletop import block, scene_of, table, three_apart
+
+
+def relabelled(scene, ids):
+    return replace(scene, gaussians=replace(scene.gaussians, object_id=ids))
+
+
+def shown(scene):
+    return seen_from(scene.gaussians, scene.cameras).norm(dim=1) > SEEN
+
+
+def iou(a, b):
+    return float((a & b).sum() / (a | b).sum())
+
+
+@pytest.fixture(scope="module")
+def truth():
+    return three_apart(noise=0.001)
+
+
+def skirted(scene, width):
+    """Labels with the table around each object given to it."""
+    g, ids = scene.gaussians, scene.gaussians.object_id.clone()
+    for n in (1, 2, 3):
+        near = torch.cdist(g.means[:, :2], g.means[g.object_id == n][:, :2]).amin(1) < width
+        ids[near & (ids == 0)] = n
+    return ids
+
+
+def test_a_skirt_of_table_goes_back_to_the_table(truth):
+    wrong, true = skirted(truth, 0.02), truth.gaussians.object_id
+    found = redrawn(relabelled(truth, wrong), find_support(truth)).object_id
+    seen = shown(truth)
+    taken = (wrong > 0) & (true == 0) & seen  # some of it is under an object, where no photo shows it
+    assert taken.sum() > 200 and (found[taken] == 0).float().mean() > 0.99
+    assert min(iou((found == n) & seen, (true == n) & seen) for n in (1, 2, 3)) > 0.99
+
+
+def test_a_rim_that_the_table_has_goes_back_to_the_object(truth):
+    true, ids = truth.gaussians.object_id, truth.gaussians.object_id.clone()
+    ids[(true == 1) & (truth.gaussians.means[:, 2] < 0.012)] = 0
+    lost = (ids == 0) & (true == 1) & shown(truth)
+    found = redrawn(relabelled(truth, ids), find_support(truth)).object_id
+    assert lost.sum() > 50 and (found[lost] == 1).float().mean() > 0.9
+
+
+def test_a_skirt_over_a_patch_of_another_colour_goes_back_too():
+    patch = table()
+    stained = (patch.means[:, 0] > 0.05) & (patch.means[:, 1].abs() < 0.12)
+    patch.sh[stained, 0] -= 0.8  # dark, and reaching from the block to where the table is sure
+    scene = scene_of(patch, block((0.0, 0.0), (0.1, 0.1, 0.08), (0.8, 0.1, 0.1), 1), noise=0.0005)
+    true = scene.gaussians.object_id
+    ids = torch.where((true == 0) & (scene.gaussians.means[:, 0] - 0.1).abs().lt(0.06)
+                      & (scene.gaussians.means[:, 1].abs() < 0.05), 1, true)  # fmt: skip
+    found = redrawn(relabelled(scene, ids), find_support(scene)).object_id
+    assert (ids != true).sum() > 40 and iou(found == 1, true == 1) > 0.97
+
+
+def test_true_labels_stay_and_so_does_what_no_photo_shows(truth):
+    support = find_support(truth)
+    found = redrawn(truth, support).object_id
+    assert (found == truth.gaussians.object_id).float().mean() > 0.998
+    below = truth.gaussians.means.clone()
+    buried = torch.nonzero(truth.gaussians.object_id == 1)[:5, 0]
+    below[buried] = torch.tensor([0.3, 0.3, -0.05])  # under the table, that hides it
+    hidden = replace(truth, gaussians=replace(truth.gaussians, means=below))
+    assert (redrawn(hidden, support).object_id[buried] == 1).all()
+    blind = relabelled(replace(truth, cameras=None), skirted(truth, 0.02))
+    assert torch.equal(redrawn(blind, support).object_id, blind.gaussians.object_id)
+
+
+def test_nothing_goes_from_one_object_to_another():
+    scene = scene_of(
+        table(), block((-0.05, 0.0), (0.1, 0.1, 0.08), (0.8, 0.1, 0.1), 1),
+        block((0.055, 0.0), (0.1, 0.1, 0.08), (0.8, 0.15, 0.1), 2),
+    )  # fmt: skip
+    found, true = redrawn(scene, find_support(scene)).object_id, scene.gaussians.object_id
+    assert not ((found > 0) & (true > 0) & (found != true)).any()

@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from stages.backends import pick_device
@@ -32,6 +32,7 @@ from stages.scene.scene import Scene, SceneObject
 from stages.scene.trajectory import Keypoints
 from stages.simulate.mpm import Stage, set_up
 from stages.simulate.options import SimulateOptions
+from stages.simulate.sleep import Sleepers
 
 log = logging.getLogger(__name__)
 SIZE = 0.55  # usual longest side of an object in training [m]
@@ -91,19 +92,29 @@ def rollout(scene: Scene, keypoints: Keypoints, prompts: Prompts, options: Simul
     log.info("%s (%s): %d objects, %d keypoints, %.3g times as large and %.3g times slower, %d steps a frame",
              options.engine, card["sha256"][:8], len(ids), len(keypoints.rest), frame.length / scene.metres_per_unit,
              frame.time, steps)  # fmt: skip
+    sleepers = Sleepers(world, _awake(world, prompts, frame, stage, ids))
+    log.info("%d objects rest until something reaches them", int(sleepers.asleep.sum()))
     lifted = keypoints.rest + stage.lift[[ids.index(int(i)) for i in keypoints.object_id]]
 
     def states() -> Iterator[State]:
         place = world.to(device)
-        stepper = Stepper(model, place, options.dt * frame.time / steps, pushes.to(device))
-        first = stepper.points.clone()
+        pinned, dt = pushes.pinned, options.dt * frame.time / steps
+        held = replace(pushes, pinned=pinned | sleepers.asleep)
+        stepper = Stepper(model, place, dt, held.to(device))
+        first, before = stepper.points.clone(), world.points
         for n in range(options.steps):
             if not bool(stepper.points.isfinite().all()):
                 raise InputError(f"the motion ceased to be finite at {n * options.dt:.2f} s; use a smaller --velocity "
                                  "or --force, or --engine mpm")  # fmt: skip
             yield _state(keypoints, ids, lifted, place, (stepper.points - first) / frame.length, stage)
-            for _ in range(steps if n < options.steps - 1 else 0):
+            if n == options.steps - 1 or bool(sleepers.asleep.all()):
+                continue
+            for _ in range(steps):
                 stepper.step()
+            here = stepper.points.cpu()
+            if sleepers.wake(here, (here - before) / (steps * dt)):
+                stepper.pushes.pinned.copy_(pinned | sleepers.asleep)
+            before = here.clone()
 
     return states()
 
@@ -153,6 +164,13 @@ def _known_stiffness(o: SceneObject, E: float, wall: float) -> float:
         log.warning("object %d (%s): %.2g Pa (at this size) is far from the %.2g to %.2g Pa of training, and taken as "
                     "%.2g Pa; compare with --engine mpm", o.id, o.name, E, *STIFF, told)  # fmt: skip
     return told
+
+
+def _awake(world: World, prompts: Prompts, frame: Frame, stage: Stage, ids: list[int]) -> Bool[Tensor, "o"]:
+    """Objects that something is done to; all, where weight does not hold them down."""
+    pushed = {f.object_id for f in prompts.forces}
+    awake = torch.tensor([i in pushed for i in ids]) | (world.velocity[0] != 0).any(-1) | (stage.lift != 0).any(-1)
+    return awake | (frame.gravity <= 0)
 
 
 def _scaled(prompts: Prompts, frame: Frame, stage: Stage, ids: list[int]) -> Prompts:

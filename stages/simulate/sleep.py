@@ -1,0 +1,70 @@
+"""What rests at the start stays as it is until something reaches it: photos show things in equilibrium.
+
+A learned force field holds a body only about as well as it has learned to, and parts found in photos overlap a little,
+so that they would be pushed apart. Source of the idea: sleeping islands, as rigid body engines have them.
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from stages.models.contact import nearest
+from stages.models.world import World
+
+TOUCH = 0.05  # what is nearer touches, beside half the distance between keypoints [m]
+SEAM = 0.1  # the same of things at the start: photos show little of where they touch
+STIR = 0.15  # what touches faster wakes [m/s]
+
+
+class Sleepers:
+    """Which objects of a scene sleep; `awake` (o) are those that are thrown, lifted, or pushed.
+
+    The others sleep if they stand on the floor, or touch what sleeps and does so.
+    """
+
+    def __init__(self, world: World, awake: Bool[Tensor, "o"]):
+        self.points, self.valid = world.points, world.valid
+        self.spacing = _spacing(world)
+        lowest = world.points[0, ..., 2].masked_fill(~world.valid[0], torch.inf).amin(-1)
+        self.grounded = lowest - world.floor[0] < 2 * SEAM + self.spacing / 2
+        near = self._near(world.points, SEAM).any(-1)
+        self.touches = near | near.T
+        self.asleep = ~awake
+        self._supported()
+
+    def wake(self, points: Float[Tensor, "1 o n 3"], speed: Float[Tensor, "1 o n 3"]) -> bool:
+        """Wake whatever something awake has reached, or no longer holds; whether anything woke."""
+        before = int(self.asleep.sum())
+        if not before:
+            return False
+        quick = speed[0].norm(dim=-1) > STIR
+        hit = (self._near(points, TOUCH) & quick[:, None]).any(-1) & ~self.asleep[:, None]
+        self.asleep &= ~hit.any(0)
+        self._supported()
+        return int(self.asleep.sum()) < before
+
+    def _near(self, points: Float[Tensor, "1 o n 3"], gap: float) -> Bool[Tensor, "o o n"]:
+        """Which keypoints of object i (first) touch object j (second)."""
+        most = gap + torch.maximum(self.spacing[:, None], self.spacing) / 2
+        distance, _ = nearest(points, self.valid, float(most.max()))
+        return distance[0] < most[..., None]
+
+    def _supported(self) -> None:
+        """Whoever sleeps on nothing wakes."""
+        held = self.asleep & self.grounded
+        while True:
+            more = held | (self.asleep & (self.touches & held).any(-1))
+            if bool((more == held).all()):
+                break
+            held = more
+        self.asleep = held
+
+
+def _spacing(world: World) -> Float[Tensor, "o"]:
+    """About how far apart the keypoints of each object are [m]: as on the surface of its bounding box."""
+    hidden = ~world.valid[0, ..., None]
+    high = world.points[0].masked_fill(hidden, -torch.inf).amax(1)
+    a, b, c = (high - world.points[0].masked_fill(hidden, torch.inf).amin(1)).unbind(-1)
+    return (2 * (a * b + b * c + c * a) / world.valid[0].sum(-1)).sqrt()

@@ -1,0 +1,71 @@
+"""What rests stays; what is hit, or no longer held, moves."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from stages.models.weights import HERE, find
+from stages.models.world import FLOOR, World
+from stages.scene.scene_ply import write_scene
+from stages.scene.trajectory import read_trajectory
+from stages.simulate.options import SimulateOptions
+from stages.simulate.sleep import SEAM, Sleepers
+from stages.simulate.stage import run
+
+SIDE = 0.3
+
+
+def stacked(*heights: float, aside: float = 0.0) -> World:
+    """Cubes of points in the model's world with their lower faces at these heights above the floor."""
+    line = torch.linspace(0, SIDE, 8)
+    cube = torch.cartesian_prod(line, line, line)
+    points = torch.stack([cube + torch.tensor([i * aside, 0, FLOOR + h]) for i, h in enumerate(heights)])
+    return World.of(points[None])
+
+
+def none(count: int) -> torch.Tensor:
+    return torch.zeros(count, dtype=torch.bool)
+
+
+def test_a_stack_sleeps_and_what_hangs_does_not():
+    assert Sleepers(stacked(0.0, SIDE, 2 * SIDE), none(3)).asleep.all()
+    high = 2 * SIDE + 3 * SEAM  # above the second
+    assert Sleepers(stacked(0.0, SIDE, SIDE + high), none(3)).asleep.tolist() == [True, True, False]
+
+
+def test_what_loses_its_hold_wakes():
+    stack = stacked(0.0, SIDE, 2 * SIDE)
+    assert Sleepers(stack, torch.tensor([True, False, False])).asleep.tolist() == [False, False, False]
+    assert Sleepers(stack, torch.tensor([False, False, True])).asleep.tolist() == [True, True, False]
+    beside = stacked(0.0, 0.0, aside=SIDE)
+    assert Sleepers(beside, torch.tensor([True, False])).asleep.tolist() == [False, True]
+
+
+@pytest.mark.parametrize(("speed", "height", "wakes"), [(1.0, SIDE, True), (0.05, SIDE, False), (1.0, 3 * SIDE, False)])
+def test_a_blow_wakes_and_a_touch_does_not(speed, height, wakes):
+    world = stacked(0.0, 3 * SIDE)
+    sleepers = Sleepers(world, torch.tensor([False, True]))
+    points = world.points.clone()
+    points[0, 1, :, 2] += height - 3 * SIDE
+    assert sleepers.wake(points, torch.tensor([[0.0, -speed]])[..., None, None].expand_as(points)) is wakes
+    assert sleepers.asleep.tolist() == [not wakes, False]
+
+
+def test_at_rest_nothing_moves_until_it_is_hit(two_balls, tmp_path):
+    """The red ball lies, the green one is let go beside it, then above it; with the weights that ship."""
+    write_scene(tmp_path / "scene.ply", two_balls)
+    chosen = SimulateOptions(steps=30, weights=find("ngff", HERE), keypoints=64, device="cpu", quality="draft")
+    run(tmp_path / "scene.ply", tmp_path / "t.h5", chosen)
+    lies = read_trajectory(tmp_path / "t.h5")
+    moved = (lies.positions - lies.positions[0]).norm(dim=-1)
+    assert moved[:, lies.keypoints.object_id == 1].max() == 0 < moved[:, lies.keypoints.object_id == 2].max()
+    green = two_balls.gaussians.object_id == 2
+    means = two_balls.gaussians.means.clone()
+    red = means[two_balls.gaussians.object_id == 1].mean(0)
+    means[green] += red + torch.tensor([0.0, 0, 0.6]) - means[green].mean(0)
+    write_scene(tmp_path / "above.ply", replace(two_balls, gaussians=replace(two_balls.gaussians, means=means)))
+    run(tmp_path / "above.ply", tmp_path / "t.h5", chosen)
+    hit = read_trajectory(tmp_path / "t.h5")
+    moved = (hit.positions - hit.positions[0])[:, hit.keypoints.object_id == 1].norm(dim=-1).amax(1)
+    assert moved[3] == 0 < moved[-1]

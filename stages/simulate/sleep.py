@@ -15,7 +15,7 @@ from stages.models.world import World
 
 TOUCH = 0.05  # what is nearer touches, beside half the distance between keypoints [m]
 SEAM = 0.1  # the same of things at the start: photos show little of where they touch
-STIR = 0.15  # what touches faster wakes [m/s]
+STIR = 0.25  # what would make something so fast if it stuck to it wakes it [m/s]
 
 
 class Sleepers:
@@ -25,7 +25,7 @@ class Sleepers:
     """
 
     def __init__(self, world: World, awake: Bool[Tensor, "o"]):
-        self.points, self.valid = world.points, world.valid
+        self.valid, self.mass = world.valid, world.mass[0].clamp_min(1e-6)
         self.spacing = _spacing(world)
         lowest = world.points[0, ..., 2].masked_fill(~world.valid[0], torch.inf).amin(-1)
         self.grounded = lowest - world.floor[0] < 2 * SEAM + self.spacing / 2
@@ -39,8 +39,9 @@ class Sleepers:
         before = int(self.asleep.sum())
         if not before:
             return False
-        quick = speed[0].norm(dim=-1) > STIR
-        hit = (self._near(points, TOUCH) & quick[:, None]).any(-1) & ~self.asleep[:, None]
+        share = self.mass[:, None] / (self.mass[:, None] + self.mass)
+        quick = speed[0].norm(dim=-1)[:, None] * share[..., None] > STIR
+        hit = (self._near(points, TOUCH) & quick).any(-1) & ~self.asleep[:, None]
         self.asleep &= ~hit.any(0)
         self._supported()
         return int(self.asleep.sum()) < before

@@ -42,9 +42,11 @@ def test_what_loses_its_hold_wakes():
     assert Sleepers(beside, torch.tensor([True, False])).asleep.tolist() == [False, True]
 
 
-@pytest.mark.parametrize(("speed", "height", "wakes"), [(1.0, SIDE, True), (0.05, SIDE, False), (1.0, 3 * SIDE, False)])
-def test_a_blow_wakes_and_a_touch_does_not(speed, height, wakes):
-    world = stacked(0.0, 3 * SIDE)
+@pytest.mark.parametrize(("speed", "height", "mass", "wakes"), [
+    (1.0, SIDE, 1.0, True), (0.1, SIDE, 1.0, False), (1.0, 3 * SIDE, 1.0, False), (1.0, SIDE, 0.1, False),
+])  # fmt: skip
+def test_a_blow_wakes_and_a_touch_does_not(speed, height, mass, wakes):
+    world = replace(stacked(0.0, 3 * SIDE), mass=torch.tensor([[1.0, mass]]))
     sleepers = Sleepers(world, torch.tensor([False, True]))
     points = world.points.clone()
     points[0, 1, :, 2] += height - 3 * SIDE

@@ -71,9 +71,11 @@ class Side:
     gaussians: int
     psnr: float  # on the photos kept out, mean [dB]
     ssim: float
+    psnr_exposed: float  # with the exposure of each photo fitted [dB]
 
     def __str__(self) -> str:
-        return f"{self.psnr:6.2f} dB {self.ssim:.3f} {self.gaussians:9,} {self.steps:7,} {self.seconds:5.0f} s"
+        shown = f"{self.psnr:6.2f} ({self.psnr_exposed:5.2f}) dB {self.ssim:.3f}"
+        return f"{shown} {self.gaussians:9,} {self.steps:7,} {self.seconds:5.0f} s"
 
 
 def run(sets: list[Path], out: Path, options: BenchOptions) -> Iterator[str]:
@@ -85,7 +87,7 @@ def run(sets: list[Path], out: Path, options: BenchOptions) -> Iterator[str]:
     folders = {folder: photo_folder(folder) for folder in map(Path, sets)}
     rows = json.loads(out.read_text())["sets"] if out.exists() else {}
     yield f"{machine('cuda')}; quality {options.quality}, every {options.holdout}th photo kept out"
-    head = f"{'held-out':>15s} {'Gaussians':>9s} {'steps':>7s} {'time':>7s}"
+    head = f"{'held-out (exposed)':>23s} {'Gaussians':>9s} {'steps':>7s} {'time':>7s}"
     yield f"{'set':14s}   ours: {head}   gsplat: {head}"
     for folder, images in folders.items():
         name = folder.resolve().name
@@ -162,7 +164,8 @@ def coloured(
 
 
 def judged(gaussians: Gaussians, made: Reconstruction, seconds: float, steps: int, device: str = "cuda") -> Side:
-    return Side(seconds, steps, len(gaussians), *score(gaussians, made.views, made.held, device))
+    fitted, _ = score(gaussians, made.views, made.held, device, exposed=True)
+    return Side(seconds, steps, len(gaussians), *score(gaussians, made.views, made.held, device), fitted)
 
 
 def timed(make: Callable[[], T]) -> tuple[T, float]:

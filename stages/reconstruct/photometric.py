@@ -187,8 +187,13 @@ def _finished(fit: _Fit, views: Views, touched: Bool[Tensor, "n"], reach: float)
     return done[keep & done.means.isfinite().all(1)]
 
 
-def score(gaussians: Gaussians, views: Views, index: list[int], device: str = "cpu") -> tuple[float, float]:
-    """Mean PSNR [dB] and SSIM of the renders of these views against their photos, exposure not adapted."""
+def score(
+    gaussians: Gaussians, views: Views, index: list[int], device: str = "cpu", exposed: bool = False
+) -> tuple[float, float]:
+    """Mean PSNR [dB] and SSIM of the renders of these views against their photos.
+
+    `exposed`: each render is first exposed as its photo, by the factor for each channel that fits best.
+    """
     psnrs, ssims = [], []
     gaussians = gaussians.to(device)
     with torch.no_grad():
@@ -198,6 +203,8 @@ def score(gaussians: Gaussians, views: Views, index: list[int], device: str = "c
             black = torch.zeros(3, device=device)
             rendering = rasterise(gaussians, cameras.viewmats.to(device), cameras.Ks.to(device), width, height, black)
             image = rendering.rgb[0].clamp(0, 1)
+            if exposed:
+                image = image * (image * photo).sum((0, 1)) / image.square().sum((0, 1)).clamp_min(1e-9)
             psnrs.append(-10 * (image - photo).square().mean().clamp_min(1e-10).log10())
             ssims.append(ssim(image, photo))
     return float(torch.stack(psnrs).mean()), float(torch.stack(ssims).mean())

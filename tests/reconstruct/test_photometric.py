@@ -41,6 +41,16 @@ def test_the_same_seed_gives_the_same_gaussians(target):
         torch.testing.assert_close(getattr(first, name), getattr(second, name), rtol=0, atol=1e-6)
 
 
+def test_scores_may_leave_exposure_out(target):
+    """Photos of 0.8 times the light: 20 dB off, and next to nothing once exposed alike."""
+    true, views = target
+    dark = replace(views, images=tuple((0.8 * image.float()).round().to(torch.uint8) for image in views.images))
+    exact, _ = photometric.score(true, views, [0, 1])
+    raw, _ = photometric.score(true, dark, [0, 1])
+    fitted, _ = photometric.score(true, dark, [0, 1], exposed=True)
+    assert raw < 30 < 45 < fitted and exact > 45
+
+
 def test_a_darker_photo_is_taken_as_exposure(target):
     true, views = target
     images = list(views.images)

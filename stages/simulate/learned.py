@@ -32,7 +32,7 @@ from stages.scene.scene import Scene, SceneObject
 from stages.scene.trajectory import Keypoints
 from stages.simulate.mpm import Stage, set_up
 from stages.simulate.options import SimulateOptions
-from stages.simulate.sleep import SEAM, Sleepers
+from stages.simulate.sleep import Sleepers
 
 log = logging.getLogger(__name__)
 SIZE = 0.55  # usual longest side of an object in training [m]
@@ -92,7 +92,7 @@ def rollout(scene: Scene, keypoints: Keypoints, prompts: Prompts, options: Simul
     log.info("%s (%s): %d objects, %d keypoints, %.3g times as large and %.3g times slower, %d steps a frame",
              options.engine, card["sha256"][:8], len(ids), len(keypoints.rest), frame.length / scene.metres_per_unit,
              frame.time, steps)  # fmt: skip
-    sleepers = Sleepers(world, _awake(world, prompts, frame, stage, ids))
+    sleepers = Sleepers(world, _awake(world, prompts, frame, stage, ids), stage.standing)
     log.info("%d objects rest until something reaches them", int(sleepers.asleep.sum()))
     lifted = keypoints.rest + stage.lift[[ids.index(int(i)) for i in keypoints.object_id]]
 
@@ -148,7 +148,7 @@ def _world(
     low, high = torch.tensor([-FAR, -FAR, FLOOR]), torch.full((3,), FAR)
     if options.box:
         low, high = (frame.inside(torch.tensor(corner)) for corner in (stage.box.low, stage.box.high))
-    low[2] += _hover(points[0, ..., 2] - stage.lift[:, 2:] * frame.length - low[2], valid[0])
+    low[2] += _hover((points[0, ..., 2] - low[2])[stage.standing], valid[0, stage.standing])
     gravity = torch.tensor([0.0, 0.0, -frame.gravity])
     return World.of(points, valid, mass=mass, E=E, nu=nu, friction=friction, velocity=velocity, gravity=gravity,
                     box=torch.stack([low, high]))  # fmt: skip
@@ -157,8 +157,7 @@ def _world(
 def _hover(heights: Float[Tensor, "o n"], valid: Bool[Tensor, "o n"]) -> float:
     """How far above the floor the keypoints of what stands on it end [m]: photos do not show its underside."""
     lowest = heights.masked_fill(~valid, torch.inf).amin(1)
-    standing = lowest[(lowest > 0) & (lowest < 2 * SEAM)]
-    return float(standing.quantile(0.25)) if len(standing) else 0.0
+    return max(0.0, float(lowest.quantile(0.25))) if len(lowest) else 0.0
 
 
 def _known_stiffness(o: SceneObject, E: float, wall: float) -> float:

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from stages.backends import pick_device
@@ -41,6 +41,7 @@ class Stage:
 
     bodies: Bodies  # as seen
     lift: Float[Tensor, "o 3"]  # asked for by the user, and shown
+    standing: Bool[Tensor, "o"]  # on the floor
     settled: Float[Tensor, "o 3"]  # taken on by the simulation alone, so that what stands on the floor touches it
     box: mpm.Box
 
@@ -125,8 +126,9 @@ def set_up(scene: Scene, prompts: Prompts, options: SimulateOptions, fine: bool 
         log.info("the scene has no floor; one is put under the lowest object, at %.3g (--floor changes it)", floor)
     settled = torch.zeros(count, 3)
     gap = bottom - floor
+    standing = gap < 2 * h
     for row, o in enumerate(scene.objects):
-        if gap[row] < 2 * h and o.id not in prompts.pinned:
+        if standing[row] and o.id not in prompts.pinned:
             settled[row, 2] = -gap[row]
             if gap[row] < -4 * h:
                 log.warning("object %d (%s) reaches %.3g below the floor; it is simulated as standing on it",
@@ -143,7 +145,7 @@ def set_up(scene: Scene, prompts: Prompts, options: SimulateOptions, fine: bool 
         raise InputError(f"--box {options.box}: object {o.id} ({o.name}) is not inside; it spans "
                          f"{_span(x[bodies.body == list(scene.objects).index(o)])}")  # fmt: skip
     seen = x - (lift + settled)[bodies.body]
-    return Stage(replace(bodies, x=seen), lift, settled, box)
+    return Stage(replace(bodies, x=seen), lift, standing, settled, box)
 
 
 def vector_box(text: str) -> mpm.Box:

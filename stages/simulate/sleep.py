@@ -21,17 +21,15 @@ STIR = 0.25  # what would make something so fast if it stuck to it wakes it [m/s
 class Sleepers:
     """Which objects of a scene sleep; `awake` (o) are those that are thrown, lifted, or pushed.
 
-    The others sleep if they stand on the floor, or touch what sleeps and does so.
+    The others sleep if they are `standing` on the floor (o), or touch what sleeps and does so.
     """
 
-    def __init__(self, world: World, awake: Bool[Tensor, "o"]):
+    def __init__(self, world: World, awake: Bool[Tensor, "o"], standing: Bool[Tensor, "o"]):
         self.valid, self.mass = world.valid, world.mass[0].clamp_min(1e-6)
         self.spacing = _spacing(world)
-        lowest = world.points[0, ..., 2].masked_fill(~world.valid[0], torch.inf).amin(-1)
-        self.grounded = lowest - world.floor[0] < 2 * SEAM + self.spacing / 2
         near = self._near(world.points, SEAM).any(-1)
         self.touches = near | near.T
-        self.asleep = ~awake
+        self.standing, self.asleep = standing, ~awake
         self._supported()
 
     def wake(self, points: Float[Tensor, "1 o n 3"], speed: Float[Tensor, "1 o n 3"]) -> bool:
@@ -54,7 +52,7 @@ class Sleepers:
 
     def _supported(self) -> None:
         """Whoever sleeps on nothing wakes."""
-        held = self.asleep & self.grounded
+        held = self.asleep & self.standing
         while True:
             more = held | (self.asleep & (self.touches & held).any(-1))
             if bool((more == held).all()):

@@ -14,7 +14,7 @@ from stages.lab.ablation import CHOICES, IMPULSES
 from stages.lab.bench_ablation import BenchOptions, run
 from stages.lab.motions import write_motions
 from stages.lab.train import TrainOptions
-from stages.models.places import pair_places
+from stages.models.places import LEVER, pair_places
 from stages.models.pushes import Pushes
 from stages.models.shape import shape_of
 from stages.models.world import World
@@ -83,15 +83,23 @@ def test_rigid_bodies_keep_their_shape():
 
 
 def test_the_last_vectors_of_a_contact_are_the_impulses():
-    """What is taken away is K^-1 v and K^-1 n: for points without arms, at equal masses, v and n themselves."""
+    """What is taken away would stop the places of a pair, or part them at 1 m/s, if both bodies got it, opposite."""
     world = colliding()
     shape = shape_of(world)
     model = CHOICES["full"].network()
     moving = model._moving(model.informed(shape), model.start(model.informed(shape)))
-    vectors = pair_places(shape, moving).vectors
-    assert vectors.shape[-2] == 10 and IMPULSES == 2
-    stopped = vectors[..., -2, :]
-    assert (stopped * vectors[..., 3, :]).sum(-1).max() > 0  # along the speed at which the places pass each other
+    places = pair_places(shape, moving)
+    near, vectors = places.gate[0, 0, 0] > 0, places.vectors[0, 0, 0]
+    vectors = vectors[near]
+    assert len(vectors) > 3 and vectors.shape[-2] == 10
+    m = world.mass[0]
+    reduced = m[0] * m[1] / (m[0] + m[1])
+    for impulse, wanted in ((vectors[:, -IMPULSES], vectors[:, 3]), (vectors[:, -1], vectors[:, 2])):
+        change = torch.zeros_like(wanted)
+        for body, arm in enumerate((LEVER * vectors[:, 4], LEVER * vectors[:, 5])):
+            spin = torch.linalg.cross(arm, impulse) @ moving.inverse[0, body].T
+            change += reduced / m[body] * (impulse + torch.linalg.cross(spin, arm))
+        assert_close(change, wanted, rtol=1e-4, atol=1e-5)
 
 
 def test_contacts_without_context_are_not_told_of_others():

@@ -24,22 +24,27 @@ def stacked(*heights: float, aside: float = 0.0) -> World:
     return World.of(points[None])
 
 
+def sleepers_of(world: World, awake: torch.Tensor) -> Sleepers:
+    """With what is at the height of the floor standing on it."""
+    return Sleepers(world, awake, world.points[0, ..., 2].amin(1) < FLOOR + 1e-3)
+
+
 def none(count: int) -> torch.Tensor:
     return torch.zeros(count, dtype=torch.bool)
 
 
 def test_a_stack_sleeps_and_what_hangs_does_not():
-    assert Sleepers(stacked(0.0, SIDE, 2 * SIDE), none(3)).asleep.all()
+    assert sleepers_of(stacked(0.0, SIDE, 2 * SIDE), none(3)).asleep.all()
     high = 2 * SIDE + 3 * SEAM  # above the second
-    assert Sleepers(stacked(0.0, SIDE, SIDE + high), none(3)).asleep.tolist() == [True, True, False]
+    assert sleepers_of(stacked(0.0, SIDE, SIDE + high), none(3)).asleep.tolist() == [True, True, False]
 
 
 def test_what_loses_its_hold_wakes():
     stack = stacked(0.0, SIDE, 2 * SIDE)
-    assert Sleepers(stack, torch.tensor([True, False, False])).asleep.tolist() == [False, False, False]
-    assert Sleepers(stack, torch.tensor([False, False, True])).asleep.tolist() == [True, True, False]
+    assert sleepers_of(stack, torch.tensor([True, False, False])).asleep.tolist() == [False, False, False]
+    assert sleepers_of(stack, torch.tensor([False, False, True])).asleep.tolist() == [True, True, False]
     beside = stacked(0.0, 0.0, aside=SIDE)
-    assert Sleepers(beside, torch.tensor([True, False])).asleep.tolist() == [False, True]
+    assert sleepers_of(beside, torch.tensor([True, False])).asleep.tolist() == [False, True]
 
 
 @pytest.mark.parametrize(("speed", "height", "mass", "wakes"), [
@@ -47,11 +52,22 @@ def test_what_loses_its_hold_wakes():
 ])  # fmt: skip
 def test_a_blow_wakes_and_a_touch_does_not(speed, height, mass, wakes):
     world = replace(stacked(0.0, 3 * SIDE), mass=torch.tensor([[1.0, mass]]))
-    sleepers = Sleepers(world, torch.tensor([False, True]))
+    sleepers = sleepers_of(world, torch.tensor([False, True]))
     points = world.points.clone()
     points[0, 1, :, 2] += height - 3 * SIDE
     assert sleepers.wake(points, torch.tensor([[0.0, -speed]])[..., None, None].expand_as(points)) is wakes
     assert sleepers.asleep.tolist() == [not wakes, False]
+
+
+def test_what_hangs_a_little_above_the_floor_falls(two_balls, tmp_path):
+    """As in MPM: only what is as near as particles can tell stands on it."""
+    red = two_balls.gaussians.object_id == 1
+    means = two_balls.gaussians.means + 0.06 * red[:, None] * torch.tensor([0.0, 0.0, 1.0])
+    write_scene(tmp_path / "scene.ply", replace(two_balls, gaussians=replace(two_balls.gaussians, means=means)))
+    for engine in ("ngff", "mpm"):
+        run(tmp_path / "scene.ply", tmp_path / "t.h5", SimulateOptions(steps=8, engine=engine, device="cpu"))
+        t = read_trajectory(tmp_path / "t.h5")
+        assert float(t.com[0, 0, 2] - t.com[-1, 0, 2]) > 0.02
 
 
 def test_at_rest_nothing_moves_until_it_is_hit(two_balls, tmp_path):

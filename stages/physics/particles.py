@@ -185,9 +185,8 @@ def _fill(shell: np.ndarray, gap: int, standing: bool) -> np.ndarray:
     grown = ndimage.binary_dilation(enclosed, CROSS, iterations=gap) & wide if enclosed.any() else enclosed
     closed = ndimage.binary_erosion(wide, CROSS, iterations=gap)
     body = shell | closed | enclosed | (grown & ~ndimage.binary_dilation(outside, CROSS, iterations=gap))
-    walls = shell | closed
-    walls[:, :, : layers[0] + 1] |= standing
-    body |= _cavities(walls)
+    if not standing:  # under the folds of a cloth on the floor it looks like a hollow that leaks
+        body |= _cavities(shell | closed)
     if standing:
         body[:, :, : layers[0]] = False
     return body
@@ -199,7 +198,7 @@ def _cavities(walls: np.ndarray) -> np.ndarray:
     Photos leave holes in the shells of things, which would crumple like paper bags if they were left hollow.
     """
     room = LEAKS[-1]  # around it, for what leads outside
-    walls = np.pad(walls, room, mode="edge")  # the floor goes on
+    walls = np.pad(walls, room)
     away = ndimage.distance_transform_edt(~walls)
     filled = np.zeros_like(walls)
     for leak in LEAKS:

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from stages.errors import InputError
+from stages.lab.objects import OBJECTS, make_object
 from stages.physics.particles import FEWEST, inliers, sample
 from stages.scene.gaussians import Gaussians, concatenate
 from stages.scene.scene import Scene, SceneObject
@@ -61,6 +62,16 @@ def test_a_shell_with_a_hole_is_filled_up_to_the_hole():
     assert float(bodies.volume.sum()) == pytest.approx(float(closed.volume.sum()), rel=0.08)
     over = bodies.x[bodies.x[:, :2].norm(dim=1) < 0.02]
     assert 0.06 < float(over[:, 2].max()) < 0.1  # and nothing pours out
+
+
+def test_nothing_is_filled_in_under_the_folds_of_a_cloth():
+    cloth, size = make_object("cloth")[::6], OBJECTS["cloth"].scale
+    means = size * cloth.means
+    means = means - torch.tensor([0.0, 0.0, float(means[:, 2].min())])
+    ids = torch.ones(len(cloth), dtype=torch.int64)
+    cloth = replace(cloth, means=means, scales=1.3 * 6**0.5 * size * cloth.scales, object_id=ids)
+    lying, flying = (sample(scene(cloth, floor=floor), 20_000) for floor in (0.0, -1.0))
+    assert float(lying.volume.sum()) == pytest.approx(float(flying.volume.sum()), rel=0.05)
 
 
 def test_a_mug_stays_hollow():

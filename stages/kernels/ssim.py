@@ -7,24 +7,17 @@ pixel counts (as in 3D Gaussian splatting; scikit-image instead leaves out a bor
 
 from __future__ import annotations
 
-import math
-
 import torch
 import warp as wp
 from jaxtyping import Float
 from torch import Tensor
 
+from stages.kernels import ssim_pixel
 from stages.kernels.interop import view
 from stages.kernels.splat_lanes import LANES, VECTORS, even, parts, run
+from stages.kernels.ssim_pixel import C1, C2, REACH, WINDOW
 
 wp.set_module_options({"enable_backward": False})
-
-REACH = 5  # pixels to either side of the window's centre
-SIGMA = 1.5  # [px]
-C1, C2 = 0.01**2, 0.03**2  # for images in 0..1
-
-_WEIGHTS = [math.exp(-0.5 * (i / SIGMA) ** 2) for i in range(-REACH, REACH + 1)]
-_WINDOW = [weight / sum(_WEIGHTS) for weight in _WEIGHTS]
 
 # Down the column of every element of row i, then along the row; COUNT maps at once.
 _ROWS = r"""
@@ -55,7 +48,7 @@ auto clear = [&]() {
         for (int j = 5 * channels + size; j < line; ++j) row[j] = 0;
     }
 };
-""".replace("WINDOW", ", ".join(f"{weight!r}f" for weight in _WINDOW))
+""".replace("WINDOW", ", ".join(f"{weight!r}f" for weight in WINDOW))
 
 # Means, variances and covariance; then similarity and its derivatives by mean, variance and covariance of the first.
 _FORWARD = r"""
@@ -165,18 +158,23 @@ def _launch(kernel: wp.Kernel, first: Tensor, second: Tensor, maps: int, *output
     run(kernel, even(height, pieces), [height, width, channels, *flat])
 
 
+def _ways(image: Tensor):
+    return (ssim_pixel.measure, ssim_pixel.pull) if image.is_cuda else (_measure, _pull)
+
+
 class _Ssim(torch.autograd.Function):
     @staticmethod
     def forward(ctx, first, second):
-        value, slopes = _measure(first, second)
+        value, slopes = _ways(first)[0](first, second)
         ctx.save_for_backward(first, second, slopes)
         return value
 
     @staticmethod
     def backward(ctx, v):
         first, second, slopes = ctx.saved_tensors
-        by_first = v * _pull(first, second, slopes) if ctx.needs_input_grad[0] else None
-        by_second = v * _pull(second, first, _measure(second, first)[1]) if ctx.needs_input_grad[1] else None
+        measure, pull = _ways(first)
+        by_first = v * pull(first, second, slopes) if ctx.needs_input_grad[0] else None
+        by_second = v * pull(second, first, measure(second, first)[1]) if ctx.needs_input_grad[1] else None
         return by_first, by_second
 
 
@@ -187,14 +185,12 @@ def ssim(first: Float[Tensor, "h w c"], second: Float[Tensor, "h w c"]) -> Float
     """
     if first.shape != second.shape:
         raise ValueError(f"images of different shape: {tuple(first.shape)} and {tuple(second.shape)}")
-    if first.is_cuda:
-        return ssim_reference(first, second)
     return _Ssim.apply(first.float().contiguous(), second.float().contiguous())
 
 
 def ssim_reference(first: Float[Tensor, "h w c"], second: Float[Tensor, "h w c"]) -> Float[Tensor, ""]:
     """The same in plain PyTorch, in any precision."""
-    window = torch.tensor(_WINDOW, dtype=torch.float64).to(first)
+    window = torch.tensor(WINDOW, dtype=torch.float64).to(first)
     x, y = first.permute(2, 0, 1)[:, None], second.permute(2, 0, 1)[:, None]
 
     def blur(image: Tensor) -> Tensor:

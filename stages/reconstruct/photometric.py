@@ -103,7 +103,7 @@ def refine(
     if not steps:
         return gaussians
     fit = _Fit.start(gaussians.to(device), len(views), reach)
-    near = replace(views, images=tuple(image.to(device) for image in views.images))
+    near = _moved(views, device)
     inverse = [(reach / depth).to(device) for depth in depths]
     generator = torch.Generator().manual_seed(seed)
     splits = {round(share * steps) for share in SPLITS if steps >= 200}
@@ -125,6 +125,13 @@ def refine(
     return _finished(fit, views, pull > 0, reach)
 
 
+def _moved(views: Views, device: str) -> Views:
+    """All at once: a copy a step would wait for the GPU."""
+    cameras = views.cameras
+    cameras = replace(cameras, viewmats=cameras.viewmats.to(device), Ks=cameras.Ks.to(device))
+    return Views(tuple(image.to(device) for image in views.images), cameras)
+
+
 def _step(
     fit: _Fit, views: Views, view: int, grey: float, device: str, inverse: Float[Tensor, "h w"] | None = None
 ) -> Float[Tensor, ""]:
@@ -132,9 +139,9 @@ def _step(
     photo = views.image(view, device)
     height, width = photo.shape[:2]
     background = torch.full((3,), grey, device=device)
-    cameras = views.cameras[[view]]
+    one = slice(view, view + 1)
     rendering = rasterise(
-        fit.gaussians(), cameras.viewmats.to(device), cameras.Ks.to(device), width, height, background
+        fit.gaussians(), views.cameras.viewmats[one], views.cameras.Ks[one], width, height, background
     )  # fmt: skip
     image = rendering.rgb[0] * fit.gain(view)
     loss = (1 - STRUCTURE) * (image - photo).abs().mean() + STRUCTURE * (1 - ssim(image, photo))

@@ -5,6 +5,7 @@ import pytest
 import torch
 from scipy.ndimage import gaussian_filter
 
+from stages.kernels import ssim_pixel
 from stages.kernels.ssim import ssim, ssim_reference
 
 devices = ["cpu"] + (["cuda"] if torch.cuda.is_available() else [])
@@ -46,6 +47,18 @@ def test_gradient_of_both_images_is_that_of_the_reference(device, shape):
     true = torch.autograd.grad(3 * ssim_reference(*exact), exact)
     for a, b in zip(mine, true, strict=True):
         assert float((a - b).norm() / b.norm()) < 1e-5
+
+
+@pytest.mark.parametrize("device", devices)
+@pytest.mark.parametrize("shape", SIZES)
+def test_one_thread_a_value_says_the_same(device, shape):
+    first, second = (image.to(device) for image in pair(shape))
+    leaf = first.clone().double().requires_grad_()
+    true = ssim_reference(leaf, second.double())
+    (grad,) = torch.autograd.grad(true, leaf)
+    value, slopes = ssim_pixel.measure(first, second)
+    assert float(value) == pytest.approx(float(true), abs=2e-6)
+    assert float((ssim_pixel.pull(first, second, slopes) - grad).norm() / grad.norm()) < 1e-5
 
 
 def test_gradient_is_the_slope():

@@ -208,6 +208,24 @@ def test_table_and_plots_are_drawn_again_from_the_results_alone(data, weights, t
     assert done.exit_code == 2 and "--data" in done.stderr
 
 
+def test_rows_of_the_same_scenes_stay_when_others_are_measured(data, weights, tmp_path, monkeypatch):
+    monkeypatch.setattr(bench_dynamics, "TIMED", 2)
+    out = tmp_path / "results.json"
+    run(data, weights, out, NONE)
+    before = json.loads(out.read_text())["rows"]
+    (weights / "transformer.safetensors").unlink()
+    save(weights / "gcn.safetensors", "gcn", build("gcn", hidden=8), {"minutes": 3.0})
+    run(data, weights, out, NONE)
+    rows = json.loads(out.read_text())["rows"]
+    assert list(rows) == list(before) and rows["transformer"] == before["transformer"]
+    assert rows["gcn"]["card"]["minutes"] == 3.0
+    run(data, weights, out, replace(NONE, limit=1))  # other scenes: numbers of before would mislead
+    assert list(json.loads(out.read_text())["rows"]) == [FALL, RIGID, "gcn"]
+    out.write_text("[]")
+    with pytest.raises(InputError, match="results.json: holds no results"):
+        run(data, weights, out, NONE)
+
+
 def test_the_best_model_of_each_split_is_bold():
     def row(rmse, **more):
         score = {"RMSE": rmse, "FPE": 0.1, "R": 0.5}

@@ -132,7 +132,7 @@ def bench_dynamics(
         Path | None, typer.Option(help="folder of weights (.safetensors), all of which are measured; by default ours")
     ] = None,
     out: Annotated[
-        Path, typer.Option("-o", "--out", help="results (.json), added to what is there; table (.md), plots (.png) beside")
+        Path, typer.Option("-o", "--out", help="results (.json), added to what is there; table and plots beside")
     ] = Path("results.json"),
     nudged: Annotated[
         Path | None, typer.Option(help="the same scenes with starts moved by 1 mm, as another data set")

@@ -192,7 +192,9 @@ def _model(file: Path, splits: dict[str, Motions], options: BenchOptions, device
     with torch.inference_mode():
         results = {n: measured(_rolled(model), m, options.batch) for n, m in splits.items()}
         seconds = _seconds(model, next(iter(splits.values())), device)
-    about = {k: card[k] for k in ("model", "config", "minutes", "scenes", "device", "sha256") if k in card}
+    about = {k: card[k] for k in ("model", "config", "scenes", "device", "sha256") if k in card}
+    if "minutes" in card:
+        about["minutes"] = _digits(weights.minutes(card))
     parameters = sum(p.numel() for p in model.parameters())
     keypoints = min(learned, options.keypoints)
     return {"splits": results, "seconds": seconds, "keypoints": keypoints, "parameters": parameters, "card": about}

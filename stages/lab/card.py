@@ -11,7 +11,7 @@ from pathlib import Path
 
 from stages.errors import InputError
 from stages.lab.plot import Panel, draw
-from stages.models.weights import halve
+from stages.models.weights import halve, minutes
 from stages.scene.files import must_exist
 
 PANELS = {"loss": "loss", "RMSE": "RMSE [m] of scenes not learned from", "R": "correlation, of the same scenes"}
@@ -51,4 +51,4 @@ def _line(name: str, row: dict) -> str:
     best = row.get("validation") or {}
     score = "  ".join(f"{k} {best[k]:.4f}" for k in ("RMSE", "FPE", "R") if isinstance(best.get(k), (int, float)))
     known = f"{row['scenes']} scenes, " if "scenes" in row else ""
-    return f"{name}: {row['model']}, {known}{row['minutes']:.1f} min on {row.get('device', 'what was there')}: {score}"
+    return f"{name}: {row['model']}, {known}{minutes(row):.1f} min on {row.get('device', 'what was there')}: {score}"

@@ -70,6 +70,11 @@ def halve(path: Path) -> None:
     save(path, card["model"], model, card, half=True)
 
 
+def minutes(card: Mapping) -> float:
+    """Of training, that of the weights it began with included."""
+    return float(card["minutes"]) + (minutes(card["before"]) if "before" in card else 0.0)
+
+
 def write_card(path: Path, card: Mapping) -> None:
     """A line for each entry, and for each row of a table; numbers of eight digits; of data, only what differs."""
     facts = dict(card)

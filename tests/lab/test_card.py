@@ -29,6 +29,12 @@ def test_two_trainings_in_one_picture(tmp_path):
     assert (image[:HEIGHT, :WIDTH] == (40, 40, 200)).all(2).sum() > 50  # the curve of a; of b there is a point
 
 
+def test_the_minutes_of_the_weights_begun_with_count(tmp_path):
+    first, second = json.loads(card(tmp_path / "a.json").read_text()), card(tmp_path / "b.json", minutes=(1.0, 4.0))
+    second.write_text(json.dumps({**json.loads(second.read_text()), "before": {**first, "before": first}}))
+    assert run([second], tmp_path / "c.png")[0].startswith("b: gcn, 7 scenes, 8.0 min on cpu")
+
+
 def test_the_cards_that_ship_have_curves(tmp_path):
     lines = run(sorted(HERE.glob("*.json")), tmp_path / "c.png")
     assert any(line.startswith("ngff: ngff, ") for line in lines)

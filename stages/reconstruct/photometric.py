@@ -21,6 +21,7 @@ from stages.geometry.rotations import matrix
 from stages.kernels.ssim import ssim
 from stages.raster.rasterise import rasterise
 from stages.reconstruct.photos import Views
+from stages.scene.cameras import Cameras
 from stages.scene.gaussians import Gaussians
 
 STRUCTURE = 0.2  # weight of 1 - SSIM against L1
@@ -39,9 +40,11 @@ class _Fit:
     values: dict[str, Tensor]
     optimiser: torch.optim.Optimizer
     reach: float  # of the cameras [scene units]
+    own: Float[Tensor, "c c"]  # takes from exposures what their cameras explain
 
     @classmethod
-    def start(cls, gaussians: Gaussians, views: int, reach: float) -> _Fit:
+    def start(cls, gaussians: Gaussians, cameras: Cameras, reach: float) -> _Fit:
+        device = gaussians.means.device
         values = {
             "means": gaussians.means,
             "scales": gaussians.scales.log(),
@@ -49,12 +52,12 @@ class _Fit:
             "opacities": gaussians.opacities.clamp(1e-4, 1 - 1e-4).logit(),
             "base": gaussians.sh[:, :1],
             "rest": gaussians.sh[:, 1:],
-            "gains": torch.zeros(views, 3, device=gaussians.means.device),  # logarithms, one a photo and channel
+            "gains": torch.zeros(len(cameras), 3, device=device),  # logarithms, one a photo and channel
         }
         values = {name: value.clone().requires_grad_() for name, value in values.items() if value.numel()}
         rates = {**RATES, "means": MOVE * reach}
         groups = [{"params": [value], "lr": rates[name], "name": name} for name, value in values.items()]
-        return cls(values, torch.optim.Adam(groups, eps=1e-15, fused=True), reach)
+        return cls(values, torch.optim.Adam(groups, eps=1e-15, fused=True), reach, _unexplained(cameras).to(device))
 
     def gaussians(self) -> Gaussians:
         """As the rasteriser wants them, with gradients."""
@@ -65,8 +68,8 @@ class _Fit:
         return Gaussians(v["means"], quats, v["scales"].exp(), v["opacities"].sigmoid(), sh, ids)
 
     def gain(self, view: int) -> Float[Tensor, "3"]:
-        """Exposure of a photo relative to the mean of all."""
-        return (self.values["gains"][view] - self.values["gains"].mean(0)).exp()
+        """Exposure of a photo, as far as it is not what photos from there have: that is what harmonics are for."""
+        return (self.own[view] @ self.values["gains"]).exp()
 
     def rows(self, index: Int[Tensor, "m"], fresh: Int[Tensor, "k"] | None = None) -> None:
         """Keeps (or repeats) these Gaussians with their moments; those at positions `fresh` start with none."""
@@ -102,7 +105,7 @@ def refine(
     """
     if not steps:
         return gaussians
-    fit = _Fit.start(gaussians.to(device), len(views), reach)
+    fit = _Fit.start(gaussians.to(device), views.cameras, reach)
     near = _moved(views, device)
     inverse = [(reach / depth).to(device) for depth in depths]
     generator = torch.Generator().manual_seed(seed)
@@ -123,6 +126,20 @@ def refine(
             if step % 20 == 0:
                 bar.set_postfix(loss=f"{loss.item():.4f}")
     return _finished(fit, views, pull > 0, reach)
+
+
+def _unexplained(cameras: Cameras) -> Float[Tensor, "c c"]:
+    """The projection that leaves of numbers, one a camera, nothing constant or linear in its place and direction.
+
+    With few cameras only in their main directions, so that most of what the numbers tell stays.
+    """
+    count = len(cameras)
+    place, ahead = (x.double().cpu() for x in (centres(cameras.viewmats), cameras.viewmats[:, 2, :3]))
+    place, ahead = ((x - x.mean(0)) / (x - x.mean(0)).norm().clamp_min(1e-9) for x in (place, ahead))
+    main, size, _ = torch.linalg.svd(torch.cat([place, ahead], 1), full_matrices=False)
+    main = main[:, size > 1e-3 * size[0]][:, : count // 4]
+    basis = torch.cat([torch.full((count, 1), count**-0.5, dtype=main.dtype), main], 1)
+    return (torch.eye(count, dtype=main.dtype) - basis @ basis.T).float()
 
 
 def _moved(views: Views, device: str) -> Views:

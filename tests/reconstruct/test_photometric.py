@@ -55,13 +55,32 @@ def test_a_darker_photo_is_taken_as_exposure(target):
     true, views = target
     images = list(views.images)
     images[0] = (images[0].float() * 0.6).to(torch.uint8)
-    fit = photometric._Fit.start(true, 6, 2.0)
+    fit = photometric._Fit.start(true, views.cameras, 2.0)
     for _ in range(100):
         for view in (0, 3):
             photometric._step(fit, Views(tuple(images), views.cameras), view, 0.0, "cpu")
             fit.values["means"].grad.zero_()
             fit.optimiser.step()
     assert float(fit.gain(0).detach().mean()) < float(fit.gain(3).detach().mean())
+
+
+def test_exposure_that_goes_with_the_place_is_left_to_the_harmonics():
+    """Light that grows to one side is view-dependent colour; a single photo taken too dark is not."""
+    cameras = ring(40, 48)
+    own = photometric._unexplained(cameras).double()
+    torch.testing.assert_close(own @ own, own)
+    smooth = 0.3 * torch.linalg.inv(cameras.viewmats.double())[:, 0, 3] + 0.2
+    assert float((own @ smooth).abs().max()) < 1e-5
+    dark = torch.zeros(40, dtype=torch.float64)
+    dark[7] = -0.5
+    left = own @ dark
+    assert float(left[7]) < -0.4 and float(left[torch.arange(40) != 7].abs().max()) < 0.06
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 7])
+def test_few_photos_may_differ_in_exposure(count):
+    own = photometric._unexplained(ring(count, 48))
+    assert own.isfinite().all() and round(float(own.trace())) == count - 1 - count // 4
 
 
 def test_what_was_lost_is_dropped():
@@ -80,7 +99,7 @@ def test_what_was_lost_is_dropped():
 
 def test_splitting_keeps_the_mass_and_shrinks_the_halves():
     start = random_gaussians(100, seed=3)
-    fit = photometric._Fit.start(start, 1, 1.0)
+    fit = photometric._Fit.start(start, ring(1, 48), 1.0)
     pull = torch.zeros(100)
     pull[7] = 1.0
     fit.values["means"].grad = torch.zeros(100, 3)

@@ -92,7 +92,7 @@ def rollout(scene: Scene, keypoints: Keypoints, prompts: Prompts, options: Simul
     log.info("%s (%s): %d objects, %d keypoints, %.3g times as large and %.3g times slower, %d steps a frame",
              options.engine, card["sha256"][:8], len(ids), len(keypoints.rest), frame.length / scene.metres_per_unit,
              frame.time, steps)  # fmt: skip
-    sleepers = Sleepers(world, _awake(world, prompts, frame, stage, ids), stage.standing)
+    sleepers = Sleepers(world, _awake(world, frame, stage), stage.standing)
     log.info("%d objects rest until something reaches them", int(sleepers.asleep.sum()))
     lifted = keypoints.rest + stage.lift[[ids.index(int(i)) for i in keypoints.object_id]]
 
@@ -107,7 +107,12 @@ def rollout(scene: Scene, keypoints: Keypoints, prompts: Prompts, options: Simul
                 raise InputError(f"the motion ceased to be finite at {n * options.dt:.2f} s; use a smaller --velocity "
                                  "or --force, or --engine mpm")  # fmt: skip
             yield _state(keypoints, ids, lifted, place, (stepper.points - first) / frame.length, stage)
-            if n == options.steps - 1 or bool(sleepers.asleep.all()):
+            if n == options.steps - 1:
+                continue
+            if sleepers.rouse(_pushed(prompts, ids, n * options.dt, (n + 1) * options.dt)):
+                stepper.pushes.pinned.copy_(pinned | sleepers.asleep)
+            if bool(sleepers.asleep.all()):
+                stepper.time += steps
                 continue
             for _ in range(steps):
                 stepper.step()
@@ -173,11 +178,15 @@ def _known_stiffness(o: SceneObject, E: float, wall: float) -> float:
     return told
 
 
-def _awake(world: World, prompts: Prompts, frame: Frame, stage: Stage, ids: list[int]) -> Bool[Tensor, "o"]:
-    """Objects that something is done to; all, where weight does not hold them down."""
-    pushed = {f.object_id for f in prompts.forces}
-    awake = torch.tensor([i in pushed for i in ids]) | (world.velocity[0] != 0).any(-1) | (stage.lift != 0).any(-1)
-    return awake | (frame.gravity <= 0)
+def _awake(world: World, frame: Frame, stage: Stage) -> Bool[Tensor, "o"]:
+    """Objects that are thrown or lifted; all, where weight does not hold them down."""
+    return (world.velocity[0] != 0).any(-1) | (stage.lift != 0).any(-1) | (frame.gravity <= 0)
+
+
+def _pushed(prompts: Prompts, ids: list[int], start: float, end: float) -> Bool[Tensor, "o"]:
+    """Objects that are pushed at some time from `start` to `end` [s]."""
+    now = {f.object_id for f in prompts.forces if f.overlap(start, end) > 0}
+    return torch.tensor([i in now for i in ids])
 
 
 def _scaled(prompts: Prompts, frame: Frame, stage: Stage, ids: list[int]) -> Prompts:

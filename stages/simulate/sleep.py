@@ -19,7 +19,7 @@ STIR = 0.25  # what would make something so fast if it stuck to it wakes it [m/s
 
 
 class Sleepers:
-    """Which objects of a scene sleep; `awake` (o) are those that are thrown, lifted, or pushed.
+    """Which objects of a scene sleep; `awake` (o) are those that are thrown, lifted, or pushed at once.
 
     The others sleep if they are `standing` on the floor (o), or touch what sleeps and does so.
     """
@@ -34,13 +34,17 @@ class Sleepers:
 
     def wake(self, points: Float[Tensor, "1 o n 3"], speed: Float[Tensor, "1 o n 3"]) -> bool:
         """Wake whatever something awake has reached, or no longer holds; whether anything woke."""
-        before = int(self.asleep.sum())
-        if not before:
+        if not bool(self.asleep.any()):
             return False
         share = self.mass[:, None] / (self.mass[:, None] + self.mass)
         quick = speed[0].norm(dim=-1)[:, None] * share[..., None] > STIR
         hit = (self._near(points, TOUCH) & quick).any(-1) & ~self.asleep[:, None]
-        self.asleep &= ~hit.any(0)
+        return self.rouse(hit.any(0))
+
+    def rouse(self, rows: Bool[Tensor, "o"]) -> bool:
+        """Wake these and whatever they held; whether anything woke."""
+        before = int(self.asleep.sum())
+        self.asleep = self.asleep & ~rows
         self._supported()
         return int(self.asleep.sum()) < before
 

@@ -87,3 +87,20 @@ def test_at_rest_nothing_moves_until_it_is_hit(two_balls, tmp_path):
     hit = read_trajectory(tmp_path / "t.h5")
     moved = (hit.positions - hit.positions[0])[:, hit.keypoints.object_id == 1].norm(dim=-1).amax(1)
     assert moved[3] == 0 < moved[-1]
+
+
+def test_what_is_pushed_later_sleeps_until_then(two_balls, tmp_path):
+    """And moves as if it had been pushed at once, so much later."""
+    red = two_balls.gaussians.object_id == 1
+    alone = replace(two_balls, gaussians=two_balls.gaussians[red], objects=two_balls.objects[:1])
+    write_scene(tmp_path / "scene.ply", alone)
+    chosen = SimulateOptions(steps=16, weights=find("ngff", HERE), keypoints=64, device="cpu", quality="draft")
+    runs = []
+    for start in (0.0, 0.2):
+        push = f"object=1 force=2,0,0 from={start} to={start + 0.1}"
+        run(tmp_path / "scene.ply", tmp_path / "t.h5", replace(chosen, force=(push,)))
+        runs.append(read_trajectory(tmp_path / "t.h5").positions)
+    at_once, later = runs
+    assert torch.equal(later[:11], later[:1].expand(11, -1, -1))
+    torch.testing.assert_close(later[10:], at_once[:6], rtol=0, atol=1e-6)
+    assert (at_once[5] - at_once[0]).norm(dim=1).max() > 1e-3

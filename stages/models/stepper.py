@@ -28,8 +28,8 @@ from stages.models.world import World
 class Stepper:
     """A scene that moves on by dt [s] with every `step`; on other devices than CUDA simply the model's own step.
 
-    `state`, `points` and `pushes` are tensors that stay where they are: their contents change, and `pushes` may be
-    written to between steps.
+    `state`, `points`, `pushes` and `time` (steps so far) are tensors that stay where they are: their contents change,
+    and `pushes` and `time` may be written to between steps.
     """
 
     @torch.no_grad()

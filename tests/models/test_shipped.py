@@ -45,6 +45,13 @@ def motion(world, points):
     return com, com.diff(dim=1).norm(dim=-1) / DT
 
 
+def rests(com, speed):
+    assert speed[:, :40].amax() > 0.8  # it did fall
+    # a fortieth of that, averaged over the last second
+    assert float(speed[:, -50:].mean(1).max()) < 0.02
+    assert float((com[:, -1] - com[:, -250])[..., :2].norm(dim=-1).max()) < 0.05  # and lies where it lay 5 s before
+
+
 @pytest.fixture(scope="module")
 def model():
     return load(find("ngff", HERE))[0]
@@ -78,19 +85,12 @@ def test_what_has_fallen_comes_to_rest(model):
     )  # fmt: skip
     with torch.inference_mode(), one_thread():
         points = model.rollout(world, 1000)
-    com, speed = motion(world, points)
-    assert speed[:, :40].amax() > 0.8  # it did fall
-    # a fortieth of that, averaged over the last second
-    assert float(speed[:, -50:].mean(1).max()) < 0.02
-    assert float((com[:, -1] - com[:, -250])[..., :2].norm(dim=-1).max()) < 0.05  # and lies where it lay 5 s before
+    rests(*motion(world, points))
 
 
-def test_shapes_never_learned_from_hardly_creep(dropped):
-    world, points = dropped
-    com, speed = motion(world, points)
-    assert speed[:, :40].amax() > 1
-    assert float(speed[:, -50:].mean(1).max()) < 0.1
-    assert float((com[:, -1] - com[:, -250])[..., :2].norm(dim=-1).max()) < 0.1
+@pytest.mark.xfail(strict=True, reason="bodies unlike those learned from creep on: README, learned dynamics")
+def test_shapes_never_learned_from_come_to_rest(dropped):
+    rests(*motion(*dropped))
 
 
 @pytest.mark.parametrize("E", [(1e4, 1e6), (1e6, 1e7)])

@@ -51,7 +51,7 @@ def watch(
 
 @triton.jit
 def strain(
-    record, known, see, say, stress, n, blocks, kinds, HARDEST: tl.constexpr, HEAVIEST: tl.constexpr,
+    record, known, yields, see, say, stress, n, blocks, kinds, HARDEST: tl.constexpr, HEAVIEST: tl.constexpr,
     ROWS: tl.constexpr, H: tl.constexpr, PRECISION: tl.constexpr,
 ):  # fmt: skip
     """Acceleration of a block of points: springs pull back, dampers slow, the rest drives."""
@@ -64,6 +64,7 @@ def strain(
     y = silu(layer(y, say[0], say[1], H, H, H, PRECISION))
     y = layer(y, say[2], say[3], 9, H, MOST, PRECISION)
     v = tl.arange(0, MOST)[None, :]
-    y = tl.where(v < 3, -HARDEST * tl.sigmoid(y - 3), tl.where(v < 6, -HEAVIEST * tl.sigmoid(y - 2), y))
+    drive = tl.load(yields + i) * y
+    y = tl.where(v < 3, -HARDEST * tl.sigmoid(y - 3), tl.where(v < 6, -HEAVIEST * tl.sigmoid(y - 2), drive))
     a = weighed(record, r, p < n, y, ROWS, 9)
     store3(stress + 3 * i * n + p, n, scaled(10.0, a), p < n)

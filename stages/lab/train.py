@@ -169,7 +169,7 @@ class Job:
         trainee, options, part = self.trainee, self.options, self.team.rows(self.options.batch)
         self.clock = time.perf_counter() - trainee.elapsed
         roll, horizon, done = None, 0, self.progress()
-        with _asked_to_stop() as asked, tqdm(
+        with _asked_to_stop() as asked, _rounded(self.team.device), tqdm(
             total=1.0, bar_format="{l_bar}{bar}| {elapsed}", disable=not self.team.leads
         ) as bar:
             while done < 1 and not self.team.agreed(len(asked)):
@@ -220,6 +220,17 @@ def _asked_to_stop():
         yield asked
     finally:
         signal.signal(signal.SIGTERM, before)
+
+
+@contextmanager
+def _rounded(device: str):
+    """On a GPU, products of matrices as tf32 has them: what they lose is far below the noise of a batch."""
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("high" if device == "cuda" else before)
+    try:
+        yield
+    finally:
+        torch.set_float32_matmul_precision(before)
 
 
 @torch.no_grad()

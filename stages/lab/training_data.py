@@ -10,7 +10,7 @@ from typing import Any
 
 import h5py
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from stages.errors import InputError
@@ -20,6 +20,7 @@ from stages.models.world import World
 from stages.scene.files import sha256
 
 UNSEEN = 100  # scenes at the end of the last group that only choose among weights
+ASLEEP, AWHILE = 0.02, 5  # a scene whose points moved slower [m/s] for the last frames goes on as it ends
 
 
 @dataclass(frozen=True)
@@ -79,26 +80,38 @@ def recipe(folder: Path, names: Sequence[str]) -> list[dict]:
 
 
 class Pieces:
-    """Random pieces of scenes that lie in the memory of a device."""
+    """Random pieces of scenes that lie in the memory of a device.
+
+    Scenes that have come to rest are known for longer than they were simulated: they stay as they are.
+    """
 
     def __init__(self, motions: Motions, device: torch.device | str, model: Dynamics):
         self.motions = motions.to(device)
         self.world = self.motions.world()
         self.rest = model.rest(self.world)
+        self.asleep = asleep(self.motions)
 
     def draw(self, count: int, horizon: int, generator: torch.Generator, part: slice = slice(None)) -> Piece:
         """`count` random scenes from random frames on, for `horizon` frames after the first; a part of them."""
         points = self.motions.points
         frames = points.shape[1]
         row = torch.randint(len(points), (count,), generator=generator)
-        start = torch.randint(frames - horizon, (count,), generator=generator)
+        starts = torch.where(self.asleep[row], frames, frames - horizon)
+        start = (torch.rand(count, generator=generator, dtype=torch.float64) * starts).long()
         return self.take(row[part].to(points.device), start[part].to(points.device), horizon)
 
     def take(self, row: Tensor, start: Tensor, horizon: int) -> Piece:
         """Those scenes from those frames on; speeds are central differences, and 0 at frame 0, where all rest."""
         points, dt = self.motions.points, self.motions.dt
         frames = start[:, None] + torch.arange(1, horizon + 1, device=start.device)
-        truth = points[row[:, None], frames]
+        truth = points[row[:, None], frames.clamp_max(points.shape[1] - 1)]
         speed = (truth[:, 0] - points[row, (start - 1).clamp_min(0)]) / (2 * dt)
         speed = torch.where((start > 0)[:, None, None, None], speed, 0.0)
         return Piece(self.world[row], self.rest[row], points[row, start], speed, truth)
+
+
+def asleep(motions: Motions) -> Bool[Tensor, "b"]:
+    """Scenes that have come to rest at their end; on the CPU."""
+    last = motions.points[:, -AWHILE - 1 :]
+    speed = (last[:, 1:] - last[:, :-1]).norm(dim=-1).mean(1) / motions.dt
+    return (speed.flatten(1).amax(1) < ASLEEP).cpu()

@@ -47,7 +47,7 @@ class Team:
         """What number 0 says."""
         if self.size == 1:
             return value
-        said = torch.tensor(value, dtype=torch.float64, device=self.device)
+        said = torch.tensor(value, dtype=torch.float64)  # not on the device, for which the host would have to wait
         dist.broadcast(said, 0)
         return said.item()
 
@@ -63,7 +63,7 @@ def team(device: str, batch: int) -> Iterator[Team]:
         raise InputError(f"--batch {batch}: cannot be shared by {size} processes; take a multiple of {size}")
     if device == "cuda":
         torch.cuda.set_device(int(os.environ["LOCAL_RANK"]))
-    dist.init_process_group("nccl" if device == "cuda" else "gloo")
+    dist.init_process_group("cpu:gloo,cuda:nccl" if device == "cuda" else "gloo")
     try:
         yield Team(dist.get_rank(), size, device)
     finally:

@@ -31,6 +31,7 @@ SINK = 0.03  # deepest that a point may get into the floor or a wall [m]
 RISE = 1.0  # fastest that a body is pushed out from deeper [m/s]
 FASTEST, WILDEST = 8.0, 60.0  # speed [m/s] and spin [rad/s] are kept below
 HOLD = 0.05  # strongest grip of the floor [m/s]
+RIGID = 3.2e5  # E size / mass of the stiffest objects learned from [1/s^2]; what is stiffer bends less by the ratio
 
 
 class BodyState(NamedTuple):
@@ -52,6 +53,7 @@ class Scene:
     code: Float[Tensor, "b o h"]  # shape and material of an object, as the network sees it
     stiffness: Float[Tensor, "b o"]  # of the displacements [1/s^2]
     damping: Float[Tensor, "b o"]  # [1/s]
+    yields: Float[Tensor, "b o"]  # 1; less for what is stiffer than all that was learned from
 
 
 class Rates(NamedTuple):
@@ -86,19 +88,22 @@ class ForceField(Dynamics):
         return shape_of(world, half=TRITON and usual)  # reading neighbourhoods takes the longest of a step of many
 
     def informed(self, shape: Shape) -> Scene:
-        code = self._encode(shape)
+        w = shape.world
+        stiffest = RIGID * w.mass.clamp_min(1e-6) / shape.size.clamp_min(1e-6)
+        E = torch.minimum(w.E, stiffest)
+        code, yields = self._encode(shape, E), E / w.E  # linear elasticity: strain is stress over E
         if self.stress is None:
-            none = torch.zeros_like(shape.world.mass)
-            return Scene(shape, code, none, none)
-        return Scene(shape, code, *self.stress.springs(code))
+            none = torch.zeros_like(yields)
+            return Scene(shape, code, none, none, yields)
+        return Scene(shape, code, *self.stress.springs(code), yields)
 
-    def _encode(self, shape: Shape) -> Float[Tensor, "b o h"]:
+    def _encode(self, shape: Shape, E: Float[Tensor, "b o"]) -> Float[Tensor, "b o h"]:
         """From numbers that no rotation changes: points in any order, and the material."""
         w, size = shape.world, shape.size
         moments = (shape.principal * size[..., None] ** 2).log()
         mass = w.mass.clamp_min(1e-6)
-        stiffness = (w.E * size / mass).log() / 5  # square of a frequency
-        whole = torch.stack([size.log(), w.E.log10() - 5, w.nu, w.friction, mass.log(), stiffness], -1)
+        stiffness = (E * size / mass).log() / 5  # square of a frequency
+        whole = torch.stack([size.log(), E.log10() - 5, w.nu, w.friction, mass.log(), stiffness], -1)
         whole = torch.cat([whole, moments], -1)[:, :, None].expand(*shape.spacing.shape, -1)
         arm, normal = shape.arm / size[..., None, None], shape.normal
         each = [arm.norm(dim=-1), normal.norm(dim=-1), (arm * normal).sum(-1), shape.spacing / size[..., None]]
@@ -211,7 +216,7 @@ class ForceField(Dynamics):
             return Rates(force, torque, torch.zeros_like(touch), grip)
         inwards = moving.R.mT
         gravity, touch = apply(inwards, w.gravity[:, None]), apply(inwards[:, :, None], touch)
-        stress = self.stress(scene.shape, scene.code, state.u, state.du, touch, gravity)
+        stress = self.stress(scene.shape, scene.code, scene.yields, state.u, state.du, touch, gravity)
         return Rates(force, torque, stress, grip)
 
     def _contact(

@@ -185,8 +185,8 @@ class _Step:
             ROWS=ROWS, num_warps=2,
         )  # fmt: skip
         straining.strain[(self.objects, blocks)](
-            record, known, _layers(stress.see), _layers(stress.say[0], stress.say[2]), field, n, blocks, self.kinds,
-            HARDEST=HARDEST, HEAVIEST=HEAVIEST, **self.network,
+            record, known, scene.yields.contiguous(), _layers(stress.see), _layers(stress.say[0], stress.say[2]),
+            field, n, blocks, self.kinds, HARDEST=HARDEST, HEAVIEST=HEAVIEST, **self.network,
         )  # fmt: skip
         u, du = self._new(n, 3), self._new(n, 3)
         stiffness, damping = scene.stiffness.contiguous(), scene.damping.contiguous()

@@ -37,12 +37,13 @@ class Stress(nn.Module):
         return STIFFEST * stiffness, THICKEST * damping
 
     def forward(
-        self, shape: Shape, code: Float[Tensor, "b o h"], u: Float[Tensor, "b o n 3"], du: Float[Tensor, "b o n 3"],
-        touch: Float[Tensor, "b o n 3"], gravity: Float[Tensor, "b o 3"],
+        self, shape: Shape, code: Float[Tensor, "b o h"], yields: Float[Tensor, "b o"], u: Float[Tensor, "b o n 3"],
+        du: Float[Tensor, "b o n 3"], touch: Float[Tensor, "b o n 3"], gravity: Float[Tensor, "b o 3"],
     ) -> Float[Tensor, "b o n 3"]:  # fmt: skip
         """Acceleration in the object's frame [m/s^2], without any that would move or turn the whole.
 
-        `touch` is the acceleration at the points by contact, `gravity` as the object's axes see it.
+        `touch` is the acceleration at the points by contact, `gravity` as the object's axes see it; what does not
+        `yield` is driven less.
         """
         size = shape.size[..., None, None]
         share = shape.world.share[..., None]
@@ -59,6 +60,7 @@ class Stress(nn.Module):
                      self.own(code)[:, :, None])  # fmt: skip
         # only what vanishes at rest: an untouched body stays as it is; springs pull back and dampers slow
         pull, slow, drive = said.unflatten(-1, (3, SCALES)).unbind(-2)
+        drive = yields[..., None, None] * drive
         said = torch.cat([-HARDEST * torch.sigmoid(pull - 3), -HEAVIEST * torch.sigmoid(slow - 2), drive], -1)
         return projected(shape, 10 * weigh(said, moving))
 

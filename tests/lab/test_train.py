@@ -18,7 +18,7 @@ from ngff_cli.lab import app
 from stages.errors import InputError
 from stages.lab.motions import Motions, write_motions
 from stages.lab.train import TrainOptions, run, validate
-from stages.lab.training_data import Pieces, read_groups, split
+from stages.lab.training_data import Pieces, asleep, read_groups, split
 from stages.lab.training_roll import Roll, loss_of
 from stages.lab.training_state import LIMIT, WARM, Trainee
 from stages.models.pushes import Pushes
@@ -82,6 +82,20 @@ def test_pieces_never_reach_past_the_last_frame():
     pieces, rng = Pieces(falling(frames=5), "cpu", build("gcn", hidden=8)), torch.Generator().manual_seed(0)
     starts = {float(pieces.draw(1, 3, rng).speed[0, 0, 0, 2]) for _ in range(40)}
     assert len(starts) == 2  # frames 0 and 1 are all that leave 3 more
+
+
+def test_scenes_at_rest_go_on_as_they_are():
+    """One falls to its last frame, the other has stood still for all of the last ones."""
+    motions = falling(frames=12)[:2]
+    motions.points[1, 5:] = motions.points[1, 5:6]
+    assert asleep(motions).tolist() == [False, True]
+    pieces, rng = Pieces(motions, "cpu", build("gcn", hidden=8)), torch.Generator().manual_seed(0)
+    heights = pieces.draw(300, 9, rng).points[:, 0, 0, 2]
+    assert len(heights.unique()) == 3 + 6  # one starts in frames 0 to 2, the other also in those in which it rests
+    assert float((heights == motions.points[1, 11, 0, 0, 2]).float().mean()) > 0.2
+    late = pieces.take(torch.tensor([1]), torch.tensor([11]), 9)
+    assert_close(late.truth, motions.points[1:, 11:].expand(1, 9, 2, 8, 3))
+    assert not late.speed.any()
 
 
 def test_a_centimetre_in_one_coordinate_is_a_third_of_a_square_centimetre():

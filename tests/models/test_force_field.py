@@ -1,12 +1,13 @@
 """Our force field, untrained: what its construction promises whatever the weights are."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 
 from stages.geometry.rotations import matrix
-from stages.models.force_field import SINK, ForceField
+from stages.models.force_field import RIGID, SINK, ForceField
 from stages.models.pushes import Pushes
 from stages.models.shape import shape_of
 from stages.models.stress import projected
@@ -134,6 +135,24 @@ def test_an_untouched_body_stays_as_it_is():
     world = flying(velocity=NOWHERE, spin=NOWHERE)
     out = loud().rollout(World.of(world.points * torch.tensor([4.0, 1, 1]), gravity=NOWHERE, box=ROOMY), 100)
     assert (out == out[:, :1]).all() or (out - out[:, :1]).abs().max() < 1e-12
+
+
+@torch.no_grad()
+def test_what_is_stiffer_than_all_learned_from_bends_less_by_as_much():
+    """Linear elasticity; softer things are told apart by the network alone."""
+    model, world = ForceField(hidden=8).double().eval(), crowd(1, 1, 12)
+    stiffest = float(RIGID * world.mass[0, 0] / shape_of(world).size[0, 0])
+    touch = torch.randn(1, 1, 12, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    rest, gravity = torch.zeros_like(touch), torch.zeros(1, 1, 3, dtype=torch.float64)
+    bends = []
+    for E in (stiffest / 10, stiffest, 5 * stiffest, 1e4 * stiffest):
+        scene = model.prepare(replace(world, E=torch.full_like(world.E, E)))
+        bends.append(model.stress(scene.shape, scene.code, scene.yields, rest, rest, touch, gravity))
+    soft, usual, stiff, rigid = bends
+    assert not torch.allclose(soft, usual, rtol=1e-3)
+    torch.testing.assert_close(stiff, usual / 5)
+    torch.testing.assert_close(rigid, usual / 1e4)
+    assert usual.norm() > 1e-3
 
 
 @torch.no_grad()

@@ -50,7 +50,8 @@ def all_ways(model: ForceField, world, steps: int, prompt=None, pinned: bool = F
     single.load_state_dict(model.state_dict())
     shape = replace(scene.shape, world=scene.shape.world.to(torch.float32), blur=half)
     shape = replace(shape, **{k: getattr(shape, k).float() for k in ("arm", "normal", "spacing", "size", "inverse")})
-    scene = replace(scene, shape=shape, **{k: getattr(scene, k).float() for k in ("code", "stiffness", "damping")})
+    known = {k: getattr(scene, k).float() for k in ("code", "stiffness", "damping", "yields")}
+    scene = replace(scene, shape=shape, **known)
     pushes = replace(pushes, **{k: getattr(pushes, k).float() for k in ("force", "torque", "start", "end")})
     assert fused_step.fits(single, scene)
     plain, found = start, start

@@ -1,7 +1,8 @@
 """Photos kept out, as our Gaussians show them and as those of gsplat's default recipe do, after the same seconds.
 
 Both start from the same cameras and sparse points, learn from the same undistorted photos at the same size, and are
-judged by the same code on the photos kept out. Our time is that of all that follows structure from motion: depth maps,
+judged by the same code on the photos kept out; where there is nothing to see, ours is the photos' mean colour, theirs
+black or that, whichever suits it. Our time is that of all that follows structure from motion: depth maps,
 first Gaussians, and their fit. gsplat's schedule of 30,000 steps does not fit in it, so it is scaled to as many steps
 as do. How many is guessed from the speed of its first 100, and, when a run of so many ends far from the time, as
 Gaussians multiplied less or more than guessed, once more from that run; finding out is not counted as its time.
@@ -13,7 +14,7 @@ import json
 import logging
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TypeVar
@@ -40,6 +41,7 @@ from stages.scene.gaussians import Gaussians
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")
+BLACK = (0.0, 0.0, 0.0)
 FIRST = 100  # steps by which gsplat's first speed is told
 SLOWER = 0.5  # share of it that is left on the whole, as Gaussians multiply; a first guess
 LONGEST = 1.15  # share of our time after which gsplat's first run is cut off; one below the inverse is repeated too
@@ -106,7 +108,8 @@ def measure(name: str, images: Path, options: BenchOptions, device: str = "cuda"
     model = sfm.solve(photos, steps=steps)
     (steps.folder / "depth.pt").unlink(missing_ok=True)  # of an earlier run: making it is part of our time
     made, seconds = timed(lambda: classic.reconstruct(photos, wanted, steps))
-    ours = judged(made.scene.gaussians, made, seconds, wanted.steps(len(made.trained), device), device)
+    count = wanted.steps(len(made.trained), device)
+    ours = judged(made.scene.gaussians, made, made.scene.background, seconds, count, device)
     log.info("%s: ours %s; %s", name, ours, {k: round(v, 1) for k, v in steps.seconds.items()})
     theirs = by_gsplat(made, model, seconds, device, draw)
     facts = {"photos": len(photos), "trained": len(made.trained), "held_out": len(made.held)}
@@ -139,7 +142,8 @@ def by_gsplat(
         latest = time.perf_counter() + longest
         (gaussians, done), took = timed(lambda: train(steps, lambda _: time.perf_counter() < latest))  # noqa: B023
         log.info("gsplat: %d of %d steps in %.1f s, %d Gaussians", done, steps, took, len(gaussians))
-        side = judged(gaussians, made, took, done, device)
+        sides = [judged(gaussians, made, behind, took, done, device) for behind in (BLACK, made.scene.background)]
+        side = max(sides, key=lambda side: side.psnr)
         if done == steps and took > seconds / LONGEST:
             break
         steps = max(1, int(done * seconds / took))
@@ -163,9 +167,13 @@ def coloured(
     return points[seen], total[seen] / count[seen, None]
 
 
-def judged(gaussians: Gaussians, made: Reconstruction, seconds: float, steps: int, device: str = "cuda") -> Side:
-    fitted, _ = score(gaussians, made.views, made.held, device, exposed=True)
-    return Side(seconds, steps, len(gaussians), *score(gaussians, made.views, made.held, device), fitted)
+def judged(
+    gaussians: Gaussians, made: Reconstruction, background: Sequence[float], seconds: float, steps: int,
+    device: str = "cuda",
+) -> Side:  # fmt: skip
+    """With what to paint where there are no Gaussians."""
+    raw, fitted = (score(gaussians, made.views, made.held, device, exposed, background) for exposed in (False, True))
+    return Side(seconds, steps, len(gaussians), *raw, fitted[0])
 
 
 def timed(make: Callable[[], T]) -> tuple[T, float]:

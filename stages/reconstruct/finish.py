@@ -83,7 +83,7 @@ def finish(found: Found, options: ReconstructOptions, steps: Steps, device: str)
     facts = {"upright": upright_by, "supporting_plane": ground.plane is not None}
     scale = _scale(options, length and move.scale * length)
     floor = None if ground.plane is None else 0.0
-    scene = Scene(gaussians, cameras=views.cameras, floor=floor, scale=scale, provenance=facts)
+    scene = Scene(gaussians, (), views.cameras, floor, scale, facts, mean_colour(used))
     confirmed = torch.stack([(m.support >= least).float().mean() for m in found.maps])
     sharp = torch.tensor([sharpness(image) for image in used.images])
     advice = advise(views.cameras[found.trained], focus, confirmed, sharp, ground.plane is not None, found.dropped)
@@ -97,6 +97,13 @@ def filled_in(
     more = initialise.fill(views, maps, cloud, ground.plane, least, FAR * ground.radius)
     more = initialise.thin(more, options.level.gaussians // 4, ground.focus, ground.radius)
     return [initialise.to_gaussians(more, torch.full((len(more),), 0.5), 0)] if len(more) > 10 else []
+
+
+def mean_colour(views: Views) -> tuple[float, float, float]:
+    """Of all photos: the best guess at what none of them shows."""
+    each = [views.image(i).mean((0, 1)) for i in range(len(views))]
+    red, green, blue = torch.stack(each).mean(0).tolist()
+    return red, green, blue
 
 
 def _scale(options: ReconstructOptions, units: float | None) -> dict:

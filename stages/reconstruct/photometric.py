@@ -212,7 +212,8 @@ def _finished(fit: _Fit, views: Views, touched: Bool[Tensor, "n"], reach: float)
 
 
 def score(
-    gaussians: Gaussians, views: Views, index: list[int], device: str = "cpu", exposed: bool = False
+    gaussians: Gaussians, views: Views, index: list[int], device: str = "cpu", exposed: bool = False,
+    background: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> tuple[float, float]:
     """Mean PSNR [dB] and SSIM of the renders of these views against their photos.
 
@@ -224,8 +225,8 @@ def score(
         for i in index:
             photo, cameras = views.image(i, device), views.cameras[[i]]
             height, width = photo.shape[:2]
-            black = torch.zeros(3, device=device)
-            rendering = rasterise(gaussians, cameras.viewmats.to(device), cameras.Ks.to(device), width, height, black)
+            behind = torch.tensor(background, device=device)
+            rendering = rasterise(gaussians, cameras.viewmats.to(device), cameras.Ks.to(device), width, height, behind)
             image = rendering.rgb[0].clamp(0, 1)
             if exposed:
                 image = image * (image * photo).sum((0, 1)) / image.square().sum((0, 1)).clamp_min(1e-9)

@@ -79,9 +79,13 @@ def _key(photos: Photos, options: ReconstructOptions) -> str:
 def _report(photos: Photos, made: Reconstruction, steps: Steps, device: str) -> Report:
     from stages.reconstruct.photometric import score
 
-    scores = []
-    for index in (made.trained, made.held):
-        scores.append(Score(len(index), *score(made.scene.gaussians, made.views, index, device)) if index else None)
+    def judged(index: list[int]) -> Score | None:
+        if not index:
+            return None
+        scene = made.scene
+        return Score(len(index), *score(scene.gaussians, made.views, index, device, background=scene.background))
+
+    scores = judged(made.trained), judged(made.held)
     return Report(
         len(photos), len(made.views), made.dropped, len(made.scene.gaussians), *scores, steps.seconds, peak_memory(),
         made.advice,

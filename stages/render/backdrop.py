@@ -14,6 +14,7 @@ from stages.errors import InputError
 from stages.render.options import hex_colour
 from stages.scene.gaussians import Gaussians, concatenate
 from stages.scene.images import PHOTOS, read_image, resize
+from stages.scene.scene import Scene
 from stages.scene.scene_ply import read_scene
 
 log = logging.getLogger(__name__)
@@ -45,10 +46,10 @@ class Backdrop:
         return grown[top : top + height, left : left + width]
 
 
-def open_backdrop(choice: str | None) -> Backdrop:
+def open_backdrop(choice: str | None, scene: Scene) -> Backdrop:
     """From the value of --background; of a scene with objects only what belongs to none of them is taken."""
     if choice is None:
-        return Backdrop()
+        return Backdrop(colour=scene.background or WHITE)
     if choice.startswith("#"):
         return Backdrop(own=False, colour=hex_colour(choice))
     suffix = Path(choice).suffix.lower()

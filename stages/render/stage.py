@@ -33,9 +33,9 @@ def run(source: Path | Sequence[Path], out: Path | None, options: RenderOptions)
     sources = [Path(source)] if isinstance(source, (str, Path)) else [Path(s) for s in source]
     _check_count(sources, options)
     device = pick_device(options.device)
-    backdrop = open_backdrop(options.background)
-    takes = [Take(open_footage(s, options.frame, device), options, backdrop, device, name)
-             for s, name in zip(sources, _names(sources), strict=True)]  # fmt: skip
+    films = [open_footage(s, options.frame, device) for s in sources]
+    takes = [Take(footage, options, open_backdrop(options.background, footage.scene), device, name)
+             for footage, name in zip(films, _names(sources), strict=True)]  # fmt: skip
     studio = Studio(takes, options)
     out = Path(out) if out is not None else _beside(sources, studio)
     if out.suffix.lower() not in (".mp4", ".png", ".jpg"):

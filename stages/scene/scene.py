@@ -27,6 +27,7 @@ class Scene:
     floor: float | None = None  # height z of the supporting plane
     scale: dict = field(default_factory=lambda: {"metres_per_unit": 1.0, "source": "not stated"})
     provenance: dict = field(default_factory=dict)
+    background: tuple[float, float, float] | None = None  # RGB 0..1 seen where there is nothing
 
     @property
     def metres_per_unit(self) -> float:

@@ -90,9 +90,17 @@ def _with_header(path: Path, gaussians: Gaussians, comments: list[str]) -> Scene
             facts.get("floor", [None])[0],
             facts.get("scale", [{"metres_per_unit": 1.0, "source": "not stated in the file"}])[0],
             facts.get("provenance", [{}])[0],
+            _colour(facts.get("background", [None])[0]),
         )
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(f"{path}: a header comment of ngff is damaged ({error!r}); write the file again") from error
+
+
+def _colour(said: list | None) -> tuple[float, float, float] | None:
+    if said is None:
+        return None
+    red, green, blue = (min(max(float(x), 0.0), 1.0) for x in said)
+    return red, green, blue
 
 
 def write_scene(path: Path, scene: Scene) -> None:
@@ -116,6 +124,7 @@ def write_scene(path: Path, scene: Scene) -> None:
 
 def _header(scene: Scene) -> list[str]:
     facts = [("version", VERSION), ("up", [0, 0, 1]), ("scale", scene.scale), ("floor", scene.floor)]
+    facts += [("background", scene.background)] if scene.background else []
     facts += [("object", {"id": o.id, "name": o.name, "material": o.material}) for o in scene.objects]
     facts += [("camera", row) for row in (camera_json.to_json(scene.cameras) if scene.cameras else [])]
     facts += [("provenance", scene.provenance)]

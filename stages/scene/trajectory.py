@@ -1,6 +1,7 @@
 """traj.h5: how a scene moves, with all that `ngff render` needs to draw it.
 
-    attributes            format, version, fps, dt [s], gravity [units/s^2], up, units, engine, floor, scale, provenance
+    attributes            format, version, fps, dt [s], gravity [units/s^2], up, units, engine, scale, provenance, and
+                          where known floor, background (RGB 0..1, seen where there is nothing)
     gaussians/            means quats scales opacities sh object_id: the rest frame, as in memory
     objects/              id (O) name (O) material (O) com (T,O,3) rotation (T,O,4; w x y z, relative to rest)
     keypoints/            rest (P,3) object_id (P) positions (T,P,3)
@@ -173,6 +174,7 @@ def _write_rest(file: h5py.File, scene: Scene, motion: Motion, keypoints: Keypoi
         format=FORMAT, version=VERSION, fps=1 / motion.dt, dt=motion.dt, gravity=motion.gravity, up="z",
         units="scene units, seconds", engine=motion.engine, scale=json.dumps(scene.scale),
         provenance=json.dumps(scene.provenance), **({} if scene.floor is None else {"floor": scene.floor}),
+        **({} if scene.background is None else {"background": scene.background}),
     )  # fmt: skip
     for field in fields(Gaussians):
         value = getattr(scene.gaussians, field.name).cpu().numpy()
@@ -231,7 +233,8 @@ def _read(path: Path, file: h5py.File) -> Trajectory:
         cameras = Cameras(*(tensor(f"cameras/{n}") for n in ("viewmats", "Ks", "sizes")), tuple(names("cameras/names")))
     floor = float(file.attrs["floor"]) if "floor" in file.attrs else None
     scale = json.loads(file.attrs.get("scale", '{"metres_per_unit": 1.0, "source": "not stated"}'))
-    scene = Scene(gaussians, objects, cameras, floor, scale, json.loads(file.attrs.get("provenance", "{}")))
+    background = tuple(float(x) for x in file.attrs["background"]) if "background" in file.attrs else None
+    scene = Scene(gaussians, objects, cameras, floor, scale, json.loads(file.attrs.get("provenance", "{}")), background)
     gravity = tuple(float(g) for g in file.attrs["gravity"])
     forces = tuple(json.loads(f) for f in names("forces/json"))
     motion = Motion(float(file.attrs["dt"]), gravity, str(file.attrs["engine"]), forces)

@@ -102,7 +102,7 @@ def test_the_steps_fit_in_the_seconds(monkeypatch):
     scene, cameras = two_balls_scene(), ring(6)
     views = Views(tuple(torch.zeros(64, 64, 3, dtype=torch.uint8) for _ in range(6)), cameras)
     move = {"scale": 1.0, "rotation": torch.eye(3).tolist(), "translation": [0.0, 0.0, 0.0]}
-    scene = Scene(scene.gaussians, provenance={"upright": move})
+    scene = Scene(scene.gaussians, provenance={"upright": move}, background=(0.5, 0.5, 0.5))
     made = Reconstruction(scene, views, [1, 2, 3, 4, 5], [0], {}, [])
     seen = torch.zeros(1, dtype=torch.int64)
     model = SparseModel(cameras, Lenses(torch.zeros(6, 5)), torch.zeros(1, 3), seen, seen + 1)

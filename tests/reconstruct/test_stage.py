@@ -70,8 +70,10 @@ def test_photos_kept_out_look_right_too(made, capsys, caplog):
     folder, scene = made
     images = tuple((read_image(folder / "images" / n) * 255).round().to(torch.uint8) for n in scene.cameras.names)
     views = Views(images, scene.cameras)
-    held, _ = score(scene.gaussians, views, [3])
+    held, _ = score(scene.gaussians, views, [3], background=scene.background)
     assert held > 19
+    mean = torch.stack([image.float().mean((0, 1)) / 255 for image in images]).mean(0)
+    assert scene.background == pytest.approx(mean.tolist(), abs=0.02)
     assert scene.provenance["options"]["holdout"] == 3
 
 

@@ -129,6 +129,13 @@ def test_backgrounds_replace_the_surroundings_of_the_objects(scene, tmp_path, tw
     assert share(other, (1.0, 1.0, 1.0), 0.1) > 0.6 and share(other, RED) > 0.005
 
 
+def test_where_there_is_nothing_the_scene_says_what_to_show(tmp_path, two_balls):
+    blue, alone = (0.2, 0.4, 0.6), two_balls.gaussians[two_balls.gaussians.object_id > 0]
+    for background, colour in ((blue, blue), (None, (1.0, 1.0, 1.0))):
+        write_scene(tmp_path / "s.ply", replace(two_balls, gaussians=alone, background=background))
+        assert share(picture(tmp_path / "s.ply", tmp_path / "s.png", view="input:0"), colour, 0.01) > 0.6
+
+
 def test_ids_are_flat_and_keep_their_colours(scene, tmp_path):
     image = picture(scene, tmp_path / "ids.png", view="input:0", ids=True)
     first, second = palette(torch.tensor([1, 2]))

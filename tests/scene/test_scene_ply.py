@@ -23,11 +23,12 @@ def test_round_trip_of_gaussians(tmp_path, degree):
 
 
 def test_round_trip_of_facts(tmp_path, two_balls):
-    scene = dataclasses.replace(two_balls, scale={"metres_per_unit": 0.5, "source": "known"}, provenance={"seed": 1})
+    scale = {"metres_per_unit": 0.5, "source": "known"}
+    scene = dataclasses.replace(two_balls, scale=scale, provenance={"seed": 1}, background=(0.2, 0.4, 0.6))
     write_scene(tmp_path / "s.ply", scene)
     back = read_scene(tmp_path / "s.ply")
-    assert (back.objects, back.floor, back.scale, back.provenance) == (
-        scene.objects, scene.floor, scene.scale, scene.provenance)  # fmt: skip
+    for name in ("objects", "floor", "scale", "provenance", "background"):
+        assert getattr(back, name) == getattr(scene, name)
     torch.testing.assert_close(back.cameras.viewmats, scene.cameras.viewmats)
     assert back.cameras.names == scene.cameras.names
 

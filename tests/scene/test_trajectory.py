@@ -1,4 +1,5 @@
 import os
+from dataclasses import replace
 
 import h5py
 import pytest
@@ -25,11 +26,12 @@ def write(path, scene, frames: int = 3):
 
 
 def test_round_trip(tmp_path, two_balls):
-    write(tmp_path / "t.h5", two_balls)
+    write(tmp_path / "t.h5", replace(two_balls, background=(0.2, 0.4, 0.6)))
     t = read_trajectory(tmp_path / "t.h5")
     motion, keypoints, binding = parts(two_balls)
     assert len(t) == 3 and t.motion == motion
     assert t.scene.objects == two_balls.objects and t.scene.floor == 0.0
+    assert t.scene.background == (0.2, 0.4, 0.6)
     assert t.scene.cameras.names == two_balls.cameras.names
     assert torch.equal(t.scene.gaussians.means, two_balls.gaussians.means)
     assert torch.equal(t.positions[2], keypoints.rest + 0.2)

@@ -44,11 +44,11 @@ class OneSided(_Plain):
 class Unaware(_Plain):
     """All objects are of one stiffness, Poisson ratio and friction to the network; their mass it knows."""
 
-    def _encode(self, shape: Shape) -> Float[Tensor, "b o h"]:
+    def informed(self, shape: Shape) -> Scene:
         w = shape.world
         same = replace(w, E=torch.full_like(w.E, 1e5), nu=torch.full_like(w.nu, 0.3),
                        friction=torch.full_like(w.friction, 0.5))  # fmt: skip
-        return super()._encode(replace(shape, world=same))
+        return replace(super().informed(replace(shape, world=same)), shape=shape)
 
 
 class _NoImpulses(Touch):

@@ -156,12 +156,18 @@ def train(
     steps: Annotated[int, typer.Option(help="budget in steps of the optimizer instead; 0: minutes count")] = 0,
     batch: Annotated[int, typer.Option(help="scenes a step")] = 32,
     keypoints: Annotated[int, typer.Option(help="of each object")] = 256,
+    few: Annotated[int, typer.Option(help="of each object in every fourth step instead; 0: never")] = 0,
     lr: Annotated[float, typer.Option(help="highest learning rate")] = 1e-3,
-    hidden: Annotated[int, typer.Option(help="width of the network; 0: the model's own")] = 0,
+    hidden: Annotated[int, typer.Option(help="width of the network, also wider than --from; 0: its own")] = 0,
     horizons: Annotated[str, typer.Option(help="frames to roll out in each phase")] = "8,20,40",
     loss: Annotated[
-        str, typer.Option(help="square: squared error | scene: RMSE of a scene | axes: RMSE of an object's axis")
-    ] = "scene",
+        str,
+        typer.Option(help="square: squared error | scene: RMSE of a scene | axes: RMSE of an object's axis | "
+                     "relative: the same against how much there is of motion"),
+    ] = "scene",  # fmt: skip
+    speeds: Annotated[
+        float, typer.Option(help="errors of speeds count as of places so much later [s]; 0: they do not")
+    ] = 0.0,
     memory: Annotated[float, typer.Option(help="share of a gradient that goes back by another frame")] = 0.9,
     groups: Annotated[str, typer.Option(help="of scenes; the last 100 choose the best weights")] = "3_0..3_8",
     compiled: Annotated[bool, typer.Option("--compiled", help="compile a step first; for GPUs")] = False,
@@ -176,8 +182,9 @@ def train(
     from stages.lab.train import TrainOptions, run
 
     options = TrainOptions(
-        minutes, steps, batch, keypoints, lr, horizons, hidden, loss, memory, groups, compiled, seed, device
-    )
+        minutes, steps, batch, keypoints, few, lr, horizons, hidden, loss, speeds, memory, groups, compiled, seed,
+        device,
+    )  # fmt: skip
     for line in run(model, data, out, options, resume, start):
         print(line)
 

@@ -80,7 +80,7 @@ def _measured(choice: Choice, data: Path, base: TrainOptions, test: list[str], d
     torch.manual_seed(options.seed)
     trainee = Trainee(choice.network().to(device), options.lr, options.seed)
     with tempfile.TemporaryDirectory() as folder:
-        pieces = Pieces(known, device, trainee.model)
+        pieces = [Pieces(known, device, trainee.model)]
         job = Job(trainee, pieces, unseen.to(device), options, Team(device=device), Path(folder) / "weights", {})
         if not job.run():
             raise InputError("stopped; choices measured so far are kept, the same command goes on with the next")

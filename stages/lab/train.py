@@ -9,7 +9,7 @@ import signal
 import sys
 import time
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import torch
@@ -24,6 +24,8 @@ from stages.lab.training_data import UNSEEN, Pieces, read_groups, recipe, split
 from stages.lab.training_roll import LOSSES, Roll
 from stages.lab.training_state import Trainee
 from stages.lab.training_team import Team, team
+from stages.lab.widen import widened
+from stages.models.dynamics import Dynamics
 from stages.models.weights import build, load, save
 from stages.scene.files import ngff_version
 
@@ -33,6 +35,7 @@ LINE = (
     "{minutes:6.1f} min {step:7d} steps  horizon {horizon:2d}  loss {loss:.4f}  "
     "RMSE {RMSE:.4f}  FPE {FPE:.4f}  R {R:.3f}"
 )
+FOURTH = 4  # steps after which there is one with few keypoints
 FRAMES = 80  # of the rollouts that choose the weights
 
 
@@ -44,10 +47,12 @@ class TrainOptions:
     steps: int = 0  # the budget in steps of the optimizer instead, when not 0: the same on every machine
     batch: int = 32  # scenes a step
     keypoints: int = 256  # of an object
+    few: int = 0  # of an object in every fourth step instead, so that the model bears other numbers of them; 0: never
     lr: float = 1e-3  # highest rate
     horizons: str = "8,20,40"  # frames that a rollout goes on for, one phase each
     hidden: int = 0  # width of the network; 0: the model's own
     loss: str = "scene"  # one of training_roll.LOSSES
+    speeds: float = 0.0  # an error of a speed counts as one of the place so much later [s]; 0: not at all
     memory: float = 0.9  # share of a gradient that goes back by another frame
     groups: str = "3_0..3_8"  # files to learn from; the last scenes of the last choose the best weights
     compiled: bool = False  # compile a step first: a minute or so, then faster; for GPUs
@@ -58,6 +63,10 @@ class TrainOptions:
     def __post_init__(self):
         if self.minutes <= 0 or self.steps < 0 or min(self.batch, self.keypoints) < 1 or self.lr <= 0:
             raise InputError("--minutes, --batch, --keypoints and --lr must be positive, --steps at least 0")
+        if not 0 <= self.few <= self.keypoints:
+            raise InputError(f"--few {self.few}: must be between 0 and --keypoints")
+        if self.speeds < 0:
+            raise InputError(f"--speeds {self.speeds}: a time in seconds, or 0")
         if not 0 <= self.memory <= 1:
             raise InputError(f"--memory {self.memory}: must be between 0 and 1")
         if self.loss not in LOSSES:
@@ -106,7 +115,7 @@ def run(
         if crew.leads:
             log.info("%s, %s parameters: learns from %d scenes, chosen by %d", model,
                      f"{sum(p.numel() for p in trainee.params):,}", len(known), len(unseen))  # fmt: skip
-        pieces = Pieces(known, crew.device, trainee.model)
+        pieces = [Pieces(part, crew.device, trainee.model) for part in _seen(known, options.few)]
         job = Job(trainee, pieces, unseen.to(crew.device), options, crew, out, _key(model, options, before))
         finished = job.run()
         if not crew.leads:
@@ -125,6 +134,11 @@ def run(
             f"unseen scenes, after {best['minutes']:.1f} of {trainee.elapsed / 60:.1f} min{ended}"]  # fmt: skip
 
 
+def _seen(motions: Motions, few: int) -> list[Motions]:
+    """The motions, and the same with few keypoints if that is wanted."""
+    return [motions, replace(motions, points=motions.points[:, :, :, :few].clone())] if few else [motions]
+
+
 def _trainee(
     model: str, out: Path, options: TrainOptions, device: str, resume: bool, start: Path | None
 ) -> tuple[Trainee, dict]:
@@ -135,10 +149,14 @@ def _trainee(
         network = build(model, **({"hidden": options.hidden} if options.hidden else {})).to(device)
     else:
         network, card = load(start, device)
+        if options.hidden and card["model"] == model == "ngff":
+            network = widened(network, options.hidden)
         if card["model"] != model or options.hidden not in (0, network.config.get("hidden")):
             raise InputError(f"{start}: holds {card['model']} {network.config}, not what is to be trained; leave "
                              "--hidden out and name weights of the same model")  # fmt: skip
         before = {"before": {k: v for k, v in card.items() if k not in ("model", "config")}}
+    if options.speeds and type(network).speed is Dynamics.speed:
+        raise InputError(f"--speeds: {model} does not tell how fast keypoints are; leave the option out")
     trainee = Trainee(network, options.lr, options.seed)
     if resume:
         trainee.load(out.with_suffix(".ckpt"), _key(model, options, before))
@@ -157,7 +175,7 @@ class Job:
     """One run of training, by one process or several."""
 
     trainee: Trainee
-    pieces: Pieces
+    pieces: list[Pieces]  # the usual ones; what every fourth step learns from
     unseen: Motions
     options: TrainOptions
     team: Team
@@ -168,20 +186,20 @@ class Job:
         """Go on until the budget is used up (True) or somebody asks to stop (False)."""
         trainee, options, part = self.trainee, self.options, self.team.rows(self.options.batch)
         self.clock = time.perf_counter() - trainee.elapsed
-        roll, horizon, done = None, 0, self.progress()
+        rolls, horizon, done = [], 0, self.progress()
         with _asked_to_stop() as asked, _rounded(self.team.device), tqdm(
             total=1.0, bar_format="{l_bar}{bar}| {elapsed}", disable=not self.team.leads
         ) as bar:
             while done < 1 and not self.team.agreed(len(asked)):
                 if options.horizon(done) != horizon:
-                    roll, horizon = None, options.horizon(done)  # the memory of the old graph goes first
-                    dt = self.pieces.motions.dt
-                    roll = Roll(trainee.model, dt, options.loss, options.memory, compiled=options.compiled)
+                    rolls, horizon = [], options.horizon(done)  # the memory of the old graphs goes first
+                    rolls = [self.roll(pieces) for pieces in self.pieces]
                     trainee.anew(horizon)
-                loss, grads = roll(self.pieces.draw(options.batch, horizon, trainee.generator, part))
-                *grads, loss = self.team.mean([*grads, loss.clone()])  # a graph writes the next loss in the same place
+                turn = -1 if trainee.step % FOURTH == 0 else 0
+                loss, grads = rolls[turn](self.pieces[turn].draw(options.batch, horizon, trainee.generator, part))
+                *grads, loss = self.team.mean([*grads, loss])
                 trainee.update(grads, options.rate(done))
-                trainee.losses.append(loss)
+                trainee.losses.append(loss.clone())  # a graph writes the next one in the same place
                 before, done = done, self.progress()
                 if math.floor(done * options.checks) > math.floor(before * options.checks):
                     self.check(horizon)
@@ -192,6 +210,11 @@ class Job:
         if self.team.leads:
             trainee.save(self.out.with_suffix(".ckpt"), self.key)
         return done >= 1
+
+    def roll(self, pieces: Pieces) -> Roll:
+        options = self.options
+        return Roll(self.trainee.model, pieces.motions.dt, options.loss, options.memory, compiled=options.compiled,
+                    speeds=options.speeds)  # fmt: skip
 
     def progress(self) -> float:
         """Share of the budget that is used up."""

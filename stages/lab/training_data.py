@@ -20,6 +20,7 @@ from stages.models.world import World
 from stages.scene.files import sha256
 
 UNSEEN = 100  # scenes at the end of the last group that only choose among weights
+CALM = 0.3  # usual change of speed from frame to frame [m/s] above which the speed between is not to be told
 ASLEEP, AWHILE = 0.02, 5  # a scene whose points moved slower [m/s] for the last frames goes on as it ends
 
 
@@ -32,6 +33,7 @@ class Piece:
     points: Float[Tensor, "b o n 3"]  # where they start [m]
     speed: Float[Tensor, "b o n 3"]  # [m/s]
     truth: Float[Tensor, "b t o n 3"]  # the frames after the start [m]
+    spread: Float[Tensor, "b o 3"]  # of the points of an object about their mean in time, in the whole motion [m]
 
 
 def home(folder: Path) -> Path:
@@ -82,7 +84,8 @@ def recipe(folder: Path, names: Sequence[str]) -> list[dict]:
 class Pieces:
     """Random pieces of scenes that lie in the memory of a device.
 
-    Scenes that have come to rest are known for longer than they were simulated: they stay as they are.
+    They begin where speeds are known: not amid an impact, where central differences are far from them. Scenes that
+    have come to rest are known for longer than they were simulated: they stay as they are.
     """
 
     def __init__(self, motions: Motions, device: torch.device | str, model: Dynamics):
@@ -90,14 +93,17 @@ class Pieces:
         self.world = self.motions.world()
         self.rest = model.rest(self.world)
         self.asleep = asleep(self.motions)
+        self.calm = calm(self.motions).cumsum(1)
+        self.spread = spread(self.motions)
 
     def draw(self, count: int, horizon: int, generator: torch.Generator, part: slice = slice(None)) -> Piece:
         """`count` random scenes from random frames on, for `horizon` frames after the first; a part of them."""
         points = self.motions.points
         frames = points.shape[1]
         row = torch.randint(len(points), (count,), generator=generator)
-        starts = torch.where(self.asleep[row], frames, frames - horizon)
-        start = (torch.rand(count, generator=generator, dtype=torch.float64) * starts).long()
+        starts = self.calm[row, torch.where(self.asleep[row], frames, frames - horizon) - 1]
+        which = (torch.rand(count, generator=generator, dtype=torch.float64) * starts).long()
+        start = torch.searchsorted(self.calm[row], which[:, None], right=True)[:, 0]
         return self.take(row[part].to(points.device), start[part].to(points.device), horizon)
 
     def take(self, row: Tensor, start: Tensor, horizon: int) -> Piece:
@@ -107,7 +113,7 @@ class Pieces:
         truth = points[row[:, None], frames.clamp_max(points.shape[1] - 1)]
         speed = (truth[:, 0] - points[row, (start - 1).clamp_min(0)]) / (2 * dt)
         speed = torch.where((start > 0)[:, None, None, None], speed, 0.0)
-        return Piece(self.world[row], self.rest[row], points[row, start], speed, truth)
+        return Piece(self.world[row], self.rest[row], points[row, start], speed, truth, self.spread[row])
 
 
 def asleep(motions: Motions) -> Bool[Tensor, "b"]:
@@ -115,3 +121,18 @@ def asleep(motions: Motions) -> Bool[Tensor, "b"]:
     last = motions.points[:, -AWHILE - 1 :]
     speed = (last[:, 1:] - last[:, :-1]).norm(dim=-1).mean(1) / motions.dt
     return (speed.flatten(1).amax(1) < ASLEEP).cpu()
+
+
+def spread(motions: Motions) -> Float[Tensor, "b o 3"]:
+    """How far the points of each object are from their mean in time, as a root of mean squares along each axis [m]."""
+    return torch.stack([x.var(0, correction=0).mean(1).sqrt() for x in motions.points])
+
+
+def calm(motions: Motions) -> Bool[Tensor, "b t"]:
+    """Frames in which no object is changing its speed abruptly; on the CPU."""
+    rows = []
+    for x in motions.points:
+        change = torch.zeros(x.shape[:2], device=x.device)
+        change[1:-1] = (x[2:] - 2 * x[1:-1] + x[:-2]).square().sum(-1).mean(-1).sqrt() / motions.dt
+        rows.append(change.amax(1) < CALM)
+    return torch.stack(rows).cpu()

@@ -13,34 +13,55 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from stages.lab.training_data import Piece
+from stages.lab.training_data import CALM, Piece
 from stages.models.dynamics import Dynamics
 from stages.models.pushes import Pushes
 from stages.models.trees import rebuilt, tensors
 
 log = logging.getLogger(__name__)
 UNIT = 0.01  # errors count in centimetres: gradients of order one
-LOSSES = ("square", "scene", "axes")
+LOSSES = ("square", "scene", "axes", "relative")
 FINE = 0.1  # errors below a millimetre no longer matter to the root [UNIT]
+LITTLE, USUAL = 1.0, 5.0  # motion that an error is measured against is at least so much; so much is usual [UNIT]
 
 
 def loss_of(
-    predicted: Float[Tensor, "b t o n 3"], truth: Float[Tensor, "b t o n 3"], valid: Bool[Tensor, "b o n"], kind: str
-) -> Float[Tensor, ""]:
+    predicted: Float[Tensor, "b t o n 3"], truth: Float[Tensor, "b t o n 3"], valid: Bool[Tensor, "b o n"], kind: str,
+    spread: Float[Tensor, "b o 3"],
+) -> Float[Tensor, ""]:  # fmt: skip
     """Error of the keypoints that are there, one of LOSSES.
 
     "square" is the mean squared coordinate error [cm^2], "scene" the mean RMSE of a scene [cm], and "axes" the mean
-    RMSE of each axis of each object [cm], in which little motion counts as much as the fall.
+    RMSE of each axis of each object [cm], in which little motion counts as much as the fall; in "relative" it is
+    measured against how much there is along that axis in the whole motion, as the correlation R measures it.
     """
     squared = ((predicted - truth) / UNIT).square().mean(1)
     squared = torch.where(valid[..., None], squared, 0.0)
-    if kind == "axes":
+    if kind in ("axes", "relative"):
         count = valid.sum(2)
         each = squared.sum(2) / count.clamp_min(1)[..., None]
         root = (each + FINE**2).sqrt()
+        if kind == "relative":
+            root = root * (USUAL / (LITTLE + spread / UNIT))
         return (root.mean(-1) * (count > 0)).sum() / (count > 0).sum().clamp_min(1)
     each = squared.mean(-1).sum((1, 2)) / valid.sum((1, 2)).clamp_min(1)
     return (each + FINE**2).sqrt().mean() if kind == "scene" else each.mean()
+
+
+def speed_loss(
+    predicted: Float[Tensor, "b t o n 3"], points: Float[Tensor, "b t+1 o n 3"], valid: Bool[Tensor, "b o n"],
+    kind: str, spread: Float[Tensor, "b o 3"], dt: float, time: float,
+) -> Float[Tensor, ""]:  # fmt: skip
+    """Error of speeds in all frames but the last, as of places `time` [s] later; `points` begin a frame earlier.
+
+    A step that undoes what the one before did goes unseen in places. The truth are central differences, which mean
+    nothing amid an impact: such frames of an object do not count.
+    """
+    truth = (points[:, 2:] - points[:, :-2]) / (2 * dt)
+    change = (points[:, 2:] - 2 * points[:, 1:-1] + points[:, :-2]).square().sum(-1)
+    change = torch.where(valid[:, None], change, 0.0).sum(-1) / valid.sum(-1).clamp_min(1)[:, None]
+    known = (change < (CALM * dt) ** 2)[..., None, None]
+    return loss_of(torch.where(known, time * predicted[:, :-1], time * truth), time * truth, valid, kind, spread)
 
 
 class Roll:
@@ -51,9 +72,9 @@ class Roll:
 
     def __init__(
         self, model: Dynamics, dt: float, loss: str = "square", memory: float = 1.0, graph: bool = True,
-        compiled: bool = False,
+        compiled: bool = False, speeds: float = 0.0,
     ):  # fmt: skip
-        self.model, self.dt, self.loss, self.memory = model, dt, loss, memory
+        self.model, self.dt, self.loss, self.memory, self.speeds = model, dt, loss, memory, speeds
         self.advance = torch.compile(_advance, fullgraph=True, dynamic=False) if compiled else _advance
         self.compiling = compiled
         self.params = [p for p in model.parameters() if p.requires_grad]
@@ -64,7 +85,7 @@ class Roll:
         scene = self.model.informed(piece.rest)
         with torch.no_grad():
             state = self.model.observe(scene, piece.points, piece.speed)
-        given = (scene, state, piece.truth, piece.world.valid)
+        given = (scene, state, piece.points, piece.truth, piece.world.valid, piece.spread)
         if self.compiling:
             self._check(given)
             self.compiling = False
@@ -81,7 +102,7 @@ class Roll:
 
     def _walk(self, given: tuple) -> tuple[Tensor, list[Tensor | None]]:
         """Loss, and gradients of the parameters, then of what was prepared."""
-        scene, state, truth, valid = given
+        scene, state, start, truth, valid, spread = given
         free = [x.detach().requires_grad_(x.requires_grad) for x in tensors(scene)]
         scene = rebuilt(scene, iter(free))
         # so that the first step is like the others to a compiler
@@ -90,10 +111,14 @@ class Roll:
         frames = []
         for _ in range(truth.shape[1]):
             state = rebuilt(state, (torch.lerp(x.detach(), x, self.memory) for x in tensors(state)))
-            *moved, points = self.advance(self.model, scene, state, self.dt, pushes)
+            moved = self.advance(self.model, scene, state, self.dt, pushes, self.speeds > 0)
             state = rebuilt(state, iter(moved))
-            frames.append(points)
-        loss = loss_of(torch.stack(frames, 1), truth, valid, self.loss)
+            frames.append(moved[len(state):])
+        points, *speed = (torch.stack(x, 1) for x in zip(*frames, strict=True))
+        loss = loss_of(points, truth, valid, self.loss, spread)
+        if speed:
+            known = torch.cat([start[:, None], truth], 1)
+            loss = loss + speed_loss(*speed, known, valid, self.loss, spread, self.dt, self.speeds)
         wanted = self.params + [x for x in free if x.requires_grad]
         return loss.detach(), list(torch.autograd.grad(loss, wanted, allow_unused=True))
 
@@ -142,13 +167,15 @@ class Roll:
             log.info("no CUDA graph, going on step by step: %s", str(error).splitlines()[0])
 
 
-def _advance(model: Dynamics, scene: Any, state: tuple, dt: float, pushes: Pushes) -> tuple[Tensor, ...]:
-    """The tensors of the next state and where its points are; without pushes the time does not matter.
+def _advance(
+    model: Dynamics, scene: Any, state: tuple, dt: float, pushes: Pushes, speeds: bool
+) -> tuple[Tensor, ...]:
+    """The tensors of the next state, where its points are and perhaps how fast; without pushes the time is nothing.
 
     One flat tuple: PyTorch 2.11 compiles a named tuple that comes out of a `_replace` to an empty one.
     """
     state = model.step(scene, state, 0.0, dt, pushes)
-    return (*state, model.points(scene, state))
+    return (*state, model.points(scene, state), *([model.speed(scene, state)] if speeds else []))
 
 
 def _sum(like: Tensor, a: Tensor | None, b: Tensor | None) -> Tensor:

@@ -61,6 +61,10 @@ class Dynamics(nn.Module, ABC):
     def points(self, scene: Any, state: tuple) -> Float[Tensor, "b o n 3"]:
         """Where the keypoints are in a state [m]."""
 
+    def speed(self, scene: Any, state: tuple) -> Float[Tensor, "b o n 3"]:
+        """How fast the keypoints are in a state [m/s]; not every model has to know."""
+        raise NotImplementedError(f"{type(self).__name__} does not tell how fast keypoints are")
+
     def step(self, scene: Any, state: tuple, t: Tensor | float, dt: float, pushes: Pushes) -> tuple:
         """The state dt [s] later. Unless a model knows better: one explicit Euler step."""
         rate = self.derivative(scene, t, state, pushes)
@@ -132,6 +136,9 @@ class PointDynamics(Dynamics):
 
     def points(self, world: World, state: PointState) -> Float[Tensor, "b o n 3"]:
         return state.position
+
+    def speed(self, world: World, state: PointState) -> Float[Tensor, "b o n 3"]:
+        return state.velocity
 
 
 def free(world: World, pushes: Pushes) -> Bool[Tensor, "b o n 1"]:

@@ -71,8 +71,9 @@ def halve(path: Path) -> None:
 
 
 def minutes(card: Mapping) -> float:
-    """Of training, that of the weights it began with included."""
-    return float(card["minutes"]) + (minutes(card["before"]) if "before" in card else 0.0)
+    """Of one processor's training, that of the weights it began with included."""
+    own = float(card["minutes"]) * card.get("processes", 1)
+    return own + (minutes(card["before"]) if "before" in card else 0.0)
 
 
 def write_card(path: Path, card: Mapping) -> None:

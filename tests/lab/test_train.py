@@ -18,9 +18,10 @@ from ngff_cli.lab import app
 from stages.errors import InputError
 from stages.lab.motions import Motions, write_motions
 from stages.lab.train import TrainOptions, run, validate
-from stages.lab.training_data import Pieces, asleep, read_groups, split
-from stages.lab.training_roll import Roll, loss_of
+from stages.lab.training_data import CALM, Pieces, asleep, calm, read_groups, split, spread
+from stages.lab.training_roll import Roll, loss_of, speed_loss
 from stages.lab.training_state import LIMIT, WARM, Trainee
+from stages.lab.widen import widened
 from stages.models.pushes import Pushes
 from stages.models.weights import MODELS, build, load
 from stages.models.world import BOX, GRAVITY
@@ -98,15 +99,65 @@ def test_scenes_at_rest_go_on_as_they_are():
     assert not late.speed.any()
 
 
+def test_pieces_do_not_begin_amid_an_impact():
+    """A ball that is hit between two frames: in those two, central differences are far from any speed it had."""
+    motions = falling(frames=12)[:1]
+    hit = torch.arange(12)[:, None, None, None] * torch.tensor([0.0, 0.0, 0.02])
+    motions.points[:] = motions.points[:, :1] + torch.where(torch.arange(12)[:, None, None, None] < 5, 0.0, hit - 0.09)
+    assert calm(motions)[0].tolist() == [t not in (4, 5) for t in range(12)]
+    pieces, rng = Pieces(motions, "cpu", build("gcn", hidden=8)), torch.Generator().manual_seed(0)
+    speeds = pieces.draw(200, 3, rng).speed[:, 0, 0, 2]
+    for speed in speeds.unique():
+        assert min(abs(float(speed)), abs(float(speed) - 1.0)) < 1e-5
+    assert (speeds > 0.5).any() and (speeds < 0.5).any()
+
+
+def test_the_spread_of_an_object_is_that_of_its_points_over_time():
+    motions = falling(frames=9)[:2]
+    x = motions.points[1, :, 1]
+    assert_close(spread(motions)[1, 1], (x - x.mean(0)).square().mean((0, 1)).sqrt())
+
+
 def test_a_centimetre_in_one_coordinate_is_a_third_of_a_square_centimetre():
     truth = torch.zeros(1, 2, 2, 4, 3)
     valid = torch.tensor([[[True] * 4, [False] * 4]])
     predicted = truth.clone()
     predicted[:, :, 0, :, 2] = 0.01
     predicted[:, :, 1] = 7.0  # padding does not count
-    assert_close(loss_of(predicted, truth, valid, "square"), torch.tensor(1 / 3))
-    assert_close(loss_of(predicted, truth, valid, "scene"), torch.tensor((1 / 3 + 0.01) ** 0.5))
-    assert_close(loss_of(predicted, truth, valid, "axes"), torch.tensor((0.1 + 0.1 + 1.01**0.5) / 3))
+    spread = torch.tensor([[[0.0, 0.0, 0.04], [0.0, 0.0, 0.0]]])
+    assert_close(loss_of(predicted, truth, valid, "square", spread), torch.tensor(1 / 3))
+    assert_close(loss_of(predicted, truth, valid, "scene", spread), torch.tensor((1 / 3 + 0.01) ** 0.5))
+    assert_close(loss_of(predicted, truth, valid, "axes", spread), torch.tensor((0.1 + 0.1 + 1.01**0.5) / 3))
+    relative = loss_of(predicted, truth, valid, "relative", spread)  # to 1 cm more than the spread, 5 cm being usual
+    assert_close(relative, torch.tensor((0.1 * 5 + 0.1 * 5 + 1.01**0.5) / 3))
+
+
+def test_steps_that_undo_each_other_are_seen_in_speeds_alone():
+    """Speeds of 1 m/s that change their sign each frame move nothing. A frame amid an impact does not count."""
+    points = torch.zeros(1, 7, 1, 4, 3)
+    valid, spread = torch.ones(1, 1, 4, dtype=torch.bool), torch.zeros(1, 1, 3)
+    ringing = torch.zeros(1, 6, 1, 4, 3)
+    ringing[..., 0] = (-1.0) ** torch.arange(6)[None, :, None, None]
+    assert speed_loss(0 * ringing, points, valid, "square", spread, DT, 0.1) == 0
+    assert_close(speed_loss(ringing, points, valid, "square", spread, DT, 0.1), torch.tensor(10.0**2 / 3))
+    points[:, 4:, ..., 2] = 2 * CALM * DT * torch.arange(3)[None, :, None, None] + CALM * DT * 2  # hit after frame 3
+    free = torch.zeros(1, 6, 1, 4, 3)
+    free[:, 3:, ..., 2] = 2 * CALM
+    assert_close(speed_loss(free, points, valid, "square", spread, DT, 0.1), torch.tensor(0.0), rtol=0, atol=1e-5)
+
+
+def test_what_is_widened_does_the_same_and_learns_with_all_it_gained():
+    torch.manual_seed(0)
+    narrow = build("ngff", hidden=8).eval()
+    wide = widened(narrow, 16)
+    pieces = Pieces(without_last(falling()), "cpu", narrow)
+    piece = pieces.take(torch.tensor([0, 3]), torch.tensor([0, 5]), 4)
+    (was, _), (loss, grads) = Roll(narrow, DT)(piece), Roll(wide, DT)(piece)
+    assert_close(loss, was)
+    new = dict(zip((name for name, _ in wide.named_parameters()), grads, strict=True))["planes.say.2.weight"]
+    assert new.shape[1] == 16 and (new[:, 8:].abs().sum(0) > 0).all()
+    with pytest.raises(InputError, match="can only be widened"):
+        widened(wide, 8)
 
 
 @pytest.mark.parametrize("name", MODELS)
@@ -118,7 +169,7 @@ def test_gradients_are_those_of_the_rollout(name):
     piece = pieces.take(torch.tensor([0, 3]), torch.tensor([0, 5]), 3)
     loss, grads = Roll(model, DT)(piece)
     predicted = model.rollout(piece.world, 4, DT, start=(piece.points, piece.speed))[:, 1:]
-    whole = loss_of(predicted, piece.truth, piece.world.valid, False)
+    whole = loss_of(predicted, piece.truth, piece.world.valid, "square", piece.spread)
     whole.backward()
     assert_close(loss, whole.detach())
     assert sum(float(g.abs().sum()) for g in grads) > 0
@@ -346,6 +397,8 @@ def test_an_rmse_that_is_not_finite_is_the_worst():
         ({"horizons": "3,8"}, "6 frames"),
         ({"horizons": "8,x"}, "--horizons"),
         ({"lr": 0.0}, "--lr"),
+        ({"few": 9}, "--few"),
+        ({"speeds": -0.1}, "--speeds"),
     ],
 )
 def test_what_cannot_be_trained_on_is_said(data, tmp_path, change, message):
@@ -354,9 +407,28 @@ def test_what_cannot_be_trained_on_is_said(data, tmp_path, change, message):
     assert not (tmp_path / "a.safetensors").exists()
 
 
+def test_a_model_that_tells_no_speeds_is_not_asked_for_them(data, tmp_path):
+    with pytest.raises(InputError, match="does not tell how fast"):
+        run("ngff-paper", data, tmp_path / "a.safetensors", replace(QUICK, speeds=0.1))
+
+
+def test_every_fourth_step_sees_few_keypoints(data, tmp_path, monkeypatch):
+    seen, draw = [], Pieces.draw
+
+    def watched(self, *args):
+        piece = draw(self, *args)
+        seen.append(piece.points.shape[2])
+        return piece
+
+    monkeypatch.setattr(Pieces, "draw", watched)
+    run("ngff", data, tmp_path / "a.safetensors", replace(QUICK, steps=6, few=4, speeds=0.1))
+    assert seen == [4, 8, 8, 8, 4, 8]
+
+
 def test_the_command_trains(data, tmp_path):
     out = tmp_path / "gcn.safetensors"
-    words = f"--steps 2 --batch 2 --keypoints 8 --horizons 2 --hidden 8 --groups 3_0,3_1 --device cpu -o {out}"
+    words = "--steps 2 --batch 2 --keypoints 8 --few 4 --speeds 0.1 --horizons 3 --loss relative --hidden 8"
+    words += f" --groups 3_0,3_1 --device cpu -o {out}"
     result = CliRunner().invoke(app, ["train", "gcn", "--data", str(data), *words.split()])
     assert result.exit_code == 0, result.output
     assert "RMSE" in result.stdout

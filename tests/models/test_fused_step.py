@@ -69,7 +69,8 @@ def all_ways(model: ForceField, world, steps: int, prompt=None, pinned: bool = F
     (64, crowd(1, 5, 200, seed=3), {"pinned": True}),
     (64, replace(crowd(1, 3, 200), box=NARROW[None]), {}),
     (64, crowd(3, 1, 33), {}),
-], ids=["crowd", "padded and pushed", "pinned", "walls", "alone"])  # fmt: skip
+    (128, crowd(1, 2, 40), {}),
+], ids=["crowd", "padded and pushed", "pinned", "walls", "alone", "wide"])  # fmt: skip
 @torch.no_grad()
 def test_it_goes_where_the_plain_step_goes(hidden, world, given):
     wanted, plain, found, where, there = all_ways(loud(hidden), world, 3, **given)

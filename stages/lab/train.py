@@ -25,7 +25,6 @@ from stages.lab.training_roll import LOSSES, Roll
 from stages.lab.training_state import Trainee
 from stages.lab.training_team import Team, team
 from stages.lab.widen import widened
-from stages.models.dynamics import Dynamics
 from stages.models.weights import build, load, save
 from stages.scene.files import ngff_version
 
@@ -155,8 +154,6 @@ def _trainee(
             raise InputError(f"{start}: holds {card['model']} {network.config}, not what is to be trained; leave "
                              "--hidden out and name weights of the same model")  # fmt: skip
         before = {"before": {k: v for k, v in card.items() if k not in ("model", "config")}}
-    if options.speeds and type(network).speed is Dynamics.speed:
-        raise InputError(f"--speeds: {model} does not tell how fast keypoints are; leave the option out")
     trainee = Trainee(network, options.lr, options.seed)
     if resume:
         trainee.load(out.with_suffix(".ckpt"), _key(model, options, before))

@@ -130,9 +130,12 @@ def spread(motions: Motions) -> Float[Tensor, "b o 3"]:
 
 def calm(motions: Motions) -> Bool[Tensor, "b t"]:
     """Frames in which no object is changing its speed abruptly; on the CPU."""
-    rows = []
-    for x in motions.points:
-        change = torch.zeros(x.shape[:2], device=x.device)
-        change[1:-1] = (x[2:] - 2 * x[1:-1] + x[:-2]).square().sum(-1).mean(-1).sqrt() / motions.dt
-        rows.append(change.amax(1) < CALM)
-    return torch.stack(rows).cpu()
+    inner = torch.stack([steady(x, motions.dt).all(-1) for x in motions.points]).cpu()
+    ends = torch.ones(len(inner), 1, dtype=torch.bool)
+    return torch.cat([ends, inner, ends], 1)
+
+
+def steady(points: Float[Tensor, "*b t o n 3"], dt: float) -> Bool[Tensor, "*b t-2 o"]:
+    """In which frames, the ends left out, central differences are about the speed an object has."""
+    before, now, after = points[..., :-2, :, :, :], points[..., 1:-1, :, :, :], points[..., 2:, :, :, :]
+    return (after - 2 * now + before).square().sum(-1).mean(-1) < (CALM * dt) ** 2

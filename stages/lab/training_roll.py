@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from stages.lab.training_data import CALM, Piece
+from stages.lab.training_data import Piece, steady
 from stages.models.dynamics import Dynamics
 from stages.models.pushes import Pushes
 from stages.models.trees import rebuilt, tensors
@@ -58,9 +58,7 @@ def speed_loss(
     nothing amid an impact: such frames of an object do not count.
     """
     truth = (points[:, 2:] - points[:, :-2]) / (2 * dt)
-    change = (points[:, 2:] - 2 * points[:, 1:-1] + points[:, :-2]).square().sum(-1)
-    change = torch.where(valid[:, None], change, 0.0).sum(-1) / valid.sum(-1).clamp_min(1)[:, None]
-    known = (change < (CALM * dt) ** 2)[..., None, None]
+    known = steady(points, dt)[..., None, None]
     return loss_of(torch.where(known, time * predicted[:, :-1], time * truth), time * truth, valid, kind, spread)
 
 
@@ -175,7 +173,7 @@ def _advance(
     One flat tuple: PyTorch 2.11 compiles a named tuple that comes out of a `_replace` to an empty one.
     """
     state = model.step(scene, state, 0.0, dt, pushes)
-    return (*state, model.points(scene, state), *([model.speed(scene, state)] if speeds else []))
+    return (*state, model.points(scene, state), *([model.speed(scene, state, pushes)] if speeds else []))
 
 
 def _sum(like: Tensor, a: Tensor | None, b: Tensor | None) -> Tensor:

@@ -61,9 +61,10 @@ class Dynamics(nn.Module, ABC):
     def points(self, scene: Any, state: tuple) -> Float[Tensor, "b o n 3"]:
         """Where the keypoints are in a state [m]."""
 
-    def speed(self, scene: Any, state: tuple) -> Float[Tensor, "b o n 3"]:
-        """How fast the keypoints are in a state [m/s]; not every model has to know."""
-        raise NotImplementedError(f"{type(self).__name__} does not tell how fast keypoints are")
+    def speed(self, scene: Any, state: tuple, pushes: Pushes) -> Float[Tensor, "b o n 3"]:
+        """How fast the keypoints move in a state [m/s]. Unless a model knows better: along the rate of the state."""
+        rate = self.derivative(scene, 0.0, state, pushes)
+        return torch.func.jvp(lambda *y: self.points(scene, type(state)(*y)), tuple(state), tuple(rate))[1]
 
     def step(self, scene: Any, state: tuple, t: Tensor | float, dt: float, pushes: Pushes) -> tuple:
         """The state dt [s] later. Unless a model knows better: one explicit Euler step."""
@@ -136,9 +137,6 @@ class PointDynamics(Dynamics):
 
     def points(self, world: World, state: PointState) -> Float[Tensor, "b o n 3"]:
         return state.position
-
-    def speed(self, world: World, state: PointState) -> Float[Tensor, "b o n 3"]:
-        return state.velocity
 
 
 def free(world: World, pushes: Pushes) -> Bool[Tensor, "b o n 1"]:

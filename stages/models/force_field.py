@@ -135,7 +135,7 @@ class ForceField(Dynamics):
             return points(scene, state)
         return state.com[:, :, None] + apply(matrix(state.quat)[:, :, None], scene.shape.arm + state.u)
 
-    def speed(self, scene: Scene, state: BodyState) -> Float[Tensor, "b o n 3"]:
+    def speed(self, scene: Scene, state: BodyState, pushes: Pushes) -> Float[Tensor, "b o n 3"]:
         return self._moving(scene, state).speed
 
     def derivative(self, scene: Scene, t: Tensor | float, state: BodyState, pushes: Pushes) -> BodyState:

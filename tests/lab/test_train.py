@@ -407,11 +407,6 @@ def test_what_cannot_be_trained_on_is_said(data, tmp_path, change, message):
     assert not (tmp_path / "a.safetensors").exists()
 
 
-def test_a_model_that_tells_no_speeds_is_not_asked_for_them(data, tmp_path):
-    with pytest.raises(InputError, match="does not tell how fast"):
-        run("ngff-paper", data, tmp_path / "a.safetensors", replace(QUICK, speeds=0.1))
-
-
 def test_every_fourth_step_sees_few_keypoints(data, tmp_path, monkeypatch):
     seen, draw = [], Pieces.draw
 

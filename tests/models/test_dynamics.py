@@ -35,6 +35,23 @@ def test_the_start_is_the_first_frame_and_things_move(name):
 
 
 @torch.no_grad()
+def test_speeds_are_those_with_which_points_move(name):
+    """Along the rate of the state, by central differences, amid a motion in which things turn and deform."""
+    world, model, h = crowd(), small(name), 1e-6
+    scene, nobody = model.prepare(world), Pushes.none(world)
+    state = model.start(scene)
+    for _ in range(3):
+        state = model.step(scene, state, 0.0, 0.02, nobody)
+    rate = model.derivative(scene, 0.0, state, nobody)
+    ahead, behind = (
+        model.points(scene, type(state)(*(y + s * dy for y, dy in zip(state, rate, strict=True)))) for s in (h, -h)
+    )
+    speed = model.speed(scene, state, nobody)
+    assert speed.norm(dim=-1).amax() > 0.1
+    torch.testing.assert_close(speed, (ahead - behind) / (2 * h), rtol=0, atol=1e-7)
+
+
+@torch.no_grad()
 def test_order_of_objects_and_keypoints_does_not_matter(name):
     world, rows, columns = crowd(), torch.tensor([2, 0, 1]), torch.randperm(12)
     out = small(name).rollout(world, STEPS)

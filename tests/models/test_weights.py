@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from stages.errors import InputError
-from stages.models.weights import MODELS, build, find, halve, load, save
+from stages.models.weights import MODELS, build, find, halve, load, minutes, save
 from tests.models.worlds import SMALL, crowd
 
 
@@ -137,3 +137,7 @@ def test_weights_are_found(saved, monkeypatch, tmp_path):
         find("w")
     monkeypatch.setenv("NGFF_WEIGHTS", str(tmp_path))
     assert find("w") == saved
+
+
+def test_minutes_are_those_of_every_processor_and_of_all_that_went_before():
+    assert minutes({"minutes": 3.0, "processes": 2, "before": {"minutes": 1.5, "before": {"minutes": 4.0}}}) == 11.5

@@ -165,6 +165,7 @@ def train(
         typer.Option(help="square: squared error | scene: RMSE of a scene | axes: RMSE of an object's axis | "
                      "relative: the same against how much there is of motion"),
     ] = "scene",  # fmt: skip
+    optimizer: Annotated[str, typer.Option(help="adamw | soap (extra `train`)")] = "adamw",
     speeds: Annotated[
         float, typer.Option(help="errors of speeds count as of places so much later [s]; 0: they do not")
     ] = 0.0,
@@ -182,8 +183,8 @@ def train(
     from stages.lab.train import TrainOptions, run
 
     options = TrainOptions(
-        minutes, steps, batch, keypoints, few, lr, horizons, hidden, loss, speeds, memory, groups, compiled, seed,
-        device,
+        minutes, steps, batch, keypoints, few, lr, horizons, hidden, loss, optimizer, speeds, memory, groups,
+        compiled, seed, device,
     )  # fmt: skip
     for line in run(model, data, out, options, resume, start):
         print(line)

@@ -22,7 +22,7 @@ from stages.lab.motions import Motions
 from stages.lab.scenes import VARIED, groups_of
 from stages.lab.training_data import UNSEEN, Pieces, read_groups, recipe, split
 from stages.lab.training_roll import LOSSES, Roll
-from stages.lab.training_state import Trainee
+from stages.lab.training_state import OPTIMIZERS, Trainee
 from stages.lab.training_team import Team, team
 from stages.lab.widen import widened
 from stages.models.weights import build, load, save
@@ -51,6 +51,7 @@ class TrainOptions:
     horizons: str = "8,20,40"  # frames that a rollout goes on for, one phase each
     hidden: int = 0  # width of the network; 0: the model's own
     loss: str = "scene"  # one of training_roll.LOSSES
+    optimizer: str = "adamw"  # one of training_state.OPTIMIZERS
     speeds: float = 0.0  # an error of a speed counts as one of the place so much later [s]; 0: not at all
     memory: float = 0.9  # share of a gradient that goes back by another frame
     groups: str = "3_0..3_8"  # files to learn from; the last scenes of the last choose the best weights
@@ -70,6 +71,8 @@ class TrainOptions:
             raise InputError(f"--memory {self.memory}: must be between 0 and 1")
         if self.loss not in LOSSES:
             raise InputError(f"--loss {self.loss}: choose from {', '.join(LOSSES)}")
+        if self.optimizer not in OPTIMIZERS:
+            raise InputError(f"--optimizer {self.optimizer}: choose from {', '.join(OPTIMIZERS)}")
         if min(self.frames) < 1:
             raise InputError(f"--horizons takes frames, such as 8,20,40, not {self.horizons!r}")
 
@@ -154,7 +157,7 @@ def _trainee(
             raise InputError(f"{start}: holds {card['model']} {network.config}, not what is to be trained; leave "
                              "--hidden out and name weights of the same model")  # fmt: skip
         before = {"before": {k: v for k, v in card.items() if k not in ("model", "config")}}
-    trainee = Trainee(network, options.lr, options.seed)
+    trainee = Trainee(network, options.lr, options.seed, options.optimizer)
     if resume:
         trainee.load(out.with_suffix(".ckpt"), _key(model, options, before))
         log.info("going on from step %d, %.1f min", trainee.step, trainee.elapsed / 60)

@@ -18,17 +18,18 @@ LIMIT = 2.0  # gradients are cut to so many times their usual norm
 MEMORY = 0.99  # of the usual norm
 WARM = 200  # steps until the full rate
 LOST = 1.25  # times the lowest RMSE so far, from which on training has gone astray
+OPTIMIZERS = ("adamw", "soap")
 
 
 class Trainee:
     """A model in training."""
 
-    def __init__(self, model: Dynamics, lr: float, seed: int):
+    def __init__(self, model: Dynamics, lr: float, seed: int, optimizer: str = "adamw"):
         self.model = model.train()
         self.ema = copy.deepcopy(model).eval().requires_grad_(False)
         self.best = copy.deepcopy(self.ema.state_dict())
         self.params = [p for p in model.parameters() if p.requires_grad]
-        self.optimizer = torch.optim.AdamW(self.params, lr, betas=(0.9, 0.99), weight_decay=1e-4, fused=True)
+        self.optimizer = _optimizer(optimizer, self.params, lr)
         self.usual = self.params[0].new_zeros(())
         self.generator = torch.Generator().manual_seed(seed)
         self.step, self.elapsed, self.curve = 0, 0.0, []
@@ -52,10 +53,11 @@ class Trainee:
             p.grad = torch.where(finite, g * scale, 0.0)
         for group in self.optimizer.param_groups:
             group["lr"] = lr * self.caution * min(1.0, (self.step - self.since + 1) / WARM)
-        self.optimizer.found_inf = (~finite).float()  # fused AdamW then leaves everything as it is
-        self.skipped += ~finite
-        self.optimizer.grad_scale = None
+        before = [p.detach().clone() for p in self.params]
         self.optimizer.step()
+        for p, old in zip(self.params, before, strict=True):
+            p.copy_(torch.where(finite, p, old))
+        self.skipped += ~finite
         self.step += 1
         keep = min(EMA, (1 + self.step) / (10 + self.step))
         torch._foreach_lerp_(list(self.ema.parameters()), list(self.model.parameters()), 1 - keep)
@@ -98,8 +100,9 @@ class Trainee:
         self.since = self.step
         self.usual.zero_()
         for moments in self.optimizer.state.values():
-            for x in moments.values():
-                x.zero_()
+            for name in ("exp_avg", "exp_avg_sq", "step"):  # not the axes that SOAP has found
+                if name in moments:
+                    moments[name].zero_()
 
     def best_row(self) -> dict:
         return min(self.curve, key=lambda r: r["RMSE"])
@@ -144,3 +147,17 @@ class Trainee:
         torch.set_rng_state(state["random"].cpu())
         if state["cuda"] is not None and self.usual.is_cuda:
             torch.cuda.set_rng_state(state["cuda"].cpu())
+
+
+def _optimizer(kind: str, params: list[Tensor], lr: float) -> torch.optim.Optimizer:
+    """One of OPTIMIZERS: AdamW, or SOAP, which is Adam along the axes in which gradients vary most and least.
+
+    Source: Vyas et al. 2024, "SOAP: improving and stabilizing Shampoo using Adam".
+    """
+    if kind == "adamw":
+        return torch.optim.AdamW(params, lr, betas=(0.9, 0.99), weight_decay=1e-4, fused=True)
+    try:
+        from pytorch_optimizer import SOAP
+    except ImportError as error:
+        raise InputError("--optimizer soap needs the package pytorch-optimizer; pip install 'ngff[train]'") from error
+    return SOAP(params, lr, betas=(0.95, 0.95), weight_decay=1e-4)

@@ -20,7 +20,7 @@ from stages.lab.motions import Motions, write_motions
 from stages.lab.train import TrainOptions, run, validate
 from stages.lab.training_data import CALM, Pieces, asleep, calm, read_groups, split, spread
 from stages.lab.training_roll import Roll, loss_of, speed_loss
-from stages.lab.training_state import LIMIT, WARM, Trainee
+from stages.lab.training_state import LIMIT, OPTIMIZERS, WARM, Trainee, _optimizer
 from stages.lab.widen import widened
 from stages.models.pushes import Pushes
 from stages.models.weights import MODELS, build, load
@@ -231,10 +231,12 @@ def test_no_pushes_are_no_pushes():
         assert_close(pushes.wrench(world.points, com, 0.0, DT), weak.wrench(world.points, com, 0.0, DT))
 
 
-def test_a_step_without_finite_gradients_changes_nothing():
-    trainee = Trainee(build("gcn", hidden=8), 1e-2, 0)
+@pytest.mark.parametrize("optimizer", OPTIMIZERS)
+def test_a_step_without_finite_gradients_changes_nothing(optimizer):
+    trainee = Trainee(build("gcn", hidden=8), 1e-2, 0, optimizer)
     good = [torch.ones_like(p) for p in trainee.params]
-    trainee.update(good, 1e-2)
+    for _ in range(2):
+        trainee.update(good, 1e-2)
     before = [p.detach().clone() for p in trainee.params]
     usual = trainee.usual.clone()
     trainee.update([torch.full_like(good[0], math.nan), *good[1:]], 1e-2)
@@ -244,6 +246,24 @@ def test_a_step_without_finite_gradients_changes_nothing():
     assert trainee.curve[-1]["skipped"] == 1
     trainee.update(good, 1e-2)
     assert not any(torch.equal(a, b) for a, b in zip(before, trainee.params, strict=True))
+
+
+def test_soap_goes_down_a_narrow_valley_that_is_aslant():
+    """A million times narrower than long: it finds the axes, along which Adam on each weight alone would be stuck."""
+    rng = torch.Generator().manual_seed(0)
+    turn = torch.linalg.qr(torch.randn(8, 8, generator=rng))[0]
+    H = (turn * 10.0 ** torch.linspace(-3, 3, 8)) @ turn.T
+    wanted = torch.randn(8, 8, generator=rng)
+    left = {}
+    for kind in OPTIMIZERS:
+        weight = torch.nn.Parameter(torch.zeros(8, 8))
+        steps = _optimizer(kind, [weight], 0.03)
+        for step in range(1500):
+            weight.grad = (weight.detach() - wanted) @ H
+            steps.param_groups[0]["lr"] = 0.03 * (1 - step / 1500)
+            steps.step()
+        left[kind] = float((weight.detach() - wanted).norm() / wanted.norm())
+    assert left["soap"] < 0.05 < 0.2 < left["adamw"]
 
 
 def test_an_outlier_is_cut_to_twice_the_usual_norm():
@@ -318,9 +338,10 @@ def test_the_card_says_what_made_the_weights(data, tmp_path):
     assert validate(model, unseen)["RMSE"] == pytest.approx(card["validation"]["RMSE"], rel=1e-6)
 
 
-@pytest.mark.parametrize("after", [1, 5])
-def test_a_run_that_was_stopped_goes_on_to_the_same_curve(data, tmp_path, monkeypatch, after):
-    run("pointformer", data, tmp_path / "whole.safetensors", QUICK)  # with dropout
+@pytest.mark.parametrize(("after", "optimizer"), [(1, "adamw"), (5, "adamw"), (5, "soap")])
+def test_a_run_that_was_stopped_goes_on_to_the_same_curve(data, tmp_path, monkeypatch, after, optimizer):
+    options = replace(QUICK, optimizer=optimizer)
+    run("pointformer", data, tmp_path / "whole.safetensors", options)  # with dropout
     with monkeypatch.context() as patch:
         update = Trainee.update
 
@@ -330,9 +351,9 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_curve(data, tmp_path, monkey
                 os.kill(os.getpid(), signal.SIGTERM)
 
         patch.setattr(Trainee, "update", stopped)
-        lines = run("pointformer", data, tmp_path / "parts.safetensors", QUICK)
+        lines = run("pointformer", data, tmp_path / "parts.safetensors", options)
     assert "--resume" in lines[0] and not load(tmp_path / "parts.safetensors")[1]["finished"]
-    run("pointformer", data, tmp_path / "parts.safetensors", QUICK, resume=True)
+    run("pointformer", data, tmp_path / "parts.safetensors", options, resume=True)
     (a, whole), (b, parts) = (load(tmp_path / f"{name}.safetensors") for name in ("whole", "parts"))
     assert parts["finished"] and parts["steps"] == 12
     extra = [row for row in parts["curve"] if row["step"] not in {row["step"] for row in whole["curve"]}]
@@ -398,6 +419,7 @@ def test_an_rmse_that_is_not_finite_is_the_worst():
         ({"horizons": "8,x"}, "--horizons"),
         ({"lr": 0.0}, "--lr"),
         ({"few": 9}, "--few"),
+        ({"optimizer": "newton"}, "--optimizer newton"),
         ({"speeds": -0.1}, "--speeds"),
     ],
 )

@@ -25,6 +25,7 @@ from stages.kernels.bodies import (
     U,
     bounded,
 )
+from stages.kernels.meeting import partner_of
 from stages.kernels.triples import (
     add,
     back,
@@ -91,10 +92,10 @@ def _guarded(v, up, down, RISE: tl.constexpr):
 
 @triton.jit
 def kick(
-    body, moved, field, parts, felt, grip, pushed, twisted, arm, valid, share, size, mass, inverse, pinned,
+    body, moved, field, parts, felt, grip, unit, pushed, twisted, arm, valid, share, size, mass, inverse, pinned,
     gravity, box, com, quat, velocity, momentum, high, low, scale, o, n, dt, places, wide,
-    PUSHED: tl.constexpr, SINK: tl.constexpr, RISE: tl.constexpr, FASTEST: tl.constexpr, WILDEST: tl.constexpr,
-    FRAME: tl.constexpr, BLOCK: tl.constexpr, BLOCKS: tl.constexpr,
+    GRIP: tl.constexpr, PUSHED: tl.constexpr, SINK: tl.constexpr, RISE: tl.constexpr, FASTEST: tl.constexpr,
+    WILDEST: tl.constexpr, BRISK: tl.constexpr, FRAME: tl.constexpr, BLOCK: tl.constexpr, BLOCKS: tl.constexpr,
 ):  # fmt: skip
     """Velocities after the forces, and where they lead; what the points feel, for the stress field.
 
@@ -109,15 +110,21 @@ def kick(
         force = add(force, scaled(1 / here, row3(pushed + 3 * i)))
         torque = add(torque, scaled(1 / here, row3(twisted + 3 * i)))
     now = body + BODY * i
+    past_v, past_spin = row3(now + VELOCITY), times(row9(now + INVERSE), row3(now + MOMENTUM))
     L = add(row3(now + MOMENTUM), scaled(dt, torque))
-    v = add(row3(now + VELOCITY), scaled(dt, force))
+    v = add(past_v, scaled(dt, force))
     spin = times(row9(now + INVERSE), L)
     slower = WILDEST / tl.maximum(tl.sqrt(dot(spin, spin)), WILDEST)
     L, spin = scaled(slower, L), scaled(slower, spin)
     v = scaled(FASTEST / tl.maximum(tl.sqrt(dot(v, v)), FASTEST), v)
     extent, hold = tl.load(size + i), tl.load(grip + i)
-    moving = dot(v, v) + extent * extent * dot(spin, spin) + 1e-12
-    kept = moving / (moving + dt / FRAME * hold * hold)
+    for k in range(o - 1):  # what stands on what the floor holds is held as well
+        firm = 1 - GRIP * tl.load(unit + i * (o + 1) + k)  # weight of all places of this contact
+        hold = tl.maximum(hold, firm * tl.load(grip + partner_of(i, k, o)))
+    last = (dot(v, v) + extent * extent * dot(spin, spin)) / BRISK
+    past_v, past_spin = add(past_v, v), add(past_spin, spin)
+    moving = (dot(past_v, past_v) + extent * extent * dot(past_spin, past_spin)) / 4 + last * last
+    kept = (moving * moving + 1e-16) / (moving * moving + 1e-16 + dt / FRAME * hold * hold * hold * hold)
     v, L, spin = scaled(kept, v), scaled(kept, L), scaled(kept, spin)
 
     r = tl.arange(0, BLOCK)

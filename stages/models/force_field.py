@@ -30,7 +30,8 @@ from stages.models.world import World, centre, inertia
 SINK = 0.03  # deepest that a point may get into the floor or a wall [m]
 RISE = 1.0  # fastest that a body is pushed out from deeper [m/s]
 FASTEST, WILDEST = 8.0, 60.0  # speed [m/s] and spin [rad/s] are kept below
-HOLD = 0.05  # strongest grip of the floor [m/s]
+HOLD = 0.07  # strongest grip of the floor [m/s]
+BRISK = 0.3  # speed from which it does not matter whether it lasts, to that grip [m/s]
 RIGID = 3.2e5  # E size / mass of the stiffest objects learned from [1/s^2]; what is stiffer bends less by the ratio
 
 
@@ -53,7 +54,7 @@ class Scene:
     code: Float[Tensor, "b o h"]  # shape and material of an object, as the network sees it
     stiffness: Float[Tensor, "b o"]  # of the displacements [1/s^2]
     damping: Float[Tensor, "b o"]  # [1/s]
-    yields: Float[Tensor, "b o"]  # 1; less for what is stiffer than all that was learned from
+    yields: Float[Tensor, "b o"]  # 1; less for what is stiffer than all that was learned from, or solid
 
 
 class Rates(NamedTuple):
@@ -62,13 +63,15 @@ class Rates(NamedTuple):
     force: Float[Tensor, "b o 3"]  # [m/s^2]
     torque: Float[Tensor, "b o 3"]  # about the centre of mass [m^2/s^2]
     stress: Float[Tensor, "b o n 3"]  # in the object's frame [m/s^2]
-    grip: Float[Tensor, "b o 1"]  # speed below which the floor holds a body [m/s]
+    grip: Float[Tensor, "b o 1"]  # speed below which the floor, or what it holds, holds a body [m/s]
 
 
 class ForceField(Dynamics):
     """`ngff`, the default."""
 
-    told = frozenset({"points", "share", "mass", "E", "nu", "friction", "velocity", "spin", "gravity", "box"})
+    told = frozenset({
+        "points", "share", "mass", "E", "solidity", "nu", "friction", "velocity", "spin", "gravity", "box"
+    })  # fmt: skip
 
     def __init__(self, hidden: int = 64, deform: bool = True):
         super().__init__()
@@ -91,7 +94,7 @@ class ForceField(Dynamics):
         w = shape.world
         stiffest = RIGID * w.mass.clamp_min(1e-6) / shape.size.clamp_min(1e-6)
         E = torch.minimum(w.E, stiffest)
-        code, yields = self._encode(shape, E), E / w.E  # linear elasticity: strain is stress over E
+        code, yields = self._encode(shape, E), E / w.E / w.solidity  # linear elasticity: strain is stress over E
         if self.stress is None:
             none = torch.zeros_like(yields)
             return Scene(shape, code, none, none, yields)
@@ -143,7 +146,8 @@ class ForceField(Dynamics):
         state = _held(state, free)
         moving = self._moving(scene, state)
         rates = self._rates(scene, state, moving, pushes, t, 0.0)
-        lost = 1 - self._slowed(scene, rates, state.velocity, moving.spin, FRAME)
+        same = state.velocity, moving.spin
+        lost = 1 - self._slowed(scene, rates, same, same, FRAME)
         spin = torch.cat([torch.zeros_like(moving.spin[..., :1]), moving.spin], -1)
         stress = rates.stress - scene.stiffness[..., None, None] * state.u - scene.damping[..., None, None] * state.du
         ahead = state.velocity * (1 - lost) + FRAME * rates.force
@@ -172,7 +176,7 @@ class ForceField(Dynamics):
         slower = WILDEST / spin.norm(dim=-1, keepdim=True).clamp_min(WILDEST)
         momentum, spin = momentum * slower, spin * slower
         velocity = limited(half.velocity + dt * rates.force, FASTEST)
-        kept = self._slowed(scene, rates, velocity, spin, dt)
+        kept = self._slowed(scene, rates, (half.velocity, moving.spin), (velocity, spin), dt)
         velocity, momentum, spin = velocity * kept, momentum * kept, spin * kept
         turning = torch.linalg.cross(spin[:, :, None].expand_as(moving.arm), moving.arm)
         velocity = self._guarded(scene, moving.points + dt / 2 * turning, velocity, dt / 2)
@@ -257,6 +261,8 @@ class ForceField(Dynamics):
         touch = torch.zeros_like(moving.arm).scatter_add(2, rows[..., None].expand_as(felt), felt)
         touch = torch.where(w.valid[..., None], touch / w.share.clamp_min(1e-9)[..., None], 0.0)
         grip = HOLD * torch.sigmoid(self.hold(status)) * weight_f[:, :, 0].sum(-1, keepdim=True)
+        if others.shape[1]:  # what stands on what the floor holds is held as well
+            grip = torch.maximum(grip, (weight.sum(-1) * grip[:, others, 0]).amax(-1, keepdim=True))
         return force / mass[..., None] + ground.sum(2), torque, touch, grip
 
     def _returned(self, shape: Shape, x: Float[Tensor, "b o m c"]) -> Float[Tensor, "b o c"]:
@@ -264,15 +270,20 @@ class ForceField(Dynamics):
         return x[:, shape.others, shape.back].sum(2)
 
     def _slowed(
-        self, scene: Scene, rates: Rates, velocity: Float[Tensor, "b o 3"], spin: Float[Tensor, "b o 3"], dt: float
+        self, scene: Scene, rates: Rates, before: tuple[Tensor, Tensor], after: tuple[Tensor, Tensor], dt: float
     ) -> Float[Tensor, "b o 1"]:
         """By how much dry friction slows a body: next to nothing when fast, to rest when slower than its grip.
 
-        Forces that are only nearly in balance would let bodies creep for ever.
+        Forces that are only nearly in balance would let bodies creep for ever. `before` and `after` the forces are
+        velocity and spin; their mean is what a step moves, and counts when slow: what the next step takes back, as
+        stiff contacts do, would hide that a body rests.
         """
-        turning = scene.shape.size[..., None].square() * spin.square().sum(-1, keepdim=True)
-        moving = velocity.square().sum(-1, keepdim=True) + turning
-        return (moving + 1e-12) / (moving + 1e-12 + dt / FRAME * rates.grip.square())
+        extent = scene.shape.size[..., None].square()
+        last = after[0].square().sum(-1, keepdim=True) + extent * after[1].square().sum(-1, keepdim=True)
+        both = [(x + y) / 2 for x, y in zip(before, after, strict=True)]
+        net = both[0].square().sum(-1, keepdim=True) + extent * both[1].square().sum(-1, keepdim=True)
+        moving = (net + (last / BRISK).square()).square() + 1e-16
+        return moving / (moving + dt / FRAME * rates.grip.square().square())
 
     def _guarded(
         self, scene: Scene, points: Float[Tensor, "b o n 3"], velocity: Float[Tensor, "b o 3"], dt: float

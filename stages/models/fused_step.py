@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from stages.kernels import bodies, kicks, meeting, places, straining, thin, touching
 from stages.models import places as near
 from stages.models.dynamics import FRAME
-from stages.models.force_field import FASTEST, HOLD, RISE, SINK, WILDEST, BodyState, ForceField, Scene
+from stages.models.force_field import BRISK, FASTEST, HOLD, RISE, SINK, WILDEST, BodyState, ForceField, Scene
 from stages.models.pushes import Pushes
 from stages.models.stress import FARTHEST, HARDEST, HEAVIEST
 from stages.models.touch import GRIP, STRENGTH
@@ -84,8 +84,8 @@ class _Step:
     def run(self, state: BodyState, t: Tensor | float) -> BodyState:
         body, moved, inner, planes = self._begin(state)
         count, point, felt, record = self._meeting(body, moved, planes)
-        known, parts, grip = self._touch(count, point, felt, record)
-        pushed = grip, grip  # nobody: not read
+        known, parts, *grip = self._touch(count, point, felt, record)
+        pushed = grip  # nobody: not read
         if self.pushes.object.shape[1]:
             pushed = self.pushes.wrench(moved[:, :, :3].mT, body[..., :3].contiguous(), t, self.dt)
         return self._end(body, moved, inner, parts, felt, grip, known, pushed)
@@ -160,10 +160,10 @@ class _Step:
             record, count, point, *mouths, told, message, weight, scale, felt, parts, *self.lists, STRENGTH=STRENGTH,
             CLOSE=near.CLOSE, LEVER=near.LEVER, **self.network,
         )  # fmt: skip
-        return known, parts, grip
+        return known, parts, grip, scale
 
     def _end(
-        self, body: Tensor, moved: Tensor, inner: Tensor, parts: Tensor, felt: Tensor, grip: Tensor,
+        self, body: Tensor, moved: Tensor, inner: Tensor, parts: Tensor, felt: Tensor, grip: list[Tensor],
         known: Tensor, pushed: tuple[Tensor, Tensor],
     ) -> BodyState:  # fmt: skip
         o, n, scene, stress = self.o, self.n, self.scene, self.field.stress
@@ -171,10 +171,10 @@ class _Step:
         high, low = (torch.empty(self.b, o, 9, n, dtype=torch.float16, device=self.arm.device) for _ in range(2))
         scale = self._new(9)
         kicks.kick[(self.objects,)](
-            body, moved, inner, parts, felt, grip, *pushed, self.arm, self.valid, self.share, self.size,
+            body, moved, inner, parts, felt, *grip, *pushed, self.arm, self.valid, self.share, self.size,
             self.mass, self.inverse, self.pinned, self.gravity, self.box, com, quat, velocity, momentum, high, low,
             scale, o, n, self.dt, self.places, self.wide, PUSHED=self.pushes.object.shape[1] > 0,
-            SINK=SINK, RISE=RISE, FASTEST=FASTEST, WILDEST=WILDEST, FRAME=FRAME,
+            GRIP=GRIP, SINK=SINK, RISE=RISE, FASTEST=FASTEST, WILDEST=WILDEST, BRISK=BRISK, FRAME=FRAME,
             BLOCKS=triton.next_power_of_2(self.places - (o - 1) * self.wide), **self.whole,
         )  # fmt: skip
         mean = thin.product_of(scene.shape.blur.flatten(0, 1).flatten(1, 2), high.flatten(0, 1), low.flatten(0, 1))

@@ -26,6 +26,7 @@ class World:
     share: Float[Tensor, "b o n"]  # of the object's mass that a keypoint stands for; sums to 1, 0 where padded
     mass: Float[Tensor, "b o"]  # [kg]
     E: Float[Tensor, "b o"]  # Young's modulus [Pa]
+    solidity: Float[Tensor, "b o"]  # how many times less it bends than a hollow or thin body of that modulus
     nu: Float[Tensor, "b o"]  # Poisson's ratio
     friction: Float[Tensor, "b o"]  # Coulomb's coefficient
     velocity: Float[Tensor, "b o 3"]  # at the start [m/s]
@@ -37,7 +38,8 @@ class World:
     def of(
         cls, points: Float[Tensor, "b o n 3"], valid: Bool[Tensor, "b o n"] | None = None, **given: Tensor
     ) -> World:
-        """A world of these keypoints; fields not given take 1 kg, 1e5 Pa, 0.3, 0.5, rest, and the published room.
+        """A world of these keypoints; fields not given take 1 kg, 1e5 Pa, hollow, 0.3, 0.5, rest, and the published
+        room.
 
         A given tensor needs only be broadcastable to its field.
         """
@@ -47,8 +49,8 @@ class World:
             share = valid.to(points)
             given["share"] = share / share.sum(-1, keepdim=True).clamp_min(1)
         default = {
-            "mass": 1.0, "E": 1e5, "nu": 0.3, "friction": 0.5, "velocity": 0.0, "spin": 0.0, "gravity": GRAVITY,
-            "box": BOX,
+            "mass": 1.0, "E": 1e5, "solidity": 1.0, "nu": 0.3, "friction": 0.5, "velocity": 0.0, "spin": 0.0,
+            "gravity": GRAVITY, "box": BOX,
         }  # fmt: skip
         shape = {"share": (b, o, n), "velocity": (b, o, 3), "spin": (b, o, 3), "gravity": (b, 3), "box": (b, 2, 3)}
         filled = {

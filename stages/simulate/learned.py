@@ -41,6 +41,7 @@ MOST = 6  # objects that scenes of the benchmark have
 THIN = 0.044  # thickness of the thinnest, the cloth [m]
 WALL = 0.015  # volume over surface of bodies in training, all of which are hollow or thin [m]
 SOFTEST = 3e3  # [Pa]; for stiffer bodies than there the model itself goes by linear elasticity
+FIRMEST = 3e4  # E size / mass of the stiffest body in training that seems round and solid, the duck [1/s^2]
 FALL = 5.0  # gravity in training [m/s^2]
 FAST = 5.0  # speeds that falls reach there [m/s]
 FAR = 100.0  # walls where there are none [m]
@@ -131,7 +132,7 @@ def _world(
     materials = choose_materials(scene.objects, options.material, options.materials)
     most = max(len(p) for p in each)
     points, valid = torch.zeros(1, len(each), most, 3), torch.zeros(1, len(each), most, dtype=torch.bool)
-    mass, E, nu, friction = torch.ones(4, 1, len(each))
+    mass, E, solidity, nu, friction = torch.ones(5, 1, len(each))
     velocity = torch.zeros(1, len(each), 3)
     for row, (o, p) in enumerate(zip(scene.objects, each, strict=True)):
         points[0, row, : len(p)] = frame.inside(p + stage.lift[row] + stage.settled[row])
@@ -141,7 +142,8 @@ def _world(
         mass[0, row] = choice.material.density * volume * frame.mass
         a, b, c = _sides(points[0, row, : len(p)]).tolist()
         wall = volume * frame.mass / (2 * (a * b + b * c + c * a))
-        E[0, row] = _known_stiffness(o, choice.material.E * frame.stress, wall)
+        known = FIRMEST * float(mass[0, row]) / max(float(points[0, row, : len(p)].std(0, correction=0).norm()), 1e-6)
+        E[0, row], solidity[0, row] = _known_stiffness(o, choice.material.E * frame.stress, wall, known)
         nu[0, row] = choice.material.nu
         friction[0, row] = choice.material.friction if options.friction is None else options.friction
         velocity[0, row] = torch.tensor(prompts.velocity.get(o.id, (0.0, 0.0, 0.0))) * frame.length / frame.time
@@ -155,8 +157,8 @@ def _world(
         low, high = (frame.inside(torch.tensor(corner)) for corner in (stage.box.low, stage.box.high))
     low[2] += _hover((points[0, ..., 2] - low[2])[stage.standing], valid[0, stage.standing])
     gravity = torch.tensor([0.0, 0.0, -frame.gravity])
-    return World.of(points, valid, mass=mass, E=E, nu=nu, friction=friction, velocity=velocity, gravity=gravity,
-                    box=torch.stack([low, high]))  # fmt: skip
+    return World.of(points, valid, mass=mass, E=E, solidity=solidity, nu=nu, friction=friction, velocity=velocity,
+                    gravity=gravity, box=torch.stack([low, high]))  # fmt: skip
 
 
 def _hover(heights: Float[Tensor, "o n"], valid: Bool[Tensor, "o n"]) -> float:
@@ -165,17 +167,19 @@ def _hover(heights: Float[Tensor, "o n"], valid: Bool[Tensor, "o n"]) -> float:
     return max(0.0, float(lowest.quantile(0.25))) if len(lowest) else 0.0
 
 
-def _known_stiffness(o: SceneObject, E: float, wall: float) -> float:
-    """Young's modulus [Pa] as the model is told it: of a body as stiff whose volume over surface is as in training.
+def _known_stiffness(o: SceneObject, E: float, wall: float, most: float) -> tuple[float, float]:
+    """Young's modulus [Pa] as the model is told it, and how many times less the body bends than it says.
 
-    Walls and boards resist bending by the cube of their thickness, so what is solid is told to be stiffer. What is
-    softer than all of training is told to be as the softest there.
+    Walls and boards resist bending by the cube of their thickness, so what is solid is told to be as stiff as a body
+    whose volume over surface is as in training. Beyond `most` [Pa] none of its kind was learned from: the rest is left
+    to linear elasticity. What is softer than all of training is told to be as the softest there.
     """
-    told = max(E * max(wall / WALL, 1.0) ** 3, SOFTEST)
+    whole = max(E * max(wall / WALL, 1.0) ** 3, SOFTEST)
+    told = min(whole, max(E, SOFTEST, most))
     if E < SOFTEST / 2:
         log.warning("object %d (%s): %.2g Pa (at this size) is softer than the %.2g Pa of training, and taken as %.2g "
-                    "Pa; compare with --engine mpm", o.id, o.name, E, SOFTEST, told)  # fmt: skip
-    return told
+                    "Pa; compare with --engine mpm", o.id, o.name, E, SOFTEST, whole)  # fmt: skip
+    return told, whole / told
 
 
 def _awake(world: World, frame: Frame, stage: Stage) -> Bool[Tensor, "o"]:

@@ -185,6 +185,7 @@ def test_what_a_model_is_told_it_uses_and_no_more(name):
     out = model.rollout(world, STEPS)
     other = {
         "mass": 3 * world.mass, "E": 30 * world.E, "nu": world.nu / 2, "friction": world.friction / 2,
+        "solidity": 3 * world.solidity,
         "gravity": 2 * world.gravity, "velocity": world.velocity + 1, "spin": world.spin + 1,
         "box": world.box + torch.tensor([0.0, 0.0, 0.15], dtype=torch.float64),
     }  # fmt: skip

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from stages.geometry.rotations import matrix
-from stages.models.force_field import RIGID, SINK, ForceField
+from stages.models.force_field import RIGID, SINK, ForceField, Rates
 from stages.models.pushes import Pushes
 from stages.models.shape import shape_of
 from stages.models.stress import projected
@@ -170,6 +170,41 @@ def test_the_floor_holds_what_creeps_and_lets_slide_what_is_fast():
 
     assert speed_left(0.005) < 1e-6
     assert 0.95 < speed_left(1.0) < 1
+
+
+@torch.no_grad()
+def test_what_lies_on_what_the_floor_holds_is_held_too_and_what_flies_is_not():
+    model = loud(deform=False)
+    for net in (model.planes, model.pairs):  # no forces
+        net.say[-1].weight.zero_()
+        net.say[-1].bias.zero_()
+    model.hold.bias.fill_(3.0)
+    box = crowd(1, 1, 100).points[0, 0]
+    box = box - box.amin(0)
+    floor = torch.tensor([0, 0, BOX[0][2] + 0.01]).double()
+    top = torch.tensor([0, 0, float(box[:, 2].max()) + 0.01]).double()
+    points = torch.stack([floor + box, floor + top + box, floor + 5 * top + box])[None]
+    world = World.of(points, gravity=NOWHERE, velocity=torch.tensor([0.005, 0, 0]))
+    left = history(model, world, 20)[1][-1].velocity[0, :, 0] / 0.005
+    assert left[0] < 1e-6 and left[1] < 1e-3
+    torch.testing.assert_close(left[2], torch.ones_like(left[2]))
+
+
+@torch.no_grad()
+def test_what_each_step_takes_back_does_not_hide_that_a_body_rests():
+    """Velocities that change their sign at each step move nothing; those of a bounce are far faster, and stay."""
+    model = loud(deform=False)
+    world = crowd(1, 1)
+    scene = model.prepare(world)
+    none = torch.zeros(1, 1, 3, dtype=torch.float64)
+    rates = Rates(none, none, none, torch.full((1, 1, 1), 0.03, dtype=torch.float64))
+
+    def kept(before: float, after: float) -> float:
+        x = torch.tensor([1.0, 0, 0]).double().expand_as(none)
+        return float(model._slowed(scene, rates, (before * x, none), (after * x, none), 0.02))
+
+    assert kept(-0.05, 0.05) < 0.1 < 0.7 < kept(0.05, 0.05)
+    assert kept(-1.0, 1.0) > 0.999
 
 
 @torch.no_grad()

@@ -122,16 +122,24 @@ def test_what_was_not_seen_in_training_is_warned_of(caplog, change, says):
 
 def test_what_is_softer_than_in_training_is_the_softest_there_and_said(caplog):
     o = SceneObject(1, "thing")
-    assert [_known_stiffness(o, E, WALL) for E in (2e3, 1e5, 7e10)] == [3e3, 1e5, 7e10] and not caplog.records
-    assert _known_stiffness(o, 50.0, WALL) == 3e3
+    told = [_known_stiffness(o, E, WALL, 1e9) for E in (2e3, 1e5, 7e10)]
+    assert told == [(3e3, 1), (1e5, 1), (7e10, 1)] and not caplog.records
+    assert _known_stiffness(o, 50.0, WALL, 1e9) == (3e3, 1)
     assert len(caplog.records) == 1
 
 
 def test_what_is_solid_is_told_to_be_stiffer():
     """As a plate of twice the thickness bends an eighth as far; a thinner one than in training is told as it is."""
     o = SceneObject(1, "thing")
-    assert _known_stiffness(o, 1e4, 2 * WALL) == pytest.approx(8e4)
-    assert _known_stiffness(o, 1e4, WALL / 2) == 1e4
+    assert _known_stiffness(o, 1e4, 2 * WALL, 1e9) == pytest.approx((8e4, 1))
+    assert _known_stiffness(o, 1e4, WALL / 2, 1e9) == (1e4, 1)
+
+
+def test_what_is_more_solid_than_all_that_was_learned_from_bends_less():
+    """However much of it is told as a stiffness, the two together say the same."""
+    o = SceneObject(1, "thing")
+    assert _known_stiffness(o, 1e4, 2 * WALL, 2e4) == pytest.approx((2e4, 4))
+    assert _known_stiffness(o, 1e4, 2 * WALL, 5e3) == pytest.approx((1e4, 8))  # never softer than its material
 
 
 def test_what_flows_is_for_mpm(two_balls, tmp_path, untrained, caplog):

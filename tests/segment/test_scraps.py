@@ -1,0 +1,48 @@
+"""Patterns of the table go back to it; whatever lies on it stays."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from stages.physics.support import find_support
+from stages.segment.scraps import without_scraps
+from tests.segment.tabletop import block, scene_of, table, three_apart
+
+
+def left(scene, ids):
+    g = replace(scene.gaussians, object_id=ids)
+    return without_scraps(g, find_support(scene)).object_id
+
+
+@pytest.fixture(scope="module")
+def truth():
+    return three_apart(noise=0.001)
+
+
+def test_threads_of_a_cloth_on_the_table_are_the_tables(truth):
+    g = truth.gaussians
+    near = torch.cdist(g.means[:, :2], g.means[g.object_id > 0][:, :2]).amin(1) < 0.05
+    patch = (g.object_id == 0) & ~near & (g.means[:, :2].norm(dim=1) < 0.4)
+    threads = patch & (torch.arange(len(patch)) % 3 == 0)
+    found = left(truth, torch.where(threads, 4, g.object_id))
+    assert threads.sum() > 100 and torch.equal(found, g.object_id)
+
+
+def test_a_whole_stripe_is_too_where_the_table_is_close_on_both_sides(truth):
+    g = truth.gaussians
+    stripe = (g.object_id == 0) & ((g.means[:, 1] + 0.3).abs() < 0.01) & (g.means[:, 0].abs() < 0.15)
+    found = left(truth, torch.where(stripe, 4, g.object_id))
+    assert stripe.sum() > 20 and torch.equal(found, g.object_id)
+
+
+@pytest.mark.parametrize("size", [(0.2, 0.014, 0.014), (0.14, 0.07, 0.009)], ids=["rope", "phone"])
+def test_what_is_thin_stays(size):
+    scene = scene_of(table(), block((0.0, 0.0), size, (0.8, 0.1, 0.1), 1), noise=0.0005)
+    assert torch.equal(left(scene, scene.gaussians.object_id), scene.gaussians.object_id)
+
+
+def test_a_scene_without_table_or_things_is_left_as_it_is(truth):
+    none = torch.zeros_like(truth.gaussians.object_id)
+    assert not left(truth, none).any()
+    assert torch.equal(left(truth, none + 1), none + 1)

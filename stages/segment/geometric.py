@@ -25,4 +25,5 @@ def segment(scene: Scene, options: SegmentOptions) -> Scene:
     if not grouped.objects or support is None or find_wall(scene, view, options.seed) is not None:
         return grouped
     whole = replace(grouped, gaussians=joined(grouped.gaussians, support))
-    return named(replace(whole, gaussians=without_scraps(redrawn(whole, support), support)), support)
+    whole = replace(whole, gaussians=redrawn(whole, support))
+    return named(replace(whole, gaussians=without_scraps(whole, support)), support)

@@ -9,26 +9,29 @@ from jaxtyping import Float
 from torch import Tensor
 
 from stages.geometry.neighbours import knn
+from stages.physics.sight import seen_from
 from stages.physics.support import Support
 from stages.scene.gaussians import Gaussians
-from stages.segment.rims import LEVEL, MARGIN
+from stages.scene.scene import Scene
+from stages.segment.rims import LEVEL, MARGIN, SEEN
 
 SHOWS = 0.1  # opacity from which a Gaussian counts
 NEIGHBOURS = 8
-NEAR_TABLE = 4.0  # the table is looked for this near its surface [levels]
-PATTERN = 0.6  # share of a thing that is level with table close by, from which it is a part of the table
+PATTERN = 0.65  # share of a thing that is level with table close by, from which it is a part of the table
 
 
-def without_scraps(g: Gaussians, support: Support) -> Gaussians:
-    """The same Gaussians, with things given back to the table that lie in it and among it.
+def without_scraps(scene: Scene, support: Support) -> Gaussians:
+    """The scene's Gaussians, with things given back to the table that lie in it and among it.
 
-    A thing that lies on the table is higher than the table next to it, or has an inside that is far from any table.
+    A thing that lies on the table is higher than the table seen next to it, or has an inside that is far from any.
     Stripes and threads of a cloth that differ from it in colour, and are an object to grouping, are neither.
     """
-    level, margin = LEVEL * support.view.radius, MARGIN * support.view.radius
+    g, level, margin = scene.gaussians, LEVEL * support.view.radius, MARGIN * support.view.radius
     shown = (g.opacities > SHOWS) & g.means.isfinite().all(1)
+    if scene.cameras is not None and len(scene.cameras):
+        shown &= seen_from(g, scene.cameras).norm(dim=1) > SEEN
     heights = torch.where(shown, support.heights(torch.where(shown[:, None], g.means, 0.0)), torch.inf)
-    table = g.means[(g.object_id == 0) & (heights.abs() < NEAR_TABLE * level)]
+    table = g.means[shown & (g.object_id == 0) & (heights.abs() < level)]
     if len(table) < NEIGHBOURS:
         return g
     ids = g.object_id.clone()

@@ -248,6 +248,12 @@ def test_a_step_without_finite_gradients_changes_nothing(optimizer):
     assert not any(torch.equal(a, b) for a, b in zip(before, trainee.params, strict=True))
 
 
+def test_soap_without_its_package_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pytorch_optimizer", None)
+    with pytest.raises(InputError, match=r"ngff\[train\]"):
+        Trainee(build("gcn", hidden=8), 1e-2, 0, "soap")
+
+
 def test_soap_goes_down_a_narrow_valley_that_is_aslant():
     """A million times narrower than long: it finds the axes, along which Adam on each weight alone would be stuck."""
     rng = torch.Generator().manual_seed(0)

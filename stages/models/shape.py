@@ -16,6 +16,7 @@ if TRITON:
     from stages.kernels.neighbourhoods import neighbourhoods
 
 BLUR = (0.12, 0.4)  # radii of neighbourhoods, in sizes of the object
+FAINT = 1e-20  # weights in them that are 0: subnormal numbers take a CPU several times as long
 
 
 @dataclass(frozen=True)
@@ -67,7 +68,8 @@ def _neighbourhoods(
     for c in arm.unbind(-1):
         gap = c[..., :, None] - c[..., None, :]
         squared.addcmul_(gap, gap)
-    weight = (squared[:, :, None] * (-1 / reach.square())[..., None, None]).exp_().mul_(share[:, :, None, None])
+    weight = (squared[:, :, None] * (-1 / reach.square())[..., None, None]).exp_()
+    weight.mul_(weight > FAINT).mul_(share[:, :, None, None])
     return weight.mul_(valid[:, :, None, :, None] / weight.sum(-1, keepdim=True).clamp_min_(1e-12))
 
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from stages.geometry.neighbours import knn
 from stages.physics.sight import seen_from
@@ -31,22 +29,16 @@ def without_scraps(scene: Scene, support: Support) -> Gaussians:
     if scene.cameras is not None and len(scene.cameras):
         shown &= seen_from(g, scene.cameras).norm(dim=1) > SEEN
     heights = torch.where(shown, support.heights(torch.where(shown[:, None], g.means, 0.0)), torch.inf)
-    table = g.means[shown & (g.object_id == 0) & (heights.abs() < level)]
-    if len(table) < NEIGHBOURS:
+    bare = shown & (g.object_id == 0) & (heights.abs() < level)
+    if int(bare.sum()) < NEIGHBOURS:
         return g
     ids = g.object_id.clone()
     for label in ids.unique().tolist():
         own = shown & (ids == label)
-        if label > 0 and own.any() and _level(g.means[own], heights[own], table, support, margin, level) > PATTERN:
+        if label == 0 or not own.any():
+            continue
+        distance, index = knn(g.means[bare], g.means[own], NEIGHBOURS)
+        even = ((heights[own][:, None] - heights[bare][index]).abs() < level).float().mean(1) > 0.5
+        if float((even & (distance[:, 0] < margin)).float().mean()) > PATTERN:
             ids[ids == label] = 0
     return replace(g, object_id=ids)
-
-
-def _level(
-    points: Float[Tensor, "m 3"], heights: Float[Tensor, "m"], table: Float[Tensor, "t 3"], support: Support,
-    margin: float, level: float,
-) -> Float[Tensor, ""]:  # fmt: skip
-    """Share of the points with table close by, most of it as high as they are."""
-    distance, index = knn(table, points, NEIGHBOURS)
-    even = (heights[:, None] - support.heights(table)[index]).abs() < level
-    return ((distance[:, 0] < margin) & (even.float().mean(1) > 0.5)).float().mean()

@@ -293,3 +293,11 @@ def test_the_same_again_is_the_same():
     world = crowd().to(torch.float32)
     model = loud().float()
     assert torch.equal(model.rollout(world, 30), model.rollout(world, 30))
+
+
+@torch.no_grad()
+def test_neighbourhoods_hold_no_subnormal_numbers_and_whole_weight():
+    """On a CPU products with them take several times as long."""
+    blur = shape_of(crowd(2, 3, 200).to(torch.float32)).blur
+    assert (blur == 0).any() and float(blur[blur > 0].min()) > 100 * torch.finfo(torch.float32).tiny
+    torch.testing.assert_close(blur.sum(-1), torch.ones_like(blur.sum(-1)))

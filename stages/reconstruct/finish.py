@@ -69,7 +69,7 @@ def finish(found: Found, options: ReconstructOptions, steps: Steps, device: str)
         first = found.gaussians
         if first is None:
             first = initialise.to_gaussians(cloud, torch.full((len(cloud),), 0.8), options.level.degree)
-        gaussians = concatenate([first, *filled_in(used, found.maps, cloud, ground, least, options)])
+        gaussians = concatenate([first, *filled_in(used, found.maps, cloud, ground, least, options, device)])
         log.info("%d Gaussians on surfaces, %d where none is known", len(first), len(gaussians) - len(first))
     focus, reach = move(ground.focus), move.scale * ground.radius
     views = dataclasses.replace(found.views, cameras=found.views.cameras.moved(move))
@@ -91,10 +91,11 @@ def finish(found: Found, options: ReconstructOptions, steps: Steps, device: str)
 
 
 def filled_in(
-    views: Views, maps: list[DepthMap], cloud: initialise.Cloud, ground: upright.Ground, least: int, options
-) -> list[Gaussians]:
+    views: Views, maps: list[DepthMap], cloud: initialise.Cloud, ground: upright.Ground, least: int,
+    options: ReconstructOptions, device: str,
+) -> list[Gaussians]:  # fmt: skip
     """Fainter, sparser ones where the photos show something but no depth was confirmed; none where that is little."""
-    more = initialise.fill(views, maps, cloud, ground.plane, least, FAR * ground.radius)
+    more = initialise.fill(views, maps, cloud, ground.plane, least, FAR * ground.radius, device=device)
     more = initialise.thin(more, options.level.gaussians // 4, ground.focus, ground.radius)
     return [initialise.to_gaussians(more, torch.full((len(more),), 0.5), 0)] if len(more) > 10 else []
 

@@ -122,8 +122,9 @@ def _cells(points: Float[Tensor, "n 3"], size: Float[Tensor, "n"]) -> Int[Tensor
 
 
 def fill(
-    views: Views, maps: list[DepthMap], cloud: Cloud, plane: Plane | None, least: int, far: float, stride: int = 3
-) -> Cloud:
+    views: Views, maps: list[DepthMap], cloud: Cloud, plane: Plane | None, least: int, far: float, stride: int = 3,
+    device: str = "cpu",
+) -> Cloud:  # fmt: skip
     """Points for what the photos show but no depth was confirmed at: every `stride`-th pixel not yet covered.
 
     In this order: on the supporting plane where it is known nearby or the matched depth is close to it; at the
@@ -131,7 +132,7 @@ def fill(
     surround the pixel; else at the depth `far`, where a wrong point hides nothing. What would stand before a
     surface that a photo confirms is moved there too.
     """
-    clouds, solid = [], to_gaussians(cloud, torch.full((len(cloud),), 0.8), degree=0)
+    clouds, solid = [], to_gaussians(cloud, torch.full((len(cloud),), 0.8), degree=0).to(device)
     for i, m in enumerate(maps):
         sure = m.support >= least
         away = torch.full_like(m.depth, far)
@@ -201,8 +202,8 @@ def _on_plane(
 def covered(views: Views, i: int, gaussians: Gaussians) -> Bool[Tensor, "h w"]:
     """Pixels of a view that the Gaussians hide by half or more."""
     height, width = views.images[i].shape[:2]
-    camera = views.cameras[[i]]
-    return rasterise(gaussians, camera.viewmats, camera.Ks, width, height).alpha[0] > 0.5
+    viewmats, Ks = (x[[i]].to(gaussians.means) for x in (views.cameras.viewmats, views.cameras.Ks))
+    return rasterise(gaussians, viewmats, Ks, width, height).alpha[0].cpu() > 0.5
 
 
 def to_gaussians(cloud: Cloud, opacity: Float[Tensor, "n"], degree: int) -> Gaussians:

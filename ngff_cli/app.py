@@ -103,7 +103,7 @@ def segment(
         Path | None, Option(help="folder of label images named as the photos (0 background, 1... objects)")
     ] = SegmentOptions.masks,
     boxes: Annotated[
-        Path | None, Option(help="prompts.json: boxes and names in view 0; for sam2 also points")
+        Path | None, Option(help="prompts.json: boxes in view 0 [px] and names; for sam2 also points")
     ] = SegmentOptions.boxes,
     photos: Annotated[
         Path | None, Option(help="of sam2: folder of the scene's photos, else the scene is drawn from its cameras")

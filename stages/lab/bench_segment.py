@@ -29,6 +29,7 @@ from stages.lab.tabletops import KINDS, tabletop
 from stages.models.sam2 import weights as sam2_weights
 from stages.scene.files import replacing
 from stages.scene.scene import Scene
+from stages.segment.boxes import segment as boxes_segment
 from stages.segment.geometric import segment
 from stages.segment.options import SegmentOptions
 from stages.segment.pictures import pictures
@@ -103,6 +104,28 @@ def by_masks(scene: Scene, truth: Int[Tensor, "n"], seed: int) -> dict[str, Call
     return out
 
 
+def by_boxes(scene: Scene, truth: Int[Tensor, "n"]) -> Int[Tensor, "n"]:
+    """Object numbers from tight boxes in the view that shows most of the object it shows least of."""
+
+    def shown(view: int) -> Int[Tensor, "h w"]:
+        front = Sight.of(scene, view).front
+        return torch.where(front >= 0, truth[front.clamp_min(0).long()], 0)
+
+    count, views = int(truth.max()) + 1, range(len(scene.cameras))
+    best = max(views, key=lambda v: int(shown(v).flatten().bincount(minlength=count).min()))
+    labels, size = shown(best), scene.cameras.sizes[best]
+    scale = size / torch.tensor([labels.shape[1], labels.shape[0]])
+    boxes = []
+    for i in range(1, count):
+        spots = (labels == i).nonzero().flip(1)
+        boxes.append([*(spots.amin(0) * scale).tolist(), *((spots.amax(0) + 1) * scale).tolist()])
+    scene = replace(scene, cameras=scene.cameras[[best, *(v for v in views if v != best)]])
+    with tempfile.TemporaryDirectory() as folder:
+        prompts = Path(folder) / "prompts.json"
+        prompts.write_text(json.dumps({"bbox": boxes}))
+        return boxes_segment(scene, SegmentOptions(boxes=prompts)).gaussians.object_id
+
+
 def by_sam2(scene: Scene, model) -> Int[Tensor, "n"]:
     """Object numbers that SAM 2.1 gives, without prompts, from drawings of the scene."""
     return labelled(scene, model, pictures(scene), None, SegmentOptions("sam2")).gaussians.object_id
@@ -113,7 +136,8 @@ def measure(kind: str, index: int, photos: int, model=None) -> list[dict]:
     scene = tabletop(kind, index, photos)
     truth = scene.gaussians.object_id
     blank = replace(scene, gaussians=replace(scene.gaussians, object_id=torch.zeros_like(truth)), objects=())
-    ways = {"geometric": lambda: segment(blank, SegmentOptions()).gaussians.object_id, **by_masks(blank, truth, index)}
+    ways = {"geometric": lambda: segment(blank, SegmentOptions()).gaussians.object_id,
+            "boxes": lambda: by_boxes(blank, truth), **by_masks(blank, truth, index)}  # fmt: skip
     if model is not None:
         ways["sam2"] = lambda: by_sam2(blank, model)
     rows = []

@@ -1,90 +1,145 @@
-"""Objects from boxes drawn in the first view: the geometric groups that fill them."""
+"""Objects from boxes drawn in the first view: cut out of it by colour, then out of other views, and voted.
+
+What is cut out of one view says of Gaussians whose they are, those say in the next view where to look, and so on, from
+near views to far ones. Source of the cut: Rother, Kolmogorov and Blake 2004, "GrabCut", as in OpenCV.
+"""
 
 from __future__ import annotations
 
-import logging
-from dataclasses import replace
-
+import cv2
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int, UInt8
+from scipy.ndimage import binary_fill_holes, distance_transform_edt, gaussian_filter
+from torch import Tensor
+from tqdm import tqdm
 
 from stages.errors import InputError
-from stages.geometry.cameras import depths, project
-from stages.physics.grouping import Grouping, group
-from stages.scene.scene import Scene, SceneObject
+from stages.geometry.cameras import centres
+from stages.scene.scene import Scene
 from stages.segment.options import SegmentOptions
+from stages.segment.pictures import drawn
 from stages.segment.prompts import read_prompts
+from stages.segment.vote import Sight, add, decide, tempered
 
-log = logging.getLogger(__name__)
+VIEWS = 32  # at most that are cut: more say the same again
+BINS = 32  # of a colour's channels
+OWN = 2.5  # times as often in the box as around it is a colour that speaks for the object
+AROUND = 0.5  # width of what is around a box [its longer side]
+REACH = 0.1  # how far from where an object is thought to be it may be found [root of its area]
+UNSEEN = 0.5  # the same, of what no earlier view showed
+PIECE = 0.1  # a separate piece of a cut smaller than this share of the largest is none
 
 
 def segment(scene: Scene, options: SegmentOptions) -> Scene:
-    """For each box the group, or the few groups, that together fill it best; the rest is background."""
-    prompts = read_prompts(options.boxes)
-    if prompts.boxes is None:
-        raise InputError(f"{options.boxes}: has points and no bbox; points are for --backend sam2")
+    """The object in each box; the rest is background. Memory holds one view at a time."""
     if scene.cameras is None or not len(scene.cameras):
         raise InputError("--boxes: the scene has no cameras; use one that `ngff reconstruct` wrote")
-    fine = Grouping(max(options.max_objects, 4 * len(prompts.names)), 0.5 * options.min_size, options.detail)
-    grouped = group(scene, fine)
-    count = len(grouped.objects)
-    if not count:
-        raise InputError(f"{options.boxes}: nothing stands on the plane of the scene, so no box can be filled")
-    spans = torch.stack([_span(grouped, number) for number in range(1, count + 1)])
-    ids, objects, taken = torch.zeros_like(grouped.gaussians.object_id), [], set()
-    for row, (box, name) in enumerate(zip(prompts.boxes, prompts.names, strict=True), start=1):
-        chosen = _fill(box, spans, taken)
-        if not chosen:
-            log.warning("%s: no group of Gaussians lies in the box of %s", options.boxes, name)
+    size = scene.cameras.sizes[0].tolist()
+    prompts = read_prompts(options.boxes, size)
+    if prompts.boxes is None:
+        raise InputError(f"{options.boxes}: has points and no bbox; points are for --backend sam2")
+    shares = prompts.boxes.clamp_min(0) / torch.tensor([*size, *size])
+    for share, name in zip(shares, prompts.names, strict=True):
+        if bool((share[:2] >= 1).any()) or not bool((share[2:] > share[:2]).all()):
+            raise InputError(f"{options.boxes}: the box of {name} lies outside of the first view, which has {size[0]}x"
+                             f'{size[1]} pixels; if it was drawn in a larger one, add "size": [width, height]')  # fmt: skip
+    votes = torch.zeros(len(scene.gaussians), 1 + len(shares))
+    for view in tqdm(nearest_first(scene), desc="cutting", unit="view", leave=False):
+        sight = Sight.of(scene, view)
+        height, width = sight.front.shape
+        picture = (255 * drawn(scene, view).numpy()).astype(np.uint8)
+        picture = cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA)
+        labels = first(picture, shares, options.seed) if view == 0 else again(picture, sight, votes, options.seed)
+        votes = add(votes, tempered(sight.votes(torch.from_numpy(labels))))
+    return decide(scene, votes, dict(enumerate(prompts.names, start=1)), str(options.boxes), options.seed)
+
+
+def nearest_first(scene: Scene) -> list[int]:
+    """The first view and at most VIEWS - 1 others, evenly chosen, by distance from it."""
+    eyes = centres(scene.cameras.viewmats)
+    order = (eyes - eyes[0]).norm(dim=1)
+    order[0] = -1
+    pick = torch.linspace(0, len(eyes) - 1, min(VIEWS, len(eyes))).round().long()
+    return order.argsort(stable=True)[pick].tolist()
+
+
+def first(
+    picture: UInt8[np.ndarray, "h w 3"], shares: Float[Tensor, "o 4"], seed: int
+) -> Int[np.ndarray, "h w"]:
+    """Labels of the view that the boxes are about. Where they overlap, the smallest has the first choice."""
+    height, width = picture.shape[:2]
+    labels = np.zeros((height, width), dtype=np.int64)
+    boxes = (shares * torch.tensor([width, height, width, height])).round().long()
+    for i in (shares[:, 2:] - shares[:, :2]).prod(1).argsort(stable=True).tolist():
+        x0, y0, x1, y1 = boxes[i].tolist()
+        inside, near = np.zeros((2, height, width), dtype=bool)
+        side = round(AROUND * max(x1 - x0, y1 - y0))
+        near[max(0, y0 - side) : y1 + side, max(0, x0 - side) : x1 + side] = True
+        inside[y0:y1, x0:x1] = True
+        inside &= labels == 0
+        likely = inside & (peculiar(picture, inside, near & ~inside) > OWN)
+        if not likely.any():  # looks like what is around it: the cut has to begin with all of the box
+            likely = inside
+        labels[cut(picture, inside & ~likely, likely, np.zeros_like(inside), seed)] = i + 1
+    return labels
+
+
+def peculiar(
+    picture: UInt8[np.ndarray, "h w 3"], inside: Bool[np.ndarray, "h w"], around: Bool[np.ndarray, "h w"]
+) -> Float[np.ndarray, "h w"]:
+    """How much oftener the colour of each pixel is inside than around."""
+    lab = cv2.cvtColor(cv2.GaussianBlur(picture, (0, 0), 1), cv2.COLOR_RGB2LAB).astype(np.int64) * BINS // 256
+    key = (lab * (BINS**2, BINS, 1)).sum(-1)
+    shares = []
+    for part in (inside, around):
+        count = np.bincount(key[part], minlength=BINS**3).reshape(BINS, BINS, BINS)
+        shares.append(gaussian_filter(count / max(1, part.sum()), 1.0).ravel())
+    return (shares[0] / (shares[1] + 1e-6))[key]
+
+
+def again(
+    picture: UInt8[np.ndarray, "h w 3"], sight: Sight, votes: Float[Tensor, "n k"], seed: int
+) -> Int[np.ndarray, "h w"]:
+    """Labels of another view, from what the Gaussians in it are known to be."""
+    front = sight.front.long().clamp_min(0)
+    known = ((sight.front >= 0) & (votes.sum(1) > 0)[front]).numpy()
+    label = votes.argmax(1)[front].numpy()
+    labels, likeliness = np.zeros(known.shape, dtype=np.int64), np.zeros(known.shape)
+    for i in range(1, votes.shape[1]):
+        own = known & (label == i)
+        if own.sum() < 20:
             continue
-        taken |= set(chosen)
-        ids[torch.isin(grouped.gaussians.object_id, torch.tensor(chosen) + 1)] = row
-        objects.append(SceneObject(row, name))
-    return replace(grouped, gaussians=replace(grouped.gaussians, object_id=ids), objects=tuple(objects))
+        other = known & ~own
+        outside, within = distance_transform_edt(~own), distance_transform_edt(~other) if other.any() else np.inf
+        size = own.sum() ** 0.5
+        sure, close = own & (within > REACH / 2 * size), outside < np.where(known, REACH, UNSEEN) * size
+        found = cut(picture, close & (outside > within), close & (outside <= within), sure, seed)
+        mine = np.where(found, within - outside, -np.inf)  # the deeper a pixel is in what is known, the surer
+        labels = np.where(found & ((labels == 0) | (mine > likeliness)), i, labels)
+        likeliness = np.where(labels == i, mine, likeliness)
+    return labels
 
 
-def _span(scene: Scene, number: int) -> Float[Tensor, "4"]:
-    """Box around an object in view 0 [px], without its outermost hundredth; nan where it is behind the camera."""
-    g, cameras = scene.gaussians, scene.cameras
-    means = g.means[g.object_id == number]
-    means = means[depths(means, cameras.viewmats[0]) > 0.01]
-    if not len(means):
-        return torch.full((4,), torch.nan)
-    pixel = project(means, cameras.viewmats[0], cameras.Ks[0])[:: max(1, len(means) // 100_000)]
-    return torch.cat([pixel.quantile(0.01, dim=0), pixel.quantile(0.99, dim=0)])
+def cut(
+    picture: UInt8[np.ndarray, "h w 3"], unlikely: Bool[np.ndarray, "h w"], likely: Bool[np.ndarray, "h w"],
+    sure: Bool[np.ndarray, "h w"], seed: int,
+) -> Bool[np.ndarray, "h w"]:  # fmt: skip
+    """The object's pixels; what is neither likely, unlikely nor sure is something else."""
+    trimap = np.full(likely.shape, cv2.GC_BGD, dtype=np.uint8)
+    trimap[unlikely], trimap[likely], trimap[sure] = cv2.GC_PR_BGD, cv2.GC_PR_FGD, cv2.GC_FGD
+    if ((trimap == cv2.GC_BGD) | (trimap == cv2.GC_PR_BGD)).any() and (likely | sure).any():
+        cv2.setRNGSeed(seed)
+        # once: learning colours again from the cut, what shows between limbs becomes the object's
+        cv2.grabCut(picture, trimap, None, *np.zeros((2, 1, 65)), 1, cv2.GC_INIT_WITH_MASK)
+    return tidy((trimap == cv2.GC_FGD) | (trimap == cv2.GC_PR_FGD))
 
 
-def _fill(box: Float[Tensor, "4"], spans: Float[Tensor, "o 4"], taken: set[int]) -> list[int]:
-    """Groups whose joint span overlaps the box best, added one at a time while that grows."""
-    chosen: list[int] = []
-    best = 0.1  # less is not this object
-    while True:
-        scores = {}
-        for i, span in enumerate(spans):
-            if i not in taken and i not in chosen and not bool(span.isnan().any()) and _within(span, box) > 0.5:
-                joint = torch.stack([span, *(spans[j] for j in chosen)])
-                scores[i] = overlap(torch.cat([joint[:, :2].amin(0), joint[:, 2:].amax(0)]), box)
-        if not scores or max(scores.values()) <= best + 0.02:
-            return chosen
-        winner = max(scores, key=scores.get)
-        best = scores[winner]
-        chosen.append(winner)
-
-
-def _area(box: Float[Tensor, "4"]) -> float:
-    return float((box[2:] - box[:2]).clamp_min(0).prod())
-
-
-def _shared(a: Float[Tensor, "4"], b: Float[Tensor, "4"]) -> float:
-    return _area(torch.cat([torch.maximum(a[:2], b[:2]), torch.minimum(a[2:], b[2:])]))
-
-
-def _within(span: Float[Tensor, "4"], box: Float[Tensor, "4"]) -> float:
-    """Share of the span that lies in the box."""
-    return _shared(span, box) / max(_area(span), 1e-9)
-
-
-def overlap(a: Float[Tensor, "4"], b: Float[Tensor, "4"]) -> float:
-    """Intersection over union of two boxes x0 y0 x1 y1."""
-    shared = _shared(a, b)
-    return shared / max(_area(a) + _area(b) - shared, 1e-9)
+def tidy(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """Without small pieces and small holes."""
+    _, piece, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
+    areas = np.where(np.arange(len(stats)) > 0, stats[:, cv2.CC_STAT_AREA], 0)
+    kept = (areas >= PIECE * areas.max())[piece] & mask
+    holes = binary_fill_holes(kept) & ~kept
+    _, hole, stats, _ = cv2.connectedComponentsWithStats(holes.astype(np.uint8))
+    return kept | (holes & (stats[:, cv2.CC_STAT_AREA] < PIECE**2 * kept.sum())[hole])

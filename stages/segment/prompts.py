@@ -23,10 +23,11 @@ class Prompts:
     names: tuple[str, ...]
 
 
-def read_prompts(path: Path) -> Prompts:
+def read_prompts(path: Path, size: tuple[int, int] | None = None) -> Prompts:
     """prompts.json in the public format: {"bbox": [[x0, y0, x1, y1]..], "center_point": [[u, v]..], "text": [..]}.
 
-    Either of the first two may be absent or empty. Raises InputError for what is no such file.
+    Either of the first two may be absent or empty. "size": [width, height] says how large the picture is that all this
+    was drawn in, when it is not as large as view 0, which has `size`. Raises InputError for what is no such file.
     """
     must_exist(path, "a prompts.json with bbox or center_point, and text")
     try:
@@ -34,6 +35,8 @@ def read_prompts(path: Path) -> Prompts:
         boxes = torch.tensor(data.get("bbox") or [], dtype=torch.float32).reshape(-1, 4)
         points = torch.tensor(data.get("center_point") or [], dtype=torch.float32).reshape(-1, 2)
         count = len(boxes) or len(points)
+        scale = torch.tensor(size or [1, 1]) / torch.tensor((data.get("size") or size) if size else [1, 1])
+        boxes, points = boxes * scale.repeat(2), points * scale
         names = tuple(str(name) for name in data.get("text") or [f"object_{i + 1}" for i in range(count)])
     except (ValueError, KeyError, TypeError, AttributeError, RuntimeError) as error:
         raise _wrong(path, repr(error)) from error

@@ -30,7 +30,7 @@ def segment(scene: Scene, options: SegmentOptions) -> Scene:
     if scene.cameras is None or not len(scene.cameras):
         raise InputError("--backend sam2: the scene has no cameras; use one that `ngff reconstruct` wrote")
     shown = pictures(scene, options.photos)
-    prompts = read_prompts(options.boxes) if options.boxes is not None else None
+    prompts = read_prompts(options.boxes, scene.cameras.sizes[0].tolist()) if options.boxes is not None else None
     if prompts is not None and shown.views[0] != 0:
         raise InputError(f"{options.photos}: lacks {scene.cameras.names[0]}, the photo that --boxes is about")
     model = load(_weights(options), pick_device(options.device))

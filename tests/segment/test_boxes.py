@@ -1,0 +1,106 @@
+"""Objects from boxes: what geometry cannot tell apart, colour does; and what a box may be."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from stages.errors import InputError
+from stages.geometry.cameras import project
+from stages.segment.boxes import VIEWS, first, nearest_first, segment, tidy
+from stages.segment.options import SegmentOptions
+from stages.segment.prompts import read_prompts
+from tests.segment.tabletop import WOOD, block, egg, round_about, scene_of, table, three_apart
+
+
+def prompts_of(path, scene, numbers, grow=1.0):
+    """A file with a box around each of these objects in the first view."""
+    rows = []
+    for i in numbers:
+        pixel = project(scene.gaussians.means[scene.gaussians.object_id == i], scene.cameras.viewmats[0],
+                        scene.cameras.Ks[0])  # fmt: skip
+        rows.append([*(pixel.amin(0) - grow).tolist(), *(pixel.amax(0) + grow).tolist()])
+    path.write_text(json.dumps({"bbox": rows, "text": [f"thing {i}" for i in numbers]}))
+    return SegmentOptions(boxes=path)
+
+
+def blank(scene):
+    return replace(scene, gaussians=replace(scene.gaussians, object_id=torch.zeros_like(scene.gaussians.object_id)))
+
+
+def overlap(found, scene, mine, theirs):
+    a, b = found.gaussians.object_id == mine, scene.gaussians.object_id == theirs
+    return float((a & b).sum() / (a | b).sum())
+
+
+def test_what_leans_on_a_thing_of_the_background_is_cut_from_it(tmp_path):
+    """A green doll of two eggs with a red mouth sits against a white cushion that nobody pointed at."""
+    cushion = block((0.0, 0.16), (0.4, 0.12, 0.25), (0.85, 0.85, 0.8), 2)
+    trunk = egg((0.0, 0.03, 0.08), (0.07, 0.07, 0.08), (0.15, 0.6, 0.1), 1)
+    head = egg((0.0, 0.03, 0.2), (0.05, 0.05, 0.05), (0.15, 0.65, 0.15), 1)
+    scene = scene_of(table(), cushion, trunk, head, noise=0.001)
+    scene = replace(scene, cameras=scene.cameras[[6, 7, 5, 4, 0]])  # the doll shows in the first
+    found = segment(blank(scene), prompts_of(tmp_path / "p.json", scene, [1]))
+    assert [(o.id, o.name) for o in found.objects] == [(1, "thing 1")]
+    assert overlap(found, scene, 1, 1) > 0.85
+
+
+def test_boxes_that_overlap_are_told_apart(tmp_path):
+    far = block((0.0, 0.05), (0.25, 0.05, 0.2), (0.8, 0.1, 0.1), 1)
+    scene = scene_of(table(), far, block((0.0, -0.08), (0.1, 0.05, 0.08), (0.1, 0.2, 0.8), 2))
+    scene = replace(scene, cameras=scene.cameras[[6, 7, 5, 0, 4, 1, 3, 2]])
+    found = segment(blank(scene), prompts_of(tmp_path / "p.json", scene, [1, 2]))
+    assert overlap(found, scene, 1, 1) > 0.85 and overlap(found, scene, 2, 2) > 0.85
+
+
+def test_what_looks_like_all_around_it_is_still_looked_for(tmp_path):
+    """A block of the table's own wood: the cut has nothing to go by, and ends in an answer or in none."""
+    scene = scene_of(table(), block((0.0, 0.0), (0.1, 0.1, 0.1), WOOD, 1))
+    found = segment(blank(scene), prompts_of(tmp_path / "p.json", scene, [1]))
+    assert {o.id for o in found.objects} <= {1}
+
+
+def test_the_first_view_comes_first_then_near_ones_and_not_too_many():
+    scene = three_apart()
+    order = nearest_first(scene)
+    assert order[0] == 0 and sorted(order) == list(range(8)) and {order[1], order[2]} == {1, 7} and order[-1] == 4
+    many = nearest_first(replace(scene, cameras=round_about(100)))
+    assert len(many) == len(set(many)) == VIEWS and many[0] == 0 and 50 in many
+
+
+def test_a_box_of_the_whole_picture_is_all_of_it():
+    picture = np.random.default_rng(0).integers(0, 255, (24, 32, 3), dtype=np.uint8)
+    assert (first(picture, torch.tensor([[0.0, 0.0, 1.0, 1.0]]), 0) == 1).all()
+
+
+def test_small_pieces_and_small_holes_go():
+    mask = np.zeros((40, 40), dtype=bool)
+    mask[5:35, 5:35] = True
+    mask[20, 20:22], mask[8:16, 8:16], mask[1, 1] = False, False, True
+    clean = tidy(mask)
+    assert clean[20, 20] and not clean[10, 10] and not clean[1, 1]
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [('{"bbox": [[200, 10, 300, 50]], "text": ["duck"]}', "of duck lies outside of the first view, which has 160x160"),
+     ('{"center_point": [[5, 5]], "text": ["duck"]}', "points are for --backend sam2")],
+)  # fmt: skip
+def test_a_box_that_cannot_be_is_one_sentence(tmp_path, text, says):
+    (tmp_path / "p.json").write_text(text)
+    with pytest.raises(InputError, match=says):
+        segment(three_apart(), SegmentOptions(boxes=tmp_path / "p.json"))
+
+
+def test_boxes_may_be_drawn_in_a_picture_of_another_size(tmp_path):
+    (tmp_path / "p.json").write_text('{"bbox": [[100, 50, 300, 200]], "center_point": [[40, 20]], "size": [1600, 800]}')
+    prompts = read_prompts(tmp_path / "p.json", (160, 80))
+    assert prompts.boxes.tolist() == [[10, 5, 30, 20]] and prompts.points.tolist() == [[4, 2]]
+
+
+def test_a_scene_without_cameras_is_refused(tmp_path):
+    (tmp_path / "p.json").write_text('{"bbox": [[1, 1, 5, 5]]}')
+    with pytest.raises(InputError, match="has no cameras"):
+        segment(three_apart(cameras=False), SegmentOptions(boxes=tmp_path / "p.json"))

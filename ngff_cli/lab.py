@@ -57,7 +57,7 @@ def replay(
 @app.command()
 def dataset(
     out: Annotated[Path, typer.Argument(metavar="FOLDER", help="where the data set goes; what is there is kept")],
-    groups: Annotated[str, typer.Option(help="which groups of scenes, such as 3_0..3_9,4,6")] = "3_0..3_9,4,6",
+    groups: Annotated[str, typer.Option(help="of scenes; more_0..more_9: more of three objects")] = "3_0..3_9,4,6",
     only: Annotated[str, typer.Option(help="parts, with commas between: motions, scenes, mpm, initial, dynamic, "
                                       "objects, backgrounds, scene_configs")] = "motions",
     frames: Annotated[int, typer.Option(help="frames of 0.02 s")] = 100,

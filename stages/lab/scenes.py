@@ -26,7 +26,9 @@ GAP = 0.05  # least distance between points of two objects, and between centres 
 ASIDE = 0.1  # how far aside of the object it is put near, in scenes of up to 4 [m]
 TRIES = 500  # for an object, before the scene is begun again
 VARIED = "varied"  # group of scenes with objects at random, which belong to no published set
-SCENES = {**{f"3_{i}": 300 for i in range(10)}, "4": 100, "6": 100}  # groups, and how many scenes each has
+PUBLISHED = {**{f"3_{i}": 300 for i in range(10)}, "4": 100, "6": 100}  # groups, and how many scenes each has
+MORE = {f"more_{i}": 300 for i in range(10)}  # the same as the first ten in other arrangements, to learn more from
+SCENES = {**PUBLISHED, **MORE}
 
 
 @dataclass(frozen=True)
@@ -63,6 +65,7 @@ class Extent:
 def configs_of(group: str, extents: Mapping[int, Extent]) -> dict[str, Config]:
     """All scenes of a group, the same for ever: each has a seed of its own."""
     count, first = objects_in(group), 300 * int(group.split("_")[1]) if "_" in group else 0
+    first += 3000 * (group in MORE)
     made = (sample_scene(first + i, count, extents) for i in range(SCENES[group]))
     return {c.name: c for c in made}
 
@@ -82,14 +85,14 @@ def objects_in(group: str) -> int:
     """How many objects the scenes of a group have. Raises InputError for a group that is not there."""
     if group not in SCENES:
         raise InputError(f"--groups {group}: there are {', '.join(SCENES)}")
-    return int(group.split("_")[0])
+    return 3 if group in MORE else int(group.split("_")[0])
 
 
 def groups_of(text: str, more: tuple[str, ...] = ()) -> list[str]:
     """ "3_0..3_2,4" -> ["3_0", "3_1", "3_2", "4"]; `more` are names of others that may be asked for."""
     out: list[str] = []
     for part in text.split(","):
-        span = re.fullmatch(r"(\d)_(\d)\.\.\1_(\d)", part.strip())
+        span = re.fullmatch(r"(\w+)_(\d)\.\.\1_(\d)", part.strip())
         names = [f"{span[1]}_{i}" for i in range(int(span[2]), int(span[3]) + 1)] if span else [part.strip()]
         for name in names:
             if name not in more:

@@ -17,7 +17,8 @@ EMA = 0.999  # of the running mean of the weights, from a few thousand steps on
 LIMIT = 2.0  # gradients are cut to so many times their usual norm
 MEMORY = 0.99  # of the usual norm
 WARM = 200  # steps until the full rate
-LOST = 1.25  # times the lowest RMSE so far, from which on training has gone astray
+LOST = 1.25  # times the lowest RMSE so far, from which on training has gone astray,
+WORSE = 4  # as it has when each of so many checks was worse than the one before
 OPTIMIZERS = ("adamw", "soap")
 
 
@@ -81,8 +82,12 @@ class Trainee:
         self.curve.append(row)
         if row["RMSE"] <= lowest:
             self.best = copy.deepcopy(self.ema.state_dict())
-        elif not row["RMSE"] < LOST * lowest:
+        elif not row["RMSE"] < LOST * lowest or self._sinking():
             self._rewind()
+
+    def _sinking(self) -> bool:
+        last = [r["RMSE"] for r in self.curve[-WORSE - 1 :]]
+        return len(last) > WORSE and all(a < b for a, b in zip(last, last[1:], strict=False))
 
     def _rewind(self) -> None:
         self.model.load_state_dict(self.best)

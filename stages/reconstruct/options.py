@@ -37,8 +37,8 @@ class Quality:
 
 QUALITIES = {
     "draft": Quality(side=512, gaussians=50_000, steps=300, steps_cuda=1000, degree=0),
-    "normal": Quality(side=640, gaussians=90_000, steps=800, steps_cuda=3000, degree=1),
-    "high": Quality(side=1024, gaussians=300_000, steps=3000, steps_cuda=3500, degree=2),
+    "normal": Quality(side=640, gaussians=90_000, steps=800, steps_cuda=3000, degree=2),
+    "high": Quality(side=1024, gaussians=300_000, steps=3000, steps_cuda=3500, degree=3),
 }
 
 

@@ -42,8 +42,8 @@ def segment(scene: Scene, options: SegmentOptions) -> Scene:
     shares = prompts.boxes.clamp_min(0) / torch.tensor([*size, *size])
     for share, name in zip(shares, prompts.names, strict=True):
         if bool((share[:2] >= 1).any()) or not bool((share[2:] > share[:2]).all()):
-            raise InputError(f"{options.boxes}: the box of {name} lies outside of the first view, which has {size[0]}x"
-                             f'{size[1]} pixels; if it was drawn in a larger one, add "size": [width, height]')  # fmt: skip
+            raise InputError(f"{options.boxes}: the box of {name} lies outside of the first view, which has "
+                             f'{size[0]}x{size[1]} pixels; drawn in a larger picture, add "size": [w, h]')  # fmt: skip
     votes = torch.zeros(len(scene.gaussians), 1 + len(shares))
     for view in tqdm(nearest_first(scene), desc="cutting", unit="view", leave=False):
         sight = Sight.of(scene, view)

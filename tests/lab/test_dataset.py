@@ -71,6 +71,12 @@ def test_groups_and_their_files(tmp_path, extents, monkeypatch):
     assert groups_of("3_0..3_2, 4") == ["3_0", "3_1", "3_2", "4"]
     with pytest.raises(InputError, match="3_10"):
         groups_of("3_10")
+    assert groups_of("more_8..more_9") == ["more_8", "more_9"]
+    for group in ("3_9", "more_0", "more_1"):
+        monkeypatch.setitem(SCENES, group, 2)
+    made = [c for group in ("3_9", "more_0", "more_1") for c in configs_of(group, extents).values()]
+    assert [int(c.name.split("_")[0]) for c in made] == [2700, 2701, 3000, 3001, 3300, 3301]  # none is another's
+    assert all(len(c.ids) == 3 for c in made)
     monkeypatch.setitem(SCENES, "4", 10)
     configs = configs_of("4", extents)
     assert len(configs) == 10 and all(len(c.ids) == 4 for c in configs.values())

@@ -305,6 +305,14 @@ def test_training_gone_astray_goes_on_from_the_best_at_half_the_rate():
     assert moved == pytest.approx(0.5e-2 / WARM, rel=0.01)  # as a first step: nothing of the old moments is left
 
 
+@pytest.mark.parametrize(("after", "caution"), [((1.01, 1.02, 1.03, 1.04), 0.5), ((1.01, 1.02, 1.03, 1.02, 1.03), 1.0)])
+def test_training_that_gets_worse_check_by_check_has_gone_astray(after, caution):
+    trainee = Trainee(build("gcn"), 1e-3, 0)
+    for rmse in (1.2, 1.0, *after):
+        trainee.note({"RMSE": rmse})
+    assert trainee.caution == caution
+
+
 def test_longer_rollouts_begin_anew():
     trainee = Trainee(build("gcn", hidden=8), 1e-2, 0)
     trainee.anew(8)

@@ -23,7 +23,11 @@ def products(vectors: Float[Tensor, "*b k 3"]) -> Float[Tensor, "*b g"]:
     k = vectors.shape[-2]
     row, column = torch.triu_indices(k, k, device=vectors.device)
     # index_select: the gradient of plain indexing sorts, which takes longer than all the rest
-    return torch.asinh((vectors.index_select(-2, row) * vectors.index_select(-2, column)).sum(-1))
+    if vectors.is_cuda:
+        return torch.asinh((vectors.index_select(-2, row) * vectors.index_select(-2, column)).sum(-1))
+    xyz = vectors.reshape(-1, k, 3).permute(2, 1, 0).contiguous()  # a CPU copies long rows faster than triples
+    inner = sum(x.index_select(0, row) * x.index_select(0, column) for x in xyz)
+    return torch.asinh(inner).mT.reshape(*vectors.shape[:-2], len(row))
 
 
 def weigh(weights: Float[Tensor, "*b k"], vectors: Float[Tensor, "*b k 3"]) -> Float[Tensor, "*b 3"]:

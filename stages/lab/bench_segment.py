@@ -112,8 +112,9 @@ def by_boxes(scene: Scene, truth: Int[Tensor, "n"]) -> Int[Tensor, "n"]:
         return torch.where(front >= 0, truth[front.clamp_min(0).long()], 0)
 
     count, views = int(truth.max()) + 1, range(len(scene.cameras))
-    best = max(views, key=lambda v: int(shown(v).flatten().bincount(minlength=count).min()))
-    labels, size = shown(best), scene.cameras.sizes[best]
+    seen = [shown(view) for view in views]
+    best = max(views, key=lambda v: int(seen[v].flatten().bincount(minlength=count).min()))
+    labels, size = seen[best], scene.cameras.sizes[best]
     scale = size / torch.tensor([labels.shape[1], labels.shape[0]])
     boxes = []
     for i in range(1, count):

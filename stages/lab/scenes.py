@@ -26,9 +26,8 @@ GAP = 0.05  # least distance between points of two objects, and between centres 
 ASIDE = 0.1  # how far aside of the object it is put near, in scenes of up to 4 [m]
 TRIES = 500  # for an object, before the scene is begun again
 VARIED = "varied"  # group of scenes with objects at random, which belong to no published set
-PUBLISHED = {**{f"3_{i}": 300 for i in range(10)}, "4": 100, "6": 100}  # groups, and how many scenes each has
-MORE = {f"more_{i}": 300 for i in range(10)}  # the same as the first ten in other arrangements, to learn more from
-SCENES = {**PUBLISHED, **MORE}
+MORE = {f"more_{i}": 300 for i in range(10)}  # of three objects, in no published set: to learn more from
+SCENES = {**{f"3_{i}": 300 for i in range(10)}, "4": 100, "6": 100, **MORE}  # groups, and how many scenes each has
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+from itertools import pairwise
 from pathlib import Path
 
 import torch
@@ -87,7 +88,7 @@ class Trainee:
 
     def _sinking(self) -> bool:
         last = [r["RMSE"] for r in self.curve[-WORSE - 1 :]]
-        return len(last) > WORSE and all(a < b for a, b in zip(last, last[1:], strict=False))
+        return len(last) > WORSE and all(a < b for a, b in pairwise(last))
 
     def _rewind(self) -> None:
         self.model.load_state_dict(self.best)

@@ -18,7 +18,6 @@ from stages.errors import InputError
 from stages.geometry.cameras import centres
 from stages.scene.scene import Scene
 from stages.segment.options import SegmentOptions
-from stages.segment.pictures import drawn
 from stages.segment.prompts import read_prompts
 from stages.segment.vote import Sight, add, decide, tempered
 
@@ -47,9 +46,7 @@ def segment(scene: Scene, options: SegmentOptions) -> Scene:
     votes = torch.zeros(len(scene.gaussians), 1 + len(shares))
     for view in tqdm(nearest_first(scene), desc="cutting", unit="view", leave=False):
         sight = Sight.of(scene, view)
-        height, width = sight.front.shape
-        picture = (255 * drawn(scene, view).numpy()).astype(np.uint8)
-        picture = cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA)
+        picture = (255 * sight.picture.numpy()).astype(np.uint8)
         labels = first(picture, shares, options.seed) if view == 0 else again(picture, sight, votes, options.seed)
         votes = add(votes, tempered(sight.votes(torch.from_numpy(labels))))
     return decide(scene, votes, dict(enumerate(prompts.names, start=1)), str(options.boxes), options.seed)

@@ -35,8 +35,9 @@ def read_prompts(path: Path, size: tuple[int, int] | None = None) -> Prompts:
         boxes = torch.tensor(data.get("bbox") or [], dtype=torch.float32).reshape(-1, 4)
         points = torch.tensor(data.get("center_point") or [], dtype=torch.float32).reshape(-1, 2)
         count = len(boxes) or len(points)
-        scale = torch.tensor(size or [1, 1]) / torch.tensor((data.get("size") or size) if size else [1, 1])
-        boxes, points = boxes * scale.repeat(2), points * scale
+        if size is not None:
+            scale = torch.tensor(size) / torch.tensor(data.get("size") or size).reshape(2)
+            boxes, points = boxes * scale.repeat(2), points * scale
         names = tuple(str(name) for name in data.get("text") or [f"object_{i + 1}" for i in range(count)])
     except (ValueError, KeyError, TypeError, AttributeError, RuntimeError) as error:
         raise _wrong(path, repr(error)) from error

@@ -34,19 +34,20 @@ class Sight:
     pixels: Int[Tensor, "m"]  # where those are, counted row by row
     weights: Float[Tensor, "m"]  # that they have in the whole image [px]
     gaussians: int  # of the scene
+    picture: Float[Tensor, "h w 3"]  # what it sees, 0..1
 
     @classmethod
     def of(cls, scene: Scene, view: int) -> Sight:
         g, viewmat = scene.gaussians, scene.cameras.viewmats[view]
         width, height, K = counted_at(scene, view)
         front, weight = visibility(g, viewmat, K, width, height)
-        depth = rasterise(g, viewmat[None], K[None], width, height).depth[0]
+        drawn = rasterise(g, viewmat[None], K[None], width, height)
         x, y = project(g.means, viewmat, K).nan_to_num(-1).floor().long().unbind(1)
         z = depths(g.means, viewmat)
         inside = torch.nonzero((z > 0.01) & (x >= 0) & (x < width) & (y >= 0) & (y < height))[:, 0]
         pixels = y[inside] * width + x[inside]
-        on = (z[inside] - depth.flatten()[pixels]).abs() < SURFACE * z[inside]
-        return cls(front, inside[on], pixels[on], weight[inside[on]], len(g))
+        on = (z[inside] - drawn.depth[0].flatten()[pixels]).abs() < SURFACE * z[inside]
+        return cls(front, inside[on], pixels[on], weight[inside[on]], len(g), drawn.rgb[0].clamp(0, 1))
 
     def votes(self, labels: Int[Tensor, "h2 w2"]) -> Float[Tensor, "n k"]:
         """For each Gaussian and label, the weight of the pixels it is seen in; `labels` may have any size.

@@ -93,6 +93,7 @@ def test_the_segment_report_finds_blocks_apart_and_the_vote_mends_wrong_masks(tm
     for by in means.values():  # blocks of Gaussians this large let the table shine through, so no mask is perfect
         assert by["masks"] > 0.7 and by["masks"] > by["masks, 20% wrong"] > by["masks, 40% wrong"]
         assert by["masks, 20% wrong"] > by["masks, 20% wrong, no vote"] + 0.2
+        assert by["boxes"] > 0.5
     assert means["apart"]["geometric"] > 0.9
 
 

@@ -85,7 +85,7 @@ class _Step:
         body, moved, inner, planes = self._begin(state)
         count, point, felt, record = self._meeting(body, moved, planes)
         known, parts, *grip = self._touch(count, point, felt, record)
-        pushed = grip  # nobody: not read
+        pushed = tuple(grip)  # nobody: not read
         if self.pushes.object.shape[1]:
             pushed = self.pushes.wrench(moved[:, :, :3].mT, body[..., :3].contiguous(), t, self.dt)
         return self._end(body, moved, inner, parts, felt, grip, known, pushed)

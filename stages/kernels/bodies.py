@@ -107,7 +107,7 @@ def advance(
     write3(to + HIGH, max3(where3(there, x, -far)))
     fastest = tl.sqrt(tl.max(tl.where(there, dot(speed, speed), 0.0)))
     tl.store(to + WITHIN, FAR / 2 + FRAME * fastest)  # two objects farther apart than both say cannot touch
-    room = box + 6 * (i // o)
+    room = box + 6 * i
     height = x[2] - tl.load(room + 2)
     key = tl.where(there, tl.minimum(height, height + FRAME * speed[2]), far)
     tl.store(keys + 2 * i * n + r, key, mask=inside)

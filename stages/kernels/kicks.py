@@ -133,7 +133,7 @@ def kick(
     own = moved + MOVED * i * n + r
     x = add(load3(own + POINT * n, n, inside), scaled(dt / 2, cross(spin, load3(own + ARM * n, n, inside))))
     far: tl.constexpr = float("inf")
-    room = box + 6 * (i // o)
+    room = box + 6 * i
     deepest = max3(where3(there, scaled(-1.0, x), -far))  # how deep points could get [m]: below the lower sides
     up = scaled(2 / dt, sub(add(row3(room), deepest), (SINK, SINK, SINK)))
     down = scaled(2 / dt, add(sub(row3(room + 3), max3(where3(there, x, -far))), (SINK, SINK, SINK)))

@@ -103,7 +103,7 @@ def show(
             tl.store(to + 5 * ROWS, extent + zero, mask=there)
             tl.store(to + 6 * ROWS, tl.log(tl.load(size + j)) + zero, mask=there)
         else:
-            room = box + 6 * (i // o)
+            room = box + 6 * i
             now, inward = wall_of(x, room)
             if k == m:
                 now, inward = x[2] - tl.load(room + 2), (zero, zero, zero + 1)

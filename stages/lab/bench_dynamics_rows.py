@@ -46,7 +46,7 @@ def free_fall(world: World, frames: int, dt: float) -> Float[Tensor, "b t o n 3"
     """Objects fall as they stand until their lowest keypoint is on the floor, and lie there."""
     time = dt * torch.arange(frames, dtype=world.points.dtype, device=world.points.device)
     fallen = -world.gravity[:, None, None, 2] * time[:, None].square() / 2
-    height = world.points[..., 2].masked_fill(~world.valid, torch.inf).amin(2) - world.floor[:, None]
+    height = world.points[..., 2].masked_fill(~world.valid, torch.inf).amin(2) - world.floor
     fallen = torch.minimum(fallen, height.clamp_min(0)[:, None])
     points = world.points[:, None].repeat(1, frames, 1, 1, 1)
     points[..., 2] -= fallen[..., None]

@@ -79,9 +79,9 @@ def _closest(x: Float[Tensor, "p 3"], y: Float[Tensor, "q 3"]) -> Int[Tensor, "p
 
 
 def near_walls(
-    points: Float[Tensor, "b o n 3"], valid: Bool[Tensor, "b o n"], box: Float[Tensor, "b 2 3"], reach: float
+    points: Float[Tensor, "b o n 3"], valid: Bool[Tensor, "b o n"], box: Float[Tensor, "b o 2 3"], reach: float
 ) -> Bool[Tensor, "b o n"]:
     """Points within `reach` [m] of the floor or of one of the four walls, on either side; the ceiling is open."""
-    low, high = box[:, None, None, 0], box[:, None, None, 1]
+    low, high = box[..., None, 0, :], box[..., None, 1, :]
     near = ((points - low).abs() < reach).any(-1) | ((points[..., :2] - high[..., :2]).abs() < reach).any(-1)
     return near & valid

@@ -294,8 +294,8 @@ class ForceField(Dynamics):
         # not amin: compiled, its gradient looks for the value again and, rounded otherwise, may not find it
         lowest = points.masked_fill(hidden, torch.inf).min(2).values
         highest = points.masked_fill(hidden, -torch.inf).max(2).values
-        up = (w.box[:, None, 0] - SINK - lowest) / dt
-        down = (w.box[:, None, 1] + SINK - highest) / dt
+        up = (w.box[..., 0, :] - SINK - lowest) / dt
+        down = (w.box[..., 1, :] + SINK - highest) / dt
         velocity = torch.maximum(velocity, up.clamp(max=RISE))
         return torch.minimum(velocity, down.clamp(min=-RISE))
 

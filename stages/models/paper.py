@@ -162,7 +162,7 @@ class Predictor(nn.Module):
     def _floor(self, shape: Float[Tensor, "b o h"], state: PaperState, world: World) -> Float[Tensor, "b o 9"]:
         """What the room does to an object; it knows the floor's height, but walls only by touch."""
         floor = torch.zeros_like(state.com)
-        floor[..., 2] = world.floor[:, None]
+        floor[..., 2] = world.floor
         s = _placement(state._replace(com=state.com - floor))
         return self.boundary_net(torch.cat([shape, self.state_embedding(s)], -1))
 

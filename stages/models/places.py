@@ -99,7 +99,7 @@ def _response(inverse: Float[Tensor, "*#b 3 3"], arm: Float[Tensor, "*#b 3"]) ->
 
 def floor_places(shape: Shape, moving: Moving) -> Places:
     """Every keypoint and the floor, however deep."""
-    height = moving.points[..., 2] - shape.world.floor[:, None, None]
+    height = moving.points[..., 2] - shape.world.floor[..., None]
     up = torch.eye(3, dtype=height.dtype, device=height.device)[2].expand_as(moving.points)
     row = torch.arange(height.shape[2], device=height.device).expand_as(height)
     return _plane(shape, moving, row, height, up)
@@ -108,7 +108,7 @@ def floor_places(shape: Shape, moving: Moving) -> Places:
 def wall_places(shape: Shape, moving: Moving) -> Places:
     """The keypoints nearest to a wall or the ceiling, each with the nearest of them."""
     w, x, most = shape.world, moving.points, math.ceil(WALL * moving.points.shape[2])
-    low, high = w.box[:, None, None, 0], w.box[:, None, None, 1]
+    low, high = w.box[..., None, 0, :], w.box[..., None, 1, :]
     eye = torch.eye(3, dtype=x.dtype, device=x.device)
     wall, which = torch.cat([(x - low)[..., :2], high - x], -1).min(-1)
     inward = torch.cat([eye[:2], -eye])[which]

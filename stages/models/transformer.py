@@ -41,7 +41,7 @@ def features(world: World, state: PointState) -> Float[Tensor, "b o n 29"]:
     com, drift = centre(world, x), centre(world, v)
     there = world.present[..., None]
     middle = (com * there).sum(1, keepdim=True) / there.sum(1, keepdim=True).clamp_min(1)
-    low, high = world.box[:, None, None, 0], world.box[:, None, None, 1]
+    low, high = world.box[..., None, 0, :], world.box[..., None, 1, :]
     height = x[..., 2:] - low[..., 2:]
     walls = (torch.cat([x - low, high - x], -1) / NEAR).clamp(-1, 1)
     material = torch.stack([world.E.log10() - 5, world.nu, world.friction, world.mass.log()], -1)

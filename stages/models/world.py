@@ -32,7 +32,7 @@ class World:
     velocity: Float[Tensor, "b o 3"]  # at the start [m/s]
     spin: Float[Tensor, "b o 3"]  # angular velocity at the start, world axes [rad/s]
     gravity: Float[Tensor, "b 3"]  # [m/s^2]
-    box: Float[Tensor, "b 2 3"]  # lower and upper corner of the room; the floor is the lower z [m]
+    box: Float[Tensor, "b o 2 3"]  # corners of the room as each finds it; the floor under it is the lower z [m]
 
     @classmethod
     def of(
@@ -52,7 +52,7 @@ class World:
             "mass": 1.0, "E": 1e5, "solidity": 1.0, "nu": 0.3, "friction": 0.5, "velocity": 0.0, "spin": 0.0,
             "gravity": GRAVITY, "box": BOX,
         }  # fmt: skip
-        shape = {"share": (b, o, n), "velocity": (b, o, 3), "spin": (b, o, 3), "gravity": (b, 3), "box": (b, 2, 3)}
+        shape = {"share": (b, o, n), "velocity": (b, o, 3), "spin": (b, o, 3), "gravity": (b, 3), "box": (b, o, 2, 3)}
         filled = {
             name: torch.as_tensor(given.pop(name, default.get(name))).to(points).expand(shape.get(name, (b, o)))
             for name in ("share", *default)
@@ -67,9 +67,9 @@ class World:
         return self.valid.any(-1)
 
     @property
-    def floor(self) -> Float[Tensor, "b"]:
-        """Height of the floor [m]."""
-        return self.box[:, 0, 2]
+    def floor(self) -> Float[Tensor, "b o"]:
+        """Height of the floor under each object [m]."""
+        return self.box[..., 0, 2]
 
     def to(self, target: torch.device | torch.dtype | str) -> World:
         """On another device, or in another precision (`valid` stays boolean)."""

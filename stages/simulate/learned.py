@@ -45,6 +45,7 @@ FIRMEST = 3e4  # E size / mass of the stiffest body in training that seems round
 FALL = 5.0  # gravity in training [m/s^2]
 FAST = 5.0  # speeds that falls reach there [m/s]
 FAR = 100.0  # walls where there are none [m]
+STRAY = 0.02  # share of keypoints that may lie below the floor that their object stands on
 
 
 @dataclass(frozen=True)
@@ -133,9 +134,10 @@ def _world(
     most = max(len(p) for p in each)
     points, valid = torch.zeros(1, len(each), most, 3), torch.zeros(1, len(each), most, dtype=torch.bool)
     mass, E, solidity, nu, friction = torch.ones(5, 1, len(each))
-    velocity = torch.zeros(1, len(each), 3)
+    velocity, floors = torch.zeros(1, len(each), 3), _floors(each, stage)
     for row, (o, p) in enumerate(zip(scene.objects, each, strict=True)):
-        points[0, row, : len(p)] = frame.inside(p + stage.lift[row] + stage.settled[row])
+        low = torch.tensor([-math.inf, -math.inf, float(floors[row])])  # what ends below would be thrown up
+        points[0, row, : len(p)] = frame.inside(p.maximum(low) + stage.lift[row])
         valid[0, row, : len(p)] = True
         choice = materials[o.id]
         volume = float(stage.bodies.volume[stage.bodies.body == row].sum()) * scene.metres_per_unit**3
@@ -152,19 +154,25 @@ def _world(
                         o.id, o.name, choice.name)  # fmt: skip
         guess = f"; material not known, taking {choice.name} (--material {o.id}=... changes it)" * choice.guessed
         log.info("object %d (%s): %s, %.3g kg%s", o.id, o.name, choice.name, mass[0, row] / frame.mass, guess)
-    low, high = torch.tensor([-FAR, -FAR, FLOOR]), torch.full((3,), FAR)
+    box = torch.tensor([[-FAR, -FAR, FLOOR], [FAR, FAR, FAR]]).repeat(len(each), 1, 1)
     if options.box:
-        low, high = (frame.inside(torch.tensor(corner)) for corner in (stage.box.low, stage.box.high))
-    low[2] += _hover((points[0, ..., 2] - low[2])[stage.standing], valid[0, stage.standing])
+        box[:] = torch.stack([frame.inside(torch.tensor(corner)) for corner in (stage.box.low, stage.box.high)])
+    box[:, 0, 2] = (floors - frame.origin[2]) * frame.length + FLOOR
     gravity = torch.tensor([0.0, 0.0, -frame.gravity])
     return World.of(points, valid, mass=mass, E=E, solidity=solidity, nu=nu, friction=friction, velocity=velocity,
-                    gravity=gravity, box=torch.stack([low, high]))  # fmt: skip
+                    gravity=gravity, box=box)  # fmt: skip
 
 
-def _hover(heights: Float[Tensor, "o n"], valid: Bool[Tensor, "o n"]) -> float:
-    """How far above the floor the keypoints of what stands on it end [m]: photos do not show its underside."""
-    lowest = heights.masked_fill(~valid, torch.inf).amin(1)
-    return max(0.0, float(lowest.quantile(0.25))) if len(lowest) else 0.0
+def _floors(each: list[Float[Tensor, "k 3"]], stage: Stage) -> Float[Tensor, "o"]:
+    """How high the floor is under each object [scene units].
+
+    What stands on it is where it was seen, for a seat sags and photos do not show undersides: the floor is where its
+    keypoints end, but for a few. Were it put onto a plane, what lies deeper would be lifted into what does not. What
+    stands on something else falls as deep as others stand.
+    """
+    ends = torch.stack([p[:, 2].quantile(STRAY) for p in each]).maximum(stage.bottom)
+    usual = ends[stage.stood].median() if bool(stage.stood.any()) else torch.tensor(stage.box.low[2])
+    return torch.where(stage.stood, ends, usual.minimum(ends))
 
 
 def _known_stiffness(o: SceneObject, E: float, wall: float, most: float) -> tuple[float, float]:
@@ -202,7 +210,7 @@ def _scaled(prompts: Prompts, frame: Frame, stage: Stage, ids: list[int]) -> Pro
         at = None
         if f.at is not None:
             row = ids.index(f.object_id)
-            at = tuple(frame.inside(torch.tensor(f.at) + stage.lift[row] + stage.settled[row]).tolist())
+            at = tuple(frame.inside(torch.tensor(f.at) + stage.lift[row]).tolist())
         return replace(
             f, force=tuple(newtons * v for v in f.force), torque=tuple(newtons * metres * v for v in f.torque),
             start=f.start * frame.time, end=f.end * frame.time, at=at,

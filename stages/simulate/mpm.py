@@ -43,6 +43,8 @@ class Stage:
     lift: Float[Tensor, "o 3"]  # asked for by the user, and shown
     standing: Bool[Tensor, "o"]  # on the floor
     settled: Float[Tensor, "o 3"]  # taken on by the simulation alone, so that what stands on the floor touches it
+    bottom: Float[Tensor, "o"]  # where each ends below, as seen
+    stood: Bool[Tensor, "o"]  # on the floor, as seen
     box: mpm.Box
 
     @property
@@ -113,7 +115,8 @@ def set_up(scene: Scene, prompts: Prompts, options: SimulateOptions, fine: bool 
         lift[row, 2] = prompts.lift.get(o.id, 0.0)
     # half a spacing below the lowest particles end their voxels, and one more the body that is seen
     lowest = torch.stack([bodies.x[bodies.body == row, 2].quantile(0.01) for row in range(count)])
-    bottom = lowest - 1.5 * h + lift[:, 2]
+    bottom = lowest - 1.5 * h
+    start = bottom + lift[:, 2]
     asked = vector_box(options.box) if options.box else None
     if options.floor is not None:
         floor = options.floor
@@ -122,11 +125,11 @@ def set_up(scene: Scene, prompts: Prompts, options: SimulateOptions, fine: bool 
     elif scene.floor is not None:
         floor = scene.floor
     else:
-        floor = float(bottom.min())
+        floor = float(start.min())
         log.info("the scene has no floor; one is put under the lowest object, at %.3g (--floor changes it)", floor)
     settled = torch.zeros(count, 3)
-    gap = bottom - floor
-    standing = gap < 2 * h
+    gap = start - floor
+    standing, stood = gap < 2 * h, bottom - floor < 2 * h
     for row, o in enumerate(scene.objects):
         if standing[row] and o.id not in prompts.pinned:
             settled[row, 2] = -gap[row]
@@ -145,7 +148,7 @@ def set_up(scene: Scene, prompts: Prompts, options: SimulateOptions, fine: bool 
         raise InputError(f"--box {options.box}: object {o.id} ({o.name}) is not inside; it spans "
                          f"{_span(x[bodies.body == list(scene.objects).index(o)])}")  # fmt: skip
     seen = x - (lift + settled)[bodies.body]
-    return Stage(replace(bodies, x=seen), lift, standing, settled, box)
+    return Stage(replace(bodies, x=seen), lift, standing, settled, bottom, stood, box)
 
 
 def vector_box(text: str) -> mpm.Box:

@@ -68,7 +68,7 @@ def test_free_fall_is_exact_for_bodies_that_only_fall():
     predicted = free_fall(motions.world(), 20, motions.dt)
     assert_close(predicted, motions.points, rtol=0, atol=1e-5)
     resting = predicted[1:, -1, :, :, 2].amin(-1)
-    assert_close(resting, torch.full_like(resting, float(motions.world().floor[0])), rtol=0, atol=1e-5)
+    assert_close(resting, torch.full_like(resting, float(motions.world().floor[0, 0])), rtol=0, atol=1e-5)
 
 
 def tumbling(seed: int = 0):

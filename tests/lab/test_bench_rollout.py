@@ -20,7 +20,7 @@ def test_the_scene_is_one_of_contacts():
     fallen = start.points - end
     assert end.isfinite().all()
     assert fallen[:, 2, :, 2].mean() > 0.3  # the upper body has come down
-    assert end[..., 2].min() > float(start.floor[0]) - 0.1
+    assert end[..., 2].min() > float(start.floor[0, 0]) - 0.1
 
 
 def test_a_run_has_all_rows_and_keeps_those_of_the_other_device(tmp_path, monkeypatch):

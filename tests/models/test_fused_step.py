@@ -17,6 +17,7 @@ from tests.models.worlds import crowd, padded, push  # noqa: E402
 
 pytestmark = pytest.mark.gpu
 NARROW = torch.tensor([[-0.08, -0.05, -0.94], [0.3, 0.35, -0.55]], dtype=torch.float64)  # walls among the objects
+STEPPED = NARROW + torch.tensor([0.0, 0.05, 0.1], dtype=torch.float64)[None, :, None, None]  # each in its own room
 
 
 def loud(hidden: int) -> ForceField:
@@ -67,7 +68,7 @@ def all_ways(model: ForceField, world, steps: int, prompt=None, pinned: bool = F
     (64, crowd(2, 3, 200), {}),
     (16, padded(crowd(2, 3, 70), 1, 3), {"prompt": {"force": (0.0, 3.0, 30.0), "torque": (0.1, 0.2, 0.0), "point": 2}}),
     (64, crowd(1, 5, 200, seed=3), {"pinned": True}),
-    (64, replace(crowd(1, 3, 200), box=NARROW[None]), {}),
+    (64, replace(crowd(1, 3, 200), box=STEPPED), {}),
     (64, crowd(3, 1, 33), {}),
     (128, crowd(1, 2, 40), {}),
 ], ids=["crowd", "padded and pushed", "pinned", "walls", "alone", "wide"])  # fmt: skip
@@ -93,7 +94,8 @@ def test_recorded_twice_it_is_the_same_to_the_last_bit():
 @torch.no_grad()
 def test_a_collision_keeps_momentum():
     model = loud(64).float()
-    world = replace(crowd(1, 3, 200), gravity=torch.zeros(1, 3).double(), box=torch.tensor([[[-9.0] * 3, [9.0] * 3]]))
+    roomy = torch.tensor([[-9.0] * 3, [9.0] * 3]).expand(1, 3, 2, 3)
+    world = replace(crowd(1, 3, 200), gravity=torch.zeros(1, 3).double(), box=roomy)
     world = world.to(torch.float32).to("cuda")
     scene, pushes = model.prepare(world), Pushes.none(world)
     states = [model.start(scene)]

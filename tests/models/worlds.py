@@ -53,7 +53,7 @@ def padded(world: World, objects: int, keypoints: int) -> World:
     return World.of(
         points, valid, mass=more(world.mass, 3.0), E=more(world.E, 2e4), nu=more(world.nu, 0.1),
         friction=more(world.friction, 0.7), velocity=more(world.velocity, 1.0), spin=more(world.spin, 1.0),
-        gravity=world.gravity, box=world.box,
+        gravity=world.gravity, box=more(world.box, 5.0),
     )  # fmt: skip
 
 

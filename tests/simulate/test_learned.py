@@ -8,12 +8,14 @@ from stages.errors import InputError
 from stages.geometry.rotations import matrix
 from stages.models.weights import HERE, build, find, save
 from stages.models.world import FLOOR, World
-from stages.scene.scene import SceneObject
+from stages.scene.gaussians import concatenate
+from stages.scene.scene import Scene, SceneObject
 from stages.scene.scene_ply import write_scene
 from stages.scene.trajectory import read_trajectory
 from stages.simulate.learned import WALL, Frame, _known_stiffness, _sides, _warn
 from stages.simulate.options import SimulateOptions
 from stages.simulate.stage import run
+from tests.conftest import ball
 
 
 @pytest.fixture(scope="module")
@@ -61,6 +63,16 @@ def test_pinned_objects_stay_and_fewer_frames_a_second_are_the_same_motion(two_b
     coarse = roll(two_balls, tmp_path, untrained, lift=("2=2",), pin=("1",), dt=0.05, steps=3)
     assert float(shift(coarse, 1)[2]) == pytest.approx(float(shift(t, 1)[2]), rel=0.01)
     assert math.isclose(coarse.motion.dt, 0.05)
+
+
+def test_what_stands_deeper_is_not_lifted_into_what_stands_beside_it(tmp_path):
+    """A seat sags: a ball 12 cm below the plane, under the belly of a larger one. A breath of force wakes both."""
+    high, low = ball((0, 0, 0.15), 0.15, 600, (1, 0, 0), 1), ball((0.2, 0, -0.02), 0.1, 600, (0, 1, 0), 2, seed=1)
+    scene = Scene(concatenate([high, low]), (SceneObject(1, "ball"), SceneObject(2, "ball")), None, 0.0)
+    wake = tuple(f"object={i} force=0,0,0.01 to=0.02" for i in (1, 2))
+    t = roll(scene, tmp_path, None, keypoints=128, steps=15, force=wake)
+    assert torch.equal(t.positions[0], t.keypoints.rest)
+    assert float((t.com - t.com[0]).norm(dim=-1).max()) < 0.02
 
 
 def elsewhere(scene, unit, floor):

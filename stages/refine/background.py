@@ -29,6 +29,8 @@ GRAZING = 0.03  # depth that a pixel of table spans at a flat angle [view radii]
 GAP = 0.03  # places that cameras see through are narrower where the reconstruction is at fault [view radii]
 OTHER = 12.0  # CIELAB distance from which a colour is not the table's
 COVERED = 0.92  # alpha above which the table is there
+DENT = 0.015  # side of the squares in which it is asked how deep things lie [view radii]
+STRAYS = 3  # Gaussians below the surface in a square that say nothing
 
 
 @dataclass(frozen=True)
@@ -40,6 +42,7 @@ class Picture:
     top: float  # height of the surface in the middle
     rgb: Float[np.ndarray, "h w 3"]
     alpha: Float[np.ndarray, "h w"]
+    dent: Float[np.ndarray, "h w"]  # how far below the surface things lie in a cell, as they do on a seat
 
     def rows_columns(self, points: Float[Tensor, "n d"]) -> tuple[np.ndarray, np.ndarray]:
         """Cell of each point, clamped to the picture."""
@@ -52,9 +55,10 @@ class Picture:
         return torch.stack([self.corner[0] + (column + 0.5) * self.cell, self.corner[1] - (row + 0.5) * self.cell], 1)
 
     def on(self, support: Support, mask: np.ndarray) -> Float[Tensor, "m 3"]:
-        """Centres of cells, on the surface."""
+        """Centres of cells, on the surface, or below it where things lie deeper."""
         points = self.centres(mask)
-        return torch.cat([points, support.surface(points)[:, None]], 1)
+        height = support.surface(points) - torch.from_numpy(self.dent[mask])
+        return torch.cat([points, height[:, None]], 1)
 
 
 def fill(scene: Scene, sight: Sight, support: Support, seed: int = 0) -> Scene:
@@ -86,6 +90,7 @@ def fill(scene: Scene, sight: Sight, support: Support, seed: int = 0) -> Scene:
     gone = _remains(g, flat, picture, colour, blind)
     left = _drawn(g[flat & ~gone], picture.corner, picture.cell, picture.top, picture.alpha.shape)
     new = hole | (near & known & (left.alpha < COVERED))
+    new &= ~_each(new & (picture.dent > 0), picture, support, lambda points: sight.empty(points, 2 * picture.cell))
     points = picture.on(support, new)
     up = torch.tensor([[0.0, 0, 1]]).expand(len(points), 3)
     more = patches(points, up, torch.from_numpy(colour[new]), picture.cell, 0)
@@ -125,7 +130,26 @@ def _picture(table: Gaussians, things: Float[Tensor, "m 3"], support: Support) -
     cell = max(longest / MOST, spacing)
     width, height = (((high - low) / cell).ceil().long().clamp_min(2)).tolist()
     top = float(support.surface((low + high)[None] / 2))
-    return _drawn(table, torch.stack([low[0], high[1]]), cell, top, (height, width))
+    flat = _drawn(table, torch.stack([low[0], high[1]]), cell, top, (height, width))
+    return replace(flat, dent=_dent(things, support, flat))
+
+
+def _dent(things: Float[Tensor, "m 3"], support: Support, picture: Picture) -> Float[np.ndarray, "h w"]:
+    """How far below the surface things lie in each cell [scene units], about 0 where none does."""
+    times = max(1, round(DENT * support.view.radius / picture.cell))
+    height, width = picture.alpha.shape
+    deep = np.zeros((-(-height // times), -(-width // times)), np.float32)
+    depth = -support.heights(things).numpy()
+    below = depth > 0
+    row, column = (index[below] // times for index in picture.rows_columns(things))
+    square = row * deep.shape[1] + column
+    order = np.lexsort((-depth[below], square))  # the deepest of each square first
+    squares, first, count = np.unique(square[order], return_index=True, return_counts=True)
+    told = count > STRAYS
+    deep.flat[squares[told]] = depth[below][order][first[told] + STRAYS] + picture.cell
+    deep = cv2.dilate(deep, np.ones((3, 3)))  # so that what is between squares lies below things as well
+    wide = cv2.resize(deep, (deep.shape[1] * times, deep.shape[0] * times), interpolation=cv2.INTER_LINEAR)
+    return wide[:height, :width]
 
 
 def _drawn(table: Gaussians, corner: Float[Tensor, "2"], cell: float, top: float, shape: tuple[int, int]) -> Picture:
@@ -139,7 +163,8 @@ def _drawn(table: Gaussians, corner: Float[Tensor, "2"], cell: float, top: float
         drawn = rasterise(table, viewmat[None], K[None], width, height)
     alpha = drawn.alpha[0]
     rgb = (drawn.rgb[0] / alpha.clamp_min(1e-3)[..., None]).clamp(0, 1)
-    return Picture(corner, cell, top, rgb.numpy().astype(np.float32), alpha.numpy())
+    flat = np.zeros(shape, np.float32)
+    return Picture(corner, cell, top, rgb.numpy().astype(np.float32), alpha.numpy(), flat)
 
 
 def _under(things: Float[Tensor, "m 3"], support: Support, picture: Picture) -> np.ndarray:

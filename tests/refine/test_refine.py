@@ -167,6 +167,18 @@ def test_what_the_photos_show_stays(before, after):
     assert agreement(before, after) > 35
 
 
+def test_what_lies_in_a_dent_is_not_covered():
+    """A plate lower than the table around it, as on a soft seat; where it lay there is table still, below it."""
+    top = table()
+    plate = coloured(sheet(0.25, 0.2, 0.006).moved((0.0, 0.0, -0.03)), (0.1, 0.2, 0.8), 1)
+    hidden = (top.means[:, 0].abs() < 0.13) & (top.means[:, 1].abs() < 0.105)
+    before = replace(scene_of(top[~hidden], plate), objects=(SceneObject(1, "plate"),))
+    after = refine(before)
+    assert agreement(before, after) > 35
+    rgb, alpha = seen(after, (0.05, 0.0, 1.0), 0)
+    assert alpha > 0.9 and torch.allclose(rgb, torch.tensor(WOOD), atol=0.08)
+
+
 def test_a_second_time_changes_little(after):
     again = refine(after)
     grown = len(again.gaussians) - len(after.gaussians)

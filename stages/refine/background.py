@@ -30,6 +30,7 @@ GAP = 0.03  # places that cameras see through are narrower where the reconstruct
 OTHER = 12.0  # CIELAB distance from which a colour is not the table's
 COVERED = 0.92  # alpha above which the table is there
 DENT = 0.015  # side of the squares in which it is asked how deep things lie [view radii]
+DEEPEST = 0.1  # below the surface that something lies on it; deeper it hangs over the edge [view radii]
 STRAYS = 3  # Gaussians below the surface in a square that say nothing
 
 
@@ -140,7 +141,7 @@ def _dent(things: Float[Tensor, "m 3"], support: Support, picture: Picture) -> F
     height, width = picture.alpha.shape
     deep = np.zeros((-(-height // times), -(-width // times)), np.float32)
     depth = -support.heights(things).numpy()
-    below = depth > 0
+    below = (depth > 0) & (depth < DEEPEST * support.view.radius)
     row, column = (index[below] // times for index in picture.rows_columns(things))
     square = row * deep.shape[1] + column
     order = np.lexsort((-depth[below], square))  # the deepest of each square first

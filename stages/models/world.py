@@ -53,10 +53,9 @@ class World:
             "gravity": GRAVITY, "box": BOX,
         }  # fmt: skip
         shape = {"share": (b, o, n), "velocity": (b, o, 3), "spin": (b, o, 3), "gravity": (b, 3), "box": (b, o, 2, 3)}
-        filled = {
-            name: torch.as_tensor(given.pop(name, default.get(name))).to(points).expand(shape.get(name, (b, o)))
-            for name in ("share", *default)
-        }
+        filled = {name: torch.as_tensor(given.pop(name, default.get(name))).to(points) for name in ("share", *default)}
+        # in memory of their own, or kernels would copy them at every step
+        filled = {name: x.expand(shape.get(name, (b, o))).contiguous() for name, x in filled.items()}
         if given:
             raise TypeError(f"a World has no {', '.join(given)}")
         return cls(torch.where(valid[..., None], points, 0.0), valid, **filled)

@@ -134,7 +134,7 @@ def set_up(scene: Scene, prompts: Prompts, options: SimulateOptions, fine: bool 
         if standing[row] and o.id not in prompts.pinned:
             settled[row, 2] = -gap[row]
             if gap[row] < -4 * h:
-                log.warning("object %d (%s) reaches %.3g below the floor; it is simulated as standing on it",
+                log.warning("object %d (%s) reaches %.3g below the floor; it is taken to stand all the same",
                             o.id, o.name, -gap[row])  # fmt: skip
     x = bodies.x + (lift + settled)[bodies.body]
     box = asked or _box(x, floor, h)

@@ -203,6 +203,19 @@ def card(
         print(line)
 
 
+@app.command()
+def average(
+    files: Annotated[list[Path], typer.Argument(metavar="WEIGHTS", help="two or more, of one model (.safetensors)")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="weights to write (.safetensors)")],
+    shares: Annotated[str, typer.Option(help="of each, such as 0.7,0.3")],
+    half: Annotated[bool, typer.Option("--half", help="store them in 16 bits, to be shipped")] = False,
+) -> None:
+    """Average the weights of several trainings, number by number."""
+    from stages.lab.average import run
+
+    print(run(files, shares, out, half))
+
+
 @app.command("train-splatter")
 def train_splatter(
     data: Annotated[Path, typer.Argument(metavar="FOLDER", help="scenes (.ply), and folders of photos with their "
@@ -276,12 +289,16 @@ def heldout(
     substep: Annotated[float, typer.Option(help="[s]")] = 1e-4,
     size: Annotated[float, typer.Option(help="longest side of a mesh [m]")] = 0.5,
     shapes: Annotated[int, typer.Option(help="so many objects at random to learn from, as the group varied")] = 0,
+    solid: Annotated[bool, typer.Option("--solid", help="the shapes are filled: the group solid")] = False,
+    turned: Annotated[int, typer.Option(help="the ten objects turned at random in so many ways to learn from, as the "
+                                        "group turned")] = 0,
     device: Device = "auto",
 ) -> None:
     """Simulate scenes of other objects than the ten: by default of eight that no model learns from."""
     from stages.lab.heldout import HeldoutOptions, run
 
-    options = HeldoutOptions(scenes, objects, frames, keypoints, dx, spacing, substep, size, shapes, device)
+    choice = shapes, solid, turned
+    options = HeldoutOptions(scenes, objects, frames, keypoints, dx, spacing, substep, size, *choice, device)
     print(run(out, options, meshes))
 
 

@@ -21,7 +21,7 @@ from stages.errors import InputError
 from stages.lab import bench
 from stages.lab.ablation import CHOICES, Choice
 from stages.lab.motions import Motions
-from stages.lab.scenes import VARIED, groups_of
+from stages.lab.scenes import OTHERS, groups_of
 from stages.lab.train import FRAMES, Job, TrainOptions, validate
 from stages.lab.training_data import UNSEEN, Pieces, read_groups, split
 from stages.lab.training_state import Trainee
@@ -65,7 +65,7 @@ def run(data: Path, out: Path, options: BenchOptions = BenchOptions(), only: str
     facts = _before(Path(out), asked) or {"options": asked, "machine": bench.machine(device), "rows": {}}
     for name in names:
         if name not in facts["rows"]:
-            facts["rows"][name] = _measured(CHOICES[name], data, base, groups_of(options.test, more=(VARIED,)), device)
+            facts["rows"][name] = _measured(CHOICES[name], data, base, groups_of(options.test, more=OTHERS), device)
             facts["rows"] = {k: facts["rows"][k] for k in CHOICES if k in facts["rows"]}
             facts["date"] = datetime.now(timezone.utc).date().isoformat()
             _write(Path(out), facts)
@@ -75,7 +75,7 @@ def run(data: Path, out: Path, options: BenchOptions = BenchOptions(), only: str
 def _measured(choice: Choice, data: Path, base: TrainOptions, test: list[str], device: str) -> dict:
     """Scores after training."""
     options = choice.options(base)
-    known, unseen = split(read_groups(data, groups_of(options.groups, more=(VARIED,)), options.keypoints), UNSEEN)
+    known, unseen = split(read_groups(data, groups_of(options.groups, more=OTHERS), options.keypoints), UNSEEN)
     scenes = read_groups(data, test, options.keypoints)
     torch.manual_seed(options.seed)
     trainee = Trainee(choice.network().to(device), options.lr, options.seed)

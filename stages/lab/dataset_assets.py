@@ -51,6 +51,7 @@ class Asset:
     volume: Float[Tensor, "p"]  # [m^3]
     E: float  # [Pa]
     density: float  # [kg/m^3]
+    solidity: float = 1.0  # how many times stiffer than what is hollow or thin
 
     @cached_property
     def mass(self) -> float:

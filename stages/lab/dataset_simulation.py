@@ -96,10 +96,10 @@ def _motions(
     scenes: Sequence[Config], things: Mapping[int, Asset], points: Float[Tensor, "t s o n 3"], most: int
 ) -> Motions:
     ids = torch.tensor([[*c.ids, *[-1] * (most - len(c.ids))] for c in scenes]).reshape(-1, most)
-    told = {i: (a.mass, a.E) for i, a in things.items()}
-    table = torch.tensor([[told.get(i, (1.0, 1.0)) for i in row] for row in ids.tolist()]).reshape(-1, most, 2)
+    told = {i: (a.mass, a.E, a.solidity) for i, a in things.items()}
+    table = torch.tensor([[told.get(i, (1.0, 1.0, 1.0)) for i in row] for row in ids.tolist()]).reshape(-1, most, 3)
     same = torch.ones(ids.shape)
     there = (ids >= 0).to(points.device)
     points = torch.where(there[:, None, :, None, None], points.transpose(0, 1), 0.0)
     return Motions(tuple(c.name for c in scenes), ids, points, table[..., 0], table[..., 1], NU * same, FRICTION * same,
-                   FRAME, GRAVITY, BOX)  # fmt: skip
+                   FRAME, GRAVITY, BOX, table[..., 2])  # fmt: skip

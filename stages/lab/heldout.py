@@ -1,10 +1,11 @@
-"""Scenes of other objects than the ten: eight that no model learns from, any meshes, or varied ones to learn from.
+"""Scenes of other objects than the ten: eight that no model learns from, any meshes, or more to learn from.
 
     OUT/scene_configs/heldout.json     where every object starts, sampled as for the data set
     OUT/motions/heldout.h5             keypoints in every frame, as `ngff-lab dataset` writes
     OUT/particles_heldout.npz          the objects as particles, kept for the next run
 
-With shapes at random the group is called varied.
+To learn from are the groups `varied`, hollow shapes at random as the ten are hollow; `solid`, such shapes filled, as
+what is simulated of photos is; and `turned`, the ten each turned at random, which they never are in the data set.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -23,22 +24,26 @@ from tqdm import tqdm
 
 from stages.backends import pick_device
 from stages.errors import InputError
+from stages.geometry.rotations import matrix
+from stages.lab import dataset_assets
 from stages.lab.dataset_assets import SUBSTEP, Asset, Fineness, count_at, extents, volumes
 from stages.lab.dataset_simulation import simulate
-from stages.lab.heldout_shapes import KINDS, Kind, surface
+from stages.lab.heldout_shapes import KINDS, Kind, filled, surface
 from stages.lab.motions import MotionsWriter
-from stages.lab.scenes import VARIED, Config, sample_scene, write_configs
+from stages.lab.scenes import HELDOUT, SOLID, TURNED, VARIED, Config, sample_scene, write_configs
 from stages.lab.shapes import one_thread
 from stages.lab.varied_shapes import kinds
+from stages.models.solid import solidity
 from stages.physics.keypoints import farthest_points
 from stages.physics.materials import choose_materials
 from stages.scene.files import provenance, replacing
 from stages.scene.scene import SceneObject
 
 log = logging.getLogger(__name__)
-GROUP = "heldout"
-FIRST = {GROUP: 10_000, VARIED: 20_000}  # index of the first scene, and so its seed: none of the data set has it
-MESH = 100  # id of the first mesh
+FIRST = {HELDOUT: 10_000, VARIED: 20_000, SOLID: 30_000, TURNED: 40_000}  # index of the first scene, and its seed
+SEEDS = {VARIED: 0, SOLID: 1}  # of shapes at random
+MESH, TURN = 100, 2000  # id of the first mesh, and of the first turned object
+INSIDE = 1.5  # particles of solid bodies in a cell, along each axis
 DENSE = 30_000  # points of a shape that particles are chosen among
 STIFFEST = 2e7  # that the published substep bears, as of the phone [Pa]
 
@@ -56,6 +61,8 @@ class HeldoutOptions:
     substep: float = SUBSTEP
     size: float = 0.5  # longest side of a mesh [m]
     shapes: int = 0  # drawn at random, with their materials, instead of the eight
+    solid: bool = False  # the shapes are filled
+    turned: int = 0  # ways in which the ten objects are turned, instead of the eight
     device: str = "auto"
 
     def __post_init__(self):
@@ -63,12 +70,16 @@ class HeldoutOptions:
             raise InputError(f"--scenes {self.scenes} --objects {self.objects}: at least one scene, of 1 to 6 objects")
         if not 0 <= self.shapes <= 1000:
             raise InputError(f"--shapes {self.shapes}: 0 for the eight, or up to 1000 at random")
+        if not 0 <= self.turned <= 1000:
+            raise InputError(f"--turned {self.turned}: 0 for the eight, or the ten objects turned in up to 1000 ways")
+        if self.solid and not self.shapes or self.shapes and self.turned:
+            raise InputError("--solid needs --shapes, and --turned goes without")
         if not 0.1 <= self.size <= 1.0:
             raise InputError(f"--size {self.size}: meshes are put into a room of 2 m; give 0.1 to 1 m")
 
     @property
     def group(self) -> str:
-        return VARIED if self.shapes else GROUP
+        return SOLID if self.solid else VARIED if self.shapes else TURNED if self.turned else HELDOUT
 
     @property
     def fineness(self) -> Fineness:
@@ -79,18 +90,22 @@ def run(out: Path, options: HeldoutOptions = HeldoutOptions(), meshes: list[Path
     """Write the group; what is there is left as it is. A line about it."""
     group = options.group
     file, motions = Path(out) / "scene_configs" / f"{group}.json", Path(out) / "motions" / f"{group}.h5"
-    if meshes and options.shapes:
-        raise InputError("--from and --shapes: choose one; meshes take the place of shapes")
+    if meshes and (options.shapes or options.turned):
+        raise InputError("--from and --shapes or --turned: choose one; meshes take the place of other objects")
     if motions.exists():
         return f"{motions}: is there"
     for folder in (file.parent, motions.parent):
         folder.mkdir(parents=True, exist_ok=True)
     device, start = pick_device(options.device), time.perf_counter()
+    kept = Path(out) / f"particles_{group}.npz"
     if meshes:
         things = mesh_assets(meshes, options)
+    elif options.turned:
+        ten = dataset_assets.assets(options.fineness, options.keypoints, kept)
+        things = turned(ten, options.turned, options.fineness)
     else:
-        table = kinds(options.shapes) if options.shapes else KINDS
-        things = assets(table, options.fineness, options.keypoints, Path(out) / f"particles_{group}.npz")
+        table = kinds(options.shapes, SEEDS[group]) if options.shapes else KINDS
+        things = assets(table, options.fineness, options.keypoints, kept, options.solid)
     configs = configs_of(things, options.scenes, options.objects, FIRST[group])
     write_configs(file, configs)
     made, count = provenance("heldout", [file, *(meshes or [])], options), 0
@@ -104,7 +119,7 @@ def run(out: Path, options: HeldoutOptions = HeldoutOptions(), meshes: list[Path
 
 
 def configs_of(
-    things: Mapping[int, Asset], scenes: int, objects: int, first: int = FIRST[GROUP]
+    things: Mapping[int, Asset], scenes: int, objects: int, first: int = FIRST[HELDOUT]
 ) -> dict[str, Config]:
     """Scenes by the sampling of the data set, with seeds of their own."""
     room = extents(things)
@@ -112,20 +127,35 @@ def configs_of(
     return {c.name: c for c in made}
 
 
+def turned(things: Mapping[int, Asset], count: int, fineness: Fineness) -> dict[int, Asset]:
+    """Objects in turn, each turned at random, by new ids."""
+    made = {}
+    for i in range(count):
+        thing = list(things.values())[i % len(things)]
+        turn = matrix(torch.from_numpy(np.random.default_rng([TURN, i]).normal(size=4)).float())
+        points = thing.points @ turn.T
+        points = points - (points.amin(0) + points.amax(0)) / 2
+        made[TURN + i] = replace(thing, id=TURN + i, points=points, volume=volumes(points, fineness.dx))
+    return made
+
+
 def assets(
-    table: Mapping[str, Kind], fineness: Fineness, least: int, kept: Path | None = None
+    table: Mapping[str, Kind], fineness: Fineness, least: int, kept: Path | None = None, solid: bool = False
 ) -> dict[int, Asset]:
     """Objects by id; `kept` is a file (.npz) to read their particles from, or to write them to."""
     key = f"spacing {fineness.spacing} least {least}"
     points = _read(kept, key, table) if kept is not None and kept.exists() else None
     if points is None:
         bar = tqdm(table.items(), desc="objects", unit="object")
-        points = {name: _chosen(kind.scale * surface(kind, DENSE), fineness, least) for name, kind in bar}
+        points = {name: _particles(kind, fineness, least, solid) for name, kind in bar}
         if kept is not None:
             with replacing(kept) as part:
                 np.savez(part, key=key, **{name: p.numpy() for name, p in points.items()})
-    return {kind.id: _asset(kind.id, kind.scale, points[name], kind.E, kind.density, fineness)
+    made = {kind.id: _asset(kind.id, kind.scale, points[name], kind.E, kind.density, fineness)
             for name, kind in table.items()}  # fmt: skip
+    if not solid:
+        return made
+    return {i: replace(a, solidity=solidity(a.points[:least], float(a.volume.sum()))) for i, a in made.items()}
 
 
 def _read(kept: Path, key: str, table: Mapping[str, Kind]) -> dict[str, Tensor] | None:
@@ -152,6 +182,14 @@ def mesh_assets(meshes: list[Path], options: HeldoutOptions) -> dict[int, Asset]
         points = _chosen(points, options.fineness, options.keypoints)
         things[id] = _asset(id, options.size, points, E, choice.material.density, options.fineness)
     return things
+
+
+def _particles(kind: Kind, fineness: Fineness, least: int, solid: bool) -> Float[Tensor, "p 3"]:
+    """Of the surface, and after those of the inside."""
+    if not solid:
+        return _chosen(kind.scale * surface(kind, DENSE), fineness, least)
+    around, inside = filled(kind, DENSE, fineness.dx / INSIDE / kind.scale)
+    return torch.cat([_chosen(kind.scale * around, fineness, least), kind.scale * inside])
 
 
 def _chosen(points: Float[Tensor, "n 3"], fineness: Fineness, least: int) -> Float[Tensor, "p 3"]:

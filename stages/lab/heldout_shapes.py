@@ -110,8 +110,16 @@ KINDS = {
 
 def surface(kind: Kind, n: int) -> Float[Tensor, "n 3"]:
     """Points spread evenly over the surface of a shape, its longest side 1, about the centre of its box."""
+    return filled(kind, n, 0.5)[0]
+
+
+def filled(kind: Kind, n: int, spacing: float) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "m 3"]]:
+    """The same, and the points of a cubic lattice inside of the shape, half a spacing below the surface or deeper."""
     field = kind.shape()
     with one_thread():
         points = evened(field, spread(field, (0.6, 0.6, 0.6), n, SKIN)).points
     low, high = points.amin(0), points.amax(0)
-    return (points - (low + high) / 2) / (high - low).max()
+    middle, side = (low + high) / 2, (high - low).max()
+    axis = torch.arange((spacing - 1) / 2, 0.5, spacing)
+    lattice = torch.cartesian_prod(axis, axis, axis)
+    return (points - middle) / side, lattice[field(lattice * side + middle) < -spacing * side / 2]

@@ -5,7 +5,7 @@ A file NAME.h5 holds one group of scenes:
     attributes    format = "ngff-motions", version, dt [s], gravity [m/s^2], box (2,3) [m], provenance (JSON)
     names (s)     objects (s,o) ids of GSCollision, -1 where there is none
     points        (s,t,o,n,3) int16, in steps of `step` [m] (an attribute of the dataset)
-    mass E nu friction (s,o)     [kg] [Pa] - -
+    mass E nu friction solidity (s,o)     [kg] [Pa] - - -; without the last all bodies are hollow or thin
 """
 
 from __future__ import annotations
@@ -48,6 +48,7 @@ class Motions:
     dt: float  # between frames [s]
     gravity: tuple[float, float, float]  # [m/s^2]
     box: tuple[tuple[float, float, float], tuple[float, float, float]]  # of the room [m]
+    solidity: Float[Tensor, "s o"]  # how many times stiffer than hollow or thin bodies of the same material
 
     def __len__(self) -> int:
         return len(self.names)
@@ -69,12 +70,12 @@ class Motions:
         rest = self.points[:, 0, :, :keypoints]
         valid = self.present[..., None].expand(rest.shape[:-1])
         return World.of(
-            rest, valid, mass=self.mass, E=self.E, nu=self.nu, friction=self.friction,
+            rest, valid, mass=self.mass, E=self.E, nu=self.nu, friction=self.friction, solidity=self.solidity,
             gravity=torch.tensor(self.gravity), box=torch.tensor(self.box),
         )  # fmt: skip
 
 
-TENSORS = ("objects", "points", "mass", "E", "nu", "friction")
+TENSORS = ("objects", "points", "mass", "E", "nu", "friction", "solidity")
 
 
 def joined(parts: Sequence[Motions]) -> Motions:
@@ -166,7 +167,9 @@ def read_motions(path: Path) -> Motions:
                 raise InputError(f"{path}: its format attribute is {file.attrs.get('format')!r}, not {FORMAT!r}; {WHAT}"
                                  " is expected")  # fmt: skip
             points = torch.from_numpy(file["points"][:]).float() * float(file["points"].attrs["step"])
-            rest = {name: torch.from_numpy(file[name][:]) for name in TENSORS if name != "points"}
+            names = [n for n in TENSORS if n != "points" and (n in file or n != "solidity")]
+            rest = {"solidity": torch.ones(len(points), points.shape[2])}
+            rest |= {name: torch.from_numpy(file[name][:]) for name in names}
             box = tuple(tuple(float(v) for v in corner) for corner in file.attrs["box"])
             gravity = tuple(float(v) for v in file.attrs["gravity"])
             return Motions(tuple(file["names"].asstr()[:]), points=points, dt=float(file.attrs["dt"]), gravity=gravity,

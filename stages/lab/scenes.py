@@ -24,8 +24,10 @@ SEED = 42
 REACH = 0.9  # bounding spheres stay within this cube [m]
 GAP = 0.05  # least distance between points of two objects, and between centres [m]
 ASIDE = 0.1  # how far aside of the object it is put near, in scenes of up to 4 [m]
-TRIES = 500  # for an object, before the scene is begun again
-VARIED = "varied"  # group of scenes with objects at random, which belong to no published set
+TRIES, DRAWS = 500, 200  # for an object, before the scene is begun again; and of its objects, before it is given up
+HELDOUT = "heldout"  # group of scenes of eight other objects, that no model learns from
+VARIED, SOLID, TURNED = "varied", "solid", "turned"  # of objects at random, solid ones, and the ten turned at random
+OTHERS = (VARIED, SOLID, TURNED)  # groups in no published set that may be learned from
 MORE = {f"more_{i}": 300 for i in range(10)}  # of three objects, in no published set: to learn more from
 SCENES = {**{f"3_{i}": 300 for i in range(10)}, "4": 100, "6": 100, **MORE}  # groups, and how many scenes each has
 
@@ -105,13 +107,14 @@ def sample_scene(index: int, count: int, extents: Mapping[int, Extent]) -> Confi
     """Scene `index` with `count` objects."""
     rng = np.random.default_rng([SEED, count, index])
     ids = sorted(extents)
-    while True:
+    for _ in range(DRAWS):
         chosen = [int(i) for i in rng.choice(ids, count)]
         at = _placed(rng, chosen, extents)
         if at is not None:
             names = "_".join(str(i) for i in chosen)
             places = tuple(tuple(float(v) for v in p) for p in at)
             return Config(f"{index}_{names}", tuple(chosen), places, tuple(extents[i].scale for i in chosen))
+    raise InputError(f"of these objects no {count} find room beside each other in {2 * REACH} m; take smaller ones")
 
 
 def _placed(rng, chosen: list[int], extents: Mapping[int, Extent]) -> list | None:

@@ -19,7 +19,7 @@ from stages.backends import pick_device
 from stages.errors import InputError
 from stages.evaluate.dynamics import all_metrics
 from stages.lab.motions import Motions
-from stages.lab.scenes import VARIED, groups_of
+from stages.lab.scenes import OTHERS, groups_of
 from stages.lab.training_data import UNSEEN, Pieces, read_groups, recipe, split
 from stages.lab.training_roll import LOSSES, Roll
 from stages.lab.training_state import OPTIMIZERS, Trainee
@@ -108,7 +108,7 @@ def run(
     out = Path(out)
     if not out.parent.is_dir():
         raise InputError(f"{out}: there is no folder {out.parent}; make it first")
-    groups = groups_of(options.groups, more=(VARIED,))
+    groups = groups_of(options.groups, more=OTHERS)
     known, unseen = split(read_groups(data, groups, options.keypoints), UNSEEN)
     if known.points.shape[1] <= max(options.frames):
         raise InputError(f"--horizons: the motions have {known.points.shape[1]} frames; take shorter ones")

@@ -33,6 +33,7 @@ FASTEST, WILDEST = 8.0, 60.0  # speed [m/s] and spin [rad/s] are kept below
 HOLD = 0.07  # strongest grip of the floor [m/s]
 BRISK = 0.3  # speed from which it does not matter whether it lasts, to that grip [m/s]
 RIGID = 3.2e5  # E size / mass of the stiffest objects learned from [1/s^2]; what is stiffer bends less by the ratio
+FIRMEST = 3e4  # the same of the stiffest that is round, the duck: to what is solid, that ratio begins there
 
 
 class BodyState(NamedTuple):
@@ -54,7 +55,7 @@ class Scene:
     code: Float[Tensor, "b o h"]  # shape and material of an object, as the network sees it
     stiffness: Float[Tensor, "b o"]  # of the displacements [1/s^2]
     damping: Float[Tensor, "b o"]  # [1/s]
-    yields: Float[Tensor, "b o"]  # 1; less for what is stiffer than all that was learned from, or solid
+    yields: Float[Tensor, "b o"]  # 1; less for what is stiffer than all that was learned from
 
 
 class Rates(NamedTuple):
@@ -92,9 +93,9 @@ class ForceField(Dynamics):
 
     def informed(self, shape: Shape) -> Scene:
         w = shape.world
-        stiffest = RIGID * w.mass.clamp_min(1e-6) / shape.size.clamp_min(1e-6)
-        E = torch.minimum(w.E, stiffest)
-        code, yields = self._encode(shape, E), E / w.E / w.solidity  # linear elasticity: strain is stress over E
+        unit, whole = w.mass.clamp_min(1e-6) / shape.size.clamp_min(1e-6), w.E * w.solidity
+        E = torch.minimum(whole, torch.maximum(w.E, FIRMEST * unit)).minimum(RIGID * unit)
+        code, yields = self._encode(shape, E), E / whole  # linear elasticity: strain is stress over E
         if self.stress is None:
             none = torch.zeros_like(yields)
             return Scene(shape, code, none, none, yields)

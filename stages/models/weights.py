@@ -71,9 +71,10 @@ def halve(path: Path) -> None:
 
 
 def minutes(card: Mapping) -> float:
-    """Of one processor's training, that of the weights it began with included."""
+    """Of one processor's training, that of the weights it began with, or was averaged with, included."""
     own = float(card["minutes"]) * card.get("processes", 1)
-    return own + (minutes(card["before"]) if "before" in card else 0.0)
+    others = [c for c in card.get("averaged", ()) if "minutes" in c]
+    return own + (minutes(card["before"]) if "before" in card else 0.0) + sum(map(minutes, others))
 
 
 def write_card(path: Path, card: Mapping) -> None:

@@ -26,7 +26,7 @@ class World:
     share: Float[Tensor, "b o n"]  # of the object's mass that a keypoint stands for; sums to 1, 0 where padded
     mass: Float[Tensor, "b o"]  # [kg]
     E: Float[Tensor, "b o"]  # Young's modulus [Pa]
-    solidity: Float[Tensor, "b o"]  # how many times less it bends than a hollow or thin body of that modulus
+    solidity: Float[Tensor, "b o"]  # how many times stiffer than a hollow or thin body of that modulus
     nu: Float[Tensor, "b o"]  # Poisson's ratio
     friction: Float[Tensor, "b o"]  # Coulomb's coefficient
     velocity: Float[Tensor, "b o 3"]  # at the start [m/s]

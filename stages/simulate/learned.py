@@ -22,6 +22,7 @@ from stages.errors import InputError
 from stages.models import weights
 from stages.models.dynamics import FRAME, Dynamics
 from stages.models.pushes import Pushes
+from stages.models.solid import sides, solidity
 from stages.models.stepper import Stepper
 from stages.models.world import FLOOR, World, centre
 from stages.physics.forces import Prompts
@@ -39,9 +40,7 @@ SIZE = 0.55  # usual longest side of an object in training [m]
 SIZES = (0.25, 1.2)  # and the smallest and largest
 MOST = 6  # objects that scenes of the benchmark have
 THIN = 0.044  # thickness of the thinnest, the cloth [m]
-WALL = 0.015  # volume over surface of bodies in training, all of which are hollow or thin [m]
 SOFTEST = 3e3  # [Pa]; for stiffer bodies than there the model itself goes by linear elasticity
-FIRMEST = 3e4  # E size / mass of the stiffest body in training that seems round and solid, the duck [1/s^2]
 FALL = 5.0  # gravity in training [m/s^2]
 FAST = 5.0  # speeds that falls reach there [m/s]
 FAR = 100.0  # walls where there are none [m]
@@ -133,7 +132,7 @@ def _world(
     materials = choose_materials(scene.objects, options.material, options.materials)
     most = max(len(p) for p in each)
     points, valid = torch.zeros(1, len(each), most, 3), torch.zeros(1, len(each), most, dtype=torch.bool)
-    mass, E, solidity, nu, friction = torch.ones(5, 1, len(each))
+    mass, E, firmer, nu, friction = torch.ones(5, 1, len(each))
     velocity, floors = torch.zeros(1, len(each), 3), _floors(each, stage)
     for row, (o, p) in enumerate(zip(scene.objects, each, strict=True)):
         low = torch.tensor([-math.inf, -math.inf, float(floors[row])])  # what ends below would be thrown up
@@ -142,10 +141,8 @@ def _world(
         choice = materials[o.id]
         volume = float(stage.bodies.volume[stage.bodies.body == row].sum()) * scene.metres_per_unit**3
         mass[0, row] = choice.material.density * volume * frame.mass
-        a, b, c = _sides(points[0, row, : len(p)]).tolist()
-        wall = volume * frame.mass / (2 * (a * b + b * c + c * a))
-        known = FIRMEST * float(mass[0, row]) / max(float(points[0, row, : len(p)].std(0, correction=0).norm()), 1e-6)
-        E[0, row], solidity[0, row] = _known_stiffness(o, choice.material.E * frame.stress, wall, known)
+        firmer[0, row] = solidity(points[0, row, : len(p)], volume * frame.mass)
+        E[0, row] = _known_stiffness(o, choice.material.E * frame.stress, float(firmer[0, row]))
         nu[0, row] = choice.material.nu
         friction[0, row] = choice.material.friction if options.friction is None else options.friction
         velocity[0, row] = torch.tensor(prompts.velocity.get(o.id, (0.0, 0.0, 0.0))) * frame.length / frame.time
@@ -159,7 +156,7 @@ def _world(
         box[:] = torch.stack([frame.inside(torch.tensor(corner)) for corner in (stage.box.low, stage.box.high)])
     box[:, 0, 2] = (floors - frame.origin[2]) * frame.length + FLOOR
     gravity = torch.tensor([0.0, 0.0, -frame.gravity])
-    return World.of(points, valid, mass=mass, E=E, solidity=solidity, nu=nu, friction=friction, velocity=velocity,
+    return World.of(points, valid, mass=mass, E=E, solidity=firmer, nu=nu, friction=friction, velocity=velocity,
                     gravity=gravity, box=box)  # fmt: skip
 
 
@@ -175,19 +172,13 @@ def _floors(each: list[Float[Tensor, "k 3"]], stage: Stage) -> Float[Tensor, "o"
     return torch.where(stage.stood, ends, usual.minimum(ends))
 
 
-def _known_stiffness(o: SceneObject, E: float, wall: float, most: float) -> tuple[float, float]:
-    """Young's modulus [Pa] as the model is told it, and how many times less the body bends than it says.
-
-    Walls and boards resist bending by the cube of their thickness, so what is solid is told to be as stiff as a body
-    whose volume over surface is as in training. Beyond `most` [Pa] none of its kind was learned from: the rest is left
-    to linear elasticity. What is softer than all of training is told to be as the softest there.
-    """
-    whole = max(E * max(wall / WALL, 1.0) ** 3, SOFTEST)
-    told = min(whole, max(E, SOFTEST, most))
-    if E < SOFTEST / 2:
-        log.warning("object %d (%s): %.2g Pa (at this size) is softer than the %.2g Pa of training, and taken as %.2g "
-                    "Pa; compare with --engine mpm", o.id, o.name, E, SOFTEST, whole)  # fmt: skip
-    return told, whole / told
+def _known_stiffness(o: SceneObject, E: float, solidity: float) -> float:
+    """Young's modulus [Pa], or what makes the body as soft as the softest in training if it is softer."""
+    known = max(E, SOFTEST / solidity)
+    if known / 2 > E:
+        log.warning("object %d (%s): %.2g Pa (at this size) is softer than the %.2g Pa of training, and taken as that; "
+                    "compare with --engine mpm", o.id, o.name, E, known)  # fmt: skip
+    return known
 
 
 def _awake(world: World, frame: Frame, stage: Stage) -> Bool[Tensor, "o"]:
@@ -223,25 +214,20 @@ def _warn(world: World, model: Dynamics) -> None:
     """What the model has not seen in training, or does not hear of."""
     points = world.points[0]
     hidden = ~world.valid[0, ..., None]
-    sides = (points.masked_fill(hidden, -torch.inf).amax(1) - points.masked_fill(hidden, torch.inf).amin(1)).amax(1)
-    if float(sides.max() / sides.min()) > SIZES[1] / SIZES[0]:
+    long = (points.masked_fill(hidden, -torch.inf).amax(1) - points.masked_fill(hidden, torch.inf).amin(1)).amax(1)
+    if float(long.max() / long.min()) > SIZES[1] / SIZES[0]:
         log.warning("the largest object is %.1f times as long as the smallest, and in training never more than %.1f; "
-                    "compare with --engine mpm", sides.max() / sides.min(), SIZES[1] / SIZES[0])  # fmt: skip
-    thin = min(float(_sides(p[seen])[0]) for p, seen in zip(points, world.valid[0], strict=True))
+                    "compare with --engine mpm", long.max() / long.min(), SIZES[1] / SIZES[0])  # fmt: skip
+    thin = min(float(sides(p[seen])[0]) for p, seen in zip(points, world.valid[0], strict=True))
     if thin < THIN / 1.5:
         log.warning("an object is %.2g times thinner than any in training; it may sink into others, so "
                     "compare with --engine mpm", THIN / thin)  # fmt: skip
-    if len(sides) > MOST:
-        log.warning("%d objects; the model was tested with up to %d, so compare with --engine mpm", len(sides), MOST)
+    if len(long) > MOST:
+        log.warning("%d objects; the model was tested with up to %d, so compare with --engine mpm", len(long), MOST)
     if float(world.velocity.norm(dim=-1).max()) > FAST:
         log.warning("an object starts faster than any in training; compare with --engine mpm")
     for name in sorted({"mass", "E", "friction", "gravity"} - model.told):
         log.warning("this model is not told the %s", name)
-
-
-def _sides(points: Float[Tensor, "n 3"]) -> Float[Tensor, "3"]:
-    """Of a block whose points spread as these do, the shortest first."""
-    return (12 * torch.linalg.eigvalsh(points.T.cov(correction=0)).clamp_min(1e-12)).sqrt()
 
 
 def _state(

@@ -9,13 +9,15 @@ from typer.testing import CliRunner
 from ngff_cli.lab import app
 from stages.errors import InputError
 from stages.lab import heldout
-from stages.lab.dataset_assets import Fineness
-from stages.lab.heldout import GROUP, HeldoutOptions, assets, configs_of, run
-from stages.lab.heldout_shapes import KINDS, surface
+from stages.lab.dataset_assets import Asset, Fineness, volumes
+from stages.lab.heldout import HeldoutOptions, assets, configs_of, run, turned
+from stages.lab.heldout_shapes import KINDS, Kind, surface
 from stages.lab.motions import read_motions
+from stages.lab.object_fields import ellipsoid
 from stages.lab.objects import OBJECTS
-from stages.lab.scenes import groups_of, read_configs
+from stages.lab.scenes import HELDOUT, OTHERS, groups_of, read_configs
 from stages.lab.varied_shapes import kinds
+from stages.models.solid import WALL
 
 FINENESS = Fineness(0.1, 0.06, 5e-4)
 COARSE = {"keypoints": 40, "dx": 0.1, "spacing": 0.06, "substep": 5e-4, "frames": 3, "device": "cpu"}
@@ -75,9 +77,9 @@ def test_the_group_is_written_and_kept(things, tmp_path, monkeypatch):
     monkeypatch.setattr(heldout, "assets", lambda *_: things)
     options = HeldoutOptions(scenes=2, **COARSE)
     assert "2 scenes of 8 objects" in run(tmp_path, options)
-    made = read_motions(tmp_path / "motions" / f"{GROUP}.h5")
+    made = read_motions(tmp_path / "motions" / f"{HELDOUT}.h5")
     assert made.points.shape == (2, 3, 3, 40, 3) and list(made.names) == list(
-        read_configs(tmp_path / "scene_configs" / f"{GROUP}.json")
+        read_configs(tmp_path / "scene_configs" / f"{HELDOUT}.json")
     )
     kinds = {k.id: k for k in KINDS.values()}
     for row, ids in enumerate(made.objects.tolist()):
@@ -89,7 +91,7 @@ def test_the_group_is_written_and_kept(things, tmp_path, monkeypatch):
 
 
 def test_particles_are_kept_and_read_again(things, kept, tmp_path, monkeypatch):
-    monkeypatch.setattr(heldout, "surface", None)  # must not be needed again
+    monkeypatch.setattr(heldout, "_particles", None)  # must not be needed again
     again = assets(KINDS, FINENESS, 40, kept)
     assert all(torch.equal(things[i].points, again[i].points) for i in things) and len(again) == 8
     (tmp_path / "p.npz").write_text("no")
@@ -109,7 +111,7 @@ def test_meshes_take_the_place_of_the_shapes(tmp_path, caplog):
         args += ["--from", str(tmp_path / mesh)]
     done = CliRunner().invoke(app, args)
     assert done.exit_code == 0 and "1 scenes of 2 objects" in done.stdout, done.stderr
-    made = read_motions(tmp_path / "motions" / f"{GROUP}.h5")
+    made = read_motions(tmp_path / "motions" / f"{HELDOUT}.h5")
     sides = made.points[0, 0].amax(1) - made.points[0, 0].amin(1)
     for id, row in zip(made.objects[0].tolist(), sides.tolist(), strict=True):
         expected = [0.3, 0.15, 0.075] if id == 100 else [0.3] * 3
@@ -117,7 +119,7 @@ def test_meshes_take_the_place_of_the_shapes(tmp_path, caplog):
     told = dict(zip(made.objects[0].tolist(), made.E[0].tolist(), strict=True))
     stiffness = {100: 1e4, 101: 2e7}  # a pillow; steel, as far as the solver goes
     assert told.items() <= stiffness.items()
-    config = json.loads((tmp_path / "scene_configs" / f"{GROUP}.json").read_text())
+    config = json.loads((tmp_path / "scene_configs" / f"{HELDOUT}.json").read_text())
     assert len(config) == 1
 
 
@@ -144,10 +146,44 @@ def test_varied_objects_become_a_group_that_training_takes(tmp_path, monkeypatch
         groups_of("varied")
 
 
+def test_solid_objects_are_filled_and_as_heavy_as_that(tmp_path, monkeypatch):
+    """Their keypoints stay those of the surface."""
+    monkeypatch.setattr(heldout, "DENSE", 2000)
+    kind = Kind(7, 0.6, 1e4, 500.0, lambda: ellipsoid((0, 0, 0), (0.4, 0.4, 0.4)))
+    ball = assets({"ball": kind}, Fineness(0.04, 0.03, 5e-4), 40, solid=True)[7]
+    assert (ball.points[:40].norm(dim=1) - 0.3).abs().max() < 3e-3
+    assert ball.points.norm(dim=1).max() < 0.304
+    volume = float(4 / 3 * torch.pi * 0.3**3)
+    around = float(4 * torch.pi * 0.3**2) * 0.04
+    assert volume < ball.mass / 500 < volume + around  # cells at the surface count whole
+    assert ball.solidity == pytest.approx((ball.mass / 500 / (24 * 0.3**2) / WALL) ** 3, rel=0.05)
+    assert "1 scenes of 9 objects" in run(tmp_path, HeldoutOptions(scenes=1, shapes=9, solid=True, **COARSE))
+    made = read_motions(tmp_path / "motions" / "solid.h5")
+    assert made.world().solidity.amax() > 1 and torch.equal(made.world().solidity, made.solidity)
+    assert groups_of("solid,turned", more=OTHERS) == ["solid", "turned"]
+
+
+def test_the_ten_turned_keep_their_shape_mass_and_material(tmp_path, monkeypatch):
+    box = 0.1 * (torch.rand(60, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([6.0, 2, 1]))
+    ten = {i: Asset(i, 0.6, box, volumes(box, 0.1), 1e5 * i, 300.0) for i in (1, 2)}
+    made = turned(ten, 5, FINENESS)
+    assert list(made) == [2000, 2001, 2002, 2003, 2004] and [a.E for a in made.values()][:3] == [1e5, 2e5, 1e5]
+    for a in made.values():
+        assert (a.points.amax(0) + a.points.amin(0)).abs().max() < 1e-5
+        torch.testing.assert_close(torch.cdist(a.points, a.points), torch.cdist(box, box), atol=1e-3, rtol=0)
+    one, other = made[2000].points, made[2002].points
+    assert (one - one.mean(0) - (other - other.mean(0))).norm(dim=1).mean() > 0.05
+    monkeypatch.setattr(heldout.dataset_assets, "assets", lambda *_: ten)
+    assert "2 scenes of 4 objects" in run(tmp_path, HeldoutOptions(scenes=2, turned=4, **COARSE))
+    assert bool((read_motions(tmp_path / "motions" / "turned.h5").objects >= 2000).all())
+
+
 @pytest.mark.parametrize(
     ("choices", "says"),
-    [({"scenes": 0}, "at least one scene"), ({"objects": 9}, "1 to 6 objects"), ({"size": 3.0}, "--size 3.0")],
-)
+    [({"scenes": 0}, "at least one scene"), ({"objects": 9}, "1 to 6 objects"), ({"size": 3.0}, "--size 3.0"),
+     ({"solid": True}, "--solid needs --shapes"), ({"shapes": 2, "turned": 2}, "goes without"),
+     ({"turned": -1}, "--turned -1")],
+)  # fmt: skip
 def test_options_that_cannot_be(choices, says):
     with pytest.raises(InputError, match=says):
         HeldoutOptions(**choices)

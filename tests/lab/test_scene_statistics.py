@@ -45,7 +45,7 @@ def motions(*objects, ids):
     """A scene, from (t, n, 3) each."""
     points = torch.stack([torch.stack(objects, 1)])
     n = torch.ones(1, len(ids))
-    return Motions(("a",), torch.tensor([ids]), points, n, n, 0.3 * n, n, 0.02, (0, 0, -5.0), BOX)
+    return Motions(("a",), torch.tensor([ids]), points, n, n, 0.3 * n, n, 0.02, (0, 0, -5.0), BOX, n)
 
 
 def test_a_ball_falls_into_a_bowl_and_a_duck_lies_beside():

@@ -44,7 +44,7 @@ def falling(scenes: int = 6, frames: int = 12, objects: int = 2, n: int = 8, see
     one = torch.ones(scenes, objects)
     ids = torch.arange(objects).expand(scenes, objects).clone()
     return Motions(tuple(map(str, range(scenes))), ids, points, 0.1 * one, 1e5 * one, 0.3 * one, 0.5 * one, DT,
-                   GRAVITY, BOX)  # fmt: skip
+                   GRAVITY, BOX, one)  # fmt: skip
 
 
 def without_last(motions: Motions) -> Motions:

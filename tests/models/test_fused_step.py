@@ -65,7 +65,7 @@ def all_ways(model: ForceField, world, steps: int, prompt=None, pinned: bool = F
 
 
 @pytest.mark.parametrize("hidden, world, given", [
-    (64, crowd(2, 3, 200), {}),
+    (64, crowd(2, 3, 200, seed=1), {}),  # with seed 0 two points are nearest to within rounding: either may be taken
     (16, padded(crowd(2, 3, 70), 1, 3), {"prompt": {"force": (0.0, 3.0, 30.0), "torque": (0.1, 0.2, 0.0), "point": 2}}),
     (64, crowd(1, 5, 200, seed=3), {"pinned": True}),
     (64, replace(crowd(1, 3, 200), box=STEPPED), {}),

@@ -13,7 +13,6 @@ from scipy import ndimage
 from torch import Tensor
 
 from stages.geometry.neighbours import knn
-from stages.physics.growing import lab_of
 from stages.physics.support import Support
 from stages.raster.rasterise import rasterise
 from stages.refine.inpaint import inpaint
@@ -22,13 +21,18 @@ from stages.refine.sight import Sight
 from stages.scene.gaussians import Gaussians, concatenate
 from stages.scene.scene import Scene
 
-MOST = 512  # cells along the longer side of the picture of the table
+MOST = 1024  # cells along the longer side of the picture of the table
+CELLS = 40_000  # under things, about
+AROUND = 0.2  # of the table around all things that is in the picture, to see how its edges go on [view radii]
 MARGIN = 0.06  # around what is under an object [view radii]
+RIM = 0.02  # beside a hole, where a contact shadow is [view radii]
+BLUR = 3.0  # standard deviation at which colours are compared, wider than threads of a cloth [cells]
 FEW = 0.25  # share of the cameras that look at a place, below which the table there counts as not seen
 GRAZING = 0.03  # depth that a pixel of table spans at a flat angle [view radii]
 GAP = 0.03  # places that cameras see through are narrower where the reconstruction is at fault [view radii]
 OTHER = 12.0  # CIELAB distance from which a colour is not the table's
 COVERED = 0.92  # alpha above which the table is there
+SEEN = 0.6  # alpha above which its colour is known
 DENT = 0.015  # side of the squares in which it is asked how deep things lie [view radii]
 DEEPEST = 0.1  # below the surface that something lies on it; deeper it hangs over the edge [view radii]
 STRAYS = 3  # Gaussians below the surface in a square that say nothing
@@ -65,10 +69,10 @@ class Picture:
 def fill(scene: Scene, sight: Sight, support: Support, seed: int = 0) -> Scene:
     """The scene with flat Gaussians on the plane where objects hide it: under them, with a margin.
 
-    The table is drawn from above without the objects, and its holes are inpainted in its own texture: those under
-    an object, and those around it that are hidden. Under an object few cameras see the table; what lies there in
-    another colour is its shadow, or a part of it that was missed, and goes. Places that a camera sees through, or
-    where it sees no table, past the edge, stay open.
+    The table is drawn from above without the objects, and its holes are inpainted from what is around: those under
+    an object, and those beside it that are hidden. Under an object few cameras see the table, and close to it what
+    they see may be its shadow, or a part of it that was missed: where that is not what is inpainted, it goes. Places
+    that a camera sees through, or where it sees no table, past the edge, stay open.
     """
     g, R = scene.gaussians, support.view.radius
     flat = (support.heights(g.means).abs() < 2 * support.tolerance) & (g.scales.amax(1) < 0.1 * R)
@@ -82,15 +86,18 @@ def fill(scene: Scene, sight: Sight, support: Support, seed: int = 0) -> Scene:
     near = ndimage.distance_transform_edt(~under) <= MARGIN * R / picture.cell
     near[near] = support.inside(picture.centres(near)).numpy()
     hidden = _each(near, picture, support, lambda points: sight.share(points, GRAZING * R) < FEW)
-    known, blind = picture.alpha >= COVERED, under & hidden
-    hole = near & ~known & (under | hidden)
+    covered, blind = picture.alpha >= COVERED, under & hidden
+    hole = near & ~covered & (under | hidden)
+    known = (picture.alpha >= SEEN) & ~hole
     width = 2 * support.tolerance + picture.cell
     empty = _each(hole, picture, support, lambda points: sight.empty(points, width))
     hole &= ~ndimage.binary_opening(empty, iterations=max(1, round(GAP * R / picture.cell / 2)))
-    colour = inpaint(picture.rgb, hole | blind, known & ~ndimage.binary_dilation(blind, iterations=2), seed)
-    gone = _remains(g, flat, picture, colour, blind)
+    beside = near & (ndimage.distance_transform_edt(~(hole | blind)) <= RIM * R / picture.cell)
+    hole |= _dirt(picture, hole, known, blind, beside, seed)
+    colour = inpaint(picture.rgb, hole, known, seed)
+    gone = flat & torch.from_numpy(hole[picture.rows_columns(g.means)])
     left = _drawn(g[flat & ~gone], picture.corner, picture.cell, picture.top, picture.alpha.shape)
-    new = hole | (near & known & (left.alpha < COVERED))
+    new = hole | (near & covered & (left.alpha < COVERED))
     new &= ~_each(new & (picture.dent > 0), picture, support, lambda points: sight.empty(points, 2 * picture.cell))
     points = picture.on(support, new)
     up = torch.tensor([[0.0, 0, 1]]).expand(len(points), 3)
@@ -107,28 +114,33 @@ def _each(
     return out
 
 
-def _remains(
-    g: Gaussians, flat: Bool[Tensor, "n"], picture: Picture, colour: np.ndarray, blind: np.ndarray
-) -> Bool[Tensor, "n"]:
-    """Gaussians of the plane in blind cells whose colour is not the table's there."""
-    rows = torch.nonzero(flat)[:, 0]
-    cells = picture.rows_columns(g.means[rows])
-    table = cv2.cvtColor(colour, cv2.COLOR_RGB2LAB)[cells]
-    differ = np.linalg.norm(lab_of(g[rows]).numpy() - table, axis=1) > OTHER
-    gone = torch.zeros(len(g), dtype=torch.bool)
-    gone[rows[torch.from_numpy(differ & blind[cells])]] = True
-    return gone
+def _dirt(
+    picture: Picture, hole: np.ndarray, known: np.ndarray, blind: np.ndarray, beside: np.ndarray, seed: int
+) -> Bool[np.ndarray, "h w"]:
+    """Blind cells, and those beside the hole in one piece with it, whose colour is not the table's there."""
+    doubt = known & (blind | beside)
+    table = inpaint(picture.rgb, hole | doubt, known, seed, rounds=0)
+    weight = doubt.astype(np.float32)
+    blurred = [cv2.GaussianBlur(rgb * weight[..., None], (0, 0), BLUR) for rgb in (picture.rgb, table)]
+    share = np.maximum(cv2.GaussianBlur(weight, (0, 0), BLUR), 1e-6)[..., None]
+    one, two = (cv2.cvtColor((b / share).clip(0, 1), cv2.COLOR_RGB2LAB) for b in blurred)
+    other = doubt & (np.linalg.norm(one - two, axis=2) > OTHER)
+    pieces, _ = ndimage.label(other | hole)
+    touching = np.isin(pieces, np.unique(pieces[hole | blind]))
+    return doubt & ndimage.binary_dilation(other & touching, iterations=2)
 
 
 def _picture(table: Gaussians, things: Float[Tensor, "m 3"], support: Support) -> Picture | None:
     """The table from above around all things."""
-    margin = 1.3 * MARGIN * support.view.radius
+    margin = AROUND * support.view.radius
     low, high = things[:, :2].amin(0) - margin, things[:, :2].amax(0) + margin
     longest = float((high - low).max())
     if not 1e-9 < longest < 1e9:
         return None
     spacing = float(knn(table.means, table.means[:: max(1, len(table) // 5000)], 4)[0][:, -1].median())
-    cell = max(longest / MOST, spacing)
+    side = DENT * support.view.radius
+    area = len((things[:, :2] / side).floor().unique(dim=0)) * side**2
+    cell = max(longest / MOST, spacing / 2, (area / CELLS) ** 0.5)  # twice as fine: Gaussians are longer than wide
     width, height = (((high - low) / cell).ceil().long().clamp_min(2)).tolist()
     top = float(support.surface((low + high)[None] / 2))
     flat = _drawn(table, torch.stack([low[0], high[1]]), cell, top, (height, width))

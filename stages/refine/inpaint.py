@@ -1,8 +1,8 @@
-"""Holes in a picture filled with its own texture: smooth light from the rim, and patches of what is seen elsewhere.
+"""Holes in a picture filled with what is seen elsewhere in it, so that edges and texture go on.
 
-Light and texture are told apart first. The light is carried smoothly over the hole, so that there is no seam; the
-texture, what is left without it, is put together from seen patches that agree with their surroundings and with each
-other, coarse to fine.
+The hole is put together from seen patches that agree with their surroundings and with each other, coarse to fine:
+where an edge runs into it at both ends, patches along the edge are what agrees. What is seen beside the hole in a
+lighter or darker place than where the patches come from is carried smoothly over it at last, so that there is no seam.
 
 Source: Wexler, Shechtman and Irani 2007, "Space-time completion of video"; the search is that of Barnes et al. 2009,
 "PatchMatch".
@@ -18,36 +18,37 @@ from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
 REACH = 3  # of a patch to either side [cells]
-LIGHT = 12.0  # standard deviation of what counts as light [cells]
+LIGHT = 6.0  # standard deviation of what counts as light [cells]
+LIGHTER = 0.1  # most that a place may be lighter than where its patches come from; more is another thing
 SHALLOW = 4  # holes no deeper than this are filled at once, others from a coarser picture [cells]
-SMALLEST = 32  # shorter side of the coarsest picture [cells]
+FEWEST = 1000  # patches to copy from that a coarser picture must have, so that all kinds of edges are among them
+LARGEST = 40_000  # patches to be found in the coarsest picture, however few there are to copy from
 SOURCES = 2000  # patches compared with every patch of the hole in the coarsest picture
-MOST = 25_000  # patches that are still searched for in a finer one; more keep the coarser answer
+MOST = 60_000  # patches that are still searched for in a finer one; more keep the coarser answer
+ENOUGH = 0.4  # share of a patch that is there to go by
+FIRST = 0.8  # share of the rim that waits for the rest of it, of more contrast
+ROUNDS = 3  # of search in every finer picture
 DOUBT = 0.7  # weight of a cell's colour in the hole, for each cell of depth
 Y, X = (d.ravel() for d in np.mgrid[-REACH : REACH + 1, -REACH : REACH + 1])
 
 
 def inpaint(
-    rgb: Float[np.ndarray, "h w 3"], hole: Bool[np.ndarray, "h w"], known: Bool[np.ndarray, "h w"], seed: int
+    rgb: Float[np.ndarray, "h w 3"],
+    hole: Bool[np.ndarray, "h w"],
+    known: Bool[np.ndarray, "h w"],
+    seed: int,
+    rounds: int = ROUNDS,
 ) -> Float[np.ndarray, "h w 3"]:
-    """The picture with new colours in the holes; cells that are neither hole nor known are filled, but not trusted."""
-    gap = ~known | hole
-    if gap.all() or not gap.any():
+    """The picture with new colours in the holes; cells that are neither hole nor known stay, and are not trusted.
+
+    With few `rounds` of search at full size, or none, it is quicker and more blurred.
+    """
+    known = known & ~hole
+    if not known.any() or not hole.any():
         return rgb
-    light = _light(rgb, gap)
-    texture = np.where(gap[..., None], 0.0, rgb - light).astype(np.float32)
-    texture = _complete(texture, gap, np.random.default_rng(seed))
-    return np.where(gap[..., None], light + texture, rgb).clip(0, 1).astype(rgb.dtype)
-
-
-def _light(rgb: np.ndarray, gap: np.ndarray) -> Float[np.ndarray, "h w 3"]:
-    """Blurred colours of what is known, carried smoothly over the gap."""
-    weight = (~gap).astype(np.float32)
-    near = cv2.GaussianBlur(weight, (0, 0), LIGHT)[..., None]
-    blurred = cv2.GaussianBlur(rgb.astype(np.float32) * weight[..., None], (0, 0), LIGHT) / np.maximum(near, 1e-6)
-    far = _membrane(np.where(gap[..., None], 0, blurred).astype(np.float32), weight)
-    share = np.clip(4 * near - 1, 0, 1)  # half the window: at the rim of a hole
-    return share * blurred + (1 - share) * cv2.GaussianBlur(far, (0, 0), LIGHT / 2)
+    smooth = _membrane(np.where(known[..., None], rgb, 0).astype(np.float32), known.astype(np.float32))
+    image = _complete(np.where(known[..., None], rgb, smooth), hole, known, np.random.default_rng(seed), rounds)
+    return np.where(hole[..., None], image, rgb).clip(0, 1).astype(rgb.dtype)
 
 
 def _membrane(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
@@ -69,133 +70,180 @@ def _membrane(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
 
 @dataclass
 class _Level:
-    """A picture with patches to be found for the targets: every cell whose patch reaches into the gap."""
+    """A picture with patches to be found for the targets: every cell whose patch reaches into the hole."""
 
     image: np.ndarray  # (h, w, 3), changed in place
-    gap: np.ndarray  # (h, w)
+    hole: np.ndarray  # (h, w)
     trust: np.ndarray  # (h, w) weight of a cell's colour when patches are compared
     source: np.ndarray  # (h, w) whether a patch around the cell is known all over
     at: np.ndarray  # (t, 2) targets
 
     @staticmethod
-    def of(image: np.ndarray, gap: np.ndarray) -> _Level:
-        depth = ndimage.distance_transform_edt(gap)
-        side = 2 * REACH + 1
-        source = ndimage.binary_erosion(~gap, np.ones((side, side)))
-        inner = np.zeros_like(gap)
+    def of(image: np.ndarray, hole: np.ndarray, known: np.ndarray) -> _Level:
+        side = np.ones((2 * REACH + 1, 2 * REACH + 1))
+        inner = np.zeros_like(hole)
         inner[REACH:-REACH, REACH:-REACH] = True
-        near = ndimage.binary_dilation(gap, np.ones((side, side))) & inner
-        return _Level(image.copy(), gap, DOUBT ** depth, source & inner, np.argwhere(near))
+        trust = np.where(hole | known, DOUBT ** ndimage.distance_transform_edt(hole), 0).astype(np.float32)
+        near = ndimage.binary_dilation(hole, side) & inner
+        return _Level(image.copy(), hole, trust, ndimage.binary_erosion(known, side) & inner, np.argwhere(near))
 
     def patches(self, at: Int[np.ndarray, "t 2"]) -> Float[np.ndarray, "t p 3"]:
-        return self.image[at[:, :1] + Y, at[:, 1:] + X]
+        return self.image.reshape(-1, 3).take(self._cells(at), axis=0)
 
-    def distances(self, match: Int[np.ndarray, "t 2"]) -> Float[np.ndarray, "t"]:
-        """Of every target's patch to that around its match."""
-        weight = self.trust[self.at[:, :1] + Y, self.at[:, 1:] + X]
-        squares = np.square(self.patches(self.at) - self.patches(match)).sum(2)
-        return (weight * squares).sum(1) / weight.sum(1).clip(1e-6)
+    def weights(self, at: Int[np.ndarray, "t 2"], told: Bool[np.ndarray, "h w"] | bool = True) -> np.ndarray:
+        """How much each cell of the patches, if told, is to be trusted (t, p)."""
+        return (self.trust * told).ravel().take(self._cells(at))
 
-    def vote(self, match: Int[np.ndarray, "t 2"], distance: Float[np.ndarray, "t"]) -> Bool[np.ndarray, "h w"]:
-        """Every cell of the gap takes the mean of what the patches over it say, good matches first; which had any."""
-        heard = np.isfinite(distance)
-        sigma = max(float(np.median(distance[heard])), 1e-8) if heard.any() else 1.0
-        weight = np.where(heard, np.exp(-distance / (0.5 * sigma)) + 1e-4, 0).astype(np.float32)
-        total, count = np.zeros_like(self.image), np.zeros(self.gap.shape, np.float32)
-        for y, x in zip(Y, X, strict=True):
-            to = (self.at[:, 0] + y, self.at[:, 1] + x)  # no target twice, so no cell twice
-            total[to] += weight[:, None] * self.image[match[:, 0] + y, match[:, 1] + x]
-            count[to] += weight
-        told = self.gap & (count > 0)
-        self.image[told] = total[told] / count[told][:, None]
+    def _cells(self, at: Int[np.ndarray, "t 2"]) -> Int[np.ndarray, "t p"]:
+        width = self.hole.shape[1]
+        return (at[:, 0] * width + at[:, 1])[:, None] + (Y * width + X)
+
+    def distances(
+        self, P: Float[np.ndarray, "t p 3"], W: Float[np.ndarray, "t p"], match: Int[np.ndarray, "t 2"]
+    ) -> Float[np.ndarray, "t"]:
+        """Of patches to those around their matches."""
+        difference = P - self.patches(match)
+        return np.einsum("tp,tpc,tpc->t", W, difference, difference) / W.sum(1).clip(1e-6)
+
+    def vote(
+        self, at: Int[np.ndarray, "t 2"], match: Int[np.ndarray, "t 2"], distance: Float[np.ndarray, "t"]
+    ) -> Bool[np.ndarray, "h w"]:
+        """Every cell of the hole takes the mean of what the patches over it say; which had any."""
+        said, told = self.said(at, match, distance)
+        told &= self.hole
+        self.image[told] = said[told]
         return told
 
+    def said(self, at: np.ndarray, match: np.ndarray, distance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The mean of what patches say of every cell, good matches first, and of which they say anything."""
+        sigma = max(float(np.median(distance)), 1e-8)
+        weight = (np.exp(-distance / (0.5 * sigma)) + 1e-4).astype(np.float32)[:, None]
+        total = np.zeros((self.hole.size, 4), np.float32)
+        image = np.concatenate([self.image, np.ones((*self.hole.shape, 1), np.float32)], 2).reshape(-1, 4)
+        to, of = self._cells(at), self._cells(match)
+        for p in range(to.shape[1]):
+            total[to[:, p]] += weight * image.take(of[:, p], axis=0)  # no target twice, so no cell twice
+        total = total.reshape(*self.hole.shape, 4)
+        return total[..., :3] / total[..., 3:].clip(1e-9), total[..., 3] > 0
 
-def _complete(texture: np.ndarray, gap: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """The texture with its gap filled, from a coarse picture of it to itself."""
-    pictures = [(texture, gap)]
-    while ndimage.distance_transform_edt(pictures[-1][1]).max() > SHALLOW and min(gap.shape) > 2 * SMALLEST:
-        texture, gap = _halved(*pictures[-1])
-        if not _Level.of(texture, gap).source.any():
+    def even(self, match: Int[np.ndarray, "t 2"]) -> None:
+        """By how much the seen cells around are lighter than patches say goes for the hole as well, smoothly."""
+        distance = self.distances(self.patches(self.at), self.weights(self.at), match)
+        said, told = self.said(self.at, match, distance)
+        rim = (told & ~self.hole & (self.trust > 0)).astype(np.float32)
+        near = cv2.GaussianBlur(rim, (0, 0), LIGHT)[..., None]
+        lighter = cv2.GaussianBlur(rim[..., None] * (self.image - said), (0, 0), LIGHT) / np.maximum(near, 1e-6)
+        over = cv2.GaussianBlur(_membrane(rim[..., None] * lighter, rim), (0, 0), LIGHT)
+        self.image[self.hole] += over[self.hole].clip(-LIGHTER, LIGHTER)
+
+
+def _complete(
+    image: np.ndarray, hole: np.ndarray, known: np.ndarray, rng: np.random.Generator, rounds: int
+) -> np.ndarray:
+    """The picture with its hole filled, from a coarse picture of it to itself."""
+    levels = [_Level.of(image, hole, known)]
+    while ndimage.distance_transform_edt(hole).max() > SHALLOW:
+        image, hole, known = _halved(image, hole, known)
+        coarser = _Level.of(image, hole, known)
+        count = int(coarser.source.sum())
+        if count < FEWEST and (not count or len(levels[-1].at) <= LARGEST):
             break
-        pictures.append((texture, gap))
-    found = None
-    for texture, gap in reversed(pictures):
-        level = _Level.of(texture, gap)
-        if not level.source.any() or not len(level.at):
-            return texture  # nothing to copy from: the light alone
-        found = _searched(level, rng) if found is None else _refined(level, found, rng)
+        levels.append(coarser)
+    if not levels[0].source.any() or not len(levels[-1].at):
+        return levels[0].image  # nothing to copy from: smooth colours alone
+    found = _searched(levels[-1], rng)
+    for level in levels[-2::-1]:
+        found = _refined(level, found, rng, ROUNDS if level is not levels[0] else rounds)
+    level = levels[0]
+    level.even(found[level.at[:, 0], level.at[:, 1]])
     return level.image
 
 
-def _halved(texture: np.ndarray, gap: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A picture of half the size; a cell is known where most of it is."""
-    height, width = (side // 2 * 2 for side in gap.shape)
-    known = (~gap[:height, :width]).astype(np.float32)
-    four = lambda v: v.reshape(height // 2, 2, width // 2, 2, *v.shape[2:]).sum((1, 3))  # noqa: E731
-    count = four(known)
-    half = four(texture[:height, :width] * known[..., None]) / np.maximum(count, 1)[..., None]
-    return half.astype(np.float32), count < 3
+def _halved(image: np.ndarray, hole: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A picture of half the size; a cell is known where most of it is, else a part of the hole where some of it is."""
+    height, width = (side // 2 * 2 for side in hole.shape)
+    four = lambda v: v[:height, :width].reshape(height // 2, 2, width // 2, 2, *v.shape[2:]).sum((1, 3))  # noqa: E731
+    weight = known + np.float32(1e-3)
+    half = four(image * weight[..., None]) / four(weight)[..., None]
+    most = four(known) >= 3
+    return half.astype(np.float32), (four(hole) > 0) & ~most, most
 
 
 def _searched(level: _Level, rng: np.random.Generator, rounds: int = 4) -> Int[np.ndarray, "h w 2"]:
-    """A match for every target among all sources, or many of them: from the rim inwards, then all together."""
+    """A match for every target among all sources, or many of them: from the rim inwards, then all together.
+
+    Where most goes on at the rim it is carried on first: edges run on straight before what is even spreads over them.
+    """
     sources = np.argwhere(level.source)
     sources = sources[rng.permutation(len(sources))[:SOURCES]]
     Q = level.patches(sources).reshape(len(sources), -1)
-    settled, told = level.trust.astype(np.float32), ~level.gap
-    while rounds:
-        level.trust = settled * told
-        W = level.trust[level.at[:, :1] + Y, level.at[:, 1:] + X]
-        P = level.patches(level.at).reshape(len(level.at), -1)
-        match = sources[_nearest(P, np.repeat(W, 3, axis=1), Q)]
-        enough = (W > 0).mean(1) >= 0.4  # of a patch is there to go by
-        rounds -= bool(told.all() or not (enough & ~told[level.at[:, 0], level.at[:, 1]]).any())
-        told = told | level.vote(match, np.where(enough, level.distances(match), np.inf))
-    level.trust = settled
+    told, at = ~level.hole, level.at
+    while len(at) and not told[level.hole].all():
+        there = cv2.blur((told & (level.trust > 0)).astype(np.float32), (2 * REACH + 1, 2 * REACH + 1))
+        at = level.at[(there >= ENOUGH)[tuple(level.at.T)] & ~told[tuple(level.at.T)]]
+        if len(at):
+            P, W = level.patches(at), level.weights(at, told)
+            first = _first(P, W)
+            at, P, W = at[first], P[first], W[first]
+            match = sources[_nearest(P, W, Q)]
+            told = told | level.vote(at, match, level.distances(P, W, match))
+    W = level.weights(level.at)
+    for _ in range(rounds):
+        P = level.patches(level.at)
+        match = sources[_nearest(P, W, Q)]
+        level.vote(level.at, match, level.distances(P, W, match))
     return _field(level, match)
 
 
-def _nearest(P: Float[np.ndarray, "t d"], W: Float[np.ndarray, "t d"], Q: Float[np.ndarray, "s d"]) -> np.ndarray:
-    """Which row of Q is nearest to each row of P, squares weighted by W."""
-    squares, parts = (Q * Q).T, range(0, len(P), 512)
-    return np.concatenate([np.argmin(W[i : i + 512] @ squares - 2 * (W * P)[i : i + 512] @ Q.T, 1) for i in parts])
+def _first(P: Float[np.ndarray, "t p 3"], W: Float[np.ndarray, "t p"]) -> Bool[np.ndarray, "t"]:
+    """Which patches have the most contrast in what is known of them."""
+    W = (W / W.sum(1, keepdims=True))[..., None]
+    contrast = (W * np.square(P - (W * P).sum(1, keepdims=True))).sum((1, 2))
+    return contrast >= np.quantile(contrast, FIRST)
 
 
-def _refined(level: _Level, coarse: Int[np.ndarray, "h w 2"], rng: np.random.Generator, rounds: int = 2) -> np.ndarray:
+def _nearest(P: Float[np.ndarray, "t p 3"], W: Float[np.ndarray, "t p"], Q: Float[np.ndarray, "s d"]) -> np.ndarray:
+    """Which row of Q is nearest to each patch, squares weighted by W."""
+    squares, nearest = (Q * Q).T, []
+    for i in range(0, len(P), 512):
+        weight = np.repeat(W[i : i + 512], 3, axis=1)
+        weighted = weight * P[i : i + 512].reshape(len(weight), -1)
+        nearest.append(np.argmin(weight @ squares - 2 * weighted @ Q.T, 1))
+    return np.concatenate(nearest)
+
+
+def _refined(level: _Level, coarse: Int[np.ndarray, "h w 2"], rng: np.random.Generator, rounds: int) -> np.ndarray:
     """Matches of a coarser picture carried over, then improved by those of neighbours and by small steps."""
     cell = np.minimum(level.at // 2, np.array(coarse.shape[:2]) - 1)
     match = 2 * coarse[cell[:, 0], cell[:, 1]] + level.at - 2 * cell
-    sources = np.argwhere(level.source)
-    lost = ~_usable(level, match)
-    match[lost] = sources[rng.integers(0, len(sources), int(lost.sum()))]
-    distance = level.distances(match)
-    level.vote(match, distance)
+    nearest = ndimage.distance_transform_edt(~level.source, return_distances=False, return_indices=True)
+    match = nearest[(slice(None), *match.clip(0, np.array(level.hole.shape) - 1).T)].T
+    P, W = level.patches(level.at), level.weights(level.at)
+    level.vote(level.at, match, level.distances(P, W, match))
     for _ in range(rounds if len(match) <= MOST else 0):
-        distance = level.distances(match)
-        for step in ((0, 1), (1, 0), (0, -1), (-1, 0)):
-            field = _field(level, match)
-            other = field[level.at[:, 0] + step[0], level.at[:, 1] + step[1]] - step
-            match, distance = _better(level, match, distance, other)
-        match, distance = _better(level, match, distance, match + rng.integers(-2, 3, match.shape))
-        level.vote(match, distance)
+        P = level.patches(level.at)
+        distance = level.distances(P, W, match)
+        for step in ((0, 1), (1, 0), (0, -1), (-1, 0), None):
+            if step is None:
+                other = match + rng.integers(-2, 3, match.shape)
+            else:
+                other = _field(level, match)[level.at[:, 0] + step[0], level.at[:, 1] + step[1]] - step
+            which = np.nonzero((other != match).any(1) & _usable(level, other))[0]
+            theirs = level.distances(P[which], W[which], other[which])
+            closer = theirs < distance[which]
+            match[which[closer]], distance[which[closer]] = other[which[closer]], theirs[closer]
+        level.vote(level.at, match, distance)
     return _field(level, match)
 
 
-def _better(level: _Level, match: np.ndarray, distance: np.ndarray, other: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    other = np.where(_usable(level, other)[:, None], other, match)
-    theirs = level.distances(other)
-    return np.where((theirs < distance)[:, None], other, match), np.minimum(theirs, distance)
-
-
 def _usable(level: _Level, match: np.ndarray) -> Bool[np.ndarray, "t"]:
-    height, width = level.gap.shape
+    height, width = level.hole.shape
     inside = ((match >= 0) & (match < (height, width))).all(1)
     return inside & level.source[match[:, 0].clip(0, height - 1), match[:, 1].clip(0, width - 1)]
 
 
 def _field(level: _Level, match: np.ndarray) -> Int[np.ndarray, "h w 2"]:
     """The match of every cell; cells that are no target are their own."""
-    field = np.stack(np.mgrid[: level.gap.shape[0], : level.gap.shape[1]], -1)
+    field = np.stack(np.mgrid[: level.hole.shape[0], : level.hole.shape[1]], -1)
     field[level.at[:, 0], level.at[:, 1]] = match
     return field

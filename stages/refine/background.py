@@ -25,12 +25,12 @@ MOST = 1024  # cells along the longer side of the picture of the table
 CELLS = 40_000  # under things, about
 AROUND = 0.2  # of the table around all things that is in the picture, to see how its edges go on [view radii]
 MARGIN = 0.06  # around what is under an object [view radii]
-RIM = 0.02  # beside a hole, where a contact shadow is [view radii]
+RIM = 0.03  # beside a hole, where a contact shadow is [view radii]
 BLUR = 3.0  # standard deviation at which colours are compared, wider than threads of a cloth [cells]
 FEW = 0.25  # share of the cameras that look at a place, below which the table there counts as not seen
 GRAZING = 0.03  # depth that a pixel of table spans at a flat angle [view radii]
 GAP = 0.03  # places that cameras see through are narrower where the reconstruction is at fault [view radii]
-OTHER = 12.0  # CIELAB distance from which a colour is not the table's
+OTHER = 6.0  # CIELAB distance from which a colour is not the table's
 COVERED = 0.92  # alpha above which the table is there
 SEEN = 0.6  # alpha above which its colour is known
 DENT = 0.015  # side of the squares in which it is asked how deep things lie [view radii]
@@ -93,8 +93,9 @@ def fill(scene: Scene, sight: Sight, support: Support, seed: int = 0) -> Scene:
     empty = _each(hole, picture, support, lambda points: sight.empty(points, width))
     hole &= ~ndimage.binary_opening(empty, iterations=max(1, round(GAP * R / picture.cell / 2)))
     beside = near & (ndimage.distance_transform_edt(~(hole | blind)) <= RIM * R / picture.cell)
-    hole |= _dirt(picture, hole, known, blind, beside, seed)
-    colour = inpaint(picture.rgb, hole, known, seed)
+    doubt = known & (blind | beside)
+    colour = inpaint(picture.rgb, hole | doubt, known, seed)
+    hole |= _other(picture.rgb, colour, doubt)
     gone = flat & torch.from_numpy(hole[picture.rows_columns(g.means)])
     left = _drawn(g[flat & ~gone], picture.corner, picture.cell, picture.top, picture.alpha.shape)
     new = hole | (near & covered & (left.alpha < COVERED))
@@ -114,20 +115,13 @@ def _each(
     return out
 
 
-def _dirt(
-    picture: Picture, hole: np.ndarray, known: np.ndarray, blind: np.ndarray, beside: np.ndarray, seed: int
-) -> Bool[np.ndarray, "h w"]:
-    """Blind cells, and those beside the hole in one piece with it, whose colour is not the table's there."""
-    doubt = known & (blind | beside)
-    table = inpaint(picture.rgb, hole | doubt, known, seed, rounds=0)
-    weight = doubt.astype(np.float32)
-    blurred = [cv2.GaussianBlur(rgb * weight[..., None], (0, 0), BLUR) for rgb in (picture.rgb, table)]
+def _other(one: np.ndarray, two: np.ndarray, where: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """Those of the cells in which two pictures, blurred, differ in colour."""
+    weight = where.astype(np.float32)
     share = np.maximum(cv2.GaussianBlur(weight, (0, 0), BLUR), 1e-6)[..., None]
-    one, two = (cv2.cvtColor((b / share).clip(0, 1), cv2.COLOR_RGB2LAB) for b in blurred)
-    other = doubt & (np.linalg.norm(one - two, axis=2) > OTHER)
-    pieces, _ = ndimage.label(other | hole)
-    touching = np.isin(pieces, np.unique(pieces[hole | blind]))
-    return doubt & ndimage.binary_dilation(other & touching, iterations=2)
+    blurred = (cv2.GaussianBlur(rgb * weight[..., None], (0, 0), BLUR) / share for rgb in (one, two))
+    lab = [cv2.cvtColor(rgb.clip(0, 1), cv2.COLOR_RGB2LAB) for rgb in blurred]
+    return where & ndimage.binary_dilation(np.linalg.norm(lab[0] - lab[1], axis=2) > OTHER, iterations=2)
 
 
 def _picture(table: Gaussians, things: Float[Tensor, "m 3"], support: Support) -> Picture | None:

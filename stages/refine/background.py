@@ -26,6 +26,7 @@ CELLS = 40_000  # under things, about
 AROUND = 0.2  # of the table around all things that is in the picture, to see how its edges go on [view radii]
 MARGIN = 0.06  # around what is under an object [view radii]
 RIM = 0.03  # beside a hole, where a contact shadow is [view radii]
+SHARPER = 2  # rounds in which what patches blur is undone
 BLUR = 3.0  # standard deviation at which colours are compared, wider than threads of a cloth [cells]
 FEW = 0.25  # share of the cameras that look at a place, below which the table there counts as not seen
 GRAZING = 0.03  # depth that a pixel of table spans at a flat angle [view radii]
@@ -92,18 +93,32 @@ def fill(scene: Scene, sight: Sight, support: Support, seed: int = 0) -> Scene:
     width = 2 * support.tolerance + picture.cell
     empty = _each(hole, picture, support, lambda points: sight.empty(points, width))
     hole &= ~ndimage.binary_opening(empty, iterations=max(1, round(GAP * R / picture.cell / 2)))
-    beside = near & (ndimage.distance_transform_edt(~(hole | blind)) <= RIM * R / picture.cell)
-    doubt = known & (blind | beside)
+    doubt = known & near & (blind | _beside(hole | blind, RIM * R / picture.cell))
     colour = inpaint(picture.rgb, hole | doubt, known, seed)
     hole |= _other(picture.rgb, colour, doubt)
     gone = flat & torch.from_numpy(hole[picture.rows_columns(g.means)])
     left = _drawn(g[flat & ~gone], picture.corner, picture.cell, picture.top, picture.alpha.shape)
     new = hole | (near & covered & (left.alpha < COVERED))
     new &= ~_each(new & (picture.dent > 0), picture, support, lambda points: sight.empty(points, 2 * picture.cell))
-    points = picture.on(support, new)
-    up = torch.tensor([[0.0, 0, 1]]).expand(len(points), 3)
-    more = patches(points, up, torch.from_numpy(colour[new]), picture.cell, 0)
+    more = _laid(picture, support, new, colour, g[flat & ~gone])
     return replace(scene, gaussians=concatenate([g[~gone], more]))
+
+
+def _laid(picture: Picture, support: Support, cells: np.ndarray, colour: np.ndarray, table: Gaussians) -> Gaussians:
+    """Patches in some of the cells of the table, of colours that, blurred by the patches around, come out as wanted."""
+    points, rgb = picture.on(support, cells), colour[cells]
+    up = torch.tensor([[0.0, 0, 1]]).expand(len(points), 3)
+    for _ in range(SHARPER):
+        more = patches(points, up, torch.from_numpy(rgb), picture.cell, 0)
+        drawn = _drawn(concatenate([table, more]), picture.corner, picture.cell, picture.top, cells.shape)
+        rgb = (rgb + colour[cells] - drawn.rgb[cells]).clip(0, 1)
+    return patches(points, up, torch.from_numpy(rgb), picture.cell, 0)
+
+
+def _beside(hole: Bool[np.ndarray, "h w"], reach: float) -> Bool[np.ndarray, "h w"]:
+    """Cells within reach of a hole; of one narrower than that, a part of the table's own pattern, only those close."""
+    far = ndimage.distance_transform_edt(hole) < reach / 2
+    return (ndimage.distance_transform_edt(far) <= 1.5 * reach) | ndimage.binary_dilation(hole, iterations=2)
 
 
 def _each(

@@ -12,11 +12,13 @@ from jaxtyping import Bool, Float
 from scipy import ndimage
 from torch import Tensor
 
+from stages.geometry.cameras import centres
+from stages.geometry.harmonics import evaluate_sh, rgb_to_sh
 from stages.geometry.neighbours import knn
 from stages.physics.support import Support
 from stages.raster.rasterise import rasterise
 from stages.refine.inpaint import inpaint
-from stages.refine.patches import patches
+from stages.refine.patches import ACROSS, patches
 from stages.refine.sight import Sight
 from stages.scene.gaussians import Gaussians, concatenate
 from stages.scene.scene import Scene
@@ -25,9 +27,11 @@ MOST = 1024  # cells along the longer side of the picture of the table
 CELLS = 40_000  # under things, about
 AROUND = 0.2  # of the table around all things that is in the picture, to see how its edges go on [view radii]
 MARGIN = 0.06  # around what is under an object [view radii]
-RIM = 0.03  # beside a hole, where a contact shadow is [view radii]
-SHARPER = 2  # rounds in which what patches blur is undone
-BLUR = 3.0  # standard deviation at which colours are compared, wider than threads of a cloth [cells]
+RIM = 0.04  # beside a hole, where a contact shadow is [view radii]
+SHARPER = 0.7  # share of what a patch blurs that is added to its colour
+SURE = 2.0  # times what is usual that colours differ
+DIRTY = 0.25  # share of dirt from which nothing close to an object is trusted
+WIDE = 0.25  # standard deviation at which colours are compared [of the rim]
 FEW = 0.25  # share of the cameras that look at a place, below which the table there counts as not seen
 GRAZING = 0.03  # depth that a pixel of table spans at a flat angle [view radii]
 GAP = 0.03  # places that cameras see through are narrower where the reconstruction is at fault [view radii]
@@ -80,45 +84,31 @@ def fill(scene: Scene, sight: Sight, support: Support, seed: int = 0) -> Scene:
     flat &= (g.object_id == 0) & (g.opacities > 0.05) & support.inside(g.means, 0.05 * R)
     things = g.means[(g.object_id > 0) & g.means.isfinite().all(1)]
     things = things[support.inside(things, 0.05 * R)]
-    picture = _picture(g[flat], things, support) if int(flat.sum()) >= 50 and len(things) else None
+    picture = _picture(_matt(g[flat], sight), things, support) if int(flat.sum()) >= 50 and len(things) else None
     if picture is None:
         return scene
     under = _under(things, support, picture)
     near = ndimage.distance_transform_edt(~under) <= MARGIN * R / picture.cell
     near[near] = support.inside(picture.centres(near)).numpy()
-    hidden = _each(near, picture, support, lambda points: sight.share(points, GRAZING * R) < FEW)
+    seen = picture.alpha >= SEEN
+    hidden = _each(near | seen, picture, support, lambda points: sight.share(points, GRAZING * R) < FEW)
     covered, blind = picture.alpha >= COVERED, under & hidden
     hole = near & ~covered & (under | hidden)
-    known = (picture.alpha >= SEEN) & ~hole
     width = 2 * support.tolerance + picture.cell
-    empty = _each(hole, picture, support, lambda points: sight.empty(points, width))
-    hole &= ~ndimage.binary_opening(empty, iterations=max(1, round(GAP * R / picture.cell / 2)))
-    doubt = known & near & (blind | _beside(hole | blind, RIM * R / picture.cell))
-    colour = inpaint(picture.rgb, hole | doubt, known, seed)
-    hole |= _other(picture.rgb, colour, doubt)
+    empty = _each(hole | seen, picture, support, lambda points: sight.empty(points, width))
+    known = seen & ~hole & ~hidden & ~empty
+    hole &= ~ndimage.binary_opening(empty & hole, iterations=max(1, round(GAP * R / picture.cell / 2)))
+    hole |= _dirt(picture, hole, seen & near, known, blind, RIM * R / picture.cell, seed)
+    colour = inpaint(picture.rgb, hole, known, seed)
     gone = flat & torch.from_numpy(hole[picture.rows_columns(g.means)])
     left = _drawn(g[flat & ~gone], picture.corner, picture.cell, picture.top, picture.alpha.shape)
     new = hole | (near & covered & (left.alpha < COVERED))
     new &= ~_each(new & (picture.dent > 0), picture, support, lambda points: sight.empty(points, 2 * picture.cell))
-    more = _laid(picture, support, new, colour, g[flat & ~gone])
-    return replace(scene, gaussians=concatenate([g[~gone], more]))
-
-
-def _laid(picture: Picture, support: Support, cells: np.ndarray, colour: np.ndarray, table: Gaussians) -> Gaussians:
-    """Patches in some of the cells of the table, of colours that, blurred by the patches around, come out as wanted."""
-    points, rgb = picture.on(support, cells), colour[cells]
+    points = picture.on(support, new)
     up = torch.tensor([[0.0, 0, 1]]).expand(len(points), 3)
-    for _ in range(SHARPER):
-        more = patches(points, up, torch.from_numpy(rgb), picture.cell, 0)
-        drawn = _drawn(concatenate([table, more]), picture.corner, picture.cell, picture.top, cells.shape)
-        rgb = (rgb + colour[cells] - drawn.rgb[cells]).clip(0, 1)
-    return patches(points, up, torch.from_numpy(rgb), picture.cell, 0)
-
-
-def _beside(hole: Bool[np.ndarray, "h w"], reach: float) -> Bool[np.ndarray, "h w"]:
-    """Cells within reach of a hole; of one narrower than that, a part of the table's own pattern, only those close."""
-    far = ndimage.distance_transform_edt(hole) < reach / 2
-    return (ndimage.distance_transform_edt(far) <= 1.5 * reach) | ndimage.binary_dilation(hole, iterations=2)
+    sharp = colour + SHARPER * (colour - cv2.GaussianBlur(colour, (0, 0), ACROSS))  # what patches blur is undone
+    more = patches(points, up, torch.from_numpy(sharp[new]), picture.cell, 0)
+    return replace(scene, gaussians=concatenate([g[~gone], more]))
 
 
 def _each(
@@ -130,13 +120,47 @@ def _each(
     return out
 
 
-def _other(one: np.ndarray, two: np.ndarray, where: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """Those of the cells in which two pictures, blurred, differ in colour."""
+def _dirt(
+    picture: Picture, hole: np.ndarray, here: np.ndarray, known: np.ndarray, blind: np.ndarray, rim: float, seed: int
+) -> Bool[np.ndarray, "h w"]:
+    """Blind cells, and those beside a hole, where colours are not what the table farther off goes on with.
+
+    How well that can be foretold is seen farther off: where the table is patched, colours that differ are its own.
+    """
+    doubt = here & ~hole & (blind | _beside(hole | blind, rim))
+    proof = known & ~doubt & (ndimage.distance_transform_edt(~(hole | doubt)) <= rim)
+    table = inpaint(picture.rgb, hole | doubt | proof, known, seed, rounds=0)
+    lab = [cv2.cvtColor(_blurred(rgb, doubt | proof, WIDE * rim), cv2.COLOR_RGB2LAB) for rgb in (picture.rgb, table)]
+    differ = np.linalg.norm(lab[0] - lab[1], axis=2)
+    usual = _blurred(differ[..., None] ** 2, proof, 2 * rim)[..., 0] ** 0.5
+    dirt = doubt & (differ > np.maximum(OTHER, SURE * usual))
+    pieces, count = ndimage.label(hole | doubt)
+    share = ndimage.sum(dirt, pieces, range(count + 1)) / np.maximum(ndimage.sum(doubt, pieces, range(count + 1)), 1)
+    return dirt | (doubt & (share > DIRTY)[pieces])
+
+
+def _blurred(values: np.ndarray, where: Bool[np.ndarray, "h w"], sigma: float) -> np.ndarray:
+    """Means around each cell of the values where they count."""
     weight = where.astype(np.float32)
-    share = np.maximum(cv2.GaussianBlur(weight, (0, 0), BLUR), 1e-6)[..., None]
-    blurred = (cv2.GaussianBlur(rgb * weight[..., None], (0, 0), BLUR) / share for rgb in (one, two))
-    lab = [cv2.cvtColor(rgb.clip(0, 1), cv2.COLOR_RGB2LAB) for rgb in blurred]
-    return where & ndimage.binary_dilation(np.linalg.norm(lab[0] - lab[1], axis=2) > OTHER, iterations=2)
+    mean = cv2.GaussianBlur(values * weight[..., None], (0, 0), sigma).reshape(values.shape)
+    return mean / np.maximum(cv2.GaussianBlur(weight, (0, 0), sigma), 1e-6)[..., None]
+
+
+def _beside(hole: Bool[np.ndarray, "h w"], reach: float) -> Bool[np.ndarray, "h w"]:
+    """Cells within reach of a hole; of one narrower than that, a part of the table's own pattern, only those close."""
+    far = ndimage.distance_transform_edt(hole) < reach / 2
+    if far.all():
+        return ndimage.binary_dilation(hole, iterations=2)
+    return (ndimage.distance_transform_edt(far) <= 1.5 * reach) | ndimage.binary_dilation(hole, iterations=2)
+
+
+def _matt(table: Gaussians, sight: Sight) -> Gaussians:
+    """In the mean of the colours that the cameras see; those straight from above, where none is, would be a guess."""
+    if not sight.views:
+        return table
+    eyes = centres(torch.stack([viewmat for viewmat, *_ in sight.views]))
+    rgb = sum(evaluate_sh(table.sh, torch.nn.functional.normalize(table.means - eye, dim=1)) for eye in eyes)
+    return replace(table, sh=rgb_to_sh((rgb / len(eyes)).clamp(0, 1)))
 
 
 def _picture(table: Gaussians, things: Float[Tensor, "m 3"], support: Support) -> Picture | None:

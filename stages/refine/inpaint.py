@@ -23,10 +23,13 @@ LIGHTER = 0.1  # most that a place may be lighter than where its patches come fr
 SHALLOW = 4  # holes no deeper than this are filled at once, others from a coarser picture [cells]
 FEWEST = 1000  # patches to copy from that a coarser picture must have, so that all kinds of edges are among them
 LARGEST = 40_000  # patches to be found in the coarsest picture, however few there are to copy from
-SOURCES = 2000  # patches compared with every patch of the hole in the coarsest picture
+SOURCES = 8000  # patches compared with every patch of the hole in the coarsest picture
 MOST = 60_000  # patches that are still searched for in a finer one; more keep the coarser answer
-ENOUGH = 0.4  # share of a patch that is there to go by
-FIRST = 0.8  # share of the rim that waits for the rest of it, of more contrast
+SCARCE = 0.3  # patches to copy from for each to be found, at least
+FEW = 12_000  # patches to be found in all tries together
+TRIES = 8  # at the coarsest picture, of which the one whose patches agree best is taken
+ENOUGH = (0.25, 0.65)  # share of a patch that is there to go by, drawn for each try
+FIRST = (0.5, 0.95)  # share of the rim that waits for the rest of it, of more contrast
 ROUNDS = 3  # of search in every finer picture
 DOUBT = 0.7  # weight of a cell's colour in the hole, for each cell of depth
 Y, X = (d.ravel() for d in np.mgrid[-REACH : REACH + 1, -REACH : REACH + 1])
@@ -149,9 +152,9 @@ def _complete(
         if count < FEWEST and (not count or len(levels[-1].at) <= LARGEST):
             break
         levels.append(coarser)
-    if not levels[0].source.any() or not len(levels[-1].at):
-        return levels[0].image  # nothing to copy from: smooth colours alone
-    found = _searched(levels[-1], rng)
+    if levels[0].source.sum() <= SCARCE * len(levels[0].at):
+        return levels[0].image  # too little to copy from: smooth colours alone
+    found = _best(levels[-1], rng, TRIES)
     for level in levels[-2::-1]:
         found = _refined(level, found, rng, ROUNDS if level is not levels[0] else rounds)
     level = levels[0]
@@ -169,7 +172,20 @@ def _halved(image: np.ndarray, hole: np.ndarray, known: np.ndarray) -> tuple[np.
     return half.astype(np.float32), (four(hole) > 0) & ~most, most
 
 
-def _searched(level: _Level, rng: np.random.Generator, rounds: int = 4) -> Int[np.ndarray, "h w 2"]:
+def _best(level: _Level, rng: np.random.Generator, tries: int) -> Int[np.ndarray, "h w 2"]:
+    """The field of matches of the best of a few tries: where an edge comes out crooked, patches agree less."""
+    fields, costs, start = [], [], level.image.copy()
+    for _ in range(max(1, min(tries, FEW // len(level.at)))):
+        level.image[:] = start
+        fields.append(_searched(level, rng, rng.uniform(*ENOUGH), rng.uniform(*FIRST)))
+        match = fields[-1][tuple(level.at.T)]
+        costs.append(level.distances(level.patches(level.at), level.weights(level.at), match).mean())
+    return fields[int(np.argmin(costs))]
+
+
+def _searched(
+    level: _Level, rng: np.random.Generator, enough: float, wait: float, rounds: int = 4
+) -> Int[np.ndarray, "h w 2"]:
     """A match for every target among all sources, or many of them: from the rim inwards, then all together.
 
     Where most goes on at the rim it is carried on first: edges run on straight before what is even spreads over them.
@@ -180,10 +196,10 @@ def _searched(level: _Level, rng: np.random.Generator, rounds: int = 4) -> Int[n
     told, at = ~level.hole, level.at
     while len(at) and not told[level.hole].all():
         there = cv2.blur((told & (level.trust > 0)).astype(np.float32), (2 * REACH + 1, 2 * REACH + 1))
-        at = level.at[(there >= ENOUGH)[tuple(level.at.T)] & ~told[tuple(level.at.T)]]
+        at = level.at[(there >= enough)[tuple(level.at.T)] & ~told[tuple(level.at.T)]]
         if len(at):
             P, W = level.patches(at), level.weights(at, told)
-            first = _first(P, W)
+            first = _first(P, W, wait)
             at, P, W = at[first], P[first], W[first]
             match = sources[_nearest(P, W, Q)]
             told = told | level.vote(at, match, level.distances(P, W, match))
@@ -195,11 +211,11 @@ def _searched(level: _Level, rng: np.random.Generator, rounds: int = 4) -> Int[n
     return _field(level, match)
 
 
-def _first(P: Float[np.ndarray, "t p 3"], W: Float[np.ndarray, "t p"]) -> Bool[np.ndarray, "t"]:
+def _first(P: Float[np.ndarray, "t p 3"], W: Float[np.ndarray, "t p"], wait: float) -> Bool[np.ndarray, "t"]:
     """Which patches have the most contrast in what is known of them."""
     W = (W / W.sum(1, keepdims=True))[..., None]
     contrast = (W * np.square(P - (W * P).sum(1, keepdims=True))).sum((1, 2))
-    return contrast >= np.quantile(contrast, FIRST)
+    return contrast >= np.quantile(contrast, wait)
 
 
 def _nearest(P: Float[np.ndarray, "t p 3"], W: Float[np.ndarray, "t p"], Q: Float[np.ndarray, "s d"]) -> np.ndarray:

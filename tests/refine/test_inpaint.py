@@ -41,6 +41,23 @@ def test_a_chequered_cloth_goes_on(shade):
     assert psnr(filled(rgb, middle())[middle()], rgb[middle()]) > 27
 
 
+@pytest.mark.parametrize("slope", [-0.6, 0.3], ids=["falling", "rising"])
+def test_the_rims_of_two_mats_go_on_straight(slope):
+    """Across a wide round hole runs a strip of table between two woven mats: no mean of all three, and no bulge."""
+    side, colours = 160, np.float32([[0.85, 0.5, 0.45], [0.55, 0.4, 0.2], [0.35, 0.4, 0.45]])
+    y, x = np.mgrid[:side, :side] - side / 2
+    away = (y - slope * x) / np.hypot(1, slope)
+    which = (away > -10).astype(int) + (away > 10)
+    weave = 0.06 * np.sin(1.3 * x + 0.4 * y) * (which != 1)
+    grain = 0.02 * np.random.default_rng(0).standard_normal((side, side, 1))
+    rgb = (colours[which] + weave[..., None] + grain).astype(np.float32)
+    hole = np.hypot(y, x) < 36
+    out = filled(rgb, hole)
+    nearest = np.linalg.norm(out[..., None, :] - colours, axis=-1).argmin(-1)
+    assert (nearest != which)[hole].mean() < 0.02
+    assert psnr(out[hole], rgb[hole]) > 28
+
+
 def test_grain_stays_grainy():
     """Noise cannot be foretold, but its strength can: a smooth patch would be seen at once."""
     rgb = 0.5 + 0.1 * np.random.default_rng(0).standard_normal((SIDE, SIDE, 3)).astype(np.float32)

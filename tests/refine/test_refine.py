@@ -112,6 +112,21 @@ def test_where_a_large_remain_goes_the_table_is_whole(before):
     assert alpha > 0.95 and torch.allclose(colour, torch.tensor(WOOD), atol=0.08)
 
 
+def test_no_dark_rim_is_left_around_a_lifted_object(before):
+    """All around the block, where it stands, a contact shadow lies on the table, in plain sight of the cameras."""
+    g = before.gaussians
+    beside = (g.means[:, 0].abs() < SIDES[0] / 2 + 0.015) & (g.means[:, 1].abs() < SIDES[1] / 2 + 0.015)
+    shadow = beside & (g.object_id == 0) & (g.means[:, 2].abs() < 0.005)
+    assert int(shadow.sum()) > 30
+    dark = coloured(sheet(0.01, 0.01, 0.005), (0.15, 0.1, 0.08), 0).sh[:1, :1]
+    sh = torch.where(shadow[:, None, None] & (torch.arange(g.sh.shape[1]) == 0)[None, :, None], dark, g.sh)
+    scene = replace(before, gaussians=replace(g, sh=sh))
+    eye, target = (0.1085, 0.001, 1.0), (0.1075, 0.0, 0.0)
+    assert float(seen(scene, eye, 0, target)[0].mean()) < 0.3
+    rgb, alpha = seen(refine(scene, RefineOptions(completer="none")), eye, 0, target)
+    assert alpha > 0.9 and torch.allclose(rgb, torch.tensor(WOOD), atol=0.08)
+
+
 def test_the_table_ends_where_it_ended():
     """In the corner of an L-shaped table a block stands at the edge; past it cameras see the floor."""
     top = table()

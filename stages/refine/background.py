@@ -28,10 +28,10 @@ CELLS = 40_000  # under things, about
 AROUND = 0.2  # of the table around all things that is in the picture, to see how its edges go on [view radii]
 MARGIN = 0.06  # around what is under an object [view radii]
 RIM = 0.04  # beside a hole, where a contact shadow is [view radii]
+WIDE = 0.25  # standard deviation at which colours are compared there [of the rim]
+SURE = 2.0  # times what is usual that they must differ
+DIRTY = 0.25  # share of dirt beside a hole from which nothing there is trusted
 SHARPER = 0.7  # share of what a patch blurs that is added to its colour
-SURE = 2.0  # times what is usual that colours differ
-DIRTY = 0.25  # share of dirt from which nothing close to an object is trusted
-WIDE = 0.25  # standard deviation at which colours are compared [of the rim]
 FEW = 0.25  # share of the cameras that look at a place, below which the table there counts as not seen
 GRAZING = 0.03  # depth that a pixel of table spans at a flat angle [view radii]
 GAP = 0.03  # places that cameras see through are narrower where the reconstruction is at fault [view radii]
@@ -104,11 +104,15 @@ def fill(scene: Scene, sight: Sight, support: Support, seed: int = 0) -> Scene:
     left = _drawn(g[flat & ~gone], picture.corner, picture.cell, picture.top, picture.alpha.shape)
     new = hole | (near & covered & (left.alpha < COVERED))
     new &= ~_each(new & (picture.dent > 0), picture, support, lambda points: sight.empty(points, 2 * picture.cell))
-    points = picture.on(support, new)
+    return replace(scene, gaussians=concatenate([g[~gone], _laid(picture, support, new, colour)]))
+
+
+def _laid(picture: Picture, support: Support, cells: np.ndarray, colour: np.ndarray) -> Gaussians:
+    """Patches in some of the cells, of colours that undo how they blur each other."""
+    points = picture.on(support, cells)
     up = torch.tensor([[0.0, 0, 1]]).expand(len(points), 3)
-    sharp = colour + SHARPER * (colour - cv2.GaussianBlur(colour, (0, 0), ACROSS))  # what patches blur is undone
-    more = patches(points, up, torch.from_numpy(sharp[new]), picture.cell, 0)
-    return replace(scene, gaussians=concatenate([g[~gone], more]))
+    sharp = colour + SHARPER * (colour - cv2.GaussianBlur(colour, (0, 0), ACROSS))
+    return patches(points, up, torch.from_numpy(sharp[cells]), picture.cell, 0)
 
 
 def _each(

@@ -154,7 +154,7 @@ def _complete(
         levels.append(coarser)
     if levels[0].source.sum() <= SCARCE * len(levels[0].at):
         return levels[0].image  # too little to copy from: smooth colours alone
-    found = _best(levels[-1], rng, TRIES)
+    found = _best(levels[-1], rng)
     for level in levels[-2::-1]:
         found = _refined(level, found, rng, ROUNDS if level is not levels[0] else rounds)
     level = levels[0]
@@ -172,10 +172,10 @@ def _halved(image: np.ndarray, hole: np.ndarray, known: np.ndarray) -> tuple[np.
     return half.astype(np.float32), (four(hole) > 0) & ~most, most
 
 
-def _best(level: _Level, rng: np.random.Generator, tries: int) -> Int[np.ndarray, "h w 2"]:
+def _best(level: _Level, rng: np.random.Generator) -> Int[np.ndarray, "h w 2"]:
     """The field of matches of the best of a few tries: where an edge comes out crooked, patches agree less."""
     fields, costs, start = [], [], level.image.copy()
-    for _ in range(max(1, min(tries, FEW // len(level.at)))):
+    for _ in range(max(1, min(TRIES, FEW // len(level.at)))):
         level.image[:] = start
         fields.append(_searched(level, rng, rng.uniform(*ENOUGH), rng.uniform(*FIRST)))
         match = fields[-1][tuple(level.at.T)]

@@ -8,6 +8,7 @@ import torch
 
 from stages.errors import InputError
 from stages.geometry.cameras import centres, intrinsics, look_at
+from stages.geometry.harmonics import rgb_to_sh
 from stages.geometry.neighbours import knn
 from stages.geometry.rotations import matrix
 from stages.geometry.similarity import Similarity
@@ -118,9 +119,8 @@ def test_no_dark_rim_is_left_around_a_lifted_object(before):
     beside = (g.means[:, 0].abs() < SIDES[0] / 2 + 0.015) & (g.means[:, 1].abs() < SIDES[1] / 2 + 0.015)
     shadow = beside & (g.object_id == 0) & (g.means[:, 2].abs() < 0.005)
     assert int(shadow.sum()) > 30
-    dark = coloured(sheet(0.01, 0.01, 0.005), (0.15, 0.1, 0.08), 0).sh[:1, :1]
-    sh = torch.where(shadow[:, None, None] & (torch.arange(g.sh.shape[1]) == 0)[None, :, None], dark, g.sh)
-    scene = replace(before, gaussians=replace(g, sh=sh))
+    dark = replace(g[shadow], sh=rgb_to_sh(torch.tensor([[0.15, 0.1, 0.08]])).expand(int(shadow.sum()), 1, 3))
+    scene = replace(before, gaussians=concatenate([g[~shadow], dark]))
     eye, target = (0.1085, 0.001, 1.0), (0.1075, 0.0, 0.0)
     assert float(seen(scene, eye, 0, target)[0].mean()) < 0.3
     rgb, alpha = seen(refine(scene, RefineOptions(completer="none")), eye, 0, target)

@@ -33,6 +33,8 @@ FASTEST, WILDEST = 8.0, 60.0  # speed [m/s] and spin [rad/s] are kept below
 HOLD = 0.07  # strongest grip of the floor [m/s]
 BRISK = 0.3  # speed from which it does not matter whether it lasts, to that grip [m/s]
 RIGID = 3.2e5  # E size / mass of the stiffest objects learned from [1/s^2]; what is stiffer bends less by the ratio
+SPRING = 4.0  # a solid ball's slowest swing, squared, over E size / mass: about as MPM has it
+SPRINGIEST = 1e4  # of such springs, so that explicit steps of a frame are stable [1/s^2]
 FIRMEST = 3e4  # the same of the stiffest that is round, the duck: to what is solid, that ratio begins there
 
 
@@ -99,7 +101,10 @@ class ForceField(Dynamics):
         if self.stress is None:
             none = torch.zeros_like(yields)
             return Scene(shape, code, none, none, yields)
-        return Scene(shape, code, *self.stress.springs(code), yields)
+        stiffness, damping = self.stress.springs(code)
+        # what is hollow crumples, as in the published data; what is solid takes its shape again
+        elastic = (SPRING * w.E / unit).clamp_max(SPRINGIEST) * (1 - 1 / w.solidity)
+        return Scene(shape, code, stiffness + elastic, damping, yields)
 
     def _encode(self, shape: Shape, E: Float[Tensor, "b o"]) -> Float[Tensor, "b o h"]:
         """From numbers that no rotation changes: points in any order, and the material."""

@@ -6,6 +6,7 @@ import torch
 from stages.geometry.rotations import matrix
 from stages.models.force_field import FIRMEST, RIGID, ForceField
 from stages.models.solid import WALL, sides, solidity
+from stages.models.weights import HERE, find, load
 from stages.models.world import World
 
 
@@ -47,3 +48,26 @@ def test_a_solid_body_is_heard_of_as_a_stiffer_one_and_beyond_what_was_learned_y
     assert heard == pytest.approx(5 * FIRMEST * unit, rel=1e-4) and yields == pytest.approx(0.5, rel=1e-4)
     heard, yields, unit = encoded(7e10, 1.0)
     assert heard == pytest.approx(RIGID * unit, rel=1e-4) and heard / yields == pytest.approx(7e10, rel=1e-4)
+
+
+def dropped(solidity, method="step", E=3e4):
+    """Height of a soft ball in every frame of a fall from 0.3 m, over that at the start."""
+    p = torch.nn.functional.normalize(torch.randn(1, 1, 200, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
+    points = 0.25 * p + torch.tensor([0.0, 0.0, 0.3 + 0.25 - 0.94])
+    world = World.of(points, E=torch.tensor(E), mass=torch.tensor(8.0), solidity=torch.tensor(solidity))
+    with torch.inference_mode():
+        z = load(find("ngff", HERE))[0].rollout(world, 40, method=method)[0, :, 0, :, 2]
+    height = z.amax(1) - z.amin(1)
+    return height / height[0]
+
+
+def test_a_solid_ball_is_squashed_as_it_lands_and_takes_its_shape_again():
+    """MPM, with 0.0133 m between particles and the scheme of the published data: 14 % at most, 0 % after that."""
+    solid, hollow = dropped(38.0), dropped(1.0)
+    assert 0.75 < solid.min() < 0.95 and solid[30:35].min() > 0.98
+    assert hollow[30:35].max() < 0.9
+
+
+def test_springs_of_the_stiffest_solid_body_are_stable_in_explicit_steps():
+    height = dropped(1e3, "rk4", E=1e10)
+    assert height.isfinite().all() and (height - 1).abs().max() < 0.1

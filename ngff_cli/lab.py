@@ -170,7 +170,7 @@ def train(
         float, typer.Option(help="errors of speeds count as of places so much later [s]; 0: they do not")
     ] = 0.0,
     memory: Annotated[float, typer.Option(help="share of a gradient that goes back by another frame")] = 0.9,
-    groups: Annotated[str, typer.Option(help="of scenes; the last 100 choose the best weights")] = "3_0..3_8",
+    groups: Annotated[str, typer.Option(help="also varied, solid, turned; the last 100 scenes choose")] = "3_0..3_8",
     compiled: Annotated[bool, typer.Option("--compiled", help="compile a step first; for GPUs")] = False,
     seed: Seed = 0,
     device: Device = "auto",

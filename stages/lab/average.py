@@ -6,6 +6,7 @@ zero-shot models". Trainings must have begun with the same weights, or one with 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -14,7 +15,8 @@ import torch
 from stages.errors import InputError
 from stages.models.weights import load, save
 
-APART = ("model", "config", "before", "data")  # of a card, what need not be said twice
+APART = {"model", "config", "before", "data"}  # of a card, what need not be said twice
+SAID = {"sha256", "note", "validation", "averaged"}  # what of it is not true of a mean
 
 
 @torch.no_grad()
@@ -24,24 +26,25 @@ def run(files: Sequence[Path], given: str, out: Path, half: bool = False) -> str
     Raises InputError for shares that make no mean, and weights of unlike models.
     """
     shares = _numbers(given)
-    if len(files) != len(shares) or len(files) < 2 or min(shares) < 0 or abs(sum(shares) - 1) > 1e-6:
+    if len(files) != len(shares) or len(files) < 2 or min(shares) < 0 or not math.isclose(sum(shares), 1):
         raise InputError(f"--shares {given}: takes a number for each of at least two files; they add up to 1, such as "
                          "0.7,0.3")  # fmt: skip
     models, cards = zip(*(load(file) for file in files), strict=True)
     for file, card in zip(files[1:], cards[1:], strict=True):
-        if (card["model"], card["config"]) != (cards[0]["model"], cards[0]["config"]):
-            raise InputError(f"{file}: holds {card['model']} {card['config']} and {files[0]} {cards[0]['model']} "
-                             f"{cards[0]['config']}; only weights of one model have a mean")  # fmt: skip
+        kinds = [f"{c['model']} {c.get('config')}" for c in (cards[0], card)]
+        if kinds[0] != kinds[1]:
+            raise InputError(f"{file}: holds {kinds[1]} and {files[0]} {kinds[0]}; only weights of one model have a "
+                             "mean")  # fmt: skip
     mean = models[0]
     for parts in zip(*(m.parameters() for m in models), strict=True):
         parts[0].copy_(sum(share * p for share, p in zip(shares, parts, strict=True)))
     known = _ancestors(cards[0])
-    averaged = [{"share": s, **(_brief(c) if c["sha256"] not in known else {"sha256": c["sha256"]})}
-                for s, c in zip(shares, cards, strict=True)]  # fmt: skip
-    first = {k: v for k, v in cards[0].items() if k not in ("sha256", "note")}
+    told = [SAID if c["sha256"] in known else c.keys() - APART for c in cards]
+    averaged = [{"share": s, **{k: v for k, v in c.items() if k in keys}}
+                for s, c, keys in zip(shares, cards, told, strict=True)]  # fmt: skip
+    first = {k: v for k, v in cards[0].items() if k not in SAID}
     save(Path(out), cards[0]["model"], mean, {**first, "averaged": averaged}, half=half)
-    told = ", ".join(f"{s:g} of {file}" for s, file in zip(shares, files, strict=True))
-    return f"{out}: {told}"
+    return f"{out}: " + ", ".join(f"{s:g} of {file}" for s, file in zip(shares, files, strict=True))
 
 
 def _numbers(given: str) -> list[float]:
@@ -52,9 +55,6 @@ def _numbers(given: str) -> list[float]:
 
 
 def _ancestors(card: dict) -> set[str]:
-    """Of the weights themselves, and of all that they began with."""
-    return {card["sha256"], *(_ancestors(card["before"]) if "before" in card else ())}
-
-
-def _brief(card: dict) -> dict:
-    return {k: v for k, v in card.items() if k not in APART}
+    """Of the weights themselves, and of all that they began with or are a mean of."""
+    more = [*card.get("averaged", ()), *([card["before"]] if "before" in card else ())]
+    return {card["sha256"]}.union(*map(_ancestors, more))

@@ -1,7 +1,8 @@
 """Scenes of the data set through time, many at once: physics as published.
 
 Fixed corotated bodies, transfer damping 0.9, walls that keep 0.9 of the tangential speed every substep of 1e-4 s,
-gravity 5 m/s^2, frames of 0.02 s; Gaussians of the surface are the particles, and bodies are hollow.
+gravity 5 m/s^2, frames of 0.02 s; Gaussians of the surface are the particles, and bodies are hollow, but for those
+of the group `solid`.
 """
 
 from __future__ import annotations

@@ -143,7 +143,7 @@ def assets(
     table: Mapping[str, Kind], fineness: Fineness, least: int, kept: Path | None = None, solid: bool = False
 ) -> dict[int, Asset]:
     """Objects by id; `kept` is a file (.npz) to read their particles from, or to write them to."""
-    key = f"spacing {fineness.spacing} least {least}"
+    key = f"spacing {fineness.spacing} least {least}" + f" dx {fineness.dx}" * solid
     points = _read(kept, key, table) if kept is not None and kept.exists() else None
     if points is None:
         bar = tqdm(table.items(), desc="objects", unit="object")

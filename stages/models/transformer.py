@@ -44,7 +44,7 @@ def features(world: World, state: PointState) -> Float[Tensor, "b o n 29"]:
     low, high = world.box[..., None, 0, :], world.box[..., None, 1, :]
     height = x[..., 2:] - low[..., 2:]
     walls = (torch.cat([x - low, high - x], -1) / NEAR).clamp(-1, 1)
-    material = torch.stack([world.E.log10() - 5, world.nu, world.friction, world.mass.log()], -1)
+    material = torch.stack([(world.E * world.solidity).log10() - 5, world.nu, world.friction, world.mass.log()], -1)
     told = torch.cat([com - middle, drift, material, (world.gravity / 5)[:, None].expand_as(com)], -1)
     told = told[:, :, None].expand(*x.shape[:3], -1)
     return torch.cat([x - com[:, :, None], offsets(world, world.points), v, height, walls, told], -1)
@@ -53,7 +53,9 @@ def features(world: World, state: PointState) -> Float[Tensor, "b o n 29"]:
 class Transformer(PointDynamics):
     """`transformer`: half of the layers look within objects, half across the scene."""
 
-    told = frozenset({"points", "share", "mass", "E", "nu", "friction", "velocity", "spin", "gravity", "box"})
+    told = frozenset({
+        "points", "share", "mass", "E", "solidity", "nu", "friction", "velocity", "spin", "gravity", "box"
+    })  # fmt: skip
 
     def __init__(self, hidden: int = 128, layers: int = 4, heads: int = 4):
         super().__init__()

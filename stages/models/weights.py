@@ -73,8 +73,12 @@ def halve(path: Path) -> None:
 def minutes(card: Mapping) -> float:
     """Of one processor's training, that of the weights it began with, or was averaged with, included."""
     own = float(card["minutes"]) * card.get("processes", 1)
-    others = [c for c in card.get("averaged", ()) if "minutes" in c]
-    return own + (minutes(card["before"]) if "before" in card else 0.0) + sum(map(minutes, others))
+    return own + (minutes(card["before"]) if "before" in card else 0.0) + _others(card)
+
+
+def _others(card: Mapping) -> float:
+    """Minutes of those that it was averaged with; of those in its own line, which count already, the others' only."""
+    return sum((minutes(c) if "minutes" in c else _others(c) for c in card.get("averaged", ())), 0.0)
 
 
 def write_card(path: Path, card: Mapping) -> None:

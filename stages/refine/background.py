@@ -96,11 +96,15 @@ def fill(scene: Scene, sight: Sight, support: Support, seed: int = 0) -> Scene:
     hole = near & ~covered & (under | hidden)
     width = 2 * support.tolerance + picture.cell
     empty = _each(hole | seen, picture, support, lambda points: sight.empty(points, width))
-    known = seen & ~hole & ~hidden & ~empty
+    known = seen & ~hole & ~empty
+    known &= ~hidden if bool((known & ~hidden).any()) else ~blind  # without cameras all of it is hidden
+    if not known.any():  # nothing to go on with
+        return scene
     hole &= ~ndimage.binary_opening(empty & hole, iterations=max(1, round(GAP * R / picture.cell / 2)))
     hole |= _dirt(picture, hole, seen & near, known, blind, RIM * R / picture.cell, seed)
     colour = inpaint(picture.rgb, hole, known, seed)
-    gone = flat & torch.from_numpy(hole[picture.rows_columns(g.means)])
+    gone = flat.clone()
+    gone[flat] = torch.from_numpy(hole[picture.rows_columns(g.means[flat])])
     left = _drawn(g[flat & ~gone], picture.corner, picture.cell, picture.top, picture.alpha.shape)
     new = hole | (near & covered & (left.alpha < COVERED))
     new &= ~_each(new & (picture.dent > 0), picture, support, lambda points: sight.empty(points, 2 * picture.cell))
@@ -111,7 +115,7 @@ def _laid(picture: Picture, support: Support, cells: np.ndarray, colour: np.ndar
     """Patches in some of the cells, of colours that undo how they blur each other."""
     points = picture.on(support, cells)
     up = torch.tensor([[0.0, 0, 1]]).expand(len(points), 3)
-    sharp = colour + SHARPER * (colour - cv2.GaussianBlur(colour, (0, 0), ACROSS))
+    sharp = colour + SHARPER * (colour - _blurred(colour, cells | (picture.alpha >= SEEN), ACROSS))
     return patches(points, up, torch.from_numpy(sharp[cells]), picture.cell, 0)
 
 

@@ -60,7 +60,7 @@ def _membrane(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
     Source: Gortler et al. 1996, "The lumigraph", push and pull.
     """
     height, width = weight.shape
-    if min(height, width) < 2 or (weight > 0).all():
+    if max(height, width) < 2 or (weight > 0).all():
         return values / np.maximum(weight, 1e-6)[..., None]
     half = ((width + 1) // 2, (height + 1) // 2)
     sums = cv2.resize(weight[..., None] * values, half, interpolation=cv2.INTER_AREA)
@@ -174,13 +174,16 @@ def _halved(image: np.ndarray, hole: np.ndarray, known: np.ndarray) -> tuple[np.
 
 def _best(level: _Level, rng: np.random.Generator) -> Int[np.ndarray, "h w 2"]:
     """The field of matches of the best of a few tries: where an edge comes out crooked, patches agree less."""
-    fields, costs, start = [], [], level.image.copy()
+    fields, costs, images, start = [], [], [], level.image.copy()
     for _ in range(max(1, min(TRIES, FEW // len(level.at)))):
         level.image[:] = start
         fields.append(_searched(level, rng, rng.uniform(*ENOUGH), rng.uniform(*FIRST)))
         match = fields[-1][tuple(level.at.T)]
         costs.append(level.distances(level.patches(level.at), level.weights(level.at), match).mean())
-    return fields[int(np.argmin(costs))]
+        images.append(level.image.copy())
+    best = int(np.argmin(costs))
+    level.image[:] = images[best]
+    return fields[best]
 
 
 def _searched(

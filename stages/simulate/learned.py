@@ -176,8 +176,8 @@ def _known_stiffness(o: SceneObject, E: float, solidity: float) -> float:
     """Young's modulus [Pa], or what makes the body as soft as the softest in training if it is softer."""
     known = max(E, SOFTEST / solidity)
     if known / 2 > E:
-        log.warning("object %d (%s): %.2g Pa (at this size) is softer than the %.2g Pa of training, and taken as that; "
-                    "compare with --engine mpm", o.id, o.name, E, known)  # fmt: skip
+        log.warning("object %d (%s): %.2g Pa (at this size) is softer than what is as thick in training, and taken as "
+                    "%.2g Pa; compare with --engine mpm", o.id, o.name, E, known)  # fmt: skip
     return known
 
 

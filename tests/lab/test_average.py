@@ -35,6 +35,15 @@ def test_the_mean_is_that_of_the_numbers_and_the_card_says_of_what(tmp_path):
     assert minutes(card) == 3 * 2.0 * 3  # what both began with is counted once
 
 
+def test_an_average_of_averages_remembers_all_of_them(tmp_path):
+    a, b, c = (trained(tmp_path / f"{n}.safetensors", i) for i, n in enumerate("abc"))
+    run([a, b], "0.5,0.5", tmp_path / "ab.safetensors")
+    run([tmp_path / "ab.safetensors", c], "0.8,0.2", tmp_path / "abc.safetensors")
+    assert minutes(load(tmp_path / "abc.safetensors")[1]) == 3 * 2.0 * 3
+    run([a, a], "0.8,0.2", tmp_path / "aa.safetensors")
+    assert minutes(load(tmp_path / "aa.safetensors")[1]) == 3 * 2.0
+
+
 def test_half_as_large_to_ship(tmp_path):
     a, b = trained(tmp_path / "a.safetensors", 1), trained(tmp_path / "b.safetensors", 2)
     for half in (False, True):
@@ -43,7 +52,7 @@ def test_half_as_large_to_ship(tmp_path):
     assert small < 0.8 * whole
 
 
-@pytest.mark.parametrize("shares", ["0.5", "0.5,0.6", "1.5,-0.5", "half,half", "0.4,0.3,0.3"])
+@pytest.mark.parametrize("shares", ["0.5", "0.5,0.6", "1.5,-0.5", "half,half", "nan,nan", "0.4,0.3,0.3"])
 def test_shares_that_make_no_mean(shares, tmp_path):
     a, b = trained(tmp_path / "a.safetensors", 1), trained(tmp_path / "b.safetensors", 2)
     with pytest.raises(InputError, match="--shares"):

@@ -127,6 +127,12 @@ def test_no_dark_rim_is_left_around_a_lifted_object(before):
     assert alpha > 0.9 and torch.allclose(rgb, torch.tensor(WOOD), atol=0.08)
 
 
+def test_without_cameras_the_table_is_filled_in_its_own_colours():
+    scene = refine(replace(photographed(), cameras=None), RefineOptions(completer="none"))
+    rgb, alpha = seen(scene, (0.001, 0.001, 1.0), 0)
+    assert alpha > 0.9 and torch.allclose(rgb, torch.tensor(WOOD), atol=0.08)
+
+
 def test_the_table_ends_where_it_ended():
     """In the corner of an L-shaped table a block stands at the edge; past it cameras see the floor."""
     top = table()

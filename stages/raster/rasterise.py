@@ -6,6 +6,7 @@ a transmittance of 1e-4. Gradients reach means, quats, scales, opacities, sh and
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -27,7 +28,7 @@ class Rendering:
     alpha: Float[Tensor, "c h w"]
     depth: Float[Tensor, "c h w"]  # along the viewing axis [m], mean over what is seen; 0 where nothing is
     extents: Float[Tensor, "c n 2"]  # half width and height on the image [px]; 0: not in view
-    pulls: tuple[list[Tensor], ...]  # one a camera, filled by backward()
+    pulls: tuple[Callable[[], list[Tensor]], ...]  # one a camera; known after backward()
 
     @property
     def visible(self) -> Bool[Tensor, "c n"]:
@@ -36,7 +37,7 @@ class Rendering:
     @property
     def absgrad(self) -> Float[Tensor, "c n 2"]:
         """After backward(), for every Gaussian the sum over pixels of |dL / d centre on the image| [1/px]."""
-        return _stack([sum(pull, torch.zeros_like(self.extents[0])) for pull in self.pulls])
+        return _stack([sum(pull(), torch.zeros_like(self.extents[0])) for pull in self.pulls])
 
 
 def rasterise(
@@ -105,7 +106,7 @@ def _draw(g: Gaussians, viewmat: Tensor, K: Tensor, width: int, height: int, bac
     if splats.requires_grad:
         splats.register_hook(lambda grad: pull.append(grad[:, 10:12]))
     rgb, depth, alpha = blend(splats, bins, None if background is None else background.detach(), mean=True)
-    return rgb, alpha, depth, splats.detach()[:, 11:13], pull
+    return rgb, alpha, depth, splats.detach()[:, 11:13], lambda: pull
 
 
 def _features(g: Gaussians, features: Tensor, viewmat: Tensor, K: Tensor, width: int, height: int, near: float):
@@ -133,13 +134,15 @@ def _draw_cuda(
         g.means, g.quats, g.scales, g.opacities, g.sh, *_camera(g, viewmat, K), width, height, near_plane=near,
         sh_degree=degree_of(g.sh.shape[1]), packed=False, render_mode="RGB+ED", absgrad=True,
     )  # fmt: skip
-    pull, centres = [], info["means2d"]
-    if centres.requires_grad:
-        centres.register_hook(lambda _: pull.append(centres.absgrad[0]))
+    centres = info["means2d"]
     rgb, alpha = image[0, ..., :3], alpha[0, ..., 0]
     if background is not None:
         rgb = rgb + (1 - alpha)[..., None] * background.detach().to(rgb)
-    return rgb, alpha, image[0, ..., 3], info["radii"][0].float(), pull
+
+    def pulls() -> list[Tensor]:  # asked for, not hooked: a hook on what it holds would keep all of a step for ever
+        return [centres.absgrad[0]] if hasattr(centres, "absgrad") else []
+
+    return rgb, alpha, image[0, ..., 3], info["radii"][0].float(), pulls
 
 
 def _features_cuda(g: Gaussians, features: Tensor, viewmat: Tensor, K: Tensor, width: int, height: int, near: float):

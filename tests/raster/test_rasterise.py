@@ -1,6 +1,8 @@
 """The one interface: by hand, against the reference, and the same on every device."""
 
+import gc
 import sys
+import weakref
 from dataclasses import replace
 
 import pytest
@@ -226,6 +228,25 @@ def test_absolute_gradient_arrives_with_backward(device):
     shot.rgb.square().sum().backward()
     assert shot.absgrad.shape == (2, 50, 2) and (shot.absgrad[shot.visible] > 0).any()
     assert (shot.absgrad[~shot.visible] == 0).all()
+
+
+@pytest.mark.parametrize("device", devices)
+def test_nothing_of_a_step_is_kept_after_it(device):
+    """Otherwise a fit of thousands of steps fills the memory."""
+    gaussians, cameras = random_gaussians(50).to(device), ring(1, size=48)
+    tensors = leaves(gaussians)
+    gc.disable()  # which would find circles of Python's own, sooner or later
+    try:
+        moved = tensors[0] + 1e-3
+        mark = moved.grad_fn.metadata["mark"] = set()
+        kept = weakref.ref(mark)
+        shot = rasterise(Gaussians(moved, *tensors[1:], gaussians.object_id), cameras.viewmats, cameras.Ks, 48, 48)
+        shot.rgb.square().sum().backward()
+        assert kept() is not None
+        del mark, moved, shot
+        assert kept() is None
+    finally:
+        gc.enable()
 
 
 def test_the_same_again_is_the_same():

@@ -143,8 +143,8 @@ def _said(
 @triton.jit
 def answer(
     record, count, point, pairs, planes, told, message, weight, scale, felt, parts, o, n, wide, narrow, slots,
-    STRENGTH: tl.constexpr, CLOSE: tl.constexpr, LEVER: tl.constexpr, ROWS: tl.constexpr, H: tl.constexpr,
-    PRECISION: tl.constexpr,
+    STRENGTH: tl.constexpr, LEAVING: tl.constexpr, CLOSE: tl.constexpr, LEVER: tl.constexpr, ROWS: tl.constexpr,
+    H: tl.constexpr, PRECISION: tl.constexpr,
 ):  # fmt: skip
     """Acceleration by each place at its point; force and torque of a block, for contacts of pairs for unit mass."""
     i, m, slot = tl.program_id(0), o - 1, tl.program_id(1) * ROWS
@@ -164,9 +164,11 @@ def answer(
             a = _said(seen_by, there, planes, told + row * H, message + at * H, w, 8, STRENGTH, ROWS, H, PRECISION)
             inward, arm = load3(seen_by + r, WIDE * ROWS, there), load3(seen_by + 3 * ROWS + r, WIDE * ROWS, there)
             arm = scaled(LEVER, arm)
+            leaving = dot(load3(seen_by + 2 * ROWS + r, WIDE * ROWS, there), inward)
             along, unit = dot(a, inward), tl.maximum(w, 1e-9)
             x = along / unit
             push = unit * (tl.maximum(x, 0.0) + tl.log(1 + tl.exp(-tl.abs(x))))  # floor and walls do not pull
+            push = push / (1 + tl.maximum(leaving, 0.0) / LEAVING)
             a = add(a, scaled(push - along, inward))
         mine = tl.load(point + at + r, mask=there, other=0)
         store3(felt + row * 3 * n + mine, n, a, there)

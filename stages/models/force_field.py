@@ -30,6 +30,7 @@ from stages.models.world import World, centre, inertia
 SINK = 0.03  # deepest that a point may get into the floor or a wall [m]
 RISE = 1.0  # fastest that a body is pushed out from deeper [m/s]
 FASTEST, WILDEST = 8.0, 60.0  # speed [m/s] and spin [rad/s] are kept below
+LEAVING = 0.5  # speed at which floor and walls push half as hard what leaves them [m/s]
 HOLD = 0.07  # strongest grip of the floor [m/s]
 BRISK = 0.3  # speed from which it does not matter whether it lasts, to that grip [m/s]
 RIGID = 3.2e5  # E size / mass of the stiffest objects learned from [1/s^2]; what is stiffer bends less by the ratio
@@ -321,7 +322,12 @@ def _shares(world: World, places: Places) -> Float[Tensor, "b o m n"]:
 def _pushed(
     a: Float[Tensor, "b o 1 n 3"], places: Places, weight: Float[Tensor, "b o 1 n"]
 ) -> Float[Tensor, "b o 1 n 3"]:
-    """Floor and walls push, and do not pull."""
+    """Floor and walls push, and do not pull; what leaves them they push less than what comes.
+
+    Like the damping of Hunt and Crossley (1975), which grows with the push, this takes energy from every bounce: else
+    a body in an odd pose may hop on for ever.
+    """
     normal, unit = places.vectors[..., 0, :], weight[..., None].clamp_min(1e-9)
-    along = (a * normal).sum(-1, keepdim=True)
-    return a + (unit * softplus(along / unit) - along) * normal
+    along, leaving = ((x * normal).sum(-1, keepdim=True) for x in (a, places.vectors[..., 2, :]))
+    push = unit * softplus(along / unit) / (1 + leaving.clamp_min(0) / LEAVING)
+    return a + (push - along) * normal

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from stages.kernels import bodies, kicks, meeting, places, straining, thin, touching
 from stages.models import places as near
 from stages.models.dynamics import FRAME
-from stages.models.force_field import BRISK, FASTEST, HOLD, RISE, SINK, WILDEST, BodyState, ForceField, Scene
+from stages.models.force_field import BRISK, FASTEST, HOLD, LEAVING, RISE, SINK, WILDEST, BodyState, ForceField, Scene
 from stages.models.pushes import Pushes
 from stages.models.stress import FARTHEST, HARDEST, HEAVIEST
 from stages.models.touch import GRIP, STRENGTH
@@ -158,7 +158,7 @@ class _Step:
         mouths = (_layers(net.say[0], net.say[2]) for net in (pair, plane))
         touching.answer[(self.objects, self.places)](
             record, count, point, *mouths, told, message, weight, scale, felt, parts, *self.lists, STRENGTH=STRENGTH,
-            CLOSE=near.CLOSE, LEVER=near.LEVER, **self.network,
+            LEAVING=LEAVING, CLOSE=near.CLOSE, LEVER=near.LEVER, **self.network,
         )  # fmt: skip
         return known, parts, grip, scale
 

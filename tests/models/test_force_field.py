@@ -7,10 +7,11 @@ import pytest
 import torch
 
 from stages.geometry.rotations import matrix
-from stages.models.force_field import RIGID, SINK, ForceField, Rates
+from stages.models.force_field import LEAVING, RIGID, SINK, ForceField, Rates, _pushed
 from stages.models.pushes import Pushes
 from stages.models.shape import shape_of
 from stages.models.stress import projected
+from stages.models.touch import Places
 from stages.models.world import BOX, World, centre
 from tests.models.worlds import crowd, push
 
@@ -223,6 +224,21 @@ def test_nothing_stays_in_the_floor_or_a_wall(depth):
 
 
 @torch.no_grad()
+def test_the_floor_gives_back_less_than_it_takes():
+    """Of what it pushes what comes, nothing to what could be pulled, and half to what leaves at LEAVING."""
+    up, a = torch.tensor([0.0, 0, 1]), torch.tensor([[3.0, 1, 5], [3.0, 1, -50], [0, 0, 0.5]])[None, None, None]
+    weight = torch.full((1, 1, 1, 3), 0.1)
+
+    def felt(speed):
+        vectors = torch.stack([up, torch.zeros(3), torch.tensor(speed)]).expand(1, 1, 1, 3, 3, 3)
+        return _pushed(a, Places(vectors, weight[..., None], weight, torch.arange(3)[None, None, None]), weight)
+
+    comes, rests, leaves = felt([0.5, 0, -2.0]), felt([0.0, 0, 0]), felt([0.5, 0, LEAVING])
+    assert torch.equal(comes, rests) and (rests[..., 2] >= 0).all()
+    torch.testing.assert_close(leaves[..., 2], rests[..., 2] / 2)
+    assert torch.equal(leaves[..., :2], a[..., :2])  # along the floor it is left to the network
+
+
 def test_a_thousand_steps_stay_finite_and_whole():
     world = crowd(1, 2, 10)
     out = loud(4).rollout(world, 1000)

@@ -87,6 +87,23 @@ def fill(scene: Scene, sight: Sight, support: Support, seed: int = 0) -> Scene:
     picture = _picture(_matt(g[flat], sight), things, support) if int(flat.sum()) >= 50 and len(things) else None
     if picture is None:
         return scene
+    hole, near, known = _missing(picture, things, support, sight, seed)
+    if not known.any():  # nothing to go on with
+        return scene
+    colour = inpaint(picture.rgb, hole, known, seed)
+    gone = flat.clone()
+    gone[flat] = torch.from_numpy(hole[picture.rows_columns(g.means[flat])])
+    left = _drawn(g[flat & ~gone], picture.corner, picture.cell, picture.top, picture.alpha.shape)
+    new = hole | (near & (picture.alpha >= COVERED) & (left.alpha < COVERED))
+    new &= ~_each(new & (picture.dent > 0), picture, support, lambda points: sight.empty(points, 2 * picture.cell))
+    return replace(scene, gaussians=concatenate([g[~gone], _laid(picture, support, new, colour)]))
+
+
+def _missing(
+    picture: Picture, things: Float[Tensor, "m 3"], support: Support, sight: Sight, seed: int
+) -> tuple[Bool[np.ndarray, "h w"], Bool[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
+    """Cells to fill, those under and close to things, and those that tell how the table goes on."""
+    R = support.view.radius
     under = _under(things, support, picture)
     near = ndimage.distance_transform_edt(~under) <= MARGIN * R / picture.cell
     near[near] = support.inside(picture.centres(near)).numpy()
@@ -98,17 +115,10 @@ def fill(scene: Scene, sight: Sight, support: Support, seed: int = 0) -> Scene:
     empty = _each(hole | seen, picture, support, lambda points: sight.empty(points, width))
     known = seen & ~hole & ~empty
     known &= ~hidden if bool((known & ~hidden).any()) else ~blind  # without cameras all of it is hidden
-    if not known.any():  # nothing to go on with
-        return scene
     hole &= ~ndimage.binary_opening(empty & hole, iterations=max(1, round(GAP * R / picture.cell / 2)))
-    hole |= _dirt(picture, hole, seen & near, known, blind, RIM * R / picture.cell, seed)
-    colour = inpaint(picture.rgb, hole, known, seed)
-    gone = flat.clone()
-    gone[flat] = torch.from_numpy(hole[picture.rows_columns(g.means[flat])])
-    left = _drawn(g[flat & ~gone], picture.corner, picture.cell, picture.top, picture.alpha.shape)
-    new = hole | (near & covered & (left.alpha < COVERED))
-    new &= ~_each(new & (picture.dent > 0), picture, support, lambda points: sight.empty(points, 2 * picture.cell))
-    return replace(scene, gaussians=concatenate([g[~gone], _laid(picture, support, new, colour)]))
+    if known.any():
+        hole |= _dirt(picture, hole, seen & near, known, blind, RIM * R / picture.cell, seed)
+    return hole, near, known
 
 
 def _laid(picture: Picture, support: Support, cells: np.ndarray, colour: np.ndarray) -> Gaussians:

@@ -153,6 +153,9 @@ def test_solid_objects_are_filled_and_as_heavy_as_that(tmp_path, monkeypatch):
     ball = assets({"ball": kind}, Fineness(0.04, 0.03, 5e-4), 40, solid=True)[7]
     assert (ball.points[:40].norm(dim=1) - 0.3).abs().max() < 3e-3
     assert ball.points.norm(dim=1).max() < 0.304
+    kept = tmp_path / "kept.npz"
+    fine, coarse = (assets({"ball": kind}, Fineness(dx, 0.03, 5e-4), 40, kept, solid=True)[7] for dx in (0.04, 0.06))
+    assert torch.equal(fine.points, ball.points) and len(coarse.points) < len(fine.points)  # not read for another dx
     volume = float(4 / 3 * torch.pi * 0.3**3)
     around = float(4 * torch.pi * 0.3**2) * 0.04
     assert volume < ball.mass / 500 < volume + around  # cells at the surface count whole

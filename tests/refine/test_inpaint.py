@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from stages.refine import inpaint as inpainting
 from stages.refine.inpaint import inpaint
 
 SIDE = 96
@@ -56,6 +57,26 @@ def test_the_rims_of_two_mats_go_on_straight(slope):
     nearest = np.linalg.norm(out[..., None, :] - colours, axis=-1).argmin(-1)
     assert (nearest != which)[hole].mean() < 0.02
     assert psnr(out[hole], rgb[hole]) > 28
+
+
+def test_of_several_tries_the_best_is_kept(monkeypatch):
+    y, x = np.mgrid[:SIDE, :SIDE]
+    rgb = np.repeat((0.3 + 0.4 * ((x // 6 + y // 6) % 2))[..., None], 3, 2).astype(np.float32)
+    hole = middle(6)  # filled at once, without a coarser picture
+    monkeypatch.setattr("stages.refine.inpaint.TRIES", 1)
+    alone, tries = filled(rgb, hole), []
+
+    def spoiled(level, rng, *numbers):
+        """The first try as it is, black ones after it."""
+        tries.append(searched(level, rng, *numbers))
+        if len(tries) > 1:
+            level.image[level.hole] = 0.0
+        return tries[-1]
+
+    monkeypatch.setattr("stages.refine.inpaint.TRIES", 4)
+    searched = inpainting._searched
+    monkeypatch.setattr("stages.refine.inpaint._searched", spoiled)
+    assert np.array_equal(filled(rgb, hole), alone) and len(tries) == 4
 
 
 def test_grain_stays_grainy():

@@ -2,8 +2,9 @@
 
 Loss, learning rates and the reasons for them follow Kerbl et al. 2023, "3D Gaussian Splatting", sec. 5 and
 its code; unlike there the Gaussians already lie on matched surfaces, so some hundred steps are enough on a CPU.
-What no photo needs fades and shrinks, as in Kheradmand et al. 2024, "3D Gaussian Splatting as Markov Chain Monte
-Carlo", sec. 4: many steps on few photos would else fit their noise with it.
+What no photo needs shrinks, as in Kheradmand et al. 2024, "3D Gaussian Splatting as Markov Chain Monte Carlo", sec. 4:
+many steps on few photos would else fit their noise with it. Opacities are left alone: what stages to come find and move
+should be solid.
 The number of steps is fixed beforehand, never by the clock, so a seed gives the same scene again.
 """
 
@@ -29,7 +30,7 @@ from stages.scene.gaussians import Gaussians
 STRUCTURE = 0.2  # weight of 1 - SSIM against L1
 RATES = {"scales": 5e-3, "quats": 2e-3, "opacities": 3e-2, "base": 5e-3, "rest": 2.5e-4, "gains": 2e-3}
 DEPTH = 0.1  # weight of the error in inverse depth, in units of one over the cameras' distance
-SPARING = 0.01  # weight of the mean opacity, and of the mean scale over the cameras' distance
+SPARING = 0.01  # weight of the mean scale over the cameras' distance
 MOVE = 2e-4  # of the means, times the cameras' distance; falls to a hundredth of it
 FAINT = 0.02  # Gaussians of less opacity are dropped
 SPLITS = (0.2, 0.4)  # after these shares of the steps, Gaussians where detail is missing are split
@@ -164,7 +165,7 @@ def _step(
     rendering = rasterise(gaussians, views.cameras.viewmats[one], views.cameras.Ks[one], width, height, background)
     image = rendering.rgb[0] * fit.gain(view)
     loss = (1 - STRUCTURE) * (image - photo).abs().mean() + STRUCTURE * (1 - ssim(image, photo))
-    loss = loss + SPARING * (gaussians.opacities.mean() + gaussians.scales.mean() / fit.reach)
+    loss = loss + SPARING * gaussians.scales.mean() / fit.reach
     if inverse is not None:
         error = fit.reach / rendering.depth[0].clamp_min(0.1 * fit.reach) - inverse
         known = error.isfinite() & (rendering.alpha[0] > 0.5)

@@ -64,6 +64,19 @@ def test_a_darker_photo_is_taken_as_exposure(target):
     assert float(fit.gain(0).detach().mean()) < float(fit.gain(3).detach().mean())
 
 
+def test_what_no_photo_shows_shrinks_and_stays_as_opaque(target):
+    """The last of them is behind all cameras."""
+    true, views = target
+    unseen = replace(true[[0]], means=torch.tensor([[0.0, 0, 60.0]]))
+    fit = photometric._Fit.start(concatenate([true, unseen]), views.cameras, 2.0)
+    for _ in range(20):
+        photometric._step(fit, views, 0, 0.0, "cpu")
+        fit.optimiser.step()
+    after = fit.gaussians()
+    assert (after.scales[-1] < 0.95 * unseen.scales).all()
+    torch.testing.assert_close(after.opacities[-1:], unseen.opacities)
+
+
 def test_exposure_that_goes_with_the_place_is_left_to_the_harmonics():
     """Light that grows to one side is view-dependent colour; a single photo taken too dark is not."""
     cameras = ring(40, 48)

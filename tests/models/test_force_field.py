@@ -223,7 +223,6 @@ def test_nothing_stays_in_the_floor_or_a_wall(depth):
         assert out[:, -1, ..., axis].min() > BOX[0][axis] - SINK - 0.02  # the rest is of second order
 
 
-@torch.no_grad()
 def test_the_floor_gives_back_less_than_it_takes():
     """Of what it pushes what comes, nothing to what could be pulled, and half to what leaves at LEAVING."""
     up, a = torch.tensor([0.0, 0, 1]), torch.tensor([[3.0, 1, 5], [3.0, 1, -50], [0, 0, 0.5]])[None, None, None]
@@ -239,6 +238,7 @@ def test_the_floor_gives_back_less_than_it_takes():
     assert torch.equal(leaves[..., :2], a[..., :2])  # along the floor it is left to the network
 
 
+@torch.no_grad()
 def test_a_thousand_steps_stay_finite_and_whole():
     world = crowd(1, 2, 10)
     out = loud(4).rollout(world, 1000)

@@ -4,6 +4,9 @@ The hole is put together from seen patches that agree with their surroundings an
 where an edge runs into it at both ends, patches along the edge are what agrees. What is seen beside the hole in a
 lighter or darker place than where the patches come from is carried smoothly over it at last, so that there is no seam.
 
+Patches are compared in integers: colours of 8 bits, weights of 10. Sums of their products are exact in float64, in
+whatever order they are added, so the result does not depend on the number of threads or on the processor.
+
 Source: Wexler, Shechtman and Irani 2007, "Space-time completion of video"; the search is that of Barnes et al. 2009,
 "PatchMatch".
 """
@@ -32,6 +35,9 @@ ENOUGH = (0.25, 0.65)  # share of a patch that is there to go by, drawn for each
 FIRST = (0.5, 0.95)  # share of the rim that waits for the rest of it, of more contrast
 ROUNDS = 3  # of search in every finer picture
 DOUBT = 0.7  # weight of a cell's colour in the hole, for each cell of depth
+COLOUR = 255  # integer colour of full intensity
+WEIGHT = 1023  # integer weight of a cell that is trusted fully
+VOTE = 1 << 14  # integer weight of a patch that matches exactly
 Y, X = (d.ravel() for d in np.mgrid[-REACH : REACH + 1, -REACH : REACH + 1])
 
 
@@ -50,7 +56,8 @@ def inpaint(
     if not known.any() or not hole.any():
         return rgb
     smooth = _membrane(np.where(known[..., None], rgb, 0).astype(np.float32), known.astype(np.float32))
-    image = _complete(np.where(known[..., None], rgb, smooth), hole, known, np.random.default_rng(seed), rounds)
+    image = np.rint(COLOUR * np.where(known[..., None], rgb, smooth))
+    image = _complete(image, hole, known, np.random.default_rng(seed), rounds) / COLOUR
     return np.where(hole[..., None], image, rgb).clip(0, 1).astype(rgb.dtype)
 
 
@@ -75,9 +82,9 @@ def _membrane(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
 class _Level:
     """A picture with patches to be found for the targets: every cell whose patch reaches into the hole."""
 
-    image: np.ndarray  # (h, w, 3), changed in place
+    image: np.ndarray  # (h, w, 3) integer colours, changed in place
     hole: np.ndarray  # (h, w)
-    trust: np.ndarray  # (h, w) weight of a cell's colour when patches are compared
+    trust: np.ndarray  # (h, w) integer weight of a cell's colour when patches are compared
     source: np.ndarray  # (h, w) whether a patch around the cell is known all over
     at: np.ndarray  # (t, 2) targets
 
@@ -86,7 +93,7 @@ class _Level:
         side = np.ones((2 * REACH + 1, 2 * REACH + 1))
         inner = np.zeros_like(hole)
         inner[REACH:-REACH, REACH:-REACH] = True
-        trust = np.where(hole | known, DOUBT ** ndimage.distance_transform_edt(hole), 0).astype(np.float32)
+        trust = np.rint(WEIGHT * np.where(hole | known, DOUBT ** ndimage.distance_transform_edt(hole), 0))
         near = ndimage.binary_dilation(hole, side) & inner
         return _Level(image.copy(), hole, trust, ndimage.binary_erosion(known, side) & inner, np.argwhere(near))
 
@@ -106,7 +113,7 @@ class _Level:
     ) -> Float[np.ndarray, "t"]:
         """Of patches to those around their matches."""
         difference = P - self.patches(match)
-        return np.einsum("tp,tpc,tpc->t", W, difference, difference) / W.sum(1).clip(1e-6)
+        return np.einsum("tp,tpc,tpc->t", W, difference, difference) / W.sum(1).clip(1)
 
     def vote(
         self, at: Int[np.ndarray, "t 2"], match: Int[np.ndarray, "t 2"], distance: Float[np.ndarray, "t"]
@@ -114,20 +121,20 @@ class _Level:
         """Every cell of the hole takes the mean of what the patches over it say; which had any."""
         said, told = self.said(at, match, distance)
         told &= self.hole
-        self.image[told] = said[told]
+        self.image[told] = np.rint(said[told])
         return told
 
     def said(self, at: np.ndarray, match: np.ndarray, distance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The mean of what patches say of every cell, good matches first, and of which they say anything."""
-        sigma = max(float(np.median(distance)), 1e-8)
-        weight = (np.exp(-distance / (0.5 * sigma)) + 1e-4).astype(np.float32)[:, None]
-        total = np.zeros((self.hole.size, 4), np.float32)
-        image = np.concatenate([self.image, np.ones((*self.hole.shape, 1), np.float32)], 2).reshape(-1, 4)
+        sigma = max(float(np.median(distance)), 1e-3)
+        weight = np.rint(VOTE * (np.exp(-distance / (0.5 * sigma)) + 1e-4))[:, None]
+        total = np.zeros((self.hole.size, 4))
+        image = np.concatenate([self.image, np.ones((*self.hole.shape, 1))], 2).reshape(-1, 4)
         to, of = self._cells(at), self._cells(match)
         for p in range(to.shape[1]):
             total[to[:, p]] += weight * image.take(of[:, p], axis=0)  # no target twice, so no cell twice
         total = total.reshape(*self.hole.shape, 4)
-        return total[..., :3] / total[..., 3:].clip(1e-9), total[..., 3] > 0
+        return total[..., :3] / total[..., 3:].clip(1), total[..., 3] > 0
 
     def even(self, match: Int[np.ndarray, "t 2"]) -> None:
         """By how much the seen cells around are lighter than patches say goes for the hole as well, smoothly."""
@@ -135,9 +142,10 @@ class _Level:
         said, told = self.said(self.at, match, distance)
         rim = (told & ~self.hole & (self.trust > 0)).astype(np.float32)
         near = cv2.GaussianBlur(rim, (0, 0), LIGHT)[..., None]
-        lighter = cv2.GaussianBlur(rim[..., None] * (self.image - said), (0, 0), LIGHT) / np.maximum(near, 1e-6)
+        step = (self.image - said).astype(np.float32)
+        lighter = cv2.GaussianBlur(rim[..., None] * step, (0, 0), LIGHT) / np.maximum(near, 1e-6)
         over = cv2.GaussianBlur(_membrane(rim[..., None] * lighter, rim), (0, 0), LIGHT)
-        self.image[self.hole] += over[self.hole].clip(-LIGHTER, LIGHTER)
+        self.image[self.hole] += over[self.hole].clip(-LIGHTER * COLOUR, LIGHTER * COLOUR)
 
 
 def _complete(
@@ -166,10 +174,10 @@ def _halved(image: np.ndarray, hole: np.ndarray, known: np.ndarray) -> tuple[np.
     """A picture of half the size; a cell is known where most of it is, else a part of the hole where some of it is."""
     height, width = (side // 2 * 2 for side in hole.shape)
     four = lambda v: v[:height, :width].reshape(height // 2, 2, width // 2, 2, *v.shape[2:]).sum((1, 3))  # noqa: E731
-    weight = known + np.float32(1e-3)
-    half = four(image * weight[..., None]) / four(weight)[..., None]
+    weight = 999 * known + 1  # what is not known counts where nothing else does
+    half = np.rint(four(image * weight[..., None]) / four(weight)[..., None])
     most = four(known) >= 3
-    return half.astype(np.float32), (four(hole) > 0) & ~most, most
+    return half, (four(hole) > 0) & ~most, most
 
 
 def _best(level: _Level, rng: np.random.Generator) -> Int[np.ndarray, "h w 2"]:
@@ -216,8 +224,9 @@ def _searched(
 
 def _first(P: Float[np.ndarray, "t p 3"], W: Float[np.ndarray, "t p"], wait: float) -> Bool[np.ndarray, "t"]:
     """Which patches have the most contrast in what is known of them."""
-    W = (W / W.sum(1, keepdims=True))[..., None]
-    contrast = (W * np.square(P - (W * P).sum(1, keepdims=True))).sum((1, 2))
+    total = W.sum(1)
+    squares, sums = np.einsum("tp,tpc,tpc->t", W, P, P), np.einsum("tp,tpc->tc", W, P)
+    contrast = (squares - np.einsum("tc,tc->t", sums, sums) / total) / total
     return contrast >= np.quantile(contrast, wait)
 
 

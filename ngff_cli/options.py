@@ -16,11 +16,18 @@ Seed = Annotated[int, typer.Option(help="same seed, same device: same result")]
 Verbose = Annotated[bool, typer.Option("-v", "--verbose", help="say more about what is done")]
 
 
+class StderrHandler(logging.Handler):
+    """Writes to what sys.stderr is at that moment: a stream kept from an earlier call may be closed by then."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        print(self.format(record), file=sys.stderr)
+
+
 def set_up_logging(verbose: bool) -> None:
     """Messages to stderr, past any progress bar; results alone go to stdout."""
     if not sys.stderr.isatty():  # in a log, a line of progress now and then will do
         os.environ.setdefault("TQDM_MININTERVAL", "10")
-    logging.basicConfig(format="%(message)s", stream=sys.stderr, level=logging.WARNING, force=True)
+    logging.basicConfig(handlers=[StderrHandler()], format="%(message)s", level=logging.WARNING, force=True)
     for name in ("stages", "ngff_cli"):
         logging.getLogger(name).setLevel(logging.DEBUG if verbose else logging.INFO)
 

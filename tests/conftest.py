@@ -15,6 +15,13 @@ DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 SHARED = Path(__file__).resolve().parents[1].parent / "shared"
 
 
+def pytest_collection_modifyitems(items) -> None:
+    """What is parametrised with a GPU is selected by `-m gpu`."""
+    for item in items:
+        if hasattr(item, "callspec") and any(isinstance(p, str) and p == "cuda" for p in item.callspec.params.values()):
+            item.add_marker(pytest.mark.gpu)
+
+
 @pytest.fixture(params=DEVICES)
 def device(request) -> str:
     return request.param

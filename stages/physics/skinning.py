@@ -22,10 +22,11 @@ class Skinning:
 
     def __init__(self, gaussians: Gaussians, binding: Binding, keypoints: Keypoints):
         self.gaussians, self.rest = gaussians, keypoints.rest.float().contiguous()
-        device = gaussians.means.device
-        self._moving = (binding.index >= 0).any(1).nonzero()[:, 0].to(device)
-        self._index = binding.index[self._moving].int().contiguous().to(device)
-        self._weight = binding.weight[self._moving].float().contiguous().to(device)
+        device = gaussians.means.device  # binding and keypoints stay where they are, as a rule on the CPU
+        moving = (binding.index >= 0).any(1).nonzero()[:, 0]
+        self._index = binding.index[moving].int().contiguous().to(device)
+        self._weight = binding.weight[moving].float().contiguous().to(device)
+        self._moving = moving.to(device)
         self._part = gaussians[self._moving]
         self._around = _neighbours(self.rest, keypoints.object_id)
         d = self.rest[self._around] - self.rest[:, None]

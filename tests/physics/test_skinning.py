@@ -58,6 +58,17 @@ def test_a_rigid_motion_is_rigid(kind):
         assert torch.equal(getattr(moved, name)[~mine], getattr(g, name)[~mine])
 
 
+def test_gaussians_on_a_device_follow_keypoints_that_came_from_a_file(device):
+    """A file's binding and keypoints are on the CPU wherever the Gaussians are drawn."""
+    g, binding, keypoints = prepared(scene_of("cloud"))
+    positions = keypoints.rest @ TURN.mT
+    moved = deform(g.to(device), binding, keypoints, positions)
+    assert moved.means.device.type == device
+    expected = deform(g, binding, keypoints, positions)
+    for name in ("means", "quats", "scales", "sh"):
+        torch.testing.assert_close(getattr(moved, name).cpu(), getattr(expected, name), rtol=0, atol=1e-5)
+
+
 def test_a_line_turns_with_its_direction():
     # points on a line do not tell the turn about it, so only positions and lengths can be asked for
     g, binding, keypoints = prepared(scene_of("line"))

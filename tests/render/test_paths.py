@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import torch
 
+from stages.backends import pick_device
 from stages.errors import InputError
 from stages.geometry.cameras import centres, depths, project
 from stages.render.footage import Footage, open_footage
@@ -166,7 +167,7 @@ def test_objects_pull_the_aim_of_the_photos_only_a_little(two_balls):
 
 def test_what_is_lifted_is_in_the_picture_from_the_start(tmp_path, two_balls):
     # the balls fall by 0.6 within a twentieth of the film, to where the cameras look
-    footage = open_footage(rising(tmp_path / "t.h5", two_balls, 40, 0.0), None, "cpu")
+    footage = open_footage(rising(tmp_path / "t.h5", two_balls, 40, 0.0), None, pick_device("auto"))
     positions = footage.trajectory.positions.clone()
     positions[:2, :, 2] += torch.tensor([[0.6], [0.3]])
     footage = replace(footage, trajectory=replace(footage.trajectory, positions=positions))
@@ -179,7 +180,7 @@ def test_what_is_lifted_is_in_the_picture_from_the_start(tmp_path, two_balls):
 @pytest.mark.parametrize("jump", [(0.0, 0.0, 0.9), (0.5, -0.5, 0.0)], ids=["high up", "to the side"])
 def test_what_moves_stays_in_the_picture_however_far(tmp_path, two_balls, jump):
     """Far above what the photos show, or far to the side of it, and back."""
-    footage = open_footage(rising(tmp_path / "t.h5", two_balls, 40, 0.0), None, "cpu")
+    footage = open_footage(rising(tmp_path / "t.h5", two_balls, 40, 0.0), None, pick_device("auto"))
     positions = footage.trajectory.positions.clone()
     positions += 4 * (torch.linspace(0, 1, 40) - torch.linspace(0, 1, 40) ** 2)[:, None, None] * torch.tensor(jump)
     footage = replace(footage, trajectory=replace(footage.trajectory, positions=positions))
@@ -192,7 +193,7 @@ def test_what_moves_stays_in_the_picture_however_far(tmp_path, two_balls, jump):
 
 
 def test_what_leaves_the_scene_is_not_chased(tmp_path, two_balls):
-    footage = open_footage(rising(tmp_path / "t.h5", two_balls, 40, 5.0), None, "cpu")
+    footage = open_footage(rising(tmp_path / "t.h5", two_balls, 40, 5.0), None, pick_device("auto"))
     path = camera_path("novel", two_balls.cameras, subject_of(footage), 40, 640)
     assert bool((path.viewmats[:, 2, 2] < 0.5).all())  # z of where they look: at most 30 degrees up
     reach = (centres(two_balls.cameras.viewmats)[:, :2].norm(dim=1)).max()

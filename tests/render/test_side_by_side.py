@@ -10,18 +10,18 @@ import torch
 
 from stages.errors import InputError
 from stages.geometry.similarity import Similarity
-from stages.render.options import RenderOptions
 from stages.render.stage import _names, run
 from stages.scene.images import read_image, read_video
 from stages.scene.scene_ply import write_scene
 from tests.evaluate.motions import elsewhere
+from tests.render.conftest import render_options
 from tests.render.motions import rising
 
 GREEN = torch.tensor([0.1, 0.8, 0.1])
 
 
 def options(**choices):
-    return RenderOptions(**{"resolution": 96, "device": "cpu", "side_by_side": True, **choices})
+    return render_options(**{"side_by_side": True, **choices})
 
 
 def height(image):

@@ -14,6 +14,7 @@ from stages.render.overlay import tile
 from stages.render.stage import run
 from stages.scene.images import read_image, read_labels, read_video, write_png
 from stages.scene.scene_ply import write_scene
+from tests.render.conftest import render_options
 from tests.render.motions import rising
 
 RED, GREEN = torch.tensor([0.9, 0.1, 0.1]), torch.tensor([0.1, 0.8, 0.1])
@@ -31,12 +32,8 @@ def trajectory(tmp_path, two_balls):
     return rising(tmp_path / "traj.h5", two_balls, frames=6, forces=(push,))
 
 
-def options(**choices):
-    return RenderOptions(**{"resolution": 96, "device": "cpu", **choices})
-
-
 def picture(source, out, **choices):
-    return read_image(run(source, out, options(**choices)))
+    return read_image(run(source, out, render_options(**choices)))
 
 
 def share(image, colour, within=0.15):
@@ -49,7 +46,7 @@ def rows_of(image, colour):
 
 
 def test_a_film_plays_at_the_rate_of_the_trajectory_and_says_what_made_it(trajectory, capsys):
-    out = run(trajectory, None, options())
+    out = run(trajectory, None, render_options())
     assert out == trajectory.with_name("traj_novel.mp4") and capsys.readouterr().out.strip() == str(out)
     with av.open(str(out)) as file:
         stream = file.streams.video[0]
@@ -62,7 +59,7 @@ def test_a_film_plays_at_the_rate_of_the_trajectory_and_says_what_made_it(trajec
 
 def test_what_rises_rises_in_the_film_and_what_stands_stands(tmp_path, two_balls):
     source = rising(tmp_path / "traj.h5", two_balls, frames=6, step=0.04)
-    frames = list(read_video(run(source, None, options(view="input:0", resolution=128))))
+    frames = list(read_video(run(source, None, render_options(view="input:0", resolution=128))))
     heights = [float(rows_of(frame, GREEN)) for frame in frames]
     assert all(b < a - 0.5 for a, b in zip(heights, heights[1:], strict=False))
     assert (frames[0] - frames[5])[-20:].abs().mean() < 0.02  # the floor in front
@@ -87,16 +84,16 @@ def test_all_views_in_one_picture(scene, tmp_path):
     assert small.shape == sheet.shape and (small - sheet).abs().mean() < 0.02
     one = picture(scene, tmp_path / "one.png", view="input:4", resolution=64)
     assert torch.equal(sheet[64:, 64:128], one)
-    assert run(scene, None, options(view="all")).name == "scene_all.png"
+    assert run(scene, None, render_options(view="all")).name == "scene_all.png"
 
 
 def test_a_film_of_all_views_and_one_along_a_path(trajectory, tmp_path, two_balls):
-    frames = list(read_video(run(trajectory, None, options(view="all"))))
+    frames = list(read_video(run(trajectory, None, render_options(view="all"))))
     assert len(frames) == 6 and frames[0].shape == (2 * 64, 3 * 64, 3)
     K = [[90.0, 0, 32], [0, 90, 24], [0, 0, 1]]
     rows = [{"viewmat": v.tolist(), "K": K, "size": [64, 48]} for v in two_balls.cameras.viewmats[:3]]
     (tmp_path / "walk.json").write_text(json.dumps(rows))
-    out = run(trajectory, None, options(view=str(tmp_path / "walk.json")))
+    out = run(trajectory, None, render_options(view=str(tmp_path / "walk.json")))
     frames = list(read_video(out))
     assert out.name == "traj_walk.mp4" and frames[0].shape == (72, 96, 3)
     assert (frames[0] - frames[5]).abs().mean() > 0.02  # seen from elsewhere
@@ -146,12 +143,12 @@ def test_ids_are_flat_and_keep_their_colours(scene, tmp_path):
 
 
 def test_depth_is_metric_in_a_png_and_coloured_in_a_film(scene, trajectory, tmp_path):
-    run(scene, tmp_path / "d.png", options(view="input:0", depth=True))
+    run(scene, tmp_path / "d.png", render_options(view="input:0", depth=True))
     depth = read_labels(tmp_path / "d.png").float() / 1000
     assert cv2.imread(str(tmp_path / "d.png"), cv2.IMREAD_UNCHANGED).dtype == "uint16"
     assert float(depth[48, 48]) == pytest.approx(2.0, abs=0.25)  # the camera is 2 from the point it aims at
     assert json.loads((tmp_path / "d.png.json").read_text())["depth_unit"] == 1e-3
-    out = run(trajectory, None, options(depth=True))
+    out = run(trajectory, None, render_options(depth=True))
     facts = json.loads(out.with_name(out.name + ".json").read_text())
     assert out.name == "traj_novel_depth.mp4" and 0.5 < facts["depth_near"] < facts["depth_far"] < 5
 
@@ -177,7 +174,7 @@ def test_tiles_of_different_shape_stand_in_the_middle():
 
 
 def test_a_film_of_given_rate_keeps_its_speed(trajectory, tmp_path):
-    out = run(trajectory, tmp_path / "slow.mp4", options(fps=25.0))
+    out = run(trajectory, tmp_path / "slow.mp4", render_options(fps=25.0))
     with av.open(str(out)) as file:
         assert (file.streams.video[0].frames, file.streams.video[0].average_rate) == (3, 25)
 
@@ -201,5 +198,5 @@ def test_options_that_cannot_be(choices, says):
 )  # fmt: skip
 def test_a_mistake_is_told_in_one_sentence_and_leaves_nothing(scene, tmp_path, out, choices, says):
     with pytest.raises(InputError, match=says) as caught:
-        run(scene, tmp_path / out, options(**choices))
+        run(scene, tmp_path / out, render_options(**choices))
     assert not re.search("\n", str(caught.value)) and [p.name for p in tmp_path.iterdir()] == ["scene.ply"]

@@ -26,7 +26,7 @@ QUALITY_HELP = " | ".join(QUALITIES)
 
 def _version(wanted: bool) -> None:
     if wanted:
-        from stages.scene.files import ngff_version
+        from stages.core.scene.files import ngff_version
 
         print(f"ngff {ngff_version()}")
         raise typer.Exit

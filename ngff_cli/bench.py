@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from ngff_cli.options import Commands, Device, Seed
-from stages.errors import InputError
+from stages.core.errors import InputError
 
 app = typer.Typer(cls=Commands, no_args_is_help=True, rich_markup_mode=None)
 
@@ -24,7 +24,7 @@ def bench_mpm(
     frames: Annotated[int, typer.Option(help="frames of 200 substeps to time")] = 10,
 ) -> None:
     """The MPM solver: time a substep, scenes a minute, and the plain three-kernel form."""
-    from stages.lab.bench_mpm import BenchOptions, run
+    from stages.lab.bench.mpm import BenchOptions, run
 
     for line in run(BenchOptions(device, tuple(particles), scenes, frames)):
         print(line, flush=True)
@@ -37,7 +37,7 @@ def bench_raster(
     shrink: Annotated[int, typer.Option(help="divide Gaussians and pixels by this, for a quick look")] = 1,
 ) -> None:
     """The CPU rasteriser: frames a second and time on one thread, beside one thread a pixel."""
-    from stages.lab.bench_raster import BenchOptions, run
+    from stages.lab.bench.raster import BenchOptions, run
 
     for line in run(out, BenchOptions(repeat, shrink)):
         print(line, flush=True)
@@ -56,7 +56,7 @@ def bench_reconstruct(
     cameras: Annotated[bool, typer.Option("--cameras", help="end with the cameras, to compare matchers")] = False,
 ) -> None:
     """Photos to Gaussians: cameras against reference cameras, photos kept out, time and memory."""
-    from stages.lab.bench_reconstruct import BenchOptions, run
+    from stages.lab.bench.reconstruct import BenchOptions, run
 
     for line in run(sets, out, BenchOptions(quality, holdout, device, matcher, cameras)):
         print(line, flush=True)
@@ -75,7 +75,7 @@ def bench_appearance(
     ] = None,
 ) -> None:
     """Photos kept out, drawn by our Gaussians and by those of gsplat's default recipe after the same seconds."""
-    from stages.lab.bench_appearance import BenchOptions, run
+    from stages.lab.bench.appearance import BenchOptions, run
 
     for line in run(sets, out, BenchOptions(quality, holdout, models)):
         print(line, flush=True)
@@ -90,7 +90,7 @@ def bench_pi3(
     splats: Annotated[bool, typer.Option("--splats", help="with the head of Gaussians")] = False,
 ) -> None:
     """π³ at its published size with random weights: seconds and memory, beside attention written out."""
-    from stages.lab.bench_pi3 import BenchOptions, run
+    from stages.lab.bench.pi3 import BenchOptions, run
 
     for line in run(BenchOptions(device, tuple(views), size, repeat, splats)):
         print(line, flush=True)
@@ -106,7 +106,7 @@ def bench_segment(
     device: Device = "auto",
 ) -> None:
     """Objects found by geometry, from masks that are true or partly wrong, and by sam2: overlap with the truth."""
-    from stages.lab.bench_segment import BenchOptions, run
+    from stages.lab.bench.segment import BenchOptions, run
 
     for line in run(out, BenchOptions(scenes, photos, weights, device, reconstruct)):
         print(line, flush=True)
@@ -119,7 +119,7 @@ def bench_refine(
     out: Annotated[Path | None, typer.Option("-o", "--out", help="the numbers as JSON")] = None,
 ) -> None:
     """Holes that lifted objects leave: the table there beside the true one, from new views."""
-    from stages.lab.bench_refine import BenchOptions, run
+    from stages.lab.bench.refine import BenchOptions, run
 
     for line in run(out, BenchOptions(scenes, photos)):
         print(line, flush=True)
@@ -148,8 +148,8 @@ def bench_dynamics(
     device: Device = "auto",
 ) -> None:
     """The dynamics models on motion that they have not seen."""
-    from stages.lab.bench_dynamics import BenchOptions, again, run
-    from stages.models.weights import HERE
+    from stages.core.models.checkpoints import HERE
+    from stages.lab.bench.dynamics import BenchOptions, again, run
 
     if results is None and data is None:
         raise InputError("--data: name the folder of motions to measure on, or --from results to draw again")
@@ -178,7 +178,7 @@ def bench_ablation(
     device: Device = "auto",
 ) -> None:
     """Our force field trained without each of its choices in turn: what they are worth."""
-    from stages.lab.bench_ablation import BenchOptions, run
+    from stages.lab.bench.ablation import BenchOptions, run
 
     options = BenchOptions(steps, batch, keypoints, horizons, groups, test, compiled, seed, device)
     for line in run(data, out, options, only):
@@ -196,7 +196,7 @@ def bench_rollout(
     device: Device = "auto",
 ) -> None:
     """The learned force field: time a rollout, and the published model and MPM beside it."""
-    from stages.lab.bench_rollout import BenchOptions, run
+    from stages.lab.bench.rollout import BenchOptions, run
 
     for line in run(out, BenchOptions(weights, keypoints, steps, tuple(scenes), repeat, device)):
         print(line, flush=True)
@@ -211,7 +211,7 @@ def bench_register(
     device: Device = "auto",
 ) -> None:
     """Registration of a part to the whole, beside plain ICP and splatreg."""
-    from stages.lab.bench_register import BenchOptions, run
+    from stages.lab.bench.register import BenchOptions, run
 
     for line in run(out, BenchOptions(only, trials, seed=seed, device=device)):
         print(line, flush=True)
@@ -227,7 +227,7 @@ def bench_complete(
     seed: Seed = 0,
 ) -> None:
     """What completing objects does to their surfaces, to pictures from behind, and to how they fall."""
-    from stages.lab.bench_complete import BenchOptions, run
+    from stages.lab.bench.complete import BenchOptions, run
 
     for line in run(out, BenchOptions(tuple(scene), known, seed=seed)):
         print(line, flush=True)

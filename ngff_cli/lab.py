@@ -7,7 +7,7 @@ import typer
 
 from ngff_cli import bench
 from ngff_cli.options import Commands, Device, Seed, set_up_logging
-from stages.lab.objects import ObjectsOptions
+from stages.lab.assets.objects import ObjectsOptions
 
 app = typer.Typer(
     cls=Commands, no_args_is_help=True, rich_markup_mode=None, add_completion=False, pretty_exceptions_enable=False
@@ -23,7 +23,7 @@ def lab() -> None:
 @app.command()
 def doctor() -> None:
     """Say what works on this machine, and what to do about what does not."""
-    from stages.lab.doctor import examine
+    from ngff_cli.doctor import examine
 
     for line in examine():
         print(line)
@@ -35,7 +35,7 @@ def example(
     photos: Annotated[int, typer.Option(help="how many photos to take")] = 26,
 ) -> None:
     """Make the example: photos of toys on a table, with true cameras, labels and motion beside them."""
-    from stages.lab.example import make
+    from stages.lab.assets.example import make
 
     make(out, photos)
 
@@ -48,7 +48,7 @@ def replay(
     device: Device = "auto",
 ) -> None:
     """Run a recorded scene of the public MPM solver again with ours, and print how they differ."""
-    from stages.lab.replay import ReplayOptions, run
+    from stages.lab.bench.replay import ReplayOptions, run
 
     for line in run(recording, out, ReplayOptions(frames, device)):
         print(line)
@@ -79,8 +79,9 @@ def dataset(
     device: Device = "auto",
 ) -> None:
     """Make GSCollision: scenes, their motion, and videos, in the published layout."""
-    from stages.lab import dataset, on_ray
-    from stages.lab.dataset_options import DatasetOptions
+    from stages.lab.dataset import make as dataset
+    from stages.lab.dataset import on_ray
+    from stages.lab.dataset.options import DatasetOptions
 
     options = DatasetOptions(groups, only, frames, keypoints, dx, spacing, substep, nudge, exact, views,
                              backgrounds, resolution, shard, limit, device)  # fmt: skip
@@ -101,7 +102,7 @@ def import_(
     keypoints: Annotated[int, typer.Option(help="of each object, at most")] = 2048,
 ) -> None:
     """Turn a published scene of GSCollision into a trajectory that `ngff render` and `ngff evaluate` read."""
-    from stages.lab.importer import run
+    from stages.lab.dataset.importer import run
 
     print(run(folder, out, scene, keypoints))
 
@@ -119,8 +120,9 @@ def statistics(
     device: Device = "auto",
 ) -> None:
     """What happens in the scenes of a data set: falls, contacts, tipping, rest; or how predictable it is."""
-    from stages.lab import predictability, scene_statistics
-    from stages.lab.scenes import groups_of
+    from stages.lab.dataset import predictability
+    from stages.lab.dataset import statistics as scene_statistics
+    from stages.lab.dataset.scenes import groups_of
 
     if against is not None:
         lines = predictability.run(data, against, out, min(keypoints, 256), device)
@@ -129,7 +131,7 @@ def statistics(
     for line in lines:
         print(line)
     if sheet is not None:
-        from stages.lab.contact_sheet import SheetOptions, write_sheet
+        from stages.lab.dataset.contact_sheet import SheetOptions, write_sheet
 
         write_sheet(data, sheet, SheetOptions(tuple(groups_of(groups)), scenes, device))
 
@@ -141,7 +143,7 @@ def study(
     device: Device = "auto",
 ) -> None:
     """How fine the data set's simulation has to be: resolutions compared with the published one."""
-    from stages.lab.study import run
+    from stages.lab.dataset.resolution_study import run
 
     for line in run(out, scenes, device):
         print(line, flush=True)
@@ -180,7 +182,7 @@ def train(
     resume: Annotated[bool, typer.Option("--resume", help="go on from the .ckpt beside the weights")] = False,
 ) -> None:
     """Train a dynamics model on simulated motion."""
-    from stages.lab.train import TrainOptions, run
+    from stages.lab.training.train import TrainOptions, run
 
     options = TrainOptions(
         minutes, steps, batch, keypoints, few, lr, horizons, hidden, loss, optimizer, speeds, memory, groups,
@@ -197,7 +199,7 @@ def card(
     half: Annotated[bool, typer.Option("--half", help="also store their weights in 16 bits, to be shipped")] = False,
 ) -> None:
     """Plot how weights were trained: loss and scores by minute."""
-    from stages.lab.card import run
+    from stages.lab.training.card import run
 
     for line in run(cards, out, half):
         print(line)
@@ -211,7 +213,7 @@ def average(
     half: Annotated[bool, typer.Option("--half", help="store them in 16 bits, to be shipped")] = False,
 ) -> None:
     """Average the weights of several trainings, number by number."""
-    from stages.lab.average import run
+    from stages.lab.training.average import run
 
     print(run(files, shares, out, half))
 
@@ -238,7 +240,7 @@ def train_splatter(
     device: Device = "auto",
 ) -> None:
     """Train pi3-splat's head of Gaussians; the rest of the network stays as it is."""
-    from stages.lab.train_splatter import SplatterOptions, run
+    from stages.lab.training.train_splatter import SplatterOptions, run
 
     for line in run(data, out, SplatterOptions(steps, views, side, depth, width, lr, seed, device), weights):
         print(line, flush=True)
@@ -256,7 +258,7 @@ def objects(
     sheet: Annotated[Path | None, typer.Option(help="picture of all of them to write (.jpg)")] = None,
 ) -> None:
     """Make the ten objects of the data set as Gaussians, or turn meshes into such objects."""
-    from stages.lab.objects import run
+    from stages.lab.assets.objects import run
 
     for line in run(out, ObjectsOptions(only, count, up, light), meshes, sheet):
         print(line, flush=True)
@@ -269,7 +271,7 @@ def backgrounds(
     sheet: Annotated[Path | None, typer.Option(help="picture of all of them to write (.jpg)")] = None,
 ) -> None:
     """Make the eight tables of the data set, each in its surround, as Gaussians."""
-    from stages.lab.backgrounds import run
+    from stages.lab.assets.backgrounds import run
 
     for line in run(out, only, sheet):
         print(line, flush=True)
@@ -295,7 +297,7 @@ def heldout(
     device: Device = "auto",
 ) -> None:
     """Simulate scenes of other objects than the ten: by default of eight that no model learns from."""
-    from stages.lab.heldout import HeldoutOptions, run
+    from stages.lab.dataset.heldout import HeldoutOptions, run
 
     choice = shapes, solid, turned
     options = HeldoutOptions(scenes, objects, frames, keypoints, dx, spacing, substep, size, *choice, device)
@@ -318,7 +320,7 @@ def estimate_materials(
 
     Any endpoint that speaks OpenAI's protocol: $OPENAI_BASE_URL, with the key $OPENAI_API_KEY if it wants one.
     """
-    from stages.lab.estimate import EstimateOptions, run
+    from stages.lab.bench.estimate_materials import EstimateOptions, run
 
     for line in run(video, out, EstimateOptions(objects, model, timeout)):
         print(line)

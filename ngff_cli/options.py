@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from stages.errors import InputError
+from stages.core.errors import InputError
 
 SceneIn = Annotated[Path, typer.Argument(metavar="SCENE.ply", help="scene to read (.ply)", show_default=False)]
 Device = Annotated[str, typer.Option(help="auto | cpu | cuda")]

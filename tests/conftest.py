@@ -1,16 +1,17 @@
 """Tiny scenes built in memory, the devices present, and skips for data that may be absent."""
 
+import os
 from pathlib import Path
 
 import pytest
 import torch
 
-from stages.geometry.cameras import intrinsics, orbit
-from stages.scene.cameras import Cameras
-from stages.scene.gaussians import Gaussians, concatenate
-from stages.scene.scene import Scene, SceneObject
+from stages.core.geometry.cameras import intrinsics, orbit
+from stages.core.scene.cameras import Cameras
+from stages.core.scene.gaussians import Gaussians, concatenate
+from stages.core.scene.scene import Scene, SceneObject
 
-torch.set_num_threads(2)
+torch.set_num_threads(1 if "PYTEST_XDIST_WORKER" in os.environ else 2)
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 SHARED = Path(__file__).resolve().parents[1].parent / "shared"
 

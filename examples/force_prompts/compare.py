@@ -16,16 +16,16 @@ from pathlib import Path
 
 import torch
 
+from stages.core.scene.gaussians import concatenate
+from stages.core.scene.scene import Scene, SceneObject
+from stages.core.scene.scene_ply import write_scene
+from stages.core.scene.trajectory import read_trajectory
 from stages.evaluate.options import EvaluateOptions
 from stages.evaluate.stage import run as evaluate
-from stages.lab.objects import OBJECTS, make_object
-from stages.lab.shapes import sheet, to_gaussians
+from stages.lab.assets.objects import OBJECTS, make_object
+from stages.lab.assets.shapes import sheet, to_gaussians
 from stages.render.options import RenderOptions
 from stages.render.stage import run as render
-from stages.scene.gaussians import concatenate
-from stages.scene.scene import Scene, SceneObject
-from stages.scene.scene_ply import write_scene
-from stages.scene.trajectory import read_trajectory
 from stages.simulate.options import SimulateOptions
 from stages.simulate.stage import run as simulate
 

@@ -5,11 +5,11 @@ from pathlib import Path
 
 import torch
 
-from stages.physics.keypoints import bind, choose_keypoints
-from stages.scene.files import provenance
-from stages.scene.scene import Scene
-from stages.scene.scene_ply import read_scene
-from stages.scene.trajectory import Motion, TrajectoryWriter
+from stages.core.physics.keypoints import bind, choose_keypoints
+from stages.core.scene.files import provenance
+from stages.core.scene.scene import Scene
+from stages.core.scene.scene_ply import read_scene
+from stages.core.scene.trajectory import Motion, TrajectoryWriter
 
 DT, FRAMES, RESTITUTION = 0.02, 100, 0.6
 

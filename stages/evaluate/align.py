@@ -9,11 +9,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from stages.errors import InputError
-from stages.geometry.cameras import centres
-from stages.geometry.similarity import Similarity, umeyama
-from stages.scene.cameras import Cameras
-from stages.scene.scene import SceneObject
+from stages.core.errors import InputError
+from stages.core.geometry.cameras import centres
+from stages.core.geometry.similarity import Similarity, umeyama
+from stages.core.scene.cameras import Cameras
+from stages.core.scene.scene import SceneObject
 
 DRIFT = 0.1  # of the cameras' spread, or APART of the objects' size: farther apart means another world
 APART = 2.0

@@ -10,16 +10,16 @@ from jaxtyping import Float, Int
 from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
-from stages.errors import InputError
+from stages.core.errors import InputError
+from stages.core.geometry.harmonics import C0
+from stages.core.geometry.neighbours import knn
+from stages.core.scene.gaussians import Gaussians
+from stages.core.scene.scene import Scene
+from stages.core.scene.scene_ply import read_scene
 from stages.evaluate.align import World, alignment, check_same_world
 from stages.evaluate.matching import labels
 from stages.evaluate.options import EvaluateOptions
 from stages.evaluate.result import Result
-from stages.geometry.harmonics import C0
-from stages.geometry.neighbours import knn
-from stages.scene.gaussians import Gaussians
-from stages.scene.scene import Scene
-from stages.scene.scene_ply import read_scene
 
 SOLID = 0.1  # opacity above which a Gaussian is part of a surface
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from scipy.optimize import linear_sum_assignment
 
-from stages.errors import InputError
+from stages.core.errors import InputError
+from stages.core.scene.scene import SceneObject
 from stages.evaluate.align import Pairs, World
-from stages.scene.scene import SceneObject
 
 
 def match(prediction: World, truth: World, names: list[str]) -> tuple[Pairs, str]:

@@ -12,10 +12,10 @@ from jaxtyping import Float
 from torch import Tensor
 from tqdm import tqdm
 
-from stages.errors import InputError
+from stages.core.errors import InputError
+from stages.core.scene.images import VIDEOS, list_photos, read_image, read_video, video_info
 from stages.evaluate.options import EvaluateOptions
 from stages.evaluate.result import Curve, Pair, Result
-from stages.scene.images import VIDEOS, list_photos, read_image, read_video, video_info
 
 WINDOW, SIGMA = 11, 1.5  # of SSIM [px]
 SHOWN = 4  # pairs of frames in the report

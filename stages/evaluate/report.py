@@ -11,9 +11,9 @@ from pathlib import Path
 from jaxtyping import Float
 from torch import Tensor
 
+from stages.core.scene.files import replacing
+from stages.core.scene.images import resize, write_png
 from stages.evaluate.result import Curve, Pair, Result, show
-from stages.scene.files import replacing
-from stages.scene.images import resize, write_png
 
 WIDTH, HEIGHT, LEFT, BOTTOM = 720, 280, 60, 36  # of the plot [px]; margins for the labels
 INKS = ("#1f6fb4", "#d1491f", "#2e8b57", "#8e44ad", "#b8860b", "#16808a", "#c2185b", "#5d6d7e")

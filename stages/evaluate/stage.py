@@ -6,13 +6,13 @@ import json
 import logging
 from pathlib import Path
 
-from stages.backends import choose
-from stages.errors import InputError
+from stages.core.backends import choose
+from stages.core.errors import InputError
+from stages.core.scene.files import must_exist, provenance, replacing
+from stages.core.scene.images import PHOTOS, VIDEOS
 from stages.evaluate.options import EvaluateOptions
 from stages.evaluate.report import write_report
 from stages.evaluate.result import table, to_json
-from stages.scene.files import must_exist, provenance, replacing
-from stages.scene.images import PHOTOS, VIDEOS
 
 log = logging.getLogger(__name__)
 

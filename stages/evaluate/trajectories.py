@@ -9,18 +9,18 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from stages.errors import InputError
+from stages.core.errors import InputError
+from stages.core.geometry.similarity import Similarity
+from stages.core.physics.keypoints import bind
+from stages.core.physics.skinning import Skinning
+from stages.core.scene.gaussians import Gaussians
+from stages.core.scene.scene import Scene
+from stages.core.scene.trajectory import Keypoints, Trajectory, read_trajectory
 from stages.evaluate.align import Pairs, World, alignment, check_same_world
 from stages.evaluate.dynamics import STILL, all_metrics, error_over_time
 from stages.evaluate.matching import labels, match
 from stages.evaluate.options import EvaluateOptions
 from stages.evaluate.result import Curve, Result
-from stages.geometry.similarity import Similarity
-from stages.physics.keypoints import bind
-from stages.physics.skinning import Skinning
-from stages.scene.gaussians import Gaussians
-from stages.scene.scene import Scene
-from stages.scene.trajectory import Keypoints, Trajectory, read_trajectory
 
 SAME = 1e-3  # keypoints within this share of an object's size at rest are the same keypoints
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from stages.scene.files import replacing
+from stages.core.scene.files import replacing
 
 WIDTH, HEIGHT, MARGIN = 460, 300, 52  # of a panel [px]
 INK, BLUE, RED, GRID = (40, 40, 40), (176, 92, 20), (40, 40, 200), (225, 225, 225)  # BGR

@@ -9,8 +9,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from stages.geometry.cameras import centres
-from stages.scene.cameras import Cameras
+from stages.core.geometry.cameras import centres
+from stages.core.scene.cameras import Cameras
 
 WIDE = 60.0  # a larger angle without a photo leaves sides unseen [degrees]
 STEP = 15.0  # between neighbouring photos, as matching likes it [degrees]

@@ -7,15 +7,15 @@ import logging
 import torch
 from torch import Tensor
 
-from stages.backends import pick_device
-from stages.errors import InputError
-from stages.geometry.cameras import depths, resize
+from stages.core.backends import pick_device
+from stages.core.errors import InputError
+from stages.core.geometry.cameras import depths, resize
+from stages.core.scene.cameras import Cameras, Lenses, read_cameras
 from stages.reconstruct import depth, sfm, upright
 from stages.reconstruct.finish import Found, finish
 from stages.reconstruct.options import ReconstructOptions
 from stages.reconstruct.photos import Photos, Reconstruction, Views, undistort
 from stages.reconstruct.steps import Steps
-from stages.scene.cameras import Cameras, Lenses, read_cameras
 
 log = logging.getLogger(__name__)
 

@@ -8,9 +8,9 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from stages.models.pi3.dinov2 import PATCH
+from stages.core.models.pi3.dinov2 import PATCH
+from stages.core.scene.images import resize
 from stages.reconstruct.photos import Photos
-from stages.scene.images import resize
 
 MOST_PIXELS = 201_000  # a photo, as the published model was run (448 x 448 for a square one)
 

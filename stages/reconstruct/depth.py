@@ -18,8 +18,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from tqdm import tqdm
 
-from stages.geometry.cameras import centres, depths, resize
-from stages.geometry.planes import Plane
+from stages.core.geometry.cameras import centres, depths, resize
+from stages.core.geometry.planes import Plane
 from stages.reconstruct.photos import Views
 from stages.reconstruct.sfm import SparseModel
 

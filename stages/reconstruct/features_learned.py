@@ -19,9 +19,9 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 from tqdm import tqdm
 
-from stages.errors import InputError
-from stages.models.aliked import ALIKED
-from stages.models.lightglue import LightGlue
+from stages.core.errors import InputError
+from stages.core.models.matching.aliked import ALIKED
+from stages.core.models.matching.lightglue import LightGlue
 from stages.reconstruct import features
 from stages.reconstruct.photos import Photos
 

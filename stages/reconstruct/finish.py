@@ -11,7 +11,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from stages.errors import InputError
+from stages.core.errors import InputError
+from stages.core.scene.gaussians import Gaussians, concatenate, moved
+from stages.core.scene.scene import Scene
 from stages.reconstruct import initialise, photometric, upright
 from stages.reconstruct.advice import advise
 from stages.reconstruct.depth import DepthMap
@@ -20,8 +22,6 @@ from stages.reconstruct.photos import Reconstruction, Views
 from stages.reconstruct.reading import sharpness
 from stages.reconstruct.scale import parse_scale
 from stages.reconstruct.steps import Steps
-from stages.scene.gaussians import Gaussians, concatenate, moved
-from stages.scene.scene import Scene
 
 log = logging.getLogger(__name__)
 FAR = 3.0  # what has no depth is put so many camera distances away

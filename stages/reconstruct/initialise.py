@@ -10,12 +10,12 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from stages.geometry.neighbours import spacing
-from stages.geometry.planes import Plane
-from stages.raster.rasterise import rasterise
+from stages.core.geometry.neighbours import spacing
+from stages.core.geometry.planes import Plane
+from stages.core.raster.rasterise import rasterise
+from stages.core.scene.gaussians import Gaussians
 from stages.reconstruct.depth import DepthMap, look_up, unproject
 from stages.reconstruct.photos import Views
-from stages.scene.gaussians import Gaussians
 
 log = logging.getLogger(__name__)
 C0 = 0.28209479177387814  # the constant spherical harmonic

@@ -8,20 +8,20 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from stages.backends import pick_device
-from stages.errors import InputError
-from stages.geometry.cameras import centres
-from stages.models.pi3 import memory
-from stages.models.pi3.network import Geometry, halve
-from stages.models.pi3.splat import Pi3Splat, splat
-from stages.models.pi3.weights import find, load
+from stages.core.backends import pick_device
+from stages.core.errors import InputError
+from stages.core.geometry.cameras import centres
+from stages.core.models.pi3 import memory
+from stages.core.models.pi3.network import Geometry, halve
+from stages.core.models.pi3.splat import Pi3Splat, splat
+from stages.core.models.pi3.weights import find, load
+from stages.core.scene.gaussians import Gaussians
 from stages.reconstruct import crops, points, upright
 from stages.reconstruct.finish import Found, finish
 from stages.reconstruct.merge import merge
 from stages.reconstruct.options import ReconstructOptions
 from stages.reconstruct.photos import Photos, Reconstruction
 from stages.reconstruct.steps import Steps
-from stages.scene.gaussians import Gaussians
 
 log = logging.getLogger(__name__)
 
@@ -61,7 +61,7 @@ def _weights(name: str, options: ReconstructOptions):
     except InputError:
         if not options.download or options.weights is not None:
             raise
-    from stages.models.pi3.download import download
+    from stages.core.models.pi3.download import download
 
     return download(name)
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from stages.backends import choose
+from stages.core.backends import choose
 from stages.reconstruct import features
 from stages.reconstruct.options import COMPARERS, EXTRACTORS
 from stages.reconstruct.photos import Photos

@@ -6,9 +6,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from stages.geometry.rotations import covariance
-from stages.models.pi3.splat import decompose
-from stages.scene.gaussians import Gaussians
+from stages.core.geometry.rotations import covariance
+from stages.core.models.pi3.splat import decompose
+from stages.core.scene.gaussians import Gaussians
 
 PRIMES = (73_856_093, 19_349_663, 83_492_791)  # Teschner et al. 2003, "Optimized spatial hashing"
 

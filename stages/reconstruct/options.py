@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from stages.errors import InputError
+from stages.core.errors import InputError
 from stages.reconstruct.scale import parse_scale
 
 BACKENDS = {

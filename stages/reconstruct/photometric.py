@@ -19,13 +19,13 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from tqdm import tqdm
 
-from stages.geometry.cameras import centres
-from stages.geometry.rotations import matrix
-from stages.kernels.ssim import ssim
-from stages.raster.rasterise import rasterise
+from stages.core.geometry.cameras import centres
+from stages.core.geometry.rotations import matrix
+from stages.core.kernels.splat.ssim import ssim
+from stages.core.raster.rasterise import rasterise
+from stages.core.scene.cameras import Cameras
+from stages.core.scene.gaussians import Gaussians
 from stages.reconstruct.photos import Views
-from stages.scene.cameras import Cameras
-from stages.scene.gaussians import Gaussians
 
 STRUCTURE = 0.2  # weight of 1 - SSIM against L1
 RATES = {"scales": 5e-3, "quats": 2e-3, "opacities": 3e-2, "base": 5e-3, "rest": 2.5e-4, "gains": 2e-3}

@@ -11,8 +11,8 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from stages.scene.cameras import Cameras, Lenses
-from stages.scene.scene import Scene
+from stages.core.scene.cameras import Cameras, Lenses
+from stages.core.scene.scene import Scene
 
 
 @dataclass(frozen=True)

@@ -7,12 +7,12 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
-from stages.geometry.cameras import centres, resize
-from stages.models.pi3.network import Geometry
+from stages.core.geometry.cameras import centres, resize
+from stages.core.models.pi3.network import Geometry
+from stages.core.scene.cameras import Cameras
 from stages.reconstruct.crops import resized
 from stages.reconstruct.depth import DepthMap, look_up, unproject
 from stages.reconstruct.photos import Views
-from stages.scene.cameras import Cameras
 
 CONFIDENT = 0.1  # below it a pixel is not trusted
 EDGE = 0.03  # share of its depth by which a pixel's neighbours may differ

@@ -16,10 +16,10 @@ from jaxtyping import UInt8
 from torch import Tensor
 from tqdm import tqdm
 
-from stages.errors import InputError
+from stages.core.errors import InputError
+from stages.core.scene.files import must_exist
+from stages.core.scene.images import PHOTOS, VIDEOS, list_photos, open_video, read_image, to_bytes
 from stages.reconstruct.photos import Photos
-from stages.scene.files import must_exist
-from stages.scene.images import PHOTOS, VIDEOS, list_photos, open_video, read_image, to_bytes
 
 log = logging.getLogger(__name__)
 MOST = 200  # photos used of a folder: about what a table top can make use of, and what bounds time and memory

@@ -6,10 +6,10 @@ import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from stages.errors import InputError
+from stages.core.errors import InputError
 
 if TYPE_CHECKING:
-    from stages.scene.cameras import Cameras
+    from stages.core.scene.cameras import Cameras
 
 FORM = re.compile(r"(?:photos=(?P<first>[^,]+),(?P<second>.+?)\s+)?distance=(?P<distance>[0-9.eE+-]+)")
 FORMS = (
@@ -33,7 +33,7 @@ class ScaleReference:
 
     def measured(self, cameras: Cameras, reach: float) -> float:
         """The same length in the units of the cameras; `reach` is their distance from what they look at."""
-        from stages.geometry.cameras import centres
+        from stages.core.geometry.cameras import centres
 
         if not self.photos:
             return reach

@@ -18,12 +18,12 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from tqdm import tqdm
 
-from stages.errors import InputError
+from stages.core.errors import InputError
+from stages.core.scene.cameras import Cameras, Lenses
 from stages.reconstruct import matching
 from stages.reconstruct.matching import Pair
 from stages.reconstruct.photos import Photos
 from stages.reconstruct.steps import Steps
-from stages.scene.cameras import Cameras, Lenses
 
 log = logging.getLogger(__name__)
 MISFIT = 0.006  # share of the photo's width by which given cameras may miss the matches (4 px of 640)

@@ -6,15 +6,15 @@ import logging
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from stages.backends import choose, pick_device
-from stages.errors import InputError
+from stages.core.backends import choose, pick_device
+from stages.core.errors import InputError
+from stages.core.scene.files import ngff_version, provenance
+from stages.core.scene.scene_ply import write_scene
 from stages.reconstruct.options import BACKENDS, MONOCULAR, ReconstructOptions
 from stages.reconstruct.photos import Photos, Reconstruction
 from stages.reconstruct.reading import read_photos
 from stages.reconstruct.scale import parse_scale
 from stages.reconstruct.steps import Steps, fingerprint, peak_memory
-from stages.scene.files import ngff_version, provenance
-from stages.scene.scene_ply import write_scene
 
 log = logging.getLogger(__name__)
 

@@ -15,8 +15,8 @@ from typing import TypeVar
 
 import torch
 
-from stages.errors import InputError
-from stages.scene.files import replacing
+from stages.core.errors import InputError
+from stages.core.scene.files import replacing
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")

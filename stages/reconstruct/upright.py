@@ -9,9 +9,9 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from stages.geometry.cameras import centres
-from stages.geometry.planes import Plane, ransac
-from stages.geometry.similarity import Similarity
+from stages.core.geometry.cameras import centres
+from stages.core.geometry.planes import Plane, ransac
+from stages.core.geometry.similarity import Similarity
 
 LEAST = ((0.5, 0.04), (0.05, 0.3))  # cosine of the cameras' pitch, and share of the points in focus, a plane needs
 BELOW, ABOVE, PATCH = 0.08, 0.03, 0.04  # of the first plane, where it is looked for again; side of a patch [radii]

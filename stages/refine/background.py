@@ -12,16 +12,16 @@ from jaxtyping import Bool, Float
 from scipy import ndimage
 from torch import Tensor
 
-from stages.geometry.cameras import centres
-from stages.geometry.harmonics import evaluate_sh, rgb_to_sh
-from stages.geometry.neighbours import knn
-from stages.physics.support import Support
-from stages.raster.rasterise import rasterise
+from stages.core.geometry.cameras import centres
+from stages.core.geometry.harmonics import evaluate_sh, rgb_to_sh
+from stages.core.geometry.neighbours import knn
+from stages.core.perception.support import Support
+from stages.core.raster.rasterise import rasterise
+from stages.core.scene.gaussians import Gaussians, concatenate
+from stages.core.scene.scene import Scene
 from stages.refine.inpaint import inpaint
 from stages.refine.patches import ACROSS, patches
 from stages.refine.sight import Sight
-from stages.scene.gaussians import Gaussians, concatenate
-from stages.scene.scene import Scene
 
 MOST = 1024  # cells along the longer side of the picture of the table
 CELLS = 40_000  # under things, about

@@ -11,15 +11,15 @@ from scipy import ndimage
 from scipy.spatial import ConvexHull, QhullError
 from torch import Tensor
 
-from stages.geometry.harmonics import C0
-from stages.geometry.neighbours import knn
-from stages.geometry.rotations import matrix
-from stages.physics.support import Support, tips
+from stages.core.geometry.harmonics import C0
+from stages.core.geometry.neighbours import knn
+from stages.core.geometry.rotations import matrix
+from stages.core.perception.support import Support, tips
+from stages.core.scene.gaussians import Gaussians
+from stages.core.scene.scene import Scene
 from stages.refine.options import RefineOptions
 from stages.refine.patches import none_like, patches
 from stages.refine.sight import Sight
-from stages.scene.gaussians import Gaussians
-from stages.scene.scene import Scene
 
 LEAST = 16  # Gaussians; fewer have no shape to speak of
 PAD = 3  # empty cells around the object

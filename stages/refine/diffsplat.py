@@ -10,18 +10,18 @@ import logging
 from functools import lru_cache
 from pathlib import Path
 
-from stages.backends import pick_device
-from stages.errors import InputError
-from stages.models.diffsplat.weights import Files, find, load
-from stages.physics.support import Support
+from stages.core.backends import pick_device
+from stages.core.errors import InputError
+from stages.core.models.diffsplat.weights import Files, find, load
+from stages.core.perception.support import Support
+from stages.core.scene.gaussians import Gaussians
+from stages.core.scene.scene import Scene
 from stages.refine.library import SOLID, put, solid
 from stages.refine.options import RefineOptions
 from stages.refine.patches import none_like
 from stages.refine.portrait import LEARNED, portrait
 from stages.refine.register import LEAST, register
 from stages.refine.sight import Sight
-from stages.scene.gaussians import Gaussians
-from stages.scene.scene import Scene
 
 log = logging.getLogger(__name__)
 FIT = 0.5  # a lower fit is another object; true maps in the network's place reach 0.95, those of random weights 0.01
@@ -63,6 +63,6 @@ def _files(weights: Path | None, download: bool) -> Files:
     except InputError:
         if not download or weights is not None:
             raise
-    from stages.models.diffsplat.download import download as fetch
+    from stages.core.models.diffsplat.download import download as fetch
 
     return fetch()

@@ -14,18 +14,18 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from stages.backends import pick_device
-from stages.errors import InputError
-from stages.geometry.neighbours import knn
-from stages.physics.support import Support
+from stages.core.backends import pick_device
+from stages.core.errors import InputError
+from stages.core.geometry.neighbours import knn
+from stages.core.perception.support import Support
+from stages.core.scene.gaussians import Gaussians, moved
+from stages.core.scene.scene import Scene
+from stages.core.scene.scene_ply import read_scene
 from stages.refine.options import RefineOptions
 from stages.refine.patches import none_like
 from stages.refine.register import LEAST, Registration, approach, rough_fit, settle
 from stages.refine.register_cloud import Cloud
 from stages.refine.sight import Sight
-from stages.scene.gaussians import Gaussians, moved
-from stages.scene.scene import Scene
-from stages.scene.scene_ply import read_scene
 
 log = logging.getLogger(__name__)
 FIT = 0.8  # a lower fit is another object

@@ -6,8 +6,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from stages.geometry.neighbours import knn
-from stages.scene.gaussians import Gaussians
+from stages.core.geometry.neighbours import knn
+from stages.core.scene.gaussians import Gaussians
 
 EVEN = 0.2  # least deviation of the logarithm of distances: an even surface's corners are not lonely
 

@@ -6,9 +6,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from stages.geometry.harmonics import rgb_to_sh
-from stages.geometry.rotations import quaternion
-from stages.scene.gaussians import Gaussians
+from stages.core.geometry.harmonics import rgb_to_sh
+from stages.core.geometry.rotations import quaternion
+from stages.core.scene.gaussians import Gaussians
 
 ACROSS, THICK = 0.65, 0.12  # standard deviations of a patch, as a share of the spacing: no holes, little overlap
 

@@ -12,15 +12,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from stages.errors import InputError
-from stages.geometry.cameras import centres, depths, intrinsics, look_at, project, resize
-from stages.geometry.similarity import Similarity
-from stages.models.diffsplat.maps import FOCAL, RADIUS, cameras
-from stages.physics.sight import SIDE as SMALL
-from stages.raster.rasterise import rasterise, rasterise_features, visibility
-from stages.scene.gaussians import Gaussians
-from stages.scene.images import list_photos, read_image
-from stages.scene.scene import Scene
+from stages.core.errors import InputError
+from stages.core.geometry.cameras import centres, depths, intrinsics, look_at, project, resize
+from stages.core.geometry.similarity import Similarity
+from stages.core.models.diffsplat.maps import FOCAL, RADIUS, cameras
+from stages.core.perception.visibility import SIDE as SMALL
+from stages.core.raster.rasterise import rasterise, rasterise_features, visibility
+from stages.core.scene.gaussians import Gaussians
+from stages.core.scene.images import list_photos, read_image
+from stages.core.scene.scene import Scene
 
 FILLS = 0.8  # share of the side that the object's longer side takes, as in the public code
 LEARNED = (-5.0, 30.0)  # elevations that DiffSplat was trained from [degrees]

@@ -13,12 +13,12 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from stages.geometry.neighbours import Products, Tree, searchable
-from stages.geometry.rotations import matrix, nearest
-from stages.geometry.similarity import Similarity
+from stages.core.geometry.neighbours import Products, Tree, searchable
+from stages.core.geometry.rotations import matrix, nearest
+from stages.core.geometry.similarity import Similarity
+from stages.core.scene.gaussians import Gaussians
 from stages.refine.register_cloud import COLOUR, REACH, Cloud
 from stages.refine.register_guess import Poses, guesses, misfit
-from stages.scene.gaussians import Gaussians
 
 LEAST = 100  # points of a part, or there is nothing to go by
 PLANE = 0.7  # weight of the distance along the normal; along the surface it is the rest, or plain parts would hold all

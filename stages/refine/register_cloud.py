@@ -9,9 +9,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from stages.geometry.harmonics import C0
-from stages.geometry.neighbours import Products, Tree, searchable
-from stages.scene.gaussians import Gaussians
+from stages.core.geometry.harmonics import C0
+from stages.core.geometry.neighbours import Products, Tree, searchable
+from stages.core.scene.gaussians import Gaussians
 
 MOST = 30_000  # points that are smoothed from
 POINTS = 3000  # points that are kept, about

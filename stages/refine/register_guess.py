@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from stages.geometry.neighbours import Products, Tree
-from stages.geometry.rotations import matrix, nearest
+from stages.core.geometry.neighbours import Products, Tree
+from stages.core.geometry.rotations import matrix, nearest
 from stages.refine.register_cloud import COLOUR, Cloud
 
 RADII = (0.07, 0.14, 0.28)  # of the neighbourhoods described [diameters of the whole object]
@@ -40,7 +40,7 @@ class Poses:
 
     @staticmethod
     def fitted(a: Float[Tensor, "h k 3"], b: Float[Tensor, "h k 3"]) -> Poses:
-        """Least squares, a to b. Source: Umeyama 1991, as in stages.geometry.similarity, for many at once."""
+        """Least squares, a to b. Source: Umeyama 1991, as in stages.core.geometry.similarity, for many at once."""
         mean_a, mean_b = a.mean(1, keepdim=True), b.mean(1, keepdim=True)
         A, B = a - mean_a, b - mean_b
         H = B.mT @ A

@@ -10,11 +10,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from stages.geometry.cameras import depths, project
-from stages.physics.sight import small
-from stages.raster.rasterise import rasterise, visibility
-from stages.scene.gaussians import Gaussians, concatenate
-from stages.scene.scene import Scene
+from stages.core.geometry.cameras import depths, project
+from stages.core.perception.visibility import small
+from stages.core.raster.rasterise import rasterise, visibility
+from stages.core.scene.gaussians import Gaussians, concatenate
+from stages.core.scene.scene import Scene
 
 FAR = 1e9
 

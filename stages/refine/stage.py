@@ -9,21 +9,21 @@ from pathlib import Path
 import torch
 from tqdm import tqdm
 
-from stages.backends import choose, pick_device
-from stages.errors import InputError
-from stages.geometry.neighbours import knn
-from stages.physics.growing import complete as take_halo
-from stages.physics.support import Support, find_support, view_of
-from stages.physics.wall import find_wall, laid_down
+from stages.core.backends import choose, pick_device
+from stages.core.errors import InputError
+from stages.core.geometry.neighbours import knn
+from stages.core.perception.growing import complete as take_halo
+from stages.core.perception.support import Support, find_support, view_of
+from stages.core.perception.wall import find_wall, laid_down
+from stages.core.scene.files import provenance
+from stages.core.scene.gaussians import Gaussians, concatenate, moved
+from stages.core.scene.scene import Scene
+from stages.core.scene.scene_ply import read_scene, write_scene
 from stages.refine.background import fill
 from stages.refine.options import BACKENDS, RefineOptions
 from stages.refine.outliers import floaters
 from stages.refine.patches import none_like
 from stages.refine.sight import Sight, agreement
-from stages.scene.files import provenance
-from stages.scene.gaussians import Gaussians, concatenate, moved
-from stages.scene.scene import Scene
-from stages.scene.scene_ply import read_scene, write_scene
 
 log = logging.getLogger(__name__)
 

@@ -10,12 +10,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from stages.errors import InputError
+from stages.core.errors import InputError
+from stages.core.scene.gaussians import Gaussians, concatenate
+from stages.core.scene.images import PHOTOS, read_image, resize
+from stages.core.scene.scene import Scene
+from stages.core.scene.scene_ply import read_scene
 from stages.render.options import hex_colour
-from stages.scene.gaussians import Gaussians, concatenate
-from stages.scene.images import PHOTOS, read_image, resize
-from stages.scene.scene import Scene
-from stages.scene.scene_ply import read_scene
 
 log = logging.getLogger(__name__)
 WHITE = (1.0, 1.0, 1.0)

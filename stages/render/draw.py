@@ -10,11 +10,11 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from stages.geometry.harmonics import C0, rgb_to_sh
-from stages.raster.rasterise import rasterise
+from stages.core.geometry.harmonics import C0, rgb_to_sh
+from stages.core.raster.rasterise import rasterise
+from stages.core.scene.cameras import Cameras
+from stages.core.scene.gaussians import Gaussians
 from stages.render.backdrop import Backdrop
-from stages.scene.cameras import Cameras
-from stages.scene.gaussians import Gaussians
 
 SEEN = 0.5  # opacity a pixel needs to have a depth
 GOLDEN = 0.6180339887498949  # steps of this part of the colour wheel keep hues apart for any number of objects

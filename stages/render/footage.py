@@ -10,13 +10,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from stages.errors import InputError
-from stages.physics.skinning import Skinning
-from stages.scene.files import must_exist
-from stages.scene.gaussians import Gaussians
-from stages.scene.scene import Scene
-from stages.scene.scene_ply import read_scene
-from stages.scene.trajectory import Trajectory, read_trajectory
+from stages.core.errors import InputError
+from stages.core.physics.skinning import Skinning
+from stages.core.scene.files import must_exist
+from stages.core.scene.gaussians import Gaussians
+from stages.core.scene.scene import Scene
+from stages.core.scene.scene_ply import read_scene
+from stages.core.scene.trajectory import Trajectory, read_trajectory
 
 WHAT = "a trajectory (.h5) or a scene (.ply)"
 SECONDS, FPS = 4.0, 30.0  # of a film in which only the camera moves

@@ -6,7 +6,7 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-from stages.errors import InputError
+from stages.core.errors import InputError
 
 VIEWS = "novel | orbit | input:K | all | path.json"
 

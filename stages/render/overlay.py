@@ -10,12 +10,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from stages.geometry.cameras import depths, project
-from stages.geometry.rotations import matrix
+from stages.core.geometry.cameras import depths, project
+from stages.core.geometry.rotations import matrix
+from stages.core.scene.cameras import Cameras
+from stages.core.scene.images import to_bytes
 from stages.render.footage import Footage
 from stages.render.subject import extent
-from stages.scene.cameras import Cameras
-from stages.scene.images import to_bytes
 
 INK, EDGE = (255, 122, 20), (40, 20, 0)  # of arrows, RGB
 LENGTH = 1.6  # of the arrow of the largest force, in radii of its object

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from stages.geometry.cameras import look_at
+from stages.core.geometry.cameras import look_at
 from stages.render.subject import Subject
 
 EDGE = 0.95  # of the picture, for what moves

@@ -14,11 +14,11 @@ import torch
 from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation, Slerp
 
-from stages.errors import InputError
-from stages.geometry.cameras import centres
-from stages.geometry.rotations import nearest
-from stages.scene.cameras import Cameras
-from stages.scene.files import must_exist
+from stages.core.errors import InputError
+from stages.core.geometry.cameras import centres
+from stages.core.geometry.rotations import nearest
+from stages.core.scene.cameras import Cameras
+from stages.core.scene.files import must_exist
 
 WHAT = "a camera path (.json: a list of {rotation, position, width, height, fx, fy} or of {viewmat, K, size})"
 

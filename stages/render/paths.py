@@ -8,12 +8,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from stages.errors import InputError
-from stages.geometry.cameras import centres, intrinsics, look_at, resize
+from stages.core.errors import InputError
+from stages.core.geometry.cameras import centres, intrinsics, look_at, resize
+from stages.core.scene.cameras import Cameras
 from stages.render.pan import pan
 from stages.render.path_file import follow, read_path
 from stages.render.subject import Subject
-from stages.scene.cameras import Cameras
 
 ARC = 30.0  # longest sweep of the novel view [degrees]
 NEAR = 25.0  # cameras within this azimuth of each other lend the novel view their height and distance [degrees]

@@ -10,16 +10,16 @@ from jaxtyping import Float
 from torch import Tensor
 from tqdm import tqdm
 
-from stages.backends import pick_device
-from stages.errors import InputError
+from stages.core.backends import pick_device
+from stages.core.errors import InputError
+from stages.core.scene.files import provenance, replacing
+from stages.core.scene.images import VideoWriter, write_depth, write_jpeg, write_png
 from stages.render.backdrop import open_backdrop
 from stages.render.draw import Seen, depth_range
 from stages.render.footage import Footage, open_footage
 from stages.render.options import RenderOptions
 from stages.render.overlay import columns_for
 from stages.render.studio import Studio, Take
-from stages.scene.files import provenance, replacing
-from stages.scene.images import VideoWriter, write_depth, write_jpeg, write_png
 
 MOMENTS, ACROSS = 12, 4  # of a contact sheet
 MOST = 8  # files side by side

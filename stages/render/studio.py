@@ -10,8 +10,10 @@ from functools import cached_property
 from jaxtyping import Float
 from torch import Tensor
 
-from stages.errors import InputError
-from stages.geometry.cameras import centres
+from stages.core.errors import InputError
+from stages.core.geometry.cameras import centres
+from stages.core.scene.cameras import Cameras
+from stages.core.scene.gaussians import Gaussians
 from stages.render.backdrop import Backdrop
 from stages.render.draw import Seen, depth_colours, false_colour, look
 from stages.render.footage import Footage
@@ -19,8 +21,6 @@ from stages.render.options import RenderOptions
 from stages.render.overlay import arrows_at, caption, columns_for, draw_arrows, tile
 from stages.render.paths import camera_path, scaled
 from stages.render.subject import Subject, joint, subject_of
-from stages.scene.cameras import Cameras
-from stages.scene.gaussians import Gaussians
 
 log = logging.getLogger(__name__)
 SAME = 1e-3  # cameras of one world agree to this share of their distance from each other

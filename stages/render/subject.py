@@ -9,10 +9,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from stages.geometry.cameras import centres, depths, project
+from stages.core.geometry.cameras import centres, depths, project
+from stages.core.scene.cameras import Cameras
+from stages.core.scene.gaussians import Gaussians
 from stages.render.footage import Footage
-from stages.scene.cameras import Cameras
-from stages.scene.gaussians import Gaussians
 
 KEPT = (0.05, 0.95)  # quantiles of each coordinate that count as the extent
 VISIBLE = 0.1  # opacity

@@ -9,8 +9,8 @@ from jaxtyping import Float
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 from torch import Tensor
 
-from stages.physics.support import Support
-from stages.scene.gaussians import Gaussians
+from stages.core.perception.support import Support
+from stages.core.scene.gaussians import Gaussians
 
 CELL = 0.01  # that positions are thinned to [view radii]
 TOUCH = 2.0  # cells between parts that touch

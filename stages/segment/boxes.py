@@ -14,9 +14,9 @@ from scipy.ndimage import binary_fill_holes, distance_transform_edt, gaussian_fi
 from torch import Tensor
 from tqdm import tqdm
 
-from stages.errors import InputError
-from stages.geometry.cameras import centres
-from stages.scene.scene import Scene
+from stages.core.errors import InputError
+from stages.core.geometry.cameras import centres
+from stages.core.scene.scene import Scene
 from stages.segment.options import SegmentOptions
 from stages.segment.prompts import read_prompts
 from stages.segment.vote import Sight, add, decide, tempered

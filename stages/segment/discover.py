@@ -8,9 +8,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from stages.models.sam2.automatic import propose
-from stages.physics.support import Support, view_of
-from stages.scene.scene import Scene
+from stages.core.models.sam2.automatic import propose
+from stages.core.perception.support import Support, view_of
+from stages.core.scene.scene import Scene
 from stages.segment.options import SegmentOptions
 from stages.segment.propagate import Tracker, resized
 from stages.segment.vote import Sight

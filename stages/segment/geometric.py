@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from stages.physics.grouping import Grouping, group, named
-from stages.physics.support import find_support, view_of
-from stages.physics.wall import find_wall
-from stages.scene.scene import Scene
+from stages.core.perception.grouping import Grouping, group, named
+from stages.core.perception.support import find_support, view_of
+from stages.core.perception.wall import find_wall
+from stages.core.scene.scene import Scene
 from stages.segment.bodies import joined
 from stages.segment.options import SegmentOptions
 from stages.segment.rims import redrawn

@@ -9,9 +9,9 @@ from jaxtyping import Int
 from torch import Tensor
 from tqdm import tqdm
 
-from stages.errors import InputError
-from stages.scene.images import read_labels
-from stages.scene.scene import Scene
+from stages.core.errors import InputError
+from stages.core.scene.images import read_labels
+from stages.core.scene.scene import Scene
 from stages.segment.options import SegmentOptions
 from stages.segment.pictures import check_proportions, match
 from stages.segment.vote import decide, poll

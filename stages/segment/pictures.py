@@ -10,11 +10,11 @@ from pathlib import Path
 from jaxtyping import Float
 from torch import Tensor
 
-from stages.errors import InputError
-from stages.geometry.cameras import resize as resize_K
-from stages.raster.rasterise import rasterise
-from stages.scene.images import PHOTOS, read_image
-from stages.scene.scene import Scene
+from stages.core.errors import InputError
+from stages.core.geometry.cameras import resize as resize_K
+from stages.core.raster.rasterise import rasterise
+from stages.core.scene.images import PHOTOS, read_image
+from stages.core.scene.scene import Scene
 
 log = logging.getLogger(__name__)
 SIDE = 1024  # longest side that a scene is drawn at [px]

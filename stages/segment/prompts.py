@@ -10,8 +10,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from stages.errors import InputError
-from stages.scene.files import must_exist
+from stages.core.errors import InputError
+from stages.core.scene.files import must_exist
 
 
 @dataclass(frozen=True)

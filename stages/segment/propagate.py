@@ -11,8 +11,8 @@ from torch import Tensor
 from tqdm import tqdm
 from transformers import Sam2VideoModel
 
-from stages.models.sam2.network import Clicks, pixel_values, side_of, track
-from stages.scene.scene import Scene
+from stages.core.models.sam2.network import Clicks, pixel_values, side_of, track
+from stages.core.scene.scene import Scene
 from stages.segment.pictures import Pictures
 from stages.segment.vote import counted_at
 

@@ -8,12 +8,12 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from stages.geometry.neighbours import knn
-from stages.physics.growing import lab_of
-from stages.physics.sight import seen_from
-from stages.physics.support import Support
-from stages.scene.gaussians import Gaussians
-from stages.scene.scene import Scene
+from stages.core.geometry.neighbours import knn
+from stages.core.perception.growing import lab_of
+from stages.core.perception.support import Support
+from stages.core.perception.visibility import seen_from
+from stages.core.scene.gaussians import Gaussians
+from stages.core.scene.scene import Scene
 
 MARGIN = 0.015  # width of a border to either side, about ten pixels of a photo [view radii]
 SEEN = 0.5  # weight in all photos together from which a Gaussian shows [px of small photos]

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import torch
 
-from stages.backends import pick_device
-from stages.errors import InputError
-from stages.models.sam2.weights import download, find, load
-from stages.physics.grouping import named
-from stages.physics.support import find_support
-from stages.scene.scene import Scene
+from stages.core.backends import pick_device
+from stages.core.errors import InputError
+from stages.core.models.sam2.weights import download, find, load
+from stages.core.perception.grouping import named
+from stages.core.perception.support import find_support
+from stages.core.scene.scene import Scene
 from stages.segment.options import SegmentOptions
 from stages.segment.pictures import Pictures, pictures
 from stages.segment.prompts import Prompts, read_prompts
@@ -66,7 +66,7 @@ def labelled(scene: Scene, model, shown: Pictures, prompts: Prompts | None, opti
 
 def clicks_of(prompts: Prompts, scene: Scene) -> list:
     """A box for each object, or a point where there are no boxes, as shares of the first view."""
-    from stages.models.sam2.network import Clicks
+    from stages.core.models.sam2.network import Clicks
 
     size = scene.cameras.sizes[0].float()
     if prompts.boxes is not None:

@@ -6,10 +6,10 @@ import re
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from stages.errors import InputError
+from stages.core.errors import InputError
 
 if TYPE_CHECKING:
-    from stages.scene.scene import Scene
+    from stages.core.scene.scene import Scene
 
 FORM = re.compile(r"object=(?P<object>[0-9]+)\s+(?P<side>height|length)=(?P<metres>[0-9.eE+-]+)")
 OUTERMOST = 0.005  # of an object's Gaussians at either end do not count

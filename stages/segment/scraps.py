@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import torch
 
-from stages.geometry.neighbours import knn
-from stages.physics.sight import seen_from
-from stages.physics.support import Support
-from stages.scene.gaussians import Gaussians
-from stages.scene.scene import Scene
+from stages.core.geometry.neighbours import knn
+from stages.core.perception.support import Support
+from stages.core.perception.visibility import seen_from
+from stages.core.scene.gaussians import Gaussians
+from stages.core.scene.scene import Scene
 from stages.segment.rims import LEVEL, MARGIN, SEEN
 
 SHOWS = 0.1  # opacity from which a Gaussian counts

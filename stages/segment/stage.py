@@ -6,11 +6,11 @@ import logging
 from dataclasses import replace
 from pathlib import Path
 
-from stages.backends import choose, pick_device
-from stages.errors import InputError
-from stages.scene.files import provenance
-from stages.scene.scene import Scene
-from stages.scene.scene_ply import read_scene, write_scene
+from stages.core.backends import choose, pick_device
+from stages.core.errors import InputError
+from stages.core.scene.files import provenance
+from stages.core.scene.scene import Scene
+from stages.core.scene.scene_ply import read_scene, write_scene
 from stages.segment.options import BACKENDS, SegmentOptions
 from stages.segment.scale import parse_scale
 

@@ -10,14 +10,14 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from stages.errors import InputError
-from stages.geometry.cameras import depths, project
-from stages.geometry.cameras import resize as resize_K
-from stages.geometry.neighbours import knn
-from stages.physics.growing import complete
-from stages.physics.support import find_support
-from stages.raster.rasterise import rasterise, visibility
-from stages.scene.scene import Scene, SceneObject
+from stages.core.errors import InputError
+from stages.core.geometry.cameras import depths, project
+from stages.core.geometry.cameras import resize as resize_K
+from stages.core.geometry.neighbours import knn
+from stages.core.perception.growing import complete
+from stages.core.perception.support import find_support
+from stages.core.raster.rasterise import rasterise, visibility
+from stages.core.scene.scene import Scene, SceneObject
 
 log = logging.getLogger(__name__)
 SIDE = 640  # longest side that votes are counted at [px]

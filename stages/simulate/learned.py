@@ -17,20 +17,20 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from stages.backends import pick_device
-from stages.errors import InputError
-from stages.models import weights
-from stages.models.dynamics import FRAME, Dynamics
-from stages.models.pushes import Pushes
-from stages.models.solid import sides, solidity
-from stages.models.stepper import Stepper
-from stages.models.world import FLOOR, World, centre
-from stages.physics.forces import Prompts
-from stages.physics.materials import PLASTIC, choose_materials
-from stages.physics.skinning import rotations
-from stages.physics.state import State
-from stages.scene.scene import Scene, SceneObject
-from stages.scene.trajectory import Keypoints
+from stages.core.backends import pick_device
+from stages.core.errors import InputError
+from stages.core.models import checkpoints as weights
+from stages.core.models.dynamics import FRAME, Dynamics
+from stages.core.models.external_forces import Pushes
+from stages.core.models.field.solidity import sides, solidity
+from stages.core.models.initial_conditions import FLOOR, World, centre
+from stages.core.models.rollout import Stepper
+from stages.core.physics.forces import Prompts
+from stages.core.physics.materials import PLASTIC, choose_materials
+from stages.core.physics.skinning import rotations
+from stages.core.physics.state import State
+from stages.core.scene.scene import Scene, SceneObject
+from stages.core.scene.trajectory import Keypoints
 from stages.simulate.mpm import Stage, set_up
 from stages.simulate.options import SimulateOptions
 from stages.simulate.sleep import Sleepers

@@ -14,19 +14,19 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from stages.backends import pick_device
-from stages.errors import InputError
-from stages.geometry.neighbours import knn
-from stages.physics import mpm
-from stages.physics.forces import Force, Prompts, vector
-from stages.physics.keypoints import nearest_weights
-from stages.physics.materials import Choice, choose_materials
-from stages.physics.mpm_refine import halved
-from stages.physics.particles import Bodies, sample
-from stages.physics.skinning import rotations
-from stages.physics.state import State
-from stages.scene.scene import Scene, SceneObject
-from stages.scene.trajectory import Keypoints
+from stages.core.backends import pick_device
+from stages.core.errors import InputError
+from stages.core.geometry.neighbours import knn
+from stages.core.physics.forces import Force, Prompts, vector
+from stages.core.physics.keypoints import nearest_weights
+from stages.core.physics.materials import Choice, choose_materials
+from stages.core.physics.mpm import solver as mpm
+from stages.core.physics.mpm.resample import halved
+from stages.core.physics.particles import Bodies, sample
+from stages.core.physics.skinning import rotations
+from stages.core.physics.state import State
+from stages.core.scene.scene import Scene, SceneObject
+from stages.core.scene.trajectory import Keypoints
 from stages.simulate.options import Quality, SimulateOptions
 
 log = logging.getLogger(__name__)

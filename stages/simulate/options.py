@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 
-from stages.errors import InputError
+from stages.core.errors import InputError
 
 BACKENDS = {
     "ngff": "stages.simulate.learned:rollout",

@@ -10,8 +10,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from stages.models.contact import nearest
-from stages.models.world import World
+from stages.core.models.field.narrow_phase import nearest
+from stages.core.models.initial_conditions import World
 
 TOUCH = 0.05  # what is nearer touches, beside half the distance between keypoints [m]
 SEAM = 0.1  # the same of things at the start: photos show little of where they touch

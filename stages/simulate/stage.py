@@ -9,14 +9,14 @@ from pathlib import Path
 import torch
 from tqdm import tqdm
 
-from stages.backends import choose
-from stages.errors import InputError
-from stages.physics import forces
-from stages.physics.keypoints import bind, choose_keypoints
-from stages.scene.files import provenance
-from stages.scene.scene import Scene
-from stages.scene.scene_ply import read_scene
-from stages.scene.trajectory import Motion, TrajectoryWriter
+from stages.core.backends import choose
+from stages.core.errors import InputError
+from stages.core.physics import forces
+from stages.core.physics.keypoints import bind, choose_keypoints
+from stages.core.scene.files import provenance
+from stages.core.scene.scene import Scene
+from stages.core.scene.scene_ply import read_scene
+from stages.core.scene.trajectory import Motion, TrajectoryWriter
 from stages.simulate.options import BACKENDS, SimulateOptions
 
 log = logging.getLogger(__name__)
@@ -56,7 +56,7 @@ def with_objects(scene: Scene, path: Path) -> Scene:
             log.warning("object %d (%s) has no Gaussians and is left out", o.id, o.name)
     if present:
         return replace(scene, objects=present)
-    from stages.physics.grouping import group  # noqa: PLC0415 -- only unlabelled scenes need it
+    from stages.core.perception.grouping import group  # noqa: PLC0415 -- only unlabelled scenes need it
 
     grouped = group(scene)
     if not grouped.objects or not torch.any(grouped.gaussians.object_id > 0):

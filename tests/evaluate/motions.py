@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import torch
 
-from stages.geometry.rotations import matrix
-from stages.physics.keypoints import bind
-from stages.scene.trajectory import Keypoints, Motion, TrajectoryWriter
+from stages.core.geometry.rotations import matrix
+from stages.core.physics.keypoints import bind
+from stages.core.scene.trajectory import Keypoints, Motion, TrajectoryWriter
 
 
 def turn(angle: float) -> torch.Tensor:

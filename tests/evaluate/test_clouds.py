@@ -3,12 +3,12 @@ from dataclasses import replace
 import pytest
 import torch
 
-from stages.errors import InputError
+from stages.core.errors import InputError
+from stages.core.geometry.similarity import Similarity
+from stages.core.scene.scene_ply import write_scene
 from stages.evaluate.clouds import chamfer, label_iou, nearest
 from stages.evaluate.options import EvaluateOptions
 from stages.evaluate.stage import run
-from stages.geometry.similarity import Similarity
-from stages.scene.scene_ply import write_scene
 from tests.evaluate.motions import elsewhere, turn
 
 

@@ -4,11 +4,11 @@ import pytest
 import torch
 from scipy.ndimage import gaussian_filter
 
-from stages.errors import InputError
+from stages.core.errors import InputError
+from stages.core.scene.images import VideoWriter, write_png
 from stages.evaluate.options import EvaluateOptions
 from stages.evaluate.pictures import psnr, ssim
 from stages.evaluate.stage import run
-from stages.scene.images import VideoWriter, write_png
 
 
 def picture(seed: int, h: int = 40, w: int = 50):

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from stages.errors import InputError
+from stages.core.errors import InputError
 from stages.evaluate.options import EvaluateOptions
 from stages.evaluate.result import Result, table, to_json
 from stages.evaluate.stage import run

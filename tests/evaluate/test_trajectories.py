@@ -5,12 +5,12 @@ import h5py
 import pytest
 import torch
 
-from stages.errors import InputError
+from stages.core.errors import InputError
+from stages.core.geometry.similarity import Similarity
 from stages.evaluate.align import World, alignment
 from stages.evaluate.options import EvaluateOptions
 from stages.evaluate.stage import run
 from stages.evaluate.trajectories import carry
-from stages.geometry.similarity import Similarity
 from tests.evaluate.motions import elsewhere, renamed, turn, write
 
 

@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from stages.scene.trajectory import read_trajectory
+from stages.core.scene.trajectory import read_trajectory
 
 BOUNCE = Path(__file__).resolve().parents[2] / "examples/new_backend/bounce.py"
 

@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import torch
 
-from stages.lab import backgrounds
-from stages.lab.dataset_options import DatasetOptions
-from stages.lab.objects import OBJECTS
-from stages.lab.scenes import SCENES
-from stages.lab.shapes import box, to_gaussians
-from stages.scene.gaussians import Gaussians
+from stages.core.scene.gaussians import Gaussians
+from stages.lab.assets import backgrounds
+from stages.lab.assets.objects import OBJECTS
+from stages.lab.assets.shapes import box, to_gaussians
+from stages.lab.dataset.options import DatasetOptions
+from stages.lab.dataset.scenes import SCENES
 
 OPTIONS = DatasetOptions("3_9", "scenes,mpm,initial,dynamic", 3, 64, 0.08, 0.04, 2e-3, views="0,16",
                          backgrounds="table0", resolution=32, device="cpu")  # fmt: skip

@@ -12,8 +12,8 @@ from typer.testing import CliRunner
 from ngff_cli import app as commands
 from ngff_cli.app import app
 from stages import PIPELINE
-from stages.scene.scene_ply import read_scene, write_scene
-from stages.scene.trajectory import read_trajectory
+from stages.core.scene.scene_ply import read_scene, write_scene
+from stages.core.scene.trajectory import read_trajectory
 from stages.simulate.options import SimulateOptions
 from stages.simulate.stage import run
 from tests.conftest import two_balls_scene

@@ -2,13 +2,13 @@
 
 import torch
 
-from stages.models.pi3.network import Geometry
-from stages.models.pi3.splat import CHANNELS
+from stages.core.models.pi3.network import Geometry
+from stages.core.models.pi3.splat import CHANNELS
+from stages.core.scene.cameras import Cameras
+from stages.core.scene.images import to_bytes
 from stages.reconstruct import crops
 from stages.reconstruct.depth import unproject
 from stages.reconstruct.photos import Photos
-from stages.scene.cameras import Cameras
-from stages.scene.images import to_bytes
 from tests.reconstruct.raycast import photograph
 
 C0 = 0.28209479177387814

@@ -6,9 +6,9 @@ from pathlib import Path
 import torch
 import torch.nn.functional as F
 
-from stages.geometry.cameras import intrinsics, orbit
-from stages.scene.cameras import Cameras
-from stages.scene.images import write_png
+from stages.core.geometry.cameras import intrinsics, orbit
+from stages.core.scene.cameras import Cameras
+from stages.core.scene.images import write_png
 
 BLOCK = (0.25, 0.2, 0.2)  # half sides along x and y, height; it stands at the origin
 

@@ -3,12 +3,12 @@
 import pytest
 import torch
 
-from stages.errors import InputError
-from stages.geometry.cameras import intrinsics, orbit
+from stages.core.errors import InputError
+from stages.core.geometry.cameras import intrinsics, orbit
+from stages.core.scene.cameras import Cameras
 from stages.reconstruct.advice import advise, widest_gap
 from stages.reconstruct.options import ReconstructOptions
 from stages.reconstruct.scale import parse_scale
-from stages.scene.cameras import Cameras
 
 
 def around(count: int, sweep: float = 360.0, elevation: float = 30.0, azimuth: float = 0.0) -> Cameras:

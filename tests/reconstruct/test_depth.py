@@ -3,11 +3,11 @@
 import pytest
 import torch
 
-from stages.geometry.planes import Plane
+from stages.core.geometry.planes import Plane
+from stages.core.scene.cameras import Lenses
 from stages.reconstruct import depth as stereo
 from stages.reconstruct.photos import Views
 from stages.reconstruct.sfm import SparseModel
-from stages.scene.cameras import Lenses
 from tests.reconstruct.raycast import arc, photograph
 
 

@@ -4,13 +4,13 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from stages.errors import InputError
-from stages.models.aliked import ALIKED
-from stages.models.lightglue import LightGlue
+from stages.core.errors import InputError
+from stages.core.models.matching.aliked import ALIKED
+from stages.core.models.matching.lightglue import LightGlue
+from stages.core.scene.images import write_png
 from stages.reconstruct import features, features_learned
 from stages.reconstruct.options import ReconstructOptions
 from stages.reconstruct.stage import run
-from stages.scene.images import write_png
 from tests.reconstruct.raycast import arc, photograph
 
 

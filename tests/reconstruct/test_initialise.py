@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from stages.geometry.rotations import matrix
+from stages.core.geometry.rotations import matrix
 from stages.reconstruct import initialise
 from stages.reconstruct.depth import DepthMap
 from stages.reconstruct.initialise import Cloud

@@ -7,20 +7,20 @@ import torch
 import torch.nn.functional as F
 from safetensors.torch import save_file
 
-from stages.errors import InputError
-from stages.geometry.cameras import centres
-from stages.geometry.similarity import umeyama
-from stages.models.pi3.network import Pi3, halve
-from stages.models.pi3.splat import Pi3Splat
+from stages.core.errors import InputError
+from stages.core.geometry.cameras import centres
+from stages.core.geometry.similarity import umeyama
+from stages.core.models.pi3.network import Pi3, halve
+from stages.core.models.pi3.splat import Pi3Splat
+from stages.core.scene.scene_ply import read_scene
 from stages.reconstruct import learned
 from stages.reconstruct import options as choices
 from stages.reconstruct.options import ReconstructOptions
 from stages.reconstruct.photometric import score
 from stages.reconstruct.stage import run
 from stages.reconstruct.steps import Steps
-from stages.scene.scene_ply import read_scene
-from tests.models.pi3.test_network import TINY, random_weights
-from tests.models.pi3.test_splat import TINY_SPLAT
+from tests.core.models.pi3.test_network import TINY, random_weights
+from tests.core.models.pi3.test_splat import TINY_SPLAT
 from tests.reconstruct.oracle import photos_of, true_splats, truth
 from tests.reconstruct.raycast import BLOCK, arc, write_set
 

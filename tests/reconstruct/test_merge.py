@@ -4,7 +4,7 @@ import dataclasses
 
 import torch
 
-from stages.geometry.rotations import covariance
+from stages.core.geometry.rotations import covariance
 from stages.reconstruct.merge import merge
 from tests.conftest import random_gaussians
 

@@ -5,10 +5,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from stages.raster.rasterise import rasterise
+from stages.core.raster.rasterise import rasterise
+from stages.core.scene.gaussians import Gaussians, concatenate
 from stages.reconstruct import photometric
 from stages.reconstruct.photos import Views
-from stages.scene.gaussians import Gaussians, concatenate
 from tests.conftest import ball, random_gaussians, ring
 
 

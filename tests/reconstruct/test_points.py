@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from stages.geometry.cameras import intrinsics
-from stages.models.pi3.network import Geometry
+from stages.core.geometry.cameras import intrinsics
+from stages.core.models.pi3.network import Geometry
 from stages.reconstruct import crops, points
 from stages.reconstruct.photos import Photos
 from tests.reconstruct.oracle import truth

@@ -12,7 +12,7 @@ import pytest
 import torch
 from PIL import Image
 
-from stages.errors import InputError
+from stages.core.errors import InputError
 from stages.reconstruct import reading
 from stages.reconstruct.reading import read_photos
 

@@ -3,12 +3,12 @@
 import pytest
 import torch
 
-from stages.errors import InputError
-from stages.geometry.cameras import centres
-from stages.geometry.similarity import umeyama
+from stages.core.errors import InputError
+from stages.core.geometry.cameras import centres
+from stages.core.geometry.similarity import umeyama
+from stages.core.scene.cameras import Lenses
 from stages.reconstruct import features, sfm
 from stages.reconstruct.photos import Photos, undistort
-from stages.scene.cameras import Lenses
 from tests.reconstruct.raycast import arc, photograph
 
 

@@ -7,12 +7,12 @@ import pytest
 import torch
 from PIL import Image
 
-from stages.errors import InputError
-from stages.geometry.cameras import centres
+from stages.core.errors import InputError
+from stages.core.geometry.cameras import centres
+from stages.core.scene.scene_ply import read_scene
 from stages.reconstruct import options as choices
 from stages.reconstruct.options import ReconstructOptions
 from stages.reconstruct.stage import run
-from stages.scene.scene_ply import read_scene
 from tests.reconstruct.raycast import BLOCK, arc, photograph, write_set
 
 
@@ -37,7 +37,7 @@ def test_the_table_is_level_and_at_zero(made):
 
 
 def test_up_and_floor_are_those_of_the_truth(made):
-    from stages.lab.bench_reconstruct import upright_error
+    from stages.lab.bench.reconstruct import upright_error
 
     _, scene = made
     tilt, floor = upright_error(scene.cameras, arc(7, (160, 120), sweep=70.0), scene.floor, 0.0)
@@ -63,9 +63,9 @@ def test_given_cameras_keep_scale_and_names(made):
 
 
 def test_photos_kept_out_look_right_too(made, capsys, caplog):
+    from stages.core.scene.images import read_image
     from stages.reconstruct.photometric import score
     from stages.reconstruct.photos import Views
-    from stages.scene.images import read_image
 
     folder, scene = made
     images = tuple((read_image(folder / "images" / n) * 255).round().to(torch.uint8) for n in scene.cameras.names)

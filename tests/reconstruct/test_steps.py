@@ -5,7 +5,7 @@ import pickle
 import pytest
 import torch
 
-from stages.errors import InputError
+from stages.core.errors import InputError
 from stages.reconstruct.depth import DepthMap
 from stages.reconstruct.steps import Steps, fingerprint, peak_memory
 

@@ -5,9 +5,9 @@ import math
 import pytest
 import torch
 
-from stages.geometry.cameras import centres, look_at, orbit
-from stages.geometry.rotations import matrix
-from stages.geometry.similarity import Similarity
+from stages.core.geometry.cameras import centres, look_at, orbit
+from stages.core.geometry.rotations import matrix
+from stages.core.geometry.similarity import Similarity
 from stages.reconstruct import upright
 
 

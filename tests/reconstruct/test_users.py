@@ -3,12 +3,12 @@
 import pytest
 import torch
 
-from stages.errors import InputError
-from stages.geometry.cameras import centres, intrinsics, orbit
-from stages.geometry.similarity import umeyama
+from stages.core.errors import InputError
+from stages.core.geometry.cameras import centres, intrinsics, orbit
+from stages.core.geometry.similarity import umeyama
+from stages.core.scene.cameras import Cameras
 from stages.reconstruct import sfm
 from stages.reconstruct.photos import Photos
-from stages.scene.cameras import Cameras
 from tests.reconstruct.raycast import arc, photograph, rays_of, texture, with_mirror
 
 

@@ -7,15 +7,18 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from stages.errors import InputError
+from stages.core.errors import InputError
+from stages.core.geometry.cameras import intrinsics
+from stages.core.geometry.harmonics import C0
+from stages.core.geometry.rotations import matrix
+from stages.core.geometry.similarity import Similarity
+from stages.core.models.diffsplat.maps import FOCAL, RADIUS, SCALES, cameras, to_gaussians
+from stages.core.raster.rasterise import rasterise
+from stages.core.scene.gaussians import Gaussians
+from stages.core.scene.scene import Scene, SceneObject
+from stages.core.scene.scene_ply import read_scene, write_scene
 from stages.evaluate.clouds import nearest
-from stages.geometry.cameras import intrinsics
-from stages.geometry.harmonics import C0
-from stages.geometry.rotations import matrix
-from stages.geometry.similarity import Similarity
-from stages.lab.shapes import ellipsoid
-from stages.models.diffsplat.maps import FOCAL, RADIUS, SCALES, cameras, to_gaussians
-from stages.raster.rasterise import rasterise
+from stages.lab.assets.shapes import ellipsoid
 from stages.refine import diffsplat
 from stages.refine.library import moved, solid
 from stages.refine.options import RefineOptions
@@ -24,9 +27,6 @@ from stages.refine.register import register
 from stages.refine.register_cloud import Cloud
 from stages.refine.sight import Sight
 from stages.refine.stage import refine, run
-from stages.scene.gaussians import Gaussians
-from stages.scene.scene import Scene, SceneObject
-from stages.scene.scene_ply import read_scene, write_scene
 from tests.refine.things import thing
 from tests.segment.tabletop import coloured, scene_of, table
 
@@ -133,8 +133,8 @@ def test_a_network_of_noise_adds_nothing_and_it_is_said(seen, tmp_path, caplog, 
     """Random weights in the published layout, through the same loader, sampler (of fewer steps) and registration."""
     pytest.importorskip("diffusers")
     pytest.importorskip("transformers")
-    from stages.models.diffsplat import network
-    from tests.models.diffsplat.tiny import published
+    from stages.core.models.diffsplat import network
+    from tests.core.models.diffsplat.tiny import published
 
     monkeypatch.setattr(network, "STEPS", 3)
     write_scene(tmp_path / "scene.ply", seen)

@@ -6,21 +6,21 @@ from dataclasses import replace
 import pytest
 import torch
 
-from stages.errors import InputError
+from stages.core.errors import InputError
+from stages.core.geometry.cameras import centres, intrinsics, look_at
+from stages.core.geometry.harmonics import C0
+from stages.core.geometry.rotations import matrix
+from stages.core.geometry.similarity import Similarity
+from stages.core.raster.rasterise import rasterise
+from stages.core.scene.gaussians import concatenate
+from stages.core.scene.scene import Scene, SceneObject
+from stages.core.scene.scene_ply import read_scene, write_scene
 from stages.evaluate.clouds import chamfer, nearest
-from stages.geometry.cameras import centres, intrinsics, look_at
-from stages.geometry.harmonics import C0
-from stages.geometry.rotations import matrix
-from stages.geometry.similarity import Similarity
-from stages.lab.shapes import ellipsoid
-from stages.raster.rasterise import rasterise
+from stages.lab.assets.shapes import ellipsoid
 from stages.refine.library import moved
 from stages.refine.options import RefineOptions
 from stages.refine.sight import Sight
 from stages.refine.stage import refine, run
-from stages.scene.gaussians import concatenate
-from stages.scene.scene import Scene, SceneObject
-from stages.scene.scene_ply import read_scene, write_scene
 from tests.conftest import random_gaussians
 from tests.refine.things import thing
 from tests.segment.tabletop import coloured, scene_of, table

@@ -5,9 +5,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from stages.geometry.neighbours import knn
+from stages.core.geometry.neighbours import knn
+from stages.core.scene.gaussians import Gaussians, concatenate
 from stages.refine.outliers import EVEN, floaters, score
-from stages.scene.gaussians import Gaussians, concatenate
 from tests.segment.tabletop import block, egg
 
 

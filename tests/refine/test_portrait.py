@@ -6,17 +6,17 @@ from dataclasses import replace
 import pytest
 import torch
 
-from stages.errors import InputError
-from stages.geometry.cameras import centres, intrinsics, look_at, orbit, project
-from stages.geometry.rotations import matrix
-from stages.geometry.similarity import Similarity
-from stages.models.diffsplat.maps import FOCAL, cameras
-from stages.raster.rasterise import rasterise
+from stages.core.errors import InputError
+from stages.core.geometry.cameras import centres, intrinsics, look_at, orbit, project
+from stages.core.geometry.rotations import matrix
+from stages.core.geometry.similarity import Similarity
+from stages.core.models.diffsplat.maps import FOCAL, cameras
+from stages.core.raster.rasterise import rasterise
+from stages.core.scene.cameras import Cameras
+from stages.core.scene.images import write_png
+from stages.core.scene.scene import Scene, SceneObject
 from stages.refine.library import moved, solid
 from stages.refine.portrait import FILLS, portrait
-from stages.scene.cameras import Cameras
-from stages.scene.images import write_png
-from stages.scene.scene import Scene, SceneObject
 from tests.refine.things import thing
 from tests.segment.tabletop import scene_of, table
 

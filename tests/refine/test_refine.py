@@ -6,23 +6,23 @@ from dataclasses import replace
 import pytest
 import torch
 
-from stages.errors import InputError
-from stages.geometry.cameras import centres, intrinsics, look_at
-from stages.geometry.harmonics import rgb_to_sh
-from stages.geometry.neighbours import knn
-from stages.geometry.rotations import matrix
-from stages.geometry.similarity import Similarity
-from stages.lab.shapes import ellipsoid, sheet
-from stages.raster.rasterise import rasterise, visibility
+from stages.core.errors import InputError
+from stages.core.geometry.cameras import centres, intrinsics, look_at
+from stages.core.geometry.harmonics import rgb_to_sh
+from stages.core.geometry.neighbours import knn
+from stages.core.geometry.rotations import matrix
+from stages.core.geometry.similarity import Similarity
+from stages.core.raster.rasterise import rasterise, visibility
+from stages.core.scene.cameras import Cameras
+from stages.core.scene.gaussians import concatenate, moved
+from stages.core.scene.scene import Scene, SceneObject
+from stages.core.scene.scene_ply import read_scene, write_scene
+from stages.lab.assets.shapes import ellipsoid, sheet
 from stages.refine.options import RefineOptions
 from stages.refine.outliers import floaters
 from stages.refine.patches import patches
 from stages.refine.sight import Sight, agreement
 from stages.refine.stage import refine, run
-from stages.scene.cameras import Cameras
-from stages.scene.gaussians import concatenate, moved
-from stages.scene.scene import Scene, SceneObject
-from stages.scene.scene_ply import read_scene, write_scene
 from tests.conftest import random_gaussians
 from tests.segment.tabletop import WOOD, block, coloured, round_about, scene_of, table
 

@@ -5,10 +5,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from stages.geometry.neighbours import Products
-from stages.geometry.rotations import matrix
-from stages.lab.bench_register import BenchOptions, errors, trial
-from stages.lab.shapes import ellipsoid
+from stages.core.geometry.neighbours import Products
+from stages.core.geometry.rotations import matrix
+from stages.lab.assets.shapes import ellipsoid
+from stages.lab.bench.register import BenchOptions, errors, trial
 from stages.refine import register as registration
 from stages.refine import register_cloud
 from stages.refine.register import register

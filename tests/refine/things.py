@@ -2,10 +2,10 @@
 
 import torch
 
-from stages.geometry.rotations import matrix
-from stages.geometry.similarity import Similarity
-from stages.lab.shapes import box, ellipsoid
-from stages.scene.gaussians import Gaussians, concatenate
+from stages.core.geometry.rotations import matrix
+from stages.core.geometry.similarity import Similarity
+from stages.core.scene.gaussians import Gaussians, concatenate
+from stages.lab.assets.shapes import box, ellipsoid
 from tests.segment.tabletop import coloured
 
 

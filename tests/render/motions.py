@@ -2,8 +2,8 @@
 
 import torch
 
-from stages.physics.keypoints import bind
-from stages.scene.trajectory import Keypoints, Motion, TrajectoryWriter
+from stages.core.physics.keypoints import bind
+from stages.core.scene.trajectory import Keypoints, Motion, TrajectoryWriter
 
 
 def rising(path, scene, frames: int = 5, step: float = 0.01, forces: tuple = ()):

@@ -4,7 +4,7 @@ import h5py
 import pytest
 import torch
 
-from stages.errors import InputError
+from stages.core.errors import InputError
 from stages.render.footage import open_footage
 from stages.render.overlay import arrows_at
 from tests.render.motions import rising

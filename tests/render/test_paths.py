@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 import torch
 
-from stages.backends import pick_device
-from stages.errors import InputError
-from stages.geometry.cameras import centres, depths, project
+from stages.core.backends import pick_device
+from stages.core.errors import InputError
+from stages.core.geometry.cameras import centres, depths, project
 from stages.render.footage import Footage, open_footage
 from stages.render.path_file import follow, read_path
 from stages.render.paths import camera_path, find_camera

@@ -8,11 +8,11 @@ import h5py
 import pytest
 import torch
 
-from stages.errors import InputError
-from stages.geometry.similarity import Similarity
+from stages.core.errors import InputError
+from stages.core.geometry.similarity import Similarity
+from stages.core.scene.images import read_image, read_video
+from stages.core.scene.scene_ply import write_scene
 from stages.render.stage import _names, run
-from stages.scene.images import read_image, read_video
-from stages.scene.scene_ply import write_scene
 from tests.evaluate.motions import elsewhere
 from tests.render.conftest import render_options
 from tests.render.motions import rising

@@ -7,13 +7,13 @@ import cv2
 import pytest
 import torch
 
-from stages.errors import InputError
+from stages.core.errors import InputError
+from stages.core.scene.images import read_image, read_labels, read_video, write_png
+from stages.core.scene.scene_ply import write_scene
 from stages.render.draw import depth_colours, depth_range, palette
 from stages.render.options import RenderOptions
 from stages.render.overlay import tile
 from stages.render.stage import run
-from stages.scene.images import read_image, read_labels, read_video, write_png
-from stages.scene.scene_ply import write_scene
 from tests.render.conftest import render_options
 from tests.render.motions import rising
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from stages.scene.scene_ply import write_scene
+from stages.core.scene.scene_ply import write_scene
 from tests.segment.tabletop import three_apart
 
 

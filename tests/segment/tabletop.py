@@ -2,11 +2,11 @@
 
 import torch
 
-from stages.geometry.cameras import intrinsics, orbit
-from stages.lab.shapes import Surface, box, ellipsoid, sheet, to_gaussians
-from stages.scene.cameras import Cameras
-from stages.scene.gaussians import Gaussians, concatenate
-from stages.scene.scene import Scene
+from stages.core.geometry.cameras import intrinsics, orbit
+from stages.core.scene.cameras import Cameras
+from stages.core.scene.gaussians import Gaussians, concatenate
+from stages.core.scene.scene import Scene
+from stages.lab.assets.shapes import Surface, box, ellipsoid, sheet, to_gaussians
 
 WOOD = (0.55, 0.4, 0.25)
 

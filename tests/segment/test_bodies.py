@@ -2,8 +2,8 @@
 
 import torch
 
-from stages.lab.shapes import box, ellipsoid
-from stages.physics.support import find_support
+from stages.core.perception.support import find_support
+from stages.lab.assets.shapes import box, ellipsoid
 from stages.segment.bodies import joined
 from tests.segment.tabletop import coloured, scene_of, table
 

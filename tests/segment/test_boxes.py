@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from stages.errors import InputError
-from stages.geometry.cameras import project
+from stages.core.errors import InputError
+from stages.core.geometry.cameras import project
 from stages.segment.boxes import VIEWS, first, nearest_first, segment, tidy
 from stages.segment.options import SegmentOptions
 from stages.segment.prompts import read_prompts

@@ -5,15 +5,15 @@ from dataclasses import dataclass, replace
 import pytest
 import torch
 
-from stages.physics.support import find_support
-from stages.scene.scene import Scene
+from stages.core.perception.support import find_support
+from stages.core.scene.scene import Scene
 from stages.segment.options import SegmentOptions
 from stages.segment.pictures import Pictures, pictures
 from stages.segment.vote import Sight, decide, poll
 from tests.segment.tabletop import best_overlap, three_apart
 
 pytest.importorskip("transformers")
-from stages.models.sam2.automatic import Proposals  # noqa: E402
+from stages.core.models.sam2.automatic import Proposals  # noqa: E402
 from stages.segment import discover  # noqa: E402
 from stages.segment.discover import same_as, standing, wholes  # noqa: E402
 

@@ -5,8 +5,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from stages.physics.sight import seen_from
-from stages.physics.support import find_support
+from stages.core.perception.support import find_support
+from stages.core.perception.visibility import seen_from
 from stages.segment.rims import SEEN, redrawn
 from tests.segment.tabletop import block, scene_of, table, three_apart
 

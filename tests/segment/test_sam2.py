@@ -6,9 +6,9 @@ from functools import partial
 import pytest
 import torch
 
-from stages.errors import InputError
-from stages.scene.images import write_png
-from stages.scene.scene_ply import read_scene
+from stages.core.errors import InputError
+from stages.core.scene.images import write_png
+from stages.core.scene.scene_ply import read_scene
 from stages.segment import sam2
 from stages.segment.options import SegmentOptions
 from stages.segment.pictures import drawn, pictures
@@ -29,7 +29,7 @@ def one_thread():
 
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory):
-    from tests.models.sam2.tiny import saved
+    from tests.core.models.sam2.tiny import saved
 
     return saved(tmp_path_factory.mktemp("sam2"))
 
@@ -85,7 +85,7 @@ def test_some_photos_may_be_missing_but_not_the_prompted_one(scene_file, truth, 
 def test_without_prompts_a_network_that_is_sure_of_nothing_finds_no_objects(
     scene_file, weights, tmp_path, caplog, monkeypatch
 ):
-    from stages.models.sam2.automatic import Automatic, propose
+    from stages.core.models.sam2.automatic import Automatic, propose
     from stages.segment import discover
 
     monkeypatch.setattr(discover, "propose", partial(propose, options=Automatic(grid=4)))

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from stages.physics.support import find_support
+from stages.core.perception.support import find_support
 from stages.segment.scraps import without_scraps
 from tests.segment.tabletop import block, scene_of, table, three_apart
 

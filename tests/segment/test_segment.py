@@ -7,11 +7,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from stages.errors import InputError
-from stages.geometry.cameras import project
-from stages.raster.rasterise import visibility
-from stages.scene.images import write_labels
-from stages.scene.scene_ply import read_scene, write_scene
+from stages.core.errors import InputError
+from stages.core.geometry.cameras import project
+from stages.core.raster.rasterise import visibility
+from stages.core.scene.images import write_labels
+from stages.core.scene.scene_ply import read_scene, write_scene
 from stages.segment.options import SegmentOptions
 from stages.segment.stage import run
 from stages.segment.vote import elect, pooled, tempered, without_outliers

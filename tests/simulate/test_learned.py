@@ -4,14 +4,14 @@ from dataclasses import replace
 import pytest
 import torch
 
-from stages.errors import InputError
-from stages.models.solid import sides
-from stages.models.weights import HERE, build, find, save
-from stages.models.world import FLOOR, World
-from stages.scene.gaussians import concatenate
-from stages.scene.scene import Scene, SceneObject
-from stages.scene.scene_ply import write_scene
-from stages.scene.trajectory import read_trajectory
+from stages.core.errors import InputError
+from stages.core.models.checkpoints import HERE, build, find, save
+from stages.core.models.field.solidity import sides
+from stages.core.models.initial_conditions import FLOOR, World
+from stages.core.scene.gaussians import concatenate
+from stages.core.scene.scene import Scene, SceneObject
+from stages.core.scene.scene_ply import write_scene
+from stages.core.scene.trajectory import read_trajectory
 from stages.simulate.learned import Frame, _known_stiffness, _warn
 from stages.simulate.options import SimulateOptions
 from stages.simulate.stage import run

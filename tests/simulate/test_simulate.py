@@ -7,13 +7,13 @@ from pathlib import Path
 import pytest
 import torch
 
-from stages.errors import InputError
-from stages.physics.forces import Prompts
-from stages.physics.materials import GUESS
-from stages.scene.gaussians import concatenate
-from stages.scene.scene import Scene, SceneObject
-from stages.scene.scene_ply import read_scene, write_scene
-from stages.scene.trajectory import Trajectory, read_trajectory
+from stages.core.errors import InputError
+from stages.core.physics.forces import Prompts
+from stages.core.physics.materials import GUESS
+from stages.core.scene.gaussians import concatenate
+from stages.core.scene.scene import Scene, SceneObject
+from stages.core.scene.scene_ply import read_scene, write_scene
+from stages.core.scene.trajectory import Trajectory, read_trajectory
 from stages.simulate import mpm as engine
 from stages.simulate.options import QUALITIES, Quality, SimulateOptions
 from stages.simulate.stage import run, with_objects

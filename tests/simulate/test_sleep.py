@@ -5,10 +5,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from stages.models.weights import HERE, find
-from stages.models.world import FLOOR, World
-from stages.scene.scene_ply import write_scene
-from stages.scene.trajectory import read_trajectory
+from stages.core.models.checkpoints import HERE, find
+from stages.core.models.initial_conditions import FLOOR, World
+from stages.core.scene.scene_ply import write_scene
+from stages.core.scene.trajectory import read_trajectory
 from stages.simulate.options import SimulateOptions
 from stages.simulate.sleep import SEAM, Sleepers
 from stages.simulate.stage import run

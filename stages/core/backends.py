@@ -1,0 +1,25 @@
+"""Backends are tables of names; a backend is a function, imported only when it is chosen."""
+
+from collections.abc import Callable, Mapping
+from importlib import import_module
+
+from stages.core.errors import InputError
+
+
+def choose(table: Mapping[str, str], name: str) -> Callable:
+    """The function that `name` stands for in a table of "module:function" entries."""
+    if name not in table:
+        raise InputError(f"no backend called {name!r}; choose from {', '.join(table)}")
+    module, function = table[name].split(":")
+    return getattr(import_module(module), function)
+
+
+def pick_device(name: str) -> str:
+    """The PyTorch device behind --device auto, cpu or cuda."""
+    import torch  # a second to import, so not before a stage runs
+
+    if name not in ("auto", "cpu", "cuda"):
+        raise InputError(f"--device {name}: choose from auto, cpu, cuda")
+    if name == "cuda" and not torch.cuda.is_available():
+        raise InputError("--device cuda: PyTorch sees no NVIDIA GPU here; use --device cpu (see `ngff-lab doctor`)")
+    return "cuda" if name != "cpu" and torch.cuda.is_available() else "cpu"

@@ -1,0 +1,47 @@
+"""Similarity transforms x -> s R x + t."""
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from stages.core.geometry.rotations import nearest
+
+
+class Similarity(NamedTuple):
+    """x -> scale * rotation @ x + translation."""
+
+    scale: float
+    rotation: Tensor  # (3, 3)
+    translation: Tensor  # (3,)
+
+    def __call__(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
+        return self.scale * points @ self.rotation.mT + self.translation
+
+    def inverse(self) -> "Similarity":
+        R = self.rotation.mT
+        return Similarity(1 / self.scale, R, -(R @ self.translation) / self.scale)
+
+    def to(self, device: str | torch.device) -> "Similarity":
+        return Similarity(self.scale, self.rotation.to(device), self.translation.to(device))
+
+    def viewmats(self, viewmats: Float[Tensor, "c 4 4"]) -> Float[Tensor, "c 4 4"]:
+        """World-to-camera matrices that see the transformed world in the same pixels, depths times scale."""
+        out = viewmats.clone()
+        out[:, :3, :3] = viewmats[:, :3, :3] @ self.rotation.mT
+        out[:, :3, 3] = self.scale * viewmats[:, :3, 3] - out[:, :3, :3] @ self.translation
+        return out
+
+
+def umeyama(source: Float[Tensor, "n 3"], target: Float[Tensor, "n 3"], scaled: bool = True) -> Similarity:
+    """Least-squares similarity (or rigid motion) from `source` to `target`.
+
+    Source: Umeyama 1991, "Least-squares estimation of transformation parameters between two point patterns".
+    """
+    mean_s, mean_t = source.mean(0), target.mean(0)
+    S, T = source - mean_s, target - mean_t
+    H = T.mT @ S
+    R = nearest(H)
+    scale = float((R * H).sum() / S.square().sum().clamp_min(torch.finfo(S.dtype).tiny)) if scaled else 1.0
+    return Similarity(scale, R, mean_t - scale * R @ mean_s)

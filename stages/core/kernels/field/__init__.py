@@ -1,0 +1,1 @@
+"""Kernels of one step of the learned force field."""

@@ -1,0 +1,139 @@
+"""Which points of bodies may touch something: others' points, the floor, a wall. In lists, so that no more is computed.
+
+`gather` finds the points of each object near the bounding box of each other one, `search` the nearest of the other's
+for each of those, and `select` takes from them, and from the points near floor and walls, those that are places of
+contact. The reference in PyTorch is `stages.core.models.field.contact_points`. Written in Triton (see `compilers`).
+"""
+
+import triton
+import triton.language as tl
+
+from stages.core.kernels.field.bodies import BODY, HIGH, LOW, MOVED, POINT, SPEED, WITHIN
+from stages.core.kernels.field.vec3 import add, dot, load3, scaled, store3, sub
+
+QUERIES, CHUNK = 16, 128  # points that search together, and points that each looks at in one go
+
+
+@triton.jit
+def partner_of(i, k, o):
+    """The k-th other object of object i's scene."""
+    return i - i % o + k + (k >= i % o)
+
+
+@triton.jit
+def _reach(body, i, j, SEEN: tl.constexpr):
+    """Objects that are farther apart [m] do not touch within a frame."""
+    return tl.minimum(tl.load(body + BODY * i + WITHIN) + tl.load(body + BODY * j + WITHIN), SEEN)
+
+
+@triton.jit
+def gather(body, moved, valid, close, which, many, o, n, SEEN: tl.constexpr, BLOCK: tl.constexpr):
+    """Points of object i within reach of the bounding box of another one: where, which and how many."""
+    i, k = tl.program_id(0), tl.program_id(1)
+    j = partner_of(i, k, o)
+    reach = _reach(body, i, j, SEEN)
+    r = tl.arange(0, BLOCK)
+    near = tl.load(valid + i * n + r, mask=r < n, other=0) != 0
+    x = load3(moved + (MOVED * i + POINT) * n + r, n, r < n)
+    for axis in tl.static_range(3):
+        near &= x[axis] > tl.load(body + BODY * j + LOW + axis) - reach
+        near &= x[axis] < tl.load(body + BODY * j + HIGH + axis) + reach
+    row = i * (o - 1) + k
+    place = tl.cumsum(near.to(tl.int32), 0) - 1
+    store3(close + 3 * row * n + place, n, x, near)
+    tl.store(which + row * n + place, r, mask=near)
+    tl.store(many + row, tl.sum(near.to(tl.int32)))
+
+
+@triton.jit
+def search(
+    body, moved, close, which, many, keys, partner, o, n, SEEN: tl.constexpr, FRAME: tl.constexpr,
+    QUERIES: tl.constexpr, CHUNK: tl.constexpr,
+):  # fmt: skip
+    """For those points the other object's nearest, and how far it is now or a frame ahead, whichever is less."""
+    i, k = tl.program_id(0) // (o - 1), tl.program_id(0) % (o - 1)
+    j = partner_of(i, k, o)
+    row, other = i * (o - 1) + k, j * (o - 1) + i % o - (i > j)
+    count, last = tl.load(many + row), tl.load(many + other)
+    first = tl.program_id(1) * QUERIES
+    if first < count:
+        reach = _reach(body, i, j, SEEN)
+        far: tl.constexpr = float("inf")
+        e = first + tl.arange(0, QUERIES)
+        x = load3(close + 3 * row * n + e, n, e < count)
+        column = tl.arange(0, CHUNK)
+        least = tl.full([QUERIES, CHUNK], far, tl.float32)
+        chunk = tl.zeros([QUERIES, CHUNK], tl.int32)
+        for start in range(0, last, CHUNK):
+            s = start + column
+            y = load3(close + 3 * other * n + s, n, s < last, far)
+            dx, dy, dz = x[0][:, None] - y[0][None, :], x[1][:, None] - y[1][None, :], x[2][:, None] - y[2][None, :]
+            squared = dx * dx + dy * dy + dz * dz
+            chunk = tl.where(squared < least, start, chunk)
+            least = tl.minimum(squared, least)
+        best = tl.min(least, 1)
+        entry = tl.min(tl.where(least == best[:, None], chunk + column[None, :], n), 1)
+        found = (e < count) & (best < reach * reach)
+        mine = tl.load(which + row * n + e, mask=found, other=0)
+        theirs = tl.load(which + other * n + entry, mask=found, other=0)
+        own, they = moved + MOVED * i * n + mine, moved + MOVED * j * n + theirs
+        way = sub(x, load3(they + POINT * n, n, found))
+        rate = sub(load3(own + SPEED * n, n, found), load3(they + SPEED * n, n, found))
+        way = add(way, scaled(FRAME, rate))
+        key = tl.where(found, tl.sqrt(tl.minimum(best, dot(way, way))), far)
+        tl.store(keys + row * n + e, key, mask=e < count)
+        tl.store(partner + row * n + e, theirs, mask=e < count)
+
+
+@triton.jit
+def _smallest(key, near, most):
+    """How large, in the order of integers, the `most`-th smallest of the keys is: found bit by bit from the highest."""
+    bits = key.to(tl.int32, bitcast=True).to(tl.int64)
+    bits = tl.where(bits < 0, -1 - (bits & 0x7FFFFFFF), bits) + 0x80000000
+    bits = tl.where(near, bits, 0x1FFFFFFFF)
+    limit = tl.full([], 0, tl.int64)
+    step = tl.full([], 0x80000000, tl.int64)
+    for _ in range(32):
+        limit = tl.where(tl.sum((bits < limit + step).to(tl.int32)) < most, limit + step, limit)
+        step = step >> 1
+    return bits, limit
+
+
+@triton.jit
+def select(
+    keys, planes, which, partner, many, valid, count, point, theirs, felt, o, n, wide, narrow, slots,
+    PAIR: tl.constexpr, WALL: tl.constexpr, FAR: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Of an object and one thing: its points that touch it, at most a share of all; which, and the other's there.
+
+    Lists of an object follow each other: others (`wide` slots each), floor, wall (`narrow`), `slots` in all.
+    """
+    i, k, m = tl.program_id(0), tl.program_id(1), o - 1
+    r = tl.arange(0, BLOCK)
+    most = tl.sum(tl.load(valid + i * n + r, mask=r < n, other=0).to(tl.int32))
+    far: tl.constexpr = float("inf")
+    zero = tl.zeros([BLOCK], tl.float32)
+    store3(felt + (i * (o + 1) + k) * 3 * n + r, n, (zero, zero, zero), r < n)
+    to = i * slots + k * wide
+    if k < m:
+        row = i * m + k
+        listed = r < tl.load(many + row)
+        key = tl.load(keys + row * n + r, mask=listed, other=far)
+        mine = tl.load(which + row * n + r, mask=listed, other=0)
+        other = tl.load(partner + row * n + r, mask=listed, other=0)
+        most = tl.ceil(PAIR * most).to(tl.int32)
+    else:
+        key = tl.load(planes + (2 * i + k - m) * n + r, mask=r < n, other=far)
+        mine, other = r, r
+        if k > m:
+            to = (i + 1) * slots - narrow
+            most = tl.ceil(WALL * most).to(tl.int32)
+    near = key < FAR
+    if tl.sum(near.to(tl.int32)) > most:
+        bits, limit = _smallest(key, near, most)
+        near &= bits <= limit
+    place = tl.cumsum(near.to(tl.int32), 0) - 1
+    near &= place < most  # equal keys
+    tl.store(point + to + place, mine, mask=near)
+    tl.store(theirs + to + place, other, mask=near)
+    tl.store(count + i * (o + 1) + k, tl.sum(near.to(tl.int32)))

@@ -1,0 +1,54 @@
+"""Weights that average over the neighbourhoods of points, in half precision: only they go to memory.
+
+The kernel is written in Triton (see `compilers`), which is imported with this module.
+"""
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from stages.core.kernels.field.vec3 import dot, load3, sub
+
+ROWS, CHUNK = 8, 256
+
+
+@triton.jit
+def _weights(arm, share, x, slope, s, n):
+    """What points s weigh for points x, before they are made to sum to 1."""
+    y = load3(arm + 3 * s, 1, s < n)
+    d = sub((x[0][:, None], x[1][:, None], x[2][:, None]), (y[0][None, :], y[1][None, :], y[2][None, :]))
+    return tl.exp(slope * dot(d, d)) * tl.load(share + s, mask=s < n, other=0.0)[None, :]
+
+
+@triton.jit
+def average(arm, valid, share, reach, out, n, scales, ROWS: tl.constexpr, CHUNK: tl.constexpr):
+    """Rows of the table of one object and one scale, twice: their sums, and what is divided by those."""
+    table = tl.program_id(0)
+    i = table // scales
+    arm, share, valid, out = arm + 3 * i * n, share + i * n, valid + i * n, out + table.to(tl.int64) * n * n
+    radius = tl.load(reach + table)
+    slope = -1 / (radius * radius)
+    r, column = tl.program_id(1) * ROWS + tl.arange(0, ROWS), tl.arange(0, CHUNK)
+    x = load3(arm + 3 * r, 1, r < n)
+    total = tl.zeros([ROWS, CHUNK], tl.float32)
+    for first in range(0, n, CHUNK):
+        total += _weights(arm, share, x, slope, first + column, n)
+    there = tl.load(valid + r, mask=r < n, other=0) != 0
+    unit = tl.where(there, 1 / tl.maximum(tl.sum(total, 1), 1e-12), 0.0)
+    for first in range(0, n, CHUNK):
+        s = first + column
+        weight = _weights(arm, share, x, slope, s, n) * unit[:, None]
+        inside = (r[:, None] < n) & (s[None, :] < n)
+        tl.store(out + r[:, None] * n + s[None, :], weight.to(tl.float16), mask=inside)
+
+
+def neighbourhoods(arm: Tensor, valid: Tensor, share: Tensor, reach: Tensor) -> Tensor:
+    """Gaussians of each of the radii `reach` (b o s) [m] about points `arm` (b o n 3) that weigh `share` (b o n),
+    normalised by rows: (b o s n n). Rows are 0 where not `valid` (b o n)."""
+    b, o, n, _ = arm.shape
+    given = [x.contiguous() for x in (arm, valid, share, reach)]
+    scales = reach.shape[-1]
+    out = torch.empty(b, o, scales, n, n, dtype=torch.float16, device=arm.device)
+    average[(b * o * scales, triton.cdiv(n, ROWS))](*given, out, n, scales, ROWS=ROWS, CHUNK=CHUNK)
+    return out

@@ -1,0 +1,139 @@
+"""Which way the surface under each point of a cloud faces, and the principal axes of bodies: 3 x 3 matrices by the
+thousand, for which libraries make the host wait. Distances are as exact as the points, the rest is in double precision.
+"""
+
+from typing import Any
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from stages.core.kernels.interop import device_of, launch, view
+
+NEIGHBOURS = wp.constant(12)  # points that make a normal, the point itself among them
+NEXT = wp.constant(5)  # points that make the spacing, the point itself among them
+SWEEPS = 6  # of Jacobi's rotations; each squares what is off the diagonal
+THREADS = 64  # of a block on a GPU, ten of which fit where one runs
+
+Indices = wp.types.vector(length=NEIGHBOURS, dtype=wp.int32)
+
+
+@wp.func
+def _turned(A: wp.mat33d, V: wp.mat33d, p: int, q: int):
+    """A and V after the rotation in the plane of axes p and q that makes A[p, q] vanish."""
+    G = wp.identity(n=3, dtype=wp.float64)
+    if A[p, q] != wp.float64(0.0):
+        cot = (A[q, q] - A[p, p]) / (wp.float64(2.0) * A[p, q])  # of twice the angle
+        tan = wp.float64(1.0) / (wp.abs(cot) + wp.sqrt(cot * cot + wp.float64(1.0)))
+        if cot < wp.float64(0.0):
+            tan = -tan
+        cos = wp.float64(1.0) / wp.sqrt(tan * tan + wp.float64(1.0))
+        G[p, p] = cos
+        G[q, q] = cos
+        G[p, q] = tan * cos
+        G[q, p] = -tan * cos
+    return wp.transpose(G) * A * G, V * G
+
+
+@wp.func
+def _axes(A: wp.mat33d, sweeps: int):
+    """Eigenvalues of a symmetric matrix, in no order, and its eigenvectors, as columns."""
+    V = wp.identity(n=3, dtype=wp.float64)
+    for _ in range(sweeps):
+        A, V = _turned(A, V, 0, 1)
+        A, V = _turned(A, V, 0, 2)
+        A, V = _turned(A, V, 1, 2)
+    return wp.get_diag(A), V
+
+
+@wp.kernel(enable_backward=False, launch_bounds=(THREADS, 10))
+def _surface(points: wp.array2d[Any], valid: wp.array2d[wp.bool], sweeps: int,
+             normal: wp.array2d[wp.vec3d], spacing: wp.array2d[wp.float64]):  # fmt: skip
+    o, i = wp.tid()
+    if not valid[o, i]:
+        return
+    x = points[o, i]
+    near, index = wp.vector(x.dtype(wp.inf), length=NEIGHBOURS), Indices(-1)
+    for j in range(points.shape[1]):
+        d = wp.length_sq(points[o, j] - x)
+        if d < near[NEIGHBOURS - 1] and valid[o, j]:
+            which = wp.int32(j)
+            for k in range(NEIGHBOURS):  # the nearest first; who is farther moves on by one
+                if d < near[k]:
+                    farther = near[k]
+                    whom = index[k]
+                    near[k] = d
+                    index[k] = which
+                    d = farther
+                    which = whom
+    mean, count = wp.vec3d(), wp.float64(0.0)
+    for k in range(NEIGHBOURS):
+        if index[k] >= 0:
+            mean += wp.vec3d(points[o, index[k]] - x)
+            count += wp.float64(1.0)
+    mean = mean / count
+    spread = wp.mat33d()
+    for k in range(NEIGHBOURS):
+        if index[k] >= 0:
+            arm = wp.vec3d(points[o, index[k]] - x) - mean
+            spread += wp.outer(arm, arm)
+    extent, axes = _axes(spread, sweeps)
+    least = wp.int32(wp.argmin(extent))
+    normal[o, i] = wp.vec3d(axes[0, least], axes[1, least], axes[2, least])
+    total, others = wp.float64(0.0), wp.float64(0.0)
+    for k in range(1, NEXT):
+        if index[k] >= 0:
+            total += wp.sqrt(wp.float64(near[k]))
+            others += wp.float64(1.0)
+    spacing[o, i] = total / wp.max(others, wp.float64(1.0))
+
+
+for _vector in (wp.vec3, wp.vec3d):  # both at once: one that comes later would compile all anew
+    wp.overload(_surface, {"points": wp.array2d(dtype=_vector)})
+
+
+def surface(points: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
+    """For points (b o n 3) of objects: the direction of least extent of the NEIGHBOURS nearest, either way round, and
+    the mean distance to the NEXT - 1 nearest others (b o n) [m]; both 0 where not `valid` (b o n)."""
+    normal = torch.zeros_like(points, dtype=torch.float64, memory_format=torch.contiguous_format)
+    spacing = normal.new_zeros(valid.shape)
+    vector = wp.vec3d if points.dtype == torch.float64 else wp.vec3
+    given = [view(points.contiguous().flatten(0, 1), vector), view(valid.contiguous().flatten(0, 1), wp.bool), SWEEPS]
+    found = [view(normal.flatten(0, 1), wp.vec3d), view(spacing.flatten(0, 1), wp.float64)]
+    launch(_surface, given[1].shape, given, found, device_of(points), block_dim=THREADS)
+    return normal.to(points), spacing.to(points)
+
+
+def surface_reference(points: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
+    """The same from a table of all distances, in any precision."""
+    gap = (points[..., :, None, :] - points[..., None, :, :]).norm(dim=-1)
+    gap = gap.masked_fill(~(valid[..., :, None] & valid[..., None, :]), torch.inf)
+    near, index = gap.topk(min(NEIGHBOURS, gap.shape[-1]), largest=False)
+    there, next_ = near.isfinite().to(points)[..., None], near[..., 1:NEXT]
+    rows = index[..., None].expand(*index.shape, 3)
+    cloud = torch.gather(points[:, :, None].expand(*index.shape[:3], *points.shape[2:]), 3, rows)
+    mean = (there * cloud).sum(-2, keepdim=True) / there.sum(-2, keepdim=True).clamp_min(1)
+    cloud = there * (cloud - mean)
+    normal = torch.linalg.eigh(cloud.mT @ cloud).eigenvectors[..., 0]
+    spacing = next_.masked_fill(~next_.isfinite(), 0).sum(-1) / next_.isfinite().sum(-1).clamp_min(1)
+    return normal * valid[..., None], spacing
+
+
+@wp.kernel(enable_backward=False)
+def _inverted(matrix: wp.array[wp.mat33d], sweeps: int, inverse: wp.array[wp.mat33d], values: wp.array[wp.vec3d]):
+    i = wp.tid()
+    extent, axes = _axes(matrix[i], sweeps)
+    d = wp.cw_div(wp.vec3d(wp.float64(1.0)), extent)
+    inverse[i] = axes * wp.diag(d) * wp.transpose(axes)
+    least, most = wp.min(d), wp.max(d)
+    values[i] = wp.vec3d(least, d[0] + d[1] + d[2] - least - most, most)
+
+
+def inverted(matrix: Tensor) -> tuple[Tensor, Tensor]:
+    """The inverses of positive definite matrices (b o 3 3), and the eigenvalues of those, ascending (b o 3)."""
+    real = matrix.double().contiguous()
+    inverse, values = torch.empty_like(real), torch.empty_like(real[..., 0])
+    given = [view(real.flatten(0, 1), wp.mat33d), SWEEPS]
+    found = [view(inverse.flatten(0, 1), wp.mat33d), view(values.flatten(0, 1), wp.vec3d)]
+    launch(_inverted, given[0].shape, given, found, device_of(matrix), block_dim=THREADS)
+    return inverse.to(matrix), values.to(matrix)

@@ -1,0 +1,81 @@
+"""Free motion of rigid bodies, one thread a body: as tensors it would be dozens of operations on a few numbers."""
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from stages.core.kernels.interop import device_of, launch, view
+
+
+@wp.func
+def _matrix(quat: wp.vec4):
+    return wp.quat_to_matrix(wp.normalize(wp.quat(quat[1], quat[2], quat[3], quat[0])))
+
+
+@wp.func
+def _spin(momentum: wp.vec3, inverse: wp.mat33, R: wp.mat33):
+    return R * (inverse * (wp.transpose(R) * momentum))
+
+
+@wp.func
+def _turned(quat: wp.vec4, turn: wp.vec3):
+    half = wp.sqrt(wp.length_sq(turn) + 1.0e-24) / 2.0
+    by = turn * (wp.sin(half) / half / 2.0)
+    q = wp.normalize(wp.quat(by[0], by[1], by[2], wp.cos(half)) * wp.quat(quat[1], quat[2], quat[3], quat[0]))
+    return wp.vec4(q[3], q[0], q[1], q[2])
+
+
+@wp.kernel(enable_backward=False)
+def _drift(com: wp.array[wp.vec3], quat: wp.array[wp.vec4], velocity: wp.array[wp.vec3], momentum: wp.array[wp.vec3],
+           inverse: wp.array[wp.mat33], dt: float, com_then: wp.array[wp.vec3], quat_then: wp.array[wp.vec4]):
+    i = wp.tid()
+    q, L = quat[i], momentum[i]
+    spin = _spin(L, inverse[i], _matrix(q))
+    spin = _spin(L, inverse[i], _matrix(_turned(q, dt / 2.0 * spin)))
+    com_then[i] = com[i] + dt * velocity[i]
+    quat_then[i] = _turned(q, dt * spin)
+
+
+@wp.kernel(enable_backward=False)
+def _pose(quat: wp.array[wp.vec4], momentum: wp.array[wp.vec3], inverse: wp.array[wp.mat33],
+          R: wp.array[wp.mat33], spin: wp.array[wp.vec3]):  # fmt: skip
+    i = wp.tid()
+    R[i] = _matrix(quat[i])
+    spin[i] = _spin(momentum[i], inverse[i], R[i])
+
+
+def _rows(x: Tensor, dims: int, dtype) -> wp.array:
+    return view(x.contiguous().flatten(0, -1 - dims), dtype)
+
+
+@torch.library.custom_op("ngff::drift", mutates_args=())
+def drift(
+    com: Tensor, quat: Tensor, velocity: Tensor, momentum: Tensor, inverse: Tensor, dt: float
+) -> tuple[Tensor, Tensor]:
+    """Centres of mass and orientations dt [s] later; reference: `models.field.rigid_body.drift`. Without gradients."""
+    moved, turned = com.new_empty(com.shape), quat.new_empty(quat.shape)
+    launch(_drift, com[..., 0].numel(), [
+        _rows(com, 1, wp.vec3), _rows(quat, 1, wp.vec4), _rows(velocity, 1, wp.vec3), _rows(momentum, 1, wp.vec3),
+        _rows(inverse, 2, wp.mat33), dt,
+    ], [_rows(moved, 1, wp.vec3), _rows(turned, 1, wp.vec4)], device_of(com))  # fmt: skip
+    return moved, turned
+
+
+@drift.register_fake
+def _(com, quat, velocity, momentum, inverse, dt):
+    return com.new_empty(com.shape), quat.new_empty(quat.shape)
+
+
+@torch.library.custom_op("ngff::pose", mutates_args=())
+def pose(quat: Tensor, momentum: Tensor, inverse: Tensor) -> tuple[Tensor, Tensor]:
+    """Rotation matrices and spins [rad/s]; see `stages.core.models.field.rigid_body.pose`. Without gradients."""
+    R, spin = inverse.new_empty(inverse.shape), momentum.new_empty(momentum.shape)
+    launch(_pose, momentum[..., 0].numel(), [
+        _rows(quat, 1, wp.vec4), _rows(momentum, 1, wp.vec3), _rows(inverse, 2, wp.mat33),
+    ], [_rows(R, 2, wp.mat33), _rows(spin, 1, wp.vec3)], device_of(quat))  # fmt: skip
+    return R, spin
+
+
+@pose.register_fake
+def _(quat, momentum, inverse):
+    return inverse.new_empty(inverse.shape), momentum.new_empty(momentum.shape)

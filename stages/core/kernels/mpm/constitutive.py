@@ -1,0 +1,212 @@
+"""What materials answer to deformation: stress, and what of the deformation stays for good.
+
+`respond` takes the deformation gradient that the grid asks for and returns the elastic part that is left, Kirchhoff
+stress, and the new state of the material. Kelvin-Voigt damping, eta (dv/dx + transpose), may be added to any of them.
+
+| model       | elastic law                   | plastic (3 numbers)                                | state       |
+| NEO_HOOKEAN | mu (F F^T - I) + lambda log J | -                                                  | -           |
+| COROTATED   | fixed corotated               | -                                                  | -           |
+| VON_MISES   | Hencky                        | yield stress, hardening (softening < 0), viscosity | strain      |
+| SAND        | Hencky                        | slope of the Drucker-Prager cone, -, -             | volume gain |
+| SNOW        | fixed corotated, hardened     | critical compression, critical stretch, hardening  | log Jp      |
+
+Sources: Bonet and Wood 2008, "Nonlinear Continuum Mechanics for Finite Element Analysis", eq. 6.29 (neo-Hookean);
+Stomakhin et al. 2012, "Energetically consistent invertible elasticity" (fixed corotated); Simo and Hughes 1998,
+"Computational Inelasticity", box 3.1 (von Mises with Perzyna viscosity, in Hencky strain); Klar et al. 2016,
+"Drucker-Prager elastoplasticity for sand animation", with the volume correction of Tampubolon et al. 2017;
+Stomakhin et al. 2013, "A material point method for snow simulation".
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+import warp as wp
+from torch import Tensor
+
+NEO_HOOKEAN, COROTATED, VON_MISES, SAND, SNOW = range(5)
+FLATTEST = 0.05  # a volume ratio below this counts as this, so that stress stays finite
+HARDEST = 4.0  # snow grows at most this much stiffer, so that twice the wave speed bounds the substep
+RESIDUAL = 0.1  # of the yield stress stays, however soft it gets
+
+
+@wp.struct
+class Response:
+    """F: elastic deformation gradient; tau: Kirchhoff stress [Pa]."""
+
+    F: wp.mat33
+    tau: wp.mat33
+    state: float
+
+
+@wp.func
+def neo_hookean(F: wp.mat33, stiffness: wp.vec3) -> wp.mat33:
+    """Kirchhoff stress mu (F F^T - I) + lambda log(J) I; `stiffness` is mu, lambda, eta."""
+    J = wp.max(wp.determinant(F), FLATTEST)
+    one = wp.identity(n=3, dtype=float)
+    return stiffness[0] * (F * wp.transpose(F) - one) + stiffness[1] * wp.log(J) * one
+
+
+@wp.func
+def _cofactors(A: wp.mat33) -> wp.mat33:
+    """det(A) times the transposed inverse of A."""
+    a = wp.vec3(A[0, 0], A[0, 1], A[0, 2])
+    b = wp.vec3(A[1, 0], A[1, 1], A[1, 2])
+    c = wp.vec3(A[2, 0], A[2, 1], A[2, 2])
+    return wp.matrix_from_rows(wp.cross(b, c), wp.cross(c, a), wp.cross(a, b))
+
+
+@wp.func
+def _corotated(F: wp.mat33, mu: float, lam: float) -> wp.mat33:
+    """2 mu (F - R) F^T + lambda J (J - 1) I, for J > FLATTEST; R by Newton's iteration (Higham 1986), quadratic."""
+    J = wp.determinant(F)
+    R = F
+    for _n in range(20):
+        C = _cofactors(R)
+        D = wp.determinant(R)
+        N = 0.5 * (R + C / D)
+        change = wp.ddot(N - R, N - R)
+        R = N
+        if change < 1e-10:  # the next would change R by less than float32 can hold
+            break
+    return 2.0 * mu * (F - R) * wp.transpose(F) + lam * J * (J - 1.0) * wp.identity(n=3, dtype=float)
+
+
+@wp.func
+def _von_mises(e: wp.vec3, mu: float, plastic: wp.vec3, state: float, dt: float) -> wp.vec4:
+    """Hencky strains and accumulated plastic strain after the return to the yield surface."""
+    mean = (e[0] + e[1] + e[2]) / 3.0
+    dev = e - wp.vec3(mean, mean, mean)
+    size = wp.length(dev)
+    root = wp.sqrt(2.0 / 3.0)
+    hardening = plastic[1]
+    strength = plastic[0] + hardening * state
+    if strength < RESIDUAL * plastic[0]:
+        strength = RESIDUAL * plastic[0]
+        hardening = 0.0
+    excess = 2.0 * mu * size - root * strength
+    if excess <= 0.0:
+        return wp.vec4(e[0], e[1], e[2], state)
+    resist = float(0.0)  # noqa: UP018 -- Warp takes a literal for a constant
+    if plastic[2] > 0.0:
+        resist = plastic[2] / wp.max(dt, 1e-30)  # no time, no flow
+    flow = wp.min(excess / (2.0 * mu + 2.0 / 3.0 * hardening + resist), size)
+    e2 = dev * (1.0 - flow / size) + wp.vec3(mean, mean, mean)
+    return wp.vec4(e2[0], e2[1], e2[2], state + root * flow)
+
+
+@wp.func
+def _sand(strain: wp.vec3, stiffness: wp.vec3, slope: float, state: float) -> wp.vec4:
+    """Hencky strains and gained volume after the return to the Drucker-Prager cone."""
+    third = state / 3.0
+    e = strain + wp.vec3(third, third, third)
+    trace = e[0] + e[1] + e[2]
+    if trace >= 0.0:
+        return wp.vec4(0.0, 0.0, 0.0, trace)  # apart: no stress, and the gain is remembered
+    mean = trace / 3.0
+    dev = e - wp.vec3(mean, mean, mean)
+    size = wp.length(dev)
+    bulk = (3.0 * stiffness[1] + 2.0 * stiffness[0]) / (2.0 * stiffness[0])
+    excess = size + bulk * trace * slope
+    if excess > 0.0:
+        dev = dev * (1.0 - excess / size)
+    return wp.vec4(dev[0] + mean, dev[1] + mean, dev[2] + mean, 0.0)
+
+
+@wp.func
+def respond(
+    model: int, trial: wp.mat33, stiffness: wp.vec3, plastic: wp.vec3, state: float, dt: float
+) -> Response:
+    """Any of the models above; without damping."""
+    out = Response()
+    out.F = trial
+    out.state = state
+    if model == NEO_HOOKEAN:
+        out.tau = neo_hookean(trial, stiffness)
+        return out
+    if model == COROTATED and wp.determinant(trial) > FLATTEST:
+        out.tau = _corotated(trial, stiffness[0], stiffness[1])  # without the singular values: four times as fast
+        return out
+    U = wp.mat33()
+    V = wp.mat33()
+    S = wp.vec3()
+    wp.svd3(trial, U, S, V)
+    mu = stiffness[0]
+    lam = stiffness[1]
+    t = wp.vec3()  # principal Kirchhoff stresses
+    if model == COROTATED or model == SNOW:  # noqa: SIM109 -- Warp
+        if model == SNOW:
+            low = 1.0 - plastic[0]
+            high = 1.0 + plastic[1]
+            kept = wp.vec3(wp.clamp(S[0], low, high), wp.clamp(S[1], low, high), wp.clamp(S[2], low, high))
+            gain = wp.max(S[0] * S[1] * S[2], 1e-6) / (kept[0] * kept[1] * kept[2])
+            out.state = state + wp.log(gain)
+            S = kept
+            out.F = U * wp.diag(S) * wp.transpose(V)
+            harder = wp.min(wp.exp(plastic[2] * (1.0 - wp.exp(out.state))), HARDEST)
+            mu = mu * harder
+            lam = lam * harder
+        J = S[0] * S[1] * S[2]
+        volumetric = lam * J * (J - 1.0)
+        for axis in range(3):
+            t[axis] = 2.0 * mu * (S[axis] - 1.0) * S[axis] + volumetric
+    else:
+        e = wp.vec3(wp.log(wp.max(S[0], FLATTEST)), wp.log(wp.max(S[1], FLATTEST)), wp.log(wp.max(S[2], FLATTEST)))
+        back = wp.vec4()
+        if model == SAND:  # noqa: SIM108 -- Warp's ternary computes both
+            back = _sand(e, stiffness, plastic[0], state)
+        else:
+            back = _von_mises(e, mu, plastic, state, dt)
+        e = wp.vec3(back[0], back[1], back[2])
+        out.state = back[3]
+        out.F = U * wp.diag(wp.vec3(wp.exp(e[0]), wp.exp(e[1]), wp.exp(e[2]))) * wp.transpose(V)
+        trace = lam * (e[0] + e[1] + e[2])
+        t = 2.0 * mu * e + wp.vec3(trace, trace, trace)
+    out.tau = U * wp.diag(t) * wp.transpose(U)
+    return out
+
+
+@wp.kernel
+def _respond(
+    model: wp.array[wp.int8], dt: float, F: wp.array[wp.mat33], stiffness: wp.array[wp.vec3],
+    plastic: wp.array[wp.vec3], state: wp.array[float], tau: wp.array[wp.mat33],
+):  # fmt: skip
+    i = wp.tid()
+    out = respond(int(model[i]), F[i], stiffness[i], plastic[i], state[i], dt)
+    F[i] = out.F
+    tau[i] = out.tau
+    state[i] = out.state
+
+
+def response(
+    model: Tensor, F: Tensor, stiffness: Tensor, plastic: Tensor, state: Tensor, dt: float = 0.0
+) -> tuple[Tensor, Tensor, Tensor]:
+    """F, Kirchhoff stress and state of each particle; see the table above.
+
+    model (p) int8; F (p, 3, 3); stiffness (p, 3): mu, lambda [Pa], eta (not used here); plastic (p, 3); state (p).
+    """
+    from stages.core.kernels.interop import device_of, launch, view
+
+    F, state, tau = F.clone(), state.clone(), torch.empty_like(F)
+    launch(_respond, len(F), [view(model), dt, view(F, wp.mat33), view(stiffness, wp.vec3), view(plastic, wp.vec3),
+                              view(state), view(tau, wp.mat33)], device=device_of(F))  # fmt: skip
+    return F, tau, state
+
+
+def sand_slope(degrees: float) -> float:
+    """Slope of the Drucker-Prager cone for an angle of friction, in Klar's form: |dev tau| = 3 slope x pressure.
+
+    In plane strain without dilatancy the cone then yields where Mohr-Coulomb does, at shear = sin x pressure. Klar's
+    own choice, sqrt(2/3) 2 sin / (3 - sin), agrees in triaxial compression and is a third stronger in shear.
+    """
+    return math.sqrt(2) / 3 * math.sin(math.radians(degrees))
+
+
+def corotated_reference(F: Tensor, mu: float, lam: float) -> Tensor:
+    """2 mu (F - R) F^T + lambda J (J - 1) I in PyTorch: the public solver's "jelly"."""
+    U, S, Vh = torch.linalg.svd(F)
+    flip = torch.linalg.det(U @ Vh).sign()
+    R = U @ torch.diag_embed(torch.stack([torch.ones_like(flip), torch.ones_like(flip), flip], -1)) @ Vh
+    J = torch.linalg.det(F)[:, None, None]
+    return 2 * mu * (F - R) @ F.mT + lam * J * (J - 1) * torch.eye(3).to(F)

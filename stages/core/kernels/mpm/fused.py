@@ -1,0 +1,295 @@
+"""A whole step of all particles in one launch: the order that is fastest on a GPU.
+
+A thread gathers from one grid, making velocity of momentum and applying walls as it reads, moves its particle, and
+scatters into a second grid; further threads clear a third. The three change roles every step, so that nothing waits.
+A particle that comes to a new cell enters the blocks it now reaches into the list of blocks to clear: the list is
+exact, and never read by the host. The transfers, materials and walls are those of kernels/mpm.py.
+
+Source: Wang et al. 2020, "A massively parallel and scalable multi-GPU material point method" (fused transfers).
+"""
+
+from __future__ import annotations
+
+from functools import cache
+
+import warp as wp
+
+from stages.core.kernels.mpm.constitutive import neo_hookean, respond
+from stages.core.kernels.mpm.exact import gather_exact, scatter_exact, velocity_exact
+from stages.core.kernels.mpm.grid import (
+    BLOCK,
+    Grid,
+    Obstacle,
+    at_obstacles,
+    at_walls,
+    bounced,
+    first_node,
+    near_obstacles,
+    near_walls,
+    weights,
+)
+from stages.core.kernels.mpm.nodes import gather_momentum, mat43, scatter_nodes
+from stages.core.kernels.mpm.transfers import FREE, LOST, Moved, Rows, carried, guided, lose, moved
+
+THREADS = 128  # a block
+
+
+@wp.struct
+class Touched:
+    """Blocks with particles since the start of the frame: `blocks[: total[0]]`, and a mark for each block."""
+
+    marks: wp.array[int]
+    blocks: wp.array[int]
+    total: wp.array[int]
+
+
+@wp.func
+def _node(grid: Grid, block: int, n: int) -> int:
+    """Number of node n (0..63) of a block, counted through all scenes."""
+    nb = wp.vec3i(grid.nodes[0] // BLOCK, grid.nodes[1] // BLOCK, grid.nodes[2] // BLOCK)
+    a = block // (nb[1] * nb[2])  # scenes follow each other along x
+    b = (block // nb[2]) % nb[1]
+    c = block % nb[2]
+    i = a * BLOCK + n // (BLOCK * BLOCK)
+    j = b * BLOCK + (n // BLOCK) % BLOCK
+    return (i * grid.nodes[1] + j) * grid.nodes[2] + c * BLOCK + n % BLOCK
+
+
+@wp.func
+def _touch(grid: Grid, rows: Rows, i: int, base: wp.vec3i, friction: wp.array[float], touched: Touched):
+    """List the blocks of a stencil, and let nodes at walls know the largest friction that comes to them."""
+    nb = wp.vec3i(grid.nodes[0] // BLOCK, grid.nodes[1] // BLOCK, grid.nodes[2] // BLOCK)
+    a0 = rows.scene[i] * nb[0]
+    for a in range(base[0] // BLOCK, (base[0] + 2) // BLOCK + 1):
+        for b in range(base[1] // BLOCK, (base[1] + 2) // BLOCK + 1):
+            for c in range(base[2] // BLOCK, (base[2] + 2) // BLOCK + 1):
+                block = ((a0 + a) * nb[1] + b) * nb[2] + c
+                if touched.marks[block] == 0:  # noqa: SIM102 -- look before the atomic; Warp's `and` does both
+                    if wp.atomic_max(touched.marks, block, 1) == 0:
+                        touched.blocks[wp.atomic_add(touched.total, 0, 1)] = block
+    if near_walls(grid, base):
+        corner = rows.scene[i] * grid.count + (base[0] * grid.nodes[1] + base[1]) * grid.nodes[2] + base[2]
+        mu = rows.friction[i]
+        for n in range(27):
+            node = corner + ((n // 9) * grid.nodes[1] + (n // 3) % 3) * grid.nodes[2] + n % 3
+            if friction[node] < mu:
+                wp.atomic_max(friction, node, mu)
+
+
+@wp.func
+def _add(s: mat43, fx: wp.vec3, n: int, velocity: wp.vec3) -> mat43:
+    """Sums over a stencil, with its node n (0..26) added; recomputes weights, for loops that are not unrolled."""
+    at = wp.vec3(float(n // 9), float((n // 3) % 3), float(n % 3))
+    d = at - fx
+    w = float(1.0)  # noqa: UP018 -- Warp takes a literal for a constant
+    for axis in range(3):
+        away = wp.abs(d[axis])
+        w *= wp.where(away < 0.5, 0.75 - away * away, 0.5 * (1.5 - away) * (1.5 - away))
+    v = w * velocity
+    return s + mat43(v[0], v[1], v[2], v[0] * d[0], v[1] * d[0], v[2] * d[0], v[0] * d[1], v[1] * d[1], v[2] * d[1],
+                     v[0] * d[2], v[1] * d[2], v[2] * d[2])  # fmt: skip
+
+
+@wp.func
+def _bounded(
+    grid: Grid, read: wp.array[wp.vec4], friction: wp.array[float], node: int, at: wp.vec3i, scale: wp.vec2
+) -> wp.vec3:
+    """Velocity of a node, after the walls; of one that counts in whole numbers, if there is a scale."""
+    v = wp.vec3()
+    if scale[0] > 0.0:
+        v = velocity_exact(read, node, scale)
+    else:
+        u = read[node]
+        v = wp.vec3(u[0], u[1], u[2]) / wp.max(u[3], 1e-30)
+    return at_walls(grid, at, v, friction[node])
+
+
+@wp.func
+def _gather_walls(
+    grid: Grid, read: wp.array[wp.vec4], friction: wp.array[float], corner: int, base: wp.vec3i, fx: wp.vec3,
+    scale: wp.vec2,
+) -> mat43:  # fmt: skip
+    """As gather_momentum, where some of the nodes feel a wall."""
+    s = mat43()
+    for n in range(27):
+        at = base + wp.vec3i(n // 9, (n // 3) % 3, n % 3)
+        node = corner + ((n // 9) * grid.nodes[1] + (n // 3) % 3) * grid.nodes[2] + n % 3
+        s = _add(s, fx, n, _bounded(grid, read, friction, node, at, scale))
+    return s
+
+
+@wp.func
+def _gather_solid(
+    grid: Grid, read: wp.array[wp.vec4], friction: wp.array[float], obstacles: wp.array[Obstacle], time: float,
+    corner: int, base: wp.vec3i, fx: wp.vec3, scale: wp.vec2,
+) -> mat43:  # fmt: skip
+    """As gather_momentum, where some of the nodes feel a wall or an obstacle."""
+    s = mat43()
+    for n in range(27):
+        at = base + wp.vec3i(n // 9, (n // 3) % 3, n % 3)
+        node = corner + ((n // 9) * grid.nodes[1] + (n // 3) % 3) * grid.nodes[2] + n % 3
+        v = _bounded(grid, read, friction, node, at, scale)
+        place = grid.origin + grid.dx * wp.vec3(float(at[0]), float(at[1]), float(at[2]))
+        s = _add(s, fx, n, at_obstacles(place, v, obstacles, time, grid.dx))
+    return s
+
+
+@wp.func
+def _gather_free(
+    grid: Grid, read: wp.array[wp.vec4], friction: wp.array[float], corner: int, base: wp.vec3i, fx: wp.vec3,
+    scale: wp.vec2,
+) -> mat43:  # fmt: skip
+    """Where no node feels a wall, or only the floor: the whole stencil at once."""
+    under = grid.low[2] + 1 - base[2]
+    return gather_momentum(read, friction, corner, grid.nodes[1] * grid.nodes[2], grid.nodes[2], weights(fx), fx, under,
+                           grid.keep)  # fmt: skip
+
+
+@wp.func
+def _gather_free_exact(
+    grid: Grid, read: wp.array[wp.vec4], friction: wp.array[float], corner: int, base: wp.vec3i, fx: wp.vec3,
+    scale: wp.vec2,
+) -> mat43:  # fmt: skip
+    return gather_exact(read, corner, grid.nodes[1] * grid.nodes[2], grid.nodes[2], weights(fx), fx, scale)
+
+
+@wp.func
+def _at_sides(grid: Grid, base: wp.vec3i) -> bool:
+    """Whether a stencil has nodes that feel a wall other than the floor."""
+    return base[0] <= grid.low[0] or base[1] <= grid.low[1] or base[0] + 2 >= grid.high[0] or \
+        base[1] + 2 >= grid.high[1] or base[2] + 2 >= grid.high[2]  # fmt: skip
+
+
+@wp.func
+def _scatter(
+    write: wp.array[wp.vec4], first: int, stride_x: int, stride_y: int, weight: wp.mat33, fx: wp.vec3, load: wp.mat44,
+    scale: wp.vec2,
+):  # fmt: skip
+    scatter_nodes(write, first, stride_x, stride_y, weight, fx, load)
+
+
+@cache
+def fused_step(plastic: bool, solid: bool, bouncy: bool, exact: bool) -> wp.Kernel:
+    """The kernel; only if `plastic` it knows materials beside neo-Hookean, if `solid` obstacles, if `bouncy`
+    restitution: what it does not know costs no registers. If `exact`, nodes count in whole numbers."""
+
+    # 80 registers a thread instead of 94, and a quarter more threads at once (whole numbers need more registers)
+    bounds = {} if exact else {"launch_bounds": (THREADS, 6)}
+    collect, add = (_gather_free_exact, scatter_exact) if exact else (_gather_free, _scatter)
+    walled = near_walls if exact else _at_sides
+
+    @wp.kernel(module="unique", enable_backward=False, **bounds)
+    def fused_step(
+        grid: Grid, rows: Rows, sweep_from: int, sweepers: int, gather: int, scatter: int, substep: int,
+        clock: wp.array[float], damping: float, read: wp.array[wp.vec4], write: wp.array[wp.vec4],
+        stale: wp.array[wp.vec4], friction: wp.array[float], touched: Touched, obstacles: wp.array[Obstacle],
+        scale: wp.vec2,
+    ):  # fmt: skip
+        """Threads below `sweep_from` (a multiple of 32) each move a particle; `sweepers` more clear `stale`.
+
+        clock: the substep [s], on the device so that a captured graph can be replayed with another.
+        """
+        i = wp.tid()
+        if i >= sweep_from:
+            if scatter > 0 and gather > 0:
+                nodes = touched.total[0] * BLOCK * BLOCK * BLOCK
+                t = i - sweep_from
+                while t < nodes:
+                    node = _node(grid, touched.blocks[t // 64], t % 64)
+                    if wp.static(exact):
+                        stale[2 * node] = wp.vec4()
+                        stale[2 * node + 1] = wp.vec4()
+                    else:
+                        stale[node] = wp.vec4()
+                    t += sweepers
+            return
+        dt = clock[0]
+        stride_y = grid.nodes[2]
+        stride_x = grid.nodes[1] * grid.nodes[2]
+        first = int(-1)  # noqa: UP018 -- Warp takes a literal for a constant
+        fx = wp.vec3(1.0, 1.0, 1.0)
+        load = wp.mat44()
+        held = int(LOST)
+        if i < rows.count:
+            held = int(rows.held[i])
+        if held != LOST:
+            now = Moved()
+            x = rows.x[i]
+            F = rows.F[i]
+            stiffness = rows.stiffness[i]
+            window = rows.scene[i] * grid.count
+            if gather > 0 and held == FREE:
+                g = (x - grid.origin) / grid.dx
+                base = first_node(g)
+                fx = wp.vec3(g[0] - float(base[0]), g[1] - float(base[1]), g[2] - float(base[2]))
+                at = window + base[0] * stride_x + base[1] * stride_y + base[2]
+                s = mat43()
+                if wp.static(solid):
+                    time = dt * float(substep)
+                    if walled(grid, base) or near_obstacles(x, obstacles, time, 2.0 * grid.dx):
+                        s = _gather_solid(grid, read, friction, obstacles, time, at, base, fx, scale)
+                    else:
+                        s = collect(grid, read, friction, at, base, fx, scale)
+                else:
+                    if walled(grid, base):
+                        s = _gather_walls(grid, read, friction, at, base, fx, scale)
+                    else:
+                        s = collect(grid, read, friction, at, base, fx, scale)
+                now = moved(grid, x, F, s, dt)
+            else:
+                now = guided(grid, x, rows.v[i], rows.C[i], F, wp.where(gather > 0, dt, 0.0))
+            if not now.alive:
+                lose(rows.held, rows.lost, i, rows.scene[i], rows.order[i])
+            tau = wp.mat33()
+            if wp.static(plastic):
+                answer = respond(int(rows.model[i]), now.F, stiffness, rows.plastic[i], rows.state[i],
+                                 wp.where(gather > 0, dt, 0.0))  # fmt: skip
+                now.F = answer.F
+                tau = answer.tau
+                rows.state[i] = answer.state
+            else:
+                tau = neo_hookean(now.F, stiffness)
+            if gather > 0:
+                rows.x[i] = now.x
+                rows.F[i] = now.F
+                if scatter == 0:  # between, the velocity lives on the grid
+                    rows.v[i] = now.v
+                    rows.C[i] = now.C
+            if scatter > 0 and now.alive:
+                g = (now.x - grid.origin) / grid.dx
+                base = first_node(g)
+                fx = wp.vec3(g[0] - float(base[0]), g[1] - float(base[1]), g[2] - float(base[2]))
+                home = rows.home[i]
+                if base[0] != home[0] or base[1] != home[1] or base[2] != home[2]:
+                    rows.home[i] = base
+                    _touch(grid, rows, i, base, friction, touched)
+                if wp.static(bouncy):  # noqa: SIM102 -- resolved when the kernel is built
+                    if held == FREE:
+                        now.v = bounced(grid, obstacles, dt * float(substep + 1), now.x, now.v, rows.friction[i], dt)
+                load = carried(grid.dx, now, tau, rows.mass[i], rows.volume[i], stiffness[2], rows.push[i], held, dt,
+                               damping)  # fmt: skip
+                first = window + base[0] * stride_x + base[1] * stride_y + base[2]
+        if scatter > 0:
+            add(write, first, stride_x, stride_y, weights(fx), fx, load, scale)
+
+    return fused_step
+
+
+@wp.kernel(enable_backward=False)
+def clear_touched(
+    grid: Grid, sweepers: int, a: wp.array[wp.vec4], b: wp.array[wp.vec4], c: wp.array[wp.vec4],
+    friction: wp.array[float], touched: Touched, width: int,
+):  # fmt: skip
+    """Leave all grids clean at the end of a frame, and no block marked; the list itself is emptied afterwards."""
+    t = wp.tid()
+    nodes = touched.total[0] * BLOCK * BLOCK * BLOCK
+    while t < nodes:
+        block = touched.blocks[t // 64]
+        node = _node(grid, block, t % 64)
+        for n in range(width):  # a node is one or two of them
+            a[node * width + n] = wp.vec4()
+            b[node * width + n] = wp.vec4()
+            c[node * width + n] = wp.vec4()
+        friction[node] = 0.0
+        touched.marks[block] = 0
+        t += sweepers

@@ -1,0 +1,181 @@
+"""Moving particles on a grid: MLS-MPM with APIC transfers and quadratic B-splines, for any number of scenes at once.
+
+Here is what both launch orders share. kernels/mpm_fused.py does a whole step in one launch, which is fastest on a GPU;
+kernels/mpm_split.py does particles and grid in turn, which is fastest on a CPU, where the division by mass and the
+walls would otherwise be done 27 times a particle instead of once a node.
+
+The grids are dense in memory, but only blocks of 4x4x4 nodes that particles can reach are read, written and cleared.
+
+Source: Hu et al. 2018, "A Moving Least Squares Material Point Method", eq. 16-18 and its 88-line code;
+Jiang et al. 2015, "The Affine Particle-In-Cell Method"; Jiang et al. 2017, "An angular momentum conserving affine
+particle-in-cell method" (RPIC damping).
+"""
+
+from __future__ import annotations
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from stages.core.kernels.mpm.grid import BLOCK, Grid, first_node, within
+from stages.core.kernels.mpm.nodes import mat43
+
+HELD = 1e4  # a held particle weighs this much more on the grid, so that others stop at it
+FREE, GUIDED, LOST = 0, 1, 2  # values of `held`: moved by the grid, by its own velocity, not at all any more
+
+
+@wp.struct
+class Rows:
+    """The particles of all scenes, sorted by cell. `order` is the row that each had at first."""
+
+    count: int
+    x: wp.array[wp.vec3]
+    v: wp.array[wp.vec3]
+    C: wp.array[wp.mat33]
+    F: wp.array[wp.mat33]
+    mass: wp.array[float]
+    volume: wp.array[float]
+    stiffness: wp.array[wp.vec3]
+    friction: wp.array[float]
+    held: wp.array[wp.int8]
+    model: wp.array[wp.int8]  # see mpm_materials.py
+    plastic: wp.array[wp.vec3]
+    state: wp.array[float]
+    push: wp.array[wp.vec3]  # accelerations
+    scene: wp.array[int]
+    order: wp.array[int]
+    home: wp.array[wp.vec3i]  # stencil when the list of blocks was made
+    lost: wp.array[int]  # a scene: lowest `order` of its lost particles
+
+
+@wp.struct
+class Moved:
+    """A particle on its way through a step; `alive` when it has something to scatter."""
+
+    x: wp.vec3
+    v: wp.vec3
+    C: wp.mat33
+    F: wp.mat33
+    alive: bool
+
+
+@wp.func
+def moved(grid: Grid, x: wp.vec3, F: wp.mat33, s: mat43, dt: float) -> Moved:
+    """A particle a step further, by sums over its stencil; one that would leave the grid stays, and is not alive."""
+    out = Moved()
+    k = 4.0 / grid.dx
+    out.v = wp.vec3(s[0, 0], s[0, 1], s[0, 2])
+    out.C = wp.mat33(k * s[1, 0], k * s[2, 0], k * s[3, 0], k * s[1, 1], k * s[2, 1], k * s[3, 1],
+                     k * s[1, 2], k * s[2, 2], k * s[3, 2])  # fmt: skip
+    out.x = x + dt * out.v
+    out.F = F + dt * (out.C * F)
+    out.alive = within(grid, (out.x - grid.origin) / grid.dx)
+    if not out.alive:
+        return stopped(x, F)
+    return out
+
+
+@wp.func
+def stopped(x: wp.vec3, F: wp.mat33) -> Moved:
+    """A particle that is lost."""
+    out = Moved()
+    out.x = x
+    out.F = F
+    out.alive = False
+    return out
+
+
+@wp.func
+def guided(grid: Grid, x: wp.vec3, v: wp.vec3, C: wp.mat33, F: wp.mat33, dt: float) -> Moved:
+    """A particle that goes its own way for `dt` [s]; 0 to take it as it is."""
+    out = Moved()
+    out.x = x + dt * v
+    out.v = v
+    out.C = C
+    out.F = F
+    out.alive = within(grid, (out.x - grid.origin) / grid.dx)
+    if not out.alive:
+        return stopped(x, F)
+    return out
+
+
+@wp.func
+def lose(held: wp.array[wp.int8], lost: wp.array[int], i: int, scene: int, order: int):
+    """Note that particle i is lost, and the first of its scene."""
+    held[i] = wp.int8(LOST)
+    wp.atomic_min(lost, scene, order)
+
+
+@wp.func
+def carried(
+    dx: float, now: Moved, tau: wp.mat33, mass: float, volume: float, viscosity: float, push: wp.vec3, held: int,
+    dt: float, damping: float,
+) -> wp.mat44:  # fmt: skip
+    """What a particle brings to the grid: row 0 momentum and mass, rows 1 to 3 the change a node along x, y, z."""
+    both = now.C + wp.transpose(now.C)
+    A = (dx * mass) * (now.C - (0.5 * damping) * both) - (dt * 4.0 / dx * volume) * (tau + viscosity * both)
+    m = mass
+    q = m * (now.v + dt * push)
+    if held != FREE:
+        m = m * HELD
+        q = m * now.v
+        A = wp.mat33()
+    return wp.mat44(q[0], q[1], q[2], m, A[0, 0], A[1, 0], A[2, 0], 0.0, A[0, 1], A[1, 1], A[2, 1], 0.0,
+                    A[0, 2], A[1, 2], A[2, 2], 0.0)  # fmt: skip
+
+
+@wp.kernel(enable_backward=False)
+def sort_keys(grid: Grid, rows: Rows, keys: wp.array[int]):
+    """Cells in an order that keeps neighbours together: by scene, by block, within the block. Lost particles last."""
+    i = wp.tid()
+    if rows.held[i] == wp.int8(LOST):
+        keys[i] = 2147483647
+        return
+    b = first_node((rows.x[i] - grid.origin) / grid.dx)
+    n = wp.vec3i(grid.nodes[0] // BLOCK, grid.nodes[1] // BLOCK, grid.nodes[2] // BLOCK)
+    block = ((rows.scene[i] * n[0] + b[0] // BLOCK) * n[1] + b[1] // BLOCK) * n[2] + b[2] // BLOCK
+    keys[i] = ((block * BLOCK + b[0] % BLOCK) * BLOCK + b[1] % BLOCK) * BLOCK + b[2] % BLOCK
+
+
+def substep_reference(
+    x: Tensor, v: Tensor, C: Tensor, F: Tensor, mass: Tensor, volume: Tensor, stiffness: Tensor, push: Tensor,
+    dt: float, dx: float, nodes: tuple[int, int, int], low: Tensor, high: Tensor, friction: float,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
+    """One whole step in PyTorch, origin 0: the specification of the kernels above. All particles are free.
+
+    x, v, push (p, 3); C, F (p, 3, 3); mass, volume (p); stiffness (p, 3); low, high (3,) node indices of the walls.
+    """
+    offsets = torch.cartesian_prod(*[torch.arange(3)] * 3)
+    base = (x / dx - 0.5).floor().long()
+    fx = x / dx - base
+    w = torch.stack([0.5 * (1.5 - fx) ** 2, 0.75 - (fx - 1) ** 2, 0.5 * (fx - 0.5) ** 2], 1)  # p 3nodes 3axes
+    weight = w[:, offsets[:, 0], 0] * w[:, offsets[:, 1], 1] * w[:, offsets[:, 2], 2]
+    reach = (offsets - fx[:, None]) * dx  # p 27 3
+    ijk = base[:, None] + offsets
+    flat = (ijk[..., 0] * nodes[1] + ijk[..., 1]) * nodes[2] + ijk[..., 2]
+
+    one = torch.eye(3).to(F)
+    J = torch.linalg.det(F).clamp_min(0.05)
+    tau = stiffness[:, 0, None, None] * (F @ F.mT - one) + (stiffness[:, 1] * J.log())[:, None, None] * one
+    tau = tau + stiffness[:, 2, None, None] * (C + C.mT)
+    A = mass[:, None, None] * C - (dt * volume * 4 / dx**2)[:, None, None] * tau
+    momentum = (mass[:, None] * (v + dt * push))[:, None] + torch.einsum("pab,pnb->pna", A, reach)
+    count = nodes[0] * nodes[1] * nodes[2]
+    grid_m = torch.zeros(count).to(x).index_add(0, flat.flatten(), (weight * mass[:, None]).flatten())
+    grid_v = torch.zeros(count, 3).to(x).index_add(0, flat.flatten(), (weight[..., None] * momentum).flatten(0, 1))
+    grid_v = grid_v / grid_m.clamp_min(1e-30)[:, None]
+
+    at = torch.cartesian_prod(*[torch.arange(n) for n in nodes])
+    for axis, sign, hit in [(a, s, at[:, a] <= low[a] if s > 0 else at[:, a] >= high[a]) for a in (2, 1, 0)
+                            for s in (1.0, -1.0)]:  # fmt: skip
+        across = sign * grid_v[:, axis]
+        along = grid_v.clone()
+        along[:, axis] = 0
+        speed = along.norm(dim=1)
+        keep = ((speed + friction * across) / speed.clamp_min(1e-30)).clamp_min(0)
+        grid_v = torch.where((hit & (across < 0))[:, None], along * keep[:, None], grid_v)
+
+    near = grid_v[flat]
+    v = (weight[..., None] * near).sum(1)
+    C = 4 / dx**2 * torch.einsum("pn,pna,pnb->pab", weight, near, reach)
+    return x + dt * v, v, C, F + dt * C @ F

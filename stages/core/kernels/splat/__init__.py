@@ -1,0 +1,1 @@
+"""Rasterisation and image-loss kernels."""

@@ -1,0 +1,159 @@
+"""Which splats touch which bin of the image, nearest first.
+
+The splats are sorted by depth once; walking them in that order and appending each to the bins it touches leaves every
+bin sorted. That is far less to sort than a key for each pair of splat and bin.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from stages.core.kernels.interop import view
+from stages.core.kernels.splat.projection import BIN
+from stages.core.kernels.splat.simd import even, parts, run
+
+wp.set_module_options({"enable_backward": False})
+
+# Radix sort, least significant digit first, 3 x 11 bits (the sign of a depth is always 0); stable.
+_SORT = r"""
+enum { DIGITS = 2048 };
+unsigned hist[3][DIGITS] = {};
+unsigned* key[2] = {(unsigned*)scratch.data, (unsigned*)scratch.data + n};
+int* id[2] = {order.data, scratch.data + 2 * (long)n};
+int m = 0;
+for (int i = 0; i < n; ++i) {
+    unsigned k = keys.data[i];
+    if ((int)k < 0) continue;
+    key[1][m] = k;
+    id[1][m++] = i;
+    ++hist[0][k & 2047]; ++hist[1][(k >> 11) & 2047]; ++hist[2][k >> 22];
+}
+for (int pass = 0; pass < 3; ++pass) {
+    unsigned at = 0, *h = hist[pass];
+    for (int d = 0; d < DIGITS; ++d) { unsigned c = h[d]; h[d] = at; at += c; }
+    const unsigned* from = key[~pass & 1];
+    const int* ids = id[~pass & 1];
+    for (int i = 0; i < m; ++i) {
+        unsigned slot = h[(from[i] >> (11 * pass)) & 2047]++;
+        key[pass & 1][slot] = from[i];
+        id[pass & 1][slot] = ids[i];
+    }
+}
+total.data[0] = m;
+"""
+
+# Every piece counts its own stretch of the order, so that later each knows where in a bin it writes.
+_COUNT = r"""
+int* count = counts.data + (long)piece * bins;
+for (int b = 0; b < bins; ++b) count[b] = 0;
+for (int i = bounds.data[piece]; i < bounds.data[piece + 1]; ++i) {
+    const short* r = rects.data + 4 * (long)order.data[i];
+    for (int y = r[1]; y <= r[3]; ++y)
+        for (int x = r[0]; x <= r[2]; ++x) ++count[y * across + x];
+}
+"""
+
+_FILL = r"""
+int* at = counts.data + (long)piece * bins;
+for (int i = bounds.data[piece]; i < bounds.data[piece + 1]; ++i) {
+    const int id = order.data[i];
+    const short* r = rects.data + 4 * (long)id;
+    for (int y = r[1]; y <= r[3]; ++y)
+        for (int x = r[0]; x <= r[2]; ++x) members.data[at[y * across + x]++] = id;
+}
+"""
+
+
+@wp.func_native(_SORT)
+def _sort_keys(n: int, keys: wp.array[int], order: wp.array[int], scratch: wp.array[int], total: wp.array[int]): ...
+
+
+@wp.kernel
+def _sort(
+    start: int, piece: int, n: int, keys: wp.array[int], order: wp.array[int], scratch: wp.array[int],
+    total: wp.array[int],
+):  # fmt: skip
+    _sort_keys(n, keys, order, scratch, total)
+
+
+@wp.func_native(_COUNT)
+def _count_piece(
+    piece: int, bounds: wp.array[int], order: wp.array[int], rects: wp.array[wp.int16], across: int, bins: int,
+    counts: wp.array[int],
+): ...  # fmt: skip
+
+
+@wp.func_native(_FILL)
+def _fill_piece(
+    piece: int, bounds: wp.array[int], order: wp.array[int], rects: wp.array[wp.int16], across: int, bins: int,
+    counts: wp.array[int], members: wp.array[int],
+): ...  # fmt: skip
+
+
+@wp.kernel
+def _count(
+    start: int, piece: int, bounds: wp.array[int], order: wp.array[int], rects: wp.array[wp.int16], across: int,
+    bins: int, counts: wp.array[int],
+):  # fmt: skip
+    _count_piece(piece, bounds, order, rects, across, bins, counts)
+
+
+@wp.kernel
+def _fill(
+    start: int, piece: int, bounds: wp.array[int], order: wp.array[int], rects: wp.array[wp.int16], across: int,
+    bins: int, counts: wp.array[int], members: wp.array[int],
+):  # fmt: skip
+    _fill_piece(piece, bounds, order, rects, across, bins, counts, members)
+
+
+@dataclass(frozen=True)
+class Bins:
+    """The splats of every bin of side x side pixels, row by row, nearest first."""
+
+    members: Tensor  # (m,) int32, indices of splats
+    starts: Tensor  # (bins + 1,) int32, bin b holds members[starts[b]:starts[b + 1]]
+    width: int  # [px]
+    height: int
+    side: int = BIN
+
+    @property
+    def across(self) -> int:
+        return -(-self.width // self.side)
+
+    def pieces(self, count: int, work: Tensor | None = None) -> list[int]:
+        """Bounds of at most that many runs of bins with about equal work, by default the number of members."""
+        work = self.starts.diff() if work is None else work
+        total = (work + 1).cumsum(0).double()
+        cuts = torch.searchsorted(total, total[-1] * torch.arange(1, count) / count)
+        return sorted({0, *cuts.tolist(), len(work)})
+
+
+def fill_bins(keys: Tensor, rects: Tensor, width: int, height: int, side: int = BIN) -> Bins:
+    """Bins of splats from the keys and rectangles that `project` returns, or rectangles in bins of another side."""
+    n, across, down = len(keys), -(-width // side), -(-height // side)
+    bins = across * down
+    order, scratch = torch.empty(n, dtype=torch.int32), torch.empty(3 * n, dtype=torch.int32)
+    total = torch.zeros(1, dtype=torch.int32)
+    if n:
+        run(_sort, [0, 1], [n, view(keys), view(order), view(scratch), view(total)])
+    pieces = parts()
+    bounds = torch.tensor(even(int(total), pieces), dtype=torch.int32)
+    counts = torch.empty(pieces, bins, dtype=torch.int32)
+    walk = [view(bounds), view(order), view(rects.view(-1)), across, bins, view(counts.view(-1))]
+    run(_count, list(range(pieces + 1)), walk)
+    ends = counts.T.reshape(-1).cumsum(0, dtype=torch.int32)  # bin by bin, within it piece by piece
+    starts = torch.cat([ends.new_zeros(1), ends[pieces - 1 :: pieces]])
+    counts.copy_((ends - counts.T.reshape(-1)).view(bins, pieces).T)
+    members = torch.empty(int(ends[-1]), dtype=torch.int32)
+    run(_fill, list(range(pieces + 1)), [*walk, view(members)])
+    return Bins(members, starts, width, height, side)
+
+
+def fill_bins_reference(splats: Tensor) -> Tensor:
+    """Indices of all visible splats, nearest first: what one bin over the whole image would hold."""
+    visible = (splats[:, 11] > 0).nonzero()[:, 0]
+    return visible[splats[visible, 9].argsort(stable=True)]

@@ -1,0 +1,199 @@
+"""Compositing of binned splats, front to back, sixteen pixels (4 x 4) at a time.
+
+The bin's 64 blocks of pixels keep their state in the first-level cache while the bin's splats pass by once. A 64-bit
+mask says which blocks a splat can reach and which still let light through, so neither costs more than a bit.
+"""
+
+from __future__ import annotations
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from stages.core.kernels.interop import view
+from stages.core.kernels.splat.binning import Bins
+from stages.core.kernels.splat.compositing_adjoint import blend_adjoint
+from stages.core.kernels.splat.pixel_blocks import BLOCKS_OF_BIN, CLOSED, NOTHING, PIXELS, SOLID
+from stages.core.kernels.splat.projection import FAINTEST
+from stages.core.kernels.splat.simd import VECTORS, parts, run
+
+wp.set_module_options({"enable_backward": False})
+
+_FORWARD = r"""
+F T[BLOCKS], colour[BLOCKS][4];
+I stop[BLOCKS];
+TRACK(F best[BLOCKS]; I which[BLOCKS]; float* total = totals.data + (long)piece * n;)
+unsigned long long alive = 0;
+for (int b = 0; b < BLOCKS; ++b) {
+    I in = inside(b);
+    T[b] = in ? (F)(1.0f) : (F)(-1.0f);  // negative: finished
+    for (int c = 0; c < 4; ++c) colour[b][c] = none;
+    TRACK(best[b] = none; which[b] = (I)(-1);)
+    stop[b] = (I)(0x7fffffff);
+    if (bits(in)) alive |= 1ull << b;
+}
+int k = begin;
+for (const int end = starts.data[bin + 1]; k < end && alive; ++k) {
+    __builtin_prefetch(splats.data + 16 * (long)members.data[k + 8 < end ? k + 8 : k]);
+    const int id = members.data[k];
+    const float* s = splats.data + 16 * (long)id;
+    const float x = s[0] - X, y = s[1] - Y;
+    const float A = -0.721347520f * s[2], B = -1.44269504f * s[3], C = -0.721347520f * s[4], lo = s[10];
+    TRACK(F sum = none;)
+    for (unsigned long long todo = alive & reached(x, y, s[11], s[12]); todo; todo &= todo - 1) {
+        const int b = __builtin_ctzll(todo);
+        F dx = lx + (4 * (b & 7) - x), dy = ly + (4 * (b >> 3) - y);
+        F power = fma(dx, fma((F)(A), dx, B * dy), fma(C * dy, dy, (F)(lo)));  // log2 of alpha
+        I hit = (power >= -7.99435344f) & (T[b] > 0);
+        if (!bits(hit)) continue;
+        F alpha = vmin(exp2v(power), (F)(SOLID)), next = T[b] - alpha * T[b];
+        I drawn = hit & (next > CLOSED);
+        F w = drawn ? alpha * T[b] : none;
+        for (int c = 0; c < 4; ++c) colour[b][c] = fma(w, (F)(s[6 + c]), colour[b][c]);
+        TRACK(sum += w; I more = w > best[b]; best[b] = more ? w : best[b]; which[b] = more ? (I)(id) : which[b];)
+        I shut = hit & ~drawn;
+        T[b] = drawn ? next : T[b];
+        if (bits(shut)) {
+            T[b] = shut ? -T[b] : T[b];
+            stop[b] = shut ? (I)(k) : stop[b];
+            if (!bits(T[b] > 0)) alive &= ~(1ull << b);
+        }
+    }
+    TRACK(for (int l = 0; l < 16; ++l) total[id] += sum[l];)
+}
+ends.data[bin] = k;
+for (int b = 0; b < BLOCKS; ++b) {
+    F t = __builtin_elementwise_abs(T[b]);
+    I in = inside(b);
+    store(left.data + ((long)bin * BLOCKS + b) * 16, t);
+    __builtin_memcpy(stops.data + ((long)bin * BLOCKS + b) * 16, &stop[b], 64);
+    for (int l = 0; l < 16; ++l) {
+        if (!in[l]) continue;
+        const int p = pixel(b, l);
+        const float alpha = 1 - t[l];
+        for (int c = 0; c < 3; ++c) rgb.data[3 * (long)p + c] = colour[b][c][l] + t[l] * behind.data[step * p + c];
+        fourth.data[p] = mean ? colour[b][3][l] / (alpha > NOTHING ? alpha : NOTHING) : colour[b][3][l];
+        alphas.data[p] = alpha;
+        TRACK(index.data[p] = which[b][l];)
+    }
+}
+""".replace("SOLID", f"{SOLID}f").replace("CLOSED", f"{CLOSED}f").replace("NOTHING", f"{NOTHING}f")
+
+
+def _tracked(code: str, track: bool) -> str:
+    """The forward snippet with or without the lines that look for the heaviest splat."""
+    return f"#define TRACK(...) {'__VA_ARGS__' if track else ''}\n{code}\n#undef TRACK\n"
+
+
+@wp.func_native(_tracked(VECTORS + BLOCKS_OF_BIN + _FORWARD, False))
+def _blend_bin(
+    bin: int, width: int, height: int, across: int, step: int, mean: int, splats: wp.array[float],
+    members: wp.array[int], starts: wp.array[int], behind: wp.array[float], left: wp.array[float],
+    stops: wp.array[int], ends: wp.array[int], rgb: wp.array[float], fourth: wp.array[float], alphas: wp.array[float],
+): ...  # fmt: skip
+
+
+@wp.kernel
+def _blend(
+    start: int, piece: int, n: int, width: int, height: int, across: int, step: int, mean: int,
+    splats: wp.array[float], members: wp.array[int], starts: wp.array[int], behind: wp.array[float],
+    left: wp.array[float], stops: wp.array[int], ends: wp.array[int],
+    rgb: wp.array[float], fourth: wp.array[float], alphas: wp.array[float],
+):  # fmt: skip
+    _blend_bin(start + wp.tid(), width, height, across, step, mean, splats, members, starts, behind,
+               left, stops, ends, rgb, fourth, alphas)  # fmt: skip
+
+
+@wp.func_native(_tracked(VECTORS + BLOCKS_OF_BIN + _FORWARD, True))
+def _heaviest_bin(
+    bin: int, piece: int, n: int, width: int, height: int, across: int, step: int, mean: int, splats: wp.array[float],
+    members: wp.array[int], starts: wp.array[int], behind: wp.array[float], left: wp.array[float],
+    stops: wp.array[int], ends: wp.array[int], rgb: wp.array[float], fourth: wp.array[float], alphas: wp.array[float],
+    index: wp.array[int], totals: wp.array[float],
+): ...  # fmt: skip
+
+
+@wp.kernel
+def _heaviest(
+    start: int, piece: int, n: int, width: int, height: int, across: int, step: int, mean: int,
+    splats: wp.array[float], members: wp.array[int], starts: wp.array[int], behind: wp.array[float],
+    left: wp.array[float], stops: wp.array[int], ends: wp.array[int],
+    rgb: wp.array[float], fourth: wp.array[float], alphas: wp.array[float],
+    index: wp.array[int], totals: wp.array[float],
+):  # fmt: skip
+    _heaviest_bin(start + wp.tid(), piece, n, width, height, across, step, mean, splats, members, starts, behind,
+                  left, stops, ends, rgb, fourth, alphas, index, totals)  # fmt: skip
+
+
+def _outputs(bins: Bins) -> tuple[Tensor, ...]:
+    """Empty tensors for what a forward pass leaves for the backward pass, and for its images."""
+    count, size = len(bins.starts) - 1, (bins.height, bins.width)
+    left, stops = torch.empty(count * PIXELS), torch.empty(count * PIXELS, dtype=torch.int32)
+    ends = torch.empty(count, dtype=torch.int32)
+    return left, stops, ends, torch.empty(*size, 3), torch.empty(size), torch.empty(size)
+
+
+def _walk(splats: Tensor, bins: Bins, behind: Tensor, mean: bool, *tensors: Tensor) -> list:
+    """Kernel arguments from the number of splats on."""
+    flat = (splats, bins.members, bins.starts, behind, *tensors)
+    step = 0 if behind.dim() == 1 else 3
+    views = (view(t.view(-1)) for t in flat)
+    return [len(splats), bins.width, bins.height, bins.across, step, int(mean), *views]
+
+
+class _Blend(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, splats, bins, behind, mean):
+        state = _outputs(bins)
+        run(_blend, bins.pieces(4 * parts()), _walk(splats, bins, behind, mean, *state))
+        left, stops, ends, rgb, fourth, alpha = state
+        ctx.save_for_backward(splats, behind, left, stops, ends, fourth, alpha)
+        ctx.bins, ctx.mean = bins, mean
+        return rgb, fourth, alpha
+
+    @staticmethod
+    def backward(ctx, *upstream):
+        splats, behind, *state = ctx.saved_tensors
+        upstream = [v.float().contiguous() for v in upstream]
+        walk = _walk(splats, ctx.bins, behind, ctx.mean, *state, *upstream)
+        grads = blend_adjoint(splats, ctx.bins, state[2], walk)
+        return grads, None, None, None
+
+
+def blend(splats: Tensor, bins: Bins, behind: Tensor | None = None, mean: bool = False):
+    """Image (h, w, 3), fourth channel (h, w) and alpha (h, w) of splats (n, 16). Differentiable in the splats.
+
+    `behind` is a background colour (3,) or picture (h, w, 3), black when None. The fourth channel is a composite like
+    the others or, with `mean`, the mean over what is seen. In the splats' gradient, columns 10 and 11 hold the sums
+    over pixels of the absolute gradients of the centre, which densification wants: the plain ones cancel where a
+    splat is too large for the detail it covers.
+    Source: Kerbl et al. 2023; Ye et al. 2024, "AbsGS", eq. 8.
+    """
+    behind = torch.zeros(3) if behind is None else behind.float().contiguous()
+    return _Blend.apply(splats.contiguous(), bins, behind, mean)
+
+
+def heaviest(splats: Tensor, bins: Bins) -> tuple[Tensor, Tensor]:
+    """For every pixel the splat with the greatest weight (h, w; -1: none), for every splat its total weight (n,)."""
+    bounds = bins.pieces(parts())
+    index, totals = torch.empty(bins.height, bins.width, dtype=torch.int32), torch.zeros(len(bounds) - 1, len(splats))
+    run(_heaviest, bounds, _walk(splats, bins, torch.zeros(3), False, *_outputs(bins), index, totals))
+    return index.long(), totals.sum(0)
+
+
+def blend_reference(splats: Tensor, order: Tensor, width: int, height: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Image, fourth channel, alpha as `blend`, and the weights (h, w, m) of the splats in the given order, near to far.
+
+    Plain PyTorch, every splat at every pixel: for small scenes, in any precision.
+    """
+    s = splats[order]
+    y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    dx, dy = x.to(s)[..., None] - s[:, 0], y.to(s)[..., None] - s[:, 1]
+    sigma = 0.5 * (s[:, 2] * dx * dx + s[:, 4] * dy * dy) + s[:, 3] * dx * dy
+    alpha = (s[:, 5] * torch.exp(-sigma)).clamp_max(SOLID)
+    alpha = torch.where(alpha >= FAINTEST, alpha, torch.zeros_like(alpha))
+    drawn = (1 - alpha).cumprod(-1) > CLOSED  # once false, false for all that follow
+    alpha = torch.where(drawn, alpha, torch.zeros_like(alpha))
+    T = (1 - alpha).cumprod(-1)
+    weight = alpha * torch.cat([torch.ones_like(T[..., :1]), T[..., :-1]], -1)
+    return weight @ s[:, 6:9], weight @ s[:, 9], weight.sum(-1), weight

@@ -1,0 +1,157 @@
+"""The adjoint of compositing: every bin's splats back to front, sixteen pixels at a time.
+
+Warp's own tape is wrong on a loop like this one, so the adjoint is written by hand.
+"""
+
+from __future__ import annotations
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from stages.core.kernels.interop import view
+from stages.core.kernels.splat.binning import Bins
+from stages.core.kernels.splat.pixel_blocks import BLOCKS_OF_BIN, NOTHING, SOLID
+from stages.core.kernels.splat.projection import WIDTH
+from stages.core.kernels.splat.simd import SUMS, VECTORS, even, parts, run
+
+wp.set_module_options({"enable_backward": False})
+
+# dL/dalpha = T (colour . v) - S / (1 - alpha), where S is what lies behind, seen through: the sum of w (colour . v)
+# over the later splats, minus T_end v_alpha. The sums over pixels are moments in d, so that what they mean for a
+# splat's centre and covariance can wait until all bins are added up.
+_BACKWARD = r"""
+if (first) __builtin_memset(moments.data + (long)piece * n * 16, 0, (long)n * 64);
+F T[BLOCKS], S[BLOCKS], v[BLOCKS][4];
+I stop[BLOCKS];
+int last[BLOCKS];
+for (int b = 0; b < BLOCKS; ++b) {
+    I in = inside(b);
+    F v_alpha = none;
+    T[b] = load(left.data + ((long)bin * BLOCKS + b) * 16);
+    __builtin_memcpy(&stop[b], stops.data + ((long)bin * BLOCKS + b) * 16, 64);
+    stop[b] = in ? stop[b] : (I)(0);
+    last[b] = __builtin_reduce_max(stop[b]);
+    for (int c = 0; c < 4; ++c) v[b][c] = none;
+    for (int l = 0; l < 16; ++l) {
+        if (!in[l]) continue;
+        const int p = pixel(b, l);
+        float va = v_alphas.data[p], v4 = v_fourth.data[p];
+        for (int c = 0; c < 3; ++c) {
+            v[b][c][l] = v_rgb.data[3 * (long)p + c];
+            va -= v[b][c][l] * behind.data[step * p + c];
+        }
+        if (mean) {
+            v4 = alphas.data[p] > NOTHING ? v4 / alphas.data[p] : 0;
+            va -= v4 * fourth.data[p];
+        }
+        v[b][3][l] = v4;
+        v_alpha[l] = va;
+    }
+    S[b] = -v_alpha * T[b];
+}
+for (int k = ends.data[bin] - 1; k >= begin; --k) {
+    __builtin_prefetch(splats.data + 16 * (long)members.data[k - 8 > begin ? k - 8 : begin]);
+    const int id = members.data[k];
+    const float* s = splats.data + 16 * (long)id;
+    const float x = s[0] - X, y = s[1] - Y;
+    const float A = -0.721347520f * s[2], B = -1.44269504f * s[3], C = -0.721347520f * s[4], lo = s[10];
+    F sum[16];
+    for (int i = 0; i < 16; ++i) sum[i] = none;
+    bool any = false;
+    for (unsigned long long todo = reached(x, y, s[11], s[12]); todo; todo &= todo - 1) {
+        const int b = __builtin_ctzll(todo);
+        if (k >= last[b]) continue;
+        F dx = lx + (4 * (b & 7) - x), dy = ly + (4 * (b >> 3) - y);
+        F power = fma(dx, fma((F)(A), dx, B * dy), fma(C * dy, dy, (F)(lo)));
+        I hit = (power >= -7.99435344f) & (k < stop[b]);
+        if (!bits(hit)) continue;
+        any = true;
+        F raw = exp2v(power), alpha = hit ? vmin(raw, (F)(SOLID)) : none;
+        F open = 1.0f / (1.0f - alpha);
+        F t = T[b] * open, w = alpha * t, facing = none;
+        for (int c = 0; c < 4; ++c) {
+            facing = fma(v[b][c], (F)(s[6 + c]), facing);
+            sum[6 + c] = fma(w, v[b][c], sum[6 + c]);
+        }
+        F g = raw <= SOLID ? alpha * (t * facing - S[b] * open) : none;  // dL/dlog(alpha)
+        T[b] = t;
+        S[b] = fma(w, facing, S[b]);
+        F gx = g * dx, gy = g * dy;
+        sum[0] += gx;
+        sum[1] += gy;
+        sum[2] = fma(gx, dx, sum[2]);
+        sum[3] = fma(gx, dy, sum[3]);
+        sum[4] = fma(gy, dy, sum[4]);
+        sum[5] += g;
+        sum[10] += __builtin_elementwise_abs(s[2] * gx + s[3] * gy);
+        sum[11] += __builtin_elementwise_abs(s[3] * gx + s[4] * gy);
+    }
+    if (any) {
+        float* to = moments.data + ((long)piece * n + id) * 16;
+        store(to, load(to) + sums(sum));
+    }
+}
+""".replace("SOLID", f"{SOLID}f").replace("NOTHING", f"{NOTHING}f")
+
+# The moments of all pieces of a splat's gradient become the gradient of its row.
+_GRADIENT = r"""
+F m = load(moments.data + 16 * (long)i);
+for (int p = 1; p < pieces; ++p) m += load(moments.data + 16 * ((long)p * n + i));
+const float* s = splats.data + 16 * (long)i;
+F g = m;
+g[0] = s[2] * m[0] + s[3] * m[1];
+g[1] = s[3] * m[0] + s[4] * m[1];
+g[2] = -0.5f * m[2];
+g[3] = -m[3];
+g[4] = -0.5f * m[4];
+g[5] = s[5] > 0 ? m[5] / s[5] : 0.0f;
+store(grads.data + 16 * (long)i, g);
+"""
+
+
+@wp.func_native(VECTORS + SUMS + BLOCKS_OF_BIN + _BACKWARD)
+def _unblend_bin(
+    bin: int, first: bool, piece: int, n: int, width: int, height: int, across: int, step: int, mean: int,
+    splats: wp.array[float], members: wp.array[int], starts: wp.array[int], behind: wp.array[float],
+    left: wp.array[float], stops: wp.array[int], ends: wp.array[int], fourth: wp.array[float], alphas: wp.array[float],
+    v_rgb: wp.array[float], v_fourth: wp.array[float], v_alphas: wp.array[float], moments: wp.array[float],
+): ...  # fmt: skip
+
+
+@wp.kernel
+def _blend_adjoint(
+    start: int, piece: int, n: int, width: int, height: int, across: int, step: int, mean: int,
+    splats: wp.array[float], members: wp.array[int], starts: wp.array[int], behind: wp.array[float],
+    left: wp.array[float], stops: wp.array[int], ends: wp.array[int], fourth: wp.array[float], alphas: wp.array[float],
+    v_rgb: wp.array[float], v_fourth: wp.array[float], v_alphas: wp.array[float], moments: wp.array[float],
+):  # fmt: skip
+    _unblend_bin(start + wp.tid(), wp.tid() == 0, piece, n, width, height, across, step, mean, splats, members,
+                 starts, behind, left, stops, ends, fourth, alphas, v_rgb, v_fourth, v_alphas, moments)  # fmt: skip
+
+
+@wp.func_native(VECTORS + _GRADIENT)
+def _gradient_row(
+    i: int, n: int, pieces: int, splats: wp.array[float], moments: wp.array[float], grads: wp.array[float]
+): ...
+
+
+@wp.kernel
+def _gradients(
+    start: int, piece: int, n: int, pieces: int, splats: wp.array[float], moments: wp.array[float],
+    grads: wp.array[float],
+):  # fmt: skip
+    _gradient_row(start + wp.tid(), n, pieces, splats, moments, grads)
+
+
+def blend_adjoint(splats: Tensor, bins: Bins, ends: Tensor, walk: list) -> Tensor:
+    """Gradient (n, 16) of the splats. `ends` (bins,) is where each bin's forward pass stopped.
+
+    `walk` holds the kernel's arguments: those of the forward pass, what it left, and the upstream gradients.
+    """
+    n = len(splats)
+    bounds = bins.pieces(parts(), ends - bins.starts[:-1])
+    moments, grads = torch.empty(len(bounds) - 1, n, WIDTH), torch.empty(n, WIDTH)
+    run(_blend_adjoint, bounds, [*walk, view(moments.view(-1))])
+    run(_gradients, even(n, parts()), [n, len(moments), *(view(t.view(-1)) for t in (splats, moments, grads))])
+    return grads

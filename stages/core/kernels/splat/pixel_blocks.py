@@ -1,0 +1,40 @@
+"""A bin's 64 blocks of 4 x 4 pixels, one vector each: what compositing and its adjoint share.
+
+The rule, as in gsplat: alpha = min(0.999, opacity exp(-d'Cd/2)) counts from 1/255, a pixel is finished when the next
+splat would leave a transmittance T of 1e-4 or less (that splat is not drawn), and w = alpha T.
+"""
+
+from stages.core.kernels.splat.projection import BIN
+
+SOLID = 0.999  # alpha is never more, so that light always passes and 1 / (1 - alpha) exists
+CLOSED = 1e-4  # transmittance at which a pixel is finished
+NOTHING = 1e-10  # alpha below which a mean is 0, not noise
+BLOCKS = (BIN // 4) ** 2
+PIXELS = BLOCKS * 16  # in a bin, in the order of blocks and lanes in which per-pixel state is kept between passes
+
+BLOCKS_OF_BIN = r"""
+enum { BLOCKS = 64 };
+const int X = (bin % across) * 32, Y = (bin / across) * 32;
+const F lx = {.5f, 1.5f, 2.5f, 3.5f, .5f, 1.5f, 2.5f, 3.5f, .5f, 1.5f, 2.5f, 3.5f, .5f, 1.5f, 2.5f, 3.5f};
+const F ly = {.5f, .5f, .5f, .5f, 1.5f, 1.5f, 1.5f, 1.5f, 2.5f, 2.5f, 2.5f, 2.5f, 3.5f, 3.5f, 3.5f, 3.5f};
+const F none = (F)(0.0f);
+const int begin = starts.data[bin];
+auto inside = [&](int block) -> I {
+    return (lx + (float)(X + 4 * (block & 7)) < (float)width) & (ly + (float)(Y + 4 * (block >> 3)) < (float)height);
+};
+// where lane l of a block lies in the image, row by row
+auto pixel = [&](int block, int l) {
+    return (Y + 4 * (block >> 3) + (l >> 2)) * width + X + 4 * (block & 7) + (l & 3);
+};
+// the blocks that the box x +- rx, y +- ry touches, as bits
+auto reached = [&](float x, float y, float rx, float ry) -> unsigned long long {
+    auto clamp = [](float v) { return (int)(v < -1.0f ? -1.0f : v > 8.0f ? 8.0f : v); };
+    int j0 = clamp((x - rx + 0.5f) * 0.25f), j1 = clamp((x + rx - 0.5f) * 0.25f);
+    int i0 = clamp((y - ry + 0.5f) * 0.25f), i1 = clamp((y + ry - 0.5f) * 0.25f);
+    j0 = j0 < 0 ? 0 : j0; i0 = i0 < 0 ? 0 : i0; j1 = j1 > 7 ? 7 : j1; i1 = i1 > 7 ? 7 : i1;
+    if (j0 > j1 || i0 > i1 || x + rx < 0.5f || y + ry < 0.5f) return 0;
+    unsigned long long columns = ((2u << j1) - (1u << j0)) * 0x0101010101010101ull;
+    return columns & (~0ull << (8 * i0)) & (~0ull >> (56 - 8 * i1));
+};
+"""
+"""Where the lanes of each block lie, and which blocks a splat can reach; `bin` and the image are the kernel's."""

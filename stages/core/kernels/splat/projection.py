@@ -1,0 +1,276 @@
+"""Gaussians seen by one camera: centre, inverse covariance, colour and extent on the image, and back.
+
+A splat is a row of 16 floats, one cache line, so that one memory access fetches all that compositing needs:
+0-1 centre [px], 2-4 inverse covariance xx xy yy [1/px^2], 5 opacity, 6-8 colour, 9 depth, 10 log2 of the opacity,
+11-12 half width and height [px] of the part with alpha >= 1/255 (0: not visible), 13-15 unused.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+import warp as wp
+from torch import Tensor
+
+from stages.core.geometry.harmonics import evaluate_sh
+from stages.core.geometry.rotations import matrix
+from stages.core.kernels.interop import view
+from stages.core.kernels.splat.harmonics import HARMONICS, HARMONICS_ADJOINT
+from stages.core.kernels.splat.simd import LANES, VECTORS, even, parts, run
+
+wp.set_module_options({"enable_backward": False})  # the adjoint is written by hand below
+
+BLUR = 0.3  # added to the covariance on the image [px^2], so that no splat is thinner than a pixel
+FAINTEST = 1 / 255  # what alpha is ignored below
+WIDTH = 16  # floats in a splat
+BIN = 32  # pixels along a side of a bin
+
+# From a group of 16 Gaussians to their covariance on the image.
+_GEOMETRY = r"""
+const float* cam = camera.data;
+const int count = n - 16 * group < 16 ? n - 16 * group : 16;
+int row[16];
+for (int l = 0; l < 16; ++l) row[l] = 16 * group + (l < count ? l : 0);
+auto gather = [&row](const float* p, int stride, int column) {
+    F v;
+    for (int l = 0; l < 16; ++l) v[l] = p[(long)row[l] * stride + column];
+    return v;
+};
+F m[3], p[3], q[4], s[3];
+for (int i = 0; i < 3; ++i) m[i] = gather(means.data, 3, i);
+for (int i = 0; i < 3; ++i) p[i] = cam[3*i] * m[0] + cam[3*i+1] * m[1] + cam[3*i+2] * m[2] + cam[9+i];
+I visible = (p[2] >= cam[21]) & (p[2] < 1e10f);
+const float fx = cam[12], fy = cam[13];
+F z = visible ? p[2] : (F)(1.0f), iz = 1.0f / z;
+F xz = p[0] * iz, yz = p[1] * iz;
+// far outside the image the Jacobian is taken at the border, else the linearisation explodes
+F xc = vmin(vmax(xz, (F)(cam[22])), (F)(cam[23])), yc = vmin(vmax(yz, (F)(cam[24])), (F)(cam[25]));
+
+for (int i = 0; i < 4; ++i) q[i] = gather(quats.data, 4, i);
+F iq = 1.0f / vsqrt(q[0]*q[0] + q[1]*q[1] + q[2]*q[2] + q[3]*q[3]);
+for (int i = 0; i < 4; ++i) q[i] *= iq;
+F R[9] = {1 - 2*(q[2]*q[2] + q[3]*q[3]), 2*(q[1]*q[2] - q[0]*q[3]), 2*(q[1]*q[3] + q[0]*q[2]),
+          2*(q[1]*q[2] + q[0]*q[3]), 1 - 2*(q[1]*q[1] + q[3]*q[3]), 2*(q[2]*q[3] - q[0]*q[1]),
+          2*(q[1]*q[3] - q[0]*q[2]), 2*(q[2]*q[3] + q[0]*q[1]), 1 - 2*(q[1]*q[1] + q[2]*q[2])};
+for (int i = 0; i < 3; ++i) s[i] = gather(scales.data, 3, i);
+
+// rows u, v of J W (projection's Jacobian times the camera's rotation), and a = u R S, b = v R S,
+// so that the covariance on the image is [a.a a.b; a.b b.b]
+F u[3], v[3], a[3], b[3];
+for (int i = 0; i < 3; ++i) {
+    u[i] = fx * iz * (cam[i] - xc * cam[6+i]);
+    v[i] = fy * iz * (cam[3+i] - yc * cam[6+i]);
+}
+for (int j = 0; j < 3; ++j) {
+    a[j] = (u[0] * R[j] + u[1] * R[3+j] + u[2] * R[6+j]) * s[j];
+    b[j] = (v[0] * R[j] + v[1] * R[3+j] + v[2] * R[6+j]) * s[j];
+}
+F aa = a[0]*a[0] + a[1]*a[1] + a[2]*a[2], bb = b[0]*b[0] + b[1]*b[1] + b[2]*b[2];
+F ab = a[0]*b[0] + a[1]*b[1] + a[2]*b[2];
+F c0 = a[1]*b[2] - a[2]*b[1], c1 = a[2]*b[0] - a[0]*b[2], c2 = a[0]*b[1] - a[1]*b[0];
+// det = |a x b|^2 + blur (aa + bb) + blur^2: no cancellation, however thin the splat
+F idet = 1.0f / (c0*c0 + c1*c1 + c2*c2 + BLUR * (aa + bb) + BLUR * BLUR);
+F A = (bb + BLUR) * idet, B = -ab * idet, C = (aa + BLUR) * idet;
+F o = gather(opacities.data, 1, 0);
+""".replace("BLUR", f"{BLUR}f")
+
+_FORWARD = r"""
+F px = fx * xz + cam[14], py = fy * yz + cam[15];
+visible &= (o >= FAINTEST) & (idet > 0) & (idet < 1e30f);
+F lo = log2v(visible ? o : (F)(1.0f));
+F reach = 2 * 0.693147181f * (lo + 7.99435344f) + 1e-3f;  // 2 ln(255 o), a little more for rounding
+F rx = vsqrt(reach * (aa + BLUR)), ry = vsqrt(reach * (bb + BLUR));
+visible &= (px + rx > 0) & (px - rx < cam[19]) & (py + ry > 0) & (py - ry < cam[20]);
+if (!bits(visible)) {
+    for (int l = 0; l < count; ++l) {
+        store(splats.data + 16 * (long)row[l], (F)(0.0f));
+        keys.data[row[l]] = -1;
+    }
+    return;
+}
+""".replace("FAINTEST", f"{FAINTEST!r}f").replace("BLUR", f"{BLUR}f")
+
+_WRITE = r"""
+const F none = (F)(0.0f);
+F f[13] = {px, py, A, B, C, o, vmax(rgb[0], none), vmax(rgb[1], none), vmax(rgb[2], none), z, lo, rx, ry};
+I key = visible ? __builtin_bit_cast(I, z) : (I)(-1);  // positive floats sort as integers
+auto bin = [&](F edge, float last) {
+    return __builtin_convertvector(vmin(vmax(edge * (1.0f / BIN), none), (F)(last)), I);
+};
+I x0 = bin(px - rx - 0.5f, cam[26]), x1 = bin(px + rx - 0.5f, cam[26]);
+I y0 = bin(py - ry - 0.5f, cam[27]), y1 = bin(py + ry - 0.5f, cam[27]);
+for (int l = 0; l < count; ++l) {
+    F r = none;
+    if (key[l] >= 0)
+        for (int j = 0; j < 13; ++j) r[j] = f[j][l];
+    store(splats.data + 16 * (long)row[l], r);
+    keys.data[row[l]] = key[l];
+    short* rect = rects.data + 4 * (long)row[l];
+    rect[0] = x0[l]; rect[1] = y0[l]; rect[2] = x1[l]; rect[3] = y1[l];
+}
+""".replace("BIN", str(BIN))
+
+_BACKWARD = r"""
+const F none = (F)(0.0f);
+I seen;
+for (int l = 0; l < 16; ++l) seen[l] = splats.data[16 * (long)row[l] + 11] > 0 ? -1 : 0;
+auto slot = [&](int j) { return seen ? gather(grads.data, 16, j) : none; };
+auto scatter = [&](float* to, int stride, int column, F value) {
+    value = seen ? value : none;
+    for (int l = 0; l < count; ++l) to[(long)row[l] * stride + column] = value[l];
+};
+// inverse covariance -> covariance: G = -C V C with the symmetric V of its three numbers
+F va = slot(2), vb = 0.5f * slot(3), vc = slot(4);
+F t00 = A*va + B*vb, t01 = A*vb + B*vc, t10 = B*va + C*vb, t11 = B*vb + C*vc;
+F g00 = -(t00*A + t01*B), g01 = -(t00*B + t01*C), g11 = -(t10*B + t11*C);
+F vR[9], vs[3], vu[3] = {none, none, none}, vv[3] = {none, none, none};
+for (int j = 0; j < 3; ++j) {
+    F ga = 2 * (g00 * a[j] + g01 * b[j]), gb = 2 * (g01 * a[j] + g11 * b[j]);
+    vs[j] = none;
+    for (int i = 0; i < 3; ++i) {
+        F vM = u[i] * ga + v[i] * gb, M = R[3*i+j] * s[j];
+        vu[i] += M * ga;
+        vv[i] += M * gb;
+        vs[j] += vM * R[3*i+j];
+        vR[3*i+j] = vM * s[j];
+    }
+    scatter(v_scales.data, 3, j, vs[j]);
+}
+F vq[4];
+vq[0] = 2 * (q[1]*(vR[7] - vR[5]) + q[2]*(vR[2] - vR[6]) + q[3]*(vR[3] - vR[1]));
+vq[1] = 2 * (q[2]*(vR[1] + vR[3]) + q[3]*(vR[2] + vR[6]) + q[0]*(vR[7] - vR[5]) - 2*q[1]*(vR[4] + vR[8]));
+vq[2] = 2 * (q[1]*(vR[1] + vR[3]) + q[3]*(vR[5] + vR[7]) + q[0]*(vR[2] - vR[6]) - 2*q[2]*(vR[0] + vR[8]));
+vq[3] = 2 * (q[1]*(vR[2] + vR[6]) + q[2]*(vR[5] + vR[7]) + q[0]*(vR[3] - vR[1]) - 2*q[3]*(vR[0] + vR[4]));
+F along = vq[0]*q[0] + vq[1]*q[1] + vq[2]*q[2] + vq[3]*q[3];  // the norm has no effect
+for (int i = 0; i < 4; ++i) scatter(v_quats.data, 4, i, (vq[i] - along * q[i]) * iq);
+
+// u = fx/z (w0 - xc w2), v = fy/z (w1 - yc w2) with xc = x/z inside its limits
+F vxc = none, vyc = none, uu = none, vvv = none;
+for (int i = 0; i < 3; ++i) {
+    vxc -= fx * iz * vu[i] * cam[6+i];
+    vyc -= fy * iz * vv[i] * cam[6+i];
+    uu += vu[i] * u[i];
+    vvv += vv[i] * v[i];
+}
+F inx = (xz == xc) ? vxc : none, iny = (yz == yc) ? vyc : none;
+F vxz = inx + fx * slot(0), vyz = iny + fy * slot(1);
+F vp[3] = {vxz * iz, vyz * iz, slot(9) - (uu + vvv + vxz * xz + vyz * yz) * iz};
+F vm[3];
+for (int i = 0; i < 3; ++i) vm[i] = cam[i] * vp[0] + cam[3+i] * vp[1] + cam[6+i] * vp[2];
+scatter(v_opacities.data, 1, 0, slot(5));
+"""
+
+_DIRECTION = r"""
+F radial = vd[0] * x + vd[1] * y + vd[2] * h;
+for (int i = 0; i < 3; ++i) scatter(v_means.data, 3, i, vm[i] + (vd[i] - radial * d[i]) * id);
+"""
+
+
+@wp.func_native(VECTORS + _GEOMETRY + _FORWARD + HARMONICS + _WRITE)
+def _project_group(
+    group: int, n: int, k: int, camera: wp.array[float], means: wp.array[float], quats: wp.array[float],
+    scales: wp.array[float], opacities: wp.array[float], sh: wp.array[float],
+    splats: wp.array[float], keys: wp.array[int], rects: wp.array[wp.int16],
+): ...  # fmt: skip
+
+
+@wp.kernel
+def _project(
+    start: int, piece: int, n: int, k: int, camera: wp.array[float], means: wp.array[float], quats: wp.array[float],
+    scales: wp.array[float], opacities: wp.array[float], sh: wp.array[float],
+    splats: wp.array[float], keys: wp.array[int], rects: wp.array[wp.int16],
+):  # fmt: skip
+    _project_group(start + wp.tid(), n, k, camera, means, quats, scales, opacities, sh, splats, keys, rects)
+
+
+@wp.func_native(VECTORS + _GEOMETRY + HARMONICS + _BACKWARD + HARMONICS_ADJOINT + _DIRECTION)
+def _unproject_group(
+    group: int, n: int, k: int, camera: wp.array[float], means: wp.array[float], quats: wp.array[float],
+    scales: wp.array[float], opacities: wp.array[float], sh: wp.array[float], splats: wp.array[float],
+    grads: wp.array[float], v_means: wp.array[float], v_quats: wp.array[float], v_scales: wp.array[float],
+    v_opacities: wp.array[float], v_sh: wp.array[float],
+): ...  # fmt: skip
+
+
+@wp.kernel
+def _project_adjoint(
+    start: int, piece: int, n: int, k: int, camera: wp.array[float], means: wp.array[float], quats: wp.array[float],
+    scales: wp.array[float], opacities: wp.array[float], sh: wp.array[float], splats: wp.array[float],
+    grads: wp.array[float], v_means: wp.array[float], v_quats: wp.array[float], v_scales: wp.array[float],
+    v_opacities: wp.array[float], v_sh: wp.array[float],
+):  # fmt: skip
+    _unproject_group(start + wp.tid(), n, k, camera, means, quats, scales, opacities, sh, splats,
+                     grads, v_means, v_quats, v_scales, v_opacities, v_sh)  # fmt: skip
+
+
+def pinhole(viewmat: Tensor, K: Tensor, width: int, height: int, near: float) -> Tensor:
+    """What the kernels need to know of a camera, 28 floats: rotation, translation, fx fy cx cy, centre, size, near,
+    the limits of x/z and y/z (30 % outside the image), and the last bin across and down."""
+    W, k = np.asarray(viewmat.detach().cpu(), np.float64), np.asarray(K.detach().cpu(), np.float64)
+    R, t, (fx, fy, cx, cy) = W[:3, :3], W[:3, 3], (k[0, 0], k[1, 1], k[0, 2], k[1, 2])
+    mx, my = 0.15 * width / fx, 0.15 * height / fy
+    limits = [-cx / fx - mx, (width - cx) / fx + mx, -cy / fy - my, (height - cy) / fy + my]
+    last = [(width - 1) // BIN, (height - 1) // BIN]
+    numbers = [*R.ravel(), *t, fx, fy, cx, cy, *(-R.T @ t), width, height, near, *limits, *last]
+    return torch.tensor(np.asarray(numbers, np.float32))
+
+
+class _Project(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, camera, means, quats, scales, opacities, sh):
+        n, k = len(means), sh.shape[1]
+        splats = means.new_empty(n, WIDTH)
+        keys, rects = torch.empty(n, dtype=torch.int32), torch.empty(n, 4, dtype=torch.int16)
+        flat = [view(t.view(-1)) for t in (camera, means, quats, scales, opacities, sh, splats, keys, rects)]
+        groups = -(-n // LANES)
+        run(_project, even(groups, parts()), [n, k, *flat])
+        ctx.save_for_backward(camera, means, quats, scales, opacities, sh, splats)
+        ctx.mark_non_differentiable(keys, rects)
+        return splats, keys, rects
+
+    @staticmethod
+    def backward(ctx, v_splats, _keys, _rects):
+        camera, means, quats, scales, opacities, sh, splats = ctx.saved_tensors
+        n, k = len(means), sh.shape[1]
+        grads = [torch.empty_like(t) for t in (means, quats, scales, opacities, sh)]
+        tensors = (camera, means, quats, scales, opacities, sh, splats, v_splats.contiguous(), *grads)
+        flat = [view(t.view(-1)) for t in tensors]
+        run(_project_adjoint, even(-(-n // LANES), parts()), [n, k, *flat])
+        return None, *grads
+
+
+def project(camera: Tensor, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh: Tensor):
+    """Splats (n, 16), sort keys (n,) and bin rectangles (n, 4: first and last column and row) in a `pinhole`'s view.
+
+    Only the splats are differentiable; keys are the bits of the depth, -1 for what is not visible.
+    Source: Zwicker et al. 2001, "EWA splatting"; conventions of gsplat's classic mode.
+    """
+    return _Project.apply(camera, *(t.float().contiguous() for t in (means, quats, scales, opacities, sh)))
+
+
+def project_reference(camera: Tensor, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh: Tensor):
+    """Splats as `project` makes them, in plain PyTorch and any precision."""
+    camera = camera.to(means)
+    W, t, (fx, fy, cx, cy), centre = camera[:9].view(3, 3), camera[9:12], camera[12:16], camera[16:19]
+    (width, height, near), limits = camera[19:22], camera[22:26]
+    p = means @ W.T + t
+    front = (p[:, 2] >= near) & (p[:, 2] < 1e10)
+    z = torch.where(front, p[:, 2], torch.ones_like(p[:, 2]))
+    xz, yz = p[:, 0] / z, p[:, 1] / z
+    xc, yc = xz.clamp(limits[0], limits[1]), yz.clamp(limits[2], limits[3])
+    zero = torch.zeros_like(z)
+    J = torch.stack([fx / z, zero, -fx * xc / z, zero, fy / z, -fy * yc / z], -1).unflatten(-1, (2, 3))
+    M = J @ W @ (matrix(quats) * scales[:, None, :])
+    cov = M @ M.mT + BLUR * torch.eye(2).to(means)
+    conic = torch.linalg.inv(cov)
+    dirs = torch.nn.functional.normalize(means - centre, dim=-1)
+    rgb = evaluate_sh(sh, dirs).clamp_min(0)
+    centre2d = torch.stack([fx * xz + cx, fy * yz + cy], -1)
+    reach = 2 * (opacities.detach() / FAINTEST).clamp_min(1).log()
+    extent = (reach[:, None] * cov.detach().diagonal(dim1=-2, dim2=-1)).sqrt()
+    inside = (centre2d + extent > 0) & (centre2d - extent < torch.stack([width, height]))
+    visible = front & (opacities >= FAINTEST) & inside.all(-1)
+    columns = [*centre2d.unbind(-1), conic[:, 0, 0], conic[:, 0, 1], conic[:, 1, 1], opacities, *rgb.unbind(-1), z]
+    columns += [opacities.detach().log2(), *extent.unbind(-1), zero, zero, zero]
+    return torch.where(visible[:, None], torch.stack(columns, -1), zero[:, None])
+

@@ -1,0 +1,1 @@
+"""Published and reference dynamics models."""

@@ -1,0 +1,66 @@
+"""The published graph baseline: graph convolutions over all keypoints that are near each other.
+
+Source of the layer: Kipf and Welling 2017, "Semi-Supervised Classification with Graph Convolutional Networks", eq. 2.
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from stages.core.models.dynamics import FRAME, PointDynamics, PointState, free
+from stages.core.models.external_forces import Pushes
+from stages.core.models.initial_conditions import World
+
+RADIUS = 0.1  # closer keypoints are joined, of whatever objects [m]
+
+
+@torch.no_grad()
+def adjacency(points: Float[Tensor, "b p 3"], valid: Bool[Tensor, "b p"]) -> Float[Tensor, "b p p"]:
+    """D^-1/2 (A + I) D^-1/2 of the radius graph, D being the degrees of A + I; 0 where padded."""
+    x = points - points.mean(1, keepdim=True)
+    with torch.autocast(x.device.type, enabled=False):
+        squared = x.float().square().sum(-1)
+        gap = squared[:, :, None] + squared[:, None] - 2 * x.float() @ x.float().mT
+    near = (gap < RADIUS**2) & valid[:, :, None] & valid[:, None]
+    near |= torch.diag_embed(valid)  # rounding may part a point from itself
+    scale = near.sum(-1).clamp_min(1).to(x).rsqrt()
+    return near * scale[:, :, None] * scale[:, None]
+
+
+class GraphConv(nn.Module):
+    """A normalised, X W^T of each node and its neighbours, and a bias."""
+
+    def __init__(self, inner: int, outer: int):
+        super().__init__()
+        self.linear = nn.Linear(inner, outer, bias=False)
+        self.bias = nn.Parameter(torch.zeros(outer))
+        nn.init.xavier_uniform_(self.linear.weight)
+
+    def forward(self, x: Float[Tensor, "b p w"], A: Float[Tensor, "b p p"]) -> Float[Tensor, "b p v"]:
+        return A.to(x) @ self.linear(x) + self.bias
+
+
+class GCN(PointDynamics):
+    """`gcn`: what a frame changes in position and velocity, from the graph of the moment."""
+
+    told = frozenset({"points", "velocity", "spin"})
+
+    def __init__(self, hidden: int = 128, layers: int = 4):
+        super().__init__()
+        self.config = {"hidden": hidden, "layers": layers}
+        widths = [6] + [hidden] * layers
+        self.convolutions = nn.ModuleList(GraphConv(a, b) for a, b in zip(widths[:-1], widths[1:], strict=True))
+        self.head = nn.Linear(hidden, 6)
+
+    def derivative(self, world: World, t: Tensor | float, state: PointState, pushes: Pushes) -> PointState:
+        position = state.position.flatten(1, 2)
+        A = adjacency(position, world.valid.flatten(1))
+        x = torch.cat([position, state.velocity.flatten(1, 2)], -1)
+        for convolution in self.convolutions:
+            x = torch.relu(convolution(x, A))
+        change = (self.head(x) / FRAME).unflatten(1, world.valid.shape[1:])
+        pushed = pushes.acceleration(world, state.position, t)
+        may_move = free(world, pushes)
+        return PointState(change[..., :3] * may_move, (change[..., 3:] + pushed) * may_move)

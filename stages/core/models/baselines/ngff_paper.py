@@ -1,0 +1,232 @@
+"""The published neural Gaussian force field, with its parameter names, so that its checkpoints load.
+
+Source: "Learning Physics-Grounded 4D Dynamics with Neural Gaussian Force Fields" (ICLR 2026) and its public code. Ways
+of that code that its checkpoints depend on are kept and said where they stand. Two are not: the neighbour search has no
+cap, and padding does not enter the object encoder (`padding_encoded` brings that back).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from stages.core.models.dynamics import Dynamics
+from stages.core.models.external_forces import Pushes
+from stages.core.models.field.narrow_phase import near_walls, nearest
+from stages.core.models.field.rigid_body import fitted, spin_of
+from stages.core.models.initial_conditions import GRAVITY, World, centre, inertia, offsets
+
+MASS = 0.1  # of every object [kg]
+REACH = 0.05  # closer things touch [m]
+
+
+class PaperState(NamedTuple):
+    """Objects as local points, a place and Euler angles."""
+
+    local: Float[Tensor, "b o n 3"]  # keypoints about the centre, before rotation [m]
+    local_velocity: Float[Tensor, "b o n 3"]  # [m/s]
+    com: Float[Tensor, "b o 3"]  # [m]
+    velocity: Float[Tensor, "b o 3"]  # [m/s]
+    angle: Float[Tensor, "b o 3"]  # about x, y, z, applied in this order [rad]
+    rate: Float[Tensor, "b o 3"]  # of the angles, not a rotation vector [rad/s]
+
+
+def blocks(count: int, inner: int, outer: int) -> list[nn.Module]:
+    """Linear, LayerNorm, ReLU, `count` times."""
+    widths = [inner] + [outer] * count
+    layers = [(nn.Linear(a, b), nn.LayerNorm(b), nn.ReLU()) for a, b in zip(widths[:-1], widths[1:], strict=True)]
+    return [layer for block in layers for layer in block]
+
+
+def euler_matrix(angle: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
+    """Rz Ry Rx."""
+    (sx, sy, sz), (cx, cy, cz) = angle.sin().unbind(-1), angle.cos().unbind(-1)
+    rows = [
+        cz * cy, cz * sy * sx - sz * cx, cz * sy * cx + sz * sx,
+        sz * cy, sz * sy * sx + cz * cx, sz * sy * cx - cz * sx,
+        -sy, cy * sx, cy * cx,
+    ]  # fmt: skip
+    return torch.stack(rows, -1).unflatten(-1, (3, 3))
+
+
+def euler_angles(R: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
+    """The angles of `euler_matrix`."""
+    pitch = torch.asin((-R[..., 2, 0]).clamp(-1, 1))
+    return torch.stack([torch.atan2(R[..., 2, 1], R[..., 2, 2]), pitch, torch.atan2(R[..., 1, 0], R[..., 0, 0])], -1)
+
+
+def angle_rates(angle: Float[Tensor, "*b 3"], spin: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
+    """How fast the angles change in a body with that angular velocity [rad/s]; limited near gimbal lock."""
+    (_, sy, sz), (_, cy, cz) = angle.sin().unbind(-1), angle.cos().unbind(-1)
+    about_z = cz * spin[..., 0] + sz * spin[..., 1]
+    about_y = cz * spin[..., 1] - sz * spin[..., 0]
+    roll = about_z * cy / cy.square().clamp_min(1e-2)
+    return torch.stack([roll, about_y, spin[..., 2] + sy * roll], -1)
+
+
+class Residual(nn.Module):
+    """x + ReLU(LayerNorm(Linear x))."""
+
+    def __init__(self, width: int):
+        super().__init__()
+        self.mlp = nn.Sequential(*blocks(1, width, width))
+
+    def forward(self, x: Float[Tensor, "*b w"]) -> Float[Tensor, "*b w"]:
+        return x + self.mlp(x)
+
+
+class ObjectEncoder(nn.Module):
+    """Shape of an object, from its points in any order (Qi et al. 2017, "PointNet")."""
+
+    def __init__(self, hidden: int, layers: int):
+        super().__init__()
+        self.input_embedding = nn.Sequential(*blocks(1, 3, hidden))
+        self.extraction_blocks = nn.ModuleList(Residual(hidden) for _ in range(layers))
+        self.global_features = nn.Sequential(*blocks(1, hidden, hidden))
+
+    def forward(self, local: Float[Tensor, "b o n 3"], counts: Bool[Tensor, "b o n"]) -> Float[Tensor, "b o h"]:
+        x = self.input_embedding(local)
+        for block in self.extraction_blocks:
+            x = block(x)
+        x = x.masked_fill(~counts[..., None], -torch.inf).amax(2)
+        return self.global_features(torch.where(counts.any(2, keepdim=True), x, 0.0))
+
+
+class StressNet(nn.Module):
+    """Acceleration of each point of an object within it."""
+
+    def __init__(self, hidden: int):
+        super().__init__()
+        h = hidden
+        self.feature_layer = nn.Sequential(nn.Linear(12, h), nn.ReLU(), nn.Linear(h, h), nn.ReLU(), nn.Linear(h, h))
+        self.output_layer = nn.Sequential(nn.Linear(2 * h, h), nn.ReLU(), nn.Linear(h, h), nn.ReLU(), nn.Linear(h, 3))
+
+    def forward(self, x: Float[Tensor, "b o n 12"], counts: Bool[Tensor, "b o n"]) -> Float[Tensor, "b o n 3"]:
+        x = self.feature_layer(x)
+        most = x.masked_fill(~counts[..., None], -torch.inf).amax(2, keepdim=True)
+        most = torch.where(counts.any(2)[..., None, None], most, 0.0)
+        return self.output_layer(torch.cat([x, most.expand_as(x)], -1))
+
+
+class Predictor(nn.Module):
+    """Force and torque on every object and acceleration of its points."""
+
+    def __init__(self, hidden: int, layers: int, deform: bool, padding_encoded: bool):
+        super().__init__()
+        h, wide = hidden, 2 * hidden
+        self.padding_encoded = padding_encoded
+        self.pointnet = ObjectEncoder(h, layers)
+        self.state_embedding = nn.Sequential(*blocks(layers, 12, h))
+        self.brunch = nn.Sequential(*blocks(layers, wide, wide))
+        self.trunk = nn.Sequential(*blocks(layers, h, wide))
+        self.output = nn.Sequential(*blocks(1, wide, wide), nn.Linear(wide, 9))
+        self.boundary_net = nn.Sequential(*blocks(layers, wide, wide), nn.Linear(wide, 9))
+        self.stress_net = StressNet(h) if deform else None
+
+    def forward(
+        self, world: World, state: PaperState, rest: Float[Tensor, "b o n 3"]
+    ) -> tuple[Float[Tensor, "b o 3"], Float[Tensor, "b o 3"], Float[Tensor, "b o n 3"]]:
+        """Force [N], torque [N m], acceleration of the points in the object [m/s^2] (0 without deformation).
+
+        `rest` are the local points of the start.
+        """
+        counts = torch.ones_like(world.valid) if self.padding_encoded else world.valid
+        points = world_points(state)
+        shape = self.pointnet(state.local, counts)
+        touching = nearest(points, world.valid, REACH)[0] < REACH  # (b, receiver, sender, n)
+        walls = near_walls(points, world.valid, world.box, REACH)
+        pair = self._pairs(shape, state) * touching.any(-1)[..., None]
+        wall = self._floor(shape, state, world) * walls.any(-1)[..., None]
+        force, torque, _ = (pair.sum(2) + wall).split(3, -1)
+        if self.stress_net is None:
+            return force, torque, torch.zeros_like(points)
+        latent = torch.einsum("bijn,bijd->bind", touching.to(pair), pair[..., 6:])
+        latent = torch.stack([latent, walls[..., None] * wall[:, :, None, 6:]], -2)
+        # the matrix of the negated angles is not the inverse rotation; the published checkpoints were trained with it
+        turned = latent @ euler_matrix(-state.angle).mT[:, :, None]
+        stretch = 100 * (state.local - rest)
+        x = torch.cat([stretch, 100 * state.local_velocity, turned.flatten(-2)], -1)
+        return force, torque, self.stress_net(x, counts)
+
+    def _pairs(self, shape: Float[Tensor, "b o h"], state: PaperState) -> Float[Tensor, "b o o 9"]:
+        """What object j does to object i: force, torque, latent."""
+        s = _placement(state)
+        o = shape.shape[1]
+        relative = self.state_embedding(s[:, :, None] - s[:, None])
+        receiver = shape[:, :, None].expand(-1, -1, o, -1)
+        return self.output(self.brunch(torch.cat([receiver, relative], -1)) * self.trunk(shape)[:, None])
+
+    def _floor(self, shape: Float[Tensor, "b o h"], state: PaperState, world: World) -> Float[Tensor, "b o 9"]:
+        """What the room does to an object; it knows the floor's height, but walls only by touch."""
+        floor = torch.zeros_like(state.com)
+        floor[..., 2] = world.floor
+        s = _placement(state._replace(com=state.com - floor))
+        return self.boundary_net(torch.cat([shape, self.state_embedding(s)], -1))
+
+
+def _placement(state: PaperState) -> Float[Tensor, "b o 12"]:
+    return torch.cat([state.com, state.angle, state.velocity, state.rate], -1)
+
+
+def _rest(world: World) -> Float[Tensor, "b o n 3"]:
+    return world.points - centre(world, world.points)[:, :, None]
+
+
+def world_points(state: PaperState) -> Float[Tensor, "b o n 3"]:
+    """Keypoints in the world [m]."""
+    return state.local @ euler_matrix(state.angle).mT + state.com[:, :, None]
+
+
+class PaperForceField(Dynamics):
+    """`ngff-paper`; without `deform`, `ngff-paper-rigid`.
+
+    Mass and gravity are constants of the model: it cannot be told about them, nor about materials.
+    """
+
+    told = frozenset({"points", "share", "velocity", "spin", "box"})
+
+    def __init__(self, hidden: int = 200, layers: int = 4, deform: bool = True, padding_encoded: bool = False):
+        super().__init__()
+        self.config = {"hidden": hidden, "layers": layers, "deform": deform, "padding_encoded": padding_encoded}
+        self.predictor = Predictor(hidden, layers, deform, padding_encoded)
+        self.register_buffer("gravity", torch.tensor(GRAVITY[2]))
+
+    def start(self, world: World) -> PaperState:
+        """At rest but for the objects' velocities; spins are taken as rates of the angles, which start at 0."""
+        com = centre(world, world.points)
+        local = _rest(world)
+        return PaperState(local, torch.zeros_like(local), com, world.velocity, torch.zeros_like(com), world.spin)
+
+    def observe(
+        self, world: World, points: Float[Tensor, "b o n 3"], speed: Float[Tensor, "b o n 3"]
+    ) -> PaperState:
+        arm = offsets(world, world.points)
+        inverse = torch.linalg.inv(inertia(world.share, arm))
+        m = fitted(world.share, arm, inverse, points, speed)
+        angle = euler_angles(m.R)
+        rate = angle_rates(angle, spin_of(m.momentum, inverse, m.R))
+        return PaperState(_rest(world) + m.u, m.du, m.com, m.velocity, angle, rate)
+
+    def derivative(self, world: World, t: Tensor | float, state: PaperState, pushes: Pushes) -> PaperState:
+        force, torque, stress = self.predictor(world, state, _rest(world))
+        pushed, turned = pushes.wrench(world_points(state), state.com, t)
+        # a torque of a prompt is divided by the mass twice, as published
+        acceleration = (force + pushed) / MASS + self.gravity * torch.eye(3, device=force.device)[2]
+        turning = (torque + turned / MASS) / MASS
+        free = ~pushes.pinned[..., None]
+        inner = (world.valid & free)[..., None]
+        return PaperState(
+            state.local_velocity * inner, stress * inner, state.velocity * free, acceleration * free,
+            state.rate * free, turning * free,
+        )  # fmt: skip
+
+    def points(self, world: World, state: PaperState) -> Float[Tensor, "b o n 3"]:
+        return world_points(state)
+
+
+def rigid(**config) -> PaperForceField:
+    """`ngff-paper-rigid`: the ablation without deformation."""
+    return PaperForceField(**{**config, "deform": False})

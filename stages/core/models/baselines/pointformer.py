@@ -1,0 +1,39 @@
+"""The published transformer baseline: attention between all keypoints, from their positions alone."""
+
+from __future__ import annotations
+
+from torch import Tensor, nn
+
+from stages.core.models.dynamics import FRAME, PointDynamics, PointState, free
+from stages.core.models.external_forces import Pushes
+from stages.core.models.initial_conditions import World
+
+
+class Pointformer(PointDynamics):
+    """`pointformer`: what a frame adds to the positions.
+
+    The published model knows no velocity. Here the velocity of the state holds what the start and pushes gave to a
+    point; it adds to what the network says, which cannot brake it.
+    """
+
+    told = frozenset({"points", "velocity", "spin"})
+
+    def __init__(self, hidden: int = 128, layers: int = 3, dropout: float = 0.1):
+        super().__init__()
+        self.config = {"hidden": hidden, "layers": layers, "dropout": dropout}
+        self.embed = nn.Sequential(nn.Linear(3, hidden), nn.ReLU(), nn.Linear(hidden, hidden))
+        self.blocks = nn.ModuleList(
+            nn.TransformerEncoderLayer(hidden, 1, hidden, dropout, batch_first=True) for _ in range(layers)
+        )
+        self.norm = nn.LayerNorm(hidden)
+        self.head = nn.Sequential(nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, 3))
+
+    def derivative(self, world: World, t: Tensor | float, state: PointState, pushes: Pushes) -> PointState:
+        x = self.embed(state.position.flatten(1, 2))
+        padding = ~world.valid.flatten(1)
+        for block in self.blocks:
+            x = block(x, src_key_padding_mask=padding)
+        moved = (0.1 / FRAME * self.head(self.norm(x))).unflatten(1, world.valid.shape[1:])
+        may_move = free(world, pushes)
+        pushed = pushes.acceleration(world, state.position, t)
+        return PointState((moved + state.velocity) * may_move, pushed * may_move)

@@ -1,0 +1,79 @@
+"""A strong transformer: told all that our own model is told, but free of its physics.
+
+Keypoints attend in turn to their own object and to the whole scene. Out come accelerations.
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+from torch.nn.functional import scaled_dot_product_attention
+
+from stages.core.models.dynamics import PointDynamics, PointState, free
+from stages.core.models.external_forces import Pushes
+from stages.core.models.initial_conditions import World, centre, offsets
+
+SCALE = 20.0  # acceleration that stands for 1 in the network [m/s^2]
+NEAR = 0.1  # walls farther away are not told apart [m]
+
+
+class Block(nn.Module):
+    """Pre-norm attention and feed-forward (Xiong et al. 2020, "On Layer Normalization in the Transformer")."""
+
+    def __init__(self, width: int, heads: int):
+        super().__init__()
+        self.heads = heads
+        self.before, self.between = nn.LayerNorm(width), nn.LayerNorm(width)
+        self.qkv, self.out = nn.Linear(width, 3 * width), nn.Linear(width, width)
+        self.mlp = nn.Sequential(nn.Linear(width, 4 * width), nn.GELU(), nn.Linear(4 * width, width))
+
+    def forward(self, x: Float[Tensor, "s p w"], keys: Bool[Tensor, "s p"]) -> Float[Tensor, "s p w"]:
+        q, k, v = self.qkv(self.before(x)).unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
+        y = scaled_dot_product_attention(q, k, v, attn_mask=keys[:, None, None])
+        x = x + self.out(y.transpose(1, 2).flatten(2))
+        return x + self.mlp(self.between(x))
+
+
+def features(world: World, state: PointState) -> Float[Tensor, "b o n 29"]:
+    """What a keypoint is told, in numbers of order one."""
+    x, v = state.position, state.velocity
+    com, drift = centre(world, x), centre(world, v)
+    there = world.present[..., None]
+    middle = (com * there).sum(1, keepdim=True) / there.sum(1, keepdim=True).clamp_min(1)
+    low, high = world.box[..., None, 0, :], world.box[..., None, 1, :]
+    height = x[..., 2:] - low[..., 2:]
+    walls = (torch.cat([x - low, high - x], -1) / NEAR).clamp(-1, 1)
+    material = torch.stack([(world.E * world.solidity).log10() - 5, world.nu, world.friction, world.mass.log()], -1)
+    told = torch.cat([com - middle, drift, material, (world.gravity / 5)[:, None].expand_as(com)], -1)
+    told = told[:, :, None].expand(*x.shape[:3], -1)
+    return torch.cat([x - com[:, :, None], offsets(world, world.points), v, height, walls, told], -1)
+
+
+class Transformer(PointDynamics):
+    """`transformer`: half of the layers look within objects, half across the scene."""
+
+    told = frozenset({
+        "points", "share", "mass", "E", "solidity", "nu", "friction", "velocity", "spin", "gravity", "box"
+    })  # fmt: skip
+
+    def __init__(self, hidden: int = 128, layers: int = 4, heads: int = 4):
+        super().__init__()
+        self.config = {"hidden": hidden, "layers": layers, "heads": heads}
+        self.embed = nn.Linear(29, hidden)
+        self.blocks = nn.ModuleList(Block(hidden, heads) for _ in range(layers))
+        self.head = nn.Sequential(nn.LayerNorm(hidden), nn.Linear(hidden, hidden), nn.GELU(), nn.Linear(hidden, 3))
+
+    def derivative(self, world: World, t: Tensor | float, state: PointState, pushes: Pushes) -> PointState:
+        b, o, n = world.valid.shape
+        # a missing object attends to itself: a softmax over nothing is nan
+        own = (world.valid | ~world.present[..., None]).flatten(0, 1)
+        x = self.embed(features(world, state))
+        for i, block in enumerate(self.blocks):
+            whole = i % 2 == 1
+            x = block(x.reshape(b, -1, x.shape[-1]) if whole else x.reshape(b * o, n, -1),
+                      world.valid.flatten(1) if whole else own)  # fmt: skip
+        acceleration = SCALE * self.head(x).reshape(b, o, n, 3) + world.gravity[:, None, None]
+        acceleration = acceleration + pushes.acceleration(world, state.position, t)
+        may_move = free(world, pushes)
+        return PointState(state.velocity * may_move, acceleration * may_move)

@@ -1,0 +1,185 @@
+"""Weights: find, verify, load, save. NAME.safetensors holds the numbers, NAME.json beside it says what they are."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Mapping
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file
+from safetensors.torch import save as to_bytes
+from torch import Tensor
+
+from stages.core.backends import choose
+from stages.core.errors import InputError
+from stages.core.models.dynamics import Dynamics
+from stages.core.scene.files import must_exist, replacing, sha256
+
+MODELS = {
+    "ngff-paper": "stages.core.models.baselines.ngff_paper:PaperForceField",
+    "ngff-paper-rigid": "stages.core.models.baselines.ngff_paper:rigid",
+    "ngff": "stages.core.models.field.force_field:ForceField",
+    "gcn": "stages.core.models.baselines.gcn:GCN",
+    "pointformer": "stages.core.models.baselines.pointformer:Pointformer",
+    "transformer": "stages.core.models.baselines.transformer:Transformer",
+}
+HERE = Path(__file__).parent / "weights"  # those that ship
+
+
+def build(name: str, **config) -> Dynamics:
+    """A model by its name, untrained; `config` as its class takes it."""
+    return choose(MODELS, name)(**config)
+
+
+def find(name: str, given: Path | None = None) -> Path:
+    """The weights of a model: a file or folder that was given, else those in $NGFF_WEIGHTS, else those that ship."""
+    folders = [HERE]
+    if os.environ.get("NGFF_WEIGHTS"):
+        folders.insert(0, Path(os.environ["NGFF_WEIGHTS"]))
+    if given is not None and not Path(given).is_dir():
+        return Path(given)
+    if given is not None:
+        folders = [Path(given)]
+    for folder in folders:
+        if (folder / f"{name}.safetensors").is_file():
+            return folder / f"{name}.safetensors"
+    looked = " or ".join(str(folder) for folder in folders)
+    raise InputError(f"{name}: no weights {name}.safetensors in {looked}; train them with `ngff-lab train {name}`, "
+                     "or name a file with --weights")  # fmt: skip
+
+
+def save(path: Path, name: str, model: Dynamics, card: Mapping | None = None, half: bool = False) -> None:
+    """Write PATH.safetensors and its card PATH.json; `half` stores 16-bit numbers."""
+    path = Path(path)
+    state = {k: v.detach().cpu().contiguous() for k, v in model.state_dict().items()}
+    if half:
+        state = {k: v.half() if v.is_floating_point() and v.half().isfinite().all() else v for k, v in state.items()}
+    with replacing(path) as part:
+        part.write_bytes(to_bytes(state))  # save_file makes files that only their owner may read
+    write_card(path.with_suffix(".json"), {**(card or {}), "model": name, "config": model.config,
+                                           "sha256": sha256(path)})  # fmt: skip
+
+
+def halve(path: Path) -> None:
+    """Weights rewritten in 16 bits, for shipping: that costs nothing measurable (tests/core/models/test_shipped.py)."""
+    model, card = load(path)
+    save(path, card["model"], model, card, half=True)
+
+
+def minutes(card: Mapping) -> float:
+    """Of one processor's training, that of the weights it began with, or was averaged with, included."""
+    own = float(card["minutes"]) * card.get("processes", 1)
+    return own + (minutes(card["before"]) if "before" in card else 0.0) + _others(card)
+
+
+def _others(card: Mapping) -> float:
+    """Minutes of those that it was averaged with; of those in its own line, which count already, the others' only."""
+    return sum((minutes(c) if "minutes" in c else _others(c) for c in card.get("averaged", ())), 0.0)
+
+
+def write_card(path: Path, card: Mapping) -> None:
+    """A line for each entry, and for each row of a table; numbers of eight digits; of data, only what differs."""
+    facts = dict(card)
+    if facts.get("data"):
+        first, *others = facts["data"]
+        made = first.get("made", {})
+        facts["data"] = [first, *({**row, "made": _unlike(row.get("made", {}), made)} for row in others)]
+    lines = []
+    for key, value in _rounded(facts).items():
+        table = isinstance(value, list) and value and isinstance(value[0], dict)
+        rows = ",\n  ".join(map(json.dumps, value)) if table else ""
+        lines.append(f" {json.dumps(key)}: " + (f"[\n  {rows}\n ]" if table else json.dumps(value)))
+    with replacing(path) as part:
+        part.write_text("{\n" + ",\n".join(lines) + "\n}\n")
+
+
+def _unlike(row: Mapping, first: Mapping) -> dict:
+    """The entries that are not those of the first row."""
+    return {k: v for k, v in row.items() if k not in first or first[k] != v}
+
+
+def _rounded(value: object) -> object:
+    """Floats with eight significant digits, wherever they are; None for what JSON has no number for."""
+    if isinstance(value, float):
+        return float(f"{value:.8g}") if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {k: _rounded(v) for k, v in value.items()}
+    return [_rounded(v) for v in value] if isinstance(value, (list, tuple)) else value
+
+
+def load(path: Path, device: torch.device | str = "cpu") -> tuple[Dynamics, dict]:
+    """A model ready to use, in 32-bit numbers, and its card.
+
+    A card's `model` and `config` say what to build. A file without card ending in .pt or .pth is read as a checkpoint
+    of the public NGFF code. Raises InputError for whatever is missing, damaged, or does not fit.
+    """
+    path = Path(path)
+    must_exist(path, "weights (.safetensors) such as `ngff-lab train` writes")
+    if path.suffix in (".pt", ".pth"):
+        return _public(path).to(device).eval(), {"model": "ngff-paper", "sha256": sha256(path)}
+    card = _card(path)
+    if sha256(path) != card["sha256"]:
+        raise InputError(f"{path}: does not have the sha256 that {path.with_suffix('.json').name} states; the file is "
+                         "damaged or of another training; fetch or train both again")  # fmt: skip
+    try:
+        state = load_file(path)
+    except SafetensorError as error:
+        raise InputError(f"{path}: is no safetensors file ({error}); fetch or train it again") from error
+    try:
+        model = build(card["model"], **card["config"])
+        model.load_state_dict({k: v.float() if v.is_floating_point() else v for k, v in state.items()})
+    except (TypeError, RuntimeError, ValueError) as error:
+        raise _unfit(path, f"the model {card['model']!r} of its card", error) from error
+    return model.to(device).eval(), card
+
+
+def _card(path: Path) -> dict:
+    file = path.with_suffix(".json")
+    must_exist(file, f"the card of {path.name}")
+    try:
+        card = json.loads(file.read_text())
+        wrong = not (isinstance(card["model"], str) and isinstance(card["sha256"], str))
+        wrong |= not isinstance(card["config"], dict)
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{file}: is not the card of weights ({error!r}); fetch or train it again") from error
+    if wrong or card["model"] not in MODELS:
+        raise InputError(f"{file}: needs model (one of {', '.join(MODELS)}), config and sha256")
+    return card
+
+
+def _public(path: Path) -> Dynamics:
+    """A checkpoint of the public code: its sizes are read from the shapes."""
+    try:
+        data = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # a damaged pickle raises anything
+        raise InputError(f"{path}: cannot be read as a PyTorch checkpoint ({_line(error)})") from error
+    state = _tensors(data)
+    try:
+        hidden = len(state["predictor.state_embedding.0.weight"])
+        layers = sum(k.startswith("predictor.pointnet.extraction_blocks.") and k.endswith("0.weight") for k in state)
+        deform = any(k.startswith("predictor.stress_net.") for k in state)
+        model = build("ngff-paper", hidden=hidden, layers=layers, deform=deform)
+        model.load_state_dict(state)
+    except (KeyError, RuntimeError) as error:
+        raise _unfit(path, "the published NGFF model", error) from error
+    return model
+
+
+def _tensors(data: object) -> dict[str, Tensor]:
+    """The state dict in a checkpoint, without the prefix of data-parallel training."""
+    while isinstance(data, dict) and not any(isinstance(v, Tensor) for v in data.values()):
+        data = next((data[k] for k in ("model_state_dict", "state_dict", "model") if k in data), None)
+    return {k.removeprefix("module."): v for k, v in data.items()} if isinstance(data, dict) else {}
+
+
+def _unfit(path: Path, what: str, error: Exception) -> InputError:
+    return InputError(f"{path}: does not fit {what} ({_line(error)})")
+
+
+def _line(error: Exception) -> str:
+    """The first lines of an error, as one."""
+    return " ".join(str(error).split())[:200]

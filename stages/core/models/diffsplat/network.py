@@ -1,0 +1,125 @@
+"""DiffSplat's sampler around the blocks of diffusers: noise becomes four latent maps that agree on one object."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from diffusers.models.attention_processor import AttnProcessor2_0
+from jaxtyping import Float
+from torch import Tensor
+from tqdm import tqdm
+
+from stages.core.models.diffsplat.maps import AZIMUTHS, cameras, plucker, to_gaussians
+from stages.core.scene.gaussians import Gaussians
+
+if TYPE_CHECKING:
+    from diffusers import AutoencoderKL, DPMSolverMultistepScheduler, UNet2DConditionModel
+    from transformers import CLIPTextModel, CLIPTokenizer
+
+VIEWS = len(AZIMUTHS)
+STEPS = 20
+GUIDANCE = (1.0, 2.0)  # on the picture's own side, and opposite
+NEGATIVE = "worst quality, normal quality, low quality, low res, blurry, ugly, disgusting"
+
+
+class AcrossViews:
+    """Self-attention in which the tokens of all `views` of one object see each other: (b v) n d as b (v n) d."""
+
+    def __init__(self, views: int):
+        self.views, self.plain = views, AttnProcessor2_0()
+
+    def __call__(self, attn, hidden_states: Tensor, encoder_hidden_states: Tensor | None = None, **more) -> Tensor:
+        joined = hidden_states.unflatten(0, (-1, self.views)).flatten(1, 2)
+        return self.plain(attn, joined, **more).unflatten(1, (self.views, -1)).flatten(0, 1)
+
+
+def share_attention(unet: UNet2DConditionModel, views: int = VIEWS + 1) -> None:
+    """Let every self-attention of a U-Net look across views; attention to the text stays each view's own."""
+    unet.set_attn_processor({
+        name: AcrossViews(views) if name.endswith("attn1.processor") else AttnProcessor2_0()
+        for name in unet.attn_processors
+    })  # fmt: skip
+
+
+def triangle(low: float, high: float, views: int = VIEWS) -> Float[Tensor, "v"]:
+    """Guidance of each view: `low` for the first, rising to `high` opposite, and back.
+
+    Source: Voleti et al. 2024, "SV3D", section 3, "triangular CFG scaling".
+    """
+    steps = torch.arange(views)
+    return low + (high - low) * torch.minimum(steps, views - steps) / (views // 2)
+
+
+@dataclass(frozen=True)
+class DiffSplat:
+    """The parts, ready to use, all on one device."""
+
+    tokenizer: CLIPTokenizer
+    text_encoder: CLIPTextModel
+    vae: AutoencoderKL  # of pictures
+    unet: UNet2DConditionModel  # 4 latent + 6 ray + 1 flag channels in, 4 out
+    gsvae: AutoencoderKL  # of maps of Gaussians
+    scheduler: DPMSolverMultistepScheduler
+
+    @property
+    def side(self) -> int:
+        """Width and height of pictures and maps [px]."""
+        return self.unet.config.sample_size * 2 ** (len(self.vae.config.block_out_channels) - 1)
+
+    def generate(self, image: Float[Tensor, "s s 3"], elevation: float, prompt: str = "", seed: int = 0) -> Gaussians:
+        """The whole object in a picture, on the CPU, in DiffSplat's frame; its first camera is the picture's.
+
+        `image` shows it alone on white, centred, four fifths of the side large; `elevation` [degrees] is the
+        camera's above the horizon. It learned from -5 to 30 degrees.
+        """
+        viewmats = cameras(elevation)
+        return to_gaussians(self.sample(image, viewmats, prompt, seed).cpu(), viewmats)
+
+    @torch.no_grad()
+    def sample(
+        self, image: Float[Tensor, "s s 3"], viewmats: Float[Tensor, "v 4 4"], prompt: str = "", seed: int = 0
+    ) -> Float[Tensor, "v 12 s s"]:
+        """Maps of Gaussians of the four views, in -1..1.
+
+        Each step guesses twice, with the picture's latent and the prompt and, to guide away from, with zeros and
+        NEGATIVE; the noise is drawn on the CPU, so that a seed gives one result on every device.
+        """
+        device = self.unet.device
+        text = self._text([NEGATIVE, prompt]).repeat_interleave(VIEWS + 1, 0)
+        picture = self._picture(image.to(device))
+        guidance = triangle(*GUIDANCE).to(device)[:, None, None, None]
+        generator = torch.Generator().manual_seed(seed)
+        x = torch.randn(VIEWS, *picture.shape[1:], generator=generator).to(device)
+        given = torch.stack([torch.zeros_like(picture), picture])
+        told = self._told(viewmats.to(device), picture.shape[-1])
+        self.scheduler.set_timesteps(STEPS, device=device)
+        for t in tqdm(self.scheduler.timesteps, desc="diffsplat", unit="step", leave=False):
+            views = torch.cat([torch.cat([given, x.expand(2, *x.shape)], 1), told.expand(2, *told.shape)], 2)
+            with torch.autocast(device.type, torch.bfloat16, enabled=device.type == "cuda"):
+                guess = self.unet(views.flatten(0, 1), t, text, return_dict=False)[0]
+            away, toward = guess.float().unflatten(0, (2, VIEWS + 1))[:, 1:]
+            noise = torch.randn(x.shape, generator=generator).to(device)
+            x = self.scheduler.step(away + guidance * (toward - away), t, x, variance_noise=noise).prev_sample
+        latents = x / self.gsvae.config.scaling_factor
+        return torch.cat([self.gsvae.decode(z).sample for z in latents.split(1)]).clamp(-1, 1)
+
+    def _told(self, viewmats: Float[Tensor, "v 4 4"], side: int) -> Float[Tensor, "w 7 z z"]:
+        """Rays of the picture and the views at the latents' resolution, and 0 for what is given, 1 for what is not."""
+        rays = plucker(viewmats.cpu(), self.side).to(viewmats)
+        rays = torch.nn.functional.interpolate(rays, (side, side), mode="bilinear")
+        asked = torch.ones(VIEWS + 1, 1, side, side).to(rays)
+        asked[0] = 0
+        return torch.cat([torch.cat([rays[:1], rays]), asked], 1)
+
+    def _text(self, prompts: list[str]) -> Float[Tensor, "b n d"]:
+        """The text encoder's last hidden states, of sentences cut or padded to its length."""
+        length = self.text_encoder.config.max_position_embeddings
+        tokens = self.tokenizer(prompts, padding="max_length", max_length=length, truncation=True, return_tensors="pt")
+        return self.text_encoder(tokens.input_ids.to(self.unet.device))[0]
+
+    def _picture(self, image: Float[Tensor, "s s 3"]) -> Float[Tensor, "1 4 z z"]:
+        """The picture's latent: the mean of what the encoder says, scaled."""
+        latent = self.vae.encode(2 * image.permute(2, 0, 1)[None] - 1).latent_dist.mode()
+        return latent * self.vae.config.scaling_factor

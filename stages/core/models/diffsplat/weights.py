@@ -1,0 +1,190 @@
+"""The published weights of DiffSplat (Stable Diffusion 1.5, from one picture): find, check and load.
+
+A folder holds three parts, named as their makers name them, the last as a subfolder of this name:
+
+    gsdiff_gobj83k_sd15_image__render/checkpoints/NUMBER/unet_ema/   config.json, diffusion_pytorch_model.safetensors
+    gsvae_gobj265k_sd/checkpoints/NUMBER/model.safetensors
+    stable-diffusion-v1-5/                                           tokenizer/ text_encoder/ vae/ scheduler/
+
+The U-Net's tensors have the names of Stable Diffusion's; its 859,541,124 32-bit numbers make the 3.44 GB that the
+hub lists. The names in the second file follow from the public code (`vae.` before those of an autoencoder with 12
+channels in and out, and a `tiny_decoder.` for training alone); the file itself has not been seen here.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from inspect import signature
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import torch
+from torch import nn
+
+from stages.core.errors import InputError
+from stages.core.models.diffsplat.maps import CHANNELS
+from stages.core.models.hub import Source, folders
+from stages.core.models.pi3.weights import differences, read_state
+
+if TYPE_CHECKING:
+    from stages.core.models.diffsplat.network import DiffSplat
+
+UNET, GSVAE, BASE = "gsdiff_gobj83k_sd15_image__render", "gsvae_gobj265k_sd", "stable-diffusion-v1-5"
+PARTS = ("tokenizer", "text_encoder", "vae", "scheduler")  # of Stable Diffusion
+LATENT = 4 + 6 + 1  # channels into the U-Net: latent, ray, flag
+
+
+@dataclass(frozen=True)
+class Part(Source):
+    """Where some of the weights are published, and what of that is needed."""
+
+    wanted: tuple[str, ...]  # patterns of files
+    into: str  # folder under that of the weights
+
+
+SOURCES = (
+    Part("chenguolin/DiffSplat", "3.8 GB", "MIT", (f"{UNET}/*/unet_ema/*", f"{GSVAE}/*/model.safetensors"), ""),
+    Part(
+        "stable-diffusion-v1-5/stable-diffusion-v1-5", "0.6 GB", "CreativeML OpenRAIL-M",
+        ("tokenizer/*", "text_encoder/config.json", "text_encoder/model.fp16.safetensors", "vae/config.json",
+         "vae/diffusion_pytorch_model.safetensors", "scheduler/*"), BASE,
+    ),
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Files:
+    """What is where."""
+
+    unet: Path  # folder with config and weights
+    gsvae: Path  # file
+    base: Path  # folder of Stable Diffusion
+
+
+def find(given: Path | None = None) -> Files:
+    """The parts in the folder given, else in diffsplat/ of $NGFF_WEIGHTS or of the user's cache."""
+    places = [Path(given)] if given is not None else [place / "diffsplat" for place in folders()]
+    for place in places:
+        files = _files(place)
+        if not _missing(files):
+            return files
+    code, base = SOURCES
+    lack = ", ".join(str(path) for path in _missing(_files(places[0])))
+    raise InputError(
+        f"diffsplat: the weights are not in {' or '.join(map(str, places))} (no {lack}); fetch {UNET} and {GSVAE} of "
+        f"https://huggingface.co/{code.repository} ({code.size}, licence {code.licence}) into {places[0]}, and "
+        f"{', '.join(PARTS)} of https://huggingface.co/{base.repository} ({base.size}, licence {base.licence}) into "
+        f"{places[0] / BASE}, name such a folder with --weights, or add --download"
+    )
+
+
+def _files(folder: Path) -> Files:
+    """Where the parts are, or would be."""
+    return Files(_last(folder / UNET) / "unet_ema", _last(folder / GSVAE) / "model.safetensors", folder / BASE)
+
+
+def _last(model: Path) -> Path:
+    """The checkpoint of the most steps; they are folders with a number for a name."""
+    numbers = [p for p in (model / "checkpoints").glob("*") if p.name.isdigit()]
+    return max(numbers, key=lambda p: int(p.name)) if numbers else model / "checkpoints/NUMBER"
+
+
+def _missing(files: Files) -> list[Path]:
+    needed = [files.unet / "config.json", files.unet / "diffusion_pytorch_model.safetensors", files.gsvae]
+    return [path for path in [*needed, *(files.base / part for part in PARTS)] if not path.exists()]
+
+
+def load(files: Files, device: str = "cpu") -> DiffSplat:
+    """The model, 32 bit, for inference. Sizes come from the configurations beside the weights.
+
+    Raises InputError for packages that are absent and files that are damaged or hold something else.
+    """
+    try:
+        import diffusers
+        import transformers
+    except ImportError as error:
+        raise InputError(
+            "diffsplat: needs the packages diffusers and transformers (`pip install 'ngff[diffsplat]'`)"
+        ) from error
+    from stages.core.models.diffsplat.network import DiffSplat, share_attention
+
+    transformers.utils.logging.disable_progress_bar()
+    half = (files.base / "text_encoder/model.fp16.safetensors").exists()
+    try:
+        text = _whole(transformers.CLIPTextModel, files.base / "text_encoder", variant="fp16" if half else None,
+                      dtype=torch.float32)  # fmt: skip
+        vae = _whole(diffusers.AutoencoderKL, files.base / "vae", low_cpu_mem_usage=False)
+        tokenizer = transformers.CLIPTokenizer.from_pretrained(files.base / "tokenizer", local_files_only=True)
+        scheduler = sampler(json.loads((files.base / "scheduler/scheduler_config.json").read_text()))
+    except (OSError, ValueError, RuntimeError, KeyError) as error:
+        raise InputError(
+            f"{files.base}: cannot be read as Stable Diffusion 1.5 ({' '.join(str(error).split())[:160]}); fetch its "
+            f"{', '.join(PARTS)} from https://huggingface.co/{SOURCES[1].repository} again"
+        ) from error
+    gsvae = filled(gaussian_vae(dict(vae.config)), files.gsvae, "vae.", ("tiny_decoder.",))
+    unet = filled(_unet(files.unet / "config.json"), files.unet / "diffusion_pytorch_model.safetensors")
+    share_attention(unet)
+    for part in (text, vae, unet, gsvae):
+        part.requires_grad_(False).eval().to(device)
+    return DiffSplat(tokenizer, text, vae, unet, gsvae, scheduler)
+
+
+def _whole(kind: type, folder: Path, **how) -> nn.Module:
+    """A model of a library from its folder; the libraries fill what is missing with noise, here it is an error."""
+    model, found = kind.from_pretrained(
+        folder, local_files_only=True, use_safetensors=True, output_loading_info=True, **how
+    )
+    if lack := sorted(found["missing_keys"]):
+        raise ValueError(f"{folder.name} lacks {len(lack)} tensors such as {lack[0]}")
+    return model
+
+
+def sampler(config: dict):
+    """DPM-Solver++ with noise, for a network that predicts velocities, over Stable Diffusion's own noise levels.
+
+    The public code also asks for betas rescaled to end in pure noise, but by changing a configuration that has been
+    read by then, in training as in inference; so they never were, and are not here.
+    """
+    from diffusers import DPMSolverMultistepScheduler
+
+    return DPMSolverMultistepScheduler.from_config(
+        config, algorithm_type="sde-dpmsolver++", timestep_spacing="trailing", prediction_type="v_prediction"
+    )
+
+
+def gaussian_vae(config: dict) -> nn.Module:
+    """An autoencoder like Stable Diffusion's, for maps of Gaussians in place of colours; without numbers yet."""
+    from diffusers import AutoencoderKL
+
+    with torch.device("meta"):
+        return AutoencoderKL.from_config({**config, "in_channels": CHANNELS, "out_channels": CHANNELS})
+
+
+def _unet(config: Path) -> nn.Module:
+    """The U-Net that a published configuration describes, without numbers yet.
+
+    Its blocks are named CrossAttnDownBlockMV2D and so on; they are those of diffusers but for the attention.
+    """
+    from diffusers import UNet2DConditionModel
+
+    try:
+        said = json.loads(config.read_text().replace("MV2D", "2D"))
+        known = {k: said[k] for k in signature(UNet2DConditionModel.__init__).parameters if k in said}
+        with torch.device("meta"):
+            unet = UNet2DConditionModel(**known)
+    except (ValueError, TypeError) as error:
+        raise InputError(f"{config}: does not describe DiffSplat's U-Net ({error}); fetch it again") from error
+    if unet.config.in_channels != LATENT:
+        raise InputError(f"{config}: describes a U-Net with {unet.config.in_channels} channels in; the one that takes "
+                         f"a picture has {LATENT}: {UNET} is meant")  # fmt: skip
+    return unet
+
+
+def filled(model: nn.Module, path: Path, prefix: str = "", but: tuple[str, ...] = ()) -> nn.Module:
+    """The model with the 32-bit tensors of a file, `prefix` taken off their names, those beginning with `but` left."""
+    state = {k.removeprefix(prefix): v.float() for k, v in read_state(path).items() if not k.startswith(but)}
+    if complaint := differences(model.state_dict(), state):
+        raise InputError(f"{path}: does not fit diffsplat: {complaint}")
+    model.load_state_dict(state, assign=True)
+    return model

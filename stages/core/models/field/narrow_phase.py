@@ -1,0 +1,87 @@
+"""Which points of other objects, and which walls, are near."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from stages.core.kernels.compilers import TRITON
+
+if TRITON:
+    from stages.core.kernels.field.nearest import nearest as searched
+
+MANY = 500  # points of a scene from which on it pays, on a CPU, to look before measuring
+
+Found = tuple[Float[Tensor, "b o o n"], Int[Tensor, "b o o n"]]
+
+
+@torch.no_grad()
+def nearest(points: Float[Tensor, "b o n 3"], valid: Bool[Tensor, "b o n"], reach: float) -> Found:
+    """For point n of object i and every object j: the distance [m] to j's nearest point, and which one that is.
+
+    The distance is infinite where it is not below `reach`, to the own object, to padding and from padding; the index
+    then means nothing.
+    """
+    if TRITON and points.is_cuda and points.dtype == torch.float32:
+        return searched(points, valid, reach)
+    few = points.shape[1] * points.shape[2] < MANY
+    search = _measured if few or points.is_cuda else _culled
+    distance, index = search(points, valid, reach)
+    return distance.masked_fill(distance >= reach, torch.inf), index
+
+
+def _measured(points: Float[Tensor, "b o n 3"], valid: Bool[Tensor, "b o n"], reach: float) -> Found:
+    """Between all points. Candidates come from one matrix product of centred coordinates, in single precision; the
+    distance itself from the difference of the two points."""
+    o = points.shape[1]
+    count = valid.sum((1, 2)).clamp_min(1)
+    middle = torch.where(valid[..., None], points, 0.0).sum((1, 2)) / count[:, None]
+    x = torch.where(valid[..., None], points - middle[:, None, None], 0.0)
+    with torch.autocast(x.device.type, enabled=False):
+        half = torch.where(valid, x.float().square().sum(-1) / 2, torch.inf)
+        gap = half[:, None, :, None] - torch.einsum("bind,bjmd->bijnm", x.float(), x.float())
+    index = gap.argmin(-1)
+    scene = torch.arange(len(x), device=x.device)[:, None, None, None]
+    other = torch.arange(o, device=x.device)[None, None, :, None]
+    distance = (x[:, :, None] - x[scene, other, index]).norm(dim=-1)
+    mine = torch.eye(o, dtype=torch.bool, device=x.device)[:, :, None]
+    unseen = mine | ~valid[:, :, None] | ~valid.any(-1)[:, None, :, None]
+    return distance.masked_fill(unseen, torch.inf), index
+
+
+def _culled(points: Float[Tensor, "b o n 3"], valid: Bool[Tensor, "b o n"], reach: float) -> Found:
+    """Between those points of two objects that are within reach of the other's bounding box."""
+    b, o, n, _ = points.shape
+    distance = points.new_full((b, o, o, n), torch.inf)
+    index = valid.new_zeros(b, o, o, n, dtype=torch.int64)
+    low = points.masked_fill(~valid[..., None], torch.inf).amin(2) - reach
+    high = points.masked_fill(~valid[..., None], -torch.inf).amax(2) + reach
+    inside = ((points[:, :, None] > low[:, None, :, None]) & (points[:, :, None] < high[:, None, :, None])).all(-1)
+    inside &= valid[:, :, None]
+    for s, i, j in inside.any(-1).triu(1).nonzero().tolist():
+        mine, theirs = inside[s, i, j].nonzero()[:, 0], inside[s, j, i].nonzero()[:, 0]
+        if not len(theirs):
+            continue
+        x, y = points[s, i, mine], points[s, j, theirs]
+        which = _closest(x, y)
+        distance[s, i, j, mine], index[s, i, j, mine] = (x - y[which]).norm(dim=-1), theirs[which]
+        which = _closest(y, x)
+        distance[s, j, i, theirs], index[s, j, i, theirs] = (y - x[which]).norm(dim=-1), mine[which]
+    return distance, index
+
+
+def _closest(x: Float[Tensor, "p 3"], y: Float[Tensor, "q 3"]) -> Int[Tensor, "p"]:
+    """Which of y is nearest to each of x; |x - y|^2 / 2 - |x|^2 / 2 orders them, from one matrix product."""
+    middle = y.mean(0)
+    x, y = x - middle, y - middle
+    return torch.addmm(y.square().sum(-1) / 2, x, y.T, alpha=-1).argmin(-1)
+
+
+def near_walls(
+    points: Float[Tensor, "b o n 3"], valid: Bool[Tensor, "b o n"], box: Float[Tensor, "b o 2 3"], reach: float
+) -> Bool[Tensor, "b o n"]:
+    """Points within `reach` [m] of the floor or of one of the four walls, on either side; the ceiling is open."""
+    low, high = box[..., None, 0, :], box[..., None, 1, :]
+    near = ((points - low).abs() < reach).any(-1) | ((points[..., :2] - high[..., :2]).abs() < reach).any(-1)
+    return near & valid

@@ -1,0 +1,76 @@
+"""Published weights on huggingface.co: where they are kept here, and fetching them, only when told to."""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from stages.core.errors import InputError
+from stages.core.scene.files import sha256
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where its makers put the weights of a network."""
+
+    repository: str  # on huggingface.co
+    size: str
+    licence: str
+
+
+def folders() -> list[Path]:
+    """Where weights are looked for; what is downloaded goes into the first."""
+    given = os.environ.get("NGFF_WEIGHTS")
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "ngff"
+    return [*([Path(given)] if given else []), cache]
+
+
+def fetch(source: Source, folder: Path, choose: Callable[[list], list], place: str) -> list[Path]:
+    """Files of a repository through huggingface_hub into a folder; returns their paths.
+
+    `choose` picks from what the repository holds, and raises ValueError where that is not what it should be. Size,
+    licence and sha256, as the hub states them, are logged before the first byte; files are checked against that
+    sha256. Raises InputError where the hub cannot be reached or the package is absent; `place` ends its sentence:
+    where to put what the user fetches himself.
+    """
+    try:
+        import huggingface_hub as hub
+    except ImportError as error:
+        raise InputError(
+            "--download: needs the package huggingface_hub (`pip install 'ngff[hub]'`); or fetch the weights from "
+            f"https://huggingface.co/{source.repository} yourself and name the file with --weights"
+        ) from error
+    try:
+        info = hub.HfApi().model_info(source.repository, files_metadata=True)
+        files = choose(info.siblings)
+        licence = info.card_data.license if info.card_data and info.card_data.license else source.licence
+        for file in files:
+            log.info(
+                "%s of %s at revision %s: %.2f GB, licence %s, sha256 %s; into %s", file.rfilename, source.repository,
+                info.sha[:12], file.size / 1e9, licence, _checksum(file) or "not stated", folder,
+            )  # fmt: skip
+        fetched = (hub.hf_hub_download(source.repository, f.rfilename, revision=info.sha, local_dir=folder)
+                   for f in files)  # fmt: skip
+        paths = [Path(path) for path in fetched]
+    except Exception as error:  # no network, no such repository, a gated one: each release raises its own
+        raise InputError(
+            f"--download: {source.repository} could not be fetched ({' '.join(str(error).split())[:120]}); fetch it "
+            f"where there is a network, {place}, or name it with --weights"
+        ) from error
+    for file, path in zip(files, paths, strict=True):
+        if _checksum(file) and sha256(path) != _checksum(file):
+            path.unlink()
+            raise InputError(
+                f"{path}: did not arrive whole (its sha256 is not the one stated) and was removed; try again"
+            )
+    return paths
+
+
+def _checksum(file) -> str | None:
+    """The sha256 that the hub states; only large files have one."""
+    return file.lfs.sha256 if file.lfs else None

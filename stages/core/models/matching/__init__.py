@@ -1,0 +1,1 @@
+"""Learned local features and matching."""

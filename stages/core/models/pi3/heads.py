@@ -1,0 +1,89 @@
+"""From tokens to points, confidences and cameras."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from stages.core.geometry.rotations import nearest
+from stages.core.models.pi3.dinov2 import PATCH
+from stages.core.models.pi3.layers import Block
+from stages.core.models.pi3.rope import Rotation
+
+
+class TransformerDecoder(nn.Module):
+    """A few blocks within each view, between two linear layers."""
+
+    def __init__(self, width_in: int, width: int, width_out: int, head: int, depth: int = 5):
+        super().__init__()
+        self.projects = nn.Linear(width_in, width)
+        self.blocks = nn.ModuleList(Block(width, head) for _ in range(depth))
+        self.linear_out = nn.Linear(width, width_out)
+
+    def forward(self, x: Float[Tensor, "b t c"], places: Rotation) -> Float[Tensor, "b t d"]:
+        x = self.projects(x)
+        for block in self.blocks:
+            x = block(x, places)
+        return self.linear_out(x)
+
+
+class LinearMap(nn.Module):
+    """A linear layer that paints each patch: tokens to a map of `channels` numbers a pixel."""
+
+    def __init__(self, width: int, channels: int):
+        super().__init__()
+        self.proj = nn.Linear(width, channels * PATCH * PATCH)
+
+    def forward(self, tokens: Float[Tensor, "b t c"], rows: int, columns: int) -> Float[Tensor, "b h w k"]:
+        """`rows` and `columns` of patches."""
+        maps = self.proj(tokens).mT.unflatten(2, (rows, columns))
+        return F.pixel_shuffle(maps, PATCH).permute(0, 2, 3, 1)
+
+
+def local_points(raw: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
+    """Points in the frame of their camera from the network's (x / z, y / z, log z)."""
+    z = raw[..., 2:].exp()
+    return torch.cat([raw[..., :2] * z, z], -1)
+
+
+class ResidualMLP(nn.Module):
+    def __init__(self, width: int):
+        super().__init__()
+        self.res_conv1, self.res_conv2, self.res_conv3 = (nn.Linear(width, width) for _ in range(3))
+
+    def forward(self, x: Float[Tensor, "b t c"]) -> Float[Tensor, "b t c"]:
+        inner = F.relu(self.res_conv2(F.relu(self.res_conv1(x))))
+        return x + F.relu(self.res_conv3(inner))
+
+
+class CameraHead(nn.Module):
+    """One camera for the patches of a view."""
+
+    def __init__(self, width: int):
+        super().__init__()
+        self.res_conv = nn.ModuleList(ResidualMLP(width) for _ in range(2))
+        self.more_mlps = nn.Sequential(nn.Linear(width, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU())
+        self.fc_t = nn.Linear(width, 3)
+        self.fc_rot = nn.Linear(width, 9)
+
+    def forward(self, tokens: Float[Tensor, "b t c"]) -> Float[Tensor, "b 4 4"]:
+        """Camera-to-world matrices (x right, y down, z forward), up to one similarity of the world."""
+        for block in self.res_conv:
+            tokens = block(tokens)
+        pooled = self.more_mlps(tokens.mean(1))
+        pose = torch.zeros(len(tokens), 4, 4, dtype=pooled.dtype, device=pooled.device)
+        pose[:, :3, :3] = orthogonal(self.fc_rot(pooled))
+        pose[:, :3, 3] = self.fc_t(pooled)
+        pose[:, 3, 3] = 1
+        return pose
+
+
+def orthogonal(nine: Float[Tensor, "b 9"]) -> Float[Tensor, "b 3 3"]:
+    """Rotations from nine numbers: the nearest one to the matrix of their rows, made unit.
+
+    Source: Levinson et al. 2020, "An analysis of SVD for deep rotation estimation", eq. 3.
+    """
+    rows = F.normalize(nine.float().unflatten(-1, (3, 3)), dim=-1)
+    return nearest(rows)

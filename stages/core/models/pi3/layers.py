@@ -1,0 +1,71 @@
+"""The transformer block that all parts of the network are made of."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from stages.core.models.pi3.rope import Rotation, rotate
+
+EPS = 1e-6  # of the layer norms outside attention
+
+
+class Attention(nn.Module):
+    """Attention of a sequence to itself, with rotary places and normalised queries and keys on request."""
+
+    def __init__(self, width: int, head: int, normalised: bool = False):
+        super().__init__()
+        self.head = head
+        self.qkv = nn.Linear(width, 3 * width)
+        self.proj = nn.Linear(width, width)
+        self.q_norm = nn.LayerNorm(head) if normalised else nn.Identity()
+        self.k_norm = nn.LayerNorm(head) if normalised else nn.Identity()
+        self.attend = F.scaled_dot_product_attention  # never holds the t x t matrix; a benchmark swaps it
+
+    def forward(self, x: Float[Tensor, "b t c"], places: Rotation | None = None) -> Float[Tensor, "b t c"]:
+        q, k, v = self.qkv(x).unflatten(-1, (3, -1, self.head)).permute(2, 0, 3, 1, 4)  # each (b, heads, t, d)
+        q, k = self.q_norm(q), self.k_norm(k)
+        if places is not None:
+            q, k = rotate(q, places), rotate(k, places)
+        out = self.attend(q.to(v.dtype), k.to(v.dtype), v)  # norms and angles are 32 bit also where the rest is 16
+        return self.proj(out.transpose(1, 2).flatten(2))
+
+
+class MLP(nn.Module):
+    def __init__(self, width: int, hidden: int):
+        super().__init__()
+        self.fc1 = nn.Linear(width, hidden)
+        self.fc2 = nn.Linear(hidden, width)
+
+    def forward(self, x: Float[Tensor, "b t c"]) -> Float[Tensor, "b t c"]:
+        return self.fc2(F.gelu(self.fc1(x)))
+
+
+class LayerScale(nn.Module):
+    """A learned factor for each feature, small at first. Source: Touvron et al. 2021, "Going deeper with CaiT"."""
+
+    def __init__(self, width: int, start: float = 0.01):
+        super().__init__()
+        self.gamma = nn.Parameter(torch.full((width,), start))
+
+    def forward(self, x: Float[Tensor, "b t c"]) -> Float[Tensor, "b t c"]:
+        return x * self.gamma
+
+
+class Block(nn.Module):
+    """Pre-norm transformer block."""
+
+    def __init__(self, width: int, head: int, normalised: bool = False, scaled: bool = False):
+        super().__init__()
+        self.norm1 = nn.LayerNorm(width, EPS)
+        self.attn = Attention(width, head, normalised)
+        self.ls1 = LayerScale(width) if scaled else nn.Identity()
+        self.norm2 = nn.LayerNorm(width, EPS)
+        self.mlp = MLP(width, 4 * width)
+        self.ls2 = LayerScale(width) if scaled else nn.Identity()
+
+    def forward(self, x: Float[Tensor, "b t c"], places: Rotation | None = None) -> Float[Tensor, "b t c"]:
+        x = x + self.ls1(self.attn(self.norm1(x), places))
+        return x + self.ls2(self.mlp(self.norm2(x)))

@@ -1,0 +1,76 @@
+"""How much memory a set of photos needs, said before it is asked for."""
+
+from __future__ import annotations
+
+import os
+
+import torch
+from torch import nn
+
+from stages.core.errors import InputError
+from stages.core.models.pi3.config import Pi3Config
+from stages.core.models.pi3.dinov2 import PATCH
+from stages.core.models.pi3.network import CAMERA_REGISTERS
+from stages.core.models.pi3.splat import CHANNELS
+
+SHARE = 0.9  # of the free memory that may be used
+AT_ONCE = (8, 4, 2, 1)  # views whose own share of the work is done together
+
+
+def weights(model: nn.Module) -> int:
+    """Bytes of the parameters and buffers."""
+    return sum(x.numel() * x.element_size() for x in model.state_dict().values())
+
+
+def activations(
+    config: Pi3Config, views: int, height: int, width: int, at_once: int, splats: bool, half: bool = False
+) -> int:
+    """Bytes beside the weights at the fullest moment, without gradients; never the square of the number of tokens.
+
+    A token is counted with what a block holds of it: the sum, its norm, queries, keys and values and what turning
+    them takes (32 bit where `half` computes the rest in 16). Afterwards a view's results are kept, and once more
+    while they are put together.
+    """
+    number, pixels = (2 if half else 4), height * width
+    tokens = pixels // PATCH**2 + CAMERA_REGISTERS
+    inside = views * tokens * (config.width * (44 + 4 * number) + 16 * config.head)
+    results = views * (8 * tokens * config.width + 8 * pixels * (4 + CHANNELS * splats))
+    one_part = 48 * tokens * config.width + 8 * number * pixels * config.splat_features * splats
+    return max(inside, results + at_once * one_part)
+
+
+def free(device: str) -> int | None:
+    """Bytes that can be had now; None where the system does not say."""
+    if device != "cpu":
+        unused = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
+        return torch.cuda.mem_get_info(device)[0] + unused
+    try:
+        with open("/proc/meminfo") as lines:
+            return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable"))
+    except (OSError, StopIteration):
+        pass
+    try:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, ValueError, OSError):
+        return None
+
+
+def plan(config: Pi3Config, views: int, size: tuple[int, int], splats: bool, half: bool, room: int | None) -> int:
+    """How many views to do at once so that all fits into `room` bytes.
+
+    Raises InputError, with the number of photos that would fit, when even one at a time does not.
+    """
+
+    def fits(views: int, at_once: int) -> bool:
+        return room is None or activations(config, views, *size, at_once, splats, half) <= SHARE * room
+
+    for at_once in AT_ONCE:
+        if fits(views, at_once):
+            return at_once
+    most = max((n for n in range(1, views) if fits(n, 1)), default=0)
+    need = activations(config, views, *size, 1, splats, half) / 1e9
+    remedy = f"{most} photos would fit" if most else "no photo fits"
+    raise InputError(
+        f"{views} photos of {size[1]}x{size[0]} need {need:.1f} GB beside the weights, and {room / 1e9:.1f} GB are "
+        f"free: {remedy}; give fewer photos, a smaller --resolution, or --device cpu"
+    )

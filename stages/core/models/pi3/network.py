@@ -1,0 +1,117 @@
+"""π³: any number of photos, in any order, to a point and a confidence for each pixel and a camera for each photo."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from stages.core.models.pi3.config import Pi3Config
+from stages.core.models.pi3.dinov2 import PATCH, REGISTERS, DinoV2
+from stages.core.models.pi3.heads import CameraHead, LinearMap, TransformerDecoder, local_points
+from stages.core.models.pi3.layers import Block
+from stages.core.models.pi3.rope import Rotation, patch_places, rotation
+
+MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet
+CAMERA_REGISTERS = 5  # tokens of each view beside its patches
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """What the network says about v views; lengths share one unknown unit."""
+
+    points: Float[Tensor, "v h w 3"]  # of each pixel, in the frame of its camera
+    confidence: Float[Tensor, "v h w"]  # 0..1
+    poses: Float[Tensor, "v 4 4"]  # camera-to-world: x right, y down, z forward
+
+
+class Pi3(nn.Module):
+    """Parameters are named as in the published weights. Inputs are one scene's views, sides multiples of 14 px."""
+
+    def __init__(self, config: Pi3Config = Pi3Config()):  # noqa: B008 -- frozen
+        super().__init__()
+        c = self.config = config
+        self.register_token = nn.Parameter(torch.zeros(1, 1, CAMERA_REGISTERS, c.width))
+        self.register_buffer("image_mean", torch.tensor(MEAN).view(1, 3, 1, 1))
+        self.register_buffer("image_std", torch.tensor(STD).view(1, 3, 1, 1))
+        self.encoder = DinoV2(c.width, c.head, c.encoder_depth, c.table)
+        self.decoder = nn.ModuleList(Block(c.width, c.head, True, True) for _ in range(c.decoder_depth))
+        self.point_decoder = self._decoder(c.width)
+        self.point_head = LinearMap(c.width, 3)
+        self.conf_decoder = self._decoder(c.width)
+        self.conf_head = LinearMap(c.width, 1)
+        self.camera_decoder = self._decoder(c.camera_width)
+        self.camera_head = CameraHead(c.camera_width)
+
+    def _decoder(self, width_out: int) -> TransformerDecoder:
+        c = self.config
+        return TransformerDecoder(2 * c.width, c.width, width_out, c.head, c.head_depth)
+
+    def forward(self, images: Float[Tensor, "v 3 h w"], at_once: int = 8) -> Geometry:
+        """Geometry of RGB views in 0..1. What concerns one view alone is done for `at_once` of them at a time."""
+        hidden, places = self.tokens(images, at_once)
+        return self.geometry(hidden, places, images.shape[2:], at_once)
+
+    def tokens(self, images: Float[Tensor, "v 3 h w"], at_once: int) -> tuple[Float[Tensor, "v t c"], Rotation]:
+        """What the views tell together, registers before patches, and the tokens' places."""
+        views, _, height, width = images.shape
+        places = patch_places(views, height // PATCH, width // PATCH, CAMERA_REGISTERS, images.device)
+        places = rotation(places, self.config.head)
+        return alternate(self.decoder, by_views(self._one_by_one, at_once, images), places, at_once), places
+
+    def _one_by_one(self, images: Float[Tensor, "v 3 h w"]) -> Float[Tensor, "v t c"]:
+        """What each view tells alone: registers, then patches."""
+        patches = self.encoder((images - self.image_mean) / self.image_std)[:, 1 + REGISTERS :]
+        return torch.cat([self.register_token[0].expand(len(images), -1, -1).to(patches.dtype), patches], 1)
+
+    def geometry(self, hidden: Float[Tensor, "v t c"], places: Rotation, size, at_once: int) -> Geometry:
+        """The three heads. Their last layers stay in 32 bit: a depth is the exponential of what they say."""
+        grid = size[0] // PATCH, size[1] // PATCH
+
+        def one_part(hidden: Tensor, cos: Tensor, sin: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+            near = Rotation(cos, sin)
+            parts = [d(hidden, near) for d in (self.point_decoder, self.conf_decoder, self.camera_decoder)]
+            point, confidence, camera = (part[:, CAMERA_REGISTERS:].float() for part in parts)
+            with torch.autocast(hidden.device.type, enabled=False):
+                points = local_points(self.point_head(point, *grid))
+                return points, self.conf_head(confidence, *grid)[..., 0].sigmoid(), self.camera_head(camera)
+
+        return Geometry(*by_views(one_part, at_once, hidden, *places))
+
+
+def halve(model: nn.Module) -> nn.Module:
+    """16-bit weights in all linear layers and convolutions but the last of the heads; norms and scales stay exact.
+
+    For running under autocast to bfloat16: there it changes nothing but the memory and time of casting.
+    """
+    for name, module in model.named_modules():
+        last = {"point_head", "conf_head", "camera_head"} & set(name.split("."))
+        if isinstance(module, (nn.Linear, nn.Conv2d, nn.ConvTranspose2d)) and not last:
+            module.to(torch.bfloat16)
+    return model
+
+
+def alternate(blocks: nn.ModuleList, x: Float[Tensor, "v t c"], places: Rotation, at_once: int) -> Tensor:
+    """Even blocks attend within a view, odd ones over all views; the last two outputs side by side, (v, t, 2 c)."""
+    everywhere = Rotation(*(part.transpose(0, 1).flatten(1, 2)[None] for part in places))
+    last = []
+    for i, block in enumerate(blocks):
+        if i % 2 == 0:
+            x = by_views(lambda x, cos, sin, block=block: block(x, Rotation(cos, sin)), at_once, x, *places)
+        else:
+            x = block(x.flatten(0, 1)[None], everywhere).view_as(x)
+        last = [*last[-1:], x]
+    return torch.cat(last, -1)
+
+
+def by_views(function: Callable, at_once: int, *inputs: Tensor):
+    """function(*inputs), for a few views at a time, which bounds its memory; views must not depend on each other."""
+    if len(inputs[0]) <= at_once:
+        return function(*inputs)
+    parts = [function(*part) for part in zip(*(x.split(at_once) for x in inputs), strict=True)]
+    if isinstance(parts[0], Tensor):
+        return torch.cat(parts)
+    return tuple(torch.cat(part) for part in zip(*parts, strict=True))

@@ -1,0 +1,85 @@
+"""Pi3-splat: π³ with one more head, which makes each pixel a Gaussian."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from stages.core.geometry.rotations import multiply, quaternion
+from stages.core.models.pi3.config import Pi3Config
+from stages.core.models.pi3.feature_head import FeatureHead
+from stages.core.models.pi3.network import CAMERA_REGISTERS, Geometry, Pi3, by_views
+from stages.core.models.pi3.rope import Rotation
+from stages.core.scene.gaussians import Gaussians
+
+DEGREE = 2  # of the spherical harmonics
+CHANNELS = 1 + 3 + 4 + 3 * (DEGREE + 1) ** 2  # opacity, scales, quaternion x y z w, harmonics by colour
+SMALLEST_STEP, LARGEST = 0.001, 0.3  # scales: this share of softplus, at most this [units of the points]
+BANDS = (1.0, 0.025, 0.00625)  # factor on the harmonics of each degree: what depends on direction starts small
+
+
+class SplatEncoder(Pi3):
+    """π³ and the head of Gaussians, which shares its tokens."""
+
+    def __init__(self, config: Pi3Config = Pi3Config()):  # noqa: B008 -- frozen
+        super().__init__(config)
+        c = config
+        self.feature_decoder = self._decoder(c.width)
+        self.feature_head = FeatureHead(c.width, c.splat_widths, c.splat_features, CHANNELS)
+
+    def raw(
+        self, images: Float[Tensor, "v 3 h w"], hidden: Float[Tensor, "v t c"], places: Rotation, at_once: int
+    ) -> Float[Tensor, "v h w k"]:
+        """The numbers of each pixel's Gaussian, before their activations."""
+
+        def one_part(images: Tensor, hidden: Tensor, cos: Tensor, sin: Tensor) -> Tensor:
+            tokens = self.feature_decoder(hidden, Rotation(cos, sin))[:, CAMERA_REGISTERS:]
+            return self.feature_head(tokens, (images - self.image_mean) / self.image_std).float()
+
+        return by_views(one_part, at_once, images, hidden, *places)
+
+
+class Pi3Splat(nn.Module):
+    """The network as published: `encoder.` before every name."""
+
+    def __init__(self, config: Pi3Config = Pi3Config()):  # noqa: B008 -- frozen
+        super().__init__()
+        self.encoder = SplatEncoder(config)
+
+    def forward(self, images: Float[Tensor, "v 3 h w"], at_once: int = 2) -> tuple[Geometry, Float[Tensor, "v h w k"]]:
+        """Geometry, and the raw numbers that `splat` turns into Gaussians. The convolutions on the grid of pixels
+        need the memory, so few views are done at a time."""
+        hidden, places = self.encoder.tokens(images, at_once)
+        geometry = self.encoder.geometry(hidden, places, images.shape[2:], at_once)
+        return geometry, self.encoder.raw(images, hidden, places, at_once)
+
+
+def splat(geometry: Geometry, raw: Float[Tensor, "v h w k"]) -> Gaussians:
+    """A Gaussian for each pixel, views and rows in order, in the frame of the cameras' world.
+
+    Harmonics are taken to be about the world's axes, as the published renderer does. Differentiable in `raw`.
+    """
+    opacity, scales, xyzw, sh = raw.split((1, 3, 4, CHANNELS - 8), -1)
+    R = geometry.poses[:, :3, :3]
+    means = geometry.points @ R.mT[:, None] + geometry.poses[:, None, None, :3, 3]
+    turn = quaternion(R)[:, None, None].expand(*raw.shape[:3], 4)
+    quats = multiply(turn, F.normalize(xyzw, dim=-1).roll(1, -1))
+    scales = (SMALLEST_STEP * F.softplus(scales)).clamp(max=LARGEST)
+    sh = sh.unflatten(-1, (3, -1)).mT * band_factors(raw.device)[:, None]
+    fields = (part.flatten(0, 2) for part in (means, quats, scales, opacity[..., 0].sigmoid(), sh))
+    return Gaussians(*fields, torch.zeros(opacity.numel(), dtype=torch.int64, device=raw.device))
+
+
+def band_factors(device=None) -> Float[Tensor, "k"]:
+    """One for each harmonic."""
+    return torch.cat([torch.full((2 * l + 1,), factor, device=device) for l, factor in enumerate(BANDS)])
+
+
+def decompose(covariances: Float[Tensor, "n 3 3"]) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 4"]]:
+    """Scales, largest first, and quaternions w x y z whose covariance this is; variances are at least 1e-8."""
+    variances, axes = torch.linalg.eigh(covariances)
+    variances, axes = variances.flip(-1), axes.flip(-1)
+    axes = torch.cat([axes[..., :2], axes[..., 2:] * torch.det(axes)[..., None, None]], -1)
+    return variances.clamp_min(1e-8).sqrt(), quaternion(axes)

@@ -1,0 +1,107 @@
+"""The published weights of π³ and Pi3-splat: find, fetch when told to, check and load."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file
+from torch import Tensor, nn
+
+from stages.core.errors import InputError
+from stages.core.models.hub import Source, folders
+from stages.core.models.pi3.config import Pi3Config
+from stages.core.models.pi3.network import Pi3
+from stages.core.models.pi3.splat import Pi3Splat
+from stages.core.scene.files import must_exist
+
+SUFFIXES = (".safetensors", ".pth", ".pt", ".ckpt", ".bin")
+
+
+@dataclass(frozen=True)
+class Published(Source):
+    """A network, and where its makers put the weights."""
+
+    network: type[nn.Module]
+    prefix: str  # before the names that π³ itself uses
+
+
+PUBLISHED = {
+    "pi3": Published("yyfz233/Pi3", "3.8 GB", "CC BY-NC 4.0", Pi3, ""),
+    "pi3-splat": Published("lishiqianhugh/Pi3_splat", "4.2 GB", "that of π³, CC BY-NC 4.0", Pi3Splat, "encoder."),
+}
+
+
+def find(name: str, given: Path | None = None) -> Path:
+    """The file with the weights of `name`: the one given, or NAME.safetensors, NAME.pth or a file in the folder NAME/.
+
+    `given` may be a file or a folder; without it $NGFF_WEIGHTS and the user's cache are searched.
+    """
+    if given is not None and not Path(given).is_dir():
+        must_exist(given, f"weights of {name} (.safetensors or .pth)")
+        return Path(given)
+    places = folders() if given is None else [Path(given)]
+    for place in places:
+        inside = sorted((place / name).iterdir()) if (place / name).is_dir() else []
+        for file in [*(place / f"{name}{suffix}" for suffix in SUFFIXES), *inside]:
+            if file.suffix in SUFFIXES and file.is_file():
+                return file
+    source = PUBLISHED[name]
+    raise InputError(
+        f"{name}: no weights in {' or '.join(str(p) for p in places)}; fetch them from "
+        f"https://huggingface.co/{source.repository} ({source.size}, licence {source.licence}) and save them as "
+        f"{places[0] / name}.safetensors, name the file with --weights, or add --download"
+    )
+
+
+def load(path: Path, name: str) -> nn.Module:
+    """The network with the weights of a file, on the CPU, 32 bit, for inference. Its sizes are read off the weights.
+
+    Raises InputError for a file that is damaged, holds something else, or lacks tensors.
+    """
+    source = PUBLISHED[name]
+    state = {k: v.float() if v.is_floating_point() else v for k, v in read_state(path).items()}
+    try:
+        config = Pi3Config.of({k.removeprefix(source.prefix): v for k, v in state.items()})
+    except (KeyError, IndexError) as error:
+        raise InputError(
+            f"{path}: holds no weights of {name} (its {len(state)} tensors include no {error.args[0]}); "
+            f"those at https://huggingface.co/{source.repository} are meant"
+        ) from error
+    with torch.device("meta"):
+        model = source.network(config)
+    if complaint := differences(model.state_dict(), state):
+        raise InputError(f"{path}: does not fit {name}: {complaint}")
+    model.load_state_dict(state, assign=True)
+    return model.requires_grad_(False).eval()
+
+
+def read_state(path: Path) -> dict[str, Tensor]:
+    """The tensors of a .safetensors file or of a PyTorch checkpoint, which may hold them one level down."""
+    path = Path(path)
+    must_exist(path, "weights (.safetensors or .pth)")
+    try:
+        if path.suffix == ".safetensors":
+            return load_file(path)
+        data = torch.load(path, map_location="cpu", weights_only=True)
+    except SafetensorError as error:
+        raise InputError(f"{path}: is no whole safetensors file ({error}); fetch it again") from error
+    except Exception as error:  # a damaged pickle raises anything
+        raise InputError(f"{path}: cannot be read as a PyTorch checkpoint; fetch it again") from error
+    for key in ("state_dict", "model_state_dict", "model", "module"):
+        if isinstance(data, dict) and isinstance(data.get(key), dict):
+            data = data[key]
+    return {k: v for k, v in data.items() if isinstance(v, Tensor)} if isinstance(data, dict) else {}
+
+
+def differences(wanted: Mapping[str, Tensor], given: Mapping[str, Tensor]) -> str:
+    """What is missing, unknown or of another shape, in words; empty when all fits."""
+    other = [f"{k} {tuple(given[k].shape)} instead of {tuple(wanted[k].shape)}"
+             for k in wanted if k in given and given[k].shape != wanted[k].shape]  # fmt: skip
+    groups = {"missing": [k for k in wanted if k not in given], "unknown": [k for k in given if k not in wanted],
+              "of another shape": other}  # fmt: skip
+    return "; ".join(f"{len(names)} tensors {what}: {', '.join(names[:3])}{', ...' if len(names) > 3 else ''}"
+                     for what, names in groups.items() if names)  # fmt: skip

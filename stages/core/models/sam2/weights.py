@@ -1,0 +1,96 @@
+"""The published weights of SAM 2.1: find, fetch when told to, and load. Transformers is imported when they load."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from stages.core.errors import InputError
+from stages.core.models.hub import Source, fetch, folders
+from stages.core.models.pi3.weights import read_state
+from stages.core.scene.files import must_exist
+
+if TYPE_CHECKING:
+    from transformers import Sam2VideoModel
+
+SOURCE = Source("facebook/sam2.1-hiera-large", "0.9 GB", "Apache-2.0")
+SMALLEST = "facebook/sam2.1-hiera-tiny"  # 0.16 GB, and several times quicker; any size of SAM 2.1 will do
+FILES = ("config.json", "model.safetensors")
+
+
+def find(given: Path | None = None) -> Path:
+    """The file with the weights, its config.json beside it: the one given, or model.safetensors of a folder.
+
+    Without `given`, the folder sam2/ is looked for in $NGFF_WEIGHTS and in the user's cache.
+    """
+    if given is not None and not Path(given).is_dir():
+        must_exist(given, "the weights of SAM 2.1 (model.safetensors)")
+        must_exist(Path(given).with_name("config.json"), f"the config.json published with {Path(given).name}")
+        return Path(given)
+    places = [Path(given)] if given is not None else [folder / "sam2" for folder in folders()]
+    for place in places:
+        if all((place / file).is_file() for file in FILES):
+            return place / FILES[1]
+    raise InputError(
+        f"sam2: no {' with '.join(FILES)} in {' or '.join(str(p) for p in places)}; fetch both from "
+        f"https://huggingface.co/{SOURCE.repository} ({SOURCE.size}, licence {SOURCE.licence}; {SMALLEST} is quicker "
+        f"on a CPU) into {places[0]}, name their folder with --weights, or add --download"
+    )
+
+
+def download() -> Path:
+    """Fetch config and weights of the large network into sam2/ of the first folder searched; returns the weights."""
+    folder = folders()[0] / "sam2"
+    return fetch(SOURCE, folder, _choose, f"put {' and '.join(FILES)} in {folder}")[1]
+
+
+def _choose(files: list) -> list:
+    named = {file.rfilename: file for file in files}
+    if missing := [name for name in FILES if name not in named]:
+        raise ValueError(f"it holds no {' and no '.join(missing)}")
+    return [named[name] for name in FILES]
+
+
+def load(path: Path, device: str = "cpu") -> Sam2VideoModel:
+    """The network with the weights of a file, of the size that the config.json beside it says, 32 bit, for inference.
+
+    Raises InputError where transformers is absent or older than SAM 2, and for files that are damaged, incomplete or
+    of another network.
+    """
+    try:
+        from transformers import Sam2VideoConfig, Sam2VideoModel
+        from transformers.utils import logging as reports
+    except ImportError as error:
+        raise InputError("sam2: needs transformers 4.56 or newer: `pip install -U 'ngff[sam2]'`") from error
+    config = _config(Sam2VideoConfig, Path(path).with_name("config.json"))
+    reports.disable_progress_bar()
+    level = reports.get_verbosity()
+    reports.set_verbosity_error()  # what does not fit is said below, in one sentence
+    try:
+        model, found = Sam2VideoModel.from_pretrained(
+            None, config=config, state_dict=read_state(path), output_loading_info=True
+        )
+    except RuntimeError as error:
+        raise _unfit(path, "its tensors have other shapes") from error
+    finally:
+        reports.set_verbosity(level)
+    if missing := sorted(found["missing_keys"]):
+        raise _unfit(path, f"{len(missing)} tensors missing: {', '.join(missing[:3])}")
+    return model.float().requires_grad_(False).eval().to(device)
+
+
+def _config(kind: type, file: Path):
+    must_exist(file, "the config.json published with the weights")
+    try:
+        data, _ = kind.get_config_dict(str(file))
+        if data.get("model_type") != kind.model_type:
+            raise ValueError(f"model_type {data.get('model_type')!r} instead of {kind.model_type!r}")
+        return kind.from_dict(data)
+    except Exception as error:  # each release checks in its own way, and raises its own
+        raise InputError(f"{file}: does not describe SAM 2.1 ({' '.join(str(error).split())[:120]}); use the one "
+                         f"published with the weights, as in {SOURCE.repository}") from error  # fmt: skip
+
+
+def _unfit(path: Path, what: str) -> InputError:
+    return InputError(f"{path}: does not fit the config.json beside it: {what}; fetch both from one repository, such "
+                      f"as {SOURCE.repository}")  # fmt: skip

@@ -1,0 +1,1 @@
+"""What the photos say about the scene: supports, visibility, and which Gaussians form one object."""

@@ -1,0 +1,246 @@
+"""Which Gaussians belong together as one thing that can move: no labels needed, only positions, colours, normals."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from stages.core.geometry.cameras import centres
+from stages.core.geometry.neighbours import knn
+from stages.core.geometry.rotations import matrix
+from stages.core.perception.growing import complete, lab_of, table_colour
+from stages.core.perception.naming import names_of
+from stages.core.perception.regions import Merging, Voxels, edges_of, small_regions
+from stages.core.perception.support import Support, View, cell_medians, find_support, view_of, windowed
+from stages.core.perception.visibility import seen_from
+from stages.core.perception.wall import find_wall, laid_down
+from stages.core.scene.gaussians import Gaussians
+from stages.core.scene.scene import Scene, SceneObject
+
+log = logging.getLogger(__name__)
+MOST_VOXELS = 60_000
+CROWD = 0.3  # Gaussians that a voxel of a real surface holds at least, of those usual near the focus
+HIGH = 0.4  # what hangs higher above the table than this is no thing on it [view radii]
+LOW = 0.05  # what ends lower than this and has the table's colour is a bump of the table [view radii]
+LARGE = 0.4  # longest side of a thing that stands out of its surroundings [view radii]
+ON_WALL = 0.9  # the same of what hangs on a wall, where photos are of one thing rather than of many [view radii]
+
+
+@dataclass(frozen=True)
+class Grouping:
+    """What decides how many objects come out."""
+
+    max_objects: int = 24
+    min_size: float = 0.03  # of an object, along its longest side [distance of the cameras from the focus]
+    detail: float = 0.41  # regions that differ less than this are one object; smaller gives more objects
+    seed: int = 0
+
+
+def group(scene: Scene, grouping: Grouping = Grouping()) -> Scene:
+    """The scene with an object_id for every Gaussian (0 for the background) and its objects, largest first.
+
+    The supporting plane is taken away, what is left is cut into small even regions, and these are merged
+    while they look like one thing. Things that mostly lie outside the table are background. Where there is
+    a wall and no floor, what hangs on it is found in the same way.
+    """
+    view = view_of(scene)
+    wall = find_wall(scene, view, grouping.seed)
+    if wall is None:
+        support = find_support(scene, view, grouping.seed)
+        return named(replace(scene, gaussians=_grouped(scene, view, support, grouping, LARGE)), support)
+    laid = laid_down(scene, wall)
+    view = view_of(laid)
+    ids = _grouped(laid, view, find_support(laid, view, grouping.seed), grouping, ON_WALL).object_id
+    return named(replace(scene, gaussians=replace(scene.gaussians, object_id=ids)), None)
+
+
+def _grouped(scene: Scene, view: View, support: Support | None, grouping: Grouping, large: float) -> Gaussians:
+    """The scene's Gaussians with object numbers; nothing is larger than about `large` view radii."""
+    g = replace(scene.gaussians, object_id=torch.zeros(len(scene.gaussians), dtype=torch.int64))
+    index = _candidates(g, view, support)
+    index = index[_crowded(g.means[index], view)]
+    if len(index) < 20:
+        log.info("nothing stands on the supporting plane: no objects")
+        return g
+    seen = seen_from(g, scene.cameras) if scene.cameras is not None and len(scene.cameras) else None
+    voxels, owner = _voxels(g[index], view, None if seen is None else seen[index])
+    edges = edges_of(voxels)
+    least = max(4, int((grouping.min_size * view.radius / voxels.size) ** 2))
+    regions = small_regions(voxels, edges)
+    things = Merging(voxels, edges, regions, least, grouping.detail, large * view.radius).run()
+    count = np.bincount(owner[owner >= 0], minlength=len(voxels)) * _thinning(voxels, scene, view)
+    if support is not None:
+        things = _without_skirts(voxels, things, table_colour(g, support), support)
+    things = _objects(voxels, count, things, view, support, grouping)
+    g.object_id[index] = torch.from_numpy(np.where(owner >= 0, things[owner], 0))
+    return complete(g, support, 2 * voxels.size)
+
+
+def _candidates(g: Gaussians, view: View, support: Support | None) -> Int[Tensor, "m"]:
+    """Gaussians near the focus that are something, but not the supporting plane."""
+    R = view.radius
+    ok = g.means.isfinite().all(1) & g.quats.isfinite().all(1) & g.scales.isfinite().all(1)
+    ok &= (g.opacities > 0.1) & (g.scales.amax(1) < 0.1 * R) & ((g.means - view.focus).norm(dim=1) < 1.5 * R)
+    if support is None:
+        return torch.nonzero(ok & ((g.means - view.focus).norm(dim=1) < 0.8 * R))[:, 0]
+    h = support.heights(g.means)
+    near = support.inside(g.means, 0.12 * R) & (h > -0.3 * R)
+    over = (h > support.tolerance) | (h < -3 * support.tolerance)
+    like, higher = _against_table(g, h, support)
+    bump = like & (h < 2.5 * support.tolerance) & (_shortest(g)[:, 2].abs() > 0.8)
+    return torch.nonzero(ok & near & ((over & ~bump) | (higher & ~like)))[:, 0]
+
+
+def _against_table(g: Gaussians, h: Float[Tensor, "n"], support: Support) -> tuple[Tensor, Tensor]:
+    """For Gaussians close to the table: whether they have its colour, and whether they belong to a flat thing on it.
+
+    A flat thing has another colour than the table around and is a little higher: a stain has the colour but
+    no height, a bump in the reconstruction the height but not the colour.
+    """
+    like, flat = torch.zeros(2, len(g), dtype=torch.bool)
+    near = torch.nonzero((h.abs() < 2.5 * support.tolerance) & (g.opacities > 0.1) & support.inside(g.means))[:, 0]
+    if len(near) < 50:
+        return like, flat
+    values = torch.cat([lab_of(g[near]), h[near, None]], 1)
+    table = windowed(cell_medians(support, g.means[near], values, 3), reach=5)
+    here = windowed(cell_medians(support, g.means[near], values), reach=1)
+    cell = support.cells(g.means[near])
+    around, mine = table[tuple((cell // 3).T)], here[tuple(cell.T)]
+    like[near] = (values - around)[:, :3].norm(dim=1) < 10
+    other = (mine - around)[:, :3].norm(dim=1) > 14
+    higher = (mine - around)[:, 3] > max(0.35 * support.tolerance, 0.003 * support.view.radius)
+    flat[near] = other & higher & (values[:, 3] > 0)
+    return like, flat
+
+
+def _shortest(g: Gaussians) -> Float[Tensor, "n 3"]:
+    """Direction of each Gaussian's shortest axis: the normal of a flat one."""
+    return matrix(g.quats)[torch.arange(len(g)), :, g.scales.argmin(1)]
+
+
+def _crowded(points: Float[Tensor, "m 3"], view: View) -> Bool[Tensor, "m"]:
+    """Points with neighbours as near as most have: not floaters."""
+    if len(points) < 20:
+        return torch.ones(len(points), dtype=torch.bool)
+    distance = knn(points, points, 9)[0][:, -1]
+    return distance < min(max(3.5 * float(distance.median()), 0.01 * view.radius), 0.06 * view.radius)
+
+
+def _voxels(g: Gaussians, view: View, seen: Tensor | None) -> tuple[Voxels, np.ndarray]:
+    """Means over a grid about twice as coarse as the Gaussians, and the voxel of each (-1: dropped as stray)."""
+    spacing = float(knn(g.means, g.means, 4)[0][:, 1:].mean(1).median())
+    size = min(max(2.0 * spacing, 0.007 * view.radius), 0.025 * view.radius)
+    while True:
+        cell = (g.means / size).floor().long()
+        _, owner, count = cell.unique(dim=0, return_inverse=True, return_counts=True)
+        if len(count) <= MOST_VOXELS:
+            break
+        size *= 1.3
+    points, lab = _mean(g.means, owner, count), _mean(lab_of(g), owner, count)
+    normals = _normals(g, points, owner, count, seen, view)
+    neighbours = (knn(points, points, 5)[0][:, -1] < 2.2 * size) | (count > 3)
+    number = torch.where(neighbours, neighbours.long().cumsum(0) - 1, -1)
+    kept = (t[neighbours].double().numpy() for t in (points, lab, normals))
+    return Voxels(*kept, size), number[owner].numpy()
+
+
+def _mean(values: Float[Tensor, "n *v"], owner: Int[Tensor, "n"], count: Int[Tensor, "m"]) -> Float[Tensor, "m *v"]:
+    total = torch.zeros(len(count), *values.shape[1:]).index_add_(0, owner, values.float())
+    return total / count.reshape(-1, *[1] * (values.dim() - 1))
+
+
+def _normals(g: Gaussians, points: Tensor, owner: Tensor, count: Tensor, seen: Tensor | None, view: View) -> Tensor:
+    """Shortest axes of flat Gaussians and the planes through neighbouring voxels, pointing to where they are seen."""
+    lengths, axes = g.scales.sort(1).values, _shortest(g)
+    flat = (1 - lengths[:, 0] / lengths[:, 1].clamp_min(1e-12)).clamp_min(0)
+    axes = _mean(flat[:, None, None] * axes[:, :, None] * axes[:, None], owner, count)
+    around = points[knn(points, points, 13)[1]]
+    centred = around - around.mean(1, keepdim=True)
+    spread = centred.mT @ centred
+    spread = spread / spread.diagonal(dim1=1, dim2=2).sum(1).clamp_min(1e-20)[:, None, None]
+    normals = torch.linalg.eigh(axes + torch.eye(3) - 2 * spread).eigenvectors[:, :, -1]
+    wide = points[knn(points, points, 64)[1]].mean(1)
+    toward = points - wide + 1e-3 * view.radius * torch.tensor([0.0, 0, 1])  # outside is away from what is around
+    if seen is not None:
+        total = torch.zeros(len(count), 3).index_add_(0, owner, seen)
+        toward = torch.where(total.norm(dim=1, keepdim=True) > 0, total, toward)
+    return normals * torch.where((normals * toward).sum(1, keepdim=True) < 0, -1.0, 1.0)
+
+
+def _thinning(voxels: Voxels, scene: Scene, view: View) -> np.ndarray:
+    """How much thinner than usual Gaussians lie, being farther from the nearest camera: distance squared."""
+    if scene.cameras is None or not len(scene.cameras):
+        return np.ones(len(voxels))
+    distance, _ = knn(centres(scene.cameras.viewmats), torch.from_numpy(voxels.points).float(), 1)
+    return (distance[:, 0] / view.radius).clamp(0.5, 2).square().numpy()
+
+
+def _without_skirts(
+    voxels: Voxels, things: np.ndarray, table: Float[Tensor, "bx by 3"], support: Support
+) -> np.ndarray:
+    """Things that are pieces of the table (-1): low, and of its colour, or nearly so in the shade of a larger thing."""
+    points = torch.from_numpy(voxels.points).float()
+    h = support.heights(points).numpy() / support.view.radius
+    around = table[tuple((support.cells(points) // 3).T)].numpy()
+    unlike = np.linalg.norm(voxels.lab - around, axis=1)
+    _, column = np.unique(np.floor(voxels.points[:, :2] / (4 * voxels.size)), axis=0, return_inverse=True)
+    column, size = column.reshape(-1), np.bincount(things[things >= 0])
+    out = things.copy()
+    for thing in np.unique(things[things >= 0]):
+        members = things == thing
+        if np.percentile(h[members], 95) > LOW:
+            continue
+        above = np.isin(column, column[members]) & (things >= 0) & (size[things] > 3 * size[thing])
+        shaded = len(np.unique(column[above])) > 0.5 * len(np.unique(column[members]))
+        if np.median(unlike[members]) < (25 if shaded else 10):
+            out[members] = -1
+    return out
+
+
+def _objects(
+    voxels: Voxels, count: np.ndarray, things: np.ndarray, view: View, support: Support | None, grouping: Grouping
+) -> np.ndarray:
+    """Object number of each voxel, 1 for the largest thing; 0 for what is too small, too large or off the table.
+
+    `count` says how many Gaussians a voxel holds: a cloud of floaters has hardly more than one in each.
+    """
+    points = torch.from_numpy(voxels.points).float()
+    off = np.zeros(len(voxels), bool)
+    h = np.zeros(len(voxels))
+    if support is not None:
+        h = support.heights(points).numpy()
+        off = ~support.inside(points).numpy() | (h < -2 * support.tolerance)
+    near = np.linalg.norm(voxels.points - view.focus.numpy(), axis=1) < 0.3 * view.radius
+    crowd = CROWD * np.median(count[near]) if near.any() else 0.0
+    smallest = grouping.min_size * view.radius
+    found = []
+    for thing in np.unique(things[things >= 0]):
+        members = things == thing
+        low, high = np.percentile(voxels.points[members], (2, 98), axis=0)
+        sized = smallest <= (high - low).max() < 1.2 * view.radius
+        enough = members.sum() >= max(8, 0.35 * (smallest / voxels.size) ** 2)
+        here = off[members].mean() < 0.4 and h[members].min() < HIGH * view.radius
+        if sized and enough and here and count[members].mean() > crowd:
+            found.append((int(members.sum()), thing))
+    out = np.zeros(len(voxels), np.int64)
+    for number, (_, thing) in enumerate(sorted(found, reverse=True)[: grouping.max_objects], start=1):
+        out[things == thing] = number
+    return out
+
+
+def named(scene: Scene, support: Support | None) -> Scene:
+    """Objects renumbered by their count of Gaussians, with a name each."""
+    g = scene.gaussians
+    counts = torch.bincount(g.object_id)
+    order = [i for i in counts.argsort(descending=True, stable=True).tolist() if i > 0 and counts[i] > 0]
+    number = torch.zeros(len(counts), dtype=torch.int64)
+    number[order] = torch.arange(1, len(order) + 1)
+    g = replace(g, object_id=number[g.object_id])
+    names = names_of(g, support)
+    objects = tuple(SceneObject(i, name) for i, name in enumerate(names, start=1))
+    return replace(scene, gaussians=g, objects=objects)

@@ -1,0 +1,267 @@
+"""The surface that things stand on: where it is, how even, and how far it reaches."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy import ndimage
+from scipy.spatial import ConvexHull, QhullError
+from torch import Tensor
+
+from stages.core.geometry.cameras import centres
+from stages.core.geometry.planes import ransac
+from stages.core.scene.cameras import Cameras
+from stages.core.scene.gaussians import Gaussians
+from stages.core.scene.scene import Scene
+
+REACH = 1.5  # how far from the focus anything is looked at [view radii]
+CELLS = 300  # largest side of the grid over the surface
+
+
+@dataclass(frozen=True)
+class View:
+    """What the cameras look at, and from how far."""
+
+    focus: Float[Tensor, "3"]
+    radius: float
+
+
+def view_of(scene: Scene) -> View:
+    """The point that the cameras look at; without cameras, the middle of the Gaussians."""
+    if scene.cameras is not None and len(scene.cameras):
+        focus = _aim(scene.cameras, scene.floor)
+        radius = float((centres(scene.cameras.viewmats) - focus).norm(dim=1).median())
+        if radius > 0 and np.isfinite(radius):
+            return View(focus, radius)
+    g = scene.gaussians
+    solid = g.means[(g.opacities > 0.1) & g.means.isfinite().all(1)]
+    if not len(solid):
+        return View(torch.zeros(3), 1.0)
+    focus = solid.median(0).values
+    distance = (solid - focus).norm(dim=1)
+    return View(focus, 1.5 * max(float(distance[torch.randperm(len(distance))[:100_000]].quantile(0.8)), 1e-6))
+
+
+def _aim(cameras: Cameras, floor: float | None) -> Float[Tensor, "3"]:
+    """Median of where the optical axes meet the floor, or the point nearest to all axes."""
+    eyes, ahead = centres(cameras.viewmats), cameras.viewmats[:, 2, :3]
+    down = ahead[:, 2] < -0.15
+    if floor is not None and down.any():
+        reach = (floor - eyes[down, 2]) / ahead[down, 2]
+        return (eyes[down] + ahead[down] * reach.clamp_min(0)[:, None]).median(0).values
+    across = torch.eye(3) - ahead[:, :, None] * ahead[:, None, :]
+    A, b = across.sum(0), (across @ eyes[:, :, None]).sum(0)
+    ridge = 1e-6 * torch.eye(3) * A.trace()
+    return torch.linalg.solve(A + ridge, b + ridge @ eyes.mean(0)[:, None])[:, 0]
+
+
+@dataclass(frozen=True)
+class Support:
+    """A nearly level surface z = p(x, y) + relief, p of second degree, and the part of it that is there."""
+
+    view: View
+    coefficients: Float[Tensor, "6"]  # of 1 x y x^2 x y y^2 about the focus, lengths in view radii
+    noise: float  # robust standard deviation of its Gaussians about it [scene units]
+    cell: float  # of the grid [scene units]
+    region: Bool[Tensor, "gx gy"]  # table here, or hidden under things; the grid is centred on the focus
+    relief: Float[Tensor, "gx gy"]  # broad unevenness, of the table or of its reconstruction [scene units]
+
+    @property
+    def tolerance(self) -> float:
+        """Heights up to this are the surface itself [scene units]."""
+        return min(max(3 * self.noise, 0.004 * self.view.radius), 0.02 * self.view.radius)
+
+    def heights(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
+        """Height above the surface."""
+        return points[:, 2] - self.surface(points)
+
+    def surface(self, points: Float[Tensor, "n d"]) -> Float[Tensor, "n"]:
+        """Height z of the surface below or above points (their x and y count)."""
+        xy = (points[:, :2] - self.view.focus[:2]) / self.view.radius
+        far = xy.norm(dim=1, keepdim=True).clamp_min(REACH) / REACH  # beyond the data a parabola runs away
+        i, j = self.cells(points).unbind(1)
+        return _terms(xy / far) @ self.coefficients + self.relief[i, j]
+
+    def cells(self, points: Float[Tensor, "n d"]) -> Int[Tensor, "n 2"]:
+        """Grid cell of each point, clamped to the grid."""
+        half = self.cell * len(self.region) / 2
+        index = ((points[:, :2] - self.view.focus[:2] + half) / self.cell).floor()
+        return index.nan_to_num(0).clamp(0, len(self.region) - 1).long()
+
+    def inside(self, points: Float[Tensor, "n d"], margin: float = 0.0) -> Bool[Tensor, "n"]:
+        """Whether points are over the table, or within `margin` [scene units] of its edge."""
+        i, j = self.cells(points).unbind(1)
+        if not margin:
+            return self.region[i, j]
+        return torch.from_numpy(ndimage.distance_transform_edt(~self.region.numpy()) * self.cell <= margin)[i, j]
+
+
+def _terms(xy: Float[Tensor, "n 2"]) -> Float[Tensor, "n 6"]:
+    x, y = xy.unbind(1)
+    return torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y], 1)
+
+
+def find_support(scene: Scene, view: View | None = None, seed: int = 0) -> Support | None:
+    """The surface at `scene.floor`, or the largest level one near the focus; None where there is none."""
+    view = view or view_of(scene)
+    g, R = scene.gaussians, view.radius
+    points = g.means[solid(g, R) & ((g.means - view.focus)[:, :2].norm(dim=1) < REACH * R)]
+    floor = scene.floor if scene.floor is not None else _level(points, view, seed)
+    if floor is None or not np.isfinite(floor):
+        return None
+    band = points[(points[:, 2] - floor).abs() < 0.05 * R]
+    if len(band) < 50:
+        return None
+    coefficients, noise = _fit(band, floor, view, seed)
+    bare = Support(
+        view, coefficients, noise, 2 * REACH * R / CELLS,
+        torch.zeros(CELLS, CELLS, dtype=torch.bool), torch.zeros(CELLS, CELLS),
+    )  # fmt: skip
+    uneven = replace(bare, relief=_relief(bare, band))
+    even = 1 / (1 + ((band - view.focus)[:, :2].norm(dim=1) / (0.7 * R)) ** 4)
+    noise = R * _spread((uneven.heights(band) / R).double(), even)
+    found = replace(uneven, noise=noise)
+    found = replace(found, region=_region(found, band))
+    return found if found.region.any() else None
+
+
+def solid(g: Gaussians, radius: float) -> Bool[Tensor, "n"]:
+    """Gaussians that are part of something: finite, not transparent, not a blur over the whole scene."""
+    return g.means.isfinite().all(1) & (g.opacities > 0.1) & (g.scales.amax(1) < 0.2 * radius)
+
+
+def _level(points: Float[Tensor, "n 3"], view: View, seed: int) -> float | None:
+    """Height of the level plane with most points near the focus."""
+    near = 1 / (1 + ((points - view.focus).norm(dim=1) / (0.5 * view.radius)) ** 4)
+    found = ransac(points, 0.01 * view.radius, near, lambda normals: normals[:, 2] > 0.98, seed=seed)
+    if found is None or float(near[found[1]].sum() / near.sum()) < 0.05:
+        return None
+    plane = found[0]
+    return float((plane.offset - view.focus[:2] @ plane.normal[:2]) / plane.normal[2])
+
+
+def _fit(band: Float[Tensor, "n 3"], floor: float, view: View, seed: int) -> tuple[Tensor, float]:
+    """Second-degree surface by reweighting with Tukey's biweight; each patch of table counts once.
+
+    The curvature is held back by a ridge, so that a keyboard does not become a bump in the table.
+    """
+    R = view.radius
+    local = (band - torch.cat([view.focus[:2], torch.tensor([floor])])) / R
+    _, patch, count = ((local[:, :2] + REACH) / 0.02).floor().long().unique(
+        dim=0, return_inverse=True, return_counts=True
+    )
+    even = (1 / count[patch].float()) / (1 + (local[:, :2].norm(dim=1) / 0.7) ** 4)
+    coefficients = torch.zeros(6, dtype=torch.float64)
+    found = ransac(local, 0.004, even, lambda normals: normals[:, 2] > 0.99, trials=300, seed=seed)
+    if found is not None:
+        n, d = found[0]
+        coefficients[:3] = torch.tensor([d / n[2], -n[0] / n[2], -n[1] / n[2]])
+    terms, z, start = _terms(local[:, :2]).double(), local[:, 2].double(), coefficients.clone()
+    ridge = torch.diag(torch.tensor([1e-6, 1e-3, 1e-3, 0.03, 0.03, 0.03], dtype=torch.float64))
+    for _ in range(8):
+        residual = z - terms @ coefficients
+        noise = _spread(residual, even)
+        width = max(4.685 * noise, 0.003)
+        weight = even * (1 - (residual / width) ** 2).clamp_min(0) ** 2
+        A = terms.mT @ (weight[:, None] * terms) + ridge * weight.sum()
+        b = terms.mT @ (weight * (z - terms @ start))
+        coefficients = start + torch.linalg.solve(A, b)
+    coefficients[0] += floor / R
+    return (coefficients * R).float(), noise * R
+
+
+def _spread(residual: Float[Tensor, "n"], weights: Float[Tensor, "n"], bin: float = 2.5e-4) -> float:
+    """Standard deviation of the peak at zero, from its half width at half height on the narrower side.
+
+    Quantiles would not do: low things on the surface, a keyboard, are a large part of the band.
+    """
+    edges = np.arange(-0.04, 0.04 + bin, bin)
+    height, _ = np.histogram(residual.numpy(), edges, weights=weights.numpy())
+    height = ndimage.gaussian_filter1d(height, 2.0)
+    middle = len(height) // 2
+    peak = middle - 20 + int(np.argmax(height[middle - 20 : middle + 20]))
+    low = height < 0.5 * height[peak]
+    left = low[:peak][::-1].argmax() if low[:peak].any() else peak
+    right = low[peak:].argmax() if low[peak:].any() else len(height) - peak
+    return float(max(1, min(left, right)) * bin / 1.177)
+
+
+def cell_medians(
+    support: Support, points: Float[Tensor, "n d"], values: Float[Tensor, "n v"], coarse: int = 1
+) -> Float[Tensor, "gx gy v"]:
+    """Median of the values of the points in each cell, or in blocks of `coarse` cells; nan where there are none."""
+    side = -(-len(support.region) // coarse)
+    cell = (support.cells(points) // coarse) @ torch.tensor([side, 1])
+    out = torch.full((side * side, values.shape[1]), torch.nan)
+    for v in range(values.shape[1]):
+        order = np.lexsort((values[:, v].numpy(), cell.numpy()))
+        which, first, count = np.unique(cell.numpy()[order], return_index=True, return_counts=True)
+        out[which, v] = values[:, v][order[first + count // 2]]
+    return out.reshape(side, side, -1)
+
+
+def windowed(grid: Float[Tensor, "gx gy v"], reach: int, share: float = 0.5) -> Float[Tensor, "gx gy v"]:
+    """Median (or another share) of the cells within `reach` of each cell, nan being ignored; gaps take the nearest."""
+    side = 2 * reach + 1
+    out = []
+    for layer in grid.unbind(2):
+        padded = np.pad(layer.numpy(), reach, constant_values=np.nan)
+        stack = np.lib.stride_tricks.sliding_window_view(padded, (side, side)).reshape(*layer.shape, -1)
+        stack = np.sort(stack, axis=-1)  # nan go last
+        count = np.isfinite(stack).sum(-1)
+        pick = np.take_along_axis(stack, (share * (count - 1).clip(0)).astype(int)[..., None], -1)[..., 0]
+        if count.any():
+            near = ndimage.distance_transform_edt(count == 0, return_distances=False, return_indices=True)
+            pick = pick[tuple(near)]
+        out.append(torch.from_numpy(np.nan_to_num(pick)).float())
+    return torch.stack(out, 2)
+
+
+def _relief(bare: Support, band: Float[Tensor, "n 3"]) -> Float[Tensor, "gx gy"]:
+    """Heights over windows so wide (a quarter of the view radius) that things fill less than half of them."""
+    h = bare.heights(band)
+    near = h.abs() < 0.025 * bare.view.radius
+    if not near.any():
+        return bare.relief
+    coarse = 3
+    rough = windowed(cell_medians(bare, band[near], h[near, None], coarse), reach=4, share=0.45)[..., 0]
+    smooth = ndimage.gaussian_filter(rough.numpy(), 1.5)
+    fine = ndimage.zoom(smooth, len(bare.region) / len(smooth), order=1)
+    return torch.from_numpy(fine).float()
+
+
+def _region(bare: Support, band: Float[Tensor, "n 3"]) -> Bool[Tensor, "gx gy"]:
+    """Cells of the piece of surface in focus, closed over what stands on it."""
+    on = band[bare.heights(band).abs() < bare.tolerance]
+    count = np.zeros((CELLS, CELLS))
+    np.add.at(count, tuple(bare.cells(on).T.numpy()), 1)
+    crowd = ndimage.uniform_filter(count, 3)
+    middle = slice(CELLS // 2 - CELLS // 8, CELLS // 2 + CELLS // 8)
+    usual = crowd[middle, middle]
+    seen = crowd > 0.1 * np.median(usual[usual > 0]) if (usual > 0).any() else crowd > 0  # a few strays are no table
+    seen = ndimage.binary_closing(np.pad(seen, 40), _disc(4))
+    parts, count = ndimage.label(seen)
+    if not count:
+        return torch.zeros(CELLS, CELLS, dtype=torch.bool)
+    middle = (np.arange(CELLS + 80) - CELLS / 2 - 39.5) * bare.cell / bare.view.radius
+    near = 1 / (1 + (np.hypot(*np.meshgrid(middle, middle, indexing="ij")) / 0.5) ** 4)
+    best = 1 + int(np.argmax(ndimage.sum(near, parts, np.arange(1, count + 1))))
+    part = ndimage.binary_fill_holes(ndimage.binary_closing(parts == best, _disc(20)))
+    return torch.from_numpy(part[40:-40, 40:-40].copy())
+
+
+def _disc(radius: int) -> np.ndarray:
+    x = np.arange(-radius, radius + 1)
+    return x[:, None] ** 2 + x[None] ** 2 <= radius**2
+
+
+def tips(points: Float[Tensor, "n 2"], base: Float[Tensor, "m 2"]) -> bool:
+    """Whether a body falls over: the middle of its points lies outside the convex hull of those it stands on."""
+    try:
+        hull = ConvexHull(base.double().numpy()).equations
+    except (QhullError, ValueError):  # it stands on a line, or on next to nothing
+        return False
+    return bool((hull[:, :2] @ points.double().mean(0).numpy() + hull[:, 2]).max() > 0)

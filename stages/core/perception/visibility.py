@@ -1,0 +1,40 @@
+"""How the cameras of a scene see its Gaussians."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from stages.core.geometry.cameras import centres, resize
+from stages.core.raster.rasterise import visibility
+from stages.core.scene.cameras import Cameras
+from stages.core.scene.gaussians import Gaussians
+
+SIDE = 320  # longest side that visibility is drawn at [px]
+MOST = 24  # cameras that are asked
+
+
+def small(cameras: Cameras, most: int = MOST, side: int = SIDE) -> list[tuple[Tensor, Tensor, int, int]]:
+    """(viewmat, K, width, height) of at most `most` cameras, evenly picked, their images made small."""
+    picked = torch.linspace(0, len(cameras) - 1, min(most, len(cameras))).round().long().tolist()
+    views = []
+    for i in picked:
+        width, height = cameras.sizes[i].tolist()
+        shrink = min(1.0, side / max(width, height))
+        w, h = max(1, round(width * shrink)), max(1, round(height * shrink))
+        views.append((cameras.viewmats[i], resize(cameras.Ks[i], w / width, h / height), w, h))
+    return views
+
+
+def seen_from(g: Gaussians, cameras: Cameras) -> Float[Tensor, "n 3"]:
+    """Mean direction from each Gaussian to the cameras that see it, weighted by how much; zero where none does.
+
+    It is half a sphere's worth of knowledge: the outside of a surface is the side that was seen.
+    """
+    toward = torch.zeros(len(g), 3)
+    for viewmat, K, width, height in small(cameras):
+        _, weight = visibility(g, viewmat, K, width, height)
+        eye = centres(viewmat[None])[0]
+        toward += weight[:, None].cpu() * torch.nn.functional.normalize(eye - g.means, dim=1)
+    return toward

@@ -1,0 +1,169 @@
+"""Force prompts: pushes, pins, velocities and lifts, the same for every engine.
+
+Forces are in newtons, torques in newton metres, times in seconds; places, velocities and lifts in scene units.
+The public JSON format, {scene name: [{obj_id, start, end, force?, torque?}]}, counts obj_id from 0: its object i is
+object i + 1 here, where 0 is the background.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+from stages.core.errors import InputError
+from stages.core.physics.materials import find_object
+from stages.core.scene.files import must_exist
+from stages.core.scene.scene import SceneObject
+
+Vector = tuple[float, float, float]
+FORCE = 'write "object=2 force=0,0,8 from=0.1 to=0.3", with torque=x,y,z or at=x,y,z if you like'
+
+
+@dataclass(frozen=True)
+class Force:
+    """A steady push from `start` until `end` [s]."""
+
+    object_id: int
+    force: Vector = (0.0, 0.0, 0.0)  # [N]
+    torque: Vector = (0.0, 0.0, 0.0)  # about the centre of mass [N m]
+    start: float = 0.0
+    end: float = math.inf
+    at: Vector | None = None  # where on the object at rest [scene units]; None: on the whole of it
+
+    def overlap(self, start: float, end: float) -> float:
+        """Share of the time from `start` to `end` in which it acts."""
+        return max(0.0, min(self.end, end) - max(self.start, start)) / (end - start)
+
+
+@dataclass(frozen=True)
+class Prompts:
+    """What the user wants to happen."""
+
+    forces: tuple[Force, ...] = ()
+    pinned: frozenset[int] = frozenset()
+    velocity: dict[int, Vector] = field(default_factory=dict)  # at the start [scene units/s]
+    lift: dict[int, float] = field(default_factory=dict)  # above where it was seen [scene units]
+
+    def __bool__(self) -> bool:
+        return bool(self.forces or self.pinned or self.velocity or self.lift)
+
+    def as_dicts(self) -> tuple[dict, ...]:
+        """For the trajectory file: one plain dict a prompt, `kind` first; an end that never comes is null."""
+        rows: list[dict] = []
+        for f in self.forces:
+            row = asdict(f)
+            rows.append({"kind": "force", **row, "end": None if math.isinf(f.end) else f.end})
+        rows += [{"kind": "pin", "object_id": i} for i in sorted(self.pinned)]
+        rows += [{"kind": "velocity", "object_id": i, "velocity": v} for i, v in sorted(self.velocity.items())]
+        rows += [{"kind": "lift", "object_id": i, "height": h} for i, h in sorted(self.lift.items())]
+        return tuple(rows)
+
+
+def parse(
+    objects: Sequence[SceneObject], scene_name: str = "", force: Sequence[str] = (), forces: Path | None = None,
+    pin: Sequence[str] = (), velocity: Sequence[str] = (), lift: Sequence[str] = (),
+) -> Prompts:  # fmt: skip
+    """Prompts of the command line and of a forces file; objects are meant by id or by name."""
+    pushes = [_force(text, objects) for text in force]
+    if forces is not None:
+        pushes += read_forces(forces, scene_name, objects)
+    return Prompts(
+        tuple(pushes),
+        frozenset(find_object(p, objects, f"--pin {p!r}").id for p in pin),
+        dict(_velocity(text, objects) for text in velocity),
+        {id: height for text in lift for id, height in _lift(text, objects)},
+    )
+
+
+def _force(text: str, objects: Sequence[SceneObject]) -> Force:
+    where = f"--force {text!r}"
+    words = dict(word.partition("=")[::2] for word in text.split())
+    unknown = words.keys() - {"object", "force", "torque", "from", "to", "at"}
+    if unknown:
+        raise InputError(f"{where}: {sorted(unknown)[0]!r} is not understood; {FORCE}")
+    if "object" not in words or not {"force", "torque"} & words.keys():
+        raise InputError(f"{where}: needs object= and force= or torque=; {FORCE}")
+    at = vector(words["at"], where) if "at" in words else None
+    start = number(words.get("from", "0"), where)
+    end = number(words["to"], where) if "to" in words else math.inf
+    push = vector(words.get("force", "0,0,0"), where)
+    torque = vector(words.get("torque", "0,0,0"), where)
+    return _checked(Force(find_object(words["object"], objects, where).id, push, torque, start, end, at), where)
+
+
+def _checked(force: Force, where: str) -> Force:
+    if not 0 <= force.start < force.end:
+        raise InputError(f"{where}: acts from {force.start} s to {force.end} s; the end must come after the start")
+    return force
+
+
+def _velocity(text: str, objects: Sequence[SceneObject]) -> tuple[int, Vector]:
+    where = f"--velocity {text!r}"
+    words = text.split()
+    if len(words) != 2 or not words[0].startswith("object="):
+        raise InputError(f'{where}: write "object=1 0,0,2"')
+    return find_object(words[0].removeprefix("object="), objects, where).id, vector(words[1], where)
+
+
+def _lift(text: str, objects: Sequence[SceneObject]) -> list[tuple[int, float]]:
+    where = f"--lift {text!r}"
+    key, equals, height = text.rpartition("=")
+    value = number(height, where)
+    chosen = [find_object(key, objects, where)] if equals else objects
+    return [(o.id, value) for o in chosen]
+
+
+def read_forces(path: Path, scene_name: str, objects: Sequence[SceneObject]) -> list[Force]:
+    """Forces of one scene from a file in the public format; a file of one scene fits any name."""
+    must_exist(path, "a JSON file {scene name: [{obj_id, start, end, force}]}")
+    try:
+        data = json.loads(Path(path).read_text())
+    except ValueError as error:
+        raise InputError(f"{path}: is not JSON ({error})") from error
+    if isinstance(data, dict):
+        if scene_name not in data and len(data) != 1:
+            raise InputError(f"{path}: has no scene {scene_name!r}; it has {', '.join(map(str, data)) or 'none'}")
+        data = data[scene_name] if scene_name in data else next(iter(data.values()))
+    if not isinstance(data, list):
+        raise InputError(f"{path}: must be {{scene name: [{{obj_id, start, end, force?, torque?}}]}}")
+    return [_public(row, objects, f"{path}: entry {i + 1}") for i, row in enumerate(data)]
+
+
+def _public(row: object, objects: Sequence[SceneObject], where: str) -> Force:
+    try:
+        id, start, end = int(row["obj_id"]) + 1, float(row["start"]), float(row["end"])
+        push, torque = (_floats(row.get(name, [0, 0, 0])) for name in ("force", "torque"))
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise InputError(f"{where}: {error!r}; needs obj_id, start, end and force or torque of 3 numbers") from error
+    if id not in {o.id for o in objects}:
+        raise InputError(f"{where}: obj_id {id - 1} (counted from 0) is object {id}, which this scene does not have")
+    return _checked(Force(id, push, torque, start, end), where)
+
+
+def _floats(values: Sequence[float | int | str]) -> Vector:
+    x, y, z = (float(v) for v in values)
+    if not all(map(math.isfinite, (x, y, z))):
+        raise ValueError("a number is not finite")
+    return x, y, z
+
+
+def vector(text: str, where: str) -> Vector:
+    """Three numbers with commas between."""
+    try:
+        return _floats(text.split(","))
+    except ValueError as error:
+        raise InputError(f"{where}: {text!r} is not three numbers such as 0,0,2") from error
+
+
+def number(text: str, where: str) -> float:
+    """One finite number."""
+    try:
+        value = float(text)
+    except ValueError as error:
+        raise InputError(f"{where}: {text!r} is not a number") from error
+    if not math.isfinite(value):
+        raise InputError(f"{where}: {text!r} is not finite")
+    return value

@@ -1,0 +1,188 @@
+"""Named materials, and which one an object is made of.
+
+Handbook values are for the solid stuff; many real objects are hollow, so give your own where it counts.
+Friction is Coulomb's coefficient against the floor. `loss` is the loss factor tan(delta) of a whole body's slowest
+elastic vibration: what it loses of its energy in a swing, divided by 2 pi.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+from stages.core.errors import InputError
+from stages.core.scene.files import must_exist
+from stages.core.scene.scene import SceneObject
+
+
+@dataclass(frozen=True)
+class Material:
+    """A solid. `model` and what its numbers in `plastic` mean: MODELS below."""
+
+    E: float  # Young's modulus [Pa]
+    density: float  # [kg/m^3]
+    nu: float = 0.3  # Poisson's ratio
+    friction: float = 0.5
+    loss: float = 0.1
+    model: str = "neo-hookean"
+    plastic: tuple[float | int, float | int, float | int] = (0.0, 0.0, 0.0)
+    source: str = "given by the user"
+
+
+MODELS: Mapping[str, str] = {  # sources in stages/core/kernels/mpm/constitutive.py
+    "neo-hookean": "elastic; none",
+    "corotated": "elastic; none",
+    "von-mises": "metal, plasticine, dough; yield stress [Pa], hardening (softening below 0) [Pa], viscosity [Pa s]",
+    "sand": "grains; angle of friction [degrees], 0, 0",
+    "snow": "critical compression, critical stretch, hardening",
+}
+PLASTIC = ("von-mises", "sand", "snow")
+
+ASHBY = "Ashby 2011, Materials Selection in Mechanical Design, appendix A"
+GIBSON = "Gibson and Ashby 1997, Cellular Solids, ch. 5"
+PAPER = "GSCollision, E and density as published (Poisson 0.3); friction and loss are ours"
+
+MATERIALS: Mapping[str, Material] = {
+    # rubber: Poisson 0.49 in the handbook; 0.45 keeps pressure waves, and so the substep, affordable
+    "rubber": Material(2e6, 930.0, 0.45, 0.8, 0.15, source=ASHBY + ": natural rubber 1.5-2.5 MPa"),
+    "common": Material(1e7, 540.0, 0.3, 0.5, 0.15, source="a guess: keeps its shape as hard rubber or thin plastic; "
+                       "density is the geometric mean of the ten objects of GSCollision"),
+    "soft": Material(3e4, 120.0, 0.2, 0.6, 0.3, source=GIBSON + ": stuffing as a very open soft foam"),
+    "foam": Material(1e5, 50.0, 0.2, 0.7, 0.3, source=ASHBY + ": flexible polymer foam 0.04-1 MPa, 38-70 kg/m3"),
+    "cloth": Material(3e3, 100.0, 0.3, 0.5, 0.4, source=PAPER + ": cloth"),
+    "rope": Material(5e3, 500.0, 0.3, 0.6, 0.4, source=PAPER + ": rope"),
+    "paper": Material(5e6, 200.0, 0.2, 0.4, 0.1,
+                      source="a carton of 3 GPa paper, 0.5 mm walls, spread over its volume"),
+    "plastic": Material(2e9, 1050.0, 0.38, 0.35, 0.05, source=ASHBY + ": ABS 1.1-2.9 GPa"),
+    "wood": Material(1e10, 600.0, 0.35, 0.45, 0.03, source=ASHBY + ": along the grain 6-20 GPa"),
+    "metal": Material(7e10, 2700.0, 0.33, 0.4, 0.01, source=ASHBY + ": aluminium alloys 68-82 GPa"),
+    "steel": Material(2.1e11, 7850.0, 0.29, 0.4, 0.01, source=ASHBY + ": low-carbon steel 200-215 GPa"),
+    "ceramic": Material(7e10, 2400.0, 0.22, 0.4, 0.02, source=ASHBY + ": brick and pottery to porcelain 15-110 GPa"),
+    "glass": Material(7e10, 2450.0, 0.22, 0.35, 0.02, source=ASHBY + ": soda-lime glass 68-72 GPa"),
+    "stone": Material(5e10, 2600.0, 0.25, 0.6, 0.02, source=ASHBY + ": granite, marble, slate"),
+    "fruit": Material(2e6, 900.0, 0.35, 0.4, 0.3,
+                      source="Mohsenin 1986, Physical Properties of Plant and Animal Materials"),
+    "jelly": Material(1e4, 1000.0, 0.45, 0.3, 0.2, source="gelatine gels of 5-10 percent, about 10 kPa"),
+    "ball": Material(8e5, 600.0, 0.3, 0.6, 0.15, source=PAPER),
+    "bowl": Material(1e7, 800.0, 0.3, 0.4, 0.05, source=PAPER),
+    "can": Material(1e6, 800.0, 0.3, 0.4, 0.1, source=PAPER),
+    "duck": Material(3e5, 300.0, 0.3, 0.6, 0.15, source=PAPER),
+    "miku": Material(1e5, 400.0, 0.3, 0.5, 0.2, source=PAPER),
+    "panda": Material(1e5, 700.0, 0.3, 0.6, 0.3, source=PAPER),
+    "phone": Material(2e7, 2600.0, 0.3, 0.4, 0.05, source=PAPER),
+    "pillow": Material(1e4, 500.0, 0.3, 0.6, 0.4, source=PAPER),
+    "plasticine": Material(2e6, 1800.0, 0.4, 0.6, 0.3, "von-mises", (1e5, -1e5, 0.0),
+                           "Sofuoglu and Rasty 2000, flow stress about 0.1 MPa; E and softening are ours"),
+    "dough": Material(1e5, 1100.0, 0.4, 0.7, 0.4, "von-mises", (1e3, 0.0, 1e3),
+                      "Dobraszczyk and Morgenstern 2003, yield 0.1-1 kPa, E 10-100 kPa; viscosity is ours"),
+    "sand": Material(3.5e5, 1600.0, 0.3, 0.5, 0.01, "sand", (33.0, 0.0, 0.0),
+                     "dry quartz sand, angle of repose 30-35 degrees; E as in Klar et al. 2016"),
+    "snow": Material(1.4e5, 400.0, 0.2, 0.5, 0.01, "snow", (0.025, 0.0075, 10.0), "Stomakhin et al. 2013, table 2"),
+}  # fmt: skip
+ALIASES = {
+    "soft": ["plush", "teddy", "bear", "doll", "toy", "frog", "kermit", "bunny"],
+    "cloth": ["shirt", "t-shirt", "towel", "sock", "scarf", "glove"],
+    "paper": ["book", "box", "carton", "tape", "magazine", "globe"],
+    "plastic": ["bottle", "pen", "keyboard", "mouse", "brick", "lego", "bulldozer", "telephone", "remote"],
+    "metal": ["pan", "frypan", "pot", "spoon", "fork", "knife", "key"],
+    "ceramic": ["cup", "mug", "plate", "vase", "ramekin"],
+    "stone": ["statue", "buddha", "rock"],
+    "wood": ["table", "chair", "guitar", "block"],
+    "fruit": ["apple", "banana", "orange", "lemon", "pear"],
+    "ball": ["soccer", "football", "basketball"],
+}
+GUESS = "common"
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What an object is made of, and why."""
+
+    name: str
+    material: Material
+    guessed: bool = False
+
+
+def choose_materials(
+    objects: Sequence[SceneObject], prompts: Sequence[str] = (), file: Path | None = None
+) -> dict[int, Choice]:
+    """Material of each object id: --material over --materials over the scene file over the object's name."""
+    told: dict[int, Choice] = {}
+    for key, value in (_read(file) if file else {}).items():
+        told[find_object(key, objects, f"{file}").id] = _material(value, f"{file}: {key}")
+    for prompt in prompts:
+        key, equals, value = prompt.partition("=")
+        if not equals or not value.strip():
+            raise InputError(f"--material {prompt!r}: write OBJECT=MATERIAL, such as duck=rubber")
+        where = f"--material {prompt!r}"
+        told[find_object(key, objects, where).id] = _material(value.strip(), where)
+    return {o.id: told.get(o.id) or _by_name(o) for o in objects}
+
+
+def find_object(key: str | int, objects: Sequence[SceneObject], where: str) -> SceneObject:
+    """The object of that id, or of that name (whole or the only one that contains it)."""
+    text = str(key).strip().lower()
+    exact = [o for o in objects if text in (str(o.id), o.name.lower())]
+    near = exact or [o for o in objects if text and text in o.name.lower()]
+    if len(near) == 1:
+        return near[0]
+    have = ", ".join(f"{o.id} ({o.name})" for o in objects) or "none"
+    problem = f"fits {len(near)} objects" if near else "is no object of this scene"
+    raise InputError(f"{where}: {text!r} {problem}; there are: {have}")
+
+
+def _by_name(o: SceneObject) -> Choice:
+    if o.material:
+        return _material(o.material, f"object {o.id} ({o.name}) of the scene")
+    words = set(re.findall(r"[a-z]+(?:-[a-z]+)?", o.name.lower()))
+    words |= {word.removesuffix("s") for word in words}
+    # what a thing is says more than an adjective: "rubber duck" is the duck
+    for name in sorted(words & MATERIALS.keys(), key=lambda name: not MATERIALS[name].source.startswith(PAPER)):
+        return Choice(name, MATERIALS[name])
+    for name, others in ALIASES.items():
+        if words & set(others):
+            return Choice(name, MATERIALS[name])
+    return Choice(GUESS, MATERIALS[GUESS], guessed=True)
+
+
+def _material(value: object, where: str) -> Choice:
+    if isinstance(value, str):
+        if value.lower() not in MATERIALS:
+            raise InputError(f"{where}: no material called {value!r}; choose from {', '.join(MATERIALS)}")
+        return Choice(value.lower(), MATERIALS[value.lower()])
+    known = [f.name for f in fields(Material) if f.name != "source"]
+    model, plastic = "neo-hookean", (0.0, 0.0, 0.0)
+    if not isinstance(value, dict) or not {"E", "density"} <= value.keys() or value.keys() - set(known):
+        raise InputError(f"{where}: give a material's name or {{E, density}} with any of {', '.join(known)}")
+    if value.get("model", model) not in MODELS:
+        raise InputError(f"{where}: no model called {value['model']!r}; choose from {', '.join(MODELS)}")
+    try:
+        a, b, c = (float(v) for v in value.get("plastic", plastic))
+        numbers = {k: float(v) for k, v in value.items() if k not in ("model", "plastic")}
+        material = Material(**numbers, model=value.get("model", model), plastic=(a, b, c))
+    except (TypeError, ValueError) as error:
+        problem = f"{error}; E [Pa], density [kg/m^3] and the rest are numbers, plastic three of them"
+        raise InputError(f"{where}: {problem}") from error
+    if not all(map(math.isfinite, material.plastic)) or material.model in PLASTIC and material.plastic[0] <= 0:
+        raise InputError(f"{where}: plastic must be finite, and for {material.model} the first must be positive; they "
+                         f"are: {MODELS[material.model]}")  # fmt: skip
+    if not (0 < material.E < 1e13 and 0 < material.density < 1e5 and -0.5 < material.nu < 0.49):
+        raise InputError(f"{where}: E and density must be positive and nu between -0.5 and 0.49")
+    if not (0 <= material.friction < 100 and 0 <= material.loss <= 2):
+        raise InputError(f"{where}: friction must be 0 or more and loss between 0 and 2")
+    return Choice("custom", material)
+
+
+def _read(file: Path) -> dict:
+    must_exist(file, "a JSON file {object name or id: material}")
+    try:
+        data = json.loads(Path(file).read_text())
+    except ValueError as error:
+        raise InputError(f"{file}: is not JSON ({error})") from error
+    if not isinstance(data, dict):
+        raise InputError(f"{file}: must be {{object name or id: material name or {{E, nu, density, friction}}}}")
+    return data

@@ -1,0 +1,253 @@
+"""The MPM solver: bodies of any material in a box with friction, one scene or thousands.
+
+Explicit MLS-MPM/APIC in float32; kernels and sources are in core/kernels/mpm/transfers.py. On the CPU substeps run as
+split.py says, on a GPU as fused.py says; the physics is the same. For many scenes at once, with their names, see
+batch.py.
+
+On the CPU a run gives the same bytes whatever the number of threads. On a GPU the order of additions changes from run
+to run, and with it the last bits. There are no gradients: differentiating through contact and some thousand explicit
+substeps is not offered.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import torch
+import warp as wp
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from stages.core.kernels.mpm import grid as mpm_grid
+from stages.core.kernels.mpm.constitutive import COROTATED, HARDEST, NEO_HOOKEAN, SAND, SNOW, VON_MISES, sand_slope
+from stages.core.physics.colliders import Collider, as_obstacles
+from stages.core.physics.mpm.fused import FusedOrder
+from stages.core.physics.mpm.particle_rows import NEVER, Rows
+from stages.core.physics.mpm.split import SplitOrder
+
+MODELS = {"neo-hookean": NEO_HOOKEAN, "corotated": COROTATED, "von-mises": VON_MISES, "sand": SAND, "snow": SNOW}
+SAFETY = 0.5  # of a cell that a wave or a particle may cross in a substep; free vibration diverges from 1.1
+VISCOUS = 0.15  # largest dt eta / (density dx^2); violent vibration diverges from 0.3
+FLOOR_GAP = mpm_grid.FLOOR_GAP
+MAX_NODES = 60_000_000  # of the grid of a scene: about 1 GB of address space a copy
+GRAIN = 8  # on a GPU, substeps chosen by CFL are a multiple of this, so that few graphs are captured
+
+
+class Diverged(Exception):
+    """A particle left the box or stopped being a number; `particle` is its index."""
+
+    def __init__(self, particle: int):
+        super().__init__(f"particle {particle} left the box or is not finite")
+        self.particle = particle
+
+
+@dataclass(frozen=True)
+class Box:
+    """Floor and walls: axis-aligned, solid, with the friction of the body that touches them."""
+
+    low: tuple[float | int, float | int, float | int]  # z is the floor
+    high: tuple[float | int, float | int, float | int]
+    restitution: float = 0.0  # 0: a body bounces by its own elasticity; up to 1: walls give back that share of speed
+    keep: float = -1.0  # 0..1: share of the speed along a wall that is left every substep, as in the public solver
+
+
+@dataclass
+class Particles:
+    """What the solver moves. Rows keep their order."""
+
+    x: Float[Tensor, "p 3"]  # positions [m]
+    v: Float[Tensor, "p 3"]  # velocities [m/s]
+    C: Float[Tensor, "p 3 3"]  # affine velocity: dv/dx [1/s]
+    F: Float[Tensor, "p 3 3"]  # deformation gradient; of what yields, the elastic part
+    mass: Float[Tensor, "p"]  # [kg]
+    volume: Float[Tensor, "p"]  # at rest [m^3]
+    stiffness: Float[Tensor, "p 3"]  # Lame constants mu, lambda [Pa] and viscosity eta [Pa s]
+    friction: Float[Tensor, "p"]  # Coulomb coefficient against floor and walls
+    held: Int[Tensor, "p"]  # 1: moves on with its own velocity, whatever happens; 2: lost, stays
+    model: Int[Tensor, "p"]  # material model: see stages/core/kernels/mpm/constitutive.py
+    plastic: Float[Tensor, "p 3"]  # its numbers
+    state: Float[Tensor, "p"]  # its memory; 0 at first
+
+    def __len__(self) -> int:
+        return len(self.x)
+
+
+def at_rest(
+    x: Float[Tensor, "p 3"], volume: Float[Tensor, "p"], density: Float[Tensor, "p"], E: Float[Tensor, "p"],
+    nu: Float[Tensor, "p"], viscosity: Float[Tensor, "p"], friction: Float[Tensor, "p"], model: int = NEO_HOOKEAN,
+    plastic: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> Particles:  # fmt: skip
+    """Particles of undeformed bodies that do not move. E [Pa], density [kg/m^3], viscosity [Pa s].
+
+    `model` and `plastic` are for all of them; overwrite the fields for a mixture.
+    """
+    p = len(x)
+    still, identity = torch.zeros(p, 3, 3), torch.eye(3).repeat(p, 1, 1)
+    stiffness = torch.stack([E / (2 * (1 + nu)), E * nu / ((1 + nu) * (1 - 2 * nu)), viscosity], -1)
+    held, models = torch.zeros(p, dtype=torch.int8), torch.full((p,), model, dtype=torch.int8)
+    return Particles(x, torch.zeros(p, 3), still, identity, density * volume, volume, stiffness, friction, held,
+                     models, torch.tensor(plastic).repeat(p, 1), torch.zeros(p))  # fmt: skip
+
+
+def numbers(model: str, plastic: tuple[float | int, ...], softened: float = 1.0) -> tuple[float, float, float]:
+    """`plastic` of a named model as the solver wants it, for a material made softer by this factor.
+
+    Stresses soften with it, so that things yield at the same strain; an angle of friction becomes a slope.
+    """
+    a, b, c = plastic
+    if model == "sand":
+        return sand_slope(a), 0.0, 0.0
+    return (softened * a, softened * b, c) if model == "von-mises" else (a, b, c)
+
+
+def together(parts: Sequence[Particles]) -> Particles:
+    """All of them, one after the other."""
+    return Particles(*(torch.cat([getattr(p, f.name) for p in parts]) for f in fields(Particles)))
+
+
+def wave_speed(E, nu, density):
+    """Speed of pressure waves, sqrt((lambda + 2 mu) / density) [m/s]."""
+    return (E * (1 - nu) / ((1 + nu) * (1 - 2 * nu)) / density) ** 0.5
+
+
+def stiffest(speed: float, nu: float, density: float) -> float:
+    """Young's modulus [Pa] at which pressure waves have this speed: the inverse of wave_speed."""
+    return density * speed**2 * (1 + nu) * (1 - 2 * nu) / (1 - nu)
+
+
+class Solver:
+    """Bodies in a box. `advance` moves them through one frame; read x, v, F in between.
+
+    `sizes` are the particles of each scene when there are several: scenes have the same box and colliders, and know
+    nothing of each other. `damping` (0 to 1) takes that share of the symmetric part of C at every transfer (RPIC).
+    `fused` chooses the launch order; by default what is fastest on the device. With `exact`, sums are made in whole
+    numbers: a GPU then gives the same bytes in every run, and for a scene whatever other scenes are beside it (unless
+    a surface has restitution: how stiff those are follows from the stiffest material of all).
+    """
+
+    def __init__(
+        self, particles: Particles, box: Box, dx: float, device: str = "cpu", sizes: Sequence[int] | None = None,
+        colliders: Sequence[Collider] = (), damping: float = 0.0, fused: bool | None = None, exact: bool = False,
+    ):  # fmt: skip
+        self.device, self.dx, self.grid = device, dx, make_grid(box, dx)
+        sizes = [len(particles)] if sizes is None else list(sizes)
+        if sum(sizes) != len(particles) or min(sizes) < 1:
+            raise ValueError(f"{len(particles)} particles cannot be scenes of {sizes}")
+        if len(sizes) * self.grid.count * (2 if exact else 1) > most_nodes(device):
+            raise ValueError(f"{len(sizes)} scenes of {self.grid.count} nodes are too many for one batch")
+        self.rows = Rows({f.name: getattr(particles, f.name) for f in fields(Particles)}, sizes, self.grid, device)
+        self.colliders = tuple(colliders)
+        self._obstacles = as_obstacles(self.colliders, device)
+        self._rates = self._fastest()
+        self.grid.spring = self._rates[0] / (2 * dx)  # as stiff as bodies are, so that no shorter substep is needed
+        fused = exact or (device != "cpu" if fused is None else fused)
+        plastic = bool((particles.model != NEO_HOOKEAN).any())
+        bouncy = any(thing.restitution > 0 for thing in (box, *self.colliders))
+        options = self.rows, plastic, bouncy, damping, self._obstacles
+        self._order = FusedOrder(*options, self._quanta() if exact else None) if fused else SplitOrder(*options)
+        self._grain = GRAIN if fused and device != "cpu" else 1
+
+    @property
+    def particles(self) -> Particles:
+        """The state in the order of the particles given, on the solver's device."""
+        return Particles(*(self.rows.get(f.name) for f in fields(Particles)))
+
+    @property
+    def touched(self) -> int:
+        """Nodes in the blocks that the last frame read, wrote and cleared."""
+        return self._order.blocks * mpm_grid.BLOCK**3
+
+    def set(self, **changes: Tensor) -> None:
+        """Overwrite fields of all particles, given in the original order."""
+        for name, value in changes.items():
+            self.rows.put(name, value)
+
+    def substeps(self, duration: float, push: Float[Tensor, "p 3"]) -> int:
+        """Substeps that the CFL condition asks for: dt <= SAFETY dx / (wave speed + particle speed).
+
+        Viscosity must not spread momentum by more than VISCOUS cells^2 a substep either.
+        """
+        fast = self.rows["v"].norm(dim=1)
+        speed = float(fast.max()) + float(push.norm(dim=1).max()) * duration
+        if not math.isfinite(speed):
+            raise Diverged(int(self.rows["order"][fast.isfinite().logical_not()].min()))
+        wave, viscous = self._rates
+        rate = max((wave + speed) / (SAFETY * self.dx), viscous / (VISCOUS * self.dx**2))
+        return math.ceil(max(1, math.ceil(duration * rate)) / self._grain) * self._grain
+
+    def advance(self, duration: float, push: Float[Tensor, "p 3"], substeps: int | None = None) -> int:
+        """Move on by `duration` [s] under accelerations `push` [m/s^2]; returns the substeps taken.
+
+        Raises Diverged when a particle leaves the box or is no number.
+        """
+        steps = substeps or self.substeps(duration, push)
+        self.frame(duration, push, steps)
+        first = int(self.rows.lost.min())
+        if first != NEVER:
+            raise Diverged(first)
+        return steps
+
+    def frame(self, duration: float, push: Float[Tensor, "p 3"], substeps: int) -> None:
+        """As `advance`, but the host waits for nothing: what goes wrong is only noted, in `lost`.
+
+        A particle that would leave the box or is no number stays where it was; other scenes do not notice.
+        """
+        self.rows.put("push", push)
+        self._order.frame(duration / substeps, substeps)
+        if self.colliders:
+            self.colliders = tuple(c.after(duration) for c in self.colliders)
+            self._obstacles.assign(as_obstacles(self.colliders, "cpu"))
+
+    @property
+    def lost(self) -> Int[Tensor, "s"]:
+        """For each scene the first particle that was lost, or -1."""
+        return torch.where(self.rows.lost == NEVER, -1, self.rows.lost)
+
+    def _quanta(self) -> tuple[float, float]:
+        """Quanta a kg m/s and a kg, powers of two: the same for any particles, so that scenes do not know each other.
+
+        Full cells of 10 g/cm^3 on each other, some of them held and moving at metres a second, fit into 63 bits; in a
+        cell of foam a quantum is a speed of 1e-11 m/s.
+        """
+        cell = math.ceil(math.log2(1e4 * self.dx**3))
+        return 2.0 ** (47 - cell), 2.0 ** (42 - cell)
+
+    def _fastest(self) -> tuple[float, float]:
+        """Speed of the fastest pressure wave [m/s] and largest kinematic viscosity [m^2/s] of what can move."""
+        moving = self.rows["held"] == 0
+        if not bool(moving.any()):
+            return 0.0, 0.0
+        density = (self.rows["mass"] / self.rows["volume"])[moving]
+        mu, lam, eta = self.rows["stiffness"][moving].unbind(1)
+        harder = torch.where(self.rows["model"][moving] == SNOW, HARDEST, 1.0)
+        return float((harder * (lam + 2 * mu) / density).sqrt().max()), float((eta / density).max())
+
+
+def most_nodes(device: str) -> int:
+    """Of all scenes of a batch together: indices have 31 bits, and a CPU's threads have momentum of their own."""
+    return 2 * MAX_NODES if device == "cpu" else 2**31 - 1
+
+
+def make_grid(box: Box, dx: float):
+    """A grid whose outermost held nodes lie FLOOR_GAP cells outside the box, so that bodies rest on its faces.
+
+    Exact for the lower faces, the floor among them; the upper ones are moved out to the next node.
+    """
+    grid, n = mpm_grid.Grid(), []
+    for low, high in zip(box.low, box.high, strict=True):
+        inside = max(math.ceil((high - low) / dx + 2 * FLOOR_GAP - 1e-6), 4)
+        n.append((inside, math.ceil((inside + 1 + 2 * mpm_grid.PAD) / mpm_grid.BLOCK) * mpm_grid.BLOCK))
+    grid.count = math.prod(total for _, total in n)
+    if grid.count > MAX_NODES:
+        raise ValueError(f"a grid of {' x '.join(str(total) for _, total in n)} nodes is too large")
+    grid.origin = wp.vec3(*(low - (mpm_grid.PAD + FLOOR_GAP) * dx for low in box.low))
+    grid.dx = dx
+    grid.nodes = wp.vec3i(*(total for _, total in n))
+    soft = round(mpm_grid.SOFT) if box.restitution > 0 else 0
+    grid.low = wp.vec3i(*[mpm_grid.PAD - soft] * 3)
+    grid.high = wp.vec3i(*(mpm_grid.PAD + inside + soft for inside, _ in n))
+    grid.face_low, grid.face_high = wp.vec3(*box.low), wp.vec3(*box.high)
+    grid.restitution, grid.keep = box.restitution, box.keep
+    return grid

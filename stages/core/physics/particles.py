@@ -1,0 +1,271 @@
+"""From an object's Gaussians to the particles that stand for it.
+
+The Gaussians of an object are a shell, often with gaps. They are rasterised into voxels of half a grid cell, gaps are
+closed, what the shell encloses is filled (an open bowl stays hollow), sheets are thickened to three voxels, and each
+voxel gets one particle: eight in a full cell, as bodies with fewer than about four fracture numerically.
+
+Bodies on a shared grid touch at a distance of about a cell. So thick bodies leave their outermost layer of voxels empty
+(its mass and volume go to the other particles), and what is seen closes up. Lengths are in the unit of the Gaussians.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from scipy import ndimage
+from torch import Tensor
+
+from stages.core.errors import InputError
+from stages.core.geometry.neighbours import knn
+from stages.core.geometry.rotations import matrix
+from stages.core.perception.support import tips
+from stages.core.scene.gaussians import Gaussians
+from stages.core.scene.scene import Scene
+
+log = logging.getLogger(__name__)
+
+OPACITY = 0.02  # fainter Gaussians are no matter
+OUTLIER = 3.5  # robust z-score of the distance to the median centre (Iglewicz and Hoaglin 1993)
+FEWEST = 40  # particles of an object
+ALONG = 300  # most voxels along an object
+SAMPLES = 1_000_000  # most points taken from the Gaussians of an object
+LEAKS, WIDER = (2, 3, 4, 5, 6, 8), 1.5  # half widths of holes in shells [voxels]; hollows are so much wider
+CROSS = ndimage.generate_binary_structure(3, 1)
+CUBE = np.ones((2, 2, 2), bool)
+
+
+@dataclass(frozen=True)
+class Bodies:
+    """Particles of all objects, in the order of scene.objects."""
+
+    x: Float[Tensor, "p 3"]
+    body: Int[Tensor, "p"]  # index into scene.objects
+    volume: Float[Tensor, "p"]
+    spacing: float  # edge of a voxel; particles of thick bodies stay this far inside
+
+
+def sample(scene: Scene, count: int, seed: int = 0) -> Bodies:
+    """About `count` particles for all objects together; bounded in time and memory for any input.
+
+    Raises InputError for an object without a single usable Gaussian.
+    """
+    clouds = [surface(scene, o.id, seed) for o in scene.objects]
+    stood = scene.cameras is not None  # and held still for the photos
+    gaps = [_gap(c) for c in clouds]
+    extent = max(float((c.max(0) - c.min(0)).max()) for c in clouds)
+    # closing bridges eight voxels; finer ones would take a sparse object apart
+    finest = max(extent / ALONG, max(gaps) / 8, 1e-4 * scene_size(scene), 1e-9)
+    h = max(extent / 40, finest)
+    for _ in range(5):  # filled bodies hold ~ h^-3 voxels, shells ~ h^-2
+        solids = [_solid(c, h, gap, scene.floor, stood) for c, gap in zip(clouds, gaps, strict=True)]
+        voxels = _apart([v for v, _, _ in solids])
+        ratio = sum(map(len, voxels)) / count
+        if 0.9 < ratio < 1.05 or (ratio < 1 and h <= finest):
+            break
+        h = max(h * min(max(ratio, 0.1), 10) ** 0.4, finest)
+    rng = np.random.default_rng(seed)
+    points = [(v + 0.5 + 0.5 * (rng.random(v.shape) - 0.5)) * h for v in voxels]
+    body = torch.arange(len(points)).repeat_interleave(torch.tensor([len(p) for p in points]))
+    volume = h**3 * torch.tensor([share for _, share, _ in solids])[body]
+    for o, (_, _, held) in zip(scene.objects, solids, strict=True):
+        if held:
+            log.info("object %d (%s) would tip over as far as it was seen, and yet it stood: it is taken to reach down "
+                     "to the floor where no camera saw (`ngff refine` looks closer)", o.id, o.name)  # fmt: skip
+    return Bodies(torch.from_numpy(np.concatenate(points)).float(), body, volume, h)
+
+
+def scene_size(scene: Scene) -> float:
+    """Extent of the objects' Gaussians, outliers included only up to a point."""
+    means = scene.gaussians.means[(scene.gaussians.object_id > 0) & scene.gaussians.means.isfinite().all(1)]
+    if not len(means):
+        return 1.0
+    low, high = (torch.from_numpy(np.quantile(means.numpy(), q, axis=0)) for q in (0.01, 0.99))
+    return max(float((high - low).max()), 1e-6)
+
+
+def usable(g: Gaussians) -> Tensor:
+    """Mask of Gaussians with finite numbers, positive size and enough opacity."""
+    finite = g.means.isfinite().all(1) & g.scales.isfinite().all(1) & g.quats.isfinite().all(1)
+    return finite & (g.scales > 0).all(1) & (g.quats.norm(dim=1) > 0) & (g.opacities > OPACITY)
+
+
+def surface(scene: Scene, object_id: int, seed: int) -> np.ndarray:
+    """Points (m, 3) spread over an object's Gaussians, within 0.7 standard deviations; outliers dropped."""
+    mine = scene.gaussians.to("cpu")[(scene.gaussians.object_id == object_id).cpu()]
+    good = mine[usable(mine)]
+    if not len(good):  # better a body made of bare positions than none
+        means = mine.means[mine.means.isfinite().all(1)]
+        if not len(means):
+            raise InputError(
+                f"object {object_id} ({scene.name_of(object_id)}): none of its {len(mine)} Gaussians can be used "
+                "(not finite, or transparent); label the scene again with `ngff segment`"
+            )
+        return means.double().numpy()
+    good = good[inliers(good.means)]
+    means = good.means.double()
+    size = float((means.amax(0) - means.amin(0)).norm())
+    _, index = knn(means, means[:: max(1, len(means) // 2000)], 2)
+    gap = float((means[:: max(1, len(means) // 2000)] - means[index[:, 1]]).norm(dim=1).median()) or size / 50
+    scales = good.scales.double().clamp(max=max(size / 6, 1e-9) if len(good) > 1 else float(good.scales.median()))
+    area = scales.sort(1).values[:, 1:].prod(1) * 4 / max(gap, 1e-12) ** 2
+    each = area.clamp(1, 32).ceil().long()
+    each = (each * min(1.0, SAMPLES / float(each.sum()))).long().clamp_min(1)
+    rng = torch.Generator().manual_seed(seed)
+    of = torch.arange(len(good)).repeat_interleave(each)
+    direction = torch.nn.functional.normalize(torch.randn(len(of), 3, generator=rng, dtype=torch.float64), dim=1)
+    local = 0.7 * torch.rand(len(of), 1, generator=rng, dtype=torch.float64).pow(1 / 3) * direction * scales[of]
+    points = means[of] + (matrix(good.quats.double())[of] @ local[..., None])[..., 0]
+    return torch.cat([means, points]).numpy()
+
+
+def inliers(points: Float[Tensor, "n 3"]) -> Tensor:
+    """Mask of points whose distance to the median centre is ordinary."""
+    distance = (points - points.median(0).values).norm(dim=1)
+    middle = distance.median()
+    spread = (distance - middle).abs().median()
+    return 0.6745 * (distance - middle) <= OUTLIER * spread.clamp_min(1e-12 + 1e-3 * float(middle))
+
+
+def _solid(
+    points: np.ndarray, h: float, gap: float, floor: float | None, stood: bool
+) -> tuple[np.ndarray, float, bool]:
+    """Voxels (m, 3) of edge h, as integers, inside a closed and filled body, and the volume that each stands for.
+
+    What `stood` on the floor in photos but would tip over is filled down to the floor, which the last value tells.
+    """
+    cells = np.floor(points / h).astype(np.int64)
+    margin = 6  # room for closing
+    low = cells.min(0) - margin
+    shape = np.minimum(cells.max(0) - low + 1 + margin, ALONG + 3 * margin)
+    shell = np.zeros(shape, bool)
+    shell[tuple((cells - low)[(cells - low < shape - margin).all(1)].T)] = True
+    bridge = min(max(math.ceil(gap / h / 2), 1), 4)
+    standing = floor is not None and abs(float(low[2]) + margin - floor / h) < 4
+    body = _largest(_fill(shell, bridge, standing))
+    body = _trimmed(body, points / h - low)
+    at = torch.from_numpy(np.argwhere(body)).float()
+    held = stood and standing and tips(at[:, :2], at[at[:, 2] < at[:, 2].min() + 4, :2])
+    if held:
+        bottom = int(np.flatnonzero(body.any((0, 1)))[0])
+        body = np.flip(np.logical_or.accumulate(np.flip(body, 2), 2), 2)  # something of it is above
+        body[:, :, :bottom] = False
+    thin = body & ~ndimage.binary_opening(body, CUBE)
+    if thin.any():
+        body |= ndimage.binary_dilation(thin, CROSS)
+    while body.sum() < FEWEST:
+        body = ndimage.binary_dilation(np.pad(body, 1), CROSS)
+        low = low - 1
+    inside = body & ~_thick_skin(body)
+    if inside.sum() < FEWEST:
+        inside = body
+    return np.argwhere(inside) + low, float(body.sum() / inside.sum()), held
+
+
+def _gap(points: np.ndarray) -> float:
+    """Distance to the third neighbour, of most points: what closing must bridge."""
+    some = torch.from_numpy(points)
+    distance, _ = knn(some, some[:: max(1, len(some) // 1000)], 4)
+    return float(distance[:, 3].quantile(0.9))
+
+
+def _fill(shell: np.ndarray, gap: int, standing: bool) -> np.ndarray:
+    """The shell with gaps closed and all that it encloses; what stands on the floor is closed by the floor."""
+    wide = ndimage.binary_dilation(shell, CROSS, iterations=gap)
+    layers = np.flatnonzero(shell.any((0, 1)))
+    sealed = wide.copy()
+    if standing:
+        sealed[:, :, : layers[0] + 1] = True
+    outside = _outside(~sealed)
+    enclosed = ~(outside | sealed)
+    grown = ndimage.binary_dilation(enclosed, CROSS, iterations=gap) & wide if enclosed.any() else enclosed
+    closed = ndimage.binary_erosion(wide, CROSS, iterations=gap)
+    body = shell | closed | enclosed | (grown & ~ndimage.binary_dilation(outside, CROSS, iterations=gap))
+    if not standing:  # under the folds of a cloth on the floor it looks like a hollow that leaks
+        body |= _cavities(shell | closed)
+    if standing:
+        body[:, :, : layers[0]] = False
+    return body
+
+
+def _cavities(walls: np.ndarray) -> np.ndarray:
+    """Hollows that leak, if they are WIDER than their leaks: a jug is filled, a mug or a bowl is not.
+
+    Photos leave holes in the shells of things, which would crumple like paper bags if they were left hollow.
+    """
+    room = LEAKS[-1]  # around it, for what leads outside
+    walls = np.pad(walls, room)
+    away = ndimage.distance_transform_edt(~walls)
+    filled = np.zeros_like(walls)
+    for leak in LEAKS:
+        free = away > leak
+        outside = _outside(free)
+        hollow = _touched(free & ~outside, away >= WIDER * leak)
+        if hollow.any():  # back to the walls and into every corner, but not out through the leaks
+            filled |= _touched(~walls & (ndimage.distance_transform_edt(~outside) > leak + 1), hollow)
+    return filled[room:-room, room:-room, room:-room]
+
+
+def _touched(free: np.ndarray, seeds: np.ndarray) -> np.ndarray:
+    """The connected parts of the free voxels that hold a seed."""
+    labels, count = ndimage.label(free)
+    kept = np.zeros(count + 1, bool)
+    kept[labels[free & seeds]] = True
+    return kept[labels]
+
+
+def _outside(free: np.ndarray) -> np.ndarray:
+    """What of the free voxels is connected with the faces of the grid."""
+    faces = np.ones_like(free)
+    faces[1:-1, 1:-1, 1:-1] = False
+    return _touched(free, faces)
+
+
+def _trimmed(body: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Without the outermost voxels whose middle lies outside of the surface, where the body is thick.
+
+    `points` on the surface are in voxels. Else a body grows by half a voxel all around.
+    """
+    cell = np.floor(points).astype(np.int64)
+    kept = ((cell >= 0) & (cell < body.shape)).all(1)
+    flat = np.ravel_multi_index(tuple(cell[kept].T), body.shape)
+    slope = np.gradient(ndimage.gaussian_filter(body.astype(np.float32), 1.0))  # points inwards
+    depth = sum((points[kept, a] - cell[kept, a] - 0.5) * slope[a].ravel()[flat] for a in range(3))
+    inner = np.bincount(flat, depth, body.size).reshape(body.shape) > 0
+    return body & ~(_thick_skin(body) & inner)
+
+
+def _thick_skin(body: np.ndarray) -> np.ndarray:
+    """The outermost voxels where the body is at least five thick."""
+    core = ndimage.binary_erosion(body, CROSS, iterations=2)
+    return body & ~ndimage.binary_erosion(body, CROSS) & ndimage.binary_dilation(core, CROSS, iterations=3)
+
+
+def _largest(body: np.ndarray) -> np.ndarray:
+    """Without specks: connected parts of less than a fiftieth of the largest."""
+    labels, n = ndimage.label(body, np.ones((3, 3, 3)))
+    if n <= 1:
+        return body
+    sizes = np.bincount(labels.ravel())
+    sizes[0] = 0
+    return (sizes >= sizes.max() / 50)[labels] & body
+
+
+def _apart(bodies: list[np.ndarray]) -> list[np.ndarray]:
+    """Each voxel belongs to one body: small ones keep theirs, large ones give way (unless little would be left)."""
+    taken = np.zeros(0, np.int64)
+    out = list(bodies)
+    low = np.min([b.min(0) for b in bodies], axis=0)
+    span = np.max([b.max(0) for b in bodies], axis=0) - low + 1
+    for i in sorted(range(len(bodies)), key=lambda i: len(bodies[i])):
+        at = bodies[i] - low
+        key = (at[:, 0] * span[1] + at[:, 1]) * span[2] + at[:, 2]
+        free = ~np.isin(key, taken)
+        if free.sum() >= FEWEST:
+            out[i] = bodies[i][free]
+        taken = np.union1d(taken, key)
+    return out

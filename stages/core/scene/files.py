@@ -1,0 +1,75 @@
+"""Files that exist are complete, and say what made them."""
+
+import hashlib
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, is_dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+from stages.core.errors import InputError
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A temporary path beside `path` (same suffix) that takes its place on success and vanishes on failure."""
+    path = Path(path)
+    if path.is_dir():
+        raise InputError(f"{path}: is a folder; name the file to write")
+    if not path.parent.is_dir():
+        raise InputError(f"{path}: there is no folder {path.parent}; make it first")
+    part = path.with_name(f".part-{path.name}")
+    try:
+        yield part
+        os.replace(part, path)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror or error})") from error
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def must_exist(path: Path, what: str) -> Path:
+    """The path, if it is a readable, non-empty file; otherwise the sentence the user should see."""
+    path = Path(path)
+    if path.is_dir():
+        raise InputError(f"{path}: is a folder; {what} is expected")
+    if not path.exists():
+        raise InputError(f"{path}: no such file; {what} is expected")
+    if not os.access(path, os.R_OK):
+        raise InputError(f"{path}: may not be read; check its permissions")
+    if path.stat().st_size == 0:
+        raise InputError(f"{path}: is empty; {what} is expected")
+    return path
+
+
+def sha256(path: Path) -> str:
+    """Hex digest of a file."""
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest() if hasattr(hashlib, "file_digest") else _digest(file)
+
+
+def _digest(file) -> str:
+    """What hashlib.file_digest does, for Python 3.10."""
+    digest = hashlib.sha256()
+    while block := file.read(1 << 20):
+        digest.update(block)
+    return digest.hexdigest()
+
+
+def ngff_version() -> str:
+    try:
+        return version("ngff")
+    except PackageNotFoundError:
+        return "0 (not installed)"
+
+
+def provenance(command: str, inputs: list[Path], options: object = None) -> dict:
+    """What made a file: command, version, inputs with sha256 (of files; a folder is only named), options."""
+    chosen = asdict(options) if is_dataclass(options) else dict(options or {})
+    return {
+        "command": command,
+        "ngff": ngff_version(),
+        "inputs": [{"name": Path(p).name, **({"sha256": sha256(p)} if Path(p).is_file() else {})} for p in inputs],
+        "options": {k: str(v) if isinstance(v, Path) else v for k, v in chosen.items()},
+    }

@@ -1,0 +1,168 @@
+"""Photos, PNG and MP4: the one place that knows OpenCV is BGR."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from stages.core.errors import InputError
+from stages.core.scene.files import must_exist, replacing
+
+PHOTOS = {".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp"}
+VIDEOS = {".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v"}
+
+
+def list_photos(folder: Path) -> list[Path]:
+    """Photos of a folder in the order of their names; other files and hidden ones are left out."""
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise InputError(f"{folder}: is no folder; give a folder of photos or a video file")
+    photos = sorted(p for p in folder.iterdir() if p.suffix.lower() in PHOTOS and not p.name.startswith("."))
+    if not photos:
+        raise InputError(f"{folder}: no photos in it; these kinds are read: {' '.join(sorted(PHOTOS))}")
+    return photos
+
+
+def read_image(path: Path) -> Float[Tensor, "h w 3"]:
+    """RGB in 0..1, turned upright by its EXIF tag; alpha is dropped, 16 bits are kept to float precision."""
+    must_exist(path, "an image")
+    pixels = _decode(path, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
+    top = np.iinfo(pixels.dtype).max if pixels.dtype.kind == "u" else 1.0
+    return torch.from_numpy(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB).astype(np.float32) / np.float32(top))
+
+
+def read_labels(path: Path) -> Int[Tensor, "h w"]:
+    """A label image: one integer a pixel (8 or 16 bit, one channel)."""
+    must_exist(path, "a label image")
+    pixels = _decode(path, cv2.IMREAD_UNCHANGED)
+    if pixels.ndim != 2:
+        raise InputError(f"{path}: has {pixels.shape[2]} channels; a label image has one, with the object's number")
+    return torch.from_numpy(pixels.astype(np.int64))
+
+
+def _decode(path: Path, flags: int) -> np.ndarray:
+    """Pixels of an image file, colours as BGR. Raises InputError where OpenCV finds none."""
+    try:
+        pixels = cv2.imdecode(np.fromfile(path, np.uint8), flags)
+    except cv2.error as error:  # by its header it has more pixels than OpenCV takes, 2^30
+        raise InputError(f"{path}: is damaged, or far too large; images of 4000 pixels or less will do") from error
+    if pixels is None:
+        raise InputError(f"{path}: is not an image that can be read; convert it to JPEG or PNG")
+    return pixels
+
+
+def resize(image: Float[Tensor, "h w c"], width: int, height: int) -> Float[Tensor, "h2 w2 c"]:
+    """Resampled by area where it shrinks, linearly where it grows."""
+    shrink = width < image.shape[1]
+    pixels = cv2.resize(image.numpy(), (width, height), interpolation=cv2.INTER_AREA if shrink else cv2.INTER_LINEAR)
+    return torch.from_numpy(pixels.reshape(height, width, -1))
+
+
+def to_bytes(image: Float[Tensor, "h w 3"]) -> np.ndarray:
+    """8-bit RGB, rounded."""
+    return (image.detach().cpu().clamp(0, 1) * 255).round().to(torch.uint8).numpy()
+
+
+def write_png(path: Path, image: Float[Tensor, "h w 3"]) -> None:
+    """An 8-bit RGB PNG."""
+    _write_pixels(path, cv2.cvtColor(to_bytes(image), cv2.COLOR_RGB2BGR))
+
+
+def write_jpeg(path: Path, image: Float[Tensor, "h w 3"], quality: int = 92) -> None:
+    """An 8-bit JPEG, for photos."""
+    pixels = cv2.cvtColor(to_bytes(image), cv2.COLOR_RGB2BGR)
+    _, data = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    with replacing(path) as part:
+        part.write_bytes(data.tobytes())
+
+
+def write_labels(path: Path, labels: Int[Tensor, "h w"]) -> None:
+    """A one-channel PNG of integers, 16 bit when 8 are too few."""
+    top = int(labels.max()) if labels.numel() else 0
+    _write_pixels(path, labels.cpu().numpy().astype(np.uint8 if top < 256 else np.uint16))
+
+
+def write_depth(path: Path, depth: Float[Tensor, "h w"], unit: float = 1e-3) -> None:
+    """A 16-bit PNG of depth in steps of `unit` (millimetres for metres); 0 is "nothing there"."""
+    _write_pixels(path, (depth.cpu() / unit).round().clamp(0, 65535).numpy().astype(np.uint16))
+
+
+def _write_pixels(path: Path, pixels: np.ndarray) -> None:
+    done, data = cv2.imencode(".png", pixels)
+    if not done:
+        raise InputError(f"{path}: the image could not be encoded as PNG")
+    with replacing(path) as part:
+        part.write_bytes(data.tobytes())
+
+
+class VideoWriter:
+    """An H.264 MP4 (yuv420p, index first, so browsers and slides play it), complete or absent.
+
+    `frames` are (h, w, 3) RGB in 0..1; odd sizes lose their last row or column, since yuv420p needs even ones.
+    """
+
+    def __init__(self, path: Path, fps: float):
+        self.path, self.fps = Path(path), fps
+        self._stream = None
+
+    def __enter__(self) -> VideoWriter:
+        self._replacing = replacing(self.path)
+        self._file = av.open(str(self._replacing.__enter__()), "w", options={"movflags": "faststart"})
+        return self
+
+    def append(self, image: Float[Tensor, "h w 3"]) -> None:
+        pixels = to_bytes(image)
+        pixels = pixels[: pixels.shape[0] // 2 * 2, : pixels.shape[1] // 2 * 2]
+        if self._stream is None:
+            rate = Fraction(self.fps).limit_denominator(1000)
+            self._stream = self._file.add_stream("libx264", rate=rate, options={"crf": "17", "preset": "medium"})
+            self._stream.height, self._stream.width = pixels.shape[:2]
+            self._stream.pix_fmt = "yuv420p"
+        self._file.mux(self._stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(pixels), format="rgb24")))
+
+    def __exit__(self, kind, error, trace) -> None:
+        try:
+            if kind is None and self._stream is not None:
+                self._file.mux(self._stream.encode())
+            self._file.close()
+        except OSError as failed:
+            kind, error, trace = type(failed), failed, failed.__traceback__
+        self._replacing.__exit__(kind, error, trace)
+
+
+def video_info(path: Path) -> tuple[int, float]:
+    """Number of frames (as counted by the container, 0 when it does not say) and frames a second."""
+    with open_video(path) as file:
+        stream = file.streams.video[0]
+        return stream.frames, float(stream.average_rate or 0)
+
+
+def read_video(path: Path) -> Iterator[Float[Tensor, "h w 3"]]:
+    """The frames of a video in order."""
+    with open_video(path) as file:
+        try:
+            for frame in file.decode(video=0):
+                yield torch.from_numpy(frame.to_ndarray(format="rgb24").astype(np.float32) / 255)
+        except av.FFmpegError as error:
+            raise InputError(f"{path}: the video breaks off or is damaged ({error.strerror})") from error
+
+
+def open_video(path: Path) -> av.container.InputContainer:
+    """To be decoded. Raises InputError for what is no video."""
+    must_exist(path, "a video")
+    try:
+        file = av.open(str(path))
+    except (av.FFmpegError, OSError) as error:
+        raise InputError(f"{path}: is not a video that can be read") from error
+    if not file.streams.video:
+        file.close()
+        raise InputError(f"{path}: holds no video stream")
+    return file

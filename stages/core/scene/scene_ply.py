@@ -1,0 +1,131 @@
+"""scene.ply: the standard 3D-Gaussian PLY, plus object ids, plus our facts as JSON in header comments."""
+
+from __future__ import annotations
+
+import json
+import logging
+from pathlib import Path
+
+import numpy as np
+import torch
+from plyfile import PlyData, PlyElement, PlyParseError
+
+from stages.core.errors import InputError
+from stages.core.scene import cameras as camera_json
+from stages.core.scene.files import must_exist, replacing
+from stages.core.scene.gaussians import Gaussians
+from stages.core.scene.packed_ply import is_packed, unpack
+from stages.core.scene.scene import Scene, SceneObject
+
+log = logging.getLogger(__name__)
+VERSION = 1
+NEEDED = ["x", "y", "z", "opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
+COLOUR = [f"f_dc_{i}" for i in range(3)]
+WHAT = "a 3D-Gaussian PLY, such as `ngff reconstruct` writes"
+
+
+def read_scene(path: Path) -> Scene:
+    """Any 3D-Gaussian PLY: ours, or another tool's (SH degree 0 to 3, either byte order, packed or not).
+
+    Gaussians with a value that is not finite or a zero quaternion are dropped, and the log says how many.
+    """
+    path = Path(path)
+    must_exist(path, WHAT)
+    try:
+        ply = PlyData.read(str(path))
+    except (PlyParseError, ValueError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: is not a readable PLY file ({error}); {WHAT} is expected") from error
+    if "vertex" not in ply:
+        raise InputError(f"{path}: has no element called vertex; {WHAT} is expected")
+    raw = unpack(ply) if is_packed(ply) else {p.name: ply["vertex"][p.name] for p in ply["vertex"].properties}
+    gaussians = _activate(path, raw)
+    if not len(gaussians):
+        raise InputError(f"{path}: holds no Gaussians; {WHAT} is expected")
+    return _with_header(path, gaussians, ply.comments)
+
+
+def _activate(path: Path, raw: dict[str, np.ndarray]) -> Gaussians:
+    """Stored values (logits, logarithms, raw quaternions) to values ready for use."""
+    missing = [name for name in NEEDED + COLOUR if name not in raw]
+    if missing:
+        raise InputError(
+            f"{path}: no vertex property {', '.join(missing)}; {WHAT} is expected (this may be a plain point cloud)"
+        )
+    rest = sorted((n for n in raw if n.startswith("f_rest_")), key=lambda n: int(n.rsplit("_", 1)[1]))
+    if len(rest) not in (0, 9, 24, 45):
+        raise InputError(f"{path}: {len(rest)} f_rest properties; SH of degree 1, 2 or 3 has 9, 24 or 45")
+    columns = {name: np.asarray(raw[name], np.float32) for name in NEEDED + COLOUR + rest}
+    table = torch.from_numpy(np.stack(list(columns.values()), 1))
+    n, quats = len(table), table[:, 7:11]
+    sh = torch.cat([table[:, 11:14, None], table[:, 14:].reshape(n, 3, -1)], 2).mT.contiguous()  # channel-major file
+    ids = torch.from_numpy(np.asarray(raw.get("object_id", np.zeros(n))).astype(np.int64))
+    keep = table.isfinite().all(1) & (quats.norm(dim=1) > 1e-12)
+    if not keep.all():
+        log.warning("%s: dropped %d Gaussians with values that are not finite", path, int((~keep).sum()))
+    everything = Gaussians(
+        table[:, :3].contiguous(), torch.nn.functional.normalize(quats, dim=1), table[:, 4:7].exp(),
+        table[:, 3].sigmoid(), sh, ids,
+    )  # fmt: skip
+    return everything if keep.all() else everything[keep]
+
+
+def _with_header(path: Path, gaussians: Gaussians, comments: list[str]) -> Scene:
+    """The facts of our header comments, `ngff:KEY JSON` each; absent in other tools' files."""
+    facts: dict[str, list] = {}
+    try:
+        for comment in comments:
+            if comment.startswith("ngff:"):
+                key, value = comment[5:].split(" ", 1)
+                facts.setdefault(key, []).append(json.loads(value))
+        version = facts.get("version", [VERSION])[0]
+        if version > VERSION:
+            raise InputError(f"{path}: format version {version} is newer than {VERSION}; upgrade ngff")
+        ids = gaussians.object_id.unique().tolist()
+        named = {o["id"]: SceneObject(o["id"], o["name"], o.get("material", "")) for o in facts.get("object", [])}
+        unnamed = {i: SceneObject(i, f"object_{i}") for i in ids if i > 0 and i not in named}
+        return Scene(
+            gaussians,
+            tuple(o for _, o in sorted((named | unnamed).items())),
+            camera_json.from_json(facts.get("camera", [])),
+            facts.get("floor", [None])[0],
+            facts.get("scale", [{"metres_per_unit": 1.0, "source": "not stated in the file"}])[0],
+            facts.get("provenance", [{}])[0],
+            _colour(facts.get("background", [None])[0]),
+        )
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{path}: a header comment of ngff is damaged ({error!r}); write the file again") from error
+
+
+def _colour(said: list | None) -> tuple[float, float, float] | None:
+    if said is None:
+        return None
+    red, green, blue = (min(max(float(x), 0.0), 1.0) for x in said)
+    return red, green, blue
+
+
+def write_scene(path: Path, scene: Scene) -> None:
+    """Binary little-endian PLY that splat viewers open; our facts ride in comments."""
+    g = scene.gaussians.to("cpu")
+    n, k = g.sh.shape[:2]
+    rest = [f"f_rest_{i}" for i in range(3 * (k - 1))]
+    names = ["x", "y", "z", "nx", "ny", "nz", *COLOUR, *rest, "opacity", *NEEDED[4:7], *NEEDED[7:]]
+    opacity = g.opacities.double().clamp(1e-7, 1 - 1e-7).logit().float()[:, None]
+    columns = [
+        g.means, torch.zeros(n, 3), g.sh[:, 0], g.sh[:, 1:].mT.reshape(n, -1), opacity, g.scales.log(), g.quats
+    ]  # fmt: skip
+    vertices = np.empty(n, dtype=[(name, "<f4") for name in names] + [("object_id", "<i4")])
+    for name, column in zip(names, torch.cat(columns, 1).T.numpy(), strict=True):
+        vertices[name] = column
+    vertices["object_id"] = g.object_id.numpy()
+    ply = PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<", comments=_header(scene))
+    with replacing(path) as part:
+        ply.write(str(part))
+
+
+def _header(scene: Scene) -> list[str]:
+    facts = [("version", VERSION), ("up", [0, 0, 1]), ("scale", scene.scale), ("floor", scene.floor)]
+    facts += [("background", scene.background)] if scene.background else []
+    facts += [("object", {"id": o.id, "name": o.name, "material": o.material}) for o in scene.objects]
+    facts += [("camera", row) for row in (camera_json.to_json(scene.cameras) if scene.cameras else [])]
+    facts += [("provenance", scene.provenance)]
+    return [f"ngff:{key} {json.dumps(value)}" for key, value in facts]

@@ -1,0 +1,261 @@
+"""traj.h5: how a scene moves, with all that `ngff render` needs to draw it.
+
+    attributes            format, version, fps, dt [s], gravity [units/s^2], up, units, engine, scale, provenance, and
+                          where known floor, background (RGB 0..1, seen where there is nothing)
+    gaussians/            means quats scales opacities sh object_id: the rest frame, as in memory
+    objects/              id (O) name (O) material (O) com (T,O,3) rotation (T,O,4; w x y z, relative to rest)
+    keypoints/            rest (P,3) object_id (P) positions (T,P,3)
+    binding/              index (n,j; -1 where a Gaussian follows nothing) weight (n,j)
+    cameras/              viewmats Ks sizes names
+    forces/json           the prompts that acted, one JSON each
+    frames/               optional: means quats scales (T,n,.) of every Gaussian, used instead of the binding
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import logging
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import h5py
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from stages.core.errors import InputError
+from stages.core.scene.cameras import Cameras
+from stages.core.scene.files import must_exist, replacing
+from stages.core.scene.gaussians import Gaussians
+from stages.core.scene.scene import Scene, SceneObject
+
+log = logging.getLogger(__name__)
+FORMAT, VERSION = "ngff-trajectory", 1
+WHAT = "a trajectory (.h5), such as `ngff simulate` writes"
+
+
+@dataclass(frozen=True)
+class Keypoints:
+    """Points that carry the motion of the objects."""
+
+    rest: Float[Tensor, "p 3"]  # positions in the rest frame [m]
+    object_id: Int[Tensor, "p"]
+
+
+@dataclass(frozen=True)
+class Binding:
+    """The keypoints that each Gaussian follows; weights sum to one, index -1 with weight 0 follows nothing."""
+
+    index: Int[Tensor, "n j"]
+    weight: Float[Tensor, "n j"]
+
+
+@dataclass(frozen=True)
+class Motion:
+    """What holds for the whole of a trajectory besides the scene."""
+
+    dt: float  # time between frames [s]
+    gravity: tuple[float, float, float]  # [scene units / s^2]
+    engine: str
+    forces: tuple[dict, ...] = ()  # prompts that acted, as plain dicts
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """A trajectory in memory; dense frames, where the file has them, stay on disk until asked for."""
+
+    scene: Scene
+    motion: Motion
+    keypoints: Keypoints
+    binding: Binding
+    positions: Float[Tensor, "t p 3"]
+    com: Float[Tensor, "t o 3"]
+    rotation: Float[Tensor, "t o 4"]
+    path: Path
+    dense: bool = False
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+    def frame(self, t: int) -> Gaussians:
+        """Every Gaussian of frame t, for a file with dense frames."""
+        with h5py.File(self.path, "r") as file:
+            parts = {name: torch.from_numpy(file[f"frames/{name}"][t]) for name in ("means", "quats", "scales")}
+        g = self.scene.gaussians
+        return Gaussians(**parts, opacities=g.opacities, sh=g.sh, object_id=g.object_id)
+
+
+class _Careful(io.FileIO):
+    """A file to which HDF5 writes without ever hearing of an error, which it does not survive; `error` remembers it."""
+
+    error: OSError | None = None
+
+    def write(self, data) -> int:
+        rest = memoryview(data).cast("B")
+        while len(rest) and self.error is None:
+            try:
+                rest = rest[super().write(rest) :]
+            except OSError as error:
+                self.error = error
+        return len(data)
+
+    def truncate(self, size: int | None = None) -> int:
+        try:
+            return super().truncate(size)
+        except OSError as error:
+            self.error = self.error or error
+            return size or 0
+
+    def flush(self) -> None:
+        """Nothing is held back."""
+
+    def check(self) -> None:
+        """Raises OSError if anything could not be written."""
+        if self.error is not None:
+            raise self.error
+
+
+class TrajectoryWriter:
+    """Writes a trajectory frame by frame; the file takes its name when all is well.
+
+    When an InputError stops the run after some frames, what was written is kept as NAME.partial.h5.
+    """
+
+    def __init__(self, path: Path, scene: Scene, motion: Motion, keypoints: Keypoints, binding: Binding):
+        self.path, self.frames = Path(path), 0
+        self._contents = scene, motion, keypoints, binding
+
+    def __enter__(self) -> TrajectoryWriter:
+        self._replacing = replacing(self.path)
+        self._part = self._replacing.__enter__()
+        try:
+            self._raw = _Careful(self._part, "w+b")
+            self._file = h5py.File(self._raw, "w")
+            _write_rest(self._file, *self._contents)
+            self._raw.check()
+        except BaseException as error:
+            if hasattr(self, "_file"):
+                self._close()
+            self._replacing.__exit__(type(error), error, error.__traceback__)
+            raise
+        return self
+
+    def append(
+        self, positions: Float[Tensor, "p 3"], com: Float[Tensor, "o 3"], rotation: Float[Tensor, "o 4"]
+    ) -> None:
+        rows = {"keypoints/positions": positions, "objects/com": com, "objects/rotation": rotation}
+        for name, row in rows.items():
+            data = self._file[name]
+            data.resize(self.frames + 1, axis=0)
+            data[self.frames] = row.detach().cpu().numpy()
+        self._raw.check()
+        self.frames += 1
+
+    def _close(self) -> None:
+        self._file.close()
+        self._raw.close()
+
+    def __exit__(self, kind, error, trace) -> None:
+        self._close()
+        if kind is None and self._raw.error is not None:
+            kind, error = OSError, self._raw.error
+        if kind is not None and issubclass(kind, InputError) and self.frames:
+            kept = self.path.with_name(f"{self.path.stem}.partial.h5")
+            self._part.replace(kept)
+            log.warning("%s: the %d frames before the stop are kept", kept, self.frames)
+        self._replacing.__exit__(kind, error, trace)
+
+
+def _write_rest(file: h5py.File, scene: Scene, motion: Motion, keypoints: Keypoints, binding: Binding) -> None:
+    packed = {"compression": "gzip", "compression_opts": 4, "shuffle": True}
+    file.attrs.update(
+        format=FORMAT, version=VERSION, fps=1 / motion.dt, dt=motion.dt, gravity=motion.gravity, up="z",
+        units="scene units, seconds", engine=motion.engine, scale=json.dumps(scene.scale),
+        provenance=json.dumps(scene.provenance), **({} if scene.floor is None else {"floor": scene.floor}),
+        **({} if scene.background is None else {"background": scene.background}),
+    )  # fmt: skip
+    for field in fields(Gaussians):
+        value = getattr(scene.gaussians, field.name).cpu().numpy()
+        file.create_dataset(f"gaussians/{field.name}", data=value, **packed)
+    file["objects/id"] = np.array([o.id for o in scene.objects], np.int64)
+    text = h5py.string_dtype()
+    file.create_dataset("objects/name", data=[o.name for o in scene.objects], dtype=text)
+    file.create_dataset("objects/material", data=[o.material for o in scene.objects], dtype=text)
+    file.create_dataset("keypoints/rest", data=keypoints.rest.cpu().numpy(), **packed)
+    file.create_dataset("keypoints/object_id", data=keypoints.object_id.cpu().numpy(), **packed)
+    file.create_dataset("binding/index", data=binding.index.cpu().numpy().astype(np.int32), **packed)
+    file.create_dataset("binding/weight", data=binding.weight.cpu().numpy(), **packed)
+    p, o = len(keypoints.rest), len(scene.objects)
+    for name, shape in (("keypoints/positions", (p, 3)), ("objects/com", (o, 3)), ("objects/rotation", (o, 4))):
+        chunk = (1, *(max(s, 1) for s in shape))
+        file.create_dataset(name, (0, *shape), maxshape=(None, *shape), chunks=chunk, dtype="f4", **packed)
+    if scene.cameras is not None:
+        for name in ("viewmats", "Ks", "sizes"):
+            file[f"cameras/{name}"] = getattr(scene.cameras, name).cpu().numpy()
+        file.create_dataset("cameras/names", data=list(scene.cameras.names), dtype=text)
+    prompts = [json.dumps(f) for f in motion.forces]
+    file.create_dataset("forces/json", data=prompts, dtype=text, shape=(len(prompts),))
+
+
+def read_trajectory(path: Path) -> Trajectory:
+    """Everything but dense frames."""
+    path = Path(path)
+    must_exist(path, WHAT)
+    try:
+        with h5py.File(path, "r") as file:
+            kind = file.attrs.get("format", "")
+            if kind != FORMAT:
+                raise InputError(f"{path}: its format attribute is {kind!r}, not {FORMAT!r}; {WHAT} is expected")
+            if int(file.attrs["version"]) > VERSION:
+                raise InputError(f"{path}: version {file.attrs['version']} is newer than {VERSION}; upgrade ngff")
+            _check(path, file)
+            return _read(path, file)
+    except KeyError as error:
+        raise InputError(f"{path}: a part of the trajectory is missing ({error.args[0]}); see the README") from error
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: is not a readable HDF5 file ({error}); {WHAT} is expected") from error
+
+def _read(path: Path, file: h5py.File) -> Trajectory:
+    def tensor(name: str) -> Tensor:
+        return torch.from_numpy(np.asarray(file[name][()]))
+
+    def names(name: str) -> list[str]:
+        return [str(s) for s in file[name].asstr()[()]] if name in file else []
+
+    gaussians = Gaussians(**{f.name: tensor(f"gaussians/{f.name}") for f in fields(Gaussians)})
+    ids = [int(i) for i in file["objects/id"][()]]
+    materials = names("objects/material") or [""] * len(ids)
+    objects = tuple(SceneObject(*row) for row in zip(ids, names("objects/name"), materials, strict=True))
+    cameras = None
+    if "cameras/viewmats" in file:
+        cameras = Cameras(*(tensor(f"cameras/{n}") for n in ("viewmats", "Ks", "sizes")), tuple(names("cameras/names")))
+    floor = float(file.attrs["floor"]) if "floor" in file.attrs else None
+    scale = json.loads(file.attrs.get("scale", '{"metres_per_unit": 1.0, "source": "not stated"}'))
+    background = tuple(float(x) for x in file.attrs["background"]) if "background" in file.attrs else None
+    scene = Scene(gaussians, objects, cameras, floor, scale, json.loads(file.attrs.get("provenance", "{}")), background)
+    gravity = tuple(float(g) for g in file.attrs["gravity"])
+    forces = tuple(json.loads(f) for f in names("forces/json"))
+    motion = Motion(float(file.attrs["dt"]), gravity, str(file.attrs["engine"]), forces)
+    keypoints = Keypoints(tensor("keypoints/rest"), tensor("keypoints/object_id").long())
+    binding = Binding(tensor("binding/index").long(), tensor("binding/weight"))
+    moving = (tensor("keypoints/positions"), tensor("objects/com"), tensor("objects/rotation"))
+    return Trajectory(scene, motion, keypoints, binding, *moving, path, "frames/means" in file)
+
+
+def _check(path: Path, file: h5py.File) -> None:
+    """The promises that readers rely on."""
+    t, p = file["keypoints/positions"].shape[0], len(file["keypoints/rest"])
+    o, n = len(file["objects/id"]), len(file["gaussians/means"])
+    if not t:
+        raise InputError(f"{path}: has no frames")
+    expected = {"keypoints/positions": (t, p, 3), "objects/com": (t, o, 3), "objects/rotation": (t, o, 4)}
+    for name, shape in expected.items():
+        if file[name].shape != shape:
+            raise InputError(f"{path}: {name} has shape {file[name].shape}; the other parts call for {shape}")
+    index = file["binding/index"]
+    if "frames/means" not in file and (len(index) != n or (index.size and int(index[()].max()) >= p)):
+        raise InputError(f"{path}: the binding does not fit the {n} Gaussians and {p} keypoints")
+    if not np.isfinite(file["keypoints/positions"][()]).all():
+        raise InputError(f"{path}: some keypoint positions are not finite")

@@ -1,0 +1,1 @@
+"""Objects, backgrounds and scenes made in code."""

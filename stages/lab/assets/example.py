@@ -1,0 +1,69 @@
+"""The example that ships: photos of toys made in code, and the truth about them."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from tqdm import tqdm
+
+from stages.core.geometry.cameras import intrinsics, orbit
+from stages.core.raster.rasterise import rasterise, visibility
+from stages.core.scene.cameras import Cameras
+from stages.core.scene.images import write_jpeg, write_labels
+from stages.core.scene.scene import Scene
+from stages.core.scene.scene_ply import write_scene
+from stages.lab.assets.toys import falling_toys
+from stages.simulate.options import SimulateOptions
+from stages.simulate.stage import run as simulate
+
+WIDTH, HEIGHT, FOCAL = 640, 480, 620.0
+WALL = torch.tensor([0.62, 0.66, 0.70])  # colour behind the table
+
+
+def make(out: Path, photos: int = 26) -> None:
+    """photos/NN.jpg, masks/NN.png (object ids) and names.json, cameras.json (transforms), truth.h5."""
+    out = Path(out)
+    for folder in ("photos", "masks"):
+        (out / folder).mkdir(parents=True, exist_ok=True)
+    scene = replace(falling_toys(), cameras=_cameras(photos))
+    for i, name in enumerate(tqdm(scene.cameras.names, desc="photos", unit="photo")):
+        viewmat, K = scene.cameras.viewmats[i], scene.cameras.Ks[i]
+        drawn = rasterise(scene.gaussians, viewmat[None], K[None], WIDTH, HEIGHT, WALL)
+        write_jpeg(out / "photos" / name, drawn.rgb[0])
+        index, _ = visibility(scene.gaussians, viewmat, K, WIDTH, HEIGHT)
+        labels = torch.where(index >= 0, scene.gaussians.object_id[index.clamp_min(0)], 0)
+        write_labels(out / "masks" / f"{Path(name).stem}.png", labels)
+    (out / "masks/names.json").write_text(json.dumps({o.id: o.name for o in scene.objects}))
+    (out / "cameras.json").write_text(json.dumps(_transforms(scene.cameras), indent=1))
+    _truth(scene, out / "truth.h5")
+
+
+def _cameras(count: int) -> Cameras:
+    """Two rings of views around the toys, a low one that sees under what hangs and a high one."""
+    low = count * 3 // 5
+    centre = torch.tensor([0.0, 0.0, 0.11])
+    rings = [orbit(low, centre, 1.0, 20.0), orbit(count - low, centre, 1.05, 42.0, azimuth=127.0)]
+    K = intrinsics(WIDTH, HEIGHT, FOCAL).expand(count, 3, 3).clone()
+    names = tuple(f"{i:02d}.jpg" for i in range(count))
+    return Cameras(torch.cat(rings), K, torch.tensor([[WIDTH, HEIGHT]] * count), names)
+
+
+def _transforms(cameras: Cameras) -> dict:
+    """The nerfstudio form: camera-to-world with OpenGL axes."""
+    poses = torch.linalg.inv(cameras.viewmats) @ torch.diag(torch.tensor([1.0, -1, -1, 1]))
+    rows = zip(cameras.names, poses.tolist(), strict=True)
+    frames = [{"file_path": f"photos/{name}", "transform_matrix": pose} for name, pose in rows]
+    return {"w": WIDTH, "h": HEIGHT, "fl_x": FOCAL, "fl_y": FOCAL, "cx": WIDTH / 2, "cy": HEIGHT / 2, "frames": frames}
+
+
+def _truth(scene: Scene, out: Path) -> None:
+    """The toys alone, every third Gaussian of them, let go: a file of a size that git does not mind."""
+    toys = scene.gaussians[scene.gaussians.object_id > 0]
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "toys.ply"
+        write_scene(path, replace(scene, gaussians=toys[torch.arange(0, len(toys), 3)]))
+        simulate(path, out, SimulateOptions(engine="mpm", keypoints=256))

@@ -1,0 +1,159 @@
+"""A textured mesh as Gaussians: points spread over its faces, coloured by texture, vertices or faces."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from stages.core.errors import InputError
+from stages.core.scene.files import must_exist
+from stages.core.scene.gaussians import Gaussians
+from stages.lab.assets.shapes import Surface, one_thread, to_gaussians
+from stages.lab.assets.surface import normalised, shade
+
+KINDS = (".obj", ".glb", ".gltf", ".ply", ".stl", ".off")
+UPRIGHT = {"x": [[0, 1, 0], [0, 0, 1], [1, 0, 0]], "y": [[1, 0, 0], [0, 0, -1], [0, 1, 0]],
+           "z": [[1, 0, 0], [0, 1, 0], [0, 0, 1]]}  # fmt: skip
+
+
+def read_mesh(path: Path, count: int, up: str = "auto", light: bool = True) -> Gaussians:
+    """About `count` flat Gaussians on the faces of a mesh, z up, around the origin, longest side 1, object_id 1.
+
+    `up` names the axis that points up in the file (auto: y in glTF, which says so, else z). `light` bakes the soft
+    light of the made objects into the colours; without it they are those of the file.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in KINDS:
+        raise InputError(f"{path}: is no mesh that can be read; these kinds are: {' '.join(KINDS)}")
+    if up not in (*UPRIGHT, "auto"):
+        raise InputError(f"--up {up}: choose from auto, x, y, z")
+    if count < 100:
+        raise InputError(f"--count {count}: at least 100 Gaussians are needed to show a shape")
+    up = ("y" if path.suffix.lower() in (".glb", ".gltf") else "z") if up == "auto" else up
+    meshes = _load(path)
+    with one_thread():
+        return _splat(path, meshes, count, torch.tensor(UPRIGHT[up], dtype=torch.float32), light)
+
+
+def _splat(path: Path, meshes: list, count: int, R: Float[Tensor, "3 3"], light: bool) -> Gaussians:
+    points, normals, rgb = _sampled(path, meshes, 5 * count)
+    keep = _thinned(points, normals, count)
+    surface = Surface(points[keep] @ R.mT, normals[keep] @ R.mT)
+    size = (surface.points.amax(0) - surface.points.amin(0)).max()
+    surface = Surface(surface.points / size, surface.normals)  # the width of a Gaussian is capped in these units
+    colours = rgb[keep] * shade(surface)[:, None] if light else rgb[keep]
+    return normalised(to_gaussians(surface, colours, 1, width=0.62))
+
+
+def _load(path: Path) -> list:
+    """The triangle meshes of a file, placed as its scene graph says."""
+    must_exist(path, "a mesh")
+    try:
+        import trimesh  # an optional extra
+    except ImportError as error:
+        raise InputError(f"{path}: reading meshes needs trimesh; install it with `pip install 'ngff[mesh]'`") from error
+    try:
+        scene = trimesh.load_scene(path)
+    except Exception as error:  # its readers raise whatever they trip over
+        raise InputError(f"{path}: cannot be read as a mesh ({error})") from error
+    meshes = [m for m in scene.dump() if isinstance(m, trimesh.Trimesh) and len(m.faces) and m.area > 0]
+    if not meshes:
+        raise InputError(f"{path}: holds no triangles; a mesh with faces is needed (this may be a point cloud)")
+    return meshes
+
+
+def _sampled(path: Path, meshes: list, n: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Points, unit normals and colours of n places, evenly likely anywhere on the faces."""
+    generator = torch.Generator().manual_seed(n)
+    share = torch.tensor([float(m.area) for m in meshes], dtype=torch.float64)
+    counts = (n * share / share.sum()).ceil().long().tolist()
+    rows = []
+    for mesh, m in zip(meshes, counts, strict=True):
+        corners = torch.from_numpy(np.array(mesh.triangles, np.float32))
+        if not corners.isfinite().all():
+            raise InputError(f"{path}: has vertices that are not finite")
+        cross = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        edges = cross.norm(dim=1).double().cumsum(0)
+        # one draw in each of m equal parts of the total area: more even than m independent draws
+        level = (torch.arange(m, dtype=torch.float64) + torch.rand(m, generator=generator).double()) / m * edges[-1]
+        face = torch.searchsorted(edges, level).clamp_max(len(edges) - 1)
+        a, b = torch.rand(m, 2, generator=generator).unbind(1)
+        weight = torch.stack([1 - a.sqrt(), a.sqrt() * (1 - b), a.sqrt() * b], 1)  # Osada et al. 2002, eq. 1
+        points = (corners[face] * weight[..., None]).sum(1)
+        normals = torch.nn.functional.normalize(cross[face], dim=1)
+        rows.append((points, normals, _colours(mesh, face, weight)))
+    return tuple(torch.cat(column) for column in zip(*rows, strict=True))
+
+
+def _colours(mesh, face: Int[Tensor, "m"], weight: Float[Tensor, "m 3"]) -> Float[Tensor, "m 3"]:
+    """RGB 0..1 at places on faces: from texture, vertex colours, face colours or the material, whichever there is."""
+    visual, corner = mesh.visual, torch.from_numpy(np.array(mesh.faces, np.int64))[face]
+    if visual.kind == "face":
+        return torch.from_numpy(np.array(visual.face_colors[:, :3], np.float32))[face] / 255
+    if visual.kind == "vertex":
+        vertex = torch.from_numpy(np.array(visual.vertex_colors[:, :3], np.float32)) / 255
+        return (vertex[corner] * weight[..., None]).sum(1)
+    material = getattr(visual, "material", None)
+    images = [getattr(material, key, None) for key in ("baseColorTexture", "image")]  # of glTF, of OBJ
+    image = next((image for image in images if image is not None), None)
+    if image is None or getattr(visual, "uv", None) is None:
+        return _material_colour(material).expand(len(face), 3)
+    uv = torch.from_numpy(np.array(visual.uv, np.float32))
+    texels = torch.from_numpy(np.array(image.convert("RGB"), np.float32) / 255)
+    tint = _material_colour(material) if getattr(material, "baseColorFactor", None) is not None else torch.ones(3)
+    return _look_up(texels, (uv[corner] * weight[..., None]).sum(1)) * tint
+
+
+def _material_colour(material) -> Float[Tensor, "3"]:
+    """Base or diffuse colour, mid grey when the file names none."""
+    for key in ("baseColorFactor", "diffuse"):
+        value = getattr(material, key, None)
+        if value is not None:
+            value = np.asarray(value)
+            return torch.tensor(value[:3] / (255.0 if value.dtype.kind in "ui" else 1.0), dtype=torch.float32)
+    return torch.full((3,), 0.6)
+
+
+def _look_up(texels: Float[Tensor, "h w 3"], uv: Float[Tensor, "m 2"]) -> Float[Tensor, "m 3"]:
+    """Texture at (u right, v up), between its four nearest texels; it repeats outside 0..1."""
+    h, w = texels.shape[:2]
+    x, y = uv[:, 0] * w - 0.5, (1 - uv[:, 1]) * h - 0.5
+    i, j = x.floor(), y.floor()
+    fx, fy = (x - i)[:, None], (y - j)[:, None]
+    left, right, top, low = (i % w).long(), ((i + 1) % w).long(), (j % h).long(), ((j + 1) % h).long()
+    above = texels[top, left] * (1 - fx) + texels[top, right] * fx
+    below = texels[low, left] * (1 - fx) + texels[low, right] * fx
+    return above * (1 - fy) + below * fy
+
+
+def _thinned(points: Float[Tensor, "m 3"], normals: Float[Tensor, "m 3"], count: int) -> Int[Tensor, "n"]:
+    """About `count` of many points, none closer than a radius to another on the same side, without gaps.
+
+    All points that come first among their neighbours are taken and their neighbours struck out, until none is left:
+    dart throwing, many darts at a time. Darts without end would put 0.547 of the area under discs of that diameter;
+    with five points for each that is kept, discs cover about 0.4 (measured), which sets the radius.
+    """
+    p, n = points.double().numpy(), normals.numpy()
+    tree = cKDTree(p)
+    eighth = np.median(tree.query(p[:: max(1, len(p) // 2000)], k=9)[0][:, 8])  # a disc of this radius holds 8 points
+    radius = eighth * np.sqrt(0.4 * 4 / 8 * len(p) / count)
+    pairs = tree.query_pairs(radius, output_type="ndarray")
+    pairs = pairs[(n[pairs[:, 0]] * n[pairs[:, 1]]).sum(1) > 0]
+    rank = torch.randperm(len(p), generator=torch.Generator().manual_seed(len(p))).numpy()
+    waiting, taken = np.ones(len(p), bool), np.zeros(len(p), bool)
+    while waiting.any():
+        first = np.full(len(p), len(p))
+        np.minimum.at(first, pairs[:, 0], rank[pairs[:, 1]])
+        np.minimum.at(first, pairs[:, 1], rank[pairs[:, 0]])
+        chosen = waiting & (rank < first)
+        taken |= chosen
+        waiting &= ~chosen
+        struck = np.concatenate([pairs[chosen[pairs[:, 0]], 1], pairs[chosen[pairs[:, 1]], 0]])
+        waiting[struck] = False
+        pairs = pairs[waiting[pairs].all(1)]
+    return torch.from_numpy(np.flatnonzero(taken))

@@ -1,0 +1,128 @@
+"""The ten objects of GSCollision, made in code: what each is called, weighs and resists, and how it is made."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from tqdm import tqdm
+
+from stages.core.backends import choose
+from stages.core.errors import InputError
+
+if TYPE_CHECKING:
+    from stages.core.scene.gaussians import Gaussians
+
+
+@dataclass(frozen=True)
+class ObjectKind:
+    """One object of the data set. Source: paper and public code of NGFF, values of GSCollision."""
+
+    name: str
+    id: int  # as in scene_object_idxs
+    scale: float  # in a scene, of the object as made
+    E: float  # Young's modulus [Pa]
+    density: float  # [kg/m^3]
+    prompt: str
+    make: str  # module:function
+    side: float = 1.0  # longest side as made [scene units]
+
+
+HARD, SOFT, FIGURES, PHONE = (f"stages.lab.assets.{name}" for name in ("vessels", "soft_objects", "figures", "phone"))
+OBJECTS = {
+    kind.name: kind
+    for kind in (
+        ObjectKind("ball", 0, 0.4, 8e5, 600.0, "a pokemon ball", f"{HARD}:ball"),
+        ObjectKind("bowl", 2, 0.5, 1e7, 800.0, "a blue bowl with cloud", f"{HARD}:bowl"),
+        ObjectKind("can", 3, 1.0, 1e6, 800.0, "a cola", f"{HARD}:can", 0.4),  # a metre of it fits nowhere
+        ObjectKind("cloth", 4, 1.0, 3e3, 100.0, "a yellow t-shirt with an owl", f"{SOFT}:cloth"),
+        ObjectKind("duck", 7, 0.3, 3e5, 300.0, "a rubber duck", f"{HARD}:duck"),
+        ObjectKind("miku", 9, 0.6, 1e5, 400.0, "a hatsune miku", f"{FIGURES}:miku"),
+        ObjectKind("panda", 10, 0.6, 1e5, 700.0, "a cartoon panda", f"{FIGURES}:panda"),
+        ObjectKind("phone", 11, 0.4, 2e7, 2600.0, "a mobile phone", f"{PHONE}:phone"),
+        ObjectKind("pillow", 12, 0.7, 1e4, 500.0, "a blue and white striped pillow", f"{SOFT}:pillow"),
+        ObjectKind("rope", 14, 1.0, 5e3, 500.0, "a thick rope", f"{SOFT}:rope"),
+    )
+}
+
+
+ELEVATION = {"cloth": 52.0, "pillow": 38.0, "rope": 46.0, "bowl": 34.0}  # of the camera [deg], for what lies flat
+
+
+@dataclass(frozen=True)
+class ObjectsOptions:
+    """Which objects to write, and how meshes are turned into Gaussians."""
+
+    only: str = ""  # names with commas between; empty: all ten
+    count: int = 40_000  # Gaussians of a mesh, about
+    up: str = "auto"  # axis of a mesh that points up
+    light: bool = True  # bake soft light into the colours of a mesh
+
+    @property
+    def names(self) -> list[str]:
+        names = [name.strip() for name in self.only.split(",") if name.strip()] or list(OBJECTS)
+        for name in names:
+            _known(name)
+        return names
+
+
+def make_object(name: str) -> Gaussians:
+    """An object of OBJECTS: SH degree 2, object_id 1, bounding box around the origin.
+
+    The same Gaussians at every call; the scale of a scene is not applied.
+    """
+    from stages.lab.assets.shapes import one_thread
+
+    make = choose({kind.name: kind.make for kind in OBJECTS.values()}, _known(name))
+    with one_thread():
+        g = make()
+    side = OBJECTS[name].side
+    return replace(g, means=g.means * side, scales=g.scales * side)
+
+
+def _known(name: str) -> str:
+    if name not in OBJECTS:
+        raise InputError(f"no object called {name!r}; choose from {', '.join(OBJECTS)}")
+    return name
+
+
+def run(
+    out: Path, options: ObjectsOptions = ObjectsOptions(), meshes: Sequence[Path] = (), sheet: Path | None = None
+) -> Iterator[str]:
+    """Write OUT/<name>/ for each object, or for each mesh when there are any; a line about each, and a sheet of all."""
+    from stages.core.scene.files import provenance
+    from stages.core.scene.images import write_jpeg
+    from stages.lab.assets.splat_files import portrait, write_object
+    from stages.render.overlay import tile
+
+    if meshes and options.only:
+        raise InputError("--only names objects of the data set and --from meshes; give one of the two")
+    out, pictures = Path(out), []
+    sources = {_mesh_name(path): path for path in meshes} or dict.fromkeys(options.names)
+    if len(sources) < len(meshes):
+        raise InputError(f"--from: two meshes would both be written to {out}/<name>; rename one of them or its folder")
+    for name, path in tqdm(sources.items(), desc="objects", unit="object"):
+        g = make_object(name) if path is None else _from_mesh(path, options)
+        made_by = provenance("objects", [path], options) if path else provenance("objects", [])
+        write_object(out / name, g, name, made_by)  # the same bytes whatever else was asked for
+        if sheet:
+            pictures.append(portrait(g, ELEVATION.get(name, 24.0) if path is None else 24.0, name))
+        sides = " x ".join(f"{side:.2f}" for side in (g.means.amax(0) - g.means.amin(0)).tolist())
+        yield f"{name}: {len(g)} Gaussians, {sides}"
+    if sheet:
+        write_jpeg(sheet, tile(pictures, min(5, len(pictures))), 88)
+
+
+def _from_mesh(path: Path, options: ObjectsOptions) -> Gaussians:
+    from stages.lab.assets.meshes import read_mesh
+
+    return read_mesh(path, options.count, options.up, options.light)
+
+
+def _mesh_name(path: Path) -> str:
+    """The file's name; what every file is called says nothing, so then its folder's."""
+    path = Path(path)
+    dull = path.stem.lower() in ("mesh", "model", "object", "scene", "textured") and path.resolve().parent.name
+    return path.resolve().parent.name if dull else path.stem

@@ -1,0 +1,86 @@
+"""Where the data set keeps a splat, and pictures for sheets that show many."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from stages.core.geometry.cameras import centres, intrinsics, look_at, orbit
+from stages.core.geometry.harmonics import rgb_to_sh
+from stages.core.geometry.neighbours import knn
+from stages.core.raster.rasterise import rasterise
+from stages.core.scene.files import replacing
+from stages.core.scene.gaussians import Gaussians, concatenate
+from stages.core.scene.images import resize
+from stages.core.scene.scene import Scene, SceneObject
+from stages.core.scene.scene_ply import write_scene
+from stages.render.overlay import caption
+
+PLY = "point_cloud/iteration_30000/point_cloud.ply"
+VIEWS, RESOLUTION = 100, 1280  # of cameras.json, as the data set renders
+PAPER = torch.tensor([0.955, 0.95, 0.94])  # behind the pictures
+
+
+def write_object(folder: Path, g: Gaussians, name: str, provenance: dict) -> None:
+    """FOLDER/point_cloud/iteration_30000/point_cloud.ply and FOLDER/cameras.json, an orbit around the object."""
+    ply = folder / PLY
+    ply.parent.mkdir(parents=True, exist_ok=True)
+    write_scene(ply, Scene(g, (SceneObject(1, name),), None, None, provenance=provenance))
+    with replacing(folder / "cameras.json") as part:
+        part.write_text(json.dumps(camera_rows(orbit(VIEWS, torch.zeros(3), 2.4, 20.0), RESOLUTION)))
+
+
+def camera_rows(viewmats: Float[Tensor, "c 4 4"], size: int) -> list[dict]:
+    """Cameras as 3D Gaussian Splatting lists them: rotation is camera-to-world, the principal point in the middle."""
+    rows = zip(viewmats[:, :3, :3].mT.tolist(), centres(viewmats).tolist(), strict=True)
+    return [
+        {"id": i, "img_name": f"{i:05d}", "width": size, "height": size, "position": position, "rotation": rotation,
+         "fx": 1.5 * size, "fy": 1.5 * size}
+        for i, (rotation, position) in enumerate(rows)
+    ]  # fmt: skip
+
+
+def portrait(g: Gaussians, elevation: float, label: str, size: int = 280) -> Float[Tensor, "h w 3"]:
+    """An object around the origin, as large as fits, on white ground with its shadow, from above view 0."""
+    side = float((g.means.amax(0) - g.means.amin(0)).max())
+    g = replace(g, means=g.means / side, scales=g.scales / side)
+    eye = 2.2 * _direction(elevation)
+    return _photo(concatenate([_ground(g), g]), eye, torch.zeros(3), size, size, 1.6 * size, label)
+
+
+def view_of_table(g: Gaussians, label: str) -> Float[Tensor, "h w 3"]:
+    """A background with its table whole, from a corner of the room."""
+    eye = torch.tensor([0.0, 0, -1.1]) + 6.9 * _direction(24.0, -52.0)
+    return _photo(g, eye, torch.tensor([0.0, 0, -1.1]), 340, 255, 330.0, label)
+
+
+def _direction(elevation: float, azimuth: float = -75.0) -> Float[Tensor, "3"]:
+    """Unit vector at angles in degrees."""
+    el, az = torch.deg2rad(torch.tensor([elevation, azimuth])).unbind()
+    return torch.stack([el.cos() * az.cos(), el.cos() * az.sin(), el.sin()])
+
+
+def _photo(g: Gaussians, eye: Tensor, target: Tensor, width: int, height: int, focal: float, label: str) -> Tensor:
+    """Drawn at twice the size, made smaller, and labelled."""
+    K = intrinsics(2 * width, 2 * height, 2 * focal)
+    drawn = rasterise(g, look_at(eye, target)[None], K[None], 2 * width, 2 * height, PAPER)
+    return caption(resize(drawn.rgb[0].clamp(0, 1), width, height), label)
+
+
+def _ground(g: Gaussians) -> Gaussians:
+    """Flat Gaussians under an object, dark where it stands near them, thinning out to nothing."""
+    step = 0.025
+    line = torch.arange(-1.3, 1.3, step)
+    flat = torch.nn.functional.pad(torch.cartesian_prod(line, line), (0, 1), value=float(g.means[:, 2].min()) - 0.004)
+    near = knn(g.means[::7].contiguous(), flat, 1)[0][:, 0]
+    rgb = PAPER * (1 - 0.55 * torch.exp(-near / 0.09))[:, None]
+    n = len(flat)
+    return Gaussians(
+        flat, torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1), torch.tensor([[0.02, 0.02, 0.001]]).repeat(n, 1),
+        0.97 * torch.exp(-((near / 0.6) ** 4)), rgb_to_sh(rgb), torch.zeros(n, dtype=torch.int64),
+    )  # fmt: skip

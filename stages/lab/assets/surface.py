@@ -1,0 +1,142 @@
+"""From painted fields to Gaussians: points spread evenly over the zero surface, light baked into their colour."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from stages.core.geometry.harmonics import C0, basis
+from stages.core.geometry.neighbours import knn
+from stages.core.scene.gaussians import Gaussians
+from stages.lab.assets.shapes import Surface, to_gaussians
+from stages.lab.assets.signed_distance import Field, Vec, union
+
+CELLS = 64  # of the coarse grid, along the longest side
+SKY, KEY = torch.tensor([0.0, 0.0, 1.0]), torch.nn.functional.normalize(torch.tensor([-0.35, -0.75, 0.85]), dim=0)
+LOBE = (1 / 14, 3 / 16, 5 / 21)  # Legendre coefficients of max(cos, 0)^6
+
+
+@dataclass(frozen=True)
+class Part:
+    """A piece of an object: its shape, its colour as a function of points (n, 3) -> RGB (n, 3), and its gloss."""
+
+    field: Field
+    paint: Callable[[Tensor], Tensor]
+    gloss: float = 0.0  # brightness added at the centre of the highlight
+
+
+def sculpt(parts: list[Part], half: Vec, n: int, smooth: float = 0.0, skin: float = 0.008) -> Gaussians:
+    """n flat Gaussians of SH degree 2 on the union of the parts, which lies within +-half; longest side about 1.
+
+    A point takes paint and gloss of the part it lies on; `skin` is less than half the thickness of any wall. Same
+    arguments, same Gaussians.
+    """
+    field = union(*(part.field for part in parts), smooth=smooth)
+    surface = evened(field, spread(field, half, n, skin))
+    p = surface.points
+    owner = torch.stack([part.field(p) for part in parts]).argmin(0)
+    rgb, gloss = torch.zeros(len(p), 3), torch.zeros(len(p))
+    for i, part in enumerate(parts):
+        own = owner == i
+        if own.any():
+            rgb[own], gloss[own] = part.paint(p[own]), part.gloss
+    light = shade(surface) * openness(field, surface)
+    flat = to_gaussians(surface, rgb * light[:, None], 1, width=0.62)
+    return normalised(replace(flat, sh=shine(flat.sh, surface.normals, gloss)))
+
+
+def normalised(g: Gaussians) -> Gaussians:
+    """Bounding box of the centres around the origin, its longest side 1."""
+    low, high = g.means.amin(0), g.means.amax(0)
+    side = (high - low).max()
+    return replace(g, means=(g.means - (low + high) / 2) / side, scales=g.scales / side)
+
+
+def slope(field: Field, p: Float[Tensor, "n 3"], step: float = 1e-3) -> tuple[Tensor, Tensor]:
+    """First-order distance to the surface (n,) and unit gradient (n, 3), by differences over a tetrahedron."""
+    corners = torch.tensor([[1.0, -1, -1], [-1, -1, 1], [-1, 1, -1], [1, 1, 1]])
+    values = torch.stack([field(p + step * corner) for corner in corners], 1)
+    gradient = values @ corners / (4 * step)
+    size = gradient.norm(dim=1).clamp_min(1e-3)
+    return values.mean(1) / size, gradient / size[:, None]
+
+
+def spread(field: Field, half: Vec, n: int, skin: float) -> Surface:
+    """n random points, evenly likely anywhere on the surface of a field whose slope is nowhere below 1/2 or above 2.
+
+    Points drawn in a thin skin around the surface are carried onto it along the gradient; only cells of a coarse
+    grid that the skin can reach are drawn from.
+    """
+    generator = torch.Generator().manual_seed(n)
+    cell = 2 * max(half) / CELLS
+    corners = torch.cartesian_prod(*(torch.arange(-h - cell, h + cell, cell) for h in half))
+    near = corners[field(corners + cell / 2).abs() < 2 * (0.87 * cell + skin)]  # 0.87: half the diagonal of a cell
+    found, count = [], 0
+    while count < n:
+        which = torch.randint(len(near), (4 * n,), generator=generator)
+        p = near[which] + cell * torch.rand(4 * n, 3, generator=generator)
+        p = p[field(p).abs() < 2 * skin]
+        distance, normal = slope(field, p)
+        found.append((p - distance[:, None] * normal)[distance.abs() < skin])
+        count += len(found[-1])
+    return settled(field, torch.cat(found)[:n])
+
+
+def settled(field: Field, p: Float[Tensor, "n 3"], steps: int = 2) -> Surface:
+    """Points near the surface carried onto it by Newton steps, with the normals where the last step began."""
+    for _ in range(steps):
+        distance, normal = slope(field, p)
+        p = p - distance.clamp(-0.01, 0.01)[:, None] * normal
+    return Surface(p, normal)
+
+
+def evened(field: Field, surface: Surface, rounds: int = 5) -> Surface:
+    """Points pushed off their near neighbours on the same side and back onto the surface, so that gaps close."""
+    for last in [False] * (rounds - 1) + [True]:
+        p, normal = surface.points, surface.normals
+        distance, index = knn(p, p, 8)
+        distance, index = distance[:, 1:], index[:, 1:]
+        reach = 1.1 * float(distance[:, 4].median())  # unlike a mean the same for any number of threads
+        push = (1 - distance / reach).clamp_min(0) * (normal[:, None] * normal[index]).sum(-1).clamp_min(0)
+        away = (p[:, None] - p[index]) / distance.clamp_min(1e-9)[..., None]
+        step = 0.35 * reach * (push[..., None] * away).sum(1)
+        step = step - (step * normal).sum(1, keepdim=True) * normal
+        surface = settled(field, p + step, 2 if last else 1)
+    return surface
+
+
+def shade(surface: Surface) -> Float[Tensor, "n"]:
+    """Soft light from above and a key light from the upper front left."""
+    n = surface.normals
+    return 0.66 + 0.16 * (n @ SKY) + 0.26 * (n @ KEY).clamp_min(0)
+
+
+def openness(field: Field, surface: Surface) -> Float[Tensor, "n"]:
+    """1 where nothing stands near, less in creases: how far the field falls short of the distance moved outward.
+
+    Source: Evans 2006, "Fast approximations for global illumination on dynamic scenes".
+    """
+    hidden = torch.zeros(len(surface.points))
+    for i, h in enumerate((0.015, 0.03, 0.06, 0.12)):
+        reached = field(surface.points + h * surface.normals)
+        hidden += (1 - reached / h).clamp(0, 1) * 0.5**i
+    return 1 - 0.42 * (hidden / 1.875).clamp(0, 1)
+
+
+def shine(sh: Float[Tensor, "n 1 3"], normals: Tensor, gloss: Float[Tensor, "n"]) -> Float[Tensor, "n 9 3"]:
+    """Coefficients of degree 2 that add a broad white highlight, the mirror image of the key light.
+
+    By the addition theorem a lobe f(cos) around direction r has coefficients f_l 4 pi / (2 l + 1) Y_lm(r), f_l being
+    its Legendre coefficients. Colours are looked up along the view ray, so r is the mirrored light, reversed.
+    """
+    mirrored = 2 * (normals @ KEY)[:, None] * normals - KEY
+    lit = gloss * ((normals @ KEY) * 2).clamp(0, 1)
+    weights = torch.tensor([f * 4 * torch.pi / (2 * l + 1) for l, f in enumerate(LOBE)])
+    lobe = basis(-mirrored, 2) * weights[torch.tensor([0, 1, 1, 1, 2, 2, 2, 2, 2])]
+    out = torch.nn.functional.pad(sh, (0, 0, 0, 8)) + (lit[:, None] * lobe)[..., None]
+    out[:, 0] -= (lit * LOBE[0] / C0)[:, None]  # the mean over all views stays that of the paint
+    return out

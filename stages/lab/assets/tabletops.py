@@ -1,0 +1,122 @@
+"""Scenes whose truth is known: the ten objects resting on the eight tables, apart or touching each other."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from stages.core.geometry.cameras import intrinsics, orbit
+from stages.core.geometry.harmonics import rotate_sh
+from stages.core.geometry.rotations import multiply, quaternion
+from stages.core.scene.cameras import Cameras
+from stages.core.scene.gaussians import Gaussians, concatenate
+from stages.core.scene.scene import Scene, SceneObject
+from stages.lab.assets.backgrounds import BACKGROUNDS, TOP, make_background
+from stages.lab.assets.objects import OBJECTS, make_object
+
+KINDS = ("apart", "touching")
+EACH = 5  # objects a scene, so that two scenes show all ten
+REACH = 1.5  # things stay this near the middle of the table [m]
+GAP = 0.12  # at least, between things that stand apart [m]
+CONTACT = 0.015  # between the nearest Gaussians of things that touch [m], about their spacing
+SAMPLE = 4000  # Gaussians of a thing that distances are measured between
+WIDTH, HEIGHT, FOCAL = 640, 480, 640.0  # of the photos [px]
+DISTANCE = 3.8  # of the cameras, as in the data set [m]
+
+
+def tabletop(kind: str, index: int, photos: int = 24) -> Scene:
+    """Scene `index` of a kind: five objects resting on a table, with their true object ids, and cameras.
+
+    Two scenes in a row show all ten objects; touching are the first three, and the last two.
+    """
+    rng = np.random.default_rng([KINDS.index(kind), index // 2])
+    names = list(rng.permutation(list(OBJECTS)))[EACH * (index % 2) :][:EACH]
+    rng = np.random.default_rng([KINDS.index(kind), index, 1])
+    clusters = [[name] for name in names] if kind == "apart" else [names[:3], names[3:]]
+    placed: list[Gaussians] = []
+    for cluster in clusters:
+        together = _huddle(rng, [_turned(_resting(name), rng.uniform(0, 2 * math.pi)) for name in cluster])
+        placed += _room_for(rng, together, placed)
+    numbered = [replace(g, object_id=torch.full((len(g),), i)) for i, g in enumerate(placed, start=1)]
+    table = make_background(list(BACKGROUNDS)[(2 * index + KINDS.index(kind)) % len(BACKGROUNDS)])
+    objects = tuple(SceneObject(i, str(name)) for i, name in enumerate(names, start=1))
+    return Scene(concatenate([table, *numbered]), objects, _cameras(photos), TOP)
+
+
+@cache
+def _resting(name: str) -> Gaussians:
+    """An object at its size, lying as it would: on the table, around the origin. A phone lies on its back."""
+    g = make_object(name)
+    s = OBJECTS[name].scale
+    g = replace(g, means=s * g.means, scales=s * g.scales)
+    if name == "phone":
+        g = _rotated(g, torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]))
+    low = float(g.means[:, 2].quantile(0.0005))  # a thread may hang lower
+    return _moved(g, torch.tensor([0.0, 0.0, TOP - low + 0.002]))
+
+
+def _rotated(g: Gaussians, R: Float[Tensor, "3 3"]) -> Gaussians:
+    quats = multiply(quaternion(R[None]).expand(len(g), 4), g.quats)
+    return replace(g, means=g.means @ R.mT, quats=quats, sh=rotate_sh(g.sh, R.expand(len(g), 3, 3)))
+
+
+def _turned(g: Gaussians, angle: float) -> Gaussians:
+    c, s = math.cos(angle), math.sin(angle)
+    return _rotated(g, torch.tensor([[c, -s, 0], [s, c, 0], [0, 0, 1.0]]))
+
+
+def _moved(g: Gaussians, offset: Float[Tensor, "3"]) -> Gaussians:
+    return replace(g, means=g.means + offset)
+
+
+def _points(g: Gaussians) -> np.ndarray:
+    return g.means[:: max(1, len(g) // SAMPLE)].double().numpy()
+
+
+def _huddle(rng: np.random.Generator, things: list[Gaussians]) -> list[Gaussians]:
+    """Each thing pushed along the table against those before it, from a random side, until they touch."""
+    out = things[:1]
+    for thing in things[1:]:
+        tree, mine = cKDTree(np.concatenate([_points(g) for g in out])), _points(thing)
+        angle = rng.uniform(0, 2 * math.pi)
+        way = np.array([math.cos(angle), math.sin(angle), 0.0])
+        far = 3.0
+        while (gap := tree.query(mine + far * way)[0].min()) > CONTACT:
+            far -= max(gap - CONTACT, 0.002)  # never into each other: no point comes nearer faster than this
+            if far < -3.0:
+                raise ValueError("two things pass by each other")
+        out = [*out, _moved(thing, torch.tensor(far * way).float())]
+    return out
+
+
+def _room_for(rng: np.random.Generator, things: list[Gaussians], others: list[Gaussians]) -> list[Gaussians]:
+    """The things, moved together to where all is on the table and far enough from others; they come back as they
+    were but for that shift."""
+    mine = np.concatenate([_points(g)[:, :2] for g in things])
+    mine_at = mine.mean(0)
+    tree = cKDTree(np.concatenate([_points(g)[:, :2] for g in others])) if others else None
+    for attempt in range(4000):
+        shift = rng.uniform(-REACH, REACH, 2) - mine_at
+        wide = REACH * (1 + attempt / 8000)
+        if np.linalg.norm(mine + shift, axis=1).max() > wide:
+            continue
+        if tree is None or tree.query(mine + shift)[0].min() > GAP:
+            return [_moved(g, torch.tensor([*shift, 0.0]).float()) for g in things]
+    raise ValueError("the table is too small")
+
+
+def _cameras(count: int) -> Cameras:
+    """Two rings of views, a low one and a high one."""
+    low = count * 3 // 5
+    centre = torch.tensor([0.0, 0.0, TOP + 0.2])
+    rings = [orbit(low, centre, DISTANCE, 22.0), orbit(count - low, centre, DISTANCE, 48.0, azimuth=127.0)]
+    K = intrinsics(WIDTH, HEIGHT, FOCAL).expand(count, 3, 3).clone()
+    names = tuple(f"{i:02d}.jpg" for i in range(count))
+    return Cameras(torch.cat(rings), K, torch.tensor([[WIDTH, HEIGHT]] * count), names)

@@ -1,0 +1,137 @@
+"""What each choice of our force field is worth: it is trained without it, as long and on the same data.
+
+RESULTS.json holds the scores on scenes that were not learned from, and RESULTS.md the table. Choices that are there
+already, measured in the same way, are left as they are.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import tempfile
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from datetime import datetime, timezone
+from pathlib import Path
+
+import torch
+
+from stages.core.backends import pick_device
+from stages.core.errors import InputError
+from stages.core.scene.files import replacing
+from stages.lab.bench import common as bench
+from stages.lab.dataset.motions import Motions
+from stages.lab.dataset.scenes import OTHERS, groups_of
+from stages.lab.training.ablation import CHOICES, Choice
+from stages.lab.training.data import UNSEEN, Pieces, read_groups, split
+from stages.lab.training.distributed import Team
+from stages.lab.training.state import Trainee
+from stages.lab.training.train import FRAMES, Job, TrainOptions, validate
+
+log = logging.getLogger(__name__)
+METRICS = ("RMSE", "FPE", "R")
+CHECKS = 6  # of the weights, in one training: the best are scored
+
+
+@dataclass(frozen=True)
+class BenchOptions:
+    """How long each is trained, and on what."""
+
+    steps: int = 1500
+    batch: int = 64
+    keypoints: int = 256
+    horizons: str = "8,20"
+    groups: str = "3_0..3_8"  # to learn from; the last 100 scenes choose the best weights
+    test: str = "3_9"  # group that is scored
+    compiled: bool = False
+    seed: int = 0
+    device: str = "auto"
+
+    def training(self) -> TrainOptions:
+        return TrainOptions(
+            steps=self.steps, batch=self.batch, keypoints=self.keypoints, horizons=self.horizons, loss="axes",
+            groups=self.groups, compiled=self.compiled, seed=self.seed, device=self.device, checks=CHECKS,
+        )  # fmt: skip
+
+
+def run(data: Path, out: Path, options: BenchOptions = BenchOptions(), only: str = "") -> Iterator[str]:
+    """Train without each choice in turn, or without those of `only` (names with commas); a line about each."""
+    names = [name.strip() for name in only.split(",")] if only else list(CHOICES)
+    unknown = [name for name in names if name not in CHOICES]
+    if unknown:
+        raise InputError(f"--only {', '.join(unknown)}: choose from {', '.join(CHOICES)}")
+    base, device = options.training(), pick_device(options.device)
+    asked = {k: v for k, v in asdict(options).items() if k != "device"}
+    facts = _before(Path(out), asked) or {"options": asked, "machine": bench.machine(device), "rows": {}}
+    for name in names:
+        if name not in facts["rows"]:
+            facts["rows"][name] = _measured(CHOICES[name], data, base, groups_of(options.test, more=OTHERS), device)
+            facts["rows"] = {k: facts["rows"][k] for k in CHOICES if k in facts["rows"]}
+            facts["date"] = datetime.now(timezone.utc).date().isoformat()
+            _write(Path(out), facts)
+        yield _line(name, facts["rows"][name])
+
+
+def _measured(choice: Choice, data: Path, base: TrainOptions, test: list[str], device: str) -> dict:
+    """Scores after training."""
+    options = choice.options(base)
+    known, unseen = split(read_groups(data, groups_of(options.groups, more=OTHERS), options.keypoints), UNSEEN)
+    scenes = read_groups(data, test, options.keypoints)
+    torch.manual_seed(options.seed)
+    trainee = Trainee(choice.network().to(device), options.lr, options.seed)
+    with tempfile.TemporaryDirectory() as folder:
+        pieces = [Pieces(known, device, trainee.model)]
+        job = Job(trainee, pieces, unseen.to(device), options, Team(device=device), Path(folder) / "weights", {})
+        if not job.run():
+            raise InputError("stopped; choices measured so far are kept, the same command goes on with the next")
+    found = validate(trainee.best_model(), scenes.to(device))
+    return {"without": choice.without, **{k: float(f"{found[k]:.4g}") for k in METRICS}, "scenes": len(scenes),
+            "frames": _frames(scenes), "minutes": float(f"{trainee.elapsed / 60:.3g}"),
+            "parameters": sum(p.numel() for p in trainee.params)}  # fmt: skip
+
+
+def _frames(scenes: Motions) -> int:
+    return min(FRAMES, scenes.points.shape[1])
+
+
+def _before(out: Path, options: dict) -> dict | None:
+    """What an earlier run has measured in the same way."""
+    if not out.exists():
+        return None
+    try:
+        facts = json.loads(out.read_text())
+        same, _ = facts["options"] == options, facts["rows"].items()
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InputError(f"{out}: holds no results of `ngff-lab bench ablation` ({error!r}); name another") from error
+    if not same:
+        raise InputError(f"{out}: was measured with {facts['options']}; take the same options, or another file")
+    return facts
+
+
+def _write(out: Path, facts: dict) -> None:
+    with replacing(out) as part:
+        part.write_text(json.dumps(facts, indent=1) + "\n")
+    with replacing(out.with_suffix(".md")) as part:
+        part.write_text("\n".join(markdown(facts)) + "\n")
+
+
+def markdown(facts: dict) -> Iterator[str]:
+    """The table."""
+    o, rows = facts["options"], facts["rows"]
+    first = next(iter(rows.values()))
+    yield "# What each choice is worth"
+    yield ""
+    yield (f"`ngff-lab bench ablation`, {facts['machine']}, {facts['date']}. Each row is trained from nothing for "
+           f"{o['steps']:,} steps of {o['batch']} scenes, {o['keypoints']} keypoints an object, horizons "
+           f"{o['horizons']}, on {o['groups']}, and scored on {first['scenes']} scenes of {o['test']}, "
+           f"{first['frames']} frames from rest: a short training, to compare choices, not to reach the end.")
+    yield ""
+    yield "| without | RMSE / FPE / R | RMSE, times that of the full network |"
+    yield "| --- | --- | --- |"
+    for row in rows.values():
+        more = f"{row['RMSE'] / rows['full']['RMSE']:.2f}" if "full" in rows else ""
+        yield f"| {row['without']} | {row['RMSE']:.4f} / {row['FPE']:.3f} / {row['R']:.3f} | {more} |"
+
+
+def _line(name: str, row: dict) -> str:
+    return f"{name:12} RMSE {row['RMSE']:.4f}  FPE {row['FPE']:.4f}  R {row['R']:.3f}  without {row['without']}"

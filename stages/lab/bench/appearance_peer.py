@@ -1,0 +1,107 @@
+"""gsplat's default training recipe: what its published simple_trainer does when started without options.
+
+The loop is ours, with gsplat's rasteriser and DefaultStrategy inside: Gaussians start at the sparse points, of opacity
+0.1 and as wide as the distance to their three neighbours; harmonics gain a degree every 1,000 steps, up to 3; Gaussians
+multiply every 100 steps from 500 to 15,000; the rate of the means falls to a hundredth over 30,000 steps. A run of
+fewer steps scales all of these numbers alike, as the trainer's steps_scaler does. Structural similarity is our own,
+which both recipes use. The strategy is taken as it is: in 1.5.3 it never resets opacities, as `0 & step > 0` is false.
+Source: Ye et al. 2025, "gsplat: an open-source library for Gaussian splatting", and its examples at version 1.5.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor
+from tqdm import tqdm
+
+from stages.core.geometry.cameras import centres
+from stages.core.geometry.harmonics import rgb_to_sh
+from stages.core.geometry.neighbours import spacing
+from stages.core.kernels.splat.ssim import ssim
+from stages.core.scene.gaussians import Gaussians
+from stages.reconstruct.photos import Views
+
+FULL = 30_000  # steps of the published schedule, to which these belong:
+SCHEDULE = {"refine_start_iter": 500, "refine_stop_iter": 15_000, "reset_every": 3000, "refine_every": 100}
+DEGREE_EVERY = 1000
+RATES = {"means": 1.6e-4, "scales": 5e-3, "quats": 1e-3, "opacities": 5e-2, "sh0": 2.5e-3, "shN": 2.5e-3 / 20}
+STRUCTURE = 0.2  # weight of 1 - SSIM against L1
+
+
+def train(
+    views: Views,
+    points: Float[Tensor, "m 3"],
+    colours: Float[Tensor, "m 3"],
+    steps: int,
+    device: str = "cuda",
+    draw: Callable | None = None,
+    going: Callable[[int], bool] = lambda done: True,
+    seed: int = 0,
+) -> tuple[Gaussians, int]:
+    """Gaussians after a schedule of `steps`, one photo each, and the steps done: fewer if `going` (on) says no.
+
+    `draw` stands for gsplat.rasterization.
+    """
+    from gsplat import DefaultStrategy, rasterization
+
+    torch.manual_seed(seed)  # the strategy draws from PyTorch's own generator
+    draw, share = draw or rasterization, steps / FULL
+    eyes = centres(views.cameras.viewmats)
+    size = 1.1 * float((eyes - eyes.mean(0)).norm(dim=1).max())
+    values = start(points, colours, device)
+    optimisers = {
+        name: torch.optim.Adam([value], lr=RATES[name] * (size if name == "means" else 1), eps=1e-15, fused=True)
+        for name, value in values.items()
+    }
+    strategy = DefaultStrategy(**{name: max(1, int(count * share)) for name, count in SCHEDULE.items()})
+    strategy.check_sanity(values, optimisers)
+    state = strategy.initialize_state(scene_scale=size)
+    photos = [image.to(device) for image in views.images]
+    viewmats, Ks = views.cameras.viewmats.to(device), views.cameras.Ks.to(device)
+    order: list[int] = []
+    for step in tqdm(range(steps), desc="gsplat's recipe", unit="step", leave=False):
+        if not going(step):
+            return finished(values), step
+        order = order or torch.randperm(len(views)).tolist()
+        i, degree = order.pop(), min(3, int(step / (DEGREE_EVERY * share)))
+        photo = photos[i].float() / 255
+        image, _, info = draw(
+            values["means"], values["quats"], values["scales"].exp(), values["opacities"].sigmoid(),
+            torch.cat([values["sh0"], values["shN"]], 1), viewmats[[i]], Ks[[i]], photo.shape[1], photo.shape[0],
+            sh_degree=degree, packed=False,
+        )  # fmt: skip
+        strategy.step_pre_backward(values, optimisers, state, step, info)
+        loss = (1 - STRUCTURE) * (image[0] - photo).abs().mean() + STRUCTURE * (1 - ssim(image[0], photo))
+        loss.backward()
+        for optimiser in optimisers.values():
+            optimiser.step()
+            optimiser.zero_grad(set_to_none=True)
+        optimisers["means"].param_groups[0]["lr"] *= 0.01 ** (1 / steps)
+        strategy.step_post_backward(values, optimisers, state, step, info)
+    return finished(values), steps
+
+
+def start(points: Float[Tensor, "m 3"], colours: Float[Tensor, "m 3"], device: str) -> dict[str, torch.nn.Parameter]:
+    """What is optimised: a parameter for each rate."""
+    n = len(points)
+    values = {
+        "means": points,
+        "scales": spacing(points).log()[:, None].repeat(1, 3),
+        "quats": torch.rand(n, 4),
+        "opacities": torch.full((n,), 0.1).logit(),
+        "sh0": rgb_to_sh(colours),
+        "shN": torch.zeros(n, 15, 3),
+    }
+    return {name: torch.nn.Parameter(value.to(device)) for name, value in values.items()}
+
+
+def finished(values: dict[str, torch.nn.Parameter]) -> Gaussians:
+    v = {name: value.detach().cpu() for name, value in values.items()}
+    return Gaussians(
+        v["means"], F.normalize(v["quats"], dim=1), v["scales"].exp(), v["opacities"].sigmoid(),
+        torch.cat([v["sh0"], v["shN"]], 1), torch.zeros(len(v["means"]), dtype=torch.int64),
+    )  # fmt: skip

@@ -1,0 +1,252 @@
+"""How well trained models predict motion they have not seen: the published table, on the regenerated data set.
+
+    spatial            scenes of group 3_9: new arrangements of objects that were learned from, 80 frames
+    temporal           300 scenes of the training groups, for 100 frames
+    4, 6 objects       more objects than the 3 that were learned from, 80 frames
+    held-out objects   scenes of objects that were never learned from (`ngff-lab heldout`), 80 frames
+
+Beside the models stand rows that need no training: a fall without learning, the truth with its starts moved by 1 mm
+(how predictable the world is), the best that rigid bodies could do, and MPM with materials as a vision-language model
+saw them. RESULTS.json holds everything; RESULTS.md and RESULTS.png are drawn from it.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from datetime import datetime, timezone
+from pathlib import Path
+
+import torch
+from tqdm import tqdm
+
+from stages.core.backends import pick_device
+from stages.core.errors import InputError
+from stages.core.models import checkpoints as weights
+from stages.core.models.dynamics import Dynamics
+from stages.core.models.rollout import Stepper, frames
+from stages.core.scene.files import must_exist, replacing
+from stages.evaluate.dynamics import all_metrics, error_over_time
+from stages.lab.assets.heldout_shapes import KINDS
+from stages.lab.assets.objects import OBJECTS
+from stages.lab.bench import common as bench
+from stages.lab.bench.dynamics_report import PUBLISHED, report, table
+from stages.lab.bench.dynamics_rows import Predict, Resimulation, common, fall, rigid, same_scenes
+from stages.lab.dataset.motions import Motions
+from stages.lab.training.data import home, read_groups
+
+log = logging.getLogger(__name__)
+TRAINED = tuple(f"3_{i}" for i in range(9))
+SPLITS = {
+    "spatial": (("3_9",), 80), "temporal": (TRAINED, 100), "4 objects": (("4",), 80), "6 objects": (("6",), 80),
+    "held-out objects": (("heldout",), 80),
+}  # fmt: skip
+SAMPLE = 300  # scenes of the temporal split
+TIMED = 100  # steps of one scene whose time is taken
+STRIDE = 8  # frames between the values of an object's curve
+SAME = ("machine", "keypoints", "scenes", "frames")  # in what results must agree to stand in one table
+METRICS = ("MSE", "RMSE", "FPE", "PCE", "R", "R_pooled")
+FALL, NUDGED, RIGID, MPM = "no learning", "truth, starts moved 1 mm", "truth, best rigid fit", "mpm-estimated"
+NAMES = {kind.id: name for name, kind in (*OBJECTS.items(), *KINDS.items())}
+
+
+@dataclass(frozen=True)
+class BenchOptions:
+    """Which scenes."""
+
+    keypoints: int = 256  # of an object; a model sees no more than it learned from
+    limit: int = 0  # scenes of each split; 0: all
+    mpm: int = 100  # scenes of each split for mpm-estimated, which has to simulate them; 0: leave that row out
+    batch: int = 100  # scenes at once
+    seed: int = 0  # of the temporal sample
+    device: str = "auto"
+
+    def __post_init__(self):
+        if self.keypoints < 1 or self.batch < 1 or min(self.limit, self.mpm) < 0:
+            raise InputError("--keypoints must be positive, --limit and --mpm at least 0")
+
+
+def again(results: Path) -> list[str]:
+    """The table and the plots from results of an earlier run."""
+    must_exist(results, "results of `ngff-lab bench dynamics` (.json)")
+    try:
+        facts = json.loads(Path(results).read_text())
+        report(Path(results), facts)
+        return table(facts)
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InputError(f"{results}: holds no results of `ngff-lab bench dynamics` ({error!r})") from error
+
+
+def run(
+    data: Path, folder: Path, out: Path, options: BenchOptions = BenchOptions(), nudged: Path | None = None
+) -> list[str]:
+    """Every NAME.safetensors of a folder, and the rows that need none, on every split that the data set has.
+
+    `nudged` is a second data set of the same scenes, with every start moved by a millimetre. OUT.json is written, and
+    beside it OUT.md and OUT.png; what is returned are the lines of the table. Rows of an earlier OUT.json that are not
+    measured now stay, if it measured on the same machine and the same scenes.
+    """
+    files = sorted(Path(folder).glob("*.safetensors"), key=lambda f: (f.stem == "ngff", f.stem))  # ours comes last
+    if not files:
+        raise InputError(f"{folder}: holds no weights (.safetensors); make some with `ngff-lab train`")
+    before = _earlier(Path(out))
+    device = pick_device(options.device)
+    splits = {name: scenes_of(data, name, options).to(device) for name in SPLITS if _there(data, name)}
+    if not splits:
+        scenes_of(data, "spatial", options)  # says what is missing
+    rows = {FALL: {"splits": {name: measured(fall, m, options.batch) for name, m in splits.items()}}}
+    if nudged is not None:
+        rows[NUDGED] = {"splits": dict(_again_made(nudged, splits, options))}
+    rows[RIGID] = {"splits": {name: measured(rigid, m, options.batch) for name, m in splits.items()}}
+    if options.mpm:
+        rows[MPM] = _mpm(data, splits, options, device)
+    for file in tqdm(files, desc="models", unit="model"):
+        rows[file.stem] = _model(file, splits, options, device)
+        log.info("%s: RMSE %s", file.stem, ", ".join(f"{r['RMSE']} {n}" for n, r in rows[file.stem]["splits"].items()))
+    facts = {
+        "machine": bench.machine(device), "date": datetime.now(timezone.utc).date().isoformat(),
+        "keypoints": options.keypoints, "scenes": {n: len(m) for n, m in splits.items()},
+        "frames": {n: m.points.shape[1] for n, m in splits.items()}, "frames between values by object": STRIDE,
+        "rows": rows,
+        "published, on other data": PUBLISHED,
+    }  # fmt: skip
+    if all(before.get(key) == facts[key] for key in SAME):
+        facts["rows"] = {**before["rows"], **rows}
+    with replacing(Path(out)) as part:
+        part.write_text(_compact(facts))
+    report(Path(out), facts)
+    return table(facts)
+
+
+def _earlier(out: Path) -> dict:
+    """Results that are already there."""
+    if not out.is_file():
+        return {}
+    try:
+        before = json.loads(out.read_text())
+        return {key: before[key] for key in ("rows", *SAME)}
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{out}: holds no results of `ngff-lab bench dynamics` ({error!r})") from error
+
+
+def _there(data: Path, split: str) -> bool:
+    """Whether all groups of a split have been made; a split that is not measured is told of."""
+    missing = [g for g in SPLITS[split][0] if not (home(data) / f"{g}.h5").is_file()]
+    if missing:
+        log.warning("%s is not measured: %s has no %s", split, data, ", ".join(missing))
+    return not missing
+
+
+def scenes_of(data: Path, split: str, options: BenchOptions) -> Motions:
+    """The scenes of a split, no longer than it is measured."""
+    groups, frames = SPLITS[split]
+    motions = read_groups(data, groups, options.keypoints)
+    count = min(len(motions), options.limit or len(motions))
+    if split == "temporal":
+        count = min(count, SAMPLE)
+        rows = torch.randperm(len(motions), generator=torch.Generator().manual_seed(options.seed))[:count]
+    else:
+        rows = torch.arange(count)
+    return replace(motions[rows], points=motions.points[rows, :frames])
+
+
+def _again_made(nudged: Path, splits: dict[str, Motions], options: BenchOptions) -> Iterator[tuple[str, dict]]:
+    """The nudged scenes against the true ones, split by split."""
+    for split, motions in splits.items():
+        if _there(nudged, split):
+            made = read_groups(nudged, SPLITS[split][0], options.keypoints)
+            yield split, _compared(made, motions, options.batch)
+
+
+def _compared(made: Motions, motions: Motions, batch: int) -> dict:
+    """Scenes made otherwise against the true ones; those that went wrong are counted, and left out."""
+    both = common(motions, made)
+    if not len(both):
+        raise InputError("none of the scenes was made again: the names of the two data sets differ")
+    return {**measured(same_scenes(made, motions.points.shape[1]), both, batch), "scenes left out":
+            len(motions) - len(both)}  # fmt: skip
+
+
+def _mpm(data: Path, splits: dict[str, Motions], options: BenchOptions, device: str) -> dict:
+    """MPM with estimated materials; of objects that the paper has no estimates for, nothing."""
+    row: dict = {"splits": {}}
+    for split, motions in splits.items():
+        if not set(motions.objects.unique().tolist()) - {-1} <= {kind.id for kind in OBJECTS.values()}:
+            continue
+        again = Resimulation(data, list(SPLITS[split][0]), device)
+        some = motions[: min(options.mpm, len(motions))]
+        made = again(some.names, some.points.shape[1], options.keypoints)
+        row["splits"][split] = _compared(made, some, options.batch)
+        if device != "cpu" and "seconds" not in row:  # on a CPU it would take as long as everything else
+            row["seconds"] = _digits(again.seconds(some.names[0], TIMED), 3)
+    return row
+
+
+def _model(file: Path, splits: dict[str, Motions], options: BenchOptions, device: str) -> dict:
+    model, card = weights.load(file, device)
+    learned = card.get("options", {}).get("keypoints", options.keypoints)  # more of them it has never seen
+    splits = {n: replace(m, points=m.points[..., :learned, :]) for n, m in splits.items()}
+    with torch.inference_mode():
+        results = {n: measured(_rolled(model), m, options.batch) for n, m in splits.items()}
+        seconds = _seconds(model, next(iter(splits.values())), device)
+    about = {k: card[k] for k in ("model", "config", "scenes", "device", "sha256") if k in card}
+    if "minutes" in card:
+        about["minutes"] = _digits(weights.minutes(card))
+    parameters = sum(p.numel() for p in model.parameters())
+    keypoints = min(learned, options.keypoints)
+    return {"splits": results, "seconds": seconds, "keypoints": keypoints, "parameters": parameters, "card": about}
+
+
+def _rolled(model: Dynamics) -> Predict:
+    return lambda some: model.rollout(some.world(), some.points.shape[1], some.dt)
+
+
+def _seconds(model: Dynamics, motions: Motions, device: str) -> float:
+    """Wall time of TIMED steps of one scene, as the command rolls it out [s], without what is recorded once."""
+    one = motions[:1].world()
+    stepper = Stepper(model, one, motions.dt)
+
+    def again() -> None:
+        stepper.restart(one)
+        frames(stepper, TIMED + 1)
+
+    return _digits(bench.seconds(again, device, 3), 3)
+
+
+def measured(predict: Predict, motions: Motions, batch: int) -> dict:
+    """Metrics averaged over the scenes; curves of the error [m] by frame, and by frame for each kind of object.
+
+    A rollout that is not finite has no RMSE, and an R of 0: it is not left out.
+    """
+    metrics, errors = [], []
+    for first in tqdm(range(0, len(motions), batch), unit="batch", leave=False):
+        some = motions[first : first + batch]
+        valid, predicted = some.world().valid, predict(some)
+        metrics.append(all_metrics(predicted, some.points, valid))
+        errors.append(error_over_time(predicted, some.points, valid))
+    each = {k: torch.cat([m[k] for m in metrics]) for k in METRICS}
+    lost = ~each["RMSE"].isfinite()
+    correlated = {k: torch.where(lost, 0.0, each[k]).nanmean() for k in ("R", "R_pooled")}  # none where nothing moves
+    error, kind, present = torch.cat(errors), motions.objects, motions.present
+    by_frame = error.transpose(0, 1)[:, present].mean(1)
+    by_object = {NAMES.get(int(i), f"object {int(i)}"): error[:, ::STRIDE].transpose(0, 1)[:, kind == i].mean(1)
+                 for i in kind[present].unique()}  # fmt: skip
+    return {
+        **{k: _digits(float(correlated.get(k, each[k].mean()))) for k in METRICS}, "scenes not finite": int(lost.sum()),
+        "error by frame": [_digits(e, 3) for e in by_frame.tolist()],
+        "error by object": {name: [_digits(e, 3) for e in curve.tolist()] for name, curve in by_object.items()},
+    }  # fmt: skip
+
+
+def _digits(x: float, count: int = 4) -> float | None:
+    """As many significant digits; None for what is not finite: JSON knows no such numbers."""
+    return float(f"{x:.{count}g}") if abs(x) < float("inf") else None
+
+
+def _compact(facts: dict) -> str:
+    """JSON with every list of numbers in one line."""
+    text = json.dumps(facts, indent=1)
+    return re.sub(r"\[[^][{}]*\]", lambda found: json.dumps(json.loads(found[0])), text) + "\n"

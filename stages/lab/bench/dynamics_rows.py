@@ -1,0 +1,144 @@
+"""What stands beside trained models: rows of the table that need the truth, the solver, or nothing at all.
+
+Every one of them is a function from some scenes to keypoints in all of their frames.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import h5py
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from stages.core.errors import InputError
+from stages.core.geometry.rotations import nearest
+from stages.core.models.initial_conditions import World
+from stages.lab.assets.objects import OBJECTS
+from stages.lab.bench import common as bench
+from stages.lab.dataset.motions import Motions, joined
+from stages.lab.dataset.particles import Asset, Fineness, assets
+from stages.lab.dataset.scenes import Config, read_configs
+from stages.lab.dataset.simulation import simulate
+from stages.lab.training.data import home
+
+log = logging.getLogger(__name__)
+Predict = Callable[[Motions], Float[Tensor, "s t o n 3"]]
+# E [Pa] and density [kg/m^3] of the objects of GSCollision as the paper's vision-language model estimated them
+ESTIMATED = {
+    "ball": (573343.68, 1300.0), "bowl": (859029.80, 1200.0), "can": (19714313.88, 1060.0), "cloth": (2257.12, 100.0),
+    "duck": (4828.29, 1100.0), "miku": (2114.27, 150.0), "panda": (2114.27, 150.0), "phone": (2e7, 2700.0),
+    "pillow": (2000.0, 50.0), "rope": (573343.68, 1000.0),
+}  # fmt: skip
+
+
+def fall(some: Motions) -> Float[Tensor, "s t o n 3"]:
+    """No learning: objects fall as they stand."""
+    return free_fall(some.world(), some.points.shape[1], some.dt)
+
+
+def free_fall(world: World, frames: int, dt: float) -> Float[Tensor, "b t o n 3"]:
+    """Objects fall as they stand until their lowest keypoint is on the floor, and lie there."""
+    time = dt * torch.arange(frames, dtype=world.points.dtype, device=world.points.device)
+    fallen = -world.gravity[:, None, None, 2] * time[:, None].square() / 2
+    height = world.points[..., 2].masked_fill(~world.valid, torch.inf).amin(2) - world.floor
+    fallen = torch.minimum(fallen, height.clamp_min(0)[:, None])
+    points = world.points[:, None].repeat(1, frames, 1, 1, 1)
+    points[..., 2] -= fallen[..., None]
+    return points.masked_fill(~world.valid[:, None, ..., None], 0.0)
+
+
+def rigid(some: Motions) -> Float[Tensor, "s t o n 3"]:
+    """The truth with every object replaced, in every frame, by its shape at rest in the pose that fits best.
+
+    No model of rigid bodies can come nearer. Source of the fit: Kabsch 1976, A32, 922.
+    """
+    return rigid_fit(some.points, some.present[..., None].expand(some.points[:, 0, ..., 0].shape))
+
+
+def rigid_fit(
+    points: Float[Tensor, "s t o n 3"], valid: Bool[Tensor, "s o n"]
+) -> Float[Tensor, "s t o n 3"]:
+    weight = valid / valid.sum(-1, keepdim=True).clamp_min(1)
+    centre = torch.einsum("son,stoni->stoi", weight, points)[..., None, :]
+    arm = (points - centre)[:, 0]
+    moment = torch.einsum("son,stoni,sonj->stoij", weight, points - centre, arm)
+    fitted = centre + torch.einsum("stoij,sonj->stoni", nearest(moment), arm)
+    return fitted.masked_fill(~valid[:, None, ..., None], 0.0)
+
+
+def same_scenes(made: Motions, frames: int) -> Predict:
+    """Motions of the same scenes, made otherwise, looked up by name."""
+    row = {name: i for i, name in enumerate(made.names)}
+
+    def predict(some: Motions) -> Tensor:
+        _, t, o, n, _ = some.points.shape
+        if made.points.shape[1] < frames or made.points.shape[2] < o or made.points.shape[3] < n:
+            raise InputError(f"{some.names[0]}: was made again with fewer frames, objects or keypoints than it has")
+        return made.points[[row[name] for name in some.names], :t, :o, :n].to(some.points)
+
+    return predict
+
+
+def common(motions: Motions, made: Motions) -> Motions:
+    """The scenes that are in both."""
+    there = set(made.names)
+    return motions[torch.tensor([i for i, name in enumerate(motions.names) if name in there], dtype=torch.int64)]
+
+
+def estimated(things: Mapping[int, Asset]) -> dict[int, Asset]:
+    """The objects with Young's moduli and densities as the paper's vision-language model saw them."""
+    names = {kind.id: name for name, kind in OBJECTS.items()}
+    return {i: replace(a, E=ESTIMATED[names[i]][0], density=ESTIMATED[names[i]][1]) for i, a in things.items()}
+
+
+class Resimulation:
+    """Scenes of a data set simulated again with estimated materials, all else being equal."""
+
+    def __init__(self, data: Path, groups: list[str], device: str):
+        self.device, self.configs = device, {}
+        folder = home(data).parent if home(data).name == "motions" else Path(data)
+        made = _options(home(data) / f"{groups[0]}.h5")
+        for group in groups:
+            if not (home(data) / f"{group}.h5").is_file():
+                continue
+            if _options(home(data) / f"{group}.h5") != made:
+                raise InputError(f"{data}: {group} and {groups[0]} were made at different finenesses; make them alike")
+            self.configs.update(read_configs(folder / "scene_configs" / f"{group}.json"))
+        self.fineness = Fineness(made["dx"], made["spacing"], made["substep"])
+        self.things = estimated(assets(self.fineness, made["keypoints"], folder / "particles.npz"))
+
+    def __call__(self, names: tuple[str, ...], frames: int, keypoints: int) -> Motions:
+        """Scenes that went wrong are missing."""
+        return joined(list(self._parts({name: self._config(name) for name in names}, frames, keypoints)))
+
+    def seconds(self, name: str, steps: int) -> float:
+        """Wall time of one scene alone [s], the making of the solver included, once it is compiled."""
+        one = {name: self._config(name)}
+        list(self._parts(one, 3, 1))
+        return bench.seconds(lambda: list(self._parts(one, steps + 1, 1)), self.device, 1)
+
+    def _parts(self, configs: dict[str, Config], frames: int, keypoints: int) -> Iterator[Motions]:
+        for part in simulate(configs, self.things, self.fineness, frames, keypoints, self.device):
+            yield part.to("cpu")
+
+    def _config(self, name: str) -> Config:
+        if name not in self.configs:
+            raise InputError(f"{name}: no such scene in scene_configs; make configurations and motions together")
+        return self.configs[name]
+
+
+def _options(path: Path) -> dict:
+    """How finely a group was simulated, as its file says."""
+    with h5py.File(path, "r") as file:
+        options = json.loads(file.attrs.get("provenance", "{}")).get("options", {})
+    try:
+        return {k: options[k] for k in ("dx", "spacing", "substep", "keypoints")}
+    except KeyError as error:
+        raise InputError(f"{path}: does not say how it was simulated (no {error.args[0]}); leave mpm-estimated "
+                         "out with --mpm 0, or make the data again") from error  # fmt: skip

@@ -1,0 +1,169 @@
+"""What things in a video are made of, as a vision-language model sees it: the materials of the VLM-MPM baseline.
+
+The idea is the paper's: frames of a video are shown to the model, which answers with a Young's modulus and a density
+for each object, and MPM simulates with them. The words of the prompt are ours.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+from tqdm import tqdm
+
+from stages.core.errors import InputError
+from stages.core.scene.files import provenance, replacing
+from stages.core.scene.images import read_video, resize, video_info, write_jpeg
+from stages.core.scene.scene_ply import read_scene
+from stages.lab.bench.chat import Endpoint, picture
+
+log = logging.getLogger(__name__)
+RANGES = {"E": (1e2, 1e12), "density": (5.0, 25_000.0)}  # from foams and gels to metals [Pa] [kg/m^3]
+UNITS = {"E": "Pa", "density": "kg/m^3"}
+PROMPT = """\
+These {frames} frames, evenly spaced in time, are from one video of things that fall, collide and deform. {which}
+
+For each of them estimate what a physics simulator needs. The simulator treats an object as one homogeneous elastic \
+solid in its outer shape, so give effective values of the whole thing: a hollow can is lighter and softer than its \
+metal, a stuffed toy far softer than its fibres. Judge by what the thing looks like, how far it dents, bends and \
+bounces, and what such things usually are.
+
+- "material": a word or two on what it is made of
+- "E": Young's modulus in Pa, a plain number from {E[0]:g} to {E[1]:g} (pillow about 1e4, rubber duck 3e5, hard \
+plastic 2e7)
+- "density": mass over the volume of the outer shape in kg/m^3, a plain number from {density[0]:g} to {density[1]:g}
+
+Answer with nothing but one JSON object, one entry for each thing, for example
+{{"{example}": {{"material": "soft rubber", "E": 3e5, "density": 300}}}}"""
+
+
+@dataclass(frozen=True)
+class EstimateOptions:
+    """What is shown, and how often an unfit answer is sent back."""
+
+    objects: str = ""  # names with commas between, or a scene.ply that has them; empty: the model finds names
+    model: str = ""  # by default OPENAI_MODEL
+    timeout: float = 120.0  # [s]
+    frames: int = 10
+    longest: int = 512  # side of a frame as shown [px]
+    tries: int = 3
+
+
+class Unfit(ValueError):
+    """An answer that cannot be used; says why in words that the model can act on."""
+
+
+def run(video: Path, out: Path, options: EstimateOptions = EstimateOptions()) -> list[str]:
+    """Write OUT for `ngff simulate --materials OUT`, and beside it who said so; a line about each object."""
+    video, out = Path(video), Path(out)
+    endpoint = Endpoint.from_environment(options.model, options.timeout)
+    names = names_of(options.objects)
+    jpegs = frames_of(video, options.frames, options.longest)
+    log.info("showing %d frames of %s to %s at %s", len(jpegs), video, endpoint.model, endpoint.url)
+    found, replies = estimate(endpoint, jpegs, names, options.tries)
+    with replacing(out) as part:
+        rows = {name: {k: row[k] for k in ("E", "density")} for name, row in found.items()}
+        part.write_text(json.dumps(rows, indent=1) + "\n")
+    facts = {**provenance("estimate-materials", [video], options), "url": endpoint.url, "model": endpoint.model,
+             "materials": {name: row["material"] for name, row in found.items()}, "replies": replies}  # fmt: skip
+    with replacing(out.with_name(f"{out.name}.json")) as part:
+        part.write_text(json.dumps(facts, indent=1) + "\n")
+    return [f"{n}: {row['material']}, E {row['E']:.3g} Pa, {row['density']:.4g} kg/m^3" for n, row in found.items()]
+
+
+def names_of(objects: str) -> list[str]:
+    """Names of the objects to ask about, none when the model shall name them."""
+    if objects.lower().endswith(".ply"):
+        names = [o.name for o in read_scene(Path(objects)).objects]
+        if not names:
+            raise InputError(f"{objects}: has no objects yet; label them with `ngff segment` or write names")
+    else:
+        names = [name.strip() for name in objects.split(",") if name.strip()]
+    twice = {name for name in names if names.count(name) > 1}
+    if twice:
+        raise InputError(f"--objects {objects}: {twice.pop()!r} is there twice; names must tell objects apart")
+    return names
+
+
+def frames_of(video: Path, count: int, longest: int) -> list[bytes]:
+    """`count` evenly spaced frames, the first and the last among them (fewer if there are fewer), as JPEG."""
+    total = video_info(video)[0] or sum(1 for _ in read_video(video))
+    wanted = {round(i * (total - 1) / max(count - 1, 1)) for i in range(count)}
+    jpegs = []
+    with tempfile.TemporaryDirectory() as folder:
+        for i, image in enumerate(tqdm(read_video(video), total=total, unit="frame")):
+            if i in wanted:
+                h, w = image.shape[:2]
+                factor = min(1.0, longest / max(h, w))
+                write_jpeg(Path(folder) / "frame.jpg", resize(image, round(w * factor), round(h * factor)), 85)
+                jpegs.append((Path(folder) / "frame.jpg").read_bytes())
+    if not jpegs:
+        raise InputError(f"{video}: holds no frames")
+    return jpegs
+
+
+def estimate(endpoint: Endpoint, jpegs: list[bytes], names: list[str], tries: int) -> tuple[dict[str, dict], list[str]]:
+    """What the model says of each object, and all of its replies; an unfit one is sent back with what is wrong."""
+    which = f"The objects are called: {', '.join(names)}." if names else "Give every object a short name of its own."
+    text = PROMPT.format(frames=len(jpegs), which=which, example=names[0] if names else "duck", **RANGES)
+    messages = [{"role": "user", "content": [{"type": "text", "text": text}, *map(picture, jpegs)]}]
+    replies: list[str] = []
+    for _ in range(tries):
+        replies.append(endpoint.ask(messages))
+        try:
+            return checked(replies[-1], names), replies
+        except Unfit as error:
+            problem = str(error)
+            log.info("%s's answer cannot be used: %s", endpoint.model, problem)
+            messages += [{"role": "assistant", "content": replies[-1]},
+                         {"role": "user", "content": f"That cannot be used: {problem}. Answer again, with JSON alone."}]
+    raise InputError(f"{endpoint.model} at {endpoint.url}: {tries} answers could not be used, the last because "
+                     f"{problem}; try another --model, or write the materials yourself")  # fmt: skip
+
+
+def checked(reply: str, names: list[str]) -> dict[str, dict]:
+    """The answer as {name: {material, E, density}}, in the order of the names. Raises Unfit for anything else."""
+    text = reply.strip()
+    if text.startswith("```") and text.endswith("```"):  # a fence around the JSON is the one thing forgiven
+        text = text.strip("`").removeprefix("json")
+    try:
+        data = json.loads(text, object_pairs_hook=_once, parse_constant=_not_a_number)
+    except Unfit:
+        raise
+    except ValueError as error:
+        raise Unfit(f"it is not JSON ({error})") from error
+    if not isinstance(data, dict) or not data:
+        raise Unfit("it must be a JSON object with an entry for each thing")
+    missing, unknown = [n for n in names if n not in data], [n for n in data if names and n not in names]
+    if missing or unknown:
+        what = f"no entry for {', '.join(missing)}" if missing else f"{', '.join(unknown)} was not asked for"
+        raise Unfit(f"{what}; the names are {', '.join(names)}")
+    return {name: _entry(name, data[name]) for name in names or data}
+
+
+def _entry(name: str, row: object) -> dict:
+    if not isinstance(row, dict) or set(row) != {"material", "E", "density"}:
+        raise Unfit(f"the entry of {name} must have exactly material, E and density")
+    if not isinstance(row["material"], str) or not row["material"].strip():
+        raise Unfit(f"material of {name} must be a word or two")
+    for key, (low, high) in RANGES.items():
+        value = row[key]
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            raise Unfit(f"{key} of {name} must be a plain number in {UNITS[key]}, not {json.dumps(value)[:80]}")
+        if not low <= value <= high:
+            raise Unfit(f"{key} of {name} is {str(value)[:20]} {UNITS[key]}, which is not within {low:g} to {high:g}")
+    return {"material": " ".join(row["material"].split()), "E": float(row["E"]), "density": float(row["density"])}
+
+
+def _once(pairs: list[tuple[str, object]]) -> dict:
+    keys = [key for key, _ in pairs]
+    if len(set(keys)) < len(keys):
+        raise Unfit("a name is there twice")
+    return dict(pairs)
+
+
+def _not_a_number(word: str) -> float:
+    raise Unfit(f"{word} is not a number")

@@ -1,0 +1,162 @@
+"""How fast the CPU rasteriser is, beside compositing with one thread a pixel in the same run.
+
+A cloud of Gaussians in a unit cube, seen whole; a frame is projection, colour, sorting, binning and compositing. Wall
+time is on all of torch's threads; processor time is that of one thread doing everything, which a busy machine changes
+little, and so is the number to compare.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from stages.core.errors import InputError
+from stages.core.geometry.cameras import intrinsics, look_at
+from stages.core.kernels.splat.projection import pinhole, project
+from stages.core.kernels.splat.ssim import ssim, ssim_reference
+from stages.core.raster.rasterise import rasterise
+from stages.core.scene.files import replacing
+from stages.core.scene.gaussians import Gaussians
+from stages.lab.bench import common as bench
+from stages.lab.bench.raster_plain import blend_plain, tiles_of
+
+FORWARD = ((100_000, 448), (100_000, 800), (300_000, 448), (300_000, 800))
+BOTH = ((50_000, 448), (100_000, 448))
+SIDE = 448  # of the images whose similarity is measured [px]
+
+
+@dataclass(frozen=True)
+class BenchOptions:
+    """`shrink` divides the numbers of Gaussians and pixels, for a quick look."""
+
+    repeat: int = 15  # timed calls of each, of which the fastest counts
+    shrink: int = 1
+
+    def __post_init__(self):
+        if not 1 <= self.repeat <= 1000 or not 1 <= self.shrink <= 100:
+            raise InputError("--repeat 1 to 1000, --shrink 1 to 100")
+
+
+@dataclass(frozen=True)
+class Row:
+    """One comparison. Times in milliseconds: of the clock on `threads` threads, and of the processor on one."""
+
+    what: str
+    gaussians: int
+    pixels: int  # along a side of the image
+    threads: int
+    wall: float
+    cpu: float
+    plain_wall: float
+    plain_cpu: float
+
+    def __str__(self) -> str:
+        name = f"{self.what:<18}" + (f"{self.gaussians:>8,}" if self.gaussians else " " * 8)
+        return (
+            f"{name} {self.pixels:4d} px: {self.wall:7.1f} ms on {self.threads} threads, {1e3 / self.wall:6.1f} a"
+            f" second; one thread {self.cpu:7.1f} ms; plain {self.plain_wall:7.1f} and {self.plain_cpu:7.1f} ms:"
+            f" {self.plain_cpu / self.cpu:4.1f}x"
+        )
+
+
+def cloud(n: int, seed: int = 0) -> Gaussians:
+    """n Gaussians in the unit cube around the origin, as large as fills it; SH degree 0."""
+    rng = torch.Generator().manual_seed(seed)
+    quats = torch.nn.functional.normalize(torch.randn(n, 4, generator=rng), dim=1)
+    scales = 0.3 * n ** (-1 / 3) * torch.exp(0.5 * torch.randn(n, 3, generator=rng))
+    return Gaussians(
+        torch.rand(n, 3, generator=rng) - 0.5, quats, scales, 0.1 + 0.85 * torch.rand(n, generator=rng),
+        0.6 * torch.randn(n, 1, 3, generator=rng), torch.zeros(n, dtype=torch.int64),
+    )  # fmt: skip
+
+
+def camera(pixels: int) -> tuple[Tensor, Tensor]:
+    """World to camera, and intrinsics, of a square image that the cube fills."""
+    return look_at(torch.tensor([1.6, 0.9, 0.8]), torch.zeros(3)), intrinsics(pixels, pixels, 1.4 * pixels)
+
+
+def draw_plain(g: Gaussians, viewmat: Tensor, K: Tensor, pixels: int) -> Tensor:
+    """Colour and depth (pixels, pixels, 4) before black."""
+    tensors = (g.means, g.quats, g.scales, g.opacities, g.sh)
+    splats, keys, _ = project(pinhole(viewmat, K, pixels, pixels, 0.01), *tensors)
+    return blend_plain(splats, tiles_of(splats, keys, pixels, pixels))
+
+
+def milliseconds(call: Callable[[], object], repeat: int) -> tuple[float, float]:
+    """Wall time on torch's threads, and processor time on one [ms]: the fastest calls, for others slow them down."""
+    call()
+    wall = _fastest(call, time.perf_counter, repeat)
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        return wall, _fastest(call, time.thread_time, repeat)
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _fastest(call: Callable[[], object], clock: Callable[[], float], repeat: int) -> float:
+    times = []
+    for _ in range(repeat):
+        start = clock()
+        call()
+        times.append(1e3 * (clock() - start))
+    return min(times)
+
+
+def measure_forward(n: int, pixels: int, repeat: int) -> Row:
+    """A frame."""
+    g, (viewmat, K) = cloud(n), camera(pixels)
+    ours = lambda: rasterise(g, viewmat[None], K[None], pixels, pixels)  # noqa: E731
+    plain = lambda: draw_plain(g, viewmat, K, pixels)  # noqa: E731
+    return _row("forward", n, pixels, ours, plain, repeat)
+
+
+def measure_both(n: int, pixels: int, repeat: int) -> Row:
+    """A frame, and gradients of all that Gaussians have."""
+    g, (viewmat, K) = cloud(n), camera(pixels)
+    tensors = [t.requires_grad_() for t in (g.means, g.quats, g.scales, g.opacities, g.sh)]
+    ours = lambda: rasterise(g, viewmat[None], K[None], pixels, pixels).rgb.sum()  # noqa: E731
+    plain = lambda: draw_plain(g, viewmat, K, pixels)[..., :3].sum()  # noqa: E731
+    pulled = [lambda loss=loss: torch.autograd.grad(loss(), tensors) for loss in (ours, plain)]
+    return _row("forward, backward", n, pixels, *pulled, repeat)
+
+
+def measure_ssim(pixels: int, repeat: int) -> Row:
+    """Similarity of two pictures and its gradient, beside the same in plain PyTorch."""
+    rng = torch.Generator().manual_seed(0)
+    first, second = (torch.rand(pixels, pixels, 3, generator=rng) for _ in range(2))
+    first.requires_grad_()
+    pulled = [lambda f=f: torch.autograd.grad(f(first, second), first) for f in (ssim, ssim_reference)]
+    return _row("SSIM, backward", 0, pixels, *pulled, repeat)
+
+
+def _row(what: str, n: int, pixels: int, ours: Callable, plain: Callable, repeat: int) -> Row:
+    threads = torch.get_num_threads()
+    return Row(what, n, pixels, threads, *milliseconds(ours, repeat), *milliseconds(plain, max(1, repeat // 3)))
+
+
+def run(out: Path | None = None, options: BenchOptions = BenchOptions()) -> Iterator[str]:  # noqa: B008 -- frozen
+    """Lines of the report; all numbers as JSON in `out`."""
+    yield bench.machine("cpu")
+    by = options.shrink
+    sizes = [(f, n // by, math.ceil(p / by)) for f, rows in ((measure_forward, FORWARD), (measure_both, BOTH))
+             for n, p in rows]  # fmt: skip
+    rows = []
+    for measure, n, pixels in sizes:
+        rows.append(measure(n, pixels, options.repeat))
+        yield str(rows[-1])
+    rows.append(measure_ssim(math.ceil(SIDE / by), options.repeat))
+    yield str(rows[-1])
+    if out is not None:
+        facts = {"command": "ngff-lab bench raster", "machine": bench.machine("cpu"), "load": os.getloadavg()[0]}
+        facts["times"] = f"ms, the fastest of {options.repeat} calls ({max(1, options.repeat // 3)} of the plain form)"
+        with replacing(out) as part:
+            part.write_text(json.dumps({**facts, "rows": [asdict(row) for row in rows]}, indent=1) + "\n")

@@ -1,0 +1,127 @@
+"""The peer of the rasteriser's benchmark: compositing with one thread a pixel, forward and backward.
+
+This is how the GPU programs of the field are written, tiles of 16 x 16 pixels included; compiled for a CPU it is scalar
+code. Projection and sorting are ours, so that the difference is the compositing alone.
+"""
+
+from __future__ import annotations
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from stages.core.kernels.interop import view
+from stages.core.kernels.splat.binning import Bins, fill_bins
+from stages.core.kernels.splat.pixel_blocks import CLOSED, SOLID
+from stages.core.kernels.splat.projection import FAINTEST
+from stages.core.kernels.splat.simd import even, parts, run
+
+wp.set_module_options({"enable_backward": False})
+TILE = 16  # [px]
+NUMBERS = 10  # of a splat that have a gradient: centre, inverse covariance, opacity, colour, depth
+
+
+@wp.func
+def _falloff(splats: wp.array2d[float], s: int, dx: float, dy: float):
+    return wp.exp(-0.5 * (splats[s, 2] * dx * dx + splats[s, 4] * dy * dy) - splats[s, 3] * dx * dy)
+
+
+@wp.kernel
+def _forward(
+    start: int, piece: int, width: int, across: int, splats: wp.array2d[float], members: wp.array[int],
+    starts: wp.array[int], image: wp.array[wp.vec4], left: wp.array[float], ends: wp.array[int],
+):  # fmt: skip
+    p = start + wp.tid()
+    i, j = p // width, p % width
+    bin = (i // wp.static(TILE)) * across + j // wp.static(TILE)
+    T = wp.float32(1.0)
+    colour = wp.vec4()
+    k = wp.int32(starts[bin])
+    while k < starts[bin + 1]:
+        s = members[k]
+        alpha = wp.min(splats[s, 5] * _falloff(splats, s, float(j) + 0.5 - splats[s, 0], float(i) + 0.5 - splats[s, 1]),
+                       wp.static(SOLID))  # fmt: skip
+        if alpha >= wp.static(FAINTEST):
+            if T * (1.0 - alpha) <= wp.static(CLOSED):
+                break
+            colour += alpha * T * wp.vec4(splats[s, 6], splats[s, 7], splats[s, 8], splats[s, 9])
+            T *= 1.0 - alpha
+        k += 1
+    image[p] = colour
+    left[p] = T
+    ends[p] = k
+
+
+@wp.kernel
+def _backward(
+    start: int, piece: int, width: int, across: int, splats: wp.array2d[float], members: wp.array[int],
+    starts: wp.array[int], v_image: wp.array[wp.vec4], left: wp.array[float], ends: wp.array[int],
+    grads: wp.array3d[float],
+):  # fmt: skip
+    p = start + wp.tid()
+    i, j = p // width, p % width
+    bin = (i // wp.static(TILE)) * across + j // wp.static(TILE)
+    T = wp.float32(left[p])
+    v = v_image[p]
+    behind = wp.float32(0.0)  # upstream times what lies behind, seen through
+    k = wp.int32(ends[p])
+    while k > starts[bin]:
+        k -= 1
+        s = members[k]
+        dx, dy = float(j) + 0.5 - splats[s, 0], float(i) + 0.5 - splats[s, 1]
+        fall = _falloff(splats, s, dx, dy)
+        alpha = wp.min(splats[s, 5] * fall, wp.static(SOLID))
+        if alpha < wp.static(FAINTEST):
+            continue
+        T = T / (1.0 - alpha)
+        w = alpha * T
+        facing = wp.dot(v, wp.vec4(splats[s, 6], splats[s, 7], splats[s, 8], splats[s, 9]))
+        for c in range(4):
+            wp.atomic_add(grads, piece, s, 6 + c, w * v[c])
+        if splats[s, 5] * fall <= wp.static(SOLID):
+            g = alpha * (T * facing - behind / (1.0 - alpha))
+            wp.atomic_add(grads, piece, s, 0, g * (splats[s, 2] * dx + splats[s, 3] * dy))
+            wp.atomic_add(grads, piece, s, 1, g * (splats[s, 3] * dx + splats[s, 4] * dy))
+            wp.atomic_add(grads, piece, s, 2, -0.5 * g * dx * dx)
+            wp.atomic_add(grads, piece, s, 3, -g * dx * dy)
+            wp.atomic_add(grads, piece, s, 4, -0.5 * g * dy * dy)
+            wp.atomic_add(grads, piece, s, 5, g / splats[s, 5])
+        behind += w * facing
+
+
+class _Blend(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, splats, bins):
+        count = bins.width * bins.height
+        image, left, ends = torch.empty(count, 4), torch.empty(count), torch.empty(count, dtype=torch.int32)
+        _launch(_forward, splats, bins, view(image, wp.vec4), view(left), view(ends))
+        ctx.save_for_backward(splats, left, ends)
+        ctx.bins = bins
+        return image.view(bins.height, bins.width, 4)
+
+    @staticmethod
+    def backward(ctx, v_image):
+        splats, left, ends = ctx.saved_tensors
+        grads = torch.zeros(parts(), len(splats), NUMBERS)  # one table a thread, as ours
+        v_image = v_image.reshape(-1, 4).contiguous()
+        _launch(_backward, splats, ctx.bins, view(v_image, wp.vec4), view(left), view(ends), view(grads))
+        return torch.nn.functional.pad(grads.sum(0), (0, splats.shape[1] - NUMBERS)), None
+
+
+def _launch(kernel: wp.Kernel, splats: Tensor, bins: Bins, *views) -> None:
+    """The image's pixels in as many pieces as there are threads."""
+    inputs = [bins.width, bins.across, view(splats), view(bins.members), view(bins.starts), *views]
+    run(kernel, even(bins.width * bins.height, parts()), inputs)
+
+
+def tiles_of(splats: Tensor, keys: Tensor, width: int, height: int) -> Bins:
+    """Splats (n, 16) and their sort keys in tiles: every tile that the box around a splat touches."""
+    last = torch.tensor([(width - 1) // TILE, (height - 1) // TILE])
+    centre, reach = splats[:, :2].detach(), splats[:, 11:13].detach()
+    low, high = (((centre + sign * reach - 0.5) / TILE).floor().clamp(0 * last, last) for sign in (-1, 1))
+    return fill_bins(keys, torch.cat([low, high], 1).to(torch.int16), width, height, TILE)
+
+
+def blend_plain(splats: Tensor, bins: Bins) -> Tensor:
+    """Composite (h, w, 4) of the four channels of splats (n, 16). Differentiable in the splats."""
+    return _Blend.apply(splats, bins)

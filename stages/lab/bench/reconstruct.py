@@ -1,0 +1,212 @@
+"""How well photos become a scene: cameras against a reference, photos kept out, seconds and memory.
+
+A photo set is a folder of photos, or a folder with photos in `images/` or `photos/`; beside them `cameras.json` (a
+nerfstudio transforms file) may hold reference cameras, and `truth.h5` says that their world is upright, its floor at
+the height given there. Each set is reconstructed in a process of its own, so that its peak memory is its own.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import multiprocessing
+import tempfile
+import time
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from stages.core.backends import pick_device
+from stages.core.errors import InputError
+from stages.core.geometry.cameras import centres
+from stages.core.geometry.similarity import Similarity, umeyama
+from stages.core.scene.cameras import Cameras, read_cameras
+from stages.core.scene.files import replacing
+from stages.core.scene.scene_ply import read_scene
+from stages.lab.bench.common import machine
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class BenchOptions:
+    """What the sets are reconstructed with."""
+
+    quality: str = "normal"
+    holdout: int = 8
+    device: str = "auto"
+    matcher: str = "sift"
+    cameras: bool = False  # end with them: no Gaussians, to compare matchers
+
+    def key(self, folder: Path) -> str:
+        """The name of a set's row in the results."""
+        matcher = "" if self.matcher == "sift" else f", {self.matcher}"
+        cameras = ", cameras" if self.cameras else ""
+        return f"{folder.resolve().name}, {self.quality}, {pick_device(self.device)}{matcher}{cameras}"
+
+
+@dataclass(frozen=True)
+class PoseError:
+    """Found cameras against reference cameras of the same photos."""
+
+    cameras: int  # that both name
+    rotation: float  # median over all pairs of photos of the error in their relative rotation [degrees]
+    rotation_most: float  # the largest [degrees]
+    shift: float  # RMS distance of centres after alignment by a similarity [% of the extent of the reference centres]
+
+
+def run(sets: list[Path], out: Path, options: BenchOptions) -> Iterator[str]:
+    """A line a set, and all figures in a JSON file, which keeps the rows of sets that are not measured now.
+
+    A set of which nothing can be made has a row that says why.
+    """
+    if not sets:
+        raise InputError("name one or more photo sets: a folder with images/ and, if there are any, cameras.json")
+    photos = {folder: photo_folder(folder) for folder in map(Path, sets)}
+    rows = json.loads(out.read_text())["sets"] if out.exists() else {}
+    yield f"{'set':14s} {'photos':7s} {'rotation':>9s} {'shift':>7s} {'held-out':>19s} {'wall':>6s} {'CPU':>8s}  memory"
+    for folder, images in photos.items():
+        try:
+            row = measured_alone(folder, images, options)
+        except InputError as error:
+            row = {"failed": str(error).removeprefix(f"{images}: ")}
+        rows[options.key(folder)] = row
+        with replacing(out) as part:
+            part.write_text(json.dumps({"sets": rows}, indent=1) + "\n")
+        yield _line(folder.resolve().name, row)
+
+
+def measured_alone(folder: Path, images: Path, options: BenchOptions) -> dict:
+    """measure() in a process of its own."""
+    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as process:
+        return process.submit(measure, folder, images, options).result()
+
+
+def photo_folder(folder: Path) -> Path:
+    """Where the photos of a set are."""
+    for name in ("images", "photos"):
+        if (folder / name).is_dir():
+            return folder / name
+    if not folder.exists():
+        raise InputError(f"{folder}: no such folder; give a photo set")
+    return folder
+
+
+def measure(folder: Path, images: Path, options: BenchOptions) -> dict:
+    """One set reconstructed and compared with what is known about it."""
+    logging.basicConfig(format="%(message)s", level=logging.WARNING)
+    logging.getLogger("stages").setLevel(logging.INFO)
+    facts, found, floor = (_cameras if options.cameras else _scene)(images, options)
+    device = pick_device(options.device)
+    row = {**facts, "device": device, "cpu_seconds": time.process_time(), "machine": machine(device)}
+    if (folder / "cameras.json").exists():
+        reference, _ = read_cameras(folder / "cameras.json")
+        row["poses"] = asdict(pose_error(found, reference))
+        if floor is not None and (folder / "truth.h5").exists():
+            from stages.core.scene.trajectory import read_trajectory
+
+            true = read_trajectory(folder / "truth.h5").scene.floor
+            row["tilt"], row["floor"] = upright_error(found, reference, floor, true)
+    return row
+
+
+def _scene(images: Path, options: BenchOptions) -> tuple[dict, Cameras, float | None]:
+    """The report of a whole reconstruction, its cameras, and the height of its floor."""
+    from stages.reconstruct.options import ReconstructOptions
+    from stages.reconstruct.stage import run as reconstruct
+
+    chosen = ReconstructOptions(
+        quality=options.quality, holdout=options.holdout, device=options.device, matcher=options.matcher
+    )
+    with tempfile.TemporaryDirectory() as place:
+        path = Path(place) / "scene.ply"
+        report = reconstruct(images, path, chosen)
+        scene = read_scene(path)
+    return asdict(report), scene.cameras, scene.floor
+
+
+def _cameras(images: Path, options: BenchOptions) -> tuple[dict, Cameras, None]:
+    """The part of such a report that cameras have, and the cameras, in a world that is not yet upright."""
+    from stages.reconstruct import sfm
+    from stages.reconstruct.options import ReconstructOptions
+    from stages.reconstruct.reading import read_photos
+    from stages.reconstruct.steps import Steps, peak_memory
+
+    photos, steps = read_photos(images, ReconstructOptions(quality=options.quality).side), Steps()
+    model = sfm.solve(photos, 0, pick_device(options.device), steps, options.matcher)
+    facts = {"photos": len(photos), "placed": len(model.cameras), "dropped": model.dropped, "held_out": None}
+    return {**facts, "seconds": steps.seconds, "memory": peak_memory()}, model.cameras, None
+
+
+def pose_error(found: Cameras, reference: Cameras) -> PoseError:
+    """The relative rotation does not depend on any alignment; centres are aligned by least squares."""
+    a, b = shared(found, reference)
+    turns = []
+    for R in (a.viewmats[:, :3, :3].double(), b.viewmats[:, :3, :3].double()):
+        i, j = torch.triu_indices(len(R), len(R), 1)
+        turns.append(R[j] @ R[i].mT)
+    angles = angle(turns[0] @ turns[1].mT)
+    x, y = centres(a.viewmats.double()), centres(b.viewmats.double())
+    shift = (umeyama(x, y)(x) - y).square().sum(1).mean().sqrt() / torch.pdist(y).max()
+    return PoseError(len(a), float(angles.median()), float(angles.max()), 100 * float(shift))
+
+
+def upright_error(found: Cameras, reference: Cameras, floor: float, true_floor: float) -> tuple[float, float]:
+    """Angle between the found and the true vertical [degrees], and the floor's error in height [% of scene size].
+
+    The worlds are brought together by all cameras, turns included; the scene's size is twice the distance of the
+    cameras from their middle. The height is compared below the middle of the cameras.
+    """
+    a, b = shared(found, reference)
+    move = similarity(a.viewmats.double(), b.viewmats.double())
+    up = move.rotation @ torch.tensor([0.0, 0, 1], dtype=torch.float64)
+    x, y = centres(a.viewmats.double()).mean(0), centres(b.viewmats.double())
+    below = move(x - torch.tensor([0.0, 0, 1]) * (x[2] - floor))
+    size = 2 * float((y - y.mean(0)).norm(dim=1).mean())
+    tilt = math.degrees(math.acos(min(1.0, float(up[2]))))
+    return tilt, 100 * abs(float(below[2]) - true_floor) / size
+
+
+def similarity(source: Float[Tensor, "n 4 4"], target: Float[Tensor, "n 4 4"]) -> Similarity:
+    """From one world to the other, by centres and by points to the right, below and ahead of them."""
+    points = []
+    for viewmats in (source, target):
+        eyes = centres(viewmats)
+        reach = (eyes - eyes.mean(0)).norm(dim=1).mean()
+        points.append(torch.cat([eyes, *(eyes + reach * viewmats[:, axis, :3] for axis in range(3))]))
+    return umeyama(*points)
+
+
+def shared(found: Cameras, reference: Cameras) -> tuple[Cameras, Cameras]:
+    """Cameras of both, of the same photos in the same order."""
+    row = {name: i for i, name in enumerate(reference.names)}
+    both = [name for name in found.names if name in row]
+    if len(both) < 3:
+        raise InputError(f"the reference cameras name {len(both)} of the photos; 3 or more are needed to compare")
+    return found[[found.names.index(name) for name in both]], reference[[row[name] for name in both]]
+
+
+def angle(R: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b"]:
+    """Of a rotation [degrees]."""
+    cosine = (R.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2
+    return torch.rad2deg(torch.acos(cosine.clamp(-1, 1)))
+
+
+def _line(name: str, row: dict) -> str:
+    if "failed" in row:
+        return f"{name:14s} {row['failed']}"
+    poses = row.get("poses")
+    turned = f"{poses['rotation']:5.2f} deg {poses['shift']:5.2f} %" if poses else f"{'-':>9s} {'-':>7s}"
+    stance = f"; tilt {row['tilt']:.2f} deg, floor off by {row['floor']:.2f} %" if "tilt" in row else ""
+    held = row["held_out"]
+    score = f"{held['psnr']:6.2f} dB  {held['ssim']:.3f}" if held else f"{'-':>16s}"
+    return (
+        f"{name:14s} {row['placed']:3d}/{row['photos']:3d} {turned} {score:>19s} {sum(row['seconds'].values()):4.0f} s "
+        f"{row['cpu_seconds']:6.0f} s {row['memory']:5.1f} GB{stance}"
+    )

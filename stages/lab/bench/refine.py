@@ -1,0 +1,109 @@
+"""What is left where objects are lifted away, on scenes whose truth is known, from views that no photo had.
+
+The table under five objects is taken out where no camera sees it; `refine` fills it; then the objects are taken away
+and the table is compared with the true one in the pixels of the holes.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from tqdm import tqdm
+
+from stages.core.errors import InputError
+from stages.core.geometry.cameras import orbit
+from stages.core.perception.visibility import small
+from stages.core.raster.rasterise import rasterise, visibility
+from stages.core.scene.files import replacing
+from stages.core.scene.gaussians import Gaussians
+from stages.core.scene.scene import Scene
+from stages.lab.assets.backgrounds import TOP
+from stages.lab.assets.tabletops import DISTANCE, tabletop
+from stages.lab.bench import common as bench
+from stages.refine.options import RefineOptions
+from stages.refine.stage import refine
+
+VIEWS = 4  # from higher than the photos
+HIDDEN = 0.02  # weight in every photo below which a Gaussian of the table was not seen [px of the small images]
+THERE = 0.9  # alpha of a table that is there
+
+
+@dataclass(frozen=True)
+class BenchOptions:
+    scenes: int = 4
+    photos: int = 24
+
+    def __post_init__(self):
+        if not 1 <= self.scenes <= 100 or not 8 <= self.photos <= 200:
+            raise InputError("--scenes 1 to 100, --photos 8 to 200")
+
+
+@torch.no_grad()
+def as_photographed(scene: Scene) -> Scene:
+    """Without what of the background no camera sees."""
+    g = scene.gaussians
+    weight = torch.zeros(len(g))
+    for viewmat, K, width, height in small(scene.cameras):
+        weight = torch.maximum(weight, visibility(g, viewmat, K, width, height)[1])
+    return replace(scene, gaussians=g[(g.object_id > 0) | (weight > HIDDEN)])
+
+
+@torch.no_grad()
+def table_alone(g: Gaussians, views: Float[Tensor, "c 4 4"], scene: Scene) -> tuple[Tensor, Tensor]:
+    """Pictures (c, h, w, 3) and alpha (c, h, w) of the background, from views with the scene's lenses."""
+    width, height = (int(side) for side in scene.cameras.sizes[0])
+    Ks = scene.cameras.Ks[:1].expand(len(views), 3, 3)
+    drawn = rasterise(g[g.object_id == 0], views, Ks, width, height)
+    return drawn.rgb.clamp(0, 1), drawn.alpha
+
+
+def psnr(one: Float[Tensor, "c h w 3"], two: Float[Tensor, "c h w 3"], where: Bool[Tensor, "c h w"]) -> float:
+    """In some of the pixels [dB]."""
+    return -10 * math.log10(max(float((one - two)[where].square().mean()), 1e-10))
+
+
+def measure(index: int, photos: int) -> dict:
+    """One scene; the objects' own labels are the true ones."""
+    scene = tabletop("apart", index, photos)
+    seen = as_photographed(scene)
+    start = time.perf_counter()
+    refined = refine(seen, RefineOptions(completer="none"))  # the objects go anyway
+    took = time.perf_counter() - start
+    views = orbit(VIEWS, torch.tensor([0.0, 0, TOP]), DISTANCE, 60.0, azimuth=10.0)
+    true, _ = table_alone(scene.gaussians, views, scene)
+    before, _ = table_alone(seen.gaussians, views, scene)
+    after, _ = table_alone(refined.gaussians, views, scene)
+    # through a hole one sees the floor, so the table top alone says where the holes are
+    tops = (g[g.means[:, 2] > TOP - 0.02] for g in (scene.gaussians, seen.gaussians))
+    whole, left = (table_alone(top, views, scene)[1] for top in tops)
+    hole = (whole > THERE) & (left < THERE)
+    return {
+        "scene": index, "pixels": int(hole.sum()), "before_db": round(psnr(before, true, hole), 2),
+        "after_db": round(psnr(after, true, hole), 2), "elsewhere_db": round(psnr(after, before, ~hole), 2),
+        "seconds": round(took, 1),
+    }  # fmt: skip
+
+
+def run(out: Path | None = None, options: BenchOptions = BenchOptions()) -> Iterator[str]:  # noqa: B008 -- frozen
+    """Lines of the report; all numbers as JSON in `out`."""
+    yield bench.machine("cpu")
+    rows = []
+    for i in tqdm(range(options.scenes), unit="scene"):
+        rows.append(measure(i, options.photos))
+        r = rows[-1]
+        yield (
+            f"scene {i}: PSNR of the holes from new views {r['before_db']:.1f} dB open, {r['after_db']:.1f} dB filled; "
+            f"elsewhere as before to {r['elsewhere_db']:.1f} dB; {r['seconds']:.0f} s"
+        )
+    if out is not None:
+        facts = {"command": "ngff-lab bench refine", "machine": bench.machine("cpu")}
+        with replacing(out) as part:
+            part.write_text(json.dumps({**facts, "scenes": rows}, indent=1) + "\n")

@@ -1,0 +1,236 @@
+"""Registration of a part of an object to the whole, beside plain ICP and the package splatreg, on the same parts.
+
+A part lacks 40 % of the surface, cut off along a plane or bitten out around a point, has noise, and is turned, scaled
+and shifted at random. Right is 2 degrees, 2 % of scale and 1 % of the diameter, up to the symmetry of what is seen.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, replace
+from importlib.metadata import version
+from importlib.util import find_spec
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from scipy.spatial import cKDTree
+from torch import Tensor
+from tqdm import tqdm
+
+from stages.core.backends import pick_device
+from stages.core.geometry.harmonics import C0, rgb_to_sh
+from stages.core.geometry.rotations import matrix, multiply, nearest, quaternion
+from stages.core.geometry.similarity import Similarity, umeyama
+from stages.core.scene.files import replacing
+from stages.core.scene.gaussians import Gaussians
+from stages.lab.assets.objects import ObjectsOptions, make_object
+from stages.lab.bench import common as bench
+from stages.refine.register import register
+from stages.refine.register_cloud import diameter, lab
+
+LIMITS = {"rotation": 2.0, "scale": 2.0, "shift": 1.0}  # [deg], [%], [% of the diameter]
+ROUND = ("ball", "bowl", "can")  # their shape is one of revolution about z; what is painted on them is not
+ALIKE = 0.002  # rms change of place and colour that a turn about z may make unnoticed [diameters]
+SHOWN = 400  # Gaussians that splatreg is given of each; its time grows with the square
+RADIUS = 0.14  # rms radius of the object that splatreg's tolerances, such as 2 cm for an inlier, are made for [m]
+
+
+@dataclass(frozen=True)
+class BenchOptions:
+    only: str = ""  # names with commas between; empty: all ten objects
+    trials: int = 10  # of each object
+    missing: float = 0.4  # share of the surface
+    noise: float = 0.01  # standard deviation of place [diameters]
+    tint: float = 0.02  # standard deviation of colour [0..1]
+    seed: int = 0
+    device: str = "auto"  # where the Gaussians are
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A part of an object, and where the whole would have to be put."""
+
+    part: Gaussians
+    truth: Similarity  # whole to part
+    seen: Float[Tensor, "k"]  # rows of the whole that the part is made of
+
+
+def trial(whole: Gaussians, number: int, options: BenchOptions) -> Trial:
+    """Odd numbers are bitten, even ones cut."""
+    rng = torch.Generator().manual_seed(1000 * options.seed + number)
+    x, across = whole.means, diameter(whole.means)
+    if number % 2:
+        depth = -(x - x[torch.randint(len(x), (1,), generator=rng)]).norm(dim=1)
+    else:
+        depth = x @ torch.nn.functional.normalize(torch.randn(3, generator=rng), dim=0)
+    seen = depth.argsort()[: round(len(x) * (1 - options.missing))]
+    noisy = x[seen] + options.noise * across * torch.randn(len(seen), 3, generator=rng)
+    rgb = whole.sh[seen, 0] * C0 + 0.5 + options.tint * torch.randn(len(seen), 3, generator=rng)
+    scale = float(2 ** (2 * torch.rand(1, generator=rng) - 1))
+    truth = Similarity(scale, matrix(torch.randn(4, generator=rng)), 3 * torch.randn(3, generator=rng))
+    quats = multiply(quaternion(truth.rotation).expand(len(seen), 4), whole.quats[seen])
+    part = replace(whole[seen], means=truth(noisy), quats=quats, scales=scale * whole.scales[seen], sh=rgb_to_sh(rgb))
+    return Trial(part, truth, seen)
+
+
+def errors(found: Similarity, trial: Trial, whole: Gaussians, revolved: bool) -> dict[str, float]:
+    """Rotation [deg], scale [%], shift of the object's middle [% of its diameter], and rotation up to symmetry."""
+    middle = (whole.means.amin(0) + whole.means.amax(0)) / 2
+    shift = float((found(middle) - trial.truth(middle)).norm()) / (trial.truth.scale * diameter(whole.means))
+    R = found.rotation.mT @ trial.truth.rotation  # truth, then back by what was found: the identity where it is right
+    turned = angle(R)
+    out = {"rotation": turned, "scale": 100 * abs(found.scale / trial.truth.scale - 1), "shift": 100 * shift}
+    about = about_z(R)
+    free = revolved and turned > LIMITS["rotation"] and change(whole, trial.seen, about) < ALIKE
+    return {**out, "rotation up to symmetry": angle(R @ about.mT) if free else turned}
+
+
+def angle(R: Float[Tensor, "3 3"]) -> float:
+    """Of a rotation [deg]."""
+    return float(torch.rad2deg(((R.trace() - 1) / 2).clamp(-1, 1).arccos()))
+
+
+def about_z(R: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
+    """The turn about z nearest to a rotation."""
+    c, s = R[0, 0] + R[1, 1], R[1, 0] - R[0, 1]
+    turn = torch.eye(3)
+    turn[:2, :2] = torch.stack([torch.stack([c, -s]), torch.stack([s, c])]) / (c * c + s * s).sqrt().clamp_min(1e-9)
+    return turn
+
+
+def change(whole: Gaussians, seen: Float[Tensor, "k"], turn: Float[Tensor, "3 3"]) -> float:
+    """Rms by which the seen part, turned, differs from the whole in place and colour [diameters].
+
+    One half of the Gaussians is held against the other; what they differ by without a turn is taken off.
+    """
+    joint = torch.cat([whole.means / diameter(whole.means), lab(whole.sh[:, 0] * C0 + 0.5)], 1)
+    mine = joint[seen[seen % 2 == 0]]
+    tree = cKDTree(joint[1::2].numpy())
+    squares = []
+    for R in (turn, torch.eye(3)):
+        distance, _ = tree.query(torch.cat([mine[:, :3] @ R.mT, mine[:, 3:]], 1).numpy(), workers=2)
+        squares.append(float((distance**2).mean()))
+    return max(squares[0] - squares[1], 0.0) ** 0.5
+
+
+def icp(part: Gaussians, whole: Gaussians, seed: int = 0) -> Similarity:
+    """Plain point-to-point ICP with scale (Besl and McKay 1992), the best of 24 right-angled starts; on the CPU."""
+    rng = torch.Generator().manual_seed(seed)
+    x, y = (g.means.cpu()[torch.randperm(len(g), generator=rng)[:500]] for g in (part, whole))
+    tree, ends = cKDTree(y.numpy()), []
+    for start in _right_angles():
+        scale = float((y - y.mean(0)).norm(dim=1).mean() / (x - x.mean(0)).norm(dim=1).mean())
+        ends.append(_iterate(Similarity(scale, start, y.mean(0) - scale * start @ x.mean(0)), x, y, tree, 6))
+    pose = min(ends, key=lambda end: end[0])[1]
+    return _iterate(pose, x, y, tree, 40)[1].inverse()
+
+
+def _iterate(pose: Similarity, x: Tensor, y: Tensor, tree: cKDTree, rounds: int) -> tuple[float, Similarity]:
+    """Mean squared distance in the part's units, and the pose after some rounds."""
+    for _ in range(rounds):
+        distance, index = tree.query(pose(x).numpy())
+        pose = umeyama(x, y[torch.from_numpy(index)])
+    return float((distance**2).mean()) / pose.scale**2, pose
+
+
+def _right_angles() -> Iterator[Float[Tensor, "3 3"]]:
+    """The 24 rotations of a cube."""
+    for order in ((0, 1, 2), (1, 2, 0), (2, 0, 1), (0, 2, 1), (2, 1, 0), (1, 0, 2)):
+        for signs in torch.cartesian_prod(*[torch.tensor([-1.0, 1.0])] * 3):
+            R = torch.eye(3)[list(order)] * signs[:, None]
+            if torch.det(R) > 0:
+                yield R
+
+
+def ours(part: Gaussians, whole: Gaussians, seed: int = 0) -> Similarity:
+    found = register(part, whole, seed)
+    return found.similarity.to("cpu") if found else Similarity(1.0, torch.eye(3), torch.zeros(3))
+
+
+def splatreg(part: Gaussians, whole: Gaussians, seed: int = 0) -> Similarity:
+    """The package's pose of a known object that is seen in part, with scale.
+
+    `features` is the start it has for parts. The others end in least squares that count on the whole being there, and
+    shrink or blow up what they are given. Its sweep over rotations keeps the scale at which it starts, so both are
+    given in one size; on one thread, as its products are so small that two threads take several times as long.
+    """
+    from splatreg import Gaussians as Theirs
+    from splatreg import estimate_object_pose
+
+    rng, threads = torch.Generator().manual_seed(seed), torch.get_num_threads()
+    given, units = [], []
+    for g in (whole, part):
+        g = g[torch.randperm(len(g), generator=rng)[:SHOWN].to(g.means.device)]
+        unit = RADIUS / float((g.means - g.means.mean(0)).square().sum(1).mean().sqrt())
+        rgb = (g.sh[:, 0] * C0 + 0.5).clamp(0, 1)
+        given.append(Theirs(g.means * unit, g.quats, g.scales * unit, g.opacities, rgb))
+        units.append(unit)
+    torch.set_num_threads(1)
+    try:
+        T = estimate_object_pose(*given, init="features", transform="sim3").T_SO.detach().cpu()
+    finally:
+        torch.set_num_threads(threads)
+    scale = float(torch.det(T[:3, :3]).abs() ** (1 / 3))
+    return Similarity(scale * units[0] / units[1], nearest(T[:3, :3] / scale), T[:3, 3] / units[1])
+
+
+METHODS = {"ours": ours, "ICP": icp}  # (part, whole, seed) -> whole to part, on the CPU
+if find_spec("splatreg"):
+    METHODS["splatreg"] = splatreg
+
+
+def run(out: Path | None, options: BenchOptions = BenchOptions()) -> Iterator[str]:  # noqa: B008 -- frozen
+    """Measure every method on the same parts; a line for each object, and all trials as JSON."""
+    names, compared, device = ObjectsOptions(options.only).names, METHODS, pick_device(options.device)
+    yield f"{'right of ' + str(options.trials):14}" + "".join(f"{name:>12}" for name in compared)
+    rows = []
+    for name in names:
+        whole = make_object(name)
+        for number in tqdm(range(options.trials), desc=name, unit="part", leave=False):
+            given = trial(whole, number, options)
+            part, there = given.part.to(device), whole.to(device)
+            if device != "cpu" and not rows:
+                ours(part, there)  # not timed: the first call on a GPU loads its libraries and kernels
+            for method, function in compared.items():
+                start = time.perf_counter(), time.process_time()
+                found = function(part, there, number)
+                took = time.perf_counter() - start[0], time.process_time() - start[1]
+                rows.append({"object": name, "trial": number, "method": method, "seconds": took[0], "CPU seconds":
+                             took[1], **errors(found, given, whole, name in ROUND)})  # fmt: skip
+        right = {m: sum(_right(r) for r in rows if r["object"] == name and r["method"] == m) for m in compared}
+        yield f"{name:14}" + "".join(f"{count:12d}" for count in right.values())
+    summary = {m: summarised([r for r in rows if r["method"] == m]) for m in compared}
+    yield from (f"{m}: {json.dumps(facts)}" for m, facts in summary.items())
+    if "splatreg" not in compared:
+        yield "splatreg is not installed and left out; `pip install --no-deps splatreg` adds it (all it needs is here)"
+    if out:
+        facts = {"machine": bench.machine(device), "options": asdict(options), "limits": LIMITS, "summary": summary}
+        if "splatreg" in compared:
+            facts["splatreg"] = {"version": version("splatreg"), "Gaussians": SHOWN}
+        with replacing(out) as part:
+            part.write_text(json.dumps({**facts, "trials": [_rounded(r) for r in rows]}, indent=1) + "\n")
+
+
+def _right(row: dict) -> bool:
+    return row["rotation up to symmetry"] <= LIMITS["rotation"] and _placed(row)
+
+
+def _placed(row: dict) -> bool:
+    return row["scale"] <= LIMITS["scale"] and row["shift"] <= LIMITS["shift"]
+
+
+def summarised(rows: list[dict]) -> dict[str, float]:
+    """Shares within the limits, medians, and the time of a trial."""
+    middle = {k: round(float(torch.tensor([r[k] for r in rows]).median()), 3)
+              for k in ("rotation", "scale", "shift", "seconds", "CPU seconds")}  # fmt: skip
+    right = [_right(r) for r in rows]
+    strict = [r["rotation"] <= LIMITS["rotation"] and _placed(r) for r in rows]
+    shares = {"right": sum(right) / len(rows), "right without symmetry": sum(strict) / len(rows)}
+    return {**{k: round(v, 3) for k, v in shares.items()}, **{f"median {k}": v for k, v in middle.items()}}
+
+
+def _rounded(row: dict) -> dict:
+    return {k: round(v, 4) if isinstance(v, float) else v for k, v in row.items()}

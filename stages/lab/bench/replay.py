@@ -1,0 +1,146 @@
+"""A recorded run of the public MPM solver, run again by ours: same stress, damping, walls and grid.
+
+A recording is an NPZ with positions (t, p, 3) in grid coordinates, n (particles of each body, in order), volume (p),
+E and rho (one a body), nu, dt, substeps_per_frame, n_grid, grid_lim, gravity and rpic_damping. The public solver:
+fixed corotated stress; the affine part of the transfers damped by rpic_damping; in the three outermost layers of
+nodes a velocity that points outwards loses its normal part, and a tenth of the rest, every substep.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from zipfile import BadZipFile
+
+import numpy as np
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from stages.core.backends import pick_device
+from stages.core.errors import InputError
+from stages.core.kernels.mpm.constitutive import COROTATED
+from stages.core.physics.mpm import solver as mpm
+from stages.core.scene.files import must_exist, replacing
+
+log = logging.getLogger(__name__)
+NEEDED = {"positions", "n", "volume", "E", "rho", "nu", "dt", "substeps_per_frame", "n_grid", "grid_lim", "gravity",
+          "rpic_damping"}  # fmt: skip
+PADDING = 3  # layers of nodes outside the walls
+KEEP = 0.9  # of the velocity along a wall, every substep
+DEPARTS = 1e-3  # of the drop height: a body further than this from free fall has touched something
+
+
+@dataclass(frozen=True)
+class ReplayOptions:
+    frames: int = 0  # of the recording, the first counted; 0: all
+    device: str = "auto"
+
+    def __post_init__(self):
+        if self.frames < 0:
+            raise InputError("--frames must be 0 (all of the recording) or more")
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """How two runs of the same scene differ, in shares of the drop height."""
+
+    drop: float  # the longest way down of a centre of mass [m]
+    contact: int  # frame in which a body first departs from free fall
+    com: Tensor  # (t, o) distance of centres of mass
+    particles: Tensor  # (t) largest distance of a particle; to be read before the first contact
+
+
+def read(path: Path) -> dict[str, np.ndarray]:
+    """The recording's fields. InputError when it is none."""
+    must_exist(path, "a recording (.npz) with " + ", ".join(sorted(NEEDED)))
+    try:
+        with np.load(path) as file:
+            data = {name: file[name] for name in file.files}
+    except (ValueError, BadZipFile, EOFError) as error:
+        raise InputError(f"{path}: is not an NPZ file ({error})") from error
+    if missing := sorted(NEEDED - data.keys()):
+        raise InputError(f"{path}: no {', '.join(missing)}; a recording has {', '.join(sorted(NEEDED))}")
+    shape, p = data["positions"].shape, int(data["n"].sum())
+    if len(shape) != 3 or shape[1:] != (p, 3) or not np.isfinite(data["positions"]).all():
+        raise InputError(f"{path}: positions must be finite and (frames, {p}, 3), as n says, not {shape}")
+    for name, count in (("volume", p), ("E", len(data["n"])), ("rho", len(data["n"]))):
+        if data[name].shape != (count,):
+            raise InputError(f"{path}: {name} must have {count} values, not {data[name].shape}")
+    return data
+
+
+def set_up(data: dict[str, np.ndarray], device: str) -> mpm.Solver:
+    """Our solver at the first frame, with nodes where the public solver has them."""
+    n = torch.from_numpy(data["n"]).long()
+    each = {k: torch.from_numpy(data[k]).float().repeat_interleave(n) for k in ("E", "rho")}
+    x = torch.from_numpy(data["positions"][0]).float()
+    full = torch.ones(len(x))
+    particles = mpm.at_rest(x, torch.from_numpy(data["volume"]).float(), each["rho"], each["E"],
+                            float(data["nu"]) * full, 0 * full, 0 * full, COROTATED)  # fmt: skip
+    dx = float(data["grid_lim"]) / int(data["n_grid"])
+    # nodes up to PADDING - 1 feel the lower walls there, nodes from n_grid - PADDING on the upper ones
+    low, high = (PADDING - 1 + mpm.FLOOR_GAP) * dx, (int(data["n_grid"]) - PADDING - mpm.FLOOR_GAP) * dx
+    return mpm.Solver(particles, mpm.Box((low,) * 3, (high,) * 3, keep=KEEP), dx, device,
+                      damping=float(data["rpic_damping"]))  # fmt: skip
+
+
+def simulate(data: dict[str, np.ndarray], frames: int, device: str) -> Iterator[Tensor]:
+    """Positions (p, 3) of our run, frame by frame, the first as recorded."""
+    solver = set_up(data, device)
+    steps = int(data["substeps_per_frame"])
+    push = torch.from_numpy(data["gravity"]).float().repeat(len(solver.rows), 1).to(device)
+    yield solver.particles.x.cpu()
+    for frame in range(1, frames):
+        try:
+            solver.advance(steps * float(data["dt"]), push, steps)
+        except mpm.Diverged as error:
+            raise InputError(f"frame {frame}: {error}; the recorded dt is too long for this material") from error
+        yield solver.particles.x.cpu()
+
+
+def compare(data: dict[str, np.ndarray], ours: Tensor) -> Comparison:
+    """Our positions (t, p, 3) beside the recorded ones."""
+    theirs = torch.from_numpy(data["positions"])
+    bodies = [part.double() for part in theirs.split(data["n"].tolist(), 1)]
+    com = torch.stack([b.mean(1) for b in bodies], 1)
+    drop = float((com[0, :, 2] - com[:, :, 2]).max())
+    if drop <= 0:
+        raise InputError("nothing falls in this recording")
+    dt = float(data["dt"])
+    steps = torch.arange(len(com)).double() * int(data["substeps_per_frame"])
+    # the public solver adds gravity before it moves particles: after s substeps they fell g dt^2 s (s + 1) / 2
+    fallen = torch.from_numpy(data["gravity"]).double() * dt**2 * (steps * (steps + 1) / 2)[:, None]
+    off = (com - com[0] - fallen[:, None]).norm(dim=2).amax(1) > DEPARTS * drop
+    contact = int(off.nonzero()[0]) if bool(off.any()) else len(com)
+    t = len(ours)
+    mine = torch.stack([b.double().mean(1) for b in ours.split(data["n"].tolist(), 1)], 1)
+    return Comparison(drop, contact, (mine - com[:t]).norm(dim=2) / drop,
+                      (ours - theirs[:t]).norm(dim=2).amax(1) / drop)  # fmt: skip
+
+
+def report(c: Comparison) -> Iterator[str]:
+    """A line a frame, and what they come to."""
+    yield f"drop height {c.drop:.3f} m; first contact in frame {c.contact}; errors in % of the drop height"
+    for frame, row in enumerate(c.com.tolist()):
+        yield f"frame {frame:3d}: centres of mass " + " ".join(f"{100 * e:7.3f}" for e in row)
+    before = c.particles[: c.contact]
+    yield f"particles before first contact: {100 * float(before.max()):.4f} at most"
+    good = (c.com.amax(1) > 0.01).nonzero()
+    last = int(good[0]) - 1 if len(good) else len(c.com) - 1
+    yield f"centres of mass agree to 1 % of the drop height through frame {last} of {len(c.com) - 1}"
+
+
+def run(recording: Path, out: Path, options: ReplayOptions = ReplayOptions()) -> Iterator[str]:  # noqa: B008 -- frozen
+    """RECORDING.npz -> OURS.npz, with a report."""
+    data = read(recording)
+    frames = options.frames or len(data["positions"])
+    if frames > len(data["positions"]):
+        raise InputError(f"--frames {frames}: {recording} has {len(data['positions'])}")
+    states = simulate(data, frames, pick_device(options.device))
+    ours = torch.stack(list(tqdm(states, total=frames, unit="frame")))
+    with replacing(out) as part:
+        np.savez_compressed(part, **{**data, "positions": ours.numpy()})
+    yield from report(compare(data, ours))

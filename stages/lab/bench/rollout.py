@@ -1,0 +1,154 @@
+"""How long a rollout takes: our force field, beside the published one as published and MPM, in one run.
+
+Three ellipsoids fall onto each other and onto the floor, 100 steps of 0.02 s. Counted is all that a new scene needs
+from its keypoints at rest to its keypoints in every frame: preparing, contact search, networks, integration; Gaussians
+are not moved. Recording a graph, done once for a model and a size of scene, is stated apart.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from stages.core.backends import pick_device
+from stages.core.errors import InputError
+from stages.core.models import checkpoints as weights
+from stages.core.models.dynamics import FRAME, Dynamics
+from stages.core.models.initial_conditions import World
+from stages.core.models.rollout import Stepper, frames
+from stages.core.scene.files import replacing
+from stages.lab.bench import common as bench
+from stages.lab.bench import mpm as bench_mpm
+
+log = logging.getLogger(__name__)
+OBJECTS = 3
+PEER = "ngff-paper, step by step"  # as published
+
+
+@dataclass(frozen=True)
+class BenchOptions:
+    """`scenes` at once; none: 1 and, on a GPU, 64."""
+
+    weights: Path | None = None  # of our force field; those that ship
+    keypoints: int = 2048  # of an object
+    steps: int = 100
+    scenes: tuple[int, ...] = ()
+    repeat: int = 5  # timed rollouts, of which the median counts
+    device: str = "auto"
+
+    def __post_init__(self):
+        if min((self.keypoints, self.steps, self.repeat, *self.scenes)) < 1:
+            raise InputError("--keypoints, --steps, --scenes and --repeat must be at least 1")
+
+
+def world(scenes: int, keypoints: int) -> World:
+    """Copies of one scene: shells of ellipsoids above each other, the lowest a palm above the floor."""
+    rng = torch.Generator().manual_seed(0)
+    ball = torch.nn.functional.normalize(torch.randn(OBJECTS, keypoints, 3, generator=rng), dim=-1)
+    place = torch.tensor([[0.0, 0.0, -0.7], [0.1, 0.05, -0.35], [-0.1, 0.0, 0.02]])
+    points = ball * torch.tensor([0.25, 0.2, 0.15]) + place[:, None]
+    return World.of(points.repeat(scenes, 1, 1, 1), mass=torch.tensor([0.5, 2.0, 1.0]), E=torch.tensor([1e5, 1e4, 8e5]))
+
+
+def run(out: Path, options: BenchOptions = BenchOptions()) -> Iterator[str]:
+    """Lines of the report; the figures go to a JSON file, which keeps those of the other kind of device."""
+    device = pick_device(options.device)
+    model, card = weights.load(weights.find("ngff", options.weights), device)
+    torch.manual_seed(0)
+    paper = weights.build("ngff-paper").to(device).eval()  # untrained: a step takes as long
+    yield bench.machine(device)
+    facts = {
+        "machine": bench.machine(device), "threads": torch.get_num_threads(),
+        "date": datetime.now(timezone.utc).date().isoformat(), "weights": card["sha256"], "objects": OBJECTS,
+        "keypoints": options.keypoints, "steps": options.steps, "rows": [],
+    }  # fmt: skip
+    out = Path(out)
+    known = json.loads(out.read_text()) if out.is_file() else {}
+    for scenes in options.scenes or ((1, 64) if device != "cpu" else (1,)):
+        group = list(_measured(model, paper, scenes, device, options))
+        yield from table(group)
+        facts["rows"] += group
+        with replacing(out) as part:
+            part.write_text(json.dumps({**known, device.partition(":")[0]: facts}, indent=1) + "\n")
+
+
+def _measured(model: Dynamics, paper: Dynamics, scenes: int, device: str, options: BenchOptions) -> Iterator[dict]:
+    """One row each way of rolling out so many scenes."""
+    start, count = world(scenes, options.keypoints).to(device), options.steps + 1
+    plain = rolled(model, start, count)
+    yield _row("ngff, step by step", scenes, lambda: rolled(model, start, count), device, options.repeat)
+    for precision in ("highest", "high") if device != "cpu" else ():  # products as exact as sums, or in tf32
+        torch.set_float32_matmul_precision(precision)
+        began = time.perf_counter()
+        stepper = Stepper(model, start)
+        ready = time.perf_counter() - began
+        name = f"ngff, {'in tf32, ' * (precision == 'high')}replayed"
+        yield {
+            **_row(name, scenes, lambda s=stepper: _again(s, start, count), device, options.repeat),
+            "ready_seconds": round(ready, 2),
+            "prepare_seconds": _rounded(bench.seconds(lambda s=stepper: s.restart(start), device)),
+            "strays_m": float((_again(stepper, start, count) - plain).abs().max()),
+        }  # fmt: skip
+        del stepper
+    torch.set_float32_matmul_precision("highest")
+    yield _row(PEER, scenes, lambda: rolled(paper, start, count), device, options.repeat)
+    if device != "cpu":
+        stepper = Stepper(paper, start)
+        yield _row("ngff-paper, replayed", scenes, lambda: _again(stepper, start, count), device, options.repeat)
+    particles = OBJECTS * options.keypoints
+    mpm = bench_mpm.measure(particles, scenes, device, 2)
+    seconds = 1e-6 * mpm["substep_us"] * bench_mpm.SUBSTEPS * options.steps
+    yield {"what": f"MPM, {mpm['particles']:,} particles", "scenes": scenes, "seconds": _rounded(seconds)}
+
+
+@torch.no_grad()
+def rolled(model: Dynamics, start: World, count: int) -> Float[Tensor, "b t o n 3"]:
+    """A rollout as any code would do it."""
+    return model.rollout(start, count, FRAME)
+
+
+def _again(stepper: Stepper, start: World, count: int) -> Float[Tensor, "b t o n 3"]:
+    stepper.restart(start)
+    return frames(stepper, count)
+
+
+def _row(what: str, scenes: int, function: Callable[[], object], device: str, repeat: int) -> dict:
+    """Median wall time, and, where other programs may take turns, the processor's time, of which the least counts."""
+    function()
+    wall, cpu = [], []
+    for _ in range(repeat):
+        began = time.process_time()
+        wall.append(bench.seconds(function, device, 1))
+        cpu.append(time.process_time() - began)
+    row = {"what": what, "scenes": scenes, "seconds": _rounded(sorted(wall)[repeat // 2])}
+    return row if device != "cpu" else {**row, "processor_seconds": _rounded(min(cpu))}
+
+
+def table(rows: list[dict]) -> list[str]:
+    """A line for each row; times are compared with the published model's as published."""
+    peer = next(row["seconds"] for row in rows if row["what"] == PEER)
+    lines = []
+    for row in rows:
+        more = []
+        if "processor_seconds" in row:
+            more.append(f"{row['processor_seconds']:.2f} s of processor")
+        if "ready_seconds" in row:
+            more.append(f"once before: {row['ready_seconds']:.1f} s; strays {row['strays_m']:.1e} m")
+        lines.append(
+            f"{row['scenes']:>4} x {row['what']:32}{row['seconds']:10.4f} s {peer / row['seconds']:8.2f}x the speed of "
+            f"{PEER}" + "".join(f"; {text}" for text in more)
+        )
+    return lines
+
+
+def _rounded(seconds: float) -> float:
+    return float(f"{seconds:.4g}")

@@ -1,0 +1,205 @@
+"""How well `segment` finds objects on scenes whose truth is known: intersection over union of each object.
+
+The scenes are five of the ten objects on one of the eight tables, apart or touching; `segment` gets the true Gaussians
+without their labels, and the cameras. Masks are the true ones, or true ones made wrong, to see what the vote over views
+makes of them; beside it stands the same without a vote. SAM 2.1 takes part where its weights are here. On request
+photos of each scene are reconstructed, and overlaps are counted in pixels of what is found there.
+"""
+
+from __future__ import annotations
+
+import json
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Int
+from torch import Tensor
+from tqdm import tqdm
+
+from stages.core.backends import pick_device
+from stages.core.errors import InputError
+from stages.core.models.sam2 import weights as sam2_weights
+from stages.core.scene.files import replacing
+from stages.core.scene.scene import Scene
+from stages.lab.assets.tabletops import KINDS, tabletop
+from stages.lab.bench import common as bench
+from stages.lab.bench.photographed import label_images, rebuilt
+from stages.segment.boxes import segment as boxes_segment
+from stages.segment.geometric import segment
+from stages.segment.options import SegmentOptions
+from stages.segment.pictures import pictures
+from stages.segment.sam2 import labelled
+from stages.segment.vote import Sight, add, decide, tempered
+
+WRONG = (0.0, 0.2, 0.4)  # of each photo's objects and pixels
+PIXELS = 20  # by which masks of a wholly wrong photo are off, typically
+
+
+@dataclass(frozen=True)
+class BenchOptions:
+    """Two scenes show all ten objects."""
+
+    scenes: int = 4  # of each kind
+    photos: int = 24  # whose cameras the scene has
+    weights: Path | None = None  # of SAM 2.1; by default looked for
+    device: str = "auto"  # of SAM 2.1
+    reconstruct: bool = False  # photos of each scene, too: minutes a scene
+
+    def __post_init__(self):
+        if not 1 <= self.scenes <= 100 or not 8 <= self.photos <= 200:
+            raise InputError("--scenes 1 to 100, --photos 8 to 200")
+
+
+def overlaps(found: Int[torch.Tensor, "n"], truth: Int[torch.Tensor, "n"]) -> dict[int, float]:
+    """For each true object the intersection over union with the found object that fits it best; 0 is no object.
+
+    `found` and `truth` number the same Gaussians, or the same pixels.
+    """
+    table = torch.zeros(int(truth.max()) + 1, int(found.max()) + 1)
+    table.view(-1).index_add_(0, truth * table.shape[1] + found, torch.ones(len(truth)))
+    union = table.sum(1, keepdim=True) + table.sum(0) - table
+    best = (table / union.clamp_min(1))[:, 1:]
+    return {i: float(best[i].max()) if best.shape[1] else 0.0 for i in truth.unique().tolist() if i > 0}
+
+
+def spoilt(labels: Int[Tensor, "h w"], share: float, objects: int, rng: np.random.Generator) -> Int[Tensor, "h w"]:
+    """A label image with a share of its objects missed or taken for another, of its pixels random, and moved a bit."""
+    fate = rng.uniform(size=objects)
+    taken = [0, *(0 if u < share / 2 else int(rng.integers(1, objects + 1)) if u < share else i
+                  for i, u in enumerate(fate, start=1))]  # fmt: skip
+    out = torch.tensor(taken)[labels]
+    out = out.roll(tuple(int(step) for step in rng.normal(0, share * PIXELS, 2).round()), (0, 1))
+    noise = torch.from_numpy(rng.uniform(size=out.shape) < share)
+    return torch.where(noise, torch.from_numpy(rng.integers(0, objects + 1, out.shape)), out)
+
+
+def by_masks(scene: Scene, truth: Int[Tensor, "n"], seed: int) -> dict[str, Callable[[], Int[Tensor, "n"]]]:
+    """Ways to make object numbers of Gaussians from masks of all views, more and more of them wrong.
+
+    `scene` is without labels; of WRONG = 0.4, say, the masks of every fifth view are missing, too.
+    """
+    objects, rng = int(truth.max()), np.random.default_rng(seed)
+    votes = {share: torch.zeros(len(truth), 1) for share in WRONG}
+    last = {share: torch.zeros_like(truth) for share in WRONG}
+    for view in tqdm(range(len(scene.cameras)), desc="masks", unit="view", leave=False):
+        sight = Sight.of(scene, view)
+        seen = sight.front >= 0
+        labels = torch.where(seen, truth[sight.front.clamp_min(0).long()], 0)
+        for share in WRONG:
+            if rng.uniform() < share / 2:
+                continue
+            given = spoilt(labels, share, objects, rng)
+            votes[share] = add(votes[share], tempered(sight.votes(given)))
+            last[share][sight.front[seen].long()] = given[seen]
+    out: dict[str, Callable[[], Tensor]] = {}
+    for share in WRONG:
+        name = f"masks, {share:.0%} wrong" if share else "masks"
+        out[name] = lambda v=votes[share]: decide(scene, v, {}, "masks").gaussians.object_id
+        out[f"{name}, no vote"] = lambda ids=last[share]: ids
+    return out
+
+
+def by_boxes(scene: Scene, truth: Int[Tensor, "n"]) -> Int[Tensor, "n"]:
+    """Object numbers from tight boxes in the view that shows most of the object it shows least of."""
+
+    def shown(view: int) -> Int[Tensor, "h w"]:
+        front = Sight.of(scene, view).front
+        return torch.where(front >= 0, truth[front.clamp_min(0).long()], 0)
+
+    count, views = int(truth.max()) + 1, range(len(scene.cameras))
+    seen = [shown(view) for view in views]
+    best = max(views, key=lambda v: int(seen[v].flatten().bincount(minlength=count).min()))
+    labels, size = seen[best], scene.cameras.sizes[best]
+    scale = size / torch.tensor([labels.shape[1], labels.shape[0]])
+    boxes = []
+    for i in range(1, count):
+        spots = (labels == i).nonzero().flip(1)
+        boxes.append([*(spots.amin(0) * scale).tolist(), *((spots.amax(0) + 1) * scale).tolist()])
+    scene = replace(scene, cameras=scene.cameras[[best, *(v for v in views if v != best)]])
+    with tempfile.TemporaryDirectory() as folder:
+        prompts = Path(folder) / "prompts.json"
+        prompts.write_text(json.dumps({"bbox": boxes}))
+        return boxes_segment(scene, SegmentOptions(boxes=prompts)).gaussians.object_id
+
+
+def by_sam2(scene: Scene, model) -> Int[Tensor, "n"]:
+    """Object numbers that SAM 2.1 gives, without prompts, from drawings of the scene."""
+    return labelled(scene, model, pictures(scene), None, SegmentOptions("sam2")).gaussians.object_id
+
+
+def measure(kind: str, index: int, photos: int, model=None) -> list[dict]:
+    """Overlaps with each object of a scene, for every way to find them, and the seconds each took after its masks."""
+    scene = tabletop(kind, index, photos)
+    truth = scene.gaussians.object_id
+    blank = replace(scene, gaussians=replace(scene.gaussians, object_id=torch.zeros_like(truth)), objects=())
+    ways = {"geometric": lambda: segment(blank, SegmentOptions()).gaussians.object_id,
+            "boxes": lambda: by_boxes(blank, truth), **by_masks(blank, truth, index)}  # fmt: skip
+    if model is not None:
+        ways["sam2"] = lambda: by_sam2(blank, model)
+    rows = []
+    for way, find in ways.items():
+        start = time.perf_counter()
+        found = find()
+        rows.append(_row(kind, index, way, scene, found, truth, start))
+    return rows
+
+
+def measure_rebuilt(kind: str, index: int, photos: int) -> dict:
+    """Overlaps in the pixels of the photos that could be placed, after their reconstruction; its time is counted.
+
+    Where none can be placed nothing is found.
+    """
+    scene, start = tabletop(kind, index, photos), time.perf_counter()
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            found = segment(rebuilt(scene, Path(folder)), SegmentOptions())
+        names, labels = found.cameras.names, label_images(found, found.cameras.names)
+        truth = label_images(scene, names)
+    except InputError:
+        names, truth = (), scene.gaussians.object_id
+        labels = torch.zeros_like(truth)
+    return {**_row(kind, index, "reconstructed", scene, labels, truth, start), "placed": len(names)}
+
+
+def _row(kind: str, index: int, way: str, scene: Scene, found: Tensor, truth: Tensor, start: float) -> dict:
+    named = {scene.name_of(i): round(value, 3) for i, value in overlaps(found, truth).items()}
+    return {"kind": kind, "scene": index, "way": way, "iou": named, "found": len(found.unique()) - 1,
+            "mean": float(np.mean(list(named.values()))), "seconds": round(time.perf_counter() - start, 1)}  # fmt: skip
+
+
+def run(out: Path | None = None, options: BenchOptions = BenchOptions()) -> Iterator[str]:  # noqa: B008 -- frozen
+    """Lines of the report; all numbers as JSON in `out`."""
+    yield bench.machine("cpu")
+    try:
+        model = sam2_weights.load(sam2_weights.find(options.weights), pick_device(options.device))
+    except InputError as error:
+        if options.weights is not None:
+            raise
+        model = None
+        yield f"without sam2: {error}"
+    rows = []
+    for kind in KINDS:
+        for i in tqdm(range(options.scenes), desc=kind, unit="scene"):
+            rows += measure(kind, i, options.photos, model)
+            rows += [measure_rebuilt(kind, i, options.photos)] if options.reconstruct else []
+            for row in rows[-len({r["way"] for r in rows}) :]:
+                listed = ", ".join(f"{n} {v:.2f}" for n, v in row["iou"].items())
+                yield f"{kind} {i}, {row['way']}: mean {row['mean']:.3f}; {listed}"
+    means = {kind: _means([row for row in rows if row["kind"] == kind]) for kind in KINDS}
+    yield f"{'mean IoU':<28}" + "".join(f"{kind:>10}" for kind in KINDS)
+    for way in means[KINDS[0]]:
+        yield f"{way:<28}" + "".join(f"{means[kind][way]:>10.3f}" for kind in KINDS)
+    if out is not None:
+        facts = {"command": "ngff-lab bench segment", "machine": bench.machine("cpu")}
+        with replacing(out) as part:
+            part.write_text(json.dumps({**facts, "mean_iou": means, "scenes": rows}, indent=1) + "\n")
+
+
+def _means(rows: list[dict]) -> dict[str, float]:
+    ways = dict.fromkeys(row["way"] for row in rows)
+    return {way: round(float(np.mean([row["mean"] for row in rows if row["way"] == way])), 3) for way in ways}

@@ -1,0 +1,1 @@
+"""The GSCollision data set: making, checking, importing."""

@@ -1,0 +1,20 @@
+"""The orbit from which the data set is seen."""
+
+from __future__ import annotations
+
+import torch
+
+from stages.core.geometry.cameras import intrinsics, orbit
+from stages.core.scene.cameras import Cameras
+from stages.lab.dataset.layout import ORBIT
+
+CENTRE, RADIUS, ELEVATION = (0.0, 0.0, -0.3), 4.0, 20.0  # [m], [deg]
+FOCAL = 1.5  # focal length over the side of the picture
+
+
+def cameras_around(resolution: int) -> Cameras:
+    """All of it; camera i has azimuth 120 + 3.6 i degrees."""
+    viewmats = orbit(ORBIT, torch.tensor(CENTRE), RADIUS, ELEVATION)
+    K = intrinsics(resolution, resolution, FOCAL * resolution)
+    sizes = torch.full((ORBIT, 2), resolution)
+    return Cameras(viewmats, K.expand(ORBIT, 3, 3).clone(), sizes, tuple(f"{i:05d}" for i in range(ORBIT)))

@@ -1,0 +1,102 @@
+"""The videos of the data set, drawn as `ngff render` draws: 100 views of the start, and views of what happens.
+
+    initial/<group>/<scene>/<background>/   <scene>.mp4    the start, seen from the whole orbit, a frame each
+                                            cameras.json   of these frames
+                                            prompts.json   center_point, bbox [px of view 0] and text of each object
+                                            depth.h5       depth (v,h,w) uint16 from 0 to depth_max, of the cameras
+                                                           `view`; 0: nothing there
+    dynamic/.../view_<i>/<scene>.mp4        the scene over time from camera i of the orbit
+
+Source: public code of NGFF; its videos are MPEG-4 part 2, ours H.264.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+from pathlib import Path
+
+import h5py
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from stages.core.geometry.cameras import project
+from stages.core.scene.cameras import Cameras
+from stages.core.scene.gaussians import Gaussians
+from stages.core.scene.images import VideoWriter
+from stages.lab.assets.splat_files import camera_rows
+from stages.lab.dataset.cameras import cameras_around
+from stages.lab.dataset.dynamic_gaussians import Carried
+from stages.lab.dataset.layout import ORBIT, kind_of
+from stages.lab.dataset.particles import FRAME
+from stages.lab.dataset.scenes import Config
+from stages.render.backdrop import Backdrop
+from stages.render.draw import look
+
+FPS = 1 / FRAME
+
+
+def write_initial(
+    folder: Path, config: Config, rest: Gaussians, behind: Gaussians, resolution: int, views: Sequence[int]
+) -> None:
+    """What is known of a scene before it moves; `behind` is the background, on the same device."""
+    cameras, backdrop = cameras_around(resolution), Backdrop(own=False, gaussians=behind)
+    shown, depths = backdrop.around(rest), []
+    with VideoWriter(folder / f"{config.name}.mp4", FPS) as video:
+        for i in range(ORBIT):
+            seen = look(shown, cameras, i, backdrop)
+            video.append(seen.image)
+            if i in views:
+                depths.append(seen.depth)
+    (folder / "cameras.json").write_text(json.dumps(camera_rows(cameras.viewmats, resolution)))
+    (folder / "prompts.json").write_text(json.dumps(prompts(config, rest, cameras)))
+    (folder / "depth.h5").write_bytes(_depth_file(torch.stack(depths), views))
+
+
+def prompts(config: Config, rest: Gaussians, cameras: Cameras) -> dict[str, list]:
+    """Where each object is in view 0, and what it is called."""
+    width, height = cameras.sizes[0].tolist()
+    top = torch.tensor([width, height], dtype=torch.float32)
+    centres, boxes = [], []
+    for n in range(1, len(config.ids) + 1):
+        pixels = project(rest.means[rest.object_id == n].cpu(), cameras.viewmats[0], cameras.Ks[0])
+        centres.append(pixels.mean(0).tolist())
+        low, high = (v.clamp_min(0).minimum(top).tolist() for v in (pixels.amin(0), pixels.amax(0)))
+        boxes.append([*low, *high])
+    return {"center_point": centres, "bbox": boxes, "text": [kind_of(i).prompt for i in config.ids]}
+
+
+def _depth_file(depth: Float[Tensor, "v h w"], views: Sequence[int]) -> memoryview:
+    most = max(float(depth.max()), 1e-6)
+    memory = io.BytesIO()
+    with h5py.File(memory, "w") as file:
+        steps = (depth / most * 65535).round().numpy().astype(np.uint16)
+        file.create_dataset("depth", data=steps, chunks=(1, *steps.shape[1:]), compression="gzip", compression_opts=4,
+                            shuffle=True)  # fmt: skip
+        file["depth_max"] = np.float32(most)
+        file["view"] = np.array(views, np.int64)
+    return memory.getbuffer()
+
+
+def write_dynamic(
+    paths: dict[int, Path], scene: Carried, x: Sequence[Tensor], F: Sequence[Tensor], behind: Gaussians,
+    resolution: int,
+) -> None:  # fmt: skip
+    """A video of each view in `paths`; pictures are encoded by threads while the next are drawn."""
+    cameras, backdrop = cameras_around(resolution), Backdrop(own=False, gaussians=behind)
+    for path in paths.values():
+        path.parent.mkdir(parents=True, exist_ok=True)
+    with ExitStack() as stack, ThreadPoolExecutor(len(paths)) as pool:
+        videos = [stack.enter_context(VideoWriter(path, FPS)) for path in paths.values()]
+        before: Iterator[None] = iter(())
+        for places, gradients in zip(x, F, strict=True):
+            shown = backdrop.around(scene.at(places, gradients)[0])
+            images = [look(shown, cameras, i, backdrop).image for i in paths]
+            list(before)  # frames of a video are encoded in their order
+            before = pool.map(VideoWriter.append, videos, images)
+        list(before)

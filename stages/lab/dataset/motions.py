@@ -1,0 +1,178 @@
+"""Simulated motion for training: the keypoints of many scenes in every frame, with what the objects are made of.
+
+A file NAME.h5 holds one group of scenes:
+
+    attributes    format = "ngff-motions", version, dt [s], gravity [m/s^2], box (2,3) [m], provenance (JSON)
+    names (s)     objects (s,o) ids of GSCollision, -1 where there is none
+    points        (s,t,o,n,3) int16, in steps of `step` [m] (an attribute of the dataset)
+    mass E nu friction solidity (s,o)     [kg] [Pa] - - -; without the last all bodies are hollow or thin
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import zlib
+from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from stages.core.errors import InputError
+from stages.core.models.initial_conditions import World
+from stages.core.scene.files import must_exist, replacing
+
+FORMAT, VERSION = "ngff-motions", 1
+STEP = 1e-4  # of the stored positions [m]: they reach 3.2 m from the origin
+LEVEL = 1  # of compression
+WHAT = "simulated motion (.h5), such as `ngff-lab dataset` writes"
+
+
+@dataclass(frozen=True)
+class Motions:
+    """Scenes of up to o objects with n keypoints each."""
+
+    names: tuple[str, ...]
+    objects: Int[Tensor, "s o"]  # -1: none
+    points: Float[Tensor, "s t o n 3"]  # [m]; 0 where there is no object
+    mass: Float[Tensor, "s o"]  # [kg]
+    E: Float[Tensor, "s o"]  # [Pa]
+    nu: Float[Tensor, "s o"]
+    friction: Float[Tensor, "s o"]
+    dt: float  # between frames [s]
+    gravity: tuple[float, float, float]  # [m/s^2]
+    box: tuple[tuple[float, float, float], tuple[float, float, float]]  # of the room [m]
+    solidity: Float[Tensor, "s o"]  # how many times stiffer than hollow or thin bodies of the same material
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    @property
+    def present(self) -> Bool[Tensor, "s o"]:
+        return self.objects >= 0
+
+    def __getitem__(self, rows: Int[Tensor, "r"] | slice) -> Motions:
+        index = torch.arange(len(self))[rows].tolist()
+        tensors = {f.name: getattr(self, f.name)[rows] for f in fields(self) if f.name in TENSORS}
+        return replace(self, names=tuple(self.names[i] for i in index), **tensors)
+
+    def to(self, device: torch.device | str) -> Motions:
+        return replace(self, **{name: getattr(self, name).to(device) for name in TENSORS})
+
+    def world(self, keypoints: int | None = None) -> World:
+        """The scenes at rest, with the first so many keypoints (they come farthest first)."""
+        rest = self.points[:, 0, :, :keypoints]
+        valid = self.present[..., None].expand(rest.shape[:-1])
+        return World.of(
+            rest, valid, mass=self.mass, E=self.E, nu=self.nu, friction=self.friction, solidity=self.solidity,
+            gravity=torch.tensor(self.gravity), box=torch.tensor(self.box),
+        )  # fmt: skip
+
+
+TENSORS = ("objects", "points", "mass", "E", "nu", "friction", "solidity")
+
+
+def joined(parts: Sequence[Motions]) -> Motions:
+    """All scenes of several groups; fewer objects than the most are padded."""
+    most = max(p.objects.shape[1] for p in parts)
+
+    def padded(p: Motions, name: str) -> Tensor:
+        x, axis = getattr(p, name), 2 if name == "points" else 1
+        shape = list(x.shape)
+        shape[axis] = most - shape[axis]
+        fill = -1 if name == "objects" else 0 if name == "points" else 1
+        return torch.cat([x, x.new_full(shape, fill)], axis)
+
+    tensors = {name: torch.cat([padded(p, name) for p in parts]) for name in TENSORS}
+    return replace(parts[0], names=tuple(n for p in parts for n in p.names), **tensors)
+
+
+class MotionsWriter:
+    """Writes the scenes of a group batch by batch: positions in steps of 0.1 mm, complete or not at all.
+
+    Scenes are compressed by threads while the next batch is simulated; all have the same shape.
+    """
+
+    def __init__(self, path: Path, provenance: dict):
+        self.path, self._provenance = Path(path), provenance
+        self._parts: list[Motions] = []
+        self._packed: list[Future[bytes]] = []
+        self._pool = ThreadPoolExecutor(min(8, os.cpu_count() or 1))
+
+    def __enter__(self) -> MotionsWriter:
+        return self
+
+    def append(self, part: Motions) -> None:
+        steps = (part.points / STEP).round().clamp(-32767, 32767).to(torch.int16).cpu().numpy()
+        self._packed += [self._pool.submit(_deflated, scene) for scene in steps]
+        self._parts.append(replace(part, points=torch.empty(*part.points.shape[:-1], 0)))  # the shape is enough
+
+    def __exit__(self, kind, error, trace) -> None:
+        with self._pool as pool:
+            if kind is not None:
+                pool.shutdown(wait=True, cancel_futures=True)
+            else:
+                self._write()
+
+    def _write(self) -> None:
+        count = sum(len(p) for p in self._parts)
+        if not count:
+            raise InputError(f"{self.path}: no scene ended well; make --substep shorter or --dx as published")
+        first = self._parts[0]
+        with replacing(self.path) as part, h5py.File(part, "w") as file:
+            file.attrs.update(format=FORMAT, version=VERSION, dt=first.dt, gravity=first.gravity, box=first.box,
+                              provenance=json.dumps(self._provenance))  # fmt: skip
+            file.create_dataset("names", data=[n for p in self._parts for n in p.names], dtype=h5py.string_dtype())
+            shape = (*first.points.shape[1:4], 3)
+            data = file.create_dataset("points", (count, *shape), "<i2", chunks=(1, *shape), compression="gzip",
+                                       compression_opts=LEVEL, shuffle=True)  # fmt: skip
+            for row, packed in enumerate(self._packed):
+                data.id.write_direct_chunk((row, 0, 0, 0, 0), packed.result())
+            data.attrs["step"] = STEP
+            for name in TENSORS:
+                if name != "points":
+                    file[name] = torch.cat([getattr(p, name) for p in self._parts]).cpu().numpy()
+
+
+def _deflated(steps: np.ndarray) -> bytes:
+    """A chunk as HDF5's shuffle and gzip filters make it: all low bytes, all high bytes, compressed."""
+    shuffled = np.ascontiguousarray(steps, "<i2").view(np.uint8).reshape(-1, 2).T
+    return zlib.compress(shuffled.tobytes(), LEVEL)
+
+
+def write_motions(path: Path, motions: Motions, provenance: dict) -> None:
+    """A group in one piece."""
+    with MotionsWriter(path, provenance) as file:
+        file.append(motions)
+
+
+def made_by(path: Path) -> dict:
+    """What a file of motions says of its making."""
+    with h5py.File(must_exist(path, WHAT), "r") as file:
+        return json.loads(file.attrs.get("provenance", "{}"))
+
+
+def read_motions(path: Path) -> Motions:
+    """Raises InputError for what is no such file."""
+    must_exist(path, WHAT)
+    try:
+        with h5py.File(path, "r") as file:
+            if file.attrs.get("format") != FORMAT:
+                raise InputError(f"{path}: its format attribute is {file.attrs.get('format')!r}, not {FORMAT!r}; {WHAT}"
+                                 " is expected")  # fmt: skip
+            points = torch.from_numpy(file["points"][:]).float() * float(file["points"].attrs["step"])
+            names = [n for n in TENSORS if n != "points" and (n in file or n != "solidity")]
+            rest = {"solidity": torch.ones(len(points), points.shape[2])}
+            rest |= {name: torch.from_numpy(file[name][:]) for name in names}
+            box = tuple(tuple(float(v) for v in corner) for corner in file.attrs["box"])
+            gravity = tuple(float(v) for v in file.attrs["gravity"])
+            return Motions(tuple(file["names"].asstr()[:]), points=points, dt=float(file.attrs["dt"]), gravity=gravity,
+                           box=box, **rest)  # fmt: skip
+    except (KeyError, OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be read ({error}); {WHAT} is expected") from error

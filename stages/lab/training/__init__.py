@@ -1,0 +1,1 @@
+"""Training of dynamics models and of the splat head."""

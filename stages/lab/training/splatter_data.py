@@ -1,0 +1,130 @@
+"""Scenes to train the splat head on: folders of posed photos, and scenes of Gaussians, which are rendered."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from tqdm import tqdm
+
+from stages.core.errors import InputError
+from stages.core.geometry.cameras import intrinsics, orbit, resize
+from stages.core.raster.rasterise import rasterise
+from stages.core.scene.cameras import Cameras, Lenses, read_cameras
+from stages.core.scene.scene import Scene
+from stages.core.scene.scene_ply import read_scene
+from stages.reconstruct.crops import batch, network_size
+from stages.reconstruct.photos import undistort
+from stages.reconstruct.reading import read_photos
+
+CAMERA_FILES = ("transforms.json", "cameras.json", "sparse")
+PHOTO_FOLDERS = ("photos", "images", ".")
+HELD = 4  # every so many-th view of a scene is only ever looked at from, never learned from
+ORBIT = 24  # views of a scene without cameras
+WHITE = (1.0, 1.0, 1.0)  # behind everything, as in the published renderer
+
+
+@dataclass(frozen=True)
+class Posed:
+    """Views of one scene with their cameras, all of one size, sides multiples of 14 px."""
+
+    name: str
+    images: Float[Tensor, "v 3 h w"]
+    viewmats: Float[Tensor, "v 4 4"]
+    Ks: Float[Tensor, "v 3 3"]
+    depths: Float[Tensor, "v h w"] | None  # true ones, 0 where nothing is; None for photos
+
+    def __getitem__(self, index: list[int]) -> Posed:
+        depths = None if self.depths is None else self.depths[index]
+        return Posed(self.name, self.images[index], self.viewmats[index], self.Ks[index], depths)
+
+    def to(self, device: str) -> Posed:
+        moved = (x if x is None else x.to(device) for x in (self.images, self.viewmats, self.Ks, self.depths))
+        return Posed(self.name, *moved)
+
+    @property
+    def held(self) -> list[int]:
+        """Views that measure how well unseen ones are predicted."""
+        return list(range(HELD // 2, len(self.images), HELD))
+
+    @property
+    def learned(self) -> list[int]:
+        return [i for i in range(len(self.images)) if i not in self.held]
+
+
+def read_all(folder: Path, side: int, device: str = "cpu") -> list[Posed]:
+    """Every scene in a folder, in order of name: NAME.ply, and folders (or this one) with photos and their cameras.
+
+    `side` is the longest of an image [px]. Raises InputError where there is none.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise InputError(f"{folder}: is no folder; scenes (.ply) or folders of posed photos are expected in it")
+    places = [p for p in [folder, *sorted(folder.iterdir())] if p.is_dir() and _cameras_in(p)]
+    scenes = [_photographed(place, side) for place in places]
+    for path in tqdm(sorted(folder.glob("*.ply")), desc="rendering", unit="scene", leave=False):
+        scenes.append(rendered(path.stem, read_scene(path), side, device))
+    if not scenes:
+        raise InputError(f"{folder}: holds neither scenes (.ply) nor photos with {' or '.join(CAMERA_FILES)}")
+    few = next((s.name for s in scenes if len(s.learned) < 3), None)
+    if few:
+        raise InputError(f"{folder}: {few} has too few views; 4 or more are needed")
+    return scenes
+
+
+def _cameras_in(folder: Path) -> Path | None:
+    return next((folder / name for name in CAMERA_FILES if (folder / name).exists()), None)
+
+
+def _photographed(folder: Path, side: int) -> Posed:
+    """Photos without their lens's distortion, stretched to the next multiple of 14, and K with them."""
+    inner = next(folder / name for name in PHOTO_FOLDERS if (folder / name).is_dir())
+    photos = read_photos(inner)
+    cameras, lenses = read_cameras(_cameras_in(folder))
+    row = {name: i for i, name in enumerate(cameras.names)}
+    rows = [row[name] for name in photos.names if name in row]
+    photos = photos[[i for i, name in enumerate(photos.names) if name in row]]
+    if len(photos) < 4:
+        raise InputError(f"{_cameras_in(folder)}: names {len(photos)} of the photos in {inner}; 4 or more are needed")
+    cameras = replace(cameras[rows], Ks=_resized(cameras[rows], [photos.size(i) for i in range(len(photos))]))
+    views = undistort(photos, cameras, Lenses(lenses.coefficients[rows]), side=4096)
+    size = network_size(*photos.size(0), side)
+    Ks = _resized(views.cameras, [size] * len(photos))
+    return Posed(folder.name, batch(list(views.images), size), views.cameras.viewmats, Ks, None)
+
+
+def _resized(cameras: Cameras, sizes: list[tuple[int, int]]) -> Float[Tensor, "c 3 3"]:
+    """K for images of other sizes (width, height)."""
+    rows = zip(cameras.Ks, cameras.sizes.tolist(), sizes, strict=True)
+    return torch.stack([resize(K, new[0] / old[0], new[1] / old[1]) for K, old, new in rows])
+
+
+def rendered(name: str, scene: Scene, side: int, device: str = "cpu") -> Posed:
+    """A scene seen by its own cameras, or from all around where it has none."""
+    cameras = scene.cameras if scene.cameras is not None and len(scene.cameras) >= 4 else around(scene)
+    size = network_size(*cameras.sizes[0].tolist(), side)
+    Ks = _resized(cameras, [size] * len(cameras))
+    gaussians, white = scene.gaussians.to(device), torch.tensor(WHITE, device=device)
+    rgb, depth = [], []
+    with torch.no_grad():
+        for viewmat, K in zip(cameras.viewmats.to(device), Ks.to(device), strict=True):
+            drawn = rasterise(gaussians, viewmat[None], K[None], *size, white)
+            rgb.append(drawn.rgb[0].clamp(0, 1).cpu())
+            depth.append(torch.where(drawn.alpha[0] > 0.5, drawn.depth[0], torch.zeros_like(drawn.depth[0])).cpu())
+    images = torch.stack(rgb).permute(0, 3, 1, 2).contiguous()
+    return Posed(name, images, cameras.viewmats, Ks, torch.stack(depth))
+
+
+def around(scene: Scene) -> Cameras:
+    """Two rings of cameras around the middle of the scene, far enough to see half of it and more."""
+    means = scene.gaussians.means
+    centre = means.median(0).values
+    reach = float((means - centre).norm(dim=1).quantile(0.8))
+    rings = [orbit(ORBIT // 2, centre, 3 * reach, angle, azimuth=az) for angle, az in ((20.0, 120.0), (45.0, 135.0))]
+    K = intrinsics(448, 448, 448 / (2 * math.tan(math.radians(25))))
+    names = tuple(f"{i:02d}" for i in range(ORBIT))
+    return Cameras(torch.cat(rings), K.expand(ORBIT, 3, 3).clone(), torch.full((ORBIT, 2), 448), names)

@@ -1,0 +1,214 @@
+"""Training of Pi3-splat's head of Gaussians; all that finds points and cameras stays as it is.
+
+Gaussians are made of some views of a scene and drawn as these and other views of it see them. What is drawn should
+look like the photos, and lie at the depth that the Gaussians were put at. Source: Li et al. 2026, "Learning
+physics-grounded 4D dynamics with neural Gaussian force fields", section on reconstruction (its code for training is
+not public).
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from safetensors.torch import save_file
+from torch import Tensor, nn
+from tqdm import tqdm
+
+from stages.core.backends import pick_device
+from stages.core.errors import InputError
+from stages.core.geometry.cameras import centres
+from stages.core.geometry.similarity import umeyama
+from stages.core.kernels.splat.ssim import ssim
+from stages.core.models.pi3.config import Pi3Config
+from stages.core.models.pi3.network import Geometry
+from stages.core.models.pi3.splat import SMALLEST_STEP, Pi3Splat, splat
+from stages.core.models.pi3.weights import find, load
+from stages.core.raster.rasterise import Rendering, rasterise
+from stages.core.scene.files import replacing, sha256
+from stages.lab import plot
+from stages.lab.training.splatter_data import WHITE, Posed, read_all
+from stages.reconstruct.depth import unproject
+
+log = logging.getLogger(__name__)
+STRUCTURE, DEPTH = 0.2, 0.1  # weights of 1 - SSIM against L1, and of the relative error in depth
+CHECKS = 10  # how often the unseen views are looked at in a run
+LEARNED = ("feature_decoder", "feature_head")
+
+
+@dataclass(frozen=True)
+class SplatterOptions:
+    """How to train."""
+
+    steps: int = 20_000
+    views: int = 4  # that Gaussians are made of in a step; one more is drawn
+    side: int = 448  # longest side of an image [px]
+    depth: str = "network"  # where Gaussians lie: where the network says, or where rendered scenes truly are ("given")
+    width: int = 0  # start from a small random network this wide instead of weights, to try things out
+    lr: float = 1e-4
+    seed: int = 0
+    device: str = "auto"
+
+    def __post_init__(self):
+        if min(self.steps, self.views) < 1 or self.side < 14 or self.lr <= 0:
+            raise InputError("--steps, --views and --lr must be positive, --side at least 14")
+        if self.depth not in ("network", "given"):
+            raise InputError(f"--depth {self.depth}: choose from network, given")
+        if self.width % 16:
+            raise InputError(f"--width {self.width}: must be a multiple of 16")
+
+
+def run(data: Path, out: Path, options: SplatterOptions, weights: Path | None = None) -> Iterator[str]:
+    """Folder of scenes -> OUT.safetensors for --backend pi3-splat, its history (.json) and curves (.png) beside it."""
+    device = pick_device(options.device)
+    scenes = read_all(data, options.side, device)
+    if options.depth == "given" and (bare := [s.name for s in scenes if s.depths is None]):
+        raise InputError(f"--depth given: {bare[0]} is photos, which have none; use scenes (.ply) or --depth network")
+    torch.manual_seed(options.seed)
+    model, fresh = start(weights, options)
+    model = model.to(device)
+    seen, unseen = (scenes[:-1], scenes[-1:]) if len(scenes) > 3 else (scenes, scenes)
+    if fresh:
+        initialise(model, geometry_of(model, seen[0][seen[0].learned].to(device), options), seen[0].Ks[0])
+    history = []
+    for row in fit(model, seen, unseen, options, device):
+        best = max((r["psnr"] for r in history), default=-math.inf)
+        history.append(row)
+        if row["psnr"] > best:
+            _save(out, model)
+        loss = "" if row["loss"] is None else f"  loss {row['loss']:.4f}"
+        yield f"step {row['step']:6d}{loss}  PSNR of unseen views {row['psnr']:.2f} dB"
+    facts = {"options": asdict(options), "data": [s.name for s in scenes], "unseen": [s.name for s in unseen]}
+    with replacing(Path(out).with_suffix(".json")) as part:
+        part.write_text(json.dumps({**facts, "history": history, "sha256": sha256(out)}, indent=1) + "\n")
+    titles = {"loss": "loss against steps", "psnr": "PSNR of unseen views [dB] against steps"}
+    curves = {key: [(float(r["step"]), r[key]) for r in history if r[key] is not None] for key in titles}
+    plot.draw(Path(out).with_suffix(".png"), [plot.Panel(titles[key], points) for key, points in curves.items()], 2)
+
+
+def start(weights: Path | None, options: SplatterOptions) -> tuple[Pi3Splat, bool]:
+    """The network, of which only the head of Gaussians learns, and whether that head is fresh.
+
+    From weights of Pi3-splat, or of π³ where those are absent.
+    """
+    fresh = True
+    if options.width:
+        small = Pi3Config(options.width, 16, 2, 4, 1, options.width, 8, (options.width,) * 3, options.width)
+        model = Pi3Splat(small)
+    else:
+        try:
+            model, fresh = load(find("pi3-splat", weights), "pi3-splat"), False
+        except InputError:
+            base = load(find("pi3", weights), "pi3")
+            model = Pi3Splat(base.config)
+            model.encoder.load_state_dict(base.state_dict(), strict=False)  # the head is not among them
+    for name, parameter in model.encoder.named_parameters():
+        parameter.requires_grad_(name.startswith(LEARNED))
+    return model.eval(), fresh
+
+
+def initialise(model: Pi3Splat, geometry: Geometry, K: Float[Tensor, "3 3"]) -> None:
+    """A fresh head starts with grey, half opaque spheres as large as a pixel."""
+    last: nn.Linear = model.encoder.feature_head.down_proj
+    pixel = float((geometry.points[..., 2] / K[0, 0]).median()) / SMALLEST_STEP
+    with torch.no_grad():
+        last.weight.mul_(0.1)
+        last.bias.zero_()
+        last.bias[1:4] = pixel if pixel > 20 else math.log(max(math.expm1(pixel), 1e-6))
+        last.bias[7] = 1.0
+
+
+def fit(
+    model: Pi3Splat, seen: list[Posed], unseen: list[Posed], options: SplatterOptions, device: str
+) -> Iterator[dict]:
+    """Train; now and then {"step", "loss", "psnr"}, the first before any step."""
+    generator = torch.Generator().manual_seed(options.seed)
+    learned = [p for p in model.parameters() if p.requires_grad]
+    optimiser = torch.optim.AdamW(learned, options.lr, weight_decay=0.01)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, options.lr, options.steps + 1, pct_start=0.05)
+    every, losses = max(1, options.steps // CHECKS), []
+    for step in tqdm(range(options.steps + 1), desc="training", unit="step", leave=False):
+        if step % every == 0 or step == options.steps:
+            psnr = sum(held_out_psnr(model, s, options, device) for s in unseen) / len(unseen)
+            yield {"step": step, "loss": sum(losses) / len(losses) if losses else None, "psnr": psnr}
+            losses = []
+        if step == options.steps:
+            return
+        scene = seen[int(torch.randint(len(seen), (), generator=generator))]
+        chosen = torch.tensor(scene.learned)[torch.randperm(len(scene.learned), generator=generator)]
+        chosen = chosen[: options.views + 1].tolist()
+        loss = step_loss(model, scene[chosen].to(device), options)
+        optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        nn.utils.clip_grad_norm_(learned, 1.0)
+        optimiser.step()
+        schedule.step()
+        losses.append(loss.item())
+
+
+def step_loss(model: Pi3Splat, views: Posed, options: SplatterOptions) -> Tensor:
+    """Gaussians of all views but the last, drawn in one of these and in the last."""
+    model.encoder.feature_head.train()
+    sources = list(range(len(views.images) - 1))
+    geometry, drawn = _drawn(model, views, sources, [0, len(sources)], options)
+    loss = torch.zeros((), device=views.images.device)
+    for k, i in enumerate((0, len(sources))):
+        image, photo = drawn.rgb[k], views.images[i].permute(1, 2, 0)
+        loss = loss + (1 - STRUCTURE) * (image - photo).abs().mean() + STRUCTURE * (1 - ssim(image, photo))
+    known = (geometry.points[0, ..., 2] > 0) & (drawn.alpha[0] > 0.5)
+    wanted = geometry.points[0, ..., 2].clamp_min(1e-6)
+    error = torch.where(known, (drawn.depth[0] - wanted).abs() / wanted, torch.zeros_like(wanted))
+    return loss / 2 + DEPTH * error.mean()
+
+
+@torch.no_grad()
+def held_out_psnr(model: Pi3Splat, scene: Posed, options: SplatterOptions, device: str) -> float:
+    """Of the views never learned from, drawn from Gaussians of others [dB]."""
+    model.encoder.feature_head.eval()
+    sources = scene.learned[:: max(1, len(scene.learned) // options.views)][: options.views]
+    views = scene[[*sources, *scene.held]].to(device)
+    targets = list(range(len(sources), len(views.images)))
+    _, drawn = _drawn(model, views, list(range(len(sources))), targets, options)
+    error = (drawn.rgb.clamp(0, 1) - views.images[targets].permute(0, 2, 3, 1)).square().mean((1, 2, 3))
+    return float((-10 * error.clamp_min(1e-10).log10()).mean())
+
+
+def _drawn(model, views: Posed, sources: list[int], targets: list[int], options) -> tuple[Geometry, Rendering]:
+    """Where the sources' pixels lie, and their Gaussians as the targets see them."""
+    device = views.images.device
+    used = views[sources]
+    with torch.autocast(device.type, torch.bfloat16, enabled=device.type != "cpu"):
+        with torch.no_grad():
+            hidden, places = model.encoder.tokens(used.images, 8)
+        geometry = geometry_of(model, used, options, hidden, places)
+        raw = model.encoder.raw(used.images, hidden, places, len(sources))
+    gaussians = splat(geometry, raw)[(geometry.points[..., 2] > 0).flatten()]
+    size = views.images.shape[3], views.images.shape[2]
+    white = torch.tensor(WHITE, device=device)
+    return geometry, rasterise(gaussians, views.viewmats[targets], views.Ks[targets], *size, white)
+
+
+@torch.no_grad()
+def geometry_of(model, views: Posed, options: SplatterOptions, hidden=None, places=None) -> Geometry:
+    """Where the pixels lie: at the given cameras, at true depth or the network's, scaled so that cameras agree."""
+    if options.depth == "given":
+        depths = views.depths
+    else:
+        if hidden is None:
+            hidden, places = model.encoder.tokens(views.images, 8)
+        said = model.encoder.geometry(hidden, places, views.images.shape[2:], 8)
+        scale = umeyama(said.poses[:, :3, 3].cpu(), centres(views.viewmats).cpu()).scale
+        depths = said.points[..., 2] * scale
+    local = [unproject(d, K, torch.eye(4).to(d))[1] for d, K in zip(depths, views.Ks, strict=True)]
+    return Geometry(torch.stack(local), torch.ones_like(depths), torch.linalg.inv(views.viewmats))
+
+
+def _save(out: Path, model: Pi3Splat) -> None:
+    with replacing(out) as part:
+        save_file({k: v.detach().cpu().contiguous() for k, v in model.state_dict().items()}, part)

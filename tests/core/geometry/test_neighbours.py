@@ -1,0 +1,74 @@
+from math import inf
+
+import pytest
+import torch
+
+from stages.core.geometry.neighbours import Products, Tree, knn, searchable, spacing
+from tests.conftest import DEVICES
+
+
+@pytest.fixture(scope="module")
+def cloud():
+    """Points in a unit cube of place and colour, and a batch of queries around them."""
+    rng = torch.Generator().manual_seed(0)
+    return torch.rand(3000, 6, generator=rng) - 0.5, 1.2 * torch.rand(7, 50, 6, generator=rng) - 0.6
+
+
+@pytest.mark.parametrize("k", [1, 32])
+def test_products_find_what_the_tree_finds(cloud, k, monkeypatch):
+    monkeypatch.setattr(Products, "ENTRIES", 100_000)  # several chunks
+    points, queries = cloud
+    (far, which), (expected, index) = (way(points).query(queries, k) for way in (Products, Tree))
+    torch.testing.assert_close(far, expected, rtol=0, atol=1e-5)
+    assert torch.equal(which, index)
+    torch.testing.assert_close((queries[..., None, :] - points[which]).norm(dim=3), far)
+
+
+def test_products_keep_the_precision_of_the_queries(cloud):
+    points, queries = cloud[0], cloud[1].double()
+    (far, _), (expected, _) = (way(points).query(queries) for way in (Products, Tree))
+    torch.testing.assert_close(far, expected, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("way", [Tree, Products])
+def test_what_is_not_within_reach_is_infinitely_far(way):
+    line = torch.tensor([[0.0, 0, 0], [1, 0, 0], [3, 0, 0]])
+    distance, index = way(line).query(torch.tensor([[0.1, 0, 0], [9, 0, 0]]), 4, within=1.5)
+    torch.testing.assert_close(distance, torch.tensor([[0.1, 0.9, inf, inf], [inf] * 4]))
+    assert index[0, :2].tolist() == [0, 1] and bool((index < 3).all())
+
+
+def test_points_on_the_cpu_are_searched_by_a_tree(cloud):
+    assert isinstance(searchable(cloud[0]), Tree)
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif("cuda" not in DEVICES, reason="no NVIDIA GPU")
+def test_points_on_a_gpu_are_searched_there(cloud):
+    points, queries = (x.cuda() for x in cloud)
+    found = searchable(points)
+    assert isinstance(found, Products)
+    distance, index = found.query(queries, 5)
+    expected = Tree(cloud[0]).query(cloud[1], 5)
+    torch.testing.assert_close(distance.cpu(), expected[0], rtol=0, atol=1e-5)
+    assert torch.equal(index.cpu(), expected[1])
+
+
+def test_knn_equals_brute_force():
+    rng = torch.Generator().manual_seed(0)
+    points, queries = torch.rand(100, 3, generator=rng), torch.rand(20, 3, generator=rng)
+    distance, index = knn(points, queries, 5)
+    expected = torch.cdist(queries, points).topk(5, largest=False)
+    torch.testing.assert_close(distance, expected.values)
+    assert torch.equal(index, expected.indices)
+
+
+def test_too_few_points_repeat_the_last():
+    distance, index = knn(torch.tensor([[0.0, 0, 0], [1, 0, 0]]), torch.zeros(1, 3), 4)
+    assert index.tolist() == [[0, 1, 1, 1]]
+    assert distance.tolist() == [[0, 1, 1, 1]]
+
+
+def test_spacing_of_a_line():
+    line = torch.arange(5.0)[:, None] * torch.tensor([[0.1, 0, 0]])
+    torch.testing.assert_close(spacing(line, 1), torch.full((5,), 0.1))

@@ -1,0 +1,39 @@
+import torch
+
+from stages.core.geometry.rotations import between, covariance, matrix, multiply, nearest, quaternion
+
+
+def random_quats(n: int) -> torch.Tensor:
+    quats = torch.randn(n, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    return quats / quats.norm(dim=1, keepdim=True)
+
+
+def test_quarter_turn_about_z_swaps_x_and_y():
+    quarter = torch.tensor([0.5**0.5, 0.0, 0.0, 0.5**0.5])
+    cov = covariance(quarter, torch.tensor([1.0, 2.0, 3.0]))
+    torch.testing.assert_close(cov, torch.diag(torch.tensor([4.0, 1.0, 9.0])))
+
+
+def test_quaternion_inverts_matrix_also_at_half_turns():
+    half_turns = torch.cat([torch.zeros(3, 1), torch.eye(3)], 1).double()
+    R = matrix(torch.cat([random_quats(100), half_turns]))
+    torch.testing.assert_close(matrix(quaternion(R)), R)
+
+
+def test_multiply_is_composition():
+    a, b = random_quats(20), random_quats(40)[20:]
+    torch.testing.assert_close(matrix(multiply(a, b)), matrix(a) @ matrix(b))
+
+
+def test_between_turns_one_direction_into_the_other_also_when_opposite():
+    for a, b in [((0.0, 0, 1), (0.0, 1, 1)), ((0.0, 0, 1), (0.0, 0, -1))]:
+        a, b = torch.tensor(a), torch.tensor(b)
+        R = between(a, b)
+        torch.testing.assert_close(R @ a, b / b.norm(), atol=1e-6, rtol=0)
+        torch.testing.assert_close(torch.det(R), torch.tensor(1.0))
+
+
+def test_nearest_rotation_undoes_a_stretch():
+    R = matrix(random_quats(10))
+    stretch = torch.diag(torch.tensor([1.5, 1.0, 0.5], dtype=torch.float64))
+    torch.testing.assert_close(nearest(R @ stretch), R)

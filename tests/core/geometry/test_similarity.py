@@ -1,0 +1,23 @@
+import torch
+
+from stages.core.geometry.cameras import intrinsics, look_at, project
+from stages.core.geometry.rotations import matrix
+from stages.core.geometry.similarity import Similarity, umeyama
+
+ROTATION = matrix(torch.tensor([0.8, 0.1, -0.3, 0.5], dtype=torch.float64))
+TURN = Similarity(2.5, ROTATION, torch.tensor([1.0, -2, 3]).double())
+
+
+def test_umeyama_recovers_a_known_similarity():
+    points = torch.randn(20, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    found = umeyama(points, TURN(points))
+    assert abs(found.scale - TURN.scale) < 1e-12
+    torch.testing.assert_close(found.rotation, TURN.rotation)
+    torch.testing.assert_close(found.translation, TURN.translation)
+
+
+def test_moved_cameras_see_the_moved_world_in_the_same_pixels():
+    points = torch.randn(20, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    viewmat, K = look_at(torch.tensor([6.0, 1, 2]), torch.zeros(3)).double(), intrinsics(64, 64, 80.0).double()
+    moved = TURN.viewmats(viewmat[None])[0]
+    torch.testing.assert_close(project(TURN(points), moved, K), project(points, viewmat, K))

@@ -1,0 +1,69 @@
+"""The kernels against their specification in PyTorch."""
+
+from functools import partial
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from stages.core.kernels.mpm.grid import PAD
+from stages.core.kernels.mpm.transfers import substep_reference
+from stages.core.physics.mpm import solver as mpm
+from stages.core.physics.mpm import split as mpm_split
+from tests.conftest import DEVICES
+
+DX, DT, FRICTION = 0.1, 1e-3, 0.4
+
+
+def cloud(p: int = 300, seed: int = 0) -> mpm.Particles:
+    """Deformed, moving particles, some of them in the floor and in a wall of the box from 0 to 1."""
+    rng = torch.Generator().manual_seed(seed)
+    x = torch.rand(p, 3, generator=rng) * torch.tensor([0.3, 0.5, 0.5]) + torch.tensor([0.0, 0.25, 0.0])
+    full = torch.full((p,), 1.0)
+    particles = mpm.at_rest(x, 1e-3 * full, 900 * full, 2e5 * full, 0.3 * full, 4 * full, FRICTION * full)
+    particles.v = torch.randn(p, 3, generator=rng) - torch.tensor([1.0, 0, 1])
+    particles.C = torch.randn(p, 3, 3, generator=rng)
+    particles.F = particles.F + 0.1 * torch.randn(p, 3, 3, generator=rng)
+    return particles
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_step_equals_its_reference(device):
+    # float32 against float64: sums of a few dozen terms, so 1e-5 of the largest value
+    ours = cloud()
+    solver = mpm.Solver(ours, mpm.Box((0, 0, 0), (1, 1, 1)), DX, device)
+    push = torch.tensor([0.5, 0.0, -9.81]).repeat(len(ours), 1)
+    solver.advance(DT, push, substeps=1)
+    theirs = {k: getattr(ours, k).double() for k in ("x", "v", "C", "F", "mass", "volume", "stiffness")}
+    origin = torch.tensor(list(solver.grid.origin)).double()
+    theirs["x"] = theirs["x"] - origin
+    walls = torch.tensor(list(solver.grid.low)), torch.tensor(list(solver.grid.high))
+    expected = substep_reference(
+        **theirs, push=push.double(), dt=DT, dx=DX, nodes=tuple(solver.grid.nodes), low=walls[0], high=walls[1],
+        friction=FRICTION,
+    )  # fmt: skip
+    got = solver.particles
+    for name, value in zip(("x", "v", "C", "F"), (expected[0] + origin, *expected[1:]), strict=True):
+        scale = float(value.abs().max())
+        torch.testing.assert_close(getattr(got, name).cpu().double(), value, rtol=0, atol=2e-5 * scale, msg=name)
+    assert walls[0].tolist() == [PAD] * 3
+
+
+def test_the_same_bytes_whatever_the_number_of_threads(monkeypatch):
+    push = torch.tensor([0.0, 0.0, -9.81]).repeat(300, 1)
+    results = []
+    for threads in (1, 3):
+        crew = mpm_split._Crew(threads)
+        monkeypatch.setattr(mpm_split, "_crew", partial(getattr, SimpleNamespace(crew=crew), "crew"))
+        solver = mpm.Solver(cloud(), mpm.Box((0, 0, 0), (1, 1, 1)), DX)
+        for _ in range(3):
+            solver.advance(0.01, push)
+        results.append(solver.particles.x)
+    assert torch.equal(*results)
+
+
+def test_a_step_leaves_the_grid_clean():
+    # what one substep scattered must not come back in a later one, also where particles have moved on
+    solver = mpm.Solver(cloud(), mpm.Box((0, 0, 0), (1, 1, 1)), DX)
+    solver.advance(0.05, torch.zeros(300, 3))
+    assert not solver._order._momentum.any()

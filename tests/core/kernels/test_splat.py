@@ -1,0 +1,218 @@
+"""The rasteriser's kernels against their references, step by step."""
+
+import pytest
+import torch
+
+from stages.core.kernels.splat.binning import fill_bins, fill_bins_reference
+from stages.core.kernels.splat.compositing import blend, blend_reference, heaviest
+from stages.core.kernels.splat.compositing_pixel import composite
+from stages.core.kernels.splat.projection import BIN, pinhole, project, project_reference
+from stages.core.kernels.splat.simd import even
+from tests.conftest import random_gaussians, ring
+
+devices = ["cpu"] + (["cuda"] if torch.cuda.is_available() else [])
+WIDTH, HEIGHT = 71, 53  # no multiples of anything
+
+
+def view_of(gaussians, closer: float = 0.0, size=(WIDTH, HEIGHT)):
+    """A pinhole two units away, or `closer`, and the tensors it sees."""
+    cameras = ring()
+    viewmat = cameras.viewmats[1].clone()
+    viewmat[2, 3] -= closer
+    camera = pinhole(viewmat, cameras.Ks[1], *size, 0.01)
+    return camera, (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
+
+
+def random_splats(n: int, opacity: float = 1.0, seed: int = 0, size=(WIDTH, HEIGHT)):
+    gaussians = random_gaussians(n, seed=seed, degree=1)
+    camera, tensors = view_of(gaussians, size=size)
+    tensors = (*tensors[:3], (opacity * tensors[3]).clamp(max=1.0), tensors[4])
+    with torch.no_grad():
+        splats, keys, rects = project(camera, *tensors)
+    return splats, fill_bins(keys, rects, *size)
+
+
+def relative(ours, theirs) -> float:
+    return float((ours.double() - theirs.double()).norm() / theirs.double().norm())
+
+
+@pytest.mark.parametrize("closer", [0.0, 1.7], ids=["outside", "inside the cloud"])
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_projection_equals_its_reference(degree, closer):
+    # inside, large ones centred far outside the image reach into it, where the Jacobian is taken at the border
+    camera, tensors = view_of(random_gaussians(203, degree=degree, size=0.25 if closer else 0.05), closer)
+    tensors = [t.clone().requires_grad_() for t in tensors]
+    exact = [t.detach().double().requires_grad_() for t in tensors]
+    splats, theirs = project(camera, *tensors)[0], project_reference(camera, *exact)
+    assert torch.equal(splats[:, 11] > 0, theirs[:, 11] > 0)
+    assert 20 < (splats[:, 11] > 0).sum() <= 203
+    torch.testing.assert_close(splats[:, :10].double(), theirs[:, :10], rtol=1e-4, atol=1e-5)
+    # extents are a little generous, never short
+    assert (splats[:, 11:13] >= theirs[:, 11:13] - 1e-4).all()
+    torch.testing.assert_close(splats[:, 11:13].double(), theirs[:, 11:13], rtol=2e-3, atol=2e-2)
+    weight = torch.randn(splats.shape, generator=torch.Generator().manual_seed(1))
+    # apart, for the gradient of the centre would drown that of the covariance
+    for columns in (slice(0, 2), slice(2, 5), slice(5, 10)):
+        value, exact_value = ((s[:, columns] * weight[:, columns]).sum() for s in (splats, theirs))
+        ours = torch.autograd.grad(value, tensors, retain_graph=True)
+        wanted = torch.autograd.grad(exact_value, exact, retain_graph=True, allow_unused=True)
+        for name, mine, true in zip(("means", "quats", "scales", "opacities", "sh"), ours, wanted, strict=True):
+            true = torch.zeros_like(mine) if true is None else true
+            size = float(true.norm())
+            assert float((mine - true).norm()) <= 1e-5 * size, name
+            torch.testing.assert_close(mine.double(), true.double(), rtol=1e-4, atol=1e-5 * size)
+
+
+def test_the_length_of_a_quat_has_no_effect():
+    camera, (means, quats, *rest) = view_of(random_gaussians(40))
+    torch.testing.assert_close(project(camera, means, 7 * quats, *rest)[0], project(camera, means, quats, *rest)[0])
+
+
+def test_behind_beside_and_not_a_number_are_not_visible():
+    gaussians = random_gaussians(6)
+    eye = -ring().viewmats[1][:3, :3].T @ ring().viewmats[1][:3, 3]
+    gaussians.means[0] = 2 * eye  # behind
+    gaussians.means[1] = eye  # at the very centre
+    gaussians.means[2] = torch.tensor([0.0, 0.0, 50.0])  # above
+    gaussians.means[3] = float("nan")
+    gaussians.opacities[4] = 0.9 / 255  # too faint
+    gaussians.means[5] = 0.0
+    camera, tensors = view_of(gaussians)
+    tensors = [t.requires_grad_() for t in tensors]
+    splats, keys, _ = project(camera, *tensors)
+    assert (splats[:, 11] > 0).tolist() == [False] * 5 + [True]
+    assert splats.isfinite().all() and (keys[:5] == -1).all()
+    for grad in torch.autograd.grad(splats.sum(), tensors):
+        assert grad.isfinite().all() and (grad[:5] == 0).all()
+
+
+@pytest.mark.parametrize("n", [0, 1, 17, 1500])
+def test_bins_hold_what_touches_them_nearest_first(n):
+    splats, bins = random_splats(n)
+    order = fill_bins_reference(splats)
+    across = -(-WIDTH // BIN)
+    assert len(bins.starts) == across * -(-HEIGHT // BIN) + 1 and bins.starts[-1] == len(bins.members)
+    low, high = splats[order, :2] - splats[order, 11:13], splats[order, :2] + splats[order, 11:13]
+    for b in range(len(bins.starts) - 1):
+        corner = torch.tensor([b % across, b // across]) * BIN
+        touches = ((low <= corner + BIN - 0.5) & (high >= corner + 0.5)).all(1)  # a pixel centre between its edges
+        members = bins.members[bins.starts[b] : bins.starts[b + 1]]
+        assert set(order[touches].tolist()) <= set(members.tolist())
+        assert torch.equal(members.long(), order[torch.isin(order, members)])
+
+
+def test_equal_depths_keep_the_order_of_the_gaussians():
+    keys = torch.tensor([5, 7, 5, -1, 7, 5, 1 << 30], dtype=torch.int32)
+    bins = fill_bins(keys, torch.zeros(7, 4, dtype=torch.int16), 20, 20)
+    assert bins.members.tolist() == [0, 2, 5, 1, 4, 6]
+
+
+def test_pieces_cover_all_bins_with_about_equal_work():
+    _, bins = random_splats(1500, size=(320, 200))
+    bounds = bins.pieces(3)
+    assert bounds[0] == 0 and bounds[-1] == len(bins.starts) - 1 and bounds == sorted(set(bounds))
+    assert even(10, 3) == [0, 3, 6, 10]
+
+
+# opacity 3: most clamp at alpha 0.999, many pixels finish early
+@pytest.mark.parametrize("opacity", [0.1, 1.0, 3.0])
+def test_compositing_equals_its_reference(opacity):
+    splats, bins = random_splats(1000, opacity)
+    splats.requires_grad_()
+    exact = splats.detach().double().requires_grad_()
+    *theirs, _ = blend_reference(exact, fill_bins_reference(splats), WIDTH, HEIGHT)
+    ours = blend(splats, bins)
+    assert 0.05 < ours[2].mean() < 0.9 and (opacity == 0.1 or ours[2].max() > 0.999)
+    for mine, true in zip(ours, theirs, strict=True):
+        torch.testing.assert_close(mine.double(), true, rtol=0, atol=5e-6)
+    weights = [torch.randn(image.shape, generator=torch.Generator().manual_seed(1)) for image in ours]
+    (mine,) = torch.autograd.grad(sum((w * i).sum() for w, i in zip(weights, ours, strict=True)), splats)
+    (true,) = torch.autograd.grad(sum((w.double() * i).sum() for w, i in zip(weights, theirs, strict=True)), exact)
+    for column in range(10):
+        assert relative(mine[:, column], true[:, column]) < 1e-5, column
+    mine, true = mine[:, :10].double(), true[:, :10]
+    torch.testing.assert_close(mine, true, rtol=1e-4, atol=1e-5 * float(true.abs().max()))
+
+
+def test_mean_and_background_are_part_of_the_gradient():
+    splats, bins = random_splats(200)
+    splats.requires_grad_()
+    exact = splats.detach().double().requires_grad_()
+    behind = torch.rand(HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(2))
+    rgb, mean, _ = blend(splats, bins, behind, mean=True)
+    colour, fourth, alpha, _ = blend_reference(exact, fill_bins_reference(splats), WIDTH, HEIGHT)
+    their_rgb, their_mean = colour + (1 - alpha)[..., None] * behind, fourth / alpha.clamp_min(1e-10)
+    torch.testing.assert_close(rgb.double(), their_rgb, rtol=0, atol=5e-6)
+    torch.testing.assert_close(mean.double(), their_mean, rtol=1e-4, atol=1e-5)
+    (mine,) = torch.autograd.grad(rgb.square().sum() + mean.square().sum(), splats)
+    (true,) = torch.autograd.grad(their_rgb.square().sum() + their_mean.square().sum(), exact)
+    assert relative(mine[:, :10], true[:, :10]) < 1e-4
+
+
+def test_absolute_gradients_do_not_cancel():
+    # An upstream gradient odd in x about a splat's centre pulls it both ways: by symmetry of |.| both sides add up.
+    splats, keys, rects = one_splat(40.5, 20.5)
+    splats.requires_grad_()
+    upstream = torch.ones(HEIGHT, WIDTH, 3)
+    (grad,) = torch.autograd.grad(blend(splats, fill_bins(keys, rects, WIDTH, HEIGHT))[0], splats, upstream)
+    sigma, x = 3.0, torch.arange(-40, 31).float()
+    profile = 0.5 * torch.exp(-0.5 * (x / sigma) ** 2) * x / sigma**2
+    y = torch.arange(-20, 33).float()
+    both = (profile[None] * torch.exp(-0.5 * (y / sigma) ** 2)[:, None]).abs() * 3
+    seen = (0.5 * torch.exp(-0.5 * (x**2 + y[:, None] ** 2) / sigma**2)) >= 1 / 255
+    assert abs(float(grad[0, 0])) < 1e-4
+    torch.testing.assert_close(grad[0, 10], both[seen].sum(), rtol=1e-4, atol=0)
+
+
+def one_splat(x: float, y: float, opacity: float = 0.5, sigma: float = 3.0):
+    splats = torch.zeros(1, 16)
+    reach = sigma * (2 * torch.tensor(255 * opacity).log()).sqrt()
+    conic = [1 / sigma**2, 0, 1 / sigma**2]
+    splats[0, :13] = torch.tensor([x, y, *conic, opacity, 1, 1, 1, 2, torch.tensor(opacity).log2(), reach, reach])
+    return splats, torch.ones(1, dtype=torch.int32), torch.tensor([[0, 0, 2, 1]], dtype=torch.int16)
+
+
+@pytest.mark.parametrize("device", devices)
+def test_one_thread_a_pixel_agrees(device):
+    splats, bins = random_splats(1500)
+    image, alpha, index, totals = composite(
+        splats.to(device), bins.members.to(device), bins.starts.to(device), BIN, WIDTH, HEIGHT
+    )
+    rgb, fourth, opaque = blend(splats, bins)
+    torch.testing.assert_close(image[..., :3].cpu(), rgb, rtol=0, atol=5e-6)
+    torch.testing.assert_close(image[..., 3].cpu(), fourth, rtol=0, atol=2e-5)
+    torch.testing.assert_close(alpha.cpu(), opaque, rtol=0, atol=5e-6)
+    which, weight = heaviest(splats, bins)
+    assert (index.cpu() == which).float().mean() > 0.999  # but for ties within rounding
+    torch.testing.assert_close(totals.cpu(), weight, rtol=1e-4, atol=1e-4)
+
+
+def test_the_heaviest_splat_is_that_of_the_reference():
+    splats, bins = random_splats(400)
+    order = fill_bins_reference(splats)
+    *_, weights = blend_reference(splats.double(), order, WIDTH, HEIGHT)
+    best = torch.where(weights.amax(-1) > 0, order[weights.argmax(-1)], -1)
+    index, totals = heaviest(splats, bins)
+    assert (index == best).float().mean() > 0.999 and (index == -1).any()
+    torch.testing.assert_close(totals[order].double(), weights.sum((0, 1)), rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("threads", [1, 2, 3])
+def test_the_number_of_threads_changes_rounding_only(threads, request):
+    before = torch.get_num_threads()
+    request.addfinalizer(lambda: torch.set_num_threads(before))
+    torch.set_num_threads(threads)
+    splats, bins = random_splats(1500, size=(200, 150))
+    results = []
+    for _ in range(2):
+        leaf = splats.clone().requires_grad_()
+        rgb, _, alpha = blend(leaf, bins)
+        (grad,) = torch.autograd.grad(rgb.square().sum() + alpha.sum(), leaf)
+        results.append((rgb.detach(), grad))
+    assert torch.equal(results[0][0], results[1][0]) and torch.equal(results[0][1], results[1][1])
+    torch.set_num_threads(1)
+    leaf = splats.clone().requires_grad_()
+    rgb, _, alpha = blend(leaf, bins)
+    (grad,) = torch.autograd.grad(rgb.square().sum() + alpha.sum(), leaf)
+    assert torch.equal(rgb, results[0][0])
+    torch.testing.assert_close(grad, results[0][1], rtol=1e-4, atol=1e-4 * float(grad.abs().max()))

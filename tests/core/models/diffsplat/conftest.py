@@ -1,0 +1,20 @@
+"""One tiny model for all tests here, through the loader."""
+
+import pytest
+
+pytest.importorskip("diffusers", reason="needs the extra diffsplat")
+pytest.importorskip("transformers", reason="needs the extra diffsplat")
+
+
+@pytest.fixture(scope="session")
+def folder(tmp_path_factory):
+    from tests.core.models.diffsplat.tiny import published
+
+    return published(tmp_path_factory.mktemp("weights") / "diffsplat")
+
+
+@pytest.fixture(scope="session")
+def model(folder):
+    from stages.core.models.diffsplat.weights import find, load
+
+    return load(find(folder))

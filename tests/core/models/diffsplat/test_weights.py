@@ -1,0 +1,171 @@
+"""Published weights: their layout, names and sizes, what is wrong with others, and fetching them when told to."""
+
+import json
+import logging
+import shutil
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+from diffusers import UNet2DConditionModel
+from safetensors.torch import load_file, save_file
+
+from stages.core.errors import InputError
+from stages.core.models.diffsplat.download import download
+from stages.core.models.diffsplat.weights import BASE, GSVAE, UNET, find, gaussian_vae, load
+from stages.core.scene.files import sha256
+from tests.core.models.diffsplat.tiny import autoencoder, unet
+
+
+@pytest.fixture(autouse=True)
+def nothing_installed(monkeypatch, tmp_path):
+    monkeypatch.setenv("NGFF_WEIGHTS", str(tmp_path / "weights"))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+
+
+@pytest.fixture
+def copy(folder, tmp_path):
+    return shutil.copytree(folder, tmp_path / "copy")
+
+
+def test_every_tensor_arrives(model):
+    for mine, theirs in ((model.unet, unet()), (model.gsvae, autoencoder(12)), (model.vae, autoencoder(3))):
+        state = mine.state_dict()
+        assert state.keys() == theirs.state_dict().keys()
+        assert all(torch.equal(state[k], v) for k, v in theirs.state_dict().items())
+        assert not any(p.requires_grad for p in mine.parameters())
+
+
+def test_the_newest_checkpoint_counts(copy):
+    assert find(copy).unet.parent.name == "013020"
+    shutil.copytree(copy / UNET / "checkpoints/013020", copy / UNET / "checkpoints/100000")
+    (copy / UNET / "checkpoints/README").mkdir()
+    assert find(copy).unet.parent.name == "100000"
+
+
+def test_where_weights_are_looked_for(folder, tmp_path):
+    with pytest.raises(InputError) as caught:
+        find()
+    for needed in ("chenguolin/DiffSplat", "MIT", "stable-diffusion-v1-5", "OpenRAIL", "3.8 GB", "--download"):
+        assert needed in str(caught.value)
+    shutil.copytree(folder, tmp_path / "cache/ngff/diffsplat")
+    assert find().base == tmp_path / "cache/ngff/diffsplat" / BASE
+    shutil.copytree(folder, tmp_path / "weights/diffsplat")
+    assert find().base == tmp_path / "weights/diffsplat" / BASE
+    shutil.rmtree(tmp_path / "weights/diffsplat" / GSVAE)
+    with pytest.raises(InputError, match="no .*gsvae_gobj265k_sd.*model.safetensors"):
+        find(tmp_path / "weights/diffsplat")
+
+
+def test_half_precision_on_disk_is_32_bit_in_memory(copy):
+    file = find(copy).gsvae
+    save_file({k: v.half() for k, v in load_file(file).items()}, file)
+    assert {p.dtype for p in load(find(copy)).gsvae.parameters()} == {torch.float32}
+
+
+def test_other_weights_are_refused_with_reason(copy):
+    files = find(copy)
+    state = load_file(files.gsvae)
+    save_file({k: v for k, v in state.items() if "conv_out.bias" not in k}, files.gsvae)
+    with pytest.raises(InputError, match="model.safetensors: .*2 tensors missing: encoder.conv_out.bias"):
+        load(files)
+    save_file(state, files.gsvae)
+    words = files.base / "text_encoder/model.safetensors"
+    kept = load_file(words)
+    save_file({k: v for k, v in kept.items() if "final_layer_norm" not in k}, words, metadata={"format": "pt"})
+    with pytest.raises(InputError, match="text_encoder lacks 2 tensors such as .*final_layer_norm.bias"):
+        load(files)
+    save_file(kept, words, metadata={"format": "pt"})
+    text_only = {**json.loads((files.unet / "config.json").read_text()), "in_channels": 10}
+    (files.unet / "config.json").write_text(json.dumps(text_only))
+    with pytest.raises(InputError, match="10 channels in; the one that takes a picture has 11"):
+        load(files)
+    (files.base / "vae/diffusion_pytorch_model.safetensors").write_bytes(b"no")
+    with pytest.raises(InputError, match="Stable Diffusion 1.5 .*fetch"):
+        load(files)
+
+
+def test_absent_packages_are_named(folder, monkeypatch):
+    monkeypatch.setitem(sys.modules, "diffusers", None)
+    with pytest.raises(InputError, match=r"ngff\[diffsplat\]"):
+        load(find(folder))
+
+
+def test_the_published_sizes():
+    """The hub lists 3.44 GB for the U-Net; its autoencoder's first and last layer are those of the public code."""
+    with torch.device("meta"):
+        network = UNet2DConditionModel(in_channels=11, cross_attention_dim=768)
+    count = sum(p.numel() for p in network.parameters())
+    assert len(network.state_dict()) == 686 and count == 859_541_124
+    assert f"{4 * count / 1e9:.2f}" == "3.44"
+    published = {"block_out_channels": (128, 256, 512, 512), "down_block_types": ("DownEncoderBlock2D",) * 4,
+                 "layers_per_block": 2, "up_block_types": ("UpDecoderBlock2D",) * 4, "latent_channels": 4}  # fmt: skip
+    state = gaussian_vae(published).state_dict()
+    assert state["encoder.conv_in.weight"].shape == (128, 12, 3, 3)
+    assert state["decoder.conv_out.weight"].shape == (12, 128, 3, 3)
+    assert sum(v.numel() for v in state.values()) == pytest.approx(84e6, rel=0.01)  # the public README: 84 M
+
+
+@pytest.fixture
+def hub(monkeypatch, folder):
+    """What of huggingface_hub is used, serving the tiny model as two repositories."""
+    wrong = []
+
+    def files(root):
+        return [SimpleNamespace(rfilename=str(p.relative_to(root)), size=p.stat().st_size,
+                                lfs=SimpleNamespace(sha256="0" * 64 if wrong else sha256(p))
+                                if p.suffix == ".safetensors" else None)
+                for p in sorted(root.rglob("*")) if p.is_file()]  # fmt: skip
+
+    def model_info(repository, files_metadata):
+        assert files_metadata
+        base = repository == "stable-diffusion-v1-5/stable-diffusion-v1-5"
+        siblings = files(folder / BASE) if base else [f for f in files(folder) if not f.rfilename.startswith(BASE)]
+        for file in siblings:  # the hub has both widths
+            if file.rfilename == "text_encoder/model.safetensors":
+                file.rfilename = "text_encoder/model.fp16.safetensors"
+        card = SimpleNamespace(license="creativeml-openrail-m") if base else None
+        siblings.append(SimpleNamespace(rfilename="big.ckpt", size=10**10, lfs=None))
+        return SimpleNamespace(siblings=siblings, sha="0123456789abcdef", card_data=card)
+
+    def fetch(repository, filename, revision, local_dir):
+        source = folder / BASE if repository.startswith("stable") else folder
+        out = local_dir / filename
+        out.parent.mkdir(parents=True, exist_ok=True)
+        out.write_bytes((source / filename.replace(".fp16", "")).read_bytes())
+        return str(out)
+
+    module = SimpleNamespace(HfApi=lambda: SimpleNamespace(model_info=model_info), hf_hub_download=fetch, wrong=wrong)
+    monkeypatch.setitem(sys.modules, "huggingface_hub", module)
+    return module
+
+
+def test_a_download_says_first_what_it_is_and_leaves_what_is_looked_for(hub, folder, tmp_path, caplog):
+    with caplog.at_level(logging.INFO):
+        files = download()
+    assert files.base == tmp_path / "weights/diffsplat" / BASE
+    for needed in ("licence MIT", "licence creativeml-openrail-m", sha256(find(folder).gsvae), "3.8 GB of"):
+        assert needed in caplog.text
+    assert not list((tmp_path / "weights").rglob("big.ckpt"))
+    assert [sha256(p) for p in (files.gsvae, files.unet / "config.json")] == [
+        sha256(p) for p in (find(folder).gsvae, find(folder).unet / "config.json")
+    ]
+    assert find() == files
+
+
+def test_what_does_not_arrive_whole_is_removed(hub):
+    hub.wrong.append(True)
+    with pytest.raises(InputError, match="did not arrive whole") as caught:
+        download()
+    assert not Path(str(caught.value).split(": did not")[0]).exists()
+
+
+def test_without_a_network_it_is_one_sentence(hub):
+    def fails(*_, **__):
+        raise ConnectionError("no route\n to host")
+
+    hub.HfApi = lambda: SimpleNamespace(model_info=fails)
+    with pytest.raises(InputError, match="chenguolin/DiffSplat could not be fetched .no route to host.; .*--weights"):
+        download()

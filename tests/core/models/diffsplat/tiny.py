@@ -1,0 +1,93 @@
+"""A DiffSplat of random weights, small, in the published layout of folders and names."""
+
+import json
+from pathlib import Path
+
+import torch
+from diffusers import AutoencoderKL, UNet2DConditionModel
+from safetensors.torch import save_file
+from transformers import CLIPTextConfig, CLIPTextModel
+
+from stages.core.models.diffsplat.weights import BASE, GSVAE, UNET
+
+SIDE = 32  # of its pictures; their latents are half that
+WIDTHS = (8, 16)
+SCHEDULER = {  # that of Stable Diffusion 1.5
+    "_class_name": "PNDMScheduler", "beta_end": 0.012, "beta_schedule": "scaled_linear", "beta_start": 0.00085,
+    "num_train_timesteps": 1000, "set_alpha_to_one": False, "skip_prk_steps": True, "steps_offset": 1,
+    "trained_betas": None, "clip_sample": False,
+}  # fmt: skip
+UNET_CONFIG = {
+    "_class_name": "UNetMV2DConditionModel", "_diffusers_version": "0.32.0", "sample_size": SIDE // 2,
+    "in_channels": 11, "out_channels": 4, "block_out_channels": WIDTHS, "layers_per_block": 1, "norm_num_groups": 4,
+    "down_block_types": ["CrossAttnDownBlockMV2D", "DownBlock2D"], "mid_block_type": "UNetMidBlockMV2DCrossAttn",
+    "up_block_types": ["UpBlock2D", "CrossAttnUpBlockMV2D"], "cross_attention_dim": 16, "attention_head_dim": 2,
+    "view_concat_condition": True, "input_concat_plucker": True, "input_concat_binary_mask": True,
+}  # fmt: skip
+
+
+def unet() -> UNet2DConditionModel:
+    """What UNET_CONFIG describes, built by hand."""
+    torch.manual_seed(0)
+    return UNet2DConditionModel(
+        sample_size=SIDE // 2, in_channels=11, out_channels=4, block_out_channels=WIDTHS, layers_per_block=1,
+        norm_num_groups=4, down_block_types=("CrossAttnDownBlock2D", "DownBlock2D"),
+        up_block_types=("UpBlock2D", "CrossAttnUpBlock2D"), cross_attention_dim=16, attention_head_dim=2,
+    )  # fmt: skip
+
+
+def autoencoder(channels: int) -> AutoencoderKL:
+    torch.manual_seed(channels)
+    return AutoencoderKL(
+        in_channels=channels, out_channels=channels, down_block_types=("DownEncoderBlock2D",) * 2, layers_per_block=1,
+        up_block_types=("UpDecoderBlock2D",) * 2, block_out_channels=WIDTHS, norm_num_groups=4, latent_channels=4,
+    )  # fmt: skip
+
+
+def published(folder: Path) -> Path:
+    """Write all three parts into a folder."""
+    ema = folder / UNET / "checkpoints/013020/unet_ema"
+    ema.mkdir(parents=True)
+    (ema / "config.json").write_text(json.dumps(UNET_CONFIG))
+    save_file(unet().state_dict(), ema / "diffusion_pytorch_model.safetensors")
+    steps = folder / GSVAE / "checkpoints/039030"
+    steps.mkdir(parents=True)
+    state = {f"vae.{k}": v for k, v in autoencoder(12).state_dict().items()}
+    save_file({**state, "tiny_decoder.layers.0.weight": torch.zeros(3)}, steps / "model.safetensors")
+    base = folder / BASE
+    vae = autoencoder(3)
+    vae.save_config(base / "vae")
+    save_file(classic(vae.state_dict()), base / "vae/diffusion_pytorch_model.safetensors")
+    torch.manual_seed(3)
+    text = CLIPTextConfig(
+        vocab_size=40, hidden_size=16, intermediate_size=32, num_hidden_layers=2, num_attention_heads=2,
+        max_position_embeddings=12, bos_token_id=0, eos_token_id=1,
+    )  # fmt: skip
+    text.save_pretrained(base / "text_encoder")
+    state = {f"text_model.{k.removeprefix('text_model.')}": v for k, v in CLIPTextModel(text).state_dict().items()}
+    save_file(state, base / "text_encoder/model.safetensors", metadata={"format": "pt"})
+    (base / "scheduler").mkdir()
+    (base / "scheduler/scheduler_config.json").write_text(json.dumps(SCHEDULER))
+    _tokenizer(base / "tokenizer")
+    return folder
+
+
+def classic(state: dict) -> dict:
+    """The names that the attention of Stable Diffusion 1.5's autoencoder has on the hub."""
+    names = {"to_q": "query", "to_k": "key", "to_v": "value", "to_out.0": "proj_attn"}
+    out = {}
+    for name, value in state.items():
+        for new, old in names.items():
+            name = name.replace(f"attentions.0.{new}", f"attentions.0.{old}")
+        out[name] = value
+    return out
+
+
+def _tokenizer(folder: Path) -> None:
+    """Letters, alone and ending a word; no merges."""
+    letters = "abcdefghijklmnopq,"
+    tokens = ["<|startoftext|>", "<|endoftext|>", *letters, *(f"{letter}</w>" for letter in letters)]
+    folder.mkdir()
+    (folder / "vocab.json").write_text(json.dumps({token: i for i, token in enumerate(tokens)}))
+    (folder / "merges.txt").write_text("#version: 0.2\n")
+    (folder / "tokenizer_config.json").write_text(json.dumps({"model_max_length": 12, "do_lower_case": True}))

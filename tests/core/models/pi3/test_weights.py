@@ -1,0 +1,150 @@
+"""Published weights: found, read from either kind of file, refused with reason, fetched only when told to."""
+
+import logging
+import sys
+from types import SimpleNamespace
+
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from stages.core.errors import InputError
+from stages.core.models.pi3.download import download
+from stages.core.models.pi3.network import Pi3
+from stages.core.models.pi3.splat import Pi3Splat
+from stages.core.models.pi3.weights import find, load
+from stages.core.scene.files import sha256
+from tests.core.models.pi3.test_network import TINY, random_weights, views
+from tests.core.models.pi3.test_splat import TINY_SPLAT
+
+
+@pytest.fixture(autouse=True)
+def nothing_installed(monkeypatch, tmp_path):
+    monkeypatch.setenv("NGFF_WEIGHTS", str(tmp_path / "weights"))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+
+
+@torch.no_grad()
+def test_both_kinds_of_file_give_the_network_that_was_saved(tmp_path):
+    model = random_weights(Pi3(TINY))
+    save_file(model.state_dict(), tmp_path / "a.safetensors")
+    torch.save({"epoch": 3, "state_dict": model.state_dict()}, tmp_path / "b.pth")
+    expected = model(views()).points
+    for name in ("a.safetensors", "b.pth"):
+        loaded = load(tmp_path / name, "pi3")
+        assert torch.equal(loaded(views()).points, expected)
+        assert not any(p.requires_grad for p in loaded.parameters())
+
+
+@torch.no_grad()
+def test_half_precision_on_disk_is_32_bit_in_memory(tmp_path):
+    model = random_weights(Pi3Splat(TINY_SPLAT))
+    state = {k: v.half() if v.is_floating_point() else v for k, v in model.state_dict().items()}
+    save_file(state, tmp_path / "a.safetensors")
+    loaded = load(tmp_path / "a.safetensors", "pi3-splat")
+    assert all(p.dtype == torch.float32 for p in loaded.parameters())
+    torch.testing.assert_close(loaded(views())[0].poses, model(views())[0].poses, rtol=0.05, atol=0.05)
+
+
+def test_what_is_wrong_is_said_in_one_sentence(tmp_path):
+    state = Pi3(TINY).state_dict()
+    del state["point_head.proj.bias"], state["encoder.norm.bias"]
+    state["extra.weight"] = torch.zeros(1)
+    state["conf_head.proj.bias"] = torch.zeros(7)
+    save_file(state, tmp_path / "a.safetensors")
+    with pytest.raises(InputError) as caught:
+        load(tmp_path / "a.safetensors", "pi3")
+    message = str(caught.value)
+    assert "2 tensors missing: encoder.norm.bias, point_head.proj.bias" in message
+    assert "1 tensors unknown: extra.weight" in message
+    assert "conf_head.proj.bias (7,) instead of (196,)" in message
+
+
+def test_other_networks_and_broken_files_are_refused(tmp_path):
+    save_file({"conv.weight": torch.zeros(3)}, tmp_path / "other.safetensors")
+    with pytest.raises(InputError, match="no weights of pi3.*yyfz233/Pi3"):
+        load(tmp_path / "other.safetensors", "pi3")
+    save_file(Pi3(TINY).state_dict(), tmp_path / "pi3.safetensors")
+    with pytest.raises(InputError, match="no weights of pi3-splat"):
+        load(tmp_path / "pi3.safetensors", "pi3-splat")
+    for name in ("a.safetensors", "a.pth"):
+        (tmp_path / name).write_bytes(b"not at all")
+        with pytest.raises(InputError, match=f"{name}: .*fetch it again"):
+            load(tmp_path / name, "pi3")
+
+
+def test_a_pickle_that_would_run_code_is_not_run(tmp_path):
+    torch.save({"register_token": print}, tmp_path / "a.pth")
+    with pytest.raises(InputError, match="cannot be read as a PyTorch checkpoint"):
+        load(tmp_path / "a.pth", "pi3")
+
+
+def test_where_weights_are_looked_for(tmp_path):
+    with pytest.raises(InputError, match=r"weights or .*cache/ngff; fetch .*yyfz233/Pi3 .*CC BY-NC.*--download"):
+        find("pi3")
+    inside = tmp_path / "cache/ngff/pi3"
+    inside.mkdir(parents=True)
+    (inside / "README.md").touch()
+    (inside / "model.safetensors").touch()
+    assert find("pi3") == inside / "model.safetensors"
+    (tmp_path / "weights").mkdir()
+    (tmp_path / "weights/pi3.pth").touch()
+    assert find("pi3") == tmp_path / "weights/pi3.pth"
+    assert find("pi3", tmp_path / "cache/ngff") == inside / "model.safetensors"
+    with pytest.raises(InputError, match="no such file; weights of pi3"):
+        find("pi3", tmp_path / "missing.pth")
+
+
+@pytest.fixture
+def hub(monkeypatch, tmp_path):
+    """What of huggingface_hub is used, serving one small file."""
+    remote = tmp_path / "remote.safetensors"
+    save_file(Pi3(TINY).state_dict(), remote)
+    file = SimpleNamespace(rfilename="model.safetensors", size=remote.stat().st_size,
+                           lfs=SimpleNamespace(sha256=sha256(remote)))  # fmt: skip
+    card = SimpleNamespace(license="cc-by-nc-4.0")
+    readme = SimpleNamespace(rfilename="README.md", size=10**9, lfs=None)
+    info = SimpleNamespace(siblings=[readme, file], sha="0123456789abcdef", card_data=card)
+
+    def fetch(repository, filename, revision, local_dir):
+        assert (repository, filename, revision) == ("yyfz233/Pi3", "model.safetensors", info.sha)
+        local_dir.mkdir(parents=True)
+        (local_dir / filename).write_bytes(remote.read_bytes())
+        return str(local_dir / filename)
+
+    def model_info(repository, files_metadata):
+        assert files_metadata
+        return info
+
+    module = SimpleNamespace(HfApi=lambda: SimpleNamespace(model_info=model_info), hf_hub_download=fetch, file=file)
+    monkeypatch.setitem(sys.modules, "huggingface_hub", module)
+    return module
+
+
+def test_size_licence_and_checksum_are_said_before_fetching(hub, caplog, monkeypatch, tmp_path):
+    fetch, said = hub.hf_hub_download, []
+    hub.hf_hub_download = lambda *args, **kwargs: (said.append(caplog.text), fetch(*args, **kwargs))[1]
+    with caplog.at_level(logging.INFO):
+        path = download("pi3")
+    assert "GB, licence cc-by-nc-4.0, sha256 " + hub.file.lfs.sha256 in said[0]
+    assert path == find("pi3") == tmp_path / "weights/pi3/model.safetensors"
+    assert isinstance(load(path, "pi3"), Pi3)
+
+
+def test_what_arrives_damaged_is_removed(hub, tmp_path):
+    hub.file.lfs.sha256 = "0" * 64
+    with pytest.raises(InputError, match="did not arrive whole"):
+        download("pi3")
+    assert not list((tmp_path / "weights/pi3").iterdir())
+
+
+def test_without_network_or_package_it_says_what_to_do(hub, monkeypatch):
+    def no_network(*_, **__):
+        raise ConnectionError("no route to host")
+
+    hub.hf_hub_download = no_network
+    with pytest.raises(InputError, match="no route to host.*save it as .*pi3.safetensors"):
+        download("pi3")
+    monkeypatch.setitem(sys.modules, "huggingface_hub", None)
+    with pytest.raises(InputError, match=r"pip install 'ngff\[hub\]'"):
+        download("pi3")

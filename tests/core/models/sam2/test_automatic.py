@@ -1,0 +1,49 @@
+"""Automatic masks: as the image model gives them for the same clicks; sure ones only, each once."""
+
+import torch
+
+from stages.core.models.sam2.automatic import Automatic, distinct, propose, stability
+from tests.core.models.sam2.tiny import SIDE, random_model
+
+
+def test_masks_are_those_of_the_image_model_with_the_same_weights():
+    from transformers import Sam2Config, Sam2Model
+
+    video = random_model()
+    parts = {k: getattr(video.config, f"{k}_config") for k in ("vision", "prompt_encoder", "mask_decoder")}
+    config = Sam2Config(**{f"{k}_config": {**v.to_dict()} for k, v in parts.items()})
+    image = Sam2Model(config).eval()
+    image.load_state_dict({k: v for k, v in video.state_dict().items() if k in image.state_dict()})
+    pixels = torch.randn(3, SIDE, SIDE, generator=torch.Generator().manual_seed(2))
+    steps = (torch.arange(4) + 0.5) / 4 * SIDE
+    points = torch.cartesian_prod(steps, steps).flip(1)  # row by row
+    with torch.no_grad():
+        theirs = image(pixel_values=pixels[None], input_points=points[None, :, None],
+                       input_labels=torch.ones(1, 16, 1, dtype=torch.int32), multimask_output=True)  # fmt: skip
+    every = Automatic(grid=4, at_once=5, iou=-9.0, stability=0.0, same=1.0)
+    mine = propose(video, pixels, every)
+    masks, scores = theirs.pred_masks.flatten(0, 2) > 0, theirs.iou_scores.flatten()
+    order = distinct(masks, scores, 1.0)
+    assert len(order) > 10 and torch.equal(mine.masks, masks[order])
+    torch.testing.assert_close(mine.scores, scores[order], rtol=1e-5, atol=1e-5)
+    median = float(scores.median())
+    some = propose(video, pixels, Automatic(grid=4, at_once=16, iou=median, stability=0.0, same=1.0))
+    assert 0 < len(some.masks) < len(mine.masks) and float(some.scores.min()) >= median
+
+
+def test_stability_by_hand():
+    row = torch.tensor([[-3.0, -0.5, 0.5, 0.9, 2.0, 3.0]])  # above 1: two; above -1: five
+    soft, hard = row[None], torch.tensor([[[-9.0, -9, 9, 9, 9, 9]]])
+    torch.testing.assert_close(stability(torch.cat([soft, hard, hard - 100])), torch.tensor([0.4, 1.0, 0.0]))
+
+
+def test_of_masks_that_overlap_the_surer_stays():
+    masks = torch.zeros(5, 1, 20, dtype=torch.bool)
+    masks[0, 0, :10] = True
+    masks[1, 0, 1:11] = True  # 9 of 11 shared with the first: 0.82
+    masks[2, 0, :5] = True  # a part of the first: 0.5
+    masks[3, 0, 12:] = True
+    scores = torch.tensor([0.8, 0.9, 0.95, 0.7, 1.0])  # and the fifth is empty
+    assert distinct(masks, scores, 0.7).tolist() == [2, 1, 3]
+    assert distinct(masks, scores, 0.9).tolist() == [2, 1, 0, 3]
+    assert distinct(masks[:0], scores[:0], 0.7).tolist() == []

@@ -1,0 +1,113 @@
+"""What we feed SAM 2.1 and keep of it changes nothing: the masks are those of transformers' own way."""
+
+import numpy as np
+import pytest
+import torch
+
+from stages.core.models.sam2 import network
+from stages.core.models.sam2.network import Clicks, Session, pixel_values, track
+from tests.core.models.sam2.tiny import SIDE, random_model
+
+COUNT, START = 13, 4
+BOX, POINT = torch.tensor([0.1, 0.1, 0.5, 0.6]), torch.tensor([0.7, 0.4])
+
+
+@pytest.fixture(scope="module")
+def model():
+    return random_model()
+
+
+@pytest.fixture(scope="module")
+def video():
+    return torch.randn(COUNT, 3, SIDE, SIDE, generator=torch.Generator().manual_seed(1))
+
+
+def theirs(model, video, give) -> dict[int, torch.Tensor]:
+    """All frames in memory, nothing forgotten, through transformers' own iterators."""
+    from transformers import Sam2VideoInferenceSession
+
+    session = Sam2VideoInferenceSession(video=video, dtype=torch.float32)
+    session.obj_with_new_inputs = give(session)
+    out = {}
+    for reverse in (False, True):
+        for frame in model.propagate_in_video_iterator(session, start_frame_idx=START, reverse=reverse):
+            out[frame.frame_idx] = frame.pred_masks[:, 0]
+    return out
+
+
+def by_clicks(session) -> list[int]:
+    for i, (points, labels) in enumerate([(BOX.reshape(2, 2), [2, 3]), (POINT[None], [1])]):
+        row = session.obj_id_to_idx(i)
+        session.add_point_inputs(row, START, {"point_coords": points[None, None] * SIDE,
+                                              "point_labels": torch.tensor(labels)[None, None].int()})  # fmt: skip
+    return [0, 1]
+
+
+def a_mask() -> torch.Tensor:
+    mask = torch.zeros(SIDE // 4, SIDE // 4, dtype=torch.bool)
+    mask[5:20, 8:16] = True
+    return mask
+
+
+def by_mask(session) -> list[int]:
+    whole = torch.nn.functional.interpolate(a_mask()[None, None].float(), (SIDE, SIDE), mode="bilinear",
+                                            antialias=True)  # fmt: skip
+    session.add_mask_inputs(session.obj_id_to_idx(0), START, (whole >= 0.5).float())
+    return [0]
+
+
+@pytest.mark.parametrize(
+    ("prompts", "give"),
+    [([Clicks.box(BOX), Clicks.inside(POINT)], by_clicks), (a_mask()[None], by_mask)],
+    ids=["clicks", "mask"],
+)
+def test_propagation_is_that_of_transformers_though_most_is_forgotten(model, video, prompts, give):
+    mine = dict(track(model, lambda i: video[i], COUNT, prompts, START))
+    assert list(mine) == [*range(START, COUNT), *range(START - 1, -1, -1)]
+    for t, masks in theirs(model, video, give).items():
+        torch.testing.assert_close(mine[t], masks, rtol=0, atol=0)
+    spread = torch.stack([mine[t] for t in range(COUNT)]).std(0)
+    assert float(spread.mean()) > 1e-3  # the frames do differ, so the above says something
+
+
+def test_the_past_is_looked_at(model, video):
+    """Another second photo changes the third one's masks, by memory alone."""
+    other = video.clone()
+    other[1] = other[1].flip(-1)
+    one, two = ([m for _, m in track(model, lambda i, v=v: v[i], 3, [Clicks.box(BOX)])] for v in (video, other))
+    assert torch.equal(one[0], two[0]) and float((one[2] - two[2]).abs().max()) > 1e-3
+
+
+def test_memory_does_not_grow_with_the_sequence_and_each_photo_is_read_once(model, monkeypatch):
+    sessions, read = [], []
+
+    class Watched(Session):
+        def __init__(self, *args):
+            super().__init__(*args)
+            sessions.append(self)
+
+    def frame(i):
+        read.append(i)
+        return torch.full((3, SIDE, SIDE), i / 40)
+
+    def held() -> int:
+        outputs = sessions[-1].output_dict_per_obj[0]
+        kept = (*outputs["cond_frame_outputs"].values(), *outputs["non_cond_frame_outputs"].values())
+        return sum(x.numel() * x.element_size() for one in kept for x in one.values() if isinstance(x, torch.Tensor))
+
+    monkeypatch.setattr(network, "Session", Watched)
+    sizes = [held() for _ in track(model, frame, 40, [Clicks.box(BOX)])]
+    assert sorted(read) == list(range(40))
+    assert sizes[39] <= sizes[14] and sizes[14] > 0
+    assert sessions[-1].processed_frames is None
+
+
+def test_pixel_values_are_pillows_resize_then_the_published_mean_and_deviation():
+    Image = pytest.importorskip("PIL.Image")
+    pixels = (torch.rand(90, 210, 3, generator=torch.Generator().manual_seed(0)) * 255).round()
+    pillow = Image.fromarray(pixels.numpy().astype(np.uint8)).resize((64, 64), Image.BILINEAR)
+    expected = (torch.from_numpy(np.array(pillow)).float() / 255 - torch.tensor([0.485, 0.456, 0.406])) / torch.tensor(
+        [0.229, 0.224, 0.225]
+    )
+    mine = pixel_values(pixels / 255, 64).permute(1, 2, 0)
+    torch.testing.assert_close(mine, expected, rtol=0, atol=1.01 / 255 / 0.224)  # Pillow rounds twice to 8 bits

@@ -1,0 +1,115 @@
+"""Weights of SAM 2.1: found in the published layout, refused with reason, fetched only when told to."""
+
+import json
+import logging
+import sys
+from types import SimpleNamespace
+
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from stages.core.errors import InputError
+from stages.core.models.sam2.weights import download, find, load
+from stages.core.scene.files import sha256
+from tests.core.models.sam2.tiny import random_model, saved
+
+
+@pytest.fixture(autouse=True)
+def nothing_installed(monkeypatch, tmp_path):
+    monkeypatch.setenv("NGFF_WEIGHTS", str(tmp_path / "weights"))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+
+
+def test_where_weights_are_looked_for(tmp_path):
+    with pytest.raises(InputError, match=r"config.json with model.safetensors in .*weights/sam2 or .*ngff/sam2; fetch "
+                                         r".*facebook/sam2.1-hiera-large \(0.9 GB.*Apache.*--download"):  # fmt: skip
+        find()
+    saved(tmp_path / "cache/ngff/sam2")
+    assert find() == tmp_path / "cache/ngff/sam2/model.safetensors"
+    saved(tmp_path / "weights/sam2")
+    assert find() == tmp_path / "weights/sam2/model.safetensors"
+    assert find(tmp_path / "cache/ngff/sam2") == find(tmp_path / "cache/ngff/sam2/model.safetensors")
+    (tmp_path / "weights/sam2/config.json").unlink()
+    with pytest.raises(InputError, match="config.json: no such file"):
+        find(tmp_path / "weights/sam2/model.safetensors")
+    with pytest.raises(InputError, match="no such file; the weights of SAM 2.1"):
+        find(tmp_path / "absent.safetensors")
+
+
+def test_what_was_saved_is_what_loads_whatever_the_precision_on_disk(tmp_path):
+    saved(tmp_path / "a", seed=3)
+    state = random_model(3).state_dict()
+    model = load(find(tmp_path / "a"))
+    assert not any(p.requires_grad for p in model.parameters()) and not model.training
+    assert all(torch.equal(value, state[name]) for name, value in model.state_dict().items())
+    file = tmp_path / "a/model.safetensors"
+    save_file({k: v.bfloat16() for k, v in load_file(file).items()}, file)
+    assert all(p.dtype == torch.float32 for p in load(file).parameters())
+
+
+def edited(folder, change):
+    file = saved(folder) / "model.safetensors"
+    state = load_file(file)
+    change(state)
+    save_file(state, file)
+    return file
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda s: s.pop("no_memory_embedding"), "1 tensors missing: no_memory_embedding"),
+        (lambda s: s.update(no_memory_embedding=torch.zeros(1, 1, 7)), "other shapes"),
+        (lambda s: s.clear() or s.update(x=torch.zeros(1)), "tensors missing"),
+    ],
+)
+def test_weights_that_do_not_fit_are_refused(tmp_path, change, says):
+    with pytest.raises(InputError, match=f"model.safetensors: does not fit the config.json.*{says}"):
+        load(edited(tmp_path / "a", change))
+
+
+def test_damaged_files_are_refused(tmp_path):
+    file = saved(tmp_path / "a") / "model.safetensors"
+    whole, config = file.read_bytes(), file.with_name("config.json").read_text()
+    file.write_bytes(whole[:1000])
+    with pytest.raises(InputError, match="no whole safetensors file"):
+        load(file)
+    file.write_bytes(whole)
+    for broken in ("{", json.dumps({**json.loads(config), "model_type": "sam2"}), "[]", '{"model_type": "bert"}'):
+        file.with_name("config.json").write_text(broken)
+        with pytest.raises(InputError, match="config.json: does not describe SAM 2.1"):
+            load(file)
+
+
+def test_without_transformers_it_says_what_to_install(tmp_path, monkeypatch):
+    file = find(saved(tmp_path / "a"))
+    monkeypatch.setitem(sys.modules, "transformers", None)
+    with pytest.raises(InputError, match=r"pip install -U 'ngff\[sam2\]'"):
+        load(file)
+
+
+def test_both_files_are_fetched_and_said_before(tmp_path, monkeypatch, caplog):
+    remote = saved(tmp_path / "remote")
+    weights = SimpleNamespace(rfilename="model.safetensors", size=10**6,
+                              lfs=SimpleNamespace(sha256=sha256(remote / "model.safetensors")))  # fmt: skip
+    others = [SimpleNamespace(rfilename=name, size=9, lfs=None) for name in ("README.md", "config.json")]
+    info = SimpleNamespace(siblings=[weights, *others], sha="0123456789abcdef", card_data=None)
+    said = []
+
+    def hub_download(repository, filename, revision, local_dir):
+        said.append(caplog.text)
+        local_dir.mkdir(parents=True, exist_ok=True)
+        (local_dir / filename).write_bytes((remote / filename).read_bytes())
+        return str(local_dir / filename)
+
+    api = SimpleNamespace(model_info=lambda repository, files_metadata: info)
+    monkeypatch.setitem(sys.modules, "huggingface_hub",
+                        SimpleNamespace(HfApi=lambda: api, hf_hub_download=hub_download))  # fmt: skip
+    with caplog.at_level(logging.INFO):
+        path = download()
+    assert path == find() == tmp_path / "weights/sam2/model.safetensors"
+    assert weights.lfs.sha256 in said[0] and "Apache-2.0" in said[0]
+    info.siblings = others
+    with pytest.raises(InputError, match="it holds no model.safetensors.*put config.json and model.safetensors in"):
+        download()

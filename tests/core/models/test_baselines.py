@@ -1,0 +1,55 @@
+"""Layers of the baselines against the published formula, written down again."""
+
+import torch
+
+from stages.core.models.baselines.gcn import RADIUS, GraphConv, adjacency
+from stages.core.models.baselines.transformer import Transformer, features
+from stages.core.models.checkpoints import build
+from tests.core.models.worlds import crowd, padded
+
+
+def test_graph_convolution_is_the_published_sum():
+    # x_i' = b + sum over j in N(i) and i itself of W x_j / sqrt(d_i d_j), d counting the node itself
+    torch.manual_seed(0)
+    world = padded(crowd(1, 2, 15), 0, 3)
+    points, valid = world.points.flatten(1, 2), world.valid.flatten(1)
+    layer, x = GraphConv(4, 5).double(), torch.randn(1, points.shape[1], 4, dtype=torch.float64)
+    out = layer(x, adjacency(points, valid))
+    nodes = valid[0].nonzero()[:, 0].tolist()
+    joined = {i: [j for j in nodes if i == j or (points[0, i] - points[0, j]).norm() < RADIUS] for i in nodes}
+    assert any(len(js) > 2 for js in joined.values()) and any(len(js) < len(nodes) for js in joined.values())
+    for i in nodes:
+        wanted = layer.bias.clone()
+        for j in joined[i]:
+            wanted = wanted + layer.linear.weight @ x[0, j] / (len(joined[i]) * len(joined[j])) ** 0.5
+        torch.testing.assert_close(out[0, i], wanted)
+
+
+def test_the_graph_joins_objects():
+    a = torch.tensor([[[0.0, 0, 0], [0.05, 0, 0], [0.3, 0, 0]]])
+    A = adjacency(a, torch.ones(1, 3, dtype=torch.bool))
+    torch.testing.assert_close(A[0], torch.tensor([[0.5, 0.5, 0], [0.5, 0.5, 0], [0, 0, 1]]))
+
+
+def test_pointformer_drops_out_only_in_training():
+    torch.manual_seed(0)
+    model, world = build("pointformer").double(), crowd()
+    a, b = (model.train().rollout(world, 3) for _ in range(2))
+    assert not torch.equal(a, b)
+    a, b = (model.eval().rollout(world, 3) for _ in range(2))
+    assert torch.equal(a, b)
+
+
+def test_transformer_does_not_care_where_in_the_room_a_scene_stands():
+    world = crowd()
+    model = Transformer(hidden=16, layers=2, heads=2).double()
+    shift = torch.tensor([0.4, -0.3, 0.0]).double()
+    moved = type(world).of(world.points + shift, mass=world.mass, E=world.E, nu=world.nu, friction=world.friction,
+                           velocity=world.velocity, spin=world.spin)  # fmt: skip
+    torch.testing.assert_close(model.rollout(moved, 5), model.rollout(world, 5) + shift, rtol=0, atol=1e-10)
+
+
+def test_features_are_of_order_one():
+    world = crowd()
+    x = features(world, Transformer(hidden=8, layers=1, heads=1).start(world))
+    assert x.shape == (2, 3, 12, 29) and x.abs().max() < 4

@@ -1,0 +1,66 @@
+"""What hangs on a wall is found as what stands on a table is."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from stages.core.geometry.rotations import matrix
+from stages.core.geometry.similarity import Similarity
+from stages.core.perception.grouping import group
+from stages.core.perception.support import view_of
+from stages.core.perception.wall import find_wall, laid_down
+from stages.core.scene.gaussians import moved
+from stages.core.scene.scene import Scene
+from tests.segment.tabletop import best_overlap, block, scene_of, table, three_apart
+
+UP = Similarity(1.0, matrix(torch.tensor([0.5**0.5, 0.5**0.5, 0.0, 0.0])), torch.tensor([0.3, -0.2, 0.4]))
+
+
+def hung(scene: Scene) -> Scene:
+    """A table top with what is on it as a wall: turned by a quarter about x, so that it faces -y; without a floor."""
+    return replace(scene, gaussians=moved(scene.gaussians, UP), cameras=scene.cameras.moved(UP), floor=None)
+
+
+def test_a_wall_is_laid_on_its_back():
+    scene = hung(three_apart(noise=0.001))
+    turn = find_wall(scene, view_of(scene))
+    laid = laid_down(scene, turn)
+    wall = laid.gaussians.means[scene.gaussians.object_id == 0]
+    assert float(wall[:, 2].abs().median()) < 0.002  # the noise
+    assert float(laid.gaussians.means[scene.gaussians.object_id > 0][:, 2].min()) > -0.004
+    back = moved(laid.gaussians, turn.inverse())
+    torch.testing.assert_close(back.means, scene.gaussians.means, rtol=0, atol=1e-5)
+    torch.testing.assert_close(back.sh, scene.gaussians.sh, rtol=0, atol=1e-5)
+
+
+def test_what_hangs_on_a_wall_comes_out_whole_and_alone():
+    scene = hung(three_apart(noise=0.001))
+    blank = replace(scene, gaussians=replace(scene.gaussians, object_id=torch.zeros_like(scene.gaussians.object_id)))
+    found = group(blank)
+    assert len(found.objects) == 3
+    assert min(best_overlap(found.gaussians.object_id, scene.gaussians.object_id).values()) >= 0.9
+    assert torch.equal(found.gaussians.means, scene.gaussians.means)  # numbered where it is, not moved
+
+
+@pytest.mark.parametrize(
+    "scene",
+    [
+        three_apart(),  # a table is no wall
+        replace(three_apart(), floor=None),  # found or not
+        hung(scene_of(block((0.0, 0.0), (0.4, 0.4, 0.1), (0.8, 0.1, 0.1), 1))),  # nor is the front of a book
+        replace(hung(three_apart()), cameras=None),  # and nobody knows which side of it is seen
+    ],
+    ids=["floor", "table", "book", "no cameras"],
+)
+def test_no_wall(scene):
+    assert find_wall(scene, view_of(scene)) is None
+
+
+def test_a_wall_with_a_room_behind_it_is_a_screen():
+    scene = hung(scene_of(table()))
+    behind = moved(scene.gaussians, Similarity(1.0, torch.eye(3), torch.tensor([0.0, 0.15, 0.0])))
+    both = replace(scene, gaussians=type(behind)(*(torch.cat(pair) for pair in zip(
+        vars(scene.gaussians).values(), vars(behind).values(), strict=True))))  # fmt: skip
+    assert find_wall(scene, view_of(scene)) is not None
+    assert find_wall(both, view_of(both)) is None

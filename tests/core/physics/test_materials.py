@@ -1,0 +1,67 @@
+"""Which material an object is made of."""
+
+import json
+
+import pytest
+
+from stages.core.errors import InputError
+from stages.core.physics.materials import ALIASES, GUESS, MATERIALS, choose_materials, find_object
+from stages.core.scene.scene import SceneObject
+
+OBJECTS = (SceneObject(1, "rubber duck"), SceneObject(2, "object_2"), SceneObject(3, "green mug", "plastic"))
+
+
+def test_every_constant_is_sane_and_has_a_source():
+    for name, m in MATERIALS.items():
+        assert 1e2 < m.E < 1e12 and 10 < m.density < 1e4 and 0 < m.nu < 0.49, name
+        assert 0 < m.friction < 1.5 and 0 < m.loss < 1 and len(m.source) > 20, name
+    assert ALIASES.keys() <= MATERIALS.keys()
+
+
+@pytest.mark.parametrize("name, E, density", [("ball", 8e5, 600), ("phone", 2e7, 2600), ("rope", 5e3, 500)])
+def test_objects_of_the_paper(name, E, density):
+    assert (MATERIALS[name].E, MATERIALS[name].density, MATERIALS[name].nu) == (E, density, 0.3)
+
+
+@pytest.mark.parametrize("name, material", [
+    ("duck", "duck"), ("rubber duck", "duck"), ("red ball", "ball"), ("wooden_box", "paper"), ("candle", GUESS),
+    ("Teddy bear", "soft"), ("two cans", "can"), ("mug 2", "ceramic"), ("object_7", GUESS), ("", GUESS),
+])  # fmt: skip
+def test_by_name(name, material):
+    assert choose_materials([SceneObject(1, name)])[1].name == material
+
+
+def test_what_is_told_wins_over_the_scene_and_the_scene_over_the_name(tmp_path):
+    file = tmp_path / "m.json"
+    file.write_text(json.dumps({"2": "wood", "duck": {"E": 5e4, "density": 200, "friction": 0.9}}))
+    chosen = choose_materials(OBJECTS, ["object_2=foam"], file)
+    assert chosen[1].material.E == 5e4 and chosen[1].material.friction == 0.9 and chosen[1].material.nu == 0.3
+    assert [chosen[i].name for i in (1, 2, 3)] == ["custom", "foam", "plastic"]
+    assert choose_materials(OBJECTS)[2].guessed and not choose_materials(OBJECTS)[1].guessed
+
+
+@pytest.mark.parametrize("prompt, message", [
+    ("duck", "OBJECT=MATERIAL"), ("duck=", "OBJECT=MATERIAL"), ("duck=cheese", "choose from rubber"),
+    ("cow=rubber", "there are: 1 \\(rubber duck\\)"), ("e=rubber", "fits 3 objects"),
+])  # fmt: skip
+def test_wrong_prompts(prompt, message):
+    with pytest.raises(InputError, match=message):
+        choose_materials(OBJECTS, [prompt])
+
+
+@pytest.mark.parametrize("text, message", [
+    ("{", "not JSON"), ("[]", "object name or id"), ('{"duck": 3}', "material's name"),
+    ('{"duck": {"E": 1e5}}', "E, density"), ('{"duck": {"E": -1, "density": 1}}', "positive"),
+    ('{"duck": {"E": 1e5, "density": 100, "nu": 0.5}}', "nu"), ('{"duck": {"E": "x", "density": 1}}', "numbers"),
+    ('{"duck": {"E": 1e5, "density": 1, "colour": 1}}', "friction"),
+])  # fmt: skip
+def test_wrong_files(tmp_path, text, message):
+    file = tmp_path / "m.json"
+    file.write_text(text)
+    with pytest.raises(InputError, match=message) as error:
+        choose_materials(OBJECTS, file=file)
+    assert str(file) in str(error.value)
+
+
+def test_objects_are_found_by_id_name_or_part_of_it():
+    assert [find_object(key, OBJECTS, "").id for key in (2, "2", "Rubber Duck", "mug")] == [1 + 1, 2, 1, 3]

@@ -1,0 +1,82 @@
+"""Scenes in a batch: each as if alone, and one that goes wrong alone in that."""
+
+import pytest
+import torch
+
+from stages.core.physics.mpm import solver as mpm
+from stages.core.physics.mpm.batch import Batch
+from tests.conftest import DEVICES
+from tests.core.physics.test_mpm import block
+
+BOX, DX, SUBSTEPS, GRAVITY = mpm.Box((-0.3, -0.3, 0.0), (0.5, 0.5, 0.6)), 0.05, 40, (0.0, 0.0, -9.81)
+ORDERS = [("cpu", False), ("cpu", True)] + [("cuda", True)] * (len(DEVICES) > 1)
+
+
+def scenes() -> dict[str, mpm.Particles]:
+    """Three of different size, height, stiffness and speed."""
+    made = {
+        "low": block((0.2, 0.2, 0.1), 0.025, low=(0, 0, 0.01)),
+        "tall": block((0.1, 0.1, 0.3), 0.025, E=3e4, low=(0.1, 0.1, 0.05)),
+        "fast": block((0.1, 0.2, 0.1), 0.025, E=2e5, low=(0.0, 0.0, 0.2)),
+    }
+    made["fast"].v[:] = torch.tensor([1.0, 0.5, -2.0])
+    return made
+
+
+@pytest.mark.parametrize("device, fused", ORDERS)
+def test_a_scene_in_a_batch_moves_as_if_alone(device, fused):
+    # the sums of a scene are the same, only taken in parts that are cut elsewhere: rounding
+    batch = Batch(scenes(), BOX, DX, device)
+    together = [frame for frame in batch.frames(7, 0.02, SUBSTEPS, GRAVITY)][-1]
+    for name, particles in scenes().items():
+        alone = mpm.Solver(particles, BOX, DX, device, fused=fused)
+        for _ in range(6):
+            alone.advance(0.02, torch.tensor(GRAVITY).repeat(len(particles), 1), SUBSTEPS)
+        torch.testing.assert_close(together.of(name).x, alone.particles.x, rtol=0, atol=2e-5)
+        torch.testing.assert_close(together.of(name).F, alone.particles.F, rtol=0, atol=2e-3)
+    assert batch.failures() == {}
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_exact_sums_give_the_same_bytes_in_any_company_and_order(device):
+    def last(made: dict[str, mpm.Particles]):
+        frames = list(Batch(made, BOX, DX, device, exact=True).frames(5, 0.02, SUBSTEPS, GRAVITY))
+        return frames[-1]
+
+    made = scenes()
+    together = last(made)
+    for name in made:
+        alone = last({name: made[name]})
+        assert torch.equal(alone.x, together.of(name).x) and torch.equal(alone.F, together.of(name).F)
+    low = made["low"]
+    backwards = last({"low": mpm.Particles(*(getattr(low, f).flip(0) for f in low.__dataclass_fields__))})
+    assert torch.equal(backwards.x.flip(0), together.of("low").x)
+    # and it is the same physics, to rounding
+    rough = list(Batch(made, BOX, DX, device).frames(5, 0.02, SUBSTEPS, GRAVITY))[-1]
+    torch.testing.assert_close(together.x, rough.x, rtol=0, atol=2e-5)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_scene_that_goes_wrong_is_told_by_name_and_the_others_finish(device):
+    good = Batch(scenes(), BOX, DX, device)
+    expected = list(good.frames(5, 0.02, SUBSTEPS, GRAVITY))[-1]
+    bad = scenes()
+    bad["tall"].v[17] = torch.nan
+    bad["lonely"] = block((0.05, 0.05, 0.05), 0.025, low=(0.3, 0.3, 0.3))
+    bad["lonely"].v[:, 0] = 2000.0  # over the wall in a substep
+    batch = Batch(bad, BOX, DX, device)
+    last = list(batch.frames(5, 0.02, SUBSTEPS, GRAVITY))[-1]
+    assert set(batch.failures()) == {"tall", "lonely"}
+    assert "frame 1" in batch.failures()["lonely"]
+    assert bool(last.x.isfinite().all())  # what is lost stays where it was
+    for name in ("low", "fast"):
+        torch.testing.assert_close(last.of(name).x, expected.of(name).x, rtol=0, atol=2e-5)
+
+
+def test_how_many_scenes_fit():
+    count = mpm.make_grid(BOX, DX).count
+    fits = Batch.fits(BOX, DX, 1000, "cpu")
+    assert fits > 1 and fits * count < 2**31
+    with pytest.raises(ValueError, match="too many"):
+        one = block((0.05, 0.05, 0.05), 0.05)
+        mpm.Solver(mpm.together([one] * 40), mpm.Box((-4, -4, 0), (4, 4, 4)), 0.02, sizes=[len(one)] * 40)

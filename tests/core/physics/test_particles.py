@@ -1,0 +1,177 @@
+"""Gaussians to particles: volumes, hollows, sheets, overlaps, and input that makes no sense."""
+
+import math
+import time
+from dataclasses import replace
+
+import pytest
+import torch
+
+from stages.core.errors import InputError
+from stages.core.physics.particles import FEWEST, inliers, sample
+from stages.core.scene.gaussians import Gaussians, concatenate
+from stages.core.scene.scene import Scene, SceneObject
+from stages.lab.assets.objects import OBJECTS, make_object
+from tests.conftest import ring
+
+
+def splats(means: torch.Tensor, id: int = 1, scale: float = 0.003) -> Gaussians:
+    n = len(means)
+    quats = torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1)
+    return Gaussians(
+        means.float(), quats, torch.full((n, 3), scale), torch.full((n,), 0.9), torch.zeros(n, 1, 3),
+        torch.full((n,), id),
+    )  # fmt: skip
+
+
+def sphere(n: int = 8000, radius: float = 0.1, seed: int = 0) -> torch.Tensor:
+    directions = torch.randn(n, 3, generator=torch.Generator().manual_seed(seed))
+    return radius * torch.nn.functional.normalize(directions, dim=1)
+
+
+def scene(*bodies: Gaussians, floor: float | None = None) -> Scene:
+    objects = tuple(SceneObject(i + 1, f"object_{i + 1}") for i in range(len(bodies)))
+    return Scene(concatenate(bodies), objects, None, floor)
+
+
+def test_a_shell_is_filled():
+    # voxels on the surface count when their middle is inside; the splats make the ball a standard deviation larger
+    bodies = sample(scene(splats(sphere())), 8000)
+    assert 0.85 * 8000 < len(bodies.x) < 1.1 * 8000
+    radius = (3 / (4 * math.pi) * float(bodies.volume.sum())) ** (1 / 3)
+    assert radius == pytest.approx(0.1 + 0.003 / 2, abs=0.003 + 0.1 * bodies.spacing)
+    # the outermost layer of voxels is empty
+    assert 0.5 < (radius - float(bodies.x.norm(dim=1).quantile(0.99))) / bodies.spacing < 1.8
+    full = 4 / 3 * math.pi * 0.05**3 / bodies.spacing**3
+    assert (bodies.x.norm(dim=1) < 0.05).sum() == pytest.approx(full, rel=0.05)
+
+
+def test_an_open_bowl_stays_hollow():
+    points = sphere()
+    bodies = sample(scene(splats(points[points[:, 2] < 0])), 8000)
+    inside = (bodies.x.norm(dim=1) < 0.07) & (bodies.x[:, 2] < 0)
+    assert not inside.any()
+
+
+def test_a_shell_with_a_hole_is_filled_up_to_the_hole():
+    """Photos leave a third of the way across open: a hollow three times as wide as its leak."""
+    points = sphere()
+    holed = points[points[:, 2] < 0.1 * math.cos(math.asin(1 / 3))]
+    bodies = sample(scene(splats(holed)), 8000)
+    closed = sample(scene(splats(points)), 8000)
+    assert float(bodies.volume.sum()) == pytest.approx(float(closed.volume.sum()), rel=0.08)
+    over = bodies.x[bodies.x[:, :2].norm(dim=1) < 0.02]
+    assert 0.06 < float(over[:, 2].max()) < 0.1  # and nothing pours out
+
+
+def test_nothing_is_filled_in_under_the_folds_of_a_cloth():
+    cloth, size = make_object("cloth")[::6], OBJECTS["cloth"].scale
+    means = size * cloth.means
+    means = means - torch.tensor([0.0, 0.0, float(means[:, 2].min())])
+    ids = torch.ones(len(cloth), dtype=torch.int64)
+    cloth = replace(cloth, means=means, scales=1.3 * 6**0.5 * size * cloth.scales, object_id=ids)
+    lying, flying = (sample(scene(cloth, floor=floor), 20_000) for floor in (0.0, -1.0))
+    assert float(lying.volume.sum()) == pytest.approx(float(flying.volume.sum()), rel=0.05)
+
+
+def test_a_mug_stays_hollow():
+    rng = torch.Generator().manual_seed(0)
+    turn, up = 2 * math.pi * torch.rand(6000, generator=rng), 0.12 * torch.rand(6000, generator=rng)
+    side = torch.stack([0.05 * turn.cos(), 0.05 * turn.sin(), up], 1)
+    disc = 0.05 * torch.rand(1500, generator=rng).sqrt()[:, None] * torch.stack([turn.cos(), turn.sin()], 1)[:1500]
+    mug = torch.cat([side, torch.cat([disc, torch.zeros(1500, 1)], 1)])
+    for floor in (0.0, None):
+        bodies = sample(scene(splats(mug), floor=floor), 8000)
+        inside = (bodies.x[:, :2].norm(dim=1) < 0.03) & (bodies.x[:, 2] > 0.03)
+        assert not inside.any()
+
+
+def test_the_floor_closes_what_stands_on_it():
+    points = sphere()
+    cut = splats(points[points[:, 2] > -0.05] + torch.tensor([0, 0, 0.05]))
+    standing, flying = (sample(scene(cut, floor=floor), 8000) for floor in (0.0, -1.0))
+    middle = torch.tensor([0.0, 0, 0.05])
+    assert ((standing.x - middle).norm(dim=1) < 0.04).sum() > 100
+    assert not ((flying.x - middle).norm(dim=1) < 0.04).any()
+
+
+def test_a_sheet_gets_three_layers():
+    rng = torch.Generator().manual_seed(0)
+    flat = torch.cat([0.3 * torch.rand(6000, 2, generator=rng), torch.full((6000, 1), 0.2)], 1)
+    bodies = sample(scene(splats(flat, scale=1e-4)), 6000)
+    middle = bodies.x[((bodies.x[:, :2] - 0.15).abs() < 0.1).all(1)]
+    area = 0.2**2 / bodies.spacing**2
+    assert len(middle) / area == pytest.approx(3, rel=0.05)
+
+
+def test_overlapping_objects_share_no_voxel():
+    bodies = sample(scene(splats(sphere()), splats(sphere(seed=1) + 0.03, 2)), 8000)
+    voxels = (bodies.x / bodies.spacing).floor().long()
+    assert len(voxels.unique(dim=0)) == len(voxels)
+    assert bodies.body.bincount().min() > 500
+
+
+NAN, INF = float("nan"), float("inf")
+MOST_SECONDS = 60.0  # of processor time: twenty times what the slowest takes
+BAD = {
+    "a point": lambda: splats(torch.zeros(1, 3)),
+    "the same point many times": lambda: splats(torch.zeros(500, 3)),
+    "two points far apart": lambda: splats(torch.tensor([[0.0, 0, 0], [100, 0, 0]])),
+    "a line": lambda: splats(torch.linspace(0, 1, 300)[:, None] * torch.tensor([1.0, 0, 0])),
+    "sizes of 1e30, 0 and nan": lambda: broken(scales=[1e30, 0.0, NAN]),
+    "places of 1e20, infinity and nan": lambda: broken(means=[1e20, INF, NAN]),
+    "quats of zero and nan": lambda: broken(quats=[0.0, NAN]),
+    "all transparent": lambda: Gaussians(*splats(sphere(200)).__dict__.values()).__class__(
+        **{**splats(sphere(200)).__dict__, "opacities": torch.zeros(200)}
+    ),
+    "a plane": lambda: splats(torch.rand(3000, 3) * torch.tensor([1.0, 1, 0])),
+    "a plane a thousand times as large": lambda: splats(1000 * torch.rand(3000, 3) * torch.tensor([1.0, 1, 0])),
+    "a few huge discs": lambda: splats(sphere(8), scale=50.0),
+    "sizes of zero": lambda: splats(sphere(3000), scale=0.0),
+    "needles": lambda: replace(splats(sphere(3000)), scales=torch.tensor([[5.0, 1e-9, 1e-9]]).repeat(3000, 1)),
+    "nothing finite but one": lambda: splats(torch.cat([torch.full((500, 3), NAN), torch.zeros(1, 3)])),
+    "a speck far away": lambda: concatenate([splats(sphere(2000)), splats(torch.full((3, 3), 50.0))]),
+}
+
+
+def broken(**fields: list) -> Gaussians:
+    g = splats(sphere(3000))
+    for name, values in fields.items():
+        for i, value in enumerate(values):
+            getattr(g, name)[i :: 7 * len(values)] = value
+    return g
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_every_object_gets_some_particles(name):
+    start = time.process_time()
+    bodies = sample(scene(splats(sphere(2000) + 0.5), Gaussians(**{
+        **BAD[name]().__dict__, "object_id": torch.full((len(BAD[name]()),), 2)})), 4000)  # fmt: skip
+    assert time.process_time() - start < MOST_SECONDS
+    counts = bodies.body.bincount(minlength=2)
+    assert counts.min() >= FEWEST and len(bodies.x) < 20_000
+    assert bodies.x.isfinite().all() and bodies.spacing > 0
+
+
+def test_an_object_without_a_single_number_is_an_error():
+    with pytest.raises(InputError, match=r"object 1 \(object_1\).*Gaussians can be used"):
+        sample(scene(splats(torch.full((5, 3), NAN))), 1000)
+
+
+def test_outliers_are_what_lies_far_out():
+    points = torch.cat([sphere(1000), torch.full((3, 3), 5.0)])
+    assert inliers(points).tolist() == [True] * 1000 + [False] * 3
+
+
+@pytest.mark.parametrize(("photographed", "held"), [(True, True), (False, False)])
+def test_what_leaned_on_something_unseen_in_photos_is_held(photographed, held, caplog):
+    """A slab that leans over by twice its thickness: its middle is not above its foot."""
+    caplog.set_level("INFO")
+    rng = torch.Generator().manual_seed(0)
+    p = torch.rand(12000, 3, generator=rng) * torch.tensor([0.06, 0.2, 0.3])
+    leaning = splats(p + p[:, 2:] * torch.tensor([0.8, 0, 0]))
+    bodies = sample(replace(scene(leaning, floor=0.0), cameras=ring() if photographed else None), 8000)
+    under = (bodies.x[:, 0] > 0.2) & (bodies.x[:, 2] < 0.1)
+    assert bool(under.any()) == held and ("would tip over" in caplog.text) == held
+    upright = sample(replace(scene(splats(p), floor=0.0), cameras=ring() if photographed else None), 8000)
+    assert float(upright.volume.sum()) == pytest.approx(0.06 * 0.2 * 0.3, rel=0.25)

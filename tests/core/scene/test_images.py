@@ -1,0 +1,81 @@
+import struct
+import zlib
+
+import av
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from stages.core.errors import InputError
+from stages.core.scene.images import (
+    VideoWriter,
+    list_photos,
+    read_image,
+    read_labels,
+    read_video,
+    write_labels,
+    write_png,
+)
+
+
+def test_png_round_trip_keeps_red_red(tmp_path):
+    image = torch.zeros(4, 6, 3)
+    image[..., 0] = 1.0
+    write_png(tmp_path / "a.png", image)
+    assert torch.equal(read_image(tmp_path / "a.png"), image)
+    assert cv2.imread(str(tmp_path / "a.png"))[0, 0].tolist() == [0, 0, 255]
+
+
+@pytest.mark.parametrize("pixels", [np.full((3, 3), 128, np.uint8), np.full((3, 3, 4), 128, np.uint8),
+                                    np.full((3, 3, 3), 32896, np.uint16)], ids=["grey", "alpha", "16 bit"])  # fmt: skip
+def test_other_kinds_of_pixels_become_rgb_floats(tmp_path, pixels):
+    cv2.imwrite(str(tmp_path / "a.png"), pixels)
+    torch.testing.assert_close(read_image(tmp_path / "a.png"), torch.full((3, 3, 3), 128 / 255))
+
+
+def test_labels_round_trip_beyond_eight_bits(tmp_path):
+    labels = torch.tensor([[0, 1], [300, 2]])
+    write_labels(tmp_path / "l.png", labels)
+    assert torch.equal(read_labels(tmp_path / "l.png"), labels)
+
+
+def test_only_photos_are_listed(tmp_path):
+    for name in ("b.JPG", "a.png", "notes.txt", ".hidden.png"):
+        (tmp_path / name).touch()
+    assert [p.name for p in list_photos(tmp_path)] == ["a.png", "b.JPG"]
+
+
+def test_video_is_what_browsers_play(tmp_path):
+    path = tmp_path / "v.mp4"
+    shades = [0.2, 0.5, 0.8]
+    with VideoWriter(path, fps=50.0) as video:
+        for shade in shades:
+            video.append(torch.full((33, 48, 3), shade))  # an odd height loses a row
+    with av.open(str(path)) as file:
+        stream = file.streams.video[0]
+        assert (stream.codec_context.name, stream.pix_fmt, stream.average_rate) == ("h264", "yuv420p", 50)
+    data = path.read_bytes()
+    assert data.find(b"moov") < data.find(b"mdat")  # fast start: the index comes first
+    frames = list(read_video(path))
+    assert [f.shape for f in frames] == [(32, 48, 3)] * 3
+    torch.testing.assert_close(torch.tensor([float(f.mean()) for f in frames]), torch.tensor(shades), atol=0.02, rtol=0)
+
+
+@pytest.mark.parametrize("reader", [read_image, read_labels, lambda path: next(read_video(path))])
+def test_a_file_that_is_no_picture(tmp_path, reader):
+    path = tmp_path / "x.png"
+    path.write_bytes(b"nonsense" * 50)
+    with pytest.raises(InputError, match="can be read|is damaged"):
+        reader(path)
+
+
+@pytest.mark.parametrize("reader", [read_image, read_labels])
+def test_a_picture_with_too_many_pixels_is_named(tmp_path, reader):
+    path = tmp_path / "x.png"
+    write_png(path, torch.zeros(4, 4, 3))
+    data = path.read_bytes()
+    header = struct.pack(">4sIIBBBBB", b"IHDR", 1 << 16, 1 << 16, 8, 2, 0, 0, 0)
+    path.write_bytes(data[:12] + header + struct.pack(">I", zlib.crc32(header)) + data[33:])
+    with pytest.raises(InputError, match="x.png: is damaged, or far too large"):
+        reader(path)

@@ -1,0 +1,112 @@
+import dataclasses
+import os
+
+import numpy as np
+import pytest
+import torch
+from plyfile import PlyData, PlyElement
+
+from stages.core.errors import InputError
+from stages.core.geometry.rotations import covariance
+from stages.core.scene.scene import Scene
+from stages.core.scene.scene_ply import read_scene, write_scene
+from tests.conftest import random_gaussians
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_round_trip_of_gaussians(tmp_path, degree):
+    g = random_gaussians(50, degree=degree)
+    write_scene(tmp_path / "s.ply", Scene(g))
+    back = read_scene(tmp_path / "s.ply").gaussians
+    for field in dataclasses.fields(g):
+        torch.testing.assert_close(getattr(back, field.name), getattr(g, field.name), rtol=1e-5, atol=1e-6)
+
+
+def test_round_trip_of_facts(tmp_path, two_balls):
+    scale = {"metres_per_unit": 0.5, "source": "known"}
+    scene = dataclasses.replace(two_balls, scale=scale, provenance={"seed": 1}, background=(0.2, 0.4, 0.6))
+    write_scene(tmp_path / "s.ply", scene)
+    back = read_scene(tmp_path / "s.ply")
+    for name in ("objects", "floor", "scale", "provenance", "background"):
+        assert getattr(back, name) == getattr(scene, name)
+    torch.testing.assert_close(back.cameras.viewmats, scene.cameras.viewmats)
+    assert back.cameras.names == scene.cameras.names
+
+
+def test_stored_values_are_those_of_the_standard_layout(tmp_path):
+    """Logits, logarithms and channel-major f_rest, read with plyfile alone."""
+    g = random_gaussians(4, degree=1)
+    write_scene(tmp_path / "s.ply", Scene(g))
+    vertex = PlyData.read(str(tmp_path / "s.ply"))["vertex"]
+    np.testing.assert_allclose(vertex["scale_1"], g.scales[:, 1].log(), rtol=1e-5)
+    np.testing.assert_allclose(vertex["opacity"], g.opacities.logit(), rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(vertex["rot_0"], g.quats[:, 0], rtol=1e-6)
+    np.testing.assert_allclose(vertex["f_rest_3"], g.sh[:, 1, 1], rtol=1e-6)  # green, first of three
+    assert [p.name for p in vertex.properties][:6] == ["x", "y", "z", "nx", "ny", "nz"]
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_reads_other_peoples_files(tmp_path, order):
+    """No normals, an extra property, either byte order, quaternions of any length."""
+    names = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2",
+             "rot_0", "rot_1", "rot_2", "rot_3", "confidence"]  # fmt: skip
+    row = np.zeros(2, [(name, f"{order}f4") for name in names])
+    row["x"], row["rot_0"], row["scale_0"] = [1, 2], 3, np.log(0.1)
+    PlyData([PlyElement.describe(row, "vertex")], byte_order=order).write(str(tmp_path / "o.ply"))
+    scene = read_scene(tmp_path / "o.ply")
+    assert scene.gaussians.means[:, 0].tolist() == [1, 2]
+    assert scene.gaussians.quats[0].tolist() == [1, 0, 0, 0]
+    torch.testing.assert_close(scene.gaussians.scales[0], torch.tensor([0.1, 1, 1]))
+    assert (scene.floor, scene.objects, scene.cameras) == (None, (), None)
+
+
+def test_the_packed_layout_decodes_to_the_same_gaussians(shared):
+    plain = read_scene(shared / "data/splats/guitar.ply").gaussians
+    packed = read_scene(shared / "data/splats/guitar.compressed.ply").gaussians
+    for name in ("means", "scales", "opacities", "sh"):
+        torch.testing.assert_close(getattr(packed, name), getattr(plain, name), rtol=1e-5, atol=1e-5)
+    ours, theirs = covariance(packed.quats, packed.scales), covariance(plain.quats, plain.scales)
+    torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-6)
+
+
+def test_rows_that_are_not_finite_are_dropped_and_counted(tmp_path, caplog):
+    g = random_gaussians(5)
+    g.means[2, 0] = torch.nan
+    write_scene(tmp_path / "s.ply", Scene(g))
+    assert len(read_scene(tmp_path / "s.ply").gaussians) == 4
+    assert "dropped 1" in caplog.text
+
+
+def wrong_files(folder):
+    (folder / "empty.ply").touch()
+    (folder / "text.ply").write_text("hello")
+    points = np.zeros(3, [("x", "f4"), ("y", "f4"), ("z", "f4")])
+    PlyData([PlyElement.describe(points, "vertex")]).write(str(folder / "points.ply"))
+    write_scene(folder / "whole.ply", Scene(random_gaussians(100)))
+    (folder / "cut.ply").write_bytes((folder / "whole.ply").read_bytes()[:-500])
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [("empty.ply", "is empty"), ("text.ply", "not a readable PLY"), ("points.ply", "plain point cloud"),
+     ("cut.ply", "not a readable PLY"), ("absent.ply", "no such file"), (".", "is a folder")],
+)  # fmt: skip
+def test_wrong_files_get_one_sentence(tmp_path, name, says):
+    with pytest.raises(InputError, match=says) as caught:
+        read_scene(wrong_files(tmp_path) / name)
+    assert "\n" not in str(caught.value) and str(tmp_path) in str(caught.value)
+
+
+def test_a_failed_write_leaves_the_old_file_and_no_litter(tmp_path, two_balls, monkeypatch):
+    path = tmp_path / "s.ply"
+    write_scene(path, two_balls)
+    before = path.read_bytes()
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "replace", full)
+    with pytest.raises(InputError, match="No space left"):
+        write_scene(path, two_balls)
+    assert path.read_bytes() == before and os.listdir(tmp_path) == ["s.ply"]

@@ -1,0 +1,90 @@
+import os
+from dataclasses import replace
+
+import h5py
+import pytest
+import torch
+
+from stages.core.errors import InputError
+from stages.core.scene.trajectory import Binding, Keypoints, Motion, TrajectoryWriter, read_trajectory
+
+
+def parts(scene, p: int = 10):
+    n = len(scene.gaussians)
+    rest = torch.randn(p, 3, generator=torch.Generator().manual_seed(0))
+    keypoints = Keypoints(rest, torch.ones(p, dtype=torch.int64))
+    index = torch.randint(0, p, (n, 8), generator=torch.Generator().manual_seed(1))
+    motion = Motion(0.02, (0.0, 0.0, -9.81), "test", ({"object": 1},))
+    return motion, keypoints, Binding(index, torch.full((n, 8), 1 / 8))
+
+
+def write(path, scene, frames: int = 3):
+    motion, keypoints, binding = parts(scene)
+    with TrajectoryWriter(path, scene, motion, keypoints, binding) as writer:
+        for t in range(frames):
+            writer.append(keypoints.rest + 0.1 * t, torch.full((2, 3), float(t)), torch.eye(4)[:2])
+
+
+def test_round_trip(tmp_path, two_balls):
+    write(tmp_path / "t.h5", replace(two_balls, background=(0.2, 0.4, 0.6)))
+    t = read_trajectory(tmp_path / "t.h5")
+    motion, keypoints, binding = parts(two_balls)
+    assert len(t) == 3 and t.motion == motion
+    assert t.scene.objects == two_balls.objects and t.scene.floor == 0.0
+    assert t.scene.background == (0.2, 0.4, 0.6)
+    assert t.scene.cameras.names == two_balls.cameras.names
+    assert torch.equal(t.scene.gaussians.means, two_balls.gaussians.means)
+    assert torch.equal(t.positions[2], keypoints.rest + 0.2)
+    assert torch.equal(t.binding.index, binding.index)
+    assert torch.equal(t.com[:, 0, 0], torch.tensor([0.0, 1, 2]))
+
+
+def test_a_stop_by_the_physics_keeps_the_frames_that_were_written(tmp_path, two_balls):
+    motion, keypoints, binding = parts(two_balls)
+    with (
+        pytest.raises(InputError, match="escaped"),
+        TrajectoryWriter(tmp_path / "t.h5", two_balls, motion, keypoints, binding) as writer,
+    ):
+        writer.append(keypoints.rest, torch.zeros(2, 3), torch.zeros(2, 4))
+        raise InputError("green ball escaped")
+    assert os.listdir(tmp_path) == ["t.partial.h5"]
+    assert len(read_trajectory(tmp_path / "t.partial.h5")) == 1
+
+
+def test_an_interrupted_run_leaves_nothing(tmp_path, two_balls):
+    motion, keypoints, binding = parts(two_balls)
+    with (
+        pytest.raises(KeyboardInterrupt),
+        TrajectoryWriter(tmp_path / "t.h5", two_balls, motion, keypoints, binding) as writer,
+    ):
+        writer.append(keypoints.rest, torch.zeros(2, 3), torch.zeros(2, 4))
+        raise KeyboardInterrupt
+    assert os.listdir(tmp_path) == []
+
+
+def damage(path, scene, how: str):
+    if how == "text":
+        path.write_text("not HDF5")
+        return
+    write(path, scene)
+    with h5py.File(path, "a") as file:
+        if how == "format":
+            file.attrs["format"] = "other"
+        elif how == "part":
+            del file["binding"]
+        elif how == "nan":
+            file["keypoints/positions"][0, 0, 0] = float("nan")
+        elif how == "frames":
+            file["keypoints/positions"].resize(2, axis=0)
+
+
+@pytest.mark.parametrize(
+    ("how", "says"),
+    [("text", "not a readable HDF5"), ("format", "format attribute"), ("part", "missing"), ("nan", "not finite"),
+     ("frames", "call for")],
+)  # fmt: skip
+def test_damaged_files_get_one_sentence(tmp_path, two_balls, how, says):
+    damage(tmp_path / "t.h5", two_balls, how)
+    with pytest.raises(InputError, match=says) as caught:
+        read_trajectory(tmp_path / "t.h5")
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,290 @@
+"""The ten objects: registry, size, evenness, hollowness, colours, files, and the fields they are cut from."""
+
+import hashlib
+import json
+from dataclasses import fields, replace
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+from scipy import ndimage
+from typer.testing import CliRunner
+
+from ngff_cli.lab import app
+from stages.core.errors import InputError
+from stages.core.geometry.harmonics import C0, evaluate_sh
+from stages.core.geometry.neighbours import knn
+from stages.core.scene.gaussians import Gaussians
+from stages.core.scene.scene_ply import read_scene
+from stages.lab.assets import signed_distance as shapes
+from stages.lab.assets.objects import OBJECTS, make_object
+from stages.lab.assets.shapes import Surface, to_gaussians
+from stages.lab.assets.splat_files import PLY, camera_rows
+from stages.lab.assets.surface import KEY, Part, evened, sculpt, shine, slope, spread
+
+
+@cache
+def made(name: str) -> Gaussians:
+    """An object in units of its longest side."""
+    g, side = make_object(name), OBJECTS[name].side
+    return replace(g, means=g.means / side, scales=g.scales / side)
+
+
+NAMES = list(OBJECTS)
+CLOSED = {"ball": 0.4, "can": 0.4, "duck": 0.15, "panda": 0.1, "phone": 0.1, "pillow": 0.2}  # of the box, at least
+
+
+def digest(g: Gaussians) -> str:
+    total = hashlib.sha256()
+    for f in fields(g):
+        total.update(getattr(g, f.name).numpy().tobytes())
+    return total.hexdigest()
+
+
+def regions(g: Gaussians, cells: int = 50) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """On a grid of `cells` along the longest side: which cells hold Gaussians, which are reached from outside past
+    them, and which are shut in."""
+    where = ((g.means.numpy() + 0.5) * cells).astype(int).clip(0, cells - 1) + 2
+    shell = np.zeros((cells + 4,) * 3, bool)
+    shell[tuple(where.T)] = True
+    shell = ndimage.binary_dilation(shell)
+    labels, _ = ndimage.label(~shell)
+    open_air = labels == labels[0, 0, 0]
+    return shell, open_air, ~shell & ~open_air
+
+
+def mean_colour(g: Gaussians, mask: torch.Tensor) -> list[float]:
+    assert mask.sum() > 20
+    return (g.sh[mask, 0].mean(0) * C0 + 0.5).tolist()
+
+
+def test_registry_holds_the_published_ids_scales_and_materials():
+    rows = {o.id: (o.name, o.scale, o.E, o.density) for o in OBJECTS.values()}
+    assert sorted(rows) == [0, 2, 3, 4, 7, 9, 10, 11, 12, 14]
+    assert rows[11] == ("phone", 0.4, 2e7, 2600.0)
+    assert rows[7] == ("duck", 0.3, 3e5, 300.0)
+    assert OBJECTS["cloth"].prompt == "a yellow t-shirt with an owl"
+    can = make_object("can").means
+    assert (can.amax(0) - can.amin(0)).max() == pytest.approx(0.4)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_each_is_many_flat_gaussians_in_a_unit_box(name):
+    g = made(name)
+    low, high = g.means.amin(0), g.means.amax(0)
+    assert len(g) >= 20_000 and g.sh.shape[1] == 9 and (g.object_id == 1).all()
+    torch.testing.assert_close((high - low).max(), torch.tensor(1.0))
+    torch.testing.assert_close(low + high, torch.zeros(3), rtol=0, atol=1e-6)
+    assert all(getattr(g, f.name).isfinite().all() for f in fields(g))
+    torch.testing.assert_close(g.quats.norm(dim=1), torch.ones(len(g)))
+    assert (g.opacities > 0.5).all()
+    flat = g.scales.amin(1) / g.scales.amax(1)
+    assert flat.max() < 0.4
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_gaussians_are_spread_evenly(name):
+    """Random points on a surface have a spacing that varies by 52 % (Rayleigh); ours by far less, and no two touch."""
+    g = made(name)
+    nearest = knn(g.means, g.means, 2)[0][:, 1]
+    assert nearest.std() / nearest.mean() < 0.3
+    assert nearest.max() < 5 * nearest.mean()
+
+
+@pytest.mark.parametrize("name", CLOSED)
+def test_closed_ones_shut_in_space_that_holds_no_gaussians(name):
+    g = made(name)
+    _, _, inside = regions(g)
+    box = np.prod((g.means.amax(0) - g.means.amin(0)).numpy()) * 50**3
+    assert inside.sum() / box > CLOSED[name]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_all_gaussians_lie_on_the_outside(name):
+    """None is buried: each lies within two cells of air that is reached from outside, but for those in crevices
+    narrower than the cells (under the fringe, between limbs, where the rope crosses itself)."""
+    g = made(name)
+    _, open_air, _ = regions(g)
+    skin = ndimage.binary_dilation(open_air, iterations=3)
+    where = ((g.means.numpy() + 0.5) * 50).astype(int).clip(0, 49) + 2
+    assert skin[tuple(where.T)].mean() > (0.9 if name in ("miku", "panda", "rope") else 0.98)
+
+
+def test_the_hollow_ones_are_shells():
+    """Ball: every centre within 4 % of the sphere but for the groove and the button. Can: none well inside."""
+    r = made("ball").means.norm(dim=1)
+    assert (r > 0.44).all() and (r < 0.52).all()
+    p = made("can").means
+    assert not ((p[:, :2].norm(dim=1) < 0.2) & (p[:, 2].abs() < 0.42)).any()
+
+
+def test_the_bowl_is_open_above():
+    _, open_air, _ = regions(made("bowl"))
+    low = int((made("bowl").means[:, 2].min() + 0.5) * 50) + 2
+    assert open_air[27, 27, low + 12]  # a place in the cup is reached from outside
+    over_the_centre = made("bowl").means[:, :2].norm(dim=1) < 0.1
+    assert (made("bowl").means[over_the_centre, 2] < -0.1).all()
+
+
+def test_thin_ones_are_thin():
+    sides = {name: (made(name).means.amax(0) - made(name).means.amin(0)).sort().values for name in ("cloth", "phone")}
+    assert sides["cloth"][0] < 0.1 and sides["cloth"][1] > 0.8
+    assert sides["phone"][0] < 0.12 and 0.4 < sides["phone"][1] < 0.6
+    column = made("cloth").means
+    column = column[(column[:, :2] - torch.tensor([0.1, -0.1])).norm(dim=1) < 0.01]
+    assert 0.004 < column[:, 2].max() - column[:, 2].min() < 0.03  # two layers, a sheet's thickness apart
+
+
+def test_colours_are_those_of_the_real_things():
+    red, green, blue = range(3)
+    g = made("ball")
+    top, bottom = mean_colour(g, g.means[:, 2] > 0.2), mean_colour(g, g.means[:, 2] < -0.2)
+    assert top[red] > 3 * top[green] and max(bottom) - min(bottom) < 0.05 and bottom[red] > 0.5
+    g = made("duck")
+    yellow = mean_colour(g, g.means[:, 2] < 0)
+    assert yellow[red] > yellow[green] > 3 * yellow[blue]
+    g = made("panda")
+    ears = mean_colour(g, (g.means[:, 2] > 0.36) & (g.means[:, 0].abs() > 0.22))
+    assert max(ears) < 0.25
+    g = made("miku")
+    tails = mean_colour(g, g.means[:, 0].abs() > 0.33)
+    assert tails[blue] > 2 * tails[red] and tails[green] > 2 * tails[red]
+    g = made("pillow")
+    rows = g.sh[(g.means[:, 1].abs() < 0.01) & (g.means[:, 2] > 0)][:, 0] * C0 + 0.5
+    white = rows[:, red] > 0.5
+    assert 0.3 < white.float().mean() < 0.7
+
+
+def test_same_bytes_whatever_the_number_of_threads():
+    before = torch.get_num_threads()
+    try:
+        digests = []
+        for threads in (1, 2):
+            torch.set_num_threads(threads)
+            digests.append(digest(make_object("duck")))
+            assert torch.get_num_threads() == threads
+    finally:
+        torch.set_num_threads(before)
+    assert digests[0] == digests[1] == digest(made("duck"))
+
+
+def test_unknown_object_is_told_the_names():
+    with pytest.raises(InputError, match="no object called 'cat'; choose from ball, bowl"):
+        make_object("cat")
+
+
+def test_width_of_gaussians_unless_told_otherwise():
+    """The example that ships was made with discs of 0.7 times the spacing and 0.15 of it thick."""
+    line = torch.arange(5) * 0.01
+    points = torch.nn.functional.pad(torch.cartesian_prod(line, line), (0, 1))
+    surface = Surface(points, torch.tensor([[0.0, 0, 1]]).repeat(25, 1))
+    middle = to_gaussians(surface, torch.full((25, 3), 0.5), 1).scales[12]
+    torch.testing.assert_close(middle, torch.tensor([0.007, 0.007, 0.0015]))
+    wide = to_gaussians(surface, torch.full((25, 3), 0.5), 1, width=1.0, widest=0.005).scales[12]
+    torch.testing.assert_close(wide, torch.tensor([0.005, 0.005, 0.00075]))
+
+
+def test_points_are_spread_by_area():
+    """A sphere and a slab of known areas in one field: counts go as areas, within 4 standard deviations."""
+    ball, slab = shapes.sphere((-0.5, 0, 0), 0.2), shapes.slab((0.4, 0, 0), (0.3, 0.3, 0.3), 0.01, 0.01)
+    s = spread(shapes.union(ball, slab), (0.75, 0.35, 0.35), 20_000, 0.004)
+    areas = 4 * np.pi * 0.2**2, 6 * 0.6**2  # rounded edges take about 1 % off the box
+    share = areas[0] / sum(areas)
+    found = float((s.points[:, 0] < 0).float().mean())
+    assert abs(found - share) < 4 * (share * (1 - share) / 20_000) ** 0.5 + 0.01 * share
+
+
+def test_evening_keeps_points_on_the_surface_and_parts_them():
+    field = shapes.ellipsoid((0, 0, 0), (0.5, 0.3, 0.2))
+    before = spread(field, (0.5, 0.3, 0.2), 4000, 0.008)
+    after = evened(field, before)
+    on = (after.points / torch.tensor([0.5, 0.3, 0.2])).norm(dim=1)
+    torch.testing.assert_close(on, torch.ones(4000), rtol=0, atol=2e-4)
+    gaps = [knn(s.points, s.points, 2)[0][:, 1].quantile(0.01) for s in (before, after)]
+    assert gaps[1] > 3 * gaps[0]
+
+
+@pytest.mark.parametrize("field, point, distance", [
+    (shapes.sphere((1, 0, 0), 0.5), (1, 0, 2), 1.5),
+    (shapes.capsule((0, 0, 0), (0, 0, 1), 0.2), (0.5, 0, 0.5), 0.3),
+    (shapes.capsule((0, 0, 0), (0, 0, 1), 0.2, 0.1), (0, 0, 1.5), 0.4),
+    (shapes.torus((0, 0, 0), 1.0, 0.1), (0, 0, 0), 0.9),
+    (shapes.slab((0, 0, 0), (0.5, 0.1, 1.0), 0.05, 0.02), (0, 0.3, 0), 0.2),
+    (shapes.revolved([(0, 0), (1, 0), (1, 1), (0, 1)]), (0, 0.5, 0.5), -0.5),
+    (shapes.revolved_wall([(1, 0), (1, 1)], 0.2), (0, 1.5, 0.5), 0.4),
+    (shapes.mirrored(shapes.sphere((1, 0, 0), 0.5)), (-1, 0, 0), -0.5),
+    (shapes.posed(shapes.capsule((0, 0, 0), (0, 0, 1), 0.1), shapes.turn(x=90)), (0, -2, 0), 0.9),
+    (shapes.cut(shapes.sphere((0, 0, 0), 1.0), shapes.sphere((0, 0, 0), 0.5)), (0, 0, 0.4), 0.1),
+    (shapes.tube(torch.tensor([[0.0, 0, 0], [0, 0, 1]]), torch.tensor([0.1, 0.3])), (0.4, 0, 1), 0.1),
+    (shapes.tube(torch.tensor([[0.0, 0, 0], [0, 0, 1]]), 0.1), (9, 0, 0), shapes.FAR),
+])  # fmt: skip
+def test_distances_by_hand(field, point, distance):
+    torch.testing.assert_close(field(torch.tensor([point], dtype=torch.float32)), torch.tensor([distance]))
+
+
+def test_slope_turns_any_field_into_a_distance():
+    """Three times the distance has slope 3: divided out, the distance and the unit normal are left."""
+    sphere = shapes.sphere((0, 0, 0), 0.5)
+    distance, normal = slope(lambda p: 3 * sphere(p), torch.tensor([[0.0, 0.0, 0.6]]))
+    torch.testing.assert_close(distance, torch.tensor([0.1]), rtol=1e-3, atol=0)
+    torch.testing.assert_close(normal, torch.tensor([[0.0, 0.0, 1.0]]), rtol=0, atol=1e-3)
+
+
+def test_points_take_the_paint_of_the_part_they_lie_on():
+    parts = [Part(shapes.sphere((x, 0, 0), 0.2), lambda p, c=c: torch.tensor(c).expand(len(p), 3))
+             for x, c in ((-0.3, (0.8, 0.1, 0.1)), (0.3, (0.1, 0.1, 0.8)))]  # fmt: skip
+    g = sculpt(parts, (0.5, 0.2, 0.2), 2000)
+    left = g.means[:, 0] < 0
+    assert (g.sh[left, 0, 0] > g.sh[left, 0, 2]).all() and (g.sh[~left, 0, 0] < g.sh[~left, 0, 2]).all()
+
+
+def test_the_highlight_is_where_a_mirror_shows_the_light_and_leaves_the_mean_alone():
+    rng = torch.Generator().manual_seed(0)
+    normal = torch.nn.functional.normalize(KEY + 0.3 * torch.randn(3, generator=rng), dim=0)[None]
+    sh = shine(torch.zeros(1, 1, 3), normal, torch.tensor([1.0]))
+    views = torch.nn.functional.normalize(torch.randn(20_000, 3, generator=rng), dim=1)  # from the surface to the eye
+    seen = evaluate_sh(sh.expand(len(views), 9, 3), -views)[:, 0] - 0.5
+    mirrored = 2 * (normal @ KEY) * normal[0] - KEY
+    assert float(views[seen.argmax()] @ mirrored) > 0.99
+    assert abs(float(seen.mean())) < 0.01  # 20,000 directions of spread 0.15: 0.001
+
+
+def test_command_writes_what_public_code_reads(tmp_path):
+    done = CliRunner().invoke(app, ["objects", str(tmp_path), "--only", "duck", "--sheet", str(tmp_path / "sheet.jpg")])
+    assert done.exit_code == 0, done.output
+    assert "duck: 50000 Gaussians" in done.output
+    scene = read_scene(tmp_path / "duck" / PLY)
+    g = made("duck")
+    torch.testing.assert_close(scene.gaussians.means, g.means)
+    torch.testing.assert_close(scene.gaussians.sh, g.sh)
+    assert [o.name for o in scene.objects] == ["duck"]
+    rows = json.loads((tmp_path / "duck" / "cameras.json").read_text())
+    assert len(rows) == 100 and {"rotation", "position", "width", "height", "fx", "fy"} <= rows[0].keys()
+    assert (tmp_path / "sheet.jpg").stat().st_size < 200_000
+
+
+def test_cameras_look_at_the_object():
+    """Rotation is camera-to-world: its third column looks from the position towards the origin."""
+    from stages.core.geometry.cameras import orbit
+
+    row = camera_rows(orbit(4, torch.zeros(3), 2.0, 20.0), 640)[1]
+    position, R = torch.tensor(row["position"]), torch.tensor(row["rotation"])
+    torch.testing.assert_close(R[:, 2], -position / position.norm())
+    assert row["fx"] == 960
+
+
+def test_same_file_whatever_else_is_made(tmp_path):
+    for folder, only in (("a", "duck"), ("b", "panda,duck")):
+        assert CliRunner().invoke(app, ["objects", str(tmp_path / folder), "--only", only]).exit_code == 0
+    assert (tmp_path / "a/duck" / PLY).read_bytes() == (tmp_path / "b/duck" / PLY).read_bytes()
+
+
+def test_command_refuses_names_it_does_not_know(tmp_path):
+    done = CliRunner().invoke(app, ["objects", str(tmp_path), "--only", "duck,goose"])
+    assert done.exit_code == 2 and not list(tmp_path.iterdir())
+
+
+def test_command_refuses_meshes_and_names_together(tmp_path):
+    done = CliRunner().invoke(app, ["objects", str(tmp_path), "--only", "duck", "--from", "x.obj"])
+    assert done.exit_code == 2 and not list(tmp_path.iterdir())

@@ -1,0 +1,79 @@
+"""The bench of completion sees less than everything, and measures it."""
+
+import json
+
+import pytest
+import torch
+
+from stages.core.scene.scene import Scene
+from stages.lab.assets.shapes import ellipsoid
+from stages.lab.bench import complete as bench_complete
+from stages.lab.bench.complete import (
+    FIGURES,
+    FRONT,
+    WAYS,
+    BenchOptions,
+    cameras,
+    distance,
+    photographed,
+    psnr_behind,
+    run,
+    shown,
+    truth,
+)
+from tests.refine.things import thing
+from tests.segment.tabletop import coloured
+
+
+@pytest.fixture(scope="module")
+def true():
+    patch = pytest.MonkeyPatch()
+    patch.setattr(bench_complete, "make_object", lambda name: thing(0.02))
+    yield truth("panda,duck", BenchOptions())
+    patch.undo()
+
+
+def test_the_objects_stand_on_the_table_beside_each_other(true):
+    g = true.gaussians
+    lows = [float(g.means[g.object_id == i, 2].min()) for i in (1, 2)]
+    assert lows == pytest.approx([0.0, 0.0], abs=1e-4)
+    middles = torch.stack([g.means[g.object_id == i].mean(0) for i in (1, 2)])
+    assert float((middles[1] - middles[0]).norm()) > 0.25
+
+
+def test_the_cameras_miss_the_back_and_pictures_from_there_show_it(true):
+    seen = photographed(true, BenchOptions())
+    counts = [int((s.gaussians.object_id > 0).sum()) for s in (seen, true)]
+    assert 0.3 * counts[1] < counts[0] < 0.8 * counts[1]
+    assert distance(true, true) == 0 and distance(seen, true) > 1
+    assert psnr_behind(seen, true) < 25
+    exact = photographed(true, BenchOptions(noise=0.0))
+    kept = exact.gaussians.means[exact.gaussians.object_id > 0]
+    assert float(torch.cdist(kept[:50], true.gaussians.means).amin(1).max()) < 1e-3  # cdist rounds
+
+
+def test_what_is_seen_does_not_depend_on_how_many_gaussians_it_is_made_of():
+    """Of a ball, the front of the arc of cameras: the same share of 4,000 and of 30,000 Gaussians."""
+    shares = []
+    for count in (4000, 30_000):
+        ball = coloured(ellipsoid((0.1, 0.1, 0.1), count).moved((0, 0, 0.12)), (0.8, 0.3, 0.2), 1)
+        shares.append(float(shown(Scene(ball, (), cameras(10, FRONT, 28.0), 0.0)).float().mean()))
+    assert shares[0] == pytest.approx(shares[1], abs=0.05) and 0.5 < shares[0] < 0.9
+
+
+def test_a_run_gives_each_scene_and_the_mean_over_them(tmp_path, monkeypatch):
+    """One scene is twice as bad as the other in every figure."""
+
+    def measured(placed, folder, options):
+        assert (folder / "library/duck.ply").exists()
+        factor = 1 + (placed == "can,miku")
+        for i, way in enumerate(WAYS, 1):
+            yield way, {figure: factor * i * 10**j for j, figure in enumerate(FIGURES)}
+
+    monkeypatch.setattr(bench_complete, "measured", measured)
+    monkeypatch.setattr(bench_complete, "make_object", lambda name: thing(0.02))
+    lines = list(run(tmp_path / "out.json", BenchOptions(("panda,duck", "can,miku"), "duck")))
+    assert [line.split()[:2] for line in lines[-3:]] == [["mean", way] for way in WAYS] and len(lines) == 1 + 3 * 3
+    facts = json.loads((tmp_path / "out.json").read_text())
+    assert facts["mean"]["close"] == {"chamfer_mm": 3.0, "psnr_behind_db": 30.0, "motion_rmse_mm": 300.0}
+    assert facts["scenes"]["can,miku"]["library"]["chamfer_mm"] == 6

@@ -1,0 +1,315 @@
+"""The benchmark measures what it says, and writes down all of it."""
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import pytest
+import torch
+from torch.testing import assert_close
+from typer.testing import CliRunner
+
+from ngff_cli.lab import app
+from stages.core.errors import InputError
+from stages.core.geometry.rotations import matrix
+from stages.core.models.checkpoints import build, save
+from stages.evaluate.dynamics import rmse
+from stages.lab.bench import dynamics as bench_dynamics
+from stages.lab.bench import dynamics_rows as bench_dynamics_rows
+from stages.lab.bench.dynamics import FALL, MPM, NUDGED, RIGID, SPLITS, BenchOptions, measured, run, scenes_of
+from stages.lab.bench.dynamics_report import markdown, table
+from stages.lab.bench.dynamics_rows import (
+    ESTIMATED,
+    Resimulation,
+    common,
+    estimated,
+    fall,
+    free_fall,
+    rigid,
+    same_scenes,
+)
+from stages.lab.dataset.motions import Motions, joined, write_motions
+from stages.lab.dataset.particles import Asset, Fineness, volumes
+from stages.lab.dataset.scenes import Config, write_configs
+from stages.lab.dataset.simulation import simulate
+from stages.lab.plot import HEIGHT, STRIP, WIDTH
+from tests.lab.training.test_train import falling, without_last
+
+GROUPS = [*(f"3_{i}" for i in range(10)), "4", "6", "heldout"]
+NONE = BenchOptions(keypoints=8, mpm=0, device="cpu")
+
+
+def group(name: str, by: float = 0.0) -> Motions:
+    """Two scenes of bodies that fall, all of them `by` off."""
+    made = falling(2, 8, 3 if name == "heldout" else int(name[0]), seed=GROUPS.index(name))
+    return replace(made, names=(f"{name} a", f"{name} b"), points=made.points + by)
+
+
+@pytest.fixture
+def data(tmp_path: Path) -> Path:
+    """All groups, of two scenes each."""
+    (tmp_path / "data").mkdir()
+    for name in GROUPS:
+        write_motions(tmp_path / "data" / f"{name}.h5", group(name), {})
+    return tmp_path / "data"
+
+
+@pytest.fixture
+def weights(tmp_path: Path) -> Path:
+    (tmp_path / "weights").mkdir()
+    for name in ("gcn", "transformer"):
+        save(tmp_path / "weights" / f"{name}.safetensors", name, build(name, hidden=8), {"minutes": 2.0})
+    return tmp_path / "weights"
+
+
+def test_free_fall_is_exact_for_bodies_that_only_fall():
+    motions = without_last(falling(frames=20))
+    predicted = free_fall(motions.world(), 20, motions.dt)
+    assert_close(predicted, motions.points, rtol=0, atol=1e-5)
+    resting = predicted[1:, -1, :, :, 2].amin(-1)
+    assert_close(resting, torch.full_like(resting, float(motions.world().floor[0, 0])), rtol=0, atol=1e-5)
+
+
+def tumbling(seed: int = 0):
+    """Rigid bodies that turn and drift, the last object of scene 0 missing."""
+    motions = without_last(falling(frames=6, n=20, seed=seed))
+    rest = motions.points[:, 0]
+    centre = rest.mean(2, keepdim=True)
+    points = []
+    for t in range(6):
+        half = torch.tensor(0.4 * t)
+        R = matrix(torch.cat([half.cos()[None], half.sin() * torch.tensor([1.0, 2, 2]) / 3]))
+        points.append((rest - centre) @ R.mT + centre + 0.1 * t)
+    points = torch.stack(points, 1) * motions.present[:, None, :, None, None]
+    return replace(motions, points=points)
+
+
+def test_the_best_rigid_fit_of_rigid_bodies_is_the_truth():
+    motions = tumbling()
+    assert_close(rigid(motions), motions.points, rtol=0, atol=1e-5)
+
+
+def test_the_best_rigid_fit_of_soft_bodies_keeps_shape_and_is_the_best():
+    motions = tumbling()
+    noise = 0.02 * torch.randn(motions.points.shape, generator=torch.Generator().manual_seed(1))
+    noise[:, 0] = 0  # at rest they are as they are
+    soft = replace(motions, points=motions.points + noise * motions.present[:, None, :, None, None])
+    fit = rigid(soft)
+    rest, last = soft.points[1, 0, 0], fit[1, -1, 0]
+    assert_close(torch.cdist(last, last), torch.cdist(rest, rest), rtol=0, atol=1e-4)
+    error = (fit - soft.points).square().sum()
+    assert error < (motions.points - soft.points).square().sum()  # the motion before the noise was one of the choices
+    assert rigid(soft)[0, :, -1].abs().max() == 0  # padding
+
+
+def test_the_truth_has_no_error_and_correlates_wholly():
+    motions = without_last(falling())
+    result = measured(fall, motions, batch=4)
+    assert result["RMSE"] < 1e-5 and result["FPE"] < 1e-5 and result["R"] > 0.9999
+    assert len(result["error by frame"]) == 12 and result["scenes not finite"] == 0
+    assert {name: len(curve) for name, curve in result["error by object"].items()} == {"ball": 2, "bear": 2}
+
+
+def test_errors_are_averaged_over_scenes_whatever_the_batch():
+    motions = without_last(falling(seed=3))
+
+    def still(some):
+        return some.points[:, :1].repeat(1, 12, 1, 1, 1)
+
+    one, all_ = (measured(still, motions, batch=b) for b in (1, 6))
+    assert one == all_
+    world = motions.world()
+    expected = float(rmse(still(motions), motions.points, world.valid).mean())
+    assert one["RMSE"] == pytest.approx(expected, rel=1e-3)
+    assert one["R"] == 0  # everything falls, nothing was said to
+    gap = (motions.points - motions.points[:, :1]).norm(dim=-1).mean(-1)
+    assert one["error by frame"][-1] == pytest.approx(float(gap[:, -1][motions.present].mean()), rel=1e-2)
+    bears = motions.objects == 1
+    assert one["error by object"]["bear"][1] == pytest.approx(float(gap[:, 8][bears].mean()), rel=1e-2)
+
+
+def test_a_scene_that_is_lost_is_not_left_out():
+    motions = falling()
+
+    def lost(some):
+        points = fall(some)
+        points[0, -1] = math.nan
+        return points
+
+    result = measured(lost, motions, batch=6)
+    assert result["RMSE"] is None and result["FPE"] is None and result["scenes not finite"] == 1
+    assert result["R"] == pytest.approx(5 / 6, abs=1e-3) and result["error by frame"][-1] is None
+    facts = {"scenes": {"spatial": 6}, "rows": {"a": {"splits": {"spatial": result}}}}
+    assert "not finite" in table(facts)[1]
+
+
+def test_scenes_made_again_are_found_by_their_names():
+    motions = falling(seed=4)
+    other = replace(motions, points=motions.points + 0.01)[torch.tensor([5, 3, 0])]
+    both = common(motions, other)
+    assert both.names == ("0", "3", "5")
+    result = measured(same_scenes(other, 12), both, batch=2)
+    assert result["RMSE"] == pytest.approx(0.01, rel=1e-3) and result["PCE"] == pytest.approx(0, abs=1e-6)
+    with pytest.raises(InputError, match="fewer frames"):
+        same_scenes(replace(other, points=other.points[:, :5]), 12)(both)
+
+
+def test_the_sample_of_the_temporal_split_is_always_the_same(data, monkeypatch):
+    monkeypatch.setattr(bench_dynamics, "SAMPLE", 5)
+    options = BenchOptions(keypoints=8)
+    a, b = (scenes_of(data, "temporal", options) for _ in range(2))
+    assert len(a) == 5 and torch.equal(a.points, b.points)
+    assert not torch.equal(a.points, scenes_of(data, "temporal", replace(options, seed=1)).points)
+    assert scenes_of(data, "6 objects", options).points.shape == (2, 8, 6, 8, 3)
+
+
+def test_every_model_is_measured_on_every_split(data, weights, tmp_path, monkeypatch):
+    monkeypatch.setattr(bench_dynamics, "TIMED", 2)
+    out = tmp_path / "results.json"
+    nudged = tmp_path / "nudged"
+    nudged.mkdir()
+    for name in GROUPS:
+        write_motions(nudged / f"{name}.h5", group(name, by=0.001), {})
+    lines = run(data, weights, out, replace(NONE, limit=2), nudged)
+    facts = json.loads(out.read_text(), parse_constant=lambda word: pytest.fail(f"{word} is no JSON"))
+    assert list(facts["rows"]) == [FALL, NUDGED, RIGID, "gcn", "transformer"]
+    for row in facts["rows"].values():
+        assert list(row["splits"]) == list(SPLITS)
+    assert facts["rows"][FALL]["splits"]["spatial"]["RMSE"] < 1e-3  # these bodies only fall
+    assert facts["rows"][NUDGED]["splits"]["temporal"]["RMSE"] == pytest.approx(1e-3, rel=0.06)  # kept to 0.1 mm
+    assert facts["rows"][RIGID]["splits"]["6 objects"]["RMSE"] < 2e-4
+    row = facts["rows"]["transformer"]
+    assert row["seconds"] > 0 and row["card"]["minutes"] == 2.0 and row["parameters"] > 0
+    assert facts["scenes"] == dict.fromkeys(SPLITS, 2) and facts["machine"] and facts["date"]
+    assert facts["published, on other data"]["NGFF"]["spatial"] == [0.082, 0.326, 0.661]
+    text = "\n".join(lines)
+    assert text.index("transformer") < text.index("measured on other data") < text.index("Pointformer")
+    assert len({len(line) for line in lines if "other data" not in line}) == 1  # columns stand below each other
+    assert "[\n" not in out.read_text()  # a list of numbers is one line
+
+
+def test_table_and_plots_are_drawn_again_from_the_results_alone(data, weights, tmp_path, monkeypatch):
+    monkeypatch.setattr(bench_dynamics, "TIMED", 2)
+    out = tmp_path / "results.json"
+    lines = run(data, weights, out, NONE)
+    first = {kind: out.with_suffix(kind).read_bytes() for kind in (".md", ".png")}
+    for kind in first:
+        out.with_suffix(kind).unlink()
+    done = CliRunner().invoke(app, ["bench", "dynamics", "--from", str(out)])
+    assert done.exit_code == 0 and done.stdout.splitlines() == lines, done.stderr
+    assert first == {kind: out.with_suffix(kind).read_bytes() for kind in first}
+    assert cv2.imread(str(out.with_suffix(".png"))).shape[:2] == (2 * HEIGHT + STRIP, 5 * WIDTH)
+    for text in ("[]", "no", '{"rows": 3}'):
+        (tmp_path / "bad.json").write_text(text)
+        done = CliRunner().invoke(app, ["bench", "dynamics", "--from", str(tmp_path / "bad.json")])
+        assert done.exit_code == 2 and "bad.json: holds no results" in done.stderr
+    done = CliRunner().invoke(app, ["bench", "dynamics"])
+    assert done.exit_code == 2 and "--data" in done.stderr
+
+
+def test_rows_of_the_same_scenes_stay_when_others_are_measured(data, weights, tmp_path, monkeypatch):
+    monkeypatch.setattr(bench_dynamics, "TIMED", 2)
+    out = tmp_path / "results.json"
+    run(data, weights, out, NONE)
+    before = json.loads(out.read_text())["rows"]
+    (weights / "transformer.safetensors").unlink()
+    save(weights / "gcn.safetensors", "gcn", build("gcn", hidden=8), {"minutes": 3.0})
+    run(data, weights, out, NONE)
+    rows = json.loads(out.read_text())["rows"]
+    assert list(rows) == list(before) and rows["transformer"] == before["transformer"]
+    assert rows["gcn"]["card"]["minutes"] == 3.0
+    run(data, weights, out, replace(NONE, limit=1))  # other scenes: numbers of before would mislead
+    assert list(json.loads(out.read_text())["rows"]) == [FALL, RIGID, "gcn"]
+    out.write_text("[]")
+    with pytest.raises(InputError, match="results.json: holds no results"):
+        run(data, weights, out, NONE)
+
+
+def test_the_best_model_of_each_split_is_bold():
+    def row(rmse, **more):
+        score = {"RMSE": rmse, "FPE": 0.1, "R": 0.5}
+        return {"splits": {"spatial": {**score, **more.pop("left", {})}}, **more}
+
+    facts = {
+        "machine": "m", "date": "d", "keypoints": 8, "scenes": {"spatial": 6}, "frames": {"spatial": 80},
+        "rows": {FALL: row(0.02), MPM: row(0.3, left={"scenes left out": 2}), "gcn": row(0.2, card={"minutes": 3.0}),
+                 "ngff": row(0.1, card={}, parameters=270_000, seconds=0.0123), "odd": row(None, card={})},
+    }  # fmt: skip
+    text = "\n".join(markdown("results", facts))
+    assert "| `ngff` | **0.1000 / 0.100 / 0.500** | 0.0123 s | 0.27 M |  |" in text and text.count("**") == 2
+    assert "| no learning | 0.0200" in text and "not finite" in text and "3.0 min" in text
+    assert "mpm-estimated: without scenes that the solver gave up: 2 of spatial." in text
+    assert "| NGFF | 0.0820 / 0.326 / 0.661 | 0.363 s |" in text and "measured on other data" in text
+
+
+def box_shell(half, n=150, seed=0):
+    rng = torch.Generator().manual_seed(seed)
+    p = torch.rand(n, 3, generator=rng) * 2 - 1
+    axis = torch.randint(3, (n,), generator=rng)
+    p[torch.arange(n), axis] = p[torch.arange(n), axis].sign()
+    return p * torch.tensor(half)
+
+
+COARSE = Fineness(dx=0.08, spacing=0.03, substep=5e-4)
+
+
+@pytest.fixture
+def simulated(tmp_path, monkeypatch):
+    """One group of two scenes with a ball and a duck, and what made it; one scene is of objects far off the box."""
+    shapes = {0: (0.2, 0.2, 0.2), 7: (0.1, 0.1, 0.3)}
+    points = {i: box_shell(half, seed=i) for i, half in shapes.items()}
+    things = {i: Asset(i, 1.0, p, volumes(p, COARSE.dx), 1e5, 500.0) for i, p in points.items()}
+    heights = {"a": -0.73, "b": 0.0}
+    configs = {n: Config(n, (0, 7), ((0.0, 0.0, z), (0.7, 0.0, z + 0.1)), (1.0, 1.0)) for n, z in heights.items()}
+    for folder in ("motions", "scene_configs"):
+        (tmp_path / "set" / folder).mkdir(parents=True)
+    write_configs(tmp_path / "set" / "scene_configs" / "3_9.json", configs)
+    options = {"dx": COARSE.dx, "spacing": COARSE.spacing, "substep": COARSE.substep, "keypoints": 60}
+    made = joined(list(simulate(configs, things, COARSE, 12, 60, "cpu")))
+    write_motions(tmp_path / "set" / "motions" / "3_9.h5", made, {"options": options})
+    monkeypatch.setattr(bench_dynamics_rows, "assets", lambda fineness, least, kept: things)
+    return tmp_path / "set", things
+
+
+def test_estimated_materials_take_the_place_of_the_true_ones(simulated):
+    _, things = simulated
+    guess = estimated(things)
+    assert (guess[0].E, guess[0].density) == ESTIMATED["ball"] and (guess[7].E, guess[7].density) == ESTIMATED["duck"]
+    assert torch.equal(guess[0].points, things[0].points) and guess[7].mass == pytest.approx(
+        things[7].mass * 1100 / 500, rel=1e-6
+    )
+
+
+def test_scenes_are_simulated_again_as_they_were(simulated, monkeypatch):
+    data, things = simulated
+    monkeypatch.setattr(bench_dynamics_rows, "estimated", lambda things: things)  # the true materials
+    truth = scenes_of(data, "spatial", BenchOptions(keypoints=20))
+    again = Resimulation(data, ["3_9"], "cpu")(("b", "a"), 12, 20)
+    result = measured(same_scenes(again, 12), truth, batch=2)
+    assert result["RMSE"] < 1e-4  # positions are kept to 0.1 mm
+
+
+def test_mpm_with_estimated_materials_is_a_row_of_its_own(simulated, weights, tmp_path, monkeypatch):
+    monkeypatch.setattr(bench_dynamics, "TIMED", 2)
+    data, _ = simulated
+    run(data, weights, tmp_path / "r.json", BenchOptions(keypoints=20, mpm=1, device="cpu"))
+    facts = json.loads((tmp_path / "r.json").read_text())
+    row = facts["rows"][MPM]["splits"]["spatial"]
+    assert list(facts["rows"])[2] == MPM and row["scenes left out"] == 0
+    start, later = row["error by object"]["duck"]  # kept to 0.1 mm; 20 times as soft, it lands otherwise
+    assert start < 1e-4 and later > 5e-4
+    assert facts["scenes"] == {"spatial": 2}
+
+
+def test_data_that_do_not_say_how_they_were_made(simulated):
+    data, _ = simulated
+    write_motions(data / "motions" / "3_9.h5", group("3_9"), {"options": {"dx": 0.02}})
+    with pytest.raises(InputError, match="3_9.h5: does not say how it was simulated .no spacing.*--mpm 0"):
+        Resimulation(data, ["3_9"], "cpu")
+
+
+def test_a_folder_without_weights_is_said(data, tmp_path):
+    with pytest.raises(InputError, match="no weights"):
+        run(data, tmp_path, tmp_path / "r.json", NONE)

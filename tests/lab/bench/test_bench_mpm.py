@@ -1,0 +1,60 @@
+"""The benchmark measures what it says. No speed is tested."""
+
+import math
+
+import pytest
+import torch
+
+from stages.core.errors import InputError
+from stages.core.kernels.mpm import grid as mpm_grid
+from stages.core.physics.mpm import solver as mpm
+from stages.lab.bench import mpm as bench_mpm
+from stages.lab.bench import mpm_plain as bench_mpm_plain
+from stages.lab.bench.mpm import BenchOptions
+
+
+def test_the_plain_form_is_the_same_physics():
+    one, box, dx = bench_mpm.scene(400)
+    one.v[:] = torch.tensor([0.3, 0.1, -1.0])
+    ours = mpm.Solver(one, box, dx)
+    push = torch.tensor(bench_mpm.GRAVITY).repeat(len(one), 1)
+    ours.advance(0.02, push, 200)
+    plain = mpm.Solver(one, box, dx)
+    plain.set(push=push)
+    nodes = torch.zeros(plain.grid.count, 4)
+    for _ in range(200):
+        bench_mpm_plain.substep(plain, nodes, 1e-4)
+    assert plain.grid.low[0] == mpm_grid.PAD
+    torch.testing.assert_close(plain.particles.x, ours.particles.x, rtol=0, atol=2e-5)
+
+
+@pytest.mark.parametrize("particles", [6_144, 20_000, 250_000])
+def test_scenes_have_about_as_many_particles_as_asked_eight_a_cell(particles):
+    one, box, dx = bench_mpm.scene(particles)
+    assert len(one) == pytest.approx(particles, rel=0.1)
+    assert dx**3 / float(one.volume[0]) == pytest.approx(8, rel=1e-5)
+    low, high = torch.tensor(box.low), torch.tensor(box.high)
+    assert bool((one.x > low).all() and (one.x < high).all())
+
+
+def test_a_report_has_ratios_and_the_machine(monkeypatch):
+    monkeypatch.setattr(bench_mpm.bench, "copy_bandwidth", lambda device: 1e10)
+    lines = list(bench_mpm.run(BenchOptions("cpu", (400,), scenes=2, frames=1)))
+    assert "torch" in lines[0] and "10 GB/s" in lines[1] and len(lines) == 5
+    assert sum("mpm exact" in line for line in lines) == 1
+    for line in lines[2:]:
+        assert "us a substep" in line and "scenes a minute" in line and "the plain three-kernel form" in line
+
+
+def test_the_figures_follow_from_each_other():
+    r = bench_mpm.measure(400, 2, "cpu", 1)
+    count = 2 * r["particles"]
+    assert r["ns_per_particle"] == pytest.approx(1e3 * r["substep_us"] / count)
+    assert r["scenes_per_minute"] == pytest.approx(2 * 60 / (r["substep_us"] * 1e-6 * 200 * 100))
+    assert r["bytes"] > count * 2 * 27 * 16 and math.isfinite(r["bytes_per_second"])
+
+
+def test_wrong_options():
+    for options in ({"frames": 0}, {"particles": (3,)}, {"scenes": -1}):
+        with pytest.raises(InputError, match="--frames at least 1"):
+            BenchOptions(**options)

@@ -1,0 +1,126 @@
+"""The bench judges rightly: exact answers have no error, turns that cannot be seen are none, ICP finds what is near."""
+
+import json
+import sys
+from dataclasses import replace
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from stages.core.geometry.harmonics import rgb_to_sh
+from stages.core.geometry.rotations import matrix
+from stages.core.geometry.similarity import Similarity, umeyama
+from stages.lab.assets.shapes import ellipsoid
+from stages.lab.bench import common as bench
+from stages.lab.bench import register as bench_register
+from stages.lab.bench.register import BenchOptions, about_z, angle, errors, icp, run, splatreg, trial
+from tests.refine.things import somewhere, thing
+from tests.segment.tabletop import coloured
+
+
+@pytest.fixture(scope="module")
+def can():
+    """A grey cylinder-like egg; `painted` has one side red."""
+    return coloured(ellipsoid((0.3, 0.3, 0.5), 8000), (0.5, 0.5, 0.5), 1, grain=0.0)
+
+
+def turned_about_z(pose: Similarity, degrees: float) -> Similarity:
+    half = torch.deg2rad(torch.tensor(degrees / 2))
+    about = matrix(torch.stack([half.cos(), torch.tensor(0.0), torch.tensor(0.0), half.sin()]))
+    return Similarity(pose.scale, pose.rotation @ about, pose.translation)
+
+
+def test_the_truth_has_no_error_and_what_is_off_has_as_much_as_it_is_off(can):
+    given = trial(can, 0, BenchOptions())
+    exact = errors(given.truth, given, can, revolved=True)
+    assert max(exact.values()) < 0.1
+    larger = given.truth._replace(scale=1.05 * given.truth.scale)
+    assert errors(larger, given, can, revolved=False)["scale"] == pytest.approx(5, abs=1e-3)
+    off = turned_about_z(given.truth, 20.0)
+    assert errors(off, given, can, revolved=False)["rotation up to symmetry"] == pytest.approx(20, abs=0.1)
+
+
+def test_a_turn_that_nobody_can_see_is_no_error_and_one_of_a_painted_side_is(can):
+    given = trial(can, 0, BenchOptions())
+    off = turned_about_z(given.truth, 90.0)
+    assert errors(off, given, can, revolved=True)["rotation up to symmetry"] < 0.1
+    red = torch.where(can.means[:, :1] > 0, torch.tensor([0.9, 0.1, 0.1]), torch.tensor([0.5, 0.5, 0.5]))
+    painted = replace(can, sh=rgb_to_sh(red))
+    assert errors(off, given, painted, revolved=True)["rotation up to symmetry"] == pytest.approx(90, abs=0.1)
+
+
+def test_a_part_is_the_share_of_the_whole_that_was_asked_for_where_the_truth_puts_it(can):
+    given = trial(can, 1, BenchOptions(missing=0.4, noise=0.0, tint=0.0))
+    assert len(given.part) == round(0.6 * len(can))
+    torch.testing.assert_close(given.part.means, given.truth(can.means[given.seen]))
+    torch.testing.assert_close(given.part.sh, can.sh[given.seen])
+
+
+def test_the_turn_about_z_is_taken_apart_from_the_rest():
+    a = matrix(torch.tensor([0.9, 0.0, 0.0, 0.3]))
+    assert angle(a @ about_z(a).mT) < 0.1
+    x = matrix(torch.tensor([0.9, 0.3, 0.0, 0.0]))
+    assert angle(about_z(x)) < 0.1
+
+
+def test_there_and_back_is_nowhere():
+    pose = somewhere(2)
+    points = torch.randn(5, 3)
+    torch.testing.assert_close(pose.inverse()(pose(points)), points, rtol=0, atol=1e-5)
+
+
+def test_icp_finds_a_whole_that_is_turned_a_little():
+    whole = thing(0.02)
+    pose = Similarity(1.3, matrix(torch.tensor([1.0, 0.02, 0.03, -0.02])), torch.tensor([0.2, 0.1, 0.0]))
+    found = icp(replace(whole, means=pose(whole.means)), whole)
+    assert (found(whole.means) - pose(whole.means)).norm(dim=1).mean() < 0.03
+
+
+@pytest.fixture
+def stand_in(monkeypatch):
+    """A module in splatreg's place that matches by colour and answers as splatreg does: model to observation, 4x4."""
+
+    def estimate_object_pose(model, observation, *, init, transform):
+        assert (init, transform) == ("features", "sim3") and torch.get_num_threads() == 1
+        for g in (model, observation):
+            assert not g.log_scales and (g.colors >= 0).all() and (g.colors <= 1).all()
+            assert (g.means - g.means.mean(0)).square().sum(1).mean().sqrt() == pytest.approx(0.14, rel=1e-4)
+        pose = umeyama(model.means, observation.means[torch.cdist(model.colors, observation.colors).argmin(1)])
+        T = torch.eye(4)
+        T[:3, :3], T[:3, 3] = pose.scale * pose.rotation, pose.translation
+        return SimpleNamespace(T_SO=T)
+
+    def gaussians(means, quats, scales, opacities, colors=None, log_scales=False):
+        return SimpleNamespace(means=means, colors=colors, scales=scales, log_scales=log_scales)
+
+    module = SimpleNamespace(Gaussians=gaussians, estimate_object_pose=estimate_object_pose)
+    monkeypatch.setitem(sys.modules, "splatreg", module)
+
+
+def test_splatreg_is_handed_what_it_wants_and_its_answer_is_turned_into_ours(can, stand_in):
+    rng, threads = torch.Generator().manual_seed(0), torch.get_num_threads()
+    whole = can[torch.randperm(len(can), generator=rng)[: bench_register.SHOWN]]
+    whole = replace(whole, sh=rgb_to_sh(torch.rand(len(whole), 3, generator=rng)))
+    pose = somewhere(3)
+    found = splatreg(replace(whole, means=pose(whole.means), scales=pose.scale * whole.scales), whole)
+    torch.testing.assert_close(found(whole.means), pose(whole.means), rtol=0, atol=1e-4)
+    assert found.scale == pytest.approx(pose.scale, rel=1e-4) and torch.get_num_threads() == threads
+
+
+def test_the_real_splatreg_finds_a_whole_that_is_turned_and_scaled():
+    pytest.importorskip("splatreg")
+    whole, pose = thing(0.02), somewhere(1)
+    whole = whole[torch.randperm(len(whole), generator=torch.Generator().manual_seed(0))[: bench_register.SHOWN]]
+    found = splatreg(replace(whole, means=pose(whole.means), scales=pose.scale * whole.scales), whole)
+    torch.testing.assert_close(found(whole.means), pose(whole.means), rtol=0, atol=1e-3)
+
+
+def test_a_run_counts_and_writes(tmp_path, monkeypatch):
+    monkeypatch.setattr(bench_register, "make_object", lambda name: thing(0.02))
+    monkeypatch.setattr(bench_register, "METHODS", {"ICP": icp})
+    lines = list(run(tmp_path / "out.json", BenchOptions("duck", 1, device="cpu")))
+    assert lines[0].split() == ["right", "of", "1", "ICP"] and lines[1].split()[0] == "duck"
+    facts = json.loads((tmp_path / "out.json").read_text())
+    assert facts["machine"] == bench.machine("cpu") and [row["method"] for row in facts["trials"]] == ["ICP"]
+    assert "splatreg is not installed" in lines[-1] and "pip install --no-deps splatreg" in lines[-1]

@@ -1,0 +1,56 @@
+"""The benchmark measures what it says. No speed is tested."""
+
+import json
+
+import pytest
+import torch
+
+from stages.core.errors import InputError
+from stages.core.models.checkpoints import build, save
+from stages.lab.bench import rollout as bench_rollout
+from stages.lab.bench.rollout import PEER, BenchOptions, rolled, run, table, world
+
+
+def test_the_scene_is_one_of_contacts():
+    start = world(2, 60)
+    assert torch.equal(start.points[0], start.points[1])
+    torch.manual_seed(0)
+    model = build("ngff", hidden=8).eval()
+    end = rolled(model, start, 40)[:, -1]
+    fallen = start.points - end
+    assert end.isfinite().all()
+    assert fallen[:, 2, :, 2].mean() > 0.3  # the upper body has come down
+    assert end[..., 2].min() > float(start.floor[0, 0]) - 0.1
+
+
+def test_a_run_has_all_rows_and_keeps_those_of_the_other_device(tmp_path, monkeypatch):
+    torch.manual_seed(0)
+    save(tmp_path / "small.safetensors", "ngff", build("ngff", hidden=8))
+    small = build("ngff-paper", hidden=8, layers=1)
+    monkeypatch.setattr(bench_rollout.weights, "build", lambda name: small)
+    monkeypatch.setattr(bench_rollout.weights, "load", lambda path, device: (build("ngff", hidden=8), {"sha256": "x"}))
+    monkeypatch.setattr(bench_rollout.bench_mpm, "measure", lambda *a: {"particles": 30, "substep_us": 2.0})
+    out = tmp_path / "rollout.json"
+    out.write_text(json.dumps({"cuda": {"machine": "a large one"}}))
+    options = BenchOptions(tmp_path / "small.safetensors", keypoints=10, steps=3, scenes=(1, 2), repeat=1, device="cpu")
+    lines = list(run(out, options))
+    facts = json.loads(out.read_text())
+    assert facts["cuda"] == {"machine": "a large one"}
+    rows = facts["cpu"]["rows"]
+    assert [row["scenes"] for row in rows] == [1, 1, 1, 2, 2, 2] and len(lines) == 7
+    assert {row["what"] for row in rows} == {"ngff, step by step", PEER, "MPM, 30 particles"}
+    assert all(row["processor_seconds"] > 0 for row in rows if "MPM" not in row["what"])
+    assert rows[2]["seconds"] == pytest.approx(2e-6 * 200 * 3)  # 200 substeps for each of the steps
+
+
+def test_ratios_are_to_the_published_model_in_the_same_run():
+    rows = [{"what": "ours", "scenes": 1, "seconds": 0.5, "ready_seconds": 3.0, "strays_m": 1e-5},
+            {"what": PEER, "scenes": 1, "seconds": 4.0}]  # fmt: skip
+    ours, peer = table(rows)
+    assert "8.00x" in ours and "once before: 3.0 s" in ours and "1.00x" in peer
+
+
+def test_wrong_options():
+    for options in ({"steps": 0}, {"scenes": (0,)}, {"repeat": 0}):
+        with pytest.raises(InputError, match="at least 1"):
+            BenchOptions(**options)

@@ -1,0 +1,192 @@
+"""Objects that no model learns from."""
+
+import json
+
+import pytest
+import torch
+from typer.testing import CliRunner
+
+from ngff_cli.lab import app
+from stages.core.errors import InputError
+from stages.core.models.field.solidity import WALL
+from stages.lab.assets.heldout_shapes import KINDS, Kind, surface
+from stages.lab.assets.objects import OBJECTS
+from stages.lab.assets.random_shapes import kinds
+from stages.lab.assets.signed_distance import ellipsoid
+from stages.lab.dataset import heldout
+from stages.lab.dataset.heldout import HeldoutOptions, assets, configs_of, run, turned
+from stages.lab.dataset.motions import read_motions
+from stages.lab.dataset.particles import Asset, Fineness, volumes
+from stages.lab.dataset.scenes import HELDOUT, OTHERS, groups_of, read_configs
+
+FINENESS = Fineness(0.1, 0.06, 5e-4)
+COARSE = {"keypoints": 40, "dx": 0.1, "spacing": 0.06, "substep": 5e-4, "frames": 3, "device": "cpu"}
+
+
+def test_none_of_them_is_an_object_of_the_data_set():
+    assert not KINDS.keys() & OBJECTS.keys()
+    assert not {k.id for k in KINDS.values()} & {k.id for k in OBJECTS.values()}
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_points_lie_evenly_on_the_shape(name):
+    points = surface(KINDS[name], 2000)
+    sides = points.amax(0) - points.amin(0)
+    assert len(points) == 2000 and float(sides.max()) == pytest.approx(1.0)
+    assert (points.amax(0) + points.amin(0)).abs().max() < 1e-5
+    gap = torch.cdist(points, points).fill_diagonal_(9).min(1).values
+    # a tenth of the points at random would lie closer than a fifth of the median to another: here fewer do
+    assert float((gap < 0.2 * gap.median()).float().mean()) < 0.01 and float(gap.max()) < 4 * float(gap.median())
+
+
+def test_a_ball_is_round_and_a_knot_is_one_piece():
+    ball = surface(KINDS["soccer"], 1000)
+    assert (ball.norm(dim=1) - 0.5).abs().max() < 2e-3
+    knot = surface(KINDS["rope2"], 600)
+    near = torch.cdist(knot, knot) < 0.11
+    reached = torch.zeros(600, dtype=torch.bool)
+    reached[0] = True
+    for _ in range(100):
+        reached = (near & reached).any(1)
+    assert reached.all()
+
+
+@pytest.fixture(scope="module")
+def kept(tmp_path_factory):
+    """Particles of all shapes, chosen among few points."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(heldout, "DENSE", 2000)
+        path = tmp_path_factory.mktemp("held") / "p.npz"
+        assets(KINDS, FINENESS, 40, path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def things(kept):
+    return assets(KINDS, FINENESS, 40, kept)
+
+
+def test_scenes_of_the_group_are_sampled_as_those_of_the_data_set(things):
+    configs = configs_of(things, 3, 3)
+    assert configs == configs_of(things, 3, 3) and [n.split("_")[0] for n in configs] == ["10000", "10001", "10002"]
+    for c in configs.values():
+        assert len(c.ids) == 3 and c.translation[0] == (0.0, 0.0, 0.0) and set(c.ids) <= {k.id for k in KINDS.values()}
+
+
+def test_the_group_is_written_and_kept(things, tmp_path, monkeypatch):
+    monkeypatch.setattr(heldout, "assets", lambda *_: things)
+    options = HeldoutOptions(scenes=2, **COARSE)
+    assert "2 scenes of 8 objects" in run(tmp_path, options)
+    made = read_motions(tmp_path / "motions" / f"{HELDOUT}.h5")
+    assert made.points.shape == (2, 3, 3, 40, 3) and list(made.names) == list(
+        read_configs(tmp_path / "scene_configs" / f"{HELDOUT}.json")
+    )
+    kinds = {k.id: k for k in KINDS.values()}
+    for row, ids in enumerate(made.objects.tolist()):
+        assert [float(E) for E in made.E[row]] == [kinds[i].E for i in ids]
+    # everything but what rests on something falls: 5 m/s^2 for two frames
+    dropped = (made.points[:, 0, :, :, 2] - made.points[:, 2, :, :, 2]).amax()
+    assert float(dropped) == pytest.approx(5 / 2 * 0.04**2, rel=0.15, abs=2e-4)
+    assert "is there" in run(tmp_path, options)
+
+
+def test_particles_are_kept_and_read_again(things, kept, tmp_path, monkeypatch):
+    monkeypatch.setattr(heldout, "_particles", None)  # must not be needed again
+    again = assets(KINDS, FINENESS, 40, kept)
+    assert all(torch.equal(things[i].points, again[i].points) for i in things) and len(again) == 8
+    (tmp_path / "p.npz").write_text("no")
+    with pytest.raises(InputError, match="p.npz"):
+        assets(KINDS, FINENESS, 40, tmp_path / "p.npz")
+
+
+def test_meshes_take_the_place_of_the_shapes(tmp_path, caplog):
+    trimesh = pytest.importorskip("trimesh")
+    (tmp_path / "pillow").mkdir()
+    trimesh.creation.box((2.0, 1.0, 0.5)).export(tmp_path / "pillow" / "mesh.obj")
+    trimesh.creation.icosphere(2, 3.0).export(tmp_path / "steel_thing.stl")
+    args = ["heldout", str(tmp_path), "--scenes", "1", "--objects", "2", "--size", "0.3", "--device", "cpu"]
+    for key in ("keypoints", "dx", "spacing", "substep", "frames"):
+        args += [f"--{key}", str(COARSE[key])]
+    for mesh in ("pillow/mesh.obj", "steel_thing.stl"):
+        args += ["--from", str(tmp_path / mesh)]
+    done = CliRunner().invoke(app, args)
+    assert done.exit_code == 0 and "1 scenes of 2 objects" in done.stdout, done.stderr
+    made = read_motions(tmp_path / "motions" / f"{HELDOUT}.h5")
+    sides = made.points[0, 0].amax(1) - made.points[0, 0].amin(1)
+    for id, row in zip(made.objects[0].tolist(), sides.tolist(), strict=True):
+        expected = [0.3, 0.15, 0.075] if id == 100 else [0.3] * 3
+        assert row == pytest.approx(expected, abs=0.03)
+    told = dict(zip(made.objects[0].tolist(), made.E[0].tolist(), strict=True))
+    stiffness = {100: 1e4, 101: 2e7}  # a pillow; steel, as far as the solver goes
+    assert told.items() <= stiffness.items()
+    config = json.loads((tmp_path / "scene_configs" / f"{HELDOUT}.json").read_text())
+    assert len(config) == 1
+
+
+def test_varied_objects_are_within_what_the_ten_span_and_the_same_again():
+    table = kinds(18)
+    assert [k.E for k in kinds(5).values()] == [k.E for k in table.values()][:5]
+    assert [k.E for k in kinds(5, seed=1).values()] != [k.E for k in kinds(5).values()]
+    for name, kind in table.items():
+        points = surface(kind, 800)
+        sides = points.amax(0) - points.amin(0)
+        assert float(sides.max()) == pytest.approx(1.0) and float(sides.min()) > 0.02, name
+        assert kind.shape()(torch.tensor([[0.6, 0.6, 0.6]])) > 0  # inside of the cube where surfaces are looked for
+        assert 0.3 <= kind.scale <= 1 and 100 <= kind.density <= 2700 and 10 <= kind.E / kind.density <= 7400
+    assert len({k.id for k in table.values()} | {k.id for k in KINDS.values()}) == 18 + 8
+
+
+def test_varied_objects_become_a_group_that_training_takes(tmp_path, monkeypatch):
+    monkeypatch.setattr(heldout, "DENSE", 2000)
+    assert "2 scenes of 3 objects" in run(tmp_path, HeldoutOptions(scenes=2, shapes=3, **COARSE))
+    made = read_motions(tmp_path / "motions" / "varied.h5")
+    assert made.points.shape == (2, 3, 3, 40, 3) and bool((made.objects >= 1000).all())
+    assert groups_of("varied,3_0", more=("varied",)) == ["varied", "3_0"]
+    with pytest.raises(InputError, match="there are"):
+        groups_of("varied")
+
+
+def test_solid_objects_are_filled_and_as_heavy_as_that(tmp_path, monkeypatch):
+    """Their keypoints stay those of the surface."""
+    monkeypatch.setattr(heldout, "DENSE", 2000)
+    kind = Kind(7, 0.6, 1e4, 500.0, lambda: ellipsoid((0, 0, 0), (0.4, 0.4, 0.4)))
+    ball = assets({"ball": kind}, Fineness(0.04, 0.03, 5e-4), 40, solid=True)[7]
+    assert (ball.points[:40].norm(dim=1) - 0.3).abs().max() < 3e-3
+    assert ball.points.norm(dim=1).max() < 0.304
+    kept = tmp_path / "kept.npz"
+    fine, coarse = (assets({"ball": kind}, Fineness(dx, 0.03, 5e-4), 40, kept, solid=True)[7] for dx in (0.04, 0.06))
+    assert torch.equal(fine.points, ball.points) and len(coarse.points) < len(fine.points)  # not read for another dx
+    volume = float(4 / 3 * torch.pi * 0.3**3)
+    around = float(4 * torch.pi * 0.3**2) * 0.04
+    assert volume < ball.mass / 500 < volume + around  # cells at the surface count whole
+    assert ball.solidity == pytest.approx((ball.mass / 500 / (24 * 0.3**2) / WALL) ** 3, rel=0.05)
+    assert "1 scenes of 9 objects" in run(tmp_path, HeldoutOptions(scenes=1, shapes=9, solid=True, **COARSE))
+    made = read_motions(tmp_path / "motions" / "solid.h5")
+    assert made.world().solidity.amax() > 1 and torch.equal(made.world().solidity, made.solidity)
+    assert groups_of("solid,turned", more=OTHERS) == ["solid", "turned"]
+
+
+def test_the_ten_turned_keep_their_shape_mass_and_material(tmp_path, monkeypatch):
+    box = 0.1 * (torch.rand(60, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([6.0, 2, 1]))
+    ten = {i: Asset(i, 0.6, box, volumes(box, 0.1), 1e5 * i, 300.0) for i in (1, 2)}
+    made = turned(ten, 5, FINENESS)
+    assert list(made) == [2000, 2001, 2002, 2003, 2004] and [a.E for a in made.values()][:3] == [1e5, 2e5, 1e5]
+    for a in made.values():
+        assert (a.points.amax(0) + a.points.amin(0)).abs().max() < 1e-5
+        torch.testing.assert_close(torch.cdist(a.points, a.points), torch.cdist(box, box), atol=1e-3, rtol=0)
+    one, other = made[2000].points, made[2002].points
+    assert (one - one.mean(0) - (other - other.mean(0))).norm(dim=1).mean() > 0.05
+    monkeypatch.setattr(heldout.dataset_assets, "assets", lambda *_: ten)
+    assert "2 scenes of 4 objects" in run(tmp_path, HeldoutOptions(scenes=2, turned=4, **COARSE))
+    assert bool((read_motions(tmp_path / "motions" / "turned.h5").objects >= 2000).all())
+
+
+@pytest.mark.parametrize(
+    ("choices", "says"),
+    [({"scenes": 0}, "at least one scene"), ({"objects": 9}, "1 to 6 objects"), ({"size": 3.0}, "--size 3.0"),
+     ({"solid": True}, "--solid needs --shapes"), ({"shapes": 2, "turned": 2}, "goes without"),
+     ({"turned": -1}, "--turned -1")],
+)  # fmt: skip
+def test_options_that_cannot_be(choices, says):
+    with pytest.raises(InputError, match=says):
+        HeldoutOptions(**choices)

@@ -1,0 +1,50 @@
+"""The data set on a cluster of two workers on this machine: the same files as without."""
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from stages.core.errors import InputError
+from stages.lab.dataset import make as dataset
+from stages.lab.dataset import on_ray
+from tests.lab.small_world import OPTIONS, shrink
+
+MOTIONS = replace(OPTIONS, groups="3_9,4", only="motions,scenes", limit=2)
+
+
+def test_without_ray_it_says_what_to_install(monkeypatch, tmp_path):
+    monkeypatch.setitem(__import__("sys").modules, "ray", None)
+    with pytest.raises(InputError, match=r"pip install 'ngff\[ray\]'"):
+        on_ray.run(tmp_path, MOTIONS, "local")
+
+
+@pytest.mark.slow
+def test_two_workers_make_what_one_process_makes(tmp_path, monkeypatch):
+    ray = pytest.importorskip("ray")
+    from ray.cluster_utils import Cluster
+
+    shrink(monkeypatch.setattr, monkeypatch.setitem)
+    root = str(Path(__file__).resolve().parents[3])
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0})
+    try:
+        for _ in range(2):
+            cluster.add_node(num_cpus=1)
+        paths = os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
+        ray.init(address=cluster.address, runtime_env={
+            "env_vars": {"PYTHONPATH": paths},
+            "worker_process_setup_hook": "tests.lab.small_world.shrink_for_good",
+        })  # fmt: skip
+        on_ray.run(tmp_path / "ray", MOTIONS, "auto")
+        assert len({n["NodeID"] for n in ray.nodes() if n["Alive"] and n["Resources"].get("CPU")}) == 2
+    finally:
+        ray.shutdown()
+        cluster.shutdown()
+    dataset.run(tmp_path / "alone", MOTIONS)
+    dataset.check(tmp_path / "ray")
+    made = {p.relative_to(tmp_path / "ray") for p in (tmp_path / "ray").rglob("*") if p.is_file()}
+    assert made == {p.relative_to(tmp_path / "alone") for p in (tmp_path / "alone").rglob("*") if p.is_file()}
+    for name in made:
+        if name.name not in ("3_9.h5", "4.h5") and name.parent.name != "sums":  # they say with which options
+            assert (tmp_path / "ray" / name).read_bytes() == (tmp_path / "alone" / name).read_bytes(), name

@@ -1,0 +1,65 @@
+"""Weights between those of several trainings."""
+
+import pytest
+import torch
+from typer.testing import CliRunner
+
+from ngff_cli.lab import app
+from stages.core.errors import InputError
+from stages.core.models.checkpoints import build, load, minutes, save
+from stages.lab.training.average import run
+
+
+def trained(path, seed, of="ngff", card=None):
+    torch.manual_seed(seed)
+    model = build(of, hidden=8)
+    save(path, of, model, {"minutes": 2.0, "processes": 3, "curve": [{"minutes": 2.0}], **(card or {})})
+    return path
+
+
+def test_the_mean_is_that_of_the_numbers_and_the_card_says_of_what(tmp_path):
+    old = trained(tmp_path / "old.safetensors", 0)
+    before = {"before": load(old)[1]}
+    a, b = (trained(tmp_path / f"{n}.safetensors", i, card=before) for n, i in (("a", 1), ("b", 2)))
+    args = ["average", str(a), str(b), str(old), "--shares", "0.5,0.2,0.3", "-o", str(tmp_path / "mean.safetensors")]
+    done = CliRunner().invoke(app, args)
+    assert done.exit_code == 0 and "0.5 of" in done.stdout, done.stderr
+    mean, card = load(tmp_path / "mean.safetensors")
+    states = [load(file)[0].state_dict() for file in (a, b, old)]
+    for name, value in mean.state_dict().items():
+        x, y, z = (s[name] for s in states)
+        torch.testing.assert_close(value, 0.5 * x + 0.2 * y + 0.3 * z)
+    assert [row["share"] for row in card["averaged"]] == [0.5, 0.2, 0.3]
+    assert [row["sha256"] for row in card["averaged"]] == [load(file)[1]["sha256"] for file in (a, b, old)]
+    assert card["sha256"] not in {row["sha256"] for row in card["averaged"]}
+    assert minutes(card) == 3 * 2.0 * 3  # what both began with is counted once
+
+
+def test_an_average_of_averages_remembers_all_of_them(tmp_path):
+    a, b, c = (trained(tmp_path / f"{n}.safetensors", i) for i, n in enumerate("abc"))
+    run([a, b], "0.5,0.5", tmp_path / "ab.safetensors")
+    run([tmp_path / "ab.safetensors", c], "0.8,0.2", tmp_path / "abc.safetensors")
+    assert minutes(load(tmp_path / "abc.safetensors")[1]) == 3 * 2.0 * 3
+    run([a, a], "0.8,0.2", tmp_path / "aa.safetensors")
+    assert minutes(load(tmp_path / "aa.safetensors")[1]) == 3 * 2.0
+
+
+def test_half_as_large_to_ship(tmp_path):
+    a, b = trained(tmp_path / "a.safetensors", 1), trained(tmp_path / "b.safetensors", 2)
+    for half in (False, True):
+        run([a, b], "0.5,0.5", tmp_path / f"{half}.safetensors", half)
+    whole, small = ((tmp_path / f"{half}.safetensors").stat().st_size for half in (False, True))
+    assert small < 0.8 * whole
+
+
+@pytest.mark.parametrize("shares", ["0.5", "0.5,0.6", "1.5,-0.5", "half,half", "nan,nan", "0.4,0.3,0.3"])
+def test_shares_that_make_no_mean(shares, tmp_path):
+    a, b = trained(tmp_path / "a.safetensors", 1), trained(tmp_path / "b.safetensors", 2)
+    with pytest.raises(InputError, match="--shares"):
+        run([a, b], shares, tmp_path / "mean.safetensors")
+
+
+def test_weights_of_unlike_models_have_no_mean(tmp_path):
+    a, b = trained(tmp_path / "a.safetensors", 1), trained(tmp_path / "b.safetensors", 2, of="gcn")
+    with pytest.raises(InputError, match=r"b\.safetensors: holds gcn"):
+        run([a, b], "0.5,0.5", tmp_path / "mean.safetensors")

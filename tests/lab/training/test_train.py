@@ -1,0 +1,514 @@
+"""Training: pieces, loss, gradients, steps, checkpoints, and the command."""
+
+import math
+import os
+import signal
+import socket
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from torch.testing import assert_close
+from typer.testing import CliRunner
+
+from ngff_cli.lab import app
+from stages.core.errors import InputError
+from stages.core.models.checkpoints import MODELS, build, load
+from stages.core.models.external_forces import Pushes
+from stages.core.models.initial_conditions import BOX, GRAVITY
+from stages.lab.dataset.motions import Motions, write_motions
+from stages.lab.training.data import CALM, Pieces, asleep, calm, read_groups, split, spread
+from stages.lab.training.rollout_loss import Roll, loss_of, speed_loss
+from stages.lab.training.state import LIMIT, OPTIMIZERS, WARM, Trainee, _optimizer
+from stages.lab.training.train import TrainOptions, run, validate
+from stages.lab.training.widen import widened
+
+DT = 0.02
+FLOOR = BOX[0][2]
+
+
+def falling(scenes: int = 6, frames: int = 12, objects: int = 2, n: int = 8, seed: int = 0) -> Motions:
+    """Balls of points that fall from different heights and stay where their lowest point meets the floor."""
+    rng = torch.Generator().manual_seed(seed)
+    shape = 0.1 * torch.nn.functional.normalize(torch.randn(scenes, objects, n, 3, generator=rng), dim=-1)
+    centre = torch.rand(scenes, objects, 3, generator=rng) - 0.5
+    centre[..., 2] = FLOOR + 0.1 + 0.1 * torch.rand(scenes, objects, generator=rng)
+    start = centre[:, :, None] + shape
+    fallen = -GRAVITY[2] * (DT * torch.arange(frames)).square() / 2
+    room = start[..., 2].amin(-1) - FLOOR
+    points = start[:, None].repeat(1, frames, 1, 1, 1)
+    points[..., 2] -= torch.minimum(fallen[None, :, None], room[:, None])[..., None]
+    one = torch.ones(scenes, objects)
+    ids = torch.arange(objects).expand(scenes, objects).clone()
+    return Motions(tuple(map(str, range(scenes))), ids, points, 0.1 * one, 1e5 * one, 0.3 * one, 0.5 * one, DT,
+                   GRAVITY, BOX, one)  # fmt: skip
+
+
+def without_last(motions: Motions) -> Motions:
+    """The last object of scene 0 is padding."""
+    ids, points = motions.objects.clone(), motions.points.clone()
+    ids[0, -1], points[0, :, -1] = -1, 0
+    return replace(motions, objects=ids, points=points)
+
+
+@pytest.fixture
+def data(tmp_path: Path) -> Path:
+    """A folder with two groups."""
+    (tmp_path / "data" / "motions").mkdir(parents=True)
+    for seed, name in enumerate(("3_0", "3_1")):
+        made = {"command": f"made {name}"}
+        write_motions(tmp_path / "data" / "motions" / f"{name}.h5", falling(frames=6, seed=seed), made)
+    return tmp_path / "data"
+
+
+QUICK = TrainOptions(
+    steps=12, batch=2, keypoints=8, horizons="2,3", hidden=8, groups="3_0..3_1", device="cpu", checks=4
+)
+
+
+def test_pieces_start_with_the_speed_of_free_fall():
+    motions = falling(frames=6)
+    piece = Pieces(motions, "cpu", build("ngff", hidden=8)).take(torch.tensor([1, 4]), torch.tensor([0, 2]), 3)
+    assert_close(piece.points, torch.stack([motions.points[1, 0], motions.points[4, 2]]))
+    assert_close(piece.truth, torch.stack([motions.points[1, 1:4], motions.points[4, 3:6]]))
+    assert_close(piece.speed[0], torch.zeros(2, 8, 3))
+    # central differences are exact for a parabola: only rounding of positions near 1, over 2 dt, is left
+    assert_close(piece.speed[1], torch.tensor([0.0, 0.0, GRAVITY[2] * 2 * DT]).expand(2, 8, 3), rtol=0, atol=1e-5)
+
+
+def test_pieces_never_reach_past_the_last_frame():
+    pieces, rng = Pieces(falling(frames=5), "cpu", build("gcn", hidden=8)), torch.Generator().manual_seed(0)
+    starts = {float(pieces.draw(1, 3, rng).speed[0, 0, 0, 2]) for _ in range(40)}
+    assert len(starts) == 2  # frames 0 and 1 are all that leave 3 more
+
+
+def test_scenes_at_rest_go_on_as_they_are():
+    """One falls to its last frame, the other has stood still for all of the last ones."""
+    motions = falling(frames=12)[:2]
+    motions.points[1, 5:] = motions.points[1, 5:6]
+    assert asleep(motions).tolist() == [False, True]
+    pieces, rng = Pieces(motions, "cpu", build("gcn", hidden=8)), torch.Generator().manual_seed(0)
+    heights = pieces.draw(300, 9, rng).points[:, 0, 0, 2]
+    assert len(heights.unique()) == 3 + 6  # one starts in frames 0 to 2, the other also in those in which it rests
+    assert float((heights == motions.points[1, 11, 0, 0, 2]).float().mean()) > 0.2
+    late = pieces.take(torch.tensor([1]), torch.tensor([11]), 9)
+    assert_close(late.truth, motions.points[1:, 11:].expand(1, 9, 2, 8, 3))
+    assert not late.speed.any()
+
+
+def test_pieces_do_not_begin_amid_an_impact():
+    """A ball that is hit between two frames: in those two, central differences are far from any speed it had."""
+    motions = falling(frames=12)[:1]
+    hit = torch.arange(12)[:, None, None, None] * torch.tensor([0.0, 0.0, 0.02])
+    motions.points[:] = motions.points[:, :1] + torch.where(torch.arange(12)[:, None, None, None] < 5, 0.0, hit - 0.09)
+    assert calm(motions)[0].tolist() == [t not in (4, 5) for t in range(12)]
+    pieces, rng = Pieces(motions, "cpu", build("gcn", hidden=8)), torch.Generator().manual_seed(0)
+    speeds = pieces.draw(200, 3, rng).speed[:, 0, 0, 2]
+    for speed in speeds.unique():
+        assert min(abs(float(speed)), abs(float(speed) - 1.0)) < 1e-5
+    assert (speeds > 0.5).any() and (speeds < 0.5).any()
+
+
+def test_the_spread_of_an_object_is_that_of_its_points_over_time():
+    motions = falling(frames=9)[:2]
+    x = motions.points[1, :, 1]
+    assert_close(spread(motions)[1, 1], (x - x.mean(0)).square().mean((0, 1)).sqrt())
+
+
+def test_a_centimetre_in_one_coordinate_is_a_third_of_a_square_centimetre():
+    truth = torch.zeros(1, 2, 2, 4, 3)
+    valid = torch.tensor([[[True] * 4, [False] * 4]])
+    predicted = truth.clone()
+    predicted[:, :, 0, :, 2] = 0.01
+    predicted[:, :, 1] = 7.0  # padding does not count
+    spread = torch.tensor([[[0.0, 0.0, 0.04], [0.0, 0.0, 0.0]]])
+    assert_close(loss_of(predicted, truth, valid, "square", spread), torch.tensor(1 / 3))
+    assert_close(loss_of(predicted, truth, valid, "scene", spread), torch.tensor((1 / 3 + 0.01) ** 0.5))
+    assert_close(loss_of(predicted, truth, valid, "axes", spread), torch.tensor((0.1 + 0.1 + 1.01**0.5) / 3))
+    relative = loss_of(predicted, truth, valid, "relative", spread)  # to 1 cm more than the spread, 5 cm being usual
+    assert_close(relative, torch.tensor((0.1 * 5 + 0.1 * 5 + 1.01**0.5) / 3))
+
+
+def test_steps_that_undo_each_other_are_seen_in_speeds_alone():
+    """Speeds of 1 m/s that change their sign each frame move nothing. A frame amid an impact does not count."""
+    points = torch.zeros(1, 7, 1, 4, 3)
+    valid, spread = torch.ones(1, 1, 4, dtype=torch.bool), torch.zeros(1, 1, 3)
+    ringing = torch.zeros(1, 6, 1, 4, 3)
+    ringing[..., 0] = (-1.0) ** torch.arange(6)[None, :, None, None]
+    assert speed_loss(0 * ringing, points, valid, "square", spread, DT, 0.1) == 0
+    assert_close(speed_loss(ringing, points, valid, "square", spread, DT, 0.1), torch.tensor(10.0**2 / 3))
+    points[:, 4:, ..., 2] = 2 * CALM * DT * torch.arange(3)[None, :, None, None] + CALM * DT * 2  # hit after frame 3
+    free = torch.zeros(1, 6, 1, 4, 3)
+    free[:, 3:, ..., 2] = 2 * CALM
+    assert_close(speed_loss(free, points, valid, "square", spread, DT, 0.1), torch.tensor(0.0), rtol=0, atol=1e-5)
+
+
+def test_what_is_widened_does_the_same_and_learns_with_all_it_gained():
+    torch.manual_seed(0)
+    narrow = build("ngff", hidden=8).eval()
+    wide = widened(narrow, 16)
+    pieces = Pieces(without_last(falling()), "cpu", narrow)
+    piece = pieces.take(torch.tensor([0, 3]), torch.tensor([0, 5]), 4)
+    (was, _), (loss, grads) = Roll(narrow, DT)(piece), Roll(wide, DT)(piece)
+    assert_close(loss, was)
+    new = dict(zip((name for name, _ in wide.named_parameters()), grads, strict=True))["planes.say.2.weight"]
+    assert new.shape[1] == 16 and (new[:, 8:].abs().sum(0) > 0).all()
+    with pytest.raises(InputError, match="can only be widened"):
+        widened(wide, 8)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_gradients_are_those_of_the_rollout(name):
+    """The prepared scene is cut off and its gradient carried on by hand; the model's own rollout knows no cut."""
+    torch.manual_seed(0)
+    model = build(name, hidden=8).eval()  # no dropout
+    pieces = Pieces(without_last(falling()), "cpu", model)
+    piece = pieces.take(torch.tensor([0, 3]), torch.tensor([0, 5]), 3)
+    loss, grads = Roll(model, DT)(piece)
+    predicted = model.rollout(piece.world, 4, DT, start=(piece.points, piece.speed))[:, 1:]
+    whole = loss_of(predicted, piece.truth, piece.world.valid, "square", piece.spread)
+    whole.backward()
+    assert_close(loss, whole.detach())
+    assert sum(float(g.abs().sum()) for g in grads) > 0
+    for p, g in zip(model.parameters(), grads, strict=True):
+        assert_close(g, torch.zeros_like(p) if p.grad is None else p.grad, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize(("broken", "why"), [(True, "fails"), (False, "not finite")])
+def test_what_cannot_be_compiled_is_done_without(monkeypatch, caplog, broken, why):
+    """Neither a compiler that fails nor one whose gradients are wrong stops training, or makes it a waste of time."""
+
+    def compile(function, **_):
+        def wrong(*given):
+            if broken:
+                raise IndexError("tuple index out of range")
+            *state, points = function(*given)
+            return (*state, points * torch.nan)
+
+        return wrong
+
+    torch.manual_seed(0)
+    model = build("gcn", hidden=8).eval()
+    piece = Pieces(without_last(falling()), "cpu", model).take(torch.tensor([0]), torch.tensor([0]), 2)
+    with monkeypatch.context() as patch:
+        patch.setattr(torch, "compile", compile)
+        loss, grads = Roll(model, DT, compiled=True)(piece)
+    assert why in caplog.text
+    plain, true = Roll(model, DT)(piece)
+    assert_close(loss, plain)
+    for a, b in zip(grads, true, strict=True):
+        assert_close(a, b)
+
+
+def test_gradients_fade_on_their_way_back():
+    """Of the third frame's error, what comes back through two frames counts 0.9^2 as much."""
+    torch.manual_seed(0)
+    model = build("gcn", hidden=8).eval()
+    piece = Pieces(without_last(falling()), "cpu", model).take(torch.tensor([0]), torch.tensor([0]), 3)
+
+    def gradient(memory):
+        return torch.cat([g.flatten() for g in Roll(model, DT, memory=memory)(piece)[1]])
+
+    none, full = gradient(0.0), gradient(1.0)
+    far = [(gradient(m) - none).norm() for m in (0.25, 0.5)]
+    assert none.norm() > 0 and (full - none).norm() > 0
+    assert 2 <= far[1] / far[0] <= 4  # of one frame back half as much, of two a quarter
+
+
+def test_no_pushes_are_no_pushes():
+    world = without_last(falling()).world()
+    none, idle = Pushes.nobody(world.valid, world.points), Pushes.none(world)
+    # a push of no strength goes all the way that a real one goes
+    weak = replace(idle, object=idle.object.new_zeros(6, 1), point=idle.point.new_zeros(6, 1) - 1,
+                   force=torch.zeros(6, 1, 3), torque=torch.zeros(6, 1, 3), start=torch.zeros(6, 1),
+                   end=torch.ones(6, 1))  # fmt: skip
+    com = torch.zeros(6, 2, 3)
+    for pushes in (none, idle):
+        assert_close(pushes.acceleration(world, world.points, 0.0), weak.acceleration(world, world.points, 0.0))
+        assert_close(pushes.wrench(world.points, com, 0.0, DT), weak.wrench(world.points, com, 0.0, DT))
+
+
+@pytest.mark.parametrize("optimizer", OPTIMIZERS)
+def test_a_step_without_finite_gradients_changes_nothing(optimizer):
+    trainee = Trainee(build("gcn", hidden=8), 1e-2, 0, optimizer)
+    good = [torch.ones_like(p) for p in trainee.params]
+    for _ in range(2):
+        trainee.update(good, 1e-2)
+    before = [p.detach().clone() for p in trainee.params]
+    usual = trainee.usual.clone()
+    trainee.update([torch.full_like(good[0], math.nan), *good[1:]], 1e-2)
+    assert all(torch.equal(a, b) for a, b in zip(before, trainee.params, strict=True))
+    assert torch.equal(usual, trainee.usual)
+    trainee.note({"RMSE": 1.0})
+    assert trainee.curve[-1]["skipped"] == 1
+    trainee.update(good, 1e-2)
+    assert not any(torch.equal(a, b) for a, b in zip(before, trainee.params, strict=True))
+
+
+def test_soap_without_its_package_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pytorch_optimizer", None)
+    with pytest.raises(InputError, match=r"ngff\[train\]"):
+        Trainee(build("gcn", hidden=8), 1e-2, 0, "soap")
+
+
+def test_soap_goes_down_a_narrow_valley_that_is_aslant():
+    """A million times narrower than long: it finds the axes, along which Adam on each weight alone would be stuck."""
+    rng = torch.Generator().manual_seed(0)
+    turn = torch.linalg.qr(torch.randn(8, 8, generator=rng))[0]
+    H = (turn * 10.0 ** torch.linspace(-3, 3, 8)) @ turn.T
+    wanted = torch.randn(8, 8, generator=rng)
+    left = {}
+    for kind in OPTIMIZERS:
+        weight = torch.nn.Parameter(torch.zeros(8, 8))
+        steps = _optimizer(kind, [weight], 0.03)
+        for step in range(1500):
+            weight.grad = (weight.detach() - wanted) @ H
+            steps.param_groups[0]["lr"] = 0.03 * (1 - step / 1500)
+            steps.step()
+        left[kind] = float((weight.detach() - wanted).norm() / wanted.norm())
+    assert left["soap"] < 0.05 < 0.2 < left["adamw"]
+
+
+def test_an_outlier_is_cut_to_twice_the_usual_norm():
+    trainee = Trainee(build("gcn", hidden=8), 1e-3, 0)
+    good = [torch.ones_like(p) for p in trainee.params]
+    trainee.update(good, 1e-3)
+    usual = float(trainee.usual)
+    trainee.update([1e4 * g for g in good], 1e-3)
+    assert float(torch.stack([p.grad.square().sum() for p in trainee.params]).sum().sqrt()) == pytest.approx(
+        LIMIT * usual, rel=1e-4
+    )
+    assert float(trainee.usual) == pytest.approx(usual * (0.99 + 0.01 * LIMIT), rel=1e-4)
+
+
+def test_training_gone_astray_goes_on_from_the_best_at_half_the_rate():
+    trainee = Trainee(build("gcn", hidden=8), 1e-2, 0)
+    good = [torch.ones_like(p) for p in trainee.params]
+    trainee.update(good, 1e-2)
+    trainee.note({"RMSE": 0.1})
+    best = {k: v.clone() for k, v in trainee.best.items()}
+    trainee.update(good, 1e-2)
+    trainee.note({"RMSE": 0.12})  # a little worse: so it goes
+    assert trainee.caution == 1.0
+    assert not all(torch.equal(v, best[k]) for k, v in trainee.model.state_dict().items())
+    trainee.update(good, 1e-2)
+    trainee.note({"RMSE": math.inf})
+    assert trainee.caution == 0.5
+    for network in (trainee.model, trainee.ema):
+        assert all(torch.equal(v, best[k]) for k, v in network.state_dict().items())
+    trainee.update(good, 1e-2)
+    assert trainee.optimizer.param_groups[0]["lr"] == pytest.approx(0.5e-2 / WARM)
+    moved = max(float((p.detach() - best[n]).abs().max()) for n, p in trainee.model.named_parameters())
+    assert moved == pytest.approx(0.5e-2 / WARM, rel=0.01)  # as a first step: nothing of the old moments is left
+
+
+@pytest.mark.parametrize(("after", "caution"), [((1.01, 1.02, 1.03, 1.04), 0.5), ((1.01, 1.02, 1.03, 1.02, 1.03), 1.0)])
+def test_training_that_gets_worse_check_by_check_has_gone_astray(after, caution):
+    trainee = Trainee(build("gcn"), 1e-3, 0)
+    for rmse in (1.2, 1.0, *after):
+        trainee.note({"RMSE": rmse})
+    assert trainee.caution == caution
+
+
+def test_longer_rollouts_begin_anew():
+    trainee = Trainee(build("gcn", hidden=8), 1e-2, 0)
+    trainee.anew(8)
+    for _ in range(WARM):
+        trainee.update([torch.ones_like(p) for p in trainee.params], 1e-2)
+    assert trainee.optimizer.param_groups[0]["lr"] == 1e-2
+    before = [p.detach().clone() for p in trainee.params]
+    trainee.anew(20)
+    trainee.update([100 * torch.ones_like(p) for p in trainee.params], 1e-2)
+    step = max(float((p.detach() - q).abs().max()) for p, q in zip(trainee.params, before, strict=True))
+    assert step == pytest.approx(1e-2 / WARM, rel=0.01)  # however much larger gradients have become
+
+
+def test_training_teaches_to_fall(tmp_path):
+    """A graph network knows nothing of gravity at first."""
+    write_motions(tmp_path / "3_0.h5", falling(scenes=30, n=6, frames=6), {})
+    options = replace(QUICK, steps=80, batch=8, keypoints=6, horizons="1", lr=2e-2, hidden=16, groups="3_0")
+    torch.manual_seed(options.seed)
+    unseen = split(read_groups(tmp_path, ["3_0"], 6), 100)[1]
+    before = validate(build("gcn", hidden=16), unseen)["RMSE"]
+    run("gcn", tmp_path, tmp_path / "gcn.safetensors", options)
+    card = load(tmp_path / "gcn.safetensors")[1]
+    assert card["validation"]["RMSE"] < 0.2 * before
+    assert card["curve"][-1]["loss"] < 0.1 * card["curve"][0]["loss"]
+
+
+def test_the_card_says_what_made_the_weights(data, tmp_path):
+    lines = run("gcn", data, tmp_path / "a.safetensors", QUICK)
+    model, card = load(tmp_path / "a.safetensors")
+    assert str(tmp_path / "a.safetensors") in lines[0]
+    assert [f["made"]["command"] for f in card["data"]] == ["made 3_0", "made 3_1"]
+    assert (card["scenes"], card["scenes to choose by"], card["steps"], card["finished"]) == (8, 4, 12, True)
+    assert card["options"]["seed"] == 0 and card["config"]["hidden"] == 8
+    assert [row["horizon"] for row in card["curve"]] == [2, 2, 3, 3]
+    unseen = split(read_groups(data, ["3_0", "3_1"], 8), 100)[1]
+    assert card["validation"]["RMSE"] == min(row["RMSE"] for row in card["curve"])
+    assert validate(model, unseen)["RMSE"] == pytest.approx(card["validation"]["RMSE"], rel=1e-6)
+
+
+@pytest.mark.parametrize(("after", "optimizer"), [(1, "adamw"), (5, "adamw"), (5, "soap")])
+def test_a_run_that_was_stopped_goes_on_to_the_same_curve(data, tmp_path, monkeypatch, after, optimizer):
+    options = replace(QUICK, optimizer=optimizer)
+    run("pointformer", data, tmp_path / "whole.safetensors", options)  # with dropout
+    with monkeypatch.context() as patch:
+        update = Trainee.update
+
+        def stopped(self, grads, lr):
+            update(self, grads, lr)
+            if self.step == after:
+                os.kill(os.getpid(), signal.SIGTERM)
+
+        patch.setattr(Trainee, "update", stopped)
+        lines = run("pointformer", data, tmp_path / "parts.safetensors", options)
+    assert "--resume" in lines[0] and not load(tmp_path / "parts.safetensors")[1]["finished"]
+    run("pointformer", data, tmp_path / "parts.safetensors", options, resume=True)
+    (a, whole), (b, parts) = (load(tmp_path / f"{name}.safetensors") for name in ("whole", "parts"))
+    assert parts["finished"] and parts["steps"] == 12
+    extra = [row for row in parts["curve"] if row["step"] not in {row["step"] for row in whole["curve"]}]
+    assert len(extra) == (after == 1)  # stopped before the first line: one is needed to save weights at all
+
+    def curve(card):
+        return [{k: v for k, v in row.items() if k not in ("minutes", "loss")} for row in card["curve"]
+                if row not in extra]  # fmt: skip
+
+    assert curve(whole) == curve(parts)
+    for p, q in zip(a.parameters(), b.parameters(), strict=True):
+        assert torch.equal(p, q)
+
+
+def test_training_begins_with_other_weights_and_tells_of_them(data, tmp_path):
+    first, second = tmp_path / "first.safetensors", tmp_path / "second.safetensors"
+    run("gcn", data, first, QUICK)
+    still = replace(QUICK, steps=1, lr=1e-9, hidden=0)
+    run("gcn", data, second, still, start=first)
+    (a, before), (b, card) = load(first), load(second)
+    assert card["before"]["curve"] == before["curve"] and card["before"]["sha256"] == before["sha256"]
+    for p, q in zip(a.parameters(), b.parameters(), strict=True):
+        assert_close(p, q, rtol=0, atol=1e-8)
+    run("gcn", data, second, still, resume=True, start=first)
+    with pytest.raises(InputError, match="another from"):
+        run("gcn", data, second, still, resume=True)
+    for wrong in ({"model": "ngff"}, {"model": "gcn", "options": replace(still, hidden=16)}):
+        with pytest.raises(InputError, match="first.safetensors: holds gcn"):
+            run(**{"data": data, "out": second, "options": still, "start": first, **wrong})
+
+
+def test_a_checkpoint_of_something_else_is_refused(data, tmp_path):
+    out = tmp_path / "a.safetensors"
+    with pytest.raises(InputError, match="no such file"):
+        run("gcn", data, out, QUICK, resume=True)
+    run("gcn", data, out, replace(QUICK, steps=2))
+    with pytest.raises(InputError, match="another steps, lr"):
+        run("gcn", data, out, replace(QUICK, lr=0.1), resume=True)
+    out.with_suffix(".ckpt").write_bytes(b"broken")
+    with pytest.raises(InputError, match="checkpoint"):
+        run("gcn", data, out, QUICK, resume=True)
+
+
+def test_an_rmse_that_is_not_finite_is_the_worst():
+    class Lost:
+        def eval(self):
+            pass
+
+        def rollout(self, world, frames, dt):
+            points = world.points[:, None].repeat(1, frames, 1, 1, 1)
+            points[0] = math.nan
+            return points
+
+    assert validate(Lost(), falling())["RMSE"] == math.inf
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"groups": "3_0..3_2"}, "3_2.h5"),
+        ({"keypoints": 9}, "8 keypoints"),
+        ({"horizons": "3,8"}, "6 frames"),
+        ({"horizons": "8,x"}, "--horizons"),
+        ({"lr": 0.0}, "--lr"),
+        ({"few": 9}, "--few"),
+        ({"optimizer": "newton"}, "--optimizer newton"),
+        ({"speeds": -0.1}, "--speeds"),
+    ],
+)
+def test_what_cannot_be_trained_on_is_said(data, tmp_path, change, message):
+    with pytest.raises(InputError, match=message):
+        run("ngff", data, tmp_path / "a.safetensors", replace(QUICK, **change))
+    assert not (tmp_path / "a.safetensors").exists()
+
+
+def test_every_fourth_step_sees_few_keypoints(data, tmp_path, monkeypatch):
+    seen, draw = [], Pieces.draw
+
+    def watched(self, *args):
+        piece = draw(self, *args)
+        seen.append(piece.points.shape[2])
+        return piece
+
+    monkeypatch.setattr(Pieces, "draw", watched)
+    run("ngff", data, tmp_path / "a.safetensors", replace(QUICK, steps=6, few=4, speeds=0.1))
+    assert seen == [4, 8, 8, 8, 4, 8]
+
+
+def test_the_command_trains(data, tmp_path):
+    out = tmp_path / "gcn.safetensors"
+    words = "--steps 2 --batch 2 --keypoints 8 --few 4 --speeds 0.1 --horizons 3 --loss relative --hidden 8"
+    words += f" --groups 3_0,3_1 --device cpu -o {out}"
+    result = CliRunner().invoke(app, ["train", "gcn", "--data", str(data), *words.split()])
+    assert result.exit_code == 0, result.output
+    assert "RMSE" in result.stdout
+    assert load(out)[1]["steps"] == 2
+
+
+def test_two_processes_train_as_one_with_the_whole_batch(data, tmp_path):
+    """Each takes half of every batch, and gradients are averaged: only the order of sums differs."""
+    words = ["train", "gcn", "--data", str(data), "--device", "cpu"]
+    words += ["--steps", "6", "--batch", "4", "--keypoints", "8", "--horizons", "3", "--hidden", "8"]
+    words += ["--groups", "3_0,3_1"]
+    assert CliRunner().invoke(app, [*words, "-o", str(tmp_path / "one.safetensors")]).exit_code == 0
+    command = f"from ngff_cli.lab import app; app({[*words, '-o', str(tmp_path / 'two.safetensors')]!r})"
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        place = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(probe.getsockname()[1]), "OMP_NUM_THREADS": "1"}
+    crew = [
+        subprocess.Popen([sys.executable, "-c", command], stderr=subprocess.PIPE, text=True,
+                         env={**os.environ, **place, "WORLD_SIZE": "2", "RANK": str(i), "LOCAL_RANK": str(i)})
+        for i in range(2)
+    ]  # fmt: skip
+    for process in crew:
+        said = process.communicate(timeout=120)[1]
+        assert process.returncode == 0, said
+    (one, _), (two, card) = (load(tmp_path / f"{name}.safetensors") for name in ("one", "two"))
+    assert card["processes"] == 2 and card["steps"] == 6
+    for p, q in zip(one.parameters(), two.parameters(), strict=True):
+        assert_close(p, q, rtol=1e-3, atol=1e-5)
+
+
+def test_a_batch_that_cannot_be_shared_is_said(data, tmp_path, monkeypatch):
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    with pytest.raises(InputError, match="multiple of 2"):
+        run("gcn", data, tmp_path / "a.safetensors", replace(QUICK, batch=3))
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("name", MODELS)
+def test_a_cuda_graph_gives_the_same(name):
+    if not torch.cuda.is_available():
+        pytest.skip("needs an NVIDIA GPU")
+    torch.manual_seed(0)
+    model = build(name, hidden=16).cuda().eval()
+    pieces, rng = Pieces(without_last(falling()), "cuda", model), torch.Generator().manual_seed(0)
+    recorded, plain = Roll(model, DT), Roll(model, DT, graph=False)
+    for _ in range(3):
+        piece = pieces.draw(4, 3, rng)
+        (loss, grads), (loss_, grads_) = recorded(piece), plain(piece)
+        assert recorded.graph is not None
+        assert_close(loss, loss_)
+        for a, b in zip(grads, grads_, strict=True):
+            assert_close(a, b, rtol=1e-3, atol=1e-5)

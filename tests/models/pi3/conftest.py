@@ -1,1 +1,0 @@
-from tests.models.pi3.recorded import manifest, recorded  # noqa: F401

@@ -16,7 +16,7 @@ demo: setup
 	$(MAKE) -C examples/falling_toys NGFF=$(abspath $(BIN))/ngff
 
 test: setup
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n auto
 
 test-gpu:
 	$(PYTHON) -m pytest -m gpu

@@ -1,6 +1,10 @@
 """Tiny scenes built in memory, the devices present, and skips for data that may be absent."""
 
 import os
+
+if "PYTEST_XDIST_WORKER" in os.environ:  # before the first import that reads it: one thread in each of several workers
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+
 from pathlib import Path
 
 import pytest

@@ -22,7 +22,7 @@ Pairs = list[tuple[SceneObject, SceneObject]]  # predicted, true
 
 
 @dataclass(frozen=True)
-class World:
+class ReferenceFrame:
     """What a file says about its frame of reference: cameras, and the points of each object at rest."""
 
     file: str
@@ -33,12 +33,12 @@ class World:
     def centre(self, object: SceneObject) -> Float[Tensor, "3"]:
         return self.points[object.id].mean(0)
 
-    def moved(self, similarity: Similarity) -> World:
+    def moved(self, similarity: Similarity) -> ReferenceFrame:
         cameras = None if self.cameras is None else self.cameras.moved(similarity)
         return replace(self, cameras=cameras, points={i: similarity(p) for i, p in self.points.items()})
 
 
-def alignment(prediction: World, truth: World) -> tuple[Similarity, str]:
+def find_alignment(prediction: ReferenceFrame, truth: ReferenceFrame) -> tuple[Similarity, str]:
     """The similarity that takes the prediction into the truth's world, and how it was found."""
     mine, true = _shared_cameras(prediction, truth)
     if mine is not None and len(mine) >= 2:
@@ -56,7 +56,7 @@ def alignment(prediction: World, truth: World) -> tuple[Similarity, str]:
     )
 
 
-def check_same_world(prediction: World, truth: World, pairs: Pairs) -> None:
+def check_same_reference_frame(prediction: ReferenceFrame, truth: ReferenceFrame, pairs: Pairs) -> None:
     """Refuses files whose cameras or, without any, matched objects are clearly somewhere else."""
     mine, true = _shared_cameras(prediction, truth)
     if mine is not None and len(mine) >= 2:
@@ -76,7 +76,7 @@ def check_same_world(prediction: World, truth: World, pairs: Pairs) -> None:
         )
 
 
-def _shared_cameras(prediction: World, truth: World) -> tuple[Cameras, Cameras] | tuple[None, None]:
+def _shared_cameras(prediction: ReferenceFrame, truth: ReferenceFrame) -> tuple[Cameras, Cameras] | tuple[None, None]:
     """Cameras of both with the same photo names (file endings aside), in the same order."""
     if prediction.cameras is None or truth.cameras is None:
         return None, None

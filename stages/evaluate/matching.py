@@ -7,10 +7,10 @@ from scipy.optimize import linear_sum_assignment
 
 from stages.core.errors import InputError
 from stages.core.scene.scene import SceneObject
-from stages.evaluate.align import Pairs, World
+from stages.evaluate.align import Pairs, ReferenceFrame
 
 
-def match(prediction: World, truth: World, names: list[str]) -> tuple[Pairs, str]:
+def match_objects(prediction: ReferenceFrame, truth: ReferenceFrame, names: list[str]) -> tuple[Pairs, str]:
     """Pairs (predicted, true) of objects and how they were found: by name, else by id, else by nearest centre.
 
     With `names` only those of the truth count, and the prediction may have more. Ids count only where they
@@ -34,7 +34,9 @@ def match(prediction: World, truth: World, names: list[str]) -> tuple[Pairs, str
     return nearest, f"objects were matched by nearest centre, since names and ids differ ({told})"
 
 
-def _nearest(mine: list[SceneObject], true: list[SceneObject], prediction: World, truth: World) -> Pairs:
+def _nearest(
+    mine: list[SceneObject], true: list[SceneObject], prediction: ReferenceFrame, truth: ReferenceFrame
+) -> Pairs:
     """One to one, with the least sum of distances between centres."""
     a = torch.stack([prediction.centre(o) for o in mine])
     b = torch.stack([truth.centre(o) for o in true])
@@ -42,7 +44,7 @@ def _nearest(mine: list[SceneObject], true: list[SceneObject], prediction: World
     return [(mine[j], true[i]) for i, j in zip(rows, columns, strict=True)]
 
 
-def labels(objects: list[SceneObject]) -> list[str]:
+def object_labels(objects: list[SceneObject]) -> list[str]:
     """Names for tables: those that several objects share get the id as well."""
     names = [o.name for o in objects]
     return [o.name if names.count(o.name) == 1 else f"{o.name} {o.id}" for o in objects]
@@ -52,7 +54,7 @@ def _names(objects: list[SceneObject]) -> str:
     return ", ".join(o.name for o in objects) or "none"
 
 
-def _chosen(truth: World, names: list[str]) -> list[SceneObject]:
+def _chosen(truth: ReferenceFrame, names: list[str]) -> list[SceneObject]:
     """The truth's objects to compare: all, or those that --objects names."""
     missing = [name for name in names if name not in {o.name for o in truth.objects}]
     if missing:

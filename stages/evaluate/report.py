@@ -13,7 +13,7 @@ from torch import Tensor
 
 from stages.core.scene.files import replacing
 from stages.core.scene.images import resize, write_png
-from stages.evaluate.result import Curve, Pair, Result, show
+from stages.evaluate.result import Curve, ImagePair, Result, format_number
 
 WIDTH, HEIGHT, LEFT, BOTTOM = 720, 280, 60, 36  # of the plot [px]; margins for the labels
 INKS = ("#1f6fb4", "#d1491f", "#2e8b57", "#8e44ad", "#b8860b", "#16808a", "#c2185b", "#5d6d7e")
@@ -42,7 +42,7 @@ def _table(result: Result) -> str:
     columns = result.columns()
     head = "".join(f"<th>{escape(c)}</th>" for c in ["", *columns])
     rows = [
-        f"<tr><td>{escape(name)}</td>{''.join(f'<td>{show(row.get(c))}</td>' for c in columns)}</tr>"
+        f"<tr><td>{escape(name)}</td>{''.join(f'<td>{format_number(row.get(c))}</td>' for c in columns)}</tr>"
         for name, row in result.rows()
     ]
     return f"<table><tr>{head}</tr>{''.join(rows)}</table>"
@@ -99,7 +99,7 @@ def _round_up(value: float) -> float:
     return next(m * step for m in (1, 2, 5, 10) if m * step >= value * (1 - 1e-9))
 
 
-def _figure(pair: Pair) -> str:
+def _figure(pair: ImagePair) -> str:
     """Prediction left, truth right."""
     images = "".join(f'<img alt="{name}" src="data:image/png;base64,{_png(image)}"> ' for name, image in
                      (("prediction", pair.predicted), ("truth", pair.truth)))  # fmt: skip

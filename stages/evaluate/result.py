@@ -18,7 +18,7 @@ class Curve:
 
 
 @dataclass(frozen=True)
-class Pair:
+class ImagePair:
     """A predicted picture beside the true one."""
 
     caption: str
@@ -37,7 +37,7 @@ class Result:
     curves: list[Curve] = field(default_factory=list)
     curve_title: str = ""
     fps: float | None = None  # of the curves, where frames have a time
-    pairs: list[Pair] = field(default_factory=list)
+    pairs: list[ImagePair] = field(default_factory=list)
 
     def rows(self) -> list[tuple[str, dict[str, float | int]]]:
         return [*self.parts.items(), ("all", self.overall)] if self.parts else [("all", self.overall)]
@@ -46,7 +46,7 @@ class Result:
         return list(dict.fromkeys(name for _, metrics in self.rows() for name in metrics))
 
 
-def show(value: float | int | None) -> str:
+def format_number(value: float | int | None) -> str:
     """A number as in tables: four digits that count; a dash where it is not defined."""
     if value is None or math.isnan(value):
         return "-"
@@ -55,10 +55,10 @@ def show(value: float | int | None) -> str:
     return f"{value:.4g}" if not 1e-3 <= abs(value) < 1e4 else f"{value:.4f}"
 
 
-def table(result: Result) -> str:
+def format_table(result: Result) -> str:
     """Aligned text, one row an object, everything last."""
     columns = result.columns()
-    cells = [["", *columns]] + [[name, *(show(row.get(c)) for c in columns)] for name, row in result.rows()]
+    cells = [["", *columns]] + [[name, *(format_number(row.get(c)) for c in columns)] for name, row in result.rows()]
     widths = [max(len(row[i]) for row in cells) for i in range(len(columns) + 1)]
     return "\n".join(
         "  ".join([row[0].ljust(widths[0]), *(c.rjust(w) for c, w in zip(row[1:], widths[1:], strict=True))]).rstrip()

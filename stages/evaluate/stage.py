@@ -12,14 +12,14 @@ from stages.core.scene.files import must_exist, provenance, replacing
 from stages.core.scene.images import PHOTOS, VIDEOS
 from stages.evaluate.options import EvaluateOptions
 from stages.evaluate.report import write_report
-from stages.evaluate.result import table, to_json
+from stages.evaluate.result import format_table, to_json
 
 log = logging.getLogger(__name__)
 
 COMPARISONS = {
     "trajectory": "stages.evaluate.trajectories:compare",
-    "scene": "stages.evaluate.clouds:compare",
-    "pictures": "stages.evaluate.pictures:compare",
+    "scene": "stages.evaluate.scenes:compare",
+    "pictures": "stages.evaluate.images:compare",
 }
 
 
@@ -38,7 +38,7 @@ def run(prediction: Path, truth: Path, out: Path | None, options: EvaluateOption
         part.write_text(json.dumps(facts, indent=1) + "\n")
     if options.report:
         write_report(options.report, result, prediction, truth)
-    print(table(result))
+    print(format_table(result))
     return facts
 
 

@@ -16,9 +16,9 @@ from stages.core.physics.skinning import Skinning
 from stages.core.scene.gaussians import Gaussians
 from stages.core.scene.scene import Scene
 from stages.core.scene.trajectory import Keypoints, Trajectory, read_trajectory
-from stages.evaluate.align import Pairs, World, alignment, check_same_world
+from stages.evaluate.align import Pairs, ReferenceFrame, check_same_reference_frame, find_alignment
 from stages.evaluate.dynamics import STILL, all_metrics, error_over_time
-from stages.evaluate.matching import labels, match
+from stages.evaluate.matching import match_objects, object_labels
 from stages.evaluate.options import EvaluateOptions
 from stages.evaluate.result import Curve, Result
 
@@ -29,7 +29,7 @@ SAME = 1e-3  # keypoints within this share of an object's size at rest are the s
 class Track:
     """What of a trajectory is compared: its keypoints in every frame."""
 
-    world: World
+    world: ReferenceFrame
     dt: float  # [s]
     object_id: Int[Tensor, "p"]
     rest: Float[Tensor, "p 3"]
@@ -50,7 +50,7 @@ class Track:
 
 
 @dataclass(frozen=True)
-class Compared:
+class MatchedMotion:
     """Both motions at the same points; objects with fewer points than others are padded."""
 
     names: list[str]
@@ -65,13 +65,13 @@ def compare(prediction: Path, truth: Path, options: EvaluateOptions) -> Result:
     mine, true = _track(read_trajectory(prediction)), _track(true_scene)
     notes: list[str] = []
     if options.align:
-        similarity, how = alignment(mine.world, true.world)
+        similarity, how = find_alignment(mine.world, true.world)
         mine = mine.moved(similarity)
         notes.append(f"{how}; scale {similarity.scale:.4g}")
-    pairs, how = match(mine.world, true.world, options.object_names)
+    pairs, how = match_objects(mine.world, true.world, options.object_names)
     notes.append(how)
     if not options.align:
-        check_same_world(mine.world, true.world, pairs)
+        check_same_reference_frame(mine.world, true.world, pairs)
     mine, true = _same_frames(mine, true, options, notes)
     both = _same_points(mine, true, pairs, notes)
     return _result(both, 1 / true.dt, STILL / true_scene.scene.metres_per_unit, notes)
@@ -82,11 +82,11 @@ def _track(trajectory: Trajectory) -> Track:
     keypoints = trajectory.keypoints
     points = {o.id: keypoints.rest[keypoints.object_id == o.id] for o in trajectory.scene.objects}
     objects = tuple(o for o in trajectory.scene.objects if len(points[o.id]))
-    world = World(str(trajectory.path), trajectory.scene.cameras, objects, points)
+    world = ReferenceFrame(str(trajectory.path), trajectory.scene.cameras, objects, points)
     return Track(world, trajectory.motion.dt, keypoints.object_id, keypoints.rest, trajectory.positions)
 
 
-def _result(both: Compared, fps: float, still: float, notes: list[str]) -> Result:
+def _result(both: MatchedMotion, fps: float, still: float, notes: list[str]) -> Result:
     overall = _floats(all_metrics(both.predicted, both.truth, both.mask, still))
     parts = {
         name: _floats(all_metrics(both.predicted[:, [i]], both.truth[:, [i]], both.mask[[i]], still))
@@ -140,14 +140,14 @@ def _resampled(mine: Track, true: Track) -> Track:
     return replace(mine, positions=positions, dt=true.dt)
 
 
-def _same_points(mine: Track, true: Track, pairs: Pairs, notes: list[str]) -> Compared:
+def _same_points(mine: Track, true: Track, pairs: Pairs, notes: list[str]) -> MatchedMotion:
     """The truth's keypoints, and where the prediction takes them."""
     predicted, truths, carried = [], [], []
     for a, b in pairs:
         (rest, moving), (true_rest, true_moving) = mine.of(a.id), true.of(b.id)
         if not _alike(rest, true_rest):
             carried.append(b.name)
-            moving = carry(true_rest, rest, moving)
+            moving = transfer_motion(true_rest, rest, moving)
         predicted.append(moving)
         truths.append(true_moving)
     if carried:
@@ -157,7 +157,7 @@ def _same_points(mine: Track, true: Track, pairs: Pairs, notes: list[str]) -> Co
         )
     counts = torch.tensor([t.shape[1] for t in truths])
     mask = torch.arange(int(counts.max()))[None] < counts[:, None]
-    return Compared(labels([b for _, b in pairs]), _padded(predicted), _padded(truths), mask)
+    return MatchedMotion(object_labels([b for _, b in pairs]), _padded(predicted), _padded(truths), mask)
 
 
 def _alike(a: Float[Tensor, "p 3"], b: Float[Tensor, "q 3"]) -> bool:
@@ -173,7 +173,7 @@ def _padded(series: list[Float[Tensor, "t _ 3"]]) -> Float[Tensor, "t o p 3"]:
     return torch.stack([torch.nn.functional.pad(s, (0, 0, 0, most - s.shape[1])) for s in series], 1)
 
 
-def carry(
+def transfer_motion(
     points: Float[Tensor, "q 3"], rest: Float[Tensor, "p 3"], positions: Float[Tensor, "t p 3"]
 ) -> Float[Tensor, "t q 3"]:
     """Where points near an object go when its keypoints move: the skinning that also moves Gaussians.

@@ -14,8 +14,8 @@ from stages.core.geometry.cameras import depths, project
 from stages.core.geometry.rotations import matrix
 from stages.core.scene.cameras import Cameras
 from stages.core.scene.images import to_bytes
-from stages.render.footage import Footage
-from stages.render.subject import extent
+from stages.render.animation import Animation
+from stages.render.subject import robust_box
 
 INK, EDGE = (255, 122, 20), (40, 20, 0)  # of arrows, RGB
 LENGTH = 1.6  # of the arrow of the largest force, in radii of its object
@@ -23,7 +23,7 @@ LENGTH = 1.6  # of the arrow of the largest force, in radii of its object
 Image = Float[Tensor, "h w 3"]
 
 
-def arrows_at(footage: Footage, time: float) -> list[tuple[Tensor, Tensor]]:
+def force_arrows(footage: Animation, time: float) -> list[tuple[Tensor, Tensor]]:
     """Tail and tip in the world of every push that acts at a time, longest for the strongest push of all."""
     if footage.trajectory is None:
         return []
@@ -34,7 +34,7 @@ def arrows_at(footage: Footage, time: float) -> list[tuple[Tensor, Tensor]]:
     return [_arrow(footage, time, f, strongest) for f in acting]
 
 
-def _arrow(footage: Footage, time: float, push: dict, strongest: float) -> tuple[Tensor, Tensor]:
+def _arrow(footage: Animation, time: float, push: dict, strongest: float) -> tuple[Tensor, Tensor]:
     """From where the push acts: the centre of mass, or a point of the object at rest that has moved along."""
     trajectory = footage.trajectory
     row = [o.id for o in footage.scene.objects].index(push["object_id"])
@@ -45,7 +45,7 @@ def _arrow(footage: Footage, time: float, push: dict, strongest: float) -> tuple
         shift = (trajectory.positions[0, mine] - rest).mean(0)  # a lift: where the film starts is not where it rested
         arm = torch.tensor(push["at"]) - (trajectory.com[0, row] - shift)
         tail = com + matrix(footage.at(time, trajectory.rotation)[row]) @ arm
-    return tail, tail + LENGTH * extent(rest).radius / strongest * torch.tensor(push["force"])
+    return tail, tail + LENGTH * robust_box(rest).radius / strongest * torch.tensor(push["force"])
 
 
 def draw_arrows(image: Image, cameras: Cameras, index: int, arrows: list[tuple[Tensor, Tensor]]) -> Image:
@@ -64,7 +64,7 @@ def draw_arrows(image: Image, cameras: Cameras, index: int, arrows: list[tuple[T
     return torch.from_numpy(pixels).float() / 255
 
 
-def caption(image: Image, text: str, below: bool = False) -> Image:
+def draw_caption(image: Image, text: str, below: bool = False) -> Image:
     """White on a dark label in the upper left corner, or in the lower left one."""
     pixels = np.ascontiguousarray(to_bytes(image))
     font, size = cv2.FONT_HERSHEY_SIMPLEX, max(max(image.shape[:2]) / 800, 0.4)
@@ -76,12 +76,12 @@ def caption(image: Image, text: str, below: bool = False) -> Image:
     return torch.from_numpy(pixels).float() / 255
 
 
-def columns_for(count: int) -> int:
+def grid_columns(count: int) -> int:
     """How many pictures to put side by side."""
     return math.ceil(count**0.5)
 
 
-def tile(images: list[Float[Tensor, "_ _ 3"]], columns: int) -> Float[Tensor, "h2 w2 3"]:
+def tile_images(images: list[Float[Tensor, "_ _ 3"]], columns: int) -> Float[Tensor, "h2 w2 3"]:
     """Row by row on white; smaller pictures stand in the middle of their cell."""
     height, width = (max(image.shape[i] for image in images) for i in (0, 1))
     rows = math.ceil(len(images) / columns)

@@ -23,7 +23,7 @@ from stages.core.scene.files import must_exist
 WHAT = "a camera path (.json: a list of {rotation, position, width, height, fx, fy} or of {viewmat, K, size})"
 
 
-def read_path(path: str | Path) -> Cameras:
+def read_camera_path(path: str | Path) -> Cameras:
     """The cameras of a path file; all must have the size of the first."""
     path = Path(path)
     must_exist(path, WHAT)
@@ -61,7 +61,7 @@ def _entry(row: dict) -> tuple[np.ndarray, np.ndarray, list[int]]:
     return viewmat, K, [int(width), int(height)]
 
 
-def follow(cameras: Cameras, frames: int) -> Cameras:
+def interpolate_cameras(cameras: Cameras, frames: int) -> Cameras:
     """`frames` viewpoints from the first camera to the last, evenly in the order given; one camera stands still.
 
     Rotations turn at even speed between neighbours (slerp), positions and lenses by monotone cubics, which pass

@@ -14,12 +14,12 @@ from stages.core.backends import pick_device
 from stages.core.errors import InputError
 from stages.core.scene.files import provenance, replacing
 from stages.core.scene.images import VideoWriter, write_depth, write_jpeg, write_png
-from stages.render.backdrop import open_backdrop
-from stages.render.draw import Seen, depth_range
-from stages.render.footage import Footage, open_footage
+from stages.render.animation import Animation, open_animation
+from stages.render.background import open_background
+from stages.render.draw import RenderedView, depth_range
 from stages.render.options import RenderOptions
-from stages.render.overlay import columns_for
-from stages.render.studio import Studio, Take
+from stages.render.overlay import grid_columns
+from stages.render.renderer import Clip, Renderer
 
 MOMENTS, ACROSS = 12, 4  # of a contact sheet
 MOST = 8  # files side by side
@@ -33,10 +33,10 @@ def run(source: Path | Sequence[Path], out: Path | None, options: RenderOptions)
     sources = [Path(source)] if isinstance(source, (str, Path)) else [Path(s) for s in source]
     _check_count(sources, options)
     device = pick_device(options.device)
-    films = [open_footage(s, options.frame, device) for s in sources]
-    takes = [Take(footage, options, open_backdrop(options.background, footage.scene), device, name)
+    films = [open_animation(s, options.frame, device) for s in sources]
+    takes = [Clip(footage, options, open_background(options.background, footage.scene), device, name)
              for footage, name in zip(films, _names(sources), strict=True)]  # fmt: skip
-    studio = Studio(takes, options)
+    studio = Renderer(takes, options)
     out = Path(out) if out is not None else _beside(sources, studio)
     if out.suffix.lower() not in (".mp4", ".png", ".jpg"):
         raise InputError(f"{out}: pictures are written as .mp4, .png or .jpg; give it one of these endings")
@@ -69,7 +69,7 @@ def _names(sources: list[Path]) -> list[str]:
     return [f"{s.stem} {i}" for i, s in enumerate(sources, start=1)]  # the same file, more than once
 
 
-def _beside(sources: list[Path], studio: Studio) -> Path:
+def _beside(sources: list[Path], studio: Renderer) -> Path:
     """traj.h5 -> traj_novel.mp4, a.h5 b.h5 -> a_b_novel.mp4; a picture where neither scene nor camera moves."""
     options = studio.options
     still = not studio.moves and (options.view == "all" or options.view.startswith("input:"))
@@ -77,15 +77,15 @@ def _beside(sources: list[Path], studio: Studio) -> Path:
     return sources[0].with_name(f"{stem}_{options.label}{'.png' if still else '.mp4'}")
 
 
-def film(out: Path, studio: Studio) -> dict:
+def film(out: Path, studio: Renderer) -> dict:
     """Frame by frame; depth keeps one range of colours throughout, taken from three of the frames."""
     fps = studio.fps
     times = studio.longest.times(fps)
     cameras = studio.cameras(len(times), studio.options.resolution)
     together = studio.options.view == "all"
-    columns = columns_for(len(cameras[0]))
+    columns = grid_columns(len(cameras[0]))
 
-    def shots(i: int) -> list[list[Seen]]:
+    def shots(i: int) -> list[list[RenderedView]]:
         return studio.seen(times[i], cameras, list(range(len(cameras[0]))) if together else [i])
 
     span = None
@@ -97,12 +97,12 @@ def film(out: Path, studio: Studio) -> dict:
     return {"frames": len(times), "fps": fps, **_depth_facts(span)}
 
 
-def still(out: Path, studio: Studio) -> dict:
+def still(out: Path, studio: Renderer) -> dict:
     """One picture; of a scene that moves, a sheet of moments (of all cameras: its first frame)."""
     options, captions = studio.options, []
     if options.view == "all":
         cameras = studio.cameras(1, options.resolution)
-        views, columns = studio.seen(0.0, cameras, list(range(len(cameras[0])))), columns_for(len(cameras[0]))
+        views, columns = studio.seen(0.0, cameras, list(range(len(cameras[0])))), grid_columns(len(cameras[0]))
     elif studio.moves:
         times = _moments(studio.longest)
         across = max(1, ACROSS // len(studio.takes))
@@ -119,13 +119,13 @@ def still(out: Path, studio: Studio) -> dict:
     return {"views": sum(len(row) for row in views), **_depth_facts(span)}
 
 
-def _moments(footage: Footage) -> list[float]:
+def _moments(footage: Animation) -> list[float]:
     """Times of evenly spaced stored frames from first to last [s]."""
     count, last = min(MOMENTS, len(footage.trajectory)), len(footage.trajectory) - 1
     return [round(i * last / (count - 1)) / footage.fps for i in range(count)]
 
 
-def _depth_range(rows: list[list[Seen]]) -> tuple[float, float]:
+def _depth_range(rows: list[list[RenderedView]]) -> tuple[float, float]:
     return depth_range([view.depth for row in rows for view in row])
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from stages.core.geometry.cameras import centres, depths, project
 from stages.core.scene.cameras import Cameras
 from stages.core.scene.gaussians import Gaussians
-from stages.render.footage import Footage
+from stages.render.animation import Animation
 
 KEPT = (0.05, 0.95)  # quantiles of each coordinate that count as the extent
 VISIBLE = 0.1  # opacity
@@ -48,17 +48,17 @@ class Subject:
         return self.centre + torch.cartesian_prod(signs, signs, signs) * self.half
 
 
-def subject_of(footage: Footage) -> Subject:
+def find_subject(footage: Animation) -> Subject:
     """The objects along all of their motion; without objects what the cameras look at; else the whole scene.
 
     Photos are framed around what matters, so objects pull the aim only a little away from theirs.
     """
     g, cameras = footage.scene.gaussians, footage.scene.cameras
     seen = g[g.opacities > VISIBLE] if (g.opacities > VISIBLE).any() else g
-    aimed = (aim(cameras) or common(cameras, seen.means)) if cameras is not None else None
+    aimed = (axes_focus(cameras) or common_view_centre(cameras, seen.means)) if cameras is not None else None
     ids = _central(seen, aimed)
     if not len(ids):
-        return aimed or extent(seen.means)
+        return aimed or robust_box(seen.means)
     found = _box(footage, seen, ids)
     if aimed is None:
         return found
@@ -75,7 +75,7 @@ def _near(moving: Float[Tensor, "t m 3"] | None, aimed: Subject) -> Float[Tensor
     return torch.where(gone, aimed.centre, moving)
 
 
-def joint(subjects: Sequence[Subject]) -> Subject:
+def merge_subjects(subjects: Sequence[Subject]) -> Subject:
     """The box around several subjects; the camera aims at the middle of what they would have it aim at."""
     if len(subjects) == 1:
         return subjects[0]
@@ -88,16 +88,16 @@ def joint(subjects: Sequence[Subject]) -> Subject:
     return Subject((low + high) / 2, (high - low) / 2, aims.mean(0), moving)
 
 
-def _box(footage: Footage, seen: Gaussians, ids: Int[Tensor, "o"]) -> Subject:
+def _box(footage: Animation, seen: Gaussians, ids: Int[Tensor, "o"]) -> Subject:
     """Where these objects are in the course of the film, and where they start: what is lifted is not up for long."""
     trajectory = footage.trajectory
     if trajectory is not None:
         moving = torch.isin(trajectory.keypoints.object_id, ids)
         if moving.any():
             shown = (trajectory.positions if footage.moves else trajectory.positions[[footage.frozen or 0]])[:, moving]
-            box = joint([extent(shown.reshape(-1, 3)), extent(shown[0])])
+            box = merge_subjects([robust_box(shown.reshape(-1, 3)), robust_box(shown[0])])
             return replace(box, moving=_moving(shown, STIRS * box.radius))
-    return extent(seen.means[torch.isin(seen.object_id, ids)])
+    return robust_box(seen.means[torch.isin(seen.object_id, ids)])
 
 
 def _moving(shown: Float[Tensor, "t p 3"], least: float) -> Float[Tensor, "t m 3"] | None:
@@ -123,7 +123,7 @@ def _central(g: Gaussians, aimed: Subject | None) -> Int[Tensor, "o"]:
     return ids[near] if near.any() else ids
 
 
-def extent(points: Float[Tensor, "n 3"]) -> Subject:
+def robust_box(points: Float[Tensor, "n 3"]) -> Subject:
     """The box of the middle nine tenths of each coordinate, grown by what was cut off on average."""
     thinned = points[:: max(1, len(points) // MANY)].double()
     low, high = torch.quantile(thinned, torch.tensor(KEPT, dtype=torch.float64), dim=0)
@@ -131,7 +131,7 @@ def extent(points: Float[Tensor, "n 3"]) -> Subject:
     return Subject(((low + high) / 2).float(), half.float().clamp_min(1e-6))
 
 
-def aim(cameras: Cameras) -> Subject | None:
+def axes_focus(cameras: Cameras) -> Subject | None:
     """The point nearest to all viewing axes.
 
     Nothing when the axes are nearly parallel, or when fewer than half of the cameras see that point.
@@ -149,7 +149,7 @@ def aim(cameras: Cameras) -> Subject | None:
     return _at(point, depth[depth > 0].median())
 
 
-def common(cameras: Cameras, points: Float[Tensor, "n 3"]) -> Subject | None:
+def common_view_centre(cameras: Cameras, points: Float[Tensor, "n 3"]) -> Subject | None:
     """Where the points lie that are in the middle of most photos, for cameras that look in one direction."""
     points = points[:: max(1, len(points) // MANY)]
     middle = torch.zeros(len(points))

@@ -6,14 +6,14 @@ import pytest
 
 from stages.core.errors import InputError
 from stages.evaluate.options import EvaluateOptions
-from stages.evaluate.result import Result, table, to_json
+from stages.evaluate.result import Result, format_table, to_json
 from stages.evaluate.stage import run
 from tests.evaluate.motions import write
 
 
 def test_the_table_is_aligned():
     result = Result("trajectories", {"RMSE": 0.5, "R": math.nan, "frames": 3}, {"duck": {"RMSE": 0.00001}}, [])
-    assert table(result).splitlines() == [
+    assert format_table(result).splitlines() == [
         "        RMSE  R  frames",
         "duck   1e-05  -       -",
         "all   0.5000  -       3",

@@ -7,10 +7,10 @@ import torch
 
 from stages.core.errors import InputError
 from stages.core.geometry.similarity import Similarity
-from stages.evaluate.align import World, alignment
+from stages.evaluate.align import ReferenceFrame, find_alignment
 from stages.evaluate.options import EvaluateOptions
 from stages.evaluate.stage import run
-from stages.evaluate.trajectories import carry
+from stages.evaluate.trajectories import transfer_motion
 from tests.evaluate.motions import elsewhere, renamed, turn, write
 
 
@@ -58,7 +58,7 @@ def test_points_are_carried_with_their_offset():
     rest = torch.randn(200, 3, generator=torch.Generator().manual_seed(0))
     points = rest[:20] + 0.05
     R, shift = turn(0.8), torch.tensor([1.0, 2.0, 3.0])
-    frames = carry(points, rest, torch.stack([rest, rest @ R.mT + shift]))
+    frames = transfer_motion(points, rest, torch.stack([rest, rest @ R.mT + shift]))
     assert torch.equal(frames[0], points)
     torch.testing.assert_close(frames[1], points @ R.mT + shift, atol=1e-4, rtol=0)
 
@@ -101,7 +101,7 @@ def test_a_straight_row_of_cameras_still_fixes_the_turn_about_it(two_balls):
     viewmats[:, 0, 3] += torch.tensor([0.0, 0.5, 1.0])
     line = replace(line, viewmats=viewmats, names=("a.jpg", "b.jpg", "c.jpg"))
     away = Similarity(0.4, turn(2.0), torch.tensor([1.0, 2.0, 3.0]))
-    found, _ = alignment(World("a", line.moved(away), (), {}), World("b", line, (), {}))
+    found, _ = find_alignment(ReferenceFrame("a", line.moved(away), (), {}), ReferenceFrame("b", line, (), {}))
     points = torch.randn(10, 3, generator=torch.Generator().manual_seed(0))
     torch.testing.assert_close(found(away(points)), points, atol=1e-4, rtol=0)
 

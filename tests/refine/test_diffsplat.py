@@ -17,7 +17,7 @@ from stages.core.raster.rasterise import rasterise
 from stages.core.scene.gaussians import Gaussians
 from stages.core.scene.scene import Scene, SceneObject
 from stages.core.scene.scene_ply import read_scene, write_scene
-from stages.evaluate.clouds import nearest
+from stages.evaluate.scenes import nearest_neighbours
 from stages.lab.assets.shapes import ellipsoid
 from stages.refine import diffsplat
 from stages.refine.library import moved, solid
@@ -89,14 +89,14 @@ def test_the_thing_is_whole_where_it_was_not_seen(seen, whole, truth):
     all_round = scene_of(table(0.02), truth)
     outside = all_round.gaussians.means[(Sight.of(all_round).weight > 0.02) & (all_round.gaussians.object_id == 1)]
     before, after = (s.gaussians.means[s.gaussians.object_id == 1] for s in (seen, whole))
-    far = [nearest(outside, points).distance for points in (before, after)]
+    far = [nearest_neighbours(outside, points).distance for points in (before, after)]
     assert far[1].mean() < 0.3 * far[0].mean() and far[1].mean() < 0.02 * PLACE.scale
-    assert nearest(after, truth.means).distance.quantile(0.95) < 0.02 * PLACE.scale
+    assert nearest_neighbours(after, truth.means).distance.quantile(0.95) < 0.02 * PLACE.scale
 
 
 def test_its_colours_are_right_all_around(whole, truth):
     g = whole.gaussians[whole.gaussians.object_id == 1]
-    index = nearest(g.means, truth.means).index
+    index = nearest_neighbours(g.means, truth.means).index
     error = (g.sh[:, 0] - truth.sh[index, 0]).abs().mean(1) * C0
     assert error.median() < 0.05
 

@@ -15,7 +15,7 @@ from stages.core.raster.rasterise import rasterise
 from stages.core.scene.gaussians import concatenate
 from stages.core.scene.scene import Scene, SceneObject
 from stages.core.scene.scene_ply import read_scene, write_scene
-from stages.evaluate.clouds import chamfer, nearest
+from stages.evaluate.scenes import chamfer, nearest_neighbours
 from stages.lab.assets.shapes import ellipsoid
 from stages.refine.library import moved
 from stages.refine.options import RefineOptions
@@ -68,7 +68,7 @@ def whole(seen, folder) -> Scene:
 
 def test_the_thing_is_whole_where_it_was_not_seen(seen, whole, truth):
     before, after = (s.gaussians.means[s.gaussians.object_id == 1] for s in (seen, whole))
-    far = [chamfer(nearest(p, truth.means), nearest(truth.means, p)) for p in (before, after)]
+    far = [chamfer(nearest_neighbours(p, truth.means), nearest_neighbours(truth.means, p)) for p in (before, after)]
     assert far[1]["to_prediction"] < 0.2 * far[0]["to_prediction"]
     assert far[1]["to_truth"] < 0.01 * SIZE
 
@@ -76,7 +76,7 @@ def test_the_thing_is_whole_where_it_was_not_seen(seen, whole, truth):
 def test_it_is_as_dark_as_in_the_photos(whole, truth):
     g = whole.gaussians[whole.gaussians.object_id == 1]
     back = g[g.means[:, 1] > 0.045]
-    there = nearest(back.means, truth.means).index
+    there = nearest_neighbours(back.means, truth.means).index
     rgb, bright = (x.sh[:, 0] * C0 + 0.5 for x in (back, truth[there]))
     assert float(rgb.sum() / bright.sum()) == pytest.approx(DARK, abs=0.06)
 

@@ -10,9 +10,9 @@ import torch
 from stages.core.errors import InputError
 from stages.core.scene.images import read_image, read_labels, read_video, write_png
 from stages.core.scene.scene_ply import write_scene
-from stages.render.draw import depth_colours, depth_range, palette
+from stages.render.draw import colour_depth, depth_range, object_colours
 from stages.render.options import RenderOptions
-from stages.render.overlay import tile
+from stages.render.overlay import tile_images
 from stages.render.stage import run
 from tests.render.conftest import render_options
 from tests.render.motions import rising
@@ -135,11 +135,11 @@ def test_where_there_is_nothing_the_scene_says_what_to_show(tmp_path, two_balls)
 
 def test_ids_are_flat_and_keep_their_colours(scene, tmp_path):
     image = picture(scene, tmp_path / "ids.png", view="input:0", ids=True)
-    first, second = palette(torch.tensor([1, 2]))
+    first, second = object_colours(torch.tensor([1, 2]))
     assert share(image, first, 0.05) > 0.005 and share(image, second, 0.05) > 0.005
-    many = palette(torch.arange(1, 13))
+    many = object_colours(torch.arange(1, 13))
     assert (torch.cdist(many, many) + torch.eye(12)).min() > 0.12
-    assert torch.equal(palette(torch.tensor([9, 2]))[1], second)
+    assert torch.equal(object_colours(torch.tensor([9, 2]))[1], second)
 
 
 def test_depth_is_metric_in_a_png_and_coloured_in_a_film(scene, trajectory, tmp_path):
@@ -154,7 +154,7 @@ def test_depth_is_metric_in_a_png_and_coloured_in_a_film(scene, trajectory, tmp_
 
 
 def test_depth_colours_go_from_bright_to_dark():
-    image = depth_colours(torch.tensor([[1.0, 2.0, 3.0, 0.0]]), depth_range([torch.tensor([[1.0, 3.0]])]))
+    image = colour_depth(torch.tensor([[1.0, 2.0, 3.0, 0.0]]), depth_range([torch.tensor([[1.0, 3.0]])]))
     light = image.sum(-1)[0]
     assert light[0] > light[1] > light[2] > light[3] == 0
 
@@ -168,7 +168,7 @@ def test_arrows_are_drawn_while_a_force_acts(trajectory, tmp_path):
 
 
 def test_tiles_of_different_shape_stand_in_the_middle():
-    sheet = tile([torch.zeros(4, 4, 3), torch.zeros(2, 4, 3)], 2)
+    sheet = tile_images([torch.zeros(4, 4, 3), torch.zeros(2, 4, 3)], 2)
     assert sheet.shape == (4, 8, 3)
     assert sheet[:, 4:, 0].tolist() == [[1] * 4, [0] * 4, [0] * 4, [1] * 4]
 

@@ -174,7 +174,7 @@ def run(out: Path, only: str = "", sheet: Path | None = None) -> Iterator[str]:
     from stages.core.scene.scene import Scene
     from stages.core.scene.scene_ply import write_scene
     from stages.lab.assets.splat_files import view_of_table
-    from stages.render.overlay import tile
+    from stages.render.overlay import tile_images
 
     pictures = []
     names = [_known(name.strip()) for name in only.split(",") if name.strip()] or list(BACKGROUNDS)
@@ -187,4 +187,4 @@ def run(out: Path, only: str = "", sheet: Path | None = None) -> Iterator[str]:
             pictures.append(view_of_table(g, name))
         yield f"{name}: {len(g)} Gaussians"
     if sheet:
-        write_jpeg(sheet, tile(pictures, min(4, len(pictures))), 86)
+        write_jpeg(sheet, tile_images(pictures, min(4, len(pictures))), 86)

@@ -95,7 +95,7 @@ def run(
     from stages.core.scene.files import provenance
     from stages.core.scene.images import write_jpeg
     from stages.lab.assets.splat_files import portrait, write_object
-    from stages.render.overlay import tile
+    from stages.render.overlay import tile_images
 
     if meshes and options.only:
         raise InputError("--only names objects of the data set and --from meshes; give one of the two")
@@ -112,7 +112,7 @@ def run(
         sides = " x ".join(f"{side:.2f}" for side in (g.means.amax(0) - g.means.amin(0)).tolist())
         yield f"{name}: {len(g)} Gaussians, {sides}"
     if sheet:
-        write_jpeg(sheet, tile(pictures, min(5, len(pictures))), 88)
+        write_jpeg(sheet, tile_images(pictures, min(5, len(pictures))), 88)
 
 
 def _from_mesh(path: Path, options: ObjectsOptions) -> Gaussians:

@@ -19,7 +19,7 @@ from stages.core.scene.gaussians import Gaussians, concatenate
 from stages.core.scene.images import resize
 from stages.core.scene.scene import Scene, SceneObject
 from stages.core.scene.scene_ply import write_scene
-from stages.render.overlay import caption
+from stages.render.overlay import draw_caption
 
 PLY = "point_cloud/iteration_30000/point_cloud.ply"
 VIEWS, RESOLUTION = 100, 1280  # of cameras.json, as the data set renders
@@ -69,7 +69,7 @@ def _photo(g: Gaussians, eye: Tensor, target: Tensor, width: int, height: int, f
     """Drawn at twice the size, made smaller, and labelled."""
     K = intrinsics(2 * width, 2 * height, 2 * focal)
     drawn = rasterise(g, look_at(eye, target)[None], K[None], 2 * width, 2 * height, PAPER)
-    return caption(resize(drawn.rgb[0].clamp(0, 1), width, height), label)
+    return draw_caption(resize(drawn.rgb[0].clamp(0, 1), width, height), label)
 
 
 def _ground(g: Gaussians) -> Gaussians:

@@ -26,9 +26,9 @@ from stages.core.scene.gaussians import Gaussians, concatenate
 from stages.core.scene.scene import Scene, SceneObject
 from stages.core.scene.scene_ply import write_scene
 from stages.evaluate import trajectories
-from stages.evaluate.clouds import chamfer, nearest
+from stages.evaluate.images import psnr
 from stages.evaluate.options import EvaluateOptions
-from stages.evaluate.pictures import psnr
+from stages.evaluate.scenes import chamfer, nearest_neighbours
 from stages.lab.assets.objects import ObjectsOptions, make_object
 from stages.lab.assets.shapes import sheet, to_gaussians
 from stages.lab.bench import common as bench
@@ -113,7 +113,7 @@ def shown(scene: Scene) -> Bool[Tensor, "n"]:
 def distance(scene: Scene, true: Scene) -> float:
     """Chamfer distance of the objects [mm], mean of both directions."""
     a, b = (s.gaussians.means[s.gaussians.object_id > 0] for s in (scene, true))
-    return 1000 * chamfer(nearest(a, b), nearest(b, a))["chamfer"]
+    return 1000 * chamfer(nearest_neighbours(a, b), nearest_neighbours(b, a))["chamfer"]
 
 
 @torch.no_grad()

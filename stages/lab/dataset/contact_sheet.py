@@ -29,9 +29,9 @@ from stages.lab.dataset.layout import Layout, kind_of
 from stages.lab.dataset.motions import Motions, read_motions
 from stages.lab.dataset.particles import at_prior
 from stages.lab.dataset.scenes import Config, read_configs
-from stages.render.backdrop import Backdrop
-from stages.render.draw import look
-from stages.render.overlay import caption, tile
+from stages.render.background import RenderBackground
+from stages.render.draw import render_view
+from stages.render.overlay import draw_caption, tile_images
 
 MOMENTS, SIDE = 6, 200  # pictures in a row, and their size [px]
 STEP = 12  # of the orbit from one row to the next, so that scenes are seen from all sides
@@ -62,9 +62,9 @@ def write_sheet(data: Path, out: Path, options: SheetOptions) -> None:
     table = cache(lambda name: _table(layout, name).to(device))
     chosen = tqdm(_chosen(layout, groups, options.count), total=options.count, desc="sheet", unit="scene")
     for row, (config, motions) in enumerate(chosen):
-        backdrop = Backdrop(own=False, gaussians=table(list(BACKGROUNDS)[row % len(BACKGROUNDS)]))
+        backdrop = RenderBackground(keep_scene=False, gaussians=table(list(BACKGROUNDS)[row % len(BACKGROUNDS)]))
         pictures += _row(config, motions, body, backdrop, STEP * row % 100, device)
-    write_jpeg(out, tile(pictures, MOMENTS), 88)
+    write_jpeg(out, tile_images(pictures, MOMENTS), 88)
 
 
 def _chosen(layout: Layout, groups: Sequence[str], count: int) -> Iterator[tuple[Config, Motions]]:
@@ -77,7 +77,9 @@ def _chosen(layout: Layout, groups: Sequence[str], count: int) -> Iterator[tuple
             yield configs[motions.names[at]], motions[slice(at, at + 1)]
 
 
-def _row(config: Config, m: Motions, body, backdrop: Backdrop, view: int, device: str) -> list[Float[Tensor, "h w 3"]]:
+def _row(
+    config: Config, m: Motions, body, backdrop: RenderBackground, view: int, device: str
+) -> list[Float[Tensor, "h w 3"]]:
     parts = []
     for n, (i, p) in enumerate(zip(config.ids, config.translation, strict=True), start=1):
         g = body(kind_of(i).name)
@@ -91,8 +93,8 @@ def _row(config: Config, m: Motions, body, backdrop: Backdrop, view: int, device
     cameras, out = cameras_around(SIDE), []
     for k in range(MOMENTS):
         t = round(k * (len(points) - 1) / (MOMENTS - 1))
-        image = look(backdrop.around(skinning(points[t])), cameras, view, backdrop).image
-        out.append(caption(image, f"{config.name}  {t * m.dt:.2f} s" if k == 0 else f"{t * m.dt:.2f} s"))
+        image = render_view(backdrop.compose(skinning(points[t])), cameras, view, backdrop).image
+        out.append(draw_caption(image, f"{config.name}  {t * m.dt:.2f} s" if k == 0 else f"{t * m.dt:.2f} s"))
     return out
 
 

@@ -35,8 +35,8 @@ from stages.lab.dataset.dynamic_gaussians import Carried
 from stages.lab.dataset.layout import ORBIT, kind_of
 from stages.lab.dataset.particles import FRAME
 from stages.lab.dataset.scenes import Config
-from stages.render.backdrop import Backdrop
-from stages.render.draw import look
+from stages.render.background import RenderBackground
+from stages.render.draw import render_view
 
 FPS = 1 / FRAME
 
@@ -45,11 +45,11 @@ def write_initial(
     folder: Path, config: Config, rest: Gaussians, behind: Gaussians, resolution: int, views: Sequence[int]
 ) -> None:
     """What is known of a scene before it moves; `behind` is the background, on the same device."""
-    cameras, backdrop = cameras_around(resolution), Backdrop(own=False, gaussians=behind)
-    shown, depths = backdrop.around(rest), []
+    cameras, backdrop = cameras_around(resolution), RenderBackground(keep_scene=False, gaussians=behind)
+    shown, depths = backdrop.compose(rest), []
     with VideoWriter(folder / f"{config.name}.mp4", FPS) as video:
         for i in range(ORBIT):
-            seen = look(shown, cameras, i, backdrop)
+            seen = render_view(shown, cameras, i, backdrop)
             video.append(seen.image)
             if i in views:
                 depths.append(seen.depth)
@@ -88,15 +88,15 @@ def write_dynamic(
     resolution: int,
 ) -> None:  # fmt: skip
     """A video of each view in `paths`; pictures are encoded by threads while the next are drawn."""
-    cameras, backdrop = cameras_around(resolution), Backdrop(own=False, gaussians=behind)
+    cameras, backdrop = cameras_around(resolution), RenderBackground(keep_scene=False, gaussians=behind)
     for path in paths.values():
         path.parent.mkdir(parents=True, exist_ok=True)
     with ExitStack() as stack, ThreadPoolExecutor(len(paths)) as pool:
         videos = [stack.enter_context(VideoWriter(path, FPS)) for path in paths.values()]
         before: Iterator[None] = iter(())
         for places, gradients in zip(x, F, strict=True):
-            shown = backdrop.around(scene.at(places, gradients)[0])
-            images = [look(shown, cameras, i, backdrop).image for i in paths]
+            shown = backdrop.compose(scene.at(places, gradients)[0])
+            images = [render_view(shown, cameras, i, backdrop).image for i in paths]
             list(before)  # frames of a video are encoded in their order
             before = pool.map(VideoWriter.append, videos, images)
         list(before)

@@ -23,7 +23,7 @@ SECONDS, FPS = 4.0, 30.0  # of a film in which only the camera moves
 
 
 @dataclass(frozen=True)
-class Footage:
+class Animation:
     """Gaussians at any time from 0 to `duration` [s]."""
 
     scene: Scene
@@ -77,7 +77,7 @@ class Footage:
         return values[first] if index == first else torch.lerp(values[first], values[last], index - first)
 
 
-def open_footage(source: Path, frame: int | None = None, device: str = "cpu") -> Footage:
+def open_animation(source: Path, frame: int | None = None, device: str = "cpu") -> Animation:
     """A trajectory or a scene, by the file's ending; `frame` stops a trajectory there (negative: from the end)."""
     source = Path(source)
     suffix = source.suffix.lower()
@@ -87,9 +87,9 @@ def open_footage(source: Path, frame: int | None = None, device: str = "cpu") ->
     if suffix == ".ply":
         if frame is not None:
             raise InputError(f"--frame {frame}: {source} is a scene at rest and has no frames; leave it out")
-        return Footage(read_scene(source))
+        return Animation(read_scene(source))
     trajectory = read_trajectory(source)
     count = len(trajectory)
     if frame is not None and not -count <= frame < count:
         raise InputError(f"--frame {frame}: {source} has frames 0 to {count - 1} (or -1 for the last)")
-    return Footage(trajectory.scene, trajectory, None if frame is None else frame % count, device)
+    return Animation(trajectory.scene, trajectory, None if frame is None else frame % count, device)

@@ -22,20 +22,20 @@ WHITE = (1.0, 1.0, 1.0)
 
 
 @dataclass(frozen=True)
-class Backdrop:
-    """`own`: keep the scene's background Gaussians; without, they make way for `gaussians`, `photo` or `colour`."""
+class RenderBackground:
+    """The scene's own background Gaussians (`keep_scene`), or their replacement: `gaussians`, `photo` or `colour`."""
 
-    own: bool = True
+    keep_scene: bool = True
     gaussians: Gaussians | None = None
     photo: Float[Tensor, "h w 3"] | None = None
     colour: tuple[float, float, float] = WHITE
 
-    def around(self, g: Gaussians) -> Gaussians:
+    def compose(self, g: Gaussians) -> Gaussians:
         """What is to be drawn when the scene holds `g`; a scene without objects is kept whole."""
-        objects = g if self.own or not (g.object_id > 0).any() else g[g.object_id > 0]
+        objects = g if self.keep_scene or not (g.object_id > 0).any() else g[g.object_id > 0]
         return objects if self.gaussians is None else concatenate([self.gaussians.to(g.means.device), objects])
 
-    def behind(self, width: int, height: int) -> Float[Tensor, "h w 3"]:
+    def image(self, width: int, height: int) -> Float[Tensor, "h w 3"]:
         """The picture seen where nothing stands in front; a photo covers it, centred."""
         if self.photo is None:
             return torch.tensor(self.colour).expand(height, width, 3)
@@ -46,12 +46,12 @@ class Backdrop:
         return grown[top : top + height, left : left + width]
 
 
-def open_backdrop(choice: str | None, scene: Scene) -> Backdrop:
+def open_background(choice: str | None, scene: Scene) -> RenderBackground:
     """From the value of --background; of a scene with objects only what belongs to none of them is taken."""
     if choice is None:
-        return Backdrop(colour=scene.background or WHITE)
+        return RenderBackground(colour=scene.background or WHITE)
     if choice.startswith("#"):
-        return Backdrop(own=False, colour=hex_colour(choice))
+        return RenderBackground(keep_scene=False, colour=hex_colour(choice))
     suffix = Path(choice).suffix.lower()
     if suffix == ".ply":
         g = read_scene(Path(choice)).gaussians
@@ -59,7 +59,7 @@ def open_backdrop(choice: str | None, scene: Scene) -> Backdrop:
             g = g[g.object_id == 0]
         else:
             log.info("%s: all of its Gaussians belong to objects; all of them form the background", choice)
-        return Backdrop(own=False, gaussians=g)
+        return RenderBackground(keep_scene=False, gaussians=g)
     if suffix in PHOTOS:
-        return Backdrop(own=False, photo=read_image(Path(choice)))
+        return RenderBackground(keep_scene=False, photo=read_image(Path(choice)))
     raise InputError(f"--background {choice}: give a scene.ply, a colour such as #336699, or a photo")

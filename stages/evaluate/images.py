@@ -15,7 +15,7 @@ from tqdm import tqdm
 from stages.core.errors import InputError
 from stages.core.scene.images import VIDEOS, list_photos, read_image, read_video, video_info
 from stages.evaluate.options import EvaluateOptions
-from stages.evaluate.result import Curve, Pair, Result
+from stages.evaluate.result import Curve, ImagePair, Result
 
 WINDOW, SIGMA = 11, 1.5  # of SSIM [px]
 SHOWN = 4  # pairs of frames in the report
@@ -66,7 +66,7 @@ def compare(prediction: Path, truth: Path, options: EvaluateOptions) -> Result:
         _check_sizes(prediction, truth, mine, true)
         scores.append((psnr(mine, true), ssim(mine, true)))
         if i in chosen:
-            pairs.append(Pair(f"frame {i}: PSNR {scores[-1][0]:.2f} dB, SSIM {scores[-1][1]:.3f}", mine, true))
+            pairs.append(ImagePair(f"frame {i}: PSNR {scores[-1][0]:.2f} dB, SSIM {scores[-1][1]:.3f}", mine, true))
     if options.frames is not None and len(scores) < options.frames:
         raise InputError(f"--frames {options.frames}: both have only {len(scores)} frames; give {len(scores)} or fewer")
     if options.frames is not None:

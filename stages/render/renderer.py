@@ -14,13 +14,13 @@ from stages.core.errors import InputError
 from stages.core.geometry.cameras import centres
 from stages.core.scene.cameras import Cameras
 from stages.core.scene.gaussians import Gaussians
-from stages.render.backdrop import Backdrop
-from stages.render.draw import Seen, depth_colours, false_colour, look
-from stages.render.footage import Footage
+from stages.render.animation import Animation
+from stages.render.background import RenderBackground
+from stages.render.camera_paths import camera_path, scale_cameras
+from stages.render.draw import RenderedView, colour_by_object, colour_depth, render_view
 from stages.render.options import RenderOptions
-from stages.render.overlay import arrows_at, caption, columns_for, draw_arrows, tile
-from stages.render.paths import camera_path, scaled
-from stages.render.subject import Subject, joint, subject_of
+from stages.render.overlay import draw_arrows, draw_caption, force_arrows, grid_columns, tile_images
+from stages.render.subject import Subject, find_subject, merge_subjects
 
 log = logging.getLogger(__name__)
 SAME = 1e-3  # cameras of one world agree to this share of their distance from each other
@@ -29,12 +29,12 @@ Image = Float[Tensor, "h w 3"]
 
 
 @dataclass(frozen=True)
-class Take:
+class Clip:
     """One film as it is shown: its footage with what stands behind it."""
 
-    footage: Footage
+    footage: Animation
     options: RenderOptions
-    backdrop: Backdrop
+    backdrop: RenderBackground
     device: str
     name: str = ""  # written below it when there are several
 
@@ -46,29 +46,29 @@ class Take:
         return self._prepared(self.footage.gaussians(0.0))
 
     def _prepared(self, gaussians: Gaussians) -> Gaussians:
-        shown = self.backdrop.around(gaussians.to(self.device))
-        return false_colour(shown) if self.options.ids else shown
+        shown = self.backdrop.compose(gaussians.to(self.device))
+        return colour_by_object(shown) if self.options.ids else shown
 
-    def seen(self, time: float, cameras: Cameras, indices: list[int]) -> list[Seen]:
+    def seen(self, time: float, cameras: Cameras, indices: list[int]) -> list[RenderedView]:
         """What some of the cameras see at a time, with arrows where they are asked for."""
         gaussians = self.scene_at(time)
-        views = [look(gaussians, cameras, i, self.backdrop) for i in indices]
+        views = [render_view(gaussians, cameras, i, self.backdrop) for i in indices]
         if self.options.show_forces:
-            arrows = arrows_at(self.footage, time)
+            arrows = force_arrows(self.footage, time)
             images = [draw_arrows(v.image, cameras, i, arrows) for v, i in zip(views, indices, strict=True)]
             views = [v._replace(image=image) for v, image in zip(views, images, strict=True)]
         return views
 
 
 @dataclass(frozen=True)
-class Studio:
+class Renderer:
     """One or several takes, which stand side by side in every picture."""
 
-    takes: Sequence[Take]
+    takes: Sequence[Clip]
     options: RenderOptions
 
     @cached_property
-    def longest(self) -> Footage:
+    def longest(self) -> Animation:
         """The footage that decides how long to film; a shorter one stands still when it has ended."""
         return max((take.footage for take in self.takes), key=lambda footage: footage.duration)
 
@@ -86,10 +86,10 @@ class Studio:
         """For each take a viewpoint a frame; for "all", every stored one. Takes of one world share their viewpoints."""
         footages = [take.footage for take in self.takes]
         stored = [footage.scene.cameras for footage in footages]
-        subjects = [subject_of(footage) for footage in footages]
+        subjects = [find_subject(footage) for footage in footages]
         first = next((c for c in stored if c is not None), None)
         if all(c is None or _agree(first, c) for c in stored):
-            return [self._path(first, joint(subjects), frames, resolution)] * len(footages)
+            return [self._path(first, merge_subjects(subjects), frames, resolution)] * len(footages)
         log.warning("the files hold different worlds (their cameras differ): each is filmed by a camera of its own")
         paths = [self._path(c, subject, frames, resolution) for c, subject in zip(stored, subjects, strict=True)]
         if len({len(path) for path in paths}) > 1:
@@ -101,28 +101,29 @@ class Studio:
             return camera_path(self.options.view, stored, subject, frames, resolution)
         if stored is None:
             raise InputError("--view all: the file holds no cameras; use --view novel or --view orbit")
-        return scaled(stored, max(16, 2 * resolution // columns_for(len(stored))))
+        return scale_cameras(stored, max(16, 2 * resolution // grid_columns(len(stored))))
 
-    def seen(self, time: float, cameras: list[Cameras], indices: list[int]) -> list[list[Seen]]:
+    def seen(self, time: float, cameras: list[Cameras], indices: list[int]) -> list[list[RenderedView]]:
         """What some of the cameras see at a time: for each of them, the views of the takes."""
         rows = [take.seen(time, c, indices) for take, c in zip(self.takes, cameras, strict=True)]
         return [list(views) for views in zip(*rows, strict=True)]
 
     def picture(
-        self, views: list[list[Seen]], span: tuple[float, float] | None, columns: int = 1, captions: Sequence[str] = ()
-    ) -> Image:
+        self, views: list[list[RenderedView]], span: tuple[float, float] | None, columns: int = 1,
+        captions: Sequence[str] = (),
+    ) -> Image:  # fmt: skip
         """Views in rows, in colour, or as depth between the bounds of `span`; each may have a caption."""
         images = [self._side_by_side(row, span) for row in views]
         if captions:
-            images = [caption(image, text) for image, text in zip(images, captions, strict=True)]
-        return images[0] if len(images) == 1 else tile(images, columns)
+            images = [draw_caption(image, text) for image, text in zip(images, captions, strict=True)]
+        return images[0] if len(images) == 1 else tile_images(images, columns)
 
-    def _side_by_side(self, row: list[Seen], span: tuple[float, float] | None) -> Image:
-        images = [v.image if span is None else depth_colours(v.depth, span) for v in row]
+    def _side_by_side(self, row: list[RenderedView], span: tuple[float, float] | None) -> Image:
+        images = [v.image if span is None else colour_depth(v.depth, span) for v in row]
         if len(images) == 1:
             return images[0]
-        images = [caption(image, take.name, below=True) for image, take in zip(images, self.takes, strict=True)]
-        return tile(images, len(images))
+        images = [draw_caption(image, take.name, below=True) for image, take in zip(images, self.takes, strict=True)]
+        return tile_images(images, len(images))
 
 
 def _agree(a: Cameras, b: Cameras) -> bool:

@@ -12,7 +12,7 @@ from stages.core.errors import InputError
 from stages.core.geometry.cameras import centres, intrinsics, look_at, resize
 from stages.core.scene.cameras import Cameras
 from stages.render.pan import pan
-from stages.render.path_file import follow, read_path
+from stages.render.path_file import interpolate_cameras, read_camera_path
 from stages.render.subject import Subject
 
 ARC = 30.0  # longest sweep of the novel view [degrees]
@@ -27,32 +27,32 @@ ZOOM = (0.95, 1.6)  # how far the focal length may leave that of the photos: bey
 def camera_path(view: str, cameras: Cameras | None, subject: Subject, frames: int, resolution: int) -> Cameras:
     """`frames` viewpoints for any view but "all"; raises InputError for a camera or file that is not there."""
     if view.startswith("input:"):
-        return held(cameras, find_camera(cameras, view[6:]), frames, resolution)
+        return fixed_camera(cameras, find_camera(cameras, view[6:]), frames, resolution)
     if view.lower().endswith(".json"):
-        return follow(scaled(read_path(view), resolution), frames)
-    make = {"novel": novel, "orbit": orbit}[view]
+        return interpolate_cameras(scale_cameras(read_camera_path(view), resolution), frames)
+    make = {"novel": novel_path, "orbit": orbit_path}[view]
     return make(cameras, subject, frames, resolution)
 
 
-def phases(frames: int) -> Float[Tensor, "t"]:
+def ease_in_out(frames: int) -> Float[Tensor, "t"]:
     """From 0 to 1, starting and stopping gently; a single frame stands in the middle."""
     u = torch.linspace(0, 1, frames) if frames > 1 else torch.tensor([0.5])
     return 0.5 - 0.5 * torch.cos(math.pi * u)
 
 
-def novel(cameras: Cameras | None, subject: Subject, frames: int, resolution: int) -> Cameras:
+def novel_path(cameras: Cameras | None, subject: Subject, frames: int, resolution: int) -> Cameras:
     """A gentle arc among the photos' viewpoints, slightly above them; without photos, part of an orbit."""
     if cameras is None:
-        azimuth = math.radians(-60) + math.radians(2 * ARC) * (phases(frames) - 0.5)
+        azimuth = math.radians(-60) + math.radians(2 * ARC) * (ease_in_out(frames) - 0.5)
         return _around(None, subject, azimuth, torch.full_like(azimuth, math.radians(ELEVATION)), None, resolution)
-    azimuth, elevation, distance = polar(cameras, subject)
+    azimuth, elevation, distance = spherical_coordinates(cameras, subject)
     turn = (azimuth - azimuth[:, None] + math.pi).remainder(2 * math.pi) - math.pi  # of camera j seen from camera i
     middle = int((turn.abs() < math.radians(NEAR)).sum(1).argmax())
     group = turn[middle].abs() < math.radians(NEAR)
     turn, elevation, distance = turn[middle][group], elevation[group], distance[group]
     low, high = float(turn.min()), float(turn.max())
     half = min(max(0.3 * (high - low), math.radians(4)), math.radians(ARC / 2))
-    along = (low + high) / 2 + half * (2 * phases(frames) - 1)
+    along = (low + high) / 2 + half * (2 * ease_in_out(frames) - 1)
     weight = torch.exp(-0.5 * ((along[:, None] - turn) / max(half, math.radians(5))) ** 2) + 1e-9
     weight = weight / weight.sum(1, keepdim=True)
     height = weight @ elevation
@@ -60,18 +60,18 @@ def novel(cameras: Cameras | None, subject: Subject, frames: int, resolution: in
     return _around(cameras, subject, azimuth[middle] + along, height + aside, weight @ distance, resolution)
 
 
-def orbit(cameras: Cameras | None, subject: Subject, frames: int, resolution: int) -> Cameras:
+def orbit_path(cameras: Cameras | None, subject: Subject, frames: int, resolution: int) -> Cameras:
     """Once around the subject, as high and as far as the photos were taken in the median."""
     azimuth = math.radians(-60) + 2 * math.pi * torch.arange(frames) / frames
     elevation, distance = torch.full((frames,), math.radians(ELEVATION)), None
     if cameras is not None:
-        _, heights, distances = polar(cameras, subject)
+        _, heights, distances = spherical_coordinates(cameras, subject)
         elevation = elevation * 0 + float(heights.median().clamp(math.radians(10), math.radians(60)))
         distance = elevation * 0 + float(distances.median())
     return _around(cameras, subject, azimuth, elevation, distance, resolution)
 
 
-def polar(cameras: Cameras, subject: Subject) -> tuple[Tensor, Tensor, Tensor]:
+def spherical_coordinates(cameras: Cameras, subject: Subject) -> tuple[Tensor, Tensor, Tensor]:
     """Azimuth, elevation [rad] and distance of each camera as the subject sees it."""
     offset = centres(cameras.viewmats).cpu() - subject.target
     distance = offset.norm(dim=1).clamp_min(1e-9)
@@ -121,14 +121,14 @@ def _lens(cameras: Cameras | None, resolution: int) -> tuple[int, int, float]:
     return _even(w * factor), _even(h * factor), float(focal) * resolution
 
 
-def held(cameras: Cameras, index: int, frames: int, resolution: int) -> Cameras:
+def fixed_camera(cameras: Cameras, index: int, frames: int, resolution: int) -> Cameras:
     """One stored camera, for all frames."""
-    one = scaled(cameras[[index]], resolution)
+    one = scale_cameras(cameras[[index]], resolution)
     width, height = one.sizes[0].tolist()
     return _repeat(one.viewmats.expand(frames, 4, 4), one.Ks[0], width, height, one.names[0])
 
 
-def scaled(cameras: Cameras, resolution: int) -> Cameras:
+def scale_cameras(cameras: Cameras, resolution: int) -> Cameras:
     """The same views with pictures whose longest side is `resolution`; sides are even, as videos need."""
     Ks, sizes = [], []
     for K, (w, h) in zip(cameras.Ks, cameras.sizes.tolist(), strict=True):

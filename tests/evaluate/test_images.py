@@ -6,8 +6,8 @@ from scipy.ndimage import gaussian_filter
 
 from stages.core.errors import InputError
 from stages.core.scene.images import VideoWriter, write_png
+from stages.evaluate.images import psnr, ssim
 from stages.evaluate.options import EvaluateOptions
-from stages.evaluate.pictures import psnr, ssim
 from stages.evaluate.stage import run
 
 

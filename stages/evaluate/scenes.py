@@ -16,8 +16,8 @@ from stages.core.geometry.neighbours import knn
 from stages.core.scene.gaussians import Gaussians
 from stages.core.scene.scene import Scene
 from stages.core.scene.scene_ply import read_scene
-from stages.evaluate.align import World, alignment, check_same_world
-from stages.evaluate.matching import labels
+from stages.evaluate.align import ReferenceFrame, check_same_reference_frame, find_alignment
+from stages.evaluate.matching import object_labels
 from stages.evaluate.options import EvaluateOptions
 from stages.evaluate.result import Result
 
@@ -25,19 +25,19 @@ SOLID = 0.1  # opacity above which a Gaussian is part of a surface
 
 
 @dataclass(frozen=True)
-class Nearest:
+class NearestNeighbours:
     """For each point of one cloud, the nearest of the other."""
 
     distance: Float[Tensor, "n"]
     index: Int[Tensor, "n"]
 
 
-def nearest(points: Float[Tensor, "n 3"], others: Float[Tensor, "m 3"]) -> Nearest:
+def nearest_neighbours(points: Float[Tensor, "n 3"], others: Float[Tensor, "m 3"]) -> NearestNeighbours:
     distance, index = knn(others, points, 1)
-    return Nearest(distance[:, 0], index[:, 0])
+    return NearestNeighbours(distance[:, 0], index[:, 0])
 
 
-def chamfer(there: Nearest, back: Nearest) -> dict[str, float]:
+def chamfer(there: NearestNeighbours, back: NearestNeighbours) -> dict[str, float]:
     """Mean distance to the nearest point in each direction, and the mean of the two [units].
 
     Prediction to truth is large where something was invented, truth to prediction where something is missing.
@@ -46,14 +46,14 @@ def chamfer(there: Nearest, back: Nearest) -> dict[str, float]:
     return {"chamfer": (forth + home) / 2, "to_truth": forth, "to_prediction": home}
 
 
-def colours(g: Gaussians) -> Float[Tensor, "n 3"]:
+def base_colours(g: Gaussians) -> Float[Tensor, "n 3"]:
     """Colour of each Gaussian without its dependence on the direction of view."""
     return (g.sh[:, 0] * C0 + 0.5).clamp(0, 1)
 
 
-def colour_error(mine: Gaussians, true: Gaussians, there: Nearest, back: Nearest) -> float:
+def colour_error(mine: Gaussians, true: Gaussians, there: NearestNeighbours, back: NearestNeighbours) -> float:
     """Mean absolute difference of RGB (0..1) between nearest neighbours, both directions alike."""
-    a, b = colours(mine), colours(true)
+    a, b = base_colours(mine), base_colours(true)
     return float(((a - b[there.index]).abs().mean() + (b - a[back.index]).abs().mean()) / 2)
 
 
@@ -80,17 +80,17 @@ def label_iou(predicted: Int[Tensor, "n"], true: Int[Tensor, "n"]) -> dict[int, 
 def compare(prediction: Path, truth: Path, options: EvaluateOptions) -> Result:
     """Chamfer, colour and, where both have objects, labels."""
     scenes = [read_scene(prediction), read_scene(truth)]
-    worlds = [world_of(path, scene) for path, scene in zip((prediction, truth), scenes, strict=True)]
+    worlds = [scene_reference_frame(path, scene) for path, scene in zip((prediction, truth), scenes, strict=True)]
     mine, true = (_solid(path, s) for path, s in zip((prediction, truth), scenes, strict=True))
     notes = [f"only Gaussians of opacity above {SOLID} count"]
     means = mine.means
     if options.align:
-        similarity, how = alignment(*worlds)
+        similarity, how = find_alignment(*worlds)
         means = similarity(means)
         notes.append(how)
     else:
-        check_same_world(*worlds, [])
-    there, back = nearest(means, true.means), nearest(true.means, means)
+        check_same_reference_frame(*worlds, [])
+    there, back = nearest_neighbours(means, true.means), nearest_neighbours(true.means, means)
     overall = {**chamfer(there, back), "colour": colour_error(mine, true, there, back), "Gaussians": len(mine)}
     parts: dict[str, dict[str, float]] = {}
     if (mine.object_id > 0).any() and (true.object_id > 0).any():
@@ -102,16 +102,16 @@ def compare(prediction: Path, truth: Path, options: EvaluateOptions) -> Result:
 def _labels(scenes: list[Scene], predicted: Tensor, true: Tensor, notes: list[str]) -> dict[str, dict[str, float]]:
     """One row a true object, and a note of what each was matched to."""
     matched = label_iou(predicted, true)
-    mine, names = ({o.id: n for o, n in zip(s.objects, labels(list(s.objects)), strict=True)} for s in scenes)
+    mine, names = ({o.id: n for o, n in zip(s.objects, object_labels(list(s.objects)), strict=True)} for s in scenes)
     found = ", ".join(f"{names[i]} = {mine.get(j, 'nothing')}" for i, (j, _) in matched.items())
     notes.append(f"each true Gaussian takes the label of the nearest predicted one; matched {found}")
     return {names[i]: {"IoU": iou} for i, (_, iou) in matched.items()}
 
 
-def world_of(path: Path, scene: Scene) -> World:
+def scene_reference_frame(path: Path, scene: Scene) -> ReferenceFrame:
     g = scene.gaussians
     points = {o.id: g.means[g.object_id == o.id] for o in scene.objects}
-    return World(str(path), scene.cameras, tuple(o for o in scene.objects if len(points[o.id])), points)
+    return ReferenceFrame(str(path), scene.cameras, tuple(o for o in scene.objects if len(points[o.id])), points)
 
 
 def _solid(path: Path, scene: Scene) -> Gaussians:

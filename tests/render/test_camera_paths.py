@@ -8,10 +8,10 @@ import torch
 from stages.core.backends import pick_device
 from stages.core.errors import InputError
 from stages.core.geometry.cameras import centres, depths, project
-from stages.render.footage import Footage, open_footage
-from stages.render.path_file import follow, read_path
-from stages.render.paths import camera_path, find_camera
-from stages.render.subject import Subject, aim, common, extent, subject_of
+from stages.render.animation import Animation, open_animation
+from stages.render.camera_paths import camera_path, find_camera
+from stages.render.path_file import interpolate_cameras, read_camera_path
+from stages.render.subject import Subject, axes_focus, common_view_centre, find_subject, robust_box
 from tests.conftest import ring
 from tests.render.motions import rising
 
@@ -97,7 +97,7 @@ def test_path_files_in_both_forms_agree(tmp_path):
     (tmp_path / "b.json").write_text(
         json.dumps([{"viewmat": v.tolist(), "K": K, "size": [640, 480]} for v in cameras.viewmats])
     )
-    a, b = read_path(tmp_path / "a.json"), read_path(tmp_path / "b.json")
+    a, b = read_camera_path(tmp_path / "a.json"), read_camera_path(tmp_path / "b.json")
     torch.testing.assert_close(a.viewmats, b.viewmats, atol=1e-5, rtol=0)
     torch.testing.assert_close(a.viewmats, cameras.viewmats, atol=1e-5, rtol=0)
     assert torch.equal(a.Ks, b.Ks) and torch.equal(a.sizes, b.sizes)
@@ -105,7 +105,7 @@ def test_path_files_in_both_forms_agree(tmp_path):
 
 def test_a_path_passes_through_its_cameras_and_a_single_one_stands_still(tmp_path):
     cameras = ring(5)
-    through = follow(cameras, 17)
+    through = interpolate_cameras(cameras, 17)
     torch.testing.assert_close(through.viewmats[::4], cameras.viewmats, atol=1e-5, rtol=0)
     R = through.viewmats[:, :3, :3]
     torch.testing.assert_close(R @ R.mT, torch.eye(3).expand(17, 3, 3), atol=1e-5, rtol=0)
@@ -126,52 +126,53 @@ def test_a_path_passes_through_its_cameras_and_a_single_one_stands_still(tmp_pat
 def test_a_path_file_that_cannot_be_followed(tmp_path, text, says):
     (tmp_path / "p.json").write_text(text)
     with pytest.raises(InputError, match=says) as caught:
-        read_path(tmp_path / "p.json")
+        read_camera_path(tmp_path / "p.json")
     assert "\n" not in str(caught.value)
 
 
 def test_extent_does_not_mind_stray_points():
     points = torch.rand(10_000, 3, generator=torch.Generator().manual_seed(0))
     points[:100] += 1000
-    found = extent(points)
+    found = robust_box(points)
     assert (found.centre - 0.5).abs().max() < 0.02
     assert found.half.tolist() == pytest.approx([0.5] * 3, rel=0.03)
 
 
 def test_cameras_aim_at_a_point(two_balls):
-    found = aim(ring(8, target=0.3))
+    found = axes_focus(ring(8, target=0.3))
     np.testing.assert_allclose(found.centre.numpy(), [0, 0, 0.3], atol=1e-4)
-    assert aim(two_balls.cameras[[0, 0]]) is None  # one axis has no point of its own
+    assert axes_focus(two_balls.cameras[[0, 0]]) is None  # one axis has no point of its own
     line = two_balls.cameras[[0, 0, 0]]
     line.viewmats[:, 0, 3] += torch.tensor([-0.1, 0.0, 0.1])  # side by side, looking the same way
     g = two_balls.gaussians
-    assert aim(line) is None and common(line, g[g.object_id > 0].means).centre[2] == pytest.approx(0.25, abs=0.15)
-    assert (subject_of(Footage(two_balls)).centre - torch.tensor([0.05, 0.0, 0.25])).abs().max() < 0.15
+    assert axes_focus(line) is None
+    assert common_view_centre(line, g[g.object_id > 0].means).centre[2] == pytest.approx(0.25, abs=0.15)
+    assert (find_subject(Animation(two_balls)).centre - torch.tensor([0.05, 0.0, 0.25])).abs().max() < 0.15
 
 
 def test_an_object_far_from_where_the_photos_look_is_scenery(two_balls):
     g = two_balls.gaussians
     means = g.means.clone()
     means[g.object_id == 2] += torch.tensor([3.0, 0.0, 0.0])
-    found = subject_of(Footage(replace(two_balls, gaussians=replace(g, means=means))))
+    found = find_subject(Animation(replace(two_balls, gaussians=replace(g, means=means))))
     assert (found.centre - torch.tensor([-0.3, 0.0, 0.15])).abs().max() < 0.02
     alone = replace(two_balls, gaussians=replace(g, means=means), cameras=None)
-    assert float(subject_of(Footage(alone)).half[0]) > 1.5
+    assert float(find_subject(Animation(alone)).half[0]) > 1.5
 
 
 def test_objects_pull_the_aim_of_the_photos_only_a_little(two_balls):
-    found = subject_of(Footage(replace(two_balls, cameras=ring(6, target=-0.4))))
+    found = find_subject(Animation(replace(two_balls, cameras=ring(6, target=-0.4))))
     assert float(found.centre[2]) == pytest.approx(0.26, abs=0.05)
     assert -0.2 < float(found.target[2]) < 0.0  # from -0.4 toward 0.26, as far as 0.35 of two thirds
 
 
 def test_what_is_lifted_is_in_the_picture_from_the_start(tmp_path, two_balls):
     # the balls fall by 0.6 within a twentieth of the film, to where the cameras look
-    footage = open_footage(rising(tmp_path / "t.h5", two_balls, 40, 0.0), None, pick_device("auto"))
+    footage = open_animation(rising(tmp_path / "t.h5", two_balls, 40, 0.0), None, pick_device("auto"))
     positions = footage.trajectory.positions.clone()
     positions[:2, :, 2] += torch.tensor([[0.6], [0.3]])
     footage = replace(footage, trajectory=replace(footage.trajectory, positions=positions))
-    path = camera_path("novel", two_balls.cameras, subject_of(footage), 40, 640)
+    path = camera_path("novel", two_balls.cameras, find_subject(footage), 40, 640)
     for i in range(40):
         inside = ((project(positions[i], path.viewmats[i], path.Ks[i]) / path.sizes[i] - 0.5).abs() < 0.5).all(1)
         assert float(inside.float().mean()) > 0.95
@@ -180,12 +181,12 @@ def test_what_is_lifted_is_in_the_picture_from_the_start(tmp_path, two_balls):
 @pytest.mark.parametrize("jump", [(0.0, 0.0, 0.9), (0.5, -0.5, 0.0)], ids=["high up", "to the side"])
 def test_what_moves_stays_in_the_picture_however_far(tmp_path, two_balls, jump):
     """Far above what the photos show, or far to the side of it, and back."""
-    footage = open_footage(rising(tmp_path / "t.h5", two_balls, 40, 0.0), None, pick_device("auto"))
+    footage = open_animation(rising(tmp_path / "t.h5", two_balls, 40, 0.0), None, pick_device("auto"))
     positions = footage.trajectory.positions.clone()
     positions += 4 * (torch.linspace(0, 1, 40) - torch.linspace(0, 1, 40) ** 2)[:, None, None] * torch.tensor(jump)
     footage = replace(footage, trajectory=replace(footage.trajectory, positions=positions))
-    still = camera_path("novel", two_balls.cameras, subject_of(Footage(two_balls)), 40, 640)
-    path = camera_path("novel", two_balls.cameras, subject_of(footage), 40, 640)
+    still = camera_path("novel", two_balls.cameras, find_subject(Animation(two_balls)), 40, 640)
+    path = camera_path("novel", two_balls.cameras, find_subject(footage), 40, 640)
     assert float(path.Ks[0, 0, 0]) >= 0.75 * float(still.Ks[0, 0, 0]) / 1.6  # no fish eye
     for i in range(40):
         inside = ((project(positions[i], path.viewmats[i], path.Ks[i]) / path.sizes[i] - 0.5).abs() < 0.5).all(1)
@@ -193,15 +194,15 @@ def test_what_moves_stays_in_the_picture_however_far(tmp_path, two_balls, jump):
 
 
 def test_what_leaves_the_scene_is_not_chased(tmp_path, two_balls):
-    footage = open_footage(rising(tmp_path / "t.h5", two_balls, 40, 5.0), None, pick_device("auto"))
-    path = camera_path("novel", two_balls.cameras, subject_of(footage), 40, 640)
+    footage = open_animation(rising(tmp_path / "t.h5", two_balls, 40, 5.0), None, pick_device("auto"))
+    path = camera_path("novel", two_balls.cameras, find_subject(footage), 40, 640)
     assert bool((path.viewmats[:, 2, 2] < 0.5).all())  # z of where they look: at most 30 degrees up
     reach = (centres(two_balls.cameras.viewmats)[:, :2].norm(dim=1)).max()
     assert float(centres(path.viewmats)[:, :2].norm(dim=1).max()) < 1.6 * float(reach)
 
 
 def test_a_film_is_framed_as_before_where_all_that_moves_is_in_it(two_balls):
-    subject = subject_of(Footage(two_balls))
+    subject = find_subject(Animation(two_balls))
     inner = subject.centre + 0.3 * (subject.corners() - subject.centre)
     plain, moving = (camera_path("novel", two_balls.cameras, s, 9, 640) for s in
                      (subject, replace(subject, moving=inner.expand(5, 8, 3))))  # fmt: skip

@@ -6,8 +6,8 @@ import torch
 from stages.core.errors import InputError
 from stages.core.geometry.similarity import Similarity
 from stages.core.scene.scene_ply import write_scene
-from stages.evaluate.clouds import chamfer, label_iou, nearest
 from stages.evaluate.options import EvaluateOptions
+from stages.evaluate.scenes import chamfer, label_iou, nearest_neighbours
 from stages.evaluate.stage import run
 from tests.evaluate.motions import elsewhere, turn
 
@@ -16,7 +16,7 @@ def test_chamfer_by_hand():
     mine = torch.tensor([[0.0, 0, 0], [1, 0, 0]])
     true = torch.tensor([[0.0, 0, 3]])
     # (0,0,0) is 3 away, (1,0,0) is sqrt 10; back, the nearest to (0,0,3) is 3 away
-    found = chamfer(nearest(mine, true), nearest(true, mine))
+    found = chamfer(nearest_neighbours(mine, true), nearest_neighbours(true, mine))
     there = (3 + 10**0.5) / 2
     assert found == pytest.approx({"chamfer": (there + 3) / 2, "to_truth": there, "to_prediction": 3})
 

@@ -24,9 +24,9 @@ def bench_mpm(
     frames: Annotated[int, typer.Option(help="frames of 200 substeps to time")] = 10,
 ) -> None:
     """The MPM solver: time a substep, scenes a minute, and the plain three-kernel form."""
-    from stages.lab.bench.mpm import BenchOptions, run
+    from stages.lab.bench.mpm import MpmBenchOptions, run
 
-    for line in run(BenchOptions(device, tuple(particles), scenes, frames)):
+    for line in run(MpmBenchOptions(device, tuple(particles), scenes, frames)):
         print(line, flush=True)
 
 
@@ -37,9 +37,9 @@ def bench_raster(
     shrink: Annotated[int, typer.Option(help="divide Gaussians and pixels by this, for a quick look")] = 1,
 ) -> None:
     """The CPU rasteriser: frames a second and time on one thread, beside one thread a pixel."""
-    from stages.lab.bench.raster import BenchOptions, run
+    from stages.lab.bench.raster import RasterBenchOptions, run
 
-    for line in run(out, BenchOptions(repeat, shrink)):
+    for line in run(out, RasterBenchOptions(repeat, shrink)):
         print(line, flush=True)
 
 
@@ -56,9 +56,9 @@ def bench_reconstruct(
     cameras: Annotated[bool, typer.Option("--cameras", help="end with the cameras, to compare matchers")] = False,
 ) -> None:
     """Photos to Gaussians: cameras against reference cameras, photos kept out, time and memory."""
-    from stages.lab.bench.reconstruct import BenchOptions, run
+    from stages.lab.bench.reconstruct import ReconstructBenchOptions, run
 
-    for line in run(sets, out, BenchOptions(quality, holdout, device, matcher, cameras)):
+    for line in run(sets, out, ReconstructBenchOptions(quality, holdout, device, matcher, cameras)):
         print(line, flush=True)
 
 
@@ -75,9 +75,9 @@ def bench_appearance(
     ] = None,
 ) -> None:
     """Photos kept out, drawn by our Gaussians and by those of gsplat's default recipe after the same seconds."""
-    from stages.lab.bench.appearance import BenchOptions, run
+    from stages.lab.bench.appearance import AppearanceBenchOptions, run
 
-    for line in run(sets, out, BenchOptions(quality, holdout, models)):
+    for line in run(sets, out, AppearanceBenchOptions(quality, holdout, models)):
         print(line, flush=True)
 
 
@@ -90,9 +90,9 @@ def bench_pi3(
     splats: Annotated[bool, typer.Option("--splats", help="with the head of Gaussians")] = False,
 ) -> None:
     """π³ at its published size with random weights: seconds and memory, beside attention written out."""
-    from stages.lab.bench.pi3 import BenchOptions, run
+    from stages.lab.bench.pi3 import Pi3BenchOptions, run
 
-    for line in run(BenchOptions(device, tuple(views), size, repeat, splats)):
+    for line in run(Pi3BenchOptions(device, tuple(views), size, repeat, splats)):
         print(line, flush=True)
 
 
@@ -106,9 +106,9 @@ def bench_segment(
     device: Device = "auto",
 ) -> None:
     """Objects found by geometry, from masks that are true or partly wrong, and by sam2: overlap with the truth."""
-    from stages.lab.bench.segment import BenchOptions, run
+    from stages.lab.bench.segment import SegmentBenchOptions, run
 
-    for line in run(out, BenchOptions(scenes, photos, weights, device, reconstruct)):
+    for line in run(out, SegmentBenchOptions(scenes, photos, weights, device, reconstruct)):
         print(line, flush=True)
 
 
@@ -119,9 +119,9 @@ def bench_refine(
     out: Annotated[Path | None, typer.Option("-o", "--out", help="the numbers as JSON")] = None,
 ) -> None:
     """Holes that lifted objects leave: the table there beside the true one, from new views."""
-    from stages.lab.bench.refine import BenchOptions, run
+    from stages.lab.bench.refine import RefineBenchOptions, run
 
-    for line in run(out, BenchOptions(scenes, photos)):
+    for line in run(out, RefineBenchOptions(scenes, photos)):
         print(line, flush=True)
 
 
@@ -149,13 +149,13 @@ def bench_dynamics(
 ) -> None:
     """The dynamics models on motion that they have not seen."""
     from stages.core.models.checkpoints import HERE
-    from stages.lab.bench.dynamics import BenchOptions, again, run
+    from stages.lab.bench.dynamics import DynamicsBenchOptions, redraw, run
 
     if results is None and data is None:
         raise InputError("--data: name the folder of motions to measure on, or --from results to draw again")
     for line in (
-        again(results) if results is not None
-        else run(data, weights or HERE, out, BenchOptions(keypoints, limit, mpm, device=device), nudged)
+        redraw(results) if results is not None
+        else run(data, weights or HERE, out, DynamicsBenchOptions(keypoints, limit, mpm, device=device), nudged)
     ):
         print(line)
 
@@ -178,9 +178,9 @@ def bench_ablation(
     device: Device = "auto",
 ) -> None:
     """Our force field trained without each of its choices in turn: what they are worth."""
-    from stages.lab.bench.ablation import BenchOptions, run
+    from stages.lab.bench.ablation import AblationBenchOptions, run
 
-    options = BenchOptions(steps, batch, keypoints, horizons, groups, test, compiled, seed, device)
+    options = AblationBenchOptions(steps, batch, keypoints, horizons, groups, test, compiled, seed, device)
     for line in run(data, out, options, only):
         print(line, flush=True)
 
@@ -196,9 +196,9 @@ def bench_rollout(
     device: Device = "auto",
 ) -> None:
     """The learned force field: time a rollout, and the published model and MPM beside it."""
-    from stages.lab.bench.rollout import BenchOptions, run
+    from stages.lab.bench.rollout import RolloutBenchOptions, run
 
-    for line in run(out, BenchOptions(weights, keypoints, steps, tuple(scenes), repeat, device)):
+    for line in run(out, RolloutBenchOptions(weights, keypoints, steps, tuple(scenes), repeat, device)):
         print(line, flush=True)
 
 
@@ -211,9 +211,9 @@ def bench_register(
     device: Device = "auto",
 ) -> None:
     """Registration of a part to the whole, beside plain ICP and splatreg."""
-    from stages.lab.bench.register import BenchOptions, run
+    from stages.lab.bench.register import RegisterBenchOptions, run
 
-    for line in run(out, BenchOptions(only, trials, seed=seed, device=device)):
+    for line in run(out, RegisterBenchOptions(only, trials, seed=seed, device=device)):
         print(line, flush=True)
 
 
@@ -227,7 +227,7 @@ def bench_complete(
     seed: Seed = 0,
 ) -> None:
     """What completing objects does to their surfaces, to pictures from behind, and to how they fall."""
-    from stages.lab.bench.complete import BenchOptions, run
+    from stages.lab.bench.complete import CompleteBenchOptions, run
 
-    for line in run(out, BenchOptions(tuple(scene), known, seed=seed)):
+    for line in run(out, CompleteBenchOptions(tuple(scene), known, seed=seed)):
         print(line, flush=True)

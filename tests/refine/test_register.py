@@ -8,7 +8,7 @@ import torch
 from stages.core.geometry.neighbours import Products
 from stages.core.geometry.rotations import matrix
 from stages.lab.assets.shapes import ellipsoid
-from stages.lab.bench.register import BenchOptions, errors, trial
+from stages.lab.bench.register import RegisterBenchOptions, errors, make_trial
 from stages.refine import register as registration
 from stages.refine import register_cloud
 from stages.refine.register import register
@@ -35,7 +35,7 @@ def test_a_moved_copy_is_found_where_it_was_put(whole):
 
 @pytest.mark.parametrize("number", [0, 1])  # cut, bitten
 def test_a_noisy_part_is_found_within_the_limits(whole, number):
-    given = trial(whole, number, BenchOptions())
+    given = make_trial(whole, number, RegisterBenchOptions())
     assert len(given.part) == round(0.6 * len(whole))
     wrong = errors(register(given.part, whole).similarity, given, whole, revolved=False)
     assert wrong["rotation"] < 2 and wrong["scale"] < 2 and wrong["shift"] < 1
@@ -43,7 +43,7 @@ def test_a_noisy_part_is_found_within_the_limits(whole, number):
 
 def test_the_way_of_a_gpu_finds_the_same(whole, monkeypatch):
     monkeypatch.setattr(register_cloud, "POINTS", 1500)  # all products are many for a CPU
-    given = trial(whole, 1, BenchOptions())
+    given = make_trial(whole, 1, RegisterBenchOptions())
     expected = register(given.part, whole)
     for module in (registration, register_cloud):
         monkeypatch.setattr(module, "searchable", Products)
@@ -56,7 +56,7 @@ def test_the_way_of_a_gpu_finds_the_same(whole, monkeypatch):
 @pytest.mark.gpu
 @pytest.mark.skipif("cuda" not in DEVICES, reason="no NVIDIA GPU")
 def test_what_lies_on_a_gpu_is_registered_there(whole):
-    given = trial(whole, 1, BenchOptions())
+    given = make_trial(whole, 1, RegisterBenchOptions())
     near = given.truth._replace(scale=1.02 * given.truth.scale)  # on the CPU, as a camera would tell it
     for hint in (None, near):
         found = register(given.part.to("cuda"), whole.to("cuda"), hint=hint).similarity
@@ -66,7 +66,7 @@ def test_what_lies_on_a_gpu_is_registered_there(whole):
 
 
 def test_another_thing_fits_less(whole):
-    given = trial(whole, 0, BenchOptions())
+    given = make_trial(whole, 0, RegisterBenchOptions())
     stranger = coloured(ellipsoid((0.3, 0.2, 0.5), 6000), (0.8, 0.7, 0.6), 1)
     other = register(given.part, stranger)
     assert other is None or other.fit < register(given.part, whole).fit - 0.15
@@ -74,7 +74,7 @@ def test_another_thing_fits_less(whole):
 
 def test_a_plain_ball_is_placed_though_it_may_be_turned_any_way():
     ball = coloured(ellipsoid((0.5, 0.5, 0.5), 8000), (0.8, 0.2, 0.1), 1)
-    given = trial(ball, 1, BenchOptions())
+    given = make_trial(ball, 1, RegisterBenchOptions())
     found = register(given.part, ball)
     if found is not None:  # no feature stands out, so it may find nothing
         wrong = errors(found.similarity, given, ball, revolved=False)

@@ -22,19 +22,19 @@ from stages.core.scene.files import replacing
 from stages.lab.bench import common as bench
 from stages.lab.dataset.motions import Motions
 from stages.lab.dataset.scenes import OTHERS, groups_of
-from stages.lab.training.ablation import CHOICES, Choice
-from stages.lab.training.data import UNSEEN, Pieces, read_groups, split
-from stages.lab.training.distributed import Team
-from stages.lab.training.state import Trainee
-from stages.lab.training.train import FRAMES, Job, TrainOptions, validate
+from stages.lab.training.ablation import ABLATIONS, Ablation
+from stages.lab.training.data import VALIDATION_SCENES, ClipSampler, read_groups, train_validation_split
+from stages.lab.training.distributed import ProcessGroup
+from stages.lab.training.state import TrainingState
+from stages.lab.training.train import VALIDATION_FRAMES, TrainingRun, TrainOptions, validate
 
 log = logging.getLogger(__name__)
 METRICS = ("RMSE", "FPE", "R")
-CHECKS = 6  # of the weights, in one training: the best are scored
+VALIDATION_CHECKS = 6  # of the weights, in one training: the best are scored
 
 
 @dataclass(frozen=True)
-class BenchOptions:
+class AblationBenchOptions:
     """How long each is trained, and on what."""
 
     steps: int = 1500
@@ -50,38 +50,42 @@ class BenchOptions:
     def training(self) -> TrainOptions:
         return TrainOptions(
             steps=self.steps, batch=self.batch, keypoints=self.keypoints, horizons=self.horizons, loss="axes",
-            groups=self.groups, compiled=self.compiled, seed=self.seed, device=self.device, checks=CHECKS,
+            groups=self.groups, compiled=self.compiled, seed=self.seed, device=self.device, checks=VALIDATION_CHECKS,
         )  # fmt: skip
 
 
-def run(data: Path, out: Path, options: BenchOptions = BenchOptions(), only: str = "") -> Iterator[str]:
+def run(data: Path, out: Path, options: AblationBenchOptions = AblationBenchOptions(), only: str = "") -> Iterator[str]:
     """Train without each choice in turn, or without those of `only` (names with commas); a line about each."""
-    names = [name.strip() for name in only.split(",")] if only else list(CHOICES)
-    unknown = [name for name in names if name not in CHOICES]
+    names = [name.strip() for name in only.split(",")] if only else list(ABLATIONS)
+    unknown = [name for name in names if name not in ABLATIONS]
     if unknown:
-        raise InputError(f"--only {', '.join(unknown)}: choose from {', '.join(CHOICES)}")
+        raise InputError(f"--only {', '.join(unknown)}: choose from {', '.join(ABLATIONS)}")
     base, device = options.training(), pick_device(options.device)
     asked = {k: v for k, v in asdict(options).items() if k != "device"}
     facts = _before(Path(out), asked) or {"options": asked, "machine": bench.machine(device), "rows": {}}
     for name in names:
         if name not in facts["rows"]:
-            facts["rows"][name] = _measured(CHOICES[name], data, base, groups_of(options.test, more=OTHERS), device)
-            facts["rows"] = {k: facts["rows"][k] for k in CHOICES if k in facts["rows"]}
+            facts["rows"][name] = _measured(ABLATIONS[name], data, base, groups_of(options.test, more=OTHERS), device)
+            facts["rows"] = {k: facts["rows"][k] for k in ABLATIONS if k in facts["rows"]}
             facts["date"] = datetime.now(timezone.utc).date().isoformat()
             _write(Path(out), facts)
         yield _line(name, facts["rows"][name])
 
 
-def _measured(choice: Choice, data: Path, base: TrainOptions, test: list[str], device: str) -> dict:
+def _measured(choice: Ablation, data: Path, base: TrainOptions, test: list[str], device: str) -> dict:
     """Scores after training."""
     options = choice.options(base)
-    known, unseen = split(read_groups(data, groups_of(options.groups, more=OTHERS), options.keypoints), UNSEEN)
+    known, unseen = train_validation_split(
+        read_groups(data, groups_of(options.groups, more=OTHERS), options.keypoints), VALIDATION_SCENES
+    )
     scenes = read_groups(data, test, options.keypoints)
     torch.manual_seed(options.seed)
-    trainee = Trainee(choice.network().to(device), options.lr, options.seed)
+    trainee = TrainingState(choice.network().to(device), options.lr, options.seed)
     with tempfile.TemporaryDirectory() as folder:
-        pieces = [Pieces(known, device, trainee.model)]
-        job = Job(trainee, pieces, unseen.to(device), options, Team(device=device), Path(folder) / "weights", {})
+        pieces = [ClipSampler(known, device, trainee.model)]
+        job = TrainingRun(
+            trainee, pieces, unseen.to(device), options, ProcessGroup(device=device), Path(folder) / "weights", {}
+        )
         if not job.run():
             raise InputError("stopped; choices measured so far are kept, the same command goes on with the next")
     found = validate(trainee.best_model(), scenes.to(device))
@@ -91,7 +95,7 @@ def _measured(choice: Choice, data: Path, base: TrainOptions, test: list[str], d
 
 
 def _frames(scenes: Motions) -> int:
-    return min(FRAMES, scenes.points.shape[1])
+    return min(VALIDATION_FRAMES, scenes.points.shape[1])
 
 
 def _before(out: Path, options: dict) -> dict | None:
@@ -121,10 +125,12 @@ def markdown(facts: dict) -> Iterator[str]:
     first = next(iter(rows.values()))
     yield "# What each choice is worth"
     yield ""
-    yield (f"`ngff-lab bench ablation`, {facts['machine']}, {facts['date']}. Each row is trained from nothing for "
-           f"{o['steps']:,} steps of {o['batch']} scenes, {o['keypoints']} keypoints an object, horizons "
-           f"{o['horizons']}, on {o['groups']}, and scored on {first['scenes']} scenes of {o['test']}, "
-           f"{first['frames']} frames from rest: a short training, to compare choices, not to reach the end.")
+    yield (
+        f"`ngff-lab bench ablation`, {facts['machine']}, {facts['date']}. Each row is trained from nothing for "
+        f"{o['steps']:,} steps of {o['batch']} scenes, {o['keypoints']} keypoints an object, horizons "
+        f"{o['horizons']}, on {o['groups']}, and scored on {first['scenes']} scenes of {o['test']}, "
+        f"{first['frames']} frames from rest: a short training, to compare choices, not to reach the end."
+    )
     yield ""
     yield "| without | RMSE / FPE / R | RMSE, times that of the full network |"
     yield "| --- | --- | --- |"

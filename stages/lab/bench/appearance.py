@@ -29,7 +29,7 @@ from stages.core.geometry.cameras import depths, project
 from stages.core.geometry.similarity import Similarity
 from stages.core.scene.files import replacing
 from stages.core.scene.gaussians import Gaussians
-from stages.lab.bench import appearance_peer as peer
+from stages.lab.bench import appearance_gsplat as peer
 from stages.lab.bench.common import machine
 from stages.lab.bench.reconstruct import photo_folder
 from stages.reconstruct import classic, sfm
@@ -42,13 +42,15 @@ from stages.reconstruct.steps import Steps, fingerprint
 log = logging.getLogger(__name__)
 T = TypeVar("T")
 BLACK = (0.0, 0.0, 0.0)
-FIRST = 100  # steps by which gsplat's first speed is told
-SLOWER = 0.5  # share of it that is left on the whole, as Gaussians multiply; a first guess
-LONGEST = 1.15  # share of our time after which gsplat's first run is cut off; one below the inverse is repeated too
+WARMUP_STEPS = 100  # steps by which gsplat's first speed is told
+SPEED_FRACTION = 0.5  # share of it that is left on the whole, as Gaussians multiply; a first guess
+MAX_TIME_RATIO = (
+    1.15  # share of our time after which gsplat's first run is cut off; one below the inverse is repeated too
+)
 
 
 @dataclass(frozen=True)
-class BenchOptions:
+class AppearanceBenchOptions:
     """What the sets are reconstructed with."""
 
     quality: str = "high"
@@ -65,7 +67,7 @@ class BenchOptions:
 
 
 @dataclass(frozen=True)
-class Side:
+class MethodScore:
     """How one of the two did."""
 
     seconds: float  # wall time
@@ -80,7 +82,7 @@ class Side:
         return f"{shown} {self.gaussians:9,} {self.steps:7,} {self.seconds:5.0f} s"
 
 
-def run(sets: list[Path], out: Path, options: BenchOptions) -> Iterator[str]:
+def run(sets: list[Path], out: Path, options: AppearanceBenchOptions) -> Iterator[str]:
     """A line a set, and all figures in a JSON file, which keeps the rows of sets that are not measured now."""
     if not sets:
         raise InputError("name one or more photo sets: a folder of photos, or one with images/")
@@ -97,26 +99,28 @@ def run(sets: list[Path], out: Path, options: BenchOptions) -> Iterator[str]:
         rows[f"{name}, {options.quality}"] = {**row, "machine": machine("cuda")}
         with replacing(out) as part:
             part.write_text(json.dumps({"sets": rows}, indent=1) + "\n")
-        yield f"{name:14s}         {Side(**row['ours'])}           {Side(**row['gsplat'])}"
+        yield f"{name:14s}         {MethodScore(**row['ours'])}           {MethodScore(**row['gsplat'])}"
 
 
-def measure(name: str, images: Path, options: BenchOptions, device: str = "cuda", draw: Callable | None = None) -> dict:
+def measure(
+    name: str, images: Path, options: AppearanceBenchOptions, device: str = "cuda", draw: Callable | None = None
+) -> dict:
     """One set, by both; `draw` stands for gsplat.rasterization."""
     wanted = options.reconstruction()
     photos = read_photos(images, wanted.side)
-    steps = placed(name, photos, options.models)
+    steps = camera_steps(name, photos, options.models)
     model = sfm.solve(photos, steps=steps)
     (steps.folder / "depth.pt").unlink(missing_ok=True)  # of an earlier run: making it is part of our time
     made, seconds = timed(lambda: classic.reconstruct(photos, wanted, steps))
     count = wanted.steps(len(made.trained), device)
     ours = judged(made.scene.gaussians, made, made.scene.background, seconds, count, device)
     log.info("%s: ours %s; %s", name, ours, {k: round(v, 1) for k, v in steps.seconds.items()})
-    theirs = by_gsplat(made, model, seconds, device, draw)
+    theirs = gsplat_result(made, model, seconds, device, draw)
     facts = {"photos": len(photos), "trained": len(made.trained), "held_out": len(made.held)}
     return {**facts, "seconds": steps.seconds, "ours": asdict(ours), "gsplat": asdict(theirs)}
 
 
-def placed(name: str, photos: Photos, models: Path | None) -> Steps:
+def camera_steps(name: str, photos: Photos, models: Path | None) -> Steps:
     """Where the cameras are kept, or will be. Photos of the same names and sizes are taken to be the same."""
     if models is None:
         return Steps()
@@ -125,32 +129,32 @@ def placed(name: str, photos: Photos, models: Path | None) -> Steps:
     return Steps(models / name, key, resume=True)
 
 
-def by_gsplat(
+def gsplat_result(
     made: Reconstruction, model: sfm.SparseModel, seconds: float, device: str = "cuda", draw: Callable | None = None
-) -> Side:
+) -> MethodScore:
     """The other recipe, from the same points, moved to where our scene is, for about the same seconds."""
     views, world = made.views[made.trained], made.scene.provenance["upright"]
     move = Similarity(world["scale"], torch.tensor(world["rotation"]), torch.tensor(world["translation"]))
 
     def train(steps: int, going: Callable[[int], bool]) -> tuple[Gaussians, int]:
-        return peer.train(views, *coloured(model, move, views, made.trained), steps, device, draw, going)
+        return peer.train(views, *coloured_points(model, move, views, made.trained), steps, device, draw, going)
 
     for _ in range(2):  # the first warms up
-        _, first = timed(lambda: train(peer.FULL, lambda done: done < FIRST))
-    steps = max(1, int(SLOWER * FIRST * seconds / first))
-    for longest in (LONGEST * seconds, math.inf):
+        _, first = timed(lambda: train(peer.FULL_STEPS, lambda done: done < WARMUP_STEPS))
+    steps = max(1, int(SPEED_FRACTION * WARMUP_STEPS * seconds / first))
+    for longest in (MAX_TIME_RATIO * seconds, math.inf):
         latest = time.perf_counter() + longest
         (gaussians, done), took = timed(lambda: train(steps, lambda _: time.perf_counter() < latest))  # noqa: B023
         log.info("gsplat: %d of %d steps in %.1f s, %d Gaussians", done, steps, took, len(gaussians))
         sides = [judged(gaussians, made, behind, took, done, device) for behind in (BLACK, made.scene.background)]
         side = max(sides, key=lambda side: side.psnr)
-        if done == steps and took > seconds / LONGEST:
+        if done == steps and took > seconds / MAX_TIME_RATIO:
             break
         steps = max(1, int(done * seconds / took))
     return side
 
 
-def coloured(
+def coloured_points(
     model: sfm.SparseModel, move: Similarity, views: Views, trained: list[int]
 ) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 3"]]:
     """The sparse points that photos learned from show, moved, with the mean of their colours there (0..1)."""
@@ -170,10 +174,10 @@ def coloured(
 def judged(
     gaussians: Gaussians, made: Reconstruction, background: Sequence[float], seconds: float, steps: int,
     device: str = "cuda",
-) -> Side:  # fmt: skip
+) -> MethodScore:  # fmt: skip
     """With what to paint where there are no Gaussians."""
     raw, fitted = (score(gaussians, made.views, made.held, device, exposed, background) for exposed in (False, True))
-    return Side(seconds, steps, len(gaussians), *raw, fitted[0])
+    return MethodScore(seconds, steps, len(gaussians), *raw, fitted[0])
 
 
 def timed(make: Callable[[], T]) -> tuple[T, float]:

@@ -25,7 +25,7 @@ def _cpu() -> str:
         return platform.processor() or platform.machine()
 
 
-def seconds(function: Callable[[], object], device: str, repeat: int = 5) -> float:
+def median_seconds(function: Callable[[], object], device: str, repeat: int = 5) -> float:
     """Median wall time of a call [s], the GPU's work included; call it once before."""
     times = []
     for _ in range(repeat):
@@ -47,4 +47,4 @@ def copy_bandwidth(device: str) -> float:
     count = 2**29 if device != "cpu" else 2**25
     a, b = torch.ones(count, device=device), torch.zeros(count, device=device)
     b.copy_(a)
-    return 2 * 4 * count / seconds(lambda: b.copy_(a), device)
+    return 2 * 4 * count / median_seconds(lambda: b.copy_(a), device)

@@ -38,16 +38,16 @@ from stages.refine.stage import refine
 from stages.simulate.options import SimulateOptions
 from stages.simulate.stage import run as simulate
 
-SIZE = 0.3  # longest side of an object [m]
-VIEW, BEHIND = 320, 6  # pixels a side; cameras that the truth is compared from
-FRONT, BACK = -45.0, 135.0  # azimuth of the middle camera: it stands on the +y axis, or on -y
-SKIN = 0.03 * SIZE  # depth behind the drawn surface up to which a Gaussian belongs to it [m]
-WAYS = ("none", "close", "library")
-FIGURES = ("chamfer_mm", "psnr_behind_db", "motion_rmse_mm")
+OBJECT_SIZE = 0.3  # longest side of an object [m]
+IMAGE_SIZE, REAR_VIEWS = 320, 6  # pixels a side; cameras that the truth is compared from
+FRONT_AZIMUTH, REAR_AZIMUTH = -45.0, 135.0  # azimuth of the middle camera: it stands on the +y axis, or on -y
+SURFACE_DEPTH = 0.03 * OBJECT_SIZE  # depth behind the drawn surface up to which a Gaussian belongs to it [m]
+COMPLETERS = ("none", "close", "library")
+METRICS = ("chamfer_mm", "psnr_behind_db", "motion_rmse_mm")
 
 
 @dataclass(frozen=True)
-class BenchOptions:
+class CompleteBenchOptions:
     scenes: tuple[str, ...] = ("panda,duck", "can,miku", "bowl,phone")  # the objects of each
     known: str = ""  # those of the library; empty: all ten
     thin: int = 2  # every so manieth Gaussian of an object is used
@@ -57,7 +57,7 @@ class BenchOptions:
     seed: int = 0
 
 
-def truth(placed: str, options: BenchOptions) -> Scene:
+def true_scene(placed: str, options: CompleteBenchOptions) -> Scene:
     """The objects side by side, turned about the vertical, on a grey table whose top is z = 0."""
     rng = torch.Generator().manual_seed(options.seed)
     names = ObjectsOptions(placed).names
@@ -66,51 +66,55 @@ def truth(placed: str, options: BenchOptions) -> Scene:
     for i, name in enumerate(names):
         half = torch.pi * torch.rand(1, generator=rng)  # of the angle
         turn = matrix(torch.cat([half.cos(), torch.zeros(2), half.sin()]))
-        g = thinned(make_object(name), options.thin)
-        low = float((SIZE * g.means[:, 2]).min())
-        place = Similarity(SIZE, turn, torch.tensor([1.2 * SIZE * (i - (len(names) - 1) / 2), 0.0, -low]))
+        g = subsample(make_object(name), options.thin)
+        low = float((OBJECT_SIZE * g.means[:, 2]).min())
+        place = Similarity(OBJECT_SIZE, turn, torch.tensor([1.2 * OBJECT_SIZE * (i - (len(names) - 1) / 2), 0.0, -low]))
         parts.append(replace(moved(g, place), object_id=torch.full((len(g),), i + 1)))
     objects = tuple(SceneObject(i + 1, name) for i, name in enumerate(names))
-    return Scene(concatenate(parts), objects, cameras(10, FRONT, 28.0), 0.0)
+    return Scene(concatenate(parts), objects, camera_arc(10, FRONT_AZIMUTH, 28.0), 0.0)
 
 
-def thinned(g: Gaussians, step: int) -> Gaussians:
+def subsample(g: Gaussians, step: int) -> Gaussians:
     """Fewer Gaussians, larger by as much."""
     few = g[torch.arange(0, len(g), step)]
     return replace(few, scales=few.scales * step**0.5)
 
 
-def cameras(count: int, azimuth: float, elevation: float, sweep: float = 120.0) -> Cameras:
+def camera_arc(count: int, azimuth: float, elevation: float, sweep: float = 120.0) -> Cameras:
     """An arc of `sweep` degrees around the middle of the table."""
     viewmats = orbit(count, torch.tensor([0.0, 0, 0.12]), 1.1, elevation, azimuth - sweep / 2, sweep)
-    K = intrinsics(VIEW, VIEW, 1.4 * VIEW).expand(count, 3, 3).clone()
-    return Cameras(viewmats, K, torch.full((count, 2), VIEW), tuple(f"{i:02d}.jpg" for i in range(count)))
+    K = intrinsics(IMAGE_SIZE, IMAGE_SIZE, 1.4 * IMAGE_SIZE).expand(count, 3, 3).clone()
+    return Cameras(viewmats, K, torch.full((count, 2), IMAGE_SIZE), tuple(f"{i:02d}.jpg" for i in range(count)))
 
 
-def photographed(scene: Scene, options: BenchOptions) -> Scene:
+def visible_scene(scene: Scene, options: CompleteBenchOptions) -> Scene:
     """What the cameras see of the objects, with noise; the table is left whole."""
     g = scene.gaussians
-    seen = g[shown(scene) | (g.object_id == 0)]
-    error = SIZE * options.noise * torch.randn(seen.means.shape, generator=torch.Generator().manual_seed(options.seed))
+    seen = g[visible(scene) | (g.object_id == 0)]
+    error = (
+        OBJECT_SIZE
+        * options.noise
+        * torch.randn(seen.means.shape, generator=torch.Generator().manual_seed(options.seed))
+    )
     return replace(scene, gaussians=replace(seen, means=torch.where(seen.object_id[:, None] > 0, seen.means + error,
                                                                      seen.means)))  # fmt: skip
 
 
 @torch.no_grad()
-def shown(scene: Scene) -> Bool[Tensor, "n"]:
+def visible(scene: Scene) -> Bool[Tensor, "n"]:
     """Gaussians that lie on the surface that a camera sees; how large they are does not matter."""
     g = scene.gaussians
     out = torch.zeros(len(g), dtype=torch.bool)
     for viewmat, K in zip(scene.cameras.viewmats, scene.cameras.Ks, strict=True):
-        surface = rasterise(g, viewmat[None], K[None], VIEW, VIEW).depth[0]
+        surface = rasterise(g, viewmat[None], K[None], IMAGE_SIZE, IMAGE_SIZE).depth[0]
         pixel = project(g.means, viewmat, K).floor().long()
-        inside = ((pixel >= 0) & (pixel < VIEW)).all(1)
+        inside = ((pixel >= 0) & (pixel < IMAGE_SIZE)).all(1)
         x, y = pixel[inside].T
-        out[inside] |= depths(g.means[inside], viewmat) < surface[y, x] + SKIN
+        out[inside] |= depths(g.means[inside], viewmat) < surface[y, x] + SURFACE_DEPTH
     return out
 
 
-def distance(scene: Scene, true: Scene) -> float:
+def chamfer_mm(scene: Scene, true: Scene) -> float:
     """Chamfer distance of the objects [mm], mean of both directions."""
     a, b = (s.gaussians.means[s.gaussians.object_id > 0] for s in (scene, true))
     return 1000 * chamfer(nearest_neighbours(a, b), nearest_neighbours(b, a))["chamfer"]
@@ -119,16 +123,16 @@ def distance(scene: Scene, true: Scene) -> float:
 @torch.no_grad()
 def psnr_behind(scene: Scene, true: Scene) -> float:
     """Mean PSNR [dB] from where no camera was, in the pixels where the objects truly are."""
-    views, values = cameras(BEHIND, BACK, 20.0), []
+    views, values = camera_arc(REAR_VIEWS, REAR_AZIMUTH, 20.0), []
     for viewmat, K in zip(views.viewmats, views.Ks, strict=True):
-        mine, real = (rasterise(s.gaussians, viewmat[None], K[None], VIEW, VIEW).rgb for s in (scene, true))
-        index, _ = visibility(true.gaussians, viewmat, K, VIEW, VIEW)
+        mine, real = (rasterise(s.gaussians, viewmat[None], K[None], IMAGE_SIZE, IMAGE_SIZE).rgb for s in (scene, true))
+        index, _ = visibility(true.gaussians, viewmat, K, IMAGE_SIZE, IMAGE_SIZE)
         on = (index >= 0) & (true.gaussians.object_id[index.clamp_min(0)] > 0)
         values.append(psnr(mine[:, on].clamp(0, 1), real[:, on].clamp(0, 1)))
     return sum(values) / len(values)
 
 
-def run(out: Path | None, options: BenchOptions = BenchOptions()) -> Iterator[str]:  # noqa: B008 -- frozen
+def run(out: Path | None, options: CompleteBenchOptions = CompleteBenchOptions()) -> Iterator[str]:  # noqa: B008 -- frozen
     """A line for each scene and way of refining, the means over the scenes, and all figures as JSON."""
     yield f"{'scene':16}{'completer':12}{'Chamfer [mm]':>14}{'PSNR behind [dB]':>18}{'RMSE of motion [mm]':>21}"
     scenes = {}
@@ -137,10 +141,10 @@ def run(out: Path | None, options: BenchOptions = BenchOptions()) -> Iterator[st
         _library(folder / "library", options)
         for placed in options.scenes:
             scenes[placed] = {}
-            for way, row in measured(placed, folder, options):
+            for way, row in measure(placed, folder, options):
                 scenes[placed][way] = row
                 yield _line(placed, way, row)
-    means = {way: {f: sum(s[way][f] for s in scenes.values()) / len(scenes) for f in FIGURES} for way in WAYS}
+    means = {way: {f: sum(s[way][f] for s in scenes.values()) / len(scenes) for f in METRICS} for way in COMPLETERS}
     yield from (_line("mean", way, row) for way, row in means.items())
     if out:
         facts = {"command": "ngff-lab bench complete", "machine": bench.machine("cpu"), "options": asdict(options)}
@@ -148,30 +152,30 @@ def run(out: Path | None, options: BenchOptions = BenchOptions()) -> Iterator[st
             part.write_text(json.dumps({**facts, "scenes": scenes, "mean": means}, indent=1) + "\n")
 
 
-def measured(placed: str, folder: Path, options: BenchOptions) -> Iterator[tuple[str, dict[str, float]]]:
+def measure(placed: str, folder: Path, options: CompleteBenchOptions) -> Iterator[tuple[str, dict[str, float]]]:
     """The figures of each way of refining one scene."""
-    true = truth(placed, options)
-    seen = photographed(true, options)
+    true = true_scene(placed, options)
+    seen = visible_scene(true, options)
     _fall(true, folder / "truth", options)
-    for way in WAYS:
+    for way in COMPLETERS:
         scene = refine(seen, RefineOptions(way, folder / "library" if way == "library" else None, background=False))
         _fall(scene, folder / way, options)
         motion = trajectories.compare(folder / f"{way}.h5", folder / "truth.h5", EvaluateOptions())
-        row = distance(scene, true), psnr_behind(scene, true), 1000 * motion.overall["RMSE"]
-        yield way, {name: round(value, 3) for name, value in zip(FIGURES, row, strict=True)}
+        row = chamfer_mm(scene, true), psnr_behind(scene, true), 1000 * motion.overall["RMSE"]
+        yield way, {name: round(value, 3) for name, value in zip(METRICS, row, strict=True)}
 
 
 def _line(scene: str, way: str, row: dict[str, float]) -> str:
     return f"{scene:16}{way:12}{row['chamfer_mm']:14.2f}{row['psnr_behind_db']:18.2f}{row['motion_rmse_mm']:21.1f}"
 
 
-def _library(folder: Path, options: BenchOptions) -> None:
+def _library(folder: Path, options: CompleteBenchOptions) -> None:
     folder.mkdir()
     for name in ObjectsOptions(options.known).names:
         write_scene(folder / f"{name}.ply", Scene(make_object(name)))
 
 
-def _fall(scene: Scene, path: Path, options: BenchOptions) -> None:
+def _fall(scene: Scene, path: Path, options: CompleteBenchOptions) -> None:
     """Let the objects go from a height: PATH.h5."""
     write_scene(path.with_suffix(".ply"), scene)
     chosen = SimulateOptions(

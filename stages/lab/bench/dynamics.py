@@ -33,10 +33,17 @@ from stages.evaluate.dynamics import all_metrics, error_over_time
 from stages.lab.assets.heldout_shapes import KINDS
 from stages.lab.assets.objects import OBJECTS
 from stages.lab.bench import common as bench
+from stages.lab.bench.dynamics_baselines import (
+    Predict,
+    Resimulation,
+    predict_free_fall,
+    predict_from,
+    predict_rigid_fit,
+    shared_scenes,
+)
 from stages.lab.bench.dynamics_report import PUBLISHED, report, table
-from stages.lab.bench.dynamics_rows import Predict, Resimulation, common, fall, rigid, same_scenes
 from stages.lab.dataset.motions import Motions
-from stages.lab.training.data import home, read_groups
+from stages.lab.training.data import motions_folder, read_groups
 
 log = logging.getLogger(__name__)
 TRAINED = tuple(f"3_{i}" for i in range(9))
@@ -44,17 +51,22 @@ SPLITS = {
     "spatial": (("3_9",), 80), "temporal": (TRAINED, 100), "4 objects": (("4",), 80), "6 objects": (("6",), 80),
     "held-out objects": (("heldout",), 80),
 }  # fmt: skip
-SAMPLE = 300  # scenes of the temporal split
-TIMED = 100  # steps of one scene whose time is taken
+TEMPORAL_SCENES = 300  # scenes of the temporal split
+TIMED_STEPS = 100  # steps of one scene whose time is taken
 STRIDE = 8  # frames between the values of an object's curve
-SAME = ("machine", "keypoints", "scenes", "frames")  # in what results must agree to stand in one table
+COMPARABLE_KEYS = ("machine", "keypoints", "scenes", "frames")  # in what results must agree to stand in one table
 METRICS = ("MSE", "RMSE", "FPE", "PCE", "R", "R_pooled")
-FALL, NUDGED, RIGID, MPM = "no learning", "truth, starts moved 1 mm", "truth, best rigid fit", "mpm-estimated"
+FREE_FALL, NUDGED, RIGID_FIT, MPM_ESTIMATED = (
+    "no learning",
+    "truth, starts moved 1 mm",
+    "truth, best rigid fit",
+    "mpm-estimated",
+)
 NAMES = {kind.id: name for name, kind in (*OBJECTS.items(), *KINDS.items())}
 
 
 @dataclass(frozen=True)
-class BenchOptions:
+class DynamicsBenchOptions:
     """Which scenes."""
 
     keypoints: int = 256  # of an object; a model sees no more than it learned from
@@ -69,7 +81,7 @@ class BenchOptions:
             raise InputError("--keypoints must be positive, --limit and --mpm at least 0")
 
 
-def again(results: Path) -> list[str]:
+def redraw(results: Path) -> list[str]:
     """The table and the plots from results of an earlier run."""
     must_exist(results, "results of `ngff-lab bench dynamics` (.json)")
     try:
@@ -81,7 +93,11 @@ def again(results: Path) -> list[str]:
 
 
 def run(
-    data: Path, folder: Path, out: Path, options: BenchOptions = BenchOptions(), nudged: Path | None = None
+    data: Path,
+    folder: Path,
+    out: Path,
+    options: DynamicsBenchOptions = DynamicsBenchOptions(),
+    nudged: Path | None = None,
 ) -> list[str]:
     """Every NAME.safetensors of a folder, and the rows that need none, on every split that the data set has.
 
@@ -94,15 +110,21 @@ def run(
         raise InputError(f"{folder}: holds no weights (.safetensors); make some with `ngff-lab train`")
     before = _earlier(Path(out))
     device = pick_device(options.device)
-    splits = {name: scenes_of(data, name, options).to(device) for name in SPLITS if _there(data, name)}
+    splits = {name: split_scenes(data, name, options).to(device) for name in SPLITS if _there(data, name)}
     if not splits:
-        scenes_of(data, "spatial", options)  # says what is missing
-    rows = {FALL: {"splits": {name: measured(fall, m, options.batch) for name, m in splits.items()}}}
+        split_scenes(data, "spatial", options)  # says what is missing
+    rows = {
+        FREE_FALL: {
+            "splits": {name: evaluate_predictor(predict_free_fall, m, options.batch) for name, m in splits.items()}
+        }
+    }
     if nudged is not None:
         rows[NUDGED] = {"splits": dict(_again_made(nudged, splits, options))}
-    rows[RIGID] = {"splits": {name: measured(rigid, m, options.batch) for name, m in splits.items()}}
+    rows[RIGID_FIT] = {
+        "splits": {name: evaluate_predictor(predict_rigid_fit, m, options.batch) for name, m in splits.items()}
+    }
     if options.mpm:
-        rows[MPM] = _mpm(data, splits, options, device)
+        rows[MPM_ESTIMATED] = _mpm(data, splits, options, device)
     for file in tqdm(files, desc="models", unit="model"):
         rows[file.stem] = _model(file, splits, options, device)
         log.info("%s: RMSE %s", file.stem, ", ".join(f"{r['RMSE']} {n}" for n, r in rows[file.stem]["splits"].items()))
@@ -113,7 +135,7 @@ def run(
         "rows": rows,
         "published, on other data": PUBLISHED,
     }  # fmt: skip
-    if all(before.get(key) == facts[key] for key in SAME):
+    if all(before.get(key) == facts[key] for key in COMPARABLE_KEYS):
         facts["rows"] = {**before["rows"], **rows}
     with replacing(Path(out)) as part:
         part.write_text(_compact(facts))
@@ -127,33 +149,33 @@ def _earlier(out: Path) -> dict:
         return {}
     try:
         before = json.loads(out.read_text())
-        return {key: before[key] for key in ("rows", *SAME)}
+        return {key: before[key] for key in ("rows", *COMPARABLE_KEYS)}
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(f"{out}: holds no results of `ngff-lab bench dynamics` ({error!r})") from error
 
 
 def _there(data: Path, split: str) -> bool:
     """Whether all groups of a split have been made; a split that is not measured is told of."""
-    missing = [g for g in SPLITS[split][0] if not (home(data) / f"{g}.h5").is_file()]
+    missing = [g for g in SPLITS[split][0] if not (motions_folder(data) / f"{g}.h5").is_file()]
     if missing:
         log.warning("%s is not measured: %s has no %s", split, data, ", ".join(missing))
     return not missing
 
 
-def scenes_of(data: Path, split: str, options: BenchOptions) -> Motions:
+def split_scenes(data: Path, split: str, options: DynamicsBenchOptions) -> Motions:
     """The scenes of a split, no longer than it is measured."""
     groups, frames = SPLITS[split]
     motions = read_groups(data, groups, options.keypoints)
     count = min(len(motions), options.limit or len(motions))
     if split == "temporal":
-        count = min(count, SAMPLE)
+        count = min(count, TEMPORAL_SCENES)
         rows = torch.randperm(len(motions), generator=torch.Generator().manual_seed(options.seed))[:count]
     else:
         rows = torch.arange(count)
     return replace(motions[rows], points=motions.points[rows, :frames])
 
 
-def _again_made(nudged: Path, splits: dict[str, Motions], options: BenchOptions) -> Iterator[tuple[str, dict]]:
+def _again_made(nudged: Path, splits: dict[str, Motions], options: DynamicsBenchOptions) -> Iterator[tuple[str, dict]]:
     """The nudged scenes against the true ones, split by split."""
     for split, motions in splits.items():
         if _there(nudged, split):
@@ -163,14 +185,14 @@ def _again_made(nudged: Path, splits: dict[str, Motions], options: BenchOptions)
 
 def _compared(made: Motions, motions: Motions, batch: int) -> dict:
     """Scenes made otherwise against the true ones; those that went wrong are counted, and left out."""
-    both = common(motions, made)
+    both = shared_scenes(motions, made)
     if not len(both):
         raise InputError("none of the scenes was made again: the names of the two data sets differ")
-    return {**measured(same_scenes(made, motions.points.shape[1]), both, batch), "scenes left out":
+    return {**evaluate_predictor(predict_from(made, motions.points.shape[1]), both, batch), "scenes left out":
             len(motions) - len(both)}  # fmt: skip
 
 
-def _mpm(data: Path, splits: dict[str, Motions], options: BenchOptions, device: str) -> dict:
+def _mpm(data: Path, splits: dict[str, Motions], options: DynamicsBenchOptions, device: str) -> dict:
     """MPM with estimated materials; of objects that the paper has no estimates for, nothing."""
     row: dict = {"splits": {}}
     for split, motions in splits.items():
@@ -181,16 +203,16 @@ def _mpm(data: Path, splits: dict[str, Motions], options: BenchOptions, device: 
         made = again(some.names, some.points.shape[1], options.keypoints)
         row["splits"][split] = _compared(made, some, options.batch)
         if device != "cpu" and "seconds" not in row:  # on a CPU it would take as long as everything else
-            row["seconds"] = _digits(again.seconds(some.names[0], TIMED), 3)
+            row["seconds"] = _digits(again.seconds(some.names[0], TIMED_STEPS), 3)
     return row
 
 
-def _model(file: Path, splits: dict[str, Motions], options: BenchOptions, device: str) -> dict:
+def _model(file: Path, splits: dict[str, Motions], options: DynamicsBenchOptions, device: str) -> dict:
     model, card = weights.load(file, device)
     learned = card.get("options", {}).get("keypoints", options.keypoints)  # more of them it has never seen
     splits = {n: replace(m, points=m.points[..., :learned, :]) for n, m in splits.items()}
     with torch.inference_mode():
-        results = {n: measured(_rolled(model), m, options.batch) for n, m in splits.items()}
+        results = {n: evaluate_predictor(_rolled(model), m, options.batch) for n, m in splits.items()}
         seconds = _seconds(model, next(iter(splits.values())), device)
     about = {k: card[k] for k in ("model", "config", "scenes", "device", "sha256") if k in card}
     if "minutes" in card:
@@ -211,12 +233,12 @@ def _seconds(model: Dynamics, motions: Motions, device: str) -> float:
 
     def again() -> None:
         stepper.restart(one)
-        frames(stepper, TIMED + 1)
+        frames(stepper, TIMED_STEPS + 1)
 
-    return _digits(bench.seconds(again, device, 3), 3)
+    return _digits(bench.median_seconds(again, device, 3), 3)
 
 
-def measured(predict: Predict, motions: Motions, batch: int) -> dict:
+def evaluate_predictor(predict: Predict, motions: Motions, batch: int) -> dict:
     """Metrics averaged over the scenes; curves of the error [m] by frame, and by frame for each kind of object.
 
     A rollout that is not finite has no RMSE, and an R of 0: it is not left out.

@@ -22,8 +22,8 @@ PUBLISHED: Mapping[str, dict] = {
     "NGFF": {"spatial": [0.082, 0.326, 0.661], "temporal": [0.107, 0.419, 0.652], "4 objects": [0.0953, 0.373, 0.594],
              "6 objects": [0.1127, 0.446, 0.547], "seconds": 0.363},
 }  # fmt: skip
-NOTE = "as published, measured on other data (H100):"
-COLUMNS = 5  # of plots
+PUBLISHED_NOTE = "as published, measured on other data (H100):"
+PLOT_COLUMNS = 5  # of plots
 Cells = list[str]
 
 
@@ -36,14 +36,14 @@ def table(facts: dict) -> list[str]:
     def line(row: Cells) -> str:
         return row[0].ljust(widths[0]) + "".join(f"  {c:>{w}}" for c, w in zip(row[1:], widths[1:], strict=True))
 
-    return [line(head), *map(line, ours), NOTE, *map(line, published)]
+    return [line(head), *map(line, ours), PUBLISHED_NOTE, *map(line, published)]
 
 
 def report(results: Path, facts: dict) -> None:
     """RESULTS.md and RESULTS.png beside RESULTS.json."""
     with replacing(results.with_suffix(".md")) as part:
         part.write_text("\n".join(markdown(results.stem, facts)) + "\n")
-    draw(results.with_suffix(".png"), panels(facts), COLUMNS)
+    draw(results.with_suffix(".png"), panels(facts), PLOT_COLUMNS)
 
 
 def _cells(facts: dict) -> tuple[Cells, list[Cells], list[Cells]]:
@@ -95,7 +95,7 @@ def markdown(stem: str, facts: dict) -> Iterator[str]:
         name = f"`{row[0]}`" if row[0] in best["models"] else row[0]
         cells = zip(head[1:], row[1:], strict=True)
         yield _row([name, *(f"**{cell}**" if row[0] == best.get(split) else cell for split, cell in cells)])
-    yield _row([f"*{NOTE}*", *[""] * (len(head) - 1)])
+    yield _row([f"*{PUBLISHED_NOTE}*", *[""] * (len(head) - 1)])
     yield from map(_row, published)
     yield ""
     for row, result in facts["rows"].items():
@@ -130,7 +130,7 @@ def panels(facts: dict) -> list[Panel]:
         curves = {name: _curve(row["splits"][split]["error by frame"], 1) for name, row in rows.items()
                   if split in row["splits"]}  # fmt: skip
         out.append(Panel(f"{split}: error [cm] by frame", curves=curves))
-    out += [Panel("")] * (-len(splits) % COLUMNS)
+    out += [Panel("")] * (-len(splits) % PLOT_COLUMNS)
     first = splits[0]
     stride = facts["frames between values by object"]
     for name in next(iter(rows.values()))["splits"][first]["error by object"]:

@@ -18,7 +18,7 @@ from stages.core.errors import InputError
 from stages.core.scene.files import provenance, replacing
 from stages.core.scene.images import read_video, resize, video_info, write_jpeg
 from stages.core.scene.scene_ply import read_scene
-from stages.lab.bench.chat import Endpoint, picture
+from stages.lab.bench.chat_completions import ChatEndpoint, image_part
 
 log = logging.getLogger(__name__)
 RANGES = {"E": (1e2, 1e12), "density": (5.0, 25_000.0)}  # from foams and gels to metals [Pa] [kg/m^3]
@@ -52,16 +52,16 @@ class EstimateOptions:
     tries: int = 3
 
 
-class Unfit(ValueError):
+class InvalidReply(ValueError):
     """An answer that cannot be used; says why in words that the model can act on."""
 
 
 def run(video: Path, out: Path, options: EstimateOptions = EstimateOptions()) -> list[str]:
     """Write OUT for `ngff simulate --materials OUT`, and beside it who said so; a line about each object."""
     video, out = Path(video), Path(out)
-    endpoint = Endpoint.from_environment(options.model, options.timeout)
-    names = names_of(options.objects)
-    jpegs = frames_of(video, options.frames, options.longest)
+    endpoint = ChatEndpoint.from_environment(options.model, options.timeout)
+    names = object_names(options.objects)
+    jpegs = sample_frames(video, options.frames, options.longest)
     log.info("showing %d frames of %s to %s at %s", len(jpegs), video, endpoint.model, endpoint.url)
     found, replies = estimate(endpoint, jpegs, names, options.tries)
     with replacing(out) as part:
@@ -74,7 +74,7 @@ def run(video: Path, out: Path, options: EstimateOptions = EstimateOptions()) ->
     return [f"{n}: {row['material']}, E {row['E']:.3g} Pa, {row['density']:.4g} kg/m^3" for n, row in found.items()]
 
 
-def names_of(objects: str) -> list[str]:
+def object_names(objects: str) -> list[str]:
     """Names of the objects to ask about, none when the model shall name them."""
     if objects.lower().endswith(".ply"):
         names = [o.name for o in read_scene(Path(objects)).objects]
@@ -88,7 +88,7 @@ def names_of(objects: str) -> list[str]:
     return names
 
 
-def frames_of(video: Path, count: int, longest: int) -> list[bytes]:
+def sample_frames(video: Path, count: int, longest: int) -> list[bytes]:
     """`count` evenly spaced frames, the first and the last among them (fewer if there are fewer), as JPEG."""
     total = video_info(video)[0] or sum(1 for _ in read_video(video))
     wanted = {round(i * (total - 1) / max(count - 1, 1)) for i in range(count)}
@@ -105,65 +105,71 @@ def frames_of(video: Path, count: int, longest: int) -> list[bytes]:
     return jpegs
 
 
-def estimate(endpoint: Endpoint, jpegs: list[bytes], names: list[str], tries: int) -> tuple[dict[str, dict], list[str]]:
+def estimate(
+    endpoint: ChatEndpoint, jpegs: list[bytes], names: list[str], tries: int
+) -> tuple[dict[str, dict], list[str]]:
     """What the model says of each object, and all of its replies; an unfit one is sent back with what is wrong."""
     which = f"The objects are called: {', '.join(names)}." if names else "Give every object a short name of its own."
     text = PROMPT.format(frames=len(jpegs), which=which, example=names[0] if names else "duck", **RANGES)
-    messages = [{"role": "user", "content": [{"type": "text", "text": text}, *map(picture, jpegs)]}]
+    messages = [{"role": "user", "content": [{"type": "text", "text": text}, *map(image_part, jpegs)]}]
     replies: list[str] = []
     for _ in range(tries):
         replies.append(endpoint.ask(messages))
         try:
-            return checked(replies[-1], names), replies
-        except Unfit as error:
+            return parse_reply(replies[-1], names), replies
+        except InvalidReply as error:
             problem = str(error)
             log.info("%s's answer cannot be used: %s", endpoint.model, problem)
-            messages += [{"role": "assistant", "content": replies[-1]},
-                         {"role": "user", "content": f"That cannot be used: {problem}. Answer again, with JSON alone."}]
+            messages += [
+                {"role": "assistant", "content": replies[-1]},
+                {"role": "user", "content": f"That cannot be used: {problem}. Answer again, with JSON alone."},
+            ]
     raise InputError(f"{endpoint.model} at {endpoint.url}: {tries} answers could not be used, the last because "
                      f"{problem}; try another --model, or write the materials yourself")  # fmt: skip
 
 
-def checked(reply: str, names: list[str]) -> dict[str, dict]:
+def parse_reply(reply: str, names: list[str]) -> dict[str, dict]:
     """The answer as {name: {material, E, density}}, in the order of the names. Raises Unfit for anything else."""
     text = reply.strip()
     if text.startswith("```") and text.endswith("```"):  # a fence around the JSON is the one thing forgiven
         text = text.strip("`").removeprefix("json")
     try:
         data = json.loads(text, object_pairs_hook=_once, parse_constant=_not_a_number)
-    except Unfit:
+    except InvalidReply:
         raise
     except ValueError as error:
-        raise Unfit(f"it is not JSON ({error})") from error
+        raise InvalidReply(f"it is not JSON ({error})") from error
     if not isinstance(data, dict) or not data:
-        raise Unfit("it must be a JSON object with an entry for each thing")
+        raise InvalidReply("it must be a JSON object with an entry for each thing")
     missing, unknown = [n for n in names if n not in data], [n for n in data if names and n not in names]
     if missing or unknown:
         what = f"no entry for {', '.join(missing)}" if missing else f"{', '.join(unknown)} was not asked for"
-        raise Unfit(f"{what}; the names are {', '.join(names)}")
+        raise InvalidReply(f"{what}; the names are {', '.join(names)}")
     return {name: _entry(name, data[name]) for name in names or data}
 
 
 def _entry(name: str, row: object) -> dict:
     if not isinstance(row, dict) or set(row) != {"material", "E", "density"}:
-        raise Unfit(f"the entry of {name} must have exactly material, E and density")
+        raise InvalidReply(f"the entry of {name} must have exactly material, E and density")
     if not isinstance(row["material"], str) or not row["material"].strip():
-        raise Unfit(f"material of {name} must be a word or two")
+        raise InvalidReply(f"material of {name} must be a word or two")
     for key, (low, high) in RANGES.items():
         value = row[key]
         if isinstance(value, bool) or not isinstance(value, (int, float)):
-            raise Unfit(f"{key} of {name} must be a plain number in {UNITS[key]}, not {json.dumps(value)[:80]}")
+            raise InvalidReply(f"{key} of {name} must be a plain number in {UNITS[key]}, not {json.dumps(value)[:80]}")
         if not low <= value <= high:
-            raise Unfit(f"{key} of {name} is {str(value)[:20]} {UNITS[key]}, which is not within {low:g} to {high:g}")
+            raise InvalidReply(
+                f"{key} of {name} is {str(value)[:20]} {UNITS[key]}, which is not within {low:g} to {high:g}"
+            )
     return {"material": " ".join(row["material"].split()), "E": float(row["E"]), "density": float(row["density"])}
 
 
 def _once(pairs: list[tuple[str, object]]) -> dict:
     keys = [key for key, _ in pairs]
     if len(set(keys)) < len(keys):
-        raise Unfit("a name is there twice")
+        raise InvalidReply("a name is there twice")
     return dict(pairs)
 
 
 def _not_a_number(word: str) -> float:
-    raise Unfit(f"{word} is not a number")
+    raise InvalidReply(f"{word} is not a number")

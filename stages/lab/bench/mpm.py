@@ -16,19 +16,19 @@ import torch
 from stages.core.errors import InputError
 from stages.core.physics.mpm import solver as mpm
 from stages.lab.bench import common as bench
-from stages.lab.bench import mpm_plain as bench_mpm_plain
+from stages.lab.bench import mpm_three_kernel
 
 log = logging.getLogger(__name__)
 SUBSTEP, SUBSTEPS, FRAMES = 1e-4, 200, 100  # as published
 GRAVITY = (0.0, 0.0, -5.0)
-BODIES = 3
+BODIES_PER_SCENE = 3
 PARTICLE_BYTES = 145  # read and written of a particle's own in a substep
-NODES = 27  # of its stencil: read 16 bytes each, add 16 bytes each
+STENCIL_NODES = 27  # of its stencil: read 16 bytes each, add 16 bytes each
 MATERIALS = ((8e5, 600.0), (1e5, 700.0), (3e5, 300.0))  # E [Pa], density [kg/m^3]: ball, panda, duck
 
 
 @dataclass(frozen=True)
-class BenchOptions:
+class MpmBenchOptions:
     """Scenes are `scenes` copies of one; 0 chooses what suits the device."""
 
     device: str = "auto"
@@ -41,10 +41,10 @@ class BenchOptions:
             raise InputError("--frames at least 1, --scenes at least 0, --particles 100 to 2,000,000")
 
 
-def scene(particles: int) -> tuple[mpm.Particles, mpm.Box, float]:
+def falling_boxes(particles: int) -> tuple[mpm.Particles, mpm.Box, float]:
     """Three boxes above each other at the floor of the published world, its box, and the spacing of the grid."""
-    side = round((particles / BODIES) ** (1 / 3))
-    layers = max(1, round(particles / BODIES / side**2))
+    side = round((particles / BODIES_PER_SCENE) ** (1 / 3))
+    layers = max(1, round(particles / BODIES_PER_SCENE / side**2))
     h = 0.45 / side
     body = torch.cartesian_prod(torch.arange(side), torch.arange(side), torch.arange(layers)) + 0.5
     parts = []
@@ -57,16 +57,16 @@ def scene(particles: int) -> tuple[mpm.Particles, mpm.Box, float]:
 
 def measure(particles: int, scenes: int, device: str, frames: int, exact: bool = False) -> dict:
     """Seconds a substep of a batch, and what follows from it; with sums that do not depend on order if `exact`."""
-    one, box, dx = scene(particles)
+    one, box, dx = falling_boxes(particles)
     solver = mpm.Solver(mpm.together([one] * scenes), box, dx, device, [len(one)] * scenes, exact=exact)
     push = torch.tensor(GRAVITY, device=device).repeat(len(solver.rows), 1)
     step = lambda: solver.frame(SUBSTEP * SUBSTEPS, push, SUBSTEPS)  # noqa: E731
     for _ in range(3):
         step()
-    each = bench.seconds(lambda: [step() for _ in range(frames)], device, repeat=1) / frames / SUBSTEPS
+    each = bench.median_seconds(lambda: [step() for _ in range(frames)], device, repeat=1) / frames / SUBSTEPS
     count, nodes = len(solver.rows), solver.touched
     node = 32 if exact else 16
-    moved = count * (PARTICLE_BYTES + 2 * node * NODES) + node * nodes
+    moved = count * (PARTICLE_BYTES + 2 * node * STENCIL_NODES) + node * nodes
     if bool((solver.lost >= 0).any()):
         log.warning("%d scenes lost particles", int((solver.lost >= 0).sum()))
     return {
@@ -76,36 +76,36 @@ def measure(particles: int, scenes: int, device: str, frames: int, exact: bool =
     }  # fmt: skip
 
 
-def measure_plain(particles: int, device: str) -> float:
+def measure_three_kernel(particles: int, device: str) -> float:
     """Seconds a substep of one scene in the plain form."""
-    one, box, dx = scene(particles)
+    one, box, dx = falling_boxes(particles)
     solver = mpm.Solver(one, box, dx, device, fused=True)
     push = torch.tensor(GRAVITY, device=device).repeat(len(one), 1)
     solver.frame(SUBSTEP * SUBSTEPS, push, SUBSTEPS)
     nodes = torch.zeros(solver.grid.count, 4, device=device)
     steps = 20 if device != "cpu" else 2
-    many = lambda: [bench_mpm_plain.substep(solver, nodes, SUBSTEP) for _ in range(steps)]  # noqa: E731
+    many = lambda: [mpm_three_kernel.substep(solver, nodes, SUBSTEP) for _ in range(steps)]  # noqa: E731
     many()
     if device != "cpu":
         graph = torch.cuda.CUDAGraph()
         with torch.cuda.graph(graph):
             many()
-        return bench.seconds(graph.replay, device) / steps
-    return bench.seconds(many, device, repeat=1) / steps
+        return bench.median_seconds(graph.replay, device) / steps
+    return bench.median_seconds(many, device, repeat=1) / steps
 
 
-def fitting(particles: int, device: str) -> int:
+def batch_size(particles: int, device: str) -> int:
     """Scenes in a batch: enough to fill a GPU, and not more nodes than indices go when exact; one on a CPU."""
     if device == "cpu":
         return 1
-    _, box, dx = scene(particles)
+    _, box, dx = falling_boxes(particles)
     count = mpm.make_grid(box, dx).count
     free = torch.cuda.mem_get_info(device)[0]
     room = min(2**30 // count, int(0.8 * free / (count * 100.5 + particles * 700)))
     return max(1, min(room, math.ceil(3_000_000 / particles)))
 
 
-def run(options: BenchOptions) -> Iterator[str]:
+def run(options: MpmBenchOptions) -> Iterator[str]:
     """Lines of the report."""
     from stages.core.backends import pick_device
 
@@ -114,8 +114,8 @@ def run(options: BenchOptions) -> Iterator[str]:
     copy = bench.copy_bandwidth(device)
     yield f"copy bandwidth {copy / 1e9:,.0f} GB/s"
     for particles in options.particles:
-        plain = measure_plain(particles, device)
-        many = options.scenes or fitting(particles, device)
+        plain = measure_three_kernel(particles, device)
+        many = options.scenes or batch_size(particles, device)
         for scenes, exact in sorted({(1, False), (many, False), (many, True)}):
             r = measure(particles, scenes, device, options.frames, exact)
             kind, shape = "mpm exact" if exact else "mpm", " x ".join(map(str, r["nodes"]))

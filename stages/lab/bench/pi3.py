@@ -26,7 +26,7 @@ from stages.lab.bench import common as bench
 
 
 @dataclass(frozen=True)
-class BenchOptions:
+class Pi3BenchOptions:
     device: str = "auto"
     views: tuple[int, ...] = (1, 8, 20, 50)
     size: int = 448  # side of the square photos [px]
@@ -38,13 +38,13 @@ class BenchOptions:
             raise InputError(f"--size must be a multiple of {PATCH}, --views and --repeat at least 1")
 
 
-def naive(q: Float[Tensor, "b h t d"], k: Float[Tensor, "b h t d"], v: Float[Tensor, "b h t d"]) -> Tensor:
+def naive_attention(q: Float[Tensor, "b h t d"], k: Float[Tensor, "b h t d"], v: Float[Tensor, "b h t d"]) -> Tensor:
     """Attention with its table of all pairs of tokens, softmax in 32 bit as autocast has it."""
     scores = (q @ k.mT) * q.shape[-1] ** -0.5
     return scores.softmax(-1).to(v.dtype) @ v
 
 
-def attend_with(model: nn.Module, attend: Callable) -> None:
+def set_attention(model: nn.Module, attend: Callable) -> None:
     for module in model.modules():
         if isinstance(module, Attention):
             module.attend = attend
@@ -63,7 +63,7 @@ def measure(model: nn.Module, views: int, size: int, at_once: int, device: str, 
             torch.cuda.reset_peak_memory_stats()
         with torch.autocast(torch.device(device).type, torch.bfloat16, enabled=half):
             model(images, at_once)
-            seconds = bench.seconds(lambda: model(images, at_once), device, repeat)
+            seconds = bench.median_seconds(lambda: model(images, at_once), device, repeat)
         return seconds, torch.cuda.max_memory_allocated() if gpu else float("nan")
     finally:
         gc.collect()
@@ -71,7 +71,7 @@ def measure(model: nn.Module, views: int, size: int, at_once: int, device: str, 
             torch.cuda.empty_cache()
 
 
-def run(options: BenchOptions, config: Pi3Config = Pi3Config()) -> Iterator[str]:  # noqa: B008 -- frozen
+def run(options: Pi3BenchOptions, config: Pi3Config = Pi3Config()) -> Iterator[str]:  # noqa: B008 -- frozen
     """A line for each number of views: seconds, memory and its estimate, then the same with attention written out."""
     device = pick_device(options.device)
     half = device != "cpu"
@@ -86,14 +86,14 @@ def run(options: BenchOptions, config: Pi3Config = Pi3Config()) -> Iterator[str]
         size = options.size, options.size
         at_once = memory.plan(config, views, size, options.splats, half, memory.free(device))
         said = weights + memory.activations(config, views, *size, at_once, options.splats, half)
-        attend_with(model, nn.functional.scaled_dot_product_attention)
+        set_attention(model, nn.functional.scaled_dot_product_attention)
         try:
             seconds, most = measure(model, views, options.size, at_once, device, options.repeat)
         except torch.OutOfMemoryError:
             yield f"views {views:>3}  out of memory (estimate {_gb(said)})"
             continue
         yield f"views {views:>3}  {seconds:8.3f} s  {_gb(most)} (estimate {_gb(said)})  {views / seconds:6.1f} photos/s"
-        attend_with(model, naive)
+        set_attention(model, naive_attention)
         try:
             if not half and _table(config, views, options.size) > 0.5 * (memory.free(device) or 0):
                 raise torch.OutOfMemoryError  # a CPU would swap, not fail

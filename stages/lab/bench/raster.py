@@ -26,15 +26,15 @@ from stages.core.raster.rasterise import rasterise
 from stages.core.scene.files import replacing
 from stages.core.scene.gaussians import Gaussians
 from stages.lab.bench import common as bench
-from stages.lab.bench.raster_plain import blend_plain, tiles_of
+from stages.lab.bench.raster_per_pixel import bin_into_tiles, composite_per_pixel
 
 FORWARD = ((100_000, 448), (100_000, 800), (300_000, 448), (300_000, 800))
-BOTH = ((50_000, 448), (100_000, 448))
-SIDE = 448  # of the images whose similarity is measured [px]
+FORWARD_BACKWARD = ((50_000, 448), (100_000, 448))
+SSIM_SIZE = 448  # of the images whose similarity is measured [px]
 
 
 @dataclass(frozen=True)
-class BenchOptions:
+class RasterBenchOptions:
     """`shrink` divides the numbers of Gaussians and pixels, for a quick look."""
 
     repeat: int = 15  # timed calls of each, of which the fastest counts
@@ -46,7 +46,7 @@ class BenchOptions:
 
 
 @dataclass(frozen=True)
-class Row:
+class RasterTiming:
     """One comparison. Times in milliseconds: of the clock on `threads` threads, and of the processor on one."""
 
     what: str
@@ -67,7 +67,7 @@ class Row:
         )
 
 
-def cloud(n: int, seed: int = 0) -> Gaussians:
+def random_gaussians(n: int, seed: int = 0) -> Gaussians:
     """n Gaussians in the unit cube around the origin, as large as fills it; SH degree 0."""
     rng = torch.Generator().manual_seed(seed)
     quats = torch.nn.functional.normalize(torch.randn(n, 4, generator=rng), dim=1)
@@ -78,19 +78,19 @@ def cloud(n: int, seed: int = 0) -> Gaussians:
     )  # fmt: skip
 
 
-def camera(pixels: int) -> tuple[Tensor, Tensor]:
+def view_camera(pixels: int) -> tuple[Tensor, Tensor]:
     """World to camera, and intrinsics, of a square image that the cube fills."""
     return look_at(torch.tensor([1.6, 0.9, 0.8]), torch.zeros(3)), intrinsics(pixels, pixels, 1.4 * pixels)
 
 
-def draw_plain(g: Gaussians, viewmat: Tensor, K: Tensor, pixels: int) -> Tensor:
+def render_per_pixel(g: Gaussians, viewmat: Tensor, K: Tensor, pixels: int) -> Tensor:
     """Colour and depth (pixels, pixels, 4) before black."""
     tensors = (g.means, g.quats, g.scales, g.opacities, g.sh)
     splats, keys, _ = project(pinhole(viewmat, K, pixels, pixels, 0.01), *tensors)
-    return blend_plain(splats, tiles_of(splats, keys, pixels, pixels))
+    return composite_per_pixel(splats, bin_into_tiles(splats, keys, pixels, pixels))
 
 
-def milliseconds(call: Callable[[], object], repeat: int) -> tuple[float, float]:
+def wall_and_cpu_ms(call: Callable[[], object], repeat: int) -> tuple[float, float]:
     """Wall time on torch's threads, and processor time on one [ms]: the fastest calls, for others slow them down."""
     call()
     wall = _fastest(call, time.perf_counter, repeat)
@@ -111,25 +111,25 @@ def _fastest(call: Callable[[], object], clock: Callable[[], float], repeat: int
     return min(times)
 
 
-def measure_forward(n: int, pixels: int, repeat: int) -> Row:
+def measure_forward(n: int, pixels: int, repeat: int) -> RasterTiming:
     """A frame."""
-    g, (viewmat, K) = cloud(n), camera(pixels)
+    g, (viewmat, K) = random_gaussians(n), view_camera(pixels)
     ours = lambda: rasterise(g, viewmat[None], K[None], pixels, pixels)  # noqa: E731
-    plain = lambda: draw_plain(g, viewmat, K, pixels)  # noqa: E731
+    plain = lambda: render_per_pixel(g, viewmat, K, pixels)  # noqa: E731
     return _row("forward", n, pixels, ours, plain, repeat)
 
 
-def measure_both(n: int, pixels: int, repeat: int) -> Row:
+def measure_forward_backward(n: int, pixels: int, repeat: int) -> RasterTiming:
     """A frame, and gradients of all that Gaussians have."""
-    g, (viewmat, K) = cloud(n), camera(pixels)
+    g, (viewmat, K) = random_gaussians(n), view_camera(pixels)
     tensors = [t.requires_grad_() for t in (g.means, g.quats, g.scales, g.opacities, g.sh)]
     ours = lambda: rasterise(g, viewmat[None], K[None], pixels, pixels).rgb.sum()  # noqa: E731
-    plain = lambda: draw_plain(g, viewmat, K, pixels)[..., :3].sum()  # noqa: E731
+    plain = lambda: render_per_pixel(g, viewmat, K, pixels)[..., :3].sum()  # noqa: E731
     pulled = [lambda loss=loss: torch.autograd.grad(loss(), tensors) for loss in (ours, plain)]
     return _row("forward, backward", n, pixels, *pulled, repeat)
 
 
-def measure_ssim(pixels: int, repeat: int) -> Row:
+def measure_ssim(pixels: int, repeat: int) -> RasterTiming:
     """Similarity of two pictures and its gradient, beside the same in plain PyTorch."""
     rng = torch.Generator().manual_seed(0)
     first, second = (torch.rand(pixels, pixels, 3, generator=rng) for _ in range(2))
@@ -138,22 +138,24 @@ def measure_ssim(pixels: int, repeat: int) -> Row:
     return _row("SSIM, backward", 0, pixels, *pulled, repeat)
 
 
-def _row(what: str, n: int, pixels: int, ours: Callable, plain: Callable, repeat: int) -> Row:
+def _row(what: str, n: int, pixels: int, ours: Callable, plain: Callable, repeat: int) -> RasterTiming:
     threads = torch.get_num_threads()
-    return Row(what, n, pixels, threads, *milliseconds(ours, repeat), *milliseconds(plain, max(1, repeat // 3)))
+    return RasterTiming(
+        what, n, pixels, threads, *wall_and_cpu_ms(ours, repeat), *wall_and_cpu_ms(plain, max(1, repeat // 3))
+    )
 
 
-def run(out: Path | None = None, options: BenchOptions = BenchOptions()) -> Iterator[str]:  # noqa: B008 -- frozen
+def run(out: Path | None = None, options: RasterBenchOptions = RasterBenchOptions()) -> Iterator[str]:  # noqa: B008 -- frozen
     """Lines of the report; all numbers as JSON in `out`."""
     yield bench.machine("cpu")
     by = options.shrink
-    sizes = [(f, n // by, math.ceil(p / by)) for f, rows in ((measure_forward, FORWARD), (measure_both, BOTH))
-             for n, p in rows]  # fmt: skip
+    suites = (measure_forward, FORWARD), (measure_forward_backward, FORWARD_BACKWARD)
+    sizes = [(measure, n // by, math.ceil(p / by)) for measure, rows in suites for n, p in rows]
     rows = []
     for measure, n, pixels in sizes:
         rows.append(measure(n, pixels, options.repeat))
         yield str(rows[-1])
-    rows.append(measure_ssim(math.ceil(SIDE / by), options.repeat))
+    rows.append(measure_ssim(math.ceil(SSIM_SIZE / by), options.repeat))
     yield str(rows[-1])
     if out is not None:
         facts = {"command": "ngff-lab bench raster", "machine": bench.machine("cpu"), "load": os.getloadavg()[0]}

@@ -35,7 +35,7 @@ log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class BenchOptions:
+class ReconstructBenchOptions:
     """What the sets are reconstructed with."""
 
     quality: str = "normal"
@@ -61,7 +61,7 @@ class PoseError:
     shift: float  # RMS distance of centres after alignment by a similarity [% of the extent of the reference centres]
 
 
-def run(sets: list[Path], out: Path, options: BenchOptions) -> Iterator[str]:
+def run(sets: list[Path], out: Path, options: ReconstructBenchOptions) -> Iterator[str]:
     """A line a set, and all figures in a JSON file, which keeps the rows of sets that are not measured now.
 
     A set of which nothing can be made has a row that says why.
@@ -73,7 +73,7 @@ def run(sets: list[Path], out: Path, options: BenchOptions) -> Iterator[str]:
     yield f"{'set':14s} {'photos':7s} {'rotation':>9s} {'shift':>7s} {'held-out':>19s} {'wall':>6s} {'CPU':>8s}  memory"
     for folder, images in photos.items():
         try:
-            row = measured_alone(folder, images, options)
+            row = measure_in_subprocess(folder, images, options)
         except InputError as error:
             row = {"failed": str(error).removeprefix(f"{images}: ")}
         rows[options.key(folder)] = row
@@ -82,7 +82,7 @@ def run(sets: list[Path], out: Path, options: BenchOptions) -> Iterator[str]:
         yield _line(folder.resolve().name, row)
 
 
-def measured_alone(folder: Path, images: Path, options: BenchOptions) -> dict:
+def measure_in_subprocess(folder: Path, images: Path, options: ReconstructBenchOptions) -> dict:
     """measure() in a process of its own."""
     with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as process:
         return process.submit(measure, folder, images, options).result()
@@ -98,7 +98,7 @@ def photo_folder(folder: Path) -> Path:
     return folder
 
 
-def measure(folder: Path, images: Path, options: BenchOptions) -> dict:
+def measure(folder: Path, images: Path, options: ReconstructBenchOptions) -> dict:
     """One set reconstructed and compared with what is known about it."""
     logging.basicConfig(format="%(message)s", level=logging.WARNING)
     logging.getLogger("stages").setLevel(logging.INFO)
@@ -116,7 +116,7 @@ def measure(folder: Path, images: Path, options: BenchOptions) -> dict:
     return row
 
 
-def _scene(images: Path, options: BenchOptions) -> tuple[dict, Cameras, float | None]:
+def _scene(images: Path, options: ReconstructBenchOptions) -> tuple[dict, Cameras, float | None]:
     """The report of a whole reconstruction, its cameras, and the height of its floor."""
     from stages.reconstruct.options import ReconstructOptions
     from stages.reconstruct.stage import run as reconstruct
@@ -131,7 +131,7 @@ def _scene(images: Path, options: BenchOptions) -> tuple[dict, Cameras, float | 
     return asdict(report), scene.cameras, scene.floor
 
 
-def _cameras(images: Path, options: BenchOptions) -> tuple[dict, Cameras, None]:
+def _cameras(images: Path, options: ReconstructBenchOptions) -> tuple[dict, Cameras, None]:
     """The part of such a report that cameras have, and the cameras, in a world that is not yet upright."""
     from stages.reconstruct import sfm
     from stages.reconstruct.options import ReconstructOptions
@@ -146,12 +146,12 @@ def _cameras(images: Path, options: BenchOptions) -> tuple[dict, Cameras, None]:
 
 def pose_error(found: Cameras, reference: Cameras) -> PoseError:
     """The relative rotation does not depend on any alignment; centres are aligned by least squares."""
-    a, b = shared(found, reference)
+    a, b = matched_cameras(found, reference)
     turns = []
     for R in (a.viewmats[:, :3, :3].double(), b.viewmats[:, :3, :3].double()):
         i, j = torch.triu_indices(len(R), len(R), 1)
         turns.append(R[j] @ R[i].mT)
-    angles = angle(turns[0] @ turns[1].mT)
+    angles = rotation_angle(turns[0] @ turns[1].mT)
     x, y = centres(a.viewmats.double()), centres(b.viewmats.double())
     shift = (umeyama(x, y)(x) - y).square().sum(1).mean().sqrt() / torch.pdist(y).max()
     return PoseError(len(a), float(angles.median()), float(angles.max()), 100 * float(shift))
@@ -163,8 +163,8 @@ def upright_error(found: Cameras, reference: Cameras, floor: float, true_floor: 
     The worlds are brought together by all cameras, turns included; the scene's size is twice the distance of the
     cameras from their middle. The height is compared below the middle of the cameras.
     """
-    a, b = shared(found, reference)
-    move = similarity(a.viewmats.double(), b.viewmats.double())
+    a, b = matched_cameras(found, reference)
+    move = camera_similarity(a.viewmats.double(), b.viewmats.double())
     up = move.rotation @ torch.tensor([0.0, 0, 1], dtype=torch.float64)
     x, y = centres(a.viewmats.double()).mean(0), centres(b.viewmats.double())
     below = move(x - torch.tensor([0.0, 0, 1]) * (x[2] - floor))
@@ -173,7 +173,7 @@ def upright_error(found: Cameras, reference: Cameras, floor: float, true_floor: 
     return tilt, 100 * abs(float(below[2]) - true_floor) / size
 
 
-def similarity(source: Float[Tensor, "n 4 4"], target: Float[Tensor, "n 4 4"]) -> Similarity:
+def camera_similarity(source: Float[Tensor, "n 4 4"], target: Float[Tensor, "n 4 4"]) -> Similarity:
     """From one world to the other, by centres and by points to the right, below and ahead of them."""
     points = []
     for viewmats in (source, target):
@@ -183,7 +183,7 @@ def similarity(source: Float[Tensor, "n 4 4"], target: Float[Tensor, "n 4 4"]) -
     return umeyama(*points)
 
 
-def shared(found: Cameras, reference: Cameras) -> tuple[Cameras, Cameras]:
+def matched_cameras(found: Cameras, reference: Cameras) -> tuple[Cameras, Cameras]:
     """Cameras of both, of the same photos in the same order."""
     row = {name: i for i, name in enumerate(reference.names)}
     both = [name for name in found.names if name in row]
@@ -192,7 +192,7 @@ def shared(found: Cameras, reference: Cameras) -> tuple[Cameras, Cameras]:
     return found[[found.names.index(name) for name in both]], reference[[row[name] for name in both]]
 
 
-def angle(R: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b"]:
+def rotation_angle(R: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b"]:
     """Of a rotation [degrees]."""
     cosine = (R.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2
     return torch.rad2deg(torch.acos(cosine.clamp(-1, 1)))

@@ -31,13 +31,15 @@ from stages.lab.bench import common as bench
 from stages.refine.options import RefineOptions
 from stages.refine.stage import refine
 
-VIEWS = 4  # from higher than the photos
-HIDDEN = 0.02  # weight in every photo below which a Gaussian of the table was not seen [px of the small images]
-THERE = 0.9  # alpha of a table that is there
+NOVEL_VIEWS = 4  # from higher than the photos
+MAX_HIDDEN_WEIGHT = (
+    0.02  # weight in every photo below which a Gaussian of the table was not seen [px of the small images]
+)
+MIN_TABLE_ALPHA = 0.9  # alpha of a table that is there
 
 
 @dataclass(frozen=True)
-class BenchOptions:
+class RefineBenchOptions:
     scenes: int = 4
     photos: int = 24
 
@@ -47,17 +49,17 @@ class BenchOptions:
 
 
 @torch.no_grad()
-def as_photographed(scene: Scene) -> Scene:
+def remove_unseen_background(scene: Scene) -> Scene:
     """Without what of the background no camera sees."""
     g = scene.gaussians
     weight = torch.zeros(len(g))
     for viewmat, K, width, height in small(scene.cameras):
         weight = torch.maximum(weight, visibility(g, viewmat, K, width, height)[1])
-    return replace(scene, gaussians=g[(g.object_id > 0) | (weight > HIDDEN)])
+    return replace(scene, gaussians=g[(g.object_id > 0) | (weight > MAX_HIDDEN_WEIGHT)])
 
 
 @torch.no_grad()
-def table_alone(g: Gaussians, views: Float[Tensor, "c 4 4"], scene: Scene) -> tuple[Tensor, Tensor]:
+def render_background(g: Gaussians, views: Float[Tensor, "c 4 4"], scene: Scene) -> tuple[Tensor, Tensor]:
     """Pictures (c, h, w, 3) and alpha (c, h, w) of the background, from views with the scene's lenses."""
     width, height = (int(side) for side in scene.cameras.sizes[0])
     Ks = scene.cameras.Ks[:1].expand(len(views), 3, 3)
@@ -65,7 +67,7 @@ def table_alone(g: Gaussians, views: Float[Tensor, "c 4 4"], scene: Scene) -> tu
     return drawn.rgb.clamp(0, 1), drawn.alpha
 
 
-def psnr(one: Float[Tensor, "c h w 3"], two: Float[Tensor, "c h w 3"], where: Bool[Tensor, "c h w"]) -> float:
+def masked_psnr(one: Float[Tensor, "c h w 3"], two: Float[Tensor, "c h w 3"], where: Bool[Tensor, "c h w"]) -> float:
     """In some of the pixels [dB]."""
     return -10 * math.log10(max(float((one - two)[where].square().mean()), 1e-10))
 
@@ -73,26 +75,27 @@ def psnr(one: Float[Tensor, "c h w 3"], two: Float[Tensor, "c h w 3"], where: Bo
 def measure(index: int, photos: int) -> dict:
     """One scene; the objects' own labels are the true ones."""
     scene = tabletop("apart", index, photos)
-    seen = as_photographed(scene)
+    seen = remove_unseen_background(scene)
     start = time.perf_counter()
     refined = refine(seen, RefineOptions(completer="none"))  # the objects go anyway
     took = time.perf_counter() - start
-    views = orbit(VIEWS, torch.tensor([0.0, 0, TOP]), DISTANCE, 60.0, azimuth=10.0)
-    true, _ = table_alone(scene.gaussians, views, scene)
-    before, _ = table_alone(seen.gaussians, views, scene)
-    after, _ = table_alone(refined.gaussians, views, scene)
+    views = orbit(NOVEL_VIEWS, torch.tensor([0.0, 0, TOP]), DISTANCE, 60.0, azimuth=10.0)
+    true, _ = render_background(scene.gaussians, views, scene)
+    before, _ = render_background(seen.gaussians, views, scene)
+    after, _ = render_background(refined.gaussians, views, scene)
     # through a hole one sees the floor, so the table top alone says where the holes are
     tops = (g[g.means[:, 2] > TOP - 0.02] for g in (scene.gaussians, seen.gaussians))
-    whole, left = (table_alone(top, views, scene)[1] for top in tops)
-    hole = (whole > THERE) & (left < THERE)
+    whole, left = (render_background(top, views, scene)[1] for top in tops)
+    hole = (whole > MIN_TABLE_ALPHA) & (left < MIN_TABLE_ALPHA)
     return {
-        "scene": index, "pixels": int(hole.sum()), "before_db": round(psnr(before, true, hole), 2),
-        "after_db": round(psnr(after, true, hole), 2), "elsewhere_db": round(psnr(after, before, ~hole), 2),
+        "scene": index, "pixels": int(hole.sum()), "before_db": round(masked_psnr(before, true, hole), 2),
+        "after_db": round(masked_psnr(after, true, hole), 2),
+        "elsewhere_db": round(masked_psnr(after, before, ~hole), 2),
         "seconds": round(took, 1),
     }  # fmt: skip
 
 
-def run(out: Path | None = None, options: BenchOptions = BenchOptions()) -> Iterator[str]:  # noqa: B008 -- frozen
+def run(out: Path | None = None, options: RefineBenchOptions = RefineBenchOptions()) -> Iterator[str]:  # noqa: B008 -- frozen
     """Lines of the report; all numbers as JSON in `out`."""
     yield bench.machine("cpu")
     rows = []

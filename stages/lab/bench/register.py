@@ -32,14 +32,20 @@ from stages.refine.register import register
 from stages.refine.register_cloud import diameter, lab
 
 LIMITS = {"rotation": 2.0, "scale": 2.0, "shift": 1.0}  # [deg], [%], [% of the diameter]
-ROUND = ("ball", "bowl", "can")  # their shape is one of revolution about z; what is painted on them is not
-ALIKE = 0.002  # rms change of place and colour that a turn about z may make unnoticed [diameters]
-SHOWN = 400  # Gaussians that splatreg is given of each; its time grows with the square
-RADIUS = 0.14  # rms radius of the object that splatreg's tolerances, such as 2 cm for an inlier, are made for [m]
+SURFACES_OF_REVOLUTION = (
+    "ball",
+    "bowl",
+    "can",
+)  # their shape is one of revolution about z; what is painted on them is not
+MAX_SYMMETRY_RESIDUAL = 0.002  # rms change of place and colour that a turn about z may make unnoticed [diameters]
+SPLATREG_GAUSSIANS = 400  # Gaussians that splatreg is given of each; its time grows with the square
+SPLATREG_RADIUS = (
+    0.14  # rms radius of the object that splatreg's tolerances, such as 2 cm for an inlier, are made for [m]
+)
 
 
 @dataclass(frozen=True)
-class BenchOptions:
+class RegisterBenchOptions:
     only: str = ""  # names with commas between; empty: all ten objects
     trials: int = 10  # of each object
     missing: float = 0.4  # share of the surface
@@ -50,7 +56,7 @@ class BenchOptions:
 
 
 @dataclass(frozen=True)
-class Trial:
+class RegistrationTrial:
     """A part of an object, and where the whole would have to be put."""
 
     part: Gaussians
@@ -58,7 +64,7 @@ class Trial:
     seen: Float[Tensor, "k"]  # rows of the whole that the part is made of
 
 
-def trial(whole: Gaussians, number: int, options: BenchOptions) -> Trial:
+def make_trial(whole: Gaussians, number: int, options: RegisterBenchOptions) -> RegistrationTrial:
     """Odd numbers are bitten, even ones cut."""
     rng = torch.Generator().manual_seed(1000 * options.seed + number)
     x, across = whole.means, diameter(whole.means)
@@ -73,27 +79,29 @@ def trial(whole: Gaussians, number: int, options: BenchOptions) -> Trial:
     truth = Similarity(scale, matrix(torch.randn(4, generator=rng)), 3 * torch.randn(3, generator=rng))
     quats = multiply(quaternion(truth.rotation).expand(len(seen), 4), whole.quats[seen])
     part = replace(whole[seen], means=truth(noisy), quats=quats, scales=scale * whole.scales[seen], sh=rgb_to_sh(rgb))
-    return Trial(part, truth, seen)
+    return RegistrationTrial(part, truth, seen)
 
 
-def errors(found: Similarity, trial: Trial, whole: Gaussians, revolved: bool) -> dict[str, float]:
+def errors(found: Similarity, trial: RegistrationTrial, whole: Gaussians, revolved: bool) -> dict[str, float]:
     """Rotation [deg], scale [%], shift of the object's middle [% of its diameter], and rotation up to symmetry."""
     middle = (whole.means.amin(0) + whole.means.amax(0)) / 2
     shift = float((found(middle) - trial.truth(middle)).norm()) / (trial.truth.scale * diameter(whole.means))
     R = found.rotation.mT @ trial.truth.rotation  # truth, then back by what was found: the identity where it is right
-    turned = angle(R)
+    turned = rotation_angle(R)
     out = {"rotation": turned, "scale": 100 * abs(found.scale / trial.truth.scale - 1), "shift": 100 * shift}
-    about = about_z(R)
-    free = revolved and turned > LIMITS["rotation"] and change(whole, trial.seen, about) < ALIKE
-    return {**out, "rotation up to symmetry": angle(R @ about.mT) if free else turned}
+    about = nearest_z_rotation(R)
+    free = (
+        revolved and turned > LIMITS["rotation"] and symmetry_residual(whole, trial.seen, about) < MAX_SYMMETRY_RESIDUAL
+    )
+    return {**out, "rotation up to symmetry": rotation_angle(R @ about.mT) if free else turned}
 
 
-def angle(R: Float[Tensor, "3 3"]) -> float:
+def rotation_angle(R: Float[Tensor, "3 3"]) -> float:
     """Of a rotation [deg]."""
     return float(torch.rad2deg(((R.trace() - 1) / 2).clamp(-1, 1).arccos()))
 
 
-def about_z(R: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
+def nearest_z_rotation(R: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
     """The turn about z nearest to a rotation."""
     c, s = R[0, 0] + R[1, 1], R[1, 0] - R[0, 1]
     turn = torch.eye(3)
@@ -101,7 +109,7 @@ def about_z(R: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
     return turn
 
 
-def change(whole: Gaussians, seen: Float[Tensor, "k"], turn: Float[Tensor, "3 3"]) -> float:
+def symmetry_residual(whole: Gaussians, seen: Float[Tensor, "k"], turn: Float[Tensor, "3 3"]) -> float:
     """Rms by which the seen part, turned, differs from the whole in place and colour [diameters].
 
     One half of the Gaussians is held against the other; what they differ by without a turn is taken off.
@@ -163,8 +171,8 @@ def splatreg(part: Gaussians, whole: Gaussians, seed: int = 0) -> Similarity:
     rng, threads = torch.Generator().manual_seed(seed), torch.get_num_threads()
     given, units = [], []
     for g in (whole, part):
-        g = g[torch.randperm(len(g), generator=rng)[:SHOWN].to(g.means.device)]
-        unit = RADIUS / float((g.means - g.means.mean(0)).square().sum(1).mean().sqrt())
+        g = g[torch.randperm(len(g), generator=rng)[:SPLATREG_GAUSSIANS].to(g.means.device)]
+        unit = SPLATREG_RADIUS / float((g.means - g.means.mean(0)).square().sum(1).mean().sqrt())
         rgb = (g.sh[:, 0] * C0 + 0.5).clamp(0, 1)
         given.append(Theirs(g.means * unit, g.quats, g.scales * unit, g.opacities, rgb))
         units.append(unit)
@@ -182,7 +190,7 @@ if find_spec("splatreg"):
     METHODS["splatreg"] = splatreg
 
 
-def run(out: Path | None, options: BenchOptions = BenchOptions()) -> Iterator[str]:  # noqa: B008 -- frozen
+def run(out: Path | None, options: RegisterBenchOptions = RegisterBenchOptions()) -> Iterator[str]:  # noqa: B008 -- frozen
     """Measure every method on the same parts; a line for each object, and all trials as JSON."""
     names, compared, device = ObjectsOptions(options.only).names, METHODS, pick_device(options.device)
     yield f"{'right of ' + str(options.trials):14}" + "".join(f"{name:>12}" for name in compared)
@@ -190,7 +198,7 @@ def run(out: Path | None, options: BenchOptions = BenchOptions()) -> Iterator[st
     for name in names:
         whole = make_object(name)
         for number in tqdm(range(options.trials), desc=name, unit="part", leave=False):
-            given = trial(whole, number, options)
+            given = make_trial(whole, number, options)
             part, there = given.part.to(device), whole.to(device)
             if device != "cpu" and not rows:
                 ours(part, there)  # not timed: the first call on a GPU loads its libraries and kernels
@@ -199,17 +207,17 @@ def run(out: Path | None, options: BenchOptions = BenchOptions()) -> Iterator[st
                 found = function(part, there, number)
                 took = time.perf_counter() - start[0], time.process_time() - start[1]
                 rows.append({"object": name, "trial": number, "method": method, "seconds": took[0], "CPU seconds":
-                             took[1], **errors(found, given, whole, name in ROUND)})  # fmt: skip
+                             took[1], **errors(found, given, whole, name in SURFACES_OF_REVOLUTION)})  # fmt: skip
         right = {m: sum(_right(r) for r in rows if r["object"] == name and r["method"] == m) for m in compared}
         yield f"{name:14}" + "".join(f"{count:12d}" for count in right.values())
-    summary = {m: summarised([r for r in rows if r["method"] == m]) for m in compared}
+    summary = {m: summarise([r for r in rows if r["method"] == m]) for m in compared}
     yield from (f"{m}: {json.dumps(facts)}" for m, facts in summary.items())
     if "splatreg" not in compared:
         yield "splatreg is not installed and left out; `pip install --no-deps splatreg` adds it (all it needs is here)"
     if out:
         facts = {"machine": bench.machine(device), "options": asdict(options), "limits": LIMITS, "summary": summary}
         if "splatreg" in compared:
-            facts["splatreg"] = {"version": version("splatreg"), "Gaussians": SHOWN}
+            facts["splatreg"] = {"version": version("splatreg"), "Gaussians": SPLATREG_GAUSSIANS}
         with replacing(out) as part:
             part.write_text(json.dumps({**facts, "trials": [_rounded(r) for r in rows]}, indent=1) + "\n")
 
@@ -222,7 +230,7 @@ def _placed(row: dict) -> bool:
     return row["scale"] <= LIMITS["scale"] and row["shift"] <= LIMITS["shift"]
 
 
-def summarised(rows: list[dict]) -> dict[str, float]:
+def summarise(rows: list[dict]) -> dict[str, float]:
     """Shares within the limits, medians, and the time of a trial."""
     middle = {k: round(float(torch.tensor([r[k] for r in rows]).median()), 3)
               for k in ("rotation", "scale", "shift", "seconds", "CPU seconds")}  # fmt: skip

@@ -26,11 +26,11 @@ from stages.core.physics.mpm import solver as mpm
 from stages.core.scene.files import must_exist, replacing
 
 log = logging.getLogger(__name__)
-NEEDED = {"positions", "n", "volume", "E", "rho", "nu", "dt", "substeps_per_frame", "n_grid", "grid_lim", "gravity",
-          "rpic_damping"}  # fmt: skip
-PADDING = 3  # layers of nodes outside the walls
-KEEP = 0.9  # of the velocity along a wall, every substep
-DEPARTS = 1e-3  # of the drop height: a body further than this from free fall has touched something
+RECORDING_FIELDS = {"positions", "n", "volume", "E", "rho", "nu", "dt", "substeps_per_frame", "n_grid", "grid_lim", 
+                    "gravity", "rpic_damping"}  # fmt: skip
+WALL_LAYERS = 3  # layers of nodes outside the walls
+WALL_DAMPING = 0.9  # of the velocity along a wall, every substep
+CONTACT_DEVIATION = 1e-3  # of the drop height: a body further than this from free fall has touched something
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class ReplayOptions:
 
 
 @dataclass(frozen=True)
-class Comparison:
+class ReplayErrors:
     """How two runs of the same scene differ, in shares of the drop height."""
 
     drop: float  # the longest way down of a centre of mass [m]
@@ -53,16 +53,16 @@ class Comparison:
     particles: Tensor  # (t) largest distance of a particle; to be read before the first contact
 
 
-def read(path: Path) -> dict[str, np.ndarray]:
+def read_recording(path: Path) -> dict[str, np.ndarray]:
     """The recording's fields. InputError when it is none."""
-    must_exist(path, "a recording (.npz) with " + ", ".join(sorted(NEEDED)))
+    must_exist(path, "a recording (.npz) with " + ", ".join(sorted(RECORDING_FIELDS)))
     try:
         with np.load(path) as file:
             data = {name: file[name] for name in file.files}
     except (ValueError, BadZipFile, EOFError) as error:
         raise InputError(f"{path}: is not an NPZ file ({error})") from error
-    if missing := sorted(NEEDED - data.keys()):
-        raise InputError(f"{path}: no {', '.join(missing)}; a recording has {', '.join(sorted(NEEDED))}")
+    if missing := sorted(RECORDING_FIELDS - data.keys()):
+        raise InputError(f"{path}: no {', '.join(missing)}; a recording has {', '.join(sorted(RECORDING_FIELDS))}")
     shape, p = data["positions"].shape, int(data["n"].sum())
     if len(shape) != 3 or shape[1:] != (p, 3) or not np.isfinite(data["positions"]).all():
         raise InputError(f"{path}: positions must be finite and (frames, {p}, 3), as n says, not {shape}")
@@ -72,7 +72,7 @@ def read(path: Path) -> dict[str, np.ndarray]:
     return data
 
 
-def set_up(data: dict[str, np.ndarray], device: str) -> mpm.Solver:
+def make_solver(data: dict[str, np.ndarray], device: str) -> mpm.Solver:
     """Our solver at the first frame, with nodes where the public solver has them."""
     n = torch.from_numpy(data["n"]).long()
     each = {k: torch.from_numpy(data[k]).float().repeat_interleave(n) for k in ("E", "rho")}
@@ -82,14 +82,14 @@ def set_up(data: dict[str, np.ndarray], device: str) -> mpm.Solver:
                             float(data["nu"]) * full, 0 * full, 0 * full, COROTATED)  # fmt: skip
     dx = float(data["grid_lim"]) / int(data["n_grid"])
     # nodes up to PADDING - 1 feel the lower walls there, nodes from n_grid - PADDING on the upper ones
-    low, high = (PADDING - 1 + mpm.FLOOR_GAP) * dx, (int(data["n_grid"]) - PADDING - mpm.FLOOR_GAP) * dx
-    return mpm.Solver(particles, mpm.Box((low,) * 3, (high,) * 3, keep=KEEP), dx, device,
+    low, high = (WALL_LAYERS - 1 + mpm.FLOOR_GAP) * dx, (int(data["n_grid"]) - WALL_LAYERS - mpm.FLOOR_GAP) * dx
+    return mpm.Solver(particles, mpm.Box((low,) * 3, (high,) * 3, keep=WALL_DAMPING), dx, device,
                       damping=float(data["rpic_damping"]))  # fmt: skip
 
 
 def simulate(data: dict[str, np.ndarray], frames: int, device: str) -> Iterator[Tensor]:
     """Positions (p, 3) of our run, frame by frame, the first as recorded."""
-    solver = set_up(data, device)
+    solver = make_solver(data, device)
     steps = int(data["substeps_per_frame"])
     push = torch.from_numpy(data["gravity"]).float().repeat(len(solver.rows), 1).to(device)
     yield solver.particles.x.cpu()
@@ -101,7 +101,7 @@ def simulate(data: dict[str, np.ndarray], frames: int, device: str) -> Iterator[
         yield solver.particles.x.cpu()
 
 
-def compare(data: dict[str, np.ndarray], ours: Tensor) -> Comparison:
+def compare(data: dict[str, np.ndarray], ours: Tensor) -> ReplayErrors:
     """Our positions (t, p, 3) beside the recorded ones."""
     theirs = torch.from_numpy(data["positions"])
     bodies = [part.double() for part in theirs.split(data["n"].tolist(), 1)]
@@ -113,15 +113,15 @@ def compare(data: dict[str, np.ndarray], ours: Tensor) -> Comparison:
     steps = torch.arange(len(com)).double() * int(data["substeps_per_frame"])
     # the public solver adds gravity before it moves particles: after s substeps they fell g dt^2 s (s + 1) / 2
     fallen = torch.from_numpy(data["gravity"]).double() * dt**2 * (steps * (steps + 1) / 2)[:, None]
-    off = (com - com[0] - fallen[:, None]).norm(dim=2).amax(1) > DEPARTS * drop
+    off = (com - com[0] - fallen[:, None]).norm(dim=2).amax(1) > CONTACT_DEVIATION * drop
     contact = int(off.nonzero()[0]) if bool(off.any()) else len(com)
     t = len(ours)
     mine = torch.stack([b.double().mean(1) for b in ours.split(data["n"].tolist(), 1)], 1)
-    return Comparison(drop, contact, (mine - com[:t]).norm(dim=2) / drop,
+    return ReplayErrors(drop, contact, (mine - com[:t]).norm(dim=2) / drop,
                       (ours - theirs[:t]).norm(dim=2).amax(1) / drop)  # fmt: skip
 
 
-def report(c: Comparison) -> Iterator[str]:
+def report(c: ReplayErrors) -> Iterator[str]:
     """A line a frame, and what they come to."""
     yield f"drop height {c.drop:.3f} m; first contact in frame {c.contact}; errors in % of the drop height"
     for frame, row in enumerate(c.com.tolist()):
@@ -135,7 +135,7 @@ def report(c: Comparison) -> Iterator[str]:
 
 def run(recording: Path, out: Path, options: ReplayOptions = ReplayOptions()) -> Iterator[str]:  # noqa: B008 -- frozen
     """RECORDING.npz -> OURS.npz, with a report."""
-    data = read(recording)
+    data = read_recording(recording)
     frames = options.frames or len(data["positions"])
     if frames > len(data["positions"]):
         raise InputError(f"--frames {frames}: {recording} has {len(data['positions'])}")

@@ -30,12 +30,12 @@ from stages.lab.bench import common as bench
 from stages.lab.bench import mpm as bench_mpm
 
 log = logging.getLogger(__name__)
-OBJECTS = 3
+SCENE_OBJECTS = 3
 PEER = "ngff-paper, step by step"  # as published
 
 
 @dataclass(frozen=True)
-class BenchOptions:
+class RolloutBenchOptions:
     """`scenes` at once; none: 1 and, on a GPU, 64."""
 
     weights: Path | None = None  # of our force field; those that ship
@@ -50,16 +50,16 @@ class BenchOptions:
             raise InputError("--keypoints, --steps, --scenes and --repeat must be at least 1")
 
 
-def world(scenes: int, keypoints: int) -> World:
+def ellipsoids(scenes: int, keypoints: int) -> World:
     """Copies of one scene: shells of ellipsoids above each other, the lowest a palm above the floor."""
     rng = torch.Generator().manual_seed(0)
-    ball = torch.nn.functional.normalize(torch.randn(OBJECTS, keypoints, 3, generator=rng), dim=-1)
+    ball = torch.nn.functional.normalize(torch.randn(SCENE_OBJECTS, keypoints, 3, generator=rng), dim=-1)
     place = torch.tensor([[0.0, 0.0, -0.7], [0.1, 0.05, -0.35], [-0.1, 0.0, 0.02]])
     points = ball * torch.tensor([0.25, 0.2, 0.15]) + place[:, None]
     return World.of(points.repeat(scenes, 1, 1, 1), mass=torch.tensor([0.5, 2.0, 1.0]), E=torch.tensor([1e5, 1e4, 8e5]))
 
 
-def run(out: Path, options: BenchOptions = BenchOptions()) -> Iterator[str]:
+def run(out: Path, options: RolloutBenchOptions = RolloutBenchOptions()) -> Iterator[str]:
     """Lines of the report; the figures go to a JSON file, which keeps those of the other kind of device."""
     device = pick_device(options.device)
     model, card = weights.load(weights.find("ngff", options.weights), device)
@@ -68,7 +68,7 @@ def run(out: Path, options: BenchOptions = BenchOptions()) -> Iterator[str]:
     yield bench.machine(device)
     facts = {
         "machine": bench.machine(device), "threads": torch.get_num_threads(),
-        "date": datetime.now(timezone.utc).date().isoformat(), "weights": card["sha256"], "objects": OBJECTS,
+        "date": datetime.now(timezone.utc).date().isoformat(), "weights": card["sha256"], "objects": SCENE_OBJECTS,
         "keypoints": options.keypoints, "steps": options.steps, "rows": [],
     }  # fmt: skip
     out = Path(out)
@@ -81,11 +81,13 @@ def run(out: Path, options: BenchOptions = BenchOptions()) -> Iterator[str]:
             part.write_text(json.dumps({**known, device.partition(":")[0]: facts}, indent=1) + "\n")
 
 
-def _measured(model: Dynamics, paper: Dynamics, scenes: int, device: str, options: BenchOptions) -> Iterator[dict]:
+def _measured(
+    model: Dynamics, paper: Dynamics, scenes: int, device: str, options: RolloutBenchOptions
+) -> Iterator[dict]:
     """One row each way of rolling out so many scenes."""
-    start, count = world(scenes, options.keypoints).to(device), options.steps + 1
-    plain = rolled(model, start, count)
-    yield _row("ngff, step by step", scenes, lambda: rolled(model, start, count), device, options.repeat)
+    start, count = ellipsoids(scenes, options.keypoints).to(device), options.steps + 1
+    plain = rollout_stepwise(model, start, count)
+    yield _row("ngff, step by step", scenes, lambda: rollout_stepwise(model, start, count), device, options.repeat)
     for precision in ("highest", "high") if device != "cpu" else ():  # products as exact as sums, or in tf32
         torch.set_float32_matmul_precision(precision)
         began = time.perf_counter()
@@ -95,23 +97,23 @@ def _measured(model: Dynamics, paper: Dynamics, scenes: int, device: str, option
         yield {
             **_row(name, scenes, lambda s=stepper: _again(s, start, count), device, options.repeat),
             "ready_seconds": round(ready, 2),
-            "prepare_seconds": _rounded(bench.seconds(lambda s=stepper: s.restart(start), device)),
+            "prepare_seconds": _rounded(bench.median_seconds(lambda s=stepper: s.restart(start), device)),
             "strays_m": float((_again(stepper, start, count) - plain).abs().max()),
         }  # fmt: skip
         del stepper
     torch.set_float32_matmul_precision("highest")
-    yield _row(PEER, scenes, lambda: rolled(paper, start, count), device, options.repeat)
+    yield _row(PEER, scenes, lambda: rollout_stepwise(paper, start, count), device, options.repeat)
     if device != "cpu":
         stepper = Stepper(paper, start)
         yield _row("ngff-paper, replayed", scenes, lambda: _again(stepper, start, count), device, options.repeat)
-    particles = OBJECTS * options.keypoints
+    particles = SCENE_OBJECTS * options.keypoints
     mpm = bench_mpm.measure(particles, scenes, device, 2)
     seconds = 1e-6 * mpm["substep_us"] * bench_mpm.SUBSTEPS * options.steps
     yield {"what": f"MPM, {mpm['particles']:,} particles", "scenes": scenes, "seconds": _rounded(seconds)}
 
 
 @torch.no_grad()
-def rolled(model: Dynamics, start: World, count: int) -> Float[Tensor, "b t o n 3"]:
+def rollout_stepwise(model: Dynamics, start: World, count: int) -> Float[Tensor, "b t o n 3"]:
     """A rollout as any code would do it."""
     return model.rollout(start, count, FRAME)
 
@@ -127,7 +129,7 @@ def _row(what: str, scenes: int, function: Callable[[], object], device: str, re
     wall, cpu = [], []
     for _ in range(repeat):
         began = time.process_time()
-        wall.append(bench.seconds(function, device, 1))
+        wall.append(bench.median_seconds(function, device, 1))
         cpu.append(time.process_time() - began)
     row = {"what": what, "scenes": scenes, "seconds": _rounded(sorted(wall)[repeat // 2])}
     return row if device != "cpu" else {**row, "processor_seconds": _rounded(min(cpu))}

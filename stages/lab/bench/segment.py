@@ -28,7 +28,7 @@ from stages.core.scene.files import replacing
 from stages.core.scene.scene import Scene
 from stages.lab.assets.tabletops import KINDS, tabletop
 from stages.lab.bench import common as bench
-from stages.lab.bench.photographed import label_images, rebuilt
+from stages.lab.bench.reconstructed_scene import reconstruct_from_renders, visible_labels
 from stages.segment.boxes import segment as boxes_segment
 from stages.segment.geometric import segment
 from stages.segment.options import SegmentOptions
@@ -36,12 +36,12 @@ from stages.segment.pictures import pictures
 from stages.segment.sam2 import labelled
 from stages.segment.vote import Sight, add, decide, tempered
 
-WRONG = (0.0, 0.2, 0.4)  # of each photo's objects and pixels
-PIXELS = 20  # by which masks of a wholly wrong photo are off, typically
+ERROR_RATES = (0.0, 0.2, 0.4)  # of each photo's objects and pixels
+MASK_SHIFT = 20  # by which masks of a wholly wrong photo are off, typically
 
 
 @dataclass(frozen=True)
-class BenchOptions:
+class SegmentBenchOptions:
     """Two scenes show all ten objects."""
 
     scenes: int = 4  # of each kind
@@ -55,7 +55,7 @@ class BenchOptions:
             raise InputError("--scenes 1 to 100, --photos 8 to 200")
 
 
-def overlaps(found: Int[torch.Tensor, "n"], truth: Int[torch.Tensor, "n"]) -> dict[int, float]:
+def best_ious(found: Int[torch.Tensor, "n"], truth: Int[torch.Tensor, "n"]) -> dict[int, float]:
     """For each true object the intersection over union with the found object that fits it best; 0 is no object.
 
     `found` and `truth` number the same Gaussians, or the same pixels.
@@ -67,44 +67,46 @@ def overlaps(found: Int[torch.Tensor, "n"], truth: Int[torch.Tensor, "n"]) -> di
     return {i: float(best[i].max()) if best.shape[1] else 0.0 for i in truth.unique().tolist() if i > 0}
 
 
-def spoilt(labels: Int[Tensor, "h w"], share: float, objects: int, rng: np.random.Generator) -> Int[Tensor, "h w"]:
+def corrupt_labels(
+    labels: Int[Tensor, "h w"], share: float, objects: int, rng: np.random.Generator
+) -> Int[Tensor, "h w"]:
     """A label image with a share of its objects missed or taken for another, of its pixels random, and moved a bit."""
     fate = rng.uniform(size=objects)
     taken = [0, *(0 if u < share / 2 else int(rng.integers(1, objects + 1)) if u < share else i
                   for i, u in enumerate(fate, start=1))]  # fmt: skip
     out = torch.tensor(taken)[labels]
-    out = out.roll(tuple(int(step) for step in rng.normal(0, share * PIXELS, 2).round()), (0, 1))
+    out = out.roll(tuple(int(step) for step in rng.normal(0, share * MASK_SHIFT, 2).round()), (0, 1))
     noise = torch.from_numpy(rng.uniform(size=out.shape) < share)
     return torch.where(noise, torch.from_numpy(rng.integers(0, objects + 1, out.shape)), out)
 
 
-def by_masks(scene: Scene, truth: Int[Tensor, "n"], seed: int) -> dict[str, Callable[[], Int[Tensor, "n"]]]:
+def segment_by_masks(scene: Scene, truth: Int[Tensor, "n"], seed: int) -> dict[str, Callable[[], Int[Tensor, "n"]]]:
     """Ways to make object numbers of Gaussians from masks of all views, more and more of them wrong.
 
     `scene` is without labels; of WRONG = 0.4, say, the masks of every fifth view are missing, too.
     """
     objects, rng = int(truth.max()), np.random.default_rng(seed)
-    votes = {share: torch.zeros(len(truth), 1) for share in WRONG}
-    last = {share: torch.zeros_like(truth) for share in WRONG}
+    votes = {share: torch.zeros(len(truth), 1) for share in ERROR_RATES}
+    last = {share: torch.zeros_like(truth) for share in ERROR_RATES}
     for view in tqdm(range(len(scene.cameras)), desc="masks", unit="view", leave=False):
         sight = Sight.of(scene, view)
         seen = sight.front >= 0
         labels = torch.where(seen, truth[sight.front.clamp_min(0).long()], 0)
-        for share in WRONG:
+        for share in ERROR_RATES:
             if rng.uniform() < share / 2:
                 continue
-            given = spoilt(labels, share, objects, rng)
+            given = corrupt_labels(labels, share, objects, rng)
             votes[share] = add(votes[share], tempered(sight.votes(given)))
             last[share][sight.front[seen].long()] = given[seen]
     out: dict[str, Callable[[], Tensor]] = {}
-    for share in WRONG:
+    for share in ERROR_RATES:
         name = f"masks, {share:.0%} wrong" if share else "masks"
         out[name] = lambda v=votes[share]: decide(scene, v, {}, "masks").gaussians.object_id
         out[f"{name}, no vote"] = lambda ids=last[share]: ids
     return out
 
 
-def by_boxes(scene: Scene, truth: Int[Tensor, "n"]) -> Int[Tensor, "n"]:
+def segment_by_boxes(scene: Scene, truth: Int[Tensor, "n"]) -> Int[Tensor, "n"]:
     """Object numbers from tight boxes in the view that shows most of the object it shows least of."""
 
     def shown(view: int) -> Int[Tensor, "h w"]:
@@ -127,7 +129,7 @@ def by_boxes(scene: Scene, truth: Int[Tensor, "n"]) -> Int[Tensor, "n"]:
         return boxes_segment(scene, SegmentOptions(boxes=prompts)).gaussians.object_id
 
 
-def by_sam2(scene: Scene, model) -> Int[Tensor, "n"]:
+def segment_by_sam2(scene: Scene, model) -> Int[Tensor, "n"]:
     """Object numbers that SAM 2.1 gives, without prompts, from drawings of the scene."""
     return labelled(scene, model, pictures(scene), None, SegmentOptions("sam2")).gaussians.object_id
 
@@ -138,9 +140,9 @@ def measure(kind: str, index: int, photos: int, model=None) -> list[dict]:
     truth = scene.gaussians.object_id
     blank = replace(scene, gaussians=replace(scene.gaussians, object_id=torch.zeros_like(truth)), objects=())
     ways = {"geometric": lambda: segment(blank, SegmentOptions()).gaussians.object_id,
-            "boxes": lambda: by_boxes(blank, truth), **by_masks(blank, truth, index)}  # fmt: skip
+            "boxes": lambda: segment_by_boxes(blank, truth), **segment_by_masks(blank, truth, index)}  # fmt: skip
     if model is not None:
-        ways["sam2"] = lambda: by_sam2(blank, model)
+        ways["sam2"] = lambda: segment_by_sam2(blank, model)
     rows = []
     for way, find in ways.items():
         start = time.perf_counter()
@@ -149,7 +151,7 @@ def measure(kind: str, index: int, photos: int, model=None) -> list[dict]:
     return rows
 
 
-def measure_rebuilt(kind: str, index: int, photos: int) -> dict:
+def measure_reconstructed(kind: str, index: int, photos: int) -> dict:
     """Overlaps in the pixels of the photos that could be placed, after their reconstruction; its time is counted.
 
     Where none can be placed nothing is found.
@@ -157,9 +159,9 @@ def measure_rebuilt(kind: str, index: int, photos: int) -> dict:
     scene, start = tabletop(kind, index, photos), time.perf_counter()
     try:
         with tempfile.TemporaryDirectory() as folder:
-            found = segment(rebuilt(scene, Path(folder)), SegmentOptions())
-        names, labels = found.cameras.names, label_images(found, found.cameras.names)
-        truth = label_images(scene, names)
+            found = segment(reconstruct_from_renders(scene, Path(folder)), SegmentOptions())
+        names, labels = found.cameras.names, visible_labels(found, found.cameras.names)
+        truth = visible_labels(scene, names)
     except InputError:
         names, truth = (), scene.gaussians.object_id
         labels = torch.zeros_like(truth)
@@ -167,12 +169,12 @@ def measure_rebuilt(kind: str, index: int, photos: int) -> dict:
 
 
 def _row(kind: str, index: int, way: str, scene: Scene, found: Tensor, truth: Tensor, start: float) -> dict:
-    named = {scene.name_of(i): round(value, 3) for i, value in overlaps(found, truth).items()}
+    named = {scene.name_of(i): round(value, 3) for i, value in best_ious(found, truth).items()}
     return {"kind": kind, "scene": index, "way": way, "iou": named, "found": len(found.unique()) - 1,
             "mean": float(np.mean(list(named.values()))), "seconds": round(time.perf_counter() - start, 1)}  # fmt: skip
 
 
-def run(out: Path | None = None, options: BenchOptions = BenchOptions()) -> Iterator[str]:  # noqa: B008 -- frozen
+def run(out: Path | None = None, options: SegmentBenchOptions = SegmentBenchOptions()) -> Iterator[str]:  # noqa: B008 -- frozen
     """Lines of the report; all numbers as JSON in `out`."""
     yield bench.machine("cpu")
     try:
@@ -186,7 +188,7 @@ def run(out: Path | None = None, options: BenchOptions = BenchOptions()) -> Iter
     for kind in KINDS:
         for i in tqdm(range(options.scenes), desc=kind, unit="scene"):
             rows += measure(kind, i, options.photos, model)
-            rows += [measure_rebuilt(kind, i, options.photos)] if options.reconstruct else []
+            rows += [measure_reconstructed(kind, i, options.photos)] if options.reconstruct else []
             for row in rows[-len({r["way"] for r in rows}) :]:
                 listed = ", ".join(f"{n} {v:.2f}" for n, v in row["iou"].items())
                 yield f"{kind} {i}, {row['way']}: mean {row['mean']:.3f}; {listed}"

@@ -17,11 +17,11 @@ import torch
 from stages.core.kernels.mpm.constitutive import SAND, VON_MISES, sand_slope
 from stages.core.physics.mpm import solver as mpm
 
-FREE = mpm.Box((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0))
+OPEN_BOX = mpm.Box((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0))
 E, DENSITY = 1e5, 500.0
 
 
-def lattice(size: tuple, h: float, E: float = E, nu: float = 0.0, viscosity: float = 0.0, jitter: float = 0.0,
+def particle_block(size: tuple, h: float, E: float = E, nu: float = 0.0, viscosity: float = 0.0, jitter: float = 0.0,
             **material) -> mpm.Particles:  # fmt: skip
     """A box of particles at the centres of voxels of edge h, its lower corner at the origin."""
     counts = [max(1, round(s / h)) for s in size]
@@ -31,34 +31,34 @@ def lattice(size: tuple, h: float, E: float = E, nu: float = 0.0, viscosity: flo
     return mpm.at_rest(x, *fill, **material)
 
 
-def only(p: mpm.Particles, mask: torch.Tensor) -> mpm.Particles:
+def subset(p: mpm.Particles, mask: torch.Tensor) -> mpm.Particles:
     """Some of the particles."""
     return mpm.Particles(*(getattr(p, f.name)[mask] for f in fields(p)))
 
 
-def roll(solver: mpm.Solver, duration: float, push: tuple = (0.0, 0.0, 0.0), substeps: int | None = None) -> None:
+def advance(solver: mpm.Solver, duration: float, push: tuple = (0.0, 0.0, 0.0), substeps: int | None = None) -> None:
     solver.advance(duration, torch.tensor(push).repeat(len(solver.rows), 1), substeps)
 
 
-def pulse(cells: int = 8, travel: float = 0.8) -> list[tuple[float, float, float]]:
+def pressure_pulse(cells: int = 8, travel: float = 0.8) -> list[tuple[float, float, float]]:
     """(time, place, place by theory) of a pressure pulse in a bar of Poisson ratio 0; `cells` are in its half width.
 
     A pulse v = a g(x), strain -a g(x) / c travels only to the right, at c = sqrt(E / density).
     """
     width, c = 0.1, math.sqrt(E / DENSITY)
     dx = width / cells
-    p = lattice((1.6, 2 * dx, 2 * dx), dx / 2)
+    p = particle_block((1.6, 2 * dx, 2 * dx), dx / 2)
     g = torch.exp(-(((p.x[:, 0] - 0.4) / width) ** 2) / 2)
     a = 1e-3 * c
     p.v[:, 0] = a * g
     p.F[:, 0, 0] = 1 - a / c * g
     start, rows = p.x[:, 0].clone(), []
-    solver, frame = mpm.Solver(p, FREE, dx), travel / c / 8
+    solver, frame = mpm.Solver(p, OPEN_BOX, dx), travel / c / 8
     for n in range(9):
         v = solver.particles.v[:, 0].double().clamp_min(0) ** 2  # squared: the peak, not ripples far from it
         rows.append((n * frame, float((v * start).sum() / v.sum()), 0.4 + c * n * frame))
         if n < 8:
-            roll(solver, frame)
+            advance(solver, frame)
     return rows
 
 
@@ -66,14 +66,14 @@ def bar_frequency(cells: int) -> tuple[float, float]:
     """Lowest frequency of a free bar with this many cells along it, and sqrt(E / density) / (2 L) [Hz]."""
     length = 0.8
     dx = length / cells
-    p = lattice((length, 4 * dx, 4 * dx), dx / 2)
+    p = particle_block((length, 4 * dx, 4 * dx), dx / 2)
     shape = torch.cos(math.pi * p.x[:, 0] / length)
     p.v[:, 0] = 0.05 * shape
-    solver, signal = mpm.Solver(p, FREE, dx), []
+    solver, signal = mpm.Solver(p, OPEN_BOX, dx), []
     exact = math.sqrt(E / DENSITY) / (2 * length)
     frame = 1 / exact / 80
     for _ in range(140):
-        roll(solver, frame)
+        advance(solver, frame)
         signal.append(float((solver.particles.v[:, 0] * shape).sum()))
     s = torch.tensor(signal)
     turns = (s[1:] * s[:-1] < 0).nonzero()[:, 0]
@@ -81,19 +81,19 @@ def bar_frequency(cells: int) -> tuple[float, float]:
     return (len(at) - 1) / 2 / float(at[-1] - at[0]), exact
 
 
-def deflection(load: float, cells: int = 4) -> tuple[float, float]:
+def cantilever_deflection(load: float, cells: int = 4) -> tuple[float, float]:
     """Sag of the tip of a cantilever under gravity `load` [m/s^2], and Timoshenko's [m]; `cells` are in its height.
 
     w = density g L^2 (L^2 / (2 h^2) 3 / E + 1 / (2 k G)), k = 5/6, G = E / 2: bending and shear.
     """
     length, height = 0.4, 0.1
     dx = height / cells
-    p = lattice((length + 3 * dx, height, height), dx / 2)
+    p = particle_block((length + 3 * dx, height, height), dx / 2)
     p.held[p.x[:, 0] < 3 * dx] = 1
     tip = p.x[:, 0] > length + 3 * dx - dx
-    solver, before, liveliest = mpm.Solver(p, FREE, dx), p.x[tip, 2].mean(), 0.0
+    solver, before, liveliest = mpm.Solver(p, OPEN_BOX, dx), p.x[tip, 2].mean(), 0.0
     for _ in range(120):  # stopped wherever it is liveliest, which is near the place of rest
-        roll(solver, 0.02, (0.0, 0.0, -load))
+        advance(solver, 0.02, (0.0, 0.0, -load))
         energy = float(solver.particles.v.square().sum())
         if energy < liveliest:
             solver.set(v=torch.zeros_like(p.v), C=torch.zeros_like(p.C))
@@ -105,7 +105,9 @@ def deflection(load: float, cells: int = 4) -> tuple[float, float]:
     return float(before - solver.particles.x[tip, 2].mean()), bending + shear
 
 
-def column(aspect: float, cells: int = 6, substeps: int | None = None, E: float = 3.5e5) -> tuple[float, float]:
+def sand_column_spread(
+    aspect: float, cells: int = 6, substeps: int | None = None, E: float = 3.5e5
+) -> tuple[float, float]:
     """Spread (r - r0) / r0 of a sand column of height aspect x r0 that collapses, and Lube et al. 2004: 1.24 aspect.
 
     `cells` are in its radius, `substeps` in 0.02 s (CFL by default); angle of repose 31 degrees, on a floor as rough.
@@ -114,76 +116,77 @@ def column(aspect: float, cells: int = 6, substeps: int | None = None, E: float 
     """
     r0 = 0.1
     dx = r0 / cells
-    p = lattice((2 * r0, 2 * r0, aspect * r0), dx / 2, E=E, nu=0.3, jitter=0.5, model=SAND,
+    p = particle_block((2 * r0, 2 * r0, aspect * r0), dx / 2, E=E, nu=0.3, jitter=0.5, model=SAND,
                 plastic=(sand_slope(31.0), 0.0, 0.0))  # fmt: skip
-    p = only(p, (p.x[:, :2] - r0).norm(dim=1) < r0)
+    p = subset(p, (p.x[:, :2] - r0).norm(dim=1) < r0)
     p.x[:, 2] += dx / 4
     p.mass *= 1600 / DENSITY
     solver = mpm.Solver(p, mpm.Box((-0.4, -0.4, 0.0), (0.6, 0.6, 0.6)), dx)
     for _ in range(25):
-        roll(solver, 0.02, (0.0, 0.0, -9.81), substeps)
+        advance(solver, 0.02, (0.0, 0.0, -9.81), substeps)
     r = (solver.particles.x[:, :2] - r0).norm(dim=1)
     return (float(r.quantile(0.999)) - r0) / r0, 1.24 * aspect
 
 
-def swing(substeps: int, cells: int = 16) -> tuple[torch.Tensor, torch.Tensor]:
+def bar_displacement(substeps: int, cells: int = 16) -> tuple[torch.Tensor, torch.Tensor]:
     """Places of the particles of a bar after half a swing in so many substeps, and at the start."""
     length = 0.8
     dx = length / cells
-    p = lattice((length, 4 * dx, 4 * dx), dx / 2)
+    p = particle_block((length, 4 * dx, 4 * dx), dx / 2)
     p.v[:, 0] = 0.2 * torch.cos(math.pi * p.x[:, 0] / length)
-    solver = mpm.Solver(p, FREE, dx)
-    roll(solver, 0.03, substeps=substeps)
+    solver = mpm.Solver(p, OPEN_BOX, dx)
+    advance(solver, 0.03, substeps=substeps)
     return solver.particles.x, p.x
 
 
-def substep_error() -> list[tuple[float, float]]:
+def time_step_error() -> list[tuple[float, float]]:
     """(substep [s], rms distance to the finest of the runs as a share of the motion).
 
     Symplectic Euler has an error that grows with the substep, the transfers one that grows with their number: so it
     does not go to zero, and has no need to.
     """
-    exact, start = swing(1280)
+    exact, start = bar_displacement(1280)
     motion = (exact - start).square().sum(1).mean().sqrt()
     return [
-        (0.03 / n, float((swing(n)[0] - exact).square().sum(1).mean().sqrt() / motion)) for n in (20, 40, 80, 160, 320)
+        (0.03 / n, float((bar_displacement(n)[0] - exact).square().sum(1).mean().sqrt() / motion))
+        for n in (20, 40, 80, 160, 320)
     ]
 
 
-def drift(frames: int = 40, substeps: int = 250) -> list[tuple[int, float, float]]:
+def momentum_drift(frames: int = 40, substeps: int = 250) -> list[tuple[int, float, float]]:
     """(substeps, relative change of momentum, of angular momentum) of a body that flies, turns and shakes."""
     dx = 0.05
-    p = lattice((0.2, 0.15, 0.1), dx / 2, nu=0.3)
+    p = particle_block((0.2, 0.15, 0.1), dx / 2, nu=0.3)
     r = p.x - p.x.mean(0)
     p.v = torch.tensor([0.2, -0.1, 0.1]) + torch.linalg.cross(torch.tensor([1.0, 2.0, -1.0]).expand_as(r), r) + r
-    solver, rows = mpm.Solver(p, FREE, dx), []
-    roll(solver, 0.01, substeps=substeps)  # the affine part comes into being
-    first = momenta(solver.particles, dx)
+    solver, rows = mpm.Solver(p, OPEN_BOX, dx), []
+    advance(solver, 0.01, substeps=substeps)  # the affine part comes into being
+    first = total_momenta(solver.particles, dx)
     for n in range(frames):
-        roll(solver, 0.01, substeps=substeps)
-        now = momenta(solver.particles, dx)
+        advance(solver, 0.01, substeps=substeps)
+        now = total_momenta(solver.particles, dx)
         rows.append(((n + 1) * substeps, *(float((a - b).norm() / b.norm()) for a, b in zip(now, first, strict=True))))
     return rows
 
 
-def momenta(p: mpm.Particles, dx: float) -> tuple[torch.Tensor, torch.Tensor]:
+def total_momenta(p: mpm.Particles, dx: float) -> tuple[torch.Tensor, torch.Tensor]:
     """Linear and angular momentum; a particle of APIC spins with inertia m dx^2 / 4 (Jiang et al. 2015, eq. 8)."""
     x, v, C, m = (t.double() for t in (p.x, p.v, p.C, p.mass))
     spin = dx**2 / 4 * torch.stack([C[:, 2, 1] - C[:, 1, 2], C[:, 0, 2] - C[:, 2, 0], C[:, 1, 0] - C[:, 0, 1]], 1)
     return (m[:, None] * v).sum(0), (m[:, None] * (torch.linalg.cross(x, v) + spin)).sum(0)
 
 
-def sheared_block(strength: float) -> tuple[float, float]:
+def yield_stress(strength: float) -> tuple[float, float]:
     """Largest equivalent stress of a metal block squeezed by a tenth, and its strength [Pa]."""
     dx = 0.05
-    p = lattice((0.2, 0.2, 0.2), dx / 2, nu=0.3, viscosity=50.0, model=VON_MISES, plastic=(strength, 0.0, 0.0))
+    p = particle_block((0.2, 0.2, 0.2), dx / 2, nu=0.3, viscosity=50.0, model=VON_MISES, plastic=(strength, 0.0, 0.0))
     p.held[p.x[:, 2] < dx] = 1
     p.held[p.x[:, 2] > 0.2 - dx] = 1
     p.v[p.x[:, 2] > 0.2 - dx, 2] = -0.1
-    solver = mpm.Solver(p, FREE, dx)
+    solver = mpm.Solver(p, OPEN_BOX, dx)
     for _ in range(10):
-        roll(solver, 0.02)
-    now = only(solver.particles, p.held == 0)
+        advance(solver, 0.02)
+    now = subset(solver.particles, p.held == 0)
     S = torch.linalg.svdvals(now.F).log()
     stress = 2 * now.stiffness[:, :1] * (S - S.mean(1, keepdim=True))
     return float(math.sqrt(1.5) * stress.norm(dim=1).max()), strength
@@ -193,15 +196,15 @@ def figure(out: Path) -> None:
     """Draw what was measured beside theory."""
     from stages.lab.plot import Panel, draw
 
-    travel = pulse()
+    travel = pressure_pulse()
     coarse_to_fine = (8, 16, 32)
     bars = [(0.8 / n, abs(f / exact - 1)) for n in coarse_to_fine for f, exact in [bar_frequency(n)]]
     loads = (0.1, 0.3, 0.5, 0.8)
-    sags = [(g, *deflection(g)) for g in loads]
+    sags = [(g, *cantilever_deflection(g)) for g in loads]
     heights = (0.4, 0.8, 1.2, 1.6)
-    heaps = [(a, *column(a)) for a in heights]
-    in_time = substep_error()
-    kept = drift()
+    heaps = [(a, *sand_column_spread(a)) for a in heights]
+    in_time = time_step_error()
+    kept = momentum_drift()
     draw(out, [
         Panel("pressure pulse: place [m] after time [ms]", [(1e3 * t, x) for t, x, _ in travel],
               [(1e3 * t, x) for t, _, x in travel]),

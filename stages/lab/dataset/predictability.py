@@ -20,7 +20,7 @@ from stages.core.scene.files import replacing
 from stages.evaluate.dynamics import all_metrics
 from stages.lab.dataset.motions import Motions
 from stages.lab.dataset.scenes import groups_of
-from stages.lab.training.data import home, read_groups
+from stages.lab.training.data import motions_folder, read_groups
 
 SPLITS = {"spatial": ("3_9", 80), "temporal": ("3_0..3_8", 100), "4 objects": ("4", 80), "6 objects": ("6", 80)}
 SAMPLE = 300  # scenes of the temporal split
@@ -32,7 +32,7 @@ def run(data: Path, nudged: Path, out: Path | None, keypoints: int, device: str)
     """RMSE, FPE, PCE and R of each split that both have, as JSON and as lines of a table."""
     device, rows = pick_device(device), {}
     for split, (groups, frames) in SPLITS.items():
-        names = [g for g in groups_of(groups) if all((home(d) / f"{g}.h5").is_file() for d in (data, nudged))]
+        names = [g for g in groups_of(groups) if all((motions_folder(d) / f"{g}.h5").is_file() for d in (data, nudged))]
         if not names:
             continue
         truth, other = together(read_groups(data, names, keypoints), read_groups(nudged, names, keypoints))

@@ -31,7 +31,7 @@ from stages.core.geometry.rotations import nearest
 from stages.core.scene.files import replacing
 from stages.lab.dataset.layout import kind_of
 from stages.lab.dataset.motions import Motions, read_motions
-from stages.lab.training.data import home
+from stages.lab.training.data import motions_folder
 
 FALLEN, TOUCH, STILL = 0.05, 0.04, 0.05  # [m], [m], [m/s]
 TIPPED = 30.0  # [deg]
@@ -127,7 +127,7 @@ def run(data: Path, out: Path | None, groups: Sequence[str], keypoints: int, dev
     """Statistics of each group and each kind of object, as JSON and as lines of a table."""
     device, table, kinds = pick_device(device), {}, {}
     for group in groups:
-        path = home(data) / f"{group}.h5"
+        path = motions_folder(data) / f"{group}.h5"
         if not path.is_file():
             continue
         motions = read_motions(path)
@@ -141,7 +141,8 @@ def run(data: Path, out: Path | None, groups: Sequence[str], keypoints: int, dev
             if i >= 0:
                 kinds.setdefault(kind_of(i).name, []).append((facts, motions.objects == i))
     if not table:
-        raise InputError(f"{home(data)}: has none of {', '.join(groups)} (.h5); make them with `ngff-lab dataset`")
+        folder = motions_folder(data)
+        raise InputError(f"{folder}: has none of {', '.join(groups)} (.h5); make them with `ngff-lab dataset`")
     of = {name: _of_kind(parts) for name, parts in sorted(kinds.items())}
     if out is not None:
         with replacing(Path(out)) as part:

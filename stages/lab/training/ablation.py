@@ -15,11 +15,13 @@ from stages.core.models.field.force_field import ForceField, Scene
 from stages.core.models.field.rest_shape import Shape
 from stages.lab.training.train import TrainOptions
 
-IMPULSES = 2  # vectors at the end of those of a contact: what would stop it, and what would push it along the normal
+IMPULSE_VECTORS = (
+    2  # vectors at the end of those of a contact: what would stop it, and what would push it along the normal
+)
 
 
 @dataclass(frozen=True)
-class Choice:
+class Ablation:
     """A choice, taken away by another network or by other options of training."""
 
     without: str
@@ -27,21 +29,21 @@ class Choice:
     options: Callable[[TrainOptions], TrainOptions] = lambda options: options
 
 
-class _Plain(ForceField):
+class _UnfusedForceField(ForceField):
     """Without kernels for a whole step: they know the full network alone."""
 
     def _fused(self, scene: Scene) -> bool:
         return False
 
 
-class OneSided(_Plain):
+class NoReaction(_UnfusedForceField):
     """What touches a body pushes it, and feels nothing of that: each side has forces of its own."""
 
     def _returned(self, shape: Shape, x: Float[Tensor, "b o m c"]) -> Float[Tensor, "b o c"]:
         return torch.zeros_like(x[:, :, 0])
 
 
-class Unaware(_Plain):
+class NoMaterialInputs(_UnfusedForceField):
     """All objects are of one stiffness, Poisson ratio and friction to the network; their mass it knows."""
 
     def informed(self, shape: Shape) -> Scene:
@@ -51,26 +53,26 @@ class Unaware(_Plain):
         return replace(super().informed(replace(shape, world=same)), shape=shape)
 
 
-class _NoImpulses(Touch):
+class _NoImpulseFeatures(Touch):
     """Contacts that see how things move, but not which impulse would stop them."""
 
     def __init__(self, vectors: int, scalars: int, hidden: int, partner: bool):
-        super().__init__(vectors - IMPULSES, scalars, hidden, partner)
+        super().__init__(vectors - IMPULSE_VECTORS, scalars, hidden, partner)
 
     def listen(
         self, places: Places, share: Float[Tensor, "b o m n"], own: Float[Tensor, "b o h"],
         other: Float[Tensor, "b o m h"] | None = None,
     ) -> tuple[Float[Tensor, "b o m n h"], Float[Tensor, "b o m n"], Float[Tensor, "b o m h"]]:  # fmt: skip
-        return super().listen(replace(places, vectors=places.vectors[..., :-IMPULSES, :]), share, own, other)
+        return super().listen(replace(places, vectors=places.vectors[..., :-IMPULSE_VECTORS, :]), share, own, other)
 
     def answer(
         self, message: Float[Tensor, "b o m n h"], weight: Float[Tensor, "b o m n"], context: Float[Tensor, "b o m h"],
         vectors: Float[Tensor, "b o m n k 3"],
     ) -> Float[Tensor, "b o m n 3"]:  # fmt: skip
-        return super().answer(message, weight, context, vectors[..., :-IMPULSES, :])
+        return super().answer(message, weight, context, vectors[..., :-IMPULSE_VECTORS, :])
 
 
-class _Silence(nn.Module):
+class _ZeroFeatures(nn.Module):
     """Nothing, of some width."""
 
     def __init__(self, width: int):
@@ -81,30 +83,30 @@ class _Silence(nn.Module):
         return x.new_zeros(*x.shape[:-1], self.width)
 
 
-def without_impulses() -> ForceField:
-    model = _Plain()
+def no_impulse_features() -> ForceField:
+    model = _UnfusedForceField()
     h = model.config["hidden"]
-    model.pairs, model.planes = _NoImpulses(10, 7, h, partner=True), _NoImpulses(8, 5, h, partner=False)
+    model.pairs, model.planes = _NoImpulseFeatures(10, 7, h, partner=True), _NoImpulseFeatures(8, 5, h, partner=False)
     return model
 
 
-def without_context() -> ForceField:
+def no_context() -> ForceField:
     """Each place of contact answers for itself, not knowing of any other."""
-    model = _Plain()
-    model.between = model.against = _Silence(model.config["hidden"])
+    model = _UnfusedForceField()
+    model.between = model.against = _ZeroFeatures(model.config["hidden"])
     return model
 
 
-CHOICES = {
-    "full": Choice("nothing: the network as it is"),
-    "deformation": Choice("deformation: bodies are rigid", lambda: ForceField(deform=False)),
-    "reaction": Choice("reaction: a contact force acts on one body alone", OneSided),
-    "impulses": Choice("the impulse that would stop a contact, as what it sees", without_impulses),
-    "context": Choice("what happens elsewhere: a contact knows of no other", without_context),
-    "materials": Choice("stiffness, Poisson ratio and friction as inputs", Unaware),
-    "keypoints": Choice("three of four keypoints", options=lambda o: replace(o, keypoints=max(1, o.keypoints // 4))),
-    "memory": Choice("fading of gradients (`--memory 1`)", options=lambda o: replace(o, memory=1.0)),
-    "axes": Choice("the loss by axis of an object (`--loss square`)", options=lambda o: replace(o, loss="square")),
-    "horizons": Choice("rollouts longer than the first horizon",
+ABLATIONS = {
+    "full": Ablation("nothing: the network as it is"),
+    "deformation": Ablation("deformation: bodies are rigid", lambda: ForceField(deform=False)),
+    "reaction": Ablation("reaction: a contact force acts on one body alone", NoReaction),
+    "impulses": Ablation("the impulse that would stop a contact, as what it sees", no_impulse_features),
+    "context": Ablation("what happens elsewhere: a contact knows of no other", no_context),
+    "materials": Ablation("stiffness, Poisson ratio and friction as inputs", NoMaterialInputs),
+    "keypoints": Ablation("three of four keypoints", options=lambda o: replace(o, keypoints=max(1, o.keypoints // 4))),
+    "memory": Ablation("fading of gradients (`--memory 1`)", options=lambda o: replace(o, memory=1.0)),
+    "axes": Ablation("the loss by axis of an object (`--loss square`)", options=lambda o: replace(o, loss="square")),
+    "horizons": Ablation("rollouts longer than the first horizon",
                        options=lambda o: replace(o, horizons=str(o.frames[0]))),
 }  # fmt: skip

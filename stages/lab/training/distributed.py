@@ -18,7 +18,7 @@ from stages.core.errors import InputError
 
 
 @dataclass(frozen=True)
-class Team:
+class ProcessGroup:
     """This process is number `rank` of `size`; number 0 validates and writes."""
 
     rank: int = 0
@@ -53,11 +53,11 @@ class Team:
 
 
 @contextmanager
-def team(device: str, batch: int) -> Iterator[Team]:
+def process_group(device: str, batch: int) -> Iterator[ProcessGroup]:
     """The processes that torchrun started; without it this one alone."""
     size = int(os.environ.get("WORLD_SIZE", "1"))
     if size == 1:
-        yield Team(device=device)
+        yield ProcessGroup(device=device)
         return
     if batch % size:
         raise InputError(f"--batch {batch}: cannot be shared by {size} processes; take a multiple of {size}")
@@ -65,6 +65,6 @@ def team(device: str, batch: int) -> Iterator[Team]:
         torch.cuda.set_device(int(os.environ["LOCAL_RANK"]))
     dist.init_process_group("cpu:gloo,cuda:nccl" if device == "cuda" else "gloo")
     try:
-        yield Team(dist.get_rank(), size, device)
+        yield ProcessGroup(dist.get_rank(), size, device)
     finally:
         dist.destroy_process_group()

@@ -16,16 +16,19 @@ from torch import Tensor
 from stages.core.models.dynamics import Dynamics
 from stages.core.models.external_forces import Pushes
 from stages.core.models.trees import rebuilt, tensors
-from stages.lab.training.data import Piece, steady
+from stages.lab.training.data import MotionClip, smooth_motion
 
 log = logging.getLogger(__name__)
 UNIT = 0.01  # errors count in centimetres: gradients of order one
 LOSSES = ("square", "scene", "axes", "relative")
-FINE = 0.1  # errors below a millimetre no longer matter to the root [UNIT]
-LITTLE, USUAL = 1.0, 5.0  # motion that an error is measured against is at least so much; so much is usual [UNIT]
+ERROR_FLOOR = 0.1  # errors below a millimetre no longer matter to the root [UNIT]
+MIN_SPREAD, TYPICAL_SPREAD = (
+    1.0,
+    5.0,
+)  # motion that an error is measured against is at least so much; so much is usual [UNIT]
 
 
-def loss_of(
+def keypoint_loss(
     predicted: Float[Tensor, "b t o n 3"], truth: Float[Tensor, "b t o n 3"], valid: Bool[Tensor, "b o n"], kind: str,
     spread: Float[Tensor, "b o 3"],
 ) -> Float[Tensor, ""]:  # fmt: skip
@@ -40,15 +43,15 @@ def loss_of(
     if kind in ("axes", "relative"):
         count = valid.sum(2)
         each = squared.sum(2) / count.clamp_min(1)[..., None]
-        root = (each + FINE**2).sqrt()
+        root = (each + ERROR_FLOOR**2).sqrt()
         if kind == "relative":
-            root = root * (USUAL / (LITTLE + spread / UNIT))
+            root = root * (TYPICAL_SPREAD / (MIN_SPREAD + spread / UNIT))
         return (root.mean(-1) * (count > 0)).sum() / (count > 0).sum().clamp_min(1)
     each = squared.mean(-1).sum((1, 2)) / valid.sum((1, 2)).clamp_min(1)
-    return (each + FINE**2).sqrt().mean() if kind == "scene" else each.mean()
+    return (each + ERROR_FLOOR**2).sqrt().mean() if kind == "scene" else each.mean()
 
 
-def speed_loss(
+def velocity_loss(
     predicted: Float[Tensor, "b t o n 3"], points: Float[Tensor, "b t+1 o n 3"], valid: Bool[Tensor, "b o n"],
     kind: str, spread: Float[Tensor, "b o 3"], dt: float, time: float,
 ) -> Float[Tensor, ""]:  # fmt: skip
@@ -58,11 +61,11 @@ def speed_loss(
     nothing amid an impact: such frames of an object do not count.
     """
     truth = (points[:, 2:] - points[:, :-2]) / (2 * dt)
-    known = steady(points, dt)[..., None, None]
-    return loss_of(torch.where(known, time * predicted[:, :-1], time * truth), time * truth, valid, kind, spread)
+    known = smooth_motion(points, dt)[..., None, None]
+    return keypoint_loss(torch.where(known, time * predicted[:, :-1], time * truth), time * truth, valid, kind, spread)
 
 
-class Roll:
+class RolloutLoss:
     """Call it with batches of one size and horizon: the loss, and its gradient for each of the model's parameters.
 
     Going back by a frame a gradient keeps the share `memory`: through contacts it grows, and over many frames explodes.
@@ -79,7 +82,7 @@ class Roll:
         self.wanted = graph and self.params[0].is_cuda
         self.graph: torch.cuda.CUDAGraph | None = None
 
-    def __call__(self, piece: Piece) -> tuple[Float[Tensor, ""], list[Tensor]]:
+    def __call__(self, piece: MotionClip) -> tuple[Float[Tensor, ""], list[Tensor]]:
         scene = self.model.informed(piece.rest)
         with torch.no_grad():
             state = self.model.observe(scene, piece.points, piece.speed)
@@ -111,12 +114,12 @@ class Roll:
             state = rebuilt(state, (torch.lerp(x.detach(), x, self.memory) for x in tensors(state)))
             moved = self.advance(self.model, scene, state, self.dt, pushes, self.speeds > 0)
             state = rebuilt(state, iter(moved))
-            frames.append(moved[len(state):])
+            frames.append(moved[len(state) :])
         points, *speed = (torch.stack(x, 1) for x in zip(*frames, strict=True))
-        loss = loss_of(points, truth, valid, self.loss, spread)
+        loss = keypoint_loss(points, truth, valid, self.loss, spread)
         if speed:
             known = torch.cat([start[:, None], truth], 1)
-            loss = loss + speed_loss(*speed, known, valid, self.loss, spread, self.dt, self.speeds)
+            loss = loss + velocity_loss(*speed, known, valid, self.loss, spread, self.dt, self.speeds)
         wanted = self.params + [x for x in free if x.requires_grad]
         return loss.detach(), list(torch.autograd.grad(loss, wanted, allow_unused=True))
 
@@ -165,9 +168,7 @@ class Roll:
             log.info("no CUDA graph, going on step by step: %s", str(error).splitlines()[0])
 
 
-def _advance(
-    model: Dynamics, scene: Any, state: tuple, dt: float, pushes: Pushes, speeds: bool
-) -> tuple[Tensor, ...]:
+def _advance(model: Dynamics, scene: Any, state: tuple, dt: float, pushes: Pushes, speeds: bool) -> tuple[Tensor, ...]:
     """The tensors of the next state, where its points are and perhaps how fast; without pushes the time is nothing.
 
     One flat tuple: PyTorch 2.11 compiles a named tuple that comes out of a `_replace` to an empty one.

@@ -23,13 +23,13 @@ from stages.reconstruct.reading import read_photos
 
 CAMERA_FILES = ("transforms.json", "cameras.json", "sparse")
 PHOTO_FOLDERS = ("photos", "images", ".")
-HELD = 4  # every so many-th view of a scene is only ever looked at from, never learned from
-ORBIT = 24  # views of a scene without cameras
+HELD_OUT_EVERY = 4  # every so many-th view of a scene is only ever looked at from, never learned from
+ORBIT_VIEWS = 24  # views of a scene without cameras
 WHITE = (1.0, 1.0, 1.0)  # behind everything, as in the published renderer
 
 
 @dataclass(frozen=True)
-class Posed:
+class PosedViews:
     """Views of one scene with their cameras, all of one size, sides multiples of 14 px."""
 
     name: str
@@ -38,25 +38,25 @@ class Posed:
     Ks: Float[Tensor, "v 3 3"]
     depths: Float[Tensor, "v h w"] | None  # true ones, 0 where nothing is; None for photos
 
-    def __getitem__(self, index: list[int]) -> Posed:
+    def __getitem__(self, index: list[int]) -> PosedViews:
         depths = None if self.depths is None else self.depths[index]
-        return Posed(self.name, self.images[index], self.viewmats[index], self.Ks[index], depths)
+        return PosedViews(self.name, self.images[index], self.viewmats[index], self.Ks[index], depths)
 
-    def to(self, device: str) -> Posed:
+    def to(self, device: str) -> PosedViews:
         moved = (x if x is None else x.to(device) for x in (self.images, self.viewmats, self.Ks, self.depths))
-        return Posed(self.name, *moved)
+        return PosedViews(self.name, *moved)
 
     @property
     def held(self) -> list[int]:
         """Views that measure how well unseen ones are predicted."""
-        return list(range(HELD // 2, len(self.images), HELD))
+        return list(range(HELD_OUT_EVERY // 2, len(self.images), HELD_OUT_EVERY))
 
     @property
     def learned(self) -> list[int]:
         return [i for i in range(len(self.images)) if i not in self.held]
 
 
-def read_all(folder: Path, side: int, device: str = "cpu") -> list[Posed]:
+def read_training_scenes(folder: Path, side: int, device: str = "cpu") -> list[PosedViews]:
     """Every scene in a folder, in order of name: NAME.ply, and folders (or this one) with photos and their cameras.
 
     `side` is the longest of an image [px]. Raises InputError where there is none.
@@ -67,7 +67,7 @@ def read_all(folder: Path, side: int, device: str = "cpu") -> list[Posed]:
     places = [p for p in [folder, *sorted(folder.iterdir())] if p.is_dir() and _cameras_in(p)]
     scenes = [_photographed(place, side) for place in places]
     for path in tqdm(sorted(folder.glob("*.ply")), desc="rendering", unit="scene", leave=False):
-        scenes.append(rendered(path.stem, read_scene(path), side, device))
+        scenes.append(render_views(path.stem, read_scene(path), side, device))
     if not scenes:
         raise InputError(f"{folder}: holds neither scenes (.ply) nor photos with {' or '.join(CAMERA_FILES)}")
     few = next((s.name for s in scenes if len(s.learned) < 3), None)
@@ -80,7 +80,7 @@ def _cameras_in(folder: Path) -> Path | None:
     return next((folder / name for name in CAMERA_FILES if (folder / name).exists()), None)
 
 
-def _photographed(folder: Path, side: int) -> Posed:
+def _photographed(folder: Path, side: int) -> PosedViews:
     """Photos without their lens's distortion, stretched to the next multiple of 14, and K with them."""
     inner = next(folder / name for name in PHOTO_FOLDERS if (folder / name).is_dir())
     photos = read_photos(inner)
@@ -94,7 +94,7 @@ def _photographed(folder: Path, side: int) -> Posed:
     views = undistort(photos, cameras, Lenses(lenses.coefficients[rows]), side=4096)
     size = network_size(*photos.size(0), side)
     Ks = _resized(views.cameras, [size] * len(photos))
-    return Posed(folder.name, batch(list(views.images), size), views.cameras.viewmats, Ks, None)
+    return PosedViews(folder.name, batch(list(views.images), size), views.cameras.viewmats, Ks, None)
 
 
 def _resized(cameras: Cameras, sizes: list[tuple[int, int]]) -> Float[Tensor, "c 3 3"]:
@@ -103,9 +103,9 @@ def _resized(cameras: Cameras, sizes: list[tuple[int, int]]) -> Float[Tensor, "c
     return torch.stack([resize(K, new[0] / old[0], new[1] / old[1]) for K, old, new in rows])
 
 
-def rendered(name: str, scene: Scene, side: int, device: str = "cpu") -> Posed:
+def render_views(name: str, scene: Scene, side: int, device: str = "cpu") -> PosedViews:
     """A scene seen by its own cameras, or from all around where it has none."""
-    cameras = scene.cameras if scene.cameras is not None and len(scene.cameras) >= 4 else around(scene)
+    cameras = scene.cameras if scene.cameras is not None and len(scene.cameras) >= 4 else default_cameras(scene)
     size = network_size(*cameras.sizes[0].tolist(), side)
     Ks = _resized(cameras, [size] * len(cameras))
     gaussians, white = scene.gaussians.to(device), torch.tensor(WHITE, device=device)
@@ -116,15 +116,17 @@ def rendered(name: str, scene: Scene, side: int, device: str = "cpu") -> Posed:
             rgb.append(drawn.rgb[0].clamp(0, 1).cpu())
             depth.append(torch.where(drawn.alpha[0] > 0.5, drawn.depth[0], torch.zeros_like(drawn.depth[0])).cpu())
     images = torch.stack(rgb).permute(0, 3, 1, 2).contiguous()
-    return Posed(name, images, cameras.viewmats, Ks, torch.stack(depth))
+    return PosedViews(name, images, cameras.viewmats, Ks, torch.stack(depth))
 
 
-def around(scene: Scene) -> Cameras:
+def default_cameras(scene: Scene) -> Cameras:
     """Two rings of cameras around the middle of the scene, far enough to see half of it and more."""
     means = scene.gaussians.means
     centre = means.median(0).values
     reach = float((means - centre).norm(dim=1).quantile(0.8))
-    rings = [orbit(ORBIT // 2, centre, 3 * reach, angle, azimuth=az) for angle, az in ((20.0, 120.0), (45.0, 135.0))]
+    rings = [
+        orbit(ORBIT_VIEWS // 2, centre, 3 * reach, angle, azimuth=az) for angle, az in ((20.0, 120.0), (45.0, 135.0))
+    ]
     K = intrinsics(448, 448, 448 / (2 * math.tan(math.radians(25))))
-    names = tuple(f"{i:02d}" for i in range(ORBIT))
-    return Cameras(torch.cat(rings), K.expand(ORBIT, 3, 3).clone(), torch.full((ORBIT, 2), 448), names)
+    names = tuple(f"{i:02d}" for i in range(ORBIT_VIEWS))
+    return Cameras(torch.cat(rings), K.expand(ORBIT_VIEWS, 3, 3).clone(), torch.full((ORBIT_VIEWS, 2), 448), names)

@@ -14,16 +14,16 @@ from stages.core.errors import InputError
 from stages.core.models.dynamics import Dynamics
 from stages.core.scene.files import must_exist, replacing
 
-EMA = 0.999  # of the running mean of the weights, from a few thousand steps on
-LIMIT = 2.0  # gradients are cut to so many times their usual norm
-MEMORY = 0.99  # of the usual norm
-WARM = 200  # steps until the full rate
-LOST = 1.25  # times the lowest RMSE so far, from which on training has gone astray,
-WORSE = 4  # as it has when each of so many checks was worse than the one before
+EMA_DECAY = 0.999  # of the running mean of the weights, from a few thousand steps on
+GRADIENT_CLIP = 2.0  # gradients are cut to so many times their usual norm
+GRADIENT_NORM_DECAY = 0.99  # of the usual norm
+WARMUP_STEPS = 200  # steps until the full rate
+DIVERGENCE_RATIO = 1.25  # times the lowest RMSE so far, from which on training has gone astray,
+MAX_WORSENING_CHECKS = 4  # as it has when each of so many checks was worse than the one before
 OPTIMIZERS = ("adamw", "soap")
 
 
-class Trainee:
+class TrainingState:
     """A model in training."""
 
     def __init__(self, model: Dynamics, lr: float, seed: int, optimizer: str = "adamw"):
@@ -48,20 +48,20 @@ class Trainee:
         finite = norm.isfinite()
         norm = torch.where(finite, norm, 0.0)
         usual = torch.where(self.usual > 0, self.usual, norm)
-        cut = torch.minimum(norm, LIMIT * usual)
+        cut = torch.minimum(norm, GRADIENT_CLIP * usual)
         scale = torch.where(norm > 0, cut / norm.clamp_min(1e-30), 0.0)
-        self.usual = torch.where(finite, MEMORY * usual + (1 - MEMORY) * cut, self.usual)
+        self.usual = torch.where(finite, GRADIENT_NORM_DECAY * usual + (1 - GRADIENT_NORM_DECAY) * cut, self.usual)
         for p, g in zip(self.params, grads, strict=True):
             p.grad = torch.where(finite, g * scale, 0.0)
         for group in self.optimizer.param_groups:
-            group["lr"] = lr * self.caution * min(1.0, (self.step - self.since + 1) / WARM)
+            group["lr"] = lr * self.caution * min(1.0, (self.step - self.since + 1) / WARMUP_STEPS)
         before = [p.detach().clone() for p in self.params]
         self.optimizer.step()
         for p, old in zip(self.params, before, strict=True):
             p.copy_(torch.where(finite, p, old))
         self.skipped += ~finite
         self.step += 1
-        keep = min(EMA, (1 + self.step) / (10 + self.step))
+        keep = min(EMA_DECAY, (1 + self.step) / (10 + self.step))
         torch._foreach_lerp_(list(self.ema.parameters()), list(self.model.parameters()), 1 - keep)
         if self.usual.is_cuda:  # the host runs ahead by one step: more, and it would lose count of time
             if self.ahead is not None:
@@ -83,12 +83,12 @@ class Trainee:
         self.curve.append(row)
         if row["RMSE"] <= lowest:
             self.best = copy.deepcopy(self.ema.state_dict())
-        elif not row["RMSE"] < LOST * lowest or self._sinking():
+        elif not row["RMSE"] < DIVERGENCE_RATIO * lowest or self._sinking():
             self._rewind()
 
     def _sinking(self) -> bool:
-        last = [r["RMSE"] for r in self.curve[-WORSE - 1 :]]
-        return len(last) > WORSE and all(a < b for a, b in pairwise(last))
+        last = [r["RMSE"] for r in self.curve[-MAX_WORSENING_CHECKS - 1 :]]
+        return len(last) > MAX_WORSENING_CHECKS and all(a < b for a, b in pairwise(last))
 
     def _rewind(self) -> None:
         self.model.load_state_dict(self.best)

@@ -22,20 +22,26 @@ from stages.core.scene.files import ngff_version
 from stages.evaluate.dynamics import all_metrics
 from stages.lab.dataset.motions import Motions
 from stages.lab.dataset.scenes import OTHERS, groups_of
-from stages.lab.training.data import UNSEEN, Pieces, read_groups, recipe, split
-from stages.lab.training.distributed import Team, team
-from stages.lab.training.rollout_loss import LOSSES, Roll
-from stages.lab.training.state import OPTIMIZERS, Trainee
-from stages.lab.training.widen import widened
+from stages.lab.training.data import (
+    VALIDATION_SCENES,
+    ClipSampler,
+    describe_groups,
+    read_groups,
+    train_validation_split,
+)
+from stages.lab.training.distributed import ProcessGroup, process_group
+from stages.lab.training.rollout_loss import LOSSES, RolloutLoss
+from stages.lab.training.state import OPTIMIZERS, TrainingState
+from stages.lab.training.widen import widen
 
 log = logging.getLogger(__name__)
-SHARES = (0.35, 0.35, 0.3)  # of the budget, for three horizons
-LINE = (
+HORIZON_FRACTIONS = (0.35, 0.35, 0.3)  # of the budget, for three horizons
+PROGRESS_LINE = (
     "{minutes:6.1f} min {step:7d} steps  horizon {horizon:2d}  loss {loss:.4f}  "
     "RMSE {RMSE:.4f}  FPE {FPE:.4f}  R {R:.3f}"
 )
-FOURTH = 4  # steps after which there is one with few keypoints
-FRAMES = 80  # of the rollouts that choose the weights
+SPARSE_EVERY = 4  # steps after which there is one with few keypoints
+VALIDATION_FRAMES = 80  # of the rollouts that choose the weights
 
 
 @dataclass(frozen=True)
@@ -87,7 +93,7 @@ class TrainOptions:
     def horizon(self, progress: float) -> int:
         """Frames to roll out at this share of the budget."""
         n = len(self.frames)
-        ends = [sum(SHARES[: i + 1]) if n == len(SHARES) else (i + 1) / n for i in range(n)]
+        ends = [sum(HORIZON_FRACTIONS[: i + 1]) if n == len(HORIZON_FRACTIONS) else (i + 1) / n for i in range(n)]
         return self.frames[min(sum(progress >= e for e in ends), n - 1)]
 
     def rate(self, progress: float) -> float:
@@ -109,16 +115,16 @@ def run(
     if not out.parent.is_dir():
         raise InputError(f"{out}: there is no folder {out.parent}; make it first")
     groups = groups_of(options.groups, more=OTHERS)
-    known, unseen = split(read_groups(data, groups, options.keypoints), UNSEEN)
+    known, unseen = train_validation_split(read_groups(data, groups, options.keypoints), VALIDATION_SCENES)
     if known.points.shape[1] <= max(options.frames):
         raise InputError(f"--horizons: the motions have {known.points.shape[1]} frames; take shorter ones")
-    with team(pick_device(options.device), options.batch) as crew:
+    with process_group(pick_device(options.device), options.batch) as crew:
         trainee, before = _trainee(model, out, options, crew.device, resume, start)
         if crew.leads:
             log.info("%s, %s parameters: learns from %d scenes, chosen by %d", model,
                      f"{sum(p.numel() for p in trainee.params):,}", len(known), len(unseen))  # fmt: skip
-        pieces = [Pieces(part, crew.device, trainee.model) for part in _seen(known, options.few)]
-        job = Job(trainee, pieces, unseen.to(crew.device), options, crew, out, _key(model, options, before))
+        pieces = [ClipSampler(part, crew.device, trainee.model) for part in _seen(known, options.few)]
+        job = TrainingRun(trainee, pieces, unseen.to(crew.device), options, crew, out, _key(model, options, before))
         finished = job.run()
         if not crew.leads:
             return []
@@ -126,14 +132,14 @@ def run(
         card = {
             "command": shlex.join(["ngff-lab", *sys.argv[1:]]), "ngff": ngff_version(), "torch": torch.__version__,
             "device": torch.cuda.get_device_name() if crew.device == "cuda" else "cpu", "processes": crew.size,
-            "options": asdict(options), "data": recipe(data, groups), "scenes": len(known),
+            "options": asdict(options), "data": describe_groups(data, groups), "scenes": len(known),
             "scenes to choose by": len(unseen), "finished": finished, "minutes": trainee.elapsed / 60,
             "steps": trainee.step, "validation": best, "curve": trainee.curve, **before,
         }  # fmt: skip
         save(out, model, trainee.best_model(), card)
     ended = "" if finished else " (stopped before the end; go on with --resume)"
-    return [f"{out}: RMSE {best['RMSE']:.4f}  FPE {best['FPE']:.4f}  R {best['R']:.3f} over {FRAMES} frames of "
-            f"unseen scenes, after {best['minutes']:.1f} of {trainee.elapsed / 60:.1f} min{ended}"]  # fmt: skip
+    return [f"{out}: RMSE {best['RMSE']:.4f}  FPE {best['FPE']:.4f}  R {best['R']:.3f} over {VALIDATION_FRAMES} frames "
+            f"of unseen scenes, after {best['minutes']:.1f} of {trainee.elapsed / 60:.1f} min{ended}"]  # fmt: skip
 
 
 def _seen(motions: Motions, few: int) -> list[Motions]:
@@ -143,7 +149,7 @@ def _seen(motions: Motions, few: int) -> list[Motions]:
 
 def _trainee(
     model: str, out: Path, options: TrainOptions, device: str, resume: bool, start: Path | None
-) -> tuple[Trainee, dict]:
+) -> tuple[TrainingState, dict]:
     """A model that is new, from other weights, or from its checkpoint; and what its card says of those weights."""
     torch.manual_seed(options.seed)
     before = {}
@@ -152,12 +158,12 @@ def _trainee(
     else:
         network, card = load(start, device)
         if options.hidden and card["model"] == model == "ngff":
-            network = widened(network, options.hidden)
+            network = widen(network, options.hidden)
         if card["model"] != model or options.hidden not in (0, network.config.get("hidden")):
             raise InputError(f"{start}: holds {card['model']} {network.config}, not what is to be trained; leave "
                              "--hidden out and name weights of the same model")  # fmt: skip
         before = {"before": {k: v for k, v in card.items() if k not in ("model", "config")}}
-    trainee = Trainee(network, options.lr, options.seed, options.optimizer)
+    trainee = TrainingState(network, options.lr, options.seed, options.optimizer)
     if resume:
         trainee.load(out.with_suffix(".ckpt"), _key(model, options, before))
         log.info("going on from step %d, %.1f min", trainee.step, trainee.elapsed / 60)
@@ -171,14 +177,14 @@ def _key(model: str, options: TrainOptions, before: dict) -> dict:
 
 
 @dataclass
-class Job:
+class TrainingRun:
     """One run of training, by one process or several."""
 
-    trainee: Trainee
-    pieces: list[Pieces]  # the usual ones; what every fourth step learns from
+    trainee: TrainingState
+    pieces: list[ClipSampler]  # the usual ones; what every fourth step learns from
     unseen: Motions
     options: TrainOptions
-    team: Team
+    team: ProcessGroup
     out: Path
     key: dict
 
@@ -187,15 +193,17 @@ class Job:
         trainee, options, part = self.trainee, self.options, self.team.rows(self.options.batch)
         self.clock = time.perf_counter() - trainee.elapsed
         rolls, horizon, done = [], 0, self.progress()
-        with _asked_to_stop() as asked, _rounded(self.team.device), tqdm(
-            total=1.0, bar_format="{l_bar}{bar}| {elapsed}", disable=not self.team.leads
-        ) as bar:
+        with (
+            _asked_to_stop() as asked,
+            _rounded(self.team.device),
+            tqdm(total=1.0, bar_format="{l_bar}{bar}| {elapsed}", disable=not self.team.leads) as bar,
+        ):
             while done < 1 and not self.team.agreed(len(asked)):
                 if options.horizon(done) != horizon:
                     rolls, horizon = [], options.horizon(done)  # the memory of the old graphs goes first
                     rolls = [self.roll(pieces) for pieces in self.pieces]
                     trainee.anew(horizon)
-                turn = -1 if trainee.step % FOURTH == 0 else 0
+                turn = -1 if trainee.step % SPARSE_EVERY == 0 else 0
                 loss, grads = rolls[turn](self.pieces[turn].draw(options.batch, horizon, trainee.generator, part))
                 *grads, loss = self.team.mean([*grads, loss])
                 trainee.update(grads, options.rate(done))
@@ -211,10 +219,12 @@ class Job:
             trainee.save(self.out.with_suffix(".ckpt"), self.key)
         return done >= 1
 
-    def roll(self, pieces: Pieces) -> Roll:
+    def roll(self, pieces: ClipSampler) -> RolloutLoss:
         options = self.options
-        return Roll(self.trainee.model, pieces.motions.dt, options.loss, options.memory, compiled=options.compiled,
-                    speeds=options.speeds)  # fmt: skip
+        return RolloutLoss(
+            self.trainee.model, pieces.motions.dt, options.loss, options.memory, compiled=options.compiled,
+            speeds=options.speeds,
+        )  # fmt: skip
 
     def progress(self) -> float:
         """Share of the budget that is used up."""
@@ -229,7 +239,7 @@ class Job:
         trainee.note({"horizon": horizon, **found, "RMSE": self.team.agreed(found.get("RMSE", 0.0))})
         if leads:
             trainee.save(self.out.with_suffix(".ckpt"), self.key)
-            log.info(LINE.format(**trainee.curve[-1]))
+            log.info(PROGRESS_LINE.format(**trainee.curve[-1]))
             if trainee.curve[-1]["skipped"]:
                 log.warning("%d steps had no finite gradients and changed nothing", trainee.curve[-1]["skipped"])
 
@@ -257,7 +267,9 @@ def _rounded(device: str):
 
 
 @torch.no_grad()
-def validate(model: torch.nn.Module, scenes: Motions, frames: int = FRAMES, batch: int = 100) -> dict[str, float]:
+def validate(
+    model: torch.nn.Module, scenes: Motions, frames: int = VALIDATION_FRAMES, batch: int = 100
+) -> dict[str, float]:
     """Metrics of full rollouts from rest, averaged over the scenes; an RMSE that is not finite is infinite."""
     model.eval()
     frames = min(frames, scenes.points.shape[1])

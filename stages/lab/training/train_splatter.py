@@ -33,13 +33,13 @@ from stages.core.models.pi3.weights import find, load
 from stages.core.raster.rasterise import Rendering, rasterise
 from stages.core.scene.files import replacing, sha256
 from stages.lab import plot
-from stages.lab.training.splatter_data import WHITE, Posed, read_all
+from stages.lab.training.splatter_data import WHITE, PosedViews, read_training_scenes
 from stages.reconstruct.depth import unproject
 
 log = logging.getLogger(__name__)
-STRUCTURE, DEPTH = 0.2, 0.1  # weights of 1 - SSIM against L1, and of the relative error in depth
+SSIM_WEIGHT, DEPTH_WEIGHT = 0.2, 0.1  # weights of 1 - SSIM against L1, and of the relative error in depth
 CHECKS = 10  # how often the unseen views are looked at in a run
-LEARNED = ("feature_decoder", "feature_head")
+TRAINED_MODULES = ("feature_decoder", "feature_head")
 
 
 @dataclass(frozen=True)
@@ -67,15 +67,15 @@ class SplatterOptions:
 def run(data: Path, out: Path, options: SplatterOptions, weights: Path | None = None) -> Iterator[str]:
     """Folder of scenes -> OUT.safetensors for --backend pi3-splat, its history (.json) and curves (.png) beside it."""
     device = pick_device(options.device)
-    scenes = read_all(data, options.side, device)
+    scenes = read_training_scenes(data, options.side, device)
     if options.depth == "given" and (bare := [s.name for s in scenes if s.depths is None]):
         raise InputError(f"--depth given: {bare[0]} is photos, which have none; use scenes (.ply) or --depth network")
     torch.manual_seed(options.seed)
-    model, fresh = start(weights, options)
+    model, fresh = load_network(weights, options)
     model = model.to(device)
     seen, unseen = (scenes[:-1], scenes[-1:]) if len(scenes) > 3 else (scenes, scenes)
     if fresh:
-        initialise(model, geometry_of(model, seen[0][seen[0].learned].to(device), options), seen[0].Ks[0])
+        initialise_head(model, view_geometry(model, seen[0][seen[0].learned].to(device), options), seen[0].Ks[0])
     history = []
     for row in fit(model, seen, unseen, options, device):
         best = max((r["psnr"] for r in history), default=-math.inf)
@@ -92,7 +92,7 @@ def run(data: Path, out: Path, options: SplatterOptions, weights: Path | None = 
     plot.draw(Path(out).with_suffix(".png"), [plot.Panel(titles[key], points) for key, points in curves.items()], 2)
 
 
-def start(weights: Path | None, options: SplatterOptions) -> tuple[Pi3Splat, bool]:
+def load_network(weights: Path | None, options: SplatterOptions) -> tuple[Pi3Splat, bool]:
     """The network, of which only the head of Gaussians learns, and whether that head is fresh.
 
     From weights of Pi3-splat, or of π³ where those are absent.
@@ -109,11 +109,11 @@ def start(weights: Path | None, options: SplatterOptions) -> tuple[Pi3Splat, boo
             model = Pi3Splat(base.config)
             model.encoder.load_state_dict(base.state_dict(), strict=False)  # the head is not among them
     for name, parameter in model.encoder.named_parameters():
-        parameter.requires_grad_(name.startswith(LEARNED))
+        parameter.requires_grad_(name.startswith(TRAINED_MODULES))
     return model.eval(), fresh
 
 
-def initialise(model: Pi3Splat, geometry: Geometry, K: Float[Tensor, "3 3"]) -> None:
+def initialise_head(model: Pi3Splat, geometry: Geometry, K: Float[Tensor, "3 3"]) -> None:
     """A fresh head starts with grey, half opaque spheres as large as a pixel."""
     last: nn.Linear = model.encoder.feature_head.down_proj
     pixel = float((geometry.points[..., 2] / K[0, 0]).median()) / SMALLEST_STEP
@@ -125,7 +125,7 @@ def initialise(model: Pi3Splat, geometry: Geometry, K: Float[Tensor, "3 3"]) -> 
 
 
 def fit(
-    model: Pi3Splat, seen: list[Posed], unseen: list[Posed], options: SplatterOptions, device: str
+    model: Pi3Splat, seen: list[PosedViews], unseen: list[PosedViews], options: SplatterOptions, device: str
 ) -> Iterator[dict]:
     """Train; now and then {"step", "loss", "psnr"}, the first before any step."""
     generator = torch.Generator().manual_seed(options.seed)
@@ -152,7 +152,7 @@ def fit(
         losses.append(loss.item())
 
 
-def step_loss(model: Pi3Splat, views: Posed, options: SplatterOptions) -> Tensor:
+def step_loss(model: Pi3Splat, views: PosedViews, options: SplatterOptions) -> Tensor:
     """Gaussians of all views but the last, drawn in one of these and in the last."""
     model.encoder.feature_head.train()
     sources = list(range(len(views.images) - 1))
@@ -160,15 +160,15 @@ def step_loss(model: Pi3Splat, views: Posed, options: SplatterOptions) -> Tensor
     loss = torch.zeros((), device=views.images.device)
     for k, i in enumerate((0, len(sources))):
         image, photo = drawn.rgb[k], views.images[i].permute(1, 2, 0)
-        loss = loss + (1 - STRUCTURE) * (image - photo).abs().mean() + STRUCTURE * (1 - ssim(image, photo))
+        loss = loss + (1 - SSIM_WEIGHT) * (image - photo).abs().mean() + SSIM_WEIGHT * (1 - ssim(image, photo))
     known = (geometry.points[0, ..., 2] > 0) & (drawn.alpha[0] > 0.5)
     wanted = geometry.points[0, ..., 2].clamp_min(1e-6)
     error = torch.where(known, (drawn.depth[0] - wanted).abs() / wanted, torch.zeros_like(wanted))
-    return loss / 2 + DEPTH * error.mean()
+    return loss / 2 + DEPTH_WEIGHT * error.mean()
 
 
 @torch.no_grad()
-def held_out_psnr(model: Pi3Splat, scene: Posed, options: SplatterOptions, device: str) -> float:
+def held_out_psnr(model: Pi3Splat, scene: PosedViews, options: SplatterOptions, device: str) -> float:
     """Of the views never learned from, drawn from Gaussians of others [dB]."""
     model.encoder.feature_head.eval()
     sources = scene.learned[:: max(1, len(scene.learned) // options.views)][: options.views]
@@ -179,14 +179,14 @@ def held_out_psnr(model: Pi3Splat, scene: Posed, options: SplatterOptions, devic
     return float((-10 * error.clamp_min(1e-10).log10()).mean())
 
 
-def _drawn(model, views: Posed, sources: list[int], targets: list[int], options) -> tuple[Geometry, Rendering]:
+def _drawn(model, views: PosedViews, sources: list[int], targets: list[int], options) -> tuple[Geometry, Rendering]:
     """Where the sources' pixels lie, and their Gaussians as the targets see them."""
     device = views.images.device
     used = views[sources]
     with torch.autocast(device.type, torch.bfloat16, enabled=device.type != "cpu"):
         with torch.no_grad():
             hidden, places = model.encoder.tokens(used.images, 8)
-        geometry = geometry_of(model, used, options, hidden, places)
+        geometry = view_geometry(model, used, options, hidden, places)
         raw = model.encoder.raw(used.images, hidden, places, len(sources))
     gaussians = splat(geometry, raw)[(geometry.points[..., 2] > 0).flatten()]
     size = views.images.shape[3], views.images.shape[2]
@@ -195,7 +195,7 @@ def _drawn(model, views: Posed, sources: list[int], targets: list[int], options)
 
 
 @torch.no_grad()
-def geometry_of(model, views: Posed, options: SplatterOptions, hidden=None, places=None) -> Geometry:
+def view_geometry(model, views: PosedViews, options: SplatterOptions, hidden=None, places=None) -> Geometry:
     """Where the pixels lie: at the given cameras, at true depth or the network's, scaled so that cameras agree."""
     if options.depth == "given":
         depths = views.depths

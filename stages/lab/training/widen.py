@@ -9,7 +9,7 @@ from stages.core.models.field.force_field import ForceField
 
 
 @torch.no_grad()
-def widened(model: ForceField, hidden: int) -> ForceField:
+def widen(model: ForceField, hidden: int) -> ForceField:
     """The same function with `hidden` channels: new ones see as untrained ones do, and nobody listens to them yet."""
     old = model.config["hidden"]
     if hidden < old:

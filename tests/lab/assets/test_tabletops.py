@@ -18,7 +18,7 @@ from stages.lab.assets import tabletops
 from stages.lab.assets.backgrounds import TOP
 from stages.lab.assets.objects import OBJECTS
 from stages.lab.assets.tabletops import CONTACT, EACH, GAP, REACH, tabletop
-from stages.lab.bench import photographed
+from stages.lab.bench import reconstructed_scene
 from stages.lab.bench import refine as bench_refine
 from stages.lab.bench import segment as bench_segment
 from tests.segment.tabletop import block, three_apart
@@ -82,15 +82,15 @@ def test_overlap_by_hand():
     truth = torch.tensor([1, 1, 1, 1, 2, 2, 0, 0])
     found = torch.tensor([3, 3, 3, 0, 3, 5, 5, 0])
     # object 1: 3 of (4 + 4 - 3) with thing 3; object 2: 1 of 3 with thing 5, 1 of 5 with thing 3
-    assert bench_segment.overlaps(found, truth) == pytest.approx({1: 3 / 5, 2: 1 / 3})
-    assert bench_segment.overlaps(torch.zeros(8, dtype=torch.int64), truth) == {1: 0.0, 2: 0.0}
+    assert bench_segment.best_ious(found, truth) == pytest.approx({1: 3 / 5, 2: 1 / 3})
+    assert bench_segment.best_ious(torch.zeros(8, dtype=torch.int64), truth) == {1: 0.0, 2: 0.0}
 
 
 @pytest.mark.slow
 def test_the_segment_report_finds_blocks_apart_and_the_vote_mends_wrong_masks(tmp_path, monkeypatch):
     monkeypatch.setenv("NGFF_WEIGHTS", str(tmp_path))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    lines = list(bench_segment.run(tmp_path / "s.json", bench_segment.BenchOptions(scenes=1, photos=8)))
+    lines = list(bench_segment.run(tmp_path / "s.json", bench_segment.SegmentBenchOptions(scenes=1, photos=8)))
     means = json.loads((tmp_path / "s.json").read_text())["mean_iou"]
     assert set(means) == set(tabletops.KINDS) and "without sam2: " in lines[1]
     for by in means.values():  # blocks of Gaussians this large let the table shine through, so no mask is perfect
@@ -109,8 +109,8 @@ def test_what_is_reconstructed_is_judged_in_the_photos_that_were_placed(monkeypa
         g = moved(replace(scene.gaussians, object_id=torch.zeros_like(scene.gaussians.object_id)), move)
         write_scene(out, Scene(g, cameras=scene.cameras[list(range(1, 8))].moved(move), floor=0.0))
 
-    monkeypatch.setattr(photographed, "reconstruct", perfect)
-    row = bench_segment.measure_rebuilt("apart", 0, 8)
+    monkeypatch.setattr(reconstructed_scene, "reconstruct", perfect)
+    row = bench_segment.measure_reconstructed("apart", 0, 8)
     assert row["placed"] == 7 and row["mean"] > 0.9
 
 
@@ -118,8 +118,8 @@ def test_where_no_photo_can_be_placed_nothing_is_found(monkeypatch):
     def hopeless(photos, out, options):
         raise InputError(f"{photos}: no two photos show the same things")
 
-    monkeypatch.setattr(photographed, "reconstruct", hopeless)
-    row = bench_segment.measure_rebuilt("apart", 0, 8)
+    monkeypatch.setattr(reconstructed_scene, "reconstruct", hopeless)
+    row = bench_segment.measure_reconstructed("apart", 0, 8)
     assert row["placed"] == 0 and row["mean"] == 0.0 and len(row["iou"]) == EACH
 
 
@@ -133,18 +133,18 @@ def test_sam2_takes_part_where_its_weights_are(tmp_path, monkeypatch):
     monkeypatch.setattr(discover, "propose", lambda model, pixels: automatic.propose(model, pixels, few))
     monkeypatch.setattr(discover, "LOOKS", 1)
     scene = three_apart()
-    found = bench_segment.by_sam2(scene, weights.load(weights.find(saved(tmp_path))))
+    found = bench_segment.segment_by_sam2(scene, weights.load(weights.find(saved(tmp_path))))
     assert found.shape == scene.gaussians.object_id.shape  # which objects, only real weights know
 
 
 def test_masks_are_as_wrong_as_asked():
     rng = np.random.default_rng(0)
     truth = torch.arange(10).repeat_interleave(30).expand(50, 300)  # ten stripes, 30 pixels wide
-    assert torch.equal(bench_segment.spoilt(truth, 0.0, 9, rng), truth)
-    right = [float((bench_segment.spoilt(truth, 0.3, 9, rng) == truth).float().mean()) for _ in range(30)]
+    assert torch.equal(bench_segment.corrupt_labels(truth, 0.0, 9, rng), truth)
+    right = [float((bench_segment.corrupt_labels(truth, 0.3, 9, rng) == truth).float().mean()) for _ in range(30)]
     # 0.7 keep their object, of these 0.7 of the pixels (and a tenth of noise hits); shifts cost the rest
     assert 0.2 < np.mean(right) < 0.7 * 0.73 + 0.1
-    assert int(bench_segment.spoilt(truth, 1.0, 9, rng).max()) <= 9
+    assert int(bench_segment.corrupt_labels(truth, 1.0, 9, rng).max()) <= 9
 
 
 @pytest.mark.slow
@@ -158,4 +158,4 @@ def test_a_filled_hole_is_nearer_to_the_truth_than_an_open_one():
 @pytest.mark.parametrize("wrong", [{"scenes": 0}, {"photos": 3}])
 def test_options_check_themselves(wrong):
     with pytest.raises(InputError):
-        bench_segment.BenchOptions(**wrong)
+        bench_segment.SegmentBenchOptions(**wrong)

@@ -14,14 +14,14 @@ from stages.core.models.field.contact_points import LEVER, pair_places
 from stages.core.models.field.rest_shape import shape_of
 from stages.core.models.initial_conditions import World
 from stages.lab.bench import ablation as bench_ablation
-from stages.lab.bench.ablation import BenchOptions, run
+from stages.lab.bench.ablation import AblationBenchOptions, run
 from stages.lab.dataset.motions import write_motions
-from stages.lab.training.ablation import CHOICES, IMPULSES
+from stages.lab.training.ablation import ABLATIONS, IMPULSE_VECTORS
 from stages.lab.training.train import TrainOptions
 from tests.lab.training.test_train import falling
 
 DT = 0.02
-TINY = BenchOptions(steps=2, batch=2, keypoints=8, horizons="1,2", groups="3_0", test="3_1", device="cpu")
+TINY = AblationBenchOptions(steps=2, batch=2, keypoints=8, horizons="1,2", groups="3_0", test="3_1", device="cpu")
 
 
 @pytest.fixture
@@ -44,7 +44,7 @@ def colliding() -> World:
 def stepped(name: str, world: World) -> tuple[torch.Tensor, torch.Tensor]:
     """Velocities of the bodies after a step, and the gradient of their squares for Young's modulus."""
     torch.manual_seed(0)
-    model = CHOICES[name].network().eval()
+    model = ABLATIONS[name].network().eval()
     E = world.E.clone().requires_grad_()
     object.__setattr__(world, "E", E)
     scene = model.informed(model.rest(world))
@@ -76,7 +76,7 @@ def test_stiffness_matters_unless_it_is_not_told():
 def test_rigid_bodies_keep_their_shape():
     world = colliding()
     for name, moved in (("full", True), ("deformation", False)):
-        model = CHOICES[name].network().eval()
+        model = ABLATIONS[name].network().eval()
         scene = model.informed(model.rest(world))
         state = model.step(scene, model.start(scene), 0.0, DT, Pushes.none(world))
         assert bool(state.u.abs().max() > 0) is moved
@@ -86,7 +86,7 @@ def test_the_last_vectors_of_a_contact_are_the_impulses():
     """What is taken away would stop the places of a pair, or part them at 1 m/s, if both bodies got it, opposite."""
     world = colliding()
     shape = shape_of(world)
-    model = CHOICES["full"].network()
+    model = ABLATIONS["full"].network()
     moving = model._moving(model.informed(shape), model.start(model.informed(shape)))
     places = pair_places(shape, moving)
     near, vectors = places.gate[0, 0, 0] > 0, places.vectors[0, 0, 0]
@@ -94,7 +94,7 @@ def test_the_last_vectors_of_a_contact_are_the_impulses():
     assert len(vectors) > 3 and vectors.shape[-2] == 10
     m = world.mass[0]
     reduced = m[0] * m[1] / (m[0] + m[1])
-    for impulse, wanted in ((vectors[:, -IMPULSES], vectors[:, 3]), (vectors[:, -1], vectors[:, 2])):
+    for impulse, wanted in ((vectors[:, -IMPULSE_VECTORS], vectors[:, 3]), (vectors[:, -1], vectors[:, 2])):
         change = torch.zeros_like(wanted)
         for body, arm in enumerate((LEVER * vectors[:, 4], LEVER * vectors[:, 5])):
             spin = torch.linalg.cross(arm, impulse) @ moving.inverse[0, body].T
@@ -103,7 +103,7 @@ def test_the_last_vectors_of_a_contact_are_the_impulses():
 
 
 def test_contacts_without_context_are_not_told_of_others():
-    model = CHOICES["context"].network()
+    model = ABLATIONS["context"].network()
     x = torch.randn(2, 3, 4 * model.config["hidden"])
     assert model.between(x).abs().max() == 0 and model.between(x).shape == (2, 3, model.config["hidden"])
 
@@ -111,26 +111,26 @@ def test_contacts_without_context_are_not_told_of_others():
 def test_other_options_change_one_thing_each():
     base = TrainOptions(keypoints=64, horizons="8,20", loss="axes")
     changed = {name: {k for k, v in vars(choice.options(base)).items() if v != getattr(base, k)}
-               for name, choice in CHOICES.items()}  # fmt: skip
+               for name, choice in ABLATIONS.items()}  # fmt: skip
     others = {"keypoints": {"keypoints"}, "memory": {"memory"}, "axes": {"loss"}, "horizons": {"horizons"}}
-    assert changed == {name: others.get(name, set()) for name in CHOICES}
+    assert changed == {name: others.get(name, set()) for name in ABLATIONS}
 
 
 def test_choices_are_trained_scored_and_kept(data, tmp_path, monkeypatch):
-    monkeypatch.setattr(bench_ablation, "CHECKS", 1)
-    for name in set(CHOICES) - {"full", "reaction", "keypoints"}:
-        monkeypatch.delitem(CHOICES, name)
+    monkeypatch.setattr(bench_ablation, "VALIDATION_CHECKS", 1)
+    for name in set(ABLATIONS) - {"full", "reaction", "keypoints"}:
+        monkeypatch.delitem(ABLATIONS, name)
     out = tmp_path / "ablation.json"
     assert len(list(run(data, out, TINY, "reaction,full"))) == 2
     before = json.loads(out.read_text())["rows"]
     assert list(before) == ["full", "reaction"]
     lines = list(run(data, out, TINY))
     rows = json.loads(out.read_text())["rows"]
-    assert list(rows) == list(CHOICES) and len(lines) == len(CHOICES)
+    assert list(rows) == list(ABLATIONS) and len(lines) == len(ABLATIONS)
     assert {k: rows[k] for k in before} == before
     assert all(row["RMSE"] > 0 and row["scenes"] == 6 and row["frames"] == 6 for row in rows.values())
     table = out.with_suffix(".md").read_text()
-    assert table.count("\n| ") == len(CHOICES) + 2 and "| 1.00 |" in table
+    assert table.count("\n| ") == len(ABLATIONS) + 2 and "| 1.00 |" in table
 
 
 def test_results_of_something_else_are_kept(data, tmp_path):
@@ -143,7 +143,7 @@ def test_results_of_something_else_are_kept(data, tmp_path):
 
 
 def test_the_command(data, tmp_path, monkeypatch):
-    monkeypatch.setattr(bench_ablation, "CHECKS", 1)
+    monkeypatch.setattr(bench_ablation, "VALIDATION_CHECKS", 1)
     words = "--steps 1 --batch 2 --keypoints 8 --horizons 1 --groups 3_0 --test 3_1 --device cpu --only materials"
     call = ["bench", "ablation", "--data", str(data), "-o", str(tmp_path / "a.json"), *words.split()]
     result = CliRunner().invoke(app, call)

@@ -10,7 +10,7 @@ from stages.core.scene.cameras import Lenses
 from stages.core.scene.gaussians import Gaussians
 from stages.core.scene.scene import Scene
 from stages.lab.bench import appearance as bench
-from stages.lab.bench import appearance_peer as peer
+from stages.lab.bench import appearance_gsplat as peer
 from stages.reconstruct.photometric import score
 from stages.reconstruct.photos import Reconstruction, Views
 from stages.reconstruct.sfm import SparseModel
@@ -62,7 +62,7 @@ def test_the_recipe_learns_photos_and_multiplies_gaussians():
 
 def test_gaussians_start_as_far_apart_as_their_neighbours():
     points = torch.cartesian_prod(*3 * [torch.arange(4.0)])
-    values = peer.start(points, torch.full((64, 3), 0.5), "cpu")
+    values = peer.initial_parameters(points, torch.full((64, 3), 0.5), "cpu")
     torch.testing.assert_close(values["scales"].exp(), torch.ones(64, 3))
     torch.testing.assert_close(values["opacities"].sigmoid(), torch.full((64,), 0.1))
     assert (values["sh0"] == 0).all() and values["shN"].shape == (64, 15, 3)
@@ -74,7 +74,7 @@ def test_points_take_the_colour_that_photos_learned_from_show():
     model = SparseModel(views.cameras, Lenses(torch.zeros(3, 5)), points, torch.arange(300), view)
     half = Similarity(0.5, torch.eye(3), torch.tensor([1.0, 0.0, 0.0]))
     upright = Views(views.images, views.cameras.moved(half))
-    found, colours = bench.coloured(model, half, upright[[0, 2]], [0, 2])
+    found, colours = bench.coloured_points(model, half, upright[[0, 2]], [0, 2])
     torch.testing.assert_close(found, half(points[view != 1]))  # only the photo kept out shows the others
     true = torch.cat([_colours(views, i, points[view == i]) for i in (0, 2)])
     assert float((colours - true).abs().max()) < 1e-5
@@ -106,7 +106,7 @@ def test_the_steps_fit_in_the_seconds(monkeypatch):
     made = Reconstruction(scene, views, [1, 2, 3, 4, 5], [0], {}, [])
     seen = torch.zeros(1, dtype=torch.int64)
     model = SparseModel(cameras, Lenses(torch.zeros(6, 5)), torch.zeros(1, 3), seen, seen + 1)
-    side = bench.by_gsplat(made, model, 50.0, "cpu")
+    side = bench.gsplat_result(made, model, 50.0, "cpu")
     assert side.seconds == pytest.approx(50, rel=0.2) and side.steps == pytest.approx(2000, rel=0.2)
     assert side.gaussians == len(scene.gaussians) and side.psnr < 30
 
@@ -114,9 +114,9 @@ def test_the_steps_fit_in_the_seconds(monkeypatch):
 def test_without_a_gpu_the_user_is_told(monkeypatch, tmp_path):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(InputError, match="NVIDIA GPU"):
-        next(bench.run([tmp_path], tmp_path / "out.json", bench.BenchOptions()))
+        next(bench.run([tmp_path], tmp_path / "out.json", bench.AppearanceBenchOptions()))
     assert not (tmp_path / "out.json").exists()
     with pytest.raises(InputError, match="--holdout"):
-        bench.BenchOptions(holdout=0)
+        bench.AppearanceBenchOptions(holdout=0)
     with pytest.raises(InputError, match="--quality"):
-        bench.BenchOptions(quality="best")
+        bench.AppearanceBenchOptions(quality="best")

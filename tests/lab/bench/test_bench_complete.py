@@ -9,17 +9,17 @@ from stages.core.scene.scene import Scene
 from stages.lab.assets.shapes import ellipsoid
 from stages.lab.bench import complete as bench_complete
 from stages.lab.bench.complete import (
-    FIGURES,
-    FRONT,
-    WAYS,
-    BenchOptions,
-    cameras,
-    distance,
-    photographed,
+    COMPLETERS,
+    FRONT_AZIMUTH,
+    METRICS,
+    CompleteBenchOptions,
+    camera_arc,
+    chamfer_mm,
     psnr_behind,
     run,
-    shown,
-    truth,
+    true_scene,
+    visible,
+    visible_scene,
 )
 from tests.refine.things import thing
 from tests.segment.tabletop import coloured
@@ -29,7 +29,7 @@ from tests.segment.tabletop import coloured
 def true():
     patch = pytest.MonkeyPatch()
     patch.setattr(bench_complete, "make_object", lambda name: thing(0.02))
-    yield truth("panda,duck", BenchOptions())
+    yield true_scene("panda,duck", CompleteBenchOptions())
     patch.undo()
 
 
@@ -42,12 +42,12 @@ def test_the_objects_stand_on_the_table_beside_each_other(true):
 
 
 def test_the_cameras_miss_the_back_and_pictures_from_there_show_it(true):
-    seen = photographed(true, BenchOptions())
+    seen = visible_scene(true, CompleteBenchOptions())
     counts = [int((s.gaussians.object_id > 0).sum()) for s in (seen, true)]
     assert 0.3 * counts[1] < counts[0] < 0.8 * counts[1]
-    assert distance(true, true) == 0 and distance(seen, true) > 1
+    assert chamfer_mm(true, true) == 0 and chamfer_mm(seen, true) > 1
     assert psnr_behind(seen, true) < 25
-    exact = photographed(true, BenchOptions(noise=0.0))
+    exact = visible_scene(true, CompleteBenchOptions(noise=0.0))
     kept = exact.gaussians.means[exact.gaussians.object_id > 0]
     assert float(torch.cdist(kept[:50], true.gaussians.means).amin(1).max()) < 1e-3  # cdist rounds
 
@@ -57,7 +57,7 @@ def test_what_is_seen_does_not_depend_on_how_many_gaussians_it_is_made_of():
     shares = []
     for count in (4000, 30_000):
         ball = coloured(ellipsoid((0.1, 0.1, 0.1), count).moved((0, 0, 0.12)), (0.8, 0.3, 0.2), 1)
-        shares.append(float(shown(Scene(ball, (), cameras(10, FRONT, 28.0), 0.0)).float().mean()))
+        shares.append(float(visible(Scene(ball, (), camera_arc(10, FRONT_AZIMUTH, 28.0), 0.0)).float().mean()))
     assert shares[0] == pytest.approx(shares[1], abs=0.05) and 0.5 < shares[0] < 0.9
 
 
@@ -67,13 +67,15 @@ def test_a_run_gives_each_scene_and_the_mean_over_them(tmp_path, monkeypatch):
     def measured(placed, folder, options):
         assert (folder / "library/duck.ply").exists()
         factor = 1 + (placed == "can,miku")
-        for i, way in enumerate(WAYS, 1):
-            yield way, {figure: factor * i * 10**j for j, figure in enumerate(FIGURES)}
+        for i, way in enumerate(COMPLETERS, 1):
+            yield way, {figure: factor * i * 10**j for j, figure in enumerate(METRICS)}
 
-    monkeypatch.setattr(bench_complete, "measured", measured)
+    monkeypatch.setattr(bench_complete, "measure", measured)
     monkeypatch.setattr(bench_complete, "make_object", lambda name: thing(0.02))
-    lines = list(run(tmp_path / "out.json", BenchOptions(("panda,duck", "can,miku"), "duck")))
-    assert [line.split()[:2] for line in lines[-3:]] == [["mean", way] for way in WAYS] and len(lines) == 1 + 3 * 3
+    lines = list(run(tmp_path / "out.json", CompleteBenchOptions(("panda,duck", "can,miku"), "duck")))
+    assert [line.split()[:2] for line in lines[-3:]] == [["mean", way] for way in COMPLETERS] and len(
+        lines
+    ) == 1 + 3 * 3
     facts = json.loads((tmp_path / "out.json").read_text())
     assert facts["mean"]["close"] == {"chamfer_mm": 3.0, "psnr_behind_db": 30.0, "motion_rmse_mm": 300.0}
     assert facts["scenes"]["can,miku"]["library"]["chamfer_mm"] == 6

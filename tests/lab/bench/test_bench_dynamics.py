@@ -17,19 +17,29 @@ from stages.core.geometry.rotations import matrix
 from stages.core.models.checkpoints import build, save
 from stages.evaluate.dynamics import rmse
 from stages.lab.bench import dynamics as bench_dynamics
-from stages.lab.bench import dynamics_rows as bench_dynamics_rows
-from stages.lab.bench.dynamics import FALL, MPM, NUDGED, RIGID, SPLITS, BenchOptions, measured, run, scenes_of
-from stages.lab.bench.dynamics_report import markdown, table
-from stages.lab.bench.dynamics_rows import (
-    ESTIMATED,
-    Resimulation,
-    common,
-    estimated,
-    fall,
-    free_fall,
-    rigid,
-    same_scenes,
+from stages.lab.bench import dynamics_baselines
+from stages.lab.bench.dynamics import (
+    FREE_FALL,
+    MPM_ESTIMATED,
+    NUDGED,
+    RIGID_FIT,
+    SPLITS,
+    DynamicsBenchOptions,
+    evaluate_predictor,
+    run,
+    split_scenes,
 )
+from stages.lab.bench.dynamics_baselines import (
+    VLM_MATERIALS,
+    Resimulation,
+    free_fall,
+    predict_free_fall,
+    predict_from,
+    predict_rigid_fit,
+    shared_scenes,
+    with_estimated_materials,
+)
+from stages.lab.bench.dynamics_report import markdown, table
 from stages.lab.dataset.motions import Motions, joined, write_motions
 from stages.lab.dataset.particles import Asset, Fineness, volumes
 from stages.lab.dataset.scenes import Config, write_configs
@@ -38,7 +48,7 @@ from stages.lab.plot import HEIGHT, STRIP, WIDTH
 from tests.lab.training.test_train import falling, without_last
 
 GROUPS = [*(f"3_{i}" for i in range(10)), "4", "6", "heldout"]
-NONE = BenchOptions(keypoints=8, mpm=0, device="cpu")
+NONE = DynamicsBenchOptions(keypoints=8, mpm=0, device="cpu")
 
 
 def group(name: str, by: float = 0.0) -> Motions:
@@ -88,7 +98,7 @@ def tumbling(seed: int = 0):
 
 def test_the_best_rigid_fit_of_rigid_bodies_is_the_truth():
     motions = tumbling()
-    assert_close(rigid(motions), motions.points, rtol=0, atol=1e-5)
+    assert_close(predict_rigid_fit(motions), motions.points, rtol=0, atol=1e-5)
 
 
 def test_the_best_rigid_fit_of_soft_bodies_keeps_shape_and_is_the_best():
@@ -96,17 +106,17 @@ def test_the_best_rigid_fit_of_soft_bodies_keeps_shape_and_is_the_best():
     noise = 0.02 * torch.randn(motions.points.shape, generator=torch.Generator().manual_seed(1))
     noise[:, 0] = 0  # at rest they are as they are
     soft = replace(motions, points=motions.points + noise * motions.present[:, None, :, None, None])
-    fit = rigid(soft)
+    fit = predict_rigid_fit(soft)
     rest, last = soft.points[1, 0, 0], fit[1, -1, 0]
     assert_close(torch.cdist(last, last), torch.cdist(rest, rest), rtol=0, atol=1e-4)
     error = (fit - soft.points).square().sum()
     assert error < (motions.points - soft.points).square().sum()  # the motion before the noise was one of the choices
-    assert rigid(soft)[0, :, -1].abs().max() == 0  # padding
+    assert predict_rigid_fit(soft)[0, :, -1].abs().max() == 0  # padding
 
 
 def test_the_truth_has_no_error_and_correlates_wholly():
     motions = without_last(falling())
-    result = measured(fall, motions, batch=4)
+    result = evaluate_predictor(predict_free_fall, motions, batch=4)
     assert result["RMSE"] < 1e-5 and result["FPE"] < 1e-5 and result["R"] > 0.9999
     assert len(result["error by frame"]) == 12 and result["scenes not finite"] == 0
     assert {name: len(curve) for name, curve in result["error by object"].items()} == {"ball": 2, "bear": 2}
@@ -118,7 +128,7 @@ def test_errors_are_averaged_over_scenes_whatever_the_batch():
     def still(some):
         return some.points[:, :1].repeat(1, 12, 1, 1, 1)
 
-    one, all_ = (measured(still, motions, batch=b) for b in (1, 6))
+    one, all_ = (evaluate_predictor(still, motions, batch=b) for b in (1, 6))
     assert one == all_
     world = motions.world()
     expected = float(rmse(still(motions), motions.points, world.valid).mean())
@@ -134,11 +144,11 @@ def test_a_scene_that_is_lost_is_not_left_out():
     motions = falling()
 
     def lost(some):
-        points = fall(some)
+        points = predict_free_fall(some)
         points[0, -1] = math.nan
         return points
 
-    result = measured(lost, motions, batch=6)
+    result = evaluate_predictor(lost, motions, batch=6)
     assert result["RMSE"] is None and result["FPE"] is None and result["scenes not finite"] == 1
     assert result["R"] == pytest.approx(5 / 6, abs=1e-3) and result["error by frame"][-1] is None
     facts = {"scenes": {"spatial": 6}, "rows": {"a": {"splits": {"spatial": result}}}}
@@ -148,25 +158,25 @@ def test_a_scene_that_is_lost_is_not_left_out():
 def test_scenes_made_again_are_found_by_their_names():
     motions = falling(seed=4)
     other = replace(motions, points=motions.points + 0.01)[torch.tensor([5, 3, 0])]
-    both = common(motions, other)
+    both = shared_scenes(motions, other)
     assert both.names == ("0", "3", "5")
-    result = measured(same_scenes(other, 12), both, batch=2)
+    result = evaluate_predictor(predict_from(other, 12), both, batch=2)
     assert result["RMSE"] == pytest.approx(0.01, rel=1e-3) and result["PCE"] == pytest.approx(0, abs=1e-6)
     with pytest.raises(InputError, match="fewer frames"):
-        same_scenes(replace(other, points=other.points[:, :5]), 12)(both)
+        predict_from(replace(other, points=other.points[:, :5]), 12)(both)
 
 
 def test_the_sample_of_the_temporal_split_is_always_the_same(data, monkeypatch):
-    monkeypatch.setattr(bench_dynamics, "SAMPLE", 5)
-    options = BenchOptions(keypoints=8)
-    a, b = (scenes_of(data, "temporal", options) for _ in range(2))
+    monkeypatch.setattr(bench_dynamics, "TEMPORAL_SCENES", 5)
+    options = DynamicsBenchOptions(keypoints=8)
+    a, b = (split_scenes(data, "temporal", options) for _ in range(2))
     assert len(a) == 5 and torch.equal(a.points, b.points)
-    assert not torch.equal(a.points, scenes_of(data, "temporal", replace(options, seed=1)).points)
-    assert scenes_of(data, "6 objects", options).points.shape == (2, 8, 6, 8, 3)
+    assert not torch.equal(a.points, split_scenes(data, "temporal", replace(options, seed=1)).points)
+    assert split_scenes(data, "6 objects", options).points.shape == (2, 8, 6, 8, 3)
 
 
 def test_every_model_is_measured_on_every_split(data, weights, tmp_path, monkeypatch):
-    monkeypatch.setattr(bench_dynamics, "TIMED", 2)
+    monkeypatch.setattr(bench_dynamics, "TIMED_STEPS", 2)
     out = tmp_path / "results.json"
     nudged = tmp_path / "nudged"
     nudged.mkdir()
@@ -174,12 +184,12 @@ def test_every_model_is_measured_on_every_split(data, weights, tmp_path, monkeyp
         write_motions(nudged / f"{name}.h5", group(name, by=0.001), {})
     lines = run(data, weights, out, replace(NONE, limit=2), nudged)
     facts = json.loads(out.read_text(), parse_constant=lambda word: pytest.fail(f"{word} is no JSON"))
-    assert list(facts["rows"]) == [FALL, NUDGED, RIGID, "gcn", "transformer"]
+    assert list(facts["rows"]) == [FREE_FALL, NUDGED, RIGID_FIT, "gcn", "transformer"]
     for row in facts["rows"].values():
         assert list(row["splits"]) == list(SPLITS)
-    assert facts["rows"][FALL]["splits"]["spatial"]["RMSE"] < 1e-3  # these bodies only fall
+    assert facts["rows"][FREE_FALL]["splits"]["spatial"]["RMSE"] < 1e-3  # these bodies only fall
     assert facts["rows"][NUDGED]["splits"]["temporal"]["RMSE"] == pytest.approx(1e-3, rel=0.06)  # kept to 0.1 mm
-    assert facts["rows"][RIGID]["splits"]["6 objects"]["RMSE"] < 2e-4
+    assert facts["rows"][RIGID_FIT]["splits"]["6 objects"]["RMSE"] < 2e-4
     row = facts["rows"]["transformer"]
     assert row["seconds"] > 0 and row["card"]["minutes"] == 2.0 and row["parameters"] > 0
     assert facts["scenes"] == dict.fromkeys(SPLITS, 2) and facts["machine"] and facts["date"]
@@ -191,7 +201,7 @@ def test_every_model_is_measured_on_every_split(data, weights, tmp_path, monkeyp
 
 
 def test_table_and_plots_are_drawn_again_from_the_results_alone(data, weights, tmp_path, monkeypatch):
-    monkeypatch.setattr(bench_dynamics, "TIMED", 2)
+    monkeypatch.setattr(bench_dynamics, "TIMED_STEPS", 2)
     out = tmp_path / "results.json"
     lines = run(data, weights, out, NONE)
     first = {kind: out.with_suffix(kind).read_bytes() for kind in (".md", ".png")}
@@ -210,7 +220,7 @@ def test_table_and_plots_are_drawn_again_from_the_results_alone(data, weights, t
 
 
 def test_rows_of_the_same_scenes_stay_when_others_are_measured(data, weights, tmp_path, monkeypatch):
-    monkeypatch.setattr(bench_dynamics, "TIMED", 2)
+    monkeypatch.setattr(bench_dynamics, "TIMED_STEPS", 2)
     out = tmp_path / "results.json"
     run(data, weights, out, NONE)
     before = json.loads(out.read_text())["rows"]
@@ -221,7 +231,7 @@ def test_rows_of_the_same_scenes_stay_when_others_are_measured(data, weights, tm
     assert list(rows) == list(before) and rows["transformer"] == before["transformer"]
     assert rows["gcn"]["card"]["minutes"] == 3.0
     run(data, weights, out, replace(NONE, limit=1))  # other scenes: numbers of before would mislead
-    assert list(json.loads(out.read_text())["rows"]) == [FALL, RIGID, "gcn"]
+    assert list(json.loads(out.read_text())["rows"]) == [FREE_FALL, RIGID_FIT, "gcn"]
     out.write_text("[]")
     with pytest.raises(InputError, match="results.json: holds no results"):
         run(data, weights, out, NONE)
@@ -234,7 +244,8 @@ def test_the_best_model_of_each_split_is_bold():
 
     facts = {
         "machine": "m", "date": "d", "keypoints": 8, "scenes": {"spatial": 6}, "frames": {"spatial": 80},
-        "rows": {FALL: row(0.02), MPM: row(0.3, left={"scenes left out": 2}), "gcn": row(0.2, card={"minutes": 3.0}),
+        "rows": {FREE_FALL: row(0.02), MPM_ESTIMATED: row(0.3, left={"scenes left out": 2}),
+                 "gcn": row(0.2, card={"minutes": 3.0}),
                  "ngff": row(0.1, card={}, parameters=270_000, seconds=0.0123), "odd": row(None, card={})},
     }  # fmt: skip
     text = "\n".join(markdown("results", facts))
@@ -269,14 +280,16 @@ def simulated(tmp_path, monkeypatch):
     options = {"dx": COARSE.dx, "spacing": COARSE.spacing, "substep": COARSE.substep, "keypoints": 60}
     made = joined(list(simulate(configs, things, COARSE, 12, 60, "cpu")))
     write_motions(tmp_path / "set" / "motions" / "3_9.h5", made, {"options": options})
-    monkeypatch.setattr(bench_dynamics_rows, "assets", lambda fineness, least, kept: things)
+    monkeypatch.setattr(dynamics_baselines, "assets", lambda fineness, least, kept: things)
     return tmp_path / "set", things
 
 
 def test_estimated_materials_take_the_place_of_the_true_ones(simulated):
     _, things = simulated
-    guess = estimated(things)
-    assert (guess[0].E, guess[0].density) == ESTIMATED["ball"] and (guess[7].E, guess[7].density) == ESTIMATED["duck"]
+    guess = with_estimated_materials(things)
+    assert (guess[0].E, guess[0].density) == VLM_MATERIALS["ball"] and (guess[7].E, guess[7].density) == VLM_MATERIALS[
+        "duck"
+    ]
     assert torch.equal(guess[0].points, things[0].points) and guess[7].mass == pytest.approx(
         things[7].mass * 1100 / 500, rel=1e-6
     )
@@ -284,20 +297,20 @@ def test_estimated_materials_take_the_place_of_the_true_ones(simulated):
 
 def test_scenes_are_simulated_again_as_they_were(simulated, monkeypatch):
     data, things = simulated
-    monkeypatch.setattr(bench_dynamics_rows, "estimated", lambda things: things)  # the true materials
-    truth = scenes_of(data, "spatial", BenchOptions(keypoints=20))
+    monkeypatch.setattr(dynamics_baselines, "with_estimated_materials", lambda things: things)  # the true materials
+    truth = split_scenes(data, "spatial", DynamicsBenchOptions(keypoints=20))
     again = Resimulation(data, ["3_9"], "cpu")(("b", "a"), 12, 20)
-    result = measured(same_scenes(again, 12), truth, batch=2)
+    result = evaluate_predictor(predict_from(again, 12), truth, batch=2)
     assert result["RMSE"] < 1e-4  # positions are kept to 0.1 mm
 
 
 def test_mpm_with_estimated_materials_is_a_row_of_its_own(simulated, weights, tmp_path, monkeypatch):
-    monkeypatch.setattr(bench_dynamics, "TIMED", 2)
+    monkeypatch.setattr(bench_dynamics, "TIMED_STEPS", 2)
     data, _ = simulated
-    run(data, weights, tmp_path / "r.json", BenchOptions(keypoints=20, mpm=1, device="cpu"))
+    run(data, weights, tmp_path / "r.json", DynamicsBenchOptions(keypoints=20, mpm=1, device="cpu"))
     facts = json.loads((tmp_path / "r.json").read_text())
-    row = facts["rows"][MPM]["splits"]["spatial"]
-    assert list(facts["rows"])[2] == MPM and row["scenes left out"] == 0
+    row = facts["rows"][MPM_ESTIMATED]["splits"]["spatial"]
+    assert list(facts["rows"])[2] == MPM_ESTIMATED and row["scenes left out"] == 0
     start, later = row["error by object"]["duck"]  # kept to 0.1 mm; 20 times as soft, it lands otherwise
     assert start < 1e-4 and later > 5e-4
     assert facts["scenes"] == {"spatial": 2}

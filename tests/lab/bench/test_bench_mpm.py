@@ -9,12 +9,12 @@ from stages.core.errors import InputError
 from stages.core.kernels.mpm import grid as mpm_grid
 from stages.core.physics.mpm import solver as mpm
 from stages.lab.bench import mpm as bench_mpm
-from stages.lab.bench import mpm_plain as bench_mpm_plain
-from stages.lab.bench.mpm import BenchOptions
+from stages.lab.bench import mpm_three_kernel
+from stages.lab.bench.mpm import MpmBenchOptions
 
 
 def test_the_plain_form_is_the_same_physics():
-    one, box, dx = bench_mpm.scene(400)
+    one, box, dx = bench_mpm.falling_boxes(400)
     one.v[:] = torch.tensor([0.3, 0.1, -1.0])
     ours = mpm.Solver(one, box, dx)
     push = torch.tensor(bench_mpm.GRAVITY).repeat(len(one), 1)
@@ -23,14 +23,14 @@ def test_the_plain_form_is_the_same_physics():
     plain.set(push=push)
     nodes = torch.zeros(plain.grid.count, 4)
     for _ in range(200):
-        bench_mpm_plain.substep(plain, nodes, 1e-4)
+        mpm_three_kernel.substep(plain, nodes, 1e-4)
     assert plain.grid.low[0] == mpm_grid.PAD
     torch.testing.assert_close(plain.particles.x, ours.particles.x, rtol=0, atol=2e-5)
 
 
 @pytest.mark.parametrize("particles", [6_144, 20_000, 250_000])
 def test_scenes_have_about_as_many_particles_as_asked_eight_a_cell(particles):
-    one, box, dx = bench_mpm.scene(particles)
+    one, box, dx = bench_mpm.falling_boxes(particles)
     assert len(one) == pytest.approx(particles, rel=0.1)
     assert dx**3 / float(one.volume[0]) == pytest.approx(8, rel=1e-5)
     low, high = torch.tensor(box.low), torch.tensor(box.high)
@@ -39,7 +39,7 @@ def test_scenes_have_about_as_many_particles_as_asked_eight_a_cell(particles):
 
 def test_a_report_has_ratios_and_the_machine(monkeypatch):
     monkeypatch.setattr(bench_mpm.bench, "copy_bandwidth", lambda device: 1e10)
-    lines = list(bench_mpm.run(BenchOptions("cpu", (400,), scenes=2, frames=1)))
+    lines = list(bench_mpm.run(MpmBenchOptions("cpu", (400,), scenes=2, frames=1)))
     assert "torch" in lines[0] and "10 GB/s" in lines[1] and len(lines) == 5
     assert sum("mpm exact" in line for line in lines) == 1
     for line in lines[2:]:
@@ -57,4 +57,4 @@ def test_the_figures_follow_from_each_other():
 def test_wrong_options():
     for options in ({"frames": 0}, {"particles": (3,)}, {"scenes": -1}):
         with pytest.raises(InputError, match="--frames at least 1"):
-            BenchOptions(**options)
+            MpmBenchOptions(**options)

@@ -5,7 +5,7 @@ import torch.nn.functional as F
 from stages.core.errors import InputError
 from stages.core.models.pi3.network import Pi3
 from stages.lab.bench import pi3 as bench_pi3
-from stages.lab.bench.pi3 import BenchOptions, attend_with, measure, naive, run
+from stages.lab.bench.pi3 import Pi3BenchOptions, measure, naive_attention, run, set_attention
 from tests.core.models.pi3.test_network import TINY, random_weights, views
 from tests.core.models.pi3.test_splat import TINY_SPLAT
 
@@ -22,16 +22,16 @@ def one_thread():
 @torch.no_grad()
 def test_attention_written_out_is_the_same_attention():
     q, k, v = torch.randn(3, 2, 4, 9, 16, generator=torch.Generator().manual_seed(0)).unbind()
-    torch.testing.assert_close(naive(q, k, v), F.scaled_dot_product_attention(q, k, v))
+    torch.testing.assert_close(naive_attention(q, k, v), F.scaled_dot_product_attention(q, k, v))
     model = random_weights(Pi3(TINY))
     ours = model(views())
-    attend_with(model, naive)
+    set_attention(model, naive_attention)
     torch.testing.assert_close(model(views()).points, ours.points, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("splats", [False, True])
 def test_a_line_for_each_number_of_views_and_its_peer(splats):
-    lines = list(run(BenchOptions("cpu", (1, 2), 28, 1, splats), TINY_SPLAT))
+    lines = list(run(Pi3BenchOptions("cpu", (1, 2), 28, 1, splats), TINY_SPLAT))
     assert len(lines) == 6 and lines[1].startswith("Pi3Splat" if splats else "Pi3,")
     assert all("attention written out" in line for line in lines[3::2])
 
@@ -42,11 +42,11 @@ def test_memory_that_is_too_small_is_said(monkeypatch):
     def table(*_):
         raise torch.OutOfMemoryError
 
-    monkeypatch.setattr(bench_pi3, "naive", table)
-    lines = list(run(BenchOptions("cpu", (1,), 28, 1), TINY))[2:]
+    monkeypatch.setattr(bench_pi3, "naive_attention", table)
+    lines = list(run(Pi3BenchOptions("cpu", (1,), 28, 1), TINY))[2:]
     assert " s " in lines[0] and lines[1].endswith("attention written out: out of memory")
     monkeypatch.setattr(bench_pi3, "measure", table)
-    (line,) = list(run(BenchOptions("cpu", (3,), 28, 1), TINY))[2:]
+    (line,) = list(run(Pi3BenchOptions("cpu", (3,), 28, 1), TINY))[2:]
     assert line.startswith("views   3  out of memory (estimate") and "nan" not in line
 
 
@@ -58,4 +58,4 @@ def test_time_is_that_of_the_network():
 
 def test_sizes_that_are_no_multiple_of_a_patch():
     with pytest.raises(InputError, match="multiple of 14"):
-        BenchOptions(size=450)
+        Pi3BenchOptions(size=450)

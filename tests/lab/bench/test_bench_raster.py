@@ -7,15 +7,15 @@ import torch
 
 from stages.core.errors import InputError
 from stages.core.raster.rasterise import rasterise
-from stages.lab.bench.raster import BenchOptions, camera, cloud, draw_plain, run
+from stages.lab.bench.raster import RasterBenchOptions, random_gaussians, render_per_pixel, run, view_camera
 
 
 def test_the_peer_draws_the_same_and_has_the_same_gradients():
     """Two programs that share projection and sorting alone; the adjoint of the one knows nothing of the other's."""
-    g, (viewmat, K) = cloud(3000), camera(90)
+    g, (viewmat, K) = random_gaussians(3000), view_camera(90)
     tensors = [t.requires_grad_() for t in (g.means, g.quats, g.scales, g.opacities, g.sh)]
     drawn = rasterise(g, viewmat[None], K[None], 90, 90)
-    plain = draw_plain(g, viewmat, K, 90)
+    plain = render_per_pixel(g, viewmat, K, 90)
     torch.testing.assert_close(plain[..., :3], drawn.rgb[0], rtol=0, atol=1e-5)
     torch.testing.assert_close(plain[..., 3], (drawn.depth * drawn.alpha)[0], rtol=0, atol=3e-5)
     weight = torch.randn(90, 90, 3, generator=torch.Generator().manual_seed(0))
@@ -26,14 +26,14 @@ def test_the_peer_draws_the_same_and_has_the_same_gradients():
 
 @pytest.mark.parametrize("n", [2000, 16000])
 def test_the_cloud_fills_the_image_and_grows_no_denser(n):
-    g, (viewmat, K) = cloud(n), camera(64)
+    g, (viewmat, K) = random_gaussians(n), view_camera(64)
     drawn = rasterise(g, viewmat[None], K[None], 64, 64)
     assert float(drawn.visible.float().mean()) > 0.95
     assert float(drawn.alpha[0, 16:48, 16:48].mean()) > 0.9 and 0.5 < float(drawn.alpha.mean()) < 0.95
 
 
 def test_a_report_has_every_row_the_machine_and_its_ratio(tmp_path):
-    lines = list(run(tmp_path / "raster.json", BenchOptions(repeat=1, shrink=20)))
+    lines = list(run(tmp_path / "raster.json", RasterBenchOptions(repeat=1, shrink=20)))
     assert "cores" in lines[0] and len(lines) == 8
     assert [line.split(":")[0].split()[0] for line in lines[1:]] == ["forward"] * 4 + ["forward,"] * 2 + ["SSIM,"]
     kept = json.loads((tmp_path / "raster.json").read_text())
@@ -45,4 +45,4 @@ def test_a_report_has_every_row_the_machine_and_its_ratio(tmp_path):
 
 def test_options_check_themselves():
     with pytest.raises(InputError, match="--repeat"):
-        BenchOptions(repeat=0)
+        RasterBenchOptions(repeat=0)

@@ -80,7 +80,7 @@ def test_a_set_may_be_a_folder_of_photos_or_hold_one(tmp_path):
     with pytest.raises(InputError, match="no such folder"):
         bench.photo_folder(tmp_path / "absent")
     with pytest.raises(InputError, match="name one or more"):
-        list(bench.run([], tmp_path / "r.json", bench.BenchOptions()))
+        list(bench.run([], tmp_path / "r.json", bench.ReconstructBenchOptions()))
 
 
 def test_rows_of_other_sets_are_kept(tmp_path, monkeypatch):
@@ -88,19 +88,19 @@ def test_rows_of_other_sets_are_kept(tmp_path, monkeypatch):
         photos=5, placed=5, held_out={"photos": 1, "psnr": 20.0, "ssim": 0.7}, seconds={"model": 2.0}, memory=1.0,
         cpu_seconds=3.0, device="cpu",
     )  # fmt: skip
-    monkeypatch.setattr(bench, "measured_alone", lambda *_: report)
+    monkeypatch.setattr(bench, "measure_in_subprocess", lambda *_: report)
     for name in ("one", "two"):
         (tmp_path / name).mkdir()
-        lines = list(bench.run([tmp_path / name], tmp_path / "r.json", bench.BenchOptions(device="cpu")))
+        lines = list(bench.run([tmp_path / name], tmp_path / "r.json", bench.ReconstructBenchOptions(device="cpu")))
     assert "5/  5" in lines[1] and "20.00 dB" in lines[1]
     assert set(json.loads((tmp_path / "r.json").read_text())["sets"]) == {"one, normal, cpu", "two, normal, cpu"}
 
 
 def test_what_fails_has_a_row_that_says_why_and_matchers_have_rows_of_their_own(tmp_path, monkeypatch):
     (tmp_path / "set").mkdir()
-    monkeypatch.setattr(bench, "measured_alone", bench.measure)  # a process is not needed to fail
+    monkeypatch.setattr(bench, "measure_in_subprocess", bench.measure)  # a process is not needed to fail
     for matcher in ("sift", "aliked-lightglue"):
-        options = bench.BenchOptions(device="cpu", matcher=matcher)
+        options = bench.ReconstructBenchOptions(device="cpu", matcher=matcher)
         lines = list(bench.run([tmp_path / "set"], tmp_path / "r.json", options))
         assert lines[1].startswith("set ") and "no photos" in lines[1]
     rows = json.loads((tmp_path / "r.json").read_text())["sets"]
@@ -110,8 +110,10 @@ def test_what_fails_has_a_row_that_says_why_and_matchers_have_rows_of_their_own(
 
 def test_cameras_alone_are_compared_with_those_that_took_the_photos(tmp_path, monkeypatch):
     write_set(tmp_path / "set", arc(4, (240, 180), sweep=40.0)).rename(tmp_path / "set" / "cameras.json")
-    monkeypatch.setattr(bench, "measured_alone", bench.measure)
-    lines = list(bench.run([tmp_path / "set"], tmp_path / "r.json", bench.BenchOptions(device="cpu", cameras=True)))
+    monkeypatch.setattr(bench, "measure_in_subprocess", bench.measure)
+    lines = list(
+        bench.run([tmp_path / "set"], tmp_path / "r.json", bench.ReconstructBenchOptions(device="cpu", cameras=True))
+    )
     row = json.loads((tmp_path / "r.json").read_text())["sets"]["set, normal, cpu, cameras"]
     assert row["placed"] == row["photos"] == row["poses"]["cameras"] == 4 and "4/  4" in lines[1]
     assert row["poses"]["rotation"] < 0.5 and row["poses"]["shift"] < 2.0

@@ -14,7 +14,16 @@ from stages.core.geometry.similarity import Similarity, umeyama
 from stages.lab.assets.shapes import ellipsoid
 from stages.lab.bench import common as bench
 from stages.lab.bench import register as bench_register
-from stages.lab.bench.register import BenchOptions, about_z, angle, errors, icp, run, splatreg, trial
+from stages.lab.bench.register import (
+    RegisterBenchOptions,
+    errors,
+    icp,
+    make_trial,
+    nearest_z_rotation,
+    rotation_angle,
+    run,
+    splatreg,
+)
 from tests.refine.things import somewhere, thing
 from tests.segment.tabletop import coloured
 
@@ -32,7 +41,7 @@ def turned_about_z(pose: Similarity, degrees: float) -> Similarity:
 
 
 def test_the_truth_has_no_error_and_what_is_off_has_as_much_as_it_is_off(can):
-    given = trial(can, 0, BenchOptions())
+    given = make_trial(can, 0, RegisterBenchOptions())
     exact = errors(given.truth, given, can, revolved=True)
     assert max(exact.values()) < 0.1
     larger = given.truth._replace(scale=1.05 * given.truth.scale)
@@ -42,7 +51,7 @@ def test_the_truth_has_no_error_and_what_is_off_has_as_much_as_it_is_off(can):
 
 
 def test_a_turn_that_nobody_can_see_is_no_error_and_one_of_a_painted_side_is(can):
-    given = trial(can, 0, BenchOptions())
+    given = make_trial(can, 0, RegisterBenchOptions())
     off = turned_about_z(given.truth, 90.0)
     assert errors(off, given, can, revolved=True)["rotation up to symmetry"] < 0.1
     red = torch.where(can.means[:, :1] > 0, torch.tensor([0.9, 0.1, 0.1]), torch.tensor([0.5, 0.5, 0.5]))
@@ -51,7 +60,7 @@ def test_a_turn_that_nobody_can_see_is_no_error_and_one_of_a_painted_side_is(can
 
 
 def test_a_part_is_the_share_of_the_whole_that_was_asked_for_where_the_truth_puts_it(can):
-    given = trial(can, 1, BenchOptions(missing=0.4, noise=0.0, tint=0.0))
+    given = make_trial(can, 1, RegisterBenchOptions(missing=0.4, noise=0.0, tint=0.0))
     assert len(given.part) == round(0.6 * len(can))
     torch.testing.assert_close(given.part.means, given.truth(can.means[given.seen]))
     torch.testing.assert_close(given.part.sh, can.sh[given.seen])
@@ -59,9 +68,9 @@ def test_a_part_is_the_share_of_the_whole_that_was_asked_for_where_the_truth_put
 
 def test_the_turn_about_z_is_taken_apart_from_the_rest():
     a = matrix(torch.tensor([0.9, 0.0, 0.0, 0.3]))
-    assert angle(a @ about_z(a).mT) < 0.1
+    assert rotation_angle(a @ nearest_z_rotation(a).mT) < 0.1
     x = matrix(torch.tensor([0.9, 0.3, 0.0, 0.0]))
-    assert angle(about_z(x)) < 0.1
+    assert rotation_angle(nearest_z_rotation(x)) < 0.1
 
 
 def test_there_and_back_is_nowhere():
@@ -100,7 +109,7 @@ def stand_in(monkeypatch):
 
 def test_splatreg_is_handed_what_it_wants_and_its_answer_is_turned_into_ours(can, stand_in):
     rng, threads = torch.Generator().manual_seed(0), torch.get_num_threads()
-    whole = can[torch.randperm(len(can), generator=rng)[: bench_register.SHOWN]]
+    whole = can[torch.randperm(len(can), generator=rng)[: bench_register.SPLATREG_GAUSSIANS]]
     whole = replace(whole, sh=rgb_to_sh(torch.rand(len(whole), 3, generator=rng)))
     pose = somewhere(3)
     found = splatreg(replace(whole, means=pose(whole.means), scales=pose.scale * whole.scales), whole)
@@ -111,7 +120,9 @@ def test_splatreg_is_handed_what_it_wants_and_its_answer_is_turned_into_ours(can
 def test_the_real_splatreg_finds_a_whole_that_is_turned_and_scaled():
     pytest.importorskip("splatreg")
     whole, pose = thing(0.02), somewhere(1)
-    whole = whole[torch.randperm(len(whole), generator=torch.Generator().manual_seed(0))[: bench_register.SHOWN]]
+    whole = whole[
+        torch.randperm(len(whole), generator=torch.Generator().manual_seed(0))[: bench_register.SPLATREG_GAUSSIANS]
+    ]
     found = splatreg(replace(whole, means=pose(whole.means), scales=pose.scale * whole.scales), whole)
     torch.testing.assert_close(found(whole.means), pose(whole.means), rtol=0, atol=1e-3)
 
@@ -119,7 +130,7 @@ def test_the_real_splatreg_finds_a_whole_that_is_turned_and_scaled():
 def test_a_run_counts_and_writes(tmp_path, monkeypatch):
     monkeypatch.setattr(bench_register, "make_object", lambda name: thing(0.02))
     monkeypatch.setattr(bench_register, "METHODS", {"ICP": icp})
-    lines = list(run(tmp_path / "out.json", BenchOptions("duck", 1, device="cpu")))
+    lines = list(run(tmp_path / "out.json", RegisterBenchOptions("duck", 1, device="cpu")))
     assert lines[0].split() == ["right", "of", "1", "ICP"] and lines[1].split()[0] == "duck"
     facts = json.loads((tmp_path / "out.json").read_text())
     assert facts["machine"] == bench.machine("cpu") and [row["method"] for row in facts["trials"]] == ["ICP"]

@@ -8,15 +8,15 @@ import torch
 from stages.core.errors import InputError
 from stages.core.models.checkpoints import build, save
 from stages.lab.bench import rollout as bench_rollout
-from stages.lab.bench.rollout import PEER, BenchOptions, rolled, run, table, world
+from stages.lab.bench.rollout import PEER, RolloutBenchOptions, ellipsoids, rollout_stepwise, run, table
 
 
 def test_the_scene_is_one_of_contacts():
-    start = world(2, 60)
+    start = ellipsoids(2, 60)
     assert torch.equal(start.points[0], start.points[1])
     torch.manual_seed(0)
     model = build("ngff", hidden=8).eval()
-    end = rolled(model, start, 40)[:, -1]
+    end = rollout_stepwise(model, start, 40)[:, -1]
     fallen = start.points - end
     assert end.isfinite().all()
     assert fallen[:, 2, :, 2].mean() > 0.3  # the upper body has come down
@@ -32,7 +32,9 @@ def test_a_run_has_all_rows_and_keeps_those_of_the_other_device(tmp_path, monkey
     monkeypatch.setattr(bench_rollout.bench_mpm, "measure", lambda *a: {"particles": 30, "substep_us": 2.0})
     out = tmp_path / "rollout.json"
     out.write_text(json.dumps({"cuda": {"machine": "a large one"}}))
-    options = BenchOptions(tmp_path / "small.safetensors", keypoints=10, steps=3, scenes=(1, 2), repeat=1, device="cpu")
+    options = RolloutBenchOptions(
+        tmp_path / "small.safetensors", keypoints=10, steps=3, scenes=(1, 2), repeat=1, device="cpu"
+    )
     lines = list(run(out, options))
     facts = json.loads(out.read_text())
     assert facts["cuda"] == {"machine": "a large one"}
@@ -53,4 +55,4 @@ def test_ratios_are_to_the_published_model_in_the_same_run():
 def test_wrong_options():
     for options in ({"steps": 0}, {"scenes": (0,)}, {"repeat": 0}):
         with pytest.raises(InputError, match="at least 1"):
-            BenchOptions(**options)
+            RolloutBenchOptions(**options)

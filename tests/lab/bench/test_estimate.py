@@ -19,10 +19,10 @@ from stages.core.scene.images import VideoWriter
 from stages.core.scene.scene import SceneObject
 from stages.core.scene.scene_ply import write_scene
 from stages.lab.assets.objects import OBJECTS
-from stages.lab.bench import chat as estimate_chat
+from stages.lab.bench import chat_completions
 from stages.lab.bench import estimate_materials as estimate
-from stages.lab.bench.dynamics_rows import ESTIMATED
-from stages.lab.bench.estimate_materials import RANGES, EstimateOptions, Unfit, checked, frames_of, run
+from stages.lab.bench.dynamics_baselines import VLM_MATERIALS
+from stages.lab.bench.estimate_materials import RANGES, EstimateOptions, InvalidReply, parse_reply, run, sample_frames
 
 GOOD = {"duck": {"material": "rubber", "E": 3e5, "density": 300}, "ball": {"material": "foam", "E": 1e5, "density": 50}}
 KEY = "not-a-real-key"
@@ -69,7 +69,7 @@ def server(monkeypatch):
     thread.start()
     for name, value in {"BASE_URL": made.url, "API_KEY": KEY, "MODEL": "seer"}.items():
         monkeypatch.setenv(f"OPENAI_{name}", value)
-    monkeypatch.setattr(estimate_chat, "PAUSE", 0.01)
+    monkeypatch.setattr(chat_completions, "PAUSE", 0.01)
     yield made
     made.shutdown()
     thread.join()
@@ -114,12 +114,12 @@ def test_ten_evenly_spaced_frames_are_shown_with_the_question(server, video, tmp
 
 
 def test_frames_are_made_small_and_few_are_enough(tmp_path, video):
-    small = frames_of(video, 3, 48)
+    small = sample_frames(video, 3, 48)
     assert [cv2.imdecode(np.frombuffer(j, np.uint8), 1).shape for j in small] == [(32, 48, 3)] * 3
     with VideoWriter(tmp_path / "short.mp4", 20.0) as out:
         for _ in range(4):
             out.append(torch.zeros(64, 96, 3))
-    assert len(frames_of(tmp_path / "short.mp4", 10, 512)) == 4
+    assert len(sample_frames(tmp_path / "short.mp4", 10, 512)) == 4
 
 
 @pytest.mark.parametrize(("reply", "says"), [
@@ -136,13 +136,13 @@ def test_frames_are_made_small_and_few_are_enough(tmp_path, video):
     ('{"duck": 1, "duck": 2, "ball": 3}', "twice"),
 ])  # fmt: skip
 def test_an_answer_that_cannot_be_used(reply, says):
-    with pytest.raises(Unfit, match=says):
-        checked(reply, ["duck", "ball"])
+    with pytest.raises(InvalidReply, match=says):
+        parse_reply(reply, ["duck", "ball"])
 
 
 def test_a_fence_is_forgiven_and_without_names_the_model_finds_them():
-    assert list(checked("```json\n" + json.dumps(GOOD) + "\n```", ["ball", "duck"])) == ["ball", "duck"]
-    assert checked(json.dumps(GOOD), [])["duck"]["density"] == 300.0
+    assert list(parse_reply("```json\n" + json.dumps(GOOD) + "\n```", ["ball", "duck"])) == ["ball", "duck"]
+    assert parse_reply(json.dumps(GOOD), [])["duck"]["density"] == 300.0
 
 
 def test_an_unfit_answer_is_sent_back_with_what_is_wrong(server, video, tmp_path):
@@ -201,9 +201,9 @@ def test_what_the_environment_lacks_is_said(server, video, tmp_path, monkeypatch
 
 def test_names_come_from_a_scene(two_balls, tmp_path):
     write_scene(tmp_path / "s.ply", two_balls)
-    assert estimate.names_of(str(tmp_path / "s.ply")) == ["red ball", "green ball"]
+    assert estimate.object_names(str(tmp_path / "s.ply")) == ["red ball", "green ball"]
     with pytest.raises(InputError, match="'duck' is there twice"):
-        estimate.names_of("duck,ball,duck")
+        estimate.object_names("duck,ball,duck")
 
 
 def test_the_command(server, video, tmp_path):
@@ -218,6 +218,6 @@ def test_the_command(server, video, tmp_path):
 
 
 def test_the_published_estimates_are_of_the_ten_objects():
-    assert ESTIMATED.keys() == OBJECTS.keys()
-    for E, density in ESTIMATED.values():
+    assert VLM_MATERIALS.keys() == OBJECTS.keys()
+    for E, density in VLM_MATERIALS.values():
         assert RANGES["E"][0] < E < RANGES["E"][1] and RANGES["density"][0] < density < RANGES["density"][1]

@@ -28,7 +28,7 @@ def small(frames: int = 3) -> dict[str, np.ndarray]:
 def test_it_agrees_with_the_public_solver_through_the_first_contacts():
     if not RECORDING.exists():
         pytest.skip("the recording is not on this machine")
-    data = replay.read(RECORDING)
+    data = replay.read_recording(RECORDING)
     ours = torch.stack(list(replay.simulate(data, ALL_HAVE_TOUCHED, "cpu")))
     c = replay.compare(data, ours)
     assert c.contact == 16
@@ -39,7 +39,7 @@ def test_it_agrees_with_the_public_solver_through_the_first_contacts():
 
 
 def test_nodes_are_where_the_public_solver_has_them():
-    grid = replay.set_up(small(), "cpu").grid
+    grid = replay.make_solver(small(), "cpu").grid
     at = [(torch.tensor(list(grid.origin)) + 0.02 * torch.tensor(list(edge))) / 0.02 for edge in (grid.low, grid.high)]
     torch.testing.assert_close(at[0], torch.full((3,), 2.0), rtol=0, atol=1e-4)  # the third node is the last held one
     torch.testing.assert_close(at[1], torch.full((3,), 197.0), rtol=0, atol=1e-4)
@@ -48,7 +48,7 @@ def test_nodes_are_where_the_public_solver_has_them():
 def test_the_file_it_writes_is_a_recording(tmp_path):
     np.savez(tmp_path / "a.npz", **small())
     lines = list(replay.run(tmp_path / "a.npz", tmp_path / "ours.npz", replay.ReplayOptions(device="cpu")))
-    again = replay.read(tmp_path / "ours.npz")
+    again = replay.read_recording(tmp_path / "ours.npz")
     np.testing.assert_allclose(again["positions"], small()["positions"], rtol=0, atol=2e-6)
     assert "frame   2" in lines[3] and "agree to 1 % of the drop height through frame 2 of 2" in lines[-1]
 
@@ -65,13 +65,13 @@ def spoiled(**changes) -> dict[str, np.ndarray]:
 def test_wrong_recordings(tmp_path, data, message):
     np.savez(tmp_path / "a.npz", **data)
     with pytest.raises(InputError, match=message):
-        replay.read(tmp_path / "a.npz")
+        replay.read_recording(tmp_path / "a.npz")
 
 
 def test_wrong_files_and_options(tmp_path):
     (tmp_path / "a.npz").write_text("no")
     with pytest.raises(InputError, match="not an NPZ"):
-        replay.read(tmp_path / "a.npz")
+        replay.read_recording(tmp_path / "a.npz")
     np.savez(tmp_path / "b.npz", **small())
     with pytest.raises(InputError, match="--frames 9"):
         list(replay.run(tmp_path / "b.npz", tmp_path / "c.npz", replay.ReplayOptions(9, "cpu")))

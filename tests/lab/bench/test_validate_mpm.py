@@ -12,7 +12,7 @@ from stages.lab.bench import validate_mpm as validate
 
 def test_a_pressure_pulse_travels_at_the_speed_of_sound():
     # quadratic splines with 8 cells in its half width: dispersion of less than a percent
-    start, *_, end = validate.pulse()
+    start, *_, end = validate.pressure_pulse()
     assert end[1] - start[1] == pytest.approx(end[2] - start[2], rel=0.01)
 
 
@@ -24,38 +24,41 @@ def test_the_frequency_of_a_bar_converges_with_the_square_of_the_spacing():
 
 def test_a_cantilever_sags_as_timoshenko_says():
     # four cells in its height; the clamp is soft by a part of a cell, and 1 % of the length is 4 % of the sag
-    measured, exact = validate.deflection(0.3)
+    measured, exact = validate.cantilever_deflection(0.3)
     assert measured == pytest.approx(exact, rel=0.05)
 
 
 def test_a_sand_column_spreads_as_measured():
     # measured over many grains by Lube et al.; six cells a radius, and the last layer of grains is thinner than a cell
-    measured, published = validate.column(0.6)
+    measured, published = validate.sand_column_spread(0.6)
     assert measured == pytest.approx(published, rel=0.15)
 
 
 def test_sand_spreads_the_farther_the_less_of_its_flow_transfers_smooth_away():
     # why tall columns fall short of what is published: a coarse grid shows it most, and quickest
-    (coarse, published), (fine, _) = validate.column(1.5, cells=3), validate.column(1.5, cells=4)
-    busy, _ = validate.column(1.5, cells=3, substeps=100)
+    (coarse, published), (fine, _) = (
+        validate.sand_column_spread(1.5, cells=3),
+        validate.sand_column_spread(1.5, cells=4),
+    )
+    busy, _ = validate.sand_column_spread(1.5, cells=3, substeps=100)
     assert busy < 0.85 * coarse and 1.02 * coarse < fine < published
 
 
 def test_the_substep_hardly_matters():
-    a, start = validate.swing(20)
-    b, _ = validate.swing(80)
+    a, start = validate.bar_displacement(20)
+    b, _ = validate.bar_displacement(80)
     motion = float((b - start).square().sum(1).mean().sqrt())
     assert float((a - b).square().sum(1).mean().sqrt()) < 0.01 * motion
 
 
 def test_ten_thousand_steps_of_float32_keep_momentum():
-    steps, linear, angular = validate.drift()[-1]
+    steps, linear, angular = validate.momentum_drift()[-1]
     # rounding of 6e-8 a step: 6e-4 if it always fell to the same side, 6e-6 if at random
     assert steps == 10_000 and linear < 5e-5 and angular < 1e-4
 
 
 def test_squeezed_metal_is_nowhere_stressed_beyond_its_strength():
-    measured, strength = validate.sheared_block(1e3)
+    measured, strength = validate.yield_stress(1e3)
     assert measured == pytest.approx(strength, rel=1e-3)
 
 

@@ -20,11 +20,19 @@ from stages.core.models.checkpoints import MODELS, build, load
 from stages.core.models.external_forces import Pushes
 from stages.core.models.initial_conditions import BOX, GRAVITY
 from stages.lab.dataset.motions import Motions, write_motions
-from stages.lab.training.data import CALM, Pieces, asleep, calm, read_groups, split, spread
-from stages.lab.training.rollout_loss import Roll, loss_of, speed_loss
-from stages.lab.training.state import LIMIT, OPTIMIZERS, WARM, Trainee, _optimizer
+from stages.lab.training.data import (
+    MAX_SPEED_CHANGE,
+    ClipSampler,
+    ends_at_rest,
+    motion_spread,
+    read_groups,
+    smooth_frames,
+    train_validation_split,
+)
+from stages.lab.training.rollout_loss import RolloutLoss, keypoint_loss, velocity_loss
+from stages.lab.training.state import GRADIENT_CLIP, OPTIMIZERS, WARMUP_STEPS, TrainingState, _optimizer
 from stages.lab.training.train import TrainOptions, run, validate
-from stages.lab.training.widen import widened
+from stages.lab.training.widen import widen
 
 DT = 0.02
 FLOOR = BOX[0][2]
@@ -71,7 +79,7 @@ QUICK = TrainOptions(
 
 def test_pieces_start_with_the_speed_of_free_fall():
     motions = falling(frames=6)
-    piece = Pieces(motions, "cpu", build("ngff", hidden=8)).take(torch.tensor([1, 4]), torch.tensor([0, 2]), 3)
+    piece = ClipSampler(motions, "cpu", build("ngff", hidden=8)).take(torch.tensor([1, 4]), torch.tensor([0, 2]), 3)
     assert_close(piece.points, torch.stack([motions.points[1, 0], motions.points[4, 2]]))
     assert_close(piece.truth, torch.stack([motions.points[1, 1:4], motions.points[4, 3:6]]))
     assert_close(piece.speed[0], torch.zeros(2, 8, 3))
@@ -80,7 +88,7 @@ def test_pieces_start_with_the_speed_of_free_fall():
 
 
 def test_pieces_never_reach_past_the_last_frame():
-    pieces, rng = Pieces(falling(frames=5), "cpu", build("gcn", hidden=8)), torch.Generator().manual_seed(0)
+    pieces, rng = ClipSampler(falling(frames=5), "cpu", build("gcn", hidden=8)), torch.Generator().manual_seed(0)
     starts = {float(pieces.draw(1, 3, rng).speed[0, 0, 0, 2]) for _ in range(40)}
     assert len(starts) == 2  # frames 0 and 1 are all that leave 3 more
 
@@ -89,8 +97,8 @@ def test_scenes_at_rest_go_on_as_they_are():
     """One falls to its last frame, the other has stood still for all of the last ones."""
     motions = falling(frames=12)[:2]
     motions.points[1, 5:] = motions.points[1, 5:6]
-    assert asleep(motions).tolist() == [False, True]
-    pieces, rng = Pieces(motions, "cpu", build("gcn", hidden=8)), torch.Generator().manual_seed(0)
+    assert ends_at_rest(motions).tolist() == [False, True]
+    pieces, rng = ClipSampler(motions, "cpu", build("gcn", hidden=8)), torch.Generator().manual_seed(0)
     heights = pieces.draw(300, 9, rng).points[:, 0, 0, 2]
     assert len(heights.unique()) == 3 + 6  # one starts in frames 0 to 2, the other also in those in which it rests
     assert float((heights == motions.points[1, 11, 0, 0, 2]).float().mean()) > 0.2
@@ -104,8 +112,8 @@ def test_pieces_do_not_begin_amid_an_impact():
     motions = falling(frames=12)[:1]
     hit = torch.arange(12)[:, None, None, None] * torch.tensor([0.0, 0.0, 0.02])
     motions.points[:] = motions.points[:, :1] + torch.where(torch.arange(12)[:, None, None, None] < 5, 0.0, hit - 0.09)
-    assert calm(motions)[0].tolist() == [t not in (4, 5) for t in range(12)]
-    pieces, rng = Pieces(motions, "cpu", build("gcn", hidden=8)), torch.Generator().manual_seed(0)
+    assert smooth_frames(motions)[0].tolist() == [t not in (4, 5) for t in range(12)]
+    pieces, rng = ClipSampler(motions, "cpu", build("gcn", hidden=8)), torch.Generator().manual_seed(0)
     speeds = pieces.draw(200, 3, rng).speed[:, 0, 0, 2]
     for speed in speeds.unique():
         assert min(abs(float(speed)), abs(float(speed) - 1.0)) < 1e-5
@@ -115,7 +123,7 @@ def test_pieces_do_not_begin_amid_an_impact():
 def test_the_spread_of_an_object_is_that_of_its_points_over_time():
     motions = falling(frames=9)[:2]
     x = motions.points[1, :, 1]
-    assert_close(spread(motions)[1, 1], (x - x.mean(0)).square().mean((0, 1)).sqrt())
+    assert_close(motion_spread(motions)[1, 1], (x - x.mean(0)).square().mean((0, 1)).sqrt())
 
 
 def test_a_centimetre_in_one_coordinate_is_a_third_of_a_square_centimetre():
@@ -125,10 +133,12 @@ def test_a_centimetre_in_one_coordinate_is_a_third_of_a_square_centimetre():
     predicted[:, :, 0, :, 2] = 0.01
     predicted[:, :, 1] = 7.0  # padding does not count
     spread = torch.tensor([[[0.0, 0.0, 0.04], [0.0, 0.0, 0.0]]])
-    assert_close(loss_of(predicted, truth, valid, "square", spread), torch.tensor(1 / 3))
-    assert_close(loss_of(predicted, truth, valid, "scene", spread), torch.tensor((1 / 3 + 0.01) ** 0.5))
-    assert_close(loss_of(predicted, truth, valid, "axes", spread), torch.tensor((0.1 + 0.1 + 1.01**0.5) / 3))
-    relative = loss_of(predicted, truth, valid, "relative", spread)  # to 1 cm more than the spread, 5 cm being usual
+    assert_close(keypoint_loss(predicted, truth, valid, "square", spread), torch.tensor(1 / 3))
+    assert_close(keypoint_loss(predicted, truth, valid, "scene", spread), torch.tensor((1 / 3 + 0.01) ** 0.5))
+    assert_close(keypoint_loss(predicted, truth, valid, "axes", spread), torch.tensor((0.1 + 0.1 + 1.01**0.5) / 3))
+    relative = keypoint_loss(
+        predicted, truth, valid, "relative", spread
+    )  # to 1 cm more than the spread, 5 cm being usual
     assert_close(relative, torch.tensor((0.1 * 5 + 0.1 * 5 + 1.01**0.5) / 3))
 
 
@@ -138,26 +148,28 @@ def test_steps_that_undo_each_other_are_seen_in_speeds_alone():
     valid, spread = torch.ones(1, 1, 4, dtype=torch.bool), torch.zeros(1, 1, 3)
     ringing = torch.zeros(1, 6, 1, 4, 3)
     ringing[..., 0] = (-1.0) ** torch.arange(6)[None, :, None, None]
-    assert speed_loss(0 * ringing, points, valid, "square", spread, DT, 0.1) == 0
-    assert_close(speed_loss(ringing, points, valid, "square", spread, DT, 0.1), torch.tensor(10.0**2 / 3))
-    points[:, 4:, ..., 2] = 2 * CALM * DT * torch.arange(3)[None, :, None, None] + CALM * DT * 2  # hit after frame 3
+    assert velocity_loss(0 * ringing, points, valid, "square", spread, DT, 0.1) == 0
+    assert_close(velocity_loss(ringing, points, valid, "square", spread, DT, 0.1), torch.tensor(10.0**2 / 3))
+    points[:, 4:, ..., 2] = (
+        2 * MAX_SPEED_CHANGE * DT * torch.arange(3)[None, :, None, None] + MAX_SPEED_CHANGE * DT * 2
+    )  # hit after frame 3
     free = torch.zeros(1, 6, 1, 4, 3)
-    free[:, 3:, ..., 2] = 2 * CALM
-    assert_close(speed_loss(free, points, valid, "square", spread, DT, 0.1), torch.tensor(0.0), rtol=0, atol=1e-5)
+    free[:, 3:, ..., 2] = 2 * MAX_SPEED_CHANGE
+    assert_close(velocity_loss(free, points, valid, "square", spread, DT, 0.1), torch.tensor(0.0), rtol=0, atol=1e-5)
 
 
 def test_what_is_widened_does_the_same_and_learns_with_all_it_gained():
     torch.manual_seed(0)
     narrow = build("ngff", hidden=8).eval()
-    wide = widened(narrow, 16)
-    pieces = Pieces(without_last(falling()), "cpu", narrow)
+    wide = widen(narrow, 16)
+    pieces = ClipSampler(without_last(falling()), "cpu", narrow)
     piece = pieces.take(torch.tensor([0, 3]), torch.tensor([0, 5]), 4)
-    (was, _), (loss, grads) = Roll(narrow, DT)(piece), Roll(wide, DT)(piece)
+    (was, _), (loss, grads) = RolloutLoss(narrow, DT)(piece), RolloutLoss(wide, DT)(piece)
     assert_close(loss, was)
     new = dict(zip((name for name, _ in wide.named_parameters()), grads, strict=True))["planes.say.2.weight"]
     assert new.shape[1] == 16 and (new[:, 8:].abs().sum(0) > 0).all()
     with pytest.raises(InputError, match="can only be widened"):
-        widened(wide, 8)
+        widen(wide, 8)
 
 
 @pytest.mark.parametrize("name", MODELS)
@@ -165,11 +177,11 @@ def test_gradients_are_those_of_the_rollout(name):
     """The prepared scene is cut off and its gradient carried on by hand; the model's own rollout knows no cut."""
     torch.manual_seed(0)
     model = build(name, hidden=8).eval()  # no dropout
-    pieces = Pieces(without_last(falling()), "cpu", model)
+    pieces = ClipSampler(without_last(falling()), "cpu", model)
     piece = pieces.take(torch.tensor([0, 3]), torch.tensor([0, 5]), 3)
-    loss, grads = Roll(model, DT)(piece)
+    loss, grads = RolloutLoss(model, DT)(piece)
     predicted = model.rollout(piece.world, 4, DT, start=(piece.points, piece.speed))[:, 1:]
-    whole = loss_of(predicted, piece.truth, piece.world.valid, "square", piece.spread)
+    whole = keypoint_loss(predicted, piece.truth, piece.world.valid, "square", piece.spread)
     whole.backward()
     assert_close(loss, whole.detach())
     assert sum(float(g.abs().sum()) for g in grads) > 0
@@ -192,12 +204,12 @@ def test_what_cannot_be_compiled_is_done_without(monkeypatch, caplog, broken, wh
 
     torch.manual_seed(0)
     model = build("gcn", hidden=8).eval()
-    piece = Pieces(without_last(falling()), "cpu", model).take(torch.tensor([0]), torch.tensor([0]), 2)
+    piece = ClipSampler(without_last(falling()), "cpu", model).take(torch.tensor([0]), torch.tensor([0]), 2)
     with monkeypatch.context() as patch:
         patch.setattr(torch, "compile", compile)
-        loss, grads = Roll(model, DT, compiled=True)(piece)
+        loss, grads = RolloutLoss(model, DT, compiled=True)(piece)
     assert why in caplog.text
-    plain, true = Roll(model, DT)(piece)
+    plain, true = RolloutLoss(model, DT)(piece)
     assert_close(loss, plain)
     for a, b in zip(grads, true, strict=True):
         assert_close(a, b)
@@ -207,10 +219,10 @@ def test_gradients_fade_on_their_way_back():
     """Of the third frame's error, what comes back through two frames counts 0.9^2 as much."""
     torch.manual_seed(0)
     model = build("gcn", hidden=8).eval()
-    piece = Pieces(without_last(falling()), "cpu", model).take(torch.tensor([0]), torch.tensor([0]), 3)
+    piece = ClipSampler(without_last(falling()), "cpu", model).take(torch.tensor([0]), torch.tensor([0]), 3)
 
     def gradient(memory):
-        return torch.cat([g.flatten() for g in Roll(model, DT, memory=memory)(piece)[1]])
+        return torch.cat([g.flatten() for g in RolloutLoss(model, DT, memory=memory)(piece)[1]])
 
     none, full = gradient(0.0), gradient(1.0)
     far = [(gradient(m) - none).norm() for m in (0.25, 0.5)]
@@ -233,7 +245,7 @@ def test_no_pushes_are_no_pushes():
 
 @pytest.mark.parametrize("optimizer", OPTIMIZERS)
 def test_a_step_without_finite_gradients_changes_nothing(optimizer):
-    trainee = Trainee(build("gcn", hidden=8), 1e-2, 0, optimizer)
+    trainee = TrainingState(build("gcn", hidden=8), 1e-2, 0, optimizer)
     good = [torch.ones_like(p) for p in trainee.params]
     for _ in range(2):
         trainee.update(good, 1e-2)
@@ -251,7 +263,7 @@ def test_a_step_without_finite_gradients_changes_nothing(optimizer):
 def test_soap_without_its_package_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "pytorch_optimizer", None)
     with pytest.raises(InputError, match=r"ngff\[train\]"):
-        Trainee(build("gcn", hidden=8), 1e-2, 0, "soap")
+        TrainingState(build("gcn", hidden=8), 1e-2, 0, "soap")
 
 
 def test_soap_goes_down_a_narrow_valley_that_is_aslant():
@@ -273,19 +285,19 @@ def test_soap_goes_down_a_narrow_valley_that_is_aslant():
 
 
 def test_an_outlier_is_cut_to_twice_the_usual_norm():
-    trainee = Trainee(build("gcn", hidden=8), 1e-3, 0)
+    trainee = TrainingState(build("gcn", hidden=8), 1e-3, 0)
     good = [torch.ones_like(p) for p in trainee.params]
     trainee.update(good, 1e-3)
     usual = float(trainee.usual)
     trainee.update([1e4 * g for g in good], 1e-3)
     assert float(torch.stack([p.grad.square().sum() for p in trainee.params]).sum().sqrt()) == pytest.approx(
-        LIMIT * usual, rel=1e-4
+        GRADIENT_CLIP * usual, rel=1e-4
     )
-    assert float(trainee.usual) == pytest.approx(usual * (0.99 + 0.01 * LIMIT), rel=1e-4)
+    assert float(trainee.usual) == pytest.approx(usual * (0.99 + 0.01 * GRADIENT_CLIP), rel=1e-4)
 
 
 def test_training_gone_astray_goes_on_from_the_best_at_half_the_rate():
-    trainee = Trainee(build("gcn", hidden=8), 1e-2, 0)
+    trainee = TrainingState(build("gcn", hidden=8), 1e-2, 0)
     good = [torch.ones_like(p) for p in trainee.params]
     trainee.update(good, 1e-2)
     trainee.note({"RMSE": 0.1})
@@ -300,30 +312,32 @@ def test_training_gone_astray_goes_on_from_the_best_at_half_the_rate():
     for network in (trainee.model, trainee.ema):
         assert all(torch.equal(v, best[k]) for k, v in network.state_dict().items())
     trainee.update(good, 1e-2)
-    assert trainee.optimizer.param_groups[0]["lr"] == pytest.approx(0.5e-2 / WARM)
+    assert trainee.optimizer.param_groups[0]["lr"] == pytest.approx(0.5e-2 / WARMUP_STEPS)
     moved = max(float((p.detach() - best[n]).abs().max()) for n, p in trainee.model.named_parameters())
-    assert moved == pytest.approx(0.5e-2 / WARM, rel=0.01)  # as a first step: nothing of the old moments is left
+    assert moved == pytest.approx(
+        0.5e-2 / WARMUP_STEPS, rel=0.01
+    )  # as a first step: nothing of the old moments is left
 
 
 @pytest.mark.parametrize(("after", "caution"), [((1.01, 1.02, 1.03, 1.04), 0.5), ((1.01, 1.02, 1.03, 1.02, 1.03), 1.0)])
 def test_training_that_gets_worse_check_by_check_has_gone_astray(after, caution):
-    trainee = Trainee(build("gcn"), 1e-3, 0)
+    trainee = TrainingState(build("gcn"), 1e-3, 0)
     for rmse in (1.2, 1.0, *after):
         trainee.note({"RMSE": rmse})
     assert trainee.caution == caution
 
 
 def test_longer_rollouts_begin_anew():
-    trainee = Trainee(build("gcn", hidden=8), 1e-2, 0)
+    trainee = TrainingState(build("gcn", hidden=8), 1e-2, 0)
     trainee.anew(8)
-    for _ in range(WARM):
+    for _ in range(WARMUP_STEPS):
         trainee.update([torch.ones_like(p) for p in trainee.params], 1e-2)
     assert trainee.optimizer.param_groups[0]["lr"] == 1e-2
     before = [p.detach().clone() for p in trainee.params]
     trainee.anew(20)
     trainee.update([100 * torch.ones_like(p) for p in trainee.params], 1e-2)
     step = max(float((p.detach() - q).abs().max()) for p, q in zip(trainee.params, before, strict=True))
-    assert step == pytest.approx(1e-2 / WARM, rel=0.01)  # however much larger gradients have become
+    assert step == pytest.approx(1e-2 / WARMUP_STEPS, rel=0.01)  # however much larger gradients have become
 
 
 def test_training_teaches_to_fall(tmp_path):
@@ -331,7 +345,7 @@ def test_training_teaches_to_fall(tmp_path):
     write_motions(tmp_path / "3_0.h5", falling(scenes=30, n=6, frames=6), {})
     options = replace(QUICK, steps=80, batch=8, keypoints=6, horizons="1", lr=2e-2, hidden=16, groups="3_0")
     torch.manual_seed(options.seed)
-    unseen = split(read_groups(tmp_path, ["3_0"], 6), 100)[1]
+    unseen = train_validation_split(read_groups(tmp_path, ["3_0"], 6), 100)[1]
     before = validate(build("gcn", hidden=16), unseen)["RMSE"]
     run("gcn", tmp_path, tmp_path / "gcn.safetensors", options)
     card = load(tmp_path / "gcn.safetensors")[1]
@@ -347,7 +361,7 @@ def test_the_card_says_what_made_the_weights(data, tmp_path):
     assert (card["scenes"], card["scenes to choose by"], card["steps"], card["finished"]) == (8, 4, 12, True)
     assert card["options"]["seed"] == 0 and card["config"]["hidden"] == 8
     assert [row["horizon"] for row in card["curve"]] == [2, 2, 3, 3]
-    unseen = split(read_groups(data, ["3_0", "3_1"], 8), 100)[1]
+    unseen = train_validation_split(read_groups(data, ["3_0", "3_1"], 8), 100)[1]
     assert card["validation"]["RMSE"] == min(row["RMSE"] for row in card["curve"])
     assert validate(model, unseen)["RMSE"] == pytest.approx(card["validation"]["RMSE"], rel=1e-6)
 
@@ -357,14 +371,14 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_curve(data, tmp_path, monkey
     options = replace(QUICK, optimizer=optimizer)
     run("pointformer", data, tmp_path / "whole.safetensors", options)  # with dropout
     with monkeypatch.context() as patch:
-        update = Trainee.update
+        update = TrainingState.update
 
         def stopped(self, grads, lr):
             update(self, grads, lr)
             if self.step == after:
                 os.kill(os.getpid(), signal.SIGTERM)
 
-        patch.setattr(Trainee, "update", stopped)
+        patch.setattr(TrainingState, "update", stopped)
         lines = run("pointformer", data, tmp_path / "parts.safetensors", options)
     assert "--resume" in lines[0] and not load(tmp_path / "parts.safetensors")[1]["finished"]
     run("pointformer", data, tmp_path / "parts.safetensors", options, resume=True)
@@ -444,14 +458,14 @@ def test_what_cannot_be_trained_on_is_said(data, tmp_path, change, message):
 
 
 def test_every_fourth_step_sees_few_keypoints(data, tmp_path, monkeypatch):
-    seen, draw = [], Pieces.draw
+    seen, draw = [], ClipSampler.draw
 
     def watched(self, *args):
         piece = draw(self, *args)
         seen.append(piece.points.shape[2])
         return piece
 
-    monkeypatch.setattr(Pieces, "draw", watched)
+    monkeypatch.setattr(ClipSampler, "draw", watched)
     run("ngff", data, tmp_path / "a.safetensors", replace(QUICK, steps=6, few=4, speeds=0.1))
     assert seen == [4, 8, 8, 8, 4, 8]
 
@@ -503,8 +517,8 @@ def test_a_cuda_graph_gives_the_same(name):
         pytest.skip("needs an NVIDIA GPU")
     torch.manual_seed(0)
     model = build(name, hidden=16).cuda().eval()
-    pieces, rng = Pieces(without_last(falling()), "cuda", model), torch.Generator().manual_seed(0)
-    recorded, plain = Roll(model, DT), Roll(model, DT, graph=False)
+    pieces, rng = ClipSampler(without_last(falling()), "cuda", model), torch.Generator().manual_seed(0)
+    recorded, plain = RolloutLoss(model, DT), RolloutLoss(model, DT, graph=False)
     for _ in range(3):
         piece = pieces.draw(4, 3, rng)
         (loss, grads), (loss_, grads_) = recorded(piece), plain(piece)

@@ -14,8 +14,15 @@ from stages.core.geometry.cameras import depths
 from stages.core.models.pi3.network import Pi3
 from stages.core.models.pi3.weights import load
 from stages.core.scene.scene_ply import write_scene
-from stages.lab.training.splatter_data import Posed, read_all, rendered
-from stages.lab.training.train_splatter import SplatterOptions, geometry_of, held_out_psnr, run, start, step_loss
+from stages.lab.training.splatter_data import PosedViews, read_training_scenes, render_views
+from stages.lab.training.train_splatter import (
+    SplatterOptions,
+    held_out_psnr,
+    load_network,
+    run,
+    step_loss,
+    view_geometry,
+)
 from tests.conftest import ring, two_balls_scene
 from tests.core.models.pi3.test_network import TINY, random_weights
 from tests.reconstruct.oracle import truth
@@ -50,7 +57,7 @@ def test_unseen_views_get_better_and_only_the_head_changes(folder, tmp_path):
     assert max(row["psnr"] for row in history) > history[0]["psnr"] + 2
     assert history[-1]["loss"] < 0.8 * history[1]["loss"]
     torch.manual_seed(QUICK.seed)
-    before = start(None, QUICK)[0].state_dict()
+    before = load_network(None, QUICK)[0].state_dict()
     after = load_file(tmp_path / "w.safetensors")
     changed = {name for name in before if not torch.equal(before[name], after[name])}
     assert changed and all(name.startswith("encoder.feature_") for name in changed)
@@ -59,23 +66,23 @@ def test_unseen_views_get_better_and_only_the_head_changes(folder, tmp_path):
 def test_the_file_serves_reconstruct_and_further_training(folder, tmp_path):
     list(run(folder, tmp_path / "w.safetensors", dataclasses.replace(QUICK, steps=4)))
     model = load(tmp_path / "w.safetensors", "pi3-splat")
-    scene = read_all(folder, QUICK.side)[0]
-    again, fresh = start(tmp_path / "w.safetensors", dataclasses.replace(QUICK, width=0))
+    scene = read_training_scenes(folder, QUICK.side)[0]
+    again, fresh = load_network(tmp_path / "w.safetensors", dataclasses.replace(QUICK, width=0))
     assert not fresh and held_out_psnr(again, scene, QUICK, "cpu") == held_out_psnr(model, scene, QUICK, "cpu")
 
 
 def test_weights_of_pi3_alone_get_a_fresh_head(tmp_path):
     base = random_weights(Pi3(TINY))
     save_file(base.state_dict(), tmp_path / "pi3.safetensors")
-    model, fresh = start(tmp_path / "pi3.safetensors", dataclasses.replace(QUICK, width=0))
+    model, fresh = load_network(tmp_path / "pi3.safetensors", dataclasses.replace(QUICK, width=0))
     assert fresh and torch.equal(model.encoder.camera_head.fc_t.weight, base.camera_head.fc_t.weight)
     frozen = {name.split(".")[1] for name, p in model.named_parameters() if not p.requires_grad}
     assert frozen.isdisjoint({"feature_decoder", "feature_head"}) and {"encoder", "decoder", "point_head"} <= frozen
 
 
 def test_true_depth_puts_pixels_on_the_surface():
-    scene = rendered("balls", dataclasses.replace(two_balls_scene(), cameras=ring(8, 64, 0.1)), 56)
-    geometry = geometry_of(None, scene, QUICK)
+    scene = render_views("balls", dataclasses.replace(two_balls_scene(), cameras=ring(8, 64, 0.1)), 56)
+    geometry = view_geometry(None, scene, QUICK)
     world = geometry.points @ geometry.poses[:, None, :3, :3].mT + geometry.poses[:, None, None, :3, 3]
     known = scene.depths > 0
     assert known.float().mean() > 0.5
@@ -87,7 +94,7 @@ def test_true_depth_puts_pixels_on_the_surface():
 
 def test_posed_photos_are_read_with_their_cameras(tmp_path):
     write_set(tmp_path / "data/table", arc(5, (64, 48)))
-    (scene,) = read_all(tmp_path / "data", 56)
+    (scene,) = read_training_scenes(tmp_path / "data", 56)
     assert scene.images.shape == (5, 3, 42, 56) and scene.depths is None and scene.name == "table"
     ratio = torch.tensor([[56 / 64], [42 / 48], [1.0]])
     torch.testing.assert_close(scene.Ks, arc(5, (64, 48)).Ks * ratio)
@@ -112,9 +119,9 @@ def test_depth_of_the_network_takes_the_scale_of_the_given_cameras():
     said = truth(cameras, scale=3.7)  # in a frame and unit of its own
     encoder = SimpleNamespace(tokens=lambda *_: (None, None), geometry=lambda *_: said)
     images = torch.stack([photograph(cameras, i)[0] for i in range(4)]).permute(0, 3, 1, 2)
-    views = Posed("table", images, cameras.viewmats, cameras.Ks, None)
+    views = PosedViews("table", images, cameras.viewmats, cameras.Ks, None)
     options = dataclasses.replace(QUICK, depth="network")
-    geometry = geometry_of(SimpleNamespace(encoder=encoder), views, options)
+    geometry = view_geometry(SimpleNamespace(encoder=encoder), views, options)
     torch.testing.assert_close(geometry.points, said.points / 3.7, rtol=1e-3, atol=1e-3)
     torch.testing.assert_close(geometry.poses, torch.linalg.inv(cameras.viewmats))
 
@@ -124,7 +131,7 @@ def test_posed_photos_train_the_head_at_the_depth_of_the_network():
     images = torch.stack([photograph(cameras, i)[0] for i in range(4)]).permute(0, 3, 1, 2)
     options = dataclasses.replace(QUICK, depth="network")
     torch.manual_seed(0)
-    model, _ = start(None, options)
-    step_loss(model, Posed("table", images, cameras.viewmats, cameras.Ks, None), options).backward()
+    model, _ = load_network(None, options)
+    step_loss(model, PosedViews("table", images, cameras.viewmats, cameras.Ks, None), options).backward()
     assert model.encoder.feature_head.down_proj.weight.grad.isfinite().all()
     assert all(p.grad is None for name, p in model.encoder.named_parameters() if not name.startswith("feature_"))

@@ -25,11 +25,11 @@ from stages.core.kernels.splat.ssim import ssim
 from stages.core.scene.gaussians import Gaussians
 from stages.reconstruct.photos import Views
 
-FULL = 30_000  # steps of the published schedule, to which these belong:
+FULL_STEPS = 30_000  # steps of the published schedule, to which these belong:
 SCHEDULE = {"refine_start_iter": 500, "refine_stop_iter": 15_000, "reset_every": 3000, "refine_every": 100}
 DEGREE_EVERY = 1000
-RATES = {"means": 1.6e-4, "scales": 5e-3, "quats": 1e-3, "opacities": 5e-2, "sh0": 2.5e-3, "shN": 2.5e-3 / 20}
-STRUCTURE = 0.2  # weight of 1 - SSIM against L1
+LEARNING_RATES = {"means": 1.6e-4, "scales": 5e-3, "quats": 1e-3, "opacities": 5e-2, "sh0": 2.5e-3, "shN": 2.5e-3 / 20}
+SSIM_WEIGHT = 0.2  # weight of 1 - SSIM against L1
 
 
 def train(
@@ -49,12 +49,14 @@ def train(
     from gsplat import DefaultStrategy, rasterization
 
     torch.manual_seed(seed)  # the strategy draws from PyTorch's own generator
-    draw, share = draw or rasterization, steps / FULL
+    draw, share = draw or rasterization, steps / FULL_STEPS
     eyes = centres(views.cameras.viewmats)
     size = 1.1 * float((eyes - eyes.mean(0)).norm(dim=1).max())
-    values = start(points, colours, device)
+    values = initial_parameters(points, colours, device)
     optimisers = {
-        name: torch.optim.Adam([value], lr=RATES[name] * (size if name == "means" else 1), eps=1e-15, fused=True)
+        name: torch.optim.Adam(
+            [value], lr=LEARNING_RATES[name] * (size if name == "means" else 1), eps=1e-15, fused=True
+        )
         for name, value in values.items()
     }
     strategy = DefaultStrategy(**{name: max(1, int(count * share)) for name, count in SCHEDULE.items()})
@@ -65,7 +67,7 @@ def train(
     order: list[int] = []
     for step in tqdm(range(steps), desc="gsplat's recipe", unit="step", leave=False):
         if not going(step):
-            return finished(values), step
+            return to_gaussians(values), step
         order = order or torch.randperm(len(views)).tolist()
         i, degree = order.pop(), min(3, int(step / (DEGREE_EVERY * share)))
         photo = photos[i].float() / 255
@@ -75,17 +77,19 @@ def train(
             sh_degree=degree, packed=False,
         )  # fmt: skip
         strategy.step_pre_backward(values, optimisers, state, step, info)
-        loss = (1 - STRUCTURE) * (image[0] - photo).abs().mean() + STRUCTURE * (1 - ssim(image[0], photo))
+        loss = (1 - SSIM_WEIGHT) * (image[0] - photo).abs().mean() + SSIM_WEIGHT * (1 - ssim(image[0], photo))
         loss.backward()
         for optimiser in optimisers.values():
             optimiser.step()
             optimiser.zero_grad(set_to_none=True)
         optimisers["means"].param_groups[0]["lr"] *= 0.01 ** (1 / steps)
         strategy.step_post_backward(values, optimisers, state, step, info)
-    return finished(values), steps
+    return to_gaussians(values), steps
 
 
-def start(points: Float[Tensor, "m 3"], colours: Float[Tensor, "m 3"], device: str) -> dict[str, torch.nn.Parameter]:
+def initial_parameters(
+    points: Float[Tensor, "m 3"], colours: Float[Tensor, "m 3"], device: str
+) -> dict[str, torch.nn.Parameter]:
     """What is optimised: a parameter for each rate."""
     n = len(points)
     values = {
@@ -99,7 +103,7 @@ def start(points: Float[Tensor, "m 3"], colours: Float[Tensor, "m 3"], device: s
     return {name: torch.nn.Parameter(value.to(device)) for name, value in values.items()}
 
 
-def finished(values: dict[str, torch.nn.Parameter]) -> Gaussians:
+def to_gaussians(values: dict[str, torch.nn.Parameter]) -> Gaussians:
     v = {name: value.detach().cpu() for name, value in values.items()}
     return Gaussians(
         v["means"], F.normalize(v["quats"], dim=1), v["scales"].exp(), v["opacities"].sigmoid(),

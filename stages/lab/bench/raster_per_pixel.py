@@ -18,7 +18,7 @@ from stages.core.kernels.splat.simd import even, parts, run
 
 wp.set_module_options({"enable_backward": False})
 TILE = 16  # [px]
-NUMBERS = 10  # of a splat that have a gradient: centre, inverse covariance, opacity, colour, depth
+GRADIENT_CHANNELS = 10  # of a splat that have a gradient: centre, inverse covariance, opacity, colour, depth
 
 
 @wp.func
@@ -102,10 +102,10 @@ class _Blend(torch.autograd.Function):
     @staticmethod
     def backward(ctx, v_image):
         splats, left, ends = ctx.saved_tensors
-        grads = torch.zeros(parts(), len(splats), NUMBERS)  # one table a thread, as ours
+        grads = torch.zeros(parts(), len(splats), GRADIENT_CHANNELS)  # one table a thread, as ours
         v_image = v_image.reshape(-1, 4).contiguous()
         _launch(_backward, splats, ctx.bins, view(v_image, wp.vec4), view(left), view(ends), view(grads))
-        return torch.nn.functional.pad(grads.sum(0), (0, splats.shape[1] - NUMBERS)), None
+        return torch.nn.functional.pad(grads.sum(0), (0, splats.shape[1] - GRADIENT_CHANNELS)), None
 
 
 def _launch(kernel: wp.Kernel, splats: Tensor, bins: Bins, *views) -> None:
@@ -114,7 +114,7 @@ def _launch(kernel: wp.Kernel, splats: Tensor, bins: Bins, *views) -> None:
     run(kernel, even(bins.width * bins.height, parts()), inputs)
 
 
-def tiles_of(splats: Tensor, keys: Tensor, width: int, height: int) -> Bins:
+def bin_into_tiles(splats: Tensor, keys: Tensor, width: int, height: int) -> Bins:
     """Splats (n, 16) and their sort keys in tiles: every tile that the box around a splat touches."""
     last = torch.tensor([(width - 1) // TILE, (height - 1) // TILE])
     centre, reach = splats[:, :2].detach(), splats[:, 11:13].detach()
@@ -122,6 +122,6 @@ def tiles_of(splats: Tensor, keys: Tensor, width: int, height: int) -> Bins:
     return fill_bins(keys, torch.cat([low, high], 1).to(torch.int16), width, height, TILE)
 
 
-def blend_plain(splats: Tensor, bins: Bins) -> Tensor:
+def composite_per_pixel(splats: Tensor, bins: Bins) -> Tensor:
     """Composite (h, w, 4) of the four channels of splats (n, 16). Differentiable in the splats."""
     return _Blend.apply(splats, bins)

@@ -25,19 +25,19 @@ from stages.lab.dataset.motions import Motions, joined
 from stages.lab.dataset.particles import Asset, Fineness, assets
 from stages.lab.dataset.scenes import Config, read_configs
 from stages.lab.dataset.simulation import simulate
-from stages.lab.training.data import home
+from stages.lab.training.data import motions_folder
 
 log = logging.getLogger(__name__)
 Predict = Callable[[Motions], Float[Tensor, "s t o n 3"]]
 # E [Pa] and density [kg/m^3] of the objects of GSCollision as the paper's vision-language model estimated them
-ESTIMATED = {
+VLM_MATERIALS = {
     "ball": (573343.68, 1300.0), "bowl": (859029.80, 1200.0), "can": (19714313.88, 1060.0), "cloth": (2257.12, 100.0),
     "duck": (4828.29, 1100.0), "miku": (2114.27, 150.0), "panda": (2114.27, 150.0), "phone": (2e7, 2700.0),
     "pillow": (2000.0, 50.0), "rope": (573343.68, 1000.0),
 }  # fmt: skip
 
 
-def fall(some: Motions) -> Float[Tensor, "s t o n 3"]:
+def predict_free_fall(some: Motions) -> Float[Tensor, "s t o n 3"]:
     """No learning: objects fall as they stand."""
     return free_fall(some.world(), some.points.shape[1], some.dt)
 
@@ -53,7 +53,7 @@ def free_fall(world: World, frames: int, dt: float) -> Float[Tensor, "b t o n 3"
     return points.masked_fill(~world.valid[:, None, ..., None], 0.0)
 
 
-def rigid(some: Motions) -> Float[Tensor, "s t o n 3"]:
+def predict_rigid_fit(some: Motions) -> Float[Tensor, "s t o n 3"]:
     """The truth with every object replaced, in every frame, by its shape at rest in the pose that fits best.
 
     No model of rigid bodies can come nearer. Source of the fit: Kabsch 1976, A32, 922.
@@ -61,9 +61,7 @@ def rigid(some: Motions) -> Float[Tensor, "s t o n 3"]:
     return rigid_fit(some.points, some.present[..., None].expand(some.points[:, 0, ..., 0].shape))
 
 
-def rigid_fit(
-    points: Float[Tensor, "s t o n 3"], valid: Bool[Tensor, "s o n"]
-) -> Float[Tensor, "s t o n 3"]:
+def rigid_fit(points: Float[Tensor, "s t o n 3"], valid: Bool[Tensor, "s o n"]) -> Float[Tensor, "s t o n 3"]:
     weight = valid / valid.sum(-1, keepdim=True).clamp_min(1)
     centre = torch.einsum("son,stoni->stoi", weight, points)[..., None, :]
     arm = (points - centre)[:, 0]
@@ -72,7 +70,7 @@ def rigid_fit(
     return fitted.masked_fill(~valid[:, None, ..., None], 0.0)
 
 
-def same_scenes(made: Motions, frames: int) -> Predict:
+def predict_from(made: Motions, frames: int) -> Predict:
     """Motions of the same scenes, made otherwise, looked up by name."""
     row = {name: i for i, name in enumerate(made.names)}
 
@@ -85,16 +83,16 @@ def same_scenes(made: Motions, frames: int) -> Predict:
     return predict
 
 
-def common(motions: Motions, made: Motions) -> Motions:
+def shared_scenes(motions: Motions, made: Motions) -> Motions:
     """The scenes that are in both."""
     there = set(made.names)
     return motions[torch.tensor([i for i, name in enumerate(motions.names) if name in there], dtype=torch.int64)]
 
 
-def estimated(things: Mapping[int, Asset]) -> dict[int, Asset]:
+def with_estimated_materials(things: Mapping[int, Asset]) -> dict[int, Asset]:
     """The objects with Young's moduli and densities as the paper's vision-language model saw them."""
     names = {kind.id: name for name, kind in OBJECTS.items()}
-    return {i: replace(a, E=ESTIMATED[names[i]][0], density=ESTIMATED[names[i]][1]) for i, a in things.items()}
+    return {i: replace(a, E=VLM_MATERIALS[names[i]][0], density=VLM_MATERIALS[names[i]][1]) for i, a in things.items()}
 
 
 class Resimulation:
@@ -102,16 +100,16 @@ class Resimulation:
 
     def __init__(self, data: Path, groups: list[str], device: str):
         self.device, self.configs = device, {}
-        folder = home(data).parent if home(data).name == "motions" else Path(data)
-        made = _options(home(data) / f"{groups[0]}.h5")
+        folder = motions_folder(data).parent if motions_folder(data).name == "motions" else Path(data)
+        made = _options(motions_folder(data) / f"{groups[0]}.h5")
         for group in groups:
-            if not (home(data) / f"{group}.h5").is_file():
+            if not (motions_folder(data) / f"{group}.h5").is_file():
                 continue
-            if _options(home(data) / f"{group}.h5") != made:
+            if _options(motions_folder(data) / f"{group}.h5") != made:
                 raise InputError(f"{data}: {group} and {groups[0]} were made at different finenesses; make them alike")
             self.configs.update(read_configs(folder / "scene_configs" / f"{group}.json"))
         self.fineness = Fineness(made["dx"], made["spacing"], made["substep"])
-        self.things = estimated(assets(self.fineness, made["keypoints"], folder / "particles.npz"))
+        self.things = with_estimated_materials(assets(self.fineness, made["keypoints"], folder / "particles.npz"))
 
     def __call__(self, names: tuple[str, ...], frames: int, keypoints: int) -> Motions:
         """Scenes that went wrong are missing."""
@@ -121,7 +119,7 @@ class Resimulation:
         """Wall time of one scene alone [s], the making of the solver included, once it is compiled."""
         one = {name: self._config(name)}
         list(self._parts(one, 3, 1))
-        return bench.seconds(lambda: list(self._parts(one, steps + 1, 1)), self.device, 1)
+        return bench.median_seconds(lambda: list(self._parts(one, steps + 1, 1)), self.device, 1)
 
     def _parts(self, configs: dict[str, Config], frames: int, keypoints: int) -> Iterator[Motions]:
         for part in simulate(configs, self.things, self.fineness, frames, keypoints, self.device):

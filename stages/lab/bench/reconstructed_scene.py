@@ -17,22 +17,22 @@ from stages.core.scene.scene_ply import read_scene
 from stages.reconstruct.options import ReconstructOptions
 from stages.reconstruct.stage import run as reconstruct
 
-WALL = torch.tensor([0.62, 0.66, 0.70])  # colour behind the table
+BACKDROP = torch.tensor([0.62, 0.66, 0.70])  # colour behind the table
 
 
-def rebuilt(scene: Scene, folder: Path, options: ReconstructOptions = ReconstructOptions()) -> Scene:  # noqa: B008
+def reconstruct_from_renders(scene: Scene, folder: Path, options: ReconstructOptions = ReconstructOptions()) -> Scene:  # noqa: B008
     """What `reconstruct` makes of photos from the scene's cameras, which it is not told; both are left in `folder`."""
     photos = folder / "photos"
     photos.mkdir(parents=True)
     for i, name in enumerate(tqdm(scene.cameras.names, desc="photos", unit="photo", leave=False)):
         viewmat, K, (width, height) = scene.cameras.viewmats[i], scene.cameras.Ks[i], scene.cameras.sizes[i].tolist()
-        drawn = rasterise(scene.gaussians, viewmat[None], K[None], width, height, WALL)
+        drawn = rasterise(scene.gaussians, viewmat[None], K[None], width, height, BACKDROP)
         write_jpeg(photos / name, drawn.rgb[0])
     reconstruct(photos, folder / "scene.ply", options)
     return read_scene(folder / "scene.ply")
 
 
-def label_images(scene: Scene, names: Sequence[str]) -> Int[Tensor, "p"]:
+def visible_labels(scene: Scene, names: Sequence[str]) -> Int[Tensor, "p"]:
     """The object whose Gaussian weighs most in each pixel, of the views with these names, one after the other."""
     out = []
     for name in names:

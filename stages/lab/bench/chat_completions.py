@@ -17,11 +17,11 @@ from stages.core.errors import InputError
 log = logging.getLogger(__name__)
 URL = "https://api.openai.com/v1"
 ATTEMPTS, PAUSE = 3, 2.0  # when the other side is busy or silent; before the second attempt, doubling [s]
-BUSY = (408, 409, 429, 500, 502, 503, 504)  # worth asking again
+RETRY_STATUSES = (408, 409, 429, 500, 502, 503, 504)  # worth asking again
 
 
 @dataclass(frozen=True)
-class Endpoint:
+class ChatEndpoint:
     """Where to ask, and whom."""
 
     url: str
@@ -30,7 +30,7 @@ class Endpoint:
     timeout: float = 120.0  # for one answer [s]
 
     @staticmethod
-    def from_environment(model: str = "", timeout: float = 120.0) -> Endpoint:
+    def from_environment(model: str = "", timeout: float = 120.0) -> ChatEndpoint:
         """OPENAI_BASE_URL, OPENAI_API_KEY and, unless given, OPENAI_MODEL."""
         url = os.environ.get("OPENAI_BASE_URL", "").strip().rstrip("/") or URL
         model = model or os.environ.get("OPENAI_MODEL", "").strip()
@@ -40,7 +40,7 @@ class Endpoint:
             raise InputError(f"which model of {url}? name one that sees images with --model or OPENAI_MODEL")
         if timeout <= 0:
             raise InputError(f"--timeout {timeout:g}: give seconds above 0")
-        return Endpoint(url, model, os.environ.get("OPENAI_API_KEY", "").strip(), timeout)
+        return ChatEndpoint(url, model, os.environ.get("OPENAI_API_KEY", "").strip(), timeout)
 
     def ask(self, messages: list[dict]) -> str:
         """The text of the answer. Raises InputError when there is none."""
@@ -54,7 +54,7 @@ class Endpoint:
                 return self._text(self._post({"model": self.model, "messages": messages}))
             except urllib.error.HTTPError as error:
                 problem = f"{error.code} {error.reason}{_why(error)}"
-                if error.code not in BUSY:
+                if error.code not in RETRY_STATUSES:
                     raise InputError(f"{self.url}: {problem}; {self._advice(error.code)}") from error
             except (OSError, HTTPException) as error:  # URLError and TimeoutError are OSErrors
                 problem = self._silence(error)
@@ -100,6 +100,6 @@ def _why(error: urllib.error.HTTPError) -> str:
     return f" ({' '.join(str(said).split())[:200]})"
 
 
-def picture(jpeg: bytes) -> dict:
+def image_part(jpeg: bytes) -> dict:
     """A picture as a part of a message."""
     return {"type": "image_url", "image_url": {"url": "data:image/jpeg;base64," + base64.b64encode(jpeg).decode()}}

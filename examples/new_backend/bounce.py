@@ -9,7 +9,7 @@ from stages.core.physics.keypoints import bind, choose_keypoints
 from stages.core.scene.files import provenance
 from stages.core.scene.scene import Scene
 from stages.core.scene.scene_ply import read_scene
-from stages.core.scene.trajectory import Motion, TrajectoryWriter
+from stages.core.scene.trajectory import SimulationInfo, TrajectoryWriter
 
 DT, FRAMES, RESTITUTION = 0.02, 100, 0.6
 
@@ -34,7 +34,7 @@ def simulate(scene: Scene, out: Path) -> None:
     of = [keypoints.object_id == o.id for o in scene.objects]
     paths = [heights(float(keypoints.rest[mask, 2].min()) - scene.floor, gravity) for mask in of]
     upright = torch.tensor([[1.0, 0, 0, 0]]).repeat(len(of), 1)
-    motion = Motion(DT, (0.0, 0.0, -gravity), "bounce")
+    motion = SimulationInfo(DT, (0.0, 0.0, -gravity), "bounce")
     with TrajectoryWriter(out, scene, motion, keypoints, bind(scene, keypoints)) as traj:
         for t in range(FRAMES):
             positions = keypoints.rest.clone()

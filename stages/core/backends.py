@@ -10,8 +10,13 @@ def choose(table: Mapping[str, str], name: str) -> Callable:
     """The function that `name` stands for in a table of "module:function" entries."""
     if name not in table:
         raise InputError(f"no backend called {name!r}; choose from {', '.join(table)}")
-    module, function = table[name].split(":")
-    return getattr(import_module(module), function)
+    return load(table[name])
+
+
+def load(entry: str) -> Callable:
+    """The function or class that a "module:name" string refers to, imported now."""
+    module, name = entry.split(":")
+    return getattr(import_module(module), name)
 
 
 def pick_device(name: str) -> str:

@@ -34,7 +34,7 @@ class ReferenceFrame:
         return self.points[object.id].mean(0)
 
     def moved(self, similarity: Similarity) -> ReferenceFrame:
-        cameras = None if self.cameras is None else self.cameras.moved(similarity)
+        cameras = None if self.cameras is None else self.cameras.transformed(similarity)
         return replace(self, cameras=cameras, points={i: similarity(p) for i, p in self.points.items()})
 
 

@@ -13,7 +13,8 @@ from torch import Tensor
 from tqdm import tqdm
 
 from stages.core.errors import InputError
-from stages.core.scene.images import VIDEOS, list_photos, read_image, read_video, video_info
+from stages.core.scene.formats import VIDEO_SUFFIXES
+from stages.core.scene.images import list_photos, read_image, read_video, video_info
 from stages.evaluate.options import EvaluateOptions
 from stages.evaluate.result import Curve, ImagePair, Result
 
@@ -80,19 +81,19 @@ def compare(prediction: Path, truth: Path, options: EvaluateOptions) -> Result:
 def _frames(path: Path) -> Iterator[Image]:
     if path.is_dir():
         return (read_image(photo) for photo in list_photos(path))
-    return read_video(path) if path.suffix.lower() in VIDEOS else iter([read_image(path)])
+    return read_video(path) if path.suffix.lower() in VIDEO_SUFFIXES else iter([read_image(path)])
 
 
 def _count(path: Path) -> int:
     """Number of frames, for the progress bar and for choosing what to show."""
     if path.is_dir():
         return len(list_photos(path))
-    return max(video_info(path)[0], 1) if path.suffix.lower() in VIDEOS else 1
+    return max(video_info(path)[0], 1) if path.suffix.lower() in VIDEO_SUFFIXES else 1
 
 
 def _check_rates(prediction: Path, truth: Path) -> list[str]:
     """Videos must play equally fast; folders have no rate, but equal names are worth having."""
-    if all(p.is_file() and p.suffix.lower() in VIDEOS for p in (prediction, truth)):
+    if all(p.is_file() and p.suffix.lower() in VIDEO_SUFFIXES for p in (prediction, truth)):
         mine, true = video_info(prediction)[1], video_info(truth)[1]
         if abs(mine - true) > 1e-3 * true:
             raise InputError(

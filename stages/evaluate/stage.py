@@ -9,7 +9,7 @@ from pathlib import Path
 from stages.core.backends import choose
 from stages.core.errors import InputError
 from stages.core.scene.files import must_exist, provenance, replacing
-from stages.core.scene.images import PHOTOS, VIDEOS
+from stages.core.scene.formats import IMAGE_SUFFIXES, VIDEO_SUFFIXES
 from stages.evaluate.options import EvaluateOptions
 from stages.evaluate.report import write_report
 from stages.evaluate.result import format_table, to_json
@@ -51,7 +51,7 @@ def _kind(path: Path) -> str:
         kind = "trajectory"
     elif suffix == ".ply":
         kind = "scene"
-    elif suffix in VIDEOS | PHOTOS:
+    elif suffix in VIDEO_SUFFIXES | IMAGE_SUFFIXES:
         kind = "pictures"
     else:
         raise InputError(f"{path}: {suffix or 'no ending'} is not a kind of file that can be compared; "

@@ -83,7 +83,7 @@ def _track(trajectory: Trajectory) -> Track:
     points = {o.id: keypoints.rest[keypoints.object_id == o.id] for o in trajectory.scene.objects}
     objects = tuple(o for o in trajectory.scene.objects if len(points[o.id]))
     world = ReferenceFrame(str(trajectory.path), trajectory.scene.cameras, objects, points)
-    return Track(world, trajectory.motion.dt, keypoints.object_id, keypoints.rest, trajectory.positions)
+    return Track(world, trajectory.info.dt, keypoints.object_id, keypoints.rest, trajectory.positions)
 
 
 def _result(both: MatchedMotion, fps: float, still: float, notes: list[str]) -> Result:

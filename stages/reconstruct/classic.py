@@ -10,7 +10,7 @@ from torch import Tensor
 from stages.core.backends import pick_device
 from stages.core.errors import InputError
 from stages.core.geometry.cameras import depths, resize
-from stages.core.scene.cameras import Cameras, Lenses, read_cameras
+from stages.core.scene.cameras import Cameras, LensDistortion, read_cameras
 from stages.reconstruct import depth, sfm, upright
 from stages.reconstruct.finish import Found, finish
 from stages.reconstruct.options import ReconstructOptions
@@ -53,7 +53,7 @@ def _cameras(
         log.info("no camera is given for, and left out: %s", ", ".join(sorted(set(photos.names) - set(row))))
     photos = photos[both]
     rows = [row[name] for name in photos.names]
-    cameras, lenses = _in_pixels_of(photos, cameras[rows]), Lenses(lenses.coefficients[rows])
+    cameras, lenses = _in_pixels_of(photos, cameras[rows]), LensDistortion(lenses.coefficients[rows])
     return sfm.triangulate(photos, cameras, lenses, options.seed, steps, options.matcher), photos
 
 
@@ -87,6 +87,6 @@ def _restrict(model: sfm.SparseModel, index: list[int]) -> sfm.SparseModel:
     new[index] = torch.arange(len(index))
     keep = new[model.seen_view] >= 0
     return sfm.SparseModel(
-        model.cameras[index], Lenses(model.lenses.coefficients[index]), model.points,
+        model.cameras[index], LensDistortion(model.lenses.coefficients[index]), model.points,
         model.seen_point[keep], new[model.seen_view[keep]],
     )  # fmt: skip

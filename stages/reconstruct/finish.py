@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from stages.core.errors import InputError
-from stages.core.scene.gaussians import Gaussians, concatenate, moved
+from stages.core.scene.gaussians import Gaussians, concatenate, transformed
 from stages.core.scene.scene import Scene
 from stages.reconstruct import initialise, photometric, upright
 from stages.reconstruct.advice import advise
@@ -72,8 +72,8 @@ def finish(found: Found, options: ReconstructOptions, steps: Steps, device: str)
         gaussians = concatenate([first, *filled_in(used, found.maps, cloud, ground, least, options, device)])
         log.info("%d Gaussians on surfaces, %d where none is known", len(first), len(gaussians) - len(first))
     focus, reach = move(ground.focus), move.scale * ground.radius
-    views = dataclasses.replace(found.views, cameras=found.views.cameras.moved(move))
-    gaussians = moved(gaussians, move)
+    views = dataclasses.replace(found.views, cameras=found.views.cameras.transformed(move))
+    gaussians = transformed(gaussians, move)
     gaussians = gaussians[(gaussians.means - focus).norm(dim=1) < FARTHEST * reach]
     count = options.steps(len(used), device)
     with steps.timed("fit"):

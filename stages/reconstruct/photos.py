@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from stages.core.scene.cameras import Cameras, Lenses
+from stages.core.scene.cameras import Cameras, LensDistortion
 from stages.core.scene.scene import Scene
 
 
@@ -64,7 +64,7 @@ class Reconstruction:
     advice: list[str]  # what would improve the result, a sentence each
 
 
-def undistort(photos: Photos, cameras: Cameras, lenses: Lenses, side: int) -> Views:
+def undistort(photos: Photos, cameras: Cameras, lenses: LensDistortion, side: int) -> Views:
     """Pinhole views of the photos that `cameras` names, at most `side` wide or high.
 
     The new K keeps only pixels the photo really has, so no black borders enter the Gaussians.

@@ -18,7 +18,8 @@ from tqdm import tqdm
 
 from stages.core.errors import InputError
 from stages.core.scene.files import must_exist
-from stages.core.scene.images import PHOTOS, VIDEOS, list_photos, open_video, read_image, to_bytes
+from stages.core.scene.formats import IMAGE_SUFFIXES, VIDEO_SUFFIXES
+from stages.core.scene.images import list_photos, open_video, read_image, to_bytes
 from stages.reconstruct.photos import Photos
 
 log = logging.getLogger(__name__)
@@ -47,10 +48,10 @@ def read_photos(path: Path, side: int = 0, least: int = 2) -> Photos:
     span of neighbours is used; a photo that cannot be read is left out, and said so. Fewer than `least` are refused.
     """
     path = Path(path)
-    if path.is_file() and path.suffix.lower() in VIDEOS:
+    if path.is_file() and path.suffix.lower() in VIDEO_SUFFIXES:
         taken = _from_video(path, max(side, SIDES[0]))
     elif path.is_file():
-        raise InputError(f"{path}: is neither a folder of photos nor a video ({' '.join(sorted(VIDEOS))})")
+        raise InputError(f"{path}: is neither a folder of photos nor a video ({' '.join(sorted(VIDEO_SUFFIXES))})")
     else:
         taken = _from_folder(path, side, least)
     names, images, focals = zip(*taken, strict=True)
@@ -83,9 +84,9 @@ def _files(folder: Path) -> list[Path]:
     advice = "convert them to JPEG first, as photo apps do on export"
     if PHONE & foreign.keys():
         advice += ' (heif-convert, or sips on a Mac; a phone set to "most compatible" takes JPEG)'
-    if foreign and not PHOTOS & kinds.keys():
+    if foreign and not IMAGE_SUFFIXES & kinds.keys():
         raise InputError(f"{folder}: holds {_counted(foreign)} photos, which cannot be read; {advice}")
-    if not PHOTOS & kinds.keys() and (instead := next(filter(_is_source, inside), None)):
+    if not IMAGE_SUFFIXES & kinds.keys() and (instead := next(filter(_is_source, inside), None)):
         raise InputError(f"{folder}: holds no photos itself; give {instead}")
     files = list_photos(folder)
     if foreign:
@@ -99,8 +100,8 @@ def _files(folder: Path) -> list[Path]:
 def _is_source(path: Path) -> bool:
     """Whether this is a video, or a folder with photos in it."""
     if path.is_dir():
-        return any(p.suffix.lower() in PHOTOS and p.is_file() for p in path.iterdir())
-    return path.suffix.lower() in VIDEOS
+        return any(p.suffix.lower() in IMAGE_SUFFIXES and p.is_file() for p in path.iterdir())
+    return path.suffix.lower() in VIDEO_SUFFIXES
 
 
 def _counted(kinds: dict[str, int]) -> str:

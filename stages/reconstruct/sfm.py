@@ -19,7 +19,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from stages.core.errors import InputError
-from stages.core.scene.cameras import Cameras, Lenses
+from stages.core.scene.cameras import Cameras, LensDistortion
 from stages.reconstruct import matching
 from stages.reconstruct.matching import Pair
 from stages.reconstruct.photos import Photos
@@ -36,7 +36,7 @@ class SparseModel:
     """Registered cameras and the points they share."""
 
     cameras: Cameras
-    lenses: Lenses
+    lenses: LensDistortion
     points: Float[Tensor, "m 3"]
     seen_point: Int[Tensor, "k"]  # observation: this point ...
     seen_view: Int[Tensor, "k"]  # ... is seen by this camera
@@ -50,7 +50,7 @@ def solve(
     steps = steps or Steps()
     _quiet(seed)
     database = matching.compare(photos, matching.guessed_cameras(photos), steps, seed, device, matcher)
-    return steps.kept("model", lambda: _mapped(photos, database, seed), (SparseModel, Cameras, Lenses))
+    return steps.kept("model", lambda: _mapped(photos, database, seed), (SparseModel, Cameras, LensDistortion))
 
 
 def _mapped(photos: Photos, database: Path, seed: int) -> SparseModel:
@@ -134,7 +134,8 @@ def _why_dropped(photos: Photos, pairs: list[Pair], best, models: dict) -> dict[
 
 
 def triangulate(
-    photos: Photos, cameras: Cameras, lenses: Lenses, seed: int = 0, steps: Steps | None = None, matcher: str = "sift"
+    photos: Photos, cameras: Cameras, lenses: LensDistortion, seed: int = 0, steps: Steps | None = None,
+    matcher: str = "sift",
 ) -> SparseModel:
     """Sparse points for cameras that are known; `photos` and `cameras` in the same order, K in their pixels."""
     import pycolmap
@@ -219,6 +220,6 @@ def _from_colmap(model, dropped: dict[str, str] | None = None) -> SparseModel:
         torch.tensor(sizes), tuple(image.name for image in images),
     )  # fmt: skip
     return SparseModel(
-        cameras, Lenses(torch.tensor(lenses, dtype=torch.float32)), torch.from_numpy(np.array(points)).float(),
+        cameras, LensDistortion(torch.tensor(lenses, dtype=torch.float32)), torch.from_numpy(np.array(points)).float(),
         torch.tensor(seen_point), torch.tensor(seen_view), dropped or {},
     )  # fmt: skip

@@ -18,7 +18,7 @@ from stages.core.backends import pick_device
 from stages.core.errors import InputError
 from stages.core.geometry.neighbours import knn
 from stages.core.perception.support import Support
-from stages.core.scene.gaussians import Gaussians, moved
+from stages.core.scene.gaussians import Gaussians, transformed
 from stages.core.scene.scene import Scene
 from stages.core.scene.scene_ply import read_scene
 from stages.refine.options import RefineOptions
@@ -56,7 +56,7 @@ def solid(scene: Scene, number: int) -> Gaussians:
 
 def put(whole: Gaussians, how: Registration, own: Gaussians, sight: Sight, least: float) -> tuple[Gaussians, str]:
     """What a registered whole adds to its part, and why: nothing when it fits less than `least` or is seen through."""
-    placed = moved(whole, how.similarity.to(whole.means.device))
+    placed = transformed(whole, how.similarity.to(whole.means.device))
     through = _seen_through(placed, sight)
     fits = how.fit >= least and through <= THROUGH
     verdict = "put in its place" if fits else f"left alone: {least} and at most {THROUGH:.0%} are needed"

@@ -13,8 +13,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from stages.core.geometry.neighbours import Products, Tree, searchable
-from stages.core.geometry.rotations import matrix, nearest
+from stages.core.geometry.neighbours import BruteForce, KDTree, neighbour_index
+from stages.core.geometry.rotations import matrix, nearest_rotation
 from stages.core.geometry.similarity import Similarity
 from stages.core.scene.gaussians import Gaussians
 from stages.refine.register_cloud import COLOUR, REACH, Cloud
@@ -92,7 +92,7 @@ def _order(part: Cloud, seed: int) -> Int[Tensor, "n"]:
     return order.to(part.points.device)
 
 
-def _best(poses: Poses, part: Cloud, tree: Tree | Products, some: Int[Tensor, "k"], most: int) -> Poses:
+def _best(poses: Poses, part: Cloud, tree: KDTree | BruteForce, some: Int[Tensor, "k"], most: int) -> Poses:
     """The `most` that fit best, in order, judged by `some` points."""
     worth = misfit(poses, part.points[some], part.colours[some], tree)
     return poses[worth.topk(min(most, len(poses)), largest=False).indices]
@@ -105,14 +105,15 @@ def _difference(pose: Poses, part: Cloud, whole: Cloud) -> tuple[float, Float[Te
     may be seen in another light, though not in any.
     """
     moved = pose(part.raw[:3000])[0]
-    index = searchable(whole.points).query(moved)[1][:, 0]
+    index = neighbour_index(whole.points).query(moved)[1][:, 0]
     off = ((moved - whole.points[index]) * whole.normals[index]).sum(1)
     tint = (part.raw_colours[:3000] - whole.colours[index]).median(0).values
     return 1.4826 * float(off.abs().median()) / float(pose.scale[0]), tint.clamp(-RELIT, RELIT)
 
 
 def polish(
-    poses: Poses, part: Cloud, some: Int[Tensor, "k"], whole: Cloud, tree: Tree | Products, rounds: int, floor: float
+    poses: Poses, part: Cloud, some: Int[Tensor, "k"], whole: Cloud, tree: KDTree | BruteForce, rounds: int,
+    floor: float,
 ) -> Poses:
     """Gauss-Newton on the robust one-sided coloured Chamfer distance, all poses at once.
 
@@ -131,7 +132,7 @@ def polish(
         poses = _moved(poses, y.mean(1), step)
         if float(step.abs().max()) < 2e-5:
             break
-    return Poses(poses.scale.float(), nearest(poses.rotation).float(), poses.translation.float())
+    return Poses(poses.scale.float(), nearest_rotation(poses.rotation).float(), poses.translation.float())
 
 
 def _step(

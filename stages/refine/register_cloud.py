@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from stages.core.geometry.harmonics import C0
-from stages.core.geometry.neighbours import Products, Tree, searchable
+from stages.core.geometry.neighbours import BruteForce, KDTree, neighbour_index
 from stages.core.scene.gaussians import Gaussians
 
 MOST = 30_000  # points that are smoothed from
@@ -52,9 +52,9 @@ class Cloud:
         points, normals, colours = smoothed(self.raw + error.to(self.raw), self.raw_colours + tint, reach)
         return replace(self, points=points, normals=normals, colours=colours)
 
-    def tree(self) -> Tree | Products:
+    def tree(self) -> KDTree | BruteForce:
         """For nearest points in place and colour together."""
-        return searchable(torch.cat([self.points, self.colours], 1))
+        return neighbour_index(torch.cat([self.points, self.colours], 1))
 
 
 def lab(rgb: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
@@ -78,7 +78,7 @@ def smoothed(
 ) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 3"], Float[Tensor, "m 3"]]:
     """Evenly spread points moved onto the plane of their neighbours, its normals, and mean colours."""
     picked = thinned(points, POINTS)
-    distance, index = searchable(points).query(points[picked], NEIGHBOURS, reach)
+    distance, index = neighbour_index(points).query(points[picked], NEIGHBOURS, reach)
     near = distance.isfinite()[..., None].float()
     count = near.sum(1)
     middle = (points[index] * near).sum(1) / count

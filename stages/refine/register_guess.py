@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from stages.core.geometry.neighbours import Products, Tree
-from stages.core.geometry.rotations import matrix, nearest
+from stages.core.geometry.neighbours import BruteForce, KDTree
+from stages.core.geometry.rotations import matrix, nearest_rotation
 from stages.refine.register_cloud import COLOUR, Cloud
 
 RADII = (0.07, 0.14, 0.28)  # of the neighbourhoods described [diameters of the whole object]
@@ -44,7 +44,7 @@ class Poses:
         mean_a, mean_b = a.mean(1, keepdim=True), b.mean(1, keepdim=True)
         A, B = a - mean_a, b - mean_b
         H = B.mT @ A
-        R = nearest(H)
+        R = nearest_rotation(H)
         scale = (R * H).sum((1, 2)) / A.square().sum((1, 2)).clamp_min(1e-12)
         return Poses(scale, R, (mean_b - scale[:, None, None] * (mean_a @ R.mT))[:, 0])
 
@@ -77,7 +77,7 @@ class Poses:
 
 
 def misfit(
-    poses: Poses, points: Float[Tensor, "n 3"], colours: Float[Tensor, "n 3"], tree: Tree | Products
+    poses: Poses, points: Float[Tensor, "n 3"], colours: Float[Tensor, "n 3"], tree: KDTree | BruteForce
 ) -> Float[Tensor, "h"]:
     """Mean squared distance, in place and colour, of the part's points from the whole, in units of WORST^2: 0 to 1.
 

@@ -16,7 +16,7 @@ from stages.core.perception.growing import complete as take_halo
 from stages.core.perception.support import Support, find_support, view_of
 from stages.core.perception.wall import find_wall, laid_down
 from stages.core.scene.files import provenance
-from stages.core.scene.gaussians import Gaussians, concatenate, moved
+from stages.core.scene.gaussians import Gaussians, concatenate, transformed
 from stages.core.scene.scene import Scene
 from stages.core.scene.scene_ply import read_scene, write_scene
 from stages.refine.background import fill
@@ -52,7 +52,8 @@ def refine(scene: Scene, options: RefineOptions = RefineOptions()) -> Scene:  # 
         return _refined(scene, find_support(scene, seed=options.seed), options)
     laid = laid_down(scene, wall)
     done = _refined(laid, find_support(laid, seed=options.seed), options)
-    return replace(done, gaussians=moved(done.gaussians, wall.inverse()), cameras=scene.cameras, floor=scene.floor)
+    gaussians = transformed(done.gaussians, wall.inverse())
+    return replace(done, gaussians=gaussians, cameras=scene.cameras, floor=scene.floor)
 
 
 def _refined(scene: Scene, support: Support | None, options: RefineOptions) -> Scene:

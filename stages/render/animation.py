@@ -37,7 +37,7 @@ class Animation:
 
     @property
     def fps(self) -> float:
-        return 1 / self.trajectory.motion.dt if self.moves else FPS
+        return 1 / self.trajectory.info.dt if self.moves else FPS
 
     @property
     def duration(self) -> float:

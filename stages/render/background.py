@@ -11,8 +11,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from stages.core.errors import InputError
+from stages.core.scene.formats import IMAGE_SUFFIXES
 from stages.core.scene.gaussians import Gaussians, concatenate
-from stages.core.scene.images import PHOTOS, read_image, resize
+from stages.core.scene.images import read_image, resize
 from stages.core.scene.scene import Scene
 from stages.core.scene.scene_ply import read_scene
 from stages.render.options import hex_colour
@@ -60,6 +61,6 @@ def open_background(choice: str | None, scene: Scene) -> RenderBackground:
         else:
             log.info("%s: all of its Gaussians belong to objects; all of them form the background", choice)
         return RenderBackground(keep_scene=False, gaussians=g)
-    if suffix in PHOTOS:
+    if suffix in IMAGE_SUFFIXES:
         return RenderBackground(keep_scene=False, photo=read_image(Path(choice)))
     raise InputError(f"--background {choice}: give a scene.ply, a colour such as #336699, or a photo")

@@ -27,8 +27,8 @@ def force_arrows(footage: Animation, time: float) -> list[tuple[Tensor, Tensor]]
     """Tail and tip in the world of every push that acts at a time, longest for the strongest push of all."""
     if footage.trajectory is None:
         return []
-    time = footage.index(time) * footage.trajectory.motion.dt
-    pushes = [f for f in footage.trajectory.motion.forces if f.get("kind", "force") == "force" and any(f["force"])]
+    time = footage.index(time) * footage.trajectory.info.dt
+    pushes = [f for f in footage.trajectory.info.forces if f.get("kind", "force") == "force" and any(f["force"])]
     strongest = max((math.hypot(*f["force"]) for f in pushes), default=1.0)
     acting = [f for f in pushes if f["start"] <= time < (math.inf if f["end"] is None else f["end"])]
     return [_arrow(footage, time, f, strongest) for f in acting]

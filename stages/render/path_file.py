@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from stages.core.errors import InputError
 from stages.core.geometry.cameras import centres
-from stages.core.geometry.rotations import nearest
+from stages.core.geometry.rotations import nearest_rotation
 from stages.core.scene.cameras import Cameras
 from stages.core.scene.files import must_exist
 
@@ -57,7 +57,7 @@ def _entry(row: dict) -> tuple[np.ndarray, np.ndarray, list[int]]:
     R = viewmat[:3, :3]
     if np.abs(R @ R.T - np.eye(3)).max() > 1e-2 or np.linalg.det(R) < 0:
         raise ValueError("a rotation is not orthonormal")
-    viewmat[:3, :3] = nearest(torch.from_numpy(R)).numpy()
+    viewmat[:3, :3] = nearest_rotation(torch.from_numpy(R)).numpy()
     return viewmat, K, [int(width), int(height)]
 
 

@@ -13,7 +13,8 @@ from torch import Tensor
 from stages.core.errors import InputError
 from stages.core.geometry.cameras import resize as resize_K
 from stages.core.raster.rasterise import rasterise
-from stages.core.scene.images import PHOTOS, read_image
+from stages.core.scene.formats import IMAGE_SUFFIXES
+from stages.core.scene.images import read_image
 from stages.core.scene.scene import Scene
 
 log = logging.getLogger(__name__)
@@ -70,7 +71,7 @@ def match(folder: Path, names: tuple[str, ...], what: str, option: str) -> dict[
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError(f"{folder}: is no folder; {option} takes a folder of {what}s named as the photos")
-    images = {p.stem: p for p in sorted(folder.iterdir()) if p.suffix.lower() in PHOTOS}
+    images = {p.stem: p for p in sorted(folder.iterdir()) if p.suffix.lower() in IMAGE_SUFFIXES}
     found = {i: images[Path(name).stem] for i, name in enumerate(names) if Path(name).stem in images}
     if not found:
         raise InputError(

@@ -16,7 +16,7 @@ from stages.core.physics.keypoints import bind, choose_keypoints
 from stages.core.scene.files import provenance
 from stages.core.scene.scene import Scene
 from stages.core.scene.scene_ply import read_scene
-from stages.core.scene.trajectory import Motion, TrajectoryWriter
+from stages.core.scene.trajectory import SimulationInfo, TrajectoryWriter
 from stages.simulate.options import BACKENDS, SimulateOptions
 
 log = logging.getLogger(__name__)
@@ -33,7 +33,7 @@ def run(scene: Path, out: Path, options: SimulateOptions = SimulateOptions()) ->
     world = replace(world, provenance={**provenance("simulate", inputs, options), "scene": world.provenance})
     keypoints = choose_keypoints(world, options.keypoints, options.seed)
     gravity = (0.0, 0.0, -options.gravity / world.metres_per_unit)
-    motion = Motion(options.dt, gravity, options.engine, prompts.as_dicts())
+    motion = SimulationInfo(options.dt, gravity, options.engine, prompts.as_dicts())
     states = rollout(world, keypoints, prompts, options)
     start, furthest = None, 0.0
     with TrajectoryWriter(out, world, motion, keypoints, bind(world, keypoints)) as trajectory:

@@ -6,7 +6,7 @@ import torch
 
 from stages.core.geometry.rotations import matrix
 from stages.core.physics.keypoints import bind
-from stages.core.scene.trajectory import Keypoints, Motion, TrajectoryWriter
+from stages.core.scene.trajectory import Keypoints, SimulationInfo, TrajectoryWriter
 
 
 def turn(angle: float) -> torch.Tensor:
@@ -34,7 +34,8 @@ def write(path, scene, seed: int = 0, count: int = 100, frames: int = 12, dt: fl
             ((g.object_id == o.id).nonzero()[:, 0] for o in scene.objects)]  # fmt: skip
     rows = torch.cat(rows)
     keypoints = Keypoints(g.means[rows], g.object_id[rows])
-    with TrajectoryWriter(path, scene, Motion(dt, (0.0, 0.0, -9.81), "test"), keypoints, bind(scene, keypoints)) as out:
+    info = SimulationInfo(dt, (0.0, 0.0, -9.81), "test")
+    with TrajectoryWriter(path, scene, info, keypoints, bind(scene, keypoints)) as out:
         for t in range(frames):
             positions = moved(keypoints.rest, keypoints.object_id, t, **motion)
             com = torch.stack([positions[keypoints.object_id == o.id].mean(0) for o in scene.objects])
@@ -51,4 +52,4 @@ def elsewhere(scene, similarity):
     """The same scene in another world."""
     g = scene.gaussians
     g = replace(g, means=similarity(g.means), scales=g.scales * similarity.scale)
-    return replace(scene, gaussians=g, cameras=scene.cameras.moved(similarity))
+    return replace(scene, gaussians=g, cameras=scene.cameras.transformed(similarity))

@@ -11,7 +11,7 @@ BOUNCE = Path(__file__).resolve().parents[2] / "examples/new_backend/bounce.py"
 def test_a_simulator_of_ones_own_writes_a_trajectory_that_is_read(tmp_path, two_balls):
     runpy.run_path(str(BOUNCE))["simulate"](two_balls, tmp_path / "t.h5")
     trajectory = read_trajectory(tmp_path / "t.h5")
-    assert len(trajectory) == 100 and trajectory.motion.engine == "bounce"
+    assert len(trajectory) == 100 and trajectory.info.engine == "bounce"
     # until it lands, the green ball (0.28 above the floor) falls as g t^2 / 2, up to the first order of the scheme
     fallen = float(trajectory.com[0, 1, 2] - trajectory.com[10, 1, 2])
     assert fallen == pytest.approx(9.81 * 0.2**2 / 2, rel=0.01)

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from stages.core.geometry.planes import Plane
-from stages.core.scene.cameras import Lenses
+from stages.core.scene.cameras import LensDistortion
 from stages.reconstruct import depth as stereo
 from stages.reconstruct.photos import Views
 from stages.reconstruct.sfm import SparseModel
@@ -21,7 +21,7 @@ def sparse(cameras, truth, step: int = 12) -> SparseModel:
     poses = zip(truth, cameras.Ks, cameras.viewmats, strict=True)
     seen = torch.stack([stereo.look_up(depth, points, K, viewmat)[1] for depth, K, viewmat in poses])
     view, point = seen.nonzero().T
-    return SparseModel(cameras, Lenses(torch.zeros(len(cameras), 5)), points, point, view)
+    return SparseModel(cameras, LensDistortion(torch.zeros(len(cameras), 5)), points, point, view)
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,7 @@ import torch
 from stages.core.errors import InputError
 from stages.core.geometry.cameras import centres
 from stages.core.geometry.similarity import umeyama
-from stages.core.scene.cameras import Lenses
+from stages.core.scene.cameras import LensDistortion
 from stages.reconstruct import features, sfm
 from stages.reconstruct.photos import Photos, undistort
 from tests.reconstruct.raycast import arc, photograph
@@ -49,7 +49,7 @@ def test_the_same_seed_gives_the_same_cameras(tmp_path):
 
 def test_known_cameras_are_kept_and_give_points_on_the_surfaces(tmp_path):
     cameras = arc(4, (240, 180), sweep=40.0)
-    model = sfm.triangulate(as_photos(cameras, tmp_path), cameras, Lenses(torch.zeros(4, 5)))
+    model = sfm.triangulate(as_photos(cameras, tmp_path), cameras, LensDistortion(torch.zeros(4, 5)))
     assert torch.equal(model.cameras.viewmats, cameras.viewmats)
     outside = (model.points[:, :2].abs() > 0.3).any(1)
     assert outside.sum() > 30
@@ -60,7 +60,7 @@ def test_cameras_of_other_photos_are_noticed(tmp_path):
     cameras = arc(4, (240, 180), sweep=40.0)
     photos = as_photos(cameras, tmp_path)
     with pytest.raises(InputError, match="the given cameras are .* px off"):
-        sfm.triangulate(photos, cameras[[3, 2, 1, 0]], Lenses(torch.zeros(4, 5)))
+        sfm.triangulate(photos, cameras[[3, 2, 1, 0]], LensDistortion(torch.zeros(4, 5)))
 
 
 def test_matches_that_no_cameras_explain_are_put_down_to_a_repeated_pattern():
@@ -109,7 +109,7 @@ def test_distortion_is_undone(tmp_path):
     cameras = arc(1, size)
     cameras.Ks[0] = K
     photos = Photos((image,), cameras.names, (0.0,), tmp_path)
-    views = undistort(photos, cameras, Lenses(torch.tensor([[-0.2, 0, 0, 0, 0]])), side=200)
+    views = undistort(photos, cameras, LensDistortion(torch.tensor([[-0.2, 0, 0, 0, 0]])), side=200)
     edge = (views.images[0][..., 0].float() / 255 > 0.5).float().argmax(1) + 0.0
     at = (edge - views.cameras.Ks[0][0, 2]) / views.cameras.Ks[0][0, 0]
     assert (at - 0.3).abs().max() < 1.5 / 180

@@ -14,7 +14,7 @@ from stages.core.geometry.rotations import matrix
 from stages.core.geometry.similarity import Similarity
 from stages.core.raster.rasterise import rasterise, visibility
 from stages.core.scene.cameras import Cameras
-from stages.core.scene.gaussians import concatenate, moved
+from stages.core.scene.gaussians import concatenate, transformed
 from stages.core.scene.scene import Scene, SceneObject
 from stages.core.scene.scene_ply import read_scene, write_scene
 from stages.lab.assets.shapes import ellipsoid, sheet
@@ -290,7 +290,8 @@ def test_an_unknown_completer_is_named(before):
 def test_the_wall_behind_what_hangs_on_it_is_filled(before):
     # the block and its table turned by a quarter about x: what was up is now -y, and there is no floor
     turn = Similarity(1.0, matrix(torch.tensor([0.5**0.5, 0.5**0.5, 0.0, 0.0])), torch.zeros(3))
-    hung = replace(before, gaussians=moved(before.gaussians, turn), cameras=before.cameras.moved(turn), floor=None)
+    gaussians, cameras = transformed(before.gaussians, turn), before.cameras.transformed(turn)
+    hung = replace(before, gaussians=gaussians, cameras=cameras, floor=None)
     done = refine(hung)
     in_front = (0.0, -0.6, 0.05)
     assert seen(hung, in_front, 0)[1] < 0.1

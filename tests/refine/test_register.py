@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from stages.core.geometry.neighbours import Products
+from stages.core.geometry.neighbours import BruteForce
 from stages.core.geometry.rotations import matrix
 from stages.lab.assets.shapes import ellipsoid
 from stages.lab.bench.register import RegisterBenchOptions, errors, make_trial
@@ -46,7 +46,7 @@ def test_the_way_of_a_gpu_finds_the_same(whole, monkeypatch):
     given = make_trial(whole, 1, RegisterBenchOptions())
     expected = register(given.part, whole)
     for module in (registration, register_cloud):
-        monkeypatch.setattr(module, "searchable", Products)
+        monkeypatch.setattr(module, "searchable", BruteForce)
     found = register(given.part, whole)
     assert degrees_between(found.similarity.rotation, expected.similarity.rotation) < 0.5
     assert found.similarity.scale == pytest.approx(expected.similarity.scale, rel=5e-3)

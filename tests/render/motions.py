@@ -3,7 +3,7 @@
 import torch
 
 from stages.core.physics.keypoints import bind
-from stages.core.scene.trajectory import Keypoints, Motion, TrajectoryWriter
+from stages.core.scene.trajectory import Keypoints, SimulationInfo, TrajectoryWriter
 
 
 def rising(path, scene, frames: int = 5, step: float = 0.01, forces: tuple = ()):
@@ -11,7 +11,7 @@ def rising(path, scene, frames: int = 5, step: float = 0.01, forces: tuple = ())
     g = scene.gaussians
     rows = torch.cat([(g.object_id == o.id).nonzero()[:60, 0] for o in scene.objects])
     keypoints = Keypoints(g.means[rows], g.object_id[rows])
-    motion = Motion(0.02, (0.0, 0.0, 0.0), "test", forces)
+    motion = SimulationInfo(0.02, (0.0, 0.0, 0.0), "test", forces)
     centres = torch.stack([g.means[g.object_id == o.id].mean(0) for o in scene.objects])
     turns = torch.tensor([[1.0, 0, 0, 0]]).repeat(len(scene.objects), 1)
     with TrajectoryWriter(path, scene, motion, keypoints, bind(scene, keypoints)) as out:

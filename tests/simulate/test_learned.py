@@ -44,7 +44,7 @@ def test_free_fall_is_right_at_any_scale(two_balls, tmp_path, untrained, unit):
     t = roll(scene, tmp_path, untrained, lift=("2=2",))
     assert torch.equal(t.positions[0, t.keypoints.object_id == 1], t.keypoints.rest[t.keypoints.object_id == 1])
     assert shift(t, 1).tolist() == pytest.approx([0, 0, -9.81 / unit * 0.1**2 / 2], rel=1e-3, abs=1e-4)
-    assert t.motion.engine == "ngff"
+    assert t.info.engine == "ngff"
 
 
 def test_a_throw_and_a_push_in_flight(two_balls, tmp_path, untrained, caplog):
@@ -62,7 +62,7 @@ def test_pinned_objects_stay_and_fewer_frames_a_second_are_the_same_motion(two_b
     assert shift(t, 0).norm() < 1e-5
     coarse = roll(two_balls, tmp_path, untrained, lift=("2=2",), pin=("1",), dt=0.05, steps=3)
     assert float(shift(coarse, 1)[2]) == pytest.approx(float(shift(t, 1)[2]), rel=0.01)
-    assert math.isclose(coarse.motion.dt, 0.05)
+    assert math.isclose(coarse.info.dt, 0.05)
 
 
 def test_what_stands_deeper_is_not_lifted_into_what_stands_beside_it(tmp_path):

@@ -56,7 +56,7 @@ def shift(t: Trajectory, id: int, frame: int = -1) -> torch.Tensor:
 def test_the_first_frame_is_the_scene_and_falling_is_a_parabola(balls, caplog):
     caplog.set_level(logging.INFO)
     t = roll(balls)
-    assert len(t) == 6 and t.motion.gravity == (0.0, 0.0, pytest.approx(-9.81))
+    assert len(t) == 6 and t.info.gravity == (0.0, 0.0, pytest.approx(-9.81))
     assert torch.equal(t.positions[0], t.keypoints.rest)
     assert torch.allclose(t.rotation[0], torch.tensor([1.0, 0, 0, 0]), atol=1e-5)
     assert float(shift(t, 2)[2]) == pytest.approx(-9.81 * 0.1**2 / 2, rel=0.02)
@@ -75,7 +75,7 @@ def test_scene_units_that_are_not_metres(balls):
     scene = read_scene(balls)
     write_scene(balls, replace(scene, scale={"metres_per_unit": 0.5, "source": "test"}))
     t = roll(balls)
-    assert t.motion.gravity[2] == pytest.approx(-2 * 9.81)
+    assert t.info.gravity[2] == pytest.approx(-2 * 9.81)
     assert float(shift(t, 2)[2]) == pytest.approx(-2 * 9.81 * 0.1**2 / 2, rel=0.02)
 
 
@@ -84,7 +84,7 @@ def test_lift_velocity_and_pin(balls):
     assert torch.allclose(shift(t, 1, 0), torch.tensor([0, 0, 0.2]), atol=1e-6)
     assert torch.equal(t.positions[0][t.keypoints.object_id == 1], t.positions[-1][t.keypoints.object_id == 1])
     assert float(shift(t, 2)[0]) == pytest.approx(0.1, rel=0.01)
-    assert {f["kind"] for f in t.motion.forces} == {"lift", "velocity", "pin"}
+    assert {f["kind"] for f in t.info.forces} == {"lift", "velocity", "pin"}
 
 
 def test_a_push_of_known_impulse(balls):

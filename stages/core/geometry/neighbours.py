@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 
-class Tree:
+class KDTree:
     """Points in a k-d tree, to be searched again and again on the CPU."""
 
     def __init__(self, points: Float[Tensor, "n d"]):
@@ -25,7 +25,7 @@ class Tree:
         return torch.from_numpy(distance).to(points), torch.from_numpy(index).clamp_(max=self.size - 1)
 
 
-class Products:
+class BruteForce:
     """Points compared with every query by matrix products: on a GPU a few thousand of them are faster so.
 
     Who is nearest is decided in float32 by |x|^2 - 2 q.x, so of two points whose squared distances differ by less than
@@ -41,7 +41,7 @@ class Products:
     def query(
         self, points: Float[Tensor, "*b d"], k: int = 1, within: float = inf
     ) -> tuple[Float[Tensor, "*b k"], Int[Tensor, "*b k"]]:
-        """As `Tree.query`."""
+        """As `KDTree.query`."""
         flat, have = points.reshape(-1, points.shape[-1]), min(k, len(self.points))
         chunks = flat.split(max(1, self.ENTRIES // len(self.points)))
         index = torch.cat([self._nearest(chunk, have) for chunk in chunks])
@@ -55,9 +55,9 @@ class Products:
         return products.argmin(1, keepdim=True) if k == 1 else products.topk(k, largest=False).indices
 
 
-def searchable(points: Float[Tensor, "n d"]) -> Tree | Products:
+def neighbour_index(points: Float[Tensor, "n d"]) -> KDTree | BruteForce:
     """A few thousand points, ready for many queries on the device where they are."""
-    return Products(points) if points.is_cuda else Tree(points)
+    return BruteForce(points) if points.is_cuda else KDTree(points)
 
 
 def knn(
@@ -68,7 +68,7 @@ def knn(
     With fewer than k points the last one is repeated, so the shape holds. A kd-tree on the CPU.
     """
     have = min(k, len(points))
-    distance, index = (found.to(queries.device) for found in Tree(points.cpu()).query(queries.cpu(), have))
+    distance, index = (found.to(queries.device) for found in KDTree(points.cpu()).query(queries.cpu(), have))
     pad = torch.tensor([min(j, have - 1) for j in range(k)], device=queries.device)
     return distance[:, pad], index[:, pad]
 

@@ -21,7 +21,7 @@ class Plane(NamedTuple):
         return points @ self.normal - self.offset
 
 
-def fit(points: Float[Tensor, "n 3"], weights: Float[Tensor, "n"] | None = None) -> Plane:
+def fit_plane(points: Float[Tensor, "n 3"], weights: Float[Tensor, "n"] | None = None) -> Plane:
     """Least-squares plane of three points or more; the sign of its normal is arbitrary."""
     w = torch.ones_like(points[:, 0]) if weights is None else weights
     centre = (points * w[:, None]).sum(0) / w.sum()
@@ -30,7 +30,7 @@ def fit(points: Float[Tensor, "n 3"], weights: Float[Tensor, "n"] | None = None)
     return Plane(normal, float(normal @ centre))
 
 
-def through(triples: Float[Tensor, "k 3 3"]) -> tuple[Float[Tensor, "k 3"], Float[Tensor, "k"]]:
+def planes_through(triples: Float[Tensor, "k 3 3"]) -> tuple[Float[Tensor, "k 3"], Float[Tensor, "k"]]:
     """Unit normals and offsets of planes through three points each; points in a line give a zero normal."""
     a, b, c = triples.unbind(1)
     normals = torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=1)
@@ -57,7 +57,7 @@ def ransac(
     count = min(len(points), 20_000)
     some = torch.multinomial(weights.cpu().double(), count, replacement=True, generator=generator).to(points.device)
     draw = torch.randint(len(some), (trials, 3), generator=generator).to(points.device)
-    normals, offsets = through(points[some][draw])
+    normals, offsets = planes_through(points[some][draw])
     normals, offsets = torch.cat([normals, -normals]), torch.cat([offsets, -offsets])
     good = normals.norm(dim=1) > 0.5
     if allowed is not None:
@@ -75,7 +75,7 @@ def ransac(
         inside = plane.heights(points).abs() < threshold
         if int(inside.sum()) < 3:
             break
-        better = fit(points[inside], weights[inside])
+        better = fit_plane(points[inside], weights[inside])
         flip = -1.0 if float(better.normal @ plane.normal) < 0 else 1.0
         plane = Plane(better.normal * flip, better.offset * flip)
     return plane, plane.heights(points).abs() < threshold

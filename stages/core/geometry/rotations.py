@@ -55,7 +55,7 @@ def covariance(quats: Float[Tensor, "*b 4"], scales: Float[Tensor, "*b 3"]) -> F
     return RS @ RS.mT
 
 
-def between(a: Float[Tensor, "3"], b: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
+def rotation_between(a: Float[Tensor, "3"], b: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
     """The smallest rotation that turns direction `a` into direction `b` (any axis when they are opposite)."""
     a, b = a / a.norm(), b / b.norm()
     if torch.dot(a, b) < -1 + 1e-6:
@@ -66,7 +66,7 @@ def between(a: Float[Tensor, "3"], b: Float[Tensor, "3"]) -> Float[Tensor, "3 3"
     return matrix(q)
 
 
-def nearest(M: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3 3"]:
+def nearest_rotation(M: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3 3"]:
     """The rotation nearest to M in the Frobenius norm (polar factor, determinant +1)."""
     U, _, Vt = torch.linalg.svd(M)
     sign = torch.det(U @ Vt)

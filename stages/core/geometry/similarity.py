@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from stages.core.geometry.rotations import nearest
+from stages.core.geometry.rotations import nearest_rotation
 
 
 class Similarity(NamedTuple):
@@ -42,6 +42,6 @@ def umeyama(source: Float[Tensor, "n 3"], target: Float[Tensor, "n 3"], scaled: 
     mean_s, mean_t = source.mean(0), target.mean(0)
     S, T = source - mean_s, target - mean_t
     H = T.mT @ S
-    R = nearest(H)
+    R = nearest_rotation(H)
     scale = float((R * H).sum() / S.square().sum().clamp_min(torch.finfo(S.dtype).tiny)) if scaled else 1.0
     return Similarity(scale, R, mean_t - scale * R @ mean_s)

@@ -14,7 +14,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from stages.core.geometry.rotations import matrix, nearest, quaternion
+from stages.core.geometry.rotations import matrix, nearest_rotation, quaternion
 from stages.core.kernels.interop import device_of, launch, view
 
 
@@ -167,5 +167,5 @@ def blend_reference(
     still = (G == 0).all(-1).all(-1)
     new_quats = torch.where(still[:, None], quats, quaternion(U))
     new_scales = torch.where(still[:, None], scales, s)
-    R = torch.where(still[:, None, None], torch.eye(3).to(F), nearest(F))
+    R = torch.where(still[:, None, None], torch.eye(3).to(F), nearest_rotation(F))
     return means + shift, new_quats, new_scales, R

@@ -10,10 +10,10 @@ from torch import Tensor
 
 from stages.core.geometry.cameras import centres
 from stages.core.geometry.planes import Plane, ransac
-from stages.core.geometry.rotations import between
+from stages.core.geometry.rotations import rotation_between
 from stages.core.geometry.similarity import Similarity
 from stages.core.perception.support import REACH, View, solid
-from stages.core.scene.gaussians import moved
+from stages.core.scene.gaussians import transformed
 from stages.core.scene.scene import Scene
 
 SHARE = 0.2  # of what is in focus, a wall holds at least
@@ -44,7 +44,7 @@ def find_wall(scene: Scene, view: View, seed: int = 0) -> Similarity | None:
     behind = near[plane.heights(points) < -THICK * R].sum() / near.sum()
     if float((side * eyes).min()) <= 0 or float(near[on].sum() / near.sum()) < SHARE or float(behind) > BEHIND:
         return None
-    turn = between(plane.normal, torch.tensor([0.0, 0.0, 1.0]))
+    turn = rotation_between(plane.normal, torch.tensor([0.0, 0.0, 1.0]))
     return Similarity(1.0, turn, torch.tensor([0.0, 0.0, -plane.offset])) if _wide(points[on] @ turn.mT, R) else None
 
 
@@ -56,5 +56,5 @@ def _wide(flat: Float[Tensor, "n 3"], radius: float) -> bool:
 
 def laid_down(scene: Scene, turn: Similarity) -> Scene:
     """The scene after `find_wall`'s turn, with the wall for its floor."""
-    cameras = scene.cameras.moved(turn)
-    return replace(scene, gaussians=moved(scene.gaussians, turn), cameras=cameras, floor=0.0)
+    cameras = scene.cameras.transformed(turn)
+    return replace(scene, gaussians=transformed(scene.gaussians, turn), cameras=cameras, floor=0.0)

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from stages.core.geometry.harmonics import rotate_sh
 from stages.core.geometry.neighbours import knn
-from stages.core.geometry.rotations import nearest, quaternion
+from stages.core.geometry.rotations import nearest_rotation, quaternion
 from stages.core.kernels.skinning import blend
 from stages.core.scene.gaussians import Gaussians
 from stages.core.scene.trajectory import Binding, Keypoints
@@ -63,7 +63,7 @@ class Skinning:
         """
         relative = (u[self._around] - u[:, None]).mT @ self._ad  # A - M
         whole = self._object_rotations(u)[self._body]
-        R = nearest(self._M + relative + 0.3 * self._ridge * whole)
+        R = nearest_rotation(self._M + relative + 0.3 * self._ridge * whole)
         one = torch.eye(3)
         G = (relative + self._ridge * (R - one)) @ self._inverse
         still = (relative == 0).flatten(1).all(1)
@@ -94,7 +94,7 @@ def fit_rotations(
     H = torch.zeros(count, 3, 3).to(x).index_add(0, body, x[:, :, None] * X[:, None, :])
     # a trace of "no turn" for points on a line or in one place
     H = H + 1e-6 * (X.square().sum() / max(len(X), 1) + 1e-12) * torch.eye(3).to(H)
-    return nearest(H).to(rest)
+    return nearest_rotation(H).to(rest)
 
 
 def rotations(

@@ -31,7 +31,7 @@ class Cameras:
         rows = list(range(len(self)))[index] if isinstance(index, slice) else [int(i) for i in index]
         return Cameras(self.viewmats[rows], self.Ks[rows], self.sizes[rows], tuple(self.names[i] for i in rows))
 
-    def moved(self, similarity: Similarity) -> Cameras:
+    def transformed(self, similarity: Similarity) -> Cameras:
         """The cameras after the world is transformed."""
         return Cameras(similarity.viewmats(self.viewmats), self.Ks, self.sizes, self.names)
 
@@ -57,13 +57,13 @@ def from_json(rows: list[dict]) -> Cameras | None:
 
 
 @dataclass(frozen=True)
-class Lenses:
+class LensDistortion:
     """Distortion of each camera as OpenCV orders it: k1 k2 p1 p2 k3 (zeros for none)."""
 
     coefficients: Float[Tensor, "c 5"]
 
 
-def read_cameras(path: Path) -> tuple[Cameras, Lenses]:
+def read_cameras(path: Path) -> tuple[Cameras, LensDistortion]:
     """Cameras of a nerfstudio transforms.json or of a COLMAP model folder (cameras, images, points3D)."""
     path = Path(path)
     if path.is_dir():
@@ -80,7 +80,7 @@ def read_cameras(path: Path) -> tuple[Cameras, Lenses]:
         ) from error
 
 
-def _from_transforms(data: dict) -> tuple[Cameras, Lenses]:
+def _from_transforms(data: dict) -> tuple[Cameras, LensDistortion]:
     """OpenGL axes (y up, camera looks along -z) become OpenCV's by turning y and z."""
     viewmats, Ks, sizes, names, lenses = [], [], [], [], []
     for frame in sorted(data["frames"], key=lambda frame: frame["file_path"]):
@@ -94,10 +94,10 @@ def _from_transforms(data: dict) -> tuple[Cameras, Lenses]:
     if not names:
         raise ValueError("no frames")
     cameras = Cameras(_float(viewmats), _float(Ks), torch.tensor(sizes, dtype=torch.int64), tuple(names))
-    return cameras, Lenses(_float(lenses))
+    return cameras, LensDistortion(_float(lenses))
 
 
-def _read_colmap(path: Path) -> tuple[Cameras, Lenses]:
+def _read_colmap(path: Path) -> tuple[Cameras, LensDistortion]:
     import pycolmap  # noqa: PLC0415 -- a second to import, and only this reader needs it
 
     try:
@@ -115,7 +115,7 @@ def _read_colmap(path: Path) -> tuple[Cameras, Lenses]:
     if not names:
         raise InputError(f"{path}: the COLMAP model has no registered image")
     cameras = Cameras(_float(viewmats), _float(Ks), torch.tensor(sizes, dtype=torch.int64), tuple(names))
-    return cameras, Lenses(_float(lenses))
+    return cameras, LensDistortion(_float(lenses))
 
 
 def _colmap_lens(path: Path, camera) -> list[float]:

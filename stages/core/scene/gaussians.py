@@ -44,7 +44,7 @@ def concatenate(parts: Sequence[Gaussians]) -> Gaussians:
     return Gaussians(sh=torch.cat(padded), **joined)
 
 
-def moved(g: Gaussians, similarity: Similarity) -> Gaussians:
+def transformed(g: Gaussians, similarity: Similarity) -> Gaussians:
     """The same Gaussians elsewhere, turned and grown; colours that depend on direction turn along."""
     R = similarity.rotation
     return replace(

@@ -15,9 +15,7 @@ from torch import Tensor
 
 from stages.core.errors import InputError
 from stages.core.scene.files import must_exist, replacing
-
-PHOTOS = {".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp"}
-VIDEOS = {".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v"}
+from stages.core.scene.formats import IMAGE_SUFFIXES
 
 
 def list_photos(folder: Path) -> list[Path]:
@@ -25,9 +23,9 @@ def list_photos(folder: Path) -> list[Path]:
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError(f"{folder}: is no folder; give a folder of photos or a video file")
-    photos = sorted(p for p in folder.iterdir() if p.suffix.lower() in PHOTOS and not p.name.startswith("."))
+    photos = sorted(p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith("."))
     if not photos:
-        raise InputError(f"{folder}: no photos in it; these kinds are read: {' '.join(sorted(PHOTOS))}")
+        raise InputError(f"{folder}: no photos in it; these kinds are read: {' '.join(sorted(IMAGE_SUFFIXES))}")
     return photos
 
 

@@ -53,8 +53,8 @@ class Binding:
 
 
 @dataclass(frozen=True)
-class Motion:
-    """What holds for the whole of a trajectory besides the scene."""
+class SimulationInfo:
+    """Settings of the simulation that made a trajectory."""
 
     dt: float  # time between frames [s]
     gravity: tuple[float, float, float]  # [scene units / s^2]
@@ -67,7 +67,7 @@ class Trajectory:
     """A trajectory in memory; dense frames, where the file has them, stay on disk until asked for."""
 
     scene: Scene
-    motion: Motion
+    info: SimulationInfo
     keypoints: Keypoints
     binding: Binding
     positions: Float[Tensor, "t p 3"]
@@ -123,9 +123,9 @@ class TrajectoryWriter:
     When an InputError stops the run after some frames, what was written is kept as NAME.partial.h5.
     """
 
-    def __init__(self, path: Path, scene: Scene, motion: Motion, keypoints: Keypoints, binding: Binding):
+    def __init__(self, path: Path, scene: Scene, info: SimulationInfo, keypoints: Keypoints, binding: Binding):
         self.path, self.frames = Path(path), 0
-        self._contents = scene, motion, keypoints, binding
+        self._contents = scene, info, keypoints, binding
 
     def __enter__(self) -> TrajectoryWriter:
         self._replacing = replacing(self.path)
@@ -168,11 +168,11 @@ class TrajectoryWriter:
         self._replacing.__exit__(kind, error, trace)
 
 
-def _write_rest(file: h5py.File, scene: Scene, motion: Motion, keypoints: Keypoints, binding: Binding) -> None:
+def _write_rest(file: h5py.File, scene: Scene, info: SimulationInfo, keypoints: Keypoints, binding: Binding) -> None:
     packed = {"compression": "gzip", "compression_opts": 4, "shuffle": True}
     file.attrs.update(
-        format=FORMAT, version=VERSION, fps=1 / motion.dt, dt=motion.dt, gravity=motion.gravity, up="z",
-        units="scene units, seconds", engine=motion.engine, scale=json.dumps(scene.scale),
+        format=FORMAT, version=VERSION, fps=1 / info.dt, dt=info.dt, gravity=info.gravity, up="z",
+        units="scene units, seconds", engine=info.engine, scale=json.dumps(scene.scale),
         provenance=json.dumps(scene.provenance), **({} if scene.floor is None else {"floor": scene.floor}),
         **({} if scene.background is None else {"background": scene.background}),
     )  # fmt: skip
@@ -195,7 +195,7 @@ def _write_rest(file: h5py.File, scene: Scene, motion: Motion, keypoints: Keypoi
         for name in ("viewmats", "Ks", "sizes"):
             file[f"cameras/{name}"] = getattr(scene.cameras, name).cpu().numpy()
         file.create_dataset("cameras/names", data=list(scene.cameras.names), dtype=text)
-    prompts = [json.dumps(f) for f in motion.forces]
+    prompts = [json.dumps(f) for f in info.forces]
     file.create_dataset("forces/json", data=prompts, dtype=text, shape=(len(prompts),))
 
 
@@ -237,11 +237,11 @@ def _read(path: Path, file: h5py.File) -> Trajectory:
     scene = Scene(gaussians, objects, cameras, floor, scale, json.loads(file.attrs.get("provenance", "{}")), background)
     gravity = tuple(float(g) for g in file.attrs["gravity"])
     forces = tuple(json.loads(f) for f in names("forces/json"))
-    motion = Motion(float(file.attrs["dt"]), gravity, str(file.attrs["engine"]), forces)
+    info = SimulationInfo(float(file.attrs["dt"]), gravity, str(file.attrs["engine"]), forces)
     keypoints = Keypoints(tensor("keypoints/rest"), tensor("keypoints/object_id").long())
     binding = Binding(tensor("binding/index").long(), tensor("binding/weight"))
     moving = (tensor("keypoints/positions"), tensor("objects/com"), tensor("objects/rotation"))
-    return Trajectory(scene, motion, keypoints, binding, *moving, path, "frames/means" in file)
+    return Trajectory(scene, info, keypoints, binding, *moving, path, "frames/means" in file)
 
 
 def _check(path: Path, file: h5py.File) -> None:

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from stages.core.errors import InputError
-from stages.core.geometry.rotations import nearest
+from stages.core.geometry.rotations import nearest_rotation
 from stages.core.models.initial_conditions import World
 from stages.lab.assets.objects import OBJECTS
 from stages.lab.bench import common as bench
@@ -66,7 +66,7 @@ def rigid_fit(points: Float[Tensor, "s t o n 3"], valid: Bool[Tensor, "s o n"]) 
     centre = torch.einsum("son,stoni->stoi", weight, points)[..., None, :]
     arm = (points - centre)[:, 0]
     moment = torch.einsum("son,stoni,sonj->stoij", weight, points - centre, arm)
-    fitted = centre + torch.einsum("stoij,sonj->stoni", nearest(moment), arm)
+    fitted = centre + torch.einsum("stoij,sonj->stoni", nearest_rotation(moment), arm)
     return fitted.masked_fill(~valid[:, None, ..., None], 0.0)
 
 

@@ -22,7 +22,7 @@ from tqdm import tqdm
 
 from stages.core.backends import pick_device
 from stages.core.geometry.harmonics import C0, rgb_to_sh
-from stages.core.geometry.rotations import matrix, multiply, nearest, quaternion
+from stages.core.geometry.rotations import matrix, multiply, nearest_rotation, quaternion
 from stages.core.geometry.similarity import Similarity, umeyama
 from stages.core.scene.files import replacing
 from stages.core.scene.gaussians import Gaussians
@@ -182,7 +182,7 @@ def splatreg(part: Gaussians, whole: Gaussians, seed: int = 0) -> Similarity:
     finally:
         torch.set_num_threads(threads)
     scale = float(torch.det(T[:3, :3]).abs() ** (1 / 3))
-    return Similarity(scale * units[0] / units[1], nearest(T[:3, :3] / scale), T[:3, 3] / units[1])
+    return Similarity(scale * units[0] / units[1], nearest_rotation(T[:3, :3] / scale), T[:3, 3] / units[1])
 
 
 METHODS = {"ours": ours, "ICP": icp}  # (part, whole, seed) -> whole to part, on the CPU

@@ -25,7 +25,7 @@ from stages.core.physics.skinning import rotations
 from stages.core.scene.files import must_exist, provenance
 from stages.core.scene.scene import Scene, SceneObject
 from stages.core.scene.scene_ply import read_scene
-from stages.core.scene.trajectory import Keypoints, Motion, TrajectoryWriter
+from stages.core.scene.trajectory import Keypoints, SimulationInfo, TrajectoryWriter
 from stages.lab.dataset.cameras import cameras_around
 from stages.lab.dataset.dynamic_gaussians import FLOOR
 from stages.lab.dataset.layout import Layout, kind_of
@@ -57,7 +57,8 @@ def run(folder: Path, out: Path, scene: Path | None = None, count: int = 2048) -
                     floor=FLOOR if world.floor is None else world.floor)  # fmt: skip
     ids = [o.id for o in world.objects]
     owner = world.gaussians.object_id[rows]
-    with TrajectoryWriter(out, world, Motion(FRAME, GRAVITY, "mpm"), keypoints, bind(world, keypoints)) as trajectory:
+    info = SimulationInfo(FRAME, GRAVITY, "mpm")
+    with TrajectoryWriter(out, world, info, keypoints, bind(world, keypoints)) as trajectory:
         for t, places in enumerate(_positions(frames, len(rows))):
             com = torch.stack([places[owner == i].mean(0) for i in ids])
             points = places[chosen] if t else keypoints.rest  # the start is known better than to float16

@@ -27,7 +27,7 @@ from tqdm import tqdm
 
 from stages.core.backends import pick_device
 from stages.core.errors import InputError
-from stages.core.geometry.rotations import nearest
+from stages.core.geometry.rotations import nearest_rotation
 from stages.core.scene.files import replacing
 from stages.lab.dataset.layout import kind_of
 from stages.lab.dataset.motions import Motions, read_motions
@@ -93,7 +93,7 @@ def _rigid(
     now = p - centre[..., None, :]
     rest = now[:, :1]
     H = (now.mT @ rest).cpu().double()  # small matrices are turned faster there
-    R = nearest(H + 1e-9 * torch.eye(3, dtype=H.dtype)).to(p)
+    R = nearest_rotation(H + 1e-9 * torch.eye(3, dtype=H.dtype)).to(p)
     off = (now - rest @ R.mT).square().sum(-1).mean(-1).sqrt()
     return R, off / rest.square().sum(-1).mean(-1).sqrt().clamp_min(1e-9)
 

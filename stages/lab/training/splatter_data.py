@@ -14,7 +14,7 @@ from tqdm import tqdm
 from stages.core.errors import InputError
 from stages.core.geometry.cameras import intrinsics, orbit, resize
 from stages.core.raster.rasterise import rasterise
-from stages.core.scene.cameras import Cameras, Lenses, read_cameras
+from stages.core.scene.cameras import Cameras, LensDistortion, read_cameras
 from stages.core.scene.scene import Scene
 from stages.core.scene.scene_ply import read_scene
 from stages.reconstruct.crops import batch, network_size
@@ -91,7 +91,7 @@ def _photographed(folder: Path, side: int) -> PosedViews:
     if len(photos) < 4:
         raise InputError(f"{_cameras_in(folder)}: names {len(photos)} of the photos in {inner}; 4 or more are needed")
     cameras = replace(cameras[rows], Ks=_resized(cameras[rows], [photos.size(i) for i in range(len(photos))]))
-    views = undistort(photos, cameras, Lenses(lenses.coefficients[rows]), side=4096)
+    views = undistort(photos, cameras, LensDistortion(lenses.coefficients[rows]), side=4096)
     size = network_size(*photos.size(0), side)
     Ks = _resized(views.cameras, [size] * len(photos))
     return PosedViews(folder.name, batch(list(views.images), size), views.cameras.viewmats, Ks, None)

@@ -3,7 +3,7 @@ from math import inf
 import pytest
 import torch
 
-from stages.core.geometry.neighbours import Products, Tree, knn, searchable, spacing
+from stages.core.geometry.neighbours import BruteForce, KDTree, knn, neighbour_index, spacing
 from tests.conftest import DEVICES
 
 
@@ -16,9 +16,9 @@ def cloud():
 
 @pytest.mark.parametrize("k", [1, 32])
 def test_products_find_what_the_tree_finds(cloud, k, monkeypatch):
-    monkeypatch.setattr(Products, "ENTRIES", 100_000)  # several chunks
+    monkeypatch.setattr(BruteForce, "ENTRIES", 100_000)  # several chunks
     points, queries = cloud
-    (far, which), (expected, index) = (way(points).query(queries, k) for way in (Products, Tree))
+    (far, which), (expected, index) = (way(points).query(queries, k) for way in (BruteForce, KDTree))
     torch.testing.assert_close(far, expected, rtol=0, atol=1e-5)
     assert torch.equal(which, index)
     torch.testing.assert_close((queries[..., None, :] - points[which]).norm(dim=3), far)
@@ -26,11 +26,11 @@ def test_products_find_what_the_tree_finds(cloud, k, monkeypatch):
 
 def test_products_keep_the_precision_of_the_queries(cloud):
     points, queries = cloud[0], cloud[1].double()
-    (far, _), (expected, _) = (way(points).query(queries) for way in (Products, Tree))
+    (far, _), (expected, _) = (way(points).query(queries) for way in (BruteForce, KDTree))
     torch.testing.assert_close(far, expected, rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("way", [Tree, Products])
+@pytest.mark.parametrize("way", [KDTree, BruteForce])
 def test_what_is_not_within_reach_is_infinitely_far(way):
     line = torch.tensor([[0.0, 0, 0], [1, 0, 0], [3, 0, 0]])
     distance, index = way(line).query(torch.tensor([[0.1, 0, 0], [9, 0, 0]]), 4, within=1.5)
@@ -39,17 +39,17 @@ def test_what_is_not_within_reach_is_infinitely_far(way):
 
 
 def test_points_on_the_cpu_are_searched_by_a_tree(cloud):
-    assert isinstance(searchable(cloud[0]), Tree)
+    assert isinstance(neighbour_index(cloud[0]), KDTree)
 
 
 @pytest.mark.gpu
 @pytest.mark.skipif("cuda" not in DEVICES, reason="no NVIDIA GPU")
 def test_points_on_a_gpu_are_searched_there(cloud):
     points, queries = (x.cuda() for x in cloud)
-    found = searchable(points)
-    assert isinstance(found, Products)
+    found = neighbour_index(points)
+    assert isinstance(found, BruteForce)
     distance, index = found.query(queries, 5)
-    expected = Tree(cloud[0]).query(cloud[1], 5)
+    expected = KDTree(cloud[0]).query(cloud[1], 5)
     torch.testing.assert_close(distance.cpu(), expected[0], rtol=0, atol=1e-5)
     assert torch.equal(index.cpu(), expected[1])
 

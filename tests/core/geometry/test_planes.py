@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from stages.core.geometry.planes import Plane, fit, ransac, through
+from stages.core.geometry.planes import Plane, fit_plane, planes_through, ransac
 
 
 def angle(a, b) -> float:
@@ -22,7 +22,7 @@ def points_on(normal, offset: float, n: int, noise: float, seed: int = 0):
 
 
 def test_three_points_of_the_floor():
-    normals, offsets = through(torch.tensor([[[0.0, 0, 2], [1, 0, 2], [0, 1, 2]]]))
+    normals, offsets = planes_through(torch.tensor([[[0.0, 0, 2], [1, 0, 2], [0, 1, 2]]]))
     torch.testing.assert_close(normals, torch.tensor([[0.0, 0, 1]]))
     torch.testing.assert_close(offsets, torch.tensor([2.0]))
 
@@ -35,7 +35,7 @@ def test_heights_are_signed():
 def test_least_squares_on_a_noisy_plane():
     # The slope error of a fit over a square of half side 1: noise / sqrt(n / 3), here 0.03 degrees.
     points, normal = points_on([1.0, 2, 3], 0.7, 1000, 0.01)
-    plane = fit(points)
+    plane = fit_plane(points)
     assert angle(plane.normal, normal) < 0.15
     assert abs(abs(plane.offset) - 0.7) < 0.002
 
@@ -44,7 +44,7 @@ def test_weights_decide_between_two_planes():
     low, _ = points_on([0.0, 0, 1], 0.0, 200, 0.0)
     high, _ = points_on([0.0, 0, 1], 1.0, 200, 0.0)
     weights = torch.cat([torch.ones(200), torch.full((200,), 1e-6)])
-    assert abs(fit(torch.cat([low, high]), weights).offset) < 1e-4
+    assert abs(fit_plane(torch.cat([low, high]), weights).offset) < 1e-4
 
 
 def test_ransac_finds_the_plane_among_half_outliers():

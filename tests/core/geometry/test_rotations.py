@@ -1,6 +1,6 @@
 import torch
 
-from stages.core.geometry.rotations import between, covariance, matrix, multiply, nearest, quaternion
+from stages.core.geometry.rotations import covariance, matrix, multiply, nearest_rotation, quaternion, rotation_between
 
 
 def random_quats(n: int) -> torch.Tensor:
@@ -28,7 +28,7 @@ def test_multiply_is_composition():
 def test_between_turns_one_direction_into_the_other_also_when_opposite():
     for a, b in [((0.0, 0, 1), (0.0, 1, 1)), ((0.0, 0, 1), (0.0, 0, -1))]:
         a, b = torch.tensor(a), torch.tensor(b)
-        R = between(a, b)
+        R = rotation_between(a, b)
         torch.testing.assert_close(R @ a, b / b.norm(), atol=1e-6, rtol=0)
         torch.testing.assert_close(torch.det(R), torch.tensor(1.0))
 
@@ -36,4 +36,4 @@ def test_between_turns_one_direction_into_the_other_also_when_opposite():
 def test_nearest_rotation_undoes_a_stretch():
     R = matrix(random_quats(10))
     stretch = torch.diag(torch.tensor([1.5, 1.0, 0.5], dtype=torch.float64))
-    torch.testing.assert_close(nearest(R @ stretch), R)
+    torch.testing.assert_close(nearest_rotation(R @ stretch), R)

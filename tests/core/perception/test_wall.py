@@ -10,7 +10,7 @@ from stages.core.geometry.similarity import Similarity
 from stages.core.perception.grouping import group
 from stages.core.perception.support import view_of
 from stages.core.perception.wall import find_wall, laid_down
-from stages.core.scene.gaussians import moved
+from stages.core.scene.gaussians import transformed
 from stages.core.scene.scene import Scene
 from tests.segment.tabletop import best_overlap, block, scene_of, table, three_apart
 
@@ -19,7 +19,7 @@ UP = Similarity(1.0, matrix(torch.tensor([0.5**0.5, 0.5**0.5, 0.0, 0.0])), torch
 
 def hung(scene: Scene) -> Scene:
     """A table top with what is on it as a wall: turned by a quarter about x, so that it faces -y; without a floor."""
-    return replace(scene, gaussians=moved(scene.gaussians, UP), cameras=scene.cameras.moved(UP), floor=None)
+    return replace(scene, gaussians=transformed(scene.gaussians, UP), cameras=scene.cameras.transformed(UP), floor=None)
 
 
 def test_a_wall_is_laid_on_its_back():
@@ -29,7 +29,7 @@ def test_a_wall_is_laid_on_its_back():
     wall = laid.gaussians.means[scene.gaussians.object_id == 0]
     assert float(wall[:, 2].abs().median()) < 0.002  # the noise
     assert float(laid.gaussians.means[scene.gaussians.object_id > 0][:, 2].min()) > -0.004
-    back = moved(laid.gaussians, turn.inverse())
+    back = transformed(laid.gaussians, turn.inverse())
     torch.testing.assert_close(back.means, scene.gaussians.means, rtol=0, atol=1e-5)
     torch.testing.assert_close(back.sh, scene.gaussians.sh, rtol=0, atol=1e-5)
 
@@ -59,7 +59,7 @@ def test_no_wall(scene):
 
 def test_a_wall_with_a_room_behind_it_is_a_screen():
     scene = hung(scene_of(table()))
-    behind = moved(scene.gaussians, Similarity(1.0, torch.eye(3), torch.tensor([0.0, 0.15, 0.0])))
+    behind = transformed(scene.gaussians, Similarity(1.0, torch.eye(3), torch.tensor([0.0, 0.15, 0.0])))
     both = replace(scene, gaussians=type(behind)(*(torch.cat(pair) for pair in zip(
         vars(scene.gaussians).values(), vars(behind).values(), strict=True))))  # fmt: skip
     assert find_wall(scene, view_of(scene)) is not None

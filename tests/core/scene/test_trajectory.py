@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from stages.core.errors import InputError
-from stages.core.scene.trajectory import Binding, Keypoints, Motion, TrajectoryWriter, read_trajectory
+from stages.core.scene.trajectory import Binding, Keypoints, SimulationInfo, TrajectoryWriter, read_trajectory
 
 
 def parts(scene, p: int = 10):
@@ -14,7 +14,7 @@ def parts(scene, p: int = 10):
     rest = torch.randn(p, 3, generator=torch.Generator().manual_seed(0))
     keypoints = Keypoints(rest, torch.ones(p, dtype=torch.int64))
     index = torch.randint(0, p, (n, 8), generator=torch.Generator().manual_seed(1))
-    motion = Motion(0.02, (0.0, 0.0, -9.81), "test", ({"object": 1},))
+    motion = SimulationInfo(0.02, (0.0, 0.0, -9.81), "test", ({"object": 1},))
     return motion, keypoints, Binding(index, torch.full((n, 8), 1 / 8))
 
 
@@ -29,7 +29,7 @@ def test_round_trip(tmp_path, two_balls):
     write(tmp_path / "t.h5", replace(two_balls, background=(0.2, 0.4, 0.6)))
     t = read_trajectory(tmp_path / "t.h5")
     motion, keypoints, binding = parts(two_balls)
-    assert len(t) == 3 and t.motion == motion
+    assert len(t) == 3 and t.info == motion
     assert t.scene.objects == two_balls.objects and t.scene.floor == 0.0
     assert t.scene.background == (0.2, 0.4, 0.6)
     assert t.scene.cameras.names == two_balls.cameras.names

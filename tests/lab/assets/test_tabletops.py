@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from stages.core.errors import InputError
 from stages.core.geometry.rotations import matrix
 from stages.core.geometry.similarity import Similarity
-from stages.core.scene.gaussians import Gaussians, moved
+from stages.core.scene.gaussians import Gaussians, transformed
 from stages.core.scene.scene import Scene
 from stages.core.scene.scene_ply import write_scene
 from stages.lab.assets import tabletops
@@ -106,8 +106,8 @@ def test_what_is_reconstructed_is_judged_in_the_photos_that_were_placed(monkeypa
         assert len(list(photos.iterdir())) == 8
         scene = tabletop("apart", 0, 8)
         move = Similarity(0.5, matrix(torch.tensor([0.8, 0.0, 0.0, 0.6])), torch.tensor([0.1, 0.2, -0.5 * TOP]))
-        g = moved(replace(scene.gaussians, object_id=torch.zeros_like(scene.gaussians.object_id)), move)
-        write_scene(out, Scene(g, cameras=scene.cameras[list(range(1, 8))].moved(move), floor=0.0))
+        g = transformed(replace(scene.gaussians, object_id=torch.zeros_like(scene.gaussians.object_id)), move)
+        write_scene(out, Scene(g, cameras=scene.cameras[list(range(1, 8))].transformed(move), floor=0.0))
 
     monkeypatch.setattr(reconstructed_scene, "reconstruct", perfect)
     row = bench_segment.measure_reconstructed("apart", 0, 8)

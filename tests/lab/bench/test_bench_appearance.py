@@ -6,7 +6,7 @@ import torch
 from stages.core.errors import InputError
 from stages.core.geometry.similarity import Similarity
 from stages.core.raster.rasterise import rasterise
-from stages.core.scene.cameras import Lenses
+from stages.core.scene.cameras import LensDistortion
 from stages.core.scene.gaussians import Gaussians
 from stages.core.scene.scene import Scene
 from stages.lab.bench import appearance as bench
@@ -71,9 +71,9 @@ def test_gaussians_start_as_far_apart_as_their_neighbours():
 def test_points_take_the_colour_that_photos_learned_from_show():
     views, points = photographed(3)
     view = torch.arange(3).repeat_interleave(100)
-    model = SparseModel(views.cameras, Lenses(torch.zeros(3, 5)), points, torch.arange(300), view)
+    model = SparseModel(views.cameras, LensDistortion(torch.zeros(3, 5)), points, torch.arange(300), view)
     half = Similarity(0.5, torch.eye(3), torch.tensor([1.0, 0.0, 0.0]))
-    upright = Views(views.images, views.cameras.moved(half))
+    upright = Views(views.images, views.cameras.transformed(half))
     found, colours = bench.coloured_points(model, half, upright[[0, 2]], [0, 2])
     torch.testing.assert_close(found, half(points[view != 1]))  # only the photo kept out shows the others
     true = torch.cat([_colours(views, i, points[view == i]) for i in (0, 2)])
@@ -105,7 +105,7 @@ def test_the_steps_fit_in_the_seconds(monkeypatch):
     scene = Scene(scene.gaussians, provenance={"upright": move}, background=(0.5, 0.5, 0.5))
     made = Reconstruction(scene, views, [1, 2, 3, 4, 5], [0], {}, [])
     seen = torch.zeros(1, dtype=torch.int64)
-    model = SparseModel(cameras, Lenses(torch.zeros(6, 5)), torch.zeros(1, 3), seen, seen + 1)
+    model = SparseModel(cameras, LensDistortion(torch.zeros(6, 5)), torch.zeros(1, 3), seen, seen + 1)
     side = bench.gsplat_result(made, model, 50.0, "cpu")
     assert side.seconds == pytest.approx(50, rel=0.2) and side.steps == pytest.approx(2000, rel=0.2)
     assert side.gaussians == len(scene.gaussians) and side.psnr < 30

@@ -20,7 +20,7 @@ def elsewhere(cameras: Cameras, seed: int = 0) -> Cameras:
     """The same cameras in a turned, moved world of another scale."""
     generator = torch.Generator().manual_seed(seed)
     R = matrix(torch.randn(4, generator=generator))
-    return cameras.moved(Similarity(0.3, R, torch.randn(3, generator=generator)))
+    return cameras.transformed(Similarity(0.3, R, torch.randn(3, generator=generator)))
 
 
 def tilted(degrees: float) -> torch.Tensor:
@@ -59,7 +59,7 @@ def test_photos_are_matched_by_name():
 @pytest.mark.parametrize("degrees", [0.0, 1.5])
 def test_a_tilt_of_the_world_is_measured(degrees):
     true = ring(8)
-    found = true.moved(Similarity(2.0, tilted(degrees), torch.zeros(3)))
+    found = true.transformed(Similarity(2.0, tilted(degrees), torch.zeros(3)))
     tilt, height = bench.upright_error(found, true, 0.0, 0.0)
     assert tilt == pytest.approx(degrees, abs=0.05)
     assert height < 0.1
@@ -67,7 +67,7 @@ def test_a_tilt_of_the_world_is_measured(degrees):
 
 def test_a_floor_too_low_is_measured_in_shares_of_the_scene():
     true = ring(8)
-    found = true.moved(Similarity(2.0, torch.eye(3), torch.tensor([0.3, 0.1, 0.0])))
+    found = true.transformed(Similarity(2.0, torch.eye(3), torch.tensor([0.3, 0.1, 0.0])))
     _, height = bench.upright_error(found, true, floor=-0.1, true_floor=0.0)
     size = 4 * math.cos(math.radians(25))  # twice the cameras' distance from their middle
     assert height == pytest.approx(100 * 0.05 / size, rel=1e-3)

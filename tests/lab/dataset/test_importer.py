@@ -82,7 +82,7 @@ def test_a_folder_written_by_hand(published, small, tmp_path):
     assert done.exit_code == 0 and "5 frames of duck, phone, 99 Gaussians, 99 keypoints" in done.stdout
     t = read_trajectory(tmp_path / "t.h5")
     assert [(o.id, o.name) for o in t.scene.objects] == [(1, "duck"), (2, "phone")]
-    assert t.motion.dt == 0.02 and t.motion.gravity == (0, 0, -5) and t.scene.floor == -0.94
+    assert t.info.dt == 0.02 and t.info.gravity == (0, 0, -5) and t.scene.floor == -0.94
     assert len(t.scene.gaussians) == 100 and len(t.scene.cameras) == 100
     fallen = t.com[0, 0, 2] - t.com[:, 0, 2]
     torch.testing.assert_close(fallen, 2.5 * (0.02 * torch.arange(FRAMES)) ** 2, rtol=0, atol=2e-4)  # float16, averaged

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from stages.core.geometry.rotations import matrix, multiply, nearest
+from stages.core.geometry.rotations import matrix, multiply, nearest_rotation
 from stages.core.kernels.field import rigid_motion as kernels
 from stages.core.models.field.equivariant import apply
 
@@ -94,7 +94,7 @@ def fitted(
     # a little of the identity: points on a line or in a plane leave a turn open
     eye = torch.eye(3, dtype=arm.dtype, device=arm.device)
     spread = (weight * arm.square()).sum((2, 3))[..., None, None]
-    R = nearest((weight * offset).mT @ arm + 1e-6 * (spread + 1e-6) * eye)
+    R = nearest_rotation((weight * offset).mT @ arm + 1e-6 * (spread + 1e-6) * eye)
     momentum = torch.linalg.cross(weight * offset, drift).sum(2)
     spin = spin_of(momentum, inverse, R)
     turning = torch.linalg.cross(spin[:, :, None].expand_as(offset), offset)

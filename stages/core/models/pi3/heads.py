@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from stages.core.geometry.rotations import nearest
+from stages.core.geometry.rotations import nearest_rotation
 from stages.core.models.pi3.dinov2 import PATCH
 from stages.core.models.pi3.layers import Block
 from stages.core.models.pi3.rope import Rotation
@@ -86,4 +86,4 @@ def orthogonal(nine: Float[Tensor, "b 9"]) -> Float[Tensor, "b 3 3"]:
     Source: Levinson et al. 2020, "An analysis of SVD for deep rotation estimation", eq. 3.
     """
     rows = F.normalize(nine.float().unflatten(-1, (3, 3)), dim=-1)
-    return nearest(rows)
+    return nearest_rotation(rows)

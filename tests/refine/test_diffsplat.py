@@ -20,7 +20,7 @@ from stages.core.scene.scene_ply import read_scene, write_scene
 from stages.evaluate.scenes import nearest_neighbours
 from stages.lab.assets.shapes import ellipsoid
 from stages.refine import diffsplat
-from stages.refine.library import moved, solid
+from stages.refine.library import solid, transformed
 from stages.refine.options import RefineOptions
 from stages.refine.portrait import portrait
 from stages.refine.register import register
@@ -37,7 +37,7 @@ OFF = Similarity(0.94, matrix(torch.tensor([1.0, 0.02, -0.03, 0.02])), torch.ten
 
 @pytest.fixture(scope="module")
 def truth() -> Gaussians:
-    return moved(thing(), PLACE)
+    return transformed(thing(), PLACE)
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +73,7 @@ def perfect(seen, truth):
 
     def generate(image, elevation, prompt, seed):
         assert image.shape == (SIDE, SIDE, 3) and prompt == "toy thing"
-        return to_gaussians(maps_of(moved(moved(truth, back), OFF), elevation), cameras(elevation))
+        return to_gaussians(maps_of(transformed(transformed(truth, back), OFF), elevation), cameras(elevation))
 
     return SimpleNamespace(side=SIDE, generate=generate)
 
@@ -111,7 +111,7 @@ def test_a_hint_helps_where_nothing_stands_out():
     """A plain cylinder's part has no features to match; near a hint it is found."""
     plain = coloured(ellipsoid((0.2, 0.3, 0.5), 8000), (0.5, 0.5, 0.5), 1, grain=0.0)
     there = Similarity(0.4, matrix(torch.tensor([0.8, 0.2, -0.3, 0.1])), torch.tensor([0.2, 0.1, 0.3]))
-    part = moved(plain, there)[plain.means[:, 0] > -0.05]
+    part = transformed(plain, there)[plain.means[:, 0] > -0.05]
     near = Similarity(0.4 * 1.05, there.rotation @ OFF.rotation, there.translation + 0.01)
     found = register(part, plain, hint=near)
     assert found.similarity.scale == pytest.approx(0.4, rel=0.03)

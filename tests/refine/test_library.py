@@ -17,7 +17,7 @@ from stages.core.scene.scene import Scene, SceneObject
 from stages.core.scene.scene_ply import read_scene, write_scene
 from stages.evaluate.scenes import chamfer, nearest_neighbours
 from stages.lab.assets.shapes import ellipsoid
-from stages.refine.library import moved
+from stages.refine.library import transformed
 from stages.refine.options import RefineOptions
 from stages.refine.sight import Sight
 from stages.refine.stage import refine, run
@@ -32,7 +32,7 @@ DARK = 0.85  # the photos show the thing in less light than the library
 
 @pytest.fixture(scope="module")
 def truth():
-    return moved(thing(), PLACE)
+    return transformed(thing(), PLACE)
 
 
 @pytest.fixture(scope="module")
@@ -102,7 +102,7 @@ def test_a_moved_object_looks_as_before_from_a_camera_moved_with_it():
     there = Similarity(1.7, matrix(torch.tensor([0.5, 0.3, -0.6, 0.2])), torch.tensor([1.0, -2.0, 0.5]))
     viewmat, K = look_at(torch.tensor([2.0, 1.0, 1.5]), torch.zeros(3))[None], intrinsics(48, 48, 60.0)[None]
     before = rasterise(g, viewmat, K, 48, 48).rgb
-    after = rasterise(moved(g, there), there.viewmats(viewmat), K, 48, 48).rgb
+    after = rasterise(transformed(g, there), there.viewmats(viewmat), K, 48, 48).rgb
     torch.testing.assert_close(before, after, rtol=0, atol=2e-3)
 
 

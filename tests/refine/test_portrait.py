@@ -15,7 +15,7 @@ from stages.core.raster.rasterise import rasterise
 from stages.core.scene.cameras import Cameras
 from stages.core.scene.images import write_png
 from stages.core.scene.scene import Scene, SceneObject
-from stages.refine.library import moved, solid
+from stages.refine.library import solid, transformed
 from stages.refine.portrait import FILLS, portrait
 from tests.refine.things import thing
 from tests.segment.tabletop import scene_of, table
@@ -32,7 +32,7 @@ def scene() -> Scene:
     K = intrinsics(320, 240, 340.0)
     many = Cameras(torch.cat([viewmats, steep]), K.expand(7, 3, 3).clone(), torch.tensor([[320, 240]] * 7),
                    tuple(f"{i}.jpg" for i in range(7)))  # fmt: skip
-    made = scene_of(table(0.02), moved(thing(0.02), PLACE))
+    made = scene_of(table(0.02), transformed(thing(0.02), PLACE))
     return replace(made, objects=(SceneObject(1, "thing"),), cameras=many)
 
 

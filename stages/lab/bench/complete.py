@@ -32,7 +32,7 @@ from stages.evaluate.scenes import chamfer, nearest_neighbours
 from stages.lab.assets.objects import ObjectsOptions, make_object
 from stages.lab.assets.shapes import sheet, to_gaussians
 from stages.lab.bench import common as bench
-from stages.refine.library import moved
+from stages.refine.library import transformed
 from stages.refine.options import RefineOptions
 from stages.refine.stage import refine
 from stages.simulate.options import SimulateOptions
@@ -69,7 +69,7 @@ def true_scene(placed: str, options: CompleteBenchOptions) -> Scene:
         g = subsample(make_object(name), options.thin)
         low = float((OBJECT_SIZE * g.means[:, 2]).min())
         place = Similarity(OBJECT_SIZE, turn, torch.tensor([1.2 * OBJECT_SIZE * (i - (len(names) - 1) / 2), 0.0, -low]))
-        parts.append(replace(moved(g, place), object_id=torch.full((len(g),), i + 1)))
+        parts.append(replace(transformed(g, place), object_id=torch.full((len(g),), i + 1)))
     objects = tuple(SceneObject(i + 1, name) for i, name in enumerate(names))
     return Scene(concatenate(parts), objects, camera_arc(10, FRONT_AZIMUTH, 28.0), 0.0)
 

@@ -91,9 +91,9 @@ def _weights() -> Iterator[str]:
     """Of the models that `simulate` can use."""
     from stages.core.errors import InputError
     from stages.core.models.checkpoints import find, load
-    from stages.simulate.options import BACKENDS
+    from stages.simulate.options import ENGINES
 
-    for name in BACKENDS.keys() - {"mpm"}:
+    for name in ENGINES.keys() - {"mpm"}:
         try:
             path = find(name)
             card = load(path)[1]

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import torch
 
-from stages.core.physics.keypoints import bind, choose_keypoints
+from stages.core.physics.keypoints import bind_gaussians, choose_keypoints
 from stages.core.scene.files import provenance
 from stages.core.scene.scene import Scene
 from stages.core.scene.scene_ply import read_scene
@@ -35,7 +35,7 @@ def simulate(scene: Scene, out: Path) -> None:
     paths = [heights(float(keypoints.rest[mask, 2].min()) - scene.floor, gravity) for mask in of]
     upright = torch.tensor([[1.0, 0, 0, 0]]).repeat(len(of), 1)
     motion = SimulationInfo(DT, (0.0, 0.0, -gravity), "bounce")
-    with TrajectoryWriter(out, scene, motion, keypoints, bind(scene, keypoints)) as traj:
+    with TrajectoryWriter(out, scene, motion, keypoints, bind_gaussians(scene, keypoints)) as traj:
         for t in range(FRAMES):
             positions = keypoints.rest.clone()
             for mask, path in zip(of, paths, strict=True):

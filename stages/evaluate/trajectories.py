@@ -11,7 +11,7 @@ from torch import Tensor
 
 from stages.core.errors import InputError
 from stages.core.geometry.similarity import Similarity
-from stages.core.physics.keypoints import bind
+from stages.core.physics.keypoints import bind_gaussians
 from stages.core.physics.skinning import Skinning
 from stages.core.scene.gaussians import Gaussians
 from stages.core.scene.scene import Scene
@@ -185,5 +185,5 @@ def transfer_motion(
     turns = torch.tensor([[1.0, 0, 0, 0]]).repeat(q, 1)
     beads = Gaussians(points, turns, torch.ones(q, 3), torch.ones(q), torch.zeros(q, 1, 3), ones)
     keypoints = Keypoints(rest, torch.ones(len(rest), dtype=torch.int64))
-    skinning = Skinning(beads, bind(Scene(beads), keypoints), keypoints)
+    skinning = Skinning(beads, bind_gaussians(Scene(beads), keypoints), keypoints)
     return torch.stack([skinning(frame).means for frame in positions])

@@ -25,15 +25,15 @@ from stages.core.models.external_forces import Pushes
 from stages.core.models.field.solidity import sides, solidity
 from stages.core.models.initial_conditions import FLOOR, World, centre
 from stages.core.models.rollout import Stepper
-from stages.core.physics.forces import Prompts
+from stages.core.physics.forces import ForcePrompts
 from stages.core.physics.materials import PLASTIC, choose_materials
-from stages.core.physics.skinning import rotations
-from stages.core.physics.state import State
+from stages.core.physics.skinning import object_rotations
+from stages.core.physics.state import FrameState
 from stages.core.scene.scene import Scene, SceneObject
 from stages.core.scene.trajectory import Keypoints
-from stages.simulate.mpm import Stage, set_up
+from stages.simulate.mpm import SceneSetup, set_up_scene
 from stages.simulate.options import SimulateOptions
-from stages.simulate.sleep import Sleepers
+from stages.simulate.sleep import SleepState
 
 log = logging.getLogger(__name__)
 SIZE = 0.55  # usual longest side of an object in training [m]
@@ -48,7 +48,7 @@ STRAY = 0.02  # share of keypoints that may lie below the floor that their objec
 
 
 @dataclass(frozen=True)
-class Frame:
+class ModelUnits:
     """From the scene to the model's world and back."""
 
     length: float  # model metres in a scene unit
@@ -59,7 +59,7 @@ class Frame:
     gravity: float  # in the model's world, downwards [m/s^2]
 
     @staticmethod
-    def of(keypoints: list[Float[Tensor, "k 3"]], floor: float, unit: float, gravity: float) -> Frame:
+    def for_objects(keypoints: list[Float[Tensor, "k 3"]], floor: float, unit: float, gravity: float) -> ModelUnits:
         """`keypoints` of each object and `floor` in scene units, `unit` metres each."""
         sides = torch.stack([(p.amax(0) - p.amin(0)).amax() for p in keypoints])
         size = unit * float(sides.median().clamp_min(1e-9))
@@ -69,23 +69,25 @@ class Frame:
         quick = fall / gravity if fall else 1.0  # without weight, time is as it is
         middle = torch.cat(keypoints).mean(0)
         origin = torch.tensor([float(middle[0]), float(middle[1]), floor])
-        return Frame(length, math.sqrt(scale / quick), scale**3, scale * quick, origin, fall)
+        return ModelUnits(length, math.sqrt(scale / quick), scale**3, scale * quick, origin, fall)
 
-    def inside(self, points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
+    def to_model(self, points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
         """Scene units to model metres."""
         return (points - self.origin) * self.length + torch.tensor([0.0, 0.0, FLOOR])
 
 
-def rollout(scene: Scene, keypoints: Keypoints, prompts: Prompts, options: SimulateOptions) -> Iterator[State]:
+def rollout(
+    scene: Scene, keypoints: Keypoints, prompts: ForcePrompts, options: SimulateOptions
+) -> Iterator[FrameState]:
     """One state a frame, the first being the start. Raises InputError when the motion is no longer finite."""
     device = pick_device(options.device)
     model, card = weights.load(weights.find(options.engine, options.weights), device)
     if card.get("warning"):
         log.warning("%s", card["warning"])
-    stage = set_up(scene, prompts, options)
+    stage = set_up_scene(scene, prompts, options)
     ids = [o.id for o in scene.objects]
     each = [keypoints.rest[keypoints.object_id == i] for i in ids]
-    frame = Frame.of(each, stage.box.low[2], scene.metres_per_unit, options.gravity)
+    frame = ModelUnits.for_objects(each, stage.box.low[2], scene.metres_per_unit, options.gravity)
     world = _world(scene, each, stage, frame, prompts, options)
     _warn(world, model)
     pushes = Pushes.of(world, _scaled(prompts, frame, stage, ids), ids)
@@ -93,11 +95,11 @@ def rollout(scene: Scene, keypoints: Keypoints, prompts: Prompts, options: Simul
     log.info("%s (%s): %d objects, %d keypoints, %.3g times as large and %.3g times slower, %d steps a frame",
              options.engine, card["sha256"][:8], len(ids), len(keypoints.rest), frame.length / scene.metres_per_unit,
              frame.time, steps)  # fmt: skip
-    sleepers = Sleepers(world, _awake(world, frame, stage), stage.standing)
+    sleepers = SleepState(world, _awake(world, frame, stage), stage.on_floor)
     log.info("%d objects rest until something reaches them", int(sleepers.asleep.sum()))
     lifted = keypoints.rest + stage.lift[[ids.index(int(i)) for i in keypoints.object_id]]
 
-    def states() -> Iterator[State]:
+    def states() -> Iterator[FrameState]:
         place = world.to(device)
         pinned, dt = pushes.pinned, options.dt * frame.time / steps
         held = replace(pushes, pinned=pinned | sleepers.asleep)
@@ -126,8 +128,9 @@ def rollout(scene: Scene, keypoints: Keypoints, prompts: Prompts, options: Simul
 
 
 def _world(
-    scene: Scene, each: list[Tensor], stage: Stage, frame: Frame, prompts: Prompts, options: SimulateOptions
-) -> World:
+    scene: Scene, each: list[Tensor], stage: SceneSetup, frame: ModelUnits, prompts: ForcePrompts,
+    options: SimulateOptions,
+) -> World:  # fmt: skip
     """The objects where they start, in the model's world."""
     materials = choose_materials(scene.objects, options.material, options.materials)
     most = max(len(p) for p in each)
@@ -136,7 +139,7 @@ def _world(
     velocity, floors = torch.zeros(1, len(each), 3), _floors(each, stage)
     for row, (o, p) in enumerate(zip(scene.objects, each, strict=True)):
         low = torch.tensor([-math.inf, -math.inf, float(floors[row])])  # what ends below would be thrown up
-        points[0, row, : len(p)] = frame.inside(p.maximum(low) + stage.lift[row])
+        points[0, row, : len(p)] = frame.to_model(p.maximum(low) + stage.lift[row])
         valid[0, row, : len(p)] = True
         choice = materials[o.id]
         volume = float(stage.bodies.volume[stage.bodies.body == row].sum()) * scene.metres_per_unit**3
@@ -153,14 +156,14 @@ def _world(
         log.info("object %d (%s): %s, %.3g kg%s", o.id, o.name, choice.name, mass[0, row] / frame.mass, guess)
     box = torch.tensor([[-FAR, -FAR, FLOOR], [FAR, FAR, FAR]]).repeat(len(each), 1, 1)
     if options.box:
-        box[:] = torch.stack([frame.inside(torch.tensor(corner)) for corner in (stage.box.low, stage.box.high)])
+        box[:] = torch.stack([frame.to_model(torch.tensor(corner)) for corner in (stage.box.low, stage.box.high)])
     box[:, 0, 2] = (floors - frame.origin[2]) * frame.length + FLOOR
     gravity = torch.tensor([0.0, 0.0, -frame.gravity])
     return World.of(points, valid, mass=mass, E=E, solidity=firmer, nu=nu, friction=friction, velocity=velocity,
                     gravity=gravity, box=box)  # fmt: skip
 
 
-def _floors(each: list[Float[Tensor, "k 3"]], stage: Stage) -> Float[Tensor, "o"]:
+def _floors(each: list[Float[Tensor, "k 3"]], stage: SceneSetup) -> Float[Tensor, "o"]:
     """How high the floor is under each object [scene units].
 
     What stands on it is where it was seen, for a seat sags and photos do not show undersides: the floor is where its
@@ -168,8 +171,9 @@ def _floors(each: list[Float[Tensor, "k 3"]], stage: Stage) -> Float[Tensor, "o"
     stands on something else falls as deep as others stand.
     """
     ends = torch.stack([p[:, 2].quantile(STRAY) for p in each]).maximum(stage.bottom)
-    usual = ends[stage.stood].median() if bool(stage.stood.any()) else torch.tensor(stage.box.low[2])
-    return torch.where(stage.stood, ends, usual.minimum(ends))
+    on_floor = stage.on_floor_as_seen
+    usual = ends[on_floor].median() if bool(on_floor.any()) else torch.tensor(stage.box.low[2])
+    return torch.where(on_floor, ends, usual.minimum(ends))
 
 
 def _known_stiffness(o: SceneObject, E: float, solidity: float) -> float:
@@ -181,18 +185,18 @@ def _known_stiffness(o: SceneObject, E: float, solidity: float) -> float:
     return known
 
 
-def _awake(world: World, frame: Frame, stage: Stage) -> Bool[Tensor, "o"]:
+def _awake(world: World, frame: ModelUnits, stage: SceneSetup) -> Bool[Tensor, "o"]:
     """Objects that are thrown or lifted; all, where weight does not hold them down."""
     return (world.velocity[0] != 0).any(-1) | (stage.lift != 0).any(-1) | (frame.gravity <= 0)
 
 
-def _pushed(prompts: Prompts, ids: list[int], start: float, end: float) -> Bool[Tensor, "o"]:
+def _pushed(prompts: ForcePrompts, ids: list[int], start: float, end: float) -> Bool[Tensor, "o"]:
     """Objects that are pushed at some time from `start` to `end` [s]."""
-    now = {f.object_id for f in prompts.forces if f.overlap(start, end) > 0}
+    now = {f.object_id for f in prompts.forces if f.active_fraction(start, end) > 0}
     return torch.tensor([i in now for i in ids])
 
 
-def _scaled(prompts: Prompts, frame: Frame, stage: Stage, ids: list[int]) -> Prompts:
+def _scaled(prompts: ForcePrompts, frame: ModelUnits, stage: SceneSetup, ids: list[int]) -> ForcePrompts:
     """Pushes in the model's units."""
     metres = frame.mass ** (1 / 3)
     newtons = frame.mass * metres / frame.time**2
@@ -201,7 +205,7 @@ def _scaled(prompts: Prompts, frame: Frame, stage: Stage, ids: list[int]) -> Pro
         at = None
         if f.at is not None:
             row = ids.index(f.object_id)
-            at = tuple(frame.inside(torch.tensor(f.at) + stage.lift[row]).tolist())
+            at = tuple(frame.to_model(torch.tensor(f.at) + stage.lift[row]).tolist())
         return replace(
             f, force=tuple(newtons * v for v in f.force), torque=tuple(newtons * metres * v for v in f.torque),
             start=f.start * frame.time, end=f.end * frame.time, at=at,
@@ -232,12 +236,12 @@ def _warn(world: World, model: Dynamics) -> None:
 
 def _state(
     keypoints: Keypoints, ids: list[int], lifted: Float[Tensor, "p 3"], world: World, moved: Float[Tensor, "1 o n 3"],
-    stage: Stage,
-) -> State:  # fmt: skip
+    stage: SceneSetup,
+) -> FrameState:  # fmt: skip
     """Keypoints have `moved` [scene units] since the start, where they are exactly as seen, but for the lift."""
     positions, moved = lifted.clone(), moved.cpu()
     for row, i in enumerate(ids):
         mine = keypoints.object_id == i
         positions[mine] += moved[0, row, : int(mine.sum())]
     start = torch.stack([lifted[keypoints.object_id == i].mean(0) for i in ids])
-    return State(positions, start + centre(world.to("cpu"), moved)[0], rotations(keypoints, positions, ids))
+    return FrameState(positions, start + centre(world.to("cpu"), moved)[0], object_rotations(keypoints, positions, ids))

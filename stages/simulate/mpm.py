@@ -17,17 +17,17 @@ from torch import Tensor
 from stages.core.backends import pick_device
 from stages.core.errors import InputError
 from stages.core.geometry.neighbours import knn
-from stages.core.physics.forces import Force, Prompts, vector
+from stages.core.physics.forces import Force, ForcePrompts, vector
 from stages.core.physics.keypoints import nearest_weights
-from stages.core.physics.materials import Choice, choose_materials
+from stages.core.physics.materials import MaterialChoice, choose_materials
 from stages.core.physics.mpm import solver as mpm
-from stages.core.physics.mpm.resample import halved
-from stages.core.physics.particles import Bodies, sample
-from stages.core.physics.skinning import rotations
-from stages.core.physics.state import State
+from stages.core.physics.mpm.resample import subdivide
+from stages.core.physics.particles import Bodies, sample_bodies
+from stages.core.physics.skinning import object_rotations
+from stages.core.physics.state import FrameState
 from stages.core.scene.scene import Scene, SceneObject
 from stages.core.scene.trajectory import Keypoints
-from stages.simulate.options import Quality, SimulateOptions
+from stages.simulate.options import MpmQuality, SimulateOptions
 
 log = logging.getLogger(__name__)
 NEAR = 8  # particles that a keypoint follows
@@ -36,23 +36,25 @@ FINE = 2e-5  # shortest substep worth taking on a GPU [s]
 
 
 @dataclass(frozen=True)
-class Stage:
+class SceneSetup:
     """Where everything stands at the start, in scene units."""
 
     bodies: Bodies  # as seen
     lift: Float[Tensor, "o 3"]  # asked for by the user, and shown
-    standing: Bool[Tensor, "o"]  # on the floor
-    settled: Float[Tensor, "o 3"]  # taken on by the simulation alone, so that what stands on the floor touches it
+    on_floor: Bool[Tensor, "o"]  # on the floor
+    floor_offset: Float[Tensor, "o 3"]  # taken on by the simulation alone, so that what stands on the floor touches it
     bottom: Float[Tensor, "o"]  # where each ends below, as seen
-    stood: Bool[Tensor, "o"]  # on the floor, as seen
+    on_floor_as_seen: Bool[Tensor, "o"]  # on the floor, as seen
     box: mpm.Box
 
     @property
     def start(self) -> Float[Tensor, "p 3"]:
-        return self.bodies.x + (self.lift + self.settled)[self.bodies.body]
+        return self.bodies.x + (self.lift + self.floor_offset)[self.bodies.body]
 
 
-def rollout(scene: Scene, keypoints: Keypoints, prompts: Prompts, options: SimulateOptions) -> Iterator[State]:
+def rollout(
+    scene: Scene, keypoints: Keypoints, prompts: ForcePrompts, options: SimulateOptions
+) -> Iterator[FrameState]:
     """One state a frame, the first being the start.
 
     Raises InputError when a body leaves the box or its motion is no longer finite.
@@ -62,7 +64,7 @@ def rollout(scene: Scene, keypoints: Keypoints, prompts: Prompts, options: Simul
     if fine:  # it costs seconds there: bodies at twice the resolution, and stiffer
         level = replace(level, substep=min(level.substep, FINE))
     materials = choose_materials(scene.objects, options.material, options.materials)
-    stage = set_up(scene, prompts, options, fine)
+    stage = set_up_scene(scene, prompts, options, fine)
     body, dx = stage.bodies.body, 2 * stage.bodies.spacing * unit
     particles = _particles(scene, stage, materials, prompts, options, level)
     # particles keep a spacing inside of what they stand for, on the floor as well
@@ -81,7 +83,7 @@ def rollout(scene: Scene, keypoints: Keypoints, prompts: Prompts, options: Simul
         len(particles), dx, solver.grid.count, options.dt / substeps, substeps,
     )  # fmt: skip
 
-    def states() -> Iterator[State]:
+    def states() -> Iterator[FrameState]:
         for frame in range(options.steps):
             now = solver.particles
             x = now.x.cpu()
@@ -104,11 +106,11 @@ def _went_wrong(o: SceneObject, time: float) -> InputError:
     )
 
 
-def set_up(scene: Scene, prompts: Prompts, options: SimulateOptions, fine: bool = False) -> Stage:
+def set_up_scene(scene: Scene, prompts: ForcePrompts, options: SimulateOptions, fine: bool = False) -> SceneSetup:
     """Particles, and the box they live in; what hovers or sinks a little at the floor is settled onto it."""
-    bodies = sample(scene, options.level.particles, options.seed)
+    bodies = sample_bodies(scene, options.level.particles, options.seed)
     if fine:
-        bodies = halved(bodies, options.seed)
+        bodies = subdivide(bodies, options.seed)
     count, h = len(scene.objects), bodies.spacing
     lift = torch.zeros(count, 3)
     for row, o in enumerate(scene.objects):
@@ -148,7 +150,7 @@ def set_up(scene: Scene, prompts: Prompts, options: SimulateOptions, fine: bool 
         raise InputError(f"--box {options.box}: object {o.id} ({o.name}) is not inside; it spans "
                          f"{_span(x[bodies.body == list(scene.objects).index(o)])}")  # fmt: skip
     seen = x - (lift + settled)[bodies.body]
-    return Stage(replace(bodies, x=seen), lift, standing, settled, bottom, stood, box)
+    return SceneSetup(replace(bodies, x=seen), lift, standing, settled, bottom, stood, box)
 
 
 def vector_box(text: str) -> mpm.Box:
@@ -183,8 +185,8 @@ def _box(x: Float[Tensor, "p 3"], floor: float, h: float) -> mpm.Box:
 
 
 def _particles(
-    scene: Scene, stage: Stage, materials: dict[int, Choice], prompts: Prompts, options: SimulateOptions,
-    level: Quality,
+    scene: Scene, stage: SceneSetup, materials: dict[int, MaterialChoice], prompts: ForcePrompts,
+    options: SimulateOptions, level: MpmQuality,
 ) -> mpm.Particles:  # fmt: skip
     """Particles in metres, with each object's material, made soft enough for the quality's substep."""
     unit, body = scene.metres_per_unit, stage.bodies.body
@@ -195,14 +197,14 @@ def _particles(
     for row, o in enumerate(scene.objects):
         choice = materials[o.id]
         m = choice.material
-        E = min(m.E, mpm.stiffest(fastest, m.nu, m.density))
+        E = min(m.E, mpm.modulus_at_wave_speed(fastest, m.nu, m.density))
         size = unit * float((stage.bodies.x[body == row].amax(0) - stage.bodies.x[body == row].amin(0)).max())
         # loss factor of a bar's slowest vibration, omega = pi c / L (damping E omega_1 / omega is Kelvin-Voigt's)
         viscosity = m.loss * E * size / (math.pi * math.sqrt(E / m.density))
         viscosity = min(viscosity, 0.85 * mpm.VISCOUS * m.density * (2 * h) ** 2 / level.substep)
         friction = m.friction if options.friction is None else options.friction
         rows[row] = torch.tensor([E, m.density, m.nu, viscosity, friction, mpm.MODELS[m.model],
-                                  *mpm.numbers(m.model, m.plastic, E / m.E)])  # fmt: skip
+                                  *mpm.plastic_parameters(m.model, m.plastic, E / m.E)])  # fmt: skip
         velocity[row] = unit * torch.tensor(prompts.velocity.get(o.id, (0.0, 0.0, 0.0)))
         held[row] = o.id in prompts.pinned
         mass = float(m.density * volume[body == row].sum())
@@ -219,7 +221,7 @@ def _particles(
     return particles
 
 
-def _tell_stuck(scene: Scene, stage: Stage, prompts: Prompts) -> None:
+def _tell_stuck(scene: Scene, stage: SceneSetup, prompts: ForcePrompts) -> None:
     """Warns of what is to be pushed and touches others: with one velocity at each node, bodies hold each other."""
     x, body = stage.start, stage.bodies.body
     pushed = {f.object_id for f in prompts.forces} | set(prompts.velocity)
@@ -239,7 +241,7 @@ def _tell_stuck(scene: Scene, stage: Stage, prompts: Prompts) -> None:
 class _Push:
     """A force prompt as accelerations [m/s^2] of the particles of its object."""
 
-    def __init__(self, force: Force, particles: mpm.Particles, stage: Stage, row: int):
+    def __init__(self, force: Force, particles: mpm.Particles, stage: SceneSetup, row: int):
         self.force, self.mass = force, particles.mass
         self.mine = (stage.bodies.body == row).float() * (particles.held == 0)
         share = self.mine.clone()
@@ -251,7 +253,7 @@ class _Push:
         self.share = share / (share * self.mass).sum().clamp_min(1e-30)  # sum of mass x share is 1
 
     def __call__(self, x: Float[Tensor, "p 3"], start: float, end: float) -> Float[Tensor, "p 3"]:
-        acting = self.force.overlap(start, end)
+        acting = self.force.active_fraction(start, end)
         if not acting:
             return torch.zeros_like(x)
         push = self.share[:, None] * torch.tensor(self.force.force)
@@ -278,9 +280,9 @@ def _follow(scene: Scene, keypoints: Keypoints, bodies: Bodies) -> tuple[Int[Ten
 
 
 def _state(
-    scene: Scene, keypoints: Keypoints, stage: Stage, follow: tuple[Tensor, Tensor], x: Float[Tensor, "p 3"],
+    scene: Scene, keypoints: Keypoints, stage: SceneSetup, follow: tuple[Tensor, Tensor], x: Float[Tensor, "p 3"],
     F: Float[Tensor, "p 3 3"], mass: Float[Tensor, "p"],
-) -> State:  # fmt: skip
+) -> FrameState:  # fmt: skip
     """Keypoints move with the particles around them and with their deformation; at the start exactly by the lift."""
     index, weight = follow
     bodies = stage.bodies
@@ -291,4 +293,5 @@ def _state(
     positions = keypoints.rest + stage.lift[row] + (weight[..., None] * (moved[index] + turned)).sum(1)
     total = torch.zeros(len(scene.objects)).index_add(0, bodies.body, mass)
     com = torch.zeros(len(scene.objects), 3).index_add(0, bodies.body, mass[:, None] * x) / total[:, None]
-    return State(positions, com - stage.settled, rotations(keypoints, positions, [o.id for o in scene.objects]))
+    rotation = object_rotations(keypoints, positions, [o.id for o in scene.objects])
+    return FrameState(positions, com - stage.floor_offset, rotation)

@@ -8,14 +8,14 @@ from pathlib import Path
 
 from stages.core.errors import InputError
 
-BACKENDS = {
+ENGINES = {
     "ngff": "stages.simulate.learned:rollout",
     "mpm": "stages.simulate.mpm:rollout",
 }
 
 
 @dataclass(frozen=True)
-class Quality:
+class MpmQuality:
     """What a word like "normal" stands for."""
 
     particles: int  # of all objects together; grid spacing follows, at eight in a full cell
@@ -23,9 +23,9 @@ class Quality:
 
 
 QUALITIES = {
-    "draft": Quality(particles=6_000, substep=3e-4),
-    "normal": Quality(particles=20_000, substep=1.5e-4),
-    "high": Quality(particles=120_000, substep=2e-5),
+    "draft": MpmQuality(particles=6_000, substep=3e-4),
+    "normal": MpmQuality(particles=20_000, substep=1.5e-4),
+    "high": MpmQuality(particles=120_000, substep=2e-5),
 }
 
 
@@ -68,5 +68,5 @@ class SimulateOptions:
             raise InputError(f"--floor {self.floor}: must be a finite height")
 
     @property
-    def level(self) -> Quality:
+    def level(self) -> MpmQuality:
         return QUALITIES[self.quality]

@@ -18,7 +18,7 @@ SEAM = 0.1  # the same of things at the start: photos show little of where they 
 STIR = 0.25  # what would make something so fast if it stuck to it wakes it [m/s]
 
 
-class Sleepers:
+class SleepState:
     """Which objects of a scene sleep; `awake` (o) are those that are thrown, lifted, or pushed at once.
 
     The others sleep if they are `standing` on the floor (o), or touch what sleeps and does so.

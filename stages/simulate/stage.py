@@ -12,19 +12,19 @@ from tqdm import tqdm
 from stages.core.backends import choose
 from stages.core.errors import InputError
 from stages.core.physics import forces
-from stages.core.physics.keypoints import bind, choose_keypoints
+from stages.core.physics.keypoints import bind_gaussians, choose_keypoints
 from stages.core.scene.files import provenance
 from stages.core.scene.scene import Scene
 from stages.core.scene.scene_ply import read_scene
 from stages.core.scene.trajectory import SimulationInfo, TrajectoryWriter
-from stages.simulate.options import BACKENDS, SimulateOptions
+from stages.simulate.options import ENGINES, SimulateOptions
 
 log = logging.getLogger(__name__)
 
 
 def run(scene: Path, out: Path, options: SimulateOptions = SimulateOptions()) -> None:  # noqa: B008 -- frozen
     """Roll the objects of a scene forward in time: scene.ply -> traj.h5."""
-    rollout = choose(BACKENDS, options.engine)
+    rollout = choose(ENGINES, options.engine)
     world = with_objects(read_scene(scene), scene)
     prompts = forces.parse(
         world.objects, Path(scene).stem, options.force, options.forces, options.pin, options.velocity, options.lift
@@ -36,7 +36,7 @@ def run(scene: Path, out: Path, options: SimulateOptions = SimulateOptions()) ->
     motion = SimulationInfo(options.dt, gravity, options.engine, prompts.as_dicts())
     states = rollout(world, keypoints, prompts, options)
     start, furthest = None, 0.0
-    with TrajectoryWriter(out, world, motion, keypoints, bind(world, keypoints)) as trajectory:
+    with TrajectoryWriter(out, world, motion, keypoints, bind_gaussians(world, keypoints)) as trajectory:
         for state in tqdm(states, total=options.steps, unit="frame"):
             trajectory.append(state.positions, state.com, state.rotation)
             start = state.positions if start is None else start

@@ -5,7 +5,7 @@ from dataclasses import replace
 import torch
 
 from stages.core.geometry.rotations import matrix
-from stages.core.physics.keypoints import bind
+from stages.core.physics.keypoints import bind_gaussians
 from stages.core.scene.trajectory import Keypoints, SimulationInfo, TrajectoryWriter
 
 
@@ -35,7 +35,7 @@ def write(path, scene, seed: int = 0, count: int = 100, frames: int = 12, dt: fl
     rows = torch.cat(rows)
     keypoints = Keypoints(g.means[rows], g.object_id[rows])
     info = SimulationInfo(dt, (0.0, 0.0, -9.81), "test")
-    with TrajectoryWriter(path, scene, info, keypoints, bind(scene, keypoints)) as out:
+    with TrajectoryWriter(path, scene, info, keypoints, bind_gaussians(scene, keypoints)) as out:
         for t in range(frames):
             positions = moved(keypoints.rest, keypoints.object_id, t, **motion)
             com = torch.stack([positions[keypoints.object_id == o.id].mean(0) for o in scene.objects])

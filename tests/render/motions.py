@@ -2,7 +2,7 @@
 
 import torch
 
-from stages.core.physics.keypoints import bind
+from stages.core.physics.keypoints import bind_gaussians
 from stages.core.scene.trajectory import Keypoints, SimulationInfo, TrajectoryWriter
 
 
@@ -14,7 +14,7 @@ def rising(path, scene, frames: int = 5, step: float = 0.01, forces: tuple = ())
     motion = SimulationInfo(0.02, (0.0, 0.0, 0.0), "test", forces)
     centres = torch.stack([g.means[g.object_id == o.id].mean(0) for o in scene.objects])
     turns = torch.tensor([[1.0, 0, 0, 0]]).repeat(len(scene.objects), 1)
-    with TrajectoryWriter(path, scene, motion, keypoints, bind(scene, keypoints)) as out:
+    with TrajectoryWriter(path, scene, motion, keypoints, bind_gaussians(scene, keypoints)) as out:
         for t in range(frames):
             up = torch.tensor([0.0, 0.0, step * t])
             out.append(keypoints.rest + up, centres + up, turns)

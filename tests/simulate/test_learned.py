@@ -12,7 +12,7 @@ from stages.core.scene.gaussians import concatenate
 from stages.core.scene.scene import Scene, SceneObject
 from stages.core.scene.scene_ply import write_scene
 from stages.core.scene.trajectory import read_trajectory
-from stages.simulate.learned import Frame, _known_stiffness, _warn
+from stages.simulate.learned import ModelUnits, _known_stiffness, _warn
 from stages.simulate.options import SimulateOptions
 from stages.simulate.stage import run
 from tests.conftest import ball
@@ -97,10 +97,10 @@ def test_units_and_the_height_of_the_floor_do_not_matter(two_balls, tmp_path, un
 @pytest.mark.parametrize(("size", "scale"), [(0.5, 1.0), (0.26, 1.0), (0.05, 11.0), (5.5, 0.1)])
 def test_things_of_sizes_known_from_training_keep_their_size(size, scale):
     cube = size * torch.tensor([[0.0, 0, 0], [1, 1, 1]])
-    frame = Frame.of([cube, cube], 2.0, 1.0, 5.0)
+    frame = ModelUnits.for_objects([cube, cube], 2.0, 1.0, 5.0)
     assert frame.length == pytest.approx(scale, rel=1e-4) and frame.mass == pytest.approx(scale**3, rel=1e-3)
     assert frame.time == pytest.approx(scale**0.5, rel=1e-3) and frame.stress == pytest.approx(scale, rel=1e-3)
-    assert float(frame.inside(torch.tensor([0.0, 0, 2.0]))[2]) == pytest.approx(FLOOR)
+    assert float(frame.to_model(torch.tensor([0.0, 0, 2.0]))[2]) == pytest.approx(FLOOR)
 
 
 class Deaf:

@@ -8,14 +8,13 @@ import pytest
 import torch
 
 from stages.core.errors import InputError
-from stages.core.physics.forces import Prompts
-from stages.core.physics.materials import GUESS
+from stages.core.physics.forces import ForcePrompts
 from stages.core.scene.gaussians import concatenate
 from stages.core.scene.scene import Scene, SceneObject
 from stages.core.scene.scene_ply import read_scene, write_scene
 from stages.core.scene.trajectory import Trajectory, read_trajectory
 from stages.simulate import mpm as engine
-from stages.simulate.options import QUALITIES, Quality, SimulateOptions
+from stages.simulate.options import QUALITIES, MpmQuality, SimulateOptions
 from stages.simulate.stage import run, with_objects
 from tests.conftest import ball
 
@@ -26,7 +25,7 @@ SAG = 0.025
 
 @pytest.fixture(autouse=True)
 def tiny(monkeypatch):
-    monkeypatch.setitem(QUALITIES, "draft", Quality(particles=1200, substep=8e-4))
+    monkeypatch.setitem(QUALITIES, "draft", MpmQuality(particles=1200, substep=8e-4))
 
 
 @pytest.fixture
@@ -63,7 +62,7 @@ def test_the_first_frame_is_the_scene_and_falling_is_a_parabola(balls, caplog):
     assert float(t.com[-1, 1, 2] - t.com[0, 1, 2]) == pytest.approx(-9.81 * 0.1**2 / 2, rel=0.02)
     assert shift(t, 1).norm() < SAG  # stands
     assert (t.binding.index[t.scene.gaussians.object_id == 0] == -1).all()
-    assert f"material not known, taking {GUESS}" in caplog.text and "substep" in caplog.text
+    assert f"material not known, taking {DEFAULT_MATERIAL}" in caplog.text and "substep" in caplog.text
     assert t.scene.provenance["command"] == "simulate"
 
 
@@ -202,8 +201,9 @@ def test_an_unknown_engine(balls):
 
 
 def test_at_twice_the_resolution_bodies_stand_where_they_did(balls):
-    stage = engine.set_up(with_objects(read_scene(balls), balls), Prompts(), SimulateOptions(quality="draft"))
-    fine = engine.set_up(with_objects(read_scene(balls), balls), Prompts(), SimulateOptions(quality="draft"), True)
+    scene, options = with_objects(read_scene(balls), balls), SimulateOptions(quality="draft")
+    stage = engine.set_up_scene(scene, ForcePrompts(), options)
+    fine = engine.set_up_scene(scene, ForcePrompts(), options, True)
     assert fine.bodies.spacing == stage.bodies.spacing / 2 and len(fine.start) > 6 * len(stage.start)
     # both stand on the floor, as seen
     for s in (stage, fine):

@@ -10,7 +10,7 @@ from stages.core.models.initial_conditions import FLOOR, World
 from stages.core.scene.scene_ply import write_scene
 from stages.core.scene.trajectory import read_trajectory
 from stages.simulate.options import SimulateOptions
-from stages.simulate.sleep import SEAM, Sleepers
+from stages.simulate.sleep import SEAM, SleepState
 from stages.simulate.stage import run
 
 SIDE = 0.3
@@ -24,9 +24,9 @@ def stacked(*heights: float, aside: float = 0.0) -> World:
     return World.of(points[None])
 
 
-def sleepers_of(world: World, awake: torch.Tensor) -> Sleepers:
+def sleepers_of(world: World, awake: torch.Tensor) -> SleepState:
     """With what is at the height of the floor standing on it."""
-    return Sleepers(world, awake, world.points[0, ..., 2].amin(1) < FLOOR + 1e-3)
+    return SleepState(world, awake, world.points[0, ..., 2].amin(1) < FLOOR + 1e-3)
 
 
 def none(count: int) -> torch.Tensor:

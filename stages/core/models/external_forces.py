@@ -11,7 +11,7 @@ from torch import Tensor
 
 from stages.core.models.field.equivariant import symmetric_solve
 from stages.core.models.initial_conditions import World, centre, inertia
-from stages.core.physics.forces import Prompts
+from stages.core.physics.forces import ForcePrompts
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Pushes:
         return cls(whole, vector, vector, real, real, whole, valid.new_zeros(b, o))
 
     @classmethod
-    def of(cls, world: World, prompts: Prompts, ids: list[int]) -> Pushes:
+    def of(cls, world: World, prompts: ForcePrompts, ids: list[int]) -> Pushes:
         """The pushes and pins of a user's prompts for a world of one scene, whose rows are the objects `ids`.
 
         A push at a place takes hold of the keypoint nearest to it. Velocities and lifts belong into the world.

@@ -26,9 +26,9 @@ class Collider:
     kind: str  # plane, sphere or box
     centre: Vector  # [m]; any point of the plane
     size: Vector = (0.0, 0.0, 0.0)  # half edges of a box; the first is the radius of a sphere [m]
-    turn: tuple[float | int, float | int, float | int, float | int] = (1.0, 0.0, 0.0, 0.0)  # local to world, w x y z
+    rotation: tuple[float | int, float | int, float | int, float | int] = (1.0, 0.0, 0.0, 0.0)  # to world, w x y z
     velocity: Vector = (0.0, 0.0, 0.0)  # [m/s]
-    spin: Vector = (0.0, 0.0, 0.0)  # about the centre [rad/s]
+    angular_velocity: Vector = (0.0, 0.0, 0.0)  # about the centre [rad/s]
     surface: str = "separate"
     friction: float = 0.5  # Coulomb coefficient
     restitution: float = 0.0  # 0: a body bounces by its own elasticity; up to 1: this gives back that share of speed
@@ -40,15 +40,15 @@ class Collider:
         if self.friction < 0 or not 0 <= self.restitution <= 1:
             raise InputError("a collider's friction must be 0 or more, and restitution 0 to 1")
 
-    def after(self, duration: float) -> Collider:
+    def advanced(self, duration: float) -> Collider:
         """The collider `duration` [s] later."""
         centre = tuple(c + duration * v for c, v in zip(self.centre, self.velocity, strict=True))
-        rate = math.sqrt(sum(s * s for s in self.spin))
+        rate = math.sqrt(sum(s * s for s in self.angular_velocity))
         if not rate:
             return replace(self, centre=centre)
         half = rate * duration / 2
-        a = (math.cos(half), *(math.sin(half) * s / rate for s in self.spin))
-        return replace(self, centre=centre, turn=_product(a, self.turn))
+        a = (math.cos(half), *(math.sin(half) * s / rate for s in self.angular_velocity))
+        return replace(self, centre=centre, rotation=_product(a, self.rotation))
 
 
 def _product(a: tuple, b: tuple) -> tuple[float, float, float, float]:
@@ -65,10 +65,10 @@ def as_obstacles(colliders: Sequence[Collider], device: str) -> wp.array:
         o = mpm_grid.Obstacle()
         o.kind, o.surface = KINDS[c.kind], SURFACES[c.surface]
         o.centre, o.size = wp.vec3(*c.centre), wp.vec3(*c.size)
-        length = math.sqrt(sum(q * q for q in c.turn))
-        w, x, y, z = (q / length for q in c.turn)
+        length = math.sqrt(sum(q * q for q in c.rotation))
+        w, x, y, z = (q / length for q in c.rotation)
         o.turn = wp.quat(x, y, z, w)
-        o.velocity, o.spin = wp.vec3(*c.velocity), wp.vec3(*c.spin)
+        o.velocity, o.spin = wp.vec3(*c.velocity), wp.vec3(*c.angular_velocity)
         o.friction, o.restitution = c.friction, c.restitution
         rows.append(o)
     return wp.array(rows, dtype=mpm_grid.Obstacle, device=device) if rows else wp.empty(0, mpm_grid.Obstacle, device)

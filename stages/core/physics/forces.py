@@ -33,13 +33,13 @@ class Force:
     end: float = math.inf
     at: Vector | None = None  # where on the object at rest [scene units]; None: on the whole of it
 
-    def overlap(self, start: float, end: float) -> float:
+    def active_fraction(self, start: float, end: float) -> float:
         """Share of the time from `start` to `end` in which it acts."""
         return max(0.0, min(self.end, end) - max(self.start, start)) / (end - start)
 
 
 @dataclass(frozen=True)
-class Prompts:
+class ForcePrompts:
     """What the user wants to happen."""
 
     forces: tuple[Force, ...] = ()
@@ -65,12 +65,12 @@ class Prompts:
 def parse(
     objects: Sequence[SceneObject], scene_name: str = "", force: Sequence[str] = (), forces: Path | None = None,
     pin: Sequence[str] = (), velocity: Sequence[str] = (), lift: Sequence[str] = (),
-) -> Prompts:  # fmt: skip
+) -> ForcePrompts:  # fmt: skip
     """Prompts of the command line and of a forces file; objects are meant by id or by name."""
     pushes = [_force(text, objects) for text in force]
     if forces is not None:
         pushes += read_forces(forces, scene_name, objects)
-    return Prompts(
+    return ForcePrompts(
         tuple(pushes),
         frozenset(find_object(p, objects, f"--pin {p!r}").id for p in pin),
         dict(_velocity(text, objects) for text in velocity),

@@ -11,7 +11,7 @@ from stages.core.physics.particles import inliers, usable
 from stages.core.scene.scene import Scene
 from stages.core.scene.trajectory import Binding, Keypoints
 
-FOLLOWED = 8  # keypoints that a Gaussian follows
+KEYPOINTS_PER_GAUSSIAN = 8  # keypoints that a Gaussian follows
 CANDIDATES = 30_000  # Gaussians among which keypoints are chosen
 
 
@@ -57,17 +57,17 @@ def choose_keypoints(scene: Scene, count: int, seed: int = 0) -> Keypoints:
     return Keypoints(torch.cat(rest), torch.cat(ids))
 
 
-def bind(scene: Scene, keypoints: Keypoints) -> Binding:
+def bind_gaussians(scene: Scene, keypoints: Keypoints) -> Binding:
     """Each Gaussian of an object follows its 8 nearest keypoints of that object; the background follows none."""
     g = scene.gaussians.to("cpu")
-    index = torch.full((len(g), FOLLOWED), -1, dtype=torch.int64)
-    weight = torch.zeros(len(g), FOLLOWED)
+    index = torch.full((len(g), KEYPOINTS_PER_GAUSSIAN), -1, dtype=torch.int64)
+    weight = torch.zeros(len(g), KEYPOINTS_PER_GAUSSIAN)
     placed = g.means.isfinite().all(1)
     for id in keypoints.object_id.unique():
         mine = ((g.object_id == id) & placed).nonzero()[:, 0]
         own = (keypoints.object_id == id).nonzero()[:, 0]
         if len(mine):
-            near, weight[mine] = nearest_weights(keypoints.rest[own], g.means[mine], FOLLOWED)
+            near, weight[mine] = nearest_weights(keypoints.rest[own], g.means[mine], KEYPOINTS_PER_GAUSSIAN)
             index[mine] = own[near]
     return Binding(index, weight)
 

@@ -95,11 +95,11 @@ ALIASES = {
     "fruit": ["apple", "banana", "orange", "lemon", "pear"],
     "ball": ["soccer", "football", "basketball"],
 }
-GUESS = "common"
+DEFAULT_MATERIAL = "common"
 
 
 @dataclass(frozen=True)
-class Choice:
+class MaterialChoice:
     """What an object is made of, and why."""
 
     name: str
@@ -109,9 +109,9 @@ class Choice:
 
 def choose_materials(
     objects: Sequence[SceneObject], prompts: Sequence[str] = (), file: Path | None = None
-) -> dict[int, Choice]:
+) -> dict[int, MaterialChoice]:
     """Material of each object id: --material over --materials over the scene file over the object's name."""
-    told: dict[int, Choice] = {}
+    told: dict[int, MaterialChoice] = {}
     for key, value in (_read(file) if file else {}).items():
         told[find_object(key, objects, f"{file}").id] = _material(value, f"{file}: {key}")
     for prompt in prompts:
@@ -135,25 +135,25 @@ def find_object(key: str | int, objects: Sequence[SceneObject], where: str) -> S
     raise InputError(f"{where}: {text!r} {problem}; there are: {have}")
 
 
-def _by_name(o: SceneObject) -> Choice:
+def _by_name(o: SceneObject) -> MaterialChoice:
     if o.material:
         return _material(o.material, f"object {o.id} ({o.name}) of the scene")
     words = set(re.findall(r"[a-z]+(?:-[a-z]+)?", o.name.lower()))
     words |= {word.removesuffix("s") for word in words}
     # what a thing is says more than an adjective: "rubber duck" is the duck
     for name in sorted(words & MATERIALS.keys(), key=lambda name: not MATERIALS[name].source.startswith(PAPER)):
-        return Choice(name, MATERIALS[name])
+        return MaterialChoice(name, MATERIALS[name])
     for name, others in ALIASES.items():
         if words & set(others):
-            return Choice(name, MATERIALS[name])
-    return Choice(GUESS, MATERIALS[GUESS], guessed=True)
+            return MaterialChoice(name, MATERIALS[name])
+    return MaterialChoice(DEFAULT_MATERIAL, MATERIALS[DEFAULT_MATERIAL], guessed=True)
 
 
-def _material(value: object, where: str) -> Choice:
+def _material(value: object, where: str) -> MaterialChoice:
     if isinstance(value, str):
         if value.lower() not in MATERIALS:
             raise InputError(f"{where}: no material called {value!r}; choose from {', '.join(MATERIALS)}")
-        return Choice(value.lower(), MATERIALS[value.lower()])
+        return MaterialChoice(value.lower(), MATERIALS[value.lower()])
     known = [f.name for f in fields(Material) if f.name != "source"]
     model, plastic = "neo-hookean", (0.0, 0.0, 0.0)
     if not isinstance(value, dict) or not {"E", "density"} <= value.keys() or value.keys() - set(known):
@@ -174,7 +174,7 @@ def _material(value: object, where: str) -> Choice:
         raise InputError(f"{where}: E and density must be positive and nu between -0.5 and 0.49")
     if not (0 <= material.friction < 100 and 0 <= material.loss <= 2):
         raise InputError(f"{where}: friction must be 0 or more and loss between 0 and 2")
-    return Choice("custom", material)
+    return MaterialChoice("custom", material)
 
 
 def _read(file: Path) -> dict:

@@ -31,7 +31,7 @@ log = logging.getLogger(__name__)
 
 OPACITY = 0.02  # fainter Gaussians are no matter
 OUTLIER = 3.5  # robust z-score of the distance to the median centre (Iglewicz and Hoaglin 1993)
-FEWEST = 40  # particles of an object
+MIN_PARTICLES = 40  # particles of an object
 ALONG = 300  # most voxels along an object
 SAMPLES = 1_000_000  # most points taken from the Gaussians of an object
 LEAKS, WIDER = (2, 3, 4, 5, 6, 8), 1.5  # half widths of holes in shells [voxels]; hollows are so much wider
@@ -49,12 +49,12 @@ class Bodies:
     spacing: float  # edge of a voxel; particles of thick bodies stay this far inside
 
 
-def sample(scene: Scene, count: int, seed: int = 0) -> Bodies:
+def sample_bodies(scene: Scene, count: int, seed: int = 0) -> Bodies:
     """About `count` particles for all objects together; bounded in time and memory for any input.
 
     Raises InputError for an object without a single usable Gaussian.
     """
-    clouds = [surface(scene, o.id, seed) for o in scene.objects]
+    clouds = [surface_points(scene, o.id, seed) for o in scene.objects]
     stood = scene.cameras is not None  # and held still for the photos
     gaps = [_gap(c) for c in clouds]
     extent = max(float((c.max(0) - c.min(0)).max()) for c in clouds)
@@ -94,7 +94,7 @@ def usable(g: Gaussians) -> Tensor:
     return finite & (g.scales > 0).all(1) & (g.quats.norm(dim=1) > 0) & (g.opacities > OPACITY)
 
 
-def surface(scene: Scene, object_id: int, seed: int) -> np.ndarray:
+def surface_points(scene: Scene, object_id: int, seed: int) -> np.ndarray:
     """Points (m, 3) spread over an object's Gaussians, within 0.7 standard deviations; outliers dropped."""
     mine = scene.gaussians.to("cpu")[(scene.gaussians.object_id == object_id).cpu()]
     good = mine[usable(mine)]
@@ -157,11 +157,11 @@ def _solid(
     thin = body & ~ndimage.binary_opening(body, CUBE)
     if thin.any():
         body |= ndimage.binary_dilation(thin, CROSS)
-    while body.sum() < FEWEST:
+    while body.sum() < MIN_PARTICLES:
         body = ndimage.binary_dilation(np.pad(body, 1), CROSS)
         low = low - 1
     inside = body & ~_thick_skin(body)
-    if inside.sum() < FEWEST:
+    if inside.sum() < MIN_PARTICLES:
         inside = body
     return np.argwhere(inside) + low, float(body.sum() / inside.sum()), held
 
@@ -265,7 +265,7 @@ def _apart(bodies: list[np.ndarray]) -> list[np.ndarray]:
         at = bodies[i] - low
         key = (at[:, 0] * span[1] + at[:, 1]) * span[2] + at[:, 2]
         free = ~np.isin(key, taken)
-        if free.sum() >= FEWEST:
+        if free.sum() >= MIN_PARTICLES:
             out[i] = bodies[i][free]
         taken = np.union1d(taken, key)
     return out

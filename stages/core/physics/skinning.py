@@ -97,7 +97,7 @@ def fit_rotations(
     return nearest_rotation(H).to(rest)
 
 
-def rotations(
+def object_rotations(
     keypoints: Keypoints, positions: Float[Tensor, "p 3"], ids: list[int]
 ) -> Float[Tensor, "o 4"]:
     """Quaternions w x y z of the objects `ids` relative to rest, fitted to their keypoints."""

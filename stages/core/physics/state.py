@@ -7,7 +7,7 @@ from torch import Tensor
 
 
 @dataclass(frozen=True)
-class State:
+class FrameState:
     """One frame of a rollout, in scene units."""
 
     positions: Float[Tensor, "p 3"]  # of the keypoints

@@ -52,19 +52,19 @@ def falling_boxes(particles: int) -> tuple[mpm.Particles, mpm.Box, float]:
         x = body * h + torch.tensor([0.05 * n - 0.3, 0.03 * n - 0.3, -0.93 + n * (layers * h + 0.06)])
         fill = [torch.full((len(x),), value) for value in (h**3, density, E, 0.3, 0.0, 0.5)]
         parts.append(mpm.at_rest(x, *fill))
-    return mpm.together(parts), mpm.Box((-1.94, -1.94, -0.94), (1.94, 1.94, 2.94)), 2 * h
+    return mpm.join_particles(parts), mpm.Box((-1.94, -1.94, -0.94), (1.94, 1.94, 2.94)), 2 * h
 
 
 def measure(particles: int, scenes: int, device: str, frames: int, exact: bool = False) -> dict:
     """Seconds a substep of a batch, and what follows from it; with sums that do not depend on order if `exact`."""
     one, box, dx = falling_boxes(particles)
-    solver = mpm.Solver(mpm.together([one] * scenes), box, dx, device, [len(one)] * scenes, exact=exact)
+    solver = mpm.Solver(mpm.join_particles([one] * scenes), box, dx, device, [len(one)] * scenes, exact=exact)
     push = torch.tensor(GRAVITY, device=device).repeat(len(solver.rows), 1)
-    step = lambda: solver.frame(SUBSTEP * SUBSTEPS, push, SUBSTEPS)  # noqa: E731
+    step = lambda: solver.enqueue_frame(SUBSTEP * SUBSTEPS, push, SUBSTEPS)  # noqa: E731
     for _ in range(3):
         step()
     each = bench.median_seconds(lambda: [step() for _ in range(frames)], device, repeat=1) / frames / SUBSTEPS
-    count, nodes = len(solver.rows), solver.touched
+    count, nodes = len(solver.rows), solver.active_nodes
     node = 32 if exact else 16
     moved = count * (PARTICLE_BYTES + 2 * node * STENCIL_NODES) + node * nodes
     if bool((solver.lost >= 0).any()):
@@ -81,7 +81,7 @@ def measure_three_kernel(particles: int, device: str) -> float:
     one, box, dx = falling_boxes(particles)
     solver = mpm.Solver(one, box, dx, device, fused=True)
     push = torch.tensor(GRAVITY, device=device).repeat(len(one), 1)
-    solver.frame(SUBSTEP * SUBSTEPS, push, SUBSTEPS)
+    solver.enqueue_frame(SUBSTEP * SUBSTEPS, push, SUBSTEPS)
     nodes = torch.zeros(solver.grid.count, 4, device=device)
     steps = 20 if device != "cpu" else 2
     many = lambda: [mpm_three_kernel.substep(solver, nodes, SUBSTEP) for _ in range(steps)]  # noqa: E731

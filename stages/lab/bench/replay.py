@@ -83,7 +83,7 @@ def make_solver(data: dict[str, np.ndarray], device: str) -> mpm.Solver:
     dx = float(data["grid_lim"]) / int(data["n_grid"])
     # nodes up to PADDING - 1 feel the lower walls there, nodes from n_grid - PADDING on the upper ones
     low, high = (WALL_LAYERS - 1 + mpm.FLOOR_GAP) * dx, (int(data["n_grid"]) - WALL_LAYERS - mpm.FLOOR_GAP) * dx
-    return mpm.Solver(particles, mpm.Box((low,) * 3, (high,) * 3, keep=WALL_DAMPING), dx, device,
+    return mpm.Solver(particles, mpm.Box((low,) * 3, (high,) * 3, tangential_retention=WALL_DAMPING), dx, device,
                       damping=float(data["rpic_damping"]))  # fmt: skip
 
 

@@ -14,7 +14,7 @@ from tqdm import tqdm
 
 from stages.core.backends import pick_device
 from stages.core.errors import InputError
-from stages.core.physics.keypoints import bind
+from stages.core.physics.keypoints import bind_gaussians
 from stages.core.physics.skinning import Skinning
 from stages.core.scene.gaussians import Gaussians, concatenate
 from stages.core.scene.images import write_jpeg
@@ -89,7 +89,7 @@ def _row(
     points = m.points[0, :, : len(objects)].flatten(1, 2)  # (t, o n, 3)
     owner = torch.arange(1, len(objects) + 1).repeat_interleave(m.points.shape[3])
     keypoints = Keypoints(points[0], owner)
-    skinning = Skinning(scene.gaussians.to(device), bind(scene, keypoints), keypoints)
+    skinning = Skinning(scene.gaussians.to(device), bind_gaussians(scene, keypoints), keypoints)
     cameras, out = cameras_around(SIDE), []
     for k in range(MOMENTS):
         t = round(k * (len(points) - 1) / (MOMENTS - 1))

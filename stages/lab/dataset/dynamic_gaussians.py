@@ -21,7 +21,7 @@ from torch import Tensor
 
 from stages.core.geometry.rotations import covariance
 from stages.core.kernels.skinning import blend
-from stages.core.physics.keypoints import FOLLOWED, nearest_weights
+from stages.core.physics.keypoints import KEYPOINTS_PER_GAUSSIAN, nearest_weights
 from stages.core.scene.gaussians import Gaussians, concatenate
 from stages.core.scene.scene import Scene, SceneObject
 from stages.core.scene.scene_ply import read_scene
@@ -50,7 +50,7 @@ def skins(layout: Layout, things: Mapping[int, Asset]) -> dict[int, Skin]:
         kind = kind_of(i)
         whole = at_prior(read_scene(layout.object(kind.name)).gaussians, kind.scale)
         shown = whole[whole.opacities > LEAST_OPACITY]
-        index, weight = nearest_weights(asset.points, shown.means, FOLLOWED)
+        index, weight = nearest_weights(asset.points, shown.means, KEYPOINTS_PER_GAUSSIAN)
         out[i] = Skin(whole, shown, index.int().contiguous(), weight.contiguous())
     return out
 

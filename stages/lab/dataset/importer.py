@@ -20,8 +20,8 @@ from torch import Tensor
 from tqdm import tqdm
 
 from stages.core.errors import InputError
-from stages.core.physics.keypoints import bind, farthest_points
-from stages.core.physics.skinning import rotations
+from stages.core.physics.keypoints import bind_gaussians, farthest_points
+from stages.core.physics.skinning import object_rotations
 from stages.core.scene.files import must_exist, provenance
 from stages.core.scene.scene import Scene, SceneObject
 from stages.core.scene.scene_ply import read_scene
@@ -58,11 +58,11 @@ def run(folder: Path, out: Path, scene: Path | None = None, count: int = 2048) -
     ids = [o.id for o in world.objects]
     owner = world.gaussians.object_id[rows]
     info = SimulationInfo(FRAME, GRAVITY, "mpm")
-    with TrajectoryWriter(out, world, info, keypoints, bind(world, keypoints)) as trajectory:
+    with TrajectoryWriter(out, world, info, keypoints, bind_gaussians(world, keypoints)) as trajectory:
         for t, places in enumerate(_positions(frames, len(rows))):
             com = torch.stack([places[owner == i].mean(0) for i in ids])
             points = places[chosen] if t else keypoints.rest  # the start is known better than to float16
-            trajectory.append(points, com, rotations(keypoints, points, ids))
+            trajectory.append(points, com, object_rotations(keypoints, points, ids))
     names = ", ".join(o.name for o in world.objects)
     return f"{out}: {len(frames)} frames of {names}, {len(rows)} Gaussians, {len(keypoints.rest)} keypoints"
 

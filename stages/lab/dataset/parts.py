@@ -9,7 +9,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from stages.core.physics.mpm.batch import Frame
+from stages.core.physics.mpm.batch import BatchFrame
 from stages.core.scene.files import provenance
 from stages.core.scene.gaussians import Gaussians
 from stages.core.scene.scene_ply import write_scene
@@ -104,7 +104,7 @@ def _at_start(
 
 def _in_motion(
     layout: Layout, options: DatasetOptions, group: str, config: Config, lacks: Missing, wardrobe: Wardrobe,
-    film: Sequence[Frame], device: str,
+    film: Sequence[BatchFrame], device: str,
 ) -> None:  # fmt: skip
     carried = Carried(config, wardrobe.covers, wardrobe.things, device)
     x, F = [frame.x for frame in film], [frame.F for frame in film]

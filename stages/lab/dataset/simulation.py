@@ -51,7 +51,7 @@ def batches(
 ) -> Iterator[tuple[list[Config], Batch]]:  # fmt: skip
     """All scenes at their start, in batches of about equal size, with about so many particles on a GPU."""
     low, high = BOX
-    box = mpm.Box(low, high, keep=KEEP ** (fineness.substep / SUBSTEP))
+    box = mpm.Box(low, high, tangential_retention=KEEP ** (fineness.substep / SUBSTEP))
     todo = list(configs.values())
     largest = max(sum(len(things[i].points) for i in c.ids) for c in todo)
     parts = math.ceil(len(todo) / _most(box, fineness.dx, largest, device, exact, rows))
@@ -59,7 +59,7 @@ def batches(
     for part in range(parts):
         scenes = todo[len(todo) * part // parts : len(todo) * (part + 1) // parts]
         bodies = {
-            c.name: mpm.together([put(resting[i], p) for i, p in zip(c.ids, c.translation, strict=True)])
+            c.name: mpm.join_particles([put(resting[i], p) for i, p in zip(c.ids, c.translation, strict=True)])
             for c in scenes
         }
         yield scenes, Batch(bodies, box, fineness.dx, device, damping=DAMPING, exact=exact)

@@ -66,4 +66,4 @@ def test_a_step_leaves_the_grid_clean():
     # what one substep scattered must not come back in a later one, also where particles have moved on
     solver = mpm.Solver(cloud(), mpm.Box((0, 0, 0), (1, 1, 1)), DX)
     solver.advance(0.05, torch.zeros(300, 3))
-    assert not solver._order._momentum.any()
+    assert not solver._substepper._momentum.any()

@@ -5,14 +5,14 @@ import torch
 
 from stages.core.models.external_forces import Pushes
 from stages.core.models.initial_conditions import World, centre
-from stages.core.physics.forces import Force, Prompts
+from stages.core.physics.forces import Force, ForcePrompts
 from tests.core.models.worlds import crowd, push
 
 
 def test_from_the_prompts_of_a_user():
     world = crowd(1, 2, 10)
     place = tuple((world.points[0, 1, 4] + 1e-4).tolist())
-    prompts = Prompts((Force(7, (1.0, 2.0, 3.0), start=0.1), Force(3, torque=(0.0, 0.0, 1.0), end=0.5, at=place)),
+    prompts = ForcePrompts((Force(7, (1.0, 2.0, 3.0), start=0.1), Force(3, torque=(0.0, 0.0, 1.0), end=0.5, at=place)),
                       frozenset({7}))  # fmt: skip
     pushes = Pushes.of(world, prompts, [7, 3])
     assert pushes.object.tolist() == [[0, 1]] and pushes.point.tolist() == [[-1, 4]]

@@ -81,7 +81,7 @@ def test_restitution_is_the_share_of_speed_that_comes_back_whatever_the_substep(
 def test_a_block_rests_on_a_box_and_falls_past_its_edge():
     table = Collider("box", (0.1, 0.1, 0.2), (0.3, 0.3, 0.1))
     on, beside = block((0.2, 0.2, 0.1), 0.025, low=(0, 0, 0.31)), block((0.1, 0.1, 0.1), 0.025, low=(0.5, 0, 0.31))
-    solver = mpm.Solver(mpm.together([on, beside]), FREE, 0.05, colliders=[table])
+    solver = mpm.Solver(mpm.join_particles([on, beside]), FREE, 0.05, colliders=[table])
     roll(solver, 0.3, (0.0, 0.0, -9.81))
     z = solver.particles.x[:, 2]
     assert abs(float(z[: len(on)].min()) - 0.3) < 0.05  # a cell
@@ -108,7 +108,7 @@ def test_a_moving_wall_pushes_and_a_turning_table_carries(device, fused):
     now = solver.particles
     # a body that is pushed at constant speed keeps it, or bounces ahead
     assert 0.45 < float(now.v[:, 0].mean()) < 1.0 and float(now.x[:, 0].min()) > 0.25 - 0.05
-    table = Collider("box", PLANE, (0.5, 0.5, 0.15), spin=(0.0, 0.0, 1.0), surface="sticky")
+    table = Collider("box", PLANE, (0.5, 0.5, 0.15), angular_velocity=(0.0, 0.0, 1.0), surface="sticky")
     solver = mpm.Solver(block((0.1, 0.1, 0.1), 0.025, E=2e5, viscosity=50.0, low=(0.2, -0.05, 0.13)), FREE, 0.05,
                         device, colliders=[table], fused=fused)  # fmt: skip
     roll(solver, 0.6, (0.0, 0.0, -9.81))
@@ -119,7 +119,7 @@ def test_a_moving_wall_pushes_and_a_turning_table_carries(device, fused):
 @pytest.mark.parametrize("device, fused", [(d, f) for d in DEVICES for f in (False, True)])
 def test_a_held_body_with_a_velocity_moves_as_prescribed_and_takes_others_along(device, fused):
     low, high = block((0.3, 0.2, 0.1), 0.025), block((0.1, 0.1, 0.1), 0.025, low=(0.1, 0.05, 0.11), viscosity=50.0)
-    p = mpm.together([low, high])
+    p = mpm.join_particles([low, high])
     p.held[: len(low)] = 1
     p.v[: len(low), 0] = 0.3
     solver = mpm.Solver(p, FREE, 0.05, device, fused=fused)
@@ -131,9 +131,9 @@ def test_a_held_body_with_a_velocity_moves_as_prescribed_and_takes_others_along(
 
 
 def test_colliders_turn_and_move_as_they_say():
-    c = Collider("box", (1.0, 0, 0), (1, 1, 1), velocity=(0, 2.0, 0), spin=(0, 0, math.pi)).after(0.5)
+    c = Collider("box", (1.0, 0, 0), (1, 1, 1), velocity=(0, 2.0, 0), angular_velocity=(0, 0, math.pi)).advanced(0.5)
     assert c.centre == pytest.approx((1.0, 1.0, 0.0))
-    assert c.turn == pytest.approx((math.sqrt(0.5), 0, 0, math.sqrt(0.5)))
+    assert c.rotation == pytest.approx((math.sqrt(0.5), 0, 0, math.sqrt(0.5)))
 
 
 @pytest.mark.parametrize("wrong, message", [

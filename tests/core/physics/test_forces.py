@@ -6,7 +6,7 @@ import math
 import pytest
 
 from stages.core.errors import InputError
-from stages.core.physics.forces import Force, Prompts, parse
+from stages.core.physics.forces import Force, ForcePrompts, parse
 from stages.core.scene.scene import SceneObject
 
 OBJECTS = (SceneObject(1, "duck"), SceneObject(2, "phone"))
@@ -20,12 +20,12 @@ def test_a_push():
 def test_a_torque_and_a_place_by_name_without_times():
     (f,) = parse(OBJECTS, force=["object=duck torque=1,0,0 force=0,-2,0 at=0.1,0,.5"]).forces
     assert f == Force(1, (0.0, -2.0, 0.0), (1.0, 0.0, 0.0), 0.0, math.inf, (0.1, 0.0, 0.5))
-    assert Prompts((f,)).as_dicts()[0]["end"] is None  # JSON knows no infinity
+    assert ForcePrompts((f,)).as_dicts()[0]["end"] is None  # JSON knows no infinity
 
 
 @pytest.mark.parametrize("start, end, share", [(0.0, 0.02, 0), (0.08, 0.12, 0.5), (0.2, 0.22, 1), (0.29, 0.33, 0.25)])
 def test_share_of_a_frame(start, end, share):
-    assert Force(1, start=0.1, end=0.3).overlap(start, end) == pytest.approx(share)
+    assert Force(1, start=0.1, end=0.3).active_fraction(start, end) == pytest.approx(share)
 
 
 def test_pin_velocity_and_lift():

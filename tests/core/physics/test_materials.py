@@ -5,7 +5,7 @@ import json
 import pytest
 
 from stages.core.errors import InputError
-from stages.core.physics.materials import ALIASES, GUESS, MATERIALS, choose_materials, find_object
+from stages.core.physics.materials import ALIASES, DEFAULT_MATERIAL, MATERIALS, choose_materials, find_object
 from stages.core.scene.scene import SceneObject
 
 OBJECTS = (SceneObject(1, "rubber duck"), SceneObject(2, "object_2"), SceneObject(3, "green mug", "plastic"))
@@ -24,8 +24,9 @@ def test_objects_of_the_paper(name, E, density):
 
 
 @pytest.mark.parametrize("name, material", [
-    ("duck", "duck"), ("rubber duck", "duck"), ("red ball", "ball"), ("wooden_box", "paper"), ("candle", GUESS),
-    ("Teddy bear", "soft"), ("two cans", "can"), ("mug 2", "ceramic"), ("object_7", GUESS), ("", GUESS),
+    ("duck", "duck"), ("rubber duck", "duck"), ("red ball", "ball"), ("wooden_box", "paper"),
+    ("candle", DEFAULT_MATERIAL), ("Teddy bear", "soft"), ("two cans", "can"), ("mug 2", "ceramic"),
+    ("object_7", DEFAULT_MATERIAL), ("", DEFAULT_MATERIAL),
 ])  # fmt: skip
 def test_by_name(name, material):
     assert choose_materials([SceneObject(1, name)])[1].name == material

@@ -79,4 +79,4 @@ def test_how_many_scenes_fit():
     assert fits > 1 and fits * count < 2**31
     with pytest.raises(ValueError, match="too many"):
         one = block((0.05, 0.05, 0.05), 0.05)
-        mpm.Solver(mpm.together([one] * 40), mpm.Box((-4, -4, 0), (4, 4, 4)), 0.02, sizes=[len(one)] * 40)
+        mpm.Solver(mpm.join_particles([one] * 40), mpm.Box((-4, -4, 0), (4, 4, 4)), 0.02, sizes=[len(one)] * 40)

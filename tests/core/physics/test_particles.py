@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from stages.core.errors import InputError
-from stages.core.physics.particles import FEWEST, inliers, sample
+from stages.core.physics.particles import MIN_PARTICLES, inliers, sample_bodies
 from stages.core.scene.gaussians import Gaussians, concatenate
 from stages.core.scene.scene import Scene, SceneObject
 from stages.lab.assets.objects import OBJECTS, make_object
@@ -36,7 +36,7 @@ def scene(*bodies: Gaussians, floor: float | None = None) -> Scene:
 
 def test_a_shell_is_filled():
     # voxels on the surface count when their middle is inside; the splats make the ball a standard deviation larger
-    bodies = sample(scene(splats(sphere())), 8000)
+    bodies = sample_bodies(scene(splats(sphere())), 8000)
     assert 0.85 * 8000 < len(bodies.x) < 1.1 * 8000
     radius = (3 / (4 * math.pi) * float(bodies.volume.sum())) ** (1 / 3)
     assert radius == pytest.approx(0.1 + 0.003 / 2, abs=0.003 + 0.1 * bodies.spacing)
@@ -48,7 +48,7 @@ def test_a_shell_is_filled():
 
 def test_an_open_bowl_stays_hollow():
     points = sphere()
-    bodies = sample(scene(splats(points[points[:, 2] < 0])), 8000)
+    bodies = sample_bodies(scene(splats(points[points[:, 2] < 0])), 8000)
     inside = (bodies.x.norm(dim=1) < 0.07) & (bodies.x[:, 2] < 0)
     assert not inside.any()
 
@@ -57,8 +57,8 @@ def test_a_shell_with_a_hole_is_filled_up_to_the_hole():
     """Photos leave a third of the way across open: a hollow three times as wide as its leak."""
     points = sphere()
     holed = points[points[:, 2] < 0.1 * math.cos(math.asin(1 / 3))]
-    bodies = sample(scene(splats(holed)), 8000)
-    closed = sample(scene(splats(points)), 8000)
+    bodies = sample_bodies(scene(splats(holed)), 8000)
+    closed = sample_bodies(scene(splats(points)), 8000)
     assert float(bodies.volume.sum()) == pytest.approx(float(closed.volume.sum()), rel=0.08)
     over = bodies.x[bodies.x[:, :2].norm(dim=1) < 0.02]
     assert 0.06 < float(over[:, 2].max()) < 0.1  # and nothing pours out
@@ -70,7 +70,7 @@ def test_nothing_is_filled_in_under_the_folds_of_a_cloth():
     means = means - torch.tensor([0.0, 0.0, float(means[:, 2].min())])
     ids = torch.ones(len(cloth), dtype=torch.int64)
     cloth = replace(cloth, means=means, scales=1.3 * 6**0.5 * size * cloth.scales, object_id=ids)
-    lying, flying = (sample(scene(cloth, floor=floor), 20_000) for floor in (0.0, -1.0))
+    lying, flying = (sample_bodies(scene(cloth, floor=floor), 20_000) for floor in (0.0, -1.0))
     assert float(lying.volume.sum()) == pytest.approx(float(flying.volume.sum()), rel=0.05)
 
 
@@ -81,7 +81,7 @@ def test_a_mug_stays_hollow():
     disc = 0.05 * torch.rand(1500, generator=rng).sqrt()[:, None] * torch.stack([turn.cos(), turn.sin()], 1)[:1500]
     mug = torch.cat([side, torch.cat([disc, torch.zeros(1500, 1)], 1)])
     for floor in (0.0, None):
-        bodies = sample(scene(splats(mug), floor=floor), 8000)
+        bodies = sample_bodies(scene(splats(mug), floor=floor), 8000)
         inside = (bodies.x[:, :2].norm(dim=1) < 0.03) & (bodies.x[:, 2] > 0.03)
         assert not inside.any()
 
@@ -89,7 +89,7 @@ def test_a_mug_stays_hollow():
 def test_the_floor_closes_what_stands_on_it():
     points = sphere()
     cut = splats(points[points[:, 2] > -0.05] + torch.tensor([0, 0, 0.05]))
-    standing, flying = (sample(scene(cut, floor=floor), 8000) for floor in (0.0, -1.0))
+    standing, flying = (sample_bodies(scene(cut, floor=floor), 8000) for floor in (0.0, -1.0))
     middle = torch.tensor([0.0, 0, 0.05])
     assert ((standing.x - middle).norm(dim=1) < 0.04).sum() > 100
     assert not ((flying.x - middle).norm(dim=1) < 0.04).any()
@@ -98,14 +98,14 @@ def test_the_floor_closes_what_stands_on_it():
 def test_a_sheet_gets_three_layers():
     rng = torch.Generator().manual_seed(0)
     flat = torch.cat([0.3 * torch.rand(6000, 2, generator=rng), torch.full((6000, 1), 0.2)], 1)
-    bodies = sample(scene(splats(flat, scale=1e-4)), 6000)
+    bodies = sample_bodies(scene(splats(flat, scale=1e-4)), 6000)
     middle = bodies.x[((bodies.x[:, :2] - 0.15).abs() < 0.1).all(1)]
     area = 0.2**2 / bodies.spacing**2
     assert len(middle) / area == pytest.approx(3, rel=0.05)
 
 
 def test_overlapping_objects_share_no_voxel():
-    bodies = sample(scene(splats(sphere()), splats(sphere(seed=1) + 0.03, 2)), 8000)
+    bodies = sample_bodies(scene(splats(sphere()), splats(sphere(seed=1) + 0.03, 2)), 8000)
     voxels = (bodies.x / bodies.spacing).floor().long()
     assert len(voxels.unique(dim=0)) == len(voxels)
     assert bodies.body.bincount().min() > 500
@@ -145,17 +145,17 @@ def broken(**fields: list) -> Gaussians:
 @pytest.mark.parametrize("name", BAD)
 def test_every_object_gets_some_particles(name):
     start = time.process_time()
-    bodies = sample(scene(splats(sphere(2000) + 0.5), Gaussians(**{
+    bodies = sample_bodies(scene(splats(sphere(2000) + 0.5), Gaussians(**{
         **BAD[name]().__dict__, "object_id": torch.full((len(BAD[name]()),), 2)})), 4000)  # fmt: skip
     assert time.process_time() - start < MOST_SECONDS
     counts = bodies.body.bincount(minlength=2)
-    assert counts.min() >= FEWEST and len(bodies.x) < 20_000
+    assert counts.min() >= MIN_PARTICLES and len(bodies.x) < 20_000
     assert bodies.x.isfinite().all() and bodies.spacing > 0
 
 
 def test_an_object_without_a_single_number_is_an_error():
     with pytest.raises(InputError, match=r"object 1 \(object_1\).*Gaussians can be used"):
-        sample(scene(splats(torch.full((5, 3), NAN))), 1000)
+        sample_bodies(scene(splats(torch.full((5, 3), NAN))), 1000)
 
 
 def test_outliers_are_what_lies_far_out():
@@ -170,8 +170,8 @@ def test_what_leaned_on_something_unseen_in_photos_is_held(photographed, held, c
     rng = torch.Generator().manual_seed(0)
     p = torch.rand(12000, 3, generator=rng) * torch.tensor([0.06, 0.2, 0.3])
     leaning = splats(p + p[:, 2:] * torch.tensor([0.8, 0, 0]))
-    bodies = sample(replace(scene(leaning, floor=0.0), cameras=ring() if photographed else None), 8000)
+    bodies = sample_bodies(replace(scene(leaning, floor=0.0), cameras=ring() if photographed else None), 8000)
     under = (bodies.x[:, 0] > 0.2) & (bodies.x[:, 2] < 0.1)
     assert bool(under.any()) == held and ("would tip over" in caplog.text) == held
-    upright = sample(replace(scene(splats(p), floor=0.0), cameras=ring() if photographed else None), 8000)
+    upright = sample_bodies(replace(scene(splats(p), floor=0.0), cameras=ring() if photographed else None), 8000)
     assert float(upright.volume.sum()) == pytest.approx(0.06 * 0.2 * 0.3, rel=0.25)

@@ -7,8 +7,8 @@ import torch
 
 from stages.core.geometry.harmonics import evaluate_sh
 from stages.core.geometry.rotations import covariance, matrix
-from stages.core.physics.keypoints import bind, choose_keypoints, farthest_points, nearest_weights
-from stages.core.physics.skinning import Skinning, deform, fit_rotations, rotations
+from stages.core.physics.keypoints import bind_gaussians, choose_keypoints, farthest_points, nearest_weights
+from stages.core.physics.skinning import Skinning, deform, fit_rotations, object_rotations
 from stages.core.scene.gaussians import Gaussians, concatenate
 from stages.core.scene.scene import Scene, SceneObject
 from tests.conftest import random_gaussians
@@ -31,7 +31,7 @@ def scene_of(kind: str) -> Scene:
 
 def prepared(scene: Scene, count: int = 64) -> tuple:
     keypoints = choose_keypoints(scene, count)
-    return scene.gaussians, bind(scene, keypoints), keypoints
+    return scene.gaussians, bind_gaussians(scene, keypoints), keypoints
 
 
 @pytest.mark.parametrize("kind", ["cloud", "sheet", "line", "two", "one"])
@@ -128,7 +128,7 @@ def test_rotations_of_objects():
     keypoints = choose_keypoints(scene_of("cloud"), 64)
     first = (keypoints.object_id == 1)[:, None]
     moved = torch.where(first, keypoints.rest @ TURN.mT + 3, keypoints.rest)
-    R = matrix(rotations(keypoints, moved, [1, 2]))
+    R = matrix(object_rotations(keypoints, moved, [1, 2]))
     torch.testing.assert_close(R, torch.stack([TURN, torch.eye(3)]), rtol=0, atol=1e-5)
 
 

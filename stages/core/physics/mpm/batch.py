@@ -29,14 +29,14 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from stages.core.physics.colliders import Collider
-from stages.core.physics.mpm.solver import Box, Particles, Solver, make_grid, most_nodes, together
+from stages.core.physics.mpm.solver import Box, Particles, Solver, join_particles, make_grid, max_batch_nodes
 
 GRID_BYTES, NODE_BYTES = 48, 4.5  # of a node: three grids, twice as much when exact; friction and marks
 PARTICLE_BYTES = 700  # sorted, with room to sort
 
 
 @dataclass(frozen=True)
-class Frame:
+class BatchFrame:
     """All scenes at one time."""
 
     names: tuple[str, ...]
@@ -44,11 +44,11 @@ class Frame:
     x: Float[Tensor, "p 3"]  # [m]
     F: Float[Tensor, "p 3 3"]  # deformation gradients; of what yields, the elastic part
 
-    def of(self, name: str) -> Frame:
+    def of(self, name: str) -> BatchFrame:
         """One scene of it."""
         n = self.names.index(name)
         rows = slice(self.starts[n], self.starts[n + 1])
-        return Frame((name,), (0, rows.stop - rows.start), self.x[rows], self.F[rows])
+        return BatchFrame((name,), (0, rows.stop - rows.start), self.x[rows], self.F[rows])
 
 
 class Batch:
@@ -61,7 +61,7 @@ class Batch:
         self.names = tuple(scenes)
         sizes = [len(p) for p in scenes.values()]
         self.starts = tuple([0, *torch.tensor(sizes).cumsum(0).tolist()])
-        self.solver = Solver(together(list(scenes.values())), box, dx, device, sizes, colliders, damping,
+        self.solver = Solver(join_particles(list(scenes.values())), box, dx, device, sizes, colliders, damping,
                              exact=exact)  # fmt: skip
         self._when = torch.full((len(sizes),), -1, dtype=torch.int32, device=device)
         self._frame = 0
@@ -74,7 +74,7 @@ class Batch:
         """
         count = make_grid(box, dx).count
         width = 2 if exact else 1
-        indices = most_nodes(device) // (count * width)
+        indices = max_batch_nodes(device) // (count * width)
         if device == "cpu":
             return max(1, indices)
         free = 0.8 * torch.cuda.mem_get_info(device)[0]
@@ -83,17 +83,17 @@ class Batch:
 
     def frames(
         self, count: int, duration: float, substeps: int, gravity: tuple[float, float, float]
-    ) -> Iterator[Frame]:
+    ) -> Iterator[BatchFrame]:
         """`count` frames, the first as things are now, `duration` [s] and `substeps` apart; gravity in m/s^2."""
         rows = self.solver.rows
         push = torch.tensor(gravity, device=self.solver.device).repeat(len(rows), 1)
         for n in range(count):
             if n:
-                self.solver.frame(duration, push, substeps)
+                self.solver.enqueue_frame(duration, push, substeps)
                 self._frame += 1
                 new = (self.solver.lost >= 0) & (self._when < 0)
                 self._when.masked_fill_(new, self._frame)
-            yield Frame(self.names, self.starts, rows.get("x"), rows.get("F"))
+            yield BatchFrame(self.names, self.starts, rows.get("x"), rows.get("F"))
 
     def lost(self) -> tuple[Int[Tensor, "s"], Int[Tensor, "s"]]:
         """For each scene, the first particle lost within it (-1: none) and in which frame; waits for the device."""

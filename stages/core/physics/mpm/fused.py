@@ -11,18 +11,18 @@ import warp as wp
 from stages.core.kernels.interop import launch, view
 from stages.core.kernels.mpm.fused import THREADS, Touched, clear_touched, fused_step
 from stages.core.kernels.mpm.grid import BLOCK
-from stages.core.physics.mpm.particle_rows import Rows
+from stages.core.physics.mpm.particle_rows import ParticleRows
 
 RESORT = 100  # substeps after which particles are sorted by cell again
 ROUND = 256  # threads that clear begin at a multiple of this
 GRAPHS = 24  # kept, one for each number of substeps
 
 
-class FusedOrder:
+class FusedSubsteps:
     """Runs frames of the particles in `rows`."""
 
     def __init__(
-        self, rows: Rows, plastic: bool, bouncy: bool, damping: float, obstacles: wp.array,
+        self, rows: ParticleRows, plastic: bool, bouncy: bool, damping: float, obstacles: wp.array,
         scale: tuple[float, float] | None = None,
     ):  # fmt: skip
         """`scale`: quanta of momentum and mass, when nodes count in whole numbers; see kernels/mpm_exact.py."""

@@ -18,7 +18,7 @@ _TYPES = {
 }  # fmt: skip
 
 
-class Rows:
+class ParticleRows:
     """Tensors by name in `tensors`, all rows in one order, and the same memory as a struct for kernels."""
 
     def __init__(self, fields: dict[str, Tensor], sizes: Sequence[int], grid, device: str):

@@ -13,7 +13,7 @@ from scipy import ndimage
 from stages.core.physics.particles import CROSS, Bodies
 
 
-def halved(bodies: Bodies, seed: int = 0) -> Bodies:
+def subdivide(bodies: Bodies, seed: int = 0) -> Bodies:
     """Eight particles or more for each; rows come body by body.
 
     Thick bodies keep their outermost layer of voxels empty, and that layer is half as thick now: they grow by as much.

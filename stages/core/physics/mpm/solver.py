@@ -23,9 +23,9 @@ from torch import Tensor
 from stages.core.kernels.mpm import grid as mpm_grid
 from stages.core.kernels.mpm.constitutive import COROTATED, HARDEST, NEO_HOOKEAN, SAND, SNOW, VON_MISES, sand_slope
 from stages.core.physics.colliders import Collider, as_obstacles
-from stages.core.physics.mpm.fused import FusedOrder
-from stages.core.physics.mpm.particle_rows import NEVER, Rows
-from stages.core.physics.mpm.split import SplitOrder
+from stages.core.physics.mpm.fused import FusedSubsteps
+from stages.core.physics.mpm.particle_rows import NEVER, ParticleRows
+from stages.core.physics.mpm.split import SplitSubsteps
 
 MODELS = {"neo-hookean": NEO_HOOKEAN, "corotated": COROTATED, "von-mises": VON_MISES, "sand": SAND, "snow": SNOW}
 SAFETY = 0.5  # of a cell that a wave or a particle may cross in a substep; free vibration diverges from 1.1
@@ -50,7 +50,7 @@ class Box:
     low: tuple[float | int, float | int, float | int]  # z is the floor
     high: tuple[float | int, float | int, float | int]
     restitution: float = 0.0  # 0: a body bounces by its own elasticity; up to 1: walls give back that share of speed
-    keep: float = -1.0  # 0..1: share of the speed along a wall that is left every substep, as in the public solver
+    tangential_retention: float = -1.0  # 0..1: speed along a wall kept per substep, as in the public solver
 
 
 @dataclass
@@ -91,7 +91,9 @@ def at_rest(
                      models, torch.tensor(plastic).repeat(p, 1), torch.zeros(p))  # fmt: skip
 
 
-def numbers(model: str, plastic: tuple[float | int, ...], softened: float = 1.0) -> tuple[float, float, float]:
+def plastic_parameters(
+    model: str, plastic: tuple[float | int, ...], softened: float = 1.0
+) -> tuple[float, float, float]:
     """`plastic` of a named model as the solver wants it, for a material made softer by this factor.
 
     Stresses soften with it, so that things yield at the same strain; an angle of friction becomes a slope.
@@ -102,7 +104,7 @@ def numbers(model: str, plastic: tuple[float | int, ...], softened: float = 1.0)
     return (softened * a, softened * b, c) if model == "von-mises" else (a, b, c)
 
 
-def together(parts: Sequence[Particles]) -> Particles:
+def join_particles(parts: Sequence[Particles]) -> Particles:
     """All of them, one after the other."""
     return Particles(*(torch.cat([getattr(p, f.name) for p in parts]) for f in fields(Particles)))
 
@@ -112,7 +114,7 @@ def wave_speed(E, nu, density):
     return (E * (1 - nu) / ((1 + nu) * (1 - 2 * nu)) / density) ** 0.5
 
 
-def stiffest(speed: float, nu: float, density: float) -> float:
+def modulus_at_wave_speed(speed: float, nu: float, density: float) -> float:
     """Young's modulus [Pa] at which pressure waves have this speed: the inverse of wave_speed."""
     return density * speed**2 * (1 + nu) * (1 - 2 * nu) / (1 - nu)
 
@@ -135,9 +137,10 @@ class Solver:
         sizes = [len(particles)] if sizes is None else list(sizes)
         if sum(sizes) != len(particles) or min(sizes) < 1:
             raise ValueError(f"{len(particles)} particles cannot be scenes of {sizes}")
-        if len(sizes) * self.grid.count * (2 if exact else 1) > most_nodes(device):
+        if len(sizes) * self.grid.count * (2 if exact else 1) > max_batch_nodes(device):
             raise ValueError(f"{len(sizes)} scenes of {self.grid.count} nodes are too many for one batch")
-        self.rows = Rows({f.name: getattr(particles, f.name) for f in fields(Particles)}, sizes, self.grid, device)
+        columns = {f.name: getattr(particles, f.name) for f in fields(Particles)}
+        self.rows = ParticleRows(columns, sizes, self.grid, device)
         self.colliders = tuple(colliders)
         self._obstacles = as_obstacles(self.colliders, device)
         self._rates = self._fastest()
@@ -146,7 +149,8 @@ class Solver:
         plastic = bool((particles.model != NEO_HOOKEAN).any())
         bouncy = any(thing.restitution > 0 for thing in (box, *self.colliders))
         options = self.rows, plastic, bouncy, damping, self._obstacles
-        self._order = FusedOrder(*options, self._quanta() if exact else None) if fused else SplitOrder(*options)
+        quanta = self._quanta() if exact else None
+        self._substepper = FusedSubsteps(*options, quanta) if fused else SplitSubsteps(*options)
         self._grain = GRAIN if fused and device != "cpu" else 1
 
     @property
@@ -155,9 +159,9 @@ class Solver:
         return Particles(*(self.rows.get(f.name) for f in fields(Particles)))
 
     @property
-    def touched(self) -> int:
+    def active_nodes(self) -> int:
         """Nodes in the blocks that the last frame read, wrote and cleared."""
-        return self._order.blocks * mpm_grid.BLOCK**3
+        return self._substepper.blocks * mpm_grid.BLOCK**3
 
     def set(self, **changes: Tensor) -> None:
         """Overwrite fields of all particles, given in the original order."""
@@ -183,21 +187,21 @@ class Solver:
         Raises Diverged when a particle leaves the box or is no number.
         """
         steps = substeps or self.substeps(duration, push)
-        self.frame(duration, push, steps)
+        self.enqueue_frame(duration, push, steps)
         first = int(self.rows.lost.min())
         if first != NEVER:
             raise Diverged(first)
         return steps
 
-    def frame(self, duration: float, push: Float[Tensor, "p 3"], substeps: int) -> None:
+    def enqueue_frame(self, duration: float, push: Float[Tensor, "p 3"], substeps: int) -> None:
         """As `advance`, but the host waits for nothing: what goes wrong is only noted, in `lost`.
 
         A particle that would leave the box or is no number stays where it was; other scenes do not notice.
         """
         self.rows.put("push", push)
-        self._order.frame(duration / substeps, substeps)
+        self._substepper.frame(duration / substeps, substeps)
         if self.colliders:
-            self.colliders = tuple(c.after(duration) for c in self.colliders)
+            self.colliders = tuple(c.advanced(duration) for c in self.colliders)
             self._obstacles.assign(as_obstacles(self.colliders, "cpu"))
 
     @property
@@ -225,7 +229,7 @@ class Solver:
         return float((harder * (lam + 2 * mu) / density).sqrt().max()), float((eta / density).max())
 
 
-def most_nodes(device: str) -> int:
+def max_batch_nodes(device: str) -> int:
     """Of all scenes of a batch together: indices have 31 bits, and a CPU's threads have momentum of their own."""
     return 2 * MAX_NODES if device == "cpu" else 2**31 - 1
 
@@ -249,5 +253,5 @@ def make_grid(box: Box, dx: float):
     grid.low = wp.vec3i(*[mpm_grid.PAD - soft] * 3)
     grid.high = wp.vec3i(*(mpm_grid.PAD + inside + soft for inside, _ in n))
     grid.face_low, grid.face_high = wp.vec3(*box.low), wp.vec3(*box.high)
-    grid.restitution, grid.keep = box.restitution, box.keep
+    grid.restitution, grid.keep = box.restitution, box.tangential_retention
     return grid

@@ -17,16 +17,16 @@ from torch import Tensor
 
 from stages.core.kernels.interop import launch, view
 from stages.core.kernels.mpm import split as kernels
-from stages.core.physics.mpm.particle_rows import Rows
+from stages.core.physics.mpm.particle_rows import ParticleRows
 
 PARTS = 4  # of the particles, on the CPU
 WARP = 32
 
 
-class SplitOrder:
+class SplitSubsteps:
     """Runs frames of the particles in `rows`."""
 
-    def __init__(self, rows: Rows, plastic: bool, bouncy: bool, damping: float, obstacles: wp.array):
+    def __init__(self, rows: ParticleRows, plastic: bool, bouncy: bool, damping: float, obstacles: wp.array):
         self.rows, self.grid, self.device, self.damping = rows, rows.grid, rows.device, damping
         self.parts = PARTS if self.device == "cpu" else 1
         self._step, self._obstacles = kernels.particle_step(plastic, bouncy), obstacles

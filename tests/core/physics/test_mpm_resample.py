@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from stages.core.physics.mpm.resample import halved
-from stages.core.physics.particles import Bodies, sample
+from stages.core.physics.mpm.resample import subdivide
+from stages.core.physics.particles import Bodies, sample_bodies
 from stages.core.scene.gaussians import concatenate
 from stages.core.scene.scene import Scene, SceneObject
 from tests.conftest import ball
@@ -12,12 +12,12 @@ from tests.conftest import ball
 
 def sampled(count: int = 2000) -> Bodies:
     low, high = ball((0, 0, 0.15), 0.15, 600, (1, 0, 0), 1), ball((0.25, 0, 0.2), 0.12, 600, (0, 1, 0), 2, seed=1)
-    return sample(Scene(concatenate([low, high]), (SceneObject(1, "a"), SceneObject(2, "b")), None, 0.0), count)
+    return sample_bodies(Scene(concatenate([low, high]), (SceneObject(1, "a"), SceneObject(2, "b")), None, 0.0), count)
 
 
 def test_mass_place_and_outline_stay():
     coarse = sampled()
-    fine = halved(coarse)
+    fine = subdivide(coarse)
     assert fine.spacing == coarse.spacing / 2 and 6 * len(coarse.x) < len(fine.x) < 20 * len(coarse.x)
     for n in (0, 1):
         a, b = coarse.x[coarse.body == n], fine.x[fine.body == n]
@@ -29,7 +29,7 @@ def test_mass_place_and_outline_stay():
 
 
 def test_no_two_particles_share_a_voxel():
-    fine = halved(sampled())
+    fine = subdivide(sampled())
     voxels = torch.floor(fine.x / fine.spacing).int()
     assert len(voxels.unique(dim=0)) == len(voxels)
 
@@ -37,6 +37,6 @@ def test_no_two_particles_share_a_voxel():
 def test_a_sheet_stays_as_thin_as_it_was():
     grid = torch.cartesian_prod(torch.arange(10), torch.arange(10), torch.arange(3)).float()
     sheet = Bodies((grid + 0.5) * 0.01, torch.zeros(300, dtype=torch.int64), torch.full((300,), 0.01**3), 0.01)
-    fine = halved(sheet)
+    fine = subdivide(sheet)
     assert len(fine.x) == 2400 and float(fine.x[:, 2].max()) < 0.03
     assert float(fine.volume[0]) == pytest.approx(0.005**3)

@@ -19,9 +19,9 @@ from stages.core.perception.support import Support
 from stages.core.raster.rasterise import rasterise
 from stages.core.scene.gaussians import Gaussians, concatenate
 from stages.core.scene.scene import Scene
+from stages.refine.disc_gaussians import DISC_SIGMA, disc_gaussians
 from stages.refine.inpaint import inpaint
-from stages.refine.patches import ACROSS, patches
-from stages.refine.sight import Sight
+from stages.refine.observed_space import ObservedSpace
 
 MOST = 1024  # cells along the longer side of the picture of the table
 CELLS = 40_000  # under things, about
@@ -44,7 +44,7 @@ STRAYS = 3  # Gaussians below the surface in a square that say nothing
 
 
 @dataclass(frozen=True)
-class Picture:
+class TopView:
     """The table from above; a pixel is a cell, rows go along -y."""
 
     corner: Float[Tensor, "2"]  # x of the first column's edge, y of the first row's
@@ -71,7 +71,7 @@ class Picture:
         return torch.cat([points, height[:, None]], 1)
 
 
-def fill(scene: Scene, sight: Sight, support: Support, seed: int = 0) -> Scene:
+def fill_background(scene: Scene, sight: ObservedSpace, support: Support, seed: int = 0) -> Scene:
     """The scene with flat Gaussians on the plane where objects hide it: under them, with a margin.
 
     The table is drawn from above without the objects, and its holes are inpainted from what is around: those under
@@ -100,7 +100,7 @@ def fill(scene: Scene, sight: Sight, support: Support, seed: int = 0) -> Scene:
 
 
 def _missing(
-    picture: Picture, things: Float[Tensor, "m 3"], support: Support, sight: Sight, seed: int
+    picture: TopView, things: Float[Tensor, "m 3"], support: Support, sight: ObservedSpace, seed: int
 ) -> tuple[Bool[np.ndarray, "h w"], Bool[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
     """Cells to fill, those under and close to things, and those that tell how the table goes on."""
     R = support.view.radius
@@ -121,16 +121,16 @@ def _missing(
     return hole, near, known
 
 
-def _laid(picture: Picture, support: Support, cells: np.ndarray, colour: np.ndarray) -> Gaussians:
+def _laid(picture: TopView, support: Support, cells: np.ndarray, colour: np.ndarray) -> Gaussians:
     """Patches in some of the cells, of colours that undo how they blur each other."""
     points = picture.on(support, cells)
     up = torch.tensor([[0.0, 0, 1]]).expand(len(points), 3)
-    sharp = colour + SHARPER * (colour - _blurred(colour, cells | (picture.alpha >= SEEN), ACROSS))
-    return patches(points, up, torch.from_numpy(sharp[cells]), picture.cell, 0)
+    sharp = colour + SHARPER * (colour - _blurred(colour, cells | (picture.alpha >= SEEN), DISC_SIGMA))
+    return disc_gaussians(points, up, torch.from_numpy(sharp[cells]), picture.cell, 0)
 
 
 def _each(
-    cells: Bool[np.ndarray, "h w"], picture: Picture, support: Support, test: Callable[[Tensor], Tensor]
+    cells: Bool[np.ndarray, "h w"], picture: TopView, support: Support, test: Callable[[Tensor], Tensor]
 ) -> Bool[np.ndarray, "h w"]:
     """Those of the cells whose place on the surface passes a test."""
     out = np.zeros(cells.shape, bool)
@@ -139,7 +139,7 @@ def _each(
 
 
 def _dirt(
-    picture: Picture, hole: np.ndarray, here: np.ndarray, known: np.ndarray, blind: np.ndarray, rim: float, seed: int
+    picture: TopView, hole: np.ndarray, here: np.ndarray, known: np.ndarray, blind: np.ndarray, rim: float, seed: int
 ) -> Bool[np.ndarray, "h w"]:
     """Blind cells, and those beside a hole, where colours are not what the table farther off goes on with.
 
@@ -172,7 +172,7 @@ def _beside(hole: Bool[np.ndarray, "h w"], reach: float) -> Bool[np.ndarray, "h 
     return (ndimage.distance_transform_edt(far) <= 1.5 * reach) | ndimage.binary_dilation(hole, iterations=2)
 
 
-def _matt(table: Gaussians, sight: Sight) -> Gaussians:
+def _matt(table: Gaussians, sight: ObservedSpace) -> Gaussians:
     """In the mean of the colours that the cameras see; those straight from above, where none is, would be a guess."""
     if not sight.views:
         return table
@@ -181,7 +181,7 @@ def _matt(table: Gaussians, sight: Sight) -> Gaussians:
     return replace(table, sh=rgb_to_sh((rgb / len(eyes)).clamp(0, 1)))
 
 
-def _picture(table: Gaussians, things: Float[Tensor, "m 3"], support: Support) -> Picture | None:
+def _picture(table: Gaussians, things: Float[Tensor, "m 3"], support: Support) -> TopView | None:
     """The table from above around all things."""
     margin = AROUND * support.view.radius
     low, high = things[:, :2].amin(0) - margin, things[:, :2].amax(0) + margin
@@ -198,7 +198,7 @@ def _picture(table: Gaussians, things: Float[Tensor, "m 3"], support: Support) -
     return replace(flat, dent=_dent(things, support, flat))
 
 
-def _dent(things: Float[Tensor, "m 3"], support: Support, picture: Picture) -> Float[np.ndarray, "h w"]:
+def _dent(things: Float[Tensor, "m 3"], support: Support, picture: TopView) -> Float[np.ndarray, "h w"]:
     """How far below the surface things lie in each cell [scene units], about 0 where none does."""
     times = max(1, round(DENT * support.view.radius / picture.cell))
     height, width = picture.alpha.shape
@@ -216,7 +216,7 @@ def _dent(things: Float[Tensor, "m 3"], support: Support, picture: Picture) -> F
     return wide[:height, :width]
 
 
-def _drawn(table: Gaussians, corner: Float[Tensor, "2"], cell: float, top: float, shape: tuple[int, int]) -> Picture:
+def _drawn(table: Gaussians, corner: Float[Tensor, "2"], cell: float, top: float, shape: tuple[int, int]) -> TopView:
     """The picture with this corner, cell and shape (rows, columns), from so high that the view is all but parallel."""
     height, width = shape
     away = 50 * max(shape) * cell
@@ -228,10 +228,10 @@ def _drawn(table: Gaussians, corner: Float[Tensor, "2"], cell: float, top: float
     alpha = drawn.alpha[0]
     rgb = (drawn.rgb[0] / alpha.clamp_min(1e-3)[..., None]).clamp(0, 1)
     flat = np.zeros(shape, np.float32)
-    return Picture(corner, cell, top, rgb.numpy().astype(np.float32), alpha.numpy(), flat)
+    return TopView(corner, cell, top, rgb.numpy().astype(np.float32), alpha.numpy(), flat)
 
 
-def _under(things: Float[Tensor, "m 3"], support: Support, picture: Picture) -> np.ndarray:
+def _under(things: Float[Tensor, "m 3"], support: Support, picture: TopView) -> np.ndarray:
     """Cells directly under things that stand or hang low."""
     low = support.heights(things) < 0.3 * support.view.radius
     under = np.zeros(picture.alpha.shape, bool)

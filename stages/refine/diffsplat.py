@@ -16,37 +16,43 @@ from stages.core.models.diffsplat.weights import Files, find, load
 from stages.core.perception.support import Support
 from stages.core.scene.gaussians import Gaussians
 from stages.core.scene.scene import Scene
-from stages.refine.library import SOLID, put, solid
+from stages.refine.disc_gaussians import empty_like
+from stages.refine.library import MIN_SURFACE_OPACITY, opaque_gaussians, place_whole
+from stages.refine.object_crop import TRAINED_ELEVATIONS, crop_object
+from stages.refine.observed_space import ObservedSpace
 from stages.refine.options import RefineOptions
-from stages.refine.patches import none_like
-from stages.refine.portrait import LEARNED, portrait
-from stages.refine.register import LEAST, register
-from stages.refine.sight import Sight
+from stages.refine.registration import MIN_REGISTRATION_POINTS, register
 
 log = logging.getLogger(__name__)
 FIT = 0.5  # a lower fit is another object; true maps in the network's place reach 0.95, those of random weights 0.01
 
 
-def complete(scene: Scene, number: int, sight: Sight, support: Support | None, options: RefineOptions) -> Gaussians:
+def complete(
+    scene: Scene, number: int, sight: ObservedSpace, support: Support | None, options: RefineOptions
+) -> Gaussians:
     """Gaussians of the generated object where the photos did not see it; none when it does not fit what they saw."""
     device = pick_device(options.device)
     model = _model(options.weights, options.download, device)
-    own, name = solid(scene, number), scene.name_of(number)
-    shown = portrait(scene, own, model.side, options.photos) if len(own) >= LEAST else None
+    own, name = opaque_gaussians(scene, number), scene.name_of(number)
+    shown = crop_object(scene, own, model.side, options.photos) if len(own) >= MIN_REGISTRATION_POINTS else None
     if shown is None:
         log.info("  %d  %s: left alone: no photo shows enough of it", number, name)
-        return none_like(own)
-    if not LEARNED[0] <= shown.elevation <= LEARNED[1]:
+        return empty_like(own)
+    if not TRAINED_ELEVATIONS[0] <= shown.elevation <= TRAINED_ELEVATIONS[1]:
         log.info("  %d  %s: seen from %.0f degrees above in %s; DiffSplat learned from %.0f to %.0f, so it may err",
-                 number, name, shown.elevation, shown.name, *LEARNED)  # fmt: skip
+                 number, name, shown.elevation, shown.name, *TRAINED_ELEVATIONS)  # fmt: skip
     said = "" if name == f"object_{number}" else name.replace("_", " ")  # a number says nothing
     made = model.generate(shown.image, shown.elevation, said, options.seed)
-    made = made[made.opacities > SOLID]
-    how = register(own.to(device), made.to(device), options.seed, shown.place) if len(made) >= LEAST else None
+    made = made[made.opacities > MIN_SURFACE_OPACITY]
+    how = (
+        register(own.to(device), made.to(device), options.seed, shown.place)
+        if len(made) >= MIN_REGISTRATION_POINTS
+        else None
+    )
     if how is None:
         log.info("  %d  %s: left alone: what DiffSplat made of %s is no solid object", number, name, shown.name)
-        return none_like(own)
-    gained, verdict = put(made, how, own, sight, FIT)
+        return empty_like(own)
+    gained, verdict = place_whole(made, how, own, sight, FIT)
     log.info("  %d  %s: what DiffSplat made of %s %s", number, name, shown.name, verdict)
     return gained
 

@@ -21,51 +21,61 @@ from stages.core.perception.support import Support
 from stages.core.scene.gaussians import Gaussians, transformed
 from stages.core.scene.scene import Scene
 from stages.core.scene.scene_ply import read_scene
+from stages.refine.disc_gaussians import empty_like
+from stages.refine.observed_space import ObservedSpace
 from stages.refine.options import RefineOptions
-from stages.refine.patches import none_like
-from stages.refine.register import LEAST, Registration, approach, rough_fit, settle
-from stages.refine.register_cloud import Cloud
-from stages.refine.sight import Sight
+from stages.refine.registration import (
+    MIN_REGISTRATION_POINTS,
+    Registration,
+    coarse_fit,
+    coarse_registration,
+    fine_registration,
+)
+from stages.refine.registration_cloud import RegistrationCloud
 
 log = logging.getLogger(__name__)
 FIT = 0.8  # a lower fit is another object
 THROUGH = 0.1  # share of an asset that cameras may see through before it cannot be the object
 TRIED = 2  # assets that are registered exactly, of those that fit best roughly
 SEEN = 0.02  # distance from the part within which the asset is not needed [diameters]
-SOLID = 0.1  # opacity of Gaussians that count as surface
+MIN_SURFACE_OPACITY = 0.1  # opacity of Gaussians that count as surface
 
 
-def complete(scene: Scene, number: int, sight: Sight, support: Support | None, options: RefineOptions) -> Gaussians:
+def complete(
+    scene: Scene, number: int, sight: ObservedSpace, support: Support | None, options: RefineOptions
+) -> Gaussians:
     """Gaussians of the best asset of `options.library` where the object was not seen; none when nothing fits."""
-    own = solid(scene, number)
-    found = best(own, options) if len(own) >= LEAST else None
+    own = opaque_gaussians(scene, number)
+    found = best_asset(own, options) if len(own) >= MIN_REGISTRATION_POINTS else None
     if found is None:
         log.info("  %d  %s: left alone: too little of it to compare with the library", number, scene.name_of(number))
-        return none_like(own)
+        return empty_like(own)
     asset, whole, how = found
-    gained, verdict = put(whole, how, own, sight, FIT)
+    gained, verdict = place_whole(whole, how, own, sight, FIT)
     log.info("  %d  %s: %s of the library %s", number, scene.name_of(number), asset, verdict)
     return gained
 
 
-def solid(scene: Scene, number: int) -> Gaussians:
+def opaque_gaussians(scene: Scene, number: int) -> Gaussians:
     """The Gaussians of an object that count as its surface."""
     g = scene.gaussians
-    return g[(g.object_id == number) & (g.opacities > SOLID) & g.means.isfinite().all(1)]
+    return g[(g.object_id == number) & (g.opacities > MIN_SURFACE_OPACITY) & g.means.isfinite().all(1)]
 
 
-def put(whole: Gaussians, how: Registration, own: Gaussians, sight: Sight, least: float) -> tuple[Gaussians, str]:
+def place_whole(
+    whole: Gaussians, how: Registration, own: Gaussians, sight: ObservedSpace, least: float
+) -> tuple[Gaussians, str]:
     """What a registered whole adds to its part, and why: nothing when it fits less than `least` or is seen through."""
     placed = transformed(whole, how.similarity.to(whole.means.device))
     through = _seen_through(placed, sight)
     fits = how.fit >= least and through <= THROUGH
     verdict = "put in its place" if fits else f"left alone: {least} and at most {THROUGH:.0%} are needed"
-    gained = added(own, placed, int(own.object_id[0])) if fits else none_like(own)
+    gained = unseen_gaussians(own, placed, int(own.object_id[0])) if fits else empty_like(own)
     return gained, f"fits to {how.fit:.2f}, {100 * through:.0f} % of it is seen through; {verdict}"
 
 
 @lru_cache(maxsize=1)
-def library(folder: Path, device: str) -> dict[str, tuple[Gaussians, Cloud]]:
+def load_library(folder: Path, device: str) -> dict[str, tuple[Gaussians, RegistrationCloud]]:
     """Whole objects by name: FOLDER/NAME.ply, or FOLDER/NAME/.../*.ply as trainers and `ngff-lab objects` write.
 
     Their clouds are on `device`, ready to be registered; their Gaussians stay on the CPU.
@@ -80,28 +90,28 @@ def library(folder: Path, device: str) -> dict[str, tuple[Gaussians, Cloud]]:
     out = {}
     for name, path in files.items():
         g = read_scene(path).gaussians
-        g = g[(g.opacities > SOLID) & g.scales.isfinite().all(1)]
+        g = g[(g.opacities > MIN_SURFACE_OPACITY) & g.scales.isfinite().all(1)]
         if len(g) < 100:
             raise InputError(f"{path}: {len(g)} solid Gaussians are no object; take it out of the library")
-        out[name] = g, Cloud.of(g.to(device))
+        out[name] = g, RegistrationCloud.of(g.to(device))
     return out
 
 
-def best(own: Gaussians, options: RefineOptions) -> tuple[str, Gaussians, Registration] | None:
+def best_asset(own: Gaussians, options: RefineOptions) -> tuple[str, Gaussians, Registration] | None:
     """Name, Gaussians and registration of the asset that fits best: all roughly, the most promising exactly."""
     device, seed = pick_device(options.device), options.seed
-    assets, part = library(options.library, device), Cloud.of(own.to(device), seed)
-    rough = {name: approach(part, cloud, seed) for name, (_, cloud) in assets.items()}
-    fits = {name: rough_fit(poses, part, assets[name][1]) for name, poses in rough.items() if len(poses)}
+    assets, part = load_library(options.library, device), RegistrationCloud.of(own.to(device), seed)
+    rough = {name: coarse_registration(part, cloud, seed) for name, (_, cloud) in assets.items()}
+    fits = {name: coarse_fit(poses, part, assets[name][1]) for name, poses in rough.items() if len(poses)}
     promising = sorted(fits, key=fits.get, reverse=True)[:TRIED]
-    settled = {name: settle(rough[name], part, assets[name][1], seed) for name in promising}
+    settled = {name: fine_registration(rough[name], part, assets[name][1], seed) for name in promising}
     if not settled:
         return None
     winner = max(settled, key=lambda name: settled[name].fit)
     return winner, assets[winner][0], settled[winner]
 
 
-def _seen_through(placed: Gaussians, sight: Sight) -> float:
+def _seen_through(placed: Gaussians, sight: ObservedSpace) -> float:
     """Share of the Gaussians where the cameras see nothing."""
     if not sight.views:
         return 0.0
@@ -109,12 +119,12 @@ def _seen_through(placed: Gaussians, sight: Sight) -> float:
     return float(sight.empty(placed.means, 0.03 * size).float().mean())
 
 
-def added(own: Gaussians, placed: Gaussians, number: int) -> Gaussians:
+def unseen_gaussians(own: Gaussians, placed: Gaussians, number: int) -> Gaussians:
     """The asset's Gaussians away from those of the object, in the light of the photos."""
     size = float((placed.means.amax(0) - placed.means.amin(0)).norm())
     near = knn(own.means, placed.means, 1)[0][:, 0] < SEEN * size
     if not near.any():
-        return none_like(own)
+        return empty_like(own)
     sh = placed.sh.clone()
     sh[:, 0] += _shift(own, placed[near], placed.means)
     rest = replace(placed, sh=sh, object_id=torch.full((len(placed),), number, dtype=own.object_id.dtype))

@@ -9,10 +9,10 @@ from stages.core.errors import InputError
 
 # a completer takes (scene, object number, Sight, Support | None, options) and returns Gaussians to add
 BACKENDS = {
-    "close": "stages.refine.close:complete",
+    "close": "stages.refine.hull_completion:complete",
     "library": "stages.refine.library:complete",
     "diffsplat": "stages.refine.diffsplat:complete",
-    "none": "stages.refine.close:nothing",
+    "none": "stages.refine.hull_completion:nothing",
 }
 
 

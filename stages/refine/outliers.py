@@ -9,7 +9,7 @@ from torch import Tensor
 from stages.core.geometry.neighbours import knn
 from stages.core.scene.gaussians import Gaussians
 
-EVEN = 0.2  # least deviation of the logarithm of distances: an even surface's corners are not lonely
+MIN_LOG_SPACING_MAD = 0.2  # least deviation of the logarithm of distances: an even surface's corners are not lonely
 
 
 def floaters(g: Gaussians, limit: float = 3.0) -> Bool[Tensor, "n"]:
@@ -26,8 +26,8 @@ def floaters(g: Gaussians, limit: float = 3.0) -> Bool[Tensor, "n"]:
             continue
         means = g.means[members]
         centre = means.median(0).values
-        far = score((means - centre).norm(dim=1))
-        alone = score(knn(means, means, 9)[0][:, -1].clamp_min(1e-12).log(), EVEN)
+        far = modified_z_score((means - centre).norm(dim=1))
+        alone = modified_z_score(knn(means, means, 9)[0][:, -1].clamp_min(1e-12).log(), MIN_LOG_SPACING_MAD)
         core = means[far <= limit]
         size = float((core.amax(0) - core.amin(0)).norm()) if len(core) else 0.0
         blur = g.scales[members].amax(1) > max(0.35 * size, 1e-12)
@@ -37,7 +37,7 @@ def floaters(g: Gaussians, limit: float = 3.0) -> Bool[Tensor, "n"]:
     return out
 
 
-def score(values: Float[Tensor, "n"], least: float | None = None) -> Float[Tensor, "n"]:
+def modified_z_score(values: Float[Tensor, "n"], least: float | None = None) -> Float[Tensor, "n"]:
     """Modified z-score above the median: 0.6745 (x - median) / MAD, with a MAD of `least` at least."""
     off = values - values.median()
     if least is None:

@@ -12,18 +12,18 @@ from tqdm import tqdm
 from stages.core.backends import choose, pick_device
 from stages.core.errors import InputError
 from stages.core.geometry.neighbours import knn
-from stages.core.perception.growing import complete as take_halo
-from stages.core.perception.support import Support, find_support, view_of
-from stages.core.perception.wall import find_wall, laid_down
+from stages.core.perception.region_growing import grow_objects
+from stages.core.perception.support import Support, find_support, view_extent
+from stages.core.perception.wall import find_wall, rotate_wall_to_floor
 from stages.core.scene.files import provenance
 from stages.core.scene.gaussians import Gaussians, concatenate, transformed
 from stages.core.scene.scene import Scene
 from stages.core.scene.scene_ply import read_scene, write_scene
-from stages.refine.background import fill
+from stages.refine.background import fill_background
+from stages.refine.disc_gaussians import empty_like
+from stages.refine.observed_space import ObservedSpace, object_psnr
 from stages.refine.options import BACKENDS, RefineOptions
 from stages.refine.outliers import floaters
-from stages.refine.patches import none_like
-from stages.refine.sight import Sight, agreement
 
 log = logging.getLogger(__name__)
 
@@ -37,7 +37,7 @@ def run(scene: Path, out: Path, options: RefineOptions = RefineOptions()) -> Non
     refined = refine(whole, options)
     facts = {**provenance("refine", [Path(scene)], options), "scene": whole.provenance}
     write_scene(out, replace(refined, provenance=facts))
-    psnr = agreement(whole, refined)
+    psnr = object_psnr(whole, refined)
     seen = "" if psnr is None else f"; in the views of the photos it equals the input to {psnr:.1f} dB"
     log.info("%s: %d Gaussians, from %d%s", out, len(refined.gaussians), len(whole.gaussians), seen)
 
@@ -47,10 +47,10 @@ def refine(scene: Scene, options: RefineOptions = RefineOptions()) -> Scene:  # 
 
     Where things hang on a wall, and there is no floor, it is done with the wall lying down, and turned back.
     """
-    wall = find_wall(scene, view_of(scene), options.seed)
+    wall = find_wall(scene, view_extent(scene), options.seed)
     if wall is None:
         return _refined(scene, find_support(scene, seed=options.seed), options)
-    laid = laid_down(scene, wall)
+    laid = rotate_wall_to_floor(scene, wall)
     done = _refined(laid, find_support(laid, seed=options.seed), options)
     gaussians = transformed(done.gaussians, wall.inverse())
     return replace(done, gaussians=gaussians, cameras=scene.cameras, floor=scene.floor)
@@ -59,20 +59,20 @@ def refine(scene: Scene, options: RefineOptions = RefineOptions()) -> Scene:  # 
 def _refined(scene: Scene, support: Support | None, options: RefineOptions) -> Scene:
     """The three steps for things on `support`."""
     completer = choose(BACKENDS, options.chosen)
-    g = take_halo(scene.gaussians, support, _reach(scene.gaussians))
+    g = grow_objects(scene.gaussians, support, _reach(scene.gaussians))
     stray = floaters(g, options.outliers) if options.outliers else torch.zeros(len(g), dtype=torch.bool)
     scene = replace(scene, gaussians=g[~stray])
-    sight = Sight.of(scene)
+    sight = ObservedSpace.of(scene)
     numbers = [i for i in scene.gaussians.object_id.unique().tolist() if i > 0]
     made = [completer(scene, i, sight, support, options) for i in tqdm(numbers, unit="object")]
-    made = concatenate([none_like(scene.gaussians), *made])
+    made = concatenate([empty_like(scene.gaussians), *made])
     made = made[sight.hidden(scene.gaussians, made)]
     for i in numbers:
         count = int((made.object_id == i).sum())
         log.info("  %d  %s: %d Gaussians close its unseen sides", i, scene.name_of(i), count)
     filled = scene
     if options.background and support is not None:
-        filled = fill(scene, sight, support, options.seed)
+        filled = fill_background(scene, sight, support, options.seed)
     new = len(filled.gaussians) - len(scene.gaussians)
     log.info("  %d floaters taken away, %d Gaussians more for the table", int(stray.sum()), new)
     whole = replace(filled, gaussians=concatenate([filled.gaussians, made]))

@@ -19,9 +19,9 @@ from stages.core.geometry.cameras import centres
 from stages.core.scene.scene import Scene
 from stages.segment.options import SegmentOptions
 from stages.segment.prompts import read_prompts
-from stages.segment.vote import Sight, add, decide, tempered
+from stages.segment.voting import ViewFootprint, add_votes, apply_votes, damp_votes
 
-VIEWS = 32  # at most that are cut: more say the same again
+MAX_VIEWS = 32  # at most that are cut: more say the same again
 BINS = 32  # of a colour's channels
 OWN = 2.5  # times as often in the box as around it is a colour that speaks for the object
 AROUND = 0.5  # width of what is around a box [its longer side]
@@ -45,11 +45,15 @@ def segment(scene: Scene, options: SegmentOptions) -> Scene:
                              f'{size[0]}x{size[1]} pixels; drawn in a larger picture, add "size": [w, h]')  # fmt: skip
     votes = torch.zeros(len(scene.gaussians), 1 + len(shares))
     for view in tqdm(nearest_first(scene), desc="cutting", unit="view", leave=False):
-        sight = Sight.of(scene, view)
+        sight = ViewFootprint.of(scene, view)
         picture = (255 * sight.picture.numpy()).astype(np.uint8)
-        labels = first(picture, shares, options.seed) if view == 0 else again(picture, sight, votes, options.seed)
-        votes = add(votes, tempered(sight.votes(torch.from_numpy(labels))))
-    return decide(scene, votes, dict(enumerate(prompts.names, start=1)), str(options.boxes), options.seed)
+        labels = (
+            segment_prompted_view(picture, shares, options.seed)
+            if view == 0
+            else segment_next_view(picture, sight, votes, options.seed)
+        )
+        votes = add_votes(votes, damp_votes(sight.votes(torch.from_numpy(labels))))
+    return apply_votes(scene, votes, dict(enumerate(prompts.names, start=1)), str(options.boxes), options.seed)
 
 
 def nearest_first(scene: Scene) -> list[int]:
@@ -57,11 +61,11 @@ def nearest_first(scene: Scene) -> list[int]:
     eyes = centres(scene.cameras.viewmats)
     order = (eyes - eyes[0]).norm(dim=1)
     order[0] = -1
-    pick = torch.linspace(0, len(eyes) - 1, min(VIEWS, len(eyes))).round().long()
+    pick = torch.linspace(0, len(eyes) - 1, min(MAX_VIEWS, len(eyes))).round().long()
     return order.argsort(stable=True)[pick].tolist()
 
 
-def first(
+def segment_prompted_view(
     picture: UInt8[np.ndarray, "h w 3"], shares: Float[Tensor, "o 4"], seed: int
 ) -> Int[np.ndarray, "h w"]:
     """Labels of the view that the boxes are about. Where they overlap, the smallest has the first choice."""
@@ -75,14 +79,14 @@ def first(
         near[max(0, y0 - side) : y1 + side, max(0, x0 - side) : x1 + side] = True
         inside[y0:y1, x0:x1] = True
         inside &= labels == 0
-        likely = inside & (peculiar(picture, inside, near & ~inside) > OWN)
+        likely = inside & (colour_likelihood_ratio(picture, inside, near & ~inside) > OWN)
         if not likely.any():  # looks like what is around it: the cut has to begin with all of the box
             likely = inside
-        labels[cut(picture, inside & ~likely, likely, np.zeros_like(inside), seed)] = i + 1
+        labels[grabcut(picture, inside & ~likely, likely, np.zeros_like(inside), seed)] = i + 1
     return labels
 
 
-def peculiar(
+def colour_likelihood_ratio(
     picture: UInt8[np.ndarray, "h w 3"], inside: Bool[np.ndarray, "h w"], around: Bool[np.ndarray, "h w"]
 ) -> Float[np.ndarray, "h w"]:
     """How much oftener the colour of each pixel is inside than around."""
@@ -95,8 +99,8 @@ def peculiar(
     return (shares[0] / (shares[1] + 1e-6))[key]
 
 
-def again(
-    picture: UInt8[np.ndarray, "h w 3"], sight: Sight, votes: Float[Tensor, "n k"], seed: int
+def segment_next_view(
+    picture: UInt8[np.ndarray, "h w 3"], sight: ViewFootprint, votes: Float[Tensor, "n k"], seed: int
 ) -> Int[np.ndarray, "h w"]:
     """Labels of another view, from what the Gaussians in it are known to be."""
     front = sight.front.long().clamp_min(0)
@@ -111,14 +115,14 @@ def again(
         outside, within = distance_transform_edt(~own), distance_transform_edt(~other) if other.any() else np.inf
         size = own.sum() ** 0.5
         sure, close = own & (within > REACH / 2 * size), outside < np.where(known, REACH, UNSEEN) * size
-        found = cut(picture, close & (outside > within), close & (outside <= within), sure, seed)
+        found = grabcut(picture, close & (outside > within), close & (outside <= within), sure, seed)
         mine = np.where(found, within - outside, -np.inf)  # the deeper a pixel is in what is known, the surer
         labels = np.where(found & ((labels == 0) | (mine > likeliness)), i, labels)
         likeliness = np.where(labels == i, mine, likeliness)
     return labels
 
 
-def cut(
+def grabcut(
     picture: UInt8[np.ndarray, "h w 3"], unlikely: Bool[np.ndarray, "h w"], likely: Bool[np.ndarray, "h w"],
     sure: Bool[np.ndarray, "h w"], seed: int,
 ) -> Bool[np.ndarray, "h w"]:  # fmt: skip
@@ -129,10 +133,10 @@ def cut(
         cv2.setRNGSeed(seed)
         # once: learning colours again from the cut, what shows between limbs becomes the object's
         cv2.grabCut(picture, trimap, None, *np.zeros((2, 1, 65)), 1, cv2.GC_INIT_WITH_MASK)
-    return tidy((trimap == cv2.GC_FGD) | (trimap == cv2.GC_PR_FGD))
+    return clean_mask((trimap == cv2.GC_FGD) | (trimap == cv2.GC_PR_FGD))
 
 
-def tidy(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+def clean_mask(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     """Without small pieces and small holes."""
     _, piece, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
     areas = np.where(np.arange(len(stats)) > 0, stats[:, cv2.CC_STAT_AREA], 0)

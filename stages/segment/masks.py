@@ -13,18 +13,18 @@ from stages.core.errors import InputError
 from stages.core.scene.images import read_labels
 from stages.core.scene.scene import Scene
 from stages.segment.options import SegmentOptions
-from stages.segment.pictures import check_proportions, match
-from stages.segment.vote import decide, poll
+from stages.segment.view_images import check_proportions, match_files
+from stages.segment.voting import apply_votes, collect_votes
 
 
 def segment(scene: Scene, options: SegmentOptions) -> Scene:
     """Labels of the images in the folder `options.masks`, projected with visibility and voted over all views."""
     if scene.cameras is None:
         raise InputError("--masks: the scene has no cameras; use one that `ngff reconstruct` wrote")
-    files = match(options.masks, scene.cameras.names, "label image", "--masks")
+    files = match_files(options.masks, scene.cameras.names, "label image", "--masks")
     bar = tqdm(files.items(), unit="mask")
-    votes = poll(scene, ((view, _labels(scene, view, file)) for view, file in bar))
-    return decide(scene, votes, read_names(options.masks), str(options.masks), options.seed)
+    votes = collect_votes(scene, ((view, _labels(scene, view, file)) for view, file in bar))
+    return apply_votes(scene, votes, read_names(options.masks), str(options.masks), options.seed)
 
 
 def _labels(scene: Scene, view: int, file: Path) -> Int[Tensor, "h w"]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from stages.core.errors import InputError
-from stages.segment.scale import parse_scale
+from stages.segment.object_scale import parse_object_scale
 
 BACKENDS = {
     "geometric": "stages.segment.geometric:segment",
@@ -45,7 +45,7 @@ class SegmentOptions:
             raise InputError(f"--min-size {self.min_size}: must be between 0 and 1, such as 0.03")
         if not 0 < self.detail < 2:
             raise InputError(f"--detail {self.detail}: must be between 0 and 2, such as 0.4")
-        self.renamed, parse_scale(self.scale_reference)  # noqa: B018 -- what is bad is found before work starts
+        self.renamed, parse_object_scale(self.scale_reference)  # noqa: B018 -- what is bad is found before work starts
 
     @property
     def chosen(self) -> str:

@@ -15,7 +15,7 @@ from stages.core.scene.files import must_exist
 
 
 @dataclass(frozen=True)
-class Prompts:
+class ObjectPrompts:
     """One row an object; boxes, or points, or both are there."""
 
     boxes: Float[Tensor, "o 4"] | None  # x0 y0 x1 y1 [px] of view 0
@@ -23,7 +23,7 @@ class Prompts:
     names: tuple[str, ...]
 
 
-def read_prompts(path: Path, size: tuple[int, int] | None = None) -> Prompts:
+def read_prompts(path: Path, size: tuple[int, int] | None = None) -> ObjectPrompts:
     """prompts.json in the public format: {"bbox": [[x0, y0, x1, y1]..], "center_point": [[u, v]..], "text": [..]}.
 
     Either of the first two may be absent or empty. "size": [width, height] says how large the picture is that all this
@@ -48,7 +48,7 @@ def read_prompts(path: Path, size: tuple[int, int] | None = None) -> Prompts:
                          "each, or of boxes or points none")  # fmt: skip
     if not bool((boxes[:, 2:] > boxes[:, :2]).all()):
         raise InputError(f"{path}: a box has no area; the order is x0, y0, x1, y1 in pixels of the first photo")
-    return Prompts(boxes if len(boxes) else None, points if len(points) else None, names)
+    return ObjectPrompts(boxes if len(boxes) else None, points if len(points) else None, names)
 
 
 def _wrong(path: Path, what: str) -> InputError:

@@ -10,13 +10,13 @@ import torch
 from stages.core.backends import pick_device
 from stages.core.errors import InputError
 from stages.core.models.sam2.weights import download, find, load
-from stages.core.perception.grouping import named
+from stages.core.perception.grouping import name_objects
 from stages.core.perception.support import find_support
 from stages.core.scene.scene import Scene
 from stages.segment.options import SegmentOptions
-from stages.segment.pictures import Pictures, pictures
-from stages.segment.prompts import Prompts, read_prompts
-from stages.segment.vote import decide, poll
+from stages.segment.prompts import ObjectPrompts, read_prompts
+from stages.segment.view_images import ViewImages, view_images
+from stages.segment.voting import apply_votes, collect_votes
 
 log = logging.getLogger(__name__)
 
@@ -29,13 +29,13 @@ def segment(scene: Scene, options: SegmentOptions) -> Scene:
     """
     if scene.cameras is None or not len(scene.cameras):
         raise InputError("--backend sam2: the scene has no cameras; use one that `ngff reconstruct` wrote")
-    shown = pictures(scene, options.photos)
+    shown = view_images(scene, options.photos)
     prompts = read_prompts(options.boxes, scene.cameras.sizes[0].tolist()) if options.boxes is not None else None
     if prompts is not None and shown.views[0] != 0:
         raise InputError(f"{options.photos}: lacks {scene.cameras.names[0]}, the photo that --boxes is about")
     model = load(_weights(options), pick_device(options.device))
     log.info("SAM 2.1 looks at %d %s", len(shown), "photos" if options.photos else "drawings of the scene: no --photos")
-    return labelled(scene, model, shown, prompts, options)
+    return segment_views(scene, model, shown, prompts, options)
 
 
 def _weights(options: SegmentOptions) -> Path:
@@ -48,27 +48,31 @@ def _weights(options: SegmentOptions) -> Path:
     return download()
 
 
-def labelled(scene: Scene, model, shown: Pictures, prompts: Prompts | None, options: SegmentOptions) -> Scene:
+def segment_views(
+    scene: Scene, model, shown: ViewImages, prompts: ObjectPrompts | None, options: SegmentOptions
+) -> Scene:
     """The scene with the objects that a loaded network finds in pictures of it."""
-    from stages.segment.discover import discover  # imports transformers, whose absence `load` has explained by now
-    from stages.segment.propagate import Tracker
+    from stages.segment.discovery import (
+        discover_objects,  # imports transformers, whose absence `load` has explained by now
+    )
+    from stages.segment.propagation import MaskTracker
 
-    tracker = Tracker(model, scene, shown)
+    tracker = MaskTracker(model, scene, shown)
     if prompts is not None:
-        votes = poll(scene, tracker.labels(clicks_of(prompts, scene)))
-        return decide(scene, votes, dict(enumerate(prompts.names, start=1)), "sam2", options.seed)
+        votes = collect_votes(scene, tracker.labels(point_prompts(prompts, scene)))
+        return apply_votes(scene, votes, dict(enumerate(prompts.names, start=1)), "sam2", options.seed)
     support = find_support(scene, seed=options.seed)
-    found = discover(tracker, support, options)
+    found = discover_objects(tracker, support, options)
     if not any(bool(labels.any()) for labels in found.values()):
         return scene
-    return named(decide(scene, poll(scene, found.items()), {}, "sam2", options.seed), support)
+    return name_objects(apply_votes(scene, collect_votes(scene, found.items()), {}, "sam2", options.seed), support)
 
 
-def clicks_of(prompts: Prompts, scene: Scene) -> list:
+def point_prompts(prompts: ObjectPrompts, scene: Scene) -> list:
     """A box for each object, or a point where there are no boxes, as shares of the first view."""
-    from stages.core.models.sam2.network import Clicks
+    from stages.core.models.sam2.network import PointPrompts
 
     size = scene.cameras.sizes[0].float()
     if prompts.boxes is not None:
-        return [Clicks.box(box / torch.cat([size, size])) for box in prompts.boxes]
-    return [Clicks.inside(point / size) for point in prompts.points]
+        return [PointPrompts.box(box / torch.cat([size, size])) for box in prompts.boxes]
+    return [PointPrompts.inside(point / size) for point in prompts.points]

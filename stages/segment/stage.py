@@ -11,8 +11,8 @@ from stages.core.errors import InputError
 from stages.core.scene.files import provenance
 from stages.core.scene.scene import Scene
 from stages.core.scene.scene_ply import read_scene, write_scene
+from stages.segment.object_scale import parse_object_scale
 from stages.segment.options import BACKENDS, SegmentOptions
-from stages.segment.scale import parse_scale
 
 log = logging.getLogger(__name__)
 
@@ -22,19 +22,19 @@ def run(scene: Path, out: Path, options: SegmentOptions = SegmentOptions()) -> N
     segment = choose(BACKENDS, options.chosen)
     pick_device(options.device)  # refuses a GPU that is not there; only sam2 is heavy enough to use one
     whole = read_scene(scene)
-    labelled = renamed(segment(whole, options), options)
-    known = parse_scale(options.scale_reference)
+    labelled = rename_objects(segment(whole, options), options)
+    known = parse_object_scale(options.scale_reference)
     labelled = known.applied(labelled) if known else labelled
     inputs = [Path(p) for p in (scene, options.boxes, options.photos) if p is not None]
     facts = {**provenance("segment", inputs, options), "scene": whole.provenance}
     write_scene(out, replace(labelled, provenance=facts))
-    report(labelled)
+    log_objects(labelled)
     log.info("%s: %d objects", out, len(labelled.objects))
     if not labelled.objects:
         log.warning("%s: no objects were found; try --masks, or --min-size %g", scene, options.min_size / 2)
 
 
-def renamed(scene: Scene, options: SegmentOptions) -> Scene:
+def rename_objects(scene: Scene, options: SegmentOptions) -> Scene:
     """The names that the user gave, in place of those found."""
     have = {o.id for o in scene.objects}
     for number in options.renamed:
@@ -47,7 +47,7 @@ def _listed(scene: Scene) -> str:
     return ", ".join(f"{o.id} ({o.name})" for o in scene.objects) or "none"
 
 
-def report(scene: Scene) -> None:
+def log_objects(scene: Scene) -> None:
     """One line an object: number, name, count and size."""
     g = scene.gaussians
     for o in scene.objects:

@@ -20,15 +20,15 @@ from stages.core.scene.scene_ply import read_scene, write_scene
 from stages.evaluate.scenes import nearest_neighbours
 from stages.lab.assets.shapes import ellipsoid
 from stages.refine import diffsplat
-from stages.refine.library import solid, transformed
+from stages.refine.library import opaque_gaussians, transformed
+from stages.refine.object_crop import crop_object
+from stages.refine.observed_space import ObservedSpace
 from stages.refine.options import RefineOptions
-from stages.refine.portrait import portrait
-from stages.refine.register import register
-from stages.refine.register_cloud import Cloud
-from stages.refine.sight import Sight
+from stages.refine.registration import register
+from stages.refine.registration_cloud import RegistrationCloud
 from stages.refine.stage import refine, run
-from tests.refine.things import thing
-from tests.segment.tabletop import coloured, scene_of, table
+from tests.refine.sample_objects import asymmetric_object
+from tests.segment.tabletop import coloured_gaussians, scene_of, table_gaussians
 
 SIDE = 128
 PLACE = Similarity(0.3, matrix(torch.tensor([0.9, 0.0, 0.0, 0.4])), torch.tensor([0.02, -0.03, 0.04]))
@@ -37,16 +37,16 @@ OFF = Similarity(0.94, matrix(torch.tensor([1.0, 0.02, -0.03, 0.02])), torch.ten
 
 @pytest.fixture(scope="module")
 def truth() -> Gaussians:
-    return transformed(thing(), PLACE)
+    return transformed(asymmetric_object(), PLACE)
 
 
 @pytest.fixture(scope="module")
 def seen(truth) -> Scene:
     """What three cameras on one side see of the thing on a table."""
-    scene = scene_of(table(0.02), truth)
+    scene = scene_of(table_gaussians(0.02), truth)
     scene = replace(scene, cameras=scene.cameras[:3], objects=(SceneObject(1, "toy_thing"),))
     g = scene.gaussians
-    return replace(scene, gaussians=g[(Sight.of(scene).weight > 0.02) | (g.object_id == 0)])
+    return replace(scene, gaussians=g[(ObservedSpace.of(scene).weight > 0.02) | (g.object_id == 0)])
 
 
 def maps_of(g: Gaussians, elevation: float) -> torch.Tensor:
@@ -67,7 +67,7 @@ def maps_of(g: Gaussians, elevation: float) -> torch.Tensor:
 @pytest.fixture(scope="module")
 def perfect(seen, truth):
     """In the network's place: the true object, a little off from where the portrait's camera says it is."""
-    place = portrait(seen, solid(seen, 1), SIDE).place
+    place = crop_object(seen, opaque_gaussians(seen, 1), SIDE).place
     R = place.rotation.mT
     back = Similarity(1 / place.scale, R, -(R @ place.translation) / place.scale)
 
@@ -86,8 +86,10 @@ def whole(seen, perfect) -> Scene:
 
 
 def test_the_thing_is_whole_where_it_was_not_seen(seen, whole, truth):
-    all_round = scene_of(table(0.02), truth)
-    outside = all_round.gaussians.means[(Sight.of(all_round).weight > 0.02) & (all_round.gaussians.object_id == 1)]
+    all_round = scene_of(table_gaussians(0.02), truth)
+    outside = all_round.gaussians.means[
+        (ObservedSpace.of(all_round).weight > 0.02) & (all_round.gaussians.object_id == 1)
+    ]
     before, after = (s.gaussians.means[s.gaussians.object_id == 1] for s in (seen, whole))
     far = [nearest_neighbours(outside, points).distance for points in (before, after)]
     assert far[1].mean() < 0.3 * far[0].mean() and far[1].mean() < 0.02 * PLACE.scale
@@ -109,13 +111,15 @@ def test_the_raw_thing_stands_beside_it(seen, whole):
 
 def test_a_hint_helps_where_nothing_stands_out():
     """A plain cylinder's part has no features to match; near a hint it is found."""
-    plain = coloured(ellipsoid((0.2, 0.3, 0.5), 8000), (0.5, 0.5, 0.5), 1, grain=0.0)
+    plain = coloured_gaussians(ellipsoid((0.2, 0.3, 0.5), 8000), (0.5, 0.5, 0.5), 1, grain=0.0)
     there = Similarity(0.4, matrix(torch.tensor([0.8, 0.2, -0.3, 0.1])), torch.tensor([0.2, 0.1, 0.3]))
     part = transformed(plain, there)[plain.means[:, 0] > -0.05]
     near = Similarity(0.4 * 1.05, there.rotation @ OFF.rotation, there.translation + 0.01)
     found = register(part, plain, hint=near)
     assert found.similarity.scale == pytest.approx(0.4, rel=0.03)
-    assert (found.similarity(plain.means) - there(plain.means)).norm(dim=1).mean() < 0.02 * Cloud.of(part).diameter
+    assert (found.similarity(plain.means) - there(plain.means)).norm(dim=1).mean() < 0.02 * RegistrationCloud.of(
+        part
+    ).diameter
 
 
 def test_without_weights_it_is_one_sentence(seen, tmp_path, monkeypatch):

@@ -18,12 +18,12 @@ from stages.core.scene.scene_ply import read_scene, write_scene
 from stages.evaluate.scenes import chamfer, nearest_neighbours
 from stages.lab.assets.shapes import ellipsoid
 from stages.refine.library import transformed
+from stages.refine.observed_space import ObservedSpace
 from stages.refine.options import RefineOptions
-from stages.refine.sight import Sight
 from stages.refine.stage import refine, run
 from tests.conftest import random_gaussians
-from tests.refine.things import thing
-from tests.segment.tabletop import coloured, scene_of, table
+from tests.refine.sample_objects import asymmetric_object
+from tests.segment.tabletop import coloured_gaussians, scene_of, table_gaussians
 
 SIZE, TURN = 0.3, matrix(torch.tensor([0.9, 0.0, 0.0, 0.4]))
 PLACE = Similarity(SIZE, TURN, torch.tensor([0.02, -0.03, 0.1 * SIZE]))
@@ -32,14 +32,14 @@ DARK = 0.85  # the photos show the thing in less light than the library
 
 @pytest.fixture(scope="module")
 def truth():
-    return transformed(thing(), PLACE)
+    return transformed(asymmetric_object(), PLACE)
 
 
 @pytest.fixture(scope="module")
 def seen(truth) -> Scene:
     """The thing on a table as four cameras on one side see it, darker than in the library."""
     black = -0.5 / C0
-    scene = scene_of(table(0.02), replace(truth, sh=black + DARK * (truth.sh - black)))
+    scene = scene_of(table_gaussians(0.02), replace(truth, sh=black + DARK * (truth.sh - black)))
     all_round = scene.cameras
     ahead = torch.nonzero(centres(all_round.viewmats)[:, 1] < -0.1)[:, 0]
     cameras = replace(
@@ -48,16 +48,18 @@ def seen(truth) -> Scene:
     )  # fmt: skip
     scene = replace(scene, objects=(SceneObject(1, "thing"),), cameras=cameras)
     g = scene.gaussians
-    return replace(scene, gaussians=g[(Sight.of(scene).weight > 0.02) | (g.object_id == 0)])
+    return replace(scene, gaussians=g[(ObservedSpace.of(scene).weight > 0.02) | (g.object_id == 0)])
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     home = tmp_path_factory.mktemp("library")
-    write_scene(home / "thing.ply", Scene(thing()))
+    write_scene(home / "thing.ply", Scene(asymmetric_object()))
     nested = home / "egg/point_cloud/iteration_30000"
     nested.mkdir(parents=True)
-    write_scene(nested / "point_cloud.ply", Scene(coloured(ellipsoid((0.3, 0.25, 0.5), 4000), (0.9, 0.9, 0.85), 1)))
+    write_scene(
+        nested / "point_cloud.ply", Scene(coloured_gaussians(ellipsoid((0.3, 0.25, 0.5), 4000), (0.9, 0.9, 0.85), 1))
+    )
     return home
 
 
@@ -89,8 +91,8 @@ def test_raw_objects_are_kept_behind_the_completed_ones(seen, whole):
 
 
 def test_a_stranger_is_left_alone_and_it_is_said(folder, caplog):
-    strange = coloured(ellipsoid((0.05, 0.05, 0.12), 3000).moved((0, 0, 0.12)), (0.1, 0.7, 0.7), 1)
-    scene = replace(scene_of(table(0.02), strange), objects=(SceneObject(1, "bottle"),))
+    strange = coloured_gaussians(ellipsoid((0.05, 0.05, 0.12), 3000).moved((0, 0, 0.12)), (0.1, 0.7, 0.7), 1)
+    scene = replace(scene_of(table_gaussians(0.02), strange), objects=(SceneObject(1, "bottle"),))
     with caplog.at_level(logging.INFO):
         refined = refine(scene, RefineOptions(library=folder, background=False))
     assert int((refined.gaussians.object_id == 1).sum()) <= len(strange)

@@ -7,7 +7,7 @@ import torch
 
 from stages.core.geometry.neighbours import knn
 from stages.core.scene.gaussians import Gaussians, concatenate
-from stages.refine.outliers import EVEN, floaters, score
+from stages.refine.outliers import MIN_LOG_SPACING_MAD, floaters, modified_z_score
 from tests.segment.tabletop import block, egg
 
 
@@ -34,6 +34,6 @@ def test_what_is_left_has_no_floaters_beyond_three_robust_deviations(kind):
     assert found[len(body) :].all()
     assert float(found[: len(body)].float().mean()) < 0.01
     left = g.means[~found]
-    far = score((left - left.median(0).values).norm(dim=1))
-    alone = score(knn(left, left, 9)[0][:, -1].log(), EVEN)
+    far = modified_z_score((left - left.median(0).values).norm(dim=1))
+    alone = modified_z_score(knn(left, left, 9)[0][:, -1].log(), MIN_LOG_SPACING_MAD)
     assert not ((far > 3) & (alone > 3)).any()

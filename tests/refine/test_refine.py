@@ -18,13 +18,13 @@ from stages.core.scene.gaussians import concatenate, transformed
 from stages.core.scene.scene import Scene, SceneObject
 from stages.core.scene.scene_ply import read_scene, write_scene
 from stages.lab.assets.shapes import ellipsoid, sheet
+from stages.refine.disc_gaussians import disc_gaussians
+from stages.refine.observed_space import ObservedSpace, object_psnr
 from stages.refine.options import RefineOptions
 from stages.refine.outliers import floaters
-from stages.refine.patches import patches
-from stages.refine.sight import Sight, agreement
 from stages.refine.stage import refine, run
 from tests.conftest import random_gaussians
-from tests.segment.tabletop import WOOD, block, coloured, round_about, scene_of, table
+from tests.segment.tabletop import WOOD, block, coloured_gaussians, orbit_cameras, scene_of, table_gaussians
 
 SIDES = (0.2, 0.16, 0.12)
 REMAINS = {-0.035: (0.8, 0.7, 0.1), 0.035: (0.08, 0.08, 0.08)}  # y [m]: colour
@@ -33,7 +33,7 @@ REMAINS = {-0.035: (0.8, 0.7, 0.1), 0.035: (0.08, 0.08, 0.08)}  # y [m]: colour
 def photographed() -> Scene:
     """A red block as photos show it: no bottom, and no table beneath it."""
     thing = block((0.0, 0.0), SIDES, (0.8, 0.1, 0.1), 1)
-    top = table()
+    top = table_gaussians()
     hidden = (top.means[:, 0].abs() < SIDES[0] / 2) & (top.means[:, 1].abs() < SIDES[1] / 2)
     scene = scene_of(top[~hidden], thing)
     return replace(scene, objects=(SceneObject(1, "block"),))
@@ -82,16 +82,16 @@ def test_the_table_under_a_lifted_object_is_there_and_has_its_colour(before, aft
 
 def test_parts_of_an_object_that_were_left_on_the_table_do_not_stay_beneath_it():
     """A block stands on two rails, and what cameras saw between them lies on the table's plane in yellow and black."""
-    top, rails = table(), [block((0.0, y), (0.2, 0.02, 0.07), (0.8, 0.1, 0.1), 1) for y in (-0.07, 0.07)]
+    top, rails = table_gaussians(), [block((0.0, y), (0.2, 0.02, 0.07), (0.8, 0.1, 0.1), 1) for y in (-0.07, 0.07)]
     body = block((0.0, 0.0), SIDES, (0.8, 0.1, 0.1), 1)
     body = replace(body, means=body.means + torch.tensor([0, 0, 0.07]))
     hidden = (top.means[:, 0].abs() < 0.1) & (top.means[:, 1].abs() < 0.08)
-    left = [coloured(sheet(0.2, 0.07, 0.012).moved((0.0, y, 0.0)), rgb, 0) for y, rgb in REMAINS.items()]
+    left = [coloured_gaussians(sheet(0.2, 0.07, 0.012).moved((0.0, y, 0.0)), rgb, 0) for y, rgb in REMAINS.items()]
     scene = scene_of(top[~hidden], body, *rails, *left)
-    high, low = round_about(12, elevation=50.0), round_about(2, elevation=20.0)  # the low ones look along the rails
+    high, low = orbit_cameras(12, elevation=50.0), orbit_cameras(2, elevation=20.0)  # the low ones look along the rails
     fields = [torch.cat([getattr(high, f), getattr(low, f)]) for f in ("viewmats", "Ks", "sizes")]
     scene = replace(scene, cameras=Cameras(*fields, tuple(f"{i}.jpg" for i in range(14))))
-    weight = Sight.of(scene).weight[-2 * len(left[0].means) :]
+    weight = ObservedSpace.of(scene).weight[-2 * len(left[0].means) :]
     assert float((weight > 1).float().mean()) > 0.3  # many of them are seen, between the rails
     refined = refine(scene, RefineOptions(completer="none"))
     for y, rgb in REMAINS.items():
@@ -103,7 +103,7 @@ def test_parts_of_an_object_that_were_left_on_the_table_do_not_stay_beneath_it()
 
 def test_where_a_large_remain_goes_the_table_is_whole(before):
     # beneath the block three wide yellow Gaussians in one place, and many small ones beside it
-    small = coloured(sheet(0.05, 0.12, 0.01).moved((-0.06, 0.0, 0.0)), (0.8, 0.7, 0.1), 0)
+    small = coloured_gaussians(sheet(0.05, 0.12, 0.01).moved((-0.06, 0.0, 0.0)), (0.8, 0.7, 0.1), 0)
     wide = replace(small[:3], means=torch.tensor([[0.03, 0.0, 0.0]]).repeat(3, 1), opacities=torch.full((3,), 0.999))
     wide = replace(wide, scales=torch.tensor([[0.05, 0.05, 0.002]]).repeat(3, 1))
     scene = replace(before, gaussians=concatenate([before.gaussians, small, wide]))
@@ -135,8 +135,8 @@ def test_without_cameras_the_table_is_filled_in_its_own_colours():
 
 def test_the_table_ends_where_it_ended():
     """In the corner of an L-shaped table a block stands at the edge; past it cameras see the floor."""
-    top = table()
-    floor = coloured(sheet(2.0, 2.0, 0.03).moved((0.0, 0.0, -0.4)), (0.3, 0.3, 0.35), 0)
+    top = table_gaussians()
+    floor = coloured_gaussians(sheet(2.0, 2.0, 0.03).moved((0.0, 0.0, -0.4)), (0.3, 0.3, 0.35), 0)
     thing = block((-0.04, -0.04), (0.08, 0.08, 0.1), (0.1, 0.2, 0.8), 1)
     kept = (top.means[:, 0] < 0.02) | (top.means[:, 1] < 0.02)
     under = ((top.means[:, :2] + 0.04).abs() < 0.035).all(1)
@@ -163,39 +163,39 @@ def test_the_share_of_cameras_that_see_a_place(before):
     places = places[((places[:, 0].abs() > 0.13) | (places[:, 1].abs() > 0.11))]
     eyes = centres(before.cameras.viewmats)
     least, most = (passes(eyes, places, grown).float().mean(0) for grown in (0.02, -0.005))
-    found = Sight.of(before).share(places, 0.02)
+    found = ObservedSpace.of(before).share(places, 0.02)
     assert bool((found >= least - 1e-6).all() and (found <= most + 1e-6).all())
     assert bool((least == most).float().mean() > 0.3) and float(least.min()) < 0.7 < float(most.max())
     inside = torch.tensor([[0.0, 0.0, 0.0], [0.05, -0.04, 0.0]])
-    assert float(Sight.of(before).share(inside, 0.02).max()) == 0.0
+    assert float(ObservedSpace.of(before).share(inside, 0.02).max()) == 0.0
 
 
 def test_wide_patches_behind_fur_are_hidden_and_before_it_they_are_not():
     x = torch.cartesian_prod(torch.linspace(-0.2, 0.2, 41), torch.linspace(-0.2, 0.2, 41))
     up = torch.tensor([0.0, 0.0, 1.0])
     flat = torch.cat([x, torch.zeros(len(x), 1)], 1)
-    fur = patches(flat, up.expand(len(x), 3), torch.full((len(x), 3), 0.5), 0.01, 1)
-    wide = patches(torch.tensor([[0, 0, -0.05], [0, 0, 0.05]]), up.expand(2, 3), torch.zeros(2, 3), 0.1, 1)
+    fur = disc_gaussians(flat, up.expand(len(x), 3), torch.full((len(x), 3), 0.5), 0.01, 1)
+    wide = disc_gaussians(torch.tensor([[0, 0, -0.05], [0, 0, 0.05]]), up.expand(2, 3), torch.zeros(2, 3), 0.1, 1)
     eye = torch.tensor([[0.0, 0.01, 1.0]])
     viewmats, Ks = look_at(eye, torch.zeros(1, 3)), intrinsics(200, 200, 300.0)[None]
     scene = Scene(fur, cameras=Cameras(viewmats, Ks, torch.tensor([[200, 200]]), ("a",)))
     _, weight = visibility(concatenate([fur, wide[:1]]), viewmats[0], Ks[0], 200, 200)
     assert float(weight[-1]) > 0.3  # [px]: a little through each of many pixels
-    assert Sight.of(scene).hidden(fur, wide).tolist() == [True, False]
+    assert ObservedSpace.of(scene).hidden(fur, wide).tolist() == [True, False]
 
 
 def test_what_the_photos_show_stays(before, after):
-    assert agreement(before, after) > 35
+    assert object_psnr(before, after) > 35
 
 
 def test_what_lies_in_a_dent_is_not_covered():
     """A plate lower than the table around it, as on a soft seat; where it lay there is table still, below it."""
-    top = table()
-    plate = coloured(sheet(0.25, 0.2, 0.006).moved((0.0, 0.0, -0.03)), (0.1, 0.2, 0.8), 1)
+    top = table_gaussians()
+    plate = coloured_gaussians(sheet(0.25, 0.2, 0.006).moved((0.0, 0.0, -0.03)), (0.1, 0.2, 0.8), 1)
     hidden = (top.means[:, 0].abs() < 0.13) & (top.means[:, 1].abs() < 0.105)
     before = replace(scene_of(top[~hidden], plate), objects=(SceneObject(1, "plate"),))
     after = refine(before)
-    assert agreement(before, after) > 35
+    assert object_psnr(before, after) > 35
     rgb, alpha = seen(after, (0.05, 0.0, 1.0), 0)
     assert alpha > 0.9 and torch.allclose(rgb, torch.tensor(WOOD), atol=0.08)
 
@@ -216,8 +216,8 @@ def test_new_gaussians_stay_above_the_table_and_within_the_object(before, after)
 
 def test_a_bowl_stays_open_where_cameras_look_into_it():
     shell = ellipsoid((0.1, 0.1, 0.1), 4000).moved((0.0, 0, 0.1))
-    bowl = coloured(shell.kept(shell.points[:, 2] < 0.08), (0.1, 0.3, 0.7), 1)
-    refined = refine(scene_of(table(), bowl))
+    bowl = coloured_gaussians(shell.kept(shell.points[:, 2] < 0.08), (0.1, 0.3, 0.7), 1)
+    refined = refine(scene_of(table_gaussians(), bowl))
     new = refined.gaussians.means[refined.gaussians.object_id == 1]
     inside = (new[:, :2].norm(dim=1) < 0.05) & (new[:, 2] > 0.05)
     assert int(inside.sum()) == 0
@@ -251,7 +251,7 @@ def test_degenerate_objects_end_in_time(kind):
         "nan": lambda: replace(g, means=torch.where(torch.arange(300)[:, None] < 20, torch.nan, g.means)),
         "far apart": lambda: replace(g, means=g.means * 1e5),
     }[kind]()
-    top = table(0.03)
+    top = table_gaussians(0.03)
     start = time.perf_counter()
     refined = refine(scene_of(top, g), RefineOptions(resolution=24))
     assert time.perf_counter() - start < 30

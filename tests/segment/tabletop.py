@@ -11,34 +11,34 @@ from stages.lab.assets.shapes import Surface, box, ellipsoid, sheet, to_gaussian
 WOOD = (0.55, 0.4, 0.25)
 
 
-def round_about(count: int = 8, side: int = 160, elevation: float = 35.0) -> Cameras:
+def orbit_cameras(count: int = 8, side: int = 160, elevation: float = 35.0) -> Cameras:
     viewmats = orbit(count, torch.tensor([0.0, 0.0, 0.05]), 1.0, elevation)
     K = intrinsics(side, side, 1.4 * side)
     names = tuple(f"{i:02d}.jpg" for i in range(count))
     return Cameras(viewmats, K.expand(count, 3, 3).clone(), torch.full((count, 2), side), names)
 
 
-def coloured(surface: Surface, rgb: tuple, object_id: int, grain: float = 0.03) -> Gaussians:
+def coloured_gaussians(surface: Surface, rgb: tuple, object_id: int, grain: float = 0.03) -> Gaussians:
     rng = torch.Generator().manual_seed(object_id)
     colours = torch.tensor(rgb) + grain * torch.randn(len(surface.points), 3, generator=rng)
     return to_gaussians(surface, colours, object_id, 0.9)
 
 
-def above(surface: Surface) -> Surface:
+def visible_from_above(surface: Surface) -> Surface:
     """What a reconstruction has of a thing: no bottom."""
     return surface.kept((surface.normals[:, 2] > -0.5) & (surface.points[:, 2] > 0))
 
 
-def table(spacing: float = 0.012) -> Gaussians:
-    return coloured(sheet(1.2, 1.2, spacing), WOOD, 0)
+def table_gaussians(spacing: float = 0.012) -> Gaussians:
+    return coloured_gaussians(sheet(1.2, 1.2, spacing), WOOD, 0)
 
 
 def block(centre: tuple, sides: tuple, rgb: tuple, object_id: int, spacing: float = 0.007) -> Gaussians:
-    return coloured(above(box(sides, spacing).moved((*centre, sides[2] / 2))), rgb, object_id)
+    return coloured_gaussians(visible_from_above(box(sides, spacing).moved((*centre, sides[2] / 2))), rgb, object_id)
 
 
 def egg(centre: tuple, radii: tuple, rgb: tuple, object_id: int, n: int = 1500) -> Gaussians:
-    return coloured(above(ellipsoid(radii, n).moved(centre)), rgb, object_id)
+    return coloured_gaussians(visible_from_above(ellipsoid(radii, n).moved(centre)), rgb, object_id)
 
 
 def scene_of(*parts: Gaussians, noise: float = 0.0, tilt: float = 0.0, cameras: bool = True) -> Scene:
@@ -48,13 +48,13 @@ def scene_of(*parts: Gaussians, noise: float = 0.0, tilt: float = 0.0, cameras: 
     means = g.means + noise * torch.randn(len(g), 3, generator=rng)
     means = torch.stack([means[:, 0], means[:, 1], means[:, 2] + tilt * means[:, 0]], 1)
     moved = Gaussians(means, g.quats, g.scales, g.opacities, g.sh, g.object_id)
-    return Scene(moved, (), round_about() if cameras else None, 0.0)
+    return Scene(moved, (), orbit_cameras() if cameras else None, 0.0)
 
 
 def three_apart(**how) -> Scene:
     """A red block, a blue egg, a green tower, apart on a table."""
     return scene_of(
-        table(), block((-0.2, -0.1), (0.12, 0.1, 0.08), (0.8, 0.1, 0.1), 1),
+        table_gaussians(), block((-0.2, -0.1), (0.12, 0.1, 0.08), (0.8, 0.1, 0.1), 1),
         egg((0.2, -0.1, 0.07), (0.06, 0.06, 0.07), (0.1, 0.2, 0.8), 2),
         block((0.02, 0.2), (0.06, 0.06, 0.16), (0.1, 0.6, 0.2), 3), **how,
     )  # fmt: skip

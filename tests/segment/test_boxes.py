@@ -9,10 +9,10 @@ import torch
 
 from stages.core.errors import InputError
 from stages.core.geometry.cameras import project
-from stages.segment.boxes import VIEWS, first, nearest_first, segment, tidy
+from stages.segment.boxes import MAX_VIEWS, clean_mask, nearest_first, segment, segment_prompted_view
 from stages.segment.options import SegmentOptions
 from stages.segment.prompts import read_prompts
-from tests.segment.tabletop import WOOD, block, egg, round_about, scene_of, table, three_apart
+from tests.segment.tabletop import WOOD, block, egg, orbit_cameras, scene_of, table_gaussians, three_apart
 
 
 def prompts_of(path, scene, numbers, grow=1.0):
@@ -40,7 +40,7 @@ def test_what_leans_on_a_thing_of_the_background_is_cut_from_it(tmp_path):
     cushion = block((0.0, 0.16), (0.4, 0.12, 0.25), (0.85, 0.85, 0.8), 2)
     trunk = egg((0.0, 0.03, 0.08), (0.07, 0.07, 0.08), (0.15, 0.6, 0.1), 1)
     head = egg((0.0, 0.03, 0.2), (0.05, 0.05, 0.05), (0.15, 0.65, 0.15), 1)
-    scene = scene_of(table(), cushion, trunk, head, noise=0.001)
+    scene = scene_of(table_gaussians(), cushion, trunk, head, noise=0.001)
     scene = replace(scene, cameras=scene.cameras[[6, 7, 5, 4, 0]])  # the doll shows in the first
     found = segment(blank(scene), prompts_of(tmp_path / "p.json", scene, [1]))
     assert [(o.id, o.name) for o in found.objects] == [(1, "thing 1")]
@@ -49,7 +49,7 @@ def test_what_leans_on_a_thing_of_the_background_is_cut_from_it(tmp_path):
 
 def test_boxes_that_overlap_are_told_apart(tmp_path):
     far = block((0.0, 0.05), (0.25, 0.05, 0.2), (0.8, 0.1, 0.1), 1)
-    scene = scene_of(table(), far, block((0.0, -0.08), (0.1, 0.05, 0.08), (0.1, 0.2, 0.8), 2))
+    scene = scene_of(table_gaussians(), far, block((0.0, -0.08), (0.1, 0.05, 0.08), (0.1, 0.2, 0.8), 2))
     scene = replace(scene, cameras=scene.cameras[[6, 7, 5, 0, 4, 1, 3, 2]])
     found = segment(blank(scene), prompts_of(tmp_path / "p.json", scene, [1, 2]))
     assert overlap(found, scene, 1, 1) > 0.85 and overlap(found, scene, 2, 2) > 0.85
@@ -57,7 +57,7 @@ def test_boxes_that_overlap_are_told_apart(tmp_path):
 
 def test_what_looks_like_all_around_it_is_not_found_and_that_is_said(tmp_path, caplog):
     """A block of the table's own wood: colour has nothing to go by."""
-    scene = scene_of(table(), block((0.0, 0.0), (0.1, 0.1, 0.1), WOOD, 1))
+    scene = scene_of(table_gaussians(), block((0.0, 0.0), (0.1, 0.1, 0.1), WOOD, 1))
     found = segment(blank(scene), prompts_of(tmp_path / "p.json", scene, [1]))
     assert found.objects == () and "won no Gaussian" in caplog.text
 
@@ -66,20 +66,20 @@ def test_the_first_view_comes_first_then_near_ones_and_not_too_many():
     scene = three_apart()
     order = nearest_first(scene)
     assert order[0] == 0 and sorted(order) == list(range(8)) and {order[1], order[2]} == {1, 7} and order[-1] == 4
-    many = nearest_first(replace(scene, cameras=round_about(100)))
-    assert len(many) == len(set(many)) == VIEWS and many[0] == 0 and 50 in many
+    many = nearest_first(replace(scene, cameras=orbit_cameras(100)))
+    assert len(many) == len(set(many)) == MAX_VIEWS and many[0] == 0 and 50 in many
 
 
 def test_a_box_of_the_whole_picture_is_all_of_it():
     picture = np.random.default_rng(0).integers(0, 255, (24, 32, 3), dtype=np.uint8)
-    assert (first(picture, torch.tensor([[0.0, 0.0, 1.0, 1.0]]), 0) == 1).all()
+    assert (segment_prompted_view(picture, torch.tensor([[0.0, 0.0, 1.0, 1.0]]), 0) == 1).all()
 
 
 def test_small_pieces_and_small_holes_go():
     mask = np.zeros((40, 40), dtype=bool)
     mask[5:35, 5:35] = True
     mask[20, 20:22], mask[8:16, 8:16], mask[1, 1] = False, False, True
-    clean = tidy(mask)
+    clean = clean_mask(mask)
     assert clean[20, 20] and not clean[10, 10] and not clean[1, 1]
 
 

@@ -11,9 +11,9 @@ from stages.core.scene.images import write_png
 from stages.core.scene.scene_ply import read_scene
 from stages.segment import sam2
 from stages.segment.options import SegmentOptions
-from stages.segment.pictures import drawn, pictures
 from stages.segment.prompts import read_prompts
 from stages.segment.stage import run
+from stages.segment.view_images import render_view, view_images
 
 pytest.importorskip("transformers")
 
@@ -39,7 +39,7 @@ def photos(truth, tmp_path):
     folder = tmp_path / "photos"
     folder.mkdir()
     for view, name in enumerate(truth.cameras.names):
-        write_png(folder / name.replace(".jpg", ".png"), drawn(truth, view))
+        write_png(folder / name.replace(".jpg", ".png"), render_view(truth, view))
     return folder
 
 
@@ -66,14 +66,14 @@ def test_prompts_become_objects_by_their_names(scene_file, truth, weights, photo
 
 def test_drawings_stand_in_for_photos(truth, photos):
     """A PNG of the drawing rounds to 8 bits; else the network sees the same."""
-    shown, read = pictures(truth), pictures(truth, photos)
+    shown, read = view_images(truth), view_images(truth, photos)
     assert shown.views == read.views == list(range(len(truth.cameras)))
     torch.testing.assert_close(shown.image(3), read.image(3), rtol=0, atol=0.51 / 255)
 
 
 def test_some_photos_may_be_missing_but_not_the_prompted_one(scene_file, truth, weights, photos, tmp_path):
     (photos / "03.png").unlink()
-    assert pictures(truth, photos).views == [0, 1, 2, 4, 5, 6, 7]
+    assert view_images(truth, photos).views == [0, 1, 2, 4, 5, 6, 7]
     boxes = prompts_file(tmp_path / "p.json", **BOXES)
     options = SegmentOptions("sam2", boxes=boxes, photos=photos, weights=weights)
     run(scene_file, tmp_path / "out.ply", options)
@@ -85,10 +85,10 @@ def test_some_photos_may_be_missing_but_not_the_prompted_one(scene_file, truth, 
 def test_without_prompts_a_network_that_is_sure_of_nothing_finds_no_objects(
     scene_file, weights, tmp_path, caplog, monkeypatch
 ):
-    from stages.core.models.sam2.automatic import Automatic, propose
-    from stages.segment import discover
+    from stages.core.models.sam2.mask_generation import MaskGenerationOptions, propose_masks
+    from stages.segment import discovery
 
-    monkeypatch.setattr(discover, "propose", partial(propose, options=Automatic(grid=4)))
+    monkeypatch.setattr(discovery, "propose_masks", partial(propose_masks, options=MaskGenerationOptions(grid=4)))
     run(scene_file, tmp_path / "out.ply", SegmentOptions("sam2", weights=weights))
     assert read_scene(tmp_path / "out.ply").objects == ()
     assert "no objects were found" in caplog.text
@@ -113,7 +113,7 @@ def test_weights_are_fetched_only_when_asked_and_absent(weights, tmp_path, monke
 
 
 def test_photos_of_other_proportions_are_refused(scene_file, truth, weights, photos, tmp_path):
-    write_png(photos / "05.png", drawn(truth, 5)[:80])
+    write_png(photos / "05.png", render_view(truth, 5)[:80])
     boxes = prompts_file(tmp_path / "p.json", **BOXES)
     with pytest.raises(InputError, match="--photos: 05.jpg is 160x80, in the scene 160x160.*drawn instead"):
         run(scene_file, tmp_path / "out.ply", SegmentOptions("sam2", boxes=boxes, photos=photos, weights=weights))
@@ -140,7 +140,7 @@ def test_points_are_for_sam2_alone(scene_file, tmp_path):
 
 
 def test_what_the_network_is_told_lies_where_the_user_pointed(truth, tmp_path):
-    box, point = (sam2.clicks_of(read_prompts(prompts_file(tmp_path / "p.json", **p)), truth)[0]
+    box, point = (sam2.point_prompts(read_prompts(prompts_file(tmp_path / "p.json", **p)), truth)[0]
                   for p in (BOXES, POINTS))  # fmt: skip
     torch.testing.assert_close(box.points, torch.tensor([[10 / 160, 20 / 160], [60 / 160, 90 / 160]]))
     torch.testing.assert_close(point.points, torch.tensor([[40 / 160, 60 / 160]]))

@@ -14,7 +14,7 @@ from stages.core.scene.images import write_labels
 from stages.core.scene.scene_ply import read_scene, write_scene
 from stages.segment.options import SegmentOptions
 from stages.segment.stage import run
-from stages.segment.vote import elect, pooled, tempered, without_outliers
+from stages.segment.voting import damp_votes, majority_labels, pool_votes, remove_outliers
 from tests.segment.tabletop import best_overlap
 
 
@@ -90,7 +90,7 @@ def test_a_tie_goes_to_the_neighbours(truth):
     votes[tied] = 1.0
     unseen = torch.nonzero(truth.gaussians.object_id == 3)[::7, 0]
     votes[unseen] = 0.0
-    ids = elect(truth, votes)
+    ids = majority_labels(truth, votes)
     assert float((ids == truth.gaussians.object_id).float().mean()) > 0.995
 
 
@@ -100,16 +100,16 @@ def test_a_gaussian_without_a_place_stays_background(truth):
     lost = torch.nonzero(truth.gaussians.object_id == 2)[:3, 0]
     means[lost], votes[lost] = torch.nan, 0.0
     nowhere = replace(truth, gaussians=replace(truth.gaussians, means=means))
-    ids = elect(nowhere, pooled(means, votes))
+    ids = majority_labels(nowhere, pool_votes(means, votes))
     assert (ids[lost] == 0).all() and float((ids == truth.gaussians.object_id).float().mean()) > 0.99
 
 
 def test_one_near_view_does_not_overrule_two_far_ones():
     near, far = torch.tensor([[0.0, 90.0, 0.0]]), torch.tensor([[0.0, 0.0, 30.0]])
     assert int((near + 2 * far).argmax(1)) == 1  # by pixels it would
-    assert int((tempered(near) + 2 * tempered(far)).argmax(1)) == 2  # 9.5 against 11.0
-    torch.testing.assert_close(tempered(torch.tensor([[1.0, 3.0]])), torch.tensor([[0.5, 1.5]]))
-    assert tempered(torch.zeros(1, 3)).tolist() == [[0.0, 0.0, 0.0]]
+    assert int((damp_votes(near) + 2 * damp_votes(far)).argmax(1)) == 2  # 9.5 against 11.0
+    torch.testing.assert_close(damp_votes(torch.tensor([[1.0, 3.0]])), torch.tensor([[0.5, 1.5]]))
+    assert damp_votes(torch.zeros(1, 3)).tolist() == [[0.0, 0.0, 0.0]]
 
 
 def test_neighbours_pool_their_votes_but_not_across_a_gap():
@@ -117,9 +117,9 @@ def test_neighbours_pool_their_votes_but_not_across_a_gap():
     votes = torch.zeros(18, 2)
     votes[:9, 0], votes[9:, 1] = 1.0, 1.0
     votes[4] = torch.tensor([0.0, 3.0])  # noise
-    out = pooled(torch.stack([x, torch.zeros(18), torch.zeros(18)], 1), votes)
+    out = pool_votes(torch.stack([x, torch.zeros(18), torch.zeros(18)], 1), votes)
     assert out[4].tolist() == [8.0, 3.0] and out[13].tolist() == [0.0, 9.0]
-    alone = pooled(torch.stack([x, torch.zeros(18), torch.zeros(18)], 1)[:10], votes[:10])
+    alone = pool_votes(torch.stack([x, torch.zeros(18), torch.zeros(18)], 1)[:10], votes[:10])
     assert alone[9].tolist() == [0.0, 1.0]  # its nearest are far away
 
 
@@ -127,7 +127,7 @@ def test_outliers_by_the_modified_z_score():
     # distances 1, 2, 3, 4, 100 from the median: median 3, MAD 1, so 0.6745 * 97 > 3.5 and 0.6745 * 2 is not
     x = torch.tensor([0.0, -1, 1, -2, 2, -3, 3, -4, 4, 100])
     means = torch.stack([x, torch.zeros(10), torch.zeros(10)], 1)
-    ids = without_outliers(means, torch.ones(10, dtype=torch.int64))
+    ids = remove_outliers(means, torch.ones(10, dtype=torch.int64))
     assert ids.tolist() == [1] * 9 + [0]
 
 

@@ -13,12 +13,19 @@ from torch import Tensor
 from stages.core.geometry.cameras import centres
 from stages.core.geometry.neighbours import knn
 from stages.core.geometry.rotations import matrix
-from stages.core.perception.growing import complete, lab_of, table_colour
-from stages.core.perception.naming import names_of
-from stages.core.perception.regions import Merging, Voxels, edges_of, small_regions
-from stages.core.perception.support import Support, View, cell_medians, find_support, view_of, windowed
-from stages.core.perception.visibility import seen_from
-from stages.core.perception.wall import find_wall, laid_down
+from stages.core.perception.object_naming import object_names
+from stages.core.perception.region_growing import cielab_colours, grow_objects, table_colour
+from stages.core.perception.region_merging import RegionMerger, Voxels, oversegment, voxel_edges
+from stages.core.perception.support import (
+    Support,
+    ViewExtent,
+    cell_medians,
+    find_support,
+    sliding_quantile,
+    view_extent,
+)
+from stages.core.perception.visibility import summed_view_directions
+from stages.core.perception.wall import find_wall, rotate_wall_to_floor
 from stages.core.scene.gaussians import Gaussians
 from stages.core.scene.scene import Scene, SceneObject
 
@@ -32,7 +39,7 @@ ON_WALL = 0.9  # the same of what hangs on a wall, where photos are of one thing
 
 
 @dataclass(frozen=True)
-class Grouping:
+class GroupingOptions:
     """What decides how many objects come out."""
 
     max_objects: int = 24
@@ -41,25 +48,27 @@ class Grouping:
     seed: int = 0
 
 
-def group(scene: Scene, grouping: Grouping = Grouping()) -> Scene:
+def group_objects(scene: Scene, grouping: Grouping = GroupingOptions()) -> Scene:
     """The scene with an object_id for every Gaussian (0 for the background) and its objects, largest first.
 
     The supporting plane is taken away, what is left is cut into small even regions, and these are merged
     while they look like one thing. Things that mostly lie outside the table are background. Where there is
     a wall and no floor, what hangs on it is found in the same way.
     """
-    view = view_of(scene)
+    view = view_extent(scene)
     wall = find_wall(scene, view, grouping.seed)
     if wall is None:
         support = find_support(scene, view, grouping.seed)
-        return named(replace(scene, gaussians=_grouped(scene, view, support, grouping, LARGE)), support)
-    laid = laid_down(scene, wall)
-    view = view_of(laid)
+        return name_objects(replace(scene, gaussians=_grouped(scene, view, support, grouping, LARGE)), support)
+    laid = rotate_wall_to_floor(scene, wall)
+    view = view_extent(laid)
     ids = _grouped(laid, view, find_support(laid, view, grouping.seed), grouping, ON_WALL).object_id
-    return named(replace(scene, gaussians=replace(scene.gaussians, object_id=ids)), None)
+    return name_objects(replace(scene, gaussians=replace(scene.gaussians, object_id=ids)), None)
 
 
-def _grouped(scene: Scene, view: View, support: Support | None, grouping: Grouping, large: float) -> Gaussians:
+def _grouped(
+    scene: Scene, view: ViewExtent, support: Support | None, grouping: GroupingOptions, large: float
+) -> Gaussians:
     """The scene's Gaussians with object numbers; nothing is larger than about `large` view radii."""
     g = replace(scene.gaussians, object_id=torch.zeros(len(scene.gaussians), dtype=torch.int64))
     index = _candidates(g, view, support)
@@ -67,21 +76,21 @@ def _grouped(scene: Scene, view: View, support: Support | None, grouping: Groupi
     if len(index) < 20:
         log.info("nothing stands on the supporting plane: no objects")
         return g
-    seen = seen_from(g, scene.cameras) if scene.cameras is not None and len(scene.cameras) else None
+    seen = summed_view_directions(g, scene.cameras) if scene.cameras is not None and len(scene.cameras) else None
     voxels, owner = _voxels(g[index], view, None if seen is None else seen[index])
-    edges = edges_of(voxels)
+    edges = voxel_edges(voxels)
     least = max(4, int((grouping.min_size * view.radius / voxels.size) ** 2))
-    regions = small_regions(voxels, edges)
-    things = Merging(voxels, edges, regions, least, grouping.detail, large * view.radius).run()
+    regions = oversegment(voxels, edges)
+    things = RegionMerger(voxels, edges, regions, least, grouping.detail, large * view.radius).run()
     count = np.bincount(owner[owner >= 0], minlength=len(voxels)) * _thinning(voxels, scene, view)
     if support is not None:
         things = _without_skirts(voxels, things, table_colour(g, support), support)
     things = _objects(voxels, count, things, view, support, grouping)
     g.object_id[index] = torch.from_numpy(np.where(owner >= 0, things[owner], 0))
-    return complete(g, support, 2 * voxels.size)
+    return grow_objects(g, support, 2 * voxels.size)
 
 
-def _candidates(g: Gaussians, view: View, support: Support | None) -> Int[Tensor, "m"]:
+def _candidates(g: Gaussians, view: ViewExtent, support: Support | None) -> Int[Tensor, "m"]:
     """Gaussians near the focus that are something, but not the supporting plane."""
     R = view.radius
     ok = g.means.isfinite().all(1) & g.quats.isfinite().all(1) & g.scales.isfinite().all(1)
@@ -106,9 +115,9 @@ def _against_table(g: Gaussians, h: Float[Tensor, "n"], support: Support) -> tup
     near = torch.nonzero((h.abs() < 2.5 * support.tolerance) & (g.opacities > 0.1) & support.inside(g.means))[:, 0]
     if len(near) < 50:
         return like, flat
-    values = torch.cat([lab_of(g[near]), h[near, None]], 1)
-    table = windowed(cell_medians(support, g.means[near], values, 3), reach=5)
-    here = windowed(cell_medians(support, g.means[near], values), reach=1)
+    values = torch.cat([cielab_colours(g[near]), h[near, None]], 1)
+    table = sliding_quantile(cell_medians(support, g.means[near], values, 3), reach=5)
+    here = sliding_quantile(cell_medians(support, g.means[near], values), reach=1)
     cell = support.cells(g.means[near])
     around, mine = table[tuple((cell // 3).T)], here[tuple(cell.T)]
     like[near] = (values - around)[:, :3].norm(dim=1) < 10
@@ -123,7 +132,7 @@ def _shortest(g: Gaussians) -> Float[Tensor, "n 3"]:
     return matrix(g.quats)[torch.arange(len(g)), :, g.scales.argmin(1)]
 
 
-def _crowded(points: Float[Tensor, "m 3"], view: View) -> Bool[Tensor, "m"]:
+def _crowded(points: Float[Tensor, "m 3"], view: ViewExtent) -> Bool[Tensor, "m"]:
     """Points with neighbours as near as most have: not floaters."""
     if len(points) < 20:
         return torch.ones(len(points), dtype=torch.bool)
@@ -131,7 +140,7 @@ def _crowded(points: Float[Tensor, "m 3"], view: View) -> Bool[Tensor, "m"]:
     return distance < min(max(3.5 * float(distance.median()), 0.01 * view.radius), 0.06 * view.radius)
 
 
-def _voxels(g: Gaussians, view: View, seen: Tensor | None) -> tuple[Voxels, np.ndarray]:
+def _voxels(g: Gaussians, view: ViewExtent, seen: Tensor | None) -> tuple[Voxels, np.ndarray]:
     """Means over a grid about twice as coarse as the Gaussians, and the voxel of each (-1: dropped as stray)."""
     spacing = float(knn(g.means, g.means, 4)[0][:, 1:].mean(1).median())
     size = min(max(2.0 * spacing, 0.007 * view.radius), 0.025 * view.radius)
@@ -141,7 +150,7 @@ def _voxels(g: Gaussians, view: View, seen: Tensor | None) -> tuple[Voxels, np.n
         if len(count) <= MOST_VOXELS:
             break
         size *= 1.3
-    points, lab = _mean(g.means, owner, count), _mean(lab_of(g), owner, count)
+    points, lab = _mean(g.means, owner, count), _mean(cielab_colours(g), owner, count)
     normals = _normals(g, points, owner, count, seen, view)
     neighbours = (knn(points, points, 5)[0][:, -1] < 2.2 * size) | (count > 3)
     number = torch.where(neighbours, neighbours.long().cumsum(0) - 1, -1)
@@ -154,7 +163,9 @@ def _mean(values: Float[Tensor, "n *v"], owner: Int[Tensor, "n"], count: Int[Ten
     return total / count.reshape(-1, *[1] * (values.dim() - 1))
 
 
-def _normals(g: Gaussians, points: Tensor, owner: Tensor, count: Tensor, seen: Tensor | None, view: View) -> Tensor:
+def _normals(
+    g: Gaussians, points: Tensor, owner: Tensor, count: Tensor, seen: Tensor | None, view: ViewExtent
+) -> Tensor:
     """Shortest axes of flat Gaussians and the planes through neighbouring voxels, pointing to where they are seen."""
     lengths, axes = g.scales.sort(1).values, _shortest(g)
     flat = (1 - lengths[:, 0] / lengths[:, 1].clamp_min(1e-12)).clamp_min(0)
@@ -172,7 +183,7 @@ def _normals(g: Gaussians, points: Tensor, owner: Tensor, count: Tensor, seen: T
     return normals * torch.where((normals * toward).sum(1, keepdim=True) < 0, -1.0, 1.0)
 
 
-def _thinning(voxels: Voxels, scene: Scene, view: View) -> np.ndarray:
+def _thinning(voxels: Voxels, scene: Scene, view: ViewExtent) -> np.ndarray:
     """How much thinner than usual Gaussians lie, being farther from the nearest camera: distance squared."""
     if scene.cameras is None or not len(scene.cameras):
         return np.ones(len(voxels))
@@ -203,7 +214,12 @@ def _without_skirts(
 
 
 def _objects(
-    voxels: Voxels, count: np.ndarray, things: np.ndarray, view: View, support: Support | None, grouping: Grouping
+    voxels: Voxels,
+    count: np.ndarray,
+    things: np.ndarray,
+    view: ViewExtent,
+    support: Support | None,
+    grouping: GroupingOptions,
 ) -> np.ndarray:
     """Object number of each voxel, 1 for the largest thing; 0 for what is too small, too large or off the table.
 
@@ -233,7 +249,7 @@ def _objects(
     return out
 
 
-def named(scene: Scene, support: Support | None) -> Scene:
+def name_objects(scene: Scene, support: Support | None) -> Scene:
     """Objects renumbered by their count of Gaussians, with a name each."""
     g = scene.gaussians
     counts = torch.bincount(g.object_id)
@@ -241,6 +257,6 @@ def named(scene: Scene, support: Support | None) -> Scene:
     number = torch.zeros(len(counts), dtype=torch.int64)
     number[order] = torch.arange(1, len(order) + 1)
     g = replace(g, object_id=number[g.object_id])
-    names = names_of(g, support)
+    names = object_names(g, support)
     objects = tuple(SceneObject(i, name) for i, name in enumerate(names, start=1))
     return replace(scene, gaussians=g, objects=objects)

@@ -17,32 +17,32 @@ from stages.core.scene.cameras import Cameras
 from stages.core.scene.gaussians import Gaussians
 from stages.core.scene.scene import Scene
 
-REACH = 1.5  # how far from the focus anything is looked at [view radii]
+SEARCH_RADIUS = 1.5  # how far from the focus anything is looked at [view radii]
 CELLS = 300  # largest side of the grid over the surface
 
 
 @dataclass(frozen=True)
-class View:
+class ViewExtent:
     """What the cameras look at, and from how far."""
 
     focus: Float[Tensor, "3"]
     radius: float
 
 
-def view_of(scene: Scene) -> View:
+def view_extent(scene: Scene) -> ViewExtent:
     """The point that the cameras look at; without cameras, the middle of the Gaussians."""
     if scene.cameras is not None and len(scene.cameras):
         focus = _aim(scene.cameras, scene.floor)
         radius = float((centres(scene.cameras.viewmats) - focus).norm(dim=1).median())
         if radius > 0 and np.isfinite(radius):
-            return View(focus, radius)
+            return ViewExtent(focus, radius)
     g = scene.gaussians
-    solid = g.means[(g.opacities > 0.1) & g.means.isfinite().all(1)]
-    if not len(solid):
-        return View(torch.zeros(3), 1.0)
-    focus = solid.median(0).values
-    distance = (solid - focus).norm(dim=1)
-    return View(focus, 1.5 * max(float(distance[torch.randperm(len(distance))[:100_000]].quantile(0.8)), 1e-6))
+    is_opaque = g.means[(g.opacities > 0.1) & g.means.isfinite().all(1)]
+    if not len(is_opaque):
+        return ViewExtent(torch.zeros(3), 1.0)
+    focus = is_opaque.median(0).values
+    distance = (is_opaque - focus).norm(dim=1)
+    return ViewExtent(focus, 1.5 * max(float(distance[torch.randperm(len(distance))[:100_000]].quantile(0.8)), 1e-6))
 
 
 def _aim(cameras: Cameras, floor: float | None) -> Float[Tensor, "3"]:
@@ -62,7 +62,7 @@ def _aim(cameras: Cameras, floor: float | None) -> Float[Tensor, "3"]:
 class Support:
     """A nearly level surface z = p(x, y) + relief, p of second degree, and the part of it that is there."""
 
-    view: View
+    view: ViewExtent
     coefficients: Float[Tensor, "6"]  # of 1 x y x^2 x y y^2 about the focus, lengths in view radii
     noise: float  # robust standard deviation of its Gaussians about it [scene units]
     cell: float  # of the grid [scene units]
@@ -81,7 +81,9 @@ class Support:
     def surface(self, points: Float[Tensor, "n d"]) -> Float[Tensor, "n"]:
         """Height z of the surface below or above points (their x and y count)."""
         xy = (points[:, :2] - self.view.focus[:2]) / self.view.radius
-        far = xy.norm(dim=1, keepdim=True).clamp_min(REACH) / REACH  # beyond the data a parabola runs away
+        far = (
+            xy.norm(dim=1, keepdim=True).clamp_min(SEARCH_RADIUS) / SEARCH_RADIUS
+        )  # beyond the data a parabola runs away
         i, j = self.cells(points).unbind(1)
         return _terms(xy / far) @ self.coefficients + self.relief[i, j]
 
@@ -104,11 +106,11 @@ def _terms(xy: Float[Tensor, "n 2"]) -> Float[Tensor, "n 6"]:
     return torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y], 1)
 
 
-def find_support(scene: Scene, view: View | None = None, seed: int = 0) -> Support | None:
+def find_support(scene: Scene, view: ViewExtent | None = None, seed: int = 0) -> Support | None:
     """The surface at `scene.floor`, or the largest level one near the focus; None where there is none."""
-    view = view or view_of(scene)
+    view = view or view_extent(scene)
     g, R = scene.gaussians, view.radius
-    points = g.means[solid(g, R) & ((g.means - view.focus)[:, :2].norm(dim=1) < REACH * R)]
+    points = g.means[is_opaque(g, R) & ((g.means - view.focus)[:, :2].norm(dim=1) < SEARCH_RADIUS * R)]
     floor = scene.floor if scene.floor is not None else _level(points, view, seed)
     if floor is None or not np.isfinite(floor):
         return None
@@ -117,7 +119,7 @@ def find_support(scene: Scene, view: View | None = None, seed: int = 0) -> Suppo
         return None
     coefficients, noise = _fit(band, floor, view, seed)
     bare = Support(
-        view, coefficients, noise, 2 * REACH * R / CELLS,
+        view, coefficients, noise, 2 * SEARCH_RADIUS * R / CELLS,
         torch.zeros(CELLS, CELLS, dtype=torch.bool), torch.zeros(CELLS, CELLS),
     )  # fmt: skip
     uneven = replace(bare, relief=_relief(bare, band))
@@ -128,12 +130,12 @@ def find_support(scene: Scene, view: View | None = None, seed: int = 0) -> Suppo
     return found if found.region.any() else None
 
 
-def solid(g: Gaussians, radius: float) -> Bool[Tensor, "n"]:
+def is_opaque(g: Gaussians, radius: float) -> Bool[Tensor, "n"]:
     """Gaussians that are part of something: finite, not transparent, not a blur over the whole scene."""
     return g.means.isfinite().all(1) & (g.opacities > 0.1) & (g.scales.amax(1) < 0.2 * radius)
 
 
-def _level(points: Float[Tensor, "n 3"], view: View, seed: int) -> float | None:
+def _level(points: Float[Tensor, "n 3"], view: ViewExtent, seed: int) -> float | None:
     """Height of the level plane with most points near the focus."""
     near = 1 / (1 + ((points - view.focus).norm(dim=1) / (0.5 * view.radius)) ** 4)
     found = ransac(points, 0.01 * view.radius, near, lambda normals: normals[:, 2] > 0.98, seed=seed)
@@ -143,15 +145,15 @@ def _level(points: Float[Tensor, "n 3"], view: View, seed: int) -> float | None:
     return float((plane.offset - view.focus[:2] @ plane.normal[:2]) / plane.normal[2])
 
 
-def _fit(band: Float[Tensor, "n 3"], floor: float, view: View, seed: int) -> tuple[Tensor, float]:
+def _fit(band: Float[Tensor, "n 3"], floor: float, view: ViewExtent, seed: int) -> tuple[Tensor, float]:
     """Second-degree surface by reweighting with Tukey's biweight; each patch of table counts once.
 
     The curvature is held back by a ridge, so that a keyboard does not become a bump in the table.
     """
     R = view.radius
     local = (band - torch.cat([view.focus[:2], torch.tensor([floor])])) / R
-    _, patch, count = ((local[:, :2] + REACH) / 0.02).floor().long().unique(
-        dim=0, return_inverse=True, return_counts=True
+    _, patch, count = (
+        ((local[:, :2] + SEARCH_RADIUS) / 0.02).floor().long().unique(dim=0, return_inverse=True, return_counts=True)
     )
     even = (1 / count[patch].float()) / (1 + (local[:, :2].norm(dim=1) / 0.7) ** 4)
     coefficients = torch.zeros(6, dtype=torch.float64)
@@ -203,7 +205,7 @@ def cell_medians(
     return out.reshape(side, side, -1)
 
 
-def windowed(grid: Float[Tensor, "gx gy v"], reach: int, share: float = 0.5) -> Float[Tensor, "gx gy v"]:
+def sliding_quantile(grid: Float[Tensor, "gx gy v"], reach: int, share: float = 0.5) -> Float[Tensor, "gx gy v"]:
     """Median (or another share) of the cells within `reach` of each cell, nan being ignored; gaps take the nearest."""
     side = 2 * reach + 1
     out = []
@@ -227,7 +229,7 @@ def _relief(bare: Support, band: Float[Tensor, "n 3"]) -> Float[Tensor, "gx gy"]
     if not near.any():
         return bare.relief
     coarse = 3
-    rough = windowed(cell_medians(bare, band[near], h[near, None], coarse), reach=4, share=0.45)[..., 0]
+    rough = sliding_quantile(cell_medians(bare, band[near], h[near, None], coarse), reach=4, share=0.45)[..., 0]
     smooth = ndimage.gaussian_filter(rough.numpy(), 1.5)
     fine = ndimage.zoom(smooth, len(bare.region) / len(smooth), order=1)
     return torch.from_numpy(fine).float()
@@ -258,7 +260,7 @@ def _disc(radius: int) -> np.ndarray:
     return x[:, None] ** 2 + x[None] ** 2 <= radius**2
 
 
-def tips(points: Float[Tensor, "n 2"], base: Float[Tensor, "m 2"]) -> bool:
+def topples(points: Float[Tensor, "n 2"], base: Float[Tensor, "m 2"]) -> bool:
     """Whether a body falls over: the middle of its points lies outside the convex hull of those it stands on."""
     try:
         hull = ConvexHull(base.double().numpy()).equations

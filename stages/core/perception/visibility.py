@@ -11,11 +11,13 @@ from stages.core.raster.rasterise import visibility
 from stages.core.scene.cameras import Cameras
 from stages.core.scene.gaussians import Gaussians
 
-SIDE = 320  # longest side that visibility is drawn at [px]
-MOST = 24  # cameras that are asked
+MAX_VISIBILITY_SIDE = 320  # longest side that visibility is drawn at [px]
+MAX_VISIBILITY_VIEWS = 24  # cameras that are asked
 
 
-def small(cameras: Cameras, most: int = MOST, side: int = SIDE) -> list[tuple[Tensor, Tensor, int, int]]:
+def downscaled_views(
+    cameras: Cameras, most: int = MAX_VISIBILITY_VIEWS, side: int = MAX_VISIBILITY_SIDE
+) -> list[tuple[Tensor, Tensor, int, int]]:
     """(viewmat, K, width, height) of at most `most` cameras, evenly picked, their images made small."""
     picked = torch.linspace(0, len(cameras) - 1, min(most, len(cameras))).round().long().tolist()
     views = []
@@ -27,13 +29,13 @@ def small(cameras: Cameras, most: int = MOST, side: int = SIDE) -> list[tuple[Te
     return views
 
 
-def seen_from(g: Gaussians, cameras: Cameras) -> Float[Tensor, "n 3"]:
+def summed_view_directions(g: Gaussians, cameras: Cameras) -> Float[Tensor, "n 3"]:
     """Mean direction from each Gaussian to the cameras that see it, weighted by how much; zero where none does.
 
     It is half a sphere's worth of knowledge: the outside of a surface is the side that was seen.
     """
     toward = torch.zeros(len(g), 3)
-    for viewmat, K, width, height in small(cameras):
+    for viewmat, K, width, height in downscaled_views(cameras):
         _, weight = visibility(g, viewmat, K, width, height)
         eye = centres(viewmat[None])[0]
         toward += weight[:, None].cpu() * torch.nn.functional.normalize(eye - g.means, dim=1)

@@ -12,7 +12,7 @@ from stages.core.geometry.cameras import centres
 from stages.core.geometry.planes import Plane, ransac
 from stages.core.geometry.rotations import rotation_between
 from stages.core.geometry.similarity import Similarity
-from stages.core.perception.support import REACH, View, solid
+from stages.core.perception.support import SEARCH_RADIUS, ViewExtent, is_opaque
 from stages.core.scene.gaussians import transformed
 from stages.core.scene.scene import Scene
 
@@ -23,7 +23,7 @@ STEEP = 0.5  # z of a wall's normal at most: what is flatter is a ramp
 THICK = 0.02  # of the wall [view radii]
 
 
-def find_wall(scene: Scene, view: View, seed: int = 0) -> Similarity | None:
+def find_wall(scene: Scene, view: ViewExtent, seed: int = 0) -> Similarity | None:
     """The turn that lays the wall behind what the cameras look at on its back, as a floor at z = 0.
 
     None for scenes with a floor, and where there is no wall: the plane with most of what is in focus, if it is
@@ -32,7 +32,7 @@ def find_wall(scene: Scene, view: View, seed: int = 0) -> Similarity | None:
     if scene.floor is not None or scene.cameras is None or not len(scene.cameras):
         return None
     g, R = scene.gaussians, view.radius
-    points = g.means[solid(g, R) & ((g.means - view.focus).norm(dim=1) < REACH * R)]
+    points = g.means[is_opaque(g, R) & ((g.means - view.focus).norm(dim=1) < SEARCH_RADIUS * R)]
     near = 1 / (1 + ((points - view.focus).norm(dim=1) / (0.5 * R)) ** 4)
     found = ransac(points, 0.5 * THICK * R, near, seed=seed)
     if found is None or abs(float(found[0].normal[2])) > STEEP:
@@ -54,7 +54,7 @@ def _wide(flat: Float[Tensor, "n 3"], radius: float) -> bool:
     return bool((thinned.quantile(0.95, dim=0) - thinned.quantile(0.05, dim=0)).min() > WIDE * radius)
 
 
-def laid_down(scene: Scene, turn: Similarity) -> Scene:
+def rotate_wall_to_floor(scene: Scene, turn: Similarity) -> Scene:
     """The scene after `find_wall`'s turn, with the wall for its floor."""
     cameras = scene.cameras.transformed(turn)
     return replace(scene, gaussians=transformed(scene.gaussians, turn), cameras=cameras, floor=0.0)

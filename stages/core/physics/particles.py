@@ -23,7 +23,7 @@ from torch import Tensor
 from stages.core.errors import InputError
 from stages.core.geometry.neighbours import knn
 from stages.core.geometry.rotations import matrix
-from stages.core.perception.support import tips
+from stages.core.perception.support import topples
 from stages.core.scene.gaussians import Gaussians
 from stages.core.scene.scene import Scene
 
@@ -149,7 +149,7 @@ def _solid(
     body = _largest(_fill(shell, bridge, standing))
     body = _trimmed(body, points / h - low)
     at = torch.from_numpy(np.argwhere(body)).float()
-    held = stood and standing and tips(at[:, :2], at[at[:, 2] < at[:, 2].min() + 4, :2])
+    held = stood and standing and topples(at[:, :2], at[at[:, 2] < at[:, 2].min() + 4, :2])
     if held:
         bottom = int(np.flatnonzero(body.any((0, 1)))[0])
         body = np.flip(np.logical_or.accumulate(np.flip(body, 2), 2), 2)  # something of it is above

@@ -20,7 +20,7 @@ from tqdm import tqdm
 
 from stages.core.errors import InputError
 from stages.core.geometry.cameras import orbit
-from stages.core.perception.visibility import small
+from stages.core.perception.visibility import downscaled_views
 from stages.core.raster.rasterise import rasterise, visibility
 from stages.core.scene.files import replacing
 from stages.core.scene.gaussians import Gaussians
@@ -53,7 +53,7 @@ def remove_unseen_background(scene: Scene) -> Scene:
     """Without what of the background no camera sees."""
     g = scene.gaussians
     weight = torch.zeros(len(g))
-    for viewmat, K, width, height in small(scene.cameras):
+    for viewmat, K, width, height in downscaled_views(scene.cameras):
         weight = torch.maximum(weight, visibility(g, viewmat, K, width, height)[1])
     return replace(scene, gaussians=g[(g.object_id > 0) | (weight > MAX_HIDDEN_WEIGHT)])
 

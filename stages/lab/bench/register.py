@@ -28,8 +28,8 @@ from stages.core.scene.files import replacing
 from stages.core.scene.gaussians import Gaussians
 from stages.lab.assets.objects import ObjectsOptions, make_object
 from stages.lab.bench import common as bench
-from stages.refine.register import register
-from stages.refine.register_cloud import diameter, lab
+from stages.refine.registration import register
+from stages.refine.registration_cloud import cloud_colours, diameter
 
 LIMITS = {"rotation": 2.0, "scale": 2.0, "shift": 1.0}  # [deg], [%], [% of the diameter]
 SURFACES_OF_REVOLUTION = (
@@ -114,7 +114,7 @@ def symmetry_residual(whole: Gaussians, seen: Float[Tensor, "k"], turn: Float[Te
 
     One half of the Gaussians is held against the other; what they differ by without a turn is taken off.
     """
-    joint = torch.cat([whole.means / diameter(whole.means), lab(whole.sh[:, 0] * C0 + 0.5)], 1)
+    joint = torch.cat([whole.means / diameter(whole.means), cloud_colours(whole.sh[:, 0] * C0 + 0.5)], 1)
     mine = joint[seen[seen % 2 == 0]]
     tree = cKDTree(joint[1::2].numpy())
     squares = []

@@ -32,9 +32,9 @@ from stages.lab.bench.reconstructed_scene import reconstruct_from_renders, visib
 from stages.segment.boxes import segment as boxes_segment
 from stages.segment.geometric import segment
 from stages.segment.options import SegmentOptions
-from stages.segment.pictures import pictures
-from stages.segment.sam2 import labelled
-from stages.segment.vote import Sight, add, decide, tempered
+from stages.segment.sam2 import segment_views
+from stages.segment.view_images import view_images
+from stages.segment.voting import ViewFootprint, add_votes, apply_votes, damp_votes
 
 ERROR_RATES = (0.0, 0.2, 0.4)  # of each photo's objects and pixels
 MASK_SHIFT = 20  # by which masks of a wholly wrong photo are off, typically
@@ -89,19 +89,19 @@ def segment_by_masks(scene: Scene, truth: Int[Tensor, "n"], seed: int) -> dict[s
     votes = {share: torch.zeros(len(truth), 1) for share in ERROR_RATES}
     last = {share: torch.zeros_like(truth) for share in ERROR_RATES}
     for view in tqdm(range(len(scene.cameras)), desc="masks", unit="view", leave=False):
-        sight = Sight.of(scene, view)
+        sight = ViewFootprint.of(scene, view)
         seen = sight.front >= 0
         labels = torch.where(seen, truth[sight.front.clamp_min(0).long()], 0)
         for share in ERROR_RATES:
             if rng.uniform() < share / 2:
                 continue
             given = corrupt_labels(labels, share, objects, rng)
-            votes[share] = add(votes[share], tempered(sight.votes(given)))
+            votes[share] = add_votes(votes[share], damp_votes(sight.votes(given)))
             last[share][sight.front[seen].long()] = given[seen]
     out: dict[str, Callable[[], Tensor]] = {}
     for share in ERROR_RATES:
         name = f"masks, {share:.0%} wrong" if share else "masks"
-        out[name] = lambda v=votes[share]: decide(scene, v, {}, "masks").gaussians.object_id
+        out[name] = lambda v=votes[share]: apply_votes(scene, v, {}, "masks").gaussians.object_id
         out[f"{name}, no vote"] = lambda ids=last[share]: ids
     return out
 
@@ -110,7 +110,7 @@ def segment_by_boxes(scene: Scene, truth: Int[Tensor, "n"]) -> Int[Tensor, "n"]:
     """Object numbers from tight boxes in the view that shows most of the object it shows least of."""
 
     def shown(view: int) -> Int[Tensor, "h w"]:
-        front = Sight.of(scene, view).front
+        front = ViewFootprint.of(scene, view).front
         return torch.where(front >= 0, truth[front.clamp_min(0).long()], 0)
 
     count, views = int(truth.max()) + 1, range(len(scene.cameras))
@@ -131,7 +131,7 @@ def segment_by_boxes(scene: Scene, truth: Int[Tensor, "n"]) -> Int[Tensor, "n"]:
 
 def segment_by_sam2(scene: Scene, model) -> Int[Tensor, "n"]:
     """Object numbers that SAM 2.1 gives, without prompts, from drawings of the scene."""
-    return labelled(scene, model, pictures(scene), None, SegmentOptions("sam2")).gaussians.object_id
+    return segment_views(scene, model, view_images(scene), None, SegmentOptions("sam2")).gaussians.object_id
 
 
 def measure(kind: str, index: int, photos: int, model=None) -> list[dict]:

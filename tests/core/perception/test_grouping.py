@@ -5,14 +5,14 @@ from dataclasses import replace
 import pytest
 import torch
 
-from stages.core.perception.grouping import Grouping, group
-from stages.core.perception.growing import complete
-from stages.core.perception.support import find_support, view_of
+from stages.core.perception.grouping import GroupingOptions, group_objects
+from stages.core.perception.region_growing import grow_objects
+from stages.core.perception.support import find_support, view_extent
 from stages.core.scene.gaussians import Gaussians, concatenate
 from stages.core.scene.scene import Scene
 from stages.lab.assets.shapes import ellipsoid
 from tests.conftest import random_gaussians
-from tests.segment.tabletop import best_overlap, block, coloured, egg, scene_of, table, three_apart
+from tests.segment.tabletop import best_overlap, block, coloured_gaussians, egg, scene_of, table_gaussians, three_apart
 
 
 def unlabelled(scene: Scene) -> Scene:
@@ -20,21 +20,21 @@ def unlabelled(scene: Scene) -> Scene:
 
 
 def overlaps(scene: Scene, **how) -> dict[int, float]:
-    found = group(unlabelled(scene), Grouping(**how))
+    found = group_objects(unlabelled(scene), GroupingOptions(**how))
     return best_overlap(found.gaussians.object_id, scene.gaussians.object_id)
 
 
 @pytest.mark.parametrize("how", [{}, {"noise": 0.002}, {"noise": 0.002, "tilt": 0.03}, {"cameras": False}], ids=str)
 def test_things_that_stand_apart_come_out_whole_and_alone(how):
     scene = three_apart(**how)
-    found = group(unlabelled(scene))
+    found = group_objects(unlabelled(scene))
     assert len(found.objects) == 3
     assert min(best_overlap(found.gaussians.object_id, scene.gaussians.object_id).values()) >= 0.9
 
 
 def test_touching_things_of_different_colour_are_split():
     scene = scene_of(
-        table(), block((-0.06, 0.0), (0.12, 0.1, 0.08), (0.8, 0.1, 0.1), 1),
+        table_gaussians(), block((-0.06, 0.0), (0.12, 0.1, 0.08), (0.8, 0.1, 0.1), 1),
         egg((0.068, 0.0, 0.07), (0.068, 0.068, 0.07), (0.1, 0.2, 0.8), 2), noise=0.001,
     )  # fmt: skip
     assert min(overlaps(scene).values()) >= 0.75
@@ -42,7 +42,7 @@ def test_touching_things_of_different_colour_are_split():
 
 def test_a_thing_on_a_thing_is_a_thing_of_its_own():
     ball = egg((0.0, 0.0, 0.14), (0.06, 0.06, 0.06), (0.9, 0.8, 0.1), 2)
-    scene = scene_of(table(), block((0.0, 0.0), (0.2, 0.2, 0.08), (0.3, 0.1, 0.5), 1), ball, noise=0.001)
+    scene = scene_of(table_gaussians(), block((0.0, 0.0), (0.2, 0.2, 0.08), (0.3, 0.1, 0.5), 1), ball, noise=0.001)
     assert min(overlaps(scene).values()) >= 0.75
 
 
@@ -50,16 +50,16 @@ def test_a_striped_thing_is_one():
     cube = block((0.0, 0.0), (0.16, 0.16, 0.12), (0.9, 0.9, 0.9), 1)
     stripes = (cube.means[:, 0] / 0.03).floor().remainder(2) == 0
     cube = replace(cube, sh=torch.where(stripes[:, None, None], -cube.sh, cube.sh))
-    assert overlaps(scene_of(table(), cube))[1] >= 0.9
+    assert overlaps(scene_of(table_gaussians(), cube))[1] >= 0.9
 
 
 def test_a_thin_thing_is_found_by_its_colour_and_a_stain_is_not():
     phone = block((0.15, 0.0), (0.16, 0.08, 0.008), (0.05, 0.05, 0.05), 1)
-    top = table()
+    top = table_gaussians()
     stain = (top.means[:, :2] - torch.tensor([-0.2, 0.1])).norm(dim=1) < 0.07
     top = replace(top, sh=torch.where(stain[:, None, None], top.sh - 1.2, top.sh))
     scene = scene_of(top, phone, noise=0.0005)
-    found = group(unlabelled(scene))
+    found = group_objects(unlabelled(scene))
     assert len(found.objects) == 1
     assert best_overlap(found.gaussians.object_id, scene.gaussians.object_id)[1] >= 0.75
 
@@ -70,7 +70,7 @@ def test_walls_and_floaters_are_background():
     floaters = replace(floaters, means=floaters.means + torch.tensor([0, 0, 0.6]))
     scene = three_apart()
     scene = replace(scene, gaussians=concatenate([scene.gaussians, wall, floaters]))
-    found = group(unlabelled(scene))
+    found = group_objects(unlabelled(scene))
     assert len(found.objects) == 3
     assert int((found.gaussians.object_id[-len(floaters) - len(wall) :] > 0).sum()) < 10
 
@@ -82,7 +82,7 @@ def coloured_wall() -> Gaussians:
     x, y, _ = flat.points.unbind(1)
     points = torch.stack([x, torch.full_like(x, 0.75), y + 0.4], 1)
     upright = Surface(points, torch.tensor([[0.0, -1, 0]]).repeat(len(x), 1))
-    return coloured(upright, (0.8, 0.8, 0.75), 0)
+    return coloured_gaussians(upright, (0.8, 0.8, 0.75), 0)
 
 
 def test_faint_gaussians_inside_an_object_are_its_own():
@@ -91,7 +91,7 @@ def test_faint_gaussians_inside_an_object_are_its_own():
     inner = replace(
         inner, means=inner.means * 0.05 + torch.tensor([-0.2, -0.1, 0.05]), opacities=torch.full((40,), 0.05)
     )
-    found = group(unlabelled(replace(scene, gaussians=concatenate([scene.gaussians, inner]))))
+    found = group_objects(unlabelled(replace(scene, gaussians=concatenate([scene.gaussians, inner]))))
     ids = found.gaussians.object_id
     red = ids[scene.gaussians.object_id.argmax()]
     assert float((ids[-40:] == ids[torch.nonzero(scene.gaussians.object_id == 1)[50, 0]]).float().mean()) > 0.95
@@ -99,12 +99,12 @@ def test_faint_gaussians_inside_an_object_are_its_own():
 
 
 def test_a_blur_within_an_object_is_its_own_and_one_that_reaches_out_is_not():
-    shell = coloured(ellipsoid((1.0, 1.0, 1.0), 2000), (0.8, 0.1, 0.1), 1)
+    shell = coloured_gaussians(ellipsoid((1.0, 1.0, 1.0), 2000), (0.8, 0.1, 0.1), 1)
     blurs = random_gaussians(3)
     scales = torch.tensor([[0.4, 0.3, 0.3], [0.4, 0.3, 0.3], [0.4, 0.3, torch.inf]])
     centres = torch.tensor([[0.1, 0.0, 0.2], [0.75, 0.0, 0.0], [0.0, 0.0, 0.0]])
     blurs = replace(blurs, means=centres, scales=scales, object_id=torch.zeros(3, dtype=torch.int64))
-    whole = complete(concatenate([shell, blurs, replace(shell[:20], object_id=torch.zeros(20).long())]), None, 0.1)
+    whole = grow_objects(concatenate([shell, blurs, replace(shell[:20], object_id=torch.zeros(20).long())]), None, 0.1)
     assert whole.object_id[len(shell) :][:3].tolist() == [1, 0, 0]
 
 
@@ -116,7 +116,7 @@ def test_the_plane_is_found_without_being_told():
 
 
 def test_objects_are_numbered_by_size_and_their_names_differ():
-    found = group(unlabelled(three_apart()))
+    found = group_objects(unlabelled(three_apart()))
     counts = torch.bincount(found.gaussians.object_id)[1:].tolist()
     assert counts == sorted(counts, reverse=True)
     names = [o.name for o in found.objects]
@@ -125,7 +125,7 @@ def test_objects_are_numbered_by_size_and_their_names_differ():
 
 
 def test_the_same_seed_gives_the_same_labels():
-    one, two = (group(unlabelled(three_apart(noise=0.002))).gaussians.object_id for _ in range(2))
+    one, two = (group_objects(unlabelled(three_apart(noise=0.002))).gaussians.object_id for _ in range(2))
     assert torch.equal(one, two)
 
 
@@ -141,7 +141,7 @@ def test_degenerate_gaussians_end_quickly_and_without_objects_or_errors(kind):
         "not finite": lambda: replace(g, means=torch.full((200, 3), torch.nan)),
         "faint": lambda: replace(g, opacities=torch.zeros(200)),
     }[kind]()
-    found = group(Scene(g, floor=0.0))
+    found = group_objects(Scene(g, floor=0.0))
     assert len(found.gaussians) == len(g)
     assert len(found.objects) <= 3
-    assert view_of(Scene(g)).radius > 0
+    assert view_extent(Scene(g)).radius > 0

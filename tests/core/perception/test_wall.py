@@ -7,12 +7,12 @@ import torch
 
 from stages.core.geometry.rotations import matrix
 from stages.core.geometry.similarity import Similarity
-from stages.core.perception.grouping import group
-from stages.core.perception.support import view_of
-from stages.core.perception.wall import find_wall, laid_down
+from stages.core.perception.grouping import group_objects
+from stages.core.perception.support import view_extent
+from stages.core.perception.wall import find_wall, rotate_wall_to_floor
 from stages.core.scene.gaussians import transformed
 from stages.core.scene.scene import Scene
-from tests.segment.tabletop import best_overlap, block, scene_of, table, three_apart
+from tests.segment.tabletop import best_overlap, block, scene_of, table_gaussians, three_apart
 
 UP = Similarity(1.0, matrix(torch.tensor([0.5**0.5, 0.5**0.5, 0.0, 0.0])), torch.tensor([0.3, -0.2, 0.4]))
 
@@ -24,8 +24,8 @@ def hung(scene: Scene) -> Scene:
 
 def test_a_wall_is_laid_on_its_back():
     scene = hung(three_apart(noise=0.001))
-    turn = find_wall(scene, view_of(scene))
-    laid = laid_down(scene, turn)
+    turn = find_wall(scene, view_extent(scene))
+    laid = rotate_wall_to_floor(scene, turn)
     wall = laid.gaussians.means[scene.gaussians.object_id == 0]
     assert float(wall[:, 2].abs().median()) < 0.002  # the noise
     assert float(laid.gaussians.means[scene.gaussians.object_id > 0][:, 2].min()) > -0.004
@@ -37,7 +37,7 @@ def test_a_wall_is_laid_on_its_back():
 def test_what_hangs_on_a_wall_comes_out_whole_and_alone():
     scene = hung(three_apart(noise=0.001))
     blank = replace(scene, gaussians=replace(scene.gaussians, object_id=torch.zeros_like(scene.gaussians.object_id)))
-    found = group(blank)
+    found = group_objects(blank)
     assert len(found.objects) == 3
     assert min(best_overlap(found.gaussians.object_id, scene.gaussians.object_id).values()) >= 0.9
     assert torch.equal(found.gaussians.means, scene.gaussians.means)  # numbered where it is, not moved
@@ -54,13 +54,13 @@ def test_what_hangs_on_a_wall_comes_out_whole_and_alone():
     ids=["floor", "table", "book", "no cameras"],
 )
 def test_no_wall(scene):
-    assert find_wall(scene, view_of(scene)) is None
+    assert find_wall(scene, view_extent(scene)) is None
 
 
 def test_a_wall_with_a_room_behind_it_is_a_screen():
-    scene = hung(scene_of(table()))
+    scene = hung(scene_of(table_gaussians()))
     behind = transformed(scene.gaussians, Similarity(1.0, torch.eye(3), torch.tensor([0.0, 0.15, 0.0])))
     both = replace(scene, gaussians=type(behind)(*(torch.cat(pair) for pair in zip(
         vars(scene.gaussians).values(), vars(behind).values(), strict=True))))  # fmt: skip
-    assert find_wall(scene, view_of(scene)) is not None
-    assert find_wall(both, view_of(both)) is None
+    assert find_wall(scene, view_extent(scene)) is not None
+    assert find_wall(both, view_extent(both)) is None

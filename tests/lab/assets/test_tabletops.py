@@ -125,13 +125,15 @@ def test_where_no_photo_can_be_placed_nothing_is_found(monkeypatch):
 
 def test_sam2_takes_part_where_its_weights_are(tmp_path, monkeypatch):
     pytest.importorskip("transformers")
-    from stages.core.models.sam2 import automatic, weights
-    from stages.segment import discover
+    from stages.core.models.sam2 import mask_generation, weights
+    from stages.segment import discovery
     from tests.core.models.sam2.tiny import saved
 
-    few = automatic.Automatic(grid=2, iou=-9.0, stability=0.0)
-    monkeypatch.setattr(discover, "propose", lambda model, pixels: automatic.propose(model, pixels, few))
-    monkeypatch.setattr(discover, "LOOKS", 1)
+    few = mask_generation.MaskGenerationOptions(grid=2, iou=-9.0, stability=0.0)
+    monkeypatch.setattr(
+        discovery, "propose_masks", lambda model, pixels: mask_generation.propose_masks(model, pixels, few)
+    )
+    monkeypatch.setattr(discovery, "LOOKS", 1)
     scene = three_apart()
     found = bench_segment.segment_by_sam2(scene, weights.load(weights.find(saved(tmp_path))))
     assert found.shape == scene.gaussians.object_id.shape  # which objects, only real weights know

@@ -21,14 +21,14 @@ from stages.lab.bench.complete import (
     visible,
     visible_scene,
 )
-from tests.refine.things import thing
-from tests.segment.tabletop import coloured
+from tests.refine.sample_objects import asymmetric_object
+from tests.segment.tabletop import coloured_gaussians
 
 
 @pytest.fixture(scope="module")
 def true():
     patch = pytest.MonkeyPatch()
-    patch.setattr(bench_complete, "make_object", lambda name: thing(0.02))
+    patch.setattr(bench_complete, "make_object", lambda name: asymmetric_object(0.02))
     yield true_scene("panda,duck", CompleteBenchOptions())
     patch.undo()
 
@@ -56,7 +56,7 @@ def test_what_is_seen_does_not_depend_on_how_many_gaussians_it_is_made_of():
     """Of a ball, the front of the arc of cameras: the same share of 4,000 and of 30,000 Gaussians."""
     shares = []
     for count in (4000, 30_000):
-        ball = coloured(ellipsoid((0.1, 0.1, 0.1), count).moved((0, 0, 0.12)), (0.8, 0.3, 0.2), 1)
+        ball = coloured_gaussians(ellipsoid((0.1, 0.1, 0.1), count).moved((0, 0, 0.12)), (0.8, 0.3, 0.2), 1)
         shares.append(float(visible(Scene(ball, (), camera_arc(10, FRONT_AZIMUTH, 28.0), 0.0)).float().mean()))
     assert shares[0] == pytest.approx(shares[1], abs=0.05) and 0.5 < shares[0] < 0.9
 
@@ -71,7 +71,7 @@ def test_a_run_gives_each_scene_and_the_mean_over_them(tmp_path, monkeypatch):
             yield way, {figure: factor * i * 10**j for j, figure in enumerate(METRICS)}
 
     monkeypatch.setattr(bench_complete, "measure", measured)
-    monkeypatch.setattr(bench_complete, "make_object", lambda name: thing(0.02))
+    monkeypatch.setattr(bench_complete, "make_object", lambda name: asymmetric_object(0.02))
     lines = list(run(tmp_path / "out.json", CompleteBenchOptions(("panda,duck", "can,miku"), "duck")))
     assert [line.split()[:2] for line in lines[-3:]] == [["mean", way] for way in COMPLETERS] and len(
         lines

@@ -24,14 +24,14 @@ from stages.lab.bench.register import (
     run,
     splatreg,
 )
-from tests.refine.things import somewhere, thing
-from tests.segment.tabletop import coloured
+from tests.refine.sample_objects import asymmetric_object, random_similarity
+from tests.segment.tabletop import coloured_gaussians
 
 
 @pytest.fixture(scope="module")
 def can():
     """A grey cylinder-like egg; `painted` has one side red."""
-    return coloured(ellipsoid((0.3, 0.3, 0.5), 8000), (0.5, 0.5, 0.5), 1, grain=0.0)
+    return coloured_gaussians(ellipsoid((0.3, 0.3, 0.5), 8000), (0.5, 0.5, 0.5), 1, grain=0.0)
 
 
 def turned_about_z(pose: Similarity, degrees: float) -> Similarity:
@@ -74,13 +74,13 @@ def test_the_turn_about_z_is_taken_apart_from_the_rest():
 
 
 def test_there_and_back_is_nowhere():
-    pose = somewhere(2)
+    pose = random_similarity(2)
     points = torch.randn(5, 3)
     torch.testing.assert_close(pose.inverse()(pose(points)), points, rtol=0, atol=1e-5)
 
 
 def test_icp_finds_a_whole_that_is_turned_a_little():
-    whole = thing(0.02)
+    whole = asymmetric_object(0.02)
     pose = Similarity(1.3, matrix(torch.tensor([1.0, 0.02, 0.03, -0.02])), torch.tensor([0.2, 0.1, 0.0]))
     found = icp(replace(whole, means=pose(whole.means)), whole)
     assert (found(whole.means) - pose(whole.means)).norm(dim=1).mean() < 0.03
@@ -111,7 +111,7 @@ def test_splatreg_is_handed_what_it_wants_and_its_answer_is_turned_into_ours(can
     rng, threads = torch.Generator().manual_seed(0), torch.get_num_threads()
     whole = can[torch.randperm(len(can), generator=rng)[: bench_register.SPLATREG_GAUSSIANS]]
     whole = replace(whole, sh=rgb_to_sh(torch.rand(len(whole), 3, generator=rng)))
-    pose = somewhere(3)
+    pose = random_similarity(3)
     found = splatreg(replace(whole, means=pose(whole.means), scales=pose.scale * whole.scales), whole)
     torch.testing.assert_close(found(whole.means), pose(whole.means), rtol=0, atol=1e-4)
     assert found.scale == pytest.approx(pose.scale, rel=1e-4) and torch.get_num_threads() == threads
@@ -119,7 +119,7 @@ def test_splatreg_is_handed_what_it_wants_and_its_answer_is_turned_into_ours(can
 
 def test_the_real_splatreg_finds_a_whole_that_is_turned_and_scaled():
     pytest.importorskip("splatreg")
-    whole, pose = thing(0.02), somewhere(1)
+    whole, pose = asymmetric_object(0.02), random_similarity(1)
     whole = whole[
         torch.randperm(len(whole), generator=torch.Generator().manual_seed(0))[: bench_register.SPLATREG_GAUSSIANS]
     ]
@@ -128,7 +128,7 @@ def test_the_real_splatreg_finds_a_whole_that_is_turned_and_scaled():
 
 
 def test_a_run_counts_and_writes(tmp_path, monkeypatch):
-    monkeypatch.setattr(bench_register, "make_object", lambda name: thing(0.02))
+    monkeypatch.setattr(bench_register, "make_object", lambda name: asymmetric_object(0.02))
     monkeypatch.setattr(bench_register, "METHODS", {"ICP": icp})
     lines = list(run(tmp_path / "out.json", RegisterBenchOptions("duck", 1, device="cpu")))
     assert lines[0].split() == ["right", "of", "1", "ICP"] and lines[1].split()[0] == "duck"

@@ -15,23 +15,23 @@ OUTSIDE, INSIDE, CORNER, OPPOSITE = 0, 1, 2, 3  # what a click may say; a box is
 
 
 @dataclass(frozen=True)
-class Clicks:
+class PointPrompts:
     """What points at one object in one photo."""
 
     points: Float[Tensor, "k 2"]  # x, y [share of the photo's width and height]
     labels: Int[Tensor, "k"]  # OUTSIDE or INSIDE; CORNER and OPPOSITE
 
     @classmethod
-    def box(cls, corners: Float[Tensor, "4"]) -> Clicks:
+    def box(cls, corners: Float[Tensor, "4"]) -> PointPrompts:
         """A box x0 y0 x1 y1 around the object."""
         return cls(corners.reshape(2, 2), torch.tensor([CORNER, OPPOSITE]))
 
     @classmethod
-    def inside(cls, point: Float[Tensor, "2"]) -> Clicks:
+    def inside(cls, point: Float[Tensor, "2"]) -> PointPrompts:
         return cls(point[None], torch.tensor([INSIDE]))
 
 
-def side_of(model: Sam2VideoModel) -> int:
+def input_side(model: Sam2VideoModel) -> int:
     """Width and height of the images that the network takes [px]: 1024 for those published."""
     return int(model.prompt_encoder.input_image_size)
 
@@ -44,7 +44,7 @@ def pixel_values(image: Float[Tensor, "h w 3"], side: int) -> Float[Tensor, "3 s
     return (square - torch.tensor(MEAN)[:, None, None]) / torch.tensor(STD)[:, None, None]
 
 
-class Session(Sam2VideoInferenceSession):
+class StreamingSession(Sam2VideoInferenceSession):
     """A sequence of photos that are read when their turn comes, and a memory that does not grow with their number."""
 
     def __init__(self, frame: Callable[[int], Float[Tensor, "3 s s"]], count: int, device: torch.device):
@@ -78,11 +78,11 @@ class Session(Sam2VideoInferenceSession):
                     tracked[t].pop("maskmem_pos_enc", None)
 
 
-def track(
+def propagate_masks(
     model: Sam2VideoModel,
     frame: Callable[[int], Float[Tensor, "3 s s"]],
     count: int,
-    prompts: Sequence[Clicks] | Bool[Tensor, "o h w"],
+    prompts: Sequence[PointPrompts] | Bool[Tensor, "o h w"],
     start: int = 0,
 ) -> Iterator[tuple[int, Float[Tensor, "o l l"]]]:
     """Logits of the objects' masks, positive inside, in every photo of a sequence, at a quarter of the network's size.
@@ -91,15 +91,15 @@ def track(
     forwards to the end, then backwards to the first. `frame` gives the pixel values of a photo and is asked for each
     of the `count` once.
     """
-    session = Session(frame, count, model.device)
+    session = StreamingSession(frame, count, model.device)
     for number, prompt in enumerate(prompts):
         row = session.obj_id_to_idx(number)
-        if isinstance(prompt, Clicks):
-            points = prompt.points * side_of(model)
+        if isinstance(prompt, PointPrompts):
+            points = prompt.points * input_side(model)
             clicks = {"point_coords": points[None, None].float(), "point_labels": prompt.labels[None, None].int()}
             session.add_point_inputs(row, start, clicks)
         else:
-            session.add_mask_inputs(row, start, _enlarged(prompt, side_of(model)))
+            session.add_mask_inputs(row, start, _enlarged(prompt, input_side(model)))
     session.obj_with_new_inputs = list(session.obj_ids)
     memories, pointers = model.config.num_maskmem, model.config.max_object_pointers_in_encoder
     for now in [*range(start, count), *range(start - 1, -1, -1)]:

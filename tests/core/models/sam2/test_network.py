@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from stages.core.models.sam2 import network
-from stages.core.models.sam2.network import Clicks, Session, pixel_values, track
+from stages.core.models.sam2.network import PointPrompts, StreamingSession, pixel_values, propagate_masks
 from tests.core.models.sam2.tiny import SIDE, random_model
 
 COUNT, START = 13, 4
@@ -58,11 +58,11 @@ def by_mask(session) -> list[int]:
 
 @pytest.mark.parametrize(
     ("prompts", "give"),
-    [([Clicks.box(BOX), Clicks.inside(POINT)], by_clicks), (a_mask()[None], by_mask)],
+    [([PointPrompts.box(BOX), PointPrompts.inside(POINT)], by_clicks), (a_mask()[None], by_mask)],
     ids=["clicks", "mask"],
 )
 def test_propagation_is_that_of_transformers_though_most_is_forgotten(model, video, prompts, give):
-    mine = dict(track(model, lambda i: video[i], COUNT, prompts, START))
+    mine = dict(propagate_masks(model, lambda i: video[i], COUNT, prompts, START))
     assert list(mine) == [*range(START, COUNT), *range(START - 1, -1, -1)]
     for t, masks in theirs(model, video, give).items():
         torch.testing.assert_close(mine[t], masks, rtol=0, atol=0)
@@ -74,14 +74,16 @@ def test_the_past_is_looked_at(model, video):
     """Another second photo changes the third one's masks, by memory alone."""
     other = video.clone()
     other[1] = other[1].flip(-1)
-    one, two = ([m for _, m in track(model, lambda i, v=v: v[i], 3, [Clicks.box(BOX)])] for v in (video, other))
+    one, two = (
+        [m for _, m in propagate_masks(model, lambda i, v=v: v[i], 3, [PointPrompts.box(BOX)])] for v in (video, other)
+    )
     assert torch.equal(one[0], two[0]) and float((one[2] - two[2]).abs().max()) > 1e-3
 
 
 def test_memory_does_not_grow_with_the_sequence_and_each_photo_is_read_once(model, monkeypatch):
     sessions, read = [], []
 
-    class Watched(Session):
+    class Watched(StreamingSession):
         def __init__(self, *args):
             super().__init__(*args)
             sessions.append(self)
@@ -95,8 +97,8 @@ def test_memory_does_not_grow_with_the_sequence_and_each_photo_is_read_once(mode
         kept = (*outputs["cond_frame_outputs"].values(), *outputs["non_cond_frame_outputs"].values())
         return sum(x.numel() * x.element_size() for one in kept for x in one.values() if isinstance(x, torch.Tensor))
 
-    monkeypatch.setattr(network, "Session", Watched)
-    sizes = [held() for _ in track(model, frame, 40, [Clicks.box(BOX)])]
+    monkeypatch.setattr(network, "StreamingSession", Watched)
+    sizes = [held() for _ in propagate_masks(model, frame, 40, [PointPrompts.box(BOX)])]
     assert sorted(read) == list(range(40))
     assert sizes[39] <= sizes[14] and sizes[14] > 0
     assert sessions[-1].processed_frames is None

@@ -26,7 +26,7 @@ class Voxels:
 
 
 @dataclass(frozen=True)
-class Edges:
+class VoxelEdges:
     """Pairs of neighbouring voxels and how different they are."""
 
     i: np.ndarray  # (e,)
@@ -35,11 +35,11 @@ class Edges:
     bend: np.ndarray  # (e,) sine of the angle between the normals, above 0 in a valley and at a jump
 
 
-def edges_of(voxels: Voxels, reach: float = 2.2, k: int = 12) -> Edges:
+def voxel_edges(voxels: Voxels, reach: float = 2.2, k: int = 12) -> VoxelEdges:
     """Neighbours within `reach` voxel sides, k at most for each."""
     if len(voxels) < 2:
         none = np.zeros(0, np.int64)
-        return Edges(none, none, none.astype(float), none.astype(float))
+        return VoxelEdges(none, none, none.astype(float), none.astype(float))
     distance, index = cKDTree(voxels.points).query(
         voxels.points, k=min(k + 1, len(voxels)), distance_upper_bound=reach * voxels.size, workers=-1
     )
@@ -52,10 +52,10 @@ def edges_of(voxels: Voxels, reach: float = 2.2, k: int = 12) -> Edges:
     slope_i, slope_j = (voxels.normals[i] * step).sum(1), (voxels.normals[j] * step).sum(1)
     jump = np.sqrt((slope_i * slope_j).clip(0))  # both normals along the step: one surface behind the other
     bend = (slope_i - slope_j) / 2 + (jump - 0.3).clip(0)
-    return Edges(i, j, np.linalg.norm(voxels.lab[i] - voxels.lab[j], axis=1), bend)
+    return VoxelEdges(i, j, np.linalg.norm(voxels.lab[i] - voxels.lab[j], axis=1), bend)
 
 
-class Forest:
+class DisjointSets:
     """Disjoint sets with path halving."""
 
     def __init__(self, count: int):
@@ -69,7 +69,7 @@ class Forest:
         return i
 
 
-def small_regions(voxels: Voxels, edges: Edges, k: float = 0.8, least: int = 6, most: int = 120) -> np.ndarray:
+def oversegment(voxels: Voxels, edges: VoxelEdges, k: float = 0.8, least: int = 6, most: int = 120) -> np.ndarray:
     """Region number of each voxel: even in colour and without a valley, unless that is their texture.
 
     None grows over `most` voxels, since one weak place in a border would join two things for good.
@@ -78,7 +78,7 @@ def small_regions(voxels: Voxels, edges: Edges, k: float = 0.8, least: int = 6, 
     """
     weight = edges.contrast / 20 + 1.2 * edges.bend.clip(0)
     order = np.argsort(weight, kind="stable")
-    forest, inner, size = Forest(len(voxels)), [0.0] * len(voxels), [1] * len(voxels)
+    forest, inner, size = DisjointSets(len(voxels)), [0.0] * len(voxels), [1] * len(voxels)
     pairs = list(zip(edges.i[order].tolist(), edges.j[order].tolist(), weight[order].tolist(), strict=True))
     for allow_small in (False, True):
         for i, j, w in pairs:
@@ -116,10 +116,10 @@ class Border:
         return Border(self.count + other.count, self.contrast + other.contrast, self.bend + other.bend)
 
 
-class Merging:
+class RegionMerger:
     """Regions merged two at a time, the two that most look like one thing first."""
 
-    def __init__(self, voxels: Voxels, edges: Edges, labels: np.ndarray, least: int, limit: float, large: float):
+    def __init__(self, voxels: Voxels, edges: VoxelEdges, labels: np.ndarray, least: int, limit: float, large: float):
         self.voxels, self.least, self.limit, self.large = voxels, least, limit, large
         self.palette = _palette(voxels.lab)
         soft = _soft_bins(voxels.lab, self.palette)
@@ -134,7 +134,7 @@ class Merging:
         sample = points[:: max(1, len(points) // HULL_POINTS)]
         return Region(members, colours, sample, *_hull(points))
 
-    def _meet(self, edges: Edges, labels: np.ndarray) -> None:
+    def _meet(self, edges: VoxelEdges, labels: np.ndarray) -> None:
         a, b = labels[edges.i], labels[edges.j]
         across = a != b
         pair = np.stack([np.minimum(a, b), np.maximum(a, b)], 1)[across]

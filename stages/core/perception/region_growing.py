@@ -14,7 +14,7 @@ from torch import Tensor
 from stages.core.geometry.harmonics import C0
 from stages.core.geometry.neighbours import knn
 from stages.core.geometry.rotations import matrix
-from stages.core.perception.support import Support, cell_medians, windowed
+from stages.core.perception.support import Support, cell_medians, sliding_quantile
 from stages.core.scene.gaussians import Gaussians
 
 OTHER = 12.0  # colour difference (CIELAB) from which something is not the table
@@ -22,7 +22,7 @@ VIVID = 20.0  # difference in hue and chroma that no pattern of shade makes
 STEPS = 12  # of `reach` that an object may grow along what lies low
 
 
-def lab_of(g: Gaussians) -> Float[Tensor, "n 3"]:
+def cielab_colours(g: Gaussians) -> Float[Tensor, "n 3"]:
     """Base colours in CIELAB."""
     rgb = (g.sh[:, 0] * C0 + 0.5).nan_to_num(0.5).clamp(0, 1).numpy().astype(np.float32)
     return torch.from_numpy(cv2.cvtColor(rgb[None], cv2.COLOR_RGB2LAB)[0].reshape(-1, 3))
@@ -31,10 +31,10 @@ def lab_of(g: Gaussians) -> Float[Tensor, "n 3"]:
 def table_colour(g: Gaussians, support: Support) -> Float[Tensor, "bx by 3"]:
     """Usual colour of the table (CIELAB), in blocks of 3 x 3 cells."""
     on = (support.heights(g.means).abs() < support.tolerance) & (g.object_id == 0) & g.means.isfinite().all(1)
-    return windowed(cell_medians(support, g.means[on], lab_of(g[on]), 3), reach=3)
+    return sliding_quantile(cell_medians(support, g.means[on], cielab_colours(g[on]), 3), reach=3)
 
 
-def complete(g: Gaussians, support: Support | None, reach: float) -> Gaussians:
+def grow_objects(g: Gaussians, support: Support | None, reach: float) -> Gaussians:
     """Faint and stray Gaussians within objects, and what lies low beside them, take the nearest object's number.
 
     `reach` [scene units] is how near is near. Close to the plane a Gaussian is the object's when its colour is
@@ -57,7 +57,7 @@ def _grow(
     g: Gaussians, support: Support | None, front: Int[Tensor, "a"], free: Int[Tensor, "b"], reach: float
 ) -> Int[Tensor, "n"]:
     """Object numbers after the `front` has spread into what is `free`, step by step."""
-    ids, lab = g.object_id.clone(), lab_of(g)
+    ids, lab = g.object_id.clone(), cielab_colours(g)
     source = lab.clone()  # colour of the object where its growth began: a step after a step must not drift
     level = torch.full((len(free),), torch.inf)  # height in tolerances
     to_table = torch.zeros(len(free))

@@ -6,13 +6,13 @@ import pytest
 import torch
 
 from stages.core.perception.support import find_support
-from stages.segment.scraps import without_scraps
-from tests.segment.tabletop import block, scene_of, table, three_apart
+from stages.segment.false_positives import remove_false_positives
+from tests.segment.tabletop import block, scene_of, table_gaussians, three_apart
 
 
 def left(scene, ids):
     labelled = replace(scene, gaussians=replace(scene.gaussians, object_id=ids))
-    return without_scraps(labelled, find_support(scene)).object_id
+    return remove_false_positives(labelled, find_support(scene)).object_id
 
 
 @pytest.fixture(scope="module")
@@ -39,13 +39,13 @@ def test_a_whole_stripe_is_too_where_the_table_is_close_on_both_sides(truth):
 @pytest.mark.parametrize("size", [(0.2, 0.014, 0.014), (0.14, 0.07, 0.009), (0.14, 0.07, 0.006)],
                          ids=["rope", "phone", "card"])  # fmt: skip
 def test_what_is_thin_stays(size):
-    scene = scene_of(table(), block((0.0, 0.0), size, (0.8, 0.1, 0.1), 1), noise=0.0005)
+    scene = scene_of(table_gaussians(), block((0.0, 0.0), size, (0.8, 0.1, 0.1), 1), noise=0.0005)
     assert torch.equal(left(scene, scene.gaussians.object_id), scene.gaussians.object_id)
 
 
 def test_a_phone_of_which_some_was_missed_stays():
     """What was missed shows all over it, level with it, and is no table."""
-    scene = scene_of(table(), block((0.0, 0.0), (0.14, 0.07, 0.009), (0.8, 0.1, 0.1), 1), noise=0.0005)
+    scene = scene_of(table_gaussians(), block((0.0, 0.0), (0.14, 0.07, 0.009), (0.8, 0.1, 0.1), 1), noise=0.0005)
     true = scene.gaussians.object_id
     ids = torch.where(torch.arange(len(true)) % 5 == 0, 0, true)
     assert (ids != true).sum() > 20 and torch.equal(left(scene, ids), ids)

@@ -14,7 +14,7 @@ from stages.core.errors import InputError
 from stages.core.geometry.cameras import depths, project
 from stages.core.geometry.cameras import resize as resize_K
 from stages.core.geometry.neighbours import knn
-from stages.core.perception.growing import complete
+from stages.core.perception.region_growing import grow_objects
 from stages.core.perception.support import find_support
 from stages.core.raster.rasterise import rasterise, visibility
 from stages.core.scene.scene import Scene, SceneObject
@@ -26,7 +26,7 @@ SURFACE = 0.02  # a Gaussian this near to the drawn surface is on it [share of i
 
 
 @dataclass(frozen=True)
-class Sight:
+class ViewFootprint:
     """What one camera sees of a scene's Gaussians, at the size that votes are counted at."""
 
     front: Int[Tensor, "h w"]  # the Gaussian that weighs most in each pixel; -1: none
@@ -37,9 +37,9 @@ class Sight:
     picture: Float[Tensor, "h w 3"]  # what it sees, 0..1
 
     @classmethod
-    def of(cls, scene: Scene, view: int) -> Sight:
+    def of(cls, scene: Scene, view: int) -> ViewFootprint:
         g, viewmat = scene.gaussians, scene.cameras.viewmats[view]
-        width, height, K = counted_at(scene, view)
+        width, height, K = voting_intrinsics(scene, view)
         front, weight = visibility(g, viewmat, K, width, height)
         drawn = rasterise(g, viewmat[None], K[None], width, height)
         x, y = project(g.means, viewmat, K).nan_to_num(-1).floor().long().unbind(1)
@@ -66,7 +66,7 @@ class Sight:
         return votes
 
 
-def counted_at(scene: Scene, view: int) -> tuple[int, int, Float[Tensor, "3 3"]]:
+def voting_intrinsics(scene: Scene, view: int) -> tuple[int, int, Float[Tensor, "3 3"]]:
     """Width, height [px] and K that a view's votes are counted at."""
     width, height = scene.cameras.sizes[view].tolist()
     shrink = min(1.0, SIDE / max(width, height))
@@ -74,18 +74,18 @@ def counted_at(scene: Scene, view: int) -> tuple[int, int, Float[Tensor, "3 3"]]
     return w, h, resize_K(scene.cameras.Ks[view], w / width, h / height)
 
 
-def poll(scene: Scene, images: Iterable[tuple[int, Int[Tensor, "h w"]]]) -> Float[Tensor, "n k"]:
+def collect_votes(scene: Scene, images: Iterable[tuple[int, Int[Tensor, "h w"]]]) -> Float[Tensor, "n k"]:
     """Votes of all `images`, each the number of a camera and its labels (0 background, 1... the objects).
 
     Images come one at a time, from a folder or from a network, so memory holds one of them.
     """
     total = torch.zeros(len(scene.gaussians), 1)
     for view, labels in images:
-        total = add(total, tempered(Sight.of(scene, view).votes(labels)))
+        total = add_votes(total, damp_votes(ViewFootprint.of(scene, view).votes(labels)))
     return total
 
 
-def tempered(votes: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
+def damp_votes(votes: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
     """One view's votes with the root of its weight: pixels side by side in one mask are not independent witnesses.
 
     In between a vote for each pixel, where one near view may overrule all others, and a vote for each view.
@@ -93,7 +93,7 @@ def tempered(votes: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
     return votes / votes.sum(1, keepdim=True).clamp_min(1e-12).sqrt()
 
 
-def pooled(means: Float[Tensor, "n 3"], votes: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
+def pool_votes(means: Float[Tensor, "n 3"], votes: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
     """Each Gaussian's votes with those of its nearest neighbours: few pixels show one Gaussian, and noise is in each.
 
     Only neighbours within three times the usual spacing count. Measured with wrong masks by `ngff-lab bench segment`.
@@ -107,13 +107,15 @@ def pooled(means: Float[Tensor, "n 3"], votes: Float[Tensor, "n k"]) -> Float[Te
     return out
 
 
-def add(a: Float[Tensor, "n j"], b: Float[Tensor, "n k"]) -> Float[Tensor, "n l"]:
+def add_votes(a: Float[Tensor, "n j"], b: Float[Tensor, "n k"]) -> Float[Tensor, "n l"]:
     """Sum of votes that may know different numbers of labels."""
     wide = max(a.shape[1], b.shape[1])
     return torch.nn.functional.pad(a, (0, wide - a.shape[1])) + torch.nn.functional.pad(b, (0, wide - b.shape[1]))
 
 
-def decide(scene: Scene, votes: Float[Tensor, "n k"], names: Mapping[int, str], source: str, seed: int = 0) -> Scene:
+def apply_votes(
+    scene: Scene, votes: Float[Tensor, "n k"], names: Mapping[int, str], source: str, seed: int = 0
+) -> Scene:
     """The scene with the label that won each Gaussian, grown to whole objects, and its objects.
 
     An object without a name becomes object_NUMBER. `source` is what errors and warnings name: whatever gave labels.
@@ -121,17 +123,17 @@ def decide(scene: Scene, votes: Float[Tensor, "n k"], names: Mapping[int, str], 
     if votes.shape[1] == 1:
         raise InputError(f"{source}: the label images hold no object: every pixel is 0")
     means = scene.gaussians.means
-    ids = without_outliers(means, elect(scene, pooled(means, votes)))
+    ids = remove_outliers(means, majority_labels(scene, pool_votes(means, votes)))
     present = set(ids.unique().tolist())
     objects = tuple(SceneObject(i, names.get(i, f"object_{i}")) for i in range(1, votes.shape[1]) if i in present)
     if missing := [i for i in range(1, votes.shape[1]) if i not in present]:
         log.warning("%s: labels %s won no Gaussian", source, ", ".join(map(str, missing)))
     g = replace(scene.gaussians, object_id=ids)
-    grown = complete(g, find_support(scene, seed=seed), _reach(means, ids)) if objects else g
+    grown = grow_objects(g, find_support(scene, seed=seed), _reach(means, ids)) if objects else g
     return replace(scene, gaussians=grown, objects=objects)
 
 
-def elect(scene: Scene, votes: Float[Tensor, "n k"]) -> Int[Tensor, "n"]:
+def majority_labels(scene: Scene, votes: Float[Tensor, "n k"]) -> Int[Tensor, "n"]:
     """The label with most votes; ties and Gaussians without votes take that of the nearest decided ones.
 
     Of these the five nearest decide, if they are near: within three times the usual spacing.
@@ -151,7 +153,7 @@ def elect(scene: Scene, votes: Float[Tensor, "n k"]) -> Int[Tensor, "n"]:
     return ids
 
 
-def without_outliers(means: Float[Tensor, "n 3"], ids: Int[Tensor, "n"], limit: float = 3.5) -> Int[Tensor, "n"]:
+def remove_outliers(means: Float[Tensor, "n 3"], ids: Int[Tensor, "n"], limit: float = 3.5) -> Int[Tensor, "n"]:
     """Labels with each object's strays made background: modified z-score of the distance to the median centre.
 
     Source: Iglewicz and Hoaglin 1993: 0.6745 |d - median| / MAD <= 3.5.

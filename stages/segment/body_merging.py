@@ -21,7 +21,7 @@ BENEATH = 0.25  # share of a part that lies lower than where it would lie on ano
 
 
 @dataclass(frozen=True)
-class Part:
+class ObjectPart:
     """One object found so far, thinned."""
 
     points: np.ndarray  # (p, 3) one a cell
@@ -29,7 +29,7 @@ class Part:
     planes: np.ndarray | None  # (f, 4) outward planes of its convex hull; None for what is flat
 
     @classmethod
-    def of(cls, means: Float[Tensor, "n 3"], support: Support) -> Part:
+    def of(cls, means: Float[Tensor, "n 3"], support: Support) -> ObjectPart:
         side = CELL * support.view.radius
         _, first = np.unique((means / side).floor().numpy(), axis=0, return_index=True)
         thin = means[first]
@@ -40,7 +40,7 @@ class Part:
             planes = None
         return cls(points, (support.heights(thin) / support.tolerance).numpy(), planes)
 
-    def inside(self, other: Part, margin: float) -> float:
+    def inside(self, other: ObjectPart, margin: float) -> float:
         """Share of this part that lies deeper than `margin` in the convex hull of another."""
         if other.planes is None:
             return 0.0
@@ -48,7 +48,7 @@ class Part:
         return float((depth > margin).mean())
 
 
-def joined(g: Gaussians, support: Support) -> Gaussians:
+def merge_bodies(g: Gaussians, support: Support) -> Gaussians:
     """The same Gaussians, with the objects that are parts of one body under the number of the largest.
 
     Two bodies pushed together do not enter each other's convex hull both at once (a spoon enters that of its cup,
@@ -58,17 +58,17 @@ def joined(g: Gaussians, support: Support) -> Gaussians:
     ids = g.object_id.clone()
     finite = g.means.isfinite().all(1)
     parts = {
-        n: Part.of(g.means[(ids == n) & finite], support) for n in ids[finite].unique().tolist() if n > 0
+        n: ObjectPart.of(g.means[(ids == n) & finite], support) for n in ids[finite].unique().tolist() if n > 0
     }  # fmt: skip
     while (pair := _one_body(parts, CELL * support.view.radius)) is not None:
         kept, gone = sorted(pair, key=lambda n: (-len(parts[n].points), n))
         ids[ids == gone] = kept
-        parts[kept] = Part.of(g.means[(ids == kept) & finite], support)
+        parts[kept] = ObjectPart.of(g.means[(ids == kept) & finite], support)
         del parts[gone]
     return replace(g, object_id=ids)
 
 
-def _one_body(parts: dict[int, Part], side: float) -> tuple[int, int] | None:
+def _one_body(parts: dict[int, ObjectPart], side: float) -> tuple[int, int] | None:
     """Two parts that belong to one body: first those that hold each other, then the firmest that hangs."""
     trees = {n: cKDTree(part.points) for n, part in parts.items()}
     hanging: list[tuple[float, int, int]] = []

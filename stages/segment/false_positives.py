@@ -8,26 +8,26 @@ import torch
 
 from stages.core.geometry.neighbours import knn
 from stages.core.perception.support import Support
-from stages.core.perception.visibility import seen_from
+from stages.core.perception.visibility import summed_view_directions
 from stages.core.scene.gaussians import Gaussians
 from stages.core.scene.scene import Scene
-from stages.segment.rims import LEVEL, MARGIN, SEEN
+from stages.segment.boundary_refinement import BOUNDARY_WIDTH, HEIGHT_RESOLUTION, MIN_VISIBLE_WEIGHT
 
 SHOWS = 0.1  # opacity from which a Gaussian counts
 NEIGHBOURS = 8
 PATTERN = 0.65  # share of a thing that is level with table close by, from which it is a part of the table
 
 
-def without_scraps(scene: Scene, support: Support) -> Gaussians:
+def remove_false_positives(scene: Scene, support: Support) -> Gaussians:
     """The scene's Gaussians, with things given back to the table that lie in it and among it.
 
     A thing that lies on the table is higher than the table seen next to it, or has an inside that is far from any.
     Stripes and threads of a cloth that differ from it in colour, and are an object to grouping, are neither.
     """
-    g, level, margin = scene.gaussians, LEVEL * support.view.radius, MARGIN * support.view.radius
+    g, level, margin = scene.gaussians, HEIGHT_RESOLUTION * support.view.radius, BOUNDARY_WIDTH * support.view.radius
     shown = (g.opacities > SHOWS) & g.means.isfinite().all(1)
     if scene.cameras is not None and len(scene.cameras):
-        shown &= seen_from(g, scene.cameras).norm(dim=1) > SEEN
+        shown &= summed_view_directions(g, scene.cameras).norm(dim=1) > MIN_VISIBLE_WEIGHT
     heights = torch.where(shown, support.heights(torch.where(shown[:, None], g.means, 0.0)), torch.inf)
     bare = shown & (g.object_id == 0) & (heights.abs() < level)
     if int(bare.sum()) < NEIGHBOURS:

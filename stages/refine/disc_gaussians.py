@@ -10,10 +10,10 @@ from stages.core.geometry.harmonics import rgb_to_sh
 from stages.core.geometry.rotations import quaternion
 from stages.core.scene.gaussians import Gaussians
 
-ACROSS, THICK = 0.65, 0.12  # standard deviations of a patch, as a share of the spacing: no holes, little overlap
+DISC_SIGMA, THICK = 0.65, 0.12  # standard deviations of a patch, as a share of the spacing: no holes, little overlap
 
 
-def patches(
+def disc_gaussians(
     points: Float[Tensor, "m 3"],
     normals: Float[Tensor, "m 3"],
     rgb: Float[Tensor, "m 3"],
@@ -27,7 +27,7 @@ def patches(
     helper = torch.eye(3)[normals.abs().argmin(1)] if count else torch.zeros(0, 3)
     u = torch.nn.functional.normalize(torch.linalg.cross(helper, normals), dim=1)
     R = torch.stack([u, torch.linalg.cross(normals, u), normals], -1)
-    scales = spacing * torch.tensor([ACROSS, ACROSS, THICK])
+    scales = spacing * torch.tensor([DISC_SIGMA, DISC_SIGMA, THICK])
     return Gaussians(
         points.float(), quaternion(R) if count else torch.zeros(0, 4), scales.repeat(count, 1).float(),
         torch.full((count,), opacity), rgb_to_sh(rgb.clamp(0, 1)).float(),
@@ -35,6 +35,6 @@ def patches(
     )  # fmt: skip
 
 
-def none_like(g: Gaussians) -> Gaussians:
+def empty_like(g: Gaussians) -> Gaussians:
     """No Gaussians, in the shape of `g`."""
     return g[torch.zeros(len(g), dtype=torch.bool)]

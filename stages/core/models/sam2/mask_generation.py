@@ -12,11 +12,11 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from transformers import Sam2VideoModel
 
-from stages.core.models.sam2.network import INSIDE, side_of
+from stages.core.models.sam2.network import INSIDE, input_side
 
 
 @dataclass(frozen=True)
-class Automatic:
+class MaskGenerationOptions:
     """How many clicks, and what a mask must reach."""
 
     grid: int = 16  # clicks along each side; published is 32, but here several photos are asked about one scene
@@ -27,7 +27,7 @@ class Automatic:
 
 
 @dataclass(frozen=True)
-class Proposals:
+class MaskProposals:
     """Masks that may be objects or parts of them, the surest first."""
 
     masks: Bool[Tensor, "m l l"]
@@ -35,9 +35,9 @@ class Proposals:
 
 
 @torch.no_grad()
-def propose(
-    model: Sam2VideoModel, pixels: Float[Tensor, "3 s s"], options: Automatic = Automatic()  # noqa: B008 -- frozen
-) -> Proposals:
+def propose_masks(
+    model: Sam2VideoModel, pixels: Float[Tensor, "3 s s"], options: Automatic = MaskGenerationOptions()  # noqa: B008 -- frozen
+) -> MaskProposals:
     """Masks of a photo, at a quarter of the network's size; each click gives up to three: a thing, its part, its whole.
 
     Memory is that of `at_once` clicks, and a byte a pixel of each mask that is kept.
@@ -46,7 +46,7 @@ def propose(
     where = model.get_image_wide_positional_embeddings()
     masks, scores = [], []
     for clicks in _grid(options.grid).split(options.at_once):
-        points = clicks[None, :, None].to(model.device) * side_of(model)
+        points = clicks[None, :, None].to(model.device) * input_side(model)
         labels = torch.full(points.shape[:-1], INSIDE, dtype=torch.int32, device=model.device)
         sparse, dense = model.get_prompt_embeddings(points, labels)
         logits, predicted, _, _ = model.mask_decoder(
@@ -54,12 +54,12 @@ def propose(
             dense_prompt_embeddings=dense, multimask_output=True, high_resolution_features=embeddings[:-1],
         )  # fmt: skip
         logits, predicted = logits.flatten(0, 2).float(), predicted.flatten().float()
-        sure = (predicted >= options.iou) & (stability(logits) >= options.stability)
+        sure = (predicted >= options.iou) & (mask_stability(logits) >= options.stability)
         masks.append((logits[sure] > 0).cpu())
         scores.append(predicted[sure].cpu())
     masks, scores = torch.cat(masks), torch.cat(scores)
-    kept = distinct(masks, scores, options.same)
-    return Proposals(masks[kept], scores[kept])
+    kept = suppress_duplicates(masks, scores, options.same)
+    return MaskProposals(masks[kept], scores[kept])
 
 
 def _grid(side: int) -> Float[Tensor, "k 2"]:
@@ -68,13 +68,13 @@ def _grid(side: int) -> Float[Tensor, "k 2"]:
     return torch.stack(torch.meshgrid(middles, middles, indexing="xy"), -1).reshape(-1, 2)
 
 
-def stability(logits: Float[Tensor, "m h w"], offset: float = 1.0) -> Float[Tensor, "m"]:
+def mask_stability(logits: Float[Tensor, "m h w"], offset: float = 1.0) -> Float[Tensor, "m"]:
     """Intersection over union of each mask cut at `offset` above and below its border; 0 for an empty one."""
     inner, outer = (logits > offset).sum((1, 2)), (logits > -offset).sum((1, 2))
     return inner / outer.clamp_min(1)
 
 
-def distinct(masks: Bool[Tensor, "m h w"], scores: Float[Tensor, "m"], same: float) -> Int[Tensor, "k"]:
+def suppress_duplicates(masks: Bool[Tensor, "m h w"], scores: Float[Tensor, "m"], same: float) -> Int[Tensor, "k"]:
     """Non-maximum suppression: indices, best score first, of masks that overlap no better one by more than `same`.
 
     Masks themselves are compared, not the boxes around them, so a ring and what lies in it both stay.

@@ -16,7 +16,7 @@ OUTERMOST = 0.005  # of an object's Gaussians at either end do not count
 
 
 @dataclass(frozen=True)
-class ScaleReference:
+class ObjectScaleReference:
     """A length that was measured: how high an object stands, or its longest side in x, y and z."""
 
     object: int
@@ -37,7 +37,7 @@ class ScaleReference:
         return replace(scene, scale={"metres_per_unit": self.metres / units, "source": source})
 
 
-def parse_scale(text: str) -> ScaleReference | None:
+def parse_object_scale(text: str) -> ObjectScaleReference | None:
     """From the form of the command line; None for an empty text."""
     if not text:
         return None
@@ -49,4 +49,4 @@ def parse_scale(text: str) -> ScaleReference | None:
                          "metres") from error  # fmt: skip
     if not 0 < metres < 1e5:
         raise InputError(f"--scale-reference {text!r}: the length must be more than 0 and less than 100,000 m")
-    return ScaleReference(int(found["object"]), found["side"], metres)
+    return ObjectScaleReference(int(found["object"]), found["side"], metres)

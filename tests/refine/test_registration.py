@@ -9,23 +9,22 @@ from stages.core.geometry.neighbours import BruteForce
 from stages.core.geometry.rotations import matrix
 from stages.lab.assets.shapes import ellipsoid
 from stages.lab.bench.register import RegisterBenchOptions, errors, make_trial
-from stages.refine import register as registration
-from stages.refine import register_cloud
-from stages.refine.register import register
-from stages.refine.register_cloud import Cloud, diameter
-from stages.refine.register_guess import Poses, describe
+from stages.refine import registration, registration_cloud
+from stages.refine.registration import register
+from stages.refine.registration_cloud import RegistrationCloud, diameter
+from stages.refine.registration_hypotheses import PoseHypotheses, local_features
 from tests.conftest import DEVICES
-from tests.refine.things import degrees_between, somewhere, thing
-from tests.segment.tabletop import coloured
+from tests.refine.sample_objects import asymmetric_object, degrees_between, random_similarity
+from tests.segment.tabletop import coloured_gaussians
 
 
 @pytest.fixture(scope="module")
 def whole():
-    return thing()
+    return asymmetric_object()
 
 
 def test_a_moved_copy_is_found_where_it_was_put(whole):
-    truth = somewhere(3)
+    truth = random_similarity(3)
     found = register(replace(whole, means=truth(whole.means)), whole)
     assert degrees_between(found.similarity.rotation, truth.rotation) < 0.3
     assert found.similarity.scale == pytest.approx(truth.scale, rel=3e-3)
@@ -42,7 +41,7 @@ def test_a_noisy_part_is_found_within_the_limits(whole, number):
 
 
 def test_the_way_of_a_gpu_finds_the_same(whole, monkeypatch):
-    monkeypatch.setattr(register_cloud, "POINTS", 1500)  # all products are many for a CPU
+    monkeypatch.setattr(registration_cloud, "TARGET_POINTS", 1500)  # all products are many for a CPU
     given = make_trial(whole, 1, RegisterBenchOptions())
     expected = register(given.part, whole)
     for module in (registration, register_cloud):
@@ -67,13 +66,13 @@ def test_what_lies_on_a_gpu_is_registered_there(whole):
 
 def test_another_thing_fits_less(whole):
     given = make_trial(whole, 0, RegisterBenchOptions())
-    stranger = coloured(ellipsoid((0.3, 0.2, 0.5), 6000), (0.8, 0.7, 0.6), 1)
+    stranger = coloured_gaussians(ellipsoid((0.3, 0.2, 0.5), 6000), (0.8, 0.7, 0.6), 1)
     other = register(given.part, stranger)
     assert other is None or other.fit < register(given.part, whole).fit - 0.15
 
 
 def test_a_plain_ball_is_placed_though_it_may_be_turned_any_way():
-    ball = coloured(ellipsoid((0.5, 0.5, 0.5), 8000), (0.8, 0.2, 0.1), 1)
+    ball = coloured_gaussians(ellipsoid((0.5, 0.5, 0.5), 8000), (0.8, 0.2, 0.1), 1)
     given = make_trial(ball, 1, RegisterBenchOptions())
     found = register(given.part, ball)
     if found is not None:  # no feature stands out, so it may find nothing
@@ -86,19 +85,19 @@ def test_a_handful_of_points_is_not_enough(whole):
 
 
 def test_features_do_not_depend_on_where_and_how_a_cloud_lies(whole):
-    truth = somewhere(1)
-    a, b = Cloud.of(whole), Cloud.of(replace(whole, means=truth(whole.means)))
+    truth = random_similarity(1)
+    a, b = RegistrationCloud.of(whole), RegistrationCloud.of(replace(whole, means=truth(whole.means)))
     nearest = torch.cdist(truth(a.points * a.diameter + a.centre), b.points * b.diameter + b.centre)
     same = nearest.amin(1) < 0.004 * b.diameter
     i, j = torch.nonzero(same)[:50, 0], nearest.argmin(1)[same][:50]
-    own, others = describe(a, i, 1.0), describe(b, torch.randperm(len(b.points))[:50], 1.0)
-    assert (own - describe(b, j, 1.0)).norm(dim=1).median() < 0.3 * (own - others).norm(dim=1).median()
+    own, others = local_features(a, i, 1.0), local_features(b, torch.randperm(len(b.points))[:50], 1.0)
+    assert (own - local_features(b, j, 1.0)).norm(dim=1).median() < 0.3 * (own - others).norm(dim=1).median()
 
 
 def test_poses_are_fitted_exactly():
-    truth = somewhere(5)
+    truth = random_similarity(5)
     a = torch.randn(4, 3, 3)
-    poses = Poses.fitted(a, truth(a))
+    poses = PoseHypotheses.fitted(a, truth(a))
     torch.testing.assert_close(poses.scale, torch.full((4,), truth.scale), rtol=1e-4, atol=0)
     torch.testing.assert_close(poses.rotation, truth.rotation.expand(4, 3, 3), rtol=0, atol=1e-4)
 
@@ -106,7 +105,7 @@ def test_poses_are_fitted_exactly():
 def test_of_poses_that_are_alike_the_first_is_kept():
     turns = matrix(torch.tensor([[1.0, 0, 0, a] for a in (0.0, 0.01, 0.3, 0.0, 0.31)]))  # 0, 1, 33, 0 and 34 degrees
     shift = torch.tensor([[0.0, 0, 0], [0, 0, 0], [0, 0, 0], [0, 0.1, 0], [0, 0, 0]])
-    kept = Poses(torch.arange(5.0), turns, shift).distinct(3, degrees=5.0, far=0.05)
+    kept = PoseHypotheses(torch.arange(5.0), turns, shift).distinct(3, degrees=5.0, far=0.05)
     assert kept.scale.tolist() == [0.0, 2.0, 3.0]
 
 

@@ -14,23 +14,27 @@ from torch import Tensor
 from stages.core.geometry.harmonics import C0
 from stages.core.geometry.neighbours import knn
 from stages.core.geometry.rotations import matrix
-from stages.core.perception.support import Support, tips
+from stages.core.perception.support import Support, topples
 from stages.core.scene.gaussians import Gaussians
 from stages.core.scene.scene import Scene
+from stages.refine.disc_gaussians import disc_gaussians, empty_like
+from stages.refine.observed_space import ObservedSpace
 from stages.refine.options import RefineOptions
-from stages.refine.patches import none_like, patches
-from stages.refine.sight import Sight
 
 LEAST = 16  # Gaussians; fewer have no shape to speak of
 PAD = 3  # empty cells around the object
 
 
-def nothing(scene: Scene, number: int, sight: Sight, support: Support | None, options: RefineOptions) -> Gaussians:
+def no_completion(
+    scene: Scene, number: int, sight: ObservedSpace, support: Support | None, options: RefineOptions
+) -> Gaussians:
     """The completer that completes nothing."""
-    return none_like(scene.gaussians)
+    return empty_like(scene.gaussians)
 
 
-def complete(scene: Scene, number: int, sight: Sight, support: Support | None, options: RefineOptions) -> Gaussians:
+def complete(
+    scene: Scene, number: int, sight: ObservedSpace, support: Support | None, options: RefineOptions
+) -> Gaussians:
     """Flat Gaussians on the unseen sides and the bottom of an object, in the colours of what is seen next to them.
 
     The object's body is what lies in its convex hull (down to the plane it stands on), is not seen through by
@@ -38,20 +42,20 @@ def complete(scene: Scene, number: int, sight: Sight, support: Support | None, o
     """
     g = scene.gaussians
     own = g[(g.object_id == number) & (g.opacities > 0.05) & g.means.isfinite().all(1) & g.scales.isfinite().all(1)]
-    grid = Grid.around(own, support, options.resolution) if len(own) >= LEAST else None
+    grid = ObjectVoxels.around(own, support, options.resolution) if len(own) >= LEAST else None
     if grid is None:
-        return none_like(g)
+        return empty_like(g)
     body = _body(grid, own, g, number, sight, support)
     points, normals = _open_surface(grid, body, own)
     if support is not None and len(points):  # nothing below the table
         points[:, 2] = torch.maximum(points[:, 2], support.surface(points))
     if not len(points):
-        return none_like(g)
-    return patches(points, normals, _diffused(points, own, grid.cell), grid.cell, number)
+        return empty_like(g)
+    return disc_gaussians(points, normals, _diffused(points, own, grid.cell), grid.cell, number)
 
 
 @dataclass(frozen=True)
-class Grid:
+class ObjectVoxels:
     """Cells over an object."""
 
     low: Float[Tensor, "3"]  # corner of the first cell
@@ -59,7 +63,7 @@ class Grid:
     shape: tuple[int, int, int]
 
     @staticmethod
-    def around(own: Gaussians, support: Support | None, resolution: int) -> Grid | None:
+    def around(own: Gaussians, support: Support | None, resolution: int) -> ObjectVoxels | None:
         """None where the object has no extent."""
         low, high = own.means.amin(0), own.means.amax(0)
         if support is not None:
@@ -70,7 +74,7 @@ class Grid:
         spacing = float(knn(own.means, own.means[:: max(1, len(own) // 5000)], 4)[0][:, -1].median())
         cell = min(max(longest / resolution, 1.2 * spacing), longest / 6)
         shape = ((high - low) / cell).ceil().long() + 1 + 2 * PAD
-        return Grid(low - PAD * cell, cell, tuple(shape.tolist()))
+        return ObjectVoxels(low - PAD * cell, cell, tuple(shape.tolist()))
 
     def cells_of(self, points: Float[Tensor, "n 3"]) -> np.ndarray:
         """Whether each cell holds a point."""
@@ -92,7 +96,12 @@ def _spread(g: Gaussians, most: float) -> Float[Tensor, "m 3"]:
 
 
 def _body(
-    grid: Grid, own: Gaussians, everything: Gaussians, number: int, sight: Sight, support: Support | None
+    grid: ObjectVoxels,
+    own: Gaussians,
+    everything: Gaussians,
+    number: int,
+    sight: ObservedSpace,
+    support: Support | None,
 ) -> np.ndarray:
     """Cells that are the object, seen or not."""
     occupied = grid.cells_of(_spread(own, 2 * grid.cell))
@@ -139,7 +148,7 @@ def _standing(own: Gaussians, support: Support | None) -> np.ndarray:
         h = support.heights(points)
         low = h < max(3 * support.tolerance, 0.15 * float(h.max()))
         if float(h.min()) < 3 * support.tolerance:
-            foot = points if tips(points[:, :2], points[low, :2]) else points[low]
+            foot = points if topples(points[:, :2], points[low, :2]) else points[low]
             points = torch.cat([points, torch.cat([foot[:, :2], support.surface(foot)[:, None]], 1)])
     return points.double().numpy()
 
@@ -163,7 +172,7 @@ def _foot(occupied: np.ndarray, inside: np.ndarray) -> np.ndarray:
     return under & inside
 
 
-def _open_surface(grid: Grid, body: np.ndarray, own: Gaussians) -> tuple[Tensor, Tensor]:
+def _open_surface(grid: ObjectVoxels, body: np.ndarray, own: Gaussians) -> tuple[Tensor, Tensor]:
     """Points and outward normals on the body's surface where the object has no Gaussians yet."""
     soft = ndimage.gaussian_filter(body.astype(np.float32), 1.0)
     skin = body & ~ndimage.binary_erosion(body)

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from stages.core.geometry.cameras import depths, project
-from stages.core.perception.visibility import small
+from stages.core.perception.visibility import downscaled_views
 from stages.core.raster.rasterise import rasterise, visibility
 from stages.core.scene.gaussians import Gaussians, concatenate
 from stages.core.scene.scene import Scene
@@ -20,7 +20,7 @@ FAR = 1e9
 
 
 @dataclass(frozen=True)
-class Sight:
+class ObservedSpace:
     """Views with the depth of the nearest surface in each pixel: FAR where nothing is, 0 where it is not known."""
 
     views: list[tuple[Tensor, Tensor, int, int]]  # viewmat, K, width, height
@@ -29,11 +29,11 @@ class Sight:
 
     @staticmethod
     @torch.no_grad()
-    def of(scene: Scene) -> Sight:
+    def of(scene: Scene) -> ObservedSpace:
         """Depths drawn from the scene itself; each pixel takes the least of its neighbours, to be careful."""
         if scene.cameras is None or not len(scene.cameras):
-            return Sight([], [], torch.zeros(0))
-        views, maps = small(scene.cameras), []
+            return ObservedSpace([], [], torch.zeros(0))
+        views, maps = downscaled_views(scene.cameras), []
         weight = torch.zeros(len(scene.gaussians))
         for viewmat, K, width, height in views:
             drawn = rasterise(scene.gaussians, viewmat[None], K[None], width, height)
@@ -41,7 +41,7 @@ class Sight:
             depth = torch.where(drawn.alpha[0] < 0.05, FAR, depth)
             maps.append(-torch.nn.functional.max_pool2d(-depth[None], 3, 1, 1)[0])
             weight = torch.maximum(weight, visibility(scene.gaussians, viewmat, K, width, height)[1])
-        return Sight(views, maps, weight)
+        return ObservedSpace(views, maps, weight)
 
     def empty(self, points: Float[Tensor, "n 3"], margin: float) -> Bool[Tensor, "n"]:
         """Points that a camera sees more than `margin` in front of the surface behind them.
@@ -86,12 +86,12 @@ class Sight:
 
 
 @torch.no_grad()
-def agreement(before: Scene, after: Scene, most: int = 4) -> float | None:
+def object_psnr(before: Scene, after: Scene, most: int = 4) -> float | None:
     """PSNR [dB] between two states of a scene in the pixels where the objects are, over a few of its cameras."""
     if before.cameras is None or not len(before.cameras):
         return None
     error = count = 0.0
-    for viewmat, K, width, height in small(before.cameras, most):
+    for viewmat, K, width, height in downscaled_views(before.cameras, most):
         one, two = (rasterise(s.gaussians, viewmat[None], K[None], width, height).rgb[0] for s in (before, after))
         index, _ = visibility(before.gaussians, viewmat, K, width, height)
         on = (index >= 0) & (before.gaussians.object_id[index.clamp_min(0)] > 0)

@@ -16,21 +16,21 @@ from stages.core.errors import InputError
 from stages.core.geometry.cameras import centres, depths, intrinsics, look_at, project, resize
 from stages.core.geometry.similarity import Similarity
 from stages.core.models.diffsplat.maps import FOCAL, RADIUS, cameras
-from stages.core.perception.visibility import SIDE as SMALL
+from stages.core.perception.visibility import MAX_VISIBILITY_SIDE as SMALL
 from stages.core.raster.rasterise import rasterise, rasterise_features, visibility
 from stages.core.scene.gaussians import Gaussians
 from stages.core.scene.images import list_photos, read_image
 from stages.core.scene.scene import Scene
 
-FILLS = 0.8  # share of the side that the object's longer side takes, as in the public code
-LEARNED = (-5.0, 30.0)  # elevations that DiffSplat was trained from [degrees]
+CROP_FILL = 0.8  # share of the side that the object's longer side takes, as in the public code
+TRAINED_ELEVATIONS = (-5.0, 30.0)  # elevations that DiffSplat was trained from [degrees]
 STEEP = 75.0  # elevation beyond which a camera has no upright any more [degrees]
 AS_GOOD = 0.5  # of the most that any camera sees; among those the elevation decides
 FINE = 3  # pixels drawn for one of the portrait, each way
 
 
 @dataclass(frozen=True)
-class Portrait:
+class ObjectCrop:
     """What was seen from where."""
 
     image: Float[Tensor, "s s 3"]
@@ -39,7 +39,7 @@ class Portrait:
     name: str  # of the photo
 
 
-def portrait(scene: Scene, own: Gaussians, side: int, photos: Path | None = None) -> Portrait | None:
+def crop_object(scene: Scene, own: Gaussians, side: int, photos: Path | None = None) -> ObjectCrop | None:
     """An object, `own`, in the photo that shows it best; without `photos` drawn from the Gaussians. None: unseen.
 
     A camera in the photo's place is turned to the object, and its lens chosen so that the object fills it. So the
@@ -60,7 +60,7 @@ def portrait(scene: Scene, own: Gaussians, side: int, photos: Path | None = None
     elevation = _elevation(eye, middle)
     scale = float((eye - middle).norm()) * FOCAL * side / float(K[0, 0]) / RADIUS
     place = Similarity(scale, viewmat[:3, :3].mT @ cameras(elevation)[0, :3, :3], middle)
-    return Portrait(picture * alone + 1 - alone, elevation, place, scene.cameras.names[view])
+    return ObjectCrop(picture * alone + 1 - alone, elevation, place, scene.cameras.names[view])
 
 
 def _files(photos: Path, scene: Scene) -> dict[int, Path]:
@@ -88,7 +88,7 @@ def _best(scene: Scene, own: Gaussians, files: dict[int, Path] | None) -> int | 
         whole = ((inside >= 0) & (inside <= 1)).all(1) & (depths(own.means, viewmat) > 0)
         weight = visibility(scene.gaussians, viewmat, K, w, h)[1][scene.gaussians.object_id == own.object_id[0]]
         worth[i] = float(weight.sum()) * float(whole.float().mean()) ** 2
-        tilt[i] = max(LEARNED[0] - elevation, elevation - LEARNED[1], 0.0)
+        tilt[i] = max(TRAINED_ELEVATIONS[0] - elevation, elevation - TRAINED_ELEVATIONS[1], 0.0)
     top = max(worth.values(), default=0.0)
     good = [i for i, value in worth.items() if value > 0 and value >= AS_GOOD * top]
     return min(good, key=lambda i: (tilt[i], -worth[i]), default=None)
@@ -114,7 +114,7 @@ def _aimed(scene: Scene, own: Gaussians, view: int, side: int) -> tuple[Tensor, 
         ray = torch.cat([((low + high) / 2 - side / 2) / K[0, 0], torch.ones(1)])
         near, far = torch.quantile(depths(own.means, viewmat), torch.tensor([0.02, 0.98]))
         middle = eye + (near + far) / 2 * ray @ viewmat[:3, :3]
-    return look_at(eye, middle), intrinsics(side, side, float(K[0, 0] * FILLS * side / (high - low).max())), middle
+    return look_at(eye, middle), intrinsics(side, side, float(K[0, 0] * CROP_FILL * side / (high - low).max())), middle
 
 
 def _mask(

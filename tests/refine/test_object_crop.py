@@ -15,10 +15,10 @@ from stages.core.raster.rasterise import rasterise
 from stages.core.scene.cameras import Cameras
 from stages.core.scene.images import write_png
 from stages.core.scene.scene import Scene, SceneObject
-from stages.refine.library import solid, transformed
-from stages.refine.portrait import FILLS, portrait
-from tests.refine.things import thing
-from tests.segment.tabletop import scene_of, table
+from stages.refine.library import opaque_gaussians, transformed
+from stages.refine.object_crop import CROP_FILL, crop_object
+from tests.refine.sample_objects import asymmetric_object
+from tests.segment.tabletop import scene_of, table_gaussians
 
 SIDE = 96
 PLACE = Similarity(0.3, matrix(torch.tensor([0.9, 0.0, 0.0, 0.4])), torch.tensor([0.08, -0.05, 0.04]))
@@ -32,7 +32,7 @@ def scene() -> Scene:
     K = intrinsics(320, 240, 340.0)
     many = Cameras(torch.cat([viewmats, steep]), K.expand(7, 3, 3).clone(), torch.tensor([[320, 240]] * 7),
                    tuple(f"{i}.jpg" for i in range(7)))  # fmt: skip
-    made = scene_of(table(0.02), transformed(thing(0.02), PLACE))
+    made = scene_of(table_gaussians(0.02), transformed(asymmetric_object(0.02), PLACE))
     return replace(made, objects=(SceneObject(1, "thing"),), cameras=many)
 
 
@@ -48,7 +48,7 @@ def photos(scene, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def shown(scene, photos):
-    return portrait(scene, solid(scene, 1), SIDE, photos)
+    return crop_object(scene, opaque_gaussians(scene, 1), SIDE, photos)
 
 
 def outline(image) -> tuple[float, float, float, float]:
@@ -58,7 +58,7 @@ def outline(image) -> tuple[float, float, float, float]:
 
 def test_it_is_alone_centred_and_fills_four_fifths(shown):
     left, top, right, bottom = outline(shown.image)
-    assert max(right - left, bottom - top) == pytest.approx(FILLS * SIDE, abs=3)
+    assert max(right - left, bottom - top) == pytest.approx(CROP_FILL * SIDE, abs=3)
     assert (left + right) / 2 == pytest.approx(SIDE / 2, abs=2) and (top + bottom) / 2 == pytest.approx(SIDE / 2, abs=2)
     assert bool((shown.image[[0, 0, -1, -1], [0, -1, 0, -1]] == 1).all())
 
@@ -78,7 +78,7 @@ def test_a_turned_photo_is_what_a_turned_camera_sees(scene, shown):
 
 
 def test_without_photos_it_is_drawn_from_the_gaussians(scene, shown):
-    drawn = portrait(scene, solid(scene, 1), SIDE)
+    drawn = crop_object(scene, opaque_gaussians(scene, 1), SIDE)
     assert -10 * math.log10((drawn.image - shown.image).square().mean()) > 25
     assert drawn.elevation == pytest.approx(shown.elevation)
 
@@ -101,13 +101,13 @@ def test_the_camera_far_above_is_not_asked_and_the_one_that_sees_it_whole_is(sce
     cut = scene.cameras.viewmats.clone()
     others = [i for i in range(6) if i != 2]
     cut[others, 0, 3] += 0.55  # now at the edge of all pictures but one
-    off, own = replace(scene, cameras=replace(scene.cameras, viewmats=cut)), solid(scene, 1)
-    assert portrait(off, own, SIDE, photos).name == "2.jpg"
+    off, own = replace(scene, cameras=replace(scene.cameras, viewmats=cut)), opaque_gaussians(scene, 1)
+    assert crop_object(off, own, SIDE, photos).name == "2.jpg"
     for few in (scene.cameras[[6]], None):
-        assert portrait(replace(scene, cameras=few), own, SIDE) is None
+        assert crop_object(replace(scene, cameras=few), own, SIDE) is None
 
 
 def test_photos_of_something_else_are_refused(scene, tmp_path):
     write_png(tmp_path / "other.png", torch.zeros(4, 4, 3))
     with pytest.raises(InputError, match="holds no photo of the scene, such as 0.jpg"):
-        portrait(scene, solid(scene, 1), SIDE, tmp_path)
+        crop_object(scene, opaque_gaussians(scene, 1), SIDE, tmp_path)

@@ -17,13 +17,13 @@ from stages.core.geometry.neighbours import BruteForce, KDTree, neighbour_index
 from stages.core.geometry.rotations import matrix, nearest_rotation
 from stages.core.geometry.similarity import Similarity
 from stages.core.scene.gaussians import Gaussians
-from stages.refine.register_cloud import COLOUR, REACH, Cloud
-from stages.refine.register_guess import Poses, guesses, misfit
+from stages.refine.registration_cloud import COLOUR_WEIGHT, SMOOTHING_RADIUS, RegistrationCloud
+from stages.refine.registration_hypotheses import PoseHypotheses, misfit, pose_hypotheses
 
-LEAST = 100  # points of a part, or there is nothing to go by
+MIN_REGISTRATION_POINTS = 100  # points of a part, or there is nothing to go by
 PLANE = 0.7  # weight of the distance along the normal; along the surface it is the rest, or plain parts would hold all
 AROUND = 300  # poses tried around one that was given
-RELIT = 15 * COLOUR  # most that light may shift a colour; more is another colour
+RELIT = 15 * COLOUR_WEIGHT  # most that light may shift a colour; more is another colour
 
 
 @dataclass(frozen=True)
@@ -34,71 +34,79 @@ class Registration:
     fit: float  # 1: every point of the part is on the whole, in place and colour; 0: none within 6 % of the diameter
 
 
-def register(
-    part: Gaussians, whole: Gaussians, seed: int = 0, hint: Similarity | None = None
-) -> Registration | None:
+def register(part: Gaussians, whole: Gaussians, seed: int = 0, hint: Similarity | None = None) -> Registration | None:
     """Put `whole` where `part` is, perhaps near a `hint`; nothing when no three features agree and none was given."""
-    return register_clouds(Cloud.of(part, seed), Cloud.of(whole, seed), seed, hint)
+    return register_clouds(RegistrationCloud.of(part, seed), RegistrationCloud.of(whole, seed), seed, hint)
 
 
-def register_clouds(part: Cloud, whole: Cloud, seed: int = 0, hint: Similarity | None = None) -> Registration | None:
+def register_clouds(
+    part: RegistrationCloud, whole: RegistrationCloud, seed: int = 0, hint: Similarity | None = None
+) -> Registration | None:
     """As `register`, for clouds made before."""
-    rough = approach(part, whole, seed, hint)
-    return settle(rough, part, whole, seed) if len(rough) else None
+    rough = coarse_registration(part, whole, seed, hint)
+    return fine_registration(rough, part, whole, seed) if len(rough) else None
 
 
-def approach(part: Cloud, whole: Cloud, seed: int = 0, hint: Similarity | None = None) -> Poses:
+def coarse_registration(
+    part: RegistrationCloud, whole: RegistrationCloud, seed: int = 0, hint: Similarity | None = None
+) -> PoseHypotheses:
     """The few most promising poses, the best first, about 3 degrees off; none where no features agree.
 
     With a `hint`, whole to part, those tried are the ones around it too.
     """
-    if min(len(part.points), len(whole.points)) < LEAST:
-        return Poses(torch.zeros(0), torch.zeros(0, 3, 3), torch.zeros(0, 3))
-    poses = guesses(part, whole, seed)
+    if min(len(part.points), len(whole.points)) < MIN_REGISTRATION_POINTS:
+        return PoseHypotheses(torch.zeros(0), torch.zeros(0, 3, 3), torch.zeros(0, 3))
+    poses = pose_hypotheses(part, whole, seed)
     if hint is not None:
-        poses = Poses.joined(in_clouds(hint, part, whole).shaken(AROUND, seed), poses)
+        poses = PoseHypotheses.joined(to_normalised_frames(hint, part, whole).shaken(AROUND, seed), poses)
     if not len(poses):
         return poses
     tree, order = whole.tree(), _order(part, seed)
     poses = _best(poses, part, tree, order[:60], 200)
     poses = _best(poses, part, tree, order[:300], 200).distinct(12, 8.0, 0.05)
-    poses = polish(poses, part, order[:300], whole, tree, 10, 0.03)
+    poses = gauss_newton(poses, part, order[:300], whole, tree, 10, 0.03)
     return _best(poses, part, tree, order[:1000], 12).distinct(2, 4.0, 0.02)
 
 
-def settle(poses: Poses, part: Cloud, whole: Cloud, seed: int = 0) -> Registration:
+def fine_registration(
+    poses: PoseHypotheses, part: RegistrationCloud, whole: RegistrationCloud, seed: int = 0
+) -> Registration:
     """The best of rough poses and some around them, as exact as the part allows."""
     order, size = _order(part, seed), float(poses.scale[0])
     noise, tint = _difference(poses[:1], part, whole)
-    noisy = whole.as_seen(size * noise, tint, REACH * size, seed)
+    noisy = whole.as_seen(size * noise, tint, SMOOTHING_RADIUS * size, seed)
     tree = noisy.tree()
-    poses = polish(poses.shaken(5, seed), part, order[:700], noisy, tree, 10, 0.03)
+    poses = gauss_newton(poses.shaken(5, seed), part, order[:700], noisy, tree, 10, 0.03)
     poses = _best(poses, part, tree, order, 1)
     for _ in range(3):  # what is polished is not quite what is judged, so the way there may have been better
-        poses = Poses.joined(poses, polish(poses[-1:], part, order[:2500], noisy, tree, 7, 0.02))
+        poses = PoseHypotheses.joined(poses, gauss_newton(poses[-1:], part, order[:2500], noisy, tree, 7, 0.02))
     poses = _best(poses, part, tree, order, 1)
     fit = 1 - float(misfit(poses, part.points, part.colours, tree))
     return Registration(_in_the_scene(poses, part, whole), fit)
 
 
-def rough_fit(poses: Poses, part: Cloud, whole: Cloud) -> float:
+def coarse_fit(poses: PoseHypotheses, part: RegistrationCloud, whole: RegistrationCloud) -> float:
     """Fit of the first of rough poses; 0 without any."""
     return 1 - float(misfit(poses[:1], part.points, part.colours, whole.tree())) if len(poses) else 0.0
 
 
-def _order(part: Cloud, seed: int) -> Int[Tensor, "n"]:
+def _order(part: RegistrationCloud, seed: int) -> Int[Tensor, "n"]:
     """The part's points shuffled, so that the first few are anywhere."""
     order = torch.randperm(len(part.points), generator=torch.Generator().manual_seed(seed))
     return order.to(part.points.device)
 
 
-def _best(poses: Poses, part: Cloud, tree: KDTree | BruteForce, some: Int[Tensor, "k"], most: int) -> Poses:
+def _best(
+    poses: PoseHypotheses, part: RegistrationCloud, tree: KDTree | BruteForce, some: Int[Tensor, "k"], most: int
+) -> PoseHypotheses:
     """The `most` that fit best, in order, judged by `some` points."""
     worth = misfit(poses, part.points[some], part.colours[some], tree)
     return poses[worth.topk(min(most, len(poses)), largest=False).indices]
 
 
-def _difference(pose: Poses, part: Cloud, whole: Cloud) -> tuple[float, Float[Tensor, "3"]]:
+def _difference(
+    pose: PoseHypotheses, part: RegistrationCloud, whole: RegistrationCloud
+) -> tuple[float, Float[Tensor, "3"]]:
     """Of a part from its whole: standard deviation off the surface [diameters of the part], and median colour.
 
     Noise makes a thin thing thicker and its rim wider; a whole as noisy as the part is wider by as much. And the part
@@ -111,10 +119,15 @@ def _difference(pose: Poses, part: Cloud, whole: Cloud) -> tuple[float, Float[Te
     return 1.4826 * float(off.abs().median()) / float(pose.scale[0]), tint.clamp(-RELIT, RELIT)
 
 
-def polish(
-    poses: Poses, part: Cloud, some: Int[Tensor, "k"], whole: Cloud, tree: KDTree | BruteForce, rounds: int,
+def gauss_newton(
+    poses: PoseHypotheses,
+    part: RegistrationCloud,
+    some: Int[Tensor, "k"],
+    whole: RegistrationCloud,
+    tree: KDTree | BruteForce,
+    rounds: int,
     floor: float,
-) -> Poses:
+) -> PoseHypotheses:
     """Gauss-Newton on the robust one-sided coloured Chamfer distance, all poses at once.
 
     Nearest neighbours are taken in place and colour; their distance counts mostly along the normal (Chen and Medioni
@@ -123,7 +136,7 @@ def polish(
     """
     x, colours = part.points[some].double(), part.colours[some].double()
     targets, normals = whole.points.double(), whole.normals.double()
-    poses = Poses(poses.scale.double(), poses.rotation.double(), poses.translation.double())
+    poses = PoseHypotheses(poses.scale.double(), poses.rotation.double(), poses.translation.double())
     for _ in range(rounds):
         y = poses(x)
         distance, index = (found[..., 0] for found in tree.query(torch.cat([y, colours.expand_as(y)], 2)))
@@ -132,7 +145,7 @@ def polish(
         poses = _moved(poses, y.mean(1), step)
         if float(step.abs().max()) < 2e-5:
             break
-    return Poses(poses.scale.float(), nearest_rotation(poses.rotation).float(), poses.translation.float())
+    return PoseHypotheses(poses.scale.float(), nearest_rotation(poses.rotation).float(), poses.translation.float())
 
 
 def _step(
@@ -151,25 +164,25 @@ def _step(
     return -torch.linalg.solve(H + damping[:, None, None] * torch.eye(7).to(y), slope).clamp(-0.5, 0.5)
 
 
-def _moved(poses: Poses, about: Float[Tensor, "h 3"], step: Float[Tensor, "h 7"]) -> Poses:
+def _moved(poses: PoseHypotheses, about: Float[Tensor, "h 3"], step: Float[Tensor, "h 7"]) -> PoseHypotheses:
     """Poses after a step of Gauss-Newton."""
     angle = step[:, :3].norm(dim=1, keepdim=True).clamp_min(1e-12)
     turn = matrix(torch.cat([(angle / 2).cos(), step[:, :3] / angle * (angle / 2).sin()], 1))
     grown = step[:, 6].exp()
     arm = (turn @ (poses.translation - about)[..., None])[..., 0]
-    return Poses(poses.scale * grown, turn @ poses.rotation, grown[:, None] * arm + about + step[:, 3:6])
+    return PoseHypotheses(poses.scale * grown, turn @ poses.rotation, grown[:, None] * arm + about + step[:, 3:6])
 
 
-def in_clouds(place: Similarity, part: Cloud, whole: Cloud) -> Poses:
+def to_normalised_frames(place: Similarity, part: RegistrationCloud, whole: RegistrationCloud) -> PoseHypotheses:
     """Part to whole in normalised frames, from whole to part in the units of the scene."""
     place = place.to(part.centre.device)
     R = place.rotation.mT
     scale = part.diameter / (place.scale * whole.diameter)
     middle = (R @ (part.centre - place.translation) / place.scale - whole.centre) / whole.diameter
-    return Poses(torch.tensor([scale]).to(R), R[None], middle[None])
+    return PoseHypotheses(torch.tensor([scale]).to(R), R[None], middle[None])
 
 
-def _in_the_scene(pose: Poses, part: Cloud, whole: Cloud) -> Similarity:
+def _in_the_scene(pose: PoseHypotheses, part: RegistrationCloud, whole: RegistrationCloud) -> Similarity:
     """Whole to part in the units of the scene, from part to whole in normalised frames."""
     scale, R = float(pose.scale[0]), pose.rotation[0].mT
     grown = part.diameter / (scale * whole.diameter)

@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from stages.core.perception.support import find_support
-from stages.core.perception.visibility import seen_from
-from stages.segment.rims import SEEN, redrawn
-from tests.segment.tabletop import block, scene_of, table, three_apart
+from stages.core.perception.visibility import summed_view_directions
+from stages.segment.boundary_refinement import MIN_VISIBLE_WEIGHT, refine_boundaries
+from tests.segment.tabletop import block, scene_of, table_gaussians, three_apart
 
 
 def relabelled(scene, ids):
@@ -16,7 +16,7 @@ def relabelled(scene, ids):
 
 
 def shown(scene):
-    return seen_from(scene.gaussians, scene.cameras).norm(dim=1) > SEEN
+    return summed_view_directions(scene.gaussians, scene.cameras).norm(dim=1) > MIN_VISIBLE_WEIGHT
 
 
 def iou(a, b):
@@ -39,7 +39,7 @@ def skirted(scene, width):
 
 def test_a_skirt_of_table_goes_back_to_the_table(truth):
     wrong, true = skirted(truth, 0.02), truth.gaussians.object_id
-    found = redrawn(relabelled(truth, wrong), find_support(truth)).object_id
+    found = refine_boundaries(relabelled(truth, wrong), find_support(truth)).object_id
     seen = shown(truth)
     taken = (wrong > 0) & (true == 0) & seen  # some of it is under an object, where no photo shows it
     assert taken.sum() > 200 and (found[taken] == 0).float().mean() > 0.99
@@ -50,39 +50,39 @@ def test_a_rim_that_the_table_has_goes_back_to_the_object(truth):
     true, ids = truth.gaussians.object_id, truth.gaussians.object_id.clone()
     ids[(true == 1) & (truth.gaussians.means[:, 2] < 0.012)] = 0
     lost = (ids == 0) & (true == 1) & shown(truth)
-    found = redrawn(relabelled(truth, ids), find_support(truth)).object_id
+    found = refine_boundaries(relabelled(truth, ids), find_support(truth)).object_id
     assert lost.sum() > 50 and (found[lost] == 1).float().mean() > 0.9
 
 
 def test_a_skirt_over_a_patch_of_another_colour_goes_back_too():
-    patch = table()
+    patch = table_gaussians()
     stained = (patch.means[:, 0] > 0.05) & (patch.means[:, 1].abs() < 0.12)
     patch.sh[stained, 0] -= 0.8  # dark, and reaching from the block to where the table is sure
     scene = scene_of(patch, block((0.0, 0.0), (0.1, 0.1, 0.08), (0.8, 0.1, 0.1), 1), noise=0.0005)
     true = scene.gaussians.object_id
     ids = torch.where((true == 0) & (scene.gaussians.means[:, 0] - 0.1).abs().lt(0.06)
                       & (scene.gaussians.means[:, 1].abs() < 0.05), 1, true)  # fmt: skip
-    found = redrawn(relabelled(scene, ids), find_support(scene)).object_id
+    found = refine_boundaries(relabelled(scene, ids), find_support(scene)).object_id
     assert (ids != true).sum() > 40 and iou(found == 1, true == 1) > 0.97
 
 
 def test_true_labels_stay_and_so_does_what_no_photo_shows(truth):
     support = find_support(truth)
-    found = redrawn(truth, support).object_id
+    found = refine_boundaries(truth, support).object_id
     assert (found == truth.gaussians.object_id).float().mean() > 0.998
     below = truth.gaussians.means.clone()
     buried = torch.nonzero(truth.gaussians.object_id == 1)[:5, 0]
     below[buried] = torch.tensor([0.3, 0.3, -0.05])  # under the table, that hides it
     hidden = replace(truth, gaussians=replace(truth.gaussians, means=below))
-    assert (redrawn(hidden, support).object_id[buried] == 1).all()
+    assert (refine_boundaries(hidden, support).object_id[buried] == 1).all()
     blind = relabelled(replace(truth, cameras=None), skirted(truth, 0.02))
-    assert torch.equal(redrawn(blind, support).object_id, blind.gaussians.object_id)
+    assert torch.equal(refine_boundaries(blind, support).object_id, blind.gaussians.object_id)
 
 
 def test_nothing_goes_from_one_object_to_another():
     scene = scene_of(
-        table(), block((-0.05, 0.0), (0.1, 0.1, 0.08), (0.8, 0.1, 0.1), 1),
+        table_gaussians(), block((-0.05, 0.0), (0.1, 0.1, 0.08), (0.8, 0.1, 0.1), 1),
         block((0.055, 0.0), (0.1, 0.1, 0.08), (0.8, 0.15, 0.1), 2),
     )  # fmt: skip
-    found, true = redrawn(scene, find_support(scene)).object_id, scene.gaussians.object_id
+    found, true = refine_boundaries(scene, find_support(scene)).object_id, scene.gaussians.object_id
     assert not ((found > 0) & (true > 0) & (found != true)).any()

@@ -4,30 +4,30 @@ import torch
 
 from stages.core.perception.support import find_support
 from stages.lab.assets.shapes import box, ellipsoid
-from stages.segment.bodies import joined
-from tests.segment.tabletop import coloured, scene_of, table
+from stages.segment.body_merging import merge_bodies
+from tests.segment.tabletop import coloured_gaussians, scene_of, table_gaussians
 
 
 def brick(low: tuple, high: tuple, object_id: int):
     sides = tuple(b - a for a, b in zip(low, high, strict=True))
     middle = tuple((a + b) / 2 for a, b in zip(low, high, strict=True))
-    return coloured(box(sides, 0.007).moved(middle), (0.5, 0.5, 0.5), object_id)
+    return coloured_gaussians(box(sides, 0.007).moved(middle), (0.5, 0.5, 0.5), object_id)
 
 
 def ball(centre: tuple, radius: float, object_id: int):
-    return coloured(ellipsoid((radius,) * 3, 1500).moved(centre), (0.5, 0.5, 0.5), object_id)
+    return coloured_gaussians(ellipsoid((radius,) * 3, 1500).moved(centre), (0.5, 0.5, 0.5), object_id)
 
 
 def bodies(*parts) -> set[frozenset[int]]:
     """Objects by the numbers of the parts that they are made of."""
-    scene = scene_of(table(), *parts)
-    parts, ids = scene.gaussians.object_id, joined(scene.gaussians, find_support(scene)).object_id
+    scene = scene_of(table_gaussians(), *parts)
+    parts, ids = scene.gaussians.object_id, merge_bodies(scene.gaussians, find_support(scene)).object_id
     mine = {n: int(ids[parts == n].unique()) for n in parts.unique().tolist()}
     return {frozenset(n for n in mine if mine[n] == k) for k in set(mine.values())} - {frozenset({0})}
 
 
 def test_arms_around_a_belly_are_one_body_with_it():
-    belly = coloured(ellipsoid((0.06, 0.06, 0.1), 2500).moved((0.0, 0.0, 0.1)), (0.5, 0.5, 0.5), 1)
+    belly = coloured_gaussians(ellipsoid((0.06, 0.06, 0.1), 2500).moved((0.0, 0.0, 0.1)), (0.5, 0.5, 0.5), 1)
     sides = [brick((-0.065, y, 0.07), (0.065, y + 0.02, 0.11), 2) for y in (-0.065, 0.045)]
     front = [brick((x, -0.045, 0.07), (x + 0.02, 0.045, 0.11), 2) for x in (-0.065, 0.045)]
     legs = [brick((0.045, y, 0.0), (0.065, y + 0.02, 0.07), 2) for y in (-0.065, 0.045)]  # they stand by themselves
@@ -56,6 +56,6 @@ def test_what_lies_on_a_thing_is_another_and_what_hangs_from_it_is_not():
 
 
 def test_gaussians_without_a_place_keep_their_number():
-    scene = scene_of(table(), brick((-0.1, -0.05, 0.0), (0.0, 0.05, 0.1), 1))
+    scene = scene_of(table_gaussians(), brick((-0.1, -0.05, 0.0), (0.0, 0.05, 0.1), 1))
     scene.gaussians.means[-3:] = torch.nan
-    assert torch.equal(joined(scene.gaussians, find_support(scene)).object_id, scene.gaussians.object_id)
+    assert torch.equal(merge_bodies(scene.gaussians, find_support(scene)).object_id, scene.gaussians.object_id)

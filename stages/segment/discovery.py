@@ -8,12 +8,12 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from stages.core.models.sam2.automatic import propose
-from stages.core.perception.support import Support, view_of
+from stages.core.models.sam2.mask_generation import propose_masks
+from stages.core.perception.support import Support, view_extent
 from stages.core.scene.scene import Scene
 from stages.segment.options import SegmentOptions
-from stages.segment.propagate import Tracker, resized
-from stages.segment.vote import Sight
+from stages.segment.propagation import MaskTracker, resize_logits
+from stages.segment.voting import ViewFootprint
 
 log = logging.getLogger(__name__)
 LOOKS = 4  # pictures, evenly spread, that are searched for objects: what hides in one shows in another
@@ -23,7 +23,9 @@ HIGH = 0.4  # what hangs higher above the table than this is no thing on it [vie
 LARGE = 1.2  # longest side of a thing [view radii]
 
 
-def discover(tracker: Tracker, support: Support | None, options: SegmentOptions) -> dict[int, Int[Tensor, "h w"]]:
+def discover_objects(
+    tracker: MaskTracker, support: Support | None, options: SegmentOptions
+) -> dict[int, Int[Tensor, "h w"]]:
     """Label images of all views, by camera: 0 background, 1... the objects, at most `options.max_objects`.
 
     Each of a few pictures is searched in turn; what is new there is followed through all pictures. It is an object
@@ -35,13 +37,13 @@ def discover(tracker: Tracker, support: Support | None, options: SegmentOptions)
         view = tracker.shown.views[row]
         masks = _objects_in(tracker, row, support, options)
         if view in found and len(masks):
-            known = resized((found[view] > 0)[None], masks.shape[2], masks.shape[1])[0] > 0.5
+            known = resize_logits((found[view] > 0)[None], masks.shape[2], masks.shape[1])[0] > 0.5
             masks = masks[(masks & known).sum((1, 2)) < KNOWN * masks.sum((1, 2))]
         masks = masks[: options.max_objects - count]
         log.info("%s: %d new objects", tracker.scene.cameras.names[view], len(masks))
         if len(masks):
             fresh = dict(tracker.labels(masks, row))
-            number = same_as(fresh, found, len(masks), count)
+            number = match_labels(fresh, found, len(masks), count)
             count = max(count, int(number.max()))
             for v, labels in fresh.items():
                 before = found.get(v, torch.zeros_like(labels))
@@ -49,7 +51,7 @@ def discover(tracker: Tracker, support: Support | None, options: SegmentOptions)
     return found
 
 
-def same_as(
+def match_labels(
     fresh: dict[int, Int[Tensor, "h w"]], found: dict[int, Int[Tensor, "h w"]], new: int, count: int
 ) -> Int[Tensor, "m"]:
     """The number that each new label 0...`new` gets: that of the old object, of `count`, it mostly lies on, or a next.
@@ -76,18 +78,18 @@ def same_as(
 
 
 def _objects_in(
-    tracker: Tracker, row: int, support: Support | None, options: SegmentOptions
+    tracker: MaskTracker, row: int, support: Support | None, options: SegmentOptions
 ) -> Bool[Tensor, "m l l"]:
     """Masks of the things in a picture, largest first."""
-    masks = propose(tracker.model, tracker.pixels(row)).masks
-    sight = Sight.of(tracker.scene, tracker.shown.views[row])
+    masks = propose_masks(tracker.model, tracker.pixels(row)).masks
+    sight = ViewFootprint.of(tracker.scene, tracker.shown.views[row])
     height, width = sight.front.shape
-    stands = [standing(tracker.scene, sight.front[resized(mask[None], width, height)[0] > 0.5], support, options)
-              for mask in masks]  # fmt: skip
-    return wholes(masks[torch.tensor(stands, dtype=torch.bool)])
+    shown = [sight.front[resize_logits(mask[None], width, height)[0] > 0.5] for mask in masks]
+    stands = [is_on_support(tracker.scene, front, support, options) for front in shown]
+    return remove_nested_masks(masks[torch.tensor(stands, dtype=torch.bool)])
 
 
-def standing(scene: Scene, front: Int[Tensor, "p"], support: Support | None, options: SegmentOptions) -> bool:
+def is_on_support(scene: Scene, front: Int[Tensor, "p"], support: Support | None, options: SegmentOptions) -> bool:
     """Whether what the pixels of a mask show is a thing on the table; `front` names the Gaussian in each.
 
     It is, if it is neither small nor large, higher than the table on the whole, over the table, and reaches down.
@@ -96,7 +98,7 @@ def standing(scene: Scene, front: Int[Tensor, "p"], support: Support | None, opt
     points = scene.gaussians.means[front[:: max(1, len(front) // 5000)].long()]
     if len(points) < 20:
         return False
-    view = support.view if support is not None else view_of(scene)
+    view = support.view if support is not None else view_extent(scene)
     low, high = points.quantile(torch.tensor([0.02, 0.98]), dim=0)
     side = float((high - low).max()) / view.radius
     if not options.min_size <= side < LARGE:
@@ -110,7 +112,7 @@ def standing(scene: Scene, front: Int[Tensor, "p"], support: Support | None, opt
     )  # fmt: skip
 
 
-def wholes(masks: Bool[Tensor, "m h w"]) -> Bool[Tensor, "k h w"]:
+def remove_nested_masks(masks: Bool[Tensor, "m h w"]) -> Bool[Tensor, "k h w"]:
     """Masks without those that are parts of a larger one, largest first."""
     areas = masks.flatten(1).sum(1)
     kept: list[int] = []

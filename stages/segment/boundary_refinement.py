@@ -9,14 +9,14 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from stages.core.geometry.neighbours import knn
-from stages.core.perception.growing import lab_of
+from stages.core.perception.region_growing import cielab_colours
 from stages.core.perception.support import Support
-from stages.core.perception.visibility import seen_from
+from stages.core.perception.visibility import summed_view_directions
 from stages.core.scene.gaussians import Gaussians
 from stages.core.scene.scene import Scene
 
-MARGIN = 0.015  # width of a border to either side, about ten pixels of a photo [view radii]
-SEEN = 0.5  # weight in all photos together from which a Gaussian shows [px of small photos]
+BOUNDARY_WIDTH = 0.015  # width of a border to either side, about ten pixels of a photo [view radii]
+MIN_VISIBLE_WEIGHT = 0.5  # weight in all photos together from which a Gaussian shows [px of small photos]
 ROUNDS = 3  # a border may move by a margin in each
 SWEEPS = 8  # of mean field in each round
 SAMPLES = 24  # nearest Gaussians whose colours say how an object, or the table, looks here
@@ -24,7 +24,7 @@ NEIGHBOURS = 8
 STRAYS = 5  # Gaussians of another label that make no border yet
 SHADE = 8.0  # colours this far apart are still alike [CIELAB]
 FLOOR = 0.02  # likelihood of a colour that nothing near has
-LEVEL = 0.0045  # height that photos tell from the table [view radii]
+HEIGHT_RESOLUTION = 0.0045  # height that photos tell from the table [view radii]
 BUMP = 3.0  # height of what photos make of a bare table beside things, one deviation [levels]
 SINK = 0.5  # an object's Gaussian this much lower than it can be told from the table is one deviation off [levels]
 BROAD = 400  # Gaussians that show all colours of the table around the objects
@@ -35,7 +35,7 @@ NEVER = 1e3  # cost of a label that is out of the question
 
 
 @dataclass(frozen=True)
-class Near:
+class BoundaryRegion:
     """The Gaussians of the objects and of the table around them."""
 
     points: Float[Tensor, "m 3"]
@@ -47,15 +47,15 @@ class Near:
     margin: float  # [scene units]
 
     @classmethod
-    def of(cls, g: Gaussians, lab: Float[Tensor, "n 3"], support: Support) -> Near:
+    def of(cls, g: Gaussians, lab: Float[Tensor, "n 3"], support: Support) -> BoundaryRegion:
         """Of Gaussians that are all near objects."""
         heights = support.heights(g.means)
-        margin, level = MARGIN * support.view.radius, LEVEL * support.view.radius
+        margin, level = BOUNDARY_WIDTH * support.view.radius, HEIGHT_RESOLUTION * support.view.radius
         even = heights.abs() < support.tolerance
         return cls(g.means, lab, g.object_id, heights / level, even, _gap(g.means, g.object_id) / margin, margin)
 
 
-def redrawn(scene: Scene, support: Support) -> Gaussians:
+def refine_boundaries(scene: Scene, support: Support) -> Gaussians:
     """The Gaussians with those at a border, and those low enough to be table, given anew to an object or the table.
 
     At a border a reconstruction lifts some of the table and grouping gives it to the object, or gives the table
@@ -69,13 +69,13 @@ def redrawn(scene: Scene, support: Support) -> Gaussians:
     g = scene.gaussians
     if scene.cameras is None or not len(scene.cameras):
         return g
-    lab, ids = lab_of(g), g.object_id.clone()
-    seen = seen_from(g, scene.cameras).norm(dim=1) > SEEN
+    lab, ids = cielab_colours(g), g.object_id.clone()
+    seen = summed_view_directions(g, scene.cameras).norm(dim=1) > MIN_VISIBLE_WEIGHT
     for _ in range(ROUNDS):
-        index = _around(g.means, ids, 3 * MARGIN * support.view.radius)
+        index = _around(g.means, ids, 3 * BOUNDARY_WIDTH * support.view.radius)
         if not bool((ids[index] > 0).any()) or not bool((ids[index] == 0).any()):
             break
-        near = Near.of(replace(g[index], object_id=ids[index]), lab[index], support)
+        near = BoundaryRegion.of(replace(g[index], object_id=ids[index]), lab[index], support)
         low = (near.ids > 0) & (near.heights < 1)
         border = torch.nonzero(((near.gap < 1) | low) & seen[index])[:, 0]
         ids[index[border]] = _settled(near, border, low)
@@ -105,7 +105,7 @@ def _gap(points: Float[Tensor, "m 3"], ids: Int[Tensor, "m"]) -> Float[Tensor, "
     return gap
 
 
-def _settled(near: Near, border: Int[Tensor, "b"], low: Bool[Tensor, "m"]) -> Int[Tensor, "b"]:
+def _settled(near: BoundaryRegion, border: Int[Tensor, "b"], low: Bool[Tensor, "m"]) -> Int[Tensor, "b"]:
     """The likeliest label of each Gaussian of the border, when neighbours of like colour tend to agree."""
     labels, before = near.ids.unique(), near.ids[border]
     cost = torch.stack([_cost(near, border, label) for label in labels.tolist()], 1)
@@ -121,7 +121,7 @@ def _settled(near: Near, border: Int[Tensor, "b"], low: Bool[Tensor, "m"]) -> In
     return labels[belief[border].argmax(1)]
 
 
-def _cost(near: Near, border: Int[Tensor, "b"], label: int) -> Float[Tensor, "b"]:
+def _cost(near: BoundaryRegion, border: Int[Tensor, "b"], label: int) -> Float[Tensor, "b"]:
     """How little a label fits each Gaussian of the border: minus the logarithm of its likelihood."""
     own, h = near.ids == label, near.heights[border]
     if label == 0:

@@ -2,7 +2,12 @@
 
 import torch
 
-from stages.core.models.sam2.automatic import Automatic, distinct, propose, stability
+from stages.core.models.sam2.mask_generation import (
+    MaskGenerationOptions,
+    mask_stability,
+    propose_masks,
+    suppress_duplicates,
+)
 from tests.core.models.sam2.tiny import SIDE, random_model
 
 
@@ -20,21 +25,21 @@ def test_masks_are_those_of_the_image_model_with_the_same_weights():
     with torch.no_grad():
         theirs = image(pixel_values=pixels[None], input_points=points[None, :, None],
                        input_labels=torch.ones(1, 16, 1, dtype=torch.int32), multimask_output=True)  # fmt: skip
-    every = Automatic(grid=4, at_once=5, iou=-9.0, stability=0.0, same=1.0)
-    mine = propose(video, pixels, every)
+    every = MaskGenerationOptions(grid=4, at_once=5, iou=-9.0, stability=0.0, same=1.0)
+    mine = propose_masks(video, pixels, every)
     masks, scores = theirs.pred_masks.flatten(0, 2) > 0, theirs.iou_scores.flatten()
-    order = distinct(masks, scores, 1.0)
+    order = suppress_duplicates(masks, scores, 1.0)
     assert len(order) > 10 and torch.equal(mine.masks, masks[order])
     torch.testing.assert_close(mine.scores, scores[order], rtol=1e-5, atol=1e-5)
     median = float(scores.median())
-    some = propose(video, pixels, Automatic(grid=4, at_once=16, iou=median, stability=0.0, same=1.0))
+    some = propose_masks(video, pixels, MaskGenerationOptions(grid=4, at_once=16, iou=median, stability=0.0, same=1.0))
     assert 0 < len(some.masks) < len(mine.masks) and float(some.scores.min()) >= median
 
 
 def test_stability_by_hand():
     row = torch.tensor([[-3.0, -0.5, 0.5, 0.9, 2.0, 3.0]])  # above 1: two; above -1: five
     soft, hard = row[None], torch.tensor([[[-9.0, -9, 9, 9, 9, 9]]])
-    torch.testing.assert_close(stability(torch.cat([soft, hard, hard - 100])), torch.tensor([0.4, 1.0, 0.0]))
+    torch.testing.assert_close(mask_stability(torch.cat([soft, hard, hard - 100])), torch.tensor([0.4, 1.0, 0.0]))
 
 
 def test_of_masks_that_overlap_the_surer_stays():
@@ -44,6 +49,6 @@ def test_of_masks_that_overlap_the_surer_stays():
     masks[2, 0, :5] = True  # a part of the first: 0.5
     masks[3, 0, 12:] = True
     scores = torch.tensor([0.8, 0.9, 0.95, 0.7, 1.0])  # and the fifth is empty
-    assert distinct(masks, scores, 0.7).tolist() == [2, 1, 3]
-    assert distinct(masks, scores, 0.9).tolist() == [2, 1, 0, 3]
-    assert distinct(masks[:0], scores[:0], 0.7).tolist() == []
+    assert suppress_duplicates(masks, scores, 0.7).tolist() == [2, 1, 3]
+    assert suppress_duplicates(masks, scores, 0.9).tolist() == [2, 1, 0, 3]
+    assert suppress_duplicates(masks[:0], scores[:0], 0.7).tolist() == []

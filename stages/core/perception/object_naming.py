@@ -20,7 +20,7 @@ COLOURS = {
 }  # fmt: skip
 
 
-def names_of(g: Gaussians, support: Support | None) -> list[str]:
+def object_names(g: Gaussians, support: Support | None) -> list[str]:
     """One name for each object 1, 2, ...: "yellow_object", "flat_black_object"; numbered where two are alike."""
     names = [_name(g[g.object_id == i], support) for i in range(1, int(g.object_id.max()) + 1)]
     total, seen = Counter(names), Counter()

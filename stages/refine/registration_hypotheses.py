@@ -10,7 +10,7 @@ from torch import Tensor
 
 from stages.core.geometry.neighbours import BruteForce, KDTree
 from stages.core.geometry.rotations import matrix, nearest_rotation
-from stages.refine.register_cloud import COLOUR, Cloud
+from stages.refine.registration_cloud import COLOUR_WEIGHT, RegistrationCloud
 
 RADII = (0.07, 0.14, 0.28)  # of the neighbourhoods described [diameters of the whole object]
 SIZES = (1.0, 1.15, 1.32, 1.52)  # diameters of the whole in those of the part; a feature knows no scale, so try some
@@ -22,7 +22,7 @@ WORST = 0.06  # coloured distance at which a point counts as not matched at all 
 
 
 @dataclass(frozen=True)
-class Poses:
+class PoseHypotheses:
     """Candidate similarities, part to whole, in the clouds' normalised frames: x -> scale R x + translation."""
 
     scale: Float[Tensor, "h"]
@@ -32,27 +32,27 @@ class Poses:
     def __len__(self) -> int:
         return len(self.scale)
 
-    def __getitem__(self, index) -> Poses:
-        return Poses(self.scale[index], self.rotation[index], self.translation[index])
+    def __getitem__(self, index) -> PoseHypotheses:
+        return PoseHypotheses(self.scale[index], self.rotation[index], self.translation[index])
 
     def __call__(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "h n 3"]:
         return self.scale[:, None, None] * (points @ self.rotation.mT) + self.translation[:, None]
 
     @staticmethod
-    def fitted(a: Float[Tensor, "h k 3"], b: Float[Tensor, "h k 3"]) -> Poses:
+    def fitted(a: Float[Tensor, "h k 3"], b: Float[Tensor, "h k 3"]) -> PoseHypotheses:
         """Least squares, a to b. Source: Umeyama 1991, as in stages.core.geometry.similarity, for many at once."""
         mean_a, mean_b = a.mean(1, keepdim=True), b.mean(1, keepdim=True)
         A, B = a - mean_a, b - mean_b
         H = B.mT @ A
         R = nearest_rotation(H)
         scale = (R * H).sum((1, 2)) / A.square().sum((1, 2)).clamp_min(1e-12)
-        return Poses(scale, R, (mean_b - scale[:, None, None] * (mean_a @ R.mT))[:, 0])
+        return PoseHypotheses(scale, R, (mean_b - scale[:, None, None] * (mean_a @ R.mT))[:, 0])
 
     @staticmethod
-    def joined(*parts: Poses) -> Poses:
-        return Poses(*(torch.cat([getattr(p, f.name) for p in parts]) for f in fields(Poses)))
+    def joined(*parts: PoseHypotheses) -> PoseHypotheses:
+        return PoseHypotheses(*(torch.cat([getattr(p, f.name) for p in parts]) for f in fields(PoseHypotheses)))
 
-    def shaken(self, copies: int, seed: int) -> Poses:
+    def shaken(self, copies: int, seed: int) -> PoseHypotheses:
         """These, and `copies` of each about 5 degrees, 4 % of size and 2 % of the diameter off, about the origin."""
         rng = torch.Generator().manual_seed(seed)
         at = self.scale.device
@@ -61,9 +61,9 @@ class Poses:
         turn, grown = matrix(quats).to(at), (0.04 * torch.randn(len(some), generator=rng)).exp().to(at)
         shift = 0.01 * torch.randn(len(some), 3, generator=rng).to(at)
         moved = grown[:, None] * (turn @ some.translation[..., None])[..., 0] + shift
-        return Poses.joined(self, Poses(some.scale * grown, turn @ some.rotation, moved))
+        return PoseHypotheses.joined(self, PoseHypotheses(some.scale * grown, turn @ some.rotation, moved))
 
-    def distinct(self, most: int, degrees: float, far: float) -> Poses:
+    def distinct(self, most: int, degrees: float, far: float) -> PoseHypotheses:
         """The first `most` that differ from all before them by an angle or a shift."""
         traces = self.rotation.flatten(1) @ self.rotation.flatten(1).mT
         turned = torch.rad2deg(((traces - 1) / 2).clamp(-1, 1).arccos())
@@ -77,7 +77,7 @@ class Poses:
 
 
 def misfit(
-    poses: Poses, points: Float[Tensor, "n 3"], colours: Float[Tensor, "n 3"], tree: KDTree | BruteForce
+    poses: PoseHypotheses, points: Float[Tensor, "n 3"], colours: Float[Tensor, "n 3"], tree: KDTree | BruteForce
 ) -> Float[Tensor, "h"]:
     """Mean squared distance, in place and colour, of the part's points from the whole, in units of WORST^2: 0 to 1.
 
@@ -88,13 +88,13 @@ def misfit(
     return (distance[..., 0].clamp_max(WORST) / WORST).square().mean(1)
 
 
-def describe(cloud: Cloud, at: Int[Tensor, "k"], unit: float) -> Float[Tensor, "k f"]:
+def local_features(cloud: RegistrationCloud, at: Int[Tensor, "k"], unit: float) -> Float[Tensor, "k f"]:
     """What surrounds points of a cloud within RADII times `unit`, whichever way it is turned.
 
     Of each neighbourhood: mean colour, its spread, the three standard deviations of place, and how far the mean lies
     off the point, along the normal and at all. Each is divided by what it usually differs by.
     """
-    x, colour, q = cloud.points, cloud.colours / COLOUR, cloud.points[at]
+    x, colour, q = cloud.points, cloud.colours / COLOUR_WEIGHT, cloud.points[at]
     squared = torch.cdist(q, x).square()
     second = (x[:, :, None] * x[:, None]).flatten(1)
     values = torch.cat([x.new_ones(len(x), 1), x, second, colour, colour.square()], 1)
@@ -113,7 +113,9 @@ def describe(cloud: Cloud, at: Int[Tensor, "k"], unit: float) -> Float[Tensor, "
     return torch.cat(out, 1)
 
 
-def guesses(part: Cloud, whole: Cloud, seed: int = 0, most: int = 6000) -> Poses:
+def pose_hypotheses(
+    part: RegistrationCloud, whole: RegistrationCloud, seed: int = 0, most: int = 6000
+) -> PoseHypotheses:
     """Similarities through three matches each whose distances, and angles of normals, agree.
 
     Source: Fischler and Bolles 1981; agreement of edges before fitting as in Rusu et al. 2009, "Fast point feature
@@ -122,21 +124,23 @@ def guesses(part: Cloud, whole: Cloud, seed: int = 0, most: int = 6000) -> Poses
     generator, at = torch.Generator().manual_seed(seed), part.points.device
     targets = torch.randperm(len(whole.points), generator=generator)[:TARGETS].to(at)
     keypoints = torch.randperm(len(part.points), generator=generator)[:KEYPOINTS].to(at)
-    features = describe(whole, targets, 1.0)
+    features = local_features(whole, targets, 1.0)
     found = []
     for size in SIZES:
-        like = torch.cdist(describe(part, keypoints, size), features)
+        like = torch.cdist(local_features(part, keypoints, size), features)
         choices = targets[like.topk(min(CHOICES, len(targets)), dim=1, largest=False).indices]
         three = torch.randint(len(keypoints), (DRAWS, 3), generator=generator).to(at)
         which = torch.randint(choices.shape[1], (DRAWS, 3), generator=generator).to(at)
         found.append(_agreeing(part, whole, keypoints[three], choices[three, which], size))
     a, b = (torch.cat(side) for side in zip(*found, strict=True))
-    poses = Poses.fitted(a, b)
+    poses = PoseHypotheses.fitted(a, b)
     exact = (poses.scale[:, None, None] * (a @ poses.rotation.mT) + poses.translation[:, None] - b).norm(dim=2).amax(1)
     return poses[(exact < 0.05) & (poses.scale > 0.5) & (poses.scale < 1.15)][:most]
 
 
-def _agreeing(part: Cloud, whole: Cloud, i: Int[Tensor, "d 3"], j: Int[Tensor, "d 3"], size: float):
+def _agreeing(
+    part: RegistrationCloud, whole: RegistrationCloud, i: Int[Tensor, "d 3"], j: Int[Tensor, "d 3"], size: float
+):
     """Points of the threes that span enough, keep their proportions and are of about the size supposed."""
     a, b = part.points[i], whole.points[j]
     edges_a, edges_b = ((p - p.roll(1, 1)).norm(dim=2) for p in (a, b))

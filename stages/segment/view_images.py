@@ -23,7 +23,7 @@ PROPORTIONS = 0.03  # by which those of a photo and of what belongs to it may di
 
 
 @dataclass(frozen=True)
-class Pictures:
+class ViewImages:
     """Pictures in the order of the cameras, made or read one at a time when they are asked for."""
 
     views: list[int]  # the camera of each
@@ -33,19 +33,19 @@ class Pictures:
         return len(self.views)
 
 
-def pictures(scene: Scene, photos: Path | None = None) -> Pictures:
+def view_images(scene: Scene, photos: Path | None = None) -> ViewImages:
     """Those of the folder `photos` that the scene's cameras name, or one drawing for each camera.
 
     Memory holds one at a time. Raises InputError for a folder without them, and, when its turn comes, for a photo of
     other proportions than its camera.
     """
     if photos is None:
-        return Pictures(list(range(len(scene.cameras))), lambda view: drawn(scene, view))
-    files = match(photos, scene.cameras.names, "photo", "--photos")
-    return Pictures(list(files), lambda view: _read(scene, view, files[view]))
+        return ViewImages(list(range(len(scene.cameras))), lambda view: render_view(scene, view))
+    files = match_files(photos, scene.cameras.names, "photo", "--photos")
+    return ViewImages(list(files), lambda view: _read(scene, view, files[view]))
 
 
-def drawn(scene: Scene, view: int) -> Float[Tensor, "h w 3"]:
+def render_view(scene: Scene, view: int) -> Float[Tensor, "h w 3"]:
     """The scene as a camera sees it, before black."""
     width, height = scene.cameras.sizes[view].tolist()
     shrink = min(1.0, SIDE / max(width, height))
@@ -63,7 +63,7 @@ def _read(scene: Scene, view: int, file: Path) -> Float[Tensor, "h w 3"]:
     return image
 
 
-def match(folder: Path, names: tuple[str, ...], what: str, option: str) -> dict[int, Path]:
+def match_files(folder: Path, names: tuple[str, ...], what: str, option: str) -> dict[int, Path]:
     """The image that belongs to each camera, found by the photo's name up to its suffix.
 
     `what` the images are and the `option` that named the folder are for the error's sentence.

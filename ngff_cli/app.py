@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 from typer import Argument, Option
 
-from ngff_cli.options import Commands, Device, SceneIn, Seed, set_up_logging
+from ngff_cli.options import Commands, Device, SceneIn, Seed, Threads, limit_threads, set_up_logging
 from stages.evaluate.options import EvaluateOptions
 from stages.reconstruct.options import BACKENDS as RECONSTRUCT
 from stages.reconstruct.options import EXTRACTORS as MATCHERS
@@ -36,12 +36,14 @@ def _version(wanted: bool) -> None:
 def ngff(
     verbose: Annotated[bool, Option("-v", "--verbose", help="say more about what is done")] = False,
     version: Annotated[bool, Option("--version", callback=_version, is_eager=True, help="print the version")] = False,
+    threads: Threads = None,
 ) -> None:
     """From a folder of photos to a video of what happens next.
 
     ngff reconstruct photos/ -o scene.ply; ngff simulate scene.ply -o traj.h5; ngff render traj.h5
     """
     set_up_logging(verbose)
+    limit_threads(threads)
 
 
 @app.command()

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from ngff_cli import bench
-from ngff_cli.options import Commands, Device, Seed, set_up_logging
+from ngff_cli.options import Commands, Device, Seed, Threads, limit_threads, set_up_logging
 from stages.lab.assets.objects import ObjectsOptions
 
 app = typer.Typer(
@@ -15,9 +15,10 @@ app = typer.Typer(
 
 
 @app.callback()
-def lab() -> None:
+def lab(threads: Threads = None) -> None:
     """Beside the pipeline: make data, train, measure, and see what works on this machine."""
     set_up_logging(False)
+    limit_threads(threads)
 
 
 @app.command()

@@ -10,10 +10,29 @@ import typer
 
 from stages.core.errors import InputError
 
+# Threads that wait for each other sleep instead of spinning: OpenMP and OpenBLAS read these when they are loaded.
+# With other work on the machine a spinning thread takes the core from the one it waits for.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+os.environ.setdefault("OPENBLAS_THREAD_TIMEOUT", "4")
+
 SceneIn = Annotated[Path, typer.Argument(metavar="SCENE.ply", help="scene to read (.ply)", show_default=False)]
 Device = Annotated[str, typer.Option(help="auto | cpu | cuda")]
 Seed = Annotated[int, typer.Option(help="same seed, same device: same result")]
+Threads = Annotated[int | None, typer.Option(help="CPU threads; default: all cores", show_default=False)]
 Verbose = Annotated[bool, typer.Option("-v", "--verbose", help="say more about what is done")]
+
+
+def limit_threads(count: int | None) -> None:
+    """Use at most `count` CPU threads in PyTorch, OpenMP, OpenBLAS and our own kernels; None keeps their defaults.
+
+    They read these variables when they are first imported, which no command has done yet.
+    """
+    if count is None:
+        return
+    if count < 1:
+        raise InputError(f"--threads {count}: give 1 or more")
+    for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+        os.environ[name] = str(count)
 
 
 class StderrHandler(logging.Handler):

@@ -2,9 +2,13 @@
 
 import dataclasses
 import inspect
+import os
 import resource
+import subprocess
+import sys
 import typing
 from contextlib import contextmanager
+from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
@@ -18,6 +22,7 @@ from stages.simulate.options import SimulateOptions
 from stages.simulate.stage import run
 from tests.conftest import two_balls_scene
 
+ROOT = Path(__file__).resolve().parents[2]
 NOT_OPTIONS = {"out", "imgs", "scene", "source", "prediction", "against"}
 
 
@@ -174,3 +179,13 @@ def test_a_full_disk_is_one_sentence_too(workplace, args):
             return call(*args)
 
     assert "cannot be written" in fails_cleanly(workplace, args, limited)
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_threads_limits_pytorch(count):
+    code = (f"import sys; sys.argv = ['ngff', '--threads', '{count}', 'simulate', 'missing.ply']\n"
+            "import ngff_cli.app as a\n"
+            "try:\n a.main()\nexcept SystemExit: pass\n"
+            "import torch; print(torch.get_num_threads())")  # fmt: skip
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True)
+    assert done.stdout.strip() == str(min(count, os.cpu_count()))  # OpenMP starts no more threads than there are cores

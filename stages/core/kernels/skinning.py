@@ -7,15 +7,13 @@ Gaussians whose G is exactly zero keep their quats and scales bit by bit.
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
-from functools import cache
-
 import torch
 import warp as wp
 from torch import Tensor
 
 from stages.core.geometry.rotations import matrix, nearest_rotation, quaternion
 from stages.core.kernels.interop import device_of, launch, view
+from stages.core.kernels.threads import run_parallel
 
 
 @wp.func
@@ -138,18 +136,12 @@ def blend(
     if device != "cpu":
         launch(_blend, n, [0, *inputs], outputs, device)
         return tuple(out)
-    # a launch on the CPU takes one core and releases Python's lock, so two threads take half each
     halves = [
         wp.launch(_blend, b - a, [a, *inputs], outputs, device=device, record_cmd=True, record_tape=False)
         for a, b in ((0, n // 2), (n // 2, n)) if b > a
     ]  # fmt: skip
-    list(_pool().map(lambda half: half.launch(), halves))
+    run_parallel([half.launch for half in halves])
     return tuple(out)
-
-
-@cache
-def _pool() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(2)
 
 
 def blend_reference(

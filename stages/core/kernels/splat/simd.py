@@ -8,14 +8,13 @@ range, use the other cores.
 
 from __future__ import annotations
 
-import os
-from concurrent.futures import ThreadPoolExecutor
-from functools import cache
+from functools import cache, partial
 
 import torch
 import warp as wp
 
 from stages.core.kernels.interop import launch
+from stages.core.kernels.threads import run_parallel
 
 LANES = 16
 MAX_PARTS = 8  # more threads than this would need more memory for gradients than they are worth
@@ -75,15 +74,6 @@ auto sums = [](const F* v) {
 
 
 @cache
-def _pool(threads: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(threads, thread_name_prefix="splat")
-
-
-if hasattr(os, "register_at_fork"):  # a forked child has none of its parent's threads
-    os.register_at_fork(after_in_child=_pool.cache_clear)
-
-
-@cache
 def _load(kernel: wp.Kernel) -> None:
     """Compiles before the threads start, so that only one of them does."""
     wp.load_module(kernel.module, device="cpu")
@@ -108,8 +98,4 @@ def run(kernel: wp.Kernel, bounds: list[int], inputs: list) -> None:
     if not pieces:
         return
     _load(kernel)
-    if len(pieces) == 1 or parts() == 1:
-        for i, start, size in pieces:
-            launch(kernel, size, [start, i, *inputs])
-        return
-    list(_pool(parts()).map(lambda piece: launch(kernel, piece[2], [piece[1], piece[0], *inputs]), pieces))
+    run_parallel([partial(launch, kernel, size, [start, i, *inputs]) for i, start, size in pieces])

@@ -1,0 +1,71 @@
+"""One pool of threads for kernels on the CPU.
+
+A Warp launch on the CPU runs on the calling thread and releases Python's lock, so several threads launch the parts of
+a computation side by side. The calling thread takes part: it works through the tasks that no other thread has claimed
+yet. When other processes occupy the cores and the helpers do not get to run, it does all of the work itself instead
+of waiting for them.
+"""
+
+from __future__ import annotations
+
+import os
+from collections import deque
+from collections.abc import Callable, Sequence
+from functools import cache
+from queue import SimpleQueue
+from threading import Thread
+
+import torch
+
+Task = Callable[[], None]
+Batch = tuple[deque[Task], "SimpleQueue[BaseException | None]"]  # tasks to claim; one entry for each task that ended
+
+
+def run_parallel(tasks: Sequence[Task]) -> None:
+    """Run tasks that do not depend on each other; return when all have ended.
+
+    At most `torch.get_num_threads()` run at a time. The first exception of a task is raised after all have ended,
+    since they may share memory.
+    """
+    helpers = _helpers(max(0, torch.get_num_threads() - 1))[: len(tasks) - 1]
+    batch: Batch = deque(tasks), SimpleQueue()
+    for inbox in helpers:
+        inbox.put(batch)
+    _work(batch)
+    errors = [error for _ in tasks if (error := batch[1].get()) is not None]
+    if errors:
+        raise errors[0]
+
+
+def _work(batch: Batch) -> None:
+    """Claim and run tasks until none is left."""
+    tasks, ended = batch
+    while tasks:
+        try:
+            task = tasks.popleft()
+        except IndexError:  # another thread was faster
+            return
+        error = None
+        try:
+            task()
+        except BaseException as raised:  # passed on to the caller of run_parallel
+            error = raised
+        ended.put(error)
+
+
+@cache
+def _helpers(count: int) -> list[SimpleQueue[Batch]]:
+    """Inboxes of that many threads, which live as long as the process."""
+    inboxes: list[SimpleQueue[Batch]] = [SimpleQueue() for _ in range(count)]
+    for inbox in inboxes:
+        Thread(target=_serve, args=(inbox,), name="kernels", daemon=True).start()
+    return inboxes
+
+
+def _serve(inbox: SimpleQueue[Batch]) -> None:
+    while True:
+        _work(inbox.get())
+
+
+if hasattr(os, "register_at_fork"):  # a forked child has none of its parent's threads
+    os.register_at_fork(after_in_child=_helpers.cache_clear)

@@ -1,0 +1,64 @@
+"""The thread pool for kernels on the CPU."""
+
+import threading
+import time
+
+import pytest
+import torch
+
+from stages.core.kernels.threads import run_parallel
+
+
+@pytest.fixture(params=[1, 2, 4])
+def threads(request):
+    before = torch.get_num_threads()
+    torch.set_num_threads(request.param)
+    yield request.param
+    torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize("count", [0, 1, 7])
+def test_each_task_runs_once(threads, count):
+    done = []
+    run_parallel([lambda i=i: done.append(i) for i in range(count)])
+    assert sorted(done) == list(range(count))
+
+
+def test_an_exception_is_raised_after_all_tasks_have_ended(threads):
+    done = []
+
+    def fail():
+        raise ValueError("task 0")
+
+    with pytest.raises(ValueError, match="task 0"):
+        run_parallel([fail, *(lambda i=i: (time.sleep(0.01), done.append(i)) for i in range(3))])
+    assert sorted(done) == [0, 1, 2]
+    run_parallel([lambda: done.append(3)] * 2)  # the pool still works
+    assert done[-2:] == [3, 3]
+
+
+def test_the_calling_thread_does_the_work_that_no_helper_has_claimed(threads):
+    """Helpers that are busy elsewhere are not waited for."""
+    release, all_busy, occupied = threading.Event(), threading.Event(), threading.Semaphore(0)
+
+    def block():
+        if threading.current_thread().name == "kernels":
+            occupied.release()
+            release.wait(10)
+        else:
+            all_busy.wait(10)
+
+    def occupy():
+        run_parallel([block] * threads)
+
+    other = threading.Thread(target=occupy)
+    other.start()
+    for _ in range(threads - 1):
+        assert occupied.acquire(timeout=10)
+    all_busy.set()
+    done = []
+    run_parallel([lambda: done.append(threading.current_thread().name)] * 4)
+    assert done == [threading.current_thread().name] * 4
+    release.set()
+    other.join(10)
+    assert not other.is_alive()

@@ -36,9 +36,9 @@ def example(
     photos: Annotated[int, typer.Option(help="how many photos to take")] = 26,
 ) -> None:
     """Make the example: photos of toys on a table, with true cameras, labels and motion beside them."""
-    from stages.lab.assets.example import make
+    from stages.lab.assets.example import make_example
 
-    make(out, photos)
+    make_example(out, photos)
 
 
 @app.command()
@@ -80,18 +80,17 @@ def dataset(
     device: Device = "auto",
 ) -> None:
     """Make GSCollision: scenes, their motion, and videos, in the published layout."""
-    from stages.lab.dataset import make as dataset
-    from stages.lab.dataset import on_ray
+    from stages.lab.dataset import generate, ray_cluster
     from stages.lab.dataset.options import DatasetOptions
 
     options = DatasetOptions(groups, only, frames, keypoints, dx, spacing, substep, nudge, exact, views,
                              backgrounds, resolution, shard, limit, device)  # fmt: skip
     if check:
-        dataset.check(out)
+        generate.check(out)
     elif ray:
-        on_ray.run(out, options, ray)
+        ray_cluster.run(out, options, ray)
     else:
-        dataset.run(out, options)
+        generate.run(out, options)
 
 
 @app.command("import")
@@ -121,20 +120,19 @@ def statistics(
     device: Device = "auto",
 ) -> None:
     """What happens in the scenes of a data set: falls, contacts, tipping, rest; or how predictable it is."""
-    from stages.lab.dataset import predictability
-    from stages.lab.dataset import statistics as scene_statistics
-    from stages.lab.dataset.scenes import groups_of
+    from stages.lab.dataset import scene_statistics, sensitivity
+    from stages.lab.dataset.scene_configs import parse_groups
 
     if against is not None:
-        lines = predictability.run(data, against, out, min(keypoints, 256), device)
+        lines = sensitivity.run(data, against, out, min(keypoints, 256), device)
     else:
-        lines = scene_statistics.run(data, out, groups_of(groups), keypoints, device)
+        lines = scene_statistics.run(data, out, parse_groups(groups), keypoints, device)
     for line in lines:
         print(line)
     if sheet is not None:
         from stages.lab.dataset.contact_sheet import SheetOptions, write_sheet
 
-        write_sheet(data, sheet, SheetOptions(tuple(groups_of(groups)), scenes, device))
+        write_sheet(data, sheet, SheetOptions(tuple(parse_groups(groups)), scenes, device))
 
 
 @app.command()

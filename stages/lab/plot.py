@@ -12,11 +12,21 @@ import numpy as np
 
 from stages.core.scene.files import replacing
 
-WIDTH, HEIGHT, MARGIN = 460, 300, 52  # of a panel [px]
+PANEL_WIDTH, PANEL_HEIGHT, MARGIN = 460, 300, 52  # of a panel [px]
 INK, BLUE, RED, GRID = (40, 40, 40), (176, 92, 20), (40, 40, 200), (225, 225, 225)  # BGR
-COLOURS = ((40, 40, 200), (176, 92, 20), (44, 160, 44), (14, 127, 255), (189, 103, 148), (75, 86, 140), (194, 119, 227),
-           (110, 110, 110), (34, 189, 188), (207, 190, 23))  # of curves, BGR
-STRIP = 20  # height of a line of the legend [px]
+COLOURS = (
+    (40, 40, 200),
+    (176, 92, 20),
+    (44, 160, 44),
+    (14, 127, 255),
+    (189, 103, 148),
+    (75, 86, 140),
+    (194, 119, 227),
+    (110, 110, 110),
+    (34, 189, 188),
+    (207, 190, 23),
+)  # of curves, BGR
+LEGEND_HEIGHT = 20  # height of a line of the legend [px]
 Points = Sequence[tuple[float, float]]
 
 
@@ -32,14 +42,14 @@ class Panel:
     curves: Mapping[str, Points] = field(default_factory=dict)  # of one name: of one colour in all panels
 
 
-def draw(out: Path, panels: Sequence[Panel], columns: int = 3) -> None:
+def draw_panels(out: Path, panels: Sequence[Panel], columns: int = 3) -> None:
     """Panels in rows, as a PNG; below them, what the colours of curves mean."""
     names = list(dict.fromkeys(name for panel in panels for name in panel.curves))
     colours = {name: COLOURS[i % len(COLOURS)] for i, name in enumerate(names)}
     rows = [list(panels[i : i + columns]) for i in range(0, len(panels), columns)]
-    blank = np.full((HEIGHT, WIDTH, 3), 255, np.uint8)
+    blank = np.full((PANEL_HEIGHT, PANEL_WIDTH, 3), 255, np.uint8)
     cells = [[*(_panel(p, colours) for p in row), *[blank] * (columns - len(row))] for row in rows]
-    image = np.vstack([*map(np.hstack, cells), _legend(colours, columns * WIDTH)])
+    image = np.vstack([*map(np.hstack, cells), _legend(colours, columns * PANEL_WIDTH)])
     ok, png = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 9])
     assert ok
     with replacing(out) as part:
@@ -48,18 +58,18 @@ def draw(out: Path, panels: Sequence[Panel], columns: int = 3) -> None:
 
 def _legend(colours: Mapping[str, tuple[int, int, int]], width: int) -> np.ndarray:
     """Names of curves with a piece of each, in as many lines as they need."""
-    lines, x = [np.full((STRIP, width, 3), 255, np.uint8)], MARGIN
+    lines, x = [np.full((LEGEND_HEIGHT, width, 3), 255, np.uint8)], MARGIN
     for name, colour in colours.items():
         if x > MARGIN and x + 40 + 8 * len(name) > width:
-            lines, x = [*lines, np.full((STRIP, width, 3), 255, np.uint8)], MARGIN
-        cv2.line(lines[-1], (x, STRIP // 2), (x + 24, STRIP // 2), colour, 2, cv2.LINE_AA)
-        _text(lines[-1], name, (x + 30, STRIP // 2 + 4))
+            lines, x = [*lines, np.full((LEGEND_HEIGHT, width, 3), 255, np.uint8)], MARGIN
+        cv2.line(lines[-1], (x, LEGEND_HEIGHT // 2), (x + 24, LEGEND_HEIGHT // 2), colour, 2, cv2.LINE_AA)
+        _text(lines[-1], name, (x + 30, LEGEND_HEIGHT // 2 + 4))
         x += 40 + 8 * len(name)
-    return np.vstack(lines)[: STRIP * len(lines) if colours else 0]
+    return np.vstack(lines)[: LEGEND_HEIGHT * len(lines) if colours else 0]
 
 
 def _panel(panel: Panel, colours: Mapping[str, tuple[int, int, int]]) -> np.ndarray:
-    image = np.full((HEIGHT, WIDTH, 3), 255, np.uint8)
+    image = np.full((PANEL_HEIGHT, PANEL_WIDTH, 3), 255, np.uint8)
     scale = np.log10 if panel.log else np.asarray
     every = [*panel.measured, *panel.expected, *(point for curve in panel.curves.values() for point in curve)]
     if not every:
@@ -70,22 +80,24 @@ def _panel(panel: Panel, colours: Mapping[str, tuple[int, int, int]]) -> np.ndar
         low, high = np.minimum(low, 0), np.maximum(high, 0)
     room = 0.06 * np.maximum(high - low, 1e-12)
     low, high = np.where(panel.log | (low < 0), low - room, low), high + room
-    area = np.array([WIDTH - MARGIN - 16, HEIGHT - MARGIN - 34])
+    area = np.array([PANEL_WIDTH - MARGIN - 16, PANEL_HEIGHT - MARGIN - 34])
 
     def place(points: Points) -> np.ndarray:
         at = (scale(np.array(points, float)) - low) / (high - low) * area
-        return np.stack([MARGIN + at[:, 0], HEIGHT - MARGIN - at[:, 1]], 1).round().astype(int)
+        return np.stack([MARGIN + at[:, 0], PANEL_HEIGHT - MARGIN - at[:, 1]], 1).round().astype(int)
 
     for axis in (0, 1):
         for tick in _ticks(low[axis], high[axis], panel.log):
             at = round(float((tick - low[axis]) / (high[axis] - low[axis]) * area[axis]))
             text = f"{10**tick if panel.log else tick:.4g}"
             if axis == 0:
-                cv2.line(image, (MARGIN + at, 34), (MARGIN + at, HEIGHT - MARGIN), GRID, 1)
-                _text(image, text, (MARGIN + at - 4 * len(text), HEIGHT - MARGIN + 18))
+                cv2.line(image, (MARGIN + at, 34), (MARGIN + at, PANEL_HEIGHT - MARGIN), GRID, 1)
+                _text(image, text, (MARGIN + at - 4 * len(text), PANEL_HEIGHT - MARGIN + 18))
             else:
-                cv2.line(image, (MARGIN, HEIGHT - MARGIN - at), (WIDTH - 16, HEIGHT - MARGIN - at), GRID, 1)
-                _text(image, text, (MARGIN - 6 - 7 * len(text), HEIGHT - MARGIN - at + 4))
+                cv2.line(
+                    image, (MARGIN, PANEL_HEIGHT - MARGIN - at), (PANEL_WIDTH - 16, PANEL_HEIGHT - MARGIN - at), GRID, 1
+                )
+                _text(image, text, (MARGIN - 6 - 7 * len(text), PANEL_HEIGHT - MARGIN - at + 4))
     if len(panel.expected):
         cv2.polylines(image, [place(panel.expected)], False, RED, 1, cv2.LINE_AA)
     for name, points in panel.curves.items():
@@ -93,10 +105,12 @@ def _panel(panel: Panel, colours: Mapping[str, tuple[int, int, int]]) -> np.ndar
             cv2.polylines(image, [place(points)], False, colours[name], 2, cv2.LINE_AA)
     for x, y in place(panel.measured) if len(panel.measured) else ():
         cv2.circle(image, (int(x), int(y)), 4, BLUE, -1, cv2.LINE_AA)
-    cv2.rectangle(image, (MARGIN, 34), (WIDTH - 16, HEIGHT - MARGIN), INK, 1)
+    cv2.rectangle(image, (MARGIN, 34), (PANEL_WIDTH - 16, PANEL_HEIGHT - MARGIN), INK, 1)
     _text(image, panel.title, (MARGIN, 22), 0.44)
     if len(panel.measured):
-        _text(image, "o measured" + (f"   - {panel.theory}" if len(panel.expected) else ""), (MARGIN, HEIGHT - 12))
+        _text(
+            image, "o measured" + (f"   - {panel.theory}" if len(panel.expected) else ""), (MARGIN, PANEL_HEIGHT - 12)
+        )
     return image
 
 

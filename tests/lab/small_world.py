@@ -11,7 +11,7 @@ from stages.lab.assets import backgrounds
 from stages.lab.assets.objects import OBJECTS
 from stages.lab.assets.shapes import box, to_gaussians
 from stages.lab.dataset.options import DatasetOptions
-from stages.lab.dataset.scenes import SCENES
+from stages.lab.dataset.scene_configs import SCENE_COUNTS
 
 OPTIONS = DatasetOptions("3_9", "scenes,mpm,initial,dynamic", 3, 64, 0.08, 0.04, 2e-3, views="0,16",
                          backgrounds="table0", resolution=32, device="cpu")  # fmt: skip
@@ -33,10 +33,10 @@ def shrink(setattr, setitem) -> None:
     """Make the world small, by functions as of pytest's monkeypatch."""
     for name, kind in list(OBJECTS.items()):
         setitem(OBJECTS, name, replace(kind, make="tests.lab.small_world:brick", E=min(kind.E, 1e5), scale=0.4))
-    setitem(SCENES, "3_9", 2)
-    setitem(SCENES, "4", 2)
-    setattr(backgrounds, "FINE", 0.12)
-    setattr(backgrounds, "COARSE", 1.0)
+    setitem(SCENE_COUNTS, "3_9", 2)
+    setitem(SCENE_COUNTS, "4", 2)
+    setattr(backgrounds, "TABLE_SPACING", 0.12)
+    setattr(backgrounds, "ROOM_SPACING", 1.0)
 
 
 def shrink_for_good() -> None:

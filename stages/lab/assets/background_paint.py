@@ -8,64 +8,66 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from stages.lab.assets.paint import RGB, mix, over, plain
+from stages.lab.assets.paint import RGB, mix, overlay, plain
 from stages.lab.assets.shapes import noise
 
 Place = Float[Tensor, "n 2"]
-FINE, COARSE = 0.02, 0.12  # widths of edges on tables and in rooms, about the spacing of their Gaussians [m]
+TABLE_EDGE, ROOM_EDGE = 0.02, 0.12  # widths of edges on tables and in rooms, about the spacing of their Gaussians [m]
 
 
-def cloudy(q: Place, size: float, seed: int) -> Float[Tensor, "n"]:
+def fractal_noise(q: Place, size: float, seed: int) -> Float[Tensor, "n"]:
     """Noise in 0..1 with detail at three sizes."""
     flat = torch.nn.functional.pad(q, (0, 1), value=0.37)
     return sum(noise(flat, size * 0.45**i, seed + i) * share for i, share in enumerate((0.55, 0.3, 0.15)))
 
 
-def stretched(q: Place, along: float) -> Place:
+def stretch(q: Place, along: float) -> Place:
     """Compressed along x, so that a pattern runs that way."""
     return q * torch.tensor([1 / along, 1.0])
 
 
-def to_line(x: Float[Tensor, "n"], period: float) -> Float[Tensor, "n"]:
+def line_distance(x: Float[Tensor, "n"], period: float) -> Float[Tensor, "n"]:
     """Distance to the nearest multiple of the period."""
     return (torch.remainder(x / period + 0.5, 1.0) - 0.5).abs() * period
 
 
-def boards(q: Place, width: float, dark: RGB, pale: RGB, edge: float, seed: int = 1, spread: float = 0.3) -> Tensor:
+def wood_planks(
+    q: Place, width: float, dark: RGB, pale: RGB, edge: float, seed: int = 1, spread: float = 0.3
+) -> Tensor:
     """Boards along x with grain, each of its own shade, and dark joints."""
     number = (q[:, 1] / width).floor()
     shade = torch.frac(torch.sin(number * 12.9898 + seed) * 43758.5453).abs()
-    lane = stretched(q, 9.0) + torch.stack([number * 3.7, number * 0.0], 1)
-    rings = torch.sin(40 * lane[:, 1] + 9 * cloudy(lane, 0.3, seed)) * 0.5 + 0.5
-    grain = 0.45 * rings + 0.55 * cloudy(lane, 3 * edge, seed + 5)
+    lane = stretch(q, 9.0) + torch.stack([number * 3.7, number * 0.0], 1)
+    rings = torch.sin(40 * lane[:, 1] + 9 * fractal_noise(lane, 0.3, seed)) * 0.5 + 0.5
+    grain = 0.45 * rings + 0.55 * fractal_noise(lane, 3 * edge, seed + 5)
     rgb = mix(dark, pale, grain * (1 - spread) + shade * spread)
-    return over(rgb, 0.45 * rgb, to_line(q[:, 1], width) - 0.3 * edge, edge)
+    return overlay(rgb, 0.45 * rgb, line_distance(q[:, 1], width) - 0.3 * edge, edge)
 
 
 def oak(q: Place) -> Tensor:
-    return boards(q, 0.52, (0.42, 0.26, 0.13), (0.8, 0.6, 0.38), FINE)
+    return wood_planks(q, 0.52, (0.42, 0.26, 0.13), (0.8, 0.6, 0.38), TABLE_EDGE)
 
 
 def marble(q: Place) -> Tensor:
     """White, with grey veins along the bent level lines of noise."""
-    rgb = mix((0.8, 0.8, 0.82), (0.95, 0.94, 0.93), cloudy(q, 0.6, 3))
-    bent = stretched(q, 1.7) @ torch.tensor([[0.8, 0.6], [-0.6, 0.8]])
-    bent = bent + 0.7 * torch.stack([cloudy(q, 0.8, 11), cloudy(q, 0.8, 17)], 1)
+    rgb = mix((0.8, 0.8, 0.82), (0.95, 0.94, 0.93), fractal_noise(q, 0.6, 3))
+    bent = stretch(q, 1.7) @ torch.tensor([[0.8, 0.6], [-0.6, 0.8]])
+    bent = bent + 0.7 * torch.stack([fractal_noise(q, 0.8, 11), fractal_noise(q, 0.8, 17)], 1)
     for size, seed, depth in ((1.3, 21, 0.8), (0.5, 31, 0.4)):
-        vein = (cloudy(bent, size, seed) - 0.5).abs()
-        fade = depth * cloudy(q, 0.6, seed + 3) ** 2 * 2
+        vein = (fractal_noise(bent, size, seed) - 0.5).abs()
+        fade = depth * fractal_noise(q, 0.6, seed + 3) ** 2 * 2
         rgb = rgb + (torch.tensor([0.45, 0.46, 0.5]) - rgb) * (fade * torch.exp(-vein / 0.025)).clamp(0, 1)[:, None]
     return rgb
 
 
 def gingham(q: Place) -> Tensor:
     """Red and white cloth: two sets of stripes, darker where they cross."""
-    stripes = [(0.5 - (to_line(q[:, i], 0.32) - 0.08) / FINE).clamp(0, 1) for i in (0, 1)]
+    stripes = [(0.5 - (line_distance(q[:, i], 0.32) - 0.08) / TABLE_EDGE).clamp(0, 1) for i in (0, 1)]
     rgb = mix((0.95, 0.93, 0.9), (0.76, 0.08, 0.1), 0.5 * (stripes[0] + stripes[1]))
-    return rgb * (0.94 + 0.12 * cloudy(q, 0.05, 8))[:, None]
+    return rgb * (0.94 + 0.12 * fractal_noise(q, 0.05, 8))[:, None]
 
 
-def cells(q: Place, size: float, seed: int) -> tuple[Tensor, Tensor]:
+def voronoi_cells(q: Place, size: float, seed: int) -> tuple[Tensor, Tensor]:
     """Irregular cells: how far a place is from the border of its cell [m], and a number in 0..1 that the cell has."""
     generator = torch.Generator().manual_seed(seed)
     shift = torch.rand(32, 32, 2, generator=generator) * 0.7 + 0.15
@@ -82,27 +84,27 @@ def cells(q: Place, size: float, seed: int) -> tuple[Tensor, Tensor]:
 
 
 def flagstones(q: Place) -> Tensor:
-    border, tone = cells(q + 0.08 * cloudy(q, 0.3, 4)[:, None], 0.62, 5)
-    rgb = mix((0.4, 0.39, 0.37), (0.68, 0.65, 0.59), 0.5 * tone + 0.5 * cloudy(q, 0.12, 6))
-    return over(rgb, (0.27, 0.26, 0.24), border - 0.022, 1.5 * FINE)
+    border, tone = voronoi_cells(q + 0.08 * fractal_noise(q, 0.3, 4)[:, None], 0.62, 5)
+    rgb = mix((0.4, 0.39, 0.37), (0.68, 0.65, 0.59), 0.5 * tone + 0.5 * fractal_noise(q, 0.12, 6))
+    return overlay(rgb, (0.27, 0.26, 0.24), border - 0.022, 1.5 * TABLE_EDGE)
 
 
 def worn_paint(q: Place) -> Tensor:
     """Blue-green paint on planks, rubbed down to the wood here and there."""
-    wood = boards(q, 0.42, (0.45, 0.32, 0.2), (0.72, 0.56, 0.38), FINE, 7)
-    coat = mix((0.2, 0.5, 0.52), (0.38, 0.68, 0.67), cloudy(stretched(q, 6), 0.12, 9))
-    rubbed = 0.43 - cloudy(stretched(q, 5), 0.16, 13) - 0.16 * torch.exp(-to_line(q[:, 1], 0.42) / 0.03)
-    painted = over(wood, coat, rubbed * 0.2, FINE)
-    return over(painted, 0.4 * painted, to_line(q[:, 1], 0.42) - 0.007, FINE)
+    wood = wood_planks(q, 0.42, (0.45, 0.32, 0.2), (0.72, 0.56, 0.38), TABLE_EDGE, 7)
+    coat = mix((0.2, 0.5, 0.52), (0.38, 0.68, 0.67), fractal_noise(stretch(q, 6), 0.12, 9))
+    rubbed = 0.43 - fractal_noise(stretch(q, 5), 0.16, 13) - 0.16 * torch.exp(-line_distance(q[:, 1], 0.42) / 0.03)
+    painted = overlay(wood, coat, rubbed * 0.2, TABLE_EDGE)
+    return overlay(painted, 0.4 * painted, line_distance(q[:, 1], 0.42) - 0.007, TABLE_EDGE)
 
 
 def slate(q: Place) -> Tensor:
     """Dark, layered, with pale clefts."""
-    layers = cloudy(stretched(q, 3.0) + 0.2 * cloudy(q, 0.8, 2)[:, None], 0.3, 14)
+    layers = fractal_noise(stretch(q, 3.0) + 0.2 * fractal_noise(q, 0.8, 2)[:, None], 0.3, 14)
     rgb = mix((0.13, 0.15, 0.17), (0.34, 0.36, 0.39), layers * 1.5 - 0.25)
     step = torch.remainder(layers * 5, 1.0)
-    rgb = over(rgb, (0.45, 0.46, 0.47), (step - 0.06) * 0.1, FINE)
-    return rgb * (0.88 + 0.24 * cloudy(q, 0.045, 19))[:, None]
+    rgb = overlay(rgb, (0.45, 0.46, 0.47), (step - 0.06) * 0.1, TABLE_EDGE)
+    return rgb * (0.88 + 0.24 * fractal_noise(q, 0.045, 19))[:, None]
 
 
 def azulejo(q: Place) -> Tensor:
@@ -112,60 +114,67 @@ def azulejo(q: Place) -> Tensor:
     r, angle = t.norm(dim=1), torch.atan2(t[:, 1], t[:, 0])
     blue, pale = (0.1, 0.24, 0.58), (0.45, 0.65, 0.88)
     rgb = plain((0.93, 0.93, 0.9))(q)
-    rgb = over(rgb, pale, r - 0.155 - 0.02 * torch.cos(8 * angle), FINE)
-    rgb = over(rgb, (0.94, 0.94, 0.91), r - 0.125 - 0.03 * torch.cos(4 * angle), FINE)
-    rgb = over(rgb, blue, r - 0.085 - 0.05 * torch.cos(4 * angle), FINE)
-    rgb = over(rgb, (0.93, 0.75, 0.25), r - 0.034, FINE)
+    rgb = overlay(rgb, pale, r - 0.155 - 0.02 * torch.cos(8 * angle), TABLE_EDGE)
+    rgb = overlay(rgb, (0.94, 0.94, 0.91), r - 0.125 - 0.03 * torch.cos(4 * angle), TABLE_EDGE)
+    rgb = overlay(rgb, blue, r - 0.085 - 0.05 * torch.cos(4 * angle), TABLE_EDGE)
+    rgb = overlay(rgb, (0.93, 0.75, 0.25), r - 0.034, TABLE_EDGE)
     corner = (t.abs() - side / 2).norm(dim=1)
-    rgb = over(rgb, blue, (corner - 0.085).abs() - 0.014, FINE)
-    rgb = over(rgb, blue, corner - 0.04, FINE)
-    return over(rgb, (0.62, 0.6, 0.56), torch.minimum(to_line(q[:, 0], side), to_line(q[:, 1], side)) - 0.009, FINE)
+    rgb = overlay(rgb, blue, (corner - 0.085).abs() - 0.014, TABLE_EDGE)
+    rgb = overlay(rgb, blue, corner - 0.04, TABLE_EDGE)
+    return overlay(
+        rgb,
+        (0.62, 0.6, 0.56),
+        torch.minimum(line_distance(q[:, 0], side), line_distance(q[:, 1], side)) - 0.009,
+        TABLE_EDGE,
+    )
 
 
 def felt(q: Place) -> Tensor:
     """Green baize inside a rim of dark wood, a pale line along it."""
     inset = 2.1 - q.abs().amax(1)
-    rgb = mix((0.05, 0.3, 0.17), (0.1, 0.42, 0.25), 0.5 * cloudy(q, 0.03, 23) + 0.5 * cloudy(q, 0.7, 24))
-    rgb = over(rgb, (0.75, 0.72, 0.5), (inset - 0.42).abs() - 0.008, FINE)
+    rgb = mix((0.05, 0.3, 0.17), (0.1, 0.42, 0.25), 0.5 * fractal_noise(q, 0.03, 23) + 0.5 * fractal_noise(q, 0.7, 24))
+    rgb = overlay(rgb, (0.75, 0.72, 0.5), (inset - 0.42).abs() - 0.008, TABLE_EDGE)
     turned = torch.where((q[:, 0].abs() > q[:, 1].abs())[:, None], q.flip(1), q)
-    rim = boards(turned, 3.0, (0.2, 0.09, 0.05), (0.42, 0.21, 0.11), FINE, 3)
-    return over(rgb, rim, inset - 0.22, FINE)
+    rim = wood_planks(turned, 3.0, (0.2, 0.09, 0.05), (0.42, 0.21, 0.11), TABLE_EDGE, 3)
+    return overlay(rgb, rim, inset - 0.22, TABLE_EDGE)
 
 
 def wooden_floor(q: Place) -> Tensor:
-    return boards(q, 0.6, (0.3, 0.19, 0.11), (0.55, 0.38, 0.24), COARSE, 4, 0.5)
+    return wood_planks(q, 0.6, (0.3, 0.19, 0.11), (0.55, 0.38, 0.24), ROOM_EDGE, 4, 0.5)
 
 
 def dark_floor(q: Place) -> Tensor:
-    return boards(q, 0.7, (0.13, 0.1, 0.09), (0.28, 0.22, 0.18), COARSE, 9, 0.5)
+    return wood_planks(q, 0.7, (0.13, 0.1, 0.09), (0.28, 0.22, 0.18), ROOM_EDGE, 9, 0.5)
 
 
-def paved(pale: RGB, dark: RGB, side: float):
+def paving(pale: RGB, dark: RGB, side: float):
     """Square slabs of slightly different shades."""
+
     def paint(q: Place) -> Tensor:
         number = (q / side).floor()
         shade = torch.frac(torch.sin(number @ torch.tensor([12.9898, 78.233])) * 437.585).abs()
-        rgb = mix(dark, pale, 0.5 * shade + 0.5 * cloudy(q, 0.5, 3))
-        joint = torch.minimum(to_line(q[:, 0], side), to_line(q[:, 1], side))
-        return over(rgb, 0.6 * rgb, joint - 0.02, COARSE)
+        rgb = mix(dark, pale, 0.5 * shade + 0.5 * fractal_noise(q, 0.5, 3))
+        joint = torch.minimum(line_distance(q[:, 0], side), line_distance(q[:, 1], side))
+        return overlay(rgb, 0.6 * rgb, joint - 0.02, ROOM_EDGE)
 
     return paint
 
 
 def mottled(dark: RGB, pale: RGB, size: float, seed: int = 0):
     """Clouded colour: plaster, concrete, sand, carpet, grass or a hedge."""
-    return lambda q: mix(dark, pale, cloudy(q, size, seed) * 1.6 - 0.3)
+    return lambda q: mix(dark, pale, fractal_noise(q, size, seed) * 1.6 - 0.3)
 
 
 def panelled(upper: RGB, lower: RGB, rail: float = -1.2):
     """Plain wall above a rail, panels below; the second coordinate is the height [m]."""
+
     def paint(q: Place) -> Tensor:
-        rgb = mix(upper, upper, q[:, 1] * 0) * (0.97 + 0.06 * cloudy(q, 0.8, 2))[:, None]
+        rgb = mix(upper, upper, q[:, 1] * 0) * (0.97 + 0.06 * fractal_noise(q, 0.8, 2))[:, None]
         board = plain(lower)(q)
-        frame = torch.maximum(to_line(q[:, 0], 1.3).neg() + 0.13, ((q[:, 1] - rail + 0.65).abs() - 0.4))
-        board = over(board, 0.86 * board, frame.abs() - 0.05, COARSE)
-        rgb = over(rgb, board, q[:, 1] - rail, COARSE)
-        return over(rgb, 0.93 * board, (q[:, 1] - rail).abs() - 0.04, COARSE)
+        frame = torch.maximum(line_distance(q[:, 0], 1.3).neg() + 0.13, ((q[:, 1] - rail + 0.65).abs() - 0.4))
+        board = overlay(board, 0.86 * board, frame.abs() - 0.05, ROOM_EDGE)
+        rgb = overlay(rgb, board, q[:, 1] - rail, ROOM_EDGE)
+        return overlay(rgb, 0.93 * board, (q[:, 1] - rail).abs() - 0.04, ROOM_EDGE)
 
     return paint
 
@@ -175,17 +184,21 @@ def bricks(q: Place) -> Tensor:
     row = (q[:, 1] / tall).floor()
     x = q[:, 0] + 0.5 * long * torch.remainder(row, 2)
     shade = torch.frac(torch.sin(row * 78.233 + (x / long).floor() * 12.9898) * 437.585).abs()
-    rgb = mix((0.42, 0.19, 0.14), (0.68, 0.36, 0.27), 0.6 * shade + 0.4 * cloudy(q, 0.2, 5))
-    return over(rgb, (0.66, 0.62, 0.57), torch.minimum(to_line(q[:, 1], tall), to_line(x, long)) - 0.015, COARSE)
+    rgb = mix((0.42, 0.19, 0.14), (0.68, 0.36, 0.27), 0.6 * shade + 0.4 * fractal_noise(q, 0.2, 5))
+    return overlay(
+        rgb, (0.66, 0.62, 0.57), torch.minimum(line_distance(q[:, 1], tall), line_distance(x, long)) - 0.015, ROOM_EDGE
+    )
 
 
 def striped(a: RGB, b: RGB, period: float):
     """Upright stripes of two colours."""
-    return lambda q: over(plain(a)(q), b, to_line(q[:, 0], period) - period / 4, COARSE)
+    return lambda q: overlay(plain(a)(q), b, line_distance(q[:, 0], period) - period / 4, ROOM_EDGE)
 
 
 def garden(q: Place) -> Tensor:
     """A hedge before a pale sky."""
-    leaves = mix((0.07, 0.2, 0.06), (0.3, 0.48, 0.16), cloudy(q, 0.5, 7) * 1.6 - 0.3)
-    top = 0.9 + 0.35 * cloudy(q * torch.tensor([1.0, 0.0]), 0.9, 12) + 0.1 * torch.sin(q[:, 0] * 2 * math.pi / 3)
-    return over(leaves, mix((0.86, 0.9, 0.94), (0.55, 0.74, 0.93), (q[:, 1] - 0.8) / 1.2), top - q[:, 1], 2 * COARSE)
+    leaves = mix((0.07, 0.2, 0.06), (0.3, 0.48, 0.16), fractal_noise(q, 0.5, 7) * 1.6 - 0.3)
+    top = 0.9 + 0.35 * fractal_noise(q * torch.tensor([1.0, 0.0]), 0.9, 12) + 0.1 * torch.sin(q[:, 0] * 2 * math.pi / 3)
+    return overlay(
+        leaves, mix((0.86, 0.9, 0.94), (0.55, 0.74, 0.93), (q[:, 1] - 0.8) / 1.2), top - q[:, 1], 2 * ROOM_EDGE
+    )

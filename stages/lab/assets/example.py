@@ -24,7 +24,7 @@ WIDTH, HEIGHT, FOCAL = 640, 480, 620.0
 WALL = torch.tensor([0.62, 0.66, 0.70])  # colour behind the table
 
 
-def make(out: Path, photos: int = 26) -> None:
+def make_example(out: Path, photos: int = 26) -> None:
     """photos/NN.jpg, masks/NN.png (object ids) and names.json, cameras.json (transforms), truth.h5."""
     out = Path(out)
     for folder in ("photos", "masks"):

@@ -9,24 +9,35 @@ from jaxtyping import Float
 from torch import Tensor
 
 from stages.core.scene.gaussians import Gaussians
-from stages.lab.assets.paint import BLACK, WHITE, disc, either, mix, over, plain, shape, stroke, woven
+from stages.lab.assets.field_sampling import PaintedPart, gaussians_from_parts
+from stages.lab.assets.paint import (
+    BLACK,
+    WHITE,
+    ellipse2d,
+    fabric,
+    filled_polygon,
+    mix,
+    overlay,
+    plain,
+    stroke,
+    union2d,
+)
 from stages.lab.assets.shapes import noise
 from stages.lab.assets.signed_distance import (
     Field,
     capsule,
     curve_through,
-    cut,
+    difference,
     ellipsoid,
+    euler_rotation,
     mirrored,
     posed,
     revolved,
     sphere,
     torus,
     tube,
-    turn,
     union,
 )
-from stages.lab.assets.surface import Part, sculpt
 
 FUR, DARK = (0.94, 0.93, 0.9), (0.07, 0.07, 0.08)
 
@@ -38,41 +49,41 @@ def panda() -> Gaussians:
     body = ellipsoid((0, 0.03, -0.19), (0.25, 0.215, 0.27))
     white = union(head, muzzle, smooth=0.04)
     tail = sphere((0, 0.24, -0.34), 0.065)
-    ears = mirrored(ellipsoid((0.205, 0.0, 0.415), (0.092, 0.05, 0.092), turn(y=20)))
+    ears = mirrored(ellipsoid((0.205, 0.0, 0.415), (0.092, 0.05, 0.092), euler_rotation(y=20)))
     arms = mirrored(union(capsule((0.19, -0.02, -0.03), (0.27, -0.17, -0.2), 0.078, 0.07), smooth=0.02))
-    foot = ellipsoid((0.215, -0.36, -0.345), (0.1, 0.055, 0.125), turn(x=8, z=10))
+    foot = ellipsoid((0.215, -0.36, -0.345), (0.1, 0.055, 0.125), euler_rotation(x=8, z=10))
     legs = mirrored(union(capsule((0.14, -0.08, -0.37), (0.2, -0.28, -0.385), 0.095), foot, smooth=0.05))
 
     def plush(p: Tensor, rgb: Tensor) -> Tensor:
-        return woven(p, woven(p, rgb, 11, 0.025, 0.04), 12, 0.008, 0.07)
+        return fabric(p, fabric(p, rgb, 11, 0.025, 0.04), 12, 0.008, 0.07)
 
     def face(p: Tensor) -> Tensor:
         q = torch.stack([p[:, 0].abs(), p[:, 2]], 1)
         ahead = torch.where(p[:, 1] < -0.08, 0.0, 1.0)
-        rgb = over(plush(p, plain(FUR)(p)), (0.96, 0.66, 0.66), disc(q, (0.195, 0.135), (0.032, 0.021)) + ahead)
-        rgb = over(rgb, DARK, disc(q, (0.115, 0.235), (0.062, 0.082), -0.5) + ahead)
-        rgb = over(rgb, WHITE, disc(q, (0.105, 0.235), (0.037, 0.043)) + ahead)
-        rgb = over(rgb, BLACK, disc(q, (0.1, 0.232), (0.025, 0.031)) + ahead)
-        spark = either(disc(p[:, [0, 2]], (0.091, 0.244), 0.011), disc(p[:, [0, 2]], (-0.109, 0.244), 0.011))
-        rgb = over(rgb, WHITE, spark + ahead)
-        rgb = over(rgb, DARK, disc(q, (0.0, 0.185), (0.037, 0.024)) + ahead)
+        rgb = overlay(plush(p, plain(FUR)(p)), (0.96, 0.66, 0.66), ellipse2d(q, (0.195, 0.135), (0.032, 0.021)) + ahead)
+        rgb = overlay(rgb, DARK, ellipse2d(q, (0.115, 0.235), (0.062, 0.082), -0.5) + ahead)
+        rgb = overlay(rgb, WHITE, ellipse2d(q, (0.105, 0.235), (0.037, 0.043)) + ahead)
+        rgb = overlay(rgb, BLACK, ellipse2d(q, (0.1, 0.232), (0.025, 0.031)) + ahead)
+        spark = union2d(ellipse2d(p[:, [0, 2]], (0.091, 0.244), 0.011), ellipse2d(p[:, [0, 2]], (-0.109, 0.244), 0.011))
+        rgb = overlay(rgb, WHITE, spark + ahead)
+        rgb = overlay(rgb, DARK, ellipse2d(q, (0.0, 0.185), (0.037, 0.024)) + ahead)
         mouth = stroke(q, [(0.0, 0.165), (0.0, 0.135), (0.018, 0.119), (0.037, 0.118), (0.05, 0.13)], 0.009)
-        return over(rgb, DARK, mouth + ahead)
+        return overlay(rgb, DARK, mouth + ahead)
 
     def coat(p: Tensor) -> Tensor:
         band = p[:, 2] + 0.045 - 0.35 * p[:, 1] * 0.3
-        return plush(p, over(plain(FUR)(p), DARK, -band))
+        return plush(p, overlay(plain(FUR)(p), DARK, -band))
 
     def feet(p: Tensor) -> Tensor:
         q = torch.stack([p[:, 0].abs(), p[:, 2]], 1)
         sole = torch.where(p[:, 1] < -0.375, 0.0, 1.0)
-        toes = either(*(disc(q, (x, z), 0.021) for x, z in ((0.172, -0.272), (0.222, -0.252), (0.27, -0.276))))
-        pads = either(disc(q, (0.22, -0.355), (0.052, 0.045)), toes)
-        return plush(p, over(plain(DARK)(p), (0.93, 0.6, 0.62), pads + sole))
+        toes = union2d(*(ellipse2d(q, (x, z), 0.021) for x, z in ((0.172, -0.272), (0.222, -0.252), (0.27, -0.276))))
+        pads = union2d(ellipse2d(q, (0.22, -0.355), (0.052, 0.045)), toes)
+        return plush(p, overlay(plain(DARK)(p), (0.93, 0.6, 0.62), pads + sole))
 
-    black = Part(union(ears, arms, tail), lambda p: plush(p, plain(DARK)(p)))
-    parts = [Part(white, face), Part(body, coat), black, Part(legs, feet)]
-    return sculpt(parts, (0.42, 0.5, 0.56), 50_000, smooth=0.012)
+    black = PaintedPart(union(ears, arms, tail), lambda p: plush(p, plain(DARK)(p)))
+    parts = [PaintedPart(white, face), PaintedPart(body, coat), black, PaintedPart(legs, feet)]
+    return gaussians_from_parts(parts, (0.42, 0.5, 0.56), 50_000, smooth=0.012)
 
 
 SKIN, GREY, BOOT = (0.98, 0.83, 0.74), (0.62, 0.66, 0.69), (0.12, 0.13, 0.16)
@@ -86,18 +97,20 @@ def miku() -> Gaussians:
     def face(p: Tensor) -> Tensor:
         q = torch.stack([p[:, 0].abs(), p[:, 2]], 1)
         ahead = torch.where(p[:, 1] < -0.05, 0.0, 1.0)
-        rgb = over(plain(SKIN)(p), (0.97, 0.62, 0.6), disc(q, (0.118, 0.163), (0.026, 0.013)) + ahead)
-        rgb = over(rgb, (0.06, 0.13, 0.16), disc(q, (0.085, 0.222), (0.042, 0.056)) + ahead)
+        rgb = overlay(plain(SKIN)(p), (0.97, 0.62, 0.6), ellipse2d(q, (0.118, 0.163), (0.026, 0.013)) + ahead)
+        rgb = overlay(rgb, (0.06, 0.13, 0.16), ellipse2d(q, (0.085, 0.222), (0.042, 0.056)) + ahead)
         iris = mix((0.2, 0.85, 0.8), (0.02, 0.32, 0.38), (p[:, 2] - 0.177) / 0.08)
-        rgb = over(rgb, iris, disc(q, (0.085, 0.215), (0.034, 0.044)) + ahead)
-        rgb = over(rgb, (0.03, 0.12, 0.15), disc(q, (0.085, 0.217), (0.016, 0.023)) + ahead)
+        rgb = overlay(rgb, iris, ellipse2d(q, (0.085, 0.215), (0.034, 0.044)) + ahead)
+        rgb = overlay(rgb, (0.03, 0.12, 0.15), ellipse2d(q, (0.085, 0.217), (0.016, 0.023)) + ahead)
         for x in (-0.097, 0.073):
-            sparks = either(disc(p[:, [0, 2]], (x, 0.239), 0.014), disc(p[:, [0, 2]], (x + 0.026, 0.194), 0.007))
-            rgb = over(rgb, WHITE, sparks + ahead)
+            sparks = union2d(
+                ellipse2d(p[:, [0, 2]], (x, 0.239), 0.014), ellipse2d(p[:, [0, 2]], (x + 0.026, 0.194), 0.007)
+            )
+            rgb = overlay(rgb, WHITE, sparks + ahead)
         lash = stroke(q, [(0.043, 0.249), (0.062, 0.272), (0.095, 0.28), (0.125, 0.267), (0.141, 0.247)], 0.011)
-        rgb = over(rgb, (0.08, 0.3, 0.32), lash + ahead)
+        rgb = overlay(rgb, (0.08, 0.3, 0.32), lash + ahead)
         smile = stroke(p[:, [0, 2]], [(-0.02, 0.145), (0.0, 0.138), (0.02, 0.145)], 0.009)
-        return over(rgb, (0.78, 0.28, 0.3), smile + ahead)
+        return overlay(rgb, (0.78, 0.28, 0.3), smile + ahead)
 
     head = ellipsoid((0, 0.0, 0.25), (0.19, 0.18, 0.175))
     neck = capsule((0, 0, 0.02), (0, 0, 0.12), 0.032)
@@ -111,26 +124,33 @@ def miku() -> Gaussians:
     def dress(p: Tensor) -> Tensor:
         q = p[:, [0, 2]]
         ahead = torch.where(p[:, 1] < 0, 0.0, 1.0)
-        rgb = over(plain(GREY)(p), (0.42, 0.46, 0.5), p[:, 0].abs() - 0.004 + ahead)
-        tie = shape(q, [(-0.013, 0.055), (0.013, 0.055), (0.02, -0.05), (0.0, -0.085), (-0.02, -0.05)])
-        rgb = over(rgb, TEAL, tie + ahead)
-        return over(over(rgb, BOOT, p[:, 2] + 0.098), TEAL, (p[:, 2] - 0.058).abs() - 0.012)
+        rgb = overlay(plain(GREY)(p), (0.42, 0.46, 0.5), p[:, 0].abs() - 0.004 + ahead)
+        tie = filled_polygon(q, [(-0.013, 0.055), (0.013, 0.055), (0.02, -0.05), (0.0, -0.085), (-0.02, -0.05)])
+        rgb = overlay(rgb, TEAL, tie + ahead)
+        return overlay(overlay(rgb, BOOT, p[:, 2] + 0.098), TEAL, (p[:, 2] - 0.058).abs() - 0.012)
 
     def pleats(p: Tensor) -> Tensor:
-        return over(plain(BOOT)(p), TRIM, (p[:, 2] + 0.212).abs() - 0.009)
+        return overlay(plain(BOOT)(p), TRIM, (p[:, 2] + 0.212).abs() - 0.009)
 
     def cuff(p: Tensor) -> Tensor:
         along = (p[:, 0].abs() - 0.14) * 0.4 - (p[:, 2] + 0.075) * 0.92
-        return over(plain(BOOT)(p), TRIM, either((along - 0.105).abs() - 0.009, along.abs() - 0.007))
+        return overlay(plain(BOOT)(p), TRIM, union2d((along - 0.105).abs() - 0.009, along.abs() - 0.007))
 
     def boot(p: Tensor) -> Tensor:
-        return over(plain(BOOT)(p), TRIM, either((p[:, 2] + 0.282).abs() - 0.012, p[:, 2] + 0.488))
+        return overlay(plain(BOOT)(p), TRIM, union2d((p[:, 2] + 0.282).abs() - 0.012, p[:, 2] + 0.488))
 
     chest, waist = ellipsoid((0, 0, 0.0), (0.088, 0.066, 0.075)), capsule((0, 0, -0.02), (0, 0, -0.1), 0.066, 0.062)
     torso = union(chest, waist, smooth=0.03)
-    parts = [Part(head, face, 0.1), Part(union(neck, arm_top, hand, legs), plain(SKIN), 0.1), Part(torso, dress, 0.15),
-             Part(skirt(), pleats, 0.15), Part(sleeve, cuff, 0.15), Part(boots, boot, 0.3), *hair]  # fmt: skip
-    return sculpt(parts, (0.42, 0.34, 0.53), 60_000)
+    parts = [
+        PaintedPart(head, face, 0.1),
+        PaintedPart(union(neck, arm_top, hand, legs), plain(SKIN), 0.1),
+        PaintedPart(torso, dress, 0.15),
+        PaintedPart(skirt(), pleats, 0.15),
+        PaintedPart(sleeve, cuff, 0.15),
+        PaintedPart(boots, boot, 0.3),
+        *hair,
+    ]
+    return gaussians_from_parts(parts, (0.42, 0.34, 0.53), 60_000)
 
 
 def skirt() -> Field:
@@ -144,10 +164,10 @@ def skirt() -> Field:
     return field
 
 
-def doll_hair() -> list[Part]:
+def doll_hair() -> list[PaintedPart]:
     """A cap with a fringe of pointed locks, ties of black and pink, and two tails that widen and end in points."""
     opening = ellipsoid((0, -0.22, 0.2), (0.172, 0.2, 0.155))  # through which the face shows
-    cap = cut(ellipsoid((0, 0.012, 0.27), (0.213, 0.205, 0.19)), opening)
+    cap = difference(ellipsoid((0, 0.012, 0.27), (0.213, 0.205, 0.19)), opening)
     ends = ((-0.135, 0.17), (-0.08, 0.292), (-0.028, 0.272), (0.028, 0.296), (0.082, 0.276), (0.138, 0.17))
     lines = torch.cat([lock(x, low) for x, low in ends])
     locks = tube(lines, 0.034 * (1.1 - torch.linspace(0, 1, 120) ** 2).repeat(len(ends)))
@@ -156,7 +176,7 @@ def doll_hair() -> list[Part]:
     knots = [(0.235, 0.03, 0.37), (0.32, 0.05, 0.33), (0.365, 0.08, 0.12), (0.34, 0.09, -0.15), (0.31, 0.06, -0.32),
              (0.37, 0.05, -0.46)]  # fmt: skip
     tail = tube(curve_through(knots, 400), width)
-    ties = mirrored(posed(torus((0, 0, 0), 0.045, 0.02), turn(y=68), (0.222, 0.03, 0.377)))
+    ties = mirrored(posed(torus((0, 0, 0), 0.045, 0.02), euler_rotation(y=68), (0.222, 0.03, 0.377)))
 
     def strands(p: Tensor) -> Tensor:
         wave = torch.sin(torch.atan2(p[:, 1] - 0.07, p[:, 0].abs() - 0.33) * 11 + 6 * noise(p, 0.15, 6)) * 0.5 + 0.5
@@ -165,13 +185,13 @@ def doll_hair() -> list[Part]:
     def crown(p: Tensor) -> Tensor:
         wave = torch.sin(torch.atan2(p[:, 0], 0.46 - p[:, 2]) * 26 + 5 * noise(p, 0.1, 6)) * 0.5 + 0.5
         rgb = mix((0.07, 0.55, 0.57), (0.2, 0.8, 0.77), wave)
-        return over(rgb, (0.5, 0.95, 0.92), (p[:, 2] - 0.395 - 0.012 * wave).abs() - 0.012)
+        return overlay(rgb, (0.5, 0.95, 0.92), (p[:, 2] - 0.395 - 0.012 * wave).abs() - 0.012)
 
     def tie(p: Tensor) -> Tensor:
-        return over(plain(BLACK)(p), (0.9, 0.25, 0.5), (p[:, 0].abs() - 0.23).abs() - 0.008)
+        return overlay(plain(BLACK)(p), (0.9, 0.25, 0.5), (p[:, 0].abs() - 0.23).abs() - 0.008)
 
     fringed = union(cap, locks, smooth=0.012)
-    return [Part(fringed, crown, 0.35), Part(mirrored(tail), strands, 0.3), Part(ties, tie, 0.3)]
+    return [PaintedPart(fringed, crown, 0.35), PaintedPart(mirrored(tail), strands, 0.3), PaintedPart(ties, tie, 0.3)]
 
 
 def lock(x: float, low: float) -> Float[Tensor, "m 3"]:

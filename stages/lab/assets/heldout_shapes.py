@@ -14,7 +14,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from stages.lab.assets.shapes import one_thread
+from stages.lab.assets.field_sampling import relax_points, sample_surface
+from stages.lab.assets.shapes import single_threaded
 from stages.lab.assets.signed_distance import (
     Field,
     capsule,
@@ -27,13 +28,12 @@ from stages.lab.assets.signed_distance import (
     tube,
     union,
 )
-from stages.lab.assets.surface import evened, spread
 
-SKIN = 0.008  # less than half the thickness of the thinnest wall
+SURFACE_BAND = 0.008  # less than half the thickness of the thinnest wall
 
 
 @dataclass(frozen=True)
-class Kind:
+class ShapeKind:
     """One object."""
 
     id: int
@@ -100,24 +100,26 @@ def horse() -> Field:
     return union(body, mirrored(union(hind, fore)), neck, head, smooth=0.04)
 
 
-KINDS = {
-    "bear": Kind(1, 0.65, 5e4, 500.0, bear), "cloth2": Kind(5, 1.0, 3e3, 100.0, towel),
-    "cloth3": Kind(6, 0.6, 3e3, 100.0, skirt), "duck2": Kind(8, 0.65, 5e5, 1200.0, goose),
-    "pillow2": Kind(13, 0.9, 1e4, 500.0, bolster), "rope2": Kind(15, 0.65, 5e3, 500.0, knot),
-    "soccer": Kind(16, 0.4, 3e6, 700.0, football), "toy": Kind(17, 0.7, 1e5, 500.0, horse),
+HELDOUT_SHAPES = {
+    "bear": ShapeKind(1, 0.65, 5e4, 500.0, bear), "cloth2": ShapeKind(5, 1.0, 3e3, 100.0, towel),
+    "cloth3": ShapeKind(6, 0.6, 3e3, 100.0, skirt), "duck2": ShapeKind(8, 0.65, 5e5, 1200.0, goose),
+    "pillow2": ShapeKind(13, 0.9, 1e4, 500.0, bolster), "rope2": ShapeKind(15, 0.65, 5e3, 500.0, knot),
+    "soccer": ShapeKind(16, 0.4, 3e6, 700.0, football), "toy": ShapeKind(17, 0.7, 1e5, 500.0, horse),
 }  # fmt: skip
 
 
-def surface(kind: Kind, n: int) -> Float[Tensor, "n 3"]:
+def surface_points(kind: ShapeKind, n: int) -> Float[Tensor, "n 3"]:
     """Points spread evenly over the surface of a shape, its longest side 1, about the centre of its box."""
-    return filled(kind, n, 0.5)[0]
+    return surface_and_interior_points(kind, n, 0.5)[0]
 
 
-def filled(kind: Kind, n: int, spacing: float) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "m 3"]]:
+def surface_and_interior_points(
+    kind: ShapeKind, n: int, spacing: float
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "m 3"]]:
     """The same, and the points of a cubic lattice inside of the shape, half a spacing below the surface or deeper."""
     field = kind.shape()
-    with one_thread():
-        points = evened(field, spread(field, (0.6, 0.6, 0.6), n, SKIN)).points
+    with single_threaded():
+        points = relax_points(field, sample_surface(field, (0.6, 0.6, 0.6), n, SURFACE_BAND)).points
     low, high = points.amin(0), points.amax(0)
     middle, side = (low + high) / 2, (high - low).max()
     axis = torch.arange((spacing - 1) / 2, 0.5, spacing)

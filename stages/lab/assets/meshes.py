@@ -13,11 +13,11 @@ from torch import Tensor
 from stages.core.errors import InputError
 from stages.core.scene.files import must_exist
 from stages.core.scene.gaussians import Gaussians
-from stages.lab.assets.shapes import Surface, one_thread, to_gaussians
-from stages.lab.assets.surface import normalised, shade
+from stages.lab.assets.field_sampling import diffuse_light, normalise_size
+from stages.lab.assets.shapes import Surface, single_threaded, to_gaussians
 
-KINDS = (".obj", ".glb", ".gltf", ".ply", ".stl", ".off")
-UPRIGHT = {"x": [[0, 1, 0], [0, 0, 1], [1, 0, 0]], "y": [[1, 0, 0], [0, 0, -1], [0, 1, 0]],
+MESH_SUFFIXES = (".obj", ".glb", ".gltf", ".ply", ".stl", ".off")
+UP_ROTATIONS = {"x": [[0, 1, 0], [0, 0, 1], [1, 0, 0]], "y": [[1, 0, 0], [0, 0, -1], [0, 1, 0]],
            "z": [[1, 0, 0], [0, 1, 0], [0, 0, 1]]}  # fmt: skip
 
 
@@ -28,16 +28,16 @@ def read_mesh(path: Path, count: int, up: str = "auto", light: bool = True) -> G
     light of the made objects into the colours; without it they are those of the file.
     """
     path = Path(path)
-    if path.suffix.lower() not in KINDS:
-        raise InputError(f"{path}: is no mesh that can be read; these kinds are: {' '.join(KINDS)}")
-    if up not in (*UPRIGHT, "auto"):
+    if path.suffix.lower() not in MESH_SUFFIXES:
+        raise InputError(f"{path}: is no mesh that can be read; these kinds are: {' '.join(MESH_SUFFIXES)}")
+    if up not in (*UP_ROTATIONS, "auto"):
         raise InputError(f"--up {up}: choose from auto, x, y, z")
     if count < 100:
         raise InputError(f"--count {count}: at least 100 Gaussians are needed to show a shape")
     up = ("y" if path.suffix.lower() in (".glb", ".gltf") else "z") if up == "auto" else up
     meshes = _load(path)
-    with one_thread():
-        return _splat(path, meshes, count, torch.tensor(UPRIGHT[up], dtype=torch.float32), light)
+    with single_threaded():
+        return _splat(path, meshes, count, torch.tensor(UP_ROTATIONS[up], dtype=torch.float32), light)
 
 
 def _splat(path: Path, meshes: list, count: int, R: Float[Tensor, "3 3"], light: bool) -> Gaussians:
@@ -46,8 +46,8 @@ def _splat(path: Path, meshes: list, count: int, R: Float[Tensor, "3 3"], light:
     surface = Surface(points[keep] @ R.mT, normals[keep] @ R.mT)
     size = (surface.points.amax(0) - surface.points.amin(0)).max()
     surface = Surface(surface.points / size, surface.normals)  # the width of a Gaussian is capped in these units
-    colours = rgb[keep] * shade(surface)[:, None] if light else rgb[keep]
-    return normalised(to_gaussians(surface, colours, 1, width=0.62))
+    colours = rgb[keep] * diffuse_light(surface)[:, None] if light else rgb[keep]
+    return normalise_size(to_gaussians(surface, colours, 1, width=0.62))
 
 
 def _load(path: Path) -> list:

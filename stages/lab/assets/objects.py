@@ -30,7 +30,9 @@ class ObjectKind:
     side: float = 1.0  # longest side as made [scene units]
 
 
-HARD, SOFT, FIGURES, PHONE = (f"stages.lab.assets.{name}" for name in ("vessels", "soft_objects", "figures", "phone"))
+HARD, SOFT, FIGURES, PHONE = (
+    f"stages.lab.assets.{name}" for name in ("hard_objects", "soft_objects", "figures", "phone")
+)
 OBJECTS = {
     kind.name: kind
     for kind in (
@@ -73,10 +75,10 @@ def make_object(name: str) -> Gaussians:
 
     The same Gaussians at every call; the scale of a scene is not applied.
     """
-    from stages.lab.assets.shapes import one_thread
+    from stages.lab.assets.shapes import single_threaded
 
     make = choose({kind.name: kind.make for kind in OBJECTS.values()}, _known(name))
-    with one_thread():
+    with single_threaded():
         g = make()
     side = OBJECTS[name].side
     return replace(g, means=g.means * side, scales=g.scales * side)
@@ -94,7 +96,7 @@ def run(
     """Write OUT/<name>/ for each object, or for each mesh when there are any; a line about each, and a sheet of all."""
     from stages.core.scene.files import provenance
     from stages.core.scene.images import write_jpeg
-    from stages.lab.assets.splat_files import portrait, write_object
+    from stages.lab.assets.splat_files import object_portrait, write_object
     from stages.render.overlay import tile_images
 
     if meshes and options.only:
@@ -108,7 +110,7 @@ def run(
         made_by = provenance("objects", [path], options) if path else provenance("objects", [])
         write_object(out / name, g, name, made_by)  # the same bytes whatever else was asked for
         if sheet:
-            pictures.append(portrait(g, ELEVATION.get(name, 24.0) if path is None else 24.0, name))
+            pictures.append(object_portrait(g, ELEVATION.get(name, 24.0) if path is None else 24.0, name))
         sides = " x ".join(f"{side:.2f}" for side in (g.means.amax(0) - g.means.amin(0)).tolist())
         yield f"{name}: {len(g)} Gaussians, {sides}"
     if sheet:

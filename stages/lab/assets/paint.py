@@ -13,7 +13,7 @@ from stages.lab.assets.signed_distance import polygon, polyline
 
 RGB = tuple[float, float, float]
 WHITE, BLACK = (0.95, 0.95, 0.94), (0.05, 0.05, 0.06)
-EDGE = 0.005  # width over which a layer fades, about the spacing of the Gaussians
+EDGE_WIDTH = 0.005  # width over which a layer fades, about the spacing of the Gaussians
 
 
 def plain(colour: RGB) -> Callable[[Tensor], Tensor]:
@@ -21,8 +21,8 @@ def plain(colour: RGB) -> Callable[[Tensor], Tensor]:
     return lambda p: torch.tensor(colour).expand(len(p), 3)
 
 
-def over(
-    rgb: Float[Tensor, "n 3"], colour: RGB | Tensor, distance: Float[Tensor, "n"], edge: float = EDGE
+def overlay(
+    rgb: Float[Tensor, "n 3"], colour: RGB | Tensor, distance: Float[Tensor, "n"], edge: float = EDGE_WIDTH
 ) -> Float[Tensor, "n 3"]:
     """`colour` laid over `rgb` where the distance is negative, fading over the width `edge`."""
     c = torch.as_tensor(colour)
@@ -34,12 +34,12 @@ def mix(a: RGB, b: RGB, t: Float[Tensor, "n"]) -> Float[Tensor, "n 3"]:
     return torch.tensor(a) + (torch.tensor(b) - torch.tensor(a)) * t.clamp(0, 1)[:, None]
 
 
-def woven(p: Tensor, rgb: Tensor, seed: int, size: float = 0.012, depth: float = 0.1) -> Tensor:
+def fabric(p: Tensor, rgb: Tensor, seed: int, size: float = 0.012, depth: float = 0.1) -> Tensor:
     """Brightness varied by noise, as cloth and plush vary."""
     return rgb * (1 + depth * (2 * noise(p, size, seed) - 1))[:, None]
 
 
-def disc(
+def ellipse2d(
     q: Float[Tensor, "n 2"], centre: Sequence[float], radii: float | Sequence[float], angle: float = 0.0
 ) -> Float[Tensor, "n"]:
     """Distance in the plane to an ellipse (first order), turned counterclockwise by `angle` radians."""
@@ -62,17 +62,17 @@ def stroke(q: Float[Tensor, "n 2"], corners: Sequence[tuple[float, float]], widt
     return polyline(corners)(q) - width / 2
 
 
-def shape(q: Float[Tensor, "n 2"], corners: Sequence[tuple[float, float]]) -> Tensor:
+def filled_polygon(q: Float[Tensor, "n 2"], corners: Sequence[tuple[float, float]]) -> Tensor:
     """Distance in the plane to a filled polygon."""
     return polygon(corners)(q)
 
 
-def either(*distances: Tensor) -> Tensor:
+def union2d(*distances: Tensor) -> Tensor:
     """Distance to the nearest of several shapes."""
     return torch.stack(distances).amin(0)
 
 
-def word(q: Float[Tensor, "n 2"], width: float) -> Tensor:
+def cola_lettering(q: Float[Tensor, "n 2"], width: float) -> Tensor:
     """Distance in the plane to the letters "cola", a round hand of x-height 1 that spans -2 to 2."""
 
     def ring(x: float) -> Tensor:
@@ -80,4 +80,4 @@ def word(q: Float[Tensor, "n 2"], width: float) -> Tensor:
 
     c = torch.maximum(ring(-1.45), q[:, 0] + 1.45 - 0.12 - 0.55 * q[:, 1].abs())
     l, stem = stroke(q, [(0.55, -0.5), (0.5, 1.0)], width), stroke(q, [(1.8, 0.5), (1.85, -0.5)], width)
-    return either(c, ring(-0.3), l, ring(1.3), stem)
+    return union2d(c, ring(-0.3), l, ring(1.3), stem)

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from stages.core.geometry.rotations import matrix
-from stages.lab.assets.heldout_shapes import Kind
+from stages.lab.assets.heldout_shapes import ShapeKind
 from stages.lab.assets.signed_distance import (
     Field,
     capsule,
@@ -28,26 +28,29 @@ from stages.lab.assets.signed_distance import (
     union,
 )
 
-FIRST = 1000  # id of the first
-SIZES = (0.3, 1.0)  # longest side [m]
-DENSITIES = (100.0, 2700.0)  # [kg/m^3]
-FIRMNESS = (10.0, 7400.0)  # Young's modulus over density [m^2/s^2]: from the rope to the phone, which the substep bears
-REACH = 0.55  # from the middle to the farthest point of a shape
+FIRST_ID = 1000  # id of the first
+SIZE_RANGE = (0.3, 1.0)  # longest side [m]
+DENSITY_RANGE = (100.0, 2700.0)  # [kg/m^3]
+SPECIFIC_STIFFNESS_RANGE = (
+    10.0,
+    7400.0,
+)  # Young's modulus over density [m^2/s^2]: from the rope to the phone, which the substep bears
+MAX_RADIUS = 0.55  # from the middle to the farthest point of a shape
 
 Draw = np.random.Generator
 
 
-def kinds(count: int, seed: int = 0) -> dict[str, Kind]:
+def random_shapes(count: int, seed: int = 0) -> dict[str, ShapeKind]:
     """So many objects; the first ones are the same however many there are."""
     made = {}
     for i in range(count):
         draw = np.random.default_rng([seed, i])
         name, family = list(FAMILIES.items())[i % len(FAMILIES)]
-        density = _log(draw, *DENSITIES)
+        density = _log(draw, *DENSITY_RANGE)
         field = family(draw)
         turn = matrix(torch.from_numpy(draw.normal(size=4)).float())
-        made[f"{name}{i}"] = Kind(
-            FIRST + i, _log(draw, *SIZES), density * _log(draw, *FIRMNESS), density,
+        made[f"{name}{i}"] = ShapeKind(
+            FIRST_ID + i, _log(draw, *SIZE_RANGE), density * _log(draw, *SPECIFIC_STIFFNESS_RANGE), density,
             lambda field=field, turn=turn: posed(field, turn),
         )  # fmt: skip
     return made
@@ -60,7 +63,7 @@ def _log(draw: Draw, low: float, high: float) -> float:
 def _sides(draw: Draw, thinnest: float = 0.12) -> list[float]:
     """Half sides of a box, no corner of which is farther than REACH."""
     half = np.exp(draw.uniform(math.log(thinnest), 0, 3))
-    return (REACH * half / np.linalg.norm(half)).tolist()
+    return (MAX_RADIUS * half / np.linalg.norm(half)).tolist()
 
 
 def _box(draw: Draw) -> Field:
@@ -77,12 +80,12 @@ def _sheet(draw: Draw) -> Field:
 
 
 def _egg(draw: Draw) -> Field:
-    return ellipsoid((0, 0, 0), np.exp(draw.uniform(math.log(0.15), math.log(REACH), 3)).tolist())
+    return ellipsoid((0, 0, 0), np.exp(draw.uniform(math.log(0.15), math.log(MAX_RADIUS), 3)).tolist())
 
 
 def _stick(draw: Draw) -> Field:
     thick, end = draw.uniform(0.04, 0.16, 2)
-    far = REACH - max(thick, end)
+    far = MAX_RADIUS - max(thick, end)
     return capsule((-far, 0, 0), (far, 0, 0), thick, end)
 
 
@@ -100,7 +103,7 @@ def _lump(draw: Draw) -> Field:
 
 def _ring(draw: Draw) -> Field:
     thick = draw.uniform(0.05, 0.15)
-    return torus((0, 0, 0), REACH - thick, thick)
+    return torus((0, 0, 0), MAX_RADIUS - thick, thick)
 
 
 def _doll(draw: Draw) -> Field:

@@ -16,7 +16,7 @@ from stages.core.scene.gaussians import Gaussians
 
 
 @contextmanager
-def one_thread() -> Iterator[None]:
+def single_threaded() -> Iterator[None]:
     """PyTorch on one thread: the vector and scalar forms of sin or pow differ in the last bit, and how many threads
     share a tensor decides which element meets which."""
     threads = torch.get_num_threads()

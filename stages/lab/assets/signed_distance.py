@@ -16,7 +16,7 @@ from torch import Tensor
 
 Field = Callable[[Tensor], Tensor]
 Vec = tuple[float, float, float]
-FAR = 0.15  # beyond what shading looks at
+TUBE_FAR_DISTANCE = 0.15  # beyond what shading looks at
 
 
 def _floats(values: Sequence) -> Tensor:
@@ -24,7 +24,7 @@ def _floats(values: Sequence) -> Tensor:
     return torch.tensor(values, dtype=torch.float32)
 
 
-def turn(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Float[Tensor, "3 3"]:
+def euler_rotation(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Float[Tensor, "3 3"]:
     """Rz Ry Rx of angles in degrees."""
     R = torch.eye(3)
     for axis, angle in enumerate((x, y, z)):
@@ -107,13 +107,13 @@ def tube(curve: Float[Tensor, "m 3"], radius: Float[Tensor, "m"] | float) -> Fie
     """Round tube along a finely sampled curve; the radius may vary along it. Far off, at least FAR."""
     radii = torch.as_tensor(radius).expand(len(curve))
     tree = cKDTree(curve.numpy())
-    reach = float(radii.max()) + FAR  # looking no further makes it several times faster
+    reach = float(radii.max()) + TUBE_FAR_DISTANCE  # looking no further makes it several times faster
 
     def field(p: Tensor) -> Tensor:
         distance, index = tree.query(p.numpy(), distance_upper_bound=reach, workers=-1)
         far = index == len(curve)
         near = distance - radii.numpy()[np.where(far, 0, index)]
-        return torch.from_numpy(np.where(far, FAR, near)).float()
+        return torch.from_numpy(np.where(far, TUBE_FAR_DISTANCE, near)).float()
 
     return field
 
@@ -147,7 +147,7 @@ def union(*fields: Field, smooth: float = 0.0) -> Field:
     return field
 
 
-def cut(field: Field, *others: Field) -> Field:
+def difference(field: Field, *others: Field) -> Field:
     """The first shape without the others."""
 
     def left(p: Tensor) -> Tensor:

@@ -21,14 +21,14 @@ from stages.core.scene.scene import Scene, SceneObject
 from stages.core.scene.scene_ply import write_scene
 from stages.render.overlay import draw_caption
 
-PLY = "point_cloud/iteration_30000/point_cloud.ply"
+POINT_CLOUD = "point_cloud/iteration_30000/point_cloud.ply"
 VIEWS, RESOLUTION = 100, 1280  # of cameras.json, as the data set renders
-PAPER = torch.tensor([0.955, 0.95, 0.94])  # behind the pictures
+SHEET_BACKGROUND = torch.tensor([0.955, 0.95, 0.94])  # behind the pictures
 
 
 def write_object(folder: Path, g: Gaussians, name: str, provenance: dict) -> None:
     """FOLDER/point_cloud/iteration_30000/point_cloud.ply and FOLDER/cameras.json, an orbit around the object."""
-    ply = folder / PLY
+    ply = folder / POINT_CLOUD
     ply.parent.mkdir(parents=True, exist_ok=True)
     write_scene(ply, Scene(g, (SceneObject(1, name),), None, None, provenance=provenance))
     with replacing(folder / "cameras.json") as part:
@@ -45,7 +45,7 @@ def camera_rows(viewmats: Float[Tensor, "c 4 4"], size: int) -> list[dict]:
     ]  # fmt: skip
 
 
-def portrait(g: Gaussians, elevation: float, label: str, size: int = 280) -> Float[Tensor, "h w 3"]:
+def object_portrait(g: Gaussians, elevation: float, label: str, size: int = 280) -> Float[Tensor, "h w 3"]:
     """An object around the origin, as large as fits, on white ground with its shadow, from above view 0."""
     side = float((g.means.amax(0) - g.means.amin(0)).max())
     g = replace(g, means=g.means / side, scales=g.scales / side)
@@ -53,7 +53,7 @@ def portrait(g: Gaussians, elevation: float, label: str, size: int = 280) -> Flo
     return _photo(concatenate([_ground(g), g]), eye, torch.zeros(3), size, size, 1.6 * size, label)
 
 
-def view_of_table(g: Gaussians, label: str) -> Float[Tensor, "h w 3"]:
+def background_portrait(g: Gaussians, label: str) -> Float[Tensor, "h w 3"]:
     """A background with its table whole, from a corner of the room."""
     eye = torch.tensor([0.0, 0, -1.1]) + 6.9 * _direction(24.0, -52.0)
     return _photo(g, eye, torch.tensor([0.0, 0, -1.1]), 340, 255, 330.0, label)
@@ -68,7 +68,7 @@ def _direction(elevation: float, azimuth: float = -75.0) -> Float[Tensor, "3"]:
 def _photo(g: Gaussians, eye: Tensor, target: Tensor, width: int, height: int, focal: float, label: str) -> Tensor:
     """Drawn at twice the size, made smaller, and labelled."""
     K = intrinsics(2 * width, 2 * height, 2 * focal)
-    drawn = rasterise(g, look_at(eye, target)[None], K[None], 2 * width, 2 * height, PAPER)
+    drawn = rasterise(g, look_at(eye, target)[None], K[None], 2 * width, 2 * height, SHEET_BACKGROUND)
     return draw_caption(resize(drawn.rgb[0].clamp(0, 1), width, height), label)
 
 
@@ -78,7 +78,7 @@ def _ground(g: Gaussians) -> Gaussians:
     line = torch.arange(-1.3, 1.3, step)
     flat = torch.nn.functional.pad(torch.cartesian_prod(line, line), (0, 1), value=float(g.means[:, 2].min()) - 0.004)
     near = knn(g.means[::7].contiguous(), flat, 1)[0][:, 0]
-    rgb = PAPER * (1 - 0.55 * torch.exp(-near / 0.09))[:, None]
+    rgb = SHEET_BACKGROUND * (1 - 0.55 * torch.exp(-near / 0.09))[:, None]
     n = len(flat)
     return Gaussians(
         flat, torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1), torch.tensor([[0.02, 0.02, 0.001]]).repeat(n, 1),

@@ -18,17 +18,17 @@ from stages.core.geometry.rotations import multiply, quaternion
 from stages.core.scene.cameras import Cameras
 from stages.core.scene.gaussians import Gaussians, concatenate
 from stages.core.scene.scene import Scene, SceneObject
-from stages.lab.assets.backgrounds import BACKGROUNDS, TOP, make_background
+from stages.lab.assets.backgrounds import BACKGROUNDS, TABLE_HEIGHT, make_background
 from stages.lab.assets.objects import OBJECTS, make_object
 
-KINDS = ("apart", "touching")
-EACH = 5  # objects a scene, so that two scenes show all ten
-REACH = 1.5  # things stay this near the middle of the table [m]
-GAP = 0.12  # at least, between things that stand apart [m]
-CONTACT = 0.015  # between the nearest Gaussians of things that touch [m], about their spacing
-SAMPLE = 4000  # Gaussians of a thing that distances are measured between
+ARRANGEMENTS = ("apart", "touching")
+OBJECTS_PER_SCENE = 5  # objects a scene, so that two scenes show all ten
+MAX_RADIUS = 1.5  # things stay this near the middle of the table [m]
+MIN_GAP = 0.12  # at least, between things that stand apart [m]
+CONTACT_GAP = 0.015  # between the nearest Gaussians of things that touch [m], about their spacing
+DISTANCE_SAMPLES = 4000  # Gaussians of a thing that distances are measured between
 WIDTH, HEIGHT, FOCAL = 640, 480, 640.0  # of the photos [px]
-DISTANCE = 3.8  # of the cameras, as in the data set [m]
+CAMERA_DISTANCE = 3.8  # of the cameras, as in the data set [m]
 
 
 def tabletop(kind: str, index: int, photos: int = 24) -> Scene:
@@ -36,18 +36,18 @@ def tabletop(kind: str, index: int, photos: int = 24) -> Scene:
 
     Two scenes in a row show all ten objects; touching are the first three, and the last two.
     """
-    rng = np.random.default_rng([KINDS.index(kind), index // 2])
-    names = list(rng.permutation(list(OBJECTS)))[EACH * (index % 2) :][:EACH]
-    rng = np.random.default_rng([KINDS.index(kind), index, 1])
+    rng = np.random.default_rng([ARRANGEMENTS.index(kind), index // 2])
+    names = list(rng.permutation(list(OBJECTS)))[OBJECTS_PER_SCENE * (index % 2) :][:OBJECTS_PER_SCENE]
+    rng = np.random.default_rng([ARRANGEMENTS.index(kind), index, 1])
     clusters = [[name] for name in names] if kind == "apart" else [names[:3], names[3:]]
     placed: list[Gaussians] = []
     for cluster in clusters:
         together = _huddle(rng, [_turned(_resting(name), rng.uniform(0, 2 * math.pi)) for name in cluster])
         placed += _room_for(rng, together, placed)
     numbered = [replace(g, object_id=torch.full((len(g),), i)) for i, g in enumerate(placed, start=1)]
-    table = make_background(list(BACKGROUNDS)[(2 * index + KINDS.index(kind)) % len(BACKGROUNDS)])
+    table = make_background(list(BACKGROUNDS)[(2 * index + ARRANGEMENTS.index(kind)) % len(BACKGROUNDS)])
     objects = tuple(SceneObject(i, str(name)) for i, name in enumerate(names, start=1))
-    return Scene(concatenate([table, *numbered]), objects, _cameras(photos), TOP)
+    return Scene(concatenate([table, *numbered]), objects, _cameras(photos), TABLE_HEIGHT)
 
 
 @cache
@@ -59,7 +59,7 @@ def _resting(name: str) -> Gaussians:
     if name == "phone":
         g = _rotated(g, torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]))
     low = float(g.means[:, 2].quantile(0.0005))  # a thread may hang lower
-    return _moved(g, torch.tensor([0.0, 0.0, TOP - low + 0.002]))
+    return _moved(g, torch.tensor([0.0, 0.0, TABLE_HEIGHT - low + 0.002]))
 
 
 def _rotated(g: Gaussians, R: Float[Tensor, "3 3"]) -> Gaussians:
@@ -77,7 +77,7 @@ def _moved(g: Gaussians, offset: Float[Tensor, "3"]) -> Gaussians:
 
 
 def _points(g: Gaussians) -> np.ndarray:
-    return g.means[:: max(1, len(g) // SAMPLE)].double().numpy()
+    return g.means[:: max(1, len(g) // DISTANCE_SAMPLES)].double().numpy()
 
 
 def _huddle(rng: np.random.Generator, things: list[Gaussians]) -> list[Gaussians]:
@@ -88,8 +88,8 @@ def _huddle(rng: np.random.Generator, things: list[Gaussians]) -> list[Gaussians
         angle = rng.uniform(0, 2 * math.pi)
         way = np.array([math.cos(angle), math.sin(angle), 0.0])
         far = 3.0
-        while (gap := tree.query(mine + far * way)[0].min()) > CONTACT:
-            far -= max(gap - CONTACT, 0.002)  # never into each other: no point comes nearer faster than this
+        while (gap := tree.query(mine + far * way)[0].min()) > CONTACT_GAP:
+            far -= max(gap - CONTACT_GAP, 0.002)  # never into each other: no point comes nearer faster than this
             if far < -3.0:
                 raise ValueError("two things pass by each other")
         out = [*out, _moved(thing, torch.tensor(far * way).float())]
@@ -103,11 +103,11 @@ def _room_for(rng: np.random.Generator, things: list[Gaussians], others: list[Ga
     mine_at = mine.mean(0)
     tree = cKDTree(np.concatenate([_points(g)[:, :2] for g in others])) if others else None
     for attempt in range(4000):
-        shift = rng.uniform(-REACH, REACH, 2) - mine_at
-        wide = REACH * (1 + attempt / 8000)
+        shift = rng.uniform(-MAX_RADIUS, MAX_RADIUS, 2) - mine_at
+        wide = MAX_RADIUS * (1 + attempt / 8000)
         if np.linalg.norm(mine + shift, axis=1).max() > wide:
             continue
-        if tree is None or tree.query(mine + shift)[0].min() > GAP:
+        if tree is None or tree.query(mine + shift)[0].min() > MIN_GAP:
             return [_moved(g, torch.tensor([*shift, 0.0]).float()) for g in things]
     raise ValueError("the table is too small")
 
@@ -115,8 +115,11 @@ def _room_for(rng: np.random.Generator, things: list[Gaussians], others: list[Ga
 def _cameras(count: int) -> Cameras:
     """Two rings of views, a low one and a high one."""
     low = count * 3 // 5
-    centre = torch.tensor([0.0, 0.0, TOP + 0.2])
-    rings = [orbit(low, centre, DISTANCE, 22.0), orbit(count - low, centre, DISTANCE, 48.0, azimuth=127.0)]
+    centre = torch.tensor([0.0, 0.0, TABLE_HEIGHT + 0.2])
+    rings = [
+        orbit(low, centre, CAMERA_DISTANCE, 22.0),
+        orbit(count - low, centre, CAMERA_DISTANCE, 48.0, azimuth=127.0),
+    ]
     K = intrinsics(WIDTH, HEIGHT, FOCAL).expand(count, 3, 3).clone()
     names = tuple(f"{i:02d}.jpg" for i in range(count))
     return Cameras(torch.cat(rings), K, torch.tensor([[WIDTH, HEIGHT]] * count), names)

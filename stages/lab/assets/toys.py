@@ -80,10 +80,12 @@ def _block(centre: tuple) -> Gaussians:
 
 def _duck(centre: tuple) -> Gaussians:
     """Body, raised tail, head, and an orange beak; two dark eyes."""
-    parts = [_part((0.075, 0.052, 0.048), (0, 0, 0), 7000),
-             _part((0.03, 0.028, 0.02), (0.068, 0, 0.028), 1500),
-             _part((0.038, 0.036, 0.036), (-0.048, 0, 0.062), 4200),
-             _part((0.022, 0.02, 0.008), (-0.086, 0, 0.055), 900)]
+    parts = [
+        _part((0.075, 0.052, 0.048), (0, 0, 0), 7000),
+        _part((0.03, 0.028, 0.02), (0.068, 0, 0.028), 1500),
+        _part((0.038, 0.036, 0.036), (-0.048, 0, 0.062), 4200),
+        _part((0.022, 0.02, 0.008), (-0.086, 0, 0.055), 900),
+    ]
     s = union(*parts)
     p = s.points
     rgb = torch.tensor([0.95, 0.78, 0.12]).expand(len(p), 3)

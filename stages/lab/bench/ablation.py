@@ -20,8 +20,8 @@ from stages.core.backends import pick_device
 from stages.core.errors import InputError
 from stages.core.scene.files import replacing
 from stages.lab.bench import common as bench
-from stages.lab.dataset.motions import Motions
-from stages.lab.dataset.scenes import OTHERS, groups_of
+from stages.lab.dataset.keypoint_motions import KeypointMotions
+from stages.lab.dataset.scene_configs import EXTRA_GROUPS, parse_groups
 from stages.lab.training.ablation import ABLATIONS, Ablation
 from stages.lab.training.data import VALIDATION_SCENES, ClipSampler, read_groups, train_validation_split
 from stages.lab.training.distributed import ProcessGroup
@@ -65,7 +65,9 @@ def run(data: Path, out: Path, options: AblationBenchOptions = AblationBenchOpti
     facts = _before(Path(out), asked) or {"options": asked, "machine": bench.machine(device), "rows": {}}
     for name in names:
         if name not in facts["rows"]:
-            facts["rows"][name] = _measured(ABLATIONS[name], data, base, groups_of(options.test, more=OTHERS), device)
+            facts["rows"][name] = _measured(
+                ABLATIONS[name], data, base, parse_groups(options.test, more=EXTRA_GROUPS), device
+            )
             facts["rows"] = {k: facts["rows"][k] for k in ABLATIONS if k in facts["rows"]}
             facts["date"] = datetime.now(timezone.utc).date().isoformat()
             _write(Path(out), facts)
@@ -76,7 +78,7 @@ def _measured(choice: Ablation, data: Path, base: TrainOptions, test: list[str],
     """Scores after training."""
     options = choice.options(base)
     known, unseen = train_validation_split(
-        read_groups(data, groups_of(options.groups, more=OTHERS), options.keypoints), VALIDATION_SCENES
+        read_groups(data, parse_groups(options.groups, more=EXTRA_GROUPS), options.keypoints), VALIDATION_SCENES
     )
     scenes = read_groups(data, test, options.keypoints)
     torch.manual_seed(options.seed)
@@ -94,7 +96,7 @@ def _measured(choice: Ablation, data: Path, base: TrainOptions, test: list[str],
             "parameters": sum(p.numel() for p in trainee.params)}  # fmt: skip
 
 
-def _frames(scenes: Motions) -> int:
+def _frames(scenes: KeypointMotions) -> int:
     return min(VALIDATION_FRAMES, scenes.points.shape[1])
 
 

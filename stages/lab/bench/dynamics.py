@@ -30,7 +30,7 @@ from stages.core.models.dynamics import Dynamics
 from stages.core.models.rollout import Stepper, frames
 from stages.core.scene.files import must_exist, replacing
 from stages.evaluate.dynamics import all_metrics, error_over_time
-from stages.lab.assets.heldout_shapes import KINDS
+from stages.lab.assets.heldout_shapes import HELDOUT_SHAPES
 from stages.lab.assets.objects import OBJECTS
 from stages.lab.bench import common as bench
 from stages.lab.bench.dynamics_baselines import (
@@ -42,7 +42,7 @@ from stages.lab.bench.dynamics_baselines import (
     shared_scenes,
 )
 from stages.lab.bench.dynamics_report import PUBLISHED, report, table
-from stages.lab.dataset.motions import Motions
+from stages.lab.dataset.keypoint_motions import KeypointMotions
 from stages.lab.training.data import motions_folder, read_groups
 
 log = logging.getLogger(__name__)
@@ -62,7 +62,7 @@ FREE_FALL, NUDGED, RIGID_FIT, MPM_ESTIMATED = (
     "truth, best rigid fit",
     "mpm-estimated",
 )
-NAMES = {kind.id: name for name, kind in (*OBJECTS.items(), *KINDS.items())}
+NAMES = {kind.id: name for name, kind in (*OBJECTS.items(), *HELDOUT_SHAPES.items())}
 
 
 @dataclass(frozen=True)
@@ -162,7 +162,7 @@ def _there(data: Path, split: str) -> bool:
     return not missing
 
 
-def split_scenes(data: Path, split: str, options: DynamicsBenchOptions) -> Motions:
+def split_scenes(data: Path, split: str, options: DynamicsBenchOptions) -> KeypointMotions:
     """The scenes of a split, no longer than it is measured."""
     groups, frames = SPLITS[split]
     motions = read_groups(data, groups, options.keypoints)
@@ -175,7 +175,9 @@ def split_scenes(data: Path, split: str, options: DynamicsBenchOptions) -> Motio
     return replace(motions[rows], points=motions.points[rows, :frames])
 
 
-def _again_made(nudged: Path, splits: dict[str, Motions], options: DynamicsBenchOptions) -> Iterator[tuple[str, dict]]:
+def _again_made(
+    nudged: Path, splits: dict[str, KeypointMotions], options: DynamicsBenchOptions
+) -> Iterator[tuple[str, dict]]:
     """The nudged scenes against the true ones, split by split."""
     for split, motions in splits.items():
         if _there(nudged, split):
@@ -183,7 +185,7 @@ def _again_made(nudged: Path, splits: dict[str, Motions], options: DynamicsBench
             yield split, _compared(made, motions, options.batch)
 
 
-def _compared(made: Motions, motions: Motions, batch: int) -> dict:
+def _compared(made: KeypointMotions, motions: KeypointMotions, batch: int) -> dict:
     """Scenes made otherwise against the true ones; those that went wrong are counted, and left out."""
     both = shared_scenes(motions, made)
     if not len(both):
@@ -192,7 +194,7 @@ def _compared(made: Motions, motions: Motions, batch: int) -> dict:
             len(motions) - len(both)}  # fmt: skip
 
 
-def _mpm(data: Path, splits: dict[str, Motions], options: DynamicsBenchOptions, device: str) -> dict:
+def _mpm(data: Path, splits: dict[str, KeypointMotions], options: DynamicsBenchOptions, device: str) -> dict:
     """MPM with estimated materials; of objects that the paper has no estimates for, nothing."""
     row: dict = {"splits": {}}
     for split, motions in splits.items():
@@ -207,7 +209,7 @@ def _mpm(data: Path, splits: dict[str, Motions], options: DynamicsBenchOptions, 
     return row
 
 
-def _model(file: Path, splits: dict[str, Motions], options: DynamicsBenchOptions, device: str) -> dict:
+def _model(file: Path, splits: dict[str, KeypointMotions], options: DynamicsBenchOptions, device: str) -> dict:
     model, card = weights.load(file, device)
     learned = card.get("options", {}).get("keypoints", options.keypoints)  # more of them it has never seen
     splits = {n: replace(m, points=m.points[..., :learned, :]) for n, m in splits.items()}
@@ -223,12 +225,12 @@ def _model(file: Path, splits: dict[str, Motions], options: DynamicsBenchOptions
 
 
 def _rolled(model: Dynamics) -> Predict:
-    return lambda some: model.rollout(some.world(), some.points.shape[1], some.dt)
+    return lambda some: model.rollout(some.initial_conditions(), some.points.shape[1], some.dt)
 
 
-def _seconds(model: Dynamics, motions: Motions, device: str) -> float:
+def _seconds(model: Dynamics, motions: KeypointMotions, device: str) -> float:
     """Wall time of TIMED steps of one scene, as the command rolls it out [s], without what is recorded once."""
-    one = motions[:1].world()
+    one = motions[:1].initial_conditions()
     stepper = Stepper(model, one, motions.dt)
 
     def again() -> None:
@@ -238,7 +240,7 @@ def _seconds(model: Dynamics, motions: Motions, device: str) -> float:
     return _digits(bench.median_seconds(again, device, 3), 3)
 
 
-def evaluate_predictor(predict: Predict, motions: Motions, batch: int) -> dict:
+def evaluate_predictor(predict: Predict, motions: KeypointMotions, batch: int) -> dict:
     """Metrics averaged over the scenes; curves of the error [m] by frame, and by frame for each kind of object.
 
     A rollout that is not finite has no RMSE, and an R of 0: it is not left out.
@@ -246,7 +248,7 @@ def evaluate_predictor(predict: Predict, motions: Motions, batch: int) -> dict:
     metrics, errors = [], []
     for first in tqdm(range(0, len(motions), batch), unit="batch", leave=False):
         some = motions[first : first + batch]
-        valid, predicted = some.world().valid, predict(some)
+        valid, predicted = some.initial_conditions().valid, predict(some)
         metrics.append(all_metrics(predicted, some.points, valid))
         errors.append(error_over_time(predicted, some.points, valid))
     each = {k: torch.cat([m[k] for m in metrics]) for k in METRICS}

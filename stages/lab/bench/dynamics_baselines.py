@@ -21,14 +21,14 @@ from stages.core.geometry.rotations import nearest_rotation
 from stages.core.models.initial_conditions import World
 from stages.lab.assets.objects import OBJECTS
 from stages.lab.bench import common as bench
-from stages.lab.dataset.motions import Motions, joined
-from stages.lab.dataset.particles import Asset, Fineness, assets
-from stages.lab.dataset.scenes import Config, read_configs
+from stages.lab.dataset.keypoint_motions import KeypointMotions, concatenate_motions
+from stages.lab.dataset.object_particles import Asset, Discretisation, load_assets
+from stages.lab.dataset.scene_configs import SceneConfig, read_scene_configs
 from stages.lab.dataset.simulation import simulate
 from stages.lab.training.data import motions_folder
 
 log = logging.getLogger(__name__)
-Predict = Callable[[Motions], Float[Tensor, "s t o n 3"]]
+Predict = Callable[[KeypointMotions], Float[Tensor, "s t o n 3"]]
 # E [Pa] and density [kg/m^3] of the objects of GSCollision as the paper's vision-language model estimated them
 VLM_MATERIALS = {
     "ball": (573343.68, 1300.0), "bowl": (859029.80, 1200.0), "can": (19714313.88, 1060.0), "cloth": (2257.12, 100.0),
@@ -37,9 +37,9 @@ VLM_MATERIALS = {
 }  # fmt: skip
 
 
-def predict_free_fall(some: Motions) -> Float[Tensor, "s t o n 3"]:
+def predict_free_fall(some: KeypointMotions) -> Float[Tensor, "s t o n 3"]:
     """No learning: objects fall as they stand."""
-    return free_fall(some.world(), some.points.shape[1], some.dt)
+    return free_fall(some.initial_conditions(), some.points.shape[1], some.dt)
 
 
 def free_fall(world: World, frames: int, dt: float) -> Float[Tensor, "b t o n 3"]:
@@ -53,7 +53,7 @@ def free_fall(world: World, frames: int, dt: float) -> Float[Tensor, "b t o n 3"
     return points.masked_fill(~world.valid[:, None, ..., None], 0.0)
 
 
-def predict_rigid_fit(some: Motions) -> Float[Tensor, "s t o n 3"]:
+def predict_rigid_fit(some: KeypointMotions) -> Float[Tensor, "s t o n 3"]:
     """The truth with every object replaced, in every frame, by its shape at rest in the pose that fits best.
 
     No model of rigid bodies can come nearer. Source of the fit: Kabsch 1976, A32, 922.
@@ -70,11 +70,11 @@ def rigid_fit(points: Float[Tensor, "s t o n 3"], valid: Bool[Tensor, "s o n"]) 
     return fitted.masked_fill(~valid[:, None, ..., None], 0.0)
 
 
-def predict_from(made: Motions, frames: int) -> Predict:
+def predict_from(made: KeypointMotions, frames: int) -> Predict:
     """Motions of the same scenes, made otherwise, looked up by name."""
     row = {name: i for i, name in enumerate(made.names)}
 
-    def predict(some: Motions) -> Tensor:
+    def predict(some: KeypointMotions) -> Tensor:
         _, t, o, n, _ = some.points.shape
         if made.points.shape[1] < frames or made.points.shape[2] < o or made.points.shape[3] < n:
             raise InputError(f"{some.names[0]}: was made again with fewer frames, objects or keypoints than it has")
@@ -83,7 +83,7 @@ def predict_from(made: Motions, frames: int) -> Predict:
     return predict
 
 
-def shared_scenes(motions: Motions, made: Motions) -> Motions:
+def shared_scenes(motions: KeypointMotions, made: KeypointMotions) -> KeypointMotions:
     """The scenes that are in both."""
     there = set(made.names)
     return motions[torch.tensor([i for i, name in enumerate(motions.names) if name in there], dtype=torch.int64)]
@@ -107,13 +107,13 @@ class Resimulation:
                 continue
             if _options(motions_folder(data) / f"{group}.h5") != made:
                 raise InputError(f"{data}: {group} and {groups[0]} were made at different finenesses; make them alike")
-            self.configs.update(read_configs(folder / "scene_configs" / f"{group}.json"))
-        self.fineness = Fineness(made["dx"], made["spacing"], made["substep"])
-        self.things = with_estimated_materials(assets(self.fineness, made["keypoints"], folder / "particles.npz"))
+            self.configs.update(read_scene_configs(folder / "scene_configs" / f"{group}.json"))
+        self.fineness = Discretisation(made["dx"], made["spacing"], made["substep"])
+        self.things = with_estimated_materials(load_assets(self.fineness, made["keypoints"], folder / "particles.npz"))
 
-    def __call__(self, names: tuple[str, ...], frames: int, keypoints: int) -> Motions:
+    def __call__(self, names: tuple[str, ...], frames: int, keypoints: int) -> KeypointMotions:
         """Scenes that went wrong are missing."""
-        return joined(list(self._parts({name: self._config(name) for name in names}, frames, keypoints)))
+        return concatenate_motions(list(self._parts({name: self._config(name) for name in names}, frames, keypoints)))
 
     def seconds(self, name: str, steps: int) -> float:
         """Wall time of one scene alone [s], the making of the solver included, once it is compiled."""
@@ -121,11 +121,11 @@ class Resimulation:
         list(self._parts(one, 3, 1))
         return bench.median_seconds(lambda: list(self._parts(one, steps + 1, 1)), self.device, 1)
 
-    def _parts(self, configs: dict[str, Config], frames: int, keypoints: int) -> Iterator[Motions]:
+    def _parts(self, configs: dict[str, SceneConfig], frames: int, keypoints: int) -> Iterator[KeypointMotions]:
         for part in simulate(configs, self.things, self.fineness, frames, keypoints, self.device):
             yield part.to("cpu")
 
-    def _config(self, name: str) -> Config:
+    def _config(self, name: str) -> SceneConfig:
         if name not in self.configs:
             raise InputError(f"{name}: no such scene in scene_configs; make configurations and motions together")
         return self.configs[name]

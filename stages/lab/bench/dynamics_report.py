@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from stages.core.scene.files import replacing
-from stages.lab.plot import Panel, draw
+from stages.lab.plot import Panel, draw_panels
 
 # NGFF paper (ICLR 2026), Table 1 and ablation, on its own data: RMSE, FPE, R by split, and seconds for 100 steps on an
 # H100; of the first three models only the mean over 4 and 6 objects is known, which stands in both places
@@ -43,7 +43,7 @@ def report(results: Path, facts: dict) -> None:
     """RESULTS.md and RESULTS.png beside RESULTS.json."""
     with replacing(results.with_suffix(".md")) as part:
         part.write_text("\n".join(markdown(results.stem, facts)) + "\n")
-    draw(results.with_suffix(".png"), panels(facts), PLOT_COLUMNS)
+    draw_panels(results.with_suffix(".png"), panels(facts), PLOT_COLUMNS)
 
 
 def _cells(facts: dict) -> tuple[Cells, list[Cells], list[Cells]]:

@@ -25,8 +25,8 @@ from stages.core.raster.rasterise import rasterise, visibility
 from stages.core.scene.files import replacing
 from stages.core.scene.gaussians import Gaussians
 from stages.core.scene.scene import Scene
-from stages.lab.assets.backgrounds import TOP
-from stages.lab.assets.tabletops import DISTANCE, tabletop
+from stages.lab.assets.backgrounds import TABLE_HEIGHT
+from stages.lab.assets.tabletops import CAMERA_DISTANCE, tabletop
 from stages.lab.bench import common as bench
 from stages.refine.options import RefineOptions
 from stages.refine.stage import refine
@@ -79,12 +79,12 @@ def measure(index: int, photos: int) -> dict:
     start = time.perf_counter()
     refined = refine(seen, RefineOptions(completer="none"))  # the objects go anyway
     took = time.perf_counter() - start
-    views = orbit(NOVEL_VIEWS, torch.tensor([0.0, 0, TOP]), DISTANCE, 60.0, azimuth=10.0)
+    views = orbit(NOVEL_VIEWS, torch.tensor([0.0, 0, TABLE_HEIGHT]), CAMERA_DISTANCE, 60.0, azimuth=10.0)
     true, _ = render_background(scene.gaussians, views, scene)
     before, _ = render_background(seen.gaussians, views, scene)
     after, _ = render_background(refined.gaussians, views, scene)
     # through a hole one sees the floor, so the table top alone says where the holes are
-    tops = (g[g.means[:, 2] > TOP - 0.02] for g in (scene.gaussians, seen.gaussians))
+    tops = (g[g.means[:, 2] > TABLE_HEIGHT - 0.02] for g in (scene.gaussians, seen.gaussians))
     whole, left = (render_background(top, views, scene)[1] for top in tops)
     hole = (whole > MIN_TABLE_ALPHA) & (left < MIN_TABLE_ALPHA)
     return {

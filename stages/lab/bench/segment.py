@@ -26,7 +26,7 @@ from stages.core.errors import InputError
 from stages.core.models.sam2 import weights as sam2_weights
 from stages.core.scene.files import replacing
 from stages.core.scene.scene import Scene
-from stages.lab.assets.tabletops import KINDS, tabletop
+from stages.lab.assets.tabletops import ARRANGEMENTS, tabletop
 from stages.lab.bench import common as bench
 from stages.lab.bench.reconstructed_scene import reconstruct_from_renders, visible_labels
 from stages.segment.boxes import segment as boxes_segment
@@ -185,17 +185,17 @@ def run(out: Path | None = None, options: SegmentBenchOptions = SegmentBenchOpti
         model = None
         yield f"without sam2: {error}"
     rows = []
-    for kind in KINDS:
+    for kind in ARRANGEMENTS:
         for i in tqdm(range(options.scenes), desc=kind, unit="scene"):
             rows += measure(kind, i, options.photos, model)
             rows += [measure_reconstructed(kind, i, options.photos)] if options.reconstruct else []
             for row in rows[-len({r["way"] for r in rows}) :]:
                 listed = ", ".join(f"{n} {v:.2f}" for n, v in row["iou"].items())
                 yield f"{kind} {i}, {row['way']}: mean {row['mean']:.3f}; {listed}"
-    means = {kind: _means([row for row in rows if row["kind"] == kind]) for kind in KINDS}
-    yield f"{'mean IoU':<28}" + "".join(f"{kind:>10}" for kind in KINDS)
-    for way in means[KINDS[0]]:
-        yield f"{way:<28}" + "".join(f"{means[kind][way]:>10.3f}" for kind in KINDS)
+    means = {kind: _means([row for row in rows if row["kind"] == kind]) for kind in ARRANGEMENTS}
+    yield f"{'mean IoU':<28}" + "".join(f"{kind:>10}" for kind in ARRANGEMENTS)
+    for way in means[ARRANGEMENTS[0]]:
+        yield f"{way:<28}" + "".join(f"{means[kind][way]:>10.3f}" for kind in ARRANGEMENTS)
     if out is not None:
         facts = {"command": "ngff-lab bench segment", "machine": bench.machine("cpu")}
         with replacing(out) as part:

@@ -194,7 +194,7 @@ def yield_stress(strength: float) -> tuple[float, float]:
 
 def figure(out: Path) -> None:
     """Draw what was measured beside theory."""
-    from stages.lab.plot import Panel, draw
+    from stages.lab.plot import Panel, draw_panels
 
     travel = pressure_pulse()
     coarse_to_fine = (8, 16, 32)
@@ -205,7 +205,7 @@ def figure(out: Path) -> None:
     heaps = [(a, *sand_column_spread(a)) for a in heights]
     in_time = time_step_error()
     kept = momentum_drift()
-    draw(out, [
+    draw_panels(out, [
         Panel("pressure pulse: place [m] after time [ms]", [(1e3 * t, x) for t, x, _ in travel],
               [(1e3 * t, x) for t, _, x in travel]),
         Panel("bar: error of frequency over dx [m]", bars, [(d, bars[0][1] * (d / bars[0][0]) ** 2) for d, _ in bars],

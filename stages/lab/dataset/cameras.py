@@ -6,15 +6,15 @@ import torch
 
 from stages.core.geometry.cameras import intrinsics, orbit
 from stages.core.scene.cameras import Cameras
-from stages.lab.dataset.layout import ORBIT
+from stages.lab.dataset.layout import ORBIT_VIEWS
 
-CENTRE, RADIUS, ELEVATION = (0.0, 0.0, -0.3), 4.0, 20.0  # [m], [deg]
-FOCAL = 1.5  # focal length over the side of the picture
+ORBIT_CENTRE, ORBIT_RADIUS, ORBIT_ELEVATION = (0.0, 0.0, -0.3), 4.0, 20.0  # [m], [deg]
+RELATIVE_FOCAL = 1.5  # focal length over the side of the picture
 
 
-def cameras_around(resolution: int) -> Cameras:
+def orbit_cameras(resolution: int) -> Cameras:
     """All of it; camera i has azimuth 120 + 3.6 i degrees."""
-    viewmats = orbit(ORBIT, torch.tensor(CENTRE), RADIUS, ELEVATION)
-    K = intrinsics(resolution, resolution, FOCAL * resolution)
-    sizes = torch.full((ORBIT, 2), resolution)
-    return Cameras(viewmats, K.expand(ORBIT, 3, 3).clone(), sizes, tuple(f"{i:05d}" for i in range(ORBIT)))
+    viewmats = orbit(ORBIT_VIEWS, torch.tensor(ORBIT_CENTRE), ORBIT_RADIUS, ORBIT_ELEVATION)
+    K = intrinsics(resolution, resolution, RELATIVE_FOCAL * resolution)
+    sizes = torch.full((ORBIT_VIEWS, 2), resolution)
+    return Cameras(viewmats, K.expand(ORBIT_VIEWS, 3, 3).clone(), sizes, tuple(f"{i:05d}" for i in range(ORBIT_VIEWS)))

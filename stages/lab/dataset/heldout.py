@@ -30,22 +30,42 @@ from stages.core.physics.keypoints import farthest_points
 from stages.core.physics.materials import choose_materials
 from stages.core.scene.files import provenance, replacing
 from stages.core.scene.scene import SceneObject
-from stages.lab.assets.heldout_shapes import KINDS, Kind, filled, surface
-from stages.lab.assets.random_shapes import kinds
-from stages.lab.assets.shapes import one_thread
-from stages.lab.dataset import particles as dataset_assets
-from stages.lab.dataset.motions import MotionsWriter
-from stages.lab.dataset.particles import SUBSTEP, Asset, Fineness, count_at, extents, volumes
-from stages.lab.dataset.scenes import HELDOUT, SOLID, TURNED, VARIED, Config, sample_scene, write_configs
+from stages.lab.assets.heldout_shapes import HELDOUT_SHAPES, ShapeKind, surface_and_interior_points, surface_points
+from stages.lab.assets.random_shapes import random_shapes
+from stages.lab.assets.shapes import single_threaded
+from stages.lab.dataset import object_particles
+from stages.lab.dataset.keypoint_motions import KeypointMotionsWriter
+from stages.lab.dataset.object_particles import (
+    SUBSTEP,
+    Asset,
+    Discretisation,
+    count_for_spacing,
+    particle_volumes,
+    placement_extents,
+)
+from stages.lab.dataset.scene_configs import (
+    HELDOUT,
+    ROTATED,
+    SOLID,
+    VARIED,
+    SceneConfig,
+    sample_scene,
+    write_scene_configs,
+)
 from stages.lab.dataset.simulation import simulate
 
 log = logging.getLogger(__name__)
-FIRST = {HELDOUT: 10_000, VARIED: 20_000, SOLID: 30_000, TURNED: 40_000}  # index of the first scene, and its seed
-SEEDS = {VARIED: 0, SOLID: 1}  # of shapes at random
-MESH, TURN = 100, 2000  # id of the first mesh, and of the first turned object
-INSIDE = 1.5  # particles of solid bodies in a cell, along each axis
-DENSE = 30_000  # points of a shape that particles are chosen among
-STIFFEST = 2e7  # that the published substep bears, as of the phone [Pa]
+FIRST_SCENE = {
+    HELDOUT: 10_000,
+    VARIED: 20_000,
+    SOLID: 30_000,
+    ROTATED: 40_000,
+}  # index of the first scene, and its seed
+SHAPE_SEEDS = {VARIED: 0, SOLID: 1}  # of shapes at random
+FIRST_MESH_ID, FIRST_ROTATED_ID = 100, 2000  # id of the first mesh, and of the first turned object
+PARTICLES_PER_CELL_AXIS = 1.5  # particles of solid bodies in a cell, along each axis
+SURFACE_POINTS = 30_000  # points of a shape that particles are chosen among
+MAX_YOUNG = 2e7  # that the published substep bears, as of the phone [Pa]
 
 
 @dataclass(frozen=True)
@@ -79,11 +99,11 @@ class HeldoutOptions:
 
     @property
     def group(self) -> str:
-        return SOLID if self.solid else VARIED if self.shapes else TURNED if self.turned else HELDOUT
+        return SOLID if self.solid else VARIED if self.shapes else ROTATED if self.turned else HELDOUT
 
     @property
-    def fineness(self) -> Fineness:
-        return Fineness(self.dx, self.spacing, self.substep)
+    def fineness(self) -> Discretisation:
+        return Discretisation(self.dx, self.spacing, self.substep)
 
 
 def run(out: Path, options: HeldoutOptions = HeldoutOptions(), meshes: list[Path] | None = None) -> str:
@@ -101,16 +121,16 @@ def run(out: Path, options: HeldoutOptions = HeldoutOptions(), meshes: list[Path
     if meshes:
         things = mesh_assets(meshes, options)
     elif options.turned:
-        ten = dataset_assets.assets(options.fineness, options.keypoints, kept)
-        things = turned(ten, options.turned, options.fineness)
+        ten = object_particles.load_assets(options.fineness, options.keypoints, kept)
+        things = rotated_assets(ten, options.turned, options.fineness)
     else:
-        table = kinds(options.shapes, SEEDS[group]) if options.shapes else KINDS
-        things = assets(table, options.fineness, options.keypoints, kept, options.solid)
-    configs = configs_of(things, options.scenes, options.objects, FIRST[group])
-    write_configs(file, configs)
+        table = random_shapes(options.shapes, SHAPE_SEEDS[group]) if options.shapes else HELDOUT_SHAPES
+        things = load_shape_assets(table, options.fineness, options.keypoints, kept, options.solid)
+    configs = sample_configs(things, options.scenes, options.objects, FIRST_SCENE[group])
+    write_scene_configs(file, configs)
     made, count = provenance("heldout", [file, *(meshes or [])], options), 0
     bar = tqdm(total=len(configs), desc=group, unit="scene")
-    with bar, MotionsWriter(motions, made) as writer:
+    with bar, KeypointMotionsWriter(motions, made) as writer:
         for part in simulate(configs, things, options.fineness, options.frames, options.keypoints, device):
             writer.append(part)
             count += len(part)
@@ -118,29 +138,31 @@ def run(out: Path, options: HeldoutOptions = HeldoutOptions(), meshes: list[Path
     return f"{motions}: {count} scenes of {len(things)} objects in {time.perf_counter() - start:.0f} s"
 
 
-def configs_of(
-    things: Mapping[int, Asset], scenes: int, objects: int, first: int = FIRST[HELDOUT]
-) -> dict[str, Config]:
+def sample_configs(
+    things: Mapping[int, Asset], scenes: int, objects: int, first: int = FIRST_SCENE[HELDOUT]
+) -> dict[str, SceneConfig]:
     """Scenes by the sampling of the data set, with seeds of their own."""
-    room = extents(things)
+    room = placement_extents(things)
     made = (sample_scene(first + i, objects, room) for i in tqdm(range(scenes), desc="placing", unit="scene"))
     return {c.name: c for c in made}
 
 
-def turned(things: Mapping[int, Asset], count: int, fineness: Fineness) -> dict[int, Asset]:
+def rotated_assets(things: Mapping[int, Asset], count: int, fineness: Discretisation) -> dict[int, Asset]:
     """Objects in turn, each turned at random, by new ids."""
     made = {}
     for i in range(count):
         thing = list(things.values())[i % len(things)]
-        turn = matrix(torch.from_numpy(np.random.default_rng([TURN, i]).normal(size=4)).float())
+        turn = matrix(torch.from_numpy(np.random.default_rng([FIRST_ROTATED_ID, i]).normal(size=4)).float())
         points = thing.points @ turn.T
         points = points - (points.amin(0) + points.amax(0)) / 2
-        made[TURN + i] = replace(thing, id=TURN + i, points=points, volume=volumes(points, fineness.dx))
+        made[FIRST_ROTATED_ID + i] = replace(
+            thing, id=FIRST_ROTATED_ID + i, points=points, volume=particle_volumes(points, fineness.dx)
+        )
     return made
 
 
-def assets(
-    table: Mapping[str, Kind], fineness: Fineness, least: int, kept: Path | None = None, solid: bool = False
+def load_shape_assets(
+    table: Mapping[str, ShapeKind], fineness: Discretisation, least: int, kept: Path | None = None, solid: bool = False
 ) -> dict[int, Asset]:
     """Objects by id; `kept` is a file (.npz) to read their particles from, or to write them to."""
     key = f"spacing {fineness.spacing} least {least}" + f" dx {fineness.dx}" * solid
@@ -158,7 +180,7 @@ def assets(
     return {i: replace(a, solidity=solidity(a.points[:least], float(a.volume.sum()))) for i, a in made.items()}
 
 
-def _read(kept: Path, key: str, table: Mapping[str, Kind]) -> dict[str, Tensor] | None:
+def _read(kept: Path, key: str, table: Mapping[str, ShapeKind]) -> dict[str, Tensor] | None:
     """What was kept, if it was chosen in the same way."""
     try:
         with np.load(kept) as file:
@@ -173,33 +195,35 @@ def mesh_assets(meshes: list[Path], options: HeldoutOptions) -> dict[int, Asset]
     from stages.lab.assets.meshes import read_mesh  # noqa: PLC0415 -- needs an optional extra
 
     things = {}
-    for id, path in enumerate(tqdm(meshes, desc="meshes", unit="mesh"), start=MESH):
+    for id, path in enumerate(tqdm(meshes, desc="meshes", unit="mesh"), start=FIRST_MESH_ID):
         name = f"{Path(path).resolve().parent.name} {Path(path).stem}"
         choice = choose_materials([SceneObject(id, name)])[id]
-        E = min(choice.material.E, STIFFEST)
+        E = min(choice.material.E, MAX_YOUNG)
         log.info("%s: %s%s, E %.3g Pa", name, choice.name, " (a guess)" * choice.guessed, E)
-        points = options.size * read_mesh(path, DENSE).means
+        points = options.size * read_mesh(path, SURFACE_POINTS).means
         points = _chosen(points, options.fineness, options.keypoints)
         things[id] = _asset(id, options.size, points, E, choice.material.density, options.fineness)
     return things
 
 
-def _particles(kind: Kind, fineness: Fineness, least: int, solid: bool) -> Float[Tensor, "p 3"]:
+def _particles(kind: ShapeKind, fineness: Discretisation, least: int, solid: bool) -> Float[Tensor, "p 3"]:
     """Of the surface, and after those of the inside."""
     if not solid:
-        return _chosen(kind.scale * surface(kind, DENSE), fineness, least)
-    around, inside = filled(kind, DENSE, fineness.dx / INSIDE / kind.scale)
+        return _chosen(kind.scale * surface_points(kind, SURFACE_POINTS), fineness, least)
+    around, inside = surface_and_interior_points(
+        kind, SURFACE_POINTS, fineness.dx / PARTICLES_PER_CELL_AXIS / kind.scale
+    )
     return torch.cat([_chosen(kind.scale * around, fineness, least), kind.scale * inside])
 
 
-def _chosen(points: Float[Tensor, "n 3"], fineness: Fineness, least: int) -> Float[Tensor, "p 3"]:
+def _chosen(points: Float[Tensor, "n 3"], fineness: Discretisation, least: int) -> Float[Tensor, "p 3"]:
     """Some of the points, each the farthest from those before it."""
     if len(points) < least:
         raise InputError(f"--keypoints {least}: there are only {len(points)} points of an object")
-    count = min(len(points), max(least, count_at(points, fineness.spacing)))
-    with one_thread():
+    count = min(len(points), max(least, count_for_spacing(points, fineness.spacing)))
+    with single_threaded():
         return points[farthest_points(points, count)]
 
 
-def _asset(id: int, scale: float, points: Tensor, E: float, density: float, fineness: Fineness) -> Asset:
-    return Asset(id, scale, points, volumes(points, fineness.dx), E, density)
+def _asset(id: int, scale: float, points: Tensor, E: float, density: float, fineness: Discretisation) -> Asset:
+    return Asset(id, scale, points, particle_volumes(points, fineness.dx), E, density)

@@ -1,7 +1,7 @@
 """What a data set was made with and the sha256 of every file: the same bytes can be made again, and checked.
 
-    OUT/manifest.json         settings that all of it shares, versions, and a digest of the solver's sources
-    OUT/sums/<group>.sha256   as `sha256sum` writes them; `sha256sum -c sums/*.sha256` in OUT checks them too
+OUT/manifest.json         settings that all of it shares, versions, and a digest of the solver's sources
+OUT/sums/<group>.sha256   as `sha256sum` writes them; `sha256sum -c sums/*.sha256` in OUT checks them too
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from stages.core.errors import InputError
 from stages.core.scene.files import ngff_version, replacing, sha256
 
 FORMAT, VERSION = "ngff-dataset", 1
-SOLVER = ("core/physics/mpm/*.py", "core/kernels/mpm/*.py")  # under stages/
-NOT_LISTED = ("manifest.json", "particles.npz")  # beside the folder sums/
+SOLVER_SOURCES = ("core/physics/mpm/*.py", "core/kernels/mpm/*.py")  # under stages/
+UNLISTED_FILES = ("manifest.json", "particles.npz")  # beside the folder sums/
 
 
-def begin(root: Path, settings: dict) -> None:
+def open_manifest(root: Path, settings: dict) -> None:
     """Write the manifest, or see that what is there was made with the same settings and solver."""
     path, now = root / "manifest.json", {"settings": settings, "solver": solver_digest()}
     if path.exists():
@@ -62,15 +62,15 @@ def solver_digest() -> str:
     """sha256 of the sources that decide how things move."""
     stages = Path(__file__).resolve().parents[2]
     digest = hashlib.sha256()
-    for path in sorted(p for pattern in SOLVER for p in stages.glob(pattern)):
+    for path in sorted(p for pattern in SOLVER_SOURCES for p in stages.glob(pattern)):
         digest.update(path.name.encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()
 
 
-def seal(root: Path, name: str, files: Iterable[Path]) -> None:
+def write_checksums(root: Path, name: str, files: Iterable[Path]) -> None:
     """List files, and no others, in sums/<name>.sha256; those that are listed already are not read again."""
     path = root / "sums" / f"{name}.sha256"
-    before = read_sums(path) if path.exists() else {}
+    before = read_checksums(path) if path.exists() else {}
     names = sorted(file.relative_to(root).as_posix() for file in files)
     if names == sorted(before):
         return
@@ -80,7 +80,7 @@ def seal(root: Path, name: str, files: Iterable[Path]) -> None:
         part.write_text("".join(f"{digest}  {n}\n" for n, digest in digests.items()))
 
 
-def read_sums(path: Path) -> dict[str, str]:
+def read_checksums(path: Path) -> dict[str, str]:
     """Name -> digest of a file as `sha256sum` writes it."""
     rows = [line.split("  ", 1) for line in path.read_text().splitlines() if line]
     if not all(len(row) == 2 and len(row[0]) == 64 for row in rows):
@@ -88,12 +88,12 @@ def read_sums(path: Path) -> dict[str, str]:
     return {name: digest for digest, name in rows}
 
 
-def check(root: Path) -> int:
+def verify_files(root: Path) -> int:
     """How many files are listed, all of them as they were. Raises InputError when one is not, or is not listed."""
     lists = sorted((root / "sums").glob("*.sha256"))
     if not lists:
         raise InputError(f"{root}: has no sums/*.sha256; it is no data set of `ngff-lab dataset`, or was not finished")
-    listed = {name: digest for path in lists for name, digest in read_sums(path).items()}
+    listed = {name: digest for path in lists for name, digest in read_checksums(path).items()}
     wrong = []
     for name, digest in tqdm(listed.items(), desc="check", unit="file"):
         if not (root / name).is_file():
@@ -101,7 +101,7 @@ def check(root: Path) -> int:
         elif sha256(root / name) != digest:
             wrong.append(f"{name} has changed")
     unlisted = {str(p.relative_to(root).as_posix()) for p in root.rglob("*") if p.is_file()} - set(listed)
-    known = (*NOT_LISTED, *(f".part-{n}" for n in NOT_LISTED))  # another run may be writing them
+    known = (*UNLISTED_FILES, *(f".part-{n}" for n in UNLISTED_FILES))  # another run may be writing them
     wrong += [f"{n} is not listed" for n in sorted(unlisted) if n not in known and not n.startswith("sums/")]
     if wrong:
         more = f", and {len(wrong) - 5} more" if len(wrong) > 5 else ""

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from stages.core.errors import InputError
-from stages.lab.dataset.layout import PARTS, backgrounds_of, parts_of, views_of
-from stages.lab.dataset.particles import SUBSTEP, Fineness
-from stages.lab.dataset.scenes import groups_of
+from stages.lab.dataset.layout import PARTS, parse_backgrounds, parse_parts, parse_views
+from stages.lab.dataset.object_particles import SUBSTEP, Discretisation
+from stages.lab.dataset.scene_configs import parse_groups
 
-NEEDS = {  # of a part: what it is made from
+PREREQUISITES = {  # of a part: what it is made from
     "motions": {"scene_configs"}, "scenes": {"scene_configs", "objects"}, "mpm": {"scene_configs", "objects"},
     "initial": {"scene_configs", "objects", "backgrounds"}, "dynamic": {"scene_configs", "objects", "backgrounds"},
 }  # fmt: skip
@@ -36,7 +36,7 @@ class DatasetOptions:
     device: str = "auto"
 
     def __post_init__(self):
-        parts_of(self.only), views_of(self.views), backgrounds_of(self.backgrounds), groups_of(self.groups)
+        parse_parts(self.only), parse_views(self.views), parse_backgrounds(self.backgrounds), parse_groups(self.groups)
         _shard(self.shard)
         if self.frames < 1 or self.keypoints < 1 or self.limit < 0:
             raise InputError("--frames and --keypoints must be positive, --limit at least 0")
@@ -46,29 +46,29 @@ class DatasetOptions:
             raise InputError(f"--resolution {self.resolution}: an even number from 16 to 4096 pixels")
 
     @property
-    def fineness(self) -> Fineness:
-        return Fineness(self.dx, self.spacing, self.substep)
+    def fineness(self) -> Discretisation:
+        return Discretisation(self.dx, self.spacing, self.substep)
 
     @property
     def parts(self) -> tuple[str, ...]:
         """What is made, with what it is made from, in an order in which it can be."""
-        asked = parts_of(self.only)
-        wanted = {*asked}.union(*(NEEDS.get(part, set()) for part in asked))
+        asked = parse_parts(self.only)
+        wanted = {*asked}.union(*(PREREQUISITES.get(part, set()) for part in asked))
         return tuple(p for p in PARTS if p in wanted)
 
     @property
     def cameras(self) -> tuple[int, ...]:
-        return views_of(self.views)
+        return parse_views(self.views)
 
     @property
     def tables(self) -> tuple[str, ...]:
-        return backgrounds_of(self.backgrounds)
+        return parse_backgrounds(self.backgrounds)
 
     @property
     def mine(self) -> list[str]:
         """The groups of this shard."""
         part, parts = _shard(self.shard)
-        return groups_of(self.groups)[part::parts]
+        return parse_groups(self.groups)[part::parts]
 
     @property
     def repeatable(self) -> bool:

@@ -12,7 +12,7 @@ from pathlib import Path
 from stages.core.errors import InputError
 from stages.core.models.checkpoints import halve, minutes
 from stages.core.scene.files import must_exist
-from stages.lab.plot import Panel, draw
+from stages.lab.plot import Panel, draw_panels
 
 PANELS = {"loss": "loss", "RMSE": "RMSE [m] of scenes not learned from", "R": "correlation, of the same scenes"}
 WHAT = "the card of weights (.json), such as `ngff-lab train` writes"
@@ -27,7 +27,7 @@ def run(cards: Sequence[Path], out: Path, half: bool = False) -> list[str]:
         Panel(f"{title} by minute", curves={name: _curve(row, key) for name, row in rows.items()})
         for key, title in PANELS.items()
     ]
-    draw(out, panels)
+    draw_panels(out, panels)
     for card in cards if half else ():
         halve(Path(card).with_suffix(".safetensors"))
     return [_line(name, row) for name, row in rows.items()]

@@ -17,7 +17,7 @@ from stages.core.errors import InputError
 from stages.core.models.dynamics import Dynamics
 from stages.core.models.initial_conditions import World
 from stages.core.scene.files import sha256
-from stages.lab.dataset.motions import Motions, joined, read_motions
+from stages.lab.dataset.keypoint_motions import KeypointMotions, concatenate_motions, read_motions
 
 VALIDATION_SCENES = 100  # scenes at the end of the last group that only choose among weights
 MAX_SPEED_CHANGE = (
@@ -44,7 +44,7 @@ def motions_folder(folder: Path) -> Path:
     return inner if inner.is_dir() else Path(folder)
 
 
-def read_groups(folder: Path, names: Sequence[str], keypoints: int) -> Motions:
+def read_groups(folder: Path, names: Sequence[str], keypoints: int) -> KeypointMotions:
     """Scenes of NAME.h5 in a folder, with the first `keypoints` of each object. Raises InputError for missing files."""
     folder = motions_folder(folder)
     missing = [f"{name}.h5" for name in names if not (folder / f"{name}.h5").is_file()]
@@ -61,10 +61,10 @@ def read_groups(folder: Path, names: Sequence[str], keypoints: int) -> Motions:
     odd = next((n for n, p in zip(names, parts, strict=True) if p.points.shape[1] != parts[0].points.shape[1]), None)
     if odd:
         raise InputError(f"{folder / odd}.h5: has another number of frames than {names[0]}.h5; use groups of one kind")
-    return joined(parts)
+    return concatenate_motions(parts)
 
 
-def train_validation_split(motions: Motions, unseen: int) -> tuple[Motions, Motions]:
+def train_validation_split(motions: KeypointMotions, unseen: int) -> tuple[KeypointMotions, KeypointMotions]:
     """Scenes to learn from, and the last ones to choose by."""
     count = max(1, min(unseen, len(motions) // 3))
     if len(motions) < 2:
@@ -90,9 +90,9 @@ class ClipSampler:
     have come to rest are known for longer than they were simulated: they stay as they are.
     """
 
-    def __init__(self, motions: Motions, device: torch.device | str, model: Dynamics):
+    def __init__(self, motions: KeypointMotions, device: torch.device | str, model: Dynamics):
         self.motions = motions.to(device)
-        self.world = self.motions.world()
+        self.world = self.motions.initial_conditions()
         self.rest = model.rest(self.world)
         self.asleep = ends_at_rest(self.motions)
         self.calm = smooth_frames(self.motions).cumsum(1)
@@ -118,19 +118,19 @@ class ClipSampler:
         return MotionClip(self.world[row], self.rest[row], points[row, start], speed, truth, self.spread[row])
 
 
-def ends_at_rest(motions: Motions) -> Bool[Tensor, "b"]:
+def ends_at_rest(motions: KeypointMotions) -> Bool[Tensor, "b"]:
     """Scenes that have come to rest at their end; on the CPU."""
     last = motions.points[:, -REST_FRAMES - 1 :]
     speed = (last[:, 1:] - last[:, :-1]).norm(dim=-1).mean(1) / motions.dt
     return (speed.flatten(1).amax(1) < REST_SPEED).cpu()
 
 
-def motion_spread(motions: Motions) -> Float[Tensor, "b o 3"]:
+def motion_spread(motions: KeypointMotions) -> Float[Tensor, "b o 3"]:
     """How far the points of each object are from their mean in time, as a root of mean squares along each axis [m]."""
     return torch.stack([x.var(0, correction=0).mean(1).sqrt() for x in motions.points])
 
 
-def smooth_frames(motions: Motions) -> Bool[Tensor, "b t"]:
+def smooth_frames(motions: KeypointMotions) -> Bool[Tensor, "b t"]:
     """Frames in which no object is changing its speed abruptly; on the CPU."""
     inner = torch.stack([smooth_motion(x, motions.dt).all(-1) for x in motions.points]).cpu()
     ends = torch.ones(len(inner), 1, dtype=torch.bool)

@@ -20,8 +20,8 @@ from stages.core.errors import InputError
 from stages.core.models.checkpoints import build, load, save
 from stages.core.scene.files import ngff_version
 from stages.evaluate.dynamics import all_metrics
-from stages.lab.dataset.motions import Motions
-from stages.lab.dataset.scenes import OTHERS, groups_of
+from stages.lab.dataset.keypoint_motions import KeypointMotions
+from stages.lab.dataset.scene_configs import EXTRA_GROUPS, parse_groups
 from stages.lab.training.data import (
     VALIDATION_SCENES,
     ClipSampler,
@@ -114,7 +114,7 @@ def run(
     out = Path(out)
     if not out.parent.is_dir():
         raise InputError(f"{out}: there is no folder {out.parent}; make it first")
-    groups = groups_of(options.groups, more=OTHERS)
+    groups = parse_groups(options.groups, more=EXTRA_GROUPS)
     known, unseen = train_validation_split(read_groups(data, groups, options.keypoints), VALIDATION_SCENES)
     if known.points.shape[1] <= max(options.frames):
         raise InputError(f"--horizons: the motions have {known.points.shape[1]} frames; take shorter ones")
@@ -142,7 +142,7 @@ def run(
             f"of unseen scenes, after {best['minutes']:.1f} of {trainee.elapsed / 60:.1f} min{ended}"]  # fmt: skip
 
 
-def _seen(motions: Motions, few: int) -> list[Motions]:
+def _seen(motions: KeypointMotions, few: int) -> list[KeypointMotions]:
     """The motions, and the same with few keypoints if that is wanted."""
     return [motions, replace(motions, points=motions.points[:, :, :, :few].clone())] if few else [motions]
 
@@ -182,7 +182,7 @@ class TrainingRun:
 
     trainee: TrainingState
     pieces: list[ClipSampler]  # the usual ones; what every fourth step learns from
-    unseen: Motions
+    unseen: KeypointMotions
     options: TrainOptions
     team: ProcessGroup
     out: Path
@@ -268,12 +268,12 @@ def _rounded(device: str):
 
 @torch.no_grad()
 def validate(
-    model: torch.nn.Module, scenes: Motions, frames: int = VALIDATION_FRAMES, batch: int = 100
+    model: torch.nn.Module, scenes: KeypointMotions, frames: int = VALIDATION_FRAMES, batch: int = 100
 ) -> dict[str, float]:
     """Metrics of full rollouts from rest, averaged over the scenes; an RMSE that is not finite is infinite."""
     model.eval()
     frames = min(frames, scenes.points.shape[1])
-    world, rows = scenes.world(), []
+    world, rows = scenes.initial_conditions(), []
     for first in range(0, len(scenes), batch):
         some = world[first : first + batch]
         truth = scenes.points[first : first + batch, :frames]

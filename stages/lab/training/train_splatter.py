@@ -89,7 +89,9 @@ def run(data: Path, out: Path, options: SplatterOptions, weights: Path | None = 
         part.write_text(json.dumps({**facts, "history": history, "sha256": sha256(out)}, indent=1) + "\n")
     titles = {"loss": "loss against steps", "psnr": "PSNR of unseen views [dB] against steps"}
     curves = {key: [(float(r["step"]), r[key]) for r in history if r[key] is not None] for key in titles}
-    plot.draw(Path(out).with_suffix(".png"), [plot.Panel(titles[key], points) for key, points in curves.items()], 2)
+    plot.draw_panels(
+        Path(out).with_suffix(".png"), [plot.Panel(titles[key], points) for key, points in curves.items()], 2
+    )
 
 
 def load_network(weights: Path | None, options: SplatterOptions) -> tuple[Pi3Splat, bool]:

@@ -12,7 +12,7 @@ from stages.core.models.checkpoints import HERE, find, load
 from stages.core.models.initial_conditions import World, centre
 from stages.core.physics.keypoints import farthest_points
 from stages.lab.assets.objects import OBJECTS, make_object
-from stages.lab.assets.shapes import one_thread
+from stages.lab.assets.shapes import single_threaded
 
 DT = 0.02
 TRAINING = Path(lab.__file__).parent / "results" / "training"  # of the models that stand beside ours
@@ -33,7 +33,7 @@ def box(half, n, seed):
 def some_points(name, n):
     """Some of an object's surface, as large as in a scene."""
     means = make_object(name).means * OBJECTS[name].scale
-    with one_thread():
+    with single_threaded():
         return means[farthest_points(means, n)]
 
 
@@ -69,7 +69,7 @@ def dropped(model):
     lower, upper = box((0.25, 0.2, 0.15), n, 0), box((0.15, 0.15, 0.2), n, 1)
     points = torch.stack([lower + torch.tensor([0.0, 0, -0.5]), upper + torch.tensor([0.06, 0.04, 0.1])])
     world = World.of(points.expand(3, 2, n, 3), E=E, mass=torch.tensor([0.6, 0.3]), friction=torch.tensor(1.0))
-    with torch.inference_mode(), one_thread():  # tensors this small are not worth sharing
+    with torch.inference_mode(), single_threaded():  # tensors this small are not worth sharing
         return world, model.rollout(world, 1000)
 
 
@@ -89,7 +89,7 @@ def test_what_has_fallen_comes_to_rest(model, n):
         torch.stack(scenes), E=torch.tensor([[k.E for k in row] for row in kinds]), friction=torch.tensor(1.0),
         mass=torch.tensor([[2e-3 * k.density for k in row] for row in kinds]),
     )  # fmt: skip
-    with torch.inference_mode(), one_thread():
+    with torch.inference_mode(), single_threaded():
         points = model.rollout(world, 1000)
     rests(*motion(world, points))
 
@@ -113,7 +113,7 @@ def test_what_is_dropped_turned_at_random_comes_to_rest(model, seed, names, n):
         points[:, None], E=torch.tensor([[k.E] for k in kinds]), friction=torch.tensor(1.0),
         mass=torch.tensor([[2e-3 * k.density] for k in kinds]),
     )  # fmt: skip
-    with torch.inference_mode(), one_thread():
+    with torch.inference_mode(), single_threaded():
         com, speed = motion(world, model.rollout(world, 1000))
     assert speed[:, :40].amax() > 0.8
     slow = dict(zip(names, speed[:, -50:, 0].mean(1).tolist(), strict=True))
@@ -126,7 +126,7 @@ def test_momentum_of_two_free_bodies_that_collide_is_kept(model, E):
     points = torch.stack([a + torch.tensor([-0.4, 0, 0.5]), b + torch.tensor([0.4, 0.05, 0.55])])[None]
     mass, velocity = torch.tensor([[0.5, 0.3]]), torch.tensor([[[1.5, 0, 0], [-1.0, 0.2, 0]]])
     world = World.of(points, E=torch.tensor([E]), mass=mass, velocity=velocity, gravity=torch.zeros(3))
-    with torch.inference_mode(), one_thread():
+    with torch.inference_mode(), single_threaded():
         com = torch.stack([centre(world, p) for p in model.rollout(world, 40).unbind(1)], 1)
     v = com.diff(dim=1) / DT
     momentum = (mass[..., None] * v).sum(2)[0]
@@ -143,7 +143,7 @@ def test_rounding_to_16_bits_costs_nothing_that_can_be_measured(model, dropped):
     with torch.no_grad():
         for p in other.parameters():
             p *= 1 + (2 * torch.rand(p.shape, generator=rng) - 1) * 2**-11
-    with torch.inference_mode(), one_thread():
+    with torch.inference_mode(), single_threaded():
         again = other.rollout(world, 40)
     assert float((again - points[:, :40]).square().mean().sqrt()) < 2e-3
 

@@ -18,10 +18,18 @@ from stages.core.geometry.neighbours import knn
 from stages.core.scene.gaussians import Gaussians
 from stages.core.scene.scene_ply import read_scene
 from stages.lab.assets import signed_distance as shapes
+from stages.lab.assets.field_sampling import (
+    KEY_LIGHT,
+    PaintedPart,
+    add_highlight,
+    distance_and_normal,
+    gaussians_from_parts,
+    relax_points,
+    sample_surface,
+)
 from stages.lab.assets.objects import OBJECTS, make_object
 from stages.lab.assets.shapes import Surface, to_gaussians
-from stages.lab.assets.splat_files import PLY, camera_rows
-from stages.lab.assets.surface import KEY, Part, evened, sculpt, shine, slope, spread
+from stages.lab.assets.splat_files import POINT_CLOUD, camera_rows
 
 
 @cache
@@ -188,7 +196,7 @@ def test_width_of_gaussians_unless_told_otherwise():
 def test_points_are_spread_by_area():
     """A sphere and a slab of known areas in one field: counts go as areas, within 4 standard deviations."""
     ball, slab = shapes.sphere((-0.5, 0, 0), 0.2), shapes.slab((0.4, 0, 0), (0.3, 0.3, 0.3), 0.01, 0.01)
-    s = spread(shapes.union(ball, slab), (0.75, 0.35, 0.35), 20_000, 0.004)
+    s = sample_surface(shapes.union(ball, slab), (0.75, 0.35, 0.35), 20_000, 0.004)
     areas = 4 * np.pi * 0.2**2, 6 * 0.6**2  # rounded edges take about 1 % off the box
     share = areas[0] / sum(areas)
     found = float((s.points[:, 0] < 0).float().mean())
@@ -197,8 +205,8 @@ def test_points_are_spread_by_area():
 
 def test_evening_keeps_points_on_the_surface_and_parts_them():
     field = shapes.ellipsoid((0, 0, 0), (0.5, 0.3, 0.2))
-    before = spread(field, (0.5, 0.3, 0.2), 4000, 0.008)
-    after = evened(field, before)
+    before = sample_surface(field, (0.5, 0.3, 0.2), 4000, 0.008)
+    after = relax_points(field, before)
     on = (after.points / torch.tensor([0.5, 0.3, 0.2])).norm(dim=1)
     torch.testing.assert_close(on, torch.ones(4000), rtol=0, atol=2e-4)
     gaps = [knn(s.points, s.points, 2)[0][:, 1].quantile(0.01) for s in (before, after)]
@@ -214,10 +222,10 @@ def test_evening_keeps_points_on_the_surface_and_parts_them():
     (shapes.revolved([(0, 0), (1, 0), (1, 1), (0, 1)]), (0, 0.5, 0.5), -0.5),
     (shapes.revolved_wall([(1, 0), (1, 1)], 0.2), (0, 1.5, 0.5), 0.4),
     (shapes.mirrored(shapes.sphere((1, 0, 0), 0.5)), (-1, 0, 0), -0.5),
-    (shapes.posed(shapes.capsule((0, 0, 0), (0, 0, 1), 0.1), shapes.turn(x=90)), (0, -2, 0), 0.9),
-    (shapes.cut(shapes.sphere((0, 0, 0), 1.0), shapes.sphere((0, 0, 0), 0.5)), (0, 0, 0.4), 0.1),
+    (shapes.posed(shapes.capsule((0, 0, 0), (0, 0, 1), 0.1), shapes.euler_rotation(x=90)), (0, -2, 0), 0.9),
+    (shapes.difference(shapes.sphere((0, 0, 0), 1.0), shapes.sphere((0, 0, 0), 0.5)), (0, 0, 0.4), 0.1),
     (shapes.tube(torch.tensor([[0.0, 0, 0], [0, 0, 1]]), torch.tensor([0.1, 0.3])), (0.4, 0, 1), 0.1),
-    (shapes.tube(torch.tensor([[0.0, 0, 0], [0, 0, 1]]), 0.1), (9, 0, 0), shapes.FAR),
+    (shapes.tube(torch.tensor([[0.0, 0, 0], [0, 0, 1]]), 0.1), (9, 0, 0), shapes.TUBE_FAR_DISTANCE),
 ])  # fmt: skip
 def test_distances_by_hand(field, point, distance):
     torch.testing.assert_close(field(torch.tensor([point], dtype=torch.float32)), torch.tensor([distance]))
@@ -226,26 +234,26 @@ def test_distances_by_hand(field, point, distance):
 def test_slope_turns_any_field_into_a_distance():
     """Three times the distance has slope 3: divided out, the distance and the unit normal are left."""
     sphere = shapes.sphere((0, 0, 0), 0.5)
-    distance, normal = slope(lambda p: 3 * sphere(p), torch.tensor([[0.0, 0.0, 0.6]]))
+    distance, normal = distance_and_normal(lambda p: 3 * sphere(p), torch.tensor([[0.0, 0.0, 0.6]]))
     torch.testing.assert_close(distance, torch.tensor([0.1]), rtol=1e-3, atol=0)
     torch.testing.assert_close(normal, torch.tensor([[0.0, 0.0, 1.0]]), rtol=0, atol=1e-3)
 
 
 def test_points_take_the_paint_of_the_part_they_lie_on():
-    parts = [Part(shapes.sphere((x, 0, 0), 0.2), lambda p, c=c: torch.tensor(c).expand(len(p), 3))
+    parts = [PaintedPart(shapes.sphere((x, 0, 0), 0.2), lambda p, c=c: torch.tensor(c).expand(len(p), 3))
              for x, c in ((-0.3, (0.8, 0.1, 0.1)), (0.3, (0.1, 0.1, 0.8)))]  # fmt: skip
-    g = sculpt(parts, (0.5, 0.2, 0.2), 2000)
+    g = gaussians_from_parts(parts, (0.5, 0.2, 0.2), 2000)
     left = g.means[:, 0] < 0
     assert (g.sh[left, 0, 0] > g.sh[left, 0, 2]).all() and (g.sh[~left, 0, 0] < g.sh[~left, 0, 2]).all()
 
 
 def test_the_highlight_is_where_a_mirror_shows_the_light_and_leaves_the_mean_alone():
     rng = torch.Generator().manual_seed(0)
-    normal = torch.nn.functional.normalize(KEY + 0.3 * torch.randn(3, generator=rng), dim=0)[None]
-    sh = shine(torch.zeros(1, 1, 3), normal, torch.tensor([1.0]))
+    normal = torch.nn.functional.normalize(KEY_LIGHT + 0.3 * torch.randn(3, generator=rng), dim=0)[None]
+    sh = add_highlight(torch.zeros(1, 1, 3), normal, torch.tensor([1.0]))
     views = torch.nn.functional.normalize(torch.randn(20_000, 3, generator=rng), dim=1)  # from the surface to the eye
     seen = evaluate_sh(sh.expand(len(views), 9, 3), -views)[:, 0] - 0.5
-    mirrored = 2 * (normal @ KEY) * normal[0] - KEY
+    mirrored = 2 * (normal @ KEY_LIGHT) * normal[0] - KEY_LIGHT
     assert float(views[seen.argmax()] @ mirrored) > 0.99
     assert abs(float(seen.mean())) < 0.01  # 20,000 directions of spread 0.15: 0.001
 
@@ -254,7 +262,7 @@ def test_command_writes_what_public_code_reads(tmp_path):
     done = CliRunner().invoke(app, ["objects", str(tmp_path), "--only", "duck", "--sheet", str(tmp_path / "sheet.jpg")])
     assert done.exit_code == 0, done.output
     assert "duck: 50000 Gaussians" in done.output
-    scene = read_scene(tmp_path / "duck" / PLY)
+    scene = read_scene(tmp_path / "duck" / POINT_CLOUD)
     g = made("duck")
     torch.testing.assert_close(scene.gaussians.means, g.means)
     torch.testing.assert_close(scene.gaussians.sh, g.sh)
@@ -277,7 +285,7 @@ def test_cameras_look_at_the_object():
 def test_same_file_whatever_else_is_made(tmp_path):
     for folder, only in (("a", "duck"), ("b", "panda,duck")):
         assert CliRunner().invoke(app, ["objects", str(tmp_path / folder), "--only", only]).exit_code == 0
-    assert (tmp_path / "a/duck" / PLY).read_bytes() == (tmp_path / "b/duck" / PLY).read_bytes()
+    assert (tmp_path / "a/duck" / POINT_CLOUD).read_bytes() == (tmp_path / "b/duck" / POINT_CLOUD).read_bytes()
 
 
 def test_command_refuses_names_it_does_not_know(tmp_path):

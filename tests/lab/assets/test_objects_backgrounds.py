@@ -11,8 +11,8 @@ from stages.core.geometry.cameras import intrinsics, orbit
 from stages.core.geometry.harmonics import C0
 from stages.core.raster.rasterise import rasterise
 from stages.core.scene.scene_ply import read_scene
-from stages.lab.assets.background_paint import cells, to_line
-from stages.lab.assets.backgrounds import BACKGROUNDS, FILE, ROOM, make_background
+from stages.lab.assets.background_paint import line_distance, voronoi_cells
+from stages.lab.assets.backgrounds import BACKGROUND_PLY, BACKGROUNDS, ROOM_HALF_WIDTH, make_background
 
 NAMES = list(BACKGROUNDS)
 
@@ -40,7 +40,7 @@ def test_every_view_of_the_data_set_is_filled(name):
     viewmats = orbit(5, torch.tensor([0.0, 0.0, -0.3]), 4.0, 20.0)
     seen = rasterise(g, viewmats, intrinsics(96, 96, 144.0).expand(5, 3, 3), 96, 96).alpha
     assert (seen > 0.9).float().mean() > 0.99
-    assert ROOM > 4.0
+    assert ROOM_HALF_WIDTH > 4.0
 
 
 def test_tops_are_distinct():
@@ -60,8 +60,10 @@ def test_same_at_every_call():
 
 
 def test_lines_and_cells():
-    torch.testing.assert_close(to_line(torch.tensor([0.0, 0.3, 1.1, -0.1]), 1.0), torch.tensor([0.0, 0.3, 0.1, 0.1]))
-    border, tone = cells(torch.rand(5000, 2, generator=torch.Generator().manual_seed(0)) * 4, 0.5, 1)
+    torch.testing.assert_close(
+        line_distance(torch.tensor([0.0, 0.3, 1.1, -0.1]), 1.0), torch.tensor([0.0, 0.3, 0.1, 0.1])
+    )
+    border, tone = voronoi_cells(torch.rand(5000, 2, generator=torch.Generator().manual_seed(0)) * 4, 0.5, 1)
     assert (border >= 0).all() and border.max() < 0.5 and tone.unique().numel() > 30
 
 
@@ -69,8 +71,8 @@ def test_command_writes_the_published_names(tmp_path):
     picture = str(tmp_path / "b.jpg")
     done = CliRunner().invoke(app, ["backgrounds", str(tmp_path), "--only", "table6", "--sheet", picture])
     assert done.exit_code == 0, done.output
-    scene = read_scene(tmp_path / "table6" / FILE)
-    assert FILE == "gaussians_feedforward.ply" and len(scene.gaussians) == len(make_background("table6"))
+    scene = read_scene(tmp_path / "table6" / BACKGROUND_PLY)
+    assert BACKGROUND_PLY == "gaussians_feedforward.ply" and len(scene.gaussians) == len(make_background("table6"))
     assert scene.floor == pytest.approx(-0.94) and not scene.objects
     assert (tmp_path / "b.jpg").stat().st_size > 1000
 

@@ -15,9 +15,9 @@ from stages.core.scene.gaussians import Gaussians, transformed
 from stages.core.scene.scene import Scene
 from stages.core.scene.scene_ply import write_scene
 from stages.lab.assets import tabletops
-from stages.lab.assets.backgrounds import TOP
+from stages.lab.assets.backgrounds import TABLE_HEIGHT
 from stages.lab.assets.objects import OBJECTS
-from stages.lab.assets.tabletops import CONTACT, EACH, GAP, REACH, tabletop
+from stages.lab.assets.tabletops import CONTACT_GAP, MAX_RADIUS, MIN_GAP, OBJECTS_PER_SCENE, tabletop
 from stages.lab.bench import reconstructed_scene
 from stages.lab.bench import refine as bench_refine
 from stages.lab.bench import segment as bench_segment
@@ -45,9 +45,9 @@ def quick(monkeypatch):
 def gaps(scene) -> np.ndarray:
     """Least distances between the objects of a scene (o, o), inf on the diagonal."""
     g = scene.gaussians
-    clouds = [g.means[g.object_id == i].numpy() for i in range(1, EACH + 1)]
-    out = np.full((EACH, EACH), np.inf)
-    for i in range(EACH):
+    clouds = [g.means[g.object_id == i].numpy() for i in range(1, OBJECTS_PER_SCENE + 1)]
+    out = np.full((OBJECTS_PER_SCENE, OBJECTS_PER_SCENE), np.inf)
+    for i in range(OBJECTS_PER_SCENE):
         for j in range(i):
             out[i, j] = out[j, i] = cKDTree(clouds[i]).query(clouds[j])[0].min()
     return out
@@ -58,19 +58,19 @@ def test_two_scenes_show_all_ten_objects_resting_on_the_table():
     assert sorted(o.name for s in scenes for o in s.objects) == sorted(OBJECTS)
     for scene in scenes:
         g = scene.gaussians
-        for i in range(1, EACH + 1):
+        for i in range(1, OBJECTS_PER_SCENE + 1):
             mine = g.means[g.object_id == i]
-            assert float(mine[:, 2].min()) == pytest.approx(TOP, abs=0.005)
-            assert float(mine[:, :2].norm(dim=1).max()) < 1.5 * REACH
-        assert gaps(scene).min() > 0.9 * GAP
+            assert float(mine[:, 2].min()) == pytest.approx(TABLE_HEIGHT, abs=0.005)
+            assert float(mine[:, :2].norm(dim=1).max()) < 1.5 * MAX_RADIUS
+        assert gaps(scene).min() > 0.9 * MIN_GAP
 
 
 @pytest.mark.parametrize("index", [0, 3])
 def test_touching_things_touch_and_do_not_overlap(index):
     between = gaps(tabletop("touching", index))
-    assert (between.min(1) < CONTACT + 0.003).all()  # every one has a neighbour that it touches
-    assert between.min() > 0.2 * CONTACT
-    assert between[:3, 3:].min() > 0.9 * GAP  # and the two groups stand apart
+    assert (between.min(1) < CONTACT_GAP + 0.003).all()  # every one has a neighbour that it touches
+    assert between.min() > 0.2 * CONTACT_GAP
+    assert between[:3, 3:].min() > 0.9 * MIN_GAP  # and the two groups stand apart
 
 
 def test_the_same_scene_again_is_the_same():
@@ -92,7 +92,7 @@ def test_the_segment_report_finds_blocks_apart_and_the_vote_mends_wrong_masks(tm
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     lines = list(bench_segment.run(tmp_path / "s.json", bench_segment.SegmentBenchOptions(scenes=1, photos=8)))
     means = json.loads((tmp_path / "s.json").read_text())["mean_iou"]
-    assert set(means) == set(tabletops.KINDS) and "without sam2: " in lines[1]
+    assert set(means) == set(tabletops.ARRANGEMENTS) and "without sam2: " in lines[1]
     for by in means.values():  # blocks of Gaussians this large let the table shine through, so no mask is perfect
         assert by["masks"] > 0.7 and by["masks"] > by["masks, 20% wrong"] > by["masks, 40% wrong"]
         assert by["masks, 20% wrong"] > by["masks, 20% wrong, no vote"] + 0.2
@@ -105,7 +105,9 @@ def test_what_is_reconstructed_is_judged_in_the_photos_that_were_placed(monkeypa
         """The scene itself, elsewhere and without labels, as seen by all cameras but the first."""
         assert len(list(photos.iterdir())) == 8
         scene = tabletop("apart", 0, 8)
-        move = Similarity(0.5, matrix(torch.tensor([0.8, 0.0, 0.0, 0.6])), torch.tensor([0.1, 0.2, -0.5 * TOP]))
+        move = Similarity(
+            0.5, matrix(torch.tensor([0.8, 0.0, 0.0, 0.6])), torch.tensor([0.1, 0.2, -0.5 * TABLE_HEIGHT])
+        )
         g = transformed(replace(scene.gaussians, object_id=torch.zeros_like(scene.gaussians.object_id)), move)
         write_scene(out, Scene(g, cameras=scene.cameras[list(range(1, 8))].transformed(move), floor=0.0))
 
@@ -120,7 +122,7 @@ def test_where_no_photo_can_be_placed_nothing_is_found(monkeypatch):
 
     monkeypatch.setattr(reconstructed_scene, "reconstruct", hopeless)
     row = bench_segment.measure_reconstructed("apart", 0, 8)
-    assert row["placed"] == 0 and row["mean"] == 0.0 and len(row["iou"]) == EACH
+    assert row["placed"] == 0 and row["mean"] == 0.0 and len(row["iou"]) == OBJECTS_PER_SCENE
 
 
 def test_sam2_takes_part_where_its_weights_are(tmp_path, monkeypatch):

@@ -15,7 +15,7 @@ from stages.core.models.field.rest_shape import shape_of
 from stages.core.models.initial_conditions import World
 from stages.lab.bench import ablation as bench_ablation
 from stages.lab.bench.ablation import AblationBenchOptions, run
-from stages.lab.dataset.motions import write_motions
+from stages.lab.dataset.keypoint_motions import write_motions
 from stages.lab.training.ablation import ABLATIONS, IMPULSE_VECTORS
 from stages.lab.training.train import TrainOptions
 from tests.lab.training.test_train import falling

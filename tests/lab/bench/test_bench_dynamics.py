@@ -40,18 +40,18 @@ from stages.lab.bench.dynamics_baselines import (
     with_estimated_materials,
 )
 from stages.lab.bench.dynamics_report import markdown, table
-from stages.lab.dataset.motions import Motions, joined, write_motions
-from stages.lab.dataset.particles import Asset, Fineness, volumes
-from stages.lab.dataset.scenes import Config, write_configs
+from stages.lab.dataset.keypoint_motions import KeypointMotions, concatenate_motions, write_motions
+from stages.lab.dataset.object_particles import Asset, Discretisation, particle_volumes
+from stages.lab.dataset.scene_configs import SceneConfig, write_scene_configs
 from stages.lab.dataset.simulation import simulate
-from stages.lab.plot import HEIGHT, STRIP, WIDTH
+from stages.lab.plot import LEGEND_HEIGHT, PANEL_HEIGHT, PANEL_WIDTH
 from tests.lab.training.test_train import falling, without_last
 
 GROUPS = [*(f"3_{i}" for i in range(10)), "4", "6", "heldout"]
 NONE = DynamicsBenchOptions(keypoints=8, mpm=0, device="cpu")
 
 
-def group(name: str, by: float = 0.0) -> Motions:
+def group(name: str, by: float = 0.0) -> KeypointMotions:
     """Two scenes of bodies that fall, all of them `by` off."""
     made = falling(2, 8, 3 if name == "heldout" else int(name[0]), seed=GROUPS.index(name))
     return replace(made, names=(f"{name} a", f"{name} b"), points=made.points + by)
@@ -76,10 +76,10 @@ def weights(tmp_path: Path) -> Path:
 
 def test_free_fall_is_exact_for_bodies_that_only_fall():
     motions = without_last(falling(frames=20))
-    predicted = free_fall(motions.world(), 20, motions.dt)
+    predicted = free_fall(motions.initial_conditions(), 20, motions.dt)
     assert_close(predicted, motions.points, rtol=0, atol=1e-5)
     resting = predicted[1:, -1, :, :, 2].amin(-1)
-    assert_close(resting, torch.full_like(resting, float(motions.world().floor[0, 0])), rtol=0, atol=1e-5)
+    assert_close(resting, torch.full_like(resting, float(motions.initial_conditions().floor[0, 0])), rtol=0, atol=1e-5)
 
 
 def tumbling(seed: int = 0):
@@ -130,7 +130,7 @@ def test_errors_are_averaged_over_scenes_whatever_the_batch():
 
     one, all_ = (evaluate_predictor(still, motions, batch=b) for b in (1, 6))
     assert one == all_
-    world = motions.world()
+    world = motions.initial_conditions()
     expected = float(rmse(still(motions), motions.points, world.valid).mean())
     assert one["RMSE"] == pytest.approx(expected, rel=1e-3)
     assert one["R"] == 0  # everything falls, nothing was said to
@@ -210,7 +210,7 @@ def test_table_and_plots_are_drawn_again_from_the_results_alone(data, weights, t
     done = CliRunner().invoke(app, ["bench", "dynamics", "--from", str(out)])
     assert done.exit_code == 0 and done.stdout.splitlines() == lines, done.stderr
     assert first == {kind: out.with_suffix(kind).read_bytes() for kind in first}
-    assert cv2.imread(str(out.with_suffix(".png"))).shape[:2] == (2 * HEIGHT + STRIP, 5 * WIDTH)
+    assert cv2.imread(str(out.with_suffix(".png"))).shape[:2] == (2 * PANEL_HEIGHT + LEGEND_HEIGHT, 5 * PANEL_WIDTH)
     for text in ("[]", "no", '{"rows": 3}'):
         (tmp_path / "bad.json").write_text(text)
         done = CliRunner().invoke(app, ["bench", "dynamics", "--from", str(tmp_path / "bad.json")])
@@ -263,7 +263,7 @@ def box_shell(half, n=150, seed=0):
     return p * torch.tensor(half)
 
 
-COARSE = Fineness(dx=0.08, spacing=0.03, substep=5e-4)
+COARSE = Discretisation(dx=0.08, spacing=0.03, substep=5e-4)
 
 
 @pytest.fixture
@@ -271,16 +271,16 @@ def simulated(tmp_path, monkeypatch):
     """One group of two scenes with a ball and a duck, and what made it; one scene is of objects far off the box."""
     shapes = {0: (0.2, 0.2, 0.2), 7: (0.1, 0.1, 0.3)}
     points = {i: box_shell(half, seed=i) for i, half in shapes.items()}
-    things = {i: Asset(i, 1.0, p, volumes(p, COARSE.dx), 1e5, 500.0) for i, p in points.items()}
+    things = {i: Asset(i, 1.0, p, particle_volumes(p, COARSE.dx), 1e5, 500.0) for i, p in points.items()}
     heights = {"a": -0.73, "b": 0.0}
-    configs = {n: Config(n, (0, 7), ((0.0, 0.0, z), (0.7, 0.0, z + 0.1)), (1.0, 1.0)) for n, z in heights.items()}
+    configs = {n: SceneConfig(n, (0, 7), ((0.0, 0.0, z), (0.7, 0.0, z + 0.1)), (1.0, 1.0)) for n, z in heights.items()}
     for folder in ("motions", "scene_configs"):
         (tmp_path / "set" / folder).mkdir(parents=True)
-    write_configs(tmp_path / "set" / "scene_configs" / "3_9.json", configs)
+    write_scene_configs(tmp_path / "set" / "scene_configs" / "3_9.json", configs)
     options = {"dx": COARSE.dx, "spacing": COARSE.spacing, "substep": COARSE.substep, "keypoints": 60}
-    made = joined(list(simulate(configs, things, COARSE, 12, 60, "cpu")))
+    made = concatenate_motions(list(simulate(configs, things, COARSE, 12, 60, "cpu")))
     write_motions(tmp_path / "set" / "motions" / "3_9.h5", made, {"options": options})
-    monkeypatch.setattr(dynamics_baselines, "assets", lambda fineness, least, kept: things)
+    monkeypatch.setattr(dynamics_baselines, "load_assets", lambda fineness, least, kept: things)
     return tmp_path / "set", things
 
 

@@ -65,10 +65,14 @@ def test_squeezed_metal_is_nowhere_stressed_beyond_its_strength():
 def test_a_diagram_has_marks_and_a_line(tmp_path):
     panels = [plot.Panel("a", [(0.0, 0.0), (1.0, 2.0)], [(0.0, 0.1), (1.0, 1.9)]),
               plot.Panel("b", [(1e-3, 1.0), (1e-1, 100.0)], log=True)]  # fmt: skip
-    plot.draw(tmp_path / "a.png", panels, columns=2)
+    plot.draw_panels(tmp_path / "a.png", panels, columns=2)
     image = cv2.imread(str(tmp_path / "a.png"))
-    assert image.shape == (plot.HEIGHT, 2 * plot.WIDTH, 3)
+    assert image.shape == (plot.PANEL_HEIGHT, 2 * plot.PANEL_WIDTH, 3)
     blue, red = (image == plot.BLUE).all(2), image[..., 2].astype(int) - image[..., 0] > 60
-    assert blue[:, : plot.WIDTH].sum() > 40 and red[:, : plot.WIDTH].any() and not red[:, plot.WIDTH :].any()
+    assert (
+        blue[:, : plot.PANEL_WIDTH].sum() > 40
+        and red[:, : plot.PANEL_WIDTH].any()
+        and not red[:, plot.PANEL_WIDTH :].any()
+    )
     with pytest.raises(InputError, match="no folder"):
-        plot.draw(tmp_path / "no" / "a.png", panels)
+        plot.draw_panels(tmp_path / "no" / "a.png", panels)

@@ -10,26 +10,25 @@ import torch
 
 from ngff_cli import lab
 from stages.core.errors import InputError
-from stages.lab.dataset import make as dataset
-from stages.lab.dataset import particles as dataset_assets
-from stages.lab.dataset.motions import STEP, joined, read_motions, write_motions
+from stages.lab.dataset import generate, object_particles
+from stages.lab.dataset.keypoint_motions import POSITION_STEP, concatenate_motions, read_motions, write_motions
+from stages.lab.dataset.object_particles import Asset, Discretisation, particle_volumes
 from stages.lab.dataset.options import DatasetOptions
-from stages.lab.dataset.particles import Asset, Fineness, volumes
-from stages.lab.dataset.scenes import (
-    REACH,
-    SCENES,
-    Config,
-    configs_of,
-    groups_of,
-    nudged,
-    read_configs,
+from stages.lab.dataset.scene_configs import (
+    HALF_EXTENT,
+    SCENE_COUNTS,
+    SceneConfig,
+    parse_groups,
+    perturbed,
+    read_scene_configs,
+    sample_group,
     sample_scene,
-    write_configs,
+    write_scene_configs,
 )
 from stages.lab.dataset.simulation import simulate
 from stages.lab.training.data import read_groups
 
-COARSE = Fineness(dx=0.08, spacing=0.03, substep=5e-4)
+COARSE = Discretisation(dx=0.08, spacing=0.03, substep=5e-4)
 
 
 def box_shell(half, n=150, seed=0):
@@ -45,12 +44,12 @@ def box_shell(half, n=150, seed=0):
 def things():
     shapes = {0: (0.2, 0.2, 0.2), 2: (0.25, 0.25, 0.05), 7: (0.1, 0.1, 0.3)}
     points = {i: box_shell(half, seed=i) for i, half in shapes.items()}
-    return {i: Asset(i, 1.0, p, volumes(p, COARSE.dx), 1e5, 500.0) for i, p in points.items()}
+    return {i: Asset(i, 1.0, p, particle_volumes(p, COARSE.dx), 1e5, 500.0) for i, p in points.items()}
 
 
 @pytest.fixture(scope="module")
 def extents(things):
-    return dataset_assets.extents(things)
+    return object_particles.placement_extents(things)
 
 
 @pytest.mark.parametrize("count", [2, 3, 6])
@@ -64,36 +63,36 @@ def test_scenes_keep_the_rules(extents, count):
             assert (np.abs(p - q) >= a.half + b.half).any()
             gap = np.linalg.norm((a.points + p)[:, None] - (b.points + q)[None], axis=-1).min()
             assert gap >= 0.05
-        assert all(np.abs(p).max() + extents[i].radius <= REACH + 1e-9
+        assert all(np.abs(p).max() + extents[i].radius <= HALF_EXTENT + 1e-9
                    for i, p in zip(c.ids[1:], c.translation[1:], strict=True))  # fmt: skip
 
 
 def test_groups_and_their_files(tmp_path, extents, monkeypatch):
-    assert groups_of("3_0..3_2, 4") == ["3_0", "3_1", "3_2", "4"]
+    assert parse_groups("3_0..3_2, 4") == ["3_0", "3_1", "3_2", "4"]
     with pytest.raises(InputError, match="3_10"):
-        groups_of("3_10")
-    assert groups_of("more_8..more_9") == ["more_8", "more_9"]
+        parse_groups("3_10")
+    assert parse_groups("more_8..more_9") == ["more_8", "more_9"]
     for group in ("3_9", "more_0", "more_1"):
-        monkeypatch.setitem(SCENES, group, 2)
-    made = [c for group in ("3_9", "more_0", "more_1") for c in configs_of(group, extents).values()]
+        monkeypatch.setitem(SCENE_COUNTS, group, 2)
+    made = [c for group in ("3_9", "more_0", "more_1") for c in sample_group(group, extents).values()]
     assert [int(c.name.split("_")[0]) for c in made] == [2700, 2701, 3000, 3001, 3300, 3301]  # none is another's
     assert all(len(c.ids) == 3 for c in made)
-    monkeypatch.setitem(SCENES, "4", 10)
-    configs = configs_of("4", extents)
+    monkeypatch.setitem(SCENE_COUNTS, "4", 10)
+    configs = sample_group("4", extents)
     assert len(configs) == 10 and all(len(c.ids) == 4 for c in configs.values())
-    write_configs(tmp_path / "4.json", configs)
-    assert read_configs(tmp_path / "4.json") == configs
+    write_scene_configs(tmp_path / "4.json", configs)
+    assert read_scene_configs(tmp_path / "4.json") == configs
     row = json.loads((tmp_path / "4.json").read_text())[next(iter(configs))]
     assert set(row) == {"scene_object_idxs", "translation", "scale"}
     (tmp_path / "bad.json").write_text('{"a": 1}')
     with pytest.raises(InputError, match="bad.json"):
-        read_configs(tmp_path / "bad.json")
+        read_scene_configs(tmp_path / "bad.json")
 
 
 def test_free_fall_and_the_floor(things):
-    configs = {n: Config(n, ids, at, (1.0,) * len(ids)) for n, ids, at in (
+    configs = {n: SceneConfig(n, ids, at, (1.0,) * len(ids)) for n, ids, at in (
         ("0_0_7", (0, 7), ((0.0, 0.0, 0.5), (0.8, 0.0, 0.2))), ("1_2", (2,), ((0.0, 0.0, -0.88),)))}  # fmt: skip
-    made = joined(list(simulate(configs, things, COARSE, 30, 100, "cpu")))
+    made = concatenate_motions(list(simulate(configs, things, COARSE, 30, 100, "cpu")))
     assert made.names == ("0_0_7", "1_2") and made.points.shape == (2, 30, 2, 100, 3)
     assert made.objects.tolist() == [[0, 7], [2, -1]] and not made.points[1, :, 1].any()
     com = made.points.mean(3)
@@ -102,19 +101,21 @@ def test_free_fall_and_the_floor(things):
     assert (com[1, -1, 0] - com[1, 0, 0]).norm() < 0.03  # lies on the floor and stays
     assert made.points[..., 2].min() > -0.94 - 0.5 * COARSE.dx
     assert float(made.mass[0, 0]) == pytest.approx(500 * float(things[0].volume.sum()))
-    world = made.world(50)
+    world = made.initial_conditions(50)
     assert world.points.shape == (2, 2, 50, 3) and world.present.tolist() == [[True, True], [True, False]]
 
 
 def test_a_scene_that_goes_wrong_is_told_and_left_out(things, caplog):
-    configs = {n: Config(n, (0,), (at,), (1.0,)) for n, at in (("good", (0.0, 0.0, 0.0)), ("bad", (5.0, 0.0, 0.0)))}
-    made = joined(list(simulate(configs, things, COARSE, 3, 100, "cpu")))
+    configs = {
+        n: SceneConfig(n, (0,), (at,), (1.0,)) for n, at in (("good", (0.0, 0.0, 0.0)), ("bad", (5.0, 0.0, 0.0)))
+    }
+    made = concatenate_motions(list(simulate(configs, things, COARSE, 3, 100, "cpu")))
     assert made.names == ("good",) and "bad" in caplog.text
 
 
 def test_motions_round_trip(tmp_path, things):
-    made = joined(list(simulate({"a": Config("a", (0, 2), ((0.0, 0.0, 0.5), (0.6, 0.0, 0.3)), (1.0, 1.0))}, things,
-                                COARSE, 4, 60, "cpu")))  # fmt: skip
+    config = SceneConfig("a", (0, 2), ((0.0, 0.0, 0.5), (0.6, 0.0, 0.3)), (1.0, 1.0))
+    made = concatenate_motions(list(simulate({"a": config}, things, COARSE, 4, 60, "cpu")))
     write_motions(tmp_path / "m.h5", made, {"command": "test"})
     back = read_motions(tmp_path / "m.h5")
     with h5py.File(tmp_path / "m.h5", "r+") as file:  # HDF5's own filters would store the same
@@ -122,7 +123,7 @@ def test_motions_round_trip(tmp_path, things):
         file["points"][...] = file["points"][...]
         assert len(file["points"].id.read_direct_chunk((0, 0, 0, 0, 0))[1]) == pytest.approx(len(chunk), rel=0.05)
         assert file["points"].compression == "gzip" and file["points"].shuffle and file["points"].dtype == "<i2"
-    assert (back.points - made.points).abs().max() <= 0.51 * STEP
+    assert (back.points - made.points).abs().max() <= 0.51 * POSITION_STEP
     assert back.names == made.names and back.gravity == made.gravity and torch.equal(back.mass, made.mass)
     (tmp_path / "text.h5").write_text("no")
     with pytest.raises(InputError, match="text.h5"):
@@ -131,28 +132,28 @@ def test_motions_round_trip(tmp_path, things):
 
 def test_run_writes_resumes_and_shards(tmp_path, things, monkeypatch, capsys):
     for group in ("3_0", "4"):
-        monkeypatch.setitem(SCENES, group, 3)
-    monkeypatch.setattr(dataset, "assets", lambda fineness, least, kept: things)
+        monkeypatch.setitem(SCENE_COUNTS, group, 3)
+    monkeypatch.setattr(generate, "load_assets", lambda fineness, least, kept: things)
     options = DatasetOptions("3_0,4", "motions", 3, 50, COARSE.dx, COARSE.spacing, COARSE.substep, limit=2,
                              device="cpu")  # fmt: skip
-    dataset.run(tmp_path, options)
+    generate.run(tmp_path, options)
     files = {g: (tmp_path / "motions" / f"{g}.h5").read_bytes() for g in ("3_0", "4")}
     assert "3_0: 2 scenes" in capsys.readouterr().out and len(read_groups(tmp_path, ["3_0", "4"], 50)) == 4
     (tmp_path / "motions" / "4.h5").unlink()
-    dataset.run(tmp_path, options)
+    generate.run(tmp_path, options)
     assert {g: (tmp_path / "motions" / f"{g}.h5").read_bytes() for g in files} == files
-    dataset.run(tmp_path, options)
+    generate.run(tmp_path, options)
     assert "complete" in capsys.readouterr().out
     with pytest.raises(InputError, match="i/n"):
-        dataset.run(tmp_path, DatasetOptions(shard="3"))
+        generate.run(tmp_path, DatasetOptions(shard="3"))
 
 
 def test_particles_are_kept_and_read_again(tmp_path, monkeypatch):
-    monkeypatch.setattr(dataset_assets, "OBJECTS", {"duck": dataset_assets.OBJECTS["duck"]})
-    fine = Fineness(dx=0.03, spacing=0.03)
-    made = dataset_assets.assets(fine, 64, tmp_path / "p.npz")
-    monkeypatch.setattr(dataset_assets, "make_object", None)  # must not be needed again
-    again = dataset_assets.assets(fine, 64, tmp_path / "p.npz")
+    monkeypatch.setattr(object_particles, "OBJECTS", {"duck": object_particles.OBJECTS["duck"]})
+    fine = Discretisation(dx=0.03, spacing=0.03)
+    made = object_particles.load_assets(fine, 64, tmp_path / "p.npz")
+    monkeypatch.setattr(object_particles, "make_object", None)  # must not be needed again
+    again = object_particles.load_assets(fine, 64, tmp_path / "p.npz")
     assert torch.equal(made[7].points, again[7].points) and made[7].mass == again[7].mass
     size = made[7].points.amax(0) - made[7].points.amin(0)
     assert float(size.max()) == pytest.approx(0.3, rel=0.04)
@@ -160,7 +161,7 @@ def test_particles_are_kept_and_read_again(tmp_path, monkeypatch):
     assert float(gap.median()) == pytest.approx(0.03, rel=0.35)
     (tmp_path / "p.npz").write_text("no")
     with pytest.raises(InputError, match="p.npz"):
-        dataset_assets.assets(fine, 64, tmp_path / "p.npz")
+        object_particles.load_assets(fine, 64, tmp_path / "p.npz")
 
 
 def test_the_command_has_every_option_with_its_default():
@@ -171,10 +172,10 @@ def test_the_command_has_every_option_with_its_default():
 
 
 def test_nudged_scenes_start_so_much_aside(extents, monkeypatch):
-    monkeypatch.setitem(SCENES, "3_0", 3)
-    configs = configs_of("3_0", extents)
-    moved = nudged(configs, 1e-3)
-    assert moved == nudged(configs, 1e-3) and set(moved) == set(configs)
+    monkeypatch.setitem(SCENE_COUNTS, "3_0", 3)
+    configs = sample_group("3_0", extents)
+    moved = perturbed(configs, 1e-3)
+    assert moved == perturbed(configs, 1e-3) and set(moved) == set(configs)
     apart = np.array([np.subtract(moved[n].translation, c.translation) for n, c in configs.items()]).reshape(-1, 3)
     np.testing.assert_allclose(np.linalg.norm(apart, axis=1), 1e-3, rtol=1e-9)
     assert np.linalg.matrix_rank(apart) == 3  # each in a direction of its own

@@ -9,28 +9,28 @@ from typer.testing import CliRunner
 from ngff_cli.lab import app
 from stages.core.errors import InputError
 from stages.core.models.field.solidity import WALL
-from stages.lab.assets.heldout_shapes import KINDS, Kind, surface
+from stages.lab.assets.heldout_shapes import HELDOUT_SHAPES, ShapeKind, surface_points
 from stages.lab.assets.objects import OBJECTS
-from stages.lab.assets.random_shapes import kinds
+from stages.lab.assets.random_shapes import random_shapes
 from stages.lab.assets.signed_distance import ellipsoid
 from stages.lab.dataset import heldout
-from stages.lab.dataset.heldout import HeldoutOptions, assets, configs_of, run, turned
-from stages.lab.dataset.motions import read_motions
-from stages.lab.dataset.particles import Asset, Fineness, volumes
-from stages.lab.dataset.scenes import HELDOUT, OTHERS, groups_of, read_configs
+from stages.lab.dataset.heldout import HeldoutOptions, load_shape_assets, rotated_assets, run, sample_configs
+from stages.lab.dataset.keypoint_motions import read_motions
+from stages.lab.dataset.object_particles import Asset, Discretisation, particle_volumes
+from stages.lab.dataset.scene_configs import EXTRA_GROUPS, HELDOUT, parse_groups, read_scene_configs
 
-FINENESS = Fineness(0.1, 0.06, 5e-4)
+FINENESS = Discretisation(0.1, 0.06, 5e-4)
 COARSE = {"keypoints": 40, "dx": 0.1, "spacing": 0.06, "substep": 5e-4, "frames": 3, "device": "cpu"}
 
 
 def test_none_of_them_is_an_object_of_the_data_set():
-    assert not KINDS.keys() & OBJECTS.keys()
-    assert not {k.id for k in KINDS.values()} & {k.id for k in OBJECTS.values()}
+    assert not HELDOUT_SHAPES.keys() & OBJECTS.keys()
+    assert not {k.id for k in HELDOUT_SHAPES.values()} & {k.id for k in OBJECTS.values()}
 
 
-@pytest.mark.parametrize("name", KINDS)
+@pytest.mark.parametrize("name", HELDOUT_SHAPES)
 def test_points_lie_evenly_on_the_shape(name):
-    points = surface(KINDS[name], 2000)
+    points = surface_points(HELDOUT_SHAPES[name], 2000)
     sides = points.amax(0) - points.amin(0)
     assert len(points) == 2000 and float(sides.max()) == pytest.approx(1.0)
     assert (points.amax(0) + points.amin(0)).abs().max() < 1e-5
@@ -40,9 +40,9 @@ def test_points_lie_evenly_on_the_shape(name):
 
 
 def test_a_ball_is_round_and_a_knot_is_one_piece():
-    ball = surface(KINDS["soccer"], 1000)
+    ball = surface_points(HELDOUT_SHAPES["soccer"], 1000)
     assert (ball.norm(dim=1) - 0.5).abs().max() < 2e-3
-    knot = surface(KINDS["rope2"], 600)
+    knot = surface_points(HELDOUT_SHAPES["rope2"], 600)
     near = torch.cdist(knot, knot) < 0.11
     reached = torch.zeros(600, dtype=torch.bool)
     reached[0] = True
@@ -55,33 +55,37 @@ def test_a_ball_is_round_and_a_knot_is_one_piece():
 def kept(tmp_path_factory):
     """Particles of all shapes, chosen among few points."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(heldout, "DENSE", 2000)
+        patch.setattr(heldout, "SURFACE_POINTS", 2000)
         path = tmp_path_factory.mktemp("held") / "p.npz"
-        assets(KINDS, FINENESS, 40, path)
+        load_shape_assets(HELDOUT_SHAPES, FINENESS, 40, path)
     return path
 
 
 @pytest.fixture(scope="module")
 def things(kept):
-    return assets(KINDS, FINENESS, 40, kept)
+    return load_shape_assets(HELDOUT_SHAPES, FINENESS, 40, kept)
 
 
 def test_scenes_of_the_group_are_sampled_as_those_of_the_data_set(things):
-    configs = configs_of(things, 3, 3)
-    assert configs == configs_of(things, 3, 3) and [n.split("_")[0] for n in configs] == ["10000", "10001", "10002"]
+    configs = sample_configs(things, 3, 3)
+    assert configs == sample_configs(things, 3, 3) and [n.split("_")[0] for n in configs] == ["10000", "10001", "10002"]
     for c in configs.values():
-        assert len(c.ids) == 3 and c.translation[0] == (0.0, 0.0, 0.0) and set(c.ids) <= {k.id for k in KINDS.values()}
+        assert (
+            len(c.ids) == 3
+            and c.translation[0] == (0.0, 0.0, 0.0)
+            and set(c.ids) <= {k.id for k in HELDOUT_SHAPES.values()}
+        )
 
 
 def test_the_group_is_written_and_kept(things, tmp_path, monkeypatch):
-    monkeypatch.setattr(heldout, "assets", lambda *_: things)
+    monkeypatch.setattr(heldout, "load_shape_assets", lambda *_: things)
     options = HeldoutOptions(scenes=2, **COARSE)
     assert "2 scenes of 8 objects" in run(tmp_path, options)
     made = read_motions(tmp_path / "motions" / f"{HELDOUT}.h5")
     assert made.points.shape == (2, 3, 3, 40, 3) and list(made.names) == list(
-        read_configs(tmp_path / "scene_configs" / f"{HELDOUT}.json")
+        read_scene_configs(tmp_path / "scene_configs" / f"{HELDOUT}.json")
     )
-    kinds = {k.id: k for k in KINDS.values()}
+    kinds = {k.id: k for k in HELDOUT_SHAPES.values()}
     for row, ids in enumerate(made.objects.tolist()):
         assert [float(E) for E in made.E[row]] == [kinds[i].E for i in ids]
     # everything but what rests on something falls: 5 m/s^2 for two frames
@@ -92,11 +96,11 @@ def test_the_group_is_written_and_kept(things, tmp_path, monkeypatch):
 
 def test_particles_are_kept_and_read_again(things, kept, tmp_path, monkeypatch):
     monkeypatch.setattr(heldout, "_particles", None)  # must not be needed again
-    again = assets(KINDS, FINENESS, 40, kept)
+    again = load_shape_assets(HELDOUT_SHAPES, FINENESS, 40, kept)
     assert all(torch.equal(things[i].points, again[i].points) for i in things) and len(again) == 8
     (tmp_path / "p.npz").write_text("no")
     with pytest.raises(InputError, match="p.npz"):
-        assets(KINDS, FINENESS, 40, tmp_path / "p.npz")
+        load_shape_assets(HELDOUT_SHAPES, FINENESS, 40, tmp_path / "p.npz")
 
 
 def test_meshes_take_the_place_of_the_shapes(tmp_path, caplog):
@@ -124,37 +128,40 @@ def test_meshes_take_the_place_of_the_shapes(tmp_path, caplog):
 
 
 def test_varied_objects_are_within_what_the_ten_span_and_the_same_again():
-    table = kinds(18)
-    assert [k.E for k in kinds(5).values()] == [k.E for k in table.values()][:5]
-    assert [k.E for k in kinds(5, seed=1).values()] != [k.E for k in kinds(5).values()]
+    table = random_shapes(18)
+    assert [k.E for k in random_shapes(5).values()] == [k.E for k in table.values()][:5]
+    assert [k.E for k in random_shapes(5, seed=1).values()] != [k.E for k in random_shapes(5).values()]
     for name, kind in table.items():
-        points = surface(kind, 800)
+        points = surface_points(kind, 800)
         sides = points.amax(0) - points.amin(0)
         assert float(sides.max()) == pytest.approx(1.0) and float(sides.min()) > 0.02, name
         assert kind.shape()(torch.tensor([[0.6, 0.6, 0.6]])) > 0  # inside of the cube where surfaces are looked for
         assert 0.3 <= kind.scale <= 1 and 100 <= kind.density <= 2700 and 10 <= kind.E / kind.density <= 7400
-    assert len({k.id for k in table.values()} | {k.id for k in KINDS.values()}) == 18 + 8
+    assert len({k.id for k in table.values()} | {k.id for k in HELDOUT_SHAPES.values()}) == 18 + 8
 
 
 def test_varied_objects_become_a_group_that_training_takes(tmp_path, monkeypatch):
-    monkeypatch.setattr(heldout, "DENSE", 2000)
+    monkeypatch.setattr(heldout, "SURFACE_POINTS", 2000)
     assert "2 scenes of 3 objects" in run(tmp_path, HeldoutOptions(scenes=2, shapes=3, **COARSE))
     made = read_motions(tmp_path / "motions" / "varied.h5")
     assert made.points.shape == (2, 3, 3, 40, 3) and bool((made.objects >= 1000).all())
-    assert groups_of("varied,3_0", more=("varied",)) == ["varied", "3_0"]
+    assert parse_groups("varied,3_0", more=("varied",)) == ["varied", "3_0"]
     with pytest.raises(InputError, match="there are"):
-        groups_of("varied")
+        parse_groups("varied")
 
 
 def test_solid_objects_are_filled_and_as_heavy_as_that(tmp_path, monkeypatch):
     """Their keypoints stay those of the surface."""
-    monkeypatch.setattr(heldout, "DENSE", 2000)
-    kind = Kind(7, 0.6, 1e4, 500.0, lambda: ellipsoid((0, 0, 0), (0.4, 0.4, 0.4)))
-    ball = assets({"ball": kind}, Fineness(0.04, 0.03, 5e-4), 40, solid=True)[7]
+    monkeypatch.setattr(heldout, "SURFACE_POINTS", 2000)
+    kind = ShapeKind(7, 0.6, 1e4, 500.0, lambda: ellipsoid((0, 0, 0), (0.4, 0.4, 0.4)))
+    ball = load_shape_assets({"ball": kind}, Discretisation(0.04, 0.03, 5e-4), 40, solid=True)[7]
     assert (ball.points[:40].norm(dim=1) - 0.3).abs().max() < 3e-3
     assert ball.points.norm(dim=1).max() < 0.304
     kept = tmp_path / "kept.npz"
-    fine, coarse = (assets({"ball": kind}, Fineness(dx, 0.03, 5e-4), 40, kept, solid=True)[7] for dx in (0.04, 0.06))
+    fine, coarse = (
+        load_shape_assets({"ball": kind}, Discretisation(dx, 0.03, 5e-4), 40, kept, solid=True)[7]
+        for dx in (0.04, 0.06)
+    )
     assert torch.equal(fine.points, ball.points) and len(coarse.points) < len(fine.points)  # not read for another dx
     volume = float(4 / 3 * torch.pi * 0.3**3)
     around = float(4 * torch.pi * 0.3**2) * 0.04
@@ -162,21 +169,23 @@ def test_solid_objects_are_filled_and_as_heavy_as_that(tmp_path, monkeypatch):
     assert ball.solidity == pytest.approx((ball.mass / 500 / (24 * 0.3**2) / WALL) ** 3, rel=0.05)
     assert "1 scenes of 9 objects" in run(tmp_path, HeldoutOptions(scenes=1, shapes=9, solid=True, **COARSE))
     made = read_motions(tmp_path / "motions" / "solid.h5")
-    assert made.world().solidity.amax() > 1 and torch.equal(made.world().solidity, made.solidity)
-    assert groups_of("solid,turned", more=OTHERS) == ["solid", "turned"]
+    assert made.initial_conditions().solidity.amax() > 1 and torch.equal(
+        made.initial_conditions().solidity, made.solidity
+    )
+    assert parse_groups("solid,turned", more=EXTRA_GROUPS) == ["solid", "turned"]
 
 
 def test_the_ten_turned_keep_their_shape_mass_and_material(tmp_path, monkeypatch):
     box = 0.1 * (torch.rand(60, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([6.0, 2, 1]))
-    ten = {i: Asset(i, 0.6, box, volumes(box, 0.1), 1e5 * i, 300.0) for i in (1, 2)}
-    made = turned(ten, 5, FINENESS)
+    ten = {i: Asset(i, 0.6, box, particle_volumes(box, 0.1), 1e5 * i, 300.0) for i in (1, 2)}
+    made = rotated_assets(ten, 5, FINENESS)
     assert list(made) == [2000, 2001, 2002, 2003, 2004] and [a.E for a in made.values()][:3] == [1e5, 2e5, 1e5]
     for a in made.values():
         assert (a.points.amax(0) + a.points.amin(0)).abs().max() < 1e-5
         torch.testing.assert_close(torch.cdist(a.points, a.points), torch.cdist(box, box), atol=1e-3, rtol=0)
     one, other = made[2000].points, made[2002].points
     assert (one - one.mean(0) - (other - other.mean(0))).norm(dim=1).mean() > 0.05
-    monkeypatch.setattr(heldout.dataset_assets, "assets", lambda *_: ten)
+    monkeypatch.setattr(heldout.object_particles, "load_assets", lambda *_: ten)
     assert "2 scenes of 4 objects" in run(tmp_path, HeldoutOptions(scenes=2, turned=4, **COARSE))
     assert bool((read_motions(tmp_path / "motions" / "turned.h5").objects >= 2000).all())
 

@@ -16,8 +16,7 @@ from stages.core.errors import InputError
 from stages.core.geometry.rotations import matrix
 from stages.core.physics.skinning import Skinning
 from stages.core.scene.trajectory import read_trajectory
-from stages.lab.dataset import importer
-from stages.lab.dataset import make as dataset
+from stages.lab.dataset import generate, importer
 from tests.lab.small_world import OPTIONS, shrink
 
 DUCK, PHONE, FRAMES = 60, 40, 5
@@ -73,8 +72,8 @@ def published(tmp_path):
 @pytest.fixture
 def small(monkeypatch):
     """Objects with as few Gaussians as the folder has."""
-    monkeypatch.setitem(importer.PUBLISHED, "duck", DUCK)
-    monkeypatch.setitem(importer.PUBLISHED, "phone", PHONE)
+    monkeypatch.setitem(importer.PUBLISHED_COUNTS, "duck", DUCK)
+    monkeypatch.setitem(importer.PUBLISHED_COUNTS, "phone", PHONE)
 
 
 def test_a_folder_written_by_hand(published, small, tmp_path):
@@ -107,7 +106,7 @@ def test_what_was_imported_is_rendered_and_evaluated(published, small, tmp_path)
 def test_round_trip_of_what_we_write(tmp_path, monkeypatch):
     """All particles' frames come back to within float16, on Gaussians that only follow keypoints too."""
     shrink(monkeypatch.setattr, monkeypatch.setitem)
-    dataset.run(tmp_path, replace(OPTIONS, only="scenes,mpm", frames=12, limit=1))
+    generate.run(tmp_path, replace(OPTIONS, only="scenes,mpm", frames=12, limit=1))
     folder = next((tmp_path / "mpm" / "3_9").iterdir())
     importer.run(folder, tmp_path / "t.h5", count=128)
     t = read_trajectory(tmp_path / "t.h5")
@@ -143,7 +142,7 @@ def test_mistakes_are_told(published, small, tmp_path):
         file["pos"][...] = file["pos"][:] + np.float16(0.1)
     with pytest.raises(InputError, match="rows start up to 0.1"):
         importer.run(published, out)
-    importer.PUBLISHED["duck"] += 1
+    importer.PUBLISHED_COUNTS["duck"] += 1
     with pytest.raises(InputError, match="its objects together 101 .duck 61, phone 40."):
         importer.run(published, out)
     (tmp_path / "scene_configs" / "3_9.json").unlink()

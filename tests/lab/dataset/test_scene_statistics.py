@@ -10,10 +10,9 @@ from typer.testing import CliRunner
 
 from ngff_cli.lab import app
 from stages.core.errors import InputError
-from stages.lab.dataset import predictability
-from stages.lab.dataset import statistics as scene_statistics
-from stages.lab.dataset.motions import Motions, joined, write_motions
-from stages.lab.dataset.statistics import facts_of
+from stages.lab.dataset import scene_statistics, sensitivity
+from stages.lab.dataset.keypoint_motions import KeypointMotions, concatenate_motions, write_motions
+from stages.lab.dataset.scene_statistics import compute_statistics
 
 T, N = 20, 300
 BOX = ((-1.94, -1.94, -0.94), (1.94, 1.94, 2.94))
@@ -46,14 +45,14 @@ def motions(*objects, ids):
     """A scene, from (t, n, 3) each."""
     points = torch.stack([torch.stack(objects, 1)])
     n = torch.ones(1, len(ids))
-    return Motions(("a",), torch.tensor([ids]), points, n, n, 0.3 * n, n, 0.02, (0, 0, -5.0), BOX, n)
+    return KeypointMotions(("a",), torch.tensor([ids]), points, n, n, 0.3 * n, n, 0.02, (0, 0, -5.0), BOX, n)
 
 
 def test_a_ball_falls_into_a_bowl_and_a_duck_lies_beside():
     bowl, ball, duck = cup(0.25), shell(0.1, seed=1), shell(0.1, seed=2)
     m = motions(still(bowl, [0.0, 0.0, -0.67]), moving(ball, [0.0, 0, 0.4], [0.0, 0, -0.79]),
                 still(duck, [0.8, 0.0, -0.82]), ids=[2, 0, 7])  # fmt: skip
-    f = facts_of(m)
+    f = compute_statistics(m)
     assert f.falls.tolist() == [[0, 1, 0]] and f.contained.tolist() == [[0, 1, 0]]
     assert f.touch.tolist() == [[1, 0, 0]]  # pairs 01 02 12
     assert f.at_rest.tolist() == [[1, 1, 1]] and f.stacked.tolist() == [[0, 1, 0]]
@@ -64,11 +63,11 @@ def test_a_ball_falls_into_a_bowl_and_a_duck_lies_beside():
 def test_above_a_bowl_or_under_a_tilted_one_is_not_inside():
     bowl, ball = cup(0.25), shell(0.1, seed=1)
     above = motions(still(bowl, [0.0, 0.0, -0.67]), still(ball, [0.0, 0.0, -0.5]), ids=[2, 0])
-    assert facts_of(above).contained.tolist() == [[0, 0]]
+    assert compute_statistics(above).contained.tolist() == [[0, 0]]
     half = torch.tensor([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])
     over = moving(bowl, [0.0, 0, 0.2], [0.0, 0, -0.9])
     over = torch.cat([over[:1], (over[1:] - over[1:].mean(1, keepdim=True)) @ half.T + over[1:].mean(1, keepdim=True)])
-    f = facts_of(motions(over, still(ball, [0.0, 0.0, -0.84]), ids=[2, 0]))
+    f = compute_statistics(motions(over, still(ball, [0.0, 0.0, -0.84]), ids=[2, 0]))
     assert f.contained.tolist() == [[0, 0]] and f.tipped.tolist() == [[1, 0]]
 
 
@@ -78,7 +77,7 @@ def test_deformation_tilt_and_speed_are_what_was_put_in():
     c, s, zero, one = angle.cos(), angle.sin(), 0 * angle, 1 + 0 * angle
     R = torch.stack([one, zero, zero, zero, c, -s, zero, s, c], -1).reshape(T, 3, 3)
     turned = p @ R.mT
-    f = facts_of(motions(turned, ids=[0]))
+    f = compute_statistics(motions(turned, ids=[0]))
     assert f.tipped.item() == 1 and f.deformation.item() < 1e-5 and f.at_rest.item() == 0
     assert f.touch.shape == (1, 0)
     squashed = still(p, [0.0, 0, 0]).clone()
@@ -86,13 +85,13 @@ def test_deformation_tilt_and_speed_are_what_was_put_in():
     # the nearest rotation is none, and half of z is missing
     q = p - p.mean(0)
     expected = ((0.5 * q[:, 2]).square().mean() / q.square().sum(1).mean()).sqrt()
-    assert facts_of(motions(squashed, ids=[0])).deformation.item() == pytest.approx(float(expected), rel=1e-3)
+    assert compute_statistics(motions(squashed, ids=[0])).deformation.item() == pytest.approx(float(expected), rel=1e-3)
 
 
 def test_scenes_with_fewer_objects_count_for_those_they_have(tmp_path):
     ball = shell(0.1)
     m = motions(moving(ball, [0.0, 0, 0.4], [0.0, 0, -0.8]), still(0 * ball, [0.0, 0.0, 0.0]), ids=[0, -1])
-    f = facts_of(m)
+    f = compute_statistics(m)
     assert f.falls[0, 0] == 1 and f.falls[0, 1].isnan() and f.touch.isnan().all() and f.spread.item() < 1e-6
 
 
@@ -119,8 +118,8 @@ def test_predictability_is_the_error_between_two_runs(tmp_path):
     for name, tracks in (("a", (path, path, path)), ("b", (aside, path + torch.tensor([0, 1e-3, 0])))):
         scenes = [replace(motions(t, ids=[0]), names=(f"{i}_0",)) for i, t in enumerate(tracks)]
         (tmp_path / name).mkdir()
-        write_motions(tmp_path / name / "3_9.h5", joined(scenes), {})
-    line = predictability.run(tmp_path / "a", tmp_path / "b", tmp_path / "p.json", 256, "cpu")[2]
+        write_motions(tmp_path / name / "3_9.h5", concatenate_motions(scenes), {})
+    line = sensitivity.run(tmp_path / "a", tmp_path / "b", tmp_path / "p.json", 256, "cpu")[2]
     row = json.loads((tmp_path / "p.json").read_text())["splits"]["spatial"]
     # scene 0: 10 frames of 1 mm, 10 of 1 mm and 0.1 m; scene 1: 1 mm; an RMSE is over three axes
     first, second = math.sqrt((1e-6 + 0.5 * 0.01) / 3), math.sqrt(1e-6 / 3)
@@ -128,6 +127,6 @@ def test_predictability_is_the_error_between_two_runs(tmp_path):
     assert row["FPE"] == pytest.approx((math.hypot(0.1, 1e-3) + 1e-3) / 2, rel=1e-2)
     assert row["start apart"] == pytest.approx(1e-3, rel=0.02) and line.startswith("| spatial | 2 | 0.00100 |")
     with pytest.raises(InputError, match="start where those of"):
-        predictability.run(tmp_path / "a", tmp_path / "a", None, 256, "cpu")
+        sensitivity.run(tmp_path / "a", tmp_path / "a", None, 256, "cpu")
     with pytest.raises(InputError, match="has no group"):
-        predictability.run(tmp_path / "a", tmp_path, None, 256, "cpu")
+        sensitivity.run(tmp_path / "a", tmp_path, None, 256, "cpu")

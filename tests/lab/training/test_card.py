@@ -7,7 +7,7 @@ from typer.testing import CliRunner
 from ngff_cli.lab import app
 from stages.core.errors import InputError
 from stages.core.models.checkpoints import HERE, build, load, save
-from stages.lab.plot import HEIGHT, STRIP, WIDTH
+from stages.lab.plot import LEGEND_HEIGHT, PANEL_HEIGHT, PANEL_WIDTH
 from stages.lab.training.card import run
 
 
@@ -25,8 +25,10 @@ def test_two_trainings_in_one_picture(tmp_path):
     assert done.exit_code == 0, done.stderr
     assert done.stdout.splitlines()[0] == "a: gcn, 7 scenes, 2.0 min on cpu: RMSE 0.0250  R 0.5000"
     image = cv2.imread(str(tmp_path / "curves.png"))
-    assert image.shape == (HEIGHT + STRIP, 3 * WIDTH, 3)
-    assert (image[:HEIGHT, :WIDTH] == (40, 40, 200)).all(2).sum() > 50  # the curve of a; of b there is a point
+    assert image.shape == (PANEL_HEIGHT + LEGEND_HEIGHT, 3 * PANEL_WIDTH, 3)
+    assert (image[:PANEL_HEIGHT, :PANEL_WIDTH] == (40, 40, 200)).all(
+        2
+    ).sum() > 50  # the curve of a; of b there is a point
 
 
 def test_the_minutes_of_the_weights_begun_with_count(tmp_path):

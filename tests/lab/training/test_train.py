@@ -19,7 +19,7 @@ from stages.core.errors import InputError
 from stages.core.models.checkpoints import MODELS, build, load
 from stages.core.models.external_forces import Pushes
 from stages.core.models.initial_conditions import BOX, GRAVITY
-from stages.lab.dataset.motions import Motions, write_motions
+from stages.lab.dataset.keypoint_motions import KeypointMotions, write_motions
 from stages.lab.training.data import (
     MAX_SPEED_CHANGE,
     ClipSampler,
@@ -38,7 +38,7 @@ DT = 0.02
 FLOOR = BOX[0][2]
 
 
-def falling(scenes: int = 6, frames: int = 12, objects: int = 2, n: int = 8, seed: int = 0) -> Motions:
+def falling(scenes: int = 6, frames: int = 12, objects: int = 2, n: int = 8, seed: int = 0) -> KeypointMotions:
     """Balls of points that fall from different heights and stay where their lowest point meets the floor."""
     rng = torch.Generator().manual_seed(seed)
     shape = 0.1 * torch.nn.functional.normalize(torch.randn(scenes, objects, n, 3, generator=rng), dim=-1)
@@ -51,11 +51,11 @@ def falling(scenes: int = 6, frames: int = 12, objects: int = 2, n: int = 8, see
     points[..., 2] -= torch.minimum(fallen[None, :, None], room[:, None])[..., None]
     one = torch.ones(scenes, objects)
     ids = torch.arange(objects).expand(scenes, objects).clone()
-    return Motions(tuple(map(str, range(scenes))), ids, points, 0.1 * one, 1e5 * one, 0.3 * one, 0.5 * one, DT,
+    return KeypointMotions(tuple(map(str, range(scenes))), ids, points, 0.1 * one, 1e5 * one, 0.3 * one, 0.5 * one, DT,
                    GRAVITY, BOX, one)  # fmt: skip
 
 
-def without_last(motions: Motions) -> Motions:
+def without_last(motions: KeypointMotions) -> KeypointMotions:
     """The last object of scene 0 is padding."""
     ids, points = motions.objects.clone(), motions.points.clone()
     ids[0, -1], points[0, :, -1] = -1, 0
@@ -231,7 +231,7 @@ def test_gradients_fade_on_their_way_back():
 
 
 def test_no_pushes_are_no_pushes():
-    world = without_last(falling()).world()
+    world = without_last(falling()).initial_conditions()
     none, idle = Pushes.nobody(world.valid, world.points), Pushes.none(world)
     # a push of no strength goes all the way that a real one goes
     weak = replace(idle, object=idle.object.new_zeros(6, 1), point=idle.point.new_zeros(6, 1) - 1,

@@ -19,9 +19,9 @@ from pathlib import Path
 from tqdm import tqdm
 
 from stages.core.errors import InputError
-from stages.lab.dataset.make import Maker
+from stages.lab.dataset.disk_usage import missing_bytes, require_disk_space
+from stages.lab.dataset.generate import DatasetGenerator
 from stages.lab.dataset.options import DatasetOptions
-from stages.lab.dataset.sizes import must_fit, wanted
 
 
 def run(out: Path, options: DatasetOptions, address: str) -> None:
@@ -31,9 +31,9 @@ def run(out: Path, options: DatasetOptions, address: str) -> None:
     except ImportError as error:
         raise InputError("--ray: Ray is not installed; `pip install 'ngff[ray]'` brings it") from error
     out = Path(out).resolve()
-    maker = Maker(out, options)  # what all groups need is made once, here
+    maker = DatasetGenerator(out, options)  # what all groups need is made once, here
     maker.shared()
-    must_fit(out, wanted(maker.layout, options))
+    require_disk_space(out, missing_bytes(maker.layout, options))
     _ = maker.things
     if not ray.is_initialized():
         try:
@@ -56,4 +56,4 @@ def run(out: Path, options: DatasetOptions, address: str) -> None:
 
 def _group(out: Path, options: DatasetOptions) -> None:
     """On a worker: one group; objects and backgrounds are there."""
-    Maker(out, options).group(options.groups)
+    DatasetGenerator(out, options).group(options.groups)

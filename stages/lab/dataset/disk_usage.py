@@ -10,16 +10,20 @@ from plyfile import PlyData
 
 from stages.core.errors import InputError
 from stages.lab.assets.objects import OBJECTS
-from stages.lab.dataset.layout import ORBIT, Layout
+from stages.lab.dataset.layout import ORBIT_VIEWS, Layout
 from stages.lab.dataset.options import DatasetOptions
-from stages.lab.dataset.scenes import SCENES, objects_in
+from stages.lab.dataset.scene_configs import SCENE_COUNTS, object_count
 
-STILL, MOVING, DEPTH = 0.02, 0.035, 1.2  # bytes a pixel: of videos from a camera that stands or moves, and of depth
-PACKED = 0.55  # of keypoints: what compression leaves
+VIDEO_FIXED_CAMERA, VIDEO_MOVING_CAMERA, DEPTH_MAP = (
+    0.02,
+    0.035,
+    1.2,
+)  # bytes a pixel: of videos from a camera that stands or moves, and of depth
+KEYPOINT_COMPRESSION = 0.55  # of keypoints: what compression leaves
 
 
 @dataclass(frozen=True)
-class Sizes:
+class SizeEstimate:
     """Bytes, about: exact for what is stored as it is, as measured for what is compressed."""
 
     frames: int
@@ -32,7 +36,7 @@ class Sizes:
 
     def motion(self, objects: int) -> float:
         """Of the keypoints of a scene."""
-        return PACKED * self.frames * objects * self.keypoints * 6
+        return KEYPOINT_COMPRESSION * self.frames * objects * self.keypoints * 6
 
     def scene(self, gaussians: float) -> float:
         return 168 * gaussians
@@ -42,15 +46,15 @@ class Sizes:
 
     def initial(self, views: int) -> float:
         """Over one background."""
-        return self.resolution**2 * (ORBIT * MOVING + views * DEPTH)
+        return self.resolution**2 * (ORBIT_VIEWS * VIDEO_MOVING_CAMERA + views * DEPTH_MAP)
 
     def video(self) -> float:
-        return self.resolution**2 * self.frames * STILL
+        return self.resolution**2 * self.frames * VIDEO_FIXED_CAMERA
 
 
-def wanted(layout: Layout, options: DatasetOptions) -> dict[str, float]:
+def missing_bytes(layout: Layout, options: DatasetOptions) -> dict[str, float]:
     """What is still to be written of each part; objects are made already where scenes need them."""
-    sizes = Sizes(options.frames, options.keypoints, options.resolution)
+    sizes = SizeEstimate(options.frames, options.keypoints, options.resolution)
     paths = [layout.object(name) for name in OBJECTS]
     counts = [PlyData.read(str(p), mmap="r")["vertex"].count for p in paths if p.exists()]
     each = sum(counts) / max(len(counts), 1)  # Gaussians of an object, on average
@@ -61,9 +65,9 @@ def wanted(layout: Layout, options: DatasetOptions) -> dict[str, float]:
             continue
         out[part] = 0.0
         for group in options.mine:
-            scenes, objects = min(SCENES[group], options.limit or SCENES[group]), objects_in(group)
+            scenes, objects = min(SCENE_COUNTS[group], options.limit or SCENE_COUNTS[group]), object_count(group)
             total = {
-                "scene_configs": SCENES[group] * sizes.config(objects), "motions": scenes * sizes.motion(objects),
+                "scene_configs": SCENE_COUNTS[group] * sizes.config(objects), "motions": scenes * sizes.motion(objects),
                 "scenes": scenes * sizes.scene(objects * each), "mpm": scenes * sizes.mpm(objects * each),
                 "initial": scenes * tables * sizes.initial(views),
                 "dynamic": scenes * tables * views * sizes.video(),
@@ -78,19 +82,19 @@ def _size(folder: Path) -> int:
     return sum(p.stat().st_size for p in folder.rglob("*") if p.is_file())
 
 
-def must_fit(root: Path, parts: dict[str, float]) -> None:
+def require_disk_space(root: Path, parts: dict[str, float]) -> None:
     """Print what each part that is missing will take; raise InputError when the disk has less."""
     total, free = sum(parts.values()), shutil.disk_usage(root).free
     if not total:
         return
-    missing = ", ".join(f"{part} {human(size)}" for part, size in parts.items() if size)
-    print(f"{root}: about {human(total)} will be written ({missing}), {human(free)} are free", flush=True)
+    missing = ", ".join(f"{part} {format_bytes(size)}" for part, size in parts.items() if size)
+    print(f"{root}: about {format_bytes(total)} will be written ({missing}), {format_bytes(free)} are free", flush=True)
     if total > 0.98 * free:
-        raise InputError(f"{root}: about {human(total)} are needed and {human(free)} are free; choose fewer parts "
-                         "(--only), --groups, --views or --backgrounds, or a larger disk")  # fmt: skip
+        raise InputError(f"{root}: about {format_bytes(total)} are needed and {format_bytes(free)} are free; choose "
+                         "fewer parts (--only), --groups, --views or --backgrounds, or a larger disk")  # fmt: skip
 
 
-def human(size: float) -> str:
+def format_bytes(size: float) -> str:
     """1234567 -> "1.23 MB"."""
     for unit in ("B", "kB", "MB", "GB"):
         if size < 1000:

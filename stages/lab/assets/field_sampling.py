@@ -15,13 +15,16 @@ from stages.core.scene.gaussians import Gaussians
 from stages.lab.assets.shapes import Surface, to_gaussians
 from stages.lab.assets.signed_distance import Field, Vec, union
 
-CELLS = 64  # of the coarse grid, along the longest side
-SKY, KEY = torch.tensor([0.0, 0.0, 1.0]), torch.nn.functional.normalize(torch.tensor([-0.35, -0.75, 0.85]), dim=0)
-LOBE = (1 / 14, 3 / 16, 5 / 21)  # Legendre coefficients of max(cos, 0)^6
+GRID_CELLS = 64  # of the coarse grid, along the longest side
+SKY_LIGHT, KEY_LIGHT = (
+    torch.tensor([0.0, 0.0, 1.0]),
+    torch.nn.functional.normalize(torch.tensor([-0.35, -0.75, 0.85]), dim=0),
+)
+HIGHLIGHT_LEGENDRE = (1 / 14, 3 / 16, 5 / 21)  # Legendre coefficients of max(cos, 0)^6
 
 
 @dataclass(frozen=True)
-class Part:
+class PaintedPart:
     """A piece of an object: its shape, its colour as a function of points (n, 3) -> RGB (n, 3), and its gloss."""
 
     field: Field
@@ -29,14 +32,16 @@ class Part:
     gloss: float = 0.0  # brightness added at the centre of the highlight
 
 
-def sculpt(parts: list[Part], half: Vec, n: int, smooth: float = 0.0, skin: float = 0.008) -> Gaussians:
+def gaussians_from_parts(
+    parts: list[PaintedPart], half: Vec, n: int, smooth: float = 0.0, skin: float = 0.008
+) -> Gaussians:
     """n flat Gaussians of SH degree 2 on the union of the parts, which lies within +-half; longest side about 1.
 
     A point takes paint and gloss of the part it lies on; `skin` is less than half the thickness of any wall. Same
     arguments, same Gaussians.
     """
     field = union(*(part.field for part in parts), smooth=smooth)
-    surface = evened(field, spread(field, half, n, skin))
+    surface = relax_points(field, sample_surface(field, half, n, skin))
     p = surface.points
     owner = torch.stack([part.field(p) for part in parts]).argmin(0)
     rgb, gloss = torch.zeros(len(p), 3), torch.zeros(len(p))
@@ -44,19 +49,19 @@ def sculpt(parts: list[Part], half: Vec, n: int, smooth: float = 0.0, skin: floa
         own = owner == i
         if own.any():
             rgb[own], gloss[own] = part.paint(p[own]), part.gloss
-    light = shade(surface) * openness(field, surface)
+    light = diffuse_light(surface) * ambient_occlusion(field, surface)
     flat = to_gaussians(surface, rgb * light[:, None], 1, width=0.62)
-    return normalised(replace(flat, sh=shine(flat.sh, surface.normals, gloss)))
+    return normalise_size(replace(flat, sh=add_highlight(flat.sh, surface.normals, gloss)))
 
 
-def normalised(g: Gaussians) -> Gaussians:
+def normalise_size(g: Gaussians) -> Gaussians:
     """Bounding box of the centres around the origin, its longest side 1."""
     low, high = g.means.amin(0), g.means.amax(0)
     side = (high - low).max()
     return replace(g, means=(g.means - (low + high) / 2) / side, scales=g.scales / side)
 
 
-def slope(field: Field, p: Float[Tensor, "n 3"], step: float = 1e-3) -> tuple[Tensor, Tensor]:
+def distance_and_normal(field: Field, p: Float[Tensor, "n 3"], step: float = 1e-3) -> tuple[Tensor, Tensor]:
     """First-order distance to the surface (n,) and unit gradient (n, 3), by differences over a tetrahedron."""
     corners = torch.tensor([[1.0, -1, -1], [-1, -1, 1], [-1, 1, -1], [1, 1, 1]])
     values = torch.stack([field(p + step * corner) for corner in corners], 1)
@@ -65,14 +70,14 @@ def slope(field: Field, p: Float[Tensor, "n 3"], step: float = 1e-3) -> tuple[Te
     return values.mean(1) / size, gradient / size[:, None]
 
 
-def spread(field: Field, half: Vec, n: int, skin: float) -> Surface:
+def sample_surface(field: Field, half: Vec, n: int, skin: float) -> Surface:
     """n random points, evenly likely anywhere on the surface of a field whose slope is nowhere below 1/2 or above 2.
 
     Points drawn in a thin skin around the surface are carried onto it along the gradient; only cells of a coarse
     grid that the skin can reach are drawn from.
     """
     generator = torch.Generator().manual_seed(n)
-    cell = 2 * max(half) / CELLS
+    cell = 2 * max(half) / GRID_CELLS
     corners = torch.cartesian_prod(*(torch.arange(-h - cell, h + cell, cell) for h in half))
     near = corners[field(corners + cell / 2).abs() < 2 * (0.87 * cell + skin)]  # 0.87: half the diagonal of a cell
     found, count = [], 0
@@ -80,21 +85,21 @@ def spread(field: Field, half: Vec, n: int, skin: float) -> Surface:
         which = torch.randint(len(near), (4 * n,), generator=generator)
         p = near[which] + cell * torch.rand(4 * n, 3, generator=generator)
         p = p[field(p).abs() < 2 * skin]
-        distance, normal = slope(field, p)
+        distance, normal = distance_and_normal(field, p)
         found.append((p - distance[:, None] * normal)[distance.abs() < skin])
         count += len(found[-1])
-    return settled(field, torch.cat(found)[:n])
+    return project_to_surface(field, torch.cat(found)[:n])
 
 
-def settled(field: Field, p: Float[Tensor, "n 3"], steps: int = 2) -> Surface:
+def project_to_surface(field: Field, p: Float[Tensor, "n 3"], steps: int = 2) -> Surface:
     """Points near the surface carried onto it by Newton steps, with the normals where the last step began."""
     for _ in range(steps):
-        distance, normal = slope(field, p)
+        distance, normal = distance_and_normal(field, p)
         p = p - distance.clamp(-0.01, 0.01)[:, None] * normal
     return Surface(p, normal)
 
 
-def evened(field: Field, surface: Surface, rounds: int = 5) -> Surface:
+def relax_points(field: Field, surface: Surface, rounds: int = 5) -> Surface:
     """Points pushed off their near neighbours on the same side and back onto the surface, so that gaps close."""
     for last in [False] * (rounds - 1) + [True]:
         p, normal = surface.points, surface.normals
@@ -105,17 +110,17 @@ def evened(field: Field, surface: Surface, rounds: int = 5) -> Surface:
         away = (p[:, None] - p[index]) / distance.clamp_min(1e-9)[..., None]
         step = 0.35 * reach * (push[..., None] * away).sum(1)
         step = step - (step * normal).sum(1, keepdim=True) * normal
-        surface = settled(field, p + step, 2 if last else 1)
+        surface = project_to_surface(field, p + step, 2 if last else 1)
     return surface
 
 
-def shade(surface: Surface) -> Float[Tensor, "n"]:
+def diffuse_light(surface: Surface) -> Float[Tensor, "n"]:
     """Soft light from above and a key light from the upper front left."""
     n = surface.normals
-    return 0.66 + 0.16 * (n @ SKY) + 0.26 * (n @ KEY).clamp_min(0)
+    return 0.66 + 0.16 * (n @ SKY_LIGHT) + 0.26 * (n @ KEY_LIGHT).clamp_min(0)
 
 
-def openness(field: Field, surface: Surface) -> Float[Tensor, "n"]:
+def ambient_occlusion(field: Field, surface: Surface) -> Float[Tensor, "n"]:
     """1 where nothing stands near, less in creases: how far the field falls short of the distance moved outward.
 
     Source: Evans 2006, "Fast approximations for global illumination on dynamic scenes".
@@ -127,16 +132,16 @@ def openness(field: Field, surface: Surface) -> Float[Tensor, "n"]:
     return 1 - 0.42 * (hidden / 1.875).clamp(0, 1)
 
 
-def shine(sh: Float[Tensor, "n 1 3"], normals: Tensor, gloss: Float[Tensor, "n"]) -> Float[Tensor, "n 9 3"]:
+def add_highlight(sh: Float[Tensor, "n 1 3"], normals: Tensor, gloss: Float[Tensor, "n"]) -> Float[Tensor, "n 9 3"]:
     """Coefficients of degree 2 that add a broad white highlight, the mirror image of the key light.
 
     By the addition theorem a lobe f(cos) around direction r has coefficients f_l 4 pi / (2 l + 1) Y_lm(r), f_l being
     its Legendre coefficients. Colours are looked up along the view ray, so r is the mirrored light, reversed.
     """
-    mirrored = 2 * (normals @ KEY)[:, None] * normals - KEY
-    lit = gloss * ((normals @ KEY) * 2).clamp(0, 1)
-    weights = torch.tensor([f * 4 * torch.pi / (2 * l + 1) for l, f in enumerate(LOBE)])
+    mirrored = 2 * (normals @ KEY_LIGHT)[:, None] * normals - KEY_LIGHT
+    lit = gloss * ((normals @ KEY_LIGHT) * 2).clamp(0, 1)
+    weights = torch.tensor([f * 4 * torch.pi / (2 * l + 1) for l, f in enumerate(HIGHLIGHT_LEGENDRE)])
     lobe = basis(-mirrored, 2) * weights[torch.tensor([0, 1, 1, 1, 2, 2, 2, 2, 2])]
     out = torch.nn.functional.pad(sh, (0, 0, 0, 8)) + (lit[:, None] * lobe)[..., None]
-    out[:, 0] -= (lit * LOBE[0] / C0)[:, None]  # the mean over all views stays that of the paint
+    out[:, 0] -= (lit * HIGHLIGHT_LEGENDRE[0] / C0)[:, None]  # the mean over all views stays that of the paint
     return out

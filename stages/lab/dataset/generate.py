@@ -21,25 +21,30 @@ from stages.core.scene.files import provenance
 from stages.core.scene.scene_ply import read_scene
 from stages.lab.assets import backgrounds, objects
 from stages.lab.dataset import manifest
-from stages.lab.dataset.dynamic_gaussians import skins
-from stages.lab.dataset.layout import BY_SCENE, Layout
-from stages.lab.dataset.motions import MotionsWriter, made_by
+from stages.lab.dataset.disk_usage import missing_bytes, require_disk_space
+from stages.lab.dataset.gaussian_frames import load_skins
+from stages.lab.dataset.keypoint_motions import KeypointMotionsWriter, read_provenance
+from stages.lab.dataset.layout import SCENE_PARTS, Layout
+from stages.lab.dataset.object_particles import Asset, load_assets, placement_extents
 from stages.lab.dataset.options import DatasetOptions
-from stages.lab.dataset.particles import Asset, assets, extents
-from stages.lab.dataset.scenes import Config, configs_of, nudged, read_configs, write_configs
+from stages.lab.dataset.scene_configs import (
+    SceneConfig,
+    perturbed,
+    read_scene_configs,
+    sample_group,
+    write_scene_configs,
+)
 from stages.lab.dataset.simulation import simulate
-from stages.lab.dataset.sizes import must_fit, wanted
 
 if TYPE_CHECKING:
-    from stages.lab.dataset.parts import Wardrobe
-
+    from stages.lab.dataset.scene_files import SceneAssets
 
 
 def run(out: Path, options: DatasetOptions) -> None:
     """Write what is missing of the data set."""
-    maker = Maker(Path(out), options)
+    maker = DatasetGenerator(Path(out), options)
     maker.shared()
-    must_fit(maker.layout.root, wanted(maker.layout, options))
+    require_disk_space(maker.layout.root, missing_bytes(maker.layout, options))
     for group in options.mine:
         maker.group(group)
     print(f"{out}: complete")
@@ -47,28 +52,28 @@ def run(out: Path, options: DatasetOptions) -> None:
 
 def check(out: Path) -> None:
     """Say that all files of a data set are as they were written; raises InputError when they are not."""
-    print(f"{out}: {manifest.check(Path(out))} files, all as they were written")
+    print(f"{out}: {manifest.verify_files(Path(out))} files, all as they were written")
 
 
-class Maker:
+class DatasetGenerator:
     """Makes the parts of a data set; what they need is made or read when it is first asked for."""
 
     def __init__(self, out: Path, options: DatasetOptions):
         self.layout, self.options, self.device = Layout(out), options, pick_device(options.device)
         out.mkdir(parents=True, exist_ok=True)
-        manifest.begin(out, options.settings)
+        manifest.open_manifest(out, options.settings)
 
     @cached_property
     def things(self) -> dict[int, Asset]:
-        return assets(self.options.fineness, self.options.keypoints, self.layout.root / "particles.npz")
+        return load_assets(self.options.fineness, self.options.keypoints, self.layout.root / "particles.npz")
 
     @cached_property
-    def wardrobe(self) -> Wardrobe:
-        from stages.lab.dataset.parts import Wardrobe
+    def wardrobe(self) -> SceneAssets:
+        from stages.lab.dataset.scene_files import SceneAssets
 
         names = self.options.tables if "backgrounds" in self.options.parts else ()
         tables = {n: read_scene(self.layout.background(n)).gaussians.to(self.device) for n in names}
-        return Wardrobe(self.things, skins(self.layout, self.things), tables)
+        return SceneAssets(self.things, load_skins(self.layout, self.things), tables)
 
     def shared(self) -> None:
         """Objects and backgrounds."""
@@ -86,29 +91,31 @@ class Maker:
     def group(self, group: str) -> None:
         """All parts of a group of scenes."""
         layout, parts = self.layout, {*self.options.parts}
-        mine = [layout.config(group), layout.motions(group), *(layout.root / part / group for part in BY_SCENE)]
+        mine = [layout.config(group), layout.motions(group), *(layout.root / part / group for part in SCENE_PARTS)]
         _clear(mine)
         self._seal(group, mine)  # what is gone or was not listed when a run was killed
         if "scene_configs" in parts and not layout.config(group).exists():
             layout.config(group).parent.mkdir(exist_ok=True)
-            configs = configs_of(group, extents(self.things))
-            write_configs(layout.config(group), nudged(configs, self.options.nudge) if self.options.nudge else configs)
+            configs = sample_group(group, placement_extents(self.things))
+            write_scene_configs(
+                layout.config(group), perturbed(configs, self.options.nudge) if self.options.nudge else configs
+            )
         if "motions" in parts:
             self._motions(group)
-        if parts & {*BY_SCENE}:
-            from stages.lab.dataset.parts import make_scenes  # motions alone need no codec
+        if parts & {*SCENE_PARTS}:
+            from stages.lab.dataset.scene_files import write_scene_files  # motions alone need no codec
 
-            make_scenes(layout, self.options, group, self._configs(group), lambda: self.wardrobe, self.device)
+            write_scene_files(layout, self.options, group, self._configs(group), lambda: self.wardrobe, self.device)
         self._seal(group, mine)
 
-    def _configs(self, group: str) -> dict[str, Config]:
-        rows = list(read_configs(self.layout.config(group)).items())
+    def _configs(self, group: str) -> dict[str, SceneConfig]:
+        rows = list(read_scene_configs(self.layout.config(group)).items())
         return dict(rows[: self.options.limit or None])
 
     def _motions(self, group: str) -> None:
         path, o = self.layout.motions(group), self.options
         if path.exists():
-            limit = made_by(path).get("options", {}).get("limit", 0)
+            limit = read_provenance(path).get("options", {}).get("limit", 0)
             if limit != o.limit:
                 raise InputError(f"{path}: was made with --limit {limit}, not {o.limit}; remove it to make it again")
             return
@@ -116,7 +123,7 @@ class Maker:
         configs, start, made = self._configs(group), time.perf_counter(), 0
         source = provenance("dataset", [self.layout.config(group)], o)
         parts = simulate(configs, self.things, o.fineness, o.frames, o.keypoints, self.device, o.repeatable)
-        with tqdm(total=len(configs), desc=group, unit="scene") as bar, MotionsWriter(path, source) as motions:
+        with tqdm(total=len(configs), desc=group, unit="scene") as bar, KeypointMotionsWriter(path, source) as motions:
             for part in parts:
                 motions.append(part)
                 made += len(part)
@@ -125,7 +132,7 @@ class Maker:
         print(f"{group}: {made} scenes in {took:.1f} s, {60 * made / took:.0f} a minute", flush=True)
 
     def _seal(self, name: str, places: list[Path]) -> None:
-        manifest.seal(self.layout.root, name, [file for place in places for file in _files(place)])
+        manifest.write_checksums(self.layout.root, name, [file for place in places for file in _files(place)])
 
 
 def _files(place: Path) -> Iterator[Path]:

@@ -29,20 +29,20 @@ from stages.core.backends import pick_device
 from stages.core.errors import InputError
 from stages.core.geometry.rotations import nearest_rotation
 from stages.core.scene.files import replacing
-from stages.lab.dataset.layout import kind_of
-from stages.lab.dataset.motions import Motions, read_motions
+from stages.lab.dataset.keypoint_motions import KeypointMotions, read_motions
+from stages.lab.dataset.layout import object_kind
 from stages.lab.training.data import motions_folder
 
-FALLEN, TOUCH, STILL = 0.05, 0.04, 0.05  # [m], [m], [m/s]
-TIPPED = 30.0  # [deg]
-ON_FLOOR = 0.04  # lowest point above the floor at most [m]: bodies keep about a cell from it
+FALL_HEIGHT, CONTACT_DISTANCE, REST_SPEED = 0.05, 0.04, 0.05  # [m], [m], [m/s]
+TIP_ANGLE = 30.0  # [deg]
+FLOOR_CLEARANCE = 0.04  # lowest point above the floor at most [m]: bodies keep about a cell from it
 BOWL = "bowl"
-EVERY = 2  # frames between looks at contacts
-BATCH = 20  # scenes
+CONTACT_STRIDE = 2  # frames between looks at contacts
+SCENE_BATCH = 20  # scenes
 
 
 @dataclass(frozen=True)
-class Facts:
+class SceneStatistics:
     """A number for each scene (s), each object (s, o) or each pair of them (s, pairs); nan where there is no object."""
 
     falls: Float[Tensor, "s o"]
@@ -55,7 +55,7 @@ class Facts:
     at_rest: Float[Tensor, "s o"]
 
 
-def facts_of(m: Motions) -> Facts:
+def compute_statistics(m: KeypointMotions) -> SceneStatistics:
     """All of the above, for scenes that fit into memory together."""
     p, there = m.points, m.present
     centre = p.mean(3)
@@ -63,8 +63,8 @@ def facts_of(m: Motions) -> Facts:
     tilt = torch.rad2deg(turn[..., 2, 2].clamp(-1, 1).acos())  # (s, t, o)
     speed = (p[:, 1:] - p[:, :-1]).norm(dim=-1).mean(-1)[:, -5:].mean(1) / m.dt
     lowest = p[:, -1, :, :, 2].amin(-1)
-    still = speed < STILL
-    touching = _nearest_pairs(p) < TOUCH  # (s, t, q)
+    still = speed < REST_SPEED
+    touching = _nearest_pairs(p) < CONTACT_DISTANCE  # (s, t, q)
     pairs = torch.tensor(list(combinations(range(p.shape[2]), 2)), dtype=torch.int64).reshape(-1, 2)
     q = pairs.to(p.device)
     both = there[:, q[:, 0]] & there[:, q[:, 1]]
@@ -74,10 +74,10 @@ def facts_of(m: Motions) -> Facts:
         last[:, j] |= touching[:, -1, k]
     flat = (centre[:, -1, :, :2] - _mean(centre[:, -1, :, :2], there)[:, None]).norm(dim=-1)
     nan = lambda x, mask: torch.where(mask, x.float(), torch.nan)  # noqa: E731
-    return Facts(
-        nan(centre[:, 0, :, 2] - centre[:, -1, :, 2] > FALLEN, there), nan(touching.any(1), both),
-        nan(still & last & (lowest - m.box[0][2] > ON_FLOOR), there), nan(_contained(m, tilt[:, -1]), there),
-        nan(tilt[:, -1] > TIPPED, there), _mean(flat[..., None], there)[:, 0],
+    return SceneStatistics(
+        nan(centre[:, 0, :, 2] - centre[:, -1, :, 2] > FALL_HEIGHT, there), nan(touching.any(1), both),
+        nan(still & last & (lowest - m.box[0][2] > FLOOR_CLEARANCE), there), nan(_contained(m, tilt[:, -1]), there),
+        nan(tilt[:, -1] > TIP_ANGLE, there), _mean(flat[..., None], there)[:, 0],
         nan(deformation.amax(1), there), nan(still, there),
     )  # fmt: skip
 
@@ -100,18 +100,18 @@ def _rigid(
 
 def _nearest_pairs(p: Float[Tensor, "s t o n 3"]) -> Float[Tensor, "s t2 q"]:
     """Least distance between points of two objects, in every second frame and the last."""
-    frames = sorted({*range(0, p.shape[1], EVERY), p.shape[1] - 1})
+    frames = sorted({*range(0, p.shape[1], CONTACT_STRIDE), p.shape[1] - 1})
     p = p[:, frames]
     found = [torch.cdist(p[:, :, i], p[:, :, j]).amin((-1, -2)) for i, j in combinations(range(p.shape[2]), 2)]
     return torch.stack(found, -1) if found else p.new_zeros(*p.shape[:2], 0)
 
 
-def _contained(m: Motions, tilt: Float[Tensor, "s o"]) -> Bool[Tensor, "s o"]:
+def _contained(m: KeypointMotions, tilt: Float[Tensor, "s o"]) -> Bool[Tensor, "s o"]:
     """Objects that lie in a bowl in the last frame."""
     end, kind = m.points[:, -1], m.objects
     low, high, centre = end.amin(2), end.amax(2), end.mean(2)
-    bowl = torch.tensor([i >= 0 and kind_of(i).name == BOWL for i in kind.flatten().tolist()]).reshape(kind.shape)
-    upright = bowl.to(tilt.device) & (tilt < TIPPED)
+    bowl = torch.tensor([i >= 0 and object_kind(i).name == BOWL for i in kind.flatten().tolist()]).reshape(kind.shape)
+    upright = bowl.to(tilt.device) & (tilt < TIP_ANGLE)
     quarter = end[..., 2].quantile(0.25, dim=2)
     inside = torch.zeros_like(upright)
     for b in range(kind.shape[1]):
@@ -132,14 +132,16 @@ def run(data: Path, out: Path | None, groups: Sequence[str], keypoints: int, dev
             continue
         motions = read_motions(path)
         parts = []
-        for first in tqdm(range(0, len(motions), BATCH), desc=group, unit="batch", leave=False):
-            some = motions[slice(first, first + BATCH)]
-            parts.append(facts_of(_thinned(some, keypoints).to(device)))
-        facts = Facts(*(torch.cat([getattr(f, n).cpu() for f in parts]) for n in Facts.__dataclass_fields__))
-        table[group] = {"scenes": len(motions), **summary(facts)}
+        for first in tqdm(range(0, len(motions), SCENE_BATCH), desc=group, unit="batch", leave=False):
+            some = motions[slice(first, first + SCENE_BATCH)]
+            parts.append(compute_statistics(_thinned(some, keypoints).to(device)))
+        facts = SceneStatistics(
+            *(torch.cat([getattr(f, n).cpu() for f in parts]) for n in SceneStatistics.__dataclass_fields__)
+        )
+        table[group] = {"scenes": len(motions), **group_summary(facts)}
         for i in motions.objects.unique().tolist():
             if i >= 0:
-                kinds.setdefault(kind_of(i).name, []).append((facts, motions.objects == i))
+                kinds.setdefault(object_kind(i).name, []).append((facts, motions.objects == i))
     if not table:
         folder = motions_folder(data)
         raise InputError(f"{folder}: has none of {', '.join(groups)} (.h5); make them with `ngff-lab dataset`")
@@ -147,20 +149,26 @@ def run(data: Path, out: Path | None, groups: Sequence[str], keypoints: int, dev
     if out is not None:
         with replacing(Path(out)) as part:
             part.write_text(json.dumps({"thresholds": THRESHOLDS, "groups": table, "objects": of}, indent=1) + "\n")
-    return lines(table, "group") + [""] + lines(of, "object")
+    return markdown_table(table, "group") + [""] + markdown_table(of, "object")
 
 
-THRESHOLDS = {"fallen": FALLEN, "touch": TOUCH, "still": STILL, "tipped": TIPPED, "on floor": ON_FLOOR}
-SHARES = ("falls", "tipped", "stacked", "contained", "at_rest")  # of objects
+THRESHOLDS = {
+    "fallen": FALL_HEIGHT,
+    "touch": CONTACT_DISTANCE,
+    "still": REST_SPEED,
+    "tipped": TIP_ANGLE,
+    "on floor": FLOOR_CLEARANCE,
+}
+OBJECT_FRACTIONS = ("falls", "tipped", "stacked", "contained", "at_rest")  # of objects
 
 
-def _thinned(m: Motions, keypoints: int) -> Motions:
+def _thinned(m: KeypointMotions, keypoints: int) -> KeypointMotions:
     return replace(m, points=m.points[:, :, :, :keypoints])
 
 
-def summary(f: Facts) -> dict[str, float]:
+def group_summary(f: SceneStatistics) -> dict[str, float]:
     """Shares of objects, and of scenes in which it happens to any; means of the others."""
-    out = {name: _round(getattr(f, name).nanmean()) for name in SHARES}
+    out = {name: _round(getattr(f, name).nanmean()) for name in OBJECT_FRACTIONS}
     out["contacts a scene"] = _round(f.touch.nansum(1).mean())
     for name in ("touch", "tipped", "stacked", "contained"):
         out[f"scenes with {name}"] = _round((getattr(f, name).nan_to_num() > 0).any(1).float().mean())
@@ -171,10 +179,10 @@ def summary(f: Facts) -> dict[str, float]:
     return out
 
 
-def _of_kind(parts: list[tuple[Facts, Tensor]]) -> dict[str, float]:
+def _of_kind(parts: list[tuple[SceneStatistics, Tensor]]) -> dict[str, float]:
     """The same for the objects of one kind."""
     out: dict[str, float] = {"count": int(sum(int(mask.sum()) for _, mask in parts))}
-    for name in (*SHARES, "deformation"):
+    for name in (*OBJECT_FRACTIONS, "deformation"):
         out[name] = _round(torch.cat([getattr(f, name)[mask] for f, mask in parts]).nanmean())
     return out
 
@@ -183,7 +191,7 @@ def _round(x: Tensor) -> float:
     return round(float(x), 4)
 
 
-def lines(table: dict[str, dict[str, float]], label: str) -> list[str]:
+def markdown_table(table: dict[str, dict[str, float]], label: str) -> list[str]:
     """A Markdown table."""
     heads = list(next(iter(table.values())))
     rows = [[label, *heads], ["---"] * (len(heads) + 1)]

@@ -29,13 +29,13 @@ from stages.core.models.initial_conditions import World
 from stages.core.scene.files import must_exist, replacing
 
 FORMAT, VERSION = "ngff-motions", 1
-STEP = 1e-4  # of the stored positions [m]: they reach 3.2 m from the origin
-LEVEL = 1  # of compression
-WHAT = "simulated motion (.h5), such as `ngff-lab dataset` writes"
+POSITION_STEP = 1e-4  # of the stored positions [m]: they reach 3.2 m from the origin
+COMPRESSION_LEVEL = 1  # of compression
+FILE_KIND = "simulated motion (.h5), such as `ngff-lab dataset` writes"
 
 
 @dataclass(frozen=True)
-class Motions:
+class KeypointMotions:
     """Scenes of up to o objects with n keypoints each."""
 
     names: tuple[str, ...]
@@ -57,15 +57,15 @@ class Motions:
     def present(self) -> Bool[Tensor, "s o"]:
         return self.objects >= 0
 
-    def __getitem__(self, rows: Int[Tensor, "r"] | slice) -> Motions:
+    def __getitem__(self, rows: Int[Tensor, "r"] | slice) -> KeypointMotions:
         index = torch.arange(len(self))[rows].tolist()
         tensors = {f.name: getattr(self, f.name)[rows] for f in fields(self) if f.name in TENSORS}
         return replace(self, names=tuple(self.names[i] for i in index), **tensors)
 
-    def to(self, device: torch.device | str) -> Motions:
+    def to(self, device: torch.device | str) -> KeypointMotions:
         return replace(self, **{name: getattr(self, name).to(device) for name in TENSORS})
 
-    def world(self, keypoints: int | None = None) -> World:
+    def initial_conditions(self, keypoints: int | None = None) -> World:
         """The scenes at rest, with the first so many keypoints (they come farthest first)."""
         rest = self.points[:, 0, :, :keypoints]
         valid = self.present[..., None].expand(rest.shape[:-1])
@@ -78,11 +78,11 @@ class Motions:
 TENSORS = ("objects", "points", "mass", "E", "nu", "friction", "solidity")
 
 
-def joined(parts: Sequence[Motions]) -> Motions:
+def concatenate_motions(parts: Sequence[KeypointMotions]) -> KeypointMotions:
     """All scenes of several groups; fewer objects than the most are padded."""
     most = max(p.objects.shape[1] for p in parts)
 
-    def padded(p: Motions, name: str) -> Tensor:
+    def padded(p: KeypointMotions, name: str) -> Tensor:
         x, axis = getattr(p, name), 2 if name == "points" else 1
         shape = list(x.shape)
         shape[axis] = most - shape[axis]
@@ -93,7 +93,7 @@ def joined(parts: Sequence[Motions]) -> Motions:
     return replace(parts[0], names=tuple(n for p in parts for n in p.names), **tensors)
 
 
-class MotionsWriter:
+class KeypointMotionsWriter:
     """Writes the scenes of a group batch by batch: positions in steps of 0.1 mm, complete or not at all.
 
     Scenes are compressed by threads while the next batch is simulated; all have the same shape.
@@ -101,15 +101,15 @@ class MotionsWriter:
 
     def __init__(self, path: Path, provenance: dict):
         self.path, self._provenance = Path(path), provenance
-        self._parts: list[Motions] = []
+        self._parts: list[KeypointMotions] = []
         self._packed: list[Future[bytes]] = []
         self._pool = ThreadPoolExecutor(min(8, os.cpu_count() or 1))
 
-    def __enter__(self) -> MotionsWriter:
+    def __enter__(self) -> KeypointMotionsWriter:
         return self
 
-    def append(self, part: Motions) -> None:
-        steps = (part.points / STEP).round().clamp(-32767, 32767).to(torch.int16).cpu().numpy()
+    def append(self, part: KeypointMotions) -> None:
+        steps = (part.points / POSITION_STEP).round().clamp(-32767, 32767).to(torch.int16).cpu().numpy()
         self._packed += [self._pool.submit(_deflated, scene) for scene in steps]
         self._parts.append(replace(part, points=torch.empty(*part.points.shape[:-1], 0)))  # the shape is enough
 
@@ -131,10 +131,10 @@ class MotionsWriter:
             file.create_dataset("names", data=[n for p in self._parts for n in p.names], dtype=h5py.string_dtype())
             shape = (*first.points.shape[1:4], 3)
             data = file.create_dataset("points", (count, *shape), "<i2", chunks=(1, *shape), compression="gzip",
-                                       compression_opts=LEVEL, shuffle=True)  # fmt: skip
+                                       compression_opts=COMPRESSION_LEVEL, shuffle=True)  # fmt: skip
             for row, packed in enumerate(self._packed):
                 data.id.write_direct_chunk((row, 0, 0, 0, 0), packed.result())
-            data.attrs["step"] = STEP
+            data.attrs["step"] = POSITION_STEP
             for name in TENSORS:
                 if name != "points":
                     file[name] = torch.cat([getattr(p, name) for p in self._parts]).cpu().numpy()
@@ -143,36 +143,38 @@ class MotionsWriter:
 def _deflated(steps: np.ndarray) -> bytes:
     """A chunk as HDF5's shuffle and gzip filters make it: all low bytes, all high bytes, compressed."""
     shuffled = np.ascontiguousarray(steps, "<i2").view(np.uint8).reshape(-1, 2).T
-    return zlib.compress(shuffled.tobytes(), LEVEL)
+    return zlib.compress(shuffled.tobytes(), COMPRESSION_LEVEL)
 
 
-def write_motions(path: Path, motions: Motions, provenance: dict) -> None:
+def write_motions(path: Path, motions: KeypointMotions, provenance: dict) -> None:
     """A group in one piece."""
-    with MotionsWriter(path, provenance) as file:
+    with KeypointMotionsWriter(path, provenance) as file:
         file.append(motions)
 
 
-def made_by(path: Path) -> dict:
+def read_provenance(path: Path) -> dict:
     """What a file of motions says of its making."""
-    with h5py.File(must_exist(path, WHAT), "r") as file:
+    with h5py.File(must_exist(path, FILE_KIND), "r") as file:
         return json.loads(file.attrs.get("provenance", "{}"))
 
 
-def read_motions(path: Path) -> Motions:
+def read_motions(path: Path) -> KeypointMotions:
     """Raises InputError for what is no such file."""
-    must_exist(path, WHAT)
+    must_exist(path, FILE_KIND)
     try:
         with h5py.File(path, "r") as file:
             if file.attrs.get("format") != FORMAT:
-                raise InputError(f"{path}: its format attribute is {file.attrs.get('format')!r}, not {FORMAT!r}; {WHAT}"
-                                 " is expected")  # fmt: skip
+                raise InputError(f"{path}: its format attribute is {file.attrs.get('format')!r}, not {FORMAT!r}; "
+                                 f"{FILE_KIND} is expected")  # fmt: skip
             points = torch.from_numpy(file["points"][:]).float() * float(file["points"].attrs["step"])
             names = [n for n in TENSORS if n != "points" and (n in file or n != "solidity")]
             rest = {"solidity": torch.ones(len(points), points.shape[2])}
             rest |= {name: torch.from_numpy(file[name][:]) for name in names}
             box = tuple(tuple(float(v) for v in corner) for corner in file.attrs["box"])
             gravity = tuple(float(v) for v in file.attrs["gravity"])
-            return Motions(tuple(file["names"].asstr()[:]), points=points, dt=float(file.attrs["dt"]), gravity=gravity,
-                           box=box, **rest)  # fmt: skip
+            return KeypointMotions(
+                names=tuple(file["names"].asstr()[:]), points=points, dt=float(file.attrs["dt"]), gravity=gravity,
+                box=box, **rest,
+            )  # fmt: skip
     except (KeyError, OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot be read ({error}); {WHAT} is expected") from error
+        raise InputError(f"{path}: cannot be read ({error}); {FILE_KIND} is expected") from error

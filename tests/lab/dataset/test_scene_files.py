@@ -18,13 +18,12 @@ from plyfile import PlyData
 from stages.core.errors import InputError
 from stages.core.geometry.rotations import covariance
 from stages.core.physics.keypoints import nearest_weights
+from stages.lab.dataset import disk_usage, generate
 from stages.lab.dataset import layout as dataset_layout
-from stages.lab.dataset import make as dataset
-from stages.lab.dataset import sizes as dataset_sizes
-from stages.lab.dataset.dynamic_gaussians import Carried, Skin, write_frames
+from stages.lab.dataset.gaussian_frames import ObjectSkin, SkinnedScene, write_frames
+from stages.lab.dataset.object_particles import Asset
 from stages.lab.dataset.options import DatasetOptions
-from stages.lab.dataset.particles import Asset
-from stages.lab.dataset.scenes import Config, read_configs
+from stages.lab.dataset.scene_configs import SceneConfig, read_scene_configs
 from tests.lab.small_world import OPTIONS, brick, shrink
 
 SHAPES = {"pos": (3,), "cov3D": (6,), "rot": (3, 3)}
@@ -36,7 +35,7 @@ def data(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         shrink(patch.setattr, patch.setitem)
         root = tmp_path_factory.mktemp("data")
-        dataset.run(root, OPTIONS)
+        generate.run(root, OPTIONS)
         yield root
 
 
@@ -46,7 +45,7 @@ def digests(root: Path) -> dict[str, str]:
 
 
 def test_the_published_layout(data):
-    name = next(iter(read_configs(data / "scene_configs" / "3_9.json")))
+    name = next(iter(read_scene_configs(data / "scene_configs" / "3_9.json")))
     wanted = [
         "manifest.json", "scene_configs/3_9.json", "objects/duck/cameras.json",
         "objects/duck/point_cloud/iteration_30000/point_cloud.ply", "backgrounds/table0/gaussians_feedforward.ply",
@@ -61,8 +60,8 @@ def test_the_published_layout(data):
 
 
 def test_frames_hold_what_is_published(data):
-    config = next(iter(read_configs(data / "scene_configs" / "3_9.json").values()))
-    vertices = PlyData.read(data / f"scenes/3_9/{config.name}" / dataset_layout.PLY)["vertex"]
+    config = next(iter(read_scene_configs(data / "scene_configs" / "3_9.json").values()))
+    vertices = PlyData.read(data / f"scenes/3_9/{config.name}" / dataset_layout.POINT_CLOUD)["vertex"]
     logits = np.asarray(vertices["opacity"], float)
     matter = 1 / (1 + np.exp(-logits)) > 0.02
     assert 0.01 < 1 - matter.mean() < 0.03 and set(vertices["object_id"]) == {1, 2, 3}
@@ -94,8 +93,8 @@ def test_turned_gaussians_are_stored_turned(tmp_path):
     points, centre = g.means[::4].contiguous(), torch.tensor([0.1, 0.2, 0.3])
     index, weight = nearest_weights(points, g.means, 8)
     thing = Asset(7, 1.0, points, torch.ones(len(points)), 1e5, 500.0)
-    start = Config("a", (7,), ((0.1, 0.2, 0.3),), (1.0,))
-    carried = Carried(start, {7: Skin(g, g, index.int(), weight)}, {7: thing}, "cpu")
+    start = SceneConfig("a", (7,), ((0.1, 0.2, 0.3),), (1.0,))
+    carried = SkinnedScene(start, {7: ObjectSkin(g, g, index.int(), weight)}, {7: thing}, "cpu")
     R = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     places, gradients = points @ R.T + centre, R.expand(len(points), 3, 3)
     write_frames(tmp_path, carried, [places], [gradients])
@@ -108,7 +107,7 @@ def test_turned_gaussians_are_stored_turned(tmp_path):
 
 
 def test_videos_and_what_goes_with_them(data):
-    config = next(iter(read_configs(data / "scene_configs" / "3_9.json").values()))
+    config = next(iter(read_scene_configs(data / "scene_configs" / "3_9.json").values()))
     folder = data / "initial" / "3_9" / config.name / "table0"
     rows = json.loads((folder / "cameras.json").read_text())
     assert len(rows) == 100 and rows[0]["width"] == 32 and rows[0]["fx"] == 48
@@ -134,14 +133,14 @@ def test_videos_and_what_goes_with_them(data):
 
 
 def test_manifest_and_check(data, capsys):
-    dataset.check(data)
+    generate.check(data)
     assert "files, all as they were written" in capsys.readouterr().out
     listed = sorted(line for path in (data / "sums").iterdir() for line in path.read_text().splitlines())
     assert [line.split("  ")[1] for line in listed if "mpm/" in line]
     done = subprocess.run(f"sha256sum --quiet -c {data}/sums/*.sha256", cwd=data, shell=True, capture_output=True)
     assert done.returncode == 0, done.stderr
     with pytest.raises(InputError, match="was begun with frames 3, not 4"):
-        dataset.run(data, replace(OPTIONS, frames=4))
+        generate.run(data, replace(OPTIONS, frames=4))
 
 
 def test_damage_is_found_and_mended(data):
@@ -150,61 +149,61 @@ def test_damage_is_found_and_mended(data):
     whole = victim.read_bytes()
     victim.write_bytes(whole[:-1] + b"x")
     with pytest.raises(InputError, match="0001.h5 has changed"):
-        dataset.check(data)
+        generate.check(data)
     for file in victim.parent.iterdir():
         file.unlink()
     victim.parent.rmdir()
     next((data / "dynamic").rglob("*.mp4")).unlink()
     with pytest.raises(InputError, match="is missing"):
-        dataset.check(data)
-    dataset.run(data, OPTIONS)
+        generate.check(data)
+    generate.run(data, OPTIONS)
     assert digests(data) == before  # though only one scene was simulated now
 
 
 def test_killed_while_it_writes_it_goes_on_to_the_same_bytes(data, tmp_path):
-    code = ("from dataclasses import replace; from pathlib import Path; from stages.lab import dataset\n"
+    code = ("from dataclasses import replace; from pathlib import Path; from stages.lab.dataset import generate\n"
             "from tests.lab.small_world import OPTIONS, shrink_for_good; shrink_for_good()\n"
-            f"dataset.run(Path({str(tmp_path)!r}), replace(OPTIONS, only='scenes,mpm'))")  # fmt: skip
+            f"generate.run(Path({str(tmp_path)!r}), replace(OPTIONS, only='scenes,mpm'))")  # fmt: skip
     process = subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.DEVNULL)
     while process.poll() is None and not list(tmp_path.glob("mpm/3_9/.part-*/0000.h5")):
         time.sleep(0.002)
     process.kill()
     process.wait()
     assert not (tmp_path / "sums" / "3_9.sha256").exists()  # it was not done
-    dataset.run(tmp_path, replace(OPTIONS, only="scenes,mpm"))
+    generate.run(tmp_path, replace(OPTIONS, only="scenes,mpm"))
     files = {n: d for n, d in digests(tmp_path).items() if n.startswith(("scene", "mpm", "objects"))}
     whole = digests(data)
     assert files == {n: whole.get(n) for n in files} and len(list((tmp_path / "mpm" / "3_9").iterdir())) == 2
-    dataset.check(tmp_path)
+    generate.check(tmp_path)
 
 
 def test_a_full_disk_is_told_before_anything_is_written(tmp_path, monkeypatch):
     shrink(monkeypatch.setattr, monkeypatch.setitem)
-    usage = dataset_sizes.shutil.disk_usage(tmp_path)._replace(free=500_000)
-    monkeypatch.setattr(dataset_sizes.shutil, "disk_usage", lambda path: usage)
+    usage = disk_usage.shutil.disk_usage(tmp_path)._replace(free=500_000)
+    monkeypatch.setattr(disk_usage.shutil, "disk_usage", lambda path: usage)
     with pytest.raises(InputError, match="about .* are needed and 500 kB are free; choose fewer"):
-        dataset.run(tmp_path, OPTIONS)
+        generate.run(tmp_path, OPTIONS)
     assert not (tmp_path / "mpm").exists()
 
 
 def test_what_is_there_is_not_counted_again(data):
-    before = dataset_sizes.wanted(dataset_layout.Layout(data / "none"), replace(OPTIONS, frames=100, limit=0))
-    assert before["dynamic"] == 2 * 2 * 32**2 * 100 * dataset_sizes.STILL  # 2 scenes, 2 views
-    left = dataset_sizes.wanted(dataset_layout.Layout(data), OPTIONS)
-    assert left["mpm"] < 0.15 * 2 * dataset_sizes.Sizes(3, 64, 32).mpm(1800)
+    before = disk_usage.missing_bytes(dataset_layout.Layout(data / "none"), replace(OPTIONS, frames=100, limit=0))
+    assert before["dynamic"] == 2 * 2 * 32**2 * 100 * disk_usage.VIDEO_FIXED_CAMERA  # 2 scenes, 2 views
+    left = disk_usage.missing_bytes(dataset_layout.Layout(data), OPTIONS)
+    assert left["mpm"] < 0.15 * 2 * disk_usage.SizeEstimate(3, 64, 32).mpm(1800)
     assert left["scene_configs"] == 0  # a file that is there is whole
 
 
 def test_what_is_missing_is_told_and_nothing_when_nothing_is(tmp_path, capsys):
-    dataset_sizes.must_fit(tmp_path, {"scene_configs": 64_400.0, "motions": 0.0})
+    disk_usage.require_disk_space(tmp_path, {"scene_configs": 64_400.0, "motions": 0.0})
     assert ": about 64.4 kB will be written (scene_configs 64.4 kB), " in capsys.readouterr().out
-    dataset_sizes.must_fit(tmp_path, {"motions": 0.0})
+    disk_usage.require_disk_space(tmp_path, {"motions": 0.0})
     assert not capsys.readouterr().out
 
 
 def test_sizes_are_about_right(data):
     """Of the parts that are stored as they are; videos of 32 px are mostly headers."""
-    sizes, folder = dataset_sizes.Sizes(3, 64, 32), next((data / "mpm" / "3_9").iterdir())
+    sizes, folder = disk_usage.SizeEstimate(3, 64, 32), next((data / "mpm" / "3_9").iterdir())
     with h5py.File(folder / "opacity.h5") as file:
         count = len(file["opacity"])
     assert sum(p.stat().st_size for p in folder.iterdir()) == pytest.approx(sizes.mpm(count), rel=0.15)

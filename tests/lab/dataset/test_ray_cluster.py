@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 
 from stages.core.errors import InputError
-from stages.lab.dataset import make as dataset
-from stages.lab.dataset import on_ray
+from stages.lab.dataset import generate, ray_cluster
 from tests.lab.small_world import OPTIONS, shrink
 
 MOTIONS = replace(OPTIONS, groups="3_9,4", only="motions,scenes", limit=2)
@@ -17,7 +16,7 @@ MOTIONS = replace(OPTIONS, groups="3_9,4", only="motions,scenes", limit=2)
 def test_without_ray_it_says_what_to_install(monkeypatch, tmp_path):
     monkeypatch.setitem(__import__("sys").modules, "ray", None)
     with pytest.raises(InputError, match=r"pip install 'ngff\[ray\]'"):
-        on_ray.run(tmp_path, MOTIONS, "local")
+        ray_cluster.run(tmp_path, MOTIONS, "local")
 
 
 @pytest.mark.slow
@@ -36,13 +35,13 @@ def test_two_workers_make_what_one_process_makes(tmp_path, monkeypatch):
             "env_vars": {"PYTHONPATH": paths},
             "worker_process_setup_hook": "tests.lab.small_world.shrink_for_good",
         })  # fmt: skip
-        on_ray.run(tmp_path / "ray", MOTIONS, "auto")
+        ray_cluster.run(tmp_path / "ray", MOTIONS, "auto")
         assert len({n["NodeID"] for n in ray.nodes() if n["Alive"] and n["Resources"].get("CPU")}) == 2
     finally:
         ray.shutdown()
         cluster.shutdown()
-    dataset.run(tmp_path / "alone", MOTIONS)
-    dataset.check(tmp_path / "ray")
+    generate.run(tmp_path / "alone", MOTIONS)
+    generate.check(tmp_path / "ray")
     made = {p.relative_to(tmp_path / "ray") for p in (tmp_path / "ray").rglob("*") if p.is_file()}
     assert made == {p.relative_to(tmp_path / "alone") for p in (tmp_path / "alone").rglob("*") if p.is_file()}
     for name in made:

@@ -30,25 +30,25 @@ from stages.core.scene.cameras import Cameras
 from stages.core.scene.gaussians import Gaussians
 from stages.core.scene.images import VideoWriter
 from stages.lab.assets.splat_files import camera_rows
-from stages.lab.dataset.cameras import cameras_around
-from stages.lab.dataset.dynamic_gaussians import Carried
-from stages.lab.dataset.layout import ORBIT, kind_of
-from stages.lab.dataset.particles import FRAME
-from stages.lab.dataset.scenes import Config
+from stages.lab.dataset.cameras import orbit_cameras
+from stages.lab.dataset.gaussian_frames import SkinnedScene
+from stages.lab.dataset.layout import ORBIT_VIEWS, object_kind
+from stages.lab.dataset.object_particles import FRAME_INTERVAL
+from stages.lab.dataset.scene_configs import SceneConfig
 from stages.render.background import RenderBackground
 from stages.render.draw import render_view
 
-FPS = 1 / FRAME
+FPS = 1 / FRAME_INTERVAL
 
 
 def write_initial(
-    folder: Path, config: Config, rest: Gaussians, behind: Gaussians, resolution: int, views: Sequence[int]
+    folder: Path, config: SceneConfig, rest: Gaussians, behind: Gaussians, resolution: int, views: Sequence[int]
 ) -> None:
     """What is known of a scene before it moves; `behind` is the background, on the same device."""
-    cameras, backdrop = cameras_around(resolution), RenderBackground(keep_scene=False, gaussians=behind)
+    cameras, backdrop = orbit_cameras(resolution), RenderBackground(keep_scene=False, gaussians=behind)
     shown, depths = backdrop.compose(rest), []
     with VideoWriter(folder / f"{config.name}.mp4", FPS) as video:
-        for i in range(ORBIT):
+        for i in range(ORBIT_VIEWS):
             seen = render_view(shown, cameras, i, backdrop)
             video.append(seen.image)
             if i in views:
@@ -58,7 +58,7 @@ def write_initial(
     (folder / "depth.h5").write_bytes(_depth_file(torch.stack(depths), views))
 
 
-def prompts(config: Config, rest: Gaussians, cameras: Cameras) -> dict[str, list]:
+def prompts(config: SceneConfig, rest: Gaussians, cameras: Cameras) -> dict[str, list]:
     """Where each object is in view 0, and what it is called."""
     width, height = cameras.sizes[0].tolist()
     top = torch.tensor([width, height], dtype=torch.float32)
@@ -68,7 +68,7 @@ def prompts(config: Config, rest: Gaussians, cameras: Cameras) -> dict[str, list
         centres.append(pixels.mean(0).tolist())
         low, high = (v.clamp_min(0).minimum(top).tolist() for v in (pixels.amin(0), pixels.amax(0)))
         boxes.append([*low, *high])
-    return {"center_point": centres, "bbox": boxes, "text": [kind_of(i).prompt for i in config.ids]}
+    return {"center_point": centres, "bbox": boxes, "text": [object_kind(i).prompt for i in config.ids]}
 
 
 def _depth_file(depth: Float[Tensor, "v h w"], views: Sequence[int]) -> memoryview:
@@ -84,11 +84,11 @@ def _depth_file(depth: Float[Tensor, "v h w"], views: Sequence[int]) -> memoryvi
 
 
 def write_dynamic(
-    paths: dict[int, Path], scene: Carried, x: Sequence[Tensor], F: Sequence[Tensor], behind: Gaussians,
+    paths: dict[int, Path], scene: SkinnedScene, x: Sequence[Tensor], F: Sequence[Tensor], behind: Gaussians,
     resolution: int,
 ) -> None:  # fmt: skip
     """A video of each view in `paths`; pictures are encoded by threads while the next are drawn."""
-    cameras, backdrop = cameras_around(resolution), RenderBackground(keep_scene=False, gaussians=behind)
+    cameras, backdrop = orbit_cameras(resolution), RenderBackground(keep_scene=False, gaussians=behind)
     for path in paths.values():
         path.parent.mkdir(parents=True, exist_ok=True)
     with ExitStack() as stack, ThreadPoolExecutor(len(paths)) as pool:

@@ -25,16 +25,16 @@ from stages.core.physics.keypoints import KEYPOINTS_PER_GAUSSIAN, nearest_weight
 from stages.core.scene.gaussians import Gaussians, concatenate
 from stages.core.scene.scene import Scene, SceneObject
 from stages.core.scene.scene_ply import read_scene
-from stages.lab.dataset.layout import Layout, kind_of
-from stages.lab.dataset.particles import LEAST_OPACITY, Asset, at_prior
-from stages.lab.dataset.scenes import Config
+from stages.lab.dataset.layout import Layout, object_kind
+from stages.lab.dataset.object_particles import MIN_OPACITY, Asset, at_scale_prior
+from stages.lab.dataset.scene_configs import SceneConfig
 
-HIGHEST = 9  # SH coefficients that are stored
-FLOOR = -0.94  # [m]
+SH_COEFFICIENTS = 9  # SH coefficients that are stored
+FLOOR_HEIGHT = -0.94  # [m]
 
 
 @dataclass(frozen=True)
-class Skin:
+class ObjectSkin:
     """The Gaussians of an object about the origin, and the particles that each follows."""
 
     whole: Gaussians  # all of them
@@ -43,33 +43,35 @@ class Skin:
     weight: Float[Tensor, "n 8"]
 
 
-def skins(layout: Layout, things: Mapping[int, Asset]) -> dict[int, Skin]:
+def load_skins(layout: Layout, things: Mapping[int, Asset]) -> dict[int, ObjectSkin]:
     """Of all objects by id, from the data set's own files."""
     out = {}
     for i, asset in things.items():
-        kind = kind_of(i)
-        whole = at_prior(read_scene(layout.object(kind.name)).gaussians, kind.scale)
-        shown = whole[whole.opacities > LEAST_OPACITY]
+        kind = object_kind(i)
+        whole = at_scale_prior(read_scene(layout.object(kind.name)).gaussians, kind.scale)
+        shown = whole[whole.opacities > MIN_OPACITY]
         index, weight = nearest_weights(asset.points, shown.means, KEYPOINTS_PER_GAUSSIAN)
-        out[i] = Skin(whole, shown, index.int().contiguous(), weight.contiguous())
+        out[i] = ObjectSkin(whole, shown, index.int().contiguous(), weight.contiguous())
     return out
 
 
-def at_rest(config: Config, covers: Mapping[int, Skin], shown: bool = True, provenance: dict | None = None) -> Scene:
+def rest_scene(
+    config: SceneConfig, covers: Mapping[int, ObjectSkin], shown: bool = True, provenance: dict | None = None
+) -> Scene:
     """A scene at its start; object ids count from 1 in the order of the configuration."""
     parts, objects = [], []
     for n, (i, p) in enumerate(zip(config.ids, config.translation, strict=True), start=1):
         g = covers[i].shown if shown else covers[i].whole
         parts.append(replace(g, means=g.means + torch.tensor(p), object_id=torch.full((len(g),), n)))
-        objects.append(SceneObject(n, kind_of(i).name))
-    return Scene(concatenate(parts), tuple(objects), None, FLOOR, provenance=provenance or {})
+        objects.append(SceneObject(n, object_kind(i).name))
+    return Scene(concatenate(parts), tuple(objects), None, FLOOR_HEIGHT, provenance=provenance or {})
 
 
-class Carried:
+class SkinnedScene:
     """A scene whose Gaussians follow its particles."""
 
-    def __init__(self, config: Config, covers: Mapping[int, Skin], things: Mapping[int, Asset], device: str):
-        self.rest = at_rest(config, covers).gaussians.to(device)
+    def __init__(self, config: SceneConfig, covers: Mapping[int, ObjectSkin], things: Mapping[int, Asset], device: str):
+        self.rest = rest_scene(config, covers).gaussians.to(device)
         index, start = [], 0
         for i in config.ids:
             index.append(covers[i].index + start)
@@ -87,10 +89,10 @@ class Carried:
         return replace(g, means=means, quats=quats, scales=scales), R
 
 
-def write_frames(folder: Path, scene: Carried, x: Sequence[Tensor], F: Sequence[Tensor]) -> None:
+def write_frames(folder: Path, scene: SkinnedScene, x: Sequence[Tensor], F: Sequence[Tensor]) -> None:
     """The published files of a scene, frame by frame."""
     g = scene.rest
-    sh = torch.nn.functional.pad(g.sh[:, :HIGHEST], (0, 0, 0, max(0, HIGHEST - g.sh.shape[1])))
+    sh = torch.nn.functional.pad(g.sh[:, :SH_COEFFICIENTS], (0, 0, 0, max(0, SH_COEFFICIENTS - g.sh.shape[1])))
     _write(folder / "shs.h5", shs=sh)
     _write(folder / "opacity.h5", opacity=g.opacities[:, None])
     for t, (places, gradients) in enumerate(zip(x, F, strict=True)):

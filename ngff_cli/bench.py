@@ -148,14 +148,14 @@ def bench_dynamics(
     device: Device = "auto",
 ) -> None:
     """The dynamics models on motion that they have not seen."""
-    from stages.core.models.checkpoints import HERE
+    from stages.core.models.checkpoints import SHIPPED
     from stages.lab.bench.dynamics import DynamicsBenchOptions, redraw, run
 
     if results is None and data is None:
         raise InputError("--data: name the folder of motions to measure on, or --from results to draw again")
     for line in (
         redraw(results) if results is not None
-        else run(data, weights or HERE, out, DynamicsBenchOptions(keypoints, limit, mpm, device=device), nudged)
+        else run(data, weights or SHIPPED, out, DynamicsBenchOptions(keypoints, limit, mpm, device=device), nudged)
     ):
         print(line)
 

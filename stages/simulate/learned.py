@@ -21,10 +21,10 @@ from stages.core.backends import pick_device
 from stages.core.errors import InputError
 from stages.core.models import checkpoints as weights
 from stages.core.models.dynamics import FRAME, Dynamics
-from stages.core.models.external_forces import Pushes
-from stages.core.models.field.solidity import sides, solidity
-from stages.core.models.initial_conditions import FLOOR, World, centre
-from stages.core.models.rollout import Stepper
+from stages.core.models.external_forces import ExternalForces
+from stages.core.models.field.solidity import box_sides, solidity
+from stages.core.models.initial_conditions import FLOOR, InitialConditions, centre_of_mass
+from stages.core.models.rollout import TimeStepper
 from stages.core.physics.forces import ForcePrompts
 from stages.core.physics.materials import PLASTIC, choose_materials
 from stages.core.physics.skinning import object_rotations
@@ -90,7 +90,7 @@ def rollout(
     frame = ModelUnits.for_objects(each, stage.box.low[2], scene.metres_per_unit, options.gravity)
     world = _world(scene, each, stage, frame, prompts, options)
     _warn(world, model)
-    pushes = Pushes.of(world, _scaled(prompts, frame, stage, ids), ids)
+    pushes = ExternalForces.from_prompts(world, _scaled(prompts, frame, stage, ids), ids)
     steps = max(1, math.ceil(options.dt * frame.time / FRAME - 1e-6))
     log.info("%s (%s): %d objects, %d keypoints, %.3g times as large and %.3g times slower, %d steps a frame",
              options.engine, card["sha256"][:8], len(ids), len(keypoints.rest), frame.length / scene.metres_per_unit,
@@ -103,7 +103,7 @@ def rollout(
         place = world.to(device)
         pinned, dt = pushes.pinned, options.dt * frame.time / steps
         held = replace(pushes, pinned=pinned | sleepers.asleep)
-        stepper = Stepper(model, place, dt, held.to(device))
+        stepper = TimeStepper(model, place, dt, held.to(device))
         first, before = stepper.points.clone(), world.points
         for n in range(options.steps):
             if not bool(stepper.points.isfinite().all()):
@@ -113,15 +113,15 @@ def rollout(
             if n == options.steps - 1:
                 continue
             if sleepers.rouse(_pushed(prompts, ids, n * options.dt, (n + 1) * options.dt)):
-                stepper.pushes.pinned.copy_(pinned | sleepers.asleep)
+                stepper.external.pinned.copy_(pinned | sleepers.asleep)
             if bool(sleepers.asleep.all()):
-                stepper.time += steps
+                stepper.step_count += steps
                 continue
             for _ in range(steps):
                 stepper.step()
             here = stepper.points.cpu()
             if sleepers.wake(here, (here - before) / (steps * dt)):
-                stepper.pushes.pinned.copy_(pinned | sleepers.asleep)
+                stepper.external.pinned.copy_(pinned | sleepers.asleep)
             before = here.clone()
 
     return states()
@@ -130,7 +130,7 @@ def rollout(
 def _world(
     scene: Scene, each: list[Tensor], stage: SceneSetup, frame: ModelUnits, prompts: ForcePrompts,
     options: SimulateOptions,
-) -> World:  # fmt: skip
+) -> InitialConditions:  # fmt: skip
     """The objects where they start, in the model's world."""
     materials = choose_materials(scene.objects, options.material, options.materials)
     most = max(len(p) for p in each)
@@ -159,8 +159,8 @@ def _world(
         box[:] = torch.stack([frame.to_model(torch.tensor(corner)) for corner in (stage.box.low, stage.box.high)])
     box[:, 0, 2] = (floors - frame.origin[2]) * frame.length + FLOOR
     gravity = torch.tensor([0.0, 0.0, -frame.gravity])
-    return World.of(points, valid, mass=mass, E=E, solidity=firmer, nu=nu, friction=friction, velocity=velocity,
-                    gravity=gravity, box=box)  # fmt: skip
+    return InitialConditions.of(points, valid, mass=mass, E=E, solidity=firmer, nu=nu, friction=friction,
+                                velocity=velocity, gravity=gravity, box=box)  # fmt: skip
 
 
 def _floors(each: list[Float[Tensor, "k 3"]], stage: SceneSetup) -> Float[Tensor, "o"]:
@@ -185,7 +185,7 @@ def _known_stiffness(o: SceneObject, E: float, solidity: float) -> float:
     return known
 
 
-def _awake(world: World, frame: ModelUnits, stage: SceneSetup) -> Bool[Tensor, "o"]:
+def _awake(world: InitialConditions, frame: ModelUnits, stage: SceneSetup) -> Bool[Tensor, "o"]:
     """Objects that are thrown or lifted; all, where weight does not hold them down."""
     return (world.velocity[0] != 0).any(-1) | (stage.lift != 0).any(-1) | (frame.gravity <= 0)
 
@@ -214,7 +214,7 @@ def _scaled(prompts: ForcePrompts, frame: ModelUnits, stage: SceneSetup, ids: li
     return replace(prompts, forces=tuple(scaled(f) for f in prompts.forces))
 
 
-def _warn(world: World, model: Dynamics) -> None:
+def _warn(world: InitialConditions, model: Dynamics) -> None:
     """What the model has not seen in training, or does not hear of."""
     points = world.points[0]
     hidden = ~world.valid[0, ..., None]
@@ -222,7 +222,7 @@ def _warn(world: World, model: Dynamics) -> None:
     if float(long.max() / long.min()) > SIZES[1] / SIZES[0]:
         log.warning("the largest object is %.1f times as long as the smallest, and in training never more than %.1f; "
                     "compare with --engine mpm", long.max() / long.min(), SIZES[1] / SIZES[0])  # fmt: skip
-    thin = min(float(sides(p[seen])[0]) for p, seen in zip(points, world.valid[0], strict=True))
+    thin = min(float(box_sides(p[seen])[0]) for p, seen in zip(points, world.valid[0], strict=True))
     if thin < THIN / 1.5:
         log.warning("an object is %.2g times thinner than any in training; it may sink into others, so "
                     "compare with --engine mpm", THIN / thin)  # fmt: skip
@@ -230,13 +230,13 @@ def _warn(world: World, model: Dynamics) -> None:
         log.warning("%d objects; the model was tested with up to %d, so compare with --engine mpm", len(long), MOST)
     if float(world.velocity.norm(dim=-1).max()) > FAST:
         log.warning("an object starts faster than any in training; compare with --engine mpm")
-    for name in sorted({"mass", "E", "friction", "gravity"} - model.told):
+    for name in sorted({"mass", "E", "friction", "gravity"} - model.inputs):
         log.warning("this model is not told the %s", name)
 
 
 def _state(
-    keypoints: Keypoints, ids: list[int], lifted: Float[Tensor, "p 3"], world: World, moved: Float[Tensor, "1 o n 3"],
-    stage: SceneSetup,
+    keypoints: Keypoints, ids: list[int], lifted: Float[Tensor, "p 3"], world: InitialConditions,
+    moved: Float[Tensor, "1 o n 3"], stage: SceneSetup,
 ) -> FrameState:  # fmt: skip
     """Keypoints have `moved` [scene units] since the start, where they are exactly as seen, but for the lift."""
     positions, moved = lifted.clone(), moved.cpu()
@@ -244,4 +244,5 @@ def _state(
         mine = keypoints.object_id == i
         positions[mine] += moved[0, row, : int(mine.sum())]
     start = torch.stack([lifted[keypoints.object_id == i].mean(0) for i in ids])
-    return FrameState(positions, start + centre(world.to("cpu"), moved)[0], object_rotations(keypoints, positions, ids))
+    centre = start + centre_of_mass(world.to("cpu"), moved)[0]
+    return FrameState(positions, centre, object_rotations(keypoints, positions, ids))

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from stages.core.models.field.narrow_phase import nearest
-from stages.core.models.initial_conditions import World
+from stages.core.models.initial_conditions import InitialConditions
 
 TOUCH = 0.05  # what is nearer touches, beside half the distance between keypoints [m]
 SEAM = 0.1  # the same of things at the start: photos show little of where they touch
@@ -24,7 +24,7 @@ class SleepState:
     The others sleep if they are `standing` on the floor (o), or touch what sleeps and does so.
     """
 
-    def __init__(self, world: World, awake: Bool[Tensor, "o"], standing: Bool[Tensor, "o"]):
+    def __init__(self, world: InitialConditions, awake: Bool[Tensor, "o"], standing: Bool[Tensor, "o"]):
         self.valid, self.mass = world.valid, world.mass[0].clamp_min(1e-6)
         self.spacing = _spacing(world)
         near = self._near(world.points, SEAM).any(-1)
@@ -65,7 +65,7 @@ class SleepState:
         self.asleep = held
 
 
-def _spacing(world: World) -> Float[Tensor, "o"]:
+def _spacing(world: InitialConditions) -> Float[Tensor, "o"]:
     """About how far apart the keypoints of each object are [m]: as on the surface of its bounding box."""
     hidden = ~world.valid[0, ..., None]
     high = world.points[0].masked_fill(hidden, -torch.inf).amax(1)

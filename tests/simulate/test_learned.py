@@ -5,9 +5,9 @@ import pytest
 import torch
 
 from stages.core.errors import InputError
-from stages.core.models.checkpoints import HERE, build, find, save
-from stages.core.models.field.solidity import sides
-from stages.core.models.initial_conditions import FLOOR, World
+from stages.core.models.checkpoints import SHIPPED, build, find, save
+from stages.core.models.field.solidity import box_sides
+from stages.core.models.initial_conditions import FLOOR, InitialConditions
 from stages.core.scene.gaussians import concatenate
 from stages.core.scene.scene import Scene, SceneObject
 from stages.core.scene.scene_ply import write_scene
@@ -86,7 +86,7 @@ def elsewhere(scene, unit, floor):
 @pytest.mark.parametrize(("unit", "floor", "apart"), [(0.1, 0.0, 1e-4), (1.0, 7.0, 0.02)])
 def test_units_and_the_height_of_the_floor_do_not_matter(two_balls, tmp_path, unit, floor, apart):
     """With the weights that ship. Where the floor cuts the voxels (of 2 cm) that decide on what lies on it moves."""
-    shipped = find("ngff", HERE)
+    shipped = find("ngff", SHIPPED)
     here = roll(two_balls, tmp_path, shipped, steps=8)
     there = roll(elsewhere(two_balls, unit, floor), tmp_path, shipped, steps=8)
     moved = here.positions - here.positions[0]
@@ -104,7 +104,7 @@ def test_things_of_sizes_known_from_training_keep_their_size(size, scale):
 
 
 class Deaf:
-    told = frozenset({"mass", "E", "friction"})
+    inputs = frozenset({"mass", "E", "friction"})
 
 
 @pytest.mark.parametrize(("change", "says"), [
@@ -120,7 +120,7 @@ def test_what_was_not_seen_in_training_is_warned_of(caplog, change, says):
     points[:, 0] *= change.get("grow", 1.0)
     points[:, 1, :, 2] *= change.get("flat", 1.0)
     velocity = torch.tensor([change.get("speed", 0.0), 0, 0])
-    _warn(World.of(points, velocity=velocity), Deaf())
+    _warn(InitialConditions.of(points, velocity=velocity), Deaf())
     assert len(caplog.records) == (1 if not change else 2)
     assert says in caplog.text
 
@@ -141,10 +141,10 @@ def test_what_flows_is_for_mpm(two_balls, tmp_path, untrained, caplog):
 @pytest.mark.parametrize("name", ["rubber", "soft"])
 def test_a_solid_ball_lands_and_keeps_its_shape(two_balls, tmp_path, name):
     """With the weights that ship, from 0.3 m; hollow bodies as soft as that stay crumpled."""
-    t = roll(two_balls, tmp_path, find("ngff", HERE), lift=("0.3",), material=(f"1={name}", f"2={name}"), steps=50)
+    t = roll(two_balls, tmp_path, find("ngff", SHIPPED), lift=("0.3",), material=(f"1={name}", f"2={name}"), steps=50)
     for i in (1, 2):
         points = t.positions[:, t.keypoints.object_id == i]
-        spread = torch.stack([sides(points[frame]) for frame in (0, -1)])
+        spread = torch.stack([box_sides(points[frame]) for frame in (0, -1)])
         assert (spread[1] / spread[0] - 1).abs().max() < 0.05
         assert points[-1, :, 2].min() > -0.03
 

@@ -5,8 +5,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from stages.core.models.checkpoints import HERE, find
-from stages.core.models.initial_conditions import FLOOR, World
+from stages.core.models.checkpoints import SHIPPED, find
+from stages.core.models.initial_conditions import FLOOR, InitialConditions
 from stages.core.scene.scene_ply import write_scene
 from stages.core.scene.trajectory import read_trajectory
 from stages.simulate.options import SimulateOptions
@@ -16,15 +16,15 @@ from stages.simulate.stage import run
 SIDE = 0.3
 
 
-def stacked(*heights: float, aside: float = 0.0) -> World:
+def stacked(*heights: float, aside: float = 0.0) -> InitialConditions:
     """Cubes of points in the model's world with their lower faces at these heights above the floor."""
     line = torch.linspace(0, SIDE, 8)
     cube = torch.cartesian_prod(line, line, line)
     points = torch.stack([cube + torch.tensor([i * aside, 0, FLOOR + h]) for i, h in enumerate(heights)])
-    return World.of(points[None])
+    return InitialConditions.of(points[None])
 
 
-def sleepers_of(world: World, awake: torch.Tensor) -> SleepState:
+def sleepers_of(world: InitialConditions, awake: torch.Tensor) -> SleepState:
     """With what is at the height of the floor standing on it."""
     return SleepState(world, awake, world.points[0, ..., 2].amin(1) < FLOOR + 1e-3)
 
@@ -73,7 +73,7 @@ def test_what_hangs_a_little_above_the_floor_falls(two_balls, tmp_path):
 def test_at_rest_nothing_moves_until_it_is_hit(two_balls, tmp_path):
     """The red ball lies, the green one is let go beside it, then above it; with the weights that ship."""
     write_scene(tmp_path / "scene.ply", two_balls)
-    chosen = SimulateOptions(steps=30, weights=find("ngff", HERE), keypoints=64, device="cpu", quality="draft")
+    chosen = SimulateOptions(steps=30, weights=find("ngff", SHIPPED), keypoints=64, device="cpu", quality="draft")
     run(tmp_path / "scene.ply", tmp_path / "t.h5", chosen)
     lies = read_trajectory(tmp_path / "t.h5")
     moved = (lies.positions - lies.positions[0]).norm(dim=-1)
@@ -94,7 +94,7 @@ def test_what_is_pushed_later_sleeps_until_then(two_balls, tmp_path):
     red = two_balls.gaussians.object_id == 1
     alone = replace(two_balls, gaussians=two_balls.gaussians[red], objects=two_balls.objects[:1])
     write_scene(tmp_path / "scene.ply", alone)
-    chosen = SimulateOptions(steps=16, weights=find("ngff", HERE), keypoints=64, device="cpu", quality="draft")
+    chosen = SimulateOptions(steps=16, weights=find("ngff", SHIPPED), keypoints=64, device="cpu", quality="draft")
     runs = []
     for start in (0.0, 0.2):
         push = f"object=1 force=2,0,0 from={start} to={start + 0.1}"

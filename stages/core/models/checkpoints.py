@@ -27,7 +27,7 @@ MODELS = {
     "pointformer": "stages.core.models.baselines.pointformer:Pointformer",
     "transformer": "stages.core.models.baselines.transformer:Transformer",
 }
-HERE = Path(__file__).parent / "weights"  # those that ship
+SHIPPED = Path(__file__).parent / "weights"  # those that ship
 
 
 def build(name: str, **config) -> Dynamics:
@@ -37,7 +37,7 @@ def build(name: str, **config) -> Dynamics:
 
 def find(name: str, given: Path | None = None) -> Path:
     """The weights of a model: a file or folder that was given, else those in $NGFF_WEIGHTS, else those that ship."""
-    folders = [HERE]
+    folders = [SHIPPED]
     if os.environ.get("NGFF_WEIGHTS"):
         folders.insert(0, Path(os.environ["NGFF_WEIGHTS"]))
     if given is not None and not Path(given).is_dir():
@@ -70,15 +70,15 @@ def halve(path: Path) -> None:
     save(path, card["model"], model, card, half=True)
 
 
-def minutes(card: Mapping) -> float:
+def training_minutes(card: Mapping) -> float:
     """Of one processor's training, that of the weights it began with, or was averaged with, included."""
     own = float(card["minutes"]) * card.get("processes", 1)
-    return own + (minutes(card["before"]) if "before" in card else 0.0) + _others(card)
+    return own + (training_minutes(card["before"]) if "before" in card else 0.0) + _others(card)
 
 
 def _others(card: Mapping) -> float:
     """Minutes of those that it was averaged with; of those in its own line, which count already, the others' only."""
-    return sum((minutes(c) if "minutes" in c else _others(c) for c in card.get("averaged", ())), 0.0)
+    return sum((training_minutes(c) if "minutes" in c else _others(c) for c in card.get("averaged", ())), 0.0)
 
 
 def write_card(path: Path, card: Mapping) -> None:

@@ -15,7 +15,7 @@ log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class Source:
+class HubSource:
     """Where its makers put the weights of a network."""
 
     repository: str  # on huggingface.co
@@ -30,7 +30,7 @@ def folders() -> list[Path]:
     return [*([Path(given)] if given else []), cache]
 
 
-def fetch(source: Source, folder: Path, choose: Callable[[list], list], place: str) -> list[Path]:
+def fetch(source: HubSource, folder: Path, choose: Callable[[list], list], place: str) -> list[Path]:
     """Files of a repository through huggingface_hub into a folder; returns their paths.
 
     `choose` picks from what the repository holds, and raises ValueError where that is not what it should be. Size,

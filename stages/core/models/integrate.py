@@ -16,7 +16,7 @@ TOLERANCE = {"rtol": 1e-3, "atol": 1e-4}  # of dopri5, as published
 State = TypeVar("State", bound=tuple)  # a NamedTuple of tensors
 
 
-def solve(
+def solve_ode(
     rate: Callable[[Tensor, State], State], start: State, times: Tensor, method: str = "euler", substeps: int = 1,
     adjoint: Sequence[Tensor] | None = None,
 ) -> State:  # fmt: skip

@@ -20,12 +20,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from stages.core.models.dynamics import FRAME, Dynamics
-from stages.core.models.external_forces import Pushes
-from stages.core.models.initial_conditions import World
-from stages.core.models.trees import rebuilt, tensors
+from stages.core.models.external_forces import ExternalForces
+from stages.core.models.initial_conditions import InitialConditions
+from stages.core.models.trees import leaf_tensors, replace_tensors
 
 
-class Stepper:
+class TimeStepper:
     """A scene that moves on by dt [s] with every `step`; on other devices than CUDA simply the model's own step.
 
     `state`, `points`, `pushes` and `time` (steps so far) are tensors that stay where they are: their contents change,
@@ -33,15 +33,17 @@ class Stepper:
     """
 
     @torch.no_grad()
-    def __init__(self, model: Dynamics, world: World, dt: float = FRAME, pushes: Pushes | None = None):
+    def __init__(
+        self, model: Dynamics, initial: InitialConditions, dt: float = FRAME, external: ExternalForces | None = None
+    ):
         self.model, self.dt = model, dt
-        given = world, Pushes.none(world) if pushes is None else pushes
-        self.world, self.pushes = _copy(given)
-        self.time = torch.zeros((), dtype=torch.int64, device=world.points.device)
+        given = initial, ExternalForces.none(initial) if external is None else external
+        self.initial, self.external = _copy(given)
+        self.step_count = torch.zeros((), dtype=torch.int64, device=initial.points.device)
         self.scene, state, points = self._given()
         self.state, self.points = _copy((state, points))
         self.begin, self.advance = self._begin, self._step
-        if self.time.is_cuda:
+        if self.step_count.is_cuda:
             self.begin = _recorded(self._begin)
             self.advance = _recorded(self._step)
             self.begin()
@@ -52,36 +54,36 @@ class Stepper:
         self.advance()
 
     @torch.no_grad()
-    def restart(self, world: World, pushes: Pushes | None = None) -> None:
+    def restart(self, initial: InitialConditions, external: ExternalForces | None = None) -> None:
         """Begin anew, with a world and pushes of the same shapes."""
-        _load((self.world, self.pushes), (world, Pushes.none(world) if pushes is None else pushes))
+        _load((self.initial, self.external), (initial, ExternalForces.none(initial) if external is None else external))
         self.begin()
 
     def _given(self) -> tuple[Any, tuple, Tensor]:
         """The scene, its state at time 0, and where the keypoints are."""
-        scene = self.model.prepare(self.world)
-        state = self.model.start(scene)
+        scene = self.model.prepare(self.initial)
+        state = self.model.initial_state(scene)
         return scene, state, self.model.points(scene, state)
 
     def _begin(self) -> None:
         self.scene, state, points = self._given()  # a recorded scene lies in the memory of its graph
         _load((self.state, self.points), (state, points))
-        self.time.zero_()
+        self.step_count.zero_()
 
     def _step(self) -> None:
-        _advance(self.model, self.scene, self.state, self.points, self.pushes, self.time, self.dt)
+        _advance(self.model, self.scene, self.state, self.points, self.external, self.step_count, self.dt)
 
 
 def _copy(tree: Any) -> Any:
     """The same with tensors of their own, each one block of memory."""
-    return rebuilt(tree, (x.clone(memory_format=torch.contiguous_format) for x in tensors(tree)))
+    return replace_tensors(tree, (x.clone(memory_format=torch.contiguous_format) for x in leaf_tensors(tree)))
 
 
 def _load(mine: tuple, new: tuple) -> None:
-    for x, y in zip(tensors(mine), tensors(new), strict=True):
+    for x, y in zip(leaf_tensors(mine), leaf_tensors(new), strict=True):
         if x.shape != y.shape:
             raise ValueError(f"made for {tuple(x.shape)}, not {tuple(y.shape)}")
-    torch._foreach_copy_(list(tensors(mine)), list(tensors(new)))  # on a GPU all in one kernel
+    torch._foreach_copy_(list(leaf_tensors(mine)), list(leaf_tensors(new)))  # on a GPU all in one kernel
 
 
 def _recorded(work: Callable[[], None]) -> Callable[[], None]:
@@ -101,25 +103,25 @@ def _recorded(work: Callable[[], None]) -> Callable[[], None]:
 
 
 def _advance(
-    model: Dynamics, scene: Any, state: tuple, points: Tensor, pushes: Pushes, time: Tensor, dt: float
+    model: Dynamics, scene: Any, state: tuple, points: Tensor, external: ExternalForces, time: Tensor, dt: float
 ) -> None:
     """A step in place; `time` counts steps, so that it stays exact."""
-    new = model.step(scene, state, time.to(state[0]) * dt, dt, pushes)
+    new = model.step(scene, state, time.to(state[0]) * dt, dt, external)
     torch._foreach_copy_([*state, points], [*new, model.points(scene, new)])  # on a GPU all in one kernel
     time += 1
 
 
 @torch.no_grad()
 def rollout(
-    model: Dynamics, world: World, steps: int, dt: float = FRAME, pushes: Pushes | None = None
+    model: Dynamics, initial: InitialConditions, steps: int, dt: float = FRAME, external: ExternalForces | None = None
 ) -> Float[Tensor, "b t o n 3"]:
     """What `model.rollout` gives, with the speed of a Stepper: keypoints in `steps` frames, the first the start."""
-    out = frames(Stepper(model, world, dt, pushes), steps)
-    return out.masked_fill_(~world.valid[:, None, ..., None], 0.0)
+    out = record_frames(TimeStepper(model, initial, dt, external), steps)
+    return out.masked_fill_(~initial.valid[:, None, ..., None], 0.0)
 
 
 @torch.no_grad()
-def frames(stepper: Stepper, steps: int) -> Float[Tensor, "b t o n 3"]:
+def record_frames(stepper: TimeStepper, steps: int) -> Float[Tensor, "b t o n 3"]:
     """Keypoints now and after each of steps - 1 further steps; anything where padded."""
     b, o, n, _ = stepper.points.shape
     out = stepper.points.new_empty(b, steps, o, n, 3)

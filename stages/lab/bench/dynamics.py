@@ -27,7 +27,7 @@ from stages.core.backends import pick_device
 from stages.core.errors import InputError
 from stages.core.models import checkpoints as weights
 from stages.core.models.dynamics import Dynamics
-from stages.core.models.rollout import Stepper, frames
+from stages.core.models.rollout import TimeStepper, record_frames
 from stages.core.scene.files import must_exist, replacing
 from stages.evaluate.dynamics import all_metrics, error_over_time
 from stages.lab.assets.heldout_shapes import HELDOUT_SHAPES
@@ -218,7 +218,7 @@ def _model(file: Path, splits: dict[str, KeypointMotions], options: DynamicsBenc
         seconds = _seconds(model, next(iter(splits.values())), device)
     about = {k: card[k] for k in ("model", "config", "scenes", "device", "sha256") if k in card}
     if "minutes" in card:
-        about["minutes"] = _digits(weights.minutes(card))
+        about["minutes"] = _digits(weights.training_minutes(card))
     parameters = sum(p.numel() for p in model.parameters())
     keypoints = min(learned, options.keypoints)
     return {"splits": results, "seconds": seconds, "keypoints": keypoints, "parameters": parameters, "card": about}
@@ -231,11 +231,11 @@ def _rolled(model: Dynamics) -> Predict:
 def _seconds(model: Dynamics, motions: KeypointMotions, device: str) -> float:
     """Wall time of TIMED steps of one scene, as the command rolls it out [s], without what is recorded once."""
     one = motions[:1].initial_conditions()
-    stepper = Stepper(model, one, motions.dt)
+    stepper = TimeStepper(model, one, motions.dt)
 
     def again() -> None:
         stepper.restart(one)
-        frames(stepper, TIMED_STEPS + 1)
+        record_frames(stepper, TIMED_STEPS + 1)
 
     return _digits(bench.median_seconds(again, device, 3), 3)
 

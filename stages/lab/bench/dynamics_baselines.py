@@ -18,7 +18,7 @@ from torch import Tensor
 
 from stages.core.errors import InputError
 from stages.core.geometry.rotations import nearest_rotation
-from stages.core.models.initial_conditions import World
+from stages.core.models.initial_conditions import InitialConditions
 from stages.lab.assets.objects import OBJECTS
 from stages.lab.bench import common as bench
 from stages.lab.dataset.keypoint_motions import KeypointMotions, concatenate_motions
@@ -42,7 +42,7 @@ def predict_free_fall(some: KeypointMotions) -> Float[Tensor, "s t o n 3"]:
     return free_fall(some.initial_conditions(), some.points.shape[1], some.dt)
 
 
-def free_fall(world: World, frames: int, dt: float) -> Float[Tensor, "b t o n 3"]:
+def free_fall(world: InitialConditions, frames: int, dt: float) -> Float[Tensor, "b t o n 3"]:
     """Objects fall as they stand until their lowest keypoint is on the floor, and lie there."""
     time = dt * torch.arange(frames, dtype=world.points.dtype, device=world.points.device)
     fallen = -world.gravity[:, None, None, 2] * time[:, None].square() / 2

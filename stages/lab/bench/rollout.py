@@ -23,8 +23,8 @@ from stages.core.backends import pick_device
 from stages.core.errors import InputError
 from stages.core.models import checkpoints as weights
 from stages.core.models.dynamics import FRAME, Dynamics
-from stages.core.models.initial_conditions import World
-from stages.core.models.rollout import Stepper, frames
+from stages.core.models.initial_conditions import InitialConditions
+from stages.core.models.rollout import TimeStepper, record_frames
 from stages.core.scene.files import replacing
 from stages.lab.bench import common as bench
 from stages.lab.bench import mpm as bench_mpm
@@ -50,13 +50,14 @@ class RolloutBenchOptions:
             raise InputError("--keypoints, --steps, --scenes and --repeat must be at least 1")
 
 
-def ellipsoids(scenes: int, keypoints: int) -> World:
+def ellipsoids(scenes: int, keypoints: int) -> InitialConditions:
     """Copies of one scene: shells of ellipsoids above each other, the lowest a palm above the floor."""
     rng = torch.Generator().manual_seed(0)
     ball = torch.nn.functional.normalize(torch.randn(SCENE_OBJECTS, keypoints, 3, generator=rng), dim=-1)
     place = torch.tensor([[0.0, 0.0, -0.7], [0.1, 0.05, -0.35], [-0.1, 0.0, 0.02]])
     points = ball * torch.tensor([0.25, 0.2, 0.15]) + place[:, None]
-    return World.of(points.repeat(scenes, 1, 1, 1), mass=torch.tensor([0.5, 2.0, 1.0]), E=torch.tensor([1e5, 1e4, 8e5]))
+    mass, E = torch.tensor([0.5, 2.0, 1.0]), torch.tensor([1e5, 1e4, 8e5])
+    return InitialConditions.of(points.repeat(scenes, 1, 1, 1), mass=mass, E=E)
 
 
 def run(out: Path, options: RolloutBenchOptions = RolloutBenchOptions()) -> Iterator[str]:
@@ -91,7 +92,7 @@ def _measured(
     for precision in ("highest", "high") if device != "cpu" else ():  # products as exact as sums, or in tf32
         torch.set_float32_matmul_precision(precision)
         began = time.perf_counter()
-        stepper = Stepper(model, start)
+        stepper = TimeStepper(model, start)
         ready = time.perf_counter() - began
         name = f"ngff, {'in tf32, ' * (precision == 'high')}replayed"
         yield {
@@ -104,7 +105,7 @@ def _measured(
     torch.set_float32_matmul_precision("highest")
     yield _row(PEER, scenes, lambda: rollout_stepwise(paper, start, count), device, options.repeat)
     if device != "cpu":
-        stepper = Stepper(paper, start)
+        stepper = TimeStepper(paper, start)
         yield _row("ngff-paper, replayed", scenes, lambda: _again(stepper, start, count), device, options.repeat)
     particles = SCENE_OBJECTS * options.keypoints
     mpm = bench_mpm.measure(particles, scenes, device, 2)
@@ -113,14 +114,14 @@ def _measured(
 
 
 @torch.no_grad()
-def rollout_stepwise(model: Dynamics, start: World, count: int) -> Float[Tensor, "b t o n 3"]:
+def rollout_stepwise(model: Dynamics, start: InitialConditions, count: int) -> Float[Tensor, "b t o n 3"]:
     """A rollout as any code would do it."""
     return model.rollout(start, count, FRAME)
 
 
-def _again(stepper: Stepper, start: World, count: int) -> Float[Tensor, "b t o n 3"]:
+def _again(stepper: TimeStepper, start: InitialConditions, count: int) -> Float[Tensor, "b t o n 3"]:
     stepper.restart(start)
-    return frames(stepper, count)
+    return record_frames(stepper, count)
 
 
 def _row(what: str, scenes: int, function: Callable[[], object], device: str, repeat: int) -> dict:

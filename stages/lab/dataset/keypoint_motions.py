@@ -25,7 +25,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from stages.core.errors import InputError
-from stages.core.models.initial_conditions import World
+from stages.core.models.initial_conditions import InitialConditions
 from stages.core.scene.files import must_exist, replacing
 
 FORMAT, VERSION = "ngff-motions", 1
@@ -65,11 +65,11 @@ class KeypointMotions:
     def to(self, device: torch.device | str) -> KeypointMotions:
         return replace(self, **{name: getattr(self, name).to(device) for name in TENSORS})
 
-    def initial_conditions(self, keypoints: int | None = None) -> World:
+    def initial_conditions(self, keypoints: int | None = None) -> InitialConditions:
         """The scenes at rest, with the first so many keypoints (they come farthest first)."""
         rest = self.points[:, 0, :, :keypoints]
         valid = self.present[..., None].expand(rest.shape[:-1])
-        return World.of(
+        return InitialConditions.of(
             rest, valid, mass=self.mass, E=self.E, nu=self.nu, friction=self.friction, solidity=self.solidity,
             gravity=torch.tensor(self.gravity), box=torch.tensor(self.box),
         )  # fmt: skip

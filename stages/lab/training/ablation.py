@@ -10,9 +10,9 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from stages.core.models.dynamics import Dynamics
-from stages.core.models.field.contact_forces import Places, Touch
-from stages.core.models.field.force_field import ForceField, Scene
-from stages.core.models.field.rest_shape import Shape
+from stages.core.models.field.contact_forces import ContactNet, ContactPoints
+from stages.core.models.field.force_field import FieldScene, ForceField
+from stages.core.models.field.rest_shape import RestShape
 from stages.lab.training.train import TrainOptions
 
 IMPULSE_VECTORS = (
@@ -32,44 +32,44 @@ class Ablation:
 class _UnfusedForceField(ForceField):
     """Without kernels for a whole step: they know the full network alone."""
 
-    def _fused(self, scene: Scene) -> bool:
+    def _fused(self, scene: FieldScene) -> bool:
         return False
 
 
 class NoReaction(_UnfusedForceField):
     """What touches a body pushes it, and feels nothing of that: each side has forces of its own."""
 
-    def _returned(self, shape: Shape, x: Float[Tensor, "b o m c"]) -> Float[Tensor, "b o c"]:
+    def _returned(self, shape: RestShape, x: Float[Tensor, "b o m c"]) -> Float[Tensor, "b o c"]:
         return torch.zeros_like(x[:, :, 0])
 
 
 class NoMaterialInputs(_UnfusedForceField):
     """All objects are of one stiffness, Poisson ratio and friction to the network; their mass it knows."""
 
-    def informed(self, shape: Shape) -> Scene:
-        w = shape.world
+    def encode(self, shape: RestShape) -> FieldScene:
+        w = shape.initial
         same = replace(w, E=torch.full_like(w.E, 1e5), nu=torch.full_like(w.nu, 0.3),
                        friction=torch.full_like(w.friction, 0.5))  # fmt: skip
-        return replace(super().informed(replace(shape, world=same)), shape=shape)
+        return replace(super().encode(replace(shape, initial=same)), shape=shape)
 
 
-class _NoImpulseFeatures(Touch):
+class _NoImpulseFeatures(ContactNet):
     """Contacts that see how things move, but not which impulse would stop them."""
 
     def __init__(self, vectors: int, scalars: int, hidden: int, partner: bool):
         super().__init__(vectors - IMPULSE_VECTORS, scalars, hidden, partner)
 
-    def listen(
-        self, places: Places, share: Float[Tensor, "b o m n"], own: Float[Tensor, "b o h"],
+    def encode(
+        self, places: ContactPoints, share: Float[Tensor, "b o m n"], own: Float[Tensor, "b o h"],
         other: Float[Tensor, "b o m h"] | None = None,
     ) -> tuple[Float[Tensor, "b o m n h"], Float[Tensor, "b o m n"], Float[Tensor, "b o m h"]]:  # fmt: skip
-        return super().listen(replace(places, vectors=places.vectors[..., :-IMPULSE_VECTORS, :]), share, own, other)
+        return super().encode(replace(places, vectors=places.vectors[..., :-IMPULSE_VECTORS, :]), share, own, other)
 
-    def answer(
+    def decode(
         self, message: Float[Tensor, "b o m n h"], weight: Float[Tensor, "b o m n"], context: Float[Tensor, "b o m h"],
         vectors: Float[Tensor, "b o m n k 3"],
     ) -> Float[Tensor, "b o m n 3"]:  # fmt: skip
-        return super().answer(message, weight, context, vectors[..., :-IMPULSE_VECTORS, :])
+        return super().decode(message, weight, context, vectors[..., :-IMPULSE_VECTORS, :])
 
 
 class _ZeroFeatures(nn.Module):

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from stages.core.errors import InputError
-from stages.core.models.checkpoints import halve, minutes
+from stages.core.models.checkpoints import halve, training_minutes
 from stages.core.scene.files import must_exist
 from stages.lab.plot import Panel, draw_panels
 
@@ -51,4 +51,5 @@ def _line(name: str, row: dict) -> str:
     best = row.get("validation") or {}
     score = "  ".join(f"{k} {best[k]:.4f}" for k in ("RMSE", "FPE", "R") if isinstance(best.get(k), (int, float)))
     known = f"{row['scenes']} scenes, " if "scenes" in row else ""
-    return f"{name}: {row['model']}, {known}{minutes(row):.1f} min on {row.get('device', 'what was there')}: {score}"
+    spent = training_minutes(row)
+    return f"{name}: {row['model']}, {known}{spent:.1f} min on {row.get('device', 'what was there')}: {score}"

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from stages.core.errors import InputError
 from stages.core.models.dynamics import Dynamics
-from stages.core.models.initial_conditions import World
+from stages.core.models.initial_conditions import InitialConditions
 from stages.core.scene.files import sha256
 from stages.lab.dataset.keypoint_motions import KeypointMotions, concatenate_motions, read_motions
 
@@ -30,7 +30,7 @@ REST_SPEED, REST_FRAMES = 0.02, 5  # a scene whose points moved slower [m/s] for
 class MotionClip:
     """A batch of short motions."""
 
-    world: World  # at rest, as of the first frame of the whole motion
+    world: InitialConditions  # at rest, as of the first frame of the whole motion
     rest: Any  # what the model computes of it once and for all
     points: Float[Tensor, "b o n 3"]  # where they start [m]
     speed: Float[Tensor, "b o n 3"]  # [m/s]
@@ -93,7 +93,7 @@ class ClipSampler:
     def __init__(self, motions: KeypointMotions, device: torch.device | str, model: Dynamics):
         self.motions = motions.to(device)
         self.world = self.motions.initial_conditions()
-        self.rest = model.rest(self.world)
+        self.rest = model.precompute(self.world)
         self.asleep = ends_at_rest(self.motions)
         self.calm = smooth_frames(self.motions).cumsum(1)
         self.spread = motion_spread(self.motions)

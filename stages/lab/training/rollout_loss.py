@@ -14,8 +14,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from stages.core.models.dynamics import Dynamics
-from stages.core.models.external_forces import Pushes
-from stages.core.models.trees import rebuilt, tensors
+from stages.core.models.external_forces import ExternalForces
+from stages.core.models.trees import leaf_tensors, replace_tensors
 from stages.lab.training.data import MotionClip, smooth_motion
 
 log = logging.getLogger(__name__)
@@ -83,9 +83,9 @@ class RolloutLoss:
         self.graph: torch.cuda.CUDAGraph | None = None
 
     def __call__(self, piece: MotionClip) -> tuple[Float[Tensor, ""], list[Tensor]]:
-        scene = self.model.informed(piece.rest)
+        scene = self.model.encode(piece.rest)
         with torch.no_grad():
-            state = self.model.observe(scene, piece.points, piece.speed)
+            state = self.model.state_from_motion(scene, piece.points, piece.speed)
         given = (scene, state, piece.points, piece.truth, piece.world.valid, piece.spread)
         if self.compiling:
             self._check(given)
@@ -95,7 +95,7 @@ class RolloutLoss:
         if self.graph is None:
             loss, grads = self._walk(given)
         else:
-            for kept, new in zip(tensors(self.kept), tensors(given), strict=True):
+            for kept, new in zip(leaf_tensors(self.kept), leaf_tensors(given), strict=True):
                 kept.data.copy_(new.detach())
             self.graph.replay()
             loss, grads = self.result
@@ -104,16 +104,16 @@ class RolloutLoss:
     def _walk(self, given: tuple) -> tuple[Tensor, list[Tensor | None]]:
         """Loss, and gradients of the parameters, then of what was prepared."""
         scene, state, start, truth, valid, spread = given
-        free = [x.detach().requires_grad_(x.requires_grad) for x in tensors(scene)]
-        scene = rebuilt(scene, iter(free))
+        free = [x.detach().requires_grad_(x.requires_grad) for x in leaf_tensors(scene)]
+        scene = replace_tensors(scene, iter(free))
         # so that the first step is like the others to a compiler
-        state = rebuilt(state, (x.detach().requires_grad_() for x in tensors(state)))
-        pushes = Pushes.nobody(valid, truth)
+        state = replace_tensors(state, (x.detach().requires_grad_() for x in leaf_tensors(state)))
+        pushes = ExternalForces.none_for(valid, truth)
         frames = []
         for _ in range(truth.shape[1]):
-            state = rebuilt(state, (torch.lerp(x.detach(), x, self.memory) for x in tensors(state)))
+            state = replace_tensors(state, (torch.lerp(x.detach(), x, self.memory) for x in leaf_tensors(state)))
             moved = self.advance(self.model, scene, state, self.dt, pushes, self.speeds > 0)
-            state = rebuilt(state, iter(moved))
+            state = replace_tensors(state, iter(moved))
             frames.append(moved[len(state) :])
         points, *speed = (torch.stack(x, 1) for x in zip(*frames, strict=True))
         loss = keypoint_loss(points, truth, valid, self.loss, spread)
@@ -137,7 +137,7 @@ class RolloutLoss:
     def _carried(self, scene: Any, grads: list[Tensor | None]) -> list[Tensor]:
         """Gradients of the parameters, with those that come through the prepared scene."""
         own, inner = grads[: len(self.params)], grads[len(self.params) :]
-        prepared = [(x, g) for x, g in zip([x for x in tensors(scene) if x.requires_grad], inner, strict=True)
+        prepared = [(x, g) for x, g in zip([x for x in leaf_tensors(scene) if x.requires_grad], inner, strict=True)
                     if g is not None]  # fmt: skip
         more = [None] * len(own)
         if prepared:
@@ -150,8 +150,8 @@ class RolloutLoss:
         self.wanted = False
         # leaves with memory of their own, which the graph reads
         kept = [x.detach().clone(memory_format=torch.contiguous_format).requires_grad_(x.requires_grad)
-                for x in tensors(given)]  # fmt: skip
-        kept = rebuilt(given, iter(kept))
+                for x in leaf_tensors(given)]  # fmt: skip
+        kept = replace_tensors(given, iter(kept))
         try:
             side = torch.cuda.Stream()
             side.wait_stream(torch.cuda.current_stream())
@@ -168,13 +168,15 @@ class RolloutLoss:
             log.info("no CUDA graph, going on step by step: %s", str(error).splitlines()[0])
 
 
-def _advance(model: Dynamics, scene: Any, state: tuple, dt: float, pushes: Pushes, speeds: bool) -> tuple[Tensor, ...]:
+def _advance(
+    model: Dynamics, scene: Any, state: tuple, dt: float, pushes: ExternalForces, speeds: bool
+) -> tuple[Tensor, ...]:
     """The tensors of the next state, where its points are and perhaps how fast; without pushes the time is nothing.
 
     One flat tuple: PyTorch 2.11 compiles a named tuple that comes out of a `_replace` to an empty one.
     """
     state = model.step(scene, state, 0.0, dt, pushes)
-    return (*state, model.points(scene, state), *([model.speed(scene, state, pushes)] if speeds else []))
+    return (*state, model.points(scene, state), *([model.point_velocity(scene, state, pushes)] if speeds else []))
 
 
 def _sum(like: Tensor, a: Tensor | None, b: Tensor | None) -> Tensor:

@@ -11,8 +11,8 @@ from tests.core.models.worlds import crowd, padded
 def test_graph_convolution_is_the_published_sum():
     # x_i' = b + sum over j in N(i) and i itself of W x_j / sqrt(d_i d_j), d counting the node itself
     torch.manual_seed(0)
-    world = padded(crowd(1, 2, 15), 0, 3)
-    points, valid = world.points.flatten(1, 2), world.valid.flatten(1)
+    initial = padded(crowd(1, 2, 15), 0, 3)
+    points, valid = initial.points.flatten(1, 2), initial.valid.flatten(1)
     layer, x = GraphConv(4, 5).double(), torch.randn(1, points.shape[1], 4, dtype=torch.float64)
     out = layer(x, adjacency(points, valid))
     nodes = valid[0].nonzero()[:, 0].tolist()
@@ -33,23 +33,24 @@ def test_the_graph_joins_objects():
 
 def test_pointformer_drops_out_only_in_training():
     torch.manual_seed(0)
-    model, world = build("pointformer").double(), crowd()
-    a, b = (model.train().rollout(world, 3) for _ in range(2))
+    model, initial = build("pointformer").double(), crowd()
+    a, b = (model.train().rollout(initial, 3) for _ in range(2))
     assert not torch.equal(a, b)
-    a, b = (model.eval().rollout(world, 3) for _ in range(2))
+    a, b = (model.eval().rollout(initial, 3) for _ in range(2))
     assert torch.equal(a, b)
 
 
 def test_transformer_does_not_care_where_in_the_room_a_scene_stands():
-    world = crowd()
+    initial = crowd()
     model = Transformer(hidden=16, layers=2, heads=2).double()
     shift = torch.tensor([0.4, -0.3, 0.0]).double()
-    moved = type(world).of(world.points + shift, mass=world.mass, E=world.E, nu=world.nu, friction=world.friction,
-                           velocity=world.velocity, spin=world.spin)  # fmt: skip
-    torch.testing.assert_close(model.rollout(moved, 5), model.rollout(world, 5) + shift, rtol=0, atol=1e-10)
+    moved = type(initial).of(initial.points + shift, mass=initial.mass, E=initial.E, nu=initial.nu,
+    friction=initial.friction,
+                           velocity=initial.velocity, spin=initial.spin)  # fmt: skip
+    torch.testing.assert_close(model.rollout(moved, 5), model.rollout(initial, 5) + shift, rtol=0, atol=1e-10)
 
 
 def test_features_are_of_order_one():
-    world = crowd()
-    x = features(world, Transformer(hidden=8, layers=1, heads=1).start(world))
+    initial = crowd()
+    x = features(initial, Transformer(hidden=8, layers=1, heads=1).initial_state(initial))
     assert x.shape == (2, 3, 12, 29) and x.abs().max() < 4

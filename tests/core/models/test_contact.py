@@ -11,8 +11,8 @@ from tests.core.models.worlds import crowd, padded
 
 @pytest.mark.parametrize("search", [_measured, _culled])
 def test_nearest_equals_a_loop(search):
-    world, reach = padded(crowd(2, 3, 9), 1, 2), 0.15
-    x, valid = world.points, world.valid
+    initial, reach = padded(crowd(2, 3, 9), 1, 2), 0.15
+    x, valid = initial.points, initial.valid
     distance, index = search(x, valid, reach)
     seen = 0
     for b, i, j, n in itertools.product(range(2), range(4), range(4), range(11)):
@@ -27,32 +27,32 @@ def test_nearest_equals_a_loop(search):
 
 
 def test_only_what_is_within_reach_is_found():
-    world = crowd(2, 3, 9)
-    distance, _ = nearest(world.points, world.valid, 0.1)
-    near, _ = nearest(world.points, world.valid, 0.05)
+    initial = crowd(2, 3, 9)
+    distance, _ = nearest(initial.points, initial.valid, 0.1)
+    near, _ = nearest(initial.points, initial.valid, 0.05)
     assert distance[distance.isfinite()].max() < 0.1
     assert torch.equal(near.isfinite(), distance < 0.05) and near.isfinite().any()
 
 
 def test_many_points_are_searched_as_few_are():
-    world = crowd(2, 3, 300)
-    (a, i), (b, j) = (f(world.points, world.valid, 0.1) for f in (nearest, _measured))
+    initial = crowd(2, 3, 300)
+    (a, i), (b, j) = (f(initial.points, initial.valid, 0.1) for f in (nearest, _measured))
     b = b.masked_fill(b >= 0.1, torch.inf)
     torch.testing.assert_close(a, b)
     assert torch.equal(i[a.isfinite()], j[a.isfinite()])
 
 
 def test_a_far_scene_is_as_exact_as_one_at_the_origin():
-    world = crowd(1, 2, 40)
-    near = nearest(world.points.float(), world.valid, 1.0)[0]
+    initial = crowd(1, 2, 40)
+    near = nearest(initial.points.float(), initial.valid, 1.0)[0]
     # float32 at 64 m resolves 4e-6 m
-    far = nearest(world.points.float() + 64, world.valid, 1.0)[0]
+    far = nearest(initial.points.float() + 64, initial.valid, 1.0)[0]
     torch.testing.assert_close(far, near, rtol=0, atol=2e-5)
 
 
 def test_walls_are_felt_on_both_sides_and_the_ceiling_is_open():
-    world = crowd(1, 1, 6)
+    initial = crowd(1, 1, 6)
     places = [[0, 0, -0.94], [0, 0, -0.98], [0, 0, -1.0], [1.93, 0, 0], [0, -1.98, 0], [0, 0, 2.94]]
     points = torch.tensor(places).double()[None, None]
-    felt = near_walls(points, world.valid, world.box, 0.05)
+    felt = near_walls(points, initial.valid, initial.box, 0.05)
     assert felt.flatten().tolist() == [True, True, False, True, True, False]

@@ -7,12 +7,19 @@ import pytest
 import torch
 
 from stages.core.geometry.rotations import matrix
-from stages.core.models.external_forces import Pushes
-from stages.core.models.field.contact_forces import Places
+from stages.core.models.external_forces import ExternalForces
+from stages.core.models.field.contact_forces import ContactPoints
 from stages.core.models.field.deformation import projected
-from stages.core.models.field.force_field import LEAVING, RIGID, SINK, ForceField, Rates, _pushed
-from stages.core.models.field.rest_shape import shape_of
-from stages.core.models.initial_conditions import BOX, World, centre
+from stages.core.models.field.force_field import (
+    MAX_PENETRATION,
+    MAX_TRAINED_STIFFNESS,
+    SEPARATION_SPEED,
+    Accelerations,
+    ForceField,
+    _pushed,
+)
+from stages.core.models.field.rest_shape import rest_shape_of
+from stages.core.models.initial_conditions import BOX, InitialConditions, centre_of_mass
 from tests.core.models.worlds import crowd, push
 
 ROOMY = torch.tensor([[-50.0] * 3, [50.0] * 3], dtype=torch.float64)
@@ -30,7 +37,7 @@ def loud(seed: int = 0, deform: bool = True) -> ForceField:
     return model
 
 
-def flying(n: int = 20, gravity=NOWHERE, **given) -> World:
+def flying(n: int = 20, gravity=NOWHERE, **given) -> InitialConditions:
     """Two bodies far from everything that fly at each other, off centre and spinning; one is the heavier."""
     rng = torch.Generator().manual_seed(3)
     box = (torch.rand(2, n, 3, generator=rng, dtype=torch.float64) - 0.5) * torch.tensor([0.3, 0.2, 0.1]).double()
@@ -38,59 +45,67 @@ def flying(n: int = 20, gravity=NOWHERE, **given) -> World:
     velocity = torch.tensor([[1.0, 0, 0.1], [-0.5, 0, 0]]).double()
     spin = torch.tensor([[1.0, 3.0, -2.0], [-2.0, 0.5, 1.0]]).double()
     given = {"mass": torch.tensor([0.4, 1.2]), "velocity": velocity, "spin": spin, **given}
-    return World.of(points[None], gravity=gravity, box=ROOMY, **given)
+    return InitialConditions.of(points[None], gravity=gravity, box=ROOMY, **given)
 
 
-def history(model: ForceField, world: World, steps: int, dt: float = 0.02, pushes: Pushes | None = None):
-    scene = model.prepare(world)
-    states = [model.start(scene)]
+def history(
+    model: ForceField, initial: InitialConditions, steps: int, dt: float = 0.02, external: ExternalForces | None = None
+):
+    scene = model.prepare(initial)
+    states = [model.initial_state(scene)]
     for i in range(steps):
-        states.append(model.step(scene, states[-1], dt * i, dt, Pushes.none(world) if pushes is None else pushes))
+        states.append(
+            model.step(scene, states[-1], dt * i, dt, ExternalForces.none(initial) if external is None else external)
+        )
     return scene, states
 
 
-def momenta(world: World, state) -> tuple[torch.Tensor, torch.Tensor]:
+def momenta(initial: InitialConditions, state) -> tuple[torch.Tensor, torch.Tensor]:
     """Linear momentum, and angular momentum about the origin, of each scene."""
-    p = world.mass[..., None] * state.velocity
-    return p.sum(1), (torch.linalg.cross(state.com, p) + world.mass[..., None] * state.momentum).sum(1)
+    p = initial.mass[..., None] * state.velocity
+    return p.sum(1), (torch.linalg.cross(state.com, p) + initial.mass[..., None] * state.momentum).sum(1)
 
 
 @torch.no_grad()
 def test_a_collision_keeps_linear_and_angular_momentum():
-    world = flying()
-    _, states = history(loud(), world, 40)
+    initial = flying()
+    _, states = history(loud(), initial, 40)
     change = (states[-1].velocity - states[0].velocity).norm(dim=-1)
     assert change.min() > 0.1  # they did collide
-    for before, after in zip(momenta(world, states[0]), momenta(world, states[-1]), strict=True):
+    for before, after in zip(momenta(initial, states[0]), momenta(initial, states[-1]), strict=True):
         torch.testing.assert_close(after, before, rtol=0, atol=1e-12)
 
 
 @torch.no_grad()
 def test_the_ode_keeps_momentum_to_the_order_of_its_steps():
-    world, model = flying(), loud(deform=False)
-    scene = model.prepare(world)
-    rate = model.derivative(scene, 0.0, model.start(scene)._replace(com=world.points.mean(2) * 0.5), Pushes.none(world))
+    initial, model = flying(), loud(deform=False)
+    scene = model.prepare(initial)
+    rate = model.derivative(
+        scene, 0.0, model.initial_state(scene)._replace(com=initial.points.mean(2) * 0.5), ExternalForces.none(initial)
+    )
     assert rate.velocity.norm(dim=-1).min() > 0.1
-    assert (world.mass[..., None] * rate.velocity).sum(1).abs().max() < 1e-12
+    assert (initial.mass[..., None] * rate.velocity).sum(1).abs().max() < 1e-12
 
 
 @torch.no_grad()
 def test_free_flight_is_a_parabola():
-    world = flying(gravity=torch.tensor([0.3, 0.0, -5.0]), velocity=torch.tensor([[-1.0, 0, 2], [1, 1, 1]]))
-    scene, states = history(loud(), world, 50)
+    initial = flying(gravity=torch.tensor([0.3, 0.0, -5.0]), velocity=torch.tensor([[-1.0, 0, 2], [1, 1, 1]]))
+    scene, states = history(loud(), initial, 50)
     t = 1.0
-    wanted = states[0].com + t * world.velocity + t * t / 2 * world.gravity[:, None]
+    wanted = states[0].com + t * initial.velocity + t * t / 2 * initial.gravity[:, None]
     torch.testing.assert_close(states[-1].com, wanted, **EXACT)
 
 
 def test_a_free_spin_converges_with_order_two_and_keeps_its_energy():
     # a body of three different moments turns about no fixed axis
-    world = flying(velocity=torch.tensor([[-3.0, 0, 0], [3.0, 0, 0]]), spin=torch.tensor([[0.2, 8.0, 0.3], [5, 1, -4]]))
+    initial = flying(
+        velocity=torch.tensor([[-3.0, 0, 0], [3.0, 0, 0]]), spin=torch.tensor([[0.2, 8.0, 0.3], [5, 1, -4]])
+    )
     model = loud(deform=False)
 
     def end(steps: int):
         with torch.no_grad():
-            scene, states = history(model, world, steps, 0.4 / steps)
+            scene, states = history(model, initial, steps, 0.4 / steps)
             return scene, states[0], states[-1]
 
     scene, first, last = end(80)
@@ -111,44 +126,48 @@ def turn(angle: float, axis=(0.0, 0.0, 1.0)) -> torch.Tensor:
     return matrix(torch.cat([torch.tensor([math.cos(angle / 2)]), math.sin(angle / 2) * a / a.norm()]))
 
 
-def rotated(world: World, R: torch.Tensor) -> World:
-    given = {k: getattr(world, k) for k in ("mass", "E", "nu", "friction", "box")}
-    vectors = {k: getattr(world, k) @ R.mT for k in ("velocity", "spin", "gravity")}
-    return World.of(world.points @ R.mT, world.valid, **given, **vectors)
+def rotated(initial: InitialConditions, R: torch.Tensor) -> InitialConditions:
+    given = {k: getattr(initial, k) for k in ("mass", "E", "nu", "friction", "box")}
+    vectors = {k: getattr(initial, k) @ R.mT for k in ("velocity", "spin", "gravity")}
+    return InitialConditions.of(initial.points @ R.mT, initial.valid, **given, **vectors)
 
 
 @torch.no_grad()
 def test_a_scene_turned_about_the_vertical_moves_turned():
-    world, R, model = crowd(), turn(1.1), loud()
-    out = model.rollout(world, 15)
+    initial, R, model = crowd(), turn(1.1), loud()
+    out = model.rollout(initial, 15)
     assert (out[:, -1] - out[:, 0]).norm(dim=-1).max() > 0.05
-    torch.testing.assert_close(model.rollout(rotated(world, R), 15), out @ R.mT, rtol=0, atol=1e-7)
+    torch.testing.assert_close(model.rollout(rotated(initial, R), 15), out @ R.mT, rtol=0, atol=1e-7)
 
 
 @torch.no_grad()
 def test_far_from_floor_and_walls_no_direction_is_special():
-    world, R, model = flying(gravity=torch.tensor([1.0, 2.0, -3.0])), turn(2.0, (1, -2, 0.5)), loud()
-    torch.testing.assert_close(model.rollout(rotated(world, R), 30), model.rollout(world, 30) @ R.mT, rtol=0, atol=1e-7)
+    initial, R, model = flying(gravity=torch.tensor([1.0, 2.0, -3.0])), turn(2.0, (1, -2, 0.5)), loud()
+    torch.testing.assert_close(
+        model.rollout(rotated(initial, R), 30), model.rollout(initial, 30) @ R.mT, rtol=0, atol=1e-7
+    )
 
 
 @torch.no_grad()
 def test_an_untouched_body_stays_as_it_is():
-    world = flying(velocity=NOWHERE, spin=NOWHERE)
-    out = loud().rollout(World.of(world.points * torch.tensor([4.0, 1, 1]), gravity=NOWHERE, box=ROOMY), 100)
+    initial = flying(velocity=NOWHERE, spin=NOWHERE)
+    out = loud().rollout(
+        InitialConditions.of(initial.points * torch.tensor([4.0, 1, 1]), gravity=NOWHERE, box=ROOMY), 100
+    )
     assert (out == out[:, :1]).all() or (out - out[:, :1]).abs().max() < 1e-12
 
 
 @torch.no_grad()
 def test_what_is_stiffer_than_all_learned_from_bends_less_by_as_much():
     """Linear elasticity; softer things are told apart by the network alone."""
-    model, world = ForceField(hidden=8).double().eval(), crowd(1, 1, 12)
-    stiffest = float(RIGID * world.mass[0, 0] / shape_of(world).size[0, 0])
+    model, initial = ForceField(hidden=8).double().eval(), crowd(1, 1, 12)
+    stiffest = float(MAX_TRAINED_STIFFNESS * initial.mass[0, 0] / rest_shape_of(initial).size[0, 0])
     touch = torch.randn(1, 1, 12, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     rest, gravity = torch.zeros_like(touch), torch.zeros(1, 1, 3, dtype=torch.float64)
     bends = []
     for E in (stiffest / 10, stiffest, 5 * stiffest, 1e4 * stiffest):
-        scene = model.prepare(replace(world, E=torch.full_like(world.E, E)))
-        bends.append(model.stress(scene.shape, scene.code, scene.yields, rest, rest, touch, gravity))
+        scene = model.prepare(replace(initial, E=torch.full_like(initial.E, E)))
+        bends.append(model.stress(scene.shape, scene.code, scene.compliance_scale, rest, rest, touch, gravity))
     soft, usual, stiff, rigid = bends
     assert not torch.allclose(soft, usual, rtol=1e-3)
     torch.testing.assert_close(stiff, usual / 5)
@@ -166,8 +185,8 @@ def test_the_floor_holds_what_creeps_and_lets_slide_what_is_fast():
     points = points - points.amin((1, 2), keepdim=True) + torch.tensor([0, 0, BOX[0][2] + 0.01]).double()
 
     def speed_left(speed: float) -> float:
-        world = World.of(points, gravity=NOWHERE, velocity=torch.tensor([speed, 0, 0]))
-        return float(history(model, world, 20)[1][-1].velocity[0, 0, 0]) / speed
+        initial = InitialConditions.of(points, gravity=NOWHERE, velocity=torch.tensor([speed, 0, 0]))
+        return float(history(model, initial, 20)[1][-1].velocity[0, 0, 0]) / speed
 
     assert speed_left(0.005) < 1e-6
     assert 0.95 < speed_left(1.0) < 1
@@ -185,8 +204,8 @@ def test_what_lies_on_what_the_floor_holds_is_held_too_and_what_flies_is_not():
     floor = torch.tensor([0, 0, BOX[0][2] + 0.01]).double()
     top = torch.tensor([0, 0, float(box[:, 2].max()) + 0.01]).double()
     points = torch.stack([floor + box, floor + top + box, floor + 5 * top + box])[None]
-    world = World.of(points, gravity=NOWHERE, velocity=torch.tensor([0.005, 0, 0]))
-    left = history(model, world, 20)[1][-1].velocity[0, :, 0] / 0.005
+    initial = InitialConditions.of(points, gravity=NOWHERE, velocity=torch.tensor([0.005, 0, 0]))
+    left = history(model, initial, 20)[1][-1].velocity[0, :, 0] / 0.005
     assert left[0] < 1e-6 and left[1] < 1e-3
     torch.testing.assert_close(left[2], torch.ones_like(left[2]))
 
@@ -195,10 +214,10 @@ def test_what_lies_on_what_the_floor_holds_is_held_too_and_what_flies_is_not():
 def test_what_each_step_takes_back_does_not_hide_that_a_body_rests():
     """Velocities that change their sign at each step move nothing; those of a bounce are far faster, and stay."""
     model = loud(deform=False)
-    world = crowd(1, 1)
-    scene = model.prepare(world)
+    initial = crowd(1, 1)
+    scene = model.prepare(initial)
     none = torch.zeros(1, 1, 3, dtype=torch.float64)
-    rates = Rates(none, none, none, torch.full((1, 1, 1), 0.03, dtype=torch.float64))
+    rates = Accelerations(none, none, none, torch.full((1, 1, 1), 0.03, dtype=torch.float64))
 
     def kept(before: float, after: float) -> float:
         x = torch.tensor([1.0, 0, 0]).double().expand_as(none)
@@ -211,16 +230,16 @@ def test_what_each_step_takes_back_does_not_hide_that_a_body_rests():
 @torch.no_grad()
 @pytest.mark.parametrize("depth", [0.0, 2.0])
 def test_nothing_stays_in_the_floor_or_a_wall(depth):
-    world = crowd(1, 2)
-    low = world.points.amin((1, 2, 3))[:, None, None, None]
+    initial = crowd(1, 2)
+    low = initial.points.amin((1, 2, 3))[:, None, None, None]
     for axis in (0, 2):
         shift = torch.zeros(3, dtype=torch.float64)
         shift[axis] = BOX[0][axis] - depth
-        points = world.points - low * (torch.arange(3) == axis) + shift
-        start = World.of(points, velocity=torch.tensor([-2.0, 0, -6.0]))
+        points = initial.points - low * (torch.arange(3) == axis) + shift
+        start = InitialConditions.of(points, velocity=torch.tensor([-2.0, 0, -6.0]))
         out = loud().rollout(start, 200)
         assert out.isfinite().all()
-        assert out[:, -1, ..., axis].min() > BOX[0][axis] - SINK - 0.02  # the rest is of second order
+        assert out[:, -1, ..., axis].min() > BOX[0][axis] - MAX_PENETRATION - 0.02  # the rest is of second order
 
 
 def test_the_floor_gives_back_less_than_it_takes():
@@ -230,9 +249,9 @@ def test_the_floor_gives_back_less_than_it_takes():
 
     def felt(speed):
         vectors = torch.stack([up, torch.zeros(3), torch.tensor(speed)]).expand(1, 1, 1, 3, 3, 3)
-        return _pushed(a, Places(vectors, weight[..., None], weight, torch.arange(3)[None, None, None]), weight)
+        return _pushed(a, ContactPoints(vectors, weight[..., None], weight, torch.arange(3)[None, None, None]), weight)
 
-    comes, rests, leaves = felt([0.5, 0, -2.0]), felt([0.0, 0, 0]), felt([0.5, 0, LEAVING])
+    comes, rests, leaves = felt([0.5, 0, -2.0]), felt([0.0, 0, 0]), felt([0.5, 0, SEPARATION_SPEED])
     assert torch.equal(comes, rests) and (rests[..., 2] >= 0).all()
     torch.testing.assert_close(leaves[..., 2], rests[..., 2] / 2)
     assert torch.equal(leaves[..., :2], a[..., :2])  # along the floor it is left to the network
@@ -240,20 +259,20 @@ def test_the_floor_gives_back_less_than_it_takes():
 
 @torch.no_grad()
 def test_a_thousand_steps_stay_finite_and_whole():
-    world = crowd(1, 2, 10)
-    out = loud(4).rollout(world, 1000)
+    initial = crowd(1, 2, 10)
+    out = loud(4).rollout(initial, 1000)
     assert out.isfinite().all()
-    size = (world.points - centre(world, world.points)[:, :, None]).norm(dim=-1).amax()
+    size = (initial.points - centre_of_mass(initial, initial.points)[:, :, None]).norm(dim=-1).amax()
     arm = out - out.mean(3, keepdim=True)
     assert arm.norm(dim=-1).max() < 2.5 * size
 
 
 @torch.no_grad()
 def test_a_torque_turns_a_body_by_its_inertia():
-    world = flying(velocity=NOWHERE, spin=NOWHERE, mass=torch.tensor([2.0, 1.0]))
-    world = World.of(world.points * 3, mass=world.mass, gravity=NOWHERE, box=ROOMY)
-    pushes = push(world, 0, torque=(0.0, 0.0, 0.2))
-    scene, states = history(loud(), world, 1, 0.01, pushes)
+    initial = flying(velocity=NOWHERE, spin=NOWHERE, mass=torch.tensor([2.0, 1.0]))
+    initial = InitialConditions.of(initial.points * 3, mass=initial.mass, gravity=NOWHERE, box=ROOMY)
+    external = push(initial, 0, torque=(0.0, 0.0, 0.2))
+    scene, states = history(loud(), initial, 1, 0.01, external)
     arm = scene.shape.arm[0, 0]
     about_z = arm[:, :2].square().sum(-1).mean()
     torch.testing.assert_close(states[1].momentum[0, 0, 2], torch.tensor(0.01 * 0.2 / 2.0).double())
@@ -265,39 +284,40 @@ def test_a_torque_turns_a_body_by_its_inertia():
 
 @torch.no_grad()
 def test_a_pinned_body_is_a_wall_for_others():
-    world, model = flying(spin=NOWHERE), loud()
-    pushes = Pushes.none(world)
-    pushes.pinned[0, 1] = True
-    heavy = World.of(world.points, gravity=NOWHERE, box=ROOMY, velocity=torch.tensor([[1.0, 0, 0.1], [0, 0, 0]]),
+    initial, model = flying(spin=NOWHERE), loud()
+    external = ExternalForces.none(initial)
+    external.pinned[0, 1] = True
+    heavy = InitialConditions.of(initial.points, gravity=NOWHERE, box=ROOMY, velocity=torch.tensor([[1.0, 0, 0.1], [0,
+    0, 0]]),
                      mass=torch.tensor([0.4, 1.2]))  # fmt: skip
-    _, states = history(model, heavy, 40, pushes=pushes)
+    _, states = history(model, heavy, 40, external=external)
     assert torch.equal(states[-1].com[:, 1], states[0].com[:, 1])
     assert (states[-1].velocity[:, 1] == 0).all() and (states[-1].momentum[:, 1] == 0).all()
     assert (states[-1].velocity[:, 0] - states[0].velocity[:, 0]).norm() > 0.1
 
 
 def test_a_projected_field_neither_moves_nor_turns():
-    world = crowd()
-    shape = shape_of(world)
-    field = projected(shape, torch.randn(world.points.shape, dtype=torch.float64))
-    share = world.share[..., None]
-    assert (share * field).sum(2).abs().max() < 1e-12
+    initial = crowd()
+    shape = rest_shape_of(initial)
+    field = projected(shape, torch.randn(initial.points.shape, dtype=torch.float64))
+    mass_fraction = initial.mass_fraction[..., None]
+    assert (mass_fraction * field).sum(2).abs().max() < 1e-12
     # to the thousandth by which the inertia is enlarged
-    assert (share * torch.linalg.cross(shape.arm, field)).sum(2).abs().max() < 2e-3
+    assert (mass_fraction * torch.linalg.cross(shape.arm, field)).sum(2).abs().max() < 2e-3
 
 
 @torch.no_grad()
 def test_normals_of_a_sphere_point_outwards():
     rng = torch.Generator().manual_seed(0)
     points = torch.nn.functional.normalize(torch.randn(1, 1, 400, 3, generator=rng, dtype=torch.float64), dim=-1)
-    shape = shape_of(World.of(0.2 * points))
+    shape = rest_shape_of(InitialConditions.of(0.2 * points))
     assert (shape.normal * points).sum(-1).min() > 0.9
     assert shape.size[0, 0] == pytest.approx(0.2, rel=1e-2)
     assert shape.spacing.mean() == pytest.approx(0.025, rel=0.3)  # sqrt(4 pi r^2 / n) = 0.035; the nearest are nearer
 
 
 def test_each_object_finds_the_others_and_itself_in_them():
-    shape = shape_of(crowd(1, 4))
+    shape = rest_shape_of(crowd(1, 4))
     for i in range(4):
         assert sorted(shape.others[i].tolist()) == [j for j in range(4) if j != i]
         for k, j in enumerate(shape.others[i].tolist()):
@@ -306,14 +326,14 @@ def test_each_object_finds_the_others_and_itself_in_them():
 
 @torch.no_grad()
 def test_the_same_again_is_the_same():
-    world = crowd().to(torch.float32)
+    initial = crowd().to(torch.float32)
     model = loud().float()
-    assert torch.equal(model.rollout(world, 30), model.rollout(world, 30))
+    assert torch.equal(model.rollout(initial, 30), model.rollout(initial, 30))
 
 
 @torch.no_grad()
 def test_neighbourhoods_hold_no_subnormal_numbers_and_whole_weight():
     """On a CPU products with them take several times as long."""
-    blur = shape_of(crowd(2, 3, 200).to(torch.float32)).blur
+    blur = rest_shape_of(crowd(2, 3, 200).to(torch.float32)).blur
     assert (blur == 0).any() and float(blur[blur > 0].min()) > 100 * torch.finfo(torch.float32).tiny
     torch.testing.assert_close(blur.sum(-1), torch.ones_like(blur.sum(-1)))

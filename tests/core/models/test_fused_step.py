@@ -9,10 +9,10 @@ pytest.importorskip("triton")
 if not torch.cuda.is_available():
     pytest.skip("Triton's kernels need an NVIDIA GPU", allow_module_level=True)
 
-from stages.core.models.external_forces import Pushes  # noqa: E402
+from stages.core.models.external_forces import ExternalForces  # noqa: E402
 from stages.core.models.field import fused_step  # noqa: E402
 from stages.core.models.field.force_field import ForceField  # noqa: E402
-from stages.core.models.rollout import Stepper, frames  # noqa: E402
+from stages.core.models.rollout import TimeStepper, record_frames  # noqa: E402
 from tests.core.models.worlds import crowd, padded, push  # noqa: E402
 
 pytestmark = pytest.mark.gpu
@@ -30,36 +30,36 @@ def loud(hidden: int) -> ForceField:
     return model
 
 
-def all_ways(model: ForceField, world, steps: int, prompt=None, pinned: bool = False):
+def all_ways(model: ForceField, initial, steps: int, prompt=None, pinned: bool = False):
     """States after as many steps from one start: plain in double precision, plain in single, and fused."""
-    pushes = Pushes.none(world) if prompt is None else push(world, 0, **prompt)
-    held = pushes.pinned.clone()
+    external = ExternalForces.none(initial) if prompt is None else push(initial, 0, **prompt)
+    held = external.pinned.clone()
     held[:, 0] = pinned
-    pushes = replace(pushes, pinned=held).to("cuda")
-    scene = model.prepare(world.to("cuda"))
+    external = replace(external, pinned=held).to("cuda")
+    scene = model.prepare(initial.to("cuda"))
     half = scene.shape.blur.half()
     exact = replace(scene, shape=replace(scene.shape, blur=half.double()))
-    state = model.start(scene)
-    there = world.valid[..., None].cuda()
+    state = model.initial_state(scene)
+    there = initial.valid[..., None].cuda()
     rng = torch.Generator("cuda").manual_seed(0)
     bent = [torch.randn(state.u.shape, generator=rng, device="cuda", dtype=torch.float64) * there for _ in range(2)]
     state = state._replace(u=0.01 * bent[0], du=0.3 * bent[1])
     wanted, start = state, type(state)(*(x.float() for x in state))
     for i in range(steps):
-        wanted = model.step(exact, wanted, 0.02 * i, 0.02, pushes)
+        wanted = model.step(exact, wanted, 0.02 * i, 0.02, external)
     single = ForceField(**model.config).cuda()
     single.load_state_dict(model.state_dict())
-    shape = replace(scene.shape, world=scene.shape.world.to(torch.float32), blur=half)
+    shape = replace(scene.shape, initial=scene.shape.initial.to(torch.float32), blur=half)
     shape = replace(shape, **{k: getattr(shape, k).float() for k in ("arm", "normal", "spacing", "size", "inverse")})
     known = {k: getattr(scene, k).float() for k in ("code", "stiffness", "damping", "yields")}
     scene = replace(scene, shape=shape, **known)
-    pushes = replace(pushes, **{k: getattr(pushes, k).float() for k in ("force", "torque", "start", "end")})
+    external = replace(external, **{k: getattr(external, k).float() for k in ("force", "torque", "start", "end")})
     assert fused_step.fits(single, scene)
     plain, found = start, start
     rough = replace(scene, shape=replace(shape, blur=half.float()))  # which the kernels do not take
     for i in range(steps):
-        plain = single.step(rough, plain, 0.02 * i, 0.02, pushes)
-        found = fused_step.step(single, scene, found, 0.02 * i, 0.02, pushes)
+        plain = single.step(rough, plain, 0.02 * i, 0.02, external)
+        found = fused_step.step(single, scene, found, 0.02 * i, 0.02, external)
     states = [{name: x.double() for name, x in s._asdict().items()} for s in (wanted, plain, found)]
     return *states, model.points(exact, wanted), fused_step.points(scene, found).double()
 
@@ -73,8 +73,8 @@ def all_ways(model: ForceField, world, steps: int, prompt=None, pinned: bool = F
     (128, crowd(1, 2, 40), {}),
 ], ids=["crowd", "padded and pushed", "pinned", "walls", "alone", "wide"])  # fmt: skip
 @torch.no_grad()
-def test_it_goes_where_the_plain_step_goes(hidden, world, given):
-    wanted, plain, found, where, there = all_ways(loud(hidden), world, 3, **given)
+def test_it_goes_where_the_plain_step_goes(hidden, initial, given):
+    wanted, plain, found, where, there = all_ways(loud(hidden), initial, 3, **given)
     for name, truth in wanted.items():  # as near as the plain step in single precision comes
         near = 10 * float((plain[name] - truth).abs().max()) + 4e-5 * float(truth.abs().max()) + 1e-6
         torch.testing.assert_close(found[name], truth, rtol=0, atol=near, msg=lambda m, name=name: f"{name}: {m}")
@@ -83,11 +83,11 @@ def test_it_goes_where_the_plain_step_goes(hidden, world, given):
 
 @torch.no_grad()
 def test_recorded_twice_it_is_the_same_to_the_last_bit():
-    model, world = ForceField().cuda().eval(), crowd(2, 3, 200).to(torch.float32).to("cuda")
-    stepper = Stepper(model, world)
-    once = frames(stepper, 10)
-    stepper.restart(world)
-    assert torch.equal(frames(stepper, 10), once)
+    model, initial = ForceField().cuda().eval(), crowd(2, 3, 200).to(torch.float32).to("cuda")
+    stepper = TimeStepper(model, initial)
+    once = record_frames(stepper, 10)
+    stepper.restart(initial)
+    assert torch.equal(record_frames(stepper, 10), once)
     assert (once[:, -1] - once[:, 0]).norm(dim=-1).max() > 0.05
 
 
@@ -95,13 +95,13 @@ def test_recorded_twice_it_is_the_same_to_the_last_bit():
 def test_a_collision_keeps_momentum():
     model = loud(64).float()
     roomy = torch.tensor([[-9.0] * 3, [9.0] * 3]).expand(1, 3, 2, 3)
-    world = replace(crowd(1, 3, 200), gravity=torch.zeros(1, 3).double(), box=roomy)
-    world = world.to(torch.float32).to("cuda")
-    scene, pushes = model.prepare(world), Pushes.none(world)
-    states = [model.start(scene)]
+    initial = replace(crowd(1, 3, 200), gravity=torch.zeros(1, 3).double(), box=roomy)
+    initial = initial.to(torch.float32).to("cuda")
+    scene, external = model.prepare(initial), ExternalForces.none(initial)
+    states = [model.initial_state(scene)]
     for i in range(10):
-        states.append(fused_step.step(model, scene, states[-1], 0.02 * i, 0.02, pushes))
-    mass = world.mass[..., None]
+        states.append(fused_step.step(model, scene, states[-1], 0.02 * i, 0.02, external))
+    mass = initial.mass[..., None]
     before, after = ((mass * s.velocity).sum(1) for s in (states[0], states[-1]))
     turning = [(torch.linalg.cross(s.com, mass * s.velocity) + mass * s.momentum).sum(1) for s in states]
     assert (states[-1].velocity - states[0].velocity).norm(dim=-1).max() > 0.05

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from stages.core.errors import InputError
-from stages.core.models.integrate import solve
+from stages.core.models.integrate import solve_ode
 
 
 class Swing(NamedTuple):
@@ -23,7 +23,7 @@ def pendulum(t: Tensor, s: Swing) -> Swing:
 def end(method: str, substeps: int) -> float:
     """Error at t = 2 of a harmonic swing from angle 1."""
     start = Swing(torch.ones(1, dtype=torch.float64), torch.zeros(1, dtype=torch.float64))
-    states = solve(pendulum, start, torch.linspace(0, 2, 3, dtype=torch.float64), method, substeps)
+    states = solve_ode(pendulum, start, torch.linspace(0, 2, 3, dtype=torch.float64), method, substeps)
     return abs(float(states.angle[-1]) - math.cos(2))
 
 
@@ -42,7 +42,7 @@ def test_free_flight_is_a_parabola():
     g = torch.tensor([0, 0, -9.81], dtype=torch.float64)
     start = Swing(torch.tensor([0.0, 0, 1]).double(), torch.tensor([2.0, 0, 0]).double())
     t = torch.linspace(0, 2, 101, dtype=torch.float64)
-    x = solve(lambda t, s: Swing(s.rate, g), start, t, "rk4").angle
+    x = solve_ode(lambda t, s: Swing(s.rate, g), start, t, "rk4").angle
     wanted = start.angle + start.rate * t[:, None] + g * t[:, None] ** 2 / 2
     torch.testing.assert_close(x, wanted, rtol=0, atol=1e-12)
 
@@ -52,7 +52,7 @@ def test_adjoint_gradients_converge_to_those_through_the_steps():
         k = torch.tensor(1.3, dtype=torch.float64, requires_grad=True)
         start = Swing(torch.ones(1, dtype=torch.float64), torch.zeros(1, dtype=torch.float64))
         t = torch.linspace(0, 2, 3, dtype=torch.float64)
-        states = solve(lambda t, s: Swing(s.rate, -k * s.angle), start, t, "rk4", 20, [k] if adjoint else None)
+        states = solve_ode(lambda t, s: Swing(s.rate, -k * s.angle), start, t, "rk4", 20, [k] if adjoint else None)
         return torch.autograd.grad(states.angle[-1], k)[0]
 
     torch.testing.assert_close(gradient(True), gradient(False), rtol=1e-5, atol=0)

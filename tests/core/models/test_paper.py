@@ -8,9 +8,9 @@ import torch
 
 from stages.core.models.baselines.ngff_paper import REACH, PaperForceField, PaperState, euler_matrix, world_points
 from stages.core.models.checkpoints import build, load
-from stages.core.models.external_forces import Pushes
+from stages.core.models.external_forces import ExternalForces
 from stages.core.models.field.narrow_phase import near_walls, nearest
-from stages.core.models.initial_conditions import World, centre
+from stages.core.models.initial_conditions import InitialConditions, centre_of_mass
 from tests.core.models.worlds import push
 
 CLOSE = {"rtol": 1e-5, "atol": 1e-6}  # single precision, another order of sums
@@ -32,8 +32,10 @@ def published(recorded) -> PaperForceField:
     return model
 
 
-def world_of(data: dict) -> World:
-    return World.of(data["in/points"], data["in/padding"] > 0, velocity=data["in/com_vel"], spin=data["in/angle_vel"])
+def world_of(data: dict) -> InitialConditions:
+    return InitialConditions.of(
+        data["in/points"], data["in/padding"] > 0, velocity=data["in/com_vel"], spin=data["in/angle_vel"]
+    )
 
 
 @torch.no_grad()
@@ -41,16 +43,16 @@ def test_one_force_call(recorded, published):
     d = recorded("predictor_call")
     names = ("points_local", "points_vel", "com", "com_vel", "angle", "angle_vel")
     state = PaperState(*(d[f"in/{name}"] for name in names))
-    world = World.of(d["in/ori_pos"], d["in/padding"] > 0)
+    initial = InitialConditions.of(d["in/ori_pos"], d["in/padding"] > 0)
     points = world_points(state)
     torch.testing.assert_close(euler_matrix(state.angle), d["mid/R_angle"], **CLOSE)
     torch.testing.assert_close(euler_matrix(-state.angle), d["mid/R_neg_angle"], **CLOSE)
     torch.testing.assert_close(points, d["mid/global_points"], **CLOSE)
-    assert torch.equal(nearest(points, world.valid, REACH)[0] < REACH, d["mid/overlap_mask"])
-    assert torch.equal(near_walls(points, world.valid, world.box, REACH), d["mid/boundary_mask"][..., 0] > 0)
-    shape = published.predictor.pointnet(state.local, torch.ones_like(world.valid))
+    assert torch.equal(nearest(points, initial.valid, REACH)[0] < REACH, d["mid/overlap_mask"])
+    assert torch.equal(near_walls(points, initial.valid, initial.box, REACH), d["mid/boundary_mask"][..., 0] > 0)
+    shape = published.predictor.pointnet(state.local, torch.ones_like(initial.valid))
     torch.testing.assert_close(shape, d["mid/geom_features"], **CLOSE)
-    forces, torques, stresses = published.predictor(world, state, d["in/ori_pos"])
+    forces, torques, stresses = published.predictor(initial, state, d["in/ori_pos"])
     torch.testing.assert_close(forces, d["out/forces"], **CLOSE)
     torch.testing.assert_close(torques, d["out/torques"], **CLOSE)
     torch.testing.assert_close(stresses, d["out/stresses"], **CLOSE)
@@ -60,22 +62,22 @@ def test_one_force_call(recorded, published):
 @torch.no_grad()
 def test_rollout(recorded, published, name):
     d = recorded(name)
-    world = world_of(d)
-    torch.testing.assert_close(centre(world, world.points), d["in/com"], **CLOSE)
-    pushes = Pushes.none(world)
+    initial = world_of(d)
+    torch.testing.assert_close(centre_of_mass(initial, initial.points), d["in/com"], **CLOSE)
+    external = ExternalForces.none(initial)
     if name == "rollout_force":
         p = {k: d[f"in/external_0/{k}"].tolist() for k in ("obj_id", "force", "torque", "start", "end")}
-        pushes = push(world, p["obj_id"], p["force"], p["torque"], p["start"], p["end"])
-    ours = published.rollout(world, len(d["out/com"][0]), method="euler", pushes=pushes)
-    theirs = d["out/points_world"].masked_fill(~world.valid[:, None, ..., None], 0)
+        external = push(initial, p["obj_id"], p["force"], p["torque"], p["start"], p["end"])
+    ours = published.rollout(initial, len(d["out/com"][0]), method="euler", external=external)
+    theirs = d["out/points_world"].masked_fill(~initial.valid[:, None, ..., None], 0)
     torch.testing.assert_close(ours, theirs, **CLOSE)
 
 
 def test_loss_and_adjoint_gradients(recorded, published):
     # those of the adjoint equation: with Euler's method they differ much from the gradients through the steps
     d = recorded("loss_and_adjoint_grads")
-    world = world_of(recorded("rollout_free"))
-    loss = (published.rollout(world, 5, method="euler", adjoint=True) - d["in/target"]).square().mean()
+    initial = world_of(recorded("rollout_free"))
+    loss = (published.rollout(initial, 5, method="euler", adjoint=True) - d["in/target"]).square().mean()
     loss.backward()
     torch.testing.assert_close(loss.detach(), d["out/loss"], **CLOSE)
     wanted = {k.removeprefix("out/grad/"): v for k, v in d.items() if k.startswith("out/grad/")}
@@ -110,5 +112,5 @@ def test_without_deformation_bodies_keep_their_shape():
     model = build("ngff-paper-rigid", hidden=16, layers=2)
     assert not any("stress" in name for name in model.state_dict())
     points = torch.rand(1, 2, 10, 3, generator=torch.Generator().manual_seed(0)) * 0.3
-    end = model.rollout(World.of(points), 10)[0, -1]
+    end = model.rollout(InitialConditions.of(points), 10)[0, -1]
     torch.testing.assert_close(torch.cdist(end, end), torch.cdist(points[0], points[0]), rtol=0, atol=1e-5)

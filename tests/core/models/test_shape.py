@@ -15,15 +15,15 @@ from tests.core.models.worlds import crowd, padded  # noqa: E402
 pytestmark = pytest.mark.gpu
 
 
-@pytest.mark.parametrize("world", [
+@pytest.mark.parametrize("initial", [
     crowd(2, 3, 200), padded(crowd(2, 3, 70), 1, 3), crowd(1, 1, 3), crowd(1, 2, 2048)
 ], ids=["crowd", "padded", "few", "many"])  # fmt: skip
 @torch.no_grad()
-def test_a_scene_is_prepared_as_in_double_precision(world):
+def test_a_scene_is_prepared_as_in_double_precision(initial):
     torch.manual_seed(0)
     model = ForceField().eval()
     exact = copy.deepcopy(model).double().cuda()
-    there = world.to(torch.float32).to("cuda")  # both see the same points
+    there = initial.to(torch.float32).to("cuda")  # both see the same points
     wanted = exact.prepare(there.to(torch.float64))
     scene = model.cuda().prepare(there)
     found, true = scene.shape, wanted.shape
@@ -34,7 +34,7 @@ def test_a_scene_is_prepared_as_in_double_precision(world):
         torch.testing.assert_close(getattr(found, name).double(), getattr(true, name), rtol=1e-5, atol=5e-5)
     for name in ("code", "stiffness", "damping"):
         torch.testing.assert_close(getattr(scene, name).double(), getattr(wanted, name), rtol=1e-4, atol=1e-4)
-    spun = model.start(scene).momentum.double()
-    torch.testing.assert_close(spun, exact.start(wanted).momentum, rtol=1e-5, atol=1e-7)
+    spun = model.initial_state(scene).momentum.double()
+    torch.testing.assert_close(spun, exact.initial_state(wanted).momentum, rtol=1e-5, atol=1e-7)
     whole = found.blur.float().sum(-1)[there.valid[:, :, None].expand(found.blur.shape[:-1])]
     assert (whole - 1).abs().max() < 2**-11 * 2 and not found.blur.isnan().any()

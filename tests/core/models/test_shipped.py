@@ -8,15 +8,15 @@ import torch
 
 from stages import lab
 from stages.core.geometry.rotations import matrix
-from stages.core.models.checkpoints import HERE, find, load
-from stages.core.models.initial_conditions import World, centre
+from stages.core.models.checkpoints import SHIPPED, find, load
+from stages.core.models.initial_conditions import InitialConditions, centre_of_mass
 from stages.core.physics.keypoints import farthest_points
 from stages.lab.assets.objects import OBJECTS, make_object
 from stages.lab.assets.shapes import single_threaded
 
 DT = 0.02
 TRAINING = Path(lab.__file__).parent / "results" / "training"  # of the models that stand beside ours
-FILES = [f for folder in (HERE, TRAINING) for f in sorted(folder.glob("*.safetensors"))]
+FILES = [f for folder in (SHIPPED, TRAINING) for f in sorted(folder.glob("*.safetensors"))]
 MOST = 6e6  # bytes of all weights and cards
 SINK = 0.035  # deepest into the floor [m]: what the model promises, and a little for rounding
 
@@ -44,9 +44,9 @@ def pile(lower, upper):
     return torch.stack([lower, upper])
 
 
-def motion(world, points):
+def motion(initial, points):
     """Centres of mass [m] and their speeds [m/s]."""
-    com = torch.stack([centre(world, p) for p in points.unbind(1)], 1)
+    com = torch.stack([centre_of_mass(initial, p) for p in points.unbind(1)], 1)
     return com, com.diff(dim=1).norm(dim=-1) / DT
 
 
@@ -59,7 +59,7 @@ def rests(com, speed):
 
 @pytest.fixture(scope="module")
 def model():
-    return load(find("ngff", HERE))[0]
+    return load(find("ngff", SHIPPED))[0]
 
 
 @pytest.fixture(scope="module")
@@ -68,15 +68,17 @@ def dropped(model):
     n, E = 48, torch.tensor([[5e3], [1e5], [1e7]]).expand(3, 2)
     lower, upper = box((0.25, 0.2, 0.15), n, 0), box((0.15, 0.15, 0.2), n, 1)
     points = torch.stack([lower + torch.tensor([0.0, 0, -0.5]), upper + torch.tensor([0.06, 0.04, 0.1])])
-    world = World.of(points.expand(3, 2, n, 3), E=E, mass=torch.tensor([0.6, 0.3]), friction=torch.tensor(1.0))
+    initial = InitialConditions.of(
+        points.expand(3, 2, n, 3), E=E, mass=torch.tensor([0.6, 0.3]), friction=torch.tensor(1.0)
+    )
     with torch.inference_mode(), single_threaded():  # tensors this small are not worth sharing
-        return world, model.rollout(world, 1000)
+        return initial, model.rollout(initial, 1000)
 
 
 def test_a_thousand_steps_stay_finite_and_above_the_floor(dropped):
-    world, points = dropped
+    initial, points = dropped
     assert points.isfinite().all()
-    assert float(points[..., 2].amin() - world.floor[0, 0]) > -SINK
+    assert float(points[..., 2].amin() - initial.floor[0, 0]) > -SINK
 
 
 @pytest.mark.parametrize("n", [64, 128, 256])
@@ -85,13 +87,13 @@ def test_what_has_fallen_comes_to_rest(model, n):
     pairs = ("can", "duck"), ("pillow", "phone")
     scenes = [pile(*(some_points(name, n) for name in pair)) for pair in pairs]
     kinds = [[OBJECTS[name] for name in pair] for pair in pairs]
-    world = World.of(
+    initial = InitialConditions.of(
         torch.stack(scenes), E=torch.tensor([[k.E for k in row] for row in kinds]), friction=torch.tensor(1.0),
         mass=torch.tensor([[2e-3 * k.density for k in row] for row in kinds]),
     )  # fmt: skip
     with torch.inference_mode(), single_threaded():
-        points = model.rollout(world, 1000)
-    rests(*motion(world, points))
+        points = model.rollout(initial, 1000)
+    rests(*motion(initial, points))
 
 
 def test_shapes_never_learned_from_come_to_rest(dropped):
@@ -109,12 +111,12 @@ def test_what_is_dropped_turned_at_random_comes_to_rest(model, seed, names, n):
     points = torch.stack([some_points(name, n) @ turns[name].T for name in names])
     points[..., 2] += -0.94 + 0.3 - points[..., 2].amin(1, keepdim=True)
     kinds = [OBJECTS[name] for name in names]
-    world = World.of(
+    initial = InitialConditions.of(
         points[:, None], E=torch.tensor([[k.E] for k in kinds]), friction=torch.tensor(1.0),
         mass=torch.tensor([[2e-3 * k.density] for k in kinds]),
     )  # fmt: skip
     with torch.inference_mode(), single_threaded():
-        com, speed = motion(world, model.rollout(world, 1000))
+        com, speed = motion(initial, model.rollout(initial, 1000))
     assert speed[:, :40].amax() > 0.8
     slow = dict(zip(names, speed[:, -50:, 0].mean(1).tolist(), strict=True))
     assert max(slow.values()) < 0.025, slow
@@ -125,9 +127,9 @@ def test_momentum_of_two_free_bodies_that_collide_is_kept(model, E):
     a, b = box((0.15, 0.15, 0.15), 96, 1), box((0.1, 0.12, 0.25), 96, 2)
     points = torch.stack([a + torch.tensor([-0.4, 0, 0.5]), b + torch.tensor([0.4, 0.05, 0.55])])[None]
     mass, velocity = torch.tensor([[0.5, 0.3]]), torch.tensor([[[1.5, 0, 0], [-1.0, 0.2, 0]]])
-    world = World.of(points, E=torch.tensor([E]), mass=mass, velocity=velocity, gravity=torch.zeros(3))
+    initial = InitialConditions.of(points, E=torch.tensor([E]), mass=mass, velocity=velocity, gravity=torch.zeros(3))
     with torch.inference_mode(), single_threaded():
-        com = torch.stack([centre(world, p) for p in model.rollout(world, 40).unbind(1)], 1)
+        com = torch.stack([centre_of_mass(initial, p) for p in model.rollout(initial, 40).unbind(1)], 1)
     v = com.diff(dim=1) / DT
     momentum = (mass[..., None] * v).sum(2)[0]
     assert (v[0, -1] - v[0, 0]).norm(dim=-1).min() > 0.2  # they did collide
@@ -137,20 +139,20 @@ def test_momentum_of_two_free_bodies_that_collide_is_kept(model, E):
 
 def test_rounding_to_16_bits_costs_nothing_that_can_be_measured(model, dropped):
     """Weights changed by as much as rounding changes them fall the same way, to a millimetre or so in 0.8 s."""
-    world, points = dropped
+    initial, points = dropped
     rng = torch.Generator().manual_seed(0)
     other = copy.deepcopy(model)
     with torch.no_grad():
         for p in other.parameters():
             p *= 1 + (2 * torch.rand(p.shape, generator=rng) - 1) * 2**-11
     with torch.inference_mode(), single_threaded():
-        again = other.rollout(world, 40)
+        again = other.rollout(initial, 40)
     assert float((again - points[:, :40]).square().mean().sqrt()) < 2e-3
 
 
 def test_all_weights_and_cards_together_are_small():
-    assert sum(f.stat().st_size for folder in (HERE, TRAINING) for f in folder.iterdir()) <= MOST
-    assert {f.stem for f in HERE.glob("*.safetensors")} == {f.stem for f in HERE.glob("*.json")}
+    assert sum(f.stat().st_size for folder in (SHIPPED, TRAINING) for f in folder.iterdir()) <= MOST
+    assert {f.stem for f in SHIPPED.glob("*.safetensors")} == {f.stem for f in SHIPPED.glob("*.json")}
 
 
 @pytest.mark.parametrize("file", FILES, ids=lambda f: f.stem)

@@ -3,7 +3,7 @@
 import torch
 from torch.testing import assert_close
 
-from stages.core.models.field.equivariant import products, symmetric_solve
+from stages.core.models.field.equivariant import inner_products, symmetric_solve
 
 
 def test_symmetric_systems_are_solved():
@@ -17,4 +17,4 @@ def test_symmetric_systems_are_solved():
 def test_products_are_those_of_each_pair_once_row_by_row():
     x = torch.randn(2, 5, 4, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     wanted = [torch.asinh((x[..., i, :] * x[..., j, :]).sum(-1)) for i in range(4) for j in range(i, 4)]
-    assert_close(products(x), torch.stack(wanted, -1))
+    assert_close(inner_products(x), torch.stack(wanted, -1))

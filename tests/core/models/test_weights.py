@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from stages.core.errors import InputError
-from stages.core.models.checkpoints import MODELS, build, find, halve, load, minutes, save
+from stages.core.models.checkpoints import MODELS, build, find, halve, load, save, training_minutes
 from tests.core.models.worlds import SMALL, crowd
 
 
@@ -19,9 +19,9 @@ def test_round_trip(tmp_path, name):
     save(file, name, model, {"score": 0.5, "seed": 3})
     again, card = load(file)
     assert card["score"] == 0.5 and card["model"] == name and type(again) is type(model)
-    world = crowd().to(torch.float32)
+    initial = crowd().to(torch.float32)
     with torch.no_grad():
-        assert torch.equal(again.rollout(world, 4), model.rollout(world, 4))
+        assert torch.equal(again.rollout(initial, 4), model.rollout(initial, 4))
     assert not list(tmp_path.glob(".part*"))
 
 
@@ -140,4 +140,7 @@ def test_weights_are_found(saved, monkeypatch, tmp_path):
 
 
 def test_minutes_are_those_of_every_processor_and_of_all_that_went_before():
-    assert minutes({"minutes": 3.0, "processes": 2, "before": {"minutes": 1.5, "before": {"minutes": 4.0}}}) == 11.5
+    assert (
+        training_minutes({"minutes": 3.0, "processes": 2, "before": {"minutes": 1.5, "before": {"minutes": 4.0}}})
+        == 11.5
+    )

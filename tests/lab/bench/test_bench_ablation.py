@@ -9,10 +9,10 @@ from typer.testing import CliRunner
 
 from ngff_cli.lab import app
 from stages.core.errors import InputError
-from stages.core.models.external_forces import Pushes
-from stages.core.models.field.contact_points import LEVER, pair_places
-from stages.core.models.field.rest_shape import shape_of
-from stages.core.models.initial_conditions import World
+from stages.core.models.external_forces import ExternalForces
+from stages.core.models.field.contact_points import ARM_UNIT, pair_contacts
+from stages.core.models.field.rest_shape import rest_shape_of
+from stages.core.models.initial_conditions import InitialConditions
 from stages.lab.bench import ablation as bench_ablation
 from stages.lab.bench.ablation import AblationBenchOptions, run
 from stages.lab.dataset.keypoint_motions import write_motions
@@ -31,29 +31,29 @@ def data(tmp_path):
     return tmp_path
 
 
-def colliding() -> World:
+def colliding() -> InitialConditions:
     """Two balls of points that fly into each other, far from floor and walls."""
     rng = torch.Generator().manual_seed(0)
     ball = 0.1 * torch.nn.functional.normalize(torch.randn(2, 48, 3, generator=rng), dim=-1)
     points = ball + torch.tensor([[-0.12, 0.0, 0.3], [0.12, 0.0, 0.3]])[:, None]
     velocity = torch.tensor([[[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]]])
-    return World.of(points[None], velocity=velocity, mass=torch.tensor([1.0, 2.0]), gravity=torch.zeros(3),
+    return InitialConditions.of(points[None], velocity=velocity, mass=torch.tensor([1.0, 2.0]), gravity=torch.zeros(3),
                     E=torch.tensor([1e5, 1e4]))  # fmt: skip
 
 
-def stepped(name: str, world: World) -> tuple[torch.Tensor, torch.Tensor]:
+def stepped(name: str, world: InitialConditions) -> tuple[torch.Tensor, torch.Tensor]:
     """Velocities of the bodies after a step, and the gradient of their squares for Young's modulus."""
     torch.manual_seed(0)
     model = ABLATIONS[name].network().eval()
     E = world.E.clone().requires_grad_()
     object.__setattr__(world, "E", E)
-    scene = model.informed(model.rest(world))
-    state = model.step(scene, model.start(scene), 0.0, DT, Pushes.none(world))
+    scene = model.encode(model.precompute(world))
+    state = model.step(scene, model.initial_state(scene), 0.0, DT, ExternalForces.none(world))
     gradient = torch.autograd.grad(state.velocity.square().sum(), E, allow_unused=True)[0]
     return state.velocity.detach(), torch.zeros_like(E) if gradient is None else gradient
 
 
-def momentum(world: World, velocity: torch.Tensor) -> torch.Tensor:
+def momentum(world: InitialConditions, velocity: torch.Tensor) -> torch.Tensor:
     return (world.mass[..., None] * velocity).sum(1)
 
 
@@ -77,18 +77,18 @@ def test_rigid_bodies_keep_their_shape():
     world = colliding()
     for name, moved in (("full", True), ("deformation", False)):
         model = ABLATIONS[name].network().eval()
-        scene = model.informed(model.rest(world))
-        state = model.step(scene, model.start(scene), 0.0, DT, Pushes.none(world))
+        scene = model.encode(model.precompute(world))
+        state = model.step(scene, model.initial_state(scene), 0.0, DT, ExternalForces.none(world))
         assert bool(state.u.abs().max() > 0) is moved
 
 
 def test_the_last_vectors_of_a_contact_are_the_impulses():
     """What is taken away would stop the places of a pair, or part them at 1 m/s, if both bodies got it, opposite."""
     world = colliding()
-    shape = shape_of(world)
+    shape = rest_shape_of(world)
     model = ABLATIONS["full"].network()
-    moving = model._moving(model.informed(shape), model.start(model.informed(shape)))
-    places = pair_places(shape, moving)
+    moving = model._moving(model.encode(shape), model.initial_state(model.encode(shape)))
+    places = pair_contacts(shape, moving)
     near, vectors = places.gate[0, 0, 0] > 0, places.vectors[0, 0, 0]
     vectors = vectors[near]
     assert len(vectors) > 3 and vectors.shape[-2] == 10
@@ -96,7 +96,7 @@ def test_the_last_vectors_of_a_contact_are_the_impulses():
     reduced = m[0] * m[1] / (m[0] + m[1])
     for impulse, wanted in ((vectors[:, -IMPULSE_VECTORS], vectors[:, 3]), (vectors[:, -1], vectors[:, 2])):
         change = torch.zeros_like(wanted)
-        for body, arm in enumerate((LEVER * vectors[:, 4], LEVER * vectors[:, 5])):
+        for body, arm in enumerate((ARM_UNIT * vectors[:, 4], ARM_UNIT * vectors[:, 5])):
             spin = torch.linalg.cross(arm, impulse) @ moving.inverse[0, body].T
             change += reduced / m[body] * (impulse + torch.linalg.cross(spin, arm))
         assert_close(change, wanted, rtol=1e-4, atol=1e-5)

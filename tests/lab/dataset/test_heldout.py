@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 
 from ngff_cli.lab import app
 from stages.core.errors import InputError
-from stages.core.models.field.solidity import WALL
+from stages.core.models.field.solidity import REFERENCE_THICKNESS
 from stages.lab.assets.heldout_shapes import HELDOUT_SHAPES, ShapeKind, surface_points
 from stages.lab.assets.objects import OBJECTS
 from stages.lab.assets.random_shapes import random_shapes
@@ -166,7 +166,7 @@ def test_solid_objects_are_filled_and_as_heavy_as_that(tmp_path, monkeypatch):
     volume = float(4 / 3 * torch.pi * 0.3**3)
     around = float(4 * torch.pi * 0.3**2) * 0.04
     assert volume < ball.mass / 500 < volume + around  # cells at the surface count whole
-    assert ball.solidity == pytest.approx((ball.mass / 500 / (24 * 0.3**2) / WALL) ** 3, rel=0.05)
+    assert ball.solidity == pytest.approx((ball.mass / 500 / (24 * 0.3**2) / REFERENCE_THICKNESS) ** 3, rel=0.05)
     assert "1 scenes of 9 objects" in run(tmp_path, HeldoutOptions(scenes=1, shapes=9, solid=True, **COARSE))
     made = read_motions(tmp_path / "motions" / "solid.h5")
     assert made.initial_conditions().solidity.amax() > 1 and torch.equal(

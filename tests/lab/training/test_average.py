@@ -6,7 +6,7 @@ from typer.testing import CliRunner
 
 from ngff_cli.lab import app
 from stages.core.errors import InputError
-from stages.core.models.checkpoints import build, load, minutes, save
+from stages.core.models.checkpoints import build, load, save, training_minutes
 from stages.lab.training.average import run
 
 
@@ -32,16 +32,16 @@ def test_the_mean_is_that_of_the_numbers_and_the_card_says_of_what(tmp_path):
     assert [row["share"] for row in card["averaged"]] == [0.5, 0.2, 0.3]
     assert [row["sha256"] for row in card["averaged"]] == [load(file)[1]["sha256"] for file in (a, b, old)]
     assert card["sha256"] not in {row["sha256"] for row in card["averaged"]}
-    assert minutes(card) == 3 * 2.0 * 3  # what both began with is counted once
+    assert training_minutes(card) == 3 * 2.0 * 3  # what both began with is counted once
 
 
 def test_an_average_of_averages_remembers_all_of_them(tmp_path):
     a, b, c = (trained(tmp_path / f"{n}.safetensors", i) for i, n in enumerate("abc"))
     run([a, b], "0.5,0.5", tmp_path / "ab.safetensors")
     run([tmp_path / "ab.safetensors", c], "0.8,0.2", tmp_path / "abc.safetensors")
-    assert minutes(load(tmp_path / "abc.safetensors")[1]) == 3 * 2.0 * 3
+    assert training_minutes(load(tmp_path / "abc.safetensors")[1]) == 3 * 2.0 * 3
     run([a, a], "0.8,0.2", tmp_path / "aa.safetensors")
-    assert minutes(load(tmp_path / "aa.safetensors")[1]) == 3 * 2.0
+    assert training_minutes(load(tmp_path / "aa.safetensors")[1]) == 3 * 2.0
 
 
 def test_half_as_large_to_ship(tmp_path):

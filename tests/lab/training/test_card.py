@@ -6,7 +6,7 @@ from typer.testing import CliRunner
 
 from ngff_cli.lab import app
 from stages.core.errors import InputError
-from stages.core.models.checkpoints import HERE, build, load, save
+from stages.core.models.checkpoints import SHIPPED, build, load, save
 from stages.lab.plot import LEGEND_HEIGHT, PANEL_HEIGHT, PANEL_WIDTH
 from stages.lab.training.card import run
 
@@ -38,7 +38,7 @@ def test_the_minutes_of_the_weights_begun_with_count(tmp_path):
 
 
 def test_the_cards_that_ship_have_curves(tmp_path):
-    lines = run(sorted(HERE.glob("*.json")), tmp_path / "c.png")
+    lines = run(sorted(SHIPPED.glob("*.json")), tmp_path / "c.png")
     assert any(line.startswith("ngff: ngff, ") for line in lines)
 
 

@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 from ngff_cli.lab import app
 from stages.core.errors import InputError
 from stages.core.models.checkpoints import MODELS, build, load
-from stages.core.models.external_forces import Pushes
+from stages.core.models.external_forces import ExternalForces
 from stages.core.models.initial_conditions import BOX, GRAVITY
 from stages.lab.dataset.keypoint_motions import KeypointMotions, write_motions
 from stages.lab.training.data import (
@@ -232,7 +232,7 @@ def test_gradients_fade_on_their_way_back():
 
 def test_no_pushes_are_no_pushes():
     world = without_last(falling()).initial_conditions()
-    none, idle = Pushes.nobody(world.valid, world.points), Pushes.none(world)
+    none, idle = ExternalForces.none_for(world.valid, world.points), ExternalForces.none(world)
     # a push of no strength goes all the way that a real one goes
     weak = replace(idle, object=idle.object.new_zeros(6, 1), point=idle.point.new_zeros(6, 1) - 1,
                    force=torch.zeros(6, 1, 3), torque=torch.zeros(6, 1, 3), start=torch.zeros(6, 1),

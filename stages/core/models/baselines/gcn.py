@@ -9,9 +9,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from stages.core.models.dynamics import FRAME, PointDynamics, PointState, free
-from stages.core.models.external_forces import Pushes
-from stages.core.models.initial_conditions import World
+from stages.core.models.dynamics import FRAME, PointDynamics, PointState, movable
+from stages.core.models.external_forces import ExternalForces
+from stages.core.models.initial_conditions import InitialConditions
 
 RADIUS = 0.1  # closer keypoints are joined, of whatever objects [m]
 
@@ -45,7 +45,7 @@ class GraphConv(nn.Module):
 class GCN(PointDynamics):
     """`gcn`: what a frame changes in position and velocity, from the graph of the moment."""
 
-    told = frozenset({"points", "velocity", "spin"})
+    inputs = frozenset({"points", "velocity", "spin"})
 
     def __init__(self, hidden: int = 128, layers: int = 4):
         super().__init__()
@@ -54,13 +54,15 @@ class GCN(PointDynamics):
         self.convolutions = nn.ModuleList(GraphConv(a, b) for a, b in zip(widths[:-1], widths[1:], strict=True))
         self.head = nn.Linear(hidden, 6)
 
-    def derivative(self, world: World, t: Tensor | float, state: PointState, pushes: Pushes) -> PointState:
+    def derivative(
+        self, initial: InitialConditions, t: Tensor | float, state: PointState, external: ExternalForces
+    ) -> PointState:
         position = state.position.flatten(1, 2)
-        A = adjacency(position, world.valid.flatten(1))
+        A = adjacency(position, initial.valid.flatten(1))
         x = torch.cat([position, state.velocity.flatten(1, 2)], -1)
         for convolution in self.convolutions:
             x = torch.relu(convolution(x, A))
-        change = (self.head(x) / FRAME).unflatten(1, world.valid.shape[1:])
-        pushed = pushes.acceleration(world, state.position, t)
-        may_move = free(world, pushes)
+        change = (self.head(x) / FRAME).unflatten(1, initial.valid.shape[1:])
+        pushed = external.acceleration(initial, state.position, t)
+        may_move = movable(initial, external)
         return PointState(change[..., :3] * may_move, (change[..., 3:] + pushed) * may_move)

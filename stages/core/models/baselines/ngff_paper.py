@@ -14,10 +14,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from stages.core.models.dynamics import Dynamics
-from stages.core.models.external_forces import Pushes
+from stages.core.models.external_forces import ExternalForces
 from stages.core.models.field.narrow_phase import near_walls, nearest
-from stages.core.models.field.rigid_body import fitted, spin_of
-from stages.core.models.initial_conditions import GRAVITY, World, centre, inertia, offsets
+from stages.core.models.field.rigid_body import angular_velocity, fit_rigid_motion
+from stages.core.models.initial_conditions import GRAVITY, InitialConditions, centre_of_mass, inertia, offsets
 
 MASS = 0.1  # of every object [kg]
 REACH = 0.05  # closer things touch [m]
@@ -67,7 +67,7 @@ def angle_rates(angle: Float[Tensor, "*b 3"], spin: Float[Tensor, "*b 3"]) -> Fl
     return torch.stack([roll, about_y, spin[..., 2] + sy * roll], -1)
 
 
-class Residual(nn.Module):
+class ResidualLinear(nn.Module):
     """x + ReLU(LayerNorm(Linear x))."""
 
     def __init__(self, width: int):
@@ -84,7 +84,7 @@ class ObjectEncoder(nn.Module):
     def __init__(self, hidden: int, layers: int):
         super().__init__()
         self.input_embedding = nn.Sequential(*blocks(1, 3, hidden))
-        self.extraction_blocks = nn.ModuleList(Residual(hidden) for _ in range(layers))
+        self.extraction_blocks = nn.ModuleList(ResidualLinear(hidden) for _ in range(layers))
         self.global_features = nn.Sequential(*blocks(1, hidden, hidden))
 
     def forward(self, local: Float[Tensor, "b o n 3"], counts: Bool[Tensor, "b o n"]) -> Float[Tensor, "b o h"]:
@@ -127,28 +127,28 @@ class Predictor(nn.Module):
         self.stress_net = StressNet(h) if deform else None
 
     def forward(
-        self, world: World, state: PaperState, rest: Float[Tensor, "b o n 3"]
+        self, initial: InitialConditions, state: PaperState, rest: Float[Tensor, "b o n 3"]
     ) -> tuple[Float[Tensor, "b o 3"], Float[Tensor, "b o 3"], Float[Tensor, "b o n 3"]]:
         """Force [N], torque [N m], acceleration of the points in the object [m/s^2] (0 without deformation).
 
         `rest` are the local points of the start.
         """
-        counts = torch.ones_like(world.valid) if self.padding_encoded else world.valid
+        counts = torch.ones_like(initial.valid) if self.padding_encoded else initial.valid
         points = world_points(state)
         shape = self.pointnet(state.local, counts)
-        touching = nearest(points, world.valid, REACH)[0] < REACH  # (b, receiver, sender, n)
-        walls = near_walls(points, world.valid, world.box, REACH)
+        touching = nearest(points, initial.valid, REACH)[0] < REACH  # (b, receiver, sender, n)
+        walls = near_walls(points, initial.valid, initial.box, REACH)
         pair = self._pairs(shape, state) * touching.any(-1)[..., None]
-        wall = self._floor(shape, state, world) * walls.any(-1)[..., None]
+        wall = self._floor(shape, state, initial) * walls.any(-1)[..., None]
         force, torque, _ = (pair.sum(2) + wall).split(3, -1)
         if self.stress_net is None:
             return force, torque, torch.zeros_like(points)
         latent = torch.einsum("bijn,bijd->bind", touching.to(pair), pair[..., 6:])
         latent = torch.stack([latent, walls[..., None] * wall[:, :, None, 6:]], -2)
         # the matrix of the negated angles is not the inverse rotation; the published checkpoints were trained with it
-        turned = latent @ euler_matrix(-state.angle).mT[:, :, None]
+        rotated = latent @ euler_matrix(-state.angle).mT[:, :, None]
         stretch = 100 * (state.local - rest)
-        x = torch.cat([stretch, 100 * state.local_velocity, turned.flatten(-2)], -1)
+        x = torch.cat([stretch, 100 * state.local_velocity, rotated.flatten(-2)], -1)
         return force, torque, self.stress_net(x, counts)
 
     def _pairs(self, shape: Float[Tensor, "b o h"], state: PaperState) -> Float[Tensor, "b o o 9"]:
@@ -159,10 +159,12 @@ class Predictor(nn.Module):
         receiver = shape[:, :, None].expand(-1, -1, o, -1)
         return self.output(self.brunch(torch.cat([receiver, relative], -1)) * self.trunk(shape)[:, None])
 
-    def _floor(self, shape: Float[Tensor, "b o h"], state: PaperState, world: World) -> Float[Tensor, "b o 9"]:
+    def _floor(
+        self, shape: Float[Tensor, "b o h"], state: PaperState, initial: InitialConditions
+    ) -> Float[Tensor, "b o 9"]:
         """What the room does to an object; it knows the floor's height, but walls only by touch."""
         floor = torch.zeros_like(state.com)
-        floor[..., 2] = world.floor
+        floor[..., 2] = initial.floor
         s = _placement(state._replace(com=state.com - floor))
         return self.boundary_net(torch.cat([shape, self.state_embedding(s)], -1))
 
@@ -171,8 +173,8 @@ def _placement(state: PaperState) -> Float[Tensor, "b o 12"]:
     return torch.cat([state.com, state.angle, state.velocity, state.rate], -1)
 
 
-def _rest(world: World) -> Float[Tensor, "b o n 3"]:
-    return world.points - centre(world, world.points)[:, :, None]
+def _rest(initial: InitialConditions) -> Float[Tensor, "b o n 3"]:
+    return initial.points - centre_of_mass(initial, initial.points)[:, :, None]
 
 
 def world_points(state: PaperState) -> Float[Tensor, "b o n 3"]:
@@ -186,7 +188,7 @@ class PaperForceField(Dynamics):
     Mass and gravity are constants of the model: it cannot be told about them, nor about materials.
     """
 
-    told = frozenset({"points", "share", "velocity", "spin", "box"})
+    inputs = frozenset({"points", "mass_fraction", "velocity", "spin", "box"})
 
     def __init__(self, hidden: int = 200, layers: int = 4, deform: bool = True, padding_encoded: bool = False):
         super().__init__()
@@ -194,36 +196,38 @@ class PaperForceField(Dynamics):
         self.predictor = Predictor(hidden, layers, deform, padding_encoded)
         self.register_buffer("gravity", torch.tensor(GRAVITY[2]))
 
-    def start(self, world: World) -> PaperState:
+    def initial_state(self, initial: InitialConditions) -> PaperState:
         """At rest but for the objects' velocities; spins are taken as rates of the angles, which start at 0."""
-        com = centre(world, world.points)
-        local = _rest(world)
-        return PaperState(local, torch.zeros_like(local), com, world.velocity, torch.zeros_like(com), world.spin)
+        com = centre_of_mass(initial, initial.points)
+        local = _rest(initial)
+        return PaperState(local, torch.zeros_like(local), com, initial.velocity, torch.zeros_like(com), initial.spin)
 
-    def observe(
-        self, world: World, points: Float[Tensor, "b o n 3"], speed: Float[Tensor, "b o n 3"]
+    def state_from_motion(
+        self, initial: InitialConditions, points: Float[Tensor, "b o n 3"], speed: Float[Tensor, "b o n 3"]
     ) -> PaperState:
-        arm = offsets(world, world.points)
-        inverse = torch.linalg.inv(inertia(world.share, arm))
-        m = fitted(world.share, arm, inverse, points, speed)
+        arm = offsets(initial, initial.points)
+        inverse = torch.linalg.inv(inertia(initial.mass_fraction, arm))
+        m = fit_rigid_motion(initial.mass_fraction, arm, inverse, points, speed)
         angle = euler_angles(m.R)
-        rate = angle_rates(angle, spin_of(m.momentum, inverse, m.R))
-        return PaperState(_rest(world) + m.u, m.du, m.com, m.velocity, angle, rate)
+        rate = angle_rates(angle, angular_velocity(m.momentum, inverse, m.R))
+        return PaperState(_rest(initial) + m.u, m.du, m.com, m.velocity, angle, rate)
 
-    def derivative(self, world: World, t: Tensor | float, state: PaperState, pushes: Pushes) -> PaperState:
-        force, torque, stress = self.predictor(world, state, _rest(world))
-        pushed, turned = pushes.wrench(world_points(state), state.com, t)
+    def derivative(
+        self, initial: InitialConditions, t: Tensor | float, state: PaperState, external: ExternalForces
+    ) -> PaperState:
+        force, torque, stress = self.predictor(initial, state, _rest(initial))
+        pushed, rotated = external.wrench(world_points(state), state.com, t)
         # a torque of a prompt is divided by the mass twice, as published
         acceleration = (force + pushed) / MASS + self.gravity * torch.eye(3, device=force.device)[2]
-        turning = (torque + turned / MASS) / MASS
-        free = ~pushes.pinned[..., None]
-        inner = (world.valid & free)[..., None]
+        turning = (torque + rotated / MASS) / MASS
+        movable = ~external.pinned[..., None]
+        inner = (initial.valid & movable)[..., None]
         return PaperState(
-            state.local_velocity * inner, stress * inner, state.velocity * free, acceleration * free,
-            state.rate * free, turning * free,
+            state.local_velocity * inner, stress * inner, state.velocity * movable, acceleration * movable,
+            state.rate * movable, turning * movable,
         )  # fmt: skip
 
-    def points(self, world: World, state: PaperState) -> Float[Tensor, "b o n 3"]:
+    def points(self, initial: InitialConditions, state: PaperState) -> Float[Tensor, "b o n 3"]:
         return world_points(state)
 
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from torch import Tensor, nn
 
-from stages.core.models.dynamics import FRAME, PointDynamics, PointState, free
-from stages.core.models.external_forces import Pushes
-from stages.core.models.initial_conditions import World
+from stages.core.models.dynamics import FRAME, PointDynamics, PointState, movable
+from stages.core.models.external_forces import ExternalForces
+from stages.core.models.initial_conditions import InitialConditions
 
 
 class Pointformer(PointDynamics):
@@ -16,7 +16,7 @@ class Pointformer(PointDynamics):
     point; it adds to what the network says, which cannot brake it.
     """
 
-    told = frozenset({"points", "velocity", "spin"})
+    inputs = frozenset({"points", "velocity", "spin"})
 
     def __init__(self, hidden: int = 128, layers: int = 3, dropout: float = 0.1):
         super().__init__()
@@ -28,12 +28,14 @@ class Pointformer(PointDynamics):
         self.norm = nn.LayerNorm(hidden)
         self.head = nn.Sequential(nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, 3))
 
-    def derivative(self, world: World, t: Tensor | float, state: PointState, pushes: Pushes) -> PointState:
+    def derivative(
+        self, initial: InitialConditions, t: Tensor | float, state: PointState, external: ExternalForces
+    ) -> PointState:
         x = self.embed(state.position.flatten(1, 2))
-        padding = ~world.valid.flatten(1)
+        padding = ~initial.valid.flatten(1)
         for block in self.blocks:
             x = block(x, src_key_padding_mask=padding)
-        moved = (0.1 / FRAME * self.head(self.norm(x))).unflatten(1, world.valid.shape[1:])
-        may_move = free(world, pushes)
-        pushed = pushes.acceleration(world, state.position, t)
+        moved = (0.1 / FRAME * self.head(self.norm(x))).unflatten(1, initial.valid.shape[1:])
+        may_move = movable(initial, external)
+        pushed = external.acceleration(initial, state.position, t)
         return PointState((moved + state.velocity) * may_move, pushed * may_move)

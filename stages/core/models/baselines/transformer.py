@@ -10,15 +10,15 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn.functional import scaled_dot_product_attention
 
-from stages.core.models.dynamics import PointDynamics, PointState, free
-from stages.core.models.external_forces import Pushes
-from stages.core.models.initial_conditions import World, centre, offsets
+from stages.core.models.dynamics import PointDynamics, PointState, movable
+from stages.core.models.external_forces import ExternalForces
+from stages.core.models.initial_conditions import InitialConditions, centre_of_mass, offsets
 
 SCALE = 20.0  # acceleration that stands for 1 in the network [m/s^2]
 NEAR = 0.1  # walls farther away are not told apart [m]
 
 
-class Block(nn.Module):
+class TransformerBlock(nn.Module):
     """Pre-norm attention and feed-forward (Xiong et al. 2020, "On Layer Normalization in the Transformer")."""
 
     def __init__(self, width: int, heads: int):
@@ -35,45 +35,49 @@ class Block(nn.Module):
         return x + self.mlp(self.between(x))
 
 
-def features(world: World, state: PointState) -> Float[Tensor, "b o n 29"]:
+def features(initial: InitialConditions, state: PointState) -> Float[Tensor, "b o n 29"]:
     """What a keypoint is told, in numbers of order one."""
     x, v = state.position, state.velocity
-    com, drift = centre(world, x), centre(world, v)
-    there = world.present[..., None]
+    com, drift = centre_of_mass(initial, x), centre_of_mass(initial, v)
+    there = initial.present[..., None]
     middle = (com * there).sum(1, keepdim=True) / there.sum(1, keepdim=True).clamp_min(1)
-    low, high = world.box[..., None, 0, :], world.box[..., None, 1, :]
+    low, high = initial.box[..., None, 0, :], initial.box[..., None, 1, :]
     height = x[..., 2:] - low[..., 2:]
     walls = (torch.cat([x - low, high - x], -1) / NEAR).clamp(-1, 1)
-    material = torch.stack([(world.E * world.solidity).log10() - 5, world.nu, world.friction, world.mass.log()], -1)
-    told = torch.cat([com - middle, drift, material, (world.gravity / 5)[:, None].expand_as(com)], -1)
-    told = told[:, :, None].expand(*x.shape[:3], -1)
-    return torch.cat([x - com[:, :, None], offsets(world, world.points), v, height, walls, told], -1)
+    material = torch.stack(
+        [(initial.E * initial.solidity).log10() - 5, initial.nu, initial.friction, initial.mass.log()], -1
+    )
+    shared = torch.cat([com - middle, drift, material, (initial.gravity / 5)[:, None].expand_as(com)], -1)
+    shared = shared[:, :, None].expand(*x.shape[:3], -1)
+    return torch.cat([x - com[:, :, None], offsets(initial, initial.points), v, height, walls, shared], -1)
 
 
 class Transformer(PointDynamics):
     """`transformer`: half of the layers look within objects, half across the scene."""
 
-    told = frozenset({
-        "points", "share", "mass", "E", "solidity", "nu", "friction", "velocity", "spin", "gravity", "box"
+    inputs = frozenset({
+        "points", "mass_fraction", "mass", "E", "solidity", "nu", "friction", "velocity", "spin", "gravity", "box"
     })  # fmt: skip
 
     def __init__(self, hidden: int = 128, layers: int = 4, heads: int = 4):
         super().__init__()
         self.config = {"hidden": hidden, "layers": layers, "heads": heads}
         self.embed = nn.Linear(29, hidden)
-        self.blocks = nn.ModuleList(Block(hidden, heads) for _ in range(layers))
+        self.blocks = nn.ModuleList(TransformerBlock(hidden, heads) for _ in range(layers))
         self.head = nn.Sequential(nn.LayerNorm(hidden), nn.Linear(hidden, hidden), nn.GELU(), nn.Linear(hidden, 3))
 
-    def derivative(self, world: World, t: Tensor | float, state: PointState, pushes: Pushes) -> PointState:
-        b, o, n = world.valid.shape
+    def derivative(
+        self, initial: InitialConditions, t: Tensor | float, state: PointState, external: ExternalForces
+    ) -> PointState:
+        b, o, n = initial.valid.shape
         # a missing object attends to itself: a softmax over nothing is nan
-        own = (world.valid | ~world.present[..., None]).flatten(0, 1)
-        x = self.embed(features(world, state))
+        own = (initial.valid | ~initial.present[..., None]).flatten(0, 1)
+        x = self.embed(features(initial, state))
         for i, block in enumerate(self.blocks):
             whole = i % 2 == 1
             x = block(x.reshape(b, -1, x.shape[-1]) if whole else x.reshape(b * o, n, -1),
-                      world.valid.flatten(1) if whole else own)  # fmt: skip
-        acceleration = SCALE * self.head(x).reshape(b, o, n, 3) + world.gravity[:, None, None]
-        acceleration = acceleration + pushes.acceleration(world, state.position, t)
-        may_move = free(world, pushes)
+                      initial.valid.flatten(1) if whole else own)  # fmt: skip
+        acceleration = SCALE * self.head(x).reshape(b, o, n, 3) + initial.gravity[:, None, None]
+        acceleration = acceleration + external.acceleration(initial, state.position, t)
+        may_move = movable(initial, external)
         return PointState(state.velocity * may_move, acceleration * may_move)

@@ -24,7 +24,7 @@ from torch import nn
 
 from stages.core.errors import InputError
 from stages.core.models.diffsplat.maps import CHANNELS
-from stages.core.models.hub import Source, folders
+from stages.core.models.hub import HubSource, folders
 from stages.core.models.pi3.weights import differences, read_state
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ LATENT = 4 + 6 + 1  # channels into the U-Net: latent, ray, flag
 
 
 @dataclass(frozen=True)
-class Part(Source):
+class DiffSplatSource(HubSource):
     """Where some of the weights are published, and what of that is needed."""
 
     wanted: tuple[str, ...]  # patterns of files
@@ -44,8 +44,9 @@ class Part(Source):
 
 
 SOURCES = (
-    Part("chenguolin/DiffSplat", "3.8 GB", "MIT", (f"{UNET}/*/unet_ema/*", f"{GSVAE}/*/model.safetensors"), ""),
-    Part(
+    DiffSplatSource("chenguolin/DiffSplat", "3.8 GB", "MIT", (f"{UNET}/*/unet_ema/*", f"{GSVAE}/*/model.safetensors"),
+    ""),
+    DiffSplatSource(
         "stable-diffusion-v1-5/stable-diffusion-v1-5", "0.6 GB", "CreativeML OpenRAIL-M",
         ("tokenizer/*", "text_encoder/config.json", "text_encoder/model.fp16.safetensors", "vae/config.json",
          "vae/diffusion_pytorch_model.safetensors", "scheduler/*"), BASE,

@@ -13,14 +13,14 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from stages.core.models.field.equivariant import chain, mlp, weigh
+from stages.core.models.field.equivariant import apply_layers, mlp, weighted_sum
 
-GRIP = 2e-3  # share of an object in contact at which it is felt by half
-STRENGTH = 20.0  # acceleration that a vector of length 1 stands for [m/s^2]
+CONTACT_SATURATION = 2e-3  # share of an object in contact at which it is felt by half
+ACCELERATION_UNIT = 20.0  # acceleration that a vector of length 1 stands for [m/s^2]
 
 
 @dataclass(frozen=True)
-class Places:
+class ContactPoints:
     """Keypoints n of object o near m things."""
 
     vectors: Float[Tensor, "b o m n k 3"]  # in units in which they are of order one
@@ -29,7 +29,7 @@ class Places:
     row: Int[Tensor, "b o m n"]  # which keypoints of the object these are
 
 
-class Touch(nn.Module):
+class ContactNet(nn.Module):
     """The network of one kind of contact. `listen` first, `answer` with what else is known."""
 
     def __init__(self, vectors: int, scalars: int, hidden: int, partner: bool):
@@ -41,8 +41,8 @@ class Touch(nn.Module):
         self.tell = nn.Linear(hidden, hidden)
         self.say = mlp(hidden, hidden, vectors, quiet=0.1)
 
-    def listen(
-        self, places: Places, share: Float[Tensor, "b o m n"], own: Float[Tensor, "b o h"],
+    def encode(
+        self, places: ContactPoints, mass_fraction: Float[Tensor, "b o m n"], own: Float[Tensor, "b o h"],
         other: Float[Tensor, "b o m h"] | None = None,
     ) -> tuple[Float[Tensor, "b o m n h"], Float[Tensor, "b o m n"], Float[Tensor, "b o m h"]]:  # fmt: skip
         """What each place has to say, its weight, and what the object hears from all places together.
@@ -55,26 +55,26 @@ class Touch(nn.Module):
             known = known + self.other(other)[:, :, :, None]
         x = _at(places.gate > 0, self._heard, places.vectors, places.scalars, known)
         attention = torch.exp(4 * torch.tanh(x[..., -1] / 4))
-        weight = places.gate * share * attention
-        weight = weight / (weight.sum(-1, keepdim=True) + GRIP)
+        weight = places.gate * mass_fraction * attention
+        weight = weight / (weight.sum(-1, keepdim=True) + CONTACT_SATURATION)
         return x[..., :-1], weight, (weight[..., None] * x[..., :-1]).sum(-2)
 
     def _heard(self, vectors: Tensor, scalars: Tensor, known: Tensor, near: Tensor | None = None) -> Tensor:
-        return chain(scalars, (self.see, self.hear[0], self.hear[2]), vectors, known, near=near)
+        return apply_layers(scalars, (self.see, self.hear[0], self.hear[2]), vectors, known, near=near)
 
-    def answer(
+    def decode(
         self, message: Float[Tensor, "b o m n h"], weight: Float[Tensor, "b o m n"], context: Float[Tensor, "b o m h"],
         vectors: Float[Tensor, "b o m n k 3"],
     ) -> Float[Tensor, "b o m n 3"]:  # fmt: skip
         """Acceleration by every place, weighted [m/s^2]."""
-        told = self.tell(context)[:, :, :, None]
-        return _at(weight > 0, self._said, message, told, vectors, weight[..., None])
+        inputs = self.tell(context)[:, :, :, None]
+        return _at(weight > 0, self._said, message, inputs, vectors, weight[..., None])
 
     def _said(
-        self, message: Tensor, told: Tensor, vectors: Tensor, weight: Tensor, near: Tensor | None = None
+        self, message: Tensor, inputs: Tensor, vectors: Tensor, weight: Tensor, near: Tensor | None = None
     ) -> Tensor:
-        said = chain(message, (self.say[0], self.say[2]), known=told, active=True, near=near)
-        return weight * STRENGTH * weigh(said, vectors)
+        said = apply_layers(message, (self.say[0], self.say[2]), known=inputs, active=True, near=near)
+        return weight * ACCELERATION_UNIT * weighted_sum(said, vectors)
 
 
 def _at(near: Bool[Tensor, "b o m n"], f: Callable[..., Tensor], *given: Tensor) -> Float[Tensor, "b o m n _"]:

@@ -10,19 +10,24 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from stages.core.models.dynamics import FRAME
-from stages.core.models.field.contact_forces import Places
-from stages.core.models.field.equivariant import fade, length, symmetric_solve
+from stages.core.models.field.contact_forces import ContactPoints
+from stages.core.models.field.equivariant import smooth_cutoff, smooth_norm, symmetric_solve
 from stages.core.models.field.narrow_phase import nearest
-from stages.core.models.field.rest_shape import Shape
+from stages.core.models.field.rest_shape import RestShape
 
-NEAR, FAR = 0.04, 0.1  # a contact is full below and none above, now or a frame ahead [m]
-SEEN = 0.2  # farther things are not looked at, however fast they come: at 5 m/s they are contacts a frame later [m]
-CLOSE = 0.05  # what distances are measured in [m]
-MOST, WALL = 0.375, 0.125  # share of the keypoints of an object that can touch another one, or the walls
-LEVER = 0.3  # what arms are measured in [m]
+FULL_CONTACT, NO_CONTACT = 0.04, 0.1  # a contact is full below and none above, now or a frame ahead [m]
+SEARCH_RADIUS = (
+    0.2  # farther things are not looked at, however fast they come: at 5 m/s they are contacts a frame later [m]
+)
+GAP_UNIT = 0.05  # what distances are measured in [m]
+PAIR_FRACTION, WALL_FRACTION = (
+    0.375,
+    0.125,
+)  # share of the keypoints of an object that can touch another one, or the walls
+ARM_UNIT = 0.3  # what arms are measured in [m]
 
 
-class Moving(NamedTuple):
+class BodyKinematics(NamedTuple):
     """Bodies in the world."""
 
     R: Float[Tensor, "b o 3 3"]
@@ -36,16 +41,16 @@ class Moving(NamedTuple):
     normal: Float[Tensor, "b o n 3"]
 
 
-def pair_places(shape: Shape, moving: Moving) -> Places:
+def pair_contacts(shape: RestShape, moving: BodyKinematics) -> ContactPoints:
     """The keypoints of every object that are nearest to every other object, and its keypoint next to each of them.
 
     The first vector is the way between the two, in CLOSE. Only MOST of the keypoints of an object, those nearest now or
     a frame ahead, are places of contact with another.
     """
-    w, others = shape.world, shape.others
-    distance, index = nearest(moving.points, w.valid, SEEN)
+    w, others = shape.initial, shape.others
+    distance, index = nearest(moving.points, w.valid, SEARCH_RADIUS)
     b, o, _, n = distance.shape
-    m, most = others.shape[1], math.ceil(MOST * n)
+    m, most = others.shape[1], math.ceil(PAIR_FRACTION * n)
     pick = others[None, :, :, None].expand(b, o, m, n)
     distance, index = distance.gather(2, pick), index.gather(2, pick)
     theirs = index + n * others[:, :, None]
@@ -53,11 +58,11 @@ def pair_places(shape: Shape, moving: Moving) -> Places:
     if most < n:
         with torch.no_grad():
             ahead = moving.points + FRAME * moving.speed
-            ahead = length(ahead[:, :, None] - _rows(ahead, theirs))
+            ahead = smooth_norm(ahead[:, :, None] - _rows(ahead, theirs))
             key = torch.where(distance.isfinite(), torch.minimum(distance, ahead), torch.inf)
             mine = key.topk(most, largest=False).indices
         theirs, distance = theirs.gather(-1, mine), distance.gather(-1, mine)
-        distance = distance.masked_fill(_beyond(mine, MOST, w.valid)[:, :, None], torch.inf)
+        distance = distance.masked_fill(_beyond(mine, PAIR_FRACTION, w.valid)[:, :, None], torch.inf)
     else:
         mine = torch.arange(n, device=index.device).expand_as(index)
     here = _rows(state, mine + n * torch.arange(o, device=mine.device)[:, None, None])
@@ -65,22 +70,23 @@ def pair_places(shape: Shape, moving: Moving) -> Places:
     way, pass_by = (here - there)[..., :3], (here - there)[..., 3:6]
     apart = (moving.velocity[:, :, None] - moving.velocity[:, others])[:, :, :, None].expand_as(way)
     gravity = (w.gravity / 5)[:, None, None, None].expand_as(way)
-    now, ahead = length(way), length(way + FRAME * pass_by)
-    gate = torch.where(distance.isfinite(), fade(torch.minimum(now, ahead), NEAR, FAR), 0.0)
+    now, ahead = smooth_norm(way), smooth_norm(way + FRAME * pass_by)
+    gate = torch.where(distance.isfinite(), smooth_cutoff(torch.minimum(now, ahead), FULL_CONTACT, NO_CONTACT), 0.0)
     mass = w.mass.clamp_min(1e-6)
     light = (mass[:, others] / (mass[:, :, None] + mass[:, others]))[..., None, None, None]
     K = light * _response(moving.inverse[:, :, None, None], here[..., 9:12])
     K = K + (1 - light) * _response(moving.inverse[:, others][:, :, :, None], there[..., 9:12])
     vectors = torch.stack([
-        way / CLOSE, here[..., 6:9], there[..., 6:9], pass_by, here[..., 9:12] / LEVER, there[..., 9:12] / LEVER,
+        way / GAP_UNIT, here[..., 6:9], there[..., 6:9], pass_by, here[..., 9:12] / ARM_UNIT, there[...,
+        9:12] / ARM_UNIT,
         apart, gravity, *symmetric_solve(K, pass_by, there[..., 6:9]),
     ], -2)  # fmt: skip
     sizes = torch.stack([shape.size[:, :, None].expand(b, o, m), shape.size[:, others]], -1).log()
     scalars = torch.cat([
-        torch.stack([now / CLOSE, ahead / CLOSE, gate, here[..., 12] / CLOSE, there[..., 12] / CLOSE], -1),
+        torch.stack([now / GAP_UNIT, ahead / GAP_UNIT, gate, here[..., 12] / GAP_UNIT, there[..., 12] / GAP_UNIT], -1),
         sizes[:, :, :, None].expand(*now.shape, 2),
     ], -1)  # fmt: skip
-    return Places(_shown(vectors, gate, 2), _shown(scalars, gate, 1), gate, mine)
+    return ContactPoints(_shown(vectors, gate, 2), _shown(scalars, gate, 1), gate, mine)
 
 
 def _rows(x: Float[Tensor, "b o n c"], rows: Int[Tensor, "b *p"]) -> Float[Tensor, "b *p c"]:
@@ -92,22 +98,22 @@ def _rows(x: Float[Tensor, "b o n c"], rows: Int[Tensor, "b *p"]) -> Float[Tenso
 def _response(inverse: Float[Tensor, "*#b 3 3"], arm: Float[Tensor, "*#b 3"]) -> Float[Tensor, "*b 3 3"]:
     """How fast a point of a body moves after an impulse on it, for unit mass: 1 - [r] J^-1 [r]."""
     r = arm[..., None, :]
-    turned = torch.linalg.cross(*torch.broadcast_tensors(inverse, r))  # J^-1 [r], by rows
-    turned = torch.linalg.cross(*torch.broadcast_tensors(r, turned.mT)).mT
-    return torch.eye(3, dtype=arm.dtype, device=arm.device) - turned
+    rotated = torch.linalg.cross(*torch.broadcast_tensors(inverse, r))  # J^-1 [r], by rows
+    rotated = torch.linalg.cross(*torch.broadcast_tensors(r, rotated.mT)).mT
+    return torch.eye(3, dtype=arm.dtype, device=arm.device) - rotated
 
 
-def floor_places(shape: Shape, moving: Moving) -> Places:
+def floor_contacts(shape: RestShape, moving: BodyKinematics) -> ContactPoints:
     """Every keypoint and the floor, however deep."""
-    height = moving.points[..., 2] - shape.world.floor[..., None]
+    height = moving.points[..., 2] - shape.initial.floor[..., None]
     up = torch.eye(3, dtype=height.dtype, device=height.device)[2].expand_as(moving.points)
     row = torch.arange(height.shape[2], device=height.device).expand_as(height)
     return _plane(shape, moving, row, height, up)
 
 
-def wall_places(shape: Shape, moving: Moving) -> Places:
+def wall_contacts(shape: RestShape, moving: BodyKinematics) -> ContactPoints:
     """The keypoints nearest to a wall or the ceiling, each with the nearest of them."""
-    w, x, most = shape.world, moving.points, math.ceil(WALL * moving.points.shape[2])
+    w, x, most = shape.initial, moving.points, math.ceil(WALL_FRACTION * moving.points.shape[2])
     low, high = w.box[..., None, 0, :], w.box[..., None, 1, :]
     eye = torch.eye(3, dtype=x.dtype, device=x.device)
     wall, which = torch.cat([(x - low)[..., :2], high - x], -1).min(-1)
@@ -118,7 +124,7 @@ def wall_places(shape: Shape, moving: Moving) -> Places:
             row = key.topk(most, largest=False).indices
     else:
         row = torch.arange(wall.shape[-1], device=x.device).expand_as(wall)
-    height = wall.gather(-1, row).masked_fill(_beyond(row, WALL, w.valid), 10 * FAR)
+    height = wall.gather(-1, row).masked_fill(_beyond(row, WALL_FRACTION, w.valid), 10 * NO_CONTACT)
     return _plane(shape, moving, row, height, _own(inward, row))
 
 
@@ -132,26 +138,26 @@ def _own(x: Float[Tensor, "b o n c"], row: Int[Tensor, "b o k"]) -> Float[Tensor
 
 
 def _plane(
-    shape: Shape, moving: Moving, row: Int[Tensor, "b o k"], height: Float[Tensor, "b o k"],
+    shape: RestShape, moving: BodyKinematics, row: Int[Tensor, "b o k"], height: Float[Tensor, "b o k"],
     normal: Float[Tensor, "b o k 3"],
-) -> Places:  # fmt: skip
-    w = shape.world
+) -> ContactPoints:  # fmt: skip
+    w = shape.initial
     state = torch.cat([moving.speed, moving.normal, moving.arm, shape.spacing[..., None], w.valid[..., None]], -1)
     state = _own(state, row)
     speed, arm = state[..., :3], state[..., 6:9]
     whole, gravity = moving.velocity[:, :, None].expand_as(arm), (w.gravity / 5)[:, None, None].expand_as(arm)
     ahead = height + FRAME * (speed * normal).sum(-1)
-    gate = torch.where(state[..., 10] > 0, fade(torch.minimum(height, ahead), NEAR, FAR), 0.0)
+    gate = torch.where(state[..., 10] > 0, smooth_cutoff(torch.minimum(height, ahead), FULL_CONTACT, NO_CONTACT), 0.0)
     K = _response(moving.inverse[:, :, None], arm)
     vectors = torch.stack([
-        normal, state[..., 3:6], speed, arm / LEVER, whole, gravity, *symmetric_solve(K, speed, normal)
+        normal, state[..., 3:6], speed, arm / ARM_UNIT, whole, gravity, *symmetric_solve(K, speed, normal)
     ], -2)  # fmt: skip
     scalars = torch.stack([
-        (height / CLOSE).clamp(-2, 2), (ahead / CLOSE).clamp(-2, 2), gate, state[..., 9] / CLOSE,
+        (height / GAP_UNIT).clamp(-2, 2), (ahead / GAP_UNIT).clamp(-2, 2), gate, state[..., 9] / GAP_UNIT,
         shape.size[..., None].log().expand_as(height),
     ], -1)  # fmt: skip
     vectors, scalars = _shown(vectors, gate, 2), _shown(scalars, gate, 1)
-    return Places(vectors[:, :, None], scalars[:, :, None], gate[:, :, None], row[:, :, None])
+    return ContactPoints(vectors[:, :, None], scalars[:, :, None], gate[:, :, None], row[:, :, None])
 
 
 def _shown(x: Tensor, gate: Tensor, more: int) -> Tensor:

@@ -7,37 +7,38 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from stages.core.kernels.compilers import TRITON
-from stages.core.models.field.equivariant import apply, chain, mlp, weigh
-from stages.core.models.field.rest_shape import BLUR, Shape
+from stages.core.models.field.equivariant import apply_layers, matvec, mlp, weighted_sum
+from stages.core.models.field.rest_shape import NEIGHBOURHOOD_RADII, RestShape
 
 if TRITON:
     from stages.core.kernels.field.skinny_matmul import thin_product
 
-STIFFEST = 2500.0  # [1/s^2]: a swing of an eighth of a second, six frames
-THICKEST = 100.0  # damping [1/s]
-HARDEST, HEAVIEST = 8.0, 0.8  # of springs and dampers, so weak that steps of a frame are stable
-FARTHEST = 1.5  # a point can be displaced by so many sizes of its object
-SCALES = 1 + len(BLUR)  # at which displacements are seen: whole, and in neighbourhoods
-KINDS = 3 * SCALES + 3  # of vectors
+MAX_STIFFNESS = 2500.0  # [1/s^2]: a swing of an eighth of a second, six frames
+MAX_DAMPING = 100.0  # damping [1/s]
+MAX_SPRING_WEIGHT, MAX_DAMPER_WEIGHT = 8.0, 0.8  # of springs and dampers, so weak that steps of a frame are stable
+MAX_DISPLACEMENT = 1.5  # a point can be displaced by so many sizes of its object
+SCALE_COUNT = 1 + len(NEIGHBOURHOOD_RADII)  # at which displacements are seen: whole, and in neighbourhoods
+VECTOR_COUNT = 3 * SCALE_COUNT + 3  # of vectors
 
 
-class Stress(nn.Module):
+class DeformationNet(nn.Module):
     """Acceleration of the displacements; what springs and dampers add is left to the integrator."""
 
     def __init__(self, hidden: int):
         super().__init__()
-        self.see = nn.Linear(KINDS * (KINDS + 1) // 2, hidden)
+        self.see = nn.Linear(VECTOR_COUNT * (VECTOR_COUNT + 1) // 2, hidden)
         self.own = nn.Linear(hidden, hidden)
-        self.say = mlp(hidden, hidden, 3 * SCALES, quiet=0.1)
+        self.say = mlp(hidden, hidden, 3 * SCALE_COUNT, quiet=0.1)
         self.spring = mlp(hidden, hidden, 2)
 
     def springs(self, code: Float[Tensor, "b o h"]) -> tuple[Float[Tensor, "b o"], Float[Tensor, "b o"]]:
         """Stiffness [1/s^2] and damping [1/s] of an object."""
         stiffness, damping = torch.sigmoid(self.spring(code)).unbind(-1)
-        return STIFFEST * stiffness, THICKEST * damping
+        return MAX_STIFFNESS * stiffness, MAX_DAMPING * damping
 
     def forward(
-        self, shape: Shape, code: Float[Tensor, "b o h"], yields: Float[Tensor, "b o"], u: Float[Tensor, "b o n 3"],
+        self, shape: RestShape, code: Float[Tensor, "b o h"], compliance_scale: Float[Tensor, "b o"], u: Float[Tensor,
+        "b o n 3"],
         du: Float[Tensor, "b o n 3"], touch: Float[Tensor, "b o n 3"], gravity: Float[Tensor, "b o 3"],
     ) -> Float[Tensor, "b o n 3"]:  # fmt: skip
         """Acceleration in the object's frame [m/s^2], without any that would move or turn the whole.
@@ -46,23 +47,25 @@ class Stress(nn.Module):
         `yield` is driven less.
         """
         size = shape.size[..., None, None]
-        share = shape.world.share[..., None]
+        mass_fraction = shape.initial.mass_fraction[..., None]
         felt = _blurred(shape.blur, torch.cat([touch, u, du], -1)).unflatten(-1, (3, 3))  # b o n s 3 3
         pushed, mean_u, mean_du = felt.unbind(-2)
-        virial = torch.einsum("boni,bonj->boij", share * touch, shape.arm) / size**2
+        virial = torch.einsum("boni,bonj->boij", mass_fraction * touch, shape.arm) / size**2
         arm = shape.arm / size
         springs = torch.cat([u[..., None, :], u[..., None, :] - mean_u], -2)
         dampers = torch.cat([du[..., None, :], du[..., None, :] - mean_du], -2)
-        spread = apply((virial + virial.mT)[:, :, None], shape.arm)[..., None, :]
+        spread = matvec((virial + virial.mT)[:, :, None], shape.arm)[..., None, :]
         moving = torch.cat([20 * springs, 2 * dampers, pushed / 10, spread / 10], -2)
         still = torch.stack([shape.normal, arm, (gravity / 5)[:, :, None].expand_as(arm)], -2)
-        said = chain(arm[..., :0], (self.see, self.say[0], self.say[2]), torch.cat([moving, still], -2),
+        said = apply_layers(arm[..., :0], (self.see, self.say[0], self.say[2]), torch.cat([moving, still], -2),
                      self.own(code)[:, :, None])  # fmt: skip
         # only what vanishes at rest: an untouched body stays as it is; springs pull back and dampers slow
-        pull, slow, drive = said.unflatten(-1, (3, SCALES)).unbind(-2)
-        drive = yields[..., None, None] * drive
-        said = torch.cat([-HARDEST * torch.sigmoid(pull - 3), -HEAVIEST * torch.sigmoid(slow - 2), drive], -1)
-        return projected(shape, 10 * weigh(said, moving))
+        pull, slow, drive = said.unflatten(-1, (3, SCALE_COUNT)).unbind(-2)
+        drive = compliance_scale[..., None, None] * drive
+        said = torch.cat(
+            [-MAX_SPRING_WEIGHT * torch.sigmoid(pull - 3), -MAX_DAMPER_WEIGHT * torch.sigmoid(slow - 2), drive], -1
+        )
+        return projected(shape, 10 * weighted_sum(said, moving))
 
 
 def _blurred(blur: Float[Tensor, "b o s n n"], x: Float[Tensor, "b o n 9"]) -> Float[Tensor, "b o n s 9"]:
@@ -74,18 +77,18 @@ def _blurred(blur: Float[Tensor, "b o s n n"], x: Float[Tensor, "b o n 9"]) -> F
     return (x.mT[:, :, None] @ blur.to(x).mT).permute(0, 1, 4, 2, 3)  # on a CPU twice as fast as what it means
 
 
-def projected(shape: Shape, field: Float[Tensor, "b o n 3"]) -> Float[Tensor, "b o n 3"]:
+def projected(shape: RestShape, field: Float[Tensor, "b o n 3"]) -> Float[Tensor, "b o n 3"]:
     """A field on the points without its mean and without its net rotation; 0 where padded."""
-    share = shape.world.share[..., None]
-    field = field - (share * field).sum(2, keepdim=True)
-    momentum = (share * torch.linalg.cross(shape.arm, field)).sum(2)
-    turn = apply(shape.inverse, momentum)
+    mass_fraction = shape.initial.mass_fraction[..., None]
+    field = field - (mass_fraction * field).sum(2, keepdim=True)
+    momentum = (mass_fraction * torch.linalg.cross(shape.arm, field)).sum(2)
+    turn = matvec(shape.inverse, momentum)
     field = field - torch.linalg.cross(turn[:, :, None].expand_as(field), shape.arm)
-    return torch.where(shape.world.valid[..., None], field, 0.0)
+    return torch.where(shape.initial.valid[..., None], field, 0.0)
 
 
-def bounded(shape: Shape, u: Float[Tensor, "b o n 3"]) -> Float[Tensor, "b o n 3"]:
+def bounded(shape: RestShape, u: Float[Tensor, "b o n 3"]) -> Float[Tensor, "b o n 3"]:
     """Displacements kept below a share of the object's size, all of an object by the same, given factor."""
-    most = FARTHEST * shape.size
+    most = MAX_DISPLACEMENT * shape.size
     largest = u.detach().square().sum(-1).amax(-1).sqrt()
     return u * (most / torch.maximum(largest, most))[..., None, None]

@@ -18,7 +18,7 @@ if TRITON:
     from stages.core.kernels.field.perceptron import WIDEST, perceptron
 
 
-def products(vectors: Float[Tensor, "*b k 3"]) -> Float[Tensor, "*b g"]:
+def inner_products(vectors: Float[Tensor, "*b k 3"]) -> Float[Tensor, "*b g"]:
     """All k (k + 1) / 2 inner products, those of large vectors compressed to their logarithm."""
     k = vectors.shape[-2]
     row, column = torch.triu_indices(k, k, device=vectors.device)
@@ -30,12 +30,12 @@ def products(vectors: Float[Tensor, "*b k 3"]) -> Float[Tensor, "*b g"]:
     return torch.asinh(inner).mT.reshape(*vectors.shape[:-2], len(row))
 
 
-def weigh(weights: Float[Tensor, "*b k"], vectors: Float[Tensor, "*b k 3"]) -> Float[Tensor, "*b 3"]:
+def weighted_sum(weights: Float[Tensor, "*b k"], vectors: Float[Tensor, "*b k 3"]) -> Float[Tensor, "*b 3"]:
     """The weighted sum of vectors."""
     return (weights[..., None] * vectors).sum(-2)
 
 
-def apply(M: Float[Tensor, "*#b 3 3"], x: Float[Tensor, "*#b 3"]) -> Float[Tensor, "*#b 3"]:
+def matvec(M: Float[Tensor, "*#b 3 3"], x: Float[Tensor, "*#b 3"]) -> Float[Tensor, "*#b 3"]:
     """M x. For so small a product a sum is faster than a call of a library, and a compiler can fuse it."""
     return (M * x[..., None, :]).sum(-1)
 
@@ -48,12 +48,12 @@ def symmetric_solve(M: Float[Tensor, "*b 3 3"], *x: Float[Tensor, "*b 3"]) -> li
     return [(v[..., :1] * bc + v[..., 1:2] * ca + v[..., 2:] * ab) / det for v in x]
 
 
-def length(x: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
+def smooth_norm(x: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
     """The norm, with a gradient at zero."""
     return (x.square().sum(-1) + 1e-12).sqrt()
 
 
-def chain(
+def apply_layers(
     x: Float[Tensor, "*b i"], layers: Sequence[nn.Linear], vectors: Float[Tensor, "*b v 3"] | None = None,
     known: Float[Tensor, "*#b k"] | None = None, active: bool = False, near: Bool[Tensor, "*b"] | None = None,
 ) -> Float[Tensor, "*b j"]:  # fmt: skip
@@ -71,7 +71,7 @@ def chain(
         weights, biases = [layer.weight for layer in layers], [layer.bias for layer in layers]
         return perceptron(x.flatten(0, -2), weights, biases, vectors, known, near, active).unflatten(0, x.shape[:-1])
     if vectors is not None:
-        x = torch.cat([products(vectors), x], -1)
+        x = torch.cat([inner_products(vectors), x], -1)
     known = 0.0 if known is None else known
     y = layers[0](silu(x + known)) if active else layers[0](x) + known
     for layer in layers[1:]:
@@ -83,7 +83,7 @@ class Perceptron(nn.Sequential):
     """Linear, SiLU, Linear."""
 
     def forward(self, x: Float[Tensor, "*b i"]) -> Float[Tensor, "*b j"]:
-        return chain(x, (self[0], self[2]))
+        return apply_layers(x, (self[0], self[2]))
 
 
 def mlp(inner: int, hidden: int, outer: int, quiet: float = 1.0) -> Perceptron:
@@ -95,7 +95,7 @@ def mlp(inner: int, hidden: int, outer: int, quiet: float = 1.0) -> Perceptron:
     return Perceptron(nn.Linear(inner, hidden), nn.SiLU(), last)
 
 
-def fade(x: Float[Tensor, "*b"], start: float, end: float) -> Float[Tensor, "*b"]:
+def smooth_cutoff(x: Float[Tensor, "*b"], start: float, end: float) -> Float[Tensor, "*b"]:
     """1 below `start`, exactly 0 above `end`, smooth between."""
     s = ((end - x) / (end - start)).clamp(0, 1)
     return s * s * (3 - 2 * s)

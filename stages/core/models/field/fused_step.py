@@ -24,28 +24,28 @@ from stages.core.kernels.field import deformation_features as straining
 from stages.core.kernels.field import skinny_matmul as thin
 from stages.core.kernels.field import velocity_update as kicks
 from stages.core.models.dynamics import FRAME
-from stages.core.models.external_forces import Pushes
+from stages.core.models.external_forces import ExternalForces
 from stages.core.models.field import contact_points as near
-from stages.core.models.field.contact_forces import GRIP, STRENGTH
-from stages.core.models.field.deformation import FARTHEST, HARDEST, HEAVIEST
+from stages.core.models.field.contact_forces import ACCELERATION_UNIT, CONTACT_SATURATION
+from stages.core.models.field.deformation import MAX_DAMPER_WEIGHT, MAX_DISPLACEMENT, MAX_SPRING_WEIGHT
 from stages.core.models.field.force_field import (
-    BRISK,
-    FASTEST,
-    HOLD,
-    LEAVING,
-    RISE,
-    SINK,
-    WILDEST,
+    FRICTION_CUTOFF_SPEED,
+    MAX_FRICTION_SPEED,
+    MAX_PENETRATION,
+    MAX_RECOVERY_SPEED,
+    MAX_SPEED,
+    MAX_SPIN,
+    SEPARATION_SPEED,
     BodyState,
+    FieldScene,
     ForceField,
-    Scene,
 )
 
 LARGEST = 4096  # keypoints of an object: all of them are held in registers
 ROWS = 64  # of a block of places or points
 
 
-def fits(field: ForceField, scene: Scene) -> bool:
+def fits(field: ForceField, scene: FieldScene) -> bool:
     """Whether the kernels are made for such a model and scene; they count what they write with 32 bits."""
     b, o, n, _ = scene.shape.arm.shape
     sizes = field.config["deform"] and field.config["hidden"] in (16, 32, 64, 128) and n <= LARGEST
@@ -53,12 +53,14 @@ def fits(field: ForceField, scene: Scene) -> bool:
     return sizes and half and 64 * b * o * sum(lists(o, n)) < 2**31
 
 
-def step(field: ForceField, scene: Scene, state: BodyState, t: Tensor | float, dt: float, pushes: Pushes) -> BodyState:
+def step(
+    field: ForceField, scene: FieldScene, state: BodyState, t: Tensor | float, dt: float, external: ExternalForces
+) -> BodyState:
     """What `ForceField.step` does, in single precision, without gradients."""
-    return _Step(field, scene, pushes, dt).run(state, t)
+    return _Step(field, scene, external, dt).run(state, t)
 
 
-def points(scene: Scene, state: BodyState) -> Tensor:
+def points(scene: FieldScene, state: BodyState) -> Tensor:
     """What `ForceField.points` does."""
     b, o, n, _ = state.u.shape
     given = [x.contiguous() for x in (state.com, state.quat, state.u, scene.shape.arm)]
@@ -69,7 +71,7 @@ def points(scene: Scene, state: BodyState) -> Tensor:
 
 def lists(o: int, n: int) -> list[int]:
     """Room for places where an object touches each other one, the floor and the walls: one list after the other."""
-    return [ROWS * math.ceil(part * n / ROWS) for part in ((near.MOST,) * (o - 1) + (1.0, near.WALL))]
+    return [ROWS * math.ceil(part * n / ROWS) for part in ((near.PAIR_FRACTION,) * (o - 1) + (1.0, near.WALL_FRACTION))]
 
 
 def _layers(*layers: nn.Linear) -> tuple[Tensor, ...]:
@@ -80,15 +82,15 @@ def _layers(*layers: nn.Linear) -> tuple[Tensor, ...]:
 class _Step:
     """Sizes, what is given as one block of memory each, and the four parts of a step."""
 
-    def __init__(self, field: ForceField, scene: Scene, pushes: Pushes, dt: float):
-        self.field, self.scene, self.pushes, self.dt = field, scene, pushes, dt
+    def __init__(self, field: ForceField, scene: FieldScene, external: ExternalForces, dt: float):
+        self.field, self.scene, self.external, self.dt = field, scene, external, dt
         self.b, self.o, self.n, _ = scene.shape.arm.shape
         self.objects, self.kinds, self.hidden = self.b * self.o, self.o + 1, field.config["hidden"]
         for name in ("arm", "normal", "spacing", "size", "inverse"):
             setattr(self, name, getattr(scene.shape, name).contiguous())
-        for name in ("valid", "share", "mass", "gravity", "box"):
-            setattr(self, name, getattr(scene.shape.world, name).contiguous())
-        self.code, self.pinned = scene.code.contiguous(), pushes.pinned.contiguous()
+        for name in ("valid", "mass_fraction", "mass", "gravity", "box"):
+            setattr(self, name, getattr(scene.shape.initial, name).contiguous())
+        self.code, self.pinned = scene.code.contiguous(), external.pinned.contiguous()
 
         *others, floor, narrow = lists(self.o, self.n)
         wide, self.slots = others[0] if others else floor, sum(others) + floor + narrow
@@ -103,8 +105,8 @@ class _Step:
         count, point, felt, record = self._meeting(body, moved, planes)
         known, parts, *grip = self._touch(count, point, felt, record)
         pushed = tuple(grip)  # nobody: not read
-        if self.pushes.object.shape[1]:
-            pushed = self.pushes.wrench(moved[:, :, :3].mT, body[..., :3].contiguous(), t, self.dt)
+        if self.external.object.shape[1]:
+            pushed = self.external.wrench(moved[:, :, :3].mT, body[..., :3].contiguous(), t, self.dt)
         return self._end(body, moved, inner, parts, felt, grip, known, pushed)
 
     def _new(self, *shape: int) -> Tensor:
@@ -118,7 +120,8 @@ class _Step:
         inner, planes = self._new(bodies.FIELD.value, self.n), self._new(2, self.n)
         bodies.advance[(self.objects,)](
             *(x.contiguous() for x in state), self.arm, self.normal, self.valid, self.size, self.inverse, self.pinned,
-            self.box, body, moved, inner, planes, self.o, self.n, self.dt, FARTHEST=FARTHEST, FAR=near.FAR,
+            self.box, body, moved, inner, planes, self.o, self.n, self.dt, FARTHEST=MAX_DISPLACEMENT,
+            FAR=near.NO_CONTACT,
             FRAME=FRAME, **self.whole,
         )  # fmt: skip
         return body, moved, inner, planes
@@ -129,29 +132,32 @@ class _Step:
         many = self._count(m)
         if m:
             meeting.gather[(self.objects, m)](
-                body, moved, self.valid, close, which, many, o, n, SEEN=near.SEEN, **self.whole
+                body, moved, self.valid, close, which, many, o, n, SEEN=near.SEARCH_RADIUS, **self.whole
             )
             meeting.search[(self.objects * m, triton.cdiv(n, meeting.QUERIES))](
-                body, moved, close, which, many, keys, partner, o, n, SEEN=near.SEEN, FRAME=FRAME,
+                body, moved, close, which, many, keys, partner, o, n, SEEN=near.SEARCH_RADIUS, FRAME=FRAME,
                 QUERIES=meeting.QUERIES, CHUNK=meeting.CHUNK,
             )  # fmt: skip
         count, felt = self._count(self.kinds), self._new(self.kinds, 3, n)
         point, theirs = self._count(self.slots), self._count(self.slots)
         meeting.select[(self.objects, self.kinds)](
-            keys, planes, which, partner, many, self.valid, count, point, theirs, felt, *self.lists, PAIR=near.MOST,
-            WALL=near.WALL, FAR=near.FAR, **self.whole,
+            keys, planes, which, partner, many, self.valid, count, point, theirs, felt, *self.lists,
+            PAIR=near.PAIR_FRACTION,
+            WALL=near.WALL_FRACTION, FAR=near.NO_CONTACT, **self.whole,
         )  # fmt: skip
         record = self._new(self.slots * places.COLUMNS.value)
         places.show[(self.objects, self.places)](
-            body, moved, count, point, theirs, record, self.spacing, self.share, self.size, self.mass, self.gravity,
-            self.box, *self.lists, NEAR=near.NEAR, FAR=near.FAR, CLOSE=near.CLOSE, LEVER=near.LEVER, FRAME=FRAME,
+            body, moved, count, point, theirs, record, self.spacing, self.mass_fraction, self.size, self.mass,
+            self.gravity,
+            self.box, *self.lists, NEAR=near.FULL_CONTACT, FAR=near.NO_CONTACT, CLOSE=near.GAP_UNIT,
+            LEVER=near.ARM_UNIT, FRAME=FRAME,
             ROWS=ROWS, num_warps=2,
         )  # fmt: skip
         return count, point, felt, record
 
     def _touch(self, count: Tensor, point: Tensor, felt: Tensor, record: Tensor) -> tuple[Tensor, ...]:
         field, pair, plane, h = self.field, self.field.pairs, self.field.planes, self.hidden
-        known, told = self._new(self.kinds + 1, h), self._new(self.kinds, h)
+        known, inputs = self._new(self.kinds + 1, h), self._new(self.kinds, h)
         own = _layers(pair.own, pair.other, plane.own, field.stress.own)
         touching.introduce[(self.objects, self.kinds + 1)](self.code, *own, known, self.o, H=h)
         message, weight = self._new(self.slots, h), self._new(self.slots)
@@ -164,18 +170,19 @@ class _Step:
         grip = self._new()
         touching.hear[(self.objects,)](
             self.code, heard, total, _layers(field.status[0], field.status[2]), *_layers(field.hold), listened,
-            scale, status, grip, *self.lists, GRIP=GRIP, HOLD=HOLD, ROWS=ROWS,
+            scale, status, grip, *self.lists, GRIP=CONTACT_SATURATION, HOLD=MAX_FRICTION_SPEED, ROWS=ROWS,
             BLOCKS=triton.next_power_of_2(self.floor), H=h, num_warps=8,
         )  # fmt: skip
         touching.explain[(self.objects, self.kinds)](
             listened, status, _layers(field.between[0], field.between[2]),
-            _layers(field.against[0], field.against[2]), *_layers(pair.tell, plane.tell), told, self.o, H=h,
+            _layers(field.against[0], field.against[2]), *_layers(pair.tell, plane.tell), inputs, self.o, H=h,
         )  # fmt: skip
         parts = self._new(self.places, bodies.PART.value)
         mouths = (_layers(net.say[0], net.say[2]) for net in (pair, plane))
         touching.answer[(self.objects, self.places)](
-            record, count, point, *mouths, told, message, weight, scale, felt, parts, *self.lists, STRENGTH=STRENGTH,
-            LEAVING=LEAVING, CLOSE=near.CLOSE, LEVER=near.LEVER, **self.network,
+            record, count, point, *mouths, inputs, message, weight, scale, felt, parts, *self.lists,
+            STRENGTH=ACCELERATION_UNIT,
+            LEAVING=SEPARATION_SPEED, CLOSE=near.GAP_UNIT, LEVER=near.ARM_UNIT, **self.network,
         )  # fmt: skip
         return known, parts, grip, scale
 
@@ -188,10 +195,11 @@ class _Step:
         high, low = (torch.empty(self.b, o, 9, n, dtype=torch.float16, device=self.arm.device) for _ in range(2))
         scale = self._new(9)
         kicks.kick[(self.objects,)](
-            body, moved, inner, parts, felt, *grip, *pushed, self.arm, self.valid, self.share, self.size,
+            body, moved, inner, parts, felt, *grip, *pushed, self.arm, self.valid, self.mass_fraction, self.size,
             self.mass, self.inverse, self.pinned, self.gravity, self.box, com, quat, velocity, momentum, high, low,
-            scale, o, n, self.dt, self.places, self.wide, PUSHED=self.pushes.object.shape[1] > 0,
-            GRIP=GRIP, SINK=SINK, RISE=RISE, FASTEST=FASTEST, WILDEST=WILDEST, BRISK=BRISK, FRAME=FRAME,
+            scale, o, n, self.dt, self.places, self.wide, PUSHED=self.external.object.shape[1] > 0,
+            GRIP=CONTACT_SATURATION, SINK=MAX_PENETRATION, RISE=MAX_RECOVERY_SPEED, FASTEST=MAX_SPEED,
+            WILDEST=MAX_SPIN, BRISK=FRICTION_CUTOFF_SPEED, FRAME=FRAME,
             BLOCKS=triton.next_power_of_2(self.places - (o - 1) * self.wide), **self.whole,
         )  # fmt: skip
         mean = thin.product_of(scene.shape.blur.flatten(0, 1).flatten(1, 2), high.flatten(0, 1), low.flatten(0, 1))
@@ -202,13 +210,15 @@ class _Step:
             ROWS=ROWS, num_warps=2,
         )  # fmt: skip
         straining.strain[(self.objects, blocks)](
-            record, known, scene.yields.contiguous(), _layers(stress.see), _layers(stress.say[0], stress.say[2]),
-            field, n, blocks, self.kinds, HARDEST=HARDEST, HEAVIEST=HEAVIEST, **self.network,
+            record, known, scene.compliance_scale.contiguous(), _layers(stress.see), _layers(stress.say[0],
+            stress.say[2]),
+            field, n, blocks, self.kinds, HARDEST=MAX_SPRING_WEIGHT, HEAVIEST=MAX_DAMPER_WEIGHT, **self.network,
         )  # fmt: skip
         u, du = self._new(n, 3), self._new(n, 3)
         stiffness, damping = scene.stiffness.contiguous(), scene.damping.contiguous()
         kicks.deform[(self.objects,)](
-            inner, field, self.arm, self.valid, self.share, self.size, self.inverse, stiffness, damping, self.pinned,
-            u, du, n, self.dt, FASTEST=FASTEST, FARTHEST=FARTHEST, **self.whole,
+            inner, field, self.arm, self.valid, self.mass_fraction, self.size, self.inverse, stiffness, damping,
+            self.pinned,
+            u, du, n, self.dt, FASTEST=MAX_SPEED, FARTHEST=MAX_DISPLACEMENT, **self.whole,
         )  # fmt: skip
         return BodyState(com, quat, velocity, momentum, u, du)

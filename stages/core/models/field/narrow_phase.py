@@ -11,7 +11,7 @@ from stages.core.kernels.compilers import TRITON
 if TRITON:
     from stages.core.kernels.field.nearest import nearest as searched
 
-MANY = 500  # points of a scene from which on it pays, on a CPU, to look before measuring
+CULLING_MIN_POINTS = 500  # points of a scene from which on it pays, on a CPU, to look before measuring
 
 Found = tuple[Float[Tensor, "b o o n"], Int[Tensor, "b o o n"]]
 
@@ -25,7 +25,7 @@ def nearest(points: Float[Tensor, "b o n 3"], valid: Bool[Tensor, "b o n"], reac
     """
     if TRITON and points.is_cuda and points.dtype == torch.float32:
         return searched(points, valid, reach)
-    few = points.shape[1] * points.shape[2] < MANY
+    few = points.shape[1] * points.shape[2] < CULLING_MIN_POINTS
     search = _measured if few or points.is_cuda else _culled
     distance, index = search(points, valid, reach)
     return distance.masked_fill(distance >= reach, torch.inf), index

@@ -10,20 +10,20 @@ from torch import Tensor
 
 from stages.core.kernels.compilers import TRITON
 from stages.core.kernels.field.normals import inverted, surface
-from stages.core.models.initial_conditions import World, inertia, offsets
+from stages.core.models.initial_conditions import InitialConditions, inertia, offsets
 
 if TRITON:
     from stages.core.kernels.field.neighbourhoods import neighbourhoods
 
-BLUR = (0.12, 0.4)  # radii of neighbourhoods, in sizes of the object
-FAINT = 1e-20  # weights in them that are 0: subnormal numbers take a CPU several times as long
+NEIGHBOURHOOD_RADII = (0.12, 0.4)  # radii of neighbourhoods, in sizes of the object
+MIN_NEIGHBOUR_WEIGHT = 1e-20  # weights in them that are 0: subnormal numbers take a CPU several times as long
 
 
 @dataclass(frozen=True)
-class Shape:
+class RestShape:
     """The objects of a world at rest."""
 
-    world: World
+    initial: InitialConditions
     arm: Float[Tensor, "b o n 3"]  # keypoints about the centre of mass [m]
     normal: Float[Tensor, "b o n 3"]  # outwards, at most of length 1; short where out and in are not to be told apart
     spacing: Float[Tensor, "b o n"]  # distance to the nearest keypoints [m]
@@ -34,30 +34,30 @@ class Shape:
     others: Int[Tensor, "o m"]  # for each object the rows of the others
     back: Int[Tensor, "o m"]  # others[others[i, k], back[i, k]] is i
 
-    def __getitem__(self, rows: slice | Tensor) -> Shape:
+    def __getitem__(self, rows: slice | Tensor) -> RestShape:
         """Some of the scenes, still a batch."""
-        each = ("world", "arm", "normal", "spacing", "size", "inverse", "principal", "blur")
+        each = ("initial", "arm", "normal", "spacing", "size", "inverse", "principal", "blur")
         return replace(self, **{name: getattr(self, name)[rows] for name in each})
 
 
 @torch.no_grad()
-def shape_of(world: World, half: bool = False) -> Shape:
+def rest_shape_of(initial: InitialConditions, half: bool = False) -> RestShape:
     """Everything about the rest shape; with `half` the neighbourhoods in half precision, which takes Triton."""
-    arm = offsets(world, world.points)
-    size = (world.share * arm.square().sum(-1)).sum(-1).clamp_min(1e-8).sqrt()
-    normal, spacing = surface(arm, world.valid)
+    arm = offsets(initial, initial.points)
+    size = (initial.mass_fraction * arm.square().sum(-1)).sum(-1).clamp_min(1e-8).sqrt()
+    normal, spacing = surface(arm, initial.valid)
     side = (normal * arm).sum(-1) / (0.1 * size[..., None])
     normal = normal * side.tanh()[..., None]  # outwards
-    inverse, principal = inverted(inertia(world.share.double(), arm.double()))
-    reach = torch.stack([radius * size for radius in BLUR], -1)
+    inverse, principal = inverted(inertia(initial.mass_fraction.double(), arm.double()))
+    reach = torch.stack([radius * size for radius in NEIGHBOURHOOD_RADII], -1)
     blur = neighbourhoods if half else _neighbourhoods
-    others, back = _others(world.valid.shape[1], arm.device)
-    blurred = blur(arm, world.valid, world.share, reach)
-    return Shape(world, arm, normal, spacing, size, inverse.to(arm), principal.to(arm), blurred, others, back)
+    others, back = _others(initial.valid.shape[1], arm.device)
+    blurred = blur(arm, initial.valid, initial.mass_fraction, reach)
+    return RestShape(initial, arm, normal, spacing, size, inverse.to(arm), principal.to(arm), blurred, others, back)
 
 
 def _neighbourhoods(
-    arm: Float[Tensor, "b o n 3"], valid: Bool[Tensor, "b o n"], share: Float[Tensor, "b o n"],
+    arm: Float[Tensor, "b o n 3"], valid: Bool[Tensor, "b o n"], mass_fraction: Float[Tensor, "b o n"],
     reach: Float[Tensor, "b o s"],
 ) -> Float[Tensor, "b o s n n"]:  # fmt: skip
     """Gaussians of each radius [m] about each point, normalised by rows; 0 where padded.
@@ -69,7 +69,7 @@ def _neighbourhoods(
         gap = c[..., :, None] - c[..., None, :]
         squared.addcmul_(gap, gap)
     weight = (squared[:, :, None] * (-1 / reach.square())[..., None, None]).exp_()
-    weight.mul_(weight > FAINT).mul_(share[:, :, None, None])
+    weight.mul_(weight > MIN_NEIGHBOUR_WEIGHT).mul_(mass_fraction[:, :, None, None])
     return weight.mul_(valid[:, :, None, :, None] / weight.sum(-1, keepdim=True).clamp_min_(1e-12))
 
 

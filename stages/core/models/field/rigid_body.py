@@ -10,7 +10,7 @@ from torch import Tensor
 
 from stages.core.geometry.rotations import matrix, multiply, nearest_rotation
 from stages.core.kernels.field import rigid_motion as kernels
-from stages.core.models.field.equivariant import apply
+from stages.core.models.field.equivariant import matvec
 
 
 def exponential(turn: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 4"]:
@@ -21,17 +21,17 @@ def exponential(turn: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 4"]:
     return torch.cat([half.cos(), turn * torch.sinc(half / torch.pi) / 2], -1)
 
 
-def turned(quats: Float[Tensor, "*b 4"], turn: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 4"]:
+def rotated(quats: Float[Tensor, "*b 4"], turn: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 4"]:
     """Orientations after a rotation about world axes [rad], of unit length."""
     q = multiply(exponential(turn), quats)
     return q / q.norm(dim=-1, keepdim=True)
 
 
-def spin_of(
+def angular_velocity(
     momentum: Float[Tensor, "*b 3"], inverse: Float[Tensor, "*b 3 3"], R: Float[Tensor, "*b 3 3"]
 ) -> Float[Tensor, "*b 3"]:
     """Angular velocity [rad/s], world axes, of an angular momentum per mass [m^2/s]; `inverse` inertia at rest."""
-    return apply(R, apply(inverse, apply(R.mT, momentum)))
+    return matvec(R, matvec(inverse, matvec(R.mT, momentum)))
 
 
 def pose(
@@ -41,7 +41,7 @@ def pose(
     if _at_once(quat):
         return kernels.pose(quat, momentum, inverse)
     R = matrix(quat)
-    return R, spin_of(momentum, inverse, R)
+    return R, angular_velocity(momentum, inverse, R)
 
 
 def drift(
@@ -53,8 +53,8 @@ def drift(
     if _at_once(quat):
         return kernels.drift(com, quat, velocity, momentum, inverse, dt)
     spin = pose(quat, momentum, inverse)[1]
-    spin = pose(turned(quat, dt / 2 * spin), momentum, inverse)[1]
-    return com + dt * velocity, turned(quat, dt * spin)
+    spin = pose(rotated(quat, dt / 2 * spin), momentum, inverse)[1]
+    return com + dt * velocity, rotated(quat, dt * spin)
 
 
 def _at_once(x: Tensor) -> bool:
@@ -62,12 +62,12 @@ def _at_once(x: Tensor) -> bool:
     return x.dtype == torch.float32 and not torch.is_grad_enabled()
 
 
-def limited(x: Float[Tensor, "*b 3"], most: float) -> Float[Tensor, "*b 3"]:
+def clamp_norm(x: Float[Tensor, "*b 3"], most: float) -> Float[Tensor, "*b 3"]:
     """Vectors made no longer than `most`."""
     return x * (most / x.norm(dim=-1, keepdim=True).clamp_min(most))
 
 
-class Motion(NamedTuple):
+class RigidFit(NamedTuple):
     """The rigid motion that comes nearest to that of some points; what is left is deformation."""
 
     R: Float[Tensor, "b o 3 3"]
@@ -78,15 +78,15 @@ class Motion(NamedTuple):
     du: Float[Tensor, "b o n 3"]
 
 
-def fitted(
-    share: Float[Tensor, "b o n"], arm: Float[Tensor, "b o n 3"], inverse: Float[Tensor, "b o 3 3"],
+def fit_rigid_motion(
+    mass_fraction: Float[Tensor, "b o n"], arm: Float[Tensor, "b o n 3"], inverse: Float[Tensor, "b o 3 3"],
     points: Float[Tensor, "b o n 3"], speed: Float[Tensor, "b o n 3"],
-) -> Motion:  # fmt: skip
+) -> RigidFit:  # fmt: skip
     """Rigid motion of points whose arms at rest are known.
 
     Source: Mueller et al. 2005, "Meshless deformations based on shape matching", section 3.
     """
-    weight = share[..., None]
+    weight = mass_fraction[..., None]
     com, velocity = (weight * points).sum(2), (weight * speed).sum(2)
     there = weight > 0
     offset = torch.where(there, points - com[:, :, None], 0.0)
@@ -96,6 +96,6 @@ def fitted(
     spread = (weight * arm.square()).sum((2, 3))[..., None, None]
     R = nearest_rotation((weight * offset).mT @ arm + 1e-6 * (spread + 1e-6) * eye)
     momentum = torch.linalg.cross(weight * offset, drift).sum(2)
-    spin = spin_of(momentum, inverse, R)
+    spin = angular_velocity(momentum, inverse, R)
     turning = torch.linalg.cross(spin[:, :, None].expand_as(offset), offset)
-    return Motion(R, com, velocity, momentum, offset @ R - arm, torch.where(there, drift - turning, 0.0) @ R)
+    return RigidFit(R, com, velocity, momentum, offset @ R - arm, torch.where(there, drift - turning, 0.0) @ R)

@@ -44,7 +44,7 @@ def sample(x: Float[Tensor, "1 c h w"], at: Float[Tensor, "1 a b 2"]) -> Float[T
     return F.grid_sample(x, 2 * at / size - 1, align_corners=True)
 
 
-class Block(nn.Module):
+class ConvBlock(nn.Module):
     """Two convolutions with SELU, past a shortcut or not."""
 
     def __init__(self, inputs: int, outputs: int, shortcut: bool, deformable: bool):
@@ -90,8 +90,8 @@ class ALIKED(nn.Module):
     def __init__(self):
         super().__init__()
         a, b, c, d = WIDTHS
-        self.block1, self.block2 = Block(3, a, False, False), Block(a, b, True, False)
-        self.block3, self.block4 = Block(b, c, True, True), Block(c, d, True, True)
+        self.block1, self.block2 = ConvBlock(3, a, False, False), ConvBlock(a, b, True, False)
+        self.block3, self.block4 = ConvBlock(b, c, True, True), ConvBlock(c, d, True, True)
         self.conv1, self.conv2, self.conv3, self.conv4 = (nn.Conv2d(n, DIM // 4, 1, bias=False) for n in WIDTHS)
         widths = (DIM, 8, 4, 4, 1)
         layers = [nn.Conv2d(i, o, k, padding=k // 2, bias=False)

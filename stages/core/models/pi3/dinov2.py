@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from stages.core.models.pi3.layers import EPS, Block
+from stages.core.models.pi3.layers import EPS, ViTBlock
 
 PATCH = 14  # side of a patch [px]
 REGISTERS = 4
@@ -32,7 +32,7 @@ class DinoV2(nn.Module):
         self.pos_embed = nn.Parameter(torch.zeros(1, table * table + 1, width))
         self.register_tokens = nn.Parameter(torch.zeros(1, REGISTERS, width))
         self.patch_embed = PatchEmbed(width)
-        self.blocks = nn.ModuleList(Block(width, head, scaled=True) for _ in range(depth))
+        self.blocks = nn.ModuleList(ViTBlock(width, head, scaled=True) for _ in range(depth))
         self.norm = nn.LayerNorm(width, EPS)
 
     def forward(self, images: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b t c"]:

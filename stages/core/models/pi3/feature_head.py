@@ -17,7 +17,7 @@ def conv(width_in: int, width_out: int) -> nn.Conv2d:
     return nn.Conv2d(width_in, width_out, 3, padding=1, bias=False)
 
 
-class Residual(nn.Module):
+class ResidualConv(nn.Module):
     """Two convolutions beside an identity. Source: He et al. 2016, "Deep residual learning", fig. 2."""
 
     def __init__(self, width: int):
@@ -36,7 +36,7 @@ class TokenBranch(nn.Module):
         super().__init__()
         layers: list[nn.Module] = []
         for wide in widths:
-            layers += [conv(width, wide), nn.BatchNorm2d(wide), nn.ReLU(), Residual(wide), Residual(wide)]
+            layers += [conv(width, wide), nn.BatchNorm2d(wide), nn.ReLU(), ResidualConv(wide), ResidualConv(wide)]
             width = wide
         layers.append(nn.ConvTranspose2d(width, features, PATCH, stride=PATCH))
         for _ in range(2):
@@ -50,7 +50,7 @@ class ColourBranch(nn.Module):
     def __init__(self, features: int):
         super().__init__()
         first = nn.Sequential(conv(3, features), nn.BatchNorm2d(features), nn.ReLU())
-        self.layers = nn.Sequential(first, *(Residual(features) for _ in range(3)))
+        self.layers = nn.Sequential(first, *(ResidualConv(features) for _ in range(3)))
 
 
 class FeatureHead(nn.Module):

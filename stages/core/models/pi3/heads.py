@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from stages.core.geometry.rotations import nearest_rotation
 from stages.core.models.pi3.dinov2 import PATCH
-from stages.core.models.pi3.layers import Block
+from stages.core.models.pi3.layers import ViTBlock
 from stages.core.models.pi3.rope import Rotation
 
 
@@ -19,7 +19,7 @@ class TransformerDecoder(nn.Module):
     def __init__(self, width_in: int, width: int, width_out: int, head: int, depth: int = 5):
         super().__init__()
         self.projects = nn.Linear(width_in, width)
-        self.blocks = nn.ModuleList(Block(width, head) for _ in range(depth))
+        self.blocks = nn.ModuleList(ViTBlock(width, head) for _ in range(depth))
         self.linear_out = nn.Linear(width, width_out)
 
     def forward(self, x: Float[Tensor, "b t c"], places: Rotation) -> Float[Tensor, "b t d"]:

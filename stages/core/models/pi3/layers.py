@@ -54,7 +54,7 @@ class LayerScale(nn.Module):
         return x * self.gamma
 
 
-class Block(nn.Module):
+class ViTBlock(nn.Module):
     """Pre-norm transformer block."""
 
     def __init__(self, width: int, head: int, normalised: bool = False, scaled: bool = False):

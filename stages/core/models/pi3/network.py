@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from stages.core.models.pi3.config import Pi3Config
 from stages.core.models.pi3.dinov2 import PATCH, REGISTERS, DinoV2
 from stages.core.models.pi3.heads import CameraHead, LinearMap, TransformerDecoder, local_points
-from stages.core.models.pi3.layers import Block
+from stages.core.models.pi3.layers import ViTBlock
 from stages.core.models.pi3.rope import Rotation, patch_places, rotation
 
 MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet
@@ -38,7 +38,7 @@ class Pi3(nn.Module):
         self.register_buffer("image_mean", torch.tensor(MEAN).view(1, 3, 1, 1))
         self.register_buffer("image_std", torch.tensor(STD).view(1, 3, 1, 1))
         self.encoder = DinoV2(c.width, c.head, c.encoder_depth, c.table)
-        self.decoder = nn.ModuleList(Block(c.width, c.head, True, True) for _ in range(c.decoder_depth))
+        self.decoder = nn.ModuleList(ViTBlock(c.width, c.head, True, True) for _ in range(c.decoder_depth))
         self.point_decoder = self._decoder(c.width)
         self.point_head = LinearMap(c.width, 3)
         self.conf_decoder = self._decoder(c.width)

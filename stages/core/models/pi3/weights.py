@@ -12,7 +12,7 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from stages.core.errors import InputError
-from stages.core.models.hub import Source, folders
+from stages.core.models.hub import HubSource, folders
 from stages.core.models.pi3.config import Pi3Config
 from stages.core.models.pi3.network import Pi3
 from stages.core.models.pi3.splat import Pi3Splat
@@ -22,7 +22,7 @@ SUFFIXES = (".safetensors", ".pth", ".pt", ".ckpt", ".bin")
 
 
 @dataclass(frozen=True)
-class Published(Source):
+class Pi3Source(HubSource):
     """A network, and where its makers put the weights."""
 
     network: type[nn.Module]
@@ -30,8 +30,8 @@ class Published(Source):
 
 
 PUBLISHED = {
-    "pi3": Published("yyfz233/Pi3", "3.8 GB", "CC BY-NC 4.0", Pi3, ""),
-    "pi3-splat": Published("lishiqianhugh/Pi3_splat", "4.2 GB", "that of π³, CC BY-NC 4.0", Pi3Splat, "encoder."),
+    "pi3": Pi3Source("yyfz233/Pi3", "3.8 GB", "CC BY-NC 4.0", Pi3, ""),
+    "pi3-splat": Pi3Source("lishiqianhugh/Pi3_splat", "4.2 GB", "that of π³, CC BY-NC 4.0", Pi3Splat, "encoder."),
 }
 
 

@@ -6,14 +6,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from stages.core.errors import InputError
-from stages.core.models.hub import Source, fetch, folders
+from stages.core.models.hub import HubSource, fetch, folders
 from stages.core.models.pi3.weights import read_state
 from stages.core.scene.files import must_exist
 
 if TYPE_CHECKING:
     from transformers import Sam2VideoModel
 
-SOURCE = Source("facebook/sam2.1-hiera-large", "0.9 GB", "Apache-2.0")
+SOURCE = HubSource("facebook/sam2.1-hiera-large", "0.9 GB", "Apache-2.0")
 SMALLEST = "facebook/sam2.1-hiera-tiny"  # 0.16 GB, and several times quicker; any size of SAM 2.1 will do
 FILES = ("config.json", "model.safetensors")
 

@@ -6,7 +6,7 @@ import torch
 from stages.core.models.pi3.config import Pi3Config
 from stages.core.models.pi3.dinov2 import REGISTERS, DinoV2
 from stages.core.models.pi3.heads import CameraHead, LinearMap, TransformerDecoder, local_points, orthogonal
-from stages.core.models.pi3.layers import Block
+from stages.core.models.pi3.layers import ViTBlock
 from stages.core.models.pi3.network import CAMERA_REGISTERS, Pi3, alternate
 from stages.core.models.pi3.rope import patch_places, rotate, rotation
 from tests.core.models.pi3.recorded import CLOSE
@@ -56,7 +56,7 @@ def test_the_tokeniser(recorded):
 def test_blocks_within_views_and_over_all_views_in_turn(recorded, at_once):
     given, expected, weights = recorded("alternating_attention")
     registers = weights.pop("register_token")[0]
-    blocks = torch.nn.ModuleList(Block(64, 16, normalised=True, scaled=True) for _ in range(4))
+    blocks = torch.nn.ModuleList(ViTBlock(64, 16, normalised=True, scaled=True) for _ in range(4))
     blocks.load_state_dict({name.removeprefix("decoder."): x for name, x in weights.items()})
     scenes, count, height, width = given["BNHW"].tolist()
     places = patch_places(count, height // 14, width // 14, CAMERA_REGISTERS)

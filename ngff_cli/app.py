@@ -9,8 +9,8 @@ from typer import Argument, Option
 from ngff_cli.options import Commands, Device, SceneIn, Seed, Threads, limit_threads, set_up_logging
 from stages.evaluate.options import EvaluateOptions
 from stages.reconstruct.options import BACKENDS as RECONSTRUCT
-from stages.reconstruct.options import EXTRACTORS as MATCHERS
-from stages.reconstruct.options import QUALITIES, ReconstructOptions
+from stages.reconstruct.options import FEATURE_EXTRACTORS as MATCHERS
+from stages.reconstruct.options import QUALITY_PRESETS, ReconstructOptions
 from stages.refine.options import BACKENDS as REFINE
 from stages.refine.options import RefineOptions
 from stages.render.options import VIEWS, RenderOptions
@@ -21,7 +21,7 @@ from stages.simulate.options import SimulateOptions
 app = typer.Typer(
     cls=Commands, no_args_is_help=True, rich_markup_mode=None, add_completion=False, pretty_exceptions_enable=False
 )
-QUALITY_HELP = " | ".join(QUALITIES)
+QUALITY_HELP = " | ".join(QUALITY_PRESETS)
 
 
 def _version(wanted: bool) -> None:

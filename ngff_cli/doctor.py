@@ -111,7 +111,7 @@ def _published() -> Iterator[str]:
     from stages.reconstruct import features_learned as matcher
 
     finders = {name: partial(pi3.find, name) for name in pi3.PUBLISHED}
-    finders |= {name: partial(matcher.weights, file) for name, file in matcher.FILES.items()}
+    finders |= {name: partial(matcher.weight_file, file) for name, file in matcher.WEIGHT_FILES.items()}
     for name, find in {**finders, "sam2": sam2.find, "diffsplat": lambda: diffsplat.find().gsvae}.items():
         try:
             path = find()

@@ -12,12 +12,12 @@ from torch import Tensor
 from stages.core.geometry.cameras import centres
 from stages.core.scene.cameras import Cameras
 
-WIDE = 60.0  # a larger angle without a photo leaves sides unseen [degrees]
-STEP = 15.0  # between neighbouring photos, as matching likes it [degrees]
-FEW = 10  # photos
-UNCONFIRMED = 0.35  # less of the photos with a depth that others confirm means plain, shiny or clear things
-BLURRED = 0.2  # of the median sharpness
-REASONS, NAMED = 5, 3  # of photos left out: how many are told, and photos named for each
+MAX_GAP = 60.0  # a larger angle without a photo leaves sides unseen [degrees]
+PHOTO_SPACING = 15.0  # between neighbouring photos, as matching likes it [degrees]
+FEW_PHOTOS = 10  # photos
+MIN_CONFIRMED = 0.35  # less of the photos with a depth that others confirm means plain, shiny or clear things
+MIN_SHARPNESS = 0.2  # of the median sharpness
+MAX_REASONS, MAX_NAMED = 5, 3  # of photos left out: how many are told, and photos named for each
 
 
 def advise(
@@ -38,12 +38,12 @@ def advise(
         out.append(f"only {len(cameras)} of {len(cameras) + len(dropped)} photos show enough of the same things: take "
                    "them closer together, each showing two thirds of what the one before it shows")  # fmt: skip
     out += _left_out(dropped) + _around(cameras, focus) + _heights(cameras, focus)
-    if len(cameras) < FEW:
-        out.append(f"{len(cameras)} photos are few: {FEW} to 30 from all around show more sides and fit better")
-    blurred = [cameras.names[i] for i in (sharpness < BLURRED * sharpness.median()).nonzero()[:, 0].tolist()]
+    if len(cameras) < FEW_PHOTOS:
+        out.append(f"{len(cameras)} photos are few: {FEW_PHOTOS} to 30 from all around show more sides and fit better")
+    blurred = [cameras.names[i] for i in (sharpness < MIN_SHARPNESS * sharpness.median()).nonzero()[:, 0].tolist()]
     if blurred:
         out.append(f"blurred beside the others: {', '.join(blurred[:5])}; hold still, or use more light")
-    if float(confirmed.mean()) < UNCONFIRMED:
+    if float(confirmed.mean()) < MIN_CONFIRMED:
         out.append(
             f"photos agree on the depth of only {100 * float(confirmed.mean()):.0f} % of what they show: photos closer "
             "together help, and so does matt, patterned stuff under and around the things; plain, shiny and clear "
@@ -60,12 +60,12 @@ def _left_out(dropped: dict[str, str]) -> list[str]:
     for name, why in dropped.items():
         photos[why].append(name)
     out = []
-    for why, names in list(photos.items())[:REASONS]:
-        more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+    for why, names in list(photos.items())[:MAX_REASONS]:
+        more = f" and {len(names) - MAX_NAMED} more" if len(names) > MAX_NAMED else ""
         verb, each = ("was", "it") if len(names) == 1 else ("were", "each")
-        out.append(f"{', '.join(names[:NAMED])}{more} {verb} left out: {each} {why}")
-    if len(photos) > REASONS:
-        rest = sum(len(names) for names in list(photos.values())[REASONS:])
+        out.append(f"{', '.join(names[:MAX_NAMED])}{more} {verb} left out: {each} {why}")
+    if len(photos) > MAX_REASONS:
+        rest = sum(len(names) for names in list(photos.values())[MAX_REASONS:])
         out.append(f"{rest} more photos were left out, for like reasons")
     return out
 
@@ -73,9 +73,9 @@ def _left_out(dropped: dict[str, str]) -> list[str]:
 def _around(cameras: Cameras, focus: Float[Tensor, "3"]) -> list[str]:
     """The widest angle around the vertical through the focus from which there is no photo."""
     gap, before, after = widest_gap(cameras, focus)
-    if gap <= WIDE:
+    if gap <= MAX_GAP:
         return []
-    count = math.ceil(gap / STEP) - 1
+    count = math.ceil(gap / PHOTO_SPACING) - 1
     return [
         f"nothing was seen from the {gap:.0f} degrees between where {before} and {after} were taken: about {count} "
         "more photos along there would show the sides that are hidden now"

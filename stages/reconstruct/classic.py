@@ -11,36 +11,36 @@ from stages.core.backends import pick_device
 from stages.core.errors import InputError
 from stages.core.geometry.cameras import depths, resize
 from stages.core.scene.cameras import Cameras, LensDistortion, read_cameras
-from stages.reconstruct import depth, sfm, upright
-from stages.reconstruct.finish import Found, finish
+from stages.reconstruct import depth, sfm, world_frame
+from stages.reconstruct.build_scene import SceneGeometry, build_scene
 from stages.reconstruct.options import ReconstructOptions
 from stages.reconstruct.photos import Photos, Reconstruction, Views, undistort
-from stages.reconstruct.steps import Steps
+from stages.reconstruct.step_cache import StepCache
 
 log = logging.getLogger(__name__)
 
 
-def reconstruct(photos: Photos, options: ReconstructOptions, steps: Steps) -> Reconstruction:
+def reconstruct(photos: Photos, options: ReconstructOptions, steps: StepCache) -> Reconstruction:
     """Gaussians of what the photos show, upright, with the cameras that took them."""
     device = pick_device(options.device)
     model, photos = _cameras(photos, options, device, steps)
-    views = undistort(photos, model.cameras, model.lenses, options.side)
-    focus = upright.focus_of(model.cameras.viewmats, _typical_depths(model))
-    ground = upright.find_ground(model.points, model.cameras.viewmats, focus, options.seed)
+    views = undistort(photos, model.cameras, model.lenses, options.max_side)
+    focus = world_frame.focus_point(model.cameras.viewmats, _typical_depths(model))
+    ground = world_frame.find_ground(model.points, model.cameras.viewmats, focus, options.seed)
     trained, held = _split(views, options.holdout)
-    used, part = views[trained], _restrict(model, trained)
-    maps = steps.kept("depth", lambda: depth.estimate(used, part, ground.plane, device), (depth.DepthMap,))
+    used, part = views[trained], _subset(model, trained)
+    maps = steps.cached("depth", lambda: depth.estimate_depth_maps(used, part, ground.plane, device), (depth.DepthMap,))
     least = 2 if len(used) > 3 else 1
-    found = Found(photos.source, views, trained, held, maps, least, focus, ground.radius, dropped=model.dropped)
-    return finish(found, options, steps, device)
+    found = SceneGeometry(photos.source, views, trained, held, maps, least, focus, ground.radius, dropped=model.dropped)
+    return build_scene(found, options, steps, device)
 
 
 def _cameras(
-    photos: Photos, options: ReconstructOptions, device: str, steps: Steps
+    photos: Photos, options: ReconstructOptions, device: str, steps: StepCache
 ) -> tuple[sfm.SparseModel, Photos]:
     """Cameras and sparse points: solved for, or triangulated with the cameras that the user gave."""
     if options.cameras is None:
-        return sfm.solve(photos, options.seed, device, steps, options.matcher), photos
+        return sfm.estimate_cameras(photos, options.seed, device, steps, options.matcher), photos
     cameras, lenses = read_cameras(options.cameras)
     row = {name: i for i, name in enumerate(cameras.names)}
     both = [i for i, name in enumerate(photos.names) if name in row]
@@ -53,11 +53,11 @@ def _cameras(
         log.info("no camera is given for, and left out: %s", ", ".join(sorted(set(photos.names) - set(row))))
     photos = photos[both]
     rows = [row[name] for name in photos.names]
-    cameras, lenses = _in_pixels_of(photos, cameras[rows]), LensDistortion(lenses.coefficients[rows])
+    cameras, lenses = _rescale_to_photos(photos, cameras[rows]), LensDistortion(lenses.coefficients[rows])
     return sfm.triangulate(photos, cameras, lenses, options.seed, steps, options.matcher), photos
 
 
-def _in_pixels_of(photos: Photos, cameras: Cameras) -> Cameras:
+def _rescale_to_photos(photos: Photos, cameras: Cameras) -> Cameras:
     """The cameras with K for photos as loaded, which may be smaller than the files."""
     sizes = torch.tensor([photos.size(i) for i in range(len(photos))])
     share = sizes / cameras.sizes
@@ -69,7 +69,7 @@ def _typical_depths(model: sfm.SparseModel) -> Tensor:
     """Median depth of the sparse points that each camera sees."""
     out = []
     for i, viewmat in enumerate(model.cameras.viewmats):
-        seen = model.seen_point[model.seen_view == i]
+        seen = model.point_index[model.view_index == i]
         z = depths(model.points[seen], viewmat) if len(seen) else depths(model.points, viewmat).clamp_min(0)
         out.append(z.median())
     return torch.stack(out)
@@ -81,12 +81,12 @@ def _split(views: Views, holdout: int) -> tuple[list[int], list[int]]:
     return [i for i in range(len(views)) if i not in held], held
 
 
-def _restrict(model: sfm.SparseModel, index: list[int]) -> sfm.SparseModel:
+def _subset(model: sfm.SparseModel, index: list[int]) -> sfm.SparseModel:
     """The model as some of its cameras see it."""
     new = torch.full((len(model.cameras),), -1)
     new[index] = torch.arange(len(index))
-    keep = new[model.seen_view] >= 0
+    keep = new[model.view_index] >= 0
     return sfm.SparseModel(
         model.cameras[index], LensDistortion(model.lenses.coefficients[index]), model.points,
-        model.seen_point[keep], new[model.seen_view[keep]],
+        model.point_index[keep], new[model.view_index[keep]],
     )  # fmt: skip

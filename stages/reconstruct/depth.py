@@ -23,9 +23,9 @@ from stages.core.geometry.planes import Plane
 from stages.reconstruct.photos import Views
 from stages.reconstruct.sfm import SparseModel
 
-SOURCES = 4  # photos compared with each
-CHECKS = 10  # photos asked to confirm each
-MOST_LABELS = 192  # depth hypotheses a pixel
+MAX_SOURCES = 4  # photos compared with each
+MAX_CHECK_VIEWS = 10  # photos asked to confirm each
+MAX_LABELS = 192  # depth hypotheses a pixel
 STEP_PENALTY, JUMP_PENALTY = 0.03, 0.25  # of semi-global matching, on costs 0..1
 DEPTH_TOLERANCE, PIXEL_TOLERANCE = 0.01, 1.5  # a photo confirms a depth within this share and this many pixels
 
@@ -38,29 +38,29 @@ class DepthMap:
     support: Float[Tensor, "h w"]
 
 
-def estimate(views: Views, model: SparseModel, plane: Plane | None, device: str = "cpu") -> list[DepthMap]:
+def estimate_depth_maps(views: Views, model: SparseModel, plane: Plane | None, device: str = "cpu") -> list[DepthMap]:
     """A depth map of every view, cross-checked against the others. `plane` is the supporting plane, if known."""
-    more = choose_sources(model, CHECKS)
-    sources = [best[:SOURCES] for best in more]
+    more = select_sources(model, MAX_CHECK_VIEWS)
+    sources = [best[:MAX_SOURCES] for best in more]
     raw = []
     for i in tqdm(range(len(views)), desc="matching depth", unit="photo", leave=False):
-        raw.append(_one_view(views, model, i, sources[i], plane, device))
+        raw.append(_match_view(views, model, i, sources[i], plane, device))
     checked = []
     for i in range(len(views)):
         others = {*more[i], *(j for j in range(len(views)) if i in sources[j])}
-        found = confirm(raw, views, i, sorted(others))
+        found = check_consistency(raw, views, i, sorted(others))
         checked.append(DepthMap(found.depth.cpu(), found.support.cpu()))
     return checked
 
 
-def choose_sources(model: SparseModel, count: int) -> list[list[int]]:
+def select_sources(model: SparseModel, count: int) -> list[list[int]]:
     """For every view, those that share most points with it under a useful angle (best near 10 degrees).
 
     Score as in Yao et al. 2018, "MVSNet", sec. 4.1: a Gaussian in the angle, narrower below its centre.
     """
     eyes, c = centres(model.cameras.viewmats), len(model.cameras)
     sees = torch.zeros(c, len(model.points), dtype=torch.bool)
-    sees[model.seen_view, model.seen_point] = True
+    sees[model.view_index, model.point_index] = True
     out = []
     for i in range(c):
         score = torch.zeros(c)
@@ -79,17 +79,19 @@ def choose_sources(model: SparseModel, count: int) -> list[list[int]]:
     return out
 
 
-def _one_view(views: Views, model: SparseModel, i: int, sources: list[int], plane, device: str) -> Float[Tensor, "h w"]:
+def _match_view(
+    views: Views, model: SparseModel, i: int, sources: list[int], plane, device: str
+) -> Float[Tensor, "h w"]:
     """Depth of view i before cross-checking: swept at half size, refined at full size."""
     half = _Stereo(views, i, sources, 0.5, device)
-    low, high = _range(views, model, i)
+    low, high = _depth_range(views, model, i)
     labels = half.labels(low, high)
     cost = half.cost(1 / labels[:, None, None].expand(-1, *half.size))
     eye = centres(views.cameras.viewmats[i : i + 1])[0]
     if plane is not None and plane.heights(eye) > 0:
         normal = (views.cameras.viewmats[i, :3, :3] @ plane.normal).to(device)
         cost = torch.minimum(cost, _slanted_cost(half, labels, normal, float(plane.heights(eye))))
-    index = smooth(cost)
+    index = semi_global_matching(cost)
     inverse = labels[0] + index * (labels[1] - labels[0])
     full = _Stereo(views, i, sources, 1.0, device)
     inverse = F.interpolate(inverse[None, None], full.size, mode="bilinear", align_corners=False)[0, 0]
@@ -99,9 +101,9 @@ def _one_view(views: Views, model: SparseModel, i: int, sources: list[int], plan
     return 1 / inverse.clamp(min=float(labels[0]) / 2)
 
 
-def _range(views: Views, model: SparseModel, i: int) -> tuple[float, float]:
+def _depth_range(views: Views, model: SparseModel, i: int) -> tuple[float, float]:
     """Nearest and farthest depth to try [scene units], from the sparse points of the view with some room."""
-    seen = model.seen_point[model.seen_view == i]
+    seen = model.point_index[model.view_index == i]
     z = depths(model.points[seen if len(seen) >= 10 else slice(None)], views.cameras.viewmats[i])
     z = z[z > 0]
     if not len(z):
@@ -132,7 +134,7 @@ class _Stereo:
         for _, rotated, shift in self.sources:
             pixel = [(rotated * z + shift[:, None, None]) for z in (near, far)]
             ends.append((pixel[0][:2] / pixel[0][2:] - pixel[1][:2] / pixel[1][2:]).norm(dim=0).median())
-        count = int(torch.stack(ends).max().clamp(32, MOST_LABELS))
+        count = int(torch.stack(ends).max().clamp(32, MAX_LABELS))
         return torch.linspace(1 / far, 1 / near, count, device=self.rays.device)
 
     def cost(self, depth: Float[Tensor, "d h w"], chunk: int = 8) -> Float[Tensor, "d h w"]:
@@ -205,7 +207,7 @@ def _slanted_cost(
     slope = slope.clamp_min(0.1)
     step = (labels[1] - labels[0]) / slope[facing].median()
     low, high = 1 / (1.2 * height), 1 / (0.5 * height)
-    inverse = torch.linspace(low, high, int(((high - low) / step).clamp(16, MOST_LABELS)), device=labels.device)
+    inverse = torch.linspace(low, high, int(((high - low) / step).clamp(16, MAX_LABELS)), device=labels.device)
     cost = stereo.cost((1 / inverse)[:, None, None] / slope)
     at = (labels[:, None, None] / slope - low) / (inverse[1] - inverse[0])
     known = (at >= 0) & (at <= len(inverse) - 1) & facing
@@ -215,7 +217,7 @@ def _slanted_cost(
     return torch.where(known, read, torch.ones_like(read))
 
 
-def smooth(cost: Float[Tensor, "d h w"]) -> Float[Tensor, "h w"]:
+def semi_global_matching(cost: Float[Tensor, "d h w"]) -> Float[Tensor, "h w"]:
     """The label (with its fraction) of each pixel by semi-global matching along rows and columns."""
     lines = cost.permute(2, 1, 0).contiguous()  # (w, h, d): a step along the row is one slice
     total = _passes(lines).transpose(0, 1)
@@ -263,7 +265,7 @@ def _refined(stereo: _Stereo, inverse: Float[Tensor, "h w"], step: float) -> Flo
     return inverse + move * step
 
 
-def confirm(maps: list[Tensor], views: Views, i: int, others: list[int]) -> DepthMap:
+def check_consistency(maps: list[Tensor], views: Views, i: int, others: list[int]) -> DepthMap:
     """Depth of view i averaged with that of the views that confirm it, and how many do.
 
     A view confirms a point if its own depth there agrees within DEPTH_TOLERANCE and leads back to
@@ -275,7 +277,7 @@ def confirm(maps: list[Tensor], views: Views, i: int, others: list[int]) -> Dept
     pixels, points = unproject(depth, K, viewmat)
     total, support = depth.clone(), torch.zeros_like(depth)
     for j in others:
-        there, seen = look_up(maps[j], points, Ks[j], viewmats[j])
+        there, seen = look_up_points(maps[j], points, Ks[j], viewmats[j])
         back = torch.cat([there, torch.ones_like(there[..., :1])], -1) @ viewmat.mT
         z = back[..., 2]
         landed = back[..., :2] / z[..., None].clamp_min(1e-9) * K.diagonal()[:2] + K[:2, 2]
@@ -296,7 +298,7 @@ def unproject(
     return pixels, (camera - viewmat[:3, 3]) @ viewmat[:3, :3]
 
 
-def look_up(
+def look_up_points(
     depth: Float[Tensor, "h w"], points: Float[Tensor, "*b 3"], K: Float[Tensor, "3 3"], viewmat: Float[Tensor, "4 4"]
 ) -> tuple[Float[Tensor, "*b 3"], Bool[Tensor, "*b"]]:
     """The world point that a view sees where `points` fall in it, and whether they fall inside."""

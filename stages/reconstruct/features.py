@@ -14,11 +14,12 @@ from tqdm import tqdm
 
 from stages.reconstruct.photos import Photos
 
-SIDE = 1024  # features are found in photos of at most this size [px]
-MOST, MOST_OF_MANY = 6000, 3000  # features kept a photo, the largest first; time to match grows with the square
-EXHAUSTIVE = 60  # up to so many photos all pairs are compared
-RATIO = 0.8  # best match against second best, as Lowe 2004 proposes
-FARTHEST = 0.7  # largest distance between matching descriptors of unit length
+MAX_SIDE = 1024  # features are found in photos of at most this size [px]
+# Features kept per photo, the largest first; matching time grows with the square.
+MAX_FEATURES, MAX_FEATURES_MANY_PHOTOS = 6000, 3000
+MAX_EXHAUSTIVE = 60  # up to so many photos all pairs are compared
+MAX_RATIO = 0.8  # best match against second best, as Lowe 2004 proposes
+MAX_DISTANCE = 0.7  # largest distance between matching descriptors of unit length
 
 Feature = tuple[Tensor, Tensor]  # keypoints (k, 4) in pixels of the photo, centres at +0.5; descriptors (k, 128), bytes
 
@@ -29,11 +30,11 @@ def extract(photos: Photos, device: str = "cpu") -> list[Feature]:
 
     options = pycolmap.FeatureExtractionOptions(use_gpu=False, num_threads=1)
     extractor = pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
-    most = MOST if len(photos) <= EXHAUSTIVE else MOST_OF_MANY
+    most = MAX_FEATURES if len(photos) <= MAX_EXHAUSTIVE else MAX_FEATURES_MANY_PHOTOS
     out = []
     for image in tqdm(photos.images, desc="finding features", unit="photo", leave=False):
         grey = cv2.cvtColor(image.numpy(), cv2.COLOR_RGB2GRAY)
-        shrink = min(1.0, SIDE / max(grey.shape))
+        shrink = min(1.0, MAX_SIDE / max(grey.shape))
         if shrink < 1:
             grey = cv2.resize(grey, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
         keypoints, descriptors = extractor.extract_from_uint8_array(np.ascontiguousarray(grey))
@@ -45,25 +46,25 @@ def extract(photos: Photos, device: str = "cpu") -> list[Feature]:
     return out
 
 
-def unit(descriptors: UInt8[Tensor, "k d"]) -> Float[Tensor, "k d"]:
+def normalise(descriptors: UInt8[Tensor, "k d"]) -> Float[Tensor, "k d"]:
     """Descriptors of unit length."""
     return F.normalize(descriptors.float(), dim=1)
 
 
-def pairs(vectors: list[Float[Tensor, "_ d"]], neighbours: int = 8, similar: int = 20) -> list[tuple[int, int]]:
+def select_pairs(vectors: list[Float[Tensor, "_ d"]], neighbours: int = 8, similar: int = 20) -> list[tuple[int, int]]:
     """All pairs of few photos; of many, those near in order and those that look alike.
 
     Looking alike is the number of matches among the 200 largest features of each photo.
     Source: Wu 2013, "Towards linear-time incremental structure from motion", preemptive matching.
     """
     n = len(vectors)
-    if n <= EXHAUSTIVE:
+    if n <= MAX_EXHAUSTIVE:
         return [(i, j) for i in range(n) for j in range(i + 1, n)]
     chosen = {(i, i + step) for step in range(1, neighbours + 1) for i in range(n - step)}
     likeness = torch.zeros(n, n)
     for i in tqdm(range(n), desc="choosing pairs", unit="photo", leave=False):
         for j in range(i + 1, n):
-            likeness[i, j] = likeness[j, i] = len(match(vectors[i][:200], vectors[j][:200]))
+            likeness[i, j] = likeness[j, i] = len(match_descriptors(vectors[i][:200], vectors[j][:200]))
     best = likeness.topk(min(similar, n - 1), dim=1)
     for i in range(n):
         alike = best.indices[i][best.values[i] >= 4].tolist()
@@ -71,7 +72,7 @@ def pairs(vectors: list[Float[Tensor, "_ d"]], neighbours: int = 8, similar: int
     return sorted(chosen)
 
 
-def match(a: Float[Tensor, "n d"], b: Float[Tensor, "m d"]) -> Int[Tensor, "k 2"]:
+def match_descriptors(a: Float[Tensor, "n d"], b: Float[Tensor, "m d"]) -> Int[Tensor, "k 2"]:
     """Mutual nearest neighbours that pass the ratio and distance tests, as rows (index in a, index in b)."""
     if len(a) < 2 or len(b) < 2:
         return torch.zeros(0, 2, dtype=torch.int64)
@@ -80,11 +81,11 @@ def match(a: Float[Tensor, "n d"], b: Float[Tensor, "m d"]) -> Int[Tensor, "k 2"
     to_a = similarity.argmax(0)
     index = torch.arange(len(a), device=a.device)
     distance = (2 - 2 * best).clamp_min(0).sqrt()
-    keep = (to_a[to_b[:, 0]] == index) & (distance[:, 0] < FARTHEST) & (distance[:, 0] < RATIO * distance[:, 1])
+    keep = (to_a[to_b[:, 0]] == index) & (distance[:, 0] < MAX_DISTANCE) & (distance[:, 0] < MAX_RATIO * distance[:, 1])
     return torch.stack([index[keep], to_b[keep, 0]], 1).cpu()
 
 
-def comparer(found: list[Feature], sizes: list[tuple[int, int]], device: str) -> Callable[[int, int], Tensor]:
+def make_matcher(found: list[Feature], sizes: list[tuple[int, int]], device: str) -> Callable[[int, int], Tensor]:
     """A function of two photos' numbers that gives the rows of `match`."""
-    vectors = [unit(descriptors).to(device) for _, descriptors in found]
-    return lambda i, j: match(vectors[i], vectors[j])
+    vectors = [normalise(descriptors).to(device) for _, descriptors in found]
+    return lambda i, j: match_descriptors(vectors[i], vectors[j])

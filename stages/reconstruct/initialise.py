@@ -14,16 +14,16 @@ from stages.core.geometry.neighbours import spacing
 from stages.core.geometry.planes import Plane
 from stages.core.raster.rasterise import rasterise
 from stages.core.scene.gaussians import Gaussians
-from stages.reconstruct.depth import DepthMap, look_up, unproject
+from stages.reconstruct.depth import DepthMap, look_up_points, unproject
 from stages.reconstruct.photos import Views
 
 log = logging.getLogger(__name__)
 C0 = 0.28209479177387814  # the constant spherical harmonic
-MOST_POINTS = 6_000_000  # before thinning; bounds memory at about 1 GB
+MAX_POINTS = 6_000_000  # before thinning; bounds memory at about 1 GB
 
 
 @dataclass(frozen=True)
-class Cloud:
+class OrientedPoints:
     """Oriented coloured points."""
 
     points: Float[Tensor, "n 3"]
@@ -35,15 +35,15 @@ class Cloud:
     def __len__(self) -> int:
         return len(self.points)
 
-    def __getitem__(self, index) -> Cloud:
-        return Cloud(*(getattr(self, f.name)[index] for f in fields(self)))
+    def __getitem__(self, index) -> OrientedPoints:
+        return OrientedPoints(*(getattr(self, f.name)[index] for f in fields(self)))
 
 
-def join(clouds: list[Cloud]) -> Cloud:
-    return Cloud(*(torch.cat([getattr(c, f.name) for c in clouds]) for f in fields(Cloud)))
+def concatenate_points(clouds: list[OrientedPoints]) -> OrientedPoints:
+    return OrientedPoints(*(torch.cat([getattr(c, f.name) for c in clouds]) for f in fields(OrientedPoints)))
 
 
-def lift(views: Views, i: int, depth: Float[Tensor, "h w"], support: Float[Tensor, "h w"]) -> Cloud:
+def unproject_view(views: Views, i: int, depth: Float[Tensor, "h w"], support: Float[Tensor, "h w"]) -> OrientedPoints:
     """Every pixel of a view as an oriented point (h * w of them, in row order)."""
     K, viewmat = views.cameras.Ks[i], views.cameras.viewmats[i]
     _, points = unproject(depth, K, viewmat)
@@ -53,37 +53,39 @@ def lift(views: Views, i: int, depth: Float[Tensor, "h w"], support: Float[Tenso
     towards = F.normalize(-viewmat[:3, :3].mT @ viewmat[:3, 3] - points, dim=-1)
     normals = torch.where((normals * towards).sum(-1, keepdim=True) > 0.1, normals, towards)
     parts = points, normals, views.image(i), depth / K[0, 0], support
-    return Cloud(*(part.flatten(0, 1) for part in parts))
+    return OrientedPoints(*(part.flatten(0, 1) for part in parts))
 
 
-def fuse(views: Views, maps: list[DepthMap], least: int) -> Cloud:
+def fuse(views: Views, maps: list[DepthMap], least: int) -> OrientedPoints:
     """Points that at least `least` other photos confirm and that do not float before a confirmed surface."""
     pixels = sum(m.depth.numel() for m in maps)
     clouds = []
     for i, m in enumerate(maps):
         keep = (m.support >= least).flatten()
-        if pixels > MOST_POINTS:
+        if pixels > MAX_POINTS:
             generator = torch.Generator().manual_seed(i)
-            keep &= torch.rand(len(keep), generator=generator) < MOST_POINTS / pixels
-        clouds.append(lift(views, i, m.depth, m.support)[keep])
-    cloud = join(clouds)
-    blocked = intrusions(cloud.points, views, maps, least)
+            keep &= torch.rand(len(keep), generator=generator) < MAX_POINTS / pixels
+        clouds.append(unproject_view(views, i, m.depth, m.support)[keep])
+    cloud = concatenate_points(clouds)
+    blocked = free_space_violations(cloud.points, views, maps, least)
     return cloud[blocked <= 0.5 * cloud.support]
 
 
-def intrusions(points: Float[Tensor, "n 3"], views: Views, maps: list[DepthMap], least: int) -> Float[Tensor, "n"]:
+def free_space_violations(
+    points: Float[Tensor, "n 3"], views: Views, maps: list[DepthMap], least: int
+) -> Float[Tensor, "n"]:
     """How many views see a confirmed surface clearly behind each point, which therefore cannot be there."""
     count = torch.zeros(len(points))
     for j, m in enumerate(maps):
         K, viewmat = views.cameras.Ks[j], views.cameras.viewmats[j]
         sure = torch.where(m.support >= least, m.depth, torch.zeros_like(m.depth))
-        surface, inside = look_up(sure, points, K, viewmat)
+        surface, inside = look_up_points(sure, points, K, viewmat)
         behind = surface @ viewmat[2, :3] + viewmat[2, 3]
         count += inside & (behind > 1.04 * (points @ viewmat[2, :3] + viewmat[2, 3]))
     return count
 
 
-def thin(cloud: Cloud, target: int, focus: Float[Tensor, "3"], radius: float) -> Cloud:
+def downsample(cloud: OrientedPoints, target: int, focus: Float[Tensor, "3"], radius: float) -> OrientedPoints:
     """About `target` points: one a cell, the cell a power of two times the pixel's size at the point.
 
     So detail near the cameras stays and far walls need few; what is in focus, within a third of the cameras'
@@ -110,7 +112,7 @@ def thin(cloud: Cloud, target: int, focus: Float[Tensor, "3"], radius: float) ->
     normals = F.normalize(mean(cloud.normals), dim=1)
     lost = normals.norm(dim=1) < 0.5
     normals[lost] = torch.tensor([0.0, 0.0, 1.0])
-    return Cloud(mean(cloud.points), normals, mean(cloud.colours), mean(cloud.footprint), mean(cloud.support))
+    return OrientedPoints(mean(cloud.points), normals, mean(cloud.colours), mean(cloud.footprint), mean(cloud.support))
 
 
 def _cells(points: Float[Tensor, "n 3"], size: Float[Tensor, "n"]) -> Int[Tensor, "n"]:
@@ -121,10 +123,10 @@ def _cells(points: Float[Tensor, "n 3"], size: Float[Tensor, "n"]) -> Int[Tensor
     return mixed * 64 + (level.long() & 63)
 
 
-def fill(
-    views: Views, maps: list[DepthMap], cloud: Cloud, plane: Plane | None, least: int, far: float, stride: int = 3,
-    device: str = "cpu",
-) -> Cloud:  # fmt: skip
+def fill_unmatched(
+    views: Views, maps: list[DepthMap], cloud: OrientedPoints, plane: Plane | None, least: int, far: float,
+    stride: int = 3, device: str = "cpu",
+) -> OrientedPoints:  # fmt: skip
     """Points for what the photos show but no depth was confirmed at: every `stride`-th pixel not yet covered.
 
     In this order: on the supporting plane where it is known nearby or the matched depth is close to it; at the
@@ -136,28 +138,28 @@ def fill(
     for i, m in enumerate(maps):
         sure = m.support >= least
         away = torch.full_like(m.depth, far)
-        depth = torch.where(surrounded(sure), interpolate(m.depth, sure), away)
+        depth = torch.where(surrounded_pixels(sure), interpolate_depth(m.depth, sure), away)
         depth = torch.where(m.support >= 1, m.depth, depth)
         if plane is not None:
-            depth = _on_plane(views, i, depth, m.depth, cloud, plane)
+            depth = _depth_on_plane(views, i, depth, m.depth, cloud, plane)
         rows = torch.zeros_like(sure)
         rows[stride // 2 :: stride, stride // 2 :: stride] = True
-        wanted = (rows & ~covered(views, i, solid)).flatten()
-        close = lift(views, i, depth, torch.zeros_like(depth))[wanted]
-        intrudes = intrusions(close.points, views, maps, 1) > 0
-        distant = lift(views, i, away, torch.zeros_like(depth))[wanted]
+        wanted = (rows & ~covered_pixels(views, i, solid)).flatten()
+        close = unproject_view(views, i, depth, torch.zeros_like(depth))[wanted]
+        intrudes = free_space_violations(close.points, views, maps, 1) > 0
+        distant = unproject_view(views, i, away, torch.zeros_like(depth))[wanted]
         clouds += [close[~intrudes], distant[intrudes]]
-    found = join(clouds)
-    return found[intrusions(found.points, views, maps, least) == 0]
+    found = concatenate_points(clouds)
+    return found[free_space_violations(found.points, views, maps, least) == 0]
 
 
-def surrounded(sure: Bool[Tensor, "h w"], reach: int = 16) -> Bool[Tensor, "h w"]:
+def surrounded_pixels(sure: Bool[Tensor, "h w"], reach: int = 16) -> Bool[Tensor, "h w"]:
     """Whether at least 3 in 10 pixels around each are sure: a hole in a surface, not the open side of it."""
     share = F.avg_pool2d(sure[None, None].float(), 2 * reach + 1, 1, reach, count_include_pad=True)
     return share[0, 0] > 0.3
 
 
-def interpolate(depth: Float[Tensor, "h w"], sure: Bool[Tensor, "h w"]) -> Float[Tensor, "h w"]:
+def interpolate_depth(depth: Float[Tensor, "h w"], sure: Bool[Tensor, "h w"]) -> Float[Tensor, "h w"]:
     """Depth everywhere: confirmed pixels spread over a pyramid of ever coarser means of inverse depth."""
     value, weight = (torch.where(sure, 1 / depth, torch.zeros_like(depth)))[None, None], sure[None, None].float()
     levels = []
@@ -176,8 +178,9 @@ def interpolate(depth: Float[Tensor, "h w"], sure: Bool[Tensor, "h w"]) -> Float
     return 1 / inverse[0, 0].clamp_min(1e-9)
 
 
-def _on_plane(
-    views: Views, i: int, depth: Float[Tensor, "h w"], matched: Float[Tensor, "h w"], cloud: Cloud, plane: Plane
+def _depth_on_plane(
+    views: Views, i: int, depth: Float[Tensor, "h w"], matched: Float[Tensor, "h w"], cloud: OrientedPoints,
+    plane: Plane,
 ) -> Float[Tensor, "h w"]:
     """`depth`, but that of the supporting plane where the ray meets it near points known to lie on it, or
     where `matched` is within 3 % of it."""
@@ -199,24 +202,24 @@ def _on_plane(
 
 
 @torch.no_grad()
-def covered(views: Views, i: int, gaussians: Gaussians) -> Bool[Tensor, "h w"]:
+def covered_pixels(views: Views, i: int, gaussians: Gaussians) -> Bool[Tensor, "h w"]:
     """Pixels of a view that the Gaussians hide by half or more."""
     height, width = views.images[i].shape[:2]
     viewmats, Ks = (x[[i]].to(gaussians.means) for x in (views.cameras.viewmats, views.cameras.Ks))
     return rasterise(gaussians, viewmats, Ks, width, height).alpha[0].cpu() > 0.5
 
 
-def to_gaussians(cloud: Cloud, opacity: Float[Tensor, "n"], degree: int) -> Gaussians:
+def to_gaussians(cloud: OrientedPoints, opacity: Float[Tensor, "n"], degree: int) -> Gaussians:
     """Discs that just overlap: as wide as half the distance to their neighbours, a fifth as thick."""
     width = (0.6 * spacing(cloud.points)).clamp(min=0.3 * cloud.footprint, max=8 * cloud.footprint)
-    quats = turns(cloud.normals)
+    quats = quats_from_normals(cloud.normals)
     sh = torch.zeros(len(cloud), (degree + 1) ** 2, 3)
     sh[:, 0] = (cloud.colours - 0.5) / C0
     scales = torch.stack([width, width, 0.2 * width], 1)
     return Gaussians(cloud.points, quats, scales, opacity, sh, torch.zeros(len(cloud), dtype=torch.int64))
 
 
-def turns(normals: Float[Tensor, "n 3"]) -> Float[Tensor, "n 4"]:
+def quats_from_normals(normals: Float[Tensor, "n 3"]) -> Float[Tensor, "n 4"]:
     """Quaternions w x y z that turn the z axis into each normal by the smallest angle."""
     x, y, z = normals.unbind(1)
     opposite = z < -0.99999  # half a turn about x

@@ -16,37 +16,37 @@ from stages.core.models.pi3.network import Geometry, halve
 from stages.core.models.pi3.splat import Pi3Splat, splat
 from stages.core.models.pi3.weights import find, load
 from stages.core.scene.gaussians import Gaussians
-from stages.reconstruct import crops, points, upright
-from stages.reconstruct.finish import Found, finish
-from stages.reconstruct.merge import merge
+from stages.reconstruct import network_input, pointmaps, world_frame
+from stages.reconstruct.build_scene import SceneGeometry, build_scene
+from stages.reconstruct.merge import merge_gaussians
 from stages.reconstruct.options import ReconstructOptions
 from stages.reconstruct.photos import Photos, Reconstruction
-from stages.reconstruct.steps import Steps
+from stages.reconstruct.step_cache import StepCache
 
 log = logging.getLogger(__name__)
 
 
-def pi3(photos: Photos, options: ReconstructOptions, steps: Steps) -> Reconstruction:
+def pi3(photos: Photos, options: ReconstructOptions, steps: StepCache) -> Reconstruction:
     """One to a hundred photos through π³; Gaussians start on its points."""
     return _reconstruct("pi3", photos, options, steps)
 
 
-def pi3_splat(photos: Photos, options: ReconstructOptions, steps: Steps) -> Reconstruction:
+def pi3_splat(photos: Photos, options: ReconstructOptions, steps: StepCache) -> Reconstruction:
     """The same, but Gaussians are those of the network's splat head."""
     return _reconstruct("pi3-splat", photos, options, steps)
 
 
-def _reconstruct(name: str, photos: Photos, options: ReconstructOptions, steps: Steps) -> Reconstruction:
+def _reconstruct(name: str, photos: Photos, options: ReconstructOptions, steps: StepCache) -> Reconstruction:
     if options.cameras is not None:
         raise InputError(f"--cameras: --backend {name} finds cameras itself; use --backend classic with known ones")
     device = pick_device(options.device)
-    cropped = crops.crops(photos, options.resolution)
-    images = crops.batch(cropped, crops.common_size(photos, options.resolution))
-    geometry, raw = steps.kept("network", lambda: _predicted(name, images, options, device), (Geometry,))
+    cropped = network_input.crop_photos(photos, options.resolution)
+    images = network_input.make_batch(cropped, network_input.common_size(photos, options.resolution))
+    geometry, raw = steps.cached("network", lambda: _predict_geometry(name, images, options, device), (Geometry,))
     return assemble(photos, cropped, geometry, raw, options, steps, device)
 
 
-def _predicted(
+def _predict_geometry(
     name: str, images: Float[Tensor, "v 3 h w"], options: ReconstructOptions, device: str
 ) -> tuple[Geometry, Tensor | None]:
     """What the network says of the images; the raw numbers of Gaussians where it gives those."""
@@ -98,35 +98,35 @@ def assemble(
     geometry: Geometry,
     raw: Float[Tensor, "v h w k"] | None,
     options: ReconstructOptions,
-    steps: Steps,
+    steps: StepCache,
     device: str,
 ) -> Reconstruction:
     """A scene from what a network says about the middles of the photos."""
-    sure = points.trusted(geometry)
+    sure = pointmaps.confident_pixels(geometry)
     log.info("the network is sure of %.0f %% of the pixels", 100 * float(sure.float().mean()))
-    cameras = points.cameras_of(geometry, sure, photos.names)
-    trained, held = split(len(photos), options.holdout)
+    cameras = pointmaps.cameras_from_pointmaps(geometry, sure, photos.names)
+    trained, held = split_holdout(len(photos), options.holdout)
     depth = geometry.points[..., 2]
-    maps = points.depth_maps(depth[trained], sure[trained], cameras[trained])
-    views = points.at_size(cropped, cameras, options.side)
-    maps = [points.enlarged(m, views.images[i].shape[:2]) for i, m in zip(trained, maps, strict=True)]
+    maps = pointmaps.depth_maps(depth[trained], sure[trained], cameras[trained])
+    views = pointmaps.views_at_size(cropped, cameras, options.max_side)
+    maps = [pointmaps.upsample(m, views.images[i].shape[:2]) for i, m in zip(trained, maps, strict=True)]
     distances = torch.stack([d[s].median() if s.any() else d.median() for d, s in zip(depth, sure, strict=True)])
-    focus = upright.focus_of(cameras.viewmats, distances)
+    focus = world_frame.focus_point(cameras.viewmats, distances)
     radius = float((centres(cameras.viewmats) - focus).norm(dim=1).median())
-    gaussians = None if raw is None else _splats(geometry, raw, sure, trained, cameras, options)
-    found = Found(photos.source, views, trained, held, maps, 1, focus, radius, gaussians)
-    return finish(found, options, steps, device)
+    gaussians = None if raw is None else _network_gaussians(geometry, raw, sure, trained, cameras, options)
+    found = SceneGeometry(photos.source, views, trained, held, maps, 1, focus, radius, gaussians)
+    return build_scene(found, options, steps, device)
 
 
-def split(count: int, holdout: int) -> tuple[list[int], list[int]]:
+def split_holdout(count: int, holdout: int) -> tuple[list[int], list[int]]:
     """Indices of the photos to learn from and of those kept out; a single photo is learned from."""
     held = [i for i in range(count) if holdout and i % holdout == 0] if count > 1 else []
     return [i for i in range(count) if i not in held], held
 
 
-def _splats(geometry, raw, sure, trained: list[int], cameras, options: ReconstructOptions) -> Gaussians:
+def _network_gaussians(geometry, raw, sure, trained: list[int], cameras, options: ReconstructOptions) -> Gaussians:
     """The network's Gaussians of the views to learn from where it is to be trusted, no more than the quality asks."""
     part = Geometry(geometry.points[trained], geometry.confidence[trained], geometry.poses[trained])
     keep = sure[trained].flatten()
     footprint = (part.points[..., 2] / cameras.Ks[trained][:, 0, 0, None, None]).flatten()
-    return merge(splat(part, raw[trained].float())[keep], footprint[keep], options.level.gaussians)
+    return merge_gaussians(splat(part, raw[trained].float())[keep], footprint[keep], options.preset.gaussians)

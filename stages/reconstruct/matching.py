@@ -10,28 +10,28 @@ from tqdm import tqdm
 
 from stages.core.backends import choose
 from stages.reconstruct import features
-from stages.reconstruct.options import COMPARERS, EXTRACTORS
+from stages.reconstruct.options import FEATURE_EXTRACTORS, FEATURE_MATCHERS
 from stages.reconstruct.photos import Photos
-from stages.reconstruct.steps import Steps
+from stages.reconstruct.step_cache import StepCache
 
-Pair = tuple[int, int, np.ndarray, np.ndarray]  # two photos and the pixels (k, 2) in each that match
+MatchedPair = tuple[int, int, np.ndarray, np.ndarray]  # two photos and the pixels (k, 2) in each that match
 
 
-def compare(
-    photos: Photos, cameras: list, steps: Steps, seed: int, device: str, matcher: str = "sift"
+def build_database(
+    photos: Photos, cameras: list, steps: StepCache, seed: int, device: str, matcher: str = "sift"
 ) -> Path:
     """A COLMAP database of the photos, taken by pycolmap `cameras` (one a photo), ready to be mapped."""
-    extract = choose(EXTRACTORS, matcher)
+    extract = choose(FEATURE_EXTRACTORS, matcher)
 
     def write(path: Path) -> None:
-        found = steps.kept("features", lambda: extract(photos, device))
+        found = steps.cached("features", lambda: extract(photos, device))
         with steps.timed("matches"):
-            _fill(path, photos, cameras, found, seed, device, matcher)
+            _write_database(path, photos, cameras, found, seed, device, matcher)
 
-    return steps.file("matches.db", write)
+    return steps.cached_file("matches.db", write)
 
 
-def guessed_cameras(photos: Photos) -> list:
+def initial_cameras(photos: Photos) -> list:
     """One camera for all photos of a size and EXIF focal length; without that 1.2 times the longer side.
 
     The k1 of SIMPLE_RADIAL is enough for phones and cameras; one shared camera holds weak geometry together.
@@ -50,7 +50,7 @@ def guessed_cameras(photos: Photos) -> list:
     return [cameras[kind] for kind in kinds]
 
 
-def connected(database: Path) -> list[Pair]:
+def verified_pairs(database: Path) -> list[MatchedPair]:
     """The pairs of photos with enough verified matches; photos count from 0 in the order they were compared."""
     import pycolmap
 
@@ -66,7 +66,7 @@ def connected(database: Path) -> list[Pair]:
     return out
 
 
-def _fill(
+def _write_database(
     path: Path, photos: Photos, cameras: list, found: list[features.Feature], seed: int, device: str, matcher: str
 ) -> None:
     """Writes cameras, photos, keypoints, matches and verified matches."""
@@ -85,13 +85,15 @@ def _fill(
         frame.add_data_id(image.data_id)
         database.write_frame(frame, use_frame_id=True)
         database.write_keypoints(i + 1, found[i][0].numpy())
-    for i, j, matches, geometry in _verified(found, cameras, seed, device, matcher):
+    for i, j, matches, geometry in _match_and_verify(found, cameras, seed, device, matcher):
         database.write_matches(i + 1, j + 1, matches)
         database.write_two_view_geometry(i + 1, j + 1, geometry)
     database.close()
 
 
-def _verified(found: list[features.Feature], cameras: list, seed: int, device: str, matcher: str) -> list[tuple]:
+def _match_and_verify(
+    found: list[features.Feature], cameras: list, seed: int, device: str, matcher: str
+) -> list[tuple]:
     """Matches and two-view geometry of all pairs worth comparing, verified in the background while more are matched."""
     import pycolmap
 
@@ -99,8 +101,8 @@ def _verified(found: list[features.Feature], cameras: list, seed: int, device: s
     options.ransac.random_seed = seed
     options.ransac.max_num_trials = 3000  # a pair that needs more shares too little to be of use
     pixels = [table[:, :2].double().numpy() for table, *_ in found]
-    vectors = [features.unit(descriptors) for _, descriptors, *_ in found]
-    same = choose(COMPARERS, matcher)(found, [(c.width, c.height) for c in cameras], device)
+    vectors = [features.normalise(descriptors) for _, descriptors, *_ in found]
+    same = choose(FEATURE_MATCHERS, matcher)(found, [(c.width, c.height) for c in cameras], device)
 
     def verify(i: int, j: int, matches: np.ndarray) -> tuple:
         geometry = pycolmap.estimate_two_view_geometry(cameras[i], pixels[i], cameras[j], pixels[j], matches, options)
@@ -108,7 +110,7 @@ def _verified(found: list[features.Feature], cameras: list, seed: int, device: s
 
     pending = []
     with ThreadPoolExecutor(1) as background:
-        for i, j in tqdm(features.pairs(vectors), desc="matching photos", unit="pair", leave=False):
+        for i, j in tqdm(features.select_pairs(vectors), desc="matching photos", unit="pair", leave=False):
             matches = same(i, j).numpy().astype(np.uint32)
             if len(matches) >= options.min_num_inliers:
                 pending.append(background.submit(verify, i, j, matches))

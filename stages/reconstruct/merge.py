@@ -13,7 +13,7 @@ from stages.core.scene.gaussians import Gaussians
 PRIMES = (73_856_093, 19_349_663, 83_492_791)  # Teschner et al. 2003, "Optimized spatial hashing"
 
 
-def merge(gaussians: Gaussians, footprint: Float[Tensor, "n"], target: int) -> Gaussians:
+def merge_gaussians(gaussians: Gaussians, footprint: Float[Tensor, "n"], target: int) -> Gaussians:
     """About `target` Gaussians or fewer.
 
     A cell's side grows with the size of a pixel, `footprint`, at the Gaussian, in steps of two, so what is near the

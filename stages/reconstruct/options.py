@@ -13,32 +13,32 @@ BACKENDS = {
     "pi3": "stages.reconstruct.learned:pi3",
     "pi3-splat": "stages.reconstruct.learned:pi3_splat",
 }
-EXTRACTORS = {
+FEATURE_EXTRACTORS = {
     "sift": "stages.reconstruct.features:extract",
     "aliked-lightglue": "stages.reconstruct.features_learned:extract",
 }
-COMPARERS = {
-    "sift": "stages.reconstruct.features:comparer",
-    "aliked-lightglue": "stages.reconstruct.features_learned:comparer",
+FEATURE_MATCHERS = {
+    "sift": "stages.reconstruct.features:make_matcher",
+    "aliked-lightglue": "stages.reconstruct.features_learned:make_matcher",
 }
-MONOCULAR = {"pi3", "pi3-splat"}  # backends that one photo is enough for
+SINGLE_PHOTO_BACKENDS = {"pi3", "pi3-splat"}  # backends that one photo is enough for
 
 
 @dataclass(frozen=True)
-class Quality:
+class QualityPreset:
     """What a word like "normal" stands for."""
 
-    side: int  # longest side the photos are worked at [px]
+    max_side: int  # longest side the photos are worked at [px]
     gaussians: int  # how many to start from
-    steps: int  # photometric steps on a CPU, each on one photo; many photos get up to twice as many
-    steps_cuda: int  # the same on a GPU
+    iterations: int  # photometric steps on a CPU, each on one photo; many photos get up to twice as many
+    iterations_cuda: int  # the same on a GPU
     degree: int  # of the spherical harmonics
 
 
-QUALITIES = {
-    "draft": Quality(side=512, gaussians=50_000, steps=300, steps_cuda=1000, degree=0),
-    "normal": Quality(side=640, gaussians=90_000, steps=800, steps_cuda=3000, degree=2),
-    "high": Quality(side=1024, gaussians=300_000, steps=3000, steps_cuda=3500, degree=3),
+QUALITY_PRESETS = {
+    "draft": QualityPreset(max_side=512, gaussians=50_000, iterations=300, iterations_cuda=1000, degree=0),
+    "normal": QualityPreset(max_side=640, gaussians=90_000, iterations=800, iterations_cuda=3000, degree=2),
+    "high": QualityPreset(max_side=1024, gaussians=300_000, iterations=3000, iterations_cuda=3500, degree=3),
 }
 
 
@@ -59,10 +59,10 @@ class ReconstructOptions:
     device: str = "auto"
 
     def __post_init__(self):
-        if self.matcher not in EXTRACTORS:
-            raise InputError(f"--matcher {self.matcher}: choose from {', '.join(EXTRACTORS)}")
-        if self.quality not in QUALITIES:
-            raise InputError(f"--quality {self.quality}: choose from {', '.join(QUALITIES)}")
+        if self.matcher not in FEATURE_EXTRACTORS:
+            raise InputError(f"--matcher {self.matcher}: choose from {', '.join(FEATURE_EXTRACTORS)}")
+        if self.quality not in QUALITY_PRESETS:
+            raise InputError(f"--quality {self.quality}: choose from {', '.join(QUALITY_PRESETS)}")
         if self.holdout < 0 or self.holdout == 1:
             raise InputError(f"--holdout {self.holdout}: give 0 for none, or 2 or more for every N-th photo")
         if self.resolution is not None and not 64 <= self.resolution <= 4096:
@@ -72,16 +72,16 @@ class ReconstructOptions:
             raise InputError(f"--iterations {self.iterations}: give 0 for none, or more")
 
     @property
-    def level(self) -> Quality:
-        return QUALITIES[self.quality]
+    def preset(self) -> QualityPreset:
+        return QUALITY_PRESETS[self.quality]
 
     @property
-    def side(self) -> int:
-        return self.resolution or self.level.side
+    def max_side(self) -> int:
+        return self.resolution or self.preset.max_side
 
-    def steps(self, photos: int, device: str) -> int:
+    def iteration_count(self, photos: int, device: str) -> int:
         """Photometric steps: fixed by quality, device and photo count, so that a seed gives the same scene again."""
         if self.iterations is not None:
             return self.iterations
-        base = self.level.steps_cuda if device == "cuda" else self.level.steps
+        base = self.preset.iterations_cuda if device == "cuda" else self.preset.iterations
         return base * min(max(photos, 20), 40) // 20

@@ -27,14 +27,14 @@ from stages.core.scene.cameras import Cameras
 from stages.core.scene.gaussians import Gaussians
 from stages.reconstruct.photos import Views
 
-STRUCTURE = 0.2  # weight of 1 - SSIM against L1
-RATES = {"scales": 5e-3, "quats": 2e-3, "opacities": 3e-2, "base": 5e-3, "rest": 2.5e-4, "gains": 2e-3}
-DEPTH = 0.1  # weight of the error in inverse depth, in units of one over the cameras' distance
-SPARING = 0.01  # weight of the mean scale over the cameras' distance
-MOVE = 2e-4  # of the means, times the cameras' distance; falls to a hundredth of it
-FAINT = 0.02  # Gaussians of less opacity are dropped
-SPLITS = (0.2, 0.4)  # after these shares of the steps, Gaussians where detail is missing are split
-SPLIT_SHARE = 0.08  # of the Gaussians, each time
+SSIM_WEIGHT = 0.2  # weight of 1 - SSIM against L1
+LEARNING_RATES = {"scales": 5e-3, "quats": 2e-3, "opacities": 3e-2, "base": 5e-3, "rest": 2.5e-4, "gains": 2e-3}
+DEPTH_WEIGHT = 0.1  # weight of the error in inverse depth, in units of one over the cameras' distance
+SCALE_WEIGHT = 0.01  # weight of the mean scale over the cameras' distance
+MEANS_RATE = 2e-4  # of the means, times the cameras' distance; falls to a hundredth of it
+MIN_OPACITY = 0.02  # Gaussians of less opacity are dropped
+SPLIT_TIMES = (0.2, 0.4)  # after these shares of the steps, Gaussians where detail is missing are split
+SPLIT_FRACTION = 0.08  # of the Gaussians, each time
 
 
 @dataclass
@@ -59,9 +59,10 @@ class _Fit:
             "gains": torch.zeros(len(cameras), 3, device=device),  # logarithms, one a photo and channel
         }
         values = {name: value.clone().requires_grad_() for name, value in values.items() if value.numel()}
-        rates = {**RATES, "means": MOVE * reach}
+        rates = {**LEARNING_RATES, "means": MEANS_RATE * reach}
         groups = [{"params": [value], "lr": rates[name], "name": name} for name, value in values.items()]
-        return cls(values, torch.optim.Adam(groups, eps=1e-15, fused=True), reach, _unexplained(cameras).to(device))
+        optimiser = torch.optim.Adam(groups, eps=1e-15, fused=True)
+        return cls(values, optimiser, reach, _exposure_projection(cameras).to(device))
 
     def gaussians(self) -> Gaussians:
         """As the rasteriser wants them, with gradients."""
@@ -92,7 +93,7 @@ class _Fit:
             group["params"][0] = self.values[group["name"]] = new
 
 
-def refine(
+def fit_gaussians(
     gaussians: Gaussians,
     views: Views,
     steps: int,
@@ -110,29 +111,29 @@ def refine(
     if not steps:
         return gaussians
     fit = _Fit.start(gaussians.to(device), views.cameras, reach)
-    near = _moved(views, device)
+    near = _to_device(views, device)
     inverse = [(reach / depth).to(device) for depth in depths]
     generator = torch.Generator().manual_seed(seed)
-    splits = {round(share * steps) for share in SPLITS if steps >= 200}
+    splits = {round(share * steps) for share in SPLIT_TIMES if steps >= 200}
     pull = torch.zeros(len(gaussians), device=device)
     order: list[int] = []
     with tqdm(range(steps), desc="fitting photos", unit="step", leave=False) as bar:
         for step in bar:
             order = order or torch.randperm(len(views), generator=generator).tolist()
             view, grey = order.pop(), float(torch.rand((), generator=generator))
-            loss = _step(fit, near, view, grey, device, inverse[view] if inverse else None)
+            loss = _backward(fit, near, view, grey, device, inverse[view] if inverse else None)
             pull += fit.values["means"].grad.norm(dim=1)
             fit.optimiser.step()
-            fit.optimiser.param_groups[0]["lr"] = MOVE * reach * 0.01 ** (step / steps)
+            fit.optimiser.param_groups[0]["lr"] = MEANS_RATE * reach * 0.01 ** (step / steps)
             if step in splits:
                 _split(fit, pull, generator)
                 pull = torch.zeros(len(fit.values["means"]), device=device)
             if step % 20 == 0:
                 bar.set_postfix(loss=f"{loss.item():.4f}")
-    return _finished(fit, views, pull > 0, reach)
+    return _prune(fit, views, pull > 0, reach)
 
 
-def _unexplained(cameras: Cameras) -> Float[Tensor, "c c"]:
+def _exposure_projection(cameras: Cameras) -> Float[Tensor, "c c"]:
     """The projection that leaves of numbers, one a camera, nothing constant or linear in its place and direction.
 
     With few cameras only in their main directions, so that most of what the numbers tell stays.
@@ -146,14 +147,14 @@ def _unexplained(cameras: Cameras) -> Float[Tensor, "c c"]:
     return (torch.eye(count, dtype=main.dtype) - basis @ basis.T).float()
 
 
-def _moved(views: Views, device: str) -> Views:
+def _to_device(views: Views, device: str) -> Views:
     """All at once: a copy a step would wait for the GPU."""
     cameras = views.cameras
     cameras = replace(cameras, viewmats=cameras.viewmats.to(device), Ks=cameras.Ks.to(device))
     return Views(tuple(image.to(device) for image in views.images), cameras)
 
 
-def _step(
+def _backward(
     fit: _Fit, views: Views, view: int, grey: float, device: str, inverse: Float[Tensor, "h w"] | None = None
 ) -> Float[Tensor, ""]:
     """The loss on one photo, and its gradients; `inverse` is its inverse depth times the reach, inf where unknown."""
@@ -164,12 +165,12 @@ def _step(
     gaussians = fit.gaussians()
     rendering = rasterise(gaussians, views.cameras.viewmats[one], views.cameras.Ks[one], width, height, background)
     image = rendering.rgb[0] * fit.gain(view)
-    loss = (1 - STRUCTURE) * (image - photo).abs().mean() + STRUCTURE * (1 - ssim(image, photo))
-    loss = loss + SPARING * gaussians.scales.mean() / fit.reach
+    loss = (1 - SSIM_WEIGHT) * (image - photo).abs().mean() + SSIM_WEIGHT * (1 - ssim(image, photo))
+    loss = loss + SCALE_WEIGHT * gaussians.scales.mean() / fit.reach
     if inverse is not None:
         error = fit.reach / rendering.depth[0].clamp_min(0.1 * fit.reach) - inverse
         known = error.isfinite() & (rendering.alpha[0] > 0.5)
-        loss = loss + DEPTH * torch.where(known, error, torch.zeros_like(error)).abs().mean()
+        loss = loss + DEPTH_WEIGHT * torch.where(known, error, torch.zeros_like(error)).abs().mean()
     fit.optimiser.zero_grad(set_to_none=True)
     loss.backward()
     return loss.detach()  # a number in Python would wait for the GPU
@@ -182,15 +183,15 @@ def _split(fit: _Fit, pull: Float[Tensor, "n"], generator: torch.Generator) -> N
     would gain if it moved by its own width.
     """
     v = {name: value.detach() for name, value in fit.values.items()}
-    alive = v["opacities"].sigmoid() > FAINT
+    alive = v["opacities"].sigmoid() > MIN_OPACITY
     size = v["scales"].exp().max(1).values
-    count = int(SPLIT_SHARE * int(alive.sum()))
+    count = int(SPLIT_FRACTION * int(alive.sum()))
     chosen = torch.where(alive, pull * size, -torch.ones_like(pull)).topk(count).indices
     keep = torch.cat([alive.nonzero()[:, 0], chosen])
     first = torch.searchsorted(alive.nonzero()[:, 0], chosen)  # where the kept halves now are
     second = torch.arange(len(keep) - count, len(keep), device=keep.device)
     offset = torch.randn(count, 3, generator=generator).to(size.device) * v["scales"][chosen].exp()
-    offset = _turned(v["quats"][chosen], offset)
+    offset = _rotate(v["quats"][chosen], offset)
     fit.rows(keep, torch.cat([first, second]))
     with torch.no_grad():
         fit.values["means"][first] += 0.7 * offset
@@ -199,11 +200,11 @@ def _split(fit: _Fit, pull: Float[Tensor, "n"], generator: torch.Generator) -> N
             fit.values["scales"][rows] -= 0.47  # 1.6 times smaller
 
 
-def _turned(quats: Float[Tensor, "n 4"], vectors: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+def _rotate(quats: Float[Tensor, "n 4"], vectors: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
     return (matrix(quats) @ vectors[..., None])[..., 0]
 
 
-def _finished(fit: _Fit, views: Views, touched: Bool[Tensor, "n"], reach: float) -> Gaussians:
+def _prune(fit: _Fit, views: Views, touched: Bool[Tensor, "n"], reach: float) -> Gaussians:
     """Without what is faint, what no photo saw, what grew out of proportion, and what hangs before a lens."""
     done = fit.gaussians()
     done = Gaussians(*(getattr(done, field.name).detach().cpu() for field in fields(Gaussians)))
@@ -211,11 +212,11 @@ def _finished(fit: _Fit, views: Views, touched: Bool[Tensor, "n"], reach: float)
     close = torch.cdist(done.means, eyes).min(1).values < 0.1 * reach
     distance = (done.means - eyes.mean(0)).norm(dim=1)
     huge = done.scales.max(1).values > 0.1 * distance.clamp_min(reach)
-    keep = (done.opacities > FAINT) & touched.cpu() & ~close & ~huge
+    keep = (done.opacities > MIN_OPACITY) & touched.cpu() & ~close & ~huge
     return done[keep & done.means.isfinite().all(1)]
 
 
-def score(
+def score_views(
     gaussians: Gaussians, views: Views, index: list[int], device: str = "cpu", exposed: bool = False,
     background: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> tuple[float, float]:

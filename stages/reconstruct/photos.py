@@ -59,7 +59,7 @@ class Reconstruction:
     scene: Scene
     views: Views
     trained: list[int]  # views the Gaussians were fitted to
-    held: list[int]  # views kept out
+    held_out: list[int]  # views kept out
     dropped: dict[str, str]  # photos left out, and why
     advice: list[str]  # what would improve the result, a sentence each
 

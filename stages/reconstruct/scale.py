@@ -11,8 +11,8 @@ from stages.core.errors import InputError
 if TYPE_CHECKING:
     from stages.core.scene.cameras import Cameras
 
-FORM = re.compile(r"(?:photos=(?P<first>[^,]+),(?P<second>.+?)\s+)?distance=(?P<distance>[0-9.eE+-]+)")
-FORMS = (
+PATTERN = re.compile(r"(?:photos=(?P<first>[^,]+),(?P<second>.+?)\s+)?distance=(?P<distance>[0-9.eE+-]+)")
+USAGE = (
     '"photos=FIRST.jpg,LAST.jpg distance=0.5" (from camera to camera) or "distance=0.6" (from the cameras to what they '
     "look at), in metres"
 )
@@ -31,7 +31,7 @@ class ScaleReference:
         if absent:
             raise InputError(f"--scale-reference: no camera found for {', '.join(absent)}; name photos that are used")
 
-    def measured(self, cameras: Cameras, reach: float) -> float:
+    def in_scene_units(self, cameras: Cameras, reach: float) -> float:
         """The same length in the units of the cameras; `reach` is their distance from what they look at."""
         from stages.core.geometry.cameras import centres
 
@@ -51,12 +51,12 @@ def parse_scale(text: str) -> ScaleReference | None:
         return None
     if "object" in text and "photos" not in text:
         raise InputError(f"--scale-reference {text!r}: objects are known only once segmented, and `ngff segment` has "
-                         f"the same option; here give {FORMS}")  # fmt: skip
-    found = FORM.fullmatch(text.strip())
+                         f"the same option; here give {USAGE}")  # fmt: skip
+    found = PATTERN.fullmatch(text.strip())
     try:
         distance = float(found["distance"])
     except (TypeError, ValueError) as error:
-        raise InputError(f"--scale-reference {text!r}: give {FORMS}") from error
+        raise InputError(f"--scale-reference {text!r}: give {USAGE}") from error
     if not 0 < distance < 1e5:
         raise InputError(f"--scale-reference {text!r}: the distance must be more than 0 and less than 100,000 m")
     return ScaleReference(distance, (found["first"], found["second"]) if found["first"] else ())

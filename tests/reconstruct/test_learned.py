@@ -16,9 +16,9 @@ from stages.core.scene.scene_ply import read_scene
 from stages.reconstruct import learned
 from stages.reconstruct import options as choices
 from stages.reconstruct.options import ReconstructOptions
-from stages.reconstruct.photometric import score
+from stages.reconstruct.photometric import score_views
 from stages.reconstruct.stage import run
-from stages.reconstruct.steps import Steps
+from stages.reconstruct.step_cache import StepCache
 from tests.core.models.pi3.test_network import TINY, random_weights
 from tests.core.models.pi3.test_splat import TINY_SPLAT
 from tests.reconstruct.oracle import photos_of, true_splats, truth
@@ -38,8 +38,8 @@ def one_thread():
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch):
-    draft = dataclasses.replace(choices.QUALITIES["draft"], gaussians=5000, steps=40)
-    monkeypatch.setitem(choices.QUALITIES, "draft", draft)
+    draft = dataclasses.replace(choices.QUALITY_PRESETS["draft"], gaussians=5000, iterations=40)
+    monkeypatch.setitem(choices.QUALITY_PRESETS, "draft", draft)
 
 
 def assembled(tmp_path, count=4, splats=False, noise=0.0, **given):
@@ -52,7 +52,7 @@ def assembled(tmp_path, count=4, splats=False, noise=0.0, **given):
         geometry = dataclasses.replace(geometry, points=geometry.points * wobble[..., None])
     raw = true_splats(photos, SIZE, geometry, float(cameras.Ks[0, 0, 0])) if splats else None
     options = ReconstructOptions(**{"quality": "draft", **given})
-    made = learned.assemble(photos, list(photos.images), geometry, raw, options, Steps(), "cpu")
+    made = learned.assemble(photos, list(photos.images), geometry, raw, options, StepCache(), "cpu")
     return made, cameras
 
 
@@ -80,31 +80,31 @@ def test_a_true_answer_gives_the_true_scene(tmp_path, splats):
     up = back.rotation @ torch.tensor([0.0, 0, 1])
     assert up[2] > 0.9998  # a degree
     assert abs(float(back(torch.zeros(1, 3))[0, 2])) < 0.01  # the floor is the table
-    assert score(made.scene.gaussians, made.views, made.trained)[0] > 17  # the photos' mean colour alone scores 12.6
+    assert score_views(made.scene.gaussians, made.views, made.trained)[0] > 17  # the mean colour: 12.6
 
 
 def test_noise_of_two_percent_is_survived_and_fitting_improves_the_picture(tmp_path):
     plain, cameras = assembled(tmp_path, noise=0.02, iterations=0, holdout=3)
     fitted, _ = assembled(tmp_path, noise=0.02, iterations=60, holdout=3)
-    assert plain.held == [0, 3]
-    before, after = (score(made.scene.gaussians, made.views, made.held)[0] for made in (plain, fitted))
+    assert plain.held_out == [0, 3]
+    before, after = (score_views(made.scene.gaussians, made.views, made.held_out)[0] for made in (plain, fitted))
     assert after > before + 0.5
     assert surface_error(to_truth(fitted, cameras)(fitted.scene.gaussians.means)).median() < 0.03
 
 
 def test_one_photo_is_enough(tmp_path):
     made, cameras = assembled(tmp_path, count=1, iterations=0, holdout=3)
-    assert made.trained == [0] and not made.held
+    assert made.trained == [0] and not made.held_out
     scale = 1.6 / float(centres(made.scene.cameras.viewmats)[0].norm())
     assert float(centres(made.scene.cameras.viewmats)[0, 2]) * scale == pytest.approx(
         float(centres(cameras.viewmats)[0, 2]), rel=0.1
     )  # as high above the table as it was
-    assert score(made.scene.gaussians, made.views, [0])[0] > 17
+    assert score_views(made.scene.gaussians, made.views, [0])[0] > 17
 
 
 def test_without_a_supporting_plane_there_is_no_floor(tmp_path, monkeypatch):
     assert assembled(tmp_path, count=2, iterations=0)[0].scene.floor == 0.0
-    monkeypatch.setattr("stages.reconstruct.upright.LEAST", ())  # no plane is good enough
+    monkeypatch.setattr("stages.reconstruct.world_frame.PLANE_CRITERIA", ())  # no plane is good enough
     made, _ = assembled(tmp_path, count=2, iterations=0)
     assert made.scene.floor is None
     assert any("no table or floor" in sentence for sentence in made.advice)
@@ -114,7 +114,7 @@ def test_few_gaussians_of_a_network_look_like_the_many_they_stand_for(tmp_path):
     many, _ = assembled(tmp_path, count=2, splats=True, iterations=0, quality="high")
     few, _ = assembled(tmp_path, count=2, splats=True, iterations=0)
     assert len(few.scene.gaussians) <= 1.25 * 5000 < len(many.scene.gaussians)
-    loss = score(many.scene.gaussians, many.views, [1])[0] - score(few.scene.gaussians, few.views, [1])[0]
+    loss = score_views(many.scene.gaussians, many.views, [1])[0] - score_views(few.scene.gaussians, few.views, [1])[0]
     assert loss < 1
 
 

@@ -5,7 +5,7 @@ import dataclasses
 import torch
 
 from stages.core.geometry.rotations import covariance
-from stages.reconstruct.merge import merge
+from stages.reconstruct.merge import merge_gaussians
 from tests.conftest import random_gaussians
 
 
@@ -16,7 +16,7 @@ def test_a_mixture_keeps_its_mean_and_covariance():
         two, means=torch.tensor([[0.1, 0.2, 0.2], [0.3, 0.2, 0.2]]), scales=torch.full((2, 3), 0.05),
         opacities=torch.tensor([0.6, 0.6]),
     )  # fmt: skip
-    one = merge(same, torch.full((2,), 0.05), 1)
+    one = merge_gaussians(same, torch.full((2,), 0.05), 1)
     assert len(one) == 1
     torch.testing.assert_close(one.means[0], torch.tensor([0.2, 0.2, 0.2]))
     expected = torch.diag(torch.tensor([0.05**2 + 0.1**2, 0.05**2, 0.05**2]))
@@ -27,10 +27,10 @@ def test_a_mixture_keeps_its_mean_and_covariance():
 
 def test_the_number_is_kept_and_few_are_left_alone():
     many = random_gaussians(4000)
-    fewer = merge(many, torch.full((4000,), 0.01), 500)
+    fewer = merge_gaussians(many, torch.full((4000,), 0.01), 500)
     assert 350 < len(fewer) <= 500
     torch.testing.assert_close(fewer.means.mean(0), many.means.mean(0), rtol=0, atol=0.05)
-    assert merge(many, torch.full((4000,), 0.01), 4000) is many
+    assert merge_gaussians(many, torch.full((4000,), 0.01), 4000) is many
 
 
 def test_what_is_near_keeps_its_detail():
@@ -41,5 +41,5 @@ def test_what_is_near_keeps_its_detail():
     )  # fmt: skip
     both.means[2000:, 0] += 10
     footprint = torch.cat([torch.full((2000,), 0.01), torch.full((2000,), 0.08)])
-    fewer = merge(both, footprint, 1000)
+    fewer = merge_gaussians(both, footprint, 1000)
     assert (fewer.means[:, 0] < 5).sum() > 2 * (fewer.means[:, 0] > 5).sum()

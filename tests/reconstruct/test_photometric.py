@@ -29,14 +29,14 @@ def target() -> tuple[Gaussians, Views]:
 def test_wrong_colours_are_put_right(target):
     true, views = target
     start = replace(true, sh=true.sh + 1)
-    before, _ = photometric.score(start, views, list(range(6)))
-    after, _ = photometric.score(photometric.refine(start, views, 150, 2.0), views, list(range(6)))
+    before, _ = photometric.score_views(start, views, list(range(6)))
+    after, _ = photometric.score_views(photometric.fit_gaussians(start, views, 150, 2.0), views, list(range(6)))
     assert after > before + 6
 
 
 def test_the_same_seed_gives_the_same_gaussians(target):
     true, views = target
-    first, second = (photometric.refine(true, views, 12, 2.0, seed=3) for _ in range(2))
+    first, second = (photometric.fit_gaussians(true, views, 12, 2.0, seed=3) for _ in range(2))
     for name in ("means", "quats", "scales", "opacities", "sh"):
         torch.testing.assert_close(getattr(first, name), getattr(second, name), rtol=0, atol=1e-6)
 
@@ -45,9 +45,9 @@ def test_scores_may_leave_exposure_out(target):
     """Photos of 0.8 times the light: 20 dB off, and next to nothing once exposed alike."""
     true, views = target
     dark = replace(views, images=tuple((0.8 * image.float()).round().to(torch.uint8) for image in views.images))
-    exact, _ = photometric.score(true, views, [0, 1])
-    raw, _ = photometric.score(true, dark, [0, 1])
-    fitted, _ = photometric.score(true, dark, [0, 1], exposed=True)
+    exact, _ = photometric.score_views(true, views, [0, 1])
+    raw, _ = photometric.score_views(true, dark, [0, 1])
+    fitted, _ = photometric.score_views(true, dark, [0, 1], exposed=True)
     assert raw < 30 < 45 < fitted and exact > 45
 
 
@@ -58,7 +58,7 @@ def test_a_darker_photo_is_taken_as_exposure(target):
     fit = photometric._Fit.start(true, views.cameras, 2.0)
     for _ in range(100):
         for view in (0, 3):
-            photometric._step(fit, Views(tuple(images), views.cameras), view, 0.0, "cpu")
+            photometric._backward(fit, Views(tuple(images), views.cameras), view, 0.0, "cpu")
             fit.values["means"].grad.zero_()
             fit.optimiser.step()
     assert float(fit.gain(0).detach().mean()) < float(fit.gain(3).detach().mean())
@@ -70,7 +70,7 @@ def test_what_no_photo_shows_shrinks_and_stays_as_opaque(target):
     unseen = replace(true[[0]], means=torch.tensor([[0.0, 0, 60.0]]))
     fit = photometric._Fit.start(concatenate([true, unseen]), views.cameras, 2.0)
     for _ in range(20):
-        photometric._step(fit, views, 0, 0.0, "cpu")
+        photometric._backward(fit, views, 0, 0.0, "cpu")
         fit.optimiser.step()
     after = fit.gaussians()
     assert (after.scales[-1] < 0.95 * unseen.scales).all()
@@ -80,7 +80,7 @@ def test_what_no_photo_shows_shrinks_and_stays_as_opaque(target):
 def test_exposure_that_goes_with_the_place_is_left_to_the_harmonics():
     """Light that grows to one side is view-dependent colour; a single photo taken too dark is not."""
     cameras = ring(40, 48)
-    own = photometric._unexplained(cameras).double()
+    own = photometric._exposure_projection(cameras).double()
     torch.testing.assert_close(own @ own, own)
     smooth = 0.3 * torch.linalg.inv(cameras.viewmats.double())[:, 0, 3] + 0.2
     assert float((own @ smooth).abs().max()) < 1e-5
@@ -92,7 +92,7 @@ def test_exposure_that_goes_with_the_place_is_left_to_the_harmonics():
 
 @pytest.mark.parametrize("count", [1, 2, 3, 7])
 def test_few_photos_may_differ_in_exposure(count):
-    own = photometric._unexplained(ring(count, 48))
+    own = photometric._exposure_projection(ring(count, 48))
     assert own.isfinite().all() and round(float(own.trace())) == count - 1 - count // 4
 
 
@@ -105,7 +105,7 @@ def test_what_was_lost_is_dropped():
     opacities = true.opacities.clone()
     opacities[5:10] = 1e-3
     start = Gaussians(behind, true.quats, true.scales, opacities, true.sh, true.object_id)
-    done = photometric.refine(start, views, 5, 2.0)
+    done = photometric.fit_gaussians(start, views, 5, 2.0)
     assert len(done) <= 50
     assert done.means[:, 2].max() < 10
 
@@ -118,7 +118,7 @@ def test_splitting_keeps_the_mass_and_shrinks_the_halves():
     fit.values["means"].grad = torch.zeros(100, 3)
     photometric._split(fit, pull / fit.values["scales"].detach().exp().max(1).values, torch.Generator().manual_seed(0))
     after = fit.gaussians()
-    count = int(photometric.SPLIT_SHARE * 100)
+    count = int(photometric.SPLIT_FRACTION * 100)
     assert len(after) == 100 + count
     torch.testing.assert_close((after.means[7] + after.means[100]) / 2, start.means[7], rtol=1e-4, atol=1e-5)
     torch.testing.assert_close(after.scales[100], start.scales[7] / 1.6, rtol=1e-2, atol=0)

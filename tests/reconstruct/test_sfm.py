@@ -23,12 +23,12 @@ def test_blank_photos_are_refused_in_one_sentence(tmp_path):
         tuple("abcd"), (0.0,) * 4, tmp_path / "photos",
     )  # fmt: skip
     with pytest.raises(InputError, match=r"photos: no two photos show the same things.*take 10 or more"):
-        sfm.solve(blank)
+        sfm.estimate_cameras(blank)
 
 
 def test_cameras_of_a_ray_cast_scene_are_recovered(tmp_path):
     true = arc(6, (320, 240))
-    model = sfm.solve(as_photos(true, tmp_path))
+    model = sfm.estimate_cameras(as_photos(true, tmp_path))
     assert model.cameras.names == true.names
     move = umeyama(centres(model.cameras.viewmats), centres(true.viewmats))
     found = move.viewmats(model.cameras.viewmats)
@@ -42,7 +42,7 @@ def test_cameras_of_a_ray_cast_scene_are_recovered(tmp_path):
 
 def test_the_same_seed_gives_the_same_cameras(tmp_path):
     photos = as_photos(arc(3, (240, 180), sweep=30.0), tmp_path)
-    first, second = (sfm.solve(photos, seed=4) for _ in range(2))
+    first, second = (sfm.estimate_cameras(photos, seed=4) for _ in range(2))
     assert torch.equal(first.cameras.viewmats, second.cameras.viewmats)
     assert torch.equal(first.points, second.points)
 
@@ -64,36 +64,36 @@ def test_cameras_of_other_photos_are_noticed(tmp_path):
 
 
 def test_matches_that_no_cameras_explain_are_put_down_to_a_repeated_pattern():
-    assert "overlap too little" in sfm._unplaced(photos=24, pairs=30)  # each with the next, and little more
-    assert "a pattern repeats" in sfm._unplaced(photos=24, pairs=162)  # a checked tablecloth seen from all sides
-    assert "overlap too little" in sfm._unplaced(photos=3, pairs=3)
+    assert "overlap too little" in sfm._failure_reason(photos=24, pairs=30)  # each with the next, and little more
+    assert "a pattern repeats" in sfm._failure_reason(photos=24, pairs=162)  # a checked tablecloth seen from all sides
+    assert "overlap too little" in sfm._failure_reason(photos=3, pairs=3)
 
 
 def test_mutual_matches_by_hand():
     a = torch.nn.functional.normalize(torch.tensor([[1.0, 0, 0], [0, 1, 0], [1, 1, 0.01]]), dim=1)
     b = torch.nn.functional.normalize(torch.tensor([[0.02, 1, 0], [1, 0.01, 0], [0, 0, 1.0]]), dim=1)
     # the third of a lies between two of b, which the ratio test refuses
-    assert features.match(a, b).tolist() == [[0, 1], [1, 0]]
+    assert features.match_descriptors(a, b).tolist() == [[0, 1], [1, 0]]
 
 
 def test_many_photos_are_not_all_compared(monkeypatch):
-    monkeypatch.setattr(features, "EXHAUSTIVE", 10)
+    monkeypatch.setattr(features, "MAX_EXHAUSTIVE", 10)
     generator = torch.Generator().manual_seed(0)
     found = [torch.nn.functional.normalize(torch.randn(30, 16, generator=generator), dim=1) for _ in range(40)]
     found[39] = found[0]  # the walk ends where it began
-    chosen = features.pairs(found, neighbours=3, similar=2)
+    chosen = features.select_pairs(found, neighbours=3, similar=2)
     assert (0, 39) in chosen
     assert all((i, i + 1) in chosen for i in range(39))
     assert len(chosen) < 40 * 39 / 4
 
 
 def test_pairs_grow_with_the_number_of_photos_even_where_all_look_alike(monkeypatch):
-    monkeypatch.setattr(features, "EXHAUSTIVE", 20)
+    monkeypatch.setattr(features, "MAX_EXHAUSTIVE", 20)
     n, generator = 60, torch.Generator().manual_seed(0)
     same = torch.nn.functional.normalize(torch.randn(30, 16, generator=generator), dim=1)
-    chosen = features.pairs([same] * n)
+    chosen = features.select_pairs([same] * n)
     assert len(set(chosen)) == len(chosen) <= (8 + 20) * n < n * (n - 1) / 2
-    assert len(features.pairs([same] * 20)) == 20 * 19 / 2
+    assert len(features.select_pairs([same] * 20)) == 20 * 19 / 2
 
 
 def test_distortion_is_undone(tmp_path):

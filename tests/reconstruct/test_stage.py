@@ -22,9 +22,9 @@ def made(tmp_path_factory):
     folder = tmp_path_factory.mktemp("set")
     cameras = write_set(folder, arc(7, (160, 120), sweep=70.0))
     out = folder / "scene.ply"
-    small = {"draft": dataclasses.replace(choices.QUALITIES["draft"], gaussians=6000, steps=120)}
+    small = {"draft": dataclasses.replace(choices.QUALITY_PRESETS["draft"], gaussians=6000, iterations=120)}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(choices, "QUALITIES", {**choices.QUALITIES, **small})
+        patch.setattr(choices, "QUALITY_PRESETS", {**choices.QUALITY_PRESETS, **small})
         run(folder / "images", out, ReconstructOptions(cameras=cameras, holdout=3, quality="draft"))
     return folder, read_scene(out)
 
@@ -64,13 +64,13 @@ def test_given_cameras_keep_scale_and_names(made):
 
 def test_photos_kept_out_look_right_too(made, capsys, caplog):
     from stages.core.scene.images import read_image
-    from stages.reconstruct.photometric import score
+    from stages.reconstruct.photometric import score_views
     from stages.reconstruct.photos import Views
 
     folder, scene = made
     images = tuple((read_image(folder / "images" / n) * 255).round().to(torch.uint8) for n in scene.cameras.names)
     views = Views(images, scene.cameras)
-    held, _ = score(scene.gaussians, views, [3], background=scene.background)
+    held, _ = score_views(scene.gaussians, views, [3], background=scene.background)
     assert held > 19
     mean = torch.stack([image.float().mean((0, 1)) / 255 for image in images]).mean(0)
     assert scene.background == pytest.approx(mean.tolist(), abs=0.02)
@@ -79,8 +79,8 @@ def test_photos_kept_out_look_right_too(made, capsys, caplog):
 
 def test_held_out_photos_are_reported_on_stdout(tmp_path, capsys, caplog, monkeypatch):
     cameras = write_set(tmp_path, arc(5, (96, 72), sweep=40.0))
-    tiny = dataclasses.replace(choices.QUALITIES["draft"], gaussians=2000, steps=5)
-    monkeypatch.setitem(choices.QUALITIES, "draft", tiny)
+    tiny = dataclasses.replace(choices.QUALITY_PRESETS["draft"], gaussians=2000, iterations=5)
+    monkeypatch.setitem(choices.QUALITY_PRESETS, "draft", tiny)
     with caplog.at_level(logging.INFO):
         run(tmp_path / "images", tmp_path / "s.ply", ReconstructOptions(cameras=cameras, holdout=4, quality="draft"))
     out = capsys.readouterr().out
@@ -108,18 +108,18 @@ def test_options_that_make_no_sense(wrong, words):
 
 def test_real_photos_are_all_placed(shared):
     """The published figure for this set is 11 of 11."""
-    from stages.reconstruct.reading import read_photos
-    from stages.reconstruct.sfm import solve
+    from stages.reconstruct.photo_reader import read_photos
+    from stages.reconstruct.sfm import estimate_cameras
 
-    model = solve(read_photos(shared / "data" / "photos" / "kermit" / "images"))
+    model = estimate_cameras(read_photos(shared / "data" / "photos" / "kermit" / "images"))
     assert len(model.cameras) == 11
     assert len(model.points) > 500
 
 
 def small(monkeypatch, steps: int = 5) -> None:
     """Draft quality so small that a whole run takes seconds."""
-    tiny = dataclasses.replace(choices.QUALITIES["draft"], gaussians=2000, steps=steps)
-    monkeypatch.setitem(choices.QUALITIES, "draft", tiny)
+    tiny = dataclasses.replace(choices.QUALITY_PRESETS["draft"], gaussians=2000, iterations=steps)
+    monkeypatch.setitem(choices.QUALITY_PRESETS, "draft", tiny)
 
 
 def test_a_run_that_was_stopped_goes_on_from_its_finished_steps(tmp_path, monkeypatch, caplog):
@@ -133,7 +133,7 @@ def test_a_run_that_was_stopped_goes_on_from_its_finished_steps(tmp_path, monkey
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(photometric, "refine", stop)
+        patch.setattr(photometric, "fit_gaussians", stop)
         with pytest.raises(KeyboardInterrupt):
             run(tmp_path / "images", tmp_path / "s.ply", options)
     left = tmp_path / ".steps-s.ply"

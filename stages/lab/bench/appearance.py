@@ -34,10 +34,10 @@ from stages.lab.bench.common import machine
 from stages.lab.bench.reconstruct import photo_folder
 from stages.reconstruct import classic, sfm
 from stages.reconstruct.options import ReconstructOptions
-from stages.reconstruct.photometric import score
+from stages.reconstruct.photo_reader import read_photos
+from stages.reconstruct.photometric import score_views
 from stages.reconstruct.photos import Photos, Reconstruction, Views
-from stages.reconstruct.reading import read_photos
-from stages.reconstruct.steps import Steps, fingerprint
+from stages.reconstruct.step_cache import StepCache, fingerprint
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -107,26 +107,26 @@ def measure(
 ) -> dict:
     """One set, by both; `draw` stands for gsplat.rasterization."""
     wanted = options.reconstruction()
-    photos = read_photos(images, wanted.side)
+    photos = read_photos(images, wanted.max_side)
     steps = camera_steps(name, photos, options.models)
-    model = sfm.solve(photos, steps=steps)
+    model = sfm.estimate_cameras(photos, steps=steps)
     (steps.folder / "depth.pt").unlink(missing_ok=True)  # of an earlier run: making it is part of our time
     made, seconds = timed(lambda: classic.reconstruct(photos, wanted, steps))
-    count = wanted.steps(len(made.trained), device)
+    count = wanted.iteration_count(len(made.trained), device)
     ours = judged(made.scene.gaussians, made, made.scene.background, seconds, count, device)
     log.info("%s: ours %s; %s", name, ours, {k: round(v, 1) for k, v in steps.seconds.items()})
     theirs = gsplat_result(made, model, seconds, device, draw)
-    facts = {"photos": len(photos), "trained": len(made.trained), "held_out": len(made.held)}
+    facts = {"photos": len(photos), "trained": len(made.trained), "held_out": len(made.held_out)}
     return {**facts, "seconds": steps.seconds, "ours": asdict(ours), "gsplat": asdict(theirs)}
 
 
-def camera_steps(name: str, photos: Photos, models: Path | None) -> Steps:
+def camera_steps(name: str, photos: Photos, models: Path | None) -> StepCache:
     """Where the cameras are kept, or will be. Photos of the same names and sizes are taken to be the same."""
     if models is None:
-        return Steps()
+        return StepCache()
     models.mkdir(parents=True, exist_ok=True)
     key = fingerprint(photos.names, [photos.size(i) for i in range(len(photos))])
-    return Steps(models / name, key, resume=True)
+    return StepCache(models / name, key, resume=True)
 
 
 def gsplat_result(
@@ -160,7 +160,7 @@ def coloured_points(
     """The sparse points that photos learned from show, moved, with the mean of their colours there (0..1)."""
     points, total, count = move(model.points), torch.zeros(len(model.points), 3), torch.zeros(len(model.points))
     for row, view in enumerate(trained):
-        index = model.seen_point[model.seen_view == view]
+        index = model.point_index[model.view_index == view]
         viewmat, image = views.cameras.viewmats[row], views.image(row)
         x, y = project(points[index], viewmat, views.cameras.Ks[row]).floor().long().unbind(1)
         inside = (x >= 0) & (y >= 0) & (x < image.shape[1]) & (y < image.shape[0])
@@ -176,7 +176,9 @@ def judged(
     device: str = "cuda",
 ) -> MethodScore:  # fmt: skip
     """With what to paint where there are no Gaussians."""
-    raw, fitted = (score(gaussians, made.views, made.held, device, exposed, background) for exposed in (False, True))
+    raw, fitted = (
+        score_views(gaussians, made.views, made.held_out, device, exposed, background) for exposed in (False, True)
+    )
     return MethodScore(seconds, steps, len(gaussians), *raw, fitted[0])
 
 

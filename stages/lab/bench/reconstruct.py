@@ -135,11 +135,11 @@ def _cameras(images: Path, options: ReconstructBenchOptions) -> tuple[dict, Came
     """The part of such a report that cameras have, and the cameras, in a world that is not yet upright."""
     from stages.reconstruct import sfm
     from stages.reconstruct.options import ReconstructOptions
-    from stages.reconstruct.reading import read_photos
-    from stages.reconstruct.steps import Steps, peak_memory
+    from stages.reconstruct.photo_reader import read_photos
+    from stages.reconstruct.step_cache import StepCache, peak_memory
 
-    photos, steps = read_photos(images, ReconstructOptions(quality=options.quality).side), Steps()
-    model = sfm.solve(photos, 0, pick_device(options.device), steps, options.matcher)
+    photos, steps = read_photos(images, ReconstructOptions(quality=options.quality).max_side), StepCache()
+    model = sfm.estimate_cameras(photos, 0, pick_device(options.device), steps, options.matcher)
     facts = {"photos": len(photos), "placed": len(model.cameras), "dropped": model.dropped, "held_out": None}
     return {**facts, "seconds": steps.seconds, "memory": peak_memory()}, model.cameras, None
 

@@ -17,9 +17,9 @@ from stages.core.raster.rasterise import rasterise
 from stages.core.scene.cameras import Cameras, LensDistortion, read_cameras
 from stages.core.scene.scene import Scene
 from stages.core.scene.scene_ply import read_scene
-from stages.reconstruct.crops import batch, network_size
+from stages.reconstruct.network_input import make_batch, network_size
+from stages.reconstruct.photo_reader import read_photos
 from stages.reconstruct.photos import undistort
-from stages.reconstruct.reading import read_photos
 
 CAMERA_FILES = ("transforms.json", "cameras.json", "sparse")
 PHOTO_FOLDERS = ("photos", "images", ".")
@@ -94,7 +94,7 @@ def _photographed(folder: Path, side: int) -> PosedViews:
     views = undistort(photos, cameras, LensDistortion(lenses.coefficients[rows]), side=4096)
     size = network_size(*photos.size(0), side)
     Ks = _resized(views.cameras, [size] * len(photos))
-    return PosedViews(folder.name, batch(list(views.images), size), views.cameras.viewmats, Ks, None)
+    return PosedViews(folder.name, make_batch(list(views.images), size), views.cameras.viewmats, Ks, None)
 
 
 def _resized(cameras: Cameras, sizes: list[tuple[int, int]]) -> Float[Tensor, "c 3 3"]:

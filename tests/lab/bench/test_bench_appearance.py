@@ -11,7 +11,7 @@ from stages.core.scene.gaussians import Gaussians
 from stages.core.scene.scene import Scene
 from stages.lab.bench import appearance as bench
 from stages.lab.bench import appearance_gsplat as peer
-from stages.reconstruct.photometric import score
+from stages.reconstruct.photometric import score_views
 from stages.reconstruct.photos import Reconstruction, Views
 from stages.reconstruct.sfm import SparseModel
 from tests.conftest import ring, two_balls_scene
@@ -56,7 +56,7 @@ def test_the_recipe_learns_photos_and_multiplies_gaussians():
     many, done = peer.train(views, points, colours, 1500, "cpu", draw, going=lambda done: done < 53)
     assert (none, done) == (1, 53) and len(few) == len(points) < len(many)
     everything = list(range(len(views)))
-    assert score(many, views, everything)[0] > score(few, views, everything)[0] + 3
+    assert score_views(many, views, everything)[0] > score_views(few, views, everything)[0] + 3
     assert (many.sh[:, 1:4] != 0).any() and (many.sh[:, 4:] == 0).all()
 
 

@@ -42,7 +42,7 @@ def worst_place(model: sfm.SparseModel, true) -> float:
 
 def test_two_photos_are_enough_for_cameras(tmp_path):
     true = arc(2, (320, 240), sweep=30.0)
-    model = sfm.solve(as_photos([photograph(true, i)[0] for i in range(2)], true.names, tmp_path))
+    model = sfm.estimate_cameras(as_photos([photograph(true, i)[0] for i in range(2)], true.names, tmp_path))
     assert len(model.cameras) == 2 and len(model.points) >= 50
 
 
@@ -50,7 +50,7 @@ def test_people_walking_through_do_not_move_the_cameras(tmp_path):
     true = arc(6, (320, 240))
     images = [photograph(true, i)[0] for i in range(6)]
     crowded = [with_person(image, i) if i % 2 else image for i, image in enumerate(images)]
-    model = sfm.solve(as_photos(crowded, true.names, tmp_path))
+    model = sfm.estimate_cameras(as_photos(crowded, true.names, tmp_path))
     assert len(model.cameras) == 6
     assert worst_place(model, true) < 0.03  # the cameras are 1.6 away
 
@@ -61,7 +61,7 @@ def test_a_blank_photo_and_one_of_something_else_are_left_out_with_the_reason(tm
     v, u = torch.meshgrid(torch.linspace(-1, 1, 240), torch.linspace(-1.3, 1.3, 320), indexing="ij")
     others = [torch.full((240, 320, 3), 0.5), texture(u, v, seed=9)]
     names = (*true.names, "blank.png", "elsewhere.png")
-    model = sfm.solve(as_photos([*images, *others], names, tmp_path))
+    model = sfm.estimate_cameras(as_photos([*images, *others], names, tmp_path))
     assert model.cameras.names == true.names
     assert set(model.dropped) == {"blank.png", "elsewhere.png"}
     assert "blurred, dark or plain" in model.dropped["blank.png"]
@@ -73,7 +73,7 @@ def test_a_camera_that_stands_still_is_told_from_one_that_moves(tmp_path):
     still = photograph(true, 0)[0]
     images = [with_person(noisy(still, i), i) for i in range(5)]
     with pytest.raises(InputError, match="camera hardly moved between the photos; walk around.*plain backdrop"):
-        sfm.solve(as_photos(images, tuple("abcde"), tmp_path))
+        sfm.estimate_cameras(as_photos(images, tuple("abcde"), tmp_path))
 
 
 def around(count: int, sweep: float, distance: float = 1.4) -> Cameras:
@@ -91,14 +91,14 @@ def test_a_turntable_before_a_plain_backdrop_is_like_walking_around(tmp_path):
         eye, rays = rays_of(true, i)
         thing = (eye + depth[..., None] * rays)[..., 2] > 1e-4
         images.append(torch.where(thing[..., None], image, torch.tensor(0.8)))
-    model = sfm.solve(as_photos(images, true.names, tmp_path))
+    model = sfm.estimate_cameras(as_photos(images, true.names, tmp_path))
     assert model.cameras.names == true.names and worst_place(model, true) < 0.05
 
 
 def test_a_mirror_does_not_move_the_cameras(tmp_path):
     # A fifth of each photo shows the block a second time, as sharp as the first: where a mirror puts it.
     true = around(6, sweep=75.0)
-    model = sfm.solve(as_photos([with_mirror(true, i) for i in range(6)], true.names, tmp_path))
+    model = sfm.estimate_cameras(as_photos([with_mirror(true, i) for i in range(6)], true.names, tmp_path))
     assert model.cameras.names == true.names and worst_place(model, true) < 0.03
     a_view = umeyama(centres(model.cameras.viewmats), centres(true.viewmats))
     assert (a_view(model.points)[:, 0] < -0.6).sum() > 20  # and so there are points behind it
@@ -107,7 +107,7 @@ def test_a_mirror_does_not_move_the_cameras(tmp_path):
 def test_photos_that_are_there_twice_do_no_harm(tmp_path):
     true = arc(4, (320, 240), sweep=40.0)
     images = [photograph(true, i)[0] for i in (0, 0, 1, 1, 2, 2, 3, 3)]
-    model = sfm.solve(as_photos(images, tuple("abcdefgh"), tmp_path))
+    model = sfm.estimate_cameras(as_photos(images, tuple("abcdefgh"), tmp_path))
     twice = Cameras(*(t.repeat_interleave(2, 0) for t in (true.viewmats, true.Ks, true.sizes)), tuple("abcdefgh"))
     assert len(model.cameras) == 8 and worst_place(model, twice) < 0.03
 
@@ -116,7 +116,7 @@ def test_photos_of_different_things_are_refused(tmp_path):
     v, u = torch.meshgrid(torch.linspace(-1, 1, 120), torch.linspace(-1.3, 1.3, 160), indexing="ij")
     images = [texture(u, v, seed=20 + i) for i in range(4)]
     with pytest.raises(InputError, match="no two photos show the same|overlap too little"):
-        sfm.solve(as_photos(images, tuple("abcd"), tmp_path))
+        sfm.estimate_cameras(as_photos(images, tuple("abcd"), tmp_path))
 
 
 def test_two_rooms_give_the_larger_and_name_the_rest(tmp_path):
@@ -125,7 +125,7 @@ def test_two_rooms_give_the_larger_and_name_the_rest(tmp_path):
     images = [photograph(first, i)[0] for i in range(4)]
     images += [1 - photograph(second, i)[0].flip(0, 1) for i in range(3)]  # upside down and negative: nothing in common
     names = tuple(f"{i}.png" for i in range(7))
-    model = sfm.solve(as_photos(images, names, tmp_path))
+    model = sfm.estimate_cameras(as_photos(images, names, tmp_path))
     assert model.cameras.names == names[:4]
     assert set(model.dropped) == set(names[4:])
     assert all("go with each other" in why or "nothing that was recognised" in why for why in model.dropped.values())

@@ -8,7 +8,7 @@ import torch
 from stages.core.geometry.cameras import centres, look_at, orbit
 from stages.core.geometry.rotations import matrix
 from stages.core.geometry.similarity import Similarity
-from stages.reconstruct import upright
+from stages.reconstruct import world_frame
 
 
 def tabletop(seed: int = 0) -> torch.Tensor:
@@ -44,8 +44,8 @@ def displaced(points, viewmats, seed: int):
 def test_the_table_becomes_level_at_zero(cameras, seed):
     points, viewmats, move = displaced(tabletop(), cameras, seed)
     focus = move(torch.tensor([0.0, 0, 0.1]))
-    ground = upright.settled(upright.find_ground(points, viewmats, focus, seed), points, seed)
-    world = upright.to_world(ground, points, viewmats, metric=False)
+    ground = world_frame.refine_ground(world_frame.find_ground(points, viewmats, focus, seed), points, seed)
+    world = world_frame.to_world(ground, points, viewmats, metric=False)
     tilt = math.degrees(math.acos(min(1.0, float((world.rotation @ move.rotation)[2, 2]))))
     assert tilt < 0.5
     table = world(points)[:4000]
@@ -62,8 +62,8 @@ def test_patterned_tops_do_not_tilt_a_bare_table():
     book = rand(4000) * torch.tensor([0.2, 0.25, 0]) + torch.tensor([0.3, 0.1, 0.035])
     points = torch.cat([table, keyboard, book])
     points += 0.001 * torch.randn(points.shape, generator=generator)
-    first = upright.find_ground(points, all_round(), torch.zeros(3))
-    ground = upright.settled(first, points)
+    first = world_frame.find_ground(points, all_round(), torch.zeros(3))
+    ground = world_frame.refine_ground(first, points)
     lean = lambda up: math.degrees(math.acos(min(1.0, float(up[2]))))  # noqa: E731
     assert lean(first.up) > 2
     assert lean(ground.up) < 0.3 and abs(float(ground.plane.heights(torch.zeros(3)))) < 0.002
@@ -72,8 +72,8 @@ def test_patterned_tops_do_not_tilt_a_bare_table():
 def test_focus_scale_and_heading():
     points, viewmats, move = displaced(tabletop(), one_sided(), 2)
     focus = move(torch.tensor([0.0, 0, 0.1]))
-    ground = upright.find_ground(points, viewmats, focus)
-    world = upright.to_world(ground, points, viewmats, metric=False)
+    ground = world_frame.find_ground(points, viewmats, focus)
+    world = world_frame.to_world(ground, points, viewmats, metric=False)
     torch.testing.assert_close(world(focus)[:2], torch.zeros(2), rtol=0, atol=1e-4)
     eyes = world(centres(viewmats))
     assert abs(float((eyes - world(focus)).norm(dim=1).median()) - 1) < 1e-3
@@ -83,8 +83,8 @@ def test_focus_scale_and_heading():
 
 def test_given_cameras_keep_their_metres():
     points, viewmats, move = displaced(tabletop(), one_sided(), 3)
-    ground = upright.find_ground(points, viewmats, move(torch.tensor([0.0, 0, 0.1])))
-    assert upright.to_world(ground, points, viewmats, metric=True).scale == 1.0
+    ground = world_frame.find_ground(points, viewmats, move(torch.tensor([0.0, 0, 0.1])))
+    assert world_frame.to_world(ground, points, viewmats, metric=True).scale == 1.0
 
 
 def test_a_wall_is_not_a_floor():
@@ -94,17 +94,17 @@ def test_a_wall_is_not_a_floor():
     bump = 0.2 * torch.randn(2000, 3, generator=generator)
     eyes = torch.stack([torch.linspace(-0.5, 0.5, 6), torch.full((6,), -1.0), torch.zeros(6)], 1)
     viewmats = look_at(eyes, torch.zeros(6, 3))
-    ground = upright.find_ground(torch.cat([wall, bump]), viewmats, torch.zeros(3))
+    ground = world_frame.find_ground(torch.cat([wall, bump]), viewmats, torch.zeros(3))
     assert ground.plane is None
     assert float(ground.up[2]) > 0.999
 
 
 def test_level_cameras_all_round_say_which_way_is_up():
     ring = orbit(8, torch.zeros(3), 2.0, elevation=50.0)
-    assert float(upright.level_up(ring)[2]) > 0.9999
+    assert float(world_frame.up_from_cameras(ring)[2]) > 0.9999
 
 
 def test_focus_is_ahead_of_the_cameras():
     viewmats = orbit(8, torch.tensor([1.0, 2, 3]), 2.0, elevation=20.0)
-    focus = upright.focus_of(viewmats, torch.full((8,), 2.0))
+    focus = world_frame.focus_point(viewmats, torch.full((8,), 2.0))
     torch.testing.assert_close(focus, torch.tensor([1.0, 2, 3]), rtol=0, atol=1e-4)

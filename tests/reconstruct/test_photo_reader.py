@@ -13,8 +13,8 @@ import torch
 from PIL import Image
 
 from stages.core.errors import InputError
-from stages.reconstruct import reading
-from stages.reconstruct.reading import read_photos
+from stages.reconstruct import photo_reader
+from stages.reconstruct.photo_reader import read_photos
 
 MILLISECOND = Fraction(1, 1000)
 rng = np.random.default_rng(0)
@@ -81,14 +81,14 @@ def test_photos_are_turned_as_their_exif_says(folder):
 
 
 def test_sizes_and_cameras_may_be_mixed(folder):
-    from stages.reconstruct.matching import guessed_cameras
+    from stages.reconstruct.matching import initial_cameras
 
     exif = Image.Exif()
     exif.get_ifd(0x8769)[0xA405] = 50  # 35 mm equivalent focal length
     for name, size in (("c.jpg", (64, 96)), ("d.jpg", (128, 96)), ("e.jpg", (96, 64))):
         Image.fromarray(picture(*size)).save(folder / name, exif=exif)
     photos = read_photos(folder)
-    cameras = guessed_cameras(photos)
+    cameras = initial_cameras(photos)
     assert cameras[0].camera_id == cameras[1].camera_id
     assert len({c.camera_id for c in cameras}) == 4  # e.jpg has the size of a.jpg, but its focal length is known
     assert cameras[4].has_prior_focal_length and not cameras[0].has_prior_focal_length
@@ -181,7 +181,7 @@ def test_kinds_that_need_converting_are_named(tmp_path, caplog):
 
 
 def test_of_very_many_photos_the_sharpest_of_each_span_is_taken(tmp_path, monkeypatch, caplog):
-    monkeypatch.setattr(reading, "MOST", 4)
+    monkeypatch.setattr(photo_reader, "MAX_PHOTOS", 4)
     for i in range(12):
         pixels = picture() if i % 3 == 1 else np.full((64, 96, 3), 90, np.uint8)
         Image.fromarray(pixels).save(tmp_path / f"{i:02d}.png")
@@ -192,12 +192,12 @@ def test_of_very_many_photos_the_sharpest_of_each_span_is_taken(tmp_path, monkey
 
 
 def test_five_hundred_photos_are_held_to_a_number_and_a_size(tmp_path, monkeypatch):
-    monkeypatch.setattr(reading, "SIDES", (160, 64))
+    monkeypatch.setattr(photo_reader, "MAX_SIDES", (160, 64))
     pixels = picture(96, 64)
     for i in range(500):
         cv2.imwrite(str(tmp_path / f"{i:03d}.jpg"), pixels)
     photos = read_photos(tmp_path)
-    assert len(photos) == reading.MOST == 200
+    assert len(photos) == photo_reader.MAX_PHOTOS == 200
     assert all(max(photos.size(i)) == 64 for i in range(200))
     assert int(photos.names[0][:3]) < 3 and int(photos.names[-1][:3]) > 496  # from the whole walk
 
@@ -220,7 +220,7 @@ def film(path, times: list[float], size: tuple[int, int] = (96, 64), blurred: tu
 
 def test_frames_of_a_variable_rate_are_taken_by_time(tmp_path, monkeypatch):
     # Ten frames a second for 4 s, then one a second for 16 s: by number, two thirds would be from the first fifth.
-    monkeypatch.setattr(reading, "FRAMES", (10, 10))
+    monkeypatch.setattr(photo_reader, "VIDEO_FRAMES", (10, 10))
     film(tmp_path / "v.mp4", [0.1 * i for i in range(40)] + [4.0 + i for i in range(17)])
     photos = read_photos(tmp_path / "v.mp4")
     times = torch.tensor([float(image[..., 0].float().mean()) / 10 for image in photos.images])
@@ -229,7 +229,7 @@ def test_frames_of_a_variable_rate_are_taken_by_time(tmp_path, monkeypatch):
 
 
 def test_blurred_frames_are_passed_over(tmp_path, monkeypatch):
-    monkeypatch.setattr(reading, "FRAMES", (5, 5))
+    monkeypatch.setattr(photo_reader, "VIDEO_FRAMES", (5, 5))
     film(tmp_path / "v.mp4", [0.1 * i for i in range(25)], blurred=tuple(i for i in range(25) if i % 5 != 2))
     names = read_photos(tmp_path / "v.mp4").names
     assert [int(name[6:]) % 5 for name in names] == [2] * 5

@@ -7,7 +7,7 @@ import torch
 
 from stages.core.errors import InputError
 from stages.reconstruct.depth import DepthMap
-from stages.reconstruct.steps import Steps, fingerprint, peak_memory
+from stages.reconstruct.step_cache import StepCache, fingerprint, peak_memory
 
 
 def test_a_finished_step_is_not_done_again(tmp_path):
@@ -17,45 +17,45 @@ def test_a_finished_step_is_not_done_again(tmp_path):
         done.append(1)
         return [DepthMap(torch.ones(2, 3), torch.zeros(2, 3))]
 
-    first = Steps.beside(tmp_path / "scene.ply", "key", resume=False).kept("depth", make, (DepthMap,))
-    again = Steps.beside(tmp_path / "scene.ply", "key", resume=True)
-    second = again.kept("depth", make, (DepthMap,))
+    first = StepCache.for_output(tmp_path / "scene.ply", "key", resume=False).cached("depth", make, (DepthMap,))
+    again = StepCache.for_output(tmp_path / "scene.ply", "key", resume=True)
+    second = again.cached("depth", make, (DepthMap,))
     assert len(done) == 1 and again.seconds == {}
     assert torch.equal(first[0].depth, second[0].depth)
 
 
 @pytest.mark.parametrize(("key", "resume"), [("other", True), ("key", False)])
 def test_steps_of_other_photos_or_without_resume_are_done_again(tmp_path, key, resume):
-    Steps.beside(tmp_path / "scene.ply", "key", resume=False).kept("model", lambda: 1)
-    assert Steps.beside(tmp_path / "scene.ply", key, resume).kept("model", lambda: 2) == 2
+    StepCache.for_output(tmp_path / "scene.ply", "key", resume=False).cached("model", lambda: 1)
+    assert StepCache.for_output(tmp_path / "scene.ply", key, resume).cached("model", lambda: 2) == 2
 
 
 def test_a_step_that_fails_leaves_nothing(tmp_path):
-    steps = Steps(tmp_path / "steps")
+    steps = StepCache(tmp_path / "steps")
 
     def fail(path):
         path.write_text("half")
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        steps.file("matches.db", fail)
+        steps.cached_file("matches.db", fail)
     assert [p.name for p in steps.folder.iterdir()] == ["key"]
-    steps.file("matches.db", lambda path: path.write_text("whole"))
-    assert steps.file("matches.db", fail).read_text() == "whole"
+    steps.cached_file("matches.db", lambda path: path.write_text("whole"))
+    assert steps.cached_file("matches.db", fail).read_text() == "whole"
     steps.remove()
     assert not steps.folder.exists()
 
 
 def test_results_are_read_as_data_never_as_code(tmp_path):
-    steps = Steps(tmp_path / "steps")
+    steps = StepCache(tmp_path / "steps")
     (steps.folder / "model.pt").write_bytes(pickle.dumps(print, protocol=2))
     with pytest.raises(pickle.UnpicklingError):
-        steps.kept("model", lambda: 1)
+        steps.cached("model", lambda: 1)
 
 
 def test_a_folder_that_is_not_there_is_noticed_before_any_work(tmp_path):
     with pytest.raises(InputError, match="there is no folder"):
-        Steps.beside(tmp_path / "nowhere" / "scene.ply", "key", resume=False)
+        StepCache.for_output(tmp_path / "nowhere" / "scene.ply", "key", resume=False)
 
 
 def test_fingerprints_tell_photos_apart():

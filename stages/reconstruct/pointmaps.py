@@ -10,14 +10,14 @@ from torch import Tensor
 from stages.core.geometry.cameras import centres, resize
 from stages.core.models.pi3.network import Geometry
 from stages.core.scene.cameras import Cameras
-from stages.reconstruct.crops import resized
-from stages.reconstruct.depth import DepthMap, look_up, unproject
+from stages.reconstruct.depth import DepthMap, look_up_points, unproject
+from stages.reconstruct.network_input import resize_bytes
 from stages.reconstruct.photos import Views
 
-CONFIDENT = 0.1  # below it a pixel is not trusted
-EDGE = 0.03  # share of its depth by which a pixel's neighbours may differ
-AGREES = 0.03  # share of its depth within which another view sees the same
-CHECKS = 8  # other views asked
+MIN_CONFIDENCE = 0.1  # below it a pixel is not trusted
+MAX_DEPTH_JUMP = 0.03  # share of its depth by which a pixel's neighbours may differ
+DEPTH_TOLERANCE = 0.03  # share of its depth within which another view sees the same
+MAX_CHECK_VIEWS = 8  # other views asked
 
 
 def solve_intrinsics(
@@ -37,21 +37,21 @@ def solve_intrinsics(
     return torch.tensor([[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1]])
 
 
-def depth_edges(depth: Float[Tensor, "h w"], share: float = EDGE) -> Bool[Tensor, "h w"]:
+def depth_edges(depth: Float[Tensor, "h w"], share: float = MAX_DEPTH_JUMP) -> Bool[Tensor, "h w"]:
     """Pixels where one surface ends before another: depth spans more than `share` of itself in 3 x 3 pixels."""
     farthest = F.max_pool2d(depth[None, None], 3, 1, 1)[0, 0]
     nearest = -F.max_pool2d(-depth[None, None], 3, 1, 1)[0, 0]
     return (farthest - nearest) / depth > share
 
 
-def trusted(geometry: Geometry) -> Bool[Tensor, "v h w"]:
+def confident_pixels(geometry: Geometry) -> Bool[Tensor, "v h w"]:
     """Pixels that the network is confident of and that are on no edge."""
     depth = geometry.points[..., 2]
     edges = torch.stack([depth_edges(d) for d in depth])
-    return (geometry.confidence > CONFIDENT) & ~edges & (depth > 0) & geometry.points.isfinite().all(-1)
+    return (geometry.confidence > MIN_CONFIDENCE) & ~edges & (depth > 0) & geometry.points.isfinite().all(-1)
 
 
-def cameras_of(geometry: Geometry, sure: Bool[Tensor, "v h w"], names: tuple[str, ...]) -> Cameras:
+def cameras_from_pointmaps(geometry: Geometry, sure: Bool[Tensor, "v h w"], names: tuple[str, ...]) -> Cameras:
     """The cameras, in pixels of the network's images and in its unit of length.
 
     All photos share one shape, and mostly one lens: a view with too little to fit takes the median focal length.
@@ -76,30 +76,30 @@ def depth_maps(depths: Float[Tensor, "v h w"], sure: Bool[Tensor, "v h w"], came
     for i in range(len(cameras)):
         _, points = unproject(depths[i], cameras.Ks[i], cameras.viewmats[i])
         support = torch.ones_like(depths[i])
-        for j in far[i].argsort()[: CHECKS + 1].tolist():
+        for j in far[i].argsort()[: MAX_CHECK_VIEWS + 1].tolist():
             if j == i:
                 continue
-            there, seen = look_up(known[j], points, cameras.Ks[j], cameras.viewmats[j])
+            there, seen = look_up_points(known[j], points, cameras.Ks[j], cameras.viewmats[j])
             z = there @ cameras.viewmats[i][2, :3] + cameras.viewmats[i][2, 3]
-            support += seen & ((z - depths[i]).abs() < AGREES * depths[i])
+            support += seen & ((z - depths[i]).abs() < DEPTH_TOLERANCE * depths[i])
         out.append(DepthMap(depths[i], support * sure[i]))
     return out
 
 
-def at_size(cropped: list[UInt8[Tensor, "_ _ 3"]], cameras: Cameras, side: int) -> Views:
+def views_at_size(cropped: list[UInt8[Tensor, "_ _ 3"]], cameras: Cameras, side: int) -> Views:
     """The photos' middles, at most `side` wide or high, with the cameras in their pixels."""
     images, Ks = [], []
     for image, K, old in zip(cropped, cameras.Ks, cameras.sizes.tolist(), strict=True):
         height, width = image.shape[:2]
         shrink = min(1.0, side / max(width, height))
         size = round(width * shrink), round(height * shrink)
-        images.append(resized(image, *size) if shrink < 1 else image)
+        images.append(resize_bytes(image, *size) if shrink < 1 else image)
         Ks.append(resize(K, size[0] / old[0], size[1] / old[1]))
     sizes = torch.tensor([[image.shape[1], image.shape[0]] for image in images])
     return Views(tuple(images), Cameras(cameras.viewmats, torch.stack(Ks), sizes, cameras.names))
 
 
-def enlarged(m: DepthMap, size: tuple[int, int]) -> DepthMap:
+def upsample(m: DepthMap, size: tuple[int, int]) -> DepthMap:
     """The map at (height, width); support is that of the nearest pixel, so no depth is trusted across an edge."""
     depth = F.interpolate(m.depth[None, None], size, mode="bilinear", align_corners=False)[0, 0]
     return DepthMap(depth, F.interpolate(m.support[None, None], size, mode="nearest-exact")[0, 0])

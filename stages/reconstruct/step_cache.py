@@ -22,7 +22,7 @@ log = logging.getLogger(__name__)
 T = TypeVar("T")
 
 
-class Steps:
+class StepCache:
     """A folder with the result of every finished step, each there whole or not at all.
 
     `key` names everything that the results follow from; results found under another key are discarded.
@@ -42,7 +42,7 @@ class Steps:
         note.write_text(key)
 
     @classmethod
-    def beside(cls, out: Path, key: str, resume: bool) -> Steps:
+    def for_output(cls, out: Path, key: str, resume: bool) -> StepCache:
         """In a hidden folder next to the file that is being made."""
         out = Path(out)
         if not out.parent.is_dir():
@@ -58,7 +58,7 @@ class Steps:
         finally:
             self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
 
-    def kept(self, name: str, make: Callable[[], T], types: tuple[type, ...] = ()) -> T:
+    def cached(self, name: str, make: Callable[[], T], types: tuple[type, ...] = ()) -> T:
         """What `make` returns, or returned in the run that is resumed: tensors, plain values and `types`."""
         path = self.folder / f"{name}.pt"
         if path.exists():
@@ -71,7 +71,7 @@ class Steps:
             torch.save(made, part)
         return made
 
-    def file(self, name: str, write: Callable[[Path], None]) -> Path:
+    def cached_file(self, name: str, write: Callable[[Path], None]) -> Path:
         """A file that `write` makes, or made in the run that is resumed."""
         path = self.folder / name
         if path.exists():

@@ -6,7 +6,7 @@ import torch
 
 from stages.core.geometry.cameras import intrinsics
 from stages.core.models.pi3.network import Geometry
-from stages.reconstruct import crops, points
+from stages.reconstruct import network_input, pointmaps
 from stages.reconstruct.photos import Photos
 from tests.reconstruct.oracle import truth
 from tests.reconstruct.raycast import arc
@@ -19,47 +19,47 @@ def recorded(shared, name: str) -> dict[str, torch.Tensor]:
 
 def test_intrinsics_as_the_published_code_fits_them(shared):
     d = recorded(shared, "solve_intrinsics")
-    K = points.solve_intrinsics(d["in/local_points"][0], centre=0.0)
+    K = pointmaps.solve_intrinsics(d["in/local_points"][0], centre=0.0)
     torch.testing.assert_close(K, d["out/K"][0], rtol=1e-4, atol=1e-5)
 
 
 def test_edges_as_the_published_code_finds_them(shared):
     d = recorded(shared, "depth_edge")
-    assert torch.equal(points.depth_edges(d["in/depth"][0]), d["out/edge"][0])
+    assert torch.equal(pointmaps.depth_edges(d["in/depth"][0]), d["out/edge"][0])
 
 
 def test_intrinsics_of_true_points_are_the_cameras_and_outliers_can_be_left_out():
     cameras = arc(2, (56, 42))
     geometry = truth(cameras, 3.0)
-    torch.testing.assert_close(points.solve_intrinsics(geometry.points[0]), cameras.Ks[0], rtol=1e-4, atol=1e-3)
+    torch.testing.assert_close(pointmaps.solve_intrinsics(geometry.points[0]), cameras.Ks[0], rtol=1e-4, atol=1e-3)
     wrong = geometry.points[0].clone()
     wrong[:10, :, 0] *= 3
     sure = torch.ones(42, 56, dtype=torch.bool)
-    assert (points.solve_intrinsics(wrong) - cameras.Ks[0]).abs().max() > 5
+    assert (pointmaps.solve_intrinsics(wrong) - cameras.Ks[0]).abs().max() > 5
     sure[:10] = False
-    torch.testing.assert_close(points.solve_intrinsics(wrong, sure), cameras.Ks[0], rtol=1e-4, atol=1e-3)
+    torch.testing.assert_close(pointmaps.solve_intrinsics(wrong, sure), cameras.Ks[0], rtol=1e-4, atol=1e-3)
 
 
 def test_a_view_with_nothing_to_fit_takes_the_usual_focal_length():
     cameras = arc(3, (56, 42))
     geometry = truth(cameras, 1.0)
-    sure = points.trusted(geometry)
+    sure = pointmaps.confident_pixels(geometry)
     sure[1] = False
-    Ks = points.cameras_of(geometry, sure, cameras.names).Ks
+    Ks = pointmaps.cameras_from_pointmaps(geometry, sure, cameras.names).Ks
     torch.testing.assert_close(Ks, intrinsics(56, 42, 1.2 * 56).expand(3, 3, 3), rtol=1e-3, atol=0.05)
 
 
 def test_true_depth_is_confirmed_and_a_wrong_view_is_not():
     cameras = arc(4, (84, 56), sweep=30.0)
     geometry = truth(cameras, 2.0)
-    found = points.cameras_of(geometry, points.trusted(geometry), cameras.names)
+    found = pointmaps.cameras_from_pointmaps(geometry, pointmaps.confident_pixels(geometry), cameras.names)
     depths = geometry.points[..., 2].clone()
     depths[3] *= 1.2
-    maps = points.depth_maps(depths, points.trusted(geometry), found)
+    maps = pointmaps.depth_maps(depths, pointmaps.confident_pixels(geometry), found)
     seen = maps[0].support > 0
     assert maps[0].support[seen].mean() > 2.3  # itself and the two others that are right, where they see it
     assert maps[3].support[maps[3].support > 0].mean() < 1.3
-    assert (maps[0].support[~points.trusted(geometry)[0]] == 0).all()
+    assert (maps[0].support[~pointmaps.confident_pixels(geometry)[0]] == 0).all()
 
 
 def test_what_is_unsure_or_at_an_edge_is_not_trusted():
@@ -68,7 +68,7 @@ def test_what_is_unsure_or_at_an_edge_is_not_trusted():
     confidence = torch.full((1, 20, 20), 0.9)
     confidence[:, :5] = 0.05
     local = torch.stack([torch.zeros_like(depth), torch.zeros_like(depth), depth], -1)
-    sure = points.trusted(Geometry(local, confidence, torch.eye(4)[None]))[0]
+    sure = pointmaps.confident_pixels(Geometry(local, confidence, torch.eye(4)[None]))[0]
     assert not sure[:5].any() and not sure[:, 9:11].any()
     assert sure[5:, :9].all() and sure[5:, 11:].all()
 
@@ -78,16 +78,16 @@ def test_what_is_unsure_or_at_an_edge_is_not_trusted():
     [((448, 448), (448, 448)), ((4000, 4000), (448, 448)), ((100, 60), (98, 56)), ((3, 3), (14, 14))],
 )
 def test_sizes_of_the_network(photo, expected):
-    assert crops.network_size(*photo) == expected
+    assert network_input.network_size(*photo) == expected
 
 
 @pytest.mark.parametrize("photo", [(640, 480), (1024, 683), (576, 1024), (1500, 200)])
 def test_sizes_are_multiples_of_a_patch_as_large_as_allowed_and_in_proportion(photo):
-    width, height = crops.network_size(*photo)
+    width, height = network_input.network_size(*photo)
     assert width % 14 == height % 14 == 0
     assert 0.9 * 201_000 < width * height <= 201_000
     assert abs(width / height / (photo[0] / photo[1]) - 1) < 0.07
-    assert max(crops.network_size(*photo, longest=300)) <= 300
+    assert max(network_input.network_size(*photo, longest=300)) <= 300
 
 
 def test_photos_of_different_shape_show_their_middle(tmp_path):
@@ -95,11 +95,11 @@ def test_photos_of_different_shape_show_their_middle(tmp_path):
     wide[29:31, 49:51] = 255
     tall[49:51, 29:31] = 255
     photos = Photos((wide, tall, wide), ("a", "b", "c"), (0.0,) * 3, tmp_path)
-    cut = crops.crops(photos)
-    size = crops.common_size(photos)
+    cut = network_input.crop_photos(photos)
+    size = network_input.common_size(photos)
     for image in cut:
         assert abs(image.shape[1] / image.shape[0] - size[0] / size[1]) < 0.04
         middle = image.float().mean(2)
         place = (middle > 128).nonzero().float().mean(0) + 0.5
         assert (place - torch.tensor(middle.shape) / 2).abs().max() <= 0.6
-    assert crops.batch(cut, size).shape == (3, 3, size[1], size[0])
+    assert network_input.make_batch(cut, size).shape == (3, 3, size[1], size[0])

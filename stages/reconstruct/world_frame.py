@@ -13,8 +13,10 @@ from stages.core.geometry.cameras import centres
 from stages.core.geometry.planes import Plane, ransac
 from stages.core.geometry.similarity import Similarity
 
-LEAST = ((0.5, 0.04), (0.05, 0.3))  # cosine of the cameras' pitch, and share of the points in focus, a plane needs
-BELOW, ABOVE, PATCH = 0.08, 0.03, 0.04  # of the first plane, where it is looked for again; side of a patch [radii]
+# Minimum cosine of the cameras' pitch and minimum fraction of the points in focus, tried in this order.
+PLANE_CRITERIA = ((0.5, 0.04), (0.05, 0.3))
+# Band around the first plane in which it is fitted again, and side of a surface patch [camera distances].
+BAND_BELOW, BAND_ABOVE, PATCH_SIZE = 0.08, 0.03, 0.04
 
 
 @dataclass(frozen=True)
@@ -25,10 +27,10 @@ class Ground:
     plane: Plane | None  # supporting plane, its normal being `up`; None when there is none
     focus: Float[Tensor, "3"]  # what the cameras look at
     radius: float  # median distance of the cameras from it
-    share: float = 0.0  # of the points in focus, on the plane
+    inlier_fraction: float = 0.0  # of the points in focus, on the plane
 
 
-def focus_of(viewmats: Float[Tensor, "c 4 4"], distances: Float[Tensor, "c"]) -> Float[Tensor, "3"]:
+def focus_point(viewmats: Float[Tensor, "c 4 4"], distances: Float[Tensor, "c"]) -> Float[Tensor, "3"]:
     """The median of the points `distances` ahead of the cameras."""
     ahead = centres(viewmats) + viewmats[:, 2, :3] * distances[:, None]
     return ahead.median(0).values
@@ -45,20 +47,20 @@ def find_ground(
     """
     eyes = centres(viewmats)
     radius = float((eyes - focus).norm(dim=1).median())
-    near = _nearness(points, focus, radius)
-    for least_up, least_share in LEAST:
-        found = ransac(points, 0.01 * radius, near, lambda n, up=least_up: _holds_level(n, viewmats, up), seed=seed)
+    near = _focus_weights(points, focus, radius)
+    for least_up, least_share in PLANE_CRITERIA:
+        found = ransac(points, 0.01 * radius, near, lambda n, up=least_up: _plausible_up(n, viewmats, up), seed=seed)
         if found is None:
             continue
-        plane, inside = _lowest_strong(points, near, found[0], 0.01 * radius)
+        plane, inside = _lowest_parallel_plane(points, near, found[0], 0.01 * radius)
         share = float(near[inside].sum() / near.sum())
         above = float((plane.heights(eyes) > 0).float().mean())
         if share >= least_share and above > 0.5:
             return Ground(plane.normal, plane, focus, radius, share)
-    return Ground(level_up(viewmats), None, focus, radius)
+    return Ground(up_from_cameras(viewmats), None, focus, radius)
 
 
-def settled(ground: Ground, points: Float[Tensor, "n 3"], seed: int = 0) -> Ground:
+def refine_ground(ground: Ground, points: Float[Tensor, "n 3"], seed: int = 0) -> Ground:
     """The plane again, by area: each patch of surface counts once, however many points its pattern gave.
 
     Patterned tops, of a keyboard and of a book, may hold more points than the bare table under them and tilt the
@@ -67,21 +69,23 @@ def settled(ground: Ground, points: Float[Tensor, "n 3"], seed: int = 0) -> Grou
     if ground.plane is None:
         return ground
     heights = ground.plane.heights(points) / ground.radius
-    band = points[(heights > -BELOW) & (heights < ABOVE)]
-    _, patch, count = (band / (PATCH * ground.radius)).floor().long().unique(
+    band = points[(heights > -BAND_BELOW) & (heights < BAND_ABOVE)]
+    _, patch, count = (band / (PATCH_SIZE * ground.radius)).floor().long().unique(
         dim=0, return_inverse=True, return_counts=True
     )
-    weights = _nearness(band, ground.focus, ground.radius) / count[patch]
+    weights = _focus_weights(band, ground.focus, ground.radius) / count[patch]
     found = ransac(band, 0.005 * ground.radius, weights, lambda n: n @ ground.up > 0.99, seed=seed)
     return ground if found is None else replace(ground, up=found[0].normal, plane=found[0])
 
 
-def _nearness(points: Float[Tensor, "n 3"], focus: Float[Tensor, "3"], radius: float) -> Float[Tensor, "n"]:
+def _focus_weights(points: Float[Tensor, "n 3"], focus: Float[Tensor, "3"], radius: float) -> Float[Tensor, "n"]:
     """Weights that fall to a half at half the cameras' distance."""
     return 1 / (1 + ((points - focus).norm(dim=1) / (0.5 * radius)) ** 4)
 
 
-def _holds_level(normals: Float[Tensor, "k 3"], viewmats: Float[Tensor, "c 4 4"], least_up: float) -> Bool[Tensor, "k"]:
+def _plausible_up(
+    normals: Float[Tensor, "k 3"], viewmats: Float[Tensor, "c 4 4"], least_up: float
+) -> Bool[Tensor, "k"]:
     """Normals that make sense as up for most cameras.
 
     People hold cameras level, so up is nearly square to the cameras' horizontal axes; it has at least the
@@ -94,7 +98,7 @@ def _holds_level(normals: Float[Tensor, "k 3"], viewmats: Float[Tensor, "c 4 4"]
     return (roll < 0.3) & (upward > least_up) & (pitch < 0.2)
 
 
-def level_up(viewmats: Float[Tensor, "c 4 4"]) -> Float[Tensor, "3"]:
+def up_from_cameras(viewmats: Float[Tensor, "c 4 4"]) -> Float[Tensor, "3"]:
     """Up as the cameras were held: square to their horizontal axes where those fix it, else their mean up.
 
     The mean up of cameras that all look down from one side leans; it is corrected only as far as the
@@ -109,7 +113,7 @@ def level_up(viewmats: Float[Tensor, "c 4 4"]) -> Float[Tensor, "3"]:
     return up if float(up @ mean) > 0 else -up
 
 
-def _lowest_strong(points, weights, plane: Plane, threshold: float) -> tuple[Plane, Bool[Tensor, "n"]]:
+def _lowest_parallel_plane(points, weights, plane: Plane, threshold: float) -> tuple[Plane, Bool[Tensor, "n"]]:
     """Among planes parallel to this one, the lowest that holds half as much or more: tables, not table mats."""
     heights = plane.heights(points)
     own = weights[heights.abs() < threshold].sum()

@@ -12,7 +12,7 @@ from stages.core.models.pi3.dinov2 import PATCH
 from stages.core.scene.images import resize
 from stages.reconstruct.photos import Photos
 
-MOST_PIXELS = 201_000  # a photo, as the published model was run (448 x 448 for a square one)
+MAX_PIXELS = 201_000  # a photo, as the published model was run (448 x 448 for a square one)
 
 
 def network_size(width: int, height: int, longest: int | None = None) -> tuple[int, int]:
@@ -20,16 +20,16 @@ def network_size(width: int, height: int, longest: int | None = None) -> tuple[i
 
     Of the multiples around the exact size those with most pixels are taken.
     """
-    shrink = min(1.0, (MOST_PIXELS / (width * height)) ** 0.5, (longest or width + height) / max(width, height))
+    shrink = min(1.0, (MAX_PIXELS / (width * height)) ** 0.5, (longest or width + height) / max(width, height))
     choices = []
     for side in (width, height):
         patches = int(side * shrink + 1e-6) // PATCH
         choices.append([n * PATCH for n in (patches, patches + 1) if n and n * PATCH <= min(side, longest or side)])
-    fitting = [(w, h) for w, h in product(*choices) if w * h <= MOST_PIXELS]
+    fitting = [(w, h) for w, h in product(*choices) if w * h <= MAX_PIXELS]
     return max(fitting, key=lambda size: size[0] * size[1], default=(PATCH, PATCH))
 
 
-def crops(photos: Photos, longest: int | None = None) -> list[UInt8[Tensor, "_ _ 3"]]:
+def crop_photos(photos: Photos, longest: int | None = None) -> list[UInt8[Tensor, "_ _ 3"]]:
     """The middle of every photo, in the proportions of the network's size for the median photo.
 
     So the optical axis stays in the centre and pixels stay square.
@@ -51,10 +51,10 @@ def common_size(photos: Photos, longest: int | None = None) -> tuple[int, int]:
     return network_size(*sizes[len(sizes) // 2], longest)
 
 
-def resized(image: UInt8[Tensor, "h w 3"], width: int, height: int) -> UInt8[Tensor, "h2 w2 3"]:
+def resize_bytes(image: UInt8[Tensor, "h w 3"], width: int, height: int) -> UInt8[Tensor, "h2 w2 3"]:
     return (resize(image.float() / 255, width, height) * 255).round().clamp(0, 255).to(torch.uint8)
 
 
-def batch(images: list[UInt8[Tensor, "_ _ 3"]], size: tuple[int, int]) -> Float[Tensor, "v 3 h w"]:
+def make_batch(images: list[UInt8[Tensor, "_ _ 3"]], size: tuple[int, int]) -> Float[Tensor, "v 3 h w"]:
     """Images of one proportion at the network's size (width, height), RGB in 0..1."""
     return torch.stack([resize(image.float() / 255, *size) for image in images]).permute(0, 3, 1, 2).contiguous()

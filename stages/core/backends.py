@@ -1,4 +1,4 @@
-"""Backends are tables of names; a backend is a function, imported only when it is chosen."""
+"""Backends as tables of names: a backend is a function, imported only when it is chosen."""
 
 from collections.abc import Callable, Mapping
 from importlib import import_module
@@ -7,7 +7,7 @@ from stages.core.errors import InputError
 
 
 def choose(table: Mapping[str, str], name: str) -> Callable:
-    """The function that `name` stands for in a table of "module:function" entries."""
+    """The function that a table of "module:function" entries lists under `name`; InputError for an unknown name."""
     if name not in table:
         raise InputError(f"no backend called {name!r}; choose from {', '.join(table)}")
     return load(table[name])
@@ -20,8 +20,8 @@ def load(entry: str) -> Callable:
 
 
 def pick_device(name: str) -> str:
-    """The PyTorch device behind --device auto, cpu or cuda."""
-    import torch  # a second to import, so not before a stage runs
+    """The PyTorch device for --device auto, cpu or cuda; InputError for another name or without a GPU."""
+    import torch  # takes a second to import, so only when a stage runs
 
     if name not in ("auto", "cpu", "cuda"):
         raise InputError(f"--device {name}: choose from auto, cpu, cuda")

@@ -1,6 +1,8 @@
-"""The one exception that is the user's to read."""
+"""The exception for mistakes in the input."""
 
 
 class InputError(Exception):
-    """A mistake in what the user gave us: one sentence that names the file or option, what is
-    wrong and what would work. The command line prints it and exits with status 2."""
+    """Invalid input: the message is one line that names the file or option, what is wrong and what would work.
+
+    The command line prints it without a traceback and exits with status 2.
+    """

@@ -123,7 +123,7 @@ def small(monkeypatch, steps: int = 5) -> None:
 
 
 def test_a_run_that_was_stopped_goes_on_from_its_finished_steps(tmp_path, monkeypatch, caplog):
-    from stages.reconstruct import depth, features, photometric, sfm
+    from stages.reconstruct import depth, features, photometric
 
     cameras = write_set(tmp_path, arc(4, (96, 72), sweep=40.0))
     small(monkeypatch)
@@ -132,6 +132,9 @@ def test_a_run_that_was_stopped_goes_on_from_its_finished_steps(tmp_path, monkey
     def stop(*_):
         raise KeyboardInterrupt
 
+    def repeated(*_, **__):
+        pytest.fail("a finished step is computed again")
+
     with monkeypatch.context() as patch:
         patch.setattr(photometric, "fit_gaussians", stop)
         with pytest.raises(KeyboardInterrupt):
@@ -139,8 +142,9 @@ def test_a_run_that_was_stopped_goes_on_from_its_finished_steps(tmp_path, monkey
     left = tmp_path / ".steps-s.ply"
     assert {p.name for p in left.iterdir()} == {"key", "features.pt", "matches.db", "depth.pt"}
     with monkeypatch.context() as patch:
-        for module, name in ((features, "extract"), (features, "match"), (depth, "estimate"), (sfm, "solve")):
-            patch.setattr(module, name, stop)
+        patch.setattr(features, "extract", repeated)
+        patch.setattr(features, "match_descriptors", repeated)
+        patch.setattr(depth, "estimate_depth_maps", repeated)
         report = run(tmp_path / "images", tmp_path / "s.ply", dataclasses.replace(options, resume=True))
     assert not left.exists() and "depth" not in report.seconds
     run(tmp_path / "images", tmp_path / "t.ply", options)

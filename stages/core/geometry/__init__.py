@@ -1,1 +1,1 @@
-"""Pure functions on tensors: no files, no state."""
+"""Geometry as pure functions on tensors: no files, no state."""

@@ -1,4 +1,4 @@
-"""Pinhole cameras: x right, y down, z forward; pixel centres at +0.5."""
+"""Pinhole camera geometry: x right, y down, z forward; pixel centres at +0.5."""
 
 import math
 
@@ -10,23 +10,26 @@ from torch import Tensor
 def project(
     points: Float[Tensor, "n 3"], viewmat: Float[Tensor, "4 4"], K: Float[Tensor, "3 3"]
 ) -> Float[Tensor, "n 2"]:
-    """Pixel coordinates of world points; a point behind the camera gives a meaningless pixel, so check `depths`."""
+    """Pixel coordinates [px] of world points; only valid where `depths` is positive."""
     p = (points @ viewmat[:3, :3].mT + viewmat[:3, 3]) @ K.mT
     return p[:, :2] / p[:, 2:]
 
 
 def depths(points: Float[Tensor, "n 3"], viewmat: Float[Tensor, "4 4"]) -> Float[Tensor, "n"]:
-    """Distance along the viewing axis."""
+    """Distance of world points along the viewing axis; negative behind the camera."""
     return points @ viewmat[2, :3] + viewmat[2, 3]
 
 
 def centres(viewmats: Float[Tensor, "c 4 4"]) -> Float[Tensor, "c 3"]:
-    """Camera positions in the world: -R^T t."""
+    """Camera centres in the world: -R^T t."""
     return -(viewmats[:, :3, :3].mT @ viewmats[:, :3, 3:])[..., 0]
 
 
 def look_at(eye: Float[Tensor, "*b 3"], target: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 4 4"]:
-    """World-to-camera of an upright camera (world z up) at `eye` looking at `target`, not straight up or down."""
+    """World-to-camera matrix of a camera at `eye` without roll (world z up) looking at `target`.
+
+    The viewing direction must not be vertical.
+    """
     forward = torch.nn.functional.normalize(target - eye, dim=-1)
     up = torch.tensor([0.0, 0.0, 1.0]).to(eye).expand_as(eye)
     right = torch.nn.functional.normalize(torch.linalg.cross(forward, up), dim=-1)
@@ -39,7 +42,7 @@ def look_at(eye: Float[Tensor, "*b 3"], target: Float[Tensor, "*b 3"]) -> Float[
 
 
 def intrinsics(width: int, height: int, focal: float) -> Float[Tensor, "3 3"]:
-    """K of a camera with square pixels and the principal point at the image centre; focal length in pixels."""
+    """K of a camera with square pixels and the principal point at the image centre; `focal` in pixels."""
     return torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
 
 
@@ -56,9 +59,9 @@ def orbit(
     azimuth: float = 120.0,
     sweep: float = 360.0,
 ) -> Float[Tensor, "c 4 4"]:
-    """World-to-camera of `count` views around the vertical through `centre`; angles in degrees.
+    """World-to-camera matrices of `count` cameras on a circle about the vertical through `centre`; angles in degrees.
 
-    With azimuth 120 and elevation 20 these are the views of GSCollision, whose horizontal axes are
+    Azimuth 120 and elevation 20 give the views of GSCollision, whose horizontal axes are
     (1, 1, 0) / sqrt 2 and (1, -1, 0) / sqrt 2.
     """
     az = torch.deg2rad(azimuth + sweep * torch.arange(count) / count)

@@ -10,7 +10,7 @@ C0 = 0.28209479177387814  # 1 / (2 sqrt(pi))
 
 
 def degree_of(k: int) -> int:
-    """Degree of a set of k = (degree + 1)^2 coefficients."""
+    """Degree of a set of k = (degree + 1)^2 coefficients; ValueError unless it is 0 to 3."""
     degree = round(k**0.5) - 1
     if (degree + 1) ** 2 != k or not 0 <= degree <= 3:
         raise ValueError(f"{k} coefficients are no full set of degree 0 to 3")
@@ -41,18 +41,18 @@ def basis(dirs: Float[Tensor, "*b 3"], degree: int) -> Float[Tensor, "*b k"]:
 
 
 def evaluate_sh(sh: Float[Tensor, "n k 3"], dirs: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-    """Colour of each Gaussian seen along unit direction `dirs` (camera to Gaussian), not clamped: sh . basis + 0.5."""
+    """Colour of each Gaussian along unit view directions (camera to Gaussian), not clamped: sh . basis + 0.5."""
     return (basis(dirs, degree_of(sh.shape[1]))[..., None] * sh).sum(1) + 0.5
 
 
 def rgb_to_sh(rgb: Float[Tensor, "n 3"]) -> Float[Tensor, "n 1 3"]:
-    """Degree-0 coefficients of a colour in 0..1."""
+    """Degree-0 coefficients of RGB colours in 0..1."""
     return ((rgb - 0.5) / C0)[:, None]
 
 
 @cache
 def _probes() -> tuple[Tensor, dict[int, Tensor]]:
-    """Fixed directions, and for each band the inverse that turns values there into coefficients."""
+    """Fixed unit directions, and for each band the pseudo-inverse that maps values there to coefficients."""
     dirs = torch.randn(16, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     dirs = dirs / dirs.norm(dim=-1, keepdim=True)
     values = basis(dirs, 3)
@@ -60,9 +60,9 @@ def _probes() -> tuple[Tensor, dict[int, Tensor]]:
 
 
 def rotate_sh(sh: Float[Tensor, "n k 3"], R: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n k 3"]:
-    """Coefficients of the colour function turned by R: new(d) = old(R^T d).
+    """Coefficients of the colour function rotated by R: new(d) = old(R^T d).
 
-    Bands do not mix under rotation, so each is resampled at fixed directions and solved for (exact to rounding).
+    Bands do not mix under rotation, so each is sampled at fixed directions and solved for (exact to rounding).
     """
     degree = degree_of(sh.shape[1])
     if degree == 0:

@@ -1,4 +1,4 @@
-"""Nearest neighbours."""
+"""Nearest-neighbour search."""
 
 from math import inf
 
@@ -9,30 +9,30 @@ from torch import Tensor
 
 
 class KDTree:
-    """Points in a k-d tree, to be searched again and again on the CPU."""
+    """k-d tree on the CPU, for repeated queries."""
 
     def __init__(self, points: Float[Tensor, "n d"]):
         if not len(points):
-            raise ValueError("no points to search among")
+            raise ValueError("the tree needs at least one point")
         self.size, self.tree = len(points), cKDTree(points.detach().numpy())
 
     def query(
         self, points: Float[Tensor, "*b d"], k: int = 1, within: float = inf
     ) -> tuple[Float[Tensor, "*b k"], Int[Tensor, "*b k"]]:
-        """Distances and indices of the k nearest, nearest first; where fewer lie `within`, inf and any index."""
+        """Distances and indices of the k nearest points, nearest first; beyond `within` the distance is inf."""
         ranks = list(range(1, k + 1))  # a list keeps the last axis where k is 1
         distance, index = self.tree.query(points.detach().numpy(), ranks, distance_upper_bound=within, workers=-1)
         return torch.from_numpy(distance).to(points), torch.from_numpy(index).clamp_(max=self.size - 1)
 
 
 class BruteForce:
-    """Points compared with every query by matrix products: on a GPU a few thousand of them are faster so.
+    """Brute-force search by matrix products: for a few thousand points faster than a tree on a GPU.
 
-    Who is nearest is decided in float32 by |x|^2 - 2 q.x, so of two points whose squared distances differ by less than
-    some 1e-6 of |x|^2 either may be taken, and points should lie around the origin; distances themselves are exact.
+    Neighbours are ranked in float32 by |x|^2 - 2 q.x, so the order of points whose squared distances differ by less
+    than about 1e-6 |x|^2 is arbitrary, and points should be centred on the origin; the returned distances are exact.
     """
 
-    ENTRIES = 2**26  # of the products held at once, 256 MB
+    MAX_ENTRIES = 2**26  # of the distance matrix held at once, 256 MB
 
     def __init__(self, points: Float[Tensor, "n d"]):
         self.points = points
@@ -41,9 +41,9 @@ class BruteForce:
     def query(
         self, points: Float[Tensor, "*b d"], k: int = 1, within: float = inf
     ) -> tuple[Float[Tensor, "*b k"], Int[Tensor, "*b k"]]:
-        """As `KDTree.query`."""
+        """Same as `KDTree.query`."""
         flat, have = points.reshape(-1, points.shape[-1]), min(k, len(self.points))
-        chunks = flat.split(max(1, self.ENTRIES // len(self.points)))
+        chunks = flat.split(max(1, self.MAX_ENTRIES // len(self.points)))
         index = torch.cat([self._nearest(chunk, have) for chunk in chunks])
         distance, order = (flat[:, None] - self.points[index]).norm(dim=2).sort(1)
         distance = torch.nn.functional.pad(distance.where(distance < within, inf), (0, k - have), value=inf)
@@ -56,7 +56,7 @@ class BruteForce:
 
 
 def neighbour_index(points: Float[Tensor, "n d"]) -> KDTree | BruteForce:
-    """A few thousand points, ready for many queries on the device where they are."""
+    """A search structure for a few thousand points and many queries, on the device of the points."""
     return BruteForce(points) if points.is_cuda else KDTree(points)
 
 
@@ -65,7 +65,7 @@ def knn(
 ) -> tuple[Float[Tensor, "m k"], Int[Tensor, "m k"]]:
     """Distances and indices of the k nearest points to each query, nearest first.
 
-    With fewer than k points the last one is repeated, so the shape holds. A kd-tree on the CPU.
+    With fewer than k points the last one is repeated. Uses a k-d tree on the CPU.
     """
     have = min(k, len(points))
     distance, index = (found.to(queries.device) for found in KDTree(points.cpu()).query(queries.cpu(), have))
@@ -74,6 +74,6 @@ def knn(
 
 
 def spacing(points: Float[Tensor, "n 3"], k: int = 3) -> Float[Tensor, "n"]:
-    """Root mean square distance of each point to its k nearest others."""
+    """Root mean square distance of each point to its k nearest neighbours."""
     distance, _ = knn(points, points, k + 1)
     return distance[:, 1:].square().mean(1).sqrt()

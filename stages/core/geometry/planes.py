@@ -1,4 +1,4 @@
-"""Planes: normal . x = offset."""
+"""Planes normal . x = offset: least-squares fit and RANSAC."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Plane(NamedTuple):
 
 
 def fit_plane(points: Float[Tensor, "n 3"], weights: Float[Tensor, "n"] | None = None) -> Plane:
-    """Least-squares plane of three points or more; the sign of its normal is arbitrary."""
+    """Weighted least-squares plane of at least three points; the sign of its normal is arbitrary."""
     w = torch.ones_like(points[:, 0]) if weights is None else weights
     centre = (points * w[:, None]).sum(0) / w.sum()
     centred = points - centre
@@ -31,7 +31,7 @@ def fit_plane(points: Float[Tensor, "n 3"], weights: Float[Tensor, "n"] | None =
 
 
 def planes_through(triples: Float[Tensor, "k 3 3"]) -> tuple[Float[Tensor, "k 3"], Float[Tensor, "k"]]:
-    """Unit normals and offsets of planes through three points each; points in a line give a zero normal."""
+    """Unit normals and offsets of the planes through three points each; collinear points give a zero normal."""
     a, b, c = triples.unbind(1)
     normals = torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=1)
     return normals, (normals * a).sum(1)
@@ -45,19 +45,20 @@ def ransac(
     trials: int = 2000,
     seed: int = 0,
 ) -> tuple[Plane, Bool[Tensor, "n"]] | None:
-    """The plane with most weight of points within `threshold`, and those points; nothing if none is allowed.
+    """The plane with the largest weight of points within `threshold`, and the mask of these inliers; None if none.
 
-    `allowed` says which unit normals may win; each candidate is offered with both signs, and the sign
-    that it accepts is kept. Source: Fischler and Bolles 1981, "Random sample consensus".
+    `allowed` maps unit normals to a mask of acceptable ones; each candidate is tested with both signs of its normal,
+    and the accepted sign is kept. The best sample is refined by three least-squares fits to its inliers.
+    Source: Fischler and Bolles 1981, "Random sample consensus".
     """
     if len(points) < 3:
         return None
     weights = torch.ones_like(points[:, 0]) if weights is None else weights
     generator = torch.Generator().manual_seed(seed)
     count = min(len(points), 20_000)
-    some = torch.multinomial(weights.cpu().double(), count, replacement=True, generator=generator).to(points.device)
-    draw = torch.randint(len(some), (trials, 3), generator=generator).to(points.device)
-    normals, offsets = planes_through(points[some][draw])
+    sample = torch.multinomial(weights.cpu().double(), count, replacement=True, generator=generator).to(points.device)
+    draw = torch.randint(len(sample), (trials, 3), generator=generator).to(points.device)
+    normals, offsets = planes_through(points[sample][draw])
     normals, offsets = torch.cat([normals, -normals]), torch.cat([offsets, -offsets])
     good = normals.norm(dim=1) > 0.5
     if allowed is not None:
@@ -66,9 +67,9 @@ def ransac(
         return None
     normals, offsets = normals[good], offsets[good]
     score = torch.cat([
-        ((points[some] @ n.mT - d).abs() < threshold).double().mean(0)
+        ((points[sample] @ n.mT - d).abs() < threshold).double().mean(0)
         for n, d in zip(normals.split(256), offsets.split(256), strict=True)
-    ])  # fmt: skip  # `some` was drawn by weight, so a plain count is a weighted one
+    ])  # fmt: skip  # sampled by weight, so the count is weighted
     best = int(score.argmax())
     plane = Plane(normals[best], float(offsets[best]))
     for _ in range(3):

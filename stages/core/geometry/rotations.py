@@ -6,7 +6,7 @@ from torch import Tensor
 
 
 def matrix(quats: Float[Tensor, "*b 4"]) -> Float[Tensor, "*b 3 3"]:
-    """Rotation matrices of quaternions w x y z, which are normalised here; a zero quat gives nan."""
+    """Rotation matrices of quaternions w x y z, normalised here; a zero quaternion gives nan."""
     w, x, y, z = (quats / quats.norm(dim=-1, keepdim=True)).unbind(-1)
     rows = [
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
@@ -19,7 +19,7 @@ def matrix(quats: Float[Tensor, "*b 4"]) -> Float[Tensor, "*b 3 3"]:
 def quaternion(R: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 4"]:
     """Unit quaternions w x y z, w >= 0, of rotation matrices.
 
-    Each of the four squared components is a sum over the diagonal; the largest one is the safe divisor.
+    The largest of the four components, found from the diagonal, is used as divisor.
     Source: Shepperd 1978, "Quaternion from rotation matrix".
     """
     m = R.flatten(-2)
@@ -56,7 +56,7 @@ def covariance(quats: Float[Tensor, "*b 4"], scales: Float[Tensor, "*b 3"]) -> F
 
 
 def rotation_between(a: Float[Tensor, "3"], b: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
-    """The smallest rotation that turns direction `a` into direction `b` (any axis when they are opposite)."""
+    """Smallest rotation from direction `a` to direction `b`; arbitrary axis for opposite directions."""
     a, b = a / a.norm(), b / b.norm()
     if torch.dot(a, b) < -1 + 1e-6:
         axis = torch.linalg.cross(a, torch.eye(3).to(a)[a.abs().argmin()])

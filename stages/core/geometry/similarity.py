@@ -1,4 +1,4 @@
-"""Similarity transforms x -> s R x + t."""
+"""Similarity transforms x -> s R x + t, and their least-squares estimate."""
 
 from typing import NamedTuple
 
@@ -17,17 +17,20 @@ class Similarity(NamedTuple):
     translation: Tensor  # (3,)
 
     def __call__(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
+        """Transform points."""
         return self.scale * points @ self.rotation.mT + self.translation
 
     def inverse(self) -> "Similarity":
+        """The inverse transform."""
         R = self.rotation.mT
         return Similarity(1 / self.scale, R, -(R @ self.translation) / self.scale)
 
     def to(self, device: str | torch.device) -> "Similarity":
+        """The same transform on a device."""
         return Similarity(self.scale, self.rotation.to(device), self.translation.to(device))
 
     def viewmats(self, viewmats: Float[Tensor, "c 4 4"]) -> Float[Tensor, "c 4 4"]:
-        """World-to-camera matrices that see the transformed world in the same pixels, depths times scale."""
+        """World-to-camera matrices for the transformed world: same pixels, depths multiplied by the scale."""
         out = viewmats.clone()
         out[:, :3, :3] = viewmats[:, :3, :3] @ self.rotation.mT
         out[:, :3, 3] = self.scale * viewmats[:, :3, 3] - out[:, :3, :3] @ self.translation
@@ -35,7 +38,7 @@ class Similarity(NamedTuple):
 
 
 def umeyama(source: Float[Tensor, "n 3"], target: Float[Tensor, "n 3"], scaled: bool = True) -> Similarity:
-    """Least-squares similarity (or rigid motion) from `source` to `target`.
+    """Least-squares similarity from `source` to `target`; a rigid motion unless `scaled`.
 
     Source: Umeyama 1991, "Least-squares estimation of transformation parameters between two point patterns".
     """

@@ -16,7 +16,7 @@ def cloud():
 
 @pytest.mark.parametrize("k", [1, 32])
 def test_products_find_what_the_tree_finds(cloud, k, monkeypatch):
-    monkeypatch.setattr(BruteForce, "ENTRIES", 100_000)  # several chunks
+    monkeypatch.setattr(BruteForce, "MAX_ENTRIES", 100_000)  # several chunks
     points, queries = cloud
     (far, which), (expected, index) = (way(points).query(queries, k) for way in (BruteForce, KDTree))
     torch.testing.assert_close(far, expected, rtol=0, atol=1e-5)

@@ -118,7 +118,7 @@ def _blend(
     rotation[i] = _rotation_of(F)
 
 
-def blend(
+def skin_gaussians(
     index: Tensor, weight: Tensor, rest: Tensor, displacement: Tensor, gradient: Tensor,
     means: Tensor, quats: Tensor, scales: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
@@ -144,7 +144,7 @@ def blend(
     return tuple(out)
 
 
-def blend_reference(
+def skin_gaussians_reference(
     index: Tensor, weight: Tensor, rest: Tensor, displacement: Tensor, gradient: Tensor,
     means: Tensor, quats: Tensor, scales: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip

@@ -9,7 +9,7 @@ from torch import Tensor
 from stages.core.geometry.harmonics import rotate_sh
 from stages.core.geometry.neighbours import knn
 from stages.core.geometry.rotations import nearest_rotation, quaternion
-from stages.core.kernels.skinning import blend
+from stages.core.kernels.skinning import skin_gaussians
 from stages.core.scene.gaussians import Gaussians
 from stages.core.scene.trajectory import Binding, Keypoints
 
@@ -44,7 +44,7 @@ class Skinning:
         if not len(self._moving) or not bool(u.any()):
             return g
         G = self._gradients(u)
-        means, quats, scales, R = blend(
+        means, quats, scales, R = skin_gaussians(
             self._index, self._weight, *(t.to(part.means.device) for t in (self.rest, u, G)),
             part.means.contiguous(), part.quats.contiguous(), part.scales.contiguous(),
         )  # fmt: skip

@@ -14,9 +14,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from stages.core.geometry.harmonics import degree_of
-from stages.core.kernels.splat.binning import Bins, fill_bins
-from stages.core.kernels.splat.compositing import blend, heaviest
-from stages.core.kernels.splat.projection import pinhole, project
+from stages.core.kernels.splat.binning import Bins, bin_splats
+from stages.core.kernels.splat.compositing import composite, dominant_splats
+from stages.core.kernels.splat.projection import pack_camera, project
 from stages.core.scene.gaussians import Gaussians
 
 
@@ -85,7 +85,7 @@ def visibility(
     """For every pixel the Gaussian that weighs most (-1: none), for every Gaussian its weight over all pixels [px]."""
     if gaussians.means.is_cuda:
         return _visibility_cuda(gaussians, viewmat, K, width, height, near)
-    return heaviest(*_splats(gaussians, viewmat, K, width, height, near))
+    return dominant_splats(*_splats(gaussians, viewmat, K, width, height, near))
 
 
 def _stack(images: list[Tensor] | tuple[Tensor, ...]) -> Tensor:
@@ -94,9 +94,9 @@ def _stack(images: list[Tensor] | tuple[Tensor, ...]) -> Tensor:
 
 def _splats(g: Gaussians, viewmat: Tensor, K: Tensor, width: int, height: int, near: float) -> tuple[Tensor, Bins]:
     degree_of(g.sh.shape[1])
-    camera = pinhole(viewmat, K, width, height, near)
+    camera = pack_camera(viewmat, K, width, height, near)
     splats, keys, rects = project(camera, g.means, g.quats, g.scales, g.opacities, g.sh)
-    return splats, fill_bins(keys, rects, width, height)
+    return splats, bin_splats(keys, rects, width, height)
 
 
 def _draw(g: Gaussians, viewmat: Tensor, K: Tensor, width: int, height: int, background: Tensor | None, near: float):
@@ -105,7 +105,7 @@ def _draw(g: Gaussians, viewmat: Tensor, K: Tensor, width: int, height: int, bac
     pull: list[Tensor] = []
     if splats.requires_grad:
         splats.register_hook(lambda grad: pull.append(grad[:, 10:12]))
-    rgb, depth, alpha = blend(splats, bins, None if background is None else background.detach(), mean=True)
+    rgb, depth, alpha = composite(splats, bins, None if background is None else background.detach(), mean=True)
     return rgb, alpha, depth, splats.detach()[:, 11:13], lambda: pull
 
 
@@ -116,7 +116,7 @@ def _features(g: Gaussians, features: Tensor, viewmat: Tensor, K: Tensor, width:
     padded = torch.nn.functional.pad(features.float(), (0, -count % 4))
     images = []
     for four in padded.split(4, dim=1):
-        rgb, fourth, _ = blend(torch.cat([splats[:, :6], four, splats[:, 10:]], 1), bins)
+        rgb, fourth, _ = composite(torch.cat([splats[:, :6], four, splats[:, 10:]], 1), bins)
         images += [rgb, fourth[..., None]]
     return torch.cat(images, -1)[..., :count] if images else splats.new_zeros(height, width, 0)
 
@@ -159,7 +159,7 @@ def _visibility_cuda(g: Gaussians, viewmat: Tensor, K: Tensor, width: int, heigh
     """gsplat's splats and bins, walked by our kernel: gsplat itself does not say which splat weighs most."""
     import gsplat
 
-    from stages.core.kernels.splat.compositing_pixel import composite
+    from stages.core.kernels.splat.compositing_pixel import composite_pixelwise
 
     radii, centres, depths, conics, _ = gsplat.fully_fused_projection(
         g.means, None, g.quats, g.scales, *_camera(g, viewmat, K), width, height, near_plane=near,
@@ -171,5 +171,5 @@ def _visibility_cuda(g: Gaussians, viewmat: Tensor, K: Tensor, width: int, heigh
     starts = torch.cat([starts, starts.new_tensor([len(members)])])
     splats = torch.zeros(len(g), 16, device=centres.device)
     splats[:, :6] = torch.cat([centres[0], conics[0], g.opacities[:, None]], 1)
-    _, _, index, weight = composite(splats, members, starts, tile, width, height)
+    _, _, index, weight = composite_pixelwise(splats, members, starts, tile, width, height)
     return index, weight

@@ -10,25 +10,25 @@ import warp as wp
 
 from stages.core.kernels.interop import launch, view
 from stages.core.kernels.mpm.constitutive import neo_hookean
-from stages.core.kernels.mpm.grid import Grid, at_walls, first_node, weights
+from stages.core.kernels.mpm.grid import MpmGrid, apply_walls, bspline_weights, first_node
 from stages.core.kernels.mpm.nodes import mat43
-from stages.core.kernels.mpm.transfers import Moved, Rows, carried, moved
+from stages.core.kernels.mpm.transfers import ParticleArrays, ParticleUpdate, advance_free, affine_momentum
 from stages.core.physics.mpm.solver import Solver
 
 
 @wp.kernel(enable_backward=False)
-def _to_grid(grid: Grid, rows: Rows, dt: float, nodes: wp.array2d[float]):
+def _to_grid(grid: MpmGrid, rows: ParticleArrays, dt: float, nodes: wp.array2d[float]):
     i = wp.tid()
-    now = Moved()
+    now = ParticleUpdate()
     now.x = rows.x[i]
     now.v = rows.v[i]
     now.C = rows.C[i]
     tau = neo_hookean(rows.F[i], rows.stiffness[i])
-    load = carried(grid.dx, now, tau, rows.mass[i], rows.volume[i], 0.0, rows.push[i], 0, dt, 0.0)
+    load = affine_momentum(grid.dx, now, tau, rows.mass[i], rows.volume[i], 0.0, rows.acceleration[i], 0, dt, 0.0)
     g = (now.x - grid.origin) / grid.dx
     base = first_node(g)
     fx = wp.vec3(g[0] - float(base[0]), g[1] - float(base[1]), g[2] - float(base[2]))
-    w = weights(fx)
+    w = bspline_weights(fx)
     corner = rows.scene[i] * grid.count + (base[0] * grid.nodes[1] + base[1]) * grid.nodes[2] + base[2]
     for a in range(3):
         for b in range(3):
@@ -41,23 +41,23 @@ def _to_grid(grid: Grid, rows: Rows, dt: float, nodes: wp.array2d[float]):
 
 
 @wp.kernel(enable_backward=False)
-def _on_grid(grid: Grid, nodes: wp.array[wp.vec4]):
+def _on_grid(grid: MpmGrid, nodes: wp.array[wp.vec4]):
     t = wp.tid()
     u = nodes[t]
     if u[3] > 0.0:
         n = t % grid.count
         at = wp.vec3i(n // (grid.nodes[1] * grid.nodes[2]), (n // grid.nodes[2]) % grid.nodes[1], n % grid.nodes[2])
-        v = at_walls(grid, at, wp.vec3(u[0], u[1], u[2]) / u[3], 0.5)
+        v = apply_walls(grid, at, wp.vec3(u[0], u[1], u[2]) / u[3], 0.5)
         nodes[t] = wp.vec4(v[0], v[1], v[2], u[3])
 
 
 @wp.kernel(enable_backward=False)
-def _to_particles(grid: Grid, rows: Rows, dt: float, nodes: wp.array[wp.vec4]):
+def _to_particles(grid: MpmGrid, rows: ParticleArrays, dt: float, nodes: wp.array[wp.vec4]):
     i = wp.tid()
     g = (rows.x[i] - grid.origin) / grid.dx
     base = first_node(g)
     fx = wp.vec3(g[0] - float(base[0]), g[1] - float(base[1]), g[2] - float(base[2]))
-    w = weights(fx)
+    w = bspline_weights(fx)
     corner = rows.scene[i] * grid.count + (base[0] * grid.nodes[1] + base[1]) * grid.nodes[2] + base[2]
     s = mat43()
     for a in range(3):
@@ -69,7 +69,7 @@ def _to_particles(grid: Grid, rows: Rows, dt: float, nodes: wp.array[wp.vec4]):
                 for r in range(4):
                     for n in range(3):
                         s[r, n] += d[r] * v[n]
-    now = moved(grid, rows.x[i], rows.F[i], s, dt)
+    now = advance_free(grid, rows.x[i], rows.F[i], s, dt)
     rows.x[i] = now.x
     rows.v[i] = now.v
     rows.C[i] = now.C

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from stages.core.errors import InputError
 from stages.core.geometry.cameras import intrinsics, look_at
-from stages.core.kernels.splat.projection import pinhole, project
+from stages.core.kernels.splat.projection import pack_camera, project
 from stages.core.kernels.splat.ssim import ssim, ssim_reference
 from stages.core.raster.rasterise import rasterise
 from stages.core.scene.files import replacing
@@ -86,7 +86,7 @@ def view_camera(pixels: int) -> tuple[Tensor, Tensor]:
 def render_per_pixel(g: Gaussians, viewmat: Tensor, K: Tensor, pixels: int) -> Tensor:
     """Colour and depth (pixels, pixels, 4) before black."""
     tensors = (g.means, g.quats, g.scales, g.opacities, g.sh)
-    splats, keys, _ = project(pinhole(viewmat, K, pixels, pixels, 0.01), *tensors)
+    splats, keys, _ = project(pack_camera(viewmat, K, pixels, pixels, 0.01), *tensors)
     return composite_per_pixel(splats, bin_into_tiles(splats, keys, pixels, pixels))
 
 

@@ -11,10 +11,10 @@ import warp as wp
 from torch import Tensor
 
 from stages.core.kernels.interop import view
-from stages.core.kernels.splat.binning import Bins, fill_bins
-from stages.core.kernels.splat.pixel_blocks import CLOSED, SOLID
-from stages.core.kernels.splat.projection import FAINTEST
-from stages.core.kernels.splat.simd import even, parts, run
+from stages.core.kernels.splat.binning import Bins, bin_splats
+from stages.core.kernels.splat.pixel_blocks import MAX_ALPHA, MIN_TRANSMITTANCE
+from stages.core.kernels.splat.projection import MIN_ALPHA
+from stages.core.kernels.splat.simd import even_bounds, launch_ranges, num_threads
 
 wp.set_module_options({"enable_backward": False})
 TILE = 16  # [px]
@@ -40,9 +40,9 @@ def _forward(
     while k < starts[bin + 1]:
         s = members[k]
         alpha = wp.min(splats[s, 5] * _falloff(splats, s, float(j) + 0.5 - splats[s, 0], float(i) + 0.5 - splats[s, 1]),
-                       wp.static(SOLID))  # fmt: skip
-        if alpha >= wp.static(FAINTEST):
-            if T * (1.0 - alpha) <= wp.static(CLOSED):
+                       wp.static(MAX_ALPHA))  # fmt: skip
+        if alpha >= wp.static(MIN_ALPHA):
+            if T * (1.0 - alpha) <= wp.static(MIN_TRANSMITTANCE):
                 break
             colour += alpha * T * wp.vec4(splats[s, 6], splats[s, 7], splats[s, 8], splats[s, 9])
             T *= 1.0 - alpha
@@ -70,15 +70,15 @@ def _backward(
         s = members[k]
         dx, dy = float(j) + 0.5 - splats[s, 0], float(i) + 0.5 - splats[s, 1]
         fall = _falloff(splats, s, dx, dy)
-        alpha = wp.min(splats[s, 5] * fall, wp.static(SOLID))
-        if alpha < wp.static(FAINTEST):
+        alpha = wp.min(splats[s, 5] * fall, wp.static(MAX_ALPHA))
+        if alpha < wp.static(MIN_ALPHA):
             continue
         T = T / (1.0 - alpha)
         w = alpha * T
         facing = wp.dot(v, wp.vec4(splats[s, 6], splats[s, 7], splats[s, 8], splats[s, 9]))
         for c in range(4):
             wp.atomic_add(grads, piece, s, 6 + c, w * v[c])
-        if splats[s, 5] * fall <= wp.static(SOLID):
+        if splats[s, 5] * fall <= wp.static(MAX_ALPHA):
             g = alpha * (T * facing - behind / (1.0 - alpha))
             wp.atomic_add(grads, piece, s, 0, g * (splats[s, 2] * dx + splats[s, 3] * dy))
             wp.atomic_add(grads, piece, s, 1, g * (splats[s, 3] * dx + splats[s, 4] * dy))
@@ -102,7 +102,7 @@ class _Blend(torch.autograd.Function):
     @staticmethod
     def backward(ctx, v_image):
         splats, left, ends = ctx.saved_tensors
-        grads = torch.zeros(parts(), len(splats), GRADIENT_CHANNELS)  # one table a thread, as ours
+        grads = torch.zeros(num_threads(), len(splats), GRADIENT_CHANNELS)  # one table a thread, as ours
         v_image = v_image.reshape(-1, 4).contiguous()
         _launch(_backward, splats, ctx.bins, view(v_image, wp.vec4), view(left), view(ends), view(grads))
         return torch.nn.functional.pad(grads.sum(0), (0, splats.shape[1] - GRADIENT_CHANNELS)), None
@@ -110,8 +110,8 @@ class _Blend(torch.autograd.Function):
 
 def _launch(kernel: wp.Kernel, splats: Tensor, bins: Bins, *views) -> None:
     """The image's pixels in as many pieces as there are threads."""
-    inputs = [bins.width, bins.across, view(splats), view(bins.members), view(bins.starts), *views]
-    run(kernel, even(bins.width * bins.height, parts()), inputs)
+    inputs = [bins.width, bins.columns, view(splats), view(bins.members), view(bins.starts), *views]
+    launch_ranges(kernel, even_bounds(bins.width * bins.height, num_threads()), inputs)
 
 
 def bin_into_tiles(splats: Tensor, keys: Tensor, width: int, height: int) -> Bins:
@@ -119,7 +119,7 @@ def bin_into_tiles(splats: Tensor, keys: Tensor, width: int, height: int) -> Bin
     last = torch.tensor([(width - 1) // TILE, (height - 1) // TILE])
     centre, reach = splats[:, :2].detach(), splats[:, 11:13].detach()
     low, high = (((centre + sign * reach - 0.5) / TILE).floor().clamp(0 * last, last) for sign in (-1, 1))
-    return fill_bins(keys, torch.cat([low, high], 1).to(torch.int16), width, height, TILE)
+    return bin_splats(keys, torch.cat([low, high], 1).to(torch.int16), width, height, TILE)
 
 
 def composite_per_pixel(splats: Tensor, bins: Bins) -> Tensor:

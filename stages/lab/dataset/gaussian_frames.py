@@ -20,7 +20,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from stages.core.geometry.rotations import covariance
-from stages.core.kernels.skinning import blend
+from stages.core.kernels.skinning import skin_gaussians
 from stages.core.physics.keypoints import KEYPOINTS_PER_GAUSSIAN, nearest_weights
 from stages.core.scene.gaussians import Gaussians, concatenate
 from stages.core.scene.scene import Scene, SceneObject
@@ -84,8 +84,9 @@ class SkinnedScene:
     def at(self, x: Float[Tensor, "p 3"], F: Float[Tensor, "p 3 3"]) -> tuple[Gaussians, Float[Tensor, "n 3 3"]]:
         """The Gaussians when the particles are there and deformed so, and how each is turned; SH are not."""
         g, one = self.rest, torch.eye(3, device=x.device)
-        means, quats, scales, R = blend(self._index, self._weight, self._particles, x - self._particles, F - one,
-                                        g.means.contiguous(), g.quats.contiguous(), g.scales.contiguous())  # fmt: skip
+        means, quats, scales, R = skin_gaussians(self._index, self._weight, self._particles, x - self._particles,
+                                                 F - one, g.means.contiguous(), g.quats.contiguous(),
+                                                 g.scales.contiguous())  # fmt: skip
         return replace(g, means=means, quats=quats, scales=scales), R
 
 

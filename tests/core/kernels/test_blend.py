@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from stages.core.geometry.rotations import covariance
-from stages.core.kernels.skinning import blend, blend_reference
+from stages.core.kernels.skinning import skin_gaussians, skin_gaussians_reference
 from tests.conftest import DEVICES
 
 
@@ -23,8 +23,8 @@ def random_blend(device: str, n: int = 3000, p: int = 40) -> list[torch.Tensor]:
 @pytest.mark.parametrize("device", DEVICES)
 def test_blend_equals_its_reference(device):
     args = random_blend(device)
-    means, quats, scales, R = blend(*args)
-    exact = blend_reference(args[0], *(a.double() for a in args[1:]))
+    means, quats, scales, R = skin_gaussians(*args)
+    exact = skin_gaussians_reference(args[0], *(a.double() for a in args[1:]))
     torch.testing.assert_close(means.double(), exact[0], rtol=1e-5, atol=1e-5)
     # quats and scales of an ellipsoid are not unique, their covariance is
     ours, theirs = covariance(quats.double(), scales.double()), covariance(exact[1], exact[2])
@@ -44,7 +44,7 @@ def exact_gradient(args: list[torch.Tensor]) -> torch.Tensor:
 @pytest.mark.parametrize("device", DEVICES)
 def test_no_motion_changes_not_a_bit(device):
     index, weight, rest, displacement, gradient, means, quats, scales = random_blend(device)
-    still = blend(index, weight, rest, 0 * displacement, 0 * gradient, means, quats, scales)
+    still = skin_gaussians(index, weight, rest, 0 * displacement, 0 * gradient, means, quats, scales)
     for got, given in zip(still, (means, quats, scales), strict=False):
         assert torch.equal(got, given)
     assert torch.equal(still[3], torch.eye(3).to(device).expand(len(means), 3, 3))
@@ -53,4 +53,4 @@ def test_no_motion_changes_not_a_bit(device):
 @pytest.mark.parametrize("n", [0, 1, 2])
 def test_few_gaussians(n):
     args = random_blend("cpu", n=n)
-    assert [len(t) for t in blend(*args)] == [n] * 4
+    assert [len(t) for t in skin_gaussians(*args)] == [n] * 4

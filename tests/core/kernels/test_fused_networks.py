@@ -7,9 +7,9 @@ pytest.importorskip("triton")
 if not torch.cuda.is_available():
     pytest.skip("Triton's kernels need an NVIDIA GPU", allow_module_level=True)
 
-from stages.core.kernels.field.nearest import nearest, nearest_reference  # noqa: E402
+from stages.core.kernels.field.nearest import nearest_between_objects, nearest_between_objects_reference  # noqa: E402
 from stages.core.kernels.field.perceptron import perceptron, perceptron_reference  # noqa: E402
-from stages.core.kernels.field.skinny_matmul import thin_product  # noqa: E402
+from stages.core.kernels.field.skinny_matmul import skinny_matmul  # noqa: E402
 
 pytestmark = pytest.mark.gpu
 
@@ -24,8 +24,8 @@ def test_nearest_equals_its_reference(b, o, n):
     points[:, -1] += 5  # out of reach
     valid = rand(b, o, n) > -1
     valid[-1, 0] = False  # an object that is not there
-    distance, index = nearest(points, valid, 0.2)
-    wanted, which = nearest_reference(points.double(), valid, 0.2)
+    distance, index = nearest_between_objects(points, valid, 0.2)
+    wanted, which = nearest_between_objects_reference(points.double(), valid, 0.2)
     torch.testing.assert_close(distance.double(), wanted, rtol=1e-6, atol=1e-7)
     there = wanted.isfinite()
     assert torch.equal(index[there], which[there])
@@ -56,4 +56,4 @@ def test_perceptron_equals_its_reference(widths, active, many):
 
 def test_thin_product_is_the_matrix_product():
     A, x = rand(2, 3, 50, 200).half(), rand(2, 3, 200, 9)
-    torch.testing.assert_close(thin_product(A, x).double(), A.double() @ x.double(), rtol=1e-5, atol=1e-4)
+    torch.testing.assert_close(skinny_matmul(A, x).double(), A.double() @ x.double(), rtol=1e-5, atol=1e-4)

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from stages.core.kernels.mpm.grid import PAD
+from stages.core.kernels.mpm.grid import GRID_PADDING
 from stages.core.kernels.mpm.transfers import substep_reference
 from stages.core.physics.mpm import solver as mpm
 from stages.core.physics.mpm import split as mpm_split
@@ -46,7 +46,7 @@ def test_a_step_equals_its_reference(device):
     for name, value in zip(("x", "v", "C", "F"), (expected[0] + origin, *expected[1:]), strict=True):
         scale = float(value.abs().max())
         torch.testing.assert_close(getattr(got, name).cpu().double(), value, rtol=0, atol=2e-5 * scale, msg=name)
-    assert walls[0].tolist() == [PAD] * 3
+    assert walls[0].tolist() == [GRID_PADDING] * 3
 
 
 def test_the_same_bytes_whatever_the_number_of_threads(monkeypatch):

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from stages.core.kernels.mpm import constitutive as materials
-from stages.core.kernels.mpm.constitutive import COROTATED, NEO_HOOKEAN, SAND, SNOW, VON_MISES, response
+from stages.core.kernels.mpm.constitutive import COROTATED, NEO_HOOKEAN, SAND, SNOW, VON_MISES, update_materials
 from tests.conftest import DEVICES
 
 MU, LAM = 4e4, 6e4
@@ -16,7 +16,7 @@ def answer(model: int, F: torch.Tensor, plastic=(0.0, 0.0, 0.0), state: float = 
     p = len(F)
     rows = torch.full((p,), model, dtype=torch.int8), F, torch.tensor([[MU, LAM, 0.0]]).repeat(p, 1), \
         torch.tensor([plastic], dtype=torch.float32).repeat(p, 1), torch.full((p,), state)  # fmt: skip
-    return tuple(t.cpu() for t in response(*(r.to(device) for r in rows), dt))
+    return tuple(t.cpu() for t in update_materials(*(r.to(device) for r in rows), dt))
 
 
 def deformed(p: int = 50, size: float = 0.3, seed: int = 0) -> torch.Tensor:
@@ -100,7 +100,7 @@ def test_hardening_and_softening_move_the_yield_stress():
         _, tau, state = answer(VON_MISES, shear(0.2), (1e3, H, 0))
         assert deviator(tau) == pytest.approx(math.sqrt(2 / 3) * (1e3 + H * float(state)), rel=1e-3)
     _, tau, _ = answer(VON_MISES, shear(0.2), (1e3, -2e3, 0), state=10.0)  # plasticine that was kneaded for long
-    assert deviator(tau) == pytest.approx(materials.RESIDUAL * math.sqrt(2 / 3) * 1e3, rel=1e-3)
+    assert deviator(tau) == pytest.approx(materials.RESIDUAL_STRENGTH * math.sqrt(2 / 3) * 1e3, rel=1e-3)
 
 
 def test_foam_relaxes_at_the_rate_of_its_viscosity():
@@ -110,7 +110,7 @@ def test_foam_relaxes_at_the_rate_of_its_viscosity():
             torch.tensor([[strength, 0.0, eta]]))  # fmt: skip
     limit, state, excess = math.sqrt(2 / 3) * strength, torch.zeros(1), []
     for _ in range(60):
-        F, tau, state = response(rows[0], F, rows[1], rows[2], state, dt)
+        F, tau, state = update_materials(rows[0], F, rows[1], rows[2], state, dt)
         excess.append(deviator(tau) - limit)
     rate = math.log(excess[0] / excess[-1]) / (59 * dt)
     # implicit steps: (1 + 2 mu dt / eta) a step instead of the exponential
@@ -146,7 +146,7 @@ def test_snow_packs_and_hardens():
     torch.testing.assert_close(kept, (1 - compress) * torch.eye(3)[None], rtol=0, atol=1e-5)
     Jp = 0.9**3 / (1 - compress) ** 3
     assert math.exp(float(state)) == pytest.approx(Jp, rel=1e-4)
-    hard = min(math.exp(xi * (1 - Jp)), materials.HARDEST)
+    hard = min(math.exp(xi * (1 - Jp)), materials.MAX_SNOW_HARDENING)
     J, s = (1 - compress) ** 3, 1 - compress
     assert hard > 1
     assert float(tau[0, 0, 0]) == pytest.approx(hard * (2 * MU * (s - 1) * s + LAM * J * (J - 1)), rel=2e-3)

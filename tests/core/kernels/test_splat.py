@@ -3,11 +3,11 @@
 import pytest
 import torch
 
-from stages.core.kernels.splat.binning import fill_bins, fill_bins_reference
-from stages.core.kernels.splat.compositing import blend, blend_reference, heaviest
-from stages.core.kernels.splat.compositing_pixel import composite
-from stages.core.kernels.splat.projection import BIN, pinhole, project, project_reference
-from stages.core.kernels.splat.simd import even
+from stages.core.kernels.splat.binning import bin_splats, depth_order_reference
+from stages.core.kernels.splat.compositing import composite, composite_reference, dominant_splats
+from stages.core.kernels.splat.compositing_pixel import composite_pixelwise
+from stages.core.kernels.splat.projection import BIN_SIZE, pack_camera, project, project_reference
+from stages.core.kernels.splat.simd import even_bounds
 from tests.conftest import random_gaussians, ring
 
 devices = ["cpu"] + (["cuda"] if torch.cuda.is_available() else [])
@@ -19,7 +19,7 @@ def view_of(gaussians, closer: float = 0.0, size=(WIDTH, HEIGHT)):
     cameras = ring()
     viewmat = cameras.viewmats[1].clone()
     viewmat[2, 3] -= closer
-    camera = pinhole(viewmat, cameras.Ks[1], *size, 0.01)
+    camera = pack_camera(viewmat, cameras.Ks[1], *size, 0.01)
     return camera, (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
 
 
@@ -29,7 +29,7 @@ def random_splats(n: int, opacity: float = 1.0, seed: int = 0, size=(WIDTH, HEIG
     tensors = (*tensors[:3], (opacity * tensors[3]).clamp(max=1.0), tensors[4])
     with torch.no_grad():
         splats, keys, rects = project(camera, *tensors)
-    return splats, fill_bins(keys, rects, *size)
+    return splats, bin_splats(keys, rects, *size)
 
 
 def relative(ours, theirs) -> float:
@@ -89,13 +89,13 @@ def test_behind_beside_and_not_a_number_are_not_visible():
 @pytest.mark.parametrize("n", [0, 1, 17, 1500])
 def test_bins_hold_what_touches_them_nearest_first(n):
     splats, bins = random_splats(n)
-    order = fill_bins_reference(splats)
-    across = -(-WIDTH // BIN)
-    assert len(bins.starts) == across * -(-HEIGHT // BIN) + 1 and bins.starts[-1] == len(bins.members)
+    order = depth_order_reference(splats)
+    across = -(-WIDTH // BIN_SIZE)
+    assert len(bins.starts) == across * -(-HEIGHT // BIN_SIZE) + 1 and bins.starts[-1] == len(bins.members)
     low, high = splats[order, :2] - splats[order, 11:13], splats[order, :2] + splats[order, 11:13]
     for b in range(len(bins.starts) - 1):
-        corner = torch.tensor([b % across, b // across]) * BIN
-        touches = ((low <= corner + BIN - 0.5) & (high >= corner + 0.5)).all(1)  # a pixel centre between its edges
+        corner = torch.tensor([b % across, b // across]) * BIN_SIZE
+        touches = ((low <= corner + BIN_SIZE - 0.5) & (high >= corner + 0.5)).all(1)  # a pixel centre between its edges
         members = bins.members[bins.starts[b] : bins.starts[b + 1]]
         assert set(order[touches].tolist()) <= set(members.tolist())
         assert torch.equal(members.long(), order[torch.isin(order, members)])
@@ -103,15 +103,15 @@ def test_bins_hold_what_touches_them_nearest_first(n):
 
 def test_equal_depths_keep_the_order_of_the_gaussians():
     keys = torch.tensor([5, 7, 5, -1, 7, 5, 1 << 30], dtype=torch.int32)
-    bins = fill_bins(keys, torch.zeros(7, 4, dtype=torch.int16), 20, 20)
+    bins = bin_splats(keys, torch.zeros(7, 4, dtype=torch.int16), 20, 20)
     assert bins.members.tolist() == [0, 2, 5, 1, 4, 6]
 
 
 def test_pieces_cover_all_bins_with_about_equal_work():
     _, bins = random_splats(1500, size=(320, 200))
-    bounds = bins.pieces(3)
+    bounds = bins.balanced_bounds(3)
     assert bounds[0] == 0 and bounds[-1] == len(bins.starts) - 1 and bounds == sorted(set(bounds))
-    assert even(10, 3) == [0, 3, 6, 10]
+    assert even_bounds(10, 3) == [0, 3, 6, 10]
 
 
 # opacity 3: most clamp at alpha 0.999, many pixels finish early
@@ -120,8 +120,8 @@ def test_compositing_equals_its_reference(opacity):
     splats, bins = random_splats(1000, opacity)
     splats.requires_grad_()
     exact = splats.detach().double().requires_grad_()
-    *theirs, _ = blend_reference(exact, fill_bins_reference(splats), WIDTH, HEIGHT)
-    ours = blend(splats, bins)
+    *theirs, _ = composite_reference(exact, depth_order_reference(splats), WIDTH, HEIGHT)
+    ours = composite(splats, bins)
     assert 0.05 < ours[2].mean() < 0.9 and (opacity == 0.1 or ours[2].max() > 0.999)
     for mine, true in zip(ours, theirs, strict=True):
         torch.testing.assert_close(mine.double(), true, rtol=0, atol=5e-6)
@@ -139,8 +139,8 @@ def test_mean_and_background_are_part_of_the_gradient():
     splats.requires_grad_()
     exact = splats.detach().double().requires_grad_()
     behind = torch.rand(HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(2))
-    rgb, mean, _ = blend(splats, bins, behind, mean=True)
-    colour, fourth, alpha, _ = blend_reference(exact, fill_bins_reference(splats), WIDTH, HEIGHT)
+    rgb, mean, _ = composite(splats, bins, behind, mean=True)
+    colour, fourth, alpha, _ = composite_reference(exact, depth_order_reference(splats), WIDTH, HEIGHT)
     their_rgb, their_mean = colour + (1 - alpha)[..., None] * behind, fourth / alpha.clamp_min(1e-10)
     torch.testing.assert_close(rgb.double(), their_rgb, rtol=0, atol=5e-6)
     torch.testing.assert_close(mean.double(), their_mean, rtol=1e-4, atol=1e-5)
@@ -154,7 +154,7 @@ def test_absolute_gradients_do_not_cancel():
     splats, keys, rects = one_splat(40.5, 20.5)
     splats.requires_grad_()
     upstream = torch.ones(HEIGHT, WIDTH, 3)
-    (grad,) = torch.autograd.grad(blend(splats, fill_bins(keys, rects, WIDTH, HEIGHT))[0], splats, upstream)
+    (grad,) = torch.autograd.grad(composite(splats, bin_splats(keys, rects, WIDTH, HEIGHT))[0], splats, upstream)
     sigma, x = 3.0, torch.arange(-40, 31).float()
     profile = 0.5 * torch.exp(-0.5 * (x / sigma) ** 2) * x / sigma**2
     y = torch.arange(-20, 33).float()
@@ -175,24 +175,24 @@ def one_splat(x: float, y: float, opacity: float = 0.5, sigma: float = 3.0):
 @pytest.mark.parametrize("device", devices)
 def test_one_thread_a_pixel_agrees(device):
     splats, bins = random_splats(1500)
-    image, alpha, index, totals = composite(
-        splats.to(device), bins.members.to(device), bins.starts.to(device), BIN, WIDTH, HEIGHT
+    image, alpha, index, totals = composite_pixelwise(
+        splats.to(device), bins.members.to(device), bins.starts.to(device), BIN_SIZE, WIDTH, HEIGHT
     )
-    rgb, fourth, opaque = blend(splats, bins)
+    rgb, fourth, opaque = composite(splats, bins)
     torch.testing.assert_close(image[..., :3].cpu(), rgb, rtol=0, atol=5e-6)
     torch.testing.assert_close(image[..., 3].cpu(), fourth, rtol=0, atol=2e-5)
     torch.testing.assert_close(alpha.cpu(), opaque, rtol=0, atol=5e-6)
-    which, weight = heaviest(splats, bins)
+    which, weight = dominant_splats(splats, bins)
     assert (index.cpu() == which).float().mean() > 0.999  # but for ties within rounding
     torch.testing.assert_close(totals.cpu(), weight, rtol=1e-4, atol=1e-4)
 
 
 def test_the_heaviest_splat_is_that_of_the_reference():
     splats, bins = random_splats(400)
-    order = fill_bins_reference(splats)
-    *_, weights = blend_reference(splats.double(), order, WIDTH, HEIGHT)
+    order = depth_order_reference(splats)
+    *_, weights = composite_reference(splats.double(), order, WIDTH, HEIGHT)
     best = torch.where(weights.amax(-1) > 0, order[weights.argmax(-1)], -1)
-    index, totals = heaviest(splats, bins)
+    index, totals = dominant_splats(splats, bins)
     assert (index == best).float().mean() > 0.999 and (index == -1).any()
     torch.testing.assert_close(totals[order].double(), weights.sum((0, 1)), rtol=1e-4, atol=1e-4)
 
@@ -206,13 +206,13 @@ def test_the_number_of_threads_changes_rounding_only(threads, request):
     results = []
     for _ in range(2):
         leaf = splats.clone().requires_grad_()
-        rgb, _, alpha = blend(leaf, bins)
+        rgb, _, alpha = composite(leaf, bins)
         (grad,) = torch.autograd.grad(rgb.square().sum() + alpha.sum(), leaf)
         results.append((rgb.detach(), grad))
     assert torch.equal(results[0][0], results[1][0]) and torch.equal(results[0][1], results[1][1])
     torch.set_num_threads(1)
     leaf = splats.clone().requires_grad_()
-    rgb, _, alpha = blend(leaf, bins)
+    rgb, _, alpha = composite(leaf, bins)
     (grad,) = torch.autograd.grad(rgb.square().sum() + alpha.sum(), leaf)
     assert torch.equal(rgb, results[0][0])
     torch.testing.assert_close(grad, results[0][1], rtol=1e-4, atol=1e-4 * float(grad.abs().max()))

@@ -10,9 +10,9 @@ import torch
 
 from stages.core.geometry.cameras import intrinsics, look_at
 from stages.core.geometry.harmonics import rgb_to_sh
-from stages.core.kernels.splat.binning import fill_bins_reference
-from stages.core.kernels.splat.compositing import blend_reference
-from stages.core.kernels.splat.projection import pinhole, project_reference
+from stages.core.kernels.splat.binning import depth_order_reference
+from stages.core.kernels.splat.compositing import composite_reference
+from stages.core.kernels.splat.projection import pack_camera, project_reference
 from stages.core.raster.rasterise import rasterise, rasterise_features, visibility
 from stages.core.scene.gaussians import Gaussians
 from tests.conftest import random_gaussians, ring
@@ -43,8 +43,8 @@ def leaves(gaussians: Gaussians) -> list[torch.Tensor]:
 
 def reference(tensors, viewmat, K, width: int, height: int):
     """Image, mean depth and alpha in float64, every splat at every pixel."""
-    splats = project_reference(pinhole(viewmat, K, width, height, 0.01), *tensors)
-    rgb, total, alpha, _ = blend_reference(splats, fill_bins_reference(splats), width, height)
+    splats = project_reference(pack_camera(viewmat, K, width, height, 0.01), *tensors)
+    rgb, total, alpha, _ = composite_reference(splats, depth_order_reference(splats), width, height)
     return rgb, alpha, total / alpha.clamp_min(1e-10)
 
 

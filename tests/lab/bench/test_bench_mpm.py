@@ -20,11 +20,11 @@ def test_the_plain_form_is_the_same_physics():
     push = torch.tensor(bench_mpm.GRAVITY).repeat(len(one), 1)
     ours.advance(0.02, push, 200)
     plain = mpm.Solver(one, box, dx)
-    plain.set(push=push)
+    plain.set(acceleration=push)
     nodes = torch.zeros(plain.grid.count, 4)
     for _ in range(200):
         mpm_three_kernel.substep(plain, nodes, 1e-4)
-    assert plain.grid.low[0] == mpm_grid.PAD
+    assert plain.grid.low[0] == mpm_grid.GRID_PADDING
     torch.testing.assert_close(plain.particles.x, ours.particles.x, rtol=0, atol=2e-5)
 
 

@@ -9,20 +9,20 @@ import triton.language as tl
 
 from stages.core.kernels.field.vec3 import (
     add,
-    conjugated,
+    angular_velocity,
     cross,
     dot,
-    drifted,
+    drift,
     load3,
-    load4,
+    matvec3,
     max3,
-    rotation,
-    row3,
-    row9,
-    scaled,
-    spinning,
+    read3,
+    read4,
+    read9,
+    rotate_tensor,
+    rotation_matrix,
+    scale3,
     store3,
-    times,
     where3,
     write3,
     write4,
@@ -30,19 +30,19 @@ from stages.core.kernels.field.vec3 import (
 )
 
 # a row for each body holds these, from these columns on
-BODY = tl.constexpr(40)
-COM, VELOCITY, MOMENTUM, TURN, INVERSE, QUAT, LOW, HIGH, WITHIN = (
+BODY_SIZE = tl.constexpr(40)
+COM, VELOCITY, MOMENTUM, ROTATION, INVERSE_INERTIA, QUAT, BOX_LOW, BOX_HIGH, CONTACT_RADIUS = (
     tl.constexpr(i) for i in (0, 3, 6, 9, 18, 27, 31, 34, 37)
 )
 # and for each of its points, in the world and in its own frame
-MOVED, FIELD = tl.constexpr(12), tl.constexpr(9)
+POINT_SIZE, FIELD_SIZE = tl.constexpr(12), tl.constexpr(9)
 POINT, SPEED, NORMAL, ARM = (tl.constexpr(i) for i in (0, 3, 6, 9))
-U, DU, SPREAD = (tl.constexpr(i) for i in (0, 3, 6))
-PART = tl.constexpr(6)  # force and torque
+U, DU, VIRIAL = (tl.constexpr(i) for i in (0, 3, 6))
+WRENCH_SIZE = tl.constexpr(6)  # force and torque
 
 
 @triton.jit
-def wall_of(x, room):
+def nearest_wall(x, room):
     """Distance to the nearest of four walls and the ceiling [m], and its normal."""
     near, other = x[0] - tl.load(room), x[1] - tl.load(room + 1)
     nx, ny, nz = tl.where(other < near, 0.0, 1.0), tl.where(other < near, 1.0, 0.0), tl.zeros_like(near)
@@ -57,69 +57,69 @@ def wall_of(x, room):
 
 
 @triton.jit
-def bounded(u, size, FARTHEST: tl.constexpr):
+def clamp_displacements(u, size, FARTHEST: tl.constexpr):
     """Displacements kept below a share of the object's size."""
     most = FARTHEST * size
-    return scaled(most / tl.maximum(tl.sqrt(tl.max(dot(u, u))), most), u)
+    return scale3(most / tl.maximum(tl.sqrt(tl.max(dot(u, u))), most), u)
 
 
 @triton.jit
-def advance(
+def drift_half_step(
     com, quat, velocity, momentum, u, du, arm, normal, valid, size, inverse, pinned, box, body, moved, field, keys,
     o, n, dt, FARTHEST: tl.constexpr, FAR: tl.constexpr, FRAME: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Half a drift, and where everything is then. `keys` are distances to the floor and to a wall, now or soon."""
     i = tl.program_id(0)
     free = 1 - tl.load(pinned + i).to(tl.float32)
-    inertia = row9(inverse + 9 * i)
-    v, L = scaled(free, row3(velocity + 3 * i)), scaled(free, row3(momentum + 3 * i))
-    c, q = drifted(row3(com + 3 * i), load4(quat + 4 * i), v, L, inertia, dt / 2)
-    R, spin = rotation(q), spinning(q, L, inertia)
-    to = body + BODY * i
+    inertia = read9(inverse + 9 * i)
+    v, L = scale3(free, read3(velocity + 3 * i)), scale3(free, read3(momentum + 3 * i))
+    c, q = drift(read3(com + 3 * i), read4(quat + 4 * i), v, L, inertia, dt / 2)
+    R, spin = rotation_matrix(q), angular_velocity(q, L, inertia)
+    to = body + BODY_SIZE * i
     write3(to + COM, c)
     write3(to + VELOCITY, v)
     write3(to + MOMENTUM, L)
-    write9(to + TURN, R)
-    write9(to + INVERSE, conjugated(R, inertia))
+    write9(to + ROTATION, R)
+    write9(to + INVERSE_INERTIA, rotate_tensor(R, inertia))
     write4(to + QUAT, q)
 
     r = tl.arange(0, BLOCK)
     inside = r < n
     at = (i * n + r) * 3
-    rate = scaled(free, load3(du + at, 1, inside))
-    shift = add(load3(u + at, 1, inside), scaled(dt / 2, rate))
-    shift = bounded(shift, tl.load(size + i), FARTHEST)
-    turning = times(R, add(load3(arm + at, 1, inside), shift))
-    speed = add(add(v, cross(spin, turning)), times(R, rate))
+    rate = scale3(free, load3(du + at, 1, inside))
+    shift = add(load3(u + at, 1, inside), scale3(dt / 2, rate))
+    shift = clamp_displacements(shift, tl.load(size + i), FARTHEST)
+    turning = matvec3(R, add(load3(arm + at, 1, inside), shift))
+    speed = add(add(v, cross(spin, turning)), matvec3(R, rate))
     x = add(c, turning)
-    own = field + FIELD * i * n + r
+    own = field + FIELD_SIZE * i * n + r
     store3(own + U * n, n, shift, inside)
     store3(own + DU * n, n, rate, inside)
-    own = moved + MOVED * i * n + r
+    own = moved + POINT_SIZE * i * n + r
     store3(own + POINT * n, n, x, inside)
     store3(own + SPEED * n, n, speed, inside)
-    store3(own + NORMAL * n, n, times(R, load3(normal + at, 1, inside)), inside)
+    store3(own + NORMAL * n, n, matvec3(R, load3(normal + at, 1, inside)), inside)
     store3(own + ARM * n, n, turning, inside)
 
     far: tl.constexpr = float("inf")
     there = tl.load(valid + i * n + r, mask=inside, other=0) != 0
-    write3(to + LOW, scaled(-1.0, max3(where3(there, scaled(-1.0, x), -far))))
-    write3(to + HIGH, max3(where3(there, x, -far)))
+    write3(to + BOX_LOW, scale3(-1.0, max3(where3(there, scale3(-1.0, x), -far))))
+    write3(to + BOX_HIGH, max3(where3(there, x, -far)))
     fastest = tl.sqrt(tl.max(tl.where(there, dot(speed, speed), 0.0)))
-    tl.store(to + WITHIN, FAR / 2 + FRAME * fastest)  # two objects farther apart than both say cannot touch
+    tl.store(to + CONTACT_RADIUS, FAR / 2 + FRAME * fastest)  # two objects farther apart than both say cannot touch
     room = box + 6 * i
     height = x[2] - tl.load(room + 2)
     key = tl.where(there, tl.minimum(height, height + FRAME * speed[2]), far)
     tl.store(keys + 2 * i * n + r, key, mask=inside)
-    height, inward = wall_of(x, room)
+    height, inward = nearest_wall(x, room)
     key = tl.where(there, tl.minimum(height, height + FRAME * dot(speed, inward)), far)
     tl.store(keys + (2 * i + 1) * n + r, key, mask=inside)
 
 
 @triton.jit
-def place(com, quat, u, arm, points, n, BLOCK: tl.constexpr):
+def world_points(com, quat, u, arm, points, n, BLOCK: tl.constexpr):
     """Where the points of displaced bodies are."""
     i, r = tl.program_id(0), tl.program_id(1) * BLOCK + tl.arange(0, BLOCK)
     at, inside = (i * n + r) * 3, r < n
-    x = times(rotation(load4(quat + 4 * i)), add(load3(arm + at, 1, inside), load3(u + at, 1, inside)))
-    store3(points + at, 1, add(row3(com + 3 * i), x), inside)
+    x = matvec3(rotation_matrix(read4(quat + 4 * i)), add(load3(arm + at, 1, inside), load3(u + at, 1, inside)))
+    store3(points + at, 1, add(read3(com + 3 * i), x), inside)

@@ -8,14 +8,14 @@ contact. The reference in PyTorch is `stages.core.models.field.contact_points`. 
 import triton
 import triton.language as tl
 
-from stages.core.kernels.field.bodies import BODY, HIGH, LOW, MOVED, POINT, SPEED, WITHIN
-from stages.core.kernels.field.vec3 import add, dot, load3, scaled, store3, sub
+from stages.core.kernels.field.bodies import BODY_SIZE, BOX_HIGH, BOX_LOW, CONTACT_RADIUS, POINT, POINT_SIZE, SPEED
+from stages.core.kernels.field.vec3 import add, dot, load3, scale3, store3, sub
 
-QUERIES, CHUNK = 16, 128  # points that search together, and points that each looks at in one go
+QUERY_BLOCK, CANDIDATE_CHUNK = 16, 128  # points that search together, and points that each looks at in one go
 
 
 @triton.jit
-def partner_of(i, k, o):
+def other_object(i, k, o):
     """The k-th other object of object i's scene."""
     return i - i % o + k + (k >= i % o)
 
@@ -23,21 +23,22 @@ def partner_of(i, k, o):
 @triton.jit
 def _reach(body, i, j, SEEN: tl.constexpr):
     """Objects that are farther apart [m] do not touch within a frame."""
-    return tl.minimum(tl.load(body + BODY * i + WITHIN) + tl.load(body + BODY * j + WITHIN), SEEN)
+    radius = tl.load(body + BODY_SIZE * i + CONTACT_RADIUS) + tl.load(body + BODY_SIZE * j + CONTACT_RADIUS)
+    return tl.minimum(radius, SEEN)
 
 
 @triton.jit
-def gather(body, moved, valid, close, which, many, o, n, SEEN: tl.constexpr, BLOCK: tl.constexpr):
+def gather_candidates(body, moved, valid, close, which, many, o, n, SEEN: tl.constexpr, BLOCK: tl.constexpr):
     """Points of object i within reach of the bounding box of another one: where, which and how many."""
     i, k = tl.program_id(0), tl.program_id(1)
-    j = partner_of(i, k, o)
+    j = other_object(i, k, o)
     reach = _reach(body, i, j, SEEN)
     r = tl.arange(0, BLOCK)
     near = tl.load(valid + i * n + r, mask=r < n, other=0) != 0
-    x = load3(moved + (MOVED * i + POINT) * n + r, n, r < n)
+    x = load3(moved + (POINT_SIZE * i + POINT) * n + r, n, r < n)
     for axis in tl.static_range(3):
-        near &= x[axis] > tl.load(body + BODY * j + LOW + axis) - reach
-        near &= x[axis] < tl.load(body + BODY * j + HIGH + axis) + reach
+        near &= x[axis] > tl.load(body + BODY_SIZE * j + BOX_LOW + axis) - reach
+        near &= x[axis] < tl.load(body + BODY_SIZE * j + BOX_HIGH + axis) + reach
     row = i * (o - 1) + k
     place = tl.cumsum(near.to(tl.int32), 0) - 1
     store3(close + 3 * row * n + place, n, x, near)
@@ -46,25 +47,25 @@ def gather(body, moved, valid, close, which, many, o, n, SEEN: tl.constexpr, BLO
 
 
 @triton.jit
-def search(
+def nearest_candidates(
     body, moved, close, which, many, keys, partner, o, n, SEEN: tl.constexpr, FRAME: tl.constexpr,
-    QUERIES: tl.constexpr, CHUNK: tl.constexpr,
+    QUERY_BLOCK: tl.constexpr, CANDIDATE_CHUNK: tl.constexpr,
 ):  # fmt: skip
     """For those points the other object's nearest, and how far it is now or a frame ahead, whichever is less."""
     i, k = tl.program_id(0) // (o - 1), tl.program_id(0) % (o - 1)
-    j = partner_of(i, k, o)
+    j = other_object(i, k, o)
     row, other = i * (o - 1) + k, j * (o - 1) + i % o - (i > j)
     count, last = tl.load(many + row), tl.load(many + other)
-    first = tl.program_id(1) * QUERIES
+    first = tl.program_id(1) * QUERY_BLOCK
     if first < count:
         reach = _reach(body, i, j, SEEN)
         far: tl.constexpr = float("inf")
-        e = first + tl.arange(0, QUERIES)
+        e = first + tl.arange(0, QUERY_BLOCK)
         x = load3(close + 3 * row * n + e, n, e < count)
-        column = tl.arange(0, CHUNK)
-        least = tl.full([QUERIES, CHUNK], far, tl.float32)
-        chunk = tl.zeros([QUERIES, CHUNK], tl.int32)
-        for start in range(0, last, CHUNK):
+        column = tl.arange(0, CANDIDATE_CHUNK)
+        least = tl.full([QUERY_BLOCK, CANDIDATE_CHUNK], far, tl.float32)
+        chunk = tl.zeros([QUERY_BLOCK, CANDIDATE_CHUNK], tl.int32)
+        for start in range(0, last, CANDIDATE_CHUNK):
             s = start + column
             y = load3(close + 3 * other * n + s, n, s < last, far)
             dx, dy, dz = x[0][:, None] - y[0][None, :], x[1][:, None] - y[1][None, :], x[2][:, None] - y[2][None, :]
@@ -76,10 +77,10 @@ def search(
         found = (e < count) & (best < reach * reach)
         mine = tl.load(which + row * n + e, mask=found, other=0)
         theirs = tl.load(which + other * n + entry, mask=found, other=0)
-        own, they = moved + MOVED * i * n + mine, moved + MOVED * j * n + theirs
+        own, they = moved + POINT_SIZE * i * n + mine, moved + POINT_SIZE * j * n + theirs
         way = sub(x, load3(they + POINT * n, n, found))
         rate = sub(load3(own + SPEED * n, n, found), load3(they + SPEED * n, n, found))
-        way = add(way, scaled(FRAME, rate))
+        way = add(way, scale3(FRAME, rate))
         key = tl.where(found, tl.sqrt(tl.minimum(best, dot(way, way))), far)
         tl.store(keys + row * n + e, key, mask=e < count)
         tl.store(partner + row * n + e, theirs, mask=e < count)
@@ -100,7 +101,7 @@ def _smallest(key, near, most):
 
 
 @triton.jit
-def select(
+def select_contacts(
     keys, planes, which, partner, many, valid, count, point, theirs, felt, o, n, wide, narrow, slots,
     PAIR: tl.constexpr, WALL: tl.constexpr, FAR: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip

@@ -6,16 +6,28 @@ The same in PyTorch, its reference, is `stages.core.models.field.contact_points`
 import triton
 import triton.language as tl
 
-from stages.core.kernels.field.bodies import ARM, BODY, INVERSE, MOVED, NORMAL, POINT, SPEED, VELOCITY, wall_of
-from stages.core.kernels.field.broad_phase import partner_of
-from stages.core.kernels.field.layers import SCALARS, WIDE
-from stages.core.kernels.field.vec3 import add, dot, load3, row3, row9, scaled, solved, store3, sub
+from stages.core.kernels.field.bodies import (
+    ARM,
+    BODY_SIZE,
+    INVERSE_INERTIA,
+    NORMAL,
+    POINT,
+    POINT_SIZE,
+    SPEED,
+    VELOCITY,
+    nearest_wall,
+)
+from stages.core.kernels.field.broad_phase import other_object
+from stages.core.kernels.field.layers import FIRST_SCALAR, MAX_VECTORS
+from stages.core.kernels.field.vec3 import add, dot, load3, read3, read9, scale3, solve_symmetric, store3, sub
 
-GATE, SHARE, COLUMNS = tl.constexpr(38), tl.constexpr(43), tl.constexpr(44)  # one of the scalars, and what is no scalar
+GATE = tl.constexpr(38)  # column of the contact gate, one of the scalars
+MASS_FRACTION = tl.constexpr(43)  # column of the point's mass fraction, not a network input
+COLUMNS = tl.constexpr(44)
 
 
 @triton.jit
-def kind_of(slot, m, n, wide, narrow, slots):
+def contact_list(slot, m, n, wide, narrow, slots):
     """Which list of an object a slot belongs to, and where that list begins."""
     k = tl.minimum(slot // wide, m)
     start = k * wide
@@ -27,9 +39,9 @@ def kind_of(slot, m, n, wide, narrow, slots):
 @triton.jit
 def _response(J, r):
     """1 - [r] J [r]: how fast a point of a body moves after an impulse on it, for unit mass; xx, xy, xz, yy, yz, zz."""
-    a = sub(scaled(r[2], (J[1], J[4], J[7])), scaled(r[1], (J[2], J[5], J[8])))
-    b = sub(scaled(r[0], (J[2], J[5], J[8])), scaled(r[2], (J[0], J[3], J[6])))
-    c = sub(scaled(r[1], (J[0], J[3], J[6])), scaled(r[0], (J[1], J[4], J[7])))
+    a = sub(scale3(r[2], (J[1], J[4], J[7])), scale3(r[1], (J[2], J[5], J[8])))
+    b = sub(scale3(r[0], (J[2], J[5], J[8])), scale3(r[2], (J[0], J[3], J[6])))
+    c = sub(scale3(r[1], (J[0], J[3], J[6])), scale3(r[0], (J[1], J[4], J[7])))
     return (1 - r[1] * a[2] + r[2] * a[1], r[0] * a[2] - r[2] * a[0], r[1] * a[0] - r[0] * a[1],
             1 - r[2] * b[0] + r[0] * b[2], r[1] * b[0] - r[0] * b[1], 1 - r[0] * c[1] + r[1] * c[0])  # fmt: skip
 
@@ -46,55 +58,55 @@ def _length(a):
 
 
 @triton.jit
-def show(
+def contact_features(
     body, moved, count, point, theirs, record, spacing, share, size, mass, gravity, box, o, n, wide, narrow, slots,
     NEAR: tl.constexpr, FAR: tl.constexpr, CLOSE: tl.constexpr, LEVER: tl.constexpr, FRAME: tl.constexpr,
     ROWS: tl.constexpr,
 ):  # fmt: skip
     """Vectors and scalars of a block of places."""
     i, m, slot = tl.program_id(0), o - 1, tl.program_id(1) * ROWS
-    k, start = kind_of(slot, m, n, wide, narrow, slots)
+    k, start = contact_list(slot, m, n, wide, narrow, slots)
     r = tl.arange(0, ROWS)
     there = slot - start + r < tl.load(count + i * (o + 1) + k)
     if slot - start < tl.load(count + i * (o + 1) + k):
         to = record + (i * slots + slot) * COLUMNS + r
         mine = tl.load(point + i * slots + slot + r, mask=there, other=0)
-        at = moved + MOVED * i * n + mine
+        at = moved + POINT_SIZE * i * n + mine
         x, speed = load3(at + POINT * n, n, there), load3(at + SPEED * n, n, there)
         normal, arm = load3(at + NORMAL * n, n, there), load3(at + ARM * n, n, there)
-        tl.store(to + SHARE * ROWS, tl.load(share + i * n + mine, mask=there, other=0.0))
+        tl.store(to + MASS_FRACTION * ROWS, tl.load(share + i * n + mine, mask=there, other=0.0))
         gap = tl.load(spacing + i * n + mine, mask=there, other=0.0) / CLOSE
         extent = tl.log(tl.load(size + i))
         zero = x[0] * 0.0
-        fall = add(scaled(0.2, row3(gravity + 3 * (i // o))), (zero, zero, zero))
-        v = row3(body + BODY * i + VELOCITY)
-        one = _response(row9(body + BODY * i + INVERSE), arm)
+        fall = add(scale3(0.2, read3(gravity + 3 * (i // o))), (zero, zero, zero))
+        v = read3(body + BODY_SIZE * i + VELOCITY)
+        one = _response(read9(body + BODY_SIZE * i + INVERSE_INERTIA), arm)
         if k < m:
-            j = partner_of(i, k, o)
+            j = other_object(i, k, o)
             other = tl.load(theirs + i * slots + slot + r, mask=there, other=0)
-            at = moved + MOVED * j * n + other
+            at = moved + POINT_SIZE * j * n + other
             way, rate = sub(x, load3(at + POINT * n, n, there)), sub(speed, load3(at + SPEED * n, n, there))
             facing, lever = load3(at + NORMAL * n, n, there), load3(at + ARM * n, n, there)
             here, their = tl.maximum(tl.load(mass + i), 1e-6), tl.maximum(tl.load(mass + j), 1e-6)
-            two = _response(row9(body + BODY * j + INVERSE), lever)
+            two = _response(read9(body + BODY_SIZE * j + INVERSE_INERTIA), lever)
             f = their / (here + their)
             g = 1 - f
             K = (f * one[0] + g * two[0], f * one[1] + g * two[1], f * one[2] + g * two[2],
                  f * one[3] + g * two[3], f * one[4] + g * two[4], f * one[5] + g * two[5])  # fmt: skip
-            now, ahead = _length(way), _length(add(way, scaled(FRAME, rate)))
-            a, b = solved(K, rate, facing)
-            apart = sub(v, row3(body + BODY * j + VELOCITY))
-            store3(to, WIDE * ROWS, scaled(1 / CLOSE, way), there)
-            store3(to + ROWS, WIDE * ROWS, normal, there)
-            store3(to + 2 * ROWS, WIDE * ROWS, facing, there)
-            store3(to + 3 * ROWS, WIDE * ROWS, rate, there)
-            store3(to + 4 * ROWS, WIDE * ROWS, scaled(1 / LEVER, arm), there)
-            store3(to + 5 * ROWS, WIDE * ROWS, scaled(1 / LEVER, lever), there)
-            store3(to + 6 * ROWS, WIDE * ROWS, add(apart, (zero, zero, zero)), there)
-            store3(to + 7 * ROWS, WIDE * ROWS, fall, there)
-            store3(to + 8 * ROWS, WIDE * ROWS, a, there)
-            store3(to + 9 * ROWS, WIDE * ROWS, b, there)
-            to += SCALARS * ROWS
+            now, ahead = _length(way), _length(add(way, scale3(FRAME, rate)))
+            a, b = solve_symmetric(K, rate, facing)
+            apart = sub(v, read3(body + BODY_SIZE * j + VELOCITY))
+            store3(to, MAX_VECTORS * ROWS, scale3(1 / CLOSE, way), there)
+            store3(to + ROWS, MAX_VECTORS * ROWS, normal, there)
+            store3(to + 2 * ROWS, MAX_VECTORS * ROWS, facing, there)
+            store3(to + 3 * ROWS, MAX_VECTORS * ROWS, rate, there)
+            store3(to + 4 * ROWS, MAX_VECTORS * ROWS, scale3(1 / LEVER, arm), there)
+            store3(to + 5 * ROWS, MAX_VECTORS * ROWS, scale3(1 / LEVER, lever), there)
+            store3(to + 6 * ROWS, MAX_VECTORS * ROWS, add(apart, (zero, zero, zero)), there)
+            store3(to + 7 * ROWS, MAX_VECTORS * ROWS, fall, there)
+            store3(to + 8 * ROWS, MAX_VECTORS * ROWS, a, there)
+            store3(to + 9 * ROWS, MAX_VECTORS * ROWS, b, there)
+            to += FIRST_SCALAR * ROWS
             tl.store(to, now / CLOSE, mask=there)
             tl.store(to + ROWS, ahead / CLOSE, mask=there)
             tl.store(to + 2 * ROWS, _fade(tl.minimum(now, ahead), NEAR, FAR), mask=there)
@@ -104,20 +116,20 @@ def show(
             tl.store(to + 6 * ROWS, tl.log(tl.load(size + j)) + zero, mask=there)
         else:
             room = box + 6 * i
-            now, inward = wall_of(x, room)
+            now, inward = nearest_wall(x, room)
             if k == m:
                 now, inward = x[2] - tl.load(room + 2), (zero, zero, zero + 1)
             ahead = now + FRAME * dot(speed, inward)
-            a, b = solved(one, speed, inward)
-            store3(to, WIDE * ROWS, inward, there)
-            store3(to + ROWS, WIDE * ROWS, normal, there)
-            store3(to + 2 * ROWS, WIDE * ROWS, speed, there)
-            store3(to + 3 * ROWS, WIDE * ROWS, scaled(1 / LEVER, arm), there)
-            store3(to + 4 * ROWS, WIDE * ROWS, add(v, (zero, zero, zero)), there)
-            store3(to + 5 * ROWS, WIDE * ROWS, fall, there)
-            store3(to + 6 * ROWS, WIDE * ROWS, a, there)
-            store3(to + 7 * ROWS, WIDE * ROWS, b, there)
-            to += SCALARS * ROWS
+            a, b = solve_symmetric(one, speed, inward)
+            store3(to, MAX_VECTORS * ROWS, inward, there)
+            store3(to + ROWS, MAX_VECTORS * ROWS, normal, there)
+            store3(to + 2 * ROWS, MAX_VECTORS * ROWS, speed, there)
+            store3(to + 3 * ROWS, MAX_VECTORS * ROWS, scale3(1 / LEVER, arm), there)
+            store3(to + 4 * ROWS, MAX_VECTORS * ROWS, add(v, (zero, zero, zero)), there)
+            store3(to + 5 * ROWS, MAX_VECTORS * ROWS, fall, there)
+            store3(to + 6 * ROWS, MAX_VECTORS * ROWS, a, there)
+            store3(to + 7 * ROWS, MAX_VECTORS * ROWS, b, there)
+            to += FIRST_SCALAR * ROWS
             tl.store(to, tl.minimum(tl.maximum(now / CLOSE, -2.0), 2.0), mask=there)
             tl.store(to + ROWS, tl.minimum(tl.maximum(ahead / CLOSE, -2.0), 2.0), mask=there)
             tl.store(to + 2 * ROWS, _fade(tl.minimum(now, ahead), NEAR, FAR), mask=there)

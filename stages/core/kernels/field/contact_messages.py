@@ -7,15 +7,23 @@
 import triton
 import triton.language as tl
 
-from stages.core.kernels.field.bodies import PART
-from stages.core.kernels.field.broad_phase import partner_of
-from stages.core.kernels.field.contact_features import COLUMNS, GATE, SHARE, kind_of
-from stages.core.kernels.field.layers import MOST, WIDE, layer, matvec, seen, silu, weighed
-from stages.core.kernels.field.vec3 import add, cross, dot, load3, scaled, store3, sub, sum3, write3
+from stages.core.kernels.field.bodies import WRENCH_SIZE
+from stages.core.kernels.field.broad_phase import other_object
+from stages.core.kernels.field.contact_features import COLUMNS, GATE, MASS_FRACTION, contact_list
+from stages.core.kernels.field.layers import (
+    MAX_VECTORS,
+    PADDED_VECTORS,
+    invariant_layer,
+    linear_layer,
+    matvec,
+    silu,
+    weighted_vectors,
+)
+from stages.core.kernels.field.vec3 import add, cross, dot, load3, scale3, store3, sub, sum3, write3
 
 
 @triton.jit
-def introduce(
+def project_embeddings(
     code, own, own_b, other, other_b, plane, plane_b, stress, stress_b, known, o, H: tl.constexpr,
 ):  # fmt: skip
     """What is known of the two before they touch; in the row after those of all contacts, for the stress field."""
@@ -23,7 +31,7 @@ def introduce(
     h = tl.arange(0, H)
     mine = tl.load(code + i * H + h)
     if k < m:
-        their = tl.load(code + partner_of(i, k, o) * H + h)
+        their = tl.load(code + other_object(i, k, o) * H + h)
         y = matvec(own, mine, 0, H, H) + tl.load(own_b + h) + matvec(other, their, 0, H, H) + tl.load(other_b + h)
     elif k < m + 2:
         y = matvec(plane, mine, 0, H, H) + tl.load(plane_b + h)
@@ -38,13 +46,13 @@ def _heard(
     ROWS: tl.constexpr, H: tl.constexpr, PRECISION: tl.constexpr,
 ):  # fmt: skip
     r, h = tl.arange(0, ROWS), tl.arange(0, H)
-    y = seen(record, r, net[0], net[1], ROWS, VECTORS, MORE, H, PRECISION)
+    y = invariant_layer(record, r, net[0], net[1], ROWS, VECTORS, MORE, H, PRECISION)
     y = silu(y + tl.load(known + h)[None, :])
-    y = silu(layer(y, net[2], net[3], H, H, H, PRECISION))
+    y = silu(linear_layer(y, net[2], net[3], H, H, H, PRECISION))
     loud = tl.sum(y * tl.load(net[4] + H * H + h)[None, :], 1) + tl.load(net[5] + H)
-    y = layer(y, net[4], net[5], H, H, H, PRECISION)
+    y = linear_layer(y, net[4], net[5], H, H, H, PRECISION)
     loud = tl.exp(8 * tl.sigmoid(loud / 2) - 4)  # exp(4 tanh(loud / 4))
-    gate, share = tl.load(record + GATE * ROWS + r, mask=there, other=0.0), tl.load(record + SHARE * ROWS + r)
+    gate, share = tl.load(record + GATE * ROWS + r, mask=there, other=0.0), tl.load(record + MASS_FRACTION * ROWS + r)
     w = tl.where(there, gate * share * loud, 0.0)
     tl.store(message + r[:, None] * H + h[None, :], y)
     tl.store(weight + r, w)
@@ -53,13 +61,13 @@ def _heard(
 
 
 @triton.jit
-def listen(
+def encode_messages(
     record, count, pairs, planes, known, message, weight, heard, total, o, n, wide, narrow, slots, ROWS: tl.constexpr,
     H: tl.constexpr, PRECISION: tl.constexpr,
 ):  # fmt: skip
     """What each place says and how much it weighs; sums of both over a block."""
     i, m, slot = tl.program_id(0), o - 1, tl.program_id(1) * ROWS
-    k, start = kind_of(slot, m, n, wide, narrow, slots)
+    k, start = contact_list(slot, m, n, wide, narrow, slots)
     there = slot - start + tl.arange(0, ROWS) < tl.load(count + i * (o + 1) + k)
     at, block = i * slots + slot, i * (slots // ROWS) + tl.program_id(1)
     if slot - start < tl.load(count + i * (o + 1) + k):
@@ -76,7 +84,7 @@ def listen(
 
 
 @triton.jit
-def hear(
+def aggregate_messages(
     code, heard, total, net, hold, hold_b, listened, scale, status, grip, o, n, wide, narrow, slots,
     GRIP: tl.constexpr, HOLD: tl.constexpr, ROWS: tl.constexpr, BLOCKS: tl.constexpr, H: tl.constexpr,
 ):  # fmt: skip
@@ -105,13 +113,13 @@ def hear(
 
 
 @triton.jit
-def explain(listened, status, between, against, pairs, pairs_b, planes, planes_b, told, o, H: tl.constexpr):
+def update_contacts(listened, status, between, against, pairs, pairs_b, planes, planes_b, told, o, H: tl.constexpr):
     """What the places of a contact are told: what both objects hear from it, and how they are."""
     i, k, m = tl.program_id(0), tl.program_id(1), o - 1
     h = tl.arange(0, H)
     x, own = tl.load(listened + (i * (o + 1) + k) * H + h), tl.load(status + i * H + h)
     if k < m:
-        j = partner_of(i, k, o)
+        j = other_object(i, k, o)
         other = tl.load(listened + (j * (o + 1) + i % o - (i > j)) * H + h)
         y = matvec(between[0], x, 0, 4 * H, H) + matvec(between[0], other, H, 4 * H, H)
         y += matvec(between[0], own, 2 * H, 4 * H, H)
@@ -133,22 +141,22 @@ def _said(
     """Weighted accelerations of a block of places."""
     r, h = tl.arange(0, ROWS), tl.arange(0, H)
     x = tl.load(message + r[:, None] * H + h[None, :], mask=there[:, None], other=0.0)
-    x = silu(layer(silu(x + tl.load(told + h)[None, :]), net[0], net[1], H, H, H, PRECISION))
-    x = layer(x, net[2], net[3], VECTORS, H, MOST, PRECISION)
-    a = weighed(record, r, there, x, ROWS, VECTORS)
-    return scaled(weight * STRENGTH, a)
+    x = silu(linear_layer(silu(x + tl.load(told + h)[None, :]), net[0], net[1], H, H, H, PRECISION))
+    x = linear_layer(x, net[2], net[3], VECTORS, H, PADDED_VECTORS, PRECISION)
+    a = weighted_vectors(record, r, there, x, ROWS, VECTORS)
+    return scale3(weight * STRENGTH, a)
 
 
 @triton.jit
-def answer(
+def decode_forces(
     record, count, point, pairs, planes, told, message, weight, scale, felt, parts, o, n, wide, narrow, slots,
     STRENGTH: tl.constexpr, LEAVING: tl.constexpr, CLOSE: tl.constexpr, LEVER: tl.constexpr, ROWS: tl.constexpr,
     H: tl.constexpr, PRECISION: tl.constexpr,
 ):  # fmt: skip
     """Acceleration by each place at its point; force and torque of a block, for contacts of pairs for unit mass."""
     i, m, slot = tl.program_id(0), o - 1, tl.program_id(1) * ROWS
-    k, start = kind_of(slot, m, n, wide, narrow, slots)
-    row, to = i * (o + 1) + k, parts + (i * (slots // ROWS) + tl.program_id(1)) * PART
+    k, start = contact_list(slot, m, n, wide, narrow, slots)
+    row, to = i * (o + 1) + k, parts + (i * (slots // ROWS) + tl.program_id(1)) * WRENCH_SIZE
     r = tl.arange(0, ROWS)
     there = slot - start + r < tl.load(count + row)
     if slot - start < tl.load(count + row):
@@ -157,18 +165,19 @@ def answer(
         seen_by = record + at * COLUMNS
         if k < m:
             a = _said(seen_by, there, pairs, told + row * H, message + at * H, w, 10, STRENGTH, ROWS, H, PRECISION)
-            way, arm = load3(seen_by + r, WIDE * ROWS, there), load3(seen_by + 4 * ROWS + r, WIDE * ROWS, there)
-            arm = sub(scaled(LEVER, arm), scaled(CLOSE / 2, way))  # both bodies are pushed amid their points
+            way = load3(seen_by + r, MAX_VECTORS * ROWS, there)
+            arm = load3(seen_by + 4 * ROWS + r, MAX_VECTORS * ROWS, there)
+            arm = sub(scale3(LEVER, arm), scale3(CLOSE / 2, way))  # both bodies are pushed amid their points
         else:
             a = _said(seen_by, there, planes, told + row * H, message + at * H, w, 8, STRENGTH, ROWS, H, PRECISION)
-            inward, arm = load3(seen_by + r, WIDE * ROWS, there), load3(seen_by + 3 * ROWS + r, WIDE * ROWS, there)
-            arm = scaled(LEVER, arm)
-            leaving = dot(load3(seen_by + 2 * ROWS + r, WIDE * ROWS, there), inward)
+            inward = load3(seen_by + r, MAX_VECTORS * ROWS, there)
+            arm = scale3(LEVER, load3(seen_by + 3 * ROWS + r, MAX_VECTORS * ROWS, there))
+            leaving = dot(load3(seen_by + 2 * ROWS + r, MAX_VECTORS * ROWS, there), inward)
             along, unit = dot(a, inward), tl.maximum(w, 1e-9)
             x = along / unit
             push = unit * (tl.maximum(x, 0.0) + tl.log(1 + tl.exp(-tl.abs(x))))  # floor and walls do not pull
             push = push / (1 + tl.maximum(leaving, 0.0) / LEAVING)
-            a = add(a, scaled(push - along, inward))
+            a = add(a, scale3(push - along, inward))
         mine = tl.load(point + at + r, mask=there, other=0)
         store3(felt + row * 3 * n + mine, n, a, there)
         F, T = sum3(a), sum3(cross(arm, a))

@@ -7,9 +7,9 @@ y and z, then scalars.
 import triton
 import triton.language as tl
 
-WIDE = tl.constexpr(12)  # vectors that a record has room for
-SCALARS = tl.constexpr(36)
-MOST = tl.constexpr(16)  # vectors that are weighed, padded
+MAX_VECTORS = tl.constexpr(12)  # vectors that a record has room for
+FIRST_SCALAR = tl.constexpr(36)
+PADDED_VECTORS = tl.constexpr(16)  # vectors that are weighed, padded
 
 
 @triton.jit
@@ -25,7 +25,7 @@ def matvec(w, x, first, INNER: tl.constexpr, H: tl.constexpr):
 
 
 @triton.jit
-def layer(x, w, b, OUTER: tl.constexpr, H: tl.constexpr, O: tl.constexpr, PRECISION: tl.constexpr):
+def linear_layer(x, w, b, OUTER: tl.constexpr, H: tl.constexpr, O: tl.constexpr, PRECISION: tl.constexpr):
     """A linear layer from H columns to OUTER, padded to O."""
     i, o = tl.arange(0, H), tl.arange(0, O)
     W = tl.load(w + o[None, :] * H + i[:, None], mask=o[None, :] < OUTER, other=0.0)
@@ -33,7 +33,7 @@ def layer(x, w, b, OUTER: tl.constexpr, H: tl.constexpr, O: tl.constexpr, PRECIS
 
 
 @triton.jit
-def seen(record, r, w, b, ROWS: tl.constexpr, VECTORS: tl.constexpr, MORE: tl.constexpr, H: tl.constexpr,
+def invariant_layer(record, r, w, b, ROWS: tl.constexpr, VECTORS: tl.constexpr, MORE: tl.constexpr, H: tl.constexpr,
          PRECISION: tl.constexpr):  # fmt: skip
     """The first layer over products of vectors, compressed, and scalars."""
     PRODUCTS: tl.constexpr = VECTORS * (VECTORS + 1) // 2
@@ -48,14 +48,14 @@ def seen(record, r, w, b, ROWS: tl.constexpr, VECTORS: tl.constexpr, MORE: tl.co
         some = (c < PRODUCTS)[None, :]
         p = tl.zeros([ROWS, 32], tl.float32)
         for axis in tl.static_range(3):
-            at = record + axis * WIDE * ROWS + r[:, None]
+            at = record + axis * MAX_VECTORS * ROWS + r[:, None]
             p += tl.load(at + i[None, :] * ROWS, mask=some, other=0.0) * tl.load(at + j[None, :] * ROWS, mask=some,
                                                                                  other=0.0)  # fmt: skip
         size = tl.log(tl.abs(p) + tl.sqrt(p * p + 1))  # asinh, but for the sign
         p = tl.where(p < 0, -size, size)
         if first + 32 > PRODUCTS:
             number = (c >= PRODUCTS) & (c < PRODUCTS + MORE)
-            at = record + (c + SCALARS - PRODUCTS)[None, :] * ROWS + r[:, None]
+            at = record + (c + FIRST_SCALAR - PRODUCTS)[None, :] * ROWS + r[:, None]
             p = tl.where(number[None, :], tl.load(at, mask=number[None, :], other=0.0), p)
         W = tl.load(w + h[None, :] * (PRODUCTS + MORE) + c[:, None], mask=(c < PRODUCTS + MORE)[:, None], other=0.0)
         y += tl.dot(p, W, input_precision=PRECISION)
@@ -63,10 +63,10 @@ def seen(record, r, w, b, ROWS: tl.constexpr, VECTORS: tl.constexpr, MORE: tl.co
 
 
 @triton.jit
-def weighed(record, r, there, weights, ROWS: tl.constexpr, VECTORS: tl.constexpr):
+def weighted_vectors(record, r, there, weights, ROWS: tl.constexpr, VECTORS: tl.constexpr):
     """The weighted sum of the first vectors."""
-    v = tl.arange(0, MOST)
+    v = tl.arange(0, PADDED_VECTORS)
     at, some = record + v[None, :] * ROWS + r[:, None], (v < VECTORS)[None, :] & there[:, None]
     return (tl.sum(weights * tl.load(at, mask=some, other=0.0), 1),
-            tl.sum(weights * tl.load(at + WIDE * ROWS, mask=some, other=0.0), 1),
-            tl.sum(weights * tl.load(at + 2 * WIDE * ROWS, mask=some, other=0.0), 1))  # fmt: skip
+            tl.sum(weights * tl.load(at + MAX_VECTORS * ROWS, mask=some, other=0.0), 1),
+            tl.sum(weights * tl.load(at + 2 * MAX_VECTORS * ROWS, mask=some, other=0.0), 1))  # fmt: skip

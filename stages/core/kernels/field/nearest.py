@@ -61,7 +61,7 @@ def _(points: Tensor, low: Tensor, high: Tensor, reach: float) -> tuple[Tensor, 
     return points.new_empty(b, o, o, n), torch.empty(b, o, o, n, dtype=torch.int64, device=points.device)
 
 
-def nearest(points: Tensor, valid: Tensor, reach: float) -> tuple[Tensor, Tensor]:
+def nearest_between_objects(points: Tensor, valid: Tensor, reach: float) -> tuple[Tensor, Tensor]:
     """For point n of object i and every object j: the distance [m] to j's nearest point, and which one that is.
 
     `points` (b o n 3) in single precision, `valid` (b o n); both results (b o o n). The distance is infinite where it
@@ -73,7 +73,7 @@ def nearest(points: Tensor, valid: Tensor, reach: float) -> tuple[Tensor, Tensor
     return _nearest(placed.mT.contiguous(), low, high, reach)
 
 
-def nearest_reference(points: Tensor, valid: Tensor, reach: float) -> tuple[Tensor, Tensor]:
+def nearest_between_objects_reference(points: Tensor, valid: Tensor, reach: float) -> tuple[Tensor, Tensor]:
     """The same from a table of all distances, in any precision."""
     distance = (points[:, :, None, :, None] - points[:, None, :, None]).norm(dim=-1)
     distance, index = distance.masked_fill(~valid[:, None, :, None], torch.inf).min(-1)

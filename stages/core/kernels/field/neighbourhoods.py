@@ -22,7 +22,7 @@ def _weights(arm, share, x, slope, s, n):
 
 
 @triton.jit
-def average(arm, valid, share, reach, out, n, scales, ROWS: tl.constexpr, CHUNK: tl.constexpr):
+def _neighbourhood_weights(arm, valid, share, reach, out, n, scales, ROWS: tl.constexpr, CHUNK: tl.constexpr):
     """Rows of the table of one object and one scale, twice: their sums, and what is divided by those."""
     table = tl.program_id(0)
     i = table // scales
@@ -43,12 +43,12 @@ def average(arm, valid, share, reach, out, n, scales, ROWS: tl.constexpr, CHUNK:
         tl.store(out + r[:, None] * n + s[None, :], weight.to(tl.float16), mask=inside)
 
 
-def neighbourhoods(arm: Tensor, valid: Tensor, share: Tensor, reach: Tensor) -> Tensor:
+def neighbourhood_weights(arm: Tensor, valid: Tensor, share: Tensor, reach: Tensor) -> Tensor:
     """Gaussians of each of the radii `reach` (b o s) [m] about points `arm` (b o n 3) that weigh `share` (b o n),
     normalised by rows: (b o s n n). Rows are 0 where not `valid` (b o n)."""
     b, o, n, _ = arm.shape
     given = [x.contiguous() for x in (arm, valid, share, reach)]
     scales = reach.shape[-1]
     out = torch.empty(b, o, scales, n, n, dtype=torch.float16, device=arm.device)
-    average[(b * o * scales, triton.cdiv(n, ROWS))](*given, out, n, scales, ROWS=ROWS, CHUNK=CHUNK)
+    _neighbourhood_weights[(b * o * scales, triton.cdiv(n, ROWS))](*given, out, n, scales, ROWS=ROWS, CHUNK=CHUNK)
     return out

@@ -10,12 +10,12 @@ from torch import Tensor
 
 from stages.core.kernels.interop import device_of, launch, view
 
-NEIGHBOURS = wp.constant(12)  # points that make a normal, the point itself among them
-NEXT = wp.constant(5)  # points that make the spacing, the point itself among them
-SWEEPS = 6  # of Jacobi's rotations; each squares what is off the diagonal
-THREADS = 64  # of a block on a GPU, ten of which fit where one runs
+NORMAL_NEIGHBOURS = wp.constant(12)  # points that make a normal, the point itself among them
+SPACING_NEIGHBOURS = wp.constant(5)  # points that make the spacing, the point itself among them
+JACOBI_SWEEPS = 6  # of Jacobi's rotations; each squares what is off the diagonal
+THREADS_PER_BLOCK = 64  # of a block on a GPU, ten of which fit where one runs
 
-Indices = wp.types.vector(length=NEIGHBOURS, dtype=wp.int32)
+Indices = wp.types.vector(length=NORMAL_NEIGHBOURS, dtype=wp.int32)
 
 
 @wp.func
@@ -46,19 +46,19 @@ def _axes(A: wp.mat33d, sweeps: int):
     return wp.get_diag(A), V
 
 
-@wp.kernel(enable_backward=False, launch_bounds=(THREADS, 10))
+@wp.kernel(enable_backward=False, launch_bounds=(THREADS_PER_BLOCK, 10))
 def _surface(points: wp.array2d[Any], valid: wp.array2d[wp.bool], sweeps: int,
              normal: wp.array2d[wp.vec3d], spacing: wp.array2d[wp.float64]):  # fmt: skip
     o, i = wp.tid()
     if not valid[o, i]:
         return
     x = points[o, i]
-    near, index = wp.vector(x.dtype(wp.inf), length=NEIGHBOURS), Indices(-1)
+    near, index = wp.vector(x.dtype(wp.inf), length=NORMAL_NEIGHBOURS), Indices(-1)
     for j in range(points.shape[1]):
         d = wp.length_sq(points[o, j] - x)
-        if d < near[NEIGHBOURS - 1] and valid[o, j]:
+        if d < near[NORMAL_NEIGHBOURS - 1] and valid[o, j]:
             which = wp.int32(j)
-            for k in range(NEIGHBOURS):  # the nearest first; who is farther moves on by one
+            for k in range(NORMAL_NEIGHBOURS):  # the nearest first; who is farther moves on by one
                 if d < near[k]:
                     farther = near[k]
                     whom = index[k]
@@ -67,13 +67,13 @@ def _surface(points: wp.array2d[Any], valid: wp.array2d[wp.bool], sweeps: int,
                     d = farther
                     which = whom
     mean, count = wp.vec3d(), wp.float64(0.0)
-    for k in range(NEIGHBOURS):
+    for k in range(NORMAL_NEIGHBOURS):
         if index[k] >= 0:
             mean += wp.vec3d(points[o, index[k]] - x)
             count += wp.float64(1.0)
     mean = mean / count
     spread = wp.mat33d()
-    for k in range(NEIGHBOURS):
+    for k in range(NORMAL_NEIGHBOURS):
         if index[k] >= 0:
             arm = wp.vec3d(points[o, index[k]] - x) - mean
             spread += wp.outer(arm, arm)
@@ -81,7 +81,7 @@ def _surface(points: wp.array2d[Any], valid: wp.array2d[wp.bool], sweeps: int,
     least = wp.int32(wp.argmin(extent))
     normal[o, i] = wp.vec3d(axes[0, least], axes[1, least], axes[2, least])
     total, others = wp.float64(0.0), wp.float64(0.0)
-    for k in range(1, NEXT):
+    for k in range(1, SPACING_NEIGHBOURS):
         if index[k] >= 0:
             total += wp.sqrt(wp.float64(near[k]))
             others += wp.float64(1.0)
@@ -92,24 +92,25 @@ for _vector in (wp.vec3, wp.vec3d):  # both at once: one that comes later would 
     wp.overload(_surface, {"points": wp.array2d(dtype=_vector)})
 
 
-def surface(points: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
+def normals_and_spacing(points: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
     """For points (b o n 3) of objects: the direction of least extent of the NEIGHBOURS nearest, either way round, and
     the mean distance to the NEXT - 1 nearest others (b o n) [m]; both 0 where not `valid` (b o n)."""
     normal = torch.zeros_like(points, dtype=torch.float64, memory_format=torch.contiguous_format)
     spacing = normal.new_zeros(valid.shape)
     vector = wp.vec3d if points.dtype == torch.float64 else wp.vec3
-    given = [view(points.contiguous().flatten(0, 1), vector), view(valid.contiguous().flatten(0, 1), wp.bool), SWEEPS]
+    flat = points.contiguous().flatten(0, 1), valid.contiguous().flatten(0, 1)
+    given = [view(flat[0], vector), view(flat[1], wp.bool), JACOBI_SWEEPS]
     found = [view(normal.flatten(0, 1), wp.vec3d), view(spacing.flatten(0, 1), wp.float64)]
-    launch(_surface, given[1].shape, given, found, device_of(points), block_dim=THREADS)
+    launch(_surface, given[1].shape, given, found, device_of(points), block_dim=THREADS_PER_BLOCK)
     return normal.to(points), spacing.to(points)
 
 
-def surface_reference(points: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
+def normals_and_spacing_reference(points: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
     """The same from a table of all distances, in any precision."""
     gap = (points[..., :, None, :] - points[..., None, :, :]).norm(dim=-1)
     gap = gap.masked_fill(~(valid[..., :, None] & valid[..., None, :]), torch.inf)
-    near, index = gap.topk(min(NEIGHBOURS, gap.shape[-1]), largest=False)
-    there, next_ = near.isfinite().to(points)[..., None], near[..., 1:NEXT]
+    near, index = gap.topk(min(NORMAL_NEIGHBOURS, gap.shape[-1]), largest=False)
+    there, next_ = near.isfinite().to(points)[..., None], near[..., 1:SPACING_NEIGHBOURS]
     rows = index[..., None].expand(*index.shape, 3)
     cloud = torch.gather(points[:, :, None].expand(*index.shape[:3], *points.shape[2:]), 3, rows)
     mean = (there * cloud).sum(-2, keepdim=True) / there.sum(-2, keepdim=True).clamp_min(1)
@@ -129,11 +130,11 @@ def _inverted(matrix: wp.array[wp.mat33d], sweeps: int, inverse: wp.array[wp.mat
     values[i] = wp.vec3d(least, d[0] + d[1] + d[2] - least - most, most)
 
 
-def inverted(matrix: Tensor) -> tuple[Tensor, Tensor]:
+def invert_spd(matrix: Tensor) -> tuple[Tensor, Tensor]:
     """The inverses of positive definite matrices (b o 3 3), and the eigenvalues of those, ascending (b o 3)."""
     real = matrix.double().contiguous()
     inverse, values = torch.empty_like(real), torch.empty_like(real[..., 0])
-    given = [view(real.flatten(0, 1), wp.mat33d), SWEEPS]
+    given = [view(real.flatten(0, 1), wp.mat33d), JACOBI_SWEEPS]
     found = [view(inverse.flatten(0, 1), wp.mat33d), view(values.flatten(0, 1), wp.vec3d)]
-    launch(_inverted, given[0].shape, given, found, device_of(matrix), block_dim=THREADS)
+    launch(_inverted, given[0].shape, given, found, device_of(matrix), block_dim=THREADS_PER_BLOCK)
     return inverse.to(matrix), values.to(matrix)

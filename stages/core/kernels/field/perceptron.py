@@ -12,9 +12,9 @@ import triton.language as tl
 from torch import Tensor
 from torch.nn.functional import linear, silu
 
-WIDEST = 128  # layers that are not the input: their weights and a block of rows stay on the chip
+MAX_LAYER_WIDTH = 128  # layers that are not the input: their weights and a block of rows stay on the chip
 CHUNK = 64  # columns of the input at a time
-FEW = 65_536  # rows that are cut into small blocks, so that all processors have some
+SMALL_BLOCK_ROWS = 65_536  # rows that are cut into small blocks, so that all processors have some
 
 
 @triton.jit
@@ -100,7 +100,7 @@ def _fused(
     columns = x.shape[1]
     K, H, M, O = (max(16, triton.next_power_of_2(w)) for w in (min(columns, CHUNK), widths[0], widths[-2], widths[-1]))
     precision = "tf32x3" if torch.get_float32_matmul_precision() == "highest" else "tf32"
-    block = 32 if rows <= FEW else 64
+    block = 32 if rows <= SMALL_BLOCK_ROWS else 64
     layers = [t for pair in zip(weights, biases, strict=True) for t in pair]
     _perceptron[(triton.cdiv(rows, block),)](
         x, vectors, known, near, *layers[:4], *layers[-2:], out, rows, 1 if known is None else rows // len(known),

@@ -9,11 +9,11 @@ import triton.language as tl
 from torch import Tensor
 
 ROWS, CHUNK = 64, 128
-MOST = 16  # columns
+MAX_COLUMNS = 16  # columns
 
 
 @triton.jit
-def product(A, high, low, out, n, k, c, ROWS: tl.constexpr, CHUNK: tl.constexpr, COLUMNS: tl.constexpr):
+def _skinny_matmul(A, high, low, out, n, k, c, ROWS: tl.constexpr, CHUNK: tl.constexpr, COLUMNS: tl.constexpr):
     """Of matrices (n, k) and columns (c, k), the sum of two, all in half precision, sums in single; out (c, n)."""
     blocks = tl.cdiv(n, ROWS)
     matrix, block = (tl.program_id(0) // blocks).to(tl.int64), tl.program_id(0) % blocks
@@ -30,23 +30,24 @@ def product(A, high, low, out, n, k, c, ROWS: tl.constexpr, CHUNK: tl.constexpr,
 
 
 @torch.library.custom_op("ngff::thin_product", mutates_args=())
-def product_of(A: Tensor, high: Tensor, low: Tensor) -> Tensor:
+def split_matmul(A: Tensor, high: Tensor, low: Tensor) -> Tensor:
     g, n, k = A.shape
     out = torch.empty(g, high.shape[1], n, dtype=torch.float32, device=A.device)
-    product[(g * triton.cdiv(n, ROWS),)](A, high, low, out, n, k, high.shape[1], ROWS, CHUNK, MOST, num_stages=4)
+    blocks = (g * triton.cdiv(n, ROWS),)
+    _skinny_matmul[blocks](A, high, low, out, n, k, high.shape[1], ROWS, CHUNK, MAX_COLUMNS, num_stages=4)
     return out
 
 
-@product_of.register_fake
+@split_matmul.register_fake
 def _(A: Tensor, high: Tensor, low: Tensor) -> Tensor:
     return torch.empty(A.shape[0], high.shape[1], A.shape[1], dtype=torch.float32, device=A.device)
 
 
-def thin_product(A: Tensor, x: Tensor) -> Tensor:
+def skinny_matmul(A: Tensor, x: Tensor) -> Tensor:
     """A @ x in single precision for A (..., n, k) in half precision and x (..., k, c) of at most MOST columns c."""
     columns = x.flatten(0, -3).mT
     scale = columns.abs().amax(-1, keepdim=True).clamp_min(1e-30) / 1024
     columns = (columns / scale).contiguous()
     high = columns.half()  # two numbers of half precision hold 22 bits
-    out = product_of(A.flatten(0, -3).contiguous(), high, (columns - high).half()) * scale
+    out = split_matmul(A.flatten(0, -3).contiguous(), high, (columns - high).half()) * scale
     return out.mT.unflatten(0, A.shape[:-2])

@@ -19,7 +19,7 @@ def store3(at, stride, a, mask):
 
 
 @triton.jit
-def row3(at):
+def read3(at):
     return (tl.load(at), tl.load(at + 1), tl.load(at + 2))
 
 
@@ -31,7 +31,7 @@ def write3(at, a):
 
 
 @triton.jit
-def load4(at):
+def read4(at):
     return (tl.load(at), tl.load(at + 1), tl.load(at + 2), tl.load(at + 3))
 
 
@@ -42,7 +42,7 @@ def write4(at, q):
 
 
 @triton.jit
-def row9(at):
+def read9(at):
     return (tl.load(at), tl.load(at + 1), tl.load(at + 2), tl.load(at + 3), tl.load(at + 4), tl.load(at + 5),
             tl.load(at + 6), tl.load(at + 7), tl.load(at + 8))  # fmt: skip
 
@@ -64,7 +64,7 @@ def sub(a, b):
 
 
 @triton.jit
-def scaled(s, a):
+def scale3(s, a):
     return (s * a[0], s * a[1], s * a[2])
 
 
@@ -79,40 +79,40 @@ def cross(a, b):
 
 
 @triton.jit
-def times(M, a):
+def matvec3(M, a):
     """M a."""
     return (M[0] * a[0] + M[1] * a[1] + M[2] * a[2], M[3] * a[0] + M[4] * a[1] + M[5] * a[2],
             M[6] * a[0] + M[7] * a[1] + M[8] * a[2])  # fmt: skip
 
 
 @triton.jit
-def back(M, a):
+def transposed_matvec3(M, a):
     """M^T a."""
     return (M[0] * a[0] + M[3] * a[1] + M[6] * a[2], M[1] * a[0] + M[4] * a[1] + M[7] * a[2],
             M[2] * a[0] + M[5] * a[1] + M[8] * a[2])  # fmt: skip
 
 
 @triton.jit
-def conjugated(R, M):
+def rotate_tensor(R, M):
     """R M R^T."""
-    a = times(R, (M[0], M[3], M[6]))  # columns of R M
-    b = times(R, (M[1], M[4], M[7]))
-    c = times(R, (M[2], M[5], M[8]))
-    x = times(R, (a[0], b[0], c[0]))  # rows of the result
-    y = times(R, (a[1], b[1], c[1]))
-    z = times(R, (a[2], b[2], c[2]))
+    a = matvec3(R, (M[0], M[3], M[6]))  # columns of R M
+    b = matvec3(R, (M[1], M[4], M[7]))
+    c = matvec3(R, (M[2], M[5], M[8]))
+    x = matvec3(R, (a[0], b[0], c[0]))  # rows of the result
+    y = matvec3(R, (a[1], b[1], c[1]))
+    z = matvec3(R, (a[2], b[2], c[2]))
     return (x[0], x[1], x[2], y[0], y[1], y[2], z[0], z[1], z[2])
 
 
 @triton.jit
-def solved(K, a, b):
+def solve_symmetric(K, a, b):
     """K^-1 a and K^-1 b of a symmetric K (xx, xy, xz, yy, yz, zz), by Cramer's rule."""
     x, y, z = (K[0], K[1], K[2]), (K[1], K[3], K[4]), (K[2], K[4], K[5])
     yz, zx, xy = cross(y, z), cross(z, x), cross(x, y)
     det = dot(x, yz)
     return (
-        scaled(1 / det, add(add(scaled(a[0], yz), scaled(a[1], zx)), scaled(a[2], xy))),
-        scaled(1 / det, add(add(scaled(b[0], yz), scaled(b[1], zx)), scaled(b[2], xy))),
+        scale3(1 / det, add(add(scale3(a[0], yz), scale3(a[1], zx)), scale3(a[2], xy))),
+        scale3(1 / det, add(add(scale3(b[0], yz), scale3(b[1], zx)), scale3(b[2], xy))),
     )
 
 
@@ -143,7 +143,7 @@ def where3(mask, a, other):
 
 
 @triton.jit
-def rotation(q):
+def rotation_matrix(q):
     """The matrix of a quaternion w x y z of any length."""
     s = 1 / tl.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
     w, x, y, z = q[0] * s, q[1] * s, q[2] * s, q[3] * s
@@ -153,26 +153,26 @@ def rotation(q):
 
 
 @triton.jit
-def turned(q, turn):
+def rotate_quat(q, turn):
     """A quaternion after a rotation vector about world axes [rad], of unit length."""
     half = tl.sqrt(dot(turn, turn) + 1e-24) / 2
-    a, v = tl.cos(half), scaled(tl.sin(half) / half / 2, turn)
+    a, v = tl.cos(half), scale3(tl.sin(half) / half / 2, turn)
     u = (q[1], q[2], q[3])
     w = a * q[0] - dot(v, u)
-    x, y, z = add(add(scaled(a, u), scaled(q[0], v)), cross(v, u))
+    x, y, z = add(add(scale3(a, u), scale3(q[0], v)), cross(v, u))
     s = 1 / tl.sqrt(w * w + x * x + y * y + z * z)
     return (w * s, x * s, y * s, z * s)
 
 
 @triton.jit
-def spinning(q, momentum, inverse):
+def angular_velocity(q, momentum, inverse):
     """Spin [rad/s] at an orientation, from angular momentum and the inverse of the inertia at rest."""
-    R = rotation(q)
-    return times(R, times(inverse, back(R, momentum)))
+    R = rotation_matrix(q)
+    return matvec3(R, matvec3(inverse, transposed_matvec3(R, momentum)))
 
 
 @triton.jit
-def drifted(com, q, velocity, momentum, inverse, dt):
+def drift(com, q, velocity, momentum, inverse, dt):
     """Centre of mass and orientation dt [s] later without forces; the spin is that of the middle of the way."""
-    middle = turned(q, scaled(dt / 2, spinning(q, momentum, inverse)))
-    return add(com, scaled(dt, velocity)), turned(q, scaled(dt, spinning(middle, momentum, inverse)))
+    middle = rotate_quat(q, scale3(dt / 2, angular_velocity(q, momentum, inverse)))
+    return add(com, scale3(dt, velocity)), rotate_quat(q, scale3(dt, angular_velocity(middle, momentum, inverse)))

@@ -9,39 +9,39 @@ import triton.language as tl
 
 from stages.core.kernels.field.bodies import (
     ARM,
-    BODY,
+    BODY_SIZE,
     COM,
     DU,
-    FIELD,
-    INVERSE,
+    FIELD_SIZE,
+    INVERSE_INERTIA,
     MOMENTUM,
-    MOVED,
-    PART,
     POINT,
+    POINT_SIZE,
     QUAT,
-    SPREAD,
-    TURN,
+    ROTATION,
     VELOCITY,
+    VIRIAL,
+    WRENCH_SIZE,
     U,
-    bounded,
+    clamp_displacements,
 )
-from stages.core.kernels.field.broad_phase import partner_of
+from stages.core.kernels.field.broad_phase import other_object
 from stages.core.kernels.field.vec3 import (
     add,
-    back,
     cross,
     dot,
-    drifted,
+    drift,
     load3,
-    load4,
+    matvec3,
     max3,
-    row3,
-    row9,
-    scaled,
+    read3,
+    read4,
+    read9,
+    scale3,
     store3,
     sub,
     sum3,
-    times,
+    transposed_matvec3,
     where3,
     write3,
     write4,
@@ -52,7 +52,7 @@ from stages.core.kernels.field.vec3 import (
 def _total(parts, blocks, BLOCKS: tl.constexpr):
     """Force and torque of so many blocks of places."""
     k = tl.arange(0, BLOCKS)
-    at, some = parts + k * PART, k < blocks
+    at, some = parts + k * WRENCH_SIZE, k < blocks
     return sum3(load3(at, 1, some)), sum3(load3(at + 3, 1, some))
 
 
@@ -62,7 +62,7 @@ def _contact(
 ):  # fmt: skip
     """Force, torque and what the points feel, per unit of mass, from all that an object touches."""
     first, mine, m, kinds = i - i % o, i % o, o - 1, o + 1
-    c = row3(body + BODY * i + COM)
+    c = read3(body + BODY_SIZE * i + COM)
     here, free = tl.maximum(tl.load(mass + i), 1e-6), 1 - tl.load(pinned + i).to(tl.float32)
     r = tl.arange(0, BLOCK)
     zero = tl.zeros([BLOCK], tl.float32)
@@ -72,12 +72,12 @@ def _contact(
         again = mine - (mine > j - first)  # as which of its others j knows i
         there, loose = tl.maximum(tl.load(mass + j), 1e-6), 1 - tl.load(pinned + j).to(tl.float32)
         reduced = 1 / tl.maximum(free / here + loose / there, 1e-9)
-        F, T = _total(parts + (i * places + k * wide) * PART, wide, BLOCKS)
-        G, S = _total(parts + (j * places + again * wide) * PART, wide, BLOCKS)
-        S = add(S, cross(sub(row3(body + BODY * j + COM), c), G))
-        force, torque = add(force, scaled(reduced / here, sub(F, G))), add(torque, scaled(reduced / here, sub(T, S)))
-        touch = add(touch, scaled(reduced / here, load3(felt + (i * kinds + k) * 3 * n + r, n, r < n)))
-    F, T = _total(parts + (i * places + m * wide) * PART, places - m * wide, BLOCKS)  # floor and walls
+        F, T = _total(parts + (i * places + k * wide) * WRENCH_SIZE, wide, BLOCKS)
+        G, S = _total(parts + (j * places + again * wide) * WRENCH_SIZE, wide, BLOCKS)
+        S = add(S, cross(sub(read3(body + BODY_SIZE * j + COM), c), G))
+        force, torque = add(force, scale3(reduced / here, sub(F, G))), add(torque, scale3(reduced / here, sub(T, S)))
+        touch = add(touch, scale3(reduced / here, load3(felt + (i * kinds + k) * 3 * n + r, n, r < n)))
+    F, T = _total(parts + (i * places + m * wide) * WRENCH_SIZE, places - m * wide, BLOCKS)  # floor and walls
     force, torque = add(force, F), add(torque, T)
     touch = add(touch, load3(felt + (i * kinds + m) * 3 * n + r, n, r < n))
     touch = add(touch, load3(felt + (i * kinds + m + 1) * 3 * n + r, n, r < n))
@@ -91,7 +91,7 @@ def _guarded(v, up, down, RISE: tl.constexpr):
 
 
 @triton.jit
-def kick(
+def update_velocities(
     body, moved, field, parts, felt, grip, unit, pushed, twisted, arm, valid, share, size, mass, inverse, pinned,
     gravity, box, com, quat, velocity, momentum, high, low, scale, o, n, dt, places, wide,
     GRIP: tl.constexpr, PUSHED: tl.constexpr, SINK: tl.constexpr, RISE: tl.constexpr, FASTEST: tl.constexpr,
@@ -104,45 +104,45 @@ def kick(
     """
     i = tl.program_id(0)
     force, torque, touch = _contact(i, body, parts, felt, mass, pinned, o, n, places, wide, BLOCK, BLOCKS)
-    force = add(force, row3(gravity + 3 * (i // o)))
+    force = add(force, read3(gravity + 3 * (i // o)))
     if PUSHED:
         here = tl.maximum(tl.load(mass + i), 1e-6)
-        force = add(force, scaled(1 / here, row3(pushed + 3 * i)))
-        torque = add(torque, scaled(1 / here, row3(twisted + 3 * i)))
-    now = body + BODY * i
-    past_v, past_spin = row3(now + VELOCITY), times(row9(now + INVERSE), row3(now + MOMENTUM))
-    L = add(row3(now + MOMENTUM), scaled(dt, torque))
-    v = add(past_v, scaled(dt, force))
-    spin = times(row9(now + INVERSE), L)
+        force = add(force, scale3(1 / here, read3(pushed + 3 * i)))
+        torque = add(torque, scale3(1 / here, read3(twisted + 3 * i)))
+    now = body + BODY_SIZE * i
+    past_v, past_spin = read3(now + VELOCITY), matvec3(read9(now + INVERSE_INERTIA), read3(now + MOMENTUM))
+    L = add(read3(now + MOMENTUM), scale3(dt, torque))
+    v = add(past_v, scale3(dt, force))
+    spin = matvec3(read9(now + INVERSE_INERTIA), L)
     slower = WILDEST / tl.maximum(tl.sqrt(dot(spin, spin)), WILDEST)
-    L, spin = scaled(slower, L), scaled(slower, spin)
-    v = scaled(FASTEST / tl.maximum(tl.sqrt(dot(v, v)), FASTEST), v)
+    L, spin = scale3(slower, L), scale3(slower, spin)
+    v = scale3(FASTEST / tl.maximum(tl.sqrt(dot(v, v)), FASTEST), v)
     extent, hold = tl.load(size + i), tl.load(grip + i)
     for k in range(o - 1):  # what stands on what the floor holds is held as well
         firm = 1 - GRIP * tl.load(unit + i * (o + 1) + k)  # weight of all places of this contact
-        hold = tl.maximum(hold, firm * tl.load(grip + partner_of(i, k, o)))
+        hold = tl.maximum(hold, firm * tl.load(grip + other_object(i, k, o)))
     last = (dot(v, v) + extent * extent * dot(spin, spin)) / BRISK
     past_v, past_spin = add(past_v, v), add(past_spin, spin)
     moving = (dot(past_v, past_v) + extent * extent * dot(past_spin, past_spin)) / 4 + last * last
     kept = (moving * moving + 1e-16) / (moving * moving + 1e-16 + dt / FRAME * hold * hold * hold * hold)
-    v, L, spin = scaled(kept, v), scaled(kept, L), scaled(kept, spin)
+    v, L, spin = scale3(kept, v), scale3(kept, L), scale3(kept, spin)
 
     r = tl.arange(0, BLOCK)
     inside = r < n
     there = tl.load(valid + i * n + r, mask=inside, other=0) != 0
-    own = moved + MOVED * i * n + r
-    x = add(load3(own + POINT * n, n, inside), scaled(dt / 2, cross(spin, load3(own + ARM * n, n, inside))))
+    own = moved + POINT_SIZE * i * n + r
+    x = add(load3(own + POINT * n, n, inside), scale3(dt / 2, cross(spin, load3(own + ARM * n, n, inside))))
     far: tl.constexpr = float("inf")
     room = box + 6 * i
-    deepest = max3(where3(there, scaled(-1.0, x), -far))  # how deep points could get [m]: below the lower sides
-    up = scaled(2 / dt, sub(add(row3(room), deepest), (SINK, SINK, SINK)))
-    down = scaled(2 / dt, add(sub(row3(room + 3), max3(where3(there, x, -far))), (SINK, SINK, SINK)))
+    deepest = max3(where3(there, scale3(-1.0, x), -far))  # how deep points could get [m]: below the lower sides
+    up = scale3(2 / dt, sub(add(read3(room), deepest), (SINK, SINK, SINK)))
+    down = scale3(2 / dt, add(sub(read3(room + 3), max3(where3(there, x, -far))), (SINK, SINK, SINK)))
     free = 1 - tl.load(pinned + i).to(tl.float32)
     v = (_guarded(v[0], up[0], down[0], RISE), _guarded(v[1], up[1], down[1], RISE),
          _guarded(v[2], up[2], down[2], RISE))  # fmt: skip
-    v = scaled(free, v)
-    L = scaled(free, L)
-    c, q = drifted(row3(now + COM), load4(now + QUAT), v, L, row9(inverse + 9 * i), dt / 2)
+    v = scale3(free, v)
+    L = scale3(free, L)
+    c, q = drift(read3(now + COM), read4(now + QUAT), v, L, read9(inverse + 9 * i), dt / 2)
     write3(com + 3 * i, c)
     write4(quat + 4 * i, q)
     write3(velocity + 3 * i, v)
@@ -150,10 +150,10 @@ def kick(
 
     part = tl.load(share + i * n + r, mask=inside, other=0.0)
     one = tl.where(there, 1 / tl.maximum(part, 1e-9), 0.0)
-    touch = back(row9(now + TURN), (one * touch[0], one * touch[1], one * touch[2]))
+    touch = transposed_matvec3(read9(now + ROTATION), (one * touch[0], one * touch[1], one * touch[2]))
     rest = load3(arm + (i * n + r) * 3, 1, inside)
-    own = field + FIELD * i * n + r
-    store3(own + SPREAD * n, n, _spread(touch, rest, part, extent), inside)
+    own = field + FIELD_SIZE * i * n + r
+    store3(own + VIRIAL * n, n, _spread(touch, rest, part, extent), inside)
     _split(touch, high + 9 * i * n + r, low + 9 * i * n + r, scale + 9 * i, n, inside)
     shift = load3(own + U * n, n, inside)
     _split(shift, high + (9 * i + 3) * n + r, low + (9 * i + 3) * n + r, scale + 9 * i + 3, n, inside)
@@ -164,10 +164,10 @@ def kick(
 @triton.jit
 def _spread(touch, arm, share, size):
     """What the points feel, as one matrix (its virial) times their arms."""
-    a, b, c = scaled(share, touch)
-    x, y, z = sum3(scaled(a, arm)), sum3(scaled(b, arm)), sum3(scaled(c, arm))
+    a, b, c = scale3(share, touch)
+    x, y, z = sum3(scale3(a, arm)), sum3(scale3(b, arm)), sum3(scale3(c, arm))
     M = (2 * x[0], x[1] + y[0], x[2] + z[0], x[1] + y[0], 2 * y[1], y[2] + z[1], x[2] + z[0], y[2] + z[1], 2 * z[2])
-    return scaled(1 / (size * size), times(M, arm))
+    return scale3(1 / (size * size), matvec3(M, arm))
 
 
 @triton.jit
@@ -184,7 +184,7 @@ def _split(a, high, low, scale, n, mask):
 
 
 @triton.jit
-def deform(
+def update_displacements(
     field, stress, arm, valid, share, size, inverse, stiffness, damping, pinned, u, du, n, dt,
     FASTEST: tl.constexpr, FARTHEST: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
@@ -196,18 +196,18 @@ def deform(
     part = tl.load(share + i * n + r, mask=inside, other=0.0)
     rest = load3(arm + (i * n + r) * 3, 1, inside)
     a = load3(stress + 3 * i * n + r, n, inside)
-    a = sub(a, sum3(scaled(part, a)))
-    turn = times(row9(inverse + 9 * i), sum3(scaled(part, cross(rest, a))))
+    a = sub(a, sum3(scale3(part, a)))
+    turn = matvec3(read9(inverse + 9 * i), sum3(scale3(part, cross(rest, a))))
     a = sub(a, cross(turn, rest))
     a = where3(there, a, 0.0)
-    own = field + FIELD * i * n + r
+    own = field + FIELD_SIZE * i * n + r
     shift, rate = load3(own + U * n, n, inside), load3(own + DU * n, n, inside)
     k, c, extent = tl.load(stiffness + i), tl.load(damping + i), tl.load(size + i)
-    rate = add(rate, scaled(dt, sub(a, scaled(k, shift))))
-    rate = scaled(1 / (1 + dt * c + dt * dt / 2 * k), rate)
+    rate = add(rate, scale3(dt, sub(a, scale3(k, shift))))
+    rate = scale3(1 / (1 + dt * c + dt * dt / 2 * k), rate)
     free = 1 - tl.load(pinned + i).to(tl.float32)
-    rate = scaled(free, bounded(rate, FASTEST * extent, FARTHEST))
-    shift = bounded(add(shift, scaled(dt / 2, rate)), extent, FARTHEST)
+    rate = scale3(free, clamp_displacements(rate, FASTEST * extent, FARTHEST))
+    shift = clamp_displacements(add(shift, scale3(dt / 2, rate)), extent, FARTHEST)
     at = (i * n + r) * 3
     store3(u + at, 1, shift, inside)
     store3(du + at, 1, rate, inside)

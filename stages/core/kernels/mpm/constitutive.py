@@ -26,13 +26,13 @@ import warp as wp
 from torch import Tensor
 
 NEO_HOOKEAN, COROTATED, VON_MISES, SAND, SNOW = range(5)
-FLATTEST = 0.05  # a volume ratio below this counts as this, so that stress stays finite
-HARDEST = 4.0  # snow grows at most this much stiffer, so that twice the wave speed bounds the substep
-RESIDUAL = 0.1  # of the yield stress stays, however soft it gets
+MIN_VOLUME_RATIO = 0.05  # a volume ratio below this counts as this, so that stress stays finite
+MAX_SNOW_HARDENING = 4.0  # snow grows at most this much stiffer, so that twice the wave speed bounds the substep
+RESIDUAL_STRENGTH = 0.1  # of the yield stress stays, however soft it gets
 
 
 @wp.struct
-class Response:
+class MaterialUpdate:
     """F: elastic deformation gradient; tau: Kirchhoff stress [Pa]."""
 
     F: wp.mat33
@@ -43,7 +43,7 @@ class Response:
 @wp.func
 def neo_hookean(F: wp.mat33, stiffness: wp.vec3) -> wp.mat33:
     """Kirchhoff stress mu (F F^T - I) + lambda log(J) I; `stiffness` is mu, lambda, eta."""
-    J = wp.max(wp.determinant(F), FLATTEST)
+    J = wp.max(wp.determinant(F), MIN_VOLUME_RATIO)
     one = wp.identity(n=3, dtype=float)
     return stiffness[0] * (F * wp.transpose(F) - one) + stiffness[1] * wp.log(J) * one
 
@@ -82,8 +82,8 @@ def _von_mises(e: wp.vec3, mu: float, plastic: wp.vec3, state: float, dt: float)
     root = wp.sqrt(2.0 / 3.0)
     hardening = plastic[1]
     strength = plastic[0] + hardening * state
-    if strength < RESIDUAL * plastic[0]:
-        strength = RESIDUAL * plastic[0]
+    if strength < RESIDUAL_STRENGTH * plastic[0]:
+        strength = RESIDUAL_STRENGTH * plastic[0]
         hardening = 0.0
     excess = 2.0 * mu * size - root * strength
     if excess <= 0.0:
@@ -115,17 +115,17 @@ def _sand(strain: wp.vec3, stiffness: wp.vec3, slope: float, state: float) -> wp
 
 
 @wp.func
-def respond(
+def material_update(
     model: int, trial: wp.mat33, stiffness: wp.vec3, plastic: wp.vec3, state: float, dt: float
-) -> Response:
+) -> MaterialUpdate:
     """Any of the models above; without damping."""
-    out = Response()
+    out = MaterialUpdate()
     out.F = trial
     out.state = state
     if model == NEO_HOOKEAN:
         out.tau = neo_hookean(trial, stiffness)
         return out
-    if model == COROTATED and wp.determinant(trial) > FLATTEST:
+    if model == COROTATED and wp.determinant(trial) > MIN_VOLUME_RATIO:
         out.tau = _corotated(trial, stiffness[0], stiffness[1])  # without the singular values: four times as fast
         return out
     U = wp.mat33()
@@ -144,7 +144,7 @@ def respond(
             out.state = state + wp.log(gain)
             S = kept
             out.F = U * wp.diag(S) * wp.transpose(V)
-            harder = wp.min(wp.exp(plastic[2] * (1.0 - wp.exp(out.state))), HARDEST)
+            harder = wp.min(wp.exp(plastic[2] * (1.0 - wp.exp(out.state))), MAX_SNOW_HARDENING)
             mu = mu * harder
             lam = lam * harder
         J = S[0] * S[1] * S[2]
@@ -152,7 +152,11 @@ def respond(
         for axis in range(3):
             t[axis] = 2.0 * mu * (S[axis] - 1.0) * S[axis] + volumetric
     else:
-        e = wp.vec3(wp.log(wp.max(S[0], FLATTEST)), wp.log(wp.max(S[1], FLATTEST)), wp.log(wp.max(S[2], FLATTEST)))
+        e = wp.vec3(
+            wp.log(wp.max(S[0], MIN_VOLUME_RATIO)),
+            wp.log(wp.max(S[1], MIN_VOLUME_RATIO)),
+            wp.log(wp.max(S[2], MIN_VOLUME_RATIO)),
+        )
         back = wp.vec4()
         if model == SAND:  # noqa: SIM108 -- Warp's ternary computes both
             back = _sand(e, stiffness, plastic[0], state)
@@ -173,13 +177,13 @@ def _respond(
     plastic: wp.array[wp.vec3], state: wp.array[float], tau: wp.array[wp.mat33],
 ):  # fmt: skip
     i = wp.tid()
-    out = respond(int(model[i]), F[i], stiffness[i], plastic[i], state[i], dt)
+    out = material_update(int(model[i]), F[i], stiffness[i], plastic[i], state[i], dt)
     F[i] = out.F
     tau[i] = out.tau
     state[i] = out.state
 
 
-def response(
+def update_materials(
     model: Tensor, F: Tensor, stiffness: Tensor, plastic: Tensor, state: Tensor, dt: float = 0.0
 ) -> tuple[Tensor, Tensor, Tensor]:
     """F, Kirchhoff stress and state of each particle; see the table above.

@@ -14,28 +14,37 @@ from functools import cache
 
 import warp as wp
 
-from stages.core.kernels.mpm.constitutive import neo_hookean, respond
+from stages.core.kernels.mpm.constitutive import material_update, neo_hookean
 from stages.core.kernels.mpm.exact import gather_exact, scatter_exact, velocity_exact
 from stages.core.kernels.mpm.grid import (
     BLOCK,
-    Grid,
+    MpmGrid,
     Obstacle,
-    at_obstacles,
-    at_walls,
-    bounced,
+    apply_obstacles,
+    apply_restitution,
+    apply_walls,
+    bspline_weights,
     first_node,
     near_obstacles,
     near_walls,
-    weights,
 )
 from stages.core.kernels.mpm.nodes import gather_momentum, mat43, scatter_nodes
-from stages.core.kernels.mpm.transfers import FREE, LOST, Moved, Rows, carried, guided, lose, moved
+from stages.core.kernels.mpm.transfers import (
+    FREE,
+    LOST,
+    ParticleArrays,
+    ParticleUpdate,
+    advance_free,
+    advance_kinematic,
+    affine_momentum,
+    mark_lost,
+)
 
-THREADS = 128  # a block
+THREADS_PER_BLOCK = 128  # a block
 
 
 @wp.struct
-class Touched:
+class ActiveBlocks:
     """Blocks with particles since the start of the frame: `blocks[: total[0]]`, and a mark for each block."""
 
     marks: wp.array[int]
@@ -44,7 +53,7 @@ class Touched:
 
 
 @wp.func
-def _node(grid: Grid, block: int, n: int) -> int:
+def _node(grid: MpmGrid, block: int, n: int) -> int:
     """Number of node n (0..63) of a block, counted through all scenes."""
     nb = wp.vec3i(grid.nodes[0] // BLOCK, grid.nodes[1] // BLOCK, grid.nodes[2] // BLOCK)
     a = block // (nb[1] * nb[2])  # scenes follow each other along x
@@ -56,7 +65,9 @@ def _node(grid: Grid, block: int, n: int) -> int:
 
 
 @wp.func
-def _touch(grid: Grid, rows: Rows, i: int, base: wp.vec3i, friction: wp.array[float], touched: Touched):
+def _touch(
+    grid: MpmGrid, rows: ParticleArrays, i: int, base: wp.vec3i, friction: wp.array[float], touched: ActiveBlocks
+):
     """List the blocks of a stencil, and let nodes at walls know the largest friction that comes to them."""
     nb = wp.vec3i(grid.nodes[0] // BLOCK, grid.nodes[1] // BLOCK, grid.nodes[2] // BLOCK)
     a0 = rows.scene[i] * nb[0]
@@ -92,7 +103,7 @@ def _add(s: mat43, fx: wp.vec3, n: int, velocity: wp.vec3) -> mat43:
 
 @wp.func
 def _bounded(
-    grid: Grid, read: wp.array[wp.vec4], friction: wp.array[float], node: int, at: wp.vec3i, scale: wp.vec2
+    grid: MpmGrid, read: wp.array[wp.vec4], friction: wp.array[float], node: int, at: wp.vec3i, scale: wp.vec2
 ) -> wp.vec3:
     """Velocity of a node, after the walls; of one that counts in whole numbers, if there is a scale."""
     v = wp.vec3()
@@ -101,12 +112,12 @@ def _bounded(
     else:
         u = read[node]
         v = wp.vec3(u[0], u[1], u[2]) / wp.max(u[3], 1e-30)
-    return at_walls(grid, at, v, friction[node])
+    return apply_walls(grid, at, v, friction[node])
 
 
 @wp.func
 def _gather_walls(
-    grid: Grid, read: wp.array[wp.vec4], friction: wp.array[float], corner: int, base: wp.vec3i, fx: wp.vec3,
+    grid: MpmGrid, read: wp.array[wp.vec4], friction: wp.array[float], corner: int, base: wp.vec3i, fx: wp.vec3,
     scale: wp.vec2,
 ) -> mat43:  # fmt: skip
     """As gather_momentum, where some of the nodes feel a wall."""
@@ -120,7 +131,7 @@ def _gather_walls(
 
 @wp.func
 def _gather_solid(
-    grid: Grid, read: wp.array[wp.vec4], friction: wp.array[float], obstacles: wp.array[Obstacle], time: float,
+    grid: MpmGrid, read: wp.array[wp.vec4], friction: wp.array[float], obstacles: wp.array[Obstacle], time: float,
     corner: int, base: wp.vec3i, fx: wp.vec3, scale: wp.vec2,
 ) -> mat43:  # fmt: skip
     """As gather_momentum, where some of the nodes feel a wall or an obstacle."""
@@ -130,31 +141,31 @@ def _gather_solid(
         node = corner + ((n // 9) * grid.nodes[1] + (n // 3) % 3) * grid.nodes[2] + n % 3
         v = _bounded(grid, read, friction, node, at, scale)
         place = grid.origin + grid.dx * wp.vec3(float(at[0]), float(at[1]), float(at[2]))
-        s = _add(s, fx, n, at_obstacles(place, v, obstacles, time, grid.dx))
+        s = _add(s, fx, n, apply_obstacles(place, v, obstacles, time, grid.dx))
     return s
 
 
 @wp.func
 def _gather_free(
-    grid: Grid, read: wp.array[wp.vec4], friction: wp.array[float], corner: int, base: wp.vec3i, fx: wp.vec3,
+    grid: MpmGrid, read: wp.array[wp.vec4], friction: wp.array[float], corner: int, base: wp.vec3i, fx: wp.vec3,
     scale: wp.vec2,
 ) -> mat43:  # fmt: skip
     """Where no node feels a wall, or only the floor: the whole stencil at once."""
     under = grid.low[2] + 1 - base[2]
-    return gather_momentum(read, friction, corner, grid.nodes[1] * grid.nodes[2], grid.nodes[2], weights(fx), fx, under,
-                           grid.keep)  # fmt: skip
+    return gather_momentum(read, friction, corner, grid.nodes[1] * grid.nodes[2], grid.nodes[2], bspline_weights(fx),
+                           fx, under, grid.keep)  # fmt: skip
 
 
 @wp.func
 def _gather_free_exact(
-    grid: Grid, read: wp.array[wp.vec4], friction: wp.array[float], corner: int, base: wp.vec3i, fx: wp.vec3,
+    grid: MpmGrid, read: wp.array[wp.vec4], friction: wp.array[float], corner: int, base: wp.vec3i, fx: wp.vec3,
     scale: wp.vec2,
 ) -> mat43:  # fmt: skip
-    return gather_exact(read, corner, grid.nodes[1] * grid.nodes[2], grid.nodes[2], weights(fx), fx, scale)
+    return gather_exact(read, corner, grid.nodes[1] * grid.nodes[2], grid.nodes[2], bspline_weights(fx), fx, scale)
 
 
 @wp.func
-def _at_sides(grid: Grid, base: wp.vec3i) -> bool:
+def _at_sides(grid: MpmGrid, base: wp.vec3i) -> bool:
     """Whether a stencil has nodes that feel a wall other than the floor."""
     return base[0] <= grid.low[0] or base[1] <= grid.low[1] or base[0] + 2 >= grid.high[0] or \
         base[1] + 2 >= grid.high[1] or base[2] + 2 >= grid.high[2]  # fmt: skip
@@ -174,15 +185,15 @@ def fused_step(plastic: bool, solid: bool, bouncy: bool, exact: bool) -> wp.Kern
     restitution: what it does not know costs no registers. If `exact`, nodes count in whole numbers."""
 
     # 80 registers a thread instead of 94, and a quarter more threads at once (whole numbers need more registers)
-    bounds = {} if exact else {"launch_bounds": (THREADS, 6)}
+    bounds = {} if exact else {"launch_bounds": (THREADS_PER_BLOCK, 6)}
     collect, add = (_gather_free_exact, scatter_exact) if exact else (_gather_free, _scatter)
     walled = near_walls if exact else _at_sides
 
     @wp.kernel(module="unique", enable_backward=False, **bounds)
     def fused_step(
-        grid: Grid, rows: Rows, sweep_from: int, sweepers: int, gather: int, scatter: int, substep: int,
+        grid: MpmGrid, rows: ParticleArrays, sweep_from: int, sweepers: int, gather: int, scatter: int, substep: int,
         clock: wp.array[float], damping: float, read: wp.array[wp.vec4], write: wp.array[wp.vec4],
-        stale: wp.array[wp.vec4], friction: wp.array[float], touched: Touched, obstacles: wp.array[Obstacle],
+        stale: wp.array[wp.vec4], friction: wp.array[float], touched: ActiveBlocks, obstacles: wp.array[Obstacle],
         scale: wp.vec2,
     ):  # fmt: skip
         """Threads below `sweep_from` (a multiple of 32) each move a particle; `sweepers` more clear `stale`.
@@ -213,7 +224,7 @@ def fused_step(plastic: bool, solid: bool, bouncy: bool, exact: bool) -> wp.Kern
         if i < rows.count:
             held = int(rows.held[i])
         if held != LOST:
-            now = Moved()
+            now = ParticleUpdate()
             x = rows.x[i]
             F = rows.F[i]
             stiffness = rows.stiffness[i]
@@ -235,14 +246,14 @@ def fused_step(plastic: bool, solid: bool, bouncy: bool, exact: bool) -> wp.Kern
                         s = _gather_walls(grid, read, friction, at, base, fx, scale)
                     else:
                         s = collect(grid, read, friction, at, base, fx, scale)
-                now = moved(grid, x, F, s, dt)
+                now = advance_free(grid, x, F, s, dt)
             else:
-                now = guided(grid, x, rows.v[i], rows.C[i], F, wp.where(gather > 0, dt, 0.0))
+                now = advance_kinematic(grid, x, rows.v[i], rows.C[i], F, wp.where(gather > 0, dt, 0.0))
             if not now.alive:
-                lose(rows.held, rows.lost, i, rows.scene[i], rows.order[i])
+                mark_lost(rows.held, rows.lost, i, rows.scene[i], rows.order[i])
             tau = wp.mat33()
             if wp.static(plastic):
-                answer = respond(int(rows.model[i]), now.F, stiffness, rows.plastic[i], rows.state[i],
+                answer = material_update(int(rows.model[i]), now.F, stiffness, rows.plastic[i], rows.state[i],
                                  wp.where(gather > 0, dt, 0.0))  # fmt: skip
                 now.F = answer.F
                 tau = answer.tau
@@ -259,26 +270,28 @@ def fused_step(plastic: bool, solid: bool, bouncy: bool, exact: bool) -> wp.Kern
                 g = (now.x - grid.origin) / grid.dx
                 base = first_node(g)
                 fx = wp.vec3(g[0] - float(base[0]), g[1] - float(base[1]), g[2] - float(base[2]))
-                home = rows.home[i]
-                if base[0] != home[0] or base[1] != home[1] or base[2] != home[2]:
-                    rows.home[i] = base
+                previous = rows.base_node[i]
+                if base[0] != previous[0] or base[1] != previous[1] or base[2] != previous[2]:
+                    rows.base_node[i] = base
                     _touch(grid, rows, i, base, friction, touched)
                 if wp.static(bouncy):  # noqa: SIM102 -- resolved when the kernel is built
                     if held == FREE:
-                        now.v = bounced(grid, obstacles, dt * float(substep + 1), now.x, now.v, rows.friction[i], dt)
-                load = carried(grid.dx, now, tau, rows.mass[i], rows.volume[i], stiffness[2], rows.push[i], held, dt,
-                               damping)  # fmt: skip
+                        now.v = apply_restitution(
+                            grid, obstacles, dt * float(substep + 1), now.x, now.v, rows.friction[i], dt
+                        )
+                load = affine_momentum(grid.dx, now, tau, rows.mass[i], rows.volume[i], stiffness[2],
+                                       rows.acceleration[i], held, dt, damping)  # fmt: skip
                 first = window + base[0] * stride_x + base[1] * stride_y + base[2]
         if scatter > 0:
-            add(write, first, stride_x, stride_y, weights(fx), fx, load, scale)
+            add(write, first, stride_x, stride_y, bspline_weights(fx), fx, load, scale)
 
     return fused_step
 
 
 @wp.kernel(enable_backward=False)
-def clear_touched(
-    grid: Grid, sweepers: int, a: wp.array[wp.vec4], b: wp.array[wp.vec4], c: wp.array[wp.vec4],
-    friction: wp.array[float], touched: Touched, width: int,
+def clear_active_blocks(
+    grid: MpmGrid, sweepers: int, a: wp.array[wp.vec4], b: wp.array[wp.vec4], c: wp.array[wp.vec4],
+    friction: wp.array[float], touched: ActiveBlocks, width: int,
 ):  # fmt: skip
     """Leave all grids clean at the end of a frame, and no block marked; the list itself is emptied afterwards."""
     t = wp.tid()

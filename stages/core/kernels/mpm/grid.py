@@ -11,17 +11,17 @@ from __future__ import annotations
 import warp as wp
 
 BLOCK = 4  # nodes along the edge of a block
-PAD = 4  # nodes outside the walls on every side: room for the stencil of a particle pressed into a wall
+GRID_PADDING = 4  # nodes outside the walls on every side: room for the stencil of a particle pressed into a wall
 FLOOR_GAP = 1.0  # cells: a body coming to rest stays this far above the outermost held nodes (measured; see tests)
-OUTER = FLOOR_GAP - 0.5  # cells: see at_obstacles
-SOFT = 2.0  # cells: nodes stop what comes this much deeper where a surface has restitution
-TOUCH = 0.25  # cells: particles at rest lie this far above a surface (measured; see tests)
+OBSTACLE_OFFSET = FLOOR_GAP - 0.5  # cells: see at_obstacles
+RESTITUTION_MARGIN = 2.0  # cells: nodes stop what comes this much deeper where a surface has restitution
+REST_DISTANCE = 0.25  # cells: particles at rest lie this far above a surface (measured; see tests)
 PLANE, SPHERE, BOX = 0, 1, 2  # kinds of obstacles
 SEPARATE, SLIP, STICKY = 0, 1, 2  # surfaces of obstacles
 
 
 @wp.struct
-class Grid:
+class MpmGrid:
     """Node (i, j, k) of a scene lies at origin + dx (i, j, k) and is number (i ny + j) nz + k of its `count`."""
 
     origin: wp.vec3
@@ -53,7 +53,7 @@ class Obstacle:
 
 
 @wp.func
-def weights(fx: wp.vec3) -> wp.mat33:
+def bspline_weights(fx: wp.vec3) -> wp.mat33:
     """Quadratic B-spline: rows are axes; fx in [0.5, 1.5) is the distance to the first node."""
     w = wp.mat33()
     for axis in range(3):
@@ -65,7 +65,7 @@ def weights(fx: wp.vec3) -> wp.mat33:
 
 
 @wp.func
-def within(grid: Grid, g: wp.vec3) -> bool:
+def stencil_inside(grid: MpmGrid, g: wp.vec3) -> bool:
     """Whether the stencil of a particle at g (in cells) lies on the grid; not so for a place that is no number."""
     top = wp.vec3(float(grid.nodes[0] - 4), float(grid.nodes[1] - 4), float(grid.nodes[2] - 4))
     return g[0] >= 1.0 and g[0] < top[0] and g[1] >= 1.0 and g[1] < top[1] and g[2] >= 1.0 and g[2] < top[2]
@@ -78,7 +78,7 @@ def first_node(g: wp.vec3) -> wp.vec3i:
 
 
 @wp.func
-def contact(v: wp.vec3, normal: wp.vec3, friction: float) -> wp.vec3:
+def coulomb_contact(v: wp.vec3, normal: wp.vec3, friction: float) -> wp.vec3:
     """Velocity after a surface with unit `normal` (out of the solid) met what moves into it.
 
     Coulomb: the change along the surface is at most friction x the change across it, whatever the time step.
@@ -95,7 +95,7 @@ def contact(v: wp.vec3, normal: wp.vec3, friction: float) -> wp.vec3:
 
 @wp.func
 def _spring(
-    v: wp.vec3, normal: wp.vec3, depth: float, friction: float, restitution: float, grid: Grid, dt: float
+    v: wp.vec3, normal: wp.vec3, depth: float, friction: float, restitution: float, grid: MpmGrid, dt: float
 ) -> wp.vec3:
     """Velocity of a particle after `dt` at a surface that gives back speed; depth is counted from TOUCH."""
     if depth <= 0.0:
@@ -109,9 +109,9 @@ def _spring(
 
 
 @wp.func
-def _wall(grid: Grid, v: wp.vec3, normal: wp.vec3, friction: float) -> wp.vec3:
+def _wall(grid: MpmGrid, v: wp.vec3, normal: wp.vec3, friction: float) -> wp.vec3:
     if grid.keep < 0.0:
-        return contact(v, normal, friction)
+        return coulomb_contact(v, normal, friction)
     across = wp.dot(v, normal)
     if across >= 0.0:
         return v
@@ -119,14 +119,14 @@ def _wall(grid: Grid, v: wp.vec3, normal: wp.vec3, friction: float) -> wp.vec3:
 
 
 @wp.func
-def near_walls(grid: Grid, base: wp.vec3i) -> bool:
+def near_walls(grid: MpmGrid, base: wp.vec3i) -> bool:
     """Whether a stencil has nodes that feel a wall."""
     return base[0] <= grid.low[0] or base[1] <= grid.low[1] or base[2] <= grid.low[2] or \
         base[0] + 2 >= grid.high[0] or base[1] + 2 >= grid.high[1] or base[2] + 2 >= grid.high[2]  # fmt: skip
 
 
 @wp.func
-def at_walls(grid: Grid, at: wp.vec3i, velocity: wp.vec3, friction: float) -> wp.vec3:
+def apply_walls(grid: MpmGrid, at: wp.vec3i, velocity: wp.vec3, friction: float) -> wp.vec3:
     """Velocity of the node `at`, after floor and walls; the floor first."""
     v = velocity
     if at[2] <= grid.low[2]:
@@ -187,7 +187,7 @@ def near_obstacles(place: wp.vec3, obstacles: wp.array[Obstacle], time: float, r
 
 
 @wp.func
-def at_obstacles(
+def apply_obstacles(
     place: wp.vec3, velocity: wp.vec3, obstacles: wp.array[Obstacle], time: float, dx: float
 ) -> wp.vec3:
     """Velocity of a node at `place`, after the obstacles, as they stand `time` [s] after the start of the frame.
@@ -204,25 +204,26 @@ def at_obstacles(
         moving = o.velocity + wp.cross(o.spin, place - o.centre - time * o.velocity)
         u = v - moving
         leaves = o.surface != SEPARATE and wp.dot(u, normal) > 0.0
-        edge = wp.where(o.restitution > 0.0, -OUTER - SOFT, wp.where(leaves, OUTER, -OUTER))
+        offset = wp.where(leaves, OBSTACLE_OFFSET, -OBSTACLE_OFFSET)
+        edge = wp.where(o.restitution > 0.0, -OBSTACLE_OFFSET - RESTITUTION_MARGIN, offset)
         if out[3] < edge * dx:
             if o.surface == STICKY:
                 u = wp.vec3()
             elif o.surface == SLIP:
                 u = u - wp.dot(u, normal) * normal
             else:
-                u = contact(u, normal, o.friction)
+                u = coulomb_contact(u, normal, o.friction)
             v = moving + u
     return v
 
 
 @wp.func
-def bounced(
-    grid: Grid, obstacles: wp.array[Obstacle], time: float, x: wp.vec3, velocity: wp.vec3, friction: float, dt: float
+def apply_restitution(
+    grid: MpmGrid, obstacles: wp.array[Obstacle], time: float, x: wp.vec3, velocity: wp.vec3, friction: float, dt: float
 ) -> wp.vec3:
     """Velocity of a particle after `dt` at the surfaces with restitution."""
     v = velocity
-    touch = TOUCH * grid.dx
+    touch = REST_DISTANCE * grid.dx
     if grid.restitution > 0.0:
         for axis in range(3):
             normal = wp.vec3()

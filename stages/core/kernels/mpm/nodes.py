@@ -176,7 +176,7 @@ def scatter_nodes(
     }
 #endif
 """)
-def velocity_of_row(
+def velocity_from_momentum(
     momentum: wp.array[wp.vec4], velocity: wp.array[wp.vec4], first: int, count: int, copies: int
 ): ...  # copies: bit c is set where copy c, which starts at node c count, has something
 

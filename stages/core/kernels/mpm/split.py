@@ -11,21 +11,30 @@ from functools import cache
 
 import warp as wp
 
-from stages.core.kernels.mpm.constitutive import neo_hookean, respond
+from stages.core.kernels.mpm.constitutive import material_update, neo_hookean
 from stages.core.kernels.mpm.grid import (
     BLOCK,
-    Grid,
+    MpmGrid,
     Obstacle,
-    at_obstacles,
-    at_walls,
-    bounced,
+    apply_obstacles,
+    apply_restitution,
+    apply_walls,
+    bspline_weights,
     first_node,
     near_obstacles,
     near_walls,
-    weights,
 )
-from stages.core.kernels.mpm.nodes import gather_nodes, scatter_nodes, velocity_of_row
-from stages.core.kernels.mpm.transfers import FREE, LOST, Moved, Rows, carried, guided, lose, moved
+from stages.core.kernels.mpm.nodes import gather_nodes, scatter_nodes, velocity_from_momentum
+from stages.core.kernels.mpm.transfers import (
+    FREE,
+    LOST,
+    ParticleArrays,
+    ParticleUpdate,
+    advance_free,
+    advance_kinematic,
+    affine_momentum,
+    mark_lost,
+)
 
 
 @cache
@@ -34,8 +43,8 @@ def particle_step(plastic: bool, bouncy: bool) -> wp.Kernel:
 
     @wp.kernel(module="unique", enable_backward=False)
     def particle_step(
-        grid: Grid, rows: Rows, start: int, stop: int, gather: int, scatter: int, dt: float, damping: float,
-        velocity: wp.array[wp.vec4], momentum: wp.array[wp.vec4], copy: int, stale: wp.array[int],
+        grid: MpmGrid, rows: ParticleArrays, start: int, stop: int, gather: int, scatter: int, dt: float,
+        damping: float, velocity: wp.array[wp.vec4], momentum: wp.array[wp.vec4], copy: int, stale: wp.array[int],
         obstacles: wp.array[Obstacle], clock: wp.array[float],
     ):  # fmt: skip
         """Particles start + tid. `copy` is the first node of the momentum copy to scatter into."""
@@ -49,7 +58,7 @@ def particle_step(plastic: bool, bouncy: bool) -> wp.Kernel:
         if i < stop:
             held = int(rows.held[i])
         if held != LOST:
-            now = Moved()
+            now = ParticleUpdate()
             x = rows.x[i]
             F = rows.F[i]
             stiffness = rows.stiffness[i]
@@ -59,14 +68,15 @@ def particle_step(plastic: bool, bouncy: bool) -> wp.Kernel:
                 base = first_node(g)
                 fx = wp.vec3(g[0] - float(base[0]), g[1] - float(base[1]), g[2] - float(base[2]))
                 at = window + base[0] * stride_x + base[1] * stride_y + base[2]
-                now = moved(grid, x, F, gather_nodes(velocity, at, stride_x, stride_y, weights(fx), fx), dt)
+                sums = gather_nodes(velocity, at, stride_x, stride_y, bspline_weights(fx), fx)
+                now = advance_free(grid, x, F, sums, dt)
             else:
-                now = guided(grid, x, rows.v[i], rows.C[i], F, wp.where(gather > 0, dt, 0.0))
+                now = advance_kinematic(grid, x, rows.v[i], rows.C[i], F, wp.where(gather > 0, dt, 0.0))
             if not now.alive:
-                lose(rows.held, rows.lost, i, rows.scene[i], rows.order[i])
+                mark_lost(rows.held, rows.lost, i, rows.scene[i], rows.order[i])
             tau = wp.mat33()
             if wp.static(plastic):
-                answer = respond(int(rows.model[i]), now.F, stiffness, rows.plastic[i], rows.state[i],
+                answer = material_update(int(rows.model[i]), now.F, stiffness, rows.plastic[i], rows.state[i],
                                  wp.where(gather > 0, dt, 0.0))  # fmt: skip
                 now.F = answer.F
                 tau = answer.tau
@@ -82,24 +92,25 @@ def particle_step(plastic: bool, bouncy: bool) -> wp.Kernel:
                 g = (now.x - grid.origin) / grid.dx
                 base = first_node(g)
                 fx = wp.vec3(g[0] - float(base[0]), g[1] - float(base[1]), g[2] - float(base[2]))
-                home = rows.home[i]
-                if wp.max(wp.max(wp.abs(base[0] - home[0]), wp.abs(base[1] - home[1])), wp.abs(base[2] - home[2])) > 1:
+                previous = rows.base_node[i]
+                shift = wp.max(wp.abs(base[0] - previous[0]), wp.abs(base[1] - previous[1]))
+                if wp.max(shift, wp.abs(base[2] - previous[2])) > 1:
                     stale[0] = 1
                 if wp.static(bouncy):  # noqa: SIM102 -- resolved when the kernel is built
                     if held == FREE:
-                        now.v = bounced(grid, obstacles, clock[0] + dt, now.x, now.v, rows.friction[i], dt)
-                load = carried(grid.dx, now, tau, rows.mass[i], rows.volume[i], stiffness[2], rows.push[i], held, dt,
-                               damping)  # fmt: skip
+                        now.v = apply_restitution(grid, obstacles, clock[0] + dt, now.x, now.v, rows.friction[i], dt)
+                load = affine_momentum(grid.dx, now, tau, rows.mass[i], rows.volume[i], stiffness[2],
+                                       rows.acceleration[i], held, dt, damping)  # fmt: skip
                 first = copy + window + base[0] * stride_x + base[1] * stride_y + base[2]
         if scatter > 0:
-            scatter_nodes(momentum, first, stride_x, stride_y, weights(fx), fx, load)
+            scatter_nodes(momentum, first, stride_x, stride_y, bspline_weights(fx), fx, load)
 
     return particle_step
 
 
 @wp.kernel(enable_backward=False)
 def grid_step(
-    grid: Grid, start: int, momentum: wp.array[wp.vec4], velocity: wp.array[wp.vec4], friction: wp.array[float],
+    grid: MpmGrid, start: int, momentum: wp.array[wp.vec4], velocity: wp.array[wp.vec4], friction: wp.array[float],
     blocks: wp.array[wp.vec2i], obstacles: wp.array[Obstacle], clock: wp.array[float], scenes: int,
 ):  # fmt: skip
     """One row of four nodes of an active block; `blocks` holds the block's first node and which copies it needs.
@@ -117,7 +128,7 @@ def grid_step(
     j = (corner // stride_y) % grid.nodes[1] + row % BLOCK
     k = corner % stride_y
     first = window + i * stride_x + j * stride_y + k
-    velocity_of_row(momentum, velocity, first, grid.count * scenes, block[1])
+    velocity_from_momentum(momentum, velocity, first, grid.count * scenes, block[1])
     inside = i > grid.low[0] and i < grid.high[0] and j > grid.low[1] and j < grid.high[1]
     inside = inside and k > grid.low[2] and k + BLOCK <= grid.high[2]
     solid = bool(False)  # noqa: UP018 -- Warp takes a literal for a constant
@@ -128,21 +139,21 @@ def grid_step(
         return
     for n in range(BLOCK):
         u = velocity[first + n]
-        v = at_walls(grid, wp.vec3i(i, j, k + n), wp.vec3(u[0], u[1], u[2]), friction[first + n])
+        v = apply_walls(grid, wp.vec3i(i, j, k + n), wp.vec3(u[0], u[1], u[2]), friction[first + n])
         if solid:
             place = grid.origin + grid.dx * wp.vec3(float(i), float(j), float(k + n))
-            v = at_obstacles(place, v, obstacles, clock[0], grid.dx)
+            v = apply_obstacles(place, v, obstacles, clock[0], grid.dx)
         velocity[first + n] = wp.vec4(v[0], v[1], v[2], u[3])
 
 
 @wp.kernel(enable_backward=False)
-def mark_blocks(grid: Grid, rows: Rows, start: int, bit: int, marks: wp.array4d[int]):
+def mark_blocks(grid: MpmGrid, rows: ParticleArrays, start: int, bit: int, marks: wp.array4d[int]):
     """Blocks (scene, i, j, k) that a particle reaches while it stays within one cell of where it is now."""
     i = start + wp.tid()
     if rows.held[i] == wp.int8(LOST):
         return
     base = first_node((rows.x[i] - grid.origin) / grid.dx)
-    rows.home[i] = base
+    rows.base_node[i] = base
     s = rows.scene[i]
     lo = wp.vec3i(wp.max(base[0] - 1, 0), wp.max(base[1] - 1, 0), wp.max(base[2] - 1, 0))
     hi = wp.vec3i(wp.min(base[0] + 3, grid.nodes[0] - 1), wp.min(base[1] + 3, grid.nodes[1] - 1),
@@ -155,7 +166,7 @@ def mark_blocks(grid: Grid, rows: Rows, start: int, bit: int, marks: wp.array4d[
 
 
 @wp.kernel(enable_backward=False)
-def mark_friction(grid: Grid, rows: Rows, friction: wp.array[float]):
+def mark_friction(grid: MpmGrid, rows: ParticleArrays, friction: wp.array[float]):
     """Nodes at floor and walls take the largest friction coefficient among the particles that may touch them.
 
     Those within a cell, that is; in the fused order those that do touch. Where two bodies with different friction
@@ -176,7 +187,7 @@ def mark_friction(grid: Grid, rows: Rows, friction: wp.array[float]):
 
 
 @wp.kernel(enable_backward=False)
-def forget_friction(grid: Grid, blocks: wp.array[wp.vec2i], friction: wp.array[float]):
+def clear_friction(grid: MpmGrid, blocks: wp.array[wp.vec2i], friction: wp.array[float]):
     """One row of four nodes of a block, as in grid_step."""
     t = wp.tid()
     row = t % (BLOCK * BLOCK)

@@ -17,15 +17,15 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from stages.core.kernels.mpm.grid import BLOCK, Grid, first_node, within
+from stages.core.kernels.mpm.grid import BLOCK, MpmGrid, first_node, stencil_inside
 from stages.core.kernels.mpm.nodes import mat43
 
-HELD = 1e4  # a held particle weighs this much more on the grid, so that others stop at it
-FREE, GUIDED, LOST = 0, 1, 2  # values of `held`: moved by the grid, by its own velocity, not at all any more
+KINEMATIC_MASS_FACTOR = 1e4  # a held particle weighs this much more on the grid, so that others stop at it
+FREE, KINEMATIC, LOST = 0, 1, 2  # values of `held`: moved by the grid, by its own velocity, not at all any more
 
 
 @wp.struct
-class Rows:
+class ParticleArrays:
     """The particles of all scenes, sorted by cell. `order` is the row that each had at first."""
 
     count: int
@@ -41,15 +41,15 @@ class Rows:
     model: wp.array[wp.int8]  # see mpm_materials.py
     plastic: wp.array[wp.vec3]
     state: wp.array[float]
-    push: wp.array[wp.vec3]  # accelerations
+    acceleration: wp.array[wp.vec3]  # accelerations
     scene: wp.array[int]
     order: wp.array[int]
-    home: wp.array[wp.vec3i]  # stencil when the list of blocks was made
+    base_node: wp.array[wp.vec3i]  # stencil when the list of blocks was made
     lost: wp.array[int]  # a scene: lowest `order` of its lost particles
 
 
 @wp.struct
-class Moved:
+class ParticleUpdate:
     """A particle on its way through a step; `alive` when it has something to scatter."""
 
     x: wp.vec3
@@ -60,25 +60,25 @@ class Moved:
 
 
 @wp.func
-def moved(grid: Grid, x: wp.vec3, F: wp.mat33, s: mat43, dt: float) -> Moved:
+def advance_free(grid: MpmGrid, x: wp.vec3, F: wp.mat33, s: mat43, dt: float) -> ParticleUpdate:
     """A particle a step further, by sums over its stencil; one that would leave the grid stays, and is not alive."""
-    out = Moved()
+    out = ParticleUpdate()
     k = 4.0 / grid.dx
     out.v = wp.vec3(s[0, 0], s[0, 1], s[0, 2])
     out.C = wp.mat33(k * s[1, 0], k * s[2, 0], k * s[3, 0], k * s[1, 1], k * s[2, 1], k * s[3, 1],
                      k * s[1, 2], k * s[2, 2], k * s[3, 2])  # fmt: skip
     out.x = x + dt * out.v
     out.F = F + dt * (out.C * F)
-    out.alive = within(grid, (out.x - grid.origin) / grid.dx)
+    out.alive = stencil_inside(grid, (out.x - grid.origin) / grid.dx)
     if not out.alive:
-        return stopped(x, F)
+        return lost_particle(x, F)
     return out
 
 
 @wp.func
-def stopped(x: wp.vec3, F: wp.mat33) -> Moved:
+def lost_particle(x: wp.vec3, F: wp.mat33) -> ParticleUpdate:
     """A particle that is lost."""
-    out = Moved()
+    out = ParticleUpdate()
     out.x = x
     out.F = F
     out.alive = False
@@ -86,38 +86,38 @@ def stopped(x: wp.vec3, F: wp.mat33) -> Moved:
 
 
 @wp.func
-def guided(grid: Grid, x: wp.vec3, v: wp.vec3, C: wp.mat33, F: wp.mat33, dt: float) -> Moved:
+def advance_kinematic(grid: MpmGrid, x: wp.vec3, v: wp.vec3, C: wp.mat33, F: wp.mat33, dt: float) -> ParticleUpdate:
     """A particle that goes its own way for `dt` [s]; 0 to take it as it is."""
-    out = Moved()
+    out = ParticleUpdate()
     out.x = x + dt * v
     out.v = v
     out.C = C
     out.F = F
-    out.alive = within(grid, (out.x - grid.origin) / grid.dx)
+    out.alive = stencil_inside(grid, (out.x - grid.origin) / grid.dx)
     if not out.alive:
-        return stopped(x, F)
+        return lost_particle(x, F)
     return out
 
 
 @wp.func
-def lose(held: wp.array[wp.int8], lost: wp.array[int], i: int, scene: int, order: int):
+def mark_lost(held: wp.array[wp.int8], lost: wp.array[int], i: int, scene: int, order: int):
     """Note that particle i is lost, and the first of its scene."""
     held[i] = wp.int8(LOST)
     wp.atomic_min(lost, scene, order)
 
 
 @wp.func
-def carried(
-    dx: float, now: Moved, tau: wp.mat33, mass: float, volume: float, viscosity: float, push: wp.vec3, held: int,
-    dt: float, damping: float,
+def affine_momentum(
+    dx: float, now: ParticleUpdate, tau: wp.mat33, mass: float, volume: float, viscosity: float,
+    acceleration: wp.vec3, held: int, dt: float, damping: float,
 ) -> wp.mat44:  # fmt: skip
     """What a particle brings to the grid: row 0 momentum and mass, rows 1 to 3 the change a node along x, y, z."""
     both = now.C + wp.transpose(now.C)
     A = (dx * mass) * (now.C - (0.5 * damping) * both) - (dt * 4.0 / dx * volume) * (tau + viscosity * both)
     m = mass
-    q = m * (now.v + dt * push)
+    q = m * (now.v + dt * acceleration)
     if held != FREE:
-        m = m * HELD
+        m = m * KINEMATIC_MASS_FACTOR
         q = m * now.v
         A = wp.mat33()
     return wp.mat44(q[0], q[1], q[2], m, A[0, 0], A[1, 0], A[2, 0], 0.0, A[0, 1], A[1, 1], A[2, 1], 0.0,
@@ -125,7 +125,7 @@ def carried(
 
 
 @wp.kernel(enable_backward=False)
-def sort_keys(grid: Grid, rows: Rows, keys: wp.array[int]):
+def sort_keys(grid: MpmGrid, rows: ParticleArrays, keys: wp.array[int]):
     """Cells in an order that keeps neighbours together: by scene, by block, within the block. Lost particles last."""
     i = wp.tid()
     if rows.held[i] == wp.int8(LOST):

@@ -13,8 +13,8 @@ import warp as wp
 from torch import Tensor
 
 from stages.core.kernels.interop import view
-from stages.core.kernels.splat.projection import BIN
-from stages.core.kernels.splat.simd import even, parts, run
+from stages.core.kernels.splat.projection import BIN_SIZE
+from stages.core.kernels.splat.simd import even_bounds, launch_ranges, num_threads
 
 wp.set_module_options({"enable_backward": False})
 
@@ -118,13 +118,13 @@ class Bins:
     starts: Tensor  # (bins + 1,) int32, bin b holds members[starts[b]:starts[b + 1]]
     width: int  # [px]
     height: int
-    side: int = BIN
+    side: int = BIN_SIZE
 
     @property
-    def across(self) -> int:
+    def columns(self) -> int:
         return -(-self.width // self.side)
 
-    def pieces(self, count: int, work: Tensor | None = None) -> list[int]:
+    def balanced_bounds(self, count: int, work: Tensor | None = None) -> list[int]:
         """Bounds of at most that many runs of bins with about equal work, by default the number of members."""
         work = self.starts.diff() if work is None else work
         total = (work + 1).cumsum(0).double()
@@ -132,28 +132,28 @@ class Bins:
         return sorted({0, *cuts.tolist(), len(work)})
 
 
-def fill_bins(keys: Tensor, rects: Tensor, width: int, height: int, side: int = BIN) -> Bins:
+def bin_splats(keys: Tensor, rects: Tensor, width: int, height: int, side: int = BIN_SIZE) -> Bins:
     """Bins of splats from the keys and rectangles that `project` returns, or rectangles in bins of another side."""
     n, across, down = len(keys), -(-width // side), -(-height // side)
     bins = across * down
     order, scratch = torch.empty(n, dtype=torch.int32), torch.empty(3 * n, dtype=torch.int32)
     total = torch.zeros(1, dtype=torch.int32)
     if n:
-        run(_sort, [0, 1], [n, view(keys), view(order), view(scratch), view(total)])
-    pieces = parts()
-    bounds = torch.tensor(even(int(total), pieces), dtype=torch.int32)
+        launch_ranges(_sort, [0, 1], [n, view(keys), view(order), view(scratch), view(total)])
+    pieces = num_threads()
+    bounds = torch.tensor(even_bounds(int(total), pieces), dtype=torch.int32)
     counts = torch.empty(pieces, bins, dtype=torch.int32)
     walk = [view(bounds), view(order), view(rects.view(-1)), across, bins, view(counts.view(-1))]
-    run(_count, list(range(pieces + 1)), walk)
+    launch_ranges(_count, list(range(pieces + 1)), walk)
     ends = counts.T.reshape(-1).cumsum(0, dtype=torch.int32)  # bin by bin, within it piece by piece
     starts = torch.cat([ends.new_zeros(1), ends[pieces - 1 :: pieces]])
     counts.copy_((ends - counts.T.reshape(-1)).view(bins, pieces).T)
     members = torch.empty(int(ends[-1]), dtype=torch.int32)
-    run(_fill, list(range(pieces + 1)), [*walk, view(members)])
+    launch_ranges(_fill, list(range(pieces + 1)), [*walk, view(members)])
     return Bins(members, starts, width, height, side)
 
 
-def fill_bins_reference(splats: Tensor) -> Tensor:
+def depth_order_reference(splats: Tensor) -> Tensor:
     """Indices of all visible splats, nearest first: what one bin over the whole image would hold."""
     visible = (splats[:, 11] > 0).nonzero()[:, 0]
     return visible[splats[visible, 9].argsort(stable=True)]

@@ -12,10 +12,16 @@ from torch import Tensor
 
 from stages.core.kernels.interop import view
 from stages.core.kernels.splat.binning import Bins
-from stages.core.kernels.splat.compositing_adjoint import blend_adjoint
-from stages.core.kernels.splat.pixel_blocks import BLOCKS_OF_BIN, CLOSED, NOTHING, PIXELS, SOLID
-from stages.core.kernels.splat.projection import FAINTEST
-from stages.core.kernels.splat.simd import VECTORS, parts, run
+from stages.core.kernels.splat.compositing_adjoint import composite_adjoint
+from stages.core.kernels.splat.pixel_blocks import (
+    BIN_BLOCKS,
+    MAX_ALPHA,
+    MIN_MEAN_ALPHA,
+    MIN_TRANSMITTANCE,
+    PIXELS_PER_BIN,
+)
+from stages.core.kernels.splat.projection import MIN_ALPHA
+from stages.core.kernels.splat.simd import VECTORS, launch_ranges, num_threads
 
 wp.set_module_options({"enable_backward": False})
 
@@ -46,8 +52,8 @@ for (const int end = starts.data[bin + 1]; k < end && alive; ++k) {
         F power = fma(dx, fma((F)(A), dx, B * dy), fma(C * dy, dy, (F)(lo)));  // log2 of alpha
         I hit = (power >= -7.99435344f) & (T[b] > 0);
         if (!bits(hit)) continue;
-        F alpha = vmin(exp2v(power), (F)(SOLID)), next = T[b] - alpha * T[b];
-        I drawn = hit & (next > CLOSED);
+        F alpha = vmin(exp2v(power), (F)(MAX_ALPHA)), next = T[b] - alpha * T[b];
+        I drawn = hit & (next > MIN_TRANSMITTANCE);
         F w = drawn ? alpha * T[b] : none;
         for (int c = 0; c < 4; ++c) colour[b][c] = fma(w, (F)(s[6 + c]), colour[b][c]);
         TRACK(sum += w; I more = w > best[b]; best[b] = more ? w : best[b]; which[b] = more ? (I)(id) : which[b];)
@@ -72,12 +78,18 @@ for (int b = 0; b < BLOCKS; ++b) {
         const int p = pixel(b, l);
         const float alpha = 1 - t[l];
         for (int c = 0; c < 3; ++c) rgb.data[3 * (long)p + c] = colour[b][c][l] + t[l] * behind.data[step * p + c];
-        fourth.data[p] = mean ? colour[b][3][l] / (alpha > NOTHING ? alpha : NOTHING) : colour[b][3][l];
+        fourth.data[p] = mean ? colour[b][3][l] / (alpha > MIN_MEAN_ALPHA ? alpha : MIN_MEAN_ALPHA) : colour[b][3][l];
         alphas.data[p] = alpha;
         TRACK(index.data[p] = which[b][l];)
     }
 }
-""".replace("SOLID", f"{SOLID}f").replace("CLOSED", f"{CLOSED}f").replace("NOTHING", f"{NOTHING}f")
+"""
+for _name, _value in (
+    ("MAX_ALPHA", MAX_ALPHA),
+    ("MIN_TRANSMITTANCE", MIN_TRANSMITTANCE),
+    ("MIN_MEAN_ALPHA", MIN_MEAN_ALPHA),
+):
+    _FORWARD = _FORWARD.replace(_name, f"{_value}f")
 
 
 def _tracked(code: str, track: bool) -> str:
@@ -85,7 +97,7 @@ def _tracked(code: str, track: bool) -> str:
     return f"#define TRACK(...) {'__VA_ARGS__' if track else ''}\n{code}\n#undef TRACK\n"
 
 
-@wp.func_native(_tracked(VECTORS + BLOCKS_OF_BIN + _FORWARD, False))
+@wp.func_native(_tracked(VECTORS + BIN_BLOCKS + _FORWARD, False))
 def _blend_bin(
     bin: int, width: int, height: int, across: int, step: int, mean: int, splats: wp.array[float],
     members: wp.array[int], starts: wp.array[int], behind: wp.array[float], left: wp.array[float],
@@ -104,7 +116,7 @@ def _blend(
                left, stops, ends, rgb, fourth, alphas)  # fmt: skip
 
 
-@wp.func_native(_tracked(VECTORS + BLOCKS_OF_BIN + _FORWARD, True))
+@wp.func_native(_tracked(VECTORS + BIN_BLOCKS + _FORWARD, True))
 def _heaviest_bin(
     bin: int, piece: int, n: int, width: int, height: int, across: int, step: int, mean: int, splats: wp.array[float],
     members: wp.array[int], starts: wp.array[int], behind: wp.array[float], left: wp.array[float],
@@ -128,7 +140,7 @@ def _heaviest(
 def _outputs(bins: Bins) -> tuple[Tensor, ...]:
     """Empty tensors for what a forward pass leaves for the backward pass, and for its images."""
     count, size = len(bins.starts) - 1, (bins.height, bins.width)
-    left, stops = torch.empty(count * PIXELS), torch.empty(count * PIXELS, dtype=torch.int32)
+    left, stops = torch.empty(count * PIXELS_PER_BIN), torch.empty(count * PIXELS_PER_BIN, dtype=torch.int32)
     ends = torch.empty(count, dtype=torch.int32)
     return left, stops, ends, torch.empty(*size, 3), torch.empty(size), torch.empty(size)
 
@@ -138,14 +150,14 @@ def _walk(splats: Tensor, bins: Bins, behind: Tensor, mean: bool, *tensors: Tens
     flat = (splats, bins.members, bins.starts, behind, *tensors)
     step = 0 if behind.dim() == 1 else 3
     views = (view(t.view(-1)) for t in flat)
-    return [len(splats), bins.width, bins.height, bins.across, step, int(mean), *views]
+    return [len(splats), bins.width, bins.height, bins.columns, step, int(mean), *views]
 
 
 class _Blend(torch.autograd.Function):
     @staticmethod
     def forward(ctx, splats, bins, behind, mean):
         state = _outputs(bins)
-        run(_blend, bins.pieces(4 * parts()), _walk(splats, bins, behind, mean, *state))
+        launch_ranges(_blend, bins.balanced_bounds(4 * num_threads()), _walk(splats, bins, behind, mean, *state))
         left, stops, ends, rgb, fourth, alpha = state
         ctx.save_for_backward(splats, behind, left, stops, ends, fourth, alpha)
         ctx.bins, ctx.mean = bins, mean
@@ -156,11 +168,11 @@ class _Blend(torch.autograd.Function):
         splats, behind, *state = ctx.saved_tensors
         upstream = [v.float().contiguous() for v in upstream]
         walk = _walk(splats, ctx.bins, behind, ctx.mean, *state, *upstream)
-        grads = blend_adjoint(splats, ctx.bins, state[2], walk)
+        grads = composite_adjoint(splats, ctx.bins, state[2], walk)
         return grads, None, None, None
 
 
-def blend(splats: Tensor, bins: Bins, behind: Tensor | None = None, mean: bool = False):
+def composite(splats: Tensor, bins: Bins, behind: Tensor | None = None, mean: bool = False):
     """Image (h, w, 3), fourth channel (h, w) and alpha (h, w) of splats (n, 16). Differentiable in the splats.
 
     `behind` is a background colour (3,) or picture (h, w, 3), black when None. The fourth channel is a composite like
@@ -173,15 +185,17 @@ def blend(splats: Tensor, bins: Bins, behind: Tensor | None = None, mean: bool =
     return _Blend.apply(splats.contiguous(), bins, behind, mean)
 
 
-def heaviest(splats: Tensor, bins: Bins) -> tuple[Tensor, Tensor]:
+def dominant_splats(splats: Tensor, bins: Bins) -> tuple[Tensor, Tensor]:
     """For every pixel the splat with the greatest weight (h, w; -1: none), for every splat its total weight (n,)."""
-    bounds = bins.pieces(parts())
+    bounds = bins.balanced_bounds(num_threads())
     index, totals = torch.empty(bins.height, bins.width, dtype=torch.int32), torch.zeros(len(bounds) - 1, len(splats))
-    run(_heaviest, bounds, _walk(splats, bins, torch.zeros(3), False, *_outputs(bins), index, totals))
+    launch_ranges(_heaviest, bounds, _walk(splats, bins, torch.zeros(3), False, *_outputs(bins), index, totals))
     return index.long(), totals.sum(0)
 
 
-def blend_reference(splats: Tensor, order: Tensor, width: int, height: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def composite_reference(
+    splats: Tensor, order: Tensor, width: int, height: int
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Image, fourth channel, alpha as `blend`, and the weights (h, w, m) of the splats in the given order, near to far.
 
     Plain PyTorch, every splat at every pixel: for small scenes, in any precision.
@@ -190,9 +204,9 @@ def blend_reference(splats: Tensor, order: Tensor, width: int, height: int) -> t
     y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
     dx, dy = x.to(s)[..., None] - s[:, 0], y.to(s)[..., None] - s[:, 1]
     sigma = 0.5 * (s[:, 2] * dx * dx + s[:, 4] * dy * dy) + s[:, 3] * dx * dy
-    alpha = (s[:, 5] * torch.exp(-sigma)).clamp_max(SOLID)
-    alpha = torch.where(alpha >= FAINTEST, alpha, torch.zeros_like(alpha))
-    drawn = (1 - alpha).cumprod(-1) > CLOSED  # once false, false for all that follow
+    alpha = (s[:, 5] * torch.exp(-sigma)).clamp_max(MAX_ALPHA)
+    alpha = torch.where(alpha >= MIN_ALPHA, alpha, torch.zeros_like(alpha))
+    drawn = (1 - alpha).cumprod(-1) > MIN_TRANSMITTANCE  # once false, false for all that follow
     alpha = torch.where(drawn, alpha, torch.zeros_like(alpha))
     T = (1 - alpha).cumprod(-1)
     weight = alpha * torch.cat([torch.ones_like(T[..., :1]), T[..., :-1]], -1)

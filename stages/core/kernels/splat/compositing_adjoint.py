@@ -11,9 +11,9 @@ from torch import Tensor
 
 from stages.core.kernels.interop import view
 from stages.core.kernels.splat.binning import Bins
-from stages.core.kernels.splat.pixel_blocks import BLOCKS_OF_BIN, NOTHING, SOLID
-from stages.core.kernels.splat.projection import WIDTH
-from stages.core.kernels.splat.simd import SUMS, VECTORS, even, parts, run
+from stages.core.kernels.splat.pixel_blocks import BIN_BLOCKS, MAX_ALPHA, MIN_MEAN_ALPHA
+from stages.core.kernels.splat.projection import SPLAT_SIZE
+from stages.core.kernels.splat.simd import LANE_SUMS, VECTORS, even_bounds, launch_ranges, num_threads
 
 wp.set_module_options({"enable_backward": False})
 
@@ -42,7 +42,7 @@ for (int b = 0; b < BLOCKS; ++b) {
             va -= v[b][c][l] * behind.data[step * p + c];
         }
         if (mean) {
-            v4 = alphas.data[p] > NOTHING ? v4 / alphas.data[p] : 0;
+            v4 = alphas.data[p] > MIN_MEAN_ALPHA ? v4 / alphas.data[p] : 0;
             va -= v4 * fourth.data[p];
         }
         v[b][3][l] = v4;
@@ -67,14 +67,14 @@ for (int k = ends.data[bin] - 1; k >= begin; --k) {
         I hit = (power >= -7.99435344f) & (k < stop[b]);
         if (!bits(hit)) continue;
         any = true;
-        F raw = exp2v(power), alpha = hit ? vmin(raw, (F)(SOLID)) : none;
+        F raw = exp2v(power), alpha = hit ? vmin(raw, (F)(MAX_ALPHA)) : none;
         F open = 1.0f / (1.0f - alpha);
         F t = T[b] * open, w = alpha * t, facing = none;
         for (int c = 0; c < 4; ++c) {
             facing = fma(v[b][c], (F)(s[6 + c]), facing);
             sum[6 + c] = fma(w, v[b][c], sum[6 + c]);
         }
-        F g = raw <= SOLID ? alpha * (t * facing - S[b] * open) : none;  // dL/dlog(alpha)
+        F g = raw <= MAX_ALPHA ? alpha * (t * facing - S[b] * open) : none;  // dL/dlog(alpha)
         T[b] = t;
         S[b] = fma(w, facing, S[b]);
         F gx = g * dx, gy = g * dy;
@@ -92,7 +92,7 @@ for (int k = ends.data[bin] - 1; k >= begin; --k) {
         store(to, load(to) + sums(sum));
     }
 }
-""".replace("SOLID", f"{SOLID}f").replace("NOTHING", f"{NOTHING}f")
+""".replace("MAX_ALPHA", f"{MAX_ALPHA}f").replace("MIN_MEAN_ALPHA", f"{MIN_MEAN_ALPHA}f")
 
 # The moments of all pieces of a splat's gradient become the gradient of its row.
 _GRADIENT = r"""
@@ -110,7 +110,7 @@ store(grads.data + 16 * (long)i, g);
 """
 
 
-@wp.func_native(VECTORS + SUMS + BLOCKS_OF_BIN + _BACKWARD)
+@wp.func_native(VECTORS + LANE_SUMS + BIN_BLOCKS + _BACKWARD)
 def _unblend_bin(
     bin: int, first: bool, piece: int, n: int, width: int, height: int, across: int, step: int, mean: int,
     splats: wp.array[float], members: wp.array[int], starts: wp.array[int], behind: wp.array[float],
@@ -144,14 +144,15 @@ def _gradients(
     _gradient_row(start + wp.tid(), n, pieces, splats, moments, grads)
 
 
-def blend_adjoint(splats: Tensor, bins: Bins, ends: Tensor, walk: list) -> Tensor:
+def composite_adjoint(splats: Tensor, bins: Bins, ends: Tensor, walk: list) -> Tensor:
     """Gradient (n, 16) of the splats. `ends` (bins,) is where each bin's forward pass stopped.
 
     `walk` holds the kernel's arguments: those of the forward pass, what it left, and the upstream gradients.
     """
     n = len(splats)
-    bounds = bins.pieces(parts(), ends - bins.starts[:-1])
-    moments, grads = torch.empty(len(bounds) - 1, n, WIDTH), torch.empty(n, WIDTH)
-    run(_blend_adjoint, bounds, [*walk, view(moments.view(-1))])
-    run(_gradients, even(n, parts()), [n, len(moments), *(view(t.view(-1)) for t in (splats, moments, grads))])
+    bounds = bins.balanced_bounds(num_threads(), ends - bins.starts[:-1])
+    moments, grads = torch.empty(len(bounds) - 1, n, SPLAT_SIZE), torch.empty(n, SPLAT_SIZE)
+    launch_ranges(_blend_adjoint, bounds, [*walk, view(moments.view(-1))])
+    flat = [view(t.view(-1)) for t in (splats, moments, grads)]
+    launch_ranges(_gradients, even_bounds(n, num_threads()), [n, len(moments), *flat])
     return grads

@@ -11,8 +11,8 @@ import warp as wp
 from torch import Tensor
 
 from stages.core.kernels.interop import device_of, launch, view
-from stages.core.kernels.splat.pixel_blocks import CLOSED, SOLID
-from stages.core.kernels.splat.projection import FAINTEST
+from stages.core.kernels.splat.pixel_blocks import MAX_ALPHA, MIN_TRANSMITTANCE
+from stages.core.kernels.splat.projection import MIN_ALPHA
 
 wp.set_module_options({"enable_backward": False})
 
@@ -31,10 +31,10 @@ def _composite(
         s = members[k]
         dx, dy = float(j) + 0.5 - splats[s, 0], float(i) + 0.5 - splats[s, 1]
         sigma = 0.5 * (splats[s, 2] * dx * dx + splats[s, 4] * dy * dy) + splats[s, 3] * dx * dy
-        alpha = wp.min(splats[s, 5] * wp.exp(-sigma), wp.static(SOLID))
-        if alpha < wp.static(FAINTEST):
+        alpha = wp.min(splats[s, 5] * wp.exp(-sigma), wp.static(MAX_ALPHA))
+        if alpha < wp.static(MIN_ALPHA):
             continue
-        if T * (1.0 - alpha) <= wp.static(CLOSED):
+        if T * (1.0 - alpha) <= wp.static(MIN_TRANSMITTANCE):
             break
         w = alpha * T
         colour += w * wp.vec4(splats[s, 6], splats[s, 7], splats[s, 8], splats[s, 9])
@@ -47,7 +47,7 @@ def _composite(
     index[i, j] = which
 
 
-def composite(splats: Tensor, members: Tensor, starts: Tensor, tile: int, width: int, height: int):
+def composite_pixelwise(splats: Tensor, members: Tensor, starts: Tensor, tile: int, width: int, height: int):
     """Of splats (n, 16) in bins of tile x tile pixels: the composite of the four channels (h, w, 4), alpha (h, w), for
     every pixel the splat with the greatest weight (h, w; -1: none), and for every splat its total weight (n,).
 

@@ -4,15 +4,15 @@ The rule, as in gsplat: alpha = min(0.999, opacity exp(-d'Cd/2)) counts from 1/2
 splat would leave a transmittance T of 1e-4 or less (that splat is not drawn), and w = alpha T.
 """
 
-from stages.core.kernels.splat.projection import BIN
+from stages.core.kernels.splat.projection import BIN_SIZE
 
-SOLID = 0.999  # alpha is never more, so that light always passes and 1 / (1 - alpha) exists
-CLOSED = 1e-4  # transmittance at which a pixel is finished
-NOTHING = 1e-10  # alpha below which a mean is 0, not noise
-BLOCKS = (BIN // 4) ** 2
-PIXELS = BLOCKS * 16  # in a bin, in the order of blocks and lanes in which per-pixel state is kept between passes
+MAX_ALPHA = 0.999  # alpha is never more, so that light always passes and 1 / (1 - alpha) exists
+MIN_TRANSMITTANCE = 1e-4  # transmittance at which a pixel is finished
+MIN_MEAN_ALPHA = 1e-10  # alpha below which a mean is 0, not noise
+BLOCKS_PER_BIN = (BIN_SIZE // 4) ** 2
+PIXELS_PER_BIN = BLOCKS_PER_BIN * 16  # per-pixel state is stored by block, then by lane
 
-BLOCKS_OF_BIN = r"""
+BIN_BLOCKS = r"""
 enum { BLOCKS = 64 };
 const int X = (bin % across) * 32, Y = (bin / across) * 32;
 const F lx = {.5f, 1.5f, 2.5f, 3.5f, .5f, 1.5f, 2.5f, 3.5f, .5f, 1.5f, 2.5f, 3.5f, .5f, 1.5f, 2.5f, 3.5f};

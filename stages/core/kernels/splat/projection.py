@@ -16,14 +16,14 @@ from stages.core.geometry.harmonics import evaluate_sh
 from stages.core.geometry.rotations import matrix
 from stages.core.kernels.interop import view
 from stages.core.kernels.splat.harmonics import HARMONICS, HARMONICS_ADJOINT
-from stages.core.kernels.splat.simd import LANES, VECTORS, even, parts, run
+from stages.core.kernels.splat.simd import LANES, VECTORS, even_bounds, launch_ranges, num_threads
 
 wp.set_module_options({"enable_backward": False})  # the adjoint is written by hand below
 
 BLUR = 0.3  # added to the covariance on the image [px^2], so that no splat is thinner than a pixel
-FAINTEST = 1 / 255  # what alpha is ignored below
-WIDTH = 16  # floats in a splat
-BIN = 32  # pixels along a side of a bin
+MIN_ALPHA = 1 / 255  # what alpha is ignored below
+SPLAT_SIZE = 16  # floats in a splat
+BIN_SIZE = 32  # pixels along a side of a bin
 
 # From a group of 16 Gaussians to their covariance on the image.
 _GEOMETRY = r"""
@@ -76,7 +76,7 @@ F o = gather(opacities.data, 1, 0);
 
 _FORWARD = r"""
 F px = fx * xz + cam[14], py = fy * yz + cam[15];
-visible &= (o >= FAINTEST) & (idet > 0) & (idet < 1e30f);
+visible &= (o >= MIN_ALPHA) & (idet > 0) & (idet < 1e30f);
 F lo = log2v(visible ? o : (F)(1.0f));
 F reach = 2 * 0.693147181f * (lo + 7.99435344f) + 1e-3f;  // 2 ln(255 o), a little more for rounding
 F rx = vsqrt(reach * (aa + BLUR)), ry = vsqrt(reach * (bb + BLUR));
@@ -88,14 +88,14 @@ if (!bits(visible)) {
     }
     return;
 }
-""".replace("FAINTEST", f"{FAINTEST!r}f").replace("BLUR", f"{BLUR}f")
+""".replace("MIN_ALPHA", f"{MIN_ALPHA!r}f").replace("BLUR", f"{BLUR}f")
 
 _WRITE = r"""
 const F none = (F)(0.0f);
 F f[13] = {px, py, A, B, C, o, vmax(rgb[0], none), vmax(rgb[1], none), vmax(rgb[2], none), z, lo, rx, ry};
 I key = visible ? __builtin_bit_cast(I, z) : (I)(-1);  // positive floats sort as integers
 auto bin = [&](F edge, float last) {
-    return __builtin_convertvector(vmin(vmax(edge * (1.0f / BIN), none), (F)(last)), I);
+    return __builtin_convertvector(vmin(vmax(edge * (1.0f / BIN_SIZE), none), (F)(last)), I);
 };
 I x0 = bin(px - rx - 0.5f, cam[26]), x1 = bin(px + rx - 0.5f, cam[26]);
 I y0 = bin(py - ry - 0.5f, cam[27]), y1 = bin(py + ry - 0.5f, cam[27]);
@@ -108,7 +108,7 @@ for (int l = 0; l < count; ++l) {
     short* rect = rects.data + 4 * (long)row[l];
     rect[0] = x0[l]; rect[1] = y0[l]; rect[2] = x1[l]; rect[3] = y1[l];
 }
-""".replace("BIN", str(BIN))
+""".replace("BIN_SIZE", str(BIN_SIZE))
 
 _BACKWARD = r"""
 const F none = (F)(0.0f);
@@ -203,14 +203,14 @@ def _project_adjoint(
                      grads, v_means, v_quats, v_scales, v_opacities, v_sh)  # fmt: skip
 
 
-def pinhole(viewmat: Tensor, K: Tensor, width: int, height: int, near: float) -> Tensor:
+def pack_camera(viewmat: Tensor, K: Tensor, width: int, height: int, near: float) -> Tensor:
     """What the kernels need to know of a camera, 28 floats: rotation, translation, fx fy cx cy, centre, size, near,
     the limits of x/z and y/z (30 % outside the image), and the last bin across and down."""
     W, k = np.asarray(viewmat.detach().cpu(), np.float64), np.asarray(K.detach().cpu(), np.float64)
     R, t, (fx, fy, cx, cy) = W[:3, :3], W[:3, 3], (k[0, 0], k[1, 1], k[0, 2], k[1, 2])
     mx, my = 0.15 * width / fx, 0.15 * height / fy
     limits = [-cx / fx - mx, (width - cx) / fx + mx, -cy / fy - my, (height - cy) / fy + my]
-    last = [(width - 1) // BIN, (height - 1) // BIN]
+    last = [(width - 1) // BIN_SIZE, (height - 1) // BIN_SIZE]
     numbers = [*R.ravel(), *t, fx, fy, cx, cy, *(-R.T @ t), width, height, near, *limits, *last]
     return torch.tensor(np.asarray(numbers, np.float32))
 
@@ -219,11 +219,11 @@ class _Project(torch.autograd.Function):
     @staticmethod
     def forward(ctx, camera, means, quats, scales, opacities, sh):
         n, k = len(means), sh.shape[1]
-        splats = means.new_empty(n, WIDTH)
+        splats = means.new_empty(n, SPLAT_SIZE)
         keys, rects = torch.empty(n, dtype=torch.int32), torch.empty(n, 4, dtype=torch.int16)
         flat = [view(t.view(-1)) for t in (camera, means, quats, scales, opacities, sh, splats, keys, rects)]
         groups = -(-n // LANES)
-        run(_project, even(groups, parts()), [n, k, *flat])
+        launch_ranges(_project, even_bounds(groups, num_threads()), [n, k, *flat])
         ctx.save_for_backward(camera, means, quats, scales, opacities, sh, splats)
         ctx.mark_non_differentiable(keys, rects)
         return splats, keys, rects
@@ -235,7 +235,7 @@ class _Project(torch.autograd.Function):
         grads = [torch.empty_like(t) for t in (means, quats, scales, opacities, sh)]
         tensors = (camera, means, quats, scales, opacities, sh, splats, v_splats.contiguous(), *grads)
         flat = [view(t.view(-1)) for t in tensors]
-        run(_project_adjoint, even(-(-n // LANES), parts()), [n, k, *flat])
+        launch_ranges(_project_adjoint, even_bounds(-(-n // LANES), num_threads()), [n, k, *flat])
         return None, *grads
 
 
@@ -266,10 +266,10 @@ def project_reference(camera: Tensor, means: Tensor, quats: Tensor, scales: Tens
     dirs = torch.nn.functional.normalize(means - centre, dim=-1)
     rgb = evaluate_sh(sh, dirs).clamp_min(0)
     centre2d = torch.stack([fx * xz + cx, fy * yz + cy], -1)
-    reach = 2 * (opacities.detach() / FAINTEST).clamp_min(1).log()
+    reach = 2 * (opacities.detach() / MIN_ALPHA).clamp_min(1).log()
     extent = (reach[:, None] * cov.detach().diagonal(dim1=-2, dim2=-1)).sqrt()
     inside = (centre2d + extent > 0) & (centre2d - extent < torch.stack([width, height]))
-    visible = front & (opacities >= FAINTEST) & inside.all(-1)
+    visible = front & (opacities >= MIN_ALPHA) & inside.all(-1)
     columns = [*centre2d.unbind(-1), conic[:, 0, 0], conic[:, 0, 1], conic[:, 1, 1], opacities, *rgb.unbind(-1), z]
     columns += [opacities.detach().log2(), *extent.unbind(-1), zero, zero, zero]
     return torch.where(visible[:, None], torch.stack(columns, -1), zero[:, None])

@@ -17,7 +17,7 @@ from stages.core.kernels.interop import launch
 from stages.core.kernels.threads import run_parallel
 
 LANES = 16
-MAX_PARTS = 8  # more threads than this would need more memory for gradients than they are worth
+MAX_THREADS = 8  # more threads than this would need more memory for gradients than they are worth
 
 VECTORS = r"""
 typedef float F __attribute__((ext_vector_type(16)));
@@ -54,7 +54,7 @@ auto log2v = [](F x) {
 """
 """Types and functions; a Warp snippet is a function body, so helpers are lambdas."""
 
-SUMS = r"""
+LANE_SUMS = r"""
 // the sums over the lanes of v[0] .. v[15], as the lanes of one vector
 auto sums = [](const F* v) {
     F a[8], b[4], c[2];
@@ -79,17 +79,17 @@ def _load(kernel: wp.Kernel) -> None:
     wp.load_module(kernel.module, device="cpu")
 
 
-def parts() -> int:
+def num_threads() -> int:
     """Number of threads, and of the fixed shares of work where the order of summation must not depend on timing."""
-    return max(1, min(torch.get_num_threads(), MAX_PARTS))
+    return max(1, min(torch.get_num_threads(), MAX_THREADS))
 
 
-def even(n: int, pieces: int) -> list[int]:
+def even_bounds(n: int, pieces: int) -> list[int]:
     """Bounds of that many nearly equal pieces of range(n)."""
     return [n * i // pieces for i in range(pieces + 1)]
 
 
-def run(kernel: wp.Kernel, bounds: list[int], inputs: list) -> None:
+def launch_ranges(kernel: wp.Kernel, bounds: list[int], inputs: list) -> None:
     """Launches `kernel(start, piece, *inputs)` once for each piece bounds[i]:bounds[i + 1], on all threads.
 
     A kernel adds `start` to its thread index.

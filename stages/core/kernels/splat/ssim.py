@@ -14,8 +14,8 @@ from torch import Tensor
 
 from stages.core.kernels.interop import view
 from stages.core.kernels.splat import ssim_pixel
-from stages.core.kernels.splat.simd import LANES, VECTORS, even, parts, run
-from stages.core.kernels.splat.ssim_pixel import C1, C2, REACH, WINDOW
+from stages.core.kernels.splat.simd import LANES, VECTORS, even_bounds, launch_ranges, num_threads
+from stages.core.kernels.splat.ssim_pixel import C1, C2, WINDOW, WINDOW_RADIUS
 
 wp.set_module_options({"enable_backward": False})
 
@@ -152,14 +152,14 @@ def _pull(first: Tensor, second: Tensor, slopes: Tensor) -> Tensor:
 
 def _launch(kernel: wp.Kernel, first: Tensor, second: Tensor, maps: int, *outputs: Tensor) -> None:
     height, width, channels = first.shape
-    pieces = parts()
-    lines = torch.empty(pieces * maps * (width * channels + 2 * REACH * channels + LANES))
+    pieces = num_threads()
+    lines = torch.empty(pieces * maps * (width * channels + 2 * WINDOW_RADIUS * channels + LANES))
     flat = [view(t.view(-1)) for t in (first, second, lines, *outputs)]
-    run(kernel, even(height, pieces), [height, width, channels, *flat])
+    launch_ranges(kernel, even_bounds(height, pieces), [height, width, channels, *flat])
 
 
 def _ways(image: Tensor):
-    return (ssim_pixel.measure, ssim_pixel.pull) if image.is_cuda else (_measure, _pull)
+    return (ssim_pixel.ssim_forward, ssim_pixel.ssim_backward) if image.is_cuda else (_measure, _pull)
 
 
 class _Ssim(torch.autograd.Function):
@@ -194,8 +194,8 @@ def ssim_reference(first: Float[Tensor, "h w c"], second: Float[Tensor, "h w c"]
     x, y = first.permute(2, 0, 1)[:, None], second.permute(2, 0, 1)[:, None]
 
     def blur(image: Tensor) -> Tensor:
-        down = torch.nn.functional.conv2d(image, window[None, None, :, None], padding=(REACH, 0))
-        return torch.nn.functional.conv2d(down, window[None, None, None, :], padding=(0, REACH))
+        down = torch.nn.functional.conv2d(image, window[None, None, :, None], padding=(WINDOW_RADIUS, 0))
+        return torch.nn.functional.conv2d(down, window[None, None, None, :], padding=(0, WINDOW_RADIUS))
 
     mx, my = blur(x), blur(y)
     vx, vy, cov = blur(x * x) - mx * mx, blur(y * y) - my * my, blur(x * y) - mx * my

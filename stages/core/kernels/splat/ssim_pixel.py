@@ -15,11 +15,11 @@ from stages.core.kernels.interop import device_of, launch, view
 
 wp.set_module_options({"enable_backward": False})
 
-REACH = 5  # pixels to either side of the window's centre
+WINDOW_RADIUS = 5  # pixels to either side of the window's centre
 SIGMA = 1.5  # [px]
 C1, C2 = 0.01**2, 0.03**2  # for images in 0..1
 
-_WEIGHTS = [math.exp(-0.5 * (i / SIGMA) ** 2) for i in range(-REACH, REACH + 1)]
+_WEIGHTS = [math.exp(-0.5 * (i / SIGMA) ** 2) for i in range(-WINDOW_RADIUS, WINDOW_RADIUS + 1)]
 WINDOW = [weight / sum(_WEIGHTS) for weight in _WEIGHTS]
 TAPS = len(WINDOW)
 
@@ -33,7 +33,7 @@ def _down(window: taps, first: wp.array2d[float], second: wp.array2d[float], sum
     i, j = wp.tid()
     total = maps5()
     for t in range(wp.static(TAPS)):
-        row = i + t - wp.static(REACH)
+        row = i + t - wp.static(WINDOW_RADIUS)
         if row >= 0 and row < first.shape[0]:
             x = first[row, j]
             y = second[row, j]
@@ -49,7 +49,7 @@ def _compare(
     i, j = wp.tid()
     e = maps5()
     for t in range(wp.static(TAPS)):
-        column = j + (t - wp.static(REACH)) * channels
+        column = j + (t - wp.static(WINDOW_RADIUS)) * channels
         if column >= 0 and column < sums.shape[1]:
             e += window[t] * sums[i, column]
     mx, my = e[0], e[1]
@@ -68,7 +68,7 @@ def _down_slopes(window: taps, slopes: wp.array2d[wp.vec3], sums: wp.array2d[wp.
     i, j = wp.tid()
     total = wp.vec3()
     for t in range(wp.static(TAPS)):
-        row = i + t - wp.static(REACH)
+        row = i + t - wp.static(WINDOW_RADIUS)
         if row >= 0 and row < slopes.shape[0]:
             total += window[t] * slopes[row, j]
     sums[i, j] = total
@@ -83,13 +83,13 @@ def _gather(
     i, j = wp.tid()
     e = wp.vec3()
     for t in range(wp.static(TAPS)):
-        column = j + (t - wp.static(REACH)) * channels
+        column = j + (t - wp.static(WINDOW_RADIUS)) * channels
         if column >= 0 and column < sums.shape[1]:
             e += window[t] * sums[i, column]
     grads[i, j] = share * (e[0] + 2.0 * first[i, j] * e[1] + second[i, j] * e[2])
 
 
-def measure(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
+def ssim_forward(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
     """Mean similarity of images (h, w, c), and its derivatives (h, w * c, 3) by mean and variance of the first and by
     the covariance."""
     x, y = first.flatten(1), second.flatten(1)
@@ -100,7 +100,7 @@ def measure(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
     return similar.mean(), slopes
 
 
-def pull(first: Tensor, second: Tensor, slopes: Tensor) -> Tensor:
+def ssim_backward(first: Tensor, second: Tensor, slopes: Tensor) -> Tensor:
     """Gradient of the mean similarity by the first image."""
     x, y = first.flatten(1), second.flatten(1)
     sums, grads = torch.empty_like(slopes), torch.empty_like(x)

@@ -11,7 +11,7 @@ from stages.core.models.field.equivariant import apply_layers, matvec, mlp, weig
 from stages.core.models.field.rest_shape import NEIGHBOURHOOD_RADII, RestShape
 
 if TRITON:
-    from stages.core.kernels.field.skinny_matmul import thin_product
+    from stages.core.kernels.field.skinny_matmul import skinny_matmul
 
 MAX_STIFFNESS = 2500.0  # [1/s^2]: a swing of an eighth of a second, six frames
 MAX_DAMPING = 100.0  # damping [1/s]
@@ -73,7 +73,7 @@ def _blurred(blur: Float[Tensor, "b o s n n"], x: Float[Tensor, "b o n 9"]) -> F
     if blur.dtype == torch.float16 and not torch.is_grad_enabled():
         s = blur.shape[2]
         rows = blur.flatten(2, 3)  # all neighbourhoods at once
-        return thin_product(rows, x).unflatten(2, (s, -1)).transpose(2, 3)
+        return skinny_matmul(rows, x).unflatten(2, (s, -1)).transpose(2, 3)
     return (x.mT[:, :, None] @ blur.to(x).mT).permute(0, 1, 4, 2, 3)  # on a CPU twice as fast as what it means
 
 

@@ -15,7 +15,7 @@ from torch.nn.functional import silu
 from stages.core.kernels.compilers import TRITON
 
 if TRITON:
-    from stages.core.kernels.field.perceptron import WIDEST, perceptron
+    from stages.core.kernels.field.perceptron import MAX_LAYER_WIDTH, perceptron
 
 
 def inner_products(vectors: Float[Tensor, "*b k 3"]) -> Float[Tensor, "*b g"]:
@@ -63,7 +63,7 @@ def apply_layers(
     the first layer, or, if `active`, to x, which is then activated too. Where not `near` the result may be 0 instead.
     """
     fused = TRITON and x.is_cuda and x.dtype == torch.float32 and not torch.is_grad_enabled()
-    if fused and len(layers) in (2, 3) and max(layer.out_features for layer in layers) <= WIDEST:
+    if fused and len(layers) in (2, 3) and max(layer.out_features for layer in layers) <= MAX_LAYER_WIDTH:
         if known is not None:
             known = known.expand(*x.shape[:-2], 1, known.shape[-1]).flatten(0, -2)
         vectors = None if vectors is None else vectors.flatten(0, -3)

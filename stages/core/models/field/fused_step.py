@@ -65,7 +65,7 @@ def points(scene: FieldScene, state: BodyState) -> Tensor:
     b, o, n, _ = state.u.shape
     given = [x.contiguous() for x in (state.com, state.quat, state.u, scene.shape.arm)]
     out = torch.empty_like(given[2])
-    bodies.place[(b * o, triton.cdiv(n, 256))](*given, out, n, BLOCK=256)
+    bodies.world_points[(b * o, triton.cdiv(n, 256))](*given, out, n, BLOCK=256)
     return out
 
 
@@ -116,9 +116,9 @@ class _Step:
         return torch.empty(self.b, self.o, *shape, dtype=torch.int32, device=self.arm.device)
 
     def _begin(self, state: BodyState) -> tuple[Tensor, ...]:
-        body, moved = self._new(bodies.BODY.value), self._new(bodies.MOVED.value, self.n)
-        inner, planes = self._new(bodies.FIELD.value, self.n), self._new(2, self.n)
-        bodies.advance[(self.objects,)](
+        body, moved = self._new(bodies.BODY_SIZE.value), self._new(bodies.POINT_SIZE.value, self.n)
+        inner, planes = self._new(bodies.FIELD_SIZE.value, self.n), self._new(2, self.n)
+        bodies.drift_half_step[(self.objects,)](
             *(x.contiguous() for x in state), self.arm, self.normal, self.valid, self.size, self.inverse, self.pinned,
             self.box, body, moved, inner, planes, self.o, self.n, self.dt, FARTHEST=MAX_DISPLACEMENT,
             FAR=near.NO_CONTACT,
@@ -131,22 +131,22 @@ class _Step:
         close, keys, which, partner = self._new(m, 3, n), self._new(m, n), self._count(m, n), self._count(m, n)
         many = self._count(m)
         if m:
-            meeting.gather[(self.objects, m)](
+            meeting.gather_candidates[(self.objects, m)](
                 body, moved, self.valid, close, which, many, o, n, SEEN=near.SEARCH_RADIUS, **self.whole
             )
-            meeting.search[(self.objects * m, triton.cdiv(n, meeting.QUERIES))](
+            meeting.nearest_candidates[(self.objects * m, triton.cdiv(n, meeting.QUERY_BLOCK))](
                 body, moved, close, which, many, keys, partner, o, n, SEEN=near.SEARCH_RADIUS, FRAME=FRAME,
-                QUERIES=meeting.QUERIES, CHUNK=meeting.CHUNK,
+                QUERY_BLOCK=meeting.QUERY_BLOCK, CANDIDATE_CHUNK=meeting.CANDIDATE_CHUNK,
             )  # fmt: skip
         count, felt = self._count(self.kinds), self._new(self.kinds, 3, n)
         point, theirs = self._count(self.slots), self._count(self.slots)
-        meeting.select[(self.objects, self.kinds)](
+        meeting.select_contacts[(self.objects, self.kinds)](
             keys, planes, which, partner, many, self.valid, count, point, theirs, felt, *self.lists,
             PAIR=near.PAIR_FRACTION,
             WALL=near.WALL_FRACTION, FAR=near.NO_CONTACT, **self.whole,
         )  # fmt: skip
         record = self._new(self.slots * places.COLUMNS.value)
-        places.show[(self.objects, self.places)](
+        places.contact_features[(self.objects, self.places)](
             body, moved, count, point, theirs, record, self.spacing, self.mass_fraction, self.size, self.mass,
             self.gravity,
             self.box, *self.lists, NEAR=near.FULL_CONTACT, FAR=near.NO_CONTACT, CLOSE=near.GAP_UNIT,
@@ -159,27 +159,27 @@ class _Step:
         field, pair, plane, h = self.field, self.field.pairs, self.field.planes, self.hidden
         known, inputs = self._new(self.kinds + 1, h), self._new(self.kinds, h)
         own = _layers(pair.own, pair.other, plane.own, field.stress.own)
-        touching.introduce[(self.objects, self.kinds + 1)](self.code, *own, known, self.o, H=h)
+        touching.project_embeddings[(self.objects, self.kinds + 1)](self.code, *own, known, self.o, H=h)
         message, weight = self._new(self.slots, h), self._new(self.slots)
         heard, total = self._new(self.places, h), self._new(self.places)
         ears = (_layers(net.see, net.hear[0], net.hear[2]) for net in (pair, plane))
-        touching.listen[(self.objects, self.places)](
+        touching.encode_messages[(self.objects, self.places)](
             record, count, *ears, known, message, weight, heard, total, *self.lists, **self.network
         )
         listened, scale, status = self._new(self.kinds, h), self._new(self.kinds), self._new(h)
         grip = self._new()
-        touching.hear[(self.objects,)](
+        touching.aggregate_messages[(self.objects,)](
             self.code, heard, total, _layers(field.status[0], field.status[2]), *_layers(field.hold), listened,
             scale, status, grip, *self.lists, GRIP=CONTACT_SATURATION, HOLD=MAX_FRICTION_SPEED, ROWS=ROWS,
             BLOCKS=triton.next_power_of_2(self.floor), H=h, num_warps=8,
         )  # fmt: skip
-        touching.explain[(self.objects, self.kinds)](
+        touching.update_contacts[(self.objects, self.kinds)](
             listened, status, _layers(field.between[0], field.between[2]),
             _layers(field.against[0], field.against[2]), *_layers(pair.tell, plane.tell), inputs, self.o, H=h,
         )  # fmt: skip
-        parts = self._new(self.places, bodies.PART.value)
+        parts = self._new(self.places, bodies.WRENCH_SIZE.value)
         mouths = (_layers(net.say[0], net.say[2]) for net in (pair, plane))
-        touching.answer[(self.objects, self.places)](
+        touching.decode_forces[(self.objects, self.places)](
             record, count, point, *mouths, inputs, message, weight, scale, felt, parts, *self.lists,
             STRENGTH=ACCELERATION_UNIT,
             LEAVING=SEPARATION_SPEED, CLOSE=near.GAP_UNIT, LEVER=near.ARM_UNIT, **self.network,
@@ -194,7 +194,7 @@ class _Step:
         com, quat, velocity, momentum = (self._new(width) for width in (3, 4, 3, 3))
         high, low = (torch.empty(self.b, o, 9, n, dtype=torch.float16, device=self.arm.device) for _ in range(2))
         scale = self._new(9)
-        kicks.kick[(self.objects,)](
+        kicks.update_velocities[(self.objects,)](
             body, moved, inner, parts, felt, *grip, *pushed, self.arm, self.valid, self.mass_fraction, self.size,
             self.mass, self.inverse, self.pinned, self.gravity, self.box, com, quat, velocity, momentum, high, low,
             scale, o, n, self.dt, self.places, self.wide, PUSHED=self.external.object.shape[1] > 0,
@@ -202,21 +202,21 @@ class _Step:
             WILDEST=MAX_SPIN, BRISK=FRICTION_CUTOFF_SPEED, FRAME=FRAME,
             BLOCKS=triton.next_power_of_2(self.places - (o - 1) * self.wide), **self.whole,
         )  # fmt: skip
-        mean = thin.product_of(scene.shape.blur.flatten(0, 1).flatten(1, 2), high.flatten(0, 1), low.flatten(0, 1))
+        mean = thin.split_matmul(scene.shape.blur.flatten(0, 1).flatten(1, 2), high.flatten(0, 1), low.flatten(0, 1))
         blocks = triton.cdiv(n, ROWS)
-        record, field = self._new(blocks, straining.SEEN.value, ROWS), self._new(3, n)
-        straining.watch[(self.objects, blocks)](
+        record, field = self._new(blocks, straining.FEATURE_COLUMNS.value, ROWS), self._new(3, n)
+        straining.deformation_features[(self.objects, blocks)](
             body, inner, mean, scale, self.arm, self.normal, self.size, self.gravity, record, o, n, blocks,
             ROWS=ROWS, num_warps=2,
         )  # fmt: skip
-        straining.strain[(self.objects, blocks)](
+        straining.internal_accelerations[(self.objects, blocks)](
             record, known, scene.compliance_scale.contiguous(), _layers(stress.see), _layers(stress.say[0],
             stress.say[2]),
             field, n, blocks, self.kinds, HARDEST=MAX_SPRING_WEIGHT, HEAVIEST=MAX_DAMPER_WEIGHT, **self.network,
         )  # fmt: skip
         u, du = self._new(n, 3), self._new(n, 3)
         stiffness, damping = scene.stiffness.contiguous(), scene.damping.contiguous()
-        kicks.deform[(self.objects,)](
+        kicks.update_displacements[(self.objects,)](
             inner, field, self.arm, self.valid, self.mass_fraction, self.size, self.inverse, stiffness, damping,
             self.pinned,
             u, du, n, self.dt, FASTEST=MAX_SPEED, FARTHEST=MAX_DISPLACEMENT, **self.whole,

@@ -9,7 +9,7 @@ from torch import Tensor
 from stages.core.kernels.compilers import TRITON
 
 if TRITON:
-    from stages.core.kernels.field.nearest import nearest as searched
+    from stages.core.kernels.field.nearest import nearest_between_objects as searched
 
 CULLING_MIN_POINTS = 500  # points of a scene from which on it pays, on a CPU, to look before measuring
 

@@ -9,11 +9,11 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from stages.core.kernels.compilers import TRITON
-from stages.core.kernels.field.normals import inverted, surface
+from stages.core.kernels.field.normals import invert_spd, normals_and_spacing
 from stages.core.models.initial_conditions import InitialConditions, inertia, offsets
 
 if TRITON:
-    from stages.core.kernels.field.neighbourhoods import neighbourhoods
+    from stages.core.kernels.field.neighbourhoods import neighbourhood_weights
 
 NEIGHBOURHOOD_RADII = (0.12, 0.4)  # radii of neighbourhoods, in sizes of the object
 MIN_NEIGHBOUR_WEIGHT = 1e-20  # weights in them that are 0: subnormal numbers take a CPU several times as long
@@ -45,12 +45,12 @@ def rest_shape_of(initial: InitialConditions, half: bool = False) -> RestShape:
     """Everything about the rest shape; with `half` the neighbourhoods in half precision, which takes Triton."""
     arm = offsets(initial, initial.points)
     size = (initial.mass_fraction * arm.square().sum(-1)).sum(-1).clamp_min(1e-8).sqrt()
-    normal, spacing = surface(arm, initial.valid)
+    normal, spacing = normals_and_spacing(arm, initial.valid)
     side = (normal * arm).sum(-1) / (0.1 * size[..., None])
     normal = normal * side.tanh()[..., None]  # outwards
-    inverse, principal = inverted(inertia(initial.mass_fraction.double(), arm.double()))
+    inverse, principal = invert_spd(inertia(initial.mass_fraction.double(), arm.double()))
     reach = torch.stack([radius * size for radius in NEIGHBOURHOOD_RADII], -1)
-    blur = neighbourhoods if half else _neighbourhoods
+    blur = neighbourhood_weights if half else _neighbourhoods
     others, back = _others(initial.valid.shape[1], arm.device)
     blurred = blur(arm, initial.valid, initial.mass_fraction, reach)
     return RestShape(initial, arm, normal, spacing, size, inverse.to(arm), principal.to(arm), blurred, others, back)

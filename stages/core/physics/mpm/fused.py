@@ -9,7 +9,7 @@ import torch
 import warp as wp
 
 from stages.core.kernels.interop import launch, view
-from stages.core.kernels.mpm.fused import THREADS, Touched, clear_touched, fused_step
+from stages.core.kernels.mpm.fused import THREADS_PER_BLOCK, ActiveBlocks, clear_active_blocks, fused_step
 from stages.core.kernels.mpm.grid import BLOCK
 from stages.core.physics.mpm.particle_rows import ParticleRows
 
@@ -36,7 +36,7 @@ class FusedSubsteps:
         ints = {"dtype": torch.int32, "device": self.device}
         self._marks = torch.zeros(count // BLOCK**3, **ints)
         self._blocks, self._total = torch.zeros_like(self._marks), torch.zeros(1, **ints)
-        self._touched = Touched()
+        self._touched = ActiveBlocks()
         self._touched.marks, self._touched.blocks = view(self._marks), view(self._blocks)
         self._touched.total = view(self._total)
         self._clock = torch.zeros(1, device=self.device)
@@ -72,7 +72,7 @@ class FusedSubsteps:
 
     def _run(self, steps: int) -> None:
         self.rows.sort()
-        self.rows["home"].fill_(-1)
+        self.rows["base_node"].fill_(-1)
         self._launch(0, 0, 1)
         for step in range(1, steps):
             if step % RESORT == 0:
@@ -82,7 +82,7 @@ class FusedSubsteps:
         self._most.copy_(self._total)
         grids = [view(g, wp.vec4) for g in self._grids]
         inputs = [self.grid, self._sweep_from, *grids, view(self._friction), self._touched, self._width]
-        launch(clear_touched, self._sweep_from, inputs, device=self.device)
+        launch(clear_active_blocks, self._sweep_from, inputs, device=self.device)
         self._total.zero_()
 
     def _launch(self, step: int, gather: int, scatter: int) -> None:
@@ -91,4 +91,4 @@ class FusedSubsteps:
         inputs = [self.grid, self.rows.struct, self._sweep_from, sweepers, gather, scatter, step - 1,
                   view(self._clock), self.damping, read, write, stale, view(self._friction), self._touched,
                   self._obstacles, self._scale]  # fmt: skip
-        launch(self._kernel, self._sweep_from + sweepers, inputs, device=self.device, block_dim=THREADS)
+        launch(self._kernel, self._sweep_from + sweepers, inputs, device=self.device, block_dim=THREADS_PER_BLOCK)

@@ -14,7 +14,7 @@ from stages.core.kernels.mpm import transfers as kernels
 NEVER = 2**31 - 1  # in `lost`: no particle of this scene
 _TYPES = {
     "x": wp.vec3, "v": wp.vec3, "C": wp.mat33, "F": wp.mat33, "stiffness": wp.vec3, "plastic": wp.vec3,
-    "push": wp.vec3, "home": wp.vec3i,
+    "acceleration": wp.vec3, "base_node": wp.vec3i,
 }  # fmt: skip
 
 
@@ -27,14 +27,14 @@ class ParticleRows:
         self.tensors = {name: t.to(device, copy=True).contiguous() for name, t in fields.items()}
         scene = torch.repeat_interleave(torch.arange(len(sizes)), torch.tensor(list(sizes)))
         self.tensors |= {
-            "push": torch.zeros(p, 3, device=device),
+            "acceleration": torch.zeros(p, 3, device=device),
             "scene": scene.int().to(device),
             "order": torch.arange(p, dtype=torch.int32, device=device),
-            "home": torch.full((p, 3), -1, dtype=torch.int32, device=device),
+            "base_node": torch.full((p, 3), -1, dtype=torch.int32, device=device),
         }
         self.lost = torch.full((len(sizes),), NEVER, dtype=torch.int32, device=device)
         self._keys = torch.zeros(p, dtype=torch.int32, device=device)
-        self.struct = kernels.Rows()
+        self.struct = kernels.ParticleArrays()
         self.struct.count = p
         for name, t in self.tensors.items():
             setattr(self.struct, name, view(t, _TYPES.get(name)))

@@ -21,7 +21,15 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from stages.core.kernels.mpm import grid as mpm_grid
-from stages.core.kernels.mpm.constitutive import COROTATED, HARDEST, NEO_HOOKEAN, SAND, SNOW, VON_MISES, sand_slope
+from stages.core.kernels.mpm.constitutive import (
+    COROTATED,
+    MAX_SNOW_HARDENING,
+    NEO_HOOKEAN,
+    SAND,
+    SNOW,
+    VON_MISES,
+    sand_slope,
+)
 from stages.core.physics.colliders import Collider, as_obstacles
 from stages.core.physics.mpm.fused import FusedSubsteps
 from stages.core.physics.mpm.particle_rows import NEVER, ParticleRows
@@ -198,7 +206,7 @@ class Solver:
 
         A particle that would leave the box or is no number stays where it was; other scenes do not notice.
         """
-        self.rows.put("push", push)
+        self.rows.put("acceleration", push)
         self._substepper.frame(duration / substeps, substeps)
         if self.colliders:
             self.colliders = tuple(c.advanced(duration) for c in self.colliders)
@@ -225,7 +233,7 @@ class Solver:
             return 0.0, 0.0
         density = (self.rows["mass"] / self.rows["volume"])[moving]
         mu, lam, eta = self.rows["stiffness"][moving].unbind(1)
-        harder = torch.where(self.rows["model"][moving] == SNOW, HARDEST, 1.0)
+        harder = torch.where(self.rows["model"][moving] == SNOW, MAX_SNOW_HARDENING, 1.0)
         return float((harder * (lam + 2 * mu) / density).sqrt().max()), float((eta / density).max())
 
 
@@ -239,19 +247,19 @@ def make_grid(box: Box, dx: float):
 
     Exact for the lower faces, the floor among them; the upper ones are moved out to the next node.
     """
-    grid, n = mpm_grid.Grid(), []
+    grid, n = mpm_grid.MpmGrid(), []
     for low, high in zip(box.low, box.high, strict=True):
         inside = max(math.ceil((high - low) / dx + 2 * FLOOR_GAP - 1e-6), 4)
-        n.append((inside, math.ceil((inside + 1 + 2 * mpm_grid.PAD) / mpm_grid.BLOCK) * mpm_grid.BLOCK))
+        n.append((inside, math.ceil((inside + 1 + 2 * mpm_grid.GRID_PADDING) / mpm_grid.BLOCK) * mpm_grid.BLOCK))
     grid.count = math.prod(total for _, total in n)
     if grid.count > MAX_NODES:
         raise ValueError(f"a grid of {' x '.join(str(total) for _, total in n)} nodes is too large")
-    grid.origin = wp.vec3(*(low - (mpm_grid.PAD + FLOOR_GAP) * dx for low in box.low))
+    grid.origin = wp.vec3(*(low - (mpm_grid.GRID_PADDING + FLOOR_GAP) * dx for low in box.low))
     grid.dx = dx
     grid.nodes = wp.vec3i(*(total for _, total in n))
-    soft = round(mpm_grid.SOFT) if box.restitution > 0 else 0
-    grid.low = wp.vec3i(*[mpm_grid.PAD - soft] * 3)
-    grid.high = wp.vec3i(*(mpm_grid.PAD + inside + soft for inside, _ in n))
+    soft = round(mpm_grid.RESTITUTION_MARGIN) if box.restitution > 0 else 0
+    grid.low = wp.vec3i(*[mpm_grid.GRID_PADDING - soft] * 3)
+    grid.high = wp.vec3i(*(mpm_grid.GRID_PADDING + inside + soft for inside, _ in n))
     grid.face_low, grid.face_high = wp.vec3(*box.low), wp.vec3(*box.high)
     grid.restitution, grid.keep = box.restitution, box.tangential_retention
     return grid

@@ -94,7 +94,7 @@ class SplitSubsteps:
     def _forget_friction(self) -> None:
         rows = len(self._blocks) * kernels.BLOCK**2
         inputs = [self.grid, view(self._blocks, wp.vec2i), view(self._friction)]
-        launch(kernels.forget_friction, rows, inputs, device=self.device)
+        launch(kernels.clear_friction, rows, inputs, device=self.device)
 
     def _ranges(self, count: int) -> list[tuple[int, int]]:
         cuts = [count * part // self.parts for part in range(self.parts + 1)]

@@ -8,11 +8,14 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from stages.core.scene.files import ngff_version
+from stages.refine.options import BACKENDS as COMPLETERS
+from stages.segment.options import BACKENDS as SEGMENTERS
 
-OPTIONAL = {  # packages, what needs them, and the extra that brings them
+NETWORKS = {name: row for name, row in {**SEGMENTERS, **COMPLETERS}.items() if row.find_weights}
+OPTIONAL = {  # packages, what needs them, and the extra that installs them
     "huggingface_hub": ("--download", "hub"),
-    "transformers": ("segment --backend sam2", "sam2"),
-    "diffusers": ("refine --completer diffsplat", "diffsplat"),
+    **{row.package: (f"segment --backend {name}", row.extra) for name, row in SEGMENTERS.items() if row.package},
+    **{row.package: (f"refine --completer {name}", row.extra) for name, row in COMPLETERS.items() if row.package},
 }
 
 
@@ -104,15 +107,15 @@ def _weights() -> Iterator[str]:
 
 def _published() -> Iterator[str]:
     """Of the networks that others trained; told apart by their files' names, which loading checks."""
+    from stages.core.backends import load
     from stages.core.errors import InputError
-    from stages.core.models.diffsplat import weights as diffsplat
     from stages.core.models.pi3 import weights as pi3
-    from stages.core.models.sam2 import weights as sam2
     from stages.reconstruct import features_learned as matcher
 
     finders = {name: partial(pi3.find, name) for name in pi3.PUBLISHED}
     finders |= {name: partial(matcher.weight_file, file) for name, file in matcher.WEIGHT_FILES.items()}
-    for name, find in {**finders, "sam2": sam2.find, "diffsplat": lambda: diffsplat.find().gsvae}.items():
+    finders |= {name: load(row.find_weights) for name, row in NETWORKS.items()}
+    for name, find in finders.items():
         try:
             path = find()
             yield _line(True, name, f"{path}, {path.stat().st_size / 1e9:.1f} GB")

@@ -1,16 +1,34 @@
 """Backends as tables of names: a backend is a function, imported only when it is chosen."""
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from importlib import import_module
 
 from stages.core.errors import InputError
 
 
-def choose(table: Mapping[str, str], name: str) -> Callable:
-    """The function that a table of "module:function" entries lists under `name`; InputError for an unknown name."""
+@dataclass(frozen=True)
+class Backend:
+    """Row of a backend table; help, error messages and `ngff-lab doctor` are derived from it."""
+
+    entry: str  # "module:function"
+    help: str  # one line
+    find_weights: str = ""  # of a network: "module:function" that returns the path of its published weights
+    package: str = ""  # optional package that it needs
+    extra: str = ""  # extra of this project that installs the package
+
+
+def choose(table: Mapping[str, str | Backend], name: str) -> Callable:
+    """The function that a table of "module:function" entries or of rows lists under `name`; InputError if unknown."""
     if name not in table:
         raise InputError(f"no backend called {name!r}; choose from {', '.join(table)}")
-    return load(table[name])
+    row = table[name]
+    return load(row if isinstance(row, str) else row.entry)
+
+
+def with_weights(table: Mapping[str, Backend]) -> str:
+    """Names of the backends that run a published network, as "a or b"."""
+    return " or ".join(name for name, row in table.items() if row.find_weights)
 
 
 def load(entry: str) -> Callable:

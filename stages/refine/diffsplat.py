@@ -63,6 +63,11 @@ def _model(weights: Path | None, download: bool, device: str):
     return load(_files(weights, download), device)
 
 
+def weights_file() -> Path:
+    """Path of DiffSplat's decoder weights, as an example of its files; raises InputError where some are missing."""
+    return find().gsvae
+
+
 def _files(weights: Path | None, download: bool) -> Files:
     try:
         return find(weights)

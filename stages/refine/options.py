@@ -1,46 +1,59 @@
-"""What a user can choose about refinement."""
+"""Options of refinement, and the table of its completers."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
 
+from stages.core.backends import Backend, with_weights
 from stages.core.errors import InputError
 
-# a completer takes (scene, object number, Sight, Support | None, options) and returns Gaussians to add
+# a completer takes (scene, object id, ObservedSpace, Support | None, RefineOptions) and returns Gaussians to add
 BACKENDS = {
-    "close": "stages.refine.hull_completion:complete",
-    "library": "stages.refine.library:complete",
-    "diffsplat": "stages.refine.diffsplat:complete",
-    "none": "stages.refine.hull_completion:nothing",
-}
+    "close": Backend("stages.refine.hull_completion:complete", "fill the unseen part of the object's convex hull"),
+    "library": Backend("stages.refine.library:complete", "the registered object of --library that fits best"),
+    "diffsplat": Backend(
+        "stages.refine.diffsplat:complete", "DiffSplat: a generated object, registered to what was seen",
+        find_weights="stages.refine.diffsplat:weights_file", package="diffusers", extra="diffsplat",
+    ),
+    "none": Backend("stages.refine.hull_completion:no_completion", "add nothing to objects"),
+}  # fmt: skip
+GENERATORS = with_weights(BACKENDS)
 
 
 @dataclass(frozen=True)
 class RefineOptions:
-    completer: str = "close"  # a library chooses its own
+    """Parameters of refinement; raises InputError for values outside their range and for conflicting ones."""
+
+    completer: str = "close"  # --library selects its own
     library: Path | None = None  # folder of whole objects, each a .ply or a folder with one
-    photos: Path | None = None  # those the scene was made from, to show DiffSplat; by default drawn from the Gaussians
-    weights: Path | None = None  # folder of DiffSplat's; by default looked for
-    download: bool = False  # fetch those weights where they are not here
-    keep_raw: bool = False  # of K objects, keep those without their completion as K + 1 to 2 K
+    photos: Path | None = None  # folder of the scene's photos, for generators; by default the scene is rendered
+    weights: Path | None = None  # folder of a generator's weights; by default searched
+    download: bool = False  # download missing weights
+    keep_raw: bool = False  # of K objects, keep the uncompleted ones as K + 1 to 2 K
     outliers: float = 3.0  # robust deviations beyond which a Gaussian is a floater; 0 keeps all
     background: bool = True  # fill the table under and behind objects
-    resolution: int = 48  # cells along an object's longest side when its unseen sides are closed
+    resolution: int = 48  # cells along an object's longest side for the completer "close"
     seed: int = 0
     device: str = "auto"
 
     def __post_init__(self):
         if self.completer == "library" and self.library is None:
             raise InputError("--completer library: name its folder with --library, such as `ngff-lab objects` writes")
-        if self.completer != "diffsplat" and (self.photos or self.weights or self.download):
-            raise InputError("--photos, --weights and --download are of --completer diffsplat: add that or leave them")
+        if not self._is_generator and (self.photos or self.weights or self.download):
+            raise InputError(
+                f"--photos, --weights and --download are of --completer {GENERATORS}: add that or leave them"
+            )
         if not 0 <= self.outliers < 1000:
             raise InputError(f"--outliers {self.outliers}: give 0 to keep all, or robust deviations such as 3")
         if not 8 <= self.resolution <= 96:
             raise InputError(f"--resolution {self.resolution}: must be 8 to 96 cells")
 
     @property
+    def _is_generator(self) -> bool:
+        return self.completer in BACKENDS and bool(BACKENDS[self.completer].find_weights)
+
+    @property
     def chosen(self) -> str:
-        """The completer that the options ask for."""
+        """Name of the completer that the options select."""
         return "library" if self.library is not None and self.completer == "close" else self.completer

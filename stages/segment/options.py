@@ -1,62 +1,76 @@
-"""What a user can choose about segmentation."""
+"""Options of segmentation, and the table of its backends."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
 
+from stages.core.backends import Backend, with_weights
 from stages.core.errors import InputError
 from stages.segment.object_scale import parse_object_scale
 
+# a backend takes (scene, SegmentOptions) and returns the scene with labels and objects
 BACKENDS = {
-    "geometric": "stages.segment.geometric:segment",
-    "masks": "stages.segment.masks:segment",
-    "boxes": "stages.segment.boxes:segment",
-    "sam2": "stages.segment.sam2:segment",
-}
+    "geometric": Backend(
+        "stages.segment.geometric:segment", "objects on the supporting plane, by position, colour and shape"
+    ),
+    "masks": Backend("stages.segment.masks:segment", "label images of the photos (--masks), voted over all views"),
+    "boxes": Backend("stages.segment.boxes:segment", "bounding boxes in the first view (--boxes), cut out by colour"),
+    "sam2": Backend(
+        "stages.segment.sam2:segment", "SAM 2.1: boxes, points or automatic masks, propagated through the photos",
+        find_weights="stages.core.models.sam2.weights:find", package="transformers", extra="sam2",
+    ),
+}  # fmt: skip
+NETWORKS = with_weights(BACKENDS)
 
 
 @dataclass(frozen=True)
 class SegmentOptions:
-    backend: str = "geometric"  # --masks chooses its own, and --boxes too, unless this is sam2
+    """Parameters of segmentation; raises InputError for values outside their range and for conflicting ones."""
+
+    backend: str = "geometric"  # --masks and --boxes select their own backend, unless this is a network
     masks: Path | None = None  # folder of label images, named as the photos: 0 background, 1... the objects
-    boxes: Path | None = None  # prompts.json in the public format: boxes (for sam2 also points) in the first view
-    photos: Path | None = None  # folder of those the scene was made from, to show sam2; by default the scene is drawn
-    weights: Path | None = None  # of sam2: model.safetensors, its config.json beside it, or the folder of both
-    download: bool = False  # fetch those weights where they are not here
-    names: str = ""  # "1=duck,2=bowl" in place of the names found
+    boxes: Path | None = None  # prompts.json in the public format: boxes (for networks also points) in the first view
+    photos: Path | None = None  # folder of the scene's photos, for networks; by default the scene is rendered
+    weights: Path | None = None  # of a network: model.safetensors, its config.json beside it, or the folder of both
+    download: bool = False  # download missing weights
+    names: str = ""  # "1=duck,2=bowl": replaces the automatic names
     max_objects: int = 24
     min_size: float = 0.03  # of an object, along its longest side [distance of the cameras from what they look at]
-    detail: float = 0.41  # how unlike two regions may be and still be one object; smaller gives more objects
-    scale_reference: str = ""  # "object=1 height=0.12": a length that was measured [m]
+    detail: float = 0.41  # largest dissimilarity of two regions of one object; smaller values give more objects
+    scale_reference: str = ""  # "object=1 height=0.12": a measured length [m]
     seed: int = 0
     device: str = "auto"
 
     def __post_init__(self):
         if self.masks is not None and self.boxes is not None:
             raise InputError("--masks and --boxes: give one of them")
-        if self.backend == "sam2" and self.masks is not None:
-            raise InputError("--backend sam2 makes masks itself; give no --masks, or leave --backend out")
-        if self.backend != "sam2" and (self.photos or self.weights or self.download):
-            raise InputError("--photos, --weights and --download are of --backend sam2: add that or leave them")
+        if self._is_network and self.masks is not None:
+            raise InputError(f"--backend {self.backend} makes masks itself; give no --masks, or leave --backend out")
+        if not self._is_network and (self.photos or self.weights or self.download):
+            raise InputError(f"--photos, --weights and --download are of --backend {NETWORKS}: add that or leave them")
         if self.max_objects < 1:
             raise InputError(f"--max-objects {self.max_objects}: must be 1 or more")
         if not 0 < self.min_size < 1:
             raise InputError(f"--min-size {self.min_size}: must be between 0 and 1, such as 0.03")
         if not 0 < self.detail < 2:
             raise InputError(f"--detail {self.detail}: must be between 0 and 2, such as 0.4")
-        self.renamed, parse_object_scale(self.scale_reference)  # noqa: B018 -- what is bad is found before work starts
+        self.renamed, parse_object_scale(self.scale_reference)  # noqa: B018 -- errors are raised before work starts
+
+    @property
+    def _is_network(self) -> bool:
+        return self.backend in BACKENDS and bool(BACKENDS[self.backend].find_weights)
 
     @property
     def chosen(self) -> str:
-        """The backend that the options ask for."""
-        if self.backend == "sam2":
-            return "sam2"
+        """Name of the backend that the options select."""
+        if self._is_network:
+            return self.backend
         return "masks" if self.masks is not None else "boxes" if self.boxes is not None else self.backend
 
     @property
     def renamed(self) -> dict[int, str]:
-        """Names by object number."""
+        """Names given by the user, by object number; raises InputError where they cannot be parsed."""
         names = {}
         for part in filter(None, (p.strip() for p in self.names.split(","))):
             number, sign, name = part.partition("=")

@@ -1,4 +1,4 @@
-"""Prompts in one view become label images of all views, by SAM 2.1's memory."""
+"""Masks of one view propagated to label images of all views, by a promptable network."""
 
 from __future__ import annotations
 
@@ -9,9 +9,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from tqdm import tqdm
-from transformers import Sam2VideoModel
 
-from stages.core.models.sam2.network import PointPrompts, input_side, pixel_values, propagate_masks
+from stages.core.models.promptable import PointPrompts, PromptableSegmenter
 from stages.core.scene.scene import Scene
 from stages.segment.view_images import ViewImages
 from stages.segment.voting import voting_intrinsics
@@ -19,37 +18,41 @@ from stages.segment.voting import voting_intrinsics
 
 @dataclass(frozen=True)
 class MaskTracker:
-    """A network, and the sequence of pictures that it follows objects through."""
+    """A network together with the sequence of images through which it propagates masks."""
 
-    model: Sam2VideoModel
+    network: PromptableSegmenter
     scene: Scene
-    shown: ViewImages
+    images: ViewImages
 
     def pixels(self, row: int) -> Float[Tensor, "3 s s"]:
-        """What the network is fed of a picture."""
-        return pixel_values(self.shown.image(self.shown.views[row]), input_side(self.model))
+        """Network input for image `row` of the sequence."""
+        return self.network.preprocess(self.images.image(self.images.views[row]))
+
+    def proposals(self, row: int) -> Bool[Tensor, "m l l"]:
+        """Masks that the network proposes without prompts for image `row`."""
+        return self.network.propose_masks(self.pixels(row))
 
     def labels(
         self, prompts: Sequence[PointPrompts] | Bool[Tensor, "o l l"], start: int = 0
     ) -> Iterator[tuple[int, Int[Tensor, "h w"]]]:
-        """Each camera with its label image (1... in the order of the prompts), at the size that votes are counted at.
+        """Each camera with its label image (1... in the order of the prompts), at the resolution of voting.
 
-        `start` is the picture that the prompts are about.
+        `start` is the row of the image that the prompts refer to.
         """
-        count = len(self.shown)
-        found = propagate_masks(self.model, self.pixels, count, prompts, start)
-        for row, logits in tqdm(found, total=count, desc=f"following {len(prompts)} objects", unit="photo"):
-            view = self.shown.views[row]
+        count = len(self.images)
+        found = self.network.propagate(self.pixels, count, prompts, start)
+        for row, logits in tqdm(found, total=count, desc=f"tracking {len(prompts)} objects", unit="photo"):
+            view = self.images.views[row]
             yield view, label_image(logits, *voting_intrinsics(self.scene, view)[:2])
 
 
 def label_image(logits: Float[Tensor, "o l l"], width: int, height: int) -> Int[Tensor, "h w"]:
-    """The object whose mask is surest of each pixel, counted from 1; 0 where no logit is positive."""
+    """Number, counted from 1, of the object with the largest logit in each pixel; 0 where none is positive."""
     best, index = resize_logits(logits, width, height).max(0)
     return torch.where(best > 0, index + 1, 0)
 
 
 def resize_logits(logits: Float[Tensor, "o l l"], width: int, height: int) -> Float[Tensor, "o h w"]:
-    """From the network's square back to the proportions of the picture."""
+    """Square logits or masks of the network resized to an image's width and height."""
     size = (height, width)
     return torch.nn.functional.interpolate(logits[None].float(), size, mode="bilinear", align_corners=False)[0]

@@ -1,4 +1,4 @@
-"""Objects that nobody pointed at, with true masks, and wrong ones among them, in the place of the network's."""
+"""Discovery of objects without prompts, with mask proposals made from true labels in place of a network."""
 
 from dataclasses import dataclass, replace
 
@@ -7,17 +7,13 @@ import torch
 
 from stages.core.perception.support import find_support
 from stages.core.scene.scene import Scene
+from stages.segment.discovery import discover_objects, is_on_support, match_labels, remove_nested_masks
 from stages.segment.options import SegmentOptions
 from stages.segment.view_images import ViewImages, view_images
 from stages.segment.voting import ViewFootprint, apply_votes, collect_votes
 from tests.segment.tabletop import best_overlap, three_apart
 
-pytest.importorskip("transformers")
-from stages.core.models.sam2.mask_generation import MaskProposals  # noqa: E402
-from stages.segment import discovery  # noqa: E402
-from stages.segment.discovery import is_on_support, match_labels, remove_nested_masks  # noqa: E402
-
-SIDE = 64  # of the network's masks [px]
+SIDE = 64  # of the proposed masks [px]
 
 
 @pytest.fixture(scope="module")
@@ -25,60 +21,61 @@ def truth():
     return three_apart(noise=0.001)
 
 
-def seen(scene: Scene, view: int) -> torch.Tensor:
+@pytest.fixture(scope="module")
+def support(truth):
+    return find_support(truth)
+
+
+@pytest.fixture(scope="module")
+def true_labels(truth):
+    return [visible_objects(truth, view) for view in range(len(truth.cameras))]
+
+
+def visible_objects(scene: Scene, view: int) -> torch.Tensor:
     """The object in each pixel of a view."""
     front = ViewFootprint.of(scene, view).front
     return torch.where(front >= 0, scene.gaussians.object_id[front.clamp_min(0).long()], 0)
 
 
-def small(mask: torch.Tensor) -> torch.Tensor:
-    return torch.nn.functional.interpolate(mask[None, None].float(), (SIDE, SIDE), mode="area")[0, 0] > 0.5
+def downsample(image: torch.Tensor) -> torch.Tensor:
+    """Labels 0 to 3 at SIDE x SIDE pixels."""
+    masks = torch.stack([image == i for i in range(4)]).float()
+    small = torch.nn.functional.interpolate(masks[None], (SIDE, SIDE), mode="area")[0] > 0.5
+    return small.float().argmax(0)
 
 
 @dataclass
-class Oracle:
-    """Follows the object that most of a mask lies on, in true label images, but only through `reach` photos."""
+class OracleTracker:
+    """Proposes true and wrong masks, and tracks the true object of a mask through at most `max_distance` photos."""
 
     scene: Scene
-    shown: ViewImages
-    images: list[torch.Tensor]
-    reach: int = 100
-    model: None = None
+    images: ViewImages
+    label_images: list[torch.Tensor]
+    max_distance: int = 100
 
-    def pixels(self, row: int) -> int:
-        return row
+    def proposals(self, row: int) -> torch.Tensor:
+        """Every object, the upper half of each, the table, the whole image, and a small piece of table."""
+        ids = downsample(self.label_images[row])
+        whole = [ids == i for i in range(4)]
+        upper = torch.arange(SIDE)[:, None] < SIDE // 2
+        piece = torch.zeros(SIDE, SIDE, dtype=torch.bool)
+        piece[10:20, 30:40] = ids[10:20, 30:40] == 0
+        masks = torch.stack([piece, ids >= 0, *(mask & upper for mask in whole[1:]), *whole])
+        return masks[masks.flatten(1).any(1)]
 
     def labels(self, prompts: torch.Tensor, start: int):
-        objects = [int(small_ids(self.images[start])[mask].mode().values) for mask in prompts]
-        for row, image in enumerate(self.images):
+        objects = [int(downsample(self.label_images[start])[mask].mode().values) for mask in prompts]
+        for row, image in enumerate(self.label_images):
             out = torch.zeros_like(image)
             for number, i in enumerate(objects, start=1):
-                if abs(row - start) <= self.reach:
+                if abs(row - start) <= self.max_distance:
                     out[image == i] = number
             yield row, out
 
 
-def small_ids(image: torch.Tensor) -> torch.Tensor:
-    return torch.stack([small(image == i) for i in range(4)]).float().argmax(0)
-
-
 @pytest.fixture
-def oracle(truth, monkeypatch):
-    images = [seen(truth, view) for view in range(len(truth.cameras))]
-
-    def propose(_, row: int) -> MaskProposals:
-        """Every object, the upper half of each, the table, everything, and a speck of table."""
-        ids = small_ids(images[row])
-        wanted = [ids == i for i in range(4)]
-        upper = torch.arange(SIDE)[:, None] < SIDE // 2
-        speck = torch.zeros(SIDE, SIDE, dtype=torch.bool)
-        speck[10:20, 30:40] = ids[10:20, 30:40] == 0
-        masks = torch.stack([speck, ids >= 0, *(mask & upper for mask in wanted[1:]), *wanted])
-        masks = masks[masks.flatten(1).any(1)]
-        return MaskProposals(masks, torch.ones(len(masks)))
-
-    monkeypatch.setattr(discovery, "propose_masks", propose)
-    return Oracle(truth, view_images(truth), images)
+def oracle(truth, true_labels):
+    return OracleTracker(truth, view_images(truth), list(true_labels))
 
 
 def overlaps(truth, found) -> dict[int, float]:
@@ -87,62 +84,62 @@ def overlaps(truth, found) -> dict[int, float]:
     return best_overlap(ids, truth.gaussians.object_id)
 
 
-def test_of_all_masks_those_of_things_on_the_table_stay(oracle, truth):
-    found = discovery.discover_objects(oracle, find_support(truth), SegmentOptions())
+def test_only_masks_of_whole_objects_on_the_table_are_kept(oracle, truth, support):
+    found = discover_objects(oracle, support, SegmentOptions())
     assert max(int(labels.max()) for labels in found.values()) == 3
     assert min(overlaps(truth, found).values()) > 0.9
 
 
-def test_an_object_lost_on_the_way_is_found_again_under_its_number(oracle, truth):
-    oracle.reach = 2  # so that each photo searched finds all three anew
-    found = discovery.discover_objects(oracle, find_support(truth), SegmentOptions())
+def test_lost_object_is_found_again_under_its_number(oracle, truth, support):
+    oracle.max_distance = 2  # so that each searched photo proposes all three objects again
+    found = discover_objects(oracle, support, SegmentOptions())
     assert max(int(labels.max()) for labels in found.values()) == 3
     assert min(overlaps(truth, found).values()) > 0.9
 
 
-def test_an_object_hidden_at_first_is_found_later(oracle, truth):
-    shown = oracle.images[0]
-    oracle.images[0] = torch.where(shown == 2, 0, shown)
-    found = discovery.discover_objects(oracle, find_support(truth), SegmentOptions())
+def test_object_hidden_in_the_first_view_is_found_later(oracle, truth, support):
+    first = oracle.label_images[0]
+    oracle.label_images[0] = torch.where(first == 2, 0, first)
+    found = discover_objects(oracle, support, SegmentOptions())
     assert max(int(labels.max()) for labels in found.values()) == 3
     assert min(overlaps(truth, found).values()) > 0.9
 
 
-def test_no_more_objects_than_asked_for_and_the_largest_first(oracle, truth):
-    found = discovery.discover_objects(oracle, find_support(truth), SegmentOptions(max_objects=1))
+def test_max_objects_keeps_the_largest(oracle, support):
+    found = discover_objects(oracle, support, SegmentOptions(max_objects=1))
     assert max(int(labels.max()) for labels in found.values()) == 1
-    areas = [int((oracle.images[0] == i).sum()) for i in (1, 2, 3)]
-    mine = oracle.images[0] == 1 + areas.index(max(areas))
-    assert torch.equal(found[0] > 0, mine)
+    areas = [int((oracle.label_images[0] == i).sum()) for i in (1, 2, 3)]
+    largest = oracle.label_images[0] == 1 + areas.index(max(areas))
+    assert torch.equal(found[0] > 0, largest)
 
 
-def test_what_stands_by_hand(truth):
-    support, ids = find_support(truth), truth.gaussians.object_id
+def test_is_on_support(truth, support):
+    ids = truth.gaussians.object_id
     for i in (1, 2, 3):
         assert is_on_support(truth, torch.nonzero(ids == i)[:, 0], support, SegmentOptions())
         assert is_on_support(truth, torch.nonzero(ids == i)[:, 0], None, SegmentOptions())
     assert not is_on_support(truth, torch.nonzero(ids == 0)[:, 0], support, SegmentOptions())  # the table
     assert not is_on_support(truth, torch.nonzero(ids == 1)[:5, 0], support, SegmentOptions())  # a few pixels
     assert not is_on_support(truth, torch.nonzero(ids == 1)[:, 0], support, SegmentOptions(min_size=0.5))
-    assert not is_on_support(truth, torch.full((100,), -1), support, SegmentOptions())  # nothing is drawn there
+    assert not is_on_support(truth, torch.full((100,), -1), support, SegmentOptions())  # empty pixels
     lifted = truth.gaussians.means + torch.tensor([0, 0, 0.6]) * (ids == 1)[:, None]
     high = replace(truth, gaussians=replace(truth.gaussians, means=lifted))
     assert not is_on_support(high, torch.nonzero(ids == 1)[:, 0], support, SegmentOptions())
 
 
-def test_parts_go_wholes_stay():
+def test_masks_inside_larger_ones_are_removed():
     masks = torch.zeros(4, 1, 20, dtype=torch.bool)
-    masks[0, 0, :3] = True  # within the next
+    masks[0, 0, :3] = True  # inside the next
     masks[1, 0, :10] = True
-    masks[2, 0, 8:12] = True  # half of it
-    masks[3, 0, 8:13] = True  # two fifths, and the one above lies in it
+    masks[2, 0, 8:12] = True  # half inside it
+    masks[3, 0, 8:13] = True  # two fifths, and the one above lies inside this one
     assert torch.equal(remove_nested_masks(masks), masks[[1, 3]])
     assert remove_nested_masks(masks[:0]).shape == (0, 1, 20)
 
 
-def test_numbers_of_new_labels_by_hand():
+def test_numbers_of_new_labels():
     old = {0: torch.tensor([[1, 1, 2, 2, 0, 0]]), 1: torch.tensor([[0, 0, 0, 0, 0, 0]])}
     fresh = {0: torch.tensor([[2, 2, 0, 0, 1, 1]]), 1: torch.tensor([[2, 2, 2, 2, 2, 3]])}
-    # the second lies on object 1 in the one photo that shows both; the others are new
+    # the second covers object 1 in the one photo that shows both; the others are new
     assert match_labels(fresh, old, new=3, count=2).tolist() == [0, 3, 1, 4]
     assert match_labels(fresh, {}, new=3, count=0).tolist() == [0, 1, 2, 3]

@@ -11,6 +11,7 @@ from stages.core.scene.images import write_png
 from stages.core.scene.scene_ply import read_scene
 from stages.segment import sam2
 from stages.segment.options import SegmentOptions
+from stages.segment.prompted import point_prompts
 from stages.segment.prompts import read_prompts
 from stages.segment.stage import run
 from stages.segment.view_images import render_view, view_images
@@ -85,10 +86,10 @@ def test_some_photos_may_be_missing_but_not_the_prompted_one(scene_file, truth, 
 def test_without_prompts_a_network_that_is_sure_of_nothing_finds_no_objects(
     scene_file, weights, tmp_path, caplog, monkeypatch
 ):
+    from stages.core.models.sam2 import segmenter
     from stages.core.models.sam2.mask_generation import MaskGenerationOptions, propose_masks
-    from stages.segment import discovery
 
-    monkeypatch.setattr(discovery, "propose_masks", partial(propose_masks, options=MaskGenerationOptions(grid=4)))
+    monkeypatch.setattr(segmenter, "propose_masks", partial(propose_masks, options=MaskGenerationOptions(grid=4)))
     run(scene_file, tmp_path / "out.ply", SegmentOptions("sam2", weights=weights))
     assert read_scene(tmp_path / "out.ply").objects == ()
     assert "no objects were found" in caplog.text
@@ -140,7 +141,7 @@ def test_points_are_for_sam2_alone(scene_file, tmp_path):
 
 
 def test_what_the_network_is_told_lies_where_the_user_pointed(truth, tmp_path):
-    box, point = (sam2.point_prompts(read_prompts(prompts_file(tmp_path / "p.json", **p)), truth)[0]
+    box, point = (point_prompts(read_prompts(prompts_file(tmp_path / "p.json", **p)), truth)[0]
                   for p in (BOXES, POINTS))  # fmt: skip
     torch.testing.assert_close(box.points, torch.tensor([[10 / 160, 20 / 160], [60 / 160, 90 / 160]]))
     torch.testing.assert_close(point.points, torch.tensor([[40 / 160, 60 / 160]]))

@@ -21,9 +21,8 @@ from jaxtyping import Int
 from torch import Tensor
 from tqdm import tqdm
 
-from stages.core.backends import pick_device
+from stages.core.backends import choose, load
 from stages.core.errors import InputError
-from stages.core.models.sam2 import weights as sam2_weights
 from stages.core.scene.files import replacing
 from stages.core.scene.scene import Scene
 from stages.lab.assets.tabletops import ARRANGEMENTS, tabletop
@@ -31,9 +30,7 @@ from stages.lab.bench import common as bench
 from stages.lab.bench.reconstructed_scene import reconstruct_from_renders, visible_labels
 from stages.segment.boxes import segment as boxes_segment
 from stages.segment.geometric import segment
-from stages.segment.options import SegmentOptions
-from stages.segment.sam2 import segment_views
-from stages.segment.view_images import view_images
+from stages.segment.options import BACKENDS, SegmentOptions
 from stages.segment.voting import ViewFootprint, add_votes, apply_votes, damp_votes
 
 ERROR_RATES = (0.0, 0.2, 0.4)  # of each photo's objects and pixels
@@ -129,20 +126,40 @@ def segment_by_boxes(scene: Scene, truth: Int[Tensor, "n"]) -> Int[Tensor, "n"]:
         return boxes_segment(scene, SegmentOptions(boxes=prompts)).gaussians.object_id
 
 
-def segment_by_sam2(scene: Scene, model) -> Int[Tensor, "n"]:
-    """Object numbers that SAM 2.1 gives, without prompts, from drawings of the scene."""
-    return segment_views(scene, model, view_images(scene), None, SegmentOptions("sam2")).gaussians.object_id
+def segment_by_network(scene: Scene, name: str, options: SegmentBenchOptions) -> Int[Tensor, "n"]:
+    """Object ids of a network backend, without prompts, from rendered views of the scene."""
+    chosen = SegmentOptions(backend=name, weights=options.weights, device=options.device)
+    return choose(BACKENDS, name)(scene, chosen).gaussians.object_id
 
 
-def measure(kind: str, index: int, photos: int, model=None) -> list[dict]:
+def available_networks(options: SegmentBenchOptions) -> tuple[list[str], list[str]]:
+    """Names of the network backends whose weights are present, and a message for each of the others.
+
+    Raises InputError where weights were given that no backend accepts.
+    """
+    found, absent = [], []
+    for name, row in BACKENDS.items():
+        if not row.find_weights:
+            continue
+        try:
+            load(row.find_weights)(options.weights)
+            found.append(name)
+        except InputError as error:
+            absent.append(f"without {name}: {error}")
+    if options.weights is not None and not found:
+        raise InputError(absent[0].partition(": ")[2])
+    return found, absent
+
+
+def measure(kind: str, index: int, networks: list[str], options: SegmentBenchOptions) -> list[dict]:
     """Overlaps with each object of a scene, for every way to find them, and the seconds each took after its masks."""
-    scene = tabletop(kind, index, photos)
+    scene = tabletop(kind, index, options.photos)
     truth = scene.gaussians.object_id
     blank = replace(scene, gaussians=replace(scene.gaussians, object_id=torch.zeros_like(truth)), objects=())
     ways = {"geometric": lambda: segment(blank, SegmentOptions()).gaussians.object_id,
             "boxes": lambda: segment_by_boxes(blank, truth), **segment_by_masks(blank, truth, index)}  # fmt: skip
-    if model is not None:
-        ways["sam2"] = lambda: segment_by_sam2(blank, model)
+    for name in networks:
+        ways[name] = lambda name=name: segment_by_network(blank, name, options)
     rows = []
     for way, find in ways.items():
         start = time.perf_counter()
@@ -177,17 +194,12 @@ def _row(kind: str, index: int, way: str, scene: Scene, found: Tensor, truth: Te
 def run(out: Path | None = None, options: SegmentBenchOptions = SegmentBenchOptions()) -> Iterator[str]:  # noqa: B008 -- frozen
     """Lines of the report; all numbers as JSON in `out`."""
     yield bench.machine("cpu")
-    try:
-        model = sam2_weights.load(sam2_weights.find(options.weights), pick_device(options.device))
-    except InputError as error:
-        if options.weights is not None:
-            raise
-        model = None
-        yield f"without sam2: {error}"
+    networks, absent = available_networks(options)
+    yield from absent
     rows = []
     for kind in ARRANGEMENTS:
         for i in tqdm(range(options.scenes), desc=kind, unit="scene"):
-            rows += measure(kind, i, options.photos, model)
+            rows += measure(kind, i, networks, options)
             rows += [measure_reconstructed(kind, i, options.photos)] if options.reconstruct else []
             for row in rows[-len({r["way"] for r in rows}) :]:
                 listed = ", ".join(f"{n} {v:.2f}" for n, v in row["iou"].items())

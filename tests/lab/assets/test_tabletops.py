@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -125,20 +126,19 @@ def test_where_no_photo_can_be_placed_nothing_is_found(monkeypatch):
     assert row["placed"] == 0 and row["mean"] == 0.0 and len(row["iou"]) == OBJECTS_PER_SCENE
 
 
-def test_sam2_takes_part_where_its_weights_are(tmp_path, monkeypatch):
+def test_network_backends_with_weights_take_part(tmp_path, monkeypatch):
     pytest.importorskip("transformers")
-    from stages.core.models.sam2 import mask_generation, weights
+    from stages.core.models.sam2 import mask_generation, segmenter
     from stages.segment import discovery
     from tests.core.models.sam2.tiny import saved
 
-    few = mask_generation.MaskGenerationOptions(grid=2, iou=-9.0, stability=0.0)
-    monkeypatch.setattr(
-        discovery, "propose_masks", lambda model, pixels: mask_generation.propose_masks(model, pixels, few)
-    )
-    monkeypatch.setattr(discovery, "LOOKS", 1)
-    scene = three_apart()
-    found = bench_segment.segment_by_sam2(scene, weights.load(weights.find(saved(tmp_path))))
-    assert found.shape == scene.gaussians.object_id.shape  # which objects, only real weights know
+    few = mask_generation.MaskGenerationOptions(grid=2, min_iou=-9.0, min_stability=0.0)
+    monkeypatch.setattr(segmenter, "propose_masks", partial(mask_generation.propose_masks, options=few))
+    monkeypatch.setattr(discovery, "SEARCHED_VIEWS", 1)
+    scene, options = three_apart(), bench_segment.SegmentBenchOptions(weights=saved(tmp_path))
+    assert bench_segment.available_networks(options) == (["sam2"], [])
+    found = bench_segment.segment_by_network(scene, "sam2", options)
+    assert found.shape == scene.gaussians.object_id.shape  # the network is random, so its objects are arbitrary
 
 
 def test_masks_are_as_wrong_as_asked():

@@ -1,4 +1,4 @@
-"""Masks of whatever is in a photo, without a word or a click: a grid of clicks, and the masks that are sure.
+"""Automatic mask generation: masks of a photo from a regular grid of point prompts, filtered by predicted quality.
 
 Source: Kirillov et al. 2023, "Segment Anything", section 5 and appendix B; thresholds as published with SAM 2.
 """
@@ -12,23 +12,24 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from transformers import Sam2VideoModel
 
-from stages.core.models.sam2.network import INSIDE, input_side
+from stages.core.models.promptable import FOREGROUND_POINT
+from stages.core.models.sam2.network import input_side
 
 
 @dataclass(frozen=True)
 class MaskGenerationOptions:
-    """How many clicks, and what a mask must reach."""
+    """Density of the point grid and the quality thresholds of masks."""
 
-    grid: int = 16  # clicks along each side; published is 32, but here several photos are asked about one scene
-    at_once: int = 16  # clicks decoded together, each in about 30 MB
-    iou: float = 0.8  # that the network itself predicts for the mask
-    stability: float = 0.95  # overlap of the mask drawn tighter and drawn looser
-    same: float = 0.7  # masks that overlap more than this are one
+    grid: int = 16  # points along each side; published is 32, but here several photos of one scene are searched
+    batch: int = 16  # points decoded together, about 30 MB each
+    min_iou: float = 0.8  # intersection over union that the network predicts for the mask
+    min_stability: float = 0.95  # intersection over union of the mask at a higher and at a lower threshold
+    max_iou: float = 0.7  # masks that overlap more than this are duplicates
 
 
 @dataclass(frozen=True)
 class MaskProposals:
-    """Masks that may be objects or parts of them, the surest first."""
+    """Candidate masks of objects or parts of objects, highest score first."""
 
     masks: Bool[Tensor, "m l l"]
     scores: Float[Tensor, "m"]  # predicted intersection over union
@@ -38,46 +39,47 @@ class MaskProposals:
 def propose_masks(
     model: Sam2VideoModel, pixels: Float[Tensor, "3 s s"], options: Automatic = MaskGenerationOptions()  # noqa: B008 -- frozen
 ) -> MaskProposals:
-    """Masks of a photo, at a quarter of the network's size; each click gives up to three: a thing, its part, its whole.
+    """Masks of a photo, at a quarter of the network's input size; each point gives up to three, of different extent.
 
-    Memory is that of `at_once` clicks, and a byte a pixel of each mask that is kept.
+    Peak memory is that of `batch` points, plus 1 byte per pixel of each mask that is kept.
     """
     embeddings = model.get_image_embeddings(pixels[None].to(model.device))
-    where = model.get_image_wide_positional_embeddings()
+    position = model.get_image_wide_positional_embeddings()
     masks, scores = [], []
-    for clicks in _grid(options.grid).split(options.at_once):
-        points = clicks[None, :, None].to(model.device) * input_side(model)
-        labels = torch.full(points.shape[:-1], INSIDE, dtype=torch.int32, device=model.device)
+    for grid_points in _grid(options.grid).split(options.batch):
+        points = grid_points[None, :, None].to(model.device) * input_side(model)
+        labels = torch.full(points.shape[:-1], FOREGROUND_POINT, dtype=torch.int32, device=model.device)
         sparse, dense = model.get_prompt_embeddings(points, labels)
         logits, predicted, _, _ = model.mask_decoder(
-            image_embeddings=embeddings[-1], image_positional_embeddings=where, sparse_prompt_embeddings=sparse,
+            image_embeddings=embeddings[-1], image_positional_embeddings=position, sparse_prompt_embeddings=sparse,
             dense_prompt_embeddings=dense, multimask_output=True, high_resolution_features=embeddings[:-1],
         )  # fmt: skip
         logits, predicted = logits.flatten(0, 2).float(), predicted.flatten().float()
-        sure = (predicted >= options.iou) & (mask_stability(logits) >= options.stability)
-        masks.append((logits[sure] > 0).cpu())
-        scores.append(predicted[sure].cpu())
+        good = (predicted >= options.min_iou) & (mask_stability(logits) >= options.min_stability)
+        masks.append((logits[good] > 0).cpu())
+        scores.append(predicted[good].cpu())
     masks, scores = torch.cat(masks), torch.cat(scores)
-    kept = suppress_duplicates(masks, scores, options.same)
+    kept = suppress_duplicates(masks, scores, options.max_iou)
     return MaskProposals(masks[kept], scores[kept])
 
 
 def _grid(side: int) -> Float[Tensor, "k 2"]:
-    """Points x, y in the middles of side x side equal cells [share of the photo]."""
+    """Centres x, y of side x side equal cells, as fractions of the photo."""
     middles = (torch.arange(side) + 0.5) / side
     return torch.stack(torch.meshgrid(middles, middles, indexing="xy"), -1).reshape(-1, 2)
 
 
 def mask_stability(logits: Float[Tensor, "m h w"], offset: float = 1.0) -> Float[Tensor, "m"]:
-    """Intersection over union of each mask cut at `offset` above and below its border; 0 for an empty one."""
+    """Intersection over union of each mask thresholded at +`offset` and at -`offset`; 0 for an empty mask."""
     inner, outer = (logits > offset).sum((1, 2)), (logits > -offset).sum((1, 2))
     return inner / outer.clamp_min(1)
 
 
-def suppress_duplicates(masks: Bool[Tensor, "m h w"], scores: Float[Tensor, "m"], same: float) -> Int[Tensor, "k"]:
-    """Non-maximum suppression: indices, best score first, of masks that overlap no better one by more than `same`.
+def suppress_duplicates(masks: Bool[Tensor, "m h w"], scores: Float[Tensor, "m"], max_iou: float) -> Int[Tensor, "k"]:
+    """Non-maximum suppression: indices, best score first, of masks whose IoU with each better one is at most `max_iou`.
 
-    Masks themselves are compared, not the boxes around them, so a ring and what lies in it both stay.
+    Masks are compared, not their bounding boxes, so that a ring and an object inside it both remain. Empty masks are
+    dropped.
     """
     flat = masks.flatten(1)
     areas = flat.sum(1)
@@ -85,7 +87,7 @@ def suppress_duplicates(masks: Bool[Tensor, "m h w"], scores: Float[Tensor, "m"]
     for i in scores.argsort(descending=True, stable=True).tolist():
         if kept:
             shared = (flat[kept] & flat[i]).sum(1)
-            if bool((shared > same * (areas[kept] + areas[i] - shared)).any()):
+            if bool((shared > max_iou * (areas[kept] + areas[i] - shared)).any()):
                 continue
         if areas[i]:
             kept.append(i)

@@ -1,43 +1,26 @@
-"""Feeding SAM 2.1: photos to pixel values, prompts to masks, masks of one photo to masks of all of a sequence."""
+"""Running SAM 2.1: photos to pixel values, and prompts in one photo to masks in all photos of a sequence."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 from transformers import Sam2VideoInferenceSession, Sam2VideoModel
 
+from stages.core.models.promptable import PointPrompts
+
 MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet, as published in preprocessor_config.json
-OUTSIDE, INSIDE, CORNER, OPPOSITE = 0, 1, 2, 3  # what a click may say; a box is its two corners
-
-
-@dataclass(frozen=True)
-class PointPrompts:
-    """What points at one object in one photo."""
-
-    points: Float[Tensor, "k 2"]  # x, y [share of the photo's width and height]
-    labels: Int[Tensor, "k"]  # OUTSIDE or INSIDE; CORNER and OPPOSITE
-
-    @classmethod
-    def box(cls, corners: Float[Tensor, "4"]) -> PointPrompts:
-        """A box x0 y0 x1 y1 around the object."""
-        return cls(corners.reshape(2, 2), torch.tensor([CORNER, OPPOSITE]))
-
-    @classmethod
-    def inside(cls, point: Float[Tensor, "2"]) -> PointPrompts:
-        return cls(point[None], torch.tensor([INSIDE]))
 
 
 def input_side(model: Sam2VideoModel) -> int:
-    """Width and height of the images that the network takes [px]: 1024 for those published."""
+    """Width and height of the network's input image [px]: 1024 for the published networks."""
     return int(model.prompt_encoder.input_image_size)
 
 
 def pixel_values(image: Float[Tensor, "h w 3"], side: int) -> Float[Tensor, "3 s s"]:
-    """A photo as the network was trained on: squeezed to a square with antialiasing, and normalised."""
+    """Network input for a photo: resized to a square with antialiasing, then normalised by MEAN and STD."""
     square = torch.nn.functional.interpolate(
         image.permute(2, 0, 1)[None], (side, side), mode="bilinear", align_corners=False, antialias=True
     )[0]
@@ -45,7 +28,7 @@ def pixel_values(image: Float[Tensor, "h w 3"], side: int) -> Float[Tensor, "3 s
 
 
 class StreamingSession(Sam2VideoInferenceSession):
-    """A sequence of photos that are read when their turn comes, and a memory that does not grow with their number."""
+    """Inference session that loads frames on demand and whose memory does not grow with their number."""
 
     def __init__(self, frame: Callable[[int], Float[Tensor, "3 s s"]], count: int, device: torch.device):
         super().__init__(inference_device=device, inference_state_device=device, dtype=torch.float32)
@@ -53,20 +36,23 @@ class StreamingSession(Sam2VideoInferenceSession):
 
     @property
     def num_frames(self) -> int:
+        """Number of frames of the sequence."""
         return self._count
 
     def get_frame(self, frame_idx: int) -> Float[Tensor, "3 s s"]:
+        """Pixel values of a frame, on the inference device."""
         return self._frame(frame_idx).to(self.inference_device)
 
-    def forget(self, now: int, start: int, memories: int, pointers: int) -> None:
-        """Drop what no later frame looks at.
+    def release(self, now: int, start: int, memories: int, pointers: int) -> None:
+        """Delete the outputs that no later frame attends to.
 
-        The network attends to the prompted frame `start`, to the memories of the last `memories` frames and to the
-        object pointers of the last `pointers`, counted from the frame it is at, and on its way back from `start`.
+        The network attends to the prompted frame `start`, to the memory features of the last `memories` frames and
+        to the object pointers of the last `pointers` frames, counted from the current frame `now`, and on the
+        backward pass from `start`.
         """
         for outputs in self.output_dict_per_obj.values():
             for kept in (*outputs["cond_frame_outputs"].values(), *outputs["non_cond_frame_outputs"].values()):
-                kept.pop("high_res_masks", None)  # 4 MB each, and read only while their frame is at work
+                kept.pop("high_res_masks", None)  # 4 MB each, and read only while their frame is processed
             tracked = outputs["non_cond_frame_outputs"]
             for t in list(tracked):
                 age = min(abs(t - now), abs(t - start))
@@ -85,29 +71,30 @@ def propagate_masks(
     prompts: Sequence[PointPrompts] | Bool[Tensor, "o h w"],
     start: int = 0,
 ) -> Iterator[tuple[int, Float[Tensor, "o l l"]]]:
-    """Logits of the objects' masks, positive inside, in every photo of a sequence, at a quarter of the network's size.
+    """Mask logits of the objects, positive inside, for each photo, at a quarter of the network's input size.
 
-    `prompts` show the objects in photo `start`, by clicks or by masks; from there memory attention carries them
-    forwards to the end, then backwards to the first. `frame` gives the pixel values of a photo and is asked for each
-    of the `count` once.
+    `prompts` mark the objects in photo `start`, by points or by masks; memory attention propagates them forwards to
+    the last photo, then backwards to the first. `frame` returns the pixel values of a photo and is called once for
+    each of the `count` photos.
     """
     session = StreamingSession(frame, count, model.device)
     for number, prompt in enumerate(prompts):
         row = session.obj_id_to_idx(number)
         if isinstance(prompt, PointPrompts):
             points = prompt.points * input_side(model)
-            clicks = {"point_coords": points[None, None].float(), "point_labels": prompt.labels[None, None].int()}
-            session.add_point_inputs(row, start, clicks)
+            inputs = {"point_coords": points[None, None].float(), "point_labels": prompt.labels[None, None].int()}
+            session.add_point_inputs(row, start, inputs)
         else:
             session.add_mask_inputs(row, start, _enlarged(prompt, input_side(model)))
     session.obj_with_new_inputs = list(session.obj_ids)
     memories, pointers = model.config.num_maskmem, model.config.max_object_pointers_in_encoder
     for now in [*range(start, count), *range(start - 1, -1, -1)]:
         masks = model(inference_session=session, frame_idx=now, reverse=now < start).pred_masks
-        session.forget(now, start, memories, pointers)
+        session.release(now, start, memories, pointers)
         yield now, masks[:, 0].float().cpu().clone()
 
 
 def _enlarged(mask: Bool[Tensor, "h w"], side: int) -> Float[Tensor, "1 1 s s"]:
+    """A mask resized to the network's input size."""
     size = {"size": (side, side), "mode": "bilinear", "align_corners": False, "antialias": True}
     return (torch.nn.functional.interpolate(mask[None, None].float(), **size) >= 0.5).float()

@@ -1,4 +1,4 @@
-"""The published weights of SAM 2.1: find, fetch when told to, and load. Transformers is imported when they load."""
+"""Published weights of SAM 2.1: find, download on request, load. Transformers is imported only to load them."""
 
 from __future__ import annotations
 
@@ -14,14 +14,15 @@ if TYPE_CHECKING:
     from transformers import Sam2VideoModel
 
 SOURCE = HubSource("facebook/sam2.1-hiera-large", "0.9 GB", "Apache-2.0")
-SMALLEST = "facebook/sam2.1-hiera-tiny"  # 0.16 GB, and several times quicker; any size of SAM 2.1 will do
+SMALLEST = "facebook/sam2.1-hiera-tiny"  # 0.16 GB and several times faster; every size of SAM 2.1 works
 FILES = ("config.json", "model.safetensors")
 
 
 def find(given: Path | None = None) -> Path:
-    """The file with the weights, its config.json beside it: the one given, or model.safetensors of a folder.
+    """Path of the weights: the file `given`, or model.safetensors in the folder `given`, with config.json beside it.
 
-    Without `given`, the folder sam2/ is looked for in $NGFF_WEIGHTS and in the user's cache.
+    Without `given`, the folder sam2/ is searched in $NGFF_WEIGHTS and in the user's cache. Raises InputError, naming
+    the download, where the files are missing.
     """
     if given is not None and not Path(given).is_dir():
         must_exist(given, "the weights of SAM 2.1 (model.safetensors)")
@@ -33,13 +34,13 @@ def find(given: Path | None = None) -> Path:
             return place / FILES[1]
     raise InputError(
         f"sam2: no {' with '.join(FILES)} in {' or '.join(str(p) for p in places)}; fetch both from "
-        f"https://huggingface.co/{SOURCE.repository} ({SOURCE.size}, licence {SOURCE.licence}; {SMALLEST} is quicker "
+        f"https://huggingface.co/{SOURCE.repository} ({SOURCE.size}, licence {SOURCE.licence}; {SMALLEST} is faster "
         f"on a CPU) into {places[0]}, name their folder with --weights, or add --download"
     )
 
 
 def download() -> Path:
-    """Fetch config and weights of the large network into sam2/ of the first folder searched; returns the weights."""
+    """Download config and weights of the large network into sam2/ of the first folder searched; returns the weights."""
     folder = folders()[0] / "sam2"
     return fetch(SOURCE, folder, _choose, f"put {' and '.join(FILES)} in {folder}")[1]
 
@@ -52,7 +53,7 @@ def _choose(files: list) -> list:
 
 
 def load(path: Path, device: str = "cpu") -> Sam2VideoModel:
-    """The network with the weights of a file, of the size that the config.json beside it says, 32 bit, for inference.
+    """The network with the weights of a file and the architecture of the config.json beside it; float32, eval mode.
 
     Raises InputError where transformers is absent or older than SAM 2, and for files that are damaged, incomplete or
     of another network.
@@ -65,7 +66,7 @@ def load(path: Path, device: str = "cpu") -> Sam2VideoModel:
     config = _config(Sam2VideoConfig, Path(path).with_name("config.json"))
     reports.disable_progress_bar()
     level = reports.get_verbosity()
-    reports.set_verbosity_error()  # what does not fit is said below, in one sentence
+    reports.set_verbosity_error()  # mismatches are reported below, in one sentence
     try:
         model, found = Sam2VideoModel.from_pretrained(
             None, config=config, state_dict=read_state(path), output_loading_info=True
@@ -86,7 +87,7 @@ def _config(kind: type, file: Path):
         if data.get("model_type") != kind.model_type:
             raise ValueError(f"model_type {data.get('model_type')!r} instead of {kind.model_type!r}")
         return kind.from_dict(data)
-    except Exception as error:  # each release checks in its own way, and raises its own
+    except Exception as error:  # each release of transformers raises other types
         raise InputError(f"{file}: does not describe SAM 2.1 ({' '.join(str(error).split())[:120]}); use the one "
                          f"published with the weights, as in {SOURCE.repository}") from error  # fmt: skip
 

@@ -25,14 +25,15 @@ def test_masks_are_those_of_the_image_model_with_the_same_weights():
     with torch.no_grad():
         theirs = image(pixel_values=pixels[None], input_points=points[None, :, None],
                        input_labels=torch.ones(1, 16, 1, dtype=torch.int32), multimask_output=True)  # fmt: skip
-    every = MaskGenerationOptions(grid=4, at_once=5, iou=-9.0, stability=0.0, same=1.0)
+    every = MaskGenerationOptions(grid=4, batch=5, min_iou=-9.0, min_stability=0.0, max_iou=1.0)
     mine = propose_masks(video, pixels, every)
     masks, scores = theirs.pred_masks.flatten(0, 2) > 0, theirs.iou_scores.flatten()
     order = suppress_duplicates(masks, scores, 1.0)
     assert len(order) > 10 and torch.equal(mine.masks, masks[order])
     torch.testing.assert_close(mine.scores, scores[order], rtol=1e-5, atol=1e-5)
     median = float(scores.median())
-    some = propose_masks(video, pixels, MaskGenerationOptions(grid=4, at_once=16, iou=median, stability=0.0, same=1.0))
+    few = MaskGenerationOptions(grid=4, batch=16, min_iou=median, min_stability=0.0, max_iou=1.0)
+    some = propose_masks(video, pixels, few)
     assert 0 < len(some.masks) < len(mine.masks) and float(some.scores.min()) >= median
 
 

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 import torch
 
+from stages.core.models.promptable import PointPrompts
 from stages.core.models.sam2 import network
-from stages.core.models.sam2.network import PointPrompts, StreamingSession, pixel_values, propagate_masks
+from stages.core.models.sam2.network import StreamingSession, pixel_values, propagate_masks
 from tests.core.models.sam2.tiny import SIDE, random_model
 
 COUNT, START = 13, 4

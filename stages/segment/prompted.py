@@ -1,0 +1,60 @@
+"""Segmentation by a promptable network: masks from boxes, points or automatically, propagated through all photos."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+
+import torch
+
+from stages.core.backends import pick_device
+from stages.core.errors import InputError
+from stages.core.models.promptable import PointPrompts, PromptableSegmenter
+from stages.core.perception.grouping import name_objects
+from stages.core.perception.support import find_support
+from stages.core.scene.scene import Scene
+from stages.segment.discovery import discover_objects
+from stages.segment.options import SegmentOptions
+from stages.segment.prompts import ObjectPrompts, read_prompts
+from stages.segment.propagation import MaskTracker
+from stages.segment.view_images import view_images
+from stages.segment.voting import apply_votes, collect_votes
+
+log = logging.getLogger(__name__)
+
+
+def segment_with(
+    load: Callable[[SegmentOptions, str], PromptableSegmenter], scene: Scene, options: SegmentOptions
+) -> Scene:
+    """Objects marked by the prompts in the first view, or, without prompts, the objects on the table.
+
+    `load` returns the network for (options, device); it is called once the inputs have been checked. The network is
+    run on the photos, or, without --photos, on the scene rendered from its cameras. Raises InputError for a scene
+    without cameras and for photos without the one that the prompts refer to.
+    """
+    name = options.backend
+    if scene.cameras is None or not len(scene.cameras):
+        raise InputError(f"--backend {name}: the scene has no cameras; use one that `ngff reconstruct` wrote")
+    images = view_images(scene, options.photos)
+    prompts = read_prompts(options.boxes, scene.cameras.sizes[0].tolist()) if options.boxes is not None else None
+    if prompts is not None and images.views[0] != 0:
+        raise InputError(f"{options.photos}: lacks {scene.cameras.names[0]}, the photo that --boxes is about")
+    network = load(options, pick_device(options.device))
+    log.info("%s: %d %s", name, len(images), "photos" if options.photos else "rendered views of the scene: no --photos")
+    tracker = MaskTracker(network, scene, images)
+    if prompts is not None:
+        votes = collect_votes(scene, tracker.labels(point_prompts(prompts, scene)))
+        return apply_votes(scene, votes, dict(enumerate(prompts.names, start=1)), name, options.seed)
+    support = find_support(scene, seed=options.seed)
+    found = discover_objects(tracker, support, options)
+    if not any(bool(labels.any()) for labels in found.values()):
+        return scene
+    return name_objects(apply_votes(scene, collect_votes(scene, found.items()), {}, name, options.seed), support)
+
+
+def point_prompts(prompts: ObjectPrompts, scene: Scene) -> list[PointPrompts]:
+    """Prompts as fractions of the first view: a box for each object, or a point where there are no boxes."""
+    size = scene.cameras.sizes[0].float()
+    if prompts.boxes is not None:
+        return [PointPrompts.box(box / torch.cat([size, size])) for box in prompts.boxes]
+    return [PointPrompts.inside(point / size) for point in prompts.points]

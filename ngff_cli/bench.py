@@ -1,233 +1,271 @@
-"""`ngff-lab bench`: how good and how fast things are, beside a peer in the same run."""
+"""`ngff-lab bench`: quality and speed, each compared with a baseline measured in the same run."""
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from ngff_cli.options import Commands, Device, Seed
+from ngff_cli.options import AsJson, CommandGroup, Device, Seed, print_results
 from stages.core.errors import InputError
 
-app = typer.Typer(cls=Commands, no_args_is_help=True, rich_markup_mode=None)
+app = typer.Typer(cls=CommandGroup, no_args_is_help=True, rich_markup_mode=None)
+
+Out = Annotated[Path | None, typer.Option("-o", "--out", help="JSON file to write the results to")]
+Holdout = Annotated[int, typer.Option(help="hold out every N-th photo")]
+Compiled = Annotated[bool, typer.Option("--compiled", help="compile the training step first; for GPUs")]
 
 
 @app.callback()
 def _bench() -> None:
-    """Measure beside a peer in the same run."""
+    """Run a benchmark; each compares with a baseline in the same run."""
 
 
 @app.command("mpm")
 def bench_mpm(
     device: Device = "auto",
-    particles: Annotated[list[int], typer.Option(help="particles a scene; may be repeated")] = [6_144, 20_000, 250_000],  # noqa: B006
-    scenes: Annotated[int, typer.Option(help="scenes a batch; 0: what suits the device")] = 0,
+    particles: Annotated[list[int], typer.Option(help="particles per scene; repeatable")] = [6_144, 20_000, 250_000],  # noqa: B006
+    scenes: Annotated[int, typer.Option(help="scenes per batch; 0: chosen for the device")] = 0,
     frames: Annotated[int, typer.Option(help="frames of 200 substeps to time")] = 10,
+    out: Out = None,
+    as_json: AsJson = False,
 ) -> None:
-    """The MPM solver: time a substep, scenes a minute, and the plain three-kernel form."""
+    """MPM solver: time per substep and scenes per minute, compared with the unfused three-kernel solver."""
     from stages.lab.bench.mpm import MpmBenchOptions, run
 
-    for line in run(MpmBenchOptions(device, tuple(particles), scenes, frames)):
-        print(line, flush=True)
+    options = MpmBenchOptions(device=device, particles=tuple(particles), scenes=scenes, frames=frames)
+    print_results(lambda path: run(options, path), out, as_json)
 
 
 @app.command("raster")
 def bench_raster(
-    out: Annotated[Path | None, typer.Option("-o", "--out", help="the numbers as JSON")] = None,
+    out: Out = None,
     repeat: Annotated[int, typer.Option(help="timed calls of each; the fastest counts")] = 15,
-    shrink: Annotated[int, typer.Option(help="divide Gaussians and pixels by this, for a quick look")] = 1,
+    shrink: Annotated[int, typer.Option(help="divide the numbers of Gaussians and pixels by this factor")] = 1,
+    as_json: AsJson = False,
 ) -> None:
-    """The CPU rasteriser: frames a second and time on one thread, beside one thread a pixel."""
+    """CPU rasteriser: frames per second and time on one thread, compared with a per-pixel rasteriser."""
     from stages.lab.bench.raster import RasterBenchOptions, run
 
-    for line in run(out, RasterBenchOptions(repeat, shrink)):
-        print(line, flush=True)
+    options = RasterBenchOptions(repeat=repeat, shrink=shrink)
+    print_results(lambda path: run(path, options), out, as_json)
 
 
 @app.command("reconstruct")
 def bench_reconstruct(
     sets: Annotated[list[Path], typer.Argument(metavar="PHOTOSET...", help="folders with images/ and cameras.json")],
-    out: Annotated[Path, typer.Option("-o", "--out", help="the results as JSON, added to what is there")] = Path(
-        "reconstruct.json"
-    ),
-    quality: Annotated[str, typer.Option(help="of the reconstruction")] = "normal",
-    holdout: Annotated[int, typer.Option(help="keep every N-th photo out")] = 8,
+    out: Annotated[
+        Path, typer.Option("-o", "--out", help="JSON file of results; existing ones are kept")
+    ] = Path("reconstruct.json"),
+    quality: Annotated[str, typer.Option(help="quality of the reconstruction")] = "normal",
+    holdout: Holdout = 8,
     device: Device = "auto",
-    matcher: Annotated[str, typer.Option(help="of photos: sift or aliked-lightglue")] = "sift",
-    cameras: Annotated[bool, typer.Option("--cameras", help="end with the cameras, to compare matchers")] = False,
+    matcher: Annotated[str, typer.Option(help="features matched between photos: sift | aliked-lightglue")] = "sift",
+    cameras: Annotated[
+        bool, typer.Option("--cameras", help="stop after the cameras are estimated, to compare matchers")
+    ] = False,
+    as_json: AsJson = False,
 ) -> None:
-    """Photos to Gaussians: cameras against reference cameras, photos kept out, time and memory."""
+    """Reconstruction: camera errors against reference cameras, PSNR of held-out photos, time and memory."""
     from stages.lab.bench.reconstruct import ReconstructBenchOptions, run
 
-    for line in run(sets, out, ReconstructBenchOptions(quality, holdout, device, matcher, cameras)):
-        print(line, flush=True)
+    options = ReconstructBenchOptions(
+        quality=quality, holdout=holdout, device=device, matcher=matcher, cameras=cameras
+    )
+    print_results(lambda path: run(sets, path, options), out, as_json)
 
 
 @app.command("appearance")
 def bench_appearance(
     sets: Annotated[list[Path], typer.Argument(metavar="PHOTOSET...", help="folders of photos, or with images/")],
-    out: Annotated[Path, typer.Option("-o", "--out", help="the results as JSON, added to what is there")] = Path(
-        "appearance.json"
-    ),
-    quality: Annotated[str, typer.Option(help="of the reconstruction")] = "high",
-    holdout: Annotated[int, typer.Option(help="keep every N-th photo out")] = 8,
+    out: Annotated[
+        Path, typer.Option("-o", "--out", help="JSON file of results; existing ones are kept")
+    ] = Path("appearance.json"),
+    quality: Annotated[str, typer.Option(help="quality of the reconstruction")] = "high",
+    holdout: Holdout = 8,
     models: Annotated[
-        Path | None, typer.Option(help="folder that keeps cameras and sparse points from run to run")
+        Path | None, typer.Option(help="folder in which cameras and sparse points are cached between runs")
     ] = None,
+    as_json: AsJson = False,
 ) -> None:
-    """Photos kept out, drawn by our Gaussians and by those of gsplat's default recipe after the same seconds."""
+    """Held-out photos rendered from our Gaussians and from those of gsplat's default recipe after equal time."""
     from stages.lab.bench.appearance import AppearanceBenchOptions, run
 
-    for line in run(sets, out, AppearanceBenchOptions(quality, holdout, models)):
-        print(line, flush=True)
+    options = AppearanceBenchOptions(quality=quality, holdout=holdout, models=models)
+    print_results(lambda path: run(sets, path, options), out, as_json)
 
 
 @app.command("pi3")
 def bench_pi3(
     device: Device = "auto",
-    views: Annotated[list[int], typer.Option(help="photos at a time; may be repeated")] = [1, 8, 20, 50],  # noqa: B006
+    views: Annotated[list[int], typer.Option(help="photos per pass; repeatable")] = [1, 8, 20, 50],  # noqa: B006
     size: Annotated[int, typer.Option(help="side of the photos, a multiple of 14 [px]")] = 448,
     repeat: Annotated[int, typer.Option(help="timed passes of each")] = 3,
-    splats: Annotated[bool, typer.Option("--splats", help="with the head of Gaussians")] = False,
+    splats: Annotated[bool, typer.Option("--splats", help="include the Gaussian head")] = False,
+    out: Out = None,
+    as_json: AsJson = False,
 ) -> None:
-    """π³ at its published size with random weights: seconds and memory, beside attention written out."""
+    """π³ at its published size with random weights: time and memory, compared with unfused attention."""
     from stages.lab.bench.pi3 import Pi3BenchOptions, run
 
-    for line in run(Pi3BenchOptions(device, tuple(views), size, repeat, splats)):
-        print(line, flush=True)
+    options = Pi3BenchOptions(device=device, views=tuple(views), size=size, repeat=repeat, splats=splats)
+    print_results(lambda path: run(options, out=path), out, as_json)
 
 
 @app.command("segment")
 def bench_segment(
-    scenes: Annotated[int, typer.Option(help="scenes of each kind, apart and touching")] = 4,
-    photos: Annotated[int, typer.Option(help="photos whose cameras a scene has")] = 24,
-    weights: Annotated[Path | None, typer.Option(help="of sam2; looked for, and left out where there are none")] = None,
-    reconstruct: Annotated[bool, typer.Option("--reconstruct", help="also after reconstruction from photos")] = False,
-    out: Annotated[Path | None, typer.Option("-o", "--out", help="the numbers as JSON")] = None,
+    scenes: Annotated[int, typer.Option(help="scenes of each kind: objects apart, and touching")] = 4,
+    photos: Annotated[int, typer.Option(help="number of cameras per scene")] = 24,
+    weights: Annotated[
+        Path | None, typer.Option(help="weights of sam2; default: searched; without any, sam2 is skipped")
+    ] = None,
+    reconstruct: Annotated[
+        bool, typer.Option("--reconstruct", help="also segment scenes reconstructed from photos")
+    ] = False,
+    out: Out = None,
     device: Device = "auto",
+    as_json: AsJson = False,
 ) -> None:
-    """Objects found by geometry, from masks that are true or partly wrong, and by sam2: overlap with the truth."""
+    """Segmentation by geometry, by true and by corrupted masks, and by sam2: IoU with the true labels."""
     from stages.lab.bench.segment import SegmentBenchOptions, run
 
-    for line in run(out, SegmentBenchOptions(scenes, photos, weights, device, reconstruct)):
-        print(line, flush=True)
+    options = SegmentBenchOptions(
+        scenes=scenes, photos=photos, weights=weights, device=device, reconstruct=reconstruct
+    )
+    print_results(lambda path: run(path, options), out, as_json)
 
 
 @app.command("refine")
 def bench_refine(
-    scenes: Annotated[int, typer.Option(help="scenes, of objects apart")] = 4,
-    photos: Annotated[int, typer.Option(help="photos a scene")] = 24,
-    out: Annotated[Path | None, typer.Option("-o", "--out", help="the numbers as JSON")] = None,
+    scenes: Annotated[int, typer.Option(help="number of scenes, with objects apart")] = 4,
+    photos: Annotated[int, typer.Option(help="number of cameras per scene")] = 24,
+    out: Out = None,
+    as_json: AsJson = False,
 ) -> None:
-    """Holes that lifted objects leave: the table there beside the true one, from new views."""
+    """Filling of the table under removed objects: error against the true table in new views."""
     from stages.lab.bench.refine import RefineBenchOptions, run
 
-    for line in run(out, RefineBenchOptions(scenes, photos)):
-        print(line, flush=True)
+    options = RefineBenchOptions(scenes=scenes, photos=photos)
+    print_results(lambda path: run(path, options), out, as_json)
 
 
 @app.command("dynamics")
 def bench_dynamics(
     data: Annotated[Path | None, typer.Option(help="folder of motions, as `ngff-lab dataset` writes")] = None,
     weights: Annotated[
-        Path | None, typer.Option(help="folder of weights (.safetensors), all of which are measured; by default ours")
+        Path | None, typer.Option(help="folder of weights to evaluate (.safetensors); default: those in the package")
     ] = None,
     out: Annotated[
-        Path, typer.Option("-o", "--out", help="results (.json), added to what is there; table and plots beside")
+        Path, typer.Option("-o", "--out", help="results (.json), existing ones are kept; table and plots go beside it")
     ] = Path("results.json"),
     nudged: Annotated[
-        Path | None, typer.Option(help="the same scenes with starts moved by 1 mm, as another data set")
+        Path | None, typer.Option(help="data set of the same scenes with initial positions shifted by 1 mm")
     ] = None,
     results: Annotated[
-        Path | None, typer.Option("--from", help="only table and plots, from these results (.json)")
+        Path | None, typer.Option("--from", help="only draw the table and plots of these results (.json)")
     ] = None,
-    keypoints: Annotated[int, typer.Option(help="of each object")] = 256,
+    keypoints: Annotated[int, typer.Option(help="keypoints per object")] = 256,
     limit: Annotated[int, typer.Option(help="scenes of each split; 0: all")] = 0,
     mpm: Annotated[
-        int, typer.Option(help="scenes of each split for mpm-estimated, simulated on the way; 0: without that row")
+        int, typer.Option(help="scenes of each split to simulate for the row mpm-estimated; 0: omit that row")
     ] = 100,
     device: Device = "auto",
+    as_json: AsJson = False,
 ) -> None:
-    """The dynamics models on motion that they have not seen."""
+    """Dynamics models: errors of predicted motion on scenes not used in training."""
     from stages.core.models.checkpoints import SHIPPED
     from stages.lab.bench.dynamics import DynamicsBenchOptions, redraw, run
 
     if results is None and data is None:
         raise InputError("--data: name the folder of motions to measure on, or --from results to draw again")
-    for line in (
-        redraw(results) if results is not None
-        else run(data, weights or SHIPPED, out, DynamicsBenchOptions(keypoints, limit, mpm, device=device), nudged)
-    ):
-        print(line)
+    options = DynamicsBenchOptions(keypoints=keypoints, limit=limit, mpm=mpm, device=device)
+
+    def lines(path: Path) -> Iterable[str]:
+        return redraw(path) if results is not None else run(data, weights or SHIPPED, path, options, nudged)
+
+    print_results(lines, results or out, as_json)
 
 
 @app.command("ablation")
 def bench_ablation(
     data: Annotated[Path, typer.Option(help="folder of motions, as `ngff-lab dataset` writes")],
     out: Annotated[
-        Path, typer.Option("-o", "--out", help="the results (.json), added to what is there; a table (.md) goes beside")
+        Path, typer.Option("-o", "--out", help="results (.json), existing ones are kept; a table (.md) goes beside it")
     ] = Path("ablation.json"),
-    only: Annotated[str, typer.Option(help="some of the choices, such as full,reaction")] = "",
-    steps: Annotated[int, typer.Option(help="of training, for each choice")] = 1500,
-    batch: Annotated[int, typer.Option(help="scenes a step")] = 64,
-    keypoints: Annotated[int, typer.Option(help="of each object")] = 256,
-    horizons: Annotated[str, typer.Option(help="frames to roll out in each phase")] = "8,20",
-    groups: Annotated[str, typer.Option(help="of scenes to learn from")] = "3_0..3_8",
-    test: Annotated[str, typer.Option(help="group of scenes to score on")] = "3_9",
-    compiled: Annotated[bool, typer.Option("--compiled", help="compile a step first; for GPUs")] = False,
+    only: Annotated[str, typer.Option(help="names of the ablations, such as full,reaction; default: all")] = "",
+    steps: Annotated[int, typer.Option(help="training steps of each ablation")] = 1500,
+    batch: Annotated[int, typer.Option(help="scenes per training step")] = 64,
+    keypoints: Annotated[int, typer.Option(help="keypoints per object")] = 256,
+    horizons: Annotated[str, typer.Option(help="rollout length of each training phase [frames]")] = "8,20",
+    groups: Annotated[str, typer.Option(help="groups of scenes to train on")] = "3_0..3_8",
+    test: Annotated[str, typer.Option(help="group of scenes to test on")] = "3_9",
+    compiled: Compiled = False,
     seed: Seed = 0,
     device: Device = "auto",
+    as_json: AsJson = False,
 ) -> None:
-    """Our force field trained without each of its choices in turn: what they are worth."""
+    """Ablation: retrain the force field with one component removed at a time."""
     from stages.lab.bench.ablation import AblationBenchOptions, run
 
-    options = AblationBenchOptions(steps, batch, keypoints, horizons, groups, test, compiled, seed, device)
-    for line in run(data, out, options, only):
-        print(line, flush=True)
+    options = AblationBenchOptions(
+        steps=steps, batch=batch, keypoints=keypoints, horizons=horizons, groups=groups, test=test, compiled=compiled,
+        seed=seed, device=device,
+    )  # fmt: skip
+    print_results(lambda path: run(data, path, options, only), out, as_json)
 
 
 @app.command("rollout")
 def bench_rollout(
-    out: Annotated[Path, typer.Option("-o", "--out", help="the results as JSON")] = Path("rollout.json"),
-    weights: Annotated[Path | None, typer.Option(help="of our force field (.safetensors); those that ship")] = None,
-    keypoints: Annotated[int, typer.Option(help="of each of three objects")] = 2048,
-    steps: Annotated[int, typer.Option(help="of 0.02 s")] = 100,
-    scenes: Annotated[list[int], typer.Option(help="at once; may be repeated; none: 1, and 64 on a GPU")] = [],  # noqa: B006
+    out: Annotated[Path, typer.Option("-o", "--out", help="JSON file to write the results to")] = Path("rollout.json"),
+    weights: Annotated[
+        Path | None, typer.Option(help="weights of the force field (.safetensors); default: those in the package")
+    ] = None,
+    keypoints: Annotated[int, typer.Option(help="keypoints of each of the three objects")] = 2048,
+    steps: Annotated[int, typer.Option(help="number of 0.02 s steps")] = 100,
+    scenes: Annotated[
+        list[int], typer.Option(help="scenes per batch; repeatable; default: 1, and 64 on a GPU")
+    ] = [],  # noqa: B006
     repeat: Annotated[int, typer.Option(help="timed rollouts, of which the median counts")] = 5,
     device: Device = "auto",
+    as_json: AsJson = False,
 ) -> None:
-    """The learned force field: time a rollout, and the published model and MPM beside it."""
+    """Learned force field: time of a rollout, compared with the published model and MPM."""
     from stages.lab.bench.rollout import RolloutBenchOptions, run
 
-    for line in run(out, RolloutBenchOptions(weights, keypoints, steps, tuple(scenes), repeat, device)):
-        print(line, flush=True)
+    options = RolloutBenchOptions(
+        weights=weights, keypoints=keypoints, steps=steps, scenes=tuple(scenes), repeat=repeat, device=device
+    )
+    print_results(lambda path: run(path, options), out, as_json)
 
 
 @app.command("register")
 def bench_register(
-    only: Annotated[str, typer.Option(help="some of the ten objects, such as ball,duck")] = "",
-    trials: Annotated[int, typer.Option(help="parts of each object")] = 10,
-    out: Annotated[Path | None, typer.Option("-o", "--out", help="all trials as JSON")] = None,
+    only: Annotated[str, typer.Option(help="names of the objects, such as ball,duck; default: all ten")] = "",
+    trials: Annotated[int, typer.Option(help="partial views of each object")] = 10,
+    out: Annotated[Path | None, typer.Option("-o", "--out", help="JSON file to write all trials to")] = None,
     seed: Seed = 0,
     device: Device = "auto",
+    as_json: AsJson = False,
 ) -> None:
-    """Registration of a part to the whole, beside plain ICP and splatreg."""
+    """Registration of a partial to the complete object, compared with ICP and splatreg."""
     from stages.lab.bench.register import RegisterBenchOptions, run
 
-    for line in run(out, RegisterBenchOptions(only, trials, seed=seed, device=device)):
-        print(line, flush=True)
+    options = RegisterBenchOptions(only=only, trials=trials, seed=seed, device=device)
+    print_results(lambda path: run(path, options), out, as_json)
 
 
 @app.command("complete")
 def bench_complete(
     scene: Annotated[
-        list[str], typer.Option(help="objects of a scene, with commas between; may be repeated")
+        list[str], typer.Option(help="names of the objects of a scene, separated by commas; repeatable")
     ] = ["panda,duck", "can,miku", "bowl,phone"],  # noqa: B006
-    known: Annotated[str, typer.Option(help="objects of the library; by default all ten")] = "",
-    out: Annotated[Path | None, typer.Option("-o", "--out", help="the figures as JSON")] = None,
+    known: Annotated[str, typer.Option(help="names of the objects in the library; default: all ten")] = "",
+    out: Out = None,
     seed: Seed = 0,
+    as_json: AsJson = False,
 ) -> None:
-    """What completing objects does to their surfaces, to pictures from behind, and to how they fall."""
+    """Object completion: surface error, PSNR from behind, and error of simulated falls, by completer."""
     from stages.lab.bench.complete import CompleteBenchOptions, run
 
-    for line in run(out, CompleteBenchOptions(tuple(scene), known, seed=seed)):
-        print(line, flush=True)
+    options = CompleteBenchOptions(scenes=tuple(scene), known=known, seed=seed)
+    print_results(lambda path: run(path, options), out, as_json)

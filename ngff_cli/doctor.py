@@ -1,35 +1,56 @@
-"""What works on this machine, and what to do about what does not."""
+"""Check of the installation: each finding with its remedy."""
 
+import json
 import platform
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from typing import NamedTuple
 
 from stages.core.scene.files import ngff_version
 from stages.refine.options import BACKENDS as COMPLETERS
 from stages.segment.options import BACKENDS as SEGMENTERS
 
 NETWORKS = {name: row for name, row in {**SEGMENTERS, **COMPLETERS}.items() if row.find_weights}
-OPTIONAL = {  # packages, what needs them, and the extra that installs them
+OPTIONAL = {  # package: (what needs it, the extra that installs it)
     "huggingface_hub": ("--download", "hub"),
     **{row.package: (f"segment --backend {name}", row.extra) for name, row in SEGMENTERS.items() if row.package},
     **{row.package: (f"refine --completer {name}", row.extra) for name, row in COMPLETERS.items() if row.package},
 }
 
 
-def examine() -> Iterator[str]:
-    """One line a finding: `ok` or `--`, what it is about, what to do."""
-    yield _line(True, "ngff", f"{ngff_version()}, Python {platform.python_version()}, {platform.platform(terse=True)}")
+class Finding(NamedTuple):
+    """Result of one check."""
+
+    ok: bool
+    subject: str
+    detail: str  # version or path, or what to do
+
+    def __str__(self) -> str:
+        return f"{'ok' if self.ok else '--'}  {self.subject:<12}{self.detail}"
+
+
+def check_installation() -> Iterator[Finding]:
+    """Every check in turn: packages, GPU, codec, disk, then the weights of each network."""
+    detail = f"{ngff_version()}, Python {platform.python_version()}, {platform.platform(terse=True)}"
+    yield Finding(True, "ngff", detail)
     for check in (_torch, _gpu, _gsplat, _warp, _colmap, _codec, _disk):
-        yield _line(*check())
-    yield from _weights()
-    yield from _published()
+        yield check()
+    yield from _own_weights()
+    yield from _published_weights()
+    yield from _optional_packages()
 
 
-def _line(works: bool, subject: str, finding: str) -> str:
-    return f"{'ok' if works else '--'}  {subject:<12}{finding}"
+def write_findings(findings: Iterable[Finding], out: Path | None = None) -> Iterator[str]:
+    """The findings as lines of text; to `out`, if given, as a JSON list."""
+    rows = []
+    for finding in findings:
+        rows.append(finding._asdict())
+        yield str(finding)
+    if out is not None:
+        out.write_text(json.dumps(rows, indent=1) + "\n")
 
 
 def _installed(package: str) -> str | None:
@@ -39,59 +60,63 @@ def _installed(package: str) -> str | None:
         return None
 
 
-def _torch() -> tuple[bool, str, str]:
+def _torch() -> Finding:
     import torch
 
-    return True, "torch", f"{torch.__version__}, {torch.get_num_threads()} threads"
+    return Finding(True, "torch", f"{torch.__version__}, {torch.get_num_threads()} threads")
 
 
-def _gpu() -> tuple[bool, str, str]:
+def _gpu() -> Finding:
     import torch
 
     if not torch.cuda.is_available():
-        return False, "GPU", "PyTorch sees none, so the CPU does it all; if there is one, install torch with CUDA"
+        return Finding(False, "GPU", "PyTorch finds none and uses the CPU; if there is one, install torch with CUDA")
     properties = torch.cuda.get_device_properties(0)
-    return True, "GPU", f"{properties.name}, {properties.total_memory / 2**30:.0f} GiB, CUDA {torch.version.cuda}"
+    detail = f"{properties.name}, {properties.total_memory / 2**30:.0f} GiB, CUDA {torch.version.cuda}"
+    return Finding(True, "GPU", detail)
 
 
-def _gsplat() -> tuple[bool, str, str]:
+def _gsplat() -> Finding:
     import torch
 
     found = _installed("gsplat")
     if not torch.cuda.is_available():
-        return True, "gsplat", f"{found or 'absent'}, not used without a GPU: our own rasteriser draws"
+        return Finding(True, "gsplat", f"{found or 'absent'}, not used without a GPU: our own rasteriser is used")
     if found is None:
-        return False, "gsplat", "absent: `pip install gsplat`; until then our own rasteriser draws, more slowly"
+        return Finding(False, "gsplat", "absent: `pip install gsplat`; our own, slower rasteriser is used meanwhile")
     compiler = shutil.which("nvcc")
     if compiler is None and not any(Path(torch.__file__).parent.glob("**/gsplat*")):
-        return False, "gsplat", f"{found}; the CUDA compiler nvcc is not on PATH, needed once to build its kernels"
-    return True, "gsplat", f"{found}, built on first use with {compiler}"
+        detail = f"{found}; the CUDA compiler nvcc is not on PATH, needed once to build its kernels"
+        return Finding(False, "gsplat", detail)
+    return Finding(True, "gsplat", f"{found}, built on first use with {compiler}")
 
 
-def _warp() -> tuple[bool, str, str]:
+def _warp() -> Finding:
     import torch
     import warp
 
     from stages.core.kernels.interop import view
 
     total = float(view(torch.ones(3)).numpy().sum())
-    return total == 3, "Warp", f"{warp.__version__}, kernels cached in {warp.config.kernel_cache_dir}"
+    return Finding(total == 3, "Warp", f"{warp.__version__}, kernels cached in {warp.config.kernel_cache_dir}")
 
 
-def _colmap() -> tuple[bool, str, str]:
+def _colmap() -> Finding:
     found = _installed("pycolmap")
-    return bool(found), "pycolmap", found or "absent: `pip install pycolmap`; needed for photos without known cameras"
+    remedy = "absent: `pip install pycolmap`; needed for photos without known cameras"
+    return Finding(bool(found), "pycolmap", found or remedy)
 
 
-def _codec() -> tuple[bool, str, str]:
+def _codec() -> Finding:
     import av
 
     works = "libx264" in av.codecs_available
-    return works, "H.264", f"PyAV {av.__version__}" + ("" if works else " lacks libx264: reinstall it from its wheel")
+    remedy = "" if works else " lacks libx264: reinstall it from its wheel"
+    return Finding(works, "H.264", f"PyAV {av.__version__}{remedy}")
 
 
-def _weights() -> Iterator[str]:
-    """Of the models that `simulate` can use."""
+def _own_weights() -> Iterator[Finding]:
+    """Weights of the learned engines of `ngff simulate`."""
     from stages.core.errors import InputError
     from stages.core.models.checkpoints import find, load
     from stages.simulate.options import ENGINES
@@ -100,13 +125,14 @@ def _weights() -> Iterator[str]:
         try:
             path = find(name)
             card = load(path)[1]
-            yield _line(True, "weights", f"{name}: {path.name} of {path.parent.name}/, sha256 {card['sha256'][:8]}")
+            detail = f"{name}: {path.name} of {path.parent.name}/, sha256 {card['sha256'][:8]}"
+            yield Finding(True, "weights", detail)
         except InputError as error:
-            yield _line(False, "weights", str(error))
+            yield Finding(False, "weights", str(error))
 
 
-def _published() -> Iterator[str]:
-    """Of the networks that others trained; told apart by their files' names, which loading checks."""
+def _published_weights() -> Iterator[Finding]:
+    """Weights of networks trained by others, found by file name only; loading verifies their content."""
     from stages.core.backends import load
     from stages.core.errors import InputError
     from stages.core.models.pi3 import weights as pi3
@@ -118,14 +144,18 @@ def _published() -> Iterator[str]:
     for name, find in finders.items():
         try:
             path = find()
-            yield _line(True, name, f"{path}, {path.stat().st_size / 1e9:.1f} GB")
+            yield Finding(True, name, f"{path}, {path.stat().st_size / 1e9:.1f} GB")
         except InputError as error:
-            yield _line(False, name, str(error))
-    for package, (what, extra) in OPTIONAL.items():
-        found = _installed(package) or f"absent, and needed for {what} alone: `pip install 'ngff[{extra}]'`"
-        yield _line(True, "package", f"{package} {found}")
+            yield Finding(False, name, str(error))
 
 
-def _disk() -> tuple[bool, str, str]:
+def _optional_packages() -> Iterator[Finding]:
+    for package, (user, extra) in OPTIONAL.items():
+        found = _installed(package) or f"absent, needed for {user} only: `pip install 'ngff[{extra}]'`"
+        yield Finding(True, "package", f"{package} {found}")
+
+
+def _disk() -> Finding:
     free = shutil.disk_usage(Path.cwd()).free / 2**30
-    return free > 2, "disk", f"{free:.0f} GiB free here" + ("" if free > 2 else "; a scene with its video needs 1 GiB")
+    remedy = "" if free > 2 else "; a scene with its video needs 1 GiB"
+    return Finding(free > 2, "disk", f"{free:.0f} GiB free in this folder{remedy}")

@@ -1,4 +1,4 @@
-"""`ngff-lab`: making data, training, benchmarks, and what works on this machine."""
+"""`ngff-lab`: data generation, training, benchmarks, and a check of the installation."""
 
 from pathlib import Path
 from typing import Annotated
@@ -6,36 +6,40 @@ from typing import Annotated
 import typer
 
 from ngff_cli import bench
-from ngff_cli.options import Commands, Device, Seed, Threads, limit_threads, set_up_logging
+from ngff_cli.options import AsJson, CommandGroup, Device, Seed, Threads, limit_threads, print_results, set_up_logging
 from stages.lab.assets.objects import ObjectsOptions
 
-app = typer.Typer(
-    cls=Commands, no_args_is_help=True, rich_markup_mode=None, add_completion=False, pretty_exceptions_enable=False
-)
+app = typer.Typer(cls=CommandGroup, no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False)
+
+Groups = Annotated[str, typer.Option(help="groups of scenes, such as 3_0..3_9,4")]
+Sheet = Annotated[Path | None, typer.Option(help="contact sheet to write (.jpg)")]
+Half = Annotated[bool, typer.Option("--half", help="also store the weights in 16 bits, for the package")]
+Dx = Annotated[float, typer.Option(help="grid spacing [m]; published: 0.02")]
+ParticleSpacing = Annotated[float, typer.Option(help="spacing of particles on a surface [m]")]
+Substep = Annotated[float, typer.Option(help="simulation time step [s]; published: 1e-4")]
 
 
 @app.callback()
 def lab(threads: Threads = None) -> None:
-    """Beside the pipeline: make data, train, measure, and see what works on this machine."""
+    """Generate data, train models, run benchmarks, and check the installation."""
     set_up_logging(False)
     limit_threads(threads)
 
 
 @app.command()
-def doctor() -> None:
-    """Say what works on this machine, and what to do about what does not."""
-    from ngff_cli.doctor import examine
+def doctor(as_json: AsJson = False) -> None:
+    """Check the installation: GPU, packages, weights and disk space, with a remedy for each problem."""
+    from ngff_cli.doctor import check_installation, write_findings
 
-    for line in examine():
-        print(line)
+    print_results(lambda path: write_findings(check_installation(), path), None, as_json)
 
 
 @app.command()
 def example(
-    out: Annotated[Path, typer.Argument(metavar="FOLDER", help="where photos/, masks/ and the truth go")],
-    photos: Annotated[int, typer.Option(help="how many photos to take")] = 26,
+    out: Annotated[Path, typer.Argument(metavar="FOLDER", help="folder for photos/, masks/ and the ground truth")],
+    photos: Annotated[int, typer.Option(help="number of photos")] = 26,
 ) -> None:
-    """Make the example: photos of toys on a table, with true cameras, labels and motion beside them."""
+    """Generate the example: rendered photos of toys on a table, with true cameras, labels and motion."""
     from stages.lab.assets.example import make_example
 
     make_example(out, photos)
@@ -43,48 +47,57 @@ def example(
 
 @app.command()
 def replay(
-    recording: Annotated[Path, typer.Argument(metavar="RECORDING.npz", help="a run of the public MPM solver")],
-    out: Annotated[Path, typer.Option("-o", "--out", help="our run, in the same form (.npz)")] = Path("ours.npz"),
-    frames: Annotated[int, typer.Option(help="frames to run; 0: all of the recording")] = 0,
+    recording: Annotated[Path, typer.Argument(metavar="RECORDING.npz", help="run of the published MPM solver")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="our run to write, as RECORDING")] = Path("ours.npz"),
+    frames: Annotated[int, typer.Option(help="number of frames; 0: all of the recording")] = 0,
     device: Device = "auto",
 ) -> None:
-    """Run a recorded scene of the public MPM solver again with ours, and print how they differ."""
+    """Repeat a recorded run of the published MPM solver with ours and print the differences."""
     from stages.lab.bench.replay import ReplayOptions, run
 
-    for line in run(recording, out, ReplayOptions(frames, device)):
+    for line in run(recording, out, ReplayOptions(frames=frames, device=device)):
         print(line)
 
 
 @app.command()
 def dataset(
-    out: Annotated[Path, typer.Argument(metavar="FOLDER", help="where the data set goes; what is there is kept")],
-    groups: Annotated[str, typer.Option(help="of scenes; more_0..more_9: more of three objects")] = "3_0..3_9,4,6",
-    only: Annotated[str, typer.Option(help="parts, with commas between: motions, scenes, mpm, initial, dynamic, "
+    out: Annotated[Path, typer.Argument(metavar="FOLDER", help="folder of the data set; existing files are kept")],
+    groups: Annotated[
+        str, typer.Option(help="groups of scenes; more_0..more_9 are further scenes of three objects")
+    ] = "3_0..3_9,4,6",
+    only: Annotated[str, typer.Option(help="parts, separated by commas: motions, scenes, mpm, initial, dynamic, "
                                       "objects, backgrounds, scene_configs")] = "motions",
-    frames: Annotated[int, typer.Option(help="frames of 0.02 s")] = 100,
-    keypoints: Annotated[int, typer.Option(help="of each object, in motions")] = 2048,
-    dx: Annotated[float, typer.Option(help="spacing of the grid [m]; published: 0.02")] = 0.02,
-    spacing: Annotated[float, typer.Option(help="between particles on a surface [m]")] = 0.009,
-    substep: Annotated[float, typer.Option(help="[s]; published: 1e-4")] = 1e-4,
-    nudge: Annotated[float, typer.Option(help="put objects aside by so much [m]; see `statistics --against`")] = 0.0,
-    exact: Annotated[bool, typer.Option("--exact", help="the same bytes in every run on a GPU too, in twice the time; "
-                                        "with mpm or dynamic it always is so")] = False,
-    views: Annotated[str, typer.Option(help="of videos: some of 0,4,...,96, or all")] = "all",
-    backgrounds: Annotated[str, typer.Option(help="of videos: some of table0,...,table7, or all")] = "all",
-    resolution: Annotated[int, typer.Option(help="of videos [px]")] = 448,
+    frames: Annotated[int, typer.Option(help="frames per scene, of 0.02 s each")] = 100,
+    keypoints: Annotated[int, typer.Option(help="keypoints per object in motions")] = 2048,
+    dx: Dx = 0.02,
+    spacing: ParticleSpacing = 0.009,
+    substep: Substep = 1e-4,
+    nudge: Annotated[
+        float, typer.Option(help="shift of each object's initial position [m]; see `statistics --against`")
+    ] = 0.0,
+    exact: Annotated[bool, typer.Option("--exact", help="bitwise identical results in every run on a GPU, in twice the "
+                                        "time; always on for mpm and dynamic")] = False,
+    views: Annotated[str, typer.Option(help="views of the videos: some of 0,4,...,96, or all")] = "all",
+    backgrounds: Annotated[
+        str, typer.Option(help="backgrounds of the videos: some of table0,...,table7, or all")
+    ] = "all",
+    resolution: Annotated[int, typer.Option(help="side of the videos [px]")] = 448,
     shard: Annotated[str, typer.Option(help="i/n: the i-th of n equal parts of the groups")] = "1/1",
     limit: Annotated[int, typer.Option(help="scenes of each group; 0: all")] = 0,
-    check: Annotated[bool, typer.Option("--check", help="only see that all files are as they were written")] = False,
-    ray: Annotated[str, typer.Option(help="a Ray cluster to run on: local, auto or an address; all its machines see "
-                                     "FOLDER under the same path, have the same ngff, and make a group each")] = "",
+    check: Annotated[bool, typer.Option("--check", help="only compare all files with their checksums")] = False,
+    ray: Annotated[str, typer.Option(help="Ray cluster: local, auto or an address. All machines need the same ngff and "
+                                     "FOLDER at the same path; each makes one group at a time")] = "",
     device: Device = "auto",
 ) -> None:
-    """Make GSCollision: scenes, their motion, and videos, in the published layout."""
+    """Generate GSCollision: scenes, their motion, and videos, in the published layout."""
     from stages.lab.dataset import generate, ray_cluster
     from stages.lab.dataset.options import DatasetOptions
 
-    options = DatasetOptions(groups, only, frames, keypoints, dx, spacing, substep, nudge, exact, views,
-                             backgrounds, resolution, shard, limit, device)  # fmt: skip
+    options = DatasetOptions(
+        groups=groups, only=only, frames=frames, keypoints=keypoints, dx=dx, spacing=spacing, substep=substep,
+        nudge=nudge, exact=exact, views=views, backgrounds=backgrounds, resolution=resolution, shard=shard,
+        limit=limit, device=device,
+    )  # fmt: skip
     if check:
         generate.check(out)
     elif ray:
@@ -97,11 +110,11 @@ def dataset(
 def import_(
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="mpm/<group>/<scene> of GSCollision, with %04d.h5")],
     out: Annotated[Path, typer.Option("-o", "--out", help="trajectory to write (.h5)")] = Path("traj.h5"),
-    scene: Annotated[Path | None, typer.Option(help="its point_cloud.ply; else scenes/<group>/<scene>/ beside mpm/ is "
-                                               "searched")] = None,
-    keypoints: Annotated[int, typer.Option(help="of each object, at most")] = 2048,
+    scene: Annotated[Path | None, typer.Option(help="its point_cloud.ply; default: searched in scenes/<group>/<scene>/ "
+                                               "beside mpm/")] = None,
+    keypoints: Annotated[int, typer.Option(help="maximum number of keypoints per object")] = 2048,
 ) -> None:
-    """Turn a published scene of GSCollision into a trajectory that `ngff render` and `ngff evaluate` read."""
+    """Convert a published scene of GSCollision to a trajectory for `ngff render` and `ngff evaluate`."""
     from stages.lab.dataset.importer import run
 
     print(run(folder, out, scene, keypoints))
@@ -110,42 +123,43 @@ def import_(
 @app.command()
 def statistics(
     data: Annotated[Path, typer.Argument(metavar="FOLDER", help="data set, as `ngff-lab dataset` writes")],
-    out: Annotated[Path | None, typer.Option("-o", "--out", help="the numbers as JSON")] = None,
-    groups: Annotated[str, typer.Option(help="which groups of scenes")] = "3_0..3_9,4,6",
-    keypoints: Annotated[int, typer.Option(help="of each object to look at, at most")] = 512,
-    against: Annotated[Path | None, typer.Option(help="the same scenes made with --nudge: how predictable they are, "
+    out: Annotated[Path | None, typer.Option("-o", "--out", help="JSON file to write the results to")] = None,
+    groups: Groups = "3_0..3_9,4,6",
+    keypoints: Annotated[int, typer.Option(help="maximum number of keypoints per object")] = 512,
+    against: Annotated[Path | None, typer.Option(help="the same scenes made with --nudge: report the predictability "
                                                  "instead")] = None,
-    sheet: Annotated[Path | None, typer.Option(help="picture of some scenes to write (.jpg)")] = None,
-    scenes: Annotated[int, typer.Option(help="in the picture, a row each")] = 10,
+    sheet: Sheet = None,
+    scenes: Annotated[int, typer.Option(help="rows of the contact sheet, one scene each")] = 10,
     device: Device = "auto",
+    as_json: AsJson = False,
 ) -> None:
-    """What happens in the scenes of a data set: falls, contacts, tipping, rest; or how predictable it is."""
+    """Statistics of a data set: falls, contacts, tipping and rest of the objects; or its predictability."""
     from stages.lab.dataset import scene_statistics, sensitivity
     from stages.lab.dataset.scene_configs import parse_groups
 
-    if against is not None:
-        lines = sensitivity.run(data, against, out, min(keypoints, 256), device)
-    else:
-        lines = scene_statistics.run(data, out, parse_groups(groups), keypoints, device)
-    for line in lines:
-        print(line)
+    def lines(path: Path | None) -> list[str]:
+        if against is not None:
+            return sensitivity.run(data, against, path, min(keypoints, 256), device)
+        return scene_statistics.run(data, path, parse_groups(groups), keypoints, device)
+
+    print_results(lines, out, as_json)
     if sheet is not None:
         from stages.lab.dataset.contact_sheet import SheetOptions, write_sheet
 
-        write_sheet(data, sheet, SheetOptions(tuple(parse_groups(groups)), scenes, device))
+        write_sheet(data, sheet, SheetOptions(groups=tuple(parse_groups(groups)), count=scenes, device=device))
 
 
 @app.command()
 def study(
-    out: Annotated[Path | None, typer.Option("-o", "--out", help="the table as JSON")] = None,
-    scenes: Annotated[int, typer.Option(help="scenes to compare")] = 24,
+    out: Annotated[Path | None, typer.Option("-o", "--out", help="JSON file to write the results to")] = None,
+    scenes: Annotated[int, typer.Option(help="number of scenes")] = 24,
     device: Device = "auto",
+    as_json: AsJson = False,
 ) -> None:
-    """How fine the data set's simulation has to be: resolutions compared with the published one."""
+    """Resolution study: motion simulated at several resolutions compared with the published one."""
     from stages.lab.dataset.resolution_study import run
 
-    for line in run(out, scenes, device):
-        print(line, flush=True)
+    print_results(lambda path: run(path, scenes, device), out, as_json)
 
 
 @app.command()
@@ -153,39 +167,44 @@ def train(
     model: Annotated[str, typer.Argument(metavar="MODEL", help="ngff | ngff-paper | gcn | transformer | ...")],
     data: Annotated[Path, typer.Option(help="folder of motions, as `ngff-lab dataset` writes")],
     out: Annotated[Path, typer.Option("-o", "--out", help="weights to write (.safetensors)")],
-    minutes: Annotated[float, typer.Option(help="budget [min]")] = 20.0,
-    steps: Annotated[int, typer.Option(help="budget in steps of the optimizer instead; 0: minutes count")] = 0,
-    batch: Annotated[int, typer.Option(help="scenes a step")] = 32,
-    keypoints: Annotated[int, typer.Option(help="of each object")] = 256,
-    few: Annotated[int, typer.Option(help="of each object in every fourth step instead; 0: never")] = 0,
-    lr: Annotated[float, typer.Option(help="highest learning rate")] = 1e-3,
-    hidden: Annotated[int, typer.Option(help="width of the network, also wider than --from; 0: its own")] = 0,
-    horizons: Annotated[str, typer.Option(help="frames to roll out in each phase")] = "8,20,40",
+    minutes: Annotated[float, typer.Option(help="training time [min]")] = 20.0,
+    steps: Annotated[int, typer.Option(help="optimizer steps instead of --minutes; 0: use --minutes")] = 0,
+    batch: Annotated[int, typer.Option(help="scenes per step")] = 32,
+    keypoints: Annotated[int, typer.Option(help="keypoints per object")] = 256,
+    few: Annotated[int, typer.Option(help="keypoints per object in every fourth step; 0: the same in all steps")] = 0,
+    lr: Annotated[float, typer.Option(help="maximum learning rate")] = 1e-3,
+    hidden: Annotated[
+        int, typer.Option(help="width of the network, may exceed that of --from; 0: the model's default")
+    ] = 0,
+    horizons: Annotated[str, typer.Option(help="rollout length of each phase [frames]")] = "8,20,40",
     loss: Annotated[
         str,
-        typer.Option(help="square: squared error | scene: RMSE of a scene | axes: RMSE of an object's axis | "
-                     "relative: the same against how much there is of motion"),
+        typer.Option(help="square: squared error | scene: RMSE per scene | axes: RMSE per object and axis | "
+                     "relative: axes, divided by the amount of motion"),
     ] = "scene",  # fmt: skip
     optimizer: Annotated[str, typer.Option(help="adamw | soap (extra `train`)")] = "adamw",
     speeds: Annotated[
-        float, typer.Option(help="errors of speeds count as of places so much later [s]; 0: they do not")
+        float, typer.Option(help="weight of velocity errors relative to position errors [s]; 0: none")
     ] = 0.0,
-    memory: Annotated[float, typer.Option(help="share of a gradient that goes back by another frame")] = 0.9,
-    groups: Annotated[str, typer.Option(help="also varied, solid, turned; the last 100 scenes choose")] = "3_0..3_8",
-    compiled: Annotated[bool, typer.Option("--compiled", help="compile a step first; for GPUs")] = False,
+    memory: Annotated[float, typer.Option(help="factor on the gradient per frame of backpropagation in time")] = 0.9,
+    groups: Annotated[
+        str, typer.Option(help="groups to train on, also varied, solid, turned; the last 100 scenes are for validation")
+    ] = "3_0..3_8",
+    compiled: Annotated[bool, typer.Option("--compiled", help="compile the training step first; for GPUs")] = False,
     seed: Seed = 0,
     device: Device = "auto",
     start: Annotated[
-        Path | None, typer.Option("--from", help="weights (.safetensors) to begin with")
+        Path | None, typer.Option("--from", help="initial weights (.safetensors); default: random")
     ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="go on from the .ckpt beside the weights")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="continue from the .ckpt beside the weights")] = False,
 ) -> None:
     """Train a dynamics model on simulated motion."""
     from stages.lab.training.train import TrainOptions, run
 
     options = TrainOptions(
-        minutes, steps, batch, keypoints, few, lr, horizons, hidden, loss, optimizer, speeds, memory, groups,
-        compiled, seed, device,
+        minutes=minutes, steps=steps, batch=batch, keypoints=keypoints, few=few, lr=lr, horizons=horizons,
+        hidden=hidden, loss=loss, optimizer=optimizer, speeds=speeds, memory=memory, groups=groups, compiled=compiled,
+        seed=seed, device=device,
     )  # fmt: skip
     for line in run(model, data, out, options, resume, start):
         print(line)
@@ -193,11 +212,11 @@ def train(
 
 @app.command()
 def card(
-    cards: Annotated[list[Path], typer.Argument(metavar="CARD.json", help="beside weights; several are compared")],
-    out: Annotated[Path, typer.Option("-o", "--out", help="the curves (.png)")] = Path("training.png"),
-    half: Annotated[bool, typer.Option("--half", help="also store their weights in 16 bits, to be shipped")] = False,
+    cards: Annotated[list[Path], typer.Argument(metavar="CARD.json", help="training cards; several are compared")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="plot to write (.png)")] = Path("training.png"),
+    half: Half = False,
 ) -> None:
-    """Plot how weights were trained: loss and scores by minute."""
+    """Plot training curves: loss and validation scores over time."""
     from stages.lab.training.card import run
 
     for line in run(cards, out, half):
@@ -208,10 +227,10 @@ def card(
 def average(
     files: Annotated[list[Path], typer.Argument(metavar="WEIGHTS", help="two or more, of one model (.safetensors)")],
     out: Annotated[Path, typer.Option("-o", "--out", help="weights to write (.safetensors)")],
-    shares: Annotated[str, typer.Option(help="of each, such as 0.7,0.3")],
-    half: Annotated[bool, typer.Option("--half", help="store them in 16 bits, to be shipped")] = False,
+    shares: Annotated[str, typer.Option(help="weighting of each file, such as 0.7,0.3")],
+    half: Half = False,
 ) -> None:
-    """Average the weights of several trainings, number by number."""
+    """Average the weights of several training runs."""
     from stages.lab.training.average import run
 
     print(run(files, shares, out, half))
@@ -223,53 +242,58 @@ def train_splatter(
                                          "cameras (transforms.json or a COLMAP model)")],
     out: Annotated[Path, typer.Option("-o", "--out", help="weights of pi3-splat to write (.safetensors)")],
     weights: Annotated[
-        Path | None, typer.Option(help="weights of pi3 or pi3-splat to start from; by default looked for")
+        Path | None, typer.Option(help="initial weights of pi3 or pi3-splat; default: searched")
     ] = None,
-    steps: Annotated[int, typer.Option(help="of the optimizer")] = 20_000,
-    views: Annotated[int, typer.Option(help="that Gaussians are made of in a step; one more is drawn")] = 4,
+    steps: Annotated[int, typer.Option(help="optimizer steps")] = 20_000,
+    views: Annotated[int, typer.Option(help="input views per step; one more view is rendered")] = 4,
     side: Annotated[int, typer.Option(help="longest side of an image [px]")] = 448,
     depth: Annotated[
-        str, typer.Option(help="where Gaussians lie: network, or given (true depth, of scenes alone)")
+        str, typer.Option(help="depth of the Gaussians: network | given (true depth, for scenes only)")
     ] = "network",
     width: Annotated[
-        int, typer.Option(help="a small random network so wide instead of weights, to try things out")
+        int, typer.Option(help="width of a small random network that replaces the weights, for tests; 0: none")
     ] = 0,
-    lr: Annotated[float, typer.Option(help="highest learning rate")] = 1e-4,
+    lr: Annotated[float, typer.Option(help="maximum learning rate")] = 1e-4,
     seed: Seed = 0,
     device: Device = "auto",
 ) -> None:
-    """Train pi3-splat's head of Gaussians; the rest of the network stays as it is."""
+    """Train the Gaussian head of pi3-splat; the rest of the network stays fixed."""
     from stages.lab.training.train_splatter import SplatterOptions, run
 
-    for line in run(data, out, SplatterOptions(steps, views, side, depth, width, lr, seed, device), weights):
+    options = SplatterOptions(
+        steps=steps, views=views, side=side, depth=depth, width=width, lr=lr, seed=seed, device=device
+    )
+    for line in run(data, out, options, weights):
         print(line, flush=True)
 
 
 @app.command()
 def objects(
-    out: Annotated[Path, typer.Argument(metavar="FOLDER", help="where a folder for each object goes")],
-    only: Annotated[str, typer.Option(help="some of the ten, such as ball,duck")] = ObjectsOptions.only,
-    meshes: Annotated[list[Path], typer.Option("--from", metavar="MESH", help="a textured mesh (.obj .glb .ply ...) "
-                                               "instead of the ten; may be repeated")] = [],  # noqa: B006
-    count: Annotated[int, typer.Option(help="Gaussians of a mesh, about")] = ObjectsOptions.count,
-    up: Annotated[str, typer.Option(help="axis of a mesh that points up: auto | x | y | z")] = ObjectsOptions.up,
+    out: Annotated[Path, typer.Argument(metavar="FOLDER", help="output folder, with one folder per object")],
+    only: Annotated[
+        str, typer.Option(help="names of the objects, such as ball,duck; default: all ten")
+    ] = ObjectsOptions.only,
+    meshes: Annotated[list[Path], typer.Option("--from", metavar="MESH", help="textured mesh (.obj .glb .ply ...) to "
+                                               "convert instead; repeatable")] = [],  # noqa: B006
+    count: Annotated[int, typer.Option(help="approximate number of Gaussians of a mesh")] = ObjectsOptions.count,
+    up: Annotated[str, typer.Option(help="up axis of a mesh: auto | x | y | z")] = ObjectsOptions.up,
     light: Annotated[bool, typer.Option(help="bake soft light into the colours of a mesh")] = ObjectsOptions.light,
-    sheet: Annotated[Path | None, typer.Option(help="picture of all of them to write (.jpg)")] = None,
+    sheet: Sheet = None,
 ) -> None:
-    """Make the ten objects of the data set as Gaussians, or turn meshes into such objects."""
+    """Generate the ten objects of the data set as Gaussians, or convert meshes to such objects."""
     from stages.lab.assets.objects import run
 
-    for line in run(out, ObjectsOptions(only, count, up, light), meshes, sheet):
+    for line in run(out, ObjectsOptions(only=only, count=count, up=up, light=light), meshes, sheet):
         print(line, flush=True)
 
 
 @app.command()
 def backgrounds(
-    out: Annotated[Path, typer.Argument(metavar="FOLDER", help="where a folder for each background goes")],
-    only: Annotated[str, typer.Option(help="some of the eight, such as table0,table3")] = "",
-    sheet: Annotated[Path | None, typer.Option(help="picture of all of them to write (.jpg)")] = None,
+    out: Annotated[Path, typer.Argument(metavar="FOLDER", help="output folder, with one folder per background")],
+    only: Annotated[str, typer.Option(help="names of the backgrounds, such as table0,table3; default: all eight")] = "",
+    sheet: Sheet = None,
 ) -> None:
-    """Make the eight tables of the data set, each in its surround, as Gaussians."""
+    """Generate the eight tables of the data set with their surroundings as Gaussians."""
     from stages.lab.assets.backgrounds import run
 
     for line in run(out, only, sheet):
@@ -278,50 +302,55 @@ def backgrounds(
 
 @app.command()
 def heldout(
-    out: Annotated[Path, typer.Argument(metavar="FOLDER", help="of a data set; what is there is kept")],
-    meshes: Annotated[list[Path], typer.Option("--from", metavar="MESH", help="a mesh (.obj .glb .ply ...) instead of "
-                                               "the eight shapes; may be repeated")] = [],  # noqa: B006
-    scenes: Annotated[int, typer.Option(help="how many")] = 100,
-    objects: Annotated[int, typer.Option(help="in each scene")] = 3,
-    frames: Annotated[int, typer.Option(help="of 0.02 s")] = 100,
-    keypoints: Annotated[int, typer.Option(help="of each object")] = 2048,
-    dx: Annotated[float, typer.Option(help="spacing of the grid [m]")] = 0.02,
-    spacing: Annotated[float, typer.Option(help="between particles on a surface [m]")] = 0.009,
-    substep: Annotated[float, typer.Option(help="[s]")] = 1e-4,
+    out: Annotated[Path, typer.Argument(metavar="FOLDER", help="folder of a data set; existing files are kept")],
+    meshes: Annotated[list[Path], typer.Option("--from", metavar="MESH", help="mesh (.obj .glb .ply ...) that replaces "
+                                               "the eight shapes; repeatable")] = [],  # noqa: B006
+    scenes: Annotated[int, typer.Option(help="number of scenes")] = 100,
+    objects: Annotated[int, typer.Option(help="objects per scene")] = 3,
+    frames: Annotated[int, typer.Option(help="frames per scene, of 0.02 s each")] = 100,
+    keypoints: Annotated[int, typer.Option(help="keypoints per object")] = 2048,
+    dx: Dx = 0.02,
+    spacing: ParticleSpacing = 0.009,
+    substep: Substep = 1e-4,
     size: Annotated[float, typer.Option(help="longest side of a mesh [m]")] = 0.5,
-    shapes: Annotated[int, typer.Option(help="so many objects at random to learn from, as the group varied")] = 0,
-    solid: Annotated[bool, typer.Option("--solid", help="the shapes are filled: the group solid")] = False,
-    turned: Annotated[int, typer.Option(help="the ten objects turned at random in so many ways to learn from, as the "
-                                        "group turned")] = 0,
+    shapes: Annotated[
+        int, typer.Option(help="number of random objects for training, written as the group varied; 0: none")
+    ] = 0,
+    solid: Annotated[bool, typer.Option("--solid", help="fill the random objects: the group solid")] = False,
+    turned: Annotated[
+        int, typer.Option(help="random rotations of the ten objects for training, written as the group turned; 0: none")
+    ] = 0,
     device: Device = "auto",
 ) -> None:
-    """Simulate scenes of other objects than the ten: by default of eight that no model learns from."""
+    """Simulate scenes of other objects than the ten: by default of eight that are never used in training."""
     from stages.lab.dataset.heldout import HeldoutOptions, run
 
-    choice = shapes, solid, turned
-    options = HeldoutOptions(scenes, objects, frames, keypoints, dx, spacing, substep, size, *choice, device)
+    options = HeldoutOptions(
+        scenes=scenes, objects=objects, frames=frames, keypoints=keypoints, dx=dx, spacing=spacing, substep=substep,
+        size=size, shapes=shapes, solid=solid, turned=turned, device=device,
+    )  # fmt: skip
     print(run(out, options, meshes))
 
 
 @app.command("estimate-materials")
 def estimate_materials(
-    video: Annotated[Path, typer.Argument(metavar="VIDEO.mp4", help="things that move")],
+    video: Annotated[Path, typer.Argument(metavar="VIDEO.mp4", help="video of moving objects")],
     out: Annotated[
-        Path, typer.Option("-o", "--out", help="for `ngff simulate --materials` (.json)")
+        Path, typer.Option("-o", "--out", help="materials for `ngff simulate --materials` to write (.json)")
     ] = Path("materials.json"),
     objects: Annotated[
-        str, typer.Option(help="names, such as duck,ball, or the scene.ply that has them; by default the model's")
+        str, typer.Option(help="names, such as duck,ball, or a scene.ply that has them; default: chosen by the model")
     ] = "",
-    model: Annotated[str, typer.Option(help="one that sees images; by default $OPENAI_MODEL")] = "",
-    timeout: Annotated[float, typer.Option(help="longest to wait for an answer [s]")] = 120.0,
+    model: Annotated[str, typer.Option(help="name of a model that accepts images; default: $OPENAI_MODEL")] = "",
+    timeout: Annotated[float, typer.Option(help="maximum waiting time for a reply [s]")] = 120.0,
 ) -> None:
-    """Ask a vision-language model what the things in a video are made of.
+    """Estimate the materials of the objects in a video with a vision-language model.
 
-    Any endpoint that speaks OpenAI's protocol: $OPENAI_BASE_URL, with the key $OPENAI_API_KEY if it wants one.
+    Works with any endpoint that implements OpenAI's protocol: $OPENAI_BASE_URL, and $OPENAI_API_KEY if it needs a key.
     """
     from stages.lab.bench.estimate_materials import EstimateOptions, run
 
-    for line in run(video, out, EstimateOptions(objects, model, timeout)):
+    for line in run(video, out, EstimateOptions(objects=objects, model=model, timeout=timeout)):
         print(line)
 
 
@@ -329,4 +358,5 @@ app.add_typer(bench.app, name="bench")
 
 
 def main() -> None:
+    """Entry point of the script `ngff-lab`."""
     app()

@@ -1,9 +1,11 @@
-"""What the two command lines share: argument types, and how errors reach the user."""
+"""Shared by both command lines: option types, --json, logging and error reports."""
 
 import logging
 import os
 import sys
+from collections.abc import Callable, Iterable
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Annotated
 
 import typer
@@ -17,9 +19,9 @@ os.environ.setdefault("OPENBLAS_THREAD_TIMEOUT", "4")
 
 SceneIn = Annotated[Path, typer.Argument(metavar="SCENE.ply", help="scene to read (.ply)", show_default=False)]
 Device = Annotated[str, typer.Option(help="auto | cpu | cuda")]
-Seed = Annotated[int, typer.Option(help="same seed, same device: same result")]
+Seed = Annotated[int, typer.Option(help="random seed; the same seed and device give the same result")]
 Threads = Annotated[int | None, typer.Option(help="CPU threads; default: all cores", show_default=False)]
-Verbose = Annotated[bool, typer.Option("-v", "--verbose", help="say more about what is done")]
+AsJson = Annotated[bool, typer.Option("--json", help="print the results as JSON instead of a table")]
 
 
 def limit_threads(count: int | None) -> None:
@@ -36,28 +38,54 @@ def limit_threads(count: int | None) -> None:
 
 
 class StderrHandler(logging.Handler):
-    """Writes to what sys.stderr is at that moment: a stream kept from an earlier call may be closed by then."""
+    """Writes to the current sys.stderr, which may have been replaced since the handler was installed."""
 
     def emit(self, record: logging.LogRecord) -> None:
+        """Print one record."""
         print(self.format(record), file=sys.stderr)
 
 
 def set_up_logging(verbose: bool) -> None:
-    """Messages to stderr, past any progress bar; results alone go to stdout."""
-    if not sys.stderr.isatty():  # in a log, a line of progress now and then will do
+    """Send log messages to stderr; stdout is reserved for results. `verbose` includes debug messages."""
+    if not sys.stderr.isatty():  # in a log file a progress line every 10 s is enough
         os.environ.setdefault("TQDM_MININTERVAL", "10")
     logging.basicConfig(handlers=[StderrHandler()], format="%(message)s", level=logging.WARNING, force=True)
     for name in ("stages", "ngff_cli"):
         logging.getLogger(name).setLevel(logging.DEBUG if verbose else logging.INFO)
 
 
-class Commands(typer.core.TyperGroup):
-    """Commands in the order of the pipeline; a user's mistake is one sentence and status 2."""
+def print_results(run: Callable[[Path | None], Iterable[str]], out: Path | None, as_json: bool) -> None:
+    """Print the table lines of `run(out)`, or with --json the JSON file that it writes to `out`.
+
+    `out` is where the user wants that file, if anywhere; with --json the table lines go to stderr as progress.
+    """
+    if not as_json:
+        for line in run(out):
+            print(line, flush=True)
+        return
+    with TemporaryDirectory() as folder:
+        path = out or Path(folder) / "results.json"
+        for line in run(path):
+            print(line, file=sys.stderr, flush=True)
+        print(path.read_text().rstrip())
+
+
+class CommandGroup(typer.core.TyperGroup):
+    """Commands in the order of their definition; an InputError or OSError exits with one line and status 2."""
 
     def list_commands(self, ctx) -> list[str]:
+        """Names in the order of definition."""
         return list(self.commands)
 
+    def get_command(self, ctx, cmd_name: str):
+        """The command; --help of the group lists it with its whole first paragraph instead of 45 characters."""
+        command = super().get_command(ctx, cmd_name)
+        if command is not None and not command.short_help:
+            command.short_help = (command.help or "").split("\n\n")[0]
+        return command
+
     def invoke(self, ctx):
+        """Run the command; turn errors that a user can correct into one line on stderr."""
         try:
             return super().invoke(ctx)
         except InputError as error:
@@ -68,10 +96,10 @@ class Commands(typer.core.TyperGroup):
             where = f"{error.filename}: " if error.filename else ""
             fail(f"{where}{error.strerror or error}", 2)
         except KeyboardInterrupt:
-            fail("stopped; nothing half-written is left behind", 130)
+            fail("interrupted; no incomplete file is left", 130)
 
 
 def fail(message: str, status: int) -> None:
-    """Leave with one line on stderr."""
+    """Exit with one line on stderr."""
     print(f"ngff: {message}", file=sys.stderr)
     sys.exit(status)

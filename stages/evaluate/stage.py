@@ -23,7 +23,9 @@ COMPARISONS = {
 }
 
 
-def run(prediction: Path, truth: Path, out: Path | None, options: EvaluateOptions) -> dict:
+def run(
+    prediction: Path, truth: Path, out: Path | None, options: EvaluateOptions, as_json: bool = False
+) -> dict:
     """Compares a prediction with the truth; the table goes to stdout, everything to `out` (metrics.json beside it)."""
     prediction, truth = Path(prediction), Path(truth)
     kinds = [_kind(prediction), _kind(truth)]
@@ -38,7 +40,7 @@ def run(prediction: Path, truth: Path, out: Path | None, options: EvaluateOption
         part.write_text(json.dumps(facts, indent=1) + "\n")
     if options.report:
         write_report(options.report, result, prediction, truth)
-    print(format_table(result))
+    print(json.dumps(facts, indent=1) if as_json else format_table(result))
     return facts
 
 

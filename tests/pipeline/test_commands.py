@@ -1,13 +1,12 @@
-"""The command line as users meet it."""
+"""The command line: options, help, completion and the whole chain."""
 
 import dataclasses
 import inspect
+import json
 import os
-import resource
 import subprocess
 import sys
 import typing
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -15,20 +14,37 @@ from typer.testing import CliRunner
 
 from ngff_cli import app as commands
 from ngff_cli.app import app
+from ngff_cli.lab import app as lab_app
+from ngff_cli.options import print_results
 from stages import PIPELINE
 from stages.core.scene.scene_ply import read_scene, write_scene
 from stages.core.scene.trajectory import read_trajectory
-from stages.simulate.options import SimulateOptions
-from stages.simulate.stage import run
-from tests.conftest import two_balls_scene
 
 ROOT = Path(__file__).resolve().parents[2]
-NOT_OPTIONS = {"out", "imgs", "scene", "source", "prediction", "against"}
+NOT_OPTIONS = {"out", "imgs", "scene", "source", "prediction", "against", "as_json"}  # not in the Options classes
 
 
 def call(*args) -> tuple[int, str, str]:
+    """Exit status, stdout and stderr of `ngff ARGS`."""
     done = CliRunner().invoke(app, [str(a) for a in args])
     return done.exit_code, done.stdout, done.stderr
+
+
+def all_commands(app, prefix=()):
+    """(words, callback) of every command of a Typer app and its sub-apps."""
+    for command in app.registered_commands:
+        yield (*prefix, command.name or command.callback.__name__), command.callback
+    for group in app.registered_groups:
+        yield from all_commands(group.typer_instance, (*prefix, group.name))
+
+
+COMMANDS = {" ".join(words): callback for words, callback in
+            [*all_commands(app, ("ngff",)), *all_commands(lab_app, ("ngff-lab",))]}  # fmt: skip
+
+
+def first_paragraph(callback) -> str:
+    """Of the docstring, on one line."""
+    return " ".join(inspect.getdoc(callback).split("\n\n")[0].split())
 
 
 def test_exactly_six_commands_in_the_order_of_the_pipeline():
@@ -37,7 +53,7 @@ def test_exactly_six_commands_in_the_order_of_the_pipeline():
 
 
 @pytest.mark.parametrize("command", list(PIPELINE))
-def test_every_field_of_the_options_is_on_its_command_with_the_same_default(command):
+def test_every_field_of_the_options_class_is_an_option_with_the_same_default(command):
     options = getattr(commands, f"{command.capitalize()}Options")
     given = {n: p for n, p in inspect.signature(getattr(commands, command)).parameters.items() if n not in NOT_OPTIONS}
     fields = {f.name: f.default for f in dataclasses.fields(options)}
@@ -47,11 +63,37 @@ def test_every_field_of_the_options_is_on_its_command_with_the_same_default(comm
 
 
 @pytest.mark.parametrize("command", list(PIPELINE))
-def test_help_explains_every_option(command):
+def test_help_names_input_and_output(command):
     status, out, _ = call(command, "--help")
-    assert status == 0 and "->" in out or command == "evaluate"
-    hints = typing.get_type_hints(getattr(commands, command), include_extras=True)
-    assert all(hint.__metadata__[0].help for name, hint in hints.items() if name != "return")
+    assert status == 0 and "->" in out
+
+
+@pytest.mark.parametrize("script", ["ngff", "ngff-lab"])
+def test_help_shows_the_whole_sentence_of_each_command(script):
+    done = CliRunner().invoke({"ngff": app, "ngff-lab": lab_app}[script], ["--help"], terminal_width=80)
+    text = " ".join(done.stdout.split())
+    for name, callback in COMMANDS.items():
+        if name.split()[:-1] == [script]:
+            assert f"{name.split()[-1]} {first_paragraph(callback)}" in text
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_and_option_is_documented(name):
+    assert first_paragraph(COMMANDS[name]).endswith((".", ")."))
+    hints = typing.get_type_hints(COMMANDS[name], include_extras=True)
+    assert all(hint.__metadata__[0].help for option, hint in hints.items() if option != "return")
+
+
+@pytest.mark.parametrize("name, script", [("ngff", app), ("ngff-lab", lab_app)], ids=["ngff", "ngff-lab"])
+def test_shell_completion(name, script, monkeypatch):
+    variable = f"_{name.replace('-', '_').upper()}_COMPLETE"
+    monkeypatch.setenv("_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION", "1")
+    done = CliRunner().invoke(script, ["--show-completion", "bash"], prog_name=name)
+    assert done.exit_code == 0 and variable in done.stdout
+    env = {variable: "complete_bash", "COMP_WORDS": f"{name} re", "COMP_CWORD": "1"}
+    done = CliRunner().invoke(script, [], prog_name=name, env=env)
+    expected = [c.split()[1] for c in COMMANDS if c.startswith(f"{name} re") and len(c.split()) == 2]
+    assert done.exit_code == 0 and done.stdout.split() == expected
 
 
 def test_simulate_render_evaluate_in_a_row(tmp_path, two_balls):
@@ -61,13 +103,15 @@ def test_simulate_render_evaluate_in_a_row(tmp_path, two_balls):
     assert status == 0, err
     trajectory = read_trajectory(tmp_path / "t.h5")
     assert len(trajectory) == 4
-    # the green ball hangs in the air: after 3 frames of 0.02 s it has fallen g t^2 / 2 = 1.8 cm
+    # the green ball starts in the air: after 3 frames of 0.02 s it has fallen g t^2 / 2 = 1.8 cm
     fallen = float(trajectory.com[0, 1, 2] - trajectory.com[3, 1, 2])
     assert fallen == pytest.approx(9.81 * 0.06**2 / 2, rel=0.1)
     status, out, err = call("render", tmp_path / "t.h5", "--resolution", 64)
     assert status == 0 and "t_novel.mp4" in out, err
     status, out, err = call("evaluate", tmp_path / "t.h5", "--against", tmp_path / "t.h5")
-    assert status == 0 and (tmp_path / "metrics.json").exists(), err
+    assert status == 0 and out.split()[:2] == ["MSE", "RMSE"], err
+    status, out, err = call("evaluate", tmp_path / "t.h5", "--against", tmp_path / "t.h5", "--json")
+    assert status == 0 and json.loads(out) == json.loads((tmp_path / "metrics.json").read_text()), err
 
 
 def test_refine_reads_what_segment_writes(tmp_path, two_balls):
@@ -77,108 +121,25 @@ def test_refine_reads_what_segment_writes(tmp_path, two_balls):
     assert {o.name for o in read_scene(tmp_path / "refined.ply").objects} == {"red ball", "green ball"}
 
 
-WRONG = [
-    ("reconstruct", "{}/absent", "-o", "{}/o.ply"),
-    ("reconstruct", "{}/empty", "-o", "{}/o.ply"),
-    ("reconstruct", "{}/text.h5", "-o", "{}/o.ply"),
-    ("reconstruct", "{}/damaged", "-o", "{}/o.ply"),
-    ("reconstruct", "{}/damaged", "-o", "{}/nowhere/o.ply"),
-    ("segment", "{}/absent.ply", "-o", "{}/o.ply"),
-    ("segment", "{}/text.ply", "-o", "{}/o.ply"),
-    ("segment", "{}/cut.ply", "-o", "{}/o.ply"),
-    ("segment", "{}/empty", "-o", "{}/o.ply"),
-    ("segment", "{}/good.ply", "-o", "{}/nowhere/o.ply"),
-    ("refine", "{}/text.ply", "-o", "{}/o.ply"),
-    ("refine", "{}/empty.ply", "-o", "{}/o.ply"),
-    ("refine", "{}/cut.ply", "-o", "{}/o.ply"),
-    ("refine", "{}/good.h5", "-o", "{}/o.ply"),
-    ("refine", "{}/good.ply", "-o", "{}/empty"),
-    ("simulate", "{}/text.ply", "-o", "{}/o.h5"),
-    ("simulate", "{}/cut.ply", "-o", "{}/o.h5"),
-    ("simulate", "{}/good.h5", "-o", "{}/o.h5"),
-    ("simulate", "{}/good.ply", "-o", "{}/nowhere/o.h5"),
-    ("simulate", "{}/good.ply", "-o", "{}/o.h5", "--engine", "magic"),
-    ("simulate", "{}/good.ply", "-o", "{}/o.h5", "--force", "nonsense"),
-    ("simulate", "{}/good.ply", "-o", "{}/o.h5", "--device", "abacus"),
-    ("render", "{}/absent.h5"),
-    ("render", "{}/text.h5"),
-    ("render", "{}/cut.h5"),
-    ("render", "{}/empty.h5"),
-    ("render", "{}/empty"),
-    ("render", "{}/good.ply", "-o", "{}/o.gif"),
-    ("render", "{}/good.ply", "-o", "{}/nowhere/o.png"),
-    ("evaluate", "{}/text.h5", "--against", "{}/text.h5"),
-    ("evaluate", "{}/good.h5", "--against", "{}/cut.h5"),
-    ("evaluate", "{}/good.h5", "--against", "{}/good.ply"),
-    ("evaluate", "{}/good.ply", "--against", "{}/absent.ply"),
-    ("evaluate", "{}/good.h5", "--against", "{}/good.h5", "-o", "{}/nowhere/m.json"),
-]
+def test_json_replaces_the_table_on_stdout(tmp_path, capsys):
+    def run(out):
+        yield "a table"
+        if out is not None:
+            out.write_text('{"PSNR": 30}\n')
+
+    print_results(run, None, as_json=False)
+    assert capsys.readouterr() == ("a table\n", "")
+    for out in (None, tmp_path / "results.json"):
+        print_results(run, out, as_json=True)
+        assert capsys.readouterr() == ('{"PSNR": 30}\n', "a table\n")
+    assert (tmp_path / "results.json").exists()
 
 
-@pytest.fixture(scope="module")
-def workplace(tmp_path_factory):
-    """A scene and a trajectory that are well, and every way in which a file can be bad."""
-    folder = tmp_path_factory.mktemp("wrong")
-    for name in ("empty", "damaged"):
-        (folder / name).mkdir()
-    for i in range(3):
-        (folder / f"damaged/{i}.jpg").write_bytes(b"\xff\xd8\xff\xe0 and no more")
-    for name in ("empty.ply", "empty.h5"):
-        (folder / name).touch()
-    for name in ("text.ply", "text.h5"):
-        (folder / name).write_text("not what it says")
-    write_scene(folder / "good.ply", two_balls_scene())
-    run(folder / "good.ply", folder / "good.h5", SimulateOptions(steps=3, quality="draft"))
-    for kind in ("ply", "h5"):
-        whole = (folder / f"good.{kind}").read_bytes()
-        (folder / f"cut.{kind}").write_bytes(whole[: 2 * len(whole) // 3])
-    return folder
-
-
-def fails_cleanly(folder, args, command=call) -> str:
-    """One sentence, status 2, nothing on stdout and nothing left behind; returns the sentence."""
-    before = sorted(p.name for p in folder.iterdir())
-    status, out, err = command(*(str(a).format(folder) for a in args))
-    lines = [line for line in err.splitlines() if line.startswith("ngff: ")]
-    assert status == 2 and len(lines) == 1, err
-    assert "Traceback" not in err and out == ""
-    assert sorted(p.name for p in folder.iterdir()) == before
-    return lines[0]
-
-
-@pytest.mark.parametrize("args", WRONG, ids=lambda a: " ".join(a).replace("{}/", ""))
-def test_a_mistake_is_one_sentence_and_status_two(workplace, args):
-    fails_cleanly(workplace, args)
-
-
-@contextmanager
-def at_most(size: int):
-    """No file may grow beyond `size` bytes: to a program, much like a full disk."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-
-
-FULL = [
-    ("segment", "{}/good.ply", "-o", "{}/o.ply"),
-    ("refine", "{}/good.ply", "-o", "{}/o.ply"),
-    ("simulate", "{}/good.ply", "-o", "{}/o.h5", "--steps", 3, "--quality", "draft"),
-    ("render", "{}/good.h5", "-o", "{}/o.mp4", "--resolution", 64),
-    ("render", "{}/good.ply", "-o", "{}/o.png", "--resolution", 64),
-    ("evaluate", "{}/good.h5", "--against", "{}/good.h5", "-o", "{}/m.json"),
-]
-
-
-@pytest.mark.parametrize("args", FULL, ids=lambda a: a[0] + a[3][-4:])
-def test_a_full_disk_is_one_sentence_too(workplace, args):
-    def limited(*args):
-        with at_most(600):
-            return call(*args)
-
-    assert "cannot be written" in fails_cleanly(workplace, args, limited)
+def test_every_benchmark_has_json():
+    tables = {"ngff evaluate", "ngff-lab doctor", "ngff-lab statistics", "ngff-lab study",
+              *(name for name in COMMANDS if name.startswith("ngff-lab bench"))}  # fmt: skip
+    given = {name for name, callback in COMMANDS.items() if "as_json" in inspect.signature(callback).parameters}
+    assert given == tables
 
 
 @pytest.mark.parametrize("count", [1, 2])

@@ -6,15 +6,18 @@ frame. A scene of the published data set is 100 such frames.
 
 from __future__ import annotations
 
+import json
 import logging
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import torch
 
 from stages.core.errors import InputError
 from stages.core.physics.mpm import solver as mpm
+from stages.core.scene.files import replacing
 from stages.lab.bench import common as bench
 from stages.lab.bench import mpm_three_kernel
 
@@ -105,24 +108,31 @@ def batch_size(particles: int, device: str) -> int:
     return max(1, min(room, math.ceil(3_000_000 / particles)))
 
 
-def run(options: MpmBenchOptions) -> Iterator[str]:
-    """Lines of the report."""
+def run(options: MpmBenchOptions, out: Path | None = None) -> Iterator[str]:
+    """Lines of the report; all results as JSON in `out`."""
     from stages.core.backends import pick_device
 
     device = pick_device(options.device)
     yield bench.machine(device)
     copy = bench.copy_bandwidth(device)
     yield f"copy bandwidth {copy / 1e9:,.0f} GB/s"
+    rows = []
     for particles in options.particles:
         plain = measure_three_kernel(particles, device)
         many = options.scenes or batch_size(particles, device)
         for scenes, exact in sorted({(1, False), (many, False), (many, True)}):
             r = measure(particles, scenes, device, options.frames, exact)
+            speedup = plain * scenes / r["substep_us"] * 1e6  # compared with the three-kernel form
+            rows.append({"exact": exact, **r, "speedup": speedup})
             kind, shape = "mpm exact" if exact else "mpm", " x ".join(map(str, r["nodes"]))
             yield (
                 f"{kind} {r['particles']:>7,} particles x {scenes:>4} scenes, {shape} nodes: "
                 f"{r['substep_us']:9.1f} us a substep, {r['ns_per_particle']:.3f} ns a particle, "
                 f"{r['scenes_per_minute']:8.1f} scenes a minute; {r['bytes'] / 1e6:,.0f} MB moved, "
                 f"{r['bytes_per_second'] / copy:.2f} x the copy bandwidth; "
-                f"{plain * scenes / r['substep_us'] * 1e6:.1f}x the plain three-kernel form"
+                f"{speedup:.1f}x the plain three-kernel form"
             )
+    if out is not None:
+        facts = {"command": "ngff-lab bench mpm", "machine": bench.machine(device), "copy_bytes_per_second": copy}
+        with replacing(out) as part:
+            part.write_text(json.dumps({**facts, "rows": rows}, indent=1) + "\n")

@@ -6,9 +6,11 @@ Random weights of the published sizes: time and memory do not depend on their va
 from __future__ import annotations
 
 import gc
+import json
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import torch
 from jaxtyping import Float
@@ -22,6 +24,7 @@ from stages.core.models.pi3.dinov2 import PATCH
 from stages.core.models.pi3.layers import Attention
 from stages.core.models.pi3.network import Pi3, halve
 from stages.core.models.pi3.splat import Pi3Splat
+from stages.core.scene.files import replacing
 from stages.lab.bench import common as bench
 
 
@@ -71,7 +74,9 @@ def measure(model: nn.Module, views: int, size: int, at_once: int, device: str, 
             torch.cuda.empty_cache()
 
 
-def run(options: Pi3BenchOptions, config: Pi3Config = Pi3Config()) -> Iterator[str]:  # noqa: B008 -- frozen
+def run(
+    options: Pi3BenchOptions, config: Pi3Config = Pi3Config(), out: Path | None = None  # noqa: B008 -- frozen
+) -> Iterator[str]:
     """A line for each number of views: seconds, memory and its estimate, then the same with attention written out."""
     device = pick_device(options.device)
     half = device != "cpu"
@@ -82,16 +87,19 @@ def run(options: Pi3BenchOptions, config: Pi3Config = Pi3Config()) -> Iterator[s
     weights = memory.weights(model)
     yield bench.machine(device)
     yield f"{type(model).__name__}, {options.size}x{options.size}, {'bf16' if half else 'fp32'}, weights {_gb(weights)}"
+    rows = []
     for views in options.views:
         size = options.size, options.size
         at_once = memory.plan(config, views, size, options.splats, half, memory.free(device))
         said = weights + memory.activations(config, views, *size, at_once, options.splats, half)
+        rows.append({"views": views, "estimated_bytes": _finite(said)})
         set_attention(model, nn.functional.scaled_dot_product_attention)
         try:
             seconds, most = measure(model, views, options.size, at_once, device, options.repeat)
         except torch.OutOfMemoryError:
             yield f"views {views:>3}  out of memory (estimate {_gb(said)})"
             continue
+        rows[-1] |= {"seconds": seconds, "bytes": _finite(most)}
         yield f"views {views:>3}  {seconds:8.3f} s  {_gb(most)} (estimate {_gb(said)})  {views / seconds:6.1f} photos/s"
         set_attention(model, naive_attention)
         try:
@@ -101,13 +109,23 @@ def run(options: Pi3BenchOptions, config: Pi3Config = Pi3Config()) -> Iterator[s
         except torch.OutOfMemoryError:
             yield "           attention written out: out of memory"
             continue
+        rows[-1] |= {"naive_seconds": slow, "naive_bytes": _finite(more)}
         yield f"           attention written out: {slow:8.3f} s  {_gb(more)}, {slow / seconds:.1f} times our time"
+    if out is not None:
+        facts = {"command": "ngff-lab bench pi3", "machine": bench.machine(device), "weight_bytes": weights}
+        with replacing(out) as part:
+            part.write_text(json.dumps({**facts, "rows": rows}, indent=1) + "\n")
 
 
 def _table(config: Pi3Config, views: int, size: int) -> int:
     """Bytes of the scores of all pairs of tokens, twice, in 32 bit."""
     tokens = views * ((size // PATCH) ** 2 + 5)
     return 2 * 4 * (config.width // config.head) * tokens**2
+
+
+def _finite(count: float) -> float | None:
+    """For JSON, which has no nan."""
+    return count if math.isfinite(count) else None
 
 
 def _gb(count: float) -> str:

@@ -1,0 +1,115 @@
+"""Errors of the command line: one line on stderr, exit status 2, and no incomplete file."""
+
+import resource
+from contextlib import contextmanager
+
+import pytest
+
+from stages.core.scene.scene_ply import write_scene
+from stages.simulate.options import SimulateOptions
+from stages.simulate.stage import run
+from tests.conftest import two_balls_scene
+from tests.pipeline.test_commands import call
+
+WRONG = [
+    ("reconstruct", "{}/absent", "-o", "{}/o.ply"),
+    ("reconstruct", "{}/empty", "-o", "{}/o.ply"),
+    ("reconstruct", "{}/text.h5", "-o", "{}/o.ply"),
+    ("reconstruct", "{}/damaged", "-o", "{}/o.ply"),
+    ("reconstruct", "{}/damaged", "-o", "{}/nowhere/o.ply"),
+    ("segment", "{}/absent.ply", "-o", "{}/o.ply"),
+    ("segment", "{}/text.ply", "-o", "{}/o.ply"),
+    ("segment", "{}/cut.ply", "-o", "{}/o.ply"),
+    ("segment", "{}/empty", "-o", "{}/o.ply"),
+    ("segment", "{}/good.ply", "-o", "{}/nowhere/o.ply"),
+    ("refine", "{}/text.ply", "-o", "{}/o.ply"),
+    ("refine", "{}/empty.ply", "-o", "{}/o.ply"),
+    ("refine", "{}/cut.ply", "-o", "{}/o.ply"),
+    ("refine", "{}/good.h5", "-o", "{}/o.ply"),
+    ("refine", "{}/good.ply", "-o", "{}/empty"),
+    ("simulate", "{}/text.ply", "-o", "{}/o.h5"),
+    ("simulate", "{}/cut.ply", "-o", "{}/o.h5"),
+    ("simulate", "{}/good.h5", "-o", "{}/o.h5"),
+    ("simulate", "{}/good.ply", "-o", "{}/nowhere/o.h5"),
+    ("simulate", "{}/good.ply", "-o", "{}/o.h5", "--engine", "magic"),
+    ("simulate", "{}/good.ply", "-o", "{}/o.h5", "--force", "nonsense"),
+    ("simulate", "{}/good.ply", "-o", "{}/o.h5", "--device", "abacus"),
+    ("render", "{}/absent.h5"),
+    ("render", "{}/text.h5"),
+    ("render", "{}/cut.h5"),
+    ("render", "{}/empty.h5"),
+    ("render", "{}/empty"),
+    ("render", "{}/good.ply", "-o", "{}/o.gif"),
+    ("render", "{}/good.ply", "-o", "{}/nowhere/o.png"),
+    ("evaluate", "{}/text.h5", "--against", "{}/text.h5"),
+    ("evaluate", "{}/good.h5", "--against", "{}/cut.h5"),
+    ("evaluate", "{}/good.h5", "--against", "{}/good.ply"),
+    ("evaluate", "{}/good.ply", "--against", "{}/absent.ply"),
+    ("evaluate", "{}/good.h5", "--against", "{}/good.h5", "-o", "{}/nowhere/m.json"),
+]
+
+
+@pytest.fixture(scope="module")
+def input_files(tmp_path_factory):
+    """A valid scene and trajectory, and files that are absent, empty, truncated, or of another format."""
+    folder = tmp_path_factory.mktemp("wrong")
+    for name in ("empty", "damaged"):
+        (folder / name).mkdir()
+    for i in range(3):
+        (folder / f"damaged/{i}.jpg").write_bytes(b"\xff\xd8\xff\xe0 and no more")
+    for name in ("empty.ply", "empty.h5"):
+        (folder / name).touch()
+    for name in ("text.ply", "text.h5"):
+        (folder / name).write_text("not the format of the suffix")
+    write_scene(folder / "good.ply", two_balls_scene())
+    run(folder / "good.ply", folder / "good.h5", SimulateOptions(steps=3, quality="draft"))
+    for kind in ("ply", "h5"):
+        content = (folder / f"good.{kind}").read_bytes()
+        (folder / f"cut.{kind}").write_bytes(content[: 2 * len(content) // 3])
+    return folder
+
+
+def fails_cleanly(folder, args, command=call) -> str:
+    """Assert one line on stderr, status 2, empty stdout and no new file; return the line."""
+    before = sorted(p.name for p in folder.iterdir())
+    status, out, err = command(*(str(a).format(folder) for a in args))
+    lines = [line for line in err.splitlines() if line.startswith("ngff: ")]
+    assert status == 2 and len(lines) == 1, err
+    assert "Traceback" not in err and out == ""
+    assert sorted(p.name for p in folder.iterdir()) == before
+    return lines[0]
+
+
+@pytest.mark.parametrize("args", WRONG, ids=lambda a: " ".join(a).replace("{}/", ""))
+def test_wrong_input_gives_one_line_and_status_2(input_files, args):
+    fails_cleanly(input_files, args)
+
+
+@contextmanager
+def file_size_limit(size: int):
+    """No file may exceed `size` bytes, which a program notices like a full disk."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+FULL = [
+    ("segment", "{}/good.ply", "-o", "{}/o.ply"),
+    ("refine", "{}/good.ply", "-o", "{}/o.ply"),
+    ("simulate", "{}/good.ply", "-o", "{}/o.h5", "--steps", 3, "--quality", "draft"),
+    ("render", "{}/good.h5", "-o", "{}/o.mp4", "--resolution", 64),
+    ("render", "{}/good.ply", "-o", "{}/o.png", "--resolution", 64),
+    ("evaluate", "{}/good.h5", "--against", "{}/good.h5", "-o", "{}/m.json"),
+]
+
+
+@pytest.mark.parametrize("args", FULL, ids=lambda a: a[0] + a[3][-4:])
+def test_full_disk_gives_one_line_and_status_2(input_files, args):
+    def limited(*args):
+        with file_size_limit(600):
+            return call(*args)
+
+    assert "cannot be written" in fails_cleanly(input_files, args, limited)

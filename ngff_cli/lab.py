@@ -186,7 +186,10 @@ def train(
     speeds: Annotated[
         float, typer.Option(help="weight of velocity errors relative to position errors [s]; 0: none")
     ] = 0.0,
-    memory: Annotated[float, typer.Option(help="factor on the gradient per frame of backpropagation in time")] = 0.9,
+    gradient_discount: Annotated[
+        float,
+        typer.Option("--gradient-discount", "--memory", help="factor on the gradient per frame of backpropagation"),
+    ] = 0.9,
     groups: Annotated[
         str, typer.Option(help="groups to train on, also varied, solid, turned; the last 100 scenes are for validation")
     ] = "3_0..3_8",
@@ -203,8 +206,8 @@ def train(
 
     options = TrainOptions(
         minutes=minutes, steps=steps, batch=batch, keypoints=keypoints, few=few, lr=lr, horizons=horizons,
-        hidden=hidden, loss=loss, optimizer=optimizer, speeds=speeds, memory=memory, groups=groups, compiled=compiled,
-        seed=seed, device=device,
+        hidden=hidden, loss=loss, optimizer=optimizer, speeds=speeds,
+        gradient_discount=gradient_discount, groups=groups, compiled=compiled, seed=seed, device=device,
     )  # fmt: skip
     for line in run(model, data, out, options, resume, start):
         print(line)

@@ -70,36 +70,15 @@ def halve(path: Path) -> None:
     save(path, card["model"], model, card, half=True)
 
 
-def training_minutes(card: Mapping) -> float:
-    """Of one processor's training, that of the weights it began with, or was averaged with, included."""
-    own = float(card["minutes"]) * card.get("processes", 1)
-    return own + (training_minutes(card["before"]) if "before" in card else 0.0) + _others(card)
-
-
-def _others(card: Mapping) -> float:
-    """Minutes of those that it was averaged with; of those in its own line, which count already, the others' only."""
-    return sum((training_minutes(c) if "minutes" in c else _others(c) for c in card.get("averaged", ())), 0.0)
-
-
 def write_card(path: Path, card: Mapping) -> None:
-    """A line for each entry, and for each row of a table; numbers of eight digits; of data, only what differs."""
-    facts = dict(card)
-    if facts.get("data"):
-        first, *others = facts["data"]
-        made = first.get("made", {})
-        facts["data"] = [first, *({**row, "made": _unlike(row.get("made", {}), made)} for row in others)]
+    """Write a card as JSON: a line for each entry and for each row of a table, numbers with eight digits."""
     lines = []
-    for key, value in _rounded(facts).items():
+    for key, value in _rounded(card).items():
         table = isinstance(value, list) and value and isinstance(value[0], dict)
         rows = ",\n  ".join(map(json.dumps, value)) if table else ""
         lines.append(f" {json.dumps(key)}: " + (f"[\n  {rows}\n ]" if table else json.dumps(value)))
     with replacing(path) as part:
         part.write_text("{\n" + ",\n".join(lines) + "\n}\n")
-
-
-def _unlike(row: Mapping, first: Mapping) -> dict:
-    """The entries that are not those of the first row."""
-    return {k: v for k, v in row.items() if k not in first or first[k] != v}
 
 
 def _rounded(value: object) -> object:

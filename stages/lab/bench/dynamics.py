@@ -44,6 +44,7 @@ from stages.lab.bench.dynamics_baselines import (
 from stages.lab.bench.dynamics_report import PUBLISHED, report, table
 from stages.lab.dataset.keypoint_motions import KeypointMotions
 from stages.lab.training.data import motions_folder, read_groups
+from stages.lab.training.history import total_minutes
 
 log = logging.getLogger(__name__)
 TRAINED = tuple(f"3_{i}" for i in range(9))
@@ -216,9 +217,10 @@ def _model(file: Path, splits: dict[str, KeypointMotions], options: DynamicsBenc
     with torch.inference_mode():
         results = {n: evaluate_predictor(_rolled(model), m, options.batch) for n, m in splits.items()}
         seconds = _seconds(model, next(iter(splits.values())), device)
-    about = {k: card[k] for k in ("model", "config", "scenes", "device", "sha256") if k in card}
-    if "minutes" in card:
-        about["minutes"] = _digits(weights.training_minutes(card))
+    about = {k: card[k] for k in ("model", "config", "device", "sha256") if k in card}
+    minutes = total_minutes(card)
+    if minutes is not None:
+        about["minutes"] = _digits(minutes)
     parameters = sum(p.numel() for p in model.parameters())
     keypoints = min(learned, options.keypoints)
     return {"splits": results, "seconds": seconds, "keypoints": keypoints, "parameters": parameters, "card": about}

@@ -1,4 +1,4 @@
-"""Our force field with one of its choices taken away: what that choice is worth."""
+"""Ablations of the force field: the network, or its training options, with one component removed."""
 
 from __future__ import annotations
 
@@ -15,36 +15,34 @@ from stages.core.models.field.force_field import FieldScene, ForceField
 from stages.core.models.field.rest_shape import RestShape
 from stages.lab.training.train import TrainOptions
 
-IMPULSE_VECTORS = (
-    2  # vectors at the end of those of a contact: what would stop it, and what would push it along the normal
-)
+IMPULSE_VECTORS = 2  # last vector features of a contact: impulses that stop its motion, and its normal motion
 
 
 @dataclass(frozen=True)
 class Ablation:
-    """A choice, taken away by another network or by other options of training."""
+    """One component removed, by another network or by other training options."""
 
-    without: str
+    without: str  # what is removed, for the table
     network: Callable[[], Dynamics] = ForceField
     options: Callable[[TrainOptions], TrainOptions] = lambda options: options
 
 
 class _UnfusedForceField(ForceField):
-    """Without kernels for a whole step: they know the full network alone."""
+    """Without the fused kernels, which implement the full network only."""
 
     def _fused(self, scene: FieldScene) -> bool:
         return False
 
 
 class NoReaction(_UnfusedForceField):
-    """What touches a body pushes it, and feels nothing of that: each side has forces of its own."""
+    """Contact forces act on one body only: each side of a contact predicts a force of its own."""
 
     def _returned(self, shape: RestShape, x: Float[Tensor, "b o m c"]) -> Float[Tensor, "b o c"]:
         return torch.zeros_like(x[:, :, 0])
 
 
 class NoMaterialInputs(_UnfusedForceField):
-    """All objects are of one stiffness, Poisson ratio and friction to the network; their mass it knows."""
+    """The same stiffness, Poisson ratio and friction for all objects as network inputs; masses are the true ones."""
 
     def encode(self, shape: RestShape) -> FieldScene:
         w = shape.initial
@@ -54,7 +52,7 @@ class NoMaterialInputs(_UnfusedForceField):
 
 
 class _NoImpulseFeatures(ContactNet):
-    """Contacts that see how things move, but not which impulse would stop them."""
+    """Contact features without the impulses that would stop the relative motion."""
 
     def __init__(self, vectors: int, scalars: int, hidden: int, partner: bool):
         super().__init__(vectors - IMPULSE_VECTORS, scalars, hidden, partner)
@@ -73,7 +71,7 @@ class _NoImpulseFeatures(ContactNet):
 
 
 class _ZeroFeatures(nn.Module):
-    """Nothing, of some width."""
+    """Zeros of some width in place of a network."""
 
     def __init__(self, width: int):
         super().__init__()
@@ -84,6 +82,7 @@ class _ZeroFeatures(nn.Module):
 
 
 def no_impulse_features() -> ForceField:
+    """The force field without impulses among its contact features."""
     model = _UnfusedForceField()
     h = model.config["hidden"]
     model.pairs, model.planes = _NoImpulseFeatures(10, 7, h, partner=True), _NoImpulseFeatures(8, 5, h, partner=False)
@@ -91,21 +90,22 @@ def no_impulse_features() -> ForceField:
 
 
 def no_context() -> ForceField:
-    """Each place of contact answers for itself, not knowing of any other."""
+    """The force field without message passing between contact points."""
     model = _UnfusedForceField()
     model.between = model.against = _ZeroFeatures(model.config["hidden"])
     return model
 
 
 ABLATIONS = {
-    "full": Ablation("nothing: the network as it is"),
-    "deformation": Ablation("deformation: bodies are rigid", lambda: ForceField(deform=False)),
-    "reaction": Ablation("reaction: a contact force acts on one body alone", NoReaction),
-    "impulses": Ablation("the impulse that would stop a contact, as what it sees", no_impulse_features),
-    "context": Ablation("what happens elsewhere: a contact knows of no other", no_context),
+    "full": Ablation("nothing (the full network)"),
+    "deformation": Ablation("deformation (bodies are rigid)", lambda: ForceField(deform=False)),
+    "reaction": Ablation("action equals reaction (a contact force acts on one body only)", NoReaction),
+    "impulses": Ablation("the impulse that would stop a contact, as a feature", no_impulse_features),
+    "context": Ablation("messages between contact points", no_context),
     "materials": Ablation("stiffness, Poisson ratio and friction as inputs", NoMaterialInputs),
     "keypoints": Ablation("three of four keypoints", options=lambda o: replace(o, keypoints=max(1, o.keypoints // 4))),
-    "memory": Ablation("fading of gradients (`--memory 1`)", options=lambda o: replace(o, memory=1.0)),
+    "discount": Ablation("gradient discount (`--gradient-discount 1`)",
+                       options=lambda o: replace(o, gradient_discount=1.0)),
     "axes": Ablation("the loss by axis of an object (`--loss square`)", options=lambda o: replace(o, loss="square")),
     "horizons": Ablation("rollouts longer than the first horizon",
                        options=lambda o: replace(o, horizons=str(o.frames[0]))),

@@ -1,7 +1,4 @@
-"""The cards of weights: what each says about its training in a line, the curves of all of them in one picture.
-
-Weights that ship are kept in 16 bits.
-"""
+"""Cards of weights: a line about the training of each, and their training curves in one figure."""
 
 from __future__ import annotations
 
@@ -10,16 +7,21 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from stages.core.errors import InputError
-from stages.core.models.checkpoints import halve, training_minutes
+from stages.core.models.checkpoints import halve
 from stages.core.scene.files import must_exist
 from stages.lab.plot import Panel, draw_panels
+from stages.lab.training.history import total_minutes
 
-PANELS = {"loss": "loss", "RMSE": "RMSE [m] of scenes not learned from", "R": "correlation, of the same scenes"}
-WHAT = "the card of weights (.json), such as `ngff-lab train` writes"
+PANELS = {"loss": "loss", "RMSE": "RMSE [m] of validation scenes", "R": "correlation, of the same scenes"}
+CARD = "the card of weights (.json), such as `ngff-lab train` writes"
 
 
 def run(cards: Sequence[Path], out: Path, half: bool = False) -> list[str]:
-    """Plot the training of models over its minutes; a line about each. `half`: make their weights ready to ship."""
+    """Plot the curves of the last training run of each card; return a line about each.
+
+    `half` also rewrites the weights beside each card in 16 bits, as weights are shipped. Raises InputError for files
+    that are no cards, and for two cards of one name.
+    """
     rows = {Path(card).stem: _read(Path(card)) for card in cards}
     if len(rows) < len(cards):
         raise InputError("two of the cards have the same name, and could not be told apart; rename one")
@@ -30,26 +32,32 @@ def run(cards: Sequence[Path], out: Path, half: bool = False) -> list[str]:
     draw_panels(out, panels)
     for card in cards if half else ():
         halve(Path(card).with_suffix(".safetensors"))
-    return [_line(name, row) for name, row in rows.items()]
+    return [_summary(name, row) for name, row in rows.items()]
 
 
 def _read(card: Path) -> dict:
-    must_exist(card, WHAT)
+    """A card with its curve as lists of one length."""
+    must_exist(card, CARD)
     try:
         row = json.loads(card.read_text())
-        curve = [{"minutes": float(r["minutes"]), **{k: r.get(k) for k in PANELS}} for r in row["curve"]]
-        return {**row, "curve": curve, "model": str(row["model"]), "minutes": float(row["minutes"])}
+        curve = {key: list(row["curve"][key]) for key in ("minutes", *PANELS)}
+        list(zip(*curve.values(), strict=True))
+        return {**row, "curve": curve, "model": str(row["model"]), "runs": [dict(run) for run in row["runs"]]}
     except (ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{card}: has no curve of training ({error!r}); {WHAT} is expected") from error
+        raise InputError(f"{card}: has no training curve ({error!r}); {CARD} is expected") from error
 
 
 def _curve(row: dict, key: str) -> list[tuple[float, float]]:
-    return [(r["minutes"], r[key]) for r in row["curve"] if isinstance(r[key], (int, float))]
+    """(minutes, value) wherever there is a value."""
+    pairs = zip(row["curve"]["minutes"], row["curve"][key], strict=True)
+    return [(float(minute), value) for minute, value in pairs if isinstance(value, (int, float))]
 
 
-def _line(name: str, row: dict) -> str:
-    best = row.get("validation") or {}
+def _summary(name: str, row: dict) -> str:
+    """A line: model, scenes of the last training run, minutes of all runs, device, last validation score."""
+    last = next((run for run in reversed(row["runs"]) if "minutes" in run), {})
+    best, minutes = last.get("validation") or {}, total_minutes(row)
     score = "  ".join(f"{k} {best[k]:.4f}" for k in ("RMSE", "FPE", "R") if isinstance(best.get(k), (int, float)))
-    known = f"{row['scenes']} scenes, " if "scenes" in row else ""
-    spent = training_minutes(row)
-    return f"{name}: {row['model']}, {known}{spent:.1f} min on {row.get('device', 'what was there')}: {score}"
+    scenes = f"{last['scenes']} scenes, " if "scenes" in last else ""
+    time = "unknown time" if minutes is None else f"{minutes:.1f} min"
+    return f"{name}: {row['model']}, {scenes}{time} on {row.get('device', 'unknown device')}: {score}"

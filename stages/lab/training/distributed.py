@@ -1,6 +1,6 @@
-"""Several processes that train one model, as `torchrun` starts them: each takes a part of every batch.
+"""Data-parallel training by several processes, as `torchrun` starts them: each computes a part of every batch.
 
-All draw the same batch and keep their rows of it, so that the result does not depend on how many they are.
+All processes draw the same batch and keep their own rows of it, so that the result does not depend on their number.
 """
 
 from __future__ import annotations
@@ -19,23 +19,24 @@ from stages.core.errors import InputError
 
 @dataclass(frozen=True)
 class ProcessGroup:
-    """This process is number `rank` of `size`; number 0 validates and writes."""
+    """This process is number `rank` of `size`; rank 0 validates and writes files."""
 
     rank: int = 0
     size: int = 1
     device: str = "cpu"
 
     @property
-    def leads(self) -> bool:
+    def is_main(self) -> bool:
+        """Whether this process validates and writes files."""
         return self.rank == 0
 
     def rows(self, batch: int) -> slice:
-        """Its part of a batch."""
+        """The rows of a batch that this process computes."""
         each = batch // self.size
         return slice(self.rank * each, (self.rank + 1) * each)
 
     def mean(self, tensors: list[Tensor]) -> list[Tensor]:
-        """Of what all have."""
+        """Mean of each tensor over all processes (all-reduce)."""
         if self.size == 1:
             return tensors
         flat = torch.cat([x.flatten() for x in tensors])
@@ -43,18 +44,21 @@ class ProcessGroup:
         parts = (flat / self.size).split([x.numel() for x in tensors])
         return [part.view_as(x) for part, x in zip(parts, tensors, strict=True)]
 
-    def agreed(self, value: float) -> float:
-        """What number 0 says."""
+    def broadcast(self, value: float) -> float:
+        """The value that rank 0 has."""
         if self.size == 1:
             return value
-        said = torch.tensor(value, dtype=torch.float64)  # not on the device, for which the host would have to wait
-        dist.broadcast(said, 0)
-        return said.item()
+        sent = torch.tensor(value, dtype=torch.float64)  # not on the device, for which the host would have to wait
+        dist.broadcast(sent, 0)
+        return sent.item()
 
 
 @contextmanager
 def process_group(device: str, batch: int) -> Iterator[ProcessGroup]:
-    """The processes that torchrun started; without it this one alone."""
+    """The process group that torchrun started; without torchrun this process alone.
+
+    Raises InputError for a batch that the processes cannot divide evenly.
+    """
     size = int(os.environ.get("WORLD_SIZE", "1"))
     if size == 1:
         yield ProcessGroup(device=device)

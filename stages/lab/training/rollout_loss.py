@@ -1,12 +1,13 @@
-"""Loss and gradient of a batch: a rollout over some frames and back, on a GPU replayed as one CUDA graph.
+"""Loss of a batch and its gradient: a rollout over some frames and back, on a GPU replayed as one CUDA graph.
 
-What a model computes once for a scene (`prepare`, `observe`) decomposes matrices, for which the host must wait, so it
-stays outside of the graph; gradients are carried on by hand from the graph into it.
+What a model computes once for a scene (`precompute`, `encode`, `state_from_motion`) decomposes matrices, for which the
+host must wait, so it stays outside of the graph; its gradients are chained to those of the graph by hand.
 """
 
 from __future__ import annotations
 
 import logging
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -19,24 +20,30 @@ from stages.core.models.trees import leaf_tensors, replace_tensors
 from stages.lab.training.data import MotionClip, smooth_motion
 
 log = logging.getLogger(__name__)
-UNIT = 0.01  # errors count in centimetres: gradients of order one
+UNIT = 0.01  # errors count in centimetres, so that gradients are of order one [m]
 LOSSES = ("square", "scene", "axes", "relative")
-ERROR_FLOOR = 0.1  # errors below a millimetre no longer matter to the root [UNIT]
-MIN_SPREAD, TYPICAL_SPREAD = (
-    1.0,
-    5.0,
-)  # motion that an error is measured against is at least so much; so much is usual [UNIT]
+ERROR_FLOOR = 0.1  # added in quadrature to errors before the root: a millimetre [UNIT]
+MIN_SPREAD, TYPICAL_SPREAD = 1.0, 5.0  # floor, and reference value, of the motion that "relative" divides by [UNIT]
+
+
+@dataclass(frozen=True)
+class LossOptions:
+    """What is minimised."""
+
+    kind: str = "square"  # one of LOSSES
+    velocity_time: float = 0.0  # [s]: a velocity error counts as this times it in position; 0: not at all
+    gradient_discount: float = 1.0  # factor on a gradient for every frame it goes back: through contacts it grows
 
 
 def keypoint_loss(
     predicted: Float[Tensor, "b t o n 3"], truth: Float[Tensor, "b t o n 3"], valid: Bool[Tensor, "b o n"], kind: str,
     spread: Float[Tensor, "b o 3"],
 ) -> Float[Tensor, ""]:  # fmt: skip
-    """Error of the keypoints that are there, one of LOSSES.
+    """Error of the valid keypoints, one of LOSSES.
 
-    "square" is the mean squared coordinate error [cm^2], "scene" the mean RMSE of a scene [cm], and "axes" the mean
-    RMSE of each axis of each object [cm], in which little motion counts as much as the fall; in "relative" it is
-    measured against how much there is along that axis in the whole motion, as the correlation R measures it.
+    "square" is the mean squared coordinate error [cm^2], "scene" the mean RMSE of a scene [cm], "axes" the mean RMSE
+    over axes of objects [cm], in which small motions count as much as the fall. "relative" divides the latter by the
+    `spread` of the true motion along that axis, as the correlation R does.
     """
     squared = ((predicted - truth) / UNIT).square().mean(1)
     squared = torch.where(valid[..., None], squared, 0.0)
@@ -53,80 +60,86 @@ def keypoint_loss(
 
 def velocity_loss(
     predicted: Float[Tensor, "b t o n 3"], points: Float[Tensor, "b t+1 o n 3"], valid: Bool[Tensor, "b o n"],
-    kind: str, spread: Float[Tensor, "b o 3"], dt: float, time: float,
+    spread: Float[Tensor, "b o 3"], dt: float, options: LossOptions,
 ) -> Float[Tensor, ""]:  # fmt: skip
-    """Error of speeds in all frames but the last, as of places `time` [s] later; `points` begin a frame earlier.
+    """Error of velocities in all frames but the last, weighed as positions `options.velocity_time` later.
 
-    A step that undoes what the one before did goes unseen in places. The truth are central differences, which mean
-    nothing amid an impact: such frames of an object do not count.
+    It penalises oscillations whose positions cancel from step to step. `points` are the true keypoints, from the frame
+    before the first prediction on. The true velocities are central differences; frames of an object amid an impact,
+    where these mean nothing, do not count.
     """
-    truth = (points[:, 2:] - points[:, :-2]) / (2 * dt)
+    truth, time = (points[:, 2:] - points[:, :-2]) / (2 * dt), options.velocity_time
     known = smooth_motion(points, dt)[..., None, None]
-    return keypoint_loss(torch.where(known, time * predicted[:, :-1], time * truth), time * truth, valid, kind, spread)
+    later = torch.where(known, time * predicted[:, :-1], time * truth)
+    return keypoint_loss(later, time * truth, valid, options.kind, spread)
 
 
 class RolloutLoss:
-    """Call it with batches of one size and horizon: the loss, and its gradient for each of the model's parameters.
+    """Callable on clips of one batch size and horizon: the loss, and its gradient for each of the model's parameters.
 
-    Going back by a frame a gradient keeps the share `memory`: through contacts it grows, and over many frames explodes.
+    `graph` records the rollout as a CUDA graph on a GPU; `compiled` compiles a step first. Where either fails, training
+    goes on without it.
     """
 
     def __init__(
-        self, model: Dynamics, dt: float, loss: str = "square", memory: float = 1.0, graph: bool = True,
-        compiled: bool = False, speeds: float = 0.0,
+        self, model: Dynamics, dt: float, options: LossOptions = LossOptions(), graph: bool = True,  # noqa: B008 -- frozen
+        compiled: bool = False,
     ):  # fmt: skip
-        self.model, self.dt, self.loss, self.memory, self.speeds = model, dt, loss, memory, speeds
+        self.model, self.dt, self.options = model, dt, options
         self.advance = torch.compile(_advance, fullgraph=True, dynamic=False) if compiled else _advance
-        self.compiling = compiled
+        self.untested_compile = compiled
         self.params = [p for p in model.parameters() if p.requires_grad]
-        self.wanted = graph and self.params[0].is_cuda
+        self.record_graph = graph and self.params[0].is_cuda
         self.graph: torch.cuda.CUDAGraph | None = None
 
-    def __call__(self, piece: MotionClip) -> tuple[Float[Tensor, ""], list[Tensor]]:
-        scene = self.model.encode(piece.rest)
+    def __call__(self, clip: MotionClip) -> tuple[Float[Tensor, ""], list[Tensor]]:
+        scene = self.model.encode(clip.rest)
         with torch.no_grad():
-            state = self.model.state_from_motion(scene, piece.points, piece.speed)
-        given = (scene, state, piece.points, piece.truth, piece.world.valid, piece.spread)
-        if self.compiling:
-            self._check(given)
-            self.compiling = False
-        if self.wanted and self.graph is None:
-            self._capture(given)
+            state = self.model.state_from_motion(scene, clip.points, clip.speed)
+        inputs = (scene, state, clip.points, clip.truth, clip.world.valid, clip.spread)
+        if self.untested_compile:
+            self._test_compiled(inputs)
+            self.untested_compile = False
+        if self.record_graph and self.graph is None:
+            self._capture(inputs)
         if self.graph is None:
-            loss, grads = self._walk(given)
+            loss, grads = self._rollout(inputs)
         else:
-            for kept, new in zip(leaf_tensors(self.kept), leaf_tensors(given), strict=True):
-                kept.data.copy_(new.detach())
+            for static, new in zip(leaf_tensors(self.static_inputs), leaf_tensors(inputs), strict=True):
+                static.data.copy_(new.detach())
             self.graph.replay()
             loss, grads = self.result
-        return loss, self._carried(scene, grads)
+        return loss, self._chain(scene, grads)
 
-    def _walk(self, given: tuple) -> tuple[Tensor, list[Tensor | None]]:
-        """Loss, and gradients of the parameters, then of what was prepared."""
-        scene, state, start, truth, valid, spread = given
-        free = [x.detach().requires_grad_(x.requires_grad) for x in leaf_tensors(scene)]
-        scene = replace_tensors(scene, iter(free))
-        # so that the first step is like the others to a compiler
+    def _rollout(self, inputs: tuple) -> tuple[Tensor, list[Tensor | None]]:
+        """The loss, and its gradients for the parameters, then for the tensors of the prepared scene."""
+        scene, state, start, truth, valid, spread = inputs
+        options = self.options
+        leaves = [x.detach().requires_grad_(x.requires_grad) for x in leaf_tensors(scene)]
+        scene = replace_tensors(scene, iter(leaves))
+        # with gradients, so that the first step is like the others to a compiler
         state = replace_tensors(state, (x.detach().requires_grad_() for x in leaf_tensors(state)))
         pushes = ExternalForces.none_for(valid, truth)
         frames = []
         for _ in range(truth.shape[1]):
-            state = replace_tensors(state, (torch.lerp(x.detach(), x, self.memory) for x in leaf_tensors(state)))
-            moved = self.advance(self.model, scene, state, self.dt, pushes, self.speeds > 0)
+            state = replace_tensors(
+                state, (torch.lerp(x.detach(), x, options.gradient_discount) for x in leaf_tensors(state))
+            )
+            moved = self.advance(self.model, scene, state, self.dt, pushes, options.velocity_time > 0)
             state = replace_tensors(state, iter(moved))
             frames.append(moved[len(state) :])
         points, *speed = (torch.stack(x, 1) for x in zip(*frames, strict=True))
-        loss = keypoint_loss(points, truth, valid, self.loss, spread)
+        loss = keypoint_loss(points, truth, valid, options.kind, spread)
         if speed:
             known = torch.cat([start[:, None], truth], 1)
-            loss = loss + velocity_loss(*speed, known, valid, self.loss, spread, self.dt, self.speeds)
-        wanted = self.params + [x for x in free if x.requires_grad]
-        return loss.detach(), list(torch.autograd.grad(loss, wanted, allow_unused=True))
+            loss = loss + velocity_loss(*speed, known, valid, spread, self.dt, options)
+        with_gradient = self.params + [x for x in leaves if x.requires_grad]
+        return loss.detach(), list(torch.autograd.grad(loss, with_gradient, allow_unused=True))
 
-    def _check(self, given: tuple) -> None:
-        """Compile; where that fails or gives no finite gradients, say so and go on without."""
+    def _test_compiled(self, inputs: tuple) -> None:
+        """Compile; where that fails or gives gradients that are not finite, warn and use the plain step."""
         try:
-            if all(bool(g.isfinite().all()) for g in self._walk(given)[1] if g is not None):
+            if all(bool(g.isfinite().all()) for g in self._rollout(inputs)[1] if g is not None):
                 return
             why = "gives gradients that are not finite"
         except Exception as error:  # a compiler fails in many ways
@@ -134,35 +147,35 @@ class RolloutLoss:
         log.warning("compiling the step %s: going on without", why)
         self.advance = _advance
 
-    def _carried(self, scene: Any, grads: list[Tensor | None]) -> list[Tensor]:
-        """Gradients of the parameters, with those that come through the prepared scene."""
-        own, inner = grads[: len(self.params)], grads[len(self.params) :]
+    def _chain(self, scene: Any, grads: list[Tensor | None]) -> list[Tensor]:
+        """Gradients of the parameters, with those that reach them through the prepared scene."""
+        direct, inner = grads[: len(self.params)], grads[len(self.params) :]
         prepared = [(x, g) for x, g in zip([x for x in leaf_tensors(scene) if x.requires_grad], inner, strict=True)
                     if g is not None]  # fmt: skip
-        more = [None] * len(own)
+        through_scene = [None] * len(direct)
         if prepared:
             outputs, weights = zip(*prepared, strict=True)
-            more = torch.autograd.grad(outputs, self.params, weights, allow_unused=True)
-        return [_sum(p, a, b) for p, a, b in zip(self.params, own, more, strict=True)]
+            through_scene = torch.autograd.grad(outputs, self.params, weights, allow_unused=True)
+        return [_sum(p, a, b) for p, a, b in zip(self.params, direct, through_scene, strict=True)]
 
-    def _capture(self, given: tuple) -> None:
-        """Record the walk; where that fails, say so and go on without."""
-        self.wanted = False
+    def _capture(self, inputs: tuple) -> None:
+        """Record the rollout as a CUDA graph; where that fails, log it and go on without."""
+        self.record_graph = False
         # leaves with memory of their own, which the graph reads
-        kept = [x.detach().clone(memory_format=torch.contiguous_format).requires_grad_(x.requires_grad)
-                for x in leaf_tensors(given)]  # fmt: skip
-        kept = replace_tensors(given, iter(kept))
+        static = [x.detach().clone(memory_format=torch.contiguous_format).requires_grad_(x.requires_grad)
+                  for x in leaf_tensors(inputs)]  # fmt: skip
+        static = replace_tensors(inputs, iter(static))
         try:
             side = torch.cuda.Stream()
             side.wait_stream(torch.cuda.current_stream())
             with torch.cuda.stream(side):
                 for _ in range(2):
-                    self._walk(kept)
+                    self._rollout(static)
             torch.cuda.current_stream().wait_stream(side)
             graph = torch.cuda.CUDAGraph()
             with torch.cuda.graph(graph):
-                self.result = self._walk(kept)
-            self.graph, self.kept = graph, kept
+                self.result = self._rollout(static)
+            self.graph, self.static_inputs = graph, static
         except RuntimeError as error:
             torch.cuda.synchronize()
             log.info("no CUDA graph, going on step by step: %s", str(error).splitlines()[0])
@@ -171,7 +184,7 @@ class RolloutLoss:
 def _advance(
     model: Dynamics, scene: Any, state: tuple, dt: float, pushes: ExternalForces, speeds: bool
 ) -> tuple[Tensor, ...]:
-    """The tensors of the next state, where its points are and perhaps how fast; without pushes the time is nothing.
+    """The tensors of the next state, its keypoints and, with `speeds`, their velocities. Time only matters to forces.
 
     One flat tuple: PyTorch 2.11 compiles a named tuple that comes out of a `_replace` to an empty one.
     """

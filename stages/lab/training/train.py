@@ -30,7 +30,8 @@ from stages.lab.training.data import (
     train_validation_split,
 )
 from stages.lab.training.distributed import ProcessGroup, process_group
-from stages.lab.training.rollout_loss import LOSSES, RolloutLoss
+from stages.lab.training.history import curve_columns, runs_of
+from stages.lab.training.rollout_loss import LOSSES, LossOptions, RolloutLoss
 from stages.lab.training.state import OPTIMIZERS, TrainingState
 from stages.lab.training.widen import widen
 
@@ -40,31 +41,32 @@ PROGRESS_LINE = (
     "{minutes:6.1f} min {step:7d} steps  horizon {horizon:2d}  loss {loss:.4f}  "
     "RMSE {RMSE:.4f}  FPE {FPE:.4f}  R {R:.3f}"
 )
-SPARSE_EVERY = 4  # steps after which there is one with few keypoints
-VALIDATION_FRAMES = 80  # of the rollouts that choose the weights
+SPARSE_EVERY = 4  # every so manieth step uses few keypoints, where that is asked for
+VALIDATION_FRAMES = 80  # of the rollouts that select the weights
+SCORES = ("step", "minutes", "RMSE", "FPE", "R")  # of the selected weights, in a card
 
 
 @dataclass(frozen=True)
 class TrainOptions:
-    """How to train."""
+    """Budget, batches, loss and optimizer of a training run."""
 
     minutes: float = 20.0  # budget, validation included
-    steps: int = 0  # the budget in steps of the optimizer instead, when not 0: the same on every machine
+    steps: int = 0  # budget in optimizer steps instead, when not 0: the same on every machine
     batch: int = 32  # scenes a step
     keypoints: int = 256  # of an object
-    few: int = 0  # of an object in every fourth step instead, so that the model bears other numbers of them; 0: never
-    lr: float = 1e-3  # highest rate
-    horizons: str = "8,20,40"  # frames that a rollout goes on for, one phase each
+    few: int = 0  # keypoints of an object in every fourth step, for robustness to their number; 0: never
+    lr: float = 1e-3  # peak learning rate
+    horizons: str = "8,20,40"  # frames of a rollout, one phase each
     hidden: int = 0  # width of the network; 0: the model's own
-    loss: str = "scene"  # one of training_roll.LOSSES
-    optimizer: str = "adamw"  # one of training_state.OPTIMIZERS
-    speeds: float = 0.0  # an error of a speed counts as one of the place so much later [s]; 0: not at all
-    memory: float = 0.9  # share of a gradient that goes back by another frame
-    groups: str = "3_0..3_8"  # files to learn from; the last scenes of the last choose the best weights
-    compiled: bool = False  # compile a step first: a minute or so, then faster; for GPUs
+    loss: str = "scene"  # one of rollout_loss.LOSSES
+    optimizer: str = "adamw"  # one of state.OPTIMIZERS
+    speeds: float = 0.0  # weight of velocity errors: the time [s] over which one counts as a position error; 0: none
+    gradient_discount: float = 0.9  # factor on a gradient for every frame that it goes back
+    groups: str = "3_0..3_8"  # training files; the last scenes of the last are for validation
+    compiled: bool = False  # compile a step first: takes minutes, then faster; for GPUs
     seed: int = 0
     device: str = "auto"
-    checks: int = 24  # how often to validate, and to write a checkpoint, in the whole run
+    checks: int = 24  # validations and checkpoints in the whole run
 
     def __post_init__(self):
         if self.minutes <= 0 or self.steps < 0 or min(self.batch, self.keypoints) < 1 or self.lr <= 0:
@@ -73,8 +75,8 @@ class TrainOptions:
             raise InputError(f"--few {self.few}: must be between 0 and --keypoints")
         if self.speeds < 0:
             raise InputError(f"--speeds {self.speeds}: a time in seconds, or 0")
-        if not 0 <= self.memory <= 1:
-            raise InputError(f"--memory {self.memory}: must be between 0 and 1")
+        if not 0 <= self.gradient_discount <= 1:
+            raise InputError(f"--gradient-discount {self.gradient_discount}: must be between 0 and 1")
         if self.loss not in LOSSES:
             raise InputError(f"--loss {self.loss}: choose from {', '.join(LOSSES)}")
         if self.optimizer not in OPTIMIZERS:
@@ -84,20 +86,21 @@ class TrainOptions:
 
     @property
     def frames(self) -> tuple[int, ...]:
-        """The horizons."""
+        """The horizons as numbers. Raises InputError where they are none."""
         try:
             return tuple(int(word) for word in self.horizons.split(","))
         except ValueError as error:
             raise InputError(f"--horizons takes frames, such as 8,20,40, not {self.horizons!r}") from error
 
     def horizon(self, progress: float) -> int:
-        """Frames to roll out at this share of the budget."""
+        """Frames of a rollout at this fraction of the budget."""
         n = len(self.frames)
-        ends = [sum(HORIZON_FRACTIONS[: i + 1]) if n == len(HORIZON_FRACTIONS) else (i + 1) / n for i in range(n)]
+        fractions = HORIZON_FRACTIONS
+        ends = [sum(fractions[: i + 1]) if n == len(fractions) else (i + 1) / n for i in range(n)]
         return self.frames[min(sum(progress >= e for e in ends), n - 1)]
 
     def rate(self, progress: float) -> float:
-        """Learning rate: half a cosine down to a hundredth."""
+        """Learning rate at this fraction of the budget: half a cosine down to a hundredth."""
         return self.lr * (0.01 + 0.99 * (1 + math.cos(math.pi * min(progress, 1.0))) / 2)
 
 
@@ -105,54 +108,58 @@ def run(
     model: str, data: Path, out: Path, options: TrainOptions = TrainOptions(), resume: bool = False,
     start: Path | None = None,
 ) -> list[str]:  # fmt: skip
-    """Train on the groups in a folder; the best weights go to OUT and their card beside it. Lines of result.
+    """Train on groups of motions; write the best weights to OUT and their card beside it. Returns lines of result.
 
-    OUT with the suffix .ckpt is what `resume` goes on from; with the same options the curve is the same as without
-    the interruption. `start` are weights to begin with, whose card becomes a part of the new one. Raises InputError
-    for missing or unfit files.
+    OUT with the suffix .ckpt is the checkpoint that `resume` goes on from; with the same options the curve is the same
+    as without the interruption. `start` are weights to begin with; their runs come first in the new card. Raises
+    InputError for missing or unfit files.
     """
     out = Path(out)
     if not out.parent.is_dir():
         raise InputError(f"{out}: there is no folder {out.parent}; make it first")
     groups = parse_groups(options.groups, more=EXTRA_GROUPS)
-    known, unseen = train_validation_split(read_groups(data, groups, options.keypoints), VALIDATION_SCENES)
-    if known.points.shape[1] <= max(options.frames):
-        raise InputError(f"--horizons: the motions have {known.points.shape[1]} frames; take shorter ones")
-    with process_group(pick_device(options.device), options.batch) as crew:
-        trainee, before = _trainee(model, out, options, crew.device, resume, start)
-        if crew.leads:
-            log.info("%s, %s parameters: learns from %d scenes, chosen by %d", model,
-                     f"{sum(p.numel() for p in trainee.params):,}", len(known), len(unseen))  # fmt: skip
-        pieces = [ClipSampler(part, crew.device, trainee.model) for part in _seen(known, options.few)]
-        job = TrainingRun(trainee, pieces, unseen.to(crew.device), options, crew, out, _key(model, options, before))
+    training, validation = train_validation_split(read_groups(data, groups, options.keypoints), VALIDATION_SCENES)
+    if training.points.shape[1] <= max(options.frames):
+        raise InputError(f"--horizons: the motions have {training.points.shape[1]} frames; take shorter ones")
+    with process_group(pick_device(options.device), options.batch) as processes:
+        state, earlier = _initial_state(model, out, options, processes.device, resume, start)
+        if processes.is_main:
+            log.info("%s, %s parameters: %d training scenes, %d validation scenes", model,
+                     f"{sum(p.numel() for p in state.params):,}", len(training), len(validation))  # fmt: skip
+        samplers = [ClipSampler(part, processes.device, state.model) for part in _with_few(training, options.few)]
+        key = _key(model, options, earlier)
+        job = TrainingRun(state, samplers, validation.to(processes.device), options, processes, out, key)
         finished = job.run()
-        if not crew.leads:
+        if not processes.is_main:
             return []
-        best = trainee.best_row()
-        card = {
-            "command": shlex.join(["ngff-lab", *sys.argv[1:]]), "ngff": ngff_version(), "torch": torch.__version__,
-            "device": torch.cuda.get_device_name() if crew.device == "cuda" else "cpu", "processes": crew.size,
-            "options": asdict(options), "data": describe_groups(data, groups), "scenes": len(known),
-            "scenes to choose by": len(unseen), "finished": finished, "minutes": trainee.elapsed / 60,
-            "steps": trainee.step, "validation": best, "curve": trainee.curve, **before,
+        best = state.best_row()
+        record = {
+            "command": shlex.join(["ngff-lab", *sys.argv[1:]]), "seed": options.seed, "groups": options.groups,
+            "processes": processes.size, "scenes": len(training), "validation scenes": len(validation),
+            "steps": state.step, "minutes": state.elapsed / 60, "finished": finished,
+            "validation": {k: best[k] for k in SCORES}, "data": describe_groups(data, groups),
         }  # fmt: skip
-        save(out, model, trainee.best_model(), card)
+        save(out, model, state.best_model(), {
+            "ngff": ngff_version(), "torch": torch.__version__,
+            "device": torch.cuda.get_device_name() if processes.device == "cuda" else "cpu",
+            "options": asdict(options), "runs": [*earlier, record], "curve": curve_columns(state.curve),
+        })  # fmt: skip
     ended = "" if finished else " (stopped before the end; go on with --resume)"
     return [f"{out}: RMSE {best['RMSE']:.4f}  FPE {best['FPE']:.4f}  R {best['R']:.3f} over {VALIDATION_FRAMES} frames "
-            f"of unseen scenes, after {best['minutes']:.1f} of {trainee.elapsed / 60:.1f} min{ended}"]  # fmt: skip
+            f"of unseen scenes, after {best['minutes']:.1f} of {state.elapsed / 60:.1f} min{ended}"]  # fmt: skip
 
 
-def _seen(motions: KeypointMotions, few: int) -> list[KeypointMotions]:
-    """The motions, and the same with few keypoints if that is wanted."""
+def _with_few(motions: KeypointMotions, few: int) -> list[KeypointMotions]:
+    """The motions, and a copy with few keypoints where that is asked for."""
     return [motions, replace(motions, points=motions.points[:, :, :, :few].clone())] if few else [motions]
 
 
-def _trainee(
+def _initial_state(
     model: str, out: Path, options: TrainOptions, device: str, resume: bool, start: Path | None
-) -> tuple[TrainingState, dict]:
-    """A model that is new, from other weights, or from its checkpoint; and what its card says of those weights."""
+) -> tuple[TrainingState, list[dict]]:
+    """A model that is new, from other weights, or from its checkpoint; and the earlier runs of its weights."""
     torch.manual_seed(options.seed)
-    before = {}
+    earlier = []
     if start is None:
         network = build(model, **({"hidden": options.hidden} if options.hidden else {})).to(device)
     else:
@@ -162,17 +169,17 @@ def _trainee(
         if card["model"] != model or options.hidden not in (0, network.config.get("hidden")):
             raise InputError(f"{start}: holds {card['model']} {network.config}, not what is to be trained; leave "
                              "--hidden out and name weights of the same model")  # fmt: skip
-        before = {"before": {k: v for k, v in card.items() if k not in ("model", "config")}}
-    trainee = TrainingState(network, options.lr, options.seed, options.optimizer)
+        earlier = runs_of(card)
+    state = TrainingState(network, options.lr, options.seed, options.optimizer)
     if resume:
-        trainee.load(out.with_suffix(".ckpt"), _key(model, options, before))
-        log.info("going on from step %d, %.1f min", trainee.step, trainee.elapsed / 60)
-    return trainee, before
+        state.load(out.with_suffix(".ckpt"), _key(model, options, earlier))
+        log.info("going on from step %d, %.1f min", state.step, state.elapsed / 60)
+    return state, earlier
 
 
-def _key(model: str, options: TrainOptions, before: dict) -> dict:
-    """What must be the same for a checkpoint to be gone on from."""
-    start = before.get("before", {}).get("sha256")
+def _key(model: str, options: TrainOptions, earlier: list[dict]) -> dict:
+    """What must be equal for training to resume from a checkpoint."""
+    start = earlier[-1]["sha256"] if earlier else None
     return {"model": model, "from": start, **{k: v for k, v in asdict(options).items() if k != "device"}}
 
 
@@ -180,84 +187,87 @@ def _key(model: str, options: TrainOptions, before: dict) -> dict:
 class TrainingRun:
     """One run of training, by one process or several."""
 
-    trainee: TrainingState
-    pieces: list[ClipSampler]  # the usual ones; what every fourth step learns from
-    unseen: KeypointMotions
+    state: TrainingState
+    samplers: list[ClipSampler]  # with all keypoints; with few, for every fourth step, where asked for
+    validation: KeypointMotions
     options: TrainOptions
-    team: ProcessGroup
+    processes: ProcessGroup
     out: Path
     key: dict
 
     def run(self) -> bool:
-        """Go on until the budget is used up (True) or somebody asks to stop (False)."""
-        trainee, options, part = self.trainee, self.options, self.team.rows(self.options.batch)
-        self.clock = time.perf_counter() - trainee.elapsed
-        rolls, horizon, done = [], 0, self.progress()
+        """Train until the budget is used up (True) or the process is asked to terminate (False)."""
+        state, options, part = self.state, self.options, self.processes.rows(self.options.batch)
+        self.clock = time.perf_counter() - state.elapsed
+        losses, horizon, done = [], 0, self.progress()
         with (
-            _asked_to_stop() as asked,
-            _rounded(self.team.device),
-            tqdm(total=1.0, bar_format="{l_bar}{bar}| {elapsed}", disable=not self.team.leads) as bar,
+            _termination_requests() as requests,
+            _tf32_matmul(self.processes.device),
+            tqdm(total=1.0, bar_format="{l_bar}{bar}| {elapsed}", disable=not self.processes.is_main) as bar,
         ):
-            while done < 1 and not self.team.agreed(len(asked)):
+            while done < 1 and not self.processes.broadcast(len(requests)):
                 if options.horizon(done) != horizon:
-                    rolls, horizon = [], options.horizon(done)  # the memory of the old graphs goes first
-                    rolls = [self.roll(pieces) for pieces in self.pieces]
-                    trainee.anew(horizon)
-                turn = -1 if trainee.step % SPARSE_EVERY == 0 else 0
-                loss, grads = rolls[turn](self.pieces[turn].draw(options.batch, horizon, trainee.generator, part))
-                *grads, loss = self.team.mean([*grads, loss])
-                trainee.update(grads, options.rate(done))
-                trainee.losses.append(loss.clone())  # a graph writes the next one in the same place
+                    losses, horizon = [], options.horizon(done)  # frees the memory of the old CUDA graphs first
+                    losses = [self.rollout_loss(sampler) for sampler in self.samplers]
+                    state.start_horizon(horizon)
+                i = -1 if state.step % SPARSE_EVERY == 0 else 0
+                loss, grads = losses[i](self.samplers[i].draw(options.batch, horizon, state.generator, part))
+                *grads, loss = self.processes.mean([*grads, loss])
+                state.update(grads, options.rate(done))
+                state.losses.append(loss.clone())  # a CUDA graph writes the next loss to the same memory
                 before, done = done, self.progress()
                 if math.floor(done * options.checks) > math.floor(before * options.checks):
                     self.check(horizon)
                     done = self.progress()
                 bar.update(min(done, 1.0) - bar.n)
-        if not trainee.curve:
+        if not state.curve:
             self.check(horizon)
-        if self.team.leads:
-            trainee.save(self.out.with_suffix(".ckpt"), self.key)
+        if self.processes.is_main:
+            state.save(self.out.with_suffix(".ckpt"), self.key)
         return done >= 1
 
-    def roll(self, pieces: ClipSampler) -> RolloutLoss:
-        options = self.options
+    def rollout_loss(self, sampler: ClipSampler) -> RolloutLoss:
+        """The loss for batches of one sampler."""
+        o = self.options
         return RolloutLoss(
-            self.trainee.model, pieces.motions.dt, options.loss, options.memory, compiled=options.compiled,
-            speeds=options.speeds,
-        )  # fmt: skip
+            self.state.model,
+            sampler.motions.dt,
+            LossOptions(o.loss, o.speeds, o.gradient_discount),
+            compiled=o.compiled,
+        )
 
     def progress(self) -> float:
-        """Share of the budget that is used up."""
-        trainee, options = self.trainee, self.options
-        trainee.elapsed = self.team.agreed(time.perf_counter() - self.clock)
-        return trainee.step / options.steps if options.steps else trainee.elapsed / (60 * options.minutes)
+        """Fraction of the budget that is used up."""
+        state, options = self.state, self.options
+        state.elapsed = self.processes.broadcast(time.perf_counter() - self.clock)
+        return state.step / options.steps if options.steps else state.elapsed / (60 * options.minutes)
 
     def check(self, horizon: int) -> None:
-        """A line of the curve, and a checkpoint."""
-        trainee, leads = self.trainee, self.team.leads
-        found = validate(trainee.ema, self.unseen) if leads else {}
-        trainee.note({"horizon": horizon, **found, "RMSE": self.team.agreed(found.get("RMSE", 0.0))})
-        if leads:
-            trainee.save(self.out.with_suffix(".ckpt"), self.key)
-            log.info(PROGRESS_LINE.format(**trainee.curve[-1]))
-            if trainee.curve[-1]["skipped"]:
-                log.warning("%d steps had no finite gradients and changed nothing", trainee.curve[-1]["skipped"])
+        """Validate, append to the curve, and write a checkpoint."""
+        state, is_main = self.state, self.processes.is_main
+        found = validate(state.ema, self.validation) if is_main else {}
+        state.record({"horizon": horizon, **found, "RMSE": self.processes.broadcast(found.get("RMSE", 0.0))})
+        if is_main:
+            state.save(self.out.with_suffix(".ckpt"), self.key)
+            log.info(PROGRESS_LINE.format(**state.curve[-1]))
+            if state.curve[-1]["skipped"]:
+                log.warning("%d steps had no finite gradients and changed nothing", state.curve[-1]["skipped"])
 
 
 @contextmanager
-def _asked_to_stop():
-    """A list that is no longer empty once the process is asked to terminate, as `timeout` does."""
-    asked: list[int] = []
-    before = signal.signal(signal.SIGTERM, lambda number, _: asked.append(number))
+def _termination_requests():
+    """A list that is no longer empty once the process gets SIGTERM, as `timeout` sends it."""
+    requests: list[int] = []
+    before = signal.signal(signal.SIGTERM, lambda number, _: requests.append(number))
     try:
-        yield asked
+        yield requests
     finally:
         signal.signal(signal.SIGTERM, before)
 
 
 @contextmanager
-def _rounded(device: str):
-    """On a GPU, products of matrices as tf32 has them: what they lose is far below the noise of a batch."""
+def _tf32_matmul(device: str):
+    """On a GPU, matrix products in TF32: the rounding is far below the noise of a batch."""
     before = torch.get_float32_matmul_precision()
     torch.set_float32_matmul_precision("high" if device == "cuda" else before)
     try:
@@ -270,7 +280,7 @@ def _rounded(device: str):
 def validate(
     model: torch.nn.Module, scenes: KeypointMotions, frames: int = VALIDATION_FRAMES, batch: int = 100
 ) -> dict[str, float]:
-    """Metrics of full rollouts from rest, averaged over the scenes; an RMSE that is not finite is infinite."""
+    """Metrics of full rollouts from rest, averaged over the scenes; inf as RMSE where any scene's is not finite."""
     model.eval()
     frames = min(frames, scenes.points.shape[1])
     world, rows = scenes.initial_conditions(), []

@@ -1,4 +1,4 @@
-"""A wider force field that does what a narrower, trained one does, to go on from."""
+"""Function-preserving widening: a wider force field that computes the same as a narrower, trained one."""
 
 from __future__ import annotations
 
@@ -10,7 +10,10 @@ from stages.core.models.field.force_field import ForceField
 
 @torch.no_grad()
 def widen(model: ForceField, hidden: int) -> ForceField:
-    """The same function with `hidden` channels: new ones see as untrained ones do, and nobody listens to them yet."""
+    """The same function with `hidden` channels, to train on from.
+
+    New channels have random input weights and zero output weights. Raises InputError for fewer channels than before.
+    """
     old = model.config["hidden"]
     if hidden < old:
         raise InputError(f"--hidden {hidden}: the weights have {old} channels, and can only be widened")
@@ -18,18 +21,21 @@ def widen(model: ForceField, hidden: int) -> ForceField:
     known = model.state_dict()
     for name, new in wide.state_dict().items():
         x = known[name]
-        rows = _places(x.shape[0], new.shape[0], old, hidden)
+        rows = _old_channels(x.shape[0], new.shape[0], old, hidden)
         if x.ndim == 1:
             new[rows] = x
             continue
-        columns = _places(x.shape[1], new.shape[1], old, hidden)
+        columns = _old_channels(x.shape[1], new.shape[1], old, hidden)
         new[rows] = 0.0
         new[rows[:, None], columns] = x
     return wide
 
 
-def _places(few: int, many: int, old: int, new: int) -> torch.Tensor:
-    """Where the old channels are among the new ones: blocks of `old`, then of `new`, and what is of neither width."""
-    blocks = (many - few) // (new - old) if new > old else 0
+def _old_channels(before: int, after: int, old: int, new: int) -> torch.Tensor:
+    """Indices of the old channels along an axis that grew from `before` to `after` entries.
+
+    The axis holds blocks of `old` channels, now `new` each, then entries that do not depend on the width.
+    """
+    blocks = (after - before) // (new - old) if new > old else 0
     inner = (torch.arange(blocks)[:, None] * new + torch.arange(old)).flatten()
-    return torch.cat([inner, torch.arange(blocks * new, many)])
+    return torch.cat([inner, torch.arange(blocks * new, after)])

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from stages.core.errors import InputError
-from stages.core.models.checkpoints import MODELS, build, find, halve, load, save, training_minutes
+from stages.core.models.checkpoints import MODELS, build, find, halve, load, save
 from tests.core.models.worlds import SMALL, crowd
 
 
@@ -52,15 +52,12 @@ def test_numbers_too_large_for_16_bits_are_kept_whole(tmp_path):
     assert float(next(load(tmp_path / "a.safetensors")[0].parameters()).view(-1)[0]) == 1e6
 
 
-def test_a_card_is_short_and_says_the_same(tmp_path):
-    made = {"command": "dataset", "options": {"dx": 0.02}}
-    data = [{"name": f"3_{i}.h5", "sha256": "ab" * 32, "made": {**made, "inputs": [i]}} for i in range(3)]
-    curve = [{"minutes": i / 3, "loss": math.nan if i else 1.0} for i in range(2)]
-    save(tmp_path / "a.safetensors", "gcn", build("gcn", hidden=8), {"data": data, "curve": curve, "empty": []})
+def test_a_card_has_a_line_for_each_entry_and_row(tmp_path):
+    runs = [{"minutes": 1 / 3, "loss": math.nan}, {"minutes": 1.0, "loss": 1.0}]
+    save(tmp_path / "a.safetensors", "gcn", build("gcn", hidden=8), {"runs": runs, "curve": {"loss": [1.0]}})
     card = load(tmp_path / "a.safetensors")[1]
-    assert card["data"][0] == data[0] and card["data"][2]["made"] == {"inputs": [2]} and card["empty"] == []
-    assert card["curve"] == [{"minutes": 0.0, "loss": 1.0}, {"minutes": 0.33333333, "loss": None}]
-    assert len((tmp_path / "a.json").read_text().splitlines()) == 2 + 5 + 4 + 4
+    assert card["runs"] == [{"minutes": 0.33333333, "loss": None}, runs[1]] and card["curve"] == {"loss": [1.0]}
+    assert len((tmp_path / "a.json").read_text().splitlines()) == 2 + 4 + 4
 
 
 @pytest.fixture
@@ -137,10 +134,3 @@ def test_weights_are_found(saved, monkeypatch, tmp_path):
         find("w")
     monkeypatch.setenv("NGFF_WEIGHTS", str(tmp_path))
     assert find("w") == saved
-
-
-def test_minutes_are_those_of_every_processor_and_of_all_that_went_before():
-    assert (
-        training_minutes({"minutes": 3.0, "processes": 2, "before": {"minutes": 1.5, "before": {"minutes": 4.0}}})
-        == 11.5
-    )

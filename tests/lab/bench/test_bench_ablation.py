@@ -112,7 +112,7 @@ def test_other_options_change_one_thing_each():
     base = TrainOptions(keypoints=64, horizons="8,20", loss="axes")
     changed = {name: {k for k, v in vars(choice.options(base)).items() if v != getattr(base, k)}
                for name, choice in ABLATIONS.items()}  # fmt: skip
-    others = {"keypoints": {"keypoints"}, "memory": {"memory"}, "axes": {"loss"}, "horizons": {"horizons"}}
+    others = {"keypoints": {"keypoints"}, "discount": {"gradient_discount"}, "axes": {"loss"}, "horizons": {"horizons"}}
     assert changed == {name: others.get(name, set()) for name in ABLATIONS}
 
 

@@ -70,7 +70,7 @@ def data(tmp_path: Path) -> Path:
 def weights(tmp_path: Path) -> Path:
     (tmp_path / "weights").mkdir()
     for name in ("gcn", "transformer"):
-        save(tmp_path / "weights" / f"{name}.safetensors", name, build(name, hidden=8), {"minutes": 2.0})
+        save(tmp_path / "weights" / f"{name}.safetensors", name, build(name, hidden=8), {"runs": [{"minutes": 2.0}]})
     return tmp_path / "weights"
 
 
@@ -225,7 +225,7 @@ def test_rows_of_the_same_scenes_stay_when_others_are_measured(data, weights, tm
     run(data, weights, out, NONE)
     before = json.loads(out.read_text())["rows"]
     (weights / "transformer.safetensors").unlink()
-    save(weights / "gcn.safetensors", "gcn", build("gcn", hidden=8), {"minutes": 3.0})
+    save(weights / "gcn.safetensors", "gcn", build("gcn", hidden=8), {"runs": [{"minutes": 3.0}]})
     run(data, weights, out, NONE)
     rows = json.loads(out.read_text())["rows"]
     assert list(rows) == list(before) and rows["transformer"] == before["transformer"]

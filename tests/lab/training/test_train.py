@@ -19,6 +19,7 @@ from stages.core.errors import InputError
 from stages.core.models.checkpoints import MODELS, build, load
 from stages.core.models.external_forces import ExternalForces
 from stages.core.models.initial_conditions import BOX, GRAVITY
+from stages.core.scene.files import sha256
 from stages.lab.dataset.keypoint_motions import KeypointMotions, write_motions
 from stages.lab.training.data import (
     MAX_SPEED_CHANGE,
@@ -29,7 +30,7 @@ from stages.lab.training.data import (
     smooth_frames,
     train_validation_split,
 )
-from stages.lab.training.rollout_loss import RolloutLoss, keypoint_loss, velocity_loss
+from stages.lab.training.rollout_loss import LossOptions, RolloutLoss, keypoint_loss, velocity_loss
 from stages.lab.training.state import GRADIENT_CLIP, OPTIMIZERS, WARMUP_STEPS, TrainingState, _optimizer
 from stages.lab.training.train import TrainOptions, run, validate
 from stages.lab.training.widen import widen
@@ -143,19 +144,20 @@ def test_a_centimetre_in_one_coordinate_is_a_third_of_a_square_centimetre():
 
 
 def test_steps_that_undo_each_other_are_seen_in_speeds_alone():
-    """Speeds of 1 m/s that change their sign each frame move nothing. A frame amid an impact does not count."""
+    """Velocities of 1 m/s that change their sign each frame move nothing. A frame amid an impact does not count."""
+    weighed = LossOptions("square", velocity_time=0.1)
     points = torch.zeros(1, 7, 1, 4, 3)
     valid, spread = torch.ones(1, 1, 4, dtype=torch.bool), torch.zeros(1, 1, 3)
     ringing = torch.zeros(1, 6, 1, 4, 3)
     ringing[..., 0] = (-1.0) ** torch.arange(6)[None, :, None, None]
-    assert velocity_loss(0 * ringing, points, valid, "square", spread, DT, 0.1) == 0
-    assert_close(velocity_loss(ringing, points, valid, "square", spread, DT, 0.1), torch.tensor(10.0**2 / 3))
+    assert velocity_loss(0 * ringing, points, valid, spread, DT, weighed) == 0
+    assert_close(velocity_loss(ringing, points, valid, spread, DT, weighed), torch.tensor(10.0**2 / 3))
     points[:, 4:, ..., 2] = (
         2 * MAX_SPEED_CHANGE * DT * torch.arange(3)[None, :, None, None] + MAX_SPEED_CHANGE * DT * 2
     )  # hit after frame 3
     free = torch.zeros(1, 6, 1, 4, 3)
     free[:, 3:, ..., 2] = 2 * MAX_SPEED_CHANGE
-    assert_close(velocity_loss(free, points, valid, "square", spread, DT, 0.1), torch.tensor(0.0), rtol=0, atol=1e-5)
+    assert_close(velocity_loss(free, points, valid, spread, DT, weighed), torch.tensor(0.0), rtol=0, atol=1e-5)
 
 
 def test_what_is_widened_does_the_same_and_learns_with_all_it_gained():
@@ -221,8 +223,10 @@ def test_gradients_fade_on_their_way_back():
     model = build("gcn", hidden=8).eval()
     piece = ClipSampler(without_last(falling()), "cpu", model).take(torch.tensor([0]), torch.tensor([0]), 3)
 
-    def gradient(memory):
-        return torch.cat([g.flatten() for g in RolloutLoss(model, DT, memory=memory)(piece)[1]])
+    def gradient(discount):
+        return torch.cat(
+            [g.flatten() for g in RolloutLoss(model, DT, LossOptions(gradient_discount=discount))(piece)[1]]
+        )
 
     none, full = gradient(0.0), gradient(1.0)
     far = [(gradient(m) - none).norm() for m in (0.25, 0.5)]
@@ -245,19 +249,19 @@ def test_no_pushes_are_no_pushes():
 
 @pytest.mark.parametrize("optimizer", OPTIMIZERS)
 def test_a_step_without_finite_gradients_changes_nothing(optimizer):
-    trainee = TrainingState(build("gcn", hidden=8), 1e-2, 0, optimizer)
-    good = [torch.ones_like(p) for p in trainee.params]
+    state = TrainingState(build("gcn", hidden=8), 1e-2, 0, optimizer)
+    good = [torch.ones_like(p) for p in state.params]
     for _ in range(2):
-        trainee.update(good, 1e-2)
-    before = [p.detach().clone() for p in trainee.params]
-    usual = trainee.usual.clone()
-    trainee.update([torch.full_like(good[0], math.nan), *good[1:]], 1e-2)
-    assert all(torch.equal(a, b) for a, b in zip(before, trainee.params, strict=True))
-    assert torch.equal(usual, trainee.usual)
-    trainee.note({"RMSE": 1.0})
-    assert trainee.curve[-1]["skipped"] == 1
-    trainee.update(good, 1e-2)
-    assert not any(torch.equal(a, b) for a, b in zip(before, trainee.params, strict=True))
+        state.update(good, 1e-2)
+    before = [p.detach().clone() for p in state.params]
+    usual = state.gradient_norm.clone()
+    state.update([torch.full_like(good[0], math.nan), *good[1:]], 1e-2)
+    assert all(torch.equal(a, b) for a, b in zip(before, state.params, strict=True))
+    assert torch.equal(usual, state.gradient_norm)
+    state.record({"RMSE": 1.0})
+    assert state.curve[-1]["skipped"] == 1
+    state.update(good, 1e-2)
+    assert not any(torch.equal(a, b) for a, b in zip(before, state.params, strict=True))
 
 
 def test_soap_without_its_package_says_what_to_install(monkeypatch):
@@ -285,58 +289,58 @@ def test_soap_goes_down_a_narrow_valley_that_is_aslant():
 
 
 def test_an_outlier_is_cut_to_twice_the_usual_norm():
-    trainee = TrainingState(build("gcn", hidden=8), 1e-3, 0)
-    good = [torch.ones_like(p) for p in trainee.params]
-    trainee.update(good, 1e-3)
-    usual = float(trainee.usual)
-    trainee.update([1e4 * g for g in good], 1e-3)
-    assert float(torch.stack([p.grad.square().sum() for p in trainee.params]).sum().sqrt()) == pytest.approx(
+    state = TrainingState(build("gcn", hidden=8), 1e-3, 0)
+    good = [torch.ones_like(p) for p in state.params]
+    state.update(good, 1e-3)
+    usual = float(state.gradient_norm)
+    state.update([1e4 * g for g in good], 1e-3)
+    assert float(torch.stack([p.grad.square().sum() for p in state.params]).sum().sqrt()) == pytest.approx(
         GRADIENT_CLIP * usual, rel=1e-4
     )
-    assert float(trainee.usual) == pytest.approx(usual * (0.99 + 0.01 * GRADIENT_CLIP), rel=1e-4)
+    assert float(state.gradient_norm) == pytest.approx(usual * (0.99 + 0.01 * GRADIENT_CLIP), rel=1e-4)
 
 
 def test_training_gone_astray_goes_on_from_the_best_at_half_the_rate():
-    trainee = TrainingState(build("gcn", hidden=8), 1e-2, 0)
-    good = [torch.ones_like(p) for p in trainee.params]
-    trainee.update(good, 1e-2)
-    trainee.note({"RMSE": 0.1})
-    best = {k: v.clone() for k, v in trainee.best.items()}
-    trainee.update(good, 1e-2)
-    trainee.note({"RMSE": 0.12})  # a little worse: so it goes
-    assert trainee.caution == 1.0
-    assert not all(torch.equal(v, best[k]) for k, v in trainee.model.state_dict().items())
-    trainee.update(good, 1e-2)
-    trainee.note({"RMSE": math.inf})
-    assert trainee.caution == 0.5
-    for network in (trainee.model, trainee.ema):
+    state = TrainingState(build("gcn", hidden=8), 1e-2, 0)
+    good = [torch.ones_like(p) for p in state.params]
+    state.update(good, 1e-2)
+    state.record({"RMSE": 0.1})
+    best = {k: v.clone() for k, v in state.best.items()}
+    state.update(good, 1e-2)
+    state.record({"RMSE": 0.12})  # a little worse: so it goes
+    assert state.rate_factor == 1.0
+    assert not all(torch.equal(v, best[k]) for k, v in state.model.state_dict().items())
+    state.update(good, 1e-2)
+    state.record({"RMSE": math.inf})
+    assert state.rate_factor == 0.5
+    for network in (state.model, state.ema):
         assert all(torch.equal(v, best[k]) for k, v in network.state_dict().items())
-    trainee.update(good, 1e-2)
-    assert trainee.optimizer.param_groups[0]["lr"] == pytest.approx(0.5e-2 / WARMUP_STEPS)
-    moved = max(float((p.detach() - best[n]).abs().max()) for n, p in trainee.model.named_parameters())
+    state.update(good, 1e-2)
+    assert state.optimizer.param_groups[0]["lr"] == pytest.approx(0.5e-2 / WARMUP_STEPS)
+    moved = max(float((p.detach() - best[n]).abs().max()) for n, p in state.model.named_parameters())
     assert moved == pytest.approx(
         0.5e-2 / WARMUP_STEPS, rel=0.01
     )  # as a first step: nothing of the old moments is left
 
 
-@pytest.mark.parametrize(("after", "caution"), [((1.01, 1.02, 1.03, 1.04), 0.5), ((1.01, 1.02, 1.03, 1.02, 1.03), 1.0)])
-def test_training_that_gets_worse_check_by_check_has_gone_astray(after, caution):
-    trainee = TrainingState(build("gcn"), 1e-3, 0)
+@pytest.mark.parametrize(("after", "factor"), [((1.01, 1.02, 1.03, 1.04), 0.5), ((1.01, 1.02, 1.03, 1.02, 1.03), 1.0)])
+def test_training_that_gets_worse_check_by_check_has_gone_astray(after, factor):
+    state = TrainingState(build("gcn"), 1e-3, 0)
     for rmse in (1.2, 1.0, *after):
-        trainee.note({"RMSE": rmse})
-    assert trainee.caution == caution
+        state.record({"RMSE": rmse})
+    assert state.rate_factor == factor
 
 
 def test_longer_rollouts_begin_anew():
-    trainee = TrainingState(build("gcn", hidden=8), 1e-2, 0)
-    trainee.anew(8)
+    state = TrainingState(build("gcn", hidden=8), 1e-2, 0)
+    state.start_horizon(8)
     for _ in range(WARMUP_STEPS):
-        trainee.update([torch.ones_like(p) for p in trainee.params], 1e-2)
-    assert trainee.optimizer.param_groups[0]["lr"] == 1e-2
-    before = [p.detach().clone() for p in trainee.params]
-    trainee.anew(20)
-    trainee.update([100 * torch.ones_like(p) for p in trainee.params], 1e-2)
-    step = max(float((p.detach() - q).abs().max()) for p, q in zip(trainee.params, before, strict=True))
+        state.update([torch.ones_like(p) for p in state.params], 1e-2)
+    assert state.optimizer.param_groups[0]["lr"] == 1e-2
+    before = [p.detach().clone() for p in state.params]
+    state.start_horizon(20)
+    state.update([100 * torch.ones_like(p) for p in state.params], 1e-2)
+    step = max(float((p.detach() - q).abs().max()) for p, q in zip(state.params, before, strict=True))
     assert step == pytest.approx(1e-2 / WARMUP_STEPS, rel=0.01)  # however much larger gradients have become
 
 
@@ -349,21 +353,22 @@ def test_training_teaches_to_fall(tmp_path):
     before = validate(build("gcn", hidden=16), unseen)["RMSE"]
     run("gcn", tmp_path, tmp_path / "gcn.safetensors", options)
     card = load(tmp_path / "gcn.safetensors")[1]
-    assert card["validation"]["RMSE"] < 0.2 * before
-    assert card["curve"][-1]["loss"] < 0.1 * card["curve"][0]["loss"]
+    assert card["runs"][0]["validation"]["RMSE"] < 0.2 * before
+    assert card["curve"]["loss"][-1] < 0.1 * card["curve"]["loss"][0]
 
 
 def test_the_card_says_what_made_the_weights(data, tmp_path):
     lines = run("gcn", data, tmp_path / "a.safetensors", QUICK)
     model, card = load(tmp_path / "a.safetensors")
     assert str(tmp_path / "a.safetensors") in lines[0]
-    assert [f["made"]["command"] for f in card["data"]] == ["made 3_0", "made 3_1"]
-    assert (card["scenes"], card["scenes to choose by"], card["steps"], card["finished"]) == (8, 4, 12, True)
-    assert card["options"]["seed"] == 0 and card["config"]["hidden"] == 8
-    assert [row["horizon"] for row in card["curve"]] == [2, 2, 3, 3]
+    (record,) = card["runs"]
+    assert record["data"] == {name: sha256(data / "motions" / f"{name}.h5")[:16] for name in ("3_0", "3_1")}
+    assert (record["scenes"], record["validation scenes"], record["steps"], record["finished"]) == (8, 4, 12, True)
+    assert record["seed"] == card["options"]["seed"] == 0 and card["config"]["hidden"] == 8
+    assert card["curve"]["horizon"] == [2, 2, 3, 3]
     unseen = train_validation_split(read_groups(data, ["3_0", "3_1"], 8), 100)[1]
-    assert card["validation"]["RMSE"] == min(row["RMSE"] for row in card["curve"])
-    assert validate(model, unseen)["RMSE"] == pytest.approx(card["validation"]["RMSE"], rel=1e-6)
+    assert record["validation"]["RMSE"] == pytest.approx(min(card["curve"]["RMSE"]), rel=1e-4)
+    assert validate(model, unseen)["RMSE"] == pytest.approx(record["validation"]["RMSE"], rel=1e-6)
 
 
 @pytest.mark.parametrize(("after", "optimizer"), [(1, "adamw"), (5, "adamw"), (5, "soap")])
@@ -380,18 +385,18 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_curve(data, tmp_path, monkey
 
         patch.setattr(TrainingState, "update", stopped)
         lines = run("pointformer", data, tmp_path / "parts.safetensors", options)
-    assert "--resume" in lines[0] and not load(tmp_path / "parts.safetensors")[1]["finished"]
+    assert "--resume" in lines[0] and not load(tmp_path / "parts.safetensors")[1]["runs"][0]["finished"]
     run("pointformer", data, tmp_path / "parts.safetensors", options, resume=True)
     (a, whole), (b, parts) = (load(tmp_path / f"{name}.safetensors") for name in ("whole", "parts"))
-    assert parts["finished"] and parts["steps"] == 12
-    extra = [row for row in parts["curve"] if row["step"] not in {row["step"] for row in whole["curve"]}]
-    assert len(extra) == (after == 1)  # stopped before the first line: one is needed to save weights at all
+    assert parts["runs"][0]["finished"] and parts["runs"][0]["steps"] == 12
 
-    def curve(card):
-        return [{k: v for k, v in row.items() if k not in ("minutes", "loss")} for row in card["curve"]
-                if row not in extra]  # fmt: skip
+    def rows(card):
+        columns = [card["curve"][key] for key in ("step", "horizon", "RMSE", "R")]
+        return dict(zip(card["curve"]["step"], zip(*columns, strict=True), strict=True))
 
-    assert curve(whole) == curve(parts)
+    extra = rows(parts).keys() - rows(whole).keys()
+    assert len(extra) == (after == 1)  # stopped before the first validation: one is needed to save weights at all
+    assert rows(whole) == {step: row for step, row in rows(parts).items() if step not in extra}
     for p, q in zip(a.parameters(), b.parameters(), strict=True):
         assert torch.equal(p, q)
 
@@ -402,7 +407,8 @@ def test_training_begins_with_other_weights_and_tells_of_them(data, tmp_path):
     still = replace(QUICK, steps=1, lr=1e-9, hidden=0)
     run("gcn", data, second, still, start=first)
     (a, before), (b, card) = load(first), load(second)
-    assert card["before"]["curve"] == before["curve"] and card["before"]["sha256"] == before["sha256"]
+    assert card["runs"][0] == {**before["runs"][0], "sha256": before["sha256"]}
+    assert len(card["runs"]) == 2 and card["runs"][1]["steps"] == 1 and "sha256" not in card["runs"][1]
     for p, q in zip(a.parameters(), b.parameters(), strict=True):
         assert_close(p, q, rtol=0, atol=1e-8)
     run("gcn", data, second, still, resume=True, start=first)
@@ -477,7 +483,7 @@ def test_the_command_trains(data, tmp_path):
     result = CliRunner().invoke(app, ["train", "gcn", "--data", str(data), *words.split()])
     assert result.exit_code == 0, result.output
     assert "RMSE" in result.stdout
-    assert load(out)[1]["steps"] == 2
+    assert load(out)[1]["runs"][0]["steps"] == 2
 
 
 def test_two_processes_train_as_one_with_the_whole_batch(data, tmp_path):
@@ -499,7 +505,7 @@ def test_two_processes_train_as_one_with_the_whole_batch(data, tmp_path):
         said = process.communicate(timeout=120)[1]
         assert process.returncode == 0, said
     (one, _), (two, card) = (load(tmp_path / f"{name}.safetensors") for name in ("one", "two"))
-    assert card["processes"] == 2 and card["steps"] == 6
+    assert card["runs"][0]["processes"] == 2 and card["runs"][0]["steps"] == 6
     for p, q in zip(one.parameters(), two.parameters(), strict=True):
         assert_close(p, q, rtol=1e-3, atol=1e-5)
 

@@ -1,0 +1,41 @@
+"""Training history in the card of weights: a flat list of the runs that led to them, oldest first.
+
+A run is a training (its command, data, budget and validation score) or an average of weights (`average`: a ratio and a
+sha256 for each). Every run but the last has the sha256 of the weights it wrote; those of the last are the card's own.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+CURVE = ("minutes", "step", "horizon", "loss", "RMSE", "R")  # columns of a training curve that a card keeps
+DIGITS = 5  # significant digits of a curve's values
+
+
+def runs_of(card: Mapping) -> list[dict]:
+    """The runs of a card, each with the sha256 of the weights it wrote; one without further facts if none are known."""
+    *earlier, last = card.get("runs") or [{}]
+    return [*earlier, {**last, "sha256": card["sha256"]}]
+
+
+def merge(cards: Sequence[Mapping]) -> list[dict]:
+    """The runs of several cards, each once, in the order of their first occurrence."""
+    return list({run["sha256"]: run for card in cards for run in runs_of(card)}.values())
+
+
+def total_minutes(card: Mapping) -> float | None:
+    """Training time of all runs, summed over their processes [min]; None where a card holds no run."""
+    minutes = [float(run["minutes"]) * run.get("processes", 1) for run in card.get("runs", ()) if "minutes" in run]
+    return sum(minutes) if minutes else None
+
+
+def curve_columns(rows: Sequence[Mapping]) -> dict[str, list[float | None]]:
+    """A training curve as one list of values a column, rounded; None for what is missing or not finite."""
+    return {key: [_rounded(row.get(key)) for row in rows] for key in CURVE}
+
+
+def _rounded(value: float | None) -> float | None:
+    if value is None or not math.isfinite(value):
+        return None
+    return value if isinstance(value, int) else float(f"{value:.{DIGITS}g}")

@@ -2,8 +2,8 @@
 
 import os
 
-if "PYTEST_XDIST_WORKER" in os.environ:  # before the first import that reads it: one thread in each of several workers
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
+# before the first import that reads it: one thread in each of several workers
+os.environ.setdefault("OMP_NUM_THREADS", "1" if "PYTEST_XDIST_WORKER" in os.environ else "2")
 
 from pathlib import Path
 
@@ -15,7 +15,6 @@ from stages.core.scene.cameras import Cameras
 from stages.core.scene.gaussians import Gaussians, concatenate
 from stages.core.scene.scene import Scene, SceneObject
 
-torch.set_num_threads(1 if "PYTEST_XDIST_WORKER" in os.environ else 2)
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 SHARED = Path(__file__).resolve().parents[1].parent / "shared"
 

@@ -16,6 +16,7 @@ from stages.core.scene.cameras import Cameras
 from stages.core.scene.images import write_jpeg, write_labels
 from stages.core.scene.scene import Scene
 from stages.core.scene.scene_ply import write_scene
+from stages.core.scene.trajectory import Binding, TrajectoryWriter, read_trajectory
 from stages.lab.assets.toys import falling_toys
 from stages.simulate.options import SimulateOptions
 from stages.simulate.stage import run as simulate
@@ -61,9 +62,16 @@ def _transforms(cameras: Cameras) -> dict:
 
 
 def _truth(scene: Scene, out: Path) -> None:
-    """The toys alone, every third Gaussian of them, let go: a file of a size that git does not mind."""
+    """Simulate the toys without the table by MPM; of the Gaussians simulated, store every fourth (a small file)."""
     toys = scene.gaussians[scene.gaussians.object_id > 0]
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "toys.ply"
         write_scene(path, replace(scene, gaussians=toys[torch.arange(0, len(toys), 3)]))
-        simulate(path, out, SimulateOptions(engine="mpm", keypoints=256))
+        simulate(path, path.with_suffix(".h5"), SimulateOptions(engine="mpm", keypoints=64))
+        full = read_trajectory(path.with_suffix(".h5"))
+    some = torch.arange(0, len(full.scene.gaussians), 4)
+    thinned = replace(full.scene, gaussians=full.scene.gaussians[some])
+    binding = Binding(full.binding.index[some], full.binding.weight[some])
+    with TrajectoryWriter(out, thinned, full.info, full.keypoints, binding) as trajectory:
+        for t in range(len(full)):
+            trajectory.append(full.positions[t], full.com[t], full.rotation[t])

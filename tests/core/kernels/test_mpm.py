@@ -1,15 +1,11 @@
 """The kernels against their specification in PyTorch."""
 
-from functools import partial
-from types import SimpleNamespace
-
 import pytest
 import torch
 
 from stages.core.kernels.mpm.grid import GRID_PADDING
 from stages.core.kernels.mpm.transfers import substep_reference
 from stages.core.physics.mpm import solver as mpm
-from stages.core.physics.mpm import split as mpm_split
 from tests.conftest import DEVICES
 
 DX, DT, FRICTION = 0.1, 1e-3, 0.4
@@ -53,8 +49,7 @@ def test_the_same_bytes_whatever_the_number_of_threads(monkeypatch):
     push = torch.tensor([0.0, 0.0, -9.81]).repeat(300, 1)
     results = []
     for threads in (1, 3):
-        crew = mpm_split._Crew(threads)
-        monkeypatch.setattr(mpm_split, "_crew", partial(getattr, SimpleNamespace(crew=crew), "crew"))
+        monkeypatch.setattr(torch, "get_num_threads", lambda threads=threads: threads)
         solver = mpm.Solver(cloud(), mpm.Box((0, 0, 0), (1, 1, 1)), DX)
         for _ in range(3):
             solver.advance(0.01, push)

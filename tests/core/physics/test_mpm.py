@@ -258,3 +258,19 @@ def test_a_run_that_goes_wrong_says_which_particle():
     with pytest.raises(mpm.Diverged):
         for _ in range(20):
             unstable.advance(0.02, torch.zeros(len(p), 3), substeps=5)
+
+
+def test_an_exception_in_a_launch_reaches_the_caller_and_the_next_frame_runs(monkeypatch):
+    class Failing:
+        def launch(self):
+            raise RuntimeError("out of memory")
+
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
+    p = block()
+    solver = mpm.Solver(p, FREE, 0.025)
+    solver.advance(0.02, torch.zeros(len(p), 3), substeps=1)
+    working = solver._substepper._grid_commands[0]
+    for _ in range(2):
+        with pytest.raises(RuntimeError, match="out of memory"):
+            solver._substepper._run([working, Failing(), working, Failing()])
+    assert solver.advance(0.02, torch.zeros(len(p), 3), substeps=1) == 1

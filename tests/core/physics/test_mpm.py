@@ -261,8 +261,11 @@ def test_a_run_that_goes_wrong_says_which_particle():
 
 
 def test_an_exception_in_a_launch_reaches_the_caller_and_the_next_frame_runs(monkeypatch):
-    class Failing:
-        def launch(self):
+    class Failing(wp.Launch):
+        def __init__(self):
+            pass
+
+        def launch(self, stream=None):
             raise RuntimeError("out of memory")
 
     monkeypatch.setattr(torch, "get_num_threads", lambda: 2)

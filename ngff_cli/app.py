@@ -16,7 +16,7 @@ from stages.refine.options import RefineOptions
 from stages.render.options import VIEWS, RenderOptions
 from stages.segment.options import BACKENDS as SEGMENT
 from stages.segment.options import SegmentOptions
-from stages.simulate.options import SimulateOptions
+from stages.simulate.options import ENGINE_HELP, SimulateOptions
 
 app = typer.Typer(cls=CommandGroup, no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False)
 QUALITY_HELP = " | ".join(QUALITY_PRESETS)
@@ -189,9 +189,7 @@ def simulate(
     out: Annotated[Path, Option("-o", "--out", help="trajectory to write (.h5)")] = Path("traj.h5"),
     steps: Annotated[int, Option(help="number of frames, including the initial state")] = SimulateOptions.steps,
     dt: Annotated[float, Option(help="time between frames [s]")] = SimulateOptions.dt,
-    engine: Annotated[
-        str, Option(help="ngff: learned force field, for elastic bodies | mpm: material point method, for any material")
-    ] = SimulateOptions.engine,
+    engine: Annotated[str, Option(help=ENGINE_HELP)] = SimulateOptions.engine,
     gravity: Annotated[float, Option(help="downward acceleration [m/s^2]")] = SimulateOptions.gravity,
     quality: Annotated[str, Option(help=QUALITY_HELP)] = SimulateOptions.quality,
     material: Annotated[list[str] | None, Option(help="OBJECT=MATERIAL, such as duck=rubber; repeatable")] = None,

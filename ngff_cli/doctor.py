@@ -121,7 +121,7 @@ def _own_weights() -> Iterator[Finding]:
     from stages.core.models.checkpoints import find, load
     from stages.simulate.options import ENGINES
 
-    for name in ENGINES.keys() - {"mpm"}:
+    for name in sorted({engine.weights for engine in ENGINES.values() if engine.weights}):
         try:
             path = find(name)
             card = load(path)[1]

@@ -26,13 +26,13 @@ from stages.core.models.field.solidity import box_sides, solidity
 from stages.core.models.initial_conditions import FLOOR, InitialConditions, centre_of_mass
 from stages.core.models.rollout import TimeStepper
 from stages.core.physics.forces import ForcePrompts
-from stages.core.physics.materials import PLASTIC, choose_materials
+from stages.core.physics.materials import MODELS
 from stages.core.physics.skinning import object_rotations
 from stages.core.physics.state import FrameState
 from stages.core.scene.scene import Scene, SceneObject
 from stages.core.scene.trajectory import Keypoints
-from stages.simulate.mpm import SceneSetup, set_up_scene
-from stages.simulate.options import SimulateOptions
+from stages.simulate.options import ENGINES, SimulateOptions
+from stages.simulate.setup import SceneSetup, set_up_scene
 from stages.simulate.sleep import SleepState
 
 log = logging.getLogger(__name__)
@@ -81,7 +81,7 @@ def rollout(
 ) -> Iterator[FrameState]:
     """One state a frame, the first being the start. Raises InputError when the motion is no longer finite."""
     device = pick_device(options.device)
-    model, card = weights.load(weights.find(options.engine, options.weights), device)
+    model, card = weights.load(weights.find(ENGINES[options.engine].weights, options.weights), device)
     if card.get("warning"):
         log.warning("%s", card["warning"])
     stage = set_up_scene(scene, prompts, options)
@@ -132,7 +132,6 @@ def _world(
     options: SimulateOptions,
 ) -> InitialConditions:  # fmt: skip
     """The objects where they start, in the model's world."""
-    materials = choose_materials(scene.objects, options.material, options.materials)
     most = max(len(p) for p in each)
     points, valid = torch.zeros(1, len(each), most, 3), torch.zeros(1, len(each), most, dtype=torch.bool)
     mass, E, firmer, nu, friction = torch.ones(5, 1, len(each))
@@ -141,7 +140,7 @@ def _world(
         low = torch.tensor([-math.inf, -math.inf, float(floors[row])])  # what ends below would be thrown up
         points[0, row, : len(p)] = frame.to_model(p.maximum(low) + stage.lift[row])
         valid[0, row, : len(p)] = True
-        choice = materials[o.id]
+        choice = stage.materials[o.id]
         volume = float(stage.bodies.volume[stage.bodies.body == row].sum()) * scene.metres_per_unit**3
         mass[0, row] = choice.material.density * volume * frame.mass
         firmer[0, row] = solidity(points[0, row, : len(p)], volume * frame.mass)
@@ -149,7 +148,7 @@ def _world(
         nu[0, row] = choice.material.nu
         friction[0, row] = choice.material.friction if options.friction is None else options.friction
         velocity[0, row] = torch.tensor(prompts.velocity.get(o.id, (0.0, 0.0, 0.0))) * frame.length / frame.time
-        if choice.material.model in PLASTIC:
+        if MODELS[choice.material.model].plastic:
             log.warning("object %d (%s): %s yields or flows, which the learned field does not know; take --engine mpm",
                         o.id, o.name, choice.name)  # fmt: skip
         guess = f"; material not known, taking {choice.name} (--material {o.id}=... changes it)" * choice.guessed

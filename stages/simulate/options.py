@@ -1,4 +1,4 @@
-"""What a user can choose about simulation."""
+"""Options of `ngff simulate`, the table of engines, and the quality levels of the MPM engine."""
 
 from __future__ import annotations
 
@@ -8,18 +8,29 @@ from pathlib import Path
 
 from stages.core.errors import InputError
 
+
+@dataclass(frozen=True)
+class Engine:
+    """A simulation engine: all that the command line, `ngff-lab doctor` and errors need to know of it."""
+
+    rollout: str  # "module:function"; (scene, keypoints, prompts, options) -> an iterator of FrameState
+    help: str
+    weights: str | None = None  # model whose weights it needs (see stages/core/models/checkpoints.py)
+
+
 ENGINES = {
-    "ngff": "stages.simulate.learned:rollout",
-    "mpm": "stages.simulate.mpm:rollout",
+    "ngff": Engine("stages.simulate.learned:rollout", "learned force field, for elastic bodies", weights="ngff"),
+    "mpm": Engine("stages.simulate.mpm:rollout", "material point method, for any material"),
 }
+ENGINE_HELP = " | ".join(f"{name}: {engine.help}" for name, engine in ENGINES.items())
 
 
 @dataclass(frozen=True)
 class MpmQuality:
-    """What a word like "normal" stands for."""
+    """Resolution of the MPM engine."""
 
-    particles: int  # of all objects together; grid spacing follows, at eight in a full cell
-    substep: float  # shortest one worth taking [s]: materials too stiff for it are softened
+    particles: int  # of all objects together; the grid spacing follows from eight particles in a full cell
+    substep: float  # shortest substep taken [s]; materials too stiff for it are softened
 
 
 QUALITIES = {
@@ -31,6 +42,8 @@ QUALITIES = {
 
 @dataclass(frozen=True)
 class SimulateOptions:
+    """Options of `ngff simulate`. Raises InputError for values out of range."""
+
     steps: int = 100  # frames, the first being the start
     dt: float = 0.02  # time between frames [s]
     engine: str = "ngff"
@@ -38,16 +51,16 @@ class SimulateOptions:
     quality: str = "normal"
     material: tuple[str, ...] = ()  # OBJECT=MATERIAL
     materials: Path | None = None  # JSON {object name or id: material name or {E, nu, density, friction}}
-    force: tuple[str, ...] = ()  # "object=2 force=0,0,8 from=0.1 to=0.3", or torque=, and at= for a place
-    forces: Path | None = None  # JSON in the public format; its obj_id 0 is object 1
-    pin: tuple[str, ...] = ()  # objects that stay where they are
+    force: tuple[str, ...] = ()  # "object=2 force=0,0,8 from=0.1 to=0.3"; also torque= and at= (point of application)
+    forces: Path | None = None  # JSON in the format of NGFF; its obj_id 0 is object 1
+    pin: tuple[str, ...] = ()  # objects held at their position
     velocity: tuple[str, ...] = ()  # "object=1 0,0,2" at the start [scene units/s]
     lift: tuple[str, ...] = ()  # HEIGHT for all or OBJECT=HEIGHT [scene units]
     floor: float | None = None  # height of the floor [scene units]; by default the scene's
     friction: float | None = None  # Coulomb coefficient at floor and walls; by default each material's
     box: str | None = None  # floor, walls and ceiling: x0,y0,z0,x1,y1,z1 [scene units]; by default around the objects
-    keypoints: int = 1024  # most keypoints an object
-    weights: Path | None = None  # of a learned engine: .safetensors with its card, or a public checkpoint (.pth)
+    keypoints: int = 1024  # maximum number of keypoints per object
+    weights: Path | None = None  # of a learned engine: .safetensors with its card, or a published checkpoint (.pth)
     seed: int = 0
     device: str = "auto"
 
@@ -69,4 +82,5 @@ class SimulateOptions:
 
     @property
     def level(self) -> MpmQuality:
+        """Resolution that `quality` stands for."""
         return QUALITIES[self.quality]

@@ -1,4 +1,4 @@
-"""scene.ply -> traj.h5"""
+"""`ngff simulate`: scene.ply -> traj.h5."""
 
 from __future__ import annotations
 
@@ -23,8 +23,12 @@ log = logging.getLogger(__name__)
 
 
 def run(scene: Path, out: Path, options: SimulateOptions = SimulateOptions()) -> None:  # noqa: B008 -- frozen
-    """Roll the objects of a scene forward in time: scene.ply -> traj.h5."""
-    rollout = choose(ENGINES, options.engine)
+    """Simulate the objects of a scene: scene.ply -> traj.h5.
+
+    Raises InputError for wrong options or input, and when the simulation diverges; the frames up to then are kept in
+    OUT.partial.h5.
+    """
+    rollout = choose({name: engine.rollout for name, engine in ENGINES.items()}, options.engine)
     world = with_objects(read_scene(scene), scene)
     prompts = forces.parse(
         world.objects, Path(scene).stem, options.force, options.forces, options.pin, options.velocity, options.lift
@@ -35,25 +39,29 @@ def run(scene: Path, out: Path, options: SimulateOptions = SimulateOptions()) ->
     gravity = (0.0, 0.0, -options.gravity / world.metres_per_unit)
     motion = SimulationInfo(options.dt, gravity, options.engine, prompts.as_dicts())
     states = rollout(world, keypoints, prompts, options)
-    start, furthest = None, 0.0
+    start, max_displacement = None, 0.0
     with TrajectoryWriter(out, world, motion, keypoints, bind_gaussians(world, keypoints)) as trajectory:
         for state in tqdm(states, total=options.steps, unit="frame"):
             trajectory.append(state.positions, state.com, state.rotation)
             start = state.positions if start is None else start
-            furthest = max(furthest, float((state.positions - start).norm(dim=1).max()))
+            displacement = float((state.positions - start).norm(dim=1).max())
+            max_displacement = max(max_displacement, displacement)
     size = float((keypoints.rest.amax(0) - keypoints.rest.amin(0)).max())
-    if furthest < 0.02 * size and not prompts:
-        log.info("everything is at rest (nothing moved by more than %.2g); try --lift 0.3 or a --force", furthest)
+    if max_displacement < 0.02 * size and not prompts:
+        log.info("everything is at rest (maximum displacement %.2g); try --lift 0.3 or a --force", max_displacement)
     log.info("%s: %d frames, %.2f s", out, options.steps, options.steps * options.dt)
 
 
 def with_objects(scene: Scene, path: Path) -> Scene:
-    """The scene with every object that has Gaussians; one without labels is grouped on the way."""
+    """The scene with the objects that have Gaussians; a scene without objects is segmented by geometry first.
+
+    Raises InputError when no object is found.
+    """
     have = set(scene.gaussians.object_id.unique().tolist())
     present = tuple(o for o in scene.objects if o.id in have)
     for o in scene.objects:
         if o.id not in have:
-            log.warning("object %d (%s) has no Gaussians and is left out", o.id, o.name)
+            log.warning("object %d (%s) has no Gaussians and is skipped", o.id, o.name)
     if present:
         return replace(scene, objects=present)
     from stages.core.perception.grouping import group_objects  # noqa: PLC0415 -- only unlabelled scenes need it
@@ -62,5 +70,5 @@ def with_objects(scene: Scene, path: Path) -> Scene:
     if not grouped.objects or not torch.any(grouped.gaussians.object_id > 0):
         raise InputError(f"{path}: no objects were found in it; label them with `ngff segment`")
     names = ", ".join(f"{o.id} ({o.name})" for o in grouped.objects)
-    log.info("%s has no objects yet; grouped it into %d: %s", path, len(grouped.objects), names)
+    log.info("%s has no objects yet; segmented it by geometry into %d: %s", path, len(grouped.objects), names)
     return grouped

@@ -15,6 +15,7 @@ from stages.core.scene.scene_ply import read_scene, write_scene
 from stages.core.scene.trajectory import Trajectory, read_trajectory
 from stages.simulate import mpm as engine
 from stages.simulate.options import QUALITIES, MpmQuality, SimulateOptions
+from stages.simulate.setup import set_up_scene
 from stages.simulate.stage import run, with_objects
 from tests.conftest import ball
 
@@ -202,8 +203,8 @@ def test_an_unknown_engine(balls):
 
 def test_at_twice_the_resolution_bodies_stand_where_they_did(balls):
     scene, options = with_objects(read_scene(balls), balls), SimulateOptions(quality="draft")
-    stage = engine.set_up_scene(scene, ForcePrompts(), options)
-    fine = engine.set_up_scene(scene, ForcePrompts(), options, True)
+    stage = set_up_scene(scene, ForcePrompts(), options)
+    fine = set_up_scene(scene, ForcePrompts(), options, True)
     assert fine.bodies.spacing == stage.bodies.spacing / 2 and len(fine.start) > 6 * len(stage.start)
     # both stand on the floor, as seen
     for s in (stage, fine):

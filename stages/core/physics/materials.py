@@ -1,8 +1,8 @@
-"""Named materials, and which one an object is made of.
+"""Material models, named materials, and the choice of a material for each object.
 
-Handbook values are for the solid stuff; many real objects are hollow, so give your own where it counts.
-Friction is Coulomb's coefficient against the floor. `loss` is the loss factor tan(delta) of a whole body's slowest
-elastic vibration: what it loses of its energy in a swing, divided by 2 pi.
+Handbook values hold for the solid substance; many real objects are hollow, so give measured values where they matter.
+Friction is Coulomb's coefficient against the floor. `loss` is the loss factor tan(delta) of the slowest elastic
+vibration of a whole body: the energy lost per cycle divided by 2 pi times the stored energy.
 """
 
 from __future__ import annotations
@@ -10,37 +10,56 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 
 from stages.core.errors import InputError
+from stages.core.kernels.mpm.constitutive import COROTATED, NEO_HOOKEAN, SAND, SNOW, VON_MISES, sand_slope
 from stages.core.scene.files import must_exist
 from stages.core.scene.scene import SceneObject
+
+Triple = tuple[float | int, float | int, float | int]
 
 
 @dataclass(frozen=True)
 class Material:
-    """A solid. `model` and what its numbers in `plastic` mean: MODELS below."""
+    """An elastic or plastic solid."""
 
     E: float  # Young's modulus [Pa]
     density: float  # [kg/m^3]
     nu: float = 0.3  # Poisson's ratio
     friction: float = 0.5
     loss: float = 0.1
-    model: str = "neo-hookean"
-    plastic: tuple[float | int, float | int, float | int] = (0.0, 0.0, 0.0)
+    model: str = "neo-hookean"  # key of MODELS
+    plastic: Triple = (0.0, 0.0, 0.0)  # parameters of the model, see MODELS
     source: str = "given by the user"
 
 
-MODELS: Mapping[str, str] = {  # sources in stages/core/kernels/mpm/constitutive.py
-    "neo-hookean": "elastic; none",
-    "corotated": "elastic; none",
-    "von-mises": "metal, plasticine, dough; yield stress [Pa], hardening (softening below 0) [Pa], viscosity [Pa s]",
-    "sand": "grains; angle of friction [degrees], 0, 0",
-    "snow": "critical compression, critical stretch, hardening",
-}
-PLASTIC = ("von-mises", "sand", "snow")
+@dataclass(frozen=True)
+class MaterialModel:
+    """A constitutive law of the MPM solver; sources in stages/core/kernels/mpm/constitutive.py."""
+
+    kernel: int  # number by which the kernels know it
+    parameters: str  # meaning of Material.plastic
+    plastic: bool = False  # whether it yields or flows; the first parameter must then be positive
+    # parameters for the kernels, of a material whose E is reduced by a factor: it yields at the same strain
+    solver_parameters: Callable[[Triple, float], Triple] = lambda plastic, factor: plastic
+
+
+MODELS: Mapping[str, MaterialModel] = {
+    "neo-hookean": MaterialModel(NEO_HOOKEAN, "elastic; none"),
+    "corotated": MaterialModel(COROTATED, "elastic; none"),
+    "von-mises": MaterialModel(
+        VON_MISES, "metal, plasticine, dough; yield stress [Pa], hardening (softening below 0) [Pa], viscosity [Pa s]",
+        True, lambda plastic, factor: (factor * plastic[0], factor * plastic[1], plastic[2]),
+    ),
+    "sand": MaterialModel(
+        SAND, "granular; angle of friction [degrees], 0, 0",
+        True, lambda plastic, factor: (sand_slope(plastic[0]), 0.0, 0.0),
+    ),
+    "snow": MaterialModel(SNOW, "critical compression, critical stretch, hardening", True),
+}  # fmt: skip
 
 ASHBY = "Ashby 2011, Materials Selection in Mechanical Design, appendix A"
 GIBSON = "Gibson and Ashby 1997, Cellular Solids, ch. 5"
@@ -100,31 +119,38 @@ DEFAULT_MATERIAL = "common"
 
 @dataclass(frozen=True)
 class MaterialChoice:
-    """What an object is made of, and why."""
+    """The material of an object."""
 
     name: str
     material: Material
-    guessed: bool = False
+    guessed: bool = False  # neither given nor inferred from the object's name
 
 
 def choose_materials(
     objects: Sequence[SceneObject], prompts: Sequence[str] = (), file: Path | None = None
 ) -> dict[int, MaterialChoice]:
-    """Material of each object id: --material over --materials over the scene file over the object's name."""
-    told: dict[int, MaterialChoice] = {}
+    """Material of each object id: --material over --materials over the scene file over the object's name.
+
+    `file` is JSON {object name or id: material name or {E, density, ...}}. Raises InputError for unknown objects and
+    materials and for values out of range.
+    """
+    given: dict[int, MaterialChoice] = {}
     for key, value in (_read(file) if file else {}).items():
-        told[find_object(key, objects, f"{file}").id] = _material(value, f"{file}: {key}")
+        given[find_object(key, objects, f"{file}").id] = _material(value, f"{file}: {key}")
     for prompt in prompts:
         key, equals, value = prompt.partition("=")
         if not equals or not value.strip():
             raise InputError(f"--material {prompt!r}: write OBJECT=MATERIAL, such as duck=rubber")
         where = f"--material {prompt!r}"
-        told[find_object(key, objects, where).id] = _material(value.strip(), where)
-    return {o.id: told.get(o.id) or _by_name(o) for o in objects}
+        given[find_object(key, objects, where).id] = _material(value.strip(), where)
+    return {o.id: given.get(o.id) or _by_name(o) for o in objects}
 
 
 def find_object(key: str | int, objects: Sequence[SceneObject], where: str) -> SceneObject:
-    """The object of that id, or of that name (whole or the only one that contains it)."""
+    """The object with id or name `key`, or the only one whose name contains it.
+
+    Raises InputError, prefixed with `where`, if there is none or several.
+    """
     text = str(key).strip().lower()
     exact = [o for o in objects if text in (str(o.id), o.name.lower())]
     near = exact or [o for o in objects if text and text in o.name.lower()]
@@ -136,11 +162,12 @@ def find_object(key: str | int, objects: Sequence[SceneObject], where: str) -> S
 
 
 def _by_name(o: SceneObject) -> MaterialChoice:
+    """The scene's material of an object, or the one that its name suggests."""
     if o.material:
         return _material(o.material, f"object {o.id} ({o.name}) of the scene")
     words = set(re.findall(r"[a-z]+(?:-[a-z]+)?", o.name.lower()))
     words |= {word.removesuffix("s") for word in words}
-    # what a thing is says more than an adjective: "rubber duck" is the duck
+    # objects of the paper before substances: a "rubber duck" is a duck
     for name in sorted(words & MATERIALS.keys(), key=lambda name: not MATERIALS[name].source.startswith(PAPER)):
         return MaterialChoice(name, MATERIALS[name])
     for name, others in ALIASES.items():
@@ -150,16 +177,17 @@ def _by_name(o: SceneObject) -> MaterialChoice:
 
 
 def _material(value: object, where: str) -> MaterialChoice:
+    """A material by name, or one of a dict of values, checked."""
     if isinstance(value, str):
         if value.lower() not in MATERIALS:
             raise InputError(f"{where}: no material called {value!r}; choose from {', '.join(MATERIALS)}")
         return MaterialChoice(value.lower(), MATERIALS[value.lower()])
     known = [f.name for f in fields(Material) if f.name != "source"]
-    model, plastic = "neo-hookean", (0.0, 0.0, 0.0)
+    model, plastic = Material.model, Material.plastic
     if not isinstance(value, dict) or not {"E", "density"} <= value.keys() or value.keys() - set(known):
         raise InputError(f"{where}: give a material's name or {{E, density}} with any of {', '.join(known)}")
     if value.get("model", model) not in MODELS:
-        raise InputError(f"{where}: no model called {value['model']!r}; choose from {', '.join(MODELS)}")
+        raise InputError(f"{where}: no material model called {value['model']!r}; choose from {', '.join(MODELS)}")
     try:
         a, b, c = (float(v) for v in value.get("plastic", plastic))
         numbers = {k: float(v) for k, v in value.items() if k not in ("model", "plastic")}
@@ -167,9 +195,9 @@ def _material(value: object, where: str) -> MaterialChoice:
     except (TypeError, ValueError) as error:
         problem = f"{error}; E [Pa], density [kg/m^3] and the rest are numbers, plastic three of them"
         raise InputError(f"{where}: {problem}") from error
-    if not all(map(math.isfinite, material.plastic)) or material.model in PLASTIC and material.plastic[0] <= 0:
-        raise InputError(f"{where}: plastic must be finite, and for {material.model} the first must be positive; they "
-                         f"are: {MODELS[material.model]}")  # fmt: skip
+    if not all(map(math.isfinite, material.plastic)) or MODELS[material.model].plastic and material.plastic[0] <= 0:
+        raise InputError(f"{where}: plastic must be finite, and for {material.model} the first must be positive; the "
+                         f"parameters are: {MODELS[material.model].parameters}")  # fmt: skip
     if not (0 < material.E < 1e13 and 0 < material.density < 1e5 and -0.5 < material.nu < 0.49):
         raise InputError(f"{where}: E and density must be positive and nu between -0.5 and 0.49")
     if not (0 <= material.friction < 100 and 0 <= material.loss <= 2):
@@ -178,6 +206,7 @@ def _material(value: object, where: str) -> MaterialChoice:
 
 
 def _read(file: Path) -> dict:
+    """Contents of a materials file."""
     must_exist(file, "a JSON file {object name or id: material}")
     try:
         data = json.loads(Path(file).read_text())

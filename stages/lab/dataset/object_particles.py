@@ -16,6 +16,7 @@ from tqdm import tqdm
 from stages.core.errors import InputError
 from stages.core.geometry.neighbours import knn
 from stages.core.physics.keypoints import farthest_points
+from stages.core.physics.materials import MODELS
 from stages.core.physics.mpm import solver as mpm
 from stages.core.scene.files import replacing
 from stages.core.scene.gaussians import Gaussians
@@ -61,7 +62,7 @@ class Asset:
         """The object at rest, about the origin."""
         n = torch.ones(len(self.points))
         made = mpm.at_rest(self.points, self.volume, self.density * n, self.E * n, POISSON_RATIO * n, 0 * n,
-                           FRICTION * n, mpm.MODELS["corotated"])  # fmt: skip
+                           FRICTION * n, MODELS["corotated"].kernel)  # fmt: skip
         return mpm.Particles(*(getattr(made, f.name).to(device) for f in fields(made)))
 
 

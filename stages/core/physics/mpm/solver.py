@@ -21,21 +21,12 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from stages.core.kernels.mpm import grid as mpm_grid
-from stages.core.kernels.mpm.constitutive import (
-    COROTATED,
-    MAX_SNOW_HARDENING,
-    NEO_HOOKEAN,
-    SAND,
-    SNOW,
-    VON_MISES,
-    sand_slope,
-)
+from stages.core.kernels.mpm.constitutive import MAX_SNOW_HARDENING, NEO_HOOKEAN, SNOW
 from stages.core.physics.colliders import Collider, as_obstacles
 from stages.core.physics.mpm.fused import FusedSubsteps
 from stages.core.physics.mpm.particle_rows import NEVER, ParticleRows
 from stages.core.physics.mpm.split import SplitSubsteps
 
-MODELS = {"neo-hookean": NEO_HOOKEAN, "corotated": COROTATED, "von-mises": VON_MISES, "sand": SAND, "snow": SNOW}
 SAFETY = 0.5  # of a cell that a wave or a particle may cross in a substep; free vibration diverges from 1.1
 VISCOUS = 0.15  # largest dt eta / (density dx^2); violent vibration diverges from 0.3
 FLOOR_GAP = mpm_grid.FLOOR_GAP
@@ -97,19 +88,6 @@ def at_rest(
     held, models = torch.zeros(p, dtype=torch.int8), torch.full((p,), model, dtype=torch.int8)
     return Particles(x, torch.zeros(p, 3), still, identity, density * volume, volume, stiffness, friction, held,
                      models, torch.tensor(plastic).repeat(p, 1), torch.zeros(p))  # fmt: skip
-
-
-def plastic_parameters(
-    model: str, plastic: tuple[float | int, ...], softened: float = 1.0
-) -> tuple[float, float, float]:
-    """`plastic` of a named model as the solver wants it, for a material made softer by this factor.
-
-    Stresses soften with it, so that things yield at the same strain; an angle of friction becomes a slope.
-    """
-    a, b, c = plastic
-    if model == "sand":
-        return sand_slope(a), 0.0, 0.0
-    return (softened * a, softened * b, c) if model == "von-mises" else (a, b, c)
 
 
 def join_particles(parts: Sequence[Particles]) -> Particles:

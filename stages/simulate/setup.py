@@ -1,0 +1,136 @@
+"""Initial state that the engines share: bodies, materials, the floor, lifts and the domain."""
+
+from __future__ import annotations
+
+import logging
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from stages.core.errors import InputError
+from stages.core.physics.forces import ForcePrompts, vector
+from stages.core.physics.materials import MaterialChoice, choose_materials
+from stages.core.physics.mpm.resample import subdivide
+from stages.core.physics.mpm.solver import MAX_NODES, Box
+from stages.core.physics.particles import Bodies, sample_bodies
+from stages.core.scene.scene import Scene
+from stages.simulate.options import SimulateOptions
+
+log = logging.getLogger(__name__)
+MIN_ROOM = 20  # minimum distance from the objects to the walls of the default domain [particle spacings]
+
+
+@dataclass(frozen=True)
+class SceneSetup:
+    """Objects, materials and domain at the start of a simulation, in scene units; `o` follows scene.objects."""
+
+    bodies: Bodies  # particles at the reconstructed position
+    materials: dict[int, MaterialChoice]  # by object id
+    lift: Float[Tensor, "o 3"]  # displacement by --lift, part of the output
+    on_floor: Bool[Tensor, "o"]  # standing on the floor once lifted
+    floor_offset: Float[Tensor, "o 3"]  # displacement onto the floor within the simulation only, not part of the output
+    bottom: Float[Tensor, "o"]  # lowest point of each object as reconstructed
+    on_floor_as_seen: Bool[Tensor, "o"]  # standing on the floor as reconstructed
+    box: Box  # floor, walls and ceiling
+
+    @property
+    def start(self) -> Float[Tensor, "p 3"]:
+        """Particle positions at the start of the simulation."""
+        return self.bodies.x + (self.lift + self.floor_offset)[self.bodies.body]
+
+
+def set_up_scene(scene: Scene, prompts: ForcePrompts, options: SimulateOptions, fine: bool = False) -> SceneSetup:
+    """Sample the particles, choose the materials and place the objects in the domain.
+
+    Objects whose bottom is within two particle spacings of the floor, or below it, are moved onto it. `fine` doubles
+    the resolution of the particles. Raises InputError for a --box that does not contain the objects.
+    """
+    materials = choose_materials(scene.objects, options.material, options.materials)
+    bodies = sample_bodies(scene, options.level.particles, options.seed)
+    if fine:
+        bodies = subdivide(bodies, options.seed)
+    count, h = len(scene.objects), bodies.spacing
+    lift = torch.zeros(count, 3)
+    for row, o in enumerate(scene.objects):
+        lift[row, 2] = prompts.lift.get(o.id, 0.0)
+    # a voxel ends half a spacing below its particle, and the visible body one spacing further down
+    lowest = torch.stack([bodies.x[bodies.body == row, 2].quantile(0.01) for row in range(count)])
+    bottom = lowest - 1.5 * h
+    start = bottom + lift[:, 2]
+    asked = parse_box(options.box) if options.box else None
+    floor = _floor_height(scene, options, asked, start)
+    floor_offset = torch.zeros(count, 3)
+    gap = start - floor
+    on_floor, on_floor_as_seen = gap < 2 * h, bottom - floor < 2 * h
+    for row, o in enumerate(scene.objects):
+        if on_floor[row] and o.id not in prompts.pinned:
+            floor_offset[row, 2] = -gap[row]
+            if gap[row] < -4 * h:
+                log.warning("object %d (%s) reaches %.3g below the floor; it is placed on the floor",
+                            o.id, o.name, -gap[row])  # fmt: skip
+    x = bodies.x + (lift + floor_offset)[bodies.body]
+    box = asked or _default_box(x, floor, h)
+    box = Box((*box.low[:2], floor), box.high)
+    low, high = torch.tensor(box.low), torch.tensor(box.high)
+    # particles below the 1 % quantile may still lie under the floor, which would throw them up
+    x[:, 2].clamp_(min=floor + 1.25 * h)
+    outside = ((x < low) | (x > high)).any(1)
+    if bool(outside.any()):
+        row = int(bodies.body[outside.nonzero()[0, 0]])
+        o = scene.objects[row]
+        raise InputError(f"--box {options.box}: object {o.id} ({o.name}) is not inside; it spans "
+                         f"{_extent(x[bodies.body == row])}")  # fmt: skip
+    at_rest = x - (lift + floor_offset)[bodies.body]
+    bodies = replace(bodies, x=at_rest)
+    return SceneSetup(bodies, materials, lift, on_floor, floor_offset, bottom, on_floor_as_seen, box)
+
+
+def _floor_height(scene: Scene, options: SimulateOptions, box: Box | None, bottom: Float[Tensor, "o"]) -> float:
+    """Height of the floor: --floor over --box over the scene over the lowest object."""
+    if options.floor is not None:
+        return options.floor
+    if box is not None:
+        return box.low[2]
+    if scene.floor is not None:
+        return scene.floor
+    floor = float(bottom.min())
+    log.info("the scene has no floor; one is placed under the lowest object, at %.3g (--floor changes it)", floor)
+    return floor
+
+
+def parse_box(text: str) -> Box:
+    """The domain of --box "x0,y0,z0,x1,y1,z1": lower and upper corner. Raises InputError if malformed."""
+    where, parts = f"--box {text!r}", text.split(",")
+    if len(parts) != 6:
+        raise InputError(f"{where}: write x0,y0,z0,x1,y1,z1")
+    box = Box(vector(",".join(parts[:3]), where), vector(",".join(parts[3:]), where))
+    if any(low >= high for low, high in zip(box.low, box.high, strict=True)):
+        raise InputError(f"{where}: the first corner must be below the second in x, y and z")
+    return box
+
+
+def _extent(x: Float[Tensor, "p 3"]) -> str:
+    """Ranges of the coordinates, for an error message."""
+    low, high = x.amin(0), x.amax(0)
+    return " x ".join(f"{a:.3g}..{b:.3g}" for a, b in zip(low.tolist(), high.tolist(), strict=True))
+
+
+def _default_box(x: Float[Tensor, "p 3"], floor: float, h: float) -> Box:
+    """Twice the extent of the objects, and to the sides at least their height above the floor.
+
+    Reduced where the MPM grid would take too much memory.
+    """
+    low, high = x.amin(0), x.amax(0)
+    size = float((high - low).max())
+    room = max(size / 2, float(high[2]) - floor, MIN_ROOM * h)
+    while True:
+        box = Box((float(low[0]) - room, float(low[1]) - room, floor),
+                  (float(high[0]) + room, float(high[1]) + room, float(high[2]) + max(room, size)))  # fmt: skip
+        nodes = math.prod((b - a) / (2 * h) + 16 for a, b in zip(box.low, box.high, strict=True))
+        if nodes < MAX_NODES / 2 or room <= MIN_ROOM * h:
+            return box
+        room *= 0.8
+        size *= 0.8

@@ -9,6 +9,7 @@ import torch
 
 from stages.core.errors import InputError
 from stages.core.physics.forces import ForcePrompts
+from stages.core.physics.materials import DEFAULT_MATERIAL
 from stages.core.scene.gaussians import concatenate
 from stages.core.scene.scene import Scene, SceneObject
 from stages.core.scene.scene_ply import read_scene, write_scene

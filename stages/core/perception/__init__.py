@@ -1,1 +1,1 @@
-"""What the photos say about the scene: supports, visibility, and which Gaussians form one object."""
+"""Scene understanding from Gaussians and cameras: supporting planes, visibility, grouping into objects."""

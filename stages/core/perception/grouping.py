@@ -1,4 +1,4 @@
-"""Which Gaussians belong together as one thing that can move: no labels needed, only positions, colours, normals."""
+"""Grouping of Gaussians into movable objects by position, colour and normals, without labels or networks."""
 
 from __future__ import annotations
 
@@ -30,68 +30,71 @@ from stages.core.scene.gaussians import Gaussians
 from stages.core.scene.scene import Scene, SceneObject
 
 log = logging.getLogger(__name__)
-MOST_VOXELS = 60_000
-CROWD = 0.3  # Gaussians that a voxel of a real surface holds at least, of those usual near the focus
-HIGH = 0.4  # what hangs higher above the table than this is no thing on it [view radii]
-LOW = 0.05  # what ends lower than this and has the table's colour is a bump of the table [view radii]
-LARGE = 0.4  # longest side of a thing that stands out of its surroundings [view radii]
-ON_WALL = 0.9  # the same of what hangs on a wall, where photos are of one thing rather than of many [view radii]
+MAX_VOXELS = 60_000
+MIN_VOXEL_DENSITY = 0.3  # Gaussians per voxel of an object, relative to the median near the focus; less are floaters
+MAX_BASE_HEIGHT = 0.4  # largest height above the table of an object's lowest point [camera distance]
+MAX_BUMP_HEIGHT = 0.05  # height up to which a region of the table's colour is unevenness of the table [camera distance]
+MAX_TABLE_OBJECT = 0.4  # longest side of an object on a table [camera distance]
+MAX_WALL_OBJECT = 0.9  # longest side of an object on a wall, which often fills the photos [camera distance]
+MIN_GAUSSIANS = 20  # above the plane, or there are no objects
 
 
 @dataclass(frozen=True)
 class GroupingOptions:
-    """What decides how many objects come out."""
+    """Parameters of grouping."""
 
     max_objects: int = 24
-    min_size: float = 0.03  # of an object, along its longest side [distance of the cameras from the focus]
-    detail: float = 0.41  # regions that differ less than this are one object; smaller gives more objects
+    min_size: float = 0.03  # of an object, along its longest side [camera distance]
+    detail: float = 0.41  # largest separation of two regions of one object; smaller values give more objects
     seed: int = 0
 
 
 def group_objects(scene: Scene, grouping: Grouping = GroupingOptions()) -> Scene:
     """The scene with an object_id for every Gaussian (0 for the background) and its objects, largest first.
 
-    The supporting plane is taken away, what is left is cut into small even regions, and these are merged
-    while they look like one thing. Things that mostly lie outside the table are background. Where there is
-    a wall and no floor, what hangs on it is found in the same way.
+    The supporting plane is removed, the rest is oversegmented into small homogeneous regions, and these are merged
+    by similarity. Objects mostly outside the table become background. In a scene with a wall and no floor, objects
+    on the wall are found in the same way.
     """
     view = view_extent(scene)
     wall = find_wall(scene, view, grouping.seed)
     if wall is None:
         support = find_support(scene, view, grouping.seed)
-        return name_objects(replace(scene, gaussians=_grouped(scene, view, support, grouping, LARGE)), support)
+        return name_objects(
+            replace(scene, gaussians=_grouped(scene, view, support, grouping, MAX_TABLE_OBJECT)), support
+        )
     laid = rotate_wall_to_floor(scene, wall)
     view = view_extent(laid)
-    ids = _grouped(laid, view, find_support(laid, view, grouping.seed), grouping, ON_WALL).object_id
+    ids = _grouped(laid, view, find_support(laid, view, grouping.seed), grouping, MAX_WALL_OBJECT).object_id
     return name_objects(replace(scene, gaussians=replace(scene.gaussians, object_id=ids)), None)
 
 
 def _grouped(
-    scene: Scene, view: ViewExtent, support: Support | None, grouping: GroupingOptions, large: float
+    scene: Scene, view: ViewExtent, support: Support | None, grouping: GroupingOptions, max_extent: float
 ) -> Gaussians:
-    """The scene's Gaussians with object numbers; nothing is larger than about `large` view radii."""
+    """The scene's Gaussians with object ids; objects larger than `max_extent` camera distances are penalised."""
     g = replace(scene.gaussians, object_id=torch.zeros(len(scene.gaussians), dtype=torch.int64))
     index = _candidates(g, view, support)
-    index = index[_crowded(g.means[index], view)]
-    if len(index) < 20:
-        log.info("nothing stands on the supporting plane: no objects")
+    index = index[_is_dense(g.means[index], view)]
+    if len(index) < MIN_GAUSSIANS:
+        log.info("no Gaussians above the supporting plane: no objects")
         return g
     seen = summed_view_directions(g, scene.cameras) if scene.cameras is not None and len(scene.cameras) else None
     voxels, owner = _voxels(g[index], view, None if seen is None else seen[index])
     edges = voxel_edges(voxels)
-    least = max(4, int((grouping.min_size * view.radius / voxels.size) ** 2))
+    min_voxels = max(4, int((grouping.min_size * view.radius / voxels.size) ** 2))
     regions = oversegment(voxels, edges)
-    things = RegionMerger(voxels, edges, regions, least, grouping.detail, large * view.radius).run()
-    count = np.bincount(owner[owner >= 0], minlength=len(voxels)) * _thinning(voxels, scene, view)
+    labels = RegionMerger(voxels, edges, regions, min_voxels, grouping.detail, max_extent * view.radius).run()
+    count = np.bincount(owner[owner >= 0], minlength=len(voxels)) * _expected_sparsity(voxels, scene, view)
     if support is not None:
-        things = _without_skirts(voxels, things, table_colour(g, support), support)
-    things = _objects(voxels, count, things, view, support, grouping)
-    g.object_id[index] = torch.from_numpy(np.where(owner >= 0, things[owner], 0))
+        labels = _remove_table_regions(voxels, labels, table_colour(g, support), support)
+    labels = _objects(voxels, count, labels, view, support, grouping)
+    g.object_id[index] = torch.from_numpy(np.where(owner >= 0, labels[owner], 0))
     return grow_objects(g, support, 2 * voxels.size)
 
 
 def _candidates(g: Gaussians, view: ViewExtent, support: Support | None) -> Int[Tensor, "m"]:
-    """Gaussians near the focus that are something, but not the supporting plane."""
+    """Indices of opaque Gaussians near the focus that are not part of the supporting plane."""
     R = view.radius
     ok = g.means.isfinite().all(1) & g.quats.isfinite().all(1) & g.scales.isfinite().all(1)
     ok &= (g.opacities > 0.1) & (g.scales.amax(1) < 0.1 * R) & ((g.means - view.focus).norm(dim=1) < 1.5 * R)
@@ -106,18 +109,18 @@ def _candidates(g: Gaussians, view: ViewExtent, support: Support | None) -> Int[
 
 
 def _against_table(g: Gaussians, h: Float[Tensor, "n"], support: Support) -> tuple[Tensor, Tensor]:
-    """For Gaussians close to the table: whether they have its colour, and whether they belong to a flat thing on it.
+    """For Gaussians close to the table: whether they have its colour, and whether they belong to a flat object on it.
 
-    A flat thing has another colour than the table around and is a little higher: a stain has the colour but
-    no height, a bump in the reconstruction the height but not the colour.
+    A flat object differs from the surrounding table in colour and is slightly higher. A stain differs only in
+    colour, a bump of the reconstruction only in height.
     """
     like, flat = torch.zeros(2, len(g), dtype=torch.bool)
     near = torch.nonzero((h.abs() < 2.5 * support.tolerance) & (g.opacities > 0.1) & support.inside(g.means))[:, 0]
     if len(near) < 50:
         return like, flat
     values = torch.cat([cielab_colours(g[near]), h[near, None]], 1)
-    table = sliding_quantile(cell_medians(support, g.means[near], values, 3), reach=5)
-    here = sliding_quantile(cell_medians(support, g.means[near], values), reach=1)
+    table = sliding_quantile(cell_medians(support, g.means[near], values, 3), radius=5)
+    here = sliding_quantile(cell_medians(support, g.means[near], values), radius=1)
     cell = support.cells(g.means[near])
     around, mine = table[tuple((cell // 3).T)], here[tuple(cell.T)]
     like[near] = (values - around)[:, :3].norm(dim=1) < 10
@@ -132,22 +135,22 @@ def _shortest(g: Gaussians) -> Float[Tensor, "n 3"]:
     return matrix(g.quats)[torch.arange(len(g)), :, g.scales.argmin(1)]
 
 
-def _crowded(points: Float[Tensor, "m 3"], view: ViewExtent) -> Bool[Tensor, "m"]:
-    """Points with neighbours as near as most have: not floaters."""
-    if len(points) < 20:
+def _is_dense(points: Float[Tensor, "m 3"], view: ViewExtent) -> Bool[Tensor, "m"]:
+    """Points whose neighbours are about as near as usual; the others are floaters."""
+    if len(points) < MIN_GAUSSIANS:
         return torch.ones(len(points), dtype=torch.bool)
     distance = knn(points, points, 9)[0][:, -1]
     return distance < min(max(3.5 * float(distance.median()), 0.01 * view.radius), 0.06 * view.radius)
 
 
 def _voxels(g: Gaussians, view: ViewExtent, seen: Tensor | None) -> tuple[Voxels, np.ndarray]:
-    """Means over a grid about twice as coarse as the Gaussians, and the voxel of each (-1: dropped as stray)."""
+    """Voxels about twice as coarse as the Gaussians, and the voxel of each Gaussian (-1: dropped as stray)."""
     spacing = float(knn(g.means, g.means, 4)[0][:, 1:].mean(1).median())
     size = min(max(2.0 * spacing, 0.007 * view.radius), 0.025 * view.radius)
     while True:
         cell = (g.means / size).floor().long()
         _, owner, count = cell.unique(dim=0, return_inverse=True, return_counts=True)
-        if len(count) <= MOST_VOXELS:
+        if len(count) <= MAX_VOXELS:
             break
         size *= 1.3
     points, lab = _mean(g.means, owner, count), _mean(cielab_colours(g), owner, count)
@@ -166,7 +169,7 @@ def _mean(values: Float[Tensor, "n *v"], owner: Int[Tensor, "n"], count: Int[Ten
 def _normals(
     g: Gaussians, points: Tensor, owner: Tensor, count: Tensor, seen: Tensor | None, view: ViewExtent
 ) -> Tensor:
-    """Shortest axes of flat Gaussians and the planes through neighbouring voxels, pointing to where they are seen."""
+    """Voxel normals from the shortest axes of Gaussians and planes of neighbours, oriented towards the cameras."""
     lengths, axes = g.scales.sort(1).values, _shortest(g)
     flat = (1 - lengths[:, 0] / lengths[:, 1].clamp_min(1e-12)).clamp_min(0)
     axes = _mean(flat[:, None, None] * axes[:, :, None] * axes[:, None], owner, count)
@@ -176,39 +179,41 @@ def _normals(
     spread = spread / spread.diagonal(dim1=1, dim2=2).sum(1).clamp_min(1e-20)[:, None, None]
     normals = torch.linalg.eigh(axes + torch.eye(3) - 2 * spread).eigenvectors[:, :, -1]
     wide = points[knn(points, points, 64)[1]].mean(1)
-    toward = points - wide + 1e-3 * view.radius * torch.tensor([0.0, 0, 1])  # outside is away from what is around
+    toward = (
+        points - wide + 1e-3 * view.radius * torch.tensor([0.0, 0, 1])
+    )  # outwards is away from the surrounding points
     if seen is not None:
         total = torch.zeros(len(count), 3).index_add_(0, owner, seen)
         toward = torch.where(total.norm(dim=1, keepdim=True) > 0, total, toward)
     return normals * torch.where((normals * toward).sum(1, keepdim=True) < 0, -1.0, 1.0)
 
 
-def _thinning(voxels: Voxels, scene: Scene, view: ViewExtent) -> np.ndarray:
-    """How much thinner than usual Gaussians lie, being farther from the nearest camera: distance squared."""
+def _expected_sparsity(voxels: Voxels, scene: Scene, view: ViewExtent) -> np.ndarray:
+    """Expected sparsity of Gaussians in each voxel: squared distance from the nearest camera [camera distance^2]."""
     if scene.cameras is None or not len(scene.cameras):
         return np.ones(len(voxels))
     distance, _ = knn(centres(scene.cameras.viewmats), torch.from_numpy(voxels.points).float(), 1)
     return (distance[:, 0] / view.radius).clamp(0.5, 2).square().numpy()
 
 
-def _without_skirts(
-    voxels: Voxels, things: np.ndarray, table: Float[Tensor, "bx by 3"], support: Support
+def _remove_table_regions(
+    voxels: Voxels, labels: np.ndarray, table: Float[Tensor, "bx by 3"], support: Support
 ) -> np.ndarray:
-    """Things that are pieces of the table (-1): low, and of its colour, or nearly so in the shade of a larger thing."""
+    """Labels with regions of the table set to -1: low, and of its colour, or similar under a larger object."""
     points = torch.from_numpy(voxels.points).float()
     h = support.heights(points).numpy() / support.view.radius
     around = table[tuple((support.cells(points) // 3).T)].numpy()
-    unlike = np.linalg.norm(voxels.lab - around, axis=1)
+    difference = np.linalg.norm(voxels.lab - around, axis=1)
     _, column = np.unique(np.floor(voxels.points[:, :2] / (4 * voxels.size)), axis=0, return_inverse=True)
-    column, size = column.reshape(-1), np.bincount(things[things >= 0])
-    out = things.copy()
-    for thing in np.unique(things[things >= 0]):
-        members = things == thing
-        if np.percentile(h[members], 95) > LOW:
+    column, size = column.reshape(-1), np.bincount(labels[labels >= 0])
+    out = labels.copy()
+    for label in np.unique(labels[labels >= 0]):
+        members = labels == label
+        if np.percentile(h[members], 95) > MAX_BUMP_HEIGHT:
             continue
-        above = np.isin(column, column[members]) & (things >= 0) & (size[things] > 3 * size[thing])
+        above = np.isin(column, column[members]) & (labels >= 0) & (size[labels] > 3 * size[label])
         shaded = len(np.unique(column[above])) > 0.5 * len(np.unique(column[members]))
-        if np.median(unlike[members]) < (25 if shaded else 10):
+        if np.median(difference[members]) < (25 if shaded else 10):
             out[members] = -1
     return out
 
@@ -216,14 +221,14 @@ def _without_skirts(
 def _objects(
     voxels: Voxels,
     count: np.ndarray,
-    things: np.ndarray,
+    labels: np.ndarray,
     view: ViewExtent,
     support: Support | None,
     grouping: GroupingOptions,
 ) -> np.ndarray:
-    """Object number of each voxel, 1 for the largest thing; 0 for what is too small, too large or off the table.
+    """Object number of each voxel, 1 for the largest; 0 for regions too small, too large, too sparse or off the table.
 
-    `count` says how many Gaussians a voxel holds: a cloud of floaters has hardly more than one in each.
+    `count` is the number of Gaussians in each voxel, which is about 1 in a cloud of floaters.
     """
     points = torch.from_numpy(voxels.points).float()
     off = np.zeros(len(voxels), bool)
@@ -232,25 +237,25 @@ def _objects(
         h = support.heights(points).numpy()
         off = ~support.inside(points).numpy() | (h < -2 * support.tolerance)
     near = np.linalg.norm(voxels.points - view.focus.numpy(), axis=1) < 0.3 * view.radius
-    crowd = CROWD * np.median(count[near]) if near.any() else 0.0
-    smallest = grouping.min_size * view.radius
+    min_density = MIN_VOXEL_DENSITY * np.median(count[near]) if near.any() else 0.0
+    min_size = grouping.min_size * view.radius
     found = []
-    for thing in np.unique(things[things >= 0]):
-        members = things == thing
+    for label in np.unique(labels[labels >= 0]):
+        members = labels == label
         low, high = np.percentile(voxels.points[members], (2, 98), axis=0)
-        sized = smallest <= (high - low).max() < 1.2 * view.radius
-        enough = members.sum() >= max(8, 0.35 * (smallest / voxels.size) ** 2)
-        here = off[members].mean() < 0.4 and h[members].min() < HIGH * view.radius
-        if sized and enough and here and count[members].mean() > crowd:
-            found.append((int(members.sum()), thing))
+        sized = min_size <= (high - low).max() < 1.2 * view.radius
+        enough = members.sum() >= max(8, 0.35 * (min_size / voxels.size) ** 2)
+        here = off[members].mean() < 0.4 and h[members].min() < MAX_BASE_HEIGHT * view.radius
+        if sized and enough and here and count[members].mean() > min_density:
+            found.append((int(members.sum()), label))
     out = np.zeros(len(voxels), np.int64)
-    for number, (_, thing) in enumerate(sorted(found, reverse=True)[: grouping.max_objects], start=1):
-        out[things == thing] = number
+    for number, (_, label) in enumerate(sorted(found, reverse=True)[: grouping.max_objects], start=1):
+        out[labels == label] = number
     return out
 
 
 def name_objects(scene: Scene, support: Support | None) -> Scene:
-    """Objects renumbered by their count of Gaussians, with a name each."""
+    """The scene with its objects renumbered by decreasing count of Gaussians, and default names."""
     g = scene.gaussians
     counts = torch.bincount(g.object_id)
     order = [i for i in counts.argsort(descending=True, stable=True).tolist() if i > 0 and counts[i] > 0]

@@ -1,4 +1,4 @@
-"""Names for objects that nobody has named: size, colour and shape, as one would point them out."""
+"""Default names of objects, from their shape and colour, such as "flat_black_object"."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ COLOURS = {
 
 
 def object_names(g: Gaussians, support: Support | None) -> list[str]:
-    """One name for each object 1, 2, ...: "yellow_object", "flat_black_object"; numbered where two are alike."""
+    """One name for each object 1, 2, ...: "yellow_object", "flat_black_object"; numbered where names repeat."""
     names = [_name(g[g.object_id == i], support) for i in range(1, int(g.object_id.max()) + 1)]
     total, seen = Counter(names), Counter()
     for index, name in enumerate(names):
@@ -40,11 +40,11 @@ def _name(g: Gaussians, support: Support | None) -> str:
 
 
 def _colour(g: Gaussians) -> str:
-    """The basic colour that most of its surface is nearest to."""
+    """The basic colour that the largest part of the surface area is nearest to."""
     rgb = (g.sh[:, 0] * C0 + 0.5).clamp(0, 1)
     lab = _lab(rgb.numpy())
     base = _lab(np.array(list(COLOURS.values()), np.float32))
-    # hue says more than lightness, which light and shade change
+    # lightness has less weight than hue, since illumination changes it
     weight = np.array([0.6, 1.0, 1.0])
     nearest = np.linalg.norm((lab[:, None] - base[None]) * weight, axis=2).argmin(1)
     area = g.scales.sort(1).values[:, 1:].prod(1).numpy()

@@ -1,4 +1,7 @@
-"""Voxels of a surface gathered into regions, and regions into things, by colour, shape and how they meet."""
+"""Hierarchical segmentation of surface voxels: oversegmentation into regions, then pairwise merging into objects.
+
+The merge criterion (`RegionMerger.separation`) has hand-set weights; a learned affinity is meant to replace it.
+"""
 
 from __future__ import annotations
 
@@ -8,17 +11,17 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
-INNER_STEP = 9.0  # CIELAB steps between neighbours that are still texture
-HULL_POINTS = 150
+TEXTURE_CONTRAST = 9.0  # colour difference of neighbouring voxels up to which it is texture [CIELAB]
+MAX_SAMPLE_POINTS = 150  # points of a region that are tested against convex hulls
 
 
 @dataclass(frozen=True)
 class Voxels:
-    """Pieces of surface, one a voxel."""
+    """Surface elements, one per voxel."""
 
     points: np.ndarray  # (m, 3) mean position
     lab: np.ndarray  # (m, 3) mean colour, CIELAB
-    normals: np.ndarray  # (m, 3) unit, to the outside
+    normals: np.ndarray  # (m, 3) unit, pointing outwards
     size: float  # side of a voxel
 
     def __len__(self) -> int:
@@ -27,21 +30,21 @@ class Voxels:
 
 @dataclass(frozen=True)
 class VoxelEdges:
-    """Pairs of neighbouring voxels and how different they are."""
+    """Pairs of neighbouring voxels and their dissimilarity."""
 
     i: np.ndarray  # (e,)
     j: np.ndarray  # (e,)
     contrast: np.ndarray  # (e,) CIELAB distance
-    bend: np.ndarray  # (e,) sine of the angle between the normals, above 0 in a valley and at a jump
+    bend: np.ndarray  # (e,) sine of the angle between the normals, positive where concave and at depth jumps
 
 
-def voxel_edges(voxels: Voxels, reach: float = 2.2, k: int = 12) -> VoxelEdges:
-    """Neighbours within `reach` voxel sides, k at most for each."""
+def voxel_edges(voxels: Voxels, radius: float = 2.2, k: int = 12) -> VoxelEdges:
+    """Edges to the at most k neighbours of each voxel within `radius` voxel sides."""
     if len(voxels) < 2:
         none = np.zeros(0, np.int64)
         return VoxelEdges(none, none, none.astype(float), none.astype(float))
     distance, index = cKDTree(voxels.points).query(
-        voxels.points, k=min(k + 1, len(voxels)), distance_upper_bound=reach * voxels.size, workers=-1
+        voxels.points, k=min(k + 1, len(voxels)), distance_upper_bound=radius * voxels.size, workers=-1
     )
     i = np.repeat(np.arange(len(voxels)), index.shape[1])[np.isfinite(distance).ravel()]
     j = index.ravel()[np.isfinite(distance).ravel()]
@@ -50,18 +53,19 @@ def voxel_edges(voxels: Voxels, reach: float = 2.2, k: int = 12) -> VoxelEdges:
     step = voxels.points[j] - voxels.points[i]
     step /= np.linalg.norm(step, axis=1, keepdims=True).clip(1e-12)
     slope_i, slope_j = (voxels.normals[i] * step).sum(1), (voxels.normals[j] * step).sum(1)
-    jump = np.sqrt((slope_i * slope_j).clip(0))  # both normals along the step: one surface behind the other
+    jump = np.sqrt((slope_i * slope_j).clip(0))  # both normals along the edge: one surface is behind the other
     bend = (slope_i - slope_j) / 2 + (jump - 0.3).clip(0)
     return VoxelEdges(i, j, np.linalg.norm(voxels.lab[i] - voxels.lab[j], axis=1), bend)
 
 
 class DisjointSets:
-    """Disjoint sets with path halving."""
+    """Union-find with path halving."""
 
     def __init__(self, count: int):
         self.parent = list(range(count))
 
     def find(self, i: int) -> int:
+        """Representative of the set of element i."""
         parent = self.parent
         while parent[i] != i:
             parent[i] = parent[parent[i]]
@@ -69,10 +73,13 @@ class DisjointSets:
         return i
 
 
-def oversegment(voxels: Voxels, edges: VoxelEdges, k: float = 0.8, least: int = 6, most: int = 120) -> np.ndarray:
-    """Region number of each voxel: even in colour and without a valley, unless that is their texture.
+def oversegment(
+    voxels: Voxels, edges: VoxelEdges, k: float = 0.8, min_size: int = 6, max_size: int = 120
+) -> np.ndarray:
+    """Region number of each voxel: regions of homogeneous colour without concave edges.
 
-    None grows over `most` voxels, since one weak place in a border would join two things for good.
+    Regions below `min_size` voxels are merged with a neighbour. No region exceeds `max_size` voxels, since a single
+    weak boundary edge would otherwise join two objects irreversibly.
 
     Source: Felzenszwalb and Huttenlocher 2004, "Efficient graph-based image segmentation".
     """
@@ -83,10 +90,10 @@ def oversegment(voxels: Voxels, edges: VoxelEdges, k: float = 0.8, least: int = 
     for allow_small in (False, True):
         for i, j, w in pairs:
             a, b = forest.find(i), forest.find(j)
-            if a == b or size[a] + size[b] > most:
+            if a == b or size[a] + size[b] > max_size:
                 continue
             even = w <= min(inner[a] + k / size[a], inner[b] + k / size[b])
-            if even or (allow_small and w < 1.5 and min(size[a], size[b]) < least):
+            if even or (allow_small and w < 1.5 and min(size[a], size[b]) < min_size):
                 forest.parent[b] = a
                 size[a] += size[b]
                 inner[a] = max(inner[a], inner[b], w) if even else max(inner[a], inner[b])
@@ -95,46 +102,50 @@ def oversegment(voxels: Voxels, edges: VoxelEdges, k: float = 0.8, least: int = 
 
 @dataclass
 class Region:
-    """One growing part of a thing."""
+    """A region of voxels during merging."""
 
     members: np.ndarray  # voxels
-    colours: np.ndarray  # histogram over the palette, sums to 1
-    sample: np.ndarray  # (s, 3) some of its points
+    colours: np.ndarray  # (c,) histogram over the palette, sums to 1
+    sample: np.ndarray  # (s, 3) subset of its points
     corners: np.ndarray  # (c, 3) of its convex hull
     hull: np.ndarray | None  # (f, 4) outward planes of its convex hull
 
 
 @dataclass
 class Border:
-    """Where two regions meet, as sums over the edges across."""
+    """Boundary between two regions, as sums over the edges across it."""
 
     count: int
     contrast: float
     bend: float
 
     def plus(self, other: Border) -> Border:
+        """The union of two boundaries."""
         return Border(self.count + other.count, self.contrast + other.contrast, self.bend + other.bend)
 
 
 class RegionMerger:
-    """Regions merged two at a time, the two that most look like one thing first."""
+    """Greedy pairwise merging of regions, smallest separation first."""
 
-    def __init__(self, voxels: Voxels, edges: VoxelEdges, labels: np.ndarray, least: int, limit: float, large: float):
-        self.voxels, self.least, self.limit, self.large = voxels, least, limit, large
+    def __init__(
+        self, voxels: Voxels, edges: VoxelEdges, labels: np.ndarray, min_voxels: int, limit: float, max_extent: float
+    ):
+        """`limit`: separation up to which regions merge; `max_extent`: longest side of an object [scene units]."""
+        self.voxels, self.min_voxels, self.limit, self.max_extent = voxels, min_voxels, limit, max_extent
         self.palette = _palette(voxels.lab)
         soft = _soft_bins(voxels.lab, self.palette)
         order = np.argsort(labels, kind="stable")
         groups = np.split(order, np.flatnonzero(np.diff(labels[order])) + 1)
         self.regions = {n: self._region(members, soft[members].mean(0)) for n, members in enumerate(groups)}
         self.borders: dict[int, dict[int, Border]] = {n: {} for n in self.regions}
-        self._meet(edges, labels)
+        self._add_borders(edges, labels)
 
     def _region(self, members: np.ndarray, colours: np.ndarray) -> Region:
         points = self.voxels.points[members]
-        sample = points[:: max(1, len(points) // HULL_POINTS)]
+        sample = points[:: max(1, len(points) // MAX_SAMPLE_POINTS)]
         return Region(members, colours, sample, *_hull(points))
 
-    def _meet(self, edges: VoxelEdges, labels: np.ndarray) -> None:
+    def _add_borders(self, edges: VoxelEdges, labels: np.ndarray) -> None:
         a, b = labels[edges.i], labels[edges.j]
         across = a != b
         pair = np.stack([np.minimum(a, b), np.maximum(a, b)], 1)[across]
@@ -146,32 +157,32 @@ class RegionMerger:
             self.borders[x][y] = self.borders[y][x] = Border(int(n), float(c), float(v))
 
     def separation(self, a: int, b: int) -> float:
-        """How little two neighbours look like one thing: well below a third they do, well above it they do not.
+        """Dissimilarity of two neighbouring regions: well below 1/3 they are one object, well above it two.
 
-        Against: a valley between them, a union less convex than they are, a narrow neck, and, counting less
-        where the union is convex, unlike colours. For: one lies within the convex hull of the other, as
-        wheels do in a car.
+        It increases with a concave boundary, with a union less convex than its parts, with a narrow boundary, and
+        with different colours, which count less where the union is convex. It decreases where one region lies in the
+        convex hull of the other (the wheels of a car), and for regions smaller than `min_voxels`.
         """
         one, two, border = self.regions[a], self.regions[b], self.borders[a][b]
         small = min(len(one.members), len(two.members))
-        step = np.clip((border.contrast / border.count - INNER_STEP) / 25, 0, 1)
-        unlike = 1 - np.minimum(one.colours, two.colours).sum()
-        valley = np.clip(border.bend / border.count, -0.1, 0.5)
+        step = np.clip((border.contrast / border.count - TEXTURE_CONTRAST) / 25, 0, 1)
+        colour_distance = 1 - np.minimum(one.colours, two.colours).sum()
+        concave = np.clip(border.bend / border.count, -0.1, 0.5)
         neck = 1 - min(1.0, border.count / (6 * small**0.5))
         within = _inside(one.sample, two.hull, self.voxels.size) + _inside(two.sample, one.hull, self.voxels.size)
         hollow = self._hollow(one, two)
-        colour = unlike * (0.35 + 0.1 * step) * min(0.6 + 20 * hollow, 1.4)
-        shape = 1.5 * valley + 0.2 * neck + 3 * hollow
-        value = colour + shape * (0.2 + 0.8 * unlike) - 0.5 * min(within, 1.0) + self._too_large(one, two)
-        return value - (0.5 if small < self.least else 0.0)
+        colour = colour_distance * (0.35 + 0.1 * step) * min(0.6 + 20 * hollow, 1.4)
+        shape = 1.5 * concave + 0.2 * neck + 3 * hollow
+        value = colour + shape * (0.2 + 0.8 * colour_distance) - 0.5 * min(within, 1.0) + self._too_large(one, two)
+        return value - (0.5 if small < self.min_voxels else 0.0)
 
     def _too_large(self, one: Region, two: Region) -> float:
-        """Things that one picks up are not as large as what the cameras look at: from `large` on it speaks against."""
+        """Penalty 0..1 of a union that exceeds `max_extent`."""
         corners = np.concatenate([one.corners, two.corners])
-        return float(np.clip(np.ptp(corners, axis=0).max() / self.large - 1, 0, 1))
+        return float(np.clip(np.ptp(corners, axis=0).max() / self.max_extent - 1, 0, 1))
 
     def _hollow(self, one: Region, two: Region) -> float:
-        """How much deeper their points lie in the hull of both than in their own, as a share of the smaller's size."""
+        """Mean depth of points in the hull of the union minus that in their own hulls, relative to the smaller size."""
         both = np.concatenate([one.sample, two.sample])
         _, hull = _hull(np.concatenate([one.corners, two.corners]))
         if hull is None:
@@ -181,44 +192,44 @@ class RegionMerger:
         return float(np.clip(deep / len(both) / size, 0, 0.5))
 
     def run(self) -> np.ndarray:
-        """Thing number of each voxel, from 0."""
+        """Object number of each voxel, from 0, after merging all pairs up to the limit."""
         queue = [(self.separation(a, b), a, b) for a in self.borders for b in self.borders[a] if a < b]
         heapq.heapify(queue)
-        fresh = len(self.regions)
+        merged = len(self.regions)
         while queue:
             value, a, b = heapq.heappop(queue)
             if value > self.limit:
                 break
             if a not in self.regions or b not in self.regions:
                 continue
-            self._merge(a, b, fresh)
-            for other in self.borders[fresh]:
-                heapq.heappush(queue, (self.separation(fresh, other), fresh, other))
-            fresh += 1
+            self._merge(a, b, merged)
+            for other in self.borders[merged]:
+                heapq.heappush(queue, (self.separation(merged, other), merged, other))
+            merged += 1
         labels = np.zeros(len(self.voxels), np.int64)
         for n, region in enumerate(self.regions.values()):
             labels[region.members] = n
         return labels
 
-    def _merge(self, a: int, b: int, fresh: int) -> None:
+    def _merge(self, a: int, b: int, merged: int) -> None:
         one, two = self.regions.pop(a), self.regions.pop(b)
-        share = len(one.members) / (len(one.members) + len(two.members))
+        fraction = len(one.members) / (len(one.members) + len(two.members))
         members = np.concatenate([one.members, two.members])
-        self.regions[fresh] = self._region(members, share * one.colours + (1 - share) * two.colours)
+        self.regions[merged] = self._region(members, fraction * one.colours + (1 - fraction) * two.colours)
         joined = self.borders.pop(a)
         joined.pop(b, None)
         for other, border in self.borders.pop(b).items():
             if other != a:
                 joined[other] = joined[other].plus(border) if other in joined else border
-        self.borders[fresh] = joined
+        self.borders[merged] = joined
         for other, border in joined.items():
             self.borders[other].pop(a, None)
             self.borders[other].pop(b, None)
-            self.borders[other][fresh] = border
+            self.borders[other][merged] = border
 
 
 def _palette(lab: np.ndarray, count: int = 16) -> np.ndarray:
-    """Colours spread over those present: each next one is the farthest from all before."""
+    """Palette by farthest-point sampling of the colours present."""
     rows = lab[:: max(1, len(lab) // 2000)]
     chosen = [rows[np.argmin(np.linalg.norm(rows - np.median(rows, 0), axis=1))]]
     distance = np.linalg.norm(rows - chosen[0], axis=1)
@@ -229,14 +240,14 @@ def _palette(lab: np.ndarray, count: int = 16) -> np.ndarray:
 
 
 def _soft_bins(lab: np.ndarray, palette: np.ndarray) -> np.ndarray:
-    """Share of each palette colour in each voxel's colour."""
+    """Soft assignment of each voxel's colour to the palette."""
     distance = np.linalg.norm(lab[:, None] - palette[None], axis=2)
     weight = np.exp(-0.5 * ((distance - distance.min(1, keepdims=True)) / 8) ** 2)
     return weight / weight.sum(1, keepdims=True)
 
 
 def _hull(points: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
-    """Corners and outward planes of the convex hull; all points and None where they span no volume."""
+    """Vertices and outward planes of the convex hull; all points and None where they have no volume."""
     if len(points) < 8:
         return points, None
     try:
@@ -247,14 +258,14 @@ def _hull(points: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
 
 
 def _inside(points: np.ndarray, hull: np.ndarray | None, margin: float) -> float:
-    """Share of points inside a hull by more than a voxel's noise."""
+    """Fraction of points inside a hull by more than a quarter of `margin`."""
     if hull is None or not len(points):
         return 0.0
     return float(((points @ hull[:, :3].T + hull[:, 3]).max(1) < -0.25 * margin).mean())
 
 
 def _depth(points: np.ndarray, hull: np.ndarray | None) -> np.ndarray:
-    """Distance of points below the surface of a hull."""
+    """Depth of points below the surface of a hull; 0 outside."""
     if hull is None:
         return np.zeros(1)
     return -(points @ hull[:, :3].T + hull[:, 3]).max(1).clip(max=0)

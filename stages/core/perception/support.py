@@ -1,4 +1,4 @@
-"""The surface that things stand on: where it is, how even, and how far it reaches."""
+"""The supporting surface of a scene: its height, its noise, and the region of it that exists."""
 
 from __future__ import annotations
 
@@ -17,41 +17,52 @@ from stages.core.scene.cameras import Cameras
 from stages.core.scene.gaussians import Gaussians
 from stages.core.scene.scene import Scene
 
-SEARCH_RADIUS = 1.5  # how far from the focus anything is looked at [view radii]
-CELLS = 300  # largest side of the grid over the surface
+SEARCH_RADIUS = 1.5  # distance from the focus within which Gaussians are examined [camera distance]
+GRID_CELLS = 300  # side of the grid over the surface
+MAX_QUANTILE_POINTS = 100_000  # points that a quantile of distances is computed from
 
 
 @dataclass(frozen=True)
 class ViewExtent:
-    """What the cameras look at, and from how far."""
+    """The point that the cameras look at, and their distance from it, which is the unit of most thresholds."""
 
     focus: Float[Tensor, "3"]
-    radius: float
+    radius: float  # median distance of the cameras from the focus [scene units]
 
 
 def view_extent(scene: Scene) -> ViewExtent:
-    """The point that the cameras look at; without cameras, the middle of the Gaussians."""
+    """The focus of the cameras and their median distance from it.
+
+    Without cameras: the median of the Gaussians, and 1.5 times the 80 % quantile of their distances from it.
+    """
     if scene.cameras is not None and len(scene.cameras):
-        focus = _aim(scene.cameras, scene.floor)
+        focus = _focus(scene.cameras, scene.floor)
         radius = float((centres(scene.cameras.viewmats) - focus).norm(dim=1).median())
         if radius > 0 and np.isfinite(radius):
             return ViewExtent(focus, radius)
     g = scene.gaussians
-    is_opaque = g.means[(g.opacities > 0.1) & g.means.isfinite().all(1)]
-    if not len(is_opaque):
+    opaque = g.means[(g.opacities > 0.1) & g.means.isfinite().all(1)]
+    if not len(opaque):
         return ViewExtent(torch.zeros(3), 1.0)
-    focus = is_opaque.median(0).values
-    distance = (is_opaque - focus).norm(dim=1)
-    return ViewExtent(focus, 1.5 * max(float(distance[torch.randperm(len(distance))[:100_000]].quantile(0.8)), 1e-6))
+    focus = opaque.median(0).values
+    distance = evenly_spaced((opaque - focus).norm(dim=1), MAX_QUANTILE_POINTS)
+    return ViewExtent(focus, 1.5 * max(float(distance.quantile(0.8)), 1e-6))
 
 
-def _aim(cameras: Cameras, floor: float | None) -> Float[Tensor, "3"]:
-    """Median of where the optical axes meet the floor, or the point nearest to all axes."""
+def evenly_spaced(values: Float[Tensor, "n"], count: int) -> Float[Tensor, "m"]:
+    """At most `count` of the sorted values, at evenly spaced ranks; all of them where there are no more."""
+    if len(values) <= count:
+        return values
+    return values.sort().values[torch.linspace(0, len(values) - 1, count, dtype=torch.float64).round().long()]
+
+
+def _focus(cameras: Cameras, floor: float | None) -> Float[Tensor, "3"]:
+    """Median of the intersections of the optical axes with the floor, or else the point nearest to all axes."""
     eyes, ahead = centres(cameras.viewmats), cameras.viewmats[:, 2, :3]
     down = ahead[:, 2] < -0.15
     if floor is not None and down.any():
-        reach = (floor - eyes[down, 2]) / ahead[down, 2]
-        return (eyes[down] + ahead[down] * reach.clamp_min(0)[:, None]).median(0).values
+        distance = (floor - eyes[down, 2]) / ahead[down, 2]
+        return (eyes[down] + ahead[down] * distance.clamp_min(0)[:, None]).median(0).values
     across = torch.eye(3) - ahead[:, :, None] * ahead[:, None, :]
     A, b = across.sum(0), (across @ eyes[:, :, None]).sum(0)
     ridge = 1e-6 * torch.eye(3) * A.trace()
@@ -60,30 +71,28 @@ def _aim(cameras: Cameras, floor: float | None) -> Float[Tensor, "3"]:
 
 @dataclass(frozen=True)
 class Support:
-    """A nearly level surface z = p(x, y) + relief, p of second degree, and the part of it that is there."""
+    """A nearly level surface z = p(x, y) + relief with p of second degree, and the region of it that exists."""
 
     view: ViewExtent
-    coefficients: Float[Tensor, "6"]  # of 1 x y x^2 x y y^2 about the focus, lengths in view radii
+    coefficients: Float[Tensor, "6"]  # of 1, x, y, x^2, xy, y^2 about the focus, in units of the camera distance
     noise: float  # robust standard deviation of its Gaussians about it [scene units]
     cell: float  # of the grid [scene units]
-    region: Bool[Tensor, "gx gy"]  # table here, or hidden under things; the grid is centred on the focus
-    relief: Float[Tensor, "gx gy"]  # broad unevenness, of the table or of its reconstruction [scene units]
+    region: Bool[Tensor, "gx gy"]  # cells of table, visible or under objects; the grid is centred on the focus
+    relief: Float[Tensor, "gx gy"]  # large-scale deviation from p, of the table or of its reconstruction [scene units]
 
     @property
     def tolerance(self) -> float:
-        """Heights up to this are the surface itself [scene units]."""
+        """Height up to which Gaussians are the surface itself [scene units]."""
         return min(max(3 * self.noise, 0.004 * self.view.radius), 0.02 * self.view.radius)
 
     def heights(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
-        """Height above the surface."""
+        """Height above the surface [scene units]."""
         return points[:, 2] - self.surface(points)
 
     def surface(self, points: Float[Tensor, "n d"]) -> Float[Tensor, "n"]:
-        """Height z of the surface below or above points (their x and y count)."""
+        """Height z of the surface at the x and y of points [scene units]."""
         xy = (points[:, :2] - self.view.focus[:2]) / self.view.radius
-        far = (
-            xy.norm(dim=1, keepdim=True).clamp_min(SEARCH_RADIUS) / SEARCH_RADIUS
-        )  # beyond the data a parabola runs away
+        far = xy.norm(dim=1, keepdim=True).clamp_min(SEARCH_RADIUS) / SEARCH_RADIUS  # p is constant beyond the data
         i, j = self.cells(points).unbind(1)
         return _terms(xy / far) @ self.coefficients + self.relief[i, j]
 
@@ -94,7 +103,7 @@ class Support:
         return index.nan_to_num(0).clamp(0, len(self.region) - 1).long()
 
     def inside(self, points: Float[Tensor, "n d"], margin: float = 0.0) -> Bool[Tensor, "n"]:
-        """Whether points are over the table, or within `margin` [scene units] of its edge."""
+        """Whether points are over the table, or at most `margin` [scene units] beyond its edge."""
         i, j = self.cells(points).unbind(1)
         if not margin:
             return self.region[i, j]
@@ -107,7 +116,7 @@ def _terms(xy: Float[Tensor, "n 2"]) -> Float[Tensor, "n 6"]:
 
 
 def find_support(scene: Scene, view: ViewExtent | None = None, seed: int = 0) -> Support | None:
-    """The surface at `scene.floor`, or the largest level one near the focus; None where there is none."""
+    """The surface at `scene.floor`, or else the largest level surface near the focus; None where there is none."""
     view = view or view_extent(scene)
     g, R = scene.gaussians, view.radius
     points = g.means[is_opaque(g, R) & ((g.means - view.focus)[:, :2].norm(dim=1) < SEARCH_RADIUS * R)]
@@ -119,8 +128,8 @@ def find_support(scene: Scene, view: ViewExtent | None = None, seed: int = 0) ->
         return None
     coefficients, noise = _fit(band, floor, view, seed)
     bare = Support(
-        view, coefficients, noise, 2 * SEARCH_RADIUS * R / CELLS,
-        torch.zeros(CELLS, CELLS, dtype=torch.bool), torch.zeros(CELLS, CELLS),
+        view, coefficients, noise, 2 * SEARCH_RADIUS * R / GRID_CELLS,
+        torch.zeros(GRID_CELLS, GRID_CELLS, dtype=torch.bool), torch.zeros(GRID_CELLS, GRID_CELLS),
     )  # fmt: skip
     uneven = replace(bare, relief=_relief(bare, band))
     even = 1 / (1 + ((band - view.focus)[:, :2].norm(dim=1) / (0.7 * R)) ** 4)
@@ -131,12 +140,12 @@ def find_support(scene: Scene, view: ViewExtent | None = None, seed: int = 0) ->
 
 
 def is_opaque(g: Gaussians, radius: float) -> Bool[Tensor, "n"]:
-    """Gaussians that are part of something: finite, not transparent, not a blur over the whole scene."""
+    """Gaussians that are finite, opaque (above 0.1) and smaller than 0.2 `radius`."""
     return g.means.isfinite().all(1) & (g.opacities > 0.1) & (g.scales.amax(1) < 0.2 * radius)
 
 
 def _level(points: Float[Tensor, "n 3"], view: ViewExtent, seed: int) -> float | None:
-    """Height of the level plane with most points near the focus."""
+    """Height of the level plane with most points near the focus, by RANSAC; None where it has less than 5 %."""
     near = 1 / (1 + ((points - view.focus).norm(dim=1) / (0.5 * view.radius)) ** 4)
     found = ransac(points, 0.01 * view.radius, near, lambda normals: normals[:, 2] > 0.98, seed=seed)
     if found is None or float(near[found[1]].sum() / near.sum()) < 0.05:
@@ -146,9 +155,10 @@ def _level(points: Float[Tensor, "n 3"], view: ViewExtent, seed: int) -> float |
 
 
 def _fit(band: Float[Tensor, "n 3"], floor: float, view: ViewExtent, seed: int) -> tuple[Tensor, float]:
-    """Second-degree surface by reweighting with Tukey's biweight; each patch of table counts once.
+    """Second-degree surface by iteratively reweighted least squares with Tukey's biweight, and its noise.
 
-    The curvature is held back by a ridge, so that a keyboard does not become a bump in the table.
+    Each patch of table has the same weight. A ridge penalty on the curvature keeps low objects, such as a keyboard,
+    from bending the surface.
     """
     R = view.radius
     local = (band - torch.cat([view.focus[:2], torch.tensor([floor])])) / R
@@ -176,9 +186,9 @@ def _fit(band: Float[Tensor, "n 3"], floor: float, view: ViewExtent, seed: int) 
 
 
 def _spread(residual: Float[Tensor, "n"], weights: Float[Tensor, "n"], bin: float = 2.5e-4) -> float:
-    """Standard deviation of the peak at zero, from its half width at half height on the narrower side.
+    """Standard deviation of the peak of residuals near 0, from its half width at half maximum on the narrower side.
 
-    Quantiles would not do: low things on the surface, a keyboard, are a large part of the band.
+    Quantiles are not usable, since low objects on the surface are a large part of the residuals.
     """
     edges = np.arange(-0.04, 0.04 + bin, bin)
     height, _ = np.histogram(residual.numpy(), edges, weights=weights.numpy())
@@ -194,7 +204,7 @@ def _spread(residual: Float[Tensor, "n"], weights: Float[Tensor, "n"], bin: floa
 def cell_medians(
     support: Support, points: Float[Tensor, "n d"], values: Float[Tensor, "n v"], coarse: int = 1
 ) -> Float[Tensor, "gx gy v"]:
-    """Median of the values of the points in each cell, or in blocks of `coarse` cells; nan where there are none."""
+    """Median of the values of the points in each cell, or in each block of `coarse` cells; nan in empty ones."""
     side = -(-len(support.region) // coarse)
     cell = (support.cells(points) // coarse) @ torch.tensor([side, 1])
     out = torch.full((side * side, values.shape[1]), torch.nan)
@@ -205,16 +215,16 @@ def cell_medians(
     return out.reshape(side, side, -1)
 
 
-def sliding_quantile(grid: Float[Tensor, "gx gy v"], reach: int, share: float = 0.5) -> Float[Tensor, "gx gy v"]:
-    """Median (or another share) of the cells within `reach` of each cell, nan being ignored; gaps take the nearest."""
-    side = 2 * reach + 1
+def sliding_quantile(grid: Float[Tensor, "gx gy v"], radius: int, fraction: float = 0.5) -> Float[Tensor, "gx gy v"]:
+    """Quantile of the cells within `radius` cells of each cell, ignoring nan; empty windows take the nearest value."""
+    side = 2 * radius + 1
     out = []
     for layer in grid.unbind(2):
-        padded = np.pad(layer.numpy(), reach, constant_values=np.nan)
+        padded = np.pad(layer.numpy(), radius, constant_values=np.nan)
         stack = np.lib.stride_tricks.sliding_window_view(padded, (side, side)).reshape(*layer.shape, -1)
         stack = np.sort(stack, axis=-1)  # nan go last
         count = np.isfinite(stack).sum(-1)
-        pick = np.take_along_axis(stack, (share * (count - 1).clip(0)).astype(int)[..., None], -1)[..., 0]
+        pick = np.take_along_axis(stack, (fraction * (count - 1).clip(0)).astype(int)[..., None], -1)[..., 0]
         if count.any():
             near = ndimage.distance_transform_edt(count == 0, return_distances=False, return_indices=True)
             pick = pick[tuple(near)]
@@ -223,32 +233,32 @@ def sliding_quantile(grid: Float[Tensor, "gx gy v"], reach: int, share: float = 
 
 
 def _relief(bare: Support, band: Float[Tensor, "n 3"]) -> Float[Tensor, "gx gy"]:
-    """Heights over windows so wide (a quarter of the view radius) that things fill less than half of them."""
+    """Large-scale relief: medians over windows a quarter of the camera distance wide, mostly free of objects."""
     h = bare.heights(band)
     near = h.abs() < 0.025 * bare.view.radius
     if not near.any():
         return bare.relief
     coarse = 3
-    rough = sliding_quantile(cell_medians(bare, band[near], h[near, None], coarse), reach=4, share=0.45)[..., 0]
+    rough = sliding_quantile(cell_medians(bare, band[near], h[near, None], coarse), radius=4, fraction=0.45)[..., 0]
     smooth = ndimage.gaussian_filter(rough.numpy(), 1.5)
     fine = ndimage.zoom(smooth, len(bare.region) / len(smooth), order=1)
     return torch.from_numpy(fine).float()
 
 
 def _region(bare: Support, band: Float[Tensor, "n 3"]) -> Bool[Tensor, "gx gy"]:
-    """Cells of the piece of surface in focus, closed over what stands on it."""
+    """Cells of the connected piece of surface in focus, closed over the objects that stand on it."""
     on = band[bare.heights(band).abs() < bare.tolerance]
-    count = np.zeros((CELLS, CELLS))
+    count = np.zeros((GRID_CELLS, GRID_CELLS))
     np.add.at(count, tuple(bare.cells(on).T.numpy()), 1)
-    crowd = ndimage.uniform_filter(count, 3)
-    middle = slice(CELLS // 2 - CELLS // 8, CELLS // 2 + CELLS // 8)
-    usual = crowd[middle, middle]
-    seen = crowd > 0.1 * np.median(usual[usual > 0]) if (usual > 0).any() else crowd > 0  # a few strays are no table
+    density = ndimage.uniform_filter(count, 3)
+    middle = slice(GRID_CELLS // 2 - GRID_CELLS // 8, GRID_CELLS // 2 + GRID_CELLS // 8)
+    usual = density[middle, middle]
+    seen = density > 0.1 * np.median(usual[usual > 0]) if (usual > 0).any() else density > 0  # ignores stray Gaussians
     seen = ndimage.binary_closing(np.pad(seen, 40), _disc(4))
     parts, count = ndimage.label(seen)
     if not count:
-        return torch.zeros(CELLS, CELLS, dtype=torch.bool)
-    middle = (np.arange(CELLS + 80) - CELLS / 2 - 39.5) * bare.cell / bare.view.radius
+        return torch.zeros(GRID_CELLS, GRID_CELLS, dtype=torch.bool)
+    middle = (np.arange(GRID_CELLS + 80) - GRID_CELLS / 2 - 39.5) * bare.cell / bare.view.radius
     near = 1 / (1 + (np.hypot(*np.meshgrid(middle, middle, indexing="ij")) / 0.5) ** 4)
     best = 1 + int(np.argmax(ndimage.sum(near, parts, np.arange(1, count + 1))))
     part = ndimage.binary_fill_holes(ndimage.binary_closing(parts == best, _disc(20)))
@@ -261,9 +271,9 @@ def _disc(radius: int) -> np.ndarray:
 
 
 def topples(points: Float[Tensor, "n 2"], base: Float[Tensor, "m 2"]) -> bool:
-    """Whether a body falls over: the middle of its points lies outside the convex hull of those it stands on."""
+    """Whether a body falls over: the centroid of its points lies outside the convex hull of its base points."""
     try:
         hull = ConvexHull(base.double().numpy()).equations
-    except (QhullError, ValueError):  # it stands on a line, or on next to nothing
+    except (QhullError, ValueError):  # the base has no area
         return False
     return bool((hull[:, :2] @ points.double().mean(0).numpy() + hull[:, 2]).max() > 0)

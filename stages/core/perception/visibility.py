@@ -1,4 +1,4 @@
-"""How the cameras of a scene see its Gaussians."""
+"""Visibility of Gaussians from the cameras of a scene."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from stages.core.raster.rasterise import visibility
 from stages.core.scene.cameras import Cameras
 from stages.core.scene.gaussians import Gaussians
 
-MAX_VISIBILITY_SIDE = 320  # longest side that visibility is drawn at [px]
-MAX_VISIBILITY_VIEWS = 24  # cameras that are asked
+MAX_VISIBILITY_SIDE = 320  # longest side of the images that visibility is rendered at [px]
+MAX_VISIBILITY_VIEWS = 24  # cameras that visibility is rendered for
 
 
 def downscaled_views(
-    cameras: Cameras, most: int = MAX_VISIBILITY_VIEWS, side: int = MAX_VISIBILITY_SIDE
+    cameras: Cameras, max_views: int = MAX_VISIBILITY_VIEWS, side: int = MAX_VISIBILITY_SIDE
 ) -> list[tuple[Tensor, Tensor, int, int]]:
-    """(viewmat, K, width, height) of at most `most` cameras, evenly picked, their images made small."""
-    picked = torch.linspace(0, len(cameras) - 1, min(most, len(cameras))).round().long().tolist()
+    """(viewmat, K, width, height) of at max_views `max_views` evenly spaced cameras, images scaled down to `side`."""
+    picked = torch.linspace(0, len(cameras) - 1, min(max_views, len(cameras))).round().long().tolist()
     views = []
     for i in picked:
         width, height = cameras.sizes[i].tolist()
@@ -30,9 +30,10 @@ def downscaled_views(
 
 
 def summed_view_directions(g: Gaussians, cameras: Cameras) -> Float[Tensor, "n 3"]:
-    """Mean direction from each Gaussian to the cameras that see it, weighted by how much; zero where none does.
+    """Sum over cameras of the unit direction to the camera times the Gaussian's weight in its image [px].
 
-    It is half a sphere's worth of knowledge: the outside of a surface is the side that was seen.
+    Zero where no camera sees the Gaussian. Its direction estimates the outer side of a surface, its length how much
+    of the Gaussian is visible.
     """
     toward = torch.zeros(len(g), 3)
     for viewmat, K, width, height in downscaled_views(cameras):

@@ -1,1 +1,29 @@
-"""Warp kernels: each file holds a kernel, its wrapper and its PyTorch reference."""
+"""Numerical kernels in Warp, Triton and C++, and the PyTorch code that specifies them.
+
+Three tools: Warp compiles kernels for CPUs and GPUs. On CPUs the inner loops are C++ with SIMD vector types, given to
+Warp as strings (`wp.func_native`), since Warp does not vectorise across the threads of a launch. Triton, which needs a
+GPU, is used for the fused inference step of the force field; its modules are imported only where
+`compilers.TRITON` is true.
+
+| file                          | written in                  | specified and tested by                              |
+|-------------------------------|-----------------------------|------------------------------------------------------|
+| skinning                      | Warp                        | `skin_gaussians_reference` in the file               |
+| splat/projection, harmonics   | C++ snippets, CPU only      | `projection.project_reference`                       |
+| splat/binning                 | C++ snippets, CPU only      | `depth_order_reference` in the file                  |
+| splat/compositing(_adjoint)   | C++ snippets, CPU only      | `compositing.composite_reference`                    |
+| splat/compositing_pixel       | Warp                        | `compositing.composite_reference`                    |
+| splat/ssim, ssim_pixel        | C++ snippets (CPU), Warp    | `ssim.ssim_reference`                                |
+| mpm/transfers, grid, nodes,   | Warp with C++ and CUDA      | `transfers.substep_reference` (one free substep);    |
+|   split, fused, exact         |   snippets                  |   split and fused are tested against each other      |
+| mpm/constitutive              | Warp                        | theory, and `corotated_reference` in the file        |
+| field/normals                 | Warp                        | `normals_and_spacing_reference` in the file          |
+| field/rigid_motion            | Warp                        | `models.field.rigid_body` (drift, pose)              |
+| field/nearest, perceptron     | Triton                      | `..._reference` in each file                         |
+| field/skinny_matmul           | Triton                      | `A @ x` in double precision                          |
+| field/neighbourhoods          | Triton                      | `models.field.rest_shape`                            |
+| field/ the rest               | Triton                      | `ForceField.step` in `models.field.force_field`      |
+
+`interop` shares tensors, device and stream between PyTorch and Warp; `threads` runs CPU launches side by side;
+`splat/simd`, `splat/pixel_blocks`, `field/vec3` and `field/layers` hold what several kernels share. `raster`,
+`physics` and `models` are the callers.
+"""

@@ -1,4 +1,4 @@
-"""Which of the kernels' compilers can be used: Warp always, Triton with PyTorch's CUDA builds on Linux."""
+"""Availability of the kernel compilers: Warp always; Triton only where PyTorch has a CUDA device."""
 
 from importlib.util import find_spec
 

@@ -1,4 +1,4 @@
-"""Warp on PyTorch's tensors, device and CUDA stream."""
+"""Interoperability: Warp kernels on PyTorch tensors, devices and CUDA streams."""
 
 import os
 from functools import cache
@@ -11,8 +11,8 @@ wp.config.log_level = wp.LOG_ERROR
 
 @cache
 def _ready() -> None:
-    """Initialise Warp once; its native code reports a missing CUDA driver straight to descriptor 2,
-    which is no news on a laptop, so that descriptor looks away for a moment."""
+    """Initialise Warp once. Its native code reports a missing CUDA driver on file descriptor 2, where Python cannot
+    filter it; without a GPU that descriptor is redirected during initialisation."""
     if torch.cuda.is_available():
         wp.init()
         return
@@ -27,7 +27,7 @@ def _ready() -> None:
 
 
 def view(tensor: torch.Tensor, dtype=None) -> wp.array:
-    """The tensor as a Warp array over the same memory (no copy, no gradient).
+    """Wrap a tensor as a Warp array over the same memory (no copy, no gradient).
 
     `dtype` is a Warp type such as wp.vec3 when the last dimensions form a vector or matrix.
     """
@@ -36,14 +36,17 @@ def view(tensor: torch.Tensor, dtype=None) -> wp.array:
 
 
 def device_of(tensor: torch.Tensor) -> str:
-    """Warp's name of the tensor's device."""
+    """Return Warp's name of the tensor's device."""
     return str(tensor.device) if tensor.is_cuda else "cpu"
 
 
 def launch(
     kernel: wp.Kernel, dim, inputs: list, outputs: list = (), device: str = "cpu", block_dim: int = 256
 ) -> None:  # fmt: skip
-    """Launch on PyTorch's current stream, so the two libraries need no synchronisation; threads a block on a GPU."""
+    """Launch a kernel on PyTorch's current stream, so that the two libraries need no synchronisation.
+
+    `dim` is the number of threads (or a tuple), `block_dim` the threads per block on a GPU.
+    """
     _ready()
     stream = wp.stream_from_torch(torch.cuda.current_stream(device)) if device != "cpu" else None
     wp.launch(kernel, dim=dim, inputs=list(inputs), outputs=list(outputs), device=device, stream=stream,

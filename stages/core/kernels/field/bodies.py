@@ -1,7 +1,10 @@
-"""Bodies in the step of the force field: one program an object, all of its points in registers.
+"""Body state of the force-field step: half a drift step and world positions of the points.
 
-`advance` drifts them for half a step and places their points in the world; `place` does only the latter. The same in
-PyTorch, their reference, is in `stages.core.models.field.force_field`. Written in Triton (see `compilers`).
+One Triton program per object holds all of its points in registers. Reference:
+`stages.core.models.field.force_field`.
+
+Shapes: i counts the b o objects, n points each. Body rows are (b o, BODY_SIZE); point arrays (b o, POINT_SIZE, n) and
+(b o, FIELD_SIZE, n), each component contiguous over the points.
 """
 
 import triton
@@ -29,21 +32,22 @@ from stages.core.kernels.field.vec3 import (
     write9,
 )
 
-# a row for each body holds these, from these columns on
+# columns of a body row: centre of mass, velocity, angular momentum, rotation matrix, inverse inertia in world axes,
+# quaternion, bounding box, and contact radius (two bodies farther apart than the sum of theirs cannot touch)
 BODY_SIZE = tl.constexpr(40)
 COM, VELOCITY, MOMENTUM, ROTATION, INVERSE_INERTIA, QUAT, BOX_LOW, BOX_HIGH, CONTACT_RADIUS = (
     tl.constexpr(i) for i in (0, 3, 6, 9, 18, 27, 31, 34, 37)
 )
-# and for each of its points, in the world and in its own frame
+# columns of a point in the world frame, and in the body frame (displacement, its rate, virial field)
 POINT_SIZE, FIELD_SIZE = tl.constexpr(12), tl.constexpr(9)
 POINT, SPEED, NORMAL, ARM = (tl.constexpr(i) for i in (0, 3, 6, 9))
 U, DU, VIRIAL = (tl.constexpr(i) for i in (0, 3, 6))
-WRENCH_SIZE = tl.constexpr(6)  # force and torque
+WRENCH_SIZE = tl.constexpr(6)  # columns: force and torque
 
 
 @triton.jit
 def nearest_wall(x, room):
-    """Distance to the nearest of four walls and the ceiling [m], and its normal."""
+    """Signed distance [m] to the nearest of the four walls and the ceiling, and its inward normal."""
     near, other = x[0] - tl.load(room), x[1] - tl.load(room + 1)
     nx, ny, nz = tl.where(other < near, 0.0, 1.0), tl.where(other < near, 1.0, 0.0), tl.zeros_like(near)
     near = tl.minimum(near, other)
@@ -57,18 +61,22 @@ def nearest_wall(x, room):
 
 
 @triton.jit
-def clamp_displacements(u, size, FARTHEST: tl.constexpr):
-    """Displacements kept below a share of the object's size."""
-    most = FARTHEST * size
-    return scale3(most / tl.maximum(tl.sqrt(tl.max(dot(u, u))), most), u)
+def clamp_displacements(u, size, MAX_DISPLACEMENT: tl.constexpr):
+    """Displacements scaled so that the largest is at most MAX_DISPLACEMENT x the object's size [m]."""
+    limit = MAX_DISPLACEMENT * size
+    return scale3(limit / tl.maximum(tl.sqrt(tl.max(dot(u, u))), limit), u)
 
 
 @triton.jit
 def drift_half_step(
     com, quat, velocity, momentum, u, du, arm, normal, valid, size, inverse, pinned, box, body, moved, field, keys,
-    o, n, dt, FARTHEST: tl.constexpr, FAR: tl.constexpr, FRAME: tl.constexpr, BLOCK: tl.constexpr,
+    o, n, dt, MAX_DISPLACEMENT: tl.constexpr, NO_CONTACT: tl.constexpr, FRAME: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Half a drift, and where everything is then. `keys` are distances to the floor and to a wall, now or soon."""
+    """Drift bodies by dt / 2 and evaluate their points there.
+
+    Writes `body`, `moved` (points in the world) and `field` (points in the body frame). `keys` (b o, 2, n) are
+    distances to the floor and to the nearest wall [m]: the smaller of now and FRAME seconds ahead.
+    """
     i = tl.program_id(0)
     free = 1 - tl.load(pinned + i).to(tl.float32)
     inertia = read9(inverse + 9 * i)
@@ -88,25 +96,25 @@ def drift_half_step(
     at = (i * n + r) * 3
     rate = scale3(free, load3(du + at, 1, inside))
     shift = add(load3(u + at, 1, inside), scale3(dt / 2, rate))
-    shift = clamp_displacements(shift, tl.load(size + i), FARTHEST)
-    turning = matvec3(R, add(load3(arm + at, 1, inside), shift))
-    speed = add(add(v, cross(spin, turning)), matvec3(R, rate))
-    x = add(c, turning)
-    own = field + FIELD_SIZE * i * n + r
-    store3(own + U * n, n, shift, inside)
-    store3(own + DU * n, n, rate, inside)
-    own = moved + POINT_SIZE * i * n + r
-    store3(own + POINT * n, n, x, inside)
-    store3(own + SPEED * n, n, speed, inside)
-    store3(own + NORMAL * n, n, matvec3(R, load3(normal + at, 1, inside)), inside)
-    store3(own + ARM * n, n, turning, inside)
+    shift = clamp_displacements(shift, tl.load(size + i), MAX_DISPLACEMENT)
+    lever = matvec3(R, add(load3(arm + at, 1, inside), shift))
+    speed = add(add(v, cross(spin, lever)), matvec3(R, rate))
+    x = add(c, lever)
+    at_field = field + FIELD_SIZE * i * n + r
+    store3(at_field + U * n, n, shift, inside)
+    store3(at_field + DU * n, n, rate, inside)
+    at_moved = moved + POINT_SIZE * i * n + r
+    store3(at_moved + POINT * n, n, x, inside)
+    store3(at_moved + SPEED * n, n, speed, inside)
+    store3(at_moved + NORMAL * n, n, matvec3(R, load3(normal + at, 1, inside)), inside)
+    store3(at_moved + ARM * n, n, lever, inside)
 
     far: tl.constexpr = float("inf")
     there = tl.load(valid + i * n + r, mask=inside, other=0) != 0
     write3(to + BOX_LOW, scale3(-1.0, max3(where3(there, scale3(-1.0, x), -far))))
     write3(to + BOX_HIGH, max3(where3(there, x, -far)))
     fastest = tl.sqrt(tl.max(tl.where(there, dot(speed, speed), 0.0)))
-    tl.store(to + CONTACT_RADIUS, FAR / 2 + FRAME * fastest)  # two objects farther apart than both say cannot touch
+    tl.store(to + CONTACT_RADIUS, NO_CONTACT / 2 + FRAME * fastest)
     room = box + 6 * i
     height = x[2] - tl.load(room + 2)
     key = tl.where(there, tl.minimum(height, height + FRAME * speed[2]), far)
@@ -118,7 +126,7 @@ def drift_half_step(
 
 @triton.jit
 def world_points(com, quat, u, arm, points, n, BLOCK: tl.constexpr):
-    """Where the points of displaced bodies are."""
+    """World positions (b o, n, 3) of the displaced points of bodies."""
     i, r = tl.program_id(0), tl.program_id(1) * BLOCK + tl.arange(0, BLOCK)
     at, inside = (i * n + r) * 3, r < n
     x = matvec3(rotation_matrix(read4(quat + 4 * i)), add(load3(arm + at, 1, inside), load3(u + at, 1, inside)))

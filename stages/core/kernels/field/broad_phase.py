@@ -1,8 +1,9 @@
-"""Which points of bodies may touch something: others' points, the floor, a wall. In lists, so that no more is computed.
+"""Broad and narrow phase of the force field's contacts: compact lists of the contact points of each object.
 
-`gather` finds the points of each object near the bounding box of each other one, `search` the nearest of the other's
-for each of those, and `select` takes from them, and from the points near floor and walls, those that are places of
-contact. The reference in PyTorch is `stages.core.models.field.contact_points`. Written in Triton (see `compilers`).
+`gather_candidates` (broad phase) lists the points of each object near the bounding box of each other object,
+`nearest_candidates` (narrow phase) finds for each of them the other object's nearest point, and `select_contacts` keeps
+the closest of these, and of the points near floor and walls, as contact points.
+Reference: `stages.core.models.field.contact_points`. Written in Triton (see `compilers`).
 """
 
 import triton
@@ -11,28 +12,29 @@ import triton.language as tl
 from stages.core.kernels.field.bodies import BODY_SIZE, BOX_HIGH, BOX_LOW, CONTACT_RADIUS, POINT, POINT_SIZE, SPEED
 from stages.core.kernels.field.vec3 import add, dot, load3, scale3, store3, sub
 
-QUERY_BLOCK, CANDIDATE_CHUNK = 16, 128  # points that search together, and points that each looks at in one go
+QUERY_BLOCK, CANDIDATE_CHUNK = 16, 128  # points per program, and candidates that it reads at a time
 
 
 @triton.jit
 def other_object(i, k, o):
-    """The k-th other object of object i's scene."""
+    """Index of the k-th other object of object i's scene."""
     return i - i % o + k + (k >= i % o)
 
 
 @triton.jit
-def _reach(body, i, j, SEEN: tl.constexpr):
-    """Objects that are farther apart [m] do not touch within a frame."""
+def _contact_distance(body, i, j, SEARCH_RADIUS: tl.constexpr):
+    """Distance [m] beyond which two objects cannot touch within a frame."""
     radius = tl.load(body + BODY_SIZE * i + CONTACT_RADIUS) + tl.load(body + BODY_SIZE * j + CONTACT_RADIUS)
-    return tl.minimum(radius, SEEN)
+    return tl.minimum(radius, SEARCH_RADIUS)
 
 
 @triton.jit
-def gather_candidates(body, moved, valid, close, which, many, o, n, SEEN: tl.constexpr, BLOCK: tl.constexpr):
-    """Points of object i within reach of the bounding box of another one: where, which and how many."""
+def gather_candidates(body, moved, valid, close, which, many, o, n, SEARCH_RADIUS: tl.constexpr, BLOCK: tl.constexpr):
+    """List the points of object i within contact distance of another object's bounding box: `close` (positions),
+    `which` (point indices) and `many` (their number)."""
     i, k = tl.program_id(0), tl.program_id(1)
     j = other_object(i, k, o)
-    reach = _reach(body, i, j, SEEN)
+    reach = _contact_distance(body, i, j, SEARCH_RADIUS)
     r = tl.arange(0, BLOCK)
     near = tl.load(valid + i * n + r, mask=r < n, other=0) != 0
     x = load3(moved + (POINT_SIZE * i + POINT) * n + r, n, r < n)
@@ -48,17 +50,18 @@ def gather_candidates(body, moved, valid, close, which, many, o, n, SEEN: tl.con
 
 @triton.jit
 def nearest_candidates(
-    body, moved, close, which, many, keys, partner, o, n, SEEN: tl.constexpr, FRAME: tl.constexpr,
+    body, moved, close, which, many, keys, partner, o, n, SEARCH_RADIUS: tl.constexpr, FRAME: tl.constexpr,
     QUERY_BLOCK: tl.constexpr, CANDIDATE_CHUNK: tl.constexpr,
 ):  # fmt: skip
-    """For those points the other object's nearest, and how far it is now or a frame ahead, whichever is less."""
+    """For each listed point find the other object's nearest listed point: `partner` (its index) and `keys` (its
+    distance [m], the smaller of now and FRAME seconds ahead)."""
     i, k = tl.program_id(0) // (o - 1), tl.program_id(0) % (o - 1)
     j = other_object(i, k, o)
     row, other = i * (o - 1) + k, j * (o - 1) + i % o - (i > j)
     count, last = tl.load(many + row), tl.load(many + other)
     first = tl.program_id(1) * QUERY_BLOCK
     if first < count:
-        reach = _reach(body, i, j, SEEN)
+        reach = _contact_distance(body, i, j, SEARCH_RADIUS)
         far: tl.constexpr = float("inf")
         e = first + tl.arange(0, QUERY_BLOCK)
         x = load3(close + 3 * row * n + e, n, e < count)
@@ -87,15 +90,15 @@ def nearest_candidates(
 
 
 @triton.jit
-def _smallest(key, near, most):
-    """How large, in the order of integers, the `most`-th smallest of the keys is: found bit by bit from the highest."""
+def _smallest(key, near, count):
+    """The keys as sortable integers, and the `count`-th smallest of those with `near`, found by bisection over bits."""
     bits = key.to(tl.int32, bitcast=True).to(tl.int64)
     bits = tl.where(bits < 0, -1 - (bits & 0x7FFFFFFF), bits) + 0x80000000
     bits = tl.where(near, bits, 0x1FFFFFFFF)
     limit = tl.full([], 0, tl.int64)
     step = tl.full([], 0x80000000, tl.int64)
     for _ in range(32):
-        limit = tl.where(tl.sum((bits < limit + step).to(tl.int32)) < most, limit + step, limit)
+        limit = tl.where(tl.sum((bits < limit + step).to(tl.int32)) < count, limit + step, limit)
         step = step >> 1
     return bits, limit
 
@@ -103,15 +106,18 @@ def _smallest(key, near, most):
 @triton.jit
 def select_contacts(
     keys, planes, which, partner, many, valid, count, point, theirs, felt, o, n, wide, narrow, slots,
-    PAIR: tl.constexpr, WALL: tl.constexpr, FAR: tl.constexpr, BLOCK: tl.constexpr,
+    PAIR_FRACTION: tl.constexpr, WALL_FRACTION: tl.constexpr, NO_CONTACT: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Of an object and one thing: its points that touch it, at most a share of all; which, and the other's there.
+    """Select the contact points of an object with one other object, the floor or the walls: the closest ones, at most
+    a fraction (PAIR_FRACTION, 1, WALL_FRACTION) of the object's points. Writes the indices of its points and of the
+    other object's, and counts.
 
-    Lists of an object follow each other: others (`wide` slots each), floor, wall (`narrow`), `slots` in all.
+    The lists of an object are stored one after the other: other objects (`wide` slots each), floor, walls (`narrow`
+    slots), `slots` in all.
     """
     i, k, m = tl.program_id(0), tl.program_id(1), o - 1
     r = tl.arange(0, BLOCK)
-    most = tl.sum(tl.load(valid + i * n + r, mask=r < n, other=0).to(tl.int32))
+    limit_count = tl.sum(tl.load(valid + i * n + r, mask=r < n, other=0).to(tl.int32))
     far: tl.constexpr = float("inf")
     zero = tl.zeros([BLOCK], tl.float32)
     store3(felt + (i * (o + 1) + k) * 3 * n + r, n, (zero, zero, zero), r < n)
@@ -122,19 +128,19 @@ def select_contacts(
         key = tl.load(keys + row * n + r, mask=listed, other=far)
         mine = tl.load(which + row * n + r, mask=listed, other=0)
         other = tl.load(partner + row * n + r, mask=listed, other=0)
-        most = tl.ceil(PAIR * most).to(tl.int32)
+        limit_count = tl.ceil(PAIR_FRACTION * limit_count).to(tl.int32)
     else:
         key = tl.load(planes + (2 * i + k - m) * n + r, mask=r < n, other=far)
         mine, other = r, r
         if k > m:
             to = (i + 1) * slots - narrow
-            most = tl.ceil(WALL * most).to(tl.int32)
-    near = key < FAR
-    if tl.sum(near.to(tl.int32)) > most:
-        bits, limit = _smallest(key, near, most)
+            limit_count = tl.ceil(WALL_FRACTION * limit_count).to(tl.int32)
+    near = key < NO_CONTACT
+    if tl.sum(near.to(tl.int32)) > limit_count:
+        bits, limit = _smallest(key, near, limit_count)
         near &= bits <= limit
     place = tl.cumsum(near.to(tl.int32), 0) - 1
-    near &= place < most  # equal keys
+    near &= place < limit_count  # ties
     tl.store(point + to + place, mine, mask=near)
     tl.store(theirs + to + place, other, mask=near)
     tl.store(count + i * (o + 1) + k, tl.sum(near.to(tl.int32)))

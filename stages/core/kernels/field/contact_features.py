@@ -1,6 +1,7 @@
-"""What places of contact can see: for each block of a list of places (see `meeting`) its vectors and scalars.
+"""Input features of contact points: vectors and scalars for each block of the lists made by `broad_phase`.
 
-The same in PyTorch, its reference, is `stages.core.models.field.contact_points`. Written in Triton (see `compilers`).
+A block of ROWS contact points is one record (see `layers`). Reference: `stages.core.models.field.contact_points`.
+Written in Triton (see `compilers`).
 """
 
 import triton
@@ -28,7 +29,7 @@ COLUMNS = tl.constexpr(44)
 
 @triton.jit
 def contact_list(slot, m, n, wide, narrow, slots):
-    """Which list of an object a slot belongs to, and where that list begins."""
+    """The list of an object that a slot belongs to (other objects, floor, walls), and that list's first slot."""
     k = tl.minimum(slot // wide, m)
     start = k * wide
     if slot >= slots - narrow:
@@ -38,7 +39,10 @@ def contact_list(slot, m, n, wide, narrow, slots):
 
 @triton.jit
 def _response(J, r):
-    """1 - [r] J [r]: how fast a point of a body moves after an impulse on it, for unit mass; xx, xy, xz, yy, yz, zz."""
+    """Inverse effective mass 1 - [r] J [r] of a point at lever arm r, for unit mass: the velocity per unit impulse.
+
+    Symmetric, as xx, xy, xz, yy, yz, zz; J is the inverse inertia.
+    """
     a = sub(scale3(r[2], (J[1], J[4], J[7])), scale3(r[1], (J[2], J[5], J[8])))
     b = sub(scale3(r[0], (J[2], J[5], J[8])), scale3(r[2], (J[0], J[3], J[6])))
     c = sub(scale3(r[1], (J[0], J[3], J[6])), scale3(r[0], (J[1], J[4], J[7])))
@@ -48,22 +52,25 @@ def _response(J, r):
 
 @triton.jit
 def _fade(x, start: tl.constexpr, end: tl.constexpr):
+    """Smoothstep: 1 up to `start`, 0 from `end`."""
     s = tl.minimum(tl.maximum((end - x) / (end - start), 0.0), 1.0)
     return s * s * (3 - 2 * s)
 
 
 @triton.jit
 def _length(a):
+    """Length of a vector, regularised at 0."""
     return tl.sqrt(dot(a, a) + 1e-12)
 
 
 @triton.jit
 def contact_features(
     body, moved, count, point, theirs, record, spacing, share, size, mass, gravity, box, o, n, wide, narrow, slots,
-    NEAR: tl.constexpr, FAR: tl.constexpr, CLOSE: tl.constexpr, LEVER: tl.constexpr, FRAME: tl.constexpr,
-    ROWS: tl.constexpr,
+    FULL_CONTACT: tl.constexpr, NO_CONTACT: tl.constexpr, GAP_UNIT: tl.constexpr, ARM_UNIT: tl.constexpr,
+    FRAME: tl.constexpr, ROWS: tl.constexpr,
 ):  # fmt: skip
-    """Vectors and scalars of a block of places."""
+    """Write the features of a block of contact points into `record`: with another object 10 vectors and 7 scalars,
+    with floor or walls 8 and 5."""
     i, m, slot = tl.program_id(0), o - 1, tl.program_id(1) * ROWS
     k, start = contact_list(slot, m, n, wide, narrow, slots)
     r = tl.arange(0, ROWS)
@@ -75,7 +82,7 @@ def contact_features(
         x, speed = load3(at + POINT * n, n, there), load3(at + SPEED * n, n, there)
         normal, arm = load3(at + NORMAL * n, n, there), load3(at + ARM * n, n, there)
         tl.store(to + MASS_FRACTION * ROWS, tl.load(share + i * n + mine, mask=there, other=0.0))
-        gap = tl.load(spacing + i * n + mine, mask=there, other=0.0) / CLOSE
+        gap = tl.load(spacing + i * n + mine, mask=there, other=0.0) / GAP_UNIT
         extent = tl.log(tl.load(size + i))
         zero = x[0] * 0.0
         fall = add(scale3(0.2, read3(gravity + 3 * (i // o))), (zero, zero, zero))
@@ -96,22 +103,22 @@ def contact_features(
             now, ahead = _length(way), _length(add(way, scale3(FRAME, rate)))
             a, b = solve_symmetric(K, rate, facing)
             apart = sub(v, read3(body + BODY_SIZE * j + VELOCITY))
-            store3(to, MAX_VECTORS * ROWS, scale3(1 / CLOSE, way), there)
+            store3(to, MAX_VECTORS * ROWS, scale3(1 / GAP_UNIT, way), there)
             store3(to + ROWS, MAX_VECTORS * ROWS, normal, there)
             store3(to + 2 * ROWS, MAX_VECTORS * ROWS, facing, there)
             store3(to + 3 * ROWS, MAX_VECTORS * ROWS, rate, there)
-            store3(to + 4 * ROWS, MAX_VECTORS * ROWS, scale3(1 / LEVER, arm), there)
-            store3(to + 5 * ROWS, MAX_VECTORS * ROWS, scale3(1 / LEVER, lever), there)
+            store3(to + 4 * ROWS, MAX_VECTORS * ROWS, scale3(1 / ARM_UNIT, arm), there)
+            store3(to + 5 * ROWS, MAX_VECTORS * ROWS, scale3(1 / ARM_UNIT, lever), there)
             store3(to + 6 * ROWS, MAX_VECTORS * ROWS, add(apart, (zero, zero, zero)), there)
             store3(to + 7 * ROWS, MAX_VECTORS * ROWS, fall, there)
             store3(to + 8 * ROWS, MAX_VECTORS * ROWS, a, there)
             store3(to + 9 * ROWS, MAX_VECTORS * ROWS, b, there)
             to += FIRST_SCALAR * ROWS
-            tl.store(to, now / CLOSE, mask=there)
-            tl.store(to + ROWS, ahead / CLOSE, mask=there)
-            tl.store(to + 2 * ROWS, _fade(tl.minimum(now, ahead), NEAR, FAR), mask=there)
+            tl.store(to, now / GAP_UNIT, mask=there)
+            tl.store(to + ROWS, ahead / GAP_UNIT, mask=there)
+            tl.store(to + 2 * ROWS, _fade(tl.minimum(now, ahead), FULL_CONTACT, NO_CONTACT), mask=there)
             tl.store(to + 3 * ROWS, gap, mask=there)
-            tl.store(to + 4 * ROWS, tl.load(spacing + j * n + other, mask=there, other=0.0) / CLOSE, mask=there)
+            tl.store(to + 4 * ROWS, tl.load(spacing + j * n + other, mask=there, other=0.0) / GAP_UNIT, mask=there)
             tl.store(to + 5 * ROWS, extent + zero, mask=there)
             tl.store(to + 6 * ROWS, tl.log(tl.load(size + j)) + zero, mask=there)
         else:
@@ -124,14 +131,14 @@ def contact_features(
             store3(to, MAX_VECTORS * ROWS, inward, there)
             store3(to + ROWS, MAX_VECTORS * ROWS, normal, there)
             store3(to + 2 * ROWS, MAX_VECTORS * ROWS, speed, there)
-            store3(to + 3 * ROWS, MAX_VECTORS * ROWS, scale3(1 / LEVER, arm), there)
+            store3(to + 3 * ROWS, MAX_VECTORS * ROWS, scale3(1 / ARM_UNIT, arm), there)
             store3(to + 4 * ROWS, MAX_VECTORS * ROWS, add(v, (zero, zero, zero)), there)
             store3(to + 5 * ROWS, MAX_VECTORS * ROWS, fall, there)
             store3(to + 6 * ROWS, MAX_VECTORS * ROWS, a, there)
             store3(to + 7 * ROWS, MAX_VECTORS * ROWS, b, there)
             to += FIRST_SCALAR * ROWS
-            tl.store(to, tl.minimum(tl.maximum(now / CLOSE, -2.0), 2.0), mask=there)
-            tl.store(to + ROWS, tl.minimum(tl.maximum(ahead / CLOSE, -2.0), 2.0), mask=there)
-            tl.store(to + 2 * ROWS, _fade(tl.minimum(now, ahead), NEAR, FAR), mask=there)
+            tl.store(to, tl.minimum(tl.maximum(now / GAP_UNIT, -2.0), 2.0), mask=there)
+            tl.store(to + ROWS, tl.minimum(tl.maximum(ahead / GAP_UNIT, -2.0), 2.0), mask=there)
+            tl.store(to + 2 * ROWS, _fade(tl.minimum(now, ahead), FULL_CONTACT, NO_CONTACT), mask=there)
             tl.store(to + 3 * ROWS, gap, mask=there)
             tl.store(to + 4 * ROWS, extent + zero, mask=there)

@@ -1,45 +1,46 @@
-"""Small networks in Triton's kernels: layers for blocks of rows, and their first layer over products of vectors.
+"""Network layers in Triton kernels, for blocks of rows, with a rotation-invariant first layer.
 
-A block of rows shows its vectors in a record: a column of ROWS numbers for each component, x of all vectors first, then
-y and z, then scalars.
+The input of a block of ROWS rows is a record: a column of ROWS numbers for each component, x of all MAX_VECTORS
+vectors first, then y, then z, then scalars.
 """
 
 import triton
 import triton.language as tl
 
-MAX_VECTORS = tl.constexpr(12)  # vectors that a record has room for
-FIRST_SCALAR = tl.constexpr(36)
-PADDED_VECTORS = tl.constexpr(16)  # vectors that are weighed, padded
+MAX_VECTORS = tl.constexpr(12)  # vectors in a record
+FIRST_SCALAR = tl.constexpr(36)  # column of the first scalar
+PADDED_VECTORS = tl.constexpr(16)  # outputs that weight vectors, padded to what tl.dot takes
 
 
 @triton.jit
 def silu(x):
+    """SiLU activation."""
     return x * tl.sigmoid(x)
 
 
 @triton.jit
 def matvec(w, x, first, INNER: tl.constexpr, H: tl.constexpr):
-    """Some columns of a matrix (H outer, INNER) times x."""
+    """Columns `first` to `first` + H of a matrix (H, INNER), times x (H)."""
     o, i = tl.arange(0, H), tl.arange(0, H)
     return tl.sum(tl.load(w + o[:, None] * INNER + first + i[None, :]) * x[None, :], 1)
 
 
 @triton.jit
 def linear_layer(x, w, b, OUTER: tl.constexpr, H: tl.constexpr, O: tl.constexpr, PRECISION: tl.constexpr):
-    """A linear layer from H columns to OUTER, padded to O."""
+    """Linear layer of a block of rows, from H columns to OUTER, padded to O."""
     i, o = tl.arange(0, H), tl.arange(0, O)
     W = tl.load(w + o[None, :] * H + i[:, None], mask=o[None, :] < OUTER, other=0.0)
     return tl.dot(x, W, input_precision=PRECISION) + tl.load(b + o, mask=o < OUTER, other=0.0)[None, :]
 
 
 @triton.jit
-def invariant_layer(record, r, w, b, ROWS: tl.constexpr, VECTORS: tl.constexpr, MORE: tl.constexpr, H: tl.constexpr,
+def invariant_layer(record, r, w, b, ROWS: tl.constexpr, VECTORS: tl.constexpr, SCALARS: tl.constexpr, H: tl.constexpr,
          PRECISION: tl.constexpr):  # fmt: skip
-    """The first layer over products of vectors, compressed, and scalars."""
+    """Linear layer over the asinh of all dot products of the first VECTORS vectors, and SCALARS scalars: (ROWS, H)."""
     PRODUCTS: tl.constexpr = VECTORS * (VECTORS + 1) // 2
     h = tl.arange(0, H)
     y = tl.zeros([ROWS, H], tl.float32)
-    for first in tl.static_range(0, PRODUCTS + MORE, 32):
+    for first in tl.static_range(0, PRODUCTS + SCALARS, 32):
         c = first + tl.arange(0, 32)
         i = tl.zeros([32], tl.int32)
         for v in tl.static_range(1, VECTORS):
@@ -51,20 +52,21 @@ def invariant_layer(record, r, w, b, ROWS: tl.constexpr, VECTORS: tl.constexpr, 
             at = record + axis * MAX_VECTORS * ROWS + r[:, None]
             p += tl.load(at + i[None, :] * ROWS, mask=some, other=0.0) * tl.load(at + j[None, :] * ROWS, mask=some,
                                                                                  other=0.0)  # fmt: skip
-        size = tl.log(tl.abs(p) + tl.sqrt(p * p + 1))  # asinh, but for the sign
+        size = tl.log(tl.abs(p) + tl.sqrt(p * p + 1))  # asinh(|p|)
         p = tl.where(p < 0, -size, size)
         if first + 32 > PRODUCTS:
-            number = (c >= PRODUCTS) & (c < PRODUCTS + MORE)
+            number = (c >= PRODUCTS) & (c < PRODUCTS + SCALARS)
             at = record + (c + FIRST_SCALAR - PRODUCTS)[None, :] * ROWS + r[:, None]
             p = tl.where(number[None, :], tl.load(at, mask=number[None, :], other=0.0), p)
-        W = tl.load(w + h[None, :] * (PRODUCTS + MORE) + c[:, None], mask=(c < PRODUCTS + MORE)[:, None], other=0.0)
+        at = w + h[None, :] * (PRODUCTS + SCALARS) + c[:, None]
+        W = tl.load(at, mask=(c < PRODUCTS + SCALARS)[:, None], other=0.0)
         y += tl.dot(p, W, input_precision=PRECISION)
     return y + tl.load(b + h)[None, :]
 
 
 @triton.jit
 def weighted_vectors(record, r, there, weights, ROWS: tl.constexpr, VECTORS: tl.constexpr):
-    """The weighted sum of the first vectors."""
+    """Weighted sum of the first VECTORS vectors of each row, with `weights` (ROWS, PADDED_VECTORS)."""
     v = tl.arange(0, PADDED_VECTORS)
     at, some = record + v[None, :] * ROWS + r[:, None], (v < VECTORS)[None, :] & there[:, None]
     return (tl.sum(weights * tl.load(at, mask=some, other=0.0), 1),

@@ -1,4 +1,4 @@
-"""For every point of an object the nearest point of each other object, by measuring all distances that matter.
+"""Nearest points between objects by brute force within bounding boxes.
 
 The kernel is written in Triton (see `compilers`), which is imported with this module.
 """
@@ -8,11 +8,11 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-BLOCK, CHUNK = 16, 128  # points that search together, and points that each looks at in one go
+BLOCK, CHUNK = 16, 128  # query points per program, and points that it reads at a time
 
 
 @triton.jit
-def _search(points, low, high, distance, index, reach, o, n, BLOCK: tl.constexpr, CHUNK: tl.constexpr):
+def _nearest_kernel(points, low, high, distance, index, reach, o, n, BLOCK: tl.constexpr, CHUNK: tl.constexpr):
     blocks = tl.cdiv(n, BLOCK)
     pair, block = tl.program_id(0) // blocks, tl.program_id(0) % blocks
     i, j = pair // o, (pair // (o * o)) * o + pair % o  # rows of objects of the same scene
@@ -51,7 +51,7 @@ def _nearest(points: Tensor, low: Tensor, high: Tensor, reach: float) -> tuple[T
     distance = points.new_empty(b, o, o, n)
     index = torch.empty(b, o, o, n, dtype=torch.int64, device=points.device)
     grid = (b * o * o * triton.cdiv(n, BLOCK),)
-    _search[grid](points, low, high, distance, index, reach, o, n, BLOCK, CHUNK)
+    _nearest_kernel[grid](points, low, high, distance, index, reach, o, n, BLOCK, CHUNK)
     return distance, index
 
 
@@ -62,19 +62,19 @@ def _(points: Tensor, low: Tensor, high: Tensor, reach: float) -> tuple[Tensor, 
 
 
 def nearest_between_objects(points: Tensor, valid: Tensor, reach: float) -> tuple[Tensor, Tensor]:
-    """For point n of object i and every object j: the distance [m] to j's nearest point, and which one that is.
+    """Distance [m] from point n of object i to the nearest point of every object j, and that point's index.
 
-    `points` (b o n 3) in single precision, `valid` (b o n); both results (b o o n). The distance is infinite where it
-    is not below `reach`, to the own object, to padding and from padding; the index then means nothing.
+    `points` (b o n 3) in single precision [m], `valid` (b o n); both results (b o o n). The distance is infinite where
+    it is not below `reach` [m], to the own object, and to and from padding; the index is then undefined.
     """
     hidden = ~valid[..., None]
-    placed = points.masked_fill(hidden, torch.inf)  # padding is far from everything, and sees nothing
+    placed = points.masked_fill(hidden, torch.inf)  # infinitely far from everything
     low, high = placed.amin(2), points.masked_fill(hidden, -torch.inf).amax(2)
     return _nearest(placed.mT.contiguous(), low, high, reach)
 
 
 def nearest_between_objects_reference(points: Tensor, valid: Tensor, reach: float) -> tuple[Tensor, Tensor]:
-    """The same from a table of all distances, in any precision."""
+    """`nearest_between_objects` from the full distance matrix, in any precision."""
     distance = (points[:, :, None, :, None] - points[:, None, :, None]).norm(dim=-1)
     distance, index = distance.masked_fill(~valid[:, None, :, None], torch.inf).min(-1)
     own = torch.eye(points.shape[1], dtype=torch.bool, device=points.device)[:, :, None]

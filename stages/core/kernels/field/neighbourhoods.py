@@ -1,4 +1,4 @@
-"""Weights that average over the neighbourhoods of points, in half precision: only they go to memory.
+"""Gaussian neighbourhood weights between the points of objects, in half precision.
 
 The kernel is written in Triton (see `compilers`), which is imported with this module.
 """
@@ -10,12 +10,12 @@ from torch import Tensor
 
 from stages.core.kernels.field.vec3 import dot, load3, sub
 
-ROWS, CHUNK = 8, 256
+ROWS, CHUNK = 8, 256  # rows of the matrix per program, and columns that it computes at a time
 
 
 @triton.jit
 def _weights(arm, share, x, slope, s, n):
-    """What points s weigh for points x, before they are made to sum to 1."""
+    """Weights of points s for points x, before normalisation."""
     y = load3(arm + 3 * s, 1, s < n)
     d = sub((x[0][:, None], x[1][:, None], x[2][:, None]), (y[0][None, :], y[1][None, :], y[2][None, :]))
     return tl.exp(slope * dot(d, d)) * tl.load(share + s, mask=s < n, other=0.0)[None, :]
@@ -23,7 +23,7 @@ def _weights(arm, share, x, slope, s, n):
 
 @triton.jit
 def _neighbourhood_weights(arm, valid, share, reach, out, n, scales, ROWS: tl.constexpr, CHUNK: tl.constexpr):
-    """Rows of the table of one object and one scale, twice: their sums, and what is divided by those."""
+    """Rows of the weight matrix of one object and radius, in two passes: their sums, then the normalised weights."""
     table = tl.program_id(0)
     i = table // scales
     arm, share, valid, out = arm + 3 * i * n, share + i * n, valid + i * n, out + table.to(tl.int64) * n * n
@@ -44,8 +44,11 @@ def _neighbourhood_weights(arm, valid, share, reach, out, n, scales, ROWS: tl.co
 
 
 def neighbourhood_weights(arm: Tensor, valid: Tensor, share: Tensor, reach: Tensor) -> Tensor:
-    """Gaussians of each of the radii `reach` (b o s) [m] about points `arm` (b o n 3) that weigh `share` (b o n),
-    normalised by rows: (b o s n n). Rows are 0 where not `valid` (b o n)."""
+    """Gaussian weights exp(-(d / radius)^2) x mass fraction between points, with rows that sum to 1: (b o s n n).
+
+    `arm` (b o n 3): points [m]; `valid` (b o n): rows are 0 where false; `share` (b o n): mass fractions; `reach`
+    (b o s): radii [m].
+    """
     b, o, n, _ = arm.shape
     given = [x.contiguous() for x in (arm, valid, share, reach)]
     scales = reach.shape[-1]

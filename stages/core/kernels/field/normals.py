@@ -1,5 +1,7 @@
-"""Which way the surface under each point of a cloud faces, and the principal axes of bodies: 3 x 3 matrices by the
-thousand, for which libraries make the host wait. Distances are as exact as the points, the rest is in double precision.
+"""Surface normals of point clouds and inverses of inertia tensors: eigenproblems of many 3 x 3 matrices in Warp.
+
+Batched eigensolvers of libraries synchronise with the host; these kernels do not. Distances have the precision of the
+points, everything else is in double precision.
 """
 
 from typing import Any
@@ -10,17 +12,17 @@ from torch import Tensor
 
 from stages.core.kernels.interop import device_of, launch, view
 
-NORMAL_NEIGHBOURS = wp.constant(12)  # points that make a normal, the point itself among them
-SPACING_NEIGHBOURS = wp.constant(5)  # points that make the spacing, the point itself among them
-JACOBI_SWEEPS = 6  # of Jacobi's rotations; each squares what is off the diagonal
-THREADS_PER_BLOCK = 64  # of a block on a GPU, ten of which fit where one runs
+NORMAL_NEIGHBOURS = wp.constant(12)  # points in the fit of a normal, including the point itself
+SPACING_NEIGHBOURS = wp.constant(5)  # points in the mean spacing, including the point itself
+JACOBI_SWEEPS = 6  # Jacobi sweeps; convergence is quadratic
+THREADS_PER_BLOCK = 64  # on a GPU; ten blocks fit on a multiprocessor
 
 Indices = wp.types.vector(length=NORMAL_NEIGHBOURS, dtype=wp.int32)
 
 
 @wp.func
-def _turned(A: wp.mat33d, V: wp.mat33d, p: int, q: int):
-    """A and V after the rotation in the plane of axes p and q that makes A[p, q] vanish."""
+def _jacobi_rotation(A: wp.mat33d, V: wp.mat33d, p: int, q: int):
+    """A and V after the rotation in the plane of axes p and q that zeroes A[p, q]."""
     G = wp.identity(n=3, dtype=wp.float64)
     if A[p, q] != wp.float64(0.0):
         cot = (A[q, q] - A[p, p]) / (wp.float64(2.0) * A[p, q])  # of twice the angle
@@ -36,18 +38,18 @@ def _turned(A: wp.mat33d, V: wp.mat33d, p: int, q: int):
 
 
 @wp.func
-def _axes(A: wp.mat33d, sweeps: int):
-    """Eigenvalues of a symmetric matrix, in no order, and its eigenvectors, as columns."""
+def _eigen(A: wp.mat33d, sweeps: int):
+    """Eigenvalues (unordered) and eigenvectors (columns) of a symmetric matrix, by cyclic Jacobi rotations."""
     V = wp.identity(n=3, dtype=wp.float64)
     for _ in range(sweeps):
-        A, V = _turned(A, V, 0, 1)
-        A, V = _turned(A, V, 0, 2)
-        A, V = _turned(A, V, 1, 2)
+        A, V = _jacobi_rotation(A, V, 0, 1)
+        A, V = _jacobi_rotation(A, V, 0, 2)
+        A, V = _jacobi_rotation(A, V, 1, 2)
     return wp.get_diag(A), V
 
 
 @wp.kernel(enable_backward=False, launch_bounds=(THREADS_PER_BLOCK, 10))
-def _surface(points: wp.array2d[Any], valid: wp.array2d[wp.bool], sweeps: int,
+def _normals(points: wp.array2d[Any], valid: wp.array2d[wp.bool], sweeps: int,
              normal: wp.array2d[wp.vec3d], spacing: wp.array2d[wp.float64]):  # fmt: skip
     o, i = wp.tid()
     if not valid[o, i]:
@@ -58,14 +60,14 @@ def _surface(points: wp.array2d[Any], valid: wp.array2d[wp.bool], sweeps: int,
         d = wp.length_sq(points[o, j] - x)
         if d < near[NORMAL_NEIGHBOURS - 1] and valid[o, j]:
             which = wp.int32(j)
-            for k in range(NORMAL_NEIGHBOURS):  # the nearest first; who is farther moves on by one
+            for k in range(NORMAL_NEIGHBOURS):  # insertion into the sorted list
                 if d < near[k]:
-                    farther = near[k]
-                    whom = index[k]
+                    next_d = near[k]
+                    next_index = index[k]
                     near[k] = d
                     index[k] = which
-                    d = farther
-                    which = whom
+                    d = next_d
+                    which = next_index
     mean, count = wp.vec3d(), wp.float64(0.0)
     for k in range(NORMAL_NEIGHBOURS):
         if index[k] >= 0:
@@ -77,7 +79,7 @@ def _surface(points: wp.array2d[Any], valid: wp.array2d[wp.bool], sweeps: int,
         if index[k] >= 0:
             arm = wp.vec3d(points[o, index[k]] - x) - mean
             spread += wp.outer(arm, arm)
-    extent, axes = _axes(spread, sweeps)
+    extent, axes = _eigen(spread, sweeps)
     least = wp.int32(wp.argmin(extent))
     normal[o, i] = wp.vec3d(axes[0, least], axes[1, least], axes[2, least])
     total, others = wp.float64(0.0), wp.float64(0.0)
@@ -88,25 +90,28 @@ def _surface(points: wp.array2d[Any], valid: wp.array2d[wp.bool], sweeps: int,
     spacing[o, i] = total / wp.max(others, wp.float64(1.0))
 
 
-for _vector in (wp.vec3, wp.vec3d):  # both at once: one that comes later would compile all anew
-    wp.overload(_surface, {"points": wp.array2d(dtype=_vector)})
+for _vector in (wp.vec3, wp.vec3d):  # both at once: a later overload would recompile the module
+    wp.overload(_normals, {"points": wp.array2d(dtype=_vector)})
 
 
 def normals_and_spacing(points: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
-    """For points (b o n 3) of objects: the direction of least extent of the NEIGHBOURS nearest, either way round, and
-    the mean distance to the NEXT - 1 nearest others (b o n) [m]; both 0 where not `valid` (b o n)."""
+    """Surface normals (b o n 3) and spacing (b o n) [m] at points (b o n 3) [m]; both 0 where not `valid` (b o n).
+
+    A normal is the direction of least extent of the NORMAL_NEIGHBOURS nearest points, of arbitrary sign; the spacing
+    is the mean distance to the SPACING_NEIGHBOURS - 1 nearest others.
+    """
     normal = torch.zeros_like(points, dtype=torch.float64, memory_format=torch.contiguous_format)
     spacing = normal.new_zeros(valid.shape)
     vector = wp.vec3d if points.dtype == torch.float64 else wp.vec3
     flat = points.contiguous().flatten(0, 1), valid.contiguous().flatten(0, 1)
     given = [view(flat[0], vector), view(flat[1], wp.bool), JACOBI_SWEEPS]
     found = [view(normal.flatten(0, 1), wp.vec3d), view(spacing.flatten(0, 1), wp.float64)]
-    launch(_surface, given[1].shape, given, found, device_of(points), block_dim=THREADS_PER_BLOCK)
+    launch(_normals, given[1].shape, given, found, device_of(points), block_dim=THREADS_PER_BLOCK)
     return normal.to(points), spacing.to(points)
 
 
 def normals_and_spacing_reference(points: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
-    """The same from a table of all distances, in any precision."""
+    """`normals_and_spacing` from the full distance matrix, in any precision."""
     gap = (points[..., :, None, :] - points[..., None, :, :]).norm(dim=-1)
     gap = gap.masked_fill(~(valid[..., :, None] & valid[..., None, :]), torch.inf)
     near, index = gap.topk(min(NORMAL_NEIGHBOURS, gap.shape[-1]), largest=False)
@@ -121,9 +126,9 @@ def normals_and_spacing_reference(points: Tensor, valid: Tensor) -> tuple[Tensor
 
 
 @wp.kernel(enable_backward=False)
-def _inverted(matrix: wp.array[wp.mat33d], sweeps: int, inverse: wp.array[wp.mat33d], values: wp.array[wp.vec3d]):
+def _invert_spd(matrix: wp.array[wp.mat33d], sweeps: int, inverse: wp.array[wp.mat33d], values: wp.array[wp.vec3d]):
     i = wp.tid()
-    extent, axes = _axes(matrix[i], sweeps)
+    extent, axes = _eigen(matrix[i], sweeps)
     d = wp.cw_div(wp.vec3d(wp.float64(1.0)), extent)
     inverse[i] = axes * wp.diag(d) * wp.transpose(axes)
     least, most = wp.min(d), wp.max(d)
@@ -131,10 +136,10 @@ def _inverted(matrix: wp.array[wp.mat33d], sweeps: int, inverse: wp.array[wp.mat
 
 
 def invert_spd(matrix: Tensor) -> tuple[Tensor, Tensor]:
-    """The inverses of positive definite matrices (b o 3 3), and the eigenvalues of those, ascending (b o 3)."""
+    """Inverses of symmetric positive definite matrices (b o 3 3), and the inverses' eigenvalues, ascending (b o 3)."""
     real = matrix.double().contiguous()
     inverse, values = torch.empty_like(real), torch.empty_like(real[..., 0])
     given = [view(real.flatten(0, 1), wp.mat33d), JACOBI_SWEEPS]
     found = [view(inverse.flatten(0, 1), wp.mat33d), view(values.flatten(0, 1), wp.vec3d)]
-    launch(_inverted, given[0].shape, given, found, device_of(matrix), block_dim=THREADS_PER_BLOCK)
+    launch(_invert_spd, given[0].shape, given, found, device_of(matrix), block_dim=THREADS_PER_BLOCK)
     return inverse.to(matrix), values.to(matrix)

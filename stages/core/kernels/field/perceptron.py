@@ -1,4 +1,4 @@
-"""What vectors show and a small perceptron makes of it, for many rows in one launch; only results go to memory.
+"""Small multilayer perceptron over dot products of vectors, fused into one launch: only its output is written.
 
 The kernel is written in Triton (see `compilers`), which is imported with this module.
 """
@@ -12,13 +12,14 @@ import triton.language as tl
 from torch import Tensor
 from torch.nn.functional import linear, silu
 
-MAX_LAYER_WIDTH = 128  # layers that are not the input: their weights and a block of rows stay on the chip
-CHUNK = 64  # columns of the input at a time
-SMALL_BLOCK_ROWS = 65_536  # rows that are cut into small blocks, so that all processors have some
+MAX_LAYER_WIDTH = 128  # hidden and output layers: their weights and a block of rows are kept on chip
+CHUNK = 64  # input columns read at a time
+SMALL_BLOCK_ROWS = 65_536  # up to so many rows use smaller blocks, to occupy all multiprocessors
 
 
 @triton.jit
 def _component(vectors, r, there, i, VECTORS: tl.constexpr):
+    """The i-th vector of each row."""
     at = vectors + (r * VECTORS + i) * 3
     return (tl.load(at, mask=there, other=0.0), tl.load(at + 1, mask=there, other=0.0),
             tl.load(at + 2, mask=there, other=0.0))  # fmt: skip
@@ -27,7 +28,7 @@ def _component(vectors, r, there, i, VECTORS: tl.constexpr):
 @triton.jit
 def _layer(h, weight, bias, INNER: tl.constexpr, OUTER: tl.constexpr, I: tl.constexpr, O: tl.constexpr,
            PRECISION: tl.constexpr):  # fmt: skip
-    """The linear layer after an activation; I and O are the widths, padded."""
+    """SiLU, then a linear layer; I and O are the padded widths."""
     i, o = tl.arange(0, I), tl.arange(0, O)
     h = h * tl.sigmoid(h)
     W = tl.load(weight + o[None, :] * INNER + i[:, None], mask=(i[:, None] < INNER) & (o[None, :] < OUTER), other=0.0)
@@ -56,15 +57,15 @@ def _perceptron(
         INNER: tl.constexpr = PRODUCTS + COLUMNS
         y = tl.zeros([BLOCK, H], tl.float32)
         if VECTORS:
-            for i in range(VECTORS):  # not unrolled: that would need more registers than there are
+            for i in range(VECTORS):  # not unrolled, to limit register use
                 ax, ay, az = _component(vectors, r, there, i, VECTORS)
                 for j in range(i, VECTORS):
                     bx, by, bz = _component(vectors, r, there, j, VECTORS)
                     p = ax * bx + ay * by + az * bz
-                    size = tl.log(tl.abs(p) + tl.sqrt(p * p + 1))  # asinh, but for the sign
-                    seen = tl.where(p < 0, -size, size)
+                    size = tl.log(tl.abs(p) + tl.sqrt(p * p + 1))  # asinh(|p|)
+                    value = tl.where(p < 0, -size, size)
                     column = i * VECTORS - i * (i - 1) // 2 + j - i
-                    y += seen[:, None] * tl.load(w0 + h * INNER + column, mask=h < HIDDEN, other=0.0)[None, :]
+                    y += value[:, None] * tl.load(w0 + h * INNER + column, mask=h < HIDDEN, other=0.0)[None, :]
         for first in range(0, COLUMNS, K):
             k = first + tl.arange(0, K)
             inside = there[:, None] & (k[None, :] < COLUMNS)
@@ -119,19 +120,19 @@ def perceptron(
     x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor], vectors: Tensor | None = None,
     known: Tensor | None = None, near: Tensor | None = None, active: bool = False,
 ) -> Tensor:  # fmt: skip
-    """Two or three linear layers with SiLU between, in single precision; without gradients.
+    """Apply two or three linear layers with SiLU between them, in single precision, without gradients.
 
-    Before the columns of `x` (r, i) the first layer sees the asinh of the products of `vectors` (r, v, 3) with each
-    other. Rows come in groups of one size, and to a group belongs a row of `known` (g, _): it is added to the first
-    layer's result, or, if `active`, to `x`, which then is activated too. `near` (r) are the rows that matter: others
-    may come out as 0. With torch.set_float32_matmul_precision("high") products are rounded as tf32 has it.
+    The input of the first layer is the asinh of all dot products of `vectors` (r, v, 3), then the columns of `x`
+    (r, i). Rows come in g groups of equal size; the group's row of `known` (g, _) is added to the first layer's output
+    or, if `active`, to `x`, which is then activated as well. `near` (r) masks the rows that are needed: others may be
+    0 in the result. With torch.set_float32_matmul_precision("high") products are rounded to TF32.
     """
     x, vectors, known, near = (t if t is None else t.contiguous() for t in (x, vectors, known, near))
     return _fused(x, vectors, known, near, active, list(weights), list(biases))
 
 
 def perceptron_reference(x, weights, biases, vectors=None, known=None, near=None, active: bool = False) -> Tensor:
-    """The same layer by layer, in any precision, for all rows."""
+    """`perceptron` layer by layer, in any precision, for all rows."""
     if vectors is not None:
         i, j = torch.triu_indices(vectors.shape[1], vectors.shape[1], device=x.device)
         x = torch.cat([torch.asinh((vectors @ vectors.mT)[:, i, j]), x], -1)

@@ -1,4 +1,4 @@
-"""Free motion of rigid bodies, one thread a body: as tensors it would be dozens of operations on a few numbers."""
+"""Free rigid-body motion, one thread per body: one launch instead of dozens of small tensor operations."""
 
 import torch
 import warp as wp
@@ -9,16 +9,19 @@ from stages.core.kernels.interop import device_of, launch, view
 
 @wp.func
 def _matrix(quat: wp.vec4):
+    """Rotation matrix of a quaternion w x y z of any length."""
     return wp.quat_to_matrix(wp.normalize(wp.quat(quat[1], quat[2], quat[3], quat[0])))
 
 
 @wp.func
 def _spin(momentum: wp.vec3, inverse: wp.mat33, R: wp.mat33):
+    """Angular velocity from angular momentum and the inverse inertia in the body frame."""
     return R * (inverse * (wp.transpose(R) * momentum))
 
 
 @wp.func
-def _turned(quat: wp.vec4, turn: wp.vec3):
+def _rotated(quat: wp.vec4, turn: wp.vec3):
+    """Quaternion w x y z after the rotation vector `turn` [rad] in world axes."""
     half = wp.sqrt(wp.length_sq(turn) + 1.0e-24) / 2.0
     by = turn * (wp.sin(half) / half / 2.0)
     q = wp.normalize(wp.quat(by[0], by[1], by[2], wp.cos(half)) * wp.quat(quat[1], quat[2], quat[3], quat[0]))
@@ -27,13 +30,13 @@ def _turned(quat: wp.vec4, turn: wp.vec3):
 
 @wp.kernel(enable_backward=False)
 def _drift(com: wp.array[wp.vec3], quat: wp.array[wp.vec4], velocity: wp.array[wp.vec3], momentum: wp.array[wp.vec3],
-           inverse: wp.array[wp.mat33], dt: float, com_then: wp.array[wp.vec3], quat_then: wp.array[wp.vec4]):
+           inverse: wp.array[wp.mat33], dt: float, new_com: wp.array[wp.vec3], new_quat: wp.array[wp.vec4]):
     i = wp.tid()
     q, L = quat[i], momentum[i]
     spin = _spin(L, inverse[i], _matrix(q))
-    spin = _spin(L, inverse[i], _matrix(_turned(q, dt / 2.0 * spin)))
-    com_then[i] = com[i] + dt * velocity[i]
-    quat_then[i] = _turned(q, dt * spin)
+    spin = _spin(L, inverse[i], _matrix(_rotated(q, dt / 2.0 * spin)))
+    new_com[i] = com[i] + dt * velocity[i]
+    new_quat[i] = _rotated(q, dt * spin)
 
 
 @wp.kernel(enable_backward=False)
@@ -52,13 +55,17 @@ def _rows(x: Tensor, dims: int, dtype) -> wp.array:
 def drift(
     com: Tensor, quat: Tensor, velocity: Tensor, momentum: Tensor, inverse: Tensor, dt: float
 ) -> tuple[Tensor, Tensor]:
-    """Centres of mass and orientations dt [s] later; reference: `models.field.rigid_body.drift`. Without gradients."""
-    moved, turned = com.new_empty(com.shape), quat.new_empty(quat.shape)
+    """Centres of mass (..., 3) and quaternions (..., 4) after free motion for dt [s]. Without gradients.
+
+    `momentum` is angular, `inverse` (..., 3, 3) the inverse inertia in the body frame, both per unit of mass.
+    Reference: `stages.core.models.field.rigid_body.drift`.
+    """
+    moved, rotated = com.new_empty(com.shape), quat.new_empty(quat.shape)
     launch(_drift, com[..., 0].numel(), [
         _rows(com, 1, wp.vec3), _rows(quat, 1, wp.vec4), _rows(velocity, 1, wp.vec3), _rows(momentum, 1, wp.vec3),
         _rows(inverse, 2, wp.mat33), dt,
-    ], [_rows(moved, 1, wp.vec3), _rows(turned, 1, wp.vec4)], device_of(com))  # fmt: skip
-    return moved, turned
+    ], [_rows(moved, 1, wp.vec3), _rows(rotated, 1, wp.vec4)], device_of(com))  # fmt: skip
+    return moved, rotated
 
 
 @drift.register_fake
@@ -68,7 +75,10 @@ def _(com, quat, velocity, momentum, inverse, dt):
 
 @torch.library.custom_op("ngff::pose", mutates_args=())
 def pose(quat: Tensor, momentum: Tensor, inverse: Tensor) -> tuple[Tensor, Tensor]:
-    """Rotation matrices and spins [rad/s]; see `stages.core.models.field.rigid_body.pose`. Without gradients."""
+    """Rotation matrices (..., 3, 3) and angular velocities (..., 3) [rad/s] of bodies. Without gradients.
+
+    Reference: `stages.core.models.field.rigid_body.pose`.
+    """
     R, spin = inverse.new_empty(inverse.shape), momentum.new_empty(momentum.shape)
     launch(_pose, momentum[..., 0].numel(), [
         _rows(quat, 1, wp.vec4), _rows(momentum, 1, wp.vec3), _rows(inverse, 2, wp.mat33),

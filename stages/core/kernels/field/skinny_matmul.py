@@ -1,4 +1,4 @@
-"""Large matrices of weights times a few columns. Libraries are slow at it, as one side has too little to share out.
+"""Skinny matrix products: large half-precision matrices times a few columns, a shape that BLAS libraries run slowly.
 
 The kernel is written in Triton (see `compilers`), which is imported with this module.
 """
@@ -8,13 +8,13 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-ROWS, CHUNK = 64, 128
-MAX_COLUMNS = 16  # columns
+ROWS, CHUNK = 64, 128  # rows per program, and inner dimension read at a time
+MAX_COLUMNS = 16
 
 
 @triton.jit
 def _skinny_matmul(A, high, low, out, n, k, c, ROWS: tl.constexpr, CHUNK: tl.constexpr, COLUMNS: tl.constexpr):
-    """Of matrices (n, k) and columns (c, k), the sum of two, all in half precision, sums in single; out (c, n)."""
+    """Matrices (n, k) times columns high + low (c, k), in half precision with single-precision sums; out (c, n)."""
     blocks = tl.cdiv(n, ROWS)
     matrix, block = (tl.program_id(0) // blocks).to(tl.int64), tl.program_id(0) % blocks
     r, col = block * ROWS + tl.arange(0, ROWS), tl.arange(0, COLUMNS)
@@ -29,8 +29,9 @@ def _skinny_matmul(A, high, low, out, n, k, c, ROWS: tl.constexpr, CHUNK: tl.con
     tl.store(out + matrix * n * c + r[:, None] + col[None, :] * n, total, mask=(r[:, None] < n) & (col[None, :] < c))
 
 
-@torch.library.custom_op("ngff::thin_product", mutates_args=())
+@torch.library.custom_op("ngff::skinny_matmul", mutates_args=())
 def split_matmul(A: Tensor, high: Tensor, low: Tensor) -> Tensor:
+    """A (g, n, k) times the columns high + low (g, c, k), all in half precision: (g, c, n) in single precision."""
     g, n, k = A.shape
     out = torch.empty(g, high.shape[1], n, dtype=torch.float32, device=A.device)
     blocks = (g * triton.cdiv(n, ROWS),)
@@ -44,10 +45,10 @@ def _(A: Tensor, high: Tensor, low: Tensor) -> Tensor:
 
 
 def skinny_matmul(A: Tensor, x: Tensor) -> Tensor:
-    """A @ x in single precision for A (..., n, k) in half precision and x (..., k, c) of at most MOST columns c."""
+    """A @ x in single precision, for A (..., n, k) in half precision and x (..., k, c) with c <= MAX_COLUMNS."""
     columns = x.flatten(0, -3).mT
     scale = columns.abs().amax(-1, keepdim=True).clamp_min(1e-30) / 1024
     columns = (columns / scale).contiguous()
-    high = columns.half()  # two numbers of half precision hold 22 bits
+    high = columns.half()  # the sum of two half-precision numbers has 22 bits
     out = split_matmul(A.flatten(0, -3).contiguous(), high, (columns - high).half()) * scale
     return out.mT.unflatten(0, A.shape[:-2])

@@ -1,4 +1,8 @@
-"""Vectors of three numbers in Triton's kernels: tuples of tensors of one shape; matrices are nine, by rows."""
+"""3-vectors, 3 x 3 matrices and quaternions in Triton kernels, as tuples of tensors of one shape.
+
+Matrices have nine entries by rows, quaternions are w x y z. `load3` and `store3` take one vector per lane, with a mask
+and a stride between components; `read` and `write` take consecutive scalars.
+"""
 
 import triton
 import triton.language as tl
@@ -6,13 +10,14 @@ import triton.language as tl
 
 @triton.jit
 def load3(at, stride, mask, other=0.0):
-    """The numbers at `at` and one and two strides farther."""
+    """Load the vector with components at `at`, `at` + stride and `at` + 2 stride."""
     return (tl.load(at, mask=mask, other=other), tl.load(at + stride, mask=mask, other=other),
             tl.load(at + 2 * stride, mask=mask, other=other))  # fmt: skip
 
 
 @triton.jit
 def store3(at, stride, a, mask):
+    """Store a vector with a stride between components."""
     tl.store(at, a[0], mask=mask)
     tl.store(at + stride, a[1], mask=mask)
     tl.store(at + 2 * stride, a[2], mask=mask)
@@ -20,11 +25,13 @@ def store3(at, stride, a, mask):
 
 @triton.jit
 def read3(at):
+    """Read a vector of consecutive scalars."""
     return (tl.load(at), tl.load(at + 1), tl.load(at + 2))
 
 
 @triton.jit
 def write3(at, a):
+    """Write a vector as consecutive scalars."""
     tl.store(at, a[0])
     tl.store(at + 1, a[1])
     tl.store(at + 2, a[2])
@@ -32,49 +39,58 @@ def write3(at, a):
 
 @triton.jit
 def read4(at):
+    """Read four consecutive scalars."""
     return (tl.load(at), tl.load(at + 1), tl.load(at + 2), tl.load(at + 3))
 
 
 @triton.jit
 def write4(at, q):
+    """Write four consecutive scalars."""
     write3(at, q)
     tl.store(at + 3, q[3])
 
 
 @triton.jit
 def read9(at):
+    """Read a matrix of consecutive scalars."""
     return (tl.load(at), tl.load(at + 1), tl.load(at + 2), tl.load(at + 3), tl.load(at + 4), tl.load(at + 5),
             tl.load(at + 6), tl.load(at + 7), tl.load(at + 8))  # fmt: skip
 
 
 @triton.jit
 def write9(at, M):
+    """Write a matrix as consecutive scalars."""
     for i in tl.static_range(9):
         tl.store(at + i, M[i])
 
 
 @triton.jit
 def add(a, b):
+    """a + b."""
     return (a[0] + b[0], a[1] + b[1], a[2] + b[2])
 
 
 @triton.jit
 def sub(a, b):
+    """a - b."""
     return (a[0] - b[0], a[1] - b[1], a[2] - b[2])
 
 
 @triton.jit
 def scale3(s, a):
+    """s a."""
     return (s * a[0], s * a[1], s * a[2])
 
 
 @triton.jit
 def dot(a, b):
+    """a . b."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @triton.jit
 def cross(a, b):
+    """a x b."""
     return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 
@@ -106,7 +122,7 @@ def rotate_tensor(R, M):
 
 @triton.jit
 def solve_symmetric(K, a, b):
-    """K^-1 a and K^-1 b of a symmetric K (xx, xy, xz, yy, yz, zz), by Cramer's rule."""
+    """K^-1 a and K^-1 b for a symmetric K (xx, xy, xz, yy, yz, zz), by Cramer's rule."""
     x, y, z = (K[0], K[1], K[2]), (K[1], K[3], K[4]), (K[2], K[4], K[5])
     yz, zx, xy = cross(y, z), cross(z, x), cross(x, y)
     det = dot(x, yz)
@@ -128,23 +144,25 @@ def _both(ax, ay, az, bx, by, bz):
 
 @triton.jit
 def sum3(a):
-    """The sum over the first dimension, of all three numbers at once."""
+    """Sum of each component over the first dimension."""
     return tl.reduce((a[0], a[1], a[2]), 0, _both)
 
 
 @triton.jit
 def max3(a):
+    """Maximum of each component over the first dimension."""
     return tl.reduce((a[0], a[1], a[2]), 0, _larger)
 
 
 @triton.jit
 def where3(mask, a, other):
+    """The vector a where `mask`, else the scalar `other` in each component."""
     return (tl.where(mask, a[0], other), tl.where(mask, a[1], other), tl.where(mask, a[2], other))
 
 
 @triton.jit
 def rotation_matrix(q):
-    """The matrix of a quaternion w x y z of any length."""
+    """Rotation matrix of a quaternion of any length."""
     s = 1 / tl.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
     w, x, y, z = q[0] * s, q[1] * s, q[2] * s, q[3] * s
     return (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
@@ -154,7 +172,7 @@ def rotation_matrix(q):
 
 @triton.jit
 def rotate_quat(q, turn):
-    """A quaternion after a rotation vector about world axes [rad], of unit length."""
+    """Unit quaternion q after the rotation vector `turn` [rad] in world axes."""
     half = tl.sqrt(dot(turn, turn) + 1e-24) / 2
     a, v = tl.cos(half), scale3(tl.sin(half) / half / 2, turn)
     u = (q[1], q[2], q[3])
@@ -166,13 +184,13 @@ def rotate_quat(q, turn):
 
 @triton.jit
 def angular_velocity(q, momentum, inverse):
-    """Spin [rad/s] at an orientation, from angular momentum and the inverse of the inertia at rest."""
+    """Angular velocity [rad/s] at orientation q, from angular momentum and the inverse inertia in the body frame."""
     R = rotation_matrix(q)
     return matvec3(R, matvec3(inverse, transposed_matvec3(R, momentum)))
 
 
 @triton.jit
 def drift(com, q, velocity, momentum, inverse, dt):
-    """Centre of mass and orientation dt [s] later without forces; the spin is that of the middle of the way."""
+    """Centre of mass and orientation after free motion for dt [s]; the angular velocity is that of the midpoint."""
     middle = rotate_quat(q, scale3(dt / 2, angular_velocity(q, momentum, inverse)))
     return add(com, scale3(dt, velocity)), rotate_quat(q, scale3(dt, angular_velocity(middle, momentum, inverse)))

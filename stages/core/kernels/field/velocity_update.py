@@ -1,7 +1,8 @@
-"""What bodies do after the forces are known: one program an object, all of its points in registers.
+"""Velocity update and second half of the drift step: one program per object, all of its points in registers.
 
-`kick` gives a body what acts on it and drifts it on, `deform` does so for its displacements. The same in PyTorch, their
-reference, is `stages.core.models.field.force_field.ForceField.step`. Written in Triton (see `compilers`).
+`update_velocities` applies contact forces, gravity, external forces and friction to rigid bodies,
+`update_displacements` the internal accelerations to their displacements. Reference: `ForceField.step` in
+`stages.core.models.field.force_field`. Written in Triton (see `compilers`).
 """
 
 import triton
@@ -50,7 +51,7 @@ from stages.core.kernels.field.vec3 import (
 
 @triton.jit
 def _total(parts, blocks, BLOCKS: tl.constexpr):
-    """Force and torque of so many blocks of places."""
+    """Sum of force and torque over consecutive blocks of contact points."""
     k = tl.arange(0, BLOCKS)
     at, some = parts + k * WRENCH_SIZE, k < blocks
     return sum3(load3(at, 1, some)), sum3(load3(at + 3, 1, some))
@@ -60,7 +61,7 @@ def _total(parts, blocks, BLOCKS: tl.constexpr):
 def _contact(
     i, body, parts, felt, mass, pinned, o, n, places, wide, BLOCK: tl.constexpr, BLOCKS: tl.constexpr,
 ):  # fmt: skip
-    """Force, torque and what the points feel, per unit of mass, from all that an object touches."""
+    """Force, torque and accelerations of the points of an object, per unit of mass, summed over its contacts."""
     first, mine, m, kinds = i - i % o, i % o, o - 1, o + 1
     c = read3(body + BODY_SIZE * i + COM)
     here, free = tl.maximum(tl.load(mass + i), 1e-6), 1 - tl.load(pinned + i).to(tl.float32)
@@ -69,7 +70,7 @@ def _contact(
     touch, force, torque = (zero, zero, zero), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
     for k in range(m):
         j = first + k + (k >= mine)
-        again = mine - (mine > j - first)  # as which of its others j knows i
+        again = mine - (mine > j - first)  # index of i among the other objects of j
         there, loose = tl.maximum(tl.load(mass + j), 1e-6), 1 - tl.load(pinned + j).to(tl.float32)
         reduced = 1 / tl.maximum(free / here + loose / there, 1e-9)
         F, T = _total(parts + (i * places + k * wide) * WRENCH_SIZE, wide, BLOCKS)
@@ -85,27 +86,29 @@ def _contact(
 
 
 @triton.jit
-def _guarded(v, up, down, RISE: tl.constexpr):
-    """Along one axis, a velocity that is at least `up` and at most `down`, as far as it takes no more than RISE."""
-    return tl.minimum(tl.maximum(v, tl.minimum(up, RISE)), tl.maximum(down, -RISE))
+def _guarded(v, up, down, MAX_RECOVERY_SPEED: tl.constexpr):
+    """Velocity along one axis limited to [up, down], where each limit is cut at MAX_RECOVERY_SPEED [m/s]."""
+    return tl.minimum(tl.maximum(v, tl.minimum(up, MAX_RECOVERY_SPEED)), tl.maximum(down, -MAX_RECOVERY_SPEED))
 
 
 @triton.jit
 def update_velocities(
     body, moved, field, parts, felt, grip, unit, pushed, twisted, arm, valid, share, size, mass, inverse, pinned,
     gravity, box, com, quat, velocity, momentum, high, low, scale, o, n, dt, places, wide,
-    GRIP: tl.constexpr, PUSHED: tl.constexpr, SINK: tl.constexpr, RISE: tl.constexpr, FASTEST: tl.constexpr,
-    WILDEST: tl.constexpr, BRISK: tl.constexpr, FRAME: tl.constexpr, BLOCK: tl.constexpr, BLOCKS: tl.constexpr,
+    CONTACT_SATURATION: tl.constexpr, HAS_EXTERNAL: tl.constexpr, MAX_PENETRATION: tl.constexpr,
+    MAX_RECOVERY_SPEED: tl.constexpr, MAX_SPEED: tl.constexpr, MAX_SPIN: tl.constexpr,
+    FRICTION_CUTOFF_SPEED: tl.constexpr, FRAME: tl.constexpr, BLOCK: tl.constexpr, BLOCKS: tl.constexpr,
 ):  # fmt: skip
-    """Velocities after the forces, and where they lead; what the points feel, for the stress field.
+    """Update velocities by the forces, drift by dt / 2, and prepare the neighbourhood averages of the points.
 
-    `parts` are force and torque of blocks of places, `wide` for each other object and `places` in all, and `felt` the
-    acceleration of each point by each thing it touches (see `stages.core.kernels.field.contact_messages`).
+    `parts`: force and torque of blocks of contact points, `wide` blocks for each other object and `places` in all;
+    `felt`: acceleration of each point by each contact (both from `contact_messages`). `high`, `low`, `scale`: contact
+    acceleration, displacement and its rate, split for `skinny_matmul`.
     """
     i = tl.program_id(0)
     force, torque, touch = _contact(i, body, parts, felt, mass, pinned, o, n, places, wide, BLOCK, BLOCKS)
     force = add(force, read3(gravity + 3 * (i // o)))
-    if PUSHED:
+    if HAS_EXTERNAL:
         here = tl.maximum(tl.load(mass + i), 1e-6)
         force = add(force, scale3(1 / here, read3(pushed + 3 * i)))
         torque = add(torque, scale3(1 / here, read3(twisted + 3 * i)))
@@ -114,14 +117,14 @@ def update_velocities(
     L = add(read3(now + MOMENTUM), scale3(dt, torque))
     v = add(past_v, scale3(dt, force))
     spin = matvec3(read9(now + INVERSE_INERTIA), L)
-    slower = WILDEST / tl.maximum(tl.sqrt(dot(spin, spin)), WILDEST)
+    slower = MAX_SPIN / tl.maximum(tl.sqrt(dot(spin, spin)), MAX_SPIN)
     L, spin = scale3(slower, L), scale3(slower, spin)
-    v = scale3(FASTEST / tl.maximum(tl.sqrt(dot(v, v)), FASTEST), v)
+    v = scale3(MAX_SPEED / tl.maximum(tl.sqrt(dot(v, v)), MAX_SPEED), v)
     extent, hold = tl.load(size + i), tl.load(grip + i)
-    for k in range(o - 1):  # what stands on what the floor holds is held as well
-        firm = 1 - GRIP * tl.load(unit + i * (o + 1) + k)  # weight of all places of this contact
+    for k in range(o - 1):  # friction of the support is passed on to what it carries
+        firm = 1 - CONTACT_SATURATION * tl.load(unit + i * (o + 1) + k)  # saturated weight of the contact's points
         hold = tl.maximum(hold, firm * tl.load(grip + other_object(i, k, o)))
-    last = (dot(v, v) + extent * extent * dot(spin, spin)) / BRISK
+    last = (dot(v, v) + extent * extent * dot(spin, spin)) / FRICTION_CUTOFF_SPEED
     past_v, past_spin = add(past_v, v), add(past_spin, spin)
     moving = (dot(past_v, past_v) + extent * extent * dot(past_spin, past_spin)) / 4 + last * last
     kept = (moving * moving + 1e-16) / (moving * moving + 1e-16 + dt / FRAME * hold * hold * hold * hold)
@@ -134,12 +137,13 @@ def update_velocities(
     x = add(load3(own + POINT * n, n, inside), scale3(dt / 2, cross(spin, load3(own + ARM * n, n, inside))))
     far: tl.constexpr = float("inf")
     room = box + 6 * i
-    deepest = max3(where3(there, scale3(-1.0, x), -far))  # how deep points could get [m]: below the lower sides
-    up = scale3(2 / dt, sub(add(read3(room), deepest), (SINK, SINK, SINK)))
-    down = scale3(2 / dt, add(sub(read3(room + 3), max3(where3(there, x, -far))), (SINK, SINK, SINK)))
+    slack = (MAX_PENETRATION, MAX_PENETRATION, MAX_PENETRATION)
+    deepest = max3(where3(there, scale3(-1.0, x), -far))  # positions of the lowest points, negated [m]
+    up = scale3(2 / dt, sub(add(read3(room), deepest), slack))
+    down = scale3(2 / dt, add(sub(read3(room + 3), max3(where3(there, x, -far))), slack))
     free = 1 - tl.load(pinned + i).to(tl.float32)
-    v = (_guarded(v[0], up[0], down[0], RISE), _guarded(v[1], up[1], down[1], RISE),
-         _guarded(v[2], up[2], down[2], RISE))  # fmt: skip
+    v = (_guarded(v[0], up[0], down[0], MAX_RECOVERY_SPEED), _guarded(v[1], up[1], down[1], MAX_RECOVERY_SPEED),
+         _guarded(v[2], up[2], down[2], MAX_RECOVERY_SPEED))  # fmt: skip
     v = scale3(free, v)
     L = scale3(free, L)
     c, q = drift(read3(now + COM), read4(now + QUAT), v, L, read9(inverse + 9 * i), dt / 2)
@@ -163,7 +167,7 @@ def update_velocities(
 
 @triton.jit
 def _spread(touch, arm, share, size):
-    """What the points feel, as one matrix (its virial) times their arms."""
+    """Affine field with the virial of the contact accelerations: the symmetric virial matrix times the arms."""
     a, b, c = scale3(share, touch)
     x, y, z = sum3(scale3(a, arm)), sum3(scale3(b, arm)), sum3(scale3(c, arm))
     M = (2 * x[0], x[1] + y[0], x[2] + z[0], x[1] + y[0], 2 * y[1], y[2] + z[1], x[2] + z[0], y[2] + z[1], 2 * z[2])
@@ -172,7 +176,7 @@ def _spread(touch, arm, share, size):
 
 @triton.jit
 def _split(a, high, low, scale, n, mask):
-    """Vectors as the sum of two of half precision, 22 bits, times what makes the largest of them 1,024."""
+    """Write vectors as sums of two half-precision parts (22 bits), in units in which the largest is 1,024."""
     most = max3((tl.abs(a[0]), tl.abs(a[1]), tl.abs(a[2])))
     for axis in tl.static_range(3):
         unit = tl.maximum(most[axis], 1e-30) / 1024
@@ -186,9 +190,9 @@ def _split(a, high, low, scale, n, mask):
 @triton.jit
 def update_displacements(
     field, stress, arm, valid, share, size, inverse, stiffness, damping, pinned, u, du, n, dt,
-    FASTEST: tl.constexpr, FARTHEST: tl.constexpr, BLOCK: tl.constexpr,
+    MAX_SPEED: tl.constexpr, MAX_DISPLACEMENT: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Displacements and their rates after a stress field, of which mean and net rotation do not count."""
+    """Update displacements and their rates by internal accelerations, after removing their mean and net rotation."""
     i = tl.program_id(0)
     r = tl.arange(0, BLOCK)
     inside = r < n
@@ -206,8 +210,8 @@ def update_displacements(
     rate = add(rate, scale3(dt, sub(a, scale3(k, shift))))
     rate = scale3(1 / (1 + dt * c + dt * dt / 2 * k), rate)
     free = 1 - tl.load(pinned + i).to(tl.float32)
-    rate = scale3(free, clamp_displacements(rate, FASTEST * extent, FARTHEST))
-    shift = clamp_displacements(add(shift, scale3(dt / 2, rate)), extent, FARTHEST)
+    rate = scale3(free, clamp_displacements(rate, MAX_SPEED * extent, MAX_DISPLACEMENT))
+    shift = clamp_displacements(add(shift, scale3(dt / 2, rate)), extent, MAX_DISPLACEMENT)
     at = (i * n + r) * 3
     store3(u + at, 1, shift, inside)
     store3(du + at, 1, rate, inside)

@@ -1,1 +1,1 @@
-"""Material point method kernels."""
+"""Material point method: transfers, grid boundary conditions, constitutive models and two launch orders, in Warp."""

@@ -120,8 +120,8 @@ class _Step:
         inner, planes = self._new(bodies.FIELD_SIZE.value, self.n), self._new(2, self.n)
         bodies.drift_half_step[(self.objects,)](
             *(x.contiguous() for x in state), self.arm, self.normal, self.valid, self.size, self.inverse, self.pinned,
-            self.box, body, moved, inner, planes, self.o, self.n, self.dt, FARTHEST=MAX_DISPLACEMENT,
-            FAR=near.NO_CONTACT,
+            self.box, body, moved, inner, planes, self.o, self.n, self.dt, MAX_DISPLACEMENT=MAX_DISPLACEMENT,
+            NO_CONTACT=near.NO_CONTACT,
             FRAME=FRAME, **self.whole,
         )  # fmt: skip
         return body, moved, inner, planes
@@ -132,25 +132,25 @@ class _Step:
         many = self._count(m)
         if m:
             meeting.gather_candidates[(self.objects, m)](
-                body, moved, self.valid, close, which, many, o, n, SEEN=near.SEARCH_RADIUS, **self.whole
+                body, moved, self.valid, close, which, many, o, n, SEARCH_RADIUS=near.SEARCH_RADIUS, **self.whole
             )
             meeting.nearest_candidates[(self.objects * m, triton.cdiv(n, meeting.QUERY_BLOCK))](
-                body, moved, close, which, many, keys, partner, o, n, SEEN=near.SEARCH_RADIUS, FRAME=FRAME,
+                body, moved, close, which, many, keys, partner, o, n, SEARCH_RADIUS=near.SEARCH_RADIUS, FRAME=FRAME,
                 QUERY_BLOCK=meeting.QUERY_BLOCK, CANDIDATE_CHUNK=meeting.CANDIDATE_CHUNK,
             )  # fmt: skip
         count, felt = self._count(self.kinds), self._new(self.kinds, 3, n)
         point, theirs = self._count(self.slots), self._count(self.slots)
         meeting.select_contacts[(self.objects, self.kinds)](
             keys, planes, which, partner, many, self.valid, count, point, theirs, felt, *self.lists,
-            PAIR=near.PAIR_FRACTION,
-            WALL=near.WALL_FRACTION, FAR=near.NO_CONTACT, **self.whole,
+            PAIR_FRACTION=near.PAIR_FRACTION,
+            WALL_FRACTION=near.WALL_FRACTION, NO_CONTACT=near.NO_CONTACT, **self.whole,
         )  # fmt: skip
         record = self._new(self.slots * places.COLUMNS.value)
         places.contact_features[(self.objects, self.places)](
             body, moved, count, point, theirs, record, self.spacing, self.mass_fraction, self.size, self.mass,
             self.gravity,
-            self.box, *self.lists, NEAR=near.FULL_CONTACT, FAR=near.NO_CONTACT, CLOSE=near.GAP_UNIT,
-            LEVER=near.ARM_UNIT, FRAME=FRAME,
+            self.box, *self.lists, FULL_CONTACT=near.FULL_CONTACT, NO_CONTACT=near.NO_CONTACT, GAP_UNIT=near.GAP_UNIT,
+            ARM_UNIT=near.ARM_UNIT, FRAME=FRAME,
             ROWS=ROWS, num_warps=2,
         )  # fmt: skip
         return count, point, felt, record
@@ -170,8 +170,9 @@ class _Step:
         grip = self._new()
         touching.aggregate_messages[(self.objects,)](
             self.code, heard, total, _layers(field.status[0], field.status[2]), *_layers(field.hold), listened,
-            scale, status, grip, *self.lists, GRIP=CONTACT_SATURATION, HOLD=MAX_FRICTION_SPEED, ROWS=ROWS,
-            BLOCKS=triton.next_power_of_2(self.floor), H=h, num_warps=8,
+            scale, status, grip, *self.lists, CONTACT_SATURATION=CONTACT_SATURATION,
+            MAX_FRICTION_SPEED=MAX_FRICTION_SPEED, ROWS=ROWS, BLOCKS=triton.next_power_of_2(self.floor), H=h,
+            num_warps=8,
         )  # fmt: skip
         touching.update_contacts[(self.objects, self.kinds)](
             listened, status, _layers(field.between[0], field.between[2]),
@@ -181,8 +182,8 @@ class _Step:
         mouths = (_layers(net.say[0], net.say[2]) for net in (pair, plane))
         touching.decode_forces[(self.objects, self.places)](
             record, count, point, *mouths, inputs, message, weight, scale, felt, parts, *self.lists,
-            STRENGTH=ACCELERATION_UNIT,
-            LEAVING=SEPARATION_SPEED, CLOSE=near.GAP_UNIT, LEVER=near.ARM_UNIT, **self.network,
+            ACCELERATION_UNIT=ACCELERATION_UNIT,
+            SEPARATION_SPEED=SEPARATION_SPEED, GAP_UNIT=near.GAP_UNIT, ARM_UNIT=near.ARM_UNIT, **self.network,
         )  # fmt: skip
         return known, parts, grip, scale
 
@@ -197,9 +198,10 @@ class _Step:
         kicks.update_velocities[(self.objects,)](
             body, moved, inner, parts, felt, *grip, *pushed, self.arm, self.valid, self.mass_fraction, self.size,
             self.mass, self.inverse, self.pinned, self.gravity, self.box, com, quat, velocity, momentum, high, low,
-            scale, o, n, self.dt, self.places, self.wide, PUSHED=self.external.object.shape[1] > 0,
-            GRIP=CONTACT_SATURATION, SINK=MAX_PENETRATION, RISE=MAX_RECOVERY_SPEED, FASTEST=MAX_SPEED,
-            WILDEST=MAX_SPIN, BRISK=FRICTION_CUTOFF_SPEED, FRAME=FRAME,
+            scale, o, n, self.dt, self.places, self.wide, HAS_EXTERNAL=self.external.object.shape[1] > 0,
+            CONTACT_SATURATION=CONTACT_SATURATION, MAX_PENETRATION=MAX_PENETRATION,
+            MAX_RECOVERY_SPEED=MAX_RECOVERY_SPEED, MAX_SPEED=MAX_SPEED, MAX_SPIN=MAX_SPIN,
+            FRICTION_CUTOFF_SPEED=FRICTION_CUTOFF_SPEED, FRAME=FRAME,
             BLOCKS=triton.next_power_of_2(self.places - (o - 1) * self.wide), **self.whole,
         )  # fmt: skip
         mean = thin.split_matmul(scene.shape.blur.flatten(0, 1).flatten(1, 2), high.flatten(0, 1), low.flatten(0, 1))
@@ -212,13 +214,14 @@ class _Step:
         straining.internal_accelerations[(self.objects, blocks)](
             record, known, scene.compliance_scale.contiguous(), _layers(stress.see), _layers(stress.say[0],
             stress.say[2]),
-            field, n, blocks, self.kinds, HARDEST=MAX_SPRING_WEIGHT, HEAVIEST=MAX_DAMPER_WEIGHT, **self.network,
+            field, n, blocks, self.kinds, MAX_SPRING_WEIGHT=MAX_SPRING_WEIGHT,
+            MAX_DAMPER_WEIGHT=MAX_DAMPER_WEIGHT, **self.network,
         )  # fmt: skip
         u, du = self._new(n, 3), self._new(n, 3)
         stiffness, damping = scene.stiffness.contiguous(), scene.damping.contiguous()
         kicks.update_displacements[(self.objects,)](
             inner, field, self.arm, self.valid, self.mass_fraction, self.size, self.inverse, stiffness, damping,
             self.pinned,
-            u, du, n, self.dt, FASTEST=MAX_SPEED, FARTHEST=MAX_DISPLACEMENT, **self.whole,
+            u, du, n, self.dt, MAX_SPEED=MAX_SPEED, MAX_DISPLACEMENT=MAX_DISPLACEMENT, **self.whole,
         )  # fmt: skip
         return BodyState(com, quat, velocity, momentum, u, du)

@@ -50,6 +50,7 @@ OBJECTS = {
 }
 
 
+POINT_CLOUD = "point_cloud/iteration_30000/point_cloud.ply"  # in the folder of an object or scene
 ELEVATION = {"cloth": 52.0, "pillow": 38.0, "rope": 46.0, "bowl": 34.0}  # of the camera [deg], for what lies flat
 
 

@@ -19,9 +19,9 @@ from stages.core.scene.gaussians import Gaussians, concatenate
 from stages.core.scene.images import resize
 from stages.core.scene.scene import Scene, SceneObject
 from stages.core.scene.scene_ply import write_scene
+from stages.lab.assets.objects import POINT_CLOUD
 from stages.render.overlay import draw_caption
 
-POINT_CLOUD = "point_cloud/iteration_30000/point_cloud.ply"
 VIEWS, RESOLUTION = 100, 1280  # of cameras.json, as the data set renders
 SHEET_BACKGROUND = torch.tensor([0.955, 0.95, 0.94])  # behind the pictures
 

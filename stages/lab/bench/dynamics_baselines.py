@@ -24,7 +24,7 @@ from stages.lab.bench import common as bench
 from stages.lab.dataset.keypoint_motions import KeypointMotions, concatenate_motions
 from stages.lab.dataset.object_particles import Asset, Discretisation, load_assets
 from stages.lab.dataset.scene_configs import SceneConfig, read_scene_configs
-from stages.lab.dataset.simulation import simulate
+from stages.lab.dataset.simulation import SimulationSettings, simulate
 from stages.lab.training.data import motions_folder
 
 log = logging.getLogger(__name__)
@@ -122,7 +122,8 @@ class Resimulation:
         return bench.median_seconds(lambda: list(self._parts(one, steps + 1, 1)), self.device, 1)
 
     def _parts(self, configs: dict[str, SceneConfig], frames: int, keypoints: int) -> Iterator[KeypointMotions]:
-        for part in simulate(configs, self.things, self.fineness, frames, keypoints, self.device):
+        settings = SimulationSettings(self.fineness, frames, keypoints, self.device)
+        for part in simulate(configs, self.things, settings):
             yield part.to("cpu")
 
     def _config(self, name: str) -> SceneConfig:

@@ -1,4 +1,4 @@
-"""The orbit from which the data set is seen."""
+"""The camera orbit from which the scenes of the data set are rendered."""
 
 from __future__ import annotations
 
@@ -8,13 +8,17 @@ from stages.core.geometry.cameras import intrinsics, orbit
 from stages.core.scene.cameras import Cameras
 from stages.lab.dataset.layout import ORBIT_VIEWS
 
-ORBIT_CENTRE, ORBIT_RADIUS, ORBIT_ELEVATION = (0.0, 0.0, -0.3), 4.0, 20.0  # [m], [deg]
-RELATIVE_FOCAL = 1.5  # focal length over the side of the picture
+ORBIT_CENTRE, ORBIT_RADIUS, ORBIT_ELEVATION = (0.0, 0.0, -0.3), 4.0, 20.0  # [m], [m], [deg]
+RELATIVE_FOCAL = 1.5  # focal length divided by the image width
 
 
 def orbit_cameras(resolution: int) -> Cameras:
-    """All of it; camera i has azimuth 120 + 3.6 i degrees."""
+    """All cameras of the orbit for square images of `resolution` px; camera i has azimuth 120 + 3.6 i degrees.
+
+    Source: public code of NGFF.
+    """
     viewmats = orbit(ORBIT_VIEWS, torch.tensor(ORBIT_CENTRE), ORBIT_RADIUS, ORBIT_ELEVATION)
     K = intrinsics(resolution, resolution, RELATIVE_FOCAL * resolution)
     sizes = torch.full((ORBIT_VIEWS, 2), resolution)
-    return Cameras(viewmats, K.expand(ORBIT_VIEWS, 3, 3).clone(), sizes, tuple(f"{i:05d}" for i in range(ORBIT_VIEWS)))
+    names = tuple(f"{i:05d}" for i in range(ORBIT_VIEWS))
+    return Cameras(viewmats, K.expand(ORBIT_VIEWS, 3, 3).clone(), sizes, names)

@@ -1,10 +1,11 @@
-"""Every Gaussian of a scene in every frame: carried by the particles, stored as published.
+"""Every Gaussian of a scene in every frame, skinned to the simulated particles and stored in the published format.
 
-    mpm/<group>/<scene>/0000.h5 ...   pos (n,3); cov3D (n,6): xx xy xz yy yz zz; rot (n,3,3): the rotation, transposed
+    mpm/<group>/<scene>/0000.h5 ...   pos (n,3); cov3D (n,6): xx xy xz yy yz zz; rot (n,3,3): the transposed rotation
     shs.h5 "shs" (n,9,3)  opacity.h5 "opacity" (n,1)                                        all of them float16
 
-Rows are the Gaussians of the scene with opacity above 0.02, in the order of the objects. The published solver has a
-particle for each; where ours has fewer, a Gaussian follows the eight particles around it at rest.
+Rows are the Gaussians of the scene with opacity above 0.02, in the order of the objects. The published solver has one
+particle per Gaussian; here there may be fewer particles, and a Gaussian follows the eight particles nearest to it in
+the rest pose. Source of the format: public code of NGFF.
 """
 
 from __future__ import annotations
@@ -29,81 +30,89 @@ from stages.lab.dataset.layout import Layout, object_kind
 from stages.lab.dataset.object_particles import MIN_OPACITY, Asset, at_scale_prior
 from stages.lab.dataset.scene_configs import SceneConfig
 
-SH_COEFFICIENTS = 9  # SH coefficients that are stored
+SH_COEFFICIENTS = 9  # stored per channel (degree 2)
 FLOOR_HEIGHT = -0.94  # [m]
 
 
 @dataclass(frozen=True)
 class ObjectSkin:
-    """The Gaussians of an object about the origin, and the particles that each follows."""
+    """Gaussians of one object about the origin, and the binding of the opaque ones to its particles."""
 
-    whole: Gaussians  # all of them
-    shown: Gaussians  # those that count as matter
+    gaussians: Gaussians  # all of them
+    opaque: Gaussians  # n of them, those with opacity above MIN_OPACITY
     index: Tensor  # (n, 8) int32, rows of the object's particles
     weight: Float[Tensor, "n 8"]
 
 
-def load_skins(layout: Layout, things: Mapping[int, Asset]) -> dict[int, ObjectSkin]:
-    """Of all objects by id, from the data set's own files."""
+def load_skins(layout: Layout, assets: Mapping[int, Asset]) -> dict[int, ObjectSkin]:
+    """The skin of every object by id, from the object files of the data set."""
     out = {}
-    for i, asset in things.items():
+    for i, asset in assets.items():
         kind = object_kind(i)
-        whole = at_scale_prior(read_scene(layout.object(kind.name)).gaussians, kind.scale)
-        shown = whole[whole.opacities > MIN_OPACITY]
-        index, weight = nearest_weights(asset.points, shown.means, KEYPOINTS_PER_GAUSSIAN)
-        out[i] = ObjectSkin(whole, shown, index.int().contiguous(), weight.contiguous())
+        gaussians = at_scale_prior(read_scene(layout.object(kind.name)).gaussians, kind.scale)
+        opaque = gaussians[gaussians.opacities > MIN_OPACITY]
+        index, weight = nearest_weights(asset.points, opaque.means, KEYPOINTS_PER_GAUSSIAN)
+        out[i] = ObjectSkin(gaussians, opaque, index.int().contiguous(), weight.contiguous())
     return out
 
 
-def rest_scene(
-    config: SceneConfig, covers: Mapping[int, ObjectSkin], shown: bool = True, provenance: dict | None = None
-) -> Scene:
-    """A scene at its start; object ids count from 1 in the order of the configuration."""
+def compose_scene(config: SceneConfig, bodies: Sequence[Gaussians], provenance: dict | None = None) -> Scene:
+    """Scene of the given Gaussians, one entry per object about the origin, at their start positions.
+
+    Object ids count from 1 in the order of the configuration.
+    """
     parts, objects = [], []
-    for n, (i, p) in enumerate(zip(config.ids, config.translation, strict=True), start=1):
-        g = covers[i].shown if shown else covers[i].whole
+    for n, (i, p, g) in enumerate(zip(config.ids, config.translation, bodies, strict=True), start=1):
         parts.append(replace(g, means=g.means + torch.tensor(p), object_id=torch.full((len(g),), n)))
         objects.append(SceneObject(n, object_kind(i).name))
     return Scene(concatenate(parts), tuple(objects), None, FLOOR_HEIGHT, provenance=provenance or {})
 
 
-class SkinnedScene:
-    """A scene whose Gaussians follow its particles."""
+def opaque_rest_gaussians(config: SceneConfig, skins: Mapping[int, ObjectSkin]) -> Gaussians:
+    """The opaque Gaussians of a scene in its first frame."""
+    return compose_scene(config, [skins[i].opaque for i in config.ids]).gaussians
 
-    def __init__(self, config: SceneConfig, covers: Mapping[int, ObjectSkin], things: Mapping[int, Asset], device: str):
-        self.rest = rest_scene(config, covers).gaussians.to(device)
+
+class SkinnedScene:
+    """The opaque Gaussians of a scene, skinned to its particles."""
+
+    def __init__(self, config: SceneConfig, skins: Mapping[int, ObjectSkin], assets: Mapping[int, Asset], device: str):
+        self.rest = opaque_rest_gaussians(config, skins).to(device)
         index, start = [], 0
         for i in config.ids:
-            index.append(covers[i].index + start)
-            start += len(things[i].points)
+            index.append(skins[i].index + start)
+            start += len(assets[i].points)
         self._index = torch.cat(index).to(device)
-        self._weight = torch.cat([covers[i].weight for i in config.ids]).to(device)
-        bodies = [things[i].points + torch.tensor(p) for i, p in zip(config.ids, config.translation, strict=True)]
+        self._weight = torch.cat([skins[i].weight for i in config.ids]).to(device)
+        bodies = [assets[i].points + torch.tensor(p) for i, p in zip(config.ids, config.translation, strict=True)]
         self._particles = torch.cat(bodies).to(device)
 
     def at(self, x: Float[Tensor, "p 3"], F: Float[Tensor, "p 3 3"]) -> tuple[Gaussians, Float[Tensor, "n 3 3"]]:
-        """The Gaussians when the particles are there and deformed so, and how each is turned; SH are not."""
-        g, one = self.rest, torch.eye(3, device=x.device)
+        """The deformed Gaussians and the rotation of each, for particle positions [m] and deformation gradients.
+
+        Spherical harmonics are not rotated (as published).
+        """
+        g, identity = self.rest, torch.eye(3, device=x.device)
         means, quats, scales, R = skin_gaussians(self._index, self._weight, self._particles, x - self._particles,
-                                                 F - one, g.means.contiguous(), g.quats.contiguous(),
+                                                 F - identity, g.means.contiguous(), g.quats.contiguous(),
                                                  g.scales.contiguous())  # fmt: skip
         return replace(g, means=means, quats=quats, scales=scales), R
 
 
 def write_frames(folder: Path, scene: SkinnedScene, x: Sequence[Tensor], F: Sequence[Tensor]) -> None:
-    """The published files of a scene, frame by frame."""
+    """Write the published files of a scene from the positions (p, 3) and deformation gradients (p, 3, 3) per frame."""
     g = scene.rest
     sh = torch.nn.functional.pad(g.sh[:, :SH_COEFFICIENTS], (0, 0, 0, max(0, SH_COEFFICIENTS - g.sh.shape[1])))
     _write(folder / "shs.h5", shs=sh)
     _write(folder / "opacity.h5", opacity=g.opacities[:, None])
-    for t, (places, gradients) in enumerate(zip(x, F, strict=True)):
-        now, R = scene.at(places, gradients)
-        cov = covariance(now.quats, now.scales)[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
-        _write(folder / f"{t:04d}.h5", pos=now.means, cov3D=cov, rot=R.mT)
+    for t, (positions, gradients) in enumerate(zip(x, F, strict=True)):
+        deformed, R = scene.at(positions, gradients)
+        cov = covariance(deformed.quats, deformed.scales)[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+        _write(folder / f"{t:04d}.h5", pos=deformed.means, cov3D=cov, rot=R.mT)
 
 
 def _write(path: Path, **tensors: Tensor) -> None:
-    """By way of memory: HDF5 does not survive a full disk."""
+    """Write datasets through memory: HDF5 crashes when the disk fills up while it writes."""
     memory = io.BytesIO()
     with h5py.File(memory, "w") as file:
         for name, tensor in tensors.items():

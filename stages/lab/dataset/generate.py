@@ -1,7 +1,7 @@
-"""GSCollision again: scenes of falling objects, simulated in batches, in the published layout (dataset_layout.py).
+"""Generation of GSCollision: scenes of falling objects, simulated in batches, in the published layout (layout.py).
 
-Every file appears whole or not at all, so that a run can be stopped at any moment and begun again: what is there is
-left as it is. Fewer Gaussians than published may be particles: see stages/lab/results/dataset.md.
+Files and folders appear complete or not at all, so a run can be killed at any time and started again; existing files
+are kept. Fewer particles than the published Gaussians are simulated: see stages/lab/dataset/README.md.
 """
 
 from __future__ import annotations
@@ -34,29 +34,29 @@ from stages.lab.dataset.scene_configs import (
     sample_group,
     write_scene_configs,
 )
-from stages.lab.dataset.simulation import simulate
+from stages.lab.dataset.simulation import SimulationSettings, simulate
 
 if TYPE_CHECKING:
     from stages.lab.dataset.scene_files import SceneAssets
 
 
 def run(out: Path, options: DatasetOptions) -> None:
-    """Write what is missing of the data set."""
-    maker = DatasetGenerator(Path(out), options)
-    maker.shared()
-    require_disk_space(maker.layout.root, missing_bytes(maker.layout, options))
-    for group in options.mine:
-        maker.group(group)
+    """Write all missing files of the data set; raises InputError when the disk is too small or settings differ."""
+    generator = DatasetGenerator(Path(out), options)
+    generator.make_shared()
+    require_disk_space(generator.layout.root, missing_bytes(generator.layout, options))
+    for group in options.shard_groups:
+        generator.make_group(group)
     print(f"{out}: complete")
 
 
 def check(out: Path) -> None:
-    """Say that all files of a data set are as they were written; raises InputError when they are not."""
-    print(f"{out}: {manifest.verify_files(Path(out))} files, all as they were written")
+    """Verify the sha256 of all files of a data set; raises InputError when one is missing, changed or not listed."""
+    print(f"{out}: {manifest.verify_files(Path(out))} files, all unchanged")
 
 
 class DatasetGenerator:
-    """Makes the parts of a data set; what they need is made or read when it is first asked for."""
+    """Generates the parts of a data set; shared inputs are made or read on first use."""
 
     def __init__(self, out: Path, options: DatasetOptions):
         self.layout, self.options, self.device = Layout(out), options, pick_device(options.device)
@@ -64,55 +64,61 @@ class DatasetGenerator:
         manifest.open_manifest(out, options.settings)
 
     @cached_property
-    def things(self) -> dict[int, Asset]:
-        return load_assets(self.options.fineness, self.options.keypoints, self.layout.root / "particles.npz")
+    def assets(self) -> dict[int, Asset]:
+        """The objects as particles, by id."""
+        return load_assets(self.options.discretisation, self.options.keypoints, self.layout.root / "particles.npz")
 
     @cached_property
-    def wardrobe(self) -> SceneAssets:
+    def scene_assets(self) -> SceneAssets:
+        """Particles, skins and backgrounds of the scene files."""
         from stages.lab.dataset.scene_files import SceneAssets
 
-        names = self.options.tables if "backgrounds" in self.options.parts else ()
+        names = self.options.background_names if "backgrounds" in self.options.parts else ()
         tables = {n: read_scene(self.layout.background(n)).gaussians.to(self.device) for n in names}
-        return SceneAssets(self.things, load_skins(self.layout, self.things), tables)
+        return SceneAssets(self.assets, load_skins(self.layout, self.assets), tables)
 
-    def shared(self) -> None:
-        """Objects and backgrounds."""
+    def make_shared(self) -> None:
+        """Write missing objects and backgrounds."""
         layout, parts = self.layout, self.options.parts
-        places = [layout.root / name for name in ("objects", "backgrounds")]
-        _clear(places)
+        folders = [layout.root / name for name in ("objects", "backgrounds")]
+        _remove_partial(folders)
         kinds = [n for n in objects.OBJECTS if "objects" in parts and not layout.object(n).exists()]
-        tables = [n for n in self.options.tables if "backgrounds" in parts and not layout.background(n).exists()]
+        tables = [n for n in self.options.background_names if "backgrounds" in parts]
+        tables = [n for n in tables if not layout.background(n).exists()]
         if kinds:
-            list(objects.run(layout.root / "objects", objects.ObjectsOptions(",".join(kinds))))
+            list(objects.run(layout.root / "objects", objects.ObjectsOptions(only=",".join(kinds))))
         if tables:
             list(backgrounds.run(layout.root / "backgrounds", ",".join(tables)))
-        self._seal("shared", places)
+        self._write_checksums("shared", folders)
 
-    def group(self, group: str) -> None:
-        """All parts of a group of scenes."""
+    def make_group(self, group: str) -> None:
+        """Write all missing parts of one group of scenes."""
         layout, parts = self.layout, {*self.options.parts}
-        mine = [layout.config(group), layout.motions(group), *(layout.root / part / group for part in SCENE_PARTS)]
-        _clear(mine)
-        self._seal(group, mine)  # what is gone or was not listed when a run was killed
+        paths = [layout.config(group), layout.motions(group), *(layout.root / part / group for part in SCENE_PARTS)]
+        _remove_partial(paths)
+        self._write_checksums(group, paths)  # bring the list up to date after a killed run or removed files
         if "scene_configs" in parts and not layout.config(group).exists():
-            layout.config(group).parent.mkdir(exist_ok=True)
-            configs = sample_group(group, placement_extents(self.things))
-            write_scene_configs(
-                layout.config(group), perturbed(configs, self.options.nudge) if self.options.nudge else configs
-            )
+            self._write_configs(group)
         if "motions" in parts:
-            self._motions(group)
+            self._write_motions(group)
         if parts & {*SCENE_PARTS}:
-            from stages.lab.dataset.scene_files import write_scene_files  # motions alone need no codec
+            from stages.lab.dataset.scene_files import GroupFiles, write_scene_files  # needs a video codec
 
-            write_scene_files(layout, self.options, group, self._configs(group), lambda: self.wardrobe, self.device)
-        self._seal(group, mine)
+            files = GroupFiles(layout, self.options, group, self.device)
+            write_scene_files(files, self._configs(group), lambda: self.scene_assets)
+        self._write_checksums(group, paths)
 
     def _configs(self, group: str) -> dict[str, SceneConfig]:
         rows = list(read_scene_configs(self.layout.config(group)).items())
         return dict(rows[: self.options.limit or None])
 
-    def _motions(self, group: str) -> None:
+    def _write_configs(self, group: str) -> None:
+        path, nudge = self.layout.config(group), self.options.nudge
+        path.parent.mkdir(exist_ok=True)
+        configs = sample_group(group, placement_extents(self.assets))
+        write_scene_configs(path, perturbed(configs, nudge) if nudge else configs)
+
+    def _write_motions(self, group: str) -> None:
         path, o = self.layout.motions(group), self.options
         if path.exists():
             limit = read_provenance(path).get("options", {}).get("limit", 0)
@@ -120,30 +126,31 @@ class DatasetGenerator:
                 raise InputError(f"{path}: was made with --limit {limit}, not {o.limit}; remove it to make it again")
             return
         path.parent.mkdir(exist_ok=True)
-        configs, start, made = self._configs(group), time.perf_counter(), 0
-        source = provenance("dataset", [self.layout.config(group)], o)
-        parts = simulate(configs, self.things, o.fineness, o.frames, o.keypoints, self.device, o.repeatable)
-        with tqdm(total=len(configs), desc=group, unit="scene") as bar, KeypointMotionsWriter(path, source) as motions:
-            for part in parts:
-                motions.append(part)
-                made += len(part)
-                bar.update(len(part))
-        took = time.perf_counter() - start
-        print(f"{group}: {made} scenes in {took:.1f} s, {60 * made / took:.0f} a minute", flush=True)
+        configs, start, count = self._configs(group), time.perf_counter(), 0
+        made_by = provenance("dataset", [self.layout.config(group)], o)
+        settings = SimulationSettings(o.discretisation, o.frames, o.keypoints, self.device, o.deterministic)
+        bar = tqdm(total=len(configs), desc=group, unit="scene")
+        with bar, KeypointMotionsWriter(path, made_by) as writer:
+            for batch in simulate(configs, self.assets, settings):
+                writer.append(batch)
+                count += len(batch)
+                bar.update(len(batch))
+        seconds = time.perf_counter() - start
+        print(f"{group}: {count} scenes in {seconds:.1f} s, {60 * count / seconds:.0f} per minute", flush=True)
 
-    def _seal(self, name: str, places: list[Path]) -> None:
-        manifest.write_checksums(self.layout.root, name, [file for place in places for file in _files(place)])
-
-
-def _files(place: Path) -> Iterator[Path]:
-    if place.is_file():
-        yield place
-    yield from (p for p in place.rglob("*") if p.is_file())
+    def _write_checksums(self, name: str, paths: list[Path]) -> None:
+        manifest.write_checksums(self.layout.root, name, [file for path in paths for file in _files(path)])
 
 
-def _clear(places: list[Path]) -> None:
-    """Remove what a killed run had begun to write in folders, or beside files."""
-    for place in places:
-        begun = place.parent.glob(f".part-{place.name}") if place.suffix else place.rglob(".part-*")
-        for p in sorted(begun, key=lambda p: len(p.parts), reverse=True):
+def _files(path: Path) -> Iterator[Path]:
+    if path.is_file():
+        yield path
+    yield from (p for p in path.rglob("*") if p.is_file())
+
+
+def _remove_partial(paths: list[Path]) -> None:
+    """Remove the `.part-*` files and folders of a killed run, inside folders or beside files."""
+    for path in paths:
+        partial = path.parent.glob(f".part-{path.name}") if path.suffix else path.rglob(".part-*")
+        for p in sorted(partial, key=lambda p: len(p.parts), reverse=True):
             shutil.rmtree(p) if p.is_dir() else p.unlink()

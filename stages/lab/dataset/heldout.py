@@ -1,11 +1,12 @@
-"""Scenes of other objects than the ten: eight that no model learns from, any meshes, or more to learn from.
+"""Scenes of objects other than the ten: eight that are never trained on, any meshes, or more objects for training.
 
-    OUT/scene_configs/heldout.json     where every object starts, sampled as for the data set
-    OUT/motions/heldout.h5             keypoints in every frame, as `ngff-lab dataset` writes
-    OUT/particles_heldout.npz          the objects as particles, kept for the next run
+    OUT/scene_configs/heldout.json     start position of every object, sampled as for the data set
+    OUT/motions/heldout.h5             keypoint trajectories, as `ngff-lab dataset` writes
+    OUT/particles_heldout.npz          the objects as particles, cached for the next run
 
-To learn from are the groups `varied`, hollow shapes at random as the ten are hollow; `solid`, such shapes filled, as
-what is simulated of photos is; and `turned`, the ten each turned at random, which they never are in the data set.
+The groups for training are `varied`: random hollow shapes (the ten are hollow too); `solid`: filled random shapes,
+like the bodies simulated from photos; and `turned`: the ten, each randomly rotated, which they never are in the data
+set.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from stages.core.geometry.rotations import matrix
 from stages.core.models.field.solidity import solidity
 from stages.core.physics.keypoints import farthest_points
 from stages.core.physics.materials import choose_materials
-from stages.core.scene.files import provenance, replacing
+from stages.core.scene.files import provenance
 from stages.core.scene.scene import SceneObject
 from stages.lab.assets.heldout_shapes import HELDOUT_SHAPES, ShapeKind, surface_and_interior_points, surface_points
 from stages.lab.assets.random_shapes import random_shapes
@@ -52,178 +53,180 @@ from stages.lab.dataset.scene_configs import (
     sample_scene,
     write_scene_configs,
 )
-from stages.lab.dataset.simulation import simulate
+from stages.lab.dataset.simulation import SimulationSettings, simulate
 
 log = logging.getLogger(__name__)
-FIRST_SCENE = {
-    HELDOUT: 10_000,
-    VARIED: 20_000,
-    SOLID: 30_000,
-    ROTATED: 40_000,
-}  # index of the first scene, and its seed
-SHAPE_SEEDS = {VARIED: 0, SOLID: 1}  # of shapes at random
-FIRST_MESH_ID, FIRST_ROTATED_ID = 100, 2000  # id of the first mesh, and of the first turned object
-PARTICLES_PER_CELL_AXIS = 1.5  # particles of solid bodies in a cell, along each axis
-SURFACE_POINTS = 30_000  # points of a shape that particles are chosen among
-MAX_YOUNG = 2e7  # that the published substep bears, as of the phone [Pa]
+FIRST_SCENE = {HELDOUT: 10_000, VARIED: 20_000, SOLID: 30_000, ROTATED: 40_000}  # index, and seed, of the first scene
+SHAPE_SEEDS = {VARIED: 0, SOLID: 1}  # of random shapes
+FIRST_MESH_ID, FIRST_ROTATED_ID = 100, 2000  # object ids
+PARTICLES_PER_CELL_AXIS = 1.5  # of solid bodies
+SURFACE_POINTS = 30_000  # of a shape, from which particles are sampled
+MAX_YOUNG = 2e7  # stable at the published substep, as of the phone [Pa]
 
 
 @dataclass(frozen=True)
 class HeldoutOptions:
-    """What decides the data."""
+    """Which objects and scenes to make, and the settings of their simulation."""
 
     scenes: int = 100
-    objects: int = 3  # in each scene
+    objects: int = 3  # per scene
     frames: int = 100
-    keypoints: int = 2048
-    dx: float = 0.02
-    spacing: float = 0.009
-    substep: float = SUBSTEP
+    keypoints: int = 2048  # per object
+    dx: float = 0.02  # grid spacing [m]
+    spacing: float = 0.009  # between particles on a surface [m]
+    substep: float = SUBSTEP  # [s]
     size: float = 0.5  # longest side of a mesh [m]
-    shapes: int = 0  # drawn at random, with their materials, instead of the eight
-    solid: bool = False  # the shapes are filled
-    turned: int = 0  # ways in which the ten objects are turned, instead of the eight
+    shapes: int = 0  # random shapes and materials, instead of the eight
+    solid: bool = False  # fill the random shapes
+    turned: int = 0  # random rotations of the ten objects, instead of the eight
     device: str = "auto"
 
     def __post_init__(self):
         if self.scenes < 1 or not 1 <= self.objects <= 6:
             raise InputError(f"--scenes {self.scenes} --objects {self.objects}: at least one scene, of 1 to 6 objects")
         if not 0 <= self.shapes <= 1000:
-            raise InputError(f"--shapes {self.shapes}: 0 for the eight, or up to 1000 at random")
+            raise InputError(f"--shapes {self.shapes}: 0 for the eight, or up to 1000 random ones")
         if not 0 <= self.turned <= 1000:
-            raise InputError(f"--turned {self.turned}: 0 for the eight, or the ten objects turned in up to 1000 ways")
+            raise InputError(f"--turned {self.turned}: 0 for the eight, or up to 1000 rotations of the ten objects")
         if self.solid and not self.shapes or self.shapes and self.turned:
-            raise InputError("--solid needs --shapes, and --turned goes without")
+            raise InputError("--solid needs --shapes, and --turned cannot be combined with them")
         if not 0.1 <= self.size <= 1.0:
-            raise InputError(f"--size {self.size}: meshes are put into a room of 2 m; give 0.1 to 1 m")
+            raise InputError(f"--size {self.size}: from 0.1 to 1 m; objects are placed in a cube of 1.8 m")
 
     @property
     def group(self) -> str:
+        """Name of the group of scenes."""
         return SOLID if self.solid else VARIED if self.shapes else ROTATED if self.turned else HELDOUT
 
     @property
-    def fineness(self) -> Discretisation:
+    def discretisation(self) -> Discretisation:
+        """Grid spacing, particle spacing and substep of the simulation."""
         return Discretisation(self.dx, self.spacing, self.substep)
 
 
 def run(out: Path, options: HeldoutOptions = HeldoutOptions(), meshes: list[Path] | None = None) -> str:
-    """Write the group; what is there is left as it is. A line about it."""
+    """Write one group of scenes and return a one-line summary; an existing group is kept.
+
+    Raises InputError when meshes are combined with --shapes or --turned, or a mesh cannot be read.
+    """
     group = options.group
     file, motions = Path(out) / "scene_configs" / f"{group}.json", Path(out) / "motions" / f"{group}.h5"
     if meshes and (options.shapes or options.turned):
-        raise InputError("--from and --shapes or --turned: choose one; meshes take the place of other objects")
+        raise InputError("--from cannot be combined with --shapes or --turned")
     if motions.exists():
-        return f"{motions}: is there"
+        return f"{motions}: exists already"
     for folder in (file.parent, motions.parent):
         folder.mkdir(parents=True, exist_ok=True)
     device, start = pick_device(options.device), time.perf_counter()
-    kept = Path(out) / f"particles_{group}.npz"
-    if meshes:
-        things = mesh_assets(meshes, options)
-    elif options.turned:
-        ten = object_particles.load_assets(options.fineness, options.keypoints, kept)
-        things = rotated_assets(ten, options.turned, options.fineness)
-    else:
-        table = random_shapes(options.shapes, SHAPE_SEEDS[group]) if options.shapes else HELDOUT_SHAPES
-        things = load_shape_assets(table, options.fineness, options.keypoints, kept, options.solid)
-    configs = sample_configs(things, options.scenes, options.objects, FIRST_SCENE[group])
+    assets = _assets(options, meshes, Path(out) / f"particles_{group}.npz")
+    configs = sample_configs(assets, options.scenes, options.objects, FIRST_SCENE[group])
     write_scene_configs(file, configs)
-    made, count = provenance("heldout", [file, *(meshes or [])], options), 0
+    made_by, count = provenance("heldout", [file, *(meshes or [])], options), 0
+    settings = SimulationSettings(options.discretisation, options.frames, options.keypoints, device)
     bar = tqdm(total=len(configs), desc=group, unit="scene")
-    with bar, KeypointMotionsWriter(motions, made) as writer:
-        for part in simulate(configs, things, options.fineness, options.frames, options.keypoints, device):
-            writer.append(part)
-            count += len(part)
-            bar.update(len(part))
-    return f"{motions}: {count} scenes of {len(things)} objects in {time.perf_counter() - start:.0f} s"
+    with bar, KeypointMotionsWriter(motions, made_by) as writer:
+        for batch in simulate(configs, assets, settings):
+            writer.append(batch)
+            count += len(batch)
+            bar.update(len(batch))
+    return f"{motions}: {count} scenes of {len(assets)} objects in {time.perf_counter() - start:.0f} s"
+
+
+def _assets(options: HeldoutOptions, meshes: list[Path] | None, cache: Path) -> dict[int, Asset]:
+    """The objects that the options choose."""
+    if meshes:
+        return mesh_assets(meshes, options)
+    if options.turned:
+        ten = object_particles.load_assets(options.discretisation, options.keypoints, cache)
+        return rotated_assets(ten, options.turned, options.discretisation)
+    shapes = random_shapes(options.shapes, SHAPE_SEEDS[options.group]) if options.shapes else HELDOUT_SHAPES
+    return load_shape_assets(shapes, options.discretisation, options.keypoints, cache, options.solid)
 
 
 def sample_configs(
-    things: Mapping[int, Asset], scenes: int, objects: int, first: int = FIRST_SCENE[HELDOUT]
+    assets: Mapping[int, Asset], scenes: int, objects: int, first: int = FIRST_SCENE[HELDOUT]
 ) -> dict[str, SceneConfig]:
-    """Scenes by the sampling of the data set, with seeds of their own."""
-    room = placement_extents(things)
-    made = (sample_scene(first + i, objects, room) for i in tqdm(range(scenes), desc="placing", unit="scene"))
-    return {c.name: c for c in made}
+    """Scene configurations sampled as for the data set, with the seeds from `first` on."""
+    extents = placement_extents(assets)
+    configs = (sample_scene(first + i, objects, extents) for i in tqdm(range(scenes), desc="placing", unit="scene"))
+    return {c.name: c for c in configs}
 
 
-def rotated_assets(things: Mapping[int, Asset], count: int, fineness: Discretisation) -> dict[int, Asset]:
-    """Objects in turn, each turned at random, by new ids."""
+def rotated_assets(assets: Mapping[int, Asset], count: int, discretisation: Discretisation) -> dict[int, Asset]:
+    """`count` randomly rotated copies of the objects in turn, with new ids."""
     made = {}
     for i in range(count):
-        thing = list(things.values())[i % len(things)]
-        turn = matrix(torch.from_numpy(np.random.default_rng([FIRST_ROTATED_ID, i]).normal(size=4)).float())
-        points = thing.points @ turn.T
+        asset = list(assets.values())[i % len(assets)]
+        R = matrix(torch.from_numpy(np.random.default_rng([FIRST_ROTATED_ID, i]).normal(size=4)).float())
+        points = asset.points @ R.T
         points = points - (points.amin(0) + points.amax(0)) / 2
-        made[FIRST_ROTATED_ID + i] = replace(
-            thing, id=FIRST_ROTATED_ID + i, points=points, volume=particle_volumes(points, fineness.dx)
-        )
+        id = FIRST_ROTATED_ID + i
+        made[id] = replace(asset, id=id, points=points, volume=particle_volumes(points, discretisation.dx))
     return made
 
 
 def load_shape_assets(
-    table: Mapping[str, ShapeKind], fineness: Discretisation, least: int, kept: Path | None = None, solid: bool = False
-) -> dict[int, Asset]:
-    """Objects by id; `kept` is a file (.npz) to read their particles from, or to write them to."""
-    key = f"spacing {fineness.spacing} least {least}" + f" dx {fineness.dx}" * solid
-    points = _read(kept, key, table) if kept is not None and kept.exists() else None
-    if points is None:
-        bar = tqdm(table.items(), desc="objects", unit="object")
-        points = {name: _particles(kind, fineness, least, solid) for name, kind in bar}
-        if kept is not None:
-            with replacing(kept) as part:
-                np.savez(part, key=key, **{name: p.numpy() for name, p in points.items()})
-    made = {kind.id: _asset(kind.id, kind.scale, points[name], kind.E, kind.density, fineness)
-            for name, kind in table.items()}  # fmt: skip
+    shapes: Mapping[str, ShapeKind], discretisation: Discretisation, min_particles: int, cache: Path | None = None,
+    solid: bool = False,
+) -> dict[int, Asset]:  # fmt: skip
+    """Objects of signed distance fields by id; `cache` is a file (.npz) of their particles, read or written.
+
+    Each has at least `min_particles` surface particles, and with `solid` interior ones after them.
+    """
+    key = f"spacing {discretisation.spacing} least {min_particles}" + f" dx {discretisation.dx}" * solid
+
+    def sample() -> dict[str, Tensor]:
+        bar = tqdm(shapes.items(), desc="objects", unit="object")
+        return {name: _shape_particles(kind, discretisation, min_particles, solid) for name, kind in bar}
+
+    points = object_particles.cached_points(cache, key, shapes, sample)
+    made = {kind.id: _asset(kind.id, kind.scale, points[name], (kind.E, kind.density), discretisation)
+            for name, kind in shapes.items()}  # fmt: skip
     if not solid:
         return made
-    return {i: replace(a, solidity=solidity(a.points[:least], float(a.volume.sum()))) for i, a in made.items()}
-
-
-def _read(kept: Path, key: str, table: Mapping[str, ShapeKind]) -> dict[str, Tensor] | None:
-    """What was kept, if it was chosen in the same way."""
-    try:
-        with np.load(kept) as file:
-            there = str(file["key"]) == key and table.keys() <= set(file.files)
-            return {name: torch.from_numpy(file[name]) for name in table} if there else None
-    except (KeyError, OSError, ValueError) as error:
-        raise InputError(f"{kept}: cannot be read ({error}); remove it and it is made again") from error
+    return {i: replace(a, solidity=solidity(a.points[:min_particles], float(a.volume.sum()))) for i, a in made.items()}
 
 
 def mesh_assets(meshes: list[Path], options: HeldoutOptions) -> dict[int, Asset]:
-    """Meshes as objects 100, 101, ...; the names of file and folder tell what each is made of."""
+    """Meshes as objects 100, 101, ...; materials are chosen by the names of file and folder."""
     from stages.lab.assets.meshes import read_mesh  # noqa: PLC0415 -- needs an optional extra
 
-    things = {}
+    assets = {}
     for id, path in enumerate(tqdm(meshes, desc="meshes", unit="mesh"), start=FIRST_MESH_ID):
         name = f"{Path(path).resolve().parent.name} {Path(path).stem}"
         choice = choose_materials([SceneObject(id, name)])[id]
         E = min(choice.material.E, MAX_YOUNG)
         log.info("%s: %s%s, E %.3g Pa", name, choice.name, " (a guess)" * choice.guessed, E)
         points = options.size * read_mesh(path, SURFACE_POINTS).means
-        points = _chosen(points, options.fineness, options.keypoints)
-        things[id] = _asset(id, options.size, points, E, choice.material.density, options.fineness)
-    return things
+        points = _sample_points(points, options.discretisation, options.keypoints)
+        assets[id] = _asset(id, options.size, points, (E, choice.material.density), options.discretisation)
+    return assets
 
 
-def _particles(kind: ShapeKind, fineness: Discretisation, least: int, solid: bool) -> Float[Tensor, "p 3"]:
-    """Of the surface, and after those of the inside."""
+def _shape_particles(
+    kind: ShapeKind, discretisation: Discretisation, min_particles: int, solid: bool
+) -> Float[Tensor, "p 3"]:
+    """Particles of the surface, and with `solid` those of the interior after them."""
     if not solid:
-        return _chosen(kind.scale * surface_points(kind, SURFACE_POINTS), fineness, least)
-    around, inside = surface_and_interior_points(
-        kind, SURFACE_POINTS, fineness.dx / PARTICLES_PER_CELL_AXIS / kind.scale
-    )
-    return torch.cat([_chosen(kind.scale * around, fineness, least), kind.scale * inside])
+        return _sample_points(kind.scale * surface_points(kind, SURFACE_POINTS), discretisation, min_particles)
+    spacing = discretisation.dx / PARTICLES_PER_CELL_AXIS / kind.scale
+    surface, interior = surface_and_interior_points(kind, SURFACE_POINTS, spacing)
+    return torch.cat([_sample_points(kind.scale * surface, discretisation, min_particles), kind.scale * interior])
 
 
-def _chosen(points: Float[Tensor, "n 3"], fineness: Discretisation, least: int) -> Float[Tensor, "p 3"]:
-    """Some of the points, each the farthest from those before it."""
-    if len(points) < least:
-        raise InputError(f"--keypoints {least}: there are only {len(points)} points of an object")
-    count = min(len(points), max(least, count_for_spacing(points, fineness.spacing)))
+def _sample_points(
+    points: Float[Tensor, "n 3"], discretisation: Discretisation, min_particles: int
+) -> Float[Tensor, "p 3"]:
+    """Some of the points, by farthest-point sampling."""
+    if len(points) < min_particles:
+        raise InputError(f"--keypoints {min_particles}: an object has only {len(points)} surface points")
+    count = min(len(points), max(min_particles, count_for_spacing(points, discretisation.spacing)))
     with single_threaded():
         return points[farthest_points(points, count)]
 
 
-def _asset(id: int, scale: float, points: Tensor, E: float, density: float, fineness: Discretisation) -> Asset:
-    return Asset(id, scale, points, particle_volumes(points, fineness.dx), E, density)
+def _asset(
+    id: int, scale: float, points: Tensor, material: tuple[float, float], discretisation: Discretisation
+) -> Asset:
+    """An object of particles; `material` is Young's modulus [Pa] and density [kg/m^3]."""
+    return Asset(id, scale, points, particle_volumes(points, discretisation.dx), *material)

@@ -1,8 +1,9 @@
-"""A scene of GSCollision as published -> traj.h5: mpm/<group>/<scene>/%04d.h5 and the scene's point_cloud.ply.
+"""Import of a published scene of GSCollision: mpm/<group>/<scene>/%04d.h5 and its point_cloud.ply -> traj.h5.
 
 Row i of a frame is the i-th Gaussian of the scene with opacity above 0.02 inside the simulated cube [-1, 1]^3. Some
-rows become keypoints; all Gaussians follow them. Which Gaussians are which object is a property `object_id` of the
-scene (ours), or follows from the order of objects in scene_configs/<group>.json and how many Gaussians each has.
+rows become keypoints, to which all Gaussians are skinned. The object of each Gaussian is a property `object_id` of the
+scene file (written by ngff), or follows from the order of objects in scene_configs/<group>.json and their
+Gaussian counts.
 """
 
 from __future__ import annotations
@@ -35,40 +36,43 @@ from stages.lab.dataset.simulation import GRAVITY
 
 FILE_KIND = "a frame of GSCollision (.h5 with pos, cov3D and rot)"
 HALF_EXTENT = 1.0  # of the simulated cube [m]
-POSITION_TOLERANCE = 2e-3  # float16 positions are within this of the scene's [m]
+POSITION_TOLERANCE = 2e-3  # between float16 positions and those of the scene [m]
 RESOLUTION = 448  # of the published views [px]
-# Gaussians of the published objects. Source: public code of NGFF
+# Gaussian count of the published objects. Source: public code of NGFF
 PUBLISHED_COUNTS = {"ball": 106115, "bowl": 232764, "can": 70569, "cloth": 116188, "duck": 80544, "miku": 48316,
              "panda": 56104, "phone": 26571, "pillow": 64229, "rope": 8051}  # fmt: skip
 
 
 def run(folder: Path, out: Path, scene: Path | None = None, count: int = 2048) -> str:
-    """Write traj.h5 with at most `count` keypoints an object; a sentence about it."""
+    """Write `out` with at most `count` keypoints per object and return a one-line summary.
+
+    Raises InputError when the frames are incomplete or do not belong to the scene.
+    """
     folder = Path(folder)
     frames = frame_files(folder)
-    layout, group, name = _place(folder)
+    layout, group, name = _locate(folder)
     source = Path(scene) if scene is not None else layout.scene(group, name)
     must_exist(source, "the scene of these frames (.ply; name it with --scene)")
-    world = label_objects(read_scene(source), source, layout.config(group), layout, name)
-    rows = _rows(world, frames[0], source)
-    chosen, keypoints = _keypoints(world, rows, count)
-    made_by = {**provenance("import", [source, frames[0]]), "scene": world.provenance}
-    world = replace(world, cameras=world.cameras or orbit_cameras(RESOLUTION), provenance=made_by,
-                    floor=FLOOR_HEIGHT if world.floor is None else world.floor)  # fmt: skip
-    ids = [o.id for o in world.objects]
-    owner = world.gaussians.object_id[rows]
+    labelled = label_objects(read_scene(source), source, layout, group, name)
+    rows = _frame_rows(labelled, frames[0], source)
+    chosen, keypoints = _choose_keypoints(labelled, rows, count)
+    made_by = {**provenance("import", [source, frames[0]]), "scene": labelled.provenance}
+    initial = replace(labelled, cameras=labelled.cameras or orbit_cameras(RESOLUTION), provenance=made_by,
+                      floor=FLOOR_HEIGHT if labelled.floor is None else labelled.floor)  # fmt: skip
+    ids = [o.id for o in initial.objects]
+    owner = initial.gaussians.object_id[rows]
     info = SimulationInfo(FRAME_INTERVAL, GRAVITY, "mpm")
-    with TrajectoryWriter(out, world, info, keypoints, bind_gaussians(world, keypoints)) as trajectory:
-        for t, places in enumerate(_positions(frames, len(rows))):
-            com = torch.stack([places[owner == i].mean(0) for i in ids])
-            points = places[chosen] if t else keypoints.rest  # the start is known better than to float16
+    with TrajectoryWriter(out, initial, info, keypoints, bind_gaussians(initial, keypoints)) as trajectory:
+        for t, positions in enumerate(_read_positions(frames, len(rows))):
+            com = torch.stack([positions[owner == i].mean(0) for i in ids])
+            points = positions[chosen] if t else keypoints.rest  # more precise than float16
             trajectory.append(points, com, object_rotations(keypoints, points, ids))
-    names = ", ".join(o.name for o in world.objects)
+    names = ", ".join(o.name for o in initial.objects)
     return f"{out}: {len(frames)} frames of {names}, {len(rows)} Gaussians, {len(keypoints.rest)} keypoints"
 
 
 def frame_files(folder: Path) -> list[Path]:
-    """0000.h5, 0001.h5, ... Raises InputError when there are none or one is missing."""
+    """The frames 0000.h5, 0001.h5, ... of a folder; raises InputError when there are none or one is missing."""
     if not folder.is_dir():
         raise InputError(f"{folder}: is no folder; give mpm/<group>/<scene> of the data set")
     frames = sorted(p for p in folder.glob("*.h5") if p.stem.isdigit())
@@ -76,39 +80,46 @@ def frame_files(folder: Path) -> list[Path]:
         raise InputError(f"{folder}: has no frames 0000.h5, 0001.h5, ...; give mpm/<group>/<scene> of the data set")
     gap = next((i for i, p in enumerate(frames) if int(p.stem) != i), None)
     if gap is not None:
-        raise InputError(f"{folder}: {gap:04d}.h5 is missing, though {frames[-1].name} is there; get the folder whole")
+        raise InputError(
+            f"{folder}: {gap:04d}.h5 is missing, though {frames[-1].name} exists; download the folder completely"
+        )
     return frames
 
 
-def _place(folder: Path) -> tuple[Layout, str, str]:
-    """The data set, group and scene of ROOT/mpm/<group>/<scene>."""
+def _locate(folder: Path) -> tuple[Layout, str, str]:
+    """Data set, group and scene name of ROOT/mpm/<group>/<scene>."""
     folder = folder.resolve()
     return Layout(folder.parents[min(2, len(folder.parents) - 1)]), folder.parent.name, folder.name
 
 
-def label_objects(world: Scene, source: Path, configs: Path, layout: Layout, name: str) -> Scene:
-    """The scene with its objects, from the order in its configuration where the file does not tell."""
-    if world.objects:
-        return world
+def label_objects(scene: Scene, source: Path, layout: Layout, group: str, name: str) -> Scene:
+    """The scene with object ids: its own, or those that follow from the object order in its configuration.
+
+    `source` is the file of the scene, for messages. Raises InputError when the configuration is missing or does not
+    match the number of Gaussians.
+    """
+    if scene.objects:
+        return scene
+    configs = layout.config(group)
     if not configs.exists():
-        raise InputError(f"{source}: does not say which Gaussians are which object, and there is no {configs} to tell; "
-                         "label it with `ngff segment` and give the result as --scene")  # fmt: skip
+        raise InputError(f"{source}: has no object ids, and there is no {configs} to derive them from; label it with "
+                         "`ngff segment` and give the result as --scene")  # fmt: skip
     config = read_scene_configs(configs).get(name)
     if config is None:
-        raise InputError(f"{configs}: has no scene {name}; give the configuration that the frames were made of")
+        raise InputError(f"{configs}: has no scene {name}; give the configuration that the frames were made from")
     kinds = [object_kind(i) for i in config.ids]
-    counts = [_count(layout, kind.name) for kind in kinds]
-    if sum(counts) != len(world.gaussians):
-        told = ", ".join(f"{kind.name} {n}" for kind, n in zip(kinds, counts, strict=True))
-        raise InputError(f"{source}: has {len(world.gaussians)} Gaussians, but its objects together {sum(counts)} "
-                         f"({told}); put the objects it was made of into {layout.root / 'objects'}")  # fmt: skip
+    counts = [_gaussian_count(layout, kind.name) for kind in kinds]
+    if sum(counts) != len(scene.gaussians):
+        listed = ", ".join(f"{kind.name} {n}" for kind, n in zip(kinds, counts, strict=True))
+        raise InputError(f"{source}: has {len(scene.gaussians)} Gaussians, but its objects together {sum(counts)} "
+                         f"({listed}); put the objects it was made from into {layout.root / 'objects'}")  # fmt: skip
     ids = torch.repeat_interleave(torch.arange(1, len(kinds) + 1), torch.tensor(counts))
     objects = tuple(SceneObject(n, kind.name) for n, kind in enumerate(kinds, start=1))
-    return replace(world, gaussians=replace(world.gaussians, object_id=ids), objects=objects)
+    return replace(scene, gaussians=replace(scene.gaussians, object_id=ids), objects=objects)
 
 
-def _count(layout: Layout, name: str) -> int:
-    """Gaussians of an object: of the data set's own file, or as published."""
+def _gaussian_count(layout: Layout, name: str) -> int:
+    """Number of Gaussians of an object: of the data set's own file, or the published number."""
     path = layout.object(name)
     if not path.exists():
         return PUBLISHED_COUNTS[name]
@@ -118,45 +129,47 @@ def _count(layout: Layout, name: str) -> int:
         raise InputError(f"{path}: cannot be read ({error})") from error
 
 
-def _rows(world: Scene, first: Path, source: Path) -> Int[Tensor, "r"]:
-    """The Gaussian of each row. Raises InputError when the frames are not of this scene."""
-    g = world.gaussians
+def _frame_rows(scene: Scene, first: Path, source: Path) -> Int[Tensor, "r"]:
+    """Index of the Gaussian of each row; raises InputError when the frames do not belong to the scene."""
+    g = scene.gaussians
     rows = ((g.opacities > MIN_OPACITY) & (g.means.abs() <= HALF_EXTENT).all(1)).nonzero()[:, 0]
-    places = _read(first, "pos", (3,))
-    if len(places) != len(rows):
-        raise InputError(f"{first}: has {len(places)} rows, but {source} has {len(rows)} Gaussians with opacity above "
-                         f"{MIN_OPACITY} within {HALF_EXTENT} m; give the scene it was made of as --scene")  # fmt: skip
-    apart = float((places - g.means[rows]).abs().amax())
-    if not apart <= POSITION_TOLERANCE:
-        raise InputError(f"{first}: rows start up to {apart:.3g} m from the Gaussians of {source}; give the scene that "
-                         "the frames were made of as --scene")  # fmt: skip
+    positions = _read(first, "pos", (3,))
+    if len(positions) != len(rows):
+        raise InputError(
+            f"{first}: has {len(positions)} rows, but {source} has {len(rows)} Gaussians with opacity above "
+            f"{MIN_OPACITY} within {HALF_EXTENT} m; give the scene it was made from as --scene"
+        )
+    distance = float((positions - g.means[rows]).abs().amax())
+    if not distance <= POSITION_TOLERANCE:
+        raise InputError(f"{first}: rows start up to {distance:.3g} m from the Gaussians of {source}; give the scene "
+                         "that the frames were made from as --scene")  # fmt: skip
     return rows
 
 
-def _keypoints(world: Scene, rows: Int[Tensor, "r"], count: int) -> tuple[Int[Tensor, "k"], Keypoints]:
-    """Rows of each object spread evenly, and where they start."""
+def _choose_keypoints(scene: Scene, rows: Int[Tensor, "r"], count: int) -> tuple[Int[Tensor, "k"], Keypoints]:
+    """Evenly spaced rows of each object, and their rest positions."""
     if count < 1:
-        raise InputError(f"--keypoints {count}: at least 1 an object")
-    g, chosen = world.gaussians, []
-    for o in world.objects:
-        mine = (g.object_id[rows] == o.id).nonzero()[:, 0]
-        chosen.append(mine[farthest_points(g.means[rows[mine]], count)])
+        raise InputError(f"--keypoints {count}: at least 1 per object")
+    g, chosen = scene.gaussians, []
+    for o in scene.objects:
+        own = (g.object_id[rows] == o.id).nonzero()[:, 0]
+        chosen.append(own[farthest_points(g.means[rows[own]], count)])
     index = torch.cat(chosen)
     return index, Keypoints(g.means[rows[index]], g.object_id[rows[index]])
 
 
-def _positions(frames: list[Path], count: int) -> Iterator[Float[Tensor, "r 3"]]:
+def _read_positions(frames: list[Path], count: int) -> Iterator[Float[Tensor, "r 3"]]:
     for path in tqdm(frames, unit="frame"):
-        places = _read(path, "pos", (3,))
-        if len(places) != count:
-            raise InputError(f"{path}: has {len(places)} rows and the first frame {count}; get the folder whole")
-        if not places.isfinite().all():
+        positions = _read(path, "pos", (3,))
+        if len(positions) != count:
+            raise InputError(f"{path}: has {len(positions)} rows and the first frame {count}; download it again")
+        if not positions.isfinite().all():
             raise InputError(f"{path}: some positions are not finite; this scene cannot be used")
-        yield places
+        yield positions
 
 
 def _read(path: Path, name: str, shape: tuple[int, ...]) -> Tensor:
-    """A dataset of a frame, (n, *shape) of any float type, as float32."""
+    """Dataset `name` of a frame, (n, *shape), as float32."""
     must_exist(path, FILE_KIND)
     try:
         with h5py.File(path, "r") as file:

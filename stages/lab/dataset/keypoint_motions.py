@@ -1,11 +1,11 @@
-"""Simulated motion for training: the keypoints of many scenes in every frame, with what the objects are made of.
+"""Keypoint trajectories for training: the keypoints of many scenes in every frame, and the objects' materials.
 
 A file NAME.h5 holds one group of scenes:
 
     attributes    format = "ngff-motions", version, dt [s], gravity [m/s^2], box (2,3) [m], provenance (JSON)
-    names (s)     objects (s,o) ids of GSCollision, -1 where there is none
+    names (s)     objects (s,o) ids of GSCollision, -1: no object
     points        (s,t,o,n,3) int16, in steps of `step` [m] (an attribute of the dataset)
-    mass E nu friction solidity (s,o)     [kg] [Pa] - - -; without the last all bodies are hollow or thin
+    mass E nu friction solidity (s,o)     [kg] [Pa] - - -; files without solidity hold hollow or thin bodies only
 """
 
 from __future__ import annotations
@@ -29,32 +29,34 @@ from stages.core.models.initial_conditions import InitialConditions
 from stages.core.scene.files import must_exist, replacing
 
 FORMAT, VERSION = "ngff-motions", 1
-POSITION_STEP = 1e-4  # of the stored positions [m]: they reach 3.2 m from the origin
-COMPRESSION_LEVEL = 1  # of compression
-FILE_KIND = "simulated motion (.h5), such as `ngff-lab dataset` writes"
+POSITION_STEP = 1e-4  # quantisation of the stored positions [m]: int16 spans 3.2 m around the origin
+COMPRESSION_LEVEL = 1  # of zlib
+MAX_THREADS = 8  # that compress
+FILE_KIND = "keypoint trajectories (.h5), such as `ngff-lab dataset` writes"
 
 
 @dataclass(frozen=True)
 class KeypointMotions:
-    """Scenes of up to o objects with n keypoints each."""
+    """Keypoint trajectories of s scenes with up to o objects of n keypoints each, over t frames."""
 
     names: tuple[str, ...]
-    objects: Int[Tensor, "s o"]  # -1: none
+    objects: Int[Tensor, "s o"]  # GSCollision ids; -1: no object
     points: Float[Tensor, "s t o n 3"]  # [m]; 0 where there is no object
     mass: Float[Tensor, "s o"]  # [kg]
     E: Float[Tensor, "s o"]  # [Pa]
-    nu: Float[Tensor, "s o"]
-    friction: Float[Tensor, "s o"]
+    nu: Float[Tensor, "s o"]  # Poisson's ratio
+    friction: Float[Tensor, "s o"]  # Coulomb coefficient
     dt: float  # between frames [s]
     gravity: tuple[float, float, float]  # [m/s^2]
-    box: tuple[tuple[float, float, float], tuple[float, float, float]]  # of the room [m]
-    solidity: Float[Tensor, "s o"]  # how many times stiffer than hollow or thin bodies of the same material
+    box: tuple[tuple[float, float, float], tuple[float, float, float]]  # lower and upper corner of the walls [m]
+    solidity: Float[Tensor, "s o"]  # stiffness relative to a hollow or thin body of the same material
 
     def __len__(self) -> int:
         return len(self.names)
 
     @property
     def present(self) -> Bool[Tensor, "s o"]:
+        """Mask of the objects that exist."""
         return self.objects >= 0
 
     def __getitem__(self, rows: Int[Tensor, "r"] | slice) -> KeypointMotions:
@@ -63,10 +65,11 @@ class KeypointMotions:
         return replace(self, names=tuple(self.names[i] for i in index), **tensors)
 
     def to(self, device: torch.device | str) -> KeypointMotions:
+        """The same motions with all tensors on a device."""
         return replace(self, **{name: getattr(self, name).to(device) for name in TENSORS})
 
     def initial_conditions(self, keypoints: int | None = None) -> InitialConditions:
-        """The scenes at rest, with the first so many keypoints (they come farthest first)."""
+        """First frame of the scenes, with the first `keypoints` of each object (they are in farthest-point order)."""
         rest = self.points[:, 0, :, :keypoints]
         valid = self.present[..., None].expand(rest.shape[:-1])
         return InitialConditions.of(
@@ -79,13 +82,13 @@ TENSORS = ("objects", "points", "mass", "E", "nu", "friction", "solidity")
 
 
 def concatenate_motions(parts: Sequence[KeypointMotions]) -> KeypointMotions:
-    """All scenes of several groups; fewer objects than the most are padded."""
-    most = max(p.objects.shape[1] for p in parts)
+    """All scenes of several groups; scenes with fewer objects than the largest are padded."""
+    max_objects = max(p.objects.shape[1] for p in parts)
 
     def padded(p: KeypointMotions, name: str) -> Tensor:
         x, axis = getattr(p, name), 2 if name == "points" else 1
         shape = list(x.shape)
-        shape[axis] = most - shape[axis]
+        shape[axis] = max_objects - shape[axis]
         fill = -1 if name == "objects" else 0 if name == "points" else 1
         return torch.cat([x, x.new_full(shape, fill)], axis)
 
@@ -94,24 +97,26 @@ def concatenate_motions(parts: Sequence[KeypointMotions]) -> KeypointMotions:
 
 
 class KeypointMotionsWriter:
-    """Writes the scenes of a group batch by batch: positions in steps of 0.1 mm, complete or not at all.
+    """Writes the scenes of a group batch by batch; the file appears on success only.
 
-    Scenes are compressed by threads while the next batch is simulated; all have the same shape.
+    Threads compress the scenes while the next batch is simulated. All scenes must have the same shape. Leaving the
+    context raises InputError when no scene was appended.
     """
 
     def __init__(self, path: Path, provenance: dict):
         self.path, self._provenance = Path(path), provenance
         self._parts: list[KeypointMotions] = []
-        self._packed: list[Future[bytes]] = []
-        self._pool = ThreadPoolExecutor(min(8, os.cpu_count() or 1))
+        self._compressed: list[Future[bytes]] = []
+        self._pool = ThreadPoolExecutor(min(MAX_THREADS, os.cpu_count() or 1))
 
     def __enter__(self) -> KeypointMotionsWriter:
         return self
 
     def append(self, part: KeypointMotions) -> None:
+        """Add the scenes of one batch."""
         steps = (part.points / POSITION_STEP).round().clamp(-32767, 32767).to(torch.int16).cpu().numpy()
-        self._packed += [self._pool.submit(_deflated, scene) for scene in steps]
-        self._parts.append(replace(part, points=torch.empty(*part.points.shape[:-1], 0)))  # the shape is enough
+        self._compressed += [self._pool.submit(_compress, scene) for scene in steps]
+        self._parts.append(replace(part, points=torch.empty(*part.points.shape[:-1], 0)))  # only the shape is needed
 
     def __exit__(self, kind, error, trace) -> None:
         with self._pool as pool:
@@ -123,7 +128,9 @@ class KeypointMotionsWriter:
     def _write(self) -> None:
         count = sum(len(p) for p in self._parts)
         if not count:
-            raise InputError(f"{self.path}: no scene ended well; make --substep shorter or --dx as published")
+            raise InputError(
+                f"{self.path}: the simulation of every scene failed; choose a shorter --substep or the published --dx"
+            )
         first = self._parts[0]
         with replacing(self.path) as part, h5py.File(part, "w") as file:
             file.attrs.update(format=FORMAT, version=VERSION, dt=first.dt, gravity=first.gravity, box=first.box,
@@ -132,34 +139,34 @@ class KeypointMotionsWriter:
             shape = (*first.points.shape[1:4], 3)
             data = file.create_dataset("points", (count, *shape), "<i2", chunks=(1, *shape), compression="gzip",
                                        compression_opts=COMPRESSION_LEVEL, shuffle=True)  # fmt: skip
-            for row, packed in enumerate(self._packed):
-                data.id.write_direct_chunk((row, 0, 0, 0, 0), packed.result())
+            for row, chunk in enumerate(self._compressed):
+                data.id.write_direct_chunk((row, 0, 0, 0, 0), chunk.result())
             data.attrs["step"] = POSITION_STEP
             for name in TENSORS:
                 if name != "points":
                     file[name] = torch.cat([getattr(p, name) for p in self._parts]).cpu().numpy()
 
 
-def _deflated(steps: np.ndarray) -> bytes:
-    """A chunk as HDF5's shuffle and gzip filters make it: all low bytes, all high bytes, compressed."""
+def _compress(steps: np.ndarray) -> bytes:
+    """A chunk as HDF5's shuffle and gzip filters produce it: all low bytes, then all high bytes, compressed."""
     shuffled = np.ascontiguousarray(steps, "<i2").view(np.uint8).reshape(-1, 2).T
     return zlib.compress(shuffled.tobytes(), COMPRESSION_LEVEL)
 
 
 def write_motions(path: Path, motions: KeypointMotions, provenance: dict) -> None:
-    """A group in one piece."""
+    """Write a group at once."""
     with KeypointMotionsWriter(path, provenance) as file:
         file.append(motions)
 
 
 def read_provenance(path: Path) -> dict:
-    """What a file of motions says of its making."""
+    """The provenance stored in a file of keypoint trajectories; raises InputError when the file is missing."""
     with h5py.File(must_exist(path, FILE_KIND), "r") as file:
         return json.loads(file.attrs.get("provenance", "{}"))
 
 
 def read_motions(path: Path) -> KeypointMotions:
-    """Raises InputError for what is no such file."""
+    """Read a file of keypoint trajectories; raises InputError when it is missing or has another format."""
     must_exist(path, FILE_KIND)
     try:
         with h5py.File(path, "r") as file:

@@ -1,17 +1,16 @@
-"""Where GSCollision keeps what.
+"""Folder layout of GSCollision, and parsers for the names of its parts.
 
-scene_configs/<group>.json                       where every object starts
-motions/<group>.h5                               keypoints in every frame (motions.py); not in the published set
-objects/<object>/  backgrounds/<background>/     Gaussians, made in code
+scene_configs/<group>.json                       start position of every object
+motions/<group>.h5                               keypoints in every frame (keypoint_motions.py); not published
+objects/<object>/  backgrounds/<background>/     Gaussians, generated
 scenes/<group>/<scene>/point_cloud/iteration_30000/point_cloud.ply
-mpm/<group>/<scene>/%04d.h5, shs.h5, opacity.h5  every Gaussian in every frame (dataset_gaussians.py)
-initial/<group>/<scene>/<background>/            <scene>.mp4, cameras.json, prompts.json, depth.h5
+mpm/<group>/<scene>/%04d.h5, shs.h5, opacity.h5  every Gaussian in every frame (gaussian_frames.py)
+initial/<group>/<scene>/<background>/            <scene>.mp4, cameras.json, prompts.json, depth.h5 (videos.py)
 dynamic/<group>/<scene>/<background>/view_<i>/<scene>.mp4
 """
 
 from __future__ import annotations
 
-import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -19,94 +18,100 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from stages.core.errors import InputError
-from stages.lab.assets.backgrounds import BACKGROUND_PLY as BACKGROUND_PLY
-from stages.lab.assets.backgrounds import BACKGROUNDS
-from stages.lab.assets.objects import OBJECTS, ObjectKind
+from stages.core.scene.files import replacing
+from stages.lab.assets.backgrounds import BACKGROUND_PLY, BACKGROUNDS
+from stages.lab.assets.objects import OBJECTS, POINT_CLOUD, ObjectKind
 
 PARTS = ("scene_configs", "motions", "objects", "backgrounds", "scenes", "mpm", "initial", "dynamic")
-POINT_CLOUD = "point_cloud/iteration_30000/point_cloud.ply"  # of objects and scenes
-SCENE_PARTS = ("scenes", "mpm", "initial", "dynamic")
-ORBIT_VIEWS = 100  # cameras around a scene, a frame each of an initial video
-VIDEO_VIEWS = tuple(range(0, ORBIT_VIEWS, 4))  # from where dynamic videos are taken
+SCENE_PARTS = ("scenes", "mpm", "initial", "dynamic")  # those with files for each scene
+ORBIT_VIEWS = 100  # cameras around a scene, one frame each of an initial video
+VIDEO_VIEWS = tuple(range(0, ORBIT_VIEWS, 4))  # cameras of the dynamic videos
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Paths in a data set."""
+    """Paths inside a data set."""
 
     root: Path
 
     def config(self, group: str) -> Path:
+        """Scene configurations of a group (.json)."""
         return self.root / "scene_configs" / f"{group}.json"
 
     def motions(self, group: str) -> Path:
+        """Keypoint trajectories of a group (.h5)."""
         return self.root / "motions" / f"{group}.h5"
 
     def object(self, name: str) -> Path:
+        """Gaussians of an object (.ply)."""
         return self.root / "objects" / name / POINT_CLOUD
 
     def background(self, name: str) -> Path:
+        """Gaussians of a background (.ply)."""
         return self.root / "backgrounds" / name / BACKGROUND_PLY
 
     def scene(self, group: str, scene: str) -> Path:
+        """Gaussians of a scene in its first frame (.ply)."""
         return self.root / "scenes" / group / scene / POINT_CLOUD
 
     def mpm(self, group: str, scene: str) -> Path:
+        """Folder of the Gaussians of a scene in every frame."""
         return self.root / "mpm" / group / scene
 
     def initial(self, group: str, scene: str, background: str) -> Path:
+        """Folder of the views of the first frame over a background."""
         return self.root / "initial" / group / scene / background
 
     def dynamic(self, group: str, scene: str, background: str, view: int) -> Path:
+        """Video of a scene over time (.mp4)."""
         return self.root / "dynamic" / group / scene / background / f"view_{view}" / f"{scene}.mp4"
 
 
 @contextmanager
 def replacing_folder(path: Path) -> Iterator[Path]:
-    """An empty folder beside `path` that takes its place on success and vanishes on failure.
+    """An empty folder beside `path` that is renamed to `path` on success and removed on failure.
 
-    What a killed run left of it is removed first.
+    A leftover of an earlier, killed run is removed first. Raises InputError when it cannot be written.
     """
-    part = path.with_name(f".part-{path.name}")
-    shutil.rmtree(part, ignore_errors=True)
-    part.mkdir(parents=True)
-    try:
-        yield part
-        os.replace(part, path)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror or error})") from error
-    finally:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as part:
         shutil.rmtree(part, ignore_errors=True)
+        part.mkdir()
+        try:
+            yield part
+        except BaseException:
+            shutil.rmtree(part, ignore_errors=True)
+            raise
 
 
 def parse_parts(text: str) -> tuple[str, ...]:
-    """ "mpm, scenes" -> ("scenes", "mpm"), in the order in which they are made."""
+    """Parse --only: "mpm, scenes" -> ("scenes", "mpm"), in the order in which parts are made; InputError if unknown."""
     names = [name.strip() for name in text.split(",") if name.strip()]
-    odd = next((name for name in names if name not in PARTS), None)
-    if odd is not None or not names:
-        raise InputError(f"--only {odd or text!r}: choose from {', '.join(PARTS)}")
+    unknown = next((name for name in names if name not in PARTS), None)
+    if unknown is not None or not names:
+        raise InputError(f"--only {unknown or text!r}: choose from {', '.join(PARTS)}")
     return tuple(p for p in PARTS if p in names)
 
 
 def parse_views(text: str) -> tuple[int, ...]:
-    """ "0,16" -> (0, 16); "all" are the 25 published ones."""
+    """Parse --views: "0,16" -> (0, 16); "all" gives the 25 published views; InputError for other cameras."""
     if text == "all":
         return VIDEO_VIEWS
     names = [name.strip() for name in text.split(",")]
     if not all(name.isdigit() and int(name) in VIDEO_VIEWS for name in names):
-        raise InputError(f"--views {text}: multiples of 4 from 0 to {VIDEO_VIEWS[-1]} with commas between, or all")
+        raise InputError(f"--views {text}: multiples of 4 from 0 to {VIDEO_VIEWS[-1]}, separated by commas, or all")
     return tuple(sorted({int(name) for name in names}))
 
 
 def parse_backgrounds(text: str) -> tuple[str, ...]:
-    """ "table0,table3" -> ("table0", "table3"); "all" are the eight."""
+    """Parse --backgrounds: "table0,table3" -> ("table0", "table3"); "all" gives all eight; InputError if unknown."""
     names = tuple(BACKGROUNDS) if text == "all" else tuple(name.strip() for name in text.split(","))
-    odd = next((name for name in names if name not in BACKGROUNDS), None)
-    if odd is not None:
-        raise InputError(f"--backgrounds {odd}: choose from {', '.join(BACKGROUNDS)}, or all")
+    unknown = next((name for name in names if name not in BACKGROUNDS), None)
+    if unknown is not None:
+        raise InputError(f"--backgrounds {unknown}: choose from {', '.join(BACKGROUNDS)}, or all")
     return tuple(dict.fromkeys(names))
 
 
 def object_kind(object_id: int) -> ObjectKind:
-    """The ObjectKind with this id."""
+    """The ObjectKind with this published id."""
     return next(kind for kind in OBJECTS.values() if kind.id == object_id)

@@ -1,8 +1,8 @@
-"""The ten objects as particles, fine enough for a grid, chosen once and kept."""
+"""The ten objects as MPM particles: sampled from their Gaussians at the grid's resolution, cached in a file."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -25,13 +25,15 @@ from stages.lab.assets.shapes import single_threaded
 from stages.lab.dataset.scene_configs import PlacementExtent
 
 FRAME_INTERVAL, SUBSTEP = 0.02, 1e-4  # as published [s]
-POISSON_RATIO, FRICTION = 0.3, 1.0  # walls that keep 0.9 a substep hold like a friction of 1 or more
-MIN_OPACITY = 0.02
+POISSON_RATIO = 0.3  # of all objects, as published
+FRICTION = 1.0  # walls that keep 0.9 of the tangential speed per substep act like a coefficient of 1 or more
+MIN_OPACITY = 0.02  # of a Gaussian that becomes a particle, as published
+PLACEMENT_POINTS = 2048  # first particles of an object, of which distances between objects are computed
 
 
 @dataclass(frozen=True)
 class Discretisation:
-    """How finely the world is cut."""
+    """Resolution of the simulation in space and time."""
 
     dx: float = 0.02  # grid spacing [m]
     spacing: float = 0.009  # between particles on a surface [m]
@@ -39,6 +41,7 @@ class Discretisation:
 
     @property
     def substeps(self) -> int:
+        """Substeps per frame."""
         return round(FRAME_INTERVAL / self.substep)
 
 
@@ -48,90 +51,104 @@ class Asset:
 
     id: int
     scale: float
-    points: Float[Tensor, "p 3"]  # [m], each the farthest from those before it
+    points: Float[Tensor, "p 3"]  # [m], in farthest-point order
     volume: Float[Tensor, "p"]  # [m^3]
-    E: float  # [Pa]
+    E: float  # Young's modulus [Pa]
     density: float  # [kg/m^3]
-    solidity: float = 1.0  # how many times stiffer than what is hollow or thin
+    solidity: float = 1.0  # stiffness relative to a hollow or thin body of the same material
 
     @cached_property
     def mass(self) -> float:
+        """Total mass [kg]."""
         return self.density * float(self.volume.sum())
 
     def particles(self, device: str = "cpu") -> mpm.Particles:
-        """The object at rest, about the origin."""
+        """The object at rest about the origin."""
         n = torch.ones(len(self.points))
         made = mpm.at_rest(self.points, self.volume, self.density * n, self.E * n, POISSON_RATIO * n, 0 * n,
                            FRICTION * n, MODELS["corotated"].kernel)  # fmt: skip
         return mpm.Particles(*(getattr(made, f.name).to(device) for f in fields(made)))
 
 
-def translated(particles: mpm.Particles, at: tuple[float, float, float]) -> mpm.Particles:
-    """The same particles elsewhere."""
-    return replace(particles, x=particles.x + torch.tensor(at, device=particles.x.device))
+def translated(particles: mpm.Particles, offset: tuple[float, float, float]) -> mpm.Particles:
+    """The same particles, moved by `offset` [m]."""
+    return replace(particles, x=particles.x + torch.tensor(offset, device=particles.x.device))
 
 
-def load_assets(fineness: Discretisation, least: int, kept: Path | None = None) -> dict[int, Asset]:
-    """All objects by id, each with `least` particles or as many as the spacing asks for (or all its Gaussians).
+def load_assets(discretisation: Discretisation, min_particles: int, cache: Path | None = None) -> dict[int, Asset]:
+    """The ten objects by id, each with `min_particles` particles or as many as the particle spacing requires.
 
-    Making and choosing them takes about a minute; `kept` is a file (.npz) to read them from, or to write them to.
+    An object with fewer Gaussians than the spacing requires takes all of them. Sampling takes about a minute; `cache`
+    is a file (.npz) from which the particles are read, or to which they are written. Raises InputError when an object
+    has fewer than `min_particles` Gaussians or the cache cannot be read.
     """
-    key = f"spacing {fineness.spacing} least {least}"
-    points = _read_points(kept, key) if kept is not None and kept.exists() else None
-    if points is None:
+    key = f"spacing {discretisation.spacing} least {min_particles}"
+
+    def sample() -> dict[str, Tensor]:
         bar = tqdm(OBJECTS.values(), desc="objects", unit="object")
-        points = {kind.name: _particles(kind, fineness, least) for kind in bar}
-        if kept is not None:
-            with replacing(kept) as part:
-                np.savez(part, key=key, **{name: p.numpy() for name, p in points.items()})
+        return {kind.name: _sample_particles(kind, discretisation, min_particles) for kind in bar}
+
+    points = cached_points(cache, key, OBJECTS, sample)
     return {
-        kind.id: Asset(kind.id, kind.scale, points[kind.name], particle_volumes(points[kind.name], fineness.dx), kind.E,
-                       kind.density)
+        kind.id: Asset(kind.id, kind.scale, points[kind.name], particle_volumes(points[kind.name], discretisation.dx),
+                       kind.E, kind.density)
         for kind in OBJECTS.values()
     }  # fmt: skip
 
 
-def _read_points(kept: Path, key: str) -> dict[str, Float[Tensor, "p 3"]] | None:
-    """What was kept, if it was chosen in the same way."""
-    try:
-        with np.load(kept) as file:
-            same = str(file["key"]) == key
-            return {name: torch.from_numpy(file[name]) for name in OBJECTS} if same else None
-    except (KeyError, OSError, ValueError) as error:
-        raise InputError(f"{kept}: cannot be read ({error}); remove it and it is made again") from error
+def cached_points(
+    cache: Path | None, key: str, names: Iterable[str], sample: Callable[[], dict[str, Tensor]]
+) -> dict[str, Float[Tensor, "p 3"]]:
+    """Particle positions by object name, from the file `cache` if it was written with the same `key`.
+
+    Otherwise they are sampled, and written to the file. Raises InputError when the file cannot be read.
+    """
+    if cache is not None and cache.exists():
+        try:
+            with np.load(cache) as file:
+                if str(file["key"]) == key and {*names} <= set(file.files):
+                    return {name: torch.from_numpy(file[name]) for name in names}
+        except (KeyError, OSError, ValueError) as error:
+            raise InputError(f"{cache}: cannot be read ({error}); remove it to make it again") from error
+    points = sample()
+    if cache is not None:
+        with replacing(cache) as part:
+            np.savez(part, key=key, **{name: p.numpy() for name, p in points.items()})
+    return points
 
 
 def at_scale_prior(g: Gaussians, scale: float) -> Gaussians:
-    """An object's Gaussians at its scale prior [m], about the centre of the box around those that are particles."""
+    """An object's Gaussians scaled by its scale prior, centred on the bounding box of the opaque ones [m]."""
     means = g.means * scale
-    solid = means[g.opacities > MIN_OPACITY]
-    return replace(g, means=means - (solid.amax(0) + solid.amin(0)) / 2, scales=g.scales * scale)
+    opaque = means[g.opacities > MIN_OPACITY]
+    return replace(g, means=means - (opaque.amax(0) + opaque.amin(0)) / 2, scales=g.scales * scale)
 
 
-def _particles(kind: ObjectKind, fineness: Discretisation, least: int) -> Float[Tensor, "p 3"]:
-    """Some of its Gaussians, each the farthest from those before it."""
+def _sample_particles(kind: ObjectKind, discretisation: Discretisation, min_particles: int) -> Float[Tensor, "p 3"]:
+    """Centres of some of the object's Gaussians, by farthest-point sampling."""
     g = at_scale_prior(make_object(kind.name), kind.scale)
     means = g.means[g.opacities > MIN_OPACITY]
-    if len(means) < least:
-        raise InputError(f"--keypoints {least}: {kind.name} has only {len(means)} Gaussians")
-    with single_threaded():  # ten times faster than threads that wait for each other thousands of times
-        return means[farthest_points(means, max(least, count_for_spacing(means, fineness.spacing)))]
+    if len(means) < min_particles:
+        raise InputError(f"--keypoints {min_particles}: {kind.name} has only {len(means)} Gaussians")
+    count = max(min_particles, count_for_spacing(means, discretisation.spacing))
+    with single_threaded():  # ten times faster: threads would synchronise once per sampled point
+        return means[farthest_points(means, count)]
 
 
 def count_for_spacing(means: Float[Tensor, "n 3"], spacing: float) -> int:
-    """How many points of such a spacing cover the surface: from the spacing that all of them have."""
+    """Number of points with the given spacing [m] on the surface that `means` sample, from their own spacing."""
     sample = means[:: max(1, len(means) // 4000)]
-    own = float(knn(means, sample, 5)[0][:, 1:].mean())
-    return int(len(means) * (own / spacing) ** 2)
+    own_spacing = float(knn(means, sample, 5)[0][:, 1:].mean())
+    return int(len(means) * (own_spacing / spacing) ** 2)
 
 
 def particle_volumes(means: Float[Tensor, "n 3"], dx: float) -> Float[Tensor, "n"]:
-    """The volume of a cell, shared by the particles in it (as published)."""
+    """The volume of a grid cell divided by the number of particles in it [m^3], as published."""
     cell = (means / dx).floor().long()
     _, owner, count = cell.unique(dim=0, return_inverse=True, return_counts=True)
     return dx**3 / count[owner].float()
 
 
-def placement_extents(things: Mapping[int, Asset]) -> dict[int, PlacementExtent]:
-    """What placing them needs."""
-    return {i: PlacementExtent(a.points[:2048].numpy().astype(float), a.scale) for i, a in things.items()}
+def placement_extents(assets: Mapping[int, Asset]) -> dict[int, PlacementExtent]:
+    """What the placement of objects in scenes needs to know of each."""
+    return {i: PlacementExtent(a.points[:PLACEMENT_POINTS].numpy().astype(float), a.scale) for i, a in assets.items()}

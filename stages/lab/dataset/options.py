@@ -1,4 +1,4 @@
-"""What a user can choose about the data set."""
+"""Options of `ngff-lab dataset`."""
 
 from __future__ import annotations
 
@@ -9,80 +9,87 @@ from stages.lab.dataset.layout import PARTS, parse_backgrounds, parse_parts, par
 from stages.lab.dataset.object_particles import SUBSTEP, Discretisation
 from stages.lab.dataset.scene_configs import parse_groups
 
-PREREQUISITES = {  # of a part: what it is made from
+PREREQUISITES = {  # parts that a part is made from
     "motions": {"scene_configs"}, "scenes": {"scene_configs", "objects"}, "mpm": {"scene_configs", "objects"},
     "initial": {"scene_configs", "objects", "backgrounds"}, "dynamic": {"scene_configs", "objects", "backgrounds"},
 }  # fmt: skip
+MAX_NUDGE = 0.02  # [m]; scenes leave 0.05 m between objects
 
 
 @dataclass(frozen=True)
 class DatasetOptions:
-    """What decides the data."""
+    """What to generate, and the settings that determine its content."""
 
     groups: str = "3_0..3_9,4,6"
     only: str = "motions"  # parts
     frames: int = 100
-    keypoints: int = 2048  # of each object
-    dx: float = 0.02
-    spacing: float = 0.009
-    substep: float = SUBSTEP
-    nudge: float = 0.0  # how far every object is put aside at first, to see how predictable the world is [m]
-    exact: bool = False  # the same bytes in every run, also on a GPU
+    keypoints: int = 2048  # per object
+    dx: float = 0.02  # grid spacing [m]
+    spacing: float = 0.009  # between particles on a surface [m]
+    substep: float = SUBSTEP  # [s]
+    nudge: float = 0.0  # displacement of every start position, to measure sensitivity to initial conditions [m]
+    exact: bool = False  # identical bytes in every run, also on a GPU
     views: str = "all"  # of the videos
     backgrounds: str = "all"
     resolution: int = 448  # of the videos [px]
     shard: str = "1/1"
-    limit: int = 0  # scenes of each group; 0: all
+    limit: int = 0  # scenes per group; 0: all
     device: str = "auto"
 
     def __post_init__(self):
         parse_parts(self.only), parse_views(self.views), parse_backgrounds(self.backgrounds), parse_groups(self.groups)
-        _shard(self.shard)
+        _parse_shard(self.shard)
         if self.frames < 1 or self.keypoints < 1 or self.limit < 0:
             raise InputError("--frames and --keypoints must be positive, --limit at least 0")
-        if not 0 <= self.nudge <= 0.02:
-            raise InputError(f"--nudge {self.nudge}: from 0 to 0.02 m; scenes leave 0.05 between objects")
+        if not 0 <= self.nudge <= MAX_NUDGE:
+            raise InputError(f"--nudge {self.nudge}: from 0 to {MAX_NUDGE} m; scenes leave 0.05 between objects")
         if not 16 <= self.resolution <= 4096 or self.resolution % 2:
             raise InputError(f"--resolution {self.resolution}: an even number from 16 to 4096 pixels")
 
     @property
-    def fineness(self) -> Discretisation:
+    def discretisation(self) -> Discretisation:
+        """Grid spacing, particle spacing and substep of the simulation."""
         return Discretisation(self.dx, self.spacing, self.substep)
 
     @property
     def parts(self) -> tuple[str, ...]:
-        """What is made, with what it is made from, in an order in which it can be."""
-        asked = parse_parts(self.only)
-        wanted = {*asked}.union(*(PREREQUISITES.get(part, set()) for part in asked))
-        return tuple(p for p in PARTS if p in wanted)
+        """The requested parts and their prerequisites, prerequisites first."""
+        requested = parse_parts(self.only)
+        needed = {*requested}.union(*(PREREQUISITES.get(part, set()) for part in requested))
+        return tuple(p for p in PARTS if p in needed)
 
     @property
-    def cameras(self) -> tuple[int, ...]:
+    def view_indices(self) -> tuple[int, ...]:
+        """Orbit cameras of the dynamic videos and of the depth maps."""
         return parse_views(self.views)
 
     @property
-    def tables(self) -> tuple[str, ...]:
+    def background_names(self) -> tuple[str, ...]:
+        """Backgrounds of the videos."""
         return parse_backgrounds(self.backgrounds)
 
     @property
-    def mine(self) -> list[str]:
+    def shard_groups(self) -> list[str]:
         """The groups of this shard."""
-        part, parts = _shard(self.shard)
+        part, parts = _parse_shard(self.shard)
         return parse_groups(self.groups)[part::parts]
 
     @property
-    def repeatable(self) -> bool:
-        """Scenes that are simulated one by one, whenever they are missing, have to come out the same."""
+    def deterministic(self) -> bool:
+        """Whether the simulation must be bitwise reproducible.
+
+        Always so for mpm and dynamic: missing scenes of these are simulated again on their own.
+        """
         return self.exact or bool({"mpm", "dynamic"} & {*self.parts})
 
     @property
     def settings(self) -> dict:
-        """What all of a data set shares."""
-        same = ("frames", "keypoints", "dx", "spacing", "substep", "nudge", "resolution")
-        return {**{name: getattr(self, name) for name in same}, "exact": self.repeatable}
+        """The settings that all files of a data set share, as stored in manifest.json."""
+        shared = ("frames", "keypoints", "dx", "spacing", "substep", "nudge", "resolution")
+        return {**{name: getattr(self, name) for name in shared}, "exact": self.deterministic}
 
 
-def _shard(text: str) -> tuple[int, int]:
+def _parse_shard(text: str) -> tuple[int, int]:
     """ "2/5" -> (1, 5)."""
     part, slash, parts = text.partition("/")
     if not (slash and part.isdigit() and parts.isdigit() and 1 <= int(part) <= int(parts)):

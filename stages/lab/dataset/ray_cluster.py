@@ -1,14 +1,14 @@
-"""The data set made by the machines of a Ray cluster, a group of scenes each at a time.
+"""Generation of the data set on a Ray cluster, one task per group of scenes.
 
-A cluster needs a folder that all machines see under the same path (NFS, Lustre, ...), and on each of them the same
-version of ngff and of Python:
+A cluster needs a folder with the same path on all machines (NFS, Lustre, ...), and on each machine the same versions
+of ngff and Python:
 
     ray start --head                        # on one machine; it prints the address
     ray start --address=HEAD:6379           # on each of the others
     ngff-lab dataset /shared/OUT --ray auto # on any of them; or --ray ray://HEAD:10001 from outside
 
-With `--ray local` Ray is started on this machine alone, for its GPUs. Groups are independent, and what a lost machine
-had not finished is made again by another: every file appears whole or not at all.
+With `--ray local` Ray is started on this machine alone, to use all its GPUs. Groups are independent, and the
+unfinished groups of a failed machine are made again by another: files appear complete or not at all.
 """
 
 from __future__ import annotations
@@ -25,35 +25,39 @@ from stages.lab.dataset.options import DatasetOptions
 
 
 def run(out: Path, options: DatasetOptions, address: str) -> None:
-    """As dataset.run, with a task for each group; each takes a GPU where the cluster has some."""
+    """Write all missing files, as generate.run does, with one task per group and one GPU per task if there are any.
+
+    `address` is "local", "auto" or the address of a cluster. Raises InputError when Ray is not installed, the cluster
+    does not answer, or it has no GPU though --device cuda was given.
+    """
     try:
         import ray
     except ImportError as error:
-        raise InputError("--ray: Ray is not installed; `pip install 'ngff[ray]'` brings it") from error
+        raise InputError("--ray: Ray is not installed; install it with `pip install 'ngff[ray]'`") from error
     out = Path(out).resolve()
-    maker = DatasetGenerator(out, options)  # what all groups need is made once, here
-    maker.shared()
-    require_disk_space(out, missing_bytes(maker.layout, options))
-    _ = maker.things
+    generator = DatasetGenerator(out, options)  # makes the inputs shared by all groups, before the tasks start
+    generator.make_shared()
+    require_disk_space(out, missing_bytes(generator.layout, options))
+    _ = generator.assets
     if not ray.is_initialized():
         try:
             ray.init(address=None if address == "local" else address, log_to_driver=True)
         except (ConnectionError, ValueError) as error:
-            raise InputError(f"--ray {address}: no cluster answers ({error}); `ray start --head` starts one, "
-                             "`--ray local` uses this machine alone") from error  # fmt: skip
+            raise InputError(f"--ray {address}: no cluster answers ({error}); start one with `ray start --head`, or "
+                             "use this machine alone with `--ray local`") from error  # fmt: skip
     gpus = float(options.device != "cpu" and ray.cluster_resources().get("GPU", 0) >= 1)
     if options.device == "cuda" and not gpus:
         raise InputError(f"--device cuda: no machine of the cluster {address} has a GPU; leave --device out")
-    task = ray.remote(num_gpus=gpus, num_cpus=1, max_retries=3)(_group)
-    waiting = [task.remote(out, replace(options, groups=group, shard="1/1")) for group in options.mine]
-    with tqdm(total=len(waiting), desc="groups", unit="group") as bar:
-        while waiting:
-            done, waiting = ray.wait(waiting)
-            ray.get(done)  # raises what went wrong there
+    task = ray.remote(num_gpus=gpus, num_cpus=1, max_retries=3)(_make_group)
+    pending = [task.remote(out, replace(options, groups=group, shard="1/1")) for group in options.shard_groups]
+    with tqdm(total=len(pending), desc="groups", unit="group") as bar:
+        while pending:
+            done, pending = ray.wait(pending)
+            ray.get(done)  # raises the error of a failed task
             bar.update(len(done))
     print(f"{out}: complete")
 
 
-def _group(out: Path, options: DatasetOptions) -> None:
-    """On a worker: one group; objects and backgrounds are there."""
-    DatasetGenerator(out, options).group(options.groups)
+def _make_group(out: Path, options: DatasetOptions) -> None:
+    """Task: make one group; objects and backgrounds exist already."""
+    DatasetGenerator(out, options).make_group(options.groups)

@@ -1,8 +1,8 @@
-"""Which objects a GSCollision scene has and where they start.
+"""Sampling of GSCollision scenes: which objects, and where they start.
 
-Source: the NGFF paper, appendix on GSCollision, and the public sampling code (seed 42): objects are drawn with
-replacement, take their scale prior, are never turned, and each is put near one that is there already. There is no
-explicit tower or containment: both come from the small horizontal offsets.
+Objects are drawn with replacement, have their scale prior, are not rotated, and each is placed near one placed before.
+There is no explicit tower or containment: both arise from the small horizontal offsets.
+Source: the NGFF paper, appendix on GSCollision, and the public sampling code (seed 42).
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from stages.core.errors import InputError
 from stages.core.scene.files import must_exist, replacing
 
 SEED = 42
-HALF_EXTENT = 0.9  # bounding spheres stay within this cube [m]
-MIN_GAP = 0.05  # least distance between points of two objects, and between centres [m]
-MAX_OFFSET = 0.1  # how far aside of the object it is put near, in scenes of up to 4 [m]
+HALF_EXTENT = 0.9  # of the cube that contains all bounding spheres [m]
+MIN_GAP = 0.05  # between points of two objects, and between their centres [m]
+MAX_OFFSET = 0.1  # horizontal, from the object placed before, in scenes of up to 4 objects [m]
 MAX_PLACEMENTS, MAX_DRAWS = (
     500,
     200,
 )  # for an object, before the scene is begun again; and of its objects, before it is given up
-HELDOUT = "heldout"  # group of scenes of eight other objects, that no model learns from
+HELDOUT = "heldout"  # group of scenes of eight other objects that are never trained on
 VARIED, SOLID, ROTATED = "varied", "solid", "turned"  # of objects at random, solid ones, and the ten turned at random
 EXTRA_GROUPS = (VARIED, SOLID, ROTATED)  # groups in no published set that may be learned from
 MORE_GROUPS = {f"more_{i}": 300 for i in range(10)}  # of three objects, in no published set: to learn more from
@@ -42,7 +42,7 @@ SCENE_COUNTS = {
 
 @dataclass(frozen=True)
 class SceneConfig:
-    """A scene: object ids in the order of their Gaussians, offsets [m] and scales."""
+    """A scene: object ids in the order of their Gaussians, start positions [m] and scales."""
 
     name: str
     ids: tuple[int, ...]
@@ -59,46 +59,51 @@ class PlacementExtent:
 
     @cached_property
     def half(self) -> np.ndarray:
+        """Half the sides of the bounding box (3,) [m]."""
         return np.abs(self.points).max(0)
 
     @cached_property
     def radius(self) -> float:
-        """Half the diagonal of the bounding box."""
+        """Half the diagonal of the bounding box [m]."""
         return float(np.linalg.norm(self.half))
 
     @cached_property
     def tree(self) -> cKDTree:
+        """Search tree over the points."""
         return cKDTree(self.points)
 
 
 def sample_group(group: str, extents: Mapping[int, PlacementExtent]) -> dict[str, SceneConfig]:
-    """All scenes of a group, the same for ever: each has a seed of its own."""
+    """All scenes of a group by name, always the same: each scene has its own seed."""
     count, first = object_count(group), 300 * int(group.split("_")[1]) if "_" in group else 0
     first += 3000 * (group in MORE_GROUPS)
     made = (sample_scene(first + i, count, extents) for i in range(SCENE_COUNTS[group]))
     return {c.name: c for c in made}
 
 
-def perturbed(configs: Mapping[str, SceneConfig], by: float) -> dict[str, SceneConfig]:
-    """The same scenes with every object put aside by `by` [m], each in a direction of its own."""
+def perturbed(configs: Mapping[str, SceneConfig], distance: float) -> dict[str, SceneConfig]:
+    """The same scenes with every object moved by `distance` [m], each in its own random direction."""
     out = {}
     for name, c in configs.items():
         rng = np.random.default_rng([SEED, len(c.ids), int(name.partition("_")[0]), 1])
-        aside = rng.normal(size=(len(c.ids), 3))
-        moved = np.array(c.translation) + by * aside / np.linalg.norm(aside, axis=1, keepdims=True)
+        offset = rng.normal(size=(len(c.ids), 3))
+        moved = np.array(c.translation) + distance * offset / np.linalg.norm(offset, axis=1, keepdims=True)
         out[name] = replace(c, translation=tuple(tuple(p) for p in moved.tolist()))
     return out
 
 
 def object_count(group: str) -> int:
-    """How many objects the scenes of a group have. Raises InputError for a group that is not there."""
+    """Number of objects in each scene of a group; raises InputError for an unknown group."""
     if group not in SCENE_COUNTS:
-        raise InputError(f"--groups {group}: there are {', '.join(SCENE_COUNTS)}")
+        raise InputError(f"--groups {group}: choose from {', '.join(SCENE_COUNTS)}")
     return 3 if group in MORE_GROUPS else int(group.split("_")[0])
 
 
 def parse_groups(text: str, more: tuple[str, ...] = ()) -> list[str]:
-    """ "3_0..3_2,4" -> ["3_0", "3_1", "3_2", "4"]; `more` are names of others that may be asked for."""
+    """Parse --groups: "3_0..3_2,4" -> ["3_0", "3_1", "3_2", "4"]; `more` are further names allowed.
+
+    Raises InputError for an unknown group.
+    """
     out: list[str] = []
     for part in text.split(","):
         span = re.fullmatch(r"(\w+)_(\d)\.\.\1_(\d)", part.strip())
@@ -112,52 +117,56 @@ def parse_groups(text: str, more: tuple[str, ...] = ()) -> list[str]:
 
 
 def sample_scene(index: int, count: int, extents: Mapping[int, PlacementExtent]) -> SceneConfig:
-    """Scene `index` with `count` objects."""
+    """Scene `index` with `count` objects; raises InputError when the objects are too large to be placed."""
     rng = np.random.default_rng([SEED, count, index])
     ids = sorted(extents)
     for _ in range(MAX_DRAWS):
         chosen = [int(i) for i in rng.choice(ids, count)]
-        at = _placed(rng, chosen, extents)
-        if at is not None:
+        positions = _place_objects(rng, chosen, extents)
+        if positions is not None:
             names = "_".join(str(i) for i in chosen)
-            places = tuple(tuple(float(v) for v in p) for p in at)
-            return SceneConfig(f"{index}_{names}", tuple(chosen), places, tuple(extents[i].scale for i in chosen))
+            translation = tuple(tuple(float(v) for v in p) for p in positions)
+            return SceneConfig(f"{index}_{names}", tuple(chosen), translation, tuple(extents[i].scale for i in chosen))
     raise InputError(
-        f"of these objects no {count} find room beside each other in {2 * HALF_EXTENT} m; take smaller ones"
+        f"{count} of these objects could not be placed in a cube of {2 * HALF_EXTENT} m; take smaller ones"
     )
 
 
-def _placed(rng, chosen: list[int], extents: Mapping[int, PlacementExtent]) -> list | None:
-    """Offsets of the objects, the first at the origin; None where one found no room."""
-    at = [np.zeros(3)]
+def _place_objects(
+    rng: np.random.Generator, chosen: list[int], extents: Mapping[int, PlacementExtent]
+) -> list[np.ndarray] | None:
+    """Positions of the objects, the first at the origin; None when one could not be placed."""
+    positions = [np.zeros(3)]
     for k, i in enumerate(chosen[1:], start=1):
         for _ in range(MAX_PLACEMENTS):
             near = int(rng.integers(k))
-            aside = MAX_OFFSET if len(chosen) <= 4 else extents[i].half[:2] + extents[chosen[near]].half[:2]
-            p = np.append(at[near][:2] + rng.uniform(-1, 1, 2) * aside, rng.uniform(-HALF_EXTENT, HALF_EXTENT))
+            max_offset = MAX_OFFSET if len(chosen) <= 4 else extents[i].half[:2] + extents[chosen[near]].half[:2]
+            p = np.append(
+                positions[near][:2] + rng.uniform(-1, 1, 2) * max_offset, rng.uniform(-HALF_EXTENT, HALF_EXTENT)
+            )
             if np.abs(p).max() + extents[i].radius > HALF_EXTENT:
                 continue
-            if all(_apart(p - q, extents[i], extents[j]) for q, j in zip(at, chosen, strict=False)):
-                at.append(p)
+            if all(_separated(p - q, extents[i], extents[j]) for q, j in zip(positions, chosen, strict=False)):
+                positions.append(p)
                 break
         else:
             return None
-    return at
+    return positions
 
 
-def _apart(offset: np.ndarray, mine: PlacementExtent, theirs: PlacementExtent) -> bool:
-    """Whether bounding boxes do not overlap, and centres and points keep their distance."""
-    if (np.abs(offset) < mine.half + theirs.half).all() or np.linalg.norm(offset) < MIN_GAP:
+def _separated(offset: np.ndarray, a: PlacementExtent, b: PlacementExtent) -> bool:
+    """Whether object a at `offset` from b has a disjoint bounding box and keeps MIN_GAP from its centre and points."""
+    if (np.abs(offset) < a.half + b.half).all() or np.linalg.norm(offset) < MIN_GAP:
         return False
-    near = (np.abs(mine.points + offset) < theirs.half + MIN_GAP).all(1)
+    near = (np.abs(a.points + offset) < b.half + MIN_GAP).all(1)
     if not near.any():
         return True
-    distance, _ = theirs.tree.query(mine.points[near] + offset, distance_upper_bound=MIN_GAP)
+    distance, _ = b.tree.query(a.points[near] + offset, distance_upper_bound=MIN_GAP)
     return not np.isfinite(distance).any()
 
 
 def write_scene_configs(path: Path, configs: Mapping[str, SceneConfig]) -> None:
-    """As the public code reads them."""
+    """Write scene configurations (.json) in the published format."""
     rows = {c.name: {"scene_object_idxs": c.ids, "translation": c.translation, "scale": c.scale}
             for c in configs.values()}  # fmt: skip
     with replacing(path) as part:
@@ -165,7 +174,7 @@ def write_scene_configs(path: Path, configs: Mapping[str, SceneConfig]) -> None:
 
 
 def read_scene_configs(path: Path) -> dict[str, SceneConfig]:
-    """Raises InputError for what is no such file."""
+    """Scene configurations by name from a JSON file; raises InputError when it has another format."""
     must_exist(path, "scene configurations (.json)")
     try:
         rows = json.loads(Path(path).read_text())
@@ -176,4 +185,4 @@ def read_scene_configs(path: Path) -> dict[str, SceneConfig]:
             for name, row in rows.items()
         }  # fmt: skip
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise InputError(f"{path}: is not a file of scene configurations ({error!r})") from error
+        raise InputError(f"{path}: is no file of scene configurations ({error!r})") from error

@@ -1,4 +1,4 @@
-"""The parts of the data set that are made scene by scene: Gaussians at rest and in motion, and videos of them."""
+"""The parts of the data set with files for each scene: Gaussians at rest and in motion, and videos of them."""
 
 from __future__ import annotations
 
@@ -13,29 +13,35 @@ from stages.core.physics.mpm.batch import BatchFrame
 from stages.core.scene.files import provenance
 from stages.core.scene.gaussians import Gaussians
 from stages.core.scene.scene_ply import write_scene
-from stages.lab.dataset.gaussian_frames import ObjectSkin, SkinnedScene, rest_scene, write_frames
+from stages.lab.dataset.gaussian_frames import (
+    ObjectSkin,
+    SkinnedScene,
+    compose_scene,
+    opaque_rest_gaussians,
+    write_frames,
+)
 from stages.lab.dataset.layout import Layout, replacing_folder
 from stages.lab.dataset.object_particles import FRAME_INTERVAL, Asset
 from stages.lab.dataset.options import DatasetOptions
 from stages.lab.dataset.scene_configs import SceneConfig
-from stages.lab.dataset.simulation import GRAVITY, simulation_batches, valid_scenes
+from stages.lab.dataset.simulation import GRAVITY, SimulationSettings, simulation_batches, valid_scenes
 from stages.lab.dataset.videos import write_dynamic, write_initial
 
-MAX_BATCH_PARTICLES = 400_000  # particles at once when all frames of a batch are kept: 2 GB for 100
+MAX_BATCH_PARTICLES = 400_000  # when all frames of a batch are kept: 2 GB for 100 frames
 
 
 @dataclass(frozen=True)
 class SceneAssets:
-    """What scenes are made of."""
+    """Inputs of the scene files."""
 
-    things: Mapping[int, Asset]
-    covers: Mapping[int, ObjectSkin]
-    tables: Mapping[str, Gaussians]  # backgrounds, on the device
+    particles: Mapping[int, Asset]
+    skins: Mapping[int, ObjectSkin]
+    backgrounds: Mapping[str, Gaussians]  # on the device
 
 
 @dataclass(frozen=True)
 class MissingFiles:
-    """What is not there yet of a scene."""
+    """The files of a scene that do not exist yet."""
 
     scene: bool
     mpm: bool
@@ -43,81 +49,91 @@ class MissingFiles:
     dynamic: dict[str, dict[int, Path]]  # background -> view -> video
 
     @property
-    def moves(self) -> bool:
+    def needs_simulation(self) -> bool:
+        """Whether a missing file shows the scene in motion."""
         return self.mpm or bool(self.dynamic)
 
     def __bool__(self) -> bool:
-        return self.scene or self.moves or bool(self.initial)
+        return self.scene or self.needs_simulation or bool(self.initial)
 
 
-def missing_files(layout: Layout, options: DatasetOptions, group: str, scene: str) -> MissingFiles:
-    """Of the parts that are asked for."""
-    parts, tables = options.parts, options.tables
-    videos = {b: {v: path for v in options.cameras if not (path := layout.dynamic(group, scene, b, v)).exists()}
-              for b in tables if "dynamic" in parts}  # fmt: skip
-    return MissingFiles(
-        "scenes" in parts and not layout.scene(group, scene).exists(),
-        "mpm" in parts and not layout.mpm(group, scene).exists(),
-        tuple(b for b in tables if "initial" in parts and not layout.initial(group, scene, b).exists()),
-        {b: views for b, views in videos.items() if views},
-    )
+@dataclass(frozen=True)
+class GroupFiles:
+    """The files of one group of scenes: where they are and how they are made."""
+
+    layout: Layout
+    options: DatasetOptions
+    group: str
+    device: str
+
+    def missing(self, scene: str) -> MissingFiles:
+        """Files of the requested parts that do not exist."""
+        layout, group = self.layout, self.group
+        parts, backgrounds = self.options.parts, self.options.background_names
+        videos = {}
+        for b in backgrounds if "dynamic" in parts else ():
+            paths = {v: layout.dynamic(group, scene, b, v) for v in self.options.view_indices}
+            videos[b] = {v: path for v, path in paths.items() if not path.exists()}
+        return MissingFiles(
+            scene="scenes" in parts and not layout.scene(group, scene).exists(),
+            mpm="mpm" in parts and not layout.mpm(group, scene).exists(),
+            initial=tuple(
+                b for b in backgrounds if "initial" in parts and not layout.initial(group, scene, b).exists()
+            ),
+            dynamic={b: views for b, views in videos.items() if views},
+        )
+
+    def write_rest(self, config: SceneConfig, missing: MissingFiles, assets: SceneAssets) -> None:
+        """Write the missing files of a scene that show its first frame."""
+        if missing.scene:
+            path = self.layout.scene(self.group, config.name)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            made_by = provenance("dataset", [self.layout.config(self.group)])
+            write_scene(path, compose_scene(config, [assets.skins[i].gaussians for i in config.ids], made_by))
+        rest = opaque_rest_gaussians(config, assets.skins).to(self.device) if missing.initial else None
+        for name in missing.initial:
+            with replacing_folder(self.layout.initial(self.group, config.name, name)) as folder:
+                write_initial(folder, config, rest, assets.backgrounds[name], self.options.resolution,
+                              self.options.view_indices)  # fmt: skip
+
+    def write_motion(
+        self, config: SceneConfig, missing: MissingFiles, assets: SceneAssets, frames: Sequence[BatchFrame]
+    ) -> None:
+        """Write the missing files of a scene that show its simulated frames."""
+        scene = SkinnedScene(config, assets.skins, assets.particles, self.device)
+        x, F = [frame.x for frame in frames], [frame.F for frame in frames]
+        if missing.mpm:
+            with replacing_folder(self.layout.mpm(self.group, config.name)) as folder:
+                write_frames(folder, scene, x, F)
+        for name, views in missing.dynamic.items():
+            write_dynamic(views, scene, x, F, assets.backgrounds[name], self.options.resolution)
 
 
 def write_scene_files(
-    layout: Layout, options: DatasetOptions, group: str, configs: Mapping[str, SceneConfig],
-    wear: Callable[[], SceneAssets], device: str,
-) -> None:  # fmt: skip
-    """Write what is missing; scenes that went wrong are told of and left without motion."""
-    todo = {name: lacks for name in configs if (lacks := missing_files(layout, options, group, name))}
+    files: GroupFiles, configs: Mapping[str, SceneConfig], load_assets: Callable[[], SceneAssets]
+) -> None:
+    """Write the missing files of all scenes; `load_assets` is called only when there are any.
+
+    A scene whose simulation fails is logged and gets no files of its motion.
+    """
+    options = files.options
+    todo = {name: missing for name in configs if (missing := files.missing(name))}
     if not todo:
         return
-    wardrobe, start = wear(), time.perf_counter()
-    with tqdm(total=len(todo), desc=group, unit="scene") as bar:
-        for name, lacks in todo.items():
-            _at_start(layout, options, group, configs[name], lacks, wardrobe, device)
-            bar.update(not lacks.moves)
-        moving = {name: configs[name] for name, lacks in todo.items() if lacks.moves}
-        fineness = options.fineness
-        for scenes, batch in (
-            simulation_batches(moving, wardrobe.things, fineness, device, True, MAX_BATCH_PARTICLES) if moving else ()
-        ):
-            frames = list(batch.frames(options.frames, FRAME_INTERVAL, fineness.substeps, GRAVITY))
+    assets, start = load_assets(), time.perf_counter()
+    with tqdm(total=len(todo), desc=files.group, unit="scene") as bar:
+        for name, missing in todo.items():
+            files.write_rest(configs[name], missing, assets)
+            bar.update(not missing.needs_simulation)
+        moving = {name: configs[name] for name, missing in todo.items() if missing.needs_simulation}
+        discretisation = options.discretisation
+        settings = SimulationSettings(discretisation, options.frames, options.keypoints, files.device, exact=True)
+        batches = simulation_batches(moving, assets.particles, settings, MAX_BATCH_PARTICLES) if moving else ()
+        for scenes, batch in batches:
+            frames = list(batch.frames(options.frames, FRAME_INTERVAL, discretisation.substeps, GRAVITY))
             for k in valid_scenes(scenes, batch):
-                film = [frame.of(scenes[k].name) for frame in frames]
-                _in_motion(layout, options, group, scenes[k], todo[scenes[k].name], wardrobe, film, device)
+                name = scenes[k].name
+                files.write_motion(scenes[k], todo[name], assets, [frame.of(name) for frame in frames])
                 bar.update()
-    took = time.perf_counter() - start
-    print(f"{group}: {len(todo)} scenes in {took:.1f} s, {took / len(todo):.2f} s each", flush=True)
-
-
-def _at_start(
-    layout: Layout,
-    options: DatasetOptions,
-    group: str,
-    config: SceneConfig,
-    lacks: MissingFiles,
-    wardrobe: SceneAssets,
-    device: str,
-) -> None:
-    if lacks.scene:
-        path = layout.scene(group, config.name)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        made_by = provenance("dataset", [layout.config(group)])
-        write_scene(path, rest_scene(config, wardrobe.covers, shown=False, provenance=made_by))
-    rest = rest_scene(config, wardrobe.covers).gaussians.to(device) if lacks.initial else None
-    for background in lacks.initial:
-        with replacing_folder(layout.initial(group, config.name, background)) as folder:
-            write_initial(folder, config, rest, wardrobe.tables[background], options.resolution, options.cameras)
-
-
-def _in_motion(
-    layout: Layout, options: DatasetOptions, group: str, config: SceneConfig, lacks: MissingFiles,
-    wardrobe: SceneAssets, film: Sequence[BatchFrame], device: str,
-) -> None:  # fmt: skip
-    carried = SkinnedScene(config, wardrobe.covers, wardrobe.things, device)
-    x, F = [frame.x for frame in film], [frame.F for frame in film]
-    if lacks.mpm:
-        with replacing_folder(layout.mpm(group, config.name)) as folder:
-            write_frames(folder, carried, x, F)
-    for background, views in lacks.dynamic.items():
-        write_dynamic(views, carried, x, F, wardrobe.tables[background], options.resolution)
+    seconds = time.perf_counter() - start
+    print(f"{files.group}: {len(todo)} scenes in {seconds:.1f} s, {seconds / len(todo):.2f} s each", flush=True)

@@ -1,15 +1,16 @@
-"""What happens in the scenes of a data set: falls, contacts, containment, tipping, spread, deformation, rest.
+"""Statistics of simulated scenes: falls, contacts, containment, tipping, spread, deformation, rest.
 
-All of it is measured on keypoints, in scene units, by thresholds that are stated here:
+All are measured on keypoints, in scene units:
 
-    falls       an object's centre ends FALLEN lower than it began
-    touch       points of two objects come within TOUCH; scenes begin with at least 0.05
-    stacked     at the end an object lies still, on another one and not on the floor
-    contained   at the end the lowest quarter of an object is below the rim of an upright bowl that it lies over
-    tipped      an object's own vertical ends TIPPED away from where it began
-    spread      mean horizontal distance of the objects' centres from their mean, at the end
-    deformation RMS distance of the points from the nearest rigid motion, over the RMS radius; the largest over time
-    at rest     points move slower than STILL on average over the last five frames
+    falls       the object's centre ends FALL_HEIGHT or more below its start
+    touch       points of two objects come within CONTACT_DISTANCE; scenes start with at least 0.05 m between objects
+    stacked     at the end the object rests in contact with another one, above the floor
+    contained   at the end the lowest quarter of the object is below the rim of an upright bowl and its
+                centre within the radius of the bowl
+    tipped      the object's own vertical axis ends more than TIP_ANGLE from its start
+    spread      mean horizontal distance of the objects' centres from their mean, at the end [m]
+    deformation RMS distance of the points from the best rigid fit, divided by the RMS radius; maximum over time
+    at rest     the points move slower than REST_SPEED, averaged over the last five frames
 """
 
 from __future__ import annotations
@@ -35,15 +36,17 @@ from stages.lab.training.data import motions_folder
 
 FALL_HEIGHT, CONTACT_DISTANCE, REST_SPEED = 0.05, 0.04, 0.05  # [m], [m], [m/s]
 TIP_ANGLE = 30.0  # [deg]
-FLOOR_CLEARANCE = 0.04  # lowest point above the floor at most [m]: bodies keep about a cell from it
+FLOOR_CLEARANCE = (
+    0.04  # largest height of the lowest point of an object on the floor [m]: bodies stop about a cell above it
+)
 BOWL = "bowl"
-CONTACT_STRIDE = 2  # frames between looks at contacts
-SCENE_BATCH = 20  # scenes
+CONTACT_STRIDE = 2  # frames between contact tests
+SCENE_BATCH = 20  # scenes measured at once
 
 
 @dataclass(frozen=True)
 class SceneStatistics:
-    """A number for each scene (s), each object (s, o) or each pair of them (s, pairs); nan where there is no object."""
+    """One value per scene (s), object (s, o) or pair of objects (s, q); nan where there is no object."""
 
     falls: Float[Tensor, "s o"]
     touch: Float[Tensor, "s q"]
@@ -56,50 +59,54 @@ class SceneStatistics:
 
 
 def compute_statistics(m: KeypointMotions) -> SceneStatistics:
-    """All of the above, for scenes that fit into memory together."""
-    p, there = m.points, m.present
+    """All statistics, of scenes that fit into memory together."""
+    p, present = m.points, m.present
     centre = p.mean(3)
-    turn, deformation = _rigid(p, centre)
-    tilt = torch.rad2deg(turn[..., 2, 2].clamp(-1, 1).acos())  # (s, t, o)
+    R, deformation = _rigid_fit(p, centre)
+    tilt = torch.rad2deg(R[..., 2, 2].clamp(-1, 1).acos())  # (s, t, o)
     speed = (p[:, 1:] - p[:, :-1]).norm(dim=-1).mean(-1)[:, -5:].mean(1) / m.dt
     lowest = p[:, -1, :, :, 2].amin(-1)
     still = speed < REST_SPEED
-    touching = _nearest_pairs(p) < CONTACT_DISTANCE  # (s, t, q)
+    touching = _pair_distances(p) < CONTACT_DISTANCE  # (s, t, q)
     pairs = torch.tensor(list(combinations(range(p.shape[2]), 2)), dtype=torch.int64).reshape(-1, 2)
     q = pairs.to(p.device)
-    both = there[:, q[:, 0]] & there[:, q[:, 1]]
-    last = torch.zeros_like(there)
+    both = present[:, q[:, 0]] & present[:, q[:, 1]]
+    touching_last = torch.zeros_like(present)
     for k, (i, j) in enumerate(pairs.tolist()):
-        last[:, i] |= touching[:, -1, k]
-        last[:, j] |= touching[:, -1, k]
-    flat = (centre[:, -1, :, :2] - _mean(centre[:, -1, :, :2], there)[:, None]).norm(dim=-1)
+        touching_last[:, i] |= touching[:, -1, k]
+        touching_last[:, j] |= touching[:, -1, k]
+    flat = (centre[:, -1, :, :2] - _mean(centre[:, -1, :, :2], present)[:, None]).norm(dim=-1)
     nan = lambda x, mask: torch.where(mask, x.float(), torch.nan)  # noqa: E731
     return SceneStatistics(
-        nan(centre[:, 0, :, 2] - centre[:, -1, :, 2] > FALL_HEIGHT, there), nan(touching.any(1), both),
-        nan(still & last & (lowest - m.box[0][2] > FLOOR_CLEARANCE), there), nan(_contained(m, tilt[:, -1]), there),
-        nan(tilt[:, -1] > TIP_ANGLE, there), _mean(flat[..., None], there)[:, 0],
-        nan(deformation.amax(1), there), nan(still, there),
-    )  # fmt: skip
+        falls=nan(centre[:, 0, :, 2] - centre[:, -1, :, 2] > FALL_HEIGHT, present),
+        touch=nan(touching.any(1), both),
+        stacked=nan(still & touching_last & (lowest - m.box[0][2] > FLOOR_CLEARANCE), present),
+        contained=nan(_contained(m, tilt[:, -1]), present),
+        tipped=nan(tilt[:, -1] > TIP_ANGLE, present),
+        spread=_mean(flat[..., None], present)[:, 0],
+        deformation=nan(deformation.amax(1), present),
+        at_rest=nan(still, present),
+    )
 
 
-def _mean(x: Float[Tensor, "s o d"], there: Bool[Tensor, "s o"]) -> Float[Tensor, "s d"]:
-    return torch.where(there[..., None], x, 0.0).sum(1) / there.sum(1, keepdim=True)
+def _mean(x: Float[Tensor, "s o d"], present: Bool[Tensor, "s o"]) -> Float[Tensor, "s d"]:
+    return torch.where(present[..., None], x, 0.0).sum(1) / present.sum(1, keepdim=True)
 
 
-def _rigid(
+def _rigid_fit(
     p: Float[Tensor, "s t o n 3"], centre: Float[Tensor, "s t o 3"]
 ) -> tuple[Float[Tensor, "s t o 3 3"], Float[Tensor, "s t o"]]:
-    """Rotation of each object since the start (Kabsch 1976), and how far its points are from turned so."""
+    """Rotation of each object since the start (Kabsch 1976), and the relative RMS residual of its points."""
     now = p - centre[..., None, :]
     rest = now[:, :1]
-    H = (now.mT @ rest).cpu().double()  # small matrices are turned faster there
+    H = (now.mT @ rest).cpu().double()  # small matrices are decomposed faster there
     R = nearest_rotation(H + 1e-9 * torch.eye(3, dtype=H.dtype)).to(p)
-    off = (now - rest @ R.mT).square().sum(-1).mean(-1).sqrt()
-    return R, off / rest.square().sum(-1).mean(-1).sqrt().clamp_min(1e-9)
+    residual = (now - rest @ R.mT).square().sum(-1).mean(-1).sqrt()
+    return R, residual / rest.square().sum(-1).mean(-1).sqrt().clamp_min(1e-9)
 
 
-def _nearest_pairs(p: Float[Tensor, "s t o n 3"]) -> Float[Tensor, "s t2 q"]:
-    """Least distance between points of two objects, in every second frame and the last."""
+def _pair_distances(p: Float[Tensor, "s t o n 3"]) -> Float[Tensor, "s t2 q"]:
+    """Smallest distance between points of each pair of objects [m], in every second frame and the last."""
     frames = sorted({*range(0, p.shape[1], CONTACT_STRIDE), p.shape[1] - 1})
     p = p[:, frames]
     found = [torch.cdist(p[:, :, i], p[:, :, j]).amin((-1, -2)) for i, j in combinations(range(p.shape[2]), 2)]
@@ -107,7 +114,7 @@ def _nearest_pairs(p: Float[Tensor, "s t o n 3"]) -> Float[Tensor, "s t2 q"]:
 
 
 def _contained(m: KeypointMotions, tilt: Float[Tensor, "s o"]) -> Bool[Tensor, "s o"]:
-    """Objects that lie in a bowl in the last frame."""
+    """Objects that lie in an upright bowl in the last frame."""
     end, kind = m.points[:, -1], m.objects
     low, high, centre = end.amin(2), end.amax(2), end.mean(2)
     bowl = torch.tensor([i >= 0 and object_kind(i).name == BOWL for i in kind.flatten().tolist()]).reshape(kind.shape)
@@ -124,7 +131,10 @@ def _contained(m: KeypointMotions, tilt: Float[Tensor, "s o"]) -> Bool[Tensor, "
 
 
 def run(data: Path, out: Path | None, groups: Sequence[str], keypoints: int, device: str) -> list[str]:
-    """Statistics of each group and each kind of object, as JSON and as lines of a table."""
+    """Measure the statistics of each group and kind of object, write JSON to `out`, return the lines of two tables.
+
+    Only the first `keypoints` of each object are used. Raises InputError when the data set has none of the groups.
+    """
     device, table, kinds = pick_device(device), {}, {}
     for group in groups:
         path = motions_folder(data) / f"{group}.h5"
@@ -134,22 +144,24 @@ def run(data: Path, out: Path | None, groups: Sequence[str], keypoints: int, dev
         parts = []
         for first in tqdm(range(0, len(motions), SCENE_BATCH), desc=group, unit="batch", leave=False):
             some = motions[slice(first, first + SCENE_BATCH)]
-            parts.append(compute_statistics(_thinned(some, keypoints).to(device)))
-        facts = SceneStatistics(
+            parts.append(compute_statistics(_first_keypoints(some, keypoints).to(device)))
+        measured = SceneStatistics(
             *(torch.cat([getattr(f, n).cpu() for f in parts]) for n in SceneStatistics.__dataclass_fields__)
         )
-        table[group] = {"scenes": len(motions), **group_summary(facts)}
+        table[group] = {"scenes": len(motions), **group_summary(measured)}
         for i in motions.objects.unique().tolist():
             if i >= 0:
-                kinds.setdefault(object_kind(i).name, []).append((facts, motions.objects == i))
+                kinds.setdefault(object_kind(i).name, []).append((measured, motions.objects == i))
     if not table:
         folder = motions_folder(data)
         raise InputError(f"{folder}: has none of {', '.join(groups)} (.h5); make them with `ngff-lab dataset`")
-    of = {name: _of_kind(parts) for name, parts in sorted(kinds.items())}
+    objects = {name: _object_summary(parts) for name, parts in sorted(kinds.items())}
     if out is not None:
         with replacing(Path(out)) as part:
-            part.write_text(json.dumps({"thresholds": THRESHOLDS, "groups": table, "objects": of}, indent=1) + "\n")
-    return markdown_table(table, "group") + [""] + markdown_table(of, "object")
+            part.write_text(
+                json.dumps({"thresholds": THRESHOLDS, "groups": table, "objects": objects}, indent=1) + "\n"
+            )
+    return markdown_table(table, "group") + [""] + markdown_table(objects, "object")
 
 
 THRESHOLDS = {
@@ -162,12 +174,12 @@ THRESHOLDS = {
 OBJECT_FRACTIONS = ("falls", "tipped", "stacked", "contained", "at_rest")  # of objects
 
 
-def _thinned(m: KeypointMotions, keypoints: int) -> KeypointMotions:
+def _first_keypoints(m: KeypointMotions, keypoints: int) -> KeypointMotions:
     return replace(m, points=m.points[:, :, :, :keypoints])
 
 
 def group_summary(f: SceneStatistics) -> dict[str, float]:
-    """Shares of objects, and of scenes in which it happens to any; means of the others."""
+    """Fraction of objects with each property, of scenes in which any object has it, and means of the other values."""
     out = {name: _round(getattr(f, name).nanmean()) for name in OBJECT_FRACTIONS}
     out["contacts a scene"] = _round(f.touch.nansum(1).mean())
     for name in ("touch", "tipped", "stacked", "contained"):
@@ -179,8 +191,8 @@ def group_summary(f: SceneStatistics) -> dict[str, float]:
     return out
 
 
-def _of_kind(parts: list[tuple[SceneStatistics, Tensor]]) -> dict[str, float]:
-    """The same for the objects of one kind."""
+def _object_summary(parts: list[tuple[SceneStatistics, Tensor]]) -> dict[str, float]:
+    """The same for all objects of one kind."""
     out: dict[str, float] = {"count": int(sum(int(mask.sum()) for _, mask in parts))}
     for name in (*OBJECT_FRACTIONS, "deformation"):
         out[name] = _round(torch.cat([getattr(f, name)[mask] for f, mask in parts]).nanmean())
@@ -192,7 +204,7 @@ def _round(x: Tensor) -> float:
 
 
 def markdown_table(table: dict[str, dict[str, float]], label: str) -> list[str]:
-    """A Markdown table."""
+    """Lines of a Markdown table; `label` is the heading of the first column."""
     heads = list(next(iter(table.values())))
     rows = [[label, *heads], ["---"] * (len(heads) + 1)]
     rows += [[name, *(f"{row[h]:.3g}" for h in heads)] for name, row in table.items()]

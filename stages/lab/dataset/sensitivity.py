@@ -1,7 +1,7 @@
-"""How predictable the data set's world is: errors between two runs whose objects start a little aside.
+"""Sensitivity to initial conditions: errors between two runs of the same scenes with slightly displaced objects.
 
-No model that is told the start to this precision can be expected to do better, so this is the floor under all of
-them: `ngff-lab bench dynamics` measures models on the same splits by the same metrics.
+No model that knows the start only to this precision can be expected to do better, so this is a lower bound on the
+error: `ngff-lab bench dynamics` measures models on the same splits by the same metrics.
 """
 
 from __future__ import annotations
@@ -23,13 +23,16 @@ from stages.lab.dataset.scene_configs import parse_groups
 from stages.lab.training.data import motions_folder, read_groups
 
 SPLITS = {"spatial": ("3_9", 80), "temporal": ("3_0..3_8", 100), "4 objects": ("4", 80), "6 objects": ("6", 80)}
-TEMPORAL_SCENES = 300  # scenes of the temporal split
-SCENE_BATCH = 50  # scenes
+TEMPORAL_SCENES = 300  # random scenes of the temporal split
+SCENE_BATCH = 50  # scenes compared at once
 METRICS = ("RMSE", "FPE", "PCE", "R", "R_pooled")
 
 
 def run(data: Path, nudged: Path, out: Path | None, keypoints: int, device: str) -> list[str]:
-    """RMSE, FPE, PCE and R of each split that both have, as JSON and as lines of a table."""
+    """Compare two data sets on each split that both have; write JSON to `out` and return the lines of a table.
+
+    Raises InputError when they share no group, or the start positions are equal.
+    """
     device, rows = pick_device(device), {}
     for split, (groups, frames) in SPLITS.items():
         names = [
@@ -39,12 +42,12 @@ def run(data: Path, nudged: Path, out: Path | None, keypoints: int, device: str)
             continue
         truth, other = common_scenes(read_groups(data, names, keypoints), read_groups(nudged, names, keypoints))
         if split == "temporal":
-            some = torch.randperm(len(truth), generator=torch.Generator().manual_seed(0))[:TEMPORAL_SCENES]
-            truth, other = truth[some], other[some]
-        rows[split] = compare_motions(_cut(truth, frames).to(device), _cut(other, frames).to(device))
+            chosen = torch.randperm(len(truth), generator=torch.Generator().manual_seed(0))[:TEMPORAL_SCENES]
+            truth, other = truth[chosen], other[chosen]
+        rows[split] = compare_motions(_first_frames(truth, frames).to(device), _first_frames(other, frames).to(device))
         if not rows[split]["start apart"]:
-            raise InputError(f"{nudged}: its scenes of {', '.join(names)} start where those of {data} do; make it with "
-                             "`ngff-lab dataset --nudge 0.001`")  # fmt: skip
+            raise InputError(f"{nudged}: its scenes of {', '.join(names)} start exactly where those of {data} do; make "
+                             "it with `ngff-lab dataset --nudge 0.001`")  # fmt: skip
     if not rows:
         raise InputError(f"{nudged}: has no group of scenes that {data} has too")
     if out is not None:
@@ -59,28 +62,32 @@ def run(data: Path, nudged: Path, out: Path | None, keypoints: int, device: str)
 
 
 def common_scenes(a: KeypointMotions, b: KeypointMotions) -> tuple[KeypointMotions, KeypointMotions]:
-    """The scenes that ended well in both, in one order."""
-    both = [n for n in a.names if n in set(b.names)]
-    return a[_places(a, both)], b[_places(b, both)]
+    """The scenes that both runs have, in the order of the first."""
+    names_b = set(b.names)
+    both = [n for n in a.names if n in names_b]
+    return a[_rows(a, both)], b[_rows(b, both)]
 
 
-def _places(m: KeypointMotions, names: list[str]) -> Int[Tensor, "r"]:
-    at = {n: i for i, n in enumerate(m.names)}
-    return torch.tensor([at[n] for n in names], dtype=torch.int64)
+def _rows(m: KeypointMotions, names: list[str]) -> Int[Tensor, "r"]:
+    row = {n: i for i, n in enumerate(m.names)}
+    return torch.tensor([row[n] for n in names], dtype=torch.int64)
 
 
-def _cut(m: KeypointMotions, frames: int) -> KeypointMotions:
+def _first_frames(m: KeypointMotions, frames: int) -> KeypointMotions:
     return replace(m, points=m.points[:, :frames])
 
 
 def compare_motions(truth: KeypointMotions, other: KeypointMotions) -> dict[str, float | int]:
-    """Metrics of one run as a prediction of the other, averaged over scenes."""
+    """Metrics of `other` as a prediction of `truth`, averaged over scenes, and the mean start distance [m].
+
+    Scenes in which a metric is undefined (R without motion) are left out of its mean.
+    """
     found = []
     for first in range(0, len(truth), SCENE_BATCH):
         a, b = (m[slice(first, first + SCENE_BATCH)] for m in (truth, other))
         mask = a.present[..., None].expand(*a.present.shape, a.points.shape[3])
         found.append(all_metrics(b.points, a.points, mask))
-    means = {name: float(torch.cat([f[name] for f in found]).nanmean()) for name in METRICS}  # R: where nothing moves
+    means = {name: float(torch.cat([f[name] for f in found]).nanmean()) for name in METRICS}
     apart = (truth.points[:, 0] - other.points[:, 0]).norm(dim=-1).mean(-1)[truth.present]
     return {"scenes": len(truth), "start apart": round(float(apart.mean()), 6),
             **{name: round(value, 6) for name, value in means.items()}}  # fmt: skip

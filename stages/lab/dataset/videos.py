@@ -1,13 +1,13 @@
-"""The videos of the data set, drawn as `ngff render` draws: 100 views of the start, and views of what happens.
+"""The videos of the data set, rendered as by `ngff render`: 100 views of the first frame, and views over time.
 
-    initial/<group>/<scene>/<background>/   <scene>.mp4    the start, seen from the whole orbit, a frame each
-                                            cameras.json   of these frames
+    initial/<group>/<scene>/<background>/   <scene>.mp4    the first frame from every camera of the orbit
+                                            cameras.json   the cameras of these frames
                                             prompts.json   center_point, bbox [px of view 0] and text of each object
                                             depth.h5       depth (v,h,w) uint16 from 0 to depth_max, of the cameras
-                                                           `view`; 0: nothing there
+                                                           `view`; 0: no surface
     dynamic/.../view_<i>/<scene>.mp4        the scene over time from camera i of the orbit
 
-Source: public code of NGFF; its videos are MPEG-4 part 2, ours H.264.
+Source: public code of NGFF; the published videos are MPEG-4 part 2, these are H.264.
 """
 
 from __future__ import annotations
@@ -42,61 +42,68 @@ FPS = 1 / FRAME_INTERVAL
 
 
 def write_initial(
-    folder: Path, config: SceneConfig, rest: Gaussians, behind: Gaussians, resolution: int, views: Sequence[int]
+    folder: Path, config: SceneConfig, rest: Gaussians, background: Gaussians, resolution: int, views: Sequence[int]
 ) -> None:
-    """What is known of a scene before it moves; `behind` is the background, on the same device."""
-    cameras, backdrop = orbit_cameras(resolution), RenderBackground(keep_scene=False, gaussians=behind)
-    shown, depths = backdrop.compose(rest), []
+    """Write the `initial` files of a scene over one background.
+
+    `rest` are its Gaussians in the first frame and `background` those behind it, on the same device; depth is stored
+    for the orbit cameras `views`.
+    """
+    cameras, backdrop = orbit_cameras(resolution), RenderBackground(keep_scene=False, gaussians=background)
+    gaussians, depths = backdrop.compose(rest), []
     with VideoWriter(folder / f"{config.name}.mp4", FPS) as video:
         for i in range(ORBIT_VIEWS):
-            seen = render_view(shown, cameras, i, backdrop)
-            video.append(seen.image)
+            rendered = render_view(gaussians, cameras, i, backdrop)
+            video.append(rendered.image)
             if i in views:
-                depths.append(seen.depth)
+                depths.append(rendered.depth)
     (folder / "cameras.json").write_text(json.dumps(camera_rows(cameras.viewmats, resolution)))
     (folder / "prompts.json").write_text(json.dumps(prompts(config, rest, cameras)))
     (folder / "depth.h5").write_bytes(_depth_file(torch.stack(depths), views))
 
 
 def prompts(config: SceneConfig, rest: Gaussians, cameras: Cameras) -> dict[str, list]:
-    """Where each object is in view 0, and what it is called."""
+    """Projected centre and bounding box [px] of each object in view 0, and its text prompt."""
     width, height = cameras.sizes[0].tolist()
-    top = torch.tensor([width, height], dtype=torch.float32)
+    size = torch.tensor([width, height], dtype=torch.float32)
     centres, boxes = [], []
     for n in range(1, len(config.ids) + 1):
         pixels = project(rest.means[rest.object_id == n].cpu(), cameras.viewmats[0], cameras.Ks[0])
         centres.append(pixels.mean(0).tolist())
-        low, high = (v.clamp_min(0).minimum(top).tolist() for v in (pixels.amin(0), pixels.amax(0)))
+        low, high = (v.clamp_min(0).minimum(size).tolist() for v in (pixels.amin(0), pixels.amax(0)))
         boxes.append([*low, *high])
     return {"center_point": centres, "bbox": boxes, "text": [object_kind(i).prompt for i in config.ids]}
 
 
 def _depth_file(depth: Float[Tensor, "v h w"], views: Sequence[int]) -> memoryview:
-    most = max(float(depth.max()), 1e-6)
+    max_depth = max(float(depth.max()), 1e-6)
     memory = io.BytesIO()
     with h5py.File(memory, "w") as file:
-        steps = (depth / most * 65535).round().numpy().astype(np.uint16)
-        file.create_dataset("depth", data=steps, chunks=(1, *steps.shape[1:]), compression="gzip", compression_opts=4,
-                            shuffle=True)  # fmt: skip
-        file["depth_max"] = np.float32(most)
+        quantised = (depth / max_depth * 65535).round().numpy().astype(np.uint16)
+        file.create_dataset("depth", data=quantised, chunks=(1, *quantised.shape[1:]), compression="gzip",
+                            compression_opts=4, shuffle=True)  # fmt: skip
+        file["depth_max"] = np.float32(max_depth)
         file["view"] = np.array(views, np.int64)
     return memory.getbuffer()
 
 
 def write_dynamic(
-    paths: dict[int, Path], scene: SkinnedScene, x: Sequence[Tensor], F: Sequence[Tensor], behind: Gaussians,
+    paths: dict[int, Path], scene: SkinnedScene, x: Sequence[Tensor], F: Sequence[Tensor], background: Gaussians,
     resolution: int,
 ) -> None:  # fmt: skip
-    """A video of each view in `paths`; pictures are encoded by threads while the next are drawn."""
-    cameras, backdrop = orbit_cameras(resolution), RenderBackground(keep_scene=False, gaussians=behind)
+    """Write one video for each view in `paths`; threads encode a frame while the next one is rendered.
+
+    `x` and `F` are the particle positions (p, 3) [m] and deformation gradients (p, 3, 3) of each frame.
+    """
+    cameras, backdrop = orbit_cameras(resolution), RenderBackground(keep_scene=False, gaussians=background)
     for path in paths.values():
         path.parent.mkdir(parents=True, exist_ok=True)
     with ExitStack() as stack, ThreadPoolExecutor(len(paths)) as pool:
         videos = [stack.enter_context(VideoWriter(path, FPS)) for path in paths.values()]
-        before: Iterator[None] = iter(())
-        for places, gradients in zip(x, F, strict=True):
-            shown = backdrop.compose(scene.at(places, gradients)[0])
-            images = [render_view(shown, cameras, i, backdrop).image for i in paths]
-            list(before)  # frames of a video are encoded in their order
-            before = pool.map(VideoWriter.append, videos, images)
-        list(before)
+        pending: Iterator[None] = iter(())
+        for positions, gradients in zip(x, F, strict=True):
+            gaussians = backdrop.compose(scene.at(positions, gradients)[0])
+            images = [render_view(gaussians, cameras, i, backdrop).image for i in paths]
+            list(pending)  # the frames of a video are encoded in order
+            pending = pool.map(VideoWriter.append, videos, images)
+        list(pending)

@@ -27,9 +27,9 @@ from stages.lab.assets.field_sampling import (
     relax_points,
     sample_surface,
 )
-from stages.lab.assets.objects import OBJECTS, make_object
+from stages.lab.assets.objects import OBJECTS, POINT_CLOUD, make_object
 from stages.lab.assets.shapes import Surface, to_gaussians
-from stages.lab.assets.splat_files import POINT_CLOUD, camera_rows
+from stages.lab.assets.splat_files import camera_rows
 
 
 @cache

@@ -41,10 +41,11 @@ from stages.lab.bench.dynamics_baselines import (
 )
 from stages.lab.bench.dynamics_report import markdown, table
 from stages.lab.dataset.keypoint_motions import KeypointMotions, concatenate_motions, write_motions
-from stages.lab.dataset.object_particles import Asset, Discretisation, particle_volumes
+from stages.lab.dataset.object_particles import Asset, particle_volumes
 from stages.lab.dataset.scene_configs import SceneConfig, write_scene_configs
-from stages.lab.dataset.simulation import simulate
+from stages.lab.dataset.simulation import SimulationSettings, simulate
 from stages.lab.plot import LEGEND_HEIGHT, PANEL_HEIGHT, PANEL_WIDTH
+from tests.lab.small_world import COARSE, box_shell
 from tests.lab.training.test_train import falling, without_last
 
 GROUPS = [*(f"3_{i}" for i in range(10)), "4", "6", "heldout"]
@@ -255,17 +256,6 @@ def test_the_best_model_of_each_split_is_bold():
     assert "| NGFF | 0.0820 / 0.326 / 0.661 | 0.363 s |" in text and "measured on other data" in text
 
 
-def box_shell(half, n=150, seed=0):
-    rng = torch.Generator().manual_seed(seed)
-    p = torch.rand(n, 3, generator=rng) * 2 - 1
-    axis = torch.randint(3, (n,), generator=rng)
-    p[torch.arange(n), axis] = p[torch.arange(n), axis].sign()
-    return p * torch.tensor(half)
-
-
-COARSE = Discretisation(dx=0.08, spacing=0.03, substep=5e-4)
-
-
 @pytest.fixture
 def simulated(tmp_path, monkeypatch):
     """One group of two scenes with a ball and a duck, and what made it; one scene is of objects far off the box."""
@@ -278,7 +268,7 @@ def simulated(tmp_path, monkeypatch):
         (tmp_path / "set" / folder).mkdir(parents=True)
     write_scene_configs(tmp_path / "set" / "scene_configs" / "3_9.json", configs)
     options = {"dx": COARSE.dx, "spacing": COARSE.spacing, "substep": COARSE.substep, "keypoints": 60}
-    made = concatenate_motions(list(simulate(configs, things, COARSE, 12, 60, "cpu")))
+    made = concatenate_motions(list(simulate(configs, things, SimulationSettings(COARSE, 12, 60, "cpu"))))
     write_motions(tmp_path / "set" / "motions" / "3_9.h5", made, {"options": options})
     monkeypatch.setattr(dynamics_baselines, "load_assets", lambda fineness, least, kept: things)
     return tmp_path / "set", things

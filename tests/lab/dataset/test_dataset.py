@@ -1,3 +1,5 @@
+"""Sampling of scenes, their simulation, the files of keypoint trajectories, and the generator."""
+
 import inspect
 import json
 from dataclasses import fields
@@ -25,35 +27,25 @@ from stages.lab.dataset.scene_configs import (
     sample_scene,
     write_scene_configs,
 )
-from stages.lab.dataset.simulation import simulate
+from stages.lab.dataset.simulation import SimulationSettings, simulate
 from stages.lab.training.data import read_groups
-
-COARSE = Discretisation(dx=0.08, spacing=0.03, substep=5e-4)
-
-
-def box_shell(half, n=150, seed=0):
-    """Points on the surface of a box."""
-    rng = torch.Generator().manual_seed(seed)
-    p = torch.rand(n, 3, generator=rng) * 2 - 1
-    axis = torch.randint(3, (n,), generator=rng)
-    p[torch.arange(n), axis] = p[torch.arange(n), axis].sign()
-    return p * torch.tensor(half)
+from tests.lab.small_world import COARSE, box_shell
 
 
 @pytest.fixture(scope="module")
-def things():
+def assets():
     shapes = {0: (0.2, 0.2, 0.2), 2: (0.25, 0.25, 0.05), 7: (0.1, 0.1, 0.3)}
     points = {i: box_shell(half, seed=i) for i, half in shapes.items()}
     return {i: Asset(i, 1.0, p, particle_volumes(p, COARSE.dx), 1e5, 500.0) for i, p in points.items()}
 
 
 @pytest.fixture(scope="module")
-def extents(things):
-    return object_particles.placement_extents(things)
+def extents(assets):
+    return object_particles.placement_extents(assets)
 
 
 @pytest.mark.parametrize("count", [2, 3, 6])
-def test_scenes_keep_the_rules(extents, count):
+def test_sampled_scenes_follow_the_published_rules(extents, count):
     for index in range(8):
         c = sample_scene(index, count, extents)
         assert c == sample_scene(index, count, extents) and len(c.ids) == count
@@ -67,7 +59,7 @@ def test_scenes_keep_the_rules(extents, count):
                    for i, p in zip(c.ids[1:], c.translation[1:], strict=True))  # fmt: skip
 
 
-def test_groups_and_their_files(tmp_path, extents, monkeypatch):
+def test_groups_are_parsed_sampled_and_stored(tmp_path, extents, monkeypatch):
     assert parse_groups("3_0..3_2, 4") == ["3_0", "3_1", "3_2", "4"]
     with pytest.raises(InputError, match="3_10"):
         parse_groups("3_10")
@@ -75,7 +67,14 @@ def test_groups_and_their_files(tmp_path, extents, monkeypatch):
     for group in ("3_9", "more_0", "more_1"):
         monkeypatch.setitem(SCENE_COUNTS, group, 2)
     made = [c for group in ("3_9", "more_0", "more_1") for c in sample_group(group, extents).values()]
-    assert [int(c.name.split("_")[0]) for c in made] == [2700, 2701, 3000, 3001, 3300, 3301]  # none is another's
+    assert [int(c.name.split("_")[0]) for c in made] == [
+        2700,
+        2701,
+        3000,
+        3001,
+        3300,
+        3301,
+    ]  # no two groups share a scene
     assert all(len(c.ids) == 3 for c in made)
     monkeypatch.setitem(SCENE_COUNTS, "4", 10)
     configs = sample_group("4", extents)
@@ -89,53 +88,55 @@ def test_groups_and_their_files(tmp_path, extents, monkeypatch):
         read_scene_configs(tmp_path / "bad.json")
 
 
-def test_free_fall_and_the_floor(things):
+def test_objects_fall_freely_and_rest_on_the_floor(assets, device):
     configs = {n: SceneConfig(n, ids, at, (1.0,) * len(ids)) for n, ids, at in (
         ("0_0_7", (0, 7), ((0.0, 0.0, 0.5), (0.8, 0.0, 0.2))), ("1_2", (2,), ((0.0, 0.0, -0.88),)))}  # fmt: skip
-    made = concatenate_motions(list(simulate(configs, things, COARSE, 30, 100, "cpu")))
+    made = concatenate_motions(list(simulate(configs, assets, SimulationSettings(COARSE, 30, 100, device))))
     assert made.names == ("0_0_7", "1_2") and made.points.shape == (2, 30, 2, 100, 3)
     assert made.objects.tolist() == [[0, 7], [2, -1]] and not made.points[1, :, 1].any()
     com = made.points.mean(3)
     fallen = com[0, 0, 0, 2] - com[0, 12, 0, 2]
     assert float(fallen) == pytest.approx(5 / 2 * (12 * 0.02) ** 2, rel=0.02)
-    assert (com[1, -1, 0] - com[1, 0, 0]).norm() < 0.03  # lies on the floor and stays
+    assert (com[1, -1, 0] - com[1, 0, 0]).norm() < 0.03  # rests on the floor
     assert made.points[..., 2].min() > -0.94 - 0.5 * COARSE.dx
-    assert float(made.mass[0, 0]) == pytest.approx(500 * float(things[0].volume.sum()))
-    world = made.initial_conditions(50)
-    assert world.points.shape == (2, 2, 50, 3) and world.present.tolist() == [[True, True], [True, False]]
+    assert float(made.mass[0, 0]) == pytest.approx(500 * float(assets[0].volume.sum()))
+    initial = made.initial_conditions(50)
+    assert initial.points.shape == (2, 2, 50, 3) and initial.present.tolist() == [[True, True], [True, False]]
 
 
-def test_a_scene_that_goes_wrong_is_told_and_left_out(things, caplog):
+def test_failed_scene_is_logged_and_left_out(assets, caplog, device):
     configs = {
         n: SceneConfig(n, (0,), (at,), (1.0,)) for n, at in (("good", (0.0, 0.0, 0.0)), ("bad", (5.0, 0.0, 0.0)))
     }
-    made = concatenate_motions(list(simulate(configs, things, COARSE, 3, 100, "cpu")))
+    made = concatenate_motions(list(simulate(configs, assets, SimulationSettings(COARSE, 3, 100, device))))
     assert made.names == ("good",) and "bad" in caplog.text
 
 
-def test_motions_round_trip(tmp_path, things):
+def test_motions_round_trip(tmp_path, assets, device):
     config = SceneConfig("a", (0, 2), ((0.0, 0.0, 0.5), (0.6, 0.0, 0.3)), (1.0, 1.0))
-    made = concatenate_motions(list(simulate({"a": config}, things, COARSE, 4, 60, "cpu")))
+    made = concatenate_motions(list(simulate({"a": config}, assets, SimulationSettings(COARSE, 4, 60, device))))
     write_motions(tmp_path / "m.h5", made, {"command": "test"})
     back = read_motions(tmp_path / "m.h5")
-    with h5py.File(tmp_path / "m.h5", "r+") as file:  # HDF5's own filters would store the same
+    with h5py.File(tmp_path / "m.h5", "r+") as file:  # HDF5's own filters compress as well
         chunk = file["points"].id.read_direct_chunk((0, 0, 0, 0, 0))[1]
         file["points"][...] = file["points"][...]
         assert len(file["points"].id.read_direct_chunk((0, 0, 0, 0, 0))[1]) == pytest.approx(len(chunk), rel=0.05)
         assert file["points"].compression == "gzip" and file["points"].shuffle and file["points"].dtype == "<i2"
-    assert (back.points - made.points).abs().max() <= 0.51 * POSITION_STEP
+    assert (back.points - made.points.cpu()).abs().max() <= 0.51 * POSITION_STEP
     assert back.names == made.names and back.gravity == made.gravity and torch.equal(back.mass, made.mass)
     (tmp_path / "text.h5").write_text("no")
     with pytest.raises(InputError, match="text.h5"):
         read_motions(tmp_path / "text.h5")
 
 
-def test_run_writes_resumes_and_shards(tmp_path, things, monkeypatch, capsys):
+def test_interrupted_run_resumes_to_the_same_bytes(tmp_path, assets, monkeypatch, capsys):
     for group in ("3_0", "4"):
         monkeypatch.setitem(SCENE_COUNTS, group, 3)
-    monkeypatch.setattr(generate, "load_assets", lambda fineness, least, kept: things)
-    options = DatasetOptions("3_0,4", "motions", 3, 50, COARSE.dx, COARSE.spacing, COARSE.substep, limit=2,
-                             device="cpu")  # fmt: skip
+    monkeypatch.setattr(generate, "load_assets", lambda *_: assets)
+    options = DatasetOptions(
+        groups="3_0,4", only="motions", frames=3, keypoints=50, dx=COARSE.dx, spacing=COARSE.spacing,
+        substep=COARSE.substep, exact=True, limit=2,
+    )  # fmt: skip
     generate.run(tmp_path, options)
     files = {g: (tmp_path / "motions" / f"{g}.h5").read_bytes() for g in ("3_0", "4")}
     assert "3_0: 2 scenes" in capsys.readouterr().out and len(read_groups(tmp_path, ["3_0", "4"], 50)) == 4
@@ -148,12 +149,12 @@ def test_run_writes_resumes_and_shards(tmp_path, things, monkeypatch, capsys):
         generate.run(tmp_path, DatasetOptions(shard="3"))
 
 
-def test_particles_are_kept_and_read_again(tmp_path, monkeypatch):
+def test_particles_are_cached(tmp_path, monkeypatch):
     monkeypatch.setattr(object_particles, "OBJECTS", {"duck": object_particles.OBJECTS["duck"]})
-    fine = Discretisation(dx=0.03, spacing=0.03)
-    made = object_particles.load_assets(fine, 64, tmp_path / "p.npz")
-    monkeypatch.setattr(object_particles, "make_object", None)  # must not be needed again
-    again = object_particles.load_assets(fine, 64, tmp_path / "p.npz")
+    discretisation = Discretisation(dx=0.03, spacing=0.03)
+    made = object_particles.load_assets(discretisation, 64, tmp_path / "p.npz")
+    monkeypatch.setattr(object_particles, "make_object", None)  # must not be called
+    again = object_particles.load_assets(discretisation, 64, tmp_path / "p.npz")
     assert torch.equal(made[7].points, again[7].points) and made[7].mass == again[7].mass
     size = made[7].points.amax(0) - made[7].points.amin(0)
     assert float(size.max()) == pytest.approx(0.3, rel=0.04)
@@ -161,21 +162,21 @@ def test_particles_are_kept_and_read_again(tmp_path, monkeypatch):
     assert float(gap.median()) == pytest.approx(0.03, rel=0.35)
     (tmp_path / "p.npz").write_text("no")
     with pytest.raises(InputError, match="p.npz"):
-        object_particles.load_assets(fine, 64, tmp_path / "p.npz")
+        object_particles.load_assets(discretisation, 64, tmp_path / "p.npz")
 
 
-def test_the_command_has_every_option_with_its_default():
+def test_command_has_every_option_with_its_default():
     command = inspect.signature(lab.dataset).parameters
     for field in fields(DatasetOptions):
         assert command[field.name].default == field.default, field.name
     assert set(command) - {f.name for f in fields(DatasetOptions)} == {"out", "check", "ray"}
 
 
-def test_nudged_scenes_start_so_much_aside(extents, monkeypatch):
+def test_perturbed_scenes_start_displaced_by_the_given_distance(extents, monkeypatch):
     monkeypatch.setitem(SCENE_COUNTS, "3_0", 3)
     configs = sample_group("3_0", extents)
     moved = perturbed(configs, 1e-3)
     assert moved == perturbed(configs, 1e-3) and set(moved) == set(configs)
     apart = np.array([np.subtract(moved[n].translation, c.translation) for n, c in configs.items()]).reshape(-1, 3)
     np.testing.assert_allclose(np.linalg.norm(apart, axis=1), 1e-3, rtol=1e-9)
-    assert np.linalg.matrix_rank(apart) == 3  # each in a direction of its own
+    assert np.linalg.matrix_rank(apart) == 3  # in different directions

@@ -1,4 +1,4 @@
-"""Objects that no model learns from."""
+"""Objects other than the ten: held-out shapes, random shapes, solid shapes, rotated objects, meshes."""
 
 import json
 
@@ -19,27 +19,27 @@ from stages.lab.dataset.keypoint_motions import read_motions
 from stages.lab.dataset.object_particles import Asset, Discretisation, particle_volumes
 from stages.lab.dataset.scene_configs import EXTRA_GROUPS, HELDOUT, parse_groups, read_scene_configs
 
-FINENESS = Discretisation(0.1, 0.06, 5e-4)
-COARSE = {"keypoints": 40, "dx": 0.1, "spacing": 0.06, "substep": 5e-4, "frames": 3, "device": "cpu"}
+DISCRETISATION = Discretisation(dx=0.1, spacing=0.06, substep=5e-4)
+COARSE = {"keypoints": 40, "dx": 0.1, "spacing": 0.06, "substep": 5e-4, "frames": 3}
 
 
-def test_none_of_them_is_an_object_of_the_data_set():
+def test_held_out_objects_differ_from_the_ten():
     assert not HELDOUT_SHAPES.keys() & OBJECTS.keys()
     assert not {k.id for k in HELDOUT_SHAPES.values()} & {k.id for k in OBJECTS.values()}
 
 
 @pytest.mark.parametrize("name", HELDOUT_SHAPES)
-def test_points_lie_evenly_on_the_shape(name):
+def test_surface_points_are_evenly_spaced(name):
     points = surface_points(HELDOUT_SHAPES[name], 2000)
     sides = points.amax(0) - points.amin(0)
     assert len(points) == 2000 and float(sides.max()) == pytest.approx(1.0)
     assert (points.amax(0) + points.amin(0)).abs().max() < 1e-5
     gap = torch.cdist(points, points).fill_diagonal_(9).min(1).values
-    # a tenth of the points at random would lie closer than a fifth of the median to another: here fewer do
+    # of random points a tenth would be closer than a fifth of the median distance
     assert float((gap < 0.2 * gap.median()).float().mean()) < 0.01 and float(gap.max()) < 4 * float(gap.median())
 
 
-def test_a_ball_is_round_and_a_knot_is_one_piece():
+def test_ball_is_round_and_knot_is_connected():
     ball = surface_points(HELDOUT_SHAPES["soccer"], 1000)
     assert (ball.norm(dim=1) - 0.5).abs().max() < 2e-3
     knot = surface_points(HELDOUT_SHAPES["rope2"], 600)
@@ -52,23 +52,23 @@ def test_a_ball_is_round_and_a_knot_is_one_piece():
 
 
 @pytest.fixture(scope="module")
-def kept(tmp_path_factory):
-    """Particles of all shapes, chosen among few points."""
+def cache(tmp_path_factory):
+    """Cached particles of all shapes, sampled from few points."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(heldout, "SURFACE_POINTS", 2000)
         path = tmp_path_factory.mktemp("held") / "p.npz"
-        load_shape_assets(HELDOUT_SHAPES, FINENESS, 40, path)
+        load_shape_assets(HELDOUT_SHAPES, DISCRETISATION, 40, path)
     return path
 
 
 @pytest.fixture(scope="module")
-def things(kept):
-    return load_shape_assets(HELDOUT_SHAPES, FINENESS, 40, kept)
+def assets(cache):
+    return load_shape_assets(HELDOUT_SHAPES, DISCRETISATION, 40, cache)
 
 
-def test_scenes_of_the_group_are_sampled_as_those_of_the_data_set(things):
-    configs = sample_configs(things, 3, 3)
-    assert configs == sample_configs(things, 3, 3) and [n.split("_")[0] for n in configs] == ["10000", "10001", "10002"]
+def test_scenes_are_sampled_as_in_the_data_set(assets):
+    configs = sample_configs(assets, 3, 3)
+    assert configs == sample_configs(assets, 3, 3) and [n.split("_")[0] for n in configs] == ["10000", "10001", "10002"]
     for c in configs.values():
         assert (
             len(c.ids) == 3
@@ -77,8 +77,8 @@ def test_scenes_of_the_group_are_sampled_as_those_of_the_data_set(things):
         )
 
 
-def test_the_group_is_written_and_kept(things, tmp_path, monkeypatch):
-    monkeypatch.setattr(heldout, "load_shape_assets", lambda *_: things)
+def test_group_is_written_once(assets, tmp_path, monkeypatch):
+    monkeypatch.setattr(heldout, "load_shape_assets", lambda *_: assets)
     options = HeldoutOptions(scenes=2, **COARSE)
     assert "2 scenes of 8 objects" in run(tmp_path, options)
     made = read_motions(tmp_path / "motions" / f"{HELDOUT}.h5")
@@ -88,27 +88,27 @@ def test_the_group_is_written_and_kept(things, tmp_path, monkeypatch):
     kinds = {k.id: k for k in HELDOUT_SHAPES.values()}
     for row, ids in enumerate(made.objects.tolist()):
         assert [float(E) for E in made.E[row]] == [kinds[i].E for i in ids]
-    # everything but what rests on something falls: 5 m/s^2 for two frames
+    # unsupported objects fall: 5 m/s^2 for two frames
     dropped = (made.points[:, 0, :, :, 2] - made.points[:, 2, :, :, 2]).amax()
     assert float(dropped) == pytest.approx(5 / 2 * 0.04**2, rel=0.15, abs=2e-4)
-    assert "is there" in run(tmp_path, options)
+    assert "exists already" in run(tmp_path, options)
 
 
-def test_particles_are_kept_and_read_again(things, kept, tmp_path, monkeypatch):
-    monkeypatch.setattr(heldout, "_particles", None)  # must not be needed again
-    again = load_shape_assets(HELDOUT_SHAPES, FINENESS, 40, kept)
-    assert all(torch.equal(things[i].points, again[i].points) for i in things) and len(again) == 8
+def test_particles_are_cached(assets, cache, tmp_path, monkeypatch):
+    monkeypatch.setattr(heldout, "_shape_particles", None)  # must not be called
+    again = load_shape_assets(HELDOUT_SHAPES, DISCRETISATION, 40, cache)
+    assert all(torch.equal(assets[i].points, again[i].points) for i in assets) and len(again) == 8
     (tmp_path / "p.npz").write_text("no")
     with pytest.raises(InputError, match="p.npz"):
-        load_shape_assets(HELDOUT_SHAPES, FINENESS, 40, tmp_path / "p.npz")
+        load_shape_assets(HELDOUT_SHAPES, DISCRETISATION, 40, tmp_path / "p.npz")
 
 
-def test_meshes_take_the_place_of_the_shapes(tmp_path, caplog):
+def test_meshes_replace_the_shapes(tmp_path, caplog):
     trimesh = pytest.importorskip("trimesh")
     (tmp_path / "pillow").mkdir()
     trimesh.creation.box((2.0, 1.0, 0.5)).export(tmp_path / "pillow" / "mesh.obj")
     trimesh.creation.icosphere(2, 3.0).export(tmp_path / "steel_thing.stl")
-    args = ["heldout", str(tmp_path), "--scenes", "1", "--objects", "2", "--size", "0.3", "--device", "cpu"]
+    args = ["heldout", str(tmp_path), "--scenes", "1", "--objects", "2", "--size", "0.3"]
     for key in ("keypoints", "dx", "spacing", "substep", "frames"):
         args += [f"--{key}", str(COARSE[key])]
     for mesh in ("pillow/mesh.obj", "steel_thing.stl"):
@@ -120,14 +120,14 @@ def test_meshes_take_the_place_of_the_shapes(tmp_path, caplog):
     for id, row in zip(made.objects[0].tolist(), sides.tolist(), strict=True):
         expected = [0.3, 0.15, 0.075] if id == 100 else [0.3] * 3
         assert row == pytest.approx(expected, abs=0.03)
-    told = dict(zip(made.objects[0].tolist(), made.E[0].tolist(), strict=True))
-    stiffness = {100: 1e4, 101: 2e7}  # a pillow; steel, as far as the solver goes
-    assert told.items() <= stiffness.items()
+    found = dict(zip(made.objects[0].tolist(), made.E[0].tolist(), strict=True))
+    stiffness = {100: 1e4, 101: 2e7}  # a pillow; steel, limited to what the solver can simulate
+    assert found.items() <= stiffness.items()
     config = json.loads((tmp_path / "scene_configs" / f"{HELDOUT}.json").read_text())
     assert len(config) == 1
 
 
-def test_varied_objects_are_within_what_the_ten_span_and_the_same_again():
+def test_random_shapes_are_reproducible_and_within_the_range_of_the_ten():
     table = random_shapes(18)
     assert [k.E for k in random_shapes(5).values()] == [k.E for k in table.values()][:5]
     assert [k.E for k in random_shapes(5, seed=1).values()] != [k.E for k in random_shapes(5).values()]
@@ -135,37 +135,38 @@ def test_varied_objects_are_within_what_the_ten_span_and_the_same_again():
         points = surface_points(kind, 800)
         sides = points.amax(0) - points.amin(0)
         assert float(sides.max()) == pytest.approx(1.0) and float(sides.min()) > 0.02, name
-        assert kind.shape()(torch.tensor([[0.6, 0.6, 0.6]])) > 0  # inside of the cube where surfaces are looked for
+        assert kind.shape()(torch.tensor([[0.6, 0.6, 0.6]])) > 0  # the shape lies inside the sampled cube
         assert 0.3 <= kind.scale <= 1 and 100 <= kind.density <= 2700 and 10 <= kind.E / kind.density <= 7400
     assert len({k.id for k in table.values()} | {k.id for k in HELDOUT_SHAPES.values()}) == 18 + 8
 
 
-def test_varied_objects_become_a_group_that_training_takes(tmp_path, monkeypatch):
+def test_random_shapes_become_a_training_group(tmp_path, monkeypatch):
     monkeypatch.setattr(heldout, "SURFACE_POINTS", 2000)
     assert "2 scenes of 3 objects" in run(tmp_path, HeldoutOptions(scenes=2, shapes=3, **COARSE))
     made = read_motions(tmp_path / "motions" / "varied.h5")
     assert made.points.shape == (2, 3, 3, 40, 3) and bool((made.objects >= 1000).all())
     assert parse_groups("varied,3_0", more=("varied",)) == ["varied", "3_0"]
-    with pytest.raises(InputError, match="there are"):
+    with pytest.raises(InputError, match="choose from"):
         parse_groups("varied")
 
 
-def test_solid_objects_are_filled_and_as_heavy_as_that(tmp_path, monkeypatch):
-    """Their keypoints stay those of the surface."""
+def test_solid_shapes_are_filled_and_have_the_mass_of_their_volume(tmp_path, monkeypatch):
+    """The keypoints remain those of the surface."""
     monkeypatch.setattr(heldout, "SURFACE_POINTS", 2000)
     kind = ShapeKind(7, 0.6, 1e4, 500.0, lambda: ellipsoid((0, 0, 0), (0.4, 0.4, 0.4)))
     ball = load_shape_assets({"ball": kind}, Discretisation(0.04, 0.03, 5e-4), 40, solid=True)[7]
     assert (ball.points[:40].norm(dim=1) - 0.3).abs().max() < 3e-3
     assert ball.points.norm(dim=1).max() < 0.304
-    kept = tmp_path / "kept.npz"
+    cache = tmp_path / "cache.npz"
     fine, coarse = (
-        load_shape_assets({"ball": kind}, Discretisation(dx, 0.03, 5e-4), 40, kept, solid=True)[7]
+        load_shape_assets({"ball": kind}, Discretisation(dx, 0.03, 5e-4), 40, cache, solid=True)[7]
         for dx in (0.04, 0.06)
     )
-    assert torch.equal(fine.points, ball.points) and len(coarse.points) < len(fine.points)  # not read for another dx
+    assert torch.equal(fine.points, ball.points)
+    assert len(coarse.points) < len(fine.points)  # the cache is not used for another dx
     volume = float(4 / 3 * torch.pi * 0.3**3)
     around = float(4 * torch.pi * 0.3**2) * 0.04
-    assert volume < ball.mass / 500 < volume + around  # cells at the surface count whole
+    assert volume < ball.mass / 500 < volume + around  # cells at the surface count fully
     assert ball.solidity == pytest.approx((ball.mass / 500 / (24 * 0.3**2) / REFERENCE_THICKNESS) ** 3, rel=0.05)
     assert "1 scenes of 9 objects" in run(tmp_path, HeldoutOptions(scenes=1, shapes=9, solid=True, **COARSE))
     made = read_motions(tmp_path / "motions" / "solid.h5")
@@ -175,10 +176,10 @@ def test_solid_objects_are_filled_and_as_heavy_as_that(tmp_path, monkeypatch):
     assert parse_groups("solid,turned", more=EXTRA_GROUPS) == ["solid", "turned"]
 
 
-def test_the_ten_turned_keep_their_shape_mass_and_material(tmp_path, monkeypatch):
+def test_rotated_objects_keep_shape_and_material(tmp_path, monkeypatch):
     box = 0.1 * (torch.rand(60, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([6.0, 2, 1]))
     ten = {i: Asset(i, 0.6, box, particle_volumes(box, 0.1), 1e5 * i, 300.0) for i in (1, 2)}
-    made = rotated_assets(ten, 5, FINENESS)
+    made = rotated_assets(ten, 5, DISCRETISATION)
     assert list(made) == [2000, 2001, 2002, 2003, 2004] and [a.E for a in made.values()][:3] == [1e5, 2e5, 1e5]
     for a in made.values():
         assert (a.points.amax(0) + a.points.amin(0)).abs().max() < 1e-5
@@ -191,11 +192,11 @@ def test_the_ten_turned_keep_their_shape_mass_and_material(tmp_path, monkeypatch
 
 
 @pytest.mark.parametrize(
-    ("choices", "says"),
+    ("choices", "message"),
     [({"scenes": 0}, "at least one scene"), ({"objects": 9}, "1 to 6 objects"), ({"size": 3.0}, "--size 3.0"),
-     ({"solid": True}, "--solid needs --shapes"), ({"shapes": 2, "turned": 2}, "goes without"),
+     ({"solid": True}, "--solid needs --shapes"), ({"shapes": 2, "turned": 2}, "cannot be combined"),
      ({"turned": -1}, "--turned -1")],
 )  # fmt: skip
-def test_options_that_cannot_be(choices, says):
-    with pytest.raises(InputError, match=says):
+def test_invalid_options_are_rejected(choices, message):
+    with pytest.raises(InputError, match=message):
         HeldoutOptions(**choices)

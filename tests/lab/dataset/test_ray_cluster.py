@@ -1,4 +1,4 @@
-"""The data set on a cluster of two workers on this machine: the same files as without."""
+"""Generation on a Ray cluster of two workers on this machine gives the same files as without Ray."""
 
 import os
 from dataclasses import replace
@@ -13,14 +13,14 @@ from tests.lab.small_world import OPTIONS, shrink
 MOTIONS = replace(OPTIONS, groups="3_9,4", only="motions,scenes", limit=2)
 
 
-def test_without_ray_it_says_what_to_install(monkeypatch, tmp_path):
+def test_missing_ray_is_reported_with_its_install_command(monkeypatch, tmp_path):
     monkeypatch.setitem(__import__("sys").modules, "ray", None)
     with pytest.raises(InputError, match=r"pip install 'ngff\[ray\]'"):
         ray_cluster.run(tmp_path, MOTIONS, "local")
 
 
 @pytest.mark.slow
-def test_two_workers_make_what_one_process_makes(tmp_path, monkeypatch):
+def test_two_workers_write_the_same_files_as_one_process(tmp_path, monkeypatch):
     ray = pytest.importorskip("ray")
     from ray.cluster_utils import Cluster
 
@@ -33,7 +33,7 @@ def test_two_workers_make_what_one_process_makes(tmp_path, monkeypatch):
         paths = os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
         ray.init(address=cluster.address, runtime_env={
             "env_vars": {"PYTHONPATH": paths},
-            "worker_process_setup_hook": "tests.lab.small_world.shrink_for_good",
+            "worker_process_setup_hook": "tests.lab.small_world.shrink_process",
         })  # fmt: skip
         ray_cluster.run(tmp_path / "ray", MOTIONS, "auto")
         assert len({n["NodeID"] for n in ray.nodes() if n["Alive"] and n["Resources"].get("CPU")}) == 2
@@ -45,5 +45,5 @@ def test_two_workers_make_what_one_process_makes(tmp_path, monkeypatch):
     made = {p.relative_to(tmp_path / "ray") for p in (tmp_path / "ray").rglob("*") if p.is_file()}
     assert made == {p.relative_to(tmp_path / "alone") for p in (tmp_path / "alone").rglob("*") if p.is_file()}
     for name in made:
-        if name.name not in ("3_9.h5", "4.h5") and name.parent.name != "sums":  # they say with which options
+        if name.name not in ("3_9.h5", "4.h5") and name.parent.name != "sums":  # these contain the options
             assert (tmp_path / "ray" / name).read_bytes() == (tmp_path / "alone" / name).read_bytes(), name

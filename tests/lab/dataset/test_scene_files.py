@@ -1,4 +1,4 @@
-"""The parts of the data set that are made scene by scene: layout, contents, resuming, checking."""
+"""The files of each scene: published layout, contents, resuming after a kill, verification."""
 
 import hashlib
 import json
@@ -31,7 +31,7 @@ SHAPES = {"pos": (3,), "cov3D": (6,), "rot": (3, 3)}
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory):
-    """Everything of two small scenes."""
+    """All parts of two small scenes."""
     with pytest.MonkeyPatch.context() as patch:
         shrink(patch.setattr, patch.setitem)
         root = tmp_path_factory.mktemp("data")
@@ -44,9 +44,9 @@ def digests(root: Path) -> dict[str, str]:
             for p in sorted(root.rglob("*")) if p.is_file()}  # fmt: skip
 
 
-def test_the_published_layout(data):
+def test_files_have_the_published_layout(data):
     name = next(iter(read_scene_configs(data / "scene_configs" / "3_9.json")))
-    wanted = [
+    expected = [
         "manifest.json", "scene_configs/3_9.json", "objects/duck/cameras.json",
         "objects/duck/point_cloud/iteration_30000/point_cloud.ply", "backgrounds/table0/gaussians_feedforward.ply",
         f"scenes/3_9/{name}/point_cloud/iteration_30000/point_cloud.ply",
@@ -55,11 +55,11 @@ def test_the_published_layout(data):
         *(f"dynamic/3_9/{name}/table0/view_{v}/{name}.mp4" for v in (0, 16)),
     ]  # fmt: skip
     files = set(digests(data))
-    assert set(wanted) <= files and not any(".part-" in f for f in files)
+    assert set(expected) <= files and not any(".part-" in f for f in files)
     assert len([f for f in files if f.startswith(("mpm", "initial", "dynamic", "scenes/"))]) == 2 * (5 + 4 + 2 + 1)
 
 
-def test_frames_hold_what_is_published(data):
+def test_frames_have_the_published_contents(data):
     config = next(iter(read_scene_configs(data / "scene_configs" / "3_9.json").values()))
     vertices = PlyData.read(data / f"scenes/3_9/{config.name}" / dataset_layout.POINT_CLOUD)["vertex"]
     logits = np.asarray(vertices["opacity"], float)
@@ -76,29 +76,29 @@ def test_frames_hold_what_is_published(data):
         red = np.stack([vertices[f"f_rest_{i}"] for i in range(8)], 1)[matter]
         np.testing.assert_allclose(sh["shs"][:, 1:, 0], red, atol=2e-4)
         np.testing.assert_allclose(opacity["opacity"][:, 0], 1 / (1 + np.exp(-logits[matter])), atol=1e-3)
-    # at first all is where the scene says, unturned, with covariance R S S^T R^T
+    # the first frame has the positions of the scene, no rotation, and covariance R S S^T R^T
     np.testing.assert_allclose(frames[0]["pos"][:], xyz, atol=1e-3)
     np.testing.assert_allclose(frames[0]["rot"][:], np.eye(3)[None].repeat(len(xyz), 0), atol=1e-3)
     scales = np.exp(np.stack([vertices[f"scale_{i}"] for i in range(3)], 1)[matter])
     cov = frames[0]["cov3D"][:].astype(float)
     np.testing.assert_allclose(cov[:, [0, 3, 5]].sum(1), (scales**2).sum(1), rtol=2e-2)
-    # the objects fall as one under 5 m/s^2: after two frames sums over substeps of g t
+    # the objects fall freely under 5 m/s^2 for two frames
     fallen = (frames[0]["pos"][:, 2].astype(float) - frames[2]["pos"][:, 2]).max()
     assert fallen == pytest.approx(5 / 2 * 0.04**2, abs=1.5e-3)
 
 
-def test_turned_gaussians_are_stored_turned(tmp_path):
-    """A quarter turn about z of one object: positions, covariances and the transposed rotation say so."""
+def test_rotated_gaussians_are_stored_rotated(tmp_path, device):
+    """A quarter turn of one object about z rotates positions, covariances and the (transposed) rotation."""
     g = brick()
     points, centre = g.means[::4].contiguous(), torch.tensor([0.1, 0.2, 0.3])
     index, weight = nearest_weights(points, g.means, 8)
-    thing = Asset(7, 1.0, points, torch.ones(len(points)), 1e5, 500.0)
+    asset = Asset(7, 1.0, points, torch.ones(len(points)), 1e5, 500.0)
     start = SceneConfig("a", (7,), ((0.1, 0.2, 0.3),), (1.0,))
-    carried = SkinnedScene(start, {7: ObjectSkin(g, g, index.int(), weight)}, {7: thing}, "cpu")
+    scene = SkinnedScene(start, {7: ObjectSkin(g, g, index.int(), weight)}, {7: asset}, device)
     R = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
-    places, gradients = points @ R.T + centre, R.expand(len(points), 3, 3)
-    write_frames(tmp_path, carried, [places], [gradients])
-    torch.testing.assert_close(carried.at(places, gradients)[0].means, g.means @ R.T + centre, rtol=0, atol=1e-5)
+    positions, gradients = points @ R.T + centre, R.expand(len(points), 3, 3)
+    write_frames(tmp_path, scene, [positions], [gradients])
+    torch.testing.assert_close(scene.at(positions, gradients)[0].means, g.means @ R.T + centre, rtol=0, atol=1e-5)
     with h5py.File(tmp_path / "0000.h5") as file:
         np.testing.assert_allclose(file["rot"][:], R.T.expand(len(g), 3, 3), atol=1e-3)
         cov = R @ covariance(g.quats, g.scales) @ R.T
@@ -106,7 +106,7 @@ def test_turned_gaussians_are_stored_turned(tmp_path):
         np.testing.assert_allclose(file["cov3D"][:], upper, rtol=5e-3, atol=2e-6)
 
 
-def test_videos_and_what_goes_with_them(data):
+def test_videos_cameras_prompts_and_depth(data):
     config = next(iter(read_scene_configs(data / "scene_configs" / "3_9.json").values()))
     folder = data / "initial" / "3_9" / config.name / "table0"
     rows = json.loads((folder / "cameras.json").read_text())
@@ -116,7 +116,7 @@ def test_videos_and_what_goes_with_them(data):
     moving = cv2.VideoCapture(str(data / "dynamic/3_9" / config.name / "table0/view_0" / f"{config.name}.mp4"))
     assert moving.get(cv2.CAP_PROP_FRAME_COUNT) == 3
     first, started = video.read()[1].astype(float), moving.read()[1].astype(float)
-    assert np.abs(first - started).mean() < 8  # the same view of the same moment, compressed twice
+    assert np.abs(first - started).mean() < 8  # the same view of the same frame, compressed twice
     prompts = json.loads((folder / "prompts.json").read_text())
     assert {k: len(v) for k, v in prompts.items()} == dict.fromkeys(("center_point", "bbox", "text"), 3)
     R, eye = np.array(rows[0]["rotation"]), np.array(rows[0]["position"])
@@ -132,18 +132,18 @@ def test_videos_and_what_goes_with_them(data):
     assert nearest - 0.6 < depth[0, v, u] < 5.5
 
 
-def test_manifest_and_check(data, capsys):
+def test_checksums_are_listed_and_settings_must_stay(data, capsys):
     generate.check(data)
-    assert "files, all as they were written" in capsys.readouterr().out
+    assert "files, all unchanged" in capsys.readouterr().out
     listed = sorted(line for path in (data / "sums").iterdir() for line in path.read_text().splitlines())
     assert [line.split("  ")[1] for line in listed if "mpm/" in line]
     done = subprocess.run(f"sha256sum --quiet -c {data}/sums/*.sha256", cwd=data, shell=True, capture_output=True)
     assert done.returncode == 0, done.stderr
-    with pytest.raises(InputError, match="was begun with frames 3, not 4"):
+    with pytest.raises(InputError, match="was started with frames 3, not 4"):
         generate.run(data, replace(OPTIONS, frames=4))
 
 
-def test_damage_is_found_and_mended(data):
+def test_damaged_files_are_found_and_repaired(data):
     victim = next((data / "mpm").rglob("0001.h5"))
     before = digests(data)
     whole = victim.read_bytes()
@@ -157,19 +157,19 @@ def test_damage_is_found_and_mended(data):
     with pytest.raises(InputError, match="is missing"):
         generate.check(data)
     generate.run(data, OPTIONS)
-    assert digests(data) == before  # though only one scene was simulated now
+    assert digests(data) == before  # although only one scene was simulated again
 
 
-def test_killed_while_it_writes_it_goes_on_to_the_same_bytes(data, tmp_path):
+def test_killed_run_resumes_to_the_same_bytes(data, tmp_path):
     code = ("from dataclasses import replace; from pathlib import Path; from stages.lab.dataset import generate\n"
-            "from tests.lab.small_world import OPTIONS, shrink_for_good; shrink_for_good()\n"
+            "from tests.lab.small_world import OPTIONS, shrink_process; shrink_process()\n"
             f"generate.run(Path({str(tmp_path)!r}), replace(OPTIONS, only='scenes,mpm'))")  # fmt: skip
     process = subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.DEVNULL)
     while process.poll() is None and not list(tmp_path.glob("mpm/3_9/.part-*/0000.h5")):
         time.sleep(0.002)
     process.kill()
     process.wait()
-    assert not (tmp_path / "sums" / "3_9.sha256").exists()  # it was not done
+    assert not (tmp_path / "sums" / "3_9.sha256").exists()  # the group was not complete
     generate.run(tmp_path, replace(OPTIONS, only="scenes,mpm"))
     files = {n: d for n, d in digests(tmp_path).items() if n.startswith(("scene", "mpm", "objects"))}
     whole = digests(data)
@@ -177,32 +177,32 @@ def test_killed_while_it_writes_it_goes_on_to_the_same_bytes(data, tmp_path):
     generate.check(tmp_path)
 
 
-def test_a_full_disk_is_told_before_anything_is_written(tmp_path, monkeypatch):
+def test_full_disk_is_reported_before_writing(tmp_path, monkeypatch):
     shrink(monkeypatch.setattr, monkeypatch.setitem)
     usage = disk_usage.shutil.disk_usage(tmp_path)._replace(free=500_000)
     monkeypatch.setattr(disk_usage.shutil, "disk_usage", lambda path: usage)
-    with pytest.raises(InputError, match="about .* are needed and 500 kB are free; choose fewer"):
+    with pytest.raises(InputError, match="about .* are needed but 500 kB are free; choose fewer"):
         generate.run(tmp_path, OPTIONS)
     assert not (tmp_path / "mpm").exists()
 
 
-def test_what_is_there_is_not_counted_again(data):
+def test_existing_files_are_not_counted(data):
     before = disk_usage.missing_bytes(dataset_layout.Layout(data / "none"), replace(OPTIONS, frames=100, limit=0))
     assert before["dynamic"] == 2 * 2 * 32**2 * 100 * disk_usage.VIDEO_FIXED_CAMERA  # 2 scenes, 2 views
     left = disk_usage.missing_bytes(dataset_layout.Layout(data), OPTIONS)
     assert left["mpm"] < 0.15 * 2 * disk_usage.SizeEstimate(3, 64, 32).mpm(1800)
-    assert left["scene_configs"] == 0  # a file that is there is whole
+    assert left["scene_configs"] == 0  # a file that exists is complete
 
 
-def test_what_is_missing_is_told_and_nothing_when_nothing_is(tmp_path, capsys):
+def test_missing_sizes_are_printed(tmp_path, capsys):
     disk_usage.require_disk_space(tmp_path, {"scene_configs": 64_400.0, "motions": 0.0})
-    assert ": about 64.4 kB will be written (scene_configs 64.4 kB), " in capsys.readouterr().out
+    assert ": about 64.4 kB to write (scene_configs 64.4 kB), " in capsys.readouterr().out
     disk_usage.require_disk_space(tmp_path, {"motions": 0.0})
     assert not capsys.readouterr().out
 
 
-def test_sizes_are_about_right(data):
-    """Of the parts that are stored as they are; videos of 32 px are mostly headers."""
+def test_size_estimates_match_the_files(data):
+    """Only of uncompressed parts; videos of 32 px are mostly headers."""
     sizes, folder = disk_usage.SizeEstimate(3, 64, 32), next((data / "mpm" / "3_9").iterdir())
     with h5py.File(folder / "opacity.h5") as file:
         count = len(file["opacity"])
@@ -213,6 +213,6 @@ def test_sizes_are_about_right(data):
 
 @pytest.mark.parametrize("options", [{"only": "videos"}, {"views": "3"}, {"backgrounds": "table9"}, {"resolution": 33},
                                      {"only": ""}, {"shard": "0/2"}])  # fmt: skip
-def test_what_is_not_there_cannot_be_chosen(options):
+def test_invalid_options_are_rejected(options):
     with pytest.raises(InputError, match=f"--{next(iter(options))}"):
         DatasetOptions(**options)

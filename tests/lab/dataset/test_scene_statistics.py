@@ -1,4 +1,4 @@
-"""Statistics of scenes made by hand, in which it is known what happens."""
+"""Statistics and sensitivity of hand-made motions whose values are known."""
 
 import json
 import math
@@ -19,14 +19,14 @@ BOX = ((-1.94, -1.94, -0.94), (1.94, 1.94, 2.94))
 
 
 def shell(radius, low=-1.0, seed=0):
-    """Points on a ball, above `low` radii."""
+    """Points on a sphere, above `low` radii."""
     rng = torch.Generator().manual_seed(seed)
     p = torch.nn.functional.normalize(torch.randn(20 * N, 3, generator=rng), dim=1)
     return radius * p[p[:, 2] > low][:N]
 
 
 def cup(radius):
-    """The lower half of a ball."""
+    """The lower half of a sphere."""
     return -shell(radius, low=0.0)
 
 
@@ -35,20 +35,20 @@ def still(points, at):
 
 
 def moving(points, start, end, frames=12):
-    """From one place to another in so many frames, then still."""
+    """Moving from `start` to `end` in `frames` frames, then at rest."""
     u = (torch.arange(T) / frames).clamp_max(1)[:, None]
     path = torch.lerp(torch.tensor(start), torch.tensor(end), u)
     return points[None] + path[:, None]
 
 
 def motions(*objects, ids):
-    """A scene, from (t, n, 3) each."""
+    """Motions of one scene, from points (t, n, 3) of each object."""
     points = torch.stack([torch.stack(objects, 1)])
     n = torch.ones(1, len(ids))
     return KeypointMotions(("a",), torch.tensor([ids]), points, n, n, 0.3 * n, n, 0.02, (0, 0, -5.0), BOX, n)
 
 
-def test_a_ball_falls_into_a_bowl_and_a_duck_lies_beside():
+def test_ball_that_falls_into_a_bowl_is_contained():
     bowl, ball, duck = cup(0.25), shell(0.1, seed=1), shell(0.1, seed=2)
     m = motions(still(bowl, [0.0, 0.0, -0.67]), moving(ball, [0.0, 0, 0.4], [0.0, 0, -0.79]),
                 still(duck, [0.8, 0.0, -0.82]), ids=[2, 0, 7])  # fmt: skip
@@ -60,7 +60,7 @@ def test_a_ball_falls_into_a_bowl_and_a_duck_lies_beside():
     assert float(f.spread[0]) == pytest.approx((2 * 0.8 / 3 + 4 * 0.8 / 3 / 2) / 3, rel=0.02)
 
 
-def test_above_a_bowl_or_under_a_tilted_one_is_not_inside():
+def test_ball_above_a_bowl_or_under_a_tilted_one_is_not_contained():
     bowl, ball = cup(0.25), shell(0.1, seed=1)
     above = motions(still(bowl, [0.0, 0.0, -0.67]), still(ball, [0.0, 0.0, -0.5]), ids=[2, 0])
     assert compute_statistics(above).contained.tolist() == [[0, 0]]
@@ -71,47 +71,47 @@ def test_above_a_bowl_or_under_a_tilted_one_is_not_inside():
     assert f.contained.tolist() == [[0, 0]] and f.tipped.tolist() == [[1, 0]]
 
 
-def test_deformation_tilt_and_speed_are_what_was_put_in():
+def test_deformation_tilt_and_speed_are_measured():
     p = shell(0.2, seed=3)
     angle = math.radians(40) * torch.arange(T) / (T - 1)
     c, s, zero, one = angle.cos(), angle.sin(), 0 * angle, 1 + 0 * angle
     R = torch.stack([one, zero, zero, zero, c, -s, zero, s, c], -1).reshape(T, 3, 3)
-    turned = p @ R.mT
-    f = compute_statistics(motions(turned, ids=[0]))
+    rotated = p @ R.mT
+    f = compute_statistics(motions(rotated, ids=[0]))
     assert f.tipped.item() == 1 and f.deformation.item() < 1e-5 and f.at_rest.item() == 0
     assert f.touch.shape == (1, 0)
     squashed = still(p, [0.0, 0, 0]).clone()
     squashed[10:, :, 2] *= 0.5
-    # the nearest rotation is none, and half of z is missing
+    # the best rotation is the identity, half of each z is the residual
     q = p - p.mean(0)
     expected = ((0.5 * q[:, 2]).square().mean() / q.square().sum(1).mean()).sqrt()
     assert compute_statistics(motions(squashed, ids=[0])).deformation.item() == pytest.approx(float(expected), rel=1e-3)
 
 
-def test_scenes_with_fewer_objects_count_for_those_they_have(tmp_path):
+def test_missing_objects_are_ignored(tmp_path):
     ball = shell(0.1)
     m = motions(moving(ball, [0.0, 0, 0.4], [0.0, 0, -0.8]), still(0 * ball, [0.0, 0.0, 0.0]), ids=[0, -1])
     f = compute_statistics(m)
     assert f.falls[0, 0] == 1 and f.falls[0, 1].isnan() and f.touch.isnan().all() and f.spread.item() < 1e-6
 
 
-def test_the_command(tmp_path):
+def test_command_writes_and_prints_statistics(tmp_path):
     (tmp_path / "motions").mkdir()
     m = motions(still(cup(0.25), [0.0, 0.0, -0.67]), moving(shell(0.1), [0.0, 0, 0.4], [0.0, 0, -0.79]), ids=[2, 0])
     write_motions(tmp_path / "motions" / "3_9.h5", m, {})
     out = tmp_path / "s.json"
-    done = CliRunner().invoke(app, ["statistics", str(tmp_path), "-o", str(out), "--device", "cpu"])
+    done = CliRunner().invoke(app, ["statistics", str(tmp_path), "-o", str(out)])
     assert done.exit_code == 0, done.stderr
     facts = json.loads(out.read_text())
     assert facts["groups"]["3_9"]["contained"] == 0.5 and facts["groups"]["3_9"]["scenes with touch"] == 1
     assert facts["objects"]["ball"]["falls"] == 1 and facts["objects"]["bowl"]["falls"] == 0
     assert "| 3_9 | 1 |" in done.stdout
     with pytest.raises(InputError, match="has none of 4"):
-        scene_statistics.run(tmp_path, None, ["4"], 512, "cpu")
+        scene_statistics.run(tmp_path, None, ["4"], 512, "auto")
 
 
-def test_predictability_is_the_error_between_two_runs(tmp_path):
-    """Of two scenes one comes out 0.1 m aside from frame 10 on; the third is only in one run."""
+def test_sensitivity_is_the_error_between_two_runs(tmp_path):
+    """One of two scenes is displaced by 0.1 m from frame 10 on; a third is only in one run."""
     path = moving(shell(0.1), [0.0, 0, 0.4], [0.0, 0, -0.8])
     aside = path + torch.tensor([1e-3, 0, 0])
     aside = torch.cat([aside[:10], aside[10:] + torch.tensor([0.0, 0.1, 0])])
@@ -119,14 +119,14 @@ def test_predictability_is_the_error_between_two_runs(tmp_path):
         scenes = [replace(motions(t, ids=[0]), names=(f"{i}_0",)) for i, t in enumerate(tracks)]
         (tmp_path / name).mkdir()
         write_motions(tmp_path / name / "3_9.h5", concatenate_motions(scenes), {})
-    line = sensitivity.run(tmp_path / "a", tmp_path / "b", tmp_path / "p.json", 256, "cpu")[2]
+    line = sensitivity.run(tmp_path / "a", tmp_path / "b", tmp_path / "p.json", 256, "auto")[2]
     row = json.loads((tmp_path / "p.json").read_text())["splits"]["spatial"]
     # scene 0: 10 frames of 1 mm, 10 of 1 mm and 0.1 m; scene 1: 1 mm; an RMSE is over three axes
     first, second = math.sqrt((1e-6 + 0.5 * 0.01) / 3), math.sqrt(1e-6 / 3)
     assert row["RMSE"] == pytest.approx((first + second) / 2, rel=1e-2) and row["scenes"] == 2
     assert row["FPE"] == pytest.approx((math.hypot(0.1, 1e-3) + 1e-3) / 2, rel=1e-2)
     assert row["start apart"] == pytest.approx(1e-3, rel=0.02) and line.startswith("| spatial | 2 | 0.00100 |")
-    with pytest.raises(InputError, match="start where those of"):
-        sensitivity.run(tmp_path / "a", tmp_path / "a", None, 256, "cpu")
+    with pytest.raises(InputError, match="start exactly where those of"):
+        sensitivity.run(tmp_path / "a", tmp_path / "a", None, 256, "auto")
     with pytest.raises(InputError, match="has no group"):
-        sensitivity.run(tmp_path / "a", tmp_path, None, 256, "cpu")
+        sensitivity.run(tmp_path / "a", tmp_path, None, 256, "auto")

@@ -13,7 +13,7 @@ from stages.reconstruct.options import FEATURE_EXTRACTORS as MATCHERS
 from stages.reconstruct.options import QUALITY_PRESETS, ReconstructOptions
 from stages.refine.options import BACKENDS as REFINE
 from stages.refine.options import RefineOptions
-from stages.render.options import VIEWS, RenderOptions
+from stages.render.options import OUTPUT_FORMATS, VIEWS, RenderOptions
 from stages.segment.options import BACKENDS as SEGMENT
 from stages.segment.options import SegmentOptions
 from stages.simulate.options import ENGINE_HELP, SimulateOptions
@@ -243,7 +243,8 @@ def render(
                              show_default=False)
     ],
     out: Annotated[
-        Path | None, Option("-o", "--out", help=".mp4, .png or .jpg to write; default: beside the input; printed")
+        Path | None, Option("-o", "--out", help=f"file to write ({' '.join(OUTPUT_FORMATS)}); default: named after the "
+                            "input and the view")
     ] = None,
     view: Annotated[str, Option(help=f"camera: {VIEWS}")] = RenderOptions.view,
     resolution: Annotated[int, Option(help="longest side of a view [px]")] = RenderOptions.resolution,

@@ -1,1 +1,1 @@
-"""traj.h5 or scene.ply to MP4 or PNG."""
+"""Stage render: trajectory or scene -> video or image."""

@@ -1,4 +1,4 @@
-"""What there is to film: a trajectory or a scene at rest, asked for by time."""
+"""The scene to render as a function of time: a trajectory or a scene at rest."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from torch import Tensor
 from stages.core.errors import InputError
 from stages.core.physics.skinning import Skinning
 from stages.core.scene.files import must_exist
+from stages.core.scene.formats import FORMATS, suffixes
 from stages.core.scene.gaussians import Gaussians
 from stages.core.scene.scene import Scene
-from stages.core.scene.scene_ply import read_scene
-from stages.core.scene.trajectory import Trajectory, read_trajectory
+from stages.core.scene.trajectory import Trajectory
 
-WHAT = "a trajectory (.h5) or a scene (.ply)"
-SECONDS, FPS = 4.0, 30.0  # of a film in which only the camera moves
+EXPECTED = "a trajectory (.h5) or a scene (.ply)"
+STATIC_DURATION, STATIC_FPS = 4.0, 30.0  # of a video in which only the camera moves [s], [1/s]
 
 
 @dataclass(frozen=True)
@@ -28,67 +28,73 @@ class Animation:
 
     scene: Scene
     trajectory: Trajectory | None = None
-    frozen: int | None = None  # the frame at which time stands still
-    device: str = "cpu"  # where the Gaussians of a trajectory are moved
+    frozen: int | None = None  # index of the only frame to render
+    device: str = "cpu"  # where the Gaussians of a trajectory are computed
 
     @property
-    def moves(self) -> bool:
+    def is_moving(self) -> bool:
+        """Whether the Gaussians change over time."""
         return self.trajectory is not None and self.frozen is None and len(self.trajectory) > 1
 
     @property
     def fps(self) -> float:
-        return 1 / self.trajectory.info.dt if self.moves else FPS
+        """Stored frames per second; STATIC_FPS for a scene at rest."""
+        return 1 / self.trajectory.info.dt if self.is_moving else STATIC_FPS
 
     @property
     def duration(self) -> float:
-        """From the first stored frame to the last [s]."""
-        return (len(self.trajectory) - 1) / self.fps if self.moves else 0.0
+        """Time from the first stored frame to the last [s]."""
+        return (len(self.trajectory) - 1) / self.fps if self.is_moving else 0.0
 
-    def times(self, fps: float | None) -> list[float]:
-        """When the frames of a film are taken [s]; the trajectory's own frames at its own rate."""
+    def frame_times(self, fps: float | None) -> list[float]:
+        """Times of the frames of a video [s]; without `fps`, those of the stored frames."""
         fps = fps or self.fps
-        duration = self.duration if self.moves else SECONDS - 1 / fps
+        duration = self.duration if self.is_moving else STATIC_DURATION - 1 / fps
         return [i / fps for i in range(int(duration * fps + 1e-6) + 1)]
 
-    def index(self, time: float) -> float:
-        """Place among the stored frames; whole where it is one of them up to rounding."""
-        if not self.moves:
+    def frame_index(self, time: float) -> float:
+        """Fractional index of a time among the stored frames; times within rounding of a frame give its index."""
+        if not self.is_moving:
             return float(self.frozen or 0)
-        at = min(time * self.fps, len(self.trajectory) - 1.0)
-        return float(round(at)) if abs(at - round(at)) < 1e-4 else at
+        index = min(time * self.fps, len(self.trajectory) - 1.0)
+        return float(round(index)) if abs(index - round(index)) < 1e-4 else index
 
     def gaussians(self, time: float) -> Gaussians:
-        """Between two stored frames keypoints move straight; dense frames are taken as stored, the nearer one."""
+        """The Gaussians at a time: the nearest of dense frames, or keypoints interpolated linearly in time."""
         if self.trajectory is None:
             return self.scene.gaussians
         if self.trajectory.dense:
-            return self.trajectory.frame(round(self.index(time)))
-        return self._skinning(self.at(time, self.trajectory.positions))
+            return self.trajectory.frame(round(self.frame_index(time)))
+        return self._skinning(self.interpolate(time, self.trajectory.positions))
 
     @cached_property
     def _skinning(self) -> Skinning:
         return Skinning(self.scene.gaussians.to(self.device), self.trajectory.binding, self.trajectory.keypoints)
 
-    def at(self, time: float, values: Float[Tensor, "t *b"]) -> Float[Tensor, "*b"]:
-        """Any stored series at a time, linear between frames."""
-        index = self.index(time)
+    def interpolate(self, time: float, values: Float[Tensor, "t *b"]) -> Float[Tensor, "*b"]:
+        """A stored series at a time, linear between frames."""
+        index = self.frame_index(time)
         first = int(index)
         last = min(first + 1, len(values) - 1)
         return values[first] if index == first else torch.lerp(values[first], values[last], index - first)
 
 
 def open_animation(source: Path, frame: int | None = None, device: str = "cpu") -> Animation:
-    """A trajectory or a scene, by the file's ending; `frame` stops a trajectory there (negative: from the end)."""
+    """Read a trajectory or a scene, by its suffix; `frame` selects one frame of a trajectory (-1 is the last).
+
+    Raises InputError for other suffixes and for a frame that does not exist.
+    """
     source = Path(source)
     suffix = source.suffix.lower()
-    if suffix not in (".h5", ".hdf5", ".ply"):
-        must_exist(source, WHAT)
-        raise InputError(f"{source}: {suffix or 'no ending'} is not a kind of file that can be rendered; give {WHAT}")
-    if suffix == ".ply":
+    if suffix not in suffixes("trajectory", "scene"):
+        must_exist(source, EXPECTED)
+        raise InputError(f"{source}: files with {f'suffix {suffix}' if suffix else 'no suffix'} cannot be rendered; "
+                         f"give {EXPECTED}")  # fmt: skip
+    if FORMATS[suffix].kind == "scene":
         if frame is not None:
-            raise InputError(f"--frame {frame}: {source} is a scene at rest and has no frames; leave it out")
-        return Animation(read_scene(source))
-    trajectory = read_trajectory(source)
+            raise InputError(f"--frame {frame}: {source} is a scene at rest and has no frames; omit it")
+        return Animation(FORMATS[suffix].read(source))
+    trajectory = FORMATS[suffix].read(source)
     count = len(trajectory)
     if frame is not None and not -count <= frame < count:
         raise InputError(f"--frame {frame}: {source} has frames 0 to {count - 1} (or -1 for the last)")

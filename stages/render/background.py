@@ -1,4 +1,4 @@
-"""What stands behind the objects: the scene's own surroundings, another scene, a colour or a photo."""
+"""Background behind the objects: the scene's own, another scene's, a colour or a photo."""
 
 from __future__ import annotations
 
@@ -32,23 +32,23 @@ class RenderBackground:
     colour: tuple[float, float, float] = WHITE
 
     def compose(self, g: Gaussians) -> Gaussians:
-        """What is to be drawn when the scene holds `g`; a scene without objects is kept whole."""
+        """The Gaussians to render for the scene `g`; all of `g` if none of it belongs to an object."""
         objects = g if self.keep_scene or not (g.object_id > 0).any() else g[g.object_id > 0]
         return objects if self.gaussians is None else concatenate([self.gaussians.to(g.means.device), objects])
 
     def image(self, width: int, height: int) -> Float[Tensor, "h w 3"]:
-        """The picture seen where nothing stands in front; a photo covers it, centred."""
+        """Image behind all Gaussians: the colour, or the photo scaled to cover the image and centred."""
         if self.photo is None:
             return torch.tensor(self.colour).expand(height, width, 3)
         h, w = self.photo.shape[:2]
         factor = max(width / w, height / h)
-        grown = resize(self.photo, max(width, round(w * factor)), max(height, round(h * factor)))
-        top, left = (grown.shape[0] - height) // 2, (grown.shape[1] - width) // 2
-        return grown[top : top + height, left : left + width]
+        scaled = resize(self.photo, max(width, round(w * factor)), max(height, round(h * factor)))
+        top, left = (scaled.shape[0] - height) // 2, (scaled.shape[1] - width) // 2
+        return scaled[top : top + height, left : left + width]
 
 
 def open_background(choice: str | None, scene: Scene) -> RenderBackground:
-    """From the value of --background; of a scene with objects only what belongs to none of them is taken."""
+    """The background for a value of --background; of another scene only Gaussians without an object are used."""
     if choice is None:
         return RenderBackground(colour=scene.background or WHITE)
     if choice.startswith("#"):
@@ -59,7 +59,7 @@ def open_background(choice: str | None, scene: Scene) -> RenderBackground:
         if (g.object_id == 0).any():
             g = g[g.object_id == 0]
         else:
-            log.info("%s: all of its Gaussians belong to objects; all of them form the background", choice)
+            log.info("%s: all Gaussians belong to objects; all are used as background", choice)
         return RenderBackground(keep_scene=False, gaussians=g)
     if suffix in IMAGE_SUFFIXES:
         return RenderBackground(keep_scene=False, photo=read_image(Path(choice)))

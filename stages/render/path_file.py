@@ -1,4 +1,4 @@
-"""Camera paths of the user's own: a JSON list of cameras, smoothly connected.
+"""Camera paths from a JSON list of cameras, and smooth interpolation between cameras.
 
 Each entry is {rotation (3x3, camera to world), position, width, height, fx, fy} as in the public NGFF files
 (principal point at the centre), or {viewmat (4x4, world to camera), K, size}.
@@ -20,13 +20,13 @@ from stages.core.geometry.rotations import nearest_rotation
 from stages.core.scene.cameras import Cameras
 from stages.core.scene.files import must_exist
 
-WHAT = "a camera path (.json: a list of {rotation, position, width, height, fx, fy} or of {viewmat, K, size})"
+EXPECTED = "a camera path (.json: a list of {rotation, position, width, height, fx, fy} or of {viewmat, K, size})"
 
 
 def read_camera_path(path: str | Path) -> Cameras:
-    """The cameras of a path file; all must have the size of the first."""
+    """The cameras of a path file; InputError unless it is valid and all have the same image size."""
     path = Path(path)
-    must_exist(path, WHAT)
+    must_exist(path, EXPECTED)
     try:
         rows = json.loads(path.read_text())
         if not isinstance(rows, list) or not rows:
@@ -35,21 +35,21 @@ def read_camera_path(path: str | Path) -> Cameras:
         viewmats, Ks = (torch.from_numpy(np.stack([e[i] for e in entries])).float() for i in (0, 1))
         sizes = torch.tensor([entry[2] for entry in entries])
     except (ValueError, KeyError, TypeError, np.linalg.LinAlgError) as error:
-        raise InputError(f"{path}: cannot be followed ({error!r}); {WHAT} is expected") from error
+        raise InputError(f"{path}: is not a valid camera path ({error!r}); {EXPECTED} is expected") from error
     if not (sizes == sizes[0]).all() or not (sizes > 0).all():
-        raise InputError(f"{path}: cameras of different or zero size; a film has one size, so give all the same")
+        raise InputError(f"{path}: the cameras differ in image size, or it is zero; give all the same size")
     if not (viewmats.isfinite().all() and Ks.isfinite().all() and (Ks[:, [0, 1], [0, 1]] > 0).all()):
-        raise InputError(f"{path}: a number is not finite, or a focal length not above 0; correct the camera path")
+        raise InputError(f"{path}: values must be finite and focal lengths above 0")
     return Cameras(viewmats, Ks, sizes, tuple(f"{path.stem} {i}" for i in range(len(entries))))
 
 
 def _entry(row: dict) -> tuple[np.ndarray, np.ndarray, list[int]]:
-    """viewmat, K, size of one camera in either form."""
+    """viewmat, K and size of one camera in either format."""
     if "viewmat" in row:
         viewmat, K = np.array(row["viewmat"], np.float64).reshape(4, 4), np.array(row["K"], np.float64).reshape(3, 3)
         width, height = row["size"]
     else:
-        R = np.array(row["rotation"], np.float64).reshape(3, 3).T  # camera to world, turned round
+        R = np.array(row["rotation"], np.float64).reshape(3, 3).T  # world to camera
         viewmat = np.eye(4)
         viewmat[:3, :3], viewmat[:3, 3] = R, -R @ np.array(row["position"], np.float64).reshape(3)
         width, height = row["width"], row["height"]
@@ -62,24 +62,24 @@ def _entry(row: dict) -> tuple[np.ndarray, np.ndarray, list[int]]:
 
 
 def interpolate_cameras(cameras: Cameras, frames: int) -> Cameras:
-    """`frames` viewpoints from the first camera to the last, evenly in the order given; one camera stands still.
+    """`frames` cameras from the first to the last, evenly spaced in the order given; a single camera is repeated.
 
-    Rotations turn at even speed between neighbours (slerp), positions and lenses by monotone cubics, which pass
-    through every camera and do not overshoot.
+    Rotations are interpolated by slerp, positions and intrinsics by monotone cubics (PCHIP), which pass through
+    every camera without overshoot.
     """
     c = len(cameras)
-    width_height = cameras.sizes[:1].expand(frames, 2)
+    sizes = cameras.sizes[:1].expand(frames, 2)
     if c == 1:
         return Cameras(
-            cameras.viewmats.expand(frames, 4, 4), cameras.Ks.expand(frames, 3, 3), width_height, cameras.names * frames
+            cameras.viewmats.expand(frames, 4, 4), cameras.Ks.expand(frames, 3, 3), sizes, cameras.names * frames
         )
-    at = np.linspace(0, c - 1, frames) if frames > 1 else np.array([0.0])
+    index = np.linspace(0, c - 1, frames) if frames > 1 else np.array([0.0])
     knots = np.arange(c)
-    R = Slerp(knots, Rotation.from_matrix(cameras.viewmats[:, :3, :3].double().numpy()))(at).as_matrix()
-    eyes = PchipInterpolator(knots, centres(cameras.viewmats).double().numpy())(at)
+    R = Slerp(knots, Rotation.from_matrix(cameras.viewmats[:, :3, :3].double().numpy()))(index).as_matrix()
+    eyes = PchipInterpolator(knots, centres(cameras.viewmats).double().numpy())(index)
     viewmats = np.tile(np.eye(4), (frames, 1, 1))
     viewmats[:, :3, :3], viewmats[:, :3, 3] = R, -(R @ eyes[..., None])[..., 0]
-    Ks = PchipInterpolator(knots, cameras.Ks.double().numpy())(at)
+    Ks = PchipInterpolator(knots, cameras.Ks.double().numpy())(index)
     return Cameras(
-        torch.from_numpy(viewmats).float(), torch.from_numpy(Ks).float(), width_height, ("",) * frames
+        torch.from_numpy(viewmats).float(), torch.from_numpy(Ks).float(), sizes, ("",) * frames
     )

@@ -1,4 +1,4 @@
-"""Everything needed to take pictures: what moves, what stands behind it, and cameras, for one film or several."""
+"""Renderer: one or several animations with their backgrounds and cameras, side by side in every image."""
 
 from __future__ import annotations
 
@@ -17,44 +17,46 @@ from stages.core.scene.gaussians import Gaussians
 from stages.render.animation import Animation
 from stages.render.background import RenderBackground
 from stages.render.camera_paths import camera_path, scale_cameras
-from stages.render.draw import RenderedView, colour_by_object, colour_depth, render_view
+from stages.render.draw import RenderedView, colour_by_object, colour_depth, depth_range, render_view
 from stages.render.options import RenderOptions
 from stages.render.overlay import draw_arrows, draw_caption, force_arrows, grid_columns, tile_images
 from stages.render.subject import Subject, find_subject, merge_subjects
 
 log = logging.getLogger(__name__)
-SAME = 1e-3  # cameras of one world agree to this share of their distance from each other
+SAME_CAMERAS = 1e-3  # largest difference of equal cameras: of positions [their extent], of rotation matrix entries
 
 Image = Float[Tensor, "h w 3"]
+Views = list[list[RenderedView]]  # one row per camera, one column per clip
 
 
 @dataclass(frozen=True)
 class Clip:
-    """One film as it is shown: its footage with what stands behind it."""
+    """One animation with its background."""
 
-    footage: Animation
+    animation: Animation
     options: RenderOptions
-    backdrop: RenderBackground
+    background: RenderBackground
     device: str
-    name: str = ""  # written below it when there are several
+    name: str = ""  # caption, used if there are several clips
 
-    def scene_at(self, time: float) -> Gaussians:
-        return self._prepared(self.footage.gaussians(time)) if self.footage.moves else self._resting
+    def gaussians(self, time: float) -> Gaussians:
+        """All Gaussians to render at a time [s]."""
+        return self._prepared(self.animation.gaussians(time)) if self.animation.is_moving else self._static
 
     @cached_property
-    def _resting(self) -> Gaussians:
-        return self._prepared(self.footage.gaussians(0.0))
+    def _static(self) -> Gaussians:
+        return self._prepared(self.animation.gaussians(0.0))
 
     def _prepared(self, gaussians: Gaussians) -> Gaussians:
-        shown = self.backdrop.compose(gaussians.to(self.device))
+        shown = self.background.compose(gaussians.to(self.device))
         return colour_by_object(shown) if self.options.ids else shown
 
-    def seen(self, time: float, cameras: Cameras, indices: list[int]) -> list[RenderedView]:
-        """What some of the cameras see at a time, with arrows where they are asked for."""
-        gaussians = self.scene_at(time)
-        views = [render_view(gaussians, cameras, i, self.backdrop) for i in indices]
+    def render(self, time: float, cameras: Cameras, indices: list[int]) -> list[RenderedView]:
+        """Views of some of the cameras at a time [s], with force arrows if the options ask for them."""
+        gaussians = self.gaussians(time)
+        views = [render_view(gaussians, cameras, i, self.background) for i in indices]
         if self.options.show_forces:
-            arrows = force_arrows(self.footage, time)
+            arrows = force_arrows(self.animation, time)
             images = [draw_arrows(v.image, cameras, i, arrows) for v, i in zip(views, indices, strict=True)]
             views = [v._replace(image=image) for v, image in zip(views, images, strict=True)]
         return views
@@ -62,35 +64,40 @@ class Clip:
 
 @dataclass(frozen=True)
 class Renderer:
-    """One or several takes, which stand side by side in every picture."""
+    """Renders its clips side by side; what the writers of the output formats work with."""
 
-    takes: Sequence[Clip]
+    clips: Sequence[Clip]
     options: RenderOptions
 
     @cached_property
     def longest(self) -> Animation:
-        """The footage that decides how long to film; a shorter one stands still when it has ended."""
-        return max((take.footage for take in self.takes), key=lambda footage: footage.duration)
+        """The animation that determines the duration; shorter ones hold their last frame."""
+        return max((clip.animation for clip in self.clips), key=lambda animation: animation.duration)
 
     @property
-    def moves(self) -> bool:
-        return self.longest.moves
+    def is_moving(self) -> bool:
+        """Whether any Gaussians change over time."""
+        return self.longest.is_moving
 
     @property
     def fps(self) -> float:
-        """Frames a second: the highest rate of what moves, unless another was asked for."""
-        moving = [take.footage.fps for take in self.takes if take.footage.moves]
+        """Frames per second: those of the options, or else the highest rate of the moving clips."""
+        moving = [clip.animation.fps for clip in self.clips if clip.animation.is_moving]
         return float(self.options.fps or max(moving, default=self.longest.fps))
 
     def cameras(self, frames: int, resolution: int) -> list[Cameras]:
-        """For each take a viewpoint a frame; for "all", every stored one. Takes of one world share their viewpoints."""
-        footages = [take.footage for take in self.takes]
-        stored = [footage.scene.cameras for footage in footages]
-        subjects = [find_subject(footage) for footage in footages]
+        """For each clip one camera per frame, or for --view all every stored camera.
+
+        Clips whose stored cameras agree share one path, which frames all of them. Raises InputError where --view
+        needs stored cameras and there are none, or not equally many in all files.
+        """
+        animations = [clip.animation for clip in self.clips]
+        stored = [animation.scene.cameras for animation in animations]
+        subjects = [find_subject(animation) for animation in animations]
         first = next((c for c in stored if c is not None), None)
-        if all(c is None or _agree(first, c) for c in stored):
-            return [self._path(first, merge_subjects(subjects), frames, resolution)] * len(footages)
-        log.warning("the files hold different worlds (their cameras differ): each is filmed by a camera of its own")
+        if all(c is None or _same_cameras(first, c) for c in stored):
+            return [self._path(first, merge_subjects(subjects), frames, resolution)] * len(animations)
+        log.warning("the cameras of the files differ: each file is rendered with a camera path of its own")
         paths = [self._path(c, subject, frames, resolution) for c, subject in zip(stored, subjects, strict=True)]
         if len({len(path) for path in paths}) > 1:
             raise InputError("--view all: the files hold different numbers of cameras; choose another --view")
@@ -103,16 +110,18 @@ class Renderer:
             raise InputError("--view all: the file holds no cameras; use --view novel or --view orbit")
         return scale_cameras(stored, max(16, 2 * resolution // grid_columns(len(stored))))
 
-    def seen(self, time: float, cameras: list[Cameras], indices: list[int]) -> list[list[RenderedView]]:
-        """What some of the cameras see at a time: for each of them, the views of the takes."""
-        rows = [take.seen(time, c, indices) for take, c in zip(self.takes, cameras, strict=True)]
-        return [list(views) for views in zip(*rows, strict=True)]
+    def render(self, time: float, cameras: list[Cameras], indices: list[int]) -> Views:
+        """Views of some of the cameras at a time [s]: for each camera, one view per clip."""
+        columns = [clip.render(time, c, indices) for clip, c in zip(self.clips, cameras, strict=True)]
+        return [list(row) for row in zip(*columns, strict=True)]
 
-    def picture(
-        self, views: list[list[RenderedView]], span: tuple[float, float] | None, columns: int = 1,
-        captions: Sequence[str] = (),
-    ) -> Image:  # fmt: skip
-        """Views in rows, in colour, or as depth between the bounds of `span`; each may have a caption."""
+    def compose(
+        self, views: Views, span: tuple[float, float] | None, columns: int = 1, captions: Sequence[str] = ()
+    ) -> Image:
+        """One image of all views, in a grid of `columns`: colour, or depth in the range `span`; with captions if given.
+
+        The views of each camera are side by side in one cell of the grid.
+        """
         images = [self._side_by_side(row, span) for row in views]
         if captions:
             images = [draw_caption(image, text) for image, text in zip(images, captions, strict=True)]
@@ -122,15 +131,25 @@ class Renderer:
         images = [v.image if span is None else colour_depth(v.depth, span) for v in row]
         if len(images) == 1:
             return images[0]
-        images = [draw_caption(image, take.name, below=True) for image, take in zip(images, self.takes, strict=True)]
+        images = [draw_caption(image, clip.name, below=True) for image, clip in zip(images, self.clips, strict=True)]
         return tile_images(images, len(images))
 
 
-def _agree(a: Cameras, b: Cameras) -> bool:
-    """Whether two files have the same cameras, and so show the same world."""
+def views_depth_range(views: Views) -> tuple[float, float]:
+    """Depth range of several views, for `Renderer.compose`."""
+    return depth_range([view.depth for row in views for view in row])
+
+
+def depth_facts(span: tuple[float, float] | None) -> dict:
+    """The depth range as recorded beside the output."""
+    return {} if span is None else {"depth_near": span[0], "depth_far": span[1]}
+
+
+def _same_cameras(a: Cameras, b: Cameras) -> bool:
+    """Whether two files have the same cameras, and so the same world frame."""
     if a.viewmats.shape != b.viewmats.shape:
         return False
     p, q = centres(a.viewmats), centres(b.viewmats)
-    reach = (p - p.mean(0)).norm(dim=1).max().clamp_min(1e-9)
-    turned = (a.viewmats[:, :3, :3] - b.viewmats[:, :3, :3]).abs().max()
-    return bool((p - q).norm(dim=1).max() <= SAME * reach) and bool(turned <= SAME)
+    extent = (p - p.mean(0)).norm(dim=1).max().clamp_min(1e-9)
+    rotated = (a.viewmats[:, :3, :3] - b.viewmats[:, :3, :3]).abs().max()
+    return bool((p - q).norm(dim=1).max() <= SAME_CAMERAS * extent) and bool(rotated <= SAME_CAMERAS)

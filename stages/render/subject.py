@@ -1,4 +1,4 @@
-"""What a camera should look at."""
+"""The subject of the camera: the region of the scene to be framed."""
 
 from __future__ import annotations
 
@@ -14,155 +14,160 @@ from stages.core.scene.cameras import Cameras
 from stages.core.scene.gaussians import Gaussians
 from stages.render.animation import Animation
 
-KEPT = (0.05, 0.95)  # quantiles of each coordinate that count as the extent
-VISIBLE = 0.1  # opacity
-ASTRAY = 2.0  # radii of what the cameras look at (two thirds of their distance): objects farther off are scenery
-GONE = 4.0  # radii of what the cameras look at, whose distance is three: farther off a thing has left the scene
-LEASH = 0.35  # radii of what the cameras look at: the aim stays within this of theirs
-SCRAP = 0.05  # of the Gaussians of the largest object; smaller ones do not direct the camera
-MANY = 200_000  # points are thinned to about this many
-MOMENTS, FOLLOWED = 60, 3000  # most times at which what moves must be in the picture, and points of it
-STIRS = 0.1  # of the size of what is shown; what moves less needs no attention
+EXTENT_QUANTILES = (0.05, 0.95)  # of each coordinate, the extent of a set of points
+MIN_OPACITY = 0.1  # of the Gaussians that are framed
+# The radius of the cameras' focus is a third of their distance from it; these three are multiples of that radius.
+MAX_OBJECT_DISTANCE = 2.0  # objects farther from the focus are scenery
+MAX_POINT_DISTANCE = 4.0  # moving points farther from the focus have left the scene
+MAX_AIM_SHIFT = 0.35  # of the aim from the focus towards the objects
+MIN_OBJECT_FRACTION = 0.05  # of the Gaussians of the largest object; smaller objects are ignored
+MAX_POINTS = 200_000  # to which point sets are thinned
+MAX_TIMES, MAX_TRACKED_POINTS = 60, 3000  # to which the moving points are thinned
+MIN_MOTION = 0.1  # of the subject's radius; points that move less are not tracked
 
 
 @dataclass(frozen=True)
 class Subject:
-    """An upright box that holds what matters."""
+    """An axis-aligned box to be framed."""
 
     centre: Float[Tensor, "3"]
     half: Float[Tensor, "3"]  # from the centre to the faces
     aim: Float[Tensor, "3"] | None = None  # where to look, if not at the centre
-    moving: Float[Tensor, "t m 3"] | None = None  # points of what moves, at even times of the film
+    moving: Float[Tensor, "t m 3"] | None = None  # tracked points at evenly spaced times of the animation
 
     @property
     def target(self) -> Float[Tensor, "3"]:
+        """Point that the camera looks at."""
         return self.centre if self.aim is None else self.aim
 
     @property
     def radius(self) -> float:
-        """From the centre to the corners."""
+        """Distance from the centre to the corners."""
         return float(self.half.norm())
 
     def corners(self) -> Float[Tensor, "8 3"]:
+        """Corners of the box."""
         signs = torch.tensor([-1.0, 1.0])
         return self.centre + torch.cartesian_prod(signs, signs, signs) * self.half
 
 
-def find_subject(footage: Animation) -> Subject:
-    """The objects along all of their motion; without objects what the cameras look at; else the whole scene.
+def find_subject(animation: Animation) -> Subject:
+    """The objects over all of their motion; without objects the cameras' focus; without cameras the whole scene.
 
-    Photos are framed around what matters, so objects pull the aim only a little away from theirs.
+    With photos the camera aims at their focus, shifted by at most MAX_AIM_SHIFT towards the objects.
     """
-    g, cameras = footage.scene.gaussians, footage.scene.cameras
-    seen = g[g.opacities > VISIBLE] if (g.opacities > VISIBLE).any() else g
-    aimed = (axes_focus(cameras) or common_view_centre(cameras, seen.means)) if cameras is not None else None
-    ids = _central(seen, aimed)
+    g, cameras = animation.scene.gaussians, animation.scene.cameras
+    opaque = g[g.opacities > MIN_OPACITY] if (g.opacities > MIN_OPACITY).any() else g
+    focus = (axes_focus(cameras) or common_view_centre(cameras, opaque.means)) if cameras is not None else None
+    ids = _central_objects(opaque, focus)
     if not len(ids):
-        return aimed or robust_box(seen.means)
-    found = _box(footage, seen, ids)
-    if aimed is None:
+        return focus or robust_box(opaque.means)
+    found = _objects_box(animation, opaque, ids)
+    if focus is None:
         return found
-    pull = found.centre - aimed.centre
-    pull = pull * min(1.0, LEASH * aimed.radius / float(pull.norm().clamp_min(1e-9)))
-    return replace(found, aim=aimed.centre + pull, moving=_near(found.moving, aimed))
+    shift = found.centre - focus.centre
+    shift = shift * min(1.0, MAX_AIM_SHIFT * focus.radius / float(shift.norm().clamp_min(1e-9)))
+    return replace(found, aim=focus.centre + shift, moving=_within_scene(found.moving, focus))
 
 
-def _near(moving: Float[Tensor, "t m 3"] | None, aimed: Subject) -> Float[Tensor, "t m 3"] | None:
-    """What leaves the scene is not chased: such points count as if they were in the middle."""
+def _within_scene(moving: Float[Tensor, "t m 3"] | None, focus: Subject) -> Float[Tensor, "t m 3"] | None:
+    """Tracked points, with those that have left the scene moved to the focus so that they do not attract the camera."""
     if moving is None:
         return None
-    gone = (moving - aimed.centre).norm(dim=2, keepdim=True) > GONE * aimed.radius
-    return torch.where(gone, aimed.centre, moving)
+    outside = (moving - focus.centre).norm(dim=2, keepdim=True) > MAX_POINT_DISTANCE * focus.radius
+    return torch.where(outside, focus.centre, moving)
 
 
 def merge_subjects(subjects: Sequence[Subject]) -> Subject:
-    """The box around several subjects; the camera aims at the middle of what they would have it aim at."""
+    """The bounding box of several subjects, with the mean of their targets and all of their moving points."""
     if len(subjects) == 1:
         return subjects[0]
     low = torch.stack([s.centre - s.half for s in subjects]).amin(0)
     high = torch.stack([s.centre + s.half for s in subjects]).amax(0)
-    aims = torch.stack([s.target for s in subjects])
+    targets = torch.stack([s.target for s in subjects])
     moving = [s.moving for s in subjects if s.moving is not None]
     times = max(map(len, moving), default=0)
-    moving = torch.cat([m[_even(len(m), times)] for m in moving], 1) if moving else None
-    return Subject((low + high) / 2, (high - low) / 2, aims.mean(0), moving)
+    moving = torch.cat([m[_evenly(len(m), times)] for m in moving], 1) if moving else None
+    return Subject((low + high) / 2, (high - low) / 2, targets.mean(0), moving)
 
 
-def _box(footage: Animation, seen: Gaussians, ids: Int[Tensor, "o"]) -> Subject:
-    """Where these objects are in the course of the film, and where they start: what is lifted is not up for long."""
-    trajectory = footage.trajectory
+def _objects_box(animation: Animation, opaque: Gaussians, ids: Int[Tensor, "o"]) -> Subject:
+    """Box of these objects over the animation, which always includes their initial positions."""
+    trajectory = animation.trajectory
     if trajectory is not None:
-        moving = torch.isin(trajectory.keypoints.object_id, ids)
-        if moving.any():
-            shown = (trajectory.positions if footage.moves else trajectory.positions[[footage.frozen or 0]])[:, moving]
-            box = merge_subjects([robust_box(shown.reshape(-1, 3)), robust_box(shown[0])])
-            return replace(box, moving=_moving(shown, STIRS * box.radius))
-    return robust_box(seen.means[torch.isin(seen.object_id, ids)])
+        selected = torch.isin(trajectory.keypoints.object_id, ids)
+        if selected.any():
+            frames = slice(None) if animation.is_moving else [animation.frozen or 0]
+            positions = trajectory.positions[frames][:, selected]
+            box = merge_subjects([robust_box(positions.reshape(-1, 3)), robust_box(positions[0])])
+            return replace(box, moving=_moving_points(positions, MIN_MOTION * box.radius))
+    return robust_box(opaque.means[torch.isin(opaque.object_id, ids)])
 
 
-def _moving(shown: Float[Tensor, "t p 3"], least: float) -> Float[Tensor, "t m 3"] | None:
-    """Those of the points that move by more than `least`, thinned in time and number."""
-    shown = shown[_even(len(shown), min(len(shown), MOMENTS))]
-    shown = shown[:, (shown - shown[0]).norm(dim=2).amax(0) > least]
-    return shown[:, _even(shown.shape[1], min(shown.shape[1], FOLLOWED))] if shown.shape[1] else None
+def _moving_points(positions: Float[Tensor, "t p 3"], min_motion: float) -> Float[Tensor, "t m 3"] | None:
+    """The points that move by more than `min_motion`, thinned in time and number."""
+    positions = positions[_evenly(len(positions), min(len(positions), MAX_TIMES))]
+    positions = positions[:, (positions - positions[0]).norm(dim=2).amax(0) > min_motion]
+    count = positions.shape[1]
+    return positions[:, _evenly(count, min(count, MAX_TRACKED_POINTS))] if count else None
 
 
-def _even(have: int, count: int) -> Int[Tensor, "c"]:
-    """`count` indices from the first to the last of `have`."""
-    return torch.linspace(0, max(have - 1, 0), count).round().long()
+def _evenly(length: int, count: int) -> Int[Tensor, "c"]:
+    """`count` evenly spaced indices from the first to the last of `length`."""
+    return torch.linspace(0, max(length - 1, 0), count).round().long()
 
 
-def _central(g: Gaussians, aimed: Subject | None) -> Int[Tensor, "o"]:
-    """Ids of the objects that matter: not scraps, nor those far from where the cameras look, unless all are."""
+def _central_objects(g: Gaussians, focus: Subject | None) -> Int[Tensor, "o"]:
+    """Ids of the objects that are not very small and are near the cameras' focus; of all, if none is near."""
     ids, counts = g.object_id[g.object_id > 0].unique(return_counts=True)
-    ids = ids[counts >= SCRAP * counts.max()] if len(ids) else ids
-    if aimed is None or not len(ids):
+    ids = ids[counts >= MIN_OBJECT_FRACTION * counts.max()] if len(ids) else ids
+    if focus is None or not len(ids):
         return ids
-    centres = torch.stack([g.means[g.object_id == i].median(0).values for i in ids])
-    near = (centres - aimed.centre).norm(dim=1) < ASTRAY * aimed.radius
+    medians = torch.stack([g.means[g.object_id == i].median(0).values for i in ids])
+    near = (medians - focus.centre).norm(dim=1) < MAX_OBJECT_DISTANCE * focus.radius
     return ids[near] if near.any() else ids
 
 
 def robust_box(points: Float[Tensor, "n 3"]) -> Subject:
-    """The box of the middle nine tenths of each coordinate, grown by what was cut off on average."""
-    thinned = points[:: max(1, len(points) // MANY)].double()
-    low, high = torch.quantile(thinned, torch.tensor(KEPT, dtype=torch.float64), dim=0)
-    half = (high - low) / 2 / (KEPT[1] - KEPT[0])
+    """The box between EXTENT_QUANTILES of each coordinate, enlarged to compensate for the quantiles."""
+    thinned = points[:: max(1, len(points) // MAX_POINTS)].double()
+    low, high = torch.quantile(thinned, torch.tensor(EXTENT_QUANTILES, dtype=torch.float64), dim=0)
+    half = (high - low) / 2 / (EXTENT_QUANTILES[1] - EXTENT_QUANTILES[0])
     return Subject(((low + high) / 2).float(), half.float().clamp_min(1e-6))
 
 
 def axes_focus(cameras: Cameras) -> Subject | None:
-    """The point nearest to all viewing axes.
+    """The point nearest to all viewing axes (least squares).
 
-    Nothing when the axes are nearly parallel, or when fewer than half of the cameras see that point.
+    None when the axes are nearly parallel, or when the point is behind half of the cameras or more.
     """
     eyes = centres(cameras.viewmats).double()
     axes = cameras.viewmats[:, 2, :3].double()
-    across = torch.eye(3, dtype=torch.float64) - axes[:, :, None] * axes[:, None, :]  # projects an axis away
-    normal = across.sum(0)
+    projectors = torch.eye(3, dtype=torch.float64) - axes[:, :, None] * axes[:, None, :]  # orthogonal to an axis
+    normal = projectors.sum(0)
     if torch.linalg.eigvalsh(normal)[0] < 0.02 * len(cameras):
         return None
-    point = torch.linalg.solve(normal, (across @ eyes[..., None]).sum(0))[:, 0].float()
+    point = torch.linalg.solve(normal, (projectors @ eyes[..., None]).sum(0))[:, 0].float()
     depth = torch.stack([depths(point[None], viewmat)[0] for viewmat in cameras.viewmats])
     if (depth > 0).float().mean() < 0.5:
         return None
-    return _at(point, depth[depth > 0].median())
+    return _focus_cube(point, depth[depth > 0].median())
 
 
 def common_view_centre(cameras: Cameras, points: Float[Tensor, "n 3"]) -> Subject | None:
-    """Where the points lie that are in the middle of most photos, for cameras that look in one direction."""
-    points = points[:: max(1, len(points) // MANY)]
-    middle = torch.zeros(len(points))
+    """The median of the points in the central quarter of at least half of the photos, for nearly parallel cameras."""
+    points = points[:: max(1, len(points) // MAX_POINTS)]
+    count = torch.zeros(len(points))
     for viewmat, K, size in zip(cameras.viewmats, cameras.Ks, cameras.sizes, strict=True):
         offset = (project(points, viewmat, K) / size - 0.5).abs()
-        middle += ((offset < 0.25).all(1) & (depths(points, viewmat) > 0)).float()
-    shared = points[middle >= 0.5 * len(cameras)]
-    if not len(shared):
+        count += ((offset < 0.25).all(1) & (depths(points, viewmat) > 0)).float()
+    central = points[count >= 0.5 * len(cameras)]
+    if not len(central):
         return None
-    point = shared.median(0).values
-    return _at(point, (centres(cameras.viewmats) - point).norm(dim=1).median())
+    point = central.median(0).values
+    return _focus_cube(point, (centres(cameras.viewmats) - point).norm(dim=1).median())
 
 
-def _at(point: Float[Tensor, "3"], distance: Float[Tensor, ""]) -> Subject:
+def _focus_cube(point: Float[Tensor, "3"], distance: Float[Tensor, ""]) -> Subject:
     """A cube whose corners are a third as far from its centre as the cameras."""
     return Subject(point, (distance / 3 / 3**0.5).expand(3))

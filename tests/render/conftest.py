@@ -1,4 +1,4 @@
-"""Every test of this folder runs on the CPU and, where there is one, on a GPU."""
+"""Runs every test of this folder on each device present: the CPU and, if there is one, a GPU."""
 
 import pytest
 
@@ -10,11 +10,11 @@ _current = {"device": "cpu"}
 
 @pytest.fixture(params=DEVICES, autouse=True)
 def render_device(request):
-    """The device that `render_options` asks for during a test."""
+    """The device that `render_options` selects during a test."""
     _current["device"] = request.param
     return request.param
 
 
 def render_options(**choices) -> RenderOptions:
-    """Small pictures, on the device of the test."""
+    """Options for small images, on the device of the test."""
     return RenderOptions(**{"resolution": 96, **_current, **choices})

@@ -7,7 +7,7 @@ from stages.core.scene.trajectory import Keypoints, SimulationInfo, TrajectoryWr
 
 
 def rising(path, scene, frames: int = 5, step: float = 0.01, forces: tuple = ()):
-    """Both balls rise by `step` a frame, 50 frames a second."""
+    """Write a trajectory in which both balls rise by `step` per frame, at 50 frames per second."""
     g = scene.gaussians
     rows = torch.cat([(g.object_id == o.id).nonzero()[:60, 0] for o in scene.objects])
     keypoints = Keypoints(g.means[rows], g.object_id[rows])

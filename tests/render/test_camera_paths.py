@@ -1,3 +1,5 @@
+"""Camera paths, and the subject that they frame."""
+
 import json
 from dataclasses import replace
 
@@ -24,17 +26,17 @@ def angles(a, b, about):
     return torch.rad2deg(torch.acos((u @ v.mT).clamp(-1, 1)))
 
 
-def test_novel_keeps_near_the_photos_but_repeats_none():
+def test_novel_stays_near_the_photos_without_repeating_one():
     cameras = ring(24, target=0.1)
     path = camera_path("novel", cameras, BOX, 50, 640)
     away = angles(centres(path.viewmats), centres(cameras.viewmats), BOX.centre)
     assert away.min() > 2 and away.min(1).values.max() < 12
     steps = angles(centres(path.viewmats), centres(path.viewmats), BOX.centre).diagonal(1)
-    assert steps.max() < 2 and 10 < steps.sum() < 31  # gentle, yet it moves
-    assert steps[0] < 0.2 * steps[24] and steps[-1] < 0.2 * steps[24]  # starts and stops softly
+    assert steps.max() < 2 and 10 < steps.sum() < 31  # a short path
+    assert steps[0] < 0.2 * steps[24] and steps[-1] < 0.2 * steps[24]  # slow at both ends
 
 
-def test_novel_follows_a_camera_man_with_one_photo():
+def test_novel_with_a_single_photo():
     cameras = ring(1, target=0.1)
     path = camera_path("novel", cameras, BOX, 10, 640)
     away = angles(centres(path.viewmats), centres(cameras.viewmats), BOX.centre)
@@ -43,7 +45,7 @@ def test_novel_follows_a_camera_man_with_one_photo():
 
 @pytest.mark.parametrize("view", ["novel", "orbit"])
 @pytest.mark.parametrize("cameras", [None, ring(8, target=0.1)], ids=["no photos", "photos"])
-def test_the_subject_fills_the_picture_and_stays_in_it(view, cameras):
+def test_subject_fills_the_image_and_stays_within_it(view, cameras):
     path = camera_path(view, cameras, BOX, 12, 640)
     corners, largest = BOX.corners(), 0.0
     for viewmat, K, (w, h) in zip(path.viewmats, path.Ks, path.sizes.tolist(), strict=True):
@@ -53,7 +55,7 @@ def test_the_subject_fills_the_picture_and_stays_in_it(view, cameras):
     assert largest == pytest.approx(0.9, abs=1e-4)
 
 
-def test_an_orbit_goes_once_around_and_closes():
+def test_orbit_is_a_closed_circle():
     path = camera_path("orbit", None, BOX, 36, 640)
     eyes = centres(path.viewmats)
     assert torch.allclose(angles(eyes, eyes.roll(-1, 0), BOX.centre).diagonal(),
@@ -62,7 +64,7 @@ def test_an_orbit_goes_once_around_and_closes():
     assert torch.allclose(torch.rad2deg(elevation), torch.tensor(25.0), atol=0.01)
 
 
-def test_a_stored_camera_keeps_its_rays_at_any_resolution():
+def test_stored_camera_keeps_its_rays_at_any_resolution():
     cameras = ring(6, size=65)
     path = camera_path("input:2", cameras, BOX, 3, 200)
     assert len(path) == 3 and path.sizes.tolist() == [[200, 200]] * 3
@@ -72,7 +74,7 @@ def test_a_stored_camera_keeps_its_rays_at_any_resolution():
     torch.testing.assert_close(after, before)
 
 
-def test_cameras_by_number_and_by_name():
+def test_find_camera_by_index_and_by_name():
     cameras = ring(6)
     assert find_camera(cameras, "4") == 4
     assert find_camera(cameras, "03.png") == 3 and find_camera(cameras, "03") == 3
@@ -89,7 +91,7 @@ def public(cameras, width=640, height=480):
              "fx": 700.0, "fy": 710.0} for m in c2w]  # fmt: skip
 
 
-def test_path_files_in_both_forms_agree(tmp_path):
+def test_both_formats_of_path_files_agree(tmp_path):
     cameras = ring(5)
     rows = public(cameras)
     K = [[700.0, 0, 320], [0, 710, 240], [0, 0, 1]]
@@ -103,7 +105,7 @@ def test_path_files_in_both_forms_agree(tmp_path):
     assert torch.equal(a.Ks, b.Ks) and torch.equal(a.sizes, b.sizes)
 
 
-def test_a_path_passes_through_its_cameras_and_a_single_one_stands_still(tmp_path):
+def test_path_passes_through_its_cameras_and_repeats_a_single_one(tmp_path):
     cameras = ring(5)
     through = interpolate_cameras(cameras, 17)
     torch.testing.assert_close(through.viewmats[::4], cameras.viewmats, atol=1e-5, rtol=0)
@@ -116,21 +118,22 @@ def test_a_path_passes_through_its_cameras_and_a_single_one_stands_still(tmp_pat
 
 
 @pytest.mark.parametrize(
-    ("text", "says"),
-    [("", "is empty"), ("not json", "cannot be followed"), ("{}", "cannot be followed"), ("[]", "cannot be followed"),
+    ("text", "message"),
+    [("", "is empty"), ("not json", "is not a valid camera path"), ("{}", "is not a valid camera path"),
+     ("[]", "is not a valid camera path"),
      ('[{"rotation": [[1,0,0],[0,1,0],[0,0,2]], "position": [0,0,0], "width": 4, "height": 4, "fx": 1, "fy": 1}]',
       "not orthonormal"),
      ('[{"rotation": [[1,0,0],[0,1,0],[0,0,1]], "position": [0,0,0], "width": 0, "height": 4, "fx": 1, "fy": 1}]',
-      "zero size")],
+      "it is zero")],
 )  # fmt: skip
-def test_a_path_file_that_cannot_be_followed(tmp_path, text, says):
+def test_invalid_path_files(tmp_path, text, message):
     (tmp_path / "p.json").write_text(text)
-    with pytest.raises(InputError, match=says) as caught:
+    with pytest.raises(InputError, match=message) as caught:
         read_camera_path(tmp_path / "p.json")
     assert "\n" not in str(caught.value)
 
 
-def test_extent_does_not_mind_stray_points():
+def test_robust_box_ignores_outliers():
     points = torch.rand(10_000, 3, generator=torch.Generator().manual_seed(0))
     points[:100] += 1000
     found = robust_box(points)
@@ -138,10 +141,10 @@ def test_extent_does_not_mind_stray_points():
     assert found.half.tolist() == pytest.approx([0.5] * 3, rel=0.03)
 
 
-def test_cameras_aim_at_a_point(two_balls):
+def test_focus_of_converging_and_of_parallel_cameras(two_balls):
     found = axes_focus(ring(8, target=0.3))
     np.testing.assert_allclose(found.centre.numpy(), [0, 0, 0.3], atol=1e-4)
-    assert axes_focus(two_balls.cameras[[0, 0]]) is None  # one axis has no point of its own
+    assert axes_focus(two_balls.cameras[[0, 0]]) is None  # a single axis has no unique focus
     line = two_balls.cameras[[0, 0, 0]]
     line.viewmats[:, 0, 3] += torch.tensor([-0.1, 0.0, 0.1])  # side by side, looking the same way
     g = two_balls.gaussians
@@ -150,7 +153,7 @@ def test_cameras_aim_at_a_point(two_balls):
     assert (find_subject(Animation(two_balls)).centre - torch.tensor([0.05, 0.0, 0.25])).abs().max() < 0.15
 
 
-def test_an_object_far_from_where_the_photos_look_is_scenery(two_balls):
+def test_object_far_from_the_focus_is_not_framed(two_balls):
     g = two_balls.gaussians
     means = g.means.clone()
     means[g.object_id == 2] += torch.tensor([3.0, 0.0, 0.0])
@@ -160,48 +163,48 @@ def test_an_object_far_from_where_the_photos_look_is_scenery(two_balls):
     assert float(find_subject(Animation(alone)).half[0]) > 1.5
 
 
-def test_objects_pull_the_aim_of_the_photos_only_a_little(two_balls):
+def test_aim_shifts_only_slightly_from_the_focus_towards_objects(two_balls):
     found = find_subject(Animation(replace(two_balls, cameras=ring(6, target=-0.4))))
     assert float(found.centre[2]) == pytest.approx(0.26, abs=0.05)
     assert -0.2 < float(found.target[2]) < 0.0  # from -0.4 toward 0.26, as far as 0.35 of two thirds
 
 
-def test_what_is_lifted_is_in_the_picture_from_the_start(tmp_path, two_balls):
-    # the balls fall by 0.6 within a twentieth of the film, to where the cameras look
-    footage = open_animation(rising(tmp_path / "t.h5", two_balls, 40, 0.0), None, pick_device("auto"))
-    positions = footage.trajectory.positions.clone()
+def test_lifted_objects_are_in_the_image_from_the_first_frame(tmp_path, two_balls):
+    # the balls fall by 0.6 within a twentieth of the animation, to the focus of the cameras
+    animation = open_animation(rising(tmp_path / "t.h5", two_balls, 40, 0.0), None, pick_device("auto"))
+    positions = animation.trajectory.positions.clone()
     positions[:2, :, 2] += torch.tensor([[0.6], [0.3]])
-    footage = replace(footage, trajectory=replace(footage.trajectory, positions=positions))
-    path = camera_path("novel", two_balls.cameras, find_subject(footage), 40, 640)
+    animation = replace(animation, trajectory=replace(animation.trajectory, positions=positions))
+    path = camera_path("novel", two_balls.cameras, find_subject(animation), 40, 640)
     for i in range(40):
         inside = ((project(positions[i], path.viewmats[i], path.Ks[i]) / path.sizes[i] - 0.5).abs() < 0.5).all(1)
         assert float(inside.float().mean()) > 0.95
 
 
 @pytest.mark.parametrize("jump", [(0.0, 0.0, 0.9), (0.5, -0.5, 0.0)], ids=["high up", "to the side"])
-def test_what_moves_stays_in_the_picture_however_far(tmp_path, two_balls, jump):
-    """Far above what the photos show, or far to the side of it, and back."""
-    footage = open_animation(rising(tmp_path / "t.h5", two_balls, 40, 0.0), None, pick_device("auto"))
-    positions = footage.trajectory.positions.clone()
+def test_moving_objects_stay_in_the_image(tmp_path, two_balls, jump):
+    """Motion far above or beside the region of the photos, and back."""
+    animation = open_animation(rising(tmp_path / "t.h5", two_balls, 40, 0.0), None, pick_device("auto"))
+    positions = animation.trajectory.positions.clone()
     positions += 4 * (torch.linspace(0, 1, 40) - torch.linspace(0, 1, 40) ** 2)[:, None, None] * torch.tensor(jump)
-    footage = replace(footage, trajectory=replace(footage.trajectory, positions=positions))
+    animation = replace(animation, trajectory=replace(animation.trajectory, positions=positions))
     still = camera_path("novel", two_balls.cameras, find_subject(Animation(two_balls)), 40, 640)
-    path = camera_path("novel", two_balls.cameras, find_subject(footage), 40, 640)
-    assert float(path.Ks[0, 0, 0]) >= 0.75 * float(still.Ks[0, 0, 0]) / 1.6  # no fish eye
+    path = camera_path("novel", two_balls.cameras, find_subject(animation), 40, 640)
+    assert float(path.Ks[0, 0, 0]) >= 0.75 * float(still.Ks[0, 0, 0]) / 1.6  # MIN_FOCAL_FACTOR over the largest zoom
     for i in range(40):
         inside = ((project(positions[i], path.viewmats[i], path.Ks[i]) / path.sizes[i] - 0.5).abs() < 0.5).all(1)
         assert bool((depths(positions[i], path.viewmats[i]) > 0).all()) and bool(inside.all())
 
 
-def test_what_leaves_the_scene_is_not_chased(tmp_path, two_balls):
-    footage = open_animation(rising(tmp_path / "t.h5", two_balls, 40, 5.0), None, pick_device("auto"))
-    path = camera_path("novel", two_balls.cameras, find_subject(footage), 40, 640)
-    assert bool((path.viewmats[:, 2, 2] < 0.5).all())  # z of where they look: at most 30 degrees up
-    reach = (centres(two_balls.cameras.viewmats)[:, :2].norm(dim=1)).max()
-    assert float(centres(path.viewmats)[:, :2].norm(dim=1).max()) < 1.6 * float(reach)
+def test_objects_that_leave_the_scene_are_not_followed(tmp_path, two_balls):
+    animation = open_animation(rising(tmp_path / "t.h5", two_balls, 40, 5.0), None, pick_device("auto"))
+    path = camera_path("novel", two_balls.cameras, find_subject(animation), 40, 640)
+    assert bool((path.viewmats[:, 2, 2] < 0.5).all())  # z of the viewing axis: at most 30 degrees upwards
+    extent = (centres(two_balls.cameras.viewmats)[:, :2].norm(dim=1)).max()
+    assert float(centres(path.viewmats)[:, :2].norm(dim=1).max()) < 1.6 * float(extent)
 
 
-def test_a_film_is_framed_as_before_where_all_that_moves_is_in_it(two_balls):
+def test_motion_within_the_box_does_not_change_the_path(two_balls):
     subject = find_subject(Animation(two_balls))
     inner = subject.centre + 0.3 * (subject.corners() - subject.centre)
     plain, moving = (camera_path("novel", two_balls.cameras, s, 9, 640) for s in

@@ -1,3 +1,5 @@
+"""Stage render: videos, images and their options."""
+
 import json
 import re
 from dataclasses import replace
@@ -32,12 +34,12 @@ def trajectory(tmp_path, two_balls):
     return rising(tmp_path / "traj.h5", two_balls, frames=6, forces=(push,))
 
 
-def picture(source, out, **choices):
+def render_image(source, out, **choices):
     return read_image(run(source, out, render_options(**choices)))
 
 
-def share(image, colour, within=0.15):
-    """Of the pixels that have about this colour."""
+def colour_fraction(image, colour, within=0.15):
+    """Fraction of the pixels within a distance of this colour."""
     return float(((image - torch.as_tensor(colour)).abs().amax(-1) < within).float().mean())
 
 
@@ -45,7 +47,7 @@ def rows_of(image, colour):
     return ((image - colour).abs().amax(-1) < 0.2).nonzero()[:, 0].float().mean()
 
 
-def test_a_film_plays_at_the_rate_of_the_trajectory_and_says_what_made_it(trajectory, capsys):
+def test_video_has_the_rate_of_the_trajectory_and_records_its_inputs(trajectory, capsys):
     out = run(trajectory, None, render_options())
     assert out == trajectory.with_name("traj_novel.mp4") and capsys.readouterr().out.strip() == str(out)
     with av.open(str(out)) as file:
@@ -57,37 +59,37 @@ def test_a_film_plays_at_the_rate_of_the_trajectory_and_says_what_made_it(trajec
     assert facts["command"] == "render" and facts["inputs"][0]["name"] == "traj.h5" and facts["frames"] == 6
 
 
-def test_what_rises_rises_in_the_film_and_what_stands_stands(tmp_path, two_balls):
+def test_moving_objects_move_and_the_floor_does_not(tmp_path, two_balls):
     source = rising(tmp_path / "traj.h5", two_balls, frames=6, step=0.04)
     frames = list(read_video(run(source, None, render_options(view="input:0", resolution=128))))
     heights = [float(rows_of(frame, GREEN)) for frame in frames]
     assert all(b < a - 0.5 for a, b in zip(heights, heights[1:], strict=False))
-    assert (frames[0] - frames[5])[-20:].abs().mean() < 0.02  # the floor in front
+    assert (frames[0] - frames[5])[-20:].abs().mean() < 0.02  # floor in the foreground
 
 
-def test_the_first_frame_is_the_scene_at_rest(scene, trajectory, tmp_path):
-    still = picture(scene, tmp_path / "a.png", view="input:1")
-    first = picture(trajectory, tmp_path / "b.png", view="input:1", frame=0)
-    assert torch.equal(still, first) and share(still, RED) > 0.005 and share(still, GREEN) > 0.005
+def test_first_frame_equals_the_scene_at_rest(scene, trajectory, tmp_path):
+    still = render_image(scene, tmp_path / "a.png", view="input:1")
+    first = render_image(trajectory, tmp_path / "b.png", view="input:1", frame=0)
+    assert torch.equal(still, first) and colour_fraction(still, RED) > 0.005 and colour_fraction(still, GREEN) > 0.005
 
 
-def test_a_png_of_a_film_is_a_sheet_of_moments(trajectory, tmp_path):
-    sheet = picture(trajectory, tmp_path / "sheet.png", view="input:0")
+def test_image_of_a_trajectory_is_a_contact_sheet(trajectory, tmp_path):
+    sheet = render_image(trajectory, tmp_path / "sheet.png", view="input:0")
     assert sheet.shape == (2 * 48, 4 * 48, 3)  # six frames in two rows of four
-    assert share(sheet[48:, 96:], (1.0, 1.0, 1.0), 0.01) == 1  # two cells are left over
+    assert colour_fraction(sheet[48:, 96:], (1.0, 1.0, 1.0), 0.01) == 1  # two empty cells
 
 
-def test_all_views_in_one_picture(scene, tmp_path):
-    sheet = picture(scene, tmp_path / "all.png", view="all")
+def test_all_views_in_one_image(scene, tmp_path):
+    sheet = render_image(scene, tmp_path / "all.png", view="all")
     assert sheet.shape == (2 * 64, 3 * 64, 3)
-    small = picture(scene, tmp_path / "all.jpg", view="all")
+    small = render_image(scene, tmp_path / "all.jpg", view="all")
     assert small.shape == sheet.shape and (small - sheet).abs().mean() < 0.02
-    one = picture(scene, tmp_path / "one.png", view="input:4", resolution=64)
+    one = render_image(scene, tmp_path / "one.png", view="input:4", resolution=64)
     assert torch.equal(sheet[64:, 64:128], one)
     assert run(scene, None, render_options(view="all")).name == "scene_all.png"
 
 
-def test_a_film_of_all_views_and_one_along_a_path(trajectory, tmp_path, two_balls):
+def test_video_of_all_views_and_along_a_path(trajectory, tmp_path, two_balls):
     frames = list(read_video(run(trajectory, None, render_options(view="all"))))
     assert len(frames) == 6 and frames[0].shape == (2 * 64, 3 * 64, 3)
     K = [[90.0, 0, 32], [0, 90, 24], [0, 0, 1]]
@@ -96,107 +98,107 @@ def test_a_film_of_all_views_and_one_along_a_path(trajectory, tmp_path, two_ball
     out = run(trajectory, None, render_options(view=str(tmp_path / "walk.json")))
     frames = list(read_video(out))
     assert out.name == "traj_walk.mp4" and frames[0].shape == (72, 96, 3)
-    assert (frames[0] - frames[5]).abs().mean() > 0.02  # seen from elsewhere
+    assert (frames[0] - frames[5]).abs().mean() > 0.02  # another viewpoint
 
 
 @pytest.mark.parametrize("view", ["novel", "orbit"])
-def test_a_scene_without_cameras_or_objects_can_be_filmed(tmp_path, two_balls, view):
+def test_scene_without_cameras_or_objects(tmp_path, two_balls, view):
     g = two_balls.gaussians
     plain = replace(two_balls, gaussians=replace(g, object_id=g.object_id * 0), objects=(), cameras=None, floor=None)
     write_scene(tmp_path / "plain.ply", plain)
-    image = picture(tmp_path / "plain.ply", tmp_path / "p.png", view=view)
-    assert share(image, RED) > 0.002 and share(image, GREEN) > 0.002
+    image = render_image(tmp_path / "plain.ply", tmp_path / "p.png", view=view)
+    assert colour_fraction(image, RED) > 0.002 and colour_fraction(image, GREEN) > 0.002
 
 
-def test_backgrounds_replace_the_surroundings_of_the_objects(scene, tmp_path, two_balls):
+def test_background_option_replaces_the_background(scene, tmp_path, two_balls):
     blue = (0.2, 0.4, 0.6)
-    own = picture(scene, tmp_path / "own.png", view="input:0")
-    plain = picture(scene, tmp_path / "plain.png", view="input:0", background="#336699")
-    assert share(plain, blue, 0.01) > 0.6 and share(own, blue) == 0
-    assert share(plain, RED) > 0.03 and share(own, RED) > 0.03
+    own = render_image(scene, tmp_path / "own.png", view="input:0")
+    plain = render_image(scene, tmp_path / "plain.png", view="input:0", background="#336699")
+    assert colour_fraction(plain, blue, 0.01) > 0.6 and colour_fraction(own, blue) == 0
+    assert colour_fraction(plain, RED) > 0.03 and colour_fraction(own, RED) > 0.03
     photo = torch.zeros(40, 80, 3)
     photo[:, 40:] = 1.0
     write_png(tmp_path / "photo.png", photo)
-    behind = picture(scene, tmp_path / "c.png", view="input:0", background=str(tmp_path / "photo.png"))
-    assert share(behind[:, :20], (0.0, 0.0, 0.0), 0.01) > 0.9 and share(behind[:, -20:], (1.0, 1.0, 1.0), 0.01) > 0.9
+    behind = render_image(scene, tmp_path / "c.png", view="input:0", background=str(tmp_path / "photo.png"))
+    assert colour_fraction(behind[:, :20], (0.0, 0.0, 0.0), 0.01) > 0.9 and colour_fraction(behind[:, -20:], (1.0, 1.0, 1.0), 0.01) > 0.9
     g = two_balls.gaussians
     floor = replace(g, sh=torch.full_like(g.sh, 10.0))[g.object_id == 0]  # white
     write_scene(tmp_path / "floor.ply", replace(two_balls, gaussians=floor, objects=()))
-    other = picture(scene, tmp_path / "o.png", view="input:0", background=str(tmp_path / "floor.ply"))
-    assert share(other, (1.0, 1.0, 1.0), 0.1) > 0.6 and share(other, RED) > 0.005
+    other = render_image(scene, tmp_path / "o.png", view="input:0", background=str(tmp_path / "floor.ply"))
+    assert colour_fraction(other, (1.0, 1.0, 1.0), 0.1) > 0.6 and colour_fraction(other, RED) > 0.005
 
 
-def test_where_there_is_nothing_the_scene_says_what_to_show(tmp_path, two_balls):
+def test_empty_pixels_have_the_background_colour_of_the_scene(tmp_path, two_balls):
     blue, alone = (0.2, 0.4, 0.6), two_balls.gaussians[two_balls.gaussians.object_id > 0]
     for background, colour in ((blue, blue), (None, (1.0, 1.0, 1.0))):
         write_scene(tmp_path / "s.ply", replace(two_balls, gaussians=alone, background=background))
-        assert share(picture(tmp_path / "s.ply", tmp_path / "s.png", view="input:0"), colour, 0.01) > 0.6
+        assert colour_fraction(render_image(tmp_path / "s.ply", tmp_path / "s.png", view="input:0"), colour, 0.01) > 0.6
 
 
-def test_ids_are_flat_and_keep_their_colours(scene, tmp_path):
-    image = picture(scene, tmp_path / "ids.png", view="input:0", ids=True)
+def test_ids_have_flat_and_constant_colours(scene, tmp_path):
+    image = render_image(scene, tmp_path / "ids.png", view="input:0", ids=True)
     first, second = object_colours(torch.tensor([1, 2]))
-    assert share(image, first, 0.05) > 0.005 and share(image, second, 0.05) > 0.005
+    assert colour_fraction(image, first, 0.05) > 0.005 and colour_fraction(image, second, 0.05) > 0.005
     many = object_colours(torch.arange(1, 13))
     assert (torch.cdist(many, many) + torch.eye(12)).min() > 0.12
     assert torch.equal(object_colours(torch.tensor([9, 2]))[1], second)
 
 
-def test_depth_is_metric_in_a_png_and_coloured_in_a_film(scene, trajectory, tmp_path):
+def test_depth_is_in_units_in_a_png_and_colour_coded_in_a_video(scene, trajectory, tmp_path):
     run(scene, tmp_path / "d.png", render_options(view="input:0", depth=True))
     depth = read_labels(tmp_path / "d.png").float() / 1000
     assert cv2.imread(str(tmp_path / "d.png"), cv2.IMREAD_UNCHANGED).dtype == "uint16"
-    assert float(depth[48, 48]) == pytest.approx(2.0, abs=0.25)  # the camera is 2 from the point it aims at
+    assert float(depth[48, 48]) == pytest.approx(2.0, abs=0.25)  # the distance of the camera from its target
     assert json.loads((tmp_path / "d.png.json").read_text())["depth_unit"] == 1e-3
     out = run(trajectory, None, render_options(depth=True))
     facts = json.loads(out.with_name(out.name + ".json").read_text())
     assert out.name == "traj_novel_depth.mp4" and 0.5 < facts["depth_near"] < facts["depth_far"] < 5
 
 
-def test_depth_colours_go_from_bright_to_dark():
+def test_depth_colours_darken_with_distance():
     image = colour_depth(torch.tensor([[1.0, 2.0, 3.0, 0.0]]), depth_range([torch.tensor([[1.0, 3.0]])]))
     light = image.sum(-1)[0]
     assert light[0] > light[1] > light[2] > light[3] == 0
 
 
-def test_arrows_are_drawn_while_a_force_acts(trajectory, tmp_path):
+def test_arrows_are_drawn_while_a_force_is_active(trajectory, tmp_path):
     orange = torch.tensor([1.0, 122 / 255, 20 / 255])
     for frame, there in ((0, True), (5, False)):
-        plain = picture(trajectory, tmp_path / "a.png", view="input:0", frame=frame)
-        drawn = picture(trajectory, tmp_path / "b.png", view="input:0", frame=frame, show_forces=True)
-        assert (share(drawn, orange, 0.1) > 0.001) == there and torch.equal(plain, drawn) != there
+        plain = render_image(trajectory, tmp_path / "a.png", view="input:0", frame=frame)
+        drawn = render_image(trajectory, tmp_path / "b.png", view="input:0", frame=frame, show_forces=True)
+        assert (colour_fraction(drawn, orange, 0.1) > 0.001) == there and torch.equal(plain, drawn) != there
 
 
-def test_tiles_of_different_shape_stand_in_the_middle():
+def test_smaller_tiles_are_centred():
     sheet = tile_images([torch.zeros(4, 4, 3), torch.zeros(2, 4, 3)], 2)
     assert sheet.shape == (4, 8, 3)
     assert sheet[:, 4:, 0].tolist() == [[1] * 4, [0] * 4, [0] * 4, [1] * 4]
 
 
-def test_a_film_of_given_rate_keeps_its_speed(trajectory, tmp_path):
+def test_fps_option_keeps_the_speed_of_motion(trajectory, tmp_path):
     out = run(trajectory, tmp_path / "slow.mp4", render_options(fps=25.0))
     with av.open(str(out)) as file:
         assert (file.streams.video[0].frames, file.streams.video[0].average_rate) == (3, 25)
 
 
 @pytest.mark.parametrize(
-    ("choices", "says"),
-    [({"view": "sideways"}, "choose from novel"), ({"view": "input:"}, "which camera"), ({"resolution": 4}, "16 to"),
-     ({"fps": 0.0}, "--fps"), ({"depth": True, "ids": True}, "choose one"), ({"background": "#12"}, "#rrggbb")],
+    ("choices", "message"),
+    [({"view": "sideways"}, "choose from novel"), ({"view": "input:"}, "name the camera"), ({"resolution": 4}, "16 to"),
+     ({"fps": 0.0}, "--fps"), ({"depth": True, "ids": True}, "only one"), ({"background": "#12"}, "#rrggbb")],
 )  # fmt: skip
-def test_options_that_cannot_be(choices, says):
-    with pytest.raises(InputError, match=says):
+def test_invalid_options(choices, message):
+    with pytest.raises(InputError, match=message):
         RenderOptions(**choices)
 
 
 @pytest.mark.parametrize(
-    ("out", "choices", "says"),
-    [("a.gif", {}, r"\.mp4, \.png or \.jpg"), ("a.png", {"view": "input:99"}, "cameras 0 to 5"),
+    ("out", "choices", "message"),
+    [("a.gif", {}, r"use \.mp4, \.jpg, \.png"), ("a.png", {"view": "input:99"}, "cameras 0 to 5"),
      ("a.png", {"view": "nowhere.json"}, "no such file"), ("a.png", {"frame": 1}, "has no frames"),
      ("a.png", {"background": "x.txt"}, "give a scene.ply, a colour"), ("no/a.png", {}, "there is no folder"),
      ("no/a.mp4", {}, "there is no folder")],
 )  # fmt: skip
-def test_a_mistake_is_told_in_one_sentence_and_leaves_nothing(scene, tmp_path, out, choices, says):
-    with pytest.raises(InputError, match=says) as caught:
+def test_wrong_inputs_give_one_line_and_write_nothing(scene, tmp_path, out, choices, message):
+    with pytest.raises(InputError, match=message) as caught:
         run(scene, tmp_path / out, render_options(**choices))
     assert not re.search("\n", str(caught.value)) and [p.name for p in tmp_path.iterdir()] == ["scene.ply"]

@@ -1,8 +1,8 @@
-"""Keypoint motion carried to Gaussians: where they go, how they turn and stretch.
+"""Linear blend skinning of Gaussians by keypoints: new means, orientations and scales.
 
-A Gaussian at X follows keypoints X_j with displacement u_j and displacement gradient G_j (F_j = I + G_j):
+A Gaussian at X is bound to keypoints X_j with displacement u_j and displacement gradient G_j (F_j = I + G_j):
     x = X + sum w_j (u_j + G_j (X - X_j)),    F = I + sum w_j G_j,    covariance -> F covariance F^T.
-Gaussians whose G is exactly zero keep their quats and scales bit by bit.
+Gaussians whose G is exactly zero keep their quats and scales bit for bit.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from stages.core.kernels.threads import run_parallel
 def _rotation_of(F: wp.mat33) -> wp.mat33:
     """Polar factor of F with determinant +1.
 
-    Newton's iteration R <- (R + R^-T) / 2 (Higham 1986) doubles the digits in each step; a body turned inside out or
-    flattened takes the singular value decomposition.
+    Newton's iteration R <- (R + R^-T) / 2 (Higham 1986) converges quadratically; inverted and nearly singular F use
+    the singular value decomposition.
     """
     if wp.determinant(F) > 1.0e-3:
         R = F
@@ -40,8 +40,8 @@ def _rotation_of(F: wp.mat33) -> wp.mat33:
 
 
 @wp.func
-def _turn_apart(M: wp.mat33, p: int, q: int) -> wp.mat33:
-    """Columns p and q of M turned into each other until they are orthogonal."""
+def _orthogonalise(M: wp.mat33, p: int, q: int) -> wp.mat33:
+    """Rotate columns p and q of M in their plane until they are orthogonal (one Jacobi rotation)."""
     a = wp.vec3(M[0, p], M[1, p], M[2, p])
     b = wp.vec3(M[0, q], M[1, q], M[2, q])
     along = wp.dot(a, b)
@@ -60,21 +60,21 @@ def _turn_apart(M: wp.mat33, p: int, q: int) -> wp.mat33:
 
 @wp.func
 def _axes(M: wp.mat33) -> wp.mat33:
-    """Columns: the principal axes of the ellipsoid that M makes of a ball, as long as they are.
+    """Semi-axes (columns) of the ellipsoid that M makes of the unit ball.
 
-    One-sided Jacobi (Hestenes 1958): two or three sweeps when M is nearly a rotation of an ellipsoid's axes, and the
-    thin axis of a flat one comes out as accurately as the long ones. wp.svd3 is off by up to 1e-3 now and then.
+    One-sided Jacobi (Hestenes 1958): two or three sweeps when M is close to rotated semi-axes, and a short axis is as
+    accurate as the long ones. wp.svd3 has errors of up to 1e-3.
     """
     for _ in range(8):
         before = M
-        M = _turn_apart(_turn_apart(_turn_apart(M, 0, 1), 0, 2), 1, 2)
+        M = _orthogonalise(_orthogonalise(_orthogonalise(M, 0, 1), 0, 2), 1, 2)
         if before == M:
             break
     return M
 
 
 @wp.kernel
-def _blend(
+def _skin(
     start: int, index: wp.array2d[wp.int32], weight: wp.array2d[float],
     rest: wp.array[wp.vec3], displacement: wp.array[wp.vec3], gradient: wp.array[wp.mat33],
     means: wp.array[wp.vec3], quats: wp.array[wp.vec4], scales: wp.array[wp.vec3],
@@ -113,8 +113,8 @@ def _blend(
         y = wp.cross(z, x)
     x = wp.normalize(x)
     y = wp.normalize(y - wp.dot(x, y) * x)
-    turned = wp.quat_from_matrix(wp.matrix_from_cols(x, y, wp.cross(x, y)))
-    new_quats[i] = wp.normalize(wp.vec4(turned[3], turned[0], turned[1], turned[2]))
+    rotated = wp.quat_from_matrix(wp.matrix_from_cols(x, y, wp.cross(x, y)))
+    new_quats[i] = wp.normalize(wp.vec4(rotated[3], rotated[0], rotated[1], rotated[2]))
     rotation[i] = _rotation_of(F)
 
 
@@ -122,9 +122,10 @@ def skin_gaussians(
     index: Tensor, weight: Tensor, rest: Tensor, displacement: Tensor, gradient: Tensor,
     means: Tensor, quats: Tensor, scales: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
-    """Moved means (n, 3), quats (n, 4), scales (n, 3) and rotations (n, 3, 3) of Gaussians.
+    """Deformed means (n, 3) [m], quats (n, 4), scales (n, 3) [m] and rotations (n, 3, 3) of Gaussians.
 
-    index (n, j) int32 with -1 for none, weight (n, j); rest, displacement (p, 3) and gradient (p, 3, 3) of keypoints.
+    index (n, j): keypoints of each Gaussian, int32, -1 for none; weight (n, j); rest, displacement (p, 3) [m] and
+    displacement gradient (p, 3, 3) of the keypoints.
     """
     n, device = len(means), device_of(means)
     out = [torch.empty_like(means), torch.empty_like(quats), torch.empty_like(scales), means.new_empty(n, 3, 3)]
@@ -134,10 +135,10 @@ def skin_gaussians(
     ]  # fmt: skip
     outputs = [view(out[0], wp.vec3), view(out[1], wp.vec4), view(out[2], wp.vec3), view(out[3], wp.mat33)]
     if device != "cpu":
-        launch(_blend, n, [0, *inputs], outputs, device)
+        launch(_skin, n, [0, *inputs], outputs, device)
         return tuple(out)
     halves = [
-        wp.launch(_blend, b - a, [a, *inputs], outputs, device=device, record_cmd=True, record_tape=False)
+        wp.launch(_skin, b - a, [a, *inputs], outputs, device=device, record_cmd=True, record_tape=False)
         for a, b in ((0, n // 2), (n // 2, n)) if b > a
     ]  # fmt: skip
     run_parallel([half.launch for half in halves])
@@ -148,7 +149,7 @@ def skin_gaussians_reference(
     index: Tensor, weight: Tensor, rest: Tensor, displacement: Tensor, gradient: Tensor,
     means: Tensor, quats: Tensor, scales: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
-    """The same in PyTorch."""
+    """`skin_gaussians` in PyTorch, in any precision."""
     w = torch.where(index >= 0, weight, 0)
     k = index.clamp_min(0).long()
     G = (w[..., None, None] * gradient[k]).sum(1)

@@ -1,1 +1,1 @@
-"""Gaussians and cameras to images, one interface on every device."""
+"""Rasterisation of Gaussians to images, with one interface on all devices."""

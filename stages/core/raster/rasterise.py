@@ -1,6 +1,6 @@
-"""Images of Gaussians: gsplat on CUDA, our own kernels elsewhere, behind one interface with the same conventions.
+"""Rasterisation of Gaussians: gsplat on CUDA, `stages.core.kernels.splat` elsewhere, with the same conventions.
 
-Pixel centres at +0.5, 0.3 px^2 of blur, splats in order of camera depth, alpha from 1/255 to 0.999, a pixel finished at
+Pixel centres at +0.5, 0.3 px^2 of blur, splats sorted by camera depth, alpha from 1/255 to 0.999, a pixel finished at
 a transmittance of 1e-4. Gradients reach means, quats, scales, opacities, sh and features, not cameras or background.
 """
 
@@ -22,22 +22,23 @@ from stages.core.scene.gaussians import Gaussians
 
 @dataclass(frozen=True)
 class Rendering:
-    """Images of c cameras, and what growing and pruning of Gaussians goes by."""
+    """Images of c cameras, and image-space quantities for densification and pruning of the n Gaussians."""
 
     rgb: Float[Tensor, "c h w 3"]
     alpha: Float[Tensor, "c h w"]
-    depth: Float[Tensor, "c h w"]  # along the viewing axis [m], mean over what is seen; 0 where nothing is
-    extents: Float[Tensor, "c n 2"]  # half width and height on the image [px]; 0: not in view
-    pulls: tuple[Callable[[], list[Tensor]], ...]  # one a camera; known after backward()
+    depth: Float[Tensor, "c h w"]  # along the viewing axis [m], alpha-weighted mean; 0 where alpha is 0
+    extents: Float[Tensor, "c n 2"]  # half width and height on the image [px]; 0: not visible
+    absgrad_getters: tuple[Callable[[], list[Tensor]], ...]  # one per camera; empty lists before backward()
 
     @property
     def visible(self) -> Bool[Tensor, "c n"]:
+        """Whether a Gaussian overlaps the image with at least the minimum alpha."""
         return self.extents[..., 0] > 0
 
     @property
     def absgrad(self) -> Float[Tensor, "c n 2"]:
-        """After backward(), for every Gaussian the sum over pixels of |dL / d centre on the image| [1/px]."""
-        return _stack([sum(pull(), torch.zeros_like(self.extents[0])) for pull in self.pulls])
+        """Sum over pixels of |dL / d image centre| [1/px] of each Gaussian, after backward(); 0 before."""
+        return _stack([sum(get(), torch.zeros_like(self.extents[0])) for get in self.absgrad_getters])
 
 
 def rasterise(
@@ -49,14 +50,14 @@ def rasterise(
     background: Float[Tensor, "3"] | Float[Tensor, "h w 3"] | None = None,
     near: float = 0.01,
 ) -> Rendering:
-    """Draw the Gaussians in each of one or more cameras, before a background colour or picture (black when None).
+    """Render Gaussians in one or more cameras over a background colour or image (black when None).
 
-    Gaussians nearer than `near` [m] to a camera's plane are left out.
+    Width and height are in pixels. Gaussians with a camera depth below `near` [m] are left out.
     """
     draw = _draw_cuda if gaussians.means.is_cuda else _draw
     views = [draw(gaussians, V, K, width, height, background, near) for V, K in zip(viewmats, Ks, strict=True)]
-    *images, pulls = zip(*views, strict=True)
-    return Rendering(*(_stack(image) for image in images), pulls)
+    *images, getters = zip(*views, strict=True)
+    return Rendering(*(_stack(image) for image in images), getters)
 
 
 def rasterise_features(
@@ -68,7 +69,7 @@ def rasterise_features(
     height: int,
     near: float = 0.01,
 ) -> Float[Tensor, "c h w f"]:
-    """Composite any numbers per Gaussian as if they were colours: sum of w times feature. Differentiable."""
+    """Composite feature vectors of the Gaussians like colours, over 0: sum of weight x feature. Differentiable."""
     draw = _features_cuda if gaussians.means.is_cuda else _features
     return _stack([draw(gaussians, features, V, K, width, height, near) for V, K in zip(viewmats, Ks, strict=True)])
 
@@ -82,7 +83,7 @@ def visibility(
     height: int,
     near: float = 0.01,
 ) -> tuple[Int[Tensor, "h w"], Float[Tensor, "n"]]:
-    """For every pixel the Gaussian that weighs most (-1: none), for every Gaussian its weight over all pixels [px]."""
+    """The Gaussian with the largest weight in each pixel (-1: none), and each Gaussian's total weight [px]."""
     if gaussians.means.is_cuda:
         return _visibility_cuda(gaussians, viewmat, K, width, height, near)
     return dominant_splats(*_splats(gaussians, viewmat, K, width, height, near))
@@ -100,17 +101,17 @@ def _splats(g: Gaussians, viewmat: Tensor, K: Tensor, width: int, height: int, n
 
 
 def _draw(g: Gaussians, viewmat: Tensor, K: Tensor, width: int, height: int, background: Tensor | None, near: float):
-    """Image, alpha, depth, extents, and a list for the absolute gradients, of one view."""
+    """Image, alpha, depth, extents of one view, and a getter of its absolute gradients."""
     splats, bins = _splats(g, viewmat, K, width, height, near)
-    pull: list[Tensor] = []
+    absgrad: list[Tensor] = []
     if splats.requires_grad:
-        splats.register_hook(lambda grad: pull.append(grad[:, 10:12]))
+        splats.register_hook(lambda grad: absgrad.append(grad[:, 10:12]))
     rgb, depth, alpha = composite(splats, bins, None if background is None else background.detach(), mean=True)
-    return rgb, alpha, depth, splats.detach()[:, 11:13], lambda: pull
+    return rgb, alpha, depth, splats.detach()[:, 11:13], lambda: absgrad
 
 
 def _features(g: Gaussians, features: Tensor, viewmat: Tensor, K: Tensor, width: int, height: int, near: float):
-    """Four features at a time in the place of colour and depth."""
+    """Composite four features at a time in the columns of colour and depth."""
     splats, bins = _splats(g, viewmat, K, width, height, near)
     count = features.shape[1]
     padded = torch.nn.functional.pad(features.float(), (0, -count % 4))
@@ -139,10 +140,10 @@ def _draw_cuda(
     if background is not None:
         rgb = rgb + (1 - alpha)[..., None] * background.detach().to(rgb)
 
-    def pulls() -> list[Tensor]:  # asked for, not hooked: a hook on what it holds would keep all of a step for ever
+    def absgrad() -> list[Tensor]:  # no hook: a hook that holds its own tensor would never be freed
         return [centres.absgrad[0]] if hasattr(centres, "absgrad") else []
 
-    return rgb, alpha, image[0, ..., 3], info["radii"][0].float(), pulls
+    return rgb, alpha, image[0, ..., 3], info["radii"][0].float(), absgrad
 
 
 def _features_cuda(g: Gaussians, features: Tensor, viewmat: Tensor, K: Tensor, width: int, height: int, near: float):
@@ -156,7 +157,7 @@ def _features_cuda(g: Gaussians, features: Tensor, viewmat: Tensor, K: Tensor, w
 
 
 def _visibility_cuda(g: Gaussians, viewmat: Tensor, K: Tensor, width: int, height: int, near: float):
-    """gsplat's splats and bins, walked by our kernel: gsplat itself does not say which splat weighs most."""
+    """Visibility from gsplat's projection and binning; gsplat does not return the dominant splat of a pixel."""
     import gsplat
 
     from stages.core.kernels.splat.compositing_pixel import composite_pixelwise

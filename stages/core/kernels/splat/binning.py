@@ -1,7 +1,7 @@
-"""Which splats touch which bin of the image, nearest first.
+"""Binning: the splats that overlap each bin of the image, sorted by depth.
 
-The splats are sorted by depth once; walking them in that order and appending each to the bins it touches leaves every
-bin sorted. That is far less to sort than a key for each pair of splat and bin.
+The splats are sorted by depth once and appended in that order to the bins that they overlap, which leaves every bin
+sorted: fewer keys than one for each pair of splat and bin.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ for (int pass = 0; pass < 3; ++pass) {
 total.data[0] = m;
 """
 
-# Every piece counts its own stretch of the order, so that later each knows where in a bin it writes.
+# Counting pass: each part counts its range of the order, which gives its write position in every bin.
 _COUNT = r"""
 int* count = counts.data + (long)piece * bins;
 for (int b = 0; b < bins; ++b) count[b] = 0;
@@ -57,6 +57,7 @@ for (int i = bounds.data[piece]; i < bounds.data[piece + 1]; ++i) {
 }
 """
 
+# Filling pass: each part appends its range to the bins.
 _FILL = r"""
 int* at = counts.data + (long)piece * bins;
 for (int i = bounds.data[piece]; i < bounds.data[piece + 1]; ++i) {
@@ -112,7 +113,7 @@ def _fill(
 
 @dataclass(frozen=True)
 class Bins:
-    """The splats of every bin of side x side pixels, row by row, nearest first."""
+    """The splats of each bin of side x side pixels, nearest first; bins are numbered row by row."""
 
     members: Tensor  # (m,) int32, indices of splats
     starts: Tensor  # (bins + 1,) int32, bin b holds members[starts[b]:starts[b + 1]]
@@ -122,10 +123,11 @@ class Bins:
 
     @property
     def columns(self) -> int:
+        """Number of bins in a row."""
         return -(-self.width // self.side)
 
     def balanced_bounds(self, count: int, work: Tensor | None = None) -> list[int]:
-        """Bounds of at most that many runs of bins with about equal work, by default the number of members."""
+        """Bounds of at most `count` ranges of bins with about equal work (bins,), by default the number of members."""
         work = self.starts.diff() if work is None else work
         total = (work + 1).cumsum(0).double()
         cuts = torch.searchsorted(total, total[-1] * torch.arange(1, count) / count)
@@ -133,7 +135,7 @@ class Bins:
 
 
 def bin_splats(keys: Tensor, rects: Tensor, width: int, height: int, side: int = BIN_SIZE) -> Bins:
-    """Bins of splats from the keys and rectangles that `project` returns, or rectangles in bins of another side."""
+    """Sort splats into bins of `side` pixels, by sort keys (n,) and bin rectangles (n, 4) as `project` returns them."""
     n, across, down = len(keys), -(-width // side), -(-height // side)
     bins = across * down
     order, scratch = torch.empty(n, dtype=torch.int32), torch.empty(3 * n, dtype=torch.int32)
@@ -143,17 +145,17 @@ def bin_splats(keys: Tensor, rects: Tensor, width: int, height: int, side: int =
     pieces = num_threads()
     bounds = torch.tensor(even_bounds(int(total), pieces), dtype=torch.int32)
     counts = torch.empty(pieces, bins, dtype=torch.int32)
-    walk = [view(bounds), view(order), view(rects.view(-1)), across, bins, view(counts.view(-1))]
-    launch_ranges(_count, list(range(pieces + 1)), walk)
+    arguments = [view(bounds), view(order), view(rects.view(-1)), across, bins, view(counts.view(-1))]
+    launch_ranges(_count, list(range(pieces + 1)), arguments)
     ends = counts.T.reshape(-1).cumsum(0, dtype=torch.int32)  # bin by bin, within it piece by piece
     starts = torch.cat([ends.new_zeros(1), ends[pieces - 1 :: pieces]])
     counts.copy_((ends - counts.T.reshape(-1)).view(bins, pieces).T)
     members = torch.empty(int(ends[-1]), dtype=torch.int32)
-    launch_ranges(_fill, list(range(pieces + 1)), [*walk, view(members)])
+    launch_ranges(_fill, list(range(pieces + 1)), [*arguments, view(members)])
     return Bins(members, starts, width, height, side)
 
 
 def depth_order_reference(splats: Tensor) -> Tensor:
-    """Indices of all visible splats, nearest first: what one bin over the whole image would hold."""
+    """Indices of all visible splats, nearest first: the members of a single bin over the whole image."""
     visible = (splats[:, 11] > 0).nonzero()[:, 0]
     return visible[splats[visible, 9].argsort(stable=True)]

@@ -1,7 +1,7 @@
-"""Compositing of binned splats, front to back, sixteen pixels (4 x 4) at a time.
+"""Front-to-back compositing of binned splats, 16 pixels (4 x 4) at a time, on the CPU.
 
-The bin's 64 blocks of pixels keep their state in the first-level cache while the bin's splats pass by once. A 64-bit
-mask says which blocks a splat can reach and which still let light through, so neither costs more than a bit.
+The state of a bin's 64 blocks of pixels stays in the first-level cache during one pass over the bin's splats. 64-bit
+masks hold the blocks that a splat overlaps and the blocks that are not yet finished.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ TRACK(F best[BLOCKS]; I which[BLOCKS]; float* total = totals.data + (long)piece 
 unsigned long long alive = 0;
 for (int b = 0; b < BLOCKS; ++b) {
     I in = inside(b);
-    T[b] = in ? (F)(1.0f) : (F)(-1.0f);  // negative: finished
+    T[b] = in ? (F)(1.0f) : (F)(-1.0f);  // negative: pixel finished
     for (int c = 0; c < 4; ++c) colour[b][c] = none;
     TRACK(best[b] = none; which[b] = (I)(-1);)
     stop[b] = (I)(0x7fffffff);
@@ -46,7 +46,7 @@ for (const int end = starts.data[bin + 1]; k < end && alive; ++k) {
     const float x = s[0] - X, y = s[1] - Y;
     const float A = -0.721347520f * s[2], B = -1.44269504f * s[3], C = -0.721347520f * s[4], lo = s[10];
     TRACK(F sum = none;)
-    for (unsigned long long todo = alive & reached(x, y, s[11], s[12]); todo; todo &= todo - 1) {
+    for (unsigned long long todo = alive & overlapped(x, y, s[11], s[12]); todo; todo &= todo - 1) {
         const int b = __builtin_ctzll(todo);
         F dx = lx + (4 * (b & 7) - x), dy = ly + (4 * (b >> 3) - y);
         F power = fma(dx, fma((F)(A), dx, B * dy), fma(C * dy, dy, (F)(lo)));  // log2 of alpha
@@ -93,12 +93,12 @@ for _name, _value in (
 
 
 def _tracked(code: str, track: bool) -> str:
-    """The forward snippet with or without the lines that look for the heaviest splat."""
+    """The forward snippet with or without the lines that track the dominant splat of each pixel."""
     return f"#define TRACK(...) {'__VA_ARGS__' if track else ''}\n{code}\n#undef TRACK\n"
 
 
 @wp.func_native(_tracked(VECTORS + BIN_BLOCKS + _FORWARD, False))
-def _blend_bin(
+def _composite_bin(
     bin: int, width: int, height: int, across: int, step: int, mean: int, splats: wp.array[float],
     members: wp.array[int], starts: wp.array[int], behind: wp.array[float], left: wp.array[float],
     stops: wp.array[int], ends: wp.array[int], rgb: wp.array[float], fourth: wp.array[float], alphas: wp.array[float],
@@ -106,18 +106,18 @@ def _blend_bin(
 
 
 @wp.kernel
-def _blend(
+def _composite(
     start: int, piece: int, n: int, width: int, height: int, across: int, step: int, mean: int,
     splats: wp.array[float], members: wp.array[int], starts: wp.array[int], behind: wp.array[float],
     left: wp.array[float], stops: wp.array[int], ends: wp.array[int],
     rgb: wp.array[float], fourth: wp.array[float], alphas: wp.array[float],
 ):  # fmt: skip
-    _blend_bin(start + wp.tid(), width, height, across, step, mean, splats, members, starts, behind,
-               left, stops, ends, rgb, fourth, alphas)  # fmt: skip
+    _composite_bin(start + wp.tid(), width, height, across, step, mean, splats, members, starts, behind,
+                   left, stops, ends, rgb, fourth, alphas)  # fmt: skip
 
 
 @wp.func_native(_tracked(VECTORS + BIN_BLOCKS + _FORWARD, True))
-def _heaviest_bin(
+def _dominant_bin(
     bin: int, piece: int, n: int, width: int, height: int, across: int, step: int, mean: int, splats: wp.array[float],
     members: wp.array[int], starts: wp.array[int], behind: wp.array[float], left: wp.array[float],
     stops: wp.array[int], ends: wp.array[int], rgb: wp.array[float], fourth: wp.array[float], alphas: wp.array[float],
@@ -126,38 +126,39 @@ def _heaviest_bin(
 
 
 @wp.kernel
-def _heaviest(
+def _dominant(
     start: int, piece: int, n: int, width: int, height: int, across: int, step: int, mean: int,
     splats: wp.array[float], members: wp.array[int], starts: wp.array[int], behind: wp.array[float],
     left: wp.array[float], stops: wp.array[int], ends: wp.array[int],
     rgb: wp.array[float], fourth: wp.array[float], alphas: wp.array[float],
     index: wp.array[int], totals: wp.array[float],
 ):  # fmt: skip
-    _heaviest_bin(start + wp.tid(), piece, n, width, height, across, step, mean, splats, members, starts, behind,
+    _dominant_bin(start + wp.tid(), piece, n, width, height, across, step, mean, splats, members, starts, behind,
                   left, stops, ends, rgb, fourth, alphas, index, totals)  # fmt: skip
 
 
 def _outputs(bins: Bins) -> tuple[Tensor, ...]:
-    """Empty tensors for what a forward pass leaves for the backward pass, and for its images."""
+    """Empty tensors: saved state of a forward pass (transmittance, stops, ends) and its images (rgb, fourth, alpha)."""
     count, size = len(bins.starts) - 1, (bins.height, bins.width)
     left, stops = torch.empty(count * PIXELS_PER_BIN), torch.empty(count * PIXELS_PER_BIN, dtype=torch.int32)
     ends = torch.empty(count, dtype=torch.int32)
     return left, stops, ends, torch.empty(*size, 3), torch.empty(size), torch.empty(size)
 
 
-def _walk(splats: Tensor, bins: Bins, behind: Tensor, mean: bool, *tensors: Tensor) -> list:
-    """Kernel arguments from the number of splats on."""
+def _arguments(splats: Tensor, bins: Bins, behind: Tensor, mean: bool, *tensors: Tensor) -> list:
+    """Kernel arguments, from the number of splats on."""
     flat = (splats, bins.members, bins.starts, behind, *tensors)
     step = 0 if behind.dim() == 1 else 3
     views = (view(t.view(-1)) for t in flat)
     return [len(splats), bins.width, bins.height, bins.columns, step, int(mean), *views]
 
 
-class _Blend(torch.autograd.Function):
+class _Composite(torch.autograd.Function):
     @staticmethod
     def forward(ctx, splats, bins, behind, mean):
         state = _outputs(bins)
-        launch_ranges(_blend, bins.balanced_bounds(4 * num_threads()), _walk(splats, bins, behind, mean, *state))
+        bounds = bins.balanced_bounds(4 * num_threads())
+        launch_ranges(_composite, bounds, _arguments(splats, bins, behind, mean, *state))
         left, stops, ends, rgb, fourth, alpha = state
         ctx.save_for_backward(splats, behind, left, stops, ends, fourth, alpha)
         ctx.bins, ctx.mean = bins, mean
@@ -167,38 +168,38 @@ class _Blend(torch.autograd.Function):
     def backward(ctx, *upstream):
         splats, behind, *state = ctx.saved_tensors
         upstream = [v.float().contiguous() for v in upstream]
-        walk = _walk(splats, ctx.bins, behind, ctx.mean, *state, *upstream)
-        grads = composite_adjoint(splats, ctx.bins, state[2], walk)
+        arguments = _arguments(splats, ctx.bins, behind, ctx.mean, *state, *upstream)
+        grads = composite_adjoint(splats, ctx.bins, state[2], arguments)
         return grads, None, None, None
 
 
 def composite(splats: Tensor, bins: Bins, behind: Tensor | None = None, mean: bool = False):
-    """Image (h, w, 3), fourth channel (h, w) and alpha (h, w) of splats (n, 16). Differentiable in the splats.
+    """Composite splats (n, 16): image (h, w, 3), fourth channel (h, w) and alpha (h, w). Differentiable in the splats.
 
-    `behind` is a background colour (3,) or picture (h, w, 3), black when None. The fourth channel is a composite like
-    the others or, with `mean`, the mean over what is seen. In the splats' gradient, columns 10 and 11 hold the sums
-    over pixels of the absolute gradients of the centre, which densification wants: the plain ones cancel where a
-    splat is too large for the detail it covers.
+    `behind` is a background colour (3,) or image (h, w, 3), black when None. The fourth channel is composited like the
+    others or, with `mean`, divided by alpha. In the splats' gradient, columns 10 and 11 hold the sums over pixels of
+    the absolute gradients of the centre, for densification: the signed ones cancel where a splat is larger than the
+    detail it covers.
     Source: Kerbl et al. 2023; Ye et al. 2024, "AbsGS", eq. 8.
     """
     behind = torch.zeros(3) if behind is None else behind.float().contiguous()
-    return _Blend.apply(splats.contiguous(), bins, behind, mean)
+    return _Composite.apply(splats.contiguous(), bins, behind, mean)
 
 
 def dominant_splats(splats: Tensor, bins: Bins) -> tuple[Tensor, Tensor]:
-    """For every pixel the splat with the greatest weight (h, w; -1: none), for every splat its total weight (n,)."""
+    """The splat with the largest weight in each pixel (h, w; -1: none), and each splat's total weight (n,) [px]."""
     bounds = bins.balanced_bounds(num_threads())
     index, totals = torch.empty(bins.height, bins.width, dtype=torch.int32), torch.zeros(len(bounds) - 1, len(splats))
-    launch_ranges(_heaviest, bounds, _walk(splats, bins, torch.zeros(3), False, *_outputs(bins), index, totals))
+    launch_ranges(_dominant, bounds, _arguments(splats, bins, torch.zeros(3), False, *_outputs(bins), index, totals))
     return index.long(), totals.sum(0)
 
 
 def composite_reference(
     splats: Tensor, order: Tensor, width: int, height: int
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Image, fourth channel, alpha as `blend`, and the weights (h, w, m) of the splats in the given order, near to far.
+    """Image, fourth channel and alpha as `composite` returns them, and the weights (h, w, m) of the splats in `order`.
 
-    Plain PyTorch, every splat at every pixel: for small scenes, in any precision.
+    `order` (m,) lists splats from near to far. PyTorch, every splat at every pixel: for small scenes, any precision.
     """
     s = splats[order]
     y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
@@ -206,7 +207,7 @@ def composite_reference(
     sigma = 0.5 * (s[:, 2] * dx * dx + s[:, 4] * dy * dy) + s[:, 3] * dx * dy
     alpha = (s[:, 5] * torch.exp(-sigma)).clamp_max(MAX_ALPHA)
     alpha = torch.where(alpha >= MIN_ALPHA, alpha, torch.zeros_like(alpha))
-    drawn = (1 - alpha).cumprod(-1) > MIN_TRANSMITTANCE  # once false, false for all that follow
+    drawn = (1 - alpha).cumprod(-1) > MIN_TRANSMITTANCE  # once false, false for all later splats
     alpha = torch.where(drawn, alpha, torch.zeros_like(alpha))
     T = (1 - alpha).cumprod(-1)
     weight = alpha * torch.cat([torch.ones_like(T[..., :1]), T[..., :-1]], -1)

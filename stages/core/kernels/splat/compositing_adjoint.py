@@ -1,6 +1,6 @@
-"""The adjoint of compositing: every bin's splats back to front, sixteen pixels at a time.
+"""Adjoint of compositing: the splats of each bin back to front, 16 pixels at a time.
 
-Warp's own tape is wrong on a loop like this one, so the adjoint is written by hand.
+Written out by hand, since Warp's automatic adjoint of such a loop is wrong.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from stages.core.kernels.splat.simd import LANE_SUMS, VECTORS, even_bounds, laun
 
 wp.set_module_options({"enable_backward": False})
 
-# dL/dalpha = T (colour . v) - S / (1 - alpha), where S is what lies behind, seen through: the sum of w (colour . v)
-# over the later splats, minus T_end v_alpha. The sums over pixels are moments in d, so that what they mean for a
-# splat's centre and covariance can wait until all bins are added up.
+# dL/dalpha = T (colour . v) - S / (1 - alpha), where S is the contribution from behind: the sum of w (colour . v) over
+# the later splats, minus T_end v_alpha. Sums over pixels are accumulated as moments of d and converted to gradients of
+# centre and covariance once, after all bins.
 _BACKWARD = r"""
 if (first) __builtin_memset(moments.data + (long)piece * n * 16, 0, (long)n * 64);
 F T[BLOCKS], S[BLOCKS], v[BLOCKS][4];
-I stop[BLOCKS];
+I stop[BLOCKS];  // index of the splat at which a pixel finished
 int last[BLOCKS];
 for (int b = 0; b < BLOCKS; ++b) {
     I in = inside(b);
@@ -59,7 +59,7 @@ for (int k = ends.data[bin] - 1; k >= begin; --k) {
     F sum[16];
     for (int i = 0; i < 16; ++i) sum[i] = none;
     bool any = false;
-    for (unsigned long long todo = reached(x, y, s[11], s[12]); todo; todo &= todo - 1) {
+    for (unsigned long long todo = overlapped(x, y, s[11], s[12]); todo; todo &= todo - 1) {
         const int b = __builtin_ctzll(todo);
         if (k >= last[b]) continue;
         F dx = lx + (4 * (b & 7) - x), dy = ly + (4 * (b >> 3) - y);
@@ -69,14 +69,14 @@ for (int k = ends.data[bin] - 1; k >= begin; --k) {
         any = true;
         F raw = exp2v(power), alpha = hit ? vmin(raw, (F)(MAX_ALPHA)) : none;
         F open = 1.0f / (1.0f - alpha);
-        F t = T[b] * open, w = alpha * t, facing = none;
+        F t = T[b] * open, w = alpha * t, v_weight = none;
         for (int c = 0; c < 4; ++c) {
-            facing = fma(v[b][c], (F)(s[6 + c]), facing);
+            v_weight = fma(v[b][c], (F)(s[6 + c]), v_weight);
             sum[6 + c] = fma(w, v[b][c], sum[6 + c]);
         }
-        F g = raw <= MAX_ALPHA ? alpha * (t * facing - S[b] * open) : none;  // dL/dlog(alpha)
+        F g = raw <= MAX_ALPHA ? alpha * (t * v_weight - S[b] * open) : none;  // dL/dlog(alpha)
         T[b] = t;
-        S[b] = fma(w, facing, S[b]);
+        S[b] = fma(w, v_weight, S[b]);
         F gx = g * dx, gy = g * dy;
         sum[0] += gx;
         sum[1] += gy;
@@ -94,7 +94,7 @@ for (int k = ends.data[bin] - 1; k >= begin; --k) {
 }
 """.replace("MAX_ALPHA", f"{MAX_ALPHA}f").replace("MIN_MEAN_ALPHA", f"{MIN_MEAN_ALPHA}f")
 
-# The moments of all pieces of a splat's gradient become the gradient of its row.
+# Sum the moments over all parts, then convert them to the gradient of the splat's row.
 _GRADIENT = r"""
 F m = load(moments.data + 16 * (long)i);
 for (int p = 1; p < pieces; ++p) m += load(moments.data + 16 * ((long)p * n + i));
@@ -111,7 +111,7 @@ store(grads.data + 16 * (long)i, g);
 
 
 @wp.func_native(VECTORS + LANE_SUMS + BIN_BLOCKS + _BACKWARD)
-def _unblend_bin(
+def _adjoint_of_bin(
     bin: int, first: bool, piece: int, n: int, width: int, height: int, across: int, step: int, mean: int,
     splats: wp.array[float], members: wp.array[int], starts: wp.array[int], behind: wp.array[float],
     left: wp.array[float], stops: wp.array[int], ends: wp.array[int], fourth: wp.array[float], alphas: wp.array[float],
@@ -120,14 +120,14 @@ def _unblend_bin(
 
 
 @wp.kernel
-def _blend_adjoint(
+def _composite_adjoint(
     start: int, piece: int, n: int, width: int, height: int, across: int, step: int, mean: int,
     splats: wp.array[float], members: wp.array[int], starts: wp.array[int], behind: wp.array[float],
     left: wp.array[float], stops: wp.array[int], ends: wp.array[int], fourth: wp.array[float], alphas: wp.array[float],
     v_rgb: wp.array[float], v_fourth: wp.array[float], v_alphas: wp.array[float], moments: wp.array[float],
 ):  # fmt: skip
-    _unblend_bin(start + wp.tid(), wp.tid() == 0, piece, n, width, height, across, step, mean, splats, members,
-                 starts, behind, left, stops, ends, fourth, alphas, v_rgb, v_fourth, v_alphas, moments)  # fmt: skip
+    _adjoint_of_bin(start + wp.tid(), wp.tid() == 0, piece, n, width, height, across, step, mean, splats, members,
+                    starts, behind, left, stops, ends, fourth, alphas, v_rgb, v_fourth, v_alphas, moments)  # fmt: skip
 
 
 @wp.func_native(VECTORS + _GRADIENT)
@@ -144,15 +144,16 @@ def _gradients(
     _gradient_row(start + wp.tid(), n, pieces, splats, moments, grads)
 
 
-def composite_adjoint(splats: Tensor, bins: Bins, ends: Tensor, walk: list) -> Tensor:
-    """Gradient (n, 16) of the splats. `ends` (bins,) is where each bin's forward pass stopped.
+def composite_adjoint(splats: Tensor, bins: Bins, ends: Tensor, arguments: list) -> Tensor:
+    """Gradient (n, 16) of the splats.
 
-    `walk` holds the kernel's arguments: those of the forward pass, what it left, and the upstream gradients.
+    `ends` (bins,): index of the member at which each bin's forward pass stopped. `arguments`: of the kernel, from the
+    number of splats on: those of the forward pass, its saved state, and the upstream gradients.
     """
     n = len(splats)
     bounds = bins.balanced_bounds(num_threads(), ends - bins.starts[:-1])
     moments, grads = torch.empty(len(bounds) - 1, n, SPLAT_SIZE), torch.empty(n, SPLAT_SIZE)
-    launch_ranges(_blend_adjoint, bounds, [*walk, view(moments.view(-1))])
+    launch_ranges(_composite_adjoint, bounds, [*arguments, view(moments.view(-1))])
     flat = [view(t.view(-1)) for t in (splats, moments, grads)]
     launch_ranges(_gradients, even_bounds(n, num_threads()), [n, len(moments), *flat])
     return grads

@@ -1,7 +1,7 @@
-"""Compositing with one thread a pixel: the rule spelled out, on any device.
+"""Compositing with one thread per pixel, on any device.
 
-On the CPU it is several times slower than `splat_blend`, whose oracle it is; on CUDA it says which splat weighs most in
-each pixel, which gsplat does not.
+On the CPU it is several times slower than `compositing`, and tests compare the two; on CUDA it provides the splat with
+the largest weight in each pixel, which gsplat does not.
 """
 
 from __future__ import annotations
@@ -48,14 +48,15 @@ def _composite(
 
 
 def composite_pixelwise(splats: Tensor, members: Tensor, starts: Tensor, tile: int, width: int, height: int):
-    """Of splats (n, 16) in bins of tile x tile pixels: the composite of the four channels (h, w, 4), alpha (h, w), for
-    every pixel the splat with the greatest weight (h, w; -1: none), and for every splat its total weight (n,).
+    """Composite splats (n, 16) in bins of tile x tile pixels, front to back. Not differentiable.
 
-    Bin b, row by row, holds members[starts[b]:starts[b + 1]], nearest first.
+    Bin b (row-major) holds members[starts[b]:starts[b + 1]], nearest first. Returns the image of four channels
+    (h, w, 4), alpha (h, w), the splat with the largest weight in each pixel (h, w; -1: none), and the total weight of
+    each splat over all pixels (n,).
     """
-    make = splats.new_empty
-    image, alphas, totals = make(height, width, 4), make(height, width), splats.new_zeros(len(splats))
-    index = make(height, width, dtype=torch.int32)
+    new = splats.new_empty
+    image, alphas, totals = new(height, width, 4), new(height, width), splats.new_zeros(len(splats))
+    index = new(height, width, dtype=torch.int32)
     launch(
         _composite, (height, width), [view(splats), view(members), view(starts), tile, -(-width // tile)],
         [view(image, wp.vec4), view(alphas), view(index), view(totals)], device_of(splats),

@@ -1,6 +1,6 @@
-"""Colour from spherical harmonics and its derivatives, sixteen Gaussians at a time: snippets of `splat_project`.
+"""C++ snippets of `projection`: colour from spherical harmonics and its adjoint, 16 Gaussians at a time.
 
-As in stages/core/geometry/harmonics.py.
+Basis, order and signs as in stages/core/geometry/harmonics.py.
 """
 
 HARMONICS = r"""
@@ -25,7 +25,7 @@ F rgb[3] = {(F)(0.5f), (F)(0.5f), (F)(0.5f)};
 for (int i = 0; i < k; ++i)
     for (int c = 0; c < 3; ++c) rgb[c] += Y[i] * gather(sh.data, 3 * k, 3 * i + c);
 """
-"""From means m, their camera's centre cam[16..18] and k coefficients: direction d, harmonics Y, colour rgb."""
+"""In: means m, camera centre cam[16..18], k coefficients. Out: unit direction d, basis Y, colour rgb (not clamped)."""
 
 HARMONICS_ADJOINT = r"""
 F vrgb[3], vY[16];
@@ -54,4 +54,4 @@ if (k > 9) {
            + 0.5f * k32 * (xx - yy) * vY[14];
 }
 """
-"""From the colour's upstream gradient, slots 6 to 8: that of the coefficients, written, and vd, of the direction."""
+"""In: gradient of the colour, slots 6 to 8. Out: gradient of the coefficients, stored, and of the direction, vd."""

@@ -1,14 +1,14 @@
-"""A bin's 64 blocks of 4 x 4 pixels, one vector each: what compositing and its adjoint share.
+"""The 64 blocks of 4 x 4 pixels of a bin, one SIMD vector each: shared by compositing and its adjoint.
 
-The rule, as in gsplat: alpha = min(0.999, opacity exp(-d'Cd/2)) counts from 1/255, a pixel is finished when the next
-splat would leave a transmittance T of 1e-4 or less (that splat is not drawn), and w = alpha T.
+Compositing rule, as in gsplat: alpha = min(0.999, opacity exp(-d'Cd/2)) is skipped below 1/255, a pixel is finished
+when the next splat would reduce its transmittance T to 1e-4 or less (that splat is not drawn), the weight is alpha T.
 """
 
 from stages.core.kernels.splat.projection import BIN_SIZE
 
-MAX_ALPHA = 0.999  # alpha is never more, so that light always passes and 1 / (1 - alpha) exists
-MIN_TRANSMITTANCE = 1e-4  # transmittance at which a pixel is finished
-MIN_MEAN_ALPHA = 1e-10  # alpha below which a mean is 0, not noise
+MAX_ALPHA = 0.999  # of a splat at a pixel, so that 1 / (1 - alpha) is finite
+MIN_TRANSMITTANCE = 1e-4  # a pixel is finished when the next splat would reach it
+MIN_MEAN_ALPHA = 1e-10  # of a pixel, below which the weighted mean of the fourth channel is 0
 BLOCKS_PER_BIN = (BIN_SIZE // 4) ** 2
 PIXELS_PER_BIN = BLOCKS_PER_BIN * 16  # per-pixel state is stored by block, then by lane
 
@@ -22,12 +22,12 @@ const int begin = starts.data[bin];
 auto inside = [&](int block) -> I {
     return (lx + (float)(X + 4 * (block & 7)) < (float)width) & (ly + (float)(Y + 4 * (block >> 3)) < (float)height);
 };
-// where lane l of a block lies in the image, row by row
+// index in the image (row-major) of lane l of a block
 auto pixel = [&](int block, int l) {
     return (Y + 4 * (block >> 3) + (l >> 2)) * width + X + 4 * (block & 7) + (l & 3);
 };
-// the blocks that the box x +- rx, y +- ry touches, as bits
-auto reached = [&](float x, float y, float rx, float ry) -> unsigned long long {
+// bit mask of the blocks that the box x +- rx, y +- ry overlaps
+auto overlapped = [&](float x, float y, float rx, float ry) -> unsigned long long {
     auto clamp = [](float v) { return (int)(v < -1.0f ? -1.0f : v > 8.0f ? 8.0f : v); };
     int j0 = clamp((x - rx + 0.5f) * 0.25f), j1 = clamp((x + rx - 0.5f) * 0.25f);
     int i0 = clamp((y - ry + 0.5f) * 0.25f), i1 = clamp((y + ry - 0.5f) * 0.25f);
@@ -37,4 +37,7 @@ auto reached = [&](float x, float y, float rx, float ry) -> unsigned long long {
     return columns & (~0ull << (8 * i0)) & (~0ull >> (56 - 8 * i1));
 };
 """
-"""Where the lanes of each block lie, and which blocks a splat can reach; `bin` and the image are the kernel's."""
+"""C++: pixel coordinates of the lanes of each block, and the blocks that a splat overlaps.
+
+Uses the variables bin, across (bins per row), width, height and starts of the kernel.
+"""

@@ -1,8 +1,8 @@
-"""Gaussians seen by one camera: centre, inverse covariance, colour and extent on the image, and back.
+"""Projection of Gaussians to one camera (EWA splatting), 16 at a time on the CPU, and its adjoint.
 
-A splat is a row of 16 floats, one cache line, so that one memory access fetches all that compositing needs:
+A splat, a projected Gaussian, is a row of 16 floats, one cache line:
 0-1 centre [px], 2-4 inverse covariance xx xy yy [1/px^2], 5 opacity, 6-8 colour, 9 depth, 10 log2 of the opacity,
-11-12 half width and height [px] of the part with alpha >= 1/255 (0: not visible), 13-15 unused.
+11-12 half width and height [px] of the region with alpha >= 1/255 (0: not visible), 13-15 unused.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from stages.core.kernels.interop import view
 from stages.core.kernels.splat.harmonics import HARMONICS, HARMONICS_ADJOINT
 from stages.core.kernels.splat.simd import LANES, VECTORS, even_bounds, launch_ranges, num_threads
 
-wp.set_module_options({"enable_backward": False})  # the adjoint is written by hand below
+wp.set_module_options({"enable_backward": False})  # the adjoint is written out below
 
-BLUR = 0.3  # added to the covariance on the image [px^2], so that no splat is thinner than a pixel
-MIN_ALPHA = 1 / 255  # what alpha is ignored below
+BLUR = 0.3  # added to the image covariance [px^2], so that no splat is thinner than a pixel
+MIN_ALPHA = 1 / 255  # smaller contributions are skipped
 SPLAT_SIZE = 16  # floats in a splat
-BIN_SIZE = 32  # pixels along a side of a bin
+BIN_SIZE = 32  # [px], side of a bin
 
-# From a group of 16 Gaussians to their covariance on the image.
+# In: a group of 16 Gaussians. Out: their covariance on the image and its inverse.
 _GEOMETRY = r"""
 const float* cam = camera.data;
 const int count = n - 16 * group < 16 ? n - 16 * group : 16;
@@ -43,7 +43,7 @@ I visible = (p[2] >= cam[21]) & (p[2] < 1e10f);
 const float fx = cam[12], fy = cam[13];
 F z = visible ? p[2] : (F)(1.0f), iz = 1.0f / z;
 F xz = p[0] * iz, yz = p[1] * iz;
-// far outside the image the Jacobian is taken at the border, else the linearisation explodes
+// far outside the image the Jacobian is evaluated at the limit, where the linearisation is still bounded
 F xc = vmin(vmax(xz, (F)(cam[22])), (F)(cam[23])), yc = vmin(vmax(yz, (F)(cam[24])), (F)(cam[25]));
 
 for (int i = 0; i < 4; ++i) q[i] = gather(quats.data, 4, i);
@@ -55,7 +55,7 @@ F R[9] = {1 - 2*(q[2]*q[2] + q[3]*q[3]), 2*(q[1]*q[2] - q[0]*q[3]), 2*(q[1]*q[3]
 for (int i = 0; i < 3; ++i) s[i] = gather(scales.data, 3, i);
 
 // rows u, v of J W (projection's Jacobian times the camera's rotation), and a = u R S, b = v R S,
-// so that the covariance on the image is [a.a a.b; a.b b.b]
+// such that the image covariance is [a.a a.b; a.b b.b]
 F u[3], v[3], a[3], b[3];
 for (int i = 0; i < 3; ++i) {
     u[i] = fx * iz * (cam[i] - xc * cam[6+i]);
@@ -78,8 +78,8 @@ _FORWARD = r"""
 F px = fx * xz + cam[14], py = fy * yz + cam[15];
 visible &= (o >= MIN_ALPHA) & (idet > 0) & (idet < 1e30f);
 F lo = log2v(visible ? o : (F)(1.0f));
-F reach = 2 * 0.693147181f * (lo + 7.99435344f) + 1e-3f;  // 2 ln(255 o), a little more for rounding
-F rx = vsqrt(reach * (aa + BLUR)), ry = vsqrt(reach * (bb + BLUR));
+F radius2 = 2 * 0.693147181f * (lo + 7.99435344f) + 1e-3f;  // 2 ln(255 o), plus a margin for rounding
+F rx = vsqrt(radius2 * (aa + BLUR)), ry = vsqrt(radius2 * (bb + BLUR));
 visible &= (px + rx > 0) & (px - rx < cam[19]) & (py + ry > 0) & (py - ry < cam[20]);
 if (!bits(visible)) {
     for (int l = 0; l < count; ++l) {
@@ -112,14 +112,14 @@ for (int l = 0; l < count; ++l) {
 
 _BACKWARD = r"""
 const F none = (F)(0.0f);
-I seen;
-for (int l = 0; l < 16; ++l) seen[l] = splats.data[16 * (long)row[l] + 11] > 0 ? -1 : 0;
-auto slot = [&](int j) { return seen ? gather(grads.data, 16, j) : none; };
+I drawn;
+for (int l = 0; l < 16; ++l) drawn[l] = splats.data[16 * (long)row[l] + 11] > 0 ? -1 : 0;
+auto slot = [&](int j) { return drawn ? gather(grads.data, 16, j) : none; };
 auto scatter = [&](float* to, int stride, int column, F value) {
-    value = seen ? value : none;
+    value = drawn ? value : none;
     for (int l = 0; l < count; ++l) to[(long)row[l] * stride + column] = value[l];
 };
-// inverse covariance -> covariance: G = -C V C with the symmetric V of its three numbers
+// gradient by the covariance from that by its inverse C: G = -C V C with V symmetric
 F va = slot(2), vb = 0.5f * slot(3), vc = slot(4);
 F t00 = A*va + B*vb, t01 = A*vb + B*vc, t10 = B*va + C*vb, t11 = B*vb + C*vc;
 F g00 = -(t00*A + t01*B), g01 = -(t00*B + t01*C), g11 = -(t10*B + t11*C);
@@ -141,10 +141,10 @@ vq[0] = 2 * (q[1]*(vR[7] - vR[5]) + q[2]*(vR[2] - vR[6]) + q[3]*(vR[3] - vR[1]))
 vq[1] = 2 * (q[2]*(vR[1] + vR[3]) + q[3]*(vR[2] + vR[6]) + q[0]*(vR[7] - vR[5]) - 2*q[1]*(vR[4] + vR[8]));
 vq[2] = 2 * (q[1]*(vR[1] + vR[3]) + q[3]*(vR[5] + vR[7]) + q[0]*(vR[2] - vR[6]) - 2*q[2]*(vR[0] + vR[8]));
 vq[3] = 2 * (q[1]*(vR[2] + vR[6]) + q[2]*(vR[5] + vR[7]) + q[0]*(vR[3] - vR[1]) - 2*q[3]*(vR[0] + vR[4]));
-F along = vq[0]*q[0] + vq[1]*q[1] + vq[2]*q[2] + vq[3]*q[3];  // the norm has no effect
+F along = vq[0]*q[0] + vq[1]*q[1] + vq[2]*q[2] + vq[3]*q[3];  // the quaternion is normalised
 for (int i = 0; i < 4; ++i) scatter(v_quats.data, 4, i, (vq[i] - along * q[i]) * iq);
 
-// u = fx/z (w0 - xc w2), v = fy/z (w1 - yc w2) with xc = x/z inside its limits
+// u = fx/z (w0 - xc w2), v = fy/z (w1 - yc w2) with xc = x/z clamped to its limits
 F vxc = none, vyc = none, uu = none, vvv = none;
 for (int i = 0; i < 3; ++i) {
     vxc -= fx * iz * vu[i] * cam[6+i];
@@ -204,8 +204,11 @@ def _project_adjoint(
 
 
 def pack_camera(viewmat: Tensor, K: Tensor, width: int, height: int, near: float) -> Tensor:
-    """What the kernels need to know of a camera, 28 floats: rotation, translation, fx fy cx cy, centre, size, near,
-    the limits of x/z and y/z (30 % outside the image), and the last bin across and down."""
+    """Pack a camera into the 28 floats that the kernels read.
+
+    Rotation (9), translation (3), fx fy cx cy [px], centre (3) [m], width and height [px], near plane [m], limits of
+    x/z and y/z (15 % of the image outside each border), and the last column and row of bins.
+    """
     W, k = np.asarray(viewmat.detach().cpu(), np.float64), np.asarray(K.detach().cpu(), np.float64)
     R, t, (fx, fy, cx, cy) = W[:3, :3], W[:3, 3], (k[0, 0], k[1, 1], k[0, 2], k[1, 2])
     mx, my = 0.15 * width / fx, 0.15 * height / fy
@@ -240,16 +243,17 @@ class _Project(torch.autograd.Function):
 
 
 def project(camera: Tensor, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh: Tensor):
-    """Splats (n, 16), sort keys (n,) and bin rectangles (n, 4: first and last column and row) in a `pinhole`'s view.
+    """Project Gaussians: splats (n, 16), sort keys (n,) and bin rectangles (n, 4: first column, first row, last ones).
 
-    Only the splats are differentiable; keys are the bits of the depth, -1 for what is not visible.
+    `camera` is from `pack_camera`. Only the splats are differentiable. Keys are the bits of the depth, -1 for Gaussians
+    that are not visible.
     Source: Zwicker et al. 2001, "EWA splatting"; conventions of gsplat's classic mode.
     """
     return _Project.apply(camera, *(t.float().contiguous() for t in (means, quats, scales, opacities, sh)))
 
 
 def project_reference(camera: Tensor, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh: Tensor):
-    """Splats as `project` makes them, in plain PyTorch and any precision."""
+    """Splats (n, 16) as `project` returns them, in PyTorch and any precision."""
     camera = camera.to(means)
     W, t, (fx, fy, cx, cy), centre = camera[:9].view(3, 3), camera[9:12], camera[12:16], camera[16:19]
     (width, height, near), limits = camera[19:22], camera[22:26]

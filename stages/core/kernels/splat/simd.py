@@ -1,8 +1,8 @@
-"""Sixteen lanes at a time on the CPU: what the native snippets of the rasteriser share.
+"""SIMD types and functions of 16 lanes for the C++ snippets of the rasteriser, and their parallel launch.
 
-Warp runs a CPU launch on one thread and does not vectorise across its threads, so the snippets say what they mean in
-the compiler's own vector types. Those are lowered to whatever the processor has (one AVX-512 register, two of AVX,
-four of SSE or NEON). Warp releases the GIL while a kernel runs, so Python threads, each launching a part of the
+Warp runs a CPU launch on one thread and does not vectorise across its threads, so the snippets use the
+compiler's vector types, which are lowered to what the processor has (one AVX-512 register, two AVX registers,
+four SSE or NEON registers). Warp releases the GIL while a kernel runs, so Python threads, each launching a part of the
 range, use the other cores.
 """
 
@@ -17,7 +17,7 @@ from stages.core.kernels.interop import launch
 from stages.core.kernels.threads import run_parallel
 
 LANES = 16
-MAX_THREADS = 8  # more threads than this would need more memory for gradients than they are worth
+MAX_THREADS = 8  # each thread needs a gradient buffer of its own
 
 VECTORS = r"""
 typedef float F __attribute__((ext_vector_type(16)));
@@ -52,10 +52,10 @@ auto log2v = [](F x) {
     return __builtin_convertvector(e, F) + 2.88539008f * s * series;
 };
 """
-"""Types and functions; a Warp snippet is a function body, so helpers are lambdas."""
+"""Vector types and functions; a Warp snippet is the body of a function, so helpers are lambdas."""
 
 LANE_SUMS = r"""
-// the sums over the lanes of v[0] .. v[15], as the lanes of one vector
+// lane i of the result is the sum over the lanes of v[i], i = 0..15
 auto sums = [](const F* v) {
     F a[8], b[4], c[2];
     for (int i = 0; i < 8; ++i)
@@ -75,17 +75,20 @@ auto sums = [](const F* v) {
 
 @cache
 def _load(kernel: wp.Kernel) -> None:
-    """Compiles before the threads start, so that only one of them does."""
+    """Compile the kernel before the threads start, so that it is compiled once."""
     wp.load_module(kernel.module, device="cpu")
 
 
 def num_threads() -> int:
-    """Number of threads, and of the fixed shares of work where the order of summation must not depend on timing."""
+    """Number of parts that work is split into: torch's threads, at most MAX_THREADS.
+
+    Where sums over parts are taken, their order is fixed by this number and not by timing.
+    """
     return max(1, min(torch.get_num_threads(), MAX_THREADS))
 
 
 def even_bounds(n: int, pieces: int) -> list[int]:
-    """Bounds of that many nearly equal pieces of range(n)."""
+    """Bounds [0, ..., n] of `pieces` nearly equal parts of range(n)."""
     return [n * i // pieces for i in range(pieces + 1)]
 
 

@@ -1,8 +1,11 @@
-"""Structural similarity of two images, and its gradient: a Gaussian window of 11 x 11 pixels, sigma 1.5.
+"""Structural similarity (SSIM) of two images and its gradient.
 
-The window is separable and the three channels lie side by side, so both passes are plain sums of shifted rows: down the
-rows straight from the images, then along the row from a scratch line. Beyond the border there are zeros, so that every
-pixel counts (as in 3D Gaussian splatting; scikit-image instead leaves out a border of 5 pixels).
+Definition: Gaussian window of 11 x 11 pixels with sigma 1.5, weights that sum to 1; images are zero-padded by 5 pixels,
+and the mean is over all pixels and channels, as in the loss of 3D Gaussian splatting. `stages.evaluate.images.ssim`
+instead averages over the windows that lie inside the image (no padding), so the values of the two are not comparable.
+
+The window is separable and the channels are interleaved, so both passes are sums of shifted rows: down the columns from
+the images into a scratch line, then along that line.
 """
 
 from __future__ import annotations
@@ -19,7 +22,7 @@ from stages.core.kernels.splat.ssim_pixel import C1, C2, WINDOW, WINDOW_RADIUS
 
 wp.set_module_options({"enable_backward": False})
 
-# Down the column of every element of row i, then along the row; COUNT maps at once.
+# Window down the columns at every element of row i, then along the row; COUNT maps at once.
 _ROWS = r"""
 const float window[11] = {WINDOW};
 const int size = width * channels, line = size + 10 * channels + 16;
@@ -50,7 +53,7 @@ auto clear = [&]() {
 };
 """.replace("WINDOW", ", ".join(f"{weight!r}f" for weight in WINDOW))
 
-# Means, variances and covariance; then similarity and its derivatives by mean, variance and covariance of the first.
+# Means, variances and covariance; then SSIM and its derivatives by mean and variance of the first image and covariance.
 _FORWARD = r"""
 for (int j = 0; j < size; j += 16) {
     F sum[5];
@@ -77,21 +80,21 @@ for (int j = 0; j < size; j += 16) {
     const int count = size - j < 16 ? size - j : 16;
     for (int l = 0; l < count; ++l) total += s[l];
     const long at = (long)i * size + j, all = (long)height * size;
-    put(slopes.data + at, by_mean, count);
-    put(slopes.data + all + at, by_var, count);
-    put(slopes.data + 2 * all + at, by_cov, count);
+    put(derivatives.data + at, by_mean, count);
+    put(derivatives.data + all + at, by_var, count);
+    put(derivatives.data + 2 * all + at, by_cov, count);
 }
 totals.data[i] = total;
 """.replace("C1", f"{C1}f").replace("C2", f"{C2}f")
 
-# A pixel moves the mean by its window, the variance by 2 x, the covariance by y.
+# Chain rule to the first image: d mean = window, d variance = 2 x, d covariance = y.
 _BACKWARD = r"""
 const long all = (long)height * size;
 for (int j = 0; j < size; j += 16)
     for (int m = 0; m < 3; ++m) {
         F sum = (F)(0.0f);
         for (int t = top; t <= bottom; ++t)
-            sum += window[t] * some(slopes.data + m * all + (long)(i + t - 5) * size + j, size - j);
+            sum += window[t] * some(derivatives.data + m * all + (long)(i + t - 5) * size + j, size - j);
         store(scratch + m * line + 5 * channels + j, sum);
     }
 clear();
@@ -106,47 +109,47 @@ for (int j = 0; j < size; j += 16) {
 
 
 @wp.func_native(VECTORS + _ROWS.replace("COUNT", "5") + _FORWARD)
-def _similar_row(
+def _ssim_row(
     i: int, piece: int, height: int, width: int, channels: int, first: wp.array[float], second: wp.array[float],
-    lines: wp.array[float], slopes: wp.array[float], totals: wp.array[wp.float64],
+    lines: wp.array[float], derivatives: wp.array[float], totals: wp.array[wp.float64],
 ): ...  # fmt: skip
 
 
 @wp.kernel
 def _similarity(
     start: int, piece: int, height: int, width: int, channels: int, first: wp.array[float], second: wp.array[float],
-    lines: wp.array[float], slopes: wp.array[float], totals: wp.array[wp.float64],
+    lines: wp.array[float], derivatives: wp.array[float], totals: wp.array[wp.float64],
 ):  # fmt: skip
-    _similar_row(start + wp.tid(), piece, height, width, channels, first, second, lines, slopes, totals)
+    _ssim_row(start + wp.tid(), piece, height, width, channels, first, second, lines, derivatives, totals)
 
 
 @wp.func_native(VECTORS + _ROWS.replace("COUNT", "3") + _BACKWARD)
 def _gradient_row(
     i: int, piece: int, height: int, width: int, channels: int, first: wp.array[float], second: wp.array[float],
-    lines: wp.array[float], slopes: wp.array[float], grads: wp.array[float],
+    lines: wp.array[float], derivatives: wp.array[float], grads: wp.array[float],
 ): ...  # fmt: skip
 
 
 @wp.kernel
 def _gradient(
     start: int, piece: int, height: int, width: int, channels: int, first: wp.array[float], second: wp.array[float],
-    lines: wp.array[float], slopes: wp.array[float], grads: wp.array[float],
+    lines: wp.array[float], derivatives: wp.array[float], grads: wp.array[float],
 ):  # fmt: skip
-    _gradient_row(start + wp.tid(), piece, height, width, channels, first, second, lines, slopes, grads)
+    _gradient_row(start + wp.tid(), piece, height, width, channels, first, second, lines, derivatives, grads)
 
 
-def _measure(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean similarity, and its derivatives (3, h, w, c) by mean, variance and covariance of the first image."""
-    slopes = torch.empty(3, *first.shape)
+def _forward(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean SSIM, and the derivatives (3, h, w, c) by mean and variance of the first image and by the covariance."""
+    derivatives = torch.empty(3, *first.shape)
     totals = torch.empty(len(first), dtype=torch.float64)
-    _launch(_similarity, first, second, 5, slopes, totals)
-    return (totals.sum() / first.numel()).float(), slopes
+    _launch(_similarity, first, second, 5, derivatives, totals)
+    return (totals.sum() / first.numel()).float(), derivatives
 
 
-def _pull(first: Tensor, second: Tensor, slopes: Tensor) -> Tensor:
-    """Gradient of the mean similarity by the first image."""
+def _backward(first: Tensor, second: Tensor, derivatives: Tensor) -> Tensor:
+    """Gradient of the mean SSIM by the first image."""
     grads = torch.empty_like(first)
-    _launch(_gradient, first, second, 3, slopes, grads)
+    _launch(_gradient, first, second, 3, derivatives, grads)
     return grads / first.numel()
 
 
@@ -158,29 +161,31 @@ def _launch(kernel: wp.Kernel, first: Tensor, second: Tensor, maps: int, *output
     launch_ranges(kernel, even_bounds(height, pieces), [height, width, channels, *flat])
 
 
-def _ways(image: Tensor):
-    return (ssim_pixel.ssim_forward, ssim_pixel.ssim_backward) if image.is_cuda else (_measure, _pull)
+def _passes(image: Tensor):
+    """Forward and backward pass for the image's device."""
+    return (ssim_pixel.ssim_forward, ssim_pixel.ssim_backward) if image.is_cuda else (_forward, _backward)
 
 
 class _Ssim(torch.autograd.Function):
     @staticmethod
     def forward(ctx, first, second):
-        value, slopes = _ways(first)[0](first, second)
-        ctx.save_for_backward(first, second, slopes)
+        value, derivatives = _passes(first)[0](first, second)
+        ctx.save_for_backward(first, second, derivatives)
         return value
 
     @staticmethod
     def backward(ctx, v):
-        first, second, slopes = ctx.saved_tensors
-        measure, pull = _ways(first)
-        by_first = v * pull(first, second, slopes) if ctx.needs_input_grad[0] else None
-        by_second = v * pull(second, first, measure(second, first)[1]) if ctx.needs_input_grad[1] else None
+        first, second, derivatives = ctx.saved_tensors
+        forward, backward = _passes(first)
+        by_first = v * backward(first, second, derivatives) if ctx.needs_input_grad[0] else None
+        by_second = v * backward(second, first, forward(second, first)[1]) if ctx.needs_input_grad[1] else None
         return by_first, by_second
 
 
 def ssim(first: Float[Tensor, "h w c"], second: Float[Tensor, "h w c"]) -> Float[Tensor, ""]:
-    """Mean structural similarity of two images in 0..1, at most 1. Differentiable in both.
+    """Mean structural similarity of two images with values in 0..1, zero-padded; at most 1. Differentiable in both.
 
+    Raises ValueError if the shapes differ.
     Source: Wang et al. 2004, "Image quality assessment", eq. 13, with K1 = 0.01, K2 = 0.03.
     """
     if first.shape != second.shape:
@@ -189,7 +194,7 @@ def ssim(first: Float[Tensor, "h w c"], second: Float[Tensor, "h w c"]) -> Float
 
 
 def ssim_reference(first: Float[Tensor, "h w c"], second: Float[Tensor, "h w c"]) -> Float[Tensor, ""]:
-    """The same in plain PyTorch, in any precision."""
+    """`ssim` in PyTorch, in any precision."""
     window = torch.tensor(WINDOW, dtype=torch.float64).to(first)
     x, y = first.permute(2, 0, 1)[:, None], second.permute(2, 0, 1)[:, None]
 

@@ -1,6 +1,7 @@
-"""Structural similarity and its gradient with one thread a value, two launches each: for CUDA, and tests anywhere.
+"""Structural similarity (SSIM) and its gradient with one thread per value: used on CUDA, tested on any device.
 
-The formula is that of `ssim`; its window goes down the columns into scratch maps first, then along the rows.
+Definition as in `ssim` (zero padding). Value and gradient take two launches each: the window is applied down the
+columns into scratch maps, then along the rows.
 """
 
 from __future__ import annotations
@@ -15,9 +16,9 @@ from stages.core.kernels.interop import device_of, launch, view
 
 wp.set_module_options({"enable_backward": False})
 
-WINDOW_RADIUS = 5  # pixels to either side of the window's centre
+WINDOW_RADIUS = 5  # [px]: the window is 11 x 11
 SIGMA = 1.5  # [px]
-C1, C2 = 0.01**2, 0.03**2  # for images in 0..1
+C1, C2 = 0.01**2, 0.03**2  # (K1 L)^2 and (K2 L)^2 with K1 = 0.01, K2 = 0.03, L = 1
 
 _WEIGHTS = [math.exp(-0.5 * (i / SIGMA) ** 2) for i in range(-WINDOW_RADIUS, WINDOW_RADIUS + 1)]
 WINDOW = [weight / sum(_WEIGHTS) for weight in _WEIGHTS]
@@ -29,7 +30,7 @@ taps = wp.types.vector(TAPS, wp.float32)
 
 @wp.kernel
 def _down(window: taps, first: wp.array2d[float], second: wp.array2d[float], sums: wp.array2d[maps5]):
-    """Of both images, their squares and their product."""
+    """Window down the columns of both images, their squares and their product."""
     i, j = wp.tid()
     total = maps5()
     for t in range(wp.static(TAPS)):
@@ -43,9 +44,9 @@ def _down(window: taps, first: wp.array2d[float], second: wp.array2d[float], sum
 
 @wp.kernel
 def _compare(
-    window: taps, channels: int, sums: wp.array2d[maps5], similar: wp.array2d[float], slopes: wp.array2d[wp.vec3]
+    window: taps, channels: int, sums: wp.array2d[maps5], ssim_map: wp.array2d[float], derivatives: wp.array2d[wp.vec3]
 ):  # fmt: skip
-    """Similarity, and its derivatives by mean and variance of the first image and by the covariance."""
+    """Window along the rows; SSIM and its derivatives by the first image's mean and variance and by the covariance."""
     i, j = wp.tid()
     e = maps5()
     for t in range(wp.static(TAPS)):
@@ -59,52 +60,53 @@ def _compare(
     s = a1 * a2 / (b1 * b2)
     by_variance, by_covariance = -s / b2, 2.0 * a1 / (b1 * b2)
     by_mean = 2.0 * my * a2 / (b1 * b2) - 2.0 * mx * s / b1 - 2.0 * mx * by_variance - my * by_covariance
-    similar[i, j] = s
-    slopes[i, j] = wp.vec3(by_mean, by_variance, by_covariance)
+    ssim_map[i, j] = s
+    derivatives[i, j] = wp.vec3(by_mean, by_variance, by_covariance)
 
 
 @wp.kernel
-def _down_slopes(window: taps, slopes: wp.array2d[wp.vec3], sums: wp.array2d[wp.vec3]):
+def _down_derivatives(window: taps, derivatives: wp.array2d[wp.vec3], sums: wp.array2d[wp.vec3]):
+    """Window down the columns of the three derivatives."""
     i, j = wp.tid()
     total = wp.vec3()
     for t in range(wp.static(TAPS)):
         row = i + t - wp.static(WINDOW_RADIUS)
-        if row >= 0 and row < slopes.shape[0]:
-            total += window[t] * slopes[row, j]
+        if row >= 0 and row < derivatives.shape[0]:
+            total += window[t] * derivatives[row, j]
     sums[i, j] = total
 
 
 @wp.kernel
 def _gather(
-    window: taps, channels: int, share: float, first: wp.array2d[float], second: wp.array2d[float],
+    window: taps, channels: int, factor: float, first: wp.array2d[float], second: wp.array2d[float],
     sums: wp.array2d[wp.vec3], grads: wp.array2d[float],
 ):  # fmt: skip
-    """A pixel moves the mean by its window, the variance by 2 x, the covariance by y."""
+    """Window along the rows; chain rule to the first image: d mean = window, d variance = 2 x, d covariance = y."""
     i, j = wp.tid()
     e = wp.vec3()
     for t in range(wp.static(TAPS)):
         column = j + (t - wp.static(WINDOW_RADIUS)) * channels
         if column >= 0 and column < sums.shape[1]:
             e += window[t] * sums[i, column]
-    grads[i, j] = share * (e[0] + 2.0 * first[i, j] * e[1] + second[i, j] * e[2])
+    grads[i, j] = factor * (e[0] + 2.0 * first[i, j] * e[1] + second[i, j] * e[2])
 
 
 def ssim_forward(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean similarity of images (h, w, c), and its derivatives (h, w * c, 3) by mean and variance of the first and by
-    the covariance."""
+    """Mean SSIM of images (h, w, c), and the derivatives (h, w * c, 3) of the SSIM map by the first image's mean and
+    variance and by the covariance."""
     x, y = first.flatten(1), second.flatten(1)
-    sums, similar, slopes = x.new_empty(*x.shape, 5), torch.empty_like(x), x.new_empty(*x.shape, 3)
+    sums, ssim_map, derivatives = x.new_empty(*x.shape, 5), torch.empty_like(x), x.new_empty(*x.shape, 3)
     launch(_down, x.shape, [taps(WINDOW), view(x), view(y)], [view(sums, maps5)], device_of(x))
     launch(_compare, x.shape, [taps(WINDOW), first.shape[2], view(sums, maps5)],
-           [view(similar), view(slopes, wp.vec3)], device_of(x))  # fmt: skip
-    return similar.mean(), slopes
+           [view(ssim_map), view(derivatives, wp.vec3)], device_of(x))  # fmt: skip
+    return ssim_map.mean(), derivatives
 
 
-def ssim_backward(first: Tensor, second: Tensor, slopes: Tensor) -> Tensor:
-    """Gradient of the mean similarity by the first image."""
+def ssim_backward(first: Tensor, second: Tensor, derivatives: Tensor) -> Tensor:
+    """Gradient (h, w, c) of the mean SSIM by the first image; `derivatives` as `ssim_forward` returns them."""
     x, y = first.flatten(1), second.flatten(1)
-    sums, grads = torch.empty_like(slopes), torch.empty_like(x)
-    launch(_down_slopes, x.shape, [taps(WINDOW), view(slopes, wp.vec3)], [view(sums, wp.vec3)], device_of(x))
+    sums, grads = torch.empty_like(derivatives), torch.empty_like(x)
+    launch(_down_derivatives, x.shape, [taps(WINDOW), view(derivatives, wp.vec3)], [view(sums, wp.vec3)], device_of(x))
     launch(_gather, x.shape,
            [taps(WINDOW), first.shape[2], 1 / x.numel(), view(x), view(y), view(sums, wp.vec3)],
            [view(grads)], device_of(x))  # fmt: skip

@@ -1,7 +1,7 @@
-"""What each choice of our force field is worth: it is trained without it, as long and on the same data.
+"""Ablation benchmark: retrains the force field with one component removed, for as long and on the same data.
 
-RESULTS.json holds the scores on scenes that were not learned from, and RESULTS.md the table. Choices that are there
-already, measured in the same way, are left as they are.
+RESULTS.json holds the scores on held-out scenes, RESULTS.md the table. Rows that an earlier run measured with the same
+options are kept.
 """
 
 from __future__ import annotations
@@ -30,24 +30,25 @@ from stages.lab.training.train import VALIDATION_FRAMES, TrainingRun, TrainOptio
 
 log = logging.getLogger(__name__)
 METRICS = ("RMSE", "FPE", "R")
-VALIDATION_CHECKS = 6  # of the weights, in one training: the best are scored
+VALIDATION_CHECKS = 6  # validations in one training; the best weights are scored
 
 
 @dataclass(frozen=True)
 class AblationBenchOptions:
-    """How long each is trained, and on what."""
+    """Length and data of each training."""
 
     steps: int = 1500
     batch: int = 64
     keypoints: int = 256
     horizons: str = "8,20"
-    groups: str = "3_0..3_8"  # to learn from; the last 100 scenes choose the best weights
-    test: str = "3_9"  # group that is scored
+    groups: str = "3_0..3_8"  # to train on; the last 100 scenes are for validation
+    test: str = "3_9"  # group to score on
     compiled: bool = False
     seed: int = 0
     device: str = "auto"
 
     def training(self) -> TrainOptions:
+        """Options of the full network's training."""
         return TrainOptions(
             steps=self.steps, batch=self.batch, keypoints=self.keypoints, horizons=self.horizons, loss="axes",
             groups=self.groups, compiled=self.compiled, seed=self.seed, device=self.device, checks=VALIDATION_CHECKS,
@@ -55,7 +56,7 @@ class AblationBenchOptions:
 
 
 def run(data: Path, out: Path, options: AblationBenchOptions = AblationBenchOptions(), only: str = "") -> Iterator[str]:
-    """Train without each choice in turn, or without those of `only` (names with commas); a line about each."""
+    """Train each ablation, or those named in `only` (separated by commas); yield a line about each."""
     names = [name.strip() for name in only.split(",")] if only else list(ABLATIONS)
     unknown = [name for name in names if name not in ABLATIONS]
     if unknown:
@@ -75,7 +76,7 @@ def run(data: Path, out: Path, options: AblationBenchOptions = AblationBenchOpti
 
 
 def _measured(choice: Ablation, data: Path, base: TrainOptions, test: list[str], device: str) -> dict:
-    """Scores after training."""
+    """Train one ablation; its scores on the test groups."""
     options = choice.options(base)
     known, unseen = train_validation_split(
         read_groups(data, parse_groups(options.groups, more=EXTRA_GROUPS), options.keypoints), VALIDATION_SCENES
@@ -89,7 +90,7 @@ def _measured(choice: Ablation, data: Path, base: TrainOptions, test: list[str],
             trainee, pieces, unseen.to(device), options, ProcessGroup(device=device), Path(folder) / "weights", {}
         )
         if not job.run():
-            raise InputError("stopped; choices measured so far are kept, the same command goes on with the next")
+            raise InputError("stopped; rows measured so far are kept, and the same command goes on with the next")
     found = validate(trainee.best_model(), scenes.to(device))
     return {"without": choice.without, **{k: float(f"{found[k]:.4g}") for k in METRICS}, "scenes": len(scenes),
             "frames": _frames(scenes), "minutes": float(f"{trainee.elapsed / 60:.3g}"),
@@ -101,7 +102,7 @@ def _frames(scenes: KeypointMotions) -> int:
 
 
 def _before(out: Path, options: dict) -> dict | None:
-    """What an earlier run has measured in the same way."""
+    """Results of an earlier run with the same options, if there are any."""
     if not out.exists():
         return None
     try:
@@ -115,26 +116,25 @@ def _before(out: Path, options: dict) -> dict | None:
 
 
 def _write(out: Path, facts: dict) -> None:
-    with replacing(out) as part:
-        part.write_text(json.dumps(facts, indent=1) + "\n")
+    bench.write_json(out, facts)
     with replacing(out.with_suffix(".md")) as part:
         part.write_text("\n".join(markdown(facts)) + "\n")
 
 
 def markdown(facts: dict) -> Iterator[str]:
-    """The table."""
+    """The results as a Markdown page."""
     o, rows = facts["options"], facts["rows"]
     first = next(iter(rows.values()))
-    yield "# What each choice is worth"
+    yield "# Ablation of the force field"
     yield ""
     yield (
-        f"`ngff-lab bench ablation`, {facts['machine']}, {facts['date']}. Each row is trained from nothing for "
+        f"`ngff-lab bench ablation`, {facts['machine']}, {facts['date']}. Each row is trained from scratch for "
         f"{o['steps']:,} steps of {o['batch']} scenes, {o['keypoints']} keypoints an object, horizons "
         f"{o['horizons']}, on {o['groups']}, and scored on {first['scenes']} scenes of {o['test']}, "
-        f"{first['frames']} frames from rest: a short training, to compare choices, not to reach the end."
+        f"{first['frames']} frames from rest. Trainings this short compare components; they do not converge."
     )
     yield ""
-    yield "| without | RMSE / FPE / R | RMSE, times that of the full network |"
+    yield "| without | RMSE [m] / FPE [m] / R | RMSE / RMSE of the full network |"
     yield "| --- | --- | --- |"
     for row in rows.values():
         more = f"{row['RMSE'] / rows['full']['RMSE']:.2f}" if "full" in rows else ""

@@ -1,11 +1,11 @@
-"""Photos kept out, as our Gaussians show them and as those of gsplat's default recipe do, after the same seconds.
+"""Benchmark of appearance: held-out photos, compared with gsplat's default recipe after the same wall time.
 
-Both start from the same cameras and sparse points, learn from the same undistorted photos at the same size, and are
-judged by the same code on the photos kept out; where there is nothing to see, ours is the photos' mean colour, theirs
-black or that, whichever suits it. Our time is that of all that follows structure from motion: depth maps,
-first Gaussians, and their fit. gsplat's schedule of 30,000 steps does not fit in it, so it is scaled to as many steps
-as do. How many is guessed from the speed of its first 100, and, when a run of so many ends far from the time, as
-Gaussians multiplied less or more than guessed, once more from that run; finding out is not counted as its time.
+Both start from the same cameras and sparse points, train on the same undistorted photos at the same size, and are
+scored by the same code on held-out photos. Our background is the photos' mean colour; gsplat's is black or that colour,
+whichever scores better. Our time covers all that follows structure from motion: depth maps, initial Gaussians, and
+their optimisation. gsplat's schedule of 30,000 steps does not fit into it, so it is scaled to the number of steps that
+do: this number is estimated from the speed of the first 100 steps and, where a run then ends far from our time, once
+more from that run. Estimating it does not count as gsplat's time.
 """
 
 from __future__ import annotations
@@ -20,17 +20,14 @@ from pathlib import Path
 from typing import TypeVar
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from stages.core.backends import pick_device
 from stages.core.errors import InputError
 from stages.core.geometry.cameras import depths, project
 from stages.core.geometry.similarity import Similarity
-from stages.core.scene.files import replacing
 from stages.core.scene.gaussians import Gaussians
 from stages.lab.bench import appearance_gsplat as peer
-from stages.lab.bench.common import machine
+from stages.lab.bench.common import machine, write_json
 from stages.lab.bench.reconstruct import photo_folder
 from stages.reconstruct import classic, sfm
 from stages.reconstruct.options import ReconstructOptions
@@ -42,40 +39,39 @@ from stages.reconstruct.step_cache import StepCache, fingerprint
 log = logging.getLogger(__name__)
 T = TypeVar("T")
 BLACK = (0.0, 0.0, 0.0)
-WARMUP_STEPS = 100  # steps by which gsplat's first speed is told
-SPEED_FRACTION = 0.5  # share of it that is left on the whole, as Gaussians multiply; a first guess
-MAX_TIME_RATIO = (
-    1.15  # share of our time after which gsplat's first run is cut off; one below the inverse is repeated too
-)
+WARMUP_STEPS = 100  # steps that estimate gsplat's initial speed
+SPEED_FRACTION = 0.5  # mean speed / initial speed, as Gaussians multiply: first estimate
+MAX_TIME_RATIO = 1.15  # gsplat's time / ours: its first run is stopped here, and repeated if below the inverse
 
 
 @dataclass(frozen=True)
 class AppearanceBenchOptions:
-    """What the sets are reconstructed with."""
+    """Options of the reconstruction."""
 
     quality: str = "high"
     holdout: int = 8
-    models: Path | None = None  # folder that keeps each set's cameras and sparse points; found anew without it
+    models: Path | None = None  # cache of each set's cameras and sparse points; None: estimate them
 
     def __post_init__(self):
         if self.holdout < 2:
-            raise InputError(f"--holdout {self.holdout}: give 2 or more, to keep every N-th photo out")
+            raise InputError(f"--holdout {self.holdout}: give 2 or more, to hold out every N-th photo")
         self.reconstruction()
 
     def reconstruction(self) -> ReconstructOptions:
+        """Options of `ngff reconstruct`."""
         return ReconstructOptions(quality=self.quality, holdout=self.holdout)
 
 
 @dataclass(frozen=True)
 class MethodScore:
-    """How one of the two did."""
+    """Time, size and scores of one method."""
 
     seconds: float  # wall time
     steps: int  # photometric, on one photo each
     gaussians: int
-    psnr: float  # on the photos kept out, mean [dB]
+    psnr: float  # mean over held-out photos [dB]
     ssim: float
-    psnr_exposed: float  # with the exposure of each photo fitted [dB]
+    psnr_exposed: float  # the same with the exposure of each photo fitted [dB]
 
     def __str__(self) -> str:
         shown = f"{self.psnr:6.2f} ({self.psnr_exposed:5.2f}) dB {self.ssim:.3f}"
@@ -83,34 +79,36 @@ class MethodScore:
 
 
 def run(sets: list[Path], out: Path, options: AppearanceBenchOptions) -> Iterator[str]:
-    """A line a set, and all figures in a JSON file, which keeps the rows of sets that are not measured now."""
+    """Yield a line for each set; all results go to the JSON file `out`, which keeps rows of other sets.
+
+    Raises InputError without photo sets and without an NVIDIA GPU.
+    """
     if not sets:
         raise InputError("name one or more photo sets: a folder of photos, or one with images/")
     if pick_device("auto") != "cuda":
         raise InputError("gsplat needs an NVIDIA GPU, and PyTorch sees none here (see `ngff-lab doctor`)")
     folders = {folder: photo_folder(folder) for folder in map(Path, sets)}
     rows = json.loads(out.read_text())["sets"] if out.exists() else {}
-    yield f"{machine('cuda')}; quality {options.quality}, every {options.holdout}th photo kept out"
+    yield f"{machine('cuda')}; quality {options.quality}, every {options.holdout}th photo held out"
     head = f"{'held-out (exposed)':>23s} {'Gaussians':>9s} {'steps':>7s} {'time':>7s}"
     yield f"{'set':14s}   ours: {head}   gsplat: {head}"
     for folder, images in folders.items():
         name = folder.resolve().name
         row = measure(name, images, options)
         rows[f"{name}, {options.quality}"] = {**row, "machine": machine("cuda")}
-        with replacing(out) as part:
-            part.write_text(json.dumps({"sets": rows}, indent=1) + "\n")
+        write_json(out, {"sets": rows})
         yield f"{name:14s}         {MethodScore(**row['ours'])}           {MethodScore(**row['gsplat'])}"
 
 
 def measure(
     name: str, images: Path, options: AppearanceBenchOptions, device: str = "cuda", draw: Callable | None = None
 ) -> dict:
-    """One set, by both; `draw` stands for gsplat.rasterization."""
+    """Both methods on one set; `draw` replaces gsplat.rasterization in tests."""
     wanted = options.reconstruction()
     photos = read_photos(images, wanted.max_side)
     steps = camera_steps(name, photos, options.models)
     model = sfm.estimate_cameras(photos, steps=steps)
-    (steps.folder / "depth.pt").unlink(missing_ok=True)  # of an earlier run: making it is part of our time
+    (steps.folder / "depth.pt").unlink(missing_ok=True)  # of an earlier run; computing it is part of our time
     made, seconds = timed(lambda: classic.reconstruct(photos, wanted, steps))
     count = wanted.iteration_count(len(made.trained), device)
     ours = judged(made.scene.gaussians, made, made.scene.background, seconds, count, device)
@@ -121,7 +119,7 @@ def measure(
 
 
 def camera_steps(name: str, photos: Photos, models: Path | None) -> StepCache:
-    """Where the cameras are kept, or will be. Photos of the same names and sizes are taken to be the same."""
+    """The cache of cameras in `models`. Photos of the same names and sizes are assumed to be the same."""
     if models is None:
         return StepCache()
     models.mkdir(parents=True, exist_ok=True)
@@ -132,12 +130,12 @@ def camera_steps(name: str, photos: Photos, models: Path | None) -> StepCache:
 def gsplat_result(
     made: Reconstruction, model: sfm.SparseModel, seconds: float, device: str = "cuda", draw: Callable | None = None
 ) -> MethodScore:
-    """The other recipe, from the same points, moved to where our scene is, for about the same seconds."""
+    """gsplat's recipe from the same points, in the frame of our scene, for about the same wall time."""
     views, world = made.views[made.trained], made.scene.provenance["upright"]
     move = Similarity(world["scale"], torch.tensor(world["rotation"]), torch.tensor(world["translation"]))
 
     def train(steps: int, going: Callable[[int], bool]) -> tuple[Gaussians, int]:
-        return peer.train(views, *coloured_points(model, move, views, made.trained), steps, device, draw, going)
+        return peer.train(views, coloured_points(model, move, views, made.trained), steps, device, draw, going)
 
     for _ in range(2):  # the first warms up
         _, first = timed(lambda: train(peer.FULL_STEPS, lambda done: done < WARMUP_STEPS))
@@ -154,10 +152,8 @@ def gsplat_result(
     return side
 
 
-def coloured_points(
-    model: sfm.SparseModel, move: Similarity, views: Views, trained: list[int]
-) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 3"]]:
-    """The sparse points that photos learned from show, moved, with the mean of their colours there (0..1)."""
+def coloured_points(model: sfm.SparseModel, move: Similarity, views: Views, trained: list[int]) -> peer.ColouredPoints:
+    """Sparse points that training photos show, transformed, with the mean of their colours there (0..1)."""
     points, total, count = move(model.points), torch.zeros(len(model.points), 3), torch.zeros(len(model.points))
     for row, view in enumerate(trained):
         index = model.point_index[model.view_index == view]
@@ -168,14 +164,14 @@ def coloured_points(
         total.index_add_(0, index[inside], image[y[inside], x[inside]])
         count.index_add_(0, index[inside], torch.ones(int(inside.sum())))
     seen = count > 0
-    return points[seen], total[seen] / count[seen, None]
+    return peer.ColouredPoints(points[seen], total[seen] / count[seen, None])
 
 
 def judged(
     gaussians: Gaussians, made: Reconstruction, background: Sequence[float], seconds: float, steps: int,
     device: str = "cuda",
 ) -> MethodScore:  # fmt: skip
-    """With what to paint where there are no Gaussians."""
+    """Score Gaussians on the held-out photos, on a background colour."""
     raw, fitted = (
         score_views(gaussians, made.views, made.held_out, device, exposed, background) for exposed in (False, True)
     )
@@ -183,6 +179,6 @@ def judged(
 
 
 def timed(make: Callable[[], T]) -> tuple[T, float]:
-    """What is made, and the wall time until it is in the CPU's memory [s]."""
+    """The result of a call and its wall time [s]."""
     start = time.perf_counter()
     return make(), time.perf_counter() - start

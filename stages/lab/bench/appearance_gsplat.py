@@ -1,16 +1,18 @@
-"""gsplat's default training recipe: what its published simple_trainer does when started without options.
+"""gsplat's default training recipe: what its published simple_trainer does without options.
 
-The loop is ours, with gsplat's rasteriser and DefaultStrategy inside: Gaussians start at the sparse points, of opacity
-0.1 and as wide as the distance to their three neighbours; harmonics gain a degree every 1,000 steps, up to 3; Gaussians
-multiply every 100 steps from 500 to 15,000; the rate of the means falls to a hundredth over 30,000 steps. A run of
-fewer steps scales all of these numbers alike, as the trainer's steps_scaler does. Structural similarity is our own,
-which both recipes use. The strategy is taken as it is: in 1.5.3 it never resets opacities, as `0 & step > 0` is false.
+The loop is ours, with gsplat's rasteriser and DefaultStrategy inside. Gaussians start at the sparse points with opacity
+0.1 and the distance to their three nearest neighbours as scale; the SH degree grows every 1,000 steps, up to 3;
+Gaussians are densified every 100 steps from 500 to 15,000; the learning rate of the means falls to a hundredth over
+30,000 steps. A run of fewer steps scales all of these numbers alike, as the trainer's steps_scaler does. SSIM is our
+own implementation, as in our recipe. The strategy is unchanged: in 1.5.3 it never resets opacities, as `0 & step > 0`
+is false.
 Source: Ye et al. 2025, "gsplat: an open-source library for Gaussian splatting", and its examples at version 1.5.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -29,30 +31,36 @@ FULL_STEPS = 30_000  # steps of the published schedule, to which these belong:
 SCHEDULE = {"refine_start_iter": 500, "refine_stop_iter": 15_000, "reset_every": 3000, "refine_every": 100}
 DEGREE_EVERY = 1000
 LEARNING_RATES = {"means": 1.6e-4, "scales": 5e-3, "quats": 1e-3, "opacities": 5e-2, "sh0": 2.5e-3, "shN": 2.5e-3 / 20}
+SEED = 0
 SSIM_WEIGHT = 0.2  # weight of 1 - SSIM against L1
+
+
+class ColouredPoints(NamedTuple):
+    """Sparse points that training starts from."""
+
+    points: Float[Tensor, "m 3"]
+    colours: Float[Tensor, "m 3"]  # 0..1
 
 
 def train(
     views: Views,
-    points: Float[Tensor, "m 3"],
-    colours: Float[Tensor, "m 3"],
+    start: ColouredPoints,
     steps: int,
     device: str = "cuda",
     draw: Callable | None = None,
     going: Callable[[int], bool] = lambda done: True,
-    seed: int = 0,
 ) -> tuple[Gaussians, int]:
-    """Gaussians after a schedule of `steps`, one photo each, and the steps done: fewer if `going` (on) says no.
+    """Train for `steps` of one photo each; the Gaussians and the number of steps done (fewer once `going` is false).
 
-    `draw` stands for gsplat.rasterization.
+    `draw` replaces gsplat.rasterization in tests.
     """
     from gsplat import DefaultStrategy, rasterization
 
-    torch.manual_seed(seed)  # the strategy draws from PyTorch's own generator
+    torch.manual_seed(SEED)  # the strategy draws from PyTorch's own generator
     draw, share = draw or rasterization, steps / FULL_STEPS
     eyes = centres(views.cameras.viewmats)
     size = 1.1 * float((eyes - eyes.mean(0)).norm(dim=1).max())
-    values = initial_parameters(points, colours, device)
+    values = initial_parameters(start, device)
     optimisers = {
         name: torch.optim.Adam(
             [value], lr=LEARNING_RATES[name] * (size if name == "means" else 1), eps=1e-15, fused=True
@@ -87,10 +95,9 @@ def train(
     return to_gaussians(values), steps
 
 
-def initial_parameters(
-    points: Float[Tensor, "m 3"], colours: Float[Tensor, "m 3"], device: str
-) -> dict[str, torch.nn.Parameter]:
-    """What is optimised: a parameter for each rate."""
+def initial_parameters(start: ColouredPoints, device: str) -> dict[str, torch.nn.Parameter]:
+    """Initial parameters, one for each learning rate."""
+    points, colours = start
     n = len(points)
     values = {
         "means": points,
@@ -104,6 +111,7 @@ def initial_parameters(
 
 
 def to_gaussians(values: dict[str, torch.nn.Parameter]) -> Gaussians:
+    """The optimised parameters as Gaussians on the CPU."""
     v = {name: value.detach().cpu() for name, value in values.items()}
     return Gaussians(
         v["means"], F.normalize(v["quats"], dim=1), v["scales"].exp(), v["opacities"].sigmoid(),

@@ -1,4 +1,4 @@
-"""A chat endpoint that speaks OpenAI's protocol (many local servers do), with the standard library alone."""
+"""Client of OpenAI-compatible chat completion endpoints (many local servers are), standard library only."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from stages.core.errors import InputError
 
 log = logging.getLogger(__name__)
 URL = "https://api.openai.com/v1"
-ATTEMPTS, PAUSE = 3, 2.0  # when the other side is busy or silent; before the second attempt, doubling [s]
-RETRY_STATUSES = (408, 409, 429, 500, 502, 503, 504)  # worth asking again
+ATTEMPTS, PAUSE = 3, 2.0  # on a busy or silent server; pause before the second attempt, then doubling [s]
+RETRY_STATUSES = (408, 409, 429, 500, 502, 503, 504)  # HTTP statuses worth retrying
 
 
 @dataclass(frozen=True)
 class ChatEndpoint:
-    """Where to ask, and whom."""
+    """URL, model and key of an endpoint."""
 
     url: str
     model: str
-    key: str = ""  # sent only when there is one; never printed
-    timeout: float = 120.0  # for one answer [s]
+    key: str = ""  # sent if not empty; never printed
+    timeout: float = 120.0  # of one request [s]
 
     @staticmethod
     def from_environment(model: str = "", timeout: float = 120.0) -> ChatEndpoint:
-        """OPENAI_BASE_URL, OPENAI_API_KEY and, unless given, OPENAI_MODEL."""
+        """From OPENAI_BASE_URL, OPENAI_API_KEY and, unless given, OPENAI_MODEL; InputError for unusable values."""
         url = os.environ.get("OPENAI_BASE_URL", "").strip().rstrip("/") or URL
         model = model or os.environ.get("OPENAI_MODEL", "").strip()
         if not url.startswith(("http://", "https://")):
@@ -43,7 +43,7 @@ class ChatEndpoint:
         return ChatEndpoint(url, model, os.environ.get("OPENAI_API_KEY", "").strip(), timeout)
 
     def ask(self, messages: list[dict]) -> str:
-        """The text of the answer. Raises InputError when there is none."""
+        """Send messages; the text of the reply. Raises InputError when there is none."""
         problem = ""
         for attempt in range(ATTEMPTS):
             if attempt:
@@ -78,7 +78,7 @@ class ChatEndpoint:
 
     def _advice(self, code: int) -> str:
         if code in (401, 403):
-            return "check OPENAI_API_KEY" if self.key else "it wants a key: set OPENAI_API_KEY"
+            return "check OPENAI_API_KEY" if self.key else "the server needs a key: set OPENAI_API_KEY"
         if code == 404:
             return f"check OPENAI_BASE_URL, which often ends in /v1, and that it has the model {self.model!r}"
         return f"check that the model {self.model!r} sees images"
@@ -91,7 +91,7 @@ class ChatEndpoint:
 
 
 def _why(error: urllib.error.HTTPError) -> str:
-    """What the other side says about it, shortened."""
+    """The server's own error message, shortened."""
     try:
         said = json.loads(error.read(10_000))["error"]
         said = said["message"] if isinstance(said, dict) else said
@@ -101,5 +101,5 @@ def _why(error: urllib.error.HTTPError) -> str:
 
 
 def image_part(jpeg: bytes) -> dict:
-    """A picture as a part of a message."""
+    """A JPEG image as a part of a message."""
     return {"type": "image_url", "image_url": {"url": "data:image/jpeg;base64," + base64.b64encode(jpeg).decode()}}

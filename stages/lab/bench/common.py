@@ -1,18 +1,23 @@
-"""What every benchmark needs: the machine's name, its copy bandwidth, and time that waits for the GPU."""
+"""Shared by the benchmarks: name of the machine, timing that waits for the GPU, copy bandwidth, result files."""
 
 from __future__ import annotations
 
+import json
 import os
 import platform
+import re
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from pathlib import Path
 
 import torch
 import warp as wp
 
+from stages.core.scene.files import replacing
+
 
 def machine(device: str) -> str:
-    """Name of what runs, with the versions that matter."""
+    """Name of the device (or CPU and its core count) and versions of torch, warp and Python."""
     name = torch.cuda.get_device_name(device) if device != "cpu" else f"{_cpu()}, {len(os.sched_getaffinity(0))} cores"
     return f"{name}; torch {torch.__version__}, warp {wp.__version__}, python {platform.python_version()}"
 
@@ -26,7 +31,7 @@ def _cpu() -> str:
 
 
 def median_seconds(function: Callable[[], object], device: str, repeat: int = 5) -> float:
-    """Median wall time of a call [s], the GPU's work included; call it once before."""
+    """Median wall time of a call [s], the GPU's work included; call it once before to warm up."""
     times = []
     for _ in range(repeat):
         _wait(device)
@@ -43,8 +48,21 @@ def _wait(device: str) -> None:
 
 
 def copy_bandwidth(device: str) -> float:
-    """Bytes read plus bytes written a second by a large copy through PyTorch."""
+    """Memory bandwidth of a large copy in PyTorch: bytes read plus bytes written per second."""
     count = 2**29 if device != "cpu" else 2**25
     a, b = torch.ones(count, device=device), torch.zeros(count, device=device)
     b.copy_(a)
     return 2 * 4 * count / median_seconds(lambda: b.copy_(a), device)
+
+
+def write_json(out: Path, facts: Mapping) -> None:
+    """Write results as JSON, every list of plain values on one line."""
+    text = re.sub(r"\[[^][{}]*\]", lambda found: json.dumps(json.loads(found[0])), json.dumps(facts, indent=1))
+    with replacing(Path(out)) as part:
+        part.write_text(text + "\n")
+
+
+def write_results(out: Path | None, name: str, device: str, facts: Mapping) -> None:
+    """Write the results of `ngff-lab bench NAME` with the machine they were measured on; nothing without `out`."""
+    if out is not None:
+        write_json(out, {"command": f"ngff-lab bench {name}", "machine": machine(device), **facts})

@@ -1,12 +1,12 @@
-"""What completing objects is worth: scenes seen from one side, refined in three ways, beside the truth.
+"""Benchmark of object completion on scenes seen from one side only, compared with the true scenes.
 
-A few objects stand on a table, ten cameras look from the front, and what they see is kept, with some noise. Measured
-are the surfaces (Chamfer distance), pictures from behind (PSNR), and where the objects fall and roll to (RMSE).
+A few objects stand on a table; ten cameras look from the front, and only Gaussians that they see are kept, with noise.
+Each completer of `refine` is measured by the surfaces (Chamfer distance), views from behind (PSNR), and the motion of
+the objects when they are dropped (RMSE).
 """
 
 from __future__ import annotations
 
-import json
 import tempfile
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
@@ -21,7 +21,6 @@ from stages.core.geometry.rotations import matrix
 from stages.core.geometry.similarity import Similarity
 from stages.core.raster.rasterise import rasterise, visibility
 from stages.core.scene.cameras import Cameras
-from stages.core.scene.files import replacing
 from stages.core.scene.gaussians import Gaussians, concatenate
 from stages.core.scene.scene import Scene, SceneObject
 from stages.core.scene.scene_ply import write_scene
@@ -39,8 +38,8 @@ from stages.simulate.options import SimulateOptions
 from stages.simulate.stage import run as simulate
 
 OBJECT_SIZE = 0.3  # longest side of an object [m]
-IMAGE_SIZE, REAR_VIEWS = 320, 6  # pixels a side; cameras that the truth is compared from
-FRONT_AZIMUTH, REAR_AZIMUTH = -45.0, 135.0  # azimuth of the middle camera: it stands on the +y axis, or on -y
+IMAGE_SIZE, REAR_VIEWS = 320, 6  # pixels a side; novel views compared with the truth
+FRONT_AZIMUTH, REAR_AZIMUTH = -45.0, 135.0  # azimuth of the middle camera [degrees]
 SURFACE_DEPTH = 0.03 * OBJECT_SIZE  # depth behind the drawn surface up to which a Gaussian belongs to it [m]
 COMPLETERS = ("none", "close", "library")
 METRICS = ("chamfer_mm", "psnr_behind_db", "motion_rmse_mm")
@@ -48,17 +47,19 @@ METRICS = ("chamfer_mm", "psnr_behind_db", "motion_rmse_mm")
 
 @dataclass(frozen=True)
 class CompleteBenchOptions:
-    scenes: tuple[str, ...] = ("panda,duck", "can,miku", "bowl,phone")  # the objects of each
-    known: str = ""  # those of the library; empty: all ten
-    thin: int = 2  # every so manieth Gaussian of an object is used
-    noise: float = 0.003  # standard deviation of place [longest sides]
-    frames: int = 40  # of motion
-    lift: float = 0.2  # height that the objects are let go from [m]
+    """Scenes, noise and simulation of the benchmark."""
+
+    scenes: tuple[str, ...] = ("panda,duck", "can,miku", "bowl,phone")  # objects of each scene
+    known: str = ""  # objects of the library; empty: all ten
+    thin: int = 2  # every n-th Gaussian of an object is used
+    noise: float = 0.003  # standard deviation of positions [longest sides]
+    frames: int = 40  # frames of motion
+    lift: float = 0.2  # height that the objects are dropped from [m]
     seed: int = 0
 
 
 def true_scene(placed: str, options: CompleteBenchOptions) -> Scene:
-    """The objects side by side, turned about the vertical, on a grey table whose top is z = 0."""
+    """The objects side by side, rotated at random about the vertical, on a grey table whose top is z = 0."""
     rng = torch.Generator().manual_seed(options.seed)
     names = ObjectsOptions(placed).names
     table = sheet(1.6, 1.6, 0.012)
@@ -75,20 +76,20 @@ def true_scene(placed: str, options: CompleteBenchOptions) -> Scene:
 
 
 def subsample(g: Gaussians, step: int) -> Gaussians:
-    """Fewer Gaussians, larger by as much."""
+    """Every n-th Gaussian, enlarged to cover the same area."""
     few = g[torch.arange(0, len(g), step)]
     return replace(few, scales=few.scales * step**0.5)
 
 
 def camera_arc(count: int, azimuth: float, elevation: float, sweep: float = 120.0) -> Cameras:
-    """An arc of `sweep` degrees around the middle of the table."""
+    """Cameras on an arc of `sweep` degrees around the middle of the table."""
     viewmats = orbit(count, torch.tensor([0.0, 0, 0.12]), 1.1, elevation, azimuth - sweep / 2, sweep)
     K = intrinsics(IMAGE_SIZE, IMAGE_SIZE, 1.4 * IMAGE_SIZE).expand(count, 3, 3).clone()
     return Cameras(viewmats, K, torch.full((count, 2), IMAGE_SIZE), tuple(f"{i:02d}.jpg" for i in range(count)))
 
 
 def visible_scene(scene: Scene, options: CompleteBenchOptions) -> Scene:
-    """What the cameras see of the objects, with noise; the table is left whole."""
+    """The Gaussians of the objects that a camera sees, with noise, and the whole table."""
     g = scene.gaussians
     seen = g[visible(scene) | (g.object_id == 0)]
     error = (
@@ -102,7 +103,7 @@ def visible_scene(scene: Scene, options: CompleteBenchOptions) -> Scene:
 
 @torch.no_grad()
 def visible(scene: Scene) -> Bool[Tensor, "n"]:
-    """Gaussians that lie on the surface that a camera sees; how large they are does not matter."""
+    """Whether each Gaussian's centre lies on a surface that some camera sees, whatever its size."""
     g = scene.gaussians
     out = torch.zeros(len(g), dtype=torch.bool)
     for viewmat, K in zip(scene.cameras.viewmats, scene.cameras.Ks, strict=True):
@@ -115,14 +116,14 @@ def visible(scene: Scene) -> Bool[Tensor, "n"]:
 
 
 def chamfer_mm(scene: Scene, true: Scene) -> float:
-    """Chamfer distance of the objects [mm], mean of both directions."""
+    """Chamfer distance between the objects of two scenes [mm], mean of both directions."""
     a, b = (s.gaussians.means[s.gaussians.object_id > 0] for s in (scene, true))
     return 1000 * chamfer(nearest_neighbours(a, b), nearest_neighbours(b, a))["chamfer"]
 
 
 @torch.no_grad()
 def psnr_behind(scene: Scene, true: Scene) -> float:
-    """Mean PSNR [dB] from where no camera was, in the pixels where the objects truly are."""
+    """Mean PSNR of views from behind [dB], over the pixels that the true objects cover."""
     views, values = camera_arc(REAR_VIEWS, REAR_AZIMUTH, 20.0), []
     for viewmat, K in zip(views.viewmats, views.Ks, strict=True):
         mine, real = (rasterise(s.gaussians, viewmat[None], K[None], IMAGE_SIZE, IMAGE_SIZE).rgb for s in (scene, true))
@@ -133,7 +134,7 @@ def psnr_behind(scene: Scene, true: Scene) -> float:
 
 
 def run(out: Path | None, options: CompleteBenchOptions = CompleteBenchOptions()) -> Iterator[str]:  # noqa: B008 -- frozen
-    """A line for each scene and way of refining, the means over the scenes, and all figures as JSON."""
+    """Yield a line for each scene and completer and the means over scenes; all figures go to `out` as JSON."""
     yield f"{'scene':16}{'completer':12}{'Chamfer [mm]':>14}{'PSNR behind [dB]':>18}{'RMSE of motion [mm]':>21}"
     scenes = {}
     with tempfile.TemporaryDirectory() as name:
@@ -146,14 +147,11 @@ def run(out: Path | None, options: CompleteBenchOptions = CompleteBenchOptions()
                 yield _line(placed, way, row)
     means = {way: {f: sum(s[way][f] for s in scenes.values()) / len(scenes) for f in METRICS} for way in COMPLETERS}
     yield from (_line("mean", way, row) for way, row in means.items())
-    if out:
-        facts = {"command": "ngff-lab bench complete", "machine": bench.machine("cpu"), "options": asdict(options)}
-        with replacing(out) as part:
-            part.write_text(json.dumps({**facts, "scenes": scenes, "mean": means}, indent=1) + "\n")
+    bench.write_results(out, "complete", "cpu", {"options": asdict(options), "scenes": scenes, "mean": means})
 
 
 def measure(placed: str, folder: Path, options: CompleteBenchOptions) -> Iterator[tuple[str, dict[str, float]]]:
-    """The figures of each way of refining one scene."""
+    """Metrics of each completer on one scene."""
     true = true_scene(placed, options)
     seen = visible_scene(true, options)
     _fall(true, folder / "truth", options)
@@ -176,7 +174,7 @@ def _library(folder: Path, options: CompleteBenchOptions) -> None:
 
 
 def _fall(scene: Scene, path: Path, options: CompleteBenchOptions) -> None:
-    """Let the objects go from a height: PATH.h5."""
+    """Simulate the objects dropped from a height; the trajectory is PATH.h5."""
     write_scene(path.with_suffix(".ply"), scene)
     chosen = SimulateOptions(
         steps=options.frames, engine="mpm", quality="draft", lift=(str(options.lift),), keypoints=256

@@ -1,20 +1,19 @@
-"""How well trained models predict motion they have not seen: the published table, on the regenerated data set.
+"""Benchmark of dynamics models on motion they were not trained on: the splits of the NGFF paper, on our data set.
 
-    spatial            scenes of group 3_9: new arrangements of objects that were learned from, 80 frames
-    temporal           300 scenes of the training groups, for 100 frames
-    4, 6 objects       more objects than the 3 that were learned from, 80 frames
-    held-out objects   scenes of objects that were never learned from (`ngff-lab heldout`), 80 frames
+    spatial            scenes of group 3_9: new arrangements of training objects, 80 frames
+    temporal           300 scenes of the training groups, 100 frames
+    4, 6 objects       more objects than the 3 of most training scenes, 80 frames
+    held-out objects   scenes of objects that no model was trained on (`ngff-lab heldout`), 80 frames
 
-Beside the models stand rows that need no training: a fall without learning, the truth with its starts moved by 1 mm
-(how predictable the world is), the best that rigid bodies could do, and MPM with materials as a vision-language model
-saw them. RESULTS.json holds everything; RESULTS.md and RESULTS.png are drawn from it.
+Rows that need no training are compared with: free fall, the true scenes simulated again from starts moved by 1 mm (a
+bound by predictability), the best rigid fit to the truth, and MPM with materials estimated by a vision-language model.
+RESULTS.json holds all results; RESULTS.md and RESULTS.png are drawn from it.
 """
 
 from __future__ import annotations
 
 import json
 import logging
-import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
@@ -28,7 +27,7 @@ from stages.core.errors import InputError
 from stages.core.models import checkpoints as weights
 from stages.core.models.dynamics import Dynamics
 from stages.core.models.rollout import TimeStepper, record_frames
-from stages.core.scene.files import must_exist, replacing
+from stages.core.scene.files import must_exist
 from stages.evaluate.dynamics import all_metrics, error_over_time
 from stages.lab.assets.heldout_shapes import HELDOUT_SHAPES
 from stages.lab.assets.objects import OBJECTS
@@ -53,9 +52,9 @@ SPLITS = {
     "held-out objects": (("heldout",), 80),
 }  # fmt: skip
 TEMPORAL_SCENES = 300  # scenes of the temporal split
-TIMED_STEPS = 100  # steps of one scene whose time is taken
-STRIDE = 8  # frames between the values of an object's curve
-COMPARABLE_KEYS = ("machine", "keypoints", "scenes", "frames")  # in what results must agree to stand in one table
+TIMED_STEPS = 100  # steps of the timed rollout
+STRIDE = 8  # frames between the values of an object's error curve
+COMPARABLE_KEYS = ("machine", "keypoints", "scenes", "frames")  # results in one table must agree in these
 METRICS = ("MSE", "RMSE", "FPE", "PCE", "R", "R_pooled")
 FREE_FALL, NUDGED, RIGID_FIT, MPM_ESTIMATED = (
     "no learning",
@@ -68,11 +67,11 @@ NAMES = {kind.id: name for name, kind in (*OBJECTS.items(), *HELDOUT_SHAPES.item
 
 @dataclass(frozen=True)
 class DynamicsBenchOptions:
-    """Which scenes."""
+    """Scenes, keypoints and the optional MPM row."""
 
-    keypoints: int = 256  # of an object; a model sees no more than it learned from
+    keypoints: int = 256  # of an object; a model gets no more than it was trained with
     limit: int = 0  # scenes of each split; 0: all
-    mpm: int = 100  # scenes of each split for mpm-estimated, which has to simulate them; 0: leave that row out
+    mpm: int = 100  # scenes of each split for mpm-estimated, which simulates them; 0: no such row
     batch: int = 100  # scenes at once
     seed: int = 0  # of the temporal sample
     device: str = "auto"
@@ -83,7 +82,10 @@ class DynamicsBenchOptions:
 
 
 def redraw(results: Path) -> list[str]:
-    """The table and the plots from results of an earlier run."""
+    """Write table and plots again from the results of an earlier run; the lines of the table.
+
+    Raises InputError for a file that holds no such results.
+    """
     must_exist(results, "results of `ngff-lab bench dynamics` (.json)")
     try:
         facts = json.loads(Path(results).read_text())
@@ -100,20 +102,20 @@ def run(
     options: DynamicsBenchOptions = DynamicsBenchOptions(),
     nudged: Path | None = None,
 ) -> list[str]:
-    """Every NAME.safetensors of a folder, and the rows that need none, on every split that the data set has.
+    """Measure every NAME.safetensors of a folder, and the rows without training, on every split of a data set.
 
-    `nudged` is a second data set of the same scenes, with every start moved by a millimetre. OUT.json is written, and
-    beside it OUT.md and OUT.png; what is returned are the lines of the table. Rows of an earlier OUT.json that are not
-    measured now stay, if it measured on the same machine and the same scenes.
+    `nudged` is a second data set of the same scenes, with every start moved by 1 mm. Writes OUT.json, OUT.md
+    and OUT.png; returns the lines of the table. Other rows of an earlier OUT.json are kept if it was measured on the
+    same machine and scenes.
     """
-    files = sorted(Path(folder).glob("*.safetensors"), key=lambda f: (f.stem == "ngff", f.stem))  # ours comes last
+    files = sorted(Path(folder).glob("*.safetensors"), key=lambda f: (f.stem == "ngff", f.stem))  # our model last
     if not files:
         raise InputError(f"{folder}: holds no weights (.safetensors); make some with `ngff-lab train`")
     before = _earlier(Path(out))
     device = pick_device(options.device)
     splits = {name: split_scenes(data, name, options).to(device) for name in SPLITS if _there(data, name)}
     if not splits:
-        split_scenes(data, "spatial", options)  # says what is missing
+        split_scenes(data, "spatial", options)  # raises InputError with what is missing
     rows = {
         FREE_FALL: {
             "splits": {name: evaluate_predictor(predict_free_fall, m, options.batch) for name, m in splits.items()}
@@ -138,14 +140,13 @@ def run(
     }  # fmt: skip
     if all(before.get(key) == facts[key] for key in COMPARABLE_KEYS):
         facts["rows"] = {**before["rows"], **rows}
-    with replacing(Path(out)) as part:
-        part.write_text(_compact(facts))
+    bench.write_json(out, facts)
     report(Path(out), facts)
     return table(facts)
 
 
 def _earlier(out: Path) -> dict:
-    """Results that are already there."""
+    """Results of an earlier run, if there are any."""
     if not out.is_file():
         return {}
     try:
@@ -156,7 +157,7 @@ def _earlier(out: Path) -> dict:
 
 
 def _there(data: Path, split: str) -> bool:
-    """Whether all groups of a split have been made; a split that is not measured is told of."""
+    """Whether all groups of a split exist; logs a warning for a split that is left out."""
     missing = [g for g in SPLITS[split][0] if not (motions_folder(data) / f"{g}.h5").is_file()]
     if missing:
         log.warning("%s is not measured: %s has no %s", split, data, ", ".join(missing))
@@ -164,7 +165,7 @@ def _there(data: Path, split: str) -> bool:
 
 
 def split_scenes(data: Path, split: str, options: DynamicsBenchOptions) -> KeypointMotions:
-    """The scenes of a split, no longer than it is measured."""
+    """The scenes of a split, with as many frames as it has."""
     groups, frames = SPLITS[split]
     motions = read_groups(data, groups, options.keypoints)
     count = min(len(motions), options.limit or len(motions))
@@ -179,7 +180,7 @@ def split_scenes(data: Path, split: str, options: DynamicsBenchOptions) -> Keypo
 def _again_made(
     nudged: Path, splits: dict[str, KeypointMotions], options: DynamicsBenchOptions
 ) -> Iterator[tuple[str, dict]]:
-    """The nudged scenes against the true ones, split by split."""
+    """Metrics of the nudged scenes against the true ones, split by split."""
     for split, motions in splits.items():
         if _there(nudged, split):
             made = read_groups(nudged, SPLITS[split][0], options.keypoints)
@@ -187,16 +188,16 @@ def _again_made(
 
 
 def _compared(made: KeypointMotions, motions: KeypointMotions, batch: int) -> dict:
-    """Scenes made otherwise against the true ones; those that went wrong are counted, and left out."""
+    """Metrics of scenes simulated differently; those that failed are counted and left out."""
     both = shared_scenes(motions, made)
     if not len(both):
-        raise InputError("none of the scenes was made again: the names of the two data sets differ")
+        raise InputError("the two data sets have no scene in common by name")
     return {**evaluate_predictor(predict_from(made, motions.points.shape[1]), both, batch), "scenes left out":
             len(motions) - len(both)}  # fmt: skip
 
 
 def _mpm(data: Path, splits: dict[str, KeypointMotions], options: DynamicsBenchOptions, device: str) -> dict:
-    """MPM with estimated materials; of objects that the paper has no estimates for, nothing."""
+    """MPM with estimated materials, on splits whose objects all have an estimate in the paper."""
     row: dict = {"splits": {}}
     for split, motions in splits.items():
         if not set(motions.objects.unique().tolist()) - {-1} <= {kind.id for kind in OBJECTS.values()}:
@@ -205,14 +206,14 @@ def _mpm(data: Path, splits: dict[str, KeypointMotions], options: DynamicsBenchO
         some = motions[: min(options.mpm, len(motions))]
         made = again(some.names, some.points.shape[1], options.keypoints)
         row["splits"][split] = _compared(made, some, options.batch)
-        if device != "cpu" and "seconds" not in row:  # on a CPU it would take as long as everything else
+        if device != "cpu" and "seconds" not in row:  # on a CPU this would dominate the run time
             row["seconds"] = _digits(again.seconds(some.names[0], TIMED_STEPS), 3)
     return row
 
 
 def _model(file: Path, splits: dict[str, KeypointMotions], options: DynamicsBenchOptions, device: str) -> dict:
     model, card = weights.load(file, device)
-    learned = card.get("options", {}).get("keypoints", options.keypoints)  # more of them it has never seen
+    learned = card.get("options", {}).get("keypoints", options.keypoints)  # it was not trained with more
     splits = {n: replace(m, points=m.points[..., :learned, :]) for n, m in splits.items()}
     with torch.inference_mode():
         results = {n: evaluate_predictor(_rolled(model), m, options.batch) for n, m in splits.items()}
@@ -231,7 +232,7 @@ def _rolled(model: Dynamics) -> Predict:
 
 
 def _seconds(model: Dynamics, motions: KeypointMotions, device: str) -> float:
-    """Wall time of TIMED steps of one scene, as the command rolls it out [s], without what is recorded once."""
+    """Wall time of a rollout of TIMED_STEPS steps of one scene [s], without recording its graph."""
     one = motions[:1].initial_conditions()
     stepper = TimeStepper(model, one, motions.dt)
 
@@ -243,9 +244,9 @@ def _seconds(model: Dynamics, motions: KeypointMotions, device: str) -> float:
 
 
 def evaluate_predictor(predict: Predict, motions: KeypointMotions, batch: int) -> dict:
-    """Metrics averaged over the scenes; curves of the error [m] by frame, and by frame for each kind of object.
+    """Metrics averaged over the scenes; error [m] by frame, for all objects and for each kind of object.
 
-    A rollout that is not finite has no RMSE, and an R of 0: it is not left out.
+    A rollout that is not finite counts with R = 0 and makes the RMSE undefined.
     """
     metrics, errors = [], []
     for first in tqdm(range(0, len(motions), batch), unit="batch", leave=False):
@@ -255,7 +256,7 @@ def evaluate_predictor(predict: Predict, motions: KeypointMotions, batch: int) -
         errors.append(error_over_time(predicted, some.points, valid))
     each = {k: torch.cat([m[k] for m in metrics]) for k in METRICS}
     lost = ~each["RMSE"].isfinite()
-    correlated = {k: torch.where(lost, 0.0, each[k]).nanmean() for k in ("R", "R_pooled")}  # none where nothing moves
+    correlated = {k: torch.where(lost, 0.0, each[k]).nanmean() for k in ("R", "R_pooled")}  # nan where nothing moves
     error, kind, present = torch.cat(errors), motions.objects, motions.present
     by_frame = error.transpose(0, 1)[:, present].mean(1)
     by_object = {NAMES.get(int(i), f"object {int(i)}"): error[:, ::STRIDE].transpose(0, 1)[:, kind == i].mean(1)
@@ -268,11 +269,5 @@ def evaluate_predictor(predict: Predict, motions: KeypointMotions, batch: int) -
 
 
 def _digits(x: float, count: int = 4) -> float | None:
-    """As many significant digits; None for what is not finite: JSON knows no such numbers."""
+    """Rounded to significant digits; None for what is not finite, which JSON has no number for."""
     return float(f"{x:.{count}g}") if abs(x) < float("inf") else None
-
-
-def _compact(facts: dict) -> str:
-    """JSON with every list of numbers in one line."""
-    text = json.dumps(facts, indent=1)
-    return re.sub(r"\[[^][{}]*\]", lambda found: json.dumps(json.loads(found[0])), text) + "\n"

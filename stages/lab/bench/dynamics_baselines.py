@@ -1,6 +1,6 @@
-"""What stands beside trained models: rows of the table that need the truth, the solver, or nothing at all.
+"""Baselines of the dynamics benchmark without training: free fall, rigid fit, other simulations, MPM.
 
-Every one of them is a function from some scenes to keypoints in all of their frames.
+Each is a function from scenes to keypoints in all of their frames (`Predict`).
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ VLM_MATERIALS = {
 
 
 def predict_free_fall(some: KeypointMotions) -> Float[Tensor, "s t o n 3"]:
-    """No learning: objects fall as they stand."""
+    """Free fall without rotation, for a batch of scenes."""
     return free_fall(some.initial_conditions(), some.points.shape[1], some.dt)
 
 
 def free_fall(world: InitialConditions, frames: int, dt: float) -> Float[Tensor, "b t o n 3"]:
-    """Objects fall as they stand until their lowest keypoint is on the floor, and lie there."""
+    """Objects fall without rotation until their lowest keypoint is on the floor, and stay there."""
     time = dt * torch.arange(frames, dtype=world.points.dtype, device=world.points.device)
     fallen = -world.gravity[:, None, None, 2] * time[:, None].square() / 2
     height = world.points[..., 2].masked_fill(~world.valid, torch.inf).amin(2) - world.floor
@@ -54,14 +54,15 @@ def free_fall(world: InitialConditions, frames: int, dt: float) -> Float[Tensor,
 
 
 def predict_rigid_fit(some: KeypointMotions) -> Float[Tensor, "s t o n 3"]:
-    """The truth with every object replaced, in every frame, by its shape at rest in the pose that fits best.
+    """The true motion with each object replaced by its rest shape in the pose that fits best, frame by frame.
 
-    No model of rigid bodies can come nearer. Source of the fit: Kabsch 1976, A32, 922.
+    A lower bound on the error of rigid-body models.
     """
     return rigid_fit(some.points, some.present[..., None].expand(some.points[:, 0, ..., 0].shape))
 
 
 def rigid_fit(points: Float[Tensor, "s t o n 3"], valid: Bool[Tensor, "s o n"]) -> Float[Tensor, "s t o n 3"]:
+    """Each object's first frame, moved rigidly to fit every frame by least squares. Source: Kabsch 1976, A32, 922."""
     weight = valid / valid.sum(-1, keepdim=True).clamp_min(1)
     centre = torch.einsum("son,stoni->stoi", weight, points)[..., None, :]
     arm = (points - centre)[:, 0]
@@ -71,32 +72,35 @@ def rigid_fit(points: Float[Tensor, "s t o n 3"], valid: Bool[Tensor, "s o n"]) 
 
 
 def predict_from(made: KeypointMotions, frames: int) -> Predict:
-    """Motions of the same scenes, made otherwise, looked up by name."""
+    """A predictor that looks up other motions of the same scenes by name.
+
+    It raises InputError for motions with fewer frames, objects or keypoints.
+    """
     row = {name: i for i, name in enumerate(made.names)}
 
     def predict(some: KeypointMotions) -> Tensor:
         _, t, o, n, _ = some.points.shape
         if made.points.shape[1] < frames or made.points.shape[2] < o or made.points.shape[3] < n:
-            raise InputError(f"{some.names[0]}: was made again with fewer frames, objects or keypoints than it has")
+            raise InputError(f"{some.names[0]}: has fewer frames, objects or keypoints in the other data set")
         return made.points[[row[name] for name in some.names], :t, :o, :n].to(some.points)
 
     return predict
 
 
 def shared_scenes(motions: KeypointMotions, made: KeypointMotions) -> KeypointMotions:
-    """The scenes that are in both."""
+    """The scenes of `motions` that are also in `made`."""
     there = set(made.names)
     return motions[torch.tensor([i for i, name in enumerate(motions.names) if name in there], dtype=torch.int64)]
 
 
 def with_estimated_materials(things: Mapping[int, Asset]) -> dict[int, Asset]:
-    """The objects with Young's moduli and densities as the paper's vision-language model saw them."""
+    """The objects with the Young's moduli and densities that the paper's vision-language model estimated."""
     names = {kind.id: name for name, kind in OBJECTS.items()}
     return {i: replace(a, E=VLM_MATERIALS[names[i]][0], density=VLM_MATERIALS[names[i]][1]) for i, a in things.items()}
 
 
 class Resimulation:
-    """Scenes of a data set simulated again with estimated materials, all else being equal."""
+    """Scenes of a data set simulated again with estimated materials and otherwise equal settings."""
 
     def __init__(self, data: Path, groups: list[str], device: str):
         self.device, self.configs = device, {}
@@ -106,17 +110,19 @@ class Resimulation:
             if not (motions_folder(data) / f"{group}.h5").is_file():
                 continue
             if _options(motions_folder(data) / f"{group}.h5") != made:
-                raise InputError(f"{data}: {group} and {groups[0]} were made at different finenesses; make them alike")
+                raise InputError(
+                    f"{data}: {group} and {groups[0]} were simulated with different discretisations; make them alike"
+                )
             self.configs.update(read_scene_configs(folder / "scene_configs" / f"{group}.json"))
         self.fineness = Discretisation(made["dx"], made["spacing"], made["substep"])
         self.things = with_estimated_materials(load_assets(self.fineness, made["keypoints"], folder / "particles.npz"))
 
     def __call__(self, names: tuple[str, ...], frames: int, keypoints: int) -> KeypointMotions:
-        """Scenes that went wrong are missing."""
+        """Simulate scenes by name; failed ones are missing from the result."""
         return concatenate_motions(list(self._parts({name: self._config(name) for name in names}, frames, keypoints)))
 
     def seconds(self, name: str, steps: int) -> float:
-        """Wall time of one scene alone [s], the making of the solver included, once it is compiled."""
+        """Wall time of one scene alone [s], solver set-up included, after compilation."""
         one = {name: self._config(name)}
         list(self._parts(one, 3, 1))
         return bench.median_seconds(lambda: list(self._parts(one, steps + 1, 1)), self.device, 1)
@@ -133,11 +139,11 @@ class Resimulation:
 
 
 def _options(path: Path) -> dict:
-    """How finely a group was simulated, as its file says."""
+    """Discretisation and keypoints of a group, from the provenance in its file."""
     with h5py.File(path, "r") as file:
         options = json.loads(file.attrs.get("provenance", "{}")).get("options", {})
     try:
         return {k: options[k] for k in ("dx", "spacing", "substep", "keypoints")}
     except KeyError as error:
-        raise InputError(f"{path}: does not say how it was simulated (no {error.args[0]}); leave mpm-estimated "
+        raise InputError(f"{path}: has no record of how it was simulated (no {error.args[0]}); leave mpm-estimated "
                          "out with --mpm 0, or make the data again") from error  # fmt: skip

@@ -1,4 +1,4 @@
-"""The results of `ngff-lab bench dynamics` as a table in the terminal, as Markdown and as plots."""
+"""Results of `ngff-lab bench dynamics` as a table for the terminal, as Markdown and as plots."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from stages.core.scene.files import replacing
 from stages.lab.plot import Panel, draw_panels
 
 # NGFF paper (ICLR 2026), Table 1 and ablation, on its own data: RMSE, FPE, R by split, and seconds for 100 steps on an
-# H100; of the first three models only the mean over 4 and 6 objects is known, which stands in both places
+# H100; for the first three models only the mean over 4 and 6 objects is published, which is shown in both columns
 PUBLISHED: Mapping[str, dict] = {
     "VLM-MPM": {"spatial": [0.306, 0.774, 0.299], "temporal": [0.328, 0.901, 0.3], "4 objects": [0.358, 0.904, 0.305],
                 "6 objects": [0.358, 0.904, 0.305], "seconds": 39.29},
@@ -28,7 +28,7 @@ Cells = list[str]
 
 
 def table(facts: dict) -> list[str]:
-    """RMSE / FPE / R of each row and split, and the published ones, for a terminal."""
+    """RMSE / FPE / R of each row and split, and the published figures, as lines for a terminal."""
     head, ours, published = _cells(facts)
     rows = [head, *ours, *published]
     widths = [max(len(row[i]) for row in rows) for i in range(len(head))]
@@ -40,14 +40,14 @@ def table(facts: dict) -> list[str]:
 
 
 def report(results: Path, facts: dict) -> None:
-    """RESULTS.md and RESULTS.png beside RESULTS.json."""
+    """Write RESULTS.md and RESULTS.png next to RESULTS.json."""
     with replacing(results.with_suffix(".md")) as part:
         part.write_text("\n".join(markdown(results.stem, facts)) + "\n")
     draw_panels(results.with_suffix(".png"), panels(facts), PLOT_COLUMNS)
 
 
 def _cells(facts: dict) -> tuple[Cells, list[Cells], list[Cells]]:
-    """Head, rows measured, rows published."""
+    """Header, measured rows, published rows."""
     splits = list(facts["scenes"])
     head = ["RMSE / FPE / R", *splits, "100 steps", "parameters", "trained"]
     ours = []
@@ -79,7 +79,7 @@ def _time(seconds: float | None) -> str:
 
 
 def markdown(stem: str, facts: dict) -> Iterator[str]:
-    """The table with what is needed to read it; the best of the models in bold."""
+    """The results as a Markdown page; of the trained models the best value of each metric and split is bold."""
     scenes = ", ".join(f"{count} {split} ({facts['frames'][split]} frames)" for split, count in facts["scenes"].items())
     run = f"{facts['machine']}, {facts['date']}"
     yield "# Dynamics"
@@ -92,17 +92,19 @@ def markdown(stem: str, facts: dict) -> Iterator[str]:
     yield _row(head)
     yield _row(["---"] * len(head))
     for row in ours:
-        name = f"`{row[0]}`" if row[0] in best["models"] else row[0]
-        cells = zip(head[1:], row[1:], strict=True)
-        yield _row([name, *(f"**{cell}**" if row[0] == best.get(split) else cell for split, cell in cells)])
+        results = facts["rows"][row[0]]
+        if "card" in results:
+            scores = [_bold(split, results["splits"].get(split), best) for split in facts["scenes"]]
+            row = [f"`{row[0]}`", *scores, *row[1 + len(scores) :]]
+        yield _row(row)
     yield _row([f"*{PUBLISHED_NOTE}*", *[""] * (len(head) - 1)])
     yield from map(_row, published)
     yield ""
     for row, result in facts["rows"].items():
-        left = {split: r.get("scenes left out", 0) for split, r in result["splits"].items()}
-        if any(left.values()):
-            told = ", ".join(f"{n} of {split}" for split, n in left.items() if n)
-            yield f"{row}: without scenes that the solver gave up: {told}."
+        failed = {split: r.get("scenes left out", 0) for split, r in result["splits"].items()}
+        if any(failed.values()):
+            listed = ", ".join(f"{n} of {split}" for split, n in failed.items() if n)
+            yield f"{row}: without scenes in which the solver failed: {listed}."
     yield ""
     yield f"![Error over time]({stem}.png)"
 
@@ -111,15 +113,25 @@ def _row(cells: Cells) -> str:
     return f"| {' | '.join(cells)} |"
 
 
-def _best(facts: dict) -> dict:
-    """Names of the models, and for each split the one with the lowest RMSE."""
-    models = {name: row["splits"] for name, row in facts["rows"].items() if "card" in row}
-    best: dict = {"models": set(models)}
+def _best(facts: dict) -> dict[tuple[str, str], float]:
+    """The best value among the trained models, by split and metric."""
+    models = [row["splits"] for row in facts["rows"].values() if "card" in row]
+    best = {}
     for split in facts["scenes"]:
-        scored = {n: r[split]["RMSE"] for n, r in models.items() if split in r and r[split]["RMSE"] is not None}
-        if scored:
-            best[split] = min(scored, key=scored.get)
+        for metric, choose in (("RMSE", min), ("FPE", min), ("R", max)):
+            values = [r[split][metric] for r in models if split in r and r[split][metric] is not None]
+            if values:
+                best[split, metric] = choose(values)
     return best
+
+
+def _bold(split: str, result: dict | None, best: dict[tuple[str, str], float]) -> str:
+    """A trained model's table cell, with its best values in bold."""
+    cell = _score(result)
+    if result is None or " / " not in cell:
+        return cell
+    parts = zip(("RMSE", "FPE", "R"), cell.split(" / "), strict=True)
+    return " / ".join(f"**{text}**" if result[metric] == best[split, metric] else text for metric, text in parts)
 
 
 def panels(facts: dict) -> list[Panel]:
@@ -141,7 +153,7 @@ def panels(facts: dict) -> list[Panel]:
 
 
 def _curve(values: list[float | None], stride: int) -> list[tuple[float, float]]:
-    """In centimetres, up to where it is finite; a metre and all beyond is much the same."""
+    """(frame, error [cm]) up to the first value that is not finite, at most 100 cm."""
     points = []
     for i, value in enumerate(values):
         if value is None:

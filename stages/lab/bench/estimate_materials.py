@@ -1,7 +1,7 @@
-"""What things in a video are made of, as a vision-language model sees it: the materials of the VLM-MPM baseline.
+"""Materials of the objects in a video, estimated by a vision-language model: those of the VLM-MPM baseline.
 
-The idea is the paper's: frames of a video are shown to the model, which answers with a Young's modulus and a density
-for each object, and MPM simulates with them. The words of the prompt are ours.
+As in the NGFF paper, the model gets frames of a video and replies with a Young's modulus and a density for each object,
+with which MPM simulates. The prompt is our own.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ log = logging.getLogger(__name__)
 RANGES = {"E": (1e2, 1e12), "density": (5.0, 25_000.0)}  # from foams and gels to metals [Pa] [kg/m^3]
 UNITS = {"E": "Pa", "density": "kg/m^3"}
 PROMPT = """\
-These {frames} frames, evenly spaced in time, are from one video of things that fall, collide and deform. {which}
+These {frames} frames, evenly spaced in time, are from one video of objects that fall, collide and deform. {which}
 
 For each of them estimate what a physics simulator needs. The simulator treats an object as one homogeneous elastic \
 solid in its outer shape, so give effective values of the whole thing: a hollow can is lighter and softer than its \
@@ -42,22 +42,25 @@ Answer with nothing but one JSON object, one entry for each thing, for example
 
 @dataclass(frozen=True)
 class EstimateOptions:
-    """What is shown, and how often an unfit answer is sent back."""
+    """Model, frames shown, and number of attempts."""
 
-    objects: str = ""  # names with commas between, or a scene.ply that has them; empty: the model finds names
-    model: str = ""  # by default OPENAI_MODEL
-    timeout: float = 120.0  # [s]
-    frames: int = 10
-    longest: int = 512  # side of a frame as shown [px]
-    tries: int = 3
+    objects: str = ""  # names separated by commas, or a scene.ply that holds them; empty: the model names the objects
+    model: str = ""  # empty: OPENAI_MODEL
+    timeout: float = 120.0  # of one request [s]
+    frames: int = 10  # evenly spaced
+    longest: int = 512  # longest side of a frame as sent [px]
+    tries: int = 3  # replies, before giving up
 
 
 class InvalidReply(ValueError):
-    """An answer that cannot be used; says why in words that the model can act on."""
+    """A reply that cannot be used; its message is sent back to the model."""
 
 
 def run(video: Path, out: Path, options: EstimateOptions = EstimateOptions()) -> list[str]:
-    """Write OUT for `ngff simulate --materials OUT`, and beside it who said so; a line about each object."""
+    """Write OUT for `ngff simulate --materials OUT`, and its provenance to OUT.json; a line about each object.
+
+    Raises InputError for an unreadable video, an endpoint that fails, and replies that cannot be used.
+    """
     video, out = Path(video), Path(out)
     endpoint = ChatEndpoint.from_environment(options.model, options.timeout)
     names = object_names(options.objects)
@@ -75,7 +78,7 @@ def run(video: Path, out: Path, options: EstimateOptions = EstimateOptions()) ->
 
 
 def object_names(objects: str) -> list[str]:
-    """Names of the objects to ask about, none when the model shall name them."""
+    """Names of the objects to ask about; empty when the model is to name them. Raises InputError for repeated names."""
     if objects.lower().endswith(".ply"):
         names = [o.name for o in read_scene(Path(objects)).objects]
         if not names:
@@ -84,7 +87,7 @@ def object_names(objects: str) -> list[str]:
         names = [name.strip() for name in objects.split(",") if name.strip()]
     twice = {name for name in names if names.count(name) > 1}
     if twice:
-        raise InputError(f"--objects {objects}: {twice.pop()!r} is there twice; names must tell objects apart")
+        raise InputError(f"--objects {objects}: {twice.pop()!r} is there twice; names must be unique")
     return names
 
 
@@ -108,7 +111,7 @@ def sample_frames(video: Path, count: int, longest: int) -> list[bytes]:
 def estimate(
     endpoint: ChatEndpoint, jpegs: list[bytes], names: list[str], tries: int
 ) -> tuple[dict[str, dict], list[str]]:
-    """What the model says of each object, and all of its replies; an unfit one is sent back with what is wrong."""
+    """The estimate for each object, and all replies; an invalid reply is sent back with the reason."""
     which = f"The objects are called: {', '.join(names)}." if names else "Give every object a short name of its own."
     text = PROMPT.format(frames=len(jpegs), which=which, example=names[0] if names else "duck", **RANGES)
     messages = [{"role": "user", "content": [{"type": "text", "text": text}, *map(image_part, jpegs)]}]
@@ -129,9 +132,9 @@ def estimate(
 
 
 def parse_reply(reply: str, names: list[str]) -> dict[str, dict]:
-    """The answer as {name: {material, E, density}}, in the order of the names. Raises Unfit for anything else."""
+    """A reply as {name: {material, E, density}}, in the order of the names. Raises InvalidReply for anything else."""
     text = reply.strip()
-    if text.startswith("```") and text.endswith("```"):  # a fence around the JSON is the one thing forgiven
+    if text.startswith("```") and text.endswith("```"):  # a Markdown fence around the JSON is accepted
         text = text.strip("`").removeprefix("json")
     try:
         data = json.loads(text, object_pairs_hook=_once, parse_constant=_not_a_number)

@@ -1,4 +1,4 @@
-"""How fast the MPM solver is, beside a plain form of it in the same run and beside what the memory can do.
+"""Benchmark of the MPM solver, compared with an unfused three-kernel form in the same run and with memory bandwidth.
 
 Three elastic bodies a scene, eight particles a cell, falling on each other and on the floor; substep 1e-4 s, 200 a
 frame. A scene of the published data set is 100 such frames.
@@ -6,7 +6,6 @@ frame. A scene of the published data set is 100 such frames.
 
 from __future__ import annotations
 
-import json
 import logging
 import math
 from collections.abc import Iterator
@@ -17,7 +16,6 @@ import torch
 
 from stages.core.errors import InputError
 from stages.core.physics.mpm import solver as mpm
-from stages.core.scene.files import replacing
 from stages.lab.bench import common as bench
 from stages.lab.bench import mpm_three_kernel
 
@@ -25,19 +23,19 @@ log = logging.getLogger(__name__)
 SUBSTEP, SUBSTEPS, FRAMES = 1e-4, 200, 100  # as published
 GRAVITY = (0.0, 0.0, -5.0)
 BODIES_PER_SCENE = 3
-PARTICLE_BYTES = 145  # read and written of a particle's own in a substep
-STENCIL_NODES = 27  # of its stencil: read 16 bytes each, add 16 bytes each
+PARTICLE_BYTES = 145  # read and written per particle and substep, without the grid
+STENCIL_NODES = 27  # of a particle's stencil: 16 bytes read and 16 bytes added each
 MATERIALS = ((8e5, 600.0), (1e5, 700.0), (3e5, 300.0))  # E [Pa], density [kg/m^3]: ball, panda, duck
 
 
 @dataclass(frozen=True)
 class MpmBenchOptions:
-    """Scenes are `scenes` copies of one; 0 chooses what suits the device."""
+    """Problem sizes; a batch is `scenes` copies of one scene."""
 
     device: str = "auto"
     particles: tuple[int, ...] = (6_144, 20_000, 250_000)
-    scenes: int = 0
-    frames: int = 10  # that are timed, after three that are not
+    scenes: int = 0  # 0: as many as suit the device
+    frames: int = 10  # timed, after three of warm-up
 
     def __post_init__(self):
         if self.frames < 1 or self.scenes < 0 or not all(100 <= p <= 2_000_000 for p in self.particles):
@@ -45,7 +43,7 @@ class MpmBenchOptions:
 
 
 def falling_boxes(particles: int) -> tuple[mpm.Particles, mpm.Box, float]:
-    """Three boxes above each other at the floor of the published world, its box, and the spacing of the grid."""
+    """Three boxes above each other at the floor of the published domain; the domain; the grid spacing [m]."""
     side = round((particles / BODIES_PER_SCENE) ** (1 / 3))
     layers = max(1, round(particles / BODIES_PER_SCENE / side**2))
     h = 0.45 / side
@@ -59,7 +57,7 @@ def falling_boxes(particles: int) -> tuple[mpm.Particles, mpm.Box, float]:
 
 
 def measure(particles: int, scenes: int, device: str, frames: int, exact: bool = False) -> dict:
-    """Seconds a substep of a batch, and what follows from it; with sums that do not depend on order if `exact`."""
+    """Time per substep of a batch and figures derived from it; `exact` makes sums independent of their order."""
     one, box, dx = falling_boxes(particles)
     solver = mpm.Solver(mpm.join_particles([one] * scenes), box, dx, device, [len(one)] * scenes, exact=exact)
     push = torch.tensor(GRAVITY, device=device).repeat(len(solver.rows), 1)
@@ -80,7 +78,7 @@ def measure(particles: int, scenes: int, device: str, frames: int, exact: bool =
 
 
 def measure_three_kernel(particles: int, device: str) -> float:
-    """Seconds a substep of one scene in the plain form."""
+    """Time per substep of one scene in the three-kernel form [s]."""
     one, box, dx = falling_boxes(particles)
     solver = mpm.Solver(one, box, dx, device, fused=True)
     push = torch.tensor(GRAVITY, device=device).repeat(len(one), 1)
@@ -98,7 +96,7 @@ def measure_three_kernel(particles: int, device: str) -> float:
 
 
 def batch_size(particles: int, device: str) -> int:
-    """Scenes in a batch: enough to fill a GPU, and not more nodes than indices go when exact; one on a CPU."""
+    """Scenes that fill a GPU within its memory and the index range of exact sums; 1 on a CPU."""
     if device == "cpu":
         return 1
     _, box, dx = falling_boxes(particles)
@@ -109,7 +107,7 @@ def batch_size(particles: int, device: str) -> int:
 
 
 def run(options: MpmBenchOptions, out: Path | None = None) -> Iterator[str]:
-    """Lines of the report; all results as JSON in `out`."""
+    """Yield the lines of the report; all results go to `out` as JSON."""
     from stages.core.backends import pick_device
 
     device = pick_device(options.device)
@@ -130,9 +128,6 @@ def run(options: MpmBenchOptions, out: Path | None = None) -> Iterator[str]:
                 f"{r['substep_us']:9.1f} us a substep, {r['ns_per_particle']:.3f} ns a particle, "
                 f"{r['scenes_per_minute']:8.1f} scenes a minute; {r['bytes'] / 1e6:,.0f} MB moved, "
                 f"{r['bytes_per_second'] / copy:.2f} x the copy bandwidth; "
-                f"{speedup:.1f}x the plain three-kernel form"
+                f"{speedup:.1f}x the speed of the three-kernel form"
             )
-    if out is not None:
-        facts = {"command": "ngff-lab bench mpm", "machine": bench.machine(device), "copy_bytes_per_second": copy}
-        with replacing(out) as part:
-            part.write_text(json.dumps({**facts, "rows": rows}, indent=1) + "\n")
+    bench.write_results(out, "mpm", device, {"copy_bytes_per_second": copy, "rows": rows})

@@ -1,7 +1,7 @@
-"""The peer of the MPM benchmark: the plain form that most GPU solvers have.
+"""Baseline of the MPM benchmark: the unfused form that most GPU solvers have.
 
-Three kernels a substep (particles to grid with scalar atomics, every node of the grid, grid to particles), after a
-clear of the whole grid; particles are sorted by cell at the start. Captured in a CUDA graph, as ours.
+Three kernels per substep (particles to grid with scalar atomics, update of every grid node, grid to particles) after
+clearing the whole grid; particles are sorted by cell at the start. It is captured in a CUDA graph, as our solver is.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ def _to_particles(grid: MpmGrid, rows: ParticleArrays, dt: float, nodes: wp.arra
 
 
 def substep(solver: Solver, nodes, dt: float) -> None:
-    """One substep of a solver's particles, elastic and free, on `nodes`, a tensor of four floats a node."""
+    """One substep of a solver's elastic particles on `nodes`, a tensor of four floats per grid node."""
     rows, grid, device = solver.rows, solver.grid, solver.device
     nodes.zero_()
     launch(_to_grid, len(rows), [grid, rows.struct, dt, view(nodes)], device=device)

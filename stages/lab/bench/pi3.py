@@ -1,12 +1,11 @@
-"""How fast π³ is and what memory it takes, beside the same network with attention written out.
+"""Benchmark of π³: time and memory, compared with the same network with unfused attention.
 
-Random weights of the published sizes: time and memory do not depend on their values.
+Random weights of the published sizes are used: time and memory do not depend on their values.
 """
 
 from __future__ import annotations
 
 import gc
-import json
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -24,17 +23,18 @@ from stages.core.models.pi3.dinov2 import PATCH
 from stages.core.models.pi3.layers import Attention
 from stages.core.models.pi3.network import Pi3, halve
 from stages.core.models.pi3.splat import Pi3Splat
-from stages.core.scene.files import replacing
 from stages.lab.bench import common as bench
 
 
 @dataclass(frozen=True)
 class Pi3BenchOptions:
+    """Numbers of views, image size and repetitions."""
+
     device: str = "auto"
     views: tuple[int, ...] = (1, 8, 20, 50)
     size: int = 448  # side of the square photos [px]
     repeat: int = 3  # timed forward passes of each
-    splats: bool = False  # with the head of Gaussians
+    splats: bool = False  # with the Gaussian head
 
     def __post_init__(self):
         if self.size < PATCH or self.size % PATCH or self.repeat < 1 or min(self.views, default=0) < 1:
@@ -42,12 +42,13 @@ class Pi3BenchOptions:
 
 
 def naive_attention(q: Float[Tensor, "b h t d"], k: Float[Tensor, "b h t d"], v: Float[Tensor, "b h t d"]) -> Tensor:
-    """Attention with its table of all pairs of tokens, softmax in 32 bit as autocast has it."""
+    """Attention that stores the scores of all token pairs, with softmax in 32 bits as under autocast."""
     scores = (q @ k.mT) * q.shape[-1] ** -0.5
     return scores.softmax(-1).to(v.dtype) @ v
 
 
 def set_attention(model: nn.Module, attend: Callable) -> None:
+    """Use one attention function in all layers of a model."""
     for module in model.modules():
         if isinstance(module, Attention):
             module.attend = attend
@@ -55,9 +56,9 @@ def set_attention(model: nn.Module, attend: Callable) -> None:
 
 @torch.no_grad()
 def measure(model: nn.Module, views: int, size: int, at_once: int, device: str, repeat: int) -> tuple[float, float]:
-    """Median seconds of a forward pass, and the most memory allocated in it, weights included [bytes; nan on a CPU].
+    """Median time of a forward pass [s] and its peak memory, weights included [bytes; nan on a CPU].
 
-    Raises torch.OutOfMemoryError where memory is too small; what was allocated is free again then.
+    Raises torch.OutOfMemoryError, after freeing what was allocated.
     """
     images = torch.rand(views, 3, size, size, device=device)
     half, gpu = device != "cpu", device != "cpu"
@@ -75,9 +76,11 @@ def measure(model: nn.Module, views: int, size: int, at_once: int, device: str, 
 
 
 def run(
-    options: Pi3BenchOptions, config: Pi3Config = Pi3Config(), out: Path | None = None  # noqa: B008 -- frozen
+    options: Pi3BenchOptions,
+    config: Pi3Config = Pi3Config(),  # noqa: B008 -- frozen
+    out: Path | None = None,
 ) -> Iterator[str]:
-    """A line for each number of views: seconds, memory and its estimate, then the same with attention written out."""
+    """Yield for each number of views a line with time, memory and its estimate, and one with unfused attention."""
     device = pick_device(options.device)
     half = device != "cpu"
     with torch.device(device):
@@ -107,24 +110,21 @@ def run(
                 raise torch.OutOfMemoryError  # a CPU would swap, not fail
             slow, more = measure(model, views, options.size, at_once, device, options.repeat)
         except torch.OutOfMemoryError:
-            yield "           attention written out: out of memory"
+            yield "           unfused attention: out of memory"
             continue
         rows[-1] |= {"naive_seconds": slow, "naive_bytes": _finite(more)}
-        yield f"           attention written out: {slow:8.3f} s  {_gb(more)}, {slow / seconds:.1f} times our time"
-    if out is not None:
-        facts = {"command": "ngff-lab bench pi3", "machine": bench.machine(device), "weight_bytes": weights}
-        with replacing(out) as part:
-            part.write_text(json.dumps({**facts, "rows": rows}, indent=1) + "\n")
+        yield f"           unfused attention: {slow:8.3f} s  {_gb(more)}, {slow / seconds:.1f} times our time"
+    bench.write_results(out, "pi3", device, {"weight_bytes": weights, "rows": rows})
 
 
 def _table(config: Pi3Config, views: int, size: int) -> int:
-    """Bytes of the scores of all pairs of tokens, twice, in 32 bit."""
+    """Bytes of the scores of all token pairs, twice, in 32 bits."""
     tokens = views * ((size // PATCH) ** 2 + 5)
     return 2 * 4 * (config.width // config.head) * tokens**2
 
 
 def _finite(count: float) -> float | None:
-    """For JSON, which has no nan."""
+    """None for nan, which JSON has no number for."""
     return count if math.isfinite(count) else None
 
 

@@ -1,13 +1,12 @@
-"""How fast the CPU rasteriser is, beside compositing with one thread a pixel in the same run.
+"""Benchmark of the CPU rasteriser, compared with per-pixel compositing in the same run.
 
-A cloud of Gaussians in a unit cube, seen whole; a frame is projection, colour, sorting, binning and compositing. Wall
-time is on all of torch's threads; processor time is that of one thread doing everything, which a busy machine changes
-little, and so is the number to compare.
+Random Gaussians in a unit cube fill the image; a frame is projection, colour, sorting, binning and compositing. Wall
+time is measured on all of torch's threads, CPU time on one thread; the latter depends little on other load and is the
+number to compare.
 """
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import time
@@ -23,22 +22,21 @@ from stages.core.geometry.cameras import intrinsics, look_at
 from stages.core.kernels.splat.projection import pack_camera, project
 from stages.core.kernels.splat.ssim import ssim, ssim_reference
 from stages.core.raster.rasterise import rasterise
-from stages.core.scene.files import replacing
 from stages.core.scene.gaussians import Gaussians
 from stages.lab.bench import common as bench
 from stages.lab.bench.raster_per_pixel import bin_into_tiles, composite_per_pixel
 
 FORWARD = ((100_000, 448), (100_000, 800), (300_000, 448), (300_000, 800))
 FORWARD_BACKWARD = ((50_000, 448), (100_000, 448))
-SSIM_SIZE = 448  # of the images whose similarity is measured [px]
+SSIM_SIZE = 448  # of the images of the SSIM benchmark [px]
 
 
 @dataclass(frozen=True)
 class RasterBenchOptions:
-    """`shrink` divides the numbers of Gaussians and pixels, for a quick look."""
+    """Repetitions and problem size."""
 
     repeat: int = 15  # timed calls of each, of which the fastest counts
-    shrink: int = 1
+    shrink: int = 1  # divides the numbers of Gaussians and pixels
 
     def __post_init__(self):
         if not 1 <= self.repeat <= 1000 or not 1 <= self.shrink <= 100:
@@ -47,7 +45,7 @@ class RasterBenchOptions:
 
 @dataclass(frozen=True)
 class RasterTiming:
-    """One comparison. Times in milliseconds: of the clock on `threads` threads, and of the processor on one."""
+    """One comparison [ms]: wall time on `threads` threads and CPU time on one, ours and the baseline's."""
 
     what: str
     gaussians: int
@@ -55,7 +53,7 @@ class RasterTiming:
     threads: int
     wall: float
     cpu: float
-    plain_wall: float
+    plain_wall: float  # per-pixel baseline
     plain_cpu: float
 
     def __str__(self) -> str:
@@ -68,7 +66,7 @@ class RasterTiming:
 
 
 def random_gaussians(n: int, seed: int = 0) -> Gaussians:
-    """n Gaussians in the unit cube around the origin, as large as fills it; SH degree 0."""
+    """n random Gaussians that fill the unit cube around the origin; SH degree 0."""
     rng = torch.Generator().manual_seed(seed)
     quats = torch.nn.functional.normalize(torch.randn(n, 4, generator=rng), dim=1)
     scales = 0.3 * n ** (-1 / 3) * torch.exp(0.5 * torch.randn(n, 3, generator=rng))
@@ -79,19 +77,19 @@ def random_gaussians(n: int, seed: int = 0) -> Gaussians:
 
 
 def view_camera(pixels: int) -> tuple[Tensor, Tensor]:
-    """World to camera, and intrinsics, of a square image that the cube fills."""
+    """Extrinsics (world to camera) and intrinsics of a square image that the cube fills."""
     return look_at(torch.tensor([1.6, 0.9, 0.8]), torch.zeros(3)), intrinsics(pixels, pixels, 1.4 * pixels)
 
 
 def render_per_pixel(g: Gaussians, viewmat: Tensor, K: Tensor, pixels: int) -> Tensor:
-    """Colour and depth (pixels, pixels, 4) before black."""
+    """Colour and depth (pixels, pixels, 4) on a black background, by the per-pixel baseline."""
     tensors = (g.means, g.quats, g.scales, g.opacities, g.sh)
     splats, keys, _ = project(pack_camera(viewmat, K, pixels, pixels, 0.01), *tensors)
     return composite_per_pixel(splats, bin_into_tiles(splats, keys, pixels, pixels))
 
 
 def wall_and_cpu_ms(call: Callable[[], object], repeat: int) -> tuple[float, float]:
-    """Wall time on torch's threads, and processor time on one [ms]: the fastest calls, for others slow them down."""
+    """Wall time on torch's threads and CPU time on one [ms], each the fastest of `repeat` calls."""
     call()
     wall = _fastest(call, time.perf_counter, repeat)
     threads = torch.get_num_threads()
@@ -112,7 +110,7 @@ def _fastest(call: Callable[[], object], clock: Callable[[], float], repeat: int
 
 
 def measure_forward(n: int, pixels: int, repeat: int) -> RasterTiming:
-    """A frame."""
+    """Forward pass."""
     g, (viewmat, K) = random_gaussians(n), view_camera(pixels)
     ours = lambda: rasterise(g, viewmat[None], K[None], pixels, pixels)  # noqa: E731
     plain = lambda: render_per_pixel(g, viewmat, K, pixels)  # noqa: E731
@@ -120,7 +118,7 @@ def measure_forward(n: int, pixels: int, repeat: int) -> RasterTiming:
 
 
 def measure_forward_backward(n: int, pixels: int, repeat: int) -> RasterTiming:
-    """A frame, and gradients of all that Gaussians have."""
+    """Forward and backward pass, with gradients of all Gaussian parameters."""
     g, (viewmat, K) = random_gaussians(n), view_camera(pixels)
     tensors = [t.requires_grad_() for t in (g.means, g.quats, g.scales, g.opacities, g.sh)]
     ours = lambda: rasterise(g, viewmat[None], K[None], pixels, pixels).rgb.sum()  # noqa: E731
@@ -130,7 +128,7 @@ def measure_forward_backward(n: int, pixels: int, repeat: int) -> RasterTiming:
 
 
 def measure_ssim(pixels: int, repeat: int) -> RasterTiming:
-    """Similarity of two pictures and its gradient, beside the same in plain PyTorch."""
+    """SSIM of two images and its gradient, compared with plain PyTorch."""
     rng = torch.Generator().manual_seed(0)
     first, second = (torch.rand(pixels, pixels, 3, generator=rng) for _ in range(2))
     first.requires_grad_()
@@ -146,7 +144,7 @@ def _row(what: str, n: int, pixels: int, ours: Callable, plain: Callable, repeat
 
 
 def run(out: Path | None = None, options: RasterBenchOptions = RasterBenchOptions()) -> Iterator[str]:  # noqa: B008 -- frozen
-    """Lines of the report; all numbers as JSON in `out`."""
+    """Yield the lines of the report; all results go to `out` as JSON."""
     yield bench.machine("cpu")
     by = options.shrink
     suites = (measure_forward, FORWARD), (measure_forward_backward, FORWARD_BACKWARD)
@@ -157,8 +155,6 @@ def run(out: Path | None = None, options: RasterBenchOptions = RasterBenchOption
         yield str(rows[-1])
     rows.append(measure_ssim(math.ceil(SSIM_SIZE / by), options.repeat))
     yield str(rows[-1])
-    if out is not None:
-        facts = {"command": "ngff-lab bench raster", "machine": bench.machine("cpu"), "load": os.getloadavg()[0]}
-        facts["times"] = f"ms, the fastest of {options.repeat} calls ({max(1, options.repeat // 3)} of the plain form)"
-        with replacing(out) as part:
-            part.write_text(json.dumps({**facts, "rows": [asdict(row) for row in rows]}, indent=1) + "\n")
+    times = f"ms, the fastest of {options.repeat} calls ({max(1, options.repeat // 3)} of the baseline)"
+    facts = {"load": os.getloadavg()[0], "times": times, "rows": [asdict(row) for row in rows]}
+    bench.write_results(out, "raster", "cpu", facts)

@@ -1,7 +1,7 @@
-"""The peer of the rasteriser's benchmark: compositing with one thread a pixel, forward and backward.
+"""Baseline of the rasteriser benchmark: compositing with one thread per pixel, forward and backward.
 
-This is how the GPU programs of the field are written, tiles of 16 x 16 pixels included; compiled for a CPU it is scalar
-code. Projection and sorting are ours, so that the difference is the compositing alone.
+This is the usual form of GPU rasterisers, with tiles of 16 x 16 pixels; compiled for a CPU it is scalar code.
+Projection and sorting are ours, so that only compositing differs.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from stages.core.kernels.splat.simd import even_bounds, launch_ranges, num_threa
 
 wp.set_module_options({"enable_backward": False})
 TILE = 16  # [px]
-GRADIENT_CHANNELS = 10  # of a splat that have a gradient: centre, inverse covariance, opacity, colour, depth
+GRADIENT_CHANNELS = 10  # channels of a splat that have a gradient: centre, inverse covariance, opacity, colour, depth
 
 
 @wp.func
@@ -63,7 +63,7 @@ def _backward(
     bin = (i // wp.static(TILE)) * across + j // wp.static(TILE)
     T = wp.float32(left[p])
     v = v_image[p]
-    behind = wp.float32(0.0)  # upstream times what lies behind, seen through
+    behind = wp.float32(0.0)  # upstream gradient times the colour composited behind
     k = wp.int32(ends[p])
     while k > starts[bin]:
         k -= 1
@@ -102,20 +102,20 @@ class _Blend(torch.autograd.Function):
     @staticmethod
     def backward(ctx, v_image):
         splats, left, ends = ctx.saved_tensors
-        grads = torch.zeros(num_threads(), len(splats), GRADIENT_CHANNELS)  # one table a thread, as ours
+        grads = torch.zeros(num_threads(), len(splats), GRADIENT_CHANNELS)  # one table per thread, as in our rasteriser
         v_image = v_image.reshape(-1, 4).contiguous()
         _launch(_backward, splats, ctx.bins, view(v_image, wp.vec4), view(left), view(ends), view(grads))
         return torch.nn.functional.pad(grads.sum(0), (0, splats.shape[1] - GRADIENT_CHANNELS)), None
 
 
 def _launch(kernel: wp.Kernel, splats: Tensor, bins: Bins, *views) -> None:
-    """The image's pixels in as many pieces as there are threads."""
+    """Launch over the image's pixels in as many pieces as there are threads."""
     inputs = [bins.width, bins.columns, view(splats), view(bins.members), view(bins.starts), *views]
     launch_ranges(kernel, even_bounds(bins.width * bins.height, num_threads()), inputs)
 
 
 def bin_into_tiles(splats: Tensor, keys: Tensor, width: int, height: int) -> Bins:
-    """Splats (n, 16) and their sort keys in tiles: every tile that the box around a splat touches."""
+    """Bin splats (n, 16) by their sort keys into every tile that their bounding box touches."""
     last = torch.tensor([(width - 1) // TILE, (height - 1) // TILE])
     centre, reach = splats[:, :2].detach(), splats[:, 11:13].detach()
     low, high = (((centre + sign * reach - 0.5) / TILE).floor().clamp(0 * last, last) for sign in (-1, 1))
@@ -123,5 +123,5 @@ def bin_into_tiles(splats: Tensor, keys: Tensor, width: int, height: int) -> Bin
 
 
 def composite_per_pixel(splats: Tensor, bins: Bins) -> Tensor:
-    """Composite (h, w, 4) of the four channels of splats (n, 16). Differentiable in the splats."""
+    """Composite the four channels of splats (n, 16) into an image (h, w, 4). Differentiable in the splats."""
     return _Blend.apply(splats, bins)

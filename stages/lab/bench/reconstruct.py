@@ -1,8 +1,8 @@
-"""How well photos become a scene: cameras against a reference, photos kept out, seconds and memory.
+"""Benchmark of reconstruction: camera errors against references, PSNR of held-out photos, time and memory.
 
-A photo set is a folder of photos, or a folder with photos in `images/` or `photos/`; beside them `cameras.json` (a
-nerfstudio transforms file) may hold reference cameras, and `truth.h5` says that their world is upright, its floor at
-the height given there. Each set is reconstructed in a process of its own, so that its peak memory is its own.
+A photo set is a folder of photos, or a folder with photos in `images/` or `photos/`. Next to them `cameras.json` (a
+nerfstudio transforms file) may hold reference cameras; with `truth.h5`, their world is upright and has the floor height
+given there. Each set is reconstructed in a subprocess, so that its peak memory is measured alone.
 """
 
 from __future__ import annotations
@@ -27,25 +27,24 @@ from stages.core.errors import InputError
 from stages.core.geometry.cameras import centres
 from stages.core.geometry.similarity import Similarity, umeyama
 from stages.core.scene.cameras import Cameras, read_cameras
-from stages.core.scene.files import replacing
 from stages.core.scene.scene_ply import read_scene
-from stages.lab.bench.common import machine
+from stages.lab.bench.common import machine, write_json
 
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class ReconstructBenchOptions:
-    """What the sets are reconstructed with."""
+    """Options of the reconstruction."""
 
     quality: str = "normal"
     holdout: int = 8
     device: str = "auto"
     matcher: str = "sift"
-    cameras: bool = False  # end with them: no Gaussians, to compare matchers
+    cameras: bool = False  # stop after the cameras, to compare matchers
 
     def key(self, folder: Path) -> str:
-        """The name of a set's row in the results."""
+        """Name of a set's row in the results."""
         matcher = "" if self.matcher == "sift" else f", {self.matcher}"
         cameras = ", cameras" if self.cameras else ""
         return f"{folder.resolve().name}, {self.quality}, {pick_device(self.device)}{matcher}{cameras}"
@@ -53,18 +52,18 @@ class ReconstructBenchOptions:
 
 @dataclass(frozen=True)
 class PoseError:
-    """Found cameras against reference cameras of the same photos."""
+    """Errors of estimated cameras against reference cameras of the same photos."""
 
-    cameras: int  # that both name
+    cameras: int  # number of photos in both
     rotation: float  # median over all pairs of photos of the error in their relative rotation [degrees]
     rotation_most: float  # the largest [degrees]
     shift: float  # RMS distance of centres after alignment by a similarity [% of the extent of the reference centres]
 
 
 def run(sets: list[Path], out: Path, options: ReconstructBenchOptions) -> Iterator[str]:
-    """A line a set, and all figures in a JSON file, which keeps the rows of sets that are not measured now.
+    """Yield a line for each set; all results go to the JSON file `out`, which keeps rows of other sets.
 
-    A set of which nothing can be made has a row that says why.
+    The row of a set that cannot be reconstructed holds the error message.
     """
     if not sets:
         raise InputError("name one or more photo sets: a folder with images/ and, if there are any, cameras.json")
@@ -77,19 +76,25 @@ def run(sets: list[Path], out: Path, options: ReconstructBenchOptions) -> Iterat
         except InputError as error:
             row = {"failed": str(error).removeprefix(f"{images}: ")}
         rows[options.key(folder)] = row
-        with replacing(out) as part:
-            part.write_text(json.dumps({"sets": rows}, indent=1) + "\n")
+        write_json(out, {"sets": rows})
         yield _line(folder.resolve().name, row)
 
 
 def measure_in_subprocess(folder: Path, images: Path, options: ReconstructBenchOptions) -> dict:
-    """measure() in a process of its own."""
-    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as process:
+    """`measure` in a subprocess."""
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(1, mp_context=context, initializer=_log_to_stderr) as process:
         return process.submit(measure, folder, images, options).result()
 
 
+def _log_to_stderr() -> None:
+    """Progress messages of a subprocess, which inherits no logging set-up."""
+    logging.basicConfig(format="%(message)s", level=logging.WARNING)
+    logging.getLogger("stages").setLevel(logging.INFO)
+
+
 def photo_folder(folder: Path) -> Path:
-    """Where the photos of a set are."""
+    """The folder of a set's photos. Raises InputError if there is no such set."""
     for name in ("images", "photos"):
         if (folder / name).is_dir():
             return folder / name
@@ -99,9 +104,7 @@ def photo_folder(folder: Path) -> Path:
 
 
 def measure(folder: Path, images: Path, options: ReconstructBenchOptions) -> dict:
-    """One set reconstructed and compared with what is known about it."""
-    logging.basicConfig(format="%(message)s", level=logging.WARNING)
-    logging.getLogger("stages").setLevel(logging.INFO)
+    """Reconstruct one set and compare it with what is known about it."""
     facts, found, floor = (_cameras if options.cameras else _scene)(images, options)
     device = pick_device(options.device)
     row = {**facts, "device": device, "cpu_seconds": time.process_time(), "machine": machine(device)}
@@ -117,7 +120,7 @@ def measure(folder: Path, images: Path, options: ReconstructBenchOptions) -> dic
 
 
 def _scene(images: Path, options: ReconstructBenchOptions) -> tuple[dict, Cameras, float | None]:
-    """The report of a whole reconstruction, its cameras, and the height of its floor."""
+    """The report of a full reconstruction, its cameras, and its floor height."""
     from stages.reconstruct.options import ReconstructOptions
     from stages.reconstruct.stage import run as reconstruct
 
@@ -132,7 +135,7 @@ def _scene(images: Path, options: ReconstructBenchOptions) -> tuple[dict, Camera
 
 
 def _cameras(images: Path, options: ReconstructBenchOptions) -> tuple[dict, Cameras, None]:
-    """The part of such a report that cameras have, and the cameras, in a world that is not yet upright."""
+    """The report of camera estimation alone, and the cameras, in a world that is not yet upright."""
     from stages.reconstruct import sfm
     from stages.reconstruct.options import ReconstructOptions
     from stages.reconstruct.photo_reader import read_photos
@@ -145,7 +148,10 @@ def _cameras(images: Path, options: ReconstructBenchOptions) -> tuple[dict, Came
 
 
 def pose_error(found: Cameras, reference: Cameras) -> PoseError:
-    """The relative rotation does not depend on any alignment; centres are aligned by least squares."""
+    """Errors of relative rotations, which need no alignment, and of centres aligned by a similarity.
+
+    Raises InputError for fewer than 3 common photos.
+    """
     a, b = matched_cameras(found, reference)
     turns = []
     for R in (a.viewmats[:, :3, :3].double(), b.viewmats[:, :3, :3].double()):
@@ -160,8 +166,8 @@ def pose_error(found: Cameras, reference: Cameras) -> PoseError:
 def upright_error(found: Cameras, reference: Cameras, floor: float, true_floor: float) -> tuple[float, float]:
     """Angle between the found and the true vertical [degrees], and the floor's error in height [% of scene size].
 
-    The worlds are brought together by all cameras, turns included; the scene's size is twice the distance of the
-    cameras from their middle. The height is compared below the middle of the cameras.
+    The worlds are aligned by the positions and orientations of all cameras. The scene size is twice the mean distance
+    of the cameras from their centroid, below which the floor heights are compared.
     """
     a, b = matched_cameras(found, reference)
     move = camera_similarity(a.viewmats.double(), b.viewmats.double())
@@ -174,7 +180,7 @@ def upright_error(found: Cameras, reference: Cameras, floor: float, true_floor: 
 
 
 def camera_similarity(source: Float[Tensor, "n 4 4"], target: Float[Tensor, "n 4 4"]) -> Similarity:
-    """From one world to the other, by centres and by points to the right, below and ahead of them."""
+    """Similarity between two worlds, fitted to camera centres and to points along the axes of each camera."""
     points = []
     for viewmats in (source, target):
         eyes = centres(viewmats)
@@ -184,7 +190,7 @@ def camera_similarity(source: Float[Tensor, "n 4 4"], target: Float[Tensor, "n 4
 
 
 def matched_cameras(found: Cameras, reference: Cameras) -> tuple[Cameras, Cameras]:
-    """Cameras of both, of the same photos in the same order."""
+    """The cameras of photos in both, in the same order. Raises InputError for fewer than 3."""
     row = {name: i for i, name in enumerate(reference.names)}
     both = [name for name in found.names if name in row]
     if len(both) < 3:
@@ -193,7 +199,7 @@ def matched_cameras(found: Cameras, reference: Cameras) -> tuple[Cameras, Camera
 
 
 def rotation_angle(R: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b"]:
-    """Of a rotation [degrees]."""
+    """Angle of a rotation [degrees]."""
     cosine = (R.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2
     return torch.rad2deg(torch.acos(cosine.clamp(-1, 1)))
 

@@ -1,4 +1,4 @@
-"""A scene of known truth as a user would have it: photographed, reconstructed, and what became of its objects."""
+"""Reconstruction of a synthetic scene from rendered photos, and the labels of what its cameras see."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from stages.core.scene.scene_ply import read_scene
 from stages.reconstruct.options import ReconstructOptions
 from stages.reconstruct.stage import run as reconstruct
 
-BACKDROP = torch.tensor([0.62, 0.66, 0.70])  # colour behind the table
+BACKDROP = torch.tensor([0.62, 0.66, 0.70])  # background colour of the photos
 
 
 def reconstruct_from_renders(scene: Scene, folder: Path, options: ReconstructOptions = ReconstructOptions()) -> Scene:  # noqa: B008
-    """What `reconstruct` makes of photos from the scene's cameras, which it is not told; both are left in `folder`."""
+    """Render photos from the scene's cameras and reconstruct them with unknown cameras; both are left in `folder`."""
     photos = folder / "photos"
     photos.mkdir(parents=True)
     for i, name in enumerate(tqdm(scene.cameras.names, desc="photos", unit="photo", leave=False)):
@@ -33,7 +33,7 @@ def reconstruct_from_renders(scene: Scene, folder: Path, options: ReconstructOpt
 
 
 def visible_labels(scene: Scene, names: Sequence[str]) -> Int[Tensor, "p"]:
-    """The object whose Gaussian weighs most in each pixel, of the views with these names, one after the other."""
+    """Object number of the Gaussian with the largest weight in each pixel, over the named views in turn."""
     out = []
     for name in names:
         i = scene.cameras.names.index(name)

@@ -1,12 +1,11 @@
-"""What is left where objects are lifted away, on scenes whose truth is known, from views that no photo had.
+"""Benchmark of hole filling under objects, on synthetic scenes, from views that no photo had.
 
-The table under five objects is taken out where no camera sees it; `refine` fills it; then the objects are taken away
-and the table is compared with the true one in the pixels of the holes.
+The table under five objects is removed where no camera sees it and filled by `refine`; then the objects are removed and
+the table is compared with the true one in the pixels of the holes.
 """
 
 from __future__ import annotations
 
-import json
 import math
 import time
 from collections.abc import Iterator
@@ -22,7 +21,6 @@ from stages.core.errors import InputError
 from stages.core.geometry.cameras import orbit
 from stages.core.perception.visibility import downscaled_views
 from stages.core.raster.rasterise import rasterise, visibility
-from stages.core.scene.files import replacing
 from stages.core.scene.gaussians import Gaussians
 from stages.core.scene.scene import Scene
 from stages.lab.assets.backgrounds import TABLE_HEIGHT
@@ -31,15 +29,15 @@ from stages.lab.bench import common as bench
 from stages.refine.options import RefineOptions
 from stages.refine.stage import refine
 
-NOVEL_VIEWS = 4  # from higher than the photos
-MAX_HIDDEN_WEIGHT = (
-    0.02  # weight in every photo below which a Gaussian of the table was not seen [px of the small images]
-)
-MIN_TABLE_ALPHA = 0.9  # alpha of a table that is there
+NOVEL_VIEWS = 4  # views from above the photos' cameras
+MAX_HIDDEN_WEIGHT = 0.02  # a table Gaussian of less weight in every photo was not seen [px]
+MIN_TABLE_ALPHA = 0.9  # alpha of a pixel that shows the table
 
 
 @dataclass(frozen=True)
 class RefineBenchOptions:
+    """Number of scenes and of photos each."""
+
     scenes: int = 4
     photos: int = 24
 
@@ -50,7 +48,7 @@ class RefineBenchOptions:
 
 @torch.no_grad()
 def remove_unseen_background(scene: Scene) -> Scene:
-    """Without what of the background no camera sees."""
+    """The scene without background Gaussians that no camera sees."""
     g = scene.gaussians
     weight = torch.zeros(len(g))
     for viewmat, K, width, height in downscaled_views(scene.cameras):
@@ -60,7 +58,7 @@ def remove_unseen_background(scene: Scene) -> Scene:
 
 @torch.no_grad()
 def render_background(g: Gaussians, views: Float[Tensor, "c 4 4"], scene: Scene) -> tuple[Tensor, Tensor]:
-    """Pictures (c, h, w, 3) and alpha (c, h, w) of the background, from views with the scene's lenses."""
+    """Images (c, h, w, 3) and alpha (c, h, w) of the background alone, with the scene's intrinsics."""
     width, height = (int(side) for side in scene.cameras.sizes[0])
     Ks = scene.cameras.Ks[:1].expand(len(views), 3, 3)
     drawn = rasterise(g[g.object_id == 0], views, Ks, width, height)
@@ -68,22 +66,22 @@ def render_background(g: Gaussians, views: Float[Tensor, "c 4 4"], scene: Scene)
 
 
 def masked_psnr(one: Float[Tensor, "c h w 3"], two: Float[Tensor, "c h w 3"], where: Bool[Tensor, "c h w"]) -> float:
-    """In some of the pixels [dB]."""
+    """PSNR over the masked pixels [dB]."""
     return -10 * math.log10(max(float((one - two)[where].square().mean()), 1e-10))
 
 
 def measure(index: int, photos: int) -> dict:
-    """One scene; the objects' own labels are the true ones."""
+    """Metrics of one scene, with the true object labels."""
     scene = tabletop("apart", index, photos)
     seen = remove_unseen_background(scene)
     start = time.perf_counter()
-    refined = refine(seen, RefineOptions(completer="none"))  # the objects go anyway
+    refined = refine(seen, RefineOptions(completer="none"))  # objects are removed anyway
     took = time.perf_counter() - start
     views = orbit(NOVEL_VIEWS, torch.tensor([0.0, 0, TABLE_HEIGHT]), CAMERA_DISTANCE, 60.0, azimuth=10.0)
     true, _ = render_background(scene.gaussians, views, scene)
     before, _ = render_background(seen.gaussians, views, scene)
     after, _ = render_background(refined.gaussians, views, scene)
-    # through a hole one sees the floor, so the table top alone says where the holes are
+    # the floor shows through a hole, so the holes are where the table top alone is transparent
     tops = (g[g.means[:, 2] > TABLE_HEIGHT - 0.02] for g in (scene.gaussians, seen.gaussians))
     whole, left = (render_background(top, views, scene)[1] for top in tops)
     hole = (whole > MIN_TABLE_ALPHA) & (left < MIN_TABLE_ALPHA)
@@ -96,7 +94,7 @@ def measure(index: int, photos: int) -> dict:
 
 
 def run(out: Path | None = None, options: RefineBenchOptions = RefineBenchOptions()) -> Iterator[str]:  # noqa: B008 -- frozen
-    """Lines of the report; all numbers as JSON in `out`."""
+    """Yield the lines of the report; all results go to `out` as JSON."""
     yield bench.machine("cpu")
     rows = []
     for i in tqdm(range(options.scenes), unit="scene"):
@@ -104,9 +102,6 @@ def run(out: Path | None = None, options: RefineBenchOptions = RefineBenchOption
         r = rows[-1]
         yield (
             f"scene {i}: PSNR of the holes from new views {r['before_db']:.1f} dB open, {r['after_db']:.1f} dB filled; "
-            f"elsewhere as before to {r['elsewhere_db']:.1f} dB; {r['seconds']:.0f} s"
+            f"elsewhere unchanged to {r['elsewhere_db']:.1f} dB; {r['seconds']:.0f} s"
         )
-    if out is not None:
-        facts = {"command": "ngff-lab bench refine", "machine": bench.machine("cpu")}
-        with replacing(out) as part:
-            part.write_text(json.dumps({**facts, "scenes": rows}, indent=1) + "\n")
+    bench.write_results(out, "refine", "cpu", {"scenes": rows})

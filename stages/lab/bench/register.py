@@ -1,7 +1,8 @@
-"""Registration of a part of an object to the whole, beside plain ICP and the package splatreg, on the same parts.
+"""Benchmark of registering a partial object to the whole, compared with plain ICP and the package splatreg.
 
-A part lacks 40 % of the surface, cut off along a plane or bitten out around a point, has noise, and is turned, scaled
-and shifted at random. Right is 2 degrees, 2 % of scale and 1 % of the diameter, up to the symmetry of what is seen.
+A part lacks 40 % of the surface, cut off by a plane or removed around a point, is noisy, and has a random pose and
+scale. A registration within 2 degrees, 2 % of scale and 1 % of the diameter counts as correct, up to the symmetry of
+the visible part.
 """
 
 from __future__ import annotations
@@ -36,36 +37,36 @@ SURFACES_OF_REVOLUTION = (
     "ball",
     "bowl",
     "can",
-)  # their shape is one of revolution about z; what is painted on them is not
-MAX_SYMMETRY_RESIDUAL = 0.002  # rms change of place and colour that a turn about z may make unnoticed [diameters]
-SPLATREG_GAUSSIANS = 400  # Gaussians that splatreg is given of each; its time grows with the square
-SPLATREG_RADIUS = (
-    0.14  # rms radius of the object that splatreg's tolerances, such as 2 cm for an inlier, are made for [m]
-)
+)  # about z, in shape but not in colour
+MAX_SYMMETRY_RESIDUAL = 0.002  # RMS change of positions and colours by a symmetry [diameters]
+SPLATREG_GAUSSIANS = 400  # of each cloud given to splatreg; its time grows with their square
+SPLATREG_RADIUS = 0.14  # RMS radius that splatreg's absolute tolerances suit [m]
 
 
 @dataclass(frozen=True)
 class RegisterBenchOptions:
-    only: str = ""  # names with commas between; empty: all ten objects
-    trials: int = 10  # of each object
-    missing: float = 0.4  # share of the surface
-    noise: float = 0.01  # standard deviation of place [diameters]
-    tint: float = 0.02  # standard deviation of colour [0..1]
+    """Objects, number of trials and the damage to each part."""
+
+    only: str = ""  # names separated by commas; empty: all ten objects
+    trials: int = 10  # parts of each object
+    missing: float = 0.4  # fraction of the surface
+    noise: float = 0.01  # standard deviation of positions [diameters]
+    tint: float = 0.02  # standard deviation of colours [0..1]
     seed: int = 0
-    device: str = "auto"  # where the Gaussians are
+    device: str = "auto"  # of the Gaussians
 
 
 @dataclass(frozen=True)
 class RegistrationTrial:
-    """A part of an object, and where the whole would have to be put."""
+    """A part of an object, and the true pose of the whole."""
 
     part: Gaussians
     truth: Similarity  # whole to part
-    seen: Float[Tensor, "k"]  # rows of the whole that the part is made of
+    seen: Float[Tensor, "k"]  # indices of the part in the whole
 
 
 def make_trial(whole: Gaussians, number: int, options: RegisterBenchOptions) -> RegistrationTrial:
-    """Odd numbers are bitten, even ones cut."""
+    """A random part; odd numbers lack the surroundings of a point, even ones a side of a plane."""
     rng = torch.Generator().manual_seed(1000 * options.seed + number)
     x, across = whole.means, diameter(whole.means)
     if number % 2:
@@ -83,10 +84,10 @@ def make_trial(whole: Gaussians, number: int, options: RegisterBenchOptions) -> 
 
 
 def errors(found: Similarity, trial: RegistrationTrial, whole: Gaussians, revolved: bool) -> dict[str, float]:
-    """Rotation [deg], scale [%], shift of the object's middle [% of its diameter], and rotation up to symmetry."""
+    """Errors of rotation [deg], scale [%], position [% of the diameter], and rotation up to symmetry [deg]."""
     middle = (whole.means.amin(0) + whole.means.amax(0)) / 2
     shift = float((found(middle) - trial.truth(middle)).norm()) / (trial.truth.scale * diameter(whole.means))
-    R = found.rotation.mT @ trial.truth.rotation  # truth, then back by what was found: the identity where it is right
+    R = found.rotation.mT @ trial.truth.rotation  # the identity where the registration is exact
     turned = rotation_angle(R)
     out = {"rotation": turned, "scale": 100 * abs(found.scale / trial.truth.scale - 1), "shift": 100 * shift}
     about = nearest_z_rotation(R)
@@ -97,12 +98,12 @@ def errors(found: Similarity, trial: RegistrationTrial, whole: Gaussians, revolv
 
 
 def rotation_angle(R: Float[Tensor, "3 3"]) -> float:
-    """Of a rotation [deg]."""
+    """Angle of a rotation [deg]."""
     return float(torch.rad2deg(((R.trace() - 1) / 2).clamp(-1, 1).arccos()))
 
 
 def nearest_z_rotation(R: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
-    """The turn about z nearest to a rotation."""
+    """The rotation about z nearest to a rotation."""
     c, s = R[0, 0] + R[1, 1], R[1, 0] - R[0, 1]
     turn = torch.eye(3)
     turn[:2, :2] = torch.stack([torch.stack([c, -s]), torch.stack([s, c])]) / (c * c + s * s).sqrt().clamp_min(1e-9)
@@ -110,9 +111,9 @@ def nearest_z_rotation(R: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
 
 
 def symmetry_residual(whole: Gaussians, seen: Float[Tensor, "k"], turn: Float[Tensor, "3 3"]) -> float:
-    """Rms by which the seen part, turned, differs from the whole in place and colour [diameters].
+    """RMS difference in position and colour between the rotated visible part and the whole [diameters].
 
-    One half of the Gaussians is held against the other; what they differ by without a turn is taken off.
+    One half of the Gaussians is compared with the other; their difference without rotation is subtracted.
     """
     joint = torch.cat([whole.means / diameter(whole.means), cloud_colours(whole.sh[:, 0] * C0 + 0.5)], 1)
     mine = joint[seen[seen % 2 == 0]]
@@ -137,7 +138,7 @@ def icp(part: Gaussians, whole: Gaussians, seed: int = 0) -> Similarity:
 
 
 def _iterate(pose: Similarity, x: Tensor, y: Tensor, tree: cKDTree, rounds: int) -> tuple[float, Similarity]:
-    """Mean squared distance in the part's units, and the pose after some rounds."""
+    """Mean squared distance in the part's units, and the pose after some iterations."""
     for _ in range(rounds):
         distance, index = tree.query(pose(x).numpy())
         pose = umeyama(x, y[torch.from_numpy(index)])
@@ -154,16 +155,17 @@ def _right_angles() -> Iterator[Float[Tensor, "3 3"]]:
 
 
 def ours(part: Gaussians, whole: Gaussians, seed: int = 0) -> Similarity:
+    """Our registration; the identity where it finds none."""
     found = register(part, whole, seed)
     return found.similarity.to("cpu") if found else Similarity(1.0, torch.eye(3), torch.zeros(3))
 
 
 def splatreg(part: Gaussians, whole: Gaussians, seed: int = 0) -> Similarity:
-    """The package's pose of a known object that is seen in part, with scale.
+    """Pose and scale by the package splatreg.
 
-    `features` is the start it has for parts. The others end in least squares that count on the whole being there, and
-    shrink or blow up what they are given. Its sweep over rotations keeps the scale at which it starts, so both are
-    given in one size; on one thread, as its products are so small that two threads take several times as long.
+    `init="features"` is its initialisation for partial objects; the others assume that the whole is visible and diverge
+    in scale. Its sweep over rotations keeps the initial scale, so both clouds are scaled to one size. It runs on one
+    thread: its products are so small that two threads take several times as long.
     """
     from splatreg import Gaussians as Theirs
     from splatreg import estimate_object_pose
@@ -191,9 +193,9 @@ if find_spec("splatreg"):
 
 
 def run(out: Path | None, options: RegisterBenchOptions = RegisterBenchOptions()) -> Iterator[str]:  # noqa: B008 -- frozen
-    """Measure every method on the same parts; a line for each object, and all trials as JSON."""
+    """Register the same parts with every method; yield a line for each object. All trials go to `out` as JSON."""
     names, compared, device = ObjectsOptions(options.only).names, METHODS, pick_device(options.device)
-    yield f"{'right of ' + str(options.trials):14}" + "".join(f"{name:>12}" for name in compared)
+    yield f"{'correct of ' + str(options.trials):14}" + "".join(f"{name:>12}" for name in compared)
     rows = []
     for name in names:
         whole = make_object(name)
@@ -201,7 +203,7 @@ def run(out: Path | None, options: RegisterBenchOptions = RegisterBenchOptions()
             given = make_trial(whole, number, options)
             part, there = given.part.to(device), whole.to(device)
             if device != "cpu" and not rows:
-                ours(part, there)  # not timed: the first call on a GPU loads its libraries and kernels
+                ours(part, there)  # warm-up: the first call on a GPU loads libraries and kernels
             for method, function in compared.items():
                 start = time.perf_counter(), time.process_time()
                 found = function(part, there, number)
@@ -213,7 +215,7 @@ def run(out: Path | None, options: RegisterBenchOptions = RegisterBenchOptions()
     summary = {m: summarise([r for r in rows if r["method"] == m]) for m in compared}
     yield from (f"{m}: {json.dumps(facts)}" for m, facts in summary.items())
     if "splatreg" not in compared:
-        yield "splatreg is not installed and left out; `pip install --no-deps splatreg` adds it (all it needs is here)"
+        yield "splatreg is not installed and left out; install it by `pip install --no-deps splatreg`"
     if out:
         facts = {"machine": bench.machine(device), "options": asdict(options), "limits": LIMITS, "summary": summary}
         if "splatreg" in compared:
@@ -231,7 +233,7 @@ def _placed(row: dict) -> bool:
 
 
 def summarise(rows: list[dict]) -> dict[str, float]:
-    """Shares within the limits, medians, and the time of a trial."""
+    """Fractions of correct trials, median errors and times."""
     middle = {k: round(float(torch.tensor([r[k] for r in rows]).median()), 3)
               for k in ("rotation", "scale", "shift", "seconds", "CPU seconds")}  # fmt: skip
     right = [_right(r) for r in rows]

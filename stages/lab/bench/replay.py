@@ -1,9 +1,9 @@
-"""A recorded run of the public MPM solver, run again by ours: same stress, damping, walls and grid.
+"""Replay of a recorded run of the public MPM solver with ours: same stress, damping, walls and grid.
 
 A recording is an NPZ with positions (t, p, 3) in grid coordinates, n (particles of each body, in order), volume (p),
 E and rho (one a body), nu, dt, substeps_per_frame, n_grid, grid_lim, gravity and rpic_damping. The public solver:
 fixed corotated stress; the affine part of the transfers damped by rpic_damping; in the three outermost layers of
-nodes a velocity that points outwards loses its normal part, and a tenth of the rest, every substep.
+nodes a velocity that points outwards loses its normal component, and a tenth of the tangential one, every substep.
 """
 
 from __future__ import annotations
@@ -29,12 +29,14 @@ log = logging.getLogger(__name__)
 RECORDING_FIELDS = {"positions", "n", "volume", "E", "rho", "nu", "dt", "substeps_per_frame", "n_grid", "grid_lim", 
                     "gravity", "rpic_damping"}  # fmt: skip
 WALL_LAYERS = 3  # layers of nodes outside the walls
-WALL_DAMPING = 0.9  # of the velocity along a wall, every substep
-CONTACT_DEVIATION = 1e-3  # of the drop height: a body further than this from free fall has touched something
+WALL_DAMPING = 0.9  # factor on the tangential velocity at a wall, every substep
+CONTACT_DEVIATION = 1e-3  # deviation from free fall that shows a contact [drop heights]
 
 
 @dataclass(frozen=True)
 class ReplayOptions:
+    """Length and device of the run."""
+
     frames: int = 0  # of the recording, the first counted; 0: all
     device: str = "auto"
 
@@ -45,16 +47,16 @@ class ReplayOptions:
 
 @dataclass(frozen=True)
 class ReplayErrors:
-    """How two runs of the same scene differ, in shares of the drop height."""
+    """Differences between two runs of one scene, in drop heights."""
 
-    drop: float  # the longest way down of a centre of mass [m]
-    contact: int  # frame in which a body first departs from free fall
-    com: Tensor  # (t, o) distance of centres of mass
-    particles: Tensor  # (t) largest distance of a particle; to be read before the first contact
+    drop: float  # largest descent of a centre of mass [m]
+    contact: int  # first frame in which a body deviates from free fall
+    com: Tensor  # (t, o) distances between centres of mass
+    particles: Tensor  # (t) largest distance between particles; meaningful before the first contact
 
 
 def read_recording(path: Path) -> dict[str, np.ndarray]:
-    """The recording's fields. InputError when it is none."""
+    """The fields of a recording. Raises InputError for a file that is none."""
     must_exist(path, "a recording (.npz) with " + ", ".join(sorted(RECORDING_FIELDS)))
     try:
         with np.load(path) as file:
@@ -73,7 +75,7 @@ def read_recording(path: Path) -> dict[str, np.ndarray]:
 
 
 def make_solver(data: dict[str, np.ndarray], device: str) -> mpm.Solver:
-    """Our solver at the first frame, with nodes where the public solver has them."""
+    """Our solver at the first frame, with grid nodes where the public solver has them."""
     n = torch.from_numpy(data["n"]).long()
     each = {k: torch.from_numpy(data[k]).float().repeat_interleave(n) for k in ("E", "rho")}
     x = torch.from_numpy(data["positions"][0]).float()
@@ -81,14 +83,14 @@ def make_solver(data: dict[str, np.ndarray], device: str) -> mpm.Solver:
     particles = mpm.at_rest(x, torch.from_numpy(data["volume"]).float(), each["rho"], each["E"],
                             float(data["nu"]) * full, 0 * full, 0 * full, COROTATED)  # fmt: skip
     dx = float(data["grid_lim"]) / int(data["n_grid"])
-    # nodes up to PADDING - 1 feel the lower walls there, nodes from n_grid - PADDING on the upper ones
+    # the lower walls act on nodes up to WALL_LAYERS - 1, the upper ones on nodes from n_grid - WALL_LAYERS on
     low, high = (WALL_LAYERS - 1 + mpm.FLOOR_GAP) * dx, (int(data["n_grid"]) - WALL_LAYERS - mpm.FLOOR_GAP) * dx
     return mpm.Solver(particles, mpm.Box((low,) * 3, (high,) * 3, tangential_retention=WALL_DAMPING), dx, device,
                       damping=float(data["rpic_damping"]))  # fmt: skip
 
 
 def simulate(data: dict[str, np.ndarray], frames: int, device: str) -> Iterator[Tensor]:
-    """Positions (p, 3) of our run, frame by frame, the first as recorded."""
+    """Positions (p, 3) of our run, frame by frame, from the first recorded frame. Raises InputError on divergence."""
     solver = make_solver(data, device)
     steps = int(data["substeps_per_frame"])
     push = torch.from_numpy(data["gravity"]).float().repeat(len(solver.rows), 1).to(device)
@@ -102,7 +104,7 @@ def simulate(data: dict[str, np.ndarray], frames: int, device: str) -> Iterator[
 
 
 def compare(data: dict[str, np.ndarray], ours: Tensor) -> ReplayErrors:
-    """Our positions (t, p, 3) beside the recorded ones."""
+    """Compare our positions (t, p, 3) with the recorded ones."""
     theirs = torch.from_numpy(data["positions"])
     bodies = [part.double() for part in theirs.split(data["n"].tolist(), 1)]
     com = torch.stack([b.mean(1) for b in bodies], 1)
@@ -122,7 +124,7 @@ def compare(data: dict[str, np.ndarray], ours: Tensor) -> ReplayErrors:
 
 
 def report(c: ReplayErrors) -> Iterator[str]:
-    """A line a frame, and what they come to."""
+    """A line for each frame, and a summary."""
     yield f"drop height {c.drop:.3f} m; first contact in frame {c.contact}; errors in % of the drop height"
     for frame, row in enumerate(c.com.tolist()):
         yield f"frame {frame:3d}: centres of mass " + " ".join(f"{100 * e:7.3f}" for e in row)
@@ -134,7 +136,7 @@ def report(c: ReplayErrors) -> Iterator[str]:
 
 
 def run(recording: Path, out: Path, options: ReplayOptions = ReplayOptions()) -> Iterator[str]:  # noqa: B008 -- frozen
-    """RECORDING.npz -> OURS.npz, with a report."""
+    """Replay RECORDING.npz into OURS.npz and yield the lines of a report."""
     data = read_recording(recording)
     frames = options.frames or len(data["positions"])
     if frames > len(data["positions"]):

@@ -1,8 +1,8 @@
-"""How long a rollout takes: our force field, beside the published one as published and MPM, in one run.
+"""Benchmark of rollout time: our force field, compared with the published model and MPM in the same run.
 
-Three ellipsoids fall onto each other and onto the floor, 100 steps of 0.02 s. Counted is all that a new scene needs
-from its keypoints at rest to its keypoints in every frame: preparing, contact search, networks, integration; Gaussians
-are not moved. Recording a graph, done once for a model and a size of scene, is stated apart.
+Three ellipsoids fall onto each other and onto the floor, 100 steps of 0.02 s. The time covers everything from the
+keypoints of a new scene at rest to its keypoints in every frame: precomputation, contact search, networks, integration;
+Gaussians are not moved. Recording a CUDA graph, once for a model and a problem size, is reported separately.
 """
 
 from __future__ import annotations
@@ -25,23 +25,22 @@ from stages.core.models import checkpoints as weights
 from stages.core.models.dynamics import FRAME, Dynamics
 from stages.core.models.initial_conditions import InitialConditions
 from stages.core.models.rollout import TimeStepper, record_frames
-from stages.core.scene.files import replacing
 from stages.lab.bench import common as bench
 from stages.lab.bench import mpm as bench_mpm
 
 log = logging.getLogger(__name__)
 SCENE_OBJECTS = 3
-PEER = "ngff-paper, step by step"  # as published
+PEER = "ngff-paper, step by step"  # the baseline, as published
 
 
 @dataclass(frozen=True)
 class RolloutBenchOptions:
-    """`scenes` at once; none: 1 and, on a GPU, 64."""
+    """Model and size of the rollouts."""
 
-    weights: Path | None = None  # of our force field; those that ship
+    weights: Path | None = None  # of our force field; None: the shipped ones
     keypoints: int = 2048  # of an object
     steps: int = 100
-    scenes: tuple[int, ...] = ()
+    scenes: tuple[int, ...] = ()  # batch sizes; empty: 1 and, on a GPU, 64
     repeat: int = 5  # timed rollouts, of which the median counts
     device: str = "auto"
 
@@ -51,7 +50,7 @@ class RolloutBenchOptions:
 
 
 def ellipsoids(scenes: int, keypoints: int) -> InitialConditions:
-    """Copies of one scene: shells of ellipsoids above each other, the lowest a palm above the floor."""
+    """Copies of one scene of three ellipsoidal shells above each other and above the floor."""
     rng = torch.Generator().manual_seed(0)
     ball = torch.nn.functional.normalize(torch.randn(SCENE_OBJECTS, keypoints, 3, generator=rng), dim=-1)
     place = torch.tensor([[0.0, 0.0, -0.7], [0.1, 0.05, -0.35], [-0.1, 0.0, 0.02]])
@@ -61,11 +60,11 @@ def ellipsoids(scenes: int, keypoints: int) -> InitialConditions:
 
 
 def run(out: Path, options: RolloutBenchOptions = RolloutBenchOptions()) -> Iterator[str]:
-    """Lines of the report; the figures go to a JSON file, which keeps those of the other kind of device."""
+    """Yield the lines of the report; results go to the JSON file `out`, which keeps those of other devices."""
     device = pick_device(options.device)
     model, card = weights.load(weights.find("ngff", options.weights), device)
     torch.manual_seed(0)
-    paper = weights.build("ngff-paper").to(device).eval()  # untrained: a step takes as long
+    paper = weights.build("ngff-paper").to(device).eval()  # untrained: a step takes the same time
     yield bench.machine(device)
     facts = {
         "machine": bench.machine(device), "threads": torch.get_num_threads(),
@@ -78,18 +77,17 @@ def run(out: Path, options: RolloutBenchOptions = RolloutBenchOptions()) -> Iter
         group = list(_measured(model, paper, scenes, device, options))
         yield from table(group)
         facts["rows"] += group
-        with replacing(out) as part:
-            part.write_text(json.dumps({**known, device.partition(":")[0]: facts}, indent=1) + "\n")
+        bench.write_json(out, {**known, device.partition(":")[0]: facts})
 
 
 def _measured(
     model: Dynamics, paper: Dynamics, scenes: int, device: str, options: RolloutBenchOptions
 ) -> Iterator[dict]:
-    """One row each way of rolling out so many scenes."""
+    """A row for each model and way of rolling out a batch of scenes."""
     start, count = ellipsoids(scenes, options.keypoints).to(device), options.steps + 1
     plain = rollout_stepwise(model, start, count)
     yield _row("ngff, step by step", scenes, lambda: rollout_stepwise(model, start, count), device, options.repeat)
-    for precision in ("highest", "high") if device != "cpu" else ():  # products as exact as sums, or in tf32
+    for precision in ("highest", "high") if device != "cpu" else ():  # FP32 or TF32 matrix products
         torch.set_float32_matmul_precision(precision)
         began = time.perf_counter()
         stepper = TimeStepper(model, start)
@@ -115,7 +113,7 @@ def _measured(
 
 @torch.no_grad()
 def rollout_stepwise(model: Dynamics, start: InitialConditions, count: int) -> Float[Tensor, "b t o n 3"]:
-    """A rollout as any code would do it."""
+    """A rollout step by step, without a CUDA graph. [m]"""
     return model.rollout(start, count, FRAME)
 
 
@@ -125,7 +123,7 @@ def _again(stepper: TimeStepper, start: InitialConditions, count: int) -> Float[
 
 
 def _row(what: str, scenes: int, function: Callable[[], object], device: str, repeat: int) -> dict:
-    """Median wall time, and, where other programs may take turns, the processor's time, of which the least counts."""
+    """A row with the median wall time and, on a CPU, the minimum CPU time."""
     function()
     wall, cpu = [], []
     for _ in range(repeat):
@@ -137,15 +135,15 @@ def _row(what: str, scenes: int, function: Callable[[], object], device: str, re
 
 
 def table(rows: list[dict]) -> list[str]:
-    """A line for each row; times are compared with the published model's as published."""
+    """A line for each row; speeds are relative to the published model, step by step."""
     peer = next(row["seconds"] for row in rows if row["what"] == PEER)
     lines = []
     for row in rows:
         more = []
         if "processor_seconds" in row:
-            more.append(f"{row['processor_seconds']:.2f} s of processor")
+            more.append(f"{row['processor_seconds']:.2f} s of CPU time")
         if "ready_seconds" in row:
-            more.append(f"once before: {row['ready_seconds']:.1f} s; strays {row['strays_m']:.1e} m")
+            more.append(f"set-up: {row['ready_seconds']:.1f} s; deviates by {row['strays_m']:.1e} m")
         lines.append(
             f"{row['scenes']:>4} x {row['what']:32}{row['seconds']:10.4f} s {peer / row['seconds']:8.2f}x the speed of "
             f"{PEER}" + "".join(f"; {text}" for text in more)

@@ -1,9 +1,9 @@
-"""How well `segment` finds objects on scenes whose truth is known: intersection over union of each object.
+"""Benchmark of `segment` on synthetic scenes: intersection over union (IoU) with each true object.
 
-The scenes are five of the ten objects on one of the eight tables, apart or touching; `segment` gets the true Gaussians
-without their labels, and the cameras. Masks are the true ones, or true ones made wrong, to see what the vote over views
-makes of them; beside it stands the same without a vote. SAM 2.1 takes part where its weights are here. On request
-photos of each scene are reconstructed, and overlaps are counted in pixels of what is found there.
+A scene has five of the ten objects on one of the eight tables, apart or touching; `segment` gets the true Gaussians
+without labels, and the cameras. Label images are the true ones or corrupted ones; the vote over views is compared with
+labels without a vote. SAM 2.1 is included where its weights are installed. On request rendered photos of each scene are
+reconstructed and segmented, and the IoU is measured in pixels.
 """
 
 from __future__ import annotations
@@ -23,7 +23,6 @@ from tqdm import tqdm
 
 from stages.core.backends import choose, load
 from stages.core.errors import InputError
-from stages.core.scene.files import replacing
 from stages.core.scene.scene import Scene
 from stages.lab.assets.tabletops import ARRANGEMENTS, tabletop
 from stages.lab.bench import common as bench
@@ -33,19 +32,19 @@ from stages.segment.geometric import segment
 from stages.segment.options import BACKENDS, SegmentOptions
 from stages.segment.voting import ViewFootprint, add_votes, apply_votes, damp_votes
 
-ERROR_RATES = (0.0, 0.2, 0.4)  # of each photo's objects and pixels
-MASK_SHIFT = 20  # by which masks of a wholly wrong photo are off, typically
+ERROR_RATES = (0.0, 0.2, 0.4)  # fraction of wrong objects and pixels in each photo
+MASK_SHIFT = 20  # standard deviation of the shift of masks at an error rate of 1 [px]
 
 
 @dataclass(frozen=True)
 class SegmentBenchOptions:
-    """Two scenes show all ten objects."""
+    """Scenes and methods; two scenes show all ten objects."""
 
-    scenes: int = 4  # of each kind
-    photos: int = 24  # whose cameras the scene has
-    weights: Path | None = None  # of SAM 2.1; by default looked for
+    scenes: int = 4  # of each arrangement
+    photos: int = 24  # cameras of a scene
+    weights: Path | None = None  # of SAM 2.1; None: the default locations
     device: str = "auto"  # of SAM 2.1
-    reconstruct: bool = False  # photos of each scene, too: minutes a scene
+    reconstruct: bool = False  # also from rendered photos: minutes per scene
 
     def __post_init__(self):
         if not 1 <= self.scenes <= 100 or not 8 <= self.photos <= 200:
@@ -53,9 +52,9 @@ class SegmentBenchOptions:
 
 
 def best_ious(found: Int[torch.Tensor, "n"], truth: Int[torch.Tensor, "n"]) -> dict[int, float]:
-    """For each true object the intersection over union with the found object that fits it best; 0 is no object.
+    """IoU of each true object with the found object that fits it best.
 
-    `found` and `truth` number the same Gaussians, or the same pixels.
+    `found` and `truth` are labels of the same Gaussians, or of the same pixels; 0 is the background.
     """
     table = torch.zeros(int(truth.max()) + 1, int(found.max()) + 1)
     table.view(-1).index_add_(0, truth * table.shape[1] + found, torch.ones(len(truth)))
@@ -67,7 +66,7 @@ def best_ious(found: Int[torch.Tensor, "n"], truth: Int[torch.Tensor, "n"]) -> d
 def corrupt_labels(
     labels: Int[Tensor, "h w"], share: float, objects: int, rng: np.random.Generator
 ) -> Int[Tensor, "h w"]:
-    """A label image with a share of its objects missed or taken for another, of its pixels random, and moved a bit."""
+    """A label image with a fraction of its objects missed or swapped and of its pixels random, shifted a little."""
     fate = rng.uniform(size=objects)
     taken = [0, *(0 if u < share / 2 else int(rng.integers(1, objects + 1)) if u < share else i
                   for i, u in enumerate(fate, start=1))]  # fmt: skip
@@ -78,9 +77,9 @@ def corrupt_labels(
 
 
 def segment_by_masks(scene: Scene, truth: Int[Tensor, "n"], seed: int) -> dict[str, Callable[[], Int[Tensor, "n"]]]:
-    """Ways to make object numbers of Gaussians from masks of all views, more and more of them wrong.
+    """Segmentations from label images of all views, by error rate, with and without a vote.
 
-    `scene` is without labels; of WRONG = 0.4, say, the masks of every fifth view are missing, too.
+    `scene` has no labels. At an error rate of 0.4, for example, the images of a fifth of the views are missing as well.
     """
     objects, rng = int(truth.max()), np.random.default_rng(seed)
     votes = {share: torch.zeros(len(truth), 1) for share in ERROR_RATES}
@@ -104,7 +103,7 @@ def segment_by_masks(scene: Scene, truth: Int[Tensor, "n"], seed: int) -> dict[s
 
 
 def segment_by_boxes(scene: Scene, truth: Int[Tensor, "n"]) -> Int[Tensor, "n"]:
-    """Object numbers from tight boxes in the view that shows most of the object it shows least of."""
+    """Object numbers from tight boxes in the view whose least visible object is most visible."""
 
     def shown(view: int) -> Int[Tensor, "h w"]:
         front = ViewFootprint.of(scene, view).front
@@ -152,7 +151,7 @@ def available_networks(options: SegmentBenchOptions) -> tuple[list[str], list[st
 
 
 def measure(kind: str, index: int, networks: list[str], options: SegmentBenchOptions) -> list[dict]:
-    """Overlaps with each object of a scene, for every way to find them, and the seconds each took after its masks."""
+    """A row for each method on one scene: IoU of each object, and seconds without rendering label images."""
     scene = tabletop(kind, index, options.photos)
     truth = scene.gaussians.object_id
     blank = replace(scene, gaussians=replace(scene.gaussians, object_id=torch.zeros_like(truth)), objects=())
@@ -169,9 +168,9 @@ def measure(kind: str, index: int, networks: list[str], options: SegmentBenchOpt
 
 
 def measure_reconstructed(kind: str, index: int, photos: int) -> dict:
-    """Overlaps in the pixels of the photos that could be placed, after their reconstruction; its time is counted.
+    """A row for geometric segmentation of a reconstruction: IoU in the pixels of the photos with cameras; total time.
 
-    Where none can be placed nothing is found.
+    The IoU is 0 where no camera could be estimated.
     """
     scene, start = tabletop(kind, index, photos), time.perf_counter()
     try:
@@ -192,7 +191,7 @@ def _row(kind: str, index: int, way: str, scene: Scene, found: Tensor, truth: Te
 
 
 def run(out: Path | None = None, options: SegmentBenchOptions = SegmentBenchOptions()) -> Iterator[str]:  # noqa: B008 -- frozen
-    """Lines of the report; all numbers as JSON in `out`."""
+    """Yield the lines of the report; all results go to `out` as JSON."""
     yield bench.machine("cpu")
     networks, absent = available_networks(options)
     yield from absent
@@ -208,10 +207,7 @@ def run(out: Path | None = None, options: SegmentBenchOptions = SegmentBenchOpti
     yield f"{'mean IoU':<28}" + "".join(f"{kind:>10}" for kind in ARRANGEMENTS)
     for way in means[ARRANGEMENTS[0]]:
         yield f"{way:<28}" + "".join(f"{means[kind][way]:>10.3f}" for kind in ARRANGEMENTS)
-    if out is not None:
-        facts = {"command": "ngff-lab bench segment", "machine": bench.machine("cpu")}
-        with replacing(out) as part:
-            part.write_text(json.dumps({**facts, "mean_iou": means, "scenes": rows}, indent=1) + "\n")
+    bench.write_results(out, "segment", "cpu", {"mean_iou": means, "scenes": rows})
 
 
 def _means(rows: list[dict]) -> dict[str, float]:

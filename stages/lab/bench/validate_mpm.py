@@ -1,8 +1,8 @@
-"""The MPM solver against theory: the figure of stages/lab/results/mpm.md, and what tests measure at one setting each.
+"""Validation of the MPM solver against theory: the figure of stages/lab/results/mpm.md; tests check one setting each.
 
     python -m stages.lab.bench.validate_mpm stages/lab/results/mpm.png
 
-Every function makes a small scene whose outcome is known, and returns what was measured beside what should be.
+Every function simulates a small scene with a known outcome and returns the measured and the expected value.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ E, DENSITY = 1e5, 500.0
 
 def particle_block(size: tuple, h: float, E: float = E, nu: float = 0.0, viscosity: float = 0.0, jitter: float = 0.0,
             **material) -> mpm.Particles:  # fmt: skip
-    """A box of particles at the centres of voxels of edge h, its lower corner at the origin."""
+    """A box of particles at the centres of voxels of edge h [m], its lower corner at the origin."""
     counts = [max(1, round(s / h)) for s in size]
     x = (torch.cartesian_prod(*[torch.arange(n) + 0.5 for n in counts]) * h).reshape(-1, 3)
     x = x + jitter * h * (torch.rand(x.shape, generator=torch.Generator().manual_seed(0)) - 0.5)
@@ -32,18 +32,20 @@ def particle_block(size: tuple, h: float, E: float = E, nu: float = 0.0, viscosi
 
 
 def subset(p: mpm.Particles, mask: torch.Tensor) -> mpm.Particles:
-    """Some of the particles."""
+    """The particles selected by a mask."""
     return mpm.Particles(*(getattr(p, f.name)[mask] for f in fields(p)))
 
 
 def advance(solver: mpm.Solver, duration: float, push: tuple = (0.0, 0.0, 0.0), substeps: int | None = None) -> None:
+    """Advance a solver by `duration` [s] under one acceleration [m/s^2] for all particles."""
     solver.advance(duration, torch.tensor(push).repeat(len(solver.rows), 1), substeps)
 
 
 def pressure_pulse(cells: int = 8, travel: float = 0.8) -> list[tuple[float, float, float]]:
-    """(time, place, place by theory) of a pressure pulse in a bar of Poisson ratio 0; `cells` are in its half width.
+    """(time [s], position, theoretical position [m]) of a pressure pulse in a bar of Poisson ratio 0.
 
-    A pulse v = a g(x), strain -a g(x) / c travels only to the right, at c = sqrt(E / density).
+    `cells` are in the half width of the pulse. A pulse v = a g(x) with strain -a g(x) / c travels to the right only, at
+    c = sqrt(E / density).
     """
     width, c = 0.1, math.sqrt(E / DENSITY)
     dx = width / cells
@@ -55,7 +57,9 @@ def pressure_pulse(cells: int = 8, travel: float = 0.8) -> list[tuple[float, flo
     start, rows = p.x[:, 0].clone(), []
     solver, frame = mpm.Solver(p, OPEN_BOX, dx), travel / c / 8
     for n in range(9):
-        v = solver.particles.v[:, 0].double().clamp_min(0) ** 2  # squared: the peak, not ripples far from it
+        v = (
+            solver.particles.v[:, 0].double().clamp_min(0) ** 2
+        )  # squared, to weigh the peak and not ripples far from it
         rows.append((n * frame, float((v * start).sum() / v.sum()), 0.4 + c * n * frame))
         if n < 8:
             advance(solver, frame)
@@ -91,14 +95,14 @@ def cantilever_deflection(load: float, cells: int = 4) -> tuple[float, float]:
     p = particle_block((length + 3 * dx, height, height), dx / 2)
     p.held[p.x[:, 0] < 3 * dx] = 1
     tip = p.x[:, 0] > length + 3 * dx - dx
-    solver, before, liveliest = mpm.Solver(p, OPEN_BOX, dx), p.x[tip, 2].mean(), 0.0
-    for _ in range(120):  # stopped wherever it is liveliest, which is near the place of rest
+    solver, before, peak_energy = mpm.Solver(p, OPEN_BOX, dx), p.x[tip, 2].mean(), 0.0
+    for _ in range(120):  # stopped at each maximum of the kinetic energy, which is near equilibrium
         advance(solver, 0.02, (0.0, 0.0, -load))
         energy = float(solver.particles.v.square().sum())
-        if energy < liveliest:
+        if energy < peak_energy:
             solver.set(v=torch.zeros_like(p.v), C=torch.zeros_like(p.C))
             energy = 0.0
-        liveliest = energy
+        peak_energy = energy
     x = (float(p.x[tip, 0].mean()) - 3 * dx) / length  # the tip's particles lie half a cell before the end
     bending = DENSITY * load * 12 / (E * height**2) * length**4 / 24 * x**2 * (x**2 - 4 * x + 6)
     shear = DENSITY * load * length**2 / (2 * 5 / 6 * E / 2) * (2 * x - x**2)
@@ -111,8 +115,8 @@ def sand_column_spread(
     """Spread (r - r0) / r0 of a sand column of height aspect x r0 that collapses, and Lube et al. 2004: 1.24 aspect.
 
     `cells` are in its radius, `substeps` in 0.02 s (CFL by default); angle of repose 31 degrees, on a floor as rough.
-    Every transfer smooths a flow that is only some cells thick, so sand spreads the less, the larger the cells and the
-    more the substeps.
+    Every transfer smooths a flow that is only some cells thick, so sand spreads less with larger cells and more
+    substeps.
     """
     r0 = 0.1
     dx = r0 / cells
@@ -129,7 +133,7 @@ def sand_column_spread(
 
 
 def bar_displacement(substeps: int, cells: int = 16) -> tuple[torch.Tensor, torch.Tensor]:
-    """Places of the particles of a bar after half a swing in so many substeps, and at the start."""
+    """Positions of a vibrating bar's particles after half a period in `substeps` steps, and at the start [m]."""
     length = 0.8
     dx = length / cells
     p = particle_block((length, 4 * dx, 4 * dx), dx / 2)
@@ -140,10 +144,10 @@ def bar_displacement(substeps: int, cells: int = 16) -> tuple[torch.Tensor, torc
 
 
 def time_step_error() -> list[tuple[float, float]]:
-    """(substep [s], rms distance to the finest of the runs as a share of the motion).
+    """(substep [s], RMS distance to the run with the smallest substep / RMS motion).
 
-    Symplectic Euler has an error that grows with the substep, the transfers one that grows with their number: so it
-    does not go to zero, and has no need to.
+    The error of symplectic Euler grows with the substep, that of the transfers with their number, so the sum does not
+    tend to zero.
     """
     exact, start = bar_displacement(1280)
     motion = (exact - start).square().sum(1).mean().sqrt()
@@ -154,13 +158,13 @@ def time_step_error() -> list[tuple[float, float]]:
 
 
 def momentum_drift(frames: int = 40, substeps: int = 250) -> list[tuple[int, float, float]]:
-    """(substeps, relative change of momentum, of angular momentum) of a body that flies, turns and shakes."""
+    """(substeps, relative change of momentum, of angular momentum) of a body that translates, rotates and vibrates."""
     dx = 0.05
     p = particle_block((0.2, 0.15, 0.1), dx / 2, nu=0.3)
     r = p.x - p.x.mean(0)
     p.v = torch.tensor([0.2, -0.1, 0.1]) + torch.linalg.cross(torch.tensor([1.0, 2.0, -1.0]).expand_as(r), r) + r
     solver, rows = mpm.Solver(p, OPEN_BOX, dx), []
-    advance(solver, 0.01, substeps=substeps)  # the affine part comes into being
+    advance(solver, 0.01, substeps=substeps)  # to initialise the affine velocity matrices C
     first = total_momenta(solver.particles, dx)
     for n in range(frames):
         advance(solver, 0.01, substeps=substeps)
@@ -177,7 +181,7 @@ def total_momenta(p: mpm.Particles, dx: float) -> tuple[torch.Tensor, torch.Tens
 
 
 def yield_stress(strength: float) -> tuple[float, float]:
-    """Largest equivalent stress of a metal block squeezed by a tenth, and its strength [Pa]."""
+    """Largest von Mises stress in a metal block compressed by a tenth, and its yield strength [Pa]."""
     dx = 0.05
     p = particle_block((0.2, 0.2, 0.2), dx / 2, nu=0.3, viscosity=50.0, model=VON_MISES, plastic=(strength, 0.0, 0.0))
     p.held[p.x[:, 2] < dx] = 1
@@ -193,7 +197,7 @@ def yield_stress(strength: float) -> tuple[float, float]:
 
 
 def figure(out: Path) -> None:
-    """Draw what was measured beside theory."""
+    """Plot measured and expected values."""
     from stages.lab.plot import Panel, draw_panels
 
     travel = pressure_pulse()

@@ -52,8 +52,9 @@ def test_the_recipe_learns_photos_and_multiplies_gaussians():
     torch.manual_seed(0)
     views, points = photographed()
     colours = torch.cat([_colours(views, i, part) for i, part in enumerate(points.split(100))])
-    few, none = peer.train(views, points, colours, 1500, "cpu", draw, going=lambda done: done < 1)
-    many, done = peer.train(views, points, colours, 1500, "cpu", draw, going=lambda done: done < 53)
+    start = peer.ColouredPoints(points, colours)
+    few, none = peer.train(views, start, 1500, "cpu", draw, going=lambda done: done < 1)
+    many, done = peer.train(views, start, 1500, "cpu", draw, going=lambda done: done < 53)
     assert (none, done) == (1, 53) and len(few) == len(points) < len(many)
     everything = list(range(len(views)))
     assert score_views(many, views, everything)[0] > score_views(few, views, everything)[0] + 3
@@ -62,7 +63,7 @@ def test_the_recipe_learns_photos_and_multiplies_gaussians():
 
 def test_gaussians_start_as_far_apart_as_their_neighbours():
     points = torch.cartesian_prod(*3 * [torch.arange(4.0)])
-    values = peer.initial_parameters(points, torch.full((64, 3), 0.5), "cpu")
+    values = peer.initial_parameters(peer.ColouredPoints(points, torch.full((64, 3), 0.5)), "cpu")
     torch.testing.assert_close(values["scales"].exp(), torch.ones(64, 3))
     torch.testing.assert_close(values["opacities"].sigmoid(), torch.full((64,), 0.1))
     assert (values["sh0"] == 0).all() and values["shN"].shape == (64, 15, 3)
@@ -91,7 +92,7 @@ def test_the_steps_fit_in_the_seconds(monkeypatch):
     clock = [0.0]
     monkeypatch.setattr(bench.time, "perf_counter", lambda: clock[0])
 
-    def train(views, points, colours, steps, device, draw, going):
+    def train(views, start, steps, device, draw, going):
         for done in range(steps):
             if not going(done):
                 return scene.gaussians, done

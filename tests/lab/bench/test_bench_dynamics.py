@@ -238,21 +238,22 @@ def test_rows_of_the_same_scenes_stay_when_others_are_measured(data, weights, tm
         run(data, weights, out, NONE)
 
 
-def test_the_best_model_of_each_split_is_bold():
-    def row(rmse, **more):
-        score = {"RMSE": rmse, "FPE": 0.1, "R": 0.5}
+def test_the_best_value_of_each_split_and_metric_is_bold():
+    def row(rmse, r=0.5, **more):
+        score = {"RMSE": rmse, "FPE": 0.1, "R": r}
         return {"splits": {"spatial": {**score, **more.pop("left", {})}}, **more}
 
     facts = {
         "machine": "m", "date": "d", "keypoints": 8, "scenes": {"spatial": 6}, "frames": {"spatial": 80},
         "rows": {FREE_FALL: row(0.02), MPM_ESTIMATED: row(0.3, left={"scenes left out": 2}),
-                 "gcn": row(0.2, card={"minutes": 3.0}),
+                 "gcn": row(0.2, 0.6, card={"minutes": 3.0}),
                  "ngff": row(0.1, card={}, parameters=270_000, seconds=0.0123), "odd": row(None, card={})},
     }  # fmt: skip
     text = "\n".join(markdown("results", facts))
-    assert "| `ngff` | **0.1000 / 0.100 / 0.500** | 0.0123 s | 0.27 M |  |" in text and text.count("**") == 2
+    assert "| `ngff` | **0.1000** / **0.100** / 0.500 | 0.0123 s | 0.27 M |  |" in text
+    assert "| `gcn` | 0.2000 / **0.100** / **0.600** | - |  | 3.0 min |" in text and text.count("**") == 8
     assert "| no learning | 0.0200" in text and "not finite" in text and "3.0 min" in text
-    assert "mpm-estimated: without scenes that the solver gave up: 2 of spatial." in text
+    assert "mpm-estimated: without scenes in which the solver failed: 2 of spatial." in text
     assert "| NGFF | 0.0820 / 0.326 / 0.661 | 0.363 s |" in text and "measured on other data" in text
 
 
@@ -309,7 +310,7 @@ def test_mpm_with_estimated_materials_is_a_row_of_its_own(simulated, weights, tm
 def test_data_that_do_not_say_how_they_were_made(simulated):
     data, _ = simulated
     write_motions(data / "motions" / "3_9.h5", group("3_9"), {"options": {"dx": 0.02}})
-    with pytest.raises(InputError, match="3_9.h5: does not say how it was simulated .no spacing.*--mpm 0"):
+    with pytest.raises(InputError, match="3_9.h5: has no record of how it was simulated .no spacing.*--mpm 0"):
         Resimulation(data, ["3_9"], "cpu")
 
 

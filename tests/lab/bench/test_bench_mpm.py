@@ -43,7 +43,7 @@ def test_a_report_has_ratios_and_the_machine(monkeypatch):
     assert "torch" in lines[0] and "10 GB/s" in lines[1] and len(lines) == 5
     assert sum("mpm exact" in line for line in lines) == 1
     for line in lines[2:]:
-        assert "us a substep" in line and "scenes a minute" in line and "the plain three-kernel form" in line
+        assert "us a substep" in line and "scenes a minute" in line and "the speed of the three-kernel form" in line
 
 
 def test_the_figures_follow_from_each_other():

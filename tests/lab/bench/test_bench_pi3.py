@@ -33,7 +33,7 @@ def test_attention_written_out_is_the_same_attention():
 def test_a_line_for_each_number_of_views_and_its_peer(splats):
     lines = list(run(Pi3BenchOptions("cpu", (1, 2), 28, 1, splats), TINY_SPLAT))
     assert len(lines) == 6 and lines[1].startswith("Pi3Splat" if splats else "Pi3,")
-    assert all("attention written out" in line for line in lines[3::2])
+    assert all("unfused attention" in line for line in lines[3::2])
 
 
 def test_memory_that_is_too_small_is_said(monkeypatch):
@@ -44,7 +44,7 @@ def test_memory_that_is_too_small_is_said(monkeypatch):
 
     monkeypatch.setattr(bench_pi3, "naive_attention", table)
     lines = list(run(Pi3BenchOptions("cpu", (1,), 28, 1), TINY))[2:]
-    assert " s " in lines[0] and lines[1].endswith("attention written out: out of memory")
+    assert " s " in lines[0] and lines[1].endswith("unfused attention: out of memory")
     monkeypatch.setattr(bench_pi3, "measure", table)
     (line,) = list(run(Pi3BenchOptions("cpu", (3,), 28, 1), TINY))[2:]
     assert line.startswith("views   3  out of memory (estimate") and "nan" not in line

@@ -131,7 +131,7 @@ def test_a_run_counts_and_writes(tmp_path, monkeypatch):
     monkeypatch.setattr(bench_register, "make_object", lambda name: asymmetric_object(0.02))
     monkeypatch.setattr(bench_register, "METHODS", {"ICP": icp})
     lines = list(run(tmp_path / "out.json", RegisterBenchOptions("duck", 1, device="cpu")))
-    assert lines[0].split() == ["right", "of", "1", "ICP"] and lines[1].split()[0] == "duck"
+    assert lines[0].split() == ["correct", "of", "1", "ICP"] and lines[1].split()[0] == "duck"
     facts = json.loads((tmp_path / "out.json").read_text())
     assert facts["machine"] == bench.machine("cpu") and [row["method"] for row in facts["trials"]] == ["ICP"]
     assert "splatreg is not installed" in lines[-1] and "pip install --no-deps splatreg" in lines[-1]

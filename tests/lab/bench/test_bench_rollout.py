@@ -49,7 +49,7 @@ def test_ratios_are_to_the_published_model_in_the_same_run():
     rows = [{"what": "ours", "scenes": 1, "seconds": 0.5, "ready_seconds": 3.0, "strays_m": 1e-5},
             {"what": PEER, "scenes": 1, "seconds": 4.0}]  # fmt: skip
     ours, peer = table(rows)
-    assert "8.00x" in ours and "once before: 3.0 s" in ours and "1.00x" in peer
+    assert "8.00x" in ours and "set-up: 3.0 s" in ours and "1.00x" in peer
 
 
 def test_wrong_options():

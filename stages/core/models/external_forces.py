@@ -1,4 +1,4 @@
-"""Force prompts as tensors: who is pushed, how hard, when, and who is held."""
+"""External forces (force prompts) and pinned objects as tensors."""
 
 from __future__ import annotations
 
@@ -16,39 +16,39 @@ from stages.core.physics.forces import ForcePrompts
 
 @dataclass(frozen=True)
 class ExternalForces:
-    """Pushes j of each scene; one without force and torque is padding."""
+    """External forces j of each scene and pinned objects; entries with zero force and torque are padding."""
 
-    object: Int[Tensor, "b j"]  # row of the object that is pushed
+    object: Int[Tensor, "b j"]  # row of the object acted on
     force: Float[Tensor, "b j 3"]  # [N]
     torque: Float[Tensor, "b j 3"]  # about the centre of mass [N m]
     start: Float[Tensor, "b j"]  # [s]
     end: Float[Tensor, "b j"]  # [s]
-    point: Int[Tensor, "b j"]  # the keypoint that is pushed; -1 is the whole object
-    pinned: Bool[Tensor, "b o"]  # objects that stay where they are
+    point: Int[Tensor, "b j"]  # keypoint the force acts at; -1: at the centre of mass
+    pinned: Bool[Tensor, "b o"]  # objects that do not move
 
     @classmethod
     def none(cls, initial: InitialConditions) -> ExternalForces:
-        """Nobody is pushed or held."""
+        """No forces and no pinned objects."""
         return cls.none_for(initial.valid, initial.points)
 
     @classmethod
     def none_for(cls, valid: Bool[Tensor, "b o n"], like: Tensor) -> ExternalForces:
-        """The same for objects of whose world only `valid` is at hand, in the precision of `like`."""
+        """As `none`, from the `valid` mask alone, in the precision of `like`."""
         b, o, _ = valid.shape
         whole, real, vector = valid.new_zeros(b, 0, dtype=torch.int64), like.new_zeros(b, 0), like.new_zeros(b, 0, 3)
         return cls(whole, vector, vector, real, real, whole, valid.new_zeros(b, o))
 
     @classmethod
     def from_prompts(cls, initial: InitialConditions, prompts: ForcePrompts, ids: list[int]) -> ExternalForces:
-        """The pushes and pins of a user's prompts for a world of one scene, whose rows are the objects `ids`.
+        """Forces and pins of a user's prompts for a batch of one scene, whose rows are the objects `ids`.
 
-        A push at a place takes hold of the keypoint nearest to it. Velocities and lifts belong into the world.
+        A force at a point acts at the keypoint nearest to it. Velocities and lifts belong into `initial`.
         """
         real = {"dtype": initial.points.dtype, "device": initial.points.device}
         forces = prompts.forces
         rows = torch.tensor([[ids.index(f.object_id) for f in forces]], dtype=torch.int64, device=real["device"])
-        held = torch.tensor([[i in prompts.pinned for i in ids]], device=real["device"])
-        points = [-1 if f.at is None else _nearest(initial, ids.index(f.object_id), f.at) for f in forces]
+        pinned = torch.tensor([[i in prompts.pinned for i in ids]], device=real["device"])
+        points = [-1 if f.at is None else _nearest_keypoint(initial, ids.index(f.object_id), f.at) for f in forces]
         return cls(
             rows,
             torch.tensor([[f.force for f in forces]], **real).reshape(1, -1, 3),
@@ -56,15 +56,15 @@ class ExternalForces:
             torch.tensor([[f.start for f in forces]], **real),
             torch.tensor([[f.end for f in forces]], **real),
             torch.tensor([points], dtype=torch.int64, device=real["device"]),
-            held,
+            pinned,
         )
 
     def to(self, target: torch.device | str) -> ExternalForces:
-        """On another device."""
+        """A copy on another device."""
         return ExternalForces(**{f.name: getattr(self, f.name).to(target) for f in fields(self)})
 
     def active_fraction(self, t: Tensor | float, dt: float = 0.0) -> Float[Tensor, "b j"]:
-        """Share of the time from `t` to `t + dt` [s] in which each push acts; of the instant t (1 or 0) for dt = 0."""
+        """Fraction of the time from `t` to `t + dt` [s] that each force acts; for dt = 0, 1 or 0 at the instant t."""
         if not dt:
             return ((self.start < t) & (t < self.end)).to(self.force)
         last = torch.clamp(self.end, max=t + dt)
@@ -73,7 +73,10 @@ class ExternalForces:
     def wrench(
         self, points: Float[Tensor, "b o n 3"], com: Float[Tensor, "b o 3"], t: Tensor | float, dt: float = 0.0
     ) -> tuple[Float[Tensor, "b o 3"], Float[Tensor, "b o 3"]]:
-        """Force [N] and torque about the centre of mass [N m] on each object, its keypoints being at `points`."""
+        """Mean force [N] and torque about the centre of mass [N m] on each object from t to t + dt [s].
+
+        `points` are the positions of the keypoints and `com` the centres of mass [m].
+        """
         if not self.object.shape[1]:
             return torch.zeros_like(com), torch.zeros_like(com)
         on = self.active_fraction(t, dt)[..., None]
@@ -88,17 +91,19 @@ class ExternalForces:
     def acceleration(
         self, initial: InitialConditions, points: Float[Tensor, "b o n 3"], t: Tensor | float, dt: float = 0.0
     ) -> Float[Tensor, "b o n 3"]:
-        """What the pushes add to the acceleration of every keypoint, taking each object as rigid [m/s^2]."""
+        """Acceleration of every keypoint by the external forces, taking each object as rigid [m/s^2]."""
         if not self.object.shape[1]:
             return torch.zeros_like(points)
         com = centre_of_mass(initial, points)
         force, torque = self.wrench(points, com, t, dt)
         arm = torch.where(initial.valid[..., None], points - com[:, :, None], 0.0)
-        (turning,) = symmetric_solve(inertia(initial.mass_fraction, arm), torque)
-        spun = torch.linalg.cross(turning[:, :, None].expand_as(arm), arm)
-        return torch.where(initial.valid[..., None], (force[:, :, None] + spun) / initial.mass[..., None, None], 0.0)
+        (angular,) = symmetric_solve(inertia(initial.mass_fraction, arm), torque)
+        rotation = torch.linalg.cross(angular[:, :, None].expand_as(arm), arm)
+        return torch.where(
+            initial.valid[..., None], (force[:, :, None] + rotation) / initial.mass[..., None, None], 0.0
+        )
 
 
-def _nearest(initial: InitialConditions, row: int, place: tuple[float, float, float]) -> int:
-    distance = (initial.points[0, row] - torch.tensor(place).to(initial.points)).norm(dim=-1)
+def _nearest_keypoint(initial: InitialConditions, row: int, at: tuple[float, float, float]) -> int:
+    distance = (initial.points[0, row] - torch.tensor(at).to(initial.points)).norm(dim=-1)
     return int(torch.where(initial.valid[0, row], distance, math.inf).argmin())

@@ -1,7 +1,7 @@
-"""What every dynamics model is told: the objects at rest, what they are made of, and the room they are in.
+"""Initial conditions of a batch of scenes, the input of every dynamics model: objects, materials and room.
 
-Lengths are metres, z is up. Scenes of a batch may have different numbers of objects and keypoints: what is missing is
-padding, marked in `valid`, and never changes a result.
+Lengths are metres, z is up. Scenes of a batch may have different numbers of objects and keypoints; the rest is padding,
+marked in `valid`, which never changes a result.
 """
 
 from __future__ import annotations
@@ -12,36 +12,36 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-FLOOR = -0.94
-BOX = ((-1.94, -1.94, FLOOR), (1.94, 1.94, 2.94))  # the published simulation's [m]
-GRAVITY = (0.0, 0.0, -5.0)  # the published simulation's [m/s^2]
+FLOOR = -0.94  # height of the floor in the published simulation [m]
+BOX = ((-1.94, -1.94, FLOOR), (1.94, 1.94, 2.94))  # lower and upper corner of its room [m]
+GRAVITY = (0.0, 0.0, -5.0)  # of the published simulation [m/s^2]
 
 
 @dataclass(frozen=True)
 class InitialConditions:
-    """A batch of scenes at time 0; `World.of` fills in what is not given."""
+    """A batch of scenes at time 0; `InitialConditions.of` fills in defaults."""
 
-    points: Float[Tensor, "b o n 3"]  # keypoints at rest, where they start [m]; 0 where padded
-    valid: Bool[Tensor, "b o n"]
-    mass_fraction: Float[Tensor, "b o n"]  # of the object's mass that a keypoint stands for; sums to 1, 0 where padded
+    points: Float[Tensor, "b o n 3"]  # keypoints of the undeformed objects at time 0 [m]; 0 where padded
+    valid: Bool[Tensor, "b o n"]  # False where padded
+    mass_fraction: Float[Tensor, "b o n"]  # of each keypoint in its object's mass; sums to 1, 0 where padded
     mass: Float[Tensor, "b o"]  # [kg]
     E: Float[Tensor, "b o"]  # Young's modulus [Pa]
-    solidity: Float[Tensor, "b o"]  # how many times stiffer than a hollow or thin body of that modulus
+    solidity: Float[Tensor, "b o"]  # stiffness relative to a hollow or thin body of that modulus, see field.solidity
     nu: Float[Tensor, "b o"]  # Poisson's ratio
-    friction: Float[Tensor, "b o"]  # Coulomb's coefficient
-    velocity: Float[Tensor, "b o 3"]  # at the start [m/s]
-    spin: Float[Tensor, "b o 3"]  # angular velocity at the start, world axes [rad/s]
+    friction: Float[Tensor, "b o"]  # Coulomb coefficient
+    velocity: Float[Tensor, "b o 3"]  # of the centre of mass [m/s]
+    spin: Float[Tensor, "b o 3"]  # angular velocity, world axes [rad/s]
     gravity: Float[Tensor, "b 3"]  # [m/s^2]
-    box: Float[Tensor, "b o 2 3"]  # corners of the room as each finds it; the floor under it is the lower z [m]
+    box: Float[Tensor, "b o 2 3"]  # lower and upper corner of the room for each object; the floor is the lower z [m]
 
     @classmethod
     def of(
         cls, points: Float[Tensor, "b o n 3"], valid: Bool[Tensor, "b o n"] | None = None, **given: Tensor
     ) -> InitialConditions:
-        """A world of these keypoints; fields not given take 1 kg, 1e5 Pa, hollow, 0.3, 0.5, rest, and the published
-        room.
+        """Initial conditions of keypoints, other fields by keyword; tensors are broadcast to their field's shape.
 
-        A given tensor needs only be broadcastable to its field.
+        Defaults: 1 kg, 1e5 Pa, solidity 1, Poisson 0.3, friction 0.5, at rest, and the published gravity and room.
+        Raises TypeError for an unknown field.
         """
         b, o, n, _ = points.shape
         valid = points.new_ones(b, o, n, dtype=torch.bool) if valid is None else valid
@@ -62,15 +62,15 @@ class InitialConditions:
         filled = {
             name: torch.as_tensor(given.pop(name, default.get(name))).to(points) for name in ("mass_fraction", *default)
         }
-        # in memory of their own, or kernels would copy them at every step
+        # contiguous, or kernels would copy them at every step
         filled = {name: x.expand(shape.get(name, (b, o))).contiguous() for name, x in filled.items()}
         if given:
-            raise TypeError(f"a World has no {', '.join(given)}")
+            raise TypeError(f"InitialConditions has no field {', '.join(given)}")
         return cls(torch.where(valid[..., None], points, 0.0), valid, **filled)
 
     @property
     def present(self) -> Bool[Tensor, "b o"]:
-        """Objects that are there; the others are padding."""
+        """Objects that are not padding."""
         return self.valid.any(-1)
 
     @property
@@ -79,7 +79,7 @@ class InitialConditions:
         return self.box[..., 0, 2]
 
     def to(self, target: torch.device | torch.dtype | str) -> InitialConditions:
-        """On another device, or in another precision (`valid` stays boolean)."""
+        """A copy on another device or in another precision (`valid` stays boolean)."""
         dtype = isinstance(target, torch.dtype)
         moved = {f.name: getattr(self, f.name) for f in fields(self)}
         return InitialConditions(
@@ -90,12 +90,12 @@ class InitialConditions:
         return len(self.points)
 
     def __getitem__(self, rows: slice | Tensor) -> InitialConditions:
-        """Some of the scenes, still a batch."""
+        """The scenes `rows`, still a batch."""
         return InitialConditions(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
 
 
 def centre_of_mass(initial: InitialConditions, points: Float[Tensor, "b o n 3"]) -> Float[Tensor, "b o 3"]:
-    """Centre of mass of each object whose keypoints are at `points` [m]."""
+    """Centre of mass [m] of each object whose keypoints are at `points` [m]; also averages velocities."""
     return (initial.mass_fraction[..., None] * points).sum(2)
 
 
@@ -107,8 +107,8 @@ def offsets(initial: InitialConditions, points: Float[Tensor, "b o n 3"]) -> Flo
 def inertia(mass_fraction: Float[Tensor, "b o n"], arm: Float[Tensor, "b o n 3"]) -> Float[Tensor, "b o 3 3"]:
     """Inertia tensor per unit of mass about the origin of `arm` [m^2].
 
-    A thousandth of the trace is added to the diagonal (and 1 mm^2, for a single point), so that a rod and a point can
-    be turned about any axis.
+    A thousandth of the trace (and 1 mm^2, for a single point) is added to the diagonal, so that the tensor of a rod or
+    a point is invertible.
     """
     moment = torch.einsum("boni,bonj->boij", mass_fraction[..., None] * arm, arm)
     trace = moment.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]

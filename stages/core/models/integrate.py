@@ -1,8 +1,17 @@
-"""torchdiffeq around states with named fields."""
+"""ODE solvers for dynamics models: torchdiffeq applied to states that are named tuples of tensors.
+
+The published model is integrated with explicit Euler steps of a frame or, adaptively, with dopri5 (TOLERANCE below).
+torchdiffeq runs in `Dynamics.rollout` and `rollout.TimeStepper` whenever the method is one of METHODS, as by `ngff
+simulate --integrator`, and for gradients by the adjoint equation. The default method "step" is a model's own step:
+explicit Euler for the models that are plain ODEs (`gcn`, `pointformer`, `transformer`, `ngff-paper`), equal to "euler"
+up to rounding; for `ngff` a splitting with implicit springs, friction and a penetration limit, which a general ODE
+solver does not offer.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import TypeVar
 
 import torch
@@ -16,15 +25,30 @@ TOLERANCE = {"rtol": 1e-3, "atol": 1e-4}  # of dopri5, as published
 State = TypeVar("State", bound=tuple)  # a NamedTuple of tensors
 
 
+@dataclass(frozen=True)
+class Integration:
+    """How a rollout is integrated. Raises ValueError for an adjoint without an ODE solver."""
+
+    method: str = "step"  # the model's own step, or one of METHODS
+    substeps: int = 1  # equal parts that each frame is divided into; dopri5 chooses its own steps
+    adjoint: bool = False  # gradients of the parameters by the adjoint equation, see `solve_ode`
+
+    def __post_init__(self):
+        if self.adjoint and self.method == "step":
+            raise ValueError("the adjoint equation needs an ODE method")
+
+
 def solve_ode(
     rate: Callable[[Tensor, State], State], start: State, times: Tensor, method: str = "euler", substeps: int = 1,
     adjoint: Sequence[Tensor] | None = None,
 ) -> State:  # fmt: skip
     """States at `times` [s], stacked along a new first dimension; the first is `start`.
 
-    The fixed steps of euler and rk4 are the intervals of `times` cut into `substeps`; dopri5 chooses its own, the same
-    for a whole batch. `adjoint` names tensors that shall get gradients from the adjoint equation (memory of one step,
-    Chen et al. 2018, "Neural Ordinary Differential Equations"); without it gradients go back through the steps.
+    rate: time derivative of a state at a time.
+    method: euler and rk4 step from time to time in `substeps`; dopri5 chooses its steps, the same for a whole batch.
+    adjoint: tensors that get gradients from the adjoint equation (memory of one step; Chen et al. 2018, "Neural
+        Ordinary Differential Equations"); without it gradients are backpropagated through the steps.
+    Raises InputError for an unknown method.
     """
     if method not in METHODS:
         raise InputError(f"no integration method called {method!r}; choose from {', '.join(METHODS)}")
@@ -37,15 +61,15 @@ def solve_ode(
 
     settings: dict = {"method": method, **TOLERANCE}
     if method != "dopri5" and substeps > 1:
-        settings["options"] = {"grid_constructor": lambda f, y, t: _refined(t, substeps)}
+        settings["options"] = {"grid_constructor": lambda f, y, t: _subdivided(t, substeps)}
     if adjoint is None:
         return kind(*odeint(f, tuple(start), times, **settings))
     params = tuple(p for p in adjoint if p.requires_grad)
     return kind(*odeint_adjoint(f, tuple(start), times, adjoint_params=params, **settings))
 
 
-def _refined(t: Tensor, substeps: int) -> Tensor:
-    """Each interval of `t` in equal parts."""
+def _subdivided(t: Tensor, substeps: int) -> Tensor:
+    """Times with each interval of `t` divided into equal parts."""
     part = torch.arange(substeps, dtype=t.dtype, device=t.device) / substeps
     inner = t[:-1, None] + part * t.diff()[:, None]
     return torch.cat([inner.flatten(), t[-1:]])

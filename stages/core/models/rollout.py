@@ -1,13 +1,12 @@
-"""Rollouts at the speed of the device: on CUDA preparing a scene and a step are recorded once and replayed, without
-Python in between.
+"""Fast rollouts without gradients: on CUDA, `prepare` and `step` are captured as CUDA graphs and replayed.
 
-    stepper = Stepper(model, world)
+    stepper = TimeStepper(model, initial)
     for _ in range(steps):
         stepper.step()
-        stepper.points  # where the keypoints are now
+        stepper.points  # positions of the keypoints at the new time
 
-A step of a model is hundreds of small kernels, whose launches take ten times as long as their work. A CUDA graph
-launches them all at once.
+A step of a model launches hundreds of small kernels; launching them one by one takes about ten times as long as their
+work. A graph launches all of them at once.
 """
 
 from __future__ import annotations
@@ -26,69 +25,81 @@ from stages.core.models.trees import leaf_tensors, replace_tensors
 
 
 class TimeStepper:
-    """A scene that moves on by dt [s] with every `step`; on other devices than CUDA simply the model's own step.
+    """A batch of scenes that advances by dt [s] with every `step`.
 
-    `state`, `points`, `pushes` and `time` (steps so far) are tensors that stay where they are: their contents change,
-    and `pushes` and `time` may be written to between steps.
+    `state`, `points` [m], `external` and `step_count` are tensors at fixed addresses: their contents change, and
+    `external` and `step_count` may be written to between steps.
+    `method`: "step", the model's own, or a solver of `integrate.METHODS`. Only "step" is captured as a CUDA graph,
+    because the solvers of torchdiffeq synchronise with the host.
     """
 
     @torch.no_grad()
     def __init__(
-        self, model: Dynamics, initial: InitialConditions, dt: float = FRAME, external: ExternalForces | None = None
-    ):
-        self.model, self.dt = model, dt
-        given = initial, ExternalForces.none(initial) if external is None else external
-        self.initial, self.external = _copy(given)
+        self, model: Dynamics, initial: InitialConditions, dt: float = FRAME, external: ExternalForces | None = None,
+        method: str = "step",
+    ):  # fmt: skip
+        self.model, self.dt, self.method = model, dt, method
+        inputs = initial, ExternalForces.none(initial) if external is None else external
+        self.initial, self.external = _copy(inputs)
         self.step_count = torch.zeros((), dtype=torch.int64, device=initial.points.device)
-        self.scene, state, points = self._given()
+        self.scene, state, points = self._prepared()
         self.state, self.points = _copy((state, points))
         self.begin, self.advance = self._begin, self._step
         if self.step_count.is_cuda:
-            self.begin = _recorded(self._begin)
-            self.advance = _recorded(self._step)
+            self.begin = _captured(self._begin)
+            self.advance = _captured(self._step) if method == "step" else self._step
             self.begin()
 
     @torch.no_grad()
     def step(self) -> None:
-        """Go on by dt."""
+        """Advance by dt."""
         self.advance()
 
     @torch.no_grad()
     def restart(self, initial: InitialConditions, external: ExternalForces | None = None) -> None:
-        """Begin anew, with a world and pushes of the same shapes."""
-        _load((self.initial, self.external), (initial, ExternalForces.none(initial) if external is None else external))
+        """Start again at time 0 from inputs of the same shapes. Raises ValueError for other shapes."""
+        external = ExternalForces.none(initial) if external is None else external
+        _load((self.initial, self.external), (initial, external))
         self.begin()
 
-    def _given(self) -> tuple[Any, tuple, Tensor]:
-        """The scene, its state at time 0, and where the keypoints are."""
+    def _prepared(self) -> tuple[Any, tuple, Tensor]:
+        """The scene, its state at time 0 and the positions of its keypoints."""
         scene = self.model.prepare(self.initial)
         state = self.model.initial_state(scene)
         return scene, state, self.model.points(scene, state)
 
     def _begin(self) -> None:
-        self.scene, state, points = self._given()  # a recorded scene lies in the memory of its graph
+        self.scene, state, points = self._prepared()  # a captured scene lies in the memory of its graph
         _load((self.state, self.points), (state, points))
         self.step_count.zero_()
 
     def _step(self) -> None:
-        _advance(self.model, self.scene, self.state, self.points, self.external, self.step_count, self.dt)
+        """Advance in place; time is counted in steps, so that it stays exact."""
+        interval = self.step_count.to(self.state[0]) * self.dt, self.dt
+        new = self.model.advance(self.scene, self.state, interval, self.external, self.method)
+        # on a GPU one kernel for all copies
+        torch._foreach_copy_([*self.state, self.points], [*new, self.model.points(self.scene, new)])
+        self.step_count += 1
 
 
 def _copy(tree: Any) -> Any:
-    """The same with tensors of their own, each one block of memory."""
+    """The same structure with contiguous copies of its tensors."""
     return replace_tensors(tree, (x.clone(memory_format=torch.contiguous_format) for x in leaf_tensors(tree)))
 
 
-def _load(mine: tuple, new: tuple) -> None:
-    for x, y in zip(leaf_tensors(mine), leaf_tensors(new), strict=True):
+def _load(target: tuple, source: tuple) -> None:
+    for x, y in zip(leaf_tensors(target), leaf_tensors(source), strict=True):
         if x.shape != y.shape:
             raise ValueError(f"made for {tuple(x.shape)}, not {tuple(y.shape)}")
-    torch._foreach_copy_(list(leaf_tensors(mine)), list(leaf_tensors(new)))  # on a GPU all in one kernel
+    torch._foreach_copy_(list(leaf_tensors(target)), list(leaf_tensors(source)))  # on a GPU one kernel for all
 
 
-def _recorded(work: Callable[[], None]) -> Callable[[], None]:
-    """What replays the launches of `work`. It is also done, twice before, to load and tune whatever it uses, and after,
-    as recording alone leaves what it makes empty."""
+def _captured(work: Callable[[], None]) -> Callable[[], None]:
+    """`work` as a CUDA graph; calling the result replays its kernel launches.
+
+    `work` runs twice before the capture, which loads and tunes kernels, and is replayed once after it, because capture
+    does not execute the kernels.
+    """
     side = torch.cuda.Stream()
     side.wait_stream(torch.cuda.current_stream())
     with torch.cuda.stream(side):
@@ -102,27 +113,18 @@ def _recorded(work: Callable[[], None]) -> Callable[[], None]:
     return graph.replay
 
 
-def _advance(
-    model: Dynamics, scene: Any, state: tuple, points: Tensor, external: ExternalForces, time: Tensor, dt: float
-) -> None:
-    """A step in place; `time` counts steps, so that it stays exact."""
-    new = model.step(scene, state, time.to(state[0]) * dt, dt, external)
-    torch._foreach_copy_([*state, points], [*new, model.points(scene, new)])  # on a GPU all in one kernel
-    time += 1
-
-
 @torch.no_grad()
 def rollout(
     model: Dynamics, initial: InitialConditions, steps: int, dt: float = FRAME, external: ExternalForces | None = None
 ) -> Float[Tensor, "b t o n 3"]:
-    """What `model.rollout` gives, with the speed of a Stepper: keypoints in `steps` frames, the first the start."""
+    """`model.rollout` by a TimeStepper: keypoints [m] in `steps` frames, the first at time 0; 0 where padded."""
     out = record_frames(TimeStepper(model, initial, dt, external), steps)
     return out.masked_fill_(~initial.valid[:, None, ..., None], 0.0)
 
 
 @torch.no_grad()
 def record_frames(stepper: TimeStepper, steps: int) -> Float[Tensor, "b t o n 3"]:
-    """Keypoints now and after each of steps - 1 further steps; anything where padded."""
+    """Keypoints [m] now and after each of steps - 1 further steps; undefined where padded."""
     b, o, n, _ = stepper.points.shape
     out = stepper.points.new_empty(b, steps, o, n, 3)
     for t in range(steps):

@@ -1,4 +1,4 @@
-"""Tensors held in named tuples and dataclasses: scenes, states, pushes."""
+"""Traversal of nested tuples and dataclasses of tensors (scenes, states, external forces)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch import Tensor
 
 
 def leaf_tensors(tree: Any) -> Iterator[Tensor]:
-    """All tensors in tuples and dataclasses, in order."""
+    """All tensors in nested tuples and dataclasses, in order."""
     if isinstance(tree, Tensor):
         yield tree
     elif is_dataclass(tree):
@@ -22,7 +22,7 @@ def leaf_tensors(tree: Any) -> Iterator[Tensor]:
 
 
 def replace_tensors(tree: Any, new: Iterator[Tensor]) -> Any:
-    """The same with other tensors."""
+    """The same structure with its tensors replaced, in the order of `leaf_tensors`."""
     if isinstance(tree, Tensor):
         return next(new)
     if is_dataclass(tree):

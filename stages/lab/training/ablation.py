@@ -30,14 +30,14 @@ class Ablation:
 class _UnfusedForceField(ForceField):
     """Without the fused kernels, which implement the full network only."""
 
-    def _fused(self, scene: FieldScene) -> bool:
+    def _use_fused_step(self, scene: FieldScene) -> bool:
         return False
 
 
 class NoReaction(_UnfusedForceField):
     """Contact forces act on one body only: each side of a contact predicts a force of its own."""
 
-    def _returned(self, shape: RestShape, x: Float[Tensor, "b o m c"]) -> Float[Tensor, "b o c"]:
+    def _reaction(self, shape: RestShape, x: Float[Tensor, "b o m c"]) -> Float[Tensor, "b o c"]:
         return torch.zeros_like(x[:, :, 0])
 
 

@@ -5,6 +5,7 @@ import torch
 
 from stages.core.models.external_forces import ExternalForces
 from stages.core.models.initial_conditions import InitialConditions, centre_of_mass
+from stages.core.models.integrate import Integration
 from tests.core.models.worlds import SMALL, crowd, padded, push, small
 
 STEPS = 6
@@ -107,21 +108,24 @@ def test_a_published_step_is_one_of_euler(name):
     external = push(initial, 1, (1.0, 0.0, 2.0), (0.0, 0.1, 0.0), 0.03, 0.07)
     for substeps in (1, 3):
         rolled = [
-            model.rollout(initial, STEPS, method=m, external=external, substeps=substeps) for m in ("step", "euler")
+            model.rollout(initial, STEPS, external=external, integration=Integration(m, substeps))
+            for m in ("step", "euler")
         ]
         torch.testing.assert_close(*rolled, **EXACT)
 
 
 def test_the_adjoint_needs_an_equation():
     with pytest.raises(ValueError, match="needs an ODE method"):
-        small("gcn").rollout(crowd(), 3, adjoint=True)
+        Integration(adjoint=True)
 
 
 @torch.no_grad()
 @pytest.mark.parametrize("method", ["rk4", "dopri5"])
 def test_other_methods_run(name, method):
-    out = small(name).rollout(crowd(1), 3, method=method)
-    torch.testing.assert_close(out, small(name).rollout(crowd(1), 3, substeps=20), rtol=0, atol=0.05)
+    out = small(name).rollout(crowd(1), 3, integration=Integration(method))
+    torch.testing.assert_close(
+        out, small(name).rollout(crowd(1), 3, integration=Integration(substeps=20)), rtol=0, atol=0.05
+    )
 
 
 def test_gradients_equal_finite_differences(name):

@@ -9,15 +9,9 @@ import torch
 from stages.core.geometry.rotations import matrix
 from stages.core.models.external_forces import ExternalForces
 from stages.core.models.field.contact_forces import ContactPoints
-from stages.core.models.field.deformation import projected
-from stages.core.models.field.force_field import (
-    MAX_PENETRATION,
-    MAX_TRAINED_STIFFNESS,
-    SEPARATION_SPEED,
-    Accelerations,
-    ForceField,
-    _pushed,
-)
+from stages.core.models.field.deformation import DeformationInputs, projected
+from stages.core.models.field.floor_response import MAX_PENETRATION, SEPARATION_SPEED, friction_factor, push_only
+from stages.core.models.field.force_field import MAX_TRAINED_STIFFNESS, ForceField
 from stages.core.models.field.rest_shape import rest_shape_of
 from stages.core.models.initial_conditions import BOX, InitialConditions, centre_of_mass
 from tests.core.models.worlds import crowd, push
@@ -164,10 +158,11 @@ def test_what_is_stiffer_than_all_learned_from_bends_less_by_as_much():
     stiffest = float(MAX_TRAINED_STIFFNESS * initial.mass[0, 0] / rest_shape_of(initial).size[0, 0])
     touch = torch.randn(1, 1, 12, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     rest, gravity = torch.zeros_like(touch), torch.zeros(1, 1, 3, dtype=torch.float64)
+    inputs = DeformationInputs(rest, rest, touch, gravity)
     bends = []
     for E in (stiffest / 10, stiffest, 5 * stiffest, 1e4 * stiffest):
         scene = model.prepare(replace(initial, E=torch.full_like(initial.E, E)))
-        bends.append(model.stress(scene.shape, scene.code, scene.compliance_scale, rest, rest, touch, gravity))
+        bends.append(model.stress(scene.shape, scene.embedding, scene.compliance_scale, inputs))
     soft, usual, stiff, rigid = bends
     assert not torch.allclose(soft, usual, rtol=1e-3)
     torch.testing.assert_close(stiff, usual / 5)
@@ -217,11 +212,11 @@ def test_what_each_step_takes_back_does_not_hide_that_a_body_rests():
     initial = crowd(1, 1)
     scene = model.prepare(initial)
     none = torch.zeros(1, 1, 3, dtype=torch.float64)
-    rates = Accelerations(none, none, none, torch.full((1, 1, 1), 0.03, dtype=torch.float64))
+    threshold = torch.full((1, 1, 1), 0.03, dtype=torch.float64)
 
     def kept(before: float, after: float) -> float:
         x = torch.tensor([1.0, 0, 0]).double().expand_as(none)
-        return float(model._slowed(scene, rates, (before * x, none), (after * x, none), 0.02))
+        return float(friction_factor(scene.shape, threshold, (before * x, none), (after * x, none), 0.02))
 
     assert kept(-0.05, 0.05) < 0.1 < 0.7 < kept(0.05, 0.05)
     assert kept(-1.0, 1.0) > 0.999
@@ -249,7 +244,9 @@ def test_the_floor_gives_back_less_than_it_takes():
 
     def felt(speed):
         vectors = torch.stack([up, torch.zeros(3), torch.tensor(speed)]).expand(1, 1, 1, 3, 3, 3)
-        return _pushed(a, ContactPoints(vectors, weight[..., None], weight, torch.arange(3)[None, None, None]), weight)
+        return push_only(
+            a, ContactPoints(vectors, weight[..., None], weight, torch.arange(3)[None, None, None]), weight
+        )
 
     comes, rests, leaves = felt([0.5, 0, -2.0]), felt([0.0, 0, 0]), felt([0.5, 0, SEPARATION_SPEED])
     assert torch.equal(comes, rests) and (rests[..., 2] >= 0).all()

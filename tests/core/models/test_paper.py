@@ -11,6 +11,7 @@ from stages.core.models.checkpoints import build, load
 from stages.core.models.external_forces import ExternalForces
 from stages.core.models.field.narrow_phase import near_walls, nearest
 from stages.core.models.initial_conditions import InitialConditions, centre_of_mass
+from stages.core.models.integrate import Integration
 from tests.core.models.worlds import push
 
 CLOSE = {"rtol": 1e-5, "atol": 1e-6}  # single precision, another order of sums
@@ -68,7 +69,7 @@ def test_rollout(recorded, published, name):
     if name == "rollout_force":
         p = {k: d[f"in/external_0/{k}"].tolist() for k in ("obj_id", "force", "torque", "start", "end")}
         external = push(initial, p["obj_id"], p["force"], p["torque"], p["start"], p["end"])
-    ours = published.rollout(initial, len(d["out/com"][0]), method="euler", external=external)
+    ours = published.rollout(initial, len(d["out/com"][0]), external=external, integration=Integration("euler"))
     theirs = d["out/points_world"].masked_fill(~initial.valid[:, None, ..., None], 0)
     torch.testing.assert_close(ours, theirs, **CLOSE)
 
@@ -77,7 +78,9 @@ def test_loss_and_adjoint_gradients(recorded, published):
     # those of the adjoint equation: with Euler's method they differ much from the gradients through the steps
     d = recorded("loss_and_adjoint_grads")
     initial = world_of(recorded("rollout_free"))
-    loss = (published.rollout(initial, 5, method="euler", adjoint=True) - d["in/target"]).square().mean()
+    loss = (
+        (published.rollout(initial, 5, integration=Integration("euler", adjoint=True)) - d["in/target"]).square().mean()
+    )
     loss.backward()
     torch.testing.assert_close(loss.detach(), d["out/loss"], **CLOSE)
     wanted = {k.removeprefix("out/grad/"): v for k, v in d.items() if k.startswith("out/grad/")}

@@ -8,6 +8,7 @@ from stages.core.models.checkpoints import SHIPPED, find, load
 from stages.core.models.field.force_field import MAX_TRAINED_SOLID_STIFFNESS, MAX_TRAINED_STIFFNESS, ForceField
 from stages.core.models.field.solidity import REFERENCE_THICKNESS, box_sides, solidity
 from stages.core.models.initial_conditions import InitialConditions
+from stages.core.models.integrate import Integration
 
 
 def slab(x=0.5, y=0.3, z=0.01):
@@ -32,7 +33,7 @@ def encoded(E, solidity):
     points = 0.3 * torch.randn(1, 1, 60, 3, generator=torch.Generator().manual_seed(0))
     initial = InitialConditions.of(points, E=torch.tensor(E), solidity=torch.tensor(solidity))
     model, heard = ForceField(16), []
-    model._encode = lambda shape, E: heard.append(float(E)) or torch.zeros(1, 1, 16)
+    model._embed_objects = lambda shape, E: heard.append(float(E)) or torch.zeros(1, 1, 16)
     shape = model.precompute(initial)
     scene = model.encode(shape)
     return heard[0], float(scene.compliance_scale), 1 / float(shape.size)
@@ -64,7 +65,7 @@ def dropped(solidity, method="step", E=3e4):
     points = 0.25 * p + torch.tensor([0.0, 0.0, 0.3 + 0.25 - 0.94])
     initial = InitialConditions.of(points, E=torch.tensor(E), mass=torch.tensor(8.0), solidity=torch.tensor(solidity))
     with torch.inference_mode():
-        z = load(find("ngff", SHIPPED))[0].rollout(initial, 40, method=method)[0, :, 0, :, 2]
+        z = load(find("ngff", SHIPPED))[0].rollout(initial, 40, integration=Integration(method))[0, :, 0, :, 2]
     height = z.amax(1) - z.amin(1)
     return height / height[0]
 

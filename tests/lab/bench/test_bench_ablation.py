@@ -87,7 +87,7 @@ def test_the_last_vectors_of_a_contact_are_the_impulses():
     world = colliding()
     shape = rest_shape_of(world)
     model = ABLATIONS["full"].network()
-    moving = model._moving(model.encode(shape), model.initial_state(model.encode(shape)))
+    moving = model._kinematics(model.encode(shape), model.initial_state(model.encode(shape)))
     places = pair_contacts(shape, moving)
     near, vectors = places.gate[0, 0, 0] > 0, places.vectors[0, 0, 0]
     vectors = vectors[near]

@@ -1,7 +1,8 @@
-"""Forces where things touch: at keypoints near other objects, the floor and the walls.
+"""Contact message passing: learned forces at keypoints near other objects, the floor and the walls.
 
-Each place of contact sees invariant numbers, is heard by its pair of objects, hears what else happens to them, and
-answers with a force: a weighted sum of the vectors it saw.
+Each contact point is encoded from rotation-invariant features (encode); the messages are averaged per pair of bodies
+(aggregate); each body and pair combines them with the object embeddings into a context (update, in `force_field`); each
+contact point then gets a force, a weighted sum of its own vector features (decode).
 """
 
 from __future__ import annotations
@@ -15,76 +16,85 @@ from torch import Tensor, nn
 
 from stages.core.models.field.equivariant import apply_layers, mlp, weighted_sum
 
-CONTACT_SATURATION = 2e-3  # share of an object in contact at which it is felt by half
-ACCELERATION_UNIT = 20.0  # acceleration that a vector of length 1 stands for [m/s^2]
+CONTACT_SATURATION = 2e-3  # mass fraction in contact at which a message has half its weight; hand-chosen, no source
+ACCELERATION_UNIT = 20.0  # acceleration that a network output of 1 times a unit vector stands for [m/s^2]
 
 
 @dataclass(frozen=True)
 class ContactPoints:
-    """Keypoints n of object o near m things."""
+    """Features of k vectors and s scalars at n contact points of each object o with each of m partners.
 
-    vectors: Float[Tensor, "b o m n k 3"]  # in units in which they are of order one
-    scalars: Float[Tensor, "b o m n s"]
-    gate: Float[Tensor, "b o m n"]  # 1 near, 0 far
-    row: Int[Tensor, "b o m n"]  # which keypoints of the object these are
+    Partners are the other objects, or one plane (floor or nearest wall, m = 1).
+    """
+
+    vectors: Float[Tensor, "b o m n k 3"]  # scaled to order one
+    scalars: Float[Tensor, "b o m n s"]  # scaled to order one
+    gate: Float[Tensor, "b o m n"]  # 1 in contact, fading to exactly 0 at the cutoff distance
+    row: Int[Tensor, "b o m n"]  # index of the keypoint within its object
 
 
 class ContactNet(nn.Module):
-    """The network of one kind of contact. `listen` first, `answer` with what else is known."""
+    """Network of one kind of contact (pairs of objects, or planes): `encode` messages, then `decode` them into forces.
+
+    Attribute names are keys of the published state dicts.
+    """
 
     def __init__(self, vectors: int, scalars: int, hidden: int, partner: bool):
         super().__init__()
-        self.see = nn.Linear(vectors * (vectors + 1) // 2 + scalars, hidden)
-        self.own = nn.Linear(hidden, hidden)
-        self.other = nn.Linear(hidden, hidden) if partner else None
-        self.hear = mlp(hidden, hidden, hidden + 1)
-        self.tell = nn.Linear(hidden, hidden)
-        self.say = mlp(hidden, hidden, vectors, quiet=0.1)
+        self.see = nn.Linear(vectors * (vectors + 1) // 2 + scalars, hidden)  # first layer, of the invariant features
+        self.own = nn.Linear(hidden, hidden)  # of the object's embedding
+        self.other = nn.Linear(hidden, hidden) if partner else None  # of the partner's embedding
+        self.hear = mlp(hidden, hidden, hidden + 1)  # message and attention logit
+        self.tell = nn.Linear(hidden, hidden)  # of the context
+        self.say = mlp(hidden, hidden, vectors, output_scale=0.1)  # weights of the vector features
 
     def encode(
-        self, places: ContactPoints, mass_fraction: Float[Tensor, "b o m n"], own: Float[Tensor, "b o h"],
+        self, contacts: ContactPoints, mass_fraction: Float[Tensor, "b o m n"], own: Float[Tensor, "b o h"],
         other: Float[Tensor, "b o m h"] | None = None,
     ) -> tuple[Float[Tensor, "b o m n h"], Float[Tensor, "b o m n"], Float[Tensor, "b o m h"]]:  # fmt: skip
-        """What each place has to say, its weight, and what the object hears from all places together.
+        """Message and weight of each contact point, and the weighted mean of the messages per object and partner.
 
-        Weights of an object sum to 1 in firm contact and go to 0 with its last gate, so that neither the number of
-        keypoints nor a distant one matters.
+        `mass_fraction` is that of each point; `own` and `other` are the embeddings of the object and of its partners.
+        Weights sum to almost 1 in firm contact and go to 0 with the gates, so that neither the number of keypoints nor
+        a point at the cutoff distance matters.
         """
         known = self.own(own)[:, :, None, None]
         if self.other is not None:
             known = known + self.other(other)[:, :, :, None]
-        x = _at(places.gate > 0, self._heard, places.vectors, places.scalars, known)
+        x = _at_contacts(contacts.gate > 0, self._message, contacts.vectors, contacts.scalars, known)
         attention = torch.exp(4 * torch.tanh(x[..., -1] / 4))
-        weight = places.gate * mass_fraction * attention
+        weight = contacts.gate * mass_fraction * attention
         weight = weight / (weight.sum(-1, keepdim=True) + CONTACT_SATURATION)
         return x[..., :-1], weight, (weight[..., None] * x[..., :-1]).sum(-2)
 
-    def _heard(self, vectors: Tensor, scalars: Tensor, known: Tensor, near: Tensor | None = None) -> Tensor:
+    def _message(self, vectors: Tensor, scalars: Tensor, known: Tensor, near: Tensor | None = None) -> Tensor:
         return apply_layers(scalars, (self.see, self.hear[0], self.hear[2]), vectors, known, near=near)
 
     def decode(
         self, message: Float[Tensor, "b o m n h"], weight: Float[Tensor, "b o m n"], context: Float[Tensor, "b o m h"],
         vectors: Float[Tensor, "b o m n k 3"],
     ) -> Float[Tensor, "b o m n 3"]:  # fmt: skip
-        """Acceleration by every place, weighted [m/s^2]."""
-        inputs = self.tell(context)[:, :, :, None]
-        return _at(weight > 0, self._said, message, inputs, vectors, weight[..., None])
+        """Acceleration of the object by each contact point, times its weight [m/s^2]."""
+        known = self.tell(context)[:, :, :, None]
+        return _at_contacts(weight > 0, self._force, message, known, vectors, weight[..., None])
 
-    def _said(
-        self, message: Tensor, inputs: Tensor, vectors: Tensor, weight: Tensor, near: Tensor | None = None
+    def _force(
+        self, message: Tensor, known: Tensor, vectors: Tensor, weight: Tensor, near: Tensor | None = None
     ) -> Tensor:
-        said = apply_layers(message, (self.say[0], self.say[2]), known=inputs, active=True, near=near)
-        return weight * ACCELERATION_UNIT * weighted_sum(said, vectors)
+        coefficients = apply_layers(message, (self.say[0], self.say[2]), known=known, active=True, near=near)
+        return weight * ACCELERATION_UNIT * weighted_sum(coefficients, vectors)
 
 
-def _at(near: Bool[Tensor, "b o m n"], f: Callable[..., Tensor], *given: Tensor) -> Float[Tensor, "b o m n _"]:
-    """What f makes of the rows of `given`, which matters only where near: a CPU takes out those rows, then 0 elsewhere.
+def _at_contacts(
+    near: Bool[Tensor, "b o m n"], f: Callable[..., Tensor], *inputs: Tensor
+) -> Float[Tensor, "b o m n _"]:
+    """f of the rows of `inputs`, needed only where `near`: a CPU gathers those rows and leaves 0 elsewhere.
 
-    A GPU does not: it would have to tell the host how many rows there are.
+    A GPU evaluates all rows: gathering would make the host wait for their count.
     """
     if near.is_cuda or torch.compiler.is_compiling():
-        return f(*given, near)
+        return f(*inputs, near)
     rows, n = near.flatten().nonzero()[:, 0], near.shape[-1]
-    each = [x.expand(*near.shape[:3], *x.shape[3:]).flatten(0, 3) for x in given]
-    found = f(*(x[rows if len(x) == near.numel() else rows // n] for x in each))
+    flat = [x.expand(*near.shape[:3], *x.shape[3:]).flatten(0, 3) for x in inputs]
+    found = f(*(x[rows if len(x) == near.numel() else rows // n] for x in flat))
     return found.new_zeros(near.numel(), found.shape[-1]).index_copy(0, rows, found).unflatten(0, near.shape)

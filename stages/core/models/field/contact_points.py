@@ -1,4 +1,4 @@
-"""Where contacts are, and what can be seen there, in units of order one."""
+"""Contact points and their features: selection of keypoints near other objects, floor and walls."""
 
 from __future__ import annotations
 
@@ -15,151 +15,169 @@ from stages.core.models.field.equivariant import smooth_cutoff, smooth_norm, sym
 from stages.core.models.field.narrow_phase import nearest
 from stages.core.models.field.rest_shape import RestShape
 
-FULL_CONTACT, NO_CONTACT = 0.04, 0.1  # a contact is full below and none above, now or a frame ahead [m]
-SEARCH_RADIUS = (
-    0.2  # farther things are not looked at, however fast they come: at 5 m/s they are contacts a frame later [m]
-)
-GAP_UNIT = 0.05  # what distances are measured in [m]
-PAIR_FRACTION, WALL_FRACTION = (
-    0.375,
-    0.125,
-)  # share of the keypoints of an object that can touch another one, or the walls
-ARM_UNIT = 0.3  # what arms are measured in [m]
+# Distances count now or, extrapolated linearly, one frame ahead, whichever is smaller. Hand-chosen, no source.
+FULL_CONTACT, NO_CONTACT = 0.04, 0.1  # the gate is 1 below the first and 0 above the second [m]
+SEARCH_RADIUS = 0.2  # farther points are never paired [m]; at 5 m/s a point within it is in contact one frame later
+PAIR_FRACTION, WALL_FRACTION = 0.375, 0.125  # of an object's keypoints, at most in contact with another or with walls
+GAP_UNIT = 0.05  # network inputs: unit of distances [m]
+ARM_UNIT = 0.3  # network inputs: unit of offsets from the centre of mass [m]
 
 
 class BodyKinematics(NamedTuple):
-    """Bodies in the world."""
+    """Kinematics of the bodies and their keypoints in world coordinates."""
 
     R: Float[Tensor, "b o 3 3"]
-    inverse: Float[Tensor, "b o 3 3"]  # of the inertia per unit of mass, world axes [1/m^2]
-    spin: Float[Tensor, "b o 3"]  # [rad/s]
-    com: Float[Tensor, "b o 3"]  # [m]
-    velocity: Float[Tensor, "b o 3"]  # [m/s]
-    arm: Float[Tensor, "b o n 3"]  # points about the centre of mass [m]
+    inverse: Float[Tensor, "b o 3 3"]  # of the inertia tensor per unit of mass [1/m^2]
+    spin: Float[Tensor, "b o 3"]  # angular velocity [rad/s]
+    com: Float[Tensor, "b o 3"]  # centre of mass [m]
+    velocity: Float[Tensor, "b o 3"]  # of the centre of mass [m/s]
+    arm: Float[Tensor, "b o n 3"]  # keypoints relative to the centre of mass [m]
     points: Float[Tensor, "b o n 3"]  # [m]
-    speed: Float[Tensor, "b o n 3"]  # of the points [m/s]
-    normal: Float[Tensor, "b o n 3"]
+    point_velocity: Float[Tensor, "b o n 3"]  # of the keypoints [m/s]
+    normal: Float[Tensor, "b o n 3"]  # outward, of length up to 1
 
 
-def pair_contacts(shape: RestShape, moving: BodyKinematics) -> ContactPoints:
-    """The keypoints of every object that are nearest to every other object, and its keypoint next to each of them.
+def pair_contacts(shape: RestShape, bodies: BodyKinematics) -> ContactPoints:
+    """Contacts of every object with every other one: its nearest keypoints, each with the nearest of the other's.
 
-    The first vector is the way between the two, in CLOSE. Only MOST of the keypoints of an object, those nearest now or
-    a frame ahead, are places of contact with another.
+    At most PAIR_FRACTION of an object's keypoints, those nearest now or a frame ahead, are contact points with one
+    partner. Vectors, in this order: gap (from the partner's point, in GAP_UNIT), normals of both, relative velocity of
+    the points, arms of both (in ARM_UNIT), relative velocity of the bodies, gravity, and the impulses per reduced mass
+    that would stop the relative velocity and that act along the partner's normal.
     """
     w, others = shape.initial, shape.others
-    distance, index = nearest(moving.points, w.valid, SEARCH_RADIUS)
-    b, o, _, n = distance.shape
-    m, most = others.shape[1], math.ceil(PAIR_FRACTION * n)
-    pick = others[None, :, :, None].expand(b, o, m, n)
-    distance, index = distance.gather(2, pick), index.gather(2, pick)
-    theirs = index + n * others[:, :, None]
-    state = torch.cat([moving.points, moving.speed, moving.normal, moving.arm, shape.spacing[..., None]], -1)
-    if most < n:
-        with torch.no_grad():
-            ahead = moving.points + FRAME * moving.speed
-            ahead = smooth_norm(ahead[:, :, None] - _rows(ahead, theirs))
-            key = torch.where(distance.isfinite(), torch.minimum(distance, ahead), torch.inf)
-            mine = key.topk(most, largest=False).indices
-        theirs, distance = theirs.gather(-1, mine), distance.gather(-1, mine)
-        distance = distance.masked_fill(_beyond(mine, PAIR_FRACTION, w.valid)[:, :, None], torch.inf)
-    else:
-        mine = torch.arange(n, device=index.device).expand_as(index)
-    here = _rows(state, mine + n * torch.arange(o, device=mine.device)[:, None, None])
-    there = _rows(state, theirs)
-    way, pass_by = (here - there)[..., :3], (here - there)[..., 3:6]
-    apart = (moving.velocity[:, :, None] - moving.velocity[:, others])[:, :, :, None].expand_as(way)
-    gravity = (w.gravity / 5)[:, None, None, None].expand_as(way)
-    now, ahead = smooth_norm(way), smooth_norm(way + FRAME * pass_by)
-    gate = torch.where(distance.isfinite(), smooth_cutoff(torch.minimum(now, ahead), FULL_CONTACT, NO_CONTACT), 0.0)
+    mine, theirs, distance = _nearest_pairs(shape, bodies)
+    b, o, m, _ = mine.shape
+    state = torch.cat([bodies.points, bodies.point_velocity, bodies.normal, bodies.arm, shape.spacing[..., None]], -1)
+    here = _gather_points(state, mine + w.valid.shape[2] * torch.arange(o, device=mine.device)[:, None, None])
+    there = _gather_points(state, theirs)
+    gap, approach = (here - there)[..., :3], (here - there)[..., 3:6]
+    relative = (bodies.velocity[:, :, None] - bodies.velocity[:, others])[:, :, :, None].expand_as(gap)
+    gravity = (w.gravity / 5)[:, None, None, None].expand_as(gap)
+    now, ahead = smooth_norm(gap), smooth_norm(gap + FRAME * approach)
+    gate = torch.where(
+        distance.isfinite(), smooth_cutoff(torch.minimum(now, ahead), FULL_CONTACT, NO_CONTACT), 0.0
+    )  # fmt: skip
     mass = w.mass.clamp_min(1e-6)
-    light = (mass[:, others] / (mass[:, :, None] + mass[:, others]))[..., None, None, None]
-    K = light * _response(moving.inverse[:, :, None, None], here[..., 9:12])
-    K = K + (1 - light) * _response(moving.inverse[:, others][:, :, :, None], there[..., 9:12])
+    ratio = (mass[:, others] / (mass[:, :, None] + mass[:, others]))[..., None, None, None]
+    K = ratio * _impulse_response(bodies.inverse[:, :, None, None], here[..., 9:12])
+    K = K + (1 - ratio) * _impulse_response(bodies.inverse[:, others][:, :, :, None], there[..., 9:12])
     vectors = torch.stack([
-        way / GAP_UNIT, here[..., 6:9], there[..., 6:9], pass_by, here[..., 9:12] / ARM_UNIT, there[...,
-        9:12] / ARM_UNIT,
-        apart, gravity, *symmetric_solve(K, pass_by, there[..., 6:9]),
+        gap / GAP_UNIT, here[..., 6:9], there[..., 6:9], approach, here[..., 9:12] / ARM_UNIT,
+        there[..., 9:12] / ARM_UNIT, relative, gravity, *symmetric_solve(K, approach, there[..., 6:9]),
     ], -2)  # fmt: skip
     sizes = torch.stack([shape.size[:, :, None].expand(b, o, m), shape.size[:, others]], -1).log()
     scalars = torch.cat([
         torch.stack([now / GAP_UNIT, ahead / GAP_UNIT, gate, here[..., 12] / GAP_UNIT, there[..., 12] / GAP_UNIT], -1),
         sizes[:, :, :, None].expand(*now.shape, 2),
     ], -1)  # fmt: skip
-    return ContactPoints(_shown(vectors, gate, 2), _shown(scalars, gate, 1), gate, mine)
+    return ContactPoints(_within_cutoff(vectors, gate, 2), _within_cutoff(scalars, gate, 1), gate, mine)
 
 
-def _rows(x: Float[Tensor, "b o n c"], rows: Int[Tensor, "b *p"]) -> Float[Tensor, "b *p c"]:
-    """Rows of the points of a scene, counted through its objects."""
+def _nearest_pairs(
+    shape: RestShape, bodies: BodyKinematics
+) -> tuple[Int[Tensor, "b o m k"], Int[Tensor, "b o m k"], Float[Tensor, "b o m k"]]:
+    """Keypoints of each object near each partner, the partner's nearest ones, and their distances [m].
+
+    The second are counted through all objects of the scene; distances are infinite where there is no contact.
+    """
+    w, others = shape.initial, shape.others
+    distance, index = nearest(bodies.points, w.valid, SEARCH_RADIUS)
+    b, o, _, n = distance.shape
+    count = math.ceil(PAIR_FRACTION * n)
+    pick = others[None, :, :, None].expand(b, o, others.shape[1], n)
+    distance, index = distance.gather(2, pick), index.gather(2, pick)
+    theirs = index + n * others[:, :, None]
+    if count >= n:
+        return torch.arange(n, device=index.device).expand_as(index), theirs, distance
+    with torch.no_grad():
+        ahead = bodies.points + FRAME * bodies.point_velocity
+        ahead = smooth_norm(ahead[:, :, None] - _gather_points(ahead, theirs))
+        key = torch.where(distance.isfinite(), torch.minimum(distance, ahead), torch.inf)
+        mine = key.topk(count, largest=False).indices
+    theirs, distance = theirs.gather(-1, mine), distance.gather(-1, mine)
+    return mine, theirs, distance.masked_fill(_beyond(mine, PAIR_FRACTION, w.valid)[:, :, None], torch.inf)
+
+
+def _gather_points(x: Float[Tensor, "b o n c"], rows: Int[Tensor, "b *p"]) -> Float[Tensor, "b *p c"]:
+    """Values at keypoints, counted through all objects of a scene."""
     flat = rows.flatten(1)[..., None].expand(-1, -1, x.shape[-1])
     return x.flatten(1, 2).gather(1, flat).reshape(*rows.shape, x.shape[-1])
 
 
-def _response(inverse: Float[Tensor, "*#b 3 3"], arm: Float[Tensor, "*#b 3"]) -> Float[Tensor, "*b 3 3"]:
-    """How fast a point of a body moves after an impulse on it, for unit mass: 1 - [r] J^-1 [r]."""
+def _impulse_response(inverse: Float[Tensor, "*#b 3 3"], arm: Float[Tensor, "*#b 3"]) -> Float[Tensor, "*b 3 3"]:
+    """Velocity change of a point at `arm` per unit impulse on it and unit mass: 1 - [r] J^-1 [r]."""
     r = arm[..., None, :]
-    rotated = torch.linalg.cross(*torch.broadcast_tensors(inverse, r))  # J^-1 [r], by rows
-    rotated = torch.linalg.cross(*torch.broadcast_tensors(r, rotated.mT)).mT
-    return torch.eye(3, dtype=arm.dtype, device=arm.device) - rotated
+    K = torch.linalg.cross(*torch.broadcast_tensors(inverse, r))  # J^-1 [r], by rows
+    K = torch.linalg.cross(*torch.broadcast_tensors(r, K.mT)).mT
+    return torch.eye(3, dtype=arm.dtype, device=arm.device) - K
 
 
-def floor_contacts(shape: RestShape, moving: BodyKinematics) -> ContactPoints:
-    """Every keypoint and the floor, however deep."""
-    height = moving.points[..., 2] - shape.initial.floor[..., None]
-    up = torch.eye(3, dtype=height.dtype, device=height.device)[2].expand_as(moving.points)
+def floor_contacts(shape: RestShape, bodies: BodyKinematics) -> ContactPoints:
+    """Contacts of every keypoint with the floor, however deep it is."""
+    height = bodies.points[..., 2] - shape.initial.floor[..., None]
+    up = torch.eye(3, dtype=height.dtype, device=height.device)[2].expand_as(bodies.points)
     row = torch.arange(height.shape[2], device=height.device).expand_as(height)
-    return _plane(shape, moving, row, height, up)
+    return _plane_contacts(shape, bodies, row, height, up)
 
 
-def wall_contacts(shape: RestShape, moving: BodyKinematics) -> ContactPoints:
-    """The keypoints nearest to a wall or the ceiling, each with the nearest of them."""
-    w, x, most = shape.initial, moving.points, math.ceil(WALL_FRACTION * moving.points.shape[2])
+def wall_contacts(shape: RestShape, bodies: BodyKinematics) -> ContactPoints:
+    """Contacts of the keypoints nearest to walls or ceiling (at most WALL_FRACTION), each with the nearest plane."""
+    w, x, count = shape.initial, bodies.points, math.ceil(WALL_FRACTION * bodies.points.shape[2])
     low, high = w.box[..., None, 0, :], w.box[..., None, 1, :]
     eye = torch.eye(3, dtype=x.dtype, device=x.device)
-    wall, which = torch.cat([(x - low)[..., :2], high - x], -1).min(-1)
+    distance, which = torch.cat([(x - low)[..., :2], high - x], -1).min(-1)
     inward = torch.cat([eye[:2], -eye])[which]
-    if most < wall.shape[-1]:
+    if count < distance.shape[-1]:
         with torch.no_grad():
-            key = (wall + FRAME * (moving.speed * inward).sum(-1)).minimum(wall).masked_fill(~w.valid, torch.inf)
-            row = key.topk(most, largest=False).indices
+            key = distance + FRAME * (bodies.point_velocity * inward).sum(-1)
+            key = key.minimum(distance).masked_fill(~w.valid, torch.inf)
+            row = key.topk(count, largest=False).indices
     else:
-        row = torch.arange(wall.shape[-1], device=x.device).expand_as(wall)
-    height = wall.gather(-1, row).masked_fill(_beyond(row, WALL_FRACTION, w.valid), 10 * NO_CONTACT)
-    return _plane(shape, moving, row, height, _own(inward, row))
+        row = torch.arange(distance.shape[-1], device=x.device).expand_as(distance)
+    height = distance.gather(-1, row).masked_fill(_beyond(row, WALL_FRACTION, w.valid), 10 * NO_CONTACT)
+    return _plane_contacts(shape, bodies, row, height, _gather_own(inward, row))
 
 
-def _beyond(row: Int[Tensor, "*p k"], part: float, valid: Bool[Tensor, "b o n"]) -> Bool[Tensor, "b o k"]:
-    """Places that are there only because others have more keypoints."""
-    return torch.arange(row.shape[-1], device=row.device) >= (part * valid.sum(-1, keepdim=True)).ceil()
+def _beyond(row: Int[Tensor, "*p k"], fraction: float, valid: Bool[Tensor, "b o n"]) -> Bool[Tensor, "b o k"]:
+    """Slots past an object's own maximum; they exist because another object of the batch has more keypoints."""
+    return torch.arange(row.shape[-1], device=row.device) >= (fraction * valid.sum(-1, keepdim=True)).ceil()
 
 
-def _own(x: Float[Tensor, "b o n c"], row: Int[Tensor, "b o k"]) -> Float[Tensor, "b o k c"]:
+def _gather_own(x: Float[Tensor, "b o n c"], row: Int[Tensor, "b o k"]) -> Float[Tensor, "b o k c"]:
+    """Values at keypoints, counted within each object."""
     return x.gather(2, row[..., None].expand(*row.shape, x.shape[-1]))
 
 
-def _plane(
-    shape: RestShape, moving: BodyKinematics, row: Int[Tensor, "b o k"], height: Float[Tensor, "b o k"],
+def _plane_contacts(
+    shape: RestShape, bodies: BodyKinematics, row: Int[Tensor, "b o k"], height: Float[Tensor, "b o k"],
     normal: Float[Tensor, "b o k 3"],
 ) -> ContactPoints:  # fmt: skip
+    """Contacts of keypoints `row` that are `height` [m] above a plane with that normal.
+
+    Vectors, in this order: plane normal, keypoint normal, velocity of the point, arm (in ARM_UNIT), velocity of the
+    body, gravity, and the impulses per mass that would stop the point and that act along the plane's normal.
+    """
     w = shape.initial
-    state = torch.cat([moving.speed, moving.normal, moving.arm, shape.spacing[..., None], w.valid[..., None]], -1)
-    state = _own(state, row)
-    speed, arm = state[..., :3], state[..., 6:9]
-    whole, gravity = moving.velocity[:, :, None].expand_as(arm), (w.gravity / 5)[:, None, None].expand_as(arm)
-    ahead = height + FRAME * (speed * normal).sum(-1)
-    gate = torch.where(state[..., 10] > 0, smooth_cutoff(torch.minimum(height, ahead), FULL_CONTACT, NO_CONTACT), 0.0)
-    K = _response(moving.inverse[:, :, None], arm)
+    state = [bodies.point_velocity, bodies.normal, bodies.arm, shape.spacing[..., None], w.valid[..., None]]
+    state = _gather_own(torch.cat(state, -1), row)
+    velocity, arm = state[..., :3], state[..., 6:9]
+    whole, gravity = bodies.velocity[:, :, None].expand_as(arm), (w.gravity / 5)[:, None, None].expand_as(arm)
+    ahead = height + FRAME * (velocity * normal).sum(-1)
+    gate = smooth_cutoff(torch.minimum(height, ahead), FULL_CONTACT, NO_CONTACT)
+    gate = torch.where(state[..., 10] > 0, gate, 0.0)
+    K = _impulse_response(bodies.inverse[:, :, None], arm)
     vectors = torch.stack([
-        normal, state[..., 3:6], speed, arm / ARM_UNIT, whole, gravity, *symmetric_solve(K, speed, normal)
+        normal, state[..., 3:6], velocity, arm / ARM_UNIT, whole, gravity, *symmetric_solve(K, velocity, normal)
     ], -2)  # fmt: skip
     scalars = torch.stack([
         (height / GAP_UNIT).clamp(-2, 2), (ahead / GAP_UNIT).clamp(-2, 2), gate, state[..., 9] / GAP_UNIT,
         shape.size[..., None].log().expand_as(height),
     ], -1)  # fmt: skip
-    vectors, scalars = _shown(vectors, gate, 2), _shown(scalars, gate, 1)
+    vectors, scalars = _within_cutoff(vectors, gate, 2), _within_cutoff(scalars, gate, 1)
     return ContactPoints(vectors[:, :, None], scalars[:, :, None], gate[:, :, None], row[:, :, None])
 
 
-def _shown(x: Tensor, gate: Tensor, more: int) -> Tensor:
-    """Far places show nothing: what they hold may be huge, and must not reach the gradient."""
-    return torch.where(gate[(...,) + (None,) * more] > 0, x, 0.0)
+def _within_cutoff(x: Tensor, gate: Tensor, extra_dims: int) -> Tensor:
+    """Features with 0 where the gate is 0: there they may be huge, and must not reach the gradient."""
+    return torch.where(gate[(...,) + (None,) * extra_dims] > 0, x, 0.0)

@@ -1,6 +1,8 @@
-"""Deformation: a displacement field on the keypoints of each object, on top of its rigid motion."""
+"""Learned deformation: displacements of each object's keypoints in its body frame, on top of the rigid motion."""
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -8,77 +10,92 @@ from torch import Tensor, nn
 
 from stages.core.kernels.compilers import TRITON
 from stages.core.models.field.equivariant import apply_layers, matvec, mlp, weighted_sum
+from stages.core.models.field.kernel_choice import triton_allowed
 from stages.core.models.field.rest_shape import NEIGHBOURHOOD_RADII, RestShape
 
 if TRITON:
     from stages.core.kernels.field.skinny_matmul import skinny_matmul
 
-MAX_STIFFNESS = 2500.0  # [1/s^2]: a swing of an eighth of a second, six frames
-MAX_DAMPING = 100.0  # damping [1/s]
-MAX_SPRING_WEIGHT, MAX_DAMPER_WEIGHT = 8.0, 0.8  # of springs and dampers, so weak that steps of a frame are stable
-MAX_DISPLACEMENT = 1.5  # a point can be displaced by so many sizes of its object
-SCALE_COUNT = 1 + len(NEIGHBOURHOOD_RADII)  # at which displacements are seen: whole, and in neighbourhoods
-VECTOR_COUNT = 3 * SCALE_COUNT + 3  # of vectors
+# Ranges of the learned springs: limits of stability of explicit steps of a frame; hand-chosen, no source.
+MAX_STIFFNESS = 2500.0  # of the springs to the rest shape [1/s^2]: a period of 1/8 s, six frames
+MAX_DAMPING = 100.0  # of the displacement rates [1/s]
+MAX_SPRING_WEIGHT, MAX_DAMPER_WEIGHT = 8.0, 0.8  # of the additional springs and dampers of each scale
+MAX_DISPLACEMENT = 1.5  # of a keypoint [radii of gyration of its object]
+SCALE_COUNT = 1 + len(NEIGHBOURHOOD_RADII)  # displacements: absolute, and relative to each neighbourhood's mean
+VECTOR_COUNT = 3 * SCALE_COUNT + 3  # vector features of a keypoint
+
+
+class DeformationInputs(NamedTuple):
+    """Per-step inputs of the deformation network, in the body frame."""
+
+    u: Float[Tensor, "b o n 3"]  # displacements [m]
+    du: Float[Tensor, "b o n 3"]  # their rates [m/s]
+    contact: Float[Tensor, "b o n 3"]  # accelerations of the keypoints by contact [m/s^2]
+    gravity: Float[Tensor, "b o 3"]  # [m/s^2]
 
 
 class DeformationNet(nn.Module):
-    """Acceleration of the displacements; what springs and dampers add is left to the integrator."""
+    """Acceleration of the displacements; springs to the rest shape are added by the integrator (`springs`).
+
+    Attribute names are keys of the published state dicts.
+    """
 
     def __init__(self, hidden: int):
         super().__init__()
-        self.see = nn.Linear(VECTOR_COUNT * (VECTOR_COUNT + 1) // 2, hidden)
-        self.own = nn.Linear(hidden, hidden)
-        self.say = mlp(hidden, hidden, 3 * SCALE_COUNT, quiet=0.1)
-        self.spring = mlp(hidden, hidden, 2)
+        self.see = nn.Linear(VECTOR_COUNT * (VECTOR_COUNT + 1) // 2, hidden)  # first layer, of the invariant features
+        self.own = nn.Linear(hidden, hidden)  # of the object's embedding
+        self.say = mlp(hidden, hidden, 3 * SCALE_COUNT, output_scale=0.1)  # weights of the vector features
+        self.spring = mlp(hidden, hidden, 2)  # stiffness and damping, from the embedding
 
-    def springs(self, code: Float[Tensor, "b o h"]) -> tuple[Float[Tensor, "b o"], Float[Tensor, "b o"]]:
+    def springs(self, embedding: Float[Tensor, "b o h"]) -> tuple[Float[Tensor, "b o"], Float[Tensor, "b o"]]:
         """Stiffness [1/s^2] and damping [1/s] of an object."""
-        stiffness, damping = torch.sigmoid(self.spring(code)).unbind(-1)
+        stiffness, damping = torch.sigmoid(self.spring(embedding)).unbind(-1)
         return MAX_STIFFNESS * stiffness, MAX_DAMPING * damping
 
     def forward(
-        self, shape: RestShape, code: Float[Tensor, "b o h"], compliance_scale: Float[Tensor, "b o"], u: Float[Tensor,
-        "b o n 3"],
-        du: Float[Tensor, "b o n 3"], touch: Float[Tensor, "b o n 3"], gravity: Float[Tensor, "b o 3"],
+        self, shape: RestShape, embedding: Float[Tensor, "b o h"], compliance_scale: Float[Tensor, "b o"],
+        inputs: DeformationInputs,
     ) -> Float[Tensor, "b o n 3"]:  # fmt: skip
-        """Acceleration in the object's frame [m/s^2], without any that would move or turn the whole.
+        """Acceleration in the body frame [m/s^2], without net force and torque.
 
-        `touch` is the acceleration at the points by contact, `gravity` as the object's axes see it; what does not
-        `yield` is driven less.
+        The driving part is multiplied by `compliance_scale`, 1 or less (linear elasticity: strain is stress over E).
         """
+        u, du, contact = inputs.u, inputs.du, inputs.contact
         size = shape.size[..., None, None]
         mass_fraction = shape.initial.mass_fraction[..., None]
-        felt = _blurred(shape.blur, torch.cat([touch, u, du], -1)).unflatten(-1, (3, 3))  # b o n s 3 3
-        pushed, mean_u, mean_du = felt.unbind(-2)
-        virial = torch.einsum("boni,bonj->boij", mass_fraction * touch, shape.arm) / size**2
+        means = _neighbourhood_means(shape.blur, torch.cat([contact, u, du], -1)).unflatten(-1, (3, 3))  # b o n s 3 3
+        mean_contact, mean_u, mean_du = means.unbind(-2)
+        virial = torch.einsum("boni,bonj->boij", mass_fraction * contact, shape.arm) / size**2
         arm = shape.arm / size
         springs = torch.cat([u[..., None, :], u[..., None, :] - mean_u], -2)
         dampers = torch.cat([du[..., None, :], du[..., None, :] - mean_du], -2)
         spread = matvec((virial + virial.mT)[:, :, None], shape.arm)[..., None, :]
-        moving = torch.cat([20 * springs, 2 * dampers, pushed / 10, spread / 10], -2)
-        still = torch.stack([shape.normal, arm, (gravity / 5)[:, :, None].expand_as(arm)], -2)
-        said = apply_layers(arm[..., :0], (self.see, self.say[0], self.say[2]), torch.cat([moving, still], -2),
-                     self.own(code)[:, :, None])  # fmt: skip
-        # only what vanishes at rest: an untouched body stays as it is; springs pull back and dampers slow
-        pull, slow, drive = said.unflatten(-1, (3, SCALE_COUNT)).unbind(-2)
+        dynamic = torch.cat([20 * springs, 2 * dampers, mean_contact / 10, spread / 10], -2)
+        gravity = (inputs.gravity / 5)[:, :, None].expand_as(arm)
+        static = torch.stack([shape.normal, arm, gravity], -2)
+        weights = apply_layers(arm[..., :0], (self.see, self.say[0], self.say[2]), torch.cat([dynamic, static], -2),
+                               self.own(embedding)[:, :, None])  # fmt: skip
+        # only features that vanish at rest are weighted, so a body without contact keeps its rest shape; springs
+        # restore (negative weights) and dampers slow down
+        spring, damper, drive = weights.unflatten(-1, (3, SCALE_COUNT)).unbind(-2)
         drive = compliance_scale[..., None, None] * drive
-        said = torch.cat(
-            [-MAX_SPRING_WEIGHT * torch.sigmoid(pull - 3), -MAX_DAMPER_WEIGHT * torch.sigmoid(slow - 2), drive], -1
-        )
-        return projected(shape, 10 * weighted_sum(said, moving))
+        spring, damper = torch.sigmoid(spring - 3), torch.sigmoid(damper - 2)
+        weights = torch.cat([-MAX_SPRING_WEIGHT * spring, -MAX_DAMPER_WEIGHT * damper, drive], -1)
+        return projected(shape, 10 * weighted_sum(weights, dynamic))
 
 
-def _blurred(blur: Float[Tensor, "b o s n n"], x: Float[Tensor, "b o n 9"]) -> Float[Tensor, "b o n s 9"]:
-    """Averages of x over the neighbourhoods of each point."""
-    if blur.dtype == torch.float16 and not torch.is_grad_enabled():
+def _neighbourhood_means(blur: Float[Tensor, "b o s n n"], x: Float[Tensor, "b o n 9"]) -> Float[Tensor, "b o n s 9"]:
+    """Means of x over the s neighbourhoods of each point, whose weights are the rows of `blur`."""
+    if blur.dtype == torch.float16 and triton_allowed(x):
         s = blur.shape[2]
-        rows = blur.flatten(2, 3)  # all neighbourhoods at once
+        rows = blur.flatten(2, 3)  # all neighbourhoods in one product
         return skinny_matmul(rows, x).unflatten(2, (s, -1)).transpose(2, 3)
-    return (x.mT[:, :, None] @ blur.to(x).mT).permute(0, 1, 4, 2, 3)  # on a CPU twice as fast as what it means
+    # blur @ x, transposed: twice as fast on a CPU
+    return (x.mT[:, :, None] @ blur.to(x).mT).permute(0, 1, 4, 2, 3)
 
 
 def projected(shape: RestShape, field: Float[Tensor, "b o n 3"]) -> Float[Tensor, "b o n 3"]:
-    """A field on the points without its mean and without its net rotation; 0 where padded."""
+    """A vector field on the keypoints without its mean and without its net rotation (mass-weighted); 0 if padded."""
     mass_fraction = shape.initial.mass_fraction[..., None]
     field = field - (mass_fraction * field).sum(2, keepdim=True)
     momentum = (mass_fraction * torch.linalg.cross(shape.arm, field)).sum(2)
@@ -88,7 +105,7 @@ def projected(shape: RestShape, field: Float[Tensor, "b o n 3"]) -> Float[Tensor
 
 
 def bounded(shape: RestShape, u: Float[Tensor, "b o n 3"]) -> Float[Tensor, "b o n 3"]:
-    """Displacements kept below a share of the object's size, all of an object by the same, given factor."""
-    most = MAX_DISPLACEMENT * shape.size
+    """Displacements [m] of at most MAX_DISPLACEMENT sizes of the object, all of an object scaled by the same factor."""
+    maximum = MAX_DISPLACEMENT * shape.size
     largest = u.detach().square().sum(-1).amax(-1).sqrt()
-    return u * (most / torch.maximum(largest, most))[..., None, None]
+    return u * (maximum / torch.maximum(largest, maximum))[..., None, None]

@@ -1,4 +1,4 @@
-"""Networks that turn with the scene: numbers go in that no rotation changes, and weigh vectors that come out.
+"""Rotation-equivariant layers: inner products of vectors go into an MLP, whose outputs weight those vectors.
 
 Source: Villar et al. 2021, "Scalars are universal: equivariant machine learning, structured like classical physics".
 """
@@ -13,35 +13,36 @@ from torch import Tensor, nn
 from torch.nn.functional import silu
 
 from stages.core.kernels.compilers import TRITON
+from stages.core.models.field.kernel_choice import triton_allowed
 
 if TRITON:
     from stages.core.kernels.field.perceptron import MAX_LAYER_WIDTH, perceptron
 
 
 def inner_products(vectors: Float[Tensor, "*b k 3"]) -> Float[Tensor, "*b g"]:
-    """All k (k + 1) / 2 inner products, those of large vectors compressed to their logarithm."""
+    """asinh of all g = k (k + 1) / 2 inner products; asinh compresses large ones to about their logarithm."""
     k = vectors.shape[-2]
     row, column = torch.triu_indices(k, k, device=vectors.device)
-    # index_select: the gradient of plain indexing sorts, which takes longer than all the rest
+    # index_select: the backward pass of plain indexing sorts, which takes longer than everything else here
     if vectors.is_cuda:
         return torch.asinh((vectors.index_select(-2, row) * vectors.index_select(-2, column)).sum(-1))
-    xyz = vectors.reshape(-1, k, 3).permute(2, 1, 0).contiguous()  # a CPU copies long rows faster than triples
+    xyz = vectors.reshape(-1, k, 3).permute(2, 1, 0).contiguous()  # a CPU copies long rows faster than rows of three
     inner = sum(x.index_select(0, row) * x.index_select(0, column) for x in xyz)
     return torch.asinh(inner).mT.reshape(*vectors.shape[:-2], len(row))
 
 
 def weighted_sum(weights: Float[Tensor, "*b k"], vectors: Float[Tensor, "*b k 3"]) -> Float[Tensor, "*b 3"]:
-    """The weighted sum of vectors."""
+    """Sum of the k vectors times their weights."""
     return (weights[..., None] * vectors).sum(-2)
 
 
 def matvec(M: Float[Tensor, "*#b 3 3"], x: Float[Tensor, "*#b 3"]) -> Float[Tensor, "*#b 3"]:
-    """M x. For so small a product a sum is faster than a call of a library, and a compiler can fuse it."""
+    """M x, as an elementwise product and a sum: for 3 x 3 faster than a BLAS call, and a compiler can fuse it."""
     return (M * x[..., None, :]).sum(-1)
 
 
 def symmetric_solve(M: Float[Tensor, "*b 3 3"], *x: Float[Tensor, "*b 3"]) -> list[Float[Tensor, "*b 3"]]:
-    """M^-1 x of each x by Cramer's rule: unlike a call of a library it can be recorded in a CUDA graph."""
+    """M^-1 x for each x by Cramer's rule; unlike torch.linalg.solve it can be captured in a CUDA graph."""
     a, b, c = M.unbind(-2)
     ab, bc, ca = torch.linalg.cross(a, b), torch.linalg.cross(b, c), torch.linalg.cross(c, a)
     det = (a * bc).sum(-1, keepdim=True)
@@ -49,7 +50,7 @@ def symmetric_solve(M: Float[Tensor, "*b 3 3"], *x: Float[Tensor, "*b 3"]) -> li
 
 
 def smooth_norm(x: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
-    """The norm, with a gradient at zero."""
+    """sqrt(|x|^2 + 1e-12): the norm, differentiable at zero."""
     return (x.square().sum(-1) + 1e-12).sqrt()
 
 
@@ -57,13 +58,14 @@ def apply_layers(
     x: Float[Tensor, "*b i"], layers: Sequence[nn.Linear], vectors: Float[Tensor, "*b v 3"] | None = None,
     known: Float[Tensor, "*#b k"] | None = None, active: bool = False, near: Bool[Tensor, "*b"] | None = None,
 ) -> Float[Tensor, "*b j"]:  # fmt: skip
-    """Linear layers with SiLU between, in one kernel where that can be (on CUDA, without gradients).
+    """Linear layers with SiLU between them; one Triton kernel where `kernel_choice.triton_allowed`.
 
-    Products of `vectors` go before x. `known`, the same along the last of the dimensions b, is added to the result of
-    the first layer, or, if `active`, to x, which is then activated too. Where not `near` the result may be 0 instead.
+    x: input; the inner products of `vectors` are put before it.
+    known: added to the output of the first layer or, if `active`, to x; the same along the last batch dimension.
+    active: apply SiLU to x + known before the first layer.
+    near: rows whose result is needed; the kernel may return 0 in the others.
     """
-    fused = TRITON and x.is_cuda and x.dtype == torch.float32 and not torch.is_grad_enabled()
-    if fused and len(layers) in (2, 3) and max(layer.out_features for layer in layers) <= MAX_LAYER_WIDTH:
+    if triton_allowed(x) and len(layers) in (2, 3) and max(layer.out_features for layer in layers) <= MAX_LAYER_WIDTH:
         if known is not None:
             known = known.expand(*x.shape[:-2], 1, known.shape[-1]).flatten(0, -2)
         vectors = None if vectors is None else vectors.flatten(0, -3)
@@ -86,16 +88,16 @@ class Perceptron(nn.Sequential):
         return apply_layers(x, (self[0], self[2]))
 
 
-def mlp(inner: int, hidden: int, outer: int, quiet: float = 1.0) -> Perceptron:
-    """Linear, SiLU, Linear; `quiet` scales what comes out at first."""
+def mlp(inner: int, hidden: int, outer: int, output_scale: float = 1.0) -> Perceptron:
+    """Linear, SiLU, Linear; the initial weights of the last layer are multiplied by `output_scale`."""
     last = nn.Linear(hidden, outer)
     with torch.no_grad():
-        last.weight *= quiet
-        last.bias *= quiet
+        last.weight *= output_scale
+        last.bias *= output_scale
     return Perceptron(nn.Linear(inner, hidden), nn.SiLU(), last)
 
 
 def smooth_cutoff(x: Float[Tensor, "*b"], start: float, end: float) -> Float[Tensor, "*b"]:
-    """1 below `start`, exactly 0 above `end`, smooth between."""
+    """1 below `start`, exactly 0 above `end`, a cubic smoothstep between."""
     s = ((end - x) / (end - start)).clamp(0, 1)
     return s * s * (3 - 2 * s)

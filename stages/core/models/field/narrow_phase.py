@@ -1,4 +1,4 @@
-"""Which points of other objects, and which walls, are near."""
+"""Narrow phase of contact detection: nearest points of other objects, and points near walls."""
 
 from __future__ import annotations
 
@@ -9,31 +9,31 @@ from torch import Tensor
 from stages.core.kernels.compilers import TRITON
 
 if TRITON:
-    from stages.core.kernels.field.nearest import nearest_between_objects as searched
+    from stages.core.kernels.field.nearest import nearest_between_objects as nearest_triton
 
-CULLING_MIN_POINTS = 500  # points of a scene from which on it pays, on a CPU, to look before measuring
+CULLING_MIN_POINTS = 500  # keypoints of a scene from which culling by bounding boxes is faster on a CPU; measured
 
-Found = tuple[Float[Tensor, "b o o n"], Int[Tensor, "b o o n"]]
+Nearest = tuple[Float[Tensor, "b o o n"], Int[Tensor, "b o o n"]]
 
 
 @torch.no_grad()
-def nearest(points: Float[Tensor, "b o n 3"], valid: Bool[Tensor, "b o n"], reach: float) -> Found:
+def nearest(points: Float[Tensor, "b o n 3"], valid: Bool[Tensor, "b o n"], radius: float) -> Nearest:
     """For point n of object i and every object j: the distance [m] to j's nearest point, and which one that is.
 
-    The distance is infinite where it is not below `reach`, to the own object, to padding and from padding; the index
-    then means nothing.
+    The distance is infinite where it is not below `radius` [m], to the own object, to padding and from padding; the
+    index is then undefined.
     """
     if TRITON and points.is_cuda and points.dtype == torch.float32:
-        return searched(points, valid, reach)
-    few = points.shape[1] * points.shape[2] < CULLING_MIN_POINTS
-    search = _measured if few or points.is_cuda else _culled
-    distance, index = search(points, valid, reach)
-    return distance.masked_fill(distance >= reach, torch.inf), index
+        return nearest_triton(points, valid, radius)
+    small = points.shape[1] * points.shape[2] < CULLING_MIN_POINTS
+    search = _all_pairs if small or points.is_cuda else _culled
+    distance, index = search(points, valid, radius)
+    return distance.masked_fill(distance >= radius, torch.inf), index
 
 
-def _measured(points: Float[Tensor, "b o n 3"], valid: Bool[Tensor, "b o n"], reach: float) -> Found:
-    """Between all points. Candidates come from one matrix product of centred coordinates, in single precision; the
-    distance itself from the difference of the two points."""
+def _all_pairs(points: Float[Tensor, "b o n 3"], valid: Bool[Tensor, "b o n"], radius: float) -> Nearest:
+    """`nearest` by brute force: candidates from one matrix product of centred coordinates in single precision, the
+    distance from the difference of the two points."""
     o = points.shape[1]
     count = valid.sum((1, 2)).clamp_min(1)
     middle = torch.where(valid[..., None], points, 0.0).sum((1, 2)) / count[:, None]
@@ -50,13 +50,13 @@ def _measured(points: Float[Tensor, "b o n 3"], valid: Bool[Tensor, "b o n"], re
     return distance.masked_fill(unseen, torch.inf), index
 
 
-def _culled(points: Float[Tensor, "b o n 3"], valid: Bool[Tensor, "b o n"], reach: float) -> Found:
-    """Between those points of two objects that are within reach of the other's bounding box."""
+def _culled(points: Float[Tensor, "b o n 3"], valid: Bool[Tensor, "b o n"], radius: float) -> Nearest:
+    """`nearest` restricted to points within `radius` of the other object's bounding box."""
     b, o, n, _ = points.shape
     distance = points.new_full((b, o, o, n), torch.inf)
     index = valid.new_zeros(b, o, o, n, dtype=torch.int64)
-    low = points.masked_fill(~valid[..., None], torch.inf).amin(2) - reach
-    high = points.masked_fill(~valid[..., None], -torch.inf).amax(2) + reach
+    low = points.masked_fill(~valid[..., None], torch.inf).amin(2) - radius
+    high = points.masked_fill(~valid[..., None], -torch.inf).amax(2) + radius
     inside = ((points[:, :, None] > low[:, None, :, None]) & (points[:, :, None] < high[:, None, :, None])).all(-1)
     inside &= valid[:, :, None]
     for s, i, j in inside.any(-1).triu(1).nonzero().tolist():
@@ -64,24 +64,24 @@ def _culled(points: Float[Tensor, "b o n 3"], valid: Bool[Tensor, "b o n"], reac
         if not len(theirs):
             continue
         x, y = points[s, i, mine], points[s, j, theirs]
-        which = _closest(x, y)
+        which = _nearest_index(x, y)
         distance[s, i, j, mine], index[s, i, j, mine] = (x - y[which]).norm(dim=-1), theirs[which]
-        which = _closest(y, x)
+        which = _nearest_index(y, x)
         distance[s, j, i, theirs], index[s, j, i, theirs] = (y - x[which]).norm(dim=-1), mine[which]
     return distance, index
 
 
-def _closest(x: Float[Tensor, "p 3"], y: Float[Tensor, "q 3"]) -> Int[Tensor, "p"]:
-    """Which of y is nearest to each of x; |x - y|^2 / 2 - |x|^2 / 2 orders them, from one matrix product."""
+def _nearest_index(x: Float[Tensor, "p 3"], y: Float[Tensor, "q 3"]) -> Int[Tensor, "p"]:
+    """Index of the nearest y to each x, by |y|^2 / 2 - x.y = (|x - y|^2 - |x|^2) / 2 from one matrix product."""
     middle = y.mean(0)
     x, y = x - middle, y - middle
     return torch.addmm(y.square().sum(-1) / 2, x, y.T, alpha=-1).argmin(-1)
 
 
 def near_walls(
-    points: Float[Tensor, "b o n 3"], valid: Bool[Tensor, "b o n"], box: Float[Tensor, "b o 2 3"], reach: float
+    points: Float[Tensor, "b o n 3"], valid: Bool[Tensor, "b o n"], box: Float[Tensor, "b o 2 3"], radius: float
 ) -> Bool[Tensor, "b o n"]:
-    """Points within `reach` [m] of the floor or of one of the four walls, on either side; the ceiling is open."""
+    """Points within `radius` [m] of the floor or of one of the four walls, on either side; the ceiling is open."""
     low, high = box[..., None, 0, :], box[..., None, 1, :]
-    near = ((points - low).abs() < reach).any(-1) | ((points[..., :2] - high[..., :2]).abs() < reach).any(-1)
+    near = ((points - low).abs() < radius).any(-1) | ((points[..., :2] - high[..., :2]).abs() < radius).any(-1)
     return near & valid

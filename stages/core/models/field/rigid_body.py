@@ -1,4 +1,4 @@
-"""Turning: rotation vectors, quaternions and spin from angular momentum."""
+"""Rigid-body motion: rotation vectors, quaternions, drift without forces, and the best rigid fit to moving points."""
 
 from __future__ import annotations
 
@@ -11,34 +11,41 @@ from torch import Tensor
 from stages.core.geometry.rotations import matrix, multiply, nearest_rotation
 from stages.core.kernels.field import rigid_motion as kernels
 from stages.core.models.field.equivariant import matvec
+from stages.core.models.field.kernel_choice import kernels_allowed
 
 
-def exponential(turn: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 4"]:
-    """The quaternion w x y z of a rotation vector [rad]; smooth at zero."""
-    squared = turn.square().sum(-1, keepdim=True)
+def exponential(rotation: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 4"]:
+    """Unit quaternion w x y z of a rotation vector [rad]; smooth at zero."""
+    squared = rotation.square().sum(-1, keepdim=True)
     half = (squared + 1e-24).sqrt() / 2
     # sin(a / 2) / a without dividing by zero: torch.sinc(x) = sin(pi x) / (pi x)
-    return torch.cat([half.cos(), turn * torch.sinc(half / torch.pi) / 2], -1)
+    return torch.cat([half.cos(), rotation * torch.sinc(half / torch.pi) / 2], -1)
 
 
-def rotated(quats: Float[Tensor, "*b 4"], turn: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 4"]:
-    """Orientations after a rotation about world axes [rad], of unit length."""
-    q = multiply(exponential(turn), quats)
+def rotated(quats: Float[Tensor, "*b 4"], rotation: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 4"]:
+    """Orientations (unit quaternions w x y z) after a further rotation about world axes [rad]."""
+    q = multiply(exponential(rotation), quats)
     return q / q.norm(dim=-1, keepdim=True)
 
 
 def angular_velocity(
     momentum: Float[Tensor, "*b 3"], inverse: Float[Tensor, "*b 3 3"], R: Float[Tensor, "*b 3 3"]
 ) -> Float[Tensor, "*b 3"]:
-    """Angular velocity [rad/s], world axes, of an angular momentum per mass [m^2/s]; `inverse` inertia at rest."""
+    """Angular velocity [rad/s] of an angular momentum per unit of mass [m^2/s], both in world axes.
+
+    `inverse` is the inverse inertia tensor per unit of mass in the rest orientation [1/m^2], R the rotation from it.
+    """
     return matvec(R, matvec(inverse, matvec(R.mT, momentum)))
 
 
 def pose(
     quat: Float[Tensor, "*b 4"], momentum: Float[Tensor, "*b 3"], inverse: Float[Tensor, "*b 3 3"]
 ) -> tuple[Float[Tensor, "*b 3 3"], Float[Tensor, "*b 3"]]:
-    """Rotation matrices, and spins as `spin_of` has them."""
-    if _at_once(quat):
+    """Rotation matrices, and angular velocities [rad/s] as `angular_velocity` defines them.
+
+    One kernel without gradients where `kernel_choice.kernels_allowed`.
+    """
+    if kernels_allowed(quat):
         return kernels.pose(quat, momentum, inverse)
     R = matrix(quat)
     return R, angular_velocity(momentum, inverse, R)
@@ -48,54 +55,55 @@ def drift(
     com: Float[Tensor, "*b 3"], quat: Float[Tensor, "*b 4"], velocity: Float[Tensor, "*b 3"],
     momentum: Float[Tensor, "*b 3"], inverse: Float[Tensor, "*b 3 3"], dt: float,
 ) -> tuple[Float[Tensor, "*b 3"], Float[Tensor, "*b 4"]]:  # fmt: skip
-    """Centres of mass and orientations after dt [s] without forces. The spin is that of the middle of the way (second
-    order)."""
-    if _at_once(quat):
+    """Centres of mass [m] and orientations after dt [s] of force-free motion.
+
+    Rotations use the angular velocity at half the step (explicit midpoint rule, second order). One kernel without
+    gradients where `kernel_choice.kernels_allowed`.
+    """
+    if kernels_allowed(quat):
         return kernels.drift(com, quat, velocity, momentum, inverse, dt)
     spin = pose(quat, momentum, inverse)[1]
     spin = pose(rotated(quat, dt / 2 * spin), momentum, inverse)[1]
     return com + dt * velocity, rotated(quat, dt * spin)
 
 
-def _at_once(x: Tensor) -> bool:
-    """Whether one kernel can do it."""
-    return x.dtype == torch.float32 and not torch.is_grad_enabled()
-
-
-def clamp_norm(x: Float[Tensor, "*b 3"], most: float) -> Float[Tensor, "*b 3"]:
-    """Vectors made no longer than `most`."""
-    return x * (most / x.norm(dim=-1, keepdim=True).clamp_min(most))
+def clamp_norm(x: Float[Tensor, "*b 3"], maximum: float) -> Float[Tensor, "*b 3"]:
+    """Vectors scaled to a norm of at most `maximum`."""
+    return x * (maximum / x.norm(dim=-1, keepdim=True).clamp_min(maximum))
 
 
 class RigidFit(NamedTuple):
-    """The rigid motion that comes nearest to that of some points; what is left is deformation."""
+    """Least-squares rigid motion of moving points, and the residual as deformation."""
 
     R: Float[Tensor, "b o 3 3"]
-    com: Float[Tensor, "b o 3"]
-    velocity: Float[Tensor, "b o 3"]
-    momentum: Float[Tensor, "b o 3"]  # angular, per unit of mass, about the centre
-    u: Float[Tensor, "b o n 3"]  # in the object's frame
-    du: Float[Tensor, "b o n 3"]
+    com: Float[Tensor, "b o 3"]  # [m]
+    velocity: Float[Tensor, "b o 3"]  # [m/s]
+    momentum: Float[Tensor, "b o 3"]  # angular, per unit of mass, about the centre of mass [m^2/s]
+    u: Float[Tensor, "b o n 3"]  # residual displacements, body frame [m]
+    du: Float[Tensor, "b o n 3"]  # residual velocities, body frame [m/s]
 
 
 def fit_rigid_motion(
     mass_fraction: Float[Tensor, "b o n"], arm: Float[Tensor, "b o n 3"], inverse: Float[Tensor, "b o 3 3"],
-    points: Float[Tensor, "b o n 3"], speed: Float[Tensor, "b o n 3"],
+    points: Float[Tensor, "b o n 3"], velocities: Float[Tensor, "b o n 3"],
 ) -> RigidFit:  # fmt: skip
-    """Rigid motion of points whose arms at rest are known.
+    """Rigid motion of `points` [m] moving with `velocities` [m/s], whose offsets at rest are `arm` [m].
 
+    `inverse` is the inverse inertia tensor per unit of mass at rest [1/m^2].
     Source: Mueller et al. 2005, "Meshless deformations based on shape matching", section 3.
     """
     weight = mass_fraction[..., None]
-    com, velocity = (weight * points).sum(2), (weight * speed).sum(2)
-    there = weight > 0
-    offset = torch.where(there, points - com[:, :, None], 0.0)
-    drift = torch.where(there, speed - velocity[:, :, None], 0.0)
-    # a little of the identity: points on a line or in a plane leave a turn open
+    com, velocity = (weight * points).sum(2), (weight * velocities).sum(2)
+    present = weight > 0
+    offset = torch.where(present, points - com[:, :, None], 0.0)
+    relative = torch.where(present, velocities - velocity[:, :, None], 0.0)
+    # a small multiple of the identity: collinear or coplanar points leave a rotation undetermined
     eye = torch.eye(3, dtype=arm.dtype, device=arm.device)
     spread = (weight * arm.square()).sum((2, 3))[..., None, None]
     R = nearest_rotation((weight * offset).mT @ arm + 1e-6 * (spread + 1e-6) * eye)
-    momentum = torch.linalg.cross(weight * offset, drift).sum(2)
+    momentum = torch.linalg.cross(weight * offset, relative).sum(2)
     spin = angular_velocity(momentum, inverse, R)
-    turning = torch.linalg.cross(spin[:, :, None].expand_as(offset), offset)
-    return RigidFit(R, com, velocity, momentum, offset @ R - arm, torch.where(there, drift - turning, 0.0) @ R)
+    rotating = torch.linalg.cross(spin[:, :, None].expand_as(offset), offset)
+    return RigidFit(
+        R, com, velocity, momentum, offset @ R - arm, torch.where(present, relative - rotating, 0.0) @ R
+    )  # fmt: skip

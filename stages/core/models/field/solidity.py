@@ -1,4 +1,4 @@
-"""How much stiffer a body is than a hollow or thin one of the same material."""
+"""Solidity: ratio of a compact body's bending stiffness to that of a thin-walled one of the same material."""
 
 from __future__ import annotations
 
@@ -6,18 +6,19 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-REFERENCE_THICKNESS = 0.015  # volume over surface of bodies in the published data, all of which are hollow or thin [m]
+REFERENCE_THICKNESS = 0.015  # volume over surface of the published objects, all hollow or thin [m]; measured on them
 
 
 def solidity(points: Float[Tensor, "n 3"], volume: float) -> float:
-    """How many times stiffer, from points on its surface [m] and its volume [m^3]; 1 for what is hollow or thin.
+    """Stiffness ratio from points on the surface [m] and the volume [m^3]; 1 for hollow or thin bodies.
 
-    Walls and boards resist bending by the cube of their thickness.
+    (volume / surface / REFERENCE_THICKNESS) cubed, as the bending stiffness of a plate grows with the cube of its
+    thickness. The surface is that of the box of `box_sides`. A heuristic without a source.
     """
     a, b, c = box_sides(points).tolist()
     return max(volume / (2 * (a * b + b * c + c * a)) / REFERENCE_THICKNESS, 1.0) ** 3
 
 
 def box_sides(points: Float[Tensor, "n 3"]) -> Float[Tensor, "3"]:
-    """Of a block whose points spread as these do, the shortest first."""
+    """Side lengths [m], ascending, of a solid box whose uniform density has the same covariance as the points."""
     return (12 * torch.linalg.eigvalsh(points.T.cov(correction=0)).clamp_min(1e-12)).sqrt()

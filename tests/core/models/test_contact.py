@@ -5,11 +5,11 @@ import itertools
 import pytest
 import torch
 
-from stages.core.models.field.narrow_phase import _culled, _measured, near_walls, nearest
+from stages.core.models.field.narrow_phase import _culled, _all_pairs, near_walls, nearest
 from tests.core.models.worlds import crowd, padded
 
 
-@pytest.mark.parametrize("search", [_measured, _culled])
+@pytest.mark.parametrize("search", [_all_pairs, _culled])
 def test_nearest_equals_a_loop(search):
     initial, reach = padded(crowd(2, 3, 9), 1, 2), 0.15
     x, valid = initial.points, initial.valid
@@ -36,7 +36,7 @@ def test_only_what_is_within_reach_is_found():
 
 def test_many_points_are_searched_as_few_are():
     initial = crowd(2, 3, 300)
-    (a, i), (b, j) = (f(initial.points, initial.valid, 0.1) for f in (nearest, _measured))
+    (a, i), (b, j) = (f(initial.points, initial.valid, 0.1) for f in (nearest, _all_pairs))
     b = b.masked_fill(b >= 0.1, torch.inf)
     torch.testing.assert_close(a, b)
     assert torch.equal(i[a.isfinite()], j[a.isfinite()])

@@ -5,7 +5,7 @@ import itertools
 import pytest
 import torch
 
-from stages.core.models.field.narrow_phase import _culled, _all_pairs, near_walls, nearest
+from stages.core.models.field.narrow_phase import _all_pairs, _culled, near_walls, nearest
 from tests.core.models.worlds import crowd, padded
 
 

@@ -155,7 +155,7 @@ def test_the_folder_or_video_that_was_meant_is_named(tmp_path):
     with pytest.raises(InputError, match="films: holds no photos itself; give .*IMG 7.MOV"):
         read_photos(tmp_path / "films")
     (tmp_path / "none").mkdir()
-    with pytest.raises(InputError, match="none: no photos in it; these kinds are read"):
+    with pytest.raises(InputError, match="none: no photos in it; these formats are read"):
         read_photos(tmp_path / "none")
 
 

@@ -1,1 +1,1 @@
-"""The data model, and the only code that knows a file format."""
+"""The data model and its file formats, described in README.md."""

@@ -1,4 +1,4 @@
-"""Cameras in memory, and the camera files of other tools."""
+"""Pinhole cameras, and readers for the camera files of other tools."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ class Cameras:
         return Cameras(self.viewmats[rows], self.Ks[rows], self.sizes[rows], tuple(self.names[i] for i in rows))
 
     def transformed(self, similarity: Similarity) -> Cameras:
-        """The cameras after the world is transformed."""
+        """The same cameras in the transformed world."""
         return Cameras(similarity.viewmats(self.viewmats), self.Ks, self.sizes, self.names)
 
 
 def to_json(cameras: Cameras) -> list[dict]:
-    """One plain dict a camera, as stored in headers."""
+    """One dict per camera, as stored in the header of scene.ply."""
     return [
         {"name": name, "viewmat": viewmat.tolist(), "K": K.tolist(), "size": size.tolist()}
         for name, viewmat, K, size in zip(cameras.names, cameras.viewmats, cameras.Ks, cameras.sizes, strict=True)
@@ -45,7 +45,7 @@ def to_json(cameras: Cameras) -> list[dict]:
 
 
 def from_json(rows: list[dict]) -> Cameras | None:
-    """The inverse of to_json; nothing for an empty list."""
+    """The inverse of `to_json`; None for an empty list."""
     if not rows:
         return None
     return Cameras(
@@ -58,13 +58,16 @@ def from_json(rows: list[dict]) -> Cameras | None:
 
 @dataclass(frozen=True)
 class LensDistortion:
-    """Distortion of each camera as OpenCV orders it: k1 k2 p1 p2 k3 (zeros for none)."""
+    """Distortion coefficients of each camera in the order of OpenCV: k1 k2 p1 p2 k3 (zeros for none)."""
 
     coefficients: Float[Tensor, "c 5"]
 
 
 def read_cameras(path: Path) -> tuple[Cameras, LensDistortion]:
-    """Cameras of a nerfstudio transforms.json or of a COLMAP model folder (cameras, images, points3D)."""
+    """Cameras of a nerfstudio transforms.json or of a COLMAP model folder (cameras, images, points3D), sorted by name.
+
+    Raises InputError for other files and for camera models with other distortion parameters than OpenCV's first five.
+    """
     path = Path(path)
     if path.is_dir():
         return _read_colmap(path)
@@ -81,7 +84,7 @@ def read_cameras(path: Path) -> tuple[Cameras, LensDistortion]:
 
 
 def _from_transforms(data: dict) -> tuple[Cameras, LensDistortion]:
-    """OpenGL axes (y up, camera looks along -z) become OpenCV's by turning y and z."""
+    """Cameras of a transforms.json; OpenGL axes (y up, view along -z) become OpenCV axes by negating y and z."""
     viewmats, Ks, sizes, names, lenses = [], [], [], [], []
     for frame in sorted(data["frames"], key=lambda frame: frame["file_path"]):
         value = {**data, **frame}
@@ -98,7 +101,7 @@ def _from_transforms(data: dict) -> tuple[Cameras, LensDistortion]:
 
 
 def _read_colmap(path: Path) -> tuple[Cameras, LensDistortion]:
-    import pycolmap  # noqa: PLC0415 -- a second to import, and only this reader needs it
+    import pycolmap  # takes a second to import, and only this reader needs it
 
     try:
         model = pycolmap.Reconstruction(str(path))
@@ -119,7 +122,7 @@ def _read_colmap(path: Path) -> tuple[Cameras, LensDistortion]:
 
 
 def _colmap_lens(path: Path, camera) -> list[float]:
-    """k1 k2 p1 p2 k3 from the parameters after focal length and principal point."""
+    """k1 k2 p1 p2 k3 of a COLMAP camera: its parameters after focal length and principal point."""
     tail = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 3, "RADIAL": 3, "OPENCV": 4}
     model = camera.model.name
     if model not in tail:

@@ -1,4 +1,4 @@
-"""Files that exist are complete, and say what made them."""
+"""Atomic writing, checks before reading, and provenance."""
 
 import hashlib
 import os
@@ -13,7 +13,10 @@ from stages.core.errors import InputError
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A temporary path beside `path` (same suffix) that takes its place on success and vanishes on failure."""
+    """A temporary path beside `path`, with the same suffix, that replaces it on success and is deleted on failure.
+
+    Raises InputError where `path` is a folder, its folder is missing, or the file cannot be written.
+    """
     path = Path(path)
     if path.is_dir():
         raise InputError(f"{path}: is a folder; name the file to write")
@@ -30,27 +33,27 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def must_exist(path: Path, what: str) -> Path:
-    """The path, if it is a readable, non-empty file; otherwise the sentence the user should see."""
+    """The path of a readable, non-empty file; otherwise InputError, which names `what` is expected."""
     path = Path(path)
     if path.is_dir():
         raise InputError(f"{path}: is a folder; {what} is expected")
     if not path.exists():
         raise InputError(f"{path}: no such file; {what} is expected")
     if not os.access(path, os.R_OK):
-        raise InputError(f"{path}: may not be read; check its permissions")
+        raise InputError(f"{path}: cannot be read; check its permissions")
     if path.stat().st_size == 0:
         raise InputError(f"{path}: is empty; {what} is expected")
     return path
 
 
 def sha256(path: Path) -> str:
-    """Hex digest of a file."""
+    """Hexadecimal SHA-256 of a file."""
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest() if hasattr(hashlib, "file_digest") else _digest(file)
 
 
 def _digest(file) -> str:
-    """What hashlib.file_digest does, for Python 3.10."""
+    """SHA-256 in blocks, as hashlib.file_digest (Python 3.11)."""
     digest = hashlib.sha256()
     while block := file.read(1 << 20):
         digest.update(block)
@@ -58,6 +61,7 @@ def _digest(file) -> str:
 
 
 def ngff_version() -> str:
+    """Version of the installed package."""
     try:
         return version("ngff")
     except PackageNotFoundError:
@@ -65,7 +69,7 @@ def ngff_version() -> str:
 
 
 def provenance(command: str, inputs: list[Path], options: object = None) -> dict:
-    """What made a file: command, version, inputs with sha256 (of files; a folder is only named), options."""
+    """Provenance of a file: command, version, inputs with sha256 (of files; folders only by name), options."""
     chosen = asdict(options) if is_dataclass(options) else dict(options or {})
     return {
         "command": command,

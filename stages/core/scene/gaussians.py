@@ -1,4 +1,4 @@
-"""3D Gaussians in memory."""
+"""3D Gaussians as tensors."""
 
 from __future__ import annotations
 
@@ -29,10 +29,11 @@ class Gaussians:
         return len(self.means)
 
     def __getitem__(self, index) -> Gaussians:
-        """Those that a mask, slice or index tensor picks."""
+        """The Gaussians selected by a mask, slice or index tensor."""
         return Gaussians(*(getattr(self, f.name)[index] for f in fields(self)))
 
     def to(self, device: str | torch.device) -> Gaussians:
+        """The same Gaussians on a device."""
         return Gaussians(*(getattr(self, f.name).to(device) for f in fields(self)))
 
 
@@ -45,7 +46,7 @@ def concatenate(parts: Sequence[Gaussians]) -> Gaussians:
 
 
 def transformed(g: Gaussians, similarity: Similarity) -> Gaussians:
-    """The same Gaussians elsewhere, turned and grown; colours that depend on direction turn along."""
+    """Gaussians under a similarity transform, spherical harmonics rotated with them."""
     R = similarity.rotation
     return replace(
         g, means=similarity(g.means), quats=multiply(quaternion(R).expand(len(g), 4), g.quats),

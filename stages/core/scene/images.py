@@ -1,4 +1,4 @@
-"""Photos, PNG and MP4: the one place that knows OpenCV is BGR."""
+"""Images and videos; the only module that handles the BGR order of OpenCV."""
 
 from __future__ import annotations
 
@@ -19,26 +19,26 @@ from stages.core.scene.formats import IMAGE_SUFFIXES
 
 
 def list_photos(folder: Path) -> list[Path]:
-    """Photos of a folder in the order of their names; other files and hidden ones are left out."""
+    """Image files of a folder, sorted by name, without hidden files; InputError if there are none."""
     folder = Path(folder)
     if not folder.is_dir():
-        raise InputError(f"{folder}: is no folder; give a folder of photos or a video file")
+        raise InputError(f"{folder}: is not a folder; give a folder of photos or a video file")
     photos = sorted(p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith("."))
     if not photos:
-        raise InputError(f"{folder}: no photos in it; these kinds are read: {' '.join(sorted(IMAGE_SUFFIXES))}")
+        raise InputError(f"{folder}: no photos in it; these formats are read: {' '.join(sorted(IMAGE_SUFFIXES))}")
     return photos
 
 
 def read_image(path: Path) -> Float[Tensor, "h w 3"]:
-    """RGB in 0..1, turned upright by its EXIF tag; alpha is dropped, 16 bits are kept to float precision."""
+    """RGB in 0..1, rotated by its EXIF tag; alpha is dropped, 16-bit values keep float32 precision."""
     must_exist(path, "an image")
     pixels = _decode(path, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
-    top = np.iinfo(pixels.dtype).max if pixels.dtype.kind == "u" else 1.0
-    return torch.from_numpy(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB).astype(np.float32) / np.float32(top))
+    white = np.iinfo(pixels.dtype).max if pixels.dtype.kind == "u" else 1.0
+    return torch.from_numpy(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB).astype(np.float32) / np.float32(white))
 
 
 def read_labels(path: Path) -> Int[Tensor, "h w"]:
-    """A label image: one integer a pixel (8 or 16 bit, one channel)."""
+    """A label image: one integer per pixel (8 or 16 bit, one channel). InputError for several channels."""
     must_exist(path, "a label image")
     pixels = _decode(path, cv2.IMREAD_UNCHANGED)
     if pixels.ndim != 2:
@@ -47,10 +47,10 @@ def read_labels(path: Path) -> Int[Tensor, "h w"]:
 
 
 def _decode(path: Path, flags: int) -> np.ndarray:
-    """Pixels of an image file, colours as BGR. Raises InputError where OpenCV finds none."""
+    """Pixels of an image file, BGR. Raises InputError for files that OpenCV cannot decode."""
     try:
         pixels = cv2.imdecode(np.fromfile(path, np.uint8), flags)
-    except cv2.error as error:  # by its header it has more pixels than OpenCV takes, 2^30
+    except cv2.error as error:  # the header claims more than the 2^30 pixels that OpenCV accepts
         raise InputError(f"{path}: is damaged, or far too large; images of 4000 pixels or less will do") from error
     if pixels is None:
         raise InputError(f"{path}: is not an image that can be read; convert it to JPEG or PNG")
@@ -58,24 +58,24 @@ def _decode(path: Path, flags: int) -> np.ndarray:
 
 
 def resize(image: Float[Tensor, "h w c"], width: int, height: int) -> Float[Tensor, "h2 w2 c"]:
-    """Resampled by area where it shrinks, linearly where it grows."""
+    """Resize by area averaging to a smaller width, bilinearly to a larger one."""
     shrink = width < image.shape[1]
     pixels = cv2.resize(image.numpy(), (width, height), interpolation=cv2.INTER_AREA if shrink else cv2.INTER_LINEAR)
     return torch.from_numpy(pixels.reshape(height, width, -1))
 
 
 def to_bytes(image: Float[Tensor, "h w 3"]) -> np.ndarray:
-    """8-bit RGB, rounded."""
+    """8-bit RGB (h, w, 3), clamped and rounded."""
     return (image.detach().cpu().clamp(0, 1) * 255).round().to(torch.uint8).numpy()
 
 
 def write_png(path: Path, image: Float[Tensor, "h w 3"]) -> None:
-    """An 8-bit RGB PNG."""
+    """Write an 8-bit RGB PNG."""
     _write_pixels(path, cv2.cvtColor(to_bytes(image), cv2.COLOR_RGB2BGR))
 
 
 def write_jpeg(path: Path, image: Float[Tensor, "h w 3"], quality: int = 92) -> None:
-    """An 8-bit JPEG, for photos."""
+    """Write an 8-bit JPEG."""
     pixels = cv2.cvtColor(to_bytes(image), cv2.COLOR_RGB2BGR)
     _, data = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, quality])
     with replacing(path) as part:
@@ -83,13 +83,13 @@ def write_jpeg(path: Path, image: Float[Tensor, "h w 3"], quality: int = 92) -> 
 
 
 def write_labels(path: Path, labels: Int[Tensor, "h w"]) -> None:
-    """A one-channel PNG of integers, 16 bit when 8 are too few."""
-    top = int(labels.max()) if labels.numel() else 0
-    _write_pixels(path, labels.cpu().numpy().astype(np.uint8 if top < 256 else np.uint16))
+    """Write a one-channel PNG of integers, 8 bit, or 16 bit for labels above 255."""
+    highest = int(labels.max()) if labels.numel() else 0
+    _write_pixels(path, labels.cpu().numpy().astype(np.uint8 if highest < 256 else np.uint16))
 
 
 def write_depth(path: Path, depth: Float[Tensor, "h w"], unit: float = 1e-3) -> None:
-    """A 16-bit PNG of depth in steps of `unit` (millimetres for metres); 0 is "nothing there"."""
+    """Write depth as a 16-bit PNG in steps of `unit`, by default thousandths of a scene unit; 0 is no surface."""
     _write_pixels(path, (depth.cpu() / unit).round().clamp(0, 65535).numpy().astype(np.uint16))
 
 
@@ -102,9 +102,9 @@ def _write_pixels(path: Path, pixels: np.ndarray) -> None:
 
 
 class VideoWriter:
-    """An H.264 MP4 (yuv420p, index first, so browsers and slides play it), complete or absent.
+    """Context manager that writes an H.264 MP4 (yuv420p, index first, as browsers need it) frame by frame.
 
-    `frames` are (h, w, 3) RGB in 0..1; odd sizes lose their last row or column, since yuv420p needs even ones.
+    The file appears only on success. yuv420p needs even sizes: the last row or column of odd ones is dropped.
     """
 
     def __init__(self, path: Path, fps: float):
@@ -117,6 +117,7 @@ class VideoWriter:
         return self
 
     def append(self, image: Float[Tensor, "h w 3"]) -> None:
+        """Encode one frame, RGB in 0..1; all frames have the size of the first."""
         pixels = to_bytes(image)
         pixels = pixels[: pixels.shape[0] // 2 * 2, : pixels.shape[1] // 2 * 2]
         if self._stream is None:
@@ -137,14 +138,14 @@ class VideoWriter:
 
 
 def video_info(path: Path) -> tuple[int, float]:
-    """Number of frames (as counted by the container, 0 when it does not say) and frames a second."""
+    """Number of frames (from the container, 0 where unknown) and frames per second."""
     with open_video(path) as file:
         stream = file.streams.video[0]
         return stream.frames, float(stream.average_rate or 0)
 
 
 def read_video(path: Path) -> Iterator[Float[Tensor, "h w 3"]]:
-    """The frames of a video in order."""
+    """The frames of a video in order, RGB in 0..1. Raises InputError for a damaged video."""
     with open_video(path) as file:
         try:
             for frame in file.decode(video=0):
@@ -154,7 +155,7 @@ def read_video(path: Path) -> Iterator[Float[Tensor, "h w 3"]]:
 
 
 def open_video(path: Path) -> av.container.InputContainer:
-    """To be decoded. Raises InputError for what is no video."""
+    """Open a video for decoding. Raises InputError for other files."""
     must_exist(path, "a video")
     try:
         file = av.open(str(path))

@@ -12,11 +12,12 @@ C0 = 0.28209479177387814
 
 
 def is_packed(ply: PlyData) -> bool:
+    """Whether a PLY has the packed layout."""
     return "chunk" in ply and "packed_position" in ply["vertex"].data.dtype.names
 
 
 def unpack(ply: PlyData) -> dict[str, np.ndarray]:
-    """Columns named as in a standard 3D-Gaussian PLY."""
+    """Properties (n) by name, with the names and values of a standard 3D-Gaussian PLY."""
     vertex, chunk = ply["vertex"].data, ply["chunk"].data
     of = np.arange(len(vertex)) // CHUNK
     out: dict[str, np.ndarray] = {}
@@ -46,13 +47,13 @@ def unpack(ply: PlyData) -> dict[str, np.ndarray]:
 
 
 def _three(word: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """11, 10 and 11 bits as fractions."""
+    """Three fractions 0..1 from 11, 10 and 11 bits of 32-bit words."""
     word = word.astype(np.uint32)
     return (word >> 21) / 2047, (word >> 11 & 1023) / 1023, (word & 2047) / 2047
 
 
 def _rotation(word: np.ndarray) -> np.ndarray:
-    """w x y z from the three smaller components; the two top bits say which one was left out."""
+    """Quaternions w x y z from the three smaller components; the two top bits give the index of the omitted one."""
     word = word.astype(np.uint32)
     largest = (word >> 30).astype(np.int64)
     small = np.stack([((word >> s & 1023) / 1023 - 0.5) * 2**0.5 for s in (20, 10, 0)])

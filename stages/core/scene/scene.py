@@ -1,4 +1,4 @@
-"""A scene: Gaussians, what the objects among them are, and the cameras that saw them."""
+"""A scene: Gaussians, their objects, and the cameras of the photos."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from stages.core.scene.gaussians import Gaussians
 
 @dataclass(frozen=True)
 class SceneObject:
-    """One thing that can move; its Gaussians carry its id."""
+    """A movable object; its Gaussians have its id."""
 
     id: int  # 1 or more
     name: str
-    material: str = ""  # empty: decided by name
+    material: str = ""  # empty: decided from the name
 
 
 @dataclass(frozen=True)
 class Scene:
-    """World frame: z up, right-handed, lengths in scene units."""
+    """Gaussians, objects and cameras in the world frame: z up, right-handed, lengths in scene units."""
 
     gaussians: Gaussians
     objects: tuple[SceneObject, ...] = ()
@@ -27,12 +27,13 @@ class Scene:
     floor: float | None = None  # height z of the supporting plane
     scale: dict = field(default_factory=lambda: {"metres_per_unit": 1.0, "source": "not stated"})
     provenance: dict = field(default_factory=dict)
-    background: tuple[float, float, float] | None = None  # RGB 0..1 seen where there is nothing
+    background: tuple[float, float, float] | None = None  # RGB 0..1 where there is no Gaussian
 
     @property
     def metres_per_unit(self) -> float:
+        """Length of a scene unit [m]."""
         return float(self.scale.get("metres_per_unit", 1.0))
 
     def name_of(self, object_id: int) -> str:
-        """The object's name, or object_ID where none was given."""
+        """The name of an object, object_ID where it has none."""
         return next((o.name for o in self.objects if o.id == object_id), f"object_{object_id}")

@@ -1,4 +1,4 @@
-"""scene.ply: the standard 3D-Gaussian PLY, plus object ids, plus our facts as JSON in header comments."""
+"""scene.ply: a standard 3D-Gaussian PLY with object ids, and metadata as JSON in header comments (README.md)."""
 
 from __future__ import annotations
 
@@ -19,45 +19,47 @@ from stages.core.scene.scene import Scene, SceneObject
 
 log = logging.getLogger(__name__)
 VERSION = 1
-NEEDED = ["x", "y", "z", "opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
-COLOUR = [f"f_dc_{i}" for i in range(3)]
-WHAT = "a 3D-Gaussian PLY, such as `ngff reconstruct` writes"
+REQUIRED = ["x", "y", "z", "opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
+COLOURS = [f"f_dc_{i}" for i in range(3)]
+EXPECTED = "a 3D-Gaussian PLY, such as `ngff reconstruct` writes"
 
 
 def read_scene(path: Path) -> Scene:
-    """Any 3D-Gaussian PLY: ours, or another tool's (SH degree 0 to 3, either byte order, packed or not).
+    """Read a 3D-Gaussian PLY of any tool (SH degree 0 to 3, either byte order, packed or not).
 
-    Gaussians with a value that is not finite or a zero quaternion are dropped, and the log says how many.
+    Gaussians with a non-finite value or a zero quaternion are dropped with a warning. Raises InputError for other
+    files, files without Gaussians and newer versions.
     """
     path = Path(path)
-    must_exist(path, WHAT)
+    must_exist(path, EXPECTED)
     try:
         ply = PlyData.read(str(path))
     except (PlyParseError, ValueError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: is not a readable PLY file ({error}); {WHAT} is expected") from error
+        raise InputError(f"{path}: is not a readable PLY file ({error}); {EXPECTED} is expected") from error
     if "vertex" not in ply:
-        raise InputError(f"{path}: has no element called vertex; {WHAT} is expected")
+        raise InputError(f"{path}: has no element called vertex; {EXPECTED} is expected")
     raw = unpack(ply) if is_packed(ply) else {p.name: ply["vertex"][p.name] for p in ply["vertex"].properties}
     gaussians = _activate(path, raw)
     if not len(gaussians):
-        raise InputError(f"{path}: holds no Gaussians; {WHAT} is expected")
+        raise InputError(f"{path}: holds no Gaussians; {EXPECTED} is expected")
     return _with_header(path, gaussians, ply.comments)
 
 
 def _activate(path: Path, raw: dict[str, np.ndarray]) -> Gaussians:
-    """Stored values (logits, logarithms, raw quaternions) to values ready for use."""
-    missing = [name for name in NEEDED + COLOUR if name not in raw]
+    """Gaussians from stored values: logits, logarithms and raw quaternions."""
+    missing = [name for name in REQUIRED + COLOURS if name not in raw]
     if missing:
         raise InputError(
-            f"{path}: no vertex property {', '.join(missing)}; {WHAT} is expected (this may be a plain point cloud)"
+            f"{path}: no vertex property {', '.join(missing)}; {EXPECTED} is expected "
+            "(this may be a plain point cloud)"
         )
     rest = sorted((n for n in raw if n.startswith("f_rest_")), key=lambda n: int(n.rsplit("_", 1)[1]))
     if len(rest) not in (0, 9, 24, 45):
         raise InputError(f"{path}: {len(rest)} f_rest properties; SH of degree 1, 2 or 3 has 9, 24 or 45")
-    columns = {name: np.asarray(raw[name], np.float32) for name in NEEDED + COLOUR + rest}
+    columns = {name: np.asarray(raw[name], np.float32) for name in REQUIRED + COLOURS + rest}
     table = torch.from_numpy(np.stack(list(columns.values()), 1))
     n, quats = len(table), table[:, 7:11]
-    sh = torch.cat([table[:, 11:14, None], table[:, 14:].reshape(n, 3, -1)], 2).mT.contiguous()  # channel-major file
+    sh = torch.cat([table[:, 11:14, None], table[:, 14:].reshape(n, 3, -1)], 2).mT.contiguous()  # channel-major in the file
     ids = torch.from_numpy(np.asarray(raw.get("object_id", np.zeros(n))).astype(np.int64))
     keep = table.isfinite().all(1) & (quats.norm(dim=1) > 1e-12)
     if not keep.all():
@@ -70,45 +72,45 @@ def _activate(path: Path, raw: dict[str, np.ndarray]) -> Gaussians:
 
 
 def _with_header(path: Path, gaussians: Gaussians, comments: list[str]) -> Scene:
-    """The facts of our header comments, `ngff:KEY JSON` each; absent in other tools' files."""
-    facts: dict[str, list] = {}
+    """The scene with the metadata of the header comments `ngff:KEY JSON`, which other tools do not write."""
+    metadata: dict[str, list] = {}
     try:
         for comment in comments:
             if comment.startswith("ngff:"):
                 key, value = comment[5:].split(" ", 1)
-                facts.setdefault(key, []).append(json.loads(value))
-        version = facts.get("version", [VERSION])[0]
+                metadata.setdefault(key, []).append(json.loads(value))
+        version = metadata.get("version", [VERSION])[0]
         if version > VERSION:
             raise InputError(f"{path}: format version {version} is newer than {VERSION}; upgrade ngff")
         ids = gaussians.object_id.unique().tolist()
-        named = {o["id"]: SceneObject(o["id"], o["name"], o.get("material", "")) for o in facts.get("object", [])}
+        named = {o["id"]: SceneObject(o["id"], o["name"], o.get("material", "")) for o in metadata.get("object", [])}
         unnamed = {i: SceneObject(i, f"object_{i}") for i in ids if i > 0 and i not in named}
         return Scene(
             gaussians,
             tuple(o for _, o in sorted((named | unnamed).items())),
-            camera_json.from_json(facts.get("camera", [])),
-            facts.get("floor", [None])[0],
-            facts.get("scale", [{"metres_per_unit": 1.0, "source": "not stated in the file"}])[0],
-            facts.get("provenance", [{}])[0],
-            _colour(facts.get("background", [None])[0]),
+            camera_json.from_json(metadata.get("camera", [])),
+            metadata.get("floor", [None])[0],
+            metadata.get("scale", [{"metres_per_unit": 1.0, "source": "not stated in the file"}])[0],
+            metadata.get("provenance", [{}])[0],
+            _colour(metadata.get("background", [None])[0]),
         )
     except (ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{path}: a header comment of ngff is damaged ({error!r}); write the file again") from error
+        raise InputError(f"{path}: a header comment ngff:KEY is damaged ({error!r}); write the file again") from error
 
 
-def _colour(said: list | None) -> tuple[float, float, float] | None:
-    if said is None:
+def _colour(value: list | None) -> tuple[float, float, float] | None:
+    if value is None:
         return None
-    red, green, blue = (min(max(float(x), 0.0), 1.0) for x in said)
+    red, green, blue = (min(max(float(x), 0.0), 1.0) for x in value)
     return red, green, blue
 
 
 def write_scene(path: Path, scene: Scene) -> None:
-    """Binary little-endian PLY that splat viewers open; our facts ride in comments."""
+    """Write a binary little-endian 3D-Gaussian PLY with the metadata in comments; InputError if that fails."""
     g = scene.gaussians.to("cpu")
     n, k = g.sh.shape[:2]
     rest = [f"f_rest_{i}" for i in range(3 * (k - 1))]
-    names = ["x", "y", "z", "nx", "ny", "nz", *COLOUR, *rest, "opacity", *NEEDED[4:7], *NEEDED[7:]]
+    names = ["x", "y", "z", "nx", "ny", "nz", *COLOURS, *rest, "opacity", *REQUIRED[4:7], *REQUIRED[7:]]
     opacity = g.opacities.double().clamp(1e-7, 1 - 1e-7).logit().float()[:, None]
     columns = [
         g.means, torch.zeros(n, 3), g.sh[:, 0], g.sh[:, 1:].mT.reshape(n, -1), opacity, g.scales.log(), g.quats
@@ -123,9 +125,9 @@ def write_scene(path: Path, scene: Scene) -> None:
 
 
 def _header(scene: Scene) -> list[str]:
-    facts = [("version", VERSION), ("up", [0, 0, 1]), ("scale", scene.scale), ("floor", scene.floor)]
-    facts += [("background", scene.background)] if scene.background else []
-    facts += [("object", {"id": o.id, "name": o.name, "material": o.material}) for o in scene.objects]
-    facts += [("camera", row) for row in (camera_json.to_json(scene.cameras) if scene.cameras else [])]
-    facts += [("provenance", scene.provenance)]
-    return [f"ngff:{key} {json.dumps(value)}" for key, value in facts]
+    metadata = [("version", VERSION), ("up", [0, 0, 1]), ("scale", scene.scale), ("floor", scene.floor)]
+    metadata += [("background", scene.background)] if scene.background else []
+    metadata += [("object", {"id": o.id, "name": o.name, "material": o.material}) for o in scene.objects]
+    metadata += [("camera", row) for row in (camera_json.to_json(scene.cameras) if scene.cameras else [])]
+    metadata += [("provenance", scene.provenance)]
+    return [f"ngff:{key} {json.dumps(value)}" for key, value in metadata]

@@ -1,15 +1,4 @@
-"""traj.h5: how a scene moves, with all that `ngff render` needs to draw it.
-
-    attributes            format, version, fps, dt [s], gravity [units/s^2], up, units, engine, scale, provenance, and
-                          where known floor, background (RGB 0..1, seen where there is nothing)
-    gaussians/            means quats scales opacities sh object_id: the rest frame, as in memory
-    objects/              id (O) name (O) material (O) com (T,O,3) rotation (T,O,4; w x y z, relative to rest)
-    keypoints/            rest (P,3) object_id (P) positions (T,P,3)
-    binding/              index (n,j; -1 where a Gaussian follows nothing) weight (n,j)
-    cameras/              viewmats Ks sizes names
-    forces/json           the prompts that acted, one JSON each
-    frames/               optional: means quats scales (T,n,.) of every Gaussian, used instead of the binding
-"""
+"""traj.h5: the motion of a scene, with everything needed to render it. The format is described in README.md."""
 
 from __future__ import annotations
 
@@ -33,12 +22,12 @@ from stages.core.scene.scene import Scene, SceneObject
 
 log = logging.getLogger(__name__)
 FORMAT, VERSION = "ngff-trajectory", 1
-WHAT = "a trajectory (.h5), such as `ngff simulate` writes"
+EXPECTED = "a trajectory (.h5), such as `ngff simulate` writes"
 
 
 @dataclass(frozen=True)
 class Keypoints:
-    """Points that carry the motion of the objects."""
+    """Points of the objects whose motion is simulated; the Gaussians follow them."""
 
     rest: Float[Tensor, "p 3"]  # positions in the rest frame [m]
     object_id: Int[Tensor, "p"]
@@ -46,7 +35,7 @@ class Keypoints:
 
 @dataclass(frozen=True)
 class Binding:
-    """The keypoints that each Gaussian follows; weights sum to one, index -1 with weight 0 follows nothing."""
+    """The keypoints that each Gaussian follows: weights sum to 1; index -1 with weight 0 for none."""
 
     index: Int[Tensor, "n j"]
     weight: Float[Tensor, "n j"]
@@ -59,36 +48,36 @@ class SimulationInfo:
     dt: float  # time between frames [s]
     gravity: tuple[float, float, float]  # [scene units / s^2]
     engine: str
-    forces: tuple[dict, ...] = ()  # prompts that acted, as plain dicts
+    forces: tuple[dict, ...] = ()  # applied prompts, as JSON-serialisable dicts
 
 
 @dataclass(frozen=True)
 class Trajectory:
-    """A trajectory in memory; dense frames, where the file has them, stay on disk until asked for."""
+    """A trajectory in memory; dense frames stay in the file and are read one at a time."""
 
     scene: Scene
     info: SimulationInfo
     keypoints: Keypoints
     binding: Binding
-    positions: Float[Tensor, "t p 3"]
-    com: Float[Tensor, "t o 3"]
-    rotation: Float[Tensor, "t o 4"]
+    positions: Float[Tensor, "t p 3"]  # of the keypoints [scene units]
+    com: Float[Tensor, "t o 3"]  # centres of mass [scene units]
+    rotation: Float[Tensor, "t o 4"]  # w x y z, relative to the rest frame
     path: Path
-    dense: bool = False
+    dense: bool = False  # whether the file has every Gaussian in every frame
 
     def __len__(self) -> int:
         return len(self.positions)
 
     def frame(self, t: int) -> Gaussians:
-        """Every Gaussian of frame t, for a file with dense frames."""
+        """All Gaussians in frame t, read from the file; only where `dense`."""
         with h5py.File(self.path, "r") as file:
             parts = {name: torch.from_numpy(file[f"frames/{name}"][t]) for name in ("means", "quats", "scales")}
         g = self.scene.gaussians
         return Gaussians(**parts, opacities=g.opacities, sh=g.sh, object_id=g.object_id)
 
 
-class _Careful(io.FileIO):
-    """A file to which HDF5 writes without ever hearing of an error, which it does not survive; `error` remembers it."""
+class _ErrorDeferringFile(io.FileIO):
+    """A file that stores write errors in `error` instead of raising them, which HDF5 does not survive."""
 
     error: OSError | None = None
 
@@ -109,18 +98,19 @@ class _Careful(io.FileIO):
             return size or 0
 
     def flush(self) -> None:
-        """Nothing is held back."""
+        """Writes are not buffered."""
 
     def check(self) -> None:
-        """Raises OSError if anything could not be written."""
+        """Raise the stored OSError, if any."""
         if self.error is not None:
             raise self.error
 
 
 class TrajectoryWriter:
-    """Writes a trajectory frame by frame; the file takes its name when all is well.
+    """Context manager that writes a trajectory frame by frame; the file appears only on success.
 
-    When an InputError stops the run after some frames, what was written is kept as NAME.partial.h5.
+    When an InputError ends the run after some frames, these are kept as NAME.partial.h5. Raises InputError where the
+    file cannot be written.
     """
 
     def __init__(self, path: Path, scene: Scene, info: SimulationInfo, keypoints: Keypoints, binding: Binding):
@@ -131,7 +121,7 @@ class TrajectoryWriter:
         self._replacing = replacing(self.path)
         self._part = self._replacing.__enter__()
         try:
-            self._raw = _Careful(self._part, "w+b")
+            self._raw = _ErrorDeferringFile(self._part, "w+b")
             self._file = h5py.File(self._raw, "w")
             _write_rest(self._file, *self._contents)
             self._raw.check()
@@ -145,6 +135,7 @@ class TrajectoryWriter:
     def append(
         self, positions: Float[Tensor, "p 3"], com: Float[Tensor, "o 3"], rotation: Float[Tensor, "o 4"]
     ) -> None:
+        """Write one frame: keypoint positions, and centre of mass and rotation (w x y z) of each object."""
         rows = {"keypoints/positions": positions, "objects/com": com, "objects/rotation": rotation}
         for name, row in rows.items():
             data = self._file[name]
@@ -164,12 +155,12 @@ class TrajectoryWriter:
         if kind is not None and issubclass(kind, InputError) and self.frames:
             kept = self.path.with_name(f"{self.path.stem}.partial.h5")
             self._part.replace(kept)
-            log.warning("%s: the %d frames before the stop are kept", kept, self.frames)
+            log.warning("%s: the %d frames before the error are kept", kept, self.frames)
         self._replacing.__exit__(kind, error, trace)
 
 
 def _write_rest(file: h5py.File, scene: Scene, info: SimulationInfo, keypoints: Keypoints, binding: Binding) -> None:
-    packed = {"compression": "gzip", "compression_opts": 4, "shuffle": True}
+    compressed = {"compression": "gzip", "compression_opts": 4, "shuffle": True}
     file.attrs.update(
         format=FORMAT, version=VERSION, fps=1 / info.dt, dt=info.dt, gravity=info.gravity, up="z",
         units="scene units, seconds", engine=info.engine, scale=json.dumps(scene.scale),
@@ -178,19 +169,19 @@ def _write_rest(file: h5py.File, scene: Scene, info: SimulationInfo, keypoints: 
     )  # fmt: skip
     for field in fields(Gaussians):
         value = getattr(scene.gaussians, field.name).cpu().numpy()
-        file.create_dataset(f"gaussians/{field.name}", data=value, **packed)
+        file.create_dataset(f"gaussians/{field.name}", data=value, **compressed)
     file["objects/id"] = np.array([o.id for o in scene.objects], np.int64)
     text = h5py.string_dtype()
     file.create_dataset("objects/name", data=[o.name for o in scene.objects], dtype=text)
     file.create_dataset("objects/material", data=[o.material for o in scene.objects], dtype=text)
-    file.create_dataset("keypoints/rest", data=keypoints.rest.cpu().numpy(), **packed)
-    file.create_dataset("keypoints/object_id", data=keypoints.object_id.cpu().numpy(), **packed)
-    file.create_dataset("binding/index", data=binding.index.cpu().numpy().astype(np.int32), **packed)
-    file.create_dataset("binding/weight", data=binding.weight.cpu().numpy(), **packed)
+    file.create_dataset("keypoints/rest", data=keypoints.rest.cpu().numpy(), **compressed)
+    file.create_dataset("keypoints/object_id", data=keypoints.object_id.cpu().numpy(), **compressed)
+    file.create_dataset("binding/index", data=binding.index.cpu().numpy().astype(np.int32), **compressed)
+    file.create_dataset("binding/weight", data=binding.weight.cpu().numpy(), **compressed)
     p, o = len(keypoints.rest), len(scene.objects)
     for name, shape in (("keypoints/positions", (p, 3)), ("objects/com", (o, 3)), ("objects/rotation", (o, 4))):
         chunk = (1, *(max(s, 1) for s in shape))
-        file.create_dataset(name, (0, *shape), maxshape=(None, *shape), chunks=chunk, dtype="f4", **packed)
+        file.create_dataset(name, (0, *shape), maxshape=(None, *shape), chunks=chunk, dtype="f4", **compressed)
     if scene.cameras is not None:
         for name in ("viewmats", "Ks", "sizes"):
             file[f"cameras/{name}"] = getattr(scene.cameras, name).cpu().numpy()
@@ -200,22 +191,26 @@ def _write_rest(file: h5py.File, scene: Scene, info: SimulationInfo, keypoints: 
 
 
 def read_trajectory(path: Path) -> Trajectory:
-    """Everything but dense frames."""
+    """Read a trajectory except its dense frames. Raises InputError for other files and damaged or newer ones."""
     path = Path(path)
-    must_exist(path, WHAT)
+    must_exist(path, EXPECTED)
     try:
         with h5py.File(path, "r") as file:
             kind = file.attrs.get("format", "")
             if kind != FORMAT:
-                raise InputError(f"{path}: its format attribute is {kind!r}, not {FORMAT!r}; {WHAT} is expected")
+                raise InputError(f"{path}: its format attribute is {kind!r}, not {FORMAT!r}; {EXPECTED} is expected")
             if int(file.attrs["version"]) > VERSION:
                 raise InputError(f"{path}: version {file.attrs['version']} is newer than {VERSION}; upgrade ngff")
             _check(path, file)
             return _read(path, file)
     except KeyError as error:
-        raise InputError(f"{path}: a part of the trajectory is missing ({error.args[0]}); see the README") from error
+        missing = error.args[0]
+        raise InputError(
+            f"{path}: a part of the trajectory is missing ({missing}); see stages/core/scene/README.md"
+        ) from error
     except (OSError, ValueError) as error:
-        raise InputError(f"{path}: is not a readable HDF5 file ({error}); {WHAT} is expected") from error
+        raise InputError(f"{path}: is not a readable HDF5 file ({error}); {EXPECTED} is expected") from error
+
 
 def _read(path: Path, file: h5py.File) -> Trajectory:
     def tensor(name: str) -> Tensor:
@@ -240,12 +235,12 @@ def _read(path: Path, file: h5py.File) -> Trajectory:
     info = SimulationInfo(float(file.attrs["dt"]), gravity, str(file.attrs["engine"]), forces)
     keypoints = Keypoints(tensor("keypoints/rest"), tensor("keypoints/object_id").long())
     binding = Binding(tensor("binding/index").long(), tensor("binding/weight"))
-    moving = (tensor("keypoints/positions"), tensor("objects/com"), tensor("objects/rotation"))
-    return Trajectory(scene, info, keypoints, binding, *moving, path, "frames/means" in file)
+    motion = (tensor("keypoints/positions"), tensor("objects/com"), tensor("objects/rotation"))
+    return Trajectory(scene, info, keypoints, binding, *motion, path, "frames/means" in file)
 
 
 def _check(path: Path, file: h5py.File) -> None:
-    """The promises that readers rely on."""
+    """Raise InputError unless the shapes agree and the positions are finite."""
     t, p = file["keypoints/positions"].shape[0], len(file["keypoints/rest"])
     o, n = len(file["objects/id"]), len(file["gaussians/means"])
     if not t:
@@ -253,7 +248,7 @@ def _check(path: Path, file: h5py.File) -> None:
     expected = {"keypoints/positions": (t, p, 3), "objects/com": (t, o, 3), "objects/rotation": (t, o, 4)}
     for name, shape in expected.items():
         if file[name].shape != shape:
-            raise InputError(f"{path}: {name} has shape {file[name].shape}; the other parts call for {shape}")
+            raise InputError(f"{path}: {name} has shape {file[name].shape}; the other datasets need {shape}")
     index = file["binding/index"]
     if "frames/means" not in file and (len(index) != n or (index.size and int(index[()].max()) >= p)):
         raise InputError(f"{path}: the binding does not fit the {n} Gaussians and {p} keypoints")

@@ -81,7 +81,7 @@ def damage(path, scene, how: str):
 @pytest.mark.parametrize(
     ("how", "says"),
     [("text", "not a readable HDF5"), ("format", "format attribute"), ("part", "missing"), ("nan", "not finite"),
-     ("frames", "call for")],
+     ("frames", "other datasets need")],
 )  # fmt: skip
 def test_damaged_files_get_one_sentence(tmp_path, two_balls, how, says):
     damage(tmp_path / "t.h5", two_balls, how)

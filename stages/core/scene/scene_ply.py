@@ -59,7 +59,7 @@ def _activate(path: Path, raw: dict[str, np.ndarray]) -> Gaussians:
     columns = {name: np.asarray(raw[name], np.float32) for name in REQUIRED + COLOURS + rest}
     table = torch.from_numpy(np.stack(list(columns.values()), 1))
     n, quats = len(table), table[:, 7:11]
-    sh = torch.cat([table[:, 11:14, None], table[:, 14:].reshape(n, 3, -1)], 2).mT.contiguous()  # channel-major in the file
+    sh = torch.cat([table[:, 11:14, None], table[:, 14:].reshape(n, 3, -1)], 2).mT.contiguous()  # channel-major
     ids = torch.from_numpy(np.asarray(raw.get("object_id", np.zeros(n))).astype(np.int64))
     keep = table.isfinite().all(1) & (quats.norm(dim=1) > 1e-12)
     if not keep.all():

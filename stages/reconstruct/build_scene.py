@@ -1,4 +1,4 @@
-"""From cameras and depth maps, however they were found, to a scene: Gaussians, upright, fitted to the photos."""
+"""The steps after cameras and depth that all backends share: Gaussians, world frame, photometric fit, scale, advice."""
 
 from __future__ import annotations
 
@@ -12,105 +12,132 @@ from jaxtyping import Float
 from torch import Tensor
 
 from stages.core.errors import InputError
+from stages.core.geometry.similarity import Similarity
 from stages.core.scene.gaussians import Gaussians, concatenate, transformed
 from stages.core.scene.scene import Scene
 from stages.reconstruct import initialise, photometric, world_frame
 from stages.reconstruct.advice import advise
 from stages.reconstruct.depth import DepthMap
+from stages.reconstruct.initialise import DepthViews, OrientedPoints
 from stages.reconstruct.options import ReconstructOptions
 from stages.reconstruct.photo_reader import sharpness
 from stages.reconstruct.photos import Reconstruction, Views
 from stages.reconstruct.scale import parse_scale
 from stages.reconstruct.step_cache import StepCache
+from stages.reconstruct.world_frame import Ground
 
 log = logging.getLogger(__name__)
-FAR_DEPTH = 3.0  # what has no depth is put so many camera distances away
-MAX_DISTANCE = 10.0  # Gaussians farther from the focus than so many camera distances are dropped
+MIN_DEPTH_SAMPLES = 1000  # consistent depth samples that a scene needs
+FAR_DEPTH = 3.0  # depth of pixels without a known one [camera distances]
+MAX_DISTANCE = 10.0  # Gaussians farther from the focus are dropped [camera distances]
 
 
 @dataclass(frozen=True)
 class SceneGeometry:
-    """What is known before there is a scene. `maps` are of the views in `trained`; lengths in any one unit."""
+    """Cameras and depth of a photo set, in a frame and a unit of length of their own."""
 
-    source: Path  # of the photos, to be named in errors
+    source: Path  # of the photos, for error messages
     views: Views
-    trained: list[int]
+    trained: list[int]  # views that the Gaussians are fitted to
     held_out: list[int]
-    maps: list[DepthMap]
-    least: int  # support that a depth needs
-    focus: Float[Tensor, "3"]  # what the cameras look at
+    maps: list[DepthMap]  # of the views in `trained`
+    min_support: int  # views that have to agree with a depth
+    focus: Float[Tensor, "3"]  # the point that the cameras look at
     radius: float  # their median distance from it
-    gaussians: Gaussians | None = None  # a network's, where depth is trusted; else they are made from the maps
-    dropped: dict[str, str] = field(default_factory=dict)  # photos left out, and why
+    gaussians: Gaussians | None = None  # predicted by a network; otherwise they start from the depth maps
+    dropped: dict[str, str] = field(default_factory=dict)  # photos left out -> reason
 
 
 def build_scene(found: SceneGeometry, options: ReconstructOptions, steps: StepCache, device: str) -> Reconstruction:
-    """The scene: z up, the cameras about 1 from the focus, or as far as cameras given say.
+    """The scene in the world frame: z up, camera distance about 1 unless cameras were given.
 
-    The plane that things stand on is z = 0; where there is none, the lowest points are, and the scene has no floor.
+    The supporting plane is z = 0; without one, z = 0 is at the lowest points and the scene has no floor.
+    Raises InputError where too little depth is consistent or the scale reference does not fit the photos.
     """
-    used, least = found.views[found.trained], found.least
-    known = parse_scale(options.scale_reference)
-    length = known.in_scene_units(found.views.cameras, found.radius) if known else None
+    observed = DepthViews(found.views[found.trained], found.maps, found.min_support)
+    reference = parse_scale(options.scale_reference)
+    length = reference.in_scene_units(found.views.cameras, found.radius) if reference else None
     with steps.timed("Gaussians"):
-        cloud = initialise.fuse(used, found.maps, least)
-        if len(cloud) < 1000:
-            raise InputError(f"{found.source}: depth is sure at too few places ({len(cloud)}) of what the photos show; "
-                             "give more, sharper photos, closer together and of things with some pattern")  # fmt: skip
-        log.info("%d depth samples confirmed by %d or more other photos", len(cloud), least)
-        cloud = initialise.downsample(cloud, options.preset.gaussians, found.focus, found.radius)
-        ground = world_frame.find_ground(cloud.points, used.cameras.viewmats, found.focus, options.seed)
-        ground = world_frame.refine_ground(ground, cloud.points, options.seed)
-        if ground.plane is None:
-            log.info("no supporting plane found: up is how the cameras were held, z = 0 is at the lowest points")
-        else:
-            log.info("the supporting plane holds %.0f %% of the points in focus", 100 * ground.inlier_fraction)
-        move = world_frame.to_world(ground, cloud.points, used.cameras.viewmats, metric=options.cameras is not None)
-        first = found.gaussians
-        if first is None:
-            first = initialise.to_gaussians(cloud, torch.full((len(cloud),), 0.8), options.preset.degree)
-        gaussians = concatenate([first, *unmatched_gaussians(used, found.maps, cloud, ground, least, options, device)])
-        log.info("%d Gaussians on surfaces, %d where none is known", len(first), len(gaussians) - len(first))
-    focus, reach = move(ground.focus), move.scale * ground.radius
-    views = dataclasses.replace(found.views, cameras=found.views.cameras.transformed(move))
-    gaussians = transformed(gaussians, move)
-    gaussians = gaussians[(gaussians.means - focus).norm(dim=1) < MAX_DISTANCE * reach]
-    count = options.iteration_count(len(used), device)
-    with steps.timed("fit"):
-        depths = [torch.where(m.support >= least, m.depth * move.scale, torch.zeros_like(m.depth)) for m in found.maps]
-        gaussians = photometric.fit_gaussians(
-            gaussians, views[found.trained], count, reach, options.seed, device, depths
+        cloud = _fused_points(observed, found, options)
+        ground = _find_ground(cloud, observed.views, found, options)
+        to_world = world_frame.to_world(
+            ground, cloud.points, observed.views.cameras.viewmats, metric=options.cameras is not None
         )
-    upright_by = {"scale": move.scale, "rotation": move.rotation.tolist(), "translation": move.translation.tolist()}
-    facts = {"upright": upright_by, "supporting_plane": ground.plane is not None}
-    scale = _scale(options, length and move.scale * length)
-    floor = None if ground.plane is None else 0.0
-    scene = Scene(gaussians, (), views.cameras, floor, scale, facts, mean_colour(used))
-    confirmed = torch.stack([(m.support >= least).float().mean() for m in found.maps])
-    sharp = torch.tensor([sharpness(image) for image in used.images])
-    advice = advise(views.cameras[found.trained], focus, confirmed, sharp, ground.plane is not None, found.dropped)
+        initial = found.gaussians
+        if initial is None:
+            initial = initialise.to_gaussians(cloud, torch.full((len(cloud),), 0.8), options.preset.degree)
+        gaussians = concatenate([initial, *unmatched_gaussians(observed, cloud, ground, options, device)])
+        log.info("%d Gaussians on surfaces, %d of uncertain depth", len(initial), len(gaussians) - len(initial))
+    focus, distance = to_world(ground.focus), to_world.scale * ground.radius
+    views = dataclasses.replace(found.views, cameras=found.views.cameras.transformed(to_world))
+    gaussians = transformed(gaussians, to_world)
+    gaussians = gaussians[(gaussians.means - focus).norm(dim=1) < MAX_DISTANCE * distance]
+    fit = photometric.FitOptions(options.iteration_count(len(found.trained), device), distance, options.seed, device)
+    with steps.timed("fit"):
+        depths = [_known_depth(observed, i, to_world.scale) for i in range(len(observed.maps))]
+        gaussians = photometric.fit_gaussians(gaussians, views[found.trained], fit, depths)
+    scene = Scene(
+        gaussians, (), views.cameras, None if ground.plane is None else 0.0,
+        _scale(options, length and to_world.scale * length), _provenance(to_world, ground), mean_colour(observed.views),
+    )  # fmt: skip
+    consistent = torch.stack([observed.consistent(i).float().mean() for i in range(len(observed.maps))])
+    sharp = torch.tensor([sharpness(image) for image in observed.views.images])
+    advice = advise(views.cameras[found.trained], focus, consistent, sharp, ground.plane is not None, found.dropped)
     return Reconstruction(scene, views, found.trained, found.held_out, found.dropped, advice)
 
 
+def _fused_points(observed: DepthViews, found: SceneGeometry, options: ReconstructOptions) -> OrientedPoints:
+    """Points of the consistent depth, as many as the quality preset has Gaussians."""
+    cloud = initialise.fuse(observed)
+    if len(cloud) < MIN_DEPTH_SAMPLES:
+        raise InputError(f"{found.source}: depth is consistent at too few points ({len(cloud)}); give more, sharper "
+                         "photos, closer together and of objects with some pattern")  # fmt: skip
+    log.info("%d depth samples with %d or more agreeing photos", len(cloud), observed.min_support)
+    return initialise.downsample(cloud, options.preset.gaussians, found.focus, found.radius)
+
+
+def _find_ground(cloud: OrientedPoints, views: Views, found: SceneGeometry, options: ReconstructOptions) -> Ground:
+    ground = world_frame.find_ground(cloud.points, views.cameras.viewmats, found.focus, options.seed)
+    ground = world_frame.refine_ground(ground, cloud.points, options.seed)
+    if ground.plane is None:
+        log.info("no supporting plane found: up is how the cameras were held, z = 0 is at the lowest points")
+    else:
+        log.info("the supporting plane has %.0f %% of the points in focus", 100 * ground.inlier_fraction)
+    return ground
+
+
 def unmatched_gaussians(
-    views: Views, maps: list[DepthMap], cloud: initialise.OrientedPoints, ground: world_frame.Ground, least: int,
-    options: ReconstructOptions, device: str,
-) -> list[Gaussians]:  # fmt: skip
-    """Fainter, sparser ones where the photos show something but no depth was confirmed; none where that is little."""
-    more = initialise.fill_unmatched(views, maps, cloud, ground.plane, least, FAR_DEPTH * ground.radius, device=device)
+    observed: DepthViews, cloud: OrientedPoints, ground: Ground, options: ReconstructOptions, device: str
+) -> list[Gaussians]:
+    """Sparser, more transparent Gaussians for pixels without consistent depth; an empty list if there are few."""
+    more = initialise.fill_unmatched(observed, cloud, ground.plane, FAR_DEPTH * ground.radius, device=device)
     more = initialise.downsample(more, options.preset.gaussians // 4, ground.focus, ground.radius)
     return [initialise.to_gaussians(more, torch.full((len(more),), 0.5), 0)] if len(more) > 10 else []
 
 
 def mean_colour(views: Views) -> tuple[float, float, float]:
-    """Of all photos: the best guess at what none of them shows."""
-    each = [views.image(i).mean((0, 1)) for i in range(len(views))]
-    red, green, blue = torch.stack(each).mean(0).tolist()
+    """Mean RGB of all photos, the colour of pixels without Gaussians."""
+    means = [views.image(i).mean((0, 1)) for i in range(len(views))]
+    red, green, blue = torch.stack(means).mean(0).tolist()
     return red, green, blue
 
 
+def _known_depth(observed: DepthViews, i: int, scale: float) -> Float[Tensor, "h w"]:
+    """Consistent depth of view i times `scale`, 0 elsewhere."""
+    depth = observed.maps[i].depth
+    return torch.where(observed.consistent(i), depth * scale, torch.zeros_like(depth))
+
+
+def _provenance(to_world: Similarity, ground: Ground) -> dict:
+    """Facts stored in the provenance of the scene."""
+    similarity = {
+        "scale": to_world.scale, "rotation": to_world.rotation.tolist(), "translation": to_world.translation.tolist(),
+    }  # fmt: skip
+    return {"upright": similarity, "supporting_plane": ground.plane is not None}
+
+
 def _scale(options: ReconstructOptions, units: float | None) -> dict:
-    """Metres a scene unit and where that is from; `units`: the user's reference length in scene units."""
+    """Metres per scene unit and its source; `units` is the reference length in scene units, if there is one."""
     if units is not None:
         metres = parse_scale(options.scale_reference).distance
         return {"metres_per_unit": metres / units, "source": f"--scale-reference {options.scale_reference}"}

@@ -1,4 +1,4 @@
-"""The classic backend: structure from motion, multi-view depth, then Gaussians fitted to the photos."""
+"""The classic backend: structure from motion, multi-view stereo, then Gaussians fitted to the photos."""
 
 from __future__ import annotations
 
@@ -14,31 +14,33 @@ from stages.core.scene.cameras import Cameras, LensDistortion, read_cameras
 from stages.reconstruct import depth, sfm, world_frame
 from stages.reconstruct.build_scene import SceneGeometry, build_scene
 from stages.reconstruct.options import ReconstructOptions
-from stages.reconstruct.photos import Photos, Reconstruction, Views, undistort
+from stages.reconstruct.photos import Photos, Reconstruction, split_holdout, undistort
 from stages.reconstruct.step_cache import StepCache
 
 log = logging.getLogger(__name__)
 
 
 def reconstruct(photos: Photos, options: ReconstructOptions, steps: StepCache) -> Reconstruction:
-    """Gaussians of what the photos show, upright, with the cameras that took them."""
+    """Backend `classic`: cameras by COLMAP or as given, depth by plane sweep, Gaussians by a photometric fit."""
     device = pick_device(options.device)
     model, photos = _cameras(photos, options, device, steps)
     views = undistort(photos, model.cameras, model.lenses, options.max_side)
     focus = world_frame.focus_point(model.cameras.viewmats, _typical_depths(model))
     ground = world_frame.find_ground(model.points, model.cameras.viewmats, focus, options.seed)
-    trained, held = _split(views, options.holdout)
+    trained, held_out = split_holdout(len(views), options.holdout)
     used, part = views[trained], _subset(model, trained)
     maps = steps.cached("depth", lambda: depth.estimate_depth_maps(used, part, ground.plane, device), (depth.DepthMap,))
-    least = 2 if len(used) > 3 else 1
-    found = SceneGeometry(photos.source, views, trained, held, maps, least, focus, ground.radius, dropped=model.dropped)
+    found = SceneGeometry(
+        photos.source, views, trained, held_out, maps, min_support=2 if len(used) > 3 else 1, focus=focus,
+        radius=ground.radius, dropped=model.dropped,
+    )  # fmt: skip
     return build_scene(found, options, steps, device)
 
 
 def _cameras(
     photos: Photos, options: ReconstructOptions, device: str, steps: StepCache
 ) -> tuple[sfm.SparseModel, Photos]:
-    """Cameras and sparse points: solved for, or triangulated with the cameras that the user gave."""
+    """Cameras and sparse points: estimated, or triangulated with the given cameras; and the photos that have one."""
     if options.cameras is None:
         return sfm.estimate_cameras(photos, options.seed, device, steps, options.matcher), photos
     cameras, lenses = read_cameras(options.cameras)
@@ -50,7 +52,7 @@ def _cameras(
             f"in the photos' names, such as {photos.names[0]}"
         )
     if len(both) < len(photos):
-        log.info("no camera is given for, and left out: %s", ", ".join(sorted(set(photos.names) - set(row))))
+        log.info("left out, without a given camera: %s", ", ".join(sorted(set(photos.names) - set(row))))
     photos = photos[both]
     rows = [row[name] for name in photos.names]
     cameras, lenses = _rescale_to_photos(photos, cameras[rows]), LensDistortion(lenses.coefficients[rows])
@@ -58,15 +60,15 @@ def _cameras(
 
 
 def _rescale_to_photos(photos: Photos, cameras: Cameras) -> Cameras:
-    """The cameras with K for photos as loaded, which may be smaller than the files."""
+    """The cameras with K in pixels of the loaded photos, which may be smaller than the files."""
     sizes = torch.tensor([photos.size(i) for i in range(len(photos))])
-    share = sizes / cameras.sizes
-    Ks = torch.stack([resize(K, float(sx), float(sy)) for K, (sx, sy) in zip(cameras.Ks, share, strict=True)])
+    ratio = sizes / cameras.sizes
+    Ks = torch.stack([resize(K, float(sx), float(sy)) for K, (sx, sy) in zip(cameras.Ks, ratio, strict=True)])
     return Cameras(cameras.viewmats, Ks, sizes, cameras.names)
 
 
 def _typical_depths(model: sfm.SparseModel) -> Tensor:
-    """Median depth of the sparse points that each camera sees."""
+    """Median depth of the sparse points observed by each camera."""
     out = []
     for i, viewmat in enumerate(model.cameras.viewmats):
         seen = model.point_index[model.view_index == i]
@@ -75,14 +77,8 @@ def _typical_depths(model: sfm.SparseModel) -> Tensor:
     return torch.stack(out)
 
 
-def _split(views: Views, holdout: int) -> tuple[list[int], list[int]]:
-    """Indices of the photos to learn from and of those kept out."""
-    held = [i for i in range(len(views)) if holdout and i % holdout == 0]
-    return [i for i in range(len(views)) if i not in held], held
-
-
 def _subset(model: sfm.SparseModel, index: list[int]) -> sfm.SparseModel:
-    """The model as some of its cameras see it."""
+    """The model with some of its cameras and their observations."""
     new = torch.full((len(model.cameras),), -1)
     new[index] = torch.arange(len(index))
     keep = new[model.view_index] >= 0

@@ -1,11 +1,11 @@
-"""Dense depth by multi-view matching: plane sweep, semi-global smoothing, refinement, consistency.
+"""Dense depth by multi-view stereo: plane sweep, semi-global matching, refinement, consistency check.
 
-For each photo, depths are hypothesised on a grid of inverse depth; other photos are warped to it and
-compared by normalised cross-correlation (Collins 1996, "A space-sweep approach to true multi-image
-matching"). A second sweep along the normal of the supporting plane scores what lies flat, which a
-fronto-parallel window sees distorted (Gallup et al. 2007, "Real-time plane-sweeping stereo with multiple
-sweeping directions"). Costs are smoothed by semi-global matching (Hirschmueller 2008, eq. 13), which
-also carries depth across areas without texture; what other photos do not confirm is dropped.
+For each photo, hypotheses on a grid of inverse depth are scored by warping other photos to it and normalised
+cross-correlation (Collins 1996, "A space-sweep approach to true multi-image matching"). A second sweep parallel to the
+supporting plane scores horizontal surfaces, which fronto-parallel windows distort (Gallup et al. 2007, "Real-time
+plane-sweeping stereo with multiple sweeping directions"). Costs are aggregated by semi-global matching (Hirschmueller
+2008, eq. 13), which also propagates depth into areas without texture. Depth is then checked for consistency between
+views.
 """
 
 from __future__ import annotations
@@ -23,49 +23,51 @@ from stages.core.geometry.planes import Plane
 from stages.reconstruct.photos import Views
 from stages.reconstruct.sfm import SparseModel
 
-MAX_SOURCES = 4  # photos compared with each
-MAX_CHECK_VIEWS = 10  # photos asked to confirm each
-MAX_LABELS = 192  # depth hypotheses a pixel
-STEP_PENALTY, JUMP_PENALTY = 0.03, 0.25  # of semi-global matching, on costs 0..1
-DEPTH_TOLERANCE, PIXEL_TOLERANCE = 0.01, 1.5  # a photo confirms a depth within this share and this many pixels
+MAX_SOURCES = 4  # views matched with each view
+MAX_CHECK_VIEWS = 10  # views that the depth of each view is checked against
+MAX_LABELS = 192  # depth hypotheses per pixel
+STEP_PENALTY, JUMP_PENALTY = 0.03, 0.25  # P1 and P2 of semi-global matching, for costs 0..1
+DEPTH_TOLERANCE, PIXEL_TOLERANCE = 0.01, 1.5  # of consistent depths: relative, and reprojected [px]
+REFINE_STEPS = (0.5, 0.2)  # of the two refinement rounds [steps of the hypothesis grid]
+MOVE_COST = 0.02  # cost added per refinement step away from the current depth
 
 
 @dataclass(frozen=True)
 class DepthMap:
-    """Depth along the viewing axis in one photo; `support` counts the other photos that confirm it."""
+    """Depth along the viewing axis of one view [scene units]; `support` is the number of consistent other views."""
 
     depth: Float[Tensor, "h w"]
     support: Float[Tensor, "h w"]
 
 
 def estimate_depth_maps(views: Views, model: SparseModel, plane: Plane | None, device: str = "cpu") -> list[DepthMap]:
-    """A depth map of every view, cross-checked against the others. `plane` is the supporting plane, if known."""
-    more = select_sources(model, MAX_CHECK_VIEWS)
-    sources = [best[:MAX_SOURCES] for best in more]
+    """A depth map of every view, checked against the other views; `plane` is the supporting plane, if known."""
+    checks = select_sources(model, MAX_CHECK_VIEWS)
+    sources = [best[:MAX_SOURCES] for best in checks]
     raw = []
     for i in tqdm(range(len(views)), desc="matching depth", unit="photo", leave=False):
         raw.append(_match_view(views, model, i, sources[i], plane, device))
     checked = []
     for i in range(len(views)):
-        others = {*more[i], *(j for j in range(len(views)) if i in sources[j])}
+        others = {*checks[i], *(j for j in range(len(views)) if i in sources[j])}
         found = check_consistency(raw, views, i, sorted(others))
         checked.append(DepthMap(found.depth.cpu(), found.support.cpu()))
     return checked
 
 
 def select_sources(model: SparseModel, count: int) -> list[list[int]]:
-    """For every view, those that share most points with it under a useful angle (best near 10 degrees).
+    """For every view, up to `count` others with the most common points under a useful angle (best near 10 degrees).
 
-    Score as in Yao et al. 2018, "MVSNet", sec. 4.1: a Gaussian in the angle, narrower below its centre.
+    Score of Yao et al. 2018, "MVSNet", sec. 4.1: a Gaussian in the triangulation angle, narrower below its mean.
     """
     eyes, c = centres(model.cameras.viewmats), len(model.cameras)
-    sees = torch.zeros(c, len(model.points), dtype=torch.bool)
-    sees[model.view_index, model.point_index] = True
+    observed = torch.zeros(c, len(model.points), dtype=torch.bool)
+    observed[model.view_index, model.point_index] = True
     out = []
     for i in range(c):
         score = torch.zeros(c)
         for j in range(c):
-            shared = model.points[sees[i] & sees[j]]
+            shared = model.points[observed[i] & observed[j]]
             if i == j or not len(shared):
                 continue
             a, b = F.normalize(eyes[i] - shared, dim=1), F.normalize(eyes[j] - shared, dim=1)
@@ -80,9 +82,9 @@ def select_sources(model: SparseModel, count: int) -> list[list[int]]:
 
 
 def _match_view(
-    views: Views, model: SparseModel, i: int, sources: list[int], plane, device: str
+    views: Views, model: SparseModel, i: int, sources: list[int], plane: Plane | None, device: str
 ) -> Float[Tensor, "h w"]:
-    """Depth of view i before cross-checking: swept at half size, refined at full size."""
+    """Depth of view i before the consistency check: swept at half resolution, refined at full resolution."""
     half = _Stereo(views, i, sources, 0.5, device)
     low, high = _depth_range(views, model, i)
     labels = half.labels(low, high)
@@ -96,26 +98,26 @@ def _match_view(
     full = _Stereo(views, i, sources, 1.0, device)
     inverse = F.interpolate(inverse[None, None], full.size, mode="bilinear", align_corners=False)[0, 0]
     step = float(labels[1] - labels[0])
-    for share in (0.5, 0.2):
-        inverse = _refined(full, inverse, share * step)
+    for fraction in REFINE_STEPS:
+        inverse = _refined(full, inverse, fraction * step)
     return 1 / inverse.clamp(min=float(labels[0]) / 2)
 
 
 def _depth_range(views: Views, model: SparseModel, i: int) -> tuple[float, float]:
-    """Nearest and farthest depth to try [scene units], from the sparse points of the view with some room."""
+    """Nearest and farthest hypothesis [scene units]: the range of the sparse points of the view, with a margin."""
     seen = model.point_index[model.view_index == i]
     z = depths(model.points[seen if len(seen) >= 10 else slice(None)], views.cameras.viewmats[i])
     z = z[z > 0]
     if not len(z):
-        raise ValueError(f"no point lies before camera {i}")
+        raise ValueError(f"no point is in front of camera {i}")
     return 0.8 * float(z.quantile(0.01)), 3 * float(z.quantile(0.99))
 
 
 class _Stereo:
-    """A reference photo and its sources at one size, ready to score depth hypotheses."""
+    """A reference view and its source views at one resolution, to score depth hypotheses."""
 
-    def __init__(self, views: Views, i: int, sources: list[int], share: float, device: str):
-        self.reference, K = _grey(views, i, share, device)
+    def __init__(self, views: Views, i: int, sources: list[int], scale: float, device: str):
+        self.reference, K = _grey(views, i, scale, device)
         self.size = self.reference.shape
         viewmat = views.cameras.viewmats[i].to(device)
         y, x = torch.meshgrid(*(torch.arange(s, device=device) + 0.5 for s in self.size), indexing="ij")
@@ -123,13 +125,13 @@ class _Stereo:
         self.moments = _moments(self.reference[None])
         self.sources = []
         for j in sources:
-            image, K_j = _grey(views, j, share, device)
+            image, K_j = _grey(views, j, scale, device)
             motion = views.cameras.viewmats[j].to(device) @ torch.linalg.inv(viewmat)
             rotated = (K_j @ motion[:3, :3] @ self.rays.flatten(1)).unflatten(1, self.size)
             self.sources.append((image, rotated, K_j @ motion[:3, 3]))
 
     def labels(self, near: float, far: float) -> Float[Tensor, "d"]:
-        """Inverse depths from far to near, so close that the best pixel of any source moves by at most one."""
+        """Inverse depths from far to near, spaced by at most about a pixel in any source (up to MAX_LABELS)."""
         ends = []
         for _, rotated, shift in self.sources:
             pixel = [(rotated * z + shift[:, None, None]) for z in (near, far)]
@@ -138,9 +140,9 @@ class _Stereo:
         return torch.linspace(1 / far, 1 / near, count, device=self.rays.device)
 
     def cost(self, depth: Float[Tensor, "d h w"], chunk: int = 8) -> Float[Tensor, "d h w"]:
-        """0 (alike) to 1 (unrelated) for each hypothesis: the mean over the better half of the sources.
+        """Cost 0 (equal) to 1 (uncorrelated) of each hypothesis: the mean over the better half of the sources.
 
-        The worse half may be where the point is hidden.
+        The point may be occluded in the other half.
         """
         keep = max(1, (len(self.sources) + 1) // 2)
         out = []
@@ -150,31 +152,31 @@ class _Stereo:
         return torch.cat(out)
 
     def _correlation(self, depth, image, rotated, shift) -> Float[Tensor, "d h w"]:
-        """Normalised cross-correlation of windows; 0 where the source does not see the point."""
+        """Normalised cross-correlation of windows; 0 where the point is outside the source image."""
         point = rotated * depth[:, None] + shift[:, None, None]
         z = point[:, 2].clamp_min(1e-6)
         height, width = image.shape
         grid = torch.stack([point[:, 0] / z * (2 / width) - 1, point[:, 1] / z * (2 / height) - 1], -1)
         batch = image.expand(len(depth), 1, height, width)
         warped = F.grid_sample(batch, grid, mode="bilinear", padding_mode="border", align_corners=False)[:, 0]
-        seen = (grid.abs() < 1).all(-1) & (point[:, 2] > 0)
+        inside = (grid.abs() < 1).all(-1) & (point[:, 2] > 0)
         mean, variance = _moments(warped)
         cross = _box(warped * self.reference) - mean * self.moments[0]
-        return torch.where(seen, cross / (variance * self.moments[1]).sqrt(), torch.zeros_like(cross))
+        return torch.where(inside, cross / (variance * self.moments[1]).sqrt(), torch.zeros_like(cross))
 
 
-def _grey(views: Views, i: int, share: float, device: str) -> tuple[Float[Tensor, "h w"], Float[Tensor, "3 3"]]:
-    """The photo in grey at a share of its size, and its K."""
+def _grey(views: Views, i: int, scale: float, device: str) -> tuple[Float[Tensor, "h w"], Float[Tensor, "3 3"]]:
+    """The grey image of view i at a fraction of its size, and its K."""
     image = views.image(i, device) @ torch.tensor([0.299, 0.587, 0.114], device=device)
     height, width = image.shape
-    size = max(8, round(height * share)), max(8, round(width * share))
+    size = max(8, round(height * scale)), max(8, round(width * scale))
     if size != (height, width):
         image = F.interpolate(image[None, None], size, mode="area")[0, 0]
     return image, resize(views.cameras.Ks[i], size[1] / width, size[0] / height).to(device)
 
 
 def _box(images: Float[Tensor, "d h w"]) -> Float[Tensor, "d h w"]:
-    """Mean over 5 x 5 pixels, edges repeated; by shifted sums, ten times as fast as a pooling layer on a CPU."""
+    """Mean over 5 x 5 pixels, edges replicated; shifted sums are ten times as fast as average pooling on a CPU."""
     padded = F.pad(images[None], (2, 2, 2, 2), mode="replicate")[0]
     pairs = padded[..., :-1] + padded[..., 1:]
     rows = pairs[..., :-3] + pairs[..., 2:-1]
@@ -186,7 +188,7 @@ def _box(images: Float[Tensor, "d h w"]) -> Float[Tensor, "d h w"]:
 
 
 def _moments(images: Float[Tensor, "d h w"]) -> tuple[Tensor, Tensor]:
-    """Mean and variance over the window; a floor of 2 grey levels keeps noise from counting as texture."""
+    """Mean and variance over the window; the variance of 2 grey levels is added, to suppress noise."""
     mean = _box(images)
     return mean, (_box(images * images) - mean * mean).clamp_min(0) + (2 / 255) ** 2
 
@@ -194,14 +196,14 @@ def _moments(images: Float[Tensor, "d h w"]) -> tuple[Tensor, Tensor]:
 def _slanted_cost(
     stereo: _Stereo, labels: Float[Tensor, "d"], normal: Float[Tensor, "3"], height: float
 ) -> Float[Tensor, "d h w"]:
-    """Cost of each (label, pixel) if the surface there is parallel to the supporting plane.
+    """Cost of each hypothesis and pixel for a surface parallel to the supporting plane.
 
-    `normal` is the plane's in camera axes, pointing up, `height` the camera's distance from it. Swept over
-    planes from a little below it to halfway up to the camera, then read off at the depth of each label:
-    a ray meets the plane at h below the camera at depth h / slope.
+    `normal` is that of the plane in camera axes, pointing up, `height` the distance of the camera from it. The sweep
+    covers planes from a little below it to halfway up to the camera and is interpolated at the depth of each label: a
+    plane at h below the camera is at depth h / slope.
     """
     slope = -(normal[:, None, None] * stereo.rays).sum(0)
-    facing = slope > 0.1  # planes seen more edge-on than about 6 degrees say nothing
+    facing = slope > 0.1  # not for planes at less than about 6 degrees to the ray
     if facing.float().mean() < 0.02:
         return torch.ones(len(labels), *stereo.size, device=labels.device)
     slope = slope.clamp_min(0.1)
@@ -209,24 +211,24 @@ def _slanted_cost(
     low, high = 1 / (1.2 * height), 1 / (0.5 * height)
     inverse = torch.linspace(low, high, int(((high - low) / step).clamp(16, MAX_LABELS)), device=labels.device)
     cost = stereo.cost((1 / inverse)[:, None, None] / slope)
-    at = (labels[:, None, None] / slope - low) / (inverse[1] - inverse[0])
-    known = (at >= 0) & (at <= len(inverse) - 1) & facing
-    left = at.clamp(0, len(inverse) - 1.001)
+    position = (labels[:, None, None] / slope - low) / (inverse[1] - inverse[0])
+    known = (position >= 0) & (position <= len(inverse) - 1) & facing
+    left = position.clamp(0, len(inverse) - 1.001)
     row = left.long()
-    read = torch.lerp(cost.gather(0, row), cost.gather(0, row + 1), left - row)
-    return torch.where(known, read, torch.ones_like(read))
+    interpolated = torch.lerp(cost.gather(0, row), cost.gather(0, row + 1), left - row)
+    return torch.where(known, interpolated, torch.ones_like(interpolated))
 
 
 def semi_global_matching(cost: Float[Tensor, "d h w"]) -> Float[Tensor, "h w"]:
-    """The label (with its fraction) of each pixel by semi-global matching along rows and columns."""
-    lines = cost.permute(2, 1, 0).contiguous()  # (w, h, d): a step along the row is one slice
+    """The label of each pixel, with subpixel fraction, by semi-global matching along rows and columns."""
+    lines = cost.permute(2, 1, 0).contiguous()  # (w, h, d): one slice per step along the row
     total = _passes(lines).transpose(0, 1)
     total = total + _passes(lines.transpose(0, 1).contiguous())
     best = total.argmin(-1)
     centre = best.clamp(1, total.shape[-1] - 2)[..., None]
     before, here, after = (total.gather(-1, centre + k)[..., 0] for k in (-1, 0, 1))
-    bend = (before - 2 * here + after).clamp_min(1e-6)
-    fraction = ((before - after) / (2 * bend)).clamp(-0.5, 0.5)
+    curvature = (before - 2 * here + after).clamp_min(1e-6)
+    fraction = ((before - after) / (2 * curvature)).clamp(-0.5, 0.5)
     return torch.where(best == centre[..., 0], best + fraction, best.to(fraction))
 
 
@@ -239,24 +241,24 @@ def _passes(lines: Float[Tensor, "l m d"]) -> Float[Tensor, "l m d"]:
             if previous is None:
                 path = lines[k]
             else:
-                least = previous.min(-1, keepdim=True).values
+                lowest = previous.min(-1, keepdim=True).values
                 near = F.pad(previous, (1, 1), value=float("inf"))
                 near = torch.minimum(near[:, :-2], near[:, 2:]) + STEP_PENALTY
-                path = lines[k] + torch.minimum(torch.minimum(previous, near), least + JUMP_PENALTY) - least
+                path = lines[k] + torch.minimum(torch.minimum(previous, near), lowest + JUMP_PENALTY) - lowest
             total[k] += path
             previous = path
     return total
 
 
 def _refined(stereo: _Stereo, inverse: Float[Tensor, "h w"], step: float) -> Float[Tensor, "h w"]:
-    """Inverse depth moved by up to two steps to where the sources match best.
+    """Inverse depth moved by up to two steps to the best match.
 
-    Neighbours are warped with their own depth, so slanted surfaces keep their slant. Costs are averaged
-    over a window, and staying costs least, so areas without texture stay as they are.
+    Every pixel is warped with its own depth, so windows follow slanted surfaces. Costs are averaged over a window and
+    grow with the move, so areas without texture do not change.
     """
     moves = torch.arange(-2, 3, device=inverse.device, dtype=inverse.dtype)
     hypotheses = (inverse + moves[:, None, None] * step).clamp_min(1e-6)
-    cost = _box(stereo.cost(1 / hypotheses)) + 0.02 * moves.abs()[:, None, None]
+    cost = _box(stereo.cost(1 / hypotheses)) + MOVE_COST * moves.abs()[:, None, None]
     best = cost.argmin(0, keepdim=True)
     centre = best.clamp(1, 3)
     before, here, after = (cost.gather(0, centre + k) for k in (-1, 0, 1))
@@ -266,9 +268,9 @@ def _refined(stereo: _Stereo, inverse: Float[Tensor, "h w"], step: float) -> Flo
 
 
 def check_consistency(maps: list[Tensor], views: Views, i: int, others: list[int]) -> DepthMap:
-    """Depth of view i averaged with that of the views that confirm it, and how many do.
+    """Depth of view i averaged with that of the consistent views, and their number.
 
-    A view confirms a point if its own depth there agrees within DEPTH_TOLERANCE and leads back to
+    A view is consistent if its depth at the point agrees within DEPTH_TOLERANCE and its point projects back to
     within PIXEL_TOLERANCE of the pixel (Galliani et al. 2015, "Massively parallel multiview stereopsis", sec. 4).
     """
     depth, cameras = maps[i], views.cameras
@@ -277,12 +279,12 @@ def check_consistency(maps: list[Tensor], views: Views, i: int, others: list[int
     pixels, points = unproject(depth, K, viewmat)
     total, support = depth.clone(), torch.zeros_like(depth)
     for j in others:
-        there, seen = look_up_points(maps[j], points, Ks[j], viewmats[j])
-        back = torch.cat([there, torch.ones_like(there[..., :1])], -1) @ viewmat.mT
+        other, inside = look_up_points(maps[j], points, Ks[j], viewmats[j])
+        back = torch.cat([other, torch.ones_like(other[..., :1])], -1) @ viewmat.mT
         z = back[..., 2]
-        landed = back[..., :2] / z[..., None].clamp_min(1e-9) * K.diagonal()[:2] + K[:2, 2]
-        close = (landed - pixels).norm(dim=-1) < PIXEL_TOLERANCE
-        agrees = seen & close & ((z - depth).abs() < DEPTH_TOLERANCE * depth)
+        reprojected = back[..., :2] / z[..., None].clamp_min(1e-9) * K.diagonal()[:2] + K[:2, 2]
+        close = (reprojected - pixels).norm(dim=-1) < PIXEL_TOLERANCE
+        agrees = inside & close & ((z - depth).abs() < DEPTH_TOLERANCE * depth)
         total += torch.where(agrees, z, torch.zeros_like(z))
         support += agrees
     return DepthMap(total / (1 + support), support)
@@ -291,7 +293,7 @@ def check_consistency(maps: list[Tensor], views: Views, i: int, others: list[int
 def unproject(
     depth: Float[Tensor, "h w"], K: Float[Tensor, "3 3"], viewmat: Float[Tensor, "4 4"]
 ) -> tuple[Float[Tensor, "h w 2"], Float[Tensor, "h w 3"]]:
-    """Pixel centres and the world points at their depth."""
+    """Pixel centres [px] and the world points at their depth."""
     y, x = torch.meshgrid(*(torch.arange(s, device=depth.device) + 0.5 for s in depth.shape), indexing="ij")
     pixels = torch.stack([x, y], -1)
     camera = torch.cat([(pixels - K[:2, 2]) / K.diagonal()[:2], torch.ones_like(x)[..., None]], -1) * depth[..., None]
@@ -301,7 +303,10 @@ def unproject(
 def look_up_points(
     depth: Float[Tensor, "h w"], points: Float[Tensor, "*b 3"], K: Float[Tensor, "3 3"], viewmat: Float[Tensor, "4 4"]
 ) -> tuple[Float[Tensor, "*b 3"], Bool[Tensor, "*b"]]:
-    """The world point that a view sees where `points` fall in it, and whether they fall inside."""
+    """The surface points that a view has at the projections of `points`, and whether these are inside the image.
+
+    Each is on the exact ray, at the depth of the pixel.
+    """
     camera = points @ viewmat[:3, :3].mT + viewmat[:3, 3]
     z = camera[..., 2]
     xy = camera[..., :2] / z[..., None].clamp_min(1e-9) * K.diagonal()[:2] + K[:2, 2]
@@ -310,6 +315,5 @@ def look_up_points(
     column = xy[..., 0].nan_to_num().clamp(0, width - 1).long()
     row = xy[..., 1].nan_to_num().clamp(0, height - 1).long()
     d = depth[row, column]
-    # the ray through the exact place, the depth of the pixel it falls in
-    seen = torch.cat([(xy - K[:2, 2]) / K.diagonal()[:2], torch.ones_like(d)[..., None]], -1) * d[..., None]
-    return (seen - viewmat[:3, 3]) @ viewmat[:3, :3], inside
+    surface = torch.cat([(xy - K[:2, 2]) / K.diagonal()[:2], torch.ones_like(d)[..., None]], -1) * d[..., None]
+    return (surface - viewmat[:3, 3]) @ viewmat[:3, :3], inside

@@ -1,4 +1,4 @@
-"""SIFT features, which pairs of photos to compare, and matches between them."""
+"""SIFT features, selection of photo pairs, and descriptor matching."""
 
 from __future__ import annotations
 
@@ -14,23 +14,24 @@ from tqdm import tqdm
 
 from stages.reconstruct.photos import Photos
 
-MAX_SIDE = 1024  # features are found in photos of at most this size [px]
+MAX_SIDE = 1024  # longest side for feature extraction [px]
 # Features kept per photo, the largest first; matching time grows with the square.
 MAX_FEATURES, MAX_FEATURES_MANY_PHOTOS = 6000, 3000
-MAX_EXHAUSTIVE = 60  # up to so many photos all pairs are compared
-MAX_RATIO = 0.8  # best match against second best, as Lowe 2004 proposes
-MAX_DISTANCE = 0.7  # largest distance between matching descriptors of unit length
+MAX_EXHAUSTIVE = 60  # up to this many photos all pairs are matched
+MAX_RATIO = 0.8  # of the distances of best and second best match (Lowe 2004)
+MAX_DISTANCE = 0.7  # of matching descriptors of unit length
 
-Feature = tuple[Tensor, Tensor]  # keypoints (k, 4) in pixels of the photo, centres at +0.5; descriptors (k, 128), bytes
+# Keypoints (k, 4): x, y [px of the photo, centres at +0.5], scale, orientation; descriptors (k, 128), bytes.
+Feature = tuple[Tensor, Tensor]
 
 
 def extract(photos: Photos, device: str = "cpu") -> list[Feature]:
-    """SIFT keypoints (x, y, scale, orientation) and root-SIFT descriptors of every photo."""
+    """SIFT keypoints and root-SIFT descriptors of every photo, the largest first; always on the CPU."""
     import pycolmap
 
     options = pycolmap.FeatureExtractionOptions(use_gpu=False, num_threads=1)
     extractor = pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
-    most = MAX_FEATURES if len(photos) <= MAX_EXHAUSTIVE else MAX_FEATURES_MANY_PHOTOS
+    limit = MAX_FEATURES if len(photos) <= MAX_EXHAUSTIVE else MAX_FEATURES_MANY_PHOTOS
     out = []
     for image in tqdm(photos.images, desc="finding features", unit="photo", leave=False):
         grey = cv2.cvtColor(image.numpy(), cv2.COLOR_RGB2GRAY)
@@ -39,7 +40,7 @@ def extract(photos: Photos, device: str = "cpu") -> list[Feature]:
             grey = cv2.resize(grey, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
         keypoints, descriptors = extractor.extract_from_uint8_array(np.ascontiguousarray(grey))
         table = pycolmap.keypoints_to_matrix(keypoints).reshape(-1, 4)
-        largest = np.argsort(-table[:, 2], kind="stable")[:most]
+        largest = np.argsort(-table[:, 2], kind="stable")[:limit]
         table = table[largest] / np.array([shrink, shrink, shrink, 1], np.float32)
         vectors = np.asarray(descriptors.data, np.uint8).reshape(-1, 128)[largest]
         out.append((torch.from_numpy(table), torch.from_numpy(vectors)))
@@ -47,25 +48,25 @@ def extract(photos: Photos, device: str = "cpu") -> list[Feature]:
 
 
 def normalise(descriptors: UInt8[Tensor, "k d"]) -> Float[Tensor, "k d"]:
-    """Descriptors of unit length."""
+    """Descriptors scaled to unit length."""
     return F.normalize(descriptors.float(), dim=1)
 
 
 def select_pairs(vectors: list[Float[Tensor, "_ d"]], neighbours: int = 8, similar: int = 20) -> list[tuple[int, int]]:
-    """All pairs of few photos; of many, those near in order and those that look alike.
+    """Pairs of photos to match: all of up to MAX_EXHAUSTIVE, otherwise neighbours in order and similar photos.
 
-    Looking alike is the number of matches among the 200 largest features of each photo.
-    Source: Wu 2013, "Towards linear-time incremental structure from motion", preemptive matching.
+    Similarity is the number of matches among the 200 largest features of each photo (preemptive matching).
+    Source: Wu 2013, "Towards linear-time incremental structure from motion".
     """
     n = len(vectors)
     if n <= MAX_EXHAUSTIVE:
         return [(i, j) for i in range(n) for j in range(i + 1, n)]
     chosen = {(i, i + step) for step in range(1, neighbours + 1) for i in range(n - step)}
-    likeness = torch.zeros(n, n)
+    similarity = torch.zeros(n, n)
     for i in tqdm(range(n), desc="choosing pairs", unit="photo", leave=False):
         for j in range(i + 1, n):
-            likeness[i, j] = likeness[j, i] = len(match_descriptors(vectors[i][:200], vectors[j][:200]))
-    best = likeness.topk(min(similar, n - 1), dim=1)
+            similarity[i, j] = similarity[j, i] = len(match_descriptors(vectors[i][:200], vectors[j][:200]))
+    best = similarity.topk(min(similar, n - 1), dim=1)
     for i in range(n):
         alike = best.indices[i][best.values[i] >= 4].tolist()
         chosen |= {(min(i, j), max(i, j)) for j in alike}
@@ -86,6 +87,6 @@ def match_descriptors(a: Float[Tensor, "n d"], b: Float[Tensor, "m d"]) -> Int[T
 
 
 def make_matcher(found: list[Feature], sizes: list[tuple[int, int]], device: str) -> Callable[[int, int], Tensor]:
-    """A function of two photos' numbers that gives the rows of `match`."""
+    """A function (i, j) -> matches of photos i and j as rows of `match_descriptors`; `sizes` are not used."""
     vectors = [normalise(descriptors).to(device) for _, descriptors in found]
     return lambda i, j: match_descriptors(vectors[i], vectors[j])

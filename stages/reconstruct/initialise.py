@@ -1,8 +1,7 @@
-"""Depth maps -> the Gaussians that photometric refinement starts from."""
+"""Depth maps -> the initial Gaussians of the photometric fit."""
 
 from __future__ import annotations
 
-import logging
 from dataclasses import dataclass, fields
 
 import torch
@@ -10,6 +9,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from stages.core.geometry.harmonics import C0
 from stages.core.geometry.neighbours import spacing
 from stages.core.geometry.planes import Plane
 from stages.core.raster.rasterise import rasterise
@@ -17,20 +17,33 @@ from stages.core.scene.gaussians import Gaussians
 from stages.reconstruct.depth import DepthMap, look_up_points, unproject
 from stages.reconstruct.photos import Views
 
-log = logging.getLogger(__name__)
-C0 = 0.28209479177387814  # the constant spherical harmonic
-MAX_POINTS = 6_000_000  # before thinning; bounds memory at about 1 GB
+MAX_POINTS = 6_000_000  # before downsampling; bounds memory at about 1 GB
+FREE_SPACE_MARGIN = 1.04  # a surface farther than this times the depth of a point proves free space at the point
+FOCUS_DETAIL = 3.0  # cells in focus are up to this much finer than the rest
+
+
+@dataclass(frozen=True)
+class DepthViews:
+    """Views with their depth maps; a depth is consistent if at least `min_support` other views agree with it."""
+
+    views: Views
+    maps: list[DepthMap]
+    min_support: int
+
+    def consistent(self, i: int) -> Bool[Tensor, "h w"]:
+        """The pixels of view i with consistent depth."""
+        return self.maps[i].support >= self.min_support
 
 
 @dataclass(frozen=True)
 class OrientedPoints:
-    """Oriented coloured points."""
+    """Coloured points with normals."""
 
     points: Float[Tensor, "n 3"]
-    normals: Float[Tensor, "n 3"]  # toward the camera that saw them
+    normals: Float[Tensor, "n 3"]  # unit, towards the camera
     colours: Float[Tensor, "n 3"]
-    footprint: Float[Tensor, "n"]  # size of a pixel at the point [scene units]
-    support: Float[Tensor, "n"]  # photos that confirm it
+    footprint: Float[Tensor, "n"]  # width of a pixel at the point [scene units]
+    support: Float[Tensor, "n"]  # number of views that agree with it
 
     def __len__(self) -> int:
         return len(self.points)
@@ -40,11 +53,12 @@ class OrientedPoints:
 
 
 def concatenate_points(clouds: list[OrientedPoints]) -> OrientedPoints:
+    """All points in order."""
     return OrientedPoints(*(torch.cat([getattr(c, f.name) for c in clouds]) for f in fields(OrientedPoints)))
 
 
 def unproject_view(views: Views, i: int, depth: Float[Tensor, "h w"], support: Float[Tensor, "h w"]) -> OrientedPoints:
-    """Every pixel of a view as an oriented point (h * w of them, in row order)."""
+    """Every pixel of view i as an oriented point (h * w in row order); normals from central differences over 4 px."""
     K, viewmat = views.cameras.Ks[i], views.cameras.viewmats[i]
     _, points = unproject(depth, K, viewmat)
     padded = F.pad(points.permute(2, 0, 1)[None], (2, 2, 2, 2), mode="replicate")[0].permute(1, 2, 0)
@@ -56,44 +70,47 @@ def unproject_view(views: Views, i: int, depth: Float[Tensor, "h w"], support: F
     return OrientedPoints(*(part.flatten(0, 1) for part in parts))
 
 
-def fuse(views: Views, maps: list[DepthMap], least: int) -> OrientedPoints:
-    """Points that at least `least` other photos confirm and that do not float before a confirmed surface."""
-    pixels = sum(m.depth.numel() for m in maps)
+def fuse(observed: DepthViews) -> OrientedPoints:
+    """The consistent depth of all views as points, without points in the free space before a consistent surface.
+
+    A point is dropped if more than half as many views contradict it as support it.
+    """
+    pixels = sum(m.depth.numel() for m in observed.maps)
     clouds = []
-    for i, m in enumerate(maps):
-        keep = (m.support >= least).flatten()
+    for i, m in enumerate(observed.maps):
+        keep = observed.consistent(i).flatten()
         if pixels > MAX_POINTS:
             generator = torch.Generator().manual_seed(i)
             keep &= torch.rand(len(keep), generator=generator) < MAX_POINTS / pixels
-        clouds.append(unproject_view(views, i, m.depth, m.support)[keep])
+        clouds.append(unproject_view(observed.views, i, m.depth, m.support)[keep])
     cloud = concatenate_points(clouds)
-    blocked = free_space_violations(cloud.points, views, maps, least)
-    return cloud[blocked <= 0.5 * cloud.support]
+    violations = free_space_violations(cloud.points, observed, observed.min_support)
+    return cloud[violations <= 0.5 * cloud.support]
 
 
 def free_space_violations(
-    points: Float[Tensor, "n 3"], views: Views, maps: list[DepthMap], least: int
+    points: Float[Tensor, "n 3"], observed: DepthViews, min_support: int
 ) -> Float[Tensor, "n"]:
-    """How many views see a confirmed surface clearly behind each point, which therefore cannot be there."""
-    count = torch.zeros(len(points))
-    for j, m in enumerate(maps):
-        K, viewmat = views.cameras.Ks[j], views.cameras.viewmats[j]
-        sure = torch.where(m.support >= least, m.depth, torch.zeros_like(m.depth))
-        surface, inside = look_up_points(sure, points, K, viewmat)
-        behind = surface @ viewmat[2, :3] + viewmat[2, 3]
-        count += inside & (behind > 1.04 * (points @ viewmat[2, :3] + viewmat[2, 3]))
+    """Number of views that have a surface with `min_support` behind each point, so that the point is in free space."""
+    count, cameras = torch.zeros(len(points)), observed.views.cameras
+    for K, viewmat, m in zip(cameras.Ks, cameras.viewmats, observed.maps, strict=True):
+        known = torch.where(m.support >= min_support, m.depth, torch.zeros_like(m.depth))
+        surface, inside = look_up_points(known, points, K, viewmat)
+        surface_depth = surface @ viewmat[2, :3] + viewmat[2, 3]
+        count += inside & (surface_depth > FREE_SPACE_MARGIN * (points @ viewmat[2, :3] + viewmat[2, 3]))
     return count
 
 
 def downsample(cloud: OrientedPoints, target: int, focus: Float[Tensor, "3"], radius: float) -> OrientedPoints:
-    """About `target` points: one a cell, the cell a power of two times the pixel's size at the point.
+    """About `target` points: the weighted mean of the points in each voxel.
 
-    So detail near the cameras stays and far walls need few; what is in focus, within a third of the cameras'
-    distance `radius`, keeps cells up to 3 times finer than the rest. The cell size is found by bisection.
+    The voxel size is proportional to the pixel size at the point, rounded to a power of two, so detail near the cameras
+    is kept; within a third of the cameras' distance `radius` from `focus` voxels are up to 3 times finer. The factor is
+    found by bisection.
     """
     if len(cloud) <= target:
         return cloud
-    size = cloud.footprint * ((cloud.points - focus).norm(dim=1) / radius * 3).clamp(1, 3)
+    size = cloud.footprint * ((cloud.points - focus).norm(dim=1) / radius * FOCUS_DETAIL).clamp(1, FOCUS_DETAIL)
     low, high = 0.5, 64.0
     for _ in range(9):
         middle = (low * high) ** 0.5
@@ -110,58 +127,61 @@ def downsample(cloud: OrientedPoints, target: int, focus: Float[Tensor, "3"], ra
         return out / total.reshape(-1, *[1] * (values.ndim - 1))
 
     normals = F.normalize(mean(cloud.normals), dim=1)
-    lost = normals.norm(dim=1) < 0.5
-    normals[lost] = torch.tensor([0.0, 0.0, 1.0])
+    undefined = normals.norm(dim=1) < 0.5
+    normals[undefined] = torch.tensor([0.0, 0.0, 1.0])
     return OrientedPoints(mean(cloud.points), normals, mean(cloud.colours), mean(cloud.footprint), mean(cloud.support))
 
 
 def _cells(points: Float[Tensor, "n 3"], size: Float[Tensor, "n"]) -> Int[Tensor, "n"]:
-    """A number for the cell each point falls in; its side is the power of two nearest to `size`."""
+    """A hash of the voxel of each point, whose side is the power of two nearest to `size`."""
     level = size.log2().round()
     index = (points / 2.0 ** level[:, None]).floor().long()
-    mixed = index[:, 0] * 73856093 ^ index[:, 1] * 19349663 ^ index[:, 2] * 83492791  # Teschner et al. 2003
-    return mixed * 64 + (level.long() & 63)
+    hashed = index[:, 0] * 73856093 ^ index[:, 1] * 19349663 ^ index[:, 2] * 83492791  # Teschner et al. 2003
+    return hashed * 64 + (level.long() & 63)
 
 
 def fill_unmatched(
-    views: Views, maps: list[DepthMap], cloud: OrientedPoints, plane: Plane | None, least: int, far: float,
-    stride: int = 3, device: str = "cpu",
-) -> OrientedPoints:  # fmt: skip
-    """Points for what the photos show but no depth was confirmed at: every `stride`-th pixel not yet covered.
+    observed: DepthViews, cloud: OrientedPoints, plane: Plane | None, far: float, stride: int = 3, device: str = "cpu"
+) -> OrientedPoints:
+    """Points for pixels without consistent depth: every `stride`-th pixel that `cloud` does not cover.
 
-    In this order: on the supporting plane where it is known nearby or the matched depth is close to it; at the
-    matched depth if at least one photo confirms it; at the depth interpolated from confirmed pixels where these
-    surround the pixel; else at the depth `far`, where a wrong point hides nothing. What would stand before a
-    surface that a photo confirms is moved there too.
+    Their depth is, in this order: that of the supporting plane, where its points are near or the matched depth is close
+    to it; the matched depth, if at least one view agrees; the depth interpolated from consistent pixels, where these
+    surround the pixel; otherwise `far`, where a wrong point occludes nothing. Points in the free space before a surface
+    that a view confirms are moved to `far` too.
     """
-    clouds, solid = [], to_gaussians(cloud, torch.full((len(cloud),), 0.8), degree=0).to(device)
-    for i, m in enumerate(maps):
-        sure = m.support >= least
+    views, clouds = observed.views, []
+    opaque = to_gaussians(cloud, torch.full((len(cloud),), 0.8), degree=0).to(device)
+    for i, m in enumerate(observed.maps):
+        consistent = observed.consistent(i)
         away = torch.full_like(m.depth, far)
-        depth = torch.where(surrounded_pixels(sure), interpolate_depth(m.depth, sure), away)
+        depth = torch.where(surrounded_pixels(consistent), interpolate_depth(m.depth, consistent), away)
         depth = torch.where(m.support >= 1, m.depth, depth)
         if plane is not None:
             depth = _depth_on_plane(views, i, depth, m.depth, cloud, plane)
-        rows = torch.zeros_like(sure)
-        rows[stride // 2 :: stride, stride // 2 :: stride] = True
-        wanted = (rows & ~covered_pixels(views, i, solid)).flatten()
-        close = unproject_view(views, i, depth, torch.zeros_like(depth))[wanted]
-        intrudes = free_space_violations(close.points, views, maps, 1) > 0
-        distant = unproject_view(views, i, away, torch.zeros_like(depth))[wanted]
-        clouds += [close[~intrudes], distant[intrudes]]
+        grid = torch.zeros_like(consistent)
+        grid[stride // 2 :: stride, stride // 2 :: stride] = True
+        missing = (grid & ~covered_pixels(views, i, opaque)).flatten()
+        close = unproject_view(views, i, depth, torch.zeros_like(depth))[missing]
+        floating = free_space_violations(close.points, observed, 1) > 0
+        distant = unproject_view(views, i, away, torch.zeros_like(depth))[missing]
+        clouds += [close[~floating], distant[floating]]
     found = concatenate_points(clouds)
-    return found[free_space_violations(found.points, views, maps, least) == 0]
+    return found[free_space_violations(found.points, observed, observed.min_support) == 0]
 
 
-def surrounded_pixels(sure: Bool[Tensor, "h w"], reach: int = 16) -> Bool[Tensor, "h w"]:
-    """Whether at least 3 in 10 pixels around each are sure: a hole in a surface, not the open side of it."""
-    share = F.avg_pool2d(sure[None, None].float(), 2 * reach + 1, 1, reach, count_include_pad=True)
-    return share[0, 0] > 0.3
+def surrounded_pixels(known: Bool[Tensor, "h w"], radius: int = 16) -> Bool[Tensor, "h w"]:
+    """Pixels with more than 30 % known pixels within `radius`: holes in a surface rather than its open boundary."""
+    fraction = F.avg_pool2d(known[None, None].float(), 2 * radius + 1, 1, radius, count_include_pad=True)
+    return fraction[0, 0] > 0.3
 
 
-def interpolate_depth(depth: Float[Tensor, "h w"], sure: Bool[Tensor, "h w"]) -> Float[Tensor, "h w"]:
-    """Depth everywhere: confirmed pixels spread over a pyramid of ever coarser means of inverse depth."""
-    value, weight = (torch.where(sure, 1 / depth, torch.zeros_like(depth)))[None, None], sure[None, None].float()
+def interpolate_depth(depth: Float[Tensor, "h w"], known: Bool[Tensor, "h w"]) -> Float[Tensor, "h w"]:
+    """Depth at every pixel by pull-push interpolation of the inverse depth of known pixels over an image pyramid.
+
+    Source: Gortler et al. 1996, "The Lumigraph" (pull-push).
+    """
+    value, weight = (torch.where(known, 1 / depth, torch.zeros_like(depth)))[None, None], known[None, None].float()
     levels = []
     while True:
         levels.append((value, weight))
@@ -173,8 +193,8 @@ def interpolate_depth(depth: Float[Tensor, "h w"], sure: Bool[Tensor, "h w"]) ->
     while levels:
         value, weight = levels.pop()
         inverse = F.interpolate(inverse, value.shape[2:], mode="bilinear", align_corners=False)
-        solid = (4 * weight).clamp(max=1)
-        inverse = solid * value / weight.clamp_min(1e-9) + (1 - solid) * inverse
+        blend = (4 * weight).clamp(max=1)
+        inverse = blend * value / weight.clamp_min(1e-9) + (1 - blend) * inverse
     return 1 / inverse[0, 0].clamp_min(1e-9)
 
 
@@ -182,35 +202,35 @@ def _depth_on_plane(
     views: Views, i: int, depth: Float[Tensor, "h w"], matched: Float[Tensor, "h w"], cloud: OrientedPoints,
     plane: Plane,
 ) -> Float[Tensor, "h w"]:
-    """`depth`, but that of the supporting plane where the ray meets it near points known to lie on it, or
-    where `matched` is within 3 % of it."""
+    """`depth`, replaced by that of the supporting plane where points of `cloud` on the plane are near, or where the
+    depth `matched` is within 3 % of it."""
     K, viewmat = views.cameras.Ks[i], views.cameras.viewmats[i]
     _, ones = unproject(torch.ones_like(depth), K, viewmat)
     eye = -viewmat[:3, :3].mT @ viewmat[:3, 3]
     along = ((ones - eye) @ plane.normal).clamp(max=-1e-6)
     z = -plane.heights(eye) / along
-    met = eye + z[..., None] * (ones - eye)
+    hit = eye + z[..., None] * (ones - eye)
     size = float((cloud.points - cloud.points.median(0).values).norm(dim=1).median())
     known = cloud.points[plane.heights(cloud.points).abs() < 0.02 * size]
     if not len(known):
         return depth
     cell = 0.1 * size
     side = torch.full((1,), cell)
-    near = torch.isin(_cells(met.flatten(0, 1), side).reshape(depth.shape), _cells(known, side).unique())
+    near = torch.isin(_cells(hit.flatten(0, 1), side).reshape(depth.shape), _cells(known, side).unique())
     near |= (matched - z).abs() < 0.03 * z
     return torch.where(near & (z > 0) & (along < -0.05), z, depth)
 
 
 @torch.no_grad()
 def covered_pixels(views: Views, i: int, gaussians: Gaussians) -> Bool[Tensor, "h w"]:
-    """Pixels of a view that the Gaussians hide by half or more."""
+    """Pixels of view i where the Gaussians have an alpha above 0.5."""
     height, width = views.images[i].shape[:2]
     viewmats, Ks = (x[[i]].to(gaussians.means) for x in (views.cameras.viewmats, views.cameras.Ks))
     return rasterise(gaussians, viewmats, Ks, width, height).alpha[0].cpu() > 0.5
 
 
 def to_gaussians(cloud: OrientedPoints, opacity: Float[Tensor, "n"], degree: int) -> Gaussians:
-    """Discs that just overlap: as wide as half the distance to their neighbours, a fifth as thick."""
+    """Flat Gaussians on the points: standard deviations 0.6 times the neighbour distance, a fifth along the normal."""
     width = (0.6 * spacing(cloud.points)).clamp(min=0.3 * cloud.footprint, max=8 * cloud.footprint)
     quats = quats_from_normals(cloud.normals)
     sh = torch.zeros(len(cloud), (degree + 1) ** 2, 3)
@@ -220,9 +240,9 @@ def to_gaussians(cloud: OrientedPoints, opacity: Float[Tensor, "n"], degree: int
 
 
 def quats_from_normals(normals: Float[Tensor, "n 3"]) -> Float[Tensor, "n 4"]:
-    """Quaternions w x y z that turn the z axis into each normal by the smallest angle."""
+    """Quaternions w x y z of the smallest rotation from the z axis to each unit normal."""
     x, y, z = normals.unbind(1)
-    opposite = z < -0.99999  # half a turn about x
+    opposite = z < -0.99999  # 180 degrees about x
     half = torch.stack([1 + z, -y, x, torch.zeros_like(z)], 1)
     half[opposite] = torch.tensor([0.0, 1.0, 0.0, 0.0])
     return F.normalize(half, dim=1)

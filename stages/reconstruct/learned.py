@@ -1,11 +1,16 @@
-"""The learned backends: π³, whose points become Gaussians, and Pi3-splat, which gives Gaussians itself."""
+"""The learned backends: π³, whose point maps become Gaussians, and Pi3-splat, which predicts Gaussians.
+
+Source of π³: Wang et al. 2025, arXiv:2507.13347.
+"""
 
 from __future__ import annotations
 
 import logging
+from pathlib import Path
+from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from stages.core.backends import pick_device
@@ -15,47 +20,55 @@ from stages.core.models.pi3 import memory
 from stages.core.models.pi3.network import Geometry, halve
 from stages.core.models.pi3.splat import Pi3Splat, splat
 from stages.core.models.pi3.weights import find, load
+from stages.core.scene.cameras import Cameras
 from stages.core.scene.gaussians import Gaussians
 from stages.reconstruct import network_input, pointmaps, world_frame
 from stages.reconstruct.build_scene import SceneGeometry, build_scene
 from stages.reconstruct.merge import merge_gaussians
 from stages.reconstruct.options import ReconstructOptions
-from stages.reconstruct.photos import Photos, Reconstruction
+from stages.reconstruct.photos import Photos, Reconstruction, split_holdout
 from stages.reconstruct.step_cache import StepCache
 
 log = logging.getLogger(__name__)
 
 
+class NetworkOutput(NamedTuple):
+    """Output of a network for v views of the same size."""
+
+    geometry: Geometry  # point maps, confidence and poses
+    raw: Float[Tensor, "v h w k"] | None = None  # parameters of one Gaussian per pixel, before activation
+
+
 def pi3(photos: Photos, options: ReconstructOptions, steps: StepCache) -> Reconstruction:
-    """One to a hundred photos through π³; Gaussians start on its points."""
+    """Backend `pi3`: cameras and point maps of 1 to 100 photos by π³; the Gaussians start on the points."""
     return _reconstruct("pi3", photos, options, steps)
 
 
 def pi3_splat(photos: Photos, options: ReconstructOptions, steps: StepCache) -> Reconstruction:
-    """The same, but Gaussians are those of the network's splat head."""
+    """Backend `pi3-splat`: the same, with the Gaussians predicted by the splat head."""
     return _reconstruct("pi3-splat", photos, options, steps)
 
 
 def _reconstruct(name: str, photos: Photos, options: ReconstructOptions, steps: StepCache) -> Reconstruction:
     if options.cameras is not None:
-        raise InputError(f"--cameras: --backend {name} finds cameras itself; use --backend classic with known ones")
+        raise InputError(f"--cameras: --backend {name} estimates the cameras; use --backend classic with known ones")
     device = pick_device(options.device)
     cropped = network_input.crop_photos(photos, options.resolution)
     images = network_input.make_batch(cropped, network_input.common_size(photos, options.resolution))
     geometry, raw = steps.cached("network", lambda: _predict_geometry(name, images, options, device), (Geometry,))
-    return assemble(photos, cropped, geometry, raw, options, steps, device)
+    return assemble(photos, cropped, NetworkOutput(geometry, raw), options, steps, device)
 
 
 def _predict_geometry(
     name: str, images: Float[Tensor, "v 3 h w"], options: ReconstructOptions, device: str
 ) -> tuple[Geometry, Tensor | None]:
-    """What the network says of the images; the raw numbers of Gaussians where it gives those."""
+    """Output of the network; the raw Gaussian parameters are None for π³."""
     model = load(_weights(name, options), name)
     return predict(model, images, device)
 
 
-def _weights(name: str, options: ReconstructOptions):
-    """The file of weights, fetched first when the user asked for that and it is not there."""
+def _weights(name: str, options: ReconstructOptions) -> Path:
+    """The file of weights; with --download it is fetched where missing."""
     try:
         return find(name, options.weights)
     except InputError:
@@ -68,9 +81,9 @@ def _weights(name: str, options: ReconstructOptions):
 
 @torch.no_grad()
 def predict(model: nn.Module, images: Float[Tensor, "v 3 h w"], device: str) -> tuple[Geometry, Tensor | None]:
-    """Run the network, in 16 bit on a GPU, over as many views at once as fit; results on the CPU.
+    """Run the network, in bf16 on a GPU, in chunks of as many views as fit in memory; results on the CPU.
 
-    Raises InputError beforehand where they cannot fit.
+    Raises InputError where the weights do not fit.
     """
     half, splats = device != "cpu", isinstance(model, Pi3Splat)
     config = model.encoder.config if splats else model.config
@@ -86,8 +99,8 @@ def predict(model: nn.Module, images: Float[Tensor, "v 3 h w"], device: str) -> 
     need = memory.activations(config, views, *size, at_once, splats, half) + memory.weights(model)
     log.info("%d photos at %dx%d, about %.1f GB of memory, %d at once", views, *size[::-1], need / 1e9, at_once)
     with torch.autocast(torch.device(device).type, torch.bfloat16, enabled=half):
-        said = model(images.to(device), at_once)
-    geometry, raw = said if splats else (said, None)
+        output = model(images.to(device), at_once)
+    geometry, raw = output if splats else (output, None)
     on_cpu = (x.cpu() for x in (geometry.points, geometry.confidence, geometry.poses))
     return Geometry(*on_cpu), None if raw is None else raw.half().cpu()  # 70 bytes a pixel
 
@@ -95,38 +108,39 @@ def predict(model: nn.Module, images: Float[Tensor, "v 3 h w"], device: str) -> 
 def assemble(
     photos: Photos,
     cropped: list[Tensor],
-    geometry: Geometry,
-    raw: Float[Tensor, "v h w k"] | None,
+    network: NetworkOutput,
     options: ReconstructOptions,
     steps: StepCache,
     device: str,
 ) -> Reconstruction:
-    """A scene from what a network says about the middles of the photos."""
-    sure = pointmaps.confident_pixels(geometry)
-    log.info("the network is sure of %.0f %% of the pixels", 100 * float(sure.float().mean()))
-    cameras = pointmaps.cameras_from_pointmaps(geometry, sure, photos.names)
-    trained, held = split_holdout(len(photos), options.holdout)
+    """A scene from the output of the network for the cropped photos."""
+    geometry = network.geometry
+    confident = pointmaps.confident_pixels(geometry)
+    log.info("the network is confident in %.0f %% of the pixels", 100 * float(confident.float().mean()))
+    cameras = pointmaps.cameras_from_pointmaps(geometry, confident, photos.names)
+    trained, held_out = split_holdout(len(photos), options.holdout)
     depth = geometry.points[..., 2]
-    maps = pointmaps.depth_maps(depth[trained], sure[trained], cameras[trained])
+    maps = pointmaps.depth_maps(depth[trained], confident[trained], cameras[trained])
     views = pointmaps.views_at_size(cropped, cameras, options.max_side)
     maps = [pointmaps.upsample(m, views.images[i].shape[:2]) for i, m in zip(trained, maps, strict=True)]
-    distances = torch.stack([d[s].median() if s.any() else d.median() for d, s in zip(depth, sure, strict=True)])
+    distances = torch.stack([d[m].median() if m.any() else d.median() for d, m in zip(depth, confident, strict=True)])
     focus = world_frame.focus_point(cameras.viewmats, distances)
     radius = float((centres(cameras.viewmats) - focus).norm(dim=1).median())
-    gaussians = None if raw is None else _network_gaussians(geometry, raw, sure, trained, cameras, options)
-    found = SceneGeometry(photos.source, views, trained, held, maps, 1, focus, radius, gaussians)
+    gaussians = None
+    if network.raw is not None:
+        part = NetworkOutput(
+            Geometry(geometry.points[trained], geometry.confidence[trained], geometry.poses[trained]),
+            network.raw[trained],
+        )
+        gaussians = _network_gaussians(part, confident[trained], cameras[trained], options.preset.gaussians)
+    found = SceneGeometry(photos.source, views, trained, held_out, maps, 1, focus, radius, gaussians)
     return build_scene(found, options, steps, device)
 
 
-def split_holdout(count: int, holdout: int) -> tuple[list[int], list[int]]:
-    """Indices of the photos to learn from and of those kept out; a single photo is learned from."""
-    held = [i for i in range(count) if holdout and i % holdout == 0] if count > 1 else []
-    return [i for i in range(count) if i not in held], held
-
-
-def _network_gaussians(geometry, raw, sure, trained: list[int], cameras, options: ReconstructOptions) -> Gaussians:
-    """The network's Gaussians of the views to learn from where it is to be trusted, no more than the quality asks."""
-    part = Geometry(geometry.points[trained], geometry.confidence[trained], geometry.poses[trained])
-    keep = sure[trained].flatten()
-    footprint = (part.points[..., 2] / cameras.Ks[trained][:, 0, 0, None, None]).flatten()
-    return merge_gaussians(splat(part, raw[trained].float())[keep], footprint[keep], options.preset.gaussians)
+def _network_gaussians(
+    network: NetworkOutput, confident: Bool[Tensor, "v h w"], cameras: Cameras, target: int
+) -> Gaussians:
+    """The predicted Gaussians of confident pixels, merged to about `target`."""
+    keep = confident.flatten()
+    footprint = (network.geometry.points[..., 2] / cameras.Ks[:, 0, 0, None, None]).flatten()
+    return merge_gaussians(splat(network.geometry, network.raw.float())[keep], footprint[keep], target)

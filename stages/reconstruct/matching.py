@@ -1,9 +1,10 @@
-"""Which photos show the same things: features, matches and two-view geometry in a COLMAP database."""
+"""Features, matches and verified two-view geometry of all photos, in a COLMAP database."""
 
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from tqdm import tqdm
@@ -14,27 +15,34 @@ from stages.reconstruct.options import FEATURE_EXTRACTORS, FEATURE_MATCHERS
 from stages.reconstruct.photos import Photos
 from stages.reconstruct.step_cache import StepCache
 
-MatchedPair = tuple[int, int, np.ndarray, np.ndarray]  # two photos and the pixels (k, 2) in each that match
+MatchedPair = tuple[int, int, np.ndarray, np.ndarray]  # indices of two photos, and matching pixels (k, 2) in each
 
 
-def build_database(
-    photos: Photos, cameras: list, steps: StepCache, seed: int, device: str, matcher: str = "sift"
-) -> Path:
-    """A COLMAP database of the photos, taken by pycolmap `cameras` (one a photo), ready to be mapped."""
-    extract = choose(FEATURE_EXTRACTORS, matcher)
+class MatchingOptions(NamedTuple):
+    """How photos are matched."""
+
+    matcher: str = "sift"  # of FEATURE_MATCHERS
+    seed: int = 0
+    device: str = "cpu"
+
+
+def build_database(photos: Photos, cameras: list, steps: StepCache, matching: MatchingOptions) -> Path:
+    """Path of a COLMAP database with verified matches of the photos; `cameras` are pycolmap cameras, one per photo."""
+    extract = choose(FEATURE_EXTRACTORS, matching.matcher)
 
     def write(path: Path) -> None:
-        found = steps.cached("features", lambda: extract(photos, device))
+        found = steps.cached("features", lambda: extract(photos, matching.device))
         with steps.timed("matches"):
-            _write_database(path, photos, cameras, found, seed, device, matcher)
+            _write_database(path, photos, cameras, found, matching)
 
     return steps.cached_file("matches.db", write)
 
 
 def initial_cameras(photos: Photos) -> list:
-    """One camera for all photos of a size and EXIF focal length; without that 1.2 times the longer side.
+    """Initial pycolmap camera of each photo, shared by photos of the same size and EXIF focal length.
 
-    The k1 of SIMPLE_RADIAL is enough for phones and cameras; one shared camera holds weak geometry together.
+    Without EXIF the focal length is 1.2 times the longer side. The model is SIMPLE_RADIAL, which is enough for phones
+    and most lenses; sharing stabilises weak geometry.
     """
     import pycolmap
 
@@ -51,7 +59,7 @@ def initial_cameras(photos: Photos) -> list:
 
 
 def verified_pairs(database: Path) -> list[MatchedPair]:
-    """The pairs of photos with enough verified matches; photos count from 0 in the order they were compared."""
+    """The pairs of photos with verified matches; photos are numbered from 0 in the order of the database."""
     import pycolmap
 
     file = pycolmap.Database.open(database)
@@ -67,9 +75,9 @@ def verified_pairs(database: Path) -> list[MatchedPair]:
 
 
 def _write_database(
-    path: Path, photos: Photos, cameras: list, found: list[features.Feature], seed: int, device: str, matcher: str
+    path: Path, photos: Photos, cameras: list, found: list[features.Feature], matching: MatchingOptions
 ) -> None:
-    """Writes cameras, photos, keypoints, matches and verified matches."""
+    """Write cameras, photos, keypoints, matches and two-view geometries."""
     import pycolmap
 
     database = pycolmap.Database.open(path)
@@ -85,24 +93,22 @@ def _write_database(
         frame.add_data_id(image.data_id)
         database.write_frame(frame, use_frame_id=True)
         database.write_keypoints(i + 1, found[i][0].numpy())
-    for i, j, matches, geometry in _match_and_verify(found, cameras, seed, device, matcher):
+    for i, j, matches, geometry in _match_and_verify(found, cameras, matching):
         database.write_matches(i + 1, j + 1, matches)
         database.write_two_view_geometry(i + 1, j + 1, geometry)
     database.close()
 
 
-def _match_and_verify(
-    found: list[features.Feature], cameras: list, seed: int, device: str, matcher: str
-) -> list[tuple]:
-    """Matches and two-view geometry of all pairs worth comparing, verified in the background while more are matched."""
+def _match_and_verify(found: list[features.Feature], cameras: list, matching: MatchingOptions) -> list[tuple]:
+    """Matches and two-view geometry of the selected pairs; one thread verifies while the next pairs are matched."""
     import pycolmap
 
     options = pycolmap.TwoViewGeometryOptions()
-    options.ransac.random_seed = seed
-    options.ransac.max_num_trials = 3000  # a pair that needs more shares too little to be of use
+    options.ransac.random_seed = matching.seed
+    options.ransac.max_num_trials = 3000  # pairs that need more have too few inliers
     pixels = [table[:, :2].double().numpy() for table, *_ in found]
     vectors = [features.normalise(descriptors) for _, descriptors, *_ in found]
-    same = choose(FEATURE_MATCHERS, matcher)(found, [(c.width, c.height) for c in cameras], device)
+    match = choose(FEATURE_MATCHERS, matching.matcher)(found, [(c.width, c.height) for c in cameras], matching.device)
 
     def verify(i: int, j: int, matches: np.ndarray) -> tuple:
         geometry = pycolmap.estimate_two_view_geometry(cameras[i], pixels[i], cameras[j], pixels[j], matches, options)
@@ -111,7 +117,7 @@ def _match_and_verify(
     pending = []
     with ThreadPoolExecutor(1) as background:
         for i, j in tqdm(features.select_pairs(vectors), desc="matching photos", unit="pair", leave=False):
-            matches = same(i, j).numpy().astype(np.uint32)
+            matches = match(i, j).numpy().astype(np.uint32)
             if len(matches) >= options.min_num_inliers:
                 pending.append(background.submit(verify, i, j, matches))
         return [job.result() for job in pending]

@@ -1,4 +1,4 @@
-"""Many Gaussians -> fewer that look alike: those of a cell become the one with their moments."""
+"""Reduction of Gaussians: those in a voxel are merged into one with the same moments."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ PRIMES = (73_856_093, 19_349_663, 83_492_791)  # Teschner et al. 2003, "Optimize
 def merge_gaussians(gaussians: Gaussians, footprint: Float[Tensor, "n"], target: int) -> Gaussians:
     """About `target` Gaussians or fewer.
 
-    A cell's side grows with the size of a pixel, `footprint`, at the Gaussian, in steps of two, so what is near the
-    cameras keeps its detail; how many pixels it spans is found by bisection. The merged Gaussian has the mean and
-    covariance of the mixture it stands for, weighted by opacity and area, and the means of opacity and harmonics.
+    The voxel size is proportional to the width of a pixel at the Gaussian, `footprint` [scene units], in powers of two,
+    so detail near the cameras is kept; the factor is found by bisection. A merged Gaussian has the mean and covariance
+    of the mixture, weighted by opacity and area, and the weighted means of opacity and harmonics.
     Source: Kerbl et al. 2024, "A hierarchical 3D Gaussian representation", sec. 4.1.
     """
     if len(gaussians) <= target:
@@ -34,23 +34,23 @@ def merge_gaussians(gaussians: Gaussians, footprint: Float[Tensor, "n"], target:
 
 
 def _joined(g: Gaussians, cell: Int[Tensor, "n"], weight: Float[Tensor, "n"]) -> Gaussians:
-    """One Gaussian for each cell number, which run from 0."""
+    """One Gaussian for each cell number 0, 1, ..."""
     count = int(cell.max()) + 1
-    share = weight / weight.new_zeros(count).index_add_(0, cell, weight)[cell]
+    fraction = weight / weight.new_zeros(count).index_add_(0, cell, weight)[cell]
 
     def mean(values: Tensor) -> Tensor:
-        weighted = values * share.reshape(-1, *[1] * (values.ndim - 1))
+        weighted = values * fraction.reshape(-1, *[1] * (values.ndim - 1))
         return values.new_zeros(count, *values.shape[1:]).index_add_(0, cell, weighted)
 
     means = mean(g.means)
-    apart = g.means - means[cell]
-    scales, quats = decompose(mean(covariance(g.quats, g.scales) + apart[:, :, None] * apart[:, None]))
+    offset = g.means - means[cell]
+    scales, quats = decompose(mean(covariance(g.quats, g.scales) + offset[:, :, None] * offset[:, None]))
     return Gaussians(means, quats, scales, mean(g.opacities), mean(g.sh), torch.zeros(count, dtype=torch.int64))
 
 
 def _cells(points: Float[Tensor, "n 3"], footprint: Float[Tensor, "n"], pixels: float) -> Int[Tensor, "n"]:
-    """A number for the cell of each point; cells of the smallest footprint span so many pixels."""
-    least = footprint.min().clamp_min(1e-12)
-    level = (footprint / least).log2().floor()
-    place = (points / (pixels * least * 2**level)[:, None]).floor().long()
-    return sum(place[:, k] * prime for k, prime in enumerate(PRIMES)) * 64 + level.long()
+    """A hash of the voxel of each point; voxels span `pixels` to 2 `pixels` footprints."""
+    smallest = footprint.min().clamp_min(1e-12)
+    level = (footprint / smallest).log2().floor()
+    index = (points / (pixels * smallest * 2**level)[:, None]).floor().long()
+    return sum(index[:, k] * prime for k, prime in enumerate(PRIMES)) * 64 + level.long()

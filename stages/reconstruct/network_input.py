@@ -1,4 +1,4 @@
-"""Photos as a network wants them: one size for all, sides multiples of a patch, few enough pixels."""
+"""Photos cropped and resized for a vision transformer: one size, sides multiples of the patch size."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from stages.core.models.pi3.dinov2 import PATCH
 from stages.core.scene.images import resize
 from stages.reconstruct.photos import Photos
 
-MAX_PIXELS = 201_000  # a photo, as the published model was run (448 x 448 for a square one)
+MAX_PIXELS = 201_000  # per photo, as published (448 x 448 for a square one)
 
 
 def network_size(width: int, height: int, longest: int | None = None) -> tuple[int, int]:
-    """Width and height, multiples of 14, of the largest image no larger than the photo, MOST_PIXELS, or `longest`.
+    """Width and height, multiples of 14: as large as the photo, MAX_PIXELS and the longest side `longest` allow.
 
-    Of the multiples around the exact size those with most pixels are taken.
+    Of the multiples next to the exact size those with most pixels are taken.
     """
     shrink = min(1.0, (MAX_PIXELS / (width * height)) ** 0.5, (longest or width + height) / max(width, height))
     choices = []
@@ -30,9 +30,9 @@ def network_size(width: int, height: int, longest: int | None = None) -> tuple[i
 
 
 def crop_photos(photos: Photos, longest: int | None = None) -> list[UInt8[Tensor, "_ _ 3"]]:
-    """The middle of every photo, in the proportions of the network's size for the median photo.
+    """The centre of every photo, cropped to the aspect ratio of `common_size`.
 
-    So the optical axis stays in the centre and pixels stay square.
+    The optical axis stays in the centre and pixels stay square.
     """
     width, height = common_size(photos, longest)
     out = []
@@ -46,15 +46,16 @@ def crop_photos(photos: Photos, longest: int | None = None) -> list[UInt8[Tensor
 
 
 def common_size(photos: Photos, longest: int | None = None) -> tuple[int, int]:
-    """The network's size (width, height) for the photo whose proportions are the median."""
+    """Network size (width, height) for the photo with the median aspect ratio."""
     sizes = sorted((photos.size(i) for i in range(len(photos))), key=lambda size: size[0] / size[1])
     return network_size(*sizes[len(sizes) // 2], longest)
 
 
 def resize_bytes(image: UInt8[Tensor, "h w 3"], width: int, height: int) -> UInt8[Tensor, "h2 w2 3"]:
+    """An 8-bit image resized."""
     return (resize(image.float() / 255, width, height) * 255).round().clamp(0, 255).to(torch.uint8)
 
 
 def make_batch(images: list[UInt8[Tensor, "_ _ 3"]], size: tuple[int, int]) -> Float[Tensor, "v 3 h w"]:
-    """Images of one proportion at the network's size (width, height), RGB in 0..1."""
+    """Images of one aspect ratio at the network size (width, height), RGB in 0..1."""
     return torch.stack([resize(image.float() / 255, *size) for image in images]).permute(0, 3, 1, 2).contiguous()

@@ -1,4 +1,4 @@
-"""What a user can choose about reconstruction."""
+"""Options of the reconstruct stage, its backends and quality presets."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ FEATURE_MATCHERS = {
     "sift": "stages.reconstruct.features:make_matcher",
     "aliked-lightglue": "stages.reconstruct.features_learned:make_matcher",
 }
-SINGLE_PHOTO_BACKENDS = {"pi3", "pi3-splat"}  # backends that one photo is enough for
+SINGLE_PHOTO_BACKENDS = {"pi3", "pi3-splat"}  # backends that accept a single photo
 
 
 @dataclass(frozen=True)
 class QualityPreset:
-    """What a word like "normal" stands for."""
+    """Sizes and counts of a quality level."""
 
-    max_side: int  # longest side the photos are worked at [px]
-    gaussians: int  # how many to start from
-    iterations: int  # photometric steps on a CPU, each on one photo; many photos get up to twice as many
+    max_side: int  # longest side of the views [px]
+    gaussians: int  # at the start
+    iterations: int  # of the photometric fit on a CPU, each on one photo; up to twice as many for many photos
     iterations_cuda: int  # the same on a GPU
     degree: int  # of the spherical harmonics
 
@@ -44,17 +44,19 @@ QUALITY_PRESETS = {
 
 @dataclass(frozen=True)
 class ReconstructOptions:
+    """Options of `ngff reconstruct`; raises InputError for values out of range."""
+
     backend: str = "classic"
-    matcher: str = "sift"  # of photos, for the classic backend
+    matcher: str = "sift"  # of features, for the classic backend
     cameras: Path | None = None  # known cameras: a nerfstudio transforms.json or a COLMAP model folder
-    holdout: int = 0  # keep every N-th photo out of the Gaussians and report on it; 0 keeps none out
+    holdout: int = 0  # keep every N-th photo out of the fit and evaluate it; 0 for none
     quality: str = "normal"
-    resolution: int | None = None  # longest side the photos are worked at [px]; by default the quality's
-    scale_reference: str = ""  # a measured length, as scale.parse_scale reads it; empty: the scale is chosen
-    resume: bool = False  # go on from the finished steps of a run that was cut off
-    weights: Path | None = None  # of pi3 and pi3-splat: a file, or a folder with one; by default looked for
-    download: bool = False  # fetch those weights where they are not here
-    iterations: int | None = None  # photometric steps; by default the quality's; 0 for none
+    resolution: int | None = None  # longest side of the views [px]; by default that of the quality
+    scale_reference: str = ""  # a measured length, in the form of scale.parse_scale; empty for none
+    resume: bool = False  # continue an interrupted run from its finished steps
+    weights: Path | None = None  # of pi3 and pi3-splat: a file or a folder; by default searched for
+    download: bool = False  # download those weights if they are missing
+    iterations: int | None = None  # of the photometric fit, 0 for none; by default that of the quality
     seed: int = 0
     device: str = "auto"
 
@@ -73,14 +75,16 @@ class ReconstructOptions:
 
     @property
     def preset(self) -> QualityPreset:
+        """The preset of the chosen quality."""
         return QUALITY_PRESETS[self.quality]
 
     @property
     def max_side(self) -> int:
+        """Longest side of the views [px]."""
         return self.resolution or self.preset.max_side
 
     def iteration_count(self, photos: int, device: str) -> int:
-        """Photometric steps: fixed by quality, device and photo count, so that a seed gives the same scene again."""
+        """Iterations of the photometric fit, from quality, device and number of photos only, for reproducibility."""
         if self.iterations is not None:
             return self.iterations
         base = self.preset.iterations_cuda if device == "cuda" else self.preset.iterations

@@ -1,4 +1,4 @@
-"""Photos as taken, and the views that they become once lens distortion is taken out."""
+"""Photos as taken, and undistorted views of them."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from stages.core.scene.scene import Scene
 
 @dataclass(frozen=True)
 class Photos:
-    """Photos as taken, though smaller when they were very large; sizes may differ."""
+    """Photos as taken, large ones reduced; sizes may differ."""
 
     images: tuple[UInt8[Tensor, "h w 3"], ...]
     names: tuple[str, ...]
-    focals: tuple[float, ...]  # from EXIF, in pixels of `images`; 0 where the file does not say
-    source: Path  # folder or video they came from, to be named in errors
+    focals: tuple[float, ...]  # from EXIF, in pixels of `images`; 0 where unknown
+    source: Path  # folder or video, for error messages
 
     def __len__(self) -> int:
         return len(self.images)
@@ -31,7 +31,7 @@ class Photos:
         return Photos(*(tuple(x[i] for i in index) for x in (self.images, self.names, self.focals)), self.source)
 
     def size(self, i: int) -> tuple[int, int]:
-        """Width and height [px]."""
+        """Width and height of photo i [px]."""
         return self.images[i].shape[1], self.images[i].shape[0]
 
 
@@ -49,26 +49,32 @@ class Views:
         return Views(tuple(self.images[i] for i in index), self.cameras[index])
 
     def image(self, i: int, device: str | torch.device = "cpu") -> Float[Tensor, "h w 3"]:
+        """Image of view i, RGB in 0..1."""
         return self.images[i].to(device).float() / 255
 
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """What a backend returns: the scene, and the photos it may be judged by, upright like the scene."""
+    """Result of a backend: the scene, and the views in its frame to evaluate it with."""
 
     scene: Scene
     views: Views
-    trained: list[int]  # views the Gaussians were fitted to
-    held_out: list[int]  # views kept out
-    dropped: dict[str, str]  # photos left out, and why
-    advice: list[str]  # what would improve the result, a sentence each
+    trained: list[int]  # views that the Gaussians are fitted to
+    held_out: list[int]  # views kept out of the fit
+    dropped: dict[str, str]  # photos left out -> reason
+    advice: list[str]  # how to improve the result, one sentence each
+
+
+def split_holdout(count: int, holdout: int) -> tuple[list[int], list[int]]:
+    """Indices of the photos to fit and of every `holdout`-th, kept out; a single photo is fitted."""
+    held_out = [i for i in range(count) if holdout and i % holdout == 0] if count > 1 else []
+    return [i for i in range(count) if i not in held_out], held_out
 
 
 def undistort(photos: Photos, cameras: Cameras, lenses: LensDistortion, side: int) -> Views:
-    """Pinhole views of the photos that `cameras` names, at most `side` wide or high.
+    """Pinhole views of the photos named in `cameras`, at most `side` wide or high.
 
-    The new K keeps only pixels the photo really has, so no black borders enter the Gaussians.
-    `cameras` are in pixels of `photos`.
+    `cameras` are in pixels of `photos`. The new K is chosen so that every pixel of a view is inside the photo.
     """
     row = {name: i for i, name in enumerate(photos.names)}
     images, Ks, sizes = [], [], []
@@ -89,12 +95,12 @@ def undistort(photos: Photos, cameras: Cameras, lenses: LensDistortion, side: in
 
 
 def _pinhole(pixels: np.ndarray, K: np.ndarray, lens: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The image without distortion, same size, and its K. OpenCV has pixel centres at 0, we at +0.5."""
+    """The undistorted image, same size, and its K; pixel centres are at 0 in OpenCV, at +0.5 here."""
     if not lens.any():
         return pixels, K
     height, width = pixels.shape[:2]
     half = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
-    theirs = K - half
-    new, _ = cv2.getOptimalNewCameraMatrix(theirs, lens, (width, height), 0)
-    maps = cv2.initUndistortRectifyMap(theirs, lens, None, new, (width, height), cv2.CV_32FC1)
+    K_cv = K - half
+    new, _ = cv2.getOptimalNewCameraMatrix(K_cv, lens, (width, height), 0)
+    maps = cv2.initUndistortRectifyMap(K_cv, lens, None, new, (width, height), cv2.CV_32FC1)
     return cv2.remap(pixels, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), new + half

@@ -1,4 +1,4 @@
-"""What the user knows about the size of things: photos alone have no scale."""
+"""The scale reference given by the user; photos alone have no absolute scale."""
 
 from __future__ import annotations
 
@@ -13,40 +13,43 @@ if TYPE_CHECKING:
 
 PATTERN = re.compile(r"(?:photos=(?P<first>[^,]+),(?P<second>.+?)\s+)?distance=(?P<distance>[0-9.eE+-]+)")
 USAGE = (
-    '"photos=FIRST.jpg,LAST.jpg distance=0.5" (from camera to camera) or "distance=0.6" (from the cameras to what they '
-    "look at), in metres"
+    '"photos=FIRST.jpg,LAST.jpg distance=0.5" (from camera to camera) or "distance=0.6" (from the cameras to the '
+    "objects), in metres"
 )
 
 
 @dataclass(frozen=True)
 class ScaleReference:
-    """A length that was measured: between the cameras of two photos, or from all cameras to what they look at."""
+    """A measured length: between the cameras of two photos, or the median from the cameras to their focus."""
 
     distance: float  # [m]
-    photos: tuple[str, ...]  # two names, or none
+    photos: tuple[str, ...]  # two names, or empty
 
     def check(self, names: tuple[str, ...]) -> None:
-        """Raises InputError unless the photos are among these."""
+        """Raise InputError unless its photos are in `names`."""
         absent = [name for name in self.photos if name not in names]
         if absent:
             raise InputError(f"--scale-reference: no camera found for {', '.join(absent)}; name photos that are used")
 
-    def in_scene_units(self, cameras: Cameras, reach: float) -> float:
-        """The same length in the units of the cameras; `reach` is their distance from what they look at."""
+    def in_scene_units(self, cameras: Cameras, camera_distance: float) -> float:
+        """The same length in the units of the cameras; `camera_distance` is that from their focus.
+
+        Raises InputError where a photo has no camera or both were taken from nearly the same position.
+        """
         from stages.core.geometry.cameras import centres
 
         if not self.photos:
-            return reach
+            return camera_distance
         self.check(cameras.names)
         first, second = centres(cameras.viewmats)[[cameras.names.index(name) for name in self.photos]]
         length = float((first - second).norm())
-        if length < 0.05 * reach:
-            raise InputError("--scale-reference: these two photos were taken from nearly the same place; name others")
+        if length < 0.05 * camera_distance:
+            raise InputError("--scale-reference: both photos were taken from nearly the same position; name others")
         return length
 
 
 def parse_scale(text: str) -> ScaleReference | None:
-    """From the form of the command line; None for an empty text."""
+    """Parse the value of --scale-reference; None for an empty text, InputError for other forms."""
     if not text:
         return None
     if "object" in text and "photos" not in text:

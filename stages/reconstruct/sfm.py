@@ -1,8 +1,8 @@
 """Structure from motion: photos -> cameras and sparse points, by COLMAP's incremental mapper.
 
-The same seed gives the same result on the same machine: features and matches are free of chance, the
-random searches are seeded, and verification and mapping run on one thread, because the order in which
-threads finish would change the sums.
+Results are reproducible for a seed on the same machine: feature extraction and matching are deterministic, RANSAC is
+seeded, and verification and mapping run on one thread, since the order of floating-point sums depends on scheduling.
+Source: Schönberger and Frahm 2016, "Structure-from-motion revisited".
 """
 
 from __future__ import annotations
@@ -21,49 +21,53 @@ from tqdm import tqdm
 from stages.core.errors import InputError
 from stages.core.scene.cameras import Cameras, LensDistortion
 from stages.reconstruct import matching
-from stages.reconstruct.matching import MatchedPair
+from stages.reconstruct.matching import MatchedPair, MatchingOptions
 from stages.reconstruct.photos import Photos
 from stages.reconstruct.step_cache import StepCache
 
 log = logging.getLogger(__name__)
-MAX_EPIPOLAR_ERROR = 0.006  # share of the photo's width by which given cameras may miss the matches (4 px of 640)
-MIN_IMAGE_MOTION = 0.005  # fraction of the photo's width; below it the camera is stationary
+MAX_EPIPOLAR_ERROR = 0.006  # median of the matches for given cameras [photo sizes]: 4 px of 640
+MIN_IMAGE_MOTION = 0.005  # median displacement of matches of a camera that moves [photo sizes]
 CAPTURE_ADVICE = "take 10 or more sharp photos, each showing at least two thirds of what the one before it shows"
 
 
 @dataclass(frozen=True)
 class SparseModel:
-    """Registered cameras and the points they share."""
+    """Registered cameras, sparse points, and k observations of points by cameras."""
 
     cameras: Cameras
     lenses: LensDistortion
     points: Float[Tensor, "m 3"]
-    point_index: Int[Tensor, "k"]  # observation: this point ...
-    view_index: Int[Tensor, "k"]  # ... is seen by this camera
-    dropped: dict[str, str] = field(default_factory=dict)  # photos left out, and why
+    point_index: Int[Tensor, "k"]  # row of `points` of each observation
+    view_index: Int[Tensor, "k"]  # row of `cameras` of each observation
+    dropped: dict[str, str] = field(default_factory=dict)  # photos left out -> reason
 
 
 def estimate_cameras(
     photos: Photos, seed: int = 0, device: str = "cpu", steps: StepCache | None = None, matcher: str = "sift"
 ) -> SparseModel:
-    """Cameras of as many photos as can be connected."""
+    """Cameras of as many photos as can be registered.
+
+    Raises InputError, with what to change, where the photos do not match, the camera is stationary, or mapping fails.
+    """
     steps = steps or StepCache()
     _configure_pycolmap(seed)
-    database = matching.build_database(photos, matching.initial_cameras(photos), steps, seed, device, matcher)
+    cameras, options = matching.initial_cameras(photos), MatchingOptions(matcher, seed, device)
+    database = matching.build_database(photos, cameras, steps, options)
     return steps.cached("model", lambda: _run_mapper(photos, database, seed), (SparseModel, Cameras, LensDistortion))
 
 
 def _run_mapper(photos: Photos, database: Path, seed: int) -> SparseModel:
-    """The largest model that the verified matches in the database allow."""
+    """The largest model that COLMAP maps from the database."""
     import pycolmap
 
     pairs = matching.verified_pairs(database)
     if not pairs:
-        raise InputError(f"{photos.source}: no two photos show the same things clearly enough; {CAPTURE_ADVICE}")
+        raise InputError(f"{photos.source}: no two photos show the same objects clearly enough; {CAPTURE_ADVICE}")
     if _is_stationary(pairs, photos):
         raise InputError(
-            f"{photos.source}: the camera hardly moved between the photos; walk around the things, or, if they turn on "
-            "a turntable, put it before a plain backdrop without pattern, so that only the things are matched"
+            f"{photos.source}: the camera hardly moved between the photos; walk around the objects, or, if they are "
+            "on a turntable, put it in front of a plain backdrop, so that only the objects are matched"
         )
     options = _mapper_options(photos, seed)
     with tempfile.TemporaryDirectory() as folder, tqdm(
@@ -85,59 +89,62 @@ def _run_mapper(photos: Photos, database: Path, seed: int) -> SparseModel:
 
 
 def _mapper_options(photos: Photos, seed: int):
-    """COLMAP's defaults, on one thread, and for very few photos too."""
+    """COLMAP's defaults, on one thread, and without minimum sizes for very few photos."""
     import pycolmap
 
     options = pycolmap.IncrementalPipelineOptions(random_seed=seed, num_threads=1, extract_colors=False)
     options.min_model_size = min(3, len(photos))
-    options.triangulation.ignore_two_view_tracks = len(photos) > 3  # few photos have no others
+    options.triangulation.ignore_two_view_tracks = len(photos) > 3  # up to 3 photos have mostly these
     return options
 
 
 def _failure_reason(photos: int, pairs: int) -> str:
-    """Why no cameras were found for photos of which so many pairs match: too few do, or what they match misleads."""
+    """Why mapping failed, by the number of matching pairs: too little overlap, or misleading matches."""
     if pairs < 2 * photos:
         return f"the photos overlap too little to find where they were taken from; {CAPTURE_ADVICE}"
     return (
-        f"{pairs} pairs of photos match, but from no places would the camera see all that; where a pattern repeats "
-        "(tiles, a checked cloth) each piece is taken for another: cover it, with newspaper for instance"
+        f"{pairs} pairs of photos match, but no camera positions explain the matches; where a pattern repeats "
+        "(tiles, a checked cloth) its parts are confused: cover it, with newspaper for instance"
     )
 
 
 def _is_stationary(pairs: list[MatchedPair], photos: Photos) -> bool:
-    """Whether the matches of most pairs stay where they are in the photo."""
+    """Whether the matches of most pairs have the same position in both photos."""
     moved = [np.median(np.linalg.norm(a - b, axis=1)) / max(photos.size(i)) for i, j, a, b in pairs]
     return float(np.median(moved)) < MIN_IMAGE_MOTION
 
 
 def _drop_reasons(photos: Photos, pairs: list[MatchedPair], best, models: dict) -> dict[str, str]:
-    """What is known about why each photo that is not in the best model is not."""
+    """The likely reason for each photo that is not in the best model."""
     placed = {best.images[i].name for i in best.reg_image_ids()}
     others = [{m.images[i].name for i in m.reg_image_ids()} for m in models.values() if m is not best]
     common = np.zeros((len(photos), len(photos)), int)
     for i, j, a, _ in pairs:
         common[i, j] = common[j, i] = len(a)
     inside = [i for i, name in enumerate(photos.names) if name in placed]
-    why = {}
+    reasons = {}
     for i, name in enumerate(photos.names):
         if name in placed:
             continue
-        most = int(common[i, inside].max())
-        together = next((group - placed for group in others if name in group), set())
-        if len(together) > 1:
-            why[name] = f"is one of {len(together)} photos that go with each other but not with the rest"
-        elif most == 0:
-            why[name] = "shows nothing that was recognised in the other photos, or is blurred, dark or plain"
+        matches = int(common[i, inside].max())
+        others_in_group = next((group - placed for group in others if name in group), set())
+        if len(others_in_group) > 1:
+            reasons[name] = f"is one of {len(others_in_group)} photos that match each other but not the rest"
+        elif matches == 0:
+            reasons[name] = "shows nothing that was recognised in the other photos, or is blurred, dark or plain"
         else:
-            why[name] = f"has at most {most} points in common with any placed photo, too few or too much in line"
-    return why
+            reasons[name] = f"has at most {matches} points in common with any placed photo, too few or too much in line"
+    return reasons
 
 
 def triangulate(
     photos: Photos, cameras: Cameras, lenses: LensDistortion, seed: int = 0, steps: StepCache | None = None,
     matcher: str = "sift",
 ) -> SparseModel:
-    """Sparse points for cameras that are known; `photos` and `cameras` in the same order, K in their pixels."""
+    """Sparse points for known cameras; `photos` and `cameras` in the same order, K in pixels of the photos.
+
+    Raises InputError where the cameras do not fit the photos or these overlap too little.
+    """
     import pycolmap
 
     steps = steps or StepCache()
@@ -148,10 +155,10 @@ def triangulate(
         width, height = photos.size(i)
         params = [K[0][0], K[1][1], K[0][2], K[1][2], *k[:4], k[4], 0, 0, 0]
         known.append(pycolmap.Camera(model="FULL_OPENCV", width=width, height=height, params=params, camera_id=i + 1))
-    database = matching.build_database(photos, known, steps, seed, "cpu", matcher)
+    database = matching.build_database(photos, known, steps, MatchingOptions(matcher, seed))
     pairs = matching.verified_pairs(database)
     if not pairs:
-        raise InputError(f"{photos.source}: no two photos show the same things clearly enough; {CAPTURE_ADVICE}")
+        raise InputError(f"{photos.source}: no two photos show the same objects clearly enough; {CAPTURE_ADVICE}")
     error = epipolar_error(cameras, known, pairs)
     if error > MAX_EPIPOLAR_ERROR * max(photos.size(0)):
         raise InputError(
@@ -174,7 +181,7 @@ def triangulate(
 
 
 def epipolar_error(cameras: Cameras, models: list, pairs: list[MatchedPair]) -> float:
-    """Median distance of matches from where the cameras' relative pose allows them [px] (Sampson's first order)."""
+    """Median distance of matches from the epipolar geometry of the cameras [px], first-order (Sampson 1982)."""
     errors = []
     for i, j, a, b in pairs:
         a, b = _rays(models[i], a), _rays(models[j], b)
@@ -187,11 +194,12 @@ def epipolar_error(cameras: Cameras, models: list, pairs: list[MatchedPair]) -> 
 
 
 def _rays(camera, pixels: np.ndarray) -> np.ndarray:
-    """Undistorted directions (k, 3), z = 1, of pixels (k, 2)."""
+    """Undistorted ray directions (k, 3), z = 1, of pixels (k, 2)."""
     return np.pad(np.asarray(camera.cam_from_img(pixels.astype(np.float64))), ((0, 0), (0, 1)), constant_values=1)
 
 
 def _configure_pycolmap(seed: int) -> None:
+    """Silence COLMAP's log and seed its random numbers."""
     import pycolmap
 
     pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
@@ -199,7 +207,7 @@ def _configure_pycolmap(seed: int) -> None:
 
 
 def _from_colmap(model, dropped: dict[str, str] | None = None) -> SparseModel:
-    """Ours from COLMAP's objects, photos in order of name."""
+    """A SparseModel from a COLMAP model, photos in order of name."""
     images = sorted((model.images[i] for i in model.reg_image_ids()), key=lambda image: image.name)
     row = {image.image_id: i for i, image in enumerate(images)}
     viewmats, Ks, sizes, lenses = [], [], [], []

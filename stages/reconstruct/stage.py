@@ -1,4 +1,4 @@
-"""photos/ -> scene.ply"""
+"""The reconstruct stage: photos/ -> scene.ply."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Score:
-    """Renders against the photos of the same cameras."""
+    """Mean image quality of renders compared with their photos."""
 
     photos: int
     psnr: float  # mean [dB]
@@ -30,27 +30,27 @@ class Score:
 
 @dataclass(frozen=True)
 class Report:
-    """How a reconstruction went."""
+    """Summary of a reconstruction."""
 
     photos: int
-    placed: int  # photos whose camera was found
-    dropped: dict[str, str]  # photos left out, and why
+    placed: int  # photos with a camera
+    dropped: dict[str, str]  # photos left out -> reason
     gaussians: int
-    learned: Score  # on the photos that the Gaussians were fitted to
+    learned: Score  # on the photos that the Gaussians are fitted to
     held_out: Score | None
-    seconds: dict[str, float]  # wall time of each step; resumed steps are absent
-    memory: float  # the most that the process held [GB]
+    seconds: dict[str, float]  # wall time of each step; without resumed ones
+    memory: float  # peak memory of the process [GB]
     advice: list[str]
 
 
 def run(imgs: Path, out: Path, options: ReconstructOptions) -> Report:
-    """Gaussians of what photos (or a video) show: photos/ -> scene.ply. Scores of held-out photos go to stdout.
+    """Reconstruct a folder of photos or a video: photos/ -> scene.ply. Scores of held-out photos go to stdout.
 
-    Steps that are finished lie in a hidden folder beside `out` until the scene is there; a run that is cut off
-    leaves them for `options.resume`, a user's mistake does not.
+    Finished steps are kept in a hidden folder beside `out` until the scene is written; an interrupted run leaves it for
+    `options.resume`. Raises InputError, and deletes the folder, where the photos or options do not work.
     """
     backend = choose(BACKENDS, options.backend)
-    photos = read_photos(imgs, options.max_side, least=1 if options.backend in SINGLE_PHOTO_BACKENDS else 2)
+    photos = read_photos(imgs, options.max_side, min_count=1 if options.backend in SINGLE_PHOTO_BACKENDS else 2)
     if known := parse_scale(options.scale_reference):
         known.check(photos.names)
     steps = StepCache.for_output(out, _cache_key(photos, options), options.resume)
@@ -63,7 +63,7 @@ def run(imgs: Path, out: Path, options: ReconstructOptions) -> Report:
         steps.remove()
         raise
     except KeyboardInterrupt:
-        log.info("steps that were finished are kept beside %s; --resume goes on from them", out)
+        log.info("finished steps are kept beside %s; --resume continues from them", out)
         raise
     steps.remove()
     report = _report(photos, made, steps, pick_device(options.device))
@@ -72,20 +72,20 @@ def run(imgs: Path, out: Path, options: ReconstructOptions) -> Report:
 
 
 def _cache_key(photos: Photos, options: ReconstructOptions) -> str:
-    """What the results of steps follow from."""
+    """Fingerprint of everything that the results of the steps depend on."""
     return fingerprint(ngff_version(), replace(options, resume=False), photos.names, photos.focals, *photos.images)
 
 
 def _report(photos: Photos, made: Reconstruction, steps: StepCache, device: str) -> Report:
     from stages.reconstruct.photometric import score_views
 
-    def judged(index: list[int]) -> Score | None:
+    def evaluated(index: list[int]) -> Score | None:
         if not index:
             return None
         scene = made.scene
         return Score(len(index), *score_views(scene.gaussians, made.views, index, device, background=scene.background))
 
-    scores = judged(made.trained), judged(made.held_out)
+    scores = evaluated(made.trained), evaluated(made.held_out)
     return Report(
         len(photos), len(made.views), made.dropped, len(made.scene.gaussians), *scores, steps.seconds, peak_memory(),
         made.advice,
@@ -94,11 +94,11 @@ def _report(photos: Photos, made: Reconstruction, steps: StepCache, device: str)
 
 def _log_report(out: Path, report: Report) -> None:
     log.info(
-        "%s: %d of %d photos, %d Gaussians; on the photos it learned from PSNR %.2f dB, SSIM %.3f",
+        "%s: %d of %d photos, %d Gaussians; PSNR %.2f dB, SSIM %.3f on the fitted photos",
         out, report.placed, report.photos, report.gaussians, report.learned.psnr, report.learned.ssim,
     )  # fmt: skip
     took = ", ".join(f"{name} {seconds:.0f} s" for name, seconds in report.seconds.items())
-    log.info("%s; at most %.1f GB of memory", took, report.memory)
+    log.info("%s; peak memory %.1f GB", took, report.memory)
     if held := report.held_out:
         print(f"held-out photos: {held.photos}  PSNR {held.psnr:.2f} dB  SSIM {held.ssim:.3f}")
     for sentence in report.advice:

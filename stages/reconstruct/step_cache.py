@@ -1,4 +1,4 @@
-"""The steps of a reconstruction: how long each took, and what a later run need not do again."""
+"""Results and wall time of the steps of a reconstruction, kept to resume an interrupted run."""
 
 from __future__ import annotations
 
@@ -23,27 +23,27 @@ T = TypeVar("T")
 
 
 class StepCache:
-    """A folder with the result of every finished step, each there whole or not at all.
+    """A folder with the result of every finished step, written atomically.
 
-    `key` names everything that the results follow from; results found under another key are discarded.
-    Without a folder a temporary one serves, gone with this object.
+    `key` identifies everything that the results depend on; results of another key, or without `resume`, are deleted.
+    Without a folder a temporary one is used, deleted with this object.
     """
 
     def __init__(self, folder: Path | None = None, key: str = "", resume: bool = False):
         self._temporary = tempfile.TemporaryDirectory() if folder is None else None
         self.folder = Path(self._temporary.name if folder is None else folder)
-        self.seconds: dict[str, float] = {}
+        self.seconds: dict[str, float] = {}  # wall time of each step
         note = self.folder / "key"
         if not (resume and note.exists() and note.read_text() == key):
             if resume:
-                log.info("nothing to resume: no earlier run with these photos and options was cut off here")
+                log.info("nothing to resume: there is no interrupted run with these photos and options")
             self.remove()
         self.folder.mkdir(exist_ok=True)
         note.write_text(key)
 
     @classmethod
     def for_output(cls, out: Path, key: str, resume: bool) -> StepCache:
-        """In a hidden folder next to the file that is being made."""
+        """A cache in a hidden folder beside the output file; InputError where its folder is missing."""
         out = Path(out)
         if not out.parent.is_dir():
             raise InputError(f"{out}: there is no folder {out.parent}; make it first")
@@ -51,7 +51,7 @@ class StepCache:
 
     @contextmanager
     def timed(self, name: str) -> Iterator[None]:
-        """Adds the wall time of what is inside to the step's [s]."""
+        """Context manager that adds its wall time [s] to the step `name`."""
         start = time.perf_counter()
         try:
             yield
@@ -59,10 +59,10 @@ class StepCache:
             self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
 
     def cached(self, name: str, make: Callable[[], T], types: tuple[type, ...] = ()) -> T:
-        """What `make` returns, or returned in the run that is resumed: tensors, plain values and `types`."""
+        """The result of `make`, or that of the resumed run. It may hold tensors, plain values and `types`."""
         path = self.folder / f"{name}.pt"
         if path.exists():
-            log.info("%s: from the earlier run", name)
+            log.info("%s: result of the interrupted run", name)
             torch.serialization.add_safe_globals(list(types))
             return torch.load(path, weights_only=True)
         with self.timed(name):
@@ -72,21 +72,22 @@ class StepCache:
         return made
 
     def cached_file(self, name: str, write: Callable[[Path], None]) -> Path:
-        """A file that `write` makes, or made in the run that is resumed."""
+        """Path of the file that `write` writes, or wrote in the resumed run."""
         path = self.folder / name
         if path.exists():
-            log.info("%s: from the earlier run", path.stem)
+            log.info("%s: result of the interrupted run", path.stem)
             return path
         with replacing(path) as part:
             write(part)
         return path
 
     def remove(self) -> None:
+        """Delete the folder."""
         shutil.rmtree(self.folder, ignore_errors=True)
 
 
 def fingerprint(*parts: object) -> str:
-    """Hex digest of tensors' bytes and of everything else as it prints."""
+    """SHA-256 of the bytes of tensors and the repr of everything else."""
     digest = hashlib.sha256()
     for part in parts:
         digest.update(part.numpy().data if isinstance(part, torch.Tensor) else repr(part).encode())
@@ -94,10 +95,10 @@ def fingerprint(*parts: object) -> str:
 
 
 def peak_memory() -> float:
-    """The most memory that this process has held at a time [GB]; 0 where the system does not say."""
+    """Peak resident memory of this process [GB]; 0 outside Unix."""
     try:
         import resource
-    except ImportError:  # no such count outside Unix
+    except ImportError:  # only on Unix
         return 0.0
     unit = 1 if sys.platform == "darwin" else 1024
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e9

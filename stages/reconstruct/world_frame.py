@@ -1,4 +1,4 @@
-"""Which way is up, where the floor is, and how large the scene is."""
+"""The world frame: up direction, supporting plane and scale of the scene."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ BAND_BELOW, BAND_ABOVE, PATCH_SIZE = 0.08, 0.03, 0.04
 
 @dataclass(frozen=True)
 class Ground:
-    """What was found out about the scene's stance, in the frame of the cameras."""
+    """Up direction and supporting plane, in the frame of the cameras."""
 
     up: Float[Tensor, "3"]
-    plane: Plane | None  # supporting plane, its normal being `up`; None when there is none
-    focus: Float[Tensor, "3"]  # what the cameras look at
+    plane: Plane | None  # supporting plane with normal `up`, if there is one
+    focus: Float[Tensor, "3"]  # the point that the cameras look at
     radius: float  # median distance of the cameras from it
     inlier_fraction: float = 0.0  # of the points in focus, on the plane
 
 
 def focus_point(viewmats: Float[Tensor, "c 4 4"], distances: Float[Tensor, "c"]) -> Float[Tensor, "3"]:
-    """The median of the points `distances` ahead of the cameras."""
+    """Median of the points at `distances` along the viewing axes of the cameras."""
     ahead = centres(viewmats) + viewmats[:, 2, :3] * distances[:, None]
     return ahead.median(0).values
 
@@ -39,32 +39,32 @@ def focus_point(viewmats: Float[Tensor, "c 4 4"], distances: Float[Tensor, "c"])
 def find_ground(
     points: Float[Tensor, "n 3"], viewmats: Float[Tensor, "c 4 4"], focus: Float[Tensor, "3"], seed: int = 0
 ) -> Ground:
-    """The plane that the things in focus stand on, or the cameras' own up where there is none.
+    """The supporting plane of the objects in focus by RANSAC, or only the up direction of the cameras.
 
-    Points count by their nearness to the focus, so a table wins over the floor around it; most cameras
-    must be above it. Planes that the cameras look down on by less than 60 degrees come first, since steeper
-    ones may be the front of a book; a steeper one must hold more points.
+    Points are weighted by their distance from the focus, so that a table is preferred to the floor around it; most
+    cameras must be above the plane. Planes that the cameras look down on by less than 60 degrees are tried first, since
+    steeper ones may be the front of a book; a steeper one needs more points.
     """
     eyes = centres(viewmats)
     radius = float((eyes - focus).norm(dim=1).median())
-    near = _focus_weights(points, focus, radius)
-    for least_up, least_share in PLANE_CRITERIA:
-        found = ransac(points, 0.01 * radius, near, lambda n, up=least_up: _plausible_up(n, viewmats, up), seed=seed)
+    weights = _focus_weights(points, focus, radius)
+    for min_up, min_fraction in PLANE_CRITERIA:
+        found = ransac(points, 0.01 * radius, weights, lambda n, up=min_up: _plausible_up(n, viewmats, up), seed=seed)
         if found is None:
             continue
-        plane, inside = _lowest_parallel_plane(points, near, found[0], 0.01 * radius)
-        share = float(near[inside].sum() / near.sum())
+        plane, inside = _lowest_parallel_plane(points, weights, found[0], 0.01 * radius)
+        fraction = float(weights[inside].sum() / weights.sum())
         above = float((plane.heights(eyes) > 0).float().mean())
-        if share >= least_share and above > 0.5:
-            return Ground(plane.normal, plane, focus, radius, share)
+        if fraction >= min_fraction and above > 0.5:
+            return Ground(plane.normal, plane, focus, radius, fraction)
     return Ground(up_from_cameras(viewmats), None, focus, radius)
 
 
 def refine_ground(ground: Ground, points: Float[Tensor, "n 3"], seed: int = 0) -> Ground:
-    """The plane again, by area: each patch of surface counts once, however many points its pattern gave.
+    """The supporting plane fitted again with equal weight for equal area instead of for each point.
 
-    Patterned tops, of a keyboard and of a book, may hold more points than the bare table under them and tilt the
-    first plane. It is looked for less far above than below, since what is above may be a tray.
+    Textured objects, such as a keyboard and a book, may have more points than the table under them and tilt the first
+    plane. The band of points reaches less far above the plane than below, since points above may be on a tray.
     """
     if ground.plane is None:
         return ground
@@ -79,30 +79,29 @@ def refine_ground(ground: Ground, points: Float[Tensor, "n 3"], seed: int = 0) -
 
 
 def _focus_weights(points: Float[Tensor, "n 3"], focus: Float[Tensor, "3"], radius: float) -> Float[Tensor, "n"]:
-    """Weights that fall to a half at half the cameras' distance."""
+    """Weights of points, 1 at the focus and 1/2 at half the cameras' distance from it."""
     return 1 / (1 + ((points - focus).norm(dim=1) / (0.5 * radius)) ** 4)
 
 
 def _plausible_up(
-    normals: Float[Tensor, "k 3"], viewmats: Float[Tensor, "c 4 4"], least_up: float
+    normals: Float[Tensor, "k 3"], viewmats: Float[Tensor, "c 4 4"], min_up: float
 ) -> Bool[Tensor, "k"]:
-    """Normals that make sense as up for most cameras.
+    """Mask of unit normals that are plausible up directions for most cameras.
 
-    People hold cameras level, so up is nearly square to the cameras' horizontal axes; it has at least the
-    share `least_up` along the cameras' own up, and the cameras do not look up at the plane.
+    Cameras are mostly held without roll, so up is nearly orthogonal to their horizontal axes; its component along the
+    up axes of the cameras is at least `min_up`, and the cameras do not look up at the plane.
     """
     right, down, ahead = (viewmats[:, axis, :3] for axis in range(3))
     roll = (normals @ right.mT).abs().median(1).values  # sine of the angle the camera is rolled by
     upward = (-normals @ down.mT).median(1).values
     pitch = (normals @ ahead.mT).median(1).values
-    return (roll < 0.3) & (upward > least_up) & (pitch < 0.2)
+    return (roll < 0.3) & (upward > min_up) & (pitch < 0.2)
 
 
 def up_from_cameras(viewmats: Float[Tensor, "c 4 4"]) -> Float[Tensor, "3"]:
-    """Up as the cameras were held: square to their horizontal axes where those fix it, else their mean up.
+    """Up direction from the cameras: orthogonal to their horizontal axes if these span a plane, else their mean up.
 
-    The mean up of cameras that all look down from one side leans; it is corrected only as far as the
-    horizontal axes span two directions.
+    The mean up of cameras that all look down from one side is tilted, so it is only the fallback.
     """
     right = viewmats[:, 0, :3]
     mean = F.normalize(-viewmats[:, 1, :3].mean(0), dim=0)
@@ -114,13 +113,13 @@ def up_from_cameras(viewmats: Float[Tensor, "c 4 4"]) -> Float[Tensor, "3"]:
 
 
 def _lowest_parallel_plane(points, weights, plane: Plane, threshold: float) -> tuple[Plane, Bool[Tensor, "n"]]:
-    """Among planes parallel to this one, the lowest that holds half as much or more: tables, not table mats."""
+    """The lowest parallel plane with half the weight of this one or more (the table under a mat), and its inliers."""
     heights = plane.heights(points)
-    own = weights[heights.abs() < threshold].sum()
-    near = weights > 0.5  # the floor under a table is large, but not in focus
+    weight = weights[heights.abs() < threshold].sum()
+    in_focus = weights > 0.5  # excludes the floor under a table
     for shift in torch.arange(-12, -2).tolist():
         inside = (heights - shift * threshold).abs() < threshold
-        if weights[inside & near].sum() >= 0.5 * own:
+        if weights[inside & in_focus].sum() >= 0.5 * weight:
             centre = float((heights[inside] * weights[inside]).sum() / weights[inside].sum())
             lower = Plane(plane.normal, plane.offset + centre)
             return lower, lower.heights(points).abs() < threshold
@@ -130,18 +129,18 @@ def _lowest_parallel_plane(points, weights, plane: Plane, threshold: float) -> t
 def to_world(
     ground: Ground, points: Float[Tensor, "n 3"], viewmats: Float[Tensor, "c 4 4"], metric: bool
 ) -> Similarity:
-    """The move to the world: z up, the floor at z = 0, the focus at x = y = 0, the first camera on the -y side.
+    """Transform to the world frame: z up, supporting plane at z = 0, focus at x = y = 0, first camera on the -y side.
 
-    The scale is kept where cameras were given (`metric`), else chosen so that the cameras' median distance
-    from the focus is 1.
+    Without a plane, z = 0 is the 2 % quantile of the heights near the focus. The scale is kept for given cameras
+    (`metric`), otherwise the median distance of the cameras from the focus becomes 1.
     """
     scale = 1.0 if metric else 1 / ground.radius
-    toward = ground.focus - centres(viewmats)[0]
-    ahead = toward - ground.up * (toward @ ground.up)
-    if ahead.norm() < 1e-3 * ground.radius:  # a first camera looking straight down: its own up is ahead
-        ahead = -viewmats[0, 1, :3] - ground.up * (-viewmats[0, 1, :3] @ ground.up)
-    ahead = F.normalize(ahead, dim=0)
-    R = torch.stack([torch.linalg.cross(ahead, ground.up), ahead, ground.up])
+    to_focus = ground.focus - centres(viewmats)[0]
+    forward = to_focus - ground.up * (to_focus @ ground.up)
+    if forward.norm() < 1e-3 * ground.radius:  # the first camera looks straight down: use its up axis
+        forward = -viewmats[0, 1, :3] - ground.up * (-viewmats[0, 1, :3] @ ground.up)
+    forward = F.normalize(forward, dim=0)
+    R = torch.stack([torch.linalg.cross(forward, ground.up), forward, ground.up])
     origin = ground.focus - ground.up * (ground.focus @ ground.up)
     if ground.plane is not None:
         floor = ground.plane.offset

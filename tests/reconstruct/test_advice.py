@@ -34,7 +34,7 @@ def test_the_side_that_was_not_seen_is_named_by_the_photos_at_its_ends():
     cameras = around(13, sweep=260.0)
     gap, before, after = widest_gap(cameras, torch.zeros(3))
     assert gap == pytest.approx(120, abs=0.1) and {before, after} == {"0.jpg", "12.jpg"}
-    assert "120 degrees between where" in told(cameras) and "about 7 more photos" in told(cameras)
+    assert "120 degrees between" in told(cameras) and "about 7 more photos" in told(cameras)
 
 
 def test_the_gap_is_found_across_the_turn_of_the_angle():
@@ -55,20 +55,20 @@ def test_what_went_wrong_is_said():
     assert "only 20 %" in told(around(24), confirmed=0.2) and "glass" in told(around(24), confirmed=0.2)
     sharp = torch.ones(24)
     sharp[3] = 0.1
-    assert "blurred beside the others: 3.jpg;" in told(around(24), sharp=sharp)
+    assert "blurred compared with the others: 3.jpg;" in told(around(24), sharp=sharp)
 
 
 def test_photos_left_out_are_named_with_the_reason_but_not_without_end():
     text = told(around(24), dropped={"a.jpg": "is dark", **{f"{i:03d}.jpg": "is blank" for i in range(30)}})
     assert text.splitlines() == [
-        "only 24 of 55 photos show enough of the same things: take them closer together, each showing two thirds of "
+        "only 24 of 55 photos show enough of the same objects: take them closer together, each showing two thirds of "
         "what the one before it shows",
         "a.jpg was left out: it is dark",
         "000.jpg, 001.jpg, 002.jpg and 27 more were left out: each is blank",
     ]
     text = told(around(24), dropped={f"{i}.jpg": f"has {i} points in common" for i in range(8)})
     assert len(text.splitlines()) == 6 and "4.jpg was left out: it has 4" in text
-    assert text.endswith("3 more photos were left out, for like reasons")
+    assert text.endswith("3 more photos were left out for similar reasons")
 
 
 def test_a_length_between_two_cameras_or_to_the_scene():
@@ -99,5 +99,5 @@ def test_cameras_of_a_length_must_be_there_and_apart():
     cameras = around(4)
     with pytest.raises(InputError, match="no camera found for 9.jpg"):
         parse_scale("photos=0.jpg,9.jpg distance=1").in_scene_units(cameras, 2.0)
-    with pytest.raises(InputError, match="nearly the same place"):
+    with pytest.raises(InputError, match="nearly the same position"):
         parse_scale("photos=0.jpg,0.jpg distance=1").in_scene_units(cameras, 2.0)

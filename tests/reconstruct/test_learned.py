@@ -15,6 +15,7 @@ from stages.core.models.pi3.splat import Pi3Splat
 from stages.core.scene.scene_ply import read_scene
 from stages.reconstruct import learned
 from stages.reconstruct import options as choices
+from stages.reconstruct.learned import NetworkOutput
 from stages.reconstruct.options import ReconstructOptions
 from stages.reconstruct.photometric import score_views
 from stages.reconstruct.stage import run
@@ -52,7 +53,7 @@ def assembled(tmp_path, count=4, splats=False, noise=0.0, **given):
         geometry = dataclasses.replace(geometry, points=geometry.points * wobble[..., None])
     raw = true_splats(photos, SIZE, geometry, float(cameras.Ks[0, 0, 0])) if splats else None
     options = ReconstructOptions(**{"quality": "draft", **given})
-    made = learned.assemble(photos, list(photos.images), geometry, raw, options, StepCache(), "cpu")
+    made = learned.assemble(photos, list(photos.images), NetworkOutput(geometry, raw), options, StepCache(), "cpu")
     return made, cameras
 
 
@@ -143,7 +144,7 @@ def test_what_is_missing_or_does_not_go_together_is_said(tmp_path, monkeypatch):
     for options, words in (
         (ReconstructOptions("pi3"), "no weights in .*huggingface.co/yyfz233/Pi3"),
         (ReconstructOptions("pi3-splat", weights=tmp_path / "w.pth", download=True), "w.pth: no such file"),
-        (ReconstructOptions("pi3", cameras=cameras), "--cameras: --backend pi3 finds cameras itself"),
+        (ReconstructOptions("pi3", cameras=cameras), "--cameras: --backend pi3 estimates the cameras"),
     ):
         with pytest.raises(InputError, match=words):
             run(tmp_path / "images", tmp_path / "s.ply", options)

@@ -115,13 +115,13 @@ def test_photos_that_cannot_be_read_are_named_and_left_out(folder, caplog):
     (folder / "f.png").write_bytes((folder / "f.png").read_bytes()[:-300])
     photos = read_photos(folder)
     assert photos.names == ("a.jpg", "b.jpg")
-    for said in ("c.jpg: breaks off", "d.jpg: is empty", "e.jpg: is not an image", "f.png: breaks off"):
+    for said in ("c.jpg: is truncated", "d.jpg: is empty", "e.jpg: is not an image", "f.png: is truncated"):
         assert said in caplog.text
     (folder / "b.jpg").unlink()
     with pytest.raises(InputError, match="holds one photo that can be read"):
         read_photos(folder)
     (folder / "a.jpg").unlink()
-    with pytest.raises(InputError, match="c.jpg: breaks off"):
+    with pytest.raises(InputError, match="c.jpg: is truncated"):
         read_photos(folder)
 
 

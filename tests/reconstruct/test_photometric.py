@@ -8,6 +8,7 @@ import torch
 from stages.core.raster.rasterise import rasterise
 from stages.core.scene.gaussians import Gaussians, concatenate
 from stages.reconstruct import photometric
+from stages.reconstruct.photometric import FitOptions
 from stages.reconstruct.photos import Views
 from tests.conftest import ball, random_gaussians, ring
 
@@ -30,13 +31,14 @@ def test_wrong_colours_are_put_right(target):
     true, views = target
     start = replace(true, sh=true.sh + 1)
     before, _ = photometric.score_views(start, views, list(range(6)))
-    after, _ = photometric.score_views(photometric.fit_gaussians(start, views, 150, 2.0), views, list(range(6)))
+    fitted = photometric.fit_gaussians(start, views, FitOptions(150, 2.0))
+    after, _ = photometric.score_views(fitted, views, list(range(6)))
     assert after > before + 6
 
 
 def test_the_same_seed_gives_the_same_gaussians(target):
     true, views = target
-    first, second = (photometric.fit_gaussians(true, views, 12, 2.0, seed=3) for _ in range(2))
+    first, second = (photometric.fit_gaussians(true, views, FitOptions(12, 2.0, seed=3)) for _ in range(2))
     for name in ("means", "quats", "scales", "opacities", "sh"):
         torch.testing.assert_close(getattr(first, name), getattr(second, name), rtol=0, atol=1e-6)
 
@@ -105,7 +107,7 @@ def test_what_was_lost_is_dropped():
     opacities = true.opacities.clone()
     opacities[5:10] = 1e-3
     start = Gaussians(behind, true.quats, true.scales, opacities, true.sh, true.object_id)
-    done = photometric.fit_gaussians(start, views, 5, 2.0)
+    done = photometric.fit_gaussians(start, views, FitOptions(5, 2.0))
     assert len(done) <= 50
     assert done.means[:, 2].max() < 10
 
@@ -118,7 +120,7 @@ def test_splitting_keeps_the_mass_and_shrinks_the_halves():
     fit.values["means"].grad = torch.zeros(100, 3)
     photometric._split(fit, pull / fit.values["scales"].detach().exp().max(1).values, torch.Generator().manual_seed(0))
     after = fit.gaussians()
-    count = int(photometric.SPLIT_FRACTION * 100)
+    count = int(photometric.DENSITY.split_fraction * 100)
     assert len(after) == 100 + count
     torch.testing.assert_close((after.means[7] + after.means[100]) / 2, start.means[7], rtol=1e-4, atol=1e-5)
     torch.testing.assert_close(after.scales[100], start.scales[7] / 1.6, rtol=1e-2, atol=0)

@@ -22,7 +22,7 @@ def test_blank_photos_are_refused_in_one_sentence(tmp_path):
         tuple(torch.full((120, 160, 3), 128, dtype=torch.uint8) for _ in range(4)),
         tuple("abcd"), (0.0,) * 4, tmp_path / "photos",
     )  # fmt: skip
-    with pytest.raises(InputError, match=r"photos: no two photos show the same things.*take 10 or more"):
+    with pytest.raises(InputError, match=r"photos: no two photos show the same objects.*take 10 or more"):
         sfm.estimate_cameras(blank)
 
 

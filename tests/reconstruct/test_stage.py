@@ -155,7 +155,7 @@ def test_a_run_that_was_stopped_goes_on_from_its_finished_steps(tmp_path, monkey
 def test_a_mistake_leaves_nothing_behind(tmp_path, monkeypatch):
     cameras = write_set(tmp_path, arc(4, (96, 72), sweep=40.0))
     small(monkeypatch)
-    for names, words in (("photo_00.png,x.png", "found for x.png"), ("photo_00.png,photo_00.png", "the same place")):
+    for names, words in (("photo_00.png,x.png", "found for x.png"), ("photo_00.png,photo_00.png", "the same position")):
         wrong = ReconstructOptions(cameras=cameras, quality="draft", scale_reference=f"photos={names} distance=1")
         with pytest.raises(InputError, match=words):
             run(tmp_path / "images", tmp_path / "s.ply", wrong)
@@ -206,6 +206,6 @@ def test_the_end_says_what_would_be_better(tmp_path, monkeypatch, caplog):
     small(monkeypatch)
     with caplog.at_level(logging.INFO):
         report = run(tmp_path / "images", tmp_path / "s.ply", ReconstructOptions(cameras=cameras, quality="draft"))
-    assert "GB of memory" in caplog.text and "to improve it: 4 photos are few" in caplog.text
-    assert any("between where photo_00.png and photo_03.png were taken" in sentence for sentence in report.advice)
+    assert "peak memory" in caplog.text and "to improve it: 4 photos are few" in caplog.text
+    assert any("between photo_00.png and photo_03.png" in sentence for sentence in report.advice)
     assert report.placed == report.photos == 4 and report.held_out is None and report.memory > 0.1

@@ -1,1 +1,1 @@
-"""Pairs of files to metrics."""
+"""Stage evaluate: prediction and ground truth -> metrics."""

@@ -1,4 +1,4 @@
-"""Videos, folders of pictures and single pictures: PSNR and SSIM of each frame."""
+"""Comparison of videos, folders of images and single images: PSNR and SSIM of each frame."""
 
 from __future__ import annotations
 
@@ -19,22 +19,23 @@ from stages.evaluate.options import EvaluateOptions
 from stages.evaluate.result import Curve, ImagePair, Result
 
 WINDOW, SIGMA = 11, 1.5  # of SSIM [px]
-SHOWN = 4  # pairs of frames in the report
+REPORT_FRAMES = 4  # pairs of frames shown in the report
 
 Image = Float[Tensor, "h w 3"]
 
 
 def psnr(predicted: Image, truth: Image) -> float:
-    """Peak signal to noise ratio [dB] for values in 0..1; infinite for identical pictures."""
+    """Peak signal to noise ratio [dB] for values in 0..1; infinite for identical images."""
     error = (predicted.double() - truth.double()).square().mean()
     return float(-10 * torch.log10(error))
 
 
 def ssim(predicted: Image, truth: Image) -> float:
-    """Structural similarity for values in 0..1, mean over channels and over windows wholly inside the picture.
+    """Structural similarity for values in 0..1, averaged over channels and over windows entirely inside the image.
 
     Source: Wang et al. 2004, "Image quality assessment", eq. 13: Gaussian window 11 x 11, sigma 1.5,
-    K1 = 0.01, K2 = 0.03.
+    K1 = 0.01, K2 = 0.03. No window crosses the border. stages/core/kernels/splat/ssim.py pads with zeros instead, so
+    the values of `ngff reconstruct --holdout` and of the benchmarks differ slightly from these.
     """
     x, y = predicted.double(), truth.double()
     mean_x, mean_y, square_x, square_y, product = (_blur(image) for image in (x, y, x * x, y * y, x * y))
@@ -46,28 +47,29 @@ def ssim(predicted: Image, truth: Image) -> float:
 
 
 def _blur(image: Image) -> Float[Tensor, "h2 w2 3"]:
-    """Gaussian means of the windows that lie inside."""
-    edge = WINDOW // 2
+    """Gaussian-weighted mean of each window that lies inside the image."""
+    border = WINDOW // 2
     blurred = cv2.GaussianBlur(image.numpy(), (WINDOW, WINDOW), SIGMA)
-    return torch.from_numpy(blurred[edge:-edge, edge:-edge])
+    return torch.from_numpy(blurred[border:-border, border:-border])
 
 
 def compare(prediction: Path, truth: Path, options: EvaluateOptions) -> Result:
-    """Frame by frame, in order."""
+    """PSNR and SSIM of each pair of frames, in order; InputError if number, rate or size of the frames differ."""
     notes = _check_rates(prediction, truth)
     total = options.frames or _count(truth)
-    chosen = set(torch.linspace(0, total - 1, min(SHOWN, total)).round().int().tolist())
+    shown = set(torch.linspace(0, total - 1, min(REPORT_FRAMES, total)).round().int().tolist())
     scores, pairs = [], []
     frames = zip_longest(_frames(prediction), _frames(truth))
-    for i, (mine, true) in enumerate(tqdm(frames, total=total, unit="frame")):
+    for i, (predicted, true) in enumerate(tqdm(frames, total=total, unit="frame")):
         if options.frames is not None and i == options.frames:
             break
-        if mine is None or true is None:
-            raise _lengths(prediction, truth, i, options)
-        _check_sizes(prediction, truth, mine, true)
-        scores.append((psnr(mine, true), ssim(mine, true)))
-        if i in chosen:
-            pairs.append(ImagePair(f"frame {i}: PSNR {scores[-1][0]:.2f} dB, SSIM {scores[-1][1]:.3f}", mine, true))
+        if predicted is None or true is None:
+            raise _length_error(prediction, truth, i, options)
+        _check_sizes(prediction, truth, predicted, true)
+        scores.append((psnr(predicted, true), ssim(predicted, true)))
+        if i in shown:
+            caption = f"frame {i}: PSNR {scores[-1][0]:.2f} dB, SSIM {scores[-1][1]:.3f}"
+            pairs.append(ImagePair(caption, predicted, true))
     if options.frames is not None and len(scores) < options.frames:
         raise InputError(f"--frames {options.frames}: both have only {len(scores)} frames; give {len(scores)} or fewer")
     if options.frames is not None:
@@ -79,48 +81,51 @@ def compare(prediction: Path, truth: Path, options: EvaluateOptions) -> Result:
 
 
 def _frames(path: Path) -> Iterator[Image]:
+    """The images of a folder, video or file."""
     if path.is_dir():
         return (read_image(photo) for photo in list_photos(path))
     return read_video(path) if path.suffix.lower() in VIDEO_SUFFIXES else iter([read_image(path)])
 
 
 def _count(path: Path) -> int:
-    """Number of frames, for the progress bar and for choosing what to show."""
+    """Number of frames, for the progress bar and the choice of frames for the report."""
     if path.is_dir():
         return len(list_photos(path))
     return max(video_info(path)[0], 1) if path.suffix.lower() in VIDEO_SUFFIXES else 1
 
 
 def _check_rates(prediction: Path, truth: Path) -> list[str]:
-    """Videos must play equally fast; folders have no rate, but equal names are worth having."""
+    """Notes on how frames correspond; InputError for videos of different frame rates."""
     if all(p.is_file() and p.suffix.lower() in VIDEO_SUFFIXES for p in (prediction, truth)):
-        mine, true = video_info(prediction)[1], video_info(truth)[1]
-        if abs(mine - true) > 1e-3 * true:
+        predicted, true = video_info(prediction)[1], video_info(truth)[1]
+        if abs(predicted - true) > 1e-3 * true:
             raise InputError(
-                f"{prediction}: {mine:g} frames a second, but {truth} has {true:g}; "
+                f"{prediction}: {predicted:g} frames a second, but {truth} has {true:g}; "
                 f"render one of them again with `ngff render --fps {true:g}`"
             )
         return []
     if prediction.is_dir() and truth.is_dir():
         names = [[p.stem for p in list_photos(folder)] for folder in (prediction, truth)]
-        alike = names[0] == names[1]
-        return ["pictures were matched by name" if alike else "pictures were matched by order, since names differ"]
+        equal = names[0] == names[1]
+        return ["images were matched by name" if equal else "images were matched by order, since names differ"]
     return []
 
 
-def _lengths(prediction: Path, truth: Path, shared: int, options: EvaluateOptions) -> InputError:
+def _length_error(prediction: Path, truth: Path, shared: int, options: EvaluateOptions) -> InputError:
+    """The error for files of which only the first `shared` frames exist in both."""
     counts = f"{prediction}: {_count(prediction)} frames, but {truth} has {_count(truth)}"
     if options.frames is not None:
         return InputError(f"{counts}; --frames {options.frames} is more than both have, give {shared} or fewer")
     return InputError(f"{counts}; give --frames {shared} to compare the first {shared}")
 
 
-def _check_sizes(prediction: Path, truth: Path, mine: Tensor, true: Tensor) -> None:
-    if mine.shape != true.shape:
-        (h, w), (h2, w2) = mine.shape[:2], true.shape[:2]
+def _check_sizes(prediction: Path, truth: Path, predicted: Tensor, true: Tensor) -> None:
+    """InputError unless both images have the same size, and are large enough for SSIM."""
+    if predicted.shape != true.shape:
+        (h, w), (h2, w2) = predicted.shape[:2], true.shape[:2]
         raise InputError(
-            f"{prediction}: pictures of {w}x{h}, but {truth} has {w2}x{h2}; "
+            f"{prediction}: images of {w}x{h}, but {truth} has {w2}x{h2}; "
             f"render again with the same view and `--resolution {max(w2, h2)}`"
         )
-    if min(mine.shape[:2]) < WINDOW:
-        raise InputError(f"{prediction}: pictures smaller than {WINDOW} pixels have no SSIM; render them larger")
+    if min(predicted.shape[:2]) < WINDOW:
+        raise InputError(f"{prediction}: SSIM needs images of at least {WINDOW} pixels; render them larger")

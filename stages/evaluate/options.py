@@ -1,4 +1,4 @@
-"""What a user can choose about evaluation."""
+"""Options of the stage evaluate."""
 
 from __future__ import annotations
 
@@ -10,18 +10,21 @@ from stages.core.errors import InputError
 
 @dataclass(frozen=True)
 class EvaluateOptions:
-    align: bool = False  # first bring the prediction into the truth's world, by shared cameras or else by objects
-    frames: int | None = None  # compare only the first N frames; by default both must have the same number
-    resample: bool = False  # interpolate the predicted motion at the truth's frame times
-    objects: str = ""  # compare only these objects of the truth, by name: "duck,ball"; by default all
-    report: Path | None = None  # also write an HTML page with curves and pictures
+    """What the user can choose."""
+
+    align: bool = False  # first align the prediction with the truth, by shared cameras or else by objects
+    frames: int | None = None  # compare the first N frames only; by default both must have the same number
+    resample: bool = False  # interpolate the predicted motion at the frame times of the truth
+    objects: str = ""  # names of the objects of the truth to compare: "duck,ball"; default: all
+    report: Path | None = None  # HTML report with curves and images to write
 
     def __post_init__(self):
         if self.frames is not None and self.frames < 1:
             raise InputError(f"--frames {self.frames}: give the number of frames to compare, 1 or more")
         if self.report is not None and Path(self.report).suffix.lower() not in (".html", ".htm"):
-            raise InputError(f"--report {self.report}: the report is an HTML page; name it with .html")
+            raise InputError(f"--report {self.report}: the report is an HTML file; use the suffix .html")
 
     @property
     def object_names(self) -> list[str]:
+        """The names in `objects`."""
         return [name.strip() for name in self.objects.split(",") if name.strip()]

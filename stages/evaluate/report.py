@@ -1,4 +1,4 @@
-"""A report in one HTML file: table, curves as inline SVG, pictures inline."""
+"""HTML report in one file: table, curves as inline SVG, and inline images."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from stages.core.scene.images import resize, write_png
 from stages.evaluate.result import Curve, ImagePair, Result, format_number
 
 WIDTH, HEIGHT, LEFT, BOTTOM = 720, 280, 60, 36  # of the plot [px]; margins for the labels
-INKS = ("#1f6fb4", "#d1491f", "#2e8b57", "#8e44ad", "#b8860b", "#16808a", "#c2185b", "#5d6d7e")
-PICTURE = 420  # longest side of a picture in the report [px]
+LINE_COLOURS = ("#1f6fb4", "#d1491f", "#2e8b57", "#8e44ad", "#b8860b", "#16808a", "#c2185b", "#5d6d7e")
+MAX_IMAGE_SIDE = 420  # longest side of an image in the report [px]
 STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 900px; margin: 2em auto; padding: 0 1em; color: #222 }
 table { border-collapse: collapse } th, td { padding: .25em .9em; text-align: right; border-bottom: 1px solid #ddd }
@@ -27,7 +27,7 @@ figcaption, .notes { color: #555 } svg text { font: 12px system-ui, sans-serif; 
 
 
 def write_report(path: Path, result: Result, prediction: Path, truth: Path) -> None:
-    """Everything in one file that opens anywhere."""
+    """Write the report; it refers to no other file."""
     title = f"{Path(prediction).name} against {Path(truth).name}"
     body = [f"<h1>{escape(title)}</h1>", _table(result)]
     body += [f'<p class="notes">{escape(note)}</p>' for note in result.notes]
@@ -49,28 +49,29 @@ def _table(result: Result) -> str:
 
 
 def _plot(result: Result) -> str:
-    """The first curve's unit is the axis; curves of another unit (SSIM beside PSNR) stay in the JSON."""
+    """Plot of the curves that share the unit of the axis; SSIM, which does not, is in the JSON only."""
     curves = [c for c in result.curves if c.name != "SSIM"]
     count = len(curves[0].values)
     top = _round_up(max((v for c in curves for v in c.values if math.isfinite(v)), default=1.0))
     seconds = (count - 1) / result.fps if result.fps else None
     across = [_tick(LEFT + f * (WIDTH - LEFT - 10), _time(f, count, seconds)) for f in (0.0, 0.25, 0.5, 0.75, 1.0)]
     up = [_level(f, f * top) for f in (0.0, 0.5, 1.0)]
-    lines = [_line(c, top, INKS[i % len(INKS)]) for i, c in enumerate(curves)]
+    lines = [_line(c, top, LINE_COLOURS[i % len(LINE_COLOURS)]) for i, c in enumerate(curves)]
     names = " ".join(
-        f'<span style="color:{INKS[i % len(INKS)]}">&#9632; {escape(c.name)}</span>' for i, c in enumerate(curves)
+        f'<span style="color:{LINE_COLOURS[i % len(LINE_COLOURS)]}">&#9632; {escape(c.name)}</span>'
+        for i, c in enumerate(curves)
     )
     svg = f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img">{"".join(up + across + lines)}</svg>'
     return f"<figure>{svg}<figcaption>{escape(result.curve_title)}: {names}</figcaption></figure>"
 
 
-def _line(curve: Curve, top: float, ink: str) -> str:
+def _line(curve: Curve, top: float, colour: str) -> str:
     count = len(curve.values)
     points = [
         f"{LEFT + i / (count - 1) * (WIDTH - LEFT - 10):.1f},{_y(v / top):.1f}"
         for i, v in enumerate(curve.values) if math.isfinite(v)
     ]  # fmt: skip
-    return f'<polyline points="{" ".join(points)}" fill="none" stroke="{ink}" stroke-width="2"/>'
+    return f'<polyline points="{" ".join(points)}" fill="none" stroke="{colour}" stroke-width="2"/>'
 
 
 def _y(fraction: float) -> float:
@@ -79,8 +80,8 @@ def _y(fraction: float) -> float:
 
 def _level(fraction: float, value: float) -> str:
     y = _y(fraction)
-    rule = f'<line x1="{LEFT}" x2="{WIDTH - 10}" y1="{y:.1f}" y2="{y:.1f}" stroke="#ddd"/>'
-    return f'{rule}<text x="{LEFT - 6}" y="{y + 4:.1f}" text-anchor="end">{value:.3g}</text>'
+    grid_line = f'<line x1="{LEFT}" x2="{WIDTH - 10}" y1="{y:.1f}" y2="{y:.1f}" stroke="#ddd"/>'
+    return f'{grid_line}<text x="{LEFT - 6}" y="{y + 4:.1f}" text-anchor="end">{value:.3g}</text>'
 
 
 def _tick(x: float, text: str) -> str:
@@ -100,19 +101,19 @@ def _round_up(value: float) -> float:
 
 
 def _figure(pair: ImagePair) -> str:
-    """Prediction left, truth right."""
+    """Prediction on the left, truth on the right."""
     images = "".join(f'<img alt="{name}" src="data:image/png;base64,{_png(image)}"> ' for name, image in
                      (("prediction", pair.predicted), ("truth", pair.truth)))  # fmt: skip
     return f"<figure>{images}<figcaption>prediction, truth; {escape(pair.caption)}</figcaption></figure>"
 
 
 def _png(image: Float[Tensor, "h w 3"]) -> str:
-    """Base64 of a PNG no larger than a report needs."""
+    """Base64 of a PNG, reduced to MAX_IMAGE_SIDE."""
     h, w = image.shape[:2]
-    shrink = min(1.0, PICTURE / max(h, w))
-    if shrink < 1:
-        image = resize(image, max(1, round(w * shrink)), max(1, round(h * shrink)))
+    factor = min(1.0, MAX_IMAGE_SIDE / max(h, w))
+    if factor < 1:
+        image = resize(image, max(1, round(w * factor)), max(1, round(h * factor)))
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "picture.png"
+        path = Path(folder) / "image.png"
         write_png(path, image)
         return base64.b64encode(path.read_bytes()).decode()

@@ -1,4 +1,4 @@
-"""What every comparison ends in, and how it is written down."""
+"""Result of a comparison, and its representation as table and JSON."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Curve:
-    """One number a frame."""
+    """One value per frame."""
 
     name: str
     values: list[float]
@@ -19,7 +19,7 @@ class Curve:
 
 @dataclass(frozen=True)
 class ImagePair:
-    """A predicted picture beside the true one."""
+    """A predicted and a true image for the report."""
 
     caption: str
     predicted: Float[Tensor, "h w 3"]
@@ -28,26 +28,28 @@ class ImagePair:
 
 @dataclass(frozen=True)
 class Result:
-    """Metrics by name: of everything and of each part (objects of a scene; none for pictures)."""
+    """Metrics by name: overall, and of each object (none for images)."""
 
     kind: str  # what was compared: "trajectories", "pictures" or "scenes"
     overall: dict[str, float | int]
     parts: dict[str, dict[str, float | int]]
-    notes: list[str]  # how things were matched, in sentences
+    notes: list[str]  # sentences on how items were matched
     curves: list[Curve] = field(default_factory=list)
     curve_title: str = ""
     fps: float | None = None  # of the curves, where frames have a time
     pairs: list[ImagePair] = field(default_factory=list)
 
     def rows(self) -> list[tuple[str, dict[str, float | int]]]:
+        """Rows of the table: each object, then "all"."""
         return [*self.parts.items(), ("all", self.overall)] if self.parts else [("all", self.overall)]
 
     def columns(self) -> list[str]:
+        """Names of all metrics, in order of first use."""
         return list(dict.fromkeys(name for _, metrics in self.rows() for name in metrics))
 
 
 def format_number(value: float | int | None) -> str:
-    """A number as in tables: four digits that count; a dash where it is not defined."""
+    """A number with four significant digits; a dash if undefined."""
     if value is None or math.isnan(value):
         return "-"
     if isinstance(value, int):
@@ -56,7 +58,7 @@ def format_number(value: float | int | None) -> str:
 
 
 def format_table(result: Result) -> str:
-    """Aligned text, one row an object, everything last."""
+    """Aligned text with one row per object and the overall metrics last."""
     columns = result.columns()
     cells = [["", *columns]] + [[name, *(format_number(row.get(c)) for c in columns)] for name, row in result.rows()]
     widths = [max(len(row[i]) for row in cells) for i in range(len(columns) + 1)]
@@ -67,7 +69,7 @@ def format_table(result: Result) -> str:
 
 
 def to_json(result: Result) -> dict:
-    """Plain values; undefined is null, and an infinite PSNR (identical pictures) the string "inf"."""
+    """Values for JSON; undefined is null, and an infinite PSNR (identical images) the string "inf"."""
     return {
         "kind": result.kind,
         "overall": _plain(result.overall),

@@ -1,4 +1,4 @@
-"""Two static scenes: how far apart their surfaces are, in place, in colour and in what belongs to which object."""
+"""Comparison of two static scenes: geometry, colour and object labels."""
 
 from __future__ import annotations
 
@@ -21,55 +21,58 @@ from stages.evaluate.matching import object_labels
 from stages.evaluate.options import EvaluateOptions
 from stages.evaluate.result import Result
 
-SOLID = 0.1  # opacity above which a Gaussian is part of a surface
+MIN_OPACITY = 0.1  # above which a Gaussian is part of a surface
 
 
 @dataclass(frozen=True)
 class NearestNeighbours:
-    """For each point of one cloud, the nearest of the other."""
+    """For each point of one point cloud, the nearest point of the other."""
 
     distance: Float[Tensor, "n"]
     index: Int[Tensor, "n"]
 
 
 def nearest_neighbours(points: Float[Tensor, "n 3"], others: Float[Tensor, "m 3"]) -> NearestNeighbours:
+    """For each of `points` the nearest of `others`."""
     distance, index = knn(others, points, 1)
     return NearestNeighbours(distance[:, 0], index[:, 0])
 
 
-def chamfer(there: NearestNeighbours, back: NearestNeighbours) -> dict[str, float]:
-    """Mean distance to the nearest point in each direction, and the mean of the two [units].
+def chamfer(to_truth: NearestNeighbours, to_prediction: NearestNeighbours) -> dict[str, float]:
+    """Chamfer distance: mean distance to the nearest point in each direction, and the mean of both [scene units].
 
-    Prediction to truth is large where something was invented, truth to prediction where something is missing.
+    "to_truth" is large for surfaces that do not exist, "to_prediction" for missing surfaces.
     """
-    forth, home = float(there.distance.mean()), float(back.distance.mean())
-    return {"chamfer": (forth + home) / 2, "to_truth": forth, "to_prediction": home}
+    forward, backward = float(to_truth.distance.mean()), float(to_prediction.distance.mean())
+    return {"chamfer": (forward + backward) / 2, "to_truth": forward, "to_prediction": backward}
 
 
 def base_colours(g: Gaussians) -> Float[Tensor, "n 3"]:
-    """Colour of each Gaussian without its dependence on the direction of view."""
+    """View-independent RGB (0..1) of each Gaussian: the harmonics of degree 0."""
     return (g.sh[:, 0] * C0 + 0.5).clamp(0, 1)
 
 
-def colour_error(mine: Gaussians, true: Gaussians, there: NearestNeighbours, back: NearestNeighbours) -> float:
-    """Mean absolute difference of RGB (0..1) between nearest neighbours, both directions alike."""
-    a, b = base_colours(mine), base_colours(true)
-    return float(((a - b[there.index]).abs().mean() + (b - a[back.index]).abs().mean()) / 2)
+def colour_error(
+    predicted: Gaussians, true: Gaussians, to_truth: NearestNeighbours, to_prediction: NearestNeighbours
+) -> float:
+    """Mean absolute RGB difference (0..1) between nearest neighbours, averaged over both directions."""
+    a, b = base_colours(predicted), base_colours(true)
+    return float(((a - b[to_truth.index]).abs().mean() + (b - a[to_prediction.index]).abs().mean()) / 2)
 
 
 def label_iou(predicted: Int[Tensor, "n"], true: Int[Tensor, "n"]) -> dict[int, tuple[int, float]]:
-    """Intersection over union of each true object with the predicted one it is matched to (0 when with none).
+    """Intersection over union of each true object with the predicted object matched to it (0 without a match).
 
-    Labels are of the same points; background (0) is no object. Objects are matched one to one with the largest
-    sum of IoU. Returns {true id: (predicted id, IoU)}.
+    Both label the same points; 0 is the background. Objects are matched one to one, maximising the sum of IoU.
+    Returns {true id: (predicted id, IoU)}.
     """
     ids = [int(i) for i in true.unique() if i > 0]
     others = [int(i) for i in predicted.unique() if i > 0]
     table = torch.zeros(len(ids), len(others), dtype=torch.float64)
     for r, i in enumerate(ids):
         for c, j in enumerate(others):
-            either = ((true == i) | (predicted == j)).sum()
-            table[r, c] = ((true == i) & (predicted == j)).sum() / either
+            union = ((true == i) | (predicted == j)).sum()
+            table[r, c] = ((true == i) & (predicted == j)).sum() / union
     matched = dict.fromkeys(ids, (0, 0.0))
     for r, c in zip(*linear_sum_assignment(table.numpy(), maximize=True), strict=True):
         if table[r, c] > 0:
@@ -78,44 +81,49 @@ def label_iou(predicted: Int[Tensor, "n"], true: Int[Tensor, "n"]) -> dict[int, 
 
 
 def compare(prediction: Path, truth: Path, options: EvaluateOptions) -> Result:
-    """Chamfer, colour and, where both have objects, labels."""
+    """Chamfer distance, colour error and, if both scenes have objects, the IoU of their labels."""
     scenes = [read_scene(prediction), read_scene(truth)]
-    worlds = [scene_reference_frame(path, scene) for path, scene in zip((prediction, truth), scenes, strict=True)]
-    mine, true = (_solid(path, s) for path, s in zip((prediction, truth), scenes, strict=True))
-    notes = [f"only Gaussians of opacity above {SOLID} count"]
-    means = mine.means
+    frames = [scene_reference_frame(path, scene) for path, scene in zip((prediction, truth), scenes, strict=True)]
+    predicted, true = (_surfaces(path, s) for path, s in zip((prediction, truth), scenes, strict=True))
+    notes = [f"only Gaussians of opacity above {MIN_OPACITY} are compared"]
+    means = predicted.means
     if options.align:
-        similarity, how = find_alignment(*worlds)
+        similarity, how = find_alignment(*frames)
         means = similarity(means)
         notes.append(how)
     else:
-        check_same_reference_frame(*worlds, [])
-    there, back = nearest_neighbours(means, true.means), nearest_neighbours(true.means, means)
-    overall = {**chamfer(there, back), "colour": colour_error(mine, true, there, back), "Gaussians": len(mine)}
+        check_same_reference_frame(*frames, [])
+    to_truth, to_prediction = nearest_neighbours(means, true.means), nearest_neighbours(true.means, means)
+    colour = colour_error(predicted, true, to_truth, to_prediction)
+    overall = {**chamfer(to_truth, to_prediction), "colour": colour, "Gaussians": len(predicted)}
     parts: dict[str, dict[str, float]] = {}
-    if (mine.object_id > 0).any() and (true.object_id > 0).any():
-        parts = _labels(scenes, mine.object_id[back.index], true.object_id, notes)
+    if (predicted.object_id > 0).any() and (true.object_id > 0).any():
+        parts = _label_rows(scenes, predicted.object_id[to_prediction.index], true.object_id, notes)
         overall["IoU"] = sum(row["IoU"] for row in parts.values()) / len(parts)
     return Result("scenes", overall, parts, notes)
 
 
-def _labels(scenes: list[Scene], predicted: Tensor, true: Tensor, notes: list[str]) -> dict[str, dict[str, float]]:
-    """One row a true object, and a note of what each was matched to."""
+def _label_rows(scenes: list[Scene], predicted: Tensor, true: Tensor, notes: list[str]) -> dict[str, dict[str, float]]:
+    """IoU of each true object; appends a note on which objects were matched."""
     matched = label_iou(predicted, true)
-    mine, names = ({o.id: n for o, n in zip(s.objects, object_labels(list(s.objects)), strict=True)} for s in scenes)
-    found = ", ".join(f"{names[i]} = {mine.get(j, 'nothing')}" for i, (j, _) in matched.items())
-    notes.append(f"each true Gaussian takes the label of the nearest predicted one; matched {found}")
+    predicted_names, names = (
+        {o.id: n for o, n in zip(s.objects, object_labels(list(s.objects)), strict=True)} for s in scenes
+    )
+    listed = ", ".join(f"{names[i]} = {predicted_names.get(j, 'nothing')}" for i, (j, _) in matched.items())
+    notes.append(f"each true Gaussian takes the label of the nearest predicted one; matched {listed}")
     return {names[i]: {"IoU": iou} for i, (_, iou) in matched.items()}
 
 
 def scene_reference_frame(path: Path, scene: Scene) -> ReferenceFrame:
+    """Cameras and objects of a scene; objects without Gaussians are left out."""
     g = scene.gaussians
     points = {o.id: g.means[g.object_id == o.id] for o in scene.objects}
     return ReferenceFrame(str(path), scene.cameras, tuple(o for o in scene.objects if len(points[o.id])), points)
 
 
-def _solid(path: Path, scene: Scene) -> Gaussians:
-    g = scene.gaussians[scene.gaussians.opacities > SOLID]
+def _surfaces(path: Path, scene: Scene) -> Gaussians:
+    """The Gaussians above MIN_OPACITY; InputError if there are none."""
+    g = scene.gaussians[scene.gaussians.opacities > MIN_OPACITY]
     if not len(g):
-        raise InputError(f"{path}: no Gaussian is more opaque than {SOLID}, so there is no surface to compare")
+        raise InputError(f"{path}: no Gaussian has an opacity above {MIN_OPACITY}, so there is no surface to compare")
     return g

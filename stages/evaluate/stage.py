@@ -1,4 +1,4 @@
-"""Pairs of MP4, H5 or PLY -> metrics.json"""
+"""Stage evaluate: prediction and truth, both trajectories, scenes, or images and videos -> metrics.json."""
 
 from __future__ import annotations
 
@@ -9,28 +9,42 @@ from pathlib import Path
 from stages.core.backends import choose
 from stages.core.errors import InputError
 from stages.core.scene.files import must_exist, provenance, replacing
-from stages.core.scene.formats import IMAGE_SUFFIXES, VIDEO_SUFFIXES
+from stages.core.scene.formats import FORMATS
 from stages.evaluate.options import EvaluateOptions
 from stages.evaluate.report import write_report
 from stages.evaluate.result import format_table, to_json
 
 log = logging.getLogger(__name__)
 
+# kind of data (a folder counts as images) -> "module:function" that takes (prediction, truth, options)
 COMPARISONS = {
     "trajectory": "stages.evaluate.trajectories:compare",
     "scene": "stages.evaluate.scenes:compare",
-    "pictures": "stages.evaluate.images:compare",
+    "image": "stages.evaluate.images:compare",
+    "video": "stages.evaluate.images:compare",
+}
+OPTION_KINDS = {  # options that apply to some kinds of data only
+    "align": ("trajectory", "scene"),
+    "frames": ("trajectory", "image", "video"),
+    "resample": ("trajectory",),
+    "objects": ("trajectory",),
 }
 
 
 def run(
     prediction: Path, truth: Path, out: Path | None, options: EvaluateOptions, as_json: bool = False
 ) -> dict:
-    """Compares a prediction with the truth; the table goes to stdout, everything to `out` (metrics.json beside it)."""
+    """Compare a prediction with the truth; print a table (or JSON) and return what is written to `out`.
+
+    `out` is metrics.json beside the prediction by default. Raises InputError for files that cannot be compared and for
+    options that do not apply to them.
+    """
     prediction, truth = Path(prediction), Path(truth)
     kinds = [_kind(prediction), _kind(truth)]
-    if kinds[0] != kinds[1]:
-        raise InputError(f"{prediction}: is a {kinds[0]} file and {truth} a {kinds[1]} file; compare two of a kind")
+    if COMPARISONS[kinds[0]] != COMPARISONS[kinds[1]]:
+        raise InputError(
+            f"{prediction}: is of kind {kinds[0]}, but {truth} is of kind {kinds[1]}; give two files of one kind"
+        )
     _check_options(kinds[0], options)
     result = choose(COMPARISONS, kinds[0])(prediction, truth, options)
     for note in result.notes:
@@ -45,31 +59,20 @@ def run(
 
 
 def _kind(path: Path) -> str:
-    """What a path holds, by its ending."""
+    """Kind of data of a path, by its suffix; InputError unless it can be compared and exists."""
     if path.is_dir():
-        return "pictures"
+        return "image"
     suffix = path.suffix.lower()
-    if suffix in (".h5", ".hdf5"):
-        kind = "trajectory"
-    elif suffix == ".ply":
-        kind = "scene"
-    elif suffix in VIDEO_SUFFIXES | IMAGE_SUFFIXES:
-        kind = "pictures"
-    else:
-        raise InputError(f"{path}: {suffix or 'no ending'} is not a kind of file that can be compared; "
-                         "give trajectories (.h5), scenes (.ply), videos (.mp4) or folders of pictures")  # fmt: skip
-    must_exist(path, f"a {kind} file" if kind != "pictures" else "a video or picture")
+    if suffix not in FORMATS or FORMATS[suffix].kind not in COMPARISONS:
+        raise InputError(f"{path}: files with {f'suffix {suffix}' if suffix else 'no suffix'} cannot be compared; "
+                         "give trajectories (.h5), scenes (.ply), videos (.mp4) or folders of images")  # fmt: skip
+    kind = FORMATS[suffix].kind
+    must_exist(path, f"a file of kind {kind}")
     return kind
 
 
 def _check_options(kind: str, options: EvaluateOptions) -> None:
-    """An option that could not act is a mistake, not a wish to ignore."""
-    only = {
-        "--align": (options.align, ("trajectory", "scene")),
-        "--frames": (options.frames is not None, ("trajectory", "pictures")),
-        "--resample": (options.resample, ("trajectory",)),
-        "--objects": (bool(options.objects), ("trajectory",)),
-    }
-    for name, (given, kinds) in only.items():
-        if given and kind not in kinds:
-            raise InputError(f"{name}: has no meaning for {kind} files; leave it out")
+    """InputError for an option that has no effect on this kind of data."""
+    for name, kinds in OPTION_KINDS.items():
+        if getattr(options, name) not in (None, False, "") and kind not in kinds:
+            raise InputError(f"--{name}: does not apply to files of kind {kind}; omit it")

@@ -1,4 +1,4 @@
-"""Trajectories of the two balls whose motion is known in closed form."""
+"""Trajectories of the two balls with motion in closed form."""
 
 from dataclasses import replace
 
@@ -9,25 +9,25 @@ from stages.core.physics.keypoints import bind_gaussians
 from stages.core.scene.trajectory import Keypoints, SimulationInfo, TrajectoryWriter
 
 
-def turn(angle: float) -> torch.Tensor:
-    """About an axis that is none of the coordinate axes [rad]."""
+def rotation(angle: float) -> torch.Tensor:
+    """Rotation by an angle [rad] about an axis that is no coordinate axis."""
     axis = torch.tensor([1.0, 2, 2]) / 3
     half = torch.tensor(angle / 2)
     return matrix(torch.cat([half.cos()[None], half.sin() * axis]))
 
 
 def moved(points, object_id, t: int, spin: float = 0.15, speed: float = 0.03):
-    """Both objects turn about their centres and drift apart along y, the second twice as fast."""
+    """Both objects rotate about their centres and drift along y, the second twice as fast, and fall."""
     out = points.clone()
     for id, centre in ((1, torch.tensor([-0.3, 0.0, 0.15])), (2, torch.tensor([0.3, 0.0, 0.40]))):
         mine = object_id == id
         drift = torch.tensor([0.0, speed * t * id, -0.01 * t])
-        out[mine] = (points[mine] - centre) @ turn(spin * t).mT + centre + drift
+        out[mine] = (points[mine] - centre) @ rotation(spin * t).mT + centre + drift
     return out
 
 
-def write(path, scene, seed: int = 0, count: int = 100, frames: int = 12, dt: float = 0.02, change=None, **motion):
-    """`count` keypoints an object, drawn by `seed`; `change` alters the moved keypoints."""
+def write_motion(path, scene, seed=0, count=100, frames=12, dt=0.02, change=None, **motion):
+    """Write a trajectory with `count` random keypoints per object; `change` modifies their positions in each frame."""
     g = scene.gaussians
     rng = torch.Generator().manual_seed(seed)
     rows = [ids[torch.randperm(len(ids), generator=rng)[:count]] for ids in
@@ -48,8 +48,8 @@ def renamed(scene, names):
     return replace(scene, objects=tuple(replace(o, name=n) for o, n in zip(scene.objects, names, strict=True)))
 
 
-def elsewhere(scene, similarity):
-    """The same scene in another world."""
+def transformed_scene(scene, similarity):
+    """The scene after a similarity transform."""
     g = scene.gaussians
     g = replace(g, means=similarity(g.means), scales=g.scales * similarity.scale)
     return replace(scene, gaussians=g, cameras=scene.cameras.transformed(similarity))

@@ -1,3 +1,5 @@
+"""Metrics of predicted motion."""
+
 import numpy as np
 import pytest
 import torch
@@ -20,8 +22,8 @@ def motion(t=20, o=2, p=5, seed=0):
     return torch.randn(t, o, p, 3, generator=rng, dtype=torch.float64).cumsum(0)
 
 
-def test_a_constant_offset():
-    # Every coordinate is wrong by d in every frame, no step is wrong, and time correlation does not see it.
+def test_constant_offset():
+    # Positions are wrong by d, displacements are right, and the correlation over time is invariant to an offset.
     truth, d = motion(), 0.25
     metrics = {k: float(v) for k, v in all_metrics(truth + d, truth).items()}
     expected = {"MSE": d * d, "RMSE": d, "PCE": 0.0, "FPE": d * 3**0.5, "R": 1.0, "R_pooled": 1.0}
@@ -35,7 +37,7 @@ def test_reversed_motion_has_correlation_minus_one():
 
 
 def test_two_frames_by_hand():
-    # One point that should move 3 along x and 4 along y, and stays.
+    # One point whose truth moves by 3 along x and 4 along y, predicted at rest.
     truth = torch.zeros(2, 1, 1, 3)
     truth[1, 0, 0] = torch.tensor([3.0, 4.0, 0.0])
     still = torch.zeros_like(truth)
@@ -43,13 +45,13 @@ def test_two_frames_by_hand():
     assert float(rmse(still, truth)) == pytest.approx((25 / 6) ** 0.5)
     assert float(pce(still, truth)) == pytest.approx(5)
     assert float(fpe(still, truth)) == pytest.approx(5)
-    assert float(correlation(still, truth)) == 0  # should move, does not
+    assert float(correlation(still, truth)) == 0  # a moving coordinate predicted at rest
     assert error_over_time(still, truth).squeeze().tolist() == [0, 5]
 
 
-def test_correlation_is_numpys_averaged_over_what_moves():
+def test_correlation_is_the_mean_of_numpy_corrcoef_over_moving_coordinates():
     truth, predicted = motion(), motion(seed=1)
-    truth[:, 1, :, 2] = 1e-5 * truth[:, 1, :, 2]  # at rest: left out
+    truth[:, 1, :, 2] = 1e-5 * truth[:, 1, :, 2]  # at rest: excluded
     series = [
         (predicted[:, o, p, i], truth[:, o, p, i]) for o in range(2) for p in range(5) for i in range(3)
         if not (o == 1 and i == 2)
@@ -58,25 +60,25 @@ def test_correlation_is_numpys_averaged_over_what_moves():
     assert float(correlation(predicted, truth)) == pytest.approx(expected, abs=1e-12)
 
 
-def test_pooled_correlation_is_numpys_of_all_displacements():
+def test_pooled_correlation_is_numpy_corrcoef_of_all_displacements():
     truth, predicted = motion(), motion(seed=1)
     a, b = ((x - x[:1]).flatten().numpy() for x in (predicted, truth))
     assert float(pooled_correlation(predicted, truth)) == pytest.approx(np.corrcoef(a, b)[0, 1], abs=1e-12)
 
 
-def test_nothing_moves_is_undefined_not_perfect():
+def test_correlation_without_motion_is_undefined():
     truth = torch.ones(5, 1, 3, 3)
     assert correlation(truth, truth).isnan() and pooled_correlation(truth, truth).isnan()
 
 
-def test_rmse_is_of_the_scene_not_the_mean_of_its_objects():
+def test_rmse_of_a_scene_is_not_the_mean_over_objects():
     truth = motion()
     wrong = truth.clone()
     wrong[:, 0] += 1.0
     assert float(rmse(wrong, truth)) == pytest.approx(0.5**0.5)
 
 
-def test_padding_does_not_count():
+def test_masked_points_have_no_effect():
     truth, predicted = motion(), motion(seed=1)
     mask = torch.ones(2, 5, dtype=torch.bool)
     mask[1, 3:] = False
@@ -94,7 +96,7 @@ def test_padding_does_not_count():
                                error_over_time(predicted[:, 1:, :3], truth[:, 1:, :3])[:, 0])  # fmt: skip
 
 
-def test_a_batch_gives_each_scene_its_own():
+def test_batch_dimension_gives_one_value_per_scene():
     truth = torch.stack([motion(seed=s) for s in (0, 1)])
     predicted = torch.stack([motion(seed=s) for s in (2, 3)])
     for name, value in all_metrics(predicted, truth).items():

@@ -1,3 +1,5 @@
+"""Comparison of images and videos: PSNR and SSIM."""
+
 import math
 
 import pytest
@@ -11,7 +13,7 @@ from stages.evaluate.options import EvaluateOptions
 from stages.evaluate.stage import run
 
 
-def picture(seed: int, h: int = 40, w: int = 50):
+def random_image(seed: int, h: int = 40, w: int = 50):
     return torch.rand(h, w, 3, generator=torch.Generator().manual_seed(seed))
 
 
@@ -24,10 +26,10 @@ def test_psnr_by_hand():
     assert psnr(black, black) == math.inf
 
 
-def test_ssim_agrees_with_scipys_filter():
-    # scipy's Gaussian, cut off at 5 pixels, shares no code with ours; away from the border it needs no padding.
-    a = picture(0).double()
-    b = (0.6 * a + 0.4 * picture(1)).clamp(0, 1)
+def test_ssim_agrees_with_scipy():
+    # With scipy's Gaussian filter of radius 5, on windows inside the image.
+    a = random_image(0).double()
+    b = (0.6 * a + 0.4 * random_image(1)).clamp(0, 1)
 
     def blur(x):
         return gaussian_filter(x, 1.5, radius=5)[5:-5, 5:-5]
@@ -57,7 +59,7 @@ def evaluate(mine, true, tmp_path, **options):
 def test_folders_are_compared_frame_by_frame(tmp_path):
     grey = torch.full((32, 32, 3), 51 / 255)
     true = folder(tmp_path / "true", [grey, grey])
-    mine = folder(tmp_path / "mine", [grey + 51 / 255, grey + 102 / 255])  # wrong by 0.2, then by 0.4
+    mine = folder(tmp_path / "mine", [grey + 51 / 255, grey + 102 / 255])  # errors of 0.2 and 0.4
     facts = evaluate(mine, true, tmp_path)
     expected = [-20 * math.log10(0.2), -20 * math.log10(0.4)]
     assert facts["per_frame"]["PSNR"] == pytest.approx(expected, abs=1e-5)
@@ -65,8 +67,8 @@ def test_folders_are_compared_frame_by_frame(tmp_path):
     assert facts["overall"]["frames"] == 2
 
 
-def test_identical_pictures_have_no_finite_psnr(tmp_path):
-    write_png(tmp_path / "a.png", picture(0))
+def test_psnr_of_identical_images_is_infinite(tmp_path):
+    write_png(tmp_path / "a.png", random_image(0))
     facts = evaluate(tmp_path / "a.png", tmp_path / "a.png", tmp_path)
     assert facts["overall"]["PSNR"] == "inf" and facts["overall"]["SSIM"] == pytest.approx(1)
 
@@ -78,7 +80,7 @@ def video(path, count, fps=25.0, size=48):
     return path
 
 
-def test_videos_of_other_length_rate_or_size_are_refused(tmp_path):
+def test_videos_must_have_equal_length_rate_and_size(tmp_path):
     true = video(tmp_path / "true.mp4", 6)
     with pytest.raises(InputError, match="4 frames, but .* has 6; give --frames 4"):
         evaluate(video(tmp_path / "short.mp4", 4), true, tmp_path)
@@ -91,7 +93,7 @@ def test_videos_of_other_length_rate_or_size_are_refused(tmp_path):
         evaluate(video(tmp_path / "large.mp4", 6, size=64), true, tmp_path)
 
 
-def test_a_report_holds_curves_and_pictures(tmp_path):
+def test_report_of_videos_contains_curves_and_images(tmp_path):
     true, mine = video(tmp_path / "true.mp4", 6), video(tmp_path / "mine.mp4", 6)
     images = [torch.full((48, 48, 3), 0.3 + 0.05 * i) for i in range(6)]
     with VideoWriter(mine, 25.0) as writer:

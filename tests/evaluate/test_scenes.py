@@ -1,3 +1,5 @@
+"""Comparison of scenes: Chamfer distance, colour error and IoU of labels."""
+
 from dataclasses import replace
 
 import pytest
@@ -9,13 +11,13 @@ from stages.core.scene.scene_ply import write_scene
 from stages.evaluate.options import EvaluateOptions
 from stages.evaluate.scenes import chamfer, label_iou, nearest_neighbours
 from stages.evaluate.stage import run
-from tests.evaluate.motions import elsewhere, turn
+from tests.evaluate.motions import rotation, transformed_scene
 
 
 def test_chamfer_by_hand():
     mine = torch.tensor([[0.0, 0, 0], [1, 0, 0]])
     true = torch.tensor([[0.0, 0, 3]])
-    # (0,0,0) is 3 away, (1,0,0) is sqrt 10; back, the nearest to (0,0,3) is 3 away
+    # distances are 3 and sqrt(10) to the truth, and 3 to the prediction
     found = chamfer(nearest_neighbours(mine, true), nearest_neighbours(true, mine))
     there = (3 + 10**0.5) / 2
     assert found == pytest.approx({"chamfer": (there + 3) / 2, "to_truth": there, "to_prediction": 3})
@@ -24,7 +26,7 @@ def test_chamfer_by_hand():
 def test_label_iou_by_hand():
     true = torch.tensor([1, 1, 1, 1, 2, 2, 0, 0, 3])
     found = torch.tensor([7, 7, 7, 0, 5, 5, 5, 0, 0])
-    # object 1: 3 of 4; object 2: 2 of 3; object 3: not found
+    # IoU of object 1 is 3/4, of object 2 is 2/3; object 3 is not found
     assert label_iou(found, true) == {1: (7, 0.75), 2: (5, pytest.approx(2 / 3)), 3: (0, 0.0)}
 
 
@@ -34,17 +36,17 @@ def evaluate(tmp_path, mine, true, **options):
     return run(tmp_path / "mine.ply", tmp_path / "true.ply", tmp_path / "m.json", EvaluateOptions(**options))
 
 
-def test_a_scene_against_itself(tmp_path, two_balls):
+def test_identical_scenes(tmp_path, two_balls):
     overall = evaluate(tmp_path, two_balls, two_balls)["overall"]
     assert overall == pytest.approx({"chamfer": 0, "to_truth": 0, "to_prediction": 0, "colour": 0, "IoU": 1,
                                      "Gaussians": 1700})  # fmt: skip
 
 
-def test_haze_does_not_count_and_colour_does(tmp_path, two_balls):
+def test_transparent_gaussians_are_ignored_and_colour_is_compared(tmp_path, two_balls):
     g = two_balls.gaussians
     opacities, means, sh = g.opacities.clone(), g.means.clone(), g.sh.clone()
-    opacities[:100], means[:100] = 0.05, means[:100] + 5.0  # thin and far away
-    sh += 0.1 / 0.28209479177387814  # a tenth brighter everywhere; none is near white but the balls' 0.9 and 0.1
+    opacities[:100], means[:100] = 0.05, means[:100] + 5.0  # transparent and far away
+    sh += 0.1 / 0.28209479177387814  # brighter by 0.1 everywhere
     mine = replace(two_balls, gaussians=replace(g, opacities=opacities, means=means, sh=sh))
     true = replace(two_balls, gaussians=g)
     overall = evaluate(tmp_path, mine, true)["overall"]
@@ -52,8 +54,9 @@ def test_haze_does_not_count_and_colour_does(tmp_path, two_balls):
     assert overall["colour"] == pytest.approx(0.1, abs=1e-4)
 
 
-def test_another_world_needs_align(tmp_path, two_balls):
-    away = Similarity(0.3, turn(1.0), torch.tensor([4.0, 5.0, 6.0]))
+def test_another_reference_frame_needs_align(tmp_path, two_balls):
+    similarity = Similarity(0.3, rotation(1.0), torch.tensor([4.0, 5.0, 6.0]))
+    predicted = transformed_scene(two_balls, similarity)
     with pytest.raises(InputError, match="another frame of reference.*--align"):
-        evaluate(tmp_path, elsewhere(two_balls, away), two_balls)
-    assert evaluate(tmp_path, elsewhere(two_balls, away), two_balls, align=True)["overall"]["chamfer"] < 1e-5
+        evaluate(tmp_path, predicted, two_balls)
+    assert evaluate(tmp_path, predicted, two_balls, align=True)["overall"]["chamfer"] < 1e-5

@@ -1,3 +1,5 @@
+"""Comparison of trajectories: matching, alignment and resampling."""
+
 import json
 from dataclasses import replace
 
@@ -11,16 +13,16 @@ from stages.evaluate.align import ReferenceFrame, find_alignment
 from stages.evaluate.options import EvaluateOptions
 from stages.evaluate.stage import run
 from stages.evaluate.trajectories import transfer_motion
-from tests.evaluate.motions import elsewhere, renamed, turn, write
+from tests.evaluate.motions import renamed, rotation, transformed_scene, write_motion
 
 
 def evaluate(tmp_path, **options):
     return run(tmp_path / "mine.h5", tmp_path / "true.h5", tmp_path / "metrics.json", EvaluateOptions(**options))
 
 
-def test_a_trajectory_against_itself_is_perfect(tmp_path, two_balls, capsys):
-    write(tmp_path / "mine.h5", two_balls)
-    write(tmp_path / "true.h5", two_balls)
+def test_identical_trajectories(tmp_path, two_balls, capsys):
+    write_motion(tmp_path / "mine.h5", two_balls)
+    write_motion(tmp_path / "true.h5", two_balls)
     facts = evaluate(tmp_path)
     assert facts == json.loads((tmp_path / "metrics.json").read_text())
     assert list(facts["objects"]) == ["red ball", "green ball"]
@@ -32,11 +34,11 @@ def test_a_trajectory_against_itself_is_perfect(tmp_path, two_balls, capsys):
     assert printed[0].split()[:4] == ["MSE", "RMSE", "PCE", "FPE"] and printed[-1].startswith("all")
 
 
-def test_an_offset_of_one_object_shows_in_its_row_only(tmp_path, two_balls):
-    write(tmp_path / "true.h5", two_balls)
+def test_offset_of_one_object_affects_its_row_only(tmp_path, two_balls):
+    write_motion(tmp_path / "true.h5", two_balls)
     shift = torch.zeros(200, 3)
     shift[100:, 2] = 0.3  # green ball, up
-    write(tmp_path / "mine.h5", two_balls, change=lambda positions: positions + shift)
+    write_motion(tmp_path / "mine.h5", two_balls, change=lambda positions: positions + shift)
     facts = evaluate(tmp_path)
     assert facts["objects"]["red ball"]["FPE"] == 0
     assert facts["objects"]["green ball"]["FPE"] == pytest.approx(0.3, abs=1e-6)
@@ -45,47 +47,47 @@ def test_an_offset_of_one_object_shows_in_its_row_only(tmp_path, two_balls):
     assert facts["overall"]["MSE"] == pytest.approx(0.3**2 / 6, abs=1e-6)
 
 
-def test_other_keypoints_with_the_same_motion_agree(tmp_path, two_balls):
-    # Both objects move rigidly, which the skinning reproduces exactly wherever keypoints lie: only rounding is left.
-    write(tmp_path / "true.h5", two_balls, seed=0, count=100)
-    write(tmp_path / "mine.h5", two_balls, seed=1, count=60)
+def test_different_keypoints_with_the_same_motion_agree(tmp_path, two_balls):
+    # Skinning reproduces rigid motion exactly, independent of the keypoints: only rounding errors remain.
+    write_motion(tmp_path / "true.h5", two_balls, seed=0, count=100)
+    write_motion(tmp_path / "mine.h5", two_balls, seed=1, count=60)
     facts = evaluate(tmp_path)
     assert facts["overall"]["FPE"] < 1e-4 and facts["overall"]["R"] > 0.9999
     assert any("different keypoints for red ball, green ball" in note for note in facts["notes"])
 
 
-def test_points_are_carried_with_their_offset():
+def test_transferred_points_keep_their_offset():
     rest = torch.randn(200, 3, generator=torch.Generator().manual_seed(0))
     points = rest[:20] + 0.05
-    R, shift = turn(0.8), torch.tensor([1.0, 2.0, 3.0])
+    R, shift = rotation(0.8), torch.tensor([1.0, 2.0, 3.0])
     frames = transfer_motion(points, rest, torch.stack([rest, rest @ R.mT + shift]))
     assert torch.equal(frames[0], points)
     torch.testing.assert_close(frames[1], points @ R.mT + shift, atol=1e-4, rtol=0)
 
 
-def test_objects_by_id_when_names_differ_and_by_centre_when_ids_lie(tmp_path, two_balls):
-    write(tmp_path / "true.h5", two_balls)
-    write(tmp_path / "mine.h5", renamed(two_balls, ["a", "b"]))
+def test_objects_are_matched_by_id_or_by_centre(tmp_path, two_balls):
+    write_motion(tmp_path / "true.h5", two_balls)
+    write_motion(tmp_path / "mine.h5", renamed(two_balls, ["a", "b"]))
     facts = evaluate(tmp_path)
     assert facts["overall"]["FPE"] == 0 and any("by id" in note for note in facts["notes"])
     g = two_balls.gaussians
     swapped = replace(g, object_id=torch.tensor([0, 2, 1])[g.object_id])
     other = renamed(replace(two_balls, gaussians=swapped), ["a", "b"])
-    write(tmp_path / "mine.h5", other, count=400, spin=0.0, speed=0.0)
+    write_motion(tmp_path / "mine.h5", other, count=400, spin=0.0, speed=0.0)
     facts = evaluate(tmp_path)
     assert any("nearest centre" in note and "b = red ball" in note for note in facts["notes"])
 
 
 @pytest.mark.parametrize("cameras", [True, False], ids=["cameras", "objects"])
-def test_align_undoes_a_similarity(tmp_path, two_balls, cameras):
-    # About the vertical, since two objects leave the rest open; cameras would allow any turn.
+def test_align_inverts_a_similarity(tmp_path, two_balls, cameras):
+    # A rotation about the vertical: two objects determine no other; cameras would determine any.
     quarter = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     away = Similarity(2.5, quarter, torch.tensor([3.0, -1.0, 0.5]))
     scene = two_balls if cameras else replace(two_balls, cameras=None)
-    write(tmp_path / "true.h5", scene)
-    far = elsewhere(two_balls, away)
+    write_motion(tmp_path / "true.h5", scene)
+    far = transformed_scene(two_balls, away)
     far = far if cameras else replace(far, cameras=None)
-    mine = write(tmp_path / "mine.h5", far)  # moves by the formulas of the truth's world, so move it by hand
+    mine = write_motion(tmp_path / "mine.h5", far)  # its motion is overwritten by that of the truth, transformed
     with h5py.File(tmp_path / "true.h5") as true, h5py.File(mine, "a") as file:
         file["keypoints/positions"][...] = away(torch.from_numpy(true["keypoints/positions"][()])).numpy()
     with pytest.raises(InputError, match="--align"):
@@ -95,39 +97,39 @@ def test_align_undoes_a_similarity(tmp_path, two_balls, cameras):
     assert any(("cameras" if cameras else "centres") in note for note in facts["notes"])
 
 
-def test_a_straight_row_of_cameras_still_fixes_the_turn_about_it(two_balls):
+def test_collinear_cameras_determine_the_rotation_about_their_line(two_balls):
     line = two_balls.cameras[[0, 0, 0]]
     viewmats = line.viewmats.clone()
     viewmats[:, 0, 3] += torch.tensor([0.0, 0.5, 1.0])
     line = replace(line, viewmats=viewmats, names=("a.jpg", "b.jpg", "c.jpg"))
-    away = Similarity(0.4, turn(2.0), torch.tensor([1.0, 2.0, 3.0]))
-    found, _ = find_alignment(ReferenceFrame("a", line.moved(away), (), {}), ReferenceFrame("b", line, (), {}))
+    away = Similarity(0.4, rotation(2.0), torch.tensor([1.0, 2.0, 3.0]))
+    found, _ = find_alignment(ReferenceFrame("a", line.transformed(away), (), {}), ReferenceFrame("b", line, (), {}))
     points = torch.randn(10, 3, generator=torch.Generator().manual_seed(0))
     torch.testing.assert_close(found(away(points)), points, atol=1e-4, rtol=0)
 
 
-def test_lengths_and_rates_are_never_cut_silently(tmp_path, two_balls):
-    write(tmp_path / "true.h5", two_balls, frames=12)
-    write(tmp_path / "mine.h5", two_balls, frames=9)
+def test_different_lengths_and_rates_need_an_option(tmp_path, two_balls):
+    write_motion(tmp_path / "true.h5", two_balls, frames=12)
+    write_motion(tmp_path / "mine.h5", two_balls, frames=9)
     with pytest.raises(InputError, match="9 frames, but .* has 12; give --frames 9"):
         evaluate(tmp_path)
     facts = evaluate(tmp_path, frames=9)
     assert facts["overall"]["frames"] == 9 and facts["overall"]["MSE"] == 0
     with pytest.raises(InputError, match="--frames 10: .* give 9 or fewer"):
         evaluate(tmp_path, frames=10)
-    write(tmp_path / "mine.h5", two_balls, frames=23, dt=0.01, spin=0.0, speed=0.015)
-    write(tmp_path / "true.h5", two_balls, frames=12, dt=0.02, spin=0.0, speed=0.03)
+    write_motion(tmp_path / "mine.h5", two_balls, frames=23, dt=0.01, spin=0.0, speed=0.015)
+    write_motion(tmp_path / "true.h5", two_balls, frames=12, dt=0.02, spin=0.0, speed=0.03)
     with pytest.raises(InputError, match="100 frames a second, but .* has 50; give --resample"):
         evaluate(tmp_path)
     facts = evaluate(tmp_path, resample=True)
     assert facts["overall"]["frames"] == 12
-    assert facts["overall"]["FPE"] == pytest.approx(0.11, abs=1e-6)  # falls 0.01 a frame in both, 22 against 11
+    assert facts["overall"]["FPE"] == pytest.approx(0.11, abs=1e-6)  # both fall by 0.01 per frame: 22 frames against 11
 
 
-def test_a_missing_object_is_named(tmp_path, two_balls):
-    write(tmp_path / "true.h5", two_balls)
+def test_missing_objects_are_named_in_the_error(tmp_path, two_balls):
+    write_motion(tmp_path / "true.h5", two_balls)
     fewer = replace(two_balls, objects=two_balls.objects[:1])
-    write(tmp_path / "mine.h5", fewer)
+    write_motion(tmp_path / "mine.h5", fewer)
     with pytest.raises(InputError, match="has 1 objects .*--objects red ball"):
         evaluate(tmp_path)
     assert list(evaluate(tmp_path, objects="red ball")["objects"]) == ["red ball"]

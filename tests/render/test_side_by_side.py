@@ -13,7 +13,7 @@ from stages.core.geometry.similarity import Similarity
 from stages.core.scene.images import read_image, read_video
 from stages.core.scene.scene_ply import write_scene
 from stages.render.stage import _captions, run
-from tests.evaluate.motions import elsewhere
+from tests.evaluate.motions import transformed_scene
 from tests.render.conftest import render_options
 from tests.render.motions import rising
 
@@ -106,7 +106,7 @@ def test_scene_beside_trajectory_and_contact_sheet(tmp_path, two_balls, pair):
 def test_files_with_different_cameras_get_a_camera_each(tmp_path, two_balls, caplog):
     """A scene and its copy under a similarity look the same from their own cameras."""
     turn = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
-    moved = elsewhere(two_balls, Similarity(2.0, turn, torch.tensor([3.0, 1, 0])))
+    moved = transformed_scene(two_balls, Similarity(2.0, turn, torch.tensor([3.0, 1, 0])))
     g = moved.gaussians
     quarter = torch.tensor([0.5**0.5, 0, 0, 0.5**0.5]).expand_as(g.quats)
     moved = replace(moved, gaussians=replace(g, quats=quarter))  # discs and balls: a rotation about z suffices

@@ -221,6 +221,9 @@ def simulate(
         Path | None, Option(help="weights of the learned engine (.safetensors with its card, or a published .pth); "
                             "default: those in the package")
     ] = SimulateOptions.weights,
+    integrator: Annotated[
+        str, Option(help="learned engine: step (the model's own) or an ODE solver: euler | rk4 | dopri5")
+    ] = SimulateOptions.integrator,
     seed: Seed = SimulateOptions.seed,
     device: Device = SimulateOptions.device,
 ) -> None:
@@ -231,7 +234,7 @@ def simulate(
         steps=steps, dt=dt, engine=engine, gravity=gravity, quality=quality, material=tuple(material or ()),
         materials=materials, force=tuple(force or ()), forces=forces, pin=tuple(pin or ()),
         velocity=tuple(velocity or ()), lift=tuple(lift or ()), floor=floor, friction=friction, box=box,
-        keypoints=keypoints, weights=weights, seed=seed, device=device,
+        keypoints=keypoints, weights=weights, integrator=integrator, seed=seed, device=device,
     )  # fmt: skip
     run(scene, out, options)
 

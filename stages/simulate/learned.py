@@ -103,7 +103,7 @@ def rollout(
         place = world.to(device)
         pinned, dt = pushes.pinned, options.dt * frame.time / steps
         held = replace(pushes, pinned=pinned | sleepers.asleep)
-        stepper = TimeStepper(model, place, dt, held.to(device))
+        stepper = TimeStepper(model, place, dt, held.to(device), options.integrator)
         first, before = stepper.points.clone(), world.points
         for n in range(options.steps):
             if not bool(stepper.points.isfinite().all()):

@@ -22,6 +22,8 @@ ENGINES = {
     "ngff": Engine("stages.simulate.learned:rollout", "learned force field, for elastic bodies", weights="ngff"),
     "mpm": Engine("stages.simulate.mpm:rollout", "material point method, for any material"),
 }
+# The model's own step, or a solver of torchdiffeq for its rate of change (see stages/core/models/integrate.py).
+INTEGRATORS = ("step", "euler", "rk4", "dopri5")
 ENGINE_HELP = " | ".join(f"{name}: {engine.help}" for name, engine in ENGINES.items())
 
 
@@ -61,10 +63,15 @@ class SimulateOptions:
     box: str | None = None  # floor, walls and ceiling: x0,y0,z0,x1,y1,z1 [scene units]; by default around the objects
     keypoints: int = 1024  # maximum number of keypoints per object
     weights: Path | None = None  # of a learned engine: .safetensors with its card, or a published checkpoint (.pth)
+    integrator: str = "step"  # of a learned engine, one of INTEGRATORS
     seed: int = 0
     device: str = "auto"
 
     def __post_init__(self):
+        if self.integrator not in INTEGRATORS:
+            raise InputError(f"--integrator {self.integrator}: choose from {', '.join(INTEGRATORS)}")
+        if self.integrator != "step" and self.engine in ENGINES and not ENGINES[self.engine].weights:
+            raise InputError(f"--integrator {self.integrator}: only for learned engines, not for {self.engine}")
         if self.quality not in QUALITIES:
             raise InputError(f"--quality {self.quality}: choose from {', '.join(QUALITIES)}")
         if self.steps < 1:

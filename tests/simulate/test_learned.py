@@ -152,3 +152,23 @@ def test_a_solid_ball_lands_and_keeps_its_shape(two_balls, tmp_path, name):
 def test_missing_weights_are_said(two_balls, tmp_path):
     with pytest.raises(InputError, match="nowhere.safetensors"):
         roll(two_balls, tmp_path, tmp_path / "nowhere.safetensors")
+
+
+@pytest.mark.parametrize("method", ["euler", "rk4", "dopri5"])
+def test_an_ode_solver_can_replace_the_step_of_the_model(two_balls, tmp_path, method):
+    torch.manual_seed(0)
+    path = tmp_path / "gcn.safetensors"
+    save(path, "gcn", build("gcn", hidden=8, layers=2))
+    options = {"steps": 4, "velocity": ("object=1 0.1,0,0",), "lift": ("2",)}
+    own, solved = (roll(two_balls, tmp_path, path, integrator=m, **options) for m in ("step", method))
+    difference = float((own.positions - solved.positions).abs().max())
+    moved = float((own.positions[-1] - own.positions[0]).norm(dim=1).max())
+    assert moved > 1e-3
+    assert difference < 1e-5 if method == "euler" else 1e-7 < difference < 0.2 * moved
+
+
+def test_mpm_takes_no_ode_solver():
+    with pytest.raises(InputError, match="only for learned engines"):
+        SimulateOptions(engine="mpm", integrator="rk4")
+    with pytest.raises(InputError, match="choose from step, euler"):
+        SimulateOptions(integrator="midpoint")

@@ -1,7 +1,7 @@
-"""What materials answer to deformation: stress, and what of the deformation stays for good.
+"""Constitutive models: Kirchhoff stress and plastic flow (return mapping) of particles.
 
-`respond` takes the deformation gradient that the grid asks for and returns the elastic part that is left, Kirchhoff
-stress, and the new state of the material. Kelvin-Voigt damping, eta (dv/dx + transpose), may be added to any of them.
+`material_update` takes a trial deformation gradient and returns its elastic part after plastic flow, Kirchhoff stress
+and the new state variable. Kelvin-Voigt damping, eta (dv/dx + transpose), is added by the transfers for all models.
 
 | model       | elastic law                   | plastic (3 numbers)                                | state       |
 | NEO_HOOKEAN | mu (F F^T - I) + lambda log J | -                                                  | -           |
@@ -26,14 +26,14 @@ import warp as wp
 from torch import Tensor
 
 NEO_HOOKEAN, COROTATED, VON_MISES, SAND, SNOW = range(5)
-MIN_VOLUME_RATIO = 0.05  # a volume ratio below this counts as this, so that stress stays finite
-MAX_SNOW_HARDENING = 4.0  # snow grows at most this much stiffer, so that twice the wave speed bounds the substep
-RESIDUAL_STRENGTH = 0.1  # of the yield stress stays, however soft it gets
+MIN_VOLUME_RATIO = 0.05  # smaller volume ratios (and principal stretches) are clamped in the stress
+MAX_SNOW_HARDENING = 4.0  # limit of snow's stiffness factor, so that the CFL condition holds with twice the wave speed
+RESIDUAL_STRENGTH = 0.1  # minimum yield stress after softening, as a fraction of the initial one
 
 
 @wp.struct
 class MaterialUpdate:
-    """F: elastic deformation gradient; tau: Kirchhoff stress [Pa]."""
+    """F: elastic deformation gradient; tau: Kirchhoff stress [Pa]; state: see the table of the module."""
 
     F: wp.mat33
     tau: wp.mat33
@@ -50,7 +50,7 @@ def neo_hookean(F: wp.mat33, stiffness: wp.vec3) -> wp.mat33:
 
 @wp.func
 def _cofactors(A: wp.mat33) -> wp.mat33:
-    """det(A) times the transposed inverse of A."""
+    """Cofactor matrix: det(A) times the transposed inverse of A."""
     a = wp.vec3(A[0, 0], A[0, 1], A[0, 2])
     b = wp.vec3(A[1, 0], A[1, 1], A[1, 2])
     c = wp.vec3(A[2, 0], A[2, 1], A[2, 2])
@@ -59,7 +59,7 @@ def _cofactors(A: wp.mat33) -> wp.mat33:
 
 @wp.func
 def _corotated(F: wp.mat33, mu: float, lam: float) -> wp.mat33:
-    """2 mu (F - R) F^T + lambda J (J - 1) I, for J > FLATTEST; R by Newton's iteration (Higham 1986), quadratic."""
+    """2 mu (F - R) F^T + lambda J (J - 1) I, for J > MIN_VOLUME_RATIO; R by Newton's iteration (Higham 1986)."""
     J = wp.determinant(F)
     R = F
     for _n in range(20):
@@ -68,14 +68,14 @@ def _corotated(F: wp.mat33, mu: float, lam: float) -> wp.mat33:
         N = 0.5 * (R + C / D)
         change = wp.ddot(N - R, N - R)
         R = N
-        if change < 1e-10:  # the next would change R by less than float32 can hold
+        if change < 1e-10:  # convergence is quadratic: the next change is below float32 precision
             break
     return 2.0 * mu * (F - R) * wp.transpose(F) + lam * J * (J - 1.0) * wp.identity(n=3, dtype=float)
 
 
 @wp.func
 def _von_mises(e: wp.vec3, mu: float, plastic: wp.vec3, state: float, dt: float) -> wp.vec4:
-    """Hencky strains and accumulated plastic strain after the return to the yield surface."""
+    """Return mapping: Hencky strains (xyz) and accumulated plastic strain (w) after flow to the yield surface."""
     mean = (e[0] + e[1] + e[2]) / 3.0
     dev = e - wp.vec3(mean, mean, mean)
     size = wp.length(dev)
@@ -88,9 +88,9 @@ def _von_mises(e: wp.vec3, mu: float, plastic: wp.vec3, state: float, dt: float)
     excess = 2.0 * mu * size - root * strength
     if excess <= 0.0:
         return wp.vec4(e[0], e[1], e[2], state)
-    resist = float(0.0)  # noqa: UP018 -- Warp takes a literal for a constant
+    resist = float(0.0)  # noqa: UP018 -- a literal would be constant in Warp
     if plastic[2] > 0.0:
-        resist = plastic[2] / wp.max(dt, 1e-30)  # no time, no flow
+        resist = plastic[2] / wp.max(dt, 1e-30)  # dt = 0: no viscoplastic flow
     flow = wp.min(excess / (2.0 * mu + 2.0 / 3.0 * hardening + resist), size)
     e2 = dev * (1.0 - flow / size) + wp.vec3(mean, mean, mean)
     return wp.vec4(e2[0], e2[1], e2[2], state + root * flow)
@@ -98,12 +98,12 @@ def _von_mises(e: wp.vec3, mu: float, plastic: wp.vec3, state: float, dt: float)
 
 @wp.func
 def _sand(strain: wp.vec3, stiffness: wp.vec3, slope: float, state: float) -> wp.vec4:
-    """Hencky strains and gained volume after the return to the Drucker-Prager cone."""
+    """Return mapping: Hencky strains (xyz) and volume gain (w, log) after projection to the Drucker-Prager cone."""
     third = state / 3.0
     e = strain + wp.vec3(third, third, third)
     trace = e[0] + e[1] + e[2]
     if trace >= 0.0:
-        return wp.vec4(0.0, 0.0, 0.0, trace)  # apart: no stress, and the gain is remembered
+        return wp.vec4(0.0, 0.0, 0.0, trace)  # tension: no stress; the volume gain is stored
     mean = trace / 3.0
     dev = e - wp.vec3(mean, mean, mean)
     size = wp.length(dev)
@@ -118,7 +118,10 @@ def _sand(strain: wp.vec3, stiffness: wp.vec3, slope: float, state: float) -> wp
 def material_update(
     model: int, trial: wp.mat33, stiffness: wp.vec3, plastic: wp.vec3, state: float, dt: float
 ) -> MaterialUpdate:
-    """Any of the models above; without damping."""
+    """Stress and plastic flow of any model of the module's table, without damping.
+
+    trial: deformation gradient; stiffness: mu, lambda [Pa], eta; plastic, state: see the table; dt [s].
+    """
     out = MaterialUpdate()
     out.F = trial
     out.state = state
@@ -126,7 +129,7 @@ def material_update(
         out.tau = neo_hookean(trial, stiffness)
         return out
     if model == COROTATED and wp.determinant(trial) > MIN_VOLUME_RATIO:
-        out.tau = _corotated(trial, stiffness[0], stiffness[1])  # without the singular values: four times as fast
+        out.tau = _corotated(trial, stiffness[0], stiffness[1])  # no SVD: four times as fast
         return out
     U = wp.mat33()
     V = wp.mat33()
@@ -144,9 +147,9 @@ def material_update(
             out.state = state + wp.log(gain)
             S = kept
             out.F = U * wp.diag(S) * wp.transpose(V)
-            harder = wp.min(wp.exp(plastic[2] * (1.0 - wp.exp(out.state))), MAX_SNOW_HARDENING)
-            mu = mu * harder
-            lam = lam * harder
+            hardening = wp.min(wp.exp(plastic[2] * (1.0 - wp.exp(out.state))), MAX_SNOW_HARDENING)
+            mu = mu * hardening
+            lam = lam * hardening
         J = S[0] * S[1] * S[2]
         volumetric = lam * J * (J - 1.0)
         for axis in range(3):
@@ -157,13 +160,13 @@ def material_update(
             wp.log(wp.max(S[1], MIN_VOLUME_RATIO)),
             wp.log(wp.max(S[2], MIN_VOLUME_RATIO)),
         )
-        back = wp.vec4()
-        if model == SAND:  # noqa: SIM108 -- Warp's ternary computes both
-            back = _sand(e, stiffness, plastic[0], state)
+        mapped = wp.vec4()
+        if model == SAND:  # noqa: SIM108 -- Warp's ternary evaluates both
+            mapped = _sand(e, stiffness, plastic[0], state)
         else:
-            back = _von_mises(e, mu, plastic, state, dt)
-        e = wp.vec3(back[0], back[1], back[2])
-        out.state = back[3]
+            mapped = _von_mises(e, mu, plastic, state, dt)
+        e = wp.vec3(mapped[0], mapped[1], mapped[2])
+        out.state = mapped[3]
         out.F = U * wp.diag(wp.vec3(wp.exp(e[0]), wp.exp(e[1]), wp.exp(e[2]))) * wp.transpose(V)
         trace = lam * (e[0] + e[1] + e[2])
         t = 2.0 * mu * e + wp.vec3(trace, trace, trace)
@@ -172,7 +175,7 @@ def material_update(
 
 
 @wp.kernel
-def _respond(
+def _update(
     model: wp.array[wp.int8], dt: float, F: wp.array[wp.mat33], stiffness: wp.array[wp.vec3],
     plastic: wp.array[wp.vec3], state: wp.array[float], tau: wp.array[wp.mat33],
 ):  # fmt: skip
@@ -186,29 +189,30 @@ def _respond(
 def update_materials(
     model: Tensor, F: Tensor, stiffness: Tensor, plastic: Tensor, state: Tensor, dt: float = 0.0
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """F, Kirchhoff stress and state of each particle; see the table above.
+    """Elastic F (p, 3, 3), Kirchhoff stress (p, 3, 3) [Pa] and state (p) of particles after `material_update`.
 
-    model (p) int8; F (p, 3, 3); stiffness (p, 3): mu, lambda [Pa], eta (not used here); plastic (p, 3); state (p).
+    model (p) int8; F (p, 3, 3): trial; stiffness (p, 3): mu, lambda [Pa], eta (not used here); plastic (p, 3); state
+    (p); dt [s].
     """
     from stages.core.kernels.interop import device_of, launch, view
 
     F, state, tau = F.clone(), state.clone(), torch.empty_like(F)
-    launch(_respond, len(F), [view(model), dt, view(F, wp.mat33), view(stiffness, wp.vec3), view(plastic, wp.vec3),
+    launch(_update, len(F), [view(model), dt, view(F, wp.mat33), view(stiffness, wp.vec3), view(plastic, wp.vec3),
                               view(state), view(tau, wp.mat33)], device=device_of(F))  # fmt: skip
     return F, tau, state
 
 
 def sand_slope(degrees: float) -> float:
-    """Slope of the Drucker-Prager cone for an angle of friction, in Klar's form: |dev tau| = 3 slope x pressure.
+    """Slope of the Drucker-Prager cone for a friction angle [degrees], in Klar's form: |dev tau| = 3 slope x pressure.
 
-    In plane strain without dilatancy the cone then yields where Mohr-Coulomb does, at shear = sin x pressure. Klar's
-    own choice, sqrt(2/3) 2 sin / (3 - sin), agrees in triaxial compression and is a third stronger in shear.
+    Matched to Mohr-Coulomb in plane strain without dilatancy, at shear = sin(angle) x pressure. Klar's own choice,
+    sqrt(2/3) 2 sin / (3 - sin), is matched in triaxial compression and is a third stronger in shear.
     """
     return math.sqrt(2) / 3 * math.sin(math.radians(degrees))
 
 
 def corotated_reference(F: Tensor, mu: float, lam: float) -> Tensor:
-    """2 mu (F - R) F^T + lambda J (J - 1) I in PyTorch: the public solver's "jelly"."""
+    """Fixed-corotated Kirchhoff stress (p, 3, 3), 2 mu (F - R) F^T + lambda J (J - 1) I, in PyTorch."""
     U, S, Vh = torch.linalg.svd(F)
     flip = torch.linalg.det(U @ Vh).sign()
     R = U @ torch.diag_embed(torch.stack([torch.ones_like(flip), torch.ones_like(flip), flip], -1)) @ Vh

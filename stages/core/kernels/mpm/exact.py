@@ -1,8 +1,8 @@
-"""Transfers in whole numbers: sums that come out the same in any order.
+"""Exact transfers: fixed-point accumulation, whose sums do not depend on the order of the particles.
 
-Floating-point sums on a GPU depend on which thread comes first. Here a node holds momentum and mass as 64-bit integers
-(two wp.vec4 of memory each), `scale` quanta a unit: scale[0] a kg m/s, scale[1] a kg. Adding integers is exact, so a
-scene gives the same bytes in every run, whatever the order of its particles and whatever other scenes are beside it.
+Floating-point sums on a GPU depend on the order of the threads. Here a node holds momentum and mass as 64-bit integers
+(two wp.vec4 of memory), with scale[0] quanta per kg m/s and scale[1] quanta per kg. Integer addition is associative, so
+a scene gives the same bytes in every run, for any order of its particles and any other scenes in the batch.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from stages.core.kernels.mpm.nodes import mat43
 
 
 @wp.func_native("""
-    // as scatter_nodes; all 32 lanes of a warp must get here, first < 0: nothing to scatter
+    // As nodes.scatter_nodes, in fixed point. All 32 lanes of the warp must take part; first < 0: nothing to scatter.
     long long* base = (long long*)momentum.data + 4 * (long long)first;
 #if !defined(__CUDA_ARCH__)
     if (first < 0) return;
@@ -73,7 +73,7 @@ def scatter_exact(
 
 
 @wp.func_native("""
-    // as gather_momentum
+    // As nodes.gather_momentum, from fixed point and without a floor.
     wp::mat_t<4, 3, wp::float32> out;
     for (int r = 0; r < 4; ++r) for (int n = 0; n < 3; ++n) out.data[r][n] = 0.0f;
     const long long* base = (const long long*)momentum.data + 4 * (long long)first;
@@ -117,6 +117,7 @@ def gather_exact(
 
 
 @wp.func_native("""
+    // Velocity of one node.
     const long long* at = (const long long*)momentum.data + 4 * (long long)node;
     const float mass = (float)at[3], inverse = mass > 0.0f ? scale.c[1] / (scale.c[0] * mass) : 0.0f;
     return wp::vec3(inverse * (float)at[0], inverse * (float)at[1], inverse * (float)at[2]);

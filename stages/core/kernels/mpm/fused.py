@@ -1,9 +1,9 @@
-"""A whole step of all particles in one launch: the order that is fastest on a GPU.
+"""A whole substep of all particles in one launch: the order that is fastest on a GPU.
 
-A thread gathers from one grid, making velocity of momentum and applying walls as it reads, moves its particle, and
-scatters into a second grid; further threads clear a third. The three change roles every step, so that nothing waits.
-A particle that comes to a new cell enters the blocks it now reaches into the list of blocks to clear: the list is
-exact, and never read by the host. The transfers, materials and walls are those of kernels/mpm.py.
+A thread gathers from one grid, dividing momentum by mass and applying walls as it reads, moves its particle, and
+scatters into a second grid; additional threads clear a third. The grids change roles every substep, so that there is no
+synchronisation within one. A particle that enters a new cell adds the blocks of its stencil to the list of active
+blocks, which is exact and never read by the host. Transfers, materials and walls are those of `transfers`.
 
 Source: Wang et al. 2020, "A massively parallel and scalable multi-GPU material point method" (fused transfers).
 """
@@ -40,12 +40,12 @@ from stages.core.kernels.mpm.transfers import (
     mark_lost,
 )
 
-THREADS_PER_BLOCK = 128  # a block
+THREADS_PER_BLOCK = 128
 
 
 @wp.struct
 class ActiveBlocks:
-    """Blocks with particles since the start of the frame: `blocks[: total[0]]`, and a mark for each block."""
+    """Blocks that had particles since the start of the frame: `blocks[: total[0]]`, and a mark for every block."""
 
     marks: wp.array[int]
     blocks: wp.array[int]
@@ -54,9 +54,9 @@ class ActiveBlocks:
 
 @wp.func
 def _node(grid: MpmGrid, block: int, n: int) -> int:
-    """Number of node n (0..63) of a block, counted through all scenes."""
+    """Index of node n (0..63) of a block, over all scenes."""
     nb = wp.vec3i(grid.nodes[0] // BLOCK, grid.nodes[1] // BLOCK, grid.nodes[2] // BLOCK)
-    a = block // (nb[1] * nb[2])  # scenes follow each other along x
+    a = block // (nb[1] * nb[2])  # scenes are consecutive along x
     b = (block // nb[2]) % nb[1]
     c = block % nb[2]
     i = a * BLOCK + n // (BLOCK * BLOCK)
@@ -65,19 +65,19 @@ def _node(grid: MpmGrid, block: int, n: int) -> int:
 
 
 @wp.func
-def _touch(
-    grid: MpmGrid, rows: ParticleArrays, i: int, base: wp.vec3i, friction: wp.array[float], touched: ActiveBlocks
+def _activate(
+    grid: MpmGrid, rows: ParticleArrays, i: int, base: wp.vec3i, friction: wp.array[float], active: ActiveBlocks
 ):
-    """List the blocks of a stencil, and let nodes at walls know the largest friction that comes to them."""
+    """Add the blocks of a stencil to the active ones, and update the friction coefficients of its nodes at walls."""
     nb = wp.vec3i(grid.nodes[0] // BLOCK, grid.nodes[1] // BLOCK, grid.nodes[2] // BLOCK)
     a0 = rows.scene[i] * nb[0]
     for a in range(base[0] // BLOCK, (base[0] + 2) // BLOCK + 1):
         for b in range(base[1] // BLOCK, (base[1] + 2) // BLOCK + 1):
             for c in range(base[2] // BLOCK, (base[2] + 2) // BLOCK + 1):
                 block = ((a0 + a) * nb[1] + b) * nb[2] + c
-                if touched.marks[block] == 0:  # noqa: SIM102 -- look before the atomic; Warp's `and` does both
-                    if wp.atomic_max(touched.marks, block, 1) == 0:
-                        touched.blocks[wp.atomic_add(touched.total, 0, 1)] = block
+                if active.marks[block] == 0:  # noqa: SIM102 -- read before the atomic; Warp's `and` does not short-circuit
+                    if wp.atomic_max(active.marks, block, 1) == 0:
+                        active.blocks[wp.atomic_add(active.total, 0, 1)] = block
     if near_walls(grid, base):
         corner = rows.scene[i] * grid.count + (base[0] * grid.nodes[1] + base[1]) * grid.nodes[2] + base[2]
         mu = rows.friction[i]
@@ -89,10 +89,10 @@ def _touch(
 
 @wp.func
 def _add(s: mat43, fx: wp.vec3, n: int, velocity: wp.vec3) -> mat43:
-    """Sums over a stencil, with its node n (0..26) added; recomputes weights, for loops that are not unrolled."""
+    """Add node n (0..26) to the G2P sums `s`; computes its weight, for loops that are not unrolled."""
     at = wp.vec3(float(n // 9), float((n // 3) % 3), float(n % 3))
     d = at - fx
-    w = float(1.0)  # noqa: UP018 -- Warp takes a literal for a constant
+    w = float(1.0)  # noqa: UP018 -- a literal would be constant in Warp
     for axis in range(3):
         away = wp.abs(d[axis])
         w *= wp.where(away < 0.5, 0.75 - away * away, 0.5 * (1.5 - away) * (1.5 - away))
@@ -102,10 +102,10 @@ def _add(s: mat43, fx: wp.vec3, n: int, velocity: wp.vec3) -> mat43:
 
 
 @wp.func
-def _bounded(
+def _node_velocity(
     grid: MpmGrid, read: wp.array[wp.vec4], friction: wp.array[float], node: int, at: wp.vec3i, scale: wp.vec2
 ) -> wp.vec3:
-    """Velocity of a node, after the walls; of one that counts in whole numbers, if there is a scale."""
+    """Velocity of a node after the walls; the grid is in fixed point if `scale` is set (see `exact`)."""
     v = wp.vec3()
     if scale[0] > 0.0:
         v = velocity_exact(read, node, scale)
@@ -120,26 +120,26 @@ def _gather_walls(
     grid: MpmGrid, read: wp.array[wp.vec4], friction: wp.array[float], corner: int, base: wp.vec3i, fx: wp.vec3,
     scale: wp.vec2,
 ) -> mat43:  # fmt: skip
-    """As gather_momentum, where some of the nodes feel a wall."""
+    """As gather_momentum, for stencils with nodes subject to walls."""
     s = mat43()
     for n in range(27):
         at = base + wp.vec3i(n // 9, (n // 3) % 3, n % 3)
         node = corner + ((n // 9) * grid.nodes[1] + (n // 3) % 3) * grid.nodes[2] + n % 3
-        s = _add(s, fx, n, _bounded(grid, read, friction, node, at, scale))
+        s = _add(s, fx, n, _node_velocity(grid, read, friction, node, at, scale))
     return s
 
 
 @wp.func
-def _gather_solid(
+def _gather_obstacles(
     grid: MpmGrid, read: wp.array[wp.vec4], friction: wp.array[float], obstacles: wp.array[Obstacle], time: float,
     corner: int, base: wp.vec3i, fx: wp.vec3, scale: wp.vec2,
 ) -> mat43:  # fmt: skip
-    """As gather_momentum, where some of the nodes feel a wall or an obstacle."""
+    """As gather_momentum, for stencils with nodes subject to walls or obstacles."""
     s = mat43()
     for n in range(27):
         at = base + wp.vec3i(n // 9, (n // 3) % 3, n % 3)
         node = corner + ((n // 9) * grid.nodes[1] + (n // 3) % 3) * grid.nodes[2] + n % 3
-        v = _bounded(grid, read, friction, node, at, scale)
+        v = _node_velocity(grid, read, friction, node, at, scale)
         place = grid.origin + grid.dx * wp.vec3(float(at[0]), float(at[1]), float(at[2]))
         s = _add(s, fx, n, apply_obstacles(place, v, obstacles, time, grid.dx))
     return s
@@ -150,10 +150,10 @@ def _gather_free(
     grid: MpmGrid, read: wp.array[wp.vec4], friction: wp.array[float], corner: int, base: wp.vec3i, fx: wp.vec3,
     scale: wp.vec2,
 ) -> mat43:  # fmt: skip
-    """Where no node feels a wall, or only the floor: the whole stencil at once."""
+    """As gather_momentum, for stencils without nodes at walls, or at the floor only."""
     under = grid.low[2] + 1 - base[2]
     return gather_momentum(read, friction, corner, grid.nodes[1] * grid.nodes[2], grid.nodes[2], bspline_weights(fx),
-                           fx, under, grid.keep)  # fmt: skip
+                           fx, under, grid.tangential_retention)  # fmt: skip
 
 
 @wp.func
@@ -161,12 +161,13 @@ def _gather_free_exact(
     grid: MpmGrid, read: wp.array[wp.vec4], friction: wp.array[float], corner: int, base: wp.vec3i, fx: wp.vec3,
     scale: wp.vec2,
 ) -> mat43:  # fmt: skip
+    """As _gather_free, from fixed point, for stencils without nodes at floor or walls."""
     return gather_exact(read, corner, grid.nodes[1] * grid.nodes[2], grid.nodes[2], bspline_weights(fx), fx, scale)
 
 
 @wp.func
 def _at_sides(grid: MpmGrid, base: wp.vec3i) -> bool:
-    """Whether a stencil has nodes that feel a wall other than the floor."""
+    """Whether a stencil has nodes subject to a wall other than the floor."""
     return base[0] <= grid.low[0] or base[1] <= grid.low[1] or base[0] + 2 >= grid.high[0] or \
         base[1] + 2 >= grid.high[1] or base[2] + 2 >= grid.high[2]  # fmt: skip
 
@@ -176,15 +177,18 @@ def _scatter(
     write: wp.array[wp.vec4], first: int, stride_x: int, stride_y: int, weight: wp.mat33, fx: wp.vec3, load: wp.mat44,
     scale: wp.vec2,
 ):  # fmt: skip
+    """scatter_nodes with the signature of scatter_exact."""
     scatter_nodes(write, first, stride_x, stride_y, weight, fx, load)
 
 
 @cache
-def fused_step(plastic: bool, solid: bool, bouncy: bool, exact: bool) -> wp.Kernel:
-    """The kernel; only if `plastic` it knows materials beside neo-Hookean, if `solid` obstacles, if `bouncy`
-    restitution: what it does not know costs no registers. If `exact`, nodes count in whole numbers."""
+def fused_step(plastic: bool, has_obstacles: bool, restitution: bool, exact: bool) -> wp.Kernel:
+    """Build the kernel with the features needed, since each one costs registers.
 
-    # 80 registers a thread instead of 94, and a quarter more threads at once (whole numbers need more registers)
+    `plastic`: material models other than neo-Hookean; `exact`: grids in fixed point (see `exact`).
+    """
+
+    # 80 registers per thread instead of 94 and a quarter more threads at once; fixed point needs more registers
     bounds = {} if exact else {"launch_bounds": (THREADS_PER_BLOCK, 6)}
     collect, add = (_gather_free_exact, scatter_exact) if exact else (_gather_free, _scatter)
     walled = near_walls if exact else _at_sides
@@ -193,20 +197,21 @@ def fused_step(plastic: bool, solid: bool, bouncy: bool, exact: bool) -> wp.Kern
     def fused_step(
         grid: MpmGrid, rows: ParticleArrays, sweep_from: int, sweepers: int, gather: int, scatter: int, substep: int,
         clock: wp.array[float], damping: float, read: wp.array[wp.vec4], write: wp.array[wp.vec4],
-        stale: wp.array[wp.vec4], friction: wp.array[float], touched: ActiveBlocks, obstacles: wp.array[Obstacle],
+        stale: wp.array[wp.vec4], friction: wp.array[float], active: ActiveBlocks, obstacles: wp.array[Obstacle],
         scale: wp.vec2,
     ):  # fmt: skip
-        """Threads below `sweep_from` (a multiple of 32) each move a particle; `sweepers` more clear `stale`.
+        """Threads below `sweep_from` (a multiple of 32) each move a particle; `sweepers` more clear the grid `stale`.
 
-        clock: the substep [s], on the device so that a captured graph can be replayed with another.
+        `gather` and `scatter` switch G2P and P2G. clock: the substep [s], on the device, so that a captured graph can
+        be replayed with another value.
         """
         i = wp.tid()
         if i >= sweep_from:
             if scatter > 0 and gather > 0:
-                nodes = touched.total[0] * BLOCK * BLOCK * BLOCK
+                nodes = active.total[0] * BLOCK * BLOCK * BLOCK
                 t = i - sweep_from
                 while t < nodes:
-                    node = _node(grid, touched.blocks[t // 64], t % 64)
+                    node = _node(grid, active.blocks[t // 64], t % 64)
                     if wp.static(exact):
                         stale[2 * node] = wp.vec4()
                         stale[2 * node + 1] = wp.vec4()
@@ -217,7 +222,7 @@ def fused_step(plastic: bool, solid: bool, bouncy: bool, exact: bool) -> wp.Kern
         dt = clock[0]
         stride_y = grid.nodes[2]
         stride_x = grid.nodes[1] * grid.nodes[2]
-        first = int(-1)  # noqa: UP018 -- Warp takes a literal for a constant
+        first = int(-1)  # noqa: UP018 -- a literal would be constant in Warp
         fx = wp.vec3(1.0, 1.0, 1.0)
         load = wp.mat44()
         held = int(LOST)
@@ -235,10 +240,10 @@ def fused_step(plastic: bool, solid: bool, bouncy: bool, exact: bool) -> wp.Kern
                 fx = wp.vec3(g[0] - float(base[0]), g[1] - float(base[1]), g[2] - float(base[2]))
                 at = window + base[0] * stride_x + base[1] * stride_y + base[2]
                 s = mat43()
-                if wp.static(solid):
+                if wp.static(has_obstacles):
                     time = dt * float(substep)
                     if walled(grid, base) or near_obstacles(x, obstacles, time, 2.0 * grid.dx):
-                        s = _gather_solid(grid, read, friction, obstacles, time, at, base, fx, scale)
+                        s = _gather_obstacles(grid, read, friction, obstacles, time, at, base, fx, scale)
                     else:
                         s = collect(grid, read, friction, at, base, fx, scale)
                 else:
@@ -253,17 +258,17 @@ def fused_step(plastic: bool, solid: bool, bouncy: bool, exact: bool) -> wp.Kern
                 mark_lost(rows.held, rows.lost, i, rows.scene[i], rows.order[i])
             tau = wp.mat33()
             if wp.static(plastic):
-                answer = material_update(int(rows.model[i]), now.F, stiffness, rows.plastic[i], rows.state[i],
-                                 wp.where(gather > 0, dt, 0.0))  # fmt: skip
-                now.F = answer.F
-                tau = answer.tau
-                rows.state[i] = answer.state
+                new = material_update(int(rows.model[i]), now.F, stiffness, rows.plastic[i], rows.state[i],
+                                      wp.where(gather > 0, dt, 0.0))  # fmt: skip
+                now.F = new.F
+                tau = new.tau
+                rows.state[i] = new.state
             else:
                 tau = neo_hookean(now.F, stiffness)
             if gather > 0:
                 rows.x[i] = now.x
                 rows.F[i] = now.F
-                if scatter == 0:  # between, the velocity lives on the grid
+                if scatter == 0:  # during a frame the velocity is only on the grid
                     rows.v[i] = now.v
                     rows.C[i] = now.C
             if scatter > 0 and now.alive:
@@ -273,8 +278,8 @@ def fused_step(plastic: bool, solid: bool, bouncy: bool, exact: bool) -> wp.Kern
                 previous = rows.base_node[i]
                 if base[0] != previous[0] or base[1] != previous[1] or base[2] != previous[2]:
                     rows.base_node[i] = base
-                    _touch(grid, rows, i, base, friction, touched)
-                if wp.static(bouncy):  # noqa: SIM102 -- resolved when the kernel is built
+                    _activate(grid, rows, i, base, friction, active)
+                if wp.static(restitution):  # noqa: SIM102 -- resolved when the kernel is built
                     if held == FREE:
                         now.v = apply_restitution(
                             grid, obstacles, dt * float(substep + 1), now.x, now.v, rows.friction[i], dt
@@ -291,18 +296,18 @@ def fused_step(plastic: bool, solid: bool, bouncy: bool, exact: bool) -> wp.Kern
 @wp.kernel(enable_backward=False)
 def clear_active_blocks(
     grid: MpmGrid, sweepers: int, a: wp.array[wp.vec4], b: wp.array[wp.vec4], c: wp.array[wp.vec4],
-    friction: wp.array[float], touched: ActiveBlocks, width: int,
+    friction: wp.array[float], active: ActiveBlocks, width: int,
 ):  # fmt: skip
-    """Leave all grids clean at the end of a frame, and no block marked; the list itself is emptied afterwards."""
+    """Clear all grids and marks at the end of a frame; the caller then resets the number of active blocks."""
     t = wp.tid()
-    nodes = touched.total[0] * BLOCK * BLOCK * BLOCK
+    nodes = active.total[0] * BLOCK * BLOCK * BLOCK
     while t < nodes:
-        block = touched.blocks[t // 64]
+        block = active.blocks[t // 64]
         node = _node(grid, block, t % 64)
-        for n in range(width):  # a node is one or two of them
+        for n in range(width):  # `width` vec4 per node
             a[node * width + n] = wp.vec4()
             b[node * width + n] = wp.vec4()
             c[node * width + n] = wp.vec4()
         friction[node] = 0.0
-        touched.marks[block] = 0
+        active.marks[block] = 0
         t += sweepers

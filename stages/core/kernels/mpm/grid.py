@@ -1,60 +1,63 @@
-"""The background grid: where nodes are, how much a particle weighs on them, and what walls and obstacles do to them.
+"""Background grid: node layout, interpolation weights, and boundary conditions at walls and obstacles.
 
-A batch of scenes has one grid a scene, all of one shape, one after the other in memory. Walls and obstacles are
-conditions on the velocity of nodes: what moves in loses that speed, and friction takes from the speed along the surface
-in proportion. A body bounces by its own elasticity. A surface with restitution is a spring that pushes back particles
-instead, with the share restitution^2 of its force on their way out. None of this depends on the substep.
+A batch has one grid per scene, all of one shape, consecutive in memory. Walls and obstacles are conditions on the
+velocity of nodes: the inward normal component is removed, and Coulomb friction reduces the tangential one in
+proportion. Bodies then rebound by their own elasticity only. A surface with restitution instead acts on particles as a
+penalty spring, whose force is multiplied by restitution^2 on the way out. The result does not depend on the substep.
 """
 
 from __future__ import annotations
 
 import warp as wp
 
-BLOCK = 4  # nodes along the edge of a block
-GRID_PADDING = 4  # nodes outside the walls on every side: room for the stencil of a particle pressed into a wall
-FLOOR_GAP = 1.0  # cells: a body coming to rest stays this far above the outermost held nodes (measured; see tests)
-OBSTACLE_OFFSET = FLOOR_GAP - 0.5  # cells: see at_obstacles
-RESTITUTION_MARGIN = 2.0  # cells: nodes stop what comes this much deeper where a surface has restitution
-REST_DISTANCE = 0.25  # cells: particles at rest lie this far above a surface (measured; see tests)
-PLANE, SPHERE, BOX = 0, 1, 2  # kinds of obstacles
-SEPARATE, SLIP, STICKY = 0, 1, 2  # surfaces of obstacles
+BLOCK = 4  # nodes along an edge of a block
+GRID_PADDING = 4  # nodes outside the walls on each side, for the stencils of particles pressed into a wall
+FLOOR_GAP = 1.0  # [cells] distance of a resting body from the outermost constrained nodes (measured; see tests)
+OBSTACLE_OFFSET = FLOOR_GAP - 0.5  # [cells] depth of the outermost constrained nodes; see apply_obstacles
+RESTITUTION_MARGIN = 2.0  # [cells] added to that depth at surfaces with restitution
+REST_DISTANCE = 0.25  # [cells] distance of resting particles from a surface (measured; see tests)
+PLANE, SPHERE, BOX = 0, 1, 2  # shapes of obstacles (Obstacle.kind)
+SEPARATE, SLIP, STICKY = 0, 1, 2  # contact conditions (Obstacle.surface): Coulomb, free slip, no slip
 
 
 @wp.struct
 class MpmGrid:
-    """Node (i, j, k) of a scene lies at origin + dx (i, j, k) and is number (i ny + j) nz + k of its `count`."""
+    """Grid of a scene: node (i, j, k) lies at origin + dx (i, j, k) [m] and has index (i ny + j) nz + k of `count`."""
 
     origin: wp.vec3
     dx: float
     nodes: wp.vec3i  # multiples of BLOCK
-    low: wp.vec3i  # first node inside the walls; nodes up to and including `low` feel the wall
+    low: wp.vec3i  # nodes with an index <= low or >= high are subject to the walls
     high: wp.vec3i
-    count: int  # nodes of a scene
+    count: int  # nodes per scene
     restitution: float  # of floor and walls
-    face_low: wp.vec3  # where they are; nodes `low` and `high` lie outside
+    face_low: wp.vec3  # positions of the walls [m]; nodes `low` and `high` lie outside them
     face_high: wp.vec3
-    spring: float  # circular frequency of surfaces that give back speed [rad/s]
-    keep: float  # of the velocity along a wall, every substep, as in the public solver; below 0: Coulomb friction
+    spring: float  # circular frequency of the springs of surfaces with restitution [rad/s]
+    tangential_retention: float  # fraction of the tangential velocity kept at a wall in each substep; < 0: Coulomb
 
 
 @wp.struct
 class Obstacle:
-    """A solid in the way: a half-space below local z = 0, a sphere of radius size[0], a box of half edges size."""
+    """Moving obstacle: the half-space below local z = 0, a sphere of radius size[0] [m], or a box (half edges)."""
 
     kind: int
     surface: int
     centre: wp.vec3
-    turn: wp.quat  # local to world
+    turn: wp.quat  # rotation, local to world
     size: wp.vec3
-    velocity: wp.vec3
-    spin: wp.vec3
+    velocity: wp.vec3  # [m/s]
+    spin: wp.vec3  # angular velocity [rad/s]
     friction: float
     restitution: float
 
 
 @wp.func
 def bspline_weights(fx: wp.vec3) -> wp.mat33:
-    """Quadratic B-spline: rows are axes; fx in [0.5, 1.5) is the distance to the first node."""
+    """Quadratic B-spline weights of the three nodes (columns) along each axis (rows).
+
+    fx in [0.5, 1.5)^3 is the distance from the first node of the stencil [cells].
+    """
     w = wp.mat33()
     for axis in range(3):
         f = fx[axis]
@@ -66,22 +69,22 @@ def bspline_weights(fx: wp.vec3) -> wp.mat33:
 
 @wp.func
 def stencil_inside(grid: MpmGrid, g: wp.vec3) -> bool:
-    """Whether the stencil of a particle at g (in cells) lies on the grid; not so for a place that is no number."""
+    """Whether the stencil of a particle at g [cells] lies on the grid; False for NaN."""
     top = wp.vec3(float(grid.nodes[0] - 4), float(grid.nodes[1] - 4), float(grid.nodes[2] - 4))
     return g[0] >= 1.0 and g[0] < top[0] and g[1] >= 1.0 and g[1] < top[1] and g[2] >= 1.0 and g[2] < top[2]
 
 
 @wp.func
 def first_node(g: wp.vec3) -> wp.vec3i:
-    """Lowest node of the stencil of a particle at g (in cells, positive)."""
+    """First node of the stencil of a particle at g [cells], which must be positive."""
     return wp.vec3i(int(g[0] - 0.5), int(g[1] - 0.5), int(g[2] - 0.5))
 
 
 @wp.func
 def coulomb_contact(v: wp.vec3, normal: wp.vec3, friction: float) -> wp.vec3:
-    """Velocity after a surface with unit `normal` (out of the solid) met what moves into it.
+    """Velocity after contact with a surface of unit outward `normal`: no inward component, Coulomb friction.
 
-    Coulomb: the change along the surface is at most friction x the change across it, whatever the time step.
+    The tangential change is at most friction x the normal change, for any time step.
     """
     across = wp.dot(v, normal)
     if across >= 0.0:
@@ -97,7 +100,7 @@ def coulomb_contact(v: wp.vec3, normal: wp.vec3, friction: float) -> wp.vec3:
 def _spring(
     v: wp.vec3, normal: wp.vec3, depth: float, friction: float, restitution: float, grid: MpmGrid, dt: float
 ) -> wp.vec3:
-    """Velocity of a particle after `dt` at a surface that gives back speed; depth is counted from TOUCH."""
+    """Velocity of a particle after `dt` under a surface's penalty spring and friction; depth from REST_DISTANCE [m]."""
     if depth <= 0.0:
         return v
     across = wp.dot(v, normal)
@@ -110,24 +113,25 @@ def _spring(
 
 @wp.func
 def _wall(grid: MpmGrid, v: wp.vec3, normal: wp.vec3, friction: float) -> wp.vec3:
-    if grid.keep < 0.0:
+    """Boundary condition of one wall with inward `normal`."""
+    if grid.tangential_retention < 0.0:
         return coulomb_contact(v, normal, friction)
     across = wp.dot(v, normal)
     if across >= 0.0:
         return v
-    return grid.keep * (v - across * normal)
+    return grid.tangential_retention * (v - across * normal)
 
 
 @wp.func
 def near_walls(grid: MpmGrid, base: wp.vec3i) -> bool:
-    """Whether a stencil has nodes that feel a wall."""
+    """Whether the stencil with first node `base` includes nodes subject to floor or walls."""
     return base[0] <= grid.low[0] or base[1] <= grid.low[1] or base[2] <= grid.low[2] or \
         base[0] + 2 >= grid.high[0] or base[1] + 2 >= grid.high[1] or base[2] + 2 >= grid.high[2]  # fmt: skip
 
 
 @wp.func
 def apply_walls(grid: MpmGrid, at: wp.vec3i, velocity: wp.vec3, friction: float) -> wp.vec3:
-    """Velocity of the node `at`, after floor and walls; the floor first."""
+    """Velocity of node `at` after the conditions of floor, ceiling and walls, in this order."""
     v = velocity
     if at[2] <= grid.low[2]:
         v = _wall(grid, v, wp.vec3(0.0, 0.0, 1.0), friction)
@@ -146,7 +150,7 @@ def apply_walls(grid: MpmGrid, at: wp.vec3i, velocity: wp.vec3, friction: float)
 
 @wp.func
 def _outwards(obstacle: Obstacle, arm: wp.vec3, turn: wp.quat) -> wp.vec4:
-    """Normal and signed distance of the point `arm` away from the obstacle's centre."""
+    """Outward normal (xyz) and signed distance (w) [m] at the point `arm` relative to the obstacle's centre."""
     local = wp.quat_rotate_inv(turn, arm)
     normal = wp.vec3(0.0, 0.0, 1.0)
     distance = local[2]
@@ -156,7 +160,7 @@ def _outwards(obstacle: Obstacle, arm: wp.vec3, turn: wp.quat) -> wp.vec4:
         if length > 1e-9:
             normal = local / length
     if obstacle.kind == BOX:
-        distance = float(-1e30)  # noqa: UP018 -- Warp takes a literal for a constant
+        distance = float(-1e30)  # noqa: UP018 -- a literal would be constant in Warp
         for axis in range(3):
             gap = wp.abs(local[axis]) - obstacle.size[axis]
             if gap > distance:
@@ -168,8 +172,8 @@ def _outwards(obstacle: Obstacle, arm: wp.vec3, turn: wp.quat) -> wp.vec4:
 
 
 @wp.func
-def _seen(obstacle: Obstacle, place: wp.vec3, time: float) -> wp.vec4:
-    """Normal and signed distance of a place, `time` [s] after the start of the frame."""
+def _surface_at(obstacle: Obstacle, place: wp.vec3, time: float) -> wp.vec4:
+    """Outward normal and signed distance of a position, `time` [s] after the start of the frame."""
     turn = obstacle.turn
     rate = wp.length(obstacle.spin)
     if rate > 0.0:
@@ -178,28 +182,28 @@ def _seen(obstacle: Obstacle, place: wp.vec3, time: float) -> wp.vec4:
 
 
 @wp.func
-def near_obstacles(place: wp.vec3, obstacles: wp.array[Obstacle], time: float, reach: float) -> bool:
-    """Whether anything within `reach` of a place may lie in an obstacle. (For a box, distance is along an axis.)"""
-    near = float(1e30)  # noqa: UP018 -- Warp takes a literal for a constant
+def near_obstacles(place: wp.vec3, obstacles: wp.array[Obstacle], time: float, radius: float) -> bool:
+    """Whether a point within `radius` [m] of a position along each axis may lie in an obstacle."""
+    near = float(1e30)  # noqa: UP018 -- a literal would be constant in Warp
     for n in range(obstacles.shape[0]):
-        near = wp.min(near, _seen(obstacles[n], place, time)[3])
-    return near < 1.75 * reach
+        near = wp.min(near, _surface_at(obstacles[n], place, time)[3])
+    return near < 1.75 * radius
 
 
 @wp.func
 def apply_obstacles(
     place: wp.vec3, velocity: wp.vec3, obstacles: wp.array[Obstacle], time: float, dx: float
 ) -> wp.vec3:
-    """Velocity of a node at `place`, after the obstacles, as they stand `time` [s] after the start of the frame.
+    """Velocity of a node at `place` after the conditions of all obstacles, `time` [s] after the start of the frame.
 
-    What approaches is stopped by nodes OUTER cells deep and more, so that bodies come to rest on the surface (on
-    average the first of them is FLOOR_GAP deep). What would leave a surface that lets nothing go is held from OUTER
-    cells above it: there those bodies have their weight.
+    Approaching nodes are constrained from a depth of OBSTACLE_OFFSET cells, so that bodies come to rest on the surface
+    (the first constrained node is on average FLOOR_GAP deep). At SLIP and STICKY surfaces, separating nodes are
+    constrained from OBSTACLE_OFFSET cells above the surface, where resting bodies have their mass.
     """
     v = velocity
     for n in range(obstacles.shape[0]):
         o = obstacles[n]
-        out = _seen(o, place, time)
+        out = _surface_at(o, place, time)
         normal = wp.vec3(out[0], out[1], out[2])
         moving = o.velocity + wp.cross(o.spin, place - o.centre - time * o.velocity)
         u = v - moving
@@ -221,7 +225,7 @@ def apply_obstacles(
 def apply_restitution(
     grid: MpmGrid, obstacles: wp.array[Obstacle], time: float, x: wp.vec3, velocity: wp.vec3, friction: float, dt: float
 ) -> wp.vec3:
-    """Velocity of a particle after `dt` at the surfaces with restitution."""
+    """Velocity of a particle after `dt` [s] under the springs of all walls and obstacles with restitution."""
     v = velocity
     touch = REST_DISTANCE * grid.dx
     if grid.restitution > 0.0:
@@ -233,7 +237,7 @@ def apply_restitution(
     for n in range(obstacles.shape[0]):
         o = obstacles[n]
         if o.restitution > 0.0:
-            out = _seen(o, x, time)
+            out = _surface_at(o, x, time)
             moving = o.velocity + wp.cross(o.spin, x - o.centre - time * o.velocity)
             normal = wp.vec3(out[0], out[1], out[2])
             v = moving + _spring(v - moving, normal, touch - out[3], o.friction, o.restitution, grid, dt)

@@ -1,7 +1,9 @@
-"""Rows of grid nodes as vectors: the inner loops of the particle-grid transfers, in C++.
+"""Inner loops of the particle-grid transfers, in C++ and CUDA.
 
-A node is four floats: x, y, z of velocity or momentum, and mass. On the CPU a row of four nodes is one 16-lane vector
-(Warp brings the compiler); three of them carry weight. On CUDA a node is one 16-byte load or one vector atomic.
+A node is four floats: x, y, z of velocity or momentum, and mass. On the CPU a row of four nodes along z is one 16-lane
+SIMD vector, of which three nodes have non-zero weight. On CUDA a node is one 16-byte load or one vector atomic.
+`first` is the index of the stencil's first node, stride_x and stride_y are in nodes, `weight` and `fx` as in
+`grid.bspline_weights`.
 """
 
 from __future__ import annotations
@@ -12,7 +14,8 @@ mat43 = wp.types.matrix(shape=(4, 3), dtype=float)
 
 
 @wp.func_native("""
-    // weight: rows x, y, z; columns the three nodes. Returns sum w v and sum w v (offset along x, y, z).
+    // Grid to particle (G2P) from node velocities: row 0 of the result is sum w v, rows 1 to 3 are sum w v d with the
+    // offset d of the node from the particle along x, y, z [cells].
     wp::mat_t<4, 3, wp::float32> out;
     const float* base = (const float*)(velocity.data + first);
 #if !defined(__CUDA_ARCH__)
@@ -68,8 +71,8 @@ def gather_nodes(
 
 
 @wp.func_native("""
-    // affine: row 0 is momentum and mass at the particle, rows 1 to 3 its change a node along x, y, z.
-    // first < 0: nothing to scatter.
+    // Particle to grid (P2G). affine: row 0 is momentum and mass at the particle, rows 1 to 3 their change per cell
+    // along x, y, z. first < 0: nothing to scatter.
     float* base = (float*)(momentum.data + first);
 #if !defined(__CUDA_ARCH__)
     if (first < 0) return;
@@ -97,8 +100,8 @@ def gather_nodes(
         row += stepX;
     }
 #else
-    // Lanes of a warp whose particles share a cell, next to each other when sorted, add up before they touch memory:
-    // lane l sums lanes l to l + 7 of its run, and every eighth lane of a run writes. All 32 lanes must get here.
+    // Consecutive lanes whose particles share a cell (a run) are summed before the atomics: lane l sums lanes l to
+    // l + 7 of its run, and every eighth lane of a run writes. All 32 lanes of the warp must take part.
     const unsigned all = 0xffffffffu;
     const int lane = threadIdx.x & 31;
     const int before = __shfl_up_sync(all, first, 1);
@@ -151,7 +154,7 @@ def scatter_nodes(
 
 
 @wp.func_native("""
-    // four nodes: sum the copies, clear them, divide by mass
+    // For a row of four nodes: sum the momentum copies, clear them, divide by mass.
     float* to = (float*)(velocity.data + first);
 #if !defined(__CUDA_ARCH__)
     typedef float lanes __attribute__((ext_vector_type(16), aligned(4)));
@@ -178,12 +181,12 @@ def scatter_nodes(
 """)
 def velocity_from_momentum(
     momentum: wp.array[wp.vec4], velocity: wp.array[wp.vec4], first: int, count: int, copies: int
-): ...  # copies: bit c is set where copy c, which starts at node c count, has something
+): ...  # copies: bit c is set if copy c, which starts at node c x count, may be non-zero
 
 
 @wp.func_native("""
-    // as gather_nodes, from momentum: a node's velocity is momentum by mass; the lowest `under` layers of nodes feel
-    // the floor, as mpm_grid.at_walls says, without a loop around it
+    // As gather_nodes, from momentum: divides by mass at each node, and applies the floor condition of grid.apply_walls
+    // to the lowest `under` layers of the stencil.
     wp::mat_t<4, 3, wp::float32> out;
     for (int r = 0; r < 4; ++r) for (int n = 0; n < 3; ++n) out.data[r][n] = 0.0f;
     const float* base = (const float*)(momentum.data + first);

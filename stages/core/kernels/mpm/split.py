@@ -1,8 +1,8 @@
-"""A step as two launches, particles and then grid: the order that is fastest on a CPU.
+"""A substep as two launches, particles and then grid: the order that is fastest on a CPU.
 
-`particle_step` gathers velocities from the grid, moves the particles and scatters their momentum and stress for the
-next step; `grid_step` turns momentum into velocity and applies floor, walls and obstacles. Several CPU threads may
-scatter at once, each into its own copy of the momentum; a block knows which copies it needs.
+`particle_step` gathers velocities from the grid (G2P), moves the particles and scatters their momentum and stress for
+the next substep (P2G); `grid_step` divides momentum by mass and applies floor, walls and obstacles. Several CPU threads
+may scatter at once, each into its own copy of the momentum; each block lists the copies that it may occur in.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ from stages.core.kernels.mpm.transfers import (
 
 
 @cache
-def particle_step(plastic: bool, bouncy: bool) -> wp.Kernel:
-    """The kernel; only if `plastic` it knows materials beside neo-Hookean, and only if `bouncy` restitution."""
+def particle_step(plastic: bool, restitution: bool) -> wp.Kernel:
+    """Build the particle kernel; `plastic`: with material models other than neo-Hookean."""
 
     @wp.kernel(module="unique", enable_backward=False)
     def particle_step(
@@ -47,11 +47,12 @@ def particle_step(plastic: bool, bouncy: bool) -> wp.Kernel:
         damping: float, velocity: wp.array[wp.vec4], momentum: wp.array[wp.vec4], copy: int, stale: wp.array[int],
         obstacles: wp.array[Obstacle], clock: wp.array[float],
     ):  # fmt: skip
-        """Particles start + tid. `copy` is the first node of the momentum copy to scatter into."""
+        """Particles start + tid. `gather` and `scatter` switch G2P and P2G; `copy` is the first node of the momentum
+        copy to scatter into; `stale` is set when a particle moved beyond the marked blocks."""
         i = start + wp.tid()
         stride_y = grid.nodes[2]
         stride_x = grid.nodes[1] * grid.nodes[2]
-        first = int(-1)  # noqa: UP018 -- Warp takes a literal for a constant
+        first = int(-1)  # noqa: UP018 -- a literal would be constant in Warp
         fx = wp.vec3(1.0, 1.0, 1.0)
         load = wp.mat44()
         held = int(LOST)
@@ -76,11 +77,11 @@ def particle_step(plastic: bool, bouncy: bool) -> wp.Kernel:
                 mark_lost(rows.held, rows.lost, i, rows.scene[i], rows.order[i])
             tau = wp.mat33()
             if wp.static(plastic):
-                answer = material_update(int(rows.model[i]), now.F, stiffness, rows.plastic[i], rows.state[i],
-                                 wp.where(gather > 0, dt, 0.0))  # fmt: skip
-                now.F = answer.F
-                tau = answer.tau
-                rows.state[i] = answer.state
+                new = material_update(int(rows.model[i]), now.F, stiffness, rows.plastic[i], rows.state[i],
+                                      wp.where(gather > 0, dt, 0.0))  # fmt: skip
+                now.F = new.F
+                tau = new.tau
+                rows.state[i] = new.state
             else:
                 tau = neo_hookean(now.F, stiffness)
             if gather > 0:
@@ -96,7 +97,7 @@ def particle_step(plastic: bool, bouncy: bool) -> wp.Kernel:
                 shift = wp.max(wp.abs(base[0] - previous[0]), wp.abs(base[1] - previous[1]))
                 if wp.max(shift, wp.abs(base[2] - previous[2])) > 1:
                     stale[0] = 1
-                if wp.static(bouncy):  # noqa: SIM102 -- resolved when the kernel is built
+                if wp.static(restitution):  # noqa: SIM102 -- resolved when the kernel is built
                     if held == FREE:
                         now.v = apply_restitution(grid, obstacles, clock[0] + dt, now.x, now.v, rows.friction[i], dt)
                 load = affine_momentum(grid.dx, now, tau, rows.mass[i], rows.volume[i], stiffness[2],
@@ -113,9 +114,9 @@ def grid_step(
     grid: MpmGrid, start: int, momentum: wp.array[wp.vec4], velocity: wp.array[wp.vec4], friction: wp.array[float],
     blocks: wp.array[wp.vec2i], obstacles: wp.array[Obstacle], clock: wp.array[float], scenes: int,
 ):  # fmt: skip
-    """One row of four nodes of an active block; `blocks` holds the block's first node and which copies it needs.
+    """One row of four nodes of an active block; `blocks` holds a block's first node and the bits of its copies.
 
-    clock: time since the start of the frame, that obstacles moved on.
+    clock: time since the start of the frame [s], for moving obstacles.
     """
     t = start + wp.tid()
     block = blocks[t // (BLOCK * BLOCK)]
@@ -131,16 +132,16 @@ def grid_step(
     velocity_from_momentum(momentum, velocity, first, grid.count * scenes, block[1])
     inside = i > grid.low[0] and i < grid.high[0] and j > grid.low[1] and j < grid.high[1]
     inside = inside and k > grid.low[2] and k + BLOCK <= grid.high[2]
-    solid = bool(False)  # noqa: UP018 -- Warp takes a literal for a constant
+    blocked = bool(False)  # noqa: UP018 -- a literal would be constant in Warp
     if obstacles.shape[0] > 0:
         middle = grid.origin + grid.dx * wp.vec3(float(i), float(j), float(k) + 1.5)
-        solid = near_obstacles(middle, obstacles, clock[0], 2.0 * grid.dx)
-    if inside and not solid:
+        blocked = near_obstacles(middle, obstacles, clock[0], 2.0 * grid.dx)
+    if inside and not blocked:
         return
     for n in range(BLOCK):
         u = velocity[first + n]
         v = apply_walls(grid, wp.vec3i(i, j, k + n), wp.vec3(u[0], u[1], u[2]), friction[first + n])
-        if solid:
+        if blocked:
             place = grid.origin + grid.dx * wp.vec3(float(i), float(j), float(k + n))
             v = apply_obstacles(place, v, obstacles, clock[0], grid.dx)
         velocity[first + n] = wp.vec4(v[0], v[1], v[2], u[3])
@@ -148,7 +149,7 @@ def grid_step(
 
 @wp.kernel(enable_backward=False)
 def mark_blocks(grid: MpmGrid, rows: ParticleArrays, start: int, bit: int, marks: wp.array4d[int]):
-    """Blocks (scene, i, j, k) that a particle reaches while it stays within one cell of where it is now."""
+    """Mark the blocks (scene, i, j, k) of a particle's stencil, for motions of up to one cell, with `bit`."""
     i = start + wp.tid()
     if rows.held[i] == wp.int8(LOST):
         return
@@ -167,10 +168,10 @@ def mark_blocks(grid: MpmGrid, rows: ParticleArrays, start: int, bit: int, marks
 
 @wp.kernel(enable_backward=False)
 def mark_friction(grid: MpmGrid, rows: ParticleArrays, friction: wp.array[float]):
-    """Nodes at floor and walls take the largest friction coefficient among the particles that may touch them.
+    """Set the friction coefficient of nodes at floor and walls to the maximum over the particles near them.
 
-    Those within a cell, that is; in the fused order those that do touch. Where two bodies with different friction
-    stand side by side, the orders may differ by what that cell makes.
+    "Near" includes motions of up to one cell; the fused order takes actual stencils only, so that the two orders can
+    differ where bodies with different friction coefficients are closer than a cell.
     """
     i = wp.tid()
     if rows.held[i] == wp.int8(LOST):
@@ -188,7 +189,7 @@ def mark_friction(grid: MpmGrid, rows: ParticleArrays, friction: wp.array[float]
 
 @wp.kernel(enable_backward=False)
 def clear_friction(grid: MpmGrid, blocks: wp.array[wp.vec2i], friction: wp.array[float]):
-    """One row of four nodes of a block, as in grid_step."""
+    """Set the friction coefficient of one row of four nodes of a block to 0; threads as in grid_step."""
     t = wp.tid()
     row = t % (BLOCK * BLOCK)
     first = blocks[t // (BLOCK * BLOCK)][0] + ((row // BLOCK) * grid.nodes[1] + row % BLOCK) * grid.nodes[2]

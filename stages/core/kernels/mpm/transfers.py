@@ -1,10 +1,9 @@
-"""Moving particles on a grid: MLS-MPM with APIC transfers and quadratic B-splines, for any number of scenes at once.
+"""MLS-MPM with APIC transfers and quadratic B-splines, for batches of scenes: what both launch orders share.
 
-Here is what both launch orders share. kernels/mpm_fused.py does a whole step in one launch, which is fastest on a GPU;
-kernels/mpm_split.py does particles and grid in turn, which is fastest on a CPU, where the division by mass and the
-walls would otherwise be done 27 times a particle instead of once a node.
+`fused` does a whole substep in one launch, which is fastest on a GPU; `split` launches particles and grid in turn,
+which is fastest on a CPU: division by mass and walls are then evaluated once per node instead of 27 times per particle.
 
-The grids are dense in memory, but only blocks of 4x4x4 nodes that particles can reach are read, written and cleared.
+The grids are dense in memory, but only blocks of 4 x 4 x 4 nodes near particles are read, written and cleared.
 
 Source: Hu et al. 2018, "A Moving Least Squares Material Point Method", eq. 16-18 and its 88-line code;
 Jiang et al. 2015, "The Affine Particle-In-Cell Method"; Jiang et al. 2017, "An angular momentum conserving affine
@@ -20,37 +19,37 @@ from torch import Tensor
 from stages.core.kernels.mpm.grid import BLOCK, MpmGrid, first_node, stencil_inside
 from stages.core.kernels.mpm.nodes import mat43
 
-KINEMATIC_MASS_FACTOR = 1e4  # a held particle weighs this much more on the grid, so that others stop at it
-FREE, KINEMATIC, LOST = 0, 1, 2  # values of `held`: moved by the grid, by its own velocity, not at all any more
+KINEMATIC_MASS_FACTOR = 1e4  # mass factor of kinematic particles on the grid, so that they impose their velocity
+FREE, KINEMATIC, LOST = 0, 1, 2  # values of `held`: moved by the grid, by its own velocity, or outside the grid
 
 
 @wp.struct
 class ParticleArrays:
-    """The particles of all scenes, sorted by cell. `order` is the row that each had at first."""
+    """Particles of all scenes, sorted by cell."""
 
     count: int
-    x: wp.array[wp.vec3]
-    v: wp.array[wp.vec3]
-    C: wp.array[wp.mat33]
-    F: wp.array[wp.mat33]
-    mass: wp.array[float]
-    volume: wp.array[float]
-    stiffness: wp.array[wp.vec3]
+    x: wp.array[wp.vec3]  # [m]
+    v: wp.array[wp.vec3]  # [m/s]
+    C: wp.array[wp.mat33]  # APIC velocity gradient [1/s]
+    F: wp.array[wp.mat33]  # deformation gradient, elastic part
+    mass: wp.array[float]  # [kg]
+    volume: wp.array[float]  # at rest [m^3]
+    stiffness: wp.array[wp.vec3]  # mu, lambda [Pa], eta [Pa s]
     friction: wp.array[float]
     held: wp.array[wp.int8]
-    model: wp.array[wp.int8]  # see mpm_materials.py
+    model: wp.array[wp.int8]  # see constitutive.py, also for `plastic` and `state`
     plastic: wp.array[wp.vec3]
     state: wp.array[float]
-    acceleration: wp.array[wp.vec3]  # accelerations
+    acceleration: wp.array[wp.vec3]  # of external forces [m/s^2]
     scene: wp.array[int]
-    order: wp.array[int]
-    base_node: wp.array[wp.vec3i]  # stencil when the list of blocks was made
-    lost: wp.array[int]  # a scene: lowest `order` of its lost particles
+    order: wp.array[int]  # original row
+    base_node: wp.array[wp.vec3i]  # first node of the stencil when the list of blocks was made
+    lost: wp.array[int]  # per scene: lowest `order` of its lost particles
 
 
 @wp.struct
 class ParticleUpdate:
-    """A particle on its way through a step; `alive` when it has something to scatter."""
+    """State of a particle within a substep; `alive` is False once it has left the grid."""
 
     x: wp.vec3
     v: wp.vec3
@@ -61,7 +60,7 @@ class ParticleUpdate:
 
 @wp.func
 def advance_free(grid: MpmGrid, x: wp.vec3, F: wp.mat33, s: mat43, dt: float) -> ParticleUpdate:
-    """A particle a step further, by sums over its stencil; one that would leave the grid stays, and is not alive."""
+    """Advance a free particle by `dt` [s] with the stencil sums `s` of G2P; one that would leave the grid is lost."""
     out = ParticleUpdate()
     k = 4.0 / grid.dx
     out.v = wp.vec3(s[0, 0], s[0, 1], s[0, 2])
@@ -77,7 +76,7 @@ def advance_free(grid: MpmGrid, x: wp.vec3, F: wp.mat33, s: mat43, dt: float) ->
 
 @wp.func
 def lost_particle(x: wp.vec3, F: wp.mat33) -> ParticleUpdate:
-    """A particle that is lost."""
+    """State of a lost particle: it stays where it is and is not scattered."""
     out = ParticleUpdate()
     out.x = x
     out.F = F
@@ -87,7 +86,7 @@ def lost_particle(x: wp.vec3, F: wp.mat33) -> ParticleUpdate:
 
 @wp.func
 def advance_kinematic(grid: MpmGrid, x: wp.vec3, v: wp.vec3, C: wp.mat33, F: wp.mat33, dt: float) -> ParticleUpdate:
-    """A particle that goes its own way for `dt` [s]; 0 to take it as it is."""
+    """Advance a kinematic particle by `dt` [s] at its own velocity; 0 returns its current state."""
     out = ParticleUpdate()
     out.x = x + dt * v
     out.v = v
@@ -101,7 +100,7 @@ def advance_kinematic(grid: MpmGrid, x: wp.vec3, v: wp.vec3, C: wp.mat33, F: wp.
 
 @wp.func
 def mark_lost(held: wp.array[wp.int8], lost: wp.array[int], i: int, scene: int, order: int):
-    """Note that particle i is lost, and the first of its scene."""
+    """Mark particle i as lost, and keep the lowest original row of the scene's lost particles."""
     held[i] = wp.int8(LOST)
     wp.atomic_min(lost, scene, order)
 
@@ -111,7 +110,10 @@ def affine_momentum(
     dx: float, now: ParticleUpdate, tau: wp.mat33, mass: float, volume: float, viscosity: float,
     acceleration: wp.vec3, held: int, dt: float, damping: float,
 ) -> wp.mat44:  # fmt: skip
-    """What a particle brings to the grid: row 0 momentum and mass, rows 1 to 3 the change a node along x, y, z."""
+    """P2G contribution of a particle: row 0 momentum and mass, rows 1 to 3 their change per cell along x, y, z.
+
+    APIC momentum with RPIC damping, and the MLS-MPM stress impulse of Kirchhoff stress `tau` and viscosity.
+    """
     both = now.C + wp.transpose(now.C)
     A = (dx * mass) * (now.C - (0.5 * damping) * both) - (dt * 4.0 / dx * volume) * (tau + viscosity * both)
     m = mass
@@ -126,7 +128,7 @@ def affine_momentum(
 
 @wp.kernel(enable_backward=False)
 def sort_keys(grid: MpmGrid, rows: ParticleArrays, keys: wp.array[int]):
-    """Cells in an order that keeps neighbours together: by scene, by block, within the block. Lost particles last."""
+    """Sort keys by scene, block, and cell within the block, for memory locality; lost particles come last."""
     i = wp.tid()
     if rows.held[i] == wp.int8(LOST):
         keys[i] = 2147483647
@@ -141,16 +143,17 @@ def substep_reference(
     x: Tensor, v: Tensor, C: Tensor, F: Tensor, mass: Tensor, volume: Tensor, stiffness: Tensor, push: Tensor,
     dt: float, dx: float, nodes: tuple[int, int, int], low: Tensor, high: Tensor, friction: float,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
-    """One whole step in PyTorch, origin 0: the specification of the kernels above. All particles are free.
+    """One substep of free neo-Hookean particles in PyTorch, with the grid's origin at 0: specification of the kernels.
 
-    x, v, push (p, 3); C, F (p, 3, 3); mass, volume (p); stiffness (p, 3); low, high (3,) node indices of the walls.
+    x, v, push (external acceleration [m/s^2]) (p, 3); C, F (p, 3, 3); mass, volume (p); stiffness (p, 3); low, high
+    (3,) node indices of the walls. Returns x, v, C, F.
     """
     offsets = torch.cartesian_prod(*[torch.arange(3)] * 3)
     base = (x / dx - 0.5).floor().long()
     fx = x / dx - base
     w = torch.stack([0.5 * (1.5 - fx) ** 2, 0.75 - (fx - 1) ** 2, 0.5 * (fx - 0.5) ** 2], 1)  # p 3nodes 3axes
     weight = w[:, offsets[:, 0], 0] * w[:, offsets[:, 1], 1] * w[:, offsets[:, 2], 2]
-    reach = (offsets - fx[:, None]) * dx  # p 27 3
+    offset = (offsets - fx[:, None]) * dx  # p 27 3
     ijk = base[:, None] + offsets
     flat = (ijk[..., 0] * nodes[1] + ijk[..., 1]) * nodes[2] + ijk[..., 2]
 
@@ -159,7 +162,7 @@ def substep_reference(
     tau = stiffness[:, 0, None, None] * (F @ F.mT - one) + (stiffness[:, 1] * J.log())[:, None, None] * one
     tau = tau + stiffness[:, 2, None, None] * (C + C.mT)
     A = mass[:, None, None] * C - (dt * volume * 4 / dx**2)[:, None, None] * tau
-    momentum = (mass[:, None] * (v + dt * push))[:, None] + torch.einsum("pab,pnb->pna", A, reach)
+    momentum = (mass[:, None] * (v + dt * push))[:, None] + torch.einsum("pab,pnb->pna", A, offset)
     count = nodes[0] * nodes[1] * nodes[2]
     grid_m = torch.zeros(count).to(x).index_add(0, flat.flatten(), (weight * mass[:, None]).flatten())
     grid_v = torch.zeros(count, 3).to(x).index_add(0, flat.flatten(), (weight[..., None] * momentum).flatten(0, 1))
@@ -177,5 +180,5 @@ def substep_reference(
 
     near = grid_v[flat]
     v = (weight[..., None] * near).sum(1)
-    C = 4 / dx**2 * torch.einsum("pn,pna,pnb->pab", weight, near, reach)
+    C = 4 / dx**2 * torch.einsum("pn,pna,pnb->pab", weight, near, offset)
     return x + dt * v, v, C, F + dt * C @ F

@@ -239,5 +239,5 @@ def make_grid(box: Box, dx: float):
     grid.low = wp.vec3i(*[mpm_grid.GRID_PADDING - soft] * 3)
     grid.high = wp.vec3i(*(mpm_grid.GRID_PADDING + inside + soft for inside, _ in n))
     grid.face_low, grid.face_high = wp.vec3(*box.low), wp.vec3(*box.high)
-    grid.restitution, grid.keep = box.restitution, box.tangential_retention
+    grid.restitution, grid.tangential_retention = box.restitution, box.tangential_retention
     return grid

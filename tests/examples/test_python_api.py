@@ -1,0 +1,9 @@
+import runpy
+from pathlib import Path
+
+EXAMPLE = Path(__file__).resolve().parents[2] / "examples/python_api.py"
+
+
+def test_every_stage_is_callable_from_python(tmp_path):
+    metrics = runpy.run_path(str(EXAMPLE))["main"](tmp_path)  # asserts the outcome of each stage itself
+    assert set(metrics["objects"]) == {"red block", "blue block"}

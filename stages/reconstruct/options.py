@@ -42,7 +42,7 @@ QUALITY_PRESETS = {
 }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ReconstructOptions:
     """Options of `ngff reconstruct`; raises InputError for values out of range."""
 

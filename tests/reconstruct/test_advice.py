@@ -25,11 +25,11 @@ def told(cameras: Cameras, confirmed: float = 0.8, supported: bool = True, dropp
     )
 
 
-def test_nothing_is_said_of_a_good_set():
+def test_no_advice_for_a_good_set():
     assert told(around(24)) == ""
 
 
-def test_the_side_that_was_not_seen_is_named_by_the_photos_at_its_ends():
+def test_widest_gap_is_named_by_the_photos_at_its_ends():
     # 13 photos, 20 degrees apart: 240 degrees are seen, and the gap runs from the last to the first.
     cameras = around(13, sweep=260.0)
     gap, before, after = widest_gap(cameras, torch.zeros(3))
@@ -37,19 +37,19 @@ def test_the_side_that_was_not_seen_is_named_by_the_photos_at_its_ends():
     assert "120 degrees between" in told(cameras) and "about 7 more photos" in told(cameras)
 
 
-def test_the_gap_is_found_across_the_turn_of_the_angle():
+def test_gap_across_azimuth_zero():
     cameras = around(10, sweep=300.0, azimuth=100.0)  # 30 degrees apart
     assert widest_gap(cameras, torch.zeros(3))[0] == pytest.approx(90, abs=0.1)
 
 
 @pytest.mark.parametrize(("elevation", "words"), [(8.0, "from low down"), (70.0, "steeply down"), (35.0, "")])
-def test_one_height_only_is_noticed(elevation, words):
+def test_cameras_all_low_or_all_high(elevation, words):
     assert words in told(around(24, elevation=elevation))
     if not words:
         assert told(around(24, elevation=elevation)) == ""
 
 
-def test_what_went_wrong_is_said():
+def test_advice_for_few_blurred_inconsistent_and_unsupported_photos():
     assert "7 photos are few" in told(around(7))
     assert "no table or floor" in told(around(24), supported=False)
     assert "only 20 %" in told(around(24), confirmed=0.2) and "glass" in told(around(24), confirmed=0.2)
@@ -58,7 +58,7 @@ def test_what_went_wrong_is_said():
     assert "blurred compared with the others: 3.jpg;" in told(around(24), sharp=sharp)
 
 
-def test_photos_left_out_are_named_with_the_reason_but_not_without_end():
+def test_dropped_photos_are_named_with_limits():
     text = told(around(24), dropped={"a.jpg": "is dark", **{f"{i:03d}.jpg": "is blank" for i in range(30)}})
     assert text.splitlines() == [
         "only 24 of 55 photos show enough of the same objects: take them closer together, each showing two thirds of "
@@ -71,7 +71,7 @@ def test_photos_left_out_are_named_with_the_reason_but_not_without_end():
     assert text.endswith("3 more photos were left out for similar reasons")
 
 
-def test_a_length_between_two_cameras_or_to_the_scene():
+def test_scale_reference_between_two_cameras_or_to_the_focus():
     cameras = around(4)  # a quarter turn apart on a circle of radius 2 cos 30
     known = parse_scale("photos=0.jpg,1.jpg distance=0.5")
     assert known.in_scene_units(cameras, 2.0) == pytest.approx(2 * 3**0.5 / 2 * 2**0.5, rel=1e-5)
@@ -90,12 +90,12 @@ def test_a_length_between_two_cameras_or_to_the_scene():
         ("0.5", "in metres"),
     ],
 )
-def test_lengths_that_make_no_sense(text, words):
+def test_invalid_scale_references(text, words):
     with pytest.raises(InputError, match=words):
         ReconstructOptions(scale_reference=text)
 
 
-def test_cameras_of_a_length_must_be_there_and_apart():
+def test_photos_of_a_scale_reference_must_have_distinct_cameras():
     cameras = around(4)
     with pytest.raises(InputError, match="no camera found for 9.jpg"):
         parse_scale("photos=0.jpg,9.jpg distance=1").in_scene_units(cameras, 2.0)

@@ -32,7 +32,7 @@ def block():
     return views, truth, sparse(cameras, truth)
 
 
-def test_depth_is_right_where_others_confirm_it(block):
+def test_consistent_depth_is_accurate(block):
     views, truth, model = block
     maps = stereo.estimate_depth_maps(views, model, Plane(torch.tensor([0.0, 0, 1]), 0.0))
     for found, true in zip(maps, truth, strict=True):
@@ -44,14 +44,14 @@ def test_depth_is_right_where_others_confirm_it(block):
         assert (error < 0.02).float().mean() > 0.97
 
 
-def test_most_of_the_sources_are_neighbours(block):
+def test_sources_are_the_neighbours(block):
     _, _, model = block
     sources = stereo.select_sources(model, 2)
     assert set(sources[2]) == {1, 3}
     assert all(i not in chosen for i, chosen in enumerate(sources))
 
 
-def test_smoothing_fills_a_gap_and_keeps_an_edge():
+def test_semi_global_matching_fills_gaps_and_keeps_edges():
     # Left half at label 3, right half at label 8; in a band of columns all labels cost the same.
     cost = torch.full((12, 20, 40), 0.6)
     cost[3, :, :20] = 0
@@ -62,7 +62,7 @@ def test_smoothing_fills_a_gap_and_keeps_an_edge():
     assert (label[:, 22:] - 8).abs().max() < 0.6
 
 
-def test_a_depth_no_other_view_shares_is_not_confirmed(block):
+def test_wrong_depth_is_not_consistent(block):
     views, truth, _ = block
     wrong = [t.clone() for t in truth]
     wrong[0] = truth[0] * 1.1

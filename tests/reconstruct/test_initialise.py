@@ -29,7 +29,7 @@ def block():
     return DepthViews(views, [DepthMap(d, torch.full_like(d, 2.0)) for d in truth], 1)
 
 
-def test_discs_lie_flat_and_as_wide_as_their_spacing():
+def test_gaussians_are_flat_and_as_wide_as_the_point_spacing():
     gaussians = initialise.to_gaussians(flat_cloud(), torch.full((400,), 0.8), degree=1)
     inner = (gaussians.means[:, :2] > 0.15).all(1) & (gaussians.means[:, :2] < 1.75).all(1)
     torch.testing.assert_close(gaussians.scales[inner, 0], torch.full((int(inner.sum()),), 0.06))
@@ -38,13 +38,13 @@ def test_discs_lie_flat_and_as_wide_as_their_spacing():
     assert gaussians.sh.shape == (400, 4, 3) and not gaussians.sh[:, 1:].any()
 
 
-def test_turns_carry_z_to_the_normal():
+def test_quaternions_rotate_z_to_the_normal():
     normals = torch.nn.functional.normalize(torch.randn(50, 3, generator=torch.Generator().manual_seed(0)), dim=1)
     normals[0], normals[1] = torch.tensor([0.0, 0, 1]), torch.tensor([0.0, 0, -1])
     torch.testing.assert_close(matrix(initialise.quats_from_normals(normals))[:, :, 2], normals, rtol=0, atol=1e-5)
 
 
-def test_lifted_normals_point_up_on_the_table(block):
+def test_unprojected_normals_point_up_on_the_table(block):
     first = block.maps[0]
     cloud = initialise.unproject_view(block.views, 0, first.depth, first.support)
     table = (cloud.points[:, 2].abs() < 1e-3) & (cloud.points[:, :2].abs() > 0.4).any(1)
@@ -52,7 +52,7 @@ def test_lifted_normals_point_up_on_the_table(block):
     assert (cloud.normals[table, 2] > 0.99).float().mean() > 0.9
 
 
-def test_thinning_meets_the_target_and_keeps_the_colours():
+def test_downsampling_reaches_the_target_and_keeps_colours():
     cloud = flat_cloud(10_000, 0.01)
     few = initialise.downsample(cloud, 1000, torch.zeros(3), radius=100.0)
     assert 250 < len(few) <= 1100  # cells are powers of two, so in the plane their number jumps by four
@@ -60,7 +60,7 @@ def test_thinning_meets_the_target_and_keeps_the_colours():
     torch.testing.assert_close(few.points[:, 2], torch.zeros(len(few)))
 
 
-def test_thinning_is_finer_in_focus():
+def test_downsampling_is_finer_in_focus():
     cloud = flat_cloud(10_000, 0.01)  # a square of side 1 from the origin
     few = initialise.downsample(cloud, 2000, torch.zeros(3), radius=0.6)
     near, far = few.points.norm(dim=1) < 0.2, few.points.norm(dim=1) > 0.8
@@ -68,7 +68,7 @@ def test_thinning_is_finer_in_focus():
     assert near.sum() / (before < 0.2).sum() > 2 * far.sum() / (before > 0.8).sum()
 
 
-def test_a_point_before_a_confirmed_surface_is_an_intruder(block):
+def test_point_before_a_surface_violates_free_space(block):
     viewmat = block.views.cameras.viewmats[0]
     eye = -viewmat[:3, :3].T @ viewmat[:3, 3]
     floater = torch.lerp(eye, torch.tensor([0.0, 0, 0.2]), 0.7)
@@ -77,7 +77,7 @@ def test_a_point_before_a_confirmed_surface_is_an_intruder(block):
     assert count[0] >= 1 and count[1] == 0
 
 
-def test_interpolated_depth_joins_what_is_known():
+def test_interpolated_depth_continues_known_depth():
     depth = torch.full((32, 48), 2.0)
     sure = torch.ones(32, 48, dtype=torch.bool)
     sure[8:20, 10:30] = False
@@ -85,7 +85,7 @@ def test_interpolated_depth_joins_what_is_known():
     torch.testing.assert_close(initialise.interpolate_depth(depth, sure), torch.full((32, 48), 2.0), rtol=1e-3, atol=0)
 
 
-def test_holes_are_filled_and_covered_places_are_not(block):
+def test_only_uncovered_pixels_are_filled(block):
     known = torch.arange(80) < 40
     maps = [DepthMap(m.depth, m.support.where(known, torch.zeros_like(m.support))) for m in block.maps]
     half = DepthViews(block.views, maps, 1)

@@ -72,7 +72,7 @@ def surface_error(points: torch.Tensor) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("splats", [False, True], ids=["pi3", "pi3-splat"])
-def test_a_true_answer_gives_the_true_scene(tmp_path, splats):
+def test_true_geometry_gives_the_true_scene(tmp_path, splats):
     made, cameras = assembled(tmp_path, splats=splats, iterations=0)
     back = to_truth(made, cameras)
     assert surface_error(back(made.scene.gaussians.means)).quantile(0.9) < 0.02
@@ -84,7 +84,7 @@ def test_a_true_answer_gives_the_true_scene(tmp_path, splats):
     assert score_views(made.scene.gaussians, made.views, made.trained)[0] > 17  # the mean colour: 12.6
 
 
-def test_noise_of_two_percent_is_survived_and_fitting_improves_the_picture(tmp_path):
+def test_fit_improves_held_out_views_under_two_percent_noise(tmp_path):
     plain, cameras = assembled(tmp_path, noise=0.02, iterations=0, holdout=3)
     fitted, _ = assembled(tmp_path, noise=0.02, iterations=60, holdout=3)
     assert plain.held_out == [0, 3]
@@ -103,7 +103,7 @@ def test_one_photo_is_enough(tmp_path):
     assert score_views(made.scene.gaussians, made.views, [0])[0] > 17
 
 
-def test_without_a_supporting_plane_there_is_no_floor(tmp_path, monkeypatch):
+def test_no_floor_without_a_supporting_plane(tmp_path, monkeypatch):
     assert assembled(tmp_path, count=2, iterations=0)[0].scene.floor == 0.0
     monkeypatch.setattr("stages.reconstruct.world_frame.PLANE_CRITERIA", ())  # no plane is good enough
     made, _ = assembled(tmp_path, count=2, iterations=0)
@@ -111,7 +111,7 @@ def test_without_a_supporting_plane_there_is_no_floor(tmp_path, monkeypatch):
     assert any("no table or floor" in sentence for sentence in made.advice)
 
 
-def test_few_gaussians_of_a_network_look_like_the_many_they_stand_for(tmp_path):
+def test_merged_gaussians_look_like_the_original_ones(tmp_path):
     many, _ = assembled(tmp_path, count=2, splats=True, iterations=0, quality="high")
     few, _ = assembled(tmp_path, count=2, splats=True, iterations=0)
     assert len(few.scene.gaussians) <= 1.25 * 5000 < len(many.scene.gaussians)
@@ -121,7 +121,7 @@ def test_few_gaussians_of_a_network_look_like_the_many_they_stand_for(tmp_path):
 
 @pytest.mark.parametrize("name", ["pi3", "pi3-splat"])
 @pytest.mark.parametrize("count", [1, 3])
-def test_whole_runs_with_a_tiny_network(tmp_path, monkeypatch, name, count):
+def test_complete_runs_with_a_tiny_network(tmp_path, monkeypatch, name, count):
     """What random weights say makes no sense, but every step is walked: photos, file of weights, network, scene.ply."""
     write_set(tmp_path, arc(count, (170, 120)))
     model = random_weights(Pi3(TINY) if name == "pi3" else Pi3Splat(TINY_SPLAT), size=0.05)
@@ -130,21 +130,22 @@ def test_whole_runs_with_a_tiny_network(tmp_path, monkeypatch, name, count):
     point_head.proj.bias.data *= 0.01
     save_file(model.state_dict(), tmp_path / f"{name}.safetensors")
     monkeypatch.setenv("NGFF_WEIGHTS", str(tmp_path))
-    report = run(tmp_path / "images", tmp_path / "s.ply", ReconstructOptions(name, quality="draft", iterations=3))
+    options = ReconstructOptions(backend=name, quality="draft", iterations=3)
+    report = run(tmp_path / "images", tmp_path / "s.ply", options)
     scene = read_scene(tmp_path / "s.ply")
     assert report.placed == count == len(scene.cameras) and len(scene.gaussians) > 0
     assert scene.gaussians.means.isfinite().all() and scene.floor == 0.0
     assert scene.provenance["options"]["backend"] == name
 
 
-def test_what_is_missing_or_does_not_go_together_is_said(tmp_path, monkeypatch):
+def test_errors_for_missing_weights_and_given_cameras(tmp_path, monkeypatch):
     monkeypatch.setenv("NGFF_WEIGHTS", str(tmp_path / "none"))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "none"))
     cameras = write_set(tmp_path, arc(2, (64, 48)))
     for options, words in (
-        (ReconstructOptions("pi3"), "no weights in .*huggingface.co/yyfz233/Pi3"),
-        (ReconstructOptions("pi3-splat", weights=tmp_path / "w.pth", download=True), "w.pth: no such file"),
-        (ReconstructOptions("pi3", cameras=cameras), "--cameras: --backend pi3 estimates the cameras"),
+        (ReconstructOptions(backend="pi3"), "no weights in .*huggingface.co/yyfz233/Pi3"),
+        (ReconstructOptions(backend="pi3-splat", weights=tmp_path / "w.pth", download=True), "w.pth: no such file"),
+        (ReconstructOptions(backend="pi3", cameras=cameras), "--cameras: --backend pi3 estimates the cameras"),
     ):
         with pytest.raises(InputError, match=words):
             run(tmp_path / "images", tmp_path / "s.ply", options)
@@ -152,7 +153,7 @@ def test_what_is_missing_or_does_not_go_together_is_said(tmp_path, monkeypatch):
 
 
 @torch.no_grad()
-def test_sixteen_bit_stays_near_thirty_two():
+def test_bf16_is_close_to_fp32():
     """As on a GPU, but on the CPU."""
     model = random_weights(Pi3(TINY), size=0.1)
     images = torch.rand(3, 3, 56, 42, generator=torch.Generator().manual_seed(0))

@@ -9,7 +9,7 @@ from stages.reconstruct.merge import merge_gaussians
 from tests.conftest import random_gaussians
 
 
-def test_a_mixture_keeps_its_mean_and_covariance():
+def test_merging_keeps_mean_and_covariance():
     # two of equal weight at x = 0.1 and 0.3: mean 0.2, variance along x the common one plus 0.1 squared
     two = random_gaussians(2, degree=1)
     same = dataclasses.replace(
@@ -25,7 +25,7 @@ def test_a_mixture_keeps_its_mean_and_covariance():
     torch.testing.assert_close(one.sh[0], same.sh.mean(0))
 
 
-def test_the_number_is_kept_and_few_are_left_alone():
+def test_target_number_is_kept_and_few_are_unchanged():
     many = random_gaussians(4000)
     fewer = merge_gaussians(many, torch.full((4000,), 0.01), 500)
     assert 350 < len(fewer) <= 500
@@ -33,7 +33,7 @@ def test_the_number_is_kept_and_few_are_left_alone():
     assert merge_gaussians(many, torch.full((4000,), 0.01), 4000) is many
 
 
-def test_what_is_near_keeps_its_detail():
+def test_near_gaussians_keep_more_detail():
     near, far = random_gaussians(2000), random_gaussians(2000, seed=1)
     both = dataclasses.replace(
         near, **{name: torch.cat([getattr(near, name), getattr(far, name)]) for name in

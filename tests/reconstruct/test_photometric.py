@@ -27,7 +27,7 @@ def target() -> tuple[Gaussians, Views]:
     return gaussians, photographed(gaussians, ring(6, 48))
 
 
-def test_wrong_colours_are_put_right(target):
+def test_wrong_colours_are_corrected(target):
     true, views = target
     start = replace(true, sh=true.sh + 1)
     before, _ = photometric.score_views(start, views, list(range(6)))
@@ -43,7 +43,7 @@ def test_the_same_seed_gives_the_same_gaussians(target):
         torch.testing.assert_close(getattr(first, name), getattr(second, name), rtol=0, atol=1e-6)
 
 
-def test_scores_may_leave_exposure_out(target):
+def test_scores_with_fitted_exposure(target):
     """Photos of 0.8 times the light: 20 dB off, and next to nothing once exposed alike."""
     true, views = target
     dark = replace(views, images=tuple((0.8 * image.float()).round().to(torch.uint8) for image in views.images))
@@ -53,7 +53,7 @@ def test_scores_may_leave_exposure_out(target):
     assert raw < 30 < 45 < fitted and exact > 45
 
 
-def test_a_darker_photo_is_taken_as_exposure(target):
+def test_darker_photo_gets_lower_exposure(target):
     true, views = target
     images = list(views.images)
     images[0] = (images[0].float() * 0.6).to(torch.uint8)
@@ -66,7 +66,7 @@ def test_a_darker_photo_is_taken_as_exposure(target):
     assert float(fit.gain(0).detach().mean()) < float(fit.gain(3).detach().mean())
 
 
-def test_what_no_photo_shows_shrinks_and_stays_as_opaque(target):
+def test_scale_regularisation_shrinks_invisible_gaussians_only_in_size(target):
     """The last of them is behind all cameras."""
     true, views = target
     unseen = replace(true[[0]], means=torch.tensor([[0.0, 0, 60.0]]))
@@ -79,7 +79,7 @@ def test_what_no_photo_shows_shrinks_and_stays_as_opaque(target):
     torch.testing.assert_close(after.opacities[-1:], unseen.opacities)
 
 
-def test_exposure_that_goes_with_the_place_is_left_to_the_harmonics():
+def test_exposure_excludes_parts_linear_in_the_camera_pose():
     """Light that grows to one side is view-dependent colour; a single photo taken too dark is not."""
     cameras = ring(40, 48)
     own = photometric._exposure_projection(cameras).double()
@@ -93,12 +93,12 @@ def test_exposure_that_goes_with_the_place_is_left_to_the_harmonics():
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 7])
-def test_few_photos_may_differ_in_exposure(count):
+def test_exposure_projection_for_few_photos(count):
     own = photometric._exposure_projection(ring(count, 48))
     assert own.isfinite().all() and round(float(own.trace())) == count - 1 - count // 4
 
 
-def test_what_was_lost_is_dropped():
+def test_invisible_and_transparent_gaussians_are_pruned():
     true = random_gaussians(60, seed=2)
     cameras = ring(4, 48)
     views = photographed(true, cameras)
@@ -112,7 +112,7 @@ def test_what_was_lost_is_dropped():
     assert done.means[:, 2].max() < 10
 
 
-def test_splitting_keeps_the_mass_and_shrinks_the_halves():
+def test_split_halves_are_symmetric_and_smaller():
     start = random_gaussians(100, seed=3)
     fit = photometric._Fit.start(start, ring(1, 48), 1.0)
     pull = torch.zeros(100)

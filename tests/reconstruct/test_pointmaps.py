@@ -17,18 +17,18 @@ def recorded(shared, name: str) -> dict[str, torch.Tensor]:
     return {key: torch.from_numpy(np.array(data[key])) for key in data}
 
 
-def test_intrinsics_as_the_published_code_fits_them(shared):
+def test_intrinsics_equal_the_published_code(shared):
     d = recorded(shared, "solve_intrinsics")
     K = pointmaps.solve_intrinsics(d["in/local_points"][0], centre=0.0)
     torch.testing.assert_close(K, d["out/K"][0], rtol=1e-4, atol=1e-5)
 
 
-def test_edges_as_the_published_code_finds_them(shared):
+def test_depth_edges_equal_the_published_code(shared):
     d = recorded(shared, "depth_edge")
     assert torch.equal(pointmaps.depth_edges(d["in/depth"][0]), d["out/edge"][0])
 
 
-def test_intrinsics_of_true_points_are_the_cameras_and_outliers_can_be_left_out():
+def test_intrinsics_of_true_points_with_masked_outliers():
     cameras = arc(2, (56, 42))
     geometry = truth(cameras, 3.0)
     torch.testing.assert_close(pointmaps.solve_intrinsics(geometry.points[0]), cameras.Ks[0], rtol=1e-4, atol=1e-3)
@@ -40,7 +40,7 @@ def test_intrinsics_of_true_points_are_the_cameras_and_outliers_can_be_left_out(
     torch.testing.assert_close(pointmaps.solve_intrinsics(wrong, sure), cameras.Ks[0], rtol=1e-4, atol=1e-3)
 
 
-def test_a_view_with_nothing_to_fit_takes_the_usual_focal_length():
+def test_view_without_confident_pixels_gets_median_intrinsics():
     cameras = arc(3, (56, 42))
     geometry = truth(cameras, 1.0)
     sure = pointmaps.confident_pixels(geometry)
@@ -49,7 +49,7 @@ def test_a_view_with_nothing_to_fit_takes_the_usual_focal_length():
     torch.testing.assert_close(Ks, intrinsics(56, 42, 1.2 * 56).expand(3, 3, 3), rtol=1e-3, atol=0.05)
 
 
-def test_true_depth_is_confirmed_and_a_wrong_view_is_not():
+def test_only_true_depth_is_supported():
     cameras = arc(4, (84, 56), sweep=30.0)
     geometry = truth(cameras, 2.0)
     found = pointmaps.cameras_from_pointmaps(geometry, pointmaps.confident_pixels(geometry), cameras.names)
@@ -62,7 +62,7 @@ def test_true_depth_is_confirmed_and_a_wrong_view_is_not():
     assert (maps[0].support[~pointmaps.confident_pixels(geometry)[0]] == 0).all()
 
 
-def test_what_is_unsure_or_at_an_edge_is_not_trusted():
+def test_unconfident_pixels_and_edges_are_excluded():
     depth = torch.ones(1, 20, 20)
     depth[:, :, 10:] = 2.0
     confidence = torch.full((1, 20, 20), 0.9)
@@ -77,12 +77,12 @@ def test_what_is_unsure_or_at_an_edge_is_not_trusted():
     ("photo", "expected"),
     [((448, 448), (448, 448)), ((4000, 4000), (448, 448)), ((100, 60), (98, 56)), ((3, 3), (14, 14))],
 )
-def test_sizes_of_the_network(photo, expected):
+def test_network_sizes(photo, expected):
     assert network_input.network_size(*photo) == expected
 
 
 @pytest.mark.parametrize("photo", [(640, 480), (1024, 683), (576, 1024), (1500, 200)])
-def test_sizes_are_multiples_of_a_patch_as_large_as_allowed_and_in_proportion(photo):
+def test_network_sizes_are_patch_multiples_near_the_limit(photo):
     width, height = network_input.network_size(*photo)
     assert width % 14 == height % 14 == 0
     assert 0.9 * 201_000 < width * height <= 201_000
@@ -90,7 +90,7 @@ def test_sizes_are_multiples_of_a_patch_as_large_as_allowed_and_in_proportion(ph
     assert max(network_input.network_size(*photo, longest=300)) <= 300
 
 
-def test_photos_of_different_shape_show_their_middle(tmp_path):
+def test_crops_keep_the_image_centre(tmp_path):
     wide, tall = torch.zeros(60, 100, 3, dtype=torch.uint8), torch.zeros(100, 60, 3, dtype=torch.uint8)
     wide[29:31, 49:51] = 255
     tall[49:51, 29:31] = 255

@@ -17,7 +17,7 @@ def as_photos(cameras, folder) -> Photos:
     return Photos(images, cameras.names, (0.0,) * len(images), folder)
 
 
-def test_blank_photos_are_refused_in_one_sentence(tmp_path):
+def test_blank_photos_are_refused(tmp_path):
     blank = Photos(
         tuple(torch.full((120, 160, 3), 128, dtype=torch.uint8) for _ in range(4)),
         tuple("abcd"), (0.0,) * 4, tmp_path / "photos",
@@ -26,7 +26,7 @@ def test_blank_photos_are_refused_in_one_sentence(tmp_path):
         sfm.estimate_cameras(blank)
 
 
-def test_cameras_of_a_ray_cast_scene_are_recovered(tmp_path):
+def test_cameras_of_a_ray_cast_scene(tmp_path):
     true = arc(6, (320, 240))
     model = sfm.estimate_cameras(as_photos(true, tmp_path))
     assert model.cameras.names == true.names
@@ -56,27 +56,27 @@ def test_known_cameras_are_kept_and_give_points_on_the_surfaces(tmp_path):
     assert model.points[outside, 2].abs().median() < 0.003
 
 
-def test_cameras_of_other_photos_are_noticed(tmp_path):
+def test_cameras_that_do_not_fit_the_photos_are_refused(tmp_path):
     cameras = arc(4, (240, 180), sweep=40.0)
     photos = as_photos(cameras, tmp_path)
     with pytest.raises(InputError, match="the given cameras are .* px off"):
         sfm.triangulate(photos, cameras[[3, 2, 1, 0]], LensDistortion(torch.zeros(4, 5)))
 
 
-def test_matches_that_no_cameras_explain_are_put_down_to_a_repeated_pattern():
+def test_failure_reason_by_number_of_pairs():
     assert "overlap too little" in sfm._failure_reason(photos=24, pairs=30)  # each with the next, and little more
     assert "a pattern repeats" in sfm._failure_reason(photos=24, pairs=162)  # a checked tablecloth seen from all sides
     assert "overlap too little" in sfm._failure_reason(photos=3, pairs=3)
 
 
-def test_mutual_matches_by_hand():
+def test_mutual_matches():
     a = torch.nn.functional.normalize(torch.tensor([[1.0, 0, 0], [0, 1, 0], [1, 1, 0.01]]), dim=1)
     b = torch.nn.functional.normalize(torch.tensor([[0.02, 1, 0], [1, 0.01, 0], [0, 0, 1.0]]), dim=1)
     # the third of a lies between two of b, which the ratio test refuses
     assert features.match_descriptors(a, b).tolist() == [[0, 1], [1, 0]]
 
 
-def test_many_photos_are_not_all_compared(monkeypatch):
+def test_pairs_of_many_photos_are_neighbours_and_similar_photos(monkeypatch):
     monkeypatch.setattr(features, "MAX_EXHAUSTIVE", 10)
     generator = torch.Generator().manual_seed(0)
     found = [torch.nn.functional.normalize(torch.randn(30, 16, generator=generator), dim=1) for _ in range(40)]
@@ -87,7 +87,7 @@ def test_many_photos_are_not_all_compared(monkeypatch):
     assert len(chosen) < 40 * 39 / 4
 
 
-def test_pairs_grow_with_the_number_of_photos_even_where_all_look_alike(monkeypatch):
+def test_number_of_pairs_is_linear_even_if_all_photos_are_similar(monkeypatch):
     monkeypatch.setattr(features, "MAX_EXHAUSTIVE", 20)
     n, generator = 60, torch.Generator().manual_seed(0)
     same = torch.nn.functional.normalize(torch.randn(30, 16, generator=generator), dim=1)
@@ -96,7 +96,7 @@ def test_pairs_grow_with_the_number_of_photos_even_where_all_look_alike(monkeypa
     assert len(features.select_pairs([same] * 20)) == 20 * 19 / 2
 
 
-def test_distortion_is_undone(tmp_path):
+def test_undistortion_straightens_lines(tmp_path):
     # Straight lines of a chart seen through k1 = -0.2 become straight again.
     size, K = (200, 150), torch.tensor([[180.0, 0, 100], [0, 180, 75], [0, 0, 1]])
     y, x = torch.meshgrid(torch.arange(150) + 0.5, torch.arange(200) + 0.5, indexing="ij")

@@ -41,7 +41,7 @@ def displaced(points, viewmats, seed: int):
 
 @pytest.mark.parametrize("cameras", [one_sided(), all_round()], ids=["side", "ring"])
 @pytest.mark.parametrize("seed", [0, 1])
-def test_the_table_becomes_level_at_zero(cameras, seed):
+def test_table_is_horizontal_at_zero(cameras, seed):
     points, viewmats, move = displaced(tabletop(), cameras, seed)
     focus = move(torch.tensor([0.0, 0, 0.1]))
     ground = world_frame.refine_ground(world_frame.find_ground(points, viewmats, focus, seed), points, seed)
@@ -53,7 +53,7 @@ def test_the_table_becomes_level_at_zero(cameras, seed):
     assert abs(float(table[:, 2].mean())) < 0.002
 
 
-def test_patterned_tops_do_not_tilt_a_bare_table():
+def test_textured_objects_do_not_tilt_the_plane():
     # A keyboard and a book, 15 and 35 mm high, with ten times the points of the table that they lie on.
     generator = torch.Generator().manual_seed(0)
     rand = lambda n: torch.rand(n, 3, generator=generator) - 0.5  # noqa: E731
@@ -81,13 +81,13 @@ def test_focus_scale_and_heading():
     assert torch.det(world.rotation) > 0.999
 
 
-def test_given_cameras_keep_their_metres():
+def test_scale_of_given_cameras_is_kept():
     points, viewmats, move = displaced(tabletop(), one_sided(), 3)
     ground = world_frame.find_ground(points, viewmats, move(torch.tensor([0.0, 0, 0.1])))
     assert world_frame.to_world(ground, points, viewmats, metric=True).scale == 1.0
 
 
-def test_a_wall_is_not_a_floor():
+def test_wall_is_not_a_floor():
     # An object on a wall, seen by level cameras: no plane may be called the floor, and up is the cameras' own.
     generator = torch.Generator().manual_seed(0)
     wall = torch.rand(5000, 3, generator=generator) * torch.tensor([2.0, 0, 2]) + torch.tensor([-1.0, 1, -1])
@@ -99,7 +99,7 @@ def test_a_wall_is_not_a_floor():
     assert float(ground.up[2]) > 0.999
 
 
-def test_level_cameras_all_round_say_which_way_is_up():
+def test_up_from_cameras_without_roll():
     ring = orbit(8, torch.zeros(3), 2.0, elevation=50.0)
     assert float(world_frame.up_from_cameras(ring)[2]) > 0.9999
 

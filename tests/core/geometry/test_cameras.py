@@ -15,7 +15,7 @@ def test_projection_agrees_with_opencv():
     np.testing.assert_allclose(project(points, viewmat, K).numpy(), theirs[:, 0], rtol=0, atol=1e-4)
 
 
-def test_look_at_puts_the_target_ahead_and_up_upwards():
+def test_look_at_centres_the_target_with_up_upwards():
     viewmat = look_at(torch.tensor([2.0, 0, 1]), torch.tensor([0.0, 0, 1]))
     torch.testing.assert_close(depths(torch.tensor([[0.0, 0, 1]]), viewmat), torch.tensor([2.0]))
     above = project(torch.tensor([[0.0, 0, 1.5]]), viewmat, intrinsics(100, 100, 100.0))
@@ -23,13 +23,13 @@ def test_look_at_puts_the_target_ahead_and_up_upwards():
     torch.testing.assert_close(centres(viewmat[None]), torch.tensor([[2.0, 0, 1]]))
 
 
-def test_resize_keeps_the_picture_in_place():
+def test_resized_intrinsics():
     # a quarter of the way across stays a quarter of the way across
     K = resize(intrinsics(200, 100, 150.0), 0.5, 0.5)
     torch.testing.assert_close(K, intrinsics(100, 50, 75.0))
 
 
-def test_orbit_equals_the_recorded_cameras_of_the_public_code(shared):
+def test_orbit_equals_the_public_code(shared):
     data = np.load(shared / "facts/ngff_parity/orbit_cameras.npz")
     viewmats = orbit(100, torch.tensor([0.0, 0, -0.3]), 4.0, 20.0)
     np.testing.assert_allclose(centres(viewmats).numpy(), data["dynamic/position"], atol=1e-4)

@@ -26,7 +26,7 @@ def test_basis_agrees_with_scipy_up_to_convention():
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_turned_coefficients_show_the_old_colour_in_the_turned_direction(degree):
+def test_rotated_coefficients_give_the_same_colour_in_the_rotated_direction(degree):
     rng = torch.Generator().manual_seed(2)
     sh = torch.randn(50, (degree + 1) ** 2, 3, generator=rng, dtype=torch.float64)
     R = matrix(torch.randn(50, 4, generator=rng, dtype=torch.float64))
@@ -34,6 +34,6 @@ def test_turned_coefficients_show_the_old_colour_in_the_turned_direction(degree)
     torch.testing.assert_close(evaluate_sh(rotate_sh(sh, R), (R @ dirs[..., None])[..., 0]), evaluate_sh(sh, dirs))
 
 
-def test_degree_zero_is_the_colour():
+def test_degree_zero_is_constant_colour():
     rgb = torch.rand(5, 3)
     torch.testing.assert_close(evaluate_sh(rgb_to_sh(rgb), random_dirs(5).float()), rgb)

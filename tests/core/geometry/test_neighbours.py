@@ -15,7 +15,7 @@ def cloud():
 
 
 @pytest.mark.parametrize("k", [1, 32])
-def test_products_find_what_the_tree_finds(cloud, k, monkeypatch):
+def test_brute_force_equals_the_tree(cloud, k, monkeypatch):
     monkeypatch.setattr(BruteForce, "MAX_ENTRIES", 100_000)  # several chunks
     points, queries = cloud
     (far, which), (expected, index) = (way(points).query(queries, k) for way in (BruteForce, KDTree))
@@ -24,27 +24,27 @@ def test_products_find_what_the_tree_finds(cloud, k, monkeypatch):
     torch.testing.assert_close((queries[..., None, :] - points[which]).norm(dim=3), far)
 
 
-def test_products_keep_the_precision_of_the_queries(cloud):
+def test_brute_force_keeps_the_precision_of_the_queries(cloud):
     points, queries = cloud[0], cloud[1].double()
     (far, _), (expected, _) = (way(points).query(queries) for way in (BruteForce, KDTree))
     torch.testing.assert_close(far, expected, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("way", [KDTree, BruteForce])
-def test_what_is_not_within_reach_is_infinitely_far(way):
+def test_distance_beyond_the_limit_is_infinite(way):
     line = torch.tensor([[0.0, 0, 0], [1, 0, 0], [3, 0, 0]])
     distance, index = way(line).query(torch.tensor([[0.1, 0, 0], [9, 0, 0]]), 4, within=1.5)
     torch.testing.assert_close(distance, torch.tensor([[0.1, 0.9, inf, inf], [inf] * 4]))
     assert index[0, :2].tolist() == [0, 1] and bool((index < 3).all())
 
 
-def test_points_on_the_cpu_are_searched_by_a_tree(cloud):
+def test_tree_for_points_on_the_cpu(cloud):
     assert isinstance(neighbour_index(cloud[0]), KDTree)
 
 
 @pytest.mark.gpu
 @pytest.mark.skipif("cuda" not in DEVICES, reason="no NVIDIA GPU")
-def test_points_on_a_gpu_are_searched_there(cloud):
+def test_brute_force_for_points_on_a_gpu(cloud):
     points, queries = (x.cuda() for x in cloud)
     found = neighbour_index(points)
     assert isinstance(found, BruteForce)
@@ -63,7 +63,7 @@ def test_knn_equals_brute_force():
     assert torch.equal(index, expected.indices)
 
 
-def test_too_few_points_repeat_the_last():
+def test_fewer_points_than_k_repeat_the_last():
     distance, index = knn(torch.tensor([[0.0, 0, 0], [1, 0, 0]]), torch.zeros(1, 3), 4)
     assert index.tolist() == [[0, 1, 1, 1]]
     assert distance.tolist() == [[0, 1, 1, 1]]

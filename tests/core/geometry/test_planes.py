@@ -21,7 +21,7 @@ def points_on(normal, offset: float, n: int, noise: float, seed: int = 0):
     return points + normal * (offset + noise * torch.randn(n, 1, generator=generator)), normal
 
 
-def test_three_points_of_the_floor():
+def test_plane_through_three_points():
     normals, offsets = planes_through(torch.tensor([[[0.0, 0, 2], [1, 0, 2], [0, 1, 2]]]))
     torch.testing.assert_close(normals, torch.tensor([[0.0, 0, 1]]))
     torch.testing.assert_close(offsets, torch.tensor([2.0]))
@@ -40,14 +40,14 @@ def test_least_squares_on_a_noisy_plane():
     assert abs(abs(plane.offset) - 0.7) < 0.002
 
 
-def test_weights_decide_between_two_planes():
+def test_weighted_fit():
     low, _ = points_on([0.0, 0, 1], 0.0, 200, 0.0)
     high, _ = points_on([0.0, 0, 1], 1.0, 200, 0.0)
     weights = torch.cat([torch.ones(200), torch.full((200,), 1e-6)])
     assert abs(fit_plane(torch.cat([low, high]), weights).offset) < 1e-4
 
 
-def test_ransac_finds_the_plane_among_half_outliers():
+def test_ransac_with_half_outliers():
     points, normal = points_on([1.0, -1, 4], -0.2, 1000, 0.005)
     outliers = 4 * torch.rand(1000, 3, generator=torch.Generator().manual_seed(1)) - 2
     plane, inside = ransac(torch.cat([points, outliers]), 0.02, allowed=lambda n: n[:, 2] > 0)
@@ -57,7 +57,7 @@ def test_ransac_finds_the_plane_among_half_outliers():
     assert inside[1000:].float().mean() < 0.05  # a slab of 0.04 crosses a cube of side 4
 
 
-def test_a_larger_plane_that_is_not_allowed_loses():
+def test_larger_plane_with_forbidden_normal_is_rejected():
     wall, _ = points_on([1.0, 0, 0], 0.0, 2000, 0.0)
     floor, up = points_on([0.0, 0, 1], -1.0, 300, 0.0)
     plane, _ = ransac(torch.cat([wall, floor]), 0.01, allowed=lambda n: n[:, 2] > 0.9)
@@ -71,5 +71,5 @@ def test_the_same_seed_gives_the_same_plane():
 
 
 @pytest.mark.parametrize("points", [torch.zeros(2, 3), torch.zeros(50, 3)], ids=["two points", "one place"])
-def test_no_plane_through_too_little(points):
+def test_no_plane_for_too_few_points(points):
     assert ransac(points, 0.01) is None

@@ -25,7 +25,7 @@ def test_multiply_is_composition():
     torch.testing.assert_close(matrix(multiply(a, b)), matrix(a) @ matrix(b))
 
 
-def test_between_turns_one_direction_into_the_other_also_when_opposite():
+def test_rotation_between_directions_also_opposite_ones():
     for a, b in [((0.0, 0, 1), (0.0, 1, 1)), ((0.0, 0, 1), (0.0, 0, -1))]:
         a, b = torch.tensor(a), torch.tensor(b)
         R = rotation_between(a, b)
@@ -33,7 +33,7 @@ def test_between_turns_one_direction_into_the_other_also_when_opposite():
         torch.testing.assert_close(torch.det(R), torch.tensor(1.0))
 
 
-def test_nearest_rotation_undoes_a_stretch():
+def test_nearest_rotation_removes_a_stretch():
     R = matrix(random_quats(10))
     stretch = torch.diag(torch.tensor([1.5, 1.0, 0.5], dtype=torch.float64))
     torch.testing.assert_close(nearest_rotation(R @ stretch), R)

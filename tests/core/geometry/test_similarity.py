@@ -16,7 +16,7 @@ def test_umeyama_recovers_a_known_similarity():
     torch.testing.assert_close(found.translation, TURN.translation)
 
 
-def test_moved_cameras_see_the_moved_world_in_the_same_pixels():
+def test_transformed_cameras_project_the_transformed_world_to_the_same_pixels():
     points = torch.randn(20, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     viewmat, K = look_at(torch.tensor([6.0, 1, 2]), torch.zeros(3)).double(), intrinsics(64, 64, 80.0).double()
     moved = TURN.viewmats(viewmat[None])[0]

@@ -35,12 +35,12 @@ def test_real_reference_cameras_are_read(shared):
 
 
 @pytest.mark.parametrize("text", ["{}", '{"frames": []}', "[1]", "nonsense"])
-def test_other_json_gets_one_sentence(tmp_path, text):
+def test_other_json_is_refused(tmp_path, text):
     (tmp_path / "c.json").write_text(text)
     with pytest.raises(InputError, match="not a nerfstudio transforms file"):
         read_cameras(tmp_path / "c.json")
 
 
-def test_a_folder_without_a_model(tmp_path):
+def test_folder_without_a_colmap_model_is_refused(tmp_path):
     with pytest.raises(InputError, match="no COLMAP model"):
         read_cameras(tmp_path)

@@ -19,7 +19,7 @@ from stages.core.scene.images import (
 )
 
 
-def test_png_round_trip_keeps_red_red(tmp_path):
+def test_png_round_trip_keeps_the_channel_order(tmp_path):
     image = torch.zeros(4, 6, 3)
     image[..., 0] = 1.0
     write_png(tmp_path / "a.png", image)
@@ -29,24 +29,24 @@ def test_png_round_trip_keeps_red_red(tmp_path):
 
 @pytest.mark.parametrize("pixels", [np.full((3, 3), 128, np.uint8), np.full((3, 3, 4), 128, np.uint8),
                                     np.full((3, 3, 3), 32896, np.uint16)], ids=["grey", "alpha", "16 bit"])  # fmt: skip
-def test_other_kinds_of_pixels_become_rgb_floats(tmp_path, pixels):
+def test_grey_alpha_and_16_bit_images_are_read_as_rgb(tmp_path, pixels):
     cv2.imwrite(str(tmp_path / "a.png"), pixels)
     torch.testing.assert_close(read_image(tmp_path / "a.png"), torch.full((3, 3, 3), 128 / 255))
 
 
-def test_labels_round_trip_beyond_eight_bits(tmp_path):
+def test_label_round_trip_with_16_bits(tmp_path):
     labels = torch.tensor([[0, 1], [300, 2]])
     write_labels(tmp_path / "l.png", labels)
     assert torch.equal(read_labels(tmp_path / "l.png"), labels)
 
 
-def test_only_photos_are_listed(tmp_path):
+def test_list_photos_skips_other_and_hidden_files(tmp_path):
     for name in ("b.JPG", "a.png", "notes.txt", ".hidden.png"):
         (tmp_path / name).touch()
     assert [p.name for p in list_photos(tmp_path)] == ["a.png", "b.JPG"]
 
 
-def test_video_is_what_browsers_play(tmp_path):
+def test_video_is_h264_with_leading_index(tmp_path):
     path = tmp_path / "v.mp4"
     shades = [0.2, 0.5, 0.8]
     with VideoWriter(path, fps=50.0) as video:
@@ -63,7 +63,7 @@ def test_video_is_what_browsers_play(tmp_path):
 
 
 @pytest.mark.parametrize("reader", [read_image, read_labels, lambda path: next(read_video(path))])
-def test_a_file_that_is_no_picture(tmp_path, reader):
+def test_file_that_is_no_image_is_refused(tmp_path, reader):
     path = tmp_path / "x.png"
     path.write_bytes(b"nonsense" * 50)
     with pytest.raises(InputError, match="can be read|is damaged"):
@@ -71,7 +71,7 @@ def test_a_file_that_is_no_picture(tmp_path, reader):
 
 
 @pytest.mark.parametrize("reader", [read_image, read_labels])
-def test_a_picture_with_too_many_pixels_is_named(tmp_path, reader):
+def test_image_with_too_many_pixels_is_refused(tmp_path, reader):
     path = tmp_path / "x.png"
     write_png(path, torch.zeros(4, 4, 3))
     data = path.read_bytes()

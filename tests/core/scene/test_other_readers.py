@@ -16,7 +16,7 @@ pytestmark = pytest.mark.skipif(TOOL is None, reason="splat-transform is not ins
 
 
 @pytest.mark.parametrize("degree", [0, 2])
-def test_splat_transform_reads_what_we_write(tmp_path, degree):
+def test_splat_transform_reads_our_files(tmp_path, degree):
     g = random_gaussians(50, degree=degree)
     write_scene(tmp_path / "scene.ply", Scene(g))
     subprocess.run([TOOL, tmp_path / "scene.ply", tmp_path / "out.csv"], check=True, capture_output=True)
@@ -33,7 +33,7 @@ def test_splat_transform_reads_what_we_write(tmp_path, degree):
         assert np.allclose(np.stack([table[f"f_rest_{i}"] for i in range(len(rest))], 1), ours, atol=1e-6)
 
 
-def test_we_read_what_splat_transform_packs(tmp_path):
+def test_packed_file_of_splat_transform_is_read(tmp_path):
     g = random_gaussians(300)
     write_scene(tmp_path / "scene.ply", Scene(g))
     packed = tmp_path / "scene.compressed.ply"

@@ -22,7 +22,7 @@ def test_round_trip_of_gaussians(tmp_path, degree):
         torch.testing.assert_close(getattr(back, field.name), getattr(g, field.name), rtol=1e-5, atol=1e-6)
 
 
-def test_round_trip_of_facts(tmp_path, two_balls):
+def test_round_trip_of_metadata(tmp_path, two_balls):
     scale = {"metres_per_unit": 0.5, "source": "known"}
     scene = dataclasses.replace(two_balls, scale=scale, provenance={"seed": 1}, background=(0.2, 0.4, 0.6))
     write_scene(tmp_path / "s.ply", scene)
@@ -33,7 +33,7 @@ def test_round_trip_of_facts(tmp_path, two_balls):
     assert back.cameras.names == scene.cameras.names
 
 
-def test_stored_values_are_those_of_the_standard_layout(tmp_path):
+def test_stored_values_follow_the_standard_layout(tmp_path):
     """Logits, logarithms and channel-major f_rest, read with plyfile alone."""
     g = random_gaussians(4, degree=1)
     write_scene(tmp_path / "s.ply", Scene(g))
@@ -46,7 +46,7 @@ def test_stored_values_are_those_of_the_standard_layout(tmp_path):
 
 
 @pytest.mark.parametrize("order", ["<", ">"])
-def test_reads_other_peoples_files(tmp_path, order):
+def test_files_of_other_tools_are_read(tmp_path, order):
     """No normals, an extra property, either byte order, quaternions of any length."""
     names = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2",
              "rot_0", "rot_1", "rot_2", "rot_3", "confidence"]  # fmt: skip
@@ -60,7 +60,7 @@ def test_reads_other_peoples_files(tmp_path, order):
     assert (scene.floor, scene.objects, scene.cameras) == (None, (), None)
 
 
-def test_the_packed_layout_decodes_to_the_same_gaussians(shared):
+def test_packed_layout_decodes_to_the_same_gaussians(shared):
     plain = read_scene(shared / "data/splats/guitar.ply").gaussians
     packed = read_scene(shared / "data/splats/guitar.compressed.ply").gaussians
     for name in ("means", "scales", "opacities", "sh"):
@@ -69,7 +69,7 @@ def test_the_packed_layout_decodes_to_the_same_gaussians(shared):
     torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-6)
 
 
-def test_rows_that_are_not_finite_are_dropped_and_counted(tmp_path, caplog):
+def test_non_finite_rows_are_dropped_and_counted(tmp_path, caplog):
     g = random_gaussians(5)
     g.means[2, 0] = torch.nan
     write_scene(tmp_path / "s.ply", Scene(g))
@@ -92,13 +92,13 @@ def wrong_files(folder):
     [("empty.ply", "is empty"), ("text.ply", "not a readable PLY"), ("points.ply", "plain point cloud"),
      ("cut.ply", "not a readable PLY"), ("absent.ply", "no such file"), (".", "is a folder")],
 )  # fmt: skip
-def test_wrong_files_get_one_sentence(tmp_path, name, says):
+def test_invalid_files_are_refused_in_one_line(tmp_path, name, says):
     with pytest.raises(InputError, match=says) as caught:
         read_scene(wrong_files(tmp_path) / name)
     assert "\n" not in str(caught.value) and str(tmp_path) in str(caught.value)
 
 
-def test_a_failed_write_leaves_the_old_file_and_no_litter(tmp_path, two_balls, monkeypatch):
+def test_failed_write_keeps_the_old_file(tmp_path, two_balls, monkeypatch):
     path = tmp_path / "s.ply"
     write_scene(path, two_balls)
     before = path.read_bytes()

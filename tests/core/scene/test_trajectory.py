@@ -39,7 +39,7 @@ def test_round_trip(tmp_path, two_balls):
     assert torch.equal(t.com[:, 0, 0], torch.tensor([0.0, 1, 2]))
 
 
-def test_a_stop_by_the_physics_keeps_the_frames_that_were_written(tmp_path, two_balls):
+def test_input_error_keeps_the_written_frames(tmp_path, two_balls):
     motion, keypoints, binding = parts(two_balls)
     with (
         pytest.raises(InputError, match="escaped"),
@@ -51,7 +51,7 @@ def test_a_stop_by_the_physics_keeps_the_frames_that_were_written(tmp_path, two_
     assert len(read_trajectory(tmp_path / "t.partial.h5")) == 1
 
 
-def test_an_interrupted_run_leaves_nothing(tmp_path, two_balls):
+def test_interrupted_write_leaves_no_file(tmp_path, two_balls):
     motion, keypoints, binding = parts(two_balls)
     with (
         pytest.raises(KeyboardInterrupt),
@@ -83,7 +83,7 @@ def damage(path, scene, how: str):
     [("text", "not a readable HDF5"), ("format", "format attribute"), ("part", "missing"), ("nan", "not finite"),
      ("frames", "other datasets need")],
 )  # fmt: skip
-def test_damaged_files_get_one_sentence(tmp_path, two_balls, how, says):
+def test_damaged_files_are_refused_in_one_line(tmp_path, two_balls, how, says):
     damage(tmp_path / "t.h5", two_balls, how)
     with pytest.raises(InputError, match=says) as caught:
         read_trajectory(tmp_path / "t.h5")

@@ -1,1 +1,1 @@
-"""Engines, materials and force prompts shared by simulate and by dataset making."""
+"""Particles, materials, force prompts, skinning and the MPM solver, shared by the engines and the data set."""

@@ -1,6 +1,6 @@
-"""Solids in the way of particles: half-spaces, balls and boxes, still or moving as prescribed.
+"""Rigid colliders of the MPM solver: half-spaces, spheres and boxes, fixed or with prescribed motion.
 
-A collider needs to be at least four cells thick: the outermost cell of it is left to the bodies that rest on it.
+A collider must be at least four grid cells thick: its outermost cell belongs to the bodies in contact with it.
 """
 
 from __future__ import annotations
@@ -21,17 +21,21 @@ Vector = tuple[float | int, float | int, float | int]
 
 @dataclass(frozen=True)
 class Collider:
-    """What touches it may `separate` again, with friction; `slip` along it but not leave; or be `sticky`, and stay."""
+    """A rigid obstacle. Raises InputError for an unknown kind or surface and for coefficients out of range.
+
+    Bodies in contact may `separate` again, with Coulomb friction; `slip` without friction or separation; or stick to a
+    `sticky` surface.
+    """
 
     kind: str  # plane, sphere or box
     centre: Vector  # [m]; any point of the plane
-    size: Vector = (0.0, 0.0, 0.0)  # half edges of a box; the first is the radius of a sphere [m]
+    size: Vector = (0.0, 0.0, 0.0)  # half edges of a box, radius of a sphere first [m]
     rotation: tuple[float | int, float | int, float | int, float | int] = (1.0, 0.0, 0.0, 0.0)  # to world, w x y z
     velocity: Vector = (0.0, 0.0, 0.0)  # [m/s]
     angular_velocity: Vector = (0.0, 0.0, 0.0)  # about the centre [rad/s]
     surface: str = "separate"
     friction: float = 0.5  # Coulomb coefficient
-    restitution: float = 0.0  # 0: a body bounces by its own elasticity; up to 1: this gives back that share of speed
+    restitution: float = 0.0  # fraction of normal speed returned; 0: only the body's own elasticity
 
     def __post_init__(self):
         for what, value, table in (("kind", self.kind, KINDS), ("surface", self.surface, SURFACES)):
@@ -52,14 +56,14 @@ class Collider:
 
 
 def _product(a: tuple, b: tuple) -> tuple[float, float, float, float]:
-    """Quaternion a b, w x y z."""
+    """Quaternion product a b, w x y z."""
     (aw, ax, ay, az), (bw, bx, by, bz) = a, b
     return (aw * bw - ax * bx - ay * by - az * bz, aw * bx + ax * bw + ay * bz - az * by,
             aw * by - ax * bz + ay * bw + az * bx, aw * bz + ax * by - ay * bx + az * bw)  # fmt: skip
 
 
 def as_obstacles(colliders: Sequence[Collider], device: str) -> wp.array:
-    """For the kernels; of length 0 when there are none."""
+    """Colliders as an array for the kernels; empty if there are none."""
     rows = []
     for c in colliders:
         o = mpm_grid.Obstacle()

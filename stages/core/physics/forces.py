@@ -1,7 +1,7 @@
-"""Force prompts: pushes, pins, velocities and lifts, the same for every engine.
+"""Force prompts: forces, pins, initial velocities and lifts, the same for every engine.
 
-Forces are in newtons, torques in newton metres, times in seconds; places, velocities and lifts in scene units.
-The public JSON format, {scene name: [{obj_id, start, end, force?, torque?}]}, counts obj_id from 0: its object i is
+Forces are in newtons, torques in newton metres, times in seconds; points, velocities and lifts in scene units.
+The JSON format of NGFF, {scene name: [{obj_id, start, end, force?, torque?}]}, counts obj_id from 0: its object i is
 object i + 1 here, where 0 is the background.
 """
 
@@ -19,39 +19,39 @@ from stages.core.scene.files import must_exist
 from stages.core.scene.scene import SceneObject
 
 Vector = tuple[float, float, float]
-FORCE = 'write "object=2 force=0,0,8 from=0.1 to=0.3", with torque=x,y,z or at=x,y,z if you like'
+FORCE_SYNTAX = 'write "object=2 force=0,0,8 from=0.1 to=0.3", optionally with torque=x,y,z or at=x,y,z'
 
 
 @dataclass(frozen=True)
 class Force:
-    """A steady push from `start` until `end` [s]."""
+    """A constant force and torque on an object from `start` to `end` [s]."""
 
     object_id: int
     force: Vector = (0.0, 0.0, 0.0)  # [N]
     torque: Vector = (0.0, 0.0, 0.0)  # about the centre of mass [N m]
     start: float = 0.0
     end: float = math.inf
-    at: Vector | None = None  # where on the object at rest [scene units]; None: on the whole of it
+    at: Vector | None = None  # point of application on the object at rest [scene units]; None: the whole object
 
     def active_fraction(self, start: float, end: float) -> float:
-        """Share of the time from `start` to `end` in which it acts."""
+        """Fraction of the time from `start` to `end` [s] during which it acts."""
         return max(0.0, min(self.end, end) - max(self.start, start)) / (end - start)
 
 
 @dataclass(frozen=True)
 class ForcePrompts:
-    """What the user wants to happen."""
+    """Forces and constraints given by the user; false if there are none. Objects by id."""
 
     forces: tuple[Force, ...] = ()
     pinned: frozenset[int] = frozenset()
     velocity: dict[int, Vector] = field(default_factory=dict)  # at the start [scene units/s]
-    lift: dict[int, float] = field(default_factory=dict)  # above where it was seen [scene units]
+    lift: dict[int, float] = field(default_factory=dict)  # initial displacement upwards [scene units]
 
     def __bool__(self) -> bool:
         return bool(self.forces or self.pinned or self.velocity or self.lift)
 
     def as_dicts(self) -> tuple[dict, ...]:
-        """For the trajectory file: one plain dict a prompt, `kind` first; an end that never comes is null."""
+        """One plain dict per prompt for the trajectory file, `kind` first; an infinite end time is None."""
         rows: list[dict] = []
         for f in self.forces:
             row = asdict(f)
@@ -66,12 +66,15 @@ def parse(
     objects: Sequence[SceneObject], scene_name: str = "", force: Sequence[str] = (), forces: Path | None = None,
     pin: Sequence[str] = (), velocity: Sequence[str] = (), lift: Sequence[str] = (),
 ) -> ForcePrompts:  # fmt: skip
-    """Prompts of the command line and of a forces file; objects are meant by id or by name."""
-    pushes = [_force(text, objects) for text in force]
+    """Parse the prompts of the command line and of a forces file; objects are given by id or name.
+
+    Raises InputError for malformed prompts and unknown objects.
+    """
+    parsed = [_force(text, objects) for text in force]
     if forces is not None:
-        pushes += read_forces(forces, scene_name, objects)
+        parsed += read_forces(forces, scene_name, objects)
     return ForcePrompts(
-        tuple(pushes),
+        tuple(parsed),
         frozenset(find_object(p, objects, f"--pin {p!r}").id for p in pin),
         dict(_velocity(text, objects) for text in velocity),
         {id: height for text in lift for id, height in _lift(text, objects)},
@@ -83,9 +86,9 @@ def _force(text: str, objects: Sequence[SceneObject]) -> Force:
     words = dict(word.partition("=")[::2] for word in text.split())
     unknown = words.keys() - {"object", "force", "torque", "from", "to", "at"}
     if unknown:
-        raise InputError(f"{where}: {sorted(unknown)[0]!r} is not understood; {FORCE}")
+        raise InputError(f"{where}: {sorted(unknown)[0]!r} is not a known key; {FORCE_SYNTAX}")
     if "object" not in words or not {"force", "torque"} & words.keys():
-        raise InputError(f"{where}: needs object= and force= or torque=; {FORCE}")
+        raise InputError(f"{where}: needs object= and force= or torque=; {FORCE_SYNTAX}")
     at = vector(words["at"], where) if "at" in words else None
     start = number(words.get("from", "0"), where)
     end = number(words["to"], where) if "to" in words else math.inf
@@ -117,7 +120,10 @@ def _lift(text: str, objects: Sequence[SceneObject]) -> list[tuple[int, float]]:
 
 
 def read_forces(path: Path, scene_name: str, objects: Sequence[SceneObject]) -> list[Force]:
-    """Forces of one scene from a file in the public format; a file of one scene fits any name."""
+    """Forces of one scene from a JSON file in the format of NGFF; a file of a single scene matches any name.
+
+    Raises InputError for malformed files and unknown objects.
+    """
     must_exist(path, "a JSON file {scene name: [{obj_id, start, end, force}]}")
     try:
         data = json.loads(Path(path).read_text())
@@ -129,10 +135,10 @@ def read_forces(path: Path, scene_name: str, objects: Sequence[SceneObject]) -> 
         data = data[scene_name] if scene_name in data else next(iter(data.values()))
     if not isinstance(data, list):
         raise InputError(f"{path}: must be {{scene name: [{{obj_id, start, end, force?, torque?}}]}}")
-    return [_public(row, objects, f"{path}: entry {i + 1}") for i, row in enumerate(data)]
+    return [_parse_entry(row, objects, f"{path}: entry {i + 1}") for i, row in enumerate(data)]
 
 
-def _public(row: object, objects: Sequence[SceneObject], where: str) -> Force:
+def _parse_entry(row: object, objects: Sequence[SceneObject], where: str) -> Force:
     try:
         id, start, end = int(row["obj_id"]) + 1, float(row["start"]), float(row["end"])
         push, torque = (_floats(row.get(name, [0, 0, 0])) for name in ("force", "torque"))
@@ -151,7 +157,7 @@ def _floats(values: Sequence[float | int | str]) -> Vector:
 
 
 def vector(text: str, where: str) -> Vector:
-    """Three numbers with commas between."""
+    """Three comma-separated numbers; `where` prefixes the InputError if malformed."""
     try:
         return _floats(text.split(","))
     except ValueError as error:
@@ -159,7 +165,7 @@ def vector(text: str, where: str) -> Vector:
 
 
 def number(text: str, where: str) -> float:
-    """One finite number."""
+    """One finite number; `where` prefixes the InputError if malformed."""
     try:
         value = float(text)
     except ValueError as error:

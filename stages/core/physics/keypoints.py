@@ -1,4 +1,4 @@
-"""Keypoints: points on the objects that carry their motion, and which of them each Gaussian follows."""
+"""Keypoints, which carry the motion of the objects, and the binding of Gaussians to them."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from stages.core.physics.particles import inliers, usable
 from stages.core.scene.scene import Scene
 from stages.core.scene.trajectory import Binding, Keypoints
 
-KEYPOINTS_PER_GAUSSIAN = 8  # keypoints that a Gaussian follows
-CANDIDATES = 30_000  # Gaussians among which keypoints are chosen
+KEYPOINTS_PER_GAUSSIAN = 8  # keypoints that each Gaussian follows
+MAX_CANDIDATES = 30_000  # Gaussians of an object among which keypoints are chosen
 
 
 def farthest_points(points: Float[Tensor, "n 3"], count: int, seed: int = 0) -> Int[Tensor, "k"]:
-    """Indices of min(count, n) points, each the farthest from those before it, from a random start.
+    """Indices of min(count, n) points, each the farthest from those before it, starting from a random point.
 
-    Source: Gonzalez 1985, "Clustering to minimize the maximum intercluster distance": within a factor of two of the
-    smallest possible radius of cover.
+    Source: Gonzalez 1985, "Clustering to minimize the maximum intercluster distance": within a factor of two
+    of the smallest possible covering radius.
     """
     count = min(count, len(points))
     chosen = torch.empty(count, dtype=torch.int64)
@@ -36,19 +36,22 @@ def farthest_points(points: Float[Tensor, "n 3"], count: int, seed: int = 0) -> 
 
 
 def choose_keypoints(scene: Scene, count: int, seed: int = 0) -> Keypoints:
-    """At most `count` keypoints an object, among its usable Gaussians without outliers; an empty object has none."""
+    """At most `count` keypoints per object, farthest-point samples of its usable Gaussians without outliers.
+
+    Objects without Gaussians get none.
+    """
     g = scene.gaussians.to("cpu")
-    fine = usable(g)
+    good = usable(g)
     rest, ids = [], []
     for o in scene.objects:
         mine = g.object_id == o.id
-        means = g.means[mine & fine] if bool((mine & fine).any()) else g.means[mine & g.means.isfinite().all(1)]
+        means = g.means[mine & good] if bool((mine & good).any()) else g.means[mine & g.means.isfinite().all(1)]
         if not len(means):
             continue
         means = means[inliers(means)]
-        if len(means) > CANDIDATES:
+        if len(means) > MAX_CANDIDATES:
             order = torch.randperm(len(means), generator=torch.Generator().manual_seed(seed))
-            means = means[order[:CANDIDATES]]
+            means = means[order[:MAX_CANDIDATES]]
         picked = means[farthest_points(means, count, seed)].unique(dim=0)
         rest.append(picked)
         ids.append(torch.full((len(picked),), o.id))
@@ -58,7 +61,7 @@ def choose_keypoints(scene: Scene, count: int, seed: int = 0) -> Keypoints:
 
 
 def bind_gaussians(scene: Scene, keypoints: Keypoints) -> Binding:
-    """Each Gaussian of an object follows its 8 nearest keypoints of that object; the background follows none."""
+    """Bind each Gaussian of an object to the 8 nearest keypoints of that object; the background is not bound."""
     g = scene.gaussians.to("cpu")
     index = torch.full((len(g), KEYPOINTS_PER_GAUSSIAN), -1, dtype=torch.int64)
     weight = torch.zeros(len(g), KEYPOINTS_PER_GAUSSIAN)
@@ -75,14 +78,15 @@ def bind_gaussians(scene: Scene, keypoints: Keypoints) -> Binding:
 def nearest_weights(
     points: Float[Tensor, "n 3"], queries: Float[Tensor, "m 3"], k: int
 ) -> tuple[Int[Tensor, "m k"], Float[Tensor, "m k"]]:
-    """The k nearest points of each query and weights that sum to one.
+    """The k nearest points of each query, and weights that sum to one.
 
-    (1 - (d / r)^2)^2 with r the distance to the next neighbour, so a point fades out before another takes its place.
+    Weights are (1 - (d / r)^2)^2 with r the distance to the (k+1)-th neighbour, so they are continuous where the set of
+    neighbours changes. With fewer than k points, the surplus columns have weight 0.
     """
     distance, index = knn(points, queries, k + 1)
     have = min(k, len(points))
-    reach = distance[:, -1:] if len(points) > k else 1.5 * distance[:, have - 1 : have]
-    weight = (1 - (distance[:, :k] / reach.clamp_min(1e-30)).square()).clamp_min(0).square()
-    weight[:, have:] = 0  # repeats
+    radius = distance[:, -1:] if len(points) > k else 1.5 * distance[:, have - 1 : have]
+    weight = (1 - (distance[:, :k] / radius.clamp_min(1e-30)).square()).clamp_min(0).square()
+    weight[:, have:] = 0  # repeated points
     weight = torch.where(weight.sum(1, keepdim=True) > 0, weight, (torch.arange(k) < have).to(weight).expand_as(weight))
     return index[:, :k], weight / weight.sum(1, keepdim=True)

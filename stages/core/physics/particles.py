@@ -1,11 +1,12 @@
-"""From an object's Gaussians to the particles that stand for it.
+"""Sample the particles of an object from its Gaussians.
 
-The Gaussians of an object are a shell, often with gaps. They are rasterised into voxels of half a grid cell, gaps are
-closed, what the shell encloses is filled (an open bowl stays hollow), sheets are thickened to three voxels, and each
+The Gaussians of an object form a shell, often with gaps. The shell is rasterised into voxels of half a grid cell, gaps
+are closed, the enclosed volume is filled (an open bowl stays hollow), sheets are thickened to three voxels, and each
 voxel gets one particle: eight in a full cell, as bodies with fewer than about four fracture numerically.
 
-Bodies on a shared grid touch at a distance of about a cell. So thick bodies leave their outermost layer of voxels empty
-(its mass and volume go to the other particles), and what is seen closes up. Lengths are in the unit of the Gaussians.
+Bodies on a shared grid touch at a distance of about one cell. Thick bodies therefore leave their outermost layer of
+voxels empty, with its mass and volume carried by the other particles, so that the visible surfaces close up. Lengths
+are in the unit of the Gaussians.
 """
 
 from __future__ import annotations
@@ -29,12 +30,13 @@ from stages.core.scene.scene import Scene
 
 log = logging.getLogger(__name__)
 
-OPACITY = 0.02  # fainter Gaussians are no matter
-OUTLIER = 3.5  # robust z-score of the distance to the median centre (Iglewicz and Hoaglin 1993)
-MIN_PARTICLES = 40  # particles of an object
-ALONG = 300  # most voxels along an object
-SAMPLES = 1_000_000  # most points taken from the Gaussians of an object
-LEAKS, WIDER = (2, 3, 4, 5, 6, 8), 1.5  # half widths of holes in shells [voxels]; hollows are so much wider
+MIN_OPACITY = 0.02  # Gaussians of lower opacity are ignored
+MAX_OUTLIER_SCORE = 3.5  # robust z-score of the distance to the median centre (Iglewicz and Hoaglin 1993)
+MIN_PARTICLES = 40  # per object
+MAX_VOXELS_ALONG = 300  # maximum number of voxels along an object
+MAX_SURFACE_SAMPLES = 1_000_000  # maximum number of points sampled from the Gaussians of an object
+LEAK_RADII = (2, 3, 4, 5, 6, 8)  # half widths of the holes in shells that are closed [voxels]
+MIN_CAVITY_RATIO = 1.5  # minimum half width of a cavity relative to that of its leaks
 CROSS = ndimage.generate_binary_structure(3, 1)
 CUBE = np.ones((2, 2, 2), bool)
 
@@ -50,20 +52,21 @@ class Bodies:
 
 
 def sample_bodies(scene: Scene, count: int, seed: int = 0) -> Bodies:
-    """About `count` particles for all objects together; bounded in time and memory for any input.
+    """Sample about `count` particles for all objects together, in bounded time and memory.
 
-    Raises InputError for an object without a single usable Gaussian.
+    Objects that stood on the floor in photos but would tip over as reconstructed are extended down to the floor.
+    Raises InputError for an object without any usable Gaussian.
     """
     clouds = [surface_points(scene, o.id, seed) for o in scene.objects]
-    stood = scene.cameras is not None  # and held still for the photos
+    photographed = scene.cameras is not None  # and held still for the photos
     gaps = [_gap(c) for c in clouds]
     extent = max(float((c.max(0) - c.min(0)).max()) for c in clouds)
-    # closing bridges eight voxels; finer ones would take a sparse object apart
-    finest = max(extent / ALONG, max(gaps) / 8, 1e-4 * scene_size(scene), 1e-9)
+    # closing bridges up to eight voxels; smaller voxels would break a sparse object into pieces
+    finest = max(extent / MAX_VOXELS_ALONG, max(gaps) / 8, 1e-4 * scene_size(scene), 1e-9)
     h = max(extent / 40, finest)
     for _ in range(5):  # filled bodies hold ~ h^-3 voxels, shells ~ h^-2
-        solids = [_solid(c, h, gap, scene.floor, stood) for c, gap in zip(clouds, gaps, strict=True)]
-        voxels = _apart([v for v, _, _ in solids])
+        solids = [_solid(c, h, gap, scene.floor, photographed) for c, gap in zip(clouds, gaps, strict=True)]
+        voxels = _without_overlap([v for v, _, _ in solids])
         ratio = sum(map(len, voxels)) / count
         if 0.9 < ratio < 1.05 or (ratio < 1 and h <= finest):
             break
@@ -71,16 +74,16 @@ def sample_bodies(scene: Scene, count: int, seed: int = 0) -> Bodies:
     rng = np.random.default_rng(seed)
     points = [(v + 0.5 + 0.5 * (rng.random(v.shape) - 0.5)) * h for v in voxels]
     body = torch.arange(len(points)).repeat_interleave(torch.tensor([len(p) for p in points]))
-    volume = h**3 * torch.tensor([share for _, share, _ in solids])[body]
-    for o, (_, _, held) in zip(scene.objects, solids, strict=True):
-        if held:
-            log.info("object %d (%s) would tip over as far as it was seen, and yet it stood: it is taken to reach down "
-                     "to the floor where no camera saw (`ngff refine` looks closer)", o.id, o.name)  # fmt: skip
+    volume = h**3 * torch.tensor([ratio for _, ratio, _ in solids])[body]
+    for o, (_, _, extended) in zip(scene.objects, solids, strict=True):
+        if extended:
+            log.info("object %d (%s) stood in the photos but would tip over as reconstructed; its unseen part is "
+                     "extended down to the floor (see also `ngff refine`)", o.id, o.name)  # fmt: skip
     return Bodies(torch.from_numpy(np.concatenate(points)).float(), body, volume, h)
 
 
 def scene_size(scene: Scene) -> float:
-    """Extent of the objects' Gaussians, outliers included only up to a point."""
+    """Largest side of the objects' bounding box, from the 1 and 99 % quantiles of the Gaussians [scene units]."""
     means = scene.gaussians.means[(scene.gaussians.object_id > 0) & scene.gaussians.means.isfinite().all(1)]
     if not len(means):
         return 1.0
@@ -89,20 +92,23 @@ def scene_size(scene: Scene) -> float:
 
 
 def usable(g: Gaussians) -> Tensor:
-    """Mask of Gaussians with finite numbers, positive size and enough opacity."""
+    """Mask of Gaussians with finite parameters, positive size and sufficient opacity."""
     finite = g.means.isfinite().all(1) & g.scales.isfinite().all(1) & g.quats.isfinite().all(1)
-    return finite & (g.scales > 0).all(1) & (g.quats.norm(dim=1) > 0) & (g.opacities > OPACITY)
+    return finite & (g.scales > 0).all(1) & (g.quats.norm(dim=1) > 0) & (g.opacities > MIN_OPACITY)
 
 
 def surface_points(scene: Scene, object_id: int, seed: int) -> np.ndarray:
-    """Points (m, 3) spread over an object's Gaussians, within 0.7 standard deviations; outliers dropped."""
+    """Points (m, 3) sampled from an object's Gaussians within 0.7 standard deviations, without outliers.
+
+    Raises InputError for an object without any usable Gaussian.
+    """
     mine = scene.gaussians.to("cpu")[(scene.gaussians.object_id == object_id).cpu()]
     good = mine[usable(mine)]
-    if not len(good):  # better a body made of bare positions than none
+    if not len(good):  # fall back to the bare centres
         means = mine.means[mine.means.isfinite().all(1)]
         if not len(means):
             raise InputError(
-                f"object {object_id} ({scene.name_of(object_id)}): none of its {len(mine)} Gaussians can be used "
+                f"object {object_id} ({scene.name_of(object_id)}): none of its {len(mine)} Gaussians is usable "
                 "(not finite, or transparent); label the scene again with `ngff segment`"
             )
         return means.double().numpy()
@@ -114,7 +120,7 @@ def surface_points(scene: Scene, object_id: int, seed: int) -> np.ndarray:
     scales = good.scales.double().clamp(max=max(size / 6, 1e-9) if len(good) > 1 else float(good.scales.median()))
     area = scales.sort(1).values[:, 1:].prod(1) * 4 / max(gap, 1e-12) ** 2
     each = area.clamp(1, 32).ceil().long()
-    each = (each * min(1.0, SAMPLES / float(each.sum()))).long().clamp_min(1)
+    each = (each * min(1.0, MAX_SURFACE_SAMPLES / float(each.sum()))).long().clamp_min(1)
     rng = torch.Generator().manual_seed(seed)
     of = torch.arange(len(good)).repeat_interleave(each)
     direction = torch.nn.functional.normalize(torch.randn(len(of), 3, generator=rng, dtype=torch.float64), dim=1)
@@ -124,35 +130,37 @@ def surface_points(scene: Scene, object_id: int, seed: int) -> np.ndarray:
 
 
 def inliers(points: Float[Tensor, "n 3"]) -> Tensor:
-    """Mask of points whose distance to the median centre is ordinary."""
+    """Mask of points whose distance to the median centre is no outlier (robust z-score)."""
     distance = (points - points.median(0).values).norm(dim=1)
     middle = distance.median()
     spread = (distance - middle).abs().median()
-    return 0.6745 * (distance - middle) <= OUTLIER * spread.clamp_min(1e-12 + 1e-3 * float(middle))
+    return 0.6745 * (distance - middle) <= MAX_OUTLIER_SCORE * spread.clamp_min(1e-12 + 1e-3 * float(middle))
 
 
 def _solid(
-    points: np.ndarray, h: float, gap: float, floor: float | None, stood: bool
+    points: np.ndarray, h: float, gap: float, floor: float | None, photographed: bool
 ) -> tuple[np.ndarray, float, bool]:
-    """Voxels (m, 3) of edge h, as integers, inside a closed and filled body, and the volume that each stands for.
+    """Voxels of an object: indices (m, 3) of voxels of edge h in its closed and filled body, and the number of voxels
+    of volume that each represents.
 
-    What `stood` on the floor in photos but would tip over is filled down to the floor, which the last value tells.
+    A body that would tip over although it stood on the floor when `photographed` is extended down to the floor; the
+    last value tells whether it was.
     """
     cells = np.floor(points / h).astype(np.int64)
     margin = 6  # room for closing
     low = cells.min(0) - margin
-    shape = np.minimum(cells.max(0) - low + 1 + margin, ALONG + 3 * margin)
+    shape = np.minimum(cells.max(0) - low + 1 + margin, MAX_VOXELS_ALONG + 3 * margin)
     shell = np.zeros(shape, bool)
     shell[tuple((cells - low)[(cells - low < shape - margin).all(1)].T)] = True
     bridge = min(max(math.ceil(gap / h / 2), 1), 4)
     standing = floor is not None and abs(float(low[2]) + margin - floor / h) < 4
     body = _largest(_fill(shell, bridge, standing))
-    body = _trimmed(body, points / h - low)
+    body = _trim(body, points / h - low)
     at = torch.from_numpy(np.argwhere(body)).float()
-    held = stood and standing and topples(at[:, :2], at[at[:, 2] < at[:, 2].min() + 4, :2])
-    if held:
+    extended = photographed and standing and topples(at[:, :2], at[at[:, 2] < at[:, 2].min() + 4, :2])
+    if extended:
         bottom = int(np.flatnonzero(body.any((0, 1)))[0])
-        body = np.flip(np.logical_or.accumulate(np.flip(body, 2), 2), 2)  # something of it is above
+        body = np.flip(np.logical_or.accumulate(np.flip(body, 2), 2), 2)  # all voxels below the body
         body[:, :, :bottom] = False
     thin = body & ~ndimage.binary_opening(body, CUBE)
     if thin.any():
@@ -163,18 +171,18 @@ def _solid(
     inside = body & ~_thick_skin(body)
     if inside.sum() < MIN_PARTICLES:
         inside = body
-    return np.argwhere(inside) + low, float(body.sum() / inside.sum()), held
+    return np.argwhere(inside) + low, float(body.sum() / inside.sum()), extended
 
 
 def _gap(points: np.ndarray) -> float:
-    """Distance to the third neighbour, of most points: what closing must bridge."""
+    """Gap that closing must bridge: the 90 % quantile of the distance to the third neighbour."""
     some = torch.from_numpy(points)
     distance, _ = knn(some, some[:: max(1, len(some) // 1000)], 4)
     return float(distance[:, 3].quantile(0.9))
 
 
 def _fill(shell: np.ndarray, gap: int, standing: bool) -> np.ndarray:
-    """The shell with gaps closed and all that it encloses; what stands on the floor is closed by the floor."""
+    """The shell with gaps closed and the enclosed volume filled; the floor closes the bottom of standing objects."""
     wide = ndimage.binary_dilation(shell, CROSS, iterations=gap)
     layers = np.flatnonzero(shell.any((0, 1)))
     sealed = wide.copy()
@@ -185,7 +193,7 @@ def _fill(shell: np.ndarray, gap: int, standing: bool) -> np.ndarray:
     grown = ndimage.binary_dilation(enclosed, CROSS, iterations=gap) & wide if enclosed.any() else enclosed
     closed = ndimage.binary_erosion(wide, CROSS, iterations=gap)
     body = shell | closed | enclosed | (grown & ~ndimage.binary_dilation(outside, CROSS, iterations=gap))
-    if not standing:  # under the folds of a cloth on the floor it looks like a hollow that leaks
+    if not standing:  # a cloth on the floor has folds that look like leaking cavities
         body |= _cavities(shell | closed)
     if standing:
         body[:, :, : layers[0]] = False
@@ -193,25 +201,25 @@ def _fill(shell: np.ndarray, gap: int, standing: bool) -> np.ndarray:
 
 
 def _cavities(walls: np.ndarray) -> np.ndarray:
-    """Hollows that leak, if they are WIDER than their leaks: a jug is filled, a mug or a bowl is not.
+    """Cavities with leaks narrower than the cavity by MIN_CAVITY_RATIO: a jug is filled, a mug or a bowl is not.
 
-    Photos leave holes in the shells of things, which would crumple like paper bags if they were left hollow.
+    Reconstructed shells have holes; left hollow, they would crumple like paper bags.
     """
-    room = LEAKS[-1]  # around it, for what leads outside
+    room = LEAK_RADII[-1]  # margin, so that leaks lead outside
     walls = np.pad(walls, room)
     away = ndimage.distance_transform_edt(~walls)
     filled = np.zeros_like(walls)
-    for leak in LEAKS:
+    for leak in LEAK_RADII:
         free = away > leak
         outside = _outside(free)
-        hollow = _touched(free & ~outside, away >= WIDER * leak)
-        if hollow.any():  # back to the walls and into every corner, but not out through the leaks
-            filled |= _touched(~walls & (ndimage.distance_transform_edt(~outside) > leak + 1), hollow)
+        hollow = _components_with(free & ~outside, away >= MIN_CAVITY_RATIO * leak)
+        if hollow.any():  # grow back to the walls, but not through the leaks
+            filled |= _components_with(~walls & (ndimage.distance_transform_edt(~outside) > leak + 1), hollow)
     return filled[room:-room, room:-room, room:-room]
 
 
-def _touched(free: np.ndarray, seeds: np.ndarray) -> np.ndarray:
-    """The connected parts of the free voxels that hold a seed."""
+def _components_with(free: np.ndarray, seeds: np.ndarray) -> np.ndarray:
+    """The connected components of the free voxels that contain a seed."""
     labels, count = ndimage.label(free)
     kept = np.zeros(count + 1, bool)
     kept[labels[free & seeds]] = True
@@ -219,34 +227,34 @@ def _touched(free: np.ndarray, seeds: np.ndarray) -> np.ndarray:
 
 
 def _outside(free: np.ndarray) -> np.ndarray:
-    """What of the free voxels is connected with the faces of the grid."""
+    """The free voxels connected to the faces of the grid."""
     faces = np.ones_like(free)
     faces[1:-1, 1:-1, 1:-1] = False
-    return _touched(free, faces)
+    return _components_with(free, faces)
 
 
-def _trimmed(body: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Without the outermost voxels whose middle lies outside of the surface, where the body is thick.
+def _trim(body: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Remove outermost voxels of thick parts whose centre lies outside the surface.
 
-    `points` on the surface are in voxels. Else a body grows by half a voxel all around.
+    Otherwise a body would grow by half a voxel all around. `points` on the surface are in voxels.
     """
     cell = np.floor(points).astype(np.int64)
     kept = ((cell >= 0) & (cell < body.shape)).all(1)
     flat = np.ravel_multi_index(tuple(cell[kept].T), body.shape)
-    slope = np.gradient(ndimage.gaussian_filter(body.astype(np.float32), 1.0))  # points inwards
+    slope = np.gradient(ndimage.gaussian_filter(body.astype(np.float32), 1.0))  # points inward
     depth = sum((points[kept, a] - cell[kept, a] - 0.5) * slope[a].ravel()[flat] for a in range(3))
     inner = np.bincount(flat, depth, body.size).reshape(body.shape) > 0
     return body & ~(_thick_skin(body) & inner)
 
 
 def _thick_skin(body: np.ndarray) -> np.ndarray:
-    """The outermost voxels where the body is at least five thick."""
+    """The outermost voxels where the body is at least five voxels thick."""
     core = ndimage.binary_erosion(body, CROSS, iterations=2)
     return body & ~ndimage.binary_erosion(body, CROSS) & ndimage.binary_dilation(core, CROSS, iterations=3)
 
 
 def _largest(body: np.ndarray) -> np.ndarray:
-    """Without specks: connected parts of less than a fiftieth of the largest."""
+    """Remove connected components smaller than a fiftieth of the largest."""
     labels, n = ndimage.label(body, np.ones((3, 3, 3)))
     if n <= 1:
         return body
@@ -255,8 +263,8 @@ def _largest(body: np.ndarray) -> np.ndarray:
     return (sizes >= sizes.max() / 50)[labels] & body
 
 
-def _apart(bodies: list[np.ndarray]) -> list[np.ndarray]:
-    """Each voxel belongs to one body: small ones keep theirs, large ones give way (unless little would be left)."""
+def _without_overlap(bodies: list[np.ndarray]) -> list[np.ndarray]:
+    """Assign each voxel to one body, smaller bodies first, unless too few voxels would remain."""
     taken = np.zeros(0, np.int64)
     out = list(bodies)
     low = np.min([b.min(0) for b in bodies], axis=0)

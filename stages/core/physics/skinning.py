@@ -1,4 +1,4 @@
-"""Gaussians carried by keypoints: displaced, turned and stretched; at rest they are the input, bit by bit."""
+"""Deform Gaussians with their keypoints: displaced, rotated and stretched; at rest they are the input bit by bit."""
 
 from __future__ import annotations
 
@@ -13,25 +13,25 @@ from stages.core.kernels.skinning import skin_gaussians
 from stages.core.scene.gaussians import Gaussians
 from stages.core.scene.trajectory import Binding, Keypoints
 
-AROUND = 16  # neighbours that tell how a keypoint's surroundings deform
-RIDGE = 1e-3  # weight of "turned, not stretched" against what the neighbours say, where they say enough
+NEIGHBOURS = 16  # keypoints from which the deformation around a keypoint is estimated
+RIDGE = 1e-3  # weight of a rigid rotation relative to the neighbours' deformation
 
 
 class Skinning:
-    """Prepared once; then skinning(positions) are the Gaussians of a frame."""
+    """Linear blend skinning with deformation gradients, prepared once for many frames."""
 
     def __init__(self, gaussians: Gaussians, binding: Binding, keypoints: Keypoints):
         self.gaussians, self.rest = gaussians, keypoints.rest.float().contiguous()
-        device = gaussians.means.device  # binding and keypoints stay where they are, as a rule on the CPU
+        device = gaussians.means.device  # binding and keypoints stay on their device, usually the CPU
         moving = (binding.index >= 0).any(1).nonzero()[:, 0]
         self._index = binding.index[moving].int().contiguous().to(device)
         self._weight = binding.weight[moving].float().contiguous().to(device)
         self._moving = moving.to(device)
         self._part = gaussians[self._moving]
-        self._around = _neighbours(self.rest, keypoints.object_id)
-        d = self.rest[self._around] - self.rest[:, None]
+        self._neighbours_of = _neighbours(self.rest, keypoints.object_id)
+        d = self.rest[self._neighbours_of] - self.rest[:, None]
         a = 1 / (d.square().sum(-1) + 1e-12 + d.square().sum(-1).mean(1, keepdim=True))
-        a[self._around == torch.arange(len(d))[:, None]] = 0  # itself, where neighbours are missing
+        a[self._neighbours_of == torch.arange(len(d))[:, None]] = 0  # padding with the keypoint itself
         self._d, self._ad = d, a[..., None] * d
         self._M = self._ad.mT @ d  # (p, 3, 3) sum a d d^T
         self._ridge = RIDGE / 3 * self._M.diagonal(dim1=1, dim2=2).sum(-1)[:, None, None].clamp_min(1e-12)
@@ -39,6 +39,7 @@ class Skinning:
         _, self._body = keypoints.object_id.unique(return_inverse=True)
 
     def __call__(self, positions: Float[Tensor, "p 3"]) -> Gaussians:
+        """The Gaussians for these keypoint positions [scene units]."""
         g, part = self.gaussians, self._part
         u = positions.to(self.rest) - self.rest
         if not len(self._moving) or not bool(u.any()):
@@ -48,20 +49,20 @@ class Skinning:
             self._index, self._weight, *(t.to(part.means.device) for t in (self.rest, u, G)),
             part.means.contiguous(), part.quats.contiguous(), part.scales.contiguous(),
         )  # fmt: skip
-        moved = {"means": means, "quats": quats, "scales": scales, "sh": _turn(part.sh, R)}
+        moved = {"means": means, "quats": quats, "scales": scales, "sh": _rotate_sh(part.sh, R)}
         whole = {name: getattr(g, name).index_copy(0, self._moving, value) for name, value in moved.items()}
         return Gaussians(**whole, opacities=g.opacities, object_id=g.object_id)
 
     def _gradients(self, u: Float[Tensor, "p 3"]) -> Float[Tensor, "p 3 3"]:
         """Displacement gradient at each keypoint: weighted least squares over its neighbours, with a ridge.
 
-        The ridge pulls F toward the best rotation R of the neighbourhood, so that directions in which the neighbours
-        do not spread (normal to a sheet, across a rope) turn with the rest:
+        The ridge pulls F towards the best rotation R of the neighbourhood, so that directions in which the neighbours
+        have no extent (normal to a sheet, across a rope) rotate with the others:
             F = (A + r R)(M + r I)^-1,  A = sum a d' d^T,  M = sum a d d^T.
-        A rigid motion is reproduced exactly, since then A = R M. The small weight of the whole object's rotation
-        settles the turn about the axis when the neighbours lie on a line.
+        A rigid motion is reproduced exactly, since then A = R M. A small weight of the rotation of the whole object
+        determines the rotation about the axis when the neighbours lie on a line.
         """
-        relative = (u[self._around] - u[:, None]).mT @ self._ad  # A - M
+        relative = (u[self._neighbours_of] - u[:, None]).mT @ self._ad  # A - M
         whole = self._object_rotations(u)[self._body]
         R = nearest_rotation(self._M + relative + 0.3 * self._ridge * whole)
         one = torch.eye(3)
@@ -76,14 +77,14 @@ class Skinning:
 def deform(
     gaussians: Gaussians, binding: Binding, keypoints: Keypoints, positions: Float[Tensor, "p 3"]
 ) -> Gaussians:
-    """Gaussians of one frame; for many frames keep a Skinning."""
+    """The Gaussians of one frame; for several frames use Skinning."""
     return Skinning(gaussians, binding, keypoints)(positions)
 
 
 def fit_rotations(
     rest: Float[Tensor, "p 3"], positions: Float[Tensor, "p 3"], body: Int[Tensor, "p"]
 ) -> Float[Tensor, "o 3 3"]:
-    """Rotation of each body 0..o-1 that best turns `rest` into `positions`; none where the points do not tell.
+    """Rotation of each body 0..o-1 that best maps `rest` to `positions`; the identity where it is undetermined.
 
     Source: Kabsch 1976, "A solution for the best rotation to relate two sets of vectors".
     """
@@ -92,7 +93,7 @@ def fit_rotations(
     both = rest.double(), positions.double()
     X, x = (p - (torch.zeros(count, 3).to(p).index_add(0, body, p) / size)[body] for p in both)
     H = torch.zeros(count, 3, 3).to(x).index_add(0, body, x[:, :, None] * X[:, None, :])
-    # a trace of "no turn" for points on a line or in one place
+    # a small weight of the identity, for points on a line or coincident points
     H = H + 1e-6 * (X.square().sum() / max(len(X), 1) + 1e-12) * torch.eye(3).to(H)
     return nearest_rotation(H).to(rest)
 
@@ -111,20 +112,20 @@ def object_rotations(
 
 
 def _neighbours(rest: Float[Tensor, "p 3"], object_id: Int[Tensor, "p"]) -> Int[Tensor, "p j"]:
-    """The nearest other keypoints of the same object, at a few of them the same one repeated."""
-    around = torch.zeros(len(rest), AROUND, dtype=torch.int64)
+    """The nearest other keypoints of the same object, padded with the keypoint itself."""
+    around = torch.zeros(len(rest), NEIGHBOURS, dtype=torch.int64)
     for id in object_id.unique():
         own = (object_id == id).nonzero()[:, 0]
-        _, index = knn(rest[own], rest[own], AROUND + 1)
+        _, index = knn(rest[own], rest[own], NEIGHBOURS + 1)
         around[own] = own[index[:, 1:]]
     return around
 
 
-def _turn(sh: Float[Tensor, "n k 3"], R: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n k 3"]:
-    """SH turned with each Gaussian; those that do not turn stay as they are, bit by bit."""
+def _rotate_sh(sh: Float[Tensor, "n k 3"], R: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n k 3"]:
+    """SH coefficients rotated with each Gaussian; those with the identity rotation stay the same bit by bit."""
     if sh.shape[1] == 1:
         return sh
-    turned = R.ne(torch.eye(3).to(R)).flatten(1).any(1)[:, None, None]
-    # in pieces that fit the processor's cache: three times faster
+    rotated = R.ne(torch.eye(3).to(R)).flatten(1).any(1)[:, None, None]
+    # in pieces that fit into the cache: three times faster
     pieces = zip(sh.split(8192), R.split(8192), strict=True)
-    return torch.where(turned, torch.cat([rotate_sh(part, rotation) for part, rotation in pieces]), sh)
+    return torch.where(rotated, torch.cat([rotate_sh(part, rotation) for part, rotation in pieces]), sh)

@@ -1,4 +1,4 @@
-"""What an engine yields for every frame."""
+"""Output of a simulation engine for each frame."""
 
 from dataclasses import dataclass
 
@@ -12,4 +12,4 @@ class FrameState:
 
     positions: Float[Tensor, "p 3"]  # of the keypoints
     com: Float[Tensor, "o 3"]  # centre of mass of each object, in the order of scene.objects
-    rotation: Float[Tensor, "o 4"]  # w x y z relative to rest
+    rotation: Float[Tensor, "o 4"]  # w x y z, relative to the rest pose

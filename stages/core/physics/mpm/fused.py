@@ -1,6 +1,6 @@
-"""Substeps as one launch each over three rotating grids, a frame as one CUDA graph: fastest on a GPU.
+"""MPM substeps as one kernel launch each over three rotating grids, a frame as one CUDA graph: the GPU schedule.
 
-Nothing inside a frame is read by the host. It runs on the CPU too, one thread, where tests compare the two orders.
+The host reads nothing within a frame. The schedule also runs on the CPU, on one thread, where tests compare the two.
 """
 
 from __future__ import annotations
@@ -13,19 +13,19 @@ from stages.core.kernels.mpm.fused import THREADS_PER_BLOCK, ActiveBlocks, clear
 from stages.core.kernels.mpm.grid import BLOCK
 from stages.core.physics.mpm.particle_rows import ParticleRows
 
-RESORT = 100  # substeps after which particles are sorted by cell again
-ROUND = 256  # threads that clear begin at a multiple of this
-GRAPHS = 24  # kept, one for each number of substeps
+SORT_INTERVAL = 100  # substeps after which particles are sorted by cell again
+CLEAR_ALIGNMENT = 256  # the threads that clear the grid begin at a multiple of this
+MAX_GRAPHS = 24  # CUDA graphs kept, one per number of substeps
 
 
 class FusedSubsteps:
-    """Runs frames of the particles in `rows`."""
+    """Runs the substeps of a frame for the particles in `rows`; parameters as in SplitSubsteps."""
 
     def __init__(
         self, rows: ParticleRows, plastic: bool, bouncy: bool, damping: float, obstacles: wp.array,
         scale: tuple[float, float] | None = None,
     ):  # fmt: skip
-        """`scale`: quanta of momentum and mass, when nodes count in whole numbers; see kernels/mpm_exact.py."""
+        """`scale`: fixed-point units of momentum and mass for exact sums, see core/kernels/mpm/exact.py."""
         self.rows, self.grid, self.device, self.damping = rows, rows.grid, rows.device, damping
         self._kernel = fused_step(plastic, obstacles.shape[0] > 0, bouncy, scale is not None)
         self._obstacles = obstacles
@@ -36,17 +36,17 @@ class FusedSubsteps:
         ints = {"dtype": torch.int32, "device": self.device}
         self._marks = torch.zeros(count // BLOCK**3, **ints)
         self._blocks, self._total = torch.zeros_like(self._marks), torch.zeros(1, **ints)
-        self._touched = ActiveBlocks()
-        self._touched.marks, self._touched.blocks = view(self._marks), view(self._blocks)
-        self._touched.total = view(self._total)
+        self._active = ActiveBlocks()
+        self._active.marks, self._active.blocks = view(self._marks), view(self._blocks)
+        self._active.total = view(self._total)
         self._clock = torch.zeros(1, device=self.device)
-        self._most = torch.zeros(1, **ints)
-        self._sweep_from = -(-len(rows) // ROUND) * ROUND
+        self._last_total = torch.zeros(1, **ints)
+        self._sweep_from = -(-len(rows) // CLEAR_ALIGNMENT) * CLEAR_ALIGNMENT
         self._graphs: dict[int, torch.cuda.CUDAGraph | None] = {}
         self._pool = torch.cuda.graph_pool_handle() if self.device != "cpu" else None
 
     def frame(self, dt: float, steps: int) -> None:
-        """`steps` substeps of `dt` [s]. The first frame with so many steps runs plainly, later ones as a graph."""
+        """Take `steps` substeps of `dt` [s]: launched one by one the first time with this `steps`, then as a graph."""
         self._clock.fill_(dt)
         if self.device == "cpu":
             self._run(steps)
@@ -54,7 +54,7 @@ class FusedSubsteps:
         with torch.cuda.device(self.device):
             if steps not in self._graphs:
                 self._run(steps)
-                if len(self._graphs) >= GRAPHS:
+                if len(self._graphs) >= MAX_GRAPHS:
                     self._graphs.pop(next(iter(self._graphs)))
                 self._graphs[steps] = None
                 return
@@ -67,21 +67,21 @@ class FusedSubsteps:
 
     @property
     def blocks(self) -> int:
-        """Most blocks that were touched in the last frame."""
-        return int(self._most[0])
+        """Number of grid blocks that were active in the last frame."""
+        return int(self._last_total[0])
 
     def _run(self, steps: int) -> None:
         self.rows.sort()
         self.rows["base_node"].fill_(-1)
         self._launch(0, 0, 1)
         for step in range(1, steps):
-            if step % RESORT == 0:
+            if step % SORT_INTERVAL == 0:
                 self.rows.sort()
             self._launch(step, 1, 1)
         self._launch(steps, 1, 0)
-        self._most.copy_(self._total)
+        self._last_total.copy_(self._total)
         grids = [view(g, wp.vec4) for g in self._grids]
-        inputs = [self.grid, self._sweep_from, *grids, view(self._friction), self._touched, self._width]
+        inputs = [self.grid, self._sweep_from, *grids, view(self._friction), self._active, self._width]
         launch(clear_active_blocks, self._sweep_from, inputs, device=self.device)
         self._total.zero_()
 
@@ -89,6 +89,6 @@ class FusedSubsteps:
         read, write, stale = (view(self._grids[(step + shift) % 3], wp.vec4) for shift in (2, 0, 1))
         sweepers = self._sweep_from if gather and scatter else 0
         inputs = [self.grid, self.rows.struct, self._sweep_from, sweepers, gather, scatter, step - 1,
-                  view(self._clock), self.damping, read, write, stale, view(self._friction), self._touched,
+                  view(self._clock), self.damping, read, write, stale, view(self._friction), self._active,
                   self._obstacles, self._scale]  # fmt: skip
         launch(self._kernel, self._sweep_from + sweepers, inputs, device=self.device, block_dim=THREADS_PER_BLOCK)

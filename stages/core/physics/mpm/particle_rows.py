@@ -1,4 +1,4 @@
-"""The particles of all scenes as the kernels want them: persistent arrays, sorted by cell."""
+"""Particle arrays of all scenes in the layout of the kernels: persistent memory, sorted by grid cell."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch import Tensor
 from stages.core.kernels.interop import launch, view
 from stages.core.kernels.mpm import transfers as kernels
 
-NEVER = 2**31 - 1  # in `lost`: no particle of this scene
+NEVER = 2**31 - 1  # value of `lost` for a scene without lost particles
 _TYPES = {
     "x": wp.vec3, "v": wp.vec3, "C": wp.mat33, "F": wp.mat33, "stiffness": wp.vec3, "plastic": wp.vec3,
     "acceleration": wp.vec3, "base_node": wp.vec3i,
@@ -19,7 +19,10 @@ _TYPES = {
 
 
 class ParticleRows:
-    """Tensors by name in `tensors`, all rows in one order, and the same memory as a struct for kernels."""
+    """Tensors by name in `tensors`, all in the same row order, and a struct of the same memory for the kernels.
+
+    `sizes` is the number of particles of each scene.
+    """
 
     def __init__(self, fields: dict[str, Tensor], sizes: Sequence[int], grid, device: str):
         p = sum(sizes)
@@ -47,9 +50,9 @@ class ParticleRows:
         return self.tensors[name]
 
     def sort(self) -> None:
-        """Neighbours in space become neighbours in memory. Nothing is read by the host."""
+        """Sort by grid cell, so that neighbours in space are neighbours in memory. Does not wait for a GPU."""
         launch(kernels.sort_keys, len(self), [self.grid, self.struct, view(self._keys)], device=self.device)
-        if self.device == "cpu":  # by NumPy: PyTorch's threads cost more than they save, much more on a busy machine
+        if self.device == "cpu":  # NumPy: PyTorch's threads cost more than they save here, and stall on a busy machine
             order = self._keys.numpy().argsort(kind="stable")
             for t in self.tensors.values():
                 t.numpy()[:] = t.numpy()[order]
@@ -59,10 +62,10 @@ class ParticleRows:
             t.copy_(t[order])
 
     def put(self, name: str, value: Tensor) -> None:
-        """Overwrite a field by rows in the original order."""
+        """Overwrite a field with rows in the original order."""
         self.tensors[name].copy_(value.to(self.device)[self.tensors["order"].long()])
 
     def get(self, name: str) -> Tensor:
-        """A field in the original order."""
+        """Copy of a field in the original order."""
         t = self.tensors[name]
         return torch.empty_like(t).index_copy_(0, self.tensors["order"].long(), t)

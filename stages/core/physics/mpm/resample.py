@@ -1,7 +1,7 @@
-"""Particles at twice the resolution, of the same bodies.
+"""Particles of the same bodies at twice the resolution.
 
-Sampling an object's Gaussians anew at a finer spacing would find gaps in its shell and leave it hollow. So voxels are
-halved instead, and the bodies stay what they were, in shape and mass.
+Sampling the Gaussians again at a finer spacing would expose gaps in their shells and leave bodies hollow. Instead each
+voxel is subdivided, which keeps shape and mass.
 """
 
 from __future__ import annotations
@@ -14,17 +14,17 @@ from stages.core.physics.particles import CROSS, Bodies
 
 
 def subdivide(bodies: Bodies, seed: int = 0) -> Bodies:
-    """Eight particles or more for each; rows come body by body.
+    """Replace each particle by eight at half the spacing; rows are ordered by body.
 
-    Thick bodies keep their outermost layer of voxels empty, and that layer is half as thick now: they grow by as much.
+    Thick bodies leave their outermost layer of voxels empty. That layer becomes half as thick, so they grow by as much.
     """
     h, rng, taken, x, volume, body = bodies.spacing, np.random.default_rng(seed), None, [], [], []
     for n in range(int(bodies.body.max()) + 1):
         mine = bodies.body == n
         total = float(bodies.volume[mine].sum())
-        fine = _halves(np.floor(bodies.x[mine].double().numpy() / h).astype(np.int64))
-        if total > 1.001 * h**3 * int(mine.sum()):  # particles stand for an empty layer too
-            fine = _grown(fine)
+        fine = _split_voxels(np.floor(bodies.x[mine].double().numpy() / h).astype(np.int64))
+        if total > 1.001 * h**3 * int(mine.sum()):  # the particles also carry the mass of the empty layer
+            fine = _dilated(fine)
         if taken is not None:
             free = ~np.isin(_keys(fine), _keys(taken))
             fine = fine[free] if free.any() else fine
@@ -35,14 +35,14 @@ def subdivide(bodies: Bodies, seed: int = 0) -> Bodies:
     return Bodies(torch.from_numpy(np.concatenate(x)).float(), torch.cat(body), torch.cat(volume), h / 2)
 
 
-def _halves(voxels: np.ndarray) -> np.ndarray:
-    """The eight voxels (m, 3) of half the edge in each."""
+def _split_voxels(voxels: np.ndarray) -> np.ndarray:
+    """The eight half-size voxels of each voxel, all of shape (m, 3)."""
     corners = np.stack(np.meshgrid(*[[0, 1]] * 3, indexing="ij"), -1).reshape(-1, 3)
     return (2 * voxels[:, None] + corners).reshape(-1, 3)
 
 
-def _grown(voxels: np.ndarray) -> np.ndarray:
-    """With the voxels that share a face with them."""
+def _dilated(voxels: np.ndarray) -> np.ndarray:
+    """The voxels and those that share a face with them."""
     low = voxels.min(0) - 1
     solid = np.zeros(voxels.max(0) - low + 2, bool)
     solid[tuple((voxels - low).T)] = True
@@ -50,6 +50,6 @@ def _grown(voxels: np.ndarray) -> np.ndarray:
 
 
 def _keys(voxels: np.ndarray) -> np.ndarray:
-    """One number for each voxel."""
+    """A unique integer for each voxel."""
     a, b, c = (voxels + 2**20).T
     return (a << 42) | (b << 21) | c

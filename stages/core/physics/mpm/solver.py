@@ -1,12 +1,11 @@
-"""The MPM solver: bodies of any material in a box with friction, one scene or thousands.
+"""MPM solver: deformable bodies of any material in a box with friction, one scene or many independent ones.
 
-Explicit MLS-MPM/APIC in float32; kernels and sources are in core/kernels/mpm/transfers.py. On the CPU substeps run as
-split.py says, on a GPU as fused.py says; the physics is the same. For many scenes at once, with their names, see
-batch.py.
+Explicit MLS-MPM with APIC transfers in float32; kernels and sources are in core/kernels/mpm/transfers.py. Substeps run
+by the schedule of split.py on the CPU and of fused.py on a GPU, with the same physics. batch.py runs named scenes.
 
-On the CPU a run gives the same bytes whatever the number of threads. On a GPU the order of additions changes from run
-to run, and with it the last bits. There are no gradients: differentiating through contact and some thousand explicit
-substeps is not offered.
+Reproducibility: on the CPU a run gives the same bytes for any number of threads. On a GPU floating-point sums depend on
+the order of atomic additions, so runs differ in the last bits, unless `exact` is set, which sums in fixed point.
+Gradients through the solver are not available.
 """
 
 from __future__ import annotations
@@ -27,15 +26,15 @@ from stages.core.physics.mpm.fused import FusedSubsteps
 from stages.core.physics.mpm.particle_rows import NEVER, ParticleRows
 from stages.core.physics.mpm.split import SplitSubsteps
 
-SAFETY = 0.5  # of a cell that a wave or a particle may cross in a substep; free vibration diverges from 1.1
-VISCOUS = 0.15  # largest dt eta / (density dx^2); violent vibration diverges from 0.3
+SAFETY = 0.5  # fraction of a cell that a wave or a particle may cross in a substep; free vibration diverges from 1.1
+VISCOUS = 0.15  # maximum of dt eta / (density dx^2); violent vibration diverges from 0.3
 FLOOR_GAP = mpm_grid.FLOOR_GAP
-MAX_NODES = 60_000_000  # of the grid of a scene: about 1 GB of address space a copy
-GRAIN = 8  # on a GPU, substeps chosen by CFL are a multiple of this, so that few graphs are captured
+MAX_NODES = 60_000_000  # of the grid of a scene: about 1 GB of address space per copy
+SUBSTEP_MULTIPLE = 8  # on a GPU substeps per frame are a multiple of this, so that few CUDA graphs are captured
 
 
 class Diverged(Exception):
-    """A particle left the box or stopped being a number; `particle` is its index."""
+    """A particle left the box or is not finite; `particle` is its index."""
 
     def __init__(self, particle: int):
         super().__init__(f"particle {particle} left the box or is not finite")
@@ -44,30 +43,30 @@ class Diverged(Exception):
 
 @dataclass(frozen=True)
 class Box:
-    """Floor and walls: axis-aligned, solid, with the friction of the body that touches them."""
+    """Axis-aligned floor, walls and ceiling [m], with the friction of the body in contact."""
 
     low: tuple[float | int, float | int, float | int]  # z is the floor
     high: tuple[float | int, float | int, float | int]
-    restitution: float = 0.0  # 0: a body bounces by its own elasticity; up to 1: walls give back that share of speed
-    tangential_retention: float = -1.0  # 0..1: speed along a wall kept per substep, as in the public solver
+    restitution: float = 0.0  # fraction of normal speed returned; 0: only the body's own elasticity
+    tangential_retention: float = -1.0  # 0 to 1: tangential speed kept per substep, as NGFF has it; -1: Coulomb
 
 
 @dataclass
 class Particles:
-    """What the solver moves. Rows keep their order."""
+    """State and material of the particles; rows keep their order."""
 
     x: Float[Tensor, "p 3"]  # positions [m]
     v: Float[Tensor, "p 3"]  # velocities [m/s]
     C: Float[Tensor, "p 3 3"]  # affine velocity: dv/dx [1/s]
-    F: Float[Tensor, "p 3 3"]  # deformation gradient; of what yields, the elastic part
+    F: Float[Tensor, "p 3 3"]  # deformation gradient; its elastic part for plastic materials
     mass: Float[Tensor, "p"]  # [kg]
     volume: Float[Tensor, "p"]  # at rest [m^3]
     stiffness: Float[Tensor, "p 3"]  # Lame constants mu, lambda [Pa] and viscosity eta [Pa s]
     friction: Float[Tensor, "p"]  # Coulomb coefficient against floor and walls
-    held: Int[Tensor, "p"]  # 1: moves on with its own velocity, whatever happens; 2: lost, stays
-    model: Int[Tensor, "p"]  # material model: see stages/core/kernels/mpm/constitutive.py
-    plastic: Float[Tensor, "p 3"]  # its numbers
-    state: Float[Tensor, "p"]  # its memory; 0 at first
+    held: Int[Tensor, "p"]  # 1: kinematic, moves with its own velocity; 2: lost, stays in place
+    model: Int[Tensor, "p"]  # number of the material model, see core/kernels/mpm/constitutive.py
+    plastic: Float[Tensor, "p 3"]  # parameters of the material model
+    state: Float[Tensor, "p"]  # internal variable of the material model; initially 0
 
     def __len__(self) -> int:
         return len(self.x)
@@ -78,9 +77,10 @@ def at_rest(
     nu: Float[Tensor, "p"], viscosity: Float[Tensor, "p"], friction: Float[Tensor, "p"], model: int = NEO_HOOKEAN,
     plastic: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> Particles:  # fmt: skip
-    """Particles of undeformed bodies that do not move. E [Pa], density [kg/m^3], viscosity [Pa s].
+    """Undeformed particles without velocity. E [Pa], density [kg/m^3], viscosity [Pa s].
 
-    `model` and `plastic` are for all of them; overwrite the fields for a mixture.
+    `model` (number of the material model) and `plastic` (its parameters) apply to all; overwrite the fields for a
+    mixture.
     """
     p = len(x)
     still, identity = torch.zeros(p, 3, 3), torch.eye(3).repeat(p, 1, 1)
@@ -91,28 +91,29 @@ def at_rest(
 
 
 def join_particles(parts: Sequence[Particles]) -> Particles:
-    """All of them, one after the other."""
+    """Concatenate particles."""
     return Particles(*(torch.cat([getattr(p, f.name) for p in parts]) for f in fields(Particles)))
 
 
 def wave_speed(E, nu, density):
-    """Speed of pressure waves, sqrt((lambda + 2 mu) / density) [m/s]."""
+    """Speed of pressure waves, sqrt((lambda + 2 mu) / density) [m/s]; E [Pa], density [kg/m^3]."""
     return (E * (1 - nu) / ((1 + nu) * (1 - 2 * nu)) / density) ** 0.5
 
 
 def modulus_at_wave_speed(speed: float, nu: float, density: float) -> float:
-    """Young's modulus [Pa] at which pressure waves have this speed: the inverse of wave_speed."""
+    """Young's modulus [Pa] at which pressure waves have this `speed` [m/s]: the inverse of wave_speed."""
     return density * speed**2 * (1 + nu) * (1 - 2 * nu) / (1 - nu)
 
 
 class Solver:
-    """Bodies in a box. `advance` moves them through one frame; read x, v, F in between.
+    """Particles in a box with grid spacing `dx` [m]; `advance` moves them through one frame.
 
-    `sizes` are the particles of each scene when there are several: scenes have the same box and colliders, and know
-    nothing of each other. `damping` (0 to 1) takes that share of the symmetric part of C at every transfer (RPIC).
-    `fused` chooses the launch order; by default what is fastest on the device. With `exact`, sums are made in whole
-    numbers: a GPU then gives the same bytes in every run, and for a scene whatever other scenes are beside it (unless
-    a surface has restitution: how stiff those are follows from the stiffest material of all).
+    `sizes` gives the number of particles of each scene of a batch; scenes share box and colliders and do not interact.
+    `damping` (0 to 1) removes that fraction of the symmetric part of C at every transfer (RPIC). `fused` selects the
+    schedule, by default the faster one for the device. `exact` sums in fixed point: a GPU then gives the same bytes in
+    every run at about twice the time, and a scene the same result in any batch (unless a surface has restitution,
+    whose stiffness follows from the stiffest material of the batch). Raises ValueError for sizes that do not fit the
+    particles and for grids that are too large.
     """
 
     def __init__(
@@ -122,69 +123,69 @@ class Solver:
         self.device, self.dx, self.grid = device, dx, make_grid(box, dx)
         sizes = [len(particles)] if sizes is None else list(sizes)
         if sum(sizes) != len(particles) or min(sizes) < 1:
-            raise ValueError(f"{len(particles)} particles cannot be scenes of {sizes}")
+            raise ValueError(f"{len(particles)} particles cannot be split into scenes of {sizes}")
         if len(sizes) * self.grid.count * (2 if exact else 1) > max_batch_nodes(device):
             raise ValueError(f"{len(sizes)} scenes of {self.grid.count} nodes are too many for one batch")
         columns = {f.name: getattr(particles, f.name) for f in fields(Particles)}
         self.rows = ParticleRows(columns, sizes, self.grid, device)
         self.colliders = tuple(colliders)
         self._obstacles = as_obstacles(self.colliders, device)
-        self._rates = self._fastest()
-        self.grid.spring = self._rates[0] / (2 * dx)  # as stiff as bodies are, so that no shorter substep is needed
+        self._rates = self._max_rates()
+        self.grid.spring = self._rates[0] / (2 * dx)  # as stiff as the bodies, so that the CFL substep is stable
         fused = exact or (device != "cpu" if fused is None else fused)
         plastic = bool((particles.model != NEO_HOOKEAN).any())
-        bouncy = any(thing.restitution > 0 for thing in (box, *self.colliders))
+        bouncy = any(surface.restitution > 0 for surface in (box, *self.colliders))
         options = self.rows, plastic, bouncy, damping, self._obstacles
         quanta = self._quanta() if exact else None
         self._substepper = FusedSubsteps(*options, quanta) if fused else SplitSubsteps(*options)
-        self._grain = GRAIN if fused and device != "cpu" else 1
+        self._substep_multiple = SUBSTEP_MULTIPLE if fused and device != "cpu" else 1
 
     @property
     def particles(self) -> Particles:
-        """The state in the order of the particles given, on the solver's device."""
+        """The current state in the original order of the particles, on the solver's device."""
         return Particles(*(self.rows.get(f.name) for f in fields(Particles)))
 
     @property
     def active_nodes(self) -> int:
-        """Nodes in the blocks that the last frame read, wrote and cleared."""
+        """Number of nodes in the blocks that the last frame read, wrote and cleared."""
         return self._substepper.blocks * mpm_grid.BLOCK**3
 
     def set(self, **changes: Tensor) -> None:
-        """Overwrite fields of all particles, given in the original order."""
+        """Overwrite fields of all particles, in the original order."""
         for name, value in changes.items():
             self.rows.put(name, value)
 
-    def substeps(self, duration: float, push: Float[Tensor, "p 3"]) -> int:
-        """Substeps that the CFL condition asks for: dt <= SAFETY dx / (wave speed + particle speed).
+    def substeps(self, duration: float, acceleration: Float[Tensor, "p 3"]) -> int:
+        """Number of substeps by the CFL condition dt <= SAFETY dx / (wave speed + particle speed).
 
-        Viscosity must not spread momentum by more than VISCOUS cells^2 a substep either.
+        Also bounded by viscosity, dt eta / density <= VISCOUS dx^2. Raises Diverged when a velocity is not finite.
         """
         fast = self.rows["v"].norm(dim=1)
-        speed = float(fast.max()) + float(push.norm(dim=1).max()) * duration
+        speed = float(fast.max()) + float(acceleration.norm(dim=1).max()) * duration
         if not math.isfinite(speed):
             raise Diverged(int(self.rows["order"][fast.isfinite().logical_not()].min()))
         wave, viscous = self._rates
         rate = max((wave + speed) / (SAFETY * self.dx), viscous / (VISCOUS * self.dx**2))
-        return math.ceil(max(1, math.ceil(duration * rate)) / self._grain) * self._grain
+        return math.ceil(max(1, math.ceil(duration * rate)) / self._substep_multiple) * self._substep_multiple
 
-    def advance(self, duration: float, push: Float[Tensor, "p 3"], substeps: int | None = None) -> int:
-        """Move on by `duration` [s] under accelerations `push` [m/s^2]; returns the substeps taken.
+    def advance(self, duration: float, acceleration: Float[Tensor, "p 3"], substeps: int | None = None) -> int:
+        """Advance by `duration` [s] under the given accelerations [m/s^2]; return the number of substeps.
 
-        Raises Diverged when a particle leaves the box or is no number.
+        Raises Diverged when a particle leaves the box or is not finite.
         """
-        steps = substeps or self.substeps(duration, push)
-        self.enqueue_frame(duration, push, steps)
+        steps = substeps or self.substeps(duration, acceleration)
+        self.enqueue_frame(duration, acceleration, steps)
         first = int(self.rows.lost.min())
         if first != NEVER:
             raise Diverged(first)
         return steps
 
-    def enqueue_frame(self, duration: float, push: Float[Tensor, "p 3"], substeps: int) -> None:
-        """As `advance`, but the host waits for nothing: what goes wrong is only noted, in `lost`.
+    def enqueue_frame(self, duration: float, acceleration: Float[Tensor, "p 3"], substeps: int) -> None:
+        """As `advance`, without waiting for the device: divergence is only recorded, in `lost`.
 
-        A particle that would leave the box or is no number stays where it was; other scenes do not notice.
+        A particle that would leave the box or is not finite stays in place; other scenes are not affected.
         """
-        self.rows.put("acceleration", push)
+        self.rows.put("acceleration", acceleration)
         self._substepper.frame(duration / substeps, substeps)
         if self.colliders:
             self.colliders = tuple(c.advanced(duration) for c in self.colliders)
@@ -192,20 +193,20 @@ class Solver:
 
     @property
     def lost(self) -> Int[Tensor, "s"]:
-        """For each scene the first particle that was lost, or -1."""
+        """First lost particle of each scene, or -1."""
         return torch.where(self.rows.lost == NEVER, -1, self.rows.lost)
 
     def _quanta(self) -> tuple[float, float]:
-        """Quanta a kg m/s and a kg, powers of two: the same for any particles, so that scenes do not know each other.
+        """Fixed-point units per kg m/s and per kg: powers of two that depend on dx alone, not on the batch.
 
-        Full cells of 10 g/cm^3 on each other, some of them held and moving at metres a second, fit into 63 bits; in a
-        cell of foam a quantum is a speed of 1e-11 m/s.
+        Full cells of 10 g/cm^3, kinematic ones at metres per second among them, fit into 63 bits; in a cell of foam one
+        unit is a speed of 1e-11 m/s.
         """
         cell = math.ceil(math.log2(1e4 * self.dx**3))
         return 2.0 ** (47 - cell), 2.0 ** (42 - cell)
 
-    def _fastest(self) -> tuple[float, float]:
-        """Speed of the fastest pressure wave [m/s] and largest kinematic viscosity [m^2/s] of what can move."""
+    def _max_rates(self) -> tuple[float, float]:
+        """Maximum pressure wave speed [m/s] and kinematic viscosity [m^2/s] of the particles that are free."""
         moving = self.rows["held"] == 0
         if not bool(moving.any()):
             return 0.0, 0.0
@@ -216,14 +217,15 @@ class Solver:
 
 
 def max_batch_nodes(device: str) -> int:
-    """Of all scenes of a batch together: indices have 31 bits, and a CPU's threads have momentum of their own."""
+    """Maximum number of grid nodes of all scenes of a batch: indices have 31 bits, and the CPU keeps several copies."""
     return 2 * MAX_NODES if device == "cpu" else 2**31 - 1
 
 
 def make_grid(box: Box, dx: float):
-    """A grid whose outermost held nodes lie FLOOR_GAP cells outside the box, so that bodies rest on its faces.
+    """A grid whose boundary nodes lie FLOOR_GAP cells outside the box, so that bodies rest on its faces.
 
-    Exact for the lower faces, the floor among them; the upper ones are moved out to the next node.
+    Exact for the lower faces, the floor among them; the upper ones are moved out to the next node. Raises ValueError
+    when it has more than MAX_NODES nodes.
     """
     grid, n = mpm_grid.MpmGrid(), []
     for low, high in zip(box.low, box.high, strict=True):

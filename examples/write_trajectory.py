@@ -1,4 +1,4 @@
-"""A traj.h5 from any tool, with h5py alone: one ball that is thrown. python write_trajectory.py traj.h5"""
+"""Write a traj.h5 with h5py alone, as another tool would: a thrown ball. python write_trajectory.py traj.h5"""
 
 import sys
 

@@ -1,7 +1,7 @@
-"""A pillow pushed up and a cloth pulled left, by the learned force field and by MPM: python compare.py OUT
+"""Simulate a pillow pushed up and a cloth pulled left by the learned force field and by MPM: python compare.py OUT
 
-Writes OUT/<name>_ngff.h5, OUT/<name>_mpm.h5 and OUT/<name>.mp4, in which they stand side by side; `ngff evaluate` says
-by how much they differ. The pushes are in pillow_up.json and cloth_left.json. With the commands alone:
+Writes OUT/<name>_ngff.h5, OUT/<name>_mpm.h5 and OUT/<name>.mp4, which shows them side by side; `ngff evaluate` measures
+the difference. The forces are in pillow_up.json and cloth_left.json. The same with commands:
 
     ngff simulate pillow.ply --engine ngff --forces pillow_up.json -o pillow_ngff.h5
     ngff simulate pillow.ply --engine mpm --forces pillow_up.json -o pillow_mpm.h5
@@ -30,27 +30,27 @@ from stages.simulate.options import SimulateOptions
 from stages.simulate.stage import run as simulate
 
 HERE = Path(__file__).parent
-PUSHES = {"pillow": ("pillow_up.json", (0.0, 0.0, 1.0)), "cloth": ("cloth_left.json", (-1.0, 0.0, 0.0))}
-KEPT = 6  # every so many Gaussians of an object
+PROMPTS = {"pillow": ("pillow_up.json", (0.0, 0.0, 1.0)), "cloth": ("cloth_left.json", (-1.0, 0.0, 0.0))}
+KEEP_EVERY = 6  # only every sixth Gaussian of an object is used
 
 
 def scene(name: str) -> Scene:
-    """An object of the data set, in its usual size, lying on a floor."""
-    g = make_object(name)[::KEPT]
+    """An object of the data set at its usual size on a floor."""
+    g = make_object(name)[::KEEP_EVERY]
     scale = OBJECTS[name].scale
     means = scale * g.means
     means = means - torch.tensor([0.0, 0.0, float(means[:, 2].min())])
-    thing = replace(g, means=means, scales=1.3 * KEPT**0.5 * scale * g.scales)
-    floor = sheet(3.0, 3.0, 0.03).moved((0.0, 0.0, -0.02))  # drawn a little lower, as soft things sag into it
+    body = replace(g, means=means, scales=1.3 * KEEP_EVERY**0.5 * scale * g.scales)
+    floor = sheet(3.0, 3.0, 0.03).moved((0.0, 0.0, -0.02))  # drawn slightly lower, as soft objects sag
     tiles = (floor.points[:, :2] / 0.3).floor().sum(1).remainder(2)[:, None]
     table = to_gaussians(floor, 0.55 + 0.2 * tiles.expand(-1, 3), 0, width=0.8, widest=0.1)
-    table = replace(table, sh=torch.nn.functional.pad(table.sh, (0, 0, 0, thing.sh.shape[1] - 1)))
-    return Scene(concatenate([table, thing]), (SceneObject(1, name),), None, 0.0)
+    table = replace(table, sh=torch.nn.functional.pad(table.sh, (0, 0, 0, body.sh.shape[1] - 1)))
+    return Scene(concatenate([table, body]), (SceneObject(1, name),), None, 0.0)
 
 
 def compare(name: str, out: Path, steps: int = 60, **options) -> tuple[dict, dict]:
-    """Metrics of ngff against mpm, and how far along the push each engine carried the object, at most [m]."""
-    forces, along = PUSHES[name]
+    """Metrics of ngff against mpm, and the maximum displacement along the force by each engine [m]."""
+    forces, along = PROMPTS[name]
     write_scene(out / f"{name}.ply", scene(name))
     files = {engine: out / f"{name}_{engine}.h5" for engine in ("mpm", "ngff")}
     for engine, file in files.items():
@@ -65,13 +65,14 @@ def compare(name: str, out: Path, steps: int = 60, **options) -> tuple[dict, dic
 
 
 def main(out: Path) -> None:
+    """Compare the engines for both prompts; write metrics, trajectories and videos to `out`."""
     out.mkdir(parents=True, exist_ok=True)
-    for name in PUSHES:
+    for name in PROMPTS:
         _, moved = compare(name, out)
         files = [out / f"{name}_{engine}.h5" for engine in ("mpm", "ngff")]
         render(files, out / f"{name}.mp4", RenderOptions(side_by_side=True, show_forces=True, resolution=480))
-        print(name, *(f"{engine}: {m:.3f} m along the push" for engine, m in moved.items()))
-        assert min(moved.values()) > 0.05  # both follow the push
+        print(name, *(f"{engine}: {m:.3f} m along the force" for engine, m in moved.items()))
+        assert min(moved.values()) > 0.05  # both follow the force
 
 
 if __name__ == "__main__":

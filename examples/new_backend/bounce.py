@@ -1,4 +1,4 @@
-"""A simulator of one's own: every object a rigid body that falls and bounces. python bounce.py scene.ply traj.h5"""
+"""A custom simulator: every object is a rigid body that falls and bounces. python bounce.py scene.ply traj.h5"""
 
 import sys
 from pathlib import Path
@@ -15,7 +15,7 @@ DT, FRAMES, RESTITUTION = 0.02, 100, 0.6
 
 
 def heights(start: float, gravity: float, substeps: int = 20) -> list[float]:
-    """Height above the floor in every frame: semi-implicit Euler, and a bounce that loses energy [scene units]."""
+    """Height above the floor in every frame [scene units]: semi-implicit Euler with inelastic bounces."""
     z, v, out = start, 0.0, []
     for _ in range(FRAMES):
         out.append(z)
@@ -28,7 +28,7 @@ def heights(start: float, gravity: float, substeps: int = 20) -> list[float]:
 
 
 def simulate(scene: Scene, out: Path) -> None:
-    """scene.ply with labelled objects -> traj.h5, which `ngff render` draws like any other."""
+    """Write the trajectory of a scene with labelled objects, which `ngff render` and `ngff evaluate` read."""
     keypoints = choose_keypoints(scene, 512, seed=0)
     gravity = 9.81 / scene.metres_per_unit
     of = [keypoints.object_id == o.id for o in scene.objects]

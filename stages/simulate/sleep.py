@@ -1,7 +1,10 @@
-"""What rests at the start stays as it is until something reaches it: photos show things in equilibrium.
+"""Sleeping objects: what is at rest at the start keeps its position until something hits it.
 
-A learned force field holds a body only about as well as it has learned to, and parts found in photos overlap a little,
-so that they would be pushed apart. Source of the idea: sleeping islands, as rigid body engines have them.
+Photos show a static equilibrium, which a learned force field holds only approximately, and reconstructed objects
+overlap a little and would be pushed apart. Rigid body engines put islands of bodies at rest to sleep in the same way.
+
+Limits: support is contact in any direction, so an object that floats beside a supported one sleeps too; and objects
+that come to rest later do not fall asleep.
 """
 
 from __future__ import annotations
@@ -13,61 +16,65 @@ from torch import Tensor
 from stages.core.models.field.narrow_phase import nearest
 from stages.core.models.initial_conditions import InitialConditions
 
-TOUCH = 0.05  # what is nearer touches, beside half the distance between keypoints [m]
-SEAM = 0.1  # the same of things at the start: photos show little of where they touch
-STIR = 0.25  # what would make something so fast if it stuck to it wakes it [m/s]
+CONTACT_DISTANCE = 0.05  # distance at which objects touch, in addition to half the keypoint spacing [m]
+INITIAL_CONTACT_DISTANCE = 0.1  # the same at the start, as photos show little of contact regions [m]
+WAKE_SPEED = 0.25  # minimum speed that a perfectly inelastic impact must give an object to wake it [m/s]
 
 
 class SleepState:
-    """Which objects of a scene sleep; `awake` (o) are those that are thrown, lifted, or pushed at once.
+    """Tracks which of `o` objects are `asleep`.
 
-    The others sleep if they are `standing` on the floor (o), or touch what sleeps and does so.
+    At the start, the objects that are not `awake` sleep if they are `standing` on the floor or touch a sleeping object
+    that is itself supported.
     """
 
-    def __init__(self, world: InitialConditions, awake: Bool[Tensor, "o"], standing: Bool[Tensor, "o"]):
-        self.valid, self.mass = world.valid, world.mass[0].clamp_min(1e-6)
-        self.spacing = _spacing(world)
-        near = self._near(world.points, SEAM).any(-1)
-        self.touches = near | near.T
+    def __init__(self, initial: InitialConditions, awake: Bool[Tensor, "o"], standing: Bool[Tensor, "o"]):
+        self.valid, self.mass = initial.valid, initial.mass[0].clamp_min(1e-6)
+        self.spacing = _keypoint_spacing(initial)
+        near = self._near(initial.points, INITIAL_CONTACT_DISTANCE).any(-1)
+        self.in_contact = near | near.T
         self.standing, self.asleep = standing, ~awake
-        self._supported()
+        self._wake_unsupported()
 
-    def wake(self, points: Float[Tensor, "1 o n 3"], speed: Float[Tensor, "1 o n 3"]) -> bool:
-        """Wake whatever something awake has reached, or no longer holds; whether anything woke."""
+    def wake_on_impact(self, points: Float[Tensor, "1 o n 3"], speed: Float[Tensor, "1 o n 3"]) -> bool:
+        """Wake objects that an awake object has hit, and what they supported; whether any woke.
+
+        `points` [m] and their velocities `speed` [m/s] in model units.
+        """
         if not bool(self.asleep.any()):
             return False
-        share = self.mass[:, None] / (self.mass[:, None] + self.mass)
-        quick = speed[0].norm(dim=-1)[:, None] * share[..., None] > STIR
-        hit = (self._near(points, TOUCH) & quick).any(-1) & ~self.asleep[:, None]
-        return self.rouse(hit.any(0))
+        ratio = self.mass[:, None] / (self.mass[:, None] + self.mass)
+        fast = speed[0].norm(dim=-1)[:, None] * ratio[..., None] > WAKE_SPEED
+        hit = (self._near(points, CONTACT_DISTANCE) & fast).any(-1) & ~self.asleep[:, None]
+        return self.wake(hit.any(0))
 
-    def rouse(self, rows: Bool[Tensor, "o"]) -> bool:
-        """Wake these and whatever they held; whether anything woke."""
+    def wake(self, rows: Bool[Tensor, "o"]) -> bool:
+        """Wake these objects and those that they supported; whether any woke."""
         before = int(self.asleep.sum())
         self.asleep = self.asleep & ~rows
-        self._supported()
+        self._wake_unsupported()
         return int(self.asleep.sum()) < before
 
     def _near(self, points: Float[Tensor, "1 o n 3"], gap: float) -> Bool[Tensor, "o o n"]:
-        """Which keypoints of object i (first) touch object j (second)."""
-        most = gap + torch.maximum(self.spacing[:, None], self.spacing) / 2
-        distance, _ = nearest(points, self.valid, float(most.max()))
-        return distance[0] < most[..., None]
+        """Mask of the keypoints of object i (first) that touch object j (second)."""
+        limit = gap + torch.maximum(self.spacing[:, None], self.spacing) / 2
+        distance, _ = nearest(points, self.valid, float(limit.max()))
+        return distance[0] < limit[..., None]
 
-    def _supported(self) -> None:
-        """Whoever sleeps on nothing wakes."""
-        held = self.asleep & self.standing
+    def _wake_unsupported(self) -> None:
+        """Wake sleeping objects that neither stand on the floor nor touch a supported sleeping object."""
+        supported = self.asleep & self.standing
         while True:
-            more = held | (self.asleep & (self.touches & held).any(-1))
-            if bool((more == held).all()):
+            more = supported | (self.asleep & (self.in_contact & supported).any(-1))
+            if bool((more == supported).all()):
                 break
-            held = more
-        self.asleep = held
+            supported = more
+        self.asleep = supported
 
 
-def _spacing(world: InitialConditions) -> Float[Tensor, "o"]:
-    """About how far apart the keypoints of each object are [m]: as on the surface of its bounding box."""
-    hidden = ~world.valid[0, ..., None]
-    high = world.points[0].masked_fill(hidden, -torch.inf).amax(1)
-    a, b, c = (high - world.points[0].masked_fill(hidden, torch.inf).amin(1)).unbind(-1)
-    return (2 * (a * b + b * c + c * a) / world.valid[0].sum(-1)).sqrt()
+def _keypoint_spacing(initial: InitialConditions) -> Float[Tensor, "o"]:
+    """Approximate distance between the keypoints of each object [m], as if spread over its bounding box's surface."""
+    hidden = ~initial.valid[0, ..., None]
+    high = initial.points[0].masked_fill(hidden, -torch.inf).amax(1)
+    a, b, c = (high - initial.points[0].masked_fill(hidden, torch.inf).amin(1)).unbind(-1)
+    return (2 * (a * b + b * c + c * a) / initial.valid[0].sum(-1)).sqrt()

@@ -1,4 +1,4 @@
-"""The pushes of the paper's figures, by both engines."""
+"""examples/force_prompts: both engines follow the prompted forces."""
 
 import importlib.util
 from pathlib import Path
@@ -19,17 +19,17 @@ def example():
 
 @pytest.fixture(scope="module")
 def results(example, tmp_path_factory):
-    out = tmp_path_factory.mktemp("pushes")
-    return {name: example.compare(name, out, 25, keypoints=64, quality="draft") for name in example.PUSHES}
+    out = tmp_path_factory.mktemp("force_prompts")
+    return {name: example.compare(name, out, 25, keypoints=64, quality="draft") for name in example.PROMPTS}
 
 
 @pytest.mark.parametrize("name", ["pillow", "cloth"])
 @pytest.mark.parametrize("engine", ["mpm", "ngff"])
-def test_what_is_pushed_follows(results, name, engine):
+def test_objects_follow_the_force(results, name, engine):
     _, moved = results[name]
     assert moved[engine] > 0.05
 
 
-def test_the_engines_are_compared_at_the_same_points(results):
+def test_engines_are_compared_at_the_same_keypoints(results):
     for metrics, _ in results.values():
         assert metrics["overall"]["frames"] == 25 and metrics["overall"]["RMSE"] < 0.5

@@ -8,7 +8,7 @@ from stages.core.scene.trajectory import read_trajectory
 BOUNCE = Path(__file__).resolve().parents[2] / "examples/new_backend/bounce.py"
 
 
-def test_a_simulator_of_ones_own_writes_a_trajectory_that_is_read(tmp_path, two_balls):
+def test_bounce_writes_a_valid_trajectory(tmp_path, two_balls):
     runpy.run_path(str(BOUNCE))["simulate"](two_balls, tmp_path / "t.h5")
     trajectory = read_trajectory(tmp_path / "t.h5")
     assert len(trajectory) == 100 and trajectory.info.engine == "bounce"

@@ -58,7 +58,7 @@ def sample_bodies(scene: Scene, count: int, seed: int = 0) -> Bodies:
     Raises InputError for an object without any usable Gaussian.
     """
     clouds = [surface_points(scene, o.id, seed) for o in scene.objects]
-    photographed = scene.cameras is not None  # and held still for the photos
+    photographed = scene.cameras is not None  # so the objects were at rest
     gaps = [_gap(c) for c in clouds]
     extent = max(float((c.max(0) - c.min(0)).max()) for c in clouds)
     # closing bridges up to eight voxels; smaller voxels would break a sparse object into pieces

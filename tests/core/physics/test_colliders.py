@@ -1,4 +1,4 @@
-"""Balls, boxes and half-spaces in the way, against Coulomb, Newton and Euclid."""
+"""Colliders: friction, restitution, contact and prescribed motion."""
 
 import math
 
@@ -15,13 +15,13 @@ PLANE = (0.0, 0.0, 0.0)
 
 
 def tilted(slope: float) -> tuple[float, float, float, float]:
-    """Rotation that takes z to a plane falling along x with this slope."""
+    """Rotation of z to the normal of a plane that falls along x with this slope."""
     half = math.atan(slope) / 2
     return math.cos(half), 0.0, math.sin(half), 0.0
 
 
 def along_slope(slope: float, friction: float = 0.5, surface: str = "separate", finer: int = 1) -> float:
-    """Acceleration of a flat block on a tilted plane [m/s^2]; the block lies aligned with it, gravity is turned."""
+    """Acceleration of a flat block on a tilted plane [m/s^2]; the block lies aligned with it, gravity is rotated."""
     p = block((0.4, 0.4, 0.1), 1 / 60, E=5e5, viscosity=200.0)
     ground = Collider("plane", PLANE, surface=surface, friction=friction)
     solver, angle = mpm.Solver(p, mpm.Box((-1, -1, -0.5), (2, 1.4, 1)), 1 / 30, colliders=[ground]), math.atan(slope)
@@ -35,19 +35,19 @@ def along_slope(slope: float, friction: float = 0.5, surface: str = "separate", 
 
 
 @pytest.mark.parametrize("finer", [1, 3])
-def test_friction_is_coulombs_whatever_the_substep(finer):
+def test_coulomb_friction_does_not_depend_on_the_substep(finer):
     expected = 9.81 * (math.sin(math.atan(0.75)) - 0.3 * math.cos(math.atan(0.75)))
     assert along_slope(0.75, 0.3, finer=finer) == pytest.approx(expected, rel=0.07)
 
 
-def test_sticky_holds_and_slip_glides():
+def test_sticky_and_slip_surfaces():
     slope = 0.75
     assert abs(along_slope(slope, surface="sticky")) < 0.05
     assert along_slope(slope, surface="slip") == pytest.approx(9.81 * math.sin(math.atan(slope)), rel=0.02)
 
 
 @pytest.mark.parametrize("surface, leaves", [("separate", True), ("slip", False), ("sticky", False)])
-def test_only_what_separates_can_be_lifted_off(surface, leaves):
+def test_only_separate_surfaces_release_bodies(surface, leaves):
     p = block((0.2, 0.2, 0.1), 0.025, E=2e5)
     solver = mpm.Solver(p, FREE, 0.05, colliders=[Collider("plane", PLANE, surface=surface)])
     roll(solver, 0.1, (0.0, 0.0, -9.81))
@@ -58,7 +58,7 @@ def test_only_what_separates_can_be_lifted_off(surface, leaves):
 
 
 def dropped(restitution: float, finer: int, collider: bool) -> float:
-    """Speed at which a sheet of particles leaves the ground that it meets at 1 m/s."""
+    """Speed at which a sheet of particles leaves the ground after hitting it at 1 m/s."""
     p = block((0.3, 0.3, 0.025), 0.025, E=2e5, nu=0.0, low=(0, 0, 0.1))
     p.x[:, 2] = 0.1
     p.v[:, 2] = -1.0
@@ -72,8 +72,8 @@ def dropped(restitution: float, finer: int, collider: bool) -> float:
 
 @pytest.mark.parametrize("collider", [True, False])
 @pytest.mark.parametrize("restitution", [0.0, 0.5, 1.0])
-def test_restitution_is_the_share_of_speed_that_comes_back_whatever_the_substep(restitution, collider):
-    # a sheet has no waves in it that could take up energy, so what comes back is the surface's doing
+def test_restitution_does_not_depend_on_the_substep(restitution, collider):
+    # a sheet has no internal waves, so the speed returned is that of the surface
     for finer in (1, 4):
         assert dropped(restitution, finer, collider) == pytest.approx(restitution, abs=0.05)
 
@@ -88,25 +88,25 @@ def test_a_block_rests_on_a_box_and_falls_past_its_edge():
     assert float((beside.x[:, 2] - z[len(on) :]).mean()) == pytest.approx(9.81 * 0.3**2 / 2, rel=0.02)
 
 
-def test_nothing_is_inside_a_ball_and_things_roll_off_it():
+def test_bodies_do_not_penetrate_a_sphere_and_slide_off_it():
     ball = Collider("sphere", (0.1, 0.1, 0.0), (0.2, 0.0, 0.0), friction=0.1)
     p = block((0.1, 0.1, 0.1), 0.0125, E=2e5, low=(0.09, 0.05, 0.22))
     solver = mpm.Solver(p, FREE, 0.025, colliders=[ball])
     roll(solver, 0.6, (0.0, 0.0, -9.81))
     x = solver.particles.x - torch.tensor([0.1, 0.1, 0.0])
     assert float(x.norm(dim=1).min()) > 0.2 - 0.025
-    assert float(x[:, 0].mean()) > 0.1  # it was set down off centre
+    assert float(x[:, 0].mean()) > 0.1  # it was placed off centre
 
 
 @pytest.mark.parametrize("device, fused", [(d, f) for d in DEVICES for f in (False, True)])
-def test_a_moving_wall_pushes_and_a_turning_table_carries(device, fused):
+def test_a_moving_wall_pushes_and_a_rotating_table_carries(device, fused):
     wall = Collider("box", (-0.2, 0.1, 0.1), (0.15, 0.4, 0.4), velocity=(0.5, 0.0, 0.0), friction=0.0)
     p = block((0.1, 0.1, 0.1), 0.025, E=2e5, viscosity=100.0)
     solver = mpm.Solver(p, FREE, 0.05, device, colliders=[wall], fused=fused)
     roll(solver, 0.6)
     assert solver.colliders[0].centre == pytest.approx((0.1, 0.1, 0.1))
     now = solver.particles
-    # a body that is pushed at constant speed keeps it, or bounces ahead
+    # the body has the speed of the wall or bounces ahead
     assert 0.45 < float(now.v[:, 0].mean()) < 1.0 and float(now.x[:, 0].min()) > 0.25 - 0.05
     table = Collider("box", PLANE, (0.5, 0.5, 0.15), angular_velocity=(0.0, 0.0, 1.0), surface="sticky")
     solver = mpm.Solver(block((0.1, 0.1, 0.1), 0.025, E=2e5, viscosity=50.0, low=(0.2, -0.05, 0.13)), FREE, 0.05,
@@ -117,7 +117,7 @@ def test_a_moving_wall_pushes_and_a_turning_table_carries(device, fused):
 
 
 @pytest.mark.parametrize("device, fused", [(d, f) for d in DEVICES for f in (False, True)])
-def test_a_held_body_with_a_velocity_moves_as_prescribed_and_takes_others_along(device, fused):
+def test_a_kinematic_body_moves_as_prescribed_and_drags_others(device, fused):
     low, high = block((0.3, 0.2, 0.1), 0.025), block((0.1, 0.1, 0.1), 0.025, low=(0.1, 0.05, 0.11), viscosity=50.0)
     p = mpm.join_particles([low, high])
     p.held[: len(low)] = 1
@@ -130,7 +130,7 @@ def test_a_held_body_with_a_velocity_moves_as_prescribed_and_takes_others_along(
     assert float((end.x[len(low) :] - high.x)[:, 0].mean()) == pytest.approx(0.15, abs=0.02)
 
 
-def test_colliders_turn_and_move_as_they_say():
+def test_prescribed_motion_of_colliders():
     c = Collider("box", (1.0, 0, 0), (1, 1, 1), velocity=(0, 2.0, 0), angular_velocity=(0, 0, math.pi)).advanced(0.5)
     assert c.centre == pytest.approx((1.0, 1.0, 0.0))
     assert c.rotation == pytest.approx((math.sqrt(0.5), 0, 0, math.sqrt(0.5)))
@@ -140,6 +140,6 @@ def test_colliders_turn_and_move_as_they_say():
     ({"kind": "cone"}, "plane, sphere, box, not 'cone'"), ({"surface": "wet"}, "separate, slip, sticky"),
     ({"friction": -1.0}, "0 or more"), ({"restitution": 2.0}, "0 to 1"),
 ])  # fmt: skip
-def test_wrong_colliders(wrong, message):
+def test_invalid_colliders(wrong, message):
     with pytest.raises(InputError, match=message):
         Collider(**{"kind": "plane", "centre": PLANE, **wrong})

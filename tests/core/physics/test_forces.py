@@ -1,4 +1,4 @@
-"""Force prompts: what they mean and how wrong ones are answered."""
+"""Parsing of force prompts."""
 
 import json
 import math
@@ -12,20 +12,22 @@ from stages.core.scene.scene import SceneObject
 OBJECTS = (SceneObject(1, "duck"), SceneObject(2, "phone"))
 
 
-def test_a_push():
+def test_force():
     (f,) = parse(OBJECTS, force=["object=2 force=0,0,8 from=0.1 to=0.3"]).forces
     assert f == Force(2, (0.0, 0.0, 8.0), (0.0, 0.0, 0.0), 0.1, 0.3, None)
 
 
-def test_a_torque_and_a_place_by_name_without_times():
+def test_torque_and_point_by_name_without_times():
     (f,) = parse(OBJECTS, force=["object=duck torque=1,0,0 force=0,-2,0 at=0.1,0,.5"]).forces
     assert f == Force(1, (0.0, -2.0, 0.0), (1.0, 0.0, 0.0), 0.0, math.inf, (0.1, 0.0, 0.5))
-    assert ForcePrompts((f,)).as_dicts()[0]["end"] is None  # JSON knows no infinity
+    assert ForcePrompts((f,)).as_dicts()[0]["end"] is None  # JSON has no infinity
 
 
-@pytest.mark.parametrize("start, end, share", [(0.0, 0.02, 0), (0.08, 0.12, 0.5), (0.2, 0.22, 1), (0.29, 0.33, 0.25)])
-def test_share_of_a_frame(start, end, share):
-    assert Force(1, start=0.1, end=0.3).active_fraction(start, end) == pytest.approx(share)
+@pytest.mark.parametrize("start, end, fraction", [
+    (0.0, 0.02, 0), (0.08, 0.12, 0.5), (0.2, 0.22, 1), (0.29, 0.33, 0.25),
+])  # fmt: skip
+def test_active_fraction(start, end, fraction):
+    assert Force(1, start=0.1, end=0.3).active_fraction(start, end) == pytest.approx(fraction)
 
 
 def test_pin_velocity_and_lift():
@@ -36,7 +38,7 @@ def test_pin_velocity_and_lift():
     json.dumps(p.as_dicts())
 
 
-def test_the_public_file_counts_objects_from_0(tmp_path):
+def test_the_file_format_of_ngff_counts_objects_from_0(tmp_path):
     file = tmp_path / "forces.json"
     row = {"obj_id": 0, "start": 0.2, "end": 0.4, "force": [0, 0, 8]}
     file.write_text(json.dumps({"12_duck_phone": [row], "other": [{**row, "obj_id": 1, "torque": [1, 2, 3]}]}))
@@ -45,7 +47,7 @@ def test_the_public_file_counts_objects_from_0(tmp_path):
     with pytest.raises(InputError, match="has no scene 'mine'; it has 12_duck_phone, other"):
         parse(OBJECTS, "mine", forces=file)
     file.write_text(json.dumps({"only": [row]}))
-    assert parse(OBJECTS, "mine", forces=file).forces[0].object_id == 1  # one scene fits any name
+    assert parse(OBJECTS, "mine", forces=file).forces[0].object_id == 1  # a single scene matches any name
 
 
 @pytest.mark.parametrize("prompt, message", [
@@ -53,7 +55,7 @@ def test_the_public_file_counts_objects_from_0(tmp_path):
     ({"force": ["force=0,0,1"]}, "needs object= and force="),
     ({"force": ["object=2 force=0,0"]}, "'0,0' is not three numbers"),
     ({"force": ["object=2 force=0,0,inf"]}, "is not three numbers"),
-    ({"force": ["object=2 force=0,0,1 until=3"]}, "'until' is not understood"),
+    ({"force": ["object=2 force=0,0,1 until=3"]}, "'until' is not a known key"),
     ({"force": ["object=2 force=0,0,1 from=x"]}, "'x' is not a number"),
     ({"force": ["object=2 force=0,0,1 from=0.3 to=0.1"]}, "the end must come after"),
     ({"force": ["object=9 force=0,0,1"]}, "'9' is no object of this scene; there are: 1 \\(duck\\), 2 \\(phone\\)"),
@@ -64,7 +66,7 @@ def test_the_public_file_counts_objects_from_0(tmp_path):
     ({"lift": ["3=1"]}, "no object"),
     ({"lift": ["nan"]}, "not finite"),
 ])  # fmt: skip
-def test_wrong_prompts(prompt, message):
+def test_invalid_prompts(prompt, message):
     with pytest.raises(InputError, match=message):
         parse(OBJECTS, **prompt)
 
@@ -75,7 +77,7 @@ def test_wrong_prompts(prompt, message):
     ('{"a": [{"obj_id": 0, "start": 1, "end": 0}]}', "the end must come after"),
     ('{"a": [{"obj_id": 0, "start": 0, "end": 1, "force": [1]}]}', "3 numbers"), ('{"a": [7]}', "entry 1"),
 ])  # fmt: skip
-def test_wrong_files(tmp_path, text, message):
+def test_invalid_files(tmp_path, text, message):
     file = tmp_path / "f.json"
     file.write_text(text)
     with pytest.raises(InputError, match=message) as error:

@@ -1,4 +1,4 @@
-"""Which material an object is made of."""
+"""Material tables and the choice of a material for an object."""
 
 import json
 
@@ -11,7 +11,7 @@ from stages.core.scene.scene import SceneObject
 OBJECTS = (SceneObject(1, "rubber duck"), SceneObject(2, "object_2"), SceneObject(3, "green mug", "plastic"))
 
 
-def test_every_constant_is_sane_and_has_a_source():
+def test_every_material_is_plausible_and_has_a_source():
     for name, m in MATERIALS.items():
         assert 1e2 < m.E < 1e12 and 10 < m.density < 1e4 and 0 < m.nu < 0.49, name
         assert 0 < m.friction < 1.5 and 0 < m.loss < 1 and len(m.source) > 20, name
@@ -19,7 +19,7 @@ def test_every_constant_is_sane_and_has_a_source():
 
 
 @pytest.mark.parametrize("name, E, density", [("ball", 8e5, 600), ("phone", 2e7, 2600), ("rope", 5e3, 500)])
-def test_objects_of_the_paper(name, E, density):
+def test_materials_of_the_paper(name, E, density):
     assert (MATERIALS[name].E, MATERIALS[name].density, MATERIALS[name].nu) == (E, density, 0.3)
 
 
@@ -28,11 +28,11 @@ def test_objects_of_the_paper(name, E, density):
     ("candle", DEFAULT_MATERIAL), ("Teddy bear", "soft"), ("two cans", "can"), ("mug 2", "ceramic"),
     ("object_7", DEFAULT_MATERIAL), ("", DEFAULT_MATERIAL),
 ])  # fmt: skip
-def test_by_name(name, material):
+def test_material_from_the_name(name, material):
     assert choose_materials([SceneObject(1, name)])[1].name == material
 
 
-def test_what_is_told_wins_over_the_scene_and_the_scene_over_the_name(tmp_path):
+def test_options_override_the_scene_and_the_scene_overrides_the_name(tmp_path):
     file = tmp_path / "m.json"
     file.write_text(json.dumps({"2": "wood", "duck": {"E": 5e4, "density": 200, "friction": 0.9}}))
     chosen = choose_materials(OBJECTS, ["object_2=foam"], file)
@@ -45,7 +45,7 @@ def test_what_is_told_wins_over_the_scene_and_the_scene_over_the_name(tmp_path):
     ("duck", "OBJECT=MATERIAL"), ("duck=", "OBJECT=MATERIAL"), ("duck=cheese", "choose from rubber"),
     ("cow=rubber", "there are: 1 \\(rubber duck\\)"), ("e=rubber", "fits 3 objects"),
 ])  # fmt: skip
-def test_wrong_prompts(prompt, message):
+def test_invalid_prompts(prompt, message):
     with pytest.raises(InputError, match=message):
         choose_materials(OBJECTS, [prompt])
 
@@ -56,7 +56,7 @@ def test_wrong_prompts(prompt, message):
     ('{"duck": {"E": 1e5, "density": 100, "nu": 0.5}}', "nu"), ('{"duck": {"E": "x", "density": 1}}', "numbers"),
     ('{"duck": {"E": 1e5, "density": 1, "colour": 1}}', "friction"),
 ])  # fmt: skip
-def test_wrong_files(tmp_path, text, message):
+def test_invalid_files(tmp_path, text, message):
     file = tmp_path / "m.json"
     file.write_text(text)
     with pytest.raises(InputError, match=message) as error:
@@ -64,5 +64,5 @@ def test_wrong_files(tmp_path, text, message):
     assert str(file) in str(error.value)
 
 
-def test_objects_are_found_by_id_name_or_part_of_it():
+def test_objects_are_found_by_id_name_or_part_of_the_name():
     assert [find_object(key, OBJECTS, "").id for key in (2, "2", "Rubber Duck", "mug")] == [1 + 1, 2, 1, 3]

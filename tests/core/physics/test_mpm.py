@@ -1,4 +1,4 @@
-"""The MPM solver as physics: conservation, waves, contact, friction."""
+"""Physics of the MPM solver: conservation, waves, contact, friction."""
 
 import math
 
@@ -16,7 +16,7 @@ def block(
     size: tuple = (0.2, 0.2, 0.2), h: float = 0.0125, E: float = 1e5, nu: float = 0.3, density: float = 500.0,
     friction: float = 0.5, viscosity: float = 0.0, low: tuple = (0.0, 0.0, 0.0),
 ) -> mpm.Particles:  # fmt: skip
-    """A box of particles, jittered in voxels of edge h, that weighs what it should."""
+    """A box of particles of the given density, jittered in voxels of edge h."""
     counts = [max(1, round(s / h)) for s in size]
     x = torch.cartesian_prod(*[torch.arange(n) + 0.5 for n in counts]) * h
     x = x + (torch.rand(x.shape, generator=torch.Generator().manual_seed(0)) - 0.5) * 0.5 * h + torch.tensor(low)
@@ -31,14 +31,16 @@ def roll(solver: mpm.Solver, seconds: float, push: tuple = (0.0, 0.0, 0.0), fram
 
 
 def momenta(p: mpm.Particles, dx: float) -> tuple[torch.Tensor, torch.Tensor]:
-    """Linear and angular momentum; a particle of APIC spins with inertia m dx^2 / 4 (Jiang et al. 2015, eq. 8)."""
+    """Linear and angular momentum; an APIC particle has moment of inertia m dx^2 / 4 (Jiang et al. 2015, eq. 8)."""
     x, v, C, m = (t.double() for t in (p.x, p.v, p.C, p.mass))
     spin = dx**2 / 4 * torch.stack([C[:, 2, 1] - C[:, 1, 2], C[:, 0, 2] - C[:, 2, 0], C[:, 1, 0] - C[:, 0, 1]], 1)
     return (m[:, None] * v).sum(0), (m[:, None] * (torch.linalg.cross(x, v) + spin)).sum(0)
 
 
 def energy(p: mpm.Particles, dx: float) -> float:
-    """Kinetic (with the affine part) and stored: mu/2 (tr F^T F - 3 - 2 log J) + lambda/2 log(J)^2 a volume."""
+    """Kinetic energy (with the affine part) and elastic energy, mu/2 (tr F^T F - 3 - 2 log J) + lambda/2 log(J)^2 per
+    volume [J].
+    """
     F, v, C = p.F.double(), p.v.double(), p.C.double()
     log_J = torch.linalg.det(F).log()
     mu, lam = p.stiffness[:, 0].double(), p.stiffness[:, 1].double()
@@ -53,11 +55,11 @@ def test_free_flight_is_a_parabola(device):
     p.v[:] = torch.tensor([1.0, 0.5, 2.0])
     solver, g, t = mpm.Solver(p, FREE, 0.025, device), torch.tensor([0.0, 0.0, -9.81]), 0.4
     roll(solver, t, tuple(g.tolist()))
-    # symplectic Euler is late by g t dt / 2; float32 sums leave the rest
+    # the error of symplectic Euler is g t dt / 2; the rest is float32 rounding
     dt = 0.02 / solver.substeps(0.02, g[None])
     expected = p.x.mean(0) + p.v[0] * t + g * t**2 / 2
     torch.testing.assert_close(solver.particles.x.cpu().mean(0), expected, rtol=0, atol=9.81 * t * dt / 2 + 1e-4)
-    assert (solver.particles.F.cpu() - torch.eye(3)).abs().max() < 1e-3  # and nothing deforms
+    assert (solver.particles.F.cpu() - torch.eye(3)).abs().max() < 1e-3  # no deformation
 
 
 def test_momentum_and_angular_momentum_are_conserved():
@@ -65,16 +67,16 @@ def test_momentum_and_angular_momentum_are_conserved():
     r = p.x - p.x.mean(0)
     p.v = torch.tensor([0.5, -0.3, 0.2]) + torch.linalg.cross(torch.tensor([3.0, 5.0, -4.0]).expand_as(r), r) + 4 * r
     solver = mpm.Solver(p, FREE, dx)
-    roll(solver, 0.02)  # the affine part comes into being
+    roll(solver, 0.02)  # the affine part builds up
     before = momenta(solver.particles, dx)
     roll(solver, 0.3)
     for a, b in zip(before, momenta(solver.particles, dx), strict=True):
-        # a few hundred steps of float32: the rounding of sums, no drift
+        # rounding of a few hundred float32 steps
         torch.testing.assert_close(a, b, rtol=0, atol=2e-4 * float(a.norm()))
 
 
 def vibration(dx: float, time: float = 0.1) -> float:
-    """Share of its energy that a breathing ball keeps."""
+    """Fraction of its energy that a ball in radial vibration keeps over `time` [s]."""
     p = block(h=dx / 2, E=2e5)
     r = p.x - p.x.mean(0)
     p = mpm.Particles(*(getattr(p, f)[r.norm(dim=1) < 0.1] for f in p.__dataclass_fields__))
@@ -95,7 +97,7 @@ def test_energy_does_not_grow_and_its_loss_shrinks_with_refinement():
 
 def test_a_bar_vibrates_at_its_frequency():
     # free at both ends, Poisson 0: f = sqrt(E / density) / (2 L). Quadratic splines with 32 cells a wavelength and
-    # free ends that are fuzzy by a fraction of a cell: 3 %.
+    # free ends resolved to a fraction of a cell: 3 %.
     length, E, density, dx = 0.8, 1e5, 500.0, 0.05
     p = block((length, 0.1, 0.1), dx / 2, E, 0.0, density)
     shape = torch.cos(math.pi * p.x[:, 0] / length)
@@ -105,17 +107,17 @@ def test_a_bar_vibrates_at_its_frequency():
         roll(solver, frame, frame=frame)
         signal.append(float((solver.particles.v[:, 0] * shape).sum()))
     s = torch.tensor(signal)
-    turns = (s[1:] * s[:-1] < 0).nonzero()[:, 0]
-    crossings = frame * (turns + s[turns] / (s[turns] - s[turns + 1]))
+    changes = (s[1:] * s[:-1] < 0).nonzero()[:, 0]
+    crossings = frame * (changes + s[changes] / (s[changes] - s[changes + 1]))
     measured = (len(crossings) - 1) / 2 / float(crossings[-1] - crossings[0])
     assert len(crossings) >= 3
     assert measured == pytest.approx(math.sqrt(E / density) / (2 * length), rel=0.03)
 
 
-def test_viscosity_damps():
-    lively, dull = block(E=1e5), block(E=1e5, viscosity=30.0)
+def test_viscosity_damps_vibration():
+    elastic, viscous = block(E=1e5), block(E=1e5, viscosity=30.0)
     kept = []
-    for p in (lively, dull):
+    for p in (elastic, viscous):
         p.v = 3 * (p.x - p.x.mean(0))
         solver = mpm.Solver(p, FREE, 0.025)
         start = energy(p, 0.025)
@@ -124,8 +126,8 @@ def test_viscosity_damps():
     assert kept[1] < 0.5 * kept[0]
 
 
-def test_rest_on_the_floor():
-    # set down without force, it settles by a fraction of a cell, stops, and neither creeps nor jitters
+def test_a_block_rests_on_the_floor():
+    # it settles by a fraction of a cell, stops, and neither creeps nor jitters
     dx, box = 0.025, mpm.Box((-1, -1, 0), (1, 1, 1))
     p = block(E=5e5, viscosity=100.0)
     solver = mpm.Solver(p, box, dx)
@@ -138,8 +140,8 @@ def test_rest_on_the_floor():
     assert float((end.x - p.x).norm(dim=1).max()) < dx / 8
 
 
-def test_a_fall_ends_on_the_floor():
-    # the grid lets bodies touch at a distance of about a cell; FLOOR_GAP takes that out, to a fraction of a cell
+def test_a_fall_ends_at_floor_height():
+    # contact on the grid begins at about one cell; FLOOR_GAP corrects for it to a fraction of a cell
     dx = 0.025
     solver = mpm.Solver(block(E=5e5, viscosity=100.0, low=(0, 0, 0.03)), mpm.Box((-1, -1, 0), (1, 1, 1)), dx)
     roll(solver, 0.8, (0.0, 0.0, -9.81))
@@ -167,28 +169,28 @@ def rigid(slope: float, friction: float) -> float:
     return 9.81 * (math.sin(math.atan(slope)) - friction * math.cos(math.atan(slope)))
 
 
-def test_below_the_friction_angle_it_sticks():
+def test_a_block_sticks_below_the_friction_angle():
     assert abs(slide(0.35, 0.5)[1]) < 1e-3
 
 
 @pytest.mark.parametrize("slope, friction", [(0.75, 0.5), (0.3, 0.0)])
-def test_above_the_friction_angle_it_slides(slope, friction):
-    # soft blocks shiver a little as they slide, so not quite the whole of the underside is always in contact
+def test_a_block_slides_above_the_friction_angle(slope, friction):
+    # sliding soft blocks vibrate, so their whole underside is not always in contact
     assert slide(slope, friction)[0] == pytest.approx(rigid(slope, friction), rel=0.07)
 
 
 def test_friction_does_not_depend_on_the_substep():
-    # a factor a substep, as in the public solver, would act three times as hard
+    # a factor per substep, as in the solver of NGFF, would act three times as strongly
     assert slide(0.75, 0.5, finer=3)[0] == pytest.approx(rigid(0.75, 0.5), rel=0.07)
 
 
 @pytest.mark.gpu
-def test_a_gpu_gives_what_a_cpu_gives():
+def test_gpu_agrees_with_cpu():
     if len(DEVICES) < 2:
         pytest.skip("needs an NVIDIA GPU")
     if not wp.is_cpu_available():
         pytest.skip("this build of Warp has no CPU compiler")
-    # through a fall, contact with the floor and friction: rounding, a hundred times grown
+    # a fall, contact with the floor and friction amplify rounding about a hundred times
     ends = []
     for device in DEVICES:
         p = block(low=(0, 0, 0.05))
@@ -199,7 +201,7 @@ def test_a_gpu_gives_what_a_cpu_gives():
     torch.testing.assert_close(*ends, rtol=0, atol=2e-5)
 
 
-def test_both_launch_orders_give_the_same():
+def test_both_schedules_agree():
     ends = []
     for fused in (False, True):
         p = block(low=(0, 0, 0.05))
@@ -221,7 +223,7 @@ def test_walls_hold():
     assert float(solver.particles.v[:, 0].mean()) < 0  # bounced
 
 
-def test_a_held_body_stays_and_stops_others():
+def test_a_held_body_stays_and_supports_others():
     low, high = block((0.2, 0.2, 0.1)), block((0.2, 0.2, 0.1), low=(0, 0, 0.15))
     p = mpm.join_particles([low, high])
     p.held[: len(low)] = 1
@@ -232,7 +234,7 @@ def test_a_held_body_stays_and_stops_others():
     assert 0.1 < float(end.x[len(low) :, 2].mean()) < 0.2
 
 
-def test_substeps_follow_from_the_fastest_wave_and_speed():
+def test_substeps_follow_the_cfl_condition():
     p, dx = block(E=1e6), 0.025
     solver = mpm.Solver(p, FREE, dx)
     wave = mpm.wave_speed(1e6, 0.3, 500.0)
@@ -244,7 +246,7 @@ def test_substeps_follow_from_the_fastest_wave_and_speed():
     assert solver.substeps(0.02, torch.zeros(1, 3)) == math.ceil(0.02 * (wave + speed) / (mpm.SAFETY * dx))
 
 
-def test_a_run_that_goes_wrong_says_which_particle():
+def test_divergence_names_the_particle():
     p = block()
     solver = mpm.Solver(p, FREE, 0.025)
     bad = p.v.clone()

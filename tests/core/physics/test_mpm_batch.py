@@ -1,4 +1,4 @@
-"""Scenes in a batch: each as if alone, and one that goes wrong alone in that."""
+"""Batches of scenes: independence, exact sums and failures."""
 
 import pytest
 import torch
@@ -13,7 +13,7 @@ ORDERS = [("cpu", False), ("cpu", True)] + [("cuda", True)] * (len(DEVICES) > 1)
 
 
 def scenes() -> dict[str, mpm.Particles]:
-    """Three of different size, height, stiffness and speed."""
+    """Three scenes of different size, height, stiffness and speed."""
     made = {
         "low": block((0.2, 0.2, 0.1), 0.025, low=(0, 0, 0.01)),
         "tall": block((0.1, 0.1, 0.3), 0.025, E=3e4, low=(0.1, 0.1, 0.05)),
@@ -24,8 +24,8 @@ def scenes() -> dict[str, mpm.Particles]:
 
 
 @pytest.mark.parametrize("device, fused", ORDERS)
-def test_a_scene_in_a_batch_moves_as_if_alone(device, fused):
-    # the sums of a scene are the same, only taken in parts that are cut elsewhere: rounding
+def test_scenes_of_a_batch_are_independent(device, fused):
+    # sums are split into parts at other particles: rounding
     batch = Batch(scenes(), BOX, DX, device)
     together = [frame for frame in batch.frames(7, 0.02, SUBSTEPS, GRAVITY)][-1]
     for name, particles in scenes().items():
@@ -38,7 +38,7 @@ def test_a_scene_in_a_batch_moves_as_if_alone(device, fused):
 
 
 @pytest.mark.parametrize("device", DEVICES)
-def test_exact_sums_give_the_same_bytes_in_any_company_and_order(device):
+def test_exact_sums_do_not_depend_on_batch_and_order(device):
     def last(made: dict[str, mpm.Particles]):
         frames = list(Batch(made, BOX, DX, device, exact=True).frames(5, 0.02, SUBSTEPS, GRAVITY))
         return frames[-1]
@@ -51,29 +51,29 @@ def test_exact_sums_give_the_same_bytes_in_any_company_and_order(device):
     low = made["low"]
     backwards = last({"low": mpm.Particles(*(getattr(low, f).flip(0) for f in low.__dataclass_fields__))})
     assert torch.equal(backwards.x.flip(0), together.of("low").x)
-    # and it is the same physics, to rounding
+    # and agree with floating-point sums to rounding
     rough = list(Batch(made, BOX, DX, device).frames(5, 0.02, SUBSTEPS, GRAVITY))[-1]
     torch.testing.assert_close(together.x, rough.x, rtol=0, atol=2e-5)
 
 
 @pytest.mark.parametrize("device", DEVICES)
-def test_a_scene_that_goes_wrong_is_told_by_name_and_the_others_finish(device):
+def test_failed_scenes_are_named_and_others_finish(device):
     good = Batch(scenes(), BOX, DX, device)
     expected = list(good.frames(5, 0.02, SUBSTEPS, GRAVITY))[-1]
     bad = scenes()
     bad["tall"].v[17] = torch.nan
     bad["lonely"] = block((0.05, 0.05, 0.05), 0.025, low=(0.3, 0.3, 0.3))
-    bad["lonely"].v[:, 0] = 2000.0  # over the wall in a substep
+    bad["lonely"].v[:, 0] = 2000.0  # beyond the wall in one substep
     batch = Batch(bad, BOX, DX, device)
     last = list(batch.frames(5, 0.02, SUBSTEPS, GRAVITY))[-1]
     assert set(batch.failures()) == {"tall", "lonely"}
     assert "frame 1" in batch.failures()["lonely"]
-    assert bool(last.x.isfinite().all())  # what is lost stays where it was
+    assert bool(last.x.isfinite().all())  # lost particles stay in place
     for name in ("low", "fast"):
         torch.testing.assert_close(last.of(name).x, expected.of(name).x, rtol=0, atol=2e-5)
 
 
-def test_how_many_scenes_fit():
+def test_number_of_scenes_that_fit():
     count = mpm.make_grid(BOX, DX).count
     fits = Batch.fits(BOX, DX, 1000, "cpu")
     assert fits > 1 and fits * count < 2**31

@@ -1,4 +1,4 @@
-"""Twice the resolution, the same bodies."""
+"""Subdivision of particles."""
 
 import pytest
 import torch
@@ -15,7 +15,7 @@ def sampled(count: int = 2000) -> Bodies:
     return sample_bodies(Scene(concatenate([low, high]), (SceneObject(1, "a"), SceneObject(2, "b")), None, 0.0), count)
 
 
-def test_mass_place_and_outline_stay():
+def test_mass_position_and_extent_are_kept():
     coarse = sampled()
     fine = subdivide(coarse)
     assert fine.spacing == coarse.spacing / 2 and 6 * len(coarse.x) < len(fine.x) < 20 * len(coarse.x)
@@ -28,13 +28,13 @@ def test_mass_place_and_outline_stay():
         torch.testing.assert_close(*seen, rtol=0, atol=0.6 * coarse.spacing)
 
 
-def test_no_two_particles_share_a_voxel():
+def test_at_most_one_particle_per_voxel():
     fine = subdivide(sampled())
     voxels = torch.floor(fine.x / fine.spacing).int()
     assert len(voxels.unique(dim=0)) == len(voxels)
 
 
-def test_a_sheet_stays_as_thin_as_it_was():
+def test_a_sheet_keeps_its_thickness():
     grid = torch.cartesian_prod(torch.arange(10), torch.arange(10), torch.arange(3)).float()
     sheet = Bodies((grid + 0.5) * 0.01, torch.zeros(300, dtype=torch.int64), torch.full((300,), 0.01**3), 0.01)
     fine = subdivide(sheet)

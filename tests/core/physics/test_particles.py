@@ -1,4 +1,4 @@
-"""Gaussians to particles: volumes, hollows, sheets, overlaps, and input that makes no sense."""
+"""Sampling of particles: volumes, cavities, sheets, overlaps and degenerate input."""
 
 import math
 import time
@@ -53,18 +53,18 @@ def test_an_open_bowl_stays_hollow():
     assert not inside.any()
 
 
-def test_a_shell_with_a_hole_is_filled_up_to_the_hole():
-    """Photos leave a third of the way across open: a hollow three times as wide as its leak."""
+def test_a_shell_with_a_hole_is_filled():
+    """A hole of a third of the diameter: a cavity three times as wide as its leak."""
     points = sphere()
     holed = points[points[:, 2] < 0.1 * math.cos(math.asin(1 / 3))]
     bodies = sample_bodies(scene(splats(holed)), 8000)
     closed = sample_bodies(scene(splats(points)), 8000)
     assert float(bodies.volume.sum()) == pytest.approx(float(closed.volume.sum()), rel=0.08)
     over = bodies.x[bodies.x[:, :2].norm(dim=1) < 0.02]
-    assert 0.06 < float(over[:, 2].max()) < 0.1  # and nothing pours out
+    assert 0.06 < float(over[:, 2].max()) < 0.1  # and the filling does not leak
 
 
-def test_nothing_is_filled_in_under_the_folds_of_a_cloth():
+def test_the_folds_of_a_cloth_are_not_filled():
     cloth, size = make_object("cloth")[::6], OBJECTS["cloth"].scale
     means = size * cloth.means
     means = means - torch.tensor([0.0, 0.0, float(means[:, 2].min())])
@@ -76,9 +76,9 @@ def test_nothing_is_filled_in_under_the_folds_of_a_cloth():
 
 def test_a_mug_stays_hollow():
     rng = torch.Generator().manual_seed(0)
-    turn, up = 2 * math.pi * torch.rand(6000, generator=rng), 0.12 * torch.rand(6000, generator=rng)
-    side = torch.stack([0.05 * turn.cos(), 0.05 * turn.sin(), up], 1)
-    disc = 0.05 * torch.rand(1500, generator=rng).sqrt()[:, None] * torch.stack([turn.cos(), turn.sin()], 1)[:1500]
+    angle, height = 2 * math.pi * torch.rand(6000, generator=rng), 0.12 * torch.rand(6000, generator=rng)
+    side = torch.stack([0.05 * angle.cos(), 0.05 * angle.sin(), height], 1)
+    disc = 0.05 * torch.rand(1500, generator=rng).sqrt()[:, None] * torch.stack([angle.cos(), angle.sin()], 1)[:1500]
     mug = torch.cat([side, torch.cat([disc, torch.zeros(1500, 1)], 1)])
     for floor in (0.0, None):
         bodies = sample_bodies(scene(splats(mug), floor=floor), 8000)
@@ -86,7 +86,7 @@ def test_a_mug_stays_hollow():
         assert not inside.any()
 
 
-def test_the_floor_closes_what_stands_on_it():
+def test_the_floor_closes_standing_objects():
     points = sphere()
     cut = splats(points[points[:, 2] > -0.05] + torch.tensor([0, 0, 0.05]))
     standing, flying = (sample_bodies(scene(cut, floor=floor), 8000) for floor in (0.0, -1.0))
@@ -143,7 +143,7 @@ def broken(**fields: list) -> Gaussians:
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_every_object_gets_some_particles(name):
+def test_degenerate_objects_get_particles(name):
     start = time.process_time()
     bodies = sample_bodies(scene(splats(sphere(2000) + 0.5), Gaussians(**{
         **BAD[name]().__dict__, "object_id": torch.full((len(BAD[name]()),), 2)})), 4000)  # fmt: skip
@@ -153,25 +153,25 @@ def test_every_object_gets_some_particles(name):
     assert bodies.x.isfinite().all() and bodies.spacing > 0
 
 
-def test_an_object_without_a_single_number_is_an_error():
-    with pytest.raises(InputError, match=r"object 1 \(object_1\).*Gaussians can be used"):
+def test_an_object_without_finite_numbers_is_an_error():
+    with pytest.raises(InputError, match=r"object 1 \(object_1\).*Gaussians is usable"):
         sample_bodies(scene(splats(torch.full((5, 3), NAN))), 1000)
 
 
-def test_outliers_are_what_lies_far_out():
+def test_outliers_are_far_from_the_median():
     points = torch.cat([sphere(1000), torch.full((3, 3), 5.0)])
     assert inliers(points).tolist() == [True] * 1000 + [False] * 3
 
 
-@pytest.mark.parametrize(("photographed", "held"), [(True, True), (False, False)])
-def test_what_leaned_on_something_unseen_in_photos_is_held(photographed, held, caplog):
-    """A slab that leans over by twice its thickness: its middle is not above its foot."""
+@pytest.mark.parametrize(("photographed", "extended"), [(True, True), (False, False)])
+def test_toppling_objects_of_photos_are_extended_to_the_floor(photographed, extended, caplog):
+    """A slab that leans by twice its thickness: its centre is not above its base."""
     caplog.set_level("INFO")
     rng = torch.Generator().manual_seed(0)
     p = torch.rand(12000, 3, generator=rng) * torch.tensor([0.06, 0.2, 0.3])
     leaning = splats(p + p[:, 2:] * torch.tensor([0.8, 0, 0]))
     bodies = sample_bodies(replace(scene(leaning, floor=0.0), cameras=ring() if photographed else None), 8000)
     under = (bodies.x[:, 0] > 0.2) & (bodies.x[:, 2] < 0.1)
-    assert bool(under.any()) == held and ("would tip over" in caplog.text) == held
+    assert bool(under.any()) == extended and ("would tip over" in caplog.text) == extended
     upright = sample_bodies(replace(scene(splats(p), floor=0.0), cameras=ring() if photographed else None), 8000)
     assert float(upright.volume.sum()) == pytest.approx(0.06 * 0.2 * 0.3, rel=0.25)

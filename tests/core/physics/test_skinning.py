@@ -1,4 +1,4 @@
-"""Keypoints and the Gaussians that follow them."""
+"""Keypoints and the skinning of Gaussians."""
 
 from dataclasses import replace
 
@@ -35,7 +35,7 @@ def prepared(scene: Scene, count: int = 64) -> tuple:
 
 
 @pytest.mark.parametrize("kind", ["cloud", "sheet", "line", "two", "one"])
-def test_rest_gives_back_the_input_bit_by_bit(kind):
+def test_rest_pose_is_the_input_bit_by_bit(kind):
     g, binding, keypoints = prepared(scene_of(kind))
     still = deform(g, binding, keypoints, keypoints.rest.clone())
     for name in ("means", "quats", "scales", "opacities", "sh", "object_id"):
@@ -43,7 +43,7 @@ def test_rest_gives_back_the_input_bit_by_bit(kind):
 
 
 @pytest.mark.parametrize("kind", ["cloud", "sheet"])
-def test_a_rigid_motion_is_rigid(kind):
+def test_rigid_motion_is_reproduced(kind):
     g, binding, keypoints = prepared(scene_of(kind))
     shift = torch.tensor([0.3, -0.2, 0.9])
     moved = deform(g, binding, keypoints, keypoints.rest @ TURN.mT + shift)
@@ -58,8 +58,8 @@ def test_a_rigid_motion_is_rigid(kind):
         assert torch.equal(getattr(moved, name)[~mine], getattr(g, name)[~mine])
 
 
-def test_gaussians_on_a_device_follow_keypoints_that_came_from_a_file(device):
-    """A file's binding and keypoints are on the CPU wherever the Gaussians are drawn."""
+def test_gaussians_on_a_device_with_keypoints_on_the_cpu(device):
+    """Binding and keypoints read from a file are on the CPU, also when the Gaussians are on a GPU."""
     g, binding, keypoints = prepared(scene_of("cloud"))
     positions = keypoints.rest @ TURN.mT
     moved = deform(g.to(device), binding, keypoints, positions)
@@ -69,7 +69,7 @@ def test_gaussians_on_a_device_follow_keypoints_that_came_from_a_file(device):
         torch.testing.assert_close(getattr(moved, name).cpu(), getattr(expected, name), rtol=0, atol=1e-5)
 
 
-def test_a_line_turns_with_its_direction():
+def test_a_line_rotates_with_its_direction():
     # points on a line do not tell the turn about it, so only positions and lengths can be asked for
     g, binding, keypoints = prepared(scene_of("line"))
     moved = deform(g, binding, keypoints, keypoints.rest @ TURN.mT + 1)
@@ -79,7 +79,7 @@ def test_a_line_turns_with_its_direction():
     torch.testing.assert_close(*lengths, rtol=1e-4, atol=1e-6)
 
 
-def test_a_uniform_stretch_stretches():
+def test_uniform_stretch():
     # the ridge that keeps sheets rigid costs RIDGE of the strain; the strain here is 0.2
     g, binding, keypoints = prepared(scene_of("cloud"), 200)
     stretch = torch.diag(torch.tensor([1.2, 0.9, 1.0]))
@@ -91,7 +91,7 @@ def test_a_uniform_stretch_stretches():
     assert error < 5e-3
 
 
-def test_objects_do_not_pull_each_other():
+def test_objects_do_not_influence_each_other():
     g, binding, keypoints = prepared(scene_of("cloud"))
     shift = (keypoints.object_id == 1)[:, None] * torch.tensor([0.0, 0.0, 1.0])
     moved = deform(g, binding, keypoints, keypoints.rest + shift)
@@ -99,7 +99,7 @@ def test_objects_do_not_pull_each_other():
     torch.testing.assert_close(moved.means, expected, rtol=0, atol=1e-6)
 
 
-def test_one_skinning_serves_many_frames():
+def test_skinning_is_reused_for_many_frames():
     g, binding, keypoints = prepared(scene_of("cloud"))
     skinning = Skinning(g, binding, keypoints)
     skinning(keypoints.rest + 1)
@@ -116,7 +116,7 @@ def test_farthest_points_cover_a_square():
 
 
 @pytest.mark.parametrize("n, k", [(1, 8), (3, 8), (9, 8), (100, 8)])
-def test_weights_sum_to_one_and_fade(n, k):
+def test_weights_sum_to_one_and_decrease(n, k):
     points = torch.rand(n, 3, generator=torch.Generator().manual_seed(0))
     index, weight = nearest_weights(points, points, k)
     assert index.shape == weight.shape == (n, k) and int(index.max()) < n
@@ -124,7 +124,7 @@ def test_weights_sum_to_one_and_fade(n, k):
     assert (weight >= 0).all() and (weight[:, 0] == weight.amax(1)).all()
 
 
-def test_rotations_of_objects():
+def test_object_rotations():
     keypoints = choose_keypoints(scene_of("cloud"), 64)
     first = (keypoints.object_id == 1)[:, None]
     moved = torch.where(first, keypoints.rest @ TURN.mT + 3, keypoints.rest)
@@ -132,6 +132,6 @@ def test_rotations_of_objects():
     torch.testing.assert_close(R, torch.stack([TURN, torch.eye(3)]), rtol=0, atol=1e-5)
 
 
-def test_a_single_point_does_not_turn():
+def test_a_single_point_has_the_identity_rotation():
     body = torch.zeros(1, dtype=torch.int64)
     torch.testing.assert_close(fit_rotations(torch.ones(1, 3), torch.zeros(1, 3), body), torch.eye(3)[None])

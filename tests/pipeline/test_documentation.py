@@ -18,7 +18,7 @@ FENCE = re.compile(r"^```.*?^```", re.M | re.S)
 INDENTED = re.compile(r"^(?: {4}|\t)(.*)$", re.M)
 INLINE = re.compile(r"`([^`]+)`", re.S)
 WORD_CHARACTERS = re.compile(r"[^\w\- ]")
-PLACEHOLDERS = {"COMMAND", "..."}  # stand for any command
+PLACEHOLDER = re.compile(r"[A-Z_]+|\.\.\.")  # stands for any command
 
 
 @cache
@@ -74,7 +74,7 @@ def unknown_part(line: str) -> str | None:
             if option is not None and "=" not in word and not option.is_flag and words:
                 words = words[1:]
         elif hasattr(command, "commands"):
-            if name in PLACEHOLDERS or "/" in name:  # "simulate/render" in prose
+            if PLACEHOLDER.fullmatch(name) or "/" in name:  # "simulate/render" in prose
                 return None
             if name not in command.commands:
                 return name

@@ -72,7 +72,7 @@ def drift_half_step(
     com, quat, velocity, momentum, u, du, arm, normal, valid, size, inverse, pinned, box, body, moved, field, keys,
     o, n, dt, MAX_DISPLACEMENT: tl.constexpr, NO_CONTACT: tl.constexpr, FRAME: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Drift bodies by dt / 2 and evaluate their points there.
+    """Drift bodies by dt / 2 and evaluate their points is_valid.
 
     Writes `body`, `moved` (points in the world) and `field` (points in the body frame). `keys` (b o, 2, n) are
     distances to the floor and to the nearest wall [m]: the smaller of now and FRAME seconds ahead.
@@ -110,17 +110,17 @@ def drift_half_step(
     store3(at_moved + ARM * n, n, lever, inside)
 
     far: tl.constexpr = float("inf")
-    there = tl.load(valid + i * n + r, mask=inside, other=0) != 0
-    write3(to + BOX_LOW, scale3(-1.0, max3(where3(there, scale3(-1.0, x), -far))))
-    write3(to + BOX_HIGH, max3(where3(there, x, -far)))
-    fastest = tl.sqrt(tl.max(tl.where(there, dot(speed, speed), 0.0)))
+    is_valid = tl.load(valid + i * n + r, mask=inside, other=0) != 0
+    write3(to + BOX_LOW, scale3(-1.0, max3(where3(is_valid, scale3(-1.0, x), -far))))
+    write3(to + BOX_HIGH, max3(where3(is_valid, x, -far)))
+    fastest = tl.sqrt(tl.max(tl.where(is_valid, dot(speed, speed), 0.0)))
     tl.store(to + CONTACT_RADIUS, NO_CONTACT / 2 + FRAME * fastest)
     room = box + 6 * i
     height = x[2] - tl.load(room + 2)
-    key = tl.where(there, tl.minimum(height, height + FRAME * speed[2]), far)
+    key = tl.where(is_valid, tl.minimum(height, height + FRAME * speed[2]), far)
     tl.store(keys + 2 * i * n + r, key, mask=inside)
     height, inward = nearest_wall(x, room)
-    key = tl.where(there, tl.minimum(height, height + FRAME * dot(speed, inward)), far)
+    key = tl.where(is_valid, tl.minimum(height, height + FRAME * dot(speed, inward)), far)
     tl.store(keys + (2 * i + 1) * n + r, key, mask=inside)
 
 

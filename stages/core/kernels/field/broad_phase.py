@@ -29,28 +29,30 @@ def _contact_distance(body, i, j, SEARCH_RADIUS: tl.constexpr):
 
 
 @triton.jit
-def gather_candidates(body, moved, valid, close, which, many, o, n, SEARCH_RADIUS: tl.constexpr, BLOCK: tl.constexpr):
-    """List the points of object i within contact distance of another object's bounding box: `close` (positions),
-    `which` (point indices) and `many` (their number)."""
+def gather_candidates(
+    body, moved, valid, positions, which, candidates, o, n, SEARCH_RADIUS: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """List the points of object i within contact distance of another object's bounding box: `positions`,
+    `which` (point indices) and `candidates` (their number)."""
     i, k = tl.program_id(0), tl.program_id(1)
     j = other_object(i, k, o)
-    reach = _contact_distance(body, i, j, SEARCH_RADIUS)
+    radius = _contact_distance(body, i, j, SEARCH_RADIUS)
     r = tl.arange(0, BLOCK)
     near = tl.load(valid + i * n + r, mask=r < n, other=0) != 0
     x = load3(moved + (POINT_SIZE * i + POINT) * n + r, n, r < n)
     for axis in tl.static_range(3):
-        near &= x[axis] > tl.load(body + BODY_SIZE * j + BOX_LOW + axis) - reach
-        near &= x[axis] < tl.load(body + BODY_SIZE * j + BOX_HIGH + axis) + reach
+        near &= x[axis] > tl.load(body + BODY_SIZE * j + BOX_LOW + axis) - radius
+        near &= x[axis] < tl.load(body + BODY_SIZE * j + BOX_HIGH + axis) + radius
     row = i * (o - 1) + k
     place = tl.cumsum(near.to(tl.int32), 0) - 1
-    store3(close + 3 * row * n + place, n, x, near)
+    store3(positions + 3 * row * n + place, n, x, near)
     tl.store(which + row * n + place, r, mask=near)
-    tl.store(many + row, tl.sum(near.to(tl.int32)))
+    tl.store(candidates + row, tl.sum(near.to(tl.int32)))
 
 
 @triton.jit
 def nearest_candidates(
-    body, moved, close, which, many, keys, partner, o, n, SEARCH_RADIUS: tl.constexpr, FRAME: tl.constexpr,
+    body, moved, positions, which, candidates, keys, partner, o, n, SEARCH_RADIUS: tl.constexpr, FRAME: tl.constexpr,
     QUERY_BLOCK: tl.constexpr, CANDIDATE_CHUNK: tl.constexpr,
 ):  # fmt: skip
     """For each listed point find the other object's nearest listed point: `partner` (its index) and `keys` (its
@@ -58,35 +60,35 @@ def nearest_candidates(
     i, k = tl.program_id(0) // (o - 1), tl.program_id(0) % (o - 1)
     j = other_object(i, k, o)
     row, other = i * (o - 1) + k, j * (o - 1) + i % o - (i > j)
-    count, last = tl.load(many + row), tl.load(many + other)
+    count, last = tl.load(candidates + row), tl.load(candidates + other)
     first = tl.program_id(1) * QUERY_BLOCK
     if first < count:
-        reach = _contact_distance(body, i, j, SEARCH_RADIUS)
+        radius = _contact_distance(body, i, j, SEARCH_RADIUS)
         far: tl.constexpr = float("inf")
         e = first + tl.arange(0, QUERY_BLOCK)
-        x = load3(close + 3 * row * n + e, n, e < count)
+        x = load3(positions + 3 * row * n + e, n, e < count)
         column = tl.arange(0, CANDIDATE_CHUNK)
-        least = tl.full([QUERY_BLOCK, CANDIDATE_CHUNK], far, tl.float32)
+        smallest = tl.full([QUERY_BLOCK, CANDIDATE_CHUNK], far, tl.float32)
         chunk = tl.zeros([QUERY_BLOCK, CANDIDATE_CHUNK], tl.int32)
         for start in range(0, last, CANDIDATE_CHUNK):
             s = start + column
-            y = load3(close + 3 * other * n + s, n, s < last, far)
+            y = load3(positions + 3 * other * n + s, n, s < last, far)
             dx, dy, dz = x[0][:, None] - y[0][None, :], x[1][:, None] - y[1][None, :], x[2][:, None] - y[2][None, :]
             squared = dx * dx + dy * dy + dz * dz
-            chunk = tl.where(squared < least, start, chunk)
-            least = tl.minimum(squared, least)
-        best = tl.min(least, 1)
-        entry = tl.min(tl.where(least == best[:, None], chunk + column[None, :], n), 1)
-        found = (e < count) & (best < reach * reach)
+            chunk = tl.where(squared < smallest, start, chunk)
+            smallest = tl.minimum(squared, smallest)
+        best = tl.min(smallest, 1)
+        entry = tl.min(tl.where(smallest == best[:, None], chunk + column[None, :], n), 1)
+        found = (e < count) & (best < radius * radius)
         mine = tl.load(which + row * n + e, mask=found, other=0)
-        theirs = tl.load(which + other * n + entry, mask=found, other=0)
-        own, they = moved + POINT_SIZE * i * n + mine, moved + POINT_SIZE * j * n + theirs
-        way = sub(x, load3(they + POINT * n, n, found))
-        rate = sub(load3(own + SPEED * n, n, found), load3(they + SPEED * n, n, found))
+        other_point = tl.load(which + other * n + entry, mask=found, other=0)
+        at_own, at_other = moved + POINT_SIZE * i * n + mine, moved + POINT_SIZE * j * n + other_point
+        way = sub(x, load3(at_other + POINT * n, n, found))
+        rate = sub(load3(at_own + SPEED * n, n, found), load3(at_other + SPEED * n, n, found))
         way = add(way, scale3(FRAME, rate))
         key = tl.where(found, tl.sqrt(tl.minimum(best, dot(way, way))), far)
         tl.store(keys + row * n + e, key, mask=e < count)
-        tl.store(partner + row * n + e, theirs, mask=e < count)
+        tl.store(partner + row * n + e, other_point, mask=e < count)
 
 
 @triton.jit
@@ -105,8 +107,8 @@ def _smallest(key, near, count):
 
 @triton.jit
 def select_contacts(
-    keys, planes, which, partner, many, valid, count, point, theirs, felt, o, n, wide, narrow, slots,
-    PAIR_FRACTION: tl.constexpr, WALL_FRACTION: tl.constexpr, NO_CONTACT: tl.constexpr, BLOCK: tl.constexpr,
+    keys, planes, which, partner, candidates, valid, count, point, other_point, accelerations, o, n, wide, narrow,
+    slots, PAIR_FRACTION: tl.constexpr, WALL_FRACTION: tl.constexpr, NO_CONTACT: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Select the contact points of an object with one other object, the floor or the walls: the closest ones, at most
     a fraction (PAIR_FRACTION, 1, WALL_FRACTION) of the object's points. Writes the indices of its points and of the
@@ -120,11 +122,11 @@ def select_contacts(
     limit_count = tl.sum(tl.load(valid + i * n + r, mask=r < n, other=0).to(tl.int32))
     far: tl.constexpr = float("inf")
     zero = tl.zeros([BLOCK], tl.float32)
-    store3(felt + (i * (o + 1) + k) * 3 * n + r, n, (zero, zero, zero), r < n)
+    store3(accelerations + (i * (o + 1) + k) * 3 * n + r, n, (zero, zero, zero), r < n)
     to = i * slots + k * wide
     if k < m:
         row = i * m + k
-        listed = r < tl.load(many + row)
+        listed = r < tl.load(candidates + row)
         key = tl.load(keys + row * n + r, mask=listed, other=far)
         mine = tl.load(which + row * n + r, mask=listed, other=0)
         other = tl.load(partner + row * n + r, mask=listed, other=0)
@@ -142,5 +144,5 @@ def select_contacts(
     place = tl.cumsum(near.to(tl.int32), 0) - 1
     near &= place < limit_count  # ties
     tl.store(point + to + place, mine, mask=near)
-    tl.store(theirs + to + place, other, mask=near)
+    tl.store(other_point + to + place, other, mask=near)
     tl.store(count + i * (o + 1) + k, tl.sum(near.to(tl.int32)))

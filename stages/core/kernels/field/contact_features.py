@@ -39,7 +39,7 @@ def contact_list(slot, m, n, wide, narrow, slots):
 
 @triton.jit
 def _response(J, r):
-    """Inverse effective mass 1 - [r] J [r] of a point at lever arm r, for unit mass: the velocity per unit impulse.
+    """Inverse effective mass 1 - [r] J [r] of a point at other_arm arm r, for unit mass: the velocity per unit impulse.
 
     Symmetric, as xx, xy, xz, yy, yz, zz; J is the inverse inertia.
     """
@@ -65,8 +65,8 @@ def _length(a):
 
 @triton.jit
 def contact_features(
-    body, moved, count, point, theirs, record, spacing, share, size, mass, gravity, box, o, n, wide, narrow, slots,
-    FULL_CONTACT: tl.constexpr, NO_CONTACT: tl.constexpr, GAP_UNIT: tl.constexpr, ARM_UNIT: tl.constexpr,
+    body, moved, count, point, other_point, record, spacing, mass_fraction, size, mass, gravity, box, o, n, wide,
+    narrow, slots, FULL_CONTACT: tl.constexpr, NO_CONTACT: tl.constexpr, GAP_UNIT: tl.constexpr, ARM_UNIT: tl.constexpr,
     FRAME: tl.constexpr, ROWS: tl.constexpr,
 ):  # fmt: skip
     """Write the features of a block of contact points into `record`: with another object 10 vectors and 7 scalars,
@@ -81,36 +81,36 @@ def contact_features(
         at = moved + POINT_SIZE * i * n + mine
         x, speed = load3(at + POINT * n, n, there), load3(at + SPEED * n, n, there)
         normal, arm = load3(at + NORMAL * n, n, there), load3(at + ARM * n, n, there)
-        tl.store(to + MASS_FRACTION * ROWS, tl.load(share + i * n + mine, mask=there, other=0.0))
+        tl.store(to + MASS_FRACTION * ROWS, tl.load(mass_fraction + i * n + mine, mask=there, other=0.0))
         gap = tl.load(spacing + i * n + mine, mask=there, other=0.0) / GAP_UNIT
         extent = tl.log(tl.load(size + i))
         zero = x[0] * 0.0
-        fall = add(scale3(0.2, read3(gravity + 3 * (i // o))), (zero, zero, zero))
+        gravity_term = add(scale3(0.2, read3(gravity + 3 * (i // o))), (zero, zero, zero))
         v = read3(body + BODY_SIZE * i + VELOCITY)
         one = _response(read9(body + BODY_SIZE * i + INVERSE_INERTIA), arm)
         if k < m:
             j = other_object(i, k, o)
-            other = tl.load(theirs + i * slots + slot + r, mask=there, other=0)
+            other = tl.load(other_point + i * slots + slot + r, mask=there, other=0)
             at = moved + POINT_SIZE * j * n + other
-            way, rate = sub(x, load3(at + POINT * n, n, there)), sub(speed, load3(at + SPEED * n, n, there))
-            facing, lever = load3(at + NORMAL * n, n, there), load3(at + ARM * n, n, there)
+            offset, rate = sub(x, load3(at + POINT * n, n, there)), sub(speed, load3(at + SPEED * n, n, there))
+            other_normal, other_arm = load3(at + NORMAL * n, n, there), load3(at + ARM * n, n, there)
             here, their = tl.maximum(tl.load(mass + i), 1e-6), tl.maximum(tl.load(mass + j), 1e-6)
-            two = _response(read9(body + BODY_SIZE * j + INVERSE_INERTIA), lever)
+            two = _response(read9(body + BODY_SIZE * j + INVERSE_INERTIA), other_arm)
             f = their / (here + their)
             g = 1 - f
             K = (f * one[0] + g * two[0], f * one[1] + g * two[1], f * one[2] + g * two[2],
                  f * one[3] + g * two[3], f * one[4] + g * two[4], f * one[5] + g * two[5])  # fmt: skip
-            now, ahead = _length(way), _length(add(way, scale3(FRAME, rate)))
-            a, b = solve_symmetric(K, rate, facing)
-            apart = sub(v, read3(body + BODY_SIZE * j + VELOCITY))
-            store3(to, MAX_VECTORS * ROWS, scale3(1 / GAP_UNIT, way), there)
+            now, ahead = _length(offset), _length(add(offset, scale3(FRAME, rate)))
+            a, b = solve_symmetric(K, rate, other_normal)
+            relative_velocity = sub(v, read3(body + BODY_SIZE * j + VELOCITY))
+            store3(to, MAX_VECTORS * ROWS, scale3(1 / GAP_UNIT, offset), there)
             store3(to + ROWS, MAX_VECTORS * ROWS, normal, there)
-            store3(to + 2 * ROWS, MAX_VECTORS * ROWS, facing, there)
+            store3(to + 2 * ROWS, MAX_VECTORS * ROWS, other_normal, there)
             store3(to + 3 * ROWS, MAX_VECTORS * ROWS, rate, there)
             store3(to + 4 * ROWS, MAX_VECTORS * ROWS, scale3(1 / ARM_UNIT, arm), there)
-            store3(to + 5 * ROWS, MAX_VECTORS * ROWS, scale3(1 / ARM_UNIT, lever), there)
-            store3(to + 6 * ROWS, MAX_VECTORS * ROWS, add(apart, (zero, zero, zero)), there)
-            store3(to + 7 * ROWS, MAX_VECTORS * ROWS, fall, there)
+            store3(to + 5 * ROWS, MAX_VECTORS * ROWS, scale3(1 / ARM_UNIT, other_arm), there)
+            store3(to + 6 * ROWS, MAX_VECTORS * ROWS, add(relative_velocity, (zero, zero, zero)), there)
+            store3(to + 7 * ROWS, MAX_VECTORS * ROWS, gravity_term, there)
             store3(to + 8 * ROWS, MAX_VECTORS * ROWS, a, there)
             store3(to + 9 * ROWS, MAX_VECTORS * ROWS, b, there)
             to += FIRST_SCALAR * ROWS
@@ -133,7 +133,7 @@ def contact_features(
             store3(to + 2 * ROWS, MAX_VECTORS * ROWS, speed, there)
             store3(to + 3 * ROWS, MAX_VECTORS * ROWS, scale3(1 / ARM_UNIT, arm), there)
             store3(to + 4 * ROWS, MAX_VECTORS * ROWS, add(v, (zero, zero, zero)), there)
-            store3(to + 5 * ROWS, MAX_VECTORS * ROWS, fall, there)
+            store3(to + 5 * ROWS, MAX_VECTORS * ROWS, gravity_term, there)
             store3(to + 6 * ROWS, MAX_VECTORS * ROWS, a, there)
             store3(to + 7 * ROWS, MAX_VECTORS * ROWS, b, there)
             to += FIRST_SCALAR * ROWS

@@ -175,19 +175,19 @@ def decode_forces(
         if k < m:
             a = _decode(features, there, pairs, context + row * H, message + at * H, w, 10, ACCELERATION_UNIT, ROWS, H,
                         PRECISION)  # fmt: skip
-            way = load3(features + r, MAX_VECTORS * ROWS, there)
+            offset = load3(features + r, MAX_VECTORS * ROWS, there)
             arm = load3(features + 4 * ROWS + r, MAX_VECTORS * ROWS, there)
-            arm = sub(scale3(ARM_UNIT, arm), scale3(GAP_UNIT / 2, way))  # the force acts midway between the two points
+            arm = sub(scale3(ARM_UNIT, arm), scale3(GAP_UNIT / 2, offset))  # to the midpoint of the two points
         else:
             a = _decode(features, there, planes, context + row * H, message + at * H, w, 8, ACCELERATION_UNIT, ROWS, H,
                         PRECISION)  # fmt: skip
             inward = load3(features + r, MAX_VECTORS * ROWS, there)
             arm = scale3(ARM_UNIT, load3(features + 3 * ROWS + r, MAX_VECTORS * ROWS, there))
-            leaving = dot(load3(features + 2 * ROWS + r, MAX_VECTORS * ROWS, there), inward)
+            separation_speed = dot(load3(features + 2 * ROWS + r, MAX_VECTORS * ROWS, there), inward)
             along, unit = dot(a, inward), tl.maximum(w, 1e-9)
             x = along / unit
             push = unit * (tl.maximum(x, 0.0) + tl.log(1 + tl.exp(-tl.abs(x))))  # softplus: floor and walls only push
-            push = push / (1 + tl.maximum(leaving, 0.0) / SEPARATION_SPEED)
+            push = push / (1 + tl.maximum(separation_speed, 0.0) / SEPARATION_SPEED)
             a = add(a, scale3(push - along, inward))
         mine = tl.load(point + at + r, mask=there, other=0)
         store3(acceleration + row * 3 * n + mine, n, a, there)

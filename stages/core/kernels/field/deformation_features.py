@@ -38,8 +38,8 @@ def deformation_features(
     p = block * ROWS + r
     inside = p < n
     to = record + (i * blocks + block) * FEATURE_COLUMNS * ROWS + r
-    own = field + FIELD_SIZE * i * n + p
-    u, du = load3(own + U * n, n, inside), load3(own + DU * n, n, inside)
+    at_field = field + FIELD_SIZE * i * n + p
+    u, du = load3(at_field + U * n, n, inside), load3(at_field + DU * n, n, inside)
     store3(to, MAX_VECTORS * ROWS, scale3(20.0, u), inside)
     store3(to + 3 * ROWS, MAX_VECTORS * ROWS, scale3(2.0, du), inside)
     averages, scale = averages + 18 * i * n + p, scale + 9 * i
@@ -50,7 +50,7 @@ def deformation_features(
         store3(to + (4 + s) * ROWS, MAX_VECTORS * ROWS, local_du, inside)
         store3(to + (6 + s) * ROWS, MAX_VECTORS * ROWS, scale3(0.1, _mean(averages, scale, n, inside, 0, s)), inside)
     at = (i * n + p) * 3
-    store3(to + 8 * ROWS, MAX_VECTORS * ROWS, scale3(0.1, load3(own + VIRIAL * n, n, inside)), inside)
+    store3(to + 8 * ROWS, MAX_VECTORS * ROWS, scale3(0.1, load3(at_field + VIRIAL * n, n, inside)), inside)
     store3(to + 9 * ROWS, MAX_VECTORS * ROWS, load3(normal + at, 1, inside), inside)
     store3(to + 10 * ROWS, MAX_VECTORS * ROWS, scale3(1 / tl.load(size + i), load3(arm + at, 1, inside)), inside)
     R = read9(body + BODY_SIZE * i + ROTATION)

@@ -12,7 +12,7 @@ BLOCK, CHUNK = 16, 128  # query points per program, and points that it reads at 
 
 
 @triton.jit
-def _nearest_kernel(points, low, high, distance, index, reach, o, n, BLOCK: tl.constexpr, CHUNK: tl.constexpr):
+def _nearest_kernel(points, low, high, distance, index, radius, o, n, BLOCK: tl.constexpr, CHUNK: tl.constexpr):
     blocks = tl.cdiv(n, BLOCK)
     pair, block = tl.program_id(0) // blocks, tl.program_id(0) % blocks
     i, j = pair // o, (pair // (o * o)) * o + pair % o  # rows of objects of the same scene
@@ -21,13 +21,13 @@ def _nearest_kernel(points, low, high, distance, index, reach, o, n, BLOCK: tl.c
     far = float("inf")
     x, y, z = (tl.load(p, mask=r < n, other=far), tl.load(p + n, mask=r < n, other=far),
                tl.load(p + 2 * n, mask=r < n, other=far))  # fmt: skip
-    look = (i != j) & (x > tl.load(low + 3 * j) - reach) & (x < tl.load(high + 3 * j) + reach)
-    look &= (y > tl.load(low + 3 * j + 1) - reach) & (y < tl.load(high + 3 * j + 1) + reach)
-    look &= (z > tl.load(low + 3 * j + 2) - reach) & (z < tl.load(high + 3 * j + 2) + reach)
+    near = (i != j) & (x > tl.load(low + 3 * j) - radius) & (x < tl.load(high + 3 * j) + radius)
+    near &= (y > tl.load(low + 3 * j + 1) - radius) & (y < tl.load(high + 3 * j + 1) + radius)
+    near &= (z > tl.load(low + 3 * j + 2) - radius) & (z < tl.load(high + 3 * j + 2) + radius)
     column = tl.arange(0, CHUNK)
-    least = tl.full([BLOCK, CHUNK], far, tl.float32)
+    smallest = tl.full([BLOCK, CHUNK], far, tl.float32)
     which = tl.zeros([BLOCK, CHUNK], tl.int32)
-    if tl.sum(look.to(tl.int32)) > 0:
+    if tl.sum(near.to(tl.int32)) > 0:
         for first in range(0, n, CHUNK):
             s = first + column
             q = points + 3 * j * n + s
@@ -35,47 +35,47 @@ def _nearest_kernel(points, low, high, distance, index, reach, o, n, BLOCK: tl.c
             dy = y[:, None] - tl.load(q + n, mask=s < n, other=far)[None, :]
             dz = z[:, None] - tl.load(q + 2 * n, mask=s < n, other=far)[None, :]
             squared = dx * dx + dy * dy + dz * dz
-            nearer = squared < least
-            least = tl.where(nearer, squared, least)
+            nearer = squared < smallest
+            smallest = tl.where(nearer, squared, smallest)
             which = tl.where(nearer, first, which)
-    best = tl.min(least, 1)
-    which = tl.min(tl.where(least == best[:, None], which + column[None, :], n), 1)
-    best = tl.where(look & (best < reach * reach), tl.sqrt(best), far)
+    best = tl.min(smallest, 1)
+    which = tl.min(tl.where(smallest == best[:, None], which + column[None, :], n), 1)
+    best = tl.where(near & (best < radius * radius), tl.sqrt(best), far)
     tl.store(distance + pair * n + r, best, mask=r < n)
     tl.store(index + pair * n + r, tl.minimum(which, n - 1).to(tl.int64), mask=r < n)
 
 
 @torch.library.custom_op("ngff::nearest", mutates_args=())
-def _nearest(points: Tensor, low: Tensor, high: Tensor, reach: float) -> tuple[Tensor, Tensor]:
+def _nearest(points: Tensor, low: Tensor, high: Tensor, radius: float) -> tuple[Tensor, Tensor]:
     b, o, _, n = points.shape
     distance = points.new_empty(b, o, o, n)
     index = torch.empty(b, o, o, n, dtype=torch.int64, device=points.device)
     grid = (b * o * o * triton.cdiv(n, BLOCK),)
-    _nearest_kernel[grid](points, low, high, distance, index, reach, o, n, BLOCK, CHUNK)
+    _nearest_kernel[grid](points, low, high, distance, index, radius, o, n, BLOCK, CHUNK)
     return distance, index
 
 
 @_nearest.register_fake
-def _(points: Tensor, low: Tensor, high: Tensor, reach: float) -> tuple[Tensor, Tensor]:
+def _(points: Tensor, low: Tensor, high: Tensor, radius: float) -> tuple[Tensor, Tensor]:
     b, o, _, n = points.shape
     return points.new_empty(b, o, o, n), torch.empty(b, o, o, n, dtype=torch.int64, device=points.device)
 
 
-def nearest_between_objects(points: Tensor, valid: Tensor, reach: float) -> tuple[Tensor, Tensor]:
+def nearest_between_objects(points: Tensor, valid: Tensor, radius: float) -> tuple[Tensor, Tensor]:
     """Distance [m] from point n of object i to the nearest point of every object j, and that point's index.
 
     `points` (b o n 3) in single precision [m], `valid` (b o n); both results (b o o n). The distance is infinite where
-    it is not below `reach` [m], to the own object, and to and from padding; the index is then undefined.
+    it is not below `radius` [m], to the own object, and to and from padding; the index is then undefined.
     """
     hidden = ~valid[..., None]
     placed = points.masked_fill(hidden, torch.inf)  # infinitely far from everything
     low, high = placed.amin(2), points.masked_fill(hidden, -torch.inf).amax(2)
-    return _nearest(placed.mT.contiguous(), low, high, reach)
+    return _nearest(placed.mT.contiguous(), low, high, radius)
 
 
-def nearest_between_objects_reference(points: Tensor, valid: Tensor, reach: float) -> tuple[Tensor, Tensor]:
+def nearest_between_objects_reference(points: Tensor, valid: Tensor, radius: float) -> tuple[Tensor, Tensor]:
     """`nearest_between_objects` from the full distance matrix, in any precision."""
     distance = (points[:, :, None, :, None] - points[:, None, :, None]).norm(dim=-1)
     distance, index = distance.masked_fill(~valid[:, None, :, None], torch.inf).min(-1)
     own = torch.eye(points.shape[1], dtype=torch.bool, device=points.device)[:, :, None]
-    return distance.masked_fill(own | ~valid[:, :, None] | (distance >= reach), torch.inf), index
+    return distance.masked_fill(own | ~valid[:, :, None] | (distance >= radius), torch.inf), index

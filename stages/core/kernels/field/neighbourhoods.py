@@ -14,44 +14,44 @@ ROWS, CHUNK = 8, 256  # rows of the matrix per program, and columns that it comp
 
 
 @triton.jit
-def _weights(arm, share, x, slope, s, n):
+def _weights(arm, mass_fraction, x, slope, s, n):
     """Weights of points s for points x, before normalisation."""
     y = load3(arm + 3 * s, 1, s < n)
     d = sub((x[0][:, None], x[1][:, None], x[2][:, None]), (y[0][None, :], y[1][None, :], y[2][None, :]))
-    return tl.exp(slope * dot(d, d)) * tl.load(share + s, mask=s < n, other=0.0)[None, :]
+    return tl.exp(slope * dot(d, d)) * tl.load(mass_fraction + s, mask=s < n, other=0.0)[None, :]
 
 
 @triton.jit
-def _neighbourhood_weights(arm, valid, share, reach, out, n, scales, ROWS: tl.constexpr, CHUNK: tl.constexpr):
+def _neighbourhood_weights(arm, valid, mass_fraction, radii, out, n, scales, ROWS: tl.constexpr, CHUNK: tl.constexpr):
     """Rows of the weight matrix of one object and radius, in two passes: their sums, then the normalised weights."""
     table = tl.program_id(0)
     i = table // scales
-    arm, share, valid, out = arm + 3 * i * n, share + i * n, valid + i * n, out + table.to(tl.int64) * n * n
-    radius = tl.load(reach + table)
+    arm, mass_fraction, valid = arm + 3 * i * n, mass_fraction + i * n, valid + i * n
+    out += table.to(tl.int64) * n * n
+    radius = tl.load(radii + table)
     slope = -1 / (radius * radius)
     r, column = tl.program_id(1) * ROWS + tl.arange(0, ROWS), tl.arange(0, CHUNK)
     x = load3(arm + 3 * r, 1, r < n)
     total = tl.zeros([ROWS, CHUNK], tl.float32)
     for first in range(0, n, CHUNK):
-        total += _weights(arm, share, x, slope, first + column, n)
+        total += _weights(arm, mass_fraction, x, slope, first + column, n)
     there = tl.load(valid + r, mask=r < n, other=0) != 0
     unit = tl.where(there, 1 / tl.maximum(tl.sum(total, 1), 1e-12), 0.0)
     for first in range(0, n, CHUNK):
         s = first + column
-        weight = _weights(arm, share, x, slope, s, n) * unit[:, None]
+        weight = _weights(arm, mass_fraction, x, slope, s, n) * unit[:, None]
         inside = (r[:, None] < n) & (s[None, :] < n)
         tl.store(out + r[:, None] * n + s[None, :], weight.to(tl.float16), mask=inside)
 
 
-def neighbourhood_weights(arm: Tensor, valid: Tensor, share: Tensor, reach: Tensor) -> Tensor:
+def neighbourhood_weights(arm: Tensor, valid: Tensor, mass_fraction: Tensor, radii: Tensor) -> Tensor:
     """Gaussian weights exp(-(d / radius)^2) x mass fraction between points, with rows that sum to 1: (b o s n n).
 
-    `arm` (b o n 3): points [m]; `valid` (b o n): rows are 0 where false; `share` (b o n): mass fractions; `reach`
-    (b o s): radii [m].
+    `arm` (b o n 3): points [m]; `valid` (b o n): rows are 0 where false; `mass_fraction` (b o n); `radii` (b o s) [m].
     """
     b, o, n, _ = arm.shape
-    given = [x.contiguous() for x in (arm, valid, share, reach)]
-    scales = reach.shape[-1]
+    inputs = [x.contiguous() for x in (arm, valid, mass_fraction, radii)]
+    scales = radii.shape[-1]
     out = torch.empty(b, o, scales, n, n, dtype=torch.float16, device=arm.device)
-    _neighbourhood_weights[(b * o * scales, triton.cdiv(n, ROWS))](*given, out, n, scales, ROWS=ROWS, CHUNK=CHUNK)
+    _neighbourhood_weights[(b * o * scales, triton.cdiv(n, ROWS))](*inputs, out, n, scales, ROWS=ROWS, CHUNK=CHUNK)
     return out

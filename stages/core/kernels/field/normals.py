@@ -104,9 +104,9 @@ def normals_and_spacing(points: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
     spacing = normal.new_zeros(valid.shape)
     vector = wp.vec3d if points.dtype == torch.float64 else wp.vec3
     flat = points.contiguous().flatten(0, 1), valid.contiguous().flatten(0, 1)
-    given = [view(flat[0], vector), view(flat[1], wp.bool), JACOBI_SWEEPS]
-    found = [view(normal.flatten(0, 1), wp.vec3d), view(spacing.flatten(0, 1), wp.float64)]
-    launch(_normals, given[1].shape, given, found, device_of(points), block_dim=THREADS_PER_BLOCK)
+    inputs = [view(flat[0], vector), view(flat[1], wp.bool), JACOBI_SWEEPS]
+    outputs = [view(normal.flatten(0, 1), wp.vec3d), view(spacing.flatten(0, 1), wp.float64)]
+    launch(_normals, inputs[1].shape, inputs, outputs, device_of(points), block_dim=THREADS_PER_BLOCK)
     return normal.to(points), spacing.to(points)
 
 
@@ -139,7 +139,7 @@ def invert_spd(matrix: Tensor) -> tuple[Tensor, Tensor]:
     """Inverses of symmetric positive definite matrices (b o 3 3), and the inverses' eigenvalues, ascending (b o 3)."""
     real = matrix.double().contiguous()
     inverse, values = torch.empty_like(real), torch.empty_like(real[..., 0])
-    given = [view(real.flatten(0, 1), wp.mat33d), JACOBI_SWEEPS]
-    found = [view(inverse.flatten(0, 1), wp.mat33d), view(values.flatten(0, 1), wp.vec3d)]
-    launch(_invert_spd, given[0].shape, given, found, device_of(matrix), block_dim=THREADS_PER_BLOCK)
+    inputs = [view(real.flatten(0, 1), wp.mat33d), JACOBI_SWEEPS]
+    outputs = [view(inverse.flatten(0, 1), wp.mat33d), view(values.flatten(0, 1), wp.vec3d)]
+    launch(_invert_spd, inputs[0].shape, inputs, outputs, device_of(matrix), block_dim=THREADS_PER_BLOCK)
     return inverse.to(matrix), values.to(matrix)

@@ -47,10 +47,10 @@ def _perceptron(
     there = r < rows
     o, h = tl.arange(0, O), tl.arange(0, H)
     to, store = out + r[:, None] * OUTER + o[None, :], there[:, None] & (o[None, :] < OUTER)
-    wanted = BLOCK
+    needed = BLOCK
     if NEAR:
-        wanted = tl.sum(tl.load(near + r, mask=there, other=0).to(tl.int32))
-    if wanted == 0:
+        needed = tl.sum(tl.load(near + r, mask=there, other=0).to(tl.int32))
+    if needed == 0:
         tl.store(to, tl.zeros([BLOCK, O], tl.float32), mask=store)
     else:
         PRODUCTS: tl.constexpr = VECTORS * (VECTORS + 1) // 2

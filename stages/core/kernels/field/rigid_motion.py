@@ -20,10 +20,10 @@ def _spin(momentum: wp.vec3, inverse: wp.mat33, R: wp.mat33):
 
 
 @wp.func
-def _rotated(quat: wp.vec4, turn: wp.vec3):
-    """Quaternion w x y z after the rotation vector `turn` [rad] in world axes."""
-    half = wp.sqrt(wp.length_sq(turn) + 1.0e-24) / 2.0
-    by = turn * (wp.sin(half) / half / 2.0)
+def _rotated(quat: wp.vec4, rotation: wp.vec3):
+    """Quaternion w x y z after the rotation vector `rotation` [rad] in world axes."""
+    half = wp.sqrt(wp.length_sq(rotation) + 1.0e-24) / 2.0
+    by = rotation * (wp.sin(half) / half / 2.0)
     q = wp.normalize(wp.quat(by[0], by[1], by[2], wp.cos(half)) * wp.quat(quat[1], quat[2], quat[3], quat[0]))
     return wp.vec4(q[3], q[0], q[1], q[2])
 

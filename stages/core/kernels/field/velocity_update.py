@@ -59,30 +59,32 @@ def _total(parts, blocks, BLOCKS: tl.constexpr):
 
 @triton.jit
 def _contact(
-    i, body, parts, felt, mass, pinned, o, n, places, wide, BLOCK: tl.constexpr, BLOCKS: tl.constexpr,
+    i, body, parts, accelerations, mass, pinned, o, n, places, wide, BLOCK: tl.constexpr, BLOCKS: tl.constexpr,
 ):  # fmt: skip
     """Force, torque and accelerations of the points of an object, per unit of mass, summed over its contacts."""
     first, mine, m, kinds = i - i % o, i % o, o - 1, o + 1
     c = read3(body + BODY_SIZE * i + COM)
-    here, free = tl.maximum(tl.load(mass + i), 1e-6), 1 - tl.load(pinned + i).to(tl.float32)
+    mass_i, free = tl.maximum(tl.load(mass + i), 1e-6), 1 - tl.load(pinned + i).to(tl.float32)
     r = tl.arange(0, BLOCK)
     zero = tl.zeros([BLOCK], tl.float32)
-    touch, force, torque = (zero, zero, zero), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+    acceleration, force, torque = (zero, zero, zero), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
     for k in range(m):
         j = first + k + (k >= mine)
-        again = mine - (mine > j - first)  # index of i among the other objects of j
-        there, loose = tl.maximum(tl.load(mass + j), 1e-6), 1 - tl.load(pinned + j).to(tl.float32)
-        reduced = 1 / tl.maximum(free / here + loose / there, 1e-9)
+        index_in_j = mine - (mine > j - first)  # index of i among the other objects of j
+        mass_j, free_j = tl.maximum(tl.load(mass + j), 1e-6), 1 - tl.load(pinned + j).to(tl.float32)
+        reduced = 1 / tl.maximum(free / mass_i + free_j / mass_j, 1e-9)
         F, T = _total(parts + (i * places + k * wide) * WRENCH_SIZE, wide, BLOCKS)
-        G, S = _total(parts + (j * places + again * wide) * WRENCH_SIZE, wide, BLOCKS)
-        S = add(S, cross(sub(read3(body + BODY_SIZE * j + COM), c), G))
-        force, torque = add(force, scale3(reduced / here, sub(F, G))), add(torque, scale3(reduced / here, sub(T, S)))
-        touch = add(touch, scale3(reduced / here, load3(felt + (i * kinds + k) * 3 * n + r, n, r < n)))
+        F_j, T_j = _total(parts + (j * places + index_in_j * wide) * WRENCH_SIZE, wide, BLOCKS)
+        T_j = add(T_j, cross(sub(read3(body + BODY_SIZE * j + COM), c), F_j))
+        ratio = reduced / mass_i
+        force, torque = add(force, scale3(ratio, sub(F, F_j))), add(torque, scale3(ratio, sub(T, T_j)))
+        of_contact = load3(accelerations + (i * kinds + k) * 3 * n + r, n, r < n)
+        acceleration = add(acceleration, scale3(ratio, of_contact))
     F, T = _total(parts + (i * places + m * wide) * WRENCH_SIZE, places - m * wide, BLOCKS)  # floor and walls
     force, torque = add(force, F), add(torque, T)
-    touch = add(touch, load3(felt + (i * kinds + m) * 3 * n + r, n, r < n))
-    touch = add(touch, load3(felt + (i * kinds + m + 1) * 3 * n + r, n, r < n))
-    return force, torque, touch
+    acceleration = add(acceleration, load3(accelerations + (i * kinds + m) * 3 * n + r, n, r < n))
+    acceleration = add(acceleration, load3(accelerations + (i * kinds + m + 1) * 3 * n + r, n, r < n))
+    return force, torque, acceleration
 
 
 @triton.jit
@@ -93,7 +95,8 @@ def _guarded(v, up, down, MAX_RECOVERY_SPEED: tl.constexpr):
 
 @triton.jit
 def update_velocities(
-    body, moved, field, parts, felt, grip, unit, pushed, twisted, arm, valid, share, size, mass, inverse, pinned,
+    body, moved, field, parts, accelerations, friction, unit, external_force, external_torque, arm, valid,
+    mass_fraction, size, mass, inverse, pinned,
     gravity, box, com, quat, velocity, momentum, high, low, scale, o, n, dt, places, wide,
     CONTACT_SATURATION: tl.constexpr, HAS_EXTERNAL: tl.constexpr, MAX_PENETRATION: tl.constexpr,
     MAX_RECOVERY_SPEED: tl.constexpr, MAX_SPEED: tl.constexpr, MAX_SPIN: tl.constexpr,
@@ -102,45 +105,47 @@ def update_velocities(
     """Update velocities by the forces, drift by dt / 2, and prepare the neighbourhood averages of the points.
 
     `parts`: force and torque of blocks of contact points, `wide` blocks for each other object and `places` in all;
-    `felt`: acceleration of each point by each contact (both from `contact_messages`). `high`, `low`, `scale`: contact
+    `accelerations`: of each point by each contact (both from `contact_messages`). `high`, `low`, `scale`: contact
     acceleration, displacement and its rate, split for `skinny_matmul`.
     """
     i = tl.program_id(0)
-    force, torque, touch = _contact(i, body, parts, felt, mass, pinned, o, n, places, wide, BLOCK, BLOCKS)
+    force, torque, acceleration = _contact(i, body, parts, accelerations, mass, pinned, o, n, places, wide, BLOCK,
+                                           BLOCKS)  # fmt: skip
     force = add(force, read3(gravity + 3 * (i // o)))
     if HAS_EXTERNAL:
-        here = tl.maximum(tl.load(mass + i), 1e-6)
-        force = add(force, scale3(1 / here, read3(pushed + 3 * i)))
-        torque = add(torque, scale3(1 / here, read3(twisted + 3 * i)))
+        mass_i = tl.maximum(tl.load(mass + i), 1e-6)
+        force = add(force, scale3(1 / mass_i, read3(external_force + 3 * i)))
+        torque = add(torque, scale3(1 / mass_i, read3(external_torque + 3 * i)))
     now = body + BODY_SIZE * i
     past_v, past_spin = read3(now + VELOCITY), matvec3(read9(now + INVERSE_INERTIA), read3(now + MOMENTUM))
     L = add(read3(now + MOMENTUM), scale3(dt, torque))
     v = add(past_v, scale3(dt, force))
     spin = matvec3(read9(now + INVERSE_INERTIA), L)
-    slower = MAX_SPIN / tl.maximum(tl.sqrt(dot(spin, spin)), MAX_SPIN)
-    L, spin = scale3(slower, L), scale3(slower, spin)
+    spin_limit = MAX_SPIN / tl.maximum(tl.sqrt(dot(spin, spin)), MAX_SPIN)
+    L, spin = scale3(spin_limit, L), scale3(spin_limit, spin)
     v = scale3(MAX_SPEED / tl.maximum(tl.sqrt(dot(v, v)), MAX_SPEED), v)
-    extent, hold = tl.load(size + i), tl.load(grip + i)
+    extent, friction_speed = tl.load(size + i), tl.load(friction + i)
     for k in range(o - 1):  # friction of the support is passed on to what it carries
-        firm = 1 - CONTACT_SATURATION * tl.load(unit + i * (o + 1) + k)  # saturated weight of the contact's points
-        hold = tl.maximum(hold, firm * tl.load(grip + other_object(i, k, o)))
+        contact_weight = 1 - CONTACT_SATURATION * tl.load(unit + i * (o + 1) + k)  # saturates at 1
+        friction_speed = tl.maximum(friction_speed, contact_weight * tl.load(friction + other_object(i, k, o)))
     last = (dot(v, v) + extent * extent * dot(spin, spin)) / FRICTION_CUTOFF_SPEED
     past_v, past_spin = add(past_v, v), add(past_spin, spin)
     moving = (dot(past_v, past_v) + extent * extent * dot(past_spin, past_spin)) / 4 + last * last
-    kept = (moving * moving + 1e-16) / (moving * moving + 1e-16 + dt / FRAME * hold * hold * hold * hold)
+    drag = dt / FRAME * friction_speed * friction_speed * friction_speed * friction_speed
+    kept = (moving * moving + 1e-16) / (moving * moving + 1e-16 + drag)
     v, L, spin = scale3(kept, v), scale3(kept, L), scale3(kept, spin)
 
     r = tl.arange(0, BLOCK)
     inside = r < n
-    there = tl.load(valid + i * n + r, mask=inside, other=0) != 0
-    own = moved + POINT_SIZE * i * n + r
-    x = add(load3(own + POINT * n, n, inside), scale3(dt / 2, cross(spin, load3(own + ARM * n, n, inside))))
+    valid_points = tl.load(valid + i * n + r, mask=inside, other=0) != 0
+    at_point = moved + POINT_SIZE * i * n + r
+    x = add(load3(at_point + POINT * n, n, inside), scale3(dt / 2, cross(spin, load3(at_point + ARM * n, n, inside))))
     far: tl.constexpr = float("inf")
     room = box + 6 * i
     slack = (MAX_PENETRATION, MAX_PENETRATION, MAX_PENETRATION)
-    deepest = max3(where3(there, scale3(-1.0, x), -far))  # positions of the lowest points, negated [m]
+    deepest = max3(where3(valid_points, scale3(-1.0, x), -far))  # positions of the lowest points, negated [m]
     up = scale3(2 / dt, sub(add(read3(room), deepest), slack))
-    down = scale3(2 / dt, add(sub(read3(room + 3), max3(where3(there, x, -far))), slack))
+    down = scale3(2 / dt, add(sub(read3(room + 3), max3(where3(valid_points, x, -far))), slack))
     free = 1 - tl.load(pinned + i).to(tl.float32)
     v = (_guarded(v[0], up[0], down[0], MAX_RECOVERY_SPEED), _guarded(v[1], up[1], down[1], MAX_RECOVERY_SPEED),
          _guarded(v[2], up[2], down[2], MAX_RECOVERY_SPEED))  # fmt: skip
@@ -152,23 +157,24 @@ def update_velocities(
     write3(velocity + 3 * i, v)
     write3(momentum + 3 * i, L)
 
-    part = tl.load(share + i * n + r, mask=inside, other=0.0)
-    one = tl.where(there, 1 / tl.maximum(part, 1e-9), 0.0)
-    touch = transposed_matvec3(read9(now + ROTATION), (one * touch[0], one * touch[1], one * touch[2]))
-    rest = load3(arm + (i * n + r) * 3, 1, inside)
-    own = field + FIELD_SIZE * i * n + r
-    store3(own + VIRIAL * n, n, _spread(touch, rest, part, extent), inside)
-    _split(touch, high + 9 * i * n + r, low + 9 * i * n + r, scale + 9 * i, n, inside)
-    shift = load3(own + U * n, n, inside)
-    _split(shift, high + (9 * i + 3) * n + r, low + (9 * i + 3) * n + r, scale + 9 * i + 3, n, inside)
-    shift = load3(own + DU * n, n, inside)
-    _split(shift, high + (9 * i + 6) * n + r, low + (9 * i + 6) * n + r, scale + 9 * i + 6, n, inside)
+    part = tl.load(mass_fraction + i * n + r, mask=inside, other=0.0)
+    one = tl.where(valid_points, 1 / tl.maximum(part, 1e-9), 0.0)
+    acceleration = (one * acceleration[0], one * acceleration[1], one * acceleration[2])
+    acceleration = transposed_matvec3(read9(now + ROTATION), acceleration)
+    arms = load3(arm + (i * n + r) * 3, 1, inside)
+    at_point = field + FIELD_SIZE * i * n + r
+    store3(at_point + VIRIAL * n, n, _spread(acceleration, arms, part, extent), inside)
+    _split(acceleration, high + 9 * i * n + r, low + 9 * i * n + r, scale + 9 * i, n, inside)
+    displacement = load3(at_point + U * n, n, inside)
+    _split(displacement, high + (9 * i + 3) * n + r, low + (9 * i + 3) * n + r, scale + 9 * i + 3, n, inside)
+    rate = load3(at_point + DU * n, n, inside)
+    _split(rate, high + (9 * i + 6) * n + r, low + (9 * i + 6) * n + r, scale + 9 * i + 6, n, inside)
 
 
 @triton.jit
-def _spread(touch, arm, share, size):
+def _spread(acceleration, arm, mass_fraction, size):
     """Affine field with the virial of the contact accelerations: the symmetric virial matrix times the arms."""
-    a, b, c = scale3(share, touch)
+    a, b, c = scale3(mass_fraction, acceleration)
     x, y, z = sum3(scale3(a, arm)), sum3(scale3(b, arm)), sum3(scale3(c, arm))
     M = (2 * x[0], x[1] + y[0], x[2] + z[0], x[1] + y[0], 2 * y[1], y[2] + z[1], x[2] + z[0], y[2] + z[1], 2 * z[2])
     return scale3(1 / (size * size), matvec3(M, arm))
@@ -177,9 +183,9 @@ def _spread(touch, arm, share, size):
 @triton.jit
 def _split(a, high, low, scale, n, mask):
     """Write vectors as sums of two half-precision parts (22 bits), in units in which the largest is 1,024."""
-    most = max3((tl.abs(a[0]), tl.abs(a[1]), tl.abs(a[2])))
+    largest = max3((tl.abs(a[0]), tl.abs(a[1]), tl.abs(a[2])))
     for axis in tl.static_range(3):
-        unit = tl.maximum(most[axis], 1e-30) / 1024
+        unit = tl.maximum(largest[axis], 1e-30) / 1024
         x = a[axis] / unit
         half = x.to(tl.float16)
         tl.store(high + axis * n, half, mask=mask)
@@ -189,29 +195,29 @@ def _split(a, high, low, scale, n, mask):
 
 @triton.jit
 def update_displacements(
-    field, stress, arm, valid, share, size, inverse, stiffness, damping, pinned, u, du, n, dt,
+    field, stress, arm, valid, mass_fraction, size, inverse, stiffness, damping, pinned, u, du, n, dt,
     MAX_SPEED: tl.constexpr, MAX_DISPLACEMENT: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Update displacements and their rates by internal accelerations, after removing their mean and net rotation."""
     i = tl.program_id(0)
     r = tl.arange(0, BLOCK)
     inside = r < n
-    there = tl.load(valid + i * n + r, mask=inside, other=0) != 0
-    part = tl.load(share + i * n + r, mask=inside, other=0.0)
-    rest = load3(arm + (i * n + r) * 3, 1, inside)
+    valid_points = tl.load(valid + i * n + r, mask=inside, other=0) != 0
+    part = tl.load(mass_fraction + i * n + r, mask=inside, other=0.0)
+    arms = load3(arm + (i * n + r) * 3, 1, inside)
     a = load3(stress + 3 * i * n + r, n, inside)
     a = sub(a, sum3(scale3(part, a)))
-    turn = matvec3(read9(inverse + 9 * i), sum3(scale3(part, cross(rest, a))))
-    a = sub(a, cross(turn, rest))
-    a = where3(there, a, 0.0)
-    own = field + FIELD_SIZE * i * n + r
-    shift, rate = load3(own + U * n, n, inside), load3(own + DU * n, n, inside)
+    rotation_rate = matvec3(read9(inverse + 9 * i), sum3(scale3(part, cross(arms, a))))
+    a = sub(a, cross(rotation_rate, arms))
+    a = where3(valid_points, a, 0.0)
+    at_point = field + FIELD_SIZE * i * n + r
+    displacement, rate = load3(at_point + U * n, n, inside), load3(at_point + DU * n, n, inside)
     k, c, extent = tl.load(stiffness + i), tl.load(damping + i), tl.load(size + i)
-    rate = add(rate, scale3(dt, sub(a, scale3(k, shift))))
+    rate = add(rate, scale3(dt, sub(a, scale3(k, displacement))))
     rate = scale3(1 / (1 + dt * c + dt * dt / 2 * k), rate)
     free = 1 - tl.load(pinned + i).to(tl.float32)
     rate = scale3(free, clamp_displacements(rate, MAX_SPEED * extent, MAX_DISPLACEMENT))
-    shift = clamp_displacements(add(shift, scale3(dt / 2, rate)), extent, MAX_DISPLACEMENT)
+    displacement = clamp_displacements(add(displacement, scale3(dt / 2, rate)), extent, MAX_DISPLACEMENT)
     at = (i * n + r) * 3
-    store3(u + at, 1, shift, inside)
+    store3(u + at, 1, displacement, inside)
     store3(du + at, 1, rate, inside)

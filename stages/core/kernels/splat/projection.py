@@ -270,8 +270,8 @@ def project_reference(camera: Tensor, means: Tensor, quats: Tensor, scales: Tens
     dirs = torch.nn.functional.normalize(means - centre, dim=-1)
     rgb = evaluate_sh(sh, dirs).clamp_min(0)
     centre2d = torch.stack([fx * xz + cx, fy * yz + cy], -1)
-    reach = 2 * (opacities.detach() / MIN_ALPHA).clamp_min(1).log()
-    extent = (reach[:, None] * cov.detach().diagonal(dim1=-2, dim2=-1)).sqrt()
+    radius2 = 2 * (opacities.detach() / MIN_ALPHA).clamp_min(1).log()
+    extent = (radius2[:, None] * cov.detach().diagonal(dim1=-2, dim2=-1)).sqrt()
     inside = (centre2d + extent > 0) & (centre2d - extent < torch.stack([width, height]))
     visible = front & (opacities >= MIN_ALPHA) & inside.all(-1)
     columns = [*centre2d.unbind(-1), conic[:, 0, 0], conic[:, 0, 1], conic[:, 1, 1], opacities, *rgb.unbind(-1), z]

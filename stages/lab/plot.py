@@ -1,4 +1,4 @@
-"""Small diagrams for the docs, drawn with OpenCV: marks for what was measured, a line for theory, or several curves."""
+"""Small plots for the documentation, drawn with OpenCV: measured points, a theoretical line, or several curves."""
 
 from __future__ import annotations
 
@@ -32,18 +32,18 @@ Points = Sequence[tuple[float, float]]
 
 @dataclass(frozen=True)
 class Panel:
-    """One diagram, an empty place without points. With `log` both axes are logarithmic, and points must be positive."""
+    """One plot, left blank without points. With `log` both axes are logarithmic and points must be positive."""
 
     title: str
     measured: Points = ()
     expected: Points = ()
     log: bool = False
-    theory: str = "theory"  # what the line is called
-    curves: Mapping[str, Points] = field(default_factory=dict)  # of one name: of one colour in all panels
+    theory: str = "theory"  # label of the line
+    curves: Mapping[str, Points] = field(default_factory=dict)  # curves of one name have one colour in all panels
 
 
 def draw_panels(out: Path, panels: Sequence[Panel], columns: int = 3) -> None:
-    """Panels in rows, as a PNG; below them, what the colours of curves mean."""
+    """Write panels in rows of `columns` as a PNG, with a legend of the curves below; InputError if not writable."""
     names = list(dict.fromkeys(name for panel in panels for name in panel.curves))
     colours = {name: COLOURS[i % len(COLOURS)] for i, name in enumerate(names)}
     rows = [list(panels[i : i + columns]) for i in range(0, len(panels), columns)]
@@ -57,7 +57,7 @@ def draw_panels(out: Path, panels: Sequence[Panel], columns: int = 3) -> None:
 
 
 def _legend(colours: Mapping[str, tuple[int, int, int]], width: int) -> np.ndarray:
-    """Names of curves with a piece of each, in as many lines as they need."""
+    """Legend of the curves, in as many lines as needed."""
     lines, x = [np.full((LEGEND_HEIGHT, width, 3), 255, np.uint8)], MARGIN
     for name, colour in colours.items():
         if x > MARGIN and x + 40 + 8 * len(name) > width:
@@ -82,7 +82,7 @@ def _panel(panel: Panel, colours: Mapping[str, tuple[int, int, int]]) -> np.ndar
     low, high = np.where(panel.log | (low < 0), low - room, low), high + room
     area = np.array([PANEL_WIDTH - MARGIN - 16, PANEL_HEIGHT - MARGIN - 34])
 
-    def place(points: Points) -> np.ndarray:
+    def to_pixels(points: Points) -> np.ndarray:
         at = (scale(np.array(points, float)) - low) / (high - low) * area
         return np.stack([MARGIN + at[:, 0], PANEL_HEIGHT - MARGIN - at[:, 1]], 1).round().astype(int)
 
@@ -99,11 +99,11 @@ def _panel(panel: Panel, colours: Mapping[str, tuple[int, int, int]]) -> np.ndar
                 )
                 _text(image, text, (MARGIN - 6 - 7 * len(text), PANEL_HEIGHT - MARGIN - at + 4))
     if len(panel.expected):
-        cv2.polylines(image, [place(panel.expected)], False, RED, 1, cv2.LINE_AA)
+        cv2.polylines(image, [to_pixels(panel.expected)], False, RED, 1, cv2.LINE_AA)
     for name, points in panel.curves.items():
         if len(points):
-            cv2.polylines(image, [place(points)], False, colours[name], 2, cv2.LINE_AA)
-    for x, y in place(panel.measured) if len(panel.measured) else ():
+            cv2.polylines(image, [to_pixels(points)], False, colours[name], 2, cv2.LINE_AA)
+    for x, y in to_pixels(panel.measured) if len(panel.measured) else ():
         cv2.circle(image, (int(x), int(y)), 4, BLUE, -1, cv2.LINE_AA)
     cv2.rectangle(image, (MARGIN, 34), (PANEL_WIDTH - 16, PANEL_HEIGHT - MARGIN), INK, 1)
     _text(image, panel.title, (MARGIN, 22), 0.44)
@@ -115,7 +115,7 @@ def _panel(panel: Panel, colours: Mapping[str, tuple[int, int, int]]) -> np.ndar
 
 
 def _ticks(low: float, high: float, log: bool) -> list[float]:
-    """A few round numbers between the ends; powers of ten and their doubles and fives on a logarithmic axis."""
+    """A few round numbers between the ends; on a logarithmic axis powers of ten, with multiples 2 and 5 if few."""
     if log:
         decades = range(math.floor(low), math.ceil(high) + 1)
         marks = [d + math.log10(m) for d in decades for m in ((1, 2, 5) if high - low < 2 else (1,))]

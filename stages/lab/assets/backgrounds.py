@@ -1,4 +1,4 @@
-"""Eight tables, each in its surround, as Gaussians: the objects of a scene live in [-1, 1]^3 above the table top."""
+"""The eight backgrounds as Gaussians: a table in a room. Objects are placed in [-1, 1]^3 above the table top."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ Paint = Callable[[Tensor], Tensor]
 
 @dataclass(frozen=True)
 class Background:
-    """What covers the table, its sides and legs, the floor and the walls."""
+    """Textures and colours of the table, the floor and the walls, and the shape of the table."""
 
     top: Paint
     wood: tuple[float, float, float]  # of sides and legs
     floor: Paint
     wall: Paint
-    round: bool = False
-    overhang: float = 0.0  # how far the cover hangs down the sides [m]
+    round: bool = False  # a round table with one leg
+    overhang: float = 0.0  # length of the tablecloth below the top [m]; 0: no tablecloth
 
 
 BACKGROUNDS = {
@@ -58,7 +58,10 @@ BACKGROUNDS = {
 
 
 def make_background(name: str) -> Gaussians:
-    """A table of BACKGROUNDS in its room: SH degree 0, object_id 0, table top at z = -0.94, nothing above it."""
+    """A background by name: SH degree 0, object_id 0, table top at z = -0.94 [m], nothing above it.
+
+    Deterministic. Raises InputError for an unknown name.
+    """
     b = BACKGROUNDS[_known(name)]
     with single_threaded():
         return concatenate([_top(b), _sides(b), *_legs(b), _floor(b), *_walls(b)])
@@ -71,7 +74,7 @@ def _known(name: str) -> str:
 
 
 def outline_distance(q: Float[Tensor, "n 2"], b: Background, grow: float = 0.0) -> Float[Tensor, "n"]:
-    """Distance to the outline of the table, seen from above and grown; negative on the table [m]."""
+    """Signed distance to the outline of the table top, enlarged by `grow`, negative inside [m]."""
     return (
         q.norm(dim=1) - 1.15 * TABLE_HALF_WIDTH - grow
         if b.round
@@ -80,18 +83,18 @@ def outline_distance(q: Float[Tensor, "n 2"], b: Background, grow: float = 0.0) 
 
 
 def _top(b: Background) -> Gaussians:
-    """The top, lit a little more in the middle; points in rows that are shifted against each other."""
-    reach = TABLE_HALF_WIDTH * (1.15 if b.round else 1.0)
-    rows, columns = int(2 * reach / (TABLE_SPACING * 0.75**0.5)), int(2 * reach / TABLE_SPACING)
+    """The table top, slightly brighter in the middle, on a hexagonal grid."""
+    half = TABLE_HALF_WIDTH * (1.15 if b.round else 1.0)
+    rows, columns = int(2 * half / (TABLE_SPACING * 0.75**0.5)), int(2 * half / TABLE_SPACING)
     j, i = torch.meshgrid(torch.arange(rows), torch.arange(columns), indexing="ij")
-    q = torch.stack([(i + 0.5 * (j % 2)) * TABLE_SPACING, j * TABLE_SPACING * 0.75**0.5], -1).reshape(-1, 2) - reach
+    q = torch.stack([(i + 0.5 * (j % 2)) * TABLE_SPACING, j * TABLE_SPACING * 0.75**0.5], -1).reshape(-1, 2) - half
     q = q[outline_distance(q, b) < 0]
     rgb = b.top(q) * (1.04 - 0.035 * q.square().sum(1))[:, None].clamp_min(0.8)
     return _flat(torch.nn.functional.pad(q, (0, 1), value=TABLE_HEIGHT), (0.0, 0.0, 1.0), rgb, TABLE_SPACING)
 
 
 def _sides(b: Background) -> Gaussians:
-    """The edge all round, or the cover that hangs over it in folds."""
+    """The edge of the table top, or the folds of the tablecloth over it."""
     step, drop = 1.6 * TABLE_SPACING, max(TABLE_THICKNESS, b.overhang)
     angle = torch.arange(0, 2 * torch.pi, 2e-3)
     ray = torch.stack([angle.cos(), angle.sin()], 1)
@@ -102,16 +105,16 @@ def _sides(b: Background) -> Gaussians:
     along = torch.cat([torch.zeros(1), (line[1:] - line[:-1]).norm(dim=1).cumsum(0)])
     pick = torch.searchsorted(along, torch.arange(0.0, float(along[-1]), step))
     depth = torch.arange(0.5 * step, drop, step)
-    place, down = torch.cartesian_prod(pick.float(), depth).unbind(1)
-    place = place.long()
-    edge, e = line[place], 1e-3
+    column, down = torch.cartesian_prod(pick.float(), depth).unbind(1)
+    column = column.long()
+    edge, e = line[column], 1e-3
     x, y = (torch.tensor([[e, 0.0]]), torch.tensor([[0.0, e]]))
     normal = torch.stack([outline_distance(edge + d, b) - outline_distance(edge - d, b) for d in (x, y)], 1)
     normal = torch.nn.functional.normalize(torch.nn.functional.pad(normal, (0, 1)), dim=1)
-    fold = 0.04 * torch.sin(along[place] * 14) * down / drop if b.overhang else 0 * down
+    fold = 0.04 * torch.sin(along[column] * 14) * down / drop if b.overhang else 0 * down
     p = torch.cat([edge, (TABLE_HEIGHT - down)[:, None]], 1) + fold[:, None] * normal
     if b.overhang:
-        straight = torch.stack([along[place], down], 1)
+        straight = torch.stack([along[column], down], 1)
         rgb = b.top(straight) * (0.82 + 5.0 * fold)[:, None]
     else:
         rgb = torch.tensor(b.wood) * (0.85 + 0.3 * noise(p * torch.tensor([0.2, 0.2, 1.0]), 0.05, 2))[:, None]
@@ -119,7 +122,7 @@ def _sides(b: Background) -> Gaussians:
 
 
 def _legs(b: Background) -> list[Gaussians]:
-    """Four square legs, or one thick one in the middle."""
+    """Four square legs, or a thick one in the middle."""
     step, half = 2.5 * TABLE_SPACING, 0.5 if b.round else LEG_HALF_WIDTH
     at = (
         [(0.0, 0.0)]
@@ -147,7 +150,7 @@ def _legs(b: Background) -> list[Gaussians]:
 
 
 def _floor(b: Background) -> Gaussians:
-    """The floor, dark under the table and towards the walls."""
+    """The floor, darker under the table and near the walls."""
     line = torch.arange(-ROOM_HALF_WIDTH, ROOM_HALF_WIDTH, ROOM_SPACING)
     q = torch.cartesian_prod(line, line)
     shadow = 0.6 * torch.exp(-outline_distance(q, b).clamp_min(0) / 0.7) + 0.2 * torch.exp(
@@ -158,7 +161,7 @@ def _floor(b: Background) -> Gaussians:
 
 
 def _walls(b: Background) -> list[Gaussians]:
-    """Four walls, darker in the corners, each with a little more or less light."""
+    """Four walls, darker in the corners, each shaded by its orientation."""
     q = torch.cartesian_prod(
         torch.arange(-ROOM_HALF_WIDTH, ROOM_HALF_WIDTH, ROOM_SPACING),
         torch.arange(FLOOR_HEIGHT, CEILING_HEIGHT, ROOM_SPACING),
@@ -177,7 +180,7 @@ def _walls(b: Background) -> list[Gaussians]:
 
 
 def _daylight(normal: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n"]:
-    """Brightness of an upright face: more where it faces the light."""
+    """Brightness of a vertical face by its orientation to the light."""
     return 0.86 + 0.12 * (normal @ torch.tensor([-0.42, -0.9, 0.0]))
 
 
@@ -187,7 +190,10 @@ def _flat(p: Float[Tensor, "n 3"], normal: tuple[float, float, float], rgb: Tens
 
 
 def run(out: Path, only: str = "", sheet: Path | None = None) -> Iterator[str]:
-    """Write OUT/<name>/gaussians_feedforward.ply for each background; a line about each, and a sheet of all."""
+    """Write OUT/<name>/gaussians_feedforward.ply for each background, and an image of all to `sheet`.
+
+    `only` names some of them, separated by commas. Yields a line per background; raises InputError for unknown names.
+    """
     from stages.core.scene.files import provenance
     from stages.core.scene.images import write_jpeg
     from stages.core.scene.scene import Scene
@@ -195,7 +201,7 @@ def run(out: Path, only: str = "", sheet: Path | None = None) -> Iterator[str]:
     from stages.lab.assets.splat_files import background_portrait
     from stages.render.overlay import tile_images
 
-    pictures = []
+    images = []
     names = [_known(name.strip()) for name in only.split(",") if name.strip()] or list(BACKGROUNDS)
     for name in tqdm(names, desc="backgrounds", unit="background"):
         g = make_background(name)
@@ -203,7 +209,7 @@ def run(out: Path, only: str = "", sheet: Path | None = None) -> Iterator[str]:
         folder.mkdir(parents=True, exist_ok=True)
         write_scene(folder / BACKGROUND_PLY, Scene(g, (), None, TABLE_HEIGHT, provenance=provenance("backgrounds", [])))
         if sheet:
-            pictures.append(background_portrait(g, name))
+            images.append(background_portrait(g, name))
         yield f"{name}: {len(g)} Gaussians"
     if sheet:
-        write_jpeg(sheet, tile_images(pictures, min(4, len(pictures))), 86)
+        write_jpeg(sheet, tile_images(images, min(4, len(images))), 86)

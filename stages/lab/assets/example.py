@@ -1,4 +1,4 @@
-"""The example that ships: photos of toys made in code, and the truth about them."""
+"""The shipped example: rendered photos of toys, with ground truth."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from stages.simulate.options import SimulateOptions
 from stages.simulate.stage import run as simulate
 
 WIDTH, HEIGHT, FOCAL = 640, 480, 620.0
-WALL = torch.tensor([0.62, 0.66, 0.70])  # colour behind the table
+WALL = torch.tensor([0.62, 0.66, 0.70])  # background colour
 
 
 def make_example(out: Path, photos: int = 26) -> None:
-    """photos/NN.jpg, masks/NN.png (object ids) and names.json, cameras.json (transforms), truth.h5."""
+    """Write photos/NN.jpg, masks/NN.png (object ids), masks/names.json, cameras.json (transforms) and truth.h5."""
     out = Path(out)
     for folder in ("photos", "masks"):
         (out / folder).mkdir(parents=True, exist_ok=True)
@@ -40,11 +40,11 @@ def make_example(out: Path, photos: int = 26) -> None:
         write_labels(out / "masks" / f"{Path(name).stem}.png", labels)
     (out / "masks/names.json").write_text(json.dumps({o.id: o.name for o in scene.objects}))
     (out / "cameras.json").write_text(json.dumps(_transforms(scene.cameras), indent=1))
-    _truth(scene, out / "truth.h5")
+    _write_truth(scene, out / "truth.h5")
 
 
 def _cameras(count: int) -> Cameras:
-    """Two rings of views around the toys, a low one that sees under what hangs and a high one."""
+    """Two rings of views around the toys: a low one, from which the undersides are visible, and a high one."""
     low = count * 3 // 5
     centre = torch.tensor([0.0, 0.0, 0.11])
     rings = [orbit(low, centre, 1.0, 20.0), orbit(count - low, centre, 1.05, 42.0, azimuth=127.0)]
@@ -54,14 +54,14 @@ def _cameras(count: int) -> Cameras:
 
 
 def _transforms(cameras: Cameras) -> dict:
-    """The nerfstudio form: camera-to-world with OpenGL axes."""
+    """Cameras in the format of nerfstudio: camera-to-world with OpenGL axes."""
     poses = torch.linalg.inv(cameras.viewmats) @ torch.diag(torch.tensor([1.0, -1, -1, 1]))
     rows = zip(cameras.names, poses.tolist(), strict=True)
     frames = [{"file_path": f"photos/{name}", "transform_matrix": pose} for name, pose in rows]
     return {"w": WIDTH, "h": HEIGHT, "fl_x": FOCAL, "fl_y": FOCAL, "cx": WIDTH / 2, "cy": HEIGHT / 2, "frames": frames}
 
 
-def _truth(scene: Scene, out: Path) -> None:
+def _write_truth(scene: Scene, out: Path) -> None:
     """Simulate the toys without the table by MPM; of the Gaussians simulated, store every fourth (a small file)."""
     toys = scene.gaussians[scene.gaussians.object_id > 0]
     with tempfile.TemporaryDirectory() as folder:

@@ -1,4 +1,4 @@
-"""From painted fields to Gaussians: points spread evenly over the zero surface, light baked into their colour."""
+"""Sampling of painted signed distance fields: evenly spaced Gaussians with baked light."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from stages.core.scene.gaussians import Gaussians
 from stages.lab.assets.shapes import Surface, to_gaussians
 from stages.lab.assets.signed_distance import Field, Vec, union
 
-GRID_CELLS = 64  # of the coarse grid, along the longest side
+GRID_CELLS = 64  # of the candidate grid, along the longest side
 SKY_LIGHT, KEY_LIGHT = (
     torch.tensor([0.0, 0.0, 1.0]),
     torch.nn.functional.normalize(torch.tensor([-0.35, -0.75, 0.85]), dim=0),
@@ -25,7 +25,7 @@ HIGHLIGHT_LEGENDRE = (1 / 14, 3 / 16, 5 / 21)  # Legendre coefficients of max(co
 
 @dataclass(frozen=True)
 class PaintedPart:
-    """A piece of an object: its shape, its colour as a function of points (n, 3) -> RGB (n, 3), and its gloss."""
+    """Part of an object: its field, its colour as a function of points (n, 3) -> RGB (n, 3), and its gloss."""
 
     field: Field
     paint: Callable[[Tensor], Tensor]
@@ -35,10 +35,11 @@ class PaintedPart:
 def gaussians_from_parts(
     parts: list[PaintedPart], half: Vec, n: int, smooth: float = 0.0, skin: float = 0.008
 ) -> Gaussians:
-    """n flat Gaussians of SH degree 2 on the union of the parts, which lies within +-half; longest side about 1.
+    """n flat Gaussians of SH degree 2 on the union of the parts, normalised to longest side 1.
 
-    A point takes paint and gloss of the part it lies on; `skin` is less than half the thickness of any wall. Same
-    arguments, same Gaussians.
+    The union must lie within +-half; `smooth` is the blending width of its creases. A point has the colour and gloss of
+    the nearest part. `skin` is half the width of the band that is sampled, less than half the thinnest wall.
+    Deterministic.
     """
     field = union(*(part.field for part in parts), smooth=smooth)
     surface = relax_points(field, sample_surface(field, half, n, skin))
@@ -55,14 +56,14 @@ def gaussians_from_parts(
 
 
 def normalise_size(g: Gaussians) -> Gaussians:
-    """Bounding box of the centres around the origin, its longest side 1."""
+    """Gaussians scaled to longest side 1, their bounding box centred on the origin."""
     low, high = g.means.amin(0), g.means.amax(0)
     side = (high - low).max()
     return replace(g, means=(g.means - (low + high) / 2) / side, scales=g.scales / side)
 
 
 def distance_and_normal(field: Field, p: Float[Tensor, "n 3"], step: float = 1e-3) -> tuple[Tensor, Tensor]:
-    """First-order distance to the surface (n,) and unit gradient (n, 3), by differences over a tetrahedron."""
+    """First-order distance to the surface (n,) and unit gradient (n, 3), by finite differences over a tetrahedron."""
     corners = torch.tensor([[1.0, -1, -1], [-1, -1, 1], [-1, 1, -1], [1, 1, 1]])
     values = torch.stack([field(p + step * corner) for corner in corners], 1)
     gradient = values @ corners / (4 * step)
@@ -71,10 +72,10 @@ def distance_and_normal(field: Field, p: Float[Tensor, "n 3"], step: float = 1e-
 
 
 def sample_surface(field: Field, half: Vec, n: int, skin: float) -> Surface:
-    """n random points, evenly likely anywhere on the surface of a field whose slope is nowhere below 1/2 or above 2.
+    """n random points, uniform over the surface of a field whose gradient norm is between 1/2 and 2.
 
-    Points drawn in a thin skin around the surface are carried onto it along the gradient; only cells of a coarse
-    grid that the skin can reach are drawn from.
+    Points in a thin band of half width `skin` around the surface are projected onto it along the gradient; candidates
+    come only from cells of a coarse grid that the band can intersect.
     """
     generator = torch.Generator().manual_seed(n)
     cell = 2 * max(half) / GRID_CELLS
@@ -92,7 +93,7 @@ def sample_surface(field: Field, half: Vec, n: int, skin: float) -> Surface:
 
 
 def project_to_surface(field: Field, p: Float[Tensor, "n 3"], steps: int = 2) -> Surface:
-    """Points near the surface carried onto it by Newton steps, with the normals where the last step began."""
+    """Points near the surface projected onto it by Newton steps, with the normals before the last step."""
     for _ in range(steps):
         distance, normal = distance_and_normal(field, p)
         p = p - distance.clamp(-0.01, 0.01)[:, None] * normal
@@ -100,48 +101,48 @@ def project_to_surface(field: Field, p: Float[Tensor, "n 3"], steps: int = 2) ->
 
 
 def relax_points(field: Field, surface: Surface, rounds: int = 5) -> Surface:
-    """Points pushed off their near neighbours on the same side and back onto the surface, so that gaps close."""
+    """More even spacing: points repel near neighbours on the same side and are projected back onto the surface."""
     for last in [False] * (rounds - 1) + [True]:
         p, normal = surface.points, surface.normals
         distance, index = knn(p, p, 8)
         distance, index = distance[:, 1:], index[:, 1:]
-        reach = 1.1 * float(distance[:, 4].median())  # unlike a mean the same for any number of threads
-        push = (1 - distance / reach).clamp_min(0) * (normal[:, None] * normal[index]).sum(-1).clamp_min(0)
+        radius = 1.1 * float(distance[:, 4].median())  # unlike a mean, independent of the number of threads
+        push = (1 - distance / radius).clamp_min(0) * (normal[:, None] * normal[index]).sum(-1).clamp_min(0)
         away = (p[:, None] - p[index]) / distance.clamp_min(1e-9)[..., None]
-        step = 0.35 * reach * (push[..., None] * away).sum(1)
+        step = 0.35 * radius * (push[..., None] * away).sum(1)
         step = step - (step * normal).sum(1, keepdim=True) * normal
         surface = project_to_surface(field, p + step, 2 if last else 1)
     return surface
 
 
 def diffuse_light(surface: Surface) -> Float[Tensor, "n"]:
-    """Soft light from above and a key light from the upper front left."""
+    """Brightness under soft light from above and a key light from the upper front left."""
     n = surface.normals
     return 0.66 + 0.16 * (n @ SKY_LIGHT) + 0.26 * (n @ KEY_LIGHT).clamp_min(0)
 
 
 def ambient_occlusion(field: Field, surface: Surface) -> Float[Tensor, "n"]:
-    """1 where nothing stands near, less in creases: how far the field falls short of the distance moved outward.
+    """Ambient light factor: 1 on open surfaces, less in creases, from field values along the normal.
 
     Source: Evans 2006, "Fast approximations for global illumination on dynamic scenes".
     """
     hidden = torch.zeros(len(surface.points))
     for i, h in enumerate((0.015, 0.03, 0.06, 0.12)):
-        reached = field(surface.points + h * surface.normals)
-        hidden += (1 - reached / h).clamp(0, 1) * 0.5**i
+        distance = field(surface.points + h * surface.normals)
+        hidden += (1 - distance / h).clamp(0, 1) * 0.5**i
     return 1 - 0.42 * (hidden / 1.875).clamp(0, 1)
 
 
 def add_highlight(sh: Float[Tensor, "n 1 3"], normals: Tensor, gloss: Float[Tensor, "n"]) -> Float[Tensor, "n 9 3"]:
-    """Coefficients of degree 2 that add a broad white highlight, the mirror image of the key light.
+    """SH coefficients of degree 2 with a broad white highlight, the reflection of the key light.
 
-    By the addition theorem a lobe f(cos) around direction r has coefficients f_l 4 pi / (2 l + 1) Y_lm(r), f_l being
-    its Legendre coefficients. Colours are looked up along the view ray, so r is the mirrored light, reversed.
+    By the addition theorem a lobe f(cos) around direction r has coefficients f_l 4 pi / (2 l + 1) Y_lm(r), where f_l
+    are its Legendre coefficients. SH are evaluated along the viewing direction, so r is the negated reflection.
     """
     mirrored = 2 * (normals @ KEY_LIGHT)[:, None] * normals - KEY_LIGHT
     lit = gloss * ((normals @ KEY_LIGHT) * 2).clamp(0, 1)
     weights = torch.tensor([f * 4 * torch.pi / (2 * l + 1) for l, f in enumerate(HIGHLIGHT_LEGENDRE)])
     lobe = basis(-mirrored, 2) * weights[torch.tensor([0, 1, 1, 1, 2, 2, 2, 2, 2])]
     out = torch.nn.functional.pad(sh, (0, 0, 0, 8)) + (lit[:, None] * lobe)[..., None]
-    out[:, 0] -= (lit * HIGHLIGHT_LEGENDRE[0] / C0)[:, None]  # the mean over all views stays that of the paint
+    out[:, 0] -= (lit * HIGHLIGHT_LEGENDRE[0] / C0)[:, None]  # keeps the mean over all views
     return out

@@ -1,4 +1,4 @@
-"""The figures: a doll with turquoise twin tails, and a cartoon panda. Both sit or stand facing -y."""
+"""The two figures: a standing doll with turquoise twin tails and a seated cartoon panda, both facing -y."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ FUR, DARK = (0.94, 0.93, 0.9), (0.07, 0.07, 0.08)
 
 
 def panda() -> Gaussians:
-    """A seated panda of plush: black ears, arms, legs and eye patches, pink pads under the feet."""
+    """A seated plush panda: black ears, arms, legs and eye patches, pink pads under the feet."""
     head = ellipsoid((0, -0.03, 0.22), (0.29, 0.245, 0.24))
     muzzle = ellipsoid((0, -0.24, 0.145), (0.105, 0.06, 0.075))
     body = ellipsoid((0, 0.03, -0.19), (0.25, 0.215, 0.27))
@@ -91,7 +91,7 @@ TEAL, TRIM = (0.05, 0.5, 0.52), (0.1, 0.72, 0.7)
 
 
 def miku() -> Gaussians:
-    """A standing doll: large head, turquoise fringe and long twin tails, grey top, teal tie, dark pleated skirt."""
+    """A standing doll: large head, turquoise fringe, long twin tails, grey top, teal tie, dark pleated skirt."""
     hair = doll_hair()
 
     def face(p: Tensor) -> Tensor:
@@ -154,7 +154,7 @@ def miku() -> Gaussians:
 
 
 def skirt() -> Field:
-    """A short flared skirt with sixteen pleats, its lower side closed."""
+    """A short flared skirt with 16 pleats, closed below."""
     cone = revolved([(0, -0.09), (0.066, -0.09), (0.155, -0.225), (0, -0.205)], 0.006)
 
     def field(p: Tensor) -> Tensor:
@@ -165,8 +165,8 @@ def skirt() -> Field:
 
 
 def doll_hair() -> list[PaintedPart]:
-    """A cap with a fringe of pointed locks, ties of black and pink, and two tails that widen and end in points."""
-    opening = ellipsoid((0, -0.22, 0.2), (0.172, 0.2, 0.155))  # through which the face shows
+    """Hair of the doll: a cap with a fringe of pointed locks, black and pink ties, and two tails that end in points."""
+    opening = ellipsoid((0, -0.22, 0.2), (0.172, 0.2, 0.155))  # for the face
     cap = difference(ellipsoid((0, 0.012, 0.27), (0.213, 0.205, 0.19)), opening)
     ends = ((-0.135, 0.17), (-0.08, 0.292), (-0.028, 0.272), (0.028, 0.296), (0.082, 0.276), (0.138, 0.17))
     lines = torch.cat([lock(x, low) for x, low in ends])
@@ -195,6 +195,6 @@ def doll_hair() -> list[PaintedPart]:
 
 
 def lock(x: float, low: float) -> Float[Tensor, "m 3"]:
-    """Middle line of a lock of the fringe: from under the crown, over the brow, to a point at height `low`."""
+    """Centre line of a lock of the fringe at lateral position `x`, from the crown down to height `low`."""
     knots = [(x * 0.8, -0.13, 0.385), (x * 1.2, -0.195 + 2.6 * x * x, 0.345), (x * 1.33, -0.2 + 2.6 * x * x, low)]
     return curve_through(knots, 120)

@@ -1,4 +1,4 @@
-"""The hard ones but the phone: ball, bowl, can, duck."""
+"""Four hard objects: ball, bowl, can and duck."""
 
 from __future__ import annotations
 
@@ -9,30 +9,18 @@ import torch
 from torch import Tensor
 
 from stages.core.scene.gaussians import Gaussians
+from stages.lab.assets import signed_distance as sdf
 from stages.lab.assets.field_sampling import PaintedPart, gaussians_from_parts
 from stages.lab.assets.paint import BLACK, WHITE, cola_lettering, ellipse2d, mix, overlay, plain, stroke, union2d
-from stages.lab.assets.signed_distance import (
-    capsule,
-    curve_through,
-    difference,
-    ellipsoid,
-    euler_rotation,
-    mirrored,
-    posed,
-    revolved,
-    revolved_wall,
-    sphere,
-    union,
-)
 
 
 def ball() -> Gaussians:
-    """A capture ball: red above, white below, a black belt in a groove, and a button at the front (-y)."""
-    front = euler_rotation(x=90)  # z of a revolved shape becomes -y
-    groove = revolved([(0.488, -0.02), (0.6, -0.02), (0.6, 0.02), (0.488, 0.02)], 0.012)
-    shell = difference(sphere((0, 0, 0), 0.5), groove)
-    ring = posed(revolved([(0, 0.4), (0.118, 0.4), (0.118, 0.488), (0, 0.488)], 0.01), front)
-    button = posed(revolved([(0, 0.4), (0.062, 0.4), (0.062, 0.505), (0, 0.505)], 0.018), front)
+    """A capture ball: red above, white below, a black belt in a groove, a button at the front (-y)."""
+    front = sdf.euler_rotation(x=90)  # maps the axis of a revolved shape to -y
+    groove = sdf.revolved([(0.488, -0.02), (0.6, -0.02), (0.6, 0.02), (0.488, 0.02)], 0.012)
+    shell = sdf.difference(sdf.sphere((0, 0, 0), 0.5), groove)
+    ring = sdf.posed(sdf.revolved([(0, 0.4), (0.118, 0.4), (0.118, 0.488), (0, 0.488)], 0.01), front)
+    button = sdf.posed(sdf.revolved([(0, 0.4), (0.062, 0.4), (0.062, 0.505), (0, 0.505)], 0.018), front)
 
     def paint(p: Tensor) -> Tensor:
         rgb = overlay(plain((0.86, 0.09, 0.08))(p), WHITE, p[:, 2])
@@ -65,7 +53,7 @@ PUFFS = (
 
 
 def clouds(along: Tensor, height: Tensor, radius: float) -> Tensor:
-    """Distance to puffs with flat undersides, spaced round a wall; `along` is the azimuth [rad]."""
+    """Distance to clouds with flat undersides around a wall of `radius`; `along` is the azimuth [rad]."""
     shapes = []
     for azimuth, up, size in CLOUDS:
         u = torch.remainder(along - azimuth + math.pi, 2 * math.pi) - math.pi
@@ -76,11 +64,11 @@ def clouds(along: Tensor, height: Tensor, radius: float) -> Tensor:
 
 
 def bowl() -> Gaussians:
-    """An open bowl on a foot, sky blue with white clouds outside, paler within, a white rim."""
+    """An open bowl on a foot: sky blue with white clouds outside, paler inside, a white rim."""
     knots = [(0.0, -0.225), (0.12, -0.222), (0.27, -0.165), (0.39, -0.05), (0.455, 0.09), (0.49, 0.235)]
-    wall = revolved_wall([(r, z) for r, z in curve_through(knots, 40).tolist()], 0.03)
-    radii, heights = curve_through(knots, 200).T.numpy()
-    foot = revolved([(0.17, -0.265), (0.2, -0.265), (0.2, -0.215), (0.17, -0.215)], 0.006)
+    wall = sdf.revolved_wall([(r, z) for r, z in sdf.curve_through(knots, 40).tolist()], 0.03)
+    radii, heights = sdf.curve_through(knots, 200).T.numpy()
+    foot = sdf.revolved([(0.17, -0.265), (0.2, -0.265), (0.2, -0.215), (0.17, -0.215)], 0.006)
 
     def paint(p: Tensor) -> Tensor:
         r, z, azimuth = p[:, :2].norm(dim=1), p[:, 2], torch.atan2(p[:, 0], -p[:, 1])
@@ -101,10 +89,12 @@ CAN = [(0.0, -0.44), (0.17, -0.455), (0.185, -0.49), (0.2, -0.49), (0.262, -0.4)
 
 
 def can() -> Gaussians:
-    """A closed drinks can with a domed foot and a rimmed lid with its tab: red, a white wave and lettering."""
-    body = revolved(CAN, 0.007)
-    tab = posed(difference(ellipsoid((0, 0, 0), (0.05, 0.085, 0.012)), ellipsoid((0, 0.03, 0), (0.026, 0.03, 0.05))),
-                torch.eye(3), (0.0, -0.035, 0.474))  # fmt: skip
+    """A closed red drinks can with a domed foot, a rimmed lid with a tab, a white wave and lettering."""
+    body = sdf.revolved(CAN, 0.007)
+    loop = sdf.difference(
+        sdf.ellipsoid((0, 0, 0), (0.05, 0.085, 0.012)), sdf.ellipsoid((0, 0.03, 0), (0.026, 0.03, 0.05))
+    )
+    tab = sdf.posed(loop, torch.eye(3), (0.0, -0.035, 0.474))
 
     def paint(p: Tensor) -> Tensor:
         r, z, azimuth = p[:, :2].norm(dim=1), p[:, 2], torch.atan2(p[:, 0], -p[:, 1])
@@ -131,19 +121,19 @@ def can() -> Gaussians:
 
 
 def duck() -> Gaussians:
-    """A bath duck that looks along -y: body, raised tail, head, wings, an orange beak and black eyes."""
-    body = union(
-        ellipsoid((0, 0.06, -0.17), (0.29, 0.37, 0.215)),
-        capsule((0, 0.3, -0.06), (0, 0.47, 0.06), 0.12, 0.03),
-        ellipsoid((0, -0.13, 0.0), (0.17, 0.16, 0.18)),
+    """A rubber duck facing -y: body, raised tail, head, wings, an orange beak and black eyes."""
+    body = sdf.union(
+        sdf.ellipsoid((0, 0.06, -0.17), (0.29, 0.37, 0.215)),
+        sdf.capsule((0, 0.3, -0.06), (0, 0.47, 0.06), 0.12, 0.03),
+        sdf.ellipsoid((0, -0.13, 0.0), (0.17, 0.16, 0.18)),
         smooth=0.12,
     )  # fmt: skip
-    head = sphere((0, -0.17, 0.225), 0.215)
-    wing = mirrored(ellipsoid((0.25, 0.1, -0.13), (0.055, 0.2, 0.1), euler_rotation(x=22, z=14)))
-    yellow = union(body, head, wing, smooth=0.05)
-    upper = ellipsoid((0, -0.4, 0.205), (0.105, 0.125, 0.032), euler_rotation(x=-12))
-    lower = ellipsoid((0, -0.375, 0.165), (0.085, 0.095, 0.026), euler_rotation(x=10))
-    beak = union(upper, lower, smooth=0.015)
+    head = sdf.sphere((0, -0.17, 0.225), 0.215)
+    wing = sdf.mirrored(sdf.ellipsoid((0.25, 0.1, -0.13), (0.055, 0.2, 0.1), sdf.euler_rotation(x=22, z=14)))
+    yellow = sdf.union(body, head, wing, smooth=0.05)
+    upper = sdf.ellipsoid((0, -0.4, 0.205), (0.105, 0.125, 0.032), sdf.euler_rotation(x=-12))
+    lower = sdf.ellipsoid((0, -0.375, 0.165), (0.085, 0.095, 0.026), sdf.euler_rotation(x=10))
+    beak = sdf.union(upper, lower, smooth=0.015)
 
     def paint(p: Tensor) -> Tensor:
         rgb = mix((0.93, 0.62, 0.05), (0.99, 0.84, 0.12), (p[:, 2] + 0.35) / 0.5)

@@ -1,7 +1,7 @@
-"""Eight objects that no model learns from, as signed distance fields.
+"""Eight held-out objects, never trained on, as signed distance fields.
 
-They stand for the held-out objects of GSCollision: ids, Young's moduli and densities are those of the public code,
-shapes and sizes are ours.
+Ids, Young's moduli and densities are those of GSCollision's held-out objects (source: public code of NGFF); shapes and
+sizes are our own.
 """
 
 from __future__ import annotations
@@ -29,22 +29,22 @@ from stages.lab.assets.signed_distance import (
     union,
 )
 
-SURFACE_BAND = 0.008  # less than half the thickness of the thinnest wall
+SURFACE_BAND = 0.008  # half width of the band sampled around the surface, less than half the thinnest wall
 
 
 @dataclass(frozen=True)
 class ShapeKind:
-    """One object."""
+    """Shape, size and material of an object."""
 
     id: int
     scale: float  # longest side [m]
     E: float  # [Pa]
     density: float  # [kg/m^3]
-    shape: Callable[[], Field]  # within the cube of +-0.6, before its longest side is made 1
+    shape: Callable[[], Field]  # inside the cube of +-0.6, before normalisation to longest side 1
 
 
 def bear() -> Field:
-    """A seated bear, arms and legs forward."""
+    """A seated bear with arms and legs forward."""
     arm = capsule((0.17, -0.06, 0.0), (0.33, -0.16, -0.08), 0.09)
     leg = capsule((0.12, -0.1, -0.32), (0.2, -0.32, -0.38), 0.1)
     head = union(sphere((0, -0.04, 0.27), 0.21), sphere((0, -0.24, 0.22), 0.09))
@@ -64,7 +64,7 @@ def towel() -> Field:
 
 
 def skirt() -> Field:
-    """A band, wider below, open at both ends."""
+    """A conical band, open at both ends."""
     return revolved_wall([(0.22, 0.3), (0.28, 0.1), (0.36, -0.1), (0.5, -0.3)], 0.03)
 
 
@@ -89,6 +89,7 @@ def knot() -> Field:
 
 
 def football() -> Field:
+    """A sphere."""
     return sphere((0, 0, 0), 0.5)
 
 
@@ -109,14 +110,14 @@ HELDOUT_SHAPES = {
 
 
 def surface_points(kind: ShapeKind, n: int) -> Float[Tensor, "n 3"]:
-    """Points spread evenly over the surface of a shape, its longest side 1, about the centre of its box."""
+    """`n` evenly spaced points on the surface of a shape, scaled to longest side 1, centred on its bounding box."""
     return surface_and_interior_points(kind, n, 0.5)[0]
 
 
 def surface_and_interior_points(
     kind: ShapeKind, n: int, spacing: float
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "m 3"]]:
-    """The same, and the points of a cubic lattice inside of the shape, half a spacing below the surface or deeper."""
+    """The surface points, and points of a cubic lattice inside the shape, half a `spacing` deep or more."""
     field = kind.shape()
     with single_threaded():
         points = relax_points(field, sample_surface(field, (0.6, 0.6, 0.6), n, SURFACE_BAND)).points

@@ -1,4 +1,4 @@
-"""A textured mesh as Gaussians: points spread over its faces, coloured by texture, vertices or faces."""
+"""Conversion of textured meshes to Gaussians: points on the faces, coloured by texture, vertices or faces."""
 
 from __future__ import annotations
 
@@ -22,18 +22,19 @@ UP_ROTATIONS = {"x": [[0, 1, 0], [0, 0, 1], [1, 0, 0]], "y": [[1, 0, 0], [0, 0, 
 
 
 def read_mesh(path: Path, count: int, up: str = "auto", light: bool = True) -> Gaussians:
-    """About `count` flat Gaussians on the faces of a mesh, z up, around the origin, longest side 1, object_id 1.
+    """About `count` flat Gaussians on the faces of a mesh, z up, centred, longest side 1, object_id 1.
 
-    `up` names the axis that points up in the file (auto: y in glTF, which says so, else z). `light` bakes the soft
-    light of the made objects into the colours; without it they are those of the file.
+    `up` is the axis that points up in the file (auto: y for glTF, as its standard defines, else z). `light` bakes the
+    soft light of the generated objects into the colours of the file. Raises InputError when the file cannot be read,
+    has no faces, trimesh is missing, or an argument is invalid.
     """
     path = Path(path)
     if path.suffix.lower() not in MESH_SUFFIXES:
-        raise InputError(f"{path}: is no mesh that can be read; these kinds are: {' '.join(MESH_SUFFIXES)}")
+        raise InputError(f"{path}: is no mesh file that can be read; supported suffixes: {' '.join(MESH_SUFFIXES)}")
     if up not in (*UP_ROTATIONS, "auto"):
         raise InputError(f"--up {up}: choose from auto, x, y, z")
     if count < 100:
-        raise InputError(f"--count {count}: at least 100 Gaussians are needed to show a shape")
+        raise InputError(f"--count {count}: at least 100 Gaussians are needed")
     up = ("y" if path.suffix.lower() in (".glb", ".gltf") else "z") if up == "auto" else up
     meshes = _load(path)
     with single_threaded():
@@ -41,17 +42,17 @@ def read_mesh(path: Path, count: int, up: str = "auto", light: bool = True) -> G
 
 
 def _splat(path: Path, meshes: list, count: int, R: Float[Tensor, "3 3"], light: bool) -> Gaussians:
-    points, normals, rgb = _sampled(path, meshes, 5 * count)
-    keep = _thinned(points, normals, count)
+    points, normals, rgb = _sample_faces(path, meshes, 5 * count)
+    keep = _poisson_disk_subset(points, normals, count)
     surface = Surface(points[keep] @ R.mT, normals[keep] @ R.mT)
     size = (surface.points.amax(0) - surface.points.amin(0)).max()
-    surface = Surface(surface.points / size, surface.normals)  # the width of a Gaussian is capped in these units
+    surface = Surface(surface.points / size, surface.normals)  # Gaussian widths are limited in these units
     colours = rgb[keep] * diffuse_light(surface)[:, None] if light else rgb[keep]
     return normalise_size(to_gaussians(surface, colours, 1, width=0.62))
 
 
 def _load(path: Path) -> list:
-    """The triangle meshes of a file, placed as its scene graph says."""
+    """The triangle meshes of a file, transformed by its scene graph."""
     must_exist(path, "a mesh")
     try:
         import trimesh  # an optional extra
@@ -59,7 +60,7 @@ def _load(path: Path) -> list:
         raise InputError(f"{path}: reading meshes needs trimesh; install it with `pip install 'ngff[mesh]'`") from error
     try:
         scene = trimesh.load_scene(path)
-    except Exception as error:  # its readers raise whatever they trip over
+    except Exception as error:  # its readers raise many types
         raise InputError(f"{path}: cannot be read as a mesh ({error})") from error
     meshes = [m for m in scene.dump() if isinstance(m, trimesh.Trimesh) and len(m.faces) and m.area > 0]
     if not meshes:
@@ -67,11 +68,11 @@ def _load(path: Path) -> list:
     return meshes
 
 
-def _sampled(path: Path, meshes: list, n: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Points, unit normals and colours of n places, evenly likely anywhere on the faces."""
+def _sample_faces(path: Path, meshes: list, n: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Positions (n, 3), unit normals (n, 3) and colours (n, 3) of about n points, uniform over the faces."""
     generator = torch.Generator().manual_seed(n)
-    share = torch.tensor([float(m.area) for m in meshes], dtype=torch.float64)
-    counts = (n * share / share.sum()).ceil().long().tolist()
+    area = torch.tensor([float(m.area) for m in meshes], dtype=torch.float64)
+    counts = (n * area / area.sum()).ceil().long().tolist()
     rows = []
     for mesh, m in zip(meshes, counts, strict=True):
         corners = torch.from_numpy(np.array(mesh.triangles, np.float32))
@@ -79,7 +80,7 @@ def _sampled(path: Path, meshes: list, n: int) -> tuple[Tensor, Tensor, Tensor]:
             raise InputError(f"{path}: has vertices that are not finite")
         cross = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         edges = cross.norm(dim=1).double().cumsum(0)
-        # one draw in each of m equal parts of the total area: more even than m independent draws
+        # stratified: one sample in each of m equal parts of the total area
         level = (torch.arange(m, dtype=torch.float64) + torch.rand(m, generator=generator).double()) / m * edges[-1]
         face = torch.searchsorted(edges, level).clamp_max(len(edges) - 1)
         a, b = torch.rand(m, 2, generator=generator).unbind(1)
@@ -91,7 +92,7 @@ def _sampled(path: Path, meshes: list, n: int) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _colours(mesh, face: Int[Tensor, "m"], weight: Float[Tensor, "m 3"]) -> Float[Tensor, "m 3"]:
-    """RGB 0..1 at places on faces: from texture, vertex colours, face colours or the material, whichever there is."""
+    """RGB 0..1 at barycentric points on faces: from face colours, vertex colours, texture or the material."""
     visual, corner = mesh.visual, torch.from_numpy(np.array(mesh.faces, np.int64))[face]
     if visual.kind == "face":
         return torch.from_numpy(np.array(visual.face_colors[:, :3], np.float32))[face] / 255
@@ -106,11 +107,11 @@ def _colours(mesh, face: Int[Tensor, "m"], weight: Float[Tensor, "m 3"]) -> Floa
     uv = torch.from_numpy(np.array(visual.uv, np.float32))
     texels = torch.from_numpy(np.array(image.convert("RGB"), np.float32) / 255)
     tint = _material_colour(material) if getattr(material, "baseColorFactor", None) is not None else torch.ones(3)
-    return _look_up(texels, (uv[corner] * weight[..., None]).sum(1)) * tint
+    return _bilinear_lookup(texels, (uv[corner] * weight[..., None]).sum(1)) * tint
 
 
 def _material_colour(material) -> Float[Tensor, "3"]:
-    """Base or diffuse colour, mid grey when the file names none."""
+    """Base or diffuse colour; mid grey when the file has none."""
     for key in ("baseColorFactor", "diffuse"):
         value = getattr(material, key, None)
         if value is not None:
@@ -119,8 +120,8 @@ def _material_colour(material) -> Float[Tensor, "3"]:
     return torch.full((3,), 0.6)
 
 
-def _look_up(texels: Float[Tensor, "h w 3"], uv: Float[Tensor, "m 2"]) -> Float[Tensor, "m 3"]:
-    """Texture at (u right, v up), between its four nearest texels; it repeats outside 0..1."""
+def _bilinear_lookup(texels: Float[Tensor, "h w 3"], uv: Float[Tensor, "m 2"]) -> Float[Tensor, "m 3"]:
+    """Bilinear texture lookup at (u right, v up), repeating outside 0..1."""
     h, w = texels.shape[:2]
     x, y = uv[:, 0] * w - 0.5, (1 - uv[:, 1]) * h - 0.5
     i, j = x.floor(), y.floor()
@@ -131,12 +132,12 @@ def _look_up(texels: Float[Tensor, "h w 3"], uv: Float[Tensor, "m 2"]) -> Float[
     return above * (1 - fy) + below * fy
 
 
-def _thinned(points: Float[Tensor, "m 3"], normals: Float[Tensor, "m 3"], count: int) -> Int[Tensor, "n"]:
-    """About `count` of many points, none closer than a radius to another on the same side, without gaps.
+def _poisson_disk_subset(points: Float[Tensor, "m 3"], normals: Float[Tensor, "m 3"], count: int) -> Int[Tensor, "n"]:
+    """Indices of a Poisson-disk subset of about `count` points: no two on the same side closer than a radius.
 
-    All points that come first among their neighbours are taken and their neighbours struck out, until none is left:
-    dart throwing, many darts at a time. Darts without end would put 0.547 of the area under discs of that diameter;
-    with five points for each that is kept, discs cover about 0.4 (measured), which sets the radius.
+    Parallel dart throwing: in each round every point with the lowest random rank among its remaining neighbours is
+    accepted and its neighbours are rejected, until none is left. In the limit, discs of that diameter cover 0.547 of
+    the area; with five candidates per accepted point they cover about 0.4 (measured), which sets the radius.
     """
     p, n = points.double().numpy(), normals.numpy()
     tree = cKDTree(p)
@@ -145,15 +146,15 @@ def _thinned(points: Float[Tensor, "m 3"], normals: Float[Tensor, "m 3"], count:
     pairs = tree.query_pairs(radius, output_type="ndarray")
     pairs = pairs[(n[pairs[:, 0]] * n[pairs[:, 1]]).sum(1) > 0]
     rank = torch.randperm(len(p), generator=torch.Generator().manual_seed(len(p))).numpy()
-    waiting, taken = np.ones(len(p), bool), np.zeros(len(p), bool)
-    while waiting.any():
+    remaining, accepted = np.ones(len(p), bool), np.zeros(len(p), bool)
+    while remaining.any():
         first = np.full(len(p), len(p))
         np.minimum.at(first, pairs[:, 0], rank[pairs[:, 1]])
         np.minimum.at(first, pairs[:, 1], rank[pairs[:, 0]])
-        chosen = waiting & (rank < first)
-        taken |= chosen
-        waiting &= ~chosen
-        struck = np.concatenate([pairs[chosen[pairs[:, 0]], 1], pairs[chosen[pairs[:, 1]], 0]])
-        waiting[struck] = False
-        pairs = pairs[waiting[pairs].all(1)]
-    return torch.from_numpy(np.flatnonzero(taken))
+        chosen = remaining & (rank < first)
+        accepted |= chosen
+        remaining &= ~chosen
+        rejected = np.concatenate([pairs[chosen[pairs[:, 0]], 1], pairs[chosen[pairs[:, 1]], 0]])
+        remaining[rejected] = False
+        pairs = pairs[remaining[pairs].all(1)]
+    return torch.from_numpy(np.flatnonzero(accepted))

@@ -1,4 +1,4 @@
-"""The ten objects of GSCollision, made in code: what each is called, weighs and resists, and how it is made."""
+"""The ten objects of GSCollision: names, ids, materials, and the functions that generate their Gaussians."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ class ObjectKind:
 
     name: str
     id: int  # as in scene_object_idxs
-    scale: float  # in a scene, of the object as made
+    scale: float  # scale prior in scenes, relative to the generated object
     E: float  # Young's modulus [Pa]
     density: float  # [kg/m^3]
-    prompt: str
+    prompt: str  # text prompt
     make: str  # module:function
-    side: float = 1.0  # longest side as made [scene units]
+    side: float = 1.0  # longest side as generated [scene units]
 
 
 HARD, SOFT, FIGURES, PHONE = (
@@ -38,7 +38,7 @@ OBJECTS = {
     for kind in (
         ObjectKind("ball", 0, 0.4, 8e5, 600.0, "a pokemon ball", f"{HARD}:ball"),
         ObjectKind("bowl", 2, 0.5, 1e7, 800.0, "a blue bowl with cloud", f"{HARD}:bowl"),
-        ObjectKind("can", 3, 1.0, 1e6, 800.0, "a cola", f"{HARD}:can", 0.4),  # a metre of it fits nowhere
+        ObjectKind("can", 3, 1.0, 1e6, 800.0, "a cola", f"{HARD}:can", 0.4),  # a can of 1 m could not be placed
         ObjectKind("cloth", 4, 1.0, 3e3, 100.0, "a yellow t-shirt with an owl", f"{SOFT}:cloth"),
         ObjectKind("duck", 7, 0.3, 3e5, 300.0, "a rubber duck", f"{HARD}:duck"),
         ObjectKind("miku", 9, 0.6, 1e5, 400.0, "a hatsune miku", f"{FIGURES}:miku"),
@@ -51,20 +51,21 @@ OBJECTS = {
 
 
 POINT_CLOUD = "point_cloud/iteration_30000/point_cloud.ply"  # in the folder of an object or scene
-ELEVATION = {"cloth": 52.0, "pillow": 38.0, "rope": 46.0, "bowl": 34.0}  # of the camera [deg], for what lies flat
+ELEVATION = {"cloth": 52.0, "pillow": 38.0, "rope": 46.0, "bowl": 34.0}  # of the portrait camera for flat objects [deg]
 
 
 @dataclass(frozen=True)
 class ObjectsOptions:
-    """Which objects to write, and how meshes are turned into Gaussians."""
+    """Which objects to write, and how meshes are converted to Gaussians."""
 
-    only: str = ""  # names with commas between; empty: all ten
-    count: int = 40_000  # Gaussians of a mesh, about
+    only: str = ""  # names separated by commas; empty: all ten
+    count: int = 40_000  # approximate number of Gaussians of a mesh
     up: str = "auto"  # axis of a mesh that points up
     light: bool = True  # bake soft light into the colours of a mesh
 
     @property
     def names(self) -> list[str]:
+        """The chosen objects; raises InputError for unknown names."""
         names = [name.strip() for name in self.only.split(",") if name.strip()] or list(OBJECTS)
         for name in names:
             _known(name)
@@ -72,9 +73,9 @@ class ObjectsOptions:
 
 
 def make_object(name: str) -> Gaussians:
-    """An object of OBJECTS: SH degree 2, object_id 1, bounding box around the origin.
+    """An object by name: SH degree 2, object_id 1, bounding box centred on the origin, scale prior not applied.
 
-    The same Gaussians at every call; the scale of a scene is not applied.
+    Deterministic. Raises InputError for an unknown name.
     """
     from stages.lab.assets.shapes import single_threaded
 
@@ -94,7 +95,10 @@ def _known(name: str) -> str:
 def run(
     out: Path, options: ObjectsOptions = ObjectsOptions(), meshes: Sequence[Path] = (), sheet: Path | None = None
 ) -> Iterator[str]:
-    """Write OUT/<name>/ for each object, or for each mesh when there are any; a line about each, and a sheet of all."""
+    """Write OUT/<name>/ for each object, or for each mesh if any are given, and an image of all to `sheet`.
+
+    Yields a line per object; raises InputError for unknown names, unreadable meshes or two meshes of one name.
+    """
     from stages.core.scene.files import provenance
     from stages.core.scene.images import write_jpeg
     from stages.lab.assets.splat_files import object_portrait, write_object
@@ -102,20 +106,20 @@ def run(
 
     if meshes and options.only:
         raise InputError("--only names objects of the data set and --from meshes; give one of the two")
-    out, pictures = Path(out), []
+    out, images = Path(out), []
     sources = {_mesh_name(path): path for path in meshes} or dict.fromkeys(options.names)
     if len(sources) < len(meshes):
         raise InputError(f"--from: two meshes would both be written to {out}/<name>; rename one of them or its folder")
     for name, path in tqdm(sources.items(), desc="objects", unit="object"):
         g = make_object(name) if path is None else _from_mesh(path, options)
         made_by = provenance("objects", [path], options) if path else provenance("objects", [])
-        write_object(out / name, g, name, made_by)  # the same bytes whatever else was asked for
+        write_object(out / name, g, name, made_by)  # the file does not depend on the other objects
         if sheet:
-            pictures.append(object_portrait(g, ELEVATION.get(name, 24.0) if path is None else 24.0, name))
+            images.append(object_portrait(g, ELEVATION.get(name, 24.0) if path is None else 24.0, name))
         sides = " x ".join(f"{side:.2f}" for side in (g.means.amax(0) - g.means.amin(0)).tolist())
         yield f"{name}: {len(g)} Gaussians, {sides}"
     if sheet:
-        write_jpeg(sheet, tile_images(pictures, min(5, len(pictures))), 88)
+        write_jpeg(sheet, tile_images(images, min(5, len(images))), 88)
 
 
 def _from_mesh(path: Path, options: ObjectsOptions) -> Gaussians:
@@ -125,7 +129,7 @@ def _from_mesh(path: Path, options: ObjectsOptions) -> Gaussians:
 
 
 def _mesh_name(path: Path) -> str:
-    """The file's name; what every file is called says nothing, so then its folder's."""
+    """The file's stem, or the name of its folder if the stem is generic (mesh, model, ...)."""
     path = Path(path)
-    dull = path.stem.lower() in ("mesh", "model", "object", "scene", "textured") and path.resolve().parent.name
-    return path.resolve().parent.name if dull else path.stem
+    generic = path.stem.lower() in ("mesh", "model", "object", "scene", "textured") and path.resolve().parent.name
+    return path.resolve().parent.name if generic else path.stem

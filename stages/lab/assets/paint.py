@@ -1,4 +1,4 @@
-"""Colours of a surface as functions of the point: layers over layers, each with a soft edge."""
+"""Procedural surface colours as functions of the point: 2D shapes composited in layers with soft edges."""
 
 from __future__ import annotations
 
@@ -13,36 +13,36 @@ from stages.lab.assets.signed_distance import polygon, polyline
 
 RGB = tuple[float, float, float]
 WHITE, BLACK = (0.95, 0.95, 0.94), (0.05, 0.05, 0.06)
-EDGE_WIDTH = 0.005  # width over which a layer fades, about the spacing of the Gaussians
+EDGE_WIDTH = 0.005  # blur width of layer edges, about the spacing of the Gaussians
 
 
 def plain(colour: RGB) -> Callable[[Tensor], Tensor]:
-    """One colour everywhere."""
+    """Constant colour."""
     return lambda p: torch.tensor(colour).expand(len(p), 3)
 
 
 def overlay(
     rgb: Float[Tensor, "n 3"], colour: RGB | Tensor, distance: Float[Tensor, "n"], edge: float = EDGE_WIDTH
 ) -> Float[Tensor, "n 3"]:
-    """`colour` laid over `rgb` where the distance is negative, fading over the width `edge`."""
+    """`colour` composited over `rgb` where the signed distance is negative, blurred over the width `edge`."""
     c = torch.as_tensor(colour)
     return rgb + (c - rgb) * (0.5 - distance / edge).clamp(0, 1)[:, None]
 
 
 def mix(a: RGB, b: RGB, t: Float[Tensor, "n"]) -> Float[Tensor, "n 3"]:
-    """Colour a where t is 0, b where it is 1."""
+    """Linear interpolation between colours a (t = 0) and b (t = 1), t clamped to 0..1."""
     return torch.tensor(a) + (torch.tensor(b) - torch.tensor(a)) * t.clamp(0, 1)[:, None]
 
 
 def fabric(p: Tensor, rgb: Tensor, seed: int, size: float = 0.012, depth: float = 0.1) -> Tensor:
-    """Brightness varied by noise, as cloth and plush vary."""
+    """Colours with brightness noise of relative amplitude `depth` and features of `size`, as of fabric."""
     return rgb * (1 + depth * (2 * noise(p, size, seed) - 1))[:, None]
 
 
 def ellipse2d(
     q: Float[Tensor, "n 2"], centre: Sequence[float], radii: float | Sequence[float], angle: float = 0.0
 ) -> Float[Tensor, "n"]:
-    """Distance in the plane to an ellipse (first order), turned counterclockwise by `angle` radians."""
+    """First-order signed distance to an ellipse in the plane, rotated counterclockwise by `angle` [rad]."""
     r = torch.as_tensor(radii, dtype=torch.float32).expand(2)
     a = torch.tensor(angle)
     R = torch.stack([torch.stack([a.cos(), -a.sin()]), torch.stack([a.sin(), a.cos()])])
@@ -52,28 +52,28 @@ def ellipse2d(
 
 
 def box2(q: Float[Tensor, "n 2"], centre: Sequence[float], half: Sequence[float], corner: float = 0.0) -> Tensor:
-    """Distance in the plane to a rectangle with rounded corners."""
+    """Signed distance to a rectangle in the plane, with corners rounded by the radius `corner`."""
     d = (q - torch.tensor(centre)).abs() - (torch.tensor(half) - corner)
     return d.clamp_min(0).norm(dim=1) + d.amax(1).clamp_max(0) - corner
 
 
 def stroke(q: Float[Tensor, "n 2"], corners: Sequence[tuple[float, float]], width: float) -> Tensor:
-    """Distance in the plane to a round-ended line of that width through the corners."""
+    """Signed distance to a polyline of `width` with round ends in the plane."""
     return polyline(corners)(q) - width / 2
 
 
 def filled_polygon(q: Float[Tensor, "n 2"], corners: Sequence[tuple[float, float]]) -> Tensor:
-    """Distance in the plane to a filled polygon."""
+    """Signed distance to a filled polygon in the plane."""
     return polygon(corners)(q)
 
 
 def union2d(*distances: Tensor) -> Tensor:
-    """Distance to the nearest of several shapes."""
+    """Signed distance to the union of several shapes."""
     return torch.stack(distances).amin(0)
 
 
 def cola_lettering(q: Float[Tensor, "n 2"], width: float) -> Tensor:
-    """Distance in the plane to the letters "cola", a round hand of x-height 1 that spans -2 to 2."""
+    """Signed distance to the letters "cola" in a round script: x-height 1, strokes of `width`, x from -2 to 2."""
 
     def ring(x: float) -> Tensor:
         return ((q - torch.tensor([x, 0.0])).norm(dim=1) - 0.5).abs() - width / 2

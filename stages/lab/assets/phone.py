@@ -1,4 +1,4 @@
-"""The phone: a slab of glass and metal, and what its screen shows."""
+"""The phone: a slab of glass and metal with a lit screen."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ CLOCK = (  # 12:34, each digit a line through corners of a cell 0.04 wide and 0.
 
 
 def phone() -> Gaussians:
-    """A standing slab, its lit screen at the front (-y), three lenses at the back, keys at the side."""
+    """An upright phone: lit screen at the front (-y), three lenses at the back, keys at the side."""
     case = slab((0, 0, 0), (0.24, 0.034, 0.5), 0.055, 0.012)
     island = slab((0.125, 0.034, 0.37), (0.085, 0.014, 0.1), 0.04, 0.008)
     barrel = revolved([(0, 0), (0.03, 0), (0.03, 0.056), (0, 0.056)], 0.004)
@@ -45,9 +45,9 @@ def phone() -> Gaussians:
 
     def lens(p: Tensor) -> Tensor:
         q, rgb = p[:, [0, 2]], plain(BLACK)(p)
-        for place in LENSES:
-            rgb = overlay(rgb, (0.5, 0.52, 0.55), ellipse2d(q, place, 0.03).abs() - 0.004)
-            rgb = overlay(rgb, (0.15, 0.2, 0.4), ellipse2d(q, place, 0.014))
+        for centre in LENSES:
+            rgb = overlay(rgb, (0.5, 0.52, 0.55), ellipse2d(q, centre, 0.03).abs() - 0.004)
+            rgb = overlay(rgb, (0.15, 0.2, 0.4), ellipse2d(q, centre, 0.014))
         return rgb
 
     parts = [
@@ -60,7 +60,7 @@ def phone() -> Gaussians:
 
 
 def screen(q: Tensor) -> Tensor:
-    """Black glass around a wallpaper of dunes at dusk, a clock, rows of icons, four more in a dock, and a notch."""
+    """Colours of the screen: black border, wallpaper of dunes at dusk, clock, rows of icons, a dock and a notch."""
     x, z = q.unbind(1)
     rgb = mix((0.98, 0.55, 0.3), (0.35, 0.15, 0.55), (z + 0.46) / 0.74)
     rgb = overlay(rgb, (0.99, 0.86, 0.55), ellipse2d(q, (0.08, -0.06), 0.075))

@@ -1,4 +1,4 @@
-"""Surfaces made in code, as Gaussians: sampled points with normals, coloured by functions of the point."""
+"""Sampled surfaces (points with normals), value noise, and their conversion to Gaussians."""
 
 from __future__ import annotations
 
@@ -17,8 +17,11 @@ from stages.core.scene.gaussians import Gaussians
 
 @contextmanager
 def single_threaded() -> Iterator[None]:
-    """PyTorch on one thread: the vector and scalar forms of sin or pow differ in the last bit, and how many threads
-    share a tensor decides which element meets which."""
+    """Run PyTorch on one thread inside the context, so that results are bitwise reproducible.
+
+    The vector and scalar versions of sin or pow differ in the last bit, and the number of threads that share a tensor
+    decides which version computes an element.
+    """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -29,20 +32,22 @@ def single_threaded() -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Surface:
-    """Points spread evenly over a surface, with outward unit normals."""
+    """Evenly spaced points on a surface, with outward unit normals."""
 
     points: Float[Tensor, "n 3"]  # [m]
     normals: Float[Tensor, "n 3"]
 
     def moved(self, offset: tuple[float, float, float]) -> Surface:
+        """The surface translated by `offset` [m]."""
         return Surface(self.points + torch.tensor(offset), self.normals)
 
     def kept(self, mask: Tensor) -> Surface:
+        """The points where `mask` (n,) is true."""
         return Surface(self.points[mask], self.normals[mask])
 
 
 def ellipsoid(radii: tuple[float, float, float], n: int) -> Surface:
-    """A Fibonacci spiral on the sphere, stretched; thinned so that the density is even."""
+    """Fewer than `n` points on an ellipsoid: a stretched Fibonacci spiral, subsampled to even density."""
     i = torch.arange(n) + 0.5
     z = 1 - 2 * i / n
     phi = i * torch.pi * (1 + 5**0.5)
@@ -56,7 +61,7 @@ def ellipsoid(radii: tuple[float, float, float], n: int) -> Surface:
 
 
 def superellipsoid(radii: tuple[float, float, float], power: float, n: int) -> Surface:
-    """|x/a|^p + |y/b|^p + |z/c|^2 = 1: a cushion for p above 2."""
+    """Points on |x/a|^p + |y/b|^p + |z/c|^2 = 1, a cushion for p above 2."""
     rng = torch.Generator().manual_seed(n)
     r = torch.tensor(radii)
     xy = (torch.rand(n, 2, generator=rng) * 2 - 1) * r[:2]
@@ -69,7 +74,7 @@ def superellipsoid(radii: tuple[float, float, float], power: float, n: int) -> S
 
 
 def box(sides: tuple[float, float, float], spacing: float) -> Surface:
-    """The six faces of a box around the origin, on a grid."""
+    """Grid points on the six faces of a box centred on the origin."""
     half = torch.tensor(sides) / 2
     points, normals = [], []
     for axis in range(3):
@@ -86,14 +91,14 @@ def box(sides: tuple[float, float, float], spacing: float) -> Surface:
 
 
 def sheet(width: float, depth: float, spacing: float) -> Surface:
-    """A horizontal rectangle at z = 0, seen from above."""
+    """Grid points on a horizontal rectangle at z = 0, normals up."""
     xs, ys = (torch.arange(0, side, spacing) - side / 2 for side in (width, depth))
     points = torch.nn.functional.pad(torch.cartesian_prod(xs, ys), (0, 1))
     return Surface(points, torch.tensor([[0.0, 0, 1]]).expand_as(points).clone())
 
 
 def union(*parts: Callable[[], tuple[Surface, Callable[[Tensor], Tensor]]]) -> Surface:
-    """Several (surface, inside test) pairs; points inside another part are left out."""
+    """Union of (surface, inside test) pairs: the points of each that are not inside another."""
     pieces = []
     for i, (surface, _) in enumerate(parts):
         hidden = torch.zeros(len(surface.points), dtype=torch.bool)
@@ -104,7 +109,7 @@ def union(*parts: Callable[[], tuple[Surface, Callable[[Tensor], Tensor]]]) -> S
 
 
 def noise(points: Float[Tensor, "n 3"], size: float, seed: int) -> Float[Tensor, "n"]:
-    """Smooth value noise in 0..1 with features of the given size [m], the same for the same seed."""
+    """Smooth value noise in 0..1 with features of the given size [m], deterministic by seed."""
     lattice = torch.rand(64, 64, 64, generator=torch.Generator().manual_seed(seed))
     cell = (points / size).floor()
     f = points / size - cell
@@ -122,16 +127,16 @@ def to_gaussians(
     surface: Surface, rgb: Float[Tensor, "n 3"], object_id: int, opacity: float = 0.95, width: float = 0.7,
     widest: float = 0.05,
 ) -> Gaussians:  # fmt: skip
-    """Flat Gaussians that cover the surface without holes: discs of `width` times the local spacing.
+    """Flat Gaussians that cover the surface: discs with a standard deviation of `width` times the local point spacing.
 
-    A spacing above `widest` [m], as lone points have, counts as `widest`.
+    The spacing is limited to `widest` [m], for isolated points.
     """
     from stages.core.geometry.neighbours import spacing
 
     n = len(surface.points)
     normal = surface.normals
-    helper = torch.where((normal[:, :1].abs() < 0.9), torch.tensor([1.0, 0, 0]), torch.tensor([0.0, 1, 0]))
-    u = torch.nn.functional.normalize(torch.linalg.cross(helper, normal), dim=1)
+    tangent = torch.where((normal[:, :1].abs() < 0.9), torch.tensor([1.0, 0, 0]), torch.tensor([0.0, 1, 0]))
+    u = torch.nn.functional.normalize(torch.linalg.cross(tangent, normal), dim=1)
     R = torch.stack([u, torch.linalg.cross(normal, u), normal], -1)
     s = spacing(surface.points, 4).clamp_max(widest)
     return Gaussians(

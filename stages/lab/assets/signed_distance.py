@@ -1,6 +1,7 @@
-"""Signed distance fields: shapes as functions of the point, negative inside, put together by union.
+"""Signed distance fields: primitives, transformations and boolean operations.
 
-A field maps points (n, 3) to distances (n,). Some are only near the true distance; the sampler divides by the slope.
+A field maps points (n, 3) to distances (n,), negative inside. Some are only approximate distances; the sampler divides
+by the gradient norm.
 """
 
 from __future__ import annotations
@@ -16,16 +17,16 @@ from torch import Tensor
 
 Field = Callable[[Tensor], Tensor]
 Vec = tuple[float, float, float]
-TUBE_FAR_DISTANCE = 0.15  # beyond what shading looks at
+TUBE_FAR_DISTANCE = 0.15  # beyond the range of ambient occlusion
 
 
 def _floats(values: Sequence) -> Tensor:
-    """Numbers written by hand, whole ones among them."""
+    """Float tensor of literals, which may be integers."""
     return torch.tensor(values, dtype=torch.float32)
 
 
 def euler_rotation(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Float[Tensor, "3 3"]:
-    """Rz Ry Rx of angles in degrees."""
+    """Rotation matrix Rz Ry Rx from angles [deg]."""
     R = torch.eye(3)
     for axis, angle in enumerate((x, y, z)):
         c, s = math.cos(math.radians(angle)), math.sin(math.radians(angle))
@@ -37,12 +38,13 @@ def euler_rotation(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Float[Tens
 
 
 def sphere(centre: Vec, radius: float) -> Field:
+    """A sphere."""
     c = _floats(centre)
     return lambda p: (p - c).norm(dim=1) - radius
 
 
 def ellipsoid(centre: Vec, radii: Vec, R: Tensor | None = None) -> Field:
-    """Turned by R about its centre; exact on the surface, to first order near it."""
+    """An ellipsoid rotated by R about its centre; zero set exact, distance to first order."""
     c, r = _floats(centre), _floats(radii)
 
     def field(p: Tensor) -> Tensor:
@@ -54,7 +56,7 @@ def ellipsoid(centre: Vec, radii: Vec, R: Tensor | None = None) -> Field:
 
 
 def capsule(a: Vec, b: Vec, radius: float, end: float | None = None) -> Field:
-    """Round-ended stick from a to b, its radius going from `radius` to `end`."""
+    """A capsule from a to b whose radius changes linearly from `radius` to `end`."""
     start, axis = _floats(a), _floats(b) - _floats(a)
     grow = 0.0 if end is None else end - radius
 
@@ -67,7 +69,7 @@ def capsule(a: Vec, b: Vec, radius: float, end: float | None = None) -> Field:
 
 
 def slab(centre: Vec, half: Vec, corner: float, edge: float) -> Field:
-    """A box with its y axis through the flat faces: corners rounded in the x-z plane, edges rounded all along."""
+    """A box with half sides `half`: corners rounded by `corner` in the x-z plane, all edges rounded by `edge`."""
     c, h = _floats(centre), _floats(half)
 
     def field(p: Tensor) -> Tensor:
@@ -81,7 +83,7 @@ def slab(centre: Vec, half: Vec, corner: float, edge: float) -> Field:
 
 
 def torus(centre: Vec, ring: float, tube: float) -> Field:
-    """A ring around the vertical."""
+    """A torus around the vertical with ring radius `ring` and tube radius `tube`."""
     c = _floats(centre)
 
     def field(p: Tensor) -> Tensor:
@@ -92,25 +94,25 @@ def torus(centre: Vec, ring: float, tube: float) -> Field:
 
 
 def revolved(profile: Sequence[tuple[float, float]], rounding: float = 0.0) -> Field:
-    """The closed polygon of (radius, height) corners turned around the vertical, grown by `rounding`."""
+    """Solid of revolution of a closed polygon of (radius, height) corners, enlarged by `rounding`."""
     outline = polygon(profile)
     return lambda p: outline(torch.stack([p[:, :2].norm(dim=1), p[:, 2]], 1)) - rounding
 
 
 def revolved_wall(profile: Sequence[tuple[float, float]], thickness: float) -> Field:
-    """A wall of that thickness along an open polyline of (radius, height) corners turned around the vertical."""
+    """Surface of revolution of an open polyline of (radius, height) corners, with the given wall thickness."""
     line = polyline(profile)
     return lambda p: line(torch.stack([p[:, :2].norm(dim=1), p[:, 2]], 1)) - thickness / 2
 
 
 def tube(curve: Float[Tensor, "m 3"], radius: Float[Tensor, "m"] | float) -> Field:
-    """Round tube along a finely sampled curve; the radius may vary along it. Far off, at least FAR."""
+    """A round tube along a finely sampled curve, with one radius or one per point; TUBE_FAR_DISTANCE far away."""
     radii = torch.as_tensor(radius).expand(len(curve))
     tree = cKDTree(curve.numpy())
-    reach = float(radii.max()) + TUBE_FAR_DISTANCE  # looking no further makes it several times faster
+    max_distance = float(radii.max()) + TUBE_FAR_DISTANCE  # bounded search is several times faster
 
     def field(p: Tensor) -> Tensor:
-        distance, index = tree.query(p.numpy(), distance_upper_bound=reach, workers=-1)
+        distance, index = tree.query(p.numpy(), distance_upper_bound=max_distance, workers=-1)
         far = index == len(curve)
         near = distance - radii.numpy()[np.where(far, 0, index)]
         return torch.from_numpy(np.where(far, TUBE_FAR_DISTANCE, near)).float()
@@ -119,19 +121,19 @@ def tube(curve: Float[Tensor, "m 3"], radius: Float[Tensor, "m"] | float) -> Fie
 
 
 def posed(field: Field, R: Float[Tensor, "3 3"], offset: Vec = (0.0, 0.0, 0.0)) -> Field:
-    """The shape turned by R about the origin, then moved."""
+    """The shape rotated by R about the origin, then translated by `offset`."""
     t = _floats(offset)
     return lambda p: field((p - t) @ R)
 
 
 def mirrored(field: Field) -> Field:
-    """The shape drawn at positive x, and its mirror image."""
+    """The shape at positive x, and its mirror image."""
     flip = torch.tensor([1.0, 0, 0])
     return lambda p: field(p + flip * (p[:, :1].abs() - p[:, :1]))
 
 
 def union(*fields: Field, smooth: float = 0.0) -> Field:
-    """All shapes together; creases are filled over a width of about `smooth` (polynomial smooth minimum)."""
+    """Union of shapes; with `smooth`, creases are blended over about that width (polynomial smooth minimum)."""
 
     def field(p: Tensor) -> Tensor:
         total = fields[0](p)
@@ -148,19 +150,19 @@ def union(*fields: Field, smooth: float = 0.0) -> Field:
 
 
 def difference(field: Field, *others: Field) -> Field:
-    """The first shape without the others."""
+    """The first shape minus the others."""
 
-    def left(p: Tensor) -> Tensor:
+    def remaining(p: Tensor) -> Tensor:
         d = field(p)
         for other in others:
             d = torch.maximum(d, -other(p))
         return d
 
-    return left
+    return remaining
 
 
 def polyline(corners: Sequence[tuple[float, float]]) -> Callable[[Tensor], Tensor]:
-    """Distance in the plane to an open line through the corners."""
+    """Distance function of an open polyline in the plane."""
     a = _floats(corners)
     start, along = a[:-1], a[1:] - a[:-1]
 
@@ -175,7 +177,7 @@ def polyline(corners: Sequence[tuple[float, float]]) -> Callable[[Tensor], Tenso
 
 
 def polygon(corners: Sequence[tuple[float, float]]) -> Callable[[Tensor], Tensor]:
-    """Signed distance in the plane to a closed polygon: even-odd rule, negative inside."""
+    """Signed distance function of a closed polygon in the plane (even-odd rule)."""
     a = _floats(corners)
     edge = polyline([*corners, corners[0]])
     ends = list(zip(a, a.roll(-1, 0), strict=True))
@@ -192,7 +194,7 @@ def polygon(corners: Sequence[tuple[float, float]]) -> Callable[[Tensor], Tensor
 
 
 def curve_through(knots: Sequence[Sequence[float]], count: int, closed: bool = False) -> Float[Tensor, "m d"]:
-    """`count` points at even steps of length along the Catmull-Rom curve through the knots."""
+    """`count` points at equal arc length along the Catmull-Rom spline through the knots."""
     k = _floats(knots)
     first, last = (k[-1], k[0]) if closed else (2 * k[0] - k[1], 2 * k[-1] - k[-2])
     padded = torch.cat([first[None], k, last[None], *([k[1][None]] if closed else [])])
@@ -203,7 +205,7 @@ def curve_through(knots: Sequence[Sequence[float]], count: int, closed: bool = F
         pieces.append(0.5 * (2 * p1 + (p2 - p0) * t + cubic[0] * t**2 + cubic[1] * t**3))
     fine = torch.cat([*pieces, (k[0] if closed else k[-1])[None]])
     length = torch.cat([torch.zeros(1), (fine[1:] - fine[:-1]).norm(dim=1).cumsum(0)])
-    wanted = torch.linspace(0, float(length[-1]), count)
-    i = torch.searchsorted(length, wanted).clamp(1, len(length) - 1)
-    share = (wanted - length[i - 1]) / (length[i] - length[i - 1])
-    return fine[i - 1] + (fine[i] - fine[i - 1]) * share[:, None]
+    target = torch.linspace(0, float(length[-1]), count)
+    i = torch.searchsorted(length, target).clamp(1, len(length) - 1)
+    fraction = (target - length[i - 1]) / (length[i] - length[i - 1])
+    return fine[i - 1] + (fine[i] - fine[i - 1]) * fraction[:, None]

@@ -1,4 +1,4 @@
-"""The soft ones: cloth, pillow, rope."""
+"""The three soft objects: cloth, pillow and rope."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ SHIRT = [(-0.28, -0.45), (0.28, -0.45), (0.275, -0.2), (0.27, 0.14), (0.43, 0.03
 
 
 def folds(q: Float[Tensor, "n 2"]) -> Float[Tensor, "n"]:
-    """Height of the cloth: a low rise in the middle, long soft folds from the armpits, small ones at the sleeves."""
+    """Height of the cloth: raised in the middle, long soft folds from the armpits, small ones at the sleeves."""
     x, y = q.unbind(1)
     flat = torch.nn.functional.pad(q, (0, 1))
     drift = noise(flat, 0.35, 7)
@@ -43,7 +43,7 @@ def folds(q: Float[Tensor, "n 2"]) -> Float[Tensor, "n"]:
 
 
 def cloth() -> Gaussians:
-    """A yellow T-shirt that lies with soft folds, one closed sheet 1 % thick, an owl printed on its upper side."""
+    """A yellow T-shirt lying in soft folds: one closed sheet, 1 % thick, with an owl printed on its upper side."""
     outline = polygon(rounded(SHIRT))
 
     def field(p: Tensor) -> Tensor:
@@ -69,7 +69,7 @@ def cloth() -> Gaussians:
 
 
 def rounded(corners: list) -> list[tuple[float, float]]:
-    """The polygon with its corners taken off, by two rounds of corner cutting (Chaikin 1974, narrower cuts)."""
+    """The polygon with rounded corners, by two rounds of corner cutting (Chaikin 1974, with narrower cuts)."""
     points = torch.tensor(corners)
     for _ in range(2):
         nxt = points.roll(-1, 0)
@@ -100,10 +100,10 @@ def owl(q: Float[Tensor, "n 2"], rgb: Tensor) -> Tensor:
 
 
 def pillow() -> Gaussians:
-    """A stuffed square with pulled-out corners, blue and white stripes, and piping round its seam."""
+    """A stuffed square with pointed corners, blue and white stripes, and piping around its seam."""
 
     def edge(angle: Tensor) -> Tensor:
-        """The seam seen from above: a square whose sides bend in."""
+        """Radius of the seam by azimuth: a square with concave sides."""
         c, s = angle.cos(), angle.sin()
         square = 0.46 / (c.abs() ** 7 + s.abs() ** 7) ** (1 / 7)
         return square * (1 + 0.05 * ((2 * angle).sin().abs() ** 3) - 0.02)
@@ -131,7 +131,7 @@ KNOTS = [(-0.46, 0.02, 0.0), (-0.4, 0.2, 0.0), (-0.14, 0.28, 0.0), (0.14, 0.24, 
 
 
 def rope() -> Gaussians:
-    """Three twisted strands in a loose loop that crosses itself, whipped with cord near both ends."""
+    """A rope of three twisted strands in a loose, self-crossing loop, whipped with cord near both ends."""
     pitch, m = 0.17, 1500
     line = curve_through(KNOTS, m)
     length = float((line[1:] - line[:-1]).norm(dim=1).sum())

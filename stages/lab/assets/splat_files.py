@@ -1,4 +1,4 @@
-"""Where the data set keeps a splat, and pictures for sheets that show many."""
+"""Object files in the layout of the data set, and portraits of objects and backgrounds for overview sheets."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from stages.core.scene.scene_ply import write_scene
 from stages.lab.assets.objects import POINT_CLOUD
 from stages.render.overlay import draw_caption
 
-VIEWS, RESOLUTION = 100, 1280  # of cameras.json, as the data set renders
-SHEET_BACKGROUND = torch.tensor([0.955, 0.95, 0.94])  # behind the pictures
+VIEWS, RESOLUTION = 100, 1280  # of cameras.json
+SHEET_BACKGROUND = torch.tensor([0.955, 0.95, 0.94])  # background colour of portraits
 
 
 def write_object(folder: Path, g: Gaussians, name: str, provenance: dict) -> None:
-    """FOLDER/point_cloud/iteration_30000/point_cloud.ply and FOLDER/cameras.json, an orbit around the object."""
+    """Write FOLDER/point_cloud/iteration_30000/point_cloud.ply, and an orbit around it as FOLDER/cameras.json."""
     ply = folder / POINT_CLOUD
     ply.parent.mkdir(parents=True, exist_ok=True)
     write_scene(ply, Scene(g, (SceneObject(1, name),), None, None, provenance=provenance))
@@ -36,7 +36,10 @@ def write_object(folder: Path, g: Gaussians, name: str, provenance: dict) -> Non
 
 
 def camera_rows(viewmats: Float[Tensor, "c 4 4"], size: int) -> list[dict]:
-    """Cameras as 3D Gaussian Splatting lists them: rotation is camera-to-world, the principal point in the middle."""
+    """Cameras in the JSON format of 3D Gaussian Splatting: camera-to-world rotation, principal point at the centre.
+
+    Images have `size` px on each side and the focal length of the data set.
+    """
     rows = zip(viewmats[:, :3, :3].mT.tolist(), centres(viewmats).tolist(), strict=True)
     return [
         {"id": i, "img_name": f"{i:05d}", "width": size, "height": size, "position": position, "rotation": rotation,
@@ -46,34 +49,37 @@ def camera_rows(viewmats: Float[Tensor, "c 4 4"], size: int) -> list[dict]:
 
 
 def object_portrait(g: Gaussians, elevation: float, label: str, size: int = 280) -> Float[Tensor, "h w 3"]:
-    """An object around the origin, as large as fits, on white ground with its shadow, from above view 0."""
+    """Image of an object, fitted to the frame, on white ground with a shadow; `elevation` of the camera in [deg]."""
     side = float((g.means.amax(0) - g.means.amin(0)).max())
     g = replace(g, means=g.means / side, scales=g.scales / side)
     eye = 2.2 * _direction(elevation)
-    return _photo(concatenate([_ground(g), g]), eye, torch.zeros(3), size, size, 1.6 * size, label)
+    return _labelled_image(concatenate([_ground(g), g]), eye, torch.zeros(3), (size, size), 1.6 * size, label)
 
 
 def background_portrait(g: Gaussians, label: str) -> Float[Tensor, "h w 3"]:
-    """A background with its table whole, from a corner of the room."""
+    """Image of a background with the whole table, from a corner of the room."""
     eye = torch.tensor([0.0, 0, -1.1]) + 6.9 * _direction(24.0, -52.0)
-    return _photo(g, eye, torch.tensor([0.0, 0, -1.1]), 340, 255, 330.0, label)
+    return _labelled_image(g, eye, torch.tensor([0.0, 0, -1.1]), (340, 255), 330.0, label)
 
 
 def _direction(elevation: float, azimuth: float = -75.0) -> Float[Tensor, "3"]:
-    """Unit vector at angles in degrees."""
+    """Unit vector at these angles [deg]."""
     el, az = torch.deg2rad(torch.tensor([elevation, azimuth])).unbind()
     return torch.stack([el.cos() * az.cos(), el.cos() * az.sin(), el.sin()])
 
 
-def _photo(g: Gaussians, eye: Tensor, target: Tensor, width: int, height: int, focal: float, label: str) -> Tensor:
-    """Drawn at twice the size, made smaller, and labelled."""
+def _labelled_image(
+    g: Gaussians, eye: Tensor, target: Tensor, size: tuple[int, int], focal: float, label: str
+) -> Float[Tensor, "h w 3"]:
+    """Image of `size` (width, height) px with a caption, rendered at twice the size and downscaled."""
+    width, height = size
     K = intrinsics(2 * width, 2 * height, 2 * focal)
     drawn = rasterise(g, look_at(eye, target)[None], K[None], 2 * width, 2 * height, SHEET_BACKGROUND)
     return draw_caption(resize(drawn.rgb[0].clamp(0, 1), width, height), label)
 
 
 def _ground(g: Gaussians) -> Gaussians:
-    """Flat Gaussians under an object, dark where it stands near them, thinning out to nothing."""
+    """Ground plane of flat Gaussians under an object, dark near the object and transparent far from it."""
     step = 0.025
     line = torch.arange(-1.3, 1.3, step)
     flat = torch.nn.functional.pad(torch.cartesian_prod(line, line), (0, 1), value=float(g.means[:, 2].min()) - 0.004)

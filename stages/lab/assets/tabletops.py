@@ -1,4 +1,4 @@
-"""Scenes whose truth is known: the ten objects resting on the eight tables, apart or touching each other."""
+"""Ground-truth scenes: the ten objects resting on the eight tables, apart or touching each other."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ from stages.lab.assets.backgrounds import BACKGROUNDS, TABLE_HEIGHT, make_backgr
 from stages.lab.assets.objects import OBJECTS, make_object
 
 ARRANGEMENTS = ("apart", "touching")
-OBJECTS_PER_SCENE = 5  # objects a scene, so that two scenes show all ten
-MAX_RADIUS = 1.5  # things stay this near the middle of the table [m]
-MIN_GAP = 0.12  # at least, between things that stand apart [m]
-CONTACT_GAP = 0.015  # between the nearest Gaussians of things that touch [m], about their spacing
-DISTANCE_SAMPLES = 4000  # Gaussians of a thing that distances are measured between
-WIDTH, HEIGHT, FOCAL = 640, 480, 640.0  # of the photos [px]
-CAMERA_DISTANCE = 3.8  # of the cameras, as in the data set [m]
+OBJECTS_PER_SCENE = 5  # so that two scenes show all ten objects
+MAX_RADIUS = 1.5  # of the objects from the centre of the table [m]
+MIN_GAP = 0.12  # between separate objects [m]
+CONTACT_GAP = 0.015  # between the nearest Gaussians of touching objects [m], about their spacing
+DISTANCE_SAMPLES = 4000  # Gaussians per object between which distances are computed
+WIDTH, HEIGHT, FOCAL = 640, 480, 640.0  # of the cameras [px]
+CAMERA_DISTANCE = 3.8  # from the scene, as in the data set [m]
 
 
 def tabletop(kind: str, index: int, photos: int = 24) -> Scene:
-    """Scene `index` of a kind: five objects resting on a table, with their true object ids, and cameras.
+    """Scene `index` of an arrangement: five objects resting on a table, with true object ids, and `photos` cameras.
 
-    Two scenes in a row show all ten objects; touching are the first three, and the last two.
+    Two consecutive scenes show all ten objects. In "touching" scenes the first three objects touch, and the last two.
     """
     rng = np.random.default_rng([ARRANGEMENTS.index(kind), index // 2])
     names = list(rng.permutation(list(OBJECTS)))[OBJECTS_PER_SCENE * (index % 2) :][:OBJECTS_PER_SCENE]
@@ -42,8 +42,8 @@ def tabletop(kind: str, index: int, photos: int = 24) -> Scene:
     clusters = [[name] for name in names] if kind == "apart" else [names[:3], names[3:]]
     placed: list[Gaussians] = []
     for cluster in clusters:
-        together = _huddle(rng, [_turned(_resting(name), rng.uniform(0, 2 * math.pi)) for name in cluster])
-        placed += _room_for(rng, together, placed)
+        together = _push_together(rng, [_turned(_resting(name), rng.uniform(0, 2 * math.pi)) for name in cluster])
+        placed += _place_apart(rng, together, placed)
     numbered = [replace(g, object_id=torch.full((len(g),), i)) for i, g in enumerate(placed, start=1)]
     table = make_background(list(BACKGROUNDS)[(2 * index + ARRANGEMENTS.index(kind)) % len(BACKGROUNDS)])
     objects = tuple(SceneObject(i, str(name)) for i, name in enumerate(names, start=1))
@@ -52,13 +52,13 @@ def tabletop(kind: str, index: int, photos: int = 24) -> Scene:
 
 @cache
 def _resting(name: str) -> Gaussians:
-    """An object at its size, lying as it would: on the table, around the origin. A phone lies on its back."""
+    """An object at its scale prior, resting on the table around the origin; the phone lies on its back."""
     g = make_object(name)
     s = OBJECTS[name].scale
     g = replace(g, means=s * g.means, scales=s * g.scales)
     if name == "phone":
         g = _rotated(g, torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]))
-    low = float(g.means[:, 2].quantile(0.0005))  # a thread may hang lower
+    low = float(g.means[:, 2].quantile(0.0005))  # ignores outliers
     return _moved(g, torch.tensor([0.0, 0.0, TABLE_HEIGHT - low + 0.002]))
 
 
@@ -80,40 +80,39 @@ def _points(g: Gaussians) -> np.ndarray:
     return g.means[:: max(1, len(g) // DISTANCE_SAMPLES)].double().numpy()
 
 
-def _huddle(rng: np.random.Generator, things: list[Gaussians]) -> list[Gaussians]:
-    """Each thing pushed along the table against those before it, from a random side, until they touch."""
-    out = things[:1]
-    for thing in things[1:]:
-        tree, mine = cKDTree(np.concatenate([_points(g) for g in out])), _points(thing)
+def _push_together(rng: np.random.Generator, objects: list[Gaussians]) -> list[Gaussians]:
+    """Each object moved along the table from a random side until it touches those before it."""
+    out = objects[:1]
+    for moving in objects[1:]:
+        tree, points = cKDTree(np.concatenate([_points(g) for g in out])), _points(moving)
         angle = rng.uniform(0, 2 * math.pi)
-        way = np.array([math.cos(angle), math.sin(angle), 0.0])
+        direction = np.array([math.cos(angle), math.sin(angle), 0.0])
         far = 3.0
-        while (gap := tree.query(mine + far * way)[0].min()) > CONTACT_GAP:
-            far -= max(gap - CONTACT_GAP, 0.002)  # never into each other: no point comes nearer faster than this
+        while (gap := tree.query(points + far * direction)[0].min()) > CONTACT_GAP:
+            far -= max(gap - CONTACT_GAP, 0.002)  # never overlapping: gaps shrink no faster than the object moves
             if far < -3.0:
-                raise ValueError("two things pass by each other")
-        out = [*out, _moved(thing, torch.tensor(far * way).float())]
+                raise ValueError("two objects miss each other")
+        out = [*out, _moved(moving, torch.tensor(far * direction).float())]
     return out
 
 
-def _room_for(rng: np.random.Generator, things: list[Gaussians], others: list[Gaussians]) -> list[Gaussians]:
-    """The things, moved together to where all is on the table and far enough from others; they come back as they
-    were but for that shift."""
-    mine = np.concatenate([_points(g)[:, :2] for g in things])
-    mine_at = mine.mean(0)
+def _place_apart(rng: np.random.Generator, objects: list[Gaussians], others: list[Gaussians]) -> list[Gaussians]:
+    """The objects, translated together to a free position on the table, MIN_GAP or more from the others."""
+    points = np.concatenate([_points(g)[:, :2] for g in objects])
+    centre = points.mean(0)
     tree = cKDTree(np.concatenate([_points(g)[:, :2] for g in others])) if others else None
     for attempt in range(4000):
-        shift = rng.uniform(-MAX_RADIUS, MAX_RADIUS, 2) - mine_at
-        wide = MAX_RADIUS * (1 + attempt / 8000)
-        if np.linalg.norm(mine + shift, axis=1).max() > wide:
+        shift = rng.uniform(-MAX_RADIUS, MAX_RADIUS, 2) - centre
+        radius = MAX_RADIUS * (1 + attempt / 8000)
+        if np.linalg.norm(points + shift, axis=1).max() > radius:
             continue
-        if tree is None or tree.query(mine + shift)[0].min() > MIN_GAP:
-            return [_moved(g, torch.tensor([*shift, 0.0]).float()) for g in things]
+        if tree is None or tree.query(points + shift)[0].min() > MIN_GAP:
+            return [_moved(g, torch.tensor([*shift, 0.0]).float()) for g in objects]
     raise ValueError("the table is too small")
 
 
 def _cameras(count: int) -> Cameras:
-    """Two rings of views, a low one and a high one."""
+    """A low and a high ring of cameras."""
     low = count * 3 // 5
     centre = torch.tensor([0.0, 0.0, TABLE_HEIGHT + 0.2])
     rings = [

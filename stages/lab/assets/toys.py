@@ -1,4 +1,4 @@
-"""The example scene: a table with four toys, two of them in the air, made from shapes and textures in code."""
+"""The example scene: a table with four toys, two of them in the air."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ TOYS = (
 
 
 def falling_toys() -> Scene:
-    """Scene units are metres; the table top is z = 0. A ball hangs over a block, a duck over a cushion."""
+    """The scene in metres with the table top at z = 0: a ball above a block, a duck above a cushion."""
     parts = [_table(), _ball((-0.13, -0.06, 0.27)), _block((-0.16, -0.05, 0.0601)), _duck((0.16, 0.06, 0.22)),
              _cushion((0.17, 0.06, 0.0401))]  # fmt: skip
     return Scene(concatenate(parts), TOYS, None, 0.0, {"metres_per_unit": 1.0, "source": "made in code"})
@@ -31,13 +31,13 @@ def mix(a: tuple, b: tuple, t: Float[Tensor, "n"]) -> Float[Tensor, "n 3"]:
 
 
 def speckled(points: Tensor, rgb: Tensor, seed: int, size: float = 0.006, depth: float = 0.45) -> Tensor:
-    """Brightness varied by noise at two sizes, so that features can be found on it."""
+    """Colours with brightness noise at two sizes, so that image features can be detected."""
     grain = 0.6 * noise(points, size, seed) + 0.4 * noise(points, 3.1 * size, seed + 1)
     return rgb * (1 + depth * (2 * grain[:, None] - 1))
 
 
 def _table() -> Gaussians:
-    """Planks with grain, and darker marks here and there."""
+    """Planks with grain and dark stains."""
     s = sheet(1.5, 1.3, 0.0055)
     p = s.points
     plank = (p[:, 1] / 0.13).floor()
@@ -64,7 +64,7 @@ def _ball(centre: tuple) -> Gaussians:
 
 
 def _block(centre: tuple) -> Gaussians:
-    """A toy block: a frame and a ring on every face."""
+    """A toy block with a frame and a ring on every face."""
     s = box((0.14, 0.14, 0.12), 0.0026)
     p = s.points
     face = torch.where(s.normals.abs() > 0.5, torch.tensor(9.0), (p / torch.tensor([0.07, 0.07, 0.06])).abs())
@@ -79,7 +79,7 @@ def _block(centre: tuple) -> Gaussians:
 
 
 def _duck(centre: tuple) -> Gaussians:
-    """Body, raised tail, head, and an orange beak; two dark eyes."""
+    """A duck: body, raised tail, head, orange beak and dark eyes."""
     parts = [
         _part((0.075, 0.052, 0.048), (0, 0, 0), 7000),
         _part((0.03, 0.028, 0.02), (0.068, 0, 0.028), 1500),
@@ -99,13 +99,13 @@ def _duck(centre: tuple) -> Gaussians:
 
 
 def _part(radii: tuple, centre: tuple, n: int):
-    """An ellipsoid, and the test that says which points lie inside it."""
-    where, r = torch.tensor(centre), torch.tensor(radii)
-    return ellipsoid(radii, n).moved(centre), lambda p: ((p - where) / r).norm(dim=1) < 0.985
+    """An ellipsoid of n points, and its inside test."""
+    c, r = torch.tensor(centre), torch.tensor(radii)
+    return ellipsoid(radii, n).moved(centre), lambda p: ((p - c) / r).norm(dim=1) < 0.985
 
 
 def _cushion(centre: tuple) -> Gaussians:
-    """Blue and white stripes."""
+    """A striped cushion, blue and white."""
     s: Surface = superellipsoid((0.13, 0.11, 0.04), 5.0, 16000)
     p = s.points
     stripe = (p[:, 0] / 0.022).floor().remainder(2) == 0

@@ -1,4 +1,4 @@
-"""Meshes into Gaussians: a cube written by hand, textured, coloured by vertices or faces, and files that are wrong."""
+"""Conversion of meshes: a textured box, colours of vertices and faces, glTF, and invalid files."""
 
 import sys
 
@@ -25,7 +25,7 @@ def trimesh():
 
 
 def textured_box(folder):
-    """An OBJ whose sides take six stripes of a texture, one colour each, and quads cut into triangles."""
+    """An OBJ box whose six sides have one colour each, from stripes of a texture."""
     write_png(folder / "paint.png", torch.from_numpy(np.repeat(np.repeat(PAINT[None], 8, 1), 8, 0)).float() / 255)
     (folder / "box.mtl").write_text("newmtl skin\nKd 1 1 1\nmap_Kd paint.png\n")
     lines = ["mtllib box.mtl", "usemtl skin"]
@@ -40,7 +40,7 @@ def textured_box(folder):
 
 
 def side_of(g) -> torch.Tensor:
-    """Which side of the box each centre lies on; -1 near an edge, where two sides meet."""
+    """Index of the side each centre lies on; -1 near an edge."""
     away = torch.stack([(g.means - n / 2 * torch.tensor([1.0, 1.0, 0.5])) @ n for n in NORMALS], 1).abs()
     nearest = away.sort(1)
     return torch.where(nearest.values[:, 1] > 0.02, nearest.indices[:, 0], -1)
@@ -50,22 +50,22 @@ def rgb(g) -> torch.Tensor:
     return g.sh[:, 0] * C0 + 0.5
 
 
-def test_textured_box_keeps_sizes_colours_and_sides(tmp_path):
+def test_textured_box_keeps_size_and_colours(tmp_path):
     g = read_mesh(textured_box(tmp_path), 3000, light=False)
     torch.testing.assert_close(g.means.amax(0), torch.tensor([0.5, 0.5, 0.25]), rtol=0, atol=0.01)
     torch.testing.assert_close(g.means.amin(0), -g.means.amax(0), rtol=0, atol=0.01)
     assert abs(len(g) - 3000) < 450 and (g.object_id == 1).all()
     side = side_of(g)
     for s, paint in enumerate(PAINT):
-        mine = side == s
-        torch.testing.assert_close(rgb(g)[mine], torch.tensor(paint / 255.0).float().expand(int(mine.sum()), 3),
+        own = side == s
+        torch.testing.assert_close(rgb(g)[own], torch.tensor(paint / 255.0).float().expand(int(own.sum()), 3),
                                    rtol=0, atol=0.004)  # fmt: skip
-        thin = matrix(g.quats[mine])[:, :, 2]  # the thin axis lies along the normal
-        torch.testing.assert_close((thin @ NORMALS[s]).abs(), torch.ones(int(mine.sum())), rtol=0, atol=1e-3)
+        short_axis = matrix(g.quats[own])[:, :, 2]  # along the normal
+        torch.testing.assert_close((short_axis @ NORMALS[s]).abs(), torch.ones(int(own.sum())), rtol=0, atol=1e-3)
 
 
-def test_gaussians_go_by_area_and_keep_apart(tmp_path):
-    """Top and bottom have half of the area of all six sides: 8 of 16."""
+def test_gaussians_are_uniform_over_the_area(tmp_path):
+    """Top and bottom have half of the area of the six sides: 8 of 16."""
     g = read_mesh(textured_box(tmp_path), 4000)
     flat = (g.means[:, 2].abs() > 0.249).float().mean()
     assert abs(float(flat) - 0.5) < 0.03
@@ -73,8 +73,8 @@ def test_gaussians_go_by_area_and_keep_apart(tmp_path):
     assert nearest[side_of(g) >= 0].min() > 0.5 * float(nearest.mean())
 
 
-def test_light_falls_from_above(tmp_path):
-    """The same paint is brighter on top than below."""
+def test_baked_light_comes_from_above(tmp_path):
+    """The same colour is brighter on top than below."""
     path = textured_box(tmp_path)
     lit, plain = read_mesh(path, 3000), read_mesh(path, 3000, light=False)
     torch.testing.assert_close(lit.means, plain.means)
@@ -83,8 +83,8 @@ def test_light_falls_from_above(tmp_path):
     assert gain[side == 1].mean() > gain[side == 2].mean() > gain[side == 0].mean()
 
 
-def test_the_axis_that_points_up(tmp_path):
-    """y up: what was y is z, what was z is -y."""
+def test_up_axis(tmp_path):
+    """With y up, y becomes z and z becomes -y."""
     path = textured_box(tmp_path)
     z, y = read_mesh(path, 3000), read_mesh(path, 3000, up="y")
     torch.testing.assert_close(y.means[:, 2], z.means[:, 1], rtol=0, atol=1e-6)
@@ -93,7 +93,7 @@ def test_the_axis_that_points_up(tmp_path):
 
 @pytest.mark.parametrize("kind", ["vertex_colors", "face_colors"])
 def test_colours_of_vertices_and_faces(tmp_path, trimesh, kind):
-    """Vertices: left corners red, right ones blue, so purple in the middle. Faces: each its own."""
+    """Vertices: red at the left, blue at the right, interpolated between. Faces: one colour each."""
     triangles = [t for a, b, c, d in SIDES for t in ((a, b, c), (a, c, d))]
     if kind == "vertex_colors":
         colours = [(255, 0, 0, 255) if x == 0 else (0, 0, 255, 255) for x, _, _ in CORNERS]
@@ -111,8 +111,8 @@ def test_colours_of_vertices_and_faces(tmp_path, trimesh, kind):
     torch.testing.assert_close(rgb(g)[inner], expected[inner], rtol=0, atol=0.01)
 
 
-def test_gltf_is_y_up_and_parts_stand_where_the_file_puts_them(tmp_path, trimesh):
-    """Two boxes of the same mesh, one moved 3 up along y: twice the height of 1, 4 in all; z is up in ours."""
+def test_gltf_is_y_up_and_its_scene_graph_is_applied(tmp_path, trimesh):
+    """Two unit boxes, one translated by 3 along y: total height 4, along z after the conversion."""
     box = trimesh.creation.box((1, 1, 1))
     box.visual = trimesh.visual.TextureVisuals(material=trimesh.visual.material.PBRMaterial(
         baseColorFactor=[51, 102, 204, 255]))  # fmt: skip
@@ -126,13 +126,13 @@ def test_gltf_is_y_up_and_parts_stand_where_the_file_puts_them(tmp_path, trimesh
     torch.testing.assert_close(rgb(g).mean(0), torch.tensor([0.2, 0.4, 0.8]), rtol=0, atol=0.01)
 
 
-def test_same_mesh_same_gaussians(tmp_path):
+def test_conversion_is_deterministic(tmp_path):
     path = textured_box(tmp_path)
     a, b = read_mesh(path, 2000), read_mesh(path, 2000)
     assert torch.equal(a.means, b.means) and torch.equal(a.sh, b.sh)
 
 
-def test_wrong_files_and_options_are_told_of(tmp_path, trimesh):
+def test_wrong_files_and_options_are_rejected(tmp_path, trimesh):
     (tmp_path / "points.ply").write_bytes(trimesh.PointCloud(np.eye(3)).export(file_type="ply"))
     (tmp_path / "broken.glb").write_bytes(b"glTF nothing of the kind")
     (tmp_path / "shape.fbx").write_bytes(b"x")
@@ -140,7 +140,7 @@ def test_wrong_files_and_options_are_told_of(tmp_path, trimesh):
     for path, count, up, words in [
         (tmp_path / "points.ply", 1000, "z", "holds no triangles"),
         (tmp_path / "broken.glb", 1000, "z", "cannot be read as a mesh"),
-        (tmp_path / "shape.fbx", 1000, "z", "no mesh that can be read"),
+        (tmp_path / "shape.fbx", 1000, "z", "no mesh file that can be read"),
         (tmp_path / "absent.obj", 1000, "z", "no such file"),
         (box, 10, "z", "--count 10"),
         (box, 1000, "w", "--up w"),
@@ -149,7 +149,7 @@ def test_wrong_files_and_options_are_told_of(tmp_path, trimesh):
             read_mesh(path, count, up)
 
 
-def test_without_trimesh_one_sentence_says_what_to_install(tmp_path, monkeypatch):
+def test_missing_trimesh_is_reported_with_its_install_command(tmp_path, monkeypatch):
     path = textured_box(tmp_path)
     monkeypatch.setitem(sys.modules, "trimesh", None)
     with pytest.raises(InputError, match=r"pip install 'ngff\[mesh\]'"):

@@ -1,4 +1,4 @@
-"""The eight tables: where their tops are, that nothing stands in the way, that they differ, and their files."""
+"""The eight backgrounds: position and density of the table top, free space above it, variety, files."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ def top_of(g):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_table_top_is_whole_and_nothing_stands_above_it(name):
+def test_table_top_is_dense_with_free_space_above(name):
     g = make_background(name)
     assert 40_000 < len(g) < 65_000 and (g.object_id == 0).all()
     over_table = (g.means[:, :2].abs() < 1.9).all(1)
@@ -34,8 +34,8 @@ def test_table_top_is_whole_and_nothing_stands_above_it(name):
 
 
 @pytest.mark.parametrize("name", ["table1", "table2"])
-def test_every_view_of_the_data_set_is_filled(name):
-    """All around, from inside the room: hardly a pixel is left open."""
+def test_background_fills_every_view_of_the_data_set(name):
+    """Hardly a pixel is transparent in views from inside the room."""
     g = make_background(name)
     viewmats = orbit(5, torch.tensor([0.0, 0.0, -0.3]), 4.0, 20.0)
     seen = rasterise(g, viewmats, intrinsics(96, 96, 144.0).expand(5, 3, 3), 96, 96).alpha
@@ -54,12 +54,12 @@ def test_tops_are_distinct():
     assert apart.min() > 0.05
 
 
-def test_same_at_every_call():
+def test_backgrounds_are_deterministic():
     a, b = make_background("table3"), make_background("table3")
     assert torch.equal(a.means, b.means) and torch.equal(a.sh, b.sh) and torch.equal(a.quats, b.quats)
 
 
-def test_lines_and_cells():
+def test_line_distances_and_voronoi_cells():
     torch.testing.assert_close(
         line_distance(torch.tensor([0.0, 0.3, 1.1, -0.1]), 1.0), torch.tensor([0.0, 0.3, 0.1, 0.1])
     )
@@ -77,7 +77,7 @@ def test_command_writes_the_published_names(tmp_path):
     assert (tmp_path / "b.jpg").stat().st_size > 1000
 
 
-def test_unknown_background_is_told_the_names(tmp_path):
+def test_unknown_background_lists_the_names(tmp_path):
     with pytest.raises(InputError, match="no background called 'table9'; choose from table0"):
         make_background("table9")
     done = CliRunner().invoke(app, ["backgrounds", str(tmp_path), "--only", "table0,table9"])

@@ -1,4 +1,4 @@
-"""Scenes with known truth, and the two benchmarks that use them, on objects that are quick to make."""
+"""Ground-truth scenes and the two benchmarks that use them, with blocks as objects and small cameras."""
 
 import json
 from dataclasses import replace
@@ -15,7 +15,7 @@ from stages.core.geometry.similarity import Similarity
 from stages.core.scene.gaussians import Gaussians, transformed
 from stages.core.scene.scene import Scene
 from stages.core.scene.scene_ply import write_scene
-from stages.lab.assets import tabletops
+from stages.lab.assets import backgrounds, tabletops
 from stages.lab.assets.backgrounds import TABLE_HEIGHT
 from stages.lab.assets.objects import OBJECTS
 from stages.lab.assets.tabletops import CONTACT_GAP, MAX_RADIUS, MIN_GAP, OBJECTS_PER_SCENE, tabletop
@@ -29,22 +29,26 @@ COLOURS = {name: rgb for name, rgb in zip(
               (0.1, 0.1, 0.1), (0.3, 0.1, 0.4), (0.1, 0.2, 0.6), (0.6, 0.4, 0.2)], strict=True)}  # fmt: skip
 
 
-def simple(name: str) -> Gaussians:
-    """A block of longest side 1 in the object's place, around the origin."""
+def simple_object(name: str) -> Gaussians:
+    """A centred block with longest side 1 instead of the object."""
     g = block((0.0, 0.0), (1.0, 0.8, 0.7), COLOURS[name], 1, spacing=0.05)
     return replace(g, means=g.means - torch.tensor([0, 0, 0.35]))
 
 
 @pytest.fixture(autouse=True)
-def quick(monkeypatch):
-    monkeypatch.setattr(tabletops, "make_object", simple)
+def small_scenes(monkeypatch):
+    monkeypatch.setattr(tabletops, "make_object", simple_object)
+    for name, value in (("WIDTH", 320), ("HEIGHT", 240), ("FOCAL", 320.0)):
+        monkeypatch.setattr(tabletops, name, value)
+    monkeypatch.setattr(backgrounds, "TABLE_SPACING", 0.047)
+    monkeypatch.setattr(backgrounds, "ROOM_SPACING", 0.28)
     tabletops._resting.cache_clear()
     yield
     tabletops._resting.cache_clear()
 
 
 def gaps(scene) -> np.ndarray:
-    """Least distances between the objects of a scene (o, o), inf on the diagonal."""
+    """Smallest distances between the objects of a scene (o, o), inf on the diagonal."""
     g = scene.gaussians
     clouds = [g.means[g.object_id == i].numpy() for i in range(1, OBJECTS_PER_SCENE + 1)]
     out = np.full((OBJECTS_PER_SCENE, OBJECTS_PER_SCENE), np.inf)
@@ -67,43 +71,43 @@ def test_two_scenes_show_all_ten_objects_resting_on_the_table():
 
 
 @pytest.mark.parametrize("index", [0, 3])
-def test_touching_things_touch_and_do_not_overlap(index):
+def test_touching_objects_touch_without_overlap(index):
     between = gaps(tabletop("touching", index))
-    assert (between.min(1) < CONTACT_GAP + 0.003).all()  # every one has a neighbour that it touches
+    assert (between.min(1) < CONTACT_GAP + 0.003).all()  # every object touches another one
     assert between.min() > 0.2 * CONTACT_GAP
-    assert between[:3, 3:].min() > 0.9 * MIN_GAP  # and the two groups stand apart
+    assert between[:3, 3:].min() > 0.9 * MIN_GAP  # the two groups are separate
 
 
-def test_the_same_scene_again_is_the_same():
+def test_scenes_are_deterministic():
     one, two = (tabletop("touching", 1).gaussians for _ in range(2))
     assert torch.equal(one.means, two.means) and torch.equal(one.object_id, two.object_id)
 
 
-def test_overlap_by_hand():
+def test_best_iou_of_each_object():
     truth = torch.tensor([1, 1, 1, 1, 2, 2, 0, 0])
     found = torch.tensor([3, 3, 3, 0, 3, 5, 5, 0])
-    # object 1: 3 of (4 + 4 - 3) with thing 3; object 2: 1 of 3 with thing 5, 1 of 5 with thing 3
+    # object 1: 3 of (4 + 4 - 3) with label 3; object 2: 1 of 3 with label 5, 1 of 5 with label 3
     assert bench_segment.best_ious(found, truth) == pytest.approx({1: 3 / 5, 2: 1 / 3})
     assert bench_segment.best_ious(torch.zeros(8, dtype=torch.int64), truth) == {1: 0.0, 2: 0.0}
 
 
 @pytest.mark.slow
-def test_the_segment_report_finds_blocks_apart_and_the_vote_mends_wrong_masks(tmp_path, monkeypatch):
+def test_segment_benchmark_finds_blocks_and_voting_repairs_wrong_masks(tmp_path, monkeypatch):
     monkeypatch.setenv("NGFF_WEIGHTS", str(tmp_path))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     lines = list(bench_segment.run(tmp_path / "s.json", bench_segment.SegmentBenchOptions(scenes=1, photos=8)))
     means = json.loads((tmp_path / "s.json").read_text())["mean_iou"]
     assert set(means) == set(tabletops.ARRANGEMENTS) and "without sam2: " in lines[1]
-    for by in means.values():  # blocks of Gaussians this large let the table shine through, so no mask is perfect
+    for by in means.values():  # Gaussians this large are partly transparent, so no mask is perfect
         assert by["masks"] > 0.7 and by["masks"] > by["masks, 20% wrong"] > by["masks, 40% wrong"]
         assert by["masks, 20% wrong"] > by["masks, 20% wrong, no vote"] + 0.2
         assert by["boxes"] > 0.5
     assert means["apart"]["geometric"] > 0.9
 
 
-def test_what_is_reconstructed_is_judged_in_the_photos_that_were_placed(monkeypatch):
+def test_reconstruction_is_measured_in_the_registered_photos(monkeypatch):
     def perfect(photos, out, options):
-        """The scene itself, elsewhere and without labels, as seen by all cameras but the first."""
+        """The scene itself, transformed, without labels, with all cameras but the first."""
         assert len(list(photos.iterdir())) == 8
         scene = tabletop("apart", 0, 8)
         move = Similarity(
@@ -117,7 +121,7 @@ def test_what_is_reconstructed_is_judged_in_the_photos_that_were_placed(monkeypa
     assert row["placed"] == 7 and row["mean"] > 0.9
 
 
-def test_where_no_photo_can_be_placed_nothing_is_found(monkeypatch):
+def test_failed_reconstruction_finds_nothing(monkeypatch):
     def hopeless(photos, out, options):
         raise InputError(f"{photos}: no two photos show the same things")
 
@@ -141,25 +145,25 @@ def test_network_backends_with_weights_take_part(tmp_path, monkeypatch):
     assert found.shape == scene.gaussians.object_id.shape  # the network is random, so its objects are arbitrary
 
 
-def test_masks_are_as_wrong_as_asked():
+def test_label_errors_have_the_given_rate():
     rng = np.random.default_rng(0)
     truth = torch.arange(10).repeat_interleave(30).expand(50, 300)  # ten stripes, 30 pixels wide
     assert torch.equal(bench_segment.corrupt_labels(truth, 0.0, 9, rng), truth)
     right = [float((bench_segment.corrupt_labels(truth, 0.3, 9, rng) == truth).float().mean()) for _ in range(30)]
-    # 0.7 keep their object, of these 0.7 of the pixels (and a tenth of noise hits); shifts cost the rest
+    # 0.7 keep their object, and 0.7 of its pixels (a tenth of the noise is right); shifts cost the rest
     assert 0.2 < np.mean(right) < 0.7 * 0.73 + 0.1
     assert int(bench_segment.corrupt_labels(truth, 1.0, 9, rng).max()) <= 9
 
 
 @pytest.mark.slow
-def test_a_filled_hole_is_nearer_to_the_truth_than_an_open_one():
+def test_filled_hole_is_closer_to_the_truth_than_an_open_one():
     row = bench_refine.measure(0, photos=8)
     assert row["pixels"] > 500
     assert row["after_db"] > row["before_db"] + 6
-    assert row["elsewhere_db"] > 32  # a hole has a rim
+    assert row["elsewhere_db"] > 32  # the border of the hole
 
 
 @pytest.mark.parametrize("wrong", [{"scenes": 0}, {"photos": 3}])
-def test_options_check_themselves(wrong):
+def test_invalid_options_are_rejected(wrong):
     with pytest.raises(InputError):
         bench_segment.SegmentBenchOptions(**wrong)

@@ -1,7 +1,7 @@
-"""Unseen sides from a generator: DiffSplat makes the whole object from the photo that shows it best.
+"""Completion by a generator: DiffSplat generates the whole object from the photo that shows it best.
 
-Where it belongs is known from that photo's camera, and found exactly by registration. What the photos saw stays as
-they showed it; the generated object gives the rest, its colours shifted to agree at the seam.
+The photo's camera gives the approximate pose, registration the accurate one. Gaussians seen in the photos are kept;
+the generated object provides the unseen ones, its colours adapted to the seen part.
 """
 
 from __future__ import annotations
@@ -24,42 +24,44 @@ from stages.refine.options import RefineOptions
 from stages.refine.registration import MIN_REGISTRATION_POINTS, register
 
 log = logging.getLogger(__name__)
-FIT = 0.5  # a lower fit is another object; true maps in the network's place reach 0.95, those of random weights 0.01
+MIN_FIT = 0.5  # below it, another object; true output maps reach 0.95, those of random weights 0.01
 
 
 def complete(
-    scene: Scene, number: int, sight: ObservedSpace, support: Support | None, options: RefineOptions
+    scene: Scene, number: int, observed: ObservedSpace, support: Support | None, options: RefineOptions
 ) -> Gaussians:
-    """Gaussians of the generated object where the photos did not see it; none when it does not fit what they saw."""
+    """The completer "diffsplat": Gaussians of the generated object where it was not seen, if it fits."""
     device = pick_device(options.device)
     model = _model(options.weights, options.download, device)
     own, name = opaque_gaussians(scene, number), scene.name_of(number)
-    shown = crop_object(scene, own, model.side, options.photos) if len(own) >= MIN_REGISTRATION_POINTS else None
-    if shown is None:
-        log.info("  %d  %s: left alone: no photo shows enough of it", number, name)
+    crop = crop_object(scene, own, model.side, options.photos) if len(own) >= MIN_REGISTRATION_POINTS else None
+    if crop is None:
+        log.info("  %d  %s: unchanged: no photo shows enough of it", number, name)
         return empty_like(own)
-    if not TRAINED_ELEVATIONS[0] <= shown.elevation <= TRAINED_ELEVATIONS[1]:
-        log.info("  %d  %s: seen from %.0f degrees above in %s; DiffSplat learned from %.0f to %.0f, so it may err",
-                 number, name, shown.elevation, shown.name, *TRAINED_ELEVATIONS)  # fmt: skip
-    said = "" if name == f"object_{number}" else name.replace("_", " ")  # a number says nothing
-    made = model.generate(shown.image, shown.elevation, said, options.seed)
-    made = made[made.opacities > MIN_SURFACE_OPACITY]
-    how = (
-        register(own.to(device), made.to(device), options.seed, shown.place)
-        if len(made) >= MIN_REGISTRATION_POINTS
+    if not TRAINED_ELEVATIONS[0] <= crop.elevation <= TRAINED_ELEVATIONS[1]:
+        log.info("  %d  %s: seen from %.0f degrees above in %s; outside the %.0f to %.0f that DiffSplat was trained on",
+                 number, name, crop.elevation, crop.name, *TRAINED_ELEVATIONS)  # fmt: skip
+    prompt = "" if name == f"object_{number}" else name.replace("_", " ")  # a number is no prompt
+    generated = model.generate(crop.image, crop.elevation, prompt, options.seed)
+    generated = generated[generated.opacities > MIN_SURFACE_OPACITY]
+    registration = (
+        register(own.to(device), generated.to(device), options.seed, crop.place)
+        if len(generated) >= MIN_REGISTRATION_POINTS
         else None
     )
-    if how is None:
-        log.info("  %d  %s: left alone: what DiffSplat made of %s is no solid object", number, name, shown.name)
+    if registration is None:
+        log.info(
+            "  %d  %s: unchanged: the object generated from %s has too few opaque Gaussians", number, name, crop.name
+        )
         return empty_like(own)
-    gained, verdict = place_whole(made, how, own, sight, FIT)
-    log.info("  %d  %s: what DiffSplat made of %s %s", number, name, shown.name, verdict)
-    return gained
+    added, verdict = place_whole(generated, registration, own, observed, MIN_FIT)
+    log.info("  %d  %s: the object generated from %s %s", number, name, crop.name, verdict)
+    return added
 
 
 @lru_cache(maxsize=1)
 def _model(weights: Path | None, download: bool, device: str):
-    """The network, once for all objects; fetched first when the user asked for that and it is not there."""
+    """The network, loaded once for all objects; downloaded first if that was requested and it is missing."""
     return load(_files(weights, download), device)
 
 

@@ -1,4 +1,4 @@
-"""Flat Gaussians on surfaces that nobody saw."""
+"""Flat Gaussians that cover a reconstructed surface."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from stages.core.geometry.harmonics import rgb_to_sh
 from stages.core.geometry.rotations import quaternion
 from stages.core.scene.gaussians import Gaussians
 
-DISC_SIGMA, THICK = 0.65, 0.12  # standard deviations of a patch, as a share of the spacing: no holes, little overlap
+DISC_SIGMA, DISC_THICKNESS = 0.65, 0.12  # standard deviations [spacing]: no holes, little overlap
 
 
 def disc_gaussians(
@@ -21,13 +21,13 @@ def disc_gaussians(
     object_id: int,
     opacity: float = 0.97,
 ) -> Gaussians:
-    """Opaque discs of one colour, square to the normals, for points about `spacing` apart."""
+    """Opaque discs perpendicular to the normals, one per point, for points about `spacing` [scene units] apart."""
     count = len(points)
     normals = torch.nn.functional.normalize(normals, dim=1)
     helper = torch.eye(3)[normals.abs().argmin(1)] if count else torch.zeros(0, 3)
     u = torch.nn.functional.normalize(torch.linalg.cross(helper, normals), dim=1)
     R = torch.stack([u, torch.linalg.cross(normals, u), normals], -1)
-    scales = spacing * torch.tensor([DISC_SIGMA, DISC_SIGMA, THICK])
+    scales = spacing * torch.tensor([DISC_SIGMA, DISC_SIGMA, DISC_THICKNESS])
     return Gaussians(
         points.float(), quaternion(R) if count else torch.zeros(0, 4), scales.repeat(count, 1).float(),
         torch.full((count,), opacity), rgb_to_sh(rgb.clamp(0, 1)).float(),
@@ -36,5 +36,5 @@ def disc_gaussians(
 
 
 def empty_like(g: Gaussians) -> Gaussians:
-    """No Gaussians, in the shape of `g`."""
+    """An empty set of Gaussians with the fields and harmonics degree of `g`."""
     return g[torch.zeros(len(g), dtype=torch.bool)]

@@ -1,11 +1,11 @@
-"""Holes in a picture filled with what is seen elsewhere in it, so that edges and texture go on.
+"""Exemplar-based inpainting: holes of an image are filled with patches from its known part.
 
-The hole is put together from seen patches that agree with their surroundings and with each other, coarse to fine:
-where an edge runs into it at both ends, patches along the edge are what agrees. What is seen beside the hole in a
-lighter or darker place than where the patches come from is carried smoothly over it at last, so that there is no seam.
+Patches are chosen, coarse to fine, to agree with the surroundings of the hole and with each other, which continues
+edges and texture. Finally, the difference in brightness between the boundary of the hole and the copied patches is
+interpolated smoothly over the hole, so that available is no seam.
 
-Patches are compared in integers: colours of 8 bits, weights of 10. Sums of their products are exact in float64, in
-whatever order they are added, so the result does not depend on the number of threads or on the processor.
+Patches are compared in integers: colours of 8 bits, weights of 10 bits. Sums of their products are exact in float64
+in any order, so the result does not depend on the number of threads or on the processor.
 
 Source: Wexler, Shechtman and Irani 2007, "Space-time completion of video"; the search is that of Barnes et al. 2009,
 "PatchMatch".
@@ -20,25 +20,25 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
-REACH = 3  # of a patch to either side [cells]
-LIGHT = 6.0  # standard deviation of what counts as light [cells]
-LIGHTER = 0.1  # most that a place may be lighter than where its patches come from; more is another thing
-SHALLOW = 4  # holes no deeper than this are filled at once, others from a coarser picture [cells]
-FEWEST = 1000  # patches to copy from that a coarser picture must have, so that all kinds of edges are among them
-LARGEST = 40_000  # patches to be found in the coarsest picture, however few there are to copy from
-SOURCES = 8000  # patches compared with every patch of the hole in the coarsest picture
-MOST = 60_000  # patches that are still searched for in a finer one; more keep the coarser answer
-SCARCE = 0.3  # patches to copy from for each to be found, at least
-FEW = 12_000  # patches to be found in all tries together
-TRIES = 8  # at the coarsest picture, of which the one whose patches agree best is taken
-ENOUGH = (0.25, 0.65)  # share of a patch that is there to go by, drawn for each try
-FIRST = (0.5, 0.95)  # share of the rim that waits for the rest of it, of more contrast
-ROUNDS = 3  # of search in every finer picture
-DOUBT = 0.7  # weight of a cell's colour in the hole, for each cell of depth
+PATCH_RADIUS = 3  # [px]
+ILLUMINATION_SIGMA = 6.0  # of the blur of brightness differences [px]
+MAX_ILLUMINATION = 0.1  # largest brightness difference that is interpolated; larger ones are other surfaces
+MAX_DEPTH = 4  # of a hole that is filled without a coarser level [px]
+MIN_SOURCES = 1000  # source patches of a coarser level, so that all kinds of edges are among them
+MAX_COARSEST_TARGETS = 40_000  # target patches of the coarsest level, for any number of sources
+MAX_SOURCE_PATCHES = 8000  # compared with every target of the coarsest level
+MAX_SEARCHED_TARGETS = 60_000  # targets of a finer level that are searched; with more, coarse matches are kept
+MIN_SOURCE_RATIO = 0.3  # source patches per target patch; below it, colours are interpolated
+MAX_TRIAL_TARGETS = 12_000  # target patches of all trials together
+TRIES = 8  # trials at the coarsest level, of which that with the smallest patch distance is used
+KNOWN_FRACTION = (0.25, 0.65)  # range of the known fraction of a patch that is matched next, drawn for each trial
+WAITING_FRACTION = (0.5, 0.95)  # range of the fraction of patches, of low contrast, that are matched later
+ROUNDS = 3  # of search at each finer level
+DEPTH_DECAY = 0.7  # weight of a pixel of the hole, per pixel of depth
 COLOUR = 255  # integer colour of full intensity
-WEIGHT = 1023  # integer weight of a cell that is trusted fully
-VOTE = 1 << 14  # integer weight of a patch that matches exactly
-Y, X = (d.ravel() for d in np.mgrid[-REACH : REACH + 1, -REACH : REACH + 1])
+WEIGHT = 1023  # integer weight of a known pixel
+VOTE = 1 << 14  # integer weight of an exactly matching patch
+Y, X = (d.ravel() for d in np.mgrid[-PATCH_RADIUS : PATCH_RADIUS + 1, -PATCH_RADIUS : PATCH_RADIUS + 1])
 
 
 def inpaint(
@@ -48,21 +48,21 @@ def inpaint(
     seed: int,
     rounds: int = ROUNDS,
 ) -> Float[np.ndarray, "h w 3"]:
-    """The picture with new colours in the holes; cells that are neither hole nor known stay, and are not trusted.
+    """The image with the holes filled; pixels that are neither hole nor known are unchanged and not copied from.
 
-    With few `rounds` of search at full size, or none, it is quicker and more blurred.
+    Fewer `rounds` of search at full size, or none, are faster and give a more blurred result.
     """
     known = known & ~hole
     if not known.any() or not hole.any():
         return rgb
     smooth = _membrane(np.where(known[..., None], rgb, 0).astype(np.float32), known.astype(np.float32))
     image = np.rint(COLOUR * np.where(known[..., None], rgb, smooth))
-    image = _complete(image, hole, known, np.random.default_rng(seed), rounds) / COLOUR
+    image = _fill(image, hole, known, np.random.default_rng(seed), rounds) / COLOUR
     return np.where(hole[..., None], image, rgb).clip(0, 1).astype(rgb.dtype)
 
 
 def _membrane(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Values where the weight is 1; elsewhere those of ever coarser pictures.
+    """Values where the weight is 1; elsewhere interpolated from coarser levels.
 
     Source: Gortler et al. 1996, "The lumigraph", push and pull.
     """
@@ -80,29 +80,31 @@ def _membrane(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
 
 @dataclass
 class _Level:
-    """A picture with patches to be found for the targets: every cell whose patch reaches into the hole."""
+    """Pyramid level. Targets are the pixels whose patches overlap the hole; sources those with fully known patches."""
 
-    image: np.ndarray  # (h, w, 3) integer colours, changed in place
+    image: np.ndarray  # (h, w, 3) integer colours, modified in place
     hole: np.ndarray  # (h, w)
-    trust: np.ndarray  # (h, w) integer weight of a cell's colour when patches are compared
-    source: np.ndarray  # (h, w) whether a patch around the cell is known all over
-    at: np.ndarray  # (t, 2) targets
+    trust: np.ndarray  # (h, w) integer weight of a pixel in patch comparisons
+    source: np.ndarray  # (h, w) whether the patch around a pixel is fully known
+    at: np.ndarray  # (t, 2) targets: row, column
 
     @staticmethod
     def of(image: np.ndarray, hole: np.ndarray, known: np.ndarray) -> _Level:
-        side = np.ones((2 * REACH + 1, 2 * REACH + 1))
+        """The level of an image."""
+        side = np.ones((2 * PATCH_RADIUS + 1, 2 * PATCH_RADIUS + 1))
         inner = np.zeros_like(hole)
-        inner[REACH:-REACH, REACH:-REACH] = True
-        trust = np.rint(WEIGHT * np.where(hole | known, DOUBT ** ndimage.distance_transform_edt(hole), 0))
+        inner[PATCH_RADIUS:-PATCH_RADIUS, PATCH_RADIUS:-PATCH_RADIUS] = True
+        trust = np.rint(WEIGHT * np.where(hole | known, DEPTH_DECAY ** ndimage.distance_transform_edt(hole), 0))
         near = ndimage.binary_dilation(hole, side) & inner
         return _Level(image.copy(), hole, trust, ndimage.binary_erosion(known, side) & inner, np.argwhere(near))
 
     def patches(self, at: Int[np.ndarray, "t 2"]) -> Float[np.ndarray, "t p 3"]:
+        """Colours of the patches around pixels."""
         return self.image.reshape(-1, 3).take(self._cells(at), axis=0)
 
-    def weights(self, at: Int[np.ndarray, "t 2"], told: Bool[np.ndarray, "h w"] | bool = True) -> np.ndarray:
-        """How much each cell of the patches, if told, is to be trusted (t, p)."""
-        return (self.trust * told).ravel().take(self._cells(at))
+    def weights(self, at: Int[np.ndarray, "t 2"], known: Bool[np.ndarray, "h w"] | bool = True) -> np.ndarray:
+        """Weights of the patches' pixels, 0 where not `known` (t, p)."""
+        return (self.trust * known).ravel().take(self._cells(at))
 
     def _cells(self, at: Int[np.ndarray, "t 2"]) -> Int[np.ndarray, "t p"]:
         width = self.hole.shape[1]
@@ -111,81 +113,79 @@ class _Level:
     def distances(
         self, P: Float[np.ndarray, "t p 3"], W: Float[np.ndarray, "t p"], match: Int[np.ndarray, "t 2"]
     ) -> Float[np.ndarray, "t"]:
-        """Of patches to those around their matches."""
+        """Weighted mean squared distance of patches to those around their matches."""
         difference = P - self.patches(match)
         return np.einsum("tp,tpc,tpc->t", W, difference, difference) / W.sum(1).clip(1)
 
     def vote(
         self, at: Int[np.ndarray, "t 2"], match: Int[np.ndarray, "t 2"], distance: Float[np.ndarray, "t"]
     ) -> Bool[np.ndarray, "h w"]:
-        """Every cell of the hole takes the mean of what the patches over it say; which had any."""
-        said, told = self.said(at, match, distance)
-        told &= self.hole
-        self.image[told] = np.rint(said[told])
-        return told
+        """Set pixels of the hole to the weighted mean of the patches covering them; returns their mask."""
+        mean, filled = self.blended(at, match, distance)
+        filled &= self.hole
+        self.image[filled] = np.rint(mean[filled])
+        return filled
 
-    def said(self, at: np.ndarray, match: np.ndarray, distance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The mean of what patches say of every cell, good matches first, and of which they say anything."""
+    def blended(self, at: np.ndarray, match: np.ndarray, distance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Mean of the matched patches covering each pixel, weighted by quality, and the mask of covered pixels."""
         sigma = max(float(np.median(distance)), 1e-3)
         weight = np.rint(VOTE * (np.exp(-distance / (0.5 * sigma)) + 1e-4))[:, None]
         total = np.zeros((self.hole.size, 4))
         image = np.concatenate([self.image, np.ones((*self.hole.shape, 1))], 2).reshape(-1, 4)
         to, of = self._cells(at), self._cells(match)
         for p in range(to.shape[1]):
-            total[to[:, p]] += weight * image.take(of[:, p], axis=0)  # no target twice, so no cell twice
+            total[to[:, p]] += weight * image.take(of[:, p], axis=0)  # targets are unique, so pixels are too
         total = total.reshape(*self.hole.shape, 4)
         return total[..., :3] / total[..., 3:].clip(1), total[..., 3] > 0
 
-    def even(self, match: Int[np.ndarray, "t 2"]) -> None:
-        """By how much the seen cells around are lighter than patches say goes for the hole as well, smoothly."""
+    def equalise(self, match: Int[np.ndarray, "t 2"]) -> None:
+        """Add the brightness difference of image and matched patches at the boundary, interpolated over the hole."""
         distance = self.distances(self.patches(self.at), self.weights(self.at), match)
-        said, told = self.said(self.at, match, distance)
-        rim = (told & ~self.hole & (self.trust > 0)).astype(np.float32)
-        near = cv2.GaussianBlur(rim, (0, 0), LIGHT)[..., None]
-        step = (self.image - said).astype(np.float32)
-        lighter = cv2.GaussianBlur(rim[..., None] * step, (0, 0), LIGHT) / np.maximum(near, 1e-6)
-        over = cv2.GaussianBlur(_membrane(rim[..., None] * lighter, rim), (0, 0), LIGHT)
-        self.image[self.hole] += over[self.hole].clip(-LIGHTER * COLOUR, LIGHTER * COLOUR)
+        mean, filled = self.blended(self.at, match, distance)
+        boundary = (filled & ~self.hole & (self.trust > 0)).astype(np.float32)
+        near = cv2.GaussianBlur(boundary, (0, 0), ILLUMINATION_SIGMA)[..., None]
+        step = (self.image - mean).astype(np.float32)
+        lighter = cv2.GaussianBlur(boundary[..., None] * step, (0, 0), ILLUMINATION_SIGMA) / np.maximum(near, 1e-6)
+        over = cv2.GaussianBlur(_membrane(boundary[..., None] * lighter, boundary), (0, 0), ILLUMINATION_SIGMA)
+        self.image[self.hole] += over[self.hole].clip(-MAX_ILLUMINATION * COLOUR, MAX_ILLUMINATION * COLOUR)
 
 
-def _complete(
-    image: np.ndarray, hole: np.ndarray, known: np.ndarray, rng: np.random.Generator, rounds: int
-) -> np.ndarray:
-    """The picture with its hole filled, from a coarse picture of it to itself."""
+def _fill(image: np.ndarray, hole: np.ndarray, known: np.ndarray, rng: np.random.Generator, rounds: int) -> np.ndarray:
+    """The image with its hole filled, from the coarsest level to the finest."""
     levels = [_Level.of(image, hole, known)]
-    while ndimage.distance_transform_edt(hole).max() > SHALLOW:
-        image, hole, known = _halved(image, hole, known)
+    while ndimage.distance_transform_edt(hole).max() > MAX_DEPTH:
+        image, hole, known = _downsample(image, hole, known)
         coarser = _Level.of(image, hole, known)
         count = int(coarser.source.sum())
-        if count < FEWEST and (not count or len(levels[-1].at) <= LARGEST):
+        if count < MIN_SOURCES and (not count or len(levels[-1].at) <= MAX_COARSEST_TARGETS):
             break
         levels.append(coarser)
-    if levels[0].source.sum() <= SCARCE * len(levels[0].at):
-        return levels[0].image  # too little to copy from: smooth colours alone
-    found = _best(levels[-1], rng)
+    if levels[0].source.sum() <= MIN_SOURCE_RATIO * len(levels[0].at):
+        return levels[0].image  # too few sources: interpolated colours
+    found = _best_trial(levels[-1], rng)
     for level in levels[-2::-1]:
-        found = _refined(level, found, rng, ROUNDS if level is not levels[0] else rounds)
+        found = _refine(level, found, rng, ROUNDS if level is not levels[0] else rounds)
     level = levels[0]
-    level.even(found[level.at[:, 0], level.at[:, 1]])
+    level.equalise(found[level.at[:, 0], level.at[:, 1]])
     return level.image
 
 
-def _halved(image: np.ndarray, hole: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A picture of half the size; a cell is known where most of it is, else a part of the hole where some of it is."""
+def _downsample(image: np.ndarray, hole: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Image and masks at half the size; a pixel is known if mostly_known of it is, else hole if any of it is."""
     height, width = (side // 2 * 2 for side in hole.shape)
     four = lambda v: v[:height, :width].reshape(height // 2, 2, width // 2, 2, *v.shape[2:]).sum((1, 3))  # noqa: E731
-    weight = 999 * known + 1  # what is not known counts where nothing else does
+    weight = 999 * known + 1  # unknown pixels count only where no other does
     half = np.rint(four(image * weight[..., None]) / four(weight)[..., None])
-    most = four(known) >= 3
-    return half, (four(hole) > 0) & ~most, most
+    mostly_known = four(known) >= 3
+    return half, (four(hole) > 0) & ~mostly_known, mostly_known
 
 
-def _best(level: _Level, rng: np.random.Generator) -> Int[np.ndarray, "h w 2"]:
-    """The field of matches of the best of a few tries: where an edge comes out crooked, patches agree less."""
+def _best_trial(level: _Level, rng: np.random.Generator) -> Int[np.ndarray, "h w 2"]:
+    """The field of matches of the trial with the smallest patch distance; broken edges increase that distance."""
     fields, costs, images, start = [], [], [], level.image.copy()
-    for _ in range(max(1, min(TRIES, FEW // len(level.at)))):
+    for _ in range(max(1, min(TRIES, MAX_TRIAL_TARGETS // len(level.at)))):
         level.image[:] = start
-        fields.append(_searched(level, rng, rng.uniform(*ENOUGH), rng.uniform(*FIRST)))
+        fields.append(_search(level, rng, rng.uniform(*KNOWN_FRACTION), rng.uniform(*WAITING_FRACTION)))
         match = fields[-1][tuple(level.at.T)]
         costs.append(level.distances(level.patches(level.at), level.weights(level.at), match).mean())
         images.append(level.image.copy())
@@ -194,26 +194,28 @@ def _best(level: _Level, rng: np.random.Generator) -> Int[np.ndarray, "h w 2"]:
     return fields[best]
 
 
-def _searched(
-    level: _Level, rng: np.random.Generator, enough: float, wait: float, rounds: int = 4
+def _search(
+    level: _Level, rng: np.random.Generator, min_known: float, waiting: float, rounds: int = 4
 ) -> Int[np.ndarray, "h w 2"]:
-    """A match for every target among all sources, or many of them: from the rim inwards, then all together.
+    """Exhaustive search of a match for every target: from the boundary inwards, then for all targets together.
 
-    Where most goes on at the rim it is carried on first: edges run on straight before what is even spreads over them.
+    Patches of high contrast are matched first, so that edges continue straight before uniform regions cover them.
     """
     sources = np.argwhere(level.source)
-    sources = sources[rng.permutation(len(sources))[:SOURCES]]
+    sources = sources[rng.permutation(len(sources))[:MAX_SOURCE_PATCHES]]
     Q = level.patches(sources).reshape(len(sources), -1)
-    told, at = ~level.hole, level.at
-    while len(at) and not told[level.hole].all():
-        there = cv2.blur((told & (level.trust > 0)).astype(np.float32), (2 * REACH + 1, 2 * REACH + 1))
-        at = level.at[(there >= enough)[tuple(level.at.T)] & ~told[tuple(level.at.T)]]
+    filled, at = ~level.hole, level.at
+    while len(at) and not filled[level.hole].all():
+        available = cv2.blur(
+            (filled & (level.trust > 0)).astype(np.float32), (2 * PATCH_RADIUS + 1, 2 * PATCH_RADIUS + 1)
+        )
+        at = level.at[(available >= min_known)[tuple(level.at.T)] & ~filled[tuple(level.at.T)]]
         if len(at):
-            P, W = level.patches(at), level.weights(at, told)
-            first = _first(P, W, wait)
+            P, W = level.patches(at), level.weights(at, filled)
+            first = _high_contrast(P, W, waiting)
             at, P, W = at[first], P[first], W[first]
             match = sources[_nearest(P, W, Q)]
-            told = told | level.vote(at, match, level.distances(P, W, match))
+            filled = filled | level.vote(at, match, level.distances(P, W, match))
     W = level.weights(level.at)
     for _ in range(rounds):
         P = level.patches(level.at)
@@ -222,16 +224,16 @@ def _searched(
     return _field(level, match)
 
 
-def _first(P: Float[np.ndarray, "t p 3"], W: Float[np.ndarray, "t p"], wait: float) -> Bool[np.ndarray, "t"]:
-    """Which patches have the most contrast in what is known of them."""
+def _high_contrast(P: Float[np.ndarray, "t p 3"], W: Float[np.ndarray, "t p"], waiting: float) -> Bool[np.ndarray, "t"]:
+    """Mask of the patches with the highest contrast in their known pixels."""
     total = W.sum(1)
     squares, sums = np.einsum("tp,tpc,tpc->t", W, P, P), np.einsum("tp,tpc->tc", W, P)
     contrast = (squares - np.einsum("tc,tc->t", sums, sums) / total) / total
-    return contrast >= np.quantile(contrast, wait)
+    return contrast >= np.quantile(contrast, waiting)
 
 
 def _nearest(P: Float[np.ndarray, "t p 3"], W: Float[np.ndarray, "t p"], Q: Float[np.ndarray, "s d"]) -> np.ndarray:
-    """Which row of Q is nearest to each patch, squares weighted by W."""
+    """Index of the row of Q nearest to each patch, by squared distance weighted by W."""
     squares, nearest = (Q * Q).T, []
     for i in range(0, len(P), 512):
         weight = np.repeat(W[i : i + 512], 3, axis=1)
@@ -240,15 +242,15 @@ def _nearest(P: Float[np.ndarray, "t p 3"], W: Float[np.ndarray, "t p"], Q: Floa
     return np.concatenate(nearest)
 
 
-def _refined(level: _Level, coarse: Int[np.ndarray, "h w 2"], rng: np.random.Generator, rounds: int) -> np.ndarray:
-    """Matches of a coarser picture carried over, then improved by those of neighbours and by small steps."""
+def _refine(level: _Level, coarse: Int[np.ndarray, "h w 2"], rng: np.random.Generator, rounds: int) -> np.ndarray:
+    """Matches of the coarser level upsampled, then improved by propagation from neighbours and random search."""
     cell = np.minimum(level.at // 2, np.array(coarse.shape[:2]) - 1)
     match = 2 * coarse[cell[:, 0], cell[:, 1]] + level.at - 2 * cell
     nearest = ndimage.distance_transform_edt(~level.source, return_distances=False, return_indices=True)
     match = nearest[(slice(None), *match.clip(0, np.array(level.hole.shape) - 1).T)].T
     P, W = level.patches(level.at), level.weights(level.at)
     level.vote(level.at, match, level.distances(P, W, match))
-    for _ in range(rounds if len(match) <= MOST else 0):
+    for _ in range(rounds if len(match) <= MAX_SEARCHED_TARGETS else 0):
         P = level.patches(level.at)
         distance = level.distances(P, W, match)
         for step in ((0, 1), (1, 0), (0, -1), (-1, 0), None):
@@ -271,7 +273,7 @@ def _usable(level: _Level, match: np.ndarray) -> Bool[np.ndarray, "t"]:
 
 
 def _field(level: _Level, match: np.ndarray) -> Int[np.ndarray, "h w 2"]:
-    """The match of every cell; cells that are no target are their own."""
+    """The match of every pixel; pixels that are no target match themselves."""
     field = np.stack(np.mgrid[: level.hole.shape[0], : level.hole.shape[1]], -1)
     field[level.at[:, 0], level.at[:, 1]] = match
     return field

@@ -1,6 +1,6 @@
-"""Unseen sides from a library of whole objects: the asset that fits what was seen is put in its place.
+"""Completion from a library of whole objects: the asset that fits the seen part best is registered to it.
 
-What the photos saw stays as they showed it; the asset gives the rest, its colours shifted to agree at the seam.
+Gaussians seen in the photos are kept; the asset provides the unseen ones, its colours adapted to the seen part.
 """
 
 from __future__ import annotations
@@ -34,107 +34,116 @@ from stages.refine.registration import (
 from stages.refine.registration_cloud import RegistrationCloud
 
 log = logging.getLogger(__name__)
-FIT = 0.8  # a lower fit is another object
-THROUGH = 0.1  # share of an asset that cameras may see through before it cannot be the object
-TRIED = 2  # assets that are registered exactly, of those that fit best roughly
-SEEN = 0.02  # distance from the part within which the asset is not needed [diameters]
-MIN_SURFACE_OPACITY = 0.1  # opacity of Gaussians that count as surface
+MIN_FIT = 0.8  # below it, the asset is another object
+MAX_FREE_FRACTION = 0.1  # of an asset's Gaussians in observed free space; above it, the asset is another object
+FINE_CANDIDATES = 2  # assets that are registered accurately, those with the best coarse fit
+SEEN_DISTANCE = 0.02  # distance from the part within which the asset is not used [diameters]
+MIN_ASSET_GAUSSIANS = 100  # opaque ones, or the asset is refused
+MIN_SURFACE_OPACITY = 0.1  # of Gaussians that count as surface
 
 
 def complete(
-    scene: Scene, number: int, sight: ObservedSpace, support: Support | None, options: RefineOptions
+    scene: Scene, number: int, observed: ObservedSpace, support: Support | None, options: RefineOptions
 ) -> Gaussians:
-    """Gaussians of the best asset of `options.library` where the object was not seen; none when nothing fits."""
+    """The completer "library": Gaussians of the best asset where the object was not seen; none if no asset fits."""
     own = opaque_gaussians(scene, number)
     found = best_asset(own, options) if len(own) >= MIN_REGISTRATION_POINTS else None
     if found is None:
-        log.info("  %d  %s: left alone: too little of it to compare with the library", number, scene.name_of(number))
+        log.info("  %d  %s: unchanged: too few Gaussians to compare with the library", number, scene.name_of(number))
         return empty_like(own)
-    asset, whole, how = found
-    gained, verdict = place_whole(whole, how, own, sight, FIT)
+    asset, whole, registration = found
+    added, verdict = place_whole(whole, registration, own, observed, MIN_FIT)
     log.info("  %d  %s: %s of the library %s", number, scene.name_of(number), asset, verdict)
-    return gained
+    return added
 
 
 def opaque_gaussians(scene: Scene, number: int) -> Gaussians:
-    """The Gaussians of an object that count as its surface."""
+    """The Gaussians of an object with at least MIN_SURFACE_OPACITY."""
     g = scene.gaussians
     return g[(g.object_id == number) & (g.opacities > MIN_SURFACE_OPACITY) & g.means.isfinite().all(1)]
 
 
 def place_whole(
-    whole: Gaussians, how: Registration, own: Gaussians, sight: ObservedSpace, least: float
+    whole: Gaussians, registration: Registration, own: Gaussians, observed: ObservedSpace, min_fit: float
 ) -> tuple[Gaussians, str]:
-    """What a registered whole adds to its part, and why: nothing when it fits less than `least` or is seen through."""
-    placed = transformed(whole, how.similarity.to(whole.means.device))
-    through = _seen_through(placed, sight)
-    fits = how.fit >= least and through <= THROUGH
-    verdict = "put in its place" if fits else f"left alone: {least} and at most {THROUGH:.0%} are needed"
-    gained = unseen_gaussians(own, placed, int(own.object_id[0])) if fits else empty_like(own)
-    return gained, f"fits to {how.fit:.2f}, {100 * through:.0f} % of it is seen through; {verdict}"
+    """Gaussians that a registered whole adds to its part `own`, and a message; none where it does not fit.
+
+    It fits if its fit is at least `min_fit` and at most MAX_FREE_FRACTION of it is in observed free space.
+    """
+    placed = transformed(whole, registration.similarity.to(whole.means.device))
+    free = _free_fraction(placed, observed)
+    fits = registration.fit >= min_fit and free <= MAX_FREE_FRACTION
+    verdict = "added" if fits else f"unchanged: {min_fit} and at most {MAX_FREE_FRACTION:.0%} are needed"
+    added = unseen_gaussians(own, placed, int(own.object_id[0])) if fits else empty_like(own)
+    return added, f"has a fit of {registration.fit:.2f}, {100 * free:.0f} % of it is in observed free space; {verdict}"
 
 
 @lru_cache(maxsize=1)
 def load_library(folder: Path, device: str) -> dict[str, tuple[Gaussians, RegistrationCloud]]:
     """Whole objects by name: FOLDER/NAME.ply, or FOLDER/NAME/.../*.ply as trainers and `ngff-lab objects` write.
 
-    Their clouds are on `device`, ready to be registered; their Gaussians stay on the CPU.
+    The registration clouds are on `device`, the Gaussians on the CPU. Raises InputError for an empty folder and for
+    assets with too few Gaussians.
     """
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError(f"{folder}: is no folder; --library takes whole objects, such as `ngff-lab objects` writes")
     files = {p.stem: p for p in sorted(folder.glob("*.ply"))}
-    files.update({p.relative_to(folder).parts[0]: p for p in sorted(folder.glob("*/**/*.ply"))})  # the last iteration
+    files.update(
+        {p.relative_to(folder).parts[0]: p for p in sorted(folder.glob("*/**/*.ply"))}
+    )  # the last one of each, by path
     if not files:
         raise InputError(f"{folder}: holds no .ply; --library takes whole objects, such as `ngff-lab objects` writes")
     out = {}
     for name, path in files.items():
         g = read_scene(path).gaussians
         g = g[(g.opacities > MIN_SURFACE_OPACITY) & g.scales.isfinite().all(1)]
-        if len(g) < 100:
-            raise InputError(f"{path}: {len(g)} solid Gaussians are no object; take it out of the library")
+        if len(g) < MIN_ASSET_GAUSSIANS:
+            raise InputError(f"{path}: {len(g)} opaque Gaussians are too few for an object; remove it from the library")
         out[name] = g, RegistrationCloud.of(g.to(device))
     return out
 
 
 def best_asset(own: Gaussians, options: RefineOptions) -> tuple[str, Gaussians, Registration] | None:
-    """Name, Gaussians and registration of the asset that fits best: all roughly, the most promising exactly."""
+    """Name, Gaussians and registration of the asset that fits best: all coarsely, the best candidates accurately."""
     device, seed = pick_device(options.device), options.seed
     assets, part = load_library(options.library, device), RegistrationCloud.of(own.to(device), seed)
-    rough = {name: coarse_registration(part, cloud, seed) for name, (_, cloud) in assets.items()}
-    fits = {name: coarse_fit(poses, part, assets[name][1]) for name, poses in rough.items() if len(poses)}
-    promising = sorted(fits, key=fits.get, reverse=True)[:TRIED]
-    settled = {name: fine_registration(rough[name], part, assets[name][1], seed) for name in promising}
-    if not settled:
+    coarse = {name: coarse_registration(part, cloud, seed) for name, (_, cloud) in assets.items()}
+    fits = {name: coarse_fit(poses, part, assets[name][1]) for name, poses in coarse.items() if len(poses)}
+    candidates = sorted(fits, key=fits.get, reverse=True)[:FINE_CANDIDATES]
+    fine = {name: fine_registration(coarse[name], part, assets[name][1], seed) for name in candidates}
+    if not fine:
         return None
-    winner = max(settled, key=lambda name: settled[name].fit)
-    return winner, assets[winner][0], settled[winner]
+    winner = max(fine, key=lambda name: fine[name].fit)
+    return winner, assets[winner][0], fine[winner]
 
 
-def _seen_through(placed: Gaussians, sight: ObservedSpace) -> float:
-    """Share of the Gaussians where the cameras see nothing."""
-    if not sight.views:
+def _free_fraction(placed: Gaussians, observed: ObservedSpace) -> float:
+    """Fraction of the Gaussians in observed free space."""
+    if not observed.views:
         return 0.0
     size = float((placed.means.amax(0) - placed.means.amin(0)).norm())
-    return float(sight.empty(placed.means, 0.03 * size).float().mean())
+    return float(observed.is_free(placed.means, 0.03 * size).float().mean())
 
 
 def unseen_gaussians(own: Gaussians, placed: Gaussians, number: int) -> Gaussians:
-    """The asset's Gaussians away from those of the object, in the light of the photos."""
+    """The asset's Gaussians away from those of the object, with colours adapted to the photos."""
     size = float((placed.means.amax(0) - placed.means.amin(0)).norm())
-    near = knn(own.means, placed.means, 1)[0][:, 0] < SEEN * size
+    near = knn(own.means, placed.means, 1)[0][:, 0] < SEEN_DISTANCE * size
     if not near.any():
         return empty_like(own)
     sh = placed.sh.clone()
-    sh[:, 0] += _shift(own, placed[near], placed.means)
+    sh[:, 0] += _colour_shift(own, placed[near], placed.means)
     rest = replace(placed, sh=sh, object_id=torch.full((len(placed),), number, dtype=own.object_id.dtype))
     return rest[~near]
 
 
-def _shift(own: Gaussians, seen: Gaussians, at: Float[Tensor, "n 3"], among: int = 64) -> Float[Tensor, "n 3"]:
-    """What the photos make of the asset's colours, averaged over the nearest places where both are known."""
-    _, mine = knn(own.means, seen.means, 8)
-    difference = own.sh[mine, 0].mean(1) - seen.sh[:, 0]
-    distance, index = knn(seen.means, at, among)
+def _colour_shift(
+    own: Gaussians, seen: Gaussians, at: Float[Tensor, "n 3"], neighbours: int = 64
+) -> Float[Tensor, "n 3"]:
+    """Colour difference between photos and asset, averaged over the nearest points where both are known."""
+    _, nearest_own = knn(own.means, seen.means, 8)
+    difference = own.sh[nearest_own, 0].mean(1) - seen.sh[:, 0]
+    distance, index = knn(seen.means, at, neighbours)
     weight = 1 / distance.clamp_min(1e-9)
     return (difference[index] * weight[..., None]).sum(1) / weight.sum(1, keepdim=True)

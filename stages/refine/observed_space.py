@@ -1,4 +1,4 @@
-"""What the cameras saw through, and so know to be empty."""
+"""Observed free space: which points the cameras saw through, and which they saw."""
 
 from __future__ import annotations
 
@@ -16,45 +16,47 @@ from stages.core.raster.rasterise import rasterise, visibility
 from stages.core.scene.gaussians import Gaussians, concatenate
 from stages.core.scene.scene import Scene
 
-FAR = 1e9
+FAR = 1e9  # depth of pixels without a surface
+MIN_OPAQUE_ALPHA, MAX_EMPTY_ALPHA = 0.9, 0.05  # of pixels with a surface, and without one; others are unknown
+MIN_VIEWS_FOR_TWO = 6  # cameras from which on two must agree that a point is free
 
 
 @dataclass(frozen=True)
 class ObservedSpace:
-    """Views with the depth of the nearest surface in each pixel: FAR where nothing is, 0 where it is not known."""
+    """Depth maps of the scene's views: the nearest surface, FAR in empty pixels, 0 in unknown ones."""
 
     views: list[tuple[Tensor, Tensor, int, int]]  # viewmat, K, width, height
     depth: list[Float[Tensor, "h w"]]
-    weight: Float[Tensor, "n"]  # of each Gaussian in the view where it weighs most [px]; empty without views
+    weight: Float[Tensor, "n"]  # of each Gaussian, maximum over the views [px]; empty without views
 
     @staticmethod
     @torch.no_grad()
     def of(scene: Scene) -> ObservedSpace:
-        """Depths drawn from the scene itself; each pixel takes the least of its neighbours, to be careful."""
+        """Depth maps rendered from the scene; each pixel takes the minimum over 3 x 3 pixels, to be conservative."""
         if scene.cameras is None or not len(scene.cameras):
             return ObservedSpace([], [], torch.zeros(0))
         views, maps = downscaled_views(scene.cameras), []
         weight = torch.zeros(len(scene.gaussians))
         for viewmat, K, width, height in views:
             drawn = rasterise(scene.gaussians, viewmat[None], K[None], width, height)
-            depth = torch.where(drawn.alpha[0] > 0.9, drawn.depth[0], 0.0)
-            depth = torch.where(drawn.alpha[0] < 0.05, FAR, depth)
+            depth = torch.where(drawn.alpha[0] > MIN_OPAQUE_ALPHA, drawn.depth[0], 0.0)
+            depth = torch.where(drawn.alpha[0] < MAX_EMPTY_ALPHA, FAR, depth)
             maps.append(-torch.nn.functional.max_pool2d(-depth[None], 3, 1, 1)[0])
             weight = torch.maximum(weight, visibility(scene.gaussians, viewmat, K, width, height)[1])
         return ObservedSpace(views, maps, weight)
 
-    def empty(self, points: Float[Tensor, "n 3"], margin: float) -> Bool[Tensor, "n"]:
-        """Points that a camera sees more than `margin` in front of the surface behind them.
+    def is_free(self, points: Float[Tensor, "n 3"], margin: float) -> Bool[Tensor, "n"]:
+        """Points more than `margin` in front of the surface in the depth map of a camera.
 
-        Of six cameras or more two must agree, since one may have a floater's depth.
+        With MIN_VIEWS_FOR_TWO cameras or more two must agree, since a floater may corrupt one depth map.
         """
         count = torch.zeros(len(points), dtype=torch.int64)
         for inside, z, depth in self._depths(points):
             count[inside] += (z < depth - margin).long()
-        return count >= (2 if len(self.views) >= 6 else 1)
+        return count >= (2 if len(self.views) >= MIN_VIEWS_FOR_TWO else 1)
 
-    def share(self, points: Float[Tensor, "n 3"], margin: float) -> Float[Tensor, "n"]:
-        """Of the cameras that have a point in their picture, how many see it: nothing is `margin` in front of it."""
+    def visible_fraction(self, points: Float[Tensor, "n 3"], margin: float) -> Float[Tensor, "n"]:
+        """Fraction of the cameras with a point in their image that see it: no surface is `margin` in front of it."""
         seen, framed = torch.zeros(len(points)), torch.zeros(len(points))
         for inside, z, depth in self._depths(points):
             framed += inside
@@ -62,7 +64,7 @@ class ObservedSpace:
         return seen / framed.clamp_min(1)
 
     def _depths(self, points: Float[Tensor, "n 3"]) -> Iterator[tuple[Bool[Tensor, "n"], Tensor, Tensor]]:
-        """For each view which points are in its picture, their depth, and that of the surface drawn there."""
+        """For each view: which points are in its image, their depths, and the depths of the surface there."""
         for (viewmat, K, width, height), depth in zip(self.views, self.depth, strict=True):
             z = depths(points, viewmat)
             pixel = project(points, viewmat, K).nan_to_num(-1).clamp(-1, 1e6).floor().long()
@@ -70,28 +72,30 @@ class ObservedSpace:
             x, y = pixel[inside].T
             yield inside, z[inside], depth[y, x]
 
-    def hidden(self, scene: Gaussians, more: Gaussians, most: float = 0.3, leak: float = 0.1) -> Bool[Tensor, "m"]:
-        """Which of the Gaussians that might be added to the scene hardly change what the cameras see.
+    def is_hidden(
+        self, scene: Gaussians, added: Gaussians, max_weight: float = 0.3, max_leak: float = 0.1
+    ) -> Bool[Tensor, "m"]:
+        """Which Gaussians could be added to the scene with almost no change of its images.
 
-        One may weigh `most` pixels (of the small images) in a view; or, since fur lets a little through and a patch
-        behind it is wide, the share `leak` of what it would weigh with nothing in front.
+        In each view, the weight of one must not exceed `max_weight` [px of the downscaled images], or `max_leak` times
+        its unoccluded weight, since a large disc behind a slightly transparent surface has some weight.
         """
-        keep = torch.ones(len(more), dtype=torch.bool)
-        joint = concatenate([scene, more])
+        keep = torch.ones(len(added), dtype=torch.bool)
+        joint = concatenate([scene, added])
         for viewmat, K, width, height in self.views:
             weight = visibility(joint, viewmat, K, width, height)[1][len(scene) :]
-            bare = visibility(more, viewmat, K, width, height)[1]
-            keep &= weight <= (leak * bare).clamp_min(most)
+            bare = visibility(added, viewmat, K, width, height)[1]
+            keep &= weight <= (max_leak * bare).clamp_min(max_weight)
         return keep
 
 
 @torch.no_grad()
-def object_psnr(before: Scene, after: Scene, most: int = 4) -> float | None:
-    """PSNR [dB] between two states of a scene in the pixels where the objects are, over a few of its cameras."""
+def object_psnr(before: Scene, after: Scene, max_views: int = 4) -> float | None:
+    """PSNR [dB] between two states of a scene in the pixels of objects, over `max_views` cameras; None without any."""
     if before.cameras is None or not len(before.cameras):
         return None
     error = count = 0.0
-    for viewmat, K, width, height in downscaled_views(before.cameras, most):
+    for viewmat, K, width, height in downscaled_views(before.cameras, max_views):
         one, two = (rasterise(s.gaussians, viewmat[None], K[None], width, height).rgb[0] for s in (before, after))
         index, _ = visibility(before.gaussians, viewmat, K, width, height)
         on = (index >= 0) & (before.gaussians.object_id[index.clamp_min(0)] > 0)

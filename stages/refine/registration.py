@@ -1,13 +1,14 @@
-"""A part of an object found on the whole of it: the similarity that puts the whole where the part is.
+"""Registration of a whole object to a seen part of it: the similarity that maps the whole to the part.
 
-Features are matched, many threes of matches give a guess each, the best guesses are polished, in the end against the
-whole with as much noise as the part has. Colours count all along. The part may be any 60 % of the surface, of any
-size, turned any way. All is done on the device where the Gaussians are.
+Feature matches give many pose hypotheses (registration_hypotheses.py); the best are refined by Gauss-Newton, at last
+against the whole with as much noise as the part has. Positions and colours are used throughout. It is tested for parts
+with 60 % of the surface, any rotation and scales 0.5 to 2. Computed on the device of the Gaussians.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
@@ -20,129 +21,140 @@ from stages.core.scene.gaussians import Gaussians
 from stages.refine.registration_cloud import COLOUR_WEIGHT, SMOOTHING_RADIUS, RegistrationCloud
 from stages.refine.registration_hypotheses import PoseHypotheses, misfit, pose_hypotheses
 
-MIN_REGISTRATION_POINTS = 100  # points of a part, or there is nothing to go by
-PLANE = 0.7  # weight of the distance along the normal; along the surface it is the rest, or plain parts would hold all
-AROUND = 300  # poses tried around one that was given
-RELIT = 15 * COLOUR_WEIGHT  # most that light may shift a colour; more is another colour
+MIN_REGISTRATION_POINTS = 100  # of part and of whole
+NORMAL_WEIGHT = 0.7  # of the distance along the normal; the rest is for all directions, and bounds tangential shifts
+HINT_PERTURBATIONS = 300  # poses tried around a hint
+MAX_TINT = 15 * COLOUR_WEIGHT  # largest colour offset attributed to illumination [diameters]
+
+
+class Target(NamedTuple):
+    """A cloud to register to, and its search structure."""
+
+    cloud: RegistrationCloud
+    tree: KDTree | BruteForce
 
 
 @dataclass(frozen=True)
 class Registration:
-    """Where the whole is."""
+    """Result of a registration."""
 
     similarity: Similarity  # whole to part
-    fit: float  # 1: every point of the part is on the whole, in place and colour; 0: none within 6 % of the diameter
+    fit: float  # 1: all points of the part agree in position and colour; 0: none within 6 % of the diameter
 
 
 def register(part: Gaussians, whole: Gaussians, seed: int = 0, hint: Similarity | None = None) -> Registration | None:
-    """Put `whole` where `part` is, perhaps near a `hint`; nothing when no three features agree and none was given."""
+    """The similarity from `whole` to `part`, optionally near a `hint`; None without a hint or consistent features."""
     return register_clouds(RegistrationCloud.of(part, seed), RegistrationCloud.of(whole, seed), seed, hint)
 
 
 def register_clouds(
     part: RegistrationCloud, whole: RegistrationCloud, seed: int = 0, hint: Similarity | None = None
 ) -> Registration | None:
-    """As `register`, for clouds made before."""
-    rough = coarse_registration(part, whole, seed, hint)
-    return fine_registration(rough, part, whole, seed) if len(rough) else None
+    """As `register`, for existing clouds."""
+    coarse = coarse_registration(part, whole, seed, hint)
+    return fine_registration(coarse, part, whole, seed) if len(coarse) else None
 
 
 def coarse_registration(
     part: RegistrationCloud, whole: RegistrationCloud, seed: int = 0, hint: Similarity | None = None
 ) -> PoseHypotheses:
-    """The few most promising poses, the best first, about 3 degrees off; none where no features agree.
+    """At most 2 candidate poses, best first, accurate to about 3 degrees; empty where no features agree.
 
-    With a `hint`, whole to part, those tried are the ones around it too.
+    Poses around a `hint` (whole to part) are tried too.
     """
     if min(len(part.points), len(whole.points)) < MIN_REGISTRATION_POINTS:
         return PoseHypotheses(torch.zeros(0), torch.zeros(0, 3, 3), torch.zeros(0, 3))
     poses = pose_hypotheses(part, whole, seed)
     if hint is not None:
-        poses = PoseHypotheses.joined(to_normalised_frames(hint, part, whole).shaken(AROUND, seed), poses)
+        poses = PoseHypotheses.joined(
+            to_normalised_frames(hint, part, whole).perturbed(HINT_PERTURBATIONS, seed), poses
+        )
     if not len(poses):
         return poses
     tree, order = whole.tree(), _order(part, seed)
     poses = _best(poses, part, tree, order[:60], 200)
     poses = _best(poses, part, tree, order[:300], 200).distinct(12, 8.0, 0.05)
-    poses = gauss_newton(poses, part, order[:300], whole, tree, 10, 0.03)
+    poses = gauss_newton(poses, part, order[:300], Target(whole, tree), rounds=10, floor=0.03)
     return _best(poses, part, tree, order[:1000], 12).distinct(2, 4.0, 0.02)
 
 
 def fine_registration(
     poses: PoseHypotheses, part: RegistrationCloud, whole: RegistrationCloud, seed: int = 0
 ) -> Registration:
-    """The best of rough poses and some around them, as exact as the part allows."""
+    """The best of coarse poses and perturbations of them, refined as far as the noise of the part allows."""
     order, size = _order(part, seed), float(poses.scale[0])
-    noise, tint = _difference(poses[:1], part, whole)
+    noise, tint = _noise_and_tint(poses[:1], part, whole)
     noisy = whole.as_seen(size * noise, tint, SMOOTHING_RADIUS * size, seed)
     tree = noisy.tree()
-    poses = gauss_newton(poses.shaken(5, seed), part, order[:700], noisy, tree, 10, 0.03)
+    target = Target(noisy, tree)
+    poses = gauss_newton(poses.perturbed(5, seed), part, order[:700], target, rounds=10, floor=0.03)
     poses = _best(poses, part, tree, order, 1)
-    for _ in range(3):  # what is polished is not quite what is judged, so the way there may have been better
-        poses = PoseHypotheses.joined(poses, gauss_newton(poses[-1:], part, order[:2500], noisy, tree, 7, 0.02))
+    for _ in range(3):  # the refined criterion differs from that of selection
+        refined = gauss_newton(poses[-1:], part, order[:2500], target, rounds=7, floor=0.02)
+        poses = PoseHypotheses.joined(poses, refined)
     poses = _best(poses, part, tree, order, 1)
     fit = 1 - float(misfit(poses, part.points, part.colours, tree))
-    return Registration(_in_the_scene(poses, part, whole), fit)
+    return Registration(_to_scene_units(poses, part, whole), fit)
 
 
 def coarse_fit(poses: PoseHypotheses, part: RegistrationCloud, whole: RegistrationCloud) -> float:
-    """Fit of the first of rough poses; 0 without any."""
+    """Fit of the first of coarse poses; 0 without any."""
     return 1 - float(misfit(poses[:1], part.points, part.colours, whole.tree())) if len(poses) else 0.0
 
 
 def _order(part: RegistrationCloud, seed: int) -> Int[Tensor, "n"]:
-    """The part's points shuffled, so that the first few are anywhere."""
+    """A random permutation of the part's points, of which prefixes are random samples."""
     order = torch.randperm(len(part.points), generator=torch.Generator().manual_seed(seed))
     return order.to(part.points.device)
 
 
 def _best(
-    poses: PoseHypotheses, part: RegistrationCloud, tree: KDTree | BruteForce, some: Int[Tensor, "k"], most: int
+    poses: PoseHypotheses, part: RegistrationCloud, tree: KDTree | BruteForce, some: Int[Tensor, "k"], count: int
 ) -> PoseHypotheses:
-    """The `most` that fit best, in order, judged by `some` points."""
-    worth = misfit(poses, part.points[some], part.colours[some], tree)
-    return poses[worth.topk(min(most, len(poses)), largest=False).indices]
+    """The `count` poses with the smallest misfit of the points `some`, best first."""
+    misfits = misfit(poses, part.points[some], part.colours[some], tree)
+    return poses[misfits.topk(min(count, len(poses)), largest=False).indices]
 
 
-def _difference(
+def _noise_and_tint(
     pose: PoseHypotheses, part: RegistrationCloud, whole: RegistrationCloud
 ) -> tuple[float, Float[Tensor, "3"]]:
-    """Of a part from its whole: standard deviation off the surface [diameters of the part], and median colour.
+    """Noise of a part relative to its whole: standard deviation off the surface [diameters], and colour offset.
 
-    Noise makes a thin thing thicker and its rim wider; a whole as noisy as the part is wider by as much. And the part
-    may be seen in another light, though not in any.
+    Noise thickens thin parts and widens their edges; adding the same noise to the whole removes this bias. The colour
+    offset, due to illumination, is limited to MAX_TINT.
     """
     moved = pose(part.raw[:3000])[0]
     index = neighbour_index(whole.points).query(moved)[1][:, 0]
     off = ((moved - whole.points[index]) * whole.normals[index]).sum(1)
     tint = (part.raw_colours[:3000] - whole.colours[index]).median(0).values
-    return 1.4826 * float(off.abs().median()) / float(pose.scale[0]), tint.clamp(-RELIT, RELIT)
+    return 1.4826 * float(off.abs().median()) / float(pose.scale[0]), tint.clamp(-MAX_TINT, MAX_TINT)
 
 
 def gauss_newton(
     poses: PoseHypotheses,
     part: RegistrationCloud,
     some: Int[Tensor, "k"],
-    whole: RegistrationCloud,
-    tree: KDTree | BruteForce,
+    target: Target,
     rounds: int,
     floor: float,
 ) -> PoseHypotheses:
-    """Gauss-Newton on the robust one-sided coloured Chamfer distance, all poses at once.
+    """Gauss-Newton on a robust one-sided Chamfer distance in position and colour, batched over poses.
 
-    Nearest neighbours are taken in place and colour; their distance counts mostly along the normal (Chen and Medioni
-    1992) and with weight 1 / (1 + (d / tau)^2)^2 (Geman and McClure 1985), tau being 2.5 times the median distance or
-    `floor` [diameters]. It is measured in the part's own units: in the whole's, to shrink would always look better.
+    Nearest neighbours are found in position and colour; their distance is weighted mostly along the normal (Chen and
+    Medioni 1992) and by 1 / (1 + (d / tau)^2)^2 (Geman and McClure 1985), where tau is 2.5 times the median distance,
+    at least `floor` [diameters]. Distances are in units of the part: in those of the whole, shrinking the part would
+    always reduce them.
     """
     x, colours = part.points[some].double(), part.colours[some].double()
-    targets, normals = whole.points.double(), whole.normals.double()
+    targets, normals = target.cloud.points.double(), target.cloud.normals.double()
     poses = PoseHypotheses(poses.scale.double(), poses.rotation.double(), poses.translation.double())
     for _ in range(rounds):
         y = poses(x)
-        distance, index = (found[..., 0] for found in tree.query(torch.cat([y, colours.expand_as(y)], 2)))
+        distance, index = (found[..., 0] for found in target.tree.query(torch.cat([y, colours.expand_as(y)], 2)))
         tau = (2.5 * distance.median(1, keepdim=True).values).clamp_min(floor)
         step = _step(y, y - targets[index], normals[index], 1 / (1 + (distance / tau).square()))
-        poses = _moved(poses, y.mean(1), step)
+        poses = _stepped(poses, y.mean(1), step)
         if float(step.abs().max()) < 2e-5:
             break
     return PoseHypotheses(poses.scale.float(), nearest_rotation(poses.rotation).float(), poses.translation.float())
@@ -151,30 +163,30 @@ def gauss_newton(
 def _step(
     y: Float[Tensor, "h k 3"], error: Float[Tensor, "h k 3"], normals: Float[Tensor, "h k 3"], weight: Tensor
 ) -> Float[Tensor, "h 7"]:
-    """Turn [rad], shift and log scale about the mean of y that lessen the weighted errors the most."""
+    """Gauss-Newton step: rotation [rad], shift and log scale about the mean of y."""
     arm = y - y.mean(1, keepdim=True)
-    axes = [(normals, PLANE), *((axis.expand_as(y), 1 - PLANE) for axis in torch.eye(3).to(y))]
+    axes = [(normals, NORMAL_WEIGHT), *((axis.expand_as(y), 1 - NORMAL_WEIGHT) for axis in torch.eye(3).to(y))]
     system = y.new_zeros(len(y), 8, 8)
-    for axis, share in axes:
+    for axis, weight_along in axes:
         along = [((arm - error) * axis).sum(2, keepdim=True), (error * axis).sum(2, keepdim=True)]
-        rows = torch.cat([torch.linalg.cross(arm, axis), axis, *along], 2) * (share**0.5 * weight[..., None])
+        rows = torch.cat([torch.linalg.cross(arm, axis), axis, *along], 2) * (weight_along**0.5 * weight[..., None])
         system += rows.mT @ rows
     H, slope = system[:, :7, :7], system[:, :7, 7]
     damping = 1e-9 * H.diagonal(dim1=1, dim2=2).mean(1)
     return -torch.linalg.solve(H + damping[:, None, None] * torch.eye(7).to(y), slope).clamp(-0.5, 0.5)
 
 
-def _moved(poses: PoseHypotheses, about: Float[Tensor, "h 3"], step: Float[Tensor, "h 7"]) -> PoseHypotheses:
-    """Poses after a step of Gauss-Newton."""
+def _stepped(poses: PoseHypotheses, about: Float[Tensor, "h 3"], step: Float[Tensor, "h 7"]) -> PoseHypotheses:
+    """Poses after a Gauss-Newton step."""
     angle = step[:, :3].norm(dim=1, keepdim=True).clamp_min(1e-12)
-    turn = matrix(torch.cat([(angle / 2).cos(), step[:, :3] / angle * (angle / 2).sin()], 1))
-    grown = step[:, 6].exp()
-    arm = (turn @ (poses.translation - about)[..., None])[..., 0]
-    return PoseHypotheses(poses.scale * grown, turn @ poses.rotation, grown[:, None] * arm + about + step[:, 3:6])
+    rotation = matrix(torch.cat([(angle / 2).cos(), step[:, :3] / angle * (angle / 2).sin()], 1))
+    growth = step[:, 6].exp()
+    arm = (rotation @ (poses.translation - about)[..., None])[..., 0]
+    return PoseHypotheses(poses.scale * growth, rotation @ poses.rotation, growth[:, None] * arm + about + step[:, 3:6])
 
 
 def to_normalised_frames(place: Similarity, part: RegistrationCloud, whole: RegistrationCloud) -> PoseHypotheses:
-    """Part to whole in normalised frames, from whole to part in the units of the scene."""
+    """Pose (part to whole, normalised frames) of a similarity (whole to part, scene units)."""
     place = place.to(part.centre.device)
     R = place.rotation.mT
     scale = part.diameter / (place.scale * whole.diameter)
@@ -182,9 +194,9 @@ def to_normalised_frames(place: Similarity, part: RegistrationCloud, whole: Regi
     return PoseHypotheses(torch.tensor([scale]).to(R), R[None], middle[None])
 
 
-def _in_the_scene(pose: PoseHypotheses, part: RegistrationCloud, whole: RegistrationCloud) -> Similarity:
-    """Whole to part in the units of the scene, from part to whole in normalised frames."""
+def _to_scene_units(pose: PoseHypotheses, part: RegistrationCloud, whole: RegistrationCloud) -> Similarity:
+    """Similarity (whole to part, scene units) of a pose (part to whole, normalised frames)."""
     scale, R = float(pose.scale[0]), pose.rotation[0].mT
-    grown = part.diameter / (scale * whole.diameter)
-    shift = part.centre - part.diameter / scale * R @ pose.translation[0] - grown * R @ whole.centre
-    return Similarity(grown, R, shift)
+    growth = part.diameter / (scale * whole.diameter)
+    shift = part.centre - part.diameter / scale * R @ pose.translation[0] - growth * R @ whole.centre
+    return Similarity(growth, R, shift)

@@ -1,4 +1,4 @@
-"""Guesses of a similarity between two clouds: local features are matched, and threes of matches that agree are kept."""
+"""Hypotheses of the similarity between two clouds, from triples of matched local features that agree."""
 
 from __future__ import annotations
 
@@ -12,18 +12,19 @@ from stages.core.geometry.neighbours import BruteForce, KDTree
 from stages.core.geometry.rotations import matrix, nearest_rotation
 from stages.refine.registration_cloud import COLOUR_WEIGHT, RegistrationCloud
 
-RADII = (0.07, 0.14, 0.28)  # of the neighbourhoods described [diameters of the whole object]
-SIZES = (1.0, 1.15, 1.32, 1.52)  # diameters of the whole in those of the part; a feature knows no scale, so try some
-SLACK = 1.18  # between two of these sizes, and to spare
-KEYPOINTS, CHOICES = 500, 4  # points of the part that are matched, and matches kept for each
-TARGETS = 2000  # points of the whole to match with
-DRAWS = 40_000  # threes of matches for each size
-WORST = 0.06  # coloured distance at which a point counts as not matched at all [diameters]
+FEATURE_RADII = (0.07, 0.14, 0.28)  # of the described neighbourhoods [diameters of the whole object]
+SCALES = (1.0, 1.15, 1.32, 1.52)  # tried ratios of the diameters of whole and part, since features have no scale
+SCALE_TOLERANCE = 1.18  # ratio of an edge to its expected length; more than the step between SCALES
+KEYPOINTS, MATCHES_PER_KEYPOINT = 500, 4  # of the part
+TARGETS = 2000  # points of the whole that keypoints are matched to
+TRIPLES = 40_000  # of matches, drawn for each scale
+MAX_HYPOTHESES = 6000
+MAX_DISTANCE = 0.06  # joint distance in position and colour at which residuals are truncated [diameters]
 
 
 @dataclass(frozen=True)
 class PoseHypotheses:
-    """Candidate similarities, part to whole, in the clouds' normalised frames: x -> scale R x + translation."""
+    """Similarities from part to whole in the clouds' normalised frames: x -> scale R x + translation."""
 
     scale: Float[Tensor, "h"]
     rotation: Float[Tensor, "h 3 3"]
@@ -40,7 +41,7 @@ class PoseHypotheses:
 
     @staticmethod
     def fitted(a: Float[Tensor, "h k 3"], b: Float[Tensor, "h k 3"]) -> PoseHypotheses:
-        """Least squares, a to b. Source: Umeyama 1991, as in stages.core.geometry.similarity, for many at once."""
+        """Least-squares similarities a to b, batched. Source: Umeyama 1991, as in stages.core.geometry.similarity."""
         mean_a, mean_b = a.mean(1, keepdim=True), b.mean(1, keepdim=True)
         A, B = a - mean_a, b - mean_b
         H = B.mT @ A
@@ -50,10 +51,11 @@ class PoseHypotheses:
 
     @staticmethod
     def joined(*parts: PoseHypotheses) -> PoseHypotheses:
+        """The concatenation of several sets."""
         return PoseHypotheses(*(torch.cat([getattr(p, f.name) for p in parts]) for f in fields(PoseHypotheses)))
 
-    def shaken(self, copies: int, seed: int) -> PoseHypotheses:
-        """These, and `copies` of each about 5 degrees, 4 % of size and 2 % of the diameter off, about the origin."""
+    def perturbed(self, copies: int, seed: int) -> PoseHypotheses:
+        """These and `copies` random perturbations of each by about 5 degrees, 4 % of scale and 2 % of the diameter."""
         rng = torch.Generator().manual_seed(seed)
         at = self.scale.device
         some = self[torch.arange(len(self), device=at).repeat(copies)]
@@ -63,15 +65,15 @@ class PoseHypotheses:
         moved = grown[:, None] * (turn @ some.translation[..., None])[..., 0] + shift
         return PoseHypotheses.joined(self, PoseHypotheses(some.scale * grown, turn @ some.rotation, moved))
 
-    def distinct(self, most: int, degrees: float, far: float) -> PoseHypotheses:
-        """The first `most` that differ from all before them by an angle or a shift."""
+    def distinct(self, count: int, degrees: float, shift: float) -> PoseHypotheses:
+        """The first `count` that differ from all before them by at least an angle or a shift [diameters]."""
         traces = self.rotation.flatten(1) @ self.rotation.flatten(1).mT
         turned = torch.rad2deg(((traces - 1) / 2).clamp(-1, 1).arccos())
         shifted = (self.translation[:, None] - self.translation).norm(dim=2)
-        alike = ((turned < degrees) & (shifted < far)).tolist()  # one copy; to ask a GPU for each would take longer
+        alike = ((turned < degrees) & (shifted < shift)).tolist()  # a single copy from the GPU
         kept: list[int] = []
         for i in range(len(self)):
-            if len(kept) < most and not any(alike[i][j] for j in kept):
+            if len(kept) < count and not any(alike[i][j] for j in kept):
                 kept.append(i)
         return self[torch.tensor(kept, dtype=torch.int64).to(self.scale.device)]
 
@@ -79,33 +81,34 @@ class PoseHypotheses:
 def misfit(
     poses: PoseHypotheses, points: Float[Tensor, "n 3"], colours: Float[Tensor, "n 3"], tree: KDTree | BruteForce
 ) -> Float[Tensor, "h"]:
-    """Mean squared distance, in place and colour, of the part's points from the whole, in units of WORST^2: 0 to 1.
+    """Truncated mean squared distance in position and colour of the part's points from the whole, 0 to 1.
 
-    One-sided, as what the part lacks says nothing, and cut off, as what is not of the object says little.
+    In units of MAX_DISTANCE^2. One-sided, since the part is incomplete; truncated, for robustness to outliers.
     """
     moved = poses(points)
-    distance, _ = tree.query(torch.cat([moved, colours.expand_as(moved)], 2), within=WORST)
-    return (distance[..., 0].clamp_max(WORST) / WORST).square().mean(1)
+    distance, _ = tree.query(torch.cat([moved, colours.expand_as(moved)], 2), within=MAX_DISTANCE)
+    return (distance[..., 0].clamp_max(MAX_DISTANCE) / MAX_DISTANCE).square().mean(1)
 
 
 def local_features(cloud: RegistrationCloud, at: Int[Tensor, "k"], unit: float) -> Float[Tensor, "k f"]:
-    """What surrounds points of a cloud within RADII times `unit`, whichever way it is turned.
+    """Rotation-invariant features of the neighbourhoods of some points, of radii FEATURE_RADII times `unit`.
 
-    Of each neighbourhood: mean colour, its spread, the three standard deviations of place, and how far the mean lies
-    off the point, along the normal and at all. Each is divided by what it usually differs by.
+    For each neighbourhood: mean and standard deviation of colour, the triple principal standard deviations of
+    position, and the offset of the mean from the point, along the normal and in total. Each is divided by its typical
+    variation.
     """
     x, colour, q = cloud.points, cloud.colours / COLOUR_WEIGHT, cloud.points[at]
     squared = torch.cdist(q, x).square()
     second = (x[:, :, None] * x[:, None]).flatten(1)
     values = torch.cat([x.new_ones(len(x), 1), x, second, colour, colour.square()], 1)
     out = []
-    for r in (unit * radius for radius in RADII):
+    for r in (unit * radius for radius in FEATURE_RADII):
         sums = (1 - squared / r**2).clamp_min(0) @ values
-        _, mean, second, tint, tint2 = (sums / sums[:, :1]).split([1, 3, 9, 3, 3], 1)
+        _, mean, second, colour_mean, colour_square = (sums / sums[:, :1]).split([1, 3, 9, 3, 3], 1)
         covariance = second.unflatten(1, (3, 3)) - mean[:, :, None] * mean[:, None]
         off = mean - q
         out += [
-            tint / 12, (tint2 - tint.square()).clamp_min(0).sqrt() / 12,
+            colour_mean / 12, (colour_square - colour_mean.square()).clamp_min(0).sqrt() / 12,
             torch.linalg.eigvalsh(covariance).clamp_min(0).sqrt() / (0.05 * r),
             (off * cloud.normals[at]).sum(1, keepdim=True).abs() / (0.05 * r),
             off.norm(dim=1, keepdim=True) / (0.08 * r),
@@ -113,10 +116,8 @@ def local_features(cloud: RegistrationCloud, at: Int[Tensor, "k"], unit: float) 
     return torch.cat(out, 1)
 
 
-def pose_hypotheses(
-    part: RegistrationCloud, whole: RegistrationCloud, seed: int = 0, most: int = 6000
-) -> PoseHypotheses:
-    """Similarities through three matches each whose distances, and angles of normals, agree.
+def pose_hypotheses(part: RegistrationCloud, whole: RegistrationCloud, seed: int = 0) -> PoseHypotheses:
+    """Similarities from triples of matches with consistent distances and angles of normals.
 
     Source: Fischler and Bolles 1981; agreement of edges before fitting as in Rusu et al. 2009, "Fast point feature
     histograms (FPFH) for 3D registration".
@@ -126,26 +127,26 @@ def pose_hypotheses(
     keypoints = torch.randperm(len(part.points), generator=generator)[:KEYPOINTS].to(at)
     features = local_features(whole, targets, 1.0)
     found = []
-    for size in SIZES:
-        like = torch.cdist(local_features(part, keypoints, size), features)
-        choices = targets[like.topk(min(CHOICES, len(targets)), dim=1, largest=False).indices]
-        three = torch.randint(len(keypoints), (DRAWS, 3), generator=generator).to(at)
-        which = torch.randint(choices.shape[1], (DRAWS, 3), generator=generator).to(at)
-        found.append(_agreeing(part, whole, keypoints[three], choices[three, which], size))
+    for size in SCALES:
+        feature_distance = torch.cdist(local_features(part, keypoints, size), features)
+        choices = targets[feature_distance.topk(min(MATCHES_PER_KEYPOINT, len(targets)), dim=1, largest=False).indices]
+        triple = torch.randint(len(keypoints), (TRIPLES, 3), generator=generator).to(at)
+        which = torch.randint(choices.shape[1], (TRIPLES, 3), generator=generator).to(at)
+        found.append(_consistent(part, whole, keypoints[triple], choices[triple, which], size))
     a, b = (torch.cat(side) for side in zip(*found, strict=True))
     poses = PoseHypotheses.fitted(a, b)
     exact = (poses.scale[:, None, None] * (a @ poses.rotation.mT) + poses.translation[:, None] - b).norm(dim=2).amax(1)
-    return poses[(exact < 0.05) & (poses.scale > 0.5) & (poses.scale < 1.15)][:most]
+    return poses[(exact < 0.05) & (poses.scale > 0.5) & (poses.scale < 1.15)][:MAX_HYPOTHESES]
 
 
-def _agreeing(
+def _consistent(
     part: RegistrationCloud, whole: RegistrationCloud, i: Int[Tensor, "d 3"], j: Int[Tensor, "d 3"], size: float
 ):
-    """Points of the threes that span enough, keep their proportions and are of about the size supposed."""
+    """Points of the triples that are large enough, keep their proportions and have about the assumed scale."""
     a, b = part.points[i], whole.points[j]
     edges_a, edges_b = ((p - p.roll(1, 1)).norm(dim=2) for p in (a, b))
     ratio = size * edges_b / edges_a.clamp_min(1e-9)
-    ok = (edges_a.amin(1) > 0.15) & (ratio > 1 / SLACK).all(1) & (ratio < SLACK).all(1)
+    ok = (edges_a.amin(1) > 0.15) & (ratio > 1 / SCALE_TOLERANCE).all(1) & (ratio < SCALE_TOLERANCE).all(1)
     ok &= ratio.amax(1) < 1.15 * ratio.amin(1)
     bend_a, bend_b = ((n * n.roll(1, 1)).sum(2).abs() for n in (part.normals[i], whole.normals[j]))
     ok &= ((bend_a - bend_b).abs() < 0.35).all(1)

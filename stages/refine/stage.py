@@ -1,4 +1,4 @@
-"""labelled.ply -> refined.ply"""
+"""The refine stage: labelled.ply -> refined.ply."""
 
 from __future__ import annotations
 
@@ -29,8 +29,11 @@ log = logging.getLogger(__name__)
 
 
 def run(scene: Path, out: Path, options: RefineOptions = RefineOptions()) -> None:  # noqa: B008 -- frozen
-    """Objects without floaters, closed all around, and the table beneath them filled: labelled.ply -> refined.ply."""
-    pick_device(options.device)  # refuses a GPU that is not there; only registration and DiffSplat use one
+    """Remove outliers, complete objects, and fill the background under them: labelled.ply -> refined.ply.
+
+    Raises InputError for invalid inputs, such as a scene without objects; then nothing is written.
+    """
+    pick_device(options.device)  # raises for an absent GPU; only registration and generators use one
     whole = read_scene(scene)
     if not bool((whole.gaussians.object_id > 0).any()):
         raise InputError(f"{scene}: has no objects; label them with `ngff segment {scene} -o labelled.ply` first")
@@ -38,49 +41,49 @@ def run(scene: Path, out: Path, options: RefineOptions = RefineOptions()) -> Non
     facts = {**provenance("refine", [Path(scene)], options), "scene": whole.provenance}
     write_scene(out, replace(refined, provenance=facts))
     psnr = object_psnr(whole, refined)
-    seen = "" if psnr is None else f"; in the views of the photos it equals the input to {psnr:.1f} dB"
+    seen = "" if psnr is None else f"; PSNR against the input in the views of the photos {psnr:.1f} dB"
     log.info("%s: %d Gaussians, from %d%s", out, len(refined.gaussians), len(whole.gaussians), seen)
 
 
 def refine(scene: Scene, options: RefineOptions = RefineOptions()) -> Scene:  # noqa: B008 -- frozen
-    """The three steps on every object. What the photos show stays as it is; only the unseen is added.
+    """Outlier removal, object completion, background filling; Gaussians are added only where the photos show none.
 
-    Where things hang on a wall, and there is no floor, it is done with the wall lying down, and turned back.
+    A scene with objects on a wall and no floor is rotated so that the wall becomes the floor, and rotated back.
     """
     wall = find_wall(scene, view_extent(scene), options.seed)
     if wall is None:
         return _refined(scene, find_support(scene, seed=options.seed), options)
-    laid = rotate_wall_to_floor(scene, wall)
-    done = _refined(laid, find_support(laid, seed=options.seed), options)
-    gaussians = transformed(done.gaussians, wall.inverse())
-    return replace(done, gaussians=gaussians, cameras=scene.cameras, floor=scene.floor)
+    rotated = rotate_wall_to_floor(scene, wall)
+    refined = _refined(rotated, find_support(rotated, seed=options.seed), options)
+    gaussians = transformed(refined.gaussians, wall.inverse())
+    return replace(refined, gaussians=gaussians, cameras=scene.cameras, floor=scene.floor)
 
 
 def _refined(scene: Scene, support: Support | None, options: RefineOptions) -> Scene:
-    """The three steps for things on `support`."""
+    """The three steps for objects on `support`."""
     completer = choose(BACKENDS, options.chosen)
-    g = grow_objects(scene.gaussians, support, _reach(scene.gaussians))
-    stray = floaters(g, options.outliers) if options.outliers else torch.zeros(len(g), dtype=torch.bool)
-    scene = replace(scene, gaussians=g[~stray])
-    sight = ObservedSpace.of(scene)
+    g = grow_objects(scene.gaussians, support, _growth_radius(scene.gaussians))
+    outliers = floaters(g, options.outliers) if options.outliers else torch.zeros(len(g), dtype=torch.bool)
+    scene = replace(scene, gaussians=g[~outliers])
+    observed = ObservedSpace.of(scene)
     numbers = [i for i in scene.gaussians.object_id.unique().tolist() if i > 0]
-    made = [completer(scene, i, sight, support, options) for i in tqdm(numbers, unit="object")]
-    made = concatenate([empty_like(scene.gaussians), *made])
-    made = made[sight.hidden(scene.gaussians, made)]
+    added = [completer(scene, i, observed, support, options) for i in tqdm(numbers, unit="object")]
+    added = concatenate([empty_like(scene.gaussians), *added])
+    added = added[observed.is_hidden(scene.gaussians, added)]
     for i in numbers:
-        count = int((made.object_id == i).sum())
-        log.info("  %d  %s: %d Gaussians close its unseen sides", i, scene.name_of(i), count)
+        count = int((added.object_id == i).sum())
+        log.info("  %d  %s: %d Gaussians added to its unseen sides", i, scene.name_of(i), count)
     filled = scene
     if options.background and support is not None:
-        filled = fill_background(scene, sight, support, options.seed)
+        filled = fill_background(scene, observed, support, options.seed)
     new = len(filled.gaussians) - len(scene.gaussians)
-    log.info("  %d floaters taken away, %d Gaussians more for the table", int(stray.sum()), new)
-    whole = replace(filled, gaussians=concatenate([filled.gaussians, made]))
+    log.info("  %d outliers removed, %d Gaussians added to the table", int(outliers.sum()), new)
+    whole = replace(filled, gaussians=concatenate([filled.gaussians, added]))
     return with_raw(whole, scene) if options.keep_raw else whole
 
 
 def with_raw(whole: Scene, raw: Scene) -> Scene:
-    """The K objects of a scene, and as K + 1 to 2 K those of another state of it, under their names with "(raw)"."""
+    """`whole` with the K objects of `raw` added as objects K + 1 to 2 K, "(raw)" appended to their names."""
     g = raw.gaussians[raw.gaussians.object_id > 0]
     count = int(g.object_id.max())
     copies = tuple(replace(o, id=o.id + count, name=f"{o.name} (raw)") for o in whole.objects)
@@ -88,8 +91,8 @@ def with_raw(whole: Scene, raw: Scene) -> Scene:
     return replace(whole, gaussians=both, objects=whole.objects + copies)
 
 
-def _reach(g: Gaussians) -> float:
-    """How far a halo of stray Gaussians reaches around the objects: three times their usual spacing."""
+def _growth_radius(g: Gaussians) -> float:
+    """Radius of region growing: 3 times the median spacing of labelled Gaussians [scene units]."""
     labelled = g.means[(g.object_id > 0) & g.means.isfinite().all(1)]
     if len(labelled) < 5:
         return 0.0

@@ -1,4 +1,4 @@
-"""Parts that are one body although their colours differ: they hold each other, or one hangs from the other."""
+"""Merging of objects that are parts of one body: their convex hulls interlock, or one is suspended from the other."""
 
 from __future__ import annotations
 
@@ -12,25 +12,26 @@ from torch import Tensor
 from stages.core.perception.support import Support
 from stages.core.scene.gaussians import Gaussians
 
-CELL = 0.01  # that positions are thinned to [view radii]
-TOUCH = 2.0  # cells between parts that touch
-HELD = 0.05  # share of each part within the convex hull of the other from which neither came there alone
-FIRM = 0.05  # share of the smaller part that touches the larger, at least
-RESTS = 4.0  # what begins higher than this does not stand on the table [tolerances]
-BENEATH = 0.25  # share of a part that lies lower than where it would lie on another
+CELL_SIZE = 0.01  # of the grid that positions are thinned to [camera distance]
+MAX_CONTACT_DISTANCE = 2.0  # between touching points of two parts [cells]
+MIN_MUTUAL_OVERLAP = 0.05  # fraction of each part inside the convex hull of the other, for interlocking parts
+MIN_CONTACT_FRACTION = 0.05  # fraction of the smaller part that touches the larger
+MAX_STANDING_HEIGHT = 4.0  # of the lowest points of a part that stands on the table [support tolerances]
+MIN_BELOW_FRACTION = 0.25  # fraction of a part below its contact with another, for a suspended part
 
 
 @dataclass(frozen=True)
 class ObjectPart:
-    """One object found so far, thinned."""
+    """A labelled object, thinned to one point per cell."""
 
-    points: np.ndarray  # (p, 3) one a cell
-    heights: np.ndarray  # (p,) above the table [tolerances]
-    planes: np.ndarray | None  # (f, 4) outward planes of its convex hull; None for what is flat
+    points: np.ndarray  # (p, 3) one per cell
+    heights: np.ndarray  # (p,) above the table [support tolerances]
+    planes: np.ndarray | None  # (f, 4) outward planes of its convex hull; None without volume
 
     @classmethod
     def of(cls, means: Float[Tensor, "n 3"], support: Support) -> ObjectPart:
-        side = CELL * support.view.radius
+        """The part with these finite means."""
+        side = CELL_SIZE * support.view.radius
         _, first = np.unique((means / side).floor().numpy(), axis=0, return_index=True)
         thin = means[first]
         points = thin.double().numpy()
@@ -41,7 +42,7 @@ class ObjectPart:
         return cls(points, (support.heights(thin) / support.tolerance).numpy(), planes)
 
     def inside(self, other: ObjectPart, margin: float) -> float:
-        """Share of this part that lies deeper than `margin` in the convex hull of another."""
+        """Fraction of this part deeper than `margin` [scene units] inside the convex hull of another."""
         if other.planes is None:
             return 0.0
         depth = -(self.points @ other.planes[:, :3].T + other.planes[:, 3]).max(1)
@@ -49,41 +50,44 @@ class ObjectPart:
 
 
 def merge_bodies(g: Gaussians, support: Support) -> Gaussians:
-    """The same Gaussians, with the objects that are parts of one body under the number of the largest.
+    """The Gaussians with the objects that are parts of one body relabelled to the largest of them.
 
-    Two bodies pushed together do not enter each other's convex hull both at once (a spoon enters that of its cup,
-    but the cup not that of the spoon), limbs and the trunk they embrace do. And a part that reaches no table and
-    does not lie on top of another is fixed to what it touches.
+    Criterion 1: each of two parts has points inside the convex hull of the other, as limbs and the trunk they
+    embrace; separate bodies do not (a spoon enters the hull of its cup, but not the cup that of the spoon).
+    Criterion 2: a part that neither reaches the table nor lies on top of another is attached to what it touches.
     """
     ids = g.object_id.clone()
     finite = g.means.isfinite().all(1)
     parts = {
         n: ObjectPart.of(g.means[(ids == n) & finite], support) for n in ids[finite].unique().tolist() if n > 0
     }  # fmt: skip
-    while (pair := _one_body(parts, CELL * support.view.radius)) is not None:
-        kept, gone = sorted(pair, key=lambda n: (-len(parts[n].points), n))
-        ids[ids == gone] = kept
+    while (pair := _next_pair(parts, CELL_SIZE * support.view.radius)) is not None:
+        kept, removed = sorted(pair, key=lambda n: (-len(parts[n].points), n))
+        ids[ids == removed] = kept
         parts[kept] = ObjectPart.of(g.means[(ids == kept) & finite], support)
-        del parts[gone]
+        del parts[removed]
     return replace(g, object_id=ids)
 
 
-def _one_body(parts: dict[int, ObjectPart], side: float) -> tuple[int, int] | None:
-    """Two parts that belong to one body: first those that hold each other, then the firmest that hangs."""
+def _next_pair(parts: dict[int, ObjectPart], side: float) -> tuple[int, int] | None:
+    """The next two parts to merge: interlocking ones first, then the suspended one with the largest contact."""
     trees = {n: cKDTree(part.points) for n, part in parts.items()}
-    hanging: list[tuple[float, int, int]] = []
+    suspended: list[tuple[float, int, int]] = []
     for a, part in parts.items():
         for b, other in parts.items():
             if a == b:
                 continue
-            touching = trees[b].query(part.points, distance_upper_bound=TOUCH * side)[0] < np.inf
+            touching = trees[b].query(part.points, distance_upper_bound=MAX_CONTACT_DISTANCE * side)[0] < np.inf
             if not touching.any():
                 continue
-            firm = touching.sum() / min(len(part.points), len(other.points))
+            contact = touching.sum() / min(len(part.points), len(other.points))
             both = min(part.inside(other, 0.25 * side), other.inside(part, 0.25 * side))
-            if firm > FIRM and both > HELD:
+            if contact > MIN_CONTACT_FRACTION and both > MIN_MUTUAL_OVERLAP:
                 return a, b
             low = np.median(part.heights[touching])
-            if np.percentile(part.heights, 2) > RESTS and (part.heights < low).mean() > BENEATH:
-                hanging.append((float(firm), a, b))
-    return max(hanging)[1:] if hanging else None
+            if (
+                np.percentile(part.heights, 2) > MAX_STANDING_HEIGHT
+                and (part.heights < low).mean() > MIN_BELOW_FRACTION
+            ):
+                suspended.append((float(contact), a, b))
+    return max(suspended)[1:] if suspended else None

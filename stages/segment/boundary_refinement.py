@@ -1,4 +1,4 @@
-"""Borders of objects, redrawn: who a Gaussian near one belongs to, by colour, height and what its neighbours say."""
+"""Boundary refinement: relabels Gaussians near boundaries of objects by colour, height and neighbouring labels."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from stages.core.perception.visibility import summed_view_directions
 from stages.core.scene.gaussians import Gaussians
 from stages.core.scene.scene import Scene
 
-BOUNDARY_WIDTH = 0.015  # width of a border to either side, about ten pixels of a photo [view radii]
-MIN_VISIBLE_WEIGHT = 0.5  # weight in all photos together from which a Gaussian shows [px of small photos]
-ROUNDS = 3  # a border may move by a margin in each
-SWEEPS = 8  # of mean field in each round
-SAMPLES = 24  # nearest Gaussians whose colours say how an object, or the table, looks here
-NEIGHBOURS = 8
-STRAYS = 5  # Gaussians of another label that make no border yet
-SHADE = 8.0  # colours this far apart are still alike [CIELAB]
-FLOOR = 0.02  # likelihood of a colour that nothing near has
-HEIGHT_RESOLUTION = 0.0045  # height that photos tell from the table [view radii]
-BUMP = 3.0  # height of what photos make of a bare table beside things, one deviation [levels]
-SINK = 0.5  # an object's Gaussian this much lower than it can be told from the table is one deviation off [levels]
-BROAD = 400  # Gaussians that show all colours of the table around the objects
-BOND = 3.0  # weight of what eight neighbours of one's own colour say, against one's own colour and height
-STRANGER = 0.1  # of a neighbour of another colour, as a share of that
-CORE = 0.67  # quantile of the depth in an object beyond which a thin one shows how it looks
-NEVER = 1e3  # cost of a label that is out of the question
+BOUNDARY_WIDTH = 0.015  # of a boundary to either side, about 10 pixels of a photo [camera distance]
+MIN_VISIBLE_WEIGHT = 0.5  # summed over all photos, from which a Gaussian is visible [px of downscaled photos]
+ROUNDS = 3  # in each, a boundary may move by BOUNDARY_WIDTH
+MEAN_FIELD_ITERATIONS = 8  # per round
+COLOUR_SAMPLES = 24  # nearest Gaussians that a label's local colour distribution is estimated from
+NEIGHBOURS = 8  # that the smoothness term connects
+MIN_BOUNDARY_NEIGHBOURS = 5  # Gaussians of another label that form a boundary; fewer are strays
+COLOUR_SIGMA = 8.0  # standard deviation of the colour likelihood [CIELAB]
+MIN_COLOUR_LIKELIHOOD = 0.02  # of a colour that no nearby Gaussian of the label has
+HEIGHT_RESOLUTION = 0.0045  # smallest height that photos distinguish from the table [camera distance]
+TABLE_HEIGHT_SIGMA = 3.0  # standard deviation of the height of bare table next to objects [HEIGHT_RESOLUTION]
+OBJECT_HEIGHT_SIGMA = 0.5  # of an object's Gaussians below HEIGHT_RESOLUTION [HEIGHT_RESOLUTION]
+TABLE_COLOUR_SAMPLES = 400  # Gaussians that the global colour distribution of the table is estimated from
+SMOOTHNESS = 3.0  # weight of all neighbours together, if of the same colour, relative to the unary cost
+MIN_SMOOTHNESS = 0.1  # added to the colour likeness of a neighbour
+CORE_QUANTILE = 0.67  # of the distance to the boundary, beyond which a thin object's colour is trusted
+FORBIDDEN = 1e3  # cost of a label that is excluded
 
 
 @dataclass(frozen=True)
@@ -40,15 +40,15 @@ class BoundaryRegion:
 
     points: Float[Tensor, "m 3"]
     lab: Float[Tensor, "m 3"]  # colours, CIELAB
-    ids: Int[Tensor, "m"]  # labels so far, 0 the table
-    heights: Float[Tensor, "m"]  # above the table [levels]
-    even: Bool[Tensor, "m"]  # no farther from the surface of the table than its Gaussians are
-    gap: Float[Tensor, "m"]  # distance to the nearest of another label, but for strays [margins]
-    margin: float  # [scene units]
+    ids: Int[Tensor, "m"]  # current labels, 0 the table
+    heights: Float[Tensor, "m"]  # above the table [HEIGHT_RESOLUTION]
+    even: Bool[Tensor, "m"]  # within the support tolerance of the table
+    gap: Float[Tensor, "m"]  # distance to the nearest boundary [BOUNDARY_WIDTH]
+    margin: float  # BOUNDARY_WIDTH [scene units]
 
     @classmethod
     def of(cls, g: Gaussians, lab: Float[Tensor, "n 3"], support: Support) -> BoundaryRegion:
-        """Of Gaussians that are all near objects."""
+        """For Gaussians that are all near objects."""
         heights = support.heights(g.means)
         margin, level = BOUNDARY_WIDTH * support.view.radius, HEIGHT_RESOLUTION * support.view.radius
         even = heights.abs() < support.tolerance
@@ -56,15 +56,15 @@ class BoundaryRegion:
 
 
 def refine_boundaries(scene: Scene, support: Support) -> Gaussians:
-    """The Gaussians with those at a border, and those low enough to be table, given anew to an object or the table.
+    """The Gaussians, with those near a boundary, or low enough to be table, relabelled as object or as table.
 
-    At a border a reconstruction lifts some of the table and grouping gives it to the object, or gives the table
-    some of the object. Away from borders labels are believed: there objects and table show how they look. What
-    no photo shows stays as it is, and nothing goes from one object to another.
+    Next to objects, a reconstruction lifts parts of the table, which grouping assigns to the object, or the reverse.
+    Labels away from boundaries are kept and provide the colour distributions of object and table. Gaussians that no
+    photo shows keep their labels, and no Gaussian changes from one object to another. Without cameras nothing changes.
 
-    The labels of a conditional random field over nearest neighbours, by mean field, as in Kraehenbuehl and Koltun
-    2011, "Efficient inference in fully connected CRFs", eq. 4-6; the rounds, in each of which colours are learned
-    from the last one's labels, are those of Rother, Kolmogorov and Blake 2004, "GrabCut".
+    Labels minimise a conditional random field over nearest neighbours by mean-field inference, as in Kraehenbuehl and
+    Koltun 2011, "Efficient inference in fully connected CRFs", eq. 4-6; as in Rother, Kolmogorov and Blake 2004,
+    "GrabCut", colour distributions are estimated again in each round from the labels of the previous one.
     """
     g = scene.gaussians
     if scene.cameras is None or not len(scene.cameras):
@@ -78,71 +78,71 @@ def refine_boundaries(scene: Scene, support: Support) -> Gaussians:
         near = BoundaryRegion.of(replace(g[index], object_id=ids[index]), lab[index], support)
         low = (near.ids > 0) & (near.heights < 1)
         border = torch.nonzero(((near.gap < 1) | low) & seen[index])[:, 0]
-        ids[index[border]] = _settled(near, border, low)
+        ids[index[border]] = _mean_field(near, border, low)
     return replace(g, object_id=ids)
 
 
-def _around(means: Float[Tensor, "n 3"], ids: Int[Tensor, "n"], reach: float) -> Int[Tensor, "m"]:
-    """Which Gaussians are an object's, or within `reach` of one."""
+def _around(means: Float[Tensor, "n 3"], ids: Int[Tensor, "n"], radius: float) -> Int[Tensor, "m"]:
+    """Indices of Gaussians of objects, or within `radius` of one."""
     finite = means.isfinite().all(1)
     out = (ids > 0) & finite
     taken = means[out]
     if len(taken):
-        box = ((means > taken.amin(0) - reach) & (means < taken.amax(0) + reach)).all(1)
+        box = ((means > taken.amin(0) - radius) & (means < taken.amax(0) + radius)).all(1)
         free = torch.nonzero(box & finite & ~out)[:, 0]
-        out[free[knn(taken, means[free], 1)[0][:, 0] < reach]] = True
+        out[free[knn(taken, means[free], 1)[0][:, 0] < radius]] = True
     return torch.nonzero(out)[:, 0]
 
 
 def _gap(points: Float[Tensor, "m 3"], ids: Int[Tensor, "m"]) -> Float[Tensor, "m"]:
-    """Distance from each Gaussian to the nearest of another label, after a few strays."""
+    """Distance from each Gaussian to the MIN_BOUNDARY_NEIGHBOURS-th nearest of another label."""
     gap = torch.full((len(points),), torch.inf)
     for label in ids.unique().tolist():
         own = ids == label
         others = points[~own]
         if len(others):
-            gap[own] = knn(others, points[own], STRAYS)[0][:, -1]
+            gap[own] = knn(others, points[own], MIN_BOUNDARY_NEIGHBOURS)[0][:, -1]
     return gap
 
 
-def _settled(near: BoundaryRegion, border: Int[Tensor, "b"], low: Bool[Tensor, "m"]) -> Int[Tensor, "b"]:
-    """The likeliest label of each Gaussian of the border, when neighbours of like colour tend to agree."""
+def _mean_field(near: BoundaryRegion, border: Int[Tensor, "b"], low: Bool[Tensor, "m"]) -> Int[Tensor, "b"]:
+    """The most probable label of each boundary Gaussian, by mean-field inference."""
     labels, before = near.ids.unique(), near.ids[border]
     cost = torch.stack([_cost(near, border, label) for label in labels.tolist()], 1)
     taken = (before[:, None] > 0) & (labels > 0) & (labels != before[:, None])
-    cost = cost.masked_fill(taken, NEVER)
+    cost = cost.masked_fill(taken, FORBIDDEN)
     start = torch.searchsorted(labels, near.ids)
     start[border] = torch.where(low[border], cost.argmin(1), start[border])
     belief = torch.nn.functional.one_hot(start, len(labels)).float()
     index = knn(near.points, near.points[border], NEIGHBOURS + 1)[1][:, 1:]
-    weight = BOND * (_alike(near.lab[border], near.lab[index]) + STRANGER) / NEIGHBOURS
-    for _ in range(SWEEPS):
+    weight = SMOOTHNESS * (_similarity(near.lab[border], near.lab[index]) + MIN_SMOOTHNESS) / NEIGHBOURS
+    for _ in range(MEAN_FIELD_ITERATIONS):
         belief[border] = torch.softmax((weight[..., None] * belief[index]).sum(1) - cost, 1)
     return labels[belief[border].argmax(1)]
 
 
 def _cost(near: BoundaryRegion, border: Int[Tensor, "b"], label: int) -> Float[Tensor, "b"]:
-    """How little a label fits each Gaussian of the border: minus the logarithm of its likelihood."""
+    """Unary cost of a label for each boundary Gaussian: its negative log likelihood by height and colour."""
     own, h = near.ids == label, near.heights[border]
     if label == 0:
-        height, sure = 0.5 * (h.clamp_min(0) / BUMP) ** 2, own & (near.gap > 1) & near.even
+        height, certain = 0.5 * (h.clamp_min(0) / TABLE_HEIGHT_SIGMA) ** 2, own & (near.gap > 1) & near.even
     else:
         own = own & (near.heights >= 1)
-        height, sure = 0.5 * ((h - 1).clamp_max(0) / SINK) ** 2, own
-        if own.any():  # of what is thin all is near a border
-            sure = own & (near.gap > min(1.0, float(near.gap[own].quantile(CORE))))
-    shown = torch.nonzero(sure)[:, 0]
-    if not len(shown):
-        return torch.full((len(border),), NEVER)
-    distance, index = knn(near.points[shown], near.points[border], SAMPLES)
-    alike = _alike(near.lab[border], near.lab[shown[index]]).mean(1)
-    if label == 0:  # a patch of the table may begin at the object, and be sure elsewhere only
-        broad = near.lab[shown[:: max(1, len(shown) // BROAD)]]
-        alike = torch.maximum(alike, _alike(near.lab[border], broad[None]).mean(1))
-    cost = height - (alike + FLOOR).log()
-    return cost if label == 0 else torch.where(distance[:, 0] < 4 * near.margin, cost, NEVER)
+        height, certain = 0.5 * ((h - 1).clamp_max(0) / OBJECT_HEIGHT_SIGMA) ** 2, own
+        if own.any():  # all of a thin object is near a boundary
+            certain = own & (near.gap > min(1.0, float(near.gap[own].quantile(CORE_QUANTILE))))
+    core = torch.nonzero(certain)[:, 0]
+    if not len(core):
+        return torch.full((len(border),), FORBIDDEN)
+    distance, index = knn(near.points[core], near.points[border], COLOUR_SAMPLES)
+    likelihood = _similarity(near.lab[border], near.lab[core[index]]).mean(1)
+    if label == 0:  # a patch of table next to the object may have its core elsewhere
+        samples = near.lab[core[:: max(1, len(core) // TABLE_COLOUR_SAMPLES)]]
+        likelihood = torch.maximum(likelihood, _similarity(near.lab[border], samples[None]).mean(1))
+    cost = height - (likelihood + MIN_COLOUR_LIKELIHOOD).log()
+    return cost if label == 0 else torch.where(distance[:, 0] < 4 * near.margin, cost, FORBIDDEN)
 
 
-def _alike(a: Float[Tensor, "b 3"], b: Float[Tensor, "c k 3"]) -> Float[Tensor, "b k"]:
-    """Likeness of colours, 1 where equal."""
-    return (-0.5 * ((a[:, None] - b).norm(dim=2) / SHADE) ** 2).exp()
+def _similarity(a: Float[Tensor, "b 3"], b: Float[Tensor, "c k 3"]) -> Float[Tensor, "b k"]:
+    """Gaussian similarity of colours, 1 where equal."""
+    return (-0.5 * ((a[:, None] - b).norm(dim=2) / COLOUR_SIGMA) ** 2).exp()

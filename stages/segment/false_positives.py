@@ -1,4 +1,4 @@
-"""Patterns of the table that were taken for things lying on it."""
+"""Removal of false positives: texture of the table that was labelled as objects."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from stages.core.scene.gaussians import Gaussians
 from stages.core.scene.scene import Scene
 from stages.segment.boundary_refinement import BOUNDARY_WIDTH, HEIGHT_RESOLUTION, MIN_VISIBLE_WEIGHT
 
-SHOWS = 0.1  # opacity from which a Gaussian counts
-NEIGHBOURS = 8
-PATTERN = 0.65  # share of a thing that is level with table close by, from which it is a part of the table
+MIN_OPACITY = 0.1  # of the Gaussians that are compared
+NEIGHBOURS = 8  # Gaussians of the table that each Gaussian of an object is compared with
+MAX_LEVEL_FRACTION = 0.65  # fraction of an object that is level with nearby table; above it, it is texture
 
 
 def remove_false_positives(scene: Scene, support: Support) -> Gaussians:
-    """The scene's Gaussians, with things given back to the table that lie in it and among it.
+    """The scene's Gaussians, with objects relabelled as background that are level with the table around them.
 
-    A thing that lies on the table is higher than the table seen next to it, or has an inside that is far from any.
-    Stripes and threads of a cloth that differ from it in colour, and are an object to grouping, are neither.
+    A real object is higher than the visible table next to it, or has an interior far from any visible table. Stripes
+    and threads of a tablecloth, which grouping finds by their colour, have neither property.
     """
     g, level, margin = scene.gaussians, HEIGHT_RESOLUTION * support.view.radius, BOUNDARY_WIDTH * support.view.radius
-    shown = (g.opacities > SHOWS) & g.means.isfinite().all(1)
+    shown = (g.opacities > MIN_OPACITY) & g.means.isfinite().all(1)
     if scene.cameras is not None and len(scene.cameras):
         shown &= summed_view_directions(g, scene.cameras).norm(dim=1) > MIN_VISIBLE_WEIGHT
     heights = torch.where(shown, support.heights(torch.where(shown[:, None], g.means, 0.0)), torch.inf)
@@ -39,6 +39,6 @@ def remove_false_positives(scene: Scene, support: Support) -> Gaussians:
             continue
         distance, index = knn(g.means[bare], g.means[own], NEIGHBOURS)
         even = ((heights[own][:, None] - heights[bare][index]).abs() < level).float().mean(1) > 0.5
-        if float((even & (distance[:, 0] < margin)).float().mean()) > PATTERN:
+        if float((even & (distance[:, 0] < margin)).float().mean()) > MAX_LEVEL_FRACTION:
             ids[ids == label] = 0
     return replace(g, object_id=ids)

@@ -1,4 +1,4 @@
-"""Objects by where things are and how they look: no labels, no networks."""
+"""The geometric backend: objects by position, colour and shape, without labels or networks."""
 
 from __future__ import annotations
 
@@ -15,11 +15,13 @@ from stages.segment.options import SegmentOptions
 
 
 def segment(scene: Scene, options: SegmentOptions) -> Scene:
-    """What stands on the supporting plane: grouped by position, colour and shape; made whole; its rims redrawn.
-
-    What then turns out to be a pattern of the table is given back to it.
-    """
-    grouped = group_objects(scene, GroupingOptions(options.max_objects, options.min_size, options.detail, options.seed))
+    """Objects on the supporting plane: grouping, merging of bodies, boundary refinement, removal of false positives."""
+    grouped = group_objects(
+        scene,
+        GroupingOptions(
+            max_objects=options.max_objects, min_size=options.min_size, detail=options.detail, seed=options.seed
+        ),
+    )
     view = view_extent(scene)
     support = find_support(scene, view, options.seed)
     if not grouped.objects or support is None or find_wall(scene, view, options.seed) is not None:

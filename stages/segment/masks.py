@@ -1,4 +1,4 @@
-"""Objects from label images of the photos, whatever tool made them: each Gaussian takes the majority of its views."""
+"""The masks backend: label images of the photos, from any tool, voted over all views."""
 
 from __future__ import annotations
 
@@ -13,12 +13,15 @@ from stages.core.errors import InputError
 from stages.core.scene.images import read_labels
 from stages.core.scene.scene import Scene
 from stages.segment.options import SegmentOptions
-from stages.segment.view_images import check_proportions, match_files
+from stages.segment.view_images import check_aspect_ratio, match_files
 from stages.segment.voting import apply_votes, collect_votes
 
 
 def segment(scene: Scene, options: SegmentOptions) -> Scene:
-    """Labels of the images in the folder `options.masks`, projected with visibility and voted over all views."""
+    """Labels of the images in the folder `options.masks`, projected with visibility and voted over all views.
+
+    Raises InputError for a scene without cameras, a folder without matching images, and wrong aspect ratios.
+    """
     if scene.cameras is None:
         raise InputError("--masks: the scene has no cameras; use one that `ngff reconstruct` wrote")
     files = match_files(options.masks, scene.cameras.names, "label image", "--masks")
@@ -28,17 +31,17 @@ def segment(scene: Scene, options: SegmentOptions) -> Scene:
 
 
 def _labels(scene: Scene, view: int, file: Path) -> Int[Tensor, "h w"]:
-    """A label image, of any size, if it has the photo's proportions."""
+    """A label image of any size; raises InputError unless it has the photo's aspect ratio."""
     labels = read_labels(file)
     try:
-        check_proportions(scene, view, labels.shape[1], labels.shape[0])
+        check_aspect_ratio(scene, view, labels.shape[1], labels.shape[0])
     except InputError as error:
         raise InputError(f"--masks: the label image of {error}") from error
     return labels
 
 
 def read_names(folder: Path) -> dict[int, str]:
-    """Names by label, from names.json ({"1": "duck"} or ["duck", ...]) where there is one."""
+    """Names by label, from names.json ({"1": "duck"} or ["duck", ...]); empty without that file."""
     path = Path(folder) / "names.json"
     if not path.exists():
         return {}

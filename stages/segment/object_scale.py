@@ -1,4 +1,4 @@
-"""What the user knows about the size of an object: photos alone have no scale."""
+"""Metric scale from the measured size of an object, since photos alone have no scale."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ if TYPE_CHECKING:
     from stages.core.scene.scene import Scene
 
 FORM = re.compile(r"object=(?P<object>[0-9]+)\s+(?P<side>height|length)=(?P<metres>[0-9.eE+-]+)")
-OUTERMOST = 0.005  # of an object's Gaussians at either end do not count
+OUTLIER_FRACTION = 0.005  # of an object's Gaussians at either end, which are ignored
 
 
 @dataclass(frozen=True)
 class ObjectScaleReference:
-    """A length that was measured: how high an object stands, or its longest side in x, y and z."""
+    """A measured length of an object: its height, or its longest extent along x, y or z."""
 
     object: int
     side: str  # height | length
     metres: float
 
     def applied(self, scene: Scene) -> Scene:
-        """The scene with its `metres_per_unit` set by the object. Raises InputError when there is none."""
+        """The scene with `metres_per_unit` derived from the object; InputError if it is absent or has no extent."""
         means = scene.gaussians.means[scene.gaussians.object_id == self.object].double()
         if len(means) < 2:
             have = ", ".join(f"{o.id} ({o.name})" for o in scene.objects) or "none"
             raise InputError(f"--scale-reference: there is no object {self.object} in the scene; found were {have}")
-        sides = means.quantile(1 - OUTERMOST, dim=0) - means.quantile(OUTERMOST, dim=0)
+        sides = means.quantile(1 - OUTLIER_FRACTION, dim=0) - means.quantile(OUTLIER_FRACTION, dim=0)
         units = float(sides[2] if self.side == "height" else sides.max())
         if units <= 0:
             raise InputError(f"--scale-reference: object {self.object} has no {self.side} in the scene; name another")
@@ -38,7 +38,7 @@ class ObjectScaleReference:
 
 
 def parse_object_scale(text: str) -> ObjectScaleReference | None:
-    """From the form of the command line; None for an empty text."""
+    """Parses the command-line form, such as "object=1 height=0.12"; None for an empty text; InputError otherwise."""
     if not text:
         return None
     found = FORM.fullmatch(text.strip())

@@ -1,4 +1,4 @@
-"""What the user points at: a box or a point for each object, in the first view."""
+"""Prompts of the user: a box or a point for each object, in the first view."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from stages.core.scene.files import must_exist
 
 @dataclass(frozen=True)
 class ObjectPrompts:
-    """One row an object; boxes, or points, or both are there."""
+    """One row per object; boxes or points may be None, not both."""
 
     boxes: Float[Tensor, "o 4"] | None  # x0 y0 x1 y1 [px] of view 0
     points: Float[Tensor, "o 2"] | None  # x y inside the object [px] of view 0
@@ -26,8 +26,8 @@ class ObjectPrompts:
 def read_prompts(path: Path, size: tuple[int, int] | None = None) -> ObjectPrompts:
     """prompts.json in the public format: {"bbox": [[x0, y0, x1, y1]..], "center_point": [[u, v]..], "text": [..]}.
 
-    Either of the first two may be absent or empty. "size": [width, height] says how large the picture is that all this
-    was drawn in, when it is not as large as view 0, which has `size`. Raises InputError for what is no such file.
+    Either of the first two may be absent or empty. "size": [width, height] is the size of the image that the
+    coordinates refer to, where it differs from `size`, that of view 0. Raises InputError for an invalid file.
     """
     must_exist(path, "a prompts.json with bbox or center_point, and text")
     try:
@@ -52,6 +52,4 @@ def read_prompts(path: Path, size: tuple[int, int] | None = None) -> ObjectPromp
 
 
 def _wrong(path: Path, what: str) -> InputError:
-    return InputError(
-        f'{path}: is not a prompts file ({what}); write {{"bbox": [[x0, y0, x1, y1]], "text": ["duck"]}}'
-    )
+    return InputError(f'{path}: is not a prompts file ({what}); write {{"bbox": [[x0, y0, x1, y1]], "text": ["duck"]}}')

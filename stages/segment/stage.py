@@ -1,4 +1,4 @@
-"""scene.ply -> labelled.ply"""
+"""The segment stage: scene.ply -> labelled.ply."""
 
 from __future__ import annotations
 
@@ -18,13 +18,16 @@ log = logging.getLogger(__name__)
 
 
 def run(scene: Path, out: Path, options: SegmentOptions = SegmentOptions()) -> None:  # noqa: B008 -- frozen
-    """Which Gaussians are one object: scene.ply -> labelled.ply. A line for each object goes to stderr."""
+    """Label the Gaussians of each object: scene.ply -> labelled.ply. Logs one line per object.
+
+    Raises InputError for invalid inputs; then nothing is written.
+    """
     segment = choose(BACKENDS, options.chosen)
-    pick_device(options.device)  # refuses a GPU that is not there; only sam2 is heavy enough to use one
+    pick_device(options.device)  # raises for an absent GPU; only networks use one
     whole = read_scene(scene)
     labelled = rename_objects(segment(whole, options), options)
-    known = parse_object_scale(options.scale_reference)
-    labelled = known.applied(labelled) if known else labelled
+    reference = parse_object_scale(options.scale_reference)
+    labelled = reference.applied(labelled) if reference else labelled
     inputs = [Path(p) for p in (scene, options.boxes, options.photos) if p is not None]
     facts = {**provenance("segment", inputs, options), "scene": whole.provenance}
     write_scene(out, replace(labelled, provenance=facts))
@@ -35,7 +38,7 @@ def run(scene: Path, out: Path, options: SegmentOptions = SegmentOptions()) -> N
 
 
 def rename_objects(scene: Scene, options: SegmentOptions) -> Scene:
-    """The names that the user gave, in place of those found."""
+    """The scene with the names given by the user; raises InputError for an object that does not exist."""
     have = {o.id for o in scene.objects}
     for number in options.renamed:
         if number not in have:
@@ -48,18 +51,18 @@ def _listed(scene: Scene) -> str:
 
 
 def log_objects(scene: Scene) -> None:
-    """One line an object: number, name, count and size."""
+    """Log id, name, number of Gaussians and size of each object."""
     g = scene.gaussians
     for o in scene.objects:
         means = g.means[g.object_id == o.id].double().numpy()
         if not len(means):
-            log.info("  %d  %s: not seen in the scene", o.id, o.name)
+            log.info("  %d  %s: no Gaussians", o.id, o.name)
             continue
         size = (_quantile(means, 0.99) - _quantile(means, 0.01)) * scene.metres_per_unit * 100
         log.info("  %d  %s: %d Gaussians, %.1f x %.1f x %.1f cm", o.id, o.name, len(means), *size)
 
 
-def _quantile(values, share: float):
+def _quantile(values, fraction: float):
     import numpy as np
 
-    return np.quantile(values, share, axis=0)
+    return np.quantile(values, fraction, axis=0)

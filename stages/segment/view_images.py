@@ -1,4 +1,4 @@
-"""The images that belong to a scene's cameras: its photos or what was made of them, or the scene drawn."""
+"""The images that belong to a scene's cameras: its photos, images made from them, or renderings of the scene."""
 
 from __future__ import annotations
 
@@ -18,26 +18,26 @@ from stages.core.scene.images import read_image
 from stages.core.scene.scene import Scene
 
 log = logging.getLogger(__name__)
-SIDE = 1024  # longest side that a scene is drawn at [px]
-PROPORTIONS = 0.03  # by which those of a photo and of what belongs to it may differ
+MAX_RENDER_SIDE = 1024  # longest side of a rendered view [px]
+ASPECT_TOLERANCE = 0.03  # relative difference of the aspect ratios of a photo and its camera
 
 
 @dataclass(frozen=True)
 class ViewImages:
-    """Pictures in the order of the cameras, made or read one at a time when they are asked for."""
+    """Images in the order of the cameras, rendered or read one at a time on access."""
 
-    views: list[int]  # the camera of each
-    image: Callable[[int], Float[Tensor, "h w 3"]]  # the picture of a camera, RGB in 0..1
+    views: list[int]  # camera index of each image
+    image: Callable[[int], Float[Tensor, "h w 3"]]  # image of a camera index, RGB in 0..1
 
     def __len__(self) -> int:
         return len(self.views)
 
 
 def view_images(scene: Scene, photos: Path | None = None) -> ViewImages:
-    """Those of the folder `photos` that the scene's cameras name, or one drawing for each camera.
+    """The photos in folder `photos` that the scene's cameras name, or a rendering for each camera.
 
-    Memory holds one at a time. Raises InputError for a folder without them, and, when its turn comes, for a photo of
-    other proportions than its camera.
+    One image is in memory at a time. Raises InputError for a folder without such photos, and, on access, for a photo
+    with another aspect ratio than its camera.
     """
     if photos is None:
         return ViewImages(list(range(len(scene.cameras))), lambda view: render_view(scene, view))
@@ -46,9 +46,9 @@ def view_images(scene: Scene, photos: Path | None = None) -> ViewImages:
 
 
 def render_view(scene: Scene, view: int) -> Float[Tensor, "h w 3"]:
-    """The scene as a camera sees it, before black."""
+    """The scene rendered from a camera, on black."""
     width, height = scene.cameras.sizes[view].tolist()
-    shrink = min(1.0, SIDE / max(width, height))
+    shrink = min(1.0, MAX_RENDER_SIDE / max(width, height))
     w, h = max(1, round(width * shrink)), max(1, round(height * shrink))
     K = resize_K(scene.cameras.Ks[view], w / width, h / height)
     return rasterise(scene.gaussians, scene.cameras.viewmats[view][None], K[None], w, h).rgb[0].clamp(0, 1)
@@ -57,16 +57,17 @@ def render_view(scene: Scene, view: int) -> Float[Tensor, "h w 3"]:
 def _read(scene: Scene, view: int, file: Path) -> Float[Tensor, "h w 3"]:
     image = read_image(file)
     try:
-        check_proportions(scene, view, image.shape[1], image.shape[0])
+        check_aspect_ratio(scene, view, image.shape[1], image.shape[0])
     except InputError as error:
-        raise InputError(f"--photos: {error}; without --photos the scene is drawn instead") from error
+        raise InputError(f"--photos: {error}; without --photos the scene is rendered instead") from error
     return image
 
 
 def match_files(folder: Path, names: tuple[str, ...], what: str, option: str) -> dict[int, Path]:
-    """The image that belongs to each camera, found by the photo's name up to its suffix.
+    """The image file of each camera, by the name of its photo without suffix.
 
-    `what` the images are and the `option` that named the folder are for the error's sentence.
+    `what` (kind of image) and `option` (that named the folder) are used in error messages. Raises InputError where
+    there is no folder or no matching image.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -76,16 +77,16 @@ def match_files(folder: Path, names: tuple[str, ...], what: str, option: str) ->
     if not found:
         raise InputError(
             f"{folder}: no {what} is named as a photo of the scene, such as {Path(names[0]).stem}.png"
-            if names else f"{folder}: the scene remembers no photos"
+            if names else f"{folder}: the scene has no names of photos"
         )  # fmt: skip
     if len(found) < len(names):
         log.info("%s: %ss for %d of %d photos", folder, what, len(found), len(names))
     return found
 
 
-def check_proportions(scene: Scene, view: int, width: int, height: int) -> None:
-    """Raises InputError where an image cannot be what a camera saw, at another size."""
+def check_aspect_ratio(scene: Scene, view: int, width: int, height: int) -> None:
+    """Raises InputError unless the aspect ratio is that of the camera."""
     wide, high = scene.cameras.sizes[view].tolist()
-    if abs(width / height / (wide / high) - 1) > PROPORTIONS:
+    if abs(width / height / (wide / high) - 1) > ASPECT_TOLERANCE:
         raise InputError(f"{scene.cameras.names[view]} is {width}x{height}, in the scene {wide}x{high}; they must "
-                         "have the same proportions")  # fmt: skip
+                         "have the same aspect ratio")  # fmt: skip

@@ -1,4 +1,4 @@
-"""Label images of many views, whatever made them, become one label for each Gaussian: the majority, without strays."""
+"""Multi-view voting: label images of many views become one label per Gaussian, by majority, without outliers."""
 
 from __future__ import annotations
 
@@ -20,24 +20,27 @@ from stages.core.raster.rasterise import rasterise, visibility
 from stages.core.scene.scene import Scene, SceneObject
 
 log = logging.getLogger(__name__)
-SIDE = 640  # longest side that votes are counted at [px]
-POOL = 8  # neighbours whose votes count for a Gaussian as its own do
-SURFACE = 0.02  # a Gaussian this near to the drawn surface is on it [share of its depth]
+MAX_VOTING_SIDE = 640  # longest side of the images that votes are counted in [px]
+POOLED_NEIGHBOURS = 8  # neighbours whose votes are added to those of a Gaussian
+SURFACE_TOLERANCE = 0.02  # distance from the rendered surface up to which a Gaussian is on it [fraction of its depth]
+MAX_SPACING = 3.0  # distance of neighbours that are used [median spacing]
+MAX_SPACING_POINTS = 20_000  # Gaussians that the median spacing is estimated from
 
 
 @dataclass(frozen=True)
 class ViewFootprint:
-    """What one camera sees of a scene's Gaussians, at the size that votes are counted at."""
+    """Which of a scene's Gaussians are visible where in one view, at the resolution of voting."""
 
-    front: Int[Tensor, "h w"]  # the Gaussian that weighs most in each pixel; -1: none
-    on: Int[Tensor, "m"]  # Gaussians whose centres lie on the drawn surface
-    pixels: Int[Tensor, "m"]  # where those are, counted row by row
-    weights: Float[Tensor, "m"]  # that they have in the whole image [px]
-    gaussians: int  # of the scene
-    picture: Float[Tensor, "h w 3"]  # what it sees, 0..1
+    front: Int[Tensor, "h w"]  # the Gaussian with the largest weight in each pixel; -1: none
+    on: Int[Tensor, "m"]  # Gaussians whose centres lie on the rendered surface
+    pixels: Int[Tensor, "m"]  # their pixels, row-major
+    weights: Float[Tensor, "m"]  # their weights, summed over the image [px]
+    gaussians: int  # number of Gaussians of the scene
+    image: Float[Tensor, "h w 3"]  # the rendered view, 0..1
 
     @classmethod
     def of(cls, scene: Scene, view: int) -> ViewFootprint:
+        """The footprint of view number `view`, rendered."""
         g, viewmat = scene.gaussians, scene.cameras.viewmats[view]
         width, height, K = voting_intrinsics(scene, view)
         front, weight = visibility(g, viewmat, K, width, height)
@@ -46,14 +49,14 @@ class ViewFootprint:
         z = depths(g.means, viewmat)
         inside = torch.nonzero((z > 0.01) & (x >= 0) & (x < width) & (y >= 0) & (y < height))[:, 0]
         pixels = y[inside] * width + x[inside]
-        on = (z[inside] - drawn.depth[0].flatten()[pixels]).abs() < SURFACE * z[inside]
+        on = (z[inside] - drawn.depth[0].flatten()[pixels]).abs() < SURFACE_TOLERANCE * z[inside]
         return cls(front, inside[on], pixels[on], weight[inside[on]], len(g), drawn.rgb[0].clamp(0, 1))
 
     def votes(self, labels: Int[Tensor, "h2 w2"]) -> Float[Tensor, "n k"]:
-        """For each Gaussian and label, the weight of the pixels it is seen in; `labels` may have any size.
+        """Votes of a label image of any size: for each Gaussian and label, the weight of its pixels.
 
-        Pixels vote for the Gaussian that weighs most in them; Gaussians that weigh most nowhere but lie on the
-        drawn surface take the label of the pixel at their centre, with the little weight they have.
+        Each pixel votes for the Gaussian with the largest weight in it. Gaussians on the rendered surface also get a
+        vote of the pixel at their centre, with their summed weight.
         """
         height, width = self.front.shape
         rows = ((torch.arange(height) + 0.5) * labels.shape[0] / height).long()
@@ -67,17 +70,17 @@ class ViewFootprint:
 
 
 def voting_intrinsics(scene: Scene, view: int) -> tuple[int, int, Float[Tensor, "3 3"]]:
-    """Width, height [px] and K that a view's votes are counted at."""
+    """Width, height [px] and K of a view at the resolution of voting."""
     width, height = scene.cameras.sizes[view].tolist()
-    shrink = min(1.0, SIDE / max(width, height))
+    shrink = min(1.0, MAX_VOTING_SIDE / max(width, height))
     w, h = max(1, round(width * shrink)), max(1, round(height * shrink))
     return w, h, resize_K(scene.cameras.Ks[view], w / width, h / height)
 
 
 def collect_votes(scene: Scene, images: Iterable[tuple[int, Int[Tensor, "h w"]]]) -> Float[Tensor, "n k"]:
-    """Votes of all `images`, each the number of a camera and its labels (0 background, 1... the objects).
+    """Summed votes of all `images`: pairs of a view's index and its labels (0 background, 1... the objects).
 
-    Images come one at a time, from a folder or from a network, so memory holds one of them.
+    The iterable is consumed one image at a time, so that only one is in memory.
     """
     total = torch.zeros(len(scene.gaussians), 1)
     for view, labels in images:
@@ -86,42 +89,44 @@ def collect_votes(scene: Scene, images: Iterable[tuple[int, Int[Tensor, "h w"]]]
 
 
 def damp_votes(votes: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
-    """One view's votes with the root of its weight: pixels side by side in one mask are not independent witnesses.
+    """One view's votes, scaled so that each Gaussian's total is the square root of what it was.
 
-    In between a vote for each pixel, where one near view may overrule all others, and a vote for each view.
+    Neighbouring pixels of a mask are not independent. This is between one vote per pixel, where one close view may
+    outvote all others, and one vote per view.
     """
     return votes / votes.sum(1, keepdim=True).clamp_min(1e-12).sqrt()
 
 
 def pool_votes(means: Float[Tensor, "n 3"], votes: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
-    """Each Gaussian's votes with those of its nearest neighbours: few pixels show one Gaussian, and noise is in each.
+    """Each Gaussian's votes plus those of its nearest neighbours, which reduces noise, since few pixels show each one.
 
-    Only neighbours within three times the usual spacing count. Measured with wrong masks by `ngff-lab bench segment`.
+    Neighbours farther than MAX_SPACING are ignored. `ngff-lab bench segment` measures the effect with wrong masks.
     """
     real = torch.nonzero(means.isfinite().all(1))[:, 0]
-    distance, index = knn(means[real], means[real], POOL + 1)
-    near = distance < 3 * distance[:, -1].median()
-    out, mine = votes.clone(), votes[real]
+    distance, index = knn(means[real], means[real], POOLED_NEIGHBOURS + 1)
+    near = distance < MAX_SPACING * distance[:, -1].median()
+    out, own = votes.clone(), votes[real]
     for j in range(1, index.shape[1]):
-        out[real] += mine[index[:, j]] * near[:, j, None]
+        out[real] += own[index[:, j]] * near[:, j, None]
     return out
 
 
 def add_votes(a: Float[Tensor, "n j"], b: Float[Tensor, "n k"]) -> Float[Tensor, "n l"]:
-    """Sum of votes that may know different numbers of labels."""
-    wide = max(a.shape[1], b.shape[1])
-    return torch.nn.functional.pad(a, (0, wide - a.shape[1])) + torch.nn.functional.pad(b, (0, wide - b.shape[1]))
+    """Sum of votes that may have different numbers of labels."""
+    count = max(a.shape[1], b.shape[1])
+    return torch.nn.functional.pad(a, (0, count - a.shape[1])) + torch.nn.functional.pad(b, (0, count - b.shape[1]))
 
 
 def apply_votes(
     scene: Scene, votes: Float[Tensor, "n k"], names: Mapping[int, str], source: str, seed: int = 0
 ) -> Scene:
-    """The scene with the label that won each Gaussian, grown to whole objects, and its objects.
+    """The scene labelled by majority, labels grown to whole objects, with its objects.
 
-    An object without a name becomes object_NUMBER. `source` is what errors and warnings name: whatever gave labels.
+    An object without a name becomes object_NUMBER. `source` names the origin of the labels in messages. Raises
+    InputError where the labels contain no object.
     """
     if votes.shape[1] == 1:
-        raise InputError(f"{source}: the label images hold no object: every pixel is 0")
+        raise InputError(f"{source}: the label images contain no object: every pixel is 0")
     means = scene.gaussians.means
     ids = remove_outliers(means, majority_labels(scene, pool_votes(means, votes)))
     present = set(ids.unique().tolist())
@@ -129,32 +134,33 @@ def apply_votes(
     if missing := [i for i in range(1, votes.shape[1]) if i not in present]:
         log.warning("%s: labels %s won no Gaussian", source, ", ".join(map(str, missing)))
     g = replace(scene.gaussians, object_id=ids)
-    grown = grow_objects(g, find_support(scene, seed=seed), _reach(means, ids)) if objects else g
+    grown = grow_objects(g, find_support(scene, seed=seed), _growth_radius(means, ids)) if objects else g
     return replace(scene, gaussians=grown, objects=objects)
 
 
 def majority_labels(scene: Scene, votes: Float[Tensor, "n k"]) -> Int[Tensor, "n"]:
-    """The label with most votes; ties and Gaussians without votes take that of the nearest decided ones.
+    """The label with most votes; ties and Gaussians without votes take the majority of the 5 nearest decided ones.
 
-    Of these the five nearest decide, if they are near: within three times the usual spacing.
+    Decided neighbours farther than MAX_SPACING times the median spacing are ignored.
     """
     best, ids = votes.max(1)
     second = votes.scatter(1, ids[:, None], 0).amax(1)
     decided = (best > 0) & (best > second)
     ids = torch.where(decided, ids, 0)
     means = scene.gaussians.means
-    unsure = torch.nonzero(~decided & means.isfinite().all(1))[:, 0]
-    if not decided.any() or not len(unsure):
+    undecided = torch.nonzero(~decided & means.isfinite().all(1))[:, 0]
+    if not decided.any() or not len(undecided):
         return ids
-    distance, index = knn(means[decided], means[unsure], 5)
-    near = knn(means[decided][:20_000], means[decided][:20_000], 4)[0][:, -1].median() * 3
+    distance, index = knn(means[decided], means[undecided], 5)
+    some = means[decided][:MAX_SPACING_POINTS]
+    near = knn(some, some, 4)[0][:, -1].median() * MAX_SPACING
     ballot = torch.nn.functional.one_hot(ids[decided][index], votes.shape[1]) * (distance < near)[..., None]
-    ids[unsure] = torch.where(ballot.sum((1, 2)) > 0, ballot.sum(1).argmax(1), 0)
+    ids[undecided] = torch.where(ballot.sum((1, 2)) > 0, ballot.sum(1).argmax(1), 0)
     return ids
 
 
 def remove_outliers(means: Float[Tensor, "n 3"], ids: Int[Tensor, "n"], limit: float = 3.5) -> Int[Tensor, "n"]:
-    """Labels with each object's strays made background: modified z-score of the distance to the median centre.
+    """Labels with each object's outliers set to 0, by the modified z-score of the distance to the median centre.
 
     Source: Iglewicz and Hoaglin 1993: 0.6745 |d - median| / MAD <= 3.5.
     """
@@ -169,7 +175,9 @@ def remove_outliers(means: Float[Tensor, "n 3"], ids: Int[Tensor, "n"], limit: f
     return ids
 
 
-def _reach(means: Float[Tensor, "n 3"], ids: Int[Tensor, "n"]) -> float:
-    """Three times the usual spacing of labelled Gaussians [scene units]."""
+def _growth_radius(means: Float[Tensor, "n 3"], ids: Int[Tensor, "n"]) -> float:
+    """Radius of region growing: MAX_SPACING times the median spacing of labelled Gaussians [scene units]."""
     labelled = means[ids > 0]
-    return 3 * float(knn(labelled, labelled[:20_000], 4)[0][:, -1].median()) if len(labelled) > 4 else 0.0
+    if len(labelled) <= 4:
+        return 0.0
+    return MAX_SPACING * float(knn(labelled, labelled[:MAX_SPACING_POINTS], 4)[0][:, -1].median())

@@ -74,8 +74,8 @@ def test_of_several_tries_the_best_is_kept(monkeypatch):
         return tries[-1]
 
     monkeypatch.setattr("stages.refine.inpaint.TRIES", 4)
-    searched = inpainting._searched
-    monkeypatch.setattr("stages.refine.inpaint._searched", spoiled)
+    searched = inpainting._search
+    monkeypatch.setattr("stages.refine.inpaint._search", spoiled)
     assert np.array_equal(filled(rgb, hole), alone) and len(tries) == 4
 
 

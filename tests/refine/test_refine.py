@@ -163,11 +163,11 @@ def test_the_share_of_cameras_that_see_a_place(before):
     places = places[((places[:, 0].abs() > 0.13) | (places[:, 1].abs() > 0.11))]
     eyes = centres(before.cameras.viewmats)
     least, most = (passes(eyes, places, grown).float().mean(0) for grown in (0.02, -0.005))
-    found = ObservedSpace.of(before).share(places, 0.02)
+    found = ObservedSpace.of(before).visible_fraction(places, 0.02)
     assert bool((found >= least - 1e-6).all() and (found <= most + 1e-6).all())
     assert bool((least == most).float().mean() > 0.3) and float(least.min()) < 0.7 < float(most.max())
     inside = torch.tensor([[0.0, 0.0, 0.0], [0.05, -0.04, 0.0]])
-    assert float(ObservedSpace.of(before).share(inside, 0.02).max()) == 0.0
+    assert float(ObservedSpace.of(before).visible_fraction(inside, 0.02).max()) == 0.0
 
 
 def test_wide_patches_behind_fur_are_hidden_and_before_it_they_are_not():
@@ -181,7 +181,7 @@ def test_wide_patches_behind_fur_are_hidden_and_before_it_they_are_not():
     scene = Scene(fur, cameras=Cameras(viewmats, Ks, torch.tensor([[200, 200]]), ("a",)))
     _, weight = visibility(concatenate([fur, wide[:1]]), viewmats[0], Ks[0], 200, 200)
     assert float(weight[-1]) > 0.3  # [px]: a little through each of many pixels
-    assert ObservedSpace.of(scene).hidden(fur, wide).tolist() == [True, False]
+    assert ObservedSpace.of(scene).is_hidden(fur, wide).tolist() == [True, False]
 
 
 def test_what_the_photos_show_stays(before, after):

@@ -105,7 +105,7 @@ def test_poses_are_fitted_exactly():
 def test_of_poses_that_are_alike_the_first_is_kept():
     turns = matrix(torch.tensor([[1.0, 0, 0, a] for a in (0.0, 0.01, 0.3, 0.0, 0.31)]))  # 0, 1, 33, 0 and 34 degrees
     shift = torch.tensor([[0.0, 0, 0], [0, 0, 0], [0, 0, 0], [0, 0.1, 0], [0, 0, 0]])
-    kept = PoseHypotheses(torch.arange(5.0), turns, shift).distinct(3, degrees=5.0, far=0.05)
+    kept = PoseHypotheses(torch.arange(5.0), turns, shift).distinct(3, degrees=5.0, shift=0.05)
     assert kept.scale.tolist() == [0.0, 2.0, 3.0]
 
 

@@ -116,7 +116,7 @@ def test_weights_are_fetched_only_when_asked_and_absent(weights, tmp_path, monke
 def test_photos_of_other_proportions_are_refused(scene_file, truth, weights, photos, tmp_path):
     write_png(photos / "05.png", render_view(truth, 5)[:80])
     boxes = prompts_file(tmp_path / "p.json", **BOXES)
-    with pytest.raises(InputError, match="--photos: 05.jpg is 160x80, in the scene 160x160.*drawn instead"):
+    with pytest.raises(InputError, match="--photos: 05.jpg is 160x80, in the scene 160x160.*rendered instead"):
         run(scene_file, tmp_path / "out.ply", SegmentOptions("sam2", boxes=boxes, photos=photos, weights=weights))
 
 

@@ -168,7 +168,7 @@ def test_a_mistake_is_one_sentence_and_nothing_is_written(scene_file, tmp_path, 
 
 def test_masks_of_other_proportions_are_refused(scene_file, truth, tmp_path):
     folder = write_masks(tmp_path / "masks", truth, [torch.ones(80, 160, dtype=torch.int64)] * len(truth.cameras))
-    with pytest.raises(InputError, match="proportions"):
+    with pytest.raises(InputError, match="aspect ratio"):
         run(scene_file, tmp_path / "out.ply", SegmentOptions(masks=folder))
 
 

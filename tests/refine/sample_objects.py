@@ -1,4 +1,4 @@
-"""A thing without symmetry, in four colours, and what is seen of it."""
+"""Test objects for registration: an asymmetric object in four colours, random similarities."""
 
 import torch
 

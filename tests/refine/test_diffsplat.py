@@ -1,4 +1,4 @@
-"""The generating completer: true maps in the network's place end where the object is; a network of noise is refused."""
+"""The completer "diffsplat", with true output maps in place of the network, and with random weights."""
 
 import logging
 from dataclasses import replace
@@ -42,7 +42,7 @@ def truth() -> Gaussians:
 
 @pytest.fixture(scope="module")
 def seen(truth) -> Scene:
-    """What three cameras on one side see of the thing on a table."""
+    """The part of the object on a table that three cameras on one side see."""
     scene = scene_of(table_gaussians(0.02), truth)
     scene = replace(scene, cameras=scene.cameras[:3], objects=(SceneObject(1, "toy_thing"),))
     g = scene.gaussians
@@ -50,9 +50,9 @@ def seen(truth) -> Scene:
 
 
 def maps_of(g: Gaussians, elevation: float) -> torch.Tensor:
-    """The maps that a perfect network would answer with: colour and depth drawn by DiffSplat's own cameras."""
+    """The output maps of a perfect network: colour and depth rendered from DiffSplat's cameras."""
     viewmats = cameras(elevation)
-    # corner pixels lie on the picture's corners
+    # the centres of corner pixels are the corners of the image
     K = intrinsics(SIDE, SIDE, FOCAL * (SIDE - 1)).expand(4, 3, 3)
     drawn = rasterise(g, viewmats, K, SIDE, SIDE)
     maps = torch.zeros(4, 12, SIDE, SIDE)
@@ -66,7 +66,7 @@ def maps_of(g: Gaussians, elevation: float) -> torch.Tensor:
 
 @pytest.fixture(scope="module")
 def perfect(seen, truth):
-    """In the network's place: the true object, a little off from where the portrait's camera says it is."""
+    """In place of the network: the true object, slightly displaced from the pose of the crop's camera."""
     place = crop_object(seen, opaque_gaussians(seen, 1), SIDE).place
     R = place.rotation.mT
     back = Similarity(1 / place.scale, R, -(R @ place.translation) / place.scale)
@@ -82,10 +82,10 @@ def perfect(seen, truth):
 def whole(seen, perfect) -> Scene:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(diffsplat, "_model", lambda *_: perfect)
-        return refine(seen, RefineOptions("diffsplat", background=False, keep_raw=True))
+        return refine(seen, RefineOptions(completer="diffsplat", background=False, keep_raw=True))
 
 
-def test_the_thing_is_whole_where_it_was_not_seen(seen, whole, truth):
+def test_unseen_side_is_completed(seen, whole, truth):
     all_round = scene_of(table_gaussians(0.02), truth)
     outside = all_round.gaussians.means[
         (ObservedSpace.of(all_round).weight > 0.02) & (all_round.gaussians.object_id == 1)
@@ -96,20 +96,20 @@ def test_the_thing_is_whole_where_it_was_not_seen(seen, whole, truth):
     assert nearest_neighbours(after, truth.means).distance.quantile(0.95) < 0.02 * PLACE.scale
 
 
-def test_its_colours_are_right_all_around(whole, truth):
+def test_completed_colours_match_the_object(whole, truth):
     g = whole.gaussians[whole.gaussians.object_id == 1]
     index = nearest_neighbours(g.means, truth.means).index
     error = (g.sh[:, 0] - truth.sh[index, 0]).abs().mean(1) * C0
     assert error.median() < 0.05
 
 
-def test_the_raw_thing_stands_beside_it(seen, whole):
+def test_keep_raw_adds_the_uncompleted_object(seen, whole):
     assert [o.name for o in whole.objects] == ["toy_thing", "toy_thing (raw)"]
     counts = [int((whole.gaussians.object_id == i).sum()) for i in (1, 2)]
     assert counts[0] > counts[1] > 100
 
 
-def test_a_hint_helps_where_nothing_stands_out():
+def test_registration_of_a_featureless_object_with_a_hint():
     """A plain cylinder's part has no features to match; near a hint it is found."""
     plain = coloured_gaussians(ellipsoid((0.2, 0.3, 0.5), 8000), (0.5, 0.5, 0.5), 1, grain=0.0)
     there = Similarity(0.4, matrix(torch.tensor([0.8, 0.2, -0.3, 0.1])), torch.tensor([0.2, 0.1, 0.3]))
@@ -122,19 +122,19 @@ def test_a_hint_helps_where_nothing_stands_out():
     ).diameter
 
 
-def test_without_weights_it_is_one_sentence(seen, tmp_path, monkeypatch):
+def test_missing_weights_are_reported(seen, tmp_path, monkeypatch):
     monkeypatch.setenv("NGFF_WEIGHTS", str(tmp_path / "none"))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     write_scene(tmp_path / "scene.ply", seen)
     with pytest.raises(InputError, match="chenguolin/DiffSplat"):
-        run(tmp_path / "scene.ply", tmp_path / "out.ply", RefineOptions("diffsplat"))
+        run(tmp_path / "scene.ply", tmp_path / "out.ply", RefineOptions(completer="diffsplat"))
     assert not (tmp_path / "out.ply").exists()
     with pytest.raises(InputError, match="--completer diffsplat"):
         RefineOptions(photos=tmp_path)
 
 
-def test_a_network_of_noise_adds_nothing_and_it_is_said(seen, tmp_path, caplog, monkeypatch):
-    """Random weights in the published layout, through the same loader, sampler (of fewer steps) and registration."""
+def test_output_of_random_weights_is_rejected(seen, tmp_path, caplog, monkeypatch):
+    """Random weights in the published layout, through the loader, a sampler with fewer steps, and registration."""
     pytest.importorskip("diffusers")
     pytest.importorskip("transformers")
     from stages.core.models.diffsplat import network
@@ -143,7 +143,7 @@ def test_a_network_of_noise_adds_nothing_and_it_is_said(seen, tmp_path, caplog, 
     monkeypatch.setattr(network, "STEPS", 3)
     write_scene(tmp_path / "scene.ply", seen)
     with caplog.at_level(logging.INFO):
-        options = RefineOptions("diffsplat", weights=published(tmp_path / "weights"), background=False, device="cpu")
+        options = RefineOptions(completer="diffsplat", weights=published(tmp_path / "weights"), background=False)
         run(tmp_path / "scene.ply", tmp_path / "out.ply", options)
     assert "unchanged" in caplog.text and "the object generated from" in caplog.text
     before, after = (int((s.gaussians.object_id == 1).sum()) for s in (seen, read_scene(tmp_path / "out.ply")))

@@ -1,4 +1,4 @@
-"""Holes in pictures: light without a seam, texture that goes on, and pictures that make no sense."""
+"""Inpainting: brightness gradients, texture, edges, and degenerate images."""
 
 import numpy as np
 import pytest
@@ -25,7 +25,7 @@ def psnr(one: np.ndarray, two: np.ndarray) -> float:
     return -10 * float(np.log10(np.square(one - two).mean()))
 
 
-def test_light_goes_on_without_a_seam():
+def test_brightness_gradient_continues_without_a_seam():
     x = np.linspace(0.2, 0.8, SIDE, dtype=np.float32)
     rgb = np.stack([np.broadcast_to(x, (SIDE, SIDE))] * 3, -1)
     out = filled(rgb, middle())
@@ -34,7 +34,7 @@ def test_light_goes_on_without_a_seam():
 
 
 @pytest.mark.parametrize("shade", [0.0, 0.3], ids=["even", "lit from one side"])
-def test_a_chequered_cloth_goes_on(shade):
+def test_checker_pattern_continues(shade):
     """A period of 12 cells: what is copied must be in step with what is around, at both sides of the hole."""
     y, x = np.mgrid[:SIDE, :SIDE]
     value = 0.3 + 0.4 * ((x // 6 + y // 6) % 2) + shade * x / SIDE
@@ -43,7 +43,7 @@ def test_a_chequered_cloth_goes_on(shade):
 
 
 @pytest.mark.parametrize("slope", [-0.6, 0.3], ids=["falling", "rising"])
-def test_the_rims_of_two_mats_go_on_straight(slope):
+def test_straight_edges_continue(slope):
     """Across a wide round hole runs a strip of table between two woven mats: no mean of all three, and no bulge."""
     side, colours = 160, np.float32([[0.85, 0.5, 0.45], [0.55, 0.4, 0.2], [0.35, 0.4, 0.45]])
     y, x = np.mgrid[:side, :side] - side / 2
@@ -59,10 +59,10 @@ def test_the_rims_of_two_mats_go_on_straight(slope):
     assert psnr(out[hole], rgb[hole]) > 28
 
 
-def test_of_several_tries_the_best_is_kept(monkeypatch):
+def test_best_of_several_trials_is_used(monkeypatch):
     y, x = np.mgrid[:SIDE, :SIDE]
     rgb = np.repeat((0.3 + 0.4 * ((x // 6 + y // 6) % 2))[..., None], 3, 2).astype(np.float32)
-    hole = middle(6)  # filled at once, without a coarser picture
+    hole = middle(6)  # filled without a coarser level
     monkeypatch.setattr("stages.refine.inpaint.TRIES", 1)
     alone, tries = filled(rgb, hole), []
 
@@ -79,8 +79,8 @@ def test_of_several_tries_the_best_is_kept(monkeypatch):
     assert np.array_equal(filled(rgb, hole), alone) and len(tries) == 4
 
 
-def test_grain_stays_grainy():
-    """Noise cannot be foretold, but its strength can: a smooth patch would be seen at once."""
+def test_texture_contrast_is_kept():
+    """Noise cannot be reproduced, but its standard deviation can."""
     rgb = 0.5 + 0.1 * np.random.default_rng(0).standard_normal((SIDE, SIDE, 3)).astype(np.float32)
     out = filled(rgb.clip(0, 1), middle())
     assert 0.06 < out[middle()].std() < 0.14
@@ -91,7 +91,7 @@ def test_grain_stays_grainy():
     [((1, 1), "none"), ((2, 3), "half"), ((5, 200), "half"), ((64, 64), "none"), ((64, 64), "all"),
      ((64, 64), "one"), ((64, 64), "scattered")],
 )  # fmt: skip
-def test_pictures_with_little_to_go_by_are_filled_somehow(shape, known):
+def test_images_with_few_known_pixels_are_filled(shape, known):
     rng = np.random.default_rng(0)
     rgb = rng.random((*shape, 3), np.float32)
     mask = np.broadcast_to({
@@ -103,6 +103,6 @@ def test_pictures_with_little_to_go_by_are_filled_somehow(shape, known):
     assert (out[mask] == rgb[mask]).all()
 
 
-def test_the_same_seed_gives_the_same_picture():
+def test_same_seed_gives_the_same_image():
     rgb = np.random.default_rng(0).random((SIDE, SIDE, 3)).astype(np.float32)
     assert (filled(rgb, middle()) == filled(rgb, middle())).all()

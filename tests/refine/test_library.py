@@ -1,4 +1,4 @@
-"""The library completer: what fits is put in place, what does not is left alone, the photos' look stays."""
+"""The completer "library": a matching asset completes the object, others are rejected."""
 
 import logging
 from dataclasses import replace
@@ -27,7 +27,7 @@ from tests.segment.tabletop import coloured_gaussians, scene_of, table_gaussians
 
 SIZE, TURN = 0.3, matrix(torch.tensor([0.9, 0.0, 0.0, 0.4]))
 PLACE = Similarity(SIZE, TURN, torch.tensor([0.02, -0.03, 0.1 * SIZE]))
-DARK = 0.85  # the photos show the thing in less light than the library
+DARK = 0.85  # brightness of the object in the photos, relative to the library
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +37,7 @@ def truth():
 
 @pytest.fixture(scope="module")
 def seen(truth) -> Scene:
-    """The thing on a table as four cameras on one side see it, darker than in the library."""
+    """The part of the object on a table that four cameras on one side see, darker than in the library."""
     black = -0.5 / C0
     scene = scene_of(table_gaussians(0.02), replace(truth, sh=black + DARK * (truth.sh - black)))
     all_round = scene.cameras
@@ -68,14 +68,14 @@ def whole(seen, folder) -> Scene:
     return refine(seen, RefineOptions(library=folder, background=False, keep_raw=True))
 
 
-def test_the_thing_is_whole_where_it_was_not_seen(seen, whole, truth):
+def test_unseen_side_is_completed(seen, whole, truth):
     before, after = (s.gaussians.means[s.gaussians.object_id == 1] for s in (seen, whole))
     far = [chamfer(nearest_neighbours(p, truth.means), nearest_neighbours(truth.means, p)) for p in (before, after)]
     assert far[1]["to_prediction"] < 0.2 * far[0]["to_prediction"]
     assert far[1]["to_truth"] < 0.01 * SIZE
 
 
-def test_it_is_as_dark_as_in_the_photos(whole, truth):
+def test_asset_colours_are_adapted_to_the_photos(whole, truth):
     g = whole.gaussians[whole.gaussians.object_id == 1]
     back = g[g.means[:, 1] > 0.045]
     there = nearest_neighbours(back.means, truth.means).index
@@ -83,14 +83,14 @@ def test_it_is_as_dark_as_in_the_photos(whole, truth):
     assert float(rgb.sum() / bright.sum()) == pytest.approx(DARK, abs=0.06)
 
 
-def test_raw_objects_are_kept_behind_the_completed_ones(seen, whole):
+def test_keep_raw_appends_the_uncompleted_objects(seen, whole):
     assert [(o.id, o.name) for o in whole.objects] == [(1, "thing"), (2, "thing (raw)")]
     raw = whole.gaussians.means[whole.gaussians.object_id == 2]
     assert len(raw) <= int((seen.gaussians.object_id == 1).sum())
     assert len(raw) < int((whole.gaussians.object_id == 1).sum())
 
 
-def test_a_stranger_is_left_alone_and_it_is_said(folder, caplog):
+def test_object_without_a_matching_asset_is_unchanged(folder, caplog):
     strange = coloured_gaussians(ellipsoid((0.05, 0.05, 0.12), 3000).moved((0, 0, 0.12)), (0.1, 0.7, 0.7), 1)
     scene = replace(scene_of(table_gaussians(0.02), strange), objects=(SceneObject(1, "bottle"),))
     with caplog.at_level(logging.INFO):
@@ -99,7 +99,7 @@ def test_a_stranger_is_left_alone_and_it_is_said(folder, caplog):
     assert "bottle" in caplog.text and "unchanged" in caplog.text
 
 
-def test_a_moved_object_looks_as_before_from_a_camera_moved_with_it():
+def test_transformed_gaussians_render_equally_from_a_transformed_camera():
     g = random_gaussians(200, degree=2)
     there = Similarity(1.7, matrix(torch.tensor([0.5, 0.3, -0.6, 0.2])), torch.tensor([1.0, -2.0, 0.5]))
     viewmat, K = look_at(torch.tensor([2.0, 1.0, 1.5]), torch.zeros(3))[None], intrinsics(48, 48, 60.0)[None]
@@ -108,17 +108,18 @@ def test_a_moved_object_looks_as_before_from_a_camera_moved_with_it():
     torch.testing.assert_close(before, after, rtol=0, atol=2e-3)
 
 
-def test_what_is_no_library_is_said(seen, tmp_path):
+def test_invalid_libraries_are_refused(seen, tmp_path):
     write_scene(tmp_path / "labelled.ply", seen)
-    for folder, says in ((tmp_path / "none", "is no folder"), (tmp_path / "empty", "holds no .ply")):
+    for folder, message in ((tmp_path / "none", "is no folder"), (tmp_path / "empty", "holds no .ply")):
         (tmp_path / "empty").mkdir(exist_ok=True)
-        with pytest.raises(InputError, match=says):
+        with pytest.raises(InputError, match=message):
             run(tmp_path / "labelled.ply", tmp_path / "out.ply", RefineOptions(library=folder))
     with pytest.raises(InputError, match="--library"):
         RefineOptions(completer="library")
 
 
-def test_the_output_says_which_library(seen, folder, tmp_path):
+def test_provenance_records_the_library(seen, folder, tmp_path):
     write_scene(tmp_path / "labelled.ply", replace(seen, gaussians=concatenate([seen.gaussians[::4]])))
-    run(tmp_path / "labelled.ply", tmp_path / "out.ply", RefineOptions("none", library=folder, background=False))
+    options = RefineOptions(completer="none", library=folder, background=False)
+    run(tmp_path / "labelled.ply", tmp_path / "out.ply", options)
     assert read_scene(tmp_path / "out.ply").provenance["options"]["library"] == str(folder)

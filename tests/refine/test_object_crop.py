@@ -1,4 +1,4 @@
-"""Portraits: the photo turned to the object is what a camera turned to it sees, and tells where the object belongs."""
+"""Object crops: the warped photo equals the view of a rotated camera, whose pose is that of the network."""
 
 import math
 from dataclasses import replace
@@ -26,7 +26,7 @@ PLACE = Similarity(0.3, matrix(torch.tensor([0.9, 0.0, 0.0, 0.4])), torch.tensor
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    """The thing on a table, to one side in all pictures, from 25 degrees up, and once from far above."""
+    """The object on a table, off-centre in all views, from 25 degrees elevation and once from 85."""
     viewmats = orbit(6, torch.tensor([0.0, 0, 0.1]), 1.0, 25.0)
     steep = orbit(1, torch.tensor([0.0, 0, 0.1]), 0.8, 85.0)
     K = intrinsics(320, 240, 340.0)
@@ -56,15 +56,15 @@ def outline(image) -> tuple[float, float, float, float]:
     return float(columns.min()), float(rows.min()), float(columns.max() + 1), float(rows.max() + 1)
 
 
-def test_it_is_alone_centred_and_fills_four_fifths(shown):
+def test_object_is_alone_centred_and_fills_the_crop(shown):
     left, top, right, bottom = outline(shown.image)
     assert max(right - left, bottom - top) == pytest.approx(CROP_FILL * SIDE, abs=3)
     assert (left + right) / 2 == pytest.approx(SIDE / 2, abs=2) and (top + bottom) / 2 == pytest.approx(SIDE / 2, abs=2)
     assert bool((shown.image[[0, 0, -1, -1], [0, -1, 0, -1]] == 1).all())
 
 
-def test_a_turned_photo_is_what_a_turned_camera_sees(scene, shown):
-    """The object drawn by itself, by the camera that `place` says: in the photo's place, turned to place(0)."""
+def test_rotated_photo_equals_the_view_of_a_rotated_camera(scene, shown):
+    """Against the object rendered alone by the camera at the photo's position, rotated to place(0)."""
     eye = centres(scene.cameras.viewmats[int(shown.name[0])][None])[0]
     viewmat, distance = look_at(eye, shown.place.translation), float((eye - shown.place.translation).norm())
     focal = FOCAL * SIDE * distance / (1.4 * shown.place.scale)
@@ -74,16 +74,16 @@ def test_a_turned_photo_is_what_a_turned_camera_sees(scene, shown):
     fine = rasterise(own, viewmat[None], K[None], 4 * SIDE, 4 * SIDE, white).rgb[0]
     direct = torch.nn.functional.avg_pool2d(fine.permute(2, 0, 1), 4).permute(1, 2, 0)
     error = (direct - shown.image).square().mean()
-    assert -10 * math.log10(error) > 27  # the photo is coarser than the portrait
+    assert -10 * math.log10(error) > 27  # the photo has a lower resolution than the crop
 
 
-def test_without_photos_it_is_drawn_from_the_gaussians(scene, shown):
+def test_crop_without_photos_is_rendered(scene, shown):
     drawn = crop_object(scene, opaque_gaussians(scene, 1), SIDE)
     assert -10 * math.log10((drawn.image - shown.image).square().mean()) > 25
     assert drawn.elevation == pytest.approx(shown.elevation)
 
 
-def test_its_camera_is_the_first_of_the_network(scene, shown):
+def test_crop_camera_is_the_first_camera_of_the_network(scene, shown):
     """Points near the object's middle lie in the same pixels for the camera in the scene and for DiffSplat's first."""
     eye = centres(scene.cameras.viewmats[int(shown.name[0])][None])[0]
     middle = shown.place.translation
@@ -97,17 +97,17 @@ def test_its_camera_is_the_first_of_the_network(scene, shown):
     torch.testing.assert_close(theirs, ours, rtol=0, atol=0.03)
 
 
-def test_the_camera_far_above_is_not_asked_and_the_one_that_sees_it_whole_is(scene, photos):
+def test_steep_and_cropped_views_are_not_chosen(scene, photos):
     cut = scene.cameras.viewmats.clone()
     others = [i for i in range(6) if i != 2]
-    cut[others, 0, 3] += 0.55  # now at the edge of all pictures but one
+    cut[others, 0, 3] += 0.55  # cropped in all views but one
     off, own = replace(scene, cameras=replace(scene.cameras, viewmats=cut)), opaque_gaussians(scene, 1)
     assert crop_object(off, own, SIDE, photos).name == "2.jpg"
     for few in (scene.cameras[[6]], None):
         assert crop_object(replace(scene, cameras=few), own, SIDE) is None
 
 
-def test_photos_of_something_else_are_refused(scene, tmp_path):
+def test_photos_of_another_scene_are_refused(scene, tmp_path):
     write_png(tmp_path / "other.png", torch.zeros(4, 4, 3))
     with pytest.raises(InputError, match="holds no photo of the scene, such as 0.jpg"):
         crop_object(scene, opaque_gaussians(scene, 1), SIDE, tmp_path)

@@ -1,4 +1,4 @@
-"""Floaters go, and nothing else."""
+"""Outlier removal."""
 
 from dataclasses import replace
 
@@ -23,7 +23,7 @@ def with_floaters(body: Gaussians, count: int = 60) -> Gaussians:
 
 
 @pytest.mark.parametrize("kind", ["block", "egg", "rod"])
-def test_what_is_left_has_no_floaters_beyond_three_robust_deviations(kind):
+def test_no_outliers_beyond_three_robust_deviations_remain(kind):
     body = {
         "block": lambda: block((0.0, 0.0), (0.2, 0.16, 0.12), (0.8, 0.1, 0.1), 1),
         "egg": lambda: egg((0.0, 0.0, 0.1), (0.06, 0.06, 0.09), (0.1, 0.2, 0.8), 1),

@@ -1,4 +1,4 @@
-"""The refine stage: floaters away, unseen sides closed, the table whole; what was seen stays."""
+"""The refine stage: outlier removal, completion, background filling."""
 
 import time
 from dataclasses import replace
@@ -31,7 +31,7 @@ REMAINS = {-0.035: (0.8, 0.7, 0.1), 0.035: (0.08, 0.08, 0.08)}  # y [m]: colour
 
 
 def photographed() -> Scene:
-    """A red block as photos show it: no bottom, and no table beneath it."""
+    """A red block as reconstructed from photos: without bottom, and without table under it."""
     thing = block((0.0, 0.0), SIDES, (0.8, 0.1, 0.1), 1)
     top = table_gaussians()
     hidden = (top.means[:, 0].abs() < SIDES[0] / 2) & (top.means[:, 1].abs() < SIDES[1] / 2)
@@ -58,7 +58,7 @@ def seen(scene: Scene, eye: tuple, keep: int, target: tuple = (0.0, 0, 0)):
     return drawn.rgb[0, middle, middle].mean((0, 1)), float(drawn.alpha[0, middle, middle].mean())
 
 
-def test_the_bottom_is_closed_in_the_colour_of_the_sides(before, after):
+def test_bottom_is_closed_in_the_colour_of_the_sides(before, after):
     below = (0.05, 0.0, -0.6)
     outside = (0.0, 0.0, 0.06)
     # before, one looks up into the block; its top is seen from inside, 0.12 higher than the bottom
@@ -72,7 +72,7 @@ def test_the_bottom_is_closed_in_the_colour_of_the_sides(before, after):
     assert torch.allclose(rgb, torch.tensor([0.8, 0.1, 0.1]), atol=0.12)
 
 
-def test_the_table_under_a_lifted_object_is_there_and_has_its_colour(before, after):
+def test_table_under_an_object_is_filled_in_its_colour(before, after):
     above = (0.05, 0.0, 1.0)
     assert seen(before, above, 0)[1] < 0.2
     rgb, alpha = seen(after, above, 0)
@@ -80,7 +80,7 @@ def test_the_table_under_a_lifted_object_is_there_and_has_its_colour(before, aft
     assert torch.allclose(rgb, torch.tensor(WOOD), atol=0.08)
 
 
-def test_parts_of_an_object_that_were_left_on_the_table_do_not_stay_beneath_it():
+def test_unlabelled_parts_under_an_object_are_replaced_by_table():
     """A block stands on two rails, and what cameras saw between them lies on the table's plane in yellow and black."""
     top, rails = table_gaussians(), [block((0.0, y), (0.2, 0.02, 0.07), (0.8, 0.1, 0.1), 1) for y in (-0.07, 0.07)]
     body = block((0.0, 0.0), SIDES, (0.8, 0.1, 0.1), 1)
@@ -101,7 +101,7 @@ def test_parts_of_an_object_that_were_left_on_the_table_do_not_stay_beneath_it()
         assert alpha > 0.9 and torch.allclose(now, torch.tensor(WOOD), atol=0.08)
 
 
-def test_where_a_large_remain_goes_the_table_is_whole(before):
+def test_table_is_filled_where_a_large_gaussian_is_removed(before):
     # beneath the block three wide yellow Gaussians in one place, and many small ones beside it
     small = coloured_gaussians(sheet(0.05, 0.12, 0.01).moved((-0.06, 0.0, 0.0)), (0.8, 0.7, 0.1), 0)
     wide = replace(small[:3], means=torch.tensor([[0.03, 0.0, 0.0]]).repeat(3, 1), opacities=torch.full((3,), 0.999))
@@ -113,7 +113,7 @@ def test_where_a_large_remain_goes_the_table_is_whole(before):
     assert alpha > 0.95 and torch.allclose(colour, torch.tensor(WOOD), atol=0.08)
 
 
-def test_no_dark_rim_is_left_around_a_lifted_object(before):
+def test_contact_shadow_is_removed(before):
     """All around the block, where it stands, a contact shadow lies on the table, in plain sight of the cameras."""
     g = before.gaussians
     beside = (g.means[:, 0].abs() < SIDES[0] / 2 + 0.015) & (g.means[:, 1].abs() < SIDES[1] / 2 + 0.015)
@@ -127,13 +127,13 @@ def test_no_dark_rim_is_left_around_a_lifted_object(before):
     assert alpha > 0.9 and torch.allclose(rgb, torch.tensor(WOOD), atol=0.08)
 
 
-def test_without_cameras_the_table_is_filled_in_its_own_colours():
+def test_table_is_filled_without_cameras():
     scene = refine(replace(photographed(), cameras=None), RefineOptions(completer="none"))
     rgb, alpha = seen(scene, (0.001, 0.001, 1.0), 0)
     assert alpha > 0.9 and torch.allclose(rgb, torch.tensor(WOOD), atol=0.08)
 
 
-def test_the_table_ends_where_it_ended():
+def test_table_is_not_extended_beyond_its_edge():
     """In the corner of an L-shaped table a block stands at the edge; past it cameras see the floor."""
     top = table_gaussians()
     floor = coloured_gaussians(sheet(2.0, 2.0, 0.03).moved((0.0, 0.0, -0.4)), (0.3, 0.3, 0.35), 0)
@@ -156,7 +156,7 @@ def passes(eyes: torch.Tensor, places: torch.Tensor, grown: float) -> torch.Tens
     return torch.minimum(one, two).amax(2) > torch.maximum(one, two).amin(2).clamp_max(1.0)
 
 
-def test_the_share_of_cameras_that_see_a_place(before):
+def test_visible_fraction_equals_ray_casting(before):
     """Beside the block a place is seen by those cameras that it does not stand in the way of."""
     places = 0.36 * torch.rand(60, 3, generator=torch.Generator().manual_seed(0)) - 0.18
     places[:, 2] = 0.0
@@ -170,7 +170,7 @@ def test_the_share_of_cameras_that_see_a_place(before):
     assert float(ObservedSpace.of(before).visible_fraction(inside, 0.02).max()) == 0.0
 
 
-def test_wide_patches_behind_fur_are_hidden_and_before_it_they_are_not():
+def test_large_discs_are_hidden_only_behind_a_surface():
     x = torch.cartesian_prod(torch.linspace(-0.2, 0.2, 41), torch.linspace(-0.2, 0.2, 41))
     up = torch.tensor([0.0, 0.0, 1.0])
     flat = torch.cat([x, torch.zeros(len(x), 1)], 1)
@@ -184,11 +184,11 @@ def test_wide_patches_behind_fur_are_hidden_and_before_it_they_are_not():
     assert ObservedSpace.of(scene).is_hidden(fur, wide).tolist() == [True, False]
 
 
-def test_what_the_photos_show_stays(before, after):
+def test_views_of_the_photos_are_unchanged(before, after):
     assert object_psnr(before, after) > 35
 
 
-def test_what_lies_in_a_dent_is_not_covered():
+def test_object_in_a_dent_is_not_covered():
     """A plate lower than the table around it, as on a soft seat; where it lay there is table still, below it."""
     top = table_gaussians()
     plate = coloured_gaussians(sheet(0.25, 0.2, 0.006).moved((0.0, 0.0, -0.03)), (0.1, 0.2, 0.8), 1)
@@ -200,21 +200,21 @@ def test_what_lies_in_a_dent_is_not_covered():
     assert alpha > 0.9 and torch.allclose(rgb, torch.tensor(WOOD), atol=0.08)
 
 
-def test_a_second_time_changes_little(after):
+def test_refining_twice_changes_little(after):
     again = refine(after)
     grown = len(again.gaussians) - len(after.gaussians)
     assert abs(grown) < 0.02 * len(after.gaussians)
     assert seen(again, (0.05, 0.0, 1.0), 0)[1] > 0.9
 
 
-def test_new_gaussians_stay_above_the_table_and_within_the_object(before, after):
+def test_completion_stays_above_the_table_and_within_the_object(before, after):
     new = after.gaussians.means[after.gaussians.object_id == 1]
     old = before.gaussians.means[before.gaussians.object_id == 1]
     assert bool((new.amin(0) > old.amin(0) - 0.02).all()) and bool((new.amax(0) < old.amax(0) + 0.02).all())
     assert float(new[:, 2].min()) > -0.005
 
 
-def test_a_bowl_stays_open_where_cameras_look_into_it():
+def test_observed_inside_of_a_bowl_stays_open():
     shell = ellipsoid((0.1, 0.1, 0.1), 4000).moved((0.0, 0, 0.1))
     bowl = coloured_gaussians(shell.kept(shell.points[:, 2] < 0.08), (0.1, 0.3, 0.7), 1)
     refined = refine(scene_of(table_gaussians(), bowl))
@@ -223,7 +223,7 @@ def test_a_bowl_stays_open_where_cameras_look_into_it():
     assert int(inside.sum()) == 0
 
 
-def test_floaters_are_found_and_the_end_of_a_rope_is_not():
+def test_outliers_exclude_the_end_of_a_rope():
     rng = torch.Generator().manual_seed(0)
     rope = random_gaussians(600, size=0.004)
     rope = replace(
@@ -237,7 +237,7 @@ def test_floaters_are_found_and_the_end_of_a_rope_is_not():
 
 
 @pytest.mark.parametrize("kind", ["point", "few", "same place", "sheet", "line", "huge", "zero", "nan", "far apart"])
-def test_degenerate_objects_end_in_time(kind):
+def test_degenerate_objects_terminate(kind):
     g = random_gaussians(300, size=0.01)
     g = replace(g, object_id=torch.ones(300, dtype=torch.int64), means=0.2 * g.means + torch.tensor([0, 0, 0.15]))
     g = {
@@ -259,7 +259,7 @@ def test_degenerate_objects_end_in_time(kind):
     assert bool(refined.gaussians.means[-10:].isfinite().all())
 
 
-def test_unlabelled_scenes_are_sent_to_segment(before, tmp_path):
+def test_unlabelled_scene_is_refused(before, tmp_path):
     blank = replace(before.gaussians, object_id=torch.zeros_like(before.gaussians.object_id))
     write_scene(tmp_path / "scene.ply", replace(before, gaussians=blank, objects=()))
     with pytest.raises(InputError, match="ngff segment"):
@@ -267,7 +267,7 @@ def test_unlabelled_scenes_are_sent_to_segment(before, tmp_path):
     assert not (tmp_path / "out.ply").exists()
 
 
-def test_the_stage_keeps_objects_and_cameras_and_notes_itself(before, tmp_path):
+def test_stage_keeps_objects_and_cameras_and_records_provenance(before, tmp_path):
     write_scene(tmp_path / "labelled.ply", before)
     run(tmp_path / "labelled.ply", tmp_path / "refined.ply", RefineOptions(completer="none", background=False))
     refined = read_scene(tmp_path / "refined.ply")
@@ -276,19 +276,19 @@ def test_the_stage_keeps_objects_and_cameras_and_notes_itself(before, tmp_path):
     assert len(refined.gaussians) <= len(before.gaussians)
 
 
-@pytest.mark.parametrize(("wrong", "says"), [({"outliers": -1.0}, "outliers"), ({"resolution": 4}, "resolution")])
-def test_options_check_themselves(wrong, says):
-    with pytest.raises(InputError, match=says):
+@pytest.mark.parametrize(("wrong", "message"), [({"outliers": -1.0}, "outliers"), ({"resolution": 4}, "resolution")])
+def test_invalid_options_are_refused(wrong, message):
+    with pytest.raises(InputError, match=message):
         RefineOptions(**wrong)
 
 
-def test_an_unknown_completer_is_named(before):
+def test_unknown_completer_is_refused(before):
     with pytest.raises(InputError, match="no backend called 'magic'"):
         refine(before, RefineOptions(completer="magic"))
 
 
-def test_the_wall_behind_what_hangs_on_it_is_filled(before):
-    # the block and its table turned by a quarter about x: what was up is now -y, and there is no floor
+def test_wall_behind_an_object_is_filled(before):
+    # the block and its table rotated by 90 degrees about x: up becomes -y; without a floor
     turn = Similarity(1.0, matrix(torch.tensor([0.5**0.5, 0.5**0.5, 0.0, 0.0])), torch.zeros(3))
     gaussians, cameras = transformed(before.gaussians, turn), before.cameras.transformed(turn)
     hung = replace(before, gaussians=gaussians, cameras=cameras, floor=None)
@@ -299,4 +299,4 @@ def test_the_wall_behind_what_hangs_on_it_is_filled(before):
     assert alpha > 0.95 and float((colour / alpha - torch.tensor(WOOD)).abs().max()) < 0.05
     assert done.floor is None and torch.equal(done.cameras.viewmats, hung.cameras.viewmats)
     kept = done.gaussians.means[: len(hung.gaussians)]
-    assert float(knn(kept, hung.gaussians.means[::50], 1)[0].max()) < 1e-6  # turned there and back
+    assert float(knn(kept, hung.gaussians.means[::50], 1)[0].max()) < 1e-6  # rotated and back

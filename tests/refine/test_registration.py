@@ -1,4 +1,4 @@
-"""Parts are found on their wholes: exact without noise, within the limits with it, and strangers fit badly."""
+"""Registration of parts to whole objects: exact without noise, within tolerance with it."""
 
 from dataclasses import replace
 
@@ -23,7 +23,7 @@ def whole():
     return asymmetric_object()
 
 
-def test_a_moved_copy_is_found_where_it_was_put(whole):
+def test_transformed_copy_is_registered(whole):
     truth = random_similarity(3)
     found = register(replace(whole, means=truth(whole.means)), whole)
     assert degrees_between(found.similarity.rotation, truth.rotation) < 0.3
@@ -33,14 +33,14 @@ def test_a_moved_copy_is_found_where_it_was_put(whole):
 
 
 @pytest.mark.parametrize("number", [0, 1])  # cut, bitten
-def test_a_noisy_part_is_found_within_the_limits(whole, number):
+def test_noisy_part_is_registered_within_tolerance(whole, number):
     given = make_trial(whole, number, RegisterBenchOptions())
     assert len(given.part) == round(0.6 * len(whole))
     wrong = errors(register(given.part, whole).similarity, given, whole, revolved=False)
     assert wrong["rotation"] < 2 and wrong["scale"] < 2 and wrong["shift"] < 1
 
 
-def test_the_way_of_a_gpu_finds_the_same(whole, monkeypatch):
+def test_brute_force_search_gives_the_same_registration(whole, monkeypatch):
     monkeypatch.setattr(registration_cloud, "TARGET_POINTS", 1500)  # all products are many for a CPU
     given = make_trial(whole, 1, RegisterBenchOptions())
     expected = register(given.part, whole)
@@ -54,7 +54,7 @@ def test_the_way_of_a_gpu_finds_the_same(whole, monkeypatch):
 
 @pytest.mark.gpu
 @pytest.mark.skipif("cuda" not in DEVICES, reason="no NVIDIA GPU")
-def test_what_lies_on_a_gpu_is_registered_there(whole):
+def test_registration_on_a_gpu(whole):
     given = make_trial(whole, 1, RegisterBenchOptions())
     near = given.truth._replace(scale=1.02 * given.truth.scale)  # on the CPU, as a camera would tell it
     for hint in (None, near):
@@ -64,27 +64,27 @@ def test_what_lies_on_a_gpu_is_registered_there(whole):
         assert wrong["rotation"] < 2 and wrong["scale"] < 2 and wrong["shift"] < 1
 
 
-def test_another_thing_fits_less(whole):
+def test_another_object_has_a_lower_fit(whole):
     given = make_trial(whole, 0, RegisterBenchOptions())
     stranger = coloured_gaussians(ellipsoid((0.3, 0.2, 0.5), 6000), (0.8, 0.7, 0.6), 1)
     other = register(given.part, stranger)
     assert other is None or other.fit < register(given.part, whole).fit - 0.15
 
 
-def test_a_plain_ball_is_placed_though_it_may_be_turned_any_way():
+def test_sphere_is_registered_up_to_rotation():
     ball = coloured_gaussians(ellipsoid((0.5, 0.5, 0.5), 8000), (0.8, 0.2, 0.1), 1)
     given = make_trial(ball, 1, RegisterBenchOptions())
     found = register(given.part, ball)
-    if found is not None:  # no feature stands out, so it may find nothing
+    if found is not None:  # a sphere has no distinctive features, so there may be no hypothesis
         wrong = errors(found.similarity, given, ball, revolved=False)
         assert wrong["scale"] < 3 and wrong["shift"] < 2
 
 
-def test_a_handful_of_points_is_not_enough(whole):
+def test_too_few_points_give_no_registration(whole):
     assert register(whole[:40], whole) is None
 
 
-def test_features_do_not_depend_on_where_and_how_a_cloud_lies(whole):
+def test_features_are_invariant_to_similarities(whole):
     truth = random_similarity(1)
     a, b = RegistrationCloud.of(whole), RegistrationCloud.of(replace(whole, means=truth(whole.means)))
     nearest = torch.cdist(truth(a.points * a.diameter + a.centre), b.points * b.diameter + b.centre)
@@ -94,7 +94,7 @@ def test_features_do_not_depend_on_where_and_how_a_cloud_lies(whole):
     assert (own - local_features(b, j, 1.0)).norm(dim=1).median() < 0.3 * (own - others).norm(dim=1).median()
 
 
-def test_poses_are_fitted_exactly():
+def test_fitted_poses_are_exact():
     truth = random_similarity(5)
     a = torch.randn(4, 3, 3)
     poses = PoseHypotheses.fitted(a, truth(a))
@@ -102,13 +102,13 @@ def test_poses_are_fitted_exactly():
     torch.testing.assert_close(poses.rotation, truth.rotation.expand(4, 3, 3), rtol=0, atol=1e-4)
 
 
-def test_of_poses_that_are_alike_the_first_is_kept():
+def test_distinct_keeps_the_first_of_similar_poses():
     turns = matrix(torch.tensor([[1.0, 0, 0, a] for a in (0.0, 0.01, 0.3, 0.0, 0.31)]))  # 0, 1, 33, 0 and 34 degrees
     shift = torch.tensor([[0.0, 0, 0], [0, 0, 0], [0, 0, 0], [0, 0.1, 0], [0, 0, 0]])
     kept = PoseHypotheses(torch.arange(5.0), turns, shift).distinct(3, degrees=5.0, shift=0.05)
     assert kept.scale.tolist() == [0.0, 2.0, 3.0]
 
 
-def test_the_diameter_of_a_box_is_its_diagonal():
+def test_diameter_of_a_box_is_its_diagonal():
     corners = torch.cartesian_prod(*[torch.tensor([0.0, s]) for s in (1.0, 2.0, 2.0)])
     assert diameter(corners) == pytest.approx(3.0)

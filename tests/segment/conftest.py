@@ -1,4 +1,4 @@
-"""A tabletop of three objects, and its file as `ngff reconstruct` leaves it: without labels."""
+"""A tabletop scene with three objects, and its file without labels."""
 
 from dataclasses import replace
 

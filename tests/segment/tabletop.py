@@ -1,4 +1,4 @@
-"""Tabletops with known labels: shapes of Gaussians on a plane, seen by cameras all round."""
+"""Tabletop scenes with known labels: shapes made of Gaussians on a plane, with cameras all around."""
 
 import torch
 
@@ -25,7 +25,7 @@ def coloured_gaussians(surface: Surface, rgb: tuple, object_id: int, grain: floa
 
 
 def visible_from_above(surface: Surface) -> Surface:
-    """What a reconstruction has of a thing: no bottom."""
+    """The part of a surface that a reconstruction contains: not its bottom."""
     return surface.kept((surface.normals[:, 2] > -0.5) & (surface.points[:, 2] > 0))
 
 
@@ -42,7 +42,7 @@ def egg(centre: tuple, radii: tuple, rgb: tuple, object_id: int, n: int = 1500) 
 
 
 def scene_of(*parts: Gaussians, noise: float = 0.0, tilt: float = 0.0, cameras: bool = True) -> Scene:
-    """The parts together, with noise [m] on the positions and the world turned about y by `tilt` [rad]."""
+    """A scene of all parts, with noise [m] on the positions and z sheared by `tilt` along x."""
     g = concatenate(parts)
     rng = torch.Generator().manual_seed(1)
     means = g.means + noise * torch.randn(len(g), 3, generator=rng)

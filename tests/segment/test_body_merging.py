@@ -1,4 +1,4 @@
-"""Which parts are one body: shapes in each other's arms, or hanging, on a table; colours play no part."""
+"""Merging of interlocking or suspended parts; all parts have the same colour."""
 
 import torch
 
@@ -26,7 +26,7 @@ def bodies(*parts) -> set[frozenset[int]]:
     return {frozenset(n for n in mine if mine[n] == k) for k in set(mine.values())} - {frozenset({0})}
 
 
-def test_arms_around_a_belly_are_one_body_with_it():
+def test_interlocking_parts_are_one_body():
     belly = coloured_gaussians(ellipsoid((0.06, 0.06, 0.1), 2500).moved((0.0, 0.0, 0.1)), (0.5, 0.5, 0.5), 1)
     sides = [brick((-0.065, y, 0.07), (0.065, y + 0.02, 0.11), 2) for y in (-0.065, 0.045)]
     front = [brick((x, -0.045, 0.07), (x + 0.02, 0.045, 0.11), 2) for x in (-0.065, 0.045)]
@@ -34,18 +34,18 @@ def test_arms_around_a_belly_are_one_body_with_it():
     assert bodies(belly, *sides, *front, *legs) == {frozenset({1, 2})}
 
 
-def test_things_pushed_together_stay_two():
+def test_touching_objects_stay_separate():
     side_by_side = brick((-0.1, -0.05, 0.0), (0.0, 0.05, 0.1), 1), brick((0.003, -0.05, 0.0), (0.1, 0.05, 0.1), 2)
     assert bodies(*side_by_side) == {frozenset({1}), frozenset({2})}
     assert bodies(side_by_side[0], ball((0.06, 0.0, 0.06), 0.058, 2)) == {frozenset({1}), frozenset({2})}
 
 
-def test_a_ball_in_a_corner_is_in_the_hull_of_the_corner_but_not_the_corner_in_its():
+def test_one_sided_hull_overlap_does_not_merge():
     corner = brick((-0.1, -0.1, 0.0), (0.1, -0.07, 0.1), 1), brick((-0.1, -0.07, 0.0), (-0.07, 0.1, 0.1), 1)
     assert bodies(*corner, ball((-0.02, -0.02, 0.045), 0.045, 2)) == {frozenset({1}), frozenset({2})}
 
 
-def test_what_lies_on_a_thing_is_another_and_what_hangs_from_it_is_not():
+def test_suspended_parts_merge_and_supported_ones_do_not():
     post = brick((-0.03, -0.03, 0.0), (0.03, 0.03, 0.2), 1)
     on_top = ball((0.0, 0.0, 0.25), 0.05, 2)
     assert bodies(post, on_top) == {frozenset({1}), frozenset({2})}
@@ -55,7 +55,7 @@ def test_what_lies_on_a_thing_is_another_and_what_hangs_from_it_is_not():
     assert bodies(post, leaning) == {frozenset({1}), frozenset({2})}
 
 
-def test_gaussians_without_a_place_keep_their_number():
+def test_non_finite_gaussians_keep_their_labels():
     scene = scene_of(table_gaussians(), brick((-0.1, -0.05, 0.0), (0.0, 0.05, 0.1), 1))
     scene.gaussians.means[-3:] = torch.nan
     assert torch.equal(merge_bodies(scene.gaussians, find_support(scene)).object_id, scene.gaussians.object_id)

@@ -1,4 +1,4 @@
-"""Rims redrawn: labels that were made wrong near the border of an object come back, and no others change."""
+"""Boundary refinement corrects wrong labels near boundaries and changes no others."""
 
 from dataclasses import replace
 
@@ -37,7 +37,7 @@ def skirted(scene, width):
     return ids
 
 
-def test_a_skirt_of_table_goes_back_to_the_table(truth):
+def test_table_labelled_as_object_is_corrected(truth):
     wrong, true = skirted(truth, 0.02), truth.gaussians.object_id
     found = refine_boundaries(relabelled(truth, wrong), find_support(truth)).object_id
     seen = shown(truth)
@@ -46,7 +46,7 @@ def test_a_skirt_of_table_goes_back_to_the_table(truth):
     assert min(iou((found == n) & seen, (true == n) & seen) for n in (1, 2, 3)) > 0.99
 
 
-def test_a_rim_that_the_table_has_goes_back_to_the_object(truth):
+def test_object_labelled_as_table_is_corrected(truth):
     true, ids = truth.gaussians.object_id, truth.gaussians.object_id.clone()
     ids[(true == 1) & (truth.gaussians.means[:, 2] < 0.012)] = 0
     lost = (ids == 0) & (true == 1) & shown(truth)
@@ -54,7 +54,7 @@ def test_a_rim_that_the_table_has_goes_back_to_the_object(truth):
     assert lost.sum() > 50 and (found[lost] == 1).float().mean() > 0.9
 
 
-def test_a_skirt_over_a_patch_of_another_colour_goes_back_too():
+def test_table_of_another_colour_is_corrected():
     patch = table_gaussians()
     stained = (patch.means[:, 0] > 0.05) & (patch.means[:, 1].abs() < 0.12)
     patch.sh[stained, 0] -= 0.8  # dark, and reaching from the block to where the table is sure
@@ -66,7 +66,7 @@ def test_a_skirt_over_a_patch_of_another_colour_goes_back_too():
     assert (ids != true).sum() > 40 and iou(found == 1, true == 1) > 0.97
 
 
-def test_true_labels_stay_and_so_does_what_no_photo_shows(truth):
+def test_true_labels_and_invisible_gaussians_are_unchanged(truth):
     support = find_support(truth)
     found = refine_boundaries(truth, support).object_id
     assert (found == truth.gaussians.object_id).float().mean() > 0.998
@@ -79,7 +79,7 @@ def test_true_labels_stay_and_so_does_what_no_photo_shows(truth):
     assert torch.equal(refine_boundaries(blind, support).object_id, blind.gaussians.object_id)
 
 
-def test_nothing_goes_from_one_object_to_another():
+def test_no_gaussian_changes_between_objects():
     scene = scene_of(
         table_gaussians(), block((-0.05, 0.0), (0.1, 0.1, 0.08), (0.8, 0.1, 0.1), 1),
         block((0.055, 0.0), (0.1, 0.1, 0.08), (0.8, 0.15, 0.1), 2),

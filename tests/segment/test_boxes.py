@@ -1,4 +1,4 @@
-"""Objects from boxes: what geometry cannot tell apart, colour does; and what a box may be."""
+"""The boxes backend, and its prompts."""
 
 import json
 from dataclasses import replace
@@ -35,8 +35,8 @@ def overlap(found, scene, mine, theirs):
     return float((a & b).sum() / (a | b).sum())
 
 
-def test_what_leans_on_a_thing_of_the_background_is_cut_from_it(tmp_path):
-    """A green doll of two eggs sits against a white cushion that nobody pointed at."""
+def test_object_leaning_on_background_is_segmented(tmp_path):
+    """A green doll of two eggs sits against a white cushion without a box."""
     cushion = block((0.0, 0.16), (0.4, 0.12, 0.25), (0.85, 0.85, 0.8), 2)
     trunk = egg((0.0, 0.03, 0.08), (0.07, 0.07, 0.08), (0.15, 0.6, 0.1), 1)
     head = egg((0.0, 0.03, 0.2), (0.05, 0.05, 0.05), (0.15, 0.65, 0.15), 1)
@@ -47,7 +47,7 @@ def test_what_leans_on_a_thing_of_the_background_is_cut_from_it(tmp_path):
     assert overlap(found, scene, 1, 1) > 0.85
 
 
-def test_boxes_that_overlap_are_told_apart(tmp_path):
+def test_overlapping_boxes_are_separated(tmp_path):
     far = block((0.0, 0.05), (0.25, 0.05, 0.2), (0.8, 0.1, 0.1), 1)
     scene = scene_of(table_gaussians(), far, block((0.0, -0.08), (0.1, 0.05, 0.08), (0.1, 0.2, 0.8), 2))
     scene = replace(scene, cameras=scene.cameras[[6, 7, 5, 0, 4, 1, 3, 2]])
@@ -55,14 +55,14 @@ def test_boxes_that_overlap_are_told_apart(tmp_path):
     assert overlap(found, scene, 1, 1) > 0.85 and overlap(found, scene, 2, 2) > 0.85
 
 
-def test_what_looks_like_all_around_it_is_not_found_and_that_is_said(tmp_path, caplog):
-    """A block of the table's own wood: colour has nothing to go by."""
+def test_object_of_the_background_colour_is_reported_as_missing(tmp_path, caplog):
+    """A block of the colour of the table."""
     scene = scene_of(table_gaussians(), block((0.0, 0.0), (0.1, 0.1, 0.1), WOOD, 1))
     found = segment(blank(scene), prompts_of(tmp_path / "p.json", scene, [1]))
     assert found.objects == () and "won no Gaussian" in caplog.text
 
 
-def test_the_first_view_comes_first_then_near_ones_and_not_too_many():
+def test_views_are_ordered_by_distance_and_limited():
     scene = three_apart()
     order = nearest_first(scene)
     assert order[0] == 0 and sorted(order) == list(range(8)) and {order[1], order[2]} == {1, 7} and order[-1] == 4
@@ -70,12 +70,12 @@ def test_the_first_view_comes_first_then_near_ones_and_not_too_many():
     assert len(many) == len(set(many)) == MAX_VIEWS and many[0] == 0 and 50 in many
 
 
-def test_a_box_of_the_whole_picture_is_all_of_it():
+def test_box_of_the_whole_image_labels_all_of_it():
     picture = np.random.default_rng(0).integers(0, 255, (24, 32, 3), dtype=np.uint8)
     assert (segment_prompted_view(picture, torch.tensor([[0.0, 0.0, 1.0, 1.0]]), 0) == 1).all()
 
 
-def test_small_pieces_and_small_holes_go():
+def test_small_pieces_and_small_holes_are_removed():
     mask = np.zeros((40, 40), dtype=bool)
     mask[5:35, 5:35] = True
     mask[20, 20:22], mask[8:16, 8:16], mask[1, 1] = False, False, True
@@ -84,17 +84,17 @@ def test_small_pieces_and_small_holes_go():
 
 
 @pytest.mark.parametrize(
-    ("text", "says"),
+    ("text", "message"),
     [('{"bbox": [[200, 10, 300, 50]], "text": ["duck"]}', "of duck lies outside of the first view, which has 160x160"),
      ('{"center_point": [[5, 5]], "text": ["duck"]}', "points are for --backend sam2")],
 )  # fmt: skip
-def test_a_box_that_cannot_be_is_one_sentence(tmp_path, text, says):
+def test_invalid_boxes_are_refused(tmp_path, text, message):
     (tmp_path / "p.json").write_text(text)
-    with pytest.raises(InputError, match=says):
+    with pytest.raises(InputError, match=message):
         segment(three_apart(), SegmentOptions(boxes=tmp_path / "p.json"))
 
 
-def test_boxes_may_be_drawn_in_a_picture_of_another_size(tmp_path):
+def test_box_coordinates_are_scaled_from_their_image_size(tmp_path):
     (tmp_path / "p.json").write_text('{"bbox": [[100, 50, 300, 200]], "center_point": [[40, 20]], "size": [1600, 800]}')
     prompts = read_prompts(tmp_path / "p.json", (160, 80))
     assert prompts.boxes.tolist() == [[10, 5, 30, 20]] and prompts.points.tolist() == [[4, 2]]
@@ -103,7 +103,7 @@ def test_boxes_may_be_drawn_in_a_picture_of_another_size(tmp_path):
         read_prompts(tmp_path / "p.json", (160, 80))
 
 
-def test_a_scene_without_cameras_is_refused(tmp_path):
+def test_scene_without_cameras_is_refused(tmp_path):
     (tmp_path / "p.json").write_text('{"bbox": [[1, 1, 5, 5]]}')
     with pytest.raises(InputError, match="has no cameras"):
         segment(three_apart(cameras=False), SegmentOptions(boxes=tmp_path / "p.json"))

@@ -1,4 +1,4 @@
-"""Patterns of the table go back to it; whatever lies on it stays."""
+"""Removal of false positives: texture of the table becomes background, thin objects are kept."""
 
 from dataclasses import replace
 
@@ -20,7 +20,7 @@ def truth():
     return three_apart(noise=0.001)
 
 
-def test_threads_of_a_cloth_on_the_table_are_the_tables(truth):
+def test_sparse_texture_becomes_background(truth):
     g = truth.gaussians
     near = torch.cdist(g.means[:, :2], g.means[g.object_id > 0][:, :2]).amin(1) < 0.05
     patch = (g.object_id == 0) & ~near & (g.means[:, :2].norm(dim=1) < 0.4)
@@ -29,7 +29,7 @@ def test_threads_of_a_cloth_on_the_table_are_the_tables(truth):
     assert threads.sum() > 100 and torch.equal(found, g.object_id)
 
 
-def test_a_whole_stripe_is_too_where_the_table_is_close_on_both_sides(truth):
+def test_stripe_of_texture_becomes_background(truth):
     g = truth.gaussians
     stripe = (g.object_id == 0) & ((g.means[:, 1] + 0.3).abs() < 0.01) & (g.means[:, 0].abs() < 0.15)
     found = left(truth, torch.where(stripe, 4, g.object_id))
@@ -38,12 +38,12 @@ def test_a_whole_stripe_is_too_where_the_table_is_close_on_both_sides(truth):
 
 @pytest.mark.parametrize("size", [(0.2, 0.014, 0.014), (0.14, 0.07, 0.009), (0.14, 0.07, 0.006)],
                          ids=["rope", "phone", "card"])  # fmt: skip
-def test_what_is_thin_stays(size):
+def test_thin_objects_are_kept(size):
     scene = scene_of(table_gaussians(), block((0.0, 0.0), size, (0.8, 0.1, 0.1), 1), noise=0.0005)
     assert torch.equal(left(scene, scene.gaussians.object_id), scene.gaussians.object_id)
 
 
-def test_a_phone_of_which_some_was_missed_stays():
+def test_partially_labelled_phone_is_kept():
     """What was missed shows all over it, level with it, and is no table."""
     scene = scene_of(table_gaussians(), block((0.0, 0.0), (0.14, 0.07, 0.009), (0.8, 0.1, 0.1), 1), noise=0.0005)
     true = scene.gaussians.object_id
@@ -51,7 +51,7 @@ def test_a_phone_of_which_some_was_missed_stays():
     assert (ids != true).sum() > 20 and torch.equal(left(scene, ids), ids)
 
 
-def test_a_scene_without_table_or_things_is_left_as_it_is(truth):
+def test_scene_without_table_or_objects_is_unchanged(truth):
     none = torch.zeros_like(truth.gaussians.object_id)
     assert not left(truth, none).any()
     assert torch.equal(left(truth, none + 1), none + 1)

@@ -1,4 +1,4 @@
-"""segment --backend sam2 with a tiny random network, through the loader and the code that the published one takes."""
+"""The sam2 backend with a tiny random network, through the loader of the published one."""
 
 import json
 from functools import partial
@@ -21,7 +21,7 @@ pytest.importorskip("transformers")
 
 @pytest.fixture(scope="module", autouse=True)
 def one_thread():
-    """Matrices this small cost less than telling a second thread of them."""
+    """For matrices this small a second thread costs more than it saves."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     yield
@@ -54,10 +54,10 @@ POINTS = {"center_point": [[40, 60], [100, 90]], "bbox": []}
 
 
 @pytest.mark.parametrize("prompts", [BOXES, POINTS], ids=["boxes", "points"])
-def test_prompts_become_objects_by_their_names(scene_file, truth, weights, photos, tmp_path, prompts):
-    """Random masks label something; which, only real weights know. All else is as in earnest."""
+def test_prompts_give_named_objects(scene_file, truth, weights, photos, tmp_path, prompts):
+    """The masks are random, so only names, ids and provenance are checked."""
     boxes = prompts_file(tmp_path / "p.json", **prompts)
-    run(scene_file, tmp_path / "out.ply", SegmentOptions("sam2", boxes=boxes, photos=photos, weights=weights))
+    run(scene_file, tmp_path / "out.ply", SegmentOptions(backend="sam2", boxes=boxes, photos=photos, weights=weights))
     labelled = read_scene(tmp_path / "out.ply")
     names = prompts.get("text", ["object_1", "object_2"])
     assert labelled.objects and all(o.name == names[o.id - 1] for o in labelled.objects)
@@ -65,63 +65,63 @@ def test_prompts_become_objects_by_their_names(scene_file, truth, weights, photo
     assert [row["name"] for row in labelled.provenance["inputs"]] == ["scene.ply", "p.json", "photos"]
 
 
-def test_drawings_stand_in_for_photos(truth, photos):
-    """A PNG of the drawing rounds to 8 bits; else the network sees the same."""
+def test_rendered_views_equal_their_photos(truth, photos):
+    """Up to the rounding of PNG to 8 bits."""
     shown, read = view_images(truth), view_images(truth, photos)
     assert shown.views == read.views == list(range(len(truth.cameras)))
     torch.testing.assert_close(shown.image(3), read.image(3), rtol=0, atol=0.51 / 255)
 
 
-def test_some_photos_may_be_missing_but_not_the_prompted_one(scene_file, truth, weights, photos, tmp_path):
+def test_photos_may_be_missing_except_the_prompted_one(scene_file, truth, weights, photos, tmp_path):
     (photos / "03.png").unlink()
     assert view_images(truth, photos).views == [0, 1, 2, 4, 5, 6, 7]
     boxes = prompts_file(tmp_path / "p.json", **BOXES)
-    options = SegmentOptions("sam2", boxes=boxes, photos=photos, weights=weights)
+    options = SegmentOptions(backend="sam2", boxes=boxes, photos=photos, weights=weights)
     run(scene_file, tmp_path / "out.ply", options)
     (photos / "00.png").unlink()
     with pytest.raises(InputError, match="lacks 00.jpg, the photo that --boxes is about"):
         run(scene_file, tmp_path / "other.ply", options)
 
 
-def test_without_prompts_a_network_that_is_sure_of_nothing_finds_no_objects(
-    scene_file, weights, tmp_path, caplog, monkeypatch
-):
+def test_no_objects_from_a_network_without_confident_masks(scene_file, weights, tmp_path, caplog, monkeypatch):
     from stages.core.models.sam2 import segmenter
     from stages.core.models.sam2.mask_generation import MaskGenerationOptions, propose_masks
 
     monkeypatch.setattr(segmenter, "propose_masks", partial(propose_masks, options=MaskGenerationOptions(grid=4)))
-    run(scene_file, tmp_path / "out.ply", SegmentOptions("sam2", weights=weights))
+    run(scene_file, tmp_path / "out.ply", SegmentOptions(backend="sam2", weights=weights))
     assert read_scene(tmp_path / "out.ply").objects == ()
     assert "no objects were found" in caplog.text
 
 
-def test_without_weights_one_sentence_says_what_to_fetch_and_where(scene_file, tmp_path, monkeypatch):
+def test_missing_weights_are_reported(scene_file, tmp_path, monkeypatch):
     monkeypatch.setenv("NGFF_WEIGHTS", str(tmp_path / "weights"))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     with pytest.raises(InputError, match=r"facebook/sam2.1-hiera-large \(0.9 GB.* into .*weights/sam2.*--download"):
-        run(scene_file, tmp_path / "out.ply", SegmentOptions("sam2"))
+        run(scene_file, tmp_path / "out.ply", SegmentOptions(backend="sam2"))
     assert not (tmp_path / "out.ply").exists()
 
 
-def test_weights_are_fetched_only_when_asked_and_absent(weights, tmp_path, monkeypatch):
+def test_weights_are_downloaded_only_on_request_and_if_missing(weights, tmp_path, monkeypatch):
     monkeypatch.setenv("NGFF_WEIGHTS", str(tmp_path / "weights"))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setattr(sam2, "download", lambda: "fetched")
-    assert sam2._weights(SegmentOptions("sam2", download=True)) == "fetched"
-    assert sam2._weights(SegmentOptions("sam2", weights=weights, download=True)) == weights / "model.safetensors"
+    assert sam2._weights(SegmentOptions(backend="sam2", download=True)) == "fetched"
+    given = SegmentOptions(backend="sam2", weights=weights, download=True)
+    assert sam2._weights(given) == weights / "model.safetensors"
     with pytest.raises(InputError, match="no config.json"):
-        sam2._weights(SegmentOptions("sam2", weights=tmp_path, download=True))
+        sam2._weights(SegmentOptions(backend="sam2", weights=tmp_path, download=True))
 
 
-def test_photos_of_other_proportions_are_refused(scene_file, truth, weights, photos, tmp_path):
+def test_photos_of_another_aspect_ratio_are_refused(scene_file, truth, weights, photos, tmp_path):
     write_png(photos / "05.png", render_view(truth, 5)[:80])
     boxes = prompts_file(tmp_path / "p.json", **BOXES)
     with pytest.raises(InputError, match="--photos: 05.jpg is 160x80, in the scene 160x160.*rendered instead"):
-        run(scene_file, tmp_path / "out.ply", SegmentOptions("sam2", boxes=boxes, photos=photos, weights=weights))
+        options = SegmentOptions(backend="sam2", boxes=boxes, photos=photos, weights=weights)
+        run(scene_file, tmp_path / "out.ply", options)
 
 
 @pytest.mark.parametrize(
-    ("data", "says"),
+    ("data", "message"),
     [
         ({"text": ["duck"]}, "neither a bbox nor a center_point"),
         ({**BOXES, "center_point": [[1, 2]]}, "2 boxes, 1 points and 2 names"),
@@ -129,18 +129,18 @@ def test_photos_of_other_proportions_are_refused(scene_file, truth, weights, pho
         ({"bbox": [[5, 5, 1, 9]]}, "no area"),
     ],
 )
-def test_prompts_that_cannot_be_meant(tmp_path, data, says):
-    with pytest.raises(InputError, match=says):
+def test_invalid_prompts_are_refused(tmp_path, data, message):
+    with pytest.raises(InputError, match=message):
         read_prompts(prompts_file(tmp_path / "p.json", **data))
 
 
-def test_points_are_for_sam2_alone(scene_file, tmp_path):
+def test_boxes_backend_refuses_points(scene_file, tmp_path):
     boxes = prompts_file(tmp_path / "p.json", **POINTS)
     with pytest.raises(InputError, match="points are for --backend sam2"):
         run(scene_file, tmp_path / "out.ply", SegmentOptions(boxes=boxes))
 
 
-def test_what_the_network_is_told_lies_where_the_user_pointed(truth, tmp_path):
+def test_point_prompts_are_fractions_of_the_view(truth, tmp_path):
     box, point = (point_prompts(read_prompts(prompts_file(tmp_path / "p.json", **p)), truth)[0]
                   for p in (BOXES, POINTS))  # fmt: skip
     torch.testing.assert_close(box.points, torch.tensor([[10 / 160, 20 / 160], [60 / 160, 90 / 160]]))

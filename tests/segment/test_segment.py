@@ -1,4 +1,4 @@
-"""The segment stage: its three ways to find objects, and its messages."""
+"""The segment stage: geometric and masks backends, voting, messages."""
 
 import json
 import logging
@@ -34,7 +34,7 @@ def write_masks(folder, scene, masks):
     return folder
 
 
-def test_geometric_writes_labels_names_cameras_and_where_they_come_from(scene_file, truth, tmp_path, caplog):
+def test_geometric_writes_labels_names_cameras_and_provenance(scene_file, truth, tmp_path, caplog):
     out = tmp_path / "labelled.ply"
     with caplog.at_level(logging.INFO):
         run(scene_file, out, SegmentOptions(names="1=tower of jelly"))
@@ -47,7 +47,7 @@ def test_geometric_writes_labels_names_cameras_and_where_they_come_from(scene_fi
 
 
 @pytest.mark.parametrize(("side", "axes"), [("height", [2]), ("length", [0, 1, 2])])
-def test_a_measured_object_gives_metres(scene_file, truth, tmp_path, side, axes):
+def test_scale_reference_sets_metres_per_unit(scene_file, truth, tmp_path, side, axes):
     masks = write_masks(tmp_path / "masks", truth, true_masks(truth))
     run(scene_file, tmp_path / "out.ply", SegmentOptions(masks=masks, scale_reference=f"object=2 {side}=0.6"))
     means = truth.gaussians.means[truth.gaussians.object_id == 2][:, axes]
@@ -55,10 +55,10 @@ def test_a_measured_object_gives_metres(scene_file, truth, tmp_path, side, axes)
     assert read_scene(tmp_path / "out.ply").metres_per_unit == pytest.approx(0.6 / units, rel=0.05)
 
 
-def test_masks_with_wrong_pixels_are_outvoted(scene_file, truth, tmp_path):
+def test_wrong_pixels_of_masks_are_outvoted(scene_file, truth, tmp_path):
     rng = torch.Generator().manual_seed(0)
     masks = true_masks(truth)
-    for mask in masks:  # a tenth of all pixels say anything
+    for mask in masks:  # a tenth of all pixels are random
         wrong = torch.rand(mask.shape, generator=rng) < 0.1
         mask[wrong] = torch.randint(0, 4, (int(wrong.sum()),), generator=rng)
     masks[2] = masks[2].roll(25, 1)  # and one photo is off altogether
@@ -72,7 +72,7 @@ def test_masks_with_wrong_pixels_are_outvoted(scene_file, truth, tmp_path):
         assert float((mine & theirs).sum() / (mine | theirs).sum()) >= 0.9
 
 
-def test_most_photos_missing_and_numbers_mixed_up_in_some_are_outvoted(scene_file, truth, tmp_path):
+def test_permuted_labels_of_one_mask_are_outvoted(scene_file, truth, tmp_path):
     masks = true_masks(truth)
     masks[3] = torch.tensor([0, 2, 3, 1])[masks[3]]  # a tool that numbered one photo in another order
     some = [1, 3, 5, 6, 7]
@@ -84,7 +84,7 @@ def test_most_photos_missing_and_numbers_mixed_up_in_some_are_outvoted(scene_fil
         assert float((mine & theirs).sum() / (mine | theirs).sum()) >= 0.9
 
 
-def test_a_tie_goes_to_the_neighbours(truth):
+def test_ties_take_the_label_of_neighbours(truth):
     votes = torch.nn.functional.one_hot(truth.gaussians.object_id, 4).float()
     tied = torch.nonzero(truth.gaussians.object_id == 2)[::7, 0]
     votes[tied] = 1.0
@@ -94,7 +94,7 @@ def test_a_tie_goes_to_the_neighbours(truth):
     assert float((ids == truth.gaussians.object_id).float().mean()) > 0.995
 
 
-def test_a_gaussian_without_a_place_stays_background(truth):
+def test_non_finite_gaussians_stay_background(truth):
     votes = torch.nn.functional.one_hot(truth.gaussians.object_id, 4).float()
     means = truth.gaussians.means.clone()
     lost = torch.nonzero(truth.gaussians.object_id == 2)[:3, 0]
@@ -104,7 +104,7 @@ def test_a_gaussian_without_a_place_stays_background(truth):
     assert (ids[lost] == 0).all() and float((ids == truth.gaussians.object_id).float().mean()) > 0.99
 
 
-def test_one_near_view_does_not_overrule_two_far_ones():
+def test_one_close_view_does_not_outvote_two_distant_ones():
     near, far = torch.tensor([[0.0, 90.0, 0.0]]), torch.tensor([[0.0, 0.0, 30.0]])
     assert int((near + 2 * far).argmax(1)) == 1  # by pixels it would
     assert int((damp_votes(near) + 2 * damp_votes(far)).argmax(1)) == 2  # 9.5 against 11.0
@@ -112,7 +112,7 @@ def test_one_near_view_does_not_overrule_two_far_ones():
     assert damp_votes(torch.zeros(1, 3)).tolist() == [[0.0, 0.0, 0.0]]
 
 
-def test_neighbours_pool_their_votes_but_not_across_a_gap():
+def test_votes_are_pooled_among_close_neighbours():
     x = torch.cat([torch.arange(9.0), 100 + torch.arange(9.0)])
     votes = torch.zeros(18, 2)
     votes[:9, 0], votes[9:, 1] = 1.0, 1.0
@@ -131,7 +131,7 @@ def test_outliers_by_the_modified_z_score():
     assert ids.tolist() == [1] * 9 + [0]
 
 
-def test_boxes_name_the_groups_that_fill_them(scene_file, truth, tmp_path):
+def test_boxes_give_named_objects(scene_file, truth, tmp_path):
     rows = []
     for i in (2, 1):
         pixel = project(truth.gaussians.means[truth.gaussians.object_id == i], truth.cameras.viewmats[0],
@@ -148,7 +148,7 @@ def test_boxes_name_the_groups_that_fill_them(scene_file, truth, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("prepare", "says"),
+    ("prepare", "message"),
     [
         (lambda p: {"masks": p / "nowhere"}, "is no folder"),
         (lambda p: (p / "m").mkdir() or {"masks": p / "m"}, "no label image is named as a photo"),
@@ -160,31 +160,31 @@ def test_boxes_name_the_groups_that_fill_them(scene_file, truth, tmp_path):
         (lambda p: {"scale_reference": "object=9 height=0.1"}, "there is no object 9"),
     ],
 )  # fmt: skip
-def test_a_mistake_is_one_sentence_and_nothing_is_written(scene_file, tmp_path, prepare, says):
-    with pytest.raises(InputError, match=says):
+def test_invalid_inputs_are_refused_and_nothing_is_written(scene_file, tmp_path, prepare, message):
+    with pytest.raises(InputError, match=message):
         run(scene_file, tmp_path / "out.ply", SegmentOptions(**prepare(tmp_path)))
     assert not (tmp_path / "out.ply").exists()
 
 
-def test_masks_of_other_proportions_are_refused(scene_file, truth, tmp_path):
+def test_masks_of_another_aspect_ratio_are_refused(scene_file, truth, tmp_path):
     folder = write_masks(tmp_path / "masks", truth, [torch.ones(80, 160, dtype=torch.int64)] * len(truth.cameras))
     with pytest.raises(InputError, match="aspect ratio"):
         run(scene_file, tmp_path / "out.ply", SegmentOptions(masks=folder))
 
 
 @pytest.mark.parametrize(
-    ("wrong", "says"),
+    ("wrong", "message"),
     [({"names": "duck"}, "NUMBER=NAME"), ({"scale_reference": "duck=0.1"}, "object=1 height=0.12"),
      ({"scale_reference": "object=1 height=0"}, "more than 0"), ({"max_objects": 0}, "max-objects"),
      ({"min_size": 2.0}, "min-size"), ({"detail": 0.0}, "detail"), ({"masks": "a", "boxes": "b"}, "one of them"),
      ({"backend": "sam2", "masks": "a"}, "makes masks itself"), ({"weights": "a"}, "of --backend sam2")],
 )  # fmt: skip
-def test_options_check_themselves(wrong, says):
-    with pytest.raises(InputError, match=says):
+def test_invalid_options_are_refused(wrong, message):
+    with pytest.raises(InputError, match=message):
         SegmentOptions(**wrong)
 
 
-def test_an_empty_table_has_no_objects_and_says_so(truth, tmp_path, caplog):
+def test_empty_table_has_no_objects(truth, tmp_path, caplog):
     bare = replace(truth, gaussians=truth.gaussians[truth.gaussians.object_id == 0])
     write_scene(tmp_path / "bare.ply", bare)
     run(tmp_path / "bare.ply", tmp_path / "out.ply")

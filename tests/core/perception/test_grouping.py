@@ -1,4 +1,4 @@
-"""Things on a table, found without labels."""
+"""Grouping of Gaussians into objects on a table."""
 
 from dataclasses import replace
 
@@ -25,14 +25,14 @@ def overlaps(scene: Scene, **how) -> dict[int, float]:
 
 
 @pytest.mark.parametrize("how", [{}, {"noise": 0.002}, {"noise": 0.002, "tilt": 0.03}, {"cameras": False}], ids=str)
-def test_things_that_stand_apart_come_out_whole_and_alone(how):
+def test_separate_objects_are_found(how):
     scene = three_apart(**how)
     found = group_objects(unlabelled(scene))
     assert len(found.objects) == 3
     assert min(best_overlap(found.gaussians.object_id, scene.gaussians.object_id).values()) >= 0.9
 
 
-def test_touching_things_of_different_colour_are_split():
+def test_touching_objects_of_different_colour_are_separated():
     scene = scene_of(
         table_gaussians(), block((-0.06, 0.0), (0.12, 0.1, 0.08), (0.8, 0.1, 0.1), 1),
         egg((0.068, 0.0, 0.07), (0.068, 0.068, 0.07), (0.1, 0.2, 0.8), 2), noise=0.001,
@@ -40,20 +40,20 @@ def test_touching_things_of_different_colour_are_split():
     assert min(overlaps(scene).values()) >= 0.75
 
 
-def test_a_thing_on_a_thing_is_a_thing_of_its_own():
+def test_stacked_objects_are_separated():
     ball = egg((0.0, 0.0, 0.14), (0.06, 0.06, 0.06), (0.9, 0.8, 0.1), 2)
     scene = scene_of(table_gaussians(), block((0.0, 0.0), (0.2, 0.2, 0.08), (0.3, 0.1, 0.5), 1), ball, noise=0.001)
     assert min(overlaps(scene).values()) >= 0.75
 
 
-def test_a_striped_thing_is_one():
+def test_striped_object_is_one():
     cube = block((0.0, 0.0), (0.16, 0.16, 0.12), (0.9, 0.9, 0.9), 1)
     stripes = (cube.means[:, 0] / 0.03).floor().remainder(2) == 0
     cube = replace(cube, sh=torch.where(stripes[:, None, None], -cube.sh, cube.sh))
     assert overlaps(scene_of(table_gaussians(), cube))[1] >= 0.9
 
 
-def test_a_thin_thing_is_found_by_its_colour_and_a_stain_is_not():
+def test_flat_object_is_found_and_a_stain_is_not():
     phone = block((0.15, 0.0), (0.16, 0.08, 0.008), (0.05, 0.05, 0.05), 1)
     top = table_gaussians()
     stain = (top.means[:, :2] - torch.tensor([-0.2, 0.1])).norm(dim=1) < 0.07
@@ -85,7 +85,7 @@ def coloured_wall() -> Gaussians:
     return coloured_gaussians(upright, (0.8, 0.8, 0.75), 0)
 
 
-def test_faint_gaussians_inside_an_object_are_its_own():
+def test_transparent_gaussians_inside_an_object_are_labelled():
     scene = three_apart()
     inner = random_gaussians(40, size=0.005)
     inner = replace(
@@ -98,7 +98,7 @@ def test_faint_gaussians_inside_an_object_are_its_own():
     assert red > 0
 
 
-def test_a_blur_within_an_object_is_its_own_and_one_that_reaches_out_is_not():
+def test_large_gaussian_is_labelled_only_inside_an_object():
     shell = coloured_gaussians(ellipsoid((1.0, 1.0, 1.0), 2000), (0.8, 0.1, 0.1), 1)
     blurs = random_gaussians(3)
     scales = torch.tensor([[0.4, 0.3, 0.3], [0.4, 0.3, 0.3], [0.4, 0.3, torch.inf]])
@@ -108,14 +108,14 @@ def test_a_blur_within_an_object_is_its_own_and_one_that_reaches_out_is_not():
     assert whole.object_id[len(shell) :][:3].tolist() == [1, 0, 0]
 
 
-def test_the_plane_is_found_without_being_told():
+def test_supporting_plane_is_found_without_a_floor():
     scene = replace(three_apart(tilt=0.02), floor=None)
     support = find_support(scene)
     expected = 0.02 * scene.gaussians.means[:500, 0]
     assert torch.allclose(support.surface(scene.gaussians.means[:500]), expected, atol=0.004)
 
 
-def test_objects_are_numbered_by_size_and_their_names_differ():
+def test_objects_are_ordered_by_size_with_unique_names():
     found = group_objects(unlabelled(three_apart()))
     counts = torch.bincount(found.gaussians.object_id)[1:].tolist()
     assert counts == sorted(counts, reverse=True)
@@ -124,13 +124,13 @@ def test_objects_are_numbered_by_size_and_their_names_differ():
     assert {"red", "blue", "green"} == {n.replace("tall_", "").split("_")[0] for n in names}
 
 
-def test_the_same_seed_gives_the_same_labels():
+def test_same_seed_gives_the_same_labels():
     one, two = (group_objects(unlabelled(three_apart(noise=0.002))).gaussians.object_id for _ in range(2))
     assert torch.equal(one, two)
 
 
 @pytest.mark.parametrize("kind", ["one point", "all the same", "a line", "huge", "zero scales", "not finite", "faint"])
-def test_degenerate_gaussians_end_quickly_and_without_objects_or_errors(kind):
+def test_degenerate_gaussians_give_no_objects(kind):
     g = random_gaussians(200)
     g = {
         "one point": lambda: g[:1],

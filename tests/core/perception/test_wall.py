@@ -1,4 +1,4 @@
-"""What hangs on a wall is found as what stands on a table is."""
+"""Objects on a wall."""
 
 from dataclasses import replace
 
@@ -18,11 +18,11 @@ UP = Similarity(1.0, matrix(torch.tensor([0.5**0.5, 0.5**0.5, 0.0, 0.0])), torch
 
 
 def hung(scene: Scene) -> Scene:
-    """A table top with what is on it as a wall: turned by a quarter about x, so that it faces -y; without a floor."""
+    """A tabletop scene rotated by 90 degrees about x into a wall that faces -y; without a floor."""
     return replace(scene, gaussians=transformed(scene.gaussians, UP), cameras=scene.cameras.transformed(UP), floor=None)
 
 
-def test_a_wall_is_laid_on_its_back():
+def test_wall_is_rotated_to_the_floor():
     scene = hung(three_apart(noise=0.001))
     turn = find_wall(scene, view_extent(scene))
     laid = rotate_wall_to_floor(scene, turn)
@@ -34,7 +34,7 @@ def test_a_wall_is_laid_on_its_back():
     torch.testing.assert_close(back.sh, scene.gaussians.sh, rtol=0, atol=1e-5)
 
 
-def test_what_hangs_on_a_wall_comes_out_whole_and_alone():
+def test_objects_on_a_wall_are_found():
     scene = hung(three_apart(noise=0.001))
     blank = replace(scene, gaussians=replace(scene.gaussians, object_id=torch.zeros_like(scene.gaussians.object_id)))
     found = group_objects(blank)
@@ -49,7 +49,7 @@ def test_what_hangs_on_a_wall_comes_out_whole_and_alone():
         three_apart(),  # a table is no wall
         replace(three_apart(), floor=None),  # found or not
         hung(scene_of(block((0.0, 0.0), (0.4, 0.4, 0.1), (0.8, 0.1, 0.1), 1))),  # nor is the front of a book
-        replace(hung(three_apart()), cameras=None),  # and nobody knows which side of it is seen
+        replace(hung(three_apart()), cameras=None),  # the visible side is unknown
     ],
     ids=["floor", "table", "book", "no cameras"],
 )
@@ -57,7 +57,7 @@ def test_no_wall(scene):
     assert find_wall(scene, view_extent(scene)) is None
 
 
-def test_a_wall_with_a_room_behind_it_is_a_screen():
+def test_plane_with_gaussians_behind_it_is_no_wall():
     scene = hung(scene_of(table_gaussians()))
     behind = transformed(scene.gaussians, Similarity(1.0, torch.eye(3), torch.tensor([0.0, 0.15, 0.0])))
     both = replace(scene, gaussians=type(behind)(*(torch.cat(pair) for pair in zip(

@@ -1,4 +1,4 @@
-"""Automatic masks: as the image model gives them for the same clicks; sure ones only, each once."""
+"""Automatic masks equal those of the image model for the same points, filtered and without duplicates."""
 
 import torch
 
@@ -11,7 +11,7 @@ from stages.core.models.sam2.mask_generation import (
 from tests.core.models.sam2.tiny import SIDE, random_model
 
 
-def test_masks_are_those_of_the_image_model_with_the_same_weights():
+def test_masks_equal_those_of_the_image_model():
     from transformers import Sam2Config, Sam2Model
 
     video = random_model()
@@ -37,13 +37,13 @@ def test_masks_are_those_of_the_image_model_with_the_same_weights():
     assert 0 < len(some.masks) < len(mine.masks) and float(some.scores.min()) >= median
 
 
-def test_stability_by_hand():
+def test_stability_of_known_logits():
     row = torch.tensor([[-3.0, -0.5, 0.5, 0.9, 2.0, 3.0]])  # above 1: two; above -1: five
     soft, hard = row[None], torch.tensor([[[-9.0, -9, 9, 9, 9, 9]]])
     torch.testing.assert_close(mask_stability(torch.cat([soft, hard, hard - 100])), torch.tensor([0.4, 1.0, 0.0]))
 
 
-def test_of_masks_that_overlap_the_surer_stays():
+def test_duplicate_with_the_lower_score_is_removed():
     masks = torch.zeros(5, 1, 20, dtype=torch.bool)
     masks[0, 0, :10] = True
     masks[1, 0, 1:11] = True  # 9 of 11 shared with the first: 0.82

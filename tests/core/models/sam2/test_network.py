@@ -1,4 +1,4 @@
-"""What we feed SAM 2.1 and keep of it changes nothing: the masks are those of transformers' own way."""
+"""Propagation with bounded memory equals the reference implementation of transformers."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ def video():
 
 
 def theirs(model, video, give) -> dict[int, torch.Tensor]:
-    """All frames in memory, nothing forgotten, through transformers' own iterators."""
+    """Reference masks: all frames and outputs in memory, by the iterators of transformers."""
     from transformers import Sam2VideoInferenceSession
 
     session = Sam2VideoInferenceSession(video=video, dtype=torch.float32)
@@ -62,16 +62,16 @@ def by_mask(session) -> list[int]:
     [([PointPrompts.box(BOX), PointPrompts.inside(POINT)], by_clicks), (a_mask()[None], by_mask)],
     ids=["clicks", "mask"],
 )
-def test_propagation_is_that_of_transformers_though_most_is_forgotten(model, video, prompts, give):
+def test_propagation_equals_transformers_with_full_memory(model, video, prompts, give):
     mine = dict(propagate_masks(model, lambda i: video[i], COUNT, prompts, START))
     assert list(mine) == [*range(START, COUNT), *range(START - 1, -1, -1)]
     for t, masks in theirs(model, video, give).items():
         torch.testing.assert_close(mine[t], masks, rtol=0, atol=0)
     spread = torch.stack([mine[t] for t in range(COUNT)]).std(0)
-    assert float(spread.mean()) > 1e-3  # the frames do differ, so the above says something
+    assert float(spread.mean()) > 1e-3  # the frames differ, so the comparison is not trivial
 
 
-def test_the_past_is_looked_at(model, video):
+def test_masks_depend_on_earlier_frames(model, video):
     """Another second photo changes the third one's masks, by memory alone."""
     other = video.clone()
     other[1] = other[1].flip(-1)
@@ -81,7 +81,7 @@ def test_the_past_is_looked_at(model, video):
     assert torch.equal(one[0], two[0]) and float((one[2] - two[2]).abs().max()) > 1e-3
 
 
-def test_memory_does_not_grow_with_the_sequence_and_each_photo_is_read_once(model, monkeypatch):
+def test_memory_is_bounded_and_each_photo_is_read_once(model, monkeypatch):
     sessions, read = [], []
 
     class Watched(StreamingSession):
@@ -105,7 +105,7 @@ def test_memory_does_not_grow_with_the_sequence_and_each_photo_is_read_once(mode
     assert sessions[-1].processed_frames is None
 
 
-def test_pixel_values_are_pillows_resize_then_the_published_mean_and_deviation():
+def test_pixel_values_equal_pillow_resize_and_published_normalisation():
     Image = pytest.importorskip("PIL.Image")
     pixels = (torch.rand(90, 210, 3, generator=torch.Generator().manual_seed(0)) * 255).round()
     pillow = Image.fromarray(pixels.numpy().astype(np.uint8)).resize((64, 64), Image.BILINEAR)

@@ -1,4 +1,4 @@
-"""Weights of SAM 2.1: found in the published layout, refused with reason, fetched only when told to."""
+"""Weights of SAM 2.1: search, checks, download."""
 
 import json
 import logging
@@ -21,7 +21,7 @@ def nothing_installed(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
 
 
-def test_where_weights_are_looked_for(tmp_path):
+def test_weight_search_order(tmp_path):
     with pytest.raises(InputError, match=r"config.json with model.safetensors in .*weights/sam2 or .*ngff/sam2; fetch "
                                          r".*facebook/sam2.1-hiera-large \(0.9 GB.*Apache.*--download"):  # fmt: skip
         find()
@@ -37,7 +37,7 @@ def test_where_weights_are_looked_for(tmp_path):
         find(tmp_path / "absent.safetensors")
 
 
-def test_what_was_saved_is_what_loads_whatever_the_precision_on_disk(tmp_path):
+def test_saved_weights_load_in_float32(tmp_path):
     saved(tmp_path / "a", seed=3)
     state = random_model(3).state_dict()
     model = load(find(tmp_path / "a"))
@@ -57,15 +57,15 @@ def edited(folder, change):
 
 
 @pytest.mark.parametrize(
-    ("change", "says"),
+    ("change", "message"),
     [
         (lambda s: s.pop("no_memory_embedding"), "1 tensors missing: no_memory_embedding"),
         (lambda s: s.update(no_memory_embedding=torch.zeros(1, 1, 7)), "other shapes"),
         (lambda s: s.clear() or s.update(x=torch.zeros(1)), "tensors missing"),
     ],
 )
-def test_weights_that_do_not_fit_are_refused(tmp_path, change, says):
-    with pytest.raises(InputError, match=f"model.safetensors: does not fit the config.json.*{says}"):
+def test_mismatched_weights_are_refused(tmp_path, change, message):
+    with pytest.raises(InputError, match=f"model.safetensors: does not fit the config.json.*{message}"):
         load(edited(tmp_path / "a", change))
 
 
@@ -82,14 +82,14 @@ def test_damaged_files_are_refused(tmp_path):
             load(file)
 
 
-def test_without_transformers_it_says_what_to_install(tmp_path, monkeypatch):
+def test_missing_transformers_names_the_extra(tmp_path, monkeypatch):
     file = find(saved(tmp_path / "a"))
     monkeypatch.setitem(sys.modules, "transformers", None)
     with pytest.raises(InputError, match=r"pip install -U 'ngff\[sam2\]'"):
         load(file)
 
 
-def test_both_files_are_fetched_and_said_before(tmp_path, monkeypatch, caplog):
+def test_download_fetches_both_files_and_logs_them_first(tmp_path, monkeypatch, caplog):
     remote = saved(tmp_path / "remote")
     weights = SimpleNamespace(rfilename="model.safetensors", size=10**6,
                               lfs=SimpleNamespace(sha256=sha256(remote / "model.safetensors")))  # fmt: skip

@@ -1,4 +1,4 @@
-"""SAM 2.1 of two million times fewer operations: the published layout, random numbers."""
+"""A tiny SAM 2.1 with random weights, in the published layout."""
 
 from pathlib import Path
 

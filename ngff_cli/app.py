@@ -7,15 +7,16 @@ import typer
 from typer import Argument, Option
 
 from ngff_cli.options import AsJson, CommandGroup, Device, SceneIn, Seed, Threads, limit_threads, set_up_logging
+from stages.core.backends import describe
 from stages.evaluate.options import EvaluateOptions
 from stages.reconstruct.options import BACKENDS as RECONSTRUCT
 from stages.reconstruct.options import FEATURE_EXTRACTORS as MATCHERS
 from stages.reconstruct.options import QUALITY_PRESETS, ReconstructOptions
 from stages.refine.options import BACKENDS as REFINE
-from stages.refine.options import RefineOptions
+from stages.refine.options import GENERATORS, RefineOptions
 from stages.render.options import OUTPUT_FORMATS, VIEWS, RenderOptions
 from stages.segment.options import BACKENDS as SEGMENT
-from stages.segment.options import SegmentOptions
+from stages.segment.options import NETWORKS, SegmentOptions
 from stages.simulate.options import ENGINE_HELP, SimulateOptions
 
 app = typer.Typer(cls=CommandGroup, no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False)
@@ -101,22 +102,22 @@ def reconstruct(
 def segment(
     scene: SceneIn,
     out: Annotated[Path, Option("-o", "--out", help="labelled scene to write (.ply)")] = Path("labelled.ply"),
-    backend: Annotated[str, Option(help=" | ".join(SEGMENT))] = SegmentOptions.backend,
+    backend: Annotated[str, Option(help=describe(SEGMENT))] = SegmentOptions.backend,
     masks: Annotated[
         Path | None, Option(help="folder of label images named as the photos (0 background, 1... objects)")
     ] = SegmentOptions.masks,
     boxes: Annotated[
-        Path | None, Option(help="prompts.json: boxes in view 0 [px] and names; for sam2 also points")
+        Path | None, Option(help=f"prompts.json: boxes in view 0 [px] and names; for {NETWORKS} also points")
     ] = SegmentOptions.boxes,
     photos: Annotated[
-        Path | None, Option(help="for sam2: folder of the scene's photos; default: images rendered at its cameras")
+        Path | None, Option(help=f"for {NETWORKS}: folder of the scene's photos; default: rendered images")
     ] = SegmentOptions.photos,
     weights: Annotated[
-        Path | None, Option(help="for sam2: folder with config.json and model.safetensors; default: sam2/ in "
+        Path | None, Option(help=f"for {NETWORKS}: file or folder of its weights; default: the folder of its name in "
                             "$NGFF_WEIGHTS and ~/.cache/ngff")
     ] = SegmentOptions.weights,
     download: Annotated[
-        bool, Option("--download", help="for sam2: download missing weights (0.9 GB, Apache-2.0)")
+        bool, Option("--download", help=f"for {NETWORKS}: download missing weights, after logging size and licence")
     ] = SegmentOptions.download,
     names: Annotated[str, Option(help='object names: "1=duck,2=bowl"')] = SegmentOptions.names,
     max_objects: Annotated[int, Option(help="maximum number of objects")] = SegmentOptions.max_objects,
@@ -147,18 +148,18 @@ def segment(
 def refine(
     scene: SceneIn,
     out: Annotated[Path, Option("-o", "--out", help="refined scene to write (.ply)")] = Path("refined.ply"),
-    completer: Annotated[str, Option(help=" | ".join(REFINE))] = RefineOptions.completer,
+    completer: Annotated[str, Option(help=describe(REFINE))] = RefineOptions.completer,
     library: Annotated[
         Path | None, Option(help="folder of complete objects (.ply); the best match replaces a partial object")
     ] = RefineOptions.library,
     photos: Annotated[
-        Path | None, Option(help="for diffsplat: folder of the scene's photos; default: rendered images")
+        Path | None, Option(help=f"for {GENERATORS}: folder of the scene's photos; default: rendered images")
     ] = RefineOptions.photos,
     weights: Annotated[
-        Path | None, Option(help="for diffsplat: folder of its weights; default: searched in $NGFF_WEIGHTS")
+        Path | None, Option(help=f"for {GENERATORS}: folder of its weights; default: searched in $NGFF_WEIGHTS")
     ] = RefineOptions.weights,
     download: Annotated[
-        bool, Option("--download", help="for diffsplat: download missing weights (MIT, OpenRAIL-M)")
+        bool, Option("--download", help=f"for {GENERATORS}: download missing weights, after logging size and licence")
     ] = RefineOptions.download,
     keep_raw: Annotated[
         bool, Option("--keep-raw", help="also keep the K objects unrefined, with ids K+1 to 2K")

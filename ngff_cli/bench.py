@@ -117,7 +117,7 @@ def bench_segment(
     scenes: Annotated[int, typer.Option(help="scenes of each kind: objects apart, and touching")] = 4,
     photos: Annotated[int, typer.Option(help="number of cameras per scene")] = 24,
     weights: Annotated[
-        Path | None, typer.Option(help="weights of sam2; default: searched; without any, sam2 is skipped")
+        Path | None, typer.Option(help="weights of network backends; default: searched; without any, they are skipped")
     ] = None,
     reconstruct: Annotated[
         bool, typer.Option("--reconstruct", help="also segment scenes reconstructed from photos")
@@ -126,7 +126,7 @@ def bench_segment(
     device: Device = "auto",
     as_json: AsJson = False,
 ) -> None:
-    """Segmentation by geometry, by true and by corrupted masks, and by sam2: IoU with the true labels."""
+    """Segmentation by geometry, by true and by corrupted masks, and by networks: IoU with the true labels."""
     from stages.lab.bench.segment import SegmentBenchOptions, run
 
     options = SegmentBenchOptions(

@@ -31,6 +31,11 @@ def with_weights(table: Mapping[str, Backend]) -> str:
     return " or ".join(name for name, row in table.items() if row.find_weights)
 
 
+def describe(table: Mapping[str, Backend]) -> str:
+    """Names and one-line help of all backends, for --help."""
+    return "; ".join(f"{name}: {row.help}" for name, row in table.items())
+
+
 def load(entry: str) -> Callable:
     """The function or class that a "module:name" string refers to, imported now."""
     module, name = entry.split(":")

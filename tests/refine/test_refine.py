@@ -18,6 +18,7 @@ from stages.core.scene.gaussians import concatenate, transformed
 from stages.core.scene.scene import Scene, SceneObject
 from stages.core.scene.scene_ply import read_scene, write_scene
 from stages.lab.assets.shapes import ellipsoid, sheet
+from stages.refine import inpaint
 from stages.refine.disc_gaussians import disc_gaussians
 from stages.refine.observed_space import ObservedSpace, object_psnr
 from stages.refine.options import RefineOptions
@@ -37,6 +38,15 @@ def photographed() -> Scene:
     hidden = (top.means[:, 0].abs() < SIDES[0] / 2) & (top.means[:, 1].abs() < SIDES[1] / 2)
     scene = scene_of(top[~hidden], thing)
     return replace(scene, objects=(SceneObject(1, "block"),))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def quick_inpainting():
+    """One trial with fewer source patches, an eighth of the time; test_inpaint.py covers the full search."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(inpaint, "TRIES", 1)
+        patch.setattr(inpaint, "MAX_SOURCE_PATCHES", 2000)
+        yield
 
 
 @pytest.fixture(scope="module")

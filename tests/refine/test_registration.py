@@ -40,12 +40,13 @@ def test_noisy_part_is_registered_within_tolerance(whole, number):
     assert wrong["rotation"] < 2 and wrong["scale"] < 2 and wrong["shift"] < 1
 
 
+@pytest.mark.slow
 def test_brute_force_search_gives_the_same_registration(whole, monkeypatch):
-    monkeypatch.setattr(registration_cloud, "TARGET_POINTS", 1500)  # all products are many for a CPU
+    monkeypatch.setattr(registration_cloud, "TARGET_POINTS", 1500)  # all pairs are slow on a CPU
     given = make_trial(whole, 1, RegisterBenchOptions())
     expected = register(given.part, whole)
-    for module in (registration, register_cloud):
-        monkeypatch.setattr(module, "searchable", BruteForce)
+    for module in (registration, registration_cloud):
+        monkeypatch.setattr(module, "neighbour_index", BruteForce)
     found = register(given.part, whole)
     assert degrees_between(found.similarity.rotation, expected.similarity.rotation) < 0.5
     assert found.similarity.scale == pytest.approx(expected.similarity.scale, rel=5e-3)

@@ -49,7 +49,7 @@ class GroupingOptions:
     seed: int = 0
 
 
-def group_objects(scene: Scene, grouping: Grouping = GroupingOptions()) -> Scene:
+def group_objects(scene: Scene, grouping: GroupingOptions = GroupingOptions()) -> Scene:
     """The scene with an object_id for every Gaussian (0 for the background) and its objects, largest first.
 
     The supporting plane is removed, the rest is oversegmented into small homogeneous regions, and these are merged

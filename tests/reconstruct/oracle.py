@@ -1,4 +1,4 @@
-"""What a perfect network would say of ray-cast photos: true depth, cameras and, if wanted, Gaussians."""
+"""The output of a perfect network for ray-cast photos: true point maps, poses and Gaussians."""
 
 import torch
 
@@ -15,22 +15,23 @@ C0 = 0.28209479177387814
 
 
 def photos_of(cameras: Cameras, folder) -> Photos:
+    """The ray-cast photos of these cameras."""
     images = tuple(torch.from_numpy(to_bytes(photograph(cameras, i)[0])) for i in range(len(cameras)))
     return Photos(images, cameras.names, (0.0,) * len(cameras), folder)
 
 
 def truth(cameras: Cameras, scale: float, seed: int = 0) -> Geometry:
-    """Geometry at the size of the cameras' images, in a frame of its own: turned, moved and `scale` times as large."""
-    turn = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(seed)))[0]
-    turn = turn * torch.linalg.det(turn)
+    """True point maps and poses, randomly rotated, shifted and scaled by `scale`."""
+    R = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(seed)))[0]
+    R = R * torch.linalg.det(R)
     points, poses = [], []
     for i in range(len(cameras)):
         _, depth = photograph(cameras, i)
         _, local = unproject(depth, cameras.Ks[i], torch.eye(4))
         pose = torch.linalg.inv(cameras.viewmats[i])
         moved = torch.eye(4)
-        moved[:3, :3] = turn @ pose[:3, :3]
-        moved[:3, 3] = scale * turn @ pose[:3, 3] + 1.0
+        moved[:3, :3] = R @ pose[:3, :3]
+        moved[:3, 3] = scale * R @ pose[:3, 3] + 1.0
         points.append(scale * local)
         poses.append(moved)
     points = torch.stack(points)
@@ -38,11 +39,11 @@ def truth(cameras: Cameras, scale: float, seed: int = 0) -> Geometry:
 
 
 def true_splats(photos: Photos, size: tuple[int, int], geometry: Geometry, focal: float) -> torch.Tensor:
-    """Raw numbers of Gaussians as large as a pixel, in the pixel's colour, nearly opaque."""
+    """Raw parameters of nearly opaque Gaussians as large as a pixel, in its colour."""
     images = network_input.make_batch(list(photos.images), size).permute(0, 2, 3, 1)
     raw = torch.zeros(*images.shape[:3], CHANNELS)
     raw[..., 0] = 4.0
-    wanted = 0.7 * geometry.points[..., 2] / focal / 0.001  # what softplus has to give
+    wanted = 0.7 * geometry.points[..., 2] / focal / 0.001  # the output of softplus
     raw[..., 1:4] = torch.where(wanted > 20, wanted, wanted.expm1().clamp_min(1e-6).log())[..., None]
     raw[..., 7] = 1.0
     raw[..., 8::9] = (images - 0.5) / C0

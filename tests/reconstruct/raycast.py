@@ -1,4 +1,4 @@
-"""A textured table with a block on it, ray cast: photos, depth and cameras that are exactly known."""
+"""Ray-cast photos of a textured table with a block on it, with exact depth and cameras."""
 
 import json
 from pathlib import Path
@@ -10,7 +10,7 @@ from stages.core.geometry.cameras import intrinsics, orbit
 from stages.core.scene.cameras import Cameras
 from stages.core.scene.images import write_png
 
-BLOCK = (0.25, 0.2, 0.2)  # half sides along x and y, height; it stands at the origin
+BLOCK = (0.25, 0.2, 0.2)  # half sides along x and y, height; at the origin
 
 
 def arc(count: int = 6, size: tuple[int, int] = (160, 120), sweep: float = 60.0) -> Cameras:
@@ -22,7 +22,7 @@ def arc(count: int = 6, size: tuple[int, int] = (160, 120), sweep: float = 60.0)
 
 
 def texture(u: torch.Tensor, v: torch.Tensor, seed: int) -> torch.Tensor:
-    """Colour (..., 3) at places on a surface: blobs of four sizes, so that every window shows some."""
+    """Colour (..., 3) at surface coordinates: noise at four scales, so that every window has texture."""
     generator = torch.Generator().manual_seed(seed)
     colour = 0
     for octave in (16, 48, 96, 160):
@@ -34,7 +34,7 @@ def texture(u: torch.Tensor, v: torch.Tensor, seed: int) -> torch.Tensor:
 
 
 def rays_of(cameras: Cameras, i: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """The eye of a camera and what each pixel looks along (h, w, 3), to a depth of 1."""
+    """The centre of a camera and the ray of each pixel (h, w, 3), up to depth 1."""
     (width, height), K, viewmat = cameras.sizes[i].tolist(), cameras.Ks[i], cameras.viewmats[i]
     y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
     rays = torch.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], torch.ones_like(x)], -1) @ viewmat[:3, :3]
@@ -46,11 +46,11 @@ def photograph(cameras: Cameras, i: int) -> tuple[torch.Tensor, torch.Tensor]:
     eye, rays = rays_of(cameras, i)
     depth = -eye[2] / rays[..., 2]
     depth = torch.where(depth > 0, depth, torch.full_like(depth, 50.0))
-    met = eye + depth[..., None] * rays
-    image = texture(met[..., 0], met[..., 1], seed=0)
+    hit_point = eye + depth[..., None] * rays
+    image = texture(hit_point[..., 0], hit_point[..., 1], seed=0)
     a, b, top = BLOCK
-    for axis, place, seed in ((2, top, 1), (0, a, 2), (0, -a, 3), (1, b, 4), (1, -b, 5)):
-        t = (place - eye[axis]) / rays[..., axis]
+    for axis, offset, seed in ((2, top, 1), (0, a, 2), (0, -a, 3), (1, b, 4), (1, -b, 5)):
+        t = (offset - eye[axis]) / rays[..., axis]
         p = eye + t[..., None] * rays
         limits = torch.tensor([a, b, top]) + 1e-4
         inside = (p[..., :2].abs() <= limits[:2]).all(-1) & (p[..., 2] >= 0) & (p[..., 2] <= limits[2])
@@ -61,14 +61,14 @@ def photograph(cameras: Cameras, i: int) -> tuple[torch.Tensor, torch.Tensor]:
     return image, depth
 
 
-def with_mirror(cameras: Cameras, i: int, place: float = -0.5) -> torch.Tensor:
-    """The photo with a mirror standing on the table at x = `place`: in it, what the mirrored camera sees."""
+def with_mirror(cameras: Cameras, i: int, position: float = -0.5) -> torch.Tensor:
+    """The photo with a vertical mirror at x = `position`, rendered by the mirrored camera."""
     image, depth = photograph(cameras, i)
     eye, rays = rays_of(cameras, i)
-    turn = torch.diag(torch.tensor([-1.0, 1, 1, 1]))
-    turn[0, 3] = 2 * place
-    other, _ = photograph(Cameras(cameras.viewmats @ turn, cameras.Ks, cameras.sizes, cameras.names), i)
-    t = (place - eye[0]) / rays[..., 0]
+    reflection = torch.diag(torch.tensor([-1.0, 1, 1, 1]))
+    reflection[0, 3] = 2 * position
+    other, _ = photograph(Cameras(cameras.viewmats @ reflection, cameras.Ks, cameras.sizes, cameras.names), i)
+    t = (position - eye[0]) / rays[..., 0]
     _, y, z = (eye + t[..., None] * rays).unbind(-1)
     hit = (t > 0) & (t < depth) & (y.abs() < 0.5) & (z > 0) & (z < 0.6)
     return torch.where(hit[..., None], 0.9 * other, image)

@@ -1,4 +1,4 @@
-"""Depth by matching against a ray-cast scene of known depth."""
+"""Multi-view depth of a ray-cast scene with known depth."""
 
 import pytest
 import torch
@@ -12,7 +12,7 @@ from tests.reconstruct.raycast import arc, photograph
 
 
 def sparse(cameras, truth, step: int = 12) -> SparseModel:
-    """True points on a grid in every view, each seen by the views it falls in."""
+    """True points on a grid in every view, observed by the views that they project into."""
     points = []
     for i in range(len(cameras)):
         _, world = stereo.unproject(truth[i], cameras.Ks[i], cameras.viewmats[i])
@@ -36,9 +36,9 @@ def test_consistent_depth_is_accurate(block):
     views, truth, model = block
     maps = stereo.estimate_depth_maps(views, model, Plane(torch.tensor([0.0, 0, 1]), 0.0))
     for found, true in zip(maps, truth, strict=True):
-        sure = found.support >= 2
-        error = ((found.depth - true).abs() / true)[sure]
-        assert sure.float().mean() > 0.6
+        consistent = found.support >= 2
+        error = ((found.depth - true).abs() / true)[consistent]
+        assert consistent.float().mean() > 0.6
         # a tenth of a pixel between neighbours (12 degrees apart) is 0.25 % of the depth
         assert error.median() < 0.0025
         assert (error < 0.02).float().mean() > 0.97
@@ -52,7 +52,7 @@ def test_sources_are_the_neighbours(block):
 
 
 def test_semi_global_matching_fills_gaps_and_keeps_edges():
-    # Left half at label 3, right half at label 8; in a band of columns all labels cost the same.
+    # Left half at label 3, right half at label 8; in a band of columns all labels have the same cost.
     cost = torch.full((12, 20, 40), 0.6)
     cost[3, :, :20] = 0
     cost[8, :, 20:] = 0

@@ -1,4 +1,4 @@
-"""From depth to Gaussians."""
+"""Depth maps to initial Gaussians."""
 
 import pytest
 import torch
@@ -22,7 +22,7 @@ def flat_cloud(n: int = 400, spacing: float = 0.1) -> OrientedPoints:
 
 @pytest.fixture(scope="module")
 def block():
-    """Three views with their true depth, all of it confirmed."""
+    """Three views with their true depth, all of it consistent."""
     cameras = arc(3, (80, 60))
     photos, truth = zip(*(photograph(cameras, i) for i in range(3)), strict=True)
     views = Views(tuple((p * 255).round().to(torch.uint8) for p in photos), cameras)
@@ -55,7 +55,7 @@ def test_unprojected_normals_point_up_on_the_table(block):
 def test_downsampling_reaches_the_target_and_keeps_colours():
     cloud = flat_cloud(10_000, 0.01)
     few = initialise.downsample(cloud, 1000, torch.zeros(3), radius=100.0)
-    assert 250 < len(few) <= 1100  # cells are powers of two, so in the plane their number jumps by four
+    assert 250 < len(few) <= 1100  # voxel numbers in a plane change by factors of four
     torch.testing.assert_close(few.colours, torch.full((len(few), 3), 0.25))
     torch.testing.assert_close(few.points[:, 2], torch.zeros(len(few)))
 
@@ -79,10 +79,10 @@ def test_point_before_a_surface_violates_free_space(block):
 
 def test_interpolated_depth_continues_known_depth():
     depth = torch.full((32, 48), 2.0)
-    sure = torch.ones(32, 48, dtype=torch.bool)
-    sure[8:20, 10:30] = False
-    depth[~sure] = 77.0
-    torch.testing.assert_close(initialise.interpolate_depth(depth, sure), torch.full((32, 48), 2.0), rtol=1e-3, atol=0)
+    known = torch.ones(32, 48, dtype=torch.bool)
+    known[8:20, 10:30] = False
+    depth[~known] = 77.0
+    torch.testing.assert_close(initialise.interpolate_depth(depth, known), torch.full((32, 48), 2.0), rtol=1e-3, atol=0)
 
 
 def test_only_uncovered_pixels_are_filled(block):

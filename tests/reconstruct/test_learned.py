@@ -1,4 +1,4 @@
-"""Photos -> scene.ply with a network: all that comes after it tested with the truth in its place."""
+"""Learned backends: the steps after the network with true geometry in place of its output; complete tiny runs."""
 
 import dataclasses
 
@@ -25,12 +25,12 @@ from tests.core.models.pi3.test_splat import TINY_SPLAT
 from tests.reconstruct.oracle import photos_of, true_splats, truth
 from tests.reconstruct.raycast import BLOCK, arc, write_set
 
-SIZE = (112, 84)  # multiples of a patch, so that the network's images are the photos
+SIZE = (112, 84)  # multiples of the patch size, so that photos are not resized
 
 
 @pytest.fixture(autouse=True)
 def one_thread():
-    """Tensors are tiny here, and two threads would only wait for each other."""
+    """One thread is faster for tiny tensors."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     yield
@@ -44,13 +44,13 @@ def small(monkeypatch):
 
 
 def assembled(tmp_path, count=4, splats=False, noise=0.0, **given):
-    """A scene from true geometry in a frame and unit of its own."""
+    """A scene from true geometry in an arbitrary frame and unit."""
     cameras = arc(count, SIZE, sweep=70.0)
     photos, geometry = photos_of(cameras, tmp_path), truth(cameras, scale=3.7)
-    if noise:  # smooth, as errors of networks are
+    if noise:  # smooth, as the errors of networks
         coarse = noise * torch.randn(count, 1, 6, 8, generator=torch.Generator().manual_seed(3))
-        wobble = 1 + F.interpolate(coarse, geometry.points.shape[1:3], mode="bicubic")[:, 0]
-        geometry = dataclasses.replace(geometry, points=geometry.points * wobble[..., None])
+        factor = 1 + F.interpolate(coarse, geometry.points.shape[1:3], mode="bicubic")[:, 0]
+        geometry = dataclasses.replace(geometry, points=geometry.points * factor[..., None])
     raw = true_splats(photos, SIZE, geometry, float(cameras.Ks[0, 0, 0])) if splats else None
     options = ReconstructOptions(**{"quality": "draft", **given})
     made = learned.assemble(photos, list(photos.images), NetworkOutput(geometry, raw), options, StepCache(), "cpu")
@@ -58,12 +58,12 @@ def assembled(tmp_path, count=4, splats=False, noise=0.0, **given):
 
 
 def to_truth(made, cameras):
-    """The similarity from the scene to the true world, by the cameras."""
+    """Similarity from the scene to the true world, by the camera centres."""
     return umeyama(centres(made.scene.cameras.viewmats), centres(cameras.viewmats))
 
 
 def surface_error(points: torch.Tensor) -> torch.Tensor:
-    """Distance of points of the true world from the table or the block on it."""
+    """Distance of points from the table or the block on it."""
     a, b, top = BLOCK
     outside = (points[:, :2].abs() - torch.tensor([a, b])).clamp_min(0).norm(dim=1)
     block = torch.hypot(outside, (points[:, 2] - top).clamp_min(0))
@@ -99,13 +99,13 @@ def test_one_photo_is_enough(tmp_path):
     scale = 1.6 / float(centres(made.scene.cameras.viewmats)[0].norm())
     assert float(centres(made.scene.cameras.viewmats)[0, 2]) * scale == pytest.approx(
         float(centres(cameras.viewmats)[0, 2]), rel=0.1
-    )  # as high above the table as it was
+    )  # same height above the table
     assert score_views(made.scene.gaussians, made.views, [0])[0] > 17
 
 
 def test_no_floor_without_a_supporting_plane(tmp_path, monkeypatch):
     assert assembled(tmp_path, count=2, iterations=0)[0].scene.floor == 0.0
-    monkeypatch.setattr("stages.reconstruct.world_frame.PLANE_CRITERIA", ())  # no plane is good enough
+    monkeypatch.setattr("stages.reconstruct.world_frame.PLANE_CRITERIA", ())  # no plane is accepted
     made, _ = assembled(tmp_path, count=2, iterations=0)
     assert made.scene.floor is None
     assert any("no table or floor" in sentence for sentence in made.advice)
@@ -122,11 +122,11 @@ def test_merged_gaussians_look_like_the_original_ones(tmp_path):
 @pytest.mark.parametrize("name", ["pi3", "pi3-splat"])
 @pytest.mark.parametrize("count", [1, 3])
 def test_complete_runs_with_a_tiny_network(tmp_path, monkeypatch, name, count):
-    """What random weights say makes no sense, but every step is walked: photos, file of weights, network, scene.ply."""
+    """Random weights give a meaningless scene, but all steps run: photos, weight file, network, scene.ply."""
     write_set(tmp_path, arc(count, (170, 120)))
     model = random_weights(Pi3(TINY) if name == "pi3" else Pi3Splat(TINY_SPLAT), size=0.05)
     point_head = getattr(model.encoder, "point_head", None) or model.point_head
-    point_head.proj.weight.data *= 0.01  # so that neighbouring pixels are at nearly one depth
+    point_head.proj.weight.data *= 0.01  # so that neighbouring pixels have nearly the same depth
     point_head.proj.bias.data *= 0.01
     save_file(model.state_dict(), tmp_path / f"{name}.safetensors")
     monkeypatch.setenv("NGFF_WEIGHTS", str(tmp_path))
@@ -154,7 +154,7 @@ def test_errors_for_missing_weights_and_given_cameras(tmp_path, monkeypatch):
 
 @torch.no_grad()
 def test_bf16_is_close_to_fp32():
-    """As on a GPU, but on the CPU."""
+    """bf16 as on a GPU, run on the CPU."""
     model = random_weights(Pi3(TINY), size=0.1)
     images = torch.rand(3, 3, 56, 42, generator=torch.Generator().manual_seed(0))
     exact = model(images)

@@ -1,4 +1,4 @@
-"""What users put into a folder, and what phones film."""
+"""Folders of photos as users have them, and videos of phones."""
 
 import logging
 import struct
@@ -20,8 +20,8 @@ MILLISECOND = Fraction(1, 1000)
 rng = np.random.default_rng(0)
 
 
-def picture(width: int = 96, height: int = 64) -> np.ndarray:
-    """Coloured blobs, RGB bytes: left half reddish, right half bluish."""
+def random_image(width: int = 96, height: int = 64) -> np.ndarray:
+    """A random 8-bit RGB image: left half reddish, right half bluish."""
     small = rng.integers(0, 120, (height // 8, width // 8, 3), dtype=np.uint8)
     pixels = cv2.resize(small, (width, height), interpolation=cv2.INTER_CUBIC)
     pixels[:, : width // 2, 0] |= 128
@@ -31,9 +31,9 @@ def picture(width: int = 96, height: int = 64) -> np.ndarray:
 
 @pytest.fixture
 def folder(tmp_path):
-    """Two photos that are well, and room for others."""
+    """A folder with two valid photos."""
     for name in ("a.jpg", "b.jpg"):
-        Image.fromarray(picture()).save(tmp_path / name, quality=95)
+        Image.fromarray(random_image()).save(tmp_path / name, quality=95)
     return tmp_path
 
 
@@ -54,7 +54,7 @@ KINDS = {
 
 @pytest.mark.parametrize("kind", list(KINDS))
 def test_colours_of_all_file_formats(folder, kind):
-    pixels = picture()
+    pixels = random_image()
     KINDS[kind](folder, pixels)
     photos = read_photos(folder)
     assert len(photos) == 3
@@ -63,15 +63,15 @@ def test_colours_of_all_file_formats(folder, kind):
 
 
 def test_grey_photos_become_three_equal_channels(folder):
-    Image.fromarray(picture()[..., 1]).save(folder / "c.png")
+    Image.fromarray(random_image()[..., 1]).save(folder / "c.png")
     image = read_photos(folder).images[2]
     assert image.shape[2] == 3 and torch.equal(image[..., 0], image[..., 2])
 
 
 def test_exif_rotation_is_applied(folder):
-    pixels = picture()
+    pixels = random_image()
     exif = Image.Exif()
-    exif[0x0112] = 6  # stored lying on its side: to be turned a quarter clockwise
+    exif[0x0112] = 6  # to be rotated by 90 degrees clockwise
     Image.fromarray(np.ascontiguousarray(np.rot90(pixels))).save(folder / "c.jpg", exif=exif, quality=95)
     photos = read_photos(folder)
     assert photos.size(2) == (96, 64)
@@ -86,7 +86,7 @@ def test_mixed_sizes_and_focal_lengths_give_separate_cameras(folder):
     exif = Image.Exif()
     exif.get_ifd(0x8769)[0xA405] = 50  # 35 mm equivalent focal length
     for name, size in (("c.jpg", (64, 96)), ("d.jpg", (128, 96)), ("e.jpg", (96, 64))):
-        Image.fromarray(picture(*size)).save(folder / name, exif=exif)
+        Image.fromarray(random_image(*size)).save(folder / name, exif=exif)
     photos = read_photos(folder)
     cameras = initial_cameras(photos)
     assert cameras[0].camera_id == cameras[1].camera_id
@@ -97,9 +97,9 @@ def test_mixed_sizes_and_focal_lengths_give_separate_cameras(folder):
 
 def test_large_photos_and_their_focal_lengths_are_reduced(tmp_path):
     exif = Image.Exif()
-    exif.get_ifd(0x8769)[0xA405] = 36  # as wide as the film: the focal length is the width
+    exif.get_ifd(0x8769)[0xA405] = 36  # the focal length equals the image width
     for name in ("a.jpg", "b.jpg"):
-        Image.fromarray(picture(2400, 1600)).save(tmp_path / name, exif=exif)
+        Image.fromarray(random_image(2400, 1600)).save(tmp_path / name, exif=exif)
     photos = read_photos(tmp_path)
     assert photos.size(0) == (1600, 1067)
     assert photos.focals[0] == pytest.approx(1600, rel=0.05)
@@ -111,12 +111,12 @@ def test_unreadable_photos_are_named_and_left_out(folder, caplog):
     (folder / "c.jpg").write_bytes(whole[: len(whole) // 2])
     (folder / "d.jpg").write_bytes(b"")
     (folder / "e.jpg").write_bytes(b"no photo")
-    Image.fromarray(picture()).save(folder / "f.png")
+    Image.fromarray(random_image()).save(folder / "f.png")
     (folder / "f.png").write_bytes((folder / "f.png").read_bytes()[:-300])
     photos = read_photos(folder)
     assert photos.names == ("a.jpg", "b.jpg")
-    for said in ("c.jpg: is truncated", "d.jpg: is empty", "e.jpg: is not an image", "f.png: is truncated"):
-        assert said in caplog.text
+    for message in ("c.jpg: is truncated", "d.jpg: is empty", "e.jpg: is not an image", "f.png: is truncated"):
+        assert message in caplog.text
     (folder / "b.jpg").unlink()
     with pytest.raises(InputError, match="holds one photo that can be read"):
         read_photos(folder)
@@ -129,15 +129,15 @@ def test_other_files_with_photo_suffixes_are_left_out(folder, caplog):
     (folder / "folder.jpg").mkdir()
     (folder / "link.jpg").symlink_to(folder / "gone.jpg")
     (folder / "phone.jpg").write_bytes(b"\0\0\0\x18ftypheic" + bytes(500))  # HEIC under another name
-    (folder / "huge.png").write_bytes(png_that_claims(60_000, 60_000))
+    (folder / "huge.png").write_bytes(png_with_declared_size(60_000, 60_000))
     photos = read_photos(folder)
     assert photos.names == ("a.jpg", "b.jpg")
-    for said in ("folder.jpg: is a folder", "link.jpg: no such file", "phone.jpg: is not an image", "huge.png: is dam"):
-        assert said in caplog.text
+    for message in ("folder.jpg: is a folder", "link.jpg: no such file", "phone.jpg: is not an", "huge.png: is d"):
+        assert message in caplog.text
 
 
-def png_that_claims(width: int, height: int) -> bytes:
-    """A header without the pixels it speaks of."""
+def png_with_declared_size(width: int, height: int) -> bytes:
+    """A PNG header without the pixels it declares."""
     chunks = [(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)), (b"IDAT", zlib.compress(b"0"))]
     out = b"\x89PNG\r\n\x1a\n"
     for kind, data in (*chunks, (b"IEND", b"")):
@@ -147,7 +147,7 @@ def png_that_claims(width: int, height: int) -> bytes:
 
 def test_error_suggests_a_subfolder_or_video(tmp_path):
     (tmp_path / "day 1" / "images").mkdir(parents=True)
-    Image.fromarray(picture()).save(tmp_path / "day 1" / "images" / "a.png")
+    Image.fromarray(random_image()).save(tmp_path / "day 1" / "images" / "a.png")
     with pytest.raises(InputError, match="day 1: holds no photos itself; give .*images"):
         read_photos(tmp_path / "day 1")
     (tmp_path / "films").mkdir()
@@ -164,7 +164,7 @@ def test_appended_video_and_thumbnail_do_not_hide_truncation(folder):
     header = b"\xff\xe1" + (len(thumbnail) + 2).to_bytes(2, "big") + thumbnail
     (folder / "c.jpg").write_bytes(whole[:2] + header + whole[2:] + b"ftypmp42 a film" * 1000)
     assert len(read_photos(folder)) == 3
-    cut = (whole[:2] + header + whole[2:])[: -len(whole) // 2]  # the thumbnail's end is not the photo's
+    cut = (whole[:2] + header + whole[2:])[: -len(whole) // 2]  # only the end marker of the thumbnail is left
     (folder / "c.jpg").write_bytes(cut)
     assert len(read_photos(folder)) == 2
 
@@ -175,7 +175,7 @@ def test_formats_that_need_converting_are_named(tmp_path, caplog):
     with pytest.raises(InputError, match="holds 2 HEIC photos, which cannot be read; convert them to JPEG"):
         read_photos(tmp_path)
     for name in ("a.png", "b.png"):
-        Image.fromarray(picture()).save(tmp_path / name)
+        Image.fromarray(random_image()).save(tmp_path / name)
     assert len(read_photos(tmp_path)) == 2
     assert "2 HEIC photos are left out" in caplog.text
 
@@ -183,7 +183,7 @@ def test_formats_that_need_converting_are_named(tmp_path, caplog):
 def test_sharpest_photo_of_each_span(tmp_path, monkeypatch, caplog):
     monkeypatch.setattr(photo_reader, "MAX_PHOTOS", 4)
     for i in range(12):
-        pixels = picture() if i % 3 == 1 else np.full((64, 96, 3), 90, np.uint8)
+        pixels = random_image() if i % 3 == 1 else np.full((64, 96, 3), 90, np.uint8)
         Image.fromarray(pixels).save(tmp_path / f"{i:02d}.png")
     with caplog.at_level(logging.INFO):
         photos = read_photos(tmp_path)
@@ -193,22 +193,22 @@ def test_sharpest_photo_of_each_span(tmp_path, monkeypatch, caplog):
 
 def test_number_and_size_of_many_photos_are_limited(tmp_path, monkeypatch):
     monkeypatch.setattr(photo_reader, "MAX_SIDES", (160, 64))
-    pixels = picture(96, 64)
+    pixels = random_image(96, 64)
     for i in range(500):
         cv2.imwrite(str(tmp_path / f"{i:03d}.jpg"), pixels)
     photos = read_photos(tmp_path)
     assert len(photos) == photo_reader.MAX_PHOTOS == 200
     assert all(max(photos.size(i)) == 64 for i in range(200))
-    assert int(photos.names[0][:3]) < 3 and int(photos.names[-1][:3]) > 496  # from the whole walk
+    assert int(photos.names[0][:3]) < 3 and int(photos.names[-1][:3]) > 496  # from the whole range
 
 
-def film(path, times: list[float], size: tuple[int, int] = (96, 64), blurred: tuple[int, ...] = ()) -> None:
-    """A video with frames at these times [s]; the red channel tells the time, a tenth of a second a level."""
+def write_video(path, times: list[float], size: tuple[int, int] = (96, 64), blurred: tuple[int, ...] = ()) -> None:
+    """A video with frames at these times [s]; the red channel is the time in tenths of a second."""
     with av.open(str(path), "w") as file:
         stream = file.add_stream("libx264", rate=1000, options={"crf": "10", "g": "10"})
         stream.width, stream.height, stream.pix_fmt = *size, "yuv420p"
         stream.codec_context.time_base = MILLISECOND
-        texture = picture(*size)
+        texture = random_image(*size)
         for i, time in enumerate(times):
             pixels = cv2.GaussianBlur(texture, (0, 0), 4) if i in blurred else texture.copy()
             pixels[..., 0] = round(time * 10)
@@ -219,9 +219,9 @@ def film(path, times: list[float], size: tuple[int, int] = (96, 64), blurred: tu
 
 
 def test_variable_frame_rate_is_sampled_by_time(tmp_path, monkeypatch):
-    # Ten frames a second for 4 s, then one a second for 16 s: by number, two thirds would be from the first fifth.
+    # 10 frames/s for 4 s, then 1 frame/s for 16 s: by frame number two thirds would be from the first fifth.
     monkeypatch.setattr(photo_reader, "VIDEO_FRAMES", (10, 10))
-    film(tmp_path / "v.mp4", [0.1 * i for i in range(40)] + [4.0 + i for i in range(17)])
+    write_video(tmp_path / "v.mp4", [0.1 * i for i in range(40)] + [4.0 + i for i in range(17)])
     photos = read_photos(tmp_path / "v.mp4")
     times = torch.tensor([float(image[..., 0].float().mean()) / 10 for image in photos.images])
     assert len(photos) == 10
@@ -230,41 +230,41 @@ def test_variable_frame_rate_is_sampled_by_time(tmp_path, monkeypatch):
 
 def test_blurred_frames_are_skipped(tmp_path, monkeypatch):
     monkeypatch.setattr(photo_reader, "VIDEO_FRAMES", (5, 5))
-    film(tmp_path / "v.mp4", [0.1 * i for i in range(25)], blurred=tuple(i for i in range(25) if i % 5 != 2))
+    write_video(tmp_path / "v.mp4", [0.1 * i for i in range(25)], blurred=tuple(i for i in range(25) if i % 5 != 2))
     names = read_photos(tmp_path / "v.mp4").names
     assert [int(name[6:]) % 5 for name in names] == [2] * 5
 
 
-@pytest.mark.parametrize(("matrix", "turned"), [((0, 1, -1, 0), -1), ((0, -1, 1, 0), 1), ((-1, 0, 0, -1), 2)])
-def test_video_rotation_is_applied(tmp_path, matrix, turned):
-    film(tmp_path / "v.mp4", [0.1 * i for i in range(3)])
+@pytest.mark.parametrize(("matrix", "quarter_turns"), [((0, 1, -1, 0), -1), ((0, -1, 1, 0), 1), ((-1, 0, 0, -1), 2)])
+def test_video_rotation_is_applied(tmp_path, matrix, quarter_turns):
+    write_video(tmp_path / "v.mp4", [0.1 * i for i in range(3)])
     stored = read_photos(tmp_path / "v.mp4").images
     data = (tmp_path / "v.mp4").read_bytes()
-    a, b, c, d = (65536 * k for k in matrix)  # 16.16 fixed point, rows of a matrix that acts on row vectors
-    level = struct.pack(">9i", 65536, 0, 0, 0, 65536, 0, 0, 0, 1 << 30)
-    at = data.index(level, data.index(b"tkhd"))  # in the header of the track, ISO/IEC 14496-12
+    a, b, c, d = (65536 * k for k in matrix)  # 16.16 fixed point, for row vectors
+    identity = struct.pack(">9i", 65536, 0, 0, 0, 65536, 0, 0, 0, 1 << 30)
+    at = data.index(identity, data.index(b"tkhd"))  # of the track header, ISO/IEC 14496-12
     (tmp_path / "v.mp4").write_bytes(data[:at] + struct.pack(">9i", a, b, 0, c, d, 0, 0, 0, 1 << 30) + data[at + 36 :])
     photos = read_photos(tmp_path / "v.mp4")
     for image, before in zip(photos.images, stored, strict=True):
-        assert torch.equal(image, torch.rot90(before, turned))
+        assert torch.equal(image, torch.rot90(before, quarter_turns))
 
 
 def test_large_video_frames_are_reduced(tmp_path):
-    film(tmp_path / "v.mp4", [0.1 * i for i in range(3)], size=(1920, 1080))
+    write_video(tmp_path / "v.mp4", [0.1 * i for i in range(3)], size=(1920, 1080))
     photos = read_photos(tmp_path / "v.mp4")
     assert len(photos) == 3 and photos.size(0) == (1600, 900)
 
 
 def test_truncated_video_is_refused(tmp_path):
-    film(tmp_path / "v.mp4", [0.1 * i for i in range(10)])
+    write_video(tmp_path / "v.mp4", [0.1 * i for i in range(10)])
     whole = (tmp_path / "v.mp4").read_bytes()
-    (tmp_path / "cut.mp4").write_bytes(whole[: len(whole) // 2])  # its table of frames is at the end
+    (tmp_path / "cut.mp4").write_bytes(whole[: len(whole) // 2])  # the index is at the end
     with pytest.raises(InputError, match="cut.mp4: is not a video that can be read"):
         read_photos(tmp_path / "cut.mp4")
 
 
 def test_video_with_one_frame_is_refused(tmp_path):
-    film(tmp_path / "v.mp4", [0.0])
+    write_video(tmp_path / "v.mp4", [0.0])
     with pytest.raises(InputError, match="has 1 frame; a video that moves around"):
         read_photos(tmp_path / "v.mp4")
 
@@ -279,6 +279,6 @@ def test_other_files_in_the_folder_are_counted(folder, caplog):
 
 
 def test_one_photo_is_refused(tmp_path):
-    Image.fromarray(picture()).save(tmp_path / "a.png")
+    Image.fromarray(random_image()).save(tmp_path / "a.png")
     with pytest.raises(InputError, match="holds one photo; at least 2"):
         read_photos(tmp_path)

@@ -1,4 +1,4 @@
-"""Photo sets as people really take them: each is placed, or refused in one sentence that says what to try."""
+"""Realistic photo sets: cameras are found, or the error says what to change."""
 
 import pytest
 import torch
@@ -22,7 +22,7 @@ def noisy(image: torch.Tensor, seed: int) -> torch.Tensor:
 
 
 def with_person(image: torch.Tensor, seed: int) -> torch.Tensor:
-    """Something stands before a fifth of the photo that no other photo shows, at a place of its own."""
+    """A fifth of the photo is covered at a random position by something that no other photo shows."""
     height, width = image.shape[:2]
     h, w = height // 2, width * 2 // 5
     generator = torch.Generator().manual_seed(seed)
@@ -33,8 +33,8 @@ def with_person(image: torch.Tensor, seed: int) -> torch.Tensor:
     return out
 
 
-def worst_place(model: sfm.SparseModel, true) -> float:
-    """Largest distance of a camera from its true place, after alignment [scene units]."""
+def max_position_error(model: sfm.SparseModel, true) -> float:
+    """Largest distance of a camera from its true position after alignment [scene units]."""
     rows = [true.names.index(name) for name in model.cameras.names]
     found, there = centres(model.cameras.viewmats), centres(true.viewmats)[rows]
     return float((umeyama(found, there)(found) - there).norm(dim=1).max())
@@ -52,7 +52,7 @@ def test_people_walking_through(tmp_path):
     crowded = [with_person(image, i) if i % 2 else image for i, image in enumerate(images)]
     model = sfm.estimate_cameras(as_photos(crowded, true.names, tmp_path))
     assert len(model.cameras) == 6
-    assert worst_place(model, true) < 0.03  # the cameras are 1.6 away
+    assert max_position_error(model, true) < 0.03  # the cameras are 1.6 away
 
 
 def test_blank_and_unrelated_photos_are_dropped_with_reason(tmp_path):
@@ -68,7 +68,7 @@ def test_blank_and_unrelated_photos_are_dropped_with_reason(tmp_path):
 
 
 def test_stationary_camera_is_refused(tmp_path):
-    # As on a turntable before a patterned wall: the wall's matches say that nothing moves.
+    # As on a turntable before a patterned wall: the matches of the wall do not move.
     true = arc(1, (320, 240))
     still = photograph(true, 0)[0]
     images = [with_person(noisy(still, i), i) for i in range(5)]
@@ -76,32 +76,32 @@ def test_stationary_camera_is_refused(tmp_path):
         sfm.estimate_cameras(as_photos(images, tuple("abcde"), tmp_path))
 
 
-def around(count: int, sweep: float, distance: float = 1.4) -> Cameras:
-    """Cameras on a level ring about the block, beginning where the x axis points."""
+def arc_around(count: int, sweep: float, distance: float = 1.4) -> Cameras:
+    """Cameras on a horizontal arc around the block, about the direction of the x axis."""
     size = torch.tensor((400, 300)).expand(count, 2).clone()
     viewmats = orbit(count, torch.tensor([0.0, 0.0, 0.1]), distance, elevation=30.0, azimuth=-sweep / 2, sweep=sweep)
     return Cameras(viewmats, intrinsics(400, 300, 480.0).expand(count, 3, 3).clone(), size, tuple("abcdefgh"[:count]))
 
 
 def test_turntable_before_a_plain_backdrop(tmp_path):
-    true = around(6, sweep=60.0, distance=0.9)
+    true = arc_around(6, sweep=60.0, distance=0.9)
     images = []
     for i in range(6):
         image, depth = photograph(true, i)
         eye, rays = rays_of(true, i)
-        thing = (eye + depth[..., None] * rays)[..., 2] > 1e-4
-        images.append(torch.where(thing[..., None], image, torch.tensor(0.8)))
+        on_block = (eye + depth[..., None] * rays)[..., 2] > 1e-4
+        images.append(torch.where(on_block[..., None], image, torch.tensor(0.8)))
     model = sfm.estimate_cameras(as_photos(images, true.names, tmp_path))
-    assert model.cameras.names == true.names and worst_place(model, true) < 0.05
+    assert model.cameras.names == true.names and max_position_error(model, true) < 0.05
 
 
 def test_mirror_in_the_scene(tmp_path):
-    # A fifth of each photo shows the block a second time, as sharp as the first: where a mirror puts it.
-    true = around(6, sweep=75.0)
+    # A fifth of each photo is a sharp mirror image of the block.
+    true = arc_around(6, sweep=75.0)
     model = sfm.estimate_cameras(as_photos([with_mirror(true, i) for i in range(6)], true.names, tmp_path))
-    assert model.cameras.names == true.names and worst_place(model, true) < 0.03
-    a_view = umeyama(centres(model.cameras.viewmats), centres(true.viewmats))
-    assert (a_view(model.points)[:, 0] < -0.6).sum() > 20  # and so there are points behind it
+    assert model.cameras.names == true.names and max_position_error(model, true) < 0.03
+    align = umeyama(centres(model.cameras.viewmats), centres(true.viewmats))
+    assert (align(model.points)[:, 0] < -0.6).sum() > 20  # points behind the mirror
 
 
 def test_duplicate_photos(tmp_path):
@@ -109,7 +109,7 @@ def test_duplicate_photos(tmp_path):
     images = [photograph(true, i)[0] for i in (0, 0, 1, 1, 2, 2, 3, 3)]
     model = sfm.estimate_cameras(as_photos(images, tuple("abcdefgh"), tmp_path))
     twice = Cameras(*(t.repeat_interleave(2, 0) for t in (true.viewmats, true.Ks, true.sizes)), tuple("abcdefgh"))
-    assert len(model.cameras) == 8 and worst_place(model, twice) < 0.03
+    assert len(model.cameras) == 8 and max_position_error(model, twice) < 0.03
 
 
 def test_photos_of_different_objects_are_refused(tmp_path):
@@ -123,7 +123,7 @@ def test_photos_of_two_places_give_the_larger_set(tmp_path):
     # As a video with a cut: four photos of one place, three of another.
     first, second = arc(4, (320, 240), sweep=40.0), arc(3, (320, 240), sweep=30.0)
     images = [photograph(first, i)[0] for i in range(4)]
-    images += [1 - photograph(second, i)[0].flip(0, 1) for i in range(3)]  # upside down and negative: nothing in common
+    images += [1 - photograph(second, i)[0].flip(0, 1) for i in range(3)]  # rotated, negative: no matches
     names = tuple(f"{i}.png" for i in range(7))
     model = sfm.estimate_cameras(as_photos(images, names, tmp_path))
     assert model.cameras.names == names[:4]

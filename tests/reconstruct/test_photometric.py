@@ -1,4 +1,4 @@
-"""Fitting Gaussians to photos."""
+"""Photometric fit of Gaussians to photos."""
 
 from dataclasses import replace
 
@@ -23,7 +23,7 @@ def photographed(gaussians: Gaussians, cameras) -> Views:
 @pytest.fixture(scope="module")
 def target() -> tuple[Gaussians, Views]:
     inner = random_gaussians(300, seed=1)
-    gaussians = concatenate([inner, ball((0.0, 0.0, 0.0), 4.0, 500, (0.3, 0.4, 0.5), 0)])  # every pixel shows something
+    gaussians = concatenate([inner, ball((0.0, 0.0, 0.0), 4.0, 500, (0.3, 0.4, 0.5), 0)])  # every pixel is covered
     return gaussians, photographed(gaussians, ring(6, 48))
 
 
@@ -44,7 +44,7 @@ def test_the_same_seed_gives_the_same_gaussians(target):
 
 
 def test_scores_with_fitted_exposure(target):
-    """Photos of 0.8 times the light: 20 dB off, and next to nothing once exposed alike."""
+    """Photos 0.8 times as bright lose more than 15 dB, which a fitted exposure recovers."""
     true, views = target
     dark = replace(views, images=tuple((0.8 * image.float()).round().to(torch.uint8) for image in views.images))
     exact, _ = photometric.score_views(true, views, [0, 1])
@@ -67,7 +67,7 @@ def test_darker_photo_gets_lower_exposure(target):
 
 
 def test_scale_regularisation_shrinks_invisible_gaussians_only_in_size(target):
-    """The last of them is behind all cameras."""
+    """The last Gaussian is behind all cameras."""
     true, views = target
     unseen = replace(true[[0]], means=torch.tensor([[0.0, 0, 60.0]]))
     fit = photometric._Fit.start(concatenate([true, unseen]), views.cameras, 2.0)
@@ -80,33 +80,33 @@ def test_scale_regularisation_shrinks_invisible_gaussians_only_in_size(target):
 
 
 def test_exposure_excludes_parts_linear_in_the_camera_pose():
-    """Light that grows to one side is view-dependent colour; a single photo taken too dark is not."""
+    """Brightness linear in the position is view-dependent colour; a single darker photo is not."""
     cameras = ring(40, 48)
-    own = photometric._exposure_projection(cameras).double()
-    torch.testing.assert_close(own @ own, own)
+    projection = photometric._exposure_projection(cameras).double()
+    torch.testing.assert_close(projection @ projection, projection)
     smooth = 0.3 * torch.linalg.inv(cameras.viewmats.double())[:, 0, 3] + 0.2
-    assert float((own @ smooth).abs().max()) < 1e-5
+    assert float((projection @ smooth).abs().max()) < 1e-5
     dark = torch.zeros(40, dtype=torch.float64)
     dark[7] = -0.5
-    left = own @ dark
+    left = projection @ dark
     assert float(left[7]) < -0.4 and float(left[torch.arange(40) != 7].abs().max()) < 0.06
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 7])
 def test_exposure_projection_for_few_photos(count):
-    own = photometric._exposure_projection(ring(count, 48))
-    assert own.isfinite().all() and round(float(own.trace())) == count - 1 - count // 4
+    projection = photometric._exposure_projection(ring(count, 48))
+    assert projection.isfinite().all() and round(float(projection.trace())) == count - 1 - count // 4
 
 
 def test_invisible_and_transparent_gaussians_are_pruned():
     true = random_gaussians(60, seed=2)
     cameras = ring(4, 48)
     views = photographed(true, cameras)
-    behind = true.means.clone()
-    behind[:5] = torch.tensor([0.0, 0, 50.0])  # far above all cameras, seen by none
+    means = true.means.clone()
+    means[:5] = torch.tensor([0.0, 0, 50.0])  # far above all cameras, in no photo
     opacities = true.opacities.clone()
     opacities[5:10] = 1e-3
-    start = Gaussians(behind, true.quats, true.scales, opacities, true.sh, true.object_id)
+    start = Gaussians(means, true.quats, true.scales, opacities, true.sh, true.object_id)
     done = photometric.fit_gaussians(start, views, FitOptions(5, 2.0))
     assert len(done) <= 50
     assert done.means[:, 2].max() < 10
@@ -115,10 +115,11 @@ def test_invisible_and_transparent_gaussians_are_pruned():
 def test_split_halves_are_symmetric_and_smaller():
     start = random_gaussians(100, seed=3)
     fit = photometric._Fit.start(start, ring(1, 48), 1.0)
-    pull = torch.zeros(100)
-    pull[7] = 1.0
+    gradients = torch.zeros(100)
+    gradients[7] = 1.0
     fit.values["means"].grad = torch.zeros(100, 3)
-    photometric._split(fit, pull / fit.values["scales"].detach().exp().max(1).values, torch.Generator().manual_seed(0))
+    size = fit.values["scales"].detach().exp().max(1).values
+    photometric._split(fit, gradients / size, torch.Generator().manual_seed(0))
     after = fit.gaussians()
     count = int(photometric.DENSITY.split_fraction * 100)
     assert len(after) == 100 + count

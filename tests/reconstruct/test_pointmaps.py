@@ -1,4 +1,4 @@
-"""From what a network says to cameras and depth that can be trusted."""
+"""Point maps of a network to cameras and supported depth."""
 
 import numpy as np
 import pytest
@@ -34,18 +34,18 @@ def test_intrinsics_of_true_points_with_masked_outliers():
     torch.testing.assert_close(pointmaps.solve_intrinsics(geometry.points[0]), cameras.Ks[0], rtol=1e-4, atol=1e-3)
     wrong = geometry.points[0].clone()
     wrong[:10, :, 0] *= 3
-    sure = torch.ones(42, 56, dtype=torch.bool)
+    mask = torch.ones(42, 56, dtype=torch.bool)
     assert (pointmaps.solve_intrinsics(wrong) - cameras.Ks[0]).abs().max() > 5
-    sure[:10] = False
-    torch.testing.assert_close(pointmaps.solve_intrinsics(wrong, sure), cameras.Ks[0], rtol=1e-4, atol=1e-3)
+    mask[:10] = False
+    torch.testing.assert_close(pointmaps.solve_intrinsics(wrong, mask), cameras.Ks[0], rtol=1e-4, atol=1e-3)
 
 
 def test_view_without_confident_pixels_gets_median_intrinsics():
     cameras = arc(3, (56, 42))
     geometry = truth(cameras, 1.0)
-    sure = pointmaps.confident_pixels(geometry)
-    sure[1] = False
-    Ks = pointmaps.cameras_from_pointmaps(geometry, sure, cameras.names).Ks
+    confident = pointmaps.confident_pixels(geometry)
+    confident[1] = False
+    Ks = pointmaps.cameras_from_pointmaps(geometry, confident, cameras.names).Ks
     torch.testing.assert_close(Ks, intrinsics(56, 42, 1.2 * 56).expand(3, 3, 3), rtol=1e-3, atol=0.05)
 
 
@@ -57,7 +57,7 @@ def test_only_true_depth_is_supported():
     depths[3] *= 1.2
     maps = pointmaps.depth_maps(depths, pointmaps.confident_pixels(geometry), found)
     seen = maps[0].support > 0
-    assert maps[0].support[seen].mean() > 2.3  # itself and the two others that are right, where they see it
+    assert maps[0].support[seen].mean() > 2.3  # itself and the two other correct views, where they overlap
     assert maps[3].support[maps[3].support > 0].mean() < 1.3
     assert (maps[0].support[~pointmaps.confident_pixels(geometry)[0]] == 0).all()
 
@@ -68,9 +68,9 @@ def test_unconfident_pixels_and_edges_are_excluded():
     confidence = torch.full((1, 20, 20), 0.9)
     confidence[:, :5] = 0.05
     local = torch.stack([torch.zeros_like(depth), torch.zeros_like(depth), depth], -1)
-    sure = pointmaps.confident_pixels(Geometry(local, confidence, torch.eye(4)[None]))[0]
-    assert not sure[:5].any() and not sure[:, 9:11].any()
-    assert sure[5:, :9].all() and sure[5:, 11:].all()
+    confident = pointmaps.confident_pixels(Geometry(local, confidence, torch.eye(4)[None]))[0]
+    assert not confident[:5].any() and not confident[:, 9:11].any()
+    assert confident[5:, :9].all() and confident[5:, 11:].all()
 
 
 @pytest.mark.parametrize(
@@ -100,6 +100,6 @@ def test_crops_keep_the_image_centre(tmp_path):
     for image in cut:
         assert abs(image.shape[1] / image.shape[0] - size[0] / size[1]) < 0.04
         middle = image.float().mean(2)
-        place = (middle > 128).nonzero().float().mean(0) + 0.5
-        assert (place - torch.tensor(middle.shape) / 2).abs().max() <= 0.6
+        centre = (middle > 128).nonzero().float().mean(0) + 0.5
+        assert (centre - torch.tensor(middle.shape) / 2).abs().max() <= 0.6
     assert network_input.make_batch(cut, size).shape == (3, 3, size[1], size[0])

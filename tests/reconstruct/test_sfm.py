@@ -1,4 +1,4 @@
-"""Structure from motion: its pieces, and what it says when photos do not connect."""
+"""Structure from motion: its parts, and its errors."""
 
 import pytest
 import torch
@@ -32,7 +32,7 @@ def test_cameras_of_a_ray_cast_scene(tmp_path):
     assert model.cameras.names == true.names
     move = umeyama(centres(model.cameras.viewmats), centres(true.viewmats))
     found = move.viewmats(model.cameras.viewmats)
-    steps = [v[1:, :3, :3] @ v[:-1, :3, :3].mT for v in (found, true.viewmats)]  # from each camera to the next
+    steps = [v[1:, :3, :3] @ v[:-1, :3, :3].mT for v in (found, true.viewmats)]  # relative rotations of neighbours
     turn = steps[0] @ steps[1].mT
     angle = torch.rad2deg(torch.acos(((turn.diagonal(dim1=1, dim2=2).sum(1) - 1) / 2).clamp(-1, 1)))
     assert angle.median() < 0.3
@@ -64,15 +64,15 @@ def test_cameras_that_do_not_fit_the_photos_are_refused(tmp_path):
 
 
 def test_failure_reason_by_number_of_pairs():
-    assert "overlap too little" in sfm._failure_reason(photos=24, pairs=30)  # each with the next, and little more
-    assert "a pattern repeats" in sfm._failure_reason(photos=24, pairs=162)  # a checked tablecloth seen from all sides
+    assert "overlap too little" in sfm._failure_reason(photos=24, pairs=30)  # neighbours only
+    assert "a pattern repeats" in sfm._failure_reason(photos=24, pairs=162)  # such as a checked tablecloth
     assert "overlap too little" in sfm._failure_reason(photos=3, pairs=3)
 
 
 def test_mutual_matches():
     a = torch.nn.functional.normalize(torch.tensor([[1.0, 0, 0], [0, 1, 0], [1, 1, 0.01]]), dim=1)
     b = torch.nn.functional.normalize(torch.tensor([[0.02, 1, 0], [1, 0.01, 0], [0, 0, 1.0]]), dim=1)
-    # the third of a lies between two of b, which the ratio test refuses
+    # the third of a is between two of b, which the ratio test rejects
     assert features.match_descriptors(a, b).tolist() == [[0, 1], [1, 0]]
 
 
@@ -80,7 +80,7 @@ def test_pairs_of_many_photos_are_neighbours_and_similar_photos(monkeypatch):
     monkeypatch.setattr(features, "MAX_EXHAUSTIVE", 10)
     generator = torch.Generator().manual_seed(0)
     found = [torch.nn.functional.normalize(torch.randn(30, 16, generator=generator), dim=1) for _ in range(40)]
-    found[39] = found[0]  # the walk ends where it began
+    found[39] = found[0]  # a closed loop
     chosen = features.select_pairs(found, neighbours=3, similar=2)
     assert (0, 39) in chosen
     assert all((i, i + 1) in chosen for i in range(39))
@@ -97,12 +97,12 @@ def test_number_of_pairs_is_linear_even_if_all_photos_are_similar(monkeypatch):
 
 
 def test_undistortion_straightens_lines(tmp_path):
-    # Straight lines of a chart seen through k1 = -0.2 become straight again.
+    # An edge that k1 = -0.2 bends becomes straight.
     size, K = (200, 150), torch.tensor([[180.0, 0, 100], [0, 180, 75], [0, 0, 1]])
     y, x = torch.meshgrid(torch.arange(150) + 0.5, torch.arange(200) + 0.5, indexing="ij")
     u, v = (x - 100) / 180, (y - 75) / 180
     du, dv = u.clone(), v.clone()
-    for _ in range(20):  # where the pinhole point of each distorted pixel is
+    for _ in range(20):  # pinhole coordinates of each distorted pixel
         r2 = du**2 + dv**2
         du, dv = u / (1 - 0.2 * r2), v / (1 - 0.2 * r2)
     image = (torch.sigmoid((du - 0.3) * 60)[..., None].expand(-1, -1, 3) * 255).to(torch.uint8)

@@ -1,4 +1,4 @@
-"""Up, floor and scale of point sets whose stance is known."""
+"""Up direction, floor and scale of point sets in a known frame."""
 
 import math
 
@@ -23,11 +23,11 @@ def tabletop(seed: int = 0) -> torch.Tensor:
 
 
 def one_sided() -> torch.Tensor:
-    """Five cameras on one side, pitched 30 degrees down: their mean up leans by as much."""
+    """Five cameras on one side, pitched down by 30 degrees, which tilts their mean up as much."""
     return orbit(5, torch.tensor([0.0, 0, 0.1]), 1.0, elevation=30.0, azimuth=10.0, sweep=50.0)
 
 
-def all_round() -> torch.Tensor:
+def full_ring() -> torch.Tensor:
     return orbit(8, torch.tensor([0.0, 0, 0.1]), 1.0, elevation=30.0)
 
 
@@ -39,7 +39,7 @@ def displaced(points, viewmats, seed: int):
     return move(points), move.viewmats(viewmats), move
 
 
-@pytest.mark.parametrize("cameras", [one_sided(), all_round()], ids=["side", "ring"])
+@pytest.mark.parametrize("cameras", [one_sided(), full_ring()], ids=["side", "ring"])
 @pytest.mark.parametrize("seed", [0, 1])
 def test_table_is_horizontal_at_zero(cameras, seed):
     points, viewmats, move = displaced(tabletop(), cameras, seed)
@@ -54,7 +54,7 @@ def test_table_is_horizontal_at_zero(cameras, seed):
 
 
 def test_textured_objects_do_not_tilt_the_plane():
-    # A keyboard and a book, 15 and 35 mm high, with ten times the points of the table that they lie on.
+    # A keyboard and a book, 15 and 35 mm high, with ten times as many points as the table under them.
     generator = torch.Generator().manual_seed(0)
     rand = lambda n: torch.rand(n, 3, generator=generator) - 0.5  # noqa: E731
     table = rand(900) * torch.tensor([1.2, 0.8, 0.0])
@@ -62,11 +62,11 @@ def test_textured_objects_do_not_tilt_the_plane():
     book = rand(4000) * torch.tensor([0.2, 0.25, 0]) + torch.tensor([0.3, 0.1, 0.035])
     points = torch.cat([table, keyboard, book])
     points += 0.001 * torch.randn(points.shape, generator=generator)
-    first = world_frame.find_ground(points, all_round(), torch.zeros(3))
+    first = world_frame.find_ground(points, full_ring(), torch.zeros(3))
     ground = world_frame.refine_ground(first, points)
-    lean = lambda up: math.degrees(math.acos(min(1.0, float(up[2]))))  # noqa: E731
-    assert lean(first.up) > 2
-    assert lean(ground.up) < 0.3 and abs(float(ground.plane.heights(torch.zeros(3)))) < 0.002
+    tilt = lambda up: math.degrees(math.acos(min(1.0, float(up[2]))))  # noqa: E731
+    assert tilt(first.up) > 2
+    assert tilt(ground.up) < 0.3 and abs(float(ground.plane.heights(torch.zeros(3)))) < 0.002
 
 
 def test_focus_scale_and_heading():
@@ -88,7 +88,7 @@ def test_scale_of_given_cameras_is_kept():
 
 
 def test_wall_is_not_a_floor():
-    # An object on a wall, seen by level cameras: no plane may be called the floor, and up is the cameras' own.
+    # An object on a wall and horizontal cameras: no floor, and up is that of the cameras.
     generator = torch.Generator().manual_seed(0)
     wall = torch.rand(5000, 3, generator=generator) * torch.tensor([2.0, 0, 2]) + torch.tensor([-1.0, 1, -1])
     bump = 0.2 * torch.randn(2000, 3, generator=generator)

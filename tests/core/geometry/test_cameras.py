@@ -24,7 +24,7 @@ def test_look_at_centres_the_target_with_up_upwards():
 
 
 def test_resized_intrinsics():
-    # a quarter of the way across stays a quarter of the way across
+    # all of K scales with the image
     K = resize(intrinsics(200, 100, 150.0), 0.5, 0.5)
     torch.testing.assert_close(K, intrinsics(100, 50, 75.0))
 

@@ -9,7 +9,7 @@ from tests.conftest import DEVICES
 
 @pytest.fixture(scope="module")
 def cloud():
-    """Points in a unit cube of place and colour, and a batch of queries around them."""
+    """Random points in six dimensions, and a batch of queries around them."""
     rng = torch.Generator().manual_seed(0)
     return torch.rand(3000, 6, generator=rng) - 0.5, 1.2 * torch.rand(7, 50, 6, generator=rng) - 0.6
 
@@ -18,22 +18,22 @@ def cloud():
 def test_brute_force_equals_the_tree(cloud, k, monkeypatch):
     monkeypatch.setattr(BruteForce, "MAX_ENTRIES", 100_000)  # several chunks
     points, queries = cloud
-    (far, which), (expected, index) = (way(points).query(queries, k) for way in (BruteForce, KDTree))
-    torch.testing.assert_close(far, expected, rtol=0, atol=1e-5)
-    assert torch.equal(which, index)
-    torch.testing.assert_close((queries[..., None, :] - points[which]).norm(dim=3), far)
+    (distance, found), (expected, index) = (search(points).query(queries, k) for search in (BruteForce, KDTree))
+    torch.testing.assert_close(distance, expected, rtol=0, atol=1e-5)
+    assert torch.equal(found, index)
+    torch.testing.assert_close((queries[..., None, :] - points[found]).norm(dim=3), distance)
 
 
 def test_brute_force_keeps_the_precision_of_the_queries(cloud):
     points, queries = cloud[0], cloud[1].double()
-    (far, _), (expected, _) = (way(points).query(queries) for way in (BruteForce, KDTree))
-    torch.testing.assert_close(far, expected, rtol=0, atol=1e-12)
+    (distance, _), (expected, _) = (search(points).query(queries) for search in (BruteForce, KDTree))
+    torch.testing.assert_close(distance, expected, rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("way", [KDTree, BruteForce])
-def test_distance_beyond_the_limit_is_infinite(way):
+@pytest.mark.parametrize("search", [KDTree, BruteForce])
+def test_distance_beyond_the_limit_is_infinite(search):
     line = torch.tensor([[0.0, 0, 0], [1, 0, 0], [3, 0, 0]])
-    distance, index = way(line).query(torch.tensor([[0.1, 0, 0], [9, 0, 0]]), 4, within=1.5)
+    distance, index = search(line).query(torch.tensor([[0.1, 0, 0], [9, 0, 0]]), 4, within=1.5)
     torch.testing.assert_close(distance, torch.tensor([[0.1, 0.9, inf, inf], [inf] * 4]))
     assert index[0, :2].tolist() == [0, 1] and bool((index < 3).all())
 

@@ -5,19 +5,19 @@ from stages.core.geometry.rotations import matrix
 from stages.core.geometry.similarity import Similarity, umeyama
 
 ROTATION = matrix(torch.tensor([0.8, 0.1, -0.3, 0.5], dtype=torch.float64))
-TURN = Similarity(2.5, ROTATION, torch.tensor([1.0, -2, 3]).double())
+TRANSFORM = Similarity(2.5, ROTATION, torch.tensor([1.0, -2, 3]).double())
 
 
 def test_umeyama_recovers_a_known_similarity():
     points = torch.randn(20, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    found = umeyama(points, TURN(points))
-    assert abs(found.scale - TURN.scale) < 1e-12
-    torch.testing.assert_close(found.rotation, TURN.rotation)
-    torch.testing.assert_close(found.translation, TURN.translation)
+    found = umeyama(points, TRANSFORM(points))
+    assert abs(found.scale - TRANSFORM.scale) < 1e-12
+    torch.testing.assert_close(found.rotation, TRANSFORM.rotation)
+    torch.testing.assert_close(found.translation, TRANSFORM.translation)
 
 
 def test_transformed_cameras_project_the_transformed_world_to_the_same_pixels():
     points = torch.randn(20, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     viewmat, K = look_at(torch.tensor([6.0, 1, 2]), torch.zeros(3)).double(), intrinsics(64, 64, 80.0).double()
-    moved = TURN.viewmats(viewmat[None])[0]
-    torch.testing.assert_close(project(TURN(points), moved, K), project(points, viewmat, K))
+    transformed = TRANSFORM.viewmats(viewmat[None])[0]
+    torch.testing.assert_close(project(TRANSFORM(points), transformed, K), project(points, viewmat, K))

@@ -17,7 +17,7 @@ def test_json_round_trip():
 
 
 def test_transforms_json_has_opengl_axes(tmp_path):
-    # An OpenGL camera at (0, 0, 3) without rotation looks along -z: it sees the origin 3 ahead, and y up is -y down.
+    # An OpenGL camera at (0, 0, 3) without rotation looks along -z: the origin is 3 ahead, and y is up.
     pose = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 3], [0, 0, 0, 1]]
     data = {"fl_x": 50, "fl_y": 50, "cx": 32, "cy": 24, "w": 64, "h": 48, "k1": 0.1,
             "frames": [{"file_path": "images/a.jpg", "transform_matrix": pose}]}  # fmt: skip

@@ -1,4 +1,4 @@
-"""Files that we write, read by a program that we did not: `npm install -g @playcanvas/splat-transform`."""
+"""Exchange of files with an independent program: `npm install -g @playcanvas/splat-transform`."""
 
 import shutil
 import subprocess

@@ -77,7 +77,7 @@ def test_non_finite_rows_are_dropped_and_counted(tmp_path, caplog):
     assert "dropped 1" in caplog.text
 
 
-def wrong_files(folder):
+def write_invalid_files(folder):
     (folder / "empty.ply").touch()
     (folder / "text.ply").write_text("hello")
     points = np.zeros(3, [("x", "f4"), ("y", "f4"), ("z", "f4")])
@@ -88,13 +88,13 @@ def wrong_files(folder):
 
 
 @pytest.mark.parametrize(
-    ("name", "says"),
+    ("name", "message"),
     [("empty.ply", "is empty"), ("text.ply", "not a readable PLY"), ("points.ply", "plain point cloud"),
      ("cut.ply", "not a readable PLY"), ("absent.ply", "no such file"), (".", "is a folder")],
 )  # fmt: skip
-def test_invalid_files_are_refused_in_one_line(tmp_path, name, says):
-    with pytest.raises(InputError, match=says) as caught:
-        read_scene(wrong_files(tmp_path) / name)
+def test_invalid_files_are_refused_in_one_line(tmp_path, name, message):
+    with pytest.raises(InputError, match=message) as caught:
+        read_scene(write_invalid_files(tmp_path) / name)
     assert "\n" not in str(caught.value) and str(tmp_path) in str(caught.value)
 
 

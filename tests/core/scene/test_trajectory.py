@@ -14,13 +14,13 @@ def parts(scene, p: int = 10):
     rest = torch.randn(p, 3, generator=torch.Generator().manual_seed(0))
     keypoints = Keypoints(rest, torch.ones(p, dtype=torch.int64))
     index = torch.randint(0, p, (n, 8), generator=torch.Generator().manual_seed(1))
-    motion = SimulationInfo(0.02, (0.0, 0.0, -9.81), "test", ({"object": 1},))
-    return motion, keypoints, Binding(index, torch.full((n, 8), 1 / 8))
+    info = SimulationInfo(0.02, (0.0, 0.0, -9.81), "test", ({"object": 1},))
+    return info, keypoints, Binding(index, torch.full((n, 8), 1 / 8))
 
 
 def write(path, scene, frames: int = 3):
-    motion, keypoints, binding = parts(scene)
-    with TrajectoryWriter(path, scene, motion, keypoints, binding) as writer:
+    info, keypoints, binding = parts(scene)
+    with TrajectoryWriter(path, scene, info, keypoints, binding) as writer:
         for t in range(frames):
             writer.append(keypoints.rest + 0.1 * t, torch.full((2, 3), float(t)), torch.eye(4)[:2])
 
@@ -28,8 +28,8 @@ def write(path, scene, frames: int = 3):
 def test_round_trip(tmp_path, two_balls):
     write(tmp_path / "t.h5", replace(two_balls, background=(0.2, 0.4, 0.6)))
     t = read_trajectory(tmp_path / "t.h5")
-    motion, keypoints, binding = parts(two_balls)
-    assert len(t) == 3 and t.info == motion
+    info, keypoints, binding = parts(two_balls)
+    assert len(t) == 3 and t.info == info
     assert t.scene.objects == two_balls.objects and t.scene.floor == 0.0
     assert t.scene.background == (0.2, 0.4, 0.6)
     assert t.scene.cameras.names == two_balls.cameras.names
@@ -40,10 +40,10 @@ def test_round_trip(tmp_path, two_balls):
 
 
 def test_input_error_keeps_the_written_frames(tmp_path, two_balls):
-    motion, keypoints, binding = parts(two_balls)
+    info, keypoints, binding = parts(two_balls)
     with (
         pytest.raises(InputError, match="escaped"),
-        TrajectoryWriter(tmp_path / "t.h5", two_balls, motion, keypoints, binding) as writer,
+        TrajectoryWriter(tmp_path / "t.h5", two_balls, info, keypoints, binding) as writer,
     ):
         writer.append(keypoints.rest, torch.zeros(2, 3), torch.zeros(2, 4))
         raise InputError("green ball escaped")
@@ -52,10 +52,10 @@ def test_input_error_keeps_the_written_frames(tmp_path, two_balls):
 
 
 def test_interrupted_write_leaves_no_file(tmp_path, two_balls):
-    motion, keypoints, binding = parts(two_balls)
+    info, keypoints, binding = parts(two_balls)
     with (
         pytest.raises(KeyboardInterrupt),
-        TrajectoryWriter(tmp_path / "t.h5", two_balls, motion, keypoints, binding) as writer,
+        TrajectoryWriter(tmp_path / "t.h5", two_balls, info, keypoints, binding) as writer,
     ):
         writer.append(keypoints.rest, torch.zeros(2, 3), torch.zeros(2, 4))
         raise KeyboardInterrupt
@@ -79,12 +79,12 @@ def damage(path, scene, how: str):
 
 
 @pytest.mark.parametrize(
-    ("how", "says"),
+    ("how", "message"),
     [("text", "not a readable HDF5"), ("format", "format attribute"), ("part", "missing"), ("nan", "not finite"),
      ("frames", "other datasets need")],
 )  # fmt: skip
-def test_damaged_files_are_refused_in_one_line(tmp_path, two_balls, how, says):
+def test_damaged_files_are_refused_in_one_line(tmp_path, two_balls, how, message):
     damage(tmp_path / "t.h5", two_balls, how)
-    with pytest.raises(InputError, match=says) as caught:
+    with pytest.raises(InputError, match=message) as caught:
         read_trajectory(tmp_path / "t.h5")
     assert "\n" not in str(caught.value)

@@ -1,1 +1,1 @@
-"""Benchmarks, each beside a peer in the same run."""
+"""Benchmarks, each compared with a baseline in the same run."""

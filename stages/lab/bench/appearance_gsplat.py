@@ -57,7 +57,7 @@ def train(
     from gsplat import DefaultStrategy, rasterization
 
     torch.manual_seed(SEED)  # the strategy draws from PyTorch's own generator
-    draw, share = draw or rasterization, steps / FULL_STEPS
+    draw, scale = draw or rasterization, steps / FULL_STEPS
     eyes = centres(views.cameras.viewmats)
     size = 1.1 * float((eyes - eyes.mean(0)).norm(dim=1).max())
     values = initial_parameters(start, device)
@@ -67,7 +67,7 @@ def train(
         )
         for name, value in values.items()
     }
-    strategy = DefaultStrategy(**{name: max(1, int(count * share)) for name, count in SCHEDULE.items()})
+    strategy = DefaultStrategy(**{name: max(1, int(count * scale)) for name, count in SCHEDULE.items()})
     strategy.check_sanity(values, optimisers)
     state = strategy.initialize_state(scene_scale=size)
     photos = [image.to(device) for image in views.images]
@@ -77,7 +77,7 @@ def train(
         if not going(step):
             return to_gaussians(values), step
         order = order or torch.randperm(len(views)).tolist()
-        i, degree = order.pop(), min(3, int(step / (DEGREE_EVERY * share)))
+        i, degree = order.pop(), min(3, int(step / (DEGREE_EVERY * scale)))
         photo = photos[i].float() / 255
         image, _, info = draw(
             values["means"], values["quats"], values["scales"].exp(), values["opacities"].sigmoid(),

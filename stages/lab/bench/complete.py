@@ -58,19 +58,21 @@ class CompleteBenchOptions:
     seed: int = 0
 
 
-def true_scene(placed: str, options: CompleteBenchOptions) -> Scene:
+def true_scene(object_names: str, options: CompleteBenchOptions) -> Scene:
     """The objects side by side, rotated at random about the vertical, on a grey table whose top is z = 0."""
     rng = torch.Generator().manual_seed(options.seed)
-    names = ObjectsOptions(placed).names
+    names = ObjectsOptions(object_names).names
     table = sheet(1.6, 1.6, 0.012)
     parts = [to_gaussians(table, torch.full((len(table.points), 3), 0.55), 0, 0.9)]
     for i, name in enumerate(names):
         half = torch.pi * torch.rand(1, generator=rng)  # of the angle
-        turn = matrix(torch.cat([half.cos(), torch.zeros(2), half.sin()]))
+        rotation = matrix(torch.cat([half.cos(), torch.zeros(2), half.sin()]))
         g = subsample(make_object(name), options.thin)
         low = float((OBJECT_SIZE * g.means[:, 2]).min())
-        place = Similarity(OBJECT_SIZE, turn, torch.tensor([1.2 * OBJECT_SIZE * (i - (len(names) - 1) / 2), 0.0, -low]))
-        parts.append(replace(transformed(g, place), object_id=torch.full((len(g),), i + 1)))
+        pose = Similarity(
+            OBJECT_SIZE, rotation, torch.tensor([1.2 * OBJECT_SIZE * (i - (len(names) - 1) / 2), 0.0, -low])
+        )
+        parts.append(replace(transformed(g, pose), object_id=torch.full((len(g),), i + 1)))
     objects = tuple(SceneObject(i + 1, name) for i, name in enumerate(names))
     return Scene(concatenate(parts), objects, camera_arc(10, FRONT_AZIMUTH, 28.0), 0.0)
 
@@ -140,31 +142,38 @@ def run(out: Path | None, options: CompleteBenchOptions = CompleteBenchOptions()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         _library(folder / "library", options)
-        for placed in options.scenes:
-            scenes[placed] = {}
-            for way, row in measure(placed, folder, options):
-                scenes[placed][way] = row
-                yield _line(placed, way, row)
-    means = {way: {f: sum(s[way][f] for s in scenes.values()) / len(scenes) for f in METRICS} for way in COMPLETERS}
-    yield from (_line("mean", way, row) for way, row in means.items())
+        for object_names in options.scenes:
+            scenes[object_names] = {}
+            for completer, row in measure(object_names, folder, options):
+                scenes[object_names][completer] = row
+                yield _line(object_names, completer, row)
+    means = {
+        completer: {f: sum(s[completer][f] for s in scenes.values()) / len(scenes) for f in METRICS}
+        for completer in COMPLETERS
+    }
+    yield from (_line("mean", completer, row) for completer, row in means.items())
     bench.write_results(out, "complete", "cpu", {"options": asdict(options), "scenes": scenes, "mean": means})
 
 
-def measure(placed: str, folder: Path, options: CompleteBenchOptions) -> Iterator[tuple[str, dict[str, float]]]:
+def measure(object_names: str, folder: Path, options: CompleteBenchOptions) -> Iterator[tuple[str, dict[str, float]]]:
     """Metrics of each completer on one scene."""
-    true = true_scene(placed, options)
+    true = true_scene(object_names, options)
     seen = visible_scene(true, options)
     _fall(true, folder / "truth", options)
-    for way in COMPLETERS:
-        scene = refine(seen, RefineOptions(way, folder / "library" if way == "library" else None, background=False))
-        _fall(scene, folder / way, options)
-        motion = trajectories.compare(folder / f"{way}.h5", folder / "truth.h5", EvaluateOptions())
+    for completer in COMPLETERS:
+        scene = refine(
+            seen, RefineOptions(completer, folder / "library" if completer == "library" else None, background=False)
+        )
+        _fall(scene, folder / completer, options)
+        motion = trajectories.compare(folder / f"{completer}.h5", folder / "truth.h5", EvaluateOptions())
         row = chamfer_mm(scene, true), psnr_behind(scene, true), 1000 * motion.overall["RMSE"]
-        yield way, {name: round(value, 3) for name, value in zip(METRICS, row, strict=True)}
+        yield completer, {name: round(value, 3) for name, value in zip(METRICS, row, strict=True)}
 
 
-def _line(scene: str, way: str, row: dict[str, float]) -> str:
-    return f"{scene:16}{way:12}{row['chamfer_mm']:14.2f}{row['psnr_behind_db']:18.2f}{row['motion_rmse_mm']:21.1f}"
+def _line(scene: str, completer: str, row: dict[str, float]) -> str:
+    return (
+        f"{scene:16}{completer:12}{row['chamfer_mm']:14.2f}{row['psnr_behind_db']:18.2f}{row['motion_rmse_mm']:21.1f}"
+    )
 
 
 def _library(folder: Path, options: CompleteBenchOptions) -> None:

@@ -93,10 +93,10 @@ def shared_scenes(motions: KeypointMotions, made: KeypointMotions) -> KeypointMo
     return motions[torch.tensor([i for i, name in enumerate(motions.names) if name in there], dtype=torch.int64)]
 
 
-def with_estimated_materials(things: Mapping[int, Asset]) -> dict[int, Asset]:
+def with_estimated_materials(objects: Mapping[int, Asset]) -> dict[int, Asset]:
     """The objects with the Young's moduli and densities that the paper's vision-language model estimated."""
     names = {kind.id: name for name, kind in OBJECTS.items()}
-    return {i: replace(a, E=VLM_MATERIALS[names[i]][0], density=VLM_MATERIALS[names[i]][1]) for i, a in things.items()}
+    return {i: replace(a, E=VLM_MATERIALS[names[i]][0], density=VLM_MATERIALS[names[i]][1]) for i, a in objects.items()}
 
 
 class Resimulation:
@@ -114,8 +114,10 @@ class Resimulation:
                     f"{data}: {group} and {groups[0]} were simulated with different discretisations; make them alike"
                 )
             self.configs.update(read_scene_configs(folder / "scene_configs" / f"{group}.json"))
-        self.fineness = Discretisation(made["dx"], made["spacing"], made["substep"])
-        self.things = with_estimated_materials(load_assets(self.fineness, made["keypoints"], folder / "particles.npz"))
+        self.discretisation = Discretisation(made["dx"], made["spacing"], made["substep"])
+        self.objects = with_estimated_materials(
+            load_assets(self.discretisation, made["keypoints"], folder / "particles.npz")
+        )
 
     def __call__(self, names: tuple[str, ...], frames: int, keypoints: int) -> KeypointMotions:
         """Simulate scenes by name; failed ones are missing from the result."""
@@ -128,8 +130,8 @@ class Resimulation:
         return bench.median_seconds(lambda: list(self._parts(one, steps + 1, 1)), self.device, 1)
 
     def _parts(self, configs: dict[str, SceneConfig], frames: int, keypoints: int) -> Iterator[KeypointMotions]:
-        settings = SimulationSettings(self.fineness, frames, keypoints, self.device)
-        for part in simulate(configs, self.things, settings):
+        settings = SimulationSettings(self.discretisation, frames, keypoints, self.device)
+        for part in simulate(configs, self.objects, settings):
             yield part.to("cpu")
 
     def _config(self, name: str) -> SceneConfig:

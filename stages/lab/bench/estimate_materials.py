@@ -27,16 +27,16 @@ PROMPT = """\
 These {frames} frames, evenly spaced in time, are from one video of objects that fall, collide and deform. {which}
 
 For each of them estimate what a physics simulator needs. The simulator treats an object as one homogeneous elastic \
-solid in its outer shape, so give effective values of the whole thing: a hollow can is lighter and softer than its \
-metal, a stuffed toy far softer than its fibres. Judge by what the thing looks like, how far it dents, bends and \
-bounces, and what such things usually are.
+solid in its outer shape, so give effective values of the whole object: a hollow can is lighter and softer than its \
+metal, a stuffed toy far softer than its fibres. Judge by what the object looks like, how far it dents, bends and \
+bounces, and what such objects usually are.
 
 - "material": a word or two on what it is made of
 - "E": Young's modulus in Pa, a plain number from {E[0]:g} to {E[1]:g} (pillow about 1e4, rubber duck 3e5, hard \
 plastic 2e7)
 - "density": mass over the volume of the outer shape in kg/m^3, a plain number from {density[0]:g} to {density[1]:g}
 
-Answer with nothing but one JSON object, one entry for each thing, for example
+Answer with nothing but one JSON object, one entry for each object, for example
 {{"{example}": {{"material": "soft rubber", "E": 3e5, "density": 300}}}}"""
 
 

@@ -117,8 +117,8 @@ def _launch(kernel: wp.Kernel, splats: Tensor, bins: Bins, *views) -> None:
 def bin_into_tiles(splats: Tensor, keys: Tensor, width: int, height: int) -> Bins:
     """Bin splats (n, 16) by their sort keys into every tile that their bounding box touches."""
     last = torch.tensor([(width - 1) // TILE, (height - 1) // TILE])
-    centre, reach = splats[:, :2].detach(), splats[:, 11:13].detach()
-    low, high = (((centre + sign * reach - 0.5) / TILE).floor().clamp(0 * last, last) for sign in (-1, 1))
+    centre, radius = splats[:, :2].detach(), splats[:, 11:13].detach()
+    low, high = (((centre + sign * radius - 0.5) / TILE).floor().clamp(0 * last, last) for sign in (-1, 1))
     return bin_splats(keys, torch.cat([low, high], 1).to(torch.int16), width, height, TILE)
 
 

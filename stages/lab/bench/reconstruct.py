@@ -127,8 +127,8 @@ def _scene(images: Path, options: ReconstructBenchOptions) -> tuple[dict, Camera
     chosen = ReconstructOptions(
         quality=options.quality, holdout=options.holdout, device=options.device, matcher=options.matcher
     )
-    with tempfile.TemporaryDirectory() as place:
-        path = Path(place) / "scene.ply"
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "scene.ply"
         report = reconstruct(images, path, chosen)
         scene = read_scene(path)
     return asdict(report), scene.cameras, scene.floor
@@ -153,11 +153,11 @@ def pose_error(found: Cameras, reference: Cameras) -> PoseError:
     Raises InputError for fewer than 3 common photos.
     """
     a, b = matched_cameras(found, reference)
-    turns = []
+    relative = []
     for R in (a.viewmats[:, :3, :3].double(), b.viewmats[:, :3, :3].double()):
         i, j = torch.triu_indices(len(R), len(R), 1)
-        turns.append(R[j] @ R[i].mT)
-    angles = rotation_angle(turns[0] @ turns[1].mT)
+        relative.append(R[j] @ R[i].mT)
+    angles = rotation_angle(relative[0] @ relative[1].mT)
     x, y = centres(a.viewmats.double()), centres(b.viewmats.double())
     shift = (umeyama(x, y)(x) - y).square().sum(1).mean().sqrt() / torch.pdist(y).max()
     return PoseError(len(a), float(angles.median()), float(angles.max()), 100 * float(shift))
@@ -184,8 +184,8 @@ def camera_similarity(source: Float[Tensor, "n 4 4"], target: Float[Tensor, "n 4
     points = []
     for viewmats in (source, target):
         eyes = centres(viewmats)
-        reach = (eyes - eyes.mean(0)).norm(dim=1).mean()
-        points.append(torch.cat([eyes, *(eyes + reach * viewmats[:, axis, :3] for axis in range(3))]))
+        distance = (eyes - eyes.mean(0)).norm(dim=1).mean()
+        points.append(torch.cat([eyes, *(eyes + distance * viewmats[:, axis, :3] for axis in range(3))]))
     return umeyama(*points)
 
 
@@ -208,11 +208,11 @@ def _line(name: str, row: dict) -> str:
     if "failed" in row:
         return f"{name:14s} {row['failed']}"
     poses = row.get("poses")
-    turned = f"{poses['rotation']:5.2f} deg {poses['shift']:5.2f} %" if poses else f"{'-':>9s} {'-':>7s}"
-    stance = f"; tilt {row['tilt']:.2f} deg, floor off by {row['floor']:.2f} %" if "tilt" in row else ""
+    rotation = f"{poses['rotation']:5.2f} deg {poses['shift']:5.2f} %" if poses else f"{'-':>9s} {'-':>7s}"
+    upright = f"; tilt {row['tilt']:.2f} deg, floor off by {row['floor']:.2f} %" if "tilt" in row else ""
     held = row["held_out"]
     score = f"{held['psnr']:6.2f} dB  {held['ssim']:.3f}" if held else f"{'-':>16s}"
     return (
-        f"{name:14s} {row['placed']:3d}/{row['photos']:3d} {turned} {score:>19s} {sum(row['seconds'].values()):4.0f} s "
-        f"{row['cpu_seconds']:6.0f} s {row['memory']:5.1f} GB{stance}"
+        f"{name:14s} {row['placed']:3d}/{row['photos']:3d} {rotation} {score:>19s} "
+        f"{sum(row['seconds'].values()):4.0f} s {row['cpu_seconds']:6.0f} s {row['memory']:5.1f} GB{upright}"
     )

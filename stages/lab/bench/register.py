@@ -88,13 +88,15 @@ def errors(found: Similarity, trial: RegistrationTrial, whole: Gaussians, revolv
     middle = (whole.means.amin(0) + whole.means.amax(0)) / 2
     shift = float((found(middle) - trial.truth(middle)).norm()) / (trial.truth.scale * diameter(whole.means))
     R = found.rotation.mT @ trial.truth.rotation  # the identity where the registration is exact
-    turned = rotation_angle(R)
-    out = {"rotation": turned, "scale": 100 * abs(found.scale / trial.truth.scale - 1), "shift": 100 * shift}
-    about = nearest_z_rotation(R)
+    angle = rotation_angle(R)
+    out = {"rotation": angle, "scale": 100 * abs(found.scale / trial.truth.scale - 1), "shift": 100 * shift}
+    symmetry = nearest_z_rotation(R)
     free = (
-        revolved and turned > LIMITS["rotation"] and symmetry_residual(whole, trial.seen, about) < MAX_SYMMETRY_RESIDUAL
+        revolved
+        and angle > LIMITS["rotation"]
+        and symmetry_residual(whole, trial.seen, symmetry) < MAX_SYMMETRY_RESIDUAL
     )
-    return {**out, "rotation up to symmetry": rotation_angle(R @ about.mT) if free else turned}
+    return {**out, "rotation up to symmetry": rotation_angle(R @ symmetry.mT) if free else angle}
 
 
 def rotation_angle(R: Float[Tensor, "3 3"]) -> float:
@@ -105,12 +107,12 @@ def rotation_angle(R: Float[Tensor, "3 3"]) -> float:
 def nearest_z_rotation(R: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
     """The rotation about z nearest to a rotation."""
     c, s = R[0, 0] + R[1, 1], R[1, 0] - R[0, 1]
-    turn = torch.eye(3)
-    turn[:2, :2] = torch.stack([torch.stack([c, -s]), torch.stack([s, c])]) / (c * c + s * s).sqrt().clamp_min(1e-9)
-    return turn
+    rotation = torch.eye(3)
+    rotation[:2, :2] = torch.stack([torch.stack([c, -s]), torch.stack([s, c])]) / (c * c + s * s).sqrt().clamp_min(1e-9)
+    return rotation
 
 
-def symmetry_residual(whole: Gaussians, seen: Float[Tensor, "k"], turn: Float[Tensor, "3 3"]) -> float:
+def symmetry_residual(whole: Gaussians, seen: Float[Tensor, "k"], rotation: Float[Tensor, "3 3"]) -> float:
     """RMS difference in position and colour between the rotated visible part and the whole [diameters].
 
     One half of the Gaussians is compared with the other; their difference without rotation is subtracted.
@@ -119,7 +121,7 @@ def symmetry_residual(whole: Gaussians, seen: Float[Tensor, "k"], turn: Float[Te
     mine = joint[seen[seen % 2 == 0]]
     tree = cKDTree(joint[1::2].numpy())
     squares = []
-    for R in (turn, torch.eye(3)):
+    for R in (rotation, torch.eye(3)):
         distance, _ = tree.query(torch.cat([mine[:, :3] @ R.mT, mine[:, 3:]], 1).numpy(), workers=2)
         squares.append(float((distance**2).mean()))
     return max(squares[0] - squares[1], 0.0) ** 0.5
@@ -238,8 +240,8 @@ def summarise(rows: list[dict]) -> dict[str, float]:
               for k in ("rotation", "scale", "shift", "seconds", "CPU seconds")}  # fmt: skip
     right = [_right(r) for r in rows]
     strict = [r["rotation"] <= LIMITS["rotation"] and _placed(r) for r in rows]
-    shares = {"right": sum(right) / len(rows), "right without symmetry": sum(strict) / len(rows)}
-    return {**{k: round(v, 3) for k, v in shares.items()}, **{f"median {k}": v for k, v in middle.items()}}
+    fractions = {"right": sum(right) / len(rows), "right without symmetry": sum(strict) / len(rows)}
+    return {**{k: round(v, 3) for k, v in fractions.items()}, **{f"median {k}": v for k, v in middle.items()}}
 
 
 def _rounded(row: dict) -> dict:

@@ -53,8 +53,8 @@ def ellipsoids(scenes: int, keypoints: int) -> InitialConditions:
     """Copies of one scene of three ellipsoidal shells above each other and above the floor."""
     rng = torch.Generator().manual_seed(0)
     ball = torch.nn.functional.normalize(torch.randn(SCENE_OBJECTS, keypoints, 3, generator=rng), dim=-1)
-    place = torch.tensor([[0.0, 0.0, -0.7], [0.1, 0.05, -0.35], [-0.1, 0.0, 0.02]])
-    points = ball * torch.tensor([0.25, 0.2, 0.15]) + place[:, None]
+    offsets = torch.tensor([[0.0, 0.0, -0.7], [0.1, 0.05, -0.35], [-0.1, 0.0, 0.02]])
+    points = ball * torch.tensor([0.25, 0.2, 0.15]) + offsets[:, None]
     mass, E = torch.tensor([0.5, 2.0, 1.0]), torch.tensor([1e5, 1e4, 8e5])
     return InitialConditions.of(points.repeat(scenes, 1, 1, 1), mass=mass, E=E)
 

@@ -64,15 +64,15 @@ def best_ious(found: Int[torch.Tensor, "n"], truth: Int[torch.Tensor, "n"]) -> d
 
 
 def corrupt_labels(
-    labels: Int[Tensor, "h w"], share: float, objects: int, rng: np.random.Generator
+    labels: Int[Tensor, "h w"], rate: float, objects: int, rng: np.random.Generator
 ) -> Int[Tensor, "h w"]:
     """A label image with a fraction of its objects missed or swapped and of its pixels random, shifted a little."""
-    fate = rng.uniform(size=objects)
-    taken = [0, *(0 if u < share / 2 else int(rng.integers(1, objects + 1)) if u < share else i
-                  for i, u in enumerate(fate, start=1))]  # fmt: skip
+    chance = rng.uniform(size=objects)
+    taken = [0, *(0 if u < rate / 2 else int(rng.integers(1, objects + 1)) if u < rate else i
+                  for i, u in enumerate(chance, start=1))]  # fmt: skip
     out = torch.tensor(taken)[labels]
-    out = out.roll(tuple(int(step) for step in rng.normal(0, share * MASK_SHIFT, 2).round()), (0, 1))
-    noise = torch.from_numpy(rng.uniform(size=out.shape) < share)
+    out = out.roll(tuple(int(step) for step in rng.normal(0, rate * MASK_SHIFT, 2).round()), (0, 1))
+    noise = torch.from_numpy(rng.uniform(size=out.shape) < rate)
     return torch.where(noise, torch.from_numpy(rng.integers(0, objects + 1, out.shape)), out)
 
 
@@ -82,23 +82,23 @@ def segment_by_masks(scene: Scene, truth: Int[Tensor, "n"], seed: int) -> dict[s
     `scene` has no labels. At an error rate of 0.4, for example, the images of a fifth of the views are missing as well.
     """
     objects, rng = int(truth.max()), np.random.default_rng(seed)
-    votes = {share: torch.zeros(len(truth), 1) for share in ERROR_RATES}
-    last = {share: torch.zeros_like(truth) for share in ERROR_RATES}
+    votes = {rate: torch.zeros(len(truth), 1) for rate in ERROR_RATES}
+    last = {rate: torch.zeros_like(truth) for rate in ERROR_RATES}
     for view in tqdm(range(len(scene.cameras)), desc="masks", unit="view", leave=False):
-        sight = ViewFootprint.of(scene, view)
-        seen = sight.front >= 0
-        labels = torch.where(seen, truth[sight.front.clamp_min(0).long()], 0)
-        for share in ERROR_RATES:
-            if rng.uniform() < share / 2:
+        footprint = ViewFootprint.of(scene, view)
+        seen = footprint.front >= 0
+        labels = torch.where(seen, truth[footprint.front.clamp_min(0).long()], 0)
+        for rate in ERROR_RATES:
+            if rng.uniform() < rate / 2:
                 continue
-            given = corrupt_labels(labels, share, objects, rng)
-            votes[share] = add_votes(votes[share], damp_votes(sight.votes(given)))
-            last[share][sight.front[seen].long()] = given[seen]
+            given = corrupt_labels(labels, rate, objects, rng)
+            votes[rate] = add_votes(votes[rate], damp_votes(footprint.votes(given)))
+            last[rate][footprint.front[seen].long()] = given[seen]
     out: dict[str, Callable[[], Tensor]] = {}
-    for share in ERROR_RATES:
-        name = f"masks, {share:.0%} wrong" if share else "masks"
-        out[name] = lambda v=votes[share]: apply_votes(scene, v, {}, "masks").gaussians.object_id
-        out[f"{name}, no vote"] = lambda ids=last[share]: ids
+    for rate in ERROR_RATES:
+        name = f"masks, {rate:.0%} wrong" if rate else "masks"
+        out[name] = lambda v=votes[rate]: apply_votes(scene, v, {}, "masks").gaussians.object_id
+        out[f"{name}, no vote"] = lambda ids=last[rate]: ids
     return out
 
 
@@ -116,8 +116,8 @@ def segment_by_boxes(scene: Scene, truth: Int[Tensor, "n"]) -> Int[Tensor, "n"]:
     scale = size / torch.tensor([labels.shape[1], labels.shape[0]])
     boxes = []
     for i in range(1, count):
-        spots = (labels == i).nonzero().flip(1)
-        boxes.append([*(spots.amin(0) * scale).tolist(), *((spots.amax(0) + 1) * scale).tolist()])
+        pixels = (labels == i).nonzero().flip(1)
+        boxes.append([*(pixels.amin(0) * scale).tolist(), *((pixels.amax(0) + 1) * scale).tolist()])
     scene = replace(scene, cameras=scene.cameras[[best, *(v for v in views if v != best)]])
     with tempfile.TemporaryDirectory() as folder:
         prompts = Path(folder) / "prompts.json"
@@ -155,15 +155,15 @@ def measure(kind: str, index: int, networks: list[str], options: SegmentBenchOpt
     scene = tabletop(kind, index, options.photos)
     truth = scene.gaussians.object_id
     blank = replace(scene, gaussians=replace(scene.gaussians, object_id=torch.zeros_like(truth)), objects=())
-    ways = {"geometric": lambda: segment(blank, SegmentOptions()).gaussians.object_id,
+    methods = {"geometric": lambda: segment(blank, SegmentOptions()).gaussians.object_id,
             "boxes": lambda: segment_by_boxes(blank, truth), **segment_by_masks(blank, truth, index)}  # fmt: skip
     for name in networks:
-        ways[name] = lambda name=name: segment_by_network(blank, name, options)
+        methods[name] = lambda name=name: segment_by_network(blank, name, options)
     rows = []
-    for way, find in ways.items():
+    for method, find in methods.items():
         start = time.perf_counter()
         found = find()
-        rows.append(_row(kind, index, way, scene, found, truth, start))
+        rows.append(_row(kind, index, method, scene, found, truth, start))
     return rows
 
 
@@ -184,9 +184,9 @@ def measure_reconstructed(kind: str, index: int, photos: int) -> dict:
     return {**_row(kind, index, "reconstructed", scene, labels, truth, start), "placed": len(names)}
 
 
-def _row(kind: str, index: int, way: str, scene: Scene, found: Tensor, truth: Tensor, start: float) -> dict:
+def _row(kind: str, index: int, method: str, scene: Scene, found: Tensor, truth: Tensor, start: float) -> dict:
     named = {scene.name_of(i): round(value, 3) for i, value in best_ious(found, truth).items()}
-    return {"kind": kind, "scene": index, "way": way, "iou": named, "found": len(found.unique()) - 1,
+    return {"kind": kind, "scene": index, "way": method, "iou": named, "found": len(found.unique()) - 1,
             "mean": float(np.mean(list(named.values()))), "seconds": round(time.perf_counter() - start, 1)}  # fmt: skip
 
 
@@ -205,11 +205,13 @@ def run(out: Path | None = None, options: SegmentBenchOptions = SegmentBenchOpti
                 yield f"{kind} {i}, {row['way']}: mean {row['mean']:.3f}; {listed}"
     means = {kind: _means([row for row in rows if row["kind"] == kind]) for kind in ARRANGEMENTS}
     yield f"{'mean IoU':<28}" + "".join(f"{kind:>10}" for kind in ARRANGEMENTS)
-    for way in means[ARRANGEMENTS[0]]:
-        yield f"{way:<28}" + "".join(f"{means[kind][way]:>10.3f}" for kind in ARRANGEMENTS)
+    for method in means[ARRANGEMENTS[0]]:
+        yield f"{method:<28}" + "".join(f"{means[kind][method]:>10.3f}" for kind in ARRANGEMENTS)
     bench.write_results(out, "segment", "cpu", {"mean_iou": means, "scenes": rows})
 
 
 def _means(rows: list[dict]) -> dict[str, float]:
-    ways = dict.fromkeys(row["way"] for row in rows)
-    return {way: round(float(np.mean([row["mean"] for row in rows if row["way"] == way])), 3) for way in ways}
+    methods = dict.fromkeys(row["way"] for row in rows)
+    return {
+        method: round(float(np.mean([row["mean"] for row in rows if row["way"] == method])), 3) for method in methods
+    }

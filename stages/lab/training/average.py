@@ -1,6 +1,6 @@
 """Weighted averages of the weights of several trainings of one model, parameter by parameter.
 
-Only weights that share a common start have a meaningful average. Source: Wortsman et al. 2022, "Model soups"; and, for
+Only weights with a common start have a meaningful average. Source: Wortsman et al. 2022, "Model soups"; and, for
 an average with the weights that a training began with, Wortsman et al. 2022, "Robust fine-tuning of zero-shot models".
 """
 

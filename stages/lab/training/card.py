@@ -19,7 +19,7 @@ CARD = "the card of weights (.json), such as `ngff-lab train` writes"
 def run(cards: Sequence[Path], out: Path, half: bool = False) -> list[str]:
     """Plot the curves of the last training run of each card; return a line about each.
 
-    `half` also rewrites the weights beside each card in 16 bits, as weights are shipped. Raises InputError for files
+    `half` also rewrites the weights of each card in 16 bits, as weights are shipped. Raises InputError for files
     that are no cards, and for two cards of one name.
     """
     rows = {Path(card).stem: _read(Path(card)) for card in cards}

@@ -1,4 +1,4 @@
-"""Scenes to train the splat head on: folders of posed photos, and scenes of Gaussians, which are rendered."""
+"""Training scenes of the splat head: folders of posed photos, and Gaussian scenes, which are rendered."""
 
 from __future__ import annotations
 
@@ -23,49 +23,51 @@ from stages.reconstruct.photos import undistort
 
 CAMERA_FILES = ("transforms.json", "cameras.json", "sparse")
 PHOTO_FOLDERS = ("photos", "images", ".")
-HELD_OUT_EVERY = 4  # every so many-th view of a scene is only ever looked at from, never learned from
-ORBIT_VIEWS = 24  # views of a scene without cameras
-WHITE = (1.0, 1.0, 1.0)  # behind everything, as in the published renderer
+HELD_OUT_EVERY = 4  # every n-th view of a scene is held out from training
+ORBIT_VIEWS = 24  # rendered views of a scene without cameras
+WHITE = (1.0, 1.0, 1.0)  # background, as in the published renderer
 
 
 @dataclass(frozen=True)
 class PosedViews:
-    """Views of one scene with their cameras, all of one size, sides multiples of 14 px."""
+    """Views of one scene with their cameras, all of one size, with sides that are multiples of 14 px."""
 
     name: str
     images: Float[Tensor, "v 3 h w"]
     viewmats: Float[Tensor, "v 4 4"]
     Ks: Float[Tensor, "v 3 3"]
-    depths: Float[Tensor, "v h w"] | None  # true ones, 0 where nothing is; None for photos
+    depths: Float[Tensor, "v h w"] | None  # true depth, 0 where there is no surface; None for photos
 
     def __getitem__(self, index: list[int]) -> PosedViews:
         depths = None if self.depths is None else self.depths[index]
         return PosedViews(self.name, self.images[index], self.viewmats[index], self.Ks[index], depths)
 
     def to(self, device: str) -> PosedViews:
+        """The same views on another device."""
         moved = (x if x is None else x.to(device) for x in (self.images, self.viewmats, self.Ks, self.depths))
         return PosedViews(self.name, *moved)
 
     @property
     def held(self) -> list[int]:
-        """Views that measure how well unseen ones are predicted."""
+        """Indices of the held-out views."""
         return list(range(HELD_OUT_EVERY // 2, len(self.images), HELD_OUT_EVERY))
 
     @property
     def learned(self) -> list[int]:
+        """Indices of the training views."""
         return [i for i in range(len(self.images)) if i not in self.held]
 
 
 def read_training_scenes(folder: Path, side: int, device: str = "cpu") -> list[PosedViews]:
     """Every scene in a folder, in order of name: NAME.ply, and folders (or this one) with photos and their cameras.
 
-    `side` is the longest of an image [px]. Raises InputError where there is none.
+    `side` is the longest side of an image [px]. Raises InputError where there is no scene or one has too few views.
     """
     folder = Path(folder)
     if not folder.is_dir():
-        raise InputError(f"{folder}: is no folder; scenes (.ply) or folders of posed photos are expected in it")
-    places = [p for p in [folder, *sorted(folder.iterdir())] if p.is_dir() and _cameras_in(p)]
-    scenes = [_photographed(place, side) for place in places]
+        raise InputError(f"{folder}: is not a folder; it must hold scenes (.ply) or folders of posed photos")
+    folders = [p for p in [folder, *sorted(folder.iterdir())] if p.is_dir() and _cameras_in(p)]
+    scenes = [_photographed(inner, side) for inner in folders]
     for path in tqdm(sorted(folder.glob("*.ply")), desc="rendering", unit="scene", leave=False):
         scenes.append(render_views(path.stem, read_scene(path), side, device))
     if not scenes:
@@ -81,7 +83,7 @@ def _cameras_in(folder: Path) -> Path | None:
 
 
 def _photographed(folder: Path, side: int) -> PosedViews:
-    """Photos without their lens's distortion, stretched to the next multiple of 14, and K with them."""
+    """Undistorted photos, resized to multiples of 14 px together with their intrinsics."""
     inner = next(folder / name for name in PHOTO_FOLDERS if (folder / name).is_dir())
     photos = read_photos(inner)
     cameras, lenses = read_cameras(_cameras_in(folder))
@@ -98,13 +100,13 @@ def _photographed(folder: Path, side: int) -> PosedViews:
 
 
 def _resized(cameras: Cameras, sizes: list[tuple[int, int]]) -> Float[Tensor, "c 3 3"]:
-    """K for images of other sizes (width, height)."""
+    """Intrinsics for images resized to other sizes (width, height)."""
     rows = zip(cameras.Ks, cameras.sizes.tolist(), sizes, strict=True)
     return torch.stack([resize(K, new[0] / old[0], new[1] / old[1]) for K, old, new in rows])
 
 
 def render_views(name: str, scene: Scene, side: int, device: str = "cpu") -> PosedViews:
-    """A scene seen by its own cameras, or from all around where it has none."""
+    """Render a scene from its own cameras, or from two rings around it where it has fewer than 4."""
     cameras = scene.cameras if scene.cameras is not None and len(scene.cameras) >= 4 else default_cameras(scene)
     size = network_size(*cameras.sizes[0].tolist(), side)
     Ks = _resized(cameras, [size] * len(cameras))
@@ -120,12 +122,12 @@ def render_views(name: str, scene: Scene, side: int, device: str = "cpu") -> Pos
 
 
 def default_cameras(scene: Scene) -> Cameras:
-    """Two rings of cameras around the middle of the scene, far enough to see half of it and more."""
+    """Two rings of cameras around the centre of a scene, far enough to show most of it."""
     means = scene.gaussians.means
     centre = means.median(0).values
-    reach = float((means - centre).norm(dim=1).quantile(0.8))
+    radius = float((means - centre).norm(dim=1).quantile(0.8))
     rings = [
-        orbit(ORBIT_VIEWS // 2, centre, 3 * reach, angle, azimuth=az) for angle, az in ((20.0, 120.0), (45.0, 135.0))
+        orbit(ORBIT_VIEWS // 2, centre, 3 * radius, angle, azimuth=az) for angle, az in ((20.0, 120.0), (45.0, 135.0))
     ]
     K = intrinsics(448, 448, 448 / (2 * math.tan(math.radians(25))))
     names = tuple(f"{i:02d}" for i in range(ORBIT_VIEWS))

@@ -108,7 +108,7 @@ def run(
     model: str, data: Path, out: Path, options: TrainOptions = TrainOptions(), resume: bool = False,
     start: Path | None = None,
 ) -> list[str]:  # fmt: skip
-    """Train on groups of motions; write the best weights to OUT and their card beside it. Returns lines of result.
+    """Train on groups of motions; write the best weights to OUT and their card next to it. Returns lines of result.
 
     OUT with the suffix .ckpt is the checkpoint that `resume` goes on from; with the same options the curve is the same
     as without the interruption. `start` are weights to begin with; their runs come first in the new card. Raises

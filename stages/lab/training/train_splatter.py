@@ -1,9 +1,8 @@
-"""Training of Pi3-splat's head of Gaussians; all that finds points and cameras stays as it is.
+"""Training of Pi3-splat's Gaussian head; the parts that estimate points and cameras stay fixed.
 
-Gaussians are made of some views of a scene and drawn as these and other views of it see them. What is drawn should
-look like the photos, and lie at the depth that the Gaussians were put at. Source: Li et al. 2026, "Learning
-physics-grounded 4D dynamics with neural Gaussian force fields", section on reconstruction (its code for training is
-not public).
+Gaussians are predicted from some views of a scene and rendered in these and in another view. The loss compares renders
+with the photos, and rendered depth with the depth of the Gaussians. Source: Li et al. 2026, "Learning physics-grounded
+4D dynamics with neural Gaussian force fields", section on reconstruction (its training code is not public).
 """
 
 from __future__ import annotations
@@ -37,21 +36,21 @@ from stages.lab.training.splatter_data import WHITE, PosedViews, read_training_s
 from stages.reconstruct.depth import unproject
 
 log = logging.getLogger(__name__)
-SSIM_WEIGHT, DEPTH_WEIGHT = 0.2, 0.1  # weights of 1 - SSIM against L1, and of the relative error in depth
-CHECKS = 10  # how often the unseen views are looked at in a run
+SSIM_WEIGHT, DEPTH_WEIGHT = 0.2, 0.1  # weights of 1 - SSIM (the rest is L1) and of the relative depth error
+CHECKS = 10  # validations in a run
 TRAINED_MODULES = ("feature_decoder", "feature_head")
 
 
 @dataclass(frozen=True)
 class SplatterOptions:
-    """How to train."""
+    """Length, views, depth and optimizer of a training run."""
 
-    steps: int = 20_000
-    views: int = 4  # that Gaussians are made of in a step; one more is drawn
+    steps: int = 20_000  # of the optimizer
+    views: int = 4  # from which Gaussians are predicted in a step; one more is rendered
     side: int = 448  # longest side of an image [px]
-    depth: str = "network"  # where Gaussians lie: where the network says, or where rendered scenes truly are ("given")
-    width: int = 0  # start from a small random network this wide instead of weights, to try things out
-    lr: float = 1e-4
+    depth: str = "network"  # of the Gaussians: predicted by the network, or the true depth of rendered scenes ("given")
+    width: int = 0  # 0: start from weights; else a small random network of this width, for trials
+    lr: float = 1e-4  # peak learning rate
     seed: int = 0
     device: str = "auto"
 
@@ -65,29 +64,36 @@ class SplatterOptions:
 
 
 def run(data: Path, out: Path, options: SplatterOptions, weights: Path | None = None) -> Iterator[str]:
-    """Folder of scenes -> OUT.safetensors for --backend pi3-splat, its history (.json) and curves (.png) beside it."""
+    """Train on a folder of scenes; write OUT.safetensors for --backend pi3-splat, history (.json) and curves (.png).
+
+    Yields a line for each validation. Raises InputError for unusable data or weights.
+    """
     device = pick_device(options.device)
     scenes = read_training_scenes(data, options.side, device)
     if options.depth == "given" and (bare := [s.name for s in scenes if s.depths is None]):
-        raise InputError(f"--depth given: {bare[0]} is photos, which have none; use scenes (.ply) or --depth network")
+        raise InputError(
+            f"--depth given: {bare[0]} is a set of photos without depth; use scenes (.ply) or --depth network"
+        )
     torch.manual_seed(options.seed)
     model, fresh = load_network(weights, options)
     model = model.to(device)
-    seen, unseen = (scenes[:-1], scenes[-1:]) if len(scenes) > 3 else (scenes, scenes)
+    training, held_out = (scenes[:-1], scenes[-1:]) if len(scenes) > 3 else (scenes, scenes)
     if fresh:
-        initialise_head(model, view_geometry(model, seen[0][seen[0].learned].to(device), options), seen[0].Ks[0])
+        initialise_head(
+            model, view_geometry(model, training[0][training[0].learned].to(device), options), training[0].Ks[0]
+        )
     history = []
-    for row in fit(model, seen, unseen, options, device):
+    for row in fit(model, training, held_out, options, device):
         best = max((r["psnr"] for r in history), default=-math.inf)
         history.append(row)
         if row["psnr"] > best:
             _save(out, model)
         loss = "" if row["loss"] is None else f"  loss {row['loss']:.4f}"
-        yield f"step {row['step']:6d}{loss}  PSNR of unseen views {row['psnr']:.2f} dB"
-    facts = {"options": asdict(options), "data": [s.name for s in scenes], "unseen": [s.name for s in unseen]}
+        yield f"step {row['step']:6d}{loss}  PSNR of held-out views {row['psnr']:.2f} dB"
+    facts = {"options": asdict(options), "data": [s.name for s in scenes], "held out": [s.name for s in held_out]}
     with replacing(Path(out).with_suffix(".json")) as part:
         part.write_text(json.dumps({**facts, "history": history, "sha256": sha256(out)}, indent=1) + "\n")
-    titles = {"loss": "loss against steps", "psnr": "PSNR of unseen views [dB] against steps"}
+    titles = {"loss": "loss against steps", "psnr": "PSNR of held-out views [dB] against steps"}
     curves = {key: [(float(r["step"]), r[key]) for r in history if r[key] is not None] for key in titles}
     plot.draw_panels(
         Path(out).with_suffix(".png"), [plot.Panel(titles[key], points) for key, points in curves.items()], 2
@@ -95,9 +101,9 @@ def run(data: Path, out: Path, options: SplatterOptions, weights: Path | None = 
 
 
 def load_network(weights: Path | None, options: SplatterOptions) -> tuple[Pi3Splat, bool]:
-    """The network, of which only the head of Gaussians learns, and whether that head is fresh.
+    """The network with only the Gaussian head trainable, and whether that head is untrained.
 
-    From weights of Pi3-splat, or of π³ where those are absent.
+    Weights are those of Pi3-splat, or of π³ where there are none.
     """
     fresh = True
     if options.width:
@@ -109,14 +115,14 @@ def load_network(weights: Path | None, options: SplatterOptions) -> tuple[Pi3Spl
         except InputError:
             base = load(find("pi3", weights), "pi3")
             model = Pi3Splat(base.config)
-            model.encoder.load_state_dict(base.state_dict(), strict=False)  # the head is not among them
+            model.encoder.load_state_dict(base.state_dict(), strict=False)  # without the Gaussian head
     for name, parameter in model.encoder.named_parameters():
         parameter.requires_grad_(name.startswith(TRAINED_MODULES))
     return model.eval(), fresh
 
 
 def initialise_head(model: Pi3Splat, geometry: Geometry, K: Float[Tensor, "3 3"]) -> None:
-    """A fresh head starts with grey, half opaque spheres as large as a pixel."""
+    """Make an untrained head predict grey, half opaque spheres of the size of a pixel."""
     last: nn.Linear = model.encoder.feature_head.down_proj
     pixel = float((geometry.points[..., 2] / K[0, 0]).median()) / SMALLEST_STEP
     with torch.no_grad():
@@ -127,9 +133,9 @@ def initialise_head(model: Pi3Splat, geometry: Geometry, K: Float[Tensor, "3 3"]
 
 
 def fit(
-    model: Pi3Splat, seen: list[PosedViews], unseen: list[PosedViews], options: SplatterOptions, device: str
+    model: Pi3Splat, training: list[PosedViews], held_out: list[PosedViews], options: SplatterOptions, device: str
 ) -> Iterator[dict]:
-    """Train; now and then {"step", "loss", "psnr"}, the first before any step."""
+    """Train and yield validations {"step", "loss", "psnr"}, the first before any step."""
     generator = torch.Generator().manual_seed(options.seed)
     learned = [p for p in model.parameters() if p.requires_grad]
     optimiser = torch.optim.AdamW(learned, options.lr, weight_decay=0.01)
@@ -137,12 +143,12 @@ def fit(
     every, losses = max(1, options.steps // CHECKS), []
     for step in tqdm(range(options.steps + 1), desc="training", unit="step", leave=False):
         if step % every == 0 or step == options.steps:
-            psnr = sum(held_out_psnr(model, s, options, device) for s in unseen) / len(unseen)
+            psnr = sum(held_out_psnr(model, s, options, device) for s in held_out) / len(held_out)
             yield {"step": step, "loss": sum(losses) / len(losses) if losses else None, "psnr": psnr}
             losses = []
         if step == options.steps:
             return
-        scene = seen[int(torch.randint(len(seen), (), generator=generator))]
+        scene = training[int(torch.randint(len(training), (), generator=generator))]
         chosen = torch.tensor(scene.learned)[torch.randperm(len(scene.learned), generator=generator)]
         chosen = chosen[: options.views + 1].tolist()
         loss = step_loss(model, scene[chosen].to(device), options)
@@ -155,7 +161,7 @@ def fit(
 
 
 def step_loss(model: Pi3Splat, views: PosedViews, options: SplatterOptions) -> Tensor:
-    """Gaussians of all views but the last, drawn in one of these and in the last."""
+    """Loss of Gaussians predicted from all views but the last, rendered in the first and the last view."""
     model.encoder.feature_head.train()
     sources = list(range(len(views.images) - 1))
     geometry, drawn = _drawn(model, views, sources, [0, len(sources)], options)
@@ -171,7 +177,7 @@ def step_loss(model: Pi3Splat, views: PosedViews, options: SplatterOptions) -> T
 
 @torch.no_grad()
 def held_out_psnr(model: Pi3Splat, scene: PosedViews, options: SplatterOptions, device: str) -> float:
-    """Of the views never learned from, drawn from Gaussians of others [dB]."""
+    """Mean PSNR of the held-out views of a scene, rendered from Gaussians of training views [dB]."""
     model.encoder.feature_head.eval()
     sources = scene.learned[:: max(1, len(scene.learned) // options.views)][: options.views]
     views = scene[[*sources, *scene.held]].to(device)
@@ -182,14 +188,14 @@ def held_out_psnr(model: Pi3Splat, scene: PosedViews, options: SplatterOptions, 
 
 
 def _drawn(model, views: PosedViews, sources: list[int], targets: list[int], options) -> tuple[Geometry, Rendering]:
-    """Where the sources' pixels lie, and their Gaussians as the targets see them."""
+    """3D points of the source views' pixels, and renders of their Gaussians in the target views."""
     device = views.images.device
     used = views[sources]
     with torch.autocast(device.type, torch.bfloat16, enabled=device.type != "cpu"):
         with torch.no_grad():
-            hidden, places = model.encoder.tokens(used.images, 8)
-        geometry = view_geometry(model, used, options, hidden, places)
-        raw = model.encoder.raw(used.images, hidden, places, len(sources))
+            hidden, positions = model.encoder.tokens(used.images, 8)
+        geometry = view_geometry(model, used, options, hidden, positions)
+        raw = model.encoder.raw(used.images, hidden, positions, len(sources))
     gaussians = splat(geometry, raw)[(geometry.points[..., 2] > 0).flatten()]
     size = views.images.shape[3], views.images.shape[2]
     white = torch.tensor(WHITE, device=device)
@@ -197,16 +203,16 @@ def _drawn(model, views: PosedViews, sources: list[int], targets: list[int], opt
 
 
 @torch.no_grad()
-def view_geometry(model, views: PosedViews, options: SplatterOptions, hidden=None, places=None) -> Geometry:
-    """Where the pixels lie: at the given cameras, at true depth or the network's, scaled so that cameras agree."""
+def view_geometry(model, views: PosedViews, options: SplatterOptions, hidden=None, positions=None) -> Geometry:
+    """3D points of all pixels at the given cameras, with true or predicted depth, scaled to the given cameras."""
     if options.depth == "given":
         depths = views.depths
     else:
         if hidden is None:
-            hidden, places = model.encoder.tokens(views.images, 8)
-        said = model.encoder.geometry(hidden, places, views.images.shape[2:], 8)
-        scale = umeyama(said.poses[:, :3, 3].cpu(), centres(views.viewmats).cpu()).scale
-        depths = said.points[..., 2] * scale
+            hidden, positions = model.encoder.tokens(views.images, 8)
+        predicted = model.encoder.geometry(hidden, positions, views.images.shape[2:], 8)
+        scale = umeyama(predicted.poses[:, :3, 3].cpu(), centres(views.viewmats).cpu()).scale
+        depths = predicted.points[..., 2] * scale
     local = [unproject(d, K, torch.eye(4).to(d))[1] for d, K in zip(depths, views.Ks, strict=True)]
     return Geometry(torch.stack(local), torch.ones_like(depths), torch.linalg.inv(views.viewmats))
 

@@ -106,7 +106,7 @@ def test_what_does_not_go_together_is_said(folder, tmp_path):
     with pytest.raises(InputError, match="holds neither scenes"):
         list(run(tmp_path / "data" / "..", tmp_path / "w.safetensors", QUICK))
     write_set(folder / "table", arc(5, (64, 48)))
-    with pytest.raises(InputError, match="--depth given: table is photos"):
+    with pytest.raises(InputError, match="--depth given: table is a set of photos"):
         list(run(folder, tmp_path / "w.safetensors", QUICK))
     shutil.rmtree(folder / "table")
     for wrong in ({"depth": "guess"}, {"width": 20}, {"steps": 0}):

@@ -1,4 +1,4 @@
-"""Our force field without each of its choices."""
+"""The ablation benchmark and the ablated networks."""
 
 import json
 
@@ -21,7 +21,7 @@ from stages.lab.training.train import TrainOptions
 from tests.lab.training.test_train import falling
 
 DT = 0.02
-TINY = AblationBenchOptions(steps=2, batch=2, keypoints=8, horizons="1,2", groups="3_0", test="3_1", device="cpu")
+TINY = AblationBenchOptions(steps=2, batch=2, keypoints=8, horizons="1,2", groups="3_0", test="3_1")
 
 
 @pytest.fixture
@@ -57,7 +57,7 @@ def momentum(world: InitialConditions, velocity: torch.Tensor) -> torch.Tensor:
     return (world.mass[..., None] * velocity).sum(1)
 
 
-def test_only_without_reaction_is_momentum_lost():
+def test_momentum_is_conserved_except_without_reaction():
     world = colliding()
     before = momentum(world, world.velocity)
     for name in ("full", "deformation", "impulses", "context", "materials"):
@@ -68,7 +68,7 @@ def test_only_without_reaction_is_momentum_lost():
     assert (momentum(world, velocity) - before).abs().max() > 1e-5
 
 
-def test_stiffness_matters_unless_it_is_not_told():
+def test_stiffness_matters_except_without_material_inputs():
     assert stepped("full", colliding())[1].abs().max() > 0
     assert stepped("materials", colliding())[1].abs().max() == 0
 
@@ -82,8 +82,8 @@ def test_rigid_bodies_keep_their_shape():
         assert bool(state.u.abs().max() > 0) is moved
 
 
-def test_the_last_vectors_of_a_contact_are_the_impulses():
-    """What is taken away would stop the places of a pair, or part them at 1 m/s, if both bodies got it, opposite."""
+def test_impulses_are_the_last_contact_features():
+    """The removed features are the impulses that stop a contact pair, or separate it at 1 m/s."""
     world = colliding()
     shape = rest_shape_of(world)
     model = ABLATIONS["full"].network()
@@ -102,13 +102,13 @@ def test_the_last_vectors_of_a_contact_are_the_impulses():
         assert_close(change, wanted, rtol=1e-4, atol=1e-5)
 
 
-def test_contacts_without_context_are_not_told_of_others():
+def test_contacts_without_context_are_independent():
     model = ABLATIONS["context"].network()
     x = torch.randn(2, 3, 4 * model.config["hidden"])
     assert model.between(x).abs().max() == 0 and model.between(x).shape == (2, 3, model.config["hidden"])
 
 
-def test_other_options_change_one_thing_each():
+def test_each_ablation_changes_one_option():
     base = TrainOptions(keypoints=64, horizons="8,20", loss="axes")
     changed = {name: {k for k, v in vars(choice.options(base)).items() if v != getattr(base, k)}
                for name, choice in ABLATIONS.items()}  # fmt: skip
@@ -116,7 +116,7 @@ def test_other_options_change_one_thing_each():
     assert changed == {name: others.get(name, set()) for name in ABLATIONS}
 
 
-def test_choices_are_trained_scored_and_kept(data, tmp_path, monkeypatch):
+def test_ablations_are_trained_scored_and_kept(data, tmp_path, monkeypatch):
     monkeypatch.setattr(bench_ablation, "VALIDATION_CHECKS", 1)
     for name in set(ABLATIONS) - {"full", "reaction", "keypoints"}:
         monkeypatch.delitem(ABLATIONS, name)
@@ -133,7 +133,7 @@ def test_choices_are_trained_scored_and_kept(data, tmp_path, monkeypatch):
     assert table.count("\n| ") == len(ABLATIONS) + 2 and "| 1.00 |" in table
 
 
-def test_results_of_something_else_are_kept(data, tmp_path):
+def test_other_result_files_are_not_overwritten(data, tmp_path):
     out = tmp_path / "ablation.json"
     for text in ("{}", "[1]", '{"options": {"steps": 1}, "rows": {}}'):
         out.write_text(text)
@@ -144,7 +144,7 @@ def test_results_of_something_else_are_kept(data, tmp_path):
 
 def test_the_command(data, tmp_path, monkeypatch):
     monkeypatch.setattr(bench_ablation, "VALIDATION_CHECKS", 1)
-    words = "--steps 1 --batch 2 --keypoints 8 --horizons 1 --groups 3_0 --test 3_1 --device cpu --only materials"
+    words = "--steps 1 --batch 2 --keypoints 8 --horizons 1 --groups 3_0 --test 3_1 --only materials"
     call = ["bench", "ablation", "--data", str(data), "-o", str(tmp_path / "a.json"), *words.split()]
     result = CliRunner().invoke(app, call)
     assert result.exit_code == 0 and result.stdout.startswith("materials"), result.output

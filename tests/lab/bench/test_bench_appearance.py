@@ -1,4 +1,4 @@
-"""The bench of appearance: gsplat's recipe learns, from the points that it should, for the time that it should."""
+"""The appearance benchmark: gsplat's recipe trains, from the right points, for the right time."""
 
 import pytest
 import torch
@@ -21,7 +21,7 @@ gsplat = pytest.importorskip("gsplat")
 
 
 def draw(means, quats, scales, opacities, sh, viewmats, Ks, width, height, sh_degree, packed):
-    """gsplat.rasterization on a CPU. `means2d` is how far each centre is moved on the image, by nothing as yet."""
+    """gsplat.rasterization on a CPU. `means2d` is a zero offset of each projected centre, for its gradient."""
     moves = torch.zeros(1, len(means), 2, requires_grad=True)
     z = (means.detach() @ viewmats[0, 2, :3] + viewmats[0, 2, 3]).clamp_min(0.01)
     world = (moves[0] * (z / Ks[0, 0, 0])[:, None]) @ viewmats[0, :2, :3]
@@ -34,7 +34,7 @@ def draw(means, quats, scales, opacities, sh, viewmats, Ks, width, height, sh_de
 
 
 def photographed(count: int = 6) -> tuple[Views, torch.Tensor]:
-    """A block on a table from an arc of cameras, and where some pixels' surfaces are."""
+    """A block on a table from an arc of cameras, and surface points of some pixels."""
     cameras = arc(count, size=(80, 60))
     images, points = [], []
     for i in range(count):
@@ -47,8 +47,8 @@ def photographed(count: int = 6) -> tuple[Views, torch.Tensor]:
     return Views(tuple(images), cameras), torch.cat(points)
 
 
-def test_the_recipe_learns_photos_and_multiplies_gaussians():
-    """The start of a schedule of 1,500 steps: harmonics gain a degree every 50, Gaussians multiply from 30 on."""
+def test_recipe_fits_photos_and_densifies():
+    """The start of a schedule of 1,500 steps: a higher SH degree every 50 steps, densification from step 30 on."""
     torch.manual_seed(0)
     views, points = photographed()
     colours = torch.cat([_colours(views, i, part) for i, part in enumerate(points.split(100))])
@@ -61,7 +61,7 @@ def test_the_recipe_learns_photos_and_multiplies_gaussians():
     assert (many.sh[:, 1:4] != 0).any() and (many.sh[:, 4:] == 0).all()
 
 
-def test_gaussians_start_as_far_apart_as_their_neighbours():
+def test_initial_scales_are_neighbour_distances():
     points = torch.cartesian_prod(*3 * [torch.arange(4.0)])
     values = peer.initial_parameters(peer.ColouredPoints(points, torch.full((64, 3), 0.5)), "cpu")
     torch.testing.assert_close(values["scales"].exp(), torch.ones(64, 3))
@@ -69,7 +69,7 @@ def test_gaussians_start_as_far_apart_as_their_neighbours():
     assert (values["sh0"] == 0).all() and values["shN"].shape == (64, 15, 3)
 
 
-def test_points_take_the_colour_that_photos_learned_from_show():
+def test_points_are_coloured_from_training_photos():
     views, points = photographed(3)
     view = torch.arange(3).repeat_interleave(100)
     model = SparseModel(views.cameras, LensDistortion(torch.zeros(3, 5)), points, torch.arange(300), view)
@@ -87,8 +87,8 @@ def _colours(views: Views, i: int, points: torch.Tensor) -> torch.Tensor:
     return views.image(i)[y, x]
 
 
-def test_the_steps_fit_in_the_seconds(monkeypatch):
-    """By a clock that a step moves by 10 ms until half of the schedule is over, and then, as after growth, by 40."""
+def test_gsplat_steps_match_our_time(monkeypatch):
+    """With a clock that a step advances by 10 ms in the first half of the schedule and 40 ms in the second."""
     clock = [0.0]
     monkeypatch.setattr(bench.time, "perf_counter", lambda: clock[0])
 
@@ -112,7 +112,7 @@ def test_the_steps_fit_in_the_seconds(monkeypatch):
     assert side.gaussians == len(scene.gaussians) and side.psnr < 30
 
 
-def test_without_a_gpu_the_user_is_told(monkeypatch, tmp_path):
+def test_missing_gpu_is_reported(monkeypatch, tmp_path):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(InputError, match="NVIDIA GPU"):
         next(bench.run([tmp_path], tmp_path / "out.json", bench.AppearanceBenchOptions()))

@@ -1,4 +1,4 @@
-"""The bench of completion sees less than everything, and measures it."""
+"""The completion benchmark: what cameras see, and the metrics of what is missing."""
 
 import json
 
@@ -33,7 +33,7 @@ def true():
     patch.undo()
 
 
-def test_the_objects_stand_on_the_table_beside_each_other(true):
+def test_objects_stand_on_the_table_side_by_side(true):
     g = true.gaussians
     lows = [float(g.means[g.object_id == i, 2].min()) for i in (1, 2)]
     assert lows == pytest.approx([0.0, 0.0], abs=1e-4)
@@ -41,7 +41,7 @@ def test_the_objects_stand_on_the_table_beside_each_other(true):
     assert float((middles[1] - middles[0]).norm()) > 0.25
 
 
-def test_the_cameras_miss_the_back_and_pictures_from_there_show_it(true):
+def test_missing_back_lowers_psnr_from_behind(true):
     seen = visible_scene(true, CompleteBenchOptions())
     counts = [int((s.gaussians.object_id > 0).sum()) for s in (seen, true)]
     assert 0.3 * counts[1] < counts[0] < 0.8 * counts[1]
@@ -52,8 +52,8 @@ def test_the_cameras_miss_the_back_and_pictures_from_there_show_it(true):
     assert float(torch.cdist(kept[:50], true.gaussians.means).amin(1).max()) < 1e-3  # cdist rounds
 
 
-def test_what_is_seen_does_not_depend_on_how_many_gaussians_it_is_made_of():
-    """Of a ball, the front of the arc of cameras: the same share of 4,000 and of 30,000 Gaussians."""
+def test_visible_fraction_does_not_depend_on_density():
+    """The cameras see the same fraction of a ball of 4,000 and of 30,000 Gaussians."""
     shares = []
     for count in (4000, 30_000):
         ball = coloured_gaussians(ellipsoid((0.1, 0.1, 0.1), count).moved((0, 0, 0.12)), (0.8, 0.3, 0.2), 1)
@@ -61,8 +61,8 @@ def test_what_is_seen_does_not_depend_on_how_many_gaussians_it_is_made_of():
     assert shares[0] == pytest.approx(shares[1], abs=0.05) and 0.5 < shares[0] < 0.9
 
 
-def test_a_run_gives_each_scene_and_the_mean_over_them(tmp_path, monkeypatch):
-    """One scene is twice as bad as the other in every figure."""
+def test_results_have_each_scene_and_the_mean(tmp_path, monkeypatch):
+    """One scene has twice the other's value in every metric."""
 
     def measured(placed, folder, options):
         assert (folder / "library/duck.ply").exists()

@@ -1,4 +1,4 @@
-"""The benchmark measures what it says, and writes down all of it."""
+"""The dynamics benchmark: baselines, metrics, tables and results."""
 
 import json
 import math
@@ -49,18 +49,18 @@ from tests.lab.small_world import COARSE, box_shell
 from tests.lab.training.test_train import falling, without_last
 
 GROUPS = [*(f"3_{i}" for i in range(10)), "4", "6", "heldout"]
-NONE = DynamicsBenchOptions(keypoints=8, mpm=0, device="cpu")
+NONE = DynamicsBenchOptions(keypoints=8, mpm=0)
 
 
 def group(name: str, by: float = 0.0) -> KeypointMotions:
-    """Two scenes of bodies that fall, all of them `by` off."""
+    """Two scenes of falling bodies, all displaced by `by`."""
     made = falling(2, 8, 3 if name == "heldout" else int(name[0]), seed=GROUPS.index(name))
     return replace(made, names=(f"{name} a", f"{name} b"), points=made.points + by)
 
 
 @pytest.fixture
 def data(tmp_path: Path) -> Path:
-    """All groups, of two scenes each."""
+    """A data set of all groups, two scenes each."""
     (tmp_path / "data").mkdir()
     for name in GROUPS:
         write_motions(tmp_path / "data" / f"{name}.h5", group(name), {})
@@ -84,7 +84,7 @@ def test_free_fall_is_exact_for_bodies_that_only_fall():
 
 
 def tumbling(seed: int = 0):
-    """Rigid bodies that turn and drift, the last object of scene 0 missing."""
+    """Rigid bodies that rotate and translate; the last object of scene 0 is missing."""
     motions = without_last(falling(frames=6, n=20, seed=seed))
     rest = motions.points[:, 0]
     centre = rest.mean(2, keepdim=True)
@@ -97,12 +97,12 @@ def tumbling(seed: int = 0):
     return replace(motions, points=points)
 
 
-def test_the_best_rigid_fit_of_rigid_bodies_is_the_truth():
+def test_rigid_fit_of_rigid_bodies_is_exact():
     motions = tumbling()
     assert_close(predict_rigid_fit(motions), motions.points, rtol=0, atol=1e-5)
 
 
-def test_the_best_rigid_fit_of_soft_bodies_keeps_shape_and_is_the_best():
+def test_rigid_fit_of_soft_bodies_is_optimal():
     motions = tumbling()
     noise = 0.02 * torch.randn(motions.points.shape, generator=torch.Generator().manual_seed(1))
     noise[:, 0] = 0  # at rest they are as they are
@@ -115,7 +115,7 @@ def test_the_best_rigid_fit_of_soft_bodies_keeps_shape_and_is_the_best():
     assert predict_rigid_fit(soft)[0, :, -1].abs().max() == 0  # padding
 
 
-def test_the_truth_has_no_error_and_correlates_wholly():
+def test_the_truth_has_no_error_and_full_correlation():
     motions = without_last(falling())
     result = evaluate_predictor(predict_free_fall, motions, batch=4)
     assert result["RMSE"] < 1e-5 and result["FPE"] < 1e-5 and result["R"] > 0.9999
@@ -123,7 +123,7 @@ def test_the_truth_has_no_error_and_correlates_wholly():
     assert {name: len(curve) for name, curve in result["error by object"].items()} == {"ball": 2, "bear": 2}
 
 
-def test_errors_are_averaged_over_scenes_whatever_the_batch():
+def test_metrics_do_not_depend_on_the_batch_size():
     motions = without_last(falling(seed=3))
 
     def still(some):
@@ -141,7 +141,7 @@ def test_errors_are_averaged_over_scenes_whatever_the_batch():
     assert one["error by object"]["bear"][1] == pytest.approx(float(gap[:, 8][bears].mean()), rel=1e-2)
 
 
-def test_a_scene_that_is_lost_is_not_left_out():
+def test_nonfinite_scenes_count():
     motions = falling()
 
     def lost(some):
@@ -156,7 +156,7 @@ def test_a_scene_that_is_lost_is_not_left_out():
     assert "not finite" in table(facts)[1]
 
 
-def test_scenes_made_again_are_found_by_their_names():
+def test_scenes_are_matched_by_name():
     motions = falling(seed=4)
     other = replace(motions, points=motions.points + 0.01)[torch.tensor([5, 3, 0])]
     both = shared_scenes(motions, other)
@@ -167,7 +167,7 @@ def test_scenes_made_again_are_found_by_their_names():
         predict_from(replace(other, points=other.points[:, :5]), 12)(both)
 
 
-def test_the_sample_of_the_temporal_split_is_always_the_same(data, monkeypatch):
+def test_temporal_sample_is_reproducible(data, monkeypatch):
     monkeypatch.setattr(bench_dynamics, "TEMPORAL_SCENES", 5)
     options = DynamicsBenchOptions(keypoints=8)
     a, b = (split_scenes(data, "temporal", options) for _ in range(2))
@@ -201,7 +201,7 @@ def test_every_model_is_measured_on_every_split(data, weights, tmp_path, monkeyp
     assert "[\n" not in out.read_text()  # a list of numbers is one line
 
 
-def test_table_and_plots_are_drawn_again_from_the_results_alone(data, weights, tmp_path, monkeypatch):
+def test_table_and_plots_from_results_alone(data, weights, tmp_path, monkeypatch):
     monkeypatch.setattr(bench_dynamics, "TIMED_STEPS", 2)
     out = tmp_path / "results.json"
     lines = run(data, weights, out, NONE)
@@ -220,7 +220,7 @@ def test_table_and_plots_are_drawn_again_from_the_results_alone(data, weights, t
     assert done.exit_code == 2 and "--data" in done.stderr
 
 
-def test_rows_of_the_same_scenes_stay_when_others_are_measured(data, weights, tmp_path, monkeypatch):
+def test_other_rows_of_the_same_scenes_are_kept(data, weights, tmp_path, monkeypatch):
     monkeypatch.setattr(bench_dynamics, "TIMED_STEPS", 2)
     out = tmp_path / "results.json"
     run(data, weights, out, NONE)
@@ -259,7 +259,7 @@ def test_the_best_value_of_each_split_and_metric_is_bold():
 
 @pytest.fixture
 def simulated(tmp_path, monkeypatch):
-    """One group of two scenes with a ball and a duck, and what made it; one scene is of objects far off the box."""
+    """One group of two scenes with a ball and a duck and their assets; one scene has objects far outside the domain."""
     shapes = {0: (0.2, 0.2, 0.2), 7: (0.1, 0.1, 0.3)}
     points = {i: box_shell(half, seed=i) for i, half in shapes.items()}
     things = {i: Asset(i, 1.0, p, particle_volumes(p, COARSE.dx), 1e5, 500.0) for i, p in points.items()}
@@ -275,7 +275,7 @@ def simulated(tmp_path, monkeypatch):
     return tmp_path / "set", things
 
 
-def test_estimated_materials_take_the_place_of_the_true_ones(simulated):
+def test_estimated_materials_replace_the_true_ones(simulated):
     _, things = simulated
     guess = with_estimated_materials(things)
     assert (guess[0].E, guess[0].density) == VLM_MATERIALS["ball"] and (guess[7].E, guess[7].density) == VLM_MATERIALS[
@@ -286,7 +286,7 @@ def test_estimated_materials_take_the_place_of_the_true_ones(simulated):
     )
 
 
-def test_scenes_are_simulated_again_as_they_were(simulated, monkeypatch):
+def test_resimulation_repeats_the_scenes(simulated, monkeypatch):
     data, things = simulated
     monkeypatch.setattr(dynamics_baselines, "with_estimated_materials", lambda things: things)  # the true materials
     truth = split_scenes(data, "spatial", DynamicsBenchOptions(keypoints=20))
@@ -298,7 +298,7 @@ def test_scenes_are_simulated_again_as_they_were(simulated, monkeypatch):
 def test_mpm_with_estimated_materials_is_a_row_of_its_own(simulated, weights, tmp_path, monkeypatch):
     monkeypatch.setattr(bench_dynamics, "TIMED_STEPS", 2)
     data, _ = simulated
-    run(data, weights, tmp_path / "r.json", DynamicsBenchOptions(keypoints=20, mpm=1, device="cpu"))
+    run(data, weights, tmp_path / "r.json", DynamicsBenchOptions(keypoints=20, mpm=1))
     facts = json.loads((tmp_path / "r.json").read_text())
     row = facts["rows"][MPM_ESTIMATED]["splits"]["spatial"]
     assert list(facts["rows"])[2] == MPM_ESTIMATED and row["scenes left out"] == 0
@@ -307,13 +307,13 @@ def test_mpm_with_estimated_materials_is_a_row_of_its_own(simulated, weights, tm
     assert facts["scenes"] == {"spatial": 2}
 
 
-def test_data_that_do_not_say_how_they_were_made(simulated):
+def test_data_without_provenance_are_reported(simulated):
     data, _ = simulated
     write_motions(data / "motions" / "3_9.h5", group("3_9"), {"options": {"dx": 0.02}})
     with pytest.raises(InputError, match="3_9.h5: has no record of how it was simulated .no spacing.*--mpm 0"):
         Resimulation(data, ["3_9"], "cpu")
 
 
-def test_a_folder_without_weights_is_said(data, tmp_path):
+def test_folder_without_weights_is_reported(data, tmp_path):
     with pytest.raises(InputError, match="no weights"):
         run(data, tmp_path, tmp_path / "r.json", NONE)

@@ -1,4 +1,4 @@
-"""The benchmark measures what it says. No speed is tested."""
+"""The MPM benchmark: same physics in the baseline, consistent figures. No speed is tested."""
 
 import math
 
@@ -13,23 +13,23 @@ from stages.lab.bench import mpm_three_kernel
 from stages.lab.bench.mpm import MpmBenchOptions
 
 
-def test_the_plain_form_is_the_same_physics():
+def test_three_kernel_form_equals_the_solver():
     one, box, dx = bench_mpm.falling_boxes(400)
     one.v[:] = torch.tensor([0.3, 0.1, -1.0])
     ours = mpm.Solver(one, box, dx)
     push = torch.tensor(bench_mpm.GRAVITY).repeat(len(one), 1)
-    ours.advance(0.02, push, 200)
-    plain = mpm.Solver(one, box, dx)
-    plain.set(acceleration=push)
-    nodes = torch.zeros(plain.grid.count, 4)
-    for _ in range(200):
-        mpm_three_kernel.substep(plain, nodes, 1e-4)
-    assert plain.grid.low[0] == mpm_grid.GRID_PADDING
-    torch.testing.assert_close(plain.particles.x, ours.particles.x, rtol=0, atol=2e-5)
+    ours.advance(0.01, push, 100)
+    baseline = mpm.Solver(one, box, dx)
+    baseline.set(acceleration=push)
+    nodes = torch.zeros(baseline.grid.count, 4)
+    for _ in range(100):
+        mpm_three_kernel.substep(baseline, nodes, 1e-4)
+    assert baseline.grid.low[0] == mpm_grid.GRID_PADDING
+    torch.testing.assert_close(baseline.particles.x, ours.particles.x, rtol=0, atol=2e-5)
 
 
 @pytest.mark.parametrize("particles", [6_144, 20_000, 250_000])
-def test_scenes_have_about_as_many_particles_as_asked_eight_a_cell(particles):
+def test_scenes_have_the_requested_particles_eight_per_cell(particles):
     one, box, dx = bench_mpm.falling_boxes(particles)
     assert len(one) == pytest.approx(particles, rel=0.1)
     assert dx**3 / float(one.volume[0]) == pytest.approx(8, rel=1e-5)
@@ -37,7 +37,7 @@ def test_scenes_have_about_as_many_particles_as_asked_eight_a_cell(particles):
     assert bool((one.x > low).all() and (one.x < high).all())
 
 
-def test_a_report_has_ratios_and_the_machine(monkeypatch):
+def test_report_has_ratios_and_the_machine(monkeypatch):
     monkeypatch.setattr(bench_mpm.bench, "copy_bandwidth", lambda device: 1e10)
     lines = list(bench_mpm.run(MpmBenchOptions("cpu", (400,), scenes=2, frames=1)))
     assert "torch" in lines[0] and "10 GB/s" in lines[1] and len(lines) == 5
@@ -54,7 +54,7 @@ def test_the_figures_follow_from_each_other():
     assert r["bytes"] > count * 2 * 27 * 16 and math.isfinite(r["bytes_per_second"])
 
 
-def test_wrong_options():
+def test_invalid_options_are_rejected():
     for options in ({"frames": 0}, {"particles": (3,)}, {"scenes": -1}):
         with pytest.raises(InputError, match="--frames at least 1"):
             MpmBenchOptions(**options)

@@ -12,7 +12,7 @@ from tests.core.models.pi3.test_splat import TINY_SPLAT
 
 @pytest.fixture(autouse=True)
 def one_thread():
-    """Tensors are tiny here, and two threads would only wait for each other."""
+    """Tensors are tiny here; a second thread only costs time."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     yield
@@ -20,7 +20,7 @@ def one_thread():
 
 
 @torch.no_grad()
-def test_attention_written_out_is_the_same_attention():
+def test_naive_attention_equals_fused_attention():
     q, k, v = torch.randn(3, 2, 4, 9, 16, generator=torch.Generator().manual_seed(0)).unbind()
     torch.testing.assert_close(naive_attention(q, k, v), F.scaled_dot_product_attention(q, k, v))
     model = random_weights(Pi3(TINY))
@@ -30,14 +30,14 @@ def test_attention_written_out_is_the_same_attention():
 
 
 @pytest.mark.parametrize("splats", [False, True])
-def test_a_line_for_each_number_of_views_and_its_peer(splats):
+def test_report_has_a_line_per_view_count_and_baseline(splats):
     lines = list(run(Pi3BenchOptions("cpu", (1, 2), 28, 1, splats), TINY_SPLAT))
     assert len(lines) == 6 and lines[1].startswith("Pi3Splat" if splats else "Pi3,")
     assert all("unfused attention" in line for line in lines[3::2])
 
 
-def test_memory_that_is_too_small_is_said(monkeypatch):
-    """The scores of all pairs of tokens fit no memory, then nothing does."""
+def test_out_of_memory_is_reported(monkeypatch):
+    """The scores of all token pairs exceed memory, then everything does."""
 
     def table(*_):
         raise torch.OutOfMemoryError
@@ -50,12 +50,12 @@ def test_memory_that_is_too_small_is_said(monkeypatch):
     assert line.startswith("views   3  out of memory (estimate") and "nan" not in line
 
 
-def test_time_is_that_of_the_network():
+def test_time_and_memory_are_measured():
     model = random_weights(Pi3(TINY))
     few, many = (measure(model, n, 56, 8, "cpu", 3)[0] for n in (1, 40))
     assert many > few > 0
 
 
-def test_sizes_that_are_no_multiple_of_a_patch():
+def test_sizes_must_be_multiples_of_a_patch():
     with pytest.raises(InputError, match="multiple of 14"):
         Pi3BenchOptions(size=450)

@@ -1,4 +1,4 @@
-"""Figures of the reconstruction bench, on cameras that are off by known amounts."""
+"""Metrics of the reconstruction benchmark, on cameras with known errors."""
 
 import json
 import math
@@ -17,25 +17,25 @@ from tests.reconstruct.raycast import arc, write_set
 
 
 def elsewhere(cameras: Cameras, seed: int = 0) -> Cameras:
-    """The same cameras in a turned, moved world of another scale."""
+    """The same cameras in a rotated, translated and scaled world."""
     generator = torch.Generator().manual_seed(seed)
     R = matrix(torch.randn(4, generator=generator))
     return cameras.transformed(Similarity(0.3, R, torch.randn(3, generator=generator)))
 
 
 def tilted(degrees: float) -> torch.Tensor:
-    """A turn about the x axis."""
+    """A rotation about the x axis."""
     half = math.radians(degrees) / 2
     return matrix(torch.tensor([math.cos(half), math.sin(half), 0.0, 0.0]))
 
 
-def test_another_world_is_no_error():
+def test_a_similarity_is_no_pose_error():
     error = bench.pose_error(elsewhere(ring(8)), ring(8))
     assert error.cameras == 8
     assert error.rotation_most < 0.05 and error.shift < 1e-3  # arc cosines of float32 matrices
 
 
-def test_a_turned_camera_and_a_shifted_one_are_measured():
+def test_rotation_and_position_errors_are_measured():
     true = ring(8)
     viewmats = true.viewmats.clone()
     viewmats[2, :3] = tilted(1.0) @ viewmats[2, :3]  # 7 of the 28 pairs see it
@@ -57,7 +57,7 @@ def test_photos_are_matched_by_name():
 
 
 @pytest.mark.parametrize("degrees", [0.0, 1.5])
-def test_a_tilt_of_the_world_is_measured(degrees):
+def test_tilt_is_measured(degrees):
     true = ring(8)
     found = true.transformed(Similarity(2.0, tilted(degrees), torch.zeros(3)))
     tilt, height = bench.upright_error(found, true, 0.0, 0.0)
@@ -65,7 +65,7 @@ def test_a_tilt_of_the_world_is_measured(degrees):
     assert height < 0.1
 
 
-def test_a_floor_too_low_is_measured_in_shares_of_the_scene():
+def test_floor_error_is_relative_to_the_scene_size():
     true = ring(8)
     found = true.transformed(Similarity(2.0, torch.eye(3), torch.tensor([0.3, 0.1, 0.0])))
     _, height = bench.upright_error(found, true, floor=-0.1, true_floor=0.0)
@@ -73,7 +73,7 @@ def test_a_floor_too_low_is_measured_in_shares_of_the_scene():
     assert height == pytest.approx(100 * 0.05 / size, rel=1e-3)
 
 
-def test_a_set_may_be_a_folder_of_photos_or_hold_one(tmp_path):
+def test_photo_folder_is_found(tmp_path):
     assert bench.photo_folder(tmp_path) == tmp_path
     (tmp_path / "images").mkdir()
     assert bench.photo_folder(tmp_path) == tmp_path / "images"
@@ -96,7 +96,7 @@ def test_rows_of_other_sets_are_kept(tmp_path, monkeypatch):
     assert set(json.loads((tmp_path / "r.json").read_text())["sets"]) == {"one, normal, cpu", "two, normal, cpu"}
 
 
-def test_what_fails_has_a_row_that_says_why_and_matchers_have_rows_of_their_own(tmp_path, monkeypatch):
+def test_failures_have_a_row_and_matchers_separate_rows(tmp_path, monkeypatch):
     (tmp_path / "set").mkdir()
     monkeypatch.setattr(bench, "measure_in_subprocess", bench.measure)  # a process is not needed to fail
     for matcher in ("sift", "aliked-lightglue"):
@@ -108,7 +108,7 @@ def test_what_fails_has_a_row_that_says_why_and_matchers_have_rows_of_their_own(
     assert str(tmp_path) not in str(rows)
 
 
-def test_cameras_alone_are_compared_with_those_that_took_the_photos(tmp_path, monkeypatch):
+def test_cameras_alone_are_compared_with_references(tmp_path, monkeypatch):
     write_set(tmp_path / "set", arc(4, (240, 180), sweep=40.0)).rename(tmp_path / "set" / "cameras.json")
     monkeypatch.setattr(bench, "measure_in_subprocess", bench.measure)
     lines = list(
@@ -120,7 +120,7 @@ def test_cameras_alone_are_compared_with_those_that_took_the_photos(tmp_path, mo
     assert set(row["seconds"]) == {"features", "matches", "model"}  # and nothing after them
 
 
-def test_orbits_lie_level():
-    """What the tilt is measured against."""
+def test_orbits_are_level():
+    """The reference of the tilt: an orbit's mean up axis."""
     up = -orbit(8, torch.zeros(3), 2.0, 30.0)[:, 1, :3].mean(0)
     assert float(up[2] / up.norm()) > 0.9999

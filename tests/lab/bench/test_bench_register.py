@@ -1,4 +1,4 @@
-"""The bench judges rightly: exact answers have no error, turns that cannot be seen are none, ICP finds what is near."""
+"""The registration benchmark: error measures, symmetries, and the baselines ICP and splatreg."""
 
 import json
 import sys
@@ -30,7 +30,7 @@ from tests.segment.tabletop import coloured_gaussians
 
 @pytest.fixture(scope="module")
 def can():
-    """A grey cylinder-like egg; `painted` has one side red."""
+    """A grey ellipsoid; `painted` has one side red."""
     return coloured_gaussians(ellipsoid((0.3, 0.3, 0.5), 8000), (0.5, 0.5, 0.5), 1, grain=0.0)
 
 
@@ -40,7 +40,7 @@ def turned_about_z(pose: Similarity, degrees: float) -> Similarity:
     return Similarity(pose.scale, pose.rotation @ about, pose.translation)
 
 
-def test_the_truth_has_no_error_and_what_is_off_has_as_much_as_it_is_off(can):
+def test_errors_of_known_deviations(can):
     given = make_trial(can, 0, RegisterBenchOptions())
     exact = errors(given.truth, given, can, revolved=True)
     assert max(exact.values()) < 0.1
@@ -50,7 +50,7 @@ def test_the_truth_has_no_error_and_what_is_off_has_as_much_as_it_is_off(can):
     assert errors(off, given, can, revolved=False)["rotation up to symmetry"] == pytest.approx(20, abs=0.1)
 
 
-def test_a_turn_that_nobody_can_see_is_no_error_and_one_of_a_painted_side_is(can):
+def test_invisible_rotation_is_no_error(can):
     given = make_trial(can, 0, RegisterBenchOptions())
     off = turned_about_z(given.truth, 90.0)
     assert errors(off, given, can, revolved=True)["rotation up to symmetry"] < 0.1
@@ -59,27 +59,27 @@ def test_a_turn_that_nobody_can_see_is_no_error_and_one_of_a_painted_side_is(can
     assert errors(off, given, painted, revolved=True)["rotation up to symmetry"] == pytest.approx(90, abs=0.1)
 
 
-def test_a_part_is_the_share_of_the_whole_that_was_asked_for_where_the_truth_puts_it(can):
+def test_parts_have_the_requested_size_and_pose(can):
     given = make_trial(can, 1, RegisterBenchOptions(missing=0.4, noise=0.0, tint=0.0))
     assert len(given.part) == round(0.6 * len(can))
     torch.testing.assert_close(given.part.means, given.truth(can.means[given.seen]))
     torch.testing.assert_close(given.part.sh, can.sh[given.seen])
 
 
-def test_the_turn_about_z_is_taken_apart_from_the_rest():
+def test_nearest_z_rotation():
     a = matrix(torch.tensor([0.9, 0.0, 0.0, 0.3]))
     assert rotation_angle(a @ nearest_z_rotation(a).mT) < 0.1
     x = matrix(torch.tensor([0.9, 0.3, 0.0, 0.0]))
     assert rotation_angle(nearest_z_rotation(x)) < 0.1
 
 
-def test_there_and_back_is_nowhere():
+def test_inverse_similarity():
     pose = random_similarity(2)
     points = torch.randn(5, 3)
     torch.testing.assert_close(pose.inverse()(pose(points)), points, rtol=0, atol=1e-5)
 
 
-def test_icp_finds_a_whole_that_is_turned_a_little():
+def test_icp_corrects_small_rotations():
     whole = asymmetric_object(0.02)
     pose = Similarity(1.3, matrix(torch.tensor([1.0, 0.02, 0.03, -0.02])), torch.tensor([0.2, 0.1, 0.0]))
     found = icp(replace(whole, means=pose(whole.means)), whole)
@@ -88,7 +88,7 @@ def test_icp_finds_a_whole_that_is_turned_a_little():
 
 @pytest.fixture
 def stand_in(monkeypatch):
-    """A module in splatreg's place that matches by colour and answers as splatreg does: model to observation, 4x4."""
+    """A module in place of splatreg that matches by colour and returns a 4x4 pose, model to observation."""
 
     def estimate_object_pose(model, observation, *, init, transform):
         assert (init, transform) == ("features", "sim3") and torch.get_num_threads() == 1
@@ -107,7 +107,7 @@ def stand_in(monkeypatch):
     monkeypatch.setitem(sys.modules, "splatreg", module)
 
 
-def test_splatreg_is_handed_what_it_wants_and_its_answer_is_turned_into_ours(can, stand_in):
+def test_splatreg_interface(can, stand_in):
     rng, threads = torch.Generator().manual_seed(0), torch.get_num_threads()
     whole = can[torch.randperm(len(can), generator=rng)[: bench_register.SPLATREG_GAUSSIANS]]
     whole = replace(whole, sh=rgb_to_sh(torch.rand(len(whole), 3, generator=rng)))
@@ -117,7 +117,7 @@ def test_splatreg_is_handed_what_it_wants_and_its_answer_is_turned_into_ours(can
     assert found.scale == pytest.approx(pose.scale, rel=1e-4) and torch.get_num_threads() == threads
 
 
-def test_the_real_splatreg_finds_a_whole_that_is_turned_and_scaled():
+def test_installed_splatreg_registers_a_whole_object():
     pytest.importorskip("splatreg")
     whole, pose = asymmetric_object(0.02), random_similarity(1)
     whole = whole[
@@ -127,10 +127,10 @@ def test_the_real_splatreg_finds_a_whole_that_is_turned_and_scaled():
     torch.testing.assert_close(found(whole.means), pose(whole.means), rtol=0, atol=1e-3)
 
 
-def test_a_run_counts_and_writes(tmp_path, monkeypatch):
+def test_run_counts_and_writes_results(tmp_path, monkeypatch):
     monkeypatch.setattr(bench_register, "make_object", lambda name: asymmetric_object(0.02))
     monkeypatch.setattr(bench_register, "METHODS", {"ICP": icp})
-    lines = list(run(tmp_path / "out.json", RegisterBenchOptions("duck", 1, device="cpu")))
+    lines = list(run(tmp_path / "out.json", RegisterBenchOptions("duck", 1)))
     assert lines[0].split() == ["correct", "of", "1", "ICP"] and lines[1].split()[0] == "duck"
     facts = json.loads((tmp_path / "out.json").read_text())
     assert facts["machine"] == bench.machine("cpu") and [row["method"] for row in facts["trials"]] == ["ICP"]

@@ -1,4 +1,4 @@
-"""The benchmark measures what it says. No speed is tested."""
+"""The rollout benchmark. No speed is tested."""
 
 import json
 
@@ -11,7 +11,7 @@ from stages.lab.bench import rollout as bench_rollout
 from stages.lab.bench.rollout import PEER, RolloutBenchOptions, ellipsoids, rollout_stepwise, run, table
 
 
-def test_the_scene_is_one_of_contacts():
+def test_scene_has_contacts():
     start = ellipsoids(2, 60)
     assert torch.equal(start.points[0], start.points[1])
     torch.manual_seed(0)
@@ -23,7 +23,7 @@ def test_the_scene_is_one_of_contacts():
     assert end[..., 2].min() > float(start.floor[0, 0]) - 0.1
 
 
-def test_a_run_has_all_rows_and_keeps_those_of_the_other_device(tmp_path, monkeypatch):
+def test_run_has_all_rows_and_keeps_other_devices(tmp_path, monkeypatch):
     torch.manual_seed(0)
     save(tmp_path / "small.safetensors", "ngff", build("ngff", hidden=8))
     small = build("ngff-paper", hidden=8, layers=1)
@@ -45,14 +45,14 @@ def test_a_run_has_all_rows_and_keeps_those_of_the_other_device(tmp_path, monkey
     assert rows[2]["seconds"] == pytest.approx(2e-6 * 200 * 3)  # 200 substeps for each of the steps
 
 
-def test_ratios_are_to_the_published_model_in_the_same_run():
+def test_ratios_are_relative_to_the_published_model():
     rows = [{"what": "ours", "scenes": 1, "seconds": 0.5, "ready_seconds": 3.0, "strays_m": 1e-5},
             {"what": PEER, "scenes": 1, "seconds": 4.0}]  # fmt: skip
     ours, peer = table(rows)
     assert "8.00x" in ours and "set-up: 3.0 s" in ours and "1.00x" in peer
 
 
-def test_wrong_options():
+def test_invalid_options_are_rejected():
     for options in ({"steps": 0}, {"scenes": (0,)}, {"repeat": 0}):
         with pytest.raises(InputError, match="at least 1"):
             RolloutBenchOptions(**options)

@@ -1,4 +1,4 @@
-"""Estimates of materials, asked of a server of our own on this machine."""
+"""Estimates of materials, with a local test server."""
 
 import base64
 import json
@@ -29,7 +29,7 @@ KEY = "not-a-real-key"
 
 
 class Server(ThreadingHTTPServer):
-    """Answers with what `script` holds, one entry a request: a text, a status, bytes, or seconds to be silent."""
+    """Replies with the entries of `script`, one per request: a text, a status, bytes, or seconds of silence."""
 
     daemon_threads = True
 
@@ -86,7 +86,7 @@ def video(tmp_path_factory):
     return path
 
 
-def test_what_is_found_can_be_simulated_with(server, video, tmp_path):
+def test_estimates_are_read_by_simulate(server, video, tmp_path):
     server.script = [json.dumps(GOOD)]
     out = tmp_path / "materials.json"
     lines = run(video, out, EstimateOptions(objects="duck, ball"))
@@ -98,7 +98,7 @@ def test_what_is_found_can_be_simulated_with(server, video, tmp_path):
     assert KEY not in json.dumps(facts) and facts["replies"] == [json.dumps(GOOD)]
 
 
-def test_ten_evenly_spaced_frames_are_shown_with_the_question(server, video, tmp_path):
+def test_ten_evenly_spaced_frames_are_sent(server, video, tmp_path):
     server.script = [json.dumps(GOOD)]
     run(video, tmp_path / "m.json", EstimateOptions(objects="duck,ball"))
     path, body = server.asked[0]
@@ -113,7 +113,7 @@ def test_ten_evenly_spaced_frames_are_shown_with_the_question(server, video, tmp
     assert light == pytest.approx([round(i * 39 / 9) / 40 for i in range(10)], abs=0.02)
 
 
-def test_frames_are_made_small_and_few_are_enough(tmp_path, video):
+def test_frames_are_downscaled(tmp_path, video):
     small = sample_frames(video, 3, 48)
     assert [cv2.imdecode(np.frombuffer(j, np.uint8), 1).shape for j in small] == [(32, 48, 3)] * 3
     with VideoWriter(tmp_path / "short.mp4", 20.0) as out:
@@ -135,17 +135,17 @@ def test_frames_are_made_small_and_few_are_enough(tmp_path, video):
     (json.dumps(GOOD).replace("50", "NaN"), "NaN is not a number"),
     ('{"duck": 1, "duck": 2, "ball": 3}', "twice"),
 ])  # fmt: skip
-def test_an_answer_that_cannot_be_used(reply, says):
+def test_invalid_replies(reply, says):
     with pytest.raises(InvalidReply, match=says):
         parse_reply(reply, ["duck", "ball"])
 
 
-def test_a_fence_is_forgiven_and_without_names_the_model_finds_them():
+def test_markdown_fence_is_accepted_and_names_are_optional():
     assert list(parse_reply("```json\n" + json.dumps(GOOD) + "\n```", ["ball", "duck"])) == ["ball", "duck"]
     assert parse_reply(json.dumps(GOOD), [])["duck"]["density"] == 300.0
 
 
-def test_an_unfit_answer_is_sent_back_with_what_is_wrong(server, video, tmp_path):
+def test_invalid_reply_is_sent_back_with_the_reason(server, video, tmp_path):
     negative = {"duck": {**GOOD["duck"], "E": -1}}
     server.script = ["a duck, I think", json.dumps(negative), json.dumps({"duck": GOOD["duck"]})]
     run(video, tmp_path / "m.json", EstimateOptions(objects="duck"))
@@ -156,7 +156,7 @@ def test_an_unfit_answer_is_sent_back_with_what_is_wrong(server, video, tmp_path
     assert len(json.loads((tmp_path / "m.json.json").read_text())["replies"]) == 3
 
 
-def test_three_unfit_answers_are_one_clear_error_and_no_file(server, video, tmp_path):
+def test_three_invalid_replies_are_an_error(server, video, tmp_path):
     server.script = ["no", "no", "no"]
     with pytest.raises(InputError, match="seer at http.*: 3 answers could not be used, the last because it is not"):
         run(video, tmp_path / "m.json", EstimateOptions(objects="duck"))
@@ -168,7 +168,7 @@ def test_three_unfit_answers_are_one_clear_error_and_no_file(server, video, tmp_
     ([503, 500, 429], "429 .*, 3 times; try later"), ([b"<html>"], "choices\\[0\\]"), ([b"{}"], "choices\\[0\\]"),
     ([1.0, 1.0, 1.0], "no answer within 0.2 s, 3 times"),
 ])  # fmt: skip
-def test_a_server_that_will_not_answer(server, video, tmp_path, script, says):
+def test_failing_servers(server, video, tmp_path, script, says):
     server.script = list(script)
     with pytest.raises(InputError, match=says) as caught:
         run(video, tmp_path / "m.json", EstimateOptions(objects="duck", timeout=0.2))
@@ -176,13 +176,13 @@ def test_a_server_that_will_not_answer(server, video, tmp_path, script, says):
     assert len(server.asked) == len(script)
 
 
-def test_a_server_that_is_busy_once_and_one_that_is_silent_once(server, video, tmp_path):
+def test_busy_and_silent_servers_are_retried(server, video, tmp_path):
     server.script = [503, 1.0, json.dumps({"duck": GOOD["duck"]})]
     run(video, tmp_path / "m.json", EstimateOptions(objects="duck", timeout=0.3))
     assert len(server.asked) == 3 and (tmp_path / "m.json").exists()
 
 
-def test_what_the_environment_lacks_is_said(server, video, tmp_path, monkeypatch):
+def test_missing_environment_variables_are_reported(server, video, tmp_path, monkeypatch):
     monkeypatch.delenv("OPENAI_API_KEY")
     server.script = [401]
     with pytest.raises(InputError, match="set OPENAI_API_KEY"):
@@ -199,7 +199,7 @@ def test_what_the_environment_lacks_is_said(server, video, tmp_path, monkeypatch
         run(video, tmp_path / "m.json")
 
 
-def test_names_come_from_a_scene(two_balls, tmp_path):
+def test_names_are_read_from_a_scene(two_balls, tmp_path):
     write_scene(tmp_path / "s.ply", two_balls)
     assert estimate.object_names(str(tmp_path / "s.ply")) == ["red ball", "green ball"]
     with pytest.raises(InputError, match="'duck' is there twice"):

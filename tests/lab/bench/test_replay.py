@@ -1,4 +1,4 @@
-"""The public solver's recorded run, run again."""
+"""Replay of the public solver's recorded run."""
 
 import numpy as np
 import pytest
@@ -25,29 +25,30 @@ def small(frames: int = 3) -> dict[str, np.ndarray]:
     }  # fmt: skip
 
 
-def test_it_agrees_with_the_public_solver_through_the_first_contacts():
+@pytest.mark.slow
+def test_agrees_with_the_public_solver_through_first_contacts():
     if not RECORDING.exists():
         pytest.skip("the recording is not on this machine")
     data = replay.read_recording(RECORDING)
     ours = torch.stack(list(replay.simulate(data, ALL_HAVE_TOUCHED, "cpu")))
     c = replay.compare(data, ours)
     assert c.contact == 16
-    assert float(c.particles[: c.contact].max()) < 1e-4  # free flight: rounding alone
+    assert float(c.particles[: c.contact].max()) < 1e-4  # free flight: rounding only
     assert float(c.com.max()) < 0.01  # of the drop height
     moved = (ours[-1] - ours[15]).norm(dim=1).max() / c.drop
-    assert float(moved) > 0.3  # and it is not that nothing happened
+    assert float(moved) > 0.3  # the bodies did move
 
 
-def test_nodes_are_where_the_public_solver_has_them():
+def test_grid_nodes_match_the_public_solver():
     grid = replay.make_solver(small(), "cpu").grid
     at = [(torch.tensor(list(grid.origin)) + 0.02 * torch.tensor(list(edge))) / 0.02 for edge in (grid.low, grid.high)]
     torch.testing.assert_close(at[0], torch.full((3,), 2.0), rtol=0, atol=1e-4)  # the third node is the last held one
     torch.testing.assert_close(at[1], torch.full((3,), 197.0), rtol=0, atol=1e-4)
 
 
-def test_the_file_it_writes_is_a_recording(tmp_path):
+def test_output_is_a_recording(tmp_path):
     np.savez(tmp_path / "a.npz", **small())
-    lines = list(replay.run(tmp_path / "a.npz", tmp_path / "ours.npz", replay.ReplayOptions(device="cpu")))
+    lines = list(replay.run(tmp_path / "a.npz", tmp_path / "ours.npz", replay.ReplayOptions()))
     again = replay.read_recording(tmp_path / "ours.npz")
     np.testing.assert_allclose(again["positions"], small()["positions"], rtol=0, atol=2e-6)
     assert "frame   2" in lines[3] and "agree to 1 % of the drop height through frame 2 of 2" in lines[-1]
@@ -62,13 +63,13 @@ def spoiled(**changes) -> dict[str, np.ndarray]:
     (spoiled(volume=np.ones(3)), "volume must have 8 values"),
     (spoiled(positions=np.full((3, 8, 3), np.nan)), "positions must be finite"),
 ])  # fmt: skip
-def test_wrong_recordings(tmp_path, data, message):
+def test_invalid_recordings_are_rejected(tmp_path, data, message):
     np.savez(tmp_path / "a.npz", **data)
     with pytest.raises(InputError, match=message):
         replay.read_recording(tmp_path / "a.npz")
 
 
-def test_wrong_files_and_options(tmp_path):
+def test_invalid_files_and_options_are_rejected(tmp_path):
     (tmp_path / "a.npz").write_text("no")
     with pytest.raises(InputError, match="not an NPZ"):
         replay.read_recording(tmp_path / "a.npz")

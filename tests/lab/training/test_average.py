@@ -60,7 +60,7 @@ def test_weights_without_known_runs_can_be_averaged(tmp_path):
     assert card["runs"][:2] == [{"sha256": digest(a)}, {"sha256": digest(b)}] and total_minutes(card) is None
 
 
-def test_half_as_large_to_ship(tmp_path):
+def test_half_precision_shrinks_the_file(tmp_path):
     a, b = trained(tmp_path / "a.safetensors", 1), trained(tmp_path / "b.safetensors", 2)
     for half in (False, True):
         run([a, b], "0.5,0.5", tmp_path / f"{half}.safetensors", half)
@@ -69,13 +69,13 @@ def test_half_as_large_to_ship(tmp_path):
 
 
 @pytest.mark.parametrize("shares", ["0.5", "0.5,0.6", "1.5,-0.5", "half,half", "nan,nan", "0.4,0.3,0.3"])
-def test_shares_that_make_no_mean(shares, tmp_path):
+def test_ratios_must_add_up_to_one(shares, tmp_path):
     a, b = trained(tmp_path / "a.safetensors", 1), trained(tmp_path / "b.safetensors", 2)
     with pytest.raises(InputError, match="--shares"):
         run([a, b], shares, tmp_path / "mean.safetensors")
 
 
-def test_weights_of_unlike_models_have_no_mean(tmp_path):
+def test_weights_of_different_models_are_rejected(tmp_path):
     a, b = trained(tmp_path / "a.safetensors", 1), trained(tmp_path / "b.safetensors", 2, of="gcn")
     with pytest.raises(InputError, match=r"b\.safetensors: holds gcn"):
         run([a, b], "0.5,0.5", tmp_path / "mean.safetensors")

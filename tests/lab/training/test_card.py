@@ -25,7 +25,7 @@ def card(path, minutes=(1.0, 2.0), losses=(0.5, 0.25), earlier=()):
     return path
 
 
-def test_two_trainings_in_one_picture(tmp_path):
+def test_curves_of_two_cards_in_one_figure(tmp_path):
     cards = [card(tmp_path / "a.json"), card(tmp_path / "b.json", losses=(0.9, None))]
     args = ["card", *map(str, cards), "-o", str(tmp_path / "curves.png")]
     done = CliRunner().invoke(app, args)
@@ -50,7 +50,7 @@ def test_all_committed_cards_have_curves(tmp_path):
     assert len(lines) == 6 and lines[0].startswith("ngff: ngff, 3600 scenes, 136.6 min on NVIDIA H200")
 
 
-def test_weights_are_made_ready_to_ship(tmp_path):
+def test_half_rewrites_the_weights(tmp_path):
     save(tmp_path / "a.safetensors", "gcn", build("gcn", hidden=32), CURVES)
     before = (tmp_path / "a.safetensors").stat().st_size
     run([tmp_path / "a.json"], tmp_path / "c.png", half=True)
@@ -62,7 +62,7 @@ def test_weights_are_made_ready_to_ship(tmp_path):
     "{", "[]", '{"model": "a", "runs": [], "curve": []}', '{"runs": [], "curve": {"minutes": [1]}}',
     '{"model": "a", "runs": [], "curve": {"minutes": [1], "loss": [], "RMSE": [], "R": []}}',
 ])  # fmt: skip
-def test_what_is_no_card(tmp_path, text):
+def test_invalid_cards_are_rejected(tmp_path, text):
     (tmp_path / "x.json").write_text(text)
     with pytest.raises(InputError, match="x.json: has no training curve"):
         run([tmp_path / "x.json"], tmp_path / "c.png")

@@ -1,4 +1,4 @@
-"""Training: pieces, loss, gradients, steps, checkpoints, and the command."""
+"""Training: sampler, loss, gradients, steps, checkpoints, and the command."""
 
 import math
 import os
@@ -73,61 +73,59 @@ def data(tmp_path: Path) -> Path:
     return tmp_path / "data"
 
 
-QUICK = TrainOptions(
-    steps=12, batch=2, keypoints=8, horizons="2,3", hidden=8, groups="3_0..3_1", device="cpu", checks=4
-)
+QUICK = TrainOptions(steps=12, batch=2, keypoints=8, horizons="2,3", hidden=8, groups="3_0..3_1", checks=4)
 
 
-def test_pieces_start_with_the_speed_of_free_fall():
+def test_clips_start_with_the_velocity_of_free_fall():
     motions = falling(frames=6)
-    piece = ClipSampler(motions, "cpu", build("ngff", hidden=8)).take(torch.tensor([1, 4]), torch.tensor([0, 2]), 3)
-    assert_close(piece.points, torch.stack([motions.points[1, 0], motions.points[4, 2]]))
-    assert_close(piece.truth, torch.stack([motions.points[1, 1:4], motions.points[4, 3:6]]))
-    assert_close(piece.speed[0], torch.zeros(2, 8, 3))
+    clip = ClipSampler(motions, "cpu", build("ngff", hidden=8)).take(torch.tensor([1, 4]), torch.tensor([0, 2]), 3)
+    assert_close(clip.points, torch.stack([motions.points[1, 0], motions.points[4, 2]]))
+    assert_close(clip.truth, torch.stack([motions.points[1, 1:4], motions.points[4, 3:6]]))
+    assert_close(clip.speed[0], torch.zeros(2, 8, 3))
     # central differences are exact for a parabola: only rounding of positions near 1, over 2 dt, is left
-    assert_close(piece.speed[1], torch.tensor([0.0, 0.0, GRAVITY[2] * 2 * DT]).expand(2, 8, 3), rtol=0, atol=1e-5)
+    assert_close(clip.speed[1], torch.tensor([0.0, 0.0, GRAVITY[2] * 2 * DT]).expand(2, 8, 3), rtol=0, atol=1e-5)
 
 
-def test_pieces_never_reach_past_the_last_frame():
-    pieces, rng = ClipSampler(falling(frames=5), "cpu", build("gcn", hidden=8)), torch.Generator().manual_seed(0)
-    starts = {float(pieces.draw(1, 3, rng).speed[0, 0, 0, 2]) for _ in range(40)}
+def test_clips_end_within_the_motion():
+    sampler, rng = ClipSampler(falling(frames=5), "cpu", build("gcn", hidden=8)), torch.Generator().manual_seed(0)
+    starts = {float(sampler.draw(1, 3, rng).speed[0, 0, 0, 2]) for _ in range(40)}
     assert len(starts) == 2  # frames 0 and 1 are all that leave 3 more
 
 
-def test_scenes_at_rest_go_on_as_they_are():
-    """One falls to its last frame, the other has stood still for all of the last ones."""
+def test_scenes_at_rest_are_continued_at_rest():
+    """One scene falls to its last frame, the other is at rest at its end."""
     motions = falling(frames=12)[:2]
     motions.points[1, 5:] = motions.points[1, 5:6]
     assert ends_at_rest(motions).tolist() == [False, True]
-    pieces, rng = ClipSampler(motions, "cpu", build("gcn", hidden=8)), torch.Generator().manual_seed(0)
-    heights = pieces.draw(300, 9, rng).points[:, 0, 0, 2]
+    sampler, rng = ClipSampler(motions, "cpu", build("gcn", hidden=8)), torch.Generator().manual_seed(0)
+    heights = sampler.draw(300, 9, rng).points[:, 0, 0, 2]
     assert len(heights.unique()) == 3 + 6  # one starts in frames 0 to 2, the other also in those in which it rests
     assert float((heights == motions.points[1, 11, 0, 0, 2]).float().mean()) > 0.2
-    late = pieces.take(torch.tensor([1]), torch.tensor([11]), 9)
+    late = sampler.take(torch.tensor([1]), torch.tensor([11]), 9)
     assert_close(late.truth, motions.points[1:, 11:].expand(1, 9, 2, 8, 3))
     assert not late.speed.any()
 
 
-def test_pieces_do_not_begin_amid_an_impact():
-    """A ball that is hit between two frames: in those two, central differences are far from any speed it had."""
+def test_clips_do_not_begin_amid_an_impact():
+    """A ball hit between two frames, in which central differences are far from its velocity."""
     motions = falling(frames=12)[:1]
     hit = torch.arange(12)[:, None, None, None] * torch.tensor([0.0, 0.0, 0.02])
     motions.points[:] = motions.points[:, :1] + torch.where(torch.arange(12)[:, None, None, None] < 5, 0.0, hit - 0.09)
     assert smooth_frames(motions)[0].tolist() == [t not in (4, 5) for t in range(12)]
-    pieces, rng = ClipSampler(motions, "cpu", build("gcn", hidden=8)), torch.Generator().manual_seed(0)
-    speeds = pieces.draw(200, 3, rng).speed[:, 0, 0, 2]
+    sampler, rng = ClipSampler(motions, "cpu", build("gcn", hidden=8)), torch.Generator().manual_seed(0)
+    speeds = sampler.draw(200, 3, rng).speed[:, 0, 0, 2]
     for speed in speeds.unique():
         assert min(abs(float(speed)), abs(float(speed) - 1.0)) < 1e-5
     assert (speeds > 0.5).any() and (speeds < 0.5).any()
 
 
-def test_the_spread_of_an_object_is_that_of_its_points_over_time():
+def test_spread_is_the_rms_motion_of_an_objects_points():
     motions = falling(frames=9)[:2]
     x = motions.points[1, :, 1]
     assert_close(motion_spread(motions)[1, 1], (x - x.mean(0)).square().mean((0, 1)).sqrt())
 
 
-def test_a_centimetre_in_one_coordinate_is_a_third_of_a_square_centimetre():
+def test_losses_of_known_errors():
     truth = torch.zeros(1, 2, 2, 4, 3)
     valid = torch.tensor([[[True] * 4, [False] * 4]])
     predicted = truth.clone()
@@ -143,7 +141,7 @@ def test_a_centimetre_in_one_coordinate_is_a_third_of_a_square_centimetre():
     assert_close(relative, torch.tensor((0.1 * 5 + 0.1 * 5 + 1.01**0.5) / 3))
 
 
-def test_steps_that_undo_each_other_are_seen_in_speeds_alone():
+def test_velocity_loss_sees_oscillations():
     """Velocities of 1 m/s that change their sign each frame move nothing. A frame amid an impact does not count."""
     weighed = LossOptions("square", velocity_time=0.1)
     points = torch.zeros(1, 7, 1, 4, 3)
@@ -160,13 +158,13 @@ def test_steps_that_undo_each_other_are_seen_in_speeds_alone():
     assert_close(velocity_loss(free, points, valid, spread, DT, weighed), torch.tensor(0.0), rtol=0, atol=1e-5)
 
 
-def test_what_is_widened_does_the_same_and_learns_with_all_it_gained():
+def test_widened_network_is_the_same_function_and_trains_new_channels():
     torch.manual_seed(0)
     narrow = build("ngff", hidden=8).eval()
     wide = widen(narrow, 16)
-    pieces = ClipSampler(without_last(falling()), "cpu", narrow)
-    piece = pieces.take(torch.tensor([0, 3]), torch.tensor([0, 5]), 4)
-    (was, _), (loss, grads) = RolloutLoss(narrow, DT)(piece), RolloutLoss(wide, DT)(piece)
+    sampler = ClipSampler(without_last(falling()), "cpu", narrow)
+    clip = sampler.take(torch.tensor([0, 3]), torch.tensor([0, 5]), 4)
+    (was, _), (loss, grads) = RolloutLoss(narrow, DT)(clip), RolloutLoss(wide, DT)(clip)
     assert_close(loss, was)
     new = dict(zip((name for name, _ in wide.named_parameters()), grads, strict=True))["planes.say.2.weight"]
     assert new.shape[1] == 16 and (new[:, 8:].abs().sum(0) > 0).all()
@@ -175,15 +173,15 @@ def test_what_is_widened_does_the_same_and_learns_with_all_it_gained():
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_gradients_are_those_of_the_rollout(name):
-    """The prepared scene is cut off and its gradient carried on by hand; the model's own rollout knows no cut."""
+def test_gradients_match_autograd_of_the_rollout(name):
+    """The gradient through the prepared scene is chained by hand; autograd of the whole rollout is the reference."""
     torch.manual_seed(0)
     model = build(name, hidden=8).eval()  # no dropout
-    pieces = ClipSampler(without_last(falling()), "cpu", model)
-    piece = pieces.take(torch.tensor([0, 3]), torch.tensor([0, 5]), 3)
-    loss, grads = RolloutLoss(model, DT)(piece)
-    predicted = model.rollout(piece.world, 4, DT, start=(piece.points, piece.speed))[:, 1:]
-    whole = keypoint_loss(predicted, piece.truth, piece.world.valid, "square", piece.spread)
+    sampler = ClipSampler(without_last(falling()), "cpu", model)
+    clip = sampler.take(torch.tensor([0, 3]), torch.tensor([0, 5]), 3)
+    loss, grads = RolloutLoss(model, DT)(clip)
+    predicted = model.rollout(clip.world, 4, DT, start=(clip.points, clip.speed))[:, 1:]
+    whole = keypoint_loss(predicted, clip.truth, clip.world.valid, "square", clip.spread)
     whole.backward()
     assert_close(loss, whole.detach())
     assert sum(float(g.abs().sum()) for g in grads) > 0
@@ -192,8 +190,8 @@ def test_gradients_are_those_of_the_rollout(name):
 
 
 @pytest.mark.parametrize(("broken", "why"), [(True, "fails"), (False, "not finite")])
-def test_what_cannot_be_compiled_is_done_without(monkeypatch, caplog, broken, why):
-    """Neither a compiler that fails nor one whose gradients are wrong stops training, or makes it a waste of time."""
+def test_failed_compilation_falls_back(monkeypatch, caplog, broken, why):
+    """Neither a failing compiler nor one with wrong gradients stops or spoils training."""
 
     def compile(function, **_):
         def wrong(*given):
@@ -206,26 +204,26 @@ def test_what_cannot_be_compiled_is_done_without(monkeypatch, caplog, broken, wh
 
     torch.manual_seed(0)
     model = build("gcn", hidden=8).eval()
-    piece = ClipSampler(without_last(falling()), "cpu", model).take(torch.tensor([0]), torch.tensor([0]), 2)
+    clip = ClipSampler(without_last(falling()), "cpu", model).take(torch.tensor([0]), torch.tensor([0]), 2)
     with monkeypatch.context() as patch:
         patch.setattr(torch, "compile", compile)
-        loss, grads = RolloutLoss(model, DT, compiled=True)(piece)
+        loss, grads = RolloutLoss(model, DT, compiled=True)(clip)
     assert why in caplog.text
-    plain, true = RolloutLoss(model, DT)(piece)
+    plain, true = RolloutLoss(model, DT)(clip)
     assert_close(loss, plain)
     for a, b in zip(grads, true, strict=True):
         assert_close(a, b)
 
 
-def test_gradients_fade_on_their_way_back():
-    """Of the third frame's error, what comes back through two frames counts 0.9^2 as much."""
+def test_gradient_discount_shrinks_gradients_of_early_frames():
+    """A gradient that goes back two frames is multiplied by 0.9^2."""
     torch.manual_seed(0)
     model = build("gcn", hidden=8).eval()
-    piece = ClipSampler(without_last(falling()), "cpu", model).take(torch.tensor([0]), torch.tensor([0]), 3)
+    clip = ClipSampler(without_last(falling()), "cpu", model).take(torch.tensor([0]), torch.tensor([0]), 3)
 
     def gradient(discount):
         return torch.cat(
-            [g.flatten() for g in RolloutLoss(model, DT, LossOptions(gradient_discount=discount))(piece)[1]]
+            [g.flatten() for g in RolloutLoss(model, DT, LossOptions(gradient_discount=discount))(clip)[1]]
         )
 
     none, full = gradient(0.0), gradient(1.0)
@@ -234,7 +232,7 @@ def test_gradients_fade_on_their_way_back():
     assert 2 <= far[1] / far[0] <= 4  # of one frame back half as much, of two a quarter
 
 
-def test_no_pushes_are_no_pushes():
+def test_absent_and_zero_forces_are_equal():
     world = without_last(falling()).initial_conditions()
     none, idle = ExternalForces.none_for(world.valid, world.points), ExternalForces.none(world)
     # a push of no strength goes all the way that a real one goes
@@ -248,7 +246,7 @@ def test_no_pushes_are_no_pushes():
 
 
 @pytest.mark.parametrize("optimizer", OPTIMIZERS)
-def test_a_step_without_finite_gradients_changes_nothing(optimizer):
+def test_nonfinite_gradients_are_skipped(optimizer):
     state = TrainingState(build("gcn", hidden=8), 1e-2, 0, optimizer)
     good = [torch.ones_like(p) for p in state.params]
     for _ in range(2):
@@ -264,14 +262,14 @@ def test_a_step_without_finite_gradients_changes_nothing(optimizer):
     assert not any(torch.equal(a, b) for a, b in zip(before, state.params, strict=True))
 
 
-def test_soap_without_its_package_says_what_to_install(monkeypatch):
+def test_missing_soap_package_is_reported(monkeypatch):
     monkeypatch.setitem(sys.modules, "pytorch_optimizer", None)
     with pytest.raises(InputError, match=r"ngff\[train\]"):
         TrainingState(build("gcn", hidden=8), 1e-2, 0, "soap")
 
 
-def test_soap_goes_down_a_narrow_valley_that_is_aslant():
-    """A million times narrower than long: it finds the axes, along which Adam on each weight alone would be stuck."""
+def test_soap_minimises_an_ill_conditioned_quadratic():
+    """Condition number 1e6, rotated axes: SOAP finds the eigenvectors, where Adam would stall."""
     rng = torch.Generator().manual_seed(0)
     turn = torch.linalg.qr(torch.randn(8, 8, generator=rng))[0]
     H = (turn * 10.0 ** torch.linspace(-3, 3, 8)) @ turn.T
@@ -288,7 +286,7 @@ def test_soap_goes_down_a_narrow_valley_that_is_aslant():
     assert left["soap"] < 0.05 < 0.2 < left["adamw"]
 
 
-def test_an_outlier_is_cut_to_twice_the_usual_norm():
+def test_gradients_are_clipped_to_twice_the_average_norm():
     state = TrainingState(build("gcn", hidden=8), 1e-3, 0)
     good = [torch.ones_like(p) for p in state.params]
     state.update(good, 1e-3)
@@ -300,7 +298,7 @@ def test_an_outlier_is_cut_to_twice_the_usual_norm():
     assert float(state.gradient_norm) == pytest.approx(usual * (0.99 + 0.01 * GRADIENT_CLIP), rel=1e-4)
 
 
-def test_training_gone_astray_goes_on_from_the_best_at_half_the_rate():
+def test_divergence_restarts_from_the_best_at_half_rate():
     state = TrainingState(build("gcn", hidden=8), 1e-2, 0)
     good = [torch.ones_like(p) for p in state.params]
     state.update(good, 1e-2)
@@ -318,20 +316,18 @@ def test_training_gone_astray_goes_on_from_the_best_at_half_the_rate():
     state.update(good, 1e-2)
     assert state.optimizer.param_groups[0]["lr"] == pytest.approx(0.5e-2 / WARMUP_STEPS)
     moved = max(float((p.detach() - best[n]).abs().max()) for n, p in state.model.named_parameters())
-    assert moved == pytest.approx(
-        0.5e-2 / WARMUP_STEPS, rel=0.01
-    )  # as a first step: nothing of the old moments is left
+    assert moved == pytest.approx(0.5e-2 / WARMUP_STEPS, rel=0.01)  # a first step of Adam: the moments were reset
 
 
 @pytest.mark.parametrize(("after", "factor"), [((1.01, 1.02, 1.03, 1.04), 0.5), ((1.01, 1.02, 1.03, 1.02, 1.03), 1.0)])
-def test_training_that_gets_worse_check_by_check_has_gone_astray(after, factor):
+def test_repeated_worsening_is_divergence(after, factor):
     state = TrainingState(build("gcn"), 1e-3, 0)
     for rmse in (1.2, 1.0, *after):
         state.record({"RMSE": rmse})
     assert state.rate_factor == factor
 
 
-def test_longer_rollouts_begin_anew():
+def test_a_new_horizon_resets_moments_and_warm_up():
     state = TrainingState(build("gcn", hidden=8), 1e-2, 0)
     state.start_horizon(8)
     for _ in range(WARMUP_STEPS):
@@ -344,8 +340,8 @@ def test_longer_rollouts_begin_anew():
     assert step == pytest.approx(1e-2 / WARMUP_STEPS, rel=0.01)  # however much larger gradients have become
 
 
-def test_training_teaches_to_fall(tmp_path):
-    """A graph network knows nothing of gravity at first."""
+def test_training_learns_free_fall(tmp_path):
+    """A graph network from scratch learns gravity."""
     write_motions(tmp_path / "3_0.h5", falling(scenes=30, n=6, frames=6), {})
     options = replace(QUICK, steps=80, batch=8, keypoints=6, horizons="1", lr=2e-2, hidden=16, groups="3_0")
     torch.manual_seed(options.seed)
@@ -357,7 +353,7 @@ def test_training_teaches_to_fall(tmp_path):
     assert card["curve"]["loss"][-1] < 0.1 * card["curve"]["loss"][0]
 
 
-def test_the_card_says_what_made_the_weights(data, tmp_path):
+def test_card_records_the_training(data, tmp_path):
     lines = run("gcn", data, tmp_path / "a.safetensors", QUICK)
     model, card = load(tmp_path / "a.safetensors")
     assert str(tmp_path / "a.safetensors") in lines[0]
@@ -372,8 +368,8 @@ def test_the_card_says_what_made_the_weights(data, tmp_path):
 
 
 @pytest.mark.parametrize(("after", "optimizer"), [(1, "adamw"), (5, "adamw"), (5, "soap")])
-def test_a_run_that_was_stopped_goes_on_to_the_same_curve(data, tmp_path, monkeypatch, after, optimizer):
-    options = replace(QUICK, optimizer=optimizer)
+def test_resumed_training_repeats_the_curve(data, tmp_path, monkeypatch, after, optimizer):
+    options = replace(QUICK, optimizer=optimizer, device="cpu")  # where results repeat to the bit
     run("pointformer", data, tmp_path / "whole.safetensors", options)  # with dropout
     with monkeypatch.context() as patch:
         update = TrainingState.update
@@ -401,7 +397,7 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_curve(data, tmp_path, monkey
         assert torch.equal(p, q)
 
 
-def test_training_begins_with_other_weights_and_tells_of_them(data, tmp_path):
+def test_training_from_weights_extends_their_runs(data, tmp_path):
     first, second = tmp_path / "first.safetensors", tmp_path / "second.safetensors"
     run("gcn", data, first, QUICK)
     still = replace(QUICK, steps=1, lr=1e-9, hidden=0)
@@ -419,7 +415,7 @@ def test_training_begins_with_other_weights_and_tells_of_them(data, tmp_path):
             run(**{"data": data, "out": second, "options": still, "start": first, **wrong})
 
 
-def test_a_checkpoint_of_something_else_is_refused(data, tmp_path):
+def test_other_checkpoints_are_rejected(data, tmp_path):
     out = tmp_path / "a.safetensors"
     with pytest.raises(InputError, match="no such file"):
         run("gcn", data, out, QUICK, resume=True)
@@ -431,7 +427,7 @@ def test_a_checkpoint_of_something_else_is_refused(data, tmp_path):
         run("gcn", data, out, QUICK, resume=True)
 
 
-def test_an_rmse_that_is_not_finite_is_the_worst():
+def test_nonfinite_rmse_is_infinite():
     class Lost:
         def eval(self):
             pass
@@ -457,19 +453,19 @@ def test_an_rmse_that_is_not_finite_is_the_worst():
         ({"speeds": -0.1}, "--speeds"),
     ],
 )
-def test_what_cannot_be_trained_on_is_said(data, tmp_path, change, message):
+def test_unusable_data_and_options_are_reported(data, tmp_path, change, message):
     with pytest.raises(InputError, match=message):
         run("ngff", data, tmp_path / "a.safetensors", replace(QUICK, **change))
     assert not (tmp_path / "a.safetensors").exists()
 
 
-def test_every_fourth_step_sees_few_keypoints(data, tmp_path, monkeypatch):
+def test_every_fourth_step_uses_few_keypoints(data, tmp_path, monkeypatch):
     seen, draw = [], ClipSampler.draw
 
     def watched(self, *args):
-        piece = draw(self, *args)
-        seen.append(piece.points.shape[2])
-        return piece
+        clip = draw(self, *args)
+        seen.append(clip.points.shape[2])
+        return clip
 
     monkeypatch.setattr(ClipSampler, "draw", watched)
     run("ngff", data, tmp_path / "a.safetensors", replace(QUICK, steps=6, few=4, speeds=0.1))
@@ -479,15 +475,16 @@ def test_every_fourth_step_sees_few_keypoints(data, tmp_path, monkeypatch):
 def test_the_command_trains(data, tmp_path):
     out = tmp_path / "gcn.safetensors"
     words = "--steps 2 --batch 2 --keypoints 8 --few 4 --speeds 0.1 --horizons 3 --loss relative --hidden 8"
-    words += f" --groups 3_0,3_1 --device cpu -o {out}"
+    words += f" --groups 3_0,3_1 -o {out}"
     result = CliRunner().invoke(app, ["train", "gcn", "--data", str(data), *words.split()])
     assert result.exit_code == 0, result.output
     assert "RMSE" in result.stdout
     assert load(out)[1]["runs"][0]["steps"] == 2
 
 
-def test_two_processes_train_as_one_with_the_whole_batch(data, tmp_path):
-    """Each takes half of every batch, and gradients are averaged: only the order of sums differs."""
+@pytest.mark.slow
+def test_two_processes_equal_one_with_the_whole_batch(data, tmp_path):
+    """Each computes half of every batch and gradients are averaged: only the order of sums differs."""
     words = ["train", "gcn", "--data", str(data), "--device", "cpu"]
     words += ["--steps", "6", "--batch", "4", "--keypoints", "8", "--horizons", "3", "--hidden", "8"]
     words += ["--groups", "3_0,3_1"]
@@ -502,15 +499,15 @@ def test_two_processes_train_as_one_with_the_whole_batch(data, tmp_path):
         for i in range(2)
     ]  # fmt: skip
     for process in crew:
-        said = process.communicate(timeout=120)[1]
-        assert process.returncode == 0, said
+        error = process.communicate(timeout=120)[1]
+        assert process.returncode == 0, error
     (one, _), (two, card) = (load(tmp_path / f"{name}.safetensors") for name in ("one", "two"))
     assert card["runs"][0]["processes"] == 2 and card["runs"][0]["steps"] == 6
     for p, q in zip(one.parameters(), two.parameters(), strict=True):
         assert_close(p, q, rtol=1e-3, atol=1e-5)
 
 
-def test_a_batch_that_cannot_be_shared_is_said(data, tmp_path, monkeypatch):
+def test_indivisible_batch_is_rejected(data, tmp_path, monkeypatch):
     monkeypatch.setenv("WORLD_SIZE", "2")
     with pytest.raises(InputError, match="multiple of 2"):
         run("gcn", data, tmp_path / "a.safetensors", replace(QUICK, batch=3))
@@ -518,16 +515,16 @@ def test_a_batch_that_cannot_be_shared_is_said(data, tmp_path, monkeypatch):
 
 @pytest.mark.gpu
 @pytest.mark.parametrize("name", MODELS)
-def test_a_cuda_graph_gives_the_same(name):
+def test_cuda_graph_equals_eager(name):
     if not torch.cuda.is_available():
         pytest.skip("needs an NVIDIA GPU")
     torch.manual_seed(0)
     model = build(name, hidden=16).cuda().eval()
-    pieces, rng = ClipSampler(without_last(falling()), "cuda", model), torch.Generator().manual_seed(0)
+    sampler, rng = ClipSampler(without_last(falling()), "cuda", model), torch.Generator().manual_seed(0)
     recorded, plain = RolloutLoss(model, DT), RolloutLoss(model, DT, graph=False)
     for _ in range(3):
-        piece = pieces.draw(4, 3, rng)
-        (loss, grads), (loss_, grads_) = recorded(piece), plain(piece)
+        clip = sampler.draw(4, 3, rng)
+        (loss, grads), (loss_, grads_) = recorded(clip), plain(clip)
         assert recorded.graph is not None
         assert_close(loss, loss_)
         for a, b in zip(grads, grads_, strict=True):

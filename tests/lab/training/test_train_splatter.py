@@ -1,4 +1,4 @@
-"""The splat head learns; the rest of the network does not change."""
+"""Training of the splat head: it improves, and the rest of the network does not change."""
 
 import dataclasses
 import json
@@ -31,7 +31,7 @@ from tests.reconstruct.raycast import arc, photograph, write_set
 
 @pytest.fixture(autouse=True)
 def one_thread():
-    """Images are tiny here, and two threads would only wait for each other."""
+    """Images are tiny here; a second thread only costs time."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     yield
@@ -40,7 +40,7 @@ def one_thread():
 
 @pytest.fixture
 def folder(tmp_path):
-    """One scene of two balls, seen from eight sides."""
+    """One scene of two balls with eight cameras."""
     (tmp_path / "data").mkdir()
     write_scene(tmp_path / "data/balls.ply", dataclasses.replace(two_balls_scene(), cameras=ring(8, 64, 0.1)))
     return tmp_path / "data"
@@ -49,7 +49,7 @@ def folder(tmp_path):
 QUICK = SplatterOptions(steps=20, views=2, side=28, depth="given", width=16, lr=1e-2, device="cpu")
 
 
-def test_unseen_views_get_better_and_only_the_head_changes(folder, tmp_path):
+def test_held_out_views_improve_and_only_the_head_changes(folder, tmp_path):
     lines = list(run(folder, tmp_path / "w.safetensors", QUICK))
     facts = json.loads((tmp_path / "w.json").read_text())
     history = facts["history"]
@@ -63,7 +63,7 @@ def test_unseen_views_get_better_and_only_the_head_changes(folder, tmp_path):
     assert changed and all(name.startswith("encoder.feature_") for name in changed)
 
 
-def test_the_file_serves_reconstruct_and_further_training(folder, tmp_path):
+def test_weights_serve_reconstruct_and_further_training(folder, tmp_path):
     list(run(folder, tmp_path / "w.safetensors", dataclasses.replace(QUICK, steps=4)))
     model = load(tmp_path / "w.safetensors", "pi3-splat")
     scene = read_training_scenes(folder, QUICK.side)[0]
@@ -71,7 +71,7 @@ def test_the_file_serves_reconstruct_and_further_training(folder, tmp_path):
     assert not fresh and held_out_psnr(again, scene, QUICK, "cpu") == held_out_psnr(model, scene, QUICK, "cpu")
 
 
-def test_weights_of_pi3_alone_get_a_fresh_head(tmp_path):
+def test_pi3_weights_get_an_untrained_head(tmp_path):
     base = random_weights(Pi3(TINY))
     save_file(base.state_dict(), tmp_path / "pi3.safetensors")
     model, fresh = load_network(tmp_path / "pi3.safetensors", dataclasses.replace(QUICK, width=0))
@@ -80,7 +80,7 @@ def test_weights_of_pi3_alone_get_a_fresh_head(tmp_path):
     assert frozen.isdisjoint({"feature_decoder", "feature_head"}) and {"encoder", "decoder", "point_head"} <= frozen
 
 
-def test_true_depth_puts_pixels_on_the_surface():
+def test_true_depth_gives_points_on_the_surface():
     scene = render_views("balls", dataclasses.replace(two_balls_scene(), cameras=ring(8, 64, 0.1)), 56)
     geometry = view_geometry(None, scene, QUICK)
     world = geometry.points @ geometry.poses[:, None, :3, :3].mT + geometry.poses[:, None, None, :3, 3]
@@ -102,7 +102,7 @@ def test_posed_photos_are_read_with_their_cameras(tmp_path):
     assert (scene.images[0].mean((1, 2)) - photograph(arc(5, (64, 48)), 0)[0].mean((0, 1))).abs().max() < 0.02
 
 
-def test_what_does_not_go_together_is_said(folder, tmp_path):
+def test_inconsistent_options_are_reported(folder, tmp_path):
     with pytest.raises(InputError, match="holds neither scenes"):
         list(run(tmp_path / "data" / "..", tmp_path / "w.safetensors", QUICK))
     write_set(folder / "table", arc(5, (64, 48)))
@@ -114,19 +114,19 @@ def test_what_does_not_go_together_is_said(folder, tmp_path):
             dataclasses.replace(QUICK, **wrong)
 
 
-def test_depth_of_the_network_takes_the_scale_of_the_given_cameras():
+def test_predicted_depth_is_scaled_to_the_given_cameras():
     cameras = arc(4, (56, 42))
-    said = truth(cameras, scale=3.7)  # in a frame and unit of its own
-    encoder = SimpleNamespace(tokens=lambda *_: (None, None), geometry=lambda *_: said)
+    predicted = truth(cameras, scale=3.7)  # in a frame and unit of its own
+    encoder = SimpleNamespace(tokens=lambda *_: (None, None), geometry=lambda *_: predicted)
     images = torch.stack([photograph(cameras, i)[0] for i in range(4)]).permute(0, 3, 1, 2)
     views = PosedViews("table", images, cameras.viewmats, cameras.Ks, None)
     options = dataclasses.replace(QUICK, depth="network")
     geometry = view_geometry(SimpleNamespace(encoder=encoder), views, options)
-    torch.testing.assert_close(geometry.points, said.points / 3.7, rtol=1e-3, atol=1e-3)
+    torch.testing.assert_close(geometry.points, predicted.points / 3.7, rtol=1e-3, atol=1e-3)
     torch.testing.assert_close(geometry.poses, torch.linalg.inv(cameras.viewmats))
 
 
-def test_posed_photos_train_the_head_at_the_depth_of_the_network():
+def test_photos_train_the_head_at_predicted_depth():
     cameras = arc(4, (56, 42))
     images = torch.stack([photograph(cameras, i)[0] for i in range(4)]).permute(0, 3, 1, 2)
     options = dataclasses.replace(QUICK, depth="network")

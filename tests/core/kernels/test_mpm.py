@@ -1,4 +1,4 @@
-"""The kernels against their specification in PyTorch."""
+"""The MPM substep against its PyTorch specification; reproducibility and clean-up of the launch orders."""
 
 import pytest
 import torch
@@ -24,7 +24,7 @@ def cloud(p: int = 300, seed: int = 0) -> mpm.Particles:
 
 
 @pytest.mark.parametrize("device", DEVICES)
-def test_a_step_equals_its_reference(device):
+def test_substep_equals_its_reference(device):
     # float32 against float64: sums of a few dozen terms, so 1e-5 of the largest value
     ours = cloud()
     solver = mpm.Solver(ours, mpm.Box((0, 0, 0), (1, 1, 1)), DX, device)
@@ -45,7 +45,7 @@ def test_a_step_equals_its_reference(device):
     assert walls[0].tolist() == [GRID_PADDING] * 3
 
 
-def test_the_same_bytes_whatever_the_number_of_threads(monkeypatch):
+def test_result_is_bit_identical_for_any_number_of_threads(monkeypatch):
     push = torch.tensor([0.0, 0.0, -9.81]).repeat(300, 1)
     results = []
     for threads in (1, 3):
@@ -57,8 +57,8 @@ def test_the_same_bytes_whatever_the_number_of_threads(monkeypatch):
     assert torch.equal(*results)
 
 
-def test_a_step_leaves_the_grid_clean():
-    # what one substep scattered must not come back in a later one, also where particles have moved on
+def test_grid_is_zero_after_a_frame():
+    # momentum scattered in one substep must be cleared before the next, also where particles have left
     solver = mpm.Solver(cloud(), mpm.Box((0, 0, 0), (1, 1, 1)), DX)
     solver.advance(0.05, torch.zeros(300, 3))
     assert not solver._substepper._momentum.any()

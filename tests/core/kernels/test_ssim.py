@@ -1,4 +1,4 @@
-"""Structural similarity against scipy, by hand, and by finite differences."""
+"""SSIM against scipy, analytic values and finite differences."""
 
 import numpy as np
 import pytest
@@ -18,8 +18,8 @@ def pair(shape, seed: int = 0):
     return first, (first + 0.2 * torch.randn(shape, generator=rng)).clamp(0, 1)
 
 
-def scipys(first: np.ndarray, second: np.ndarray) -> float:
-    """The formula with scipy's filter: sigma 1.5 cut at 5 pixels, zeros outside."""
+def scipy_ssim(first: np.ndarray, second: np.ndarray) -> float:
+    """SSIM with scipy's filter: sigma 1.5, radius 5 pixels, zero padding."""
 
     def blur(image):
         return gaussian_filter(image, (1.5, 1.5, 0), truncate=5 / 1.5, mode="constant")
@@ -32,15 +32,15 @@ def scipys(first: np.ndarray, second: np.ndarray) -> float:
 
 @pytest.mark.parametrize("device", devices)
 @pytest.mark.parametrize("shape", SIZES)
-def test_value_is_that_of_the_formula_with_scipys_filter(device, shape):
+def test_value_equals_ssim_with_scipys_filter(device, shape):
     first, second = pair(shape)
-    theirs = scipys(first.double().numpy(), second.double().numpy())
+    theirs = scipy_ssim(first.double().numpy(), second.double().numpy())
     assert float(ssim(first.to(device), second.to(device))) == pytest.approx(theirs, abs=2e-6)
 
 
 @pytest.mark.parametrize("device", devices)
 @pytest.mark.parametrize("shape", SIZES)
-def test_gradient_of_both_images_is_that_of_the_reference(device, shape):
+def test_gradients_by_both_images_equal_the_reference(device, shape):
     ours = [image.to(device).requires_grad_() for image in pair(shape)]
     exact = [image.detach().double().requires_grad_() for image in ours]
     mine = torch.autograd.grad(3 * ssim(*ours), ours)
@@ -51,7 +51,7 @@ def test_gradient_of_both_images_is_that_of_the_reference(device, shape):
 
 @pytest.mark.parametrize("device", devices)
 @pytest.mark.parametrize("shape", SIZES)
-def test_one_thread_a_value_says_the_same(device, shape):
+def test_per_pixel_kernels_equal_the_reference(device, shape):
     first, second = (image.to(device) for image in pair(shape))
     leaf = first.clone().double().requires_grad_()
     true = ssim_reference(leaf, second.double())
@@ -61,19 +61,19 @@ def test_one_thread_a_value_says_the_same(device, shape):
     assert float((ssim_pixel.ssim_backward(first, second, slopes) - grad).norm() / grad.norm()) < 1e-5
 
 
-def test_gradient_is_the_slope():
+def test_gradient_equals_finite_differences():
     first, second = (image.double() for image in pair((9, 14, 3), seed=3))
     assert torch.autograd.gradcheck(lambda x: ssim_reference(x, second), first.requires_grad_())
     leaf = first.detach().float().requires_grad_()
     (grad,) = torch.autograd.grad(ssim(leaf, second.float()), leaf)
     step = torch.randn(first.shape, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
     h = 1e-4
-    slope = (scipys((first + h * step).detach().numpy(), second.numpy())
-             - scipys((first - h * step).detach().numpy(), second.numpy())) / (2 * h)  # fmt: skip
+    slope = (scipy_ssim((first + h * step).detach().numpy(), second.numpy())
+             - scipy_ssim((first - h * step).detach().numpy(), second.numpy())) / (2 * h)  # fmt: skip
     assert float((grad.double() * step).sum()) == pytest.approx(slope, rel=1e-5)
 
 
-def test_equal_images_score_one_and_are_a_maximum():
+def test_equal_images_have_ssim_one_and_zero_gradient():
     first, _ = pair((20, 20, 3))
     leaf = first.clone().requires_grad_()
     value = ssim(leaf, first)
@@ -81,13 +81,13 @@ def test_equal_images_score_one_and_are_a_maximum():
     assert value.item() == pytest.approx(1, abs=1e-6) and grad.abs().max() < 1e-6
 
 
-def test_black_against_white_is_the_constant():
-    # inside, means 0 and 1 and no variance: C1 / (1 + C1); at the border, where the mean of white falls, not much more
+def test_black_against_white_equals_the_analytic_value():
+    # interior: means 0 and 1, variance 0: C1 / (1 + C1); at the zero-padded border slightly more
     value = ssim(torch.zeros(31, 31, 1), torch.ones(31, 31, 1))
-    assert float(value) == pytest.approx(scipys(np.zeros((31, 31, 1)), np.ones((31, 31, 1))), abs=1e-7)
+    assert float(value) == pytest.approx(scipy_ssim(np.zeros((31, 31, 1)), np.ones((31, 31, 1))), abs=1e-7)
     assert float(value) < 1e-3
 
 
-def test_images_of_different_shape_are_refused():
+def test_images_of_different_shape_raise():
     with pytest.raises(ValueError, match="different shape"):
         ssim(torch.zeros(3, 4, 3), torch.zeros(4, 3, 3))

@@ -1,4 +1,4 @@
-"""The one interface: by hand, against the reference, and the same on every device."""
+"""Rasterisation: analytic cases, comparison with the reference, and agreement of the devices."""
 
 import gc
 import sys
@@ -19,13 +19,13 @@ from tests.conftest import random_gaussians, ring
 
 devices = ["cpu"] + (["cuda"] if torch.cuda.is_available() else [])
 EYE = look_at(torch.tensor([2.0, 0.0, 0.0]), torch.zeros(3))  # looks along -x; right is +y, up is +z
-SIZE, FOCAL = 41, 50.0  # odd: the axis goes through the centre of pixel (20, 20)
+SIZE, FOCAL = 41, 50.0  # odd: the optical axis passes through the centre of pixel (20, 20)
 K = intrinsics(SIZE, SIZE, FOCAL)
 
 
-def round_ones(*spots: tuple, device: str = "cpu") -> Gaussians:
+def isotropic(*blobs: tuple, device: str = "cpu") -> Gaussians:
     """Isotropic Gaussians given as (mean, standard deviation, opacity, colour)."""
-    means, sizes, opacities, colours = (torch.tensor(column, device=device) for column in zip(*spots, strict=True))
+    means, sizes, opacities, colours = (torch.tensor(column, device=device) for column in zip(*blobs, strict=True))
     n = len(means)
     quats = torch.tensor([[1.0, 0, 0, 0]], device=device).repeat(n, 1)
     ids = torch.zeros(n, dtype=torch.int64, device=device)
@@ -49,9 +49,9 @@ def reference(tensors, viewmat, K, width: int, height: int):
 
 
 @pytest.mark.parametrize("device", devices)
-def test_one_gaussian_by_hand(device):
+def test_single_gaussian_equals_the_analytic_image(device):
     # Standard deviation 0.1 at distance 2: variance (0.1 * 50 / 2)^2 + 0.3 = 6.55 px^2.
-    shot = draw(round_ones(((0.0, 0.0, 0.0), 0.1, 0.8, (1.0, 0.5, 0.25)), device=device))
+    shot = draw(isotropic(((0.0, 0.0, 0.0), 0.1, 0.8, (1.0, 0.5, 0.25)), device=device))
     centre = shot.rgb[0, 20, 20].cpu()
     torch.testing.assert_close(centre, 0.8 * torch.tensor([1.0, 0.5, 0.25]), rtol=0, atol=1e-5)
     assert float(shot.alpha[0, 20, 20]) == pytest.approx(0.8, abs=1e-5)
@@ -65,25 +65,25 @@ def test_one_gaussian_by_hand(device):
 
 
 @pytest.mark.parametrize("device", devices)
-def test_right_is_right_and_up_is_up(device):
-    shot = draw(round_ones(((0.0, 0.4, 0.2), 0.05, 0.9, (1.0, 1.0, 1.0)), device=device))
+def test_image_axes_point_right_and_down(device):
+    shot = draw(isotropic(((0.0, 0.4, 0.2), 0.05, 0.9, (1.0, 1.0, 1.0)), device=device))
     row, column = divmod(int(shot.alpha[0].argmax()), SIZE)
     assert (row, column) == (20 - 5, 20 + 10)  # 50 px * 0.2 / 2 up, 50 * 0.4 / 2 to the right
 
 
 @pytest.mark.parametrize("device", devices)
-def test_near_hides_far_whatever_the_order(device):
+def test_near_gaussians_occlude_far_ones_in_any_order(device):
     red, green = ((0.5, 0.0, 0.0), 0.3, 0.9, (1.0, 0.0, 0.0)), ((-0.5, 0.0, 0.0), 0.3, 0.9, (0.0, 1.0, 0.0))
-    for spots in ((red, green), (green, red)):
-        shot = draw(round_ones(*spots, device=device))
+    for blobs in ((red, green), (green, red)):
+        shot = draw(isotropic(*blobs, device=device))
         wanted = torch.tensor([0.9, 0.1 * 0.9, 0.0])
         torch.testing.assert_close(shot.rgb[0, 20, 20].cpu(), wanted, rtol=0, atol=1e-5)
         assert float(shot.depth[0, 20, 20]) == pytest.approx((0.9 * 1.5 + 0.09 * 2.5) / 0.99, abs=1e-4)
 
 
 @pytest.mark.parametrize("device", devices)
-def test_background_fills_what_is_left(device):
-    spot = round_ones(((0.0, 0.0, 0.0), 0.1, 0.8, (1.0, 0.0, 0.0)), device=device)
+def test_background_fills_the_remaining_transmittance(device):
+    spot = isotropic(((0.0, 0.0, 0.0), 0.1, 0.8, (1.0, 0.0, 0.0)), device=device)
     blue = torch.tensor([0.0, 0.25, 0.5])
     shot = draw(spot, blue.to(device))
     torch.testing.assert_close(shot.rgb[0, 0, 0].cpu(), blue)
@@ -150,12 +150,12 @@ def test_gsplat_and_the_kernels_agree_on_a_large_scene():
 
 
 @pytest.mark.parametrize("device", devices)
-def test_descent_finds_the_gaussian_again(device):
-    wanted = draw(round_ones(((0.0, 0.1, -0.05), 0.15, 0.7, (0.9, 0.4, 0.2)), device=device)).rgb.detach()
-    start = leaves(round_ones(((0.0, -0.1, 0.1), 0.2, 0.5, (0.5, 0.5, 0.5)), device=device))
+def test_gradient_descent_recovers_a_gaussian(device):
+    wanted = draw(isotropic(((0.0, 0.1, -0.05), 0.15, 0.7, (0.9, 0.4, 0.2)), device=device)).rgb.detach()
+    start = leaves(isotropic(((0.0, -0.1, 0.1), 0.2, 0.5, (0.5, 0.5, 0.5)), device=device))
     optimiser = torch.optim.Adam(start, lr=0.01)
     losses = []
-    for _ in range(200):
+    for _ in range(160):
         shot = draw(Gaussians(*start, torch.zeros(1, dtype=torch.int64, device=device)))
         losses.append((shot.rgb - wanted).square().mean())
         optimiser.zero_grad()
@@ -167,10 +167,10 @@ def test_descent_finds_the_gaussian_again(device):
 
 
 @pytest.mark.parametrize("device", devices)
-def test_what_cannot_be_seen_changes_nothing(device):
+def test_invisible_gaussians_have_no_effect(device):
     seen = random_gaussians(30, degree=1)
     hidden = random_gaussians(4, seed=1, degree=1)
-    # behind, at the camera, beside the image, nearer than `near`
+    # behind, at the camera, outside the image, nearer than `near`
     hidden.means[:] = torch.tensor([[5.0, 0, 0], [2.0, 0, 0], [0, 30, 0], [1.995, 0, 0]])
     both = Gaussians(*(torch.cat([getattr(seen, f), getattr(hidden, f)]) for f in vars(seen)))
     tensors = leaves(both.to(device))
@@ -181,7 +181,7 @@ def test_what_cannot_be_seen_changes_nothing(device):
         assert grad.isfinite().all() and (grad[30:] == 0).all()
 
 
-def test_no_gaussians_show_the_background():
+def test_empty_scene_shows_the_background():
     none = random_gaussians(5)[torch.zeros(5, dtype=torch.bool)]
     shot = draw(none, torch.tensor([0.1, 0.2, 0.3]))
     assert (shot.rgb == torch.tensor([0.1, 0.2, 0.3])).all() and (shot.alpha == 0).all() and (shot.depth == 0).all()
@@ -192,7 +192,7 @@ def test_no_gaussians_show_the_background():
 
 @pytest.mark.parametrize("device", devices)
 @pytest.mark.parametrize("count", [1, 3, 4, 7])
-def test_features_are_drawn_like_colours(device, count):
+def test_features_are_composited_like_colours(device, count):
     gaussians, cameras = random_gaussians(200, degree=0).to(device), ring(2, size=48)
     colours = torch.rand(200, count, generator=torch.Generator().manual_seed(1)).to(device).requires_grad_()
     image = rasterise_features(gaussians, colours, cameras.viewmats, cameras.Ks, 48, 40)
@@ -201,26 +201,26 @@ def test_features_are_drawn_like_colours(device, count):
         grey = colours[:, channel : channel + 1].detach().expand(-1, 3)
         shot = rasterise(replace(gaussians, sh=rgb_to_sh(grey)), cameras.viewmats, cameras.Ks, 48, 40)
         torch.testing.assert_close(image[..., channel].detach(), shot.rgb[..., 0], rtol=0, atol=1e-5)
-    # the derivative by a Gaussian's feature is its weight
+    # the derivative by a feature is the Gaussian's total weight
     (grad,) = torch.autograd.grad(image.sum(), colours)
     weights = sum(visibility(gaussians, V, K, 48, 40)[1] for V, K in zip(cameras.viewmats, cameras.Ks, strict=True))
     torch.testing.assert_close(grad[:, -1], weights, rtol=1e-3, atol=1e-3)
 
 
 @pytest.mark.parametrize("device", devices)
-def test_visibility_adds_up_to_alpha_and_names_the_nearest(device):
+def test_visibility_weights_sum_to_alpha(device):
     gaussians = random_gaussians(300).to(device)
     index, weight = visibility(gaussians, EYE, K, SIZE, SIZE)
     alpha = draw(gaussians).alpha[0]
     assert float(weight.sum()) == pytest.approx(float(alpha.sum()), rel=1e-4)
     assert torch.equal(index >= 0, alpha > 0)
     red, green = ((0.5, 0.0, 0.0), 0.1, 0.9, (1.0, 0.0, 0.0)), ((-0.5, 0.0, 0.0), 0.3, 0.9, (0.0, 1.0, 0.0))
-    index, weight = visibility(round_ones(green, red, device=device), EYE, K, SIZE, SIZE)
+    index, weight = visibility(isotropic(green, red, device=device), EYE, K, SIZE, SIZE)
     assert index[20, 20] == 1 and index[20, 30] == 0 and index[0, 0] == -1 and (weight > 0).all()
 
 
 @pytest.mark.parametrize("device", devices)
-def test_absolute_gradient_arrives_with_backward(device):
+def test_absolute_gradients_are_available_after_backward(device):
     gaussians, cameras = random_gaussians(50).to(device), ring(2, size=48)
     tensors = leaves(gaussians)
     shot = rasterise(Gaussians(*tensors, gaussians.object_id), cameras.viewmats, cameras.Ks, 48, 48)
@@ -231,11 +231,11 @@ def test_absolute_gradient_arrives_with_backward(device):
 
 
 @pytest.mark.parametrize("device", devices)
-def test_nothing_of_a_step_is_kept_after_it(device):
-    """Otherwise a fit of thousands of steps fills the memory."""
+def test_autograd_graph_is_freed_after_a_step(device):
+    """Otherwise memory grows with the number of optimisation steps."""
     gaussians, cameras = random_gaussians(50).to(device), ring(1, size=48)
     tensors = leaves(gaussians)
-    gc.disable()  # which would find circles of Python's own, sooner or later
+    gc.disable()  # so that reference cycles are not collected
     try:
         moved = tensors[0] + 1e-3
         mark = moved.grad_fn.metadata["mark"] = set()
@@ -249,23 +249,23 @@ def test_nothing_of_a_step_is_kept_after_it(device):
         gc.enable()
 
 
-def test_the_same_again_is_the_same():
-    gaussians, cameras = random_gaussians(2000, degree=2), ring(1, size=160)
+def test_repeated_rendering_is_bit_identical():
+    gaussians, cameras = random_gaussians(1000, degree=2), ring(1, size=112)
     results = []
     for _ in range(2):
         tensors = leaves(gaussians)
-        shot = rasterise(Gaussians(*tensors, gaussians.object_id), cameras.viewmats, cameras.Ks, 160, 160)
+        shot = rasterise(Gaussians(*tensors, gaussians.object_id), cameras.viewmats, cameras.Ks, 112, 112)
         results.append((shot.rgb.detach(), *torch.autograd.grad(shot.rgb.square().sum(), tensors)))
     for first, second in zip(*results, strict=True):
         assert torch.equal(first, second)
 
 
-def test_gsplat_is_left_alone_without_a_gpu(monkeypatch):
+def test_gsplat_is_not_imported_without_a_gpu(monkeypatch):
     monkeypatch.setitem(sys.modules, "gsplat", None)  # an import would fail
     assert draw(random_gaussians(10)).alpha.max() > 0
 
 
-def test_a_broken_set_of_harmonics_is_refused():
+def test_incomplete_harmonics_raise():
     gaussians = random_gaussians(5, degree=1)
     with pytest.raises(ValueError, match="no full set"):
         draw(replace(gaussians, sh=gaussians.sh[:, :3]))

@@ -1,4 +1,4 @@
-"""The Triton kernels of the force field against plain PyTorch in double precision."""
+"""The stand-alone Triton kernels of the force field against their references in double precision."""
 
 import pytest
 import torch
@@ -21,14 +21,14 @@ def rand(*shape: int, seed: int = 0) -> torch.Tensor:
 @pytest.mark.parametrize("b, o, n", [(1, 1, 5), (2, 3, 70), (1, 4, 300)])
 def test_nearest_equals_its_reference(b, o, n):
     points = torch.rand(b, o, n, 3, generator=torch.Generator().manual_seed(n)).cuda()
-    points[:, -1] += 5  # out of reach
+    points[:, -1] += 5  # beyond the radius
     valid = rand(b, o, n) > -1
-    valid[-1, 0] = False  # an object that is not there
+    valid[-1, 0] = False  # an empty (padding) object
     distance, index = nearest_between_objects(points, valid, 0.2)
-    wanted, which = nearest_between_objects_reference(points.double(), valid, 0.2)
-    torch.testing.assert_close(distance.double(), wanted, rtol=1e-6, atol=1e-7)
-    there = wanted.isfinite()
-    assert torch.equal(index[there], which[there])
+    expected, expected_index = nearest_between_objects_reference(points.double(), valid, 0.2)
+    torch.testing.assert_close(distance.double(), expected, rtol=1e-6, atol=1e-7)
+    finite = expected.isfinite()
+    assert torch.equal(index[finite], expected_index[finite])
     assert int(index.min()) >= 0 and int(index.max()) < n
 
 
@@ -48,12 +48,12 @@ def test_perceptron_equals_its_reference(widths, active, many):
     exact = [x.double(), *exact, vectors if vectors is None else vectors.double()]
     wanted = perceptron_reference(*exact, known.double(), None, active)
     torch.testing.assert_close(found[near].double(), wanted[near], rtol=1e-5, atol=1e-5)
-    assert not found[:32].any()  # a block without any near row is left out
+    assert not found[:32].any()  # blocks without rows in `near` are skipped
     bare = perceptron(x, weights, biases, vectors, active=active)
     wanted = perceptron_reference(*exact, active=active)
     torch.testing.assert_close(bare.double(), wanted, rtol=1e-5, atol=1e-5)
 
 
-def test_thin_product_is_the_matrix_product():
+def test_skinny_matmul_equals_the_matrix_product():
     A, x = rand(2, 3, 50, 200).half(), rand(2, 3, 200, 9)
     torch.testing.assert_close(skinny_matmul(A, x).double(), A.double() @ x.double(), rtol=1e-5, atol=1e-4)

@@ -1,4 +1,4 @@
-"""Material models at one point, against theory."""
+"""Constitutive models at one material point against theory."""
 
 import math
 
@@ -12,7 +12,7 @@ from tests.conftest import DEVICES
 MU, LAM = 4e4, 6e4
 
 
-def answer(model: int, F: torch.Tensor, plastic=(0.0, 0.0, 0.0), state: float = 0.0, dt: float = 0.0, device="cpu"):
+def respond(model: int, F: torch.Tensor, plastic=(0.0, 0.0, 0.0), state: float = 0.0, dt: float = 0.0, device="cpu"):
     p = len(F)
     rows = torch.full((p,), model, dtype=torch.int8), F, torch.tensor([[MU, LAM, 0.0]]).repeat(p, 1), \
         torch.tensor([plastic], dtype=torch.float32).repeat(p, 1), torch.full((p,), state)  # fmt: skip
@@ -20,15 +20,15 @@ def answer(model: int, F: torch.Tensor, plastic=(0.0, 0.0, 0.0), state: float = 
 
 
 def deformed(p: int = 50, size: float = 0.3, seed: int = 0) -> torch.Tensor:
-    """Turned and deformed at random."""
+    """Random rotations times random stretches (p, 3, 3)."""
     rng = torch.Generator().manual_seed(seed)
-    turn = torch.linalg.qr(torch.randn(p, 3, 3, generator=rng))[0]
-    turn = turn * torch.linalg.det(turn).sign()[:, None, None]
-    return turn @ (torch.eye(3) + size * (torch.rand(p, 3, 3, generator=rng) - 0.5))
+    rotation = torch.linalg.qr(torch.randn(p, 3, 3, generator=rng))[0]
+    rotation = rotation * torch.linalg.det(rotation).sign()[:, None, None]
+    return rotation @ (torch.eye(3) + size * (torch.rand(p, 3, 3, generator=rng) - 0.5))
 
 
 def energy(model: int, F: torch.Tensor) -> torch.Tensor:
-    """Stored energy a volume at rest."""
+    """Stored energy per volume at rest [J/m^3]."""
     J = torch.linalg.det(F)
     S = torch.linalg.svdvals(F)
     if model == NEO_HOOKEAN:
@@ -43,31 +43,31 @@ def energy(model: int, F: torch.Tensor) -> torch.Tensor:
     (NEO_HOOKEAN, (0, 0, 0)), (COROTATED, (0, 0, 0)), (VON_MISES, (1e9, 0, 0)), (SNOW, (0.9, 9, 0)),
 ])  # fmt: skip
 def test_stress_is_the_derivative_of_the_stored_energy(model, plastic, device):
-    # tau = dW/dF F^T, by autograd in float64; what does not yield is elastic
+    # tau = dW/dF F^T, by autograd in float64, below the yield stress
     F = deformed()
-    kept, tau, _ = answer(model, F, plastic, device=device)
+    kept, tau, _ = respond(model, F, plastic, device=device)
     exact = F.double().requires_grad_()
     energy(COROTATED if model == SNOW else model, exact).sum().backward()
     torch.testing.assert_close(tau.double(), exact.grad @ F.double().mT, rtol=0, atol=3e-5 * MU)
     torch.testing.assert_close(kept, F, rtol=0, atol=2e-6)
 
 
-def test_corotated_equals_its_reference_also_when_inverted():
+def test_corotated_equals_its_reference_including_inversion():
     F = deformed(size=0.4)
-    torch.testing.assert_close(answer(COROTATED, F)[1], materials.corotated_reference(F, MU, LAM), rtol=0, atol=3)
+    torch.testing.assert_close(respond(COROTATED, F)[1], materials.corotated_reference(F, MU, LAM), rtol=0, atol=3)
     flat = torch.diag(torch.tensor([1.0, 0.8, -0.2]))[None]
-    stress = answer(COROTATED, flat)[1][0]
-    # the rotation nearest to a turned-over body has no reflection: principal stress 2 mu (s - 1) s + lambda J (J - 1)
+    stress = respond(COROTATED, flat)[1][0]
+    # R of an inverted F has no reflection: principal stress 2 mu (s - 1) s + lambda J (J - 1)
     s, J = torch.tensor([1.0, 0.8, -0.2]), -0.16
     torch.testing.assert_close(stress.diag(), 2 * MU * (s - 1) * s + LAM * J * (J - 1), rtol=0, atol=3.0)
 
 
-def test_small_strain_is_hookes_law_for_all():
-    # uniaxial strain e: stress (lambda + 2 mu) e along, lambda e across; large strain changes it by order e^2
+def test_small_strains_follow_hookes_law():
+    # uniaxial strain e: stress (lambda + 2 mu) e along, lambda e across; finite strain changes it by order e^2
     e = 1e-3
     F = torch.diag(torch.tensor([1 + e, 1.0, 1.0]))[None]
     for model, plastic in ((NEO_HOOKEAN, (0, 0, 0)), (COROTATED, (0, 0, 0)), (VON_MISES, (1e9, 0, 0))):
-        tau = answer(model, F, plastic)[1][0]
+        tau = respond(model, F, plastic)[1][0]
         expected = torch.tensor([LAM + 2 * MU, LAM, LAM]) * e
         torch.testing.assert_close(tau.diag(), expected, rtol=3 * e, atol=0.05)
 
@@ -81,15 +81,15 @@ def deviator(tau: torch.Tensor) -> float:
     return float((tau - torch.einsum("pii->p", tau)[:, None, None] / 3 * torch.eye(3)).norm())
 
 
-def test_metal_yields_at_its_strength_and_keeps_its_volume():
+def test_von_mises_yields_at_the_yield_stress_and_preserves_volume():
     strength, F = 1e3, shear(0.2)
-    kept, tau, state = answer(VON_MISES, F, (strength, 0, 0))
+    kept, tau, state = respond(VON_MISES, F, (strength, 0, 0))
     assert deviator(tau) == pytest.approx(math.sqrt(2 / 3) * strength, rel=1e-4)
-    assert float(torch.linalg.det(kept)) == pytest.approx(1.0, abs=1e-5)  # plastic flow keeps the volume
-    # below the strength nothing stays
+    assert float(torch.linalg.det(kept)) == pytest.approx(1.0, abs=1e-5)  # plastic flow is isochoric
+    # elastic below the yield stress
     small = shear(0.5 * strength / (math.sqrt(3) * MU))
-    torch.testing.assert_close(answer(VON_MISES, small, (strength, 0, 0))[0], small, rtol=0, atol=1e-6)
-    # accumulated strain: what is left of the Hencky strain, sqrt(2/3) |de|
+    torch.testing.assert_close(respond(VON_MISES, small, (strength, 0, 0))[0], small, rtol=0, atol=1e-6)
+    # accumulated plastic strain: sqrt(2/3) |de| of the Hencky strain
     e = torch.linalg.svdvals(F).log()[0]
     flow = float(e.norm()) - math.sqrt(2 / 3) * strength / (2 * MU)
     assert float(state) == pytest.approx(math.sqrt(2 / 3) * flow, rel=1e-3)
@@ -97,13 +97,13 @@ def test_metal_yields_at_its_strength_and_keeps_its_volume():
 
 def test_hardening_and_softening_move_the_yield_stress():
     for H in (5e3, -2e3):
-        _, tau, state = answer(VON_MISES, shear(0.2), (1e3, H, 0))
+        _, tau, state = respond(VON_MISES, shear(0.2), (1e3, H, 0))
         assert deviator(tau) == pytest.approx(math.sqrt(2 / 3) * (1e3 + H * float(state)), rel=1e-3)
-    _, tau, _ = answer(VON_MISES, shear(0.2), (1e3, -2e3, 0), state=10.0)  # plasticine that was kneaded for long
+    _, tau, _ = respond(VON_MISES, shear(0.2), (1e3, -2e3, 0), state=10.0)  # softened to the residual strength
     assert deviator(tau) == pytest.approx(materials.RESIDUAL_STRENGTH * math.sqrt(2 / 3) * 1e3, rel=1e-3)
 
 
-def test_foam_relaxes_at_the_rate_of_its_viscosity():
+def test_viscoplastic_stress_relaxes_at_the_rate_of_perzyna_viscosity():
     # Perzyna: the stress above the yield surface decays as exp(-2 mu t / eta)
     strength, eta, F, dt = 1e3, 8e4, shear(0.1), 0.01
     rows = (torch.tensor([VON_MISES], dtype=torch.int8), torch.tensor([[MU, LAM, 0.0]]),
@@ -113,36 +113,36 @@ def test_foam_relaxes_at_the_rate_of_its_viscosity():
         F, tau, state = update_materials(rows[0], F, rows[1], rows[2], state, dt)
         excess.append(deviator(tau) - limit)
     rate = math.log(excess[0] / excess[-1]) / (59 * dt)
-    # implicit steps: (1 + 2 mu dt / eta) a step instead of the exponential
+    # implicit Euler: a factor 1 + 2 mu dt / eta per step instead of the exponential
     assert rate == pytest.approx(math.log(1 + 2 * MU * dt / eta) / dt, rel=0.01)
     assert rate == pytest.approx(2 * MU / eta, rel=0.01)
-    at_once = answer(VON_MISES, shear(0.1), (strength, 0, eta), dt=0.0)
-    torch.testing.assert_close(at_once[0], shear(0.1), rtol=0, atol=1e-6)  # no time, no flow
+    at_once = respond(VON_MISES, shear(0.1), (strength, 0, eta), dt=0.0)
+    torch.testing.assert_close(at_once[0], shear(0.1), rtol=0, atol=1e-6)  # dt = 0: no flow
 
 
-def test_sand_stays_in_its_cone_and_comes_apart():
+def test_sand_is_projected_to_its_cone_and_separates_without_stress():
     angle = math.radians(35)
     slope = materials.sand_slope(35.0)
     F = (torch.diag(torch.tensor([0.98, 0.97, 0.99])) @ shear(0.3)[0])[None]
-    _, tau, state = answer(SAND, F, (slope, 0, 0))
+    _, tau, state = respond(SAND, F, (slope, 0, 0))
     pressure = -float(torch.einsum("pii->", tau)) / 3
     # in plane strain Coulomb's limit is a shear of sin x pressure, and |dev| is sqrt(2) times the shear
     limit = math.sqrt(2) * math.sin(angle)
     assert deviator(tau) == pytest.approx(limit * pressure, rel=1e-3)
     assert float(state) == 0
     apart = torch.diag(torch.tensor([1.1, 1.0, 1.0]))[None]
-    kept, tau, state = answer(SAND, apart, (slope, 0, 0))
+    kept, tau, state = respond(SAND, apart, (slope, 0, 0))
     assert float(tau.abs().max()) < 1e-2 and float(state) == pytest.approx(math.log(1.1), rel=1e-4)
     torch.testing.assert_close(kept, torch.eye(3)[None], rtol=0, atol=1e-6)
-    # what came apart by a tenth is pressed together by as much before it resists again
-    _, tau, state = answer(SAND, torch.diag(torch.tensor([0.95, 1.0, 1.0]))[None], (slope, 0, 0), state=math.log(1.1))
+    # a volume gain of 10 % is compressed away before stress builds up again
+    _, tau, state = respond(SAND, torch.diag(torch.tensor([0.95, 1.0, 1.0]))[None], (slope, 0, 0), state=math.log(1.1))
     assert float(tau.abs().max()) < 1e-2 and float(state) == pytest.approx(math.log(1.1 * 0.95), abs=1e-4)
 
 
-def test_snow_packs_and_hardens():
+def test_snow_compacts_and_hardens():
     compress, stretch, xi = 0.025, 0.0075, 10.0
-    squeezed = 0.9 * torch.eye(3)[None]
-    kept, tau, state = answer(SNOW, squeezed, (compress, stretch, xi))
+    compressed = 0.9 * torch.eye(3)[None]
+    kept, tau, state = respond(SNOW, compressed, (compress, stretch, xi))
     torch.testing.assert_close(kept, (1 - compress) * torch.eye(3)[None], rtol=0, atol=1e-5)
     Jp = 0.9**3 / (1 - compress) ** 3
     assert math.exp(float(state)) == pytest.approx(Jp, rel=1e-4)
@@ -150,6 +150,6 @@ def test_snow_packs_and_hardens():
     J, s = (1 - compress) ** 3, 1 - compress
     assert hard > 1
     assert float(tau[0, 0, 0]) == pytest.approx(hard * (2 * MU * (s - 1) * s + LAM * J * (J - 1)), rel=2e-3)
-    kept, _, state = answer(SNOW, 1.1 * torch.eye(3)[None], (compress, stretch, xi))
+    kept, _, state = respond(SNOW, 1.1 * torch.eye(3)[None], (compress, stretch, xi))
     torch.testing.assert_close(kept, (1 + stretch) * torch.eye(3)[None], rtol=0, atol=1e-5)
-    assert float(state) > 0  # and it is softer for it
+    assert float(state) > 0  # stretching softens

@@ -1,4 +1,4 @@
-"""The kernel that moves Gaussians against PyTorch."""
+"""The skinning kernel against its PyTorch reference."""
 
 import pytest
 import torch
@@ -8,25 +8,25 @@ from stages.core.kernels.skinning import skin_gaussians, skin_gaussians_referenc
 from tests.conftest import DEVICES
 
 
-def random_blend(device: str, n: int = 3000, p: int = 40) -> list[torch.Tensor]:
+def random_inputs(device: str, n: int = 1000, p: int = 40) -> list[torch.Tensor]:
     rng = torch.Generator().manual_seed(0)
     index = torch.randint(-1, p, (n, 8), generator=rng, dtype=torch.int32)
     weight = torch.rand(n, 8, generator=rng)
     weight = weight / weight.sum(1, keepdim=True)
     gradient = 0.4 * torch.randn(p, 3, 3, generator=rng)
     quats = torch.nn.functional.normalize(torch.randn(n, 4, generator=rng), dim=1)
-    scales = 10 ** (-1 - 2 * torch.rand(n, 3, generator=rng))  # up to a hundred times longer than thick
+    scales = 10 ** (-1 - 2 * torch.rand(n, 3, generator=rng))  # aspect ratios of up to 100
     rest, displacement, means = (torch.randn(m, 3, generator=rng) for m in (p, p, n))
     return [t.to(device) for t in (index, weight, rest, displacement, gradient, means, quats, scales)]
 
 
 @pytest.mark.parametrize("device", DEVICES)
-def test_blend_equals_its_reference(device):
-    args = random_blend(device)
+def test_skinning_equals_its_reference(device):
+    args = random_inputs(device)
     means, quats, scales, R = skin_gaussians(*args)
     exact = skin_gaussians_reference(args[0], *(a.double() for a in args[1:]))
     torch.testing.assert_close(means.double(), exact[0], rtol=1e-5, atol=1e-5)
-    # quats and scales of an ellipsoid are not unique, their covariance is
+    # quats and scales of an ellipsoid are not unique, but their covariance is
     ours, theirs = covariance(quats.double(), scales.double()), covariance(exact[1], exact[2])
     size = theirs.flatten(1).abs().amax(1)[:, None, None]
     torch.testing.assert_close(ours / size, theirs / size, rtol=0, atol=2e-5)
@@ -42,15 +42,15 @@ def exact_gradient(args: list[torch.Tensor]) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("device", DEVICES)
-def test_no_motion_changes_not_a_bit(device):
-    index, weight, rest, displacement, gradient, means, quats, scales = random_blend(device)
-    still = skin_gaussians(index, weight, rest, 0 * displacement, 0 * gradient, means, quats, scales)
-    for got, given in zip(still, (means, quats, scales), strict=False):
+def test_zero_displacement_leaves_gaussians_bit_identical(device):
+    index, weight, rest, displacement, gradient, means, quats, scales = random_inputs(device)
+    unmoved = skin_gaussians(index, weight, rest, 0 * displacement, 0 * gradient, means, quats, scales)
+    for got, given in zip(unmoved, (means, quats, scales), strict=False):
         assert torch.equal(got, given)
-    assert torch.equal(still[3], torch.eye(3).to(device).expand(len(means), 3, 3))
+    assert torch.equal(unmoved[3], torch.eye(3).to(device).expand(len(means), 3, 3))
 
 
 @pytest.mark.parametrize("n", [0, 1, 2])
-def test_few_gaussians(n):
-    args = random_blend("cpu", n=n)
+def test_very_few_gaussians(n):
+    args = random_inputs("cpu", n=n)
     assert [len(t) for t in skin_gaussians(*args)] == [n] * 4

@@ -247,9 +247,9 @@ def _render_from_above(
     viewmat[:3, 3] = torch.tensor([-float(corner[0]), float(corner[1]), top + height_above])
     K = torch.tensor([[height_above / cell, 0, 0], [0, height_above / cell, 0], [0, 0, 1.0]])
     with torch.no_grad():
-        drawn = rasterise(table, viewmat[None], K[None], width, height)
-    alpha = drawn.alpha[0]
-    rgb = (drawn.rgb[0] / alpha.clamp_min(1e-3)[..., None]).clamp(0, 1)
+        rendered = rasterise(table, viewmat[None], K[None], width, height)
+    alpha = rendered.alpha[0]
+    rgb = (rendered.rgb[0] / alpha.clamp_min(1e-3)[..., None]).clamp(0, 1)
     flat = np.zeros(shape, np.float32)
     return TopView(corner, cell, top, rgb.numpy().astype(np.float32), alpha.numpy(), flat)
 

@@ -38,9 +38,9 @@ class ObservedSpace:
         views, maps = downscaled_views(scene.cameras), []
         weight = torch.zeros(len(scene.gaussians))
         for viewmat, K, width, height in views:
-            drawn = rasterise(scene.gaussians, viewmat[None], K[None], width, height)
-            depth = torch.where(drawn.alpha[0] > MIN_OPAQUE_ALPHA, drawn.depth[0], 0.0)
-            depth = torch.where(drawn.alpha[0] < MAX_EMPTY_ALPHA, FAR, depth)
+            rendered = rasterise(scene.gaussians, viewmat[None], K[None], width, height)
+            depth = torch.where(rendered.alpha[0] > MIN_OPAQUE_ALPHA, rendered.depth[0], 0.0)
+            depth = torch.where(rendered.alpha[0] < MAX_EMPTY_ALPHA, FAR, depth)
             maps.append(-torch.nn.functional.max_pool2d(-depth[None], 3, 1, 1)[0])
             weight = torch.maximum(weight, visibility(scene.gaussians, viewmat, K, width, height)[1])
         return ObservedSpace(views, maps, weight)

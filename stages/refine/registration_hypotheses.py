@@ -68,9 +68,9 @@ class PoseHypotheses:
     def distinct(self, count: int, degrees: float, shift: float) -> PoseHypotheses:
         """The first `count` that differ from all before them by at least an angle or a shift [diameters]."""
         traces = self.rotation.flatten(1) @ self.rotation.flatten(1).mT
-        turned = torch.rad2deg(((traces - 1) / 2).clamp(-1, 1).arccos())
+        rotated = torch.rad2deg(((traces - 1) / 2).clamp(-1, 1).arccos())
         shifted = (self.translation[:, None] - self.translation).norm(dim=2)
-        alike = ((turned < degrees) & (shifted < shift)).tolist()  # a single copy from the GPU
+        alike = ((rotated < degrees) & (shifted < shift)).tolist()  # a single copy from the GPU
         kept: list[int] = []
         for i in range(len(self)):
             if len(kept) < count and not any(alike[i][j] for j in kept):

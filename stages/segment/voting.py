@@ -44,13 +44,13 @@ class ViewFootprint:
         g, viewmat = scene.gaussians, scene.cameras.viewmats[view]
         width, height, K = voting_intrinsics(scene, view)
         front, weight = visibility(g, viewmat, K, width, height)
-        drawn = rasterise(g, viewmat[None], K[None], width, height)
+        rendered = rasterise(g, viewmat[None], K[None], width, height)
         x, y = project(g.means, viewmat, K).nan_to_num(-1).floor().long().unbind(1)
         z = depths(g.means, viewmat)
         inside = torch.nonzero((z > 0.01) & (x >= 0) & (x < width) & (y >= 0) & (y < height))[:, 0]
         pixels = y[inside] * width + x[inside]
-        on = (z[inside] - drawn.depth[0].flatten()[pixels]).abs() < SURFACE_TOLERANCE * z[inside]
-        return cls(front, inside[on], pixels[on], weight[inside[on]], len(g), drawn.rgb[0].clamp(0, 1))
+        on = (z[inside] - rendered.depth[0].flatten()[pixels]).abs() < SURFACE_TOLERANCE * z[inside]
+        return cls(front, inside[on], pixels[on], weight[inside[on]], len(g), rendered.rgb[0].clamp(0, 1))
 
     def votes(self, labels: Int[Tensor, "h2 w2"]) -> Float[Tensor, "n k"]:
         """Votes of a label image of any size: for each Gaussian and label, the weight of its pixels.

@@ -124,9 +124,8 @@ def _mask(
     """Coverage 0..1 of each pixel by the visible part of the object."""
     alone = (g.object_id == own.object_id[0]).to(g.means)[:, None]
     fine = resize(K, float(SUPERSAMPLING), float(SUPERSAMPLING))
-    rendered = rasterise_features(g, alone, viewmat[None], fine[None], SUPERSAMPLING * side, SUPERSAMPLING * side)[
-        0, ..., 0
-    ]
+    large = SUPERSAMPLING * side
+    rendered = rasterise_features(g, alone, viewmat[None], fine[None], large, large)[0, ..., 0]
     return torch.nn.functional.avg_pool2d(rendered[None], SUPERSAMPLING)[0].clamp(0, 1)
 
 

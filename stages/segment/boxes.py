@@ -61,7 +61,7 @@ def segment(scene: Scene, options: SegmentOptions) -> Scene:
 
 
 def nearest_first(scene: Scene) -> list[int]:
-    """The first view and at most VIEWS - 1 others, evenly chosen, by distance from it."""
+    """The first view and at most MAX_VIEWS - 1 evenly chosen others, by distance from it."""
     eyes = centres(scene.cameras.viewmats)
     order = (eyes - eyes[0]).norm(dim=1)
     order[0] = -1

@@ -23,7 +23,7 @@ def test_mass_position_and_extent_are_kept():
         a, b = coarse.x[coarse.body == n], fine.x[fine.body == n]
         assert float(fine.volume[fine.body == n].sum()) == pytest.approx(float(coarse.volume[coarse.body == n].sum()))
         torch.testing.assert_close(a.mean(0), b.mean(0), rtol=0, atol=coarse.spacing / 4)
-        # the seen body is a spacing beyond the voxels of its particles, whatever the spacing
+        # the visible body extends one spacing beyond the voxels of its particles
         seen = [x.amax(0) + 1.5 * h for x, h in ((a, coarse.spacing), (b, fine.spacing))]
         torch.testing.assert_close(*seen, rtol=0, atol=0.6 * coarse.spacing)
 

@@ -4,7 +4,9 @@ Explicit MLS-MPM with APIC transfers in float32; kernels and sources are in core
 by the schedule of split.py on the CPU and of fused.py on a GPU, with the same physics. batch.py runs named scenes.
 
 Reproducibility: on the CPU a run gives the same bytes for any number of threads. On a GPU floating-point sums depend on
-the order of atomic additions, so runs differ in the last bits, unless `exact` is set, which sums in fixed point.
+the order of atomic additions, so runs differ in the last bits, unless `exact` is set, which sums in fixed point. Even
+then the friction of a node shared by bodies of different friction may change one substep earlier or later, since the
+fused kernel raises it while others read it.
 Gradients through the solver are not available.
 """
 

@@ -93,25 +93,6 @@ TEAL, TRIM = (0.05, 0.5, 0.52), (0.1, 0.72, 0.7)
 def miku() -> Gaussians:
     """A standing doll: large head, turquoise fringe, long twin tails, grey top, teal tie, dark pleated skirt."""
     hair = doll_hair()
-
-    def face(p: Tensor) -> Tensor:
-        q = torch.stack([p[:, 0].abs(), p[:, 2]], 1)
-        ahead = torch.where(p[:, 1] < -0.05, 0.0, 1.0)
-        rgb = overlay(plain(SKIN)(p), (0.97, 0.62, 0.6), ellipse2d(q, (0.118, 0.163), (0.026, 0.013)) + ahead)
-        rgb = overlay(rgb, (0.06, 0.13, 0.16), ellipse2d(q, (0.085, 0.222), (0.042, 0.056)) + ahead)
-        iris = mix((0.2, 0.85, 0.8), (0.02, 0.32, 0.38), (p[:, 2] - 0.177) / 0.08)
-        rgb = overlay(rgb, iris, ellipse2d(q, (0.085, 0.215), (0.034, 0.044)) + ahead)
-        rgb = overlay(rgb, (0.03, 0.12, 0.15), ellipse2d(q, (0.085, 0.217), (0.016, 0.023)) + ahead)
-        for x in (-0.097, 0.073):
-            sparks = union2d(
-                ellipse2d(p[:, [0, 2]], (x, 0.239), 0.014), ellipse2d(p[:, [0, 2]], (x + 0.026, 0.194), 0.007)
-            )
-            rgb = overlay(rgb, WHITE, sparks + ahead)
-        lash = stroke(q, [(0.043, 0.249), (0.062, 0.272), (0.095, 0.28), (0.125, 0.267), (0.141, 0.247)], 0.011)
-        rgb = overlay(rgb, (0.08, 0.3, 0.32), lash + ahead)
-        smile = stroke(p[:, [0, 2]], [(-0.02, 0.145), (0.0, 0.138), (0.02, 0.145)], 0.009)
-        return overlay(rgb, (0.78, 0.28, 0.3), smile + ahead)
-
     head = ellipsoid((0, 0.0, 0.25), (0.19, 0.18, 0.175))
     neck = capsule((0, 0, 0.02), (0, 0, 0.12), 0.032)
     arm_top = mirrored(capsule((0.085, 0.0, 0.015), (0.135, -0.005, -0.065), 0.025))
@@ -142,7 +123,7 @@ def miku() -> Gaussians:
     chest, waist = ellipsoid((0, 0, 0.0), (0.088, 0.066, 0.075)), capsule((0, 0, -0.02), (0, 0, -0.1), 0.066, 0.062)
     torso = union(chest, waist, smooth=0.03)
     parts = [
-        PaintedPart(head, face, 0.1),
+        PaintedPart(head, miku_face, 0.1),
         PaintedPart(union(neck, arm_top, hand, legs), plain(SKIN), 0.1),
         PaintedPart(torso, dress, 0.15),
         PaintedPart(skirt(), pleats, 0.15),
@@ -151,6 +132,24 @@ def miku() -> Gaussians:
         *hair,
     ]
     return gaussians_from_parts(parts, (0.42, 0.34, 0.53), 60_000)
+
+
+def miku_face(p: Tensor) -> Tensor:
+    """Colours of the doll's face: cheeks, eyes, lashes and mouth."""
+    q = torch.stack([p[:, 0].abs(), p[:, 2]], 1)
+    ahead = torch.where(p[:, 1] < -0.05, 0.0, 1.0)
+    rgb = overlay(plain(SKIN)(p), (0.97, 0.62, 0.6), ellipse2d(q, (0.118, 0.163), (0.026, 0.013)) + ahead)
+    rgb = overlay(rgb, (0.06, 0.13, 0.16), ellipse2d(q, (0.085, 0.222), (0.042, 0.056)) + ahead)
+    iris = mix((0.2, 0.85, 0.8), (0.02, 0.32, 0.38), (p[:, 2] - 0.177) / 0.08)
+    rgb = overlay(rgb, iris, ellipse2d(q, (0.085, 0.215), (0.034, 0.044)) + ahead)
+    rgb = overlay(rgb, (0.03, 0.12, 0.15), ellipse2d(q, (0.085, 0.217), (0.016, 0.023)) + ahead)
+    for x in (-0.097, 0.073):
+        sparks = union2d(ellipse2d(p[:, [0, 2]], (x, 0.239), 0.014), ellipse2d(p[:, [0, 2]], (x + 0.026, 0.194), 0.007))
+        rgb = overlay(rgb, WHITE, sparks + ahead)
+    lash = stroke(q, [(0.043, 0.249), (0.062, 0.272), (0.095, 0.28), (0.125, 0.267), (0.141, 0.247)], 0.011)
+    rgb = overlay(rgb, (0.08, 0.3, 0.32), lash + ahead)
+    smile = stroke(p[:, [0, 2]], [(-0.02, 0.145), (0.0, 0.138), (0.02, 0.145)], 0.009)
+    return overlay(rgb, (0.78, 0.28, 0.3), smile + ahead)
 
 
 def skirt() -> Field:

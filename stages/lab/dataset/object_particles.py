@@ -150,5 +150,5 @@ def particle_volumes(means: Float[Tensor, "n 3"], dx: float) -> Float[Tensor, "n
 
 
 def placement_extents(assets: Mapping[int, Asset]) -> dict[int, PlacementExtent]:
-    """What the placement of objects in scenes needs to know of each."""
+    """Points and scale of each object, for its placement in scenes."""
     return {i: PlacementExtent(a.points[:PLACEMENT_POINTS].numpy().astype(float), a.scale) for i, a in assets.items()}

@@ -24,20 +24,13 @@ SEED = 42
 HALF_EXTENT = 0.9  # of the cube that contains all bounding spheres [m]
 MIN_GAP = 0.05  # between points of two objects, and between their centres [m]
 MAX_OFFSET = 0.1  # horizontal, from the object placed before, in scenes of up to 4 objects [m]
-MAX_PLACEMENTS, MAX_DRAWS = (
-    500,
-    200,
-)  # for an object, before the scene is begun again; and of its objects, before it is given up
+MAX_PLACEMENTS = 500  # attempts to place an object before its scene is drawn again
+MAX_DRAWS = 200  # of the objects of a scene
 HELDOUT = "heldout"  # group of scenes of eight other objects that are never trained on
-VARIED, SOLID, ROTATED = "varied", "solid", "turned"  # of objects at random, solid ones, and the ten turned at random
-EXTRA_GROUPS = (VARIED, SOLID, ROTATED)  # groups in no published set that may be learned from
-MORE_GROUPS = {f"more_{i}": 300 for i in range(10)}  # of three objects, in no published set: to learn more from
-SCENE_COUNTS = {
-    **{f"3_{i}": 300 for i in range(10)},
-    "4": 100,
-    "6": 100,
-    **MORE_GROUPS,
-}  # groups, and how many scenes each has
+VARIED, SOLID, ROTATED = "varied", "solid", "turned"  # groups of random shapes, solid random shapes, rotated objects
+EXTRA_GROUPS = (VARIED, SOLID, ROTATED)  # unpublished groups that may be trained on
+MORE_GROUPS = {f"more_{i}": 300 for i in range(10)}  # unpublished groups of three objects, for training
+SCENE_COUNTS = {**{f"3_{i}": 300 for i in range(10)}, "4": 100, "6": 100, **MORE_GROUPS}  # scenes in each group
 
 
 @dataclass(frozen=True)

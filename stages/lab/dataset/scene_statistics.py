@@ -170,7 +170,7 @@ THRESHOLDS = {
     "still": REST_SPEED,
     "tipped": TIP_ANGLE,
     "on floor": FLOOR_CLEARANCE,
-}
+}  # as written to the JSON file
 OBJECT_FRACTIONS = ("falls", "tipped", "stacked", "contained", "at_rest")  # of objects
 
 

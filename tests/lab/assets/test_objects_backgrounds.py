@@ -1,5 +1,7 @@
 """The eight backgrounds: position and density of the table top, free space above it, variety, files."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 import torch
@@ -17,13 +19,16 @@ from stages.lab.assets.backgrounds import BACKGROUND_PLY, BACKGROUNDS, ROOM_HALF
 NAMES = list(BACKGROUNDS)
 
 
+background = cache(make_background)
+
+
 def top_of(g):
     return g[(g.means[:, 2] + 0.94).abs() < 1e-5]
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_table_top_is_dense_with_free_space_above(name):
-    g = make_background(name)
+    g = background(name)
     assert 40_000 < len(g) < 65_000 and (g.object_id == 0).all()
     over_table = (g.means[:, :2].abs() < 1.9).all(1)
     assert not (g.means[over_table, 2] > -0.94 + 1e-5).any()
@@ -36,7 +41,7 @@ def test_table_top_is_dense_with_free_space_above(name):
 @pytest.mark.parametrize("name", ["table1", "table2"])
 def test_background_fills_every_view_of_the_data_set(name):
     """Hardly a pixel is transparent in views from inside the room."""
-    g = make_background(name)
+    g = background(name)
     viewmats = orbit(5, torch.tensor([0.0, 0.0, -0.3]), 4.0, 20.0)
     seen = rasterise(g, viewmats, intrinsics(96, 96, 144.0).expand(5, 3, 3), 96, 96).alpha
     assert (seen > 0.9).float().mean() > 0.99
@@ -47,7 +52,7 @@ def test_tops_are_distinct():
     """Mean colours or the spread of brightness differ between any two."""
     looks = []
     for name in NAMES:
-        rgb = top_of(make_background(name)).sh[:, 0] * C0 + 0.5
+        rgb = top_of(background(name)).sh[:, 0] * C0 + 0.5
         looks.append(torch.cat([rgb.mean(0), rgb.mean(1).std()[None]]))
     looks = torch.stack(looks)
     apart = torch.cdist(looks, looks) + torch.eye(8)
@@ -55,7 +60,7 @@ def test_tops_are_distinct():
 
 
 def test_backgrounds_are_deterministic():
-    a, b = make_background("table3"), make_background("table3")
+    a, b = background("table3"), make_background("table3")
     assert torch.equal(a.means, b.means) and torch.equal(a.sh, b.sh) and torch.equal(a.quats, b.quats)
 
 
@@ -72,7 +77,7 @@ def test_command_writes_the_published_names(tmp_path):
     done = CliRunner().invoke(app, ["backgrounds", str(tmp_path), "--only", "table6", "--sheet", picture])
     assert done.exit_code == 0, done.output
     scene = read_scene(tmp_path / "table6" / BACKGROUND_PLY)
-    assert BACKGROUND_PLY == "gaussians_feedforward.ply" and len(scene.gaussians) == len(make_background("table6"))
+    assert BACKGROUND_PLY == "gaussians_feedforward.ply" and len(scene.gaussians) == len(background("table6"))
     assert scene.floor == pytest.approx(-0.94) and not scene.objects
     assert (tmp_path / "b.jpg").stat().st_size > 1000
 

@@ -122,10 +122,10 @@ def test_reconstruction_is_measured_in_the_registered_photos(monkeypatch):
 
 
 def test_failed_reconstruction_finds_nothing(monkeypatch):
-    def hopeless(photos, out, options):
-        raise InputError(f"{photos}: no two photos show the same things")
+    def failing(photos, out, options):
+        raise InputError(f"{photos}: no two photos overlap")
 
-    monkeypatch.setattr(reconstructed_scene, "reconstruct", hopeless)
+    monkeypatch.setattr(reconstructed_scene, "reconstruct", failing)
     row = bench_segment.measure_reconstructed("apart", 0, 8)
     assert row["placed"] == 0 and row["mean"] == 0.0 and len(row["iou"]) == OBJECTS_PER_SCENE
 

@@ -10,19 +10,8 @@ from torch import Tensor
 
 from stages.core.geometry.neighbours import knn
 from stages.core.scene.gaussians import Gaussians
+from stages.lab.assets import paint as layers
 from stages.lab.assets.field_sampling import PaintedPart, gaussians_from_parts
-from stages.lab.assets.paint import (
-    BLACK,
-    WHITE,
-    ellipse2d,
-    fabric,
-    filled_polygon,
-    mix,
-    overlay,
-    plain,
-    stroke,
-    union2d,
-)
 from stages.lab.assets.shapes import noise
 from stages.lab.assets.signed_distance import curve_through, polygon, tube, union
 
@@ -52,16 +41,20 @@ def cloth() -> Gaussians:
 
     def paint(p: Tensor) -> Tensor:
         q = p[:, :2]
-        rgb = fabric(p, fabric(p, plain((0.97, 0.76, 0.12))(p), 3, 0.006, 0.06), 4, 0.05, 0.05)
+        rgb = layers.fabric(p, layers.fabric(p, layers.plain((0.97, 0.76, 0.12))(p), 3, 0.006, 0.06), 4, 0.05, 0.05)
         m = torch.stack([q[:, 0].abs(), q[:, 1]], 1)
-        cuff = stroke(m, [(0.4, 0.05), (0.465, 0.19)], 0.006)
-        armhole = stroke(m, [(0.27, 0.14), (0.262, 0.25), (0.275, 0.375)], 0.006)
-        rgb = overlay(
-            rgb, (0.74, 0.53, 0.06), union2d(cuff, armhole, stroke(m, [(0.0, -0.418), (0.28, -0.418)], 0.006))
+        cuff = layers.stroke(m, [(0.4, 0.05), (0.465, 0.19)], 0.006)
+        armhole = layers.stroke(m, [(0.27, 0.14), (0.262, 0.25), (0.275, 0.375)], 0.006)
+        rgb = layers.overlay(
+            rgb,
+            (0.74, 0.53, 0.06),
+            layers.union2d(cuff, armhole, layers.stroke(m, [(0.0, -0.418), (0.28, -0.418)], 0.006)),
         )
-        neck = ellipse2d(q, (0, 0.44), (0.125, 0.095))
-        rgb = overlay(overlay(rgb, (0.88, 0.62, 0.06), neck - 0.022), (0.74, 0.53, 0.06), (neck - 0.022).abs() - 0.003)
-        rgb = overlay(rgb, (0.6, 0.4, 0.05), neck)
+        neck = layers.ellipse2d(q, (0, 0.44), (0.125, 0.095))
+        rgb = layers.overlay(
+            layers.overlay(rgb, (0.88, 0.62, 0.06), neck - 0.022), (0.74, 0.53, 0.06), (neck - 0.022).abs() - 0.003
+        )
+        rgb = layers.overlay(rgb, (0.6, 0.4, 0.05), neck)
         top = p[:, 2] > folds(q)
         return torch.where(top[:, None], owl((q - torch.tensor([0.0, -0.03])) / 1.05, rgb), rgb)
 
@@ -80,23 +73,31 @@ def rounded(corners: list) -> list[tuple[float, float]]:
 def owl(q: Float[Tensor, "n 2"], rgb: Tensor) -> Tensor:
     """A round owl about 0.36 wide and 0.45 high on a branch, printed over the given colours."""
     brown, dark, cream = (0.45, 0.25, 0.12), (0.27, 0.14, 0.07), (0.96, 0.86, 0.66)
-    rgb = overlay(rgb, dark, stroke(q, [(-0.2, -0.215), (0.0, -0.205), (0.2, -0.22)], 0.022))
-    ears = union2d(*(filled_polygon(q, [(s * 0.15, 0.235), (s * 0.035, 0.16), (s * 0.15, 0.09)]) for s in (-1.0, 1.0)))
-    rgb = overlay(rgb, brown, union2d(ellipse2d(q, (0, -0.015), (0.17, 0.195)), ears))
-    rgb = overlay(rgb, cream, ellipse2d(q, (0, -0.085), (0.105, 0.115)))
+    rgb = layers.overlay(rgb, dark, layers.stroke(q, [(-0.2, -0.215), (0.0, -0.205), (0.2, -0.22)], 0.022))
+    ears = layers.union2d(
+        *(layers.filled_polygon(q, [(s * 0.15, 0.235), (s * 0.035, 0.16), (s * 0.15, 0.09)]) for s in (-1.0, 1.0))
+    )
+    rgb = layers.overlay(rgb, brown, layers.union2d(layers.ellipse2d(q, (0, -0.015), (0.17, 0.195)), ears))
+    rgb = layers.overlay(rgb, cream, layers.ellipse2d(q, (0, -0.085), (0.105, 0.115)))
     for row in range(3):
         for column in range(-1 - row % 2, 2):
             x, y = 0.055 * (column + 0.5 * (row % 2)), -0.05 - 0.045 * row
-            rgb = overlay(rgb, brown, stroke(q, [(x - 0.017, y + 0.01), (x, y - 0.008), (x + 0.017, y + 0.01)], 0.01))
+            rgb = layers.overlay(
+                rgb, brown, layers.stroke(q, [(x - 0.017, y + 0.01), (x, y - 0.008), (x + 0.017, y + 0.01)], 0.01)
+            )
     for s in (-1, 1):
-        rgb = overlay(rgb, dark, ellipse2d(q, (s * 0.145, -0.05), (0.042, 0.115), s * 0.2))
-        rgb = overlay(rgb, cream, ellipse2d(q, (s * 0.072, 0.075), 0.082))
-        rgb = overlay(rgb, WHITE, ellipse2d(q, (s * 0.07, 0.075), 0.06))
-        rgb = overlay(rgb, BLACK, ellipse2d(q, (s * 0.064, 0.072), 0.037))
-        rgb = overlay(rgb, WHITE, ellipse2d(q, (s * 0.064 - 0.012, 0.087), 0.011))
-        toes = union2d(*(ellipse2d(q, (s * 0.055 + k * 0.02, -0.205), (0.011, 0.022)) for k in (-1, 0, 1)))
-        rgb = overlay(rgb, (0.93, 0.5, 0.1), toes)
-    return overlay(rgb, (0.95, 0.5, 0.08), filled_polygon(q, [(-0.03, 0.052), (0.03, 0.052), (0.0, -0.005)]))
+        rgb = layers.overlay(rgb, dark, layers.ellipse2d(q, (s * 0.145, -0.05), (0.042, 0.115), s * 0.2))
+        rgb = layers.overlay(rgb, cream, layers.ellipse2d(q, (s * 0.072, 0.075), 0.082))
+        rgb = layers.overlay(rgb, layers.WHITE, layers.ellipse2d(q, (s * 0.07, 0.075), 0.06))
+        rgb = layers.overlay(rgb, layers.BLACK, layers.ellipse2d(q, (s * 0.064, 0.072), 0.037))
+        rgb = layers.overlay(rgb, layers.WHITE, layers.ellipse2d(q, (s * 0.064 - 0.012, 0.087), 0.011))
+        toes = layers.union2d(
+            *(layers.ellipse2d(q, (s * 0.055 + k * 0.02, -0.205), (0.011, 0.022)) for k in (-1, 0, 1))
+        )
+        rgb = layers.overlay(rgb, (0.93, 0.5, 0.1), toes)
+    return layers.overlay(
+        rgb, (0.95, 0.5, 0.08), layers.filled_polygon(q, [(-0.03, 0.052), (0.03, 0.052), (0.0, -0.005)])
+    )
 
 
 def pillow() -> Gaussians:
@@ -119,9 +120,9 @@ def pillow() -> Gaussians:
 
     def paint(p: Tensor) -> Tensor:
         wide = (torch.remainder(p[:, 0] / 0.13 + 0.25, 1.0) - 0.5).abs() * 0.13 - 0.0325
-        return fabric(p, overlay(plain(WHITE)(p), (0.12, 0.27, 0.62), wide), 9, 0.007, 0.06)
+        return layers.fabric(p, layers.overlay(layers.plain(layers.WHITE)(p), (0.12, 0.27, 0.62), wide), 9, 0.007, 0.06)
 
-    parts = [PaintedPart(field, paint), PaintedPart(tube(seam, 0.013), plain((0.1, 0.2, 0.5)))]
+    parts = [PaintedPart(field, paint), PaintedPart(tube(seam, 0.013), layers.plain((0.1, 0.2, 0.5)))]
     return gaussians_from_parts(parts, (0.53, 0.53, 0.2), 50_000, smooth=0.008)
 
 
@@ -150,13 +151,13 @@ def rope() -> Gaussians:
         spoke = p - strands[index[:, 0]]
         around = torch.atan2((spoke * up[i]).sum(1), (spoke * side[i]).sum(1))
         yarn = torch.sin(7 * around - phase[i] * 5) * 0.5 + 0.5
-        rgb = mix((0.5, 0.33, 0.16), (0.9, 0.74, 0.48), 0.55 * yarn + 0.45 * noise(p, 0.012, 8))
+        rgb = layers.mix((0.5, 0.33, 0.16), (0.9, 0.74, 0.48), 0.55 * yarn + 0.45 * noise(p, 0.012, 8))
         return rgb * torch.tensor([1.0, 0.93, 1.05])[index[:, 0] // m][:, None]
 
     def cord(p: Tensor) -> Tensor:
         _, index = knn(line, p, 1)
         wound = torch.sin(index[:, 0] * 0.85) * 0.5 + 0.5
-        return mix((0.4, 0.07, 0.06), (0.72, 0.16, 0.12), wound)
+        return layers.mix((0.4, 0.07, 0.06), (0.72, 0.16, 0.12), wound)
 
     whipping = tube(torch.cat([line[34:71], line[-71:-34]]), 0.0775)
     fillet = tube(line, 0.03)  # between the strands

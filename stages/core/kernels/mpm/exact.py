@@ -69,7 +69,8 @@ from stages.core.kernels.mpm.nodes import mat43
 def scatter_exact(
     momentum: wp.array[wp.vec4], first: int, stride_x: int, stride_y: int, weight: wp.mat33, fx: wp.vec3,
     affine: wp.mat44, scale: wp.vec2,
-): ...  # fmt: skip
+):  # fmt: skip
+    """P2G in fixed point; arguments as `scatter_nodes`, with the quanta `scale`."""
 
 
 @wp.func_native("""
@@ -113,7 +114,8 @@ def scatter_exact(
 def gather_exact(
     momentum: wp.array[wp.vec4], first: int, stride_x: int, stride_y: int, weight: wp.mat33, fx: wp.vec3,
     scale: wp.vec2,
-) -> mat43: ...  # fmt: skip
+) -> mat43:  # fmt: skip
+    """G2P from momenta in fixed point; result as `gather_nodes`."""
 
 
 @wp.func_native("""
@@ -122,4 +124,5 @@ def gather_exact(
     const float mass = (float)at[3], inverse = mass > 0.0f ? scale.c[1] / (scale.c[0] * mass) : 0.0f;
     return wp::vec3(inverse * (float)at[0], inverse * (float)at[1], inverse * (float)at[2]);
 """)
-def velocity_exact(momentum: wp.array[wp.vec4], node: int, scale: wp.vec2) -> wp.vec3: ...
+def velocity_exact(momentum: wp.array[wp.vec4], node: int, scale: wp.vec2) -> wp.vec3:
+    """Velocity [m/s] of one node in fixed point."""

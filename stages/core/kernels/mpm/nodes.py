@@ -67,7 +67,8 @@ mat43 = wp.types.matrix(shape=(4, 3), dtype=float)
 """)
 def gather_nodes(
     velocity: wp.array[wp.vec4], first: int, stride_x: int, stride_y: int, weight: wp.mat33, fx: wp.vec3
-) -> mat43: ...
+) -> mat43:
+    """G2P from node velocities: sums (4, 3) over the stencil of w v and of w v x offset [cells]."""
 
 
 @wp.func_native("""
@@ -150,7 +151,8 @@ def gather_nodes(
 def scatter_nodes(
     momentum: wp.array[wp.vec4], first: int, stride_x: int, stride_y: int, weight: wp.mat33, fx: wp.vec3,
     affine: wp.mat44,
-): ...  # fmt: skip
+):  # fmt: skip
+    """P2G: add a particle's momentum and mass, which vary affinely over the stencil, to its nodes."""
 
 
 @wp.func_native("""
@@ -181,7 +183,11 @@ def scatter_nodes(
 """)
 def velocity_from_momentum(
     momentum: wp.array[wp.vec4], velocity: wp.array[wp.vec4], first: int, count: int, copies: int
-): ...  # copies: bit c is set if copy c, which starts at node c x count, may be non-zero
+):
+    """Velocities of a row of four nodes from the sum of the momentum copies, which are cleared.
+
+    Bit c of `copies` is set if copy c, which starts at node c x count, may be non-zero.
+    """
 
 
 @wp.func_native("""
@@ -231,4 +237,5 @@ def velocity_from_momentum(
 def gather_momentum(
     momentum: wp.array[wp.vec4], friction: wp.array[float], first: int, stride_x: int, stride_y: int, weight: wp.mat33,
     fx: wp.vec3, under: int, keep: float,
-) -> mat43: ...  # fmt: skip
+) -> mat43:  # fmt: skip
+    """G2P from node momenta, with the floor condition on the lowest `under` layers of the stencil."""

@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: setup demo test test-gpu lint clean
+.PHONY: setup demo test test-all test-gpu lint clean
 
 setup: $(VENV)/.installed
 
@@ -16,6 +16,9 @@ demo: setup
 	$(MAKE) -C examples/falling_toys NGFF=$(abspath $(BIN))/ngff
 
 test: setup
+	$(BIN)/python -m pytest -n auto -m "not slow"
+
+test-all: setup
 	$(BIN)/python -m pytest -n auto
 
 test-gpu:

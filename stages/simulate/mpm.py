@@ -42,9 +42,9 @@ def rollout(
 ) -> Iterator[FrameState]:
     """One state per frame, the first being the start.
 
-    On a GPU the grid transfers are exact (fixed point), so that a run is reproduced to the byte there as on a CPU; the
-    quality levels above draft take twice the resolution and stiffer materials there. Raises InputError when a body
-    leaves the domain or its motion is no longer finite.
+    On a GPU the grid transfers are exact (fixed point), so that runs are reproducible there as on a CPU, and the
+    quality levels above draft use twice the resolution and stiffer materials. Raises InputError when a body leaves the
+    domain or its motion is no longer finite.
     """
     unit, device = scene.metres_per_unit, pick_device(options.device)
     level, fine = options.level, device != "cpu" and options.quality != "draft"

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+from stages.core.backends import pick_device
 from stages.core.geometry.harmonics import rgb_to_sh
 from stages.core.geometry.rotations import matrix
 from stages.core.geometry.similarity import Similarity, umeyama
@@ -133,5 +134,6 @@ def test_run_counts_and_writes_results(tmp_path, monkeypatch):
     lines = list(run(tmp_path / "out.json", RegisterBenchOptions("duck", 1)))
     assert lines[0].split() == ["correct", "of", "1", "ICP"] and lines[1].split()[0] == "duck"
     facts = json.loads((tmp_path / "out.json").read_text())
-    assert facts["machine"] == bench.machine("cpu") and [row["method"] for row in facts["trials"]] == ["ICP"]
+    assert facts["machine"] == bench.machine(pick_device("auto"))
+    assert [row["method"] for row in facts["trials"]] == ["ICP"]
     assert "splatreg is not installed" in lines[-1] and "pip install --no-deps splatreg" in lines[-1]

@@ -1,4 +1,4 @@
-"""Photos to 4D: the library behind the six commands, one folder a stage."""
+"""Photos to 4D: the library behind the six commands, one folder per stage."""
 
 # command -> (files in, files out), in the order of the pipeline
 PIPELINE = {

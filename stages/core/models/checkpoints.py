@@ -1,4 +1,4 @@
-"""Weights: find, verify, load, save. NAME.safetensors holds the numbers, NAME.json beside it says what they are."""
+"""Model weights: find, verify, load and save NAME.safetensors with its metadata card NAME.json."""
 
 from __future__ import annotations
 
@@ -27,16 +27,19 @@ MODELS = {
     "pointformer": "stages.core.models.baselines.pointformer:Pointformer",
     "transformer": "stages.core.models.baselines.transformer:Transformer",
 }
-SHIPPED = Path(__file__).parent / "weights"  # those that ship
+SHIPPED = Path(__file__).parent / "weights"  # shipped in the package
 
 
 def build(name: str, **config) -> Dynamics:
-    """A model by its name, untrained; `config` as its class takes it."""
+    """An untrained model by its name in MODELS; `config`: arguments of its class."""
     return choose(MODELS, name)(**config)
 
 
 def find(name: str, given: Path | None = None) -> Path:
-    """The weights of a model: a file or folder that was given, else those in $NGFF_WEIGHTS, else those that ship."""
+    """Path of a model's weights: `given` (file or folder), else in $NGFF_WEIGHTS, else shipped.
+
+    Raises InputError if there are none.
+    """
     folders = [SHIPPED]
     if os.environ.get("NGFF_WEIGHTS"):
         folders.insert(0, Path(os.environ["NGFF_WEIGHTS"]))
@@ -53,7 +56,7 @@ def find(name: str, given: Path | None = None) -> Path:
 
 
 def save(path: Path, name: str, model: Dynamics, card: Mapping | None = None, half: bool = False) -> None:
-    """Write PATH.safetensors and its card PATH.json; `half` stores 16-bit numbers."""
+    """Write PATH.safetensors and its card PATH.json; `half`: in 16 bits where the values allow it."""
     path = Path(path)
     state = {k: v.detach().cpu().contiguous() for k, v in model.state_dict().items()}
     if half:
@@ -65,7 +68,7 @@ def save(path: Path, name: str, model: Dynamics, card: Mapping | None = None, ha
 
 
 def halve(path: Path) -> None:
-    """Weights rewritten in 16 bits, for shipping: that costs nothing measurable (tests/core/models/test_shipped.py)."""
+    """Rewrite a weight file in 16 bits; no measurable loss of accuracy (tests/core/models/test_shipped.py)."""
     model, card = load(path)
     save(path, card["model"], model, card, half=True)
 
@@ -82,7 +85,7 @@ def write_card(path: Path, card: Mapping) -> None:
 
 
 def _rounded(value: object) -> object:
-    """Floats with eight significant digits, wherever they are; None for what JSON has no number for."""
+    """Nested values with floats of eight significant digits; None for infinities and nan."""
     if isinstance(value, float):
         return float(f"{value:.8g}") if math.isfinite(value) else None
     if isinstance(value, Mapping):
@@ -91,10 +94,10 @@ def _rounded(value: object) -> object:
 
 
 def load(path: Path, device: torch.device | str = "cpu") -> tuple[Dynamics, dict]:
-    """A model ready to use, in 32-bit numbers, and its card.
+    """A model in 32 bits and evaluation mode, and its card.
 
-    A card's `model` and `config` say what to build. A file without card ending in .pt or .pth is read as a checkpoint
-    of the public NGFF code. Raises InputError for whatever is missing, damaged, or does not fit.
+    The card's `model` and `config` define the model. A .pt or .pth file is read as a checkpoint of the public NGFF
+    code, without card. Raises InputError for files that are missing, damaged or do not fit.
     """
     path = Path(path)
     must_exist(path, "weights (.safetensors) such as `ngff-lab train` writes")
@@ -131,7 +134,7 @@ def _card(path: Path) -> dict:
 
 
 def _public(path: Path) -> Dynamics:
-    """A checkpoint of the public code: its sizes are read from the shapes."""
+    """A model from a checkpoint of the public code; sizes are inferred from the tensor shapes."""
     try:
         data = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # a damaged pickle raises anything
@@ -160,5 +163,5 @@ def _unfit(path: Path, what: str, error: Exception) -> InputError:
 
 
 def _line(error: Exception) -> str:
-    """The first lines of an error, as one."""
+    """An error message on one line, at most 200 characters."""
     return " ".join(str(error).split())[:200]

@@ -1,4 +1,4 @@
-"""Published weights on huggingface.co: where they are kept here, and fetching them, only when told to."""
+"""Published weights on huggingface.co: local folders and explicit download."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class HubSource:
-    """Where its makers put the weights of a network."""
+    """Publication of a network's weights."""
 
     repository: str  # on huggingface.co
     size: str
@@ -24,19 +24,19 @@ class HubSource:
 
 
 def folders() -> list[Path]:
-    """Where weights are looked for; what is downloaded goes into the first."""
+    """Folders searched for weights; downloads go into the first."""
     given = os.environ.get("NGFF_WEIGHTS")
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "ngff"
     return [*([Path(given)] if given else []), cache]
 
 
 def fetch(source: HubSource, folder: Path, choose: Callable[[list], list], place: str) -> list[Path]:
-    """Files of a repository through huggingface_hub into a folder; returns their paths.
+    """Download files of a repository into a folder through huggingface_hub; returns their paths.
 
-    `choose` picks from what the repository holds, and raises ValueError where that is not what it should be. Size,
-    licence and sha256, as the hub states them, are logged before the first byte; files are checked against that
-    sha256. Raises InputError where the hub cannot be reached or the package is absent; `place` ends its sentence:
-    where to put what the user fetches himself.
+    choose: picks files from those of the repository; may raise ValueError.
+    place: end of the error message, naming where to put manually downloaded files.
+    Size, licence and sha256, as stated by the hub, are logged before the download; files are checked against that
+    sha256. Raises InputError if the hub cannot be reached, a file is corrupt or the package is missing.
     """
     try:
         import huggingface_hub as hub
@@ -72,5 +72,5 @@ def fetch(source: HubSource, folder: Path, choose: Callable[[list], list], place
 
 
 def _checksum(file) -> str | None:
-    """The sha256 that the hub states; only large files have one."""
+    """The sha256 stated by the hub; only large files have one."""
     return file.lfs.sha256 if file.lfs else None

@@ -5,7 +5,8 @@ torchdiffeq runs in `Dynamics.rollout` and `rollout.TimeStepper` whenever the me
 simulate --integrator`, and for gradients by the adjoint equation. The default method "step" is a model's own step:
 explicit Euler for the models that are plain ODEs (`gcn`, `pointformer`, `transformer`, `ngff-paper`), equal to "euler"
 up to rounding; for `ngff` a splitting with implicit springs, friction and a penetration limit, which a general ODE
-solver does not offer.
+solver does not offer. With the shipped weights of `ngff`, rk4 agrees with this step to millimetres in first contacts,
+euler with steps of a frame diverges, and dopri5 fails at stiff contacts.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ def solve_ode(
     method: euler and rk4 step from time to time in `substeps`; dopri5 chooses its steps, the same for a whole batch.
     adjoint: tensors that get gradients from the adjoint equation (memory of one step; Chen et al. 2018, "Neural
         Ordinary Differential Equations"); without it gradients are backpropagated through the steps.
-    Raises InputError for an unknown method.
+    Raises InputError for an unknown method and where the step of dopri5 vanishes, as at stiff contacts.
     """
     if method not in METHODS:
         raise InputError(f"no integration method called {method!r}; choose from {', '.join(METHODS)}")
@@ -62,10 +63,15 @@ def solve_ode(
     settings: dict = {"method": method, **TOLERANCE}
     if method != "dopri5" and substeps > 1:
         settings["options"] = {"grid_constructor": lambda f, y, t: _subdivided(t, substeps)}
-    if adjoint is None:
-        return kind(*odeint(f, tuple(start), times, **settings))
-    params = tuple(p for p in adjoint if p.requires_grad)
-    return kind(*odeint_adjoint(f, tuple(start), times, adjoint_params=params, **settings))
+    try:
+        if adjoint is None:
+            return kind(*odeint(f, tuple(start), times, **settings))
+        params = tuple(p for p in adjoint if p.requires_grad)
+        return kind(*odeint_adjoint(f, tuple(start), times, adjoint_params=params, **settings))
+    except AssertionError as error:  # of torchdiffeq
+        if "underflow" not in str(error):
+            raise
+        raise InputError(f"{method}: the step became too small for these forces; use rk4 or step") from error
 
 
 def _subdivided(t: Tensor, substeps: int) -> Tensor:

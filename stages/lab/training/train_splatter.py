@@ -27,7 +27,7 @@ from stages.core.geometry.similarity import umeyama
 from stages.core.kernels.splat.ssim import ssim
 from stages.core.models.pi3.config import Pi3Config
 from stages.core.models.pi3.network import Geometry
-from stages.core.models.pi3.splat import SMALLEST_STEP, Pi3Splat, splat
+from stages.core.models.pi3.splat import SCALE_FACTOR, Pi3Splat, splat
 from stages.core.models.pi3.weights import find, load
 from stages.core.raster.rasterise import Rendering, rasterise
 from stages.core.scene.files import replacing, sha256
@@ -124,7 +124,7 @@ def load_network(weights: Path | None, options: SplatterOptions) -> tuple[Pi3Spl
 def initialise_head(model: Pi3Splat, geometry: Geometry, K: Float[Tensor, "3 3"]) -> None:
     """Make an untrained head predict grey, half opaque spheres of the size of a pixel."""
     last: nn.Linear = model.encoder.feature_head.down_proj
-    pixel = float((geometry.points[..., 2] / K[0, 0]).median()) / SMALLEST_STEP
+    pixel = float((geometry.points[..., 2] / K[0, 0]).median()) / SCALE_FACTOR
     with torch.no_grad():
         last.weight.mul_(0.1)
         last.bias.zero_()

@@ -3,8 +3,8 @@
 import torch
 import torch.nn.functional as F
 
-from stages.core.models.matching.aliked import ALIKED, DeformableConv, peaks, sample, suppressed
-from stages.core.models.matching.lightglue import LightGlue, Position, _turned, mutual, normalised
+from stages.core.models.matching.aliked import ALIKED, DeformableConv, peaks, sample, suppress_nonmaxima
+from stages.core.models.matching.lightglue import LightGlue, Position, _rotated, mutual, normalised
 
 
 def test_without_movement_a_deformable_convolution_is_a_convolution():
@@ -45,7 +45,7 @@ def test_peaks_are_found_below_a_pixel_and_apart():
 def test_a_maximum_silences_its_neighbours_only():
     scores = torch.zeros(1, 1, 1, 12)
     scores[..., [2, 4, 9]] = torch.tensor([0.9, 0.8, 0.5])
-    kept = torch.nonzero(suppressed(scores)[0, 0, 0])[:, 0]
+    kept = torch.nonzero(suppress_nonmaxima(scores)[0, 0, 0])[:, 0]
     assert kept.tolist() == [2, 9]
 
 
@@ -59,8 +59,8 @@ def test_attention_sees_only_where_keypoints_are_to_each_other():
     position, q, k = Position(), torch.randn(4, 1, 64), torch.randn(4, 1, 64)
     here, there = torch.tensor([[0.1, 0.2]]), torch.tensor([[-0.3, 0.5]])
     shift = torch.tensor([[0.7, -0.4]])
-    before = (_turned(q, position(here)) * _turned(k, position(there))).sum(-1)
-    after = (_turned(q, position(here + shift)) * _turned(k, position(there + shift))).sum(-1)
+    before = (_rotated(q, position(here)) * _rotated(k, position(there))).sum(-1)
+    after = (_rotated(q, position(here + shift)) * _rotated(k, position(there + shift))).sum(-1)
     torch.testing.assert_close(before, after, rtol=0, atol=1e-4)
 
 

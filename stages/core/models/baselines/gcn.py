@@ -1,4 +1,4 @@
-"""The published graph baseline: graph convolutions over all keypoints that are near each other.
+"""The published graph baseline: graph convolutions over a radius graph of all keypoints.
 
 Source of the layer: Kipf and Welling 2017, "Semi-Supervised Classification with Graph Convolutional Networks", eq. 2.
 """
@@ -13,7 +13,7 @@ from stages.core.models.dynamics import FRAME, PointDynamics, PointState, movabl
 from stages.core.models.external_forces import ExternalForces
 from stages.core.models.initial_conditions import InitialConditions
 
-RADIUS = 0.1  # closer keypoints are joined, of whatever objects [m]
+RADIUS = 0.1  # of the graph, across objects [m]
 
 
 @torch.no_grad()
@@ -24,13 +24,13 @@ def adjacency(points: Float[Tensor, "b p 3"], valid: Bool[Tensor, "b p"]) -> Flo
         squared = x.float().square().sum(-1)
         gap = squared[:, :, None] + squared[:, None] - 2 * x.float() @ x.float().mT
     near = (gap < RADIUS**2) & valid[:, :, None] & valid[:, None]
-    near |= torch.diag_embed(valid)  # rounding may part a point from itself
+    near |= torch.diag_embed(valid)  # rounding may give a point a non-zero distance to itself
     scale = near.sum(-1).clamp_min(1).to(x).rsqrt()
     return near * scale[:, :, None] * scale[:, None]
 
 
 class GraphConv(nn.Module):
-    """A normalised, X W^T of each node and its neighbours, and a bias."""
+    """A X W^T + b, with the normalised adjacency matrix A and node features X."""
 
     def __init__(self, inner: int, outer: int):
         super().__init__()
@@ -43,7 +43,7 @@ class GraphConv(nn.Module):
 
 
 class GCN(PointDynamics):
-    """`gcn`: what a frame changes in position and velocity, from the graph of the moment."""
+    """Engine `gcn`: change of positions and velocities per FRAME, predicted from the current graph; applied as a rate."""
 
     inputs = frozenset({"points", "velocity", "spin"})
 
@@ -63,6 +63,6 @@ class GCN(PointDynamics):
         for convolution in self.convolutions:
             x = torch.relu(convolution(x, A))
         change = (self.head(x) / FRAME).unflatten(1, initial.valid.shape[1:])
-        pushed = external.acceleration(initial, state.position, t)
+        applied = external.acceleration(initial, state.position, t)
         may_move = movable(initial, external)
-        return PointState(change[..., :3] * may_move, (change[..., 3:] + pushed) * may_move)
+        return PointState(change[..., :3] * may_move, (change[..., 3:] + applied) * may_move)

@@ -1,8 +1,8 @@
 """The published neural Gaussian force field, with its parameter names, so that its checkpoints load.
 
-Source: "Learning Physics-Grounded 4D Dynamics with Neural Gaussian Force Fields" (ICLR 2026) and its public code. Ways
-of that code that its checkpoints depend on are kept and said where they stand. Two are not: the neighbour search has no
-cap, and padding does not enter the object encoder (`padding_encoded` brings that back).
+Source: "Learning Physics-Grounded 4D Dynamics with Neural Gaussian Force Fields" (ICLR 2026) and its public code. Details
+of that code that its checkpoints depend on are kept and noted in place. Two are not: the neighbour search has no
+cap, and padding does not enter the object encoder (`padding_encoded` restores that).
 """
 
 from __future__ import annotations
@@ -20,29 +20,29 @@ from stages.core.models.field.rigid_body import angular_velocity, fit_rigid_moti
 from stages.core.models.initial_conditions import GRAVITY, InitialConditions, centre_of_mass, inertia, offsets
 
 MASS = 0.1  # of every object [kg]
-REACH = 0.05  # closer things touch [m]
+CONTACT_RADIUS = 0.05  # closer points are in contact [m]
 
 
 class PaperState(NamedTuple):
-    """Objects as local points, a place and Euler angles."""
+    """Objects as local points, centre of mass and Euler angles."""
 
-    local: Float[Tensor, "b o n 3"]  # keypoints about the centre, before rotation [m]
+    local: Float[Tensor, "b o n 3"]  # keypoints relative to the centre of mass, before rotation [m]
     local_velocity: Float[Tensor, "b o n 3"]  # [m/s]
     com: Float[Tensor, "b o 3"]  # [m]
     velocity: Float[Tensor, "b o 3"]  # [m/s]
     angle: Float[Tensor, "b o 3"]  # about x, y, z, applied in this order [rad]
-    rate: Float[Tensor, "b o 3"]  # of the angles, not a rotation vector [rad/s]
+    rate: Float[Tensor, "b o 3"]  # of the Euler angles, not an angular velocity vector [rad/s]
 
 
 def blocks(count: int, inner: int, outer: int) -> list[nn.Module]:
-    """Linear, LayerNorm, ReLU, `count` times."""
+    """Layers Linear, LayerNorm, ReLU, repeated `count` times."""
     widths = [inner] + [outer] * count
     layers = [(nn.Linear(a, b), nn.LayerNorm(b), nn.ReLU()) for a, b in zip(widths[:-1], widths[1:], strict=True)]
     return [layer for block in layers for layer in block]
 
 
 def euler_matrix(angle: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
-    """Rz Ry Rx."""
+    """Rotation matrix Rz Ry Rx of angles about x, y, z [rad]."""
     (sx, sy, sz), (cx, cy, cz) = angle.sin().unbind(-1), angle.cos().unbind(-1)
     rows = [
         cz * cy, cz * sy * sx - sz * cx, cz * sy * cx + sz * sx,
@@ -53,13 +53,13 @@ def euler_matrix(angle: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
 
 
 def euler_angles(R: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
-    """The angles of `euler_matrix`."""
+    """Inverse of `euler_matrix` [rad]."""
     pitch = torch.asin((-R[..., 2, 0]).clamp(-1, 1))
     return torch.stack([torch.atan2(R[..., 2, 1], R[..., 2, 2]), pitch, torch.atan2(R[..., 1, 0], R[..., 0, 0])], -1)
 
 
 def angle_rates(angle: Float[Tensor, "*b 3"], spin: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
-    """How fast the angles change in a body with that angular velocity [rad/s]; limited near gimbal lock."""
+    """Rates of the Euler angles of a body with angular velocity `spin` [rad/s]; bounded near gimbal lock."""
     (_, sy, sz), (_, cy, cz) = angle.sin().unbind(-1), angle.cos().unbind(-1)
     about_z = cz * spin[..., 0] + sz * spin[..., 1]
     about_y = cz * spin[..., 1] - sz * spin[..., 0]
@@ -79,7 +79,7 @@ class ResidualLinear(nn.Module):
 
 
 class ObjectEncoder(nn.Module):
-    """Shape of an object, from its points in any order (Qi et al. 2017, "PointNet")."""
+    """Shape embedding from an unordered set of points (Qi et al. 2017, "PointNet")."""
 
     def __init__(self, hidden: int, layers: int):
         super().__init__()
@@ -96,7 +96,7 @@ class ObjectEncoder(nn.Module):
 
 
 class StressNet(nn.Module):
-    """Acceleration of each point of an object within it."""
+    """Acceleration of each local point of an object [m/s^2]."""
 
     def __init__(self, hidden: int):
         super().__init__()
@@ -106,13 +106,13 @@ class StressNet(nn.Module):
 
     def forward(self, x: Float[Tensor, "b o n 12"], counts: Bool[Tensor, "b o n"]) -> Float[Tensor, "b o n 3"]:
         x = self.feature_layer(x)
-        most = x.masked_fill(~counts[..., None], -torch.inf).amax(2, keepdim=True)
-        most = torch.where(counts.any(2)[..., None, None], most, 0.0)
-        return self.output_layer(torch.cat([x, most.expand_as(x)], -1))
+        maximum = x.masked_fill(~counts[..., None], -torch.inf).amax(2, keepdim=True)
+        maximum = torch.where(counts.any(2)[..., None, None], maximum, 0.0)
+        return self.output_layer(torch.cat([x, maximum.expand_as(x)], -1))
 
 
 class Predictor(nn.Module):
-    """Force and torque on every object and acceleration of its points."""
+    """Force and torque on every object and acceleration of its local points."""
 
     def __init__(self, hidden: int, layers: int, deform: bool, padding_encoded: bool):
         super().__init__()
@@ -131,19 +131,19 @@ class Predictor(nn.Module):
     ) -> tuple[Float[Tensor, "b o 3"], Float[Tensor, "b o 3"], Float[Tensor, "b o n 3"]]:
         """Force [N], torque [N m], acceleration of the points in the object [m/s^2] (0 without deformation).
 
-        `rest` are the local points of the start.
+        `rest`: local points at time 0 [m].
         """
         counts = torch.ones_like(initial.valid) if self.padding_encoded else initial.valid
         points = world_points(state)
         shape = self.pointnet(state.local, counts)
-        touching = nearest(points, initial.valid, REACH)[0] < REACH  # (b, receiver, sender, n)
-        walls = near_walls(points, initial.valid, initial.box, REACH)
-        pair = self._pairs(shape, state) * touching.any(-1)[..., None]
+        contact = nearest(points, initial.valid, CONTACT_RADIUS)[0] < CONTACT_RADIUS  # (b, receiver, sender, n)
+        walls = near_walls(points, initial.valid, initial.box, CONTACT_RADIUS)
+        pair = self._pairs(shape, state) * contact.any(-1)[..., None]
         wall = self._floor(shape, state, initial) * walls.any(-1)[..., None]
         force, torque, _ = (pair.sum(2) + wall).split(3, -1)
         if self.stress_net is None:
             return force, torque, torch.zeros_like(points)
-        latent = torch.einsum("bijn,bijd->bind", touching.to(pair), pair[..., 6:])
+        latent = torch.einsum("bijn,bijd->bind", contact.to(pair), pair[..., 6:])
         latent = torch.stack([latent, walls[..., None] * wall[:, :, None, 6:]], -2)
         # the matrix of the negated angles is not the inverse rotation; the published checkpoints were trained with it
         rotated = latent @ euler_matrix(-state.angle).mT[:, :, None]
@@ -152,7 +152,7 @@ class Predictor(nn.Module):
         return force, torque, self.stress_net(x, counts)
 
     def _pairs(self, shape: Float[Tensor, "b o h"], state: PaperState) -> Float[Tensor, "b o o 9"]:
-        """What object j does to object i: force, torque, latent."""
+        """Force, torque and latent of object i by object j."""
         s = _placement(state)
         o = shape.shape[1]
         relative = self.state_embedding(s[:, :, None] - s[:, None])
@@ -162,7 +162,7 @@ class Predictor(nn.Module):
     def _floor(
         self, shape: Float[Tensor, "b o h"], state: PaperState, initial: InitialConditions
     ) -> Float[Tensor, "b o 9"]:
-        """What the room does to an object; it knows the floor's height, but walls only by touch."""
+        """Force, torque and latent of an object by the room; inputs: floor height, and walls only through contact."""
         floor = torch.zeros_like(state.com)
         floor[..., 2] = initial.floor
         s = _placement(state._replace(com=state.com - floor))
@@ -178,14 +178,14 @@ def _rest(initial: InitialConditions) -> Float[Tensor, "b o n 3"]:
 
 
 def world_points(state: PaperState) -> Float[Tensor, "b o n 3"]:
-    """Keypoints in the world [m]."""
+    """Keypoints in world coordinates [m]."""
     return state.local @ euler_matrix(state.angle).mT + state.com[:, :, None]
 
 
 class PaperForceField(Dynamics):
-    """`ngff-paper`; without `deform`, `ngff-paper-rigid`.
+    """Engine `ngff-paper`; without `deform`, `ngff-paper-rigid`.
 
-    Mass and gravity are constants of the model: it cannot be told about them, nor about materials.
+    Mass and gravity are constants of the model; materials are not inputs.
     """
 
     inputs = frozenset({"points", "mass_fraction", "velocity", "spin", "box"})
@@ -197,17 +197,17 @@ class PaperForceField(Dynamics):
         self.register_buffer("gravity", torch.tensor(GRAVITY[2]))
 
     def initial_state(self, initial: InitialConditions) -> PaperState:
-        """At rest but for the objects' velocities; spins are taken as rates of the angles, which start at 0."""
+        """Undeformed, with zero angles; angular velocities are taken as their rates."""
         com = centre_of_mass(initial, initial.points)
         local = _rest(initial)
         return PaperState(local, torch.zeros_like(local), com, initial.velocity, torch.zeros_like(com), initial.spin)
 
     def state_from_motion(
-        self, initial: InitialConditions, points: Float[Tensor, "b o n 3"], speed: Float[Tensor, "b o n 3"]
+        self, initial: InitialConditions, points: Float[Tensor, "b o n 3"], velocities: Float[Tensor, "b o n 3"]
     ) -> PaperState:
         arm = offsets(initial, initial.points)
         inverse = torch.linalg.inv(inertia(initial.mass_fraction, arm))
-        m = fit_rigid_motion(initial.mass_fraction, arm, inverse, points, speed)
+        m = fit_rigid_motion(initial.mass_fraction, arm, inverse, points, velocities)
         angle = euler_angles(m.R)
         rate = angle_rates(angle, angular_velocity(m.momentum, inverse, m.R))
         return PaperState(_rest(initial) + m.u, m.du, m.com, m.velocity, angle, rate)
@@ -216,15 +216,15 @@ class PaperForceField(Dynamics):
         self, initial: InitialConditions, t: Tensor | float, state: PaperState, external: ExternalForces
     ) -> PaperState:
         force, torque, stress = self.predictor(initial, state, _rest(initial))
-        pushed, rotated = external.wrench(world_points(state), state.com, t)
-        # a torque of a prompt is divided by the mass twice, as published
-        acceleration = (force + pushed) / MASS + self.gravity * torch.eye(3, device=force.device)[2]
-        turning = (torque + rotated / MASS) / MASS
+        applied, twist = external.wrench(world_points(state), state.com, t)
+        # the external torque is divided by the mass twice, as published
+        acceleration = (force + applied) / MASS + self.gravity * torch.eye(3, device=force.device)[2]
+        angular = (torque + twist / MASS) / MASS
         movable = ~external.pinned[..., None]
         inner = (initial.valid & movable)[..., None]
         return PaperState(
             state.local_velocity * inner, stress * inner, state.velocity * movable, acceleration * movable,
-            state.rate * movable, turning * movable,
+            state.rate * movable, angular * movable,
         )  # fmt: skip
 
     def points(self, initial: InitialConditions, state: PaperState) -> Float[Tensor, "b o n 3"]:
@@ -232,5 +232,5 @@ class PaperForceField(Dynamics):
 
 
 def rigid(**config) -> PaperForceField:
-    """`ngff-paper-rigid`: the ablation without deformation."""
+    """Engine `ngff-paper-rigid`: the ablation without deformation."""
     return PaperForceField(**{**config, "deform": False})

@@ -10,10 +10,10 @@ from stages.core.models.initial_conditions import InitialConditions
 
 
 class Pointformer(PointDynamics):
-    """`pointformer`: what a frame adds to the positions.
+    """Engine `pointformer`: change of positions per FRAME, applied as a velocity.
 
-    The published model knows no velocity. Here the velocity of the state holds what the start and pushes gave to a
-    point; it adds to what the network says, which cannot brake it.
+    The published model has no velocity input. Here the velocity of the state is that of the initial conditions plus
+    the impulses of external forces; it is added to the network's output, which does not reduce it.
     """
 
     inputs = frozenset({"points", "velocity", "spin"})
@@ -37,5 +37,5 @@ class Pointformer(PointDynamics):
             x = block(x, src_key_padding_mask=padding)
         moved = (0.1 / FRAME * self.head(self.norm(x))).unflatten(1, initial.valid.shape[1:])
         may_move = movable(initial, external)
-        pushed = external.acceleration(initial, state.position, t)
-        return PointState((moved + state.velocity) * may_move, pushed * may_move)
+        applied = external.acceleration(initial, state.position, t)
+        return PointState((moved + state.velocity) * may_move, applied * may_move)

@@ -1,6 +1,6 @@
-"""A strong transformer: told all that our own model is told, but free of its physics.
+"""A transformer baseline with the inputs of `ngff` but none of its built-in physics.
 
-Keypoints attend in turn to their own object and to the whole scene. Out come accelerations.
+Layers attend within objects and over the whole scene in turn; the output is accelerations.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from stages.core.models.dynamics import PointDynamics, PointState, movable
 from stages.core.models.external_forces import ExternalForces
 from stages.core.models.initial_conditions import InitialConditions, centre_of_mass, offsets
 
-SCALE = 20.0  # acceleration that stands for 1 in the network [m/s^2]
-NEAR = 0.1  # walls farther away are not told apart [m]
+ACCELERATION_UNIT = 20.0  # acceleration of a network output of 1 [m/s^2]
+WALL_RANGE = 0.1  # distances to walls are clipped to it [m]
 
 
 class TransformerBlock(nn.Module):
@@ -36,14 +36,14 @@ class TransformerBlock(nn.Module):
 
 
 def features(initial: InitialConditions, state: PointState) -> Float[Tensor, "b o n 29"]:
-    """What a keypoint is told, in numbers of order one."""
+    """Input features of a keypoint, scaled to order one."""
     x, v = state.position, state.velocity
     com, drift = centre_of_mass(initial, x), centre_of_mass(initial, v)
-    there = initial.present[..., None]
-    middle = (com * there).sum(1, keepdim=True) / there.sum(1, keepdim=True).clamp_min(1)
+    present = initial.present[..., None]
+    middle = (com * present).sum(1, keepdim=True) / present.sum(1, keepdim=True).clamp_min(1)
     low, high = initial.box[..., None, 0, :], initial.box[..., None, 1, :]
     height = x[..., 2:] - low[..., 2:]
-    walls = (torch.cat([x - low, high - x], -1) / NEAR).clamp(-1, 1)
+    walls = (torch.cat([x - low, high - x], -1) / WALL_RANGE).clamp(-1, 1)
     material = torch.stack(
         [(initial.E * initial.solidity).log10() - 5, initial.nu, initial.friction, initial.mass.log()], -1
     )
@@ -53,7 +53,7 @@ def features(initial: InitialConditions, state: PointState) -> Float[Tensor, "b 
 
 
 class Transformer(PointDynamics):
-    """`transformer`: half of the layers look within objects, half across the scene."""
+    """Engine `transformer`: half of the layers attend within objects, half across the scene."""
 
     inputs = frozenset({
         "points", "mass_fraction", "mass", "E", "solidity", "nu", "friction", "velocity", "spin", "gravity", "box"
@@ -70,14 +70,14 @@ class Transformer(PointDynamics):
         self, initial: InitialConditions, t: Tensor | float, state: PointState, external: ExternalForces
     ) -> PointState:
         b, o, n = initial.valid.shape
-        # a missing object attends to itself: a softmax over nothing is nan
+        # padded objects attend to their own padding, as a softmax over nothing is nan
         own = (initial.valid | ~initial.present[..., None]).flatten(0, 1)
         x = self.embed(features(initial, state))
         for i, block in enumerate(self.blocks):
             whole = i % 2 == 1
             x = block(x.reshape(b, -1, x.shape[-1]) if whole else x.reshape(b * o, n, -1),
                       initial.valid.flatten(1) if whole else own)  # fmt: skip
-        acceleration = SCALE * self.head(x).reshape(b, o, n, 3) + initial.gravity[:, None, None]
+        acceleration = ACCELERATION_UNIT * self.head(x).reshape(b, o, n, 3) + initial.gravity[:, None, None]
         acceleration = acceleration + external.acceleration(initial, state.position, t)
         may_move = movable(initial, external)
         return PointState(state.velocity * may_move, acceleration * may_move)

@@ -1,4 +1,4 @@
-"""Fetching the published weights of DiffSplat, from the two places where they are."""
+"""Download of the published weights of DiffSplat from their two repositories."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ log = logging.getLogger(__name__)
 
 
 def download() -> Files:
-    """All parts, fetched into diffsplat/ of the first folder searched; what each is worth is said before it."""
+    """Download all parts into diffsplat/ of the first search folder, logging sizes and licences first."""
     folder = folders()[0] / "diffsplat"
     log.info("diffsplat: %s", " and ".join(f"{s.size} of {s.repository} (licence {s.licence})" for s in SOURCES))
     for source in SOURCES:
         into = folder / source.into
-        fetch(source, into, lambda files, source=source: _wanted(files, source.wanted), f"save it in {into}")
+        fetch(source, into, lambda files, source=source: _matching(files, source.wanted), f"save it in {into}")
     return find(folder)
 
 
-def _wanted(files: list, patterns: tuple[str, ...]) -> list:
-    """The files that patterns name, at least one each."""
+def _matching(files: list, patterns: tuple[str, ...]) -> list:
+    """Files that match the patterns; ValueError if a pattern matches none."""
     for pattern in patterns:
         if not any(fnmatch(f.rfilename, pattern) for f in files):
             raise ValueError(f"it holds no {pattern}")

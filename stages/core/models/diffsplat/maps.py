@@ -1,4 +1,4 @@
-"""The four cameras of DiffSplat, the rays it is told of, and the maps of Gaussians that it answers with.
+"""The four cameras of DiffSplat, their rays as network inputs, and the output maps of Gaussians.
 
 Its frame: y up, the object at the origin within [-1, 1], the first camera on the side of +z.
 """
@@ -16,9 +16,9 @@ from stages.core.geometry.harmonics import rgb_to_sh
 from stages.core.scene.gaussians import Gaussians
 
 AZIMUTHS = (0.0, 90.0, 180.0, 270.0)  # of the cameras, from +z towards +x [degrees]
-RADIUS = 1.4  # of the orbit
-FOCAL = 1422.222 / 1024  # of the cameras of G-Objaverse, which it was trained on [picture sides]
-SCALES = (0.0005, 0.02)  # least and largest standard deviation
+RADIUS = 1.4  # camera distance
+FOCAL = 1422.222 / 1024  # of the cameras of G-Objaverse, the training data [image sides]
+SCALES = (0.0005, 0.02)  # minimum and maximum standard deviation
 CHANNELS = 12  # rgb 3, scale 3, rotation w x y z, opacity, depth: all in -1..1
 
 
@@ -36,10 +36,10 @@ def cameras(elevation: float) -> Float[Tensor, "4 4 4"]:
 
 
 def plucker(viewmats: Float[Tensor, "v 4 4"], side: int) -> Float[Tensor, "v 6 s s"]:
-    """Moment o x d and unit direction d of each pixel's ray, as the published network was trained to read them.
+    """Pluecker coordinates (o x d, d) of each pixel's ray, with the offset of the published training code.
 
-    The published code means to centre the pixels and adds the half after dividing by the side, so that the rays go
-    through the quarter of the picture plane right of and below its centre. The weights know no others.
+    That code adds the half-pixel offset after dividing by the side, so the rays cover the quarter of the image plane
+    right of and below its centre. The weights were trained with it.
     """
     across = torch.arange(side) / (side - 1) / FOCAL
     y, x = torch.meshgrid(across, across, indexing="ij")
@@ -50,10 +50,10 @@ def plucker(viewmats: Float[Tensor, "v 4 4"], side: int) -> Float[Tensor, "v 6 s
 
 
 def to_gaussians(maps: Float[Tensor, "v 12 s s"], viewmats: Float[Tensor, "v 4 4"]) -> Gaussians:
-    """One Gaussian a pixel, those with opacity 0 or no turn left out; place, turn and size in DiffSplat's frame.
+    """One Gaussian per pixel in DiffSplat's frame, without those of zero opacity or zero quaternion.
 
-    Depth runs along the viewing axis and is counted from the camera's distance; corner pixels lie on the picture's
-    corners. The published renderer takes quaternions as they come; here they are made unit, as the scene's are.
+    Depth is along the viewing axis, relative to the camera distance; corner pixels lie on the image corners. The
+    published renderer uses quaternions unnormalised; here they are normalised, as everywhere in a scene.
     Source: the public code's renderer of Gaussians and its unprojection of depth.
     """
     rgb, scale, quats, opacity, depth = (m.permute(0, 2, 3, 1) for m in maps.split([3, 3, 4, 1, 1], 1))
@@ -62,10 +62,10 @@ def to_gaussians(maps: Float[Tensor, "v 12 s s"], viewmats: Float[Tensor, "v 4 4
     eyes = centres(viewmats)[:, None, None]
     z = depth + eyes.norm(dim=-1, keepdim=True)
     means = torch.stack([x, y, torch.ones_like(x)], -1) * z @ viewmats[:, None, :3, :3] + eyes
-    share = scale / 2 + 0.5
+    fraction = scale / 2 + 0.5
     opacities = (opacity / 2 + 0.5).flatten()
     kept = (opacities > 0) & (quats.norm(dim=-1).flatten() > 1e-6)
-    fields = means, torch.nn.functional.normalize(quats, dim=-1), SCALES[0] * share + SCALES[1] * (1 - share), rgb
+    fields = means, torch.nn.functional.normalize(quats, dim=-1), SCALES[0] * fraction + SCALES[1] * (1 - fraction), rgb
     means, quats, scales, rgb = (f.flatten(0, 2)[kept] for f in fields)
     return Gaussians(means, quats, scales, opacities[kept], rgb_to_sh(rgb / 2 + 0.5),
                      torch.ones(len(means), dtype=torch.int64))  # fmt: skip

@@ -1,4 +1,4 @@
-"""DiffSplat's sampler around the blocks of diffusers: noise becomes four latent maps that agree on one object."""
+"""DiffSplat's sampler on top of diffusers: denoises four latent maps of one object jointly."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ if TYPE_CHECKING:
     from transformers import CLIPTextModel, CLIPTokenizer
 
 VIEWS = len(AZIMUTHS)
-STEPS = 20
-GUIDANCE = (1.0, 2.0)  # on the picture's own side, and opposite
+STEPS = 20  # of the sampler
+GUIDANCE = (1.0, 2.0)  # classifier-free guidance of the view of the image, and of the opposite one
 NEGATIVE = "worst quality, normal quality, low quality, low res, blurry, ugly, disgusting"
 
 
-class AcrossViews:
-    """Self-attention in which the tokens of all `views` of one object see each other: (b v) n d as b (v n) d."""
+class MultiViewAttention:
+    """Self-attention over the tokens of all `views` of an object: (b v) n d as b (v n) d."""
 
     def __init__(self, views: int):
         self.views, self.plain = views, AttnProcessor2_0()
@@ -36,15 +36,15 @@ class AcrossViews:
 
 
 def share_attention(unet: UNet2DConditionModel, views: int = VIEWS + 1) -> None:
-    """Let every self-attention of a U-Net look across views; attention to the text stays each view's own."""
+    """Make every self-attention of a U-Net multi-view; cross-attention to the text stays per view."""
     unet.set_attn_processor({
-        name: AcrossViews(views) if name.endswith("attn1.processor") else AttnProcessor2_0()
+        name: MultiViewAttention(views) if name.endswith("attn1.processor") else AttnProcessor2_0()
         for name in unet.attn_processors
     })  # fmt: skip
 
 
 def triangle(low: float, high: float, views: int = VIEWS) -> Float[Tensor, "v"]:
-    """Guidance of each view: `low` for the first, rising to `high` opposite, and back.
+    """Guidance of each view: `low` for the first, linear to `high` for the opposite one, and back.
 
     Source: Voleti et al. 2024, "SV3D", section 3, "triangular CFG scaling".
     """
@@ -54,25 +54,25 @@ def triangle(low: float, high: float, views: int = VIEWS) -> Float[Tensor, "v"]:
 
 @dataclass(frozen=True)
 class DiffSplat:
-    """The parts, ready to use, all on one device."""
+    """The loaded parts, all on one device."""
 
     tokenizer: CLIPTokenizer
     text_encoder: CLIPTextModel
-    vae: AutoencoderKL  # of pictures
+    vae: AutoencoderKL  # of images
     unet: UNet2DConditionModel  # 4 latent + 6 ray + 1 flag channels in, 4 out
     gsvae: AutoencoderKL  # of maps of Gaussians
     scheduler: DPMSolverMultistepScheduler
 
     @property
     def side(self) -> int:
-        """Width and height of pictures and maps [px]."""
+        """Width and height of images and maps [px]."""
         return self.unet.config.sample_size * 2 ** (len(self.vae.config.block_out_channels) - 1)
 
     def generate(self, image: Float[Tensor, "s s 3"], elevation: float, prompt: str = "", seed: int = 0) -> Gaussians:
-        """The whole object in a picture, on the CPU, in DiffSplat's frame; its first camera is the picture's.
+        """Gaussians of the whole object of an image, on the CPU, in DiffSplat's frame; camera 0 is that of the image.
 
-        `image` shows it alone on white, centred, four fifths of the side large; `elevation` [degrees] is the
-        camera's above the horizon. It learned from -5 to 30 degrees.
+        `image`: the object alone on white, centred, its longer side 4/5 of the image. `elevation`: of the camera above
+        the horizon [degrees]; the training range is -5 to 30.
         """
         viewmats = cameras(elevation)
         return to_gaussians(self.sample(image, viewmats, prompt, seed).cpu(), viewmats)
@@ -83,43 +83,43 @@ class DiffSplat:
     ) -> Float[Tensor, "v 12 s s"]:
         """Maps of Gaussians of the four views, in -1..1.
 
-        Each step guesses twice, with the picture's latent and the prompt and, to guide away from, with zeros and
-        NEGATIVE; the noise is drawn on the CPU, so that a seed gives one result on every device.
+        Classifier-free guidance: conditioned on the image latent and `prompt`, unconditioned on zeros and NEGATIVE.
+        Noise is drawn on the CPU, so that a seed gives the same noise on every device.
         """
         device = self.unet.device
         text = self._text([NEGATIVE, prompt]).repeat_interleave(VIEWS + 1, 0)
-        picture = self._picture(image.to(device))
+        latent = self._image_latent(image.to(device))
         guidance = triangle(*GUIDANCE).to(device)[:, None, None, None]
         generator = torch.Generator().manual_seed(seed)
-        x = torch.randn(VIEWS, *picture.shape[1:], generator=generator).to(device)
-        given = torch.stack([torch.zeros_like(picture), picture])
-        told = self._told(viewmats.to(device), picture.shape[-1])
+        x = torch.randn(VIEWS, *latent.shape[1:], generator=generator).to(device)
+        condition = torch.stack([torch.zeros_like(latent), latent])
+        rays = self._ray_channels(viewmats.to(device), latent.shape[-1])
         self.scheduler.set_timesteps(STEPS, device=device)
         for t in tqdm(self.scheduler.timesteps, desc="diffsplat", unit="step", leave=False):
-            views = torch.cat([torch.cat([given, x.expand(2, *x.shape)], 1), told.expand(2, *told.shape)], 2)
+            views = torch.cat([torch.cat([condition, x.expand(2, *x.shape)], 1), rays.expand(2, *rays.shape)], 2)
             with torch.autocast(device.type, torch.bfloat16, enabled=device.type == "cuda"):
-                guess = self.unet(views.flatten(0, 1), t, text, return_dict=False)[0]
-            away, toward = guess.float().unflatten(0, (2, VIEWS + 1))[:, 1:]
+                output = self.unet(views.flatten(0, 1), t, text, return_dict=False)[0]
+            negative, positive = output.float().unflatten(0, (2, VIEWS + 1))[:, 1:]
             noise = torch.randn(x.shape, generator=generator).to(device)
-            x = self.scheduler.step(away + guidance * (toward - away), t, x, variance_noise=noise).prev_sample
+            x = self.scheduler.step(negative + guidance * (positive - negative), t, x, variance_noise=noise).prev_sample
         latents = x / self.gsvae.config.scaling_factor
         return torch.cat([self.gsvae.decode(z).sample for z in latents.split(1)]).clamp(-1, 1)
 
-    def _told(self, viewmats: Float[Tensor, "v 4 4"], side: int) -> Float[Tensor, "w 7 z z"]:
-        """Rays of the picture and the views at the latents' resolution, and 0 for what is given, 1 for what is not."""
+    def _ray_channels(self, viewmats: Float[Tensor, "v 4 4"], side: int) -> Float[Tensor, "w 7 z z"]:
+        """Rays of the image and the views at latent resolution, flag 0 for the image and 1 for generated views."""
         rays = plucker(viewmats.cpu(), self.side).to(viewmats)
         rays = torch.nn.functional.interpolate(rays, (side, side), mode="bilinear")
-        asked = torch.ones(VIEWS + 1, 1, side, side).to(rays)
-        asked[0] = 0
-        return torch.cat([torch.cat([rays[:1], rays]), asked], 1)
+        flags = torch.ones(VIEWS + 1, 1, side, side).to(rays)
+        flags[0] = 0
+        return torch.cat([torch.cat([rays[:1], rays]), flags], 1)
 
     def _text(self, prompts: list[str]) -> Float[Tensor, "b n d"]:
-        """The text encoder's last hidden states, of sentences cut or padded to its length."""
+        """Last hidden states of the text encoder, of prompts cut or padded to its length."""
         length = self.text_encoder.config.max_position_embeddings
         tokens = self.tokenizer(prompts, padding="max_length", max_length=length, truncation=True, return_tensors="pt")
         return self.text_encoder(tokens.input_ids.to(self.unet.device))[0]
 
-    def _picture(self, image: Float[Tensor, "s s 3"]) -> Float[Tensor, "1 4 z z"]:
-        """The picture's latent: the mean of what the encoder says, scaled."""
+    def _image_latent(self, image: Float[Tensor, "s s 3"]) -> Float[Tensor, "1 4 z z"]:
+        """Latent of the image: the encoder's mean, scaled."""
         latent = self.vae.encode(2 * image.permute(2, 0, 1)[None] - 1).latent_dist.mode()
         return latent * self.vae.config.scaling_factor

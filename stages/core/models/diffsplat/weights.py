@@ -1,6 +1,6 @@
-"""The published weights of DiffSplat (Stable Diffusion 1.5, from one picture): find, check and load.
+"""The published weights of DiffSplat (Stable Diffusion 1.5, one image): locate, check and load.
 
-A folder holds three parts, named as their makers name them, the last as a subfolder of this name:
+A folder holds three parts under their published names:
 
     gsdiff_gobj83k_sd15_image__render/checkpoints/NUMBER/unet_ema/   config.json, diffusion_pytorch_model.safetensors
     gsvae_gobj265k_sd/checkpoints/NUMBER/model.safetensors
@@ -32,15 +32,15 @@ if TYPE_CHECKING:
 
 UNET, GSVAE, BASE = "gsdiff_gobj83k_sd15_image__render", "gsvae_gobj265k_sd", "stable-diffusion-v1-5"
 PARTS = ("tokenizer", "text_encoder", "vae", "scheduler")  # of Stable Diffusion
-LATENT = 4 + 6 + 1  # channels into the U-Net: latent, ray, flag
+IN_CHANNELS = 4 + 6 + 1  # of the U-Net: latent, ray, flag
 
 
 @dataclass(frozen=True)
 class DiffSplatSource(HubSource):
-    """Where some of the weights are published, and what of that is needed."""
+    """A publication of weights, and the files of it that are needed."""
 
-    wanted: tuple[str, ...]  # patterns of files
-    into: str  # folder under that of the weights
+    wanted: tuple[str, ...]  # glob patterns of files
+    into: str  # subfolder of the weights folder
 
 
 SOURCES = (
@@ -56,7 +56,7 @@ SOURCES = (
 
 @dataclass(frozen=True)
 class Files:
-    """What is where."""
+    """Paths of the parts."""
 
     unet: Path  # folder with config and weights
     gsvae: Path  # file
@@ -64,29 +64,32 @@ class Files:
 
 
 def find(given: Path | None = None) -> Files:
-    """The parts in the folder given, else in diffsplat/ of $NGFF_WEIGHTS or of the user's cache."""
-    places = [Path(given)] if given is not None else [place / "diffsplat" for place in folders()]
-    for place in places:
-        files = _files(place)
+    """The parts in a folder, by default diffsplat/ of $NGFF_WEIGHTS or of the user's cache.
+
+    Raises InputError if parts are missing.
+    """
+    searched = [Path(given)] if given is not None else [folder / "diffsplat" for folder in folders()]
+    for folder in searched:
+        files = _files(folder)
         if not _missing(files):
             return files
     code, base = SOURCES
-    lack = ", ".join(str(path) for path in _missing(_files(places[0])))
+    lack = ", ".join(str(path) for path in _missing(_files(searched[0])))
     raise InputError(
-        f"diffsplat: the weights are not in {' or '.join(map(str, places))} (no {lack}); fetch {UNET} and {GSVAE} of "
-        f"https://huggingface.co/{code.repository} ({code.size}, licence {code.licence}) into {places[0]}, and "
+        f"diffsplat: the weights are not in {' or '.join(map(str, searched))} (no {lack}); fetch {UNET} and {GSVAE} of "
+        f"https://huggingface.co/{code.repository} ({code.size}, licence {code.licence}) into {searched[0]}, and "
         f"{', '.join(PARTS)} of https://huggingface.co/{base.repository} ({base.size}, licence {base.licence}) into "
-        f"{places[0] / BASE}, name such a folder with --weights, or add --download"
+        f"{searched[0] / BASE}, name such a folder with --weights, or add --download"
     )
 
 
 def _files(folder: Path) -> Files:
-    """Where the parts are, or would be."""
+    """Paths where the parts are expected."""
     return Files(_last(folder / UNET) / "unet_ema", _last(folder / GSVAE) / "model.safetensors", folder / BASE)
 
 
 def _last(model: Path) -> Path:
-    """The checkpoint of the most steps; they are folders with a number for a name."""
+    """Folder of the checkpoint with the most steps; their names are numbers."""
     numbers = [p for p in (model / "checkpoints").glob("*") if p.name.isdigit()]
     return max(numbers, key=lambda p: int(p.name)) if numbers else model / "checkpoints/NUMBER"
 
@@ -97,9 +100,9 @@ def _missing(files: Files) -> list[Path]:
 
 
 def load(files: Files, device: str = "cpu") -> DiffSplat:
-    """The model, 32 bit, for inference. Sizes come from the configurations beside the weights.
+    """The model in 32 bit, for inference; sizes come from the configurations beside the weights.
 
-    Raises InputError for packages that are absent and files that are damaged or hold something else.
+    Raises InputError for missing packages and for files that are damaged or of another model.
     """
     try:
         import diffusers
@@ -113,9 +116,9 @@ def load(files: Files, device: str = "cpu") -> DiffSplat:
     transformers.utils.logging.disable_progress_bar()
     half = (files.base / "text_encoder/model.fp16.safetensors").exists()
     try:
-        text = _whole(transformers.CLIPTextModel, files.base / "text_encoder", variant="fp16" if half else None,
+        text = _from_folder(transformers.CLIPTextModel, files.base / "text_encoder", variant="fp16" if half else None,
                       dtype=torch.float32)  # fmt: skip
-        vae = _whole(diffusers.AutoencoderKL, files.base / "vae", low_cpu_mem_usage=False)
+        vae = _from_folder(diffusers.AutoencoderKL, files.base / "vae", low_cpu_mem_usage=False)
         tokenizer = transformers.CLIPTokenizer.from_pretrained(files.base / "tokenizer", local_files_only=True)
         scheduler = sampler(json.loads((files.base / "scheduler/scheduler_config.json").read_text()))
     except (OSError, ValueError, RuntimeError, KeyError) as error:
@@ -131,8 +134,8 @@ def load(files: Files, device: str = "cpu") -> DiffSplat:
     return DiffSplat(tokenizer, text, vae, unet, gsvae, scheduler)
 
 
-def _whole(kind: type, folder: Path, **how) -> nn.Module:
-    """A model of a library from its folder; the libraries fill what is missing with noise, here it is an error."""
+def _from_folder(kind: type, folder: Path, **how) -> nn.Module:
+    """A library's model from its folder; ValueError for missing tensors (the library would fill in random ones)."""
     model, found = kind.from_pretrained(
         folder, local_files_only=True, use_safetensors=True, output_loading_info=True, **how
     )
@@ -142,10 +145,10 @@ def _whole(kind: type, folder: Path, **how) -> nn.Module:
 
 
 def sampler(config: dict):
-    """DPM-Solver++ with noise, for a network that predicts velocities, over Stable Diffusion's own noise levels.
+    """SDE-DPM-Solver++ for v-prediction with Stable Diffusion's noise schedule.
 
-    The public code also asks for betas rescaled to end in pure noise, but by changing a configuration that has been
-    read by then, in training as in inference; so they never were, and are not here.
+    The public code also requests betas rescaled to zero terminal SNR, but changes the configuration only after it was
+    read, in training and in inference, so the rescaling never took effect and is omitted here.
     """
     from diffusers import DPMSolverMultistepScheduler
 
@@ -155,7 +158,7 @@ def sampler(config: dict):
 
 
 def gaussian_vae(config: dict) -> nn.Module:
-    """An autoencoder like Stable Diffusion's, for maps of Gaussians in place of colours; without numbers yet."""
+    """Stable Diffusion's autoencoder with CHANNELS in and out, for maps of Gaussians, on the meta device."""
     from diffusers import AutoencoderKL
 
     with torch.device("meta"):
@@ -163,27 +166,30 @@ def gaussian_vae(config: dict) -> nn.Module:
 
 
 def _unet(config: Path) -> nn.Module:
-    """The U-Net that a published configuration describes, without numbers yet.
+    """The U-Net of a published configuration, on the meta device. Raises InputError for another configuration.
 
-    Its blocks are named CrossAttnDownBlockMV2D and so on; they are those of diffusers but for the attention.
+    Its blocks, CrossAttnDownBlockMV2D and so on, are those of diffusers except for the attention.
     """
     from diffusers import UNet2DConditionModel
 
     try:
-        said = json.loads(config.read_text().replace("MV2D", "2D"))
-        known = {k: said[k] for k in signature(UNet2DConditionModel.__init__).parameters if k in said}
+        stored = json.loads(config.read_text().replace("MV2D", "2D"))
+        known = {k: stored[k] for k in signature(UNet2DConditionModel.__init__).parameters if k in stored}
         with torch.device("meta"):
             unet = UNet2DConditionModel(**known)
     except (ValueError, TypeError) as error:
         raise InputError(f"{config}: does not describe DiffSplat's U-Net ({error}); fetch it again") from error
-    if unet.config.in_channels != LATENT:
+    if unet.config.in_channels != IN_CHANNELS:
         raise InputError(f"{config}: describes a U-Net with {unet.config.in_channels} channels in; the one that takes "
-                         f"a picture has {LATENT}: {UNET} is meant")  # fmt: skip
+                         f"an image has {IN_CHANNELS}: {UNET} is meant")  # fmt: skip
     return unet
 
 
 def filled(model: nn.Module, path: Path, prefix: str = "", but: tuple[str, ...] = ()) -> nn.Module:
-    """The model with the 32-bit tensors of a file, `prefix` taken off their names, those beginning with `but` left."""
+    """The model with the tensors of a file in 32 bit: `prefix` removed, names starting with `but` skipped.
+
+    Raises InputError if the tensors do not fit.
+    """
     state = {k.removeprefix(prefix): v.float() for k, v in read_state(path).items() if not k.startswith(but)}
     if complaint := differences(model.state_dict(), state):
         raise InputError(f"{path}: does not fit diffsplat: {complaint}")

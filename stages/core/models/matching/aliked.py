@@ -13,14 +13,14 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 WIDTHS = (16, 32, 64, 128)  # of the four blocks, at 1, 1/2, 1/8 and 1/32 of the resolution
-DIM, SPOTS = 128, 16  # length of a descriptor, and places that one is gathered from
+DIM, SAMPLES = 128, 16  # length of a descriptor, and sampling positions that it is gathered from
 RADIUS = 2  # of non-maximum suppression and of the refinement below a pixel [px]
-SHARP = 0.1  # temperature of that refinement
-MULTIPLE = 32  # images are padded to it
+TEMPERATURE = 0.1  # of the soft maximum of that refinement
+MULTIPLE = 32  # image sides are padded to a multiple of it [px]
 
 
 class DeformableConv(nn.Module):
-    """A 3x3 convolution whose nine taps move by what another one says. Source: Dai et al. 2017."""
+    """3x3 convolution whose nine taps are displaced by predicted offsets. Source: Dai et al. 2017."""
 
     def __init__(self, inputs: int, outputs: int):
         super().__init__()
@@ -29,23 +29,23 @@ class DeformableConv(nn.Module):
 
     def forward(self, x: Float[Tensor, "1 i h w"]) -> Float[Tensor, "1 o h w"]:
         h, w = x.shape[2:]
-        most = max(h, w) / 4
-        move = self.offset_conv(x).clamp(-most, most).reshape(9, 2, h, w)  # dy, dx of each tap
+        limit = max(h, w) / 4
+        offsets = self.offset_conv(x).clamp(-limit, limit).reshape(9, 2, h, w)  # dy, dx of each tap
         ys, xs = torch.meshgrid(torch.arange(h, device=x.device), torch.arange(w, device=x.device), indexing="ij")
         taps = torch.cartesian_prod(*[torch.arange(-1, 2, device=x.device)] * 2)
-        at = torch.stack([xs + taps[:, 1, None, None] + move[:, 1], ys + taps[:, 0, None, None] + move[:, 0]], -1)
+        at = torch.stack([xs + taps[:, 1, None, None] + offsets[:, 1], ys + taps[:, 0, None, None] + offsets[:, 0]], -1)
         sampled = sample(x, at.reshape(1, 9 * h, w, 2)).reshape(-1, 9, h, w)
         return torch.einsum("ithw,oit->ohw", sampled, self.regular_conv.weight.flatten(2))[None]
 
 
 def sample(x: Float[Tensor, "1 c h w"], at: Float[Tensor, "1 a b 2"]) -> Float[Tensor, "1 c a b"]:
-    """Bilinear values at places (x, y) in pixels, pixel centres being whole numbers; zero outside."""
+    """Bilinear samples at (x, y) [px], pixel centres at integers; zero outside."""
     size = torch.tensor([x.shape[3] - 1, x.shape[2] - 1], device=x.device)
     return F.grid_sample(x, 2 * at / size - 1, align_corners=True)
 
 
 class ConvBlock(nn.Module):
-    """Two convolutions with SELU, past a shortcut or not."""
+    """Two convolutions with SELU, optionally with a shortcut."""
 
     def __init__(self, inputs: int, outputs: int, shortcut: bool, deformable: bool):
         super().__init__()
@@ -60,15 +60,15 @@ class ConvBlock(nn.Module):
 
 
 class Descriptor(nn.Module):
-    """Descriptors gathered from SPOTS places around each keypoint, which its 3x3 surroundings choose."""
+    """Descriptors gathered from SAMPLES positions around each keypoint, predicted from its 3x3 neighbourhood."""
 
     def __init__(self):
         super().__init__()
         self.offset_conv = nn.Sequential(
-            nn.Conv2d(DIM, 2 * SPOTS, 3), nn.SELU(), nn.Conv2d(2 * SPOTS, 2 * SPOTS, 1)
+            nn.Conv2d(DIM, 2 * SAMPLES, 3), nn.SELU(), nn.Conv2d(2 * SAMPLES, 2 * SAMPLES, 1)
         )  # fmt: skip
         self.sf_conv = nn.Conv2d(DIM, DIM, 1, bias=False)
-        self.agg_weights = nn.Parameter(torch.zeros(SPOTS, DIM, DIM))
+        self.agg_weights = nn.Parameter(torch.zeros(SAMPLES, DIM, DIM))
 
     def forward(self, x: Float[Tensor, "1 c h w"], keypoints: Float[Tensor, "k 2"]) -> Float[Tensor, "k c"]:
         h, w = x.shape[2:]
@@ -77,15 +77,15 @@ class Descriptor(nn.Module):
         step = torch.arange(3, device=x.device)
         rows, columns = corner[:, 1, None, None] + step[:, None], corner[:, 0, None, None] + step
         patches = x[0][:, rows, columns].transpose(0, 1)
-        most = max(h, w) / 4
-        move = self.offset_conv(patches).clamp(-most, most).reshape(-1, 2, SPOTS).mT
-        spots = sample(x, (keypoints[:, None] + move)[None])
-        spots = F.selu(self.sf_conv(spots))[0]
-        return F.normalize(torch.einsum("ckp,pcd->kd", spots, self.agg_weights), dim=1)
+        limit = max(h, w) / 4
+        offsets = self.offset_conv(patches).clamp(-limit, limit).reshape(-1, 2, SAMPLES).mT
+        samples = sample(x, (keypoints[:, None] + offsets)[None])
+        samples = F.selu(self.sf_conv(samples))[0]
+        return F.normalize(torch.einsum("ckp,pcd->kd", samples, self.agg_weights), dim=1)
 
 
 class ALIKED(nn.Module):
-    """The network; `keypoints_of` is what others call."""
+    """The network; `keypoints_of` is its public method."""
 
     def __init__(self):
         super().__init__()
@@ -100,7 +100,7 @@ class ALIKED(nn.Module):
         self.desc_head = Descriptor()
 
     def maps(self, image: Float[Tensor, "1 3 h w"]) -> tuple[Float[Tensor, "1 c h w"], Float[Tensor, "1 1 h w"]]:
-        """Features of unit length and a score for every pixel."""
+        """Unit-length features and a score for every pixel."""
         h, w = image.shape[2:]
         down, across = -h % MULTIPLE, -w % MULTIPLE
         left, top = across // 2, down // 2
@@ -117,38 +117,44 @@ class ALIKED(nn.Module):
 
     @torch.no_grad()
     def keypoints_of(
-        self, image: Float[Tensor, "h w 3"], most: int, least_score: float = 0.2
+        self, image: Float[Tensor, "h w 3"], maximum: int, min_score: float = 0.2
     ) -> tuple[Float[Tensor, "k 2"], Float[Tensor, "k 128"]]:
-        """At most `most` keypoints of an RGB image 0..1, pixel centres at +0.5, and their unit descriptors."""
+        """At most `maximum` keypoints [px] of an RGB image in 0..1, pixel centres at +0.5, and unit descriptors."""
         features, scores = self.maps(image.permute(2, 0, 1)[None])
-        keypoints = peaks(scores, most, least_score)
+        keypoints = peaks(scores, maximum, min_score)
         return keypoints + 0.5, self.desc_head(features, keypoints)
 
 
-def peaks(scores: Float[Tensor, "1 1 h w"], most: int, least: float) -> Float[Tensor, "k 2"]:
-    """Highest maxima above `least` (x, y), refined below a pixel by a soft maximum; pixel centres whole numbers."""
-    standing = suppressed(scores)[0, 0]
-    for edge in (standing[:RADIUS], standing[-RADIUS:], standing[:, :RADIUS], standing[:, -RADIUS:]):
+def peaks(scores: Float[Tensor, "1 1 h w"], maximum: int, threshold: float) -> Float[Tensor, "k 2"]:
+    """Up to `maximum` highest local maxima (x, y) above `threshold` [px], pixel centres at integers.
+
+    Positions are refined to subpixels by a soft argmax.
+    """
+    suppressed = suppress_nonmaxima(scores)[0, 0]
+    for edge in (suppressed[:RADIUS], suppressed[-RADIUS:], suppressed[:, :RADIUS], suppressed[:, -RADIUS:]):
         edge.zero_()
-    found = torch.nonzero(standing > least)
-    value = standing[found[:, 0], found[:, 1]]
-    found = found[value.topk(min(most, len(value))).indices]
+    found = torch.nonzero(suppressed > threshold)
+    value = suppressed[found[:, 0], found[:, 1]]
+    found = found[value.topk(min(maximum, len(value))).indices]
     step = torch.arange(-RADIUS, RADIUS + 1, device=scores.device)
     around = scores[0, 0][found[:, 0, None, None] + step[:, None], found[:, 1, None, None] + step]
-    weight = (around.flatten(1) / SHARP).softmax(1).unflatten(1, (len(step), len(step)))
+    weight = (around.flatten(1) / TEMPERATURE).softmax(1).unflatten(1, (len(step), len(step)))
     shift = torch.stack([(weight.sum(1) * step).sum(1), (weight.sum(2) * step).sum(1)], 1)
     return found.flip(1) + shift
 
 
-def suppressed(scores: Float[Tensor, "1 1 h w"]) -> Float[Tensor, "1 1 h w"]:
-    """Scores of maxima within RADIUS, zero elsewhere; twice more where only a suppressed value was higher."""
+def suppress_nonmaxima(scores: Float[Tensor, "1 1 h w"]) -> Float[Tensor, "1 1 h w"]:
+    """Non-maximum suppression: scores of maxima within RADIUS, zero elsewhere.
 
-    def highest(x: Tensor) -> Tensor:
+    Two more rounds keep maxima whose only higher neighbours were themselves suppressed.
+    """
+
+    def local_maximum(x: Tensor) -> Tensor:
         return F.max_pool2d(x, 2 * RADIUS + 1, 1, RADIUS)
 
-    kept = scores == highest(scores)
+    kept = scores == local_maximum(scores)
     for _ in range(2):
-        near = highest(kept.float()) > 0
+        near = local_maximum(kept.float()) > 0
         rest = scores.masked_fill(near, 0)
-        kept |= (rest == highest(rest)) & ~near
+        kept |= (rest == local_maximum(rest)) & ~near
     return torch.where(kept, scores, 0)

@@ -1,8 +1,8 @@
-"""LightGlue: which keypoints of two images are the same, by attention within and between the images.
+"""LightGlue: matches between the keypoints of two images, by attention within and between the images.
 
 Source: Lindenberger et al. 2023, "LightGlue: Local feature matching at light speed", for ALIKED's descriptors.
 Modules carry the published names, so that the published weights load. It stops at the layer where nearly all
-keypoints are sure; keypoints are not pruned.
+keypoints are confident; keypoints are not pruned.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 INPUT, DIM, HEADS, LAYERS = 128, 256, 4, 9
-LEAST = 0.1  # probability of a match
-SURE = 0.95  # share of keypoints that must be sure to stop early
+MIN_PROBABILITY = 0.1  # of a match
+CONFIDENT_FRACTION = 0.95  # of keypoints, to stop early
 
 
 def _ffn() -> nn.Sequential:
@@ -32,7 +32,7 @@ def _attend(q: Tensor, k: Tensor, v: Tensor) -> Float[Tensor, "n d"]:
 
 
 class Position(nn.Module):
-    """Learned frequencies of the place of a keypoint; they turn pairs of channels."""
+    """Rotary position embedding with learned frequencies."""
 
     def __init__(self):
         super().__init__()
@@ -43,8 +43,8 @@ class Position(nn.Module):
         return angle.cos(), angle.sin()
 
 
-def _turned(x: Float[Tensor, "h n e"], position: tuple[Tensor, Tensor]) -> Float[Tensor, "h n e"]:
-    """Rotary embedding. Source: Su et al. 2021."""
+def _rotated(x: Float[Tensor, "h n e"], position: tuple[Tensor, Tensor]) -> Float[Tensor, "h n e"]:
+    """Features with the rotary embedding applied. Source: Su et al. 2021, "RoFormer"."""
     a, b = x.unflatten(-1, (-1, 2)).unbind(-1)
     return x * position[0] + torch.stack([-b, a], -1).flatten(-2) * position[1]
 
@@ -58,7 +58,7 @@ class SelfBlock(nn.Module):
 
     def forward(self, x: Float[Tensor, "n d"], position: tuple[Tensor, Tensor]) -> Float[Tensor, "n d"]:
         q, k, v = self.Wqkv(x).unflatten(1, (HEADS, -1, 3)).permute(3, 1, 0, 2)
-        message = self.out_proj(_attend(_turned(q, position), _turned(k, position), v))
+        message = self.out_proj(_attend(_rotated(q, position), _rotated(k, position), v))
         return x + self.ffn(torch.cat([x, message], 1))
 
 
@@ -89,7 +89,7 @@ class Layer(nn.Module):
 
 
 class Assignment(nn.Module):
-    """Log probability that two keypoints are the same: a softmax both ways, times that each has a match at all."""
+    """Log probability of a match: dual softmax of similarities times both matchabilities."""
 
     def __init__(self):
         super().__init__()
@@ -102,7 +102,7 @@ class Assignment(nn.Module):
 
 
 class Confidence(nn.Module):
-    """Whether later layers would change a keypoint's match."""
+    """Confidence that later layers would not change a keypoint's match."""
 
     def __init__(self):
         super().__init__()
@@ -110,7 +110,7 @@ class Confidence(nn.Module):
 
 
 class LightGlue(nn.Module):
-    """The network; `match` is what others call."""
+    """The network; `match` is its public method."""
 
     def __init__(self):
         super().__init__()
@@ -129,27 +129,27 @@ class LightGlue(nn.Module):
         """Rows (index in the first, index in the second) of keypoints [px] of images of (width, height) `sizes`."""
         if min(len(keypoints[0]), len(keypoints[1])) == 0:
             return torch.zeros(0, 2, dtype=torch.int64, device=keypoints[0].device)
-        places = [self.posenc(normalised(k, size)) for k, size in zip(keypoints, sizes, strict=True)]
+        positions = [self.posenc(normalised(k, size)) for k, size in zip(keypoints, sizes, strict=True)]
         a, b = (self.input_proj(d) for d in descriptors)
         for i, layer in enumerate(self.transformers):
-            a, b = layer(a, b, *places)
-            if i == LAYERS - 1 or self._sure(torch.cat([a, b]), i):
+            a, b = layer(a, b, *positions)
+            if i == LAYERS - 1 or self._confident(torch.cat([a, b]), i):
                 return mutual(self.log_assignment[i](a, b).exp())
-        raise AssertionError("the last layer always answers")
+        raise AssertionError("unreachable: the last layer returns")
 
-    def _sure(self, x: Float[Tensor, "n d"], layer: int) -> bool:
+    def _confident(self, x: Float[Tensor, "n d"], layer: int) -> bool:
         threshold = 0.8 + 0.1 * math.exp(-4 * layer / LAYERS)
-        return float((self.token_confidence[layer].token(x) >= threshold).float().mean()) > SURE
+        return float((self.token_confidence[layer].token(x) >= threshold).float().mean()) > CONFIDENT_FRACTION
 
 
 def normalised(keypoints: Float[Tensor, "n 2"], size: tuple[int, int]) -> Float[Tensor, "n 2"]:
-    """Places around the image's middle, the longer side from -1 to 1."""
+    """Positions relative to the image centre, the longer side from -1 to 1."""
     return (keypoints - torch.tensor(size).to(keypoints) / 2) / (max(size) / 2)
 
 
 def mutual(probability: Float[Tensor, "n m"]) -> Int[Tensor, "k 2"]:
-    """Pairs that are each other's most probable, and probable enough."""
+    """Mutual best matches with at least MIN_PROBABILITY, as pairs of indices."""
     value, to_b = probability.max(1)
     rows = torch.arange(len(value), device=value.device)
-    keep = (probability.argmax(0)[to_b] == rows) & (value > LEAST)
+    keep = (probability.argmax(0)[to_b] == rows) & (value > MIN_PROBABILITY)
     return torch.stack([rows[keep], to_b[keep]], 1)

@@ -10,19 +10,21 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Pi3Config:
+    """Sizes of the network."""
+
     width: int = 1024  # features of a token
     head: int = 64  # features of an attention head
-    encoder_depth: int = 24  # blocks that see one photo
-    decoder_depth: int = 36  # blocks that see one photo and all photos in turn
-    head_depth: int = 5  # blocks of each decoder of an output
+    encoder_depth: int = 24  # blocks of the per-view encoder
+    decoder_depth: int = 36  # blocks that attend within a view and over all views in turn
+    head_depth: int = 5  # blocks of each output decoder
     camera_width: int = 512
-    table: int = 37  # side of the learned table of places [patches]
-    splat_widths: tuple[int, int, int] = (512, 512, 256)  # of the splat head's layers on the patch grid
-    splat_features: int = 128  # and on the pixel grid, from tokens and from colours each
+    table: int = 37  # side of the learned table of position embeddings [patches]
+    splat_widths: tuple[int, int, int] = (512, 512, 256)  # layer widths of the splat head on the patch grid
+    splat_features: int = 128  # of each of its two branches on the pixel grid
 
     @classmethod
     def of(cls, shapes: Mapping[str, Tensor]) -> Pi3Config:
-        """The sizes that a state dict (names as in π³) was made with; raises KeyError where it is of another model."""
+        """Sizes inferred from a state dict (names as in π³). Raises KeyError or IndexError for another model's."""
 
         def depth(prefix: str) -> int:
             return sum(name.startswith(prefix) and name.endswith(".norm1.weight") for name in shapes)

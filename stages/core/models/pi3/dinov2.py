@@ -1,4 +1,4 @@
-"""DINOv2's vision transformer with registers: what each patch of a photo shows.
+"""DINOv2 vision transformer with registers: features of the patches of a photo.
 
 Source: Oquab et al. 2023, "DINOv2"; Darcet et al. 2023, "Vision transformers need registers".
 """
@@ -13,17 +13,19 @@ from torch import Tensor, nn
 from stages.core.models.pi3.layers import EPS, ViTBlock
 
 PATCH = 14  # side of a patch [px]
-REGISTERS = 4
+REGISTERS = 4  # register tokens
 
 
 class PatchEmbed(nn.Module):
+    """Linear projection of patches."""
+
     def __init__(self, width: int):
         super().__init__()
         self.proj = nn.Conv2d(3, width, PATCH, stride=PATCH)
 
 
 class DinoV2(nn.Module):
-    """`table` is the side of the grid that the table of places was learned on [patches]."""
+    """The encoder; `table` is the side of the grid of learned position embeddings [patches]."""
 
     def __init__(self, width: int, head: int, depth: int, table: int = 37):
         super().__init__()
@@ -38,7 +40,7 @@ class DinoV2(nn.Module):
     def forward(self, images: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b t c"]:
         """Tokens of normalised images, sides multiples of 14: class, registers, then the patches in row order."""
         maps = self.patch_embed.proj(images)
-        patches = maps.flatten(2).mT + self._places(*maps.shape[2:]).to(maps.dtype)
+        patches = maps.flatten(2).mT + self._position_embeddings(*maps.shape[2:]).to(maps.dtype)
         first = self.cls_token + self.pos_embed[:, :1]
         parts = first, self.register_tokens, patches
         x = torch.cat([part.expand(len(images), -1, -1).to(patches.dtype) for part in parts], 1)
@@ -46,8 +48,8 @@ class DinoV2(nn.Module):
             x = block(x)
         return self.norm(x)
 
-    def _places(self, rows: int, columns: int) -> Float[Tensor, "1 t c"]:
-        """The learned table of places, resampled to the grid of patches."""
+    def _position_embeddings(self, rows: int, columns: int) -> Float[Tensor, "1 t c"]:
+        """The learned position embeddings, resampled to the grid of patches."""
         table = self.pos_embed[:, 1:]
         if (rows, columns) == (self.table, self.table):
             return table

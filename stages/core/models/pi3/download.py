@@ -1,4 +1,4 @@
-"""Fetching the published weights of π³ and Pi3-splat."""
+"""Download of the published weights of π³ and Pi3-splat."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from stages.core.models.pi3.weights import PUBLISHED, SUFFIXES
 
 
 def download(name: str) -> Path:
-    """The largest file of weights of `name`, fetched into the first folder searched."""
+    """Download the largest weight file of `name` into the first search folder; its path."""
     folder = folders()[0] / name
     return fetch(PUBLISHED[name], folder, lambda files: [_choose(files, name)], f"save it as {folder}.safetensors")[0]
 
 
 def _choose(files: list, name: str):
-    """The largest file of weights in the repository, safetensors first."""
+    """The largest weight file of the repository, safetensors first."""
     files = [f for f in files if Path(f.rfilename).suffix in SUFFIXES]
     if not files:
         raise ValueError(f"it holds no weights of {name} ({' '.join(SUFFIXES)})")

@@ -1,4 +1,4 @@
-"""The head that gives each pixel the numbers of a Gaussian: one branch from tokens, one from colours.
+"""The head that predicts a Gaussian's parameters for each pixel, from a token branch and a colour branch.
 
 Names as in the published weights of Pi3-splat (the Gaussian splat variant of NGFF's reconstruction).
 """
@@ -14,6 +14,7 @@ from stages.core.models.pi3.dinov2 import PATCH
 
 
 def conv(width_in: int, width_out: int) -> nn.Conv2d:
+    """3 x 3 convolution without bias."""
     return nn.Conv2d(width_in, width_out, 3, padding=1, bias=False)
 
 
@@ -30,7 +31,7 @@ class ResidualConv(nn.Module):
 
 
 class TokenBranch(nn.Module):
-    """From the grid of patches to the grid of pixels."""
+    """Upsampling of token features from patch to pixel resolution."""
 
     def __init__(self, width: int, widths: tuple[int, int, int], features: int):
         super().__init__()
@@ -45,7 +46,7 @@ class TokenBranch(nn.Module):
 
 
 class ColourBranch(nn.Module):
-    """What tokens are too coarse for."""
+    """Features of the image at pixel resolution."""
 
     def __init__(self, features: int):
         super().__init__()
@@ -54,6 +55,8 @@ class ColourBranch(nn.Module):
 
 
 class FeatureHead(nn.Module):
+    """Token and colour branches, joined by a linear layer per pixel."""
+
     def __init__(self, width: int, widths: tuple[int, int, int], features: int, channels: int):
         super().__init__()
         self.upsample_proj = TokenBranch(width, widths, features)
@@ -61,7 +64,7 @@ class FeatureHead(nn.Module):
         self.down_proj = nn.Linear(2 * features, channels)
 
     def forward(self, tokens: Float[Tensor, "b t c"], images: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b h w k"]:
-        """`channels` numbers a pixel, from tokens in row order and the normalised images they are of."""
+        """`channels` values per pixel, from the patch tokens in row order and the normalised images."""
         grid = images.shape[2] // PATCH, images.shape[3] // PATCH
         coarse = self.upsample_proj.model(tokens.mT.unflatten(2, grid))
         fine = self.conv_net.layers(images)

@@ -1,4 +1,4 @@
-"""From tokens to points, confidences and cameras."""
+"""Output heads: tokens to points, confidences and cameras."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from torch import Tensor, nn
 from stages.core.geometry.rotations import nearest_rotation
 from stages.core.models.pi3.dinov2 import PATCH
 from stages.core.models.pi3.layers import ViTBlock
-from stages.core.models.pi3.rope import Rotation
+from stages.core.models.pi3.rope import RotaryEmbedding
 
 
 class TransformerDecoder(nn.Module):
-    """A few blocks within each view, between two linear layers."""
+    """Transformer blocks within each view, between two linear layers."""
 
     def __init__(self, width_in: int, width: int, width_out: int, head: int, depth: int = 5):
         super().__init__()
@@ -22,15 +22,15 @@ class TransformerDecoder(nn.Module):
         self.blocks = nn.ModuleList(ViTBlock(width, head) for _ in range(depth))
         self.linear_out = nn.Linear(width, width_out)
 
-    def forward(self, x: Float[Tensor, "b t c"], places: Rotation) -> Float[Tensor, "b t d"]:
+    def forward(self, x: Float[Tensor, "b t c"], positions: RotaryEmbedding) -> Float[Tensor, "b t d"]:
         x = self.projects(x)
         for block in self.blocks:
-            x = block(x, places)
+            x = block(x, positions)
         return self.linear_out(x)
 
 
 class LinearMap(nn.Module):
-    """A linear layer that paints each patch: tokens to a map of `channels` numbers a pixel."""
+    """Linear layer and pixel shuffle: tokens to a map of `channels` values per pixel."""
 
     def __init__(self, width: int, channels: int):
         super().__init__()
@@ -49,6 +49,8 @@ def local_points(raw: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
 
 
 class ResidualMLP(nn.Module):
+    """Three linear layers with ReLU beside an identity."""
+
     def __init__(self, width: int):
         super().__init__()
         self.res_conv1, self.res_conv2, self.res_conv3 = (nn.Linear(width, width) for _ in range(3))
@@ -59,7 +61,7 @@ class ResidualMLP(nn.Module):
 
 
 class CameraHead(nn.Module):
-    """One camera for the patches of a view."""
+    """Camera pose of a view, from its pooled tokens."""
 
     def __init__(self, width: int):
         super().__init__()
@@ -69,7 +71,7 @@ class CameraHead(nn.Module):
         self.fc_rot = nn.Linear(width, 9)
 
     def forward(self, tokens: Float[Tensor, "b t c"]) -> Float[Tensor, "b 4 4"]:
-        """Camera-to-world matrices (x right, y down, z forward), up to one similarity of the world."""
+        """Camera-to-world matrices (x right, y down, z forward), up to a common similarity."""
         for block in self.res_conv:
             tokens = block(tokens)
         pooled = self.more_mlps(tokens.mean(1))
@@ -81,7 +83,7 @@ class CameraHead(nn.Module):
 
 
 def orthogonal(nine: Float[Tensor, "b 9"]) -> Float[Tensor, "b 3 3"]:
-    """Rotations from nine numbers: the nearest one to the matrix of their rows, made unit.
+    """RotaryEmbeddings from nine numbers: the nearest rotation to the matrix of their normalised rows.
 
     Source: Levinson et al. 2020, "An analysis of SVD for deep rotation estimation", eq. 3.
     """

@@ -1,4 +1,4 @@
-"""The transformer block that all parts of the network are made of."""
+"""The transformer block of all parts of the network."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from stages.core.models.pi3.rope import Rotation, rotate
+from stages.core.models.pi3.rope import RotaryEmbedding, rotate
 
 EPS = 1e-6  # of the layer norms outside attention
 
 
 class Attention(nn.Module):
-    """Attention of a sequence to itself, with rotary places and normalised queries and keys on request."""
+    """Self-attention, optionally with rotary position embedding and normalised queries and keys."""
 
     def __init__(self, width: int, head: int, normalised: bool = False):
         super().__init__()
@@ -22,18 +22,20 @@ class Attention(nn.Module):
         self.proj = nn.Linear(width, width)
         self.q_norm = nn.LayerNorm(head) if normalised else nn.Identity()
         self.k_norm = nn.LayerNorm(head) if normalised else nn.Identity()
-        self.attend = F.scaled_dot_product_attention  # never holds the t x t matrix; a benchmark swaps it
+        self.attend = F.scaled_dot_product_attention  # never stores the t x t matrix; a benchmark replaces it
 
-    def forward(self, x: Float[Tensor, "b t c"], places: Rotation | None = None) -> Float[Tensor, "b t c"]:
+    def forward(self, x: Float[Tensor, "b t c"], positions: RotaryEmbedding | None = None) -> Float[Tensor, "b t c"]:
         q, k, v = self.qkv(x).unflatten(-1, (3, -1, self.head)).permute(2, 0, 3, 1, 4)  # each (b, heads, t, d)
         q, k = self.q_norm(q), self.k_norm(k)
-        if places is not None:
-            q, k = rotate(q, places), rotate(k, places)
-        out = self.attend(q.to(v.dtype), k.to(v.dtype), v)  # norms and angles are 32 bit also where the rest is 16
+        if positions is not None:
+            q, k = rotate(q, positions), rotate(k, positions)
+        out = self.attend(q.to(v.dtype), k.to(v.dtype), v)  # norms and rotations stay in 32 bit under autocast
         return self.proj(out.transpose(1, 2).flatten(2))
 
 
 class MLP(nn.Module):
+    """Linear, GELU, Linear."""
+
     def __init__(self, width: int, hidden: int):
         super().__init__()
         self.fc1 = nn.Linear(width, hidden)
@@ -44,7 +46,7 @@ class MLP(nn.Module):
 
 
 class LayerScale(nn.Module):
-    """A learned factor for each feature, small at first. Source: Touvron et al. 2021, "Going deeper with CaiT"."""
+    """A learned factor for each feature, initially small. Source: Touvron et al. 2021, "Going deeper with CaiT"."""
 
     def __init__(self, width: int, start: float = 0.01):
         super().__init__()
@@ -55,7 +57,7 @@ class LayerScale(nn.Module):
 
 
 class ViTBlock(nn.Module):
-    """Pre-norm transformer block."""
+    """Pre-norm transformer block, optionally with LayerScale (`scaled`)."""
 
     def __init__(self, width: int, head: int, normalised: bool = False, scaled: bool = False):
         super().__init__()
@@ -66,6 +68,6 @@ class ViTBlock(nn.Module):
         self.mlp = MLP(width, 4 * width)
         self.ls2 = LayerScale(width) if scaled else nn.Identity()
 
-    def forward(self, x: Float[Tensor, "b t c"], places: Rotation | None = None) -> Float[Tensor, "b t c"]:
-        x = x + self.ls1(self.attn(self.norm1(x), places))
+    def forward(self, x: Float[Tensor, "b t c"], positions: RotaryEmbedding | None = None) -> Float[Tensor, "b t c"]:
+        x = x + self.ls1(self.attn(self.norm1(x), positions))
         return x + self.ls2(self.mlp(self.norm2(x)))

@@ -1,4 +1,4 @@
-"""How much memory a set of photos needs, said before it is asked for."""
+"""Estimate of the memory that a set of photos needs, before it is allocated."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from stages.core.models.pi3.dinov2 import PATCH
 from stages.core.models.pi3.network import CAMERA_REGISTERS
 from stages.core.models.pi3.splat import CHANNELS
 
-SHARE = 0.9  # of the free memory that may be used
-AT_ONCE = (8, 4, 2, 1)  # views whose own share of the work is done together
+MEMORY_FRACTION = 0.9  # of the free memory that may be used
+AT_ONCE = (8, 4, 2, 1)  # candidate numbers of views processed together in the per-view parts
 
 
 def weights(model: nn.Module) -> int:
@@ -25,11 +25,11 @@ def weights(model: nn.Module) -> int:
 def activations(
     config: Pi3Config, views: int, height: int, width: int, at_once: int, splats: bool, half: bool = False
 ) -> int:
-    """Bytes beside the weights at the fullest moment, without gradients; never the square of the number of tokens.
+    """Peak bytes of activations during inference; linear in the number of tokens.
 
-    A token is counted with what a block holds of it: the sum, its norm, queries, keys and values and what turning
-    them takes (32 bit where `half` computes the rest in 16). Afterwards a view's results are kept, and once more
-    while they are put together.
+    Per token a block holds the residual stream, its norm, queries, keys, values and the temporaries of the rotary
+    embedding (32 bit even if `half` computes the rest in 16). Afterwards the results of all views are kept, twice while
+    they are concatenated.
     """
     number, pixels = (2 if half else 4), height * width
     tokens = pixels // PATCH**2 + CAMERA_REGISTERS
@@ -40,7 +40,7 @@ def activations(
 
 
 def free(device: str) -> int | None:
-    """Bytes that can be had now; None where the system does not say."""
+    """Free bytes on a device; None if the system does not report them."""
     if device != "cpu":
         unused = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
         return torch.cuda.mem_get_info(device)[0] + unused
@@ -56,20 +56,20 @@ def free(device: str) -> int | None:
 
 
 def plan(config: Pi3Config, views: int, size: tuple[int, int], splats: bool, half: bool, room: int | None) -> int:
-    """How many views to do at once so that all fits into `room` bytes.
+    """Largest number of views to process at once within `room` bytes (None: unlimited).
 
-    Raises InputError, with the number of photos that would fit, when even one at a time does not.
+    Raises InputError, with the number of photos that would fit, if even one at a time is too much.
     """
 
     def fits(views: int, at_once: int) -> bool:
-        return room is None or activations(config, views, *size, at_once, splats, half) <= SHARE * room
+        return room is None or activations(config, views, *size, at_once, splats, half) <= MEMORY_FRACTION * room
 
     for at_once in AT_ONCE:
         if fits(views, at_once):
             return at_once
-    most = max((n for n in range(1, views) if fits(n, 1)), default=0)
+    maximum = max((n for n in range(1, views) if fits(n, 1)), default=0)
     need = activations(config, views, *size, 1, splats, half) / 1e9
-    remedy = f"{most} photos would fit" if most else "no photo fits"
+    remedy = f"{maximum} photos would fit" if maximum else "no photo fits"
     raise InputError(
         f"{views} photos of {size[1]}x{size[0]} need {need:.1f} GB beside the weights, and {room / 1e9:.1f} GB are "
         f"free: {remedy}; give fewer photos, a smaller --resolution, or --device cpu"

@@ -1,4 +1,4 @@
-"""π³: any number of photos, in any order, to a point and a confidence for each pixel and a camera for each photo."""
+"""π³: an unordered set of photos to a point and a confidence per pixel and a camera per photo."""
 
 from __future__ import annotations
 
@@ -13,23 +13,26 @@ from stages.core.models.pi3.config import Pi3Config
 from stages.core.models.pi3.dinov2 import PATCH, REGISTERS, DinoV2
 from stages.core.models.pi3.heads import CameraHead, LinearMap, TransformerDecoder, local_points
 from stages.core.models.pi3.layers import ViTBlock
-from stages.core.models.pi3.rope import Rotation, patch_places, rotation
+from stages.core.models.pi3.rope import RotaryEmbedding, patch_positions, rotary_embedding
 
 MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet
-CAMERA_REGISTERS = 5  # tokens of each view beside its patches
+CAMERA_REGISTERS = 5  # register tokens of each view, before its patches
 
 
 @dataclass(frozen=True)
 class Geometry:
-    """What the network says about v views; lengths share one unknown unit."""
+    """Network output for v views; lengths share one unknown unit."""
 
-    points: Float[Tensor, "v h w 3"]  # of each pixel, in the frame of its camera
+    points: Float[Tensor, "v h w 3"]  # of each pixel, in its camera's frame
     confidence: Float[Tensor, "v h w"]  # 0..1
     poses: Float[Tensor, "v 4 4"]  # camera-to-world: x right, y down, z forward
 
 
 class Pi3(nn.Module):
-    """Parameters are named as in the published weights. Inputs are one scene's views, sides multiples of 14 px."""
+    """The π³ network, with the parameter names of the published weights.
+
+    Inputs are the views of one scene, with sides that are multiples of 14 px.
+    """
 
     def __init__(self, config: Pi3Config = Pi3Config()):  # noqa: B008 -- frozen
         super().__init__()
@@ -51,41 +54,41 @@ class Pi3(nn.Module):
         return TransformerDecoder(2 * c.width, c.width, width_out, c.head, c.head_depth)
 
     def forward(self, images: Float[Tensor, "v 3 h w"], at_once: int = 8) -> Geometry:
-        """Geometry of RGB views in 0..1. What concerns one view alone is done for `at_once` of them at a time."""
-        hidden, places = self.tokens(images, at_once)
-        return self.geometry(hidden, places, images.shape[2:], at_once)
+        """Geometry of RGB views in 0..1; per-view parts process `at_once` views at a time."""
+        hidden, positions = self.tokens(images, at_once)
+        return self.geometry(hidden, positions, images.shape[2:], at_once)
 
-    def tokens(self, images: Float[Tensor, "v 3 h w"], at_once: int) -> tuple[Float[Tensor, "v t c"], Rotation]:
-        """What the views tell together, registers before patches, and the tokens' places."""
+    def tokens(self, images: Float[Tensor, "v 3 h w"], at_once: int) -> tuple[Float[Tensor, "v t c"], RotaryEmbedding]:
+        """Multi-view tokens, registers before patches, and their rotary embedding."""
         views, _, height, width = images.shape
-        places = patch_places(views, height // PATCH, width // PATCH, CAMERA_REGISTERS, images.device)
-        places = rotation(places, self.config.head)
-        return alternate(self.decoder, by_views(self._one_by_one, at_once, images), places, at_once), places
+        positions = patch_positions(views, height // PATCH, width // PATCH, CAMERA_REGISTERS, images.device)
+        positions = rotary_embedding(positions, self.config.head)
+        return alternate(self.decoder, by_views(self._encode_views, at_once, images), positions, at_once), positions
 
-    def _one_by_one(self, images: Float[Tensor, "v 3 h w"]) -> Float[Tensor, "v t c"]:
-        """What each view tells alone: registers, then patches."""
+    def _encode_views(self, images: Float[Tensor, "v 3 h w"]) -> Float[Tensor, "v t c"]:
+        """Tokens of each view alone: registers, then patches."""
         patches = self.encoder((images - self.image_mean) / self.image_std)[:, 1 + REGISTERS :]
         return torch.cat([self.register_token[0].expand(len(images), -1, -1).to(patches.dtype), patches], 1)
 
-    def geometry(self, hidden: Float[Tensor, "v t c"], places: Rotation, size, at_once: int) -> Geometry:
-        """The three heads. Their last layers stay in 32 bit: a depth is the exponential of what they say."""
+    def geometry(self, hidden: Float[Tensor, "v t c"], positions: RotaryEmbedding, size, at_once: int) -> Geometry:
+        """Outputs of the three heads. Their last layers stay in 32 bit, as depth is an exponential of the output."""
         grid = size[0] // PATCH, size[1] // PATCH
 
         def one_part(hidden: Tensor, cos: Tensor, sin: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-            near = Rotation(cos, sin)
+            near = RotaryEmbedding(cos, sin)
             parts = [d(hidden, near) for d in (self.point_decoder, self.conf_decoder, self.camera_decoder)]
             point, confidence, camera = (part[:, CAMERA_REGISTERS:].float() for part in parts)
             with torch.autocast(hidden.device.type, enabled=False):
                 points = local_points(self.point_head(point, *grid))
                 return points, self.conf_head(confidence, *grid)[..., 0].sigmoid(), self.camera_head(camera)
 
-        return Geometry(*by_views(one_part, at_once, hidden, *places))
+        return Geometry(*by_views(one_part, at_once, hidden, *positions))
 
 
 def halve(model: nn.Module) -> nn.Module:
-    """16-bit weights in all linear layers and convolutions but the last of the heads; norms and scales stay exact.
+    """Convert linear layers and convolutions to bfloat16, except the last of the heads, in place.
 
-    For running under autocast to bfloat16: there it changes nothing but the memory and time of casting.
+    For inference under autocast to bfloat16, where it changes no result, only the memory and time of casting.
     """
     for name, module in model.named_modules():
         last = {"point_head", "conf_head", "camera_head"} & set(name.split("."))
@@ -94,21 +97,21 @@ def halve(model: nn.Module) -> nn.Module:
     return model
 
 
-def alternate(blocks: nn.ModuleList, x: Float[Tensor, "v t c"], places: Rotation, at_once: int) -> Tensor:
-    """Even blocks attend within a view, odd ones over all views; the last two outputs side by side, (v, t, 2 c)."""
-    everywhere = Rotation(*(part.transpose(0, 1).flatten(1, 2)[None] for part in places))
+def alternate(blocks: nn.ModuleList, x: Float[Tensor, "v t c"], positions: RotaryEmbedding, at_once: int) -> Tensor:
+    """Even blocks attend within a view, odd ones over all views; the last two outputs concatenated, (v, t, 2 c)."""
+    joint = RotaryEmbedding(*(part.transpose(0, 1).flatten(1, 2)[None] for part in positions))
     last = []
     for i, block in enumerate(blocks):
         if i % 2 == 0:
-            x = by_views(lambda x, cos, sin, block=block: block(x, Rotation(cos, sin)), at_once, x, *places)
+            x = by_views(lambda x, cos, sin, block=block: block(x, RotaryEmbedding(cos, sin)), at_once, x, *positions)
         else:
-            x = block(x.flatten(0, 1)[None], everywhere).view_as(x)
+            x = block(x.flatten(0, 1)[None], joint).view_as(x)
         last = [*last[-1:], x]
     return torch.cat(last, -1)
 
 
 def by_views(function: Callable, at_once: int, *inputs: Tensor):
-    """function(*inputs), for a few views at a time, which bounds its memory; views must not depend on each other."""
+    """function(*inputs) for `at_once` views at a time, which bounds memory; views must not depend on each other."""
     if len(inputs[0]) <= at_once:
         return function(*inputs)
     parts = [function(*part) for part in zip(*(x.split(at_once) for x in inputs), strict=True)]

@@ -1,7 +1,7 @@
 """Rotary position embedding in two dimensions.
 
 Source: Su et al. 2021, "RoFormer"; Heo et al. 2024, "Rotary Position Embedding for Vision Transformer", in the axial
-form: one half of the features turns with the row, the other with the column.
+form: half of the features is rotated by the row, the other half by the column.
 """
 
 from typing import NamedTuple
@@ -13,35 +13,35 @@ from torch import Tensor
 BASE = 100.0  # wavelengths run from 2 pi to nearly 2 pi BASE patches
 
 
-class Rotation(NamedTuple):
-    """Cosines and sines of the angles that each token's features are turned by, found once for all blocks."""
+class RotaryEmbedding(NamedTuple):
+    """Cosines and sines of the rotation angles of each token's features, computed once for all blocks."""
 
     cos: Tensor  # (b, 1, t, d): the same for every head
     sin: Tensor
 
-    def __getitem__(self, index) -> "Rotation":
-        """Of some sequences of the batch."""
-        return Rotation(self.cos[index], self.sin[index])
+    def __getitem__(self, index) -> "RotaryEmbedding":
+        """Those of some sequences of the batch."""
+        return RotaryEmbedding(self.cos[index], self.sin[index])
 
 
-def rotation(places: Int[Tensor, "b t 2"], dim: int) -> Rotation:
+def rotary_embedding(positions: Int[Tensor, "b t 2"], dim: int) -> RotaryEmbedding:
     """Angles for tokens at (row, column) and `dim` features a head, a multiple of 4."""
     half = dim // 2
-    frequency = BASE ** (-torch.arange(0, half, 2, device=places.device) / half)
-    angle = places[..., None] * frequency  # (b, t, 2, dim / 4)
+    frequency = BASE ** (-torch.arange(0, half, 2, device=positions.device) / half)
+    angle = positions[..., None] * frequency  # (b, t, 2, dim / 4)
     angle = torch.cat([angle, angle], -1).flatten(-2)[:, None]
-    return Rotation(angle.cos(), angle.sin())
+    return RotaryEmbedding(angle.cos(), angle.sin())
 
 
-def rotate(x: Float[Tensor, "b heads t d"], by: Rotation) -> Float[Tensor, "b heads t d"]:
-    """Features turned: within each half, entry i pairs with entry i + d / 4."""
+def rotate(x: Float[Tensor, "b heads t d"], by: RotaryEmbedding) -> Float[Tensor, "b heads t d"]:
+    """Rotated features; within each half, entry i pairs with entry i + d / 4."""
     a, b = x.unflatten(-1, (2, 2, -1)).unbind(-2)
     across = torch.stack([-b, a], -2).flatten(-3)
     return x * by.cos + across * by.sin
 
 
-def patch_places(views: int, rows: int, columns: int, registers: int, device=None) -> Int[Tensor, "v t 2"]:
-    """Places of each view's tokens: the registers all at (0, 0), then the patches in row order, from (1, 1)."""
+def patch_positions(views: int, rows: int, columns: int, registers: int, device=None) -> Int[Tensor, "v t 2"]:
+    """(row, column) of each view's tokens: registers at (0, 0), then the patches in row order, from (1, 1)."""
     grid = torch.cartesian_prod(torch.arange(rows, device=device), torch.arange(columns, device=device)) + 1
-    places = torch.cat([grid.new_zeros(registers, 2), grid])
-    return places.expand(views, -1, -1)
+    positions = torch.cat([grid.new_zeros(registers, 2), grid])
+    return positions.expand(views, -1, -1)

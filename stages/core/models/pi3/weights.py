@@ -1,4 +1,4 @@
-"""The published weights of π³ and Pi3-splat: find, fetch when told to, check and load."""
+"""The published weights of π³ and Pi3-splat: locate, check and load."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ SUFFIXES = (".safetensors", ".pth", ".pt", ".ckpt", ".bin")
 
 @dataclass(frozen=True)
 class Pi3Source(HubSource):
-    """A network, and where its makers put the weights."""
+    """A network and the publication of its weights."""
 
     network: type[nn.Module]
-    prefix: str  # before the names that π³ itself uses
+    prefix: str  # of parameter names, before those of π³
 
 
 PUBLISHED = {
@@ -38,27 +38,28 @@ PUBLISHED = {
 def find(name: str, given: Path | None = None) -> Path:
     """The file with the weights of `name`: the one given, or NAME.safetensors, NAME.pth or a file in the folder NAME/.
 
-    `given` may be a file or a folder; without it $NGFF_WEIGHTS and the user's cache are searched.
+    `given` may be a file or a folder; without it $NGFF_WEIGHTS and the user's cache are searched. Raises InputError if
+    there is none.
     """
     if given is not None and not Path(given).is_dir():
         must_exist(given, f"weights of {name} (.safetensors or .pth)")
         return Path(given)
-    places = folders() if given is None else [Path(given)]
-    for place in places:
-        inside = sorted((place / name).iterdir()) if (place / name).is_dir() else []
-        for file in [*(place / f"{name}{suffix}" for suffix in SUFFIXES), *inside]:
+    searched = folders() if given is None else [Path(given)]
+    for folder in searched:
+        inside = sorted((folder / name).iterdir()) if (folder / name).is_dir() else []
+        for file in [*(folder / f"{name}{suffix}" for suffix in SUFFIXES), *inside]:
             if file.suffix in SUFFIXES and file.is_file():
                 return file
     source = PUBLISHED[name]
     raise InputError(
-        f"{name}: no weights in {' or '.join(str(p) for p in places)}; fetch them from "
+        f"{name}: no weights in {' or '.join(str(p) for p in searched)}; fetch them from "
         f"https://huggingface.co/{source.repository} ({source.size}, licence {source.licence}) and save them as "
-        f"{places[0] / name}.safetensors, name the file with --weights, or add --download"
+        f"{searched[0] / name}.safetensors, name the file with --weights, or add --download"
     )
 
 
 def load(path: Path, name: str) -> nn.Module:
-    """The network with the weights of a file, on the CPU, 32 bit, for inference. Its sizes are read off the weights.
+    """The network with the weights of a file, on the CPU, in 32 bit, for inference; sizes are inferred.
 
     Raises InputError for a file that is damaged, holds something else, or lacks tensors.
     """
@@ -98,7 +99,7 @@ def read_state(path: Path) -> dict[str, Tensor]:
 
 
 def differences(wanted: Mapping[str, Tensor], given: Mapping[str, Tensor]) -> str:
-    """What is missing, unknown or of another shape, in words; empty when all fits."""
+    """Message listing missing, unknown and differently shaped tensors; empty if all fit."""
     other = [f"{k} {tuple(given[k].shape)} instead of {tuple(wanted[k].shape)}"
              for k in wanted if k in given and given[k].shape != wanted[k].shape]  # fmt: skip
     groups = {"missing": [k for k in wanted if k not in given], "unknown": [k for k in given if k not in wanted],

@@ -8,7 +8,7 @@ from stages.core.models.pi3.dinov2 import REGISTERS, DinoV2
 from stages.core.models.pi3.heads import CameraHead, LinearMap, TransformerDecoder, local_points, orthogonal
 from stages.core.models.pi3.layers import ViTBlock
 from stages.core.models.pi3.network import CAMERA_REGISTERS, Pi3, alternate
-from stages.core.models.pi3.rope import patch_places, rotate, rotation
+from stages.core.models.pi3.rope import patch_positions, rotary_embedding, rotate
 from tests.core.models.pi3.recorded import CLOSE
 
 TINY = Pi3Config(width=32, head=16, encoder_depth=2, decoder_depth=4, head_depth=1, camera_width=16, table=4)
@@ -36,7 +36,7 @@ def test_names_and_shapes_are_the_published_ones(manifest):
 
 def test_rotary_places(recorded):
     given, expected, _ = recorded("rope2d")
-    assert_close(rotate(given["tokens"], rotation(given["positions"], 16)), expected["tokens"], **CLOSE)
+    assert_close(rotate(given["tokens"], rotary_embedding(given["positions"], 16)), expected["tokens"], **CLOSE)
 
 
 @torch.no_grad()
@@ -59,11 +59,11 @@ def test_blocks_within_views_and_over_all_views_in_turn(recorded, at_once):
     blocks = torch.nn.ModuleList(ViTBlock(64, 16, normalised=True, scaled=True) for _ in range(4))
     blocks.load_state_dict({name.removeprefix("decoder."): x for name, x in weights.items()})
     scenes, count, height, width = given["BNHW"].tolist()
-    places = patch_places(count, height // 14, width // 14, CAMERA_REGISTERS)
+    places = patch_positions(count, height // 14, width // 14, CAMERA_REGISTERS)
     assert torch.equal(places.repeat(scenes, 1, 1), expected["pos"])
     for scene, wanted in zip(given["hidden"].split(count), expected["hidden_cat"].split(count), strict=True):
         x = torch.cat([registers.expand(count, -1, -1), scene], 1)
-        assert_close(alternate(blocks, x, rotation(places, 16), at_once), wanted, **CLOSE)
+        assert_close(alternate(blocks, x, rotary_embedding(places, 16), at_once), wanted, **CLOSE)
 
 
 @torch.no_grad()
@@ -71,7 +71,7 @@ def test_the_decoder_of_a_head(recorded):
     given, expected, weights = recorded("transformer_decoder")
     model = TransformerDecoder(32, 32, 24, head=16, depth=2)
     model.load_state_dict(weights)
-    assert_close(model(given["hidden"], rotation(given["xpos"], 16)), expected["out"], **CLOSE)
+    assert_close(model(given["hidden"], rotary_embedding(given["xpos"], 16)), expected["out"], **CLOSE)
 
 
 @torch.no_grad()

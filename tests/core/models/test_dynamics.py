@@ -103,7 +103,7 @@ def test_steps_add_up_to_a_rollout(name):
 
 @pytest.mark.parametrize("name", [n for n in SMALL if n != "ngff"])
 @torch.no_grad()
-def test_a_published_step_is_one_of_euler(name):
+def test_step_of_baselines_is_explicit_euler(name):
     initial, model = crowd(), small(name)
     external = push(initial, 1, (1.0, 0.0, 2.0), (0.0, 0.1, 0.0), 0.03, 0.07)
     for substeps in (1, 3):
@@ -114,14 +114,14 @@ def test_a_published_step_is_one_of_euler(name):
         torch.testing.assert_close(*rolled, **EXACT)
 
 
-def test_the_adjoint_needs_an_equation():
+def test_adjoint_needs_an_ode_method():
     with pytest.raises(ValueError, match="needs an ODE method"):
         Integration(adjoint=True)
 
 
 @torch.no_grad()
 @pytest.mark.parametrize("method", ["rk4", "dopri5"])
-def test_other_methods_run(name, method):
+def test_ode_methods_agree_with_the_step(name, method):
     out = small(name).rollout(crowd(1), 3, integration=Integration(method))
     torch.testing.assert_close(
         out, small(name).rollout(crowd(1), 3, integration=Integration(substeps=20)), rtol=0, atol=0.05
@@ -188,7 +188,7 @@ def test_a_pinned_object_stays(name):
 
 
 @torch.no_grad()
-def test_what_a_model_is_told_it_uses_and_no_more(name):
+def test_models_use_exactly_their_inputs(name):
     initial, model = crowd(), small(name)
     out = model.rollout(initial, STEPS)
     other = {

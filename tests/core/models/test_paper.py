@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 import torch
 
-from stages.core.models.baselines.ngff_paper import REACH, PaperForceField, PaperState, euler_matrix, world_points
+from stages.core.models.baselines.ngff_paper import (
+    CONTACT_RADIUS,
+    PaperForceField,
+    PaperState,
+    euler_matrix,
+    world_points,
+)
 from stages.core.models.checkpoints import build, load
 from stages.core.models.external_forces import ExternalForces
 from stages.core.models.field.narrow_phase import near_walls, nearest
@@ -49,8 +55,10 @@ def test_one_force_call(recorded, published):
     torch.testing.assert_close(euler_matrix(state.angle), d["mid/R_angle"], **CLOSE)
     torch.testing.assert_close(euler_matrix(-state.angle), d["mid/R_neg_angle"], **CLOSE)
     torch.testing.assert_close(points, d["mid/global_points"], **CLOSE)
-    assert torch.equal(nearest(points, initial.valid, REACH)[0] < REACH, d["mid/overlap_mask"])
-    assert torch.equal(near_walls(points, initial.valid, initial.box, REACH), d["mid/boundary_mask"][..., 0] > 0)
+    assert torch.equal(nearest(points, initial.valid, CONTACT_RADIUS)[0] < CONTACT_RADIUS, d["mid/overlap_mask"])
+    assert torch.equal(
+        near_walls(points, initial.valid, initial.box, CONTACT_RADIUS), d["mid/boundary_mask"][..., 0] > 0
+    )
     shape = published.predictor.pointnet(state.local, torch.ones_like(initial.valid))
     torch.testing.assert_close(shape, d["mid/geom_features"], **CLOSE)
     forces, torques, stresses = published.predictor(initial, state, d["in/ori_pos"])

@@ -1,4 +1,4 @@
-"""What the weights that ship promise, whenever they are trained again."""
+"""Properties that the shipped weights must have after every training."""
 
 import copy
 import json
@@ -13,14 +13,15 @@ from stages.core.physics.keypoints import farthest_points
 from stages.lab.assets.objects import OBJECTS, make_object
 from stages.lab.assets.shapes import single_threaded
 
-DT = 0.02
+DT = 0.02  # [s]
+SLOW = pytest.mark.slow  # long rollouts of the same kind with more keypoints and objects
 FILES = sorted(SHIPPED.glob("*.safetensors"))
-MOST = 5e5  # bytes of all weights and cards
-SINK = 0.035  # deepest into the floor [m]: what the model promises, and a little for rounding
+MAX_BYTES = 5e5  # of all weights and cards
+MAX_DEPTH = 0.035  # of a keypoint in the floor [m]: MAX_PENETRATION and a margin for rounding
 
 
-def box(half, n, seed):
-    """Points on the surface of a box."""
+def box_surface(half, n, seed):
+    """Random points on the surface of a box."""
     rng = torch.Generator().manual_seed(seed)
     p = torch.rand(n, 3, generator=rng) * 2 - 1
     axis = torch.randint(3, (n,), generator=rng)
@@ -28,31 +29,31 @@ def box(half, n, seed):
     return p * torch.tensor(half)
 
 
-def some_points(name, n):
-    """Some of an object's surface, as large as in a scene."""
+def keypoints_of(name, n):
+    """Keypoints of an object at the size that it has in a scene [m]."""
     means = make_object(name).means * OBJECTS[name].scale
     with single_threaded():
         return means[farthest_points(means, n)]
 
 
 def pile(lower, upper):
-    """One above the floor, the other a little aside above it: (2, n, 3)."""
+    """One object above the floor and another one above it, a little aside: (2, n, 3) [m]."""
     lower = lower + torch.tensor([0.0, 0.0, -0.9 - float(lower[:, 2].min())])
     upper = upper + torch.tensor([0.05, 0.03, float(lower[:, 2].max()) + 0.15 - float(upper[:, 2].min())])
     return torch.stack([lower, upper])
 
 
 def motion(initial, points):
-    """Centres of mass [m] and their speeds [m/s]."""
+    """Centres of mass [m] and their speeds [m/s] in each frame."""
     com = torch.stack([centre_of_mass(initial, p) for p in points.unbind(1)], 1)
     return com, com.diff(dim=1).norm(dim=-1) / DT
 
 
-def rests(com, speed):
-    assert speed[:, :40].amax() > 0.8  # it did fall
-    # a fortieth of that, averaged over the last second
+def assert_comes_to_rest(com, speed):
+    assert speed[:, :40].amax() > 0.8  # falls at first
+    # at most a fortieth of that, averaged over the last second
     assert float(speed[:, -50:].mean(1).max()) < 0.02
-    assert float((com[:, -1] - com[:, -250])[..., :2].norm(dim=-1).max()) < 0.05  # and lies where it lay 5 s before
+    assert float((com[:, -1] - com[:, -250])[..., :2].norm(dim=-1).max()) < 0.05  # and moved by less than 0.05 m in 5 s
 
 
 @pytest.fixture(scope="module")
@@ -62,28 +63,28 @@ def model():
 
 @pytest.fixture(scope="module")
 def dropped(model):
-    """Soft, usual and stiff boxes that fall on each other, for 20 seconds, and their world."""
+    """Initial conditions and 1,000 steps (20 s) of soft, medium and stiff boxes falling on each other."""
     n, E = 48, torch.tensor([[5e3], [1e5], [1e7]]).expand(3, 2)
-    lower, upper = box((0.25, 0.2, 0.15), n, 0), box((0.15, 0.15, 0.2), n, 1)
+    lower, upper = box_surface((0.25, 0.2, 0.15), n, 0), box_surface((0.15, 0.15, 0.2), n, 1)
     points = torch.stack([lower + torch.tensor([0.0, 0, -0.5]), upper + torch.tensor([0.06, 0.04, 0.1])])
     initial = InitialConditions.of(
         points.expand(3, 2, n, 3), E=E, mass=torch.tensor([0.6, 0.3]), friction=torch.tensor(1.0)
     )
-    with torch.inference_mode(), single_threaded():  # tensors this small are not worth sharing
+    with torch.inference_mode(), single_threaded():
         return initial, model.rollout(initial, 1000)
 
 
 def test_a_thousand_steps_stay_finite_and_above_the_floor(dropped):
     initial, points = dropped
     assert points.isfinite().all()
-    assert float(points[..., 2].amin() - initial.floor[0, 0]) > -SINK
+    assert float(points[..., 2].amin() - initial.floor[0, 0]) > -MAX_DEPTH
 
 
-@pytest.mark.parametrize("n", [64, 128, 256])
-def test_what_has_fallen_comes_to_rest(model, n):
-    """A duck that falls on a can, a phone on a pillow, as far as their keypoints are asked for: 20 seconds."""
+@pytest.mark.parametrize("n", [64, pytest.param(128, marks=SLOW), pytest.param(256, marks=SLOW)])
+def test_stacked_objects_come_to_rest(model, n):
+    """A duck falling on a can and a phone falling on a pillow, n keypoints each, for 20 s."""
     pairs = ("can", "duck"), ("pillow", "phone")
-    scenes = [pile(*(some_points(name, n) for name in pair)) for pair in pairs]
+    scenes = [pile(*(keypoints_of(name, n) for name in pair)) for pair in pairs]
     kinds = [[OBJECTS[name] for name in pair] for pair in pairs]
     initial = InitialConditions.of(
         torch.stack(scenes), E=torch.tensor([[k.E for k in row] for row in kinds]), friction=torch.tensor(1.0),
@@ -91,22 +92,23 @@ def test_what_has_fallen_comes_to_rest(model, n):
     )  # fmt: skip
     with torch.inference_mode(), single_threaded():
         points = model.rollout(initial, 1000)
-    rests(*motion(initial, points))
+    assert_comes_to_rest(*motion(initial, points))
 
 
-def test_shapes_never_learned_from_come_to_rest(dropped):
-    rests(*motion(*dropped))
+def test_unseen_shapes_come_to_rest(dropped):
+    assert_comes_to_rest(*motion(*dropped))
 
 
-ALL = tuple(name for name in OBJECTS if name not in ("ball", "cloth"))  # the ball rolls, the cloth may creep
+ALL = tuple(name for name in OBJECTS if name not in ("ball", "cloth"))  # the ball rolls; the cloth may creep
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("seed", "names", "n"), [(0, ALL, 128), (1, ALL, 128), (0, ("bowl",), 256)])
-def test_what_is_dropped_turned_at_random_comes_to_rest(model, seed, names, n):
-    """Alone, from 0.3 m, for 20 seconds."""
+def test_randomly_rotated_objects_come_to_rest(model, seed, names, n):
+    """Single objects dropped from 0.3 m, for 20 s."""
     rng = torch.Generator().manual_seed(seed)
     turns = {name: matrix(torch.nn.functional.normalize(torch.randn(4, generator=rng), dim=0)) for name in OBJECTS}
-    points = torch.stack([some_points(name, n) @ turns[name].T for name in names])
+    points = torch.stack([keypoints_of(name, n) @ turns[name].T for name in names])
     points[..., 2] += -0.94 + 0.3 - points[..., 2].amin(1, keepdim=True)
     kinds = [OBJECTS[name] for name in names]
     initial = InitialConditions.of(
@@ -121,8 +123,8 @@ def test_what_is_dropped_turned_at_random_comes_to_rest(model, seed, names, n):
 
 
 @pytest.mark.parametrize("E", [(1e4, 1e6), (1e6, 1e7)])
-def test_momentum_of_two_free_bodies_that_collide_is_kept(model, E):
-    a, b = box((0.15, 0.15, 0.15), 96, 1), box((0.1, 0.12, 0.25), 96, 2)
+def test_collision_of_free_bodies_conserves_momentum(model, E):
+    a, b = box_surface((0.15, 0.15, 0.15), 96, 1), box_surface((0.1, 0.12, 0.25), 96, 2)
     points = torch.stack([a + torch.tensor([-0.4, 0, 0.5]), b + torch.tensor([0.4, 0.05, 0.55])])[None]
     mass, velocity = torch.tensor([[0.5, 0.3]]), torch.tensor([[[1.5, 0, 0], [-1.0, 0.2, 0]]])
     initial = InitialConditions.of(points, E=torch.tensor([E]), mass=mass, velocity=velocity, gravity=torch.zeros(3))
@@ -130,13 +132,13 @@ def test_momentum_of_two_free_bodies_that_collide_is_kept(model, E):
         com = torch.stack([centre_of_mass(initial, p) for p in model.rollout(initial, 40).unbind(1)], 1)
     v = com.diff(dim=1) / DT
     momentum = (mass[..., None] * v).sum(2)[0]
-    assert (v[0, -1] - v[0, 0]).norm(dim=-1).min() > 0.2  # they did collide
+    assert (v[0, -1] - v[0, 0]).norm(dim=-1).min() > 0.2  # a collision happened
     scale = float((mass * velocity.norm(dim=-1)).sum())
     assert (momentum - momentum[0]).norm(dim=-1).max() < 0.01 * scale
 
 
-def test_rounding_to_16_bits_costs_nothing_that_can_be_measured(model, dropped):
-    """Weights changed by as much as rounding changes them fall the same way, to a millimetre or so in 0.8 s."""
+def test_rounding_weights_to_16_bits_changes_rollouts_by_millimetres(model, dropped):
+    """Weights perturbed by the rounding error of 16 bits; root mean square difference over 0.8 s."""
     initial, points = dropped
     rng = torch.Generator().manual_seed(0)
     other = copy.deepcopy(model)
@@ -149,7 +151,7 @@ def test_rounding_to_16_bits_costs_nothing_that_can_be_measured(model, dropped):
 
 
 def test_all_weights_and_cards_together_are_small():
-    assert sum(f.stat().st_size for f in SHIPPED.iterdir()) <= MOST
+    assert sum(f.stat().st_size for f in SHIPPED.iterdir()) <= MAX_BYTES
     assert {f.stem for f in SHIPPED.glob("*.safetensors")} == {f.stem for f in SHIPPED.glob("*.json")}
 
 

@@ -43,7 +43,7 @@ class GraphConv(nn.Module):
 
 
 class GCN(PointDynamics):
-    """Engine `gcn`: change of positions and velocities per FRAME, predicted from the current graph; applied as a rate."""
+    """Engine `gcn`: change of positions and velocities per FRAME, from the current graph; applied as a rate."""
 
     inputs = frozenset({"points", "velocity", "spin"})
 

@@ -1,8 +1,8 @@
 """The published neural Gaussian force field, with its parameter names, so that its checkpoints load.
 
-Source: "Learning Physics-Grounded 4D Dynamics with Neural Gaussian Force Fields" (ICLR 2026) and its public code. Details
-of that code that its checkpoints depend on are kept and noted in place. Two are not: the neighbour search has no
-cap, and padding does not enter the object encoder (`padding_encoded` restores that).
+Source: "Learning Physics-Grounded 4D Dynamics with Neural Gaussian Force Fields" (ICLR 2026) and its public code.
+Details of that code that its checkpoints depend on are kept and noted in place. Two are not: the neighbour search has
+no cap, and padding does not enter the object encoder (`padding_encoded` restores that).
 """
 
 from __future__ import annotations

@@ -80,7 +80,7 @@ def test_other_weights_are_refused_with_reason(copy):
     save_file(kept, words, metadata={"format": "pt"})
     text_only = {**json.loads((files.unet / "config.json").read_text()), "in_channels": 10}
     (files.unet / "config.json").write_text(json.dumps(text_only))
-    with pytest.raises(InputError, match="10 channels in; the one that takes a picture has 11"):
+    with pytest.raises(InputError, match="10 channels in; the one that takes an image has 11"):
         load(files)
     (files.base / "vae/diffusion_pytorch_model.safetensors").write_bytes(b"no")
     with pytest.raises(InputError, match="Stable Diffusion 1.5 .*fetch"):

@@ -9,7 +9,7 @@ from stages.core.physics.forces import Force, ForcePrompts
 from tests.core.models.worlds import crowd, push
 
 
-def test_from_the_prompts_of_a_user():
+def test_from_force_prompts():
     initial = crowd(1, 2, 10)
     place = tuple((initial.points[0, 1, 4] + 1e-4).tolist())
     prompts = ForcePrompts((Force(7, (1.0, 2.0, 3.0), start=0.1), Force(3, torque=(0.0, 0.0, 1.0), end=0.5, at=place)),
@@ -20,7 +20,7 @@ def test_from_the_prompts_of_a_user():
     assert external.end[0, 0] == torch.inf
 
 
-def test_share_of_a_frame_and_of_an_instant():
+def test_active_fraction_of_a_frame_and_at_an_instant():
     initial = crowd(1)
     external = push(initial, 0, (1.0, 0, 0), start=0.1, end=0.3)
     shares = [float(external.active_fraction(t, 0.04)) for t in (0.0, 0.08, 0.2, 0.29)]

@@ -39,8 +39,8 @@ def encoded(E, solidity):
     return heard[0], float(scene.compliance_scale), 1 / float(shape.size)
 
 
-def test_a_solid_body_is_heard_of_as_a_stiffer_one_and_beyond_what_was_learned_yields_less():
-    """However much of it is told as a stiffness, the two together say the same."""
+def test_solid_body_is_encoded_as_a_stiffer_one_up_to_the_trained_range():
+    """Encoded stiffness over compliance scale is always the effective stiffness."""
     assert encoded(1e3, 1.0)[:2] == (1e3, 1.0)
     assert encoded(1e3, 8.0)[:2] == pytest.approx((8e3, 1.0))
     heard, compliance_scale, unit = encoded(2e3, 1e6)
@@ -70,7 +70,7 @@ def dropped(solidity, method="step", E=3e4):
     return height / height[0]
 
 
-def test_a_solid_ball_is_squashed_as_it_lands_and_takes_its_shape_again():
+def test_solid_ball_deforms_on_landing_and_recovers():
     """MPM, with 0.0133 m between particles and the scheme of the published data: 14 % at most, 0 % after that."""
     solid, hollow = dropped(38.0), dropped(1.0)
     assert 0.75 < solid.min() < 0.95 and solid[30:35].min() > 0.98

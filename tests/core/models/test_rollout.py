@@ -1,4 +1,4 @@
-"""A Stepper goes where the model's own steps go; on CUDA, recorded, to rounding."""
+"""TimeStepper against the model's own steps; on CUDA captured as a graph, equal to rounding."""
 
 import pytest
 import torch
@@ -14,7 +14,7 @@ CUDA = pytest.param("cuda", marks=pytest.mark.gpu)
 
 @pytest.mark.parametrize("device", ["cpu", *([CUDA] if "cuda" in DEVICES else [])])
 @pytest.mark.parametrize("name", SMALL)
-def test_a_rollout_is_the_model_s(name, device):
+def test_rollout_equals_that_of_the_model(name, device):
     model, initial = small(name).to(device), padded(crowd(), 1, 3).to(device)
     external = push(initial, 0, force=(0.0, 0.0, 30.0), start=0.05, end=0.11)
     external = ExternalForces(**{k: v.to(device) for k, v in vars(external).items()})
@@ -26,7 +26,7 @@ def test_a_rollout_is_the_model_s(name, device):
 
 @pytest.mark.parametrize("device", ["cpu", *([CUDA] if "cuda" in DEVICES else [])])
 @pytest.mark.parametrize("name", SMALL)
-def test_it_begins_anew_with_another_world(name, device):
+def test_restart_with_other_initial_conditions(name, device):
     model, other = small(name).to(device), crowd(seed=2).to(device)
     stepper = TimeStepper(model, crowd(seed=1).to(device))
     state = [x.data_ptr() for x in (*stepper.state, stepper.points)]
@@ -40,7 +40,7 @@ def test_it_begins_anew_with_another_world(name, device):
         stepper.restart(crowd(n=13).to(device))
 
 
-def test_pushes_may_change_between_steps():
+def test_external_forces_may_change_between_steps():
     model, initial = small("ngff-paper"), crowd()
     stepper = TimeStepper(model, initial, external=push(initial, 1))
     stepper.step()
@@ -55,7 +55,7 @@ def test_pushes_may_change_between_steps():
     torch.testing.assert_close(gained, torch.full_like(before, 1.0))
 
 
-def test_the_world_that_was_given_stays_as_it_was():
+def test_inputs_are_not_modified():
     initial, model = crowd(), small("ngff-paper")
     before = initial.points.clone()
     stepper = TimeStepper(model, initial)
@@ -66,7 +66,7 @@ def test_the_world_that_was_given_stays_as_it_was():
 
 @pytest.mark.gpu
 @pytest.mark.skipif("cuda" not in DEVICES, reason="no NVIDIA GPU")
-def test_recorded_steps_are_the_same_to_rounding():
+def test_captured_steps_equal_model_steps_to_rounding():
     torch.manual_seed(0)
     model, initial = build("ngff").cuda().eval(), crowd(2, 3, 200).to(torch.float32).to("cuda")
     wanted = model.rollout(initial, 8).detach()  # with gradients, so without fused kernels

@@ -16,10 +16,10 @@ demo: setup
 	$(MAKE) -C examples/falling_toys NGFF=$(abspath $(BIN))/ngff
 
 test: setup
-	$(BIN)/python -m pytest -n auto -m "not slow"
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto -m "not slow"
 
 test-all: setup
-	$(BIN)/python -m pytest -n auto
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto
 
 test-gpu:
 	$(PYTHON) -m pytest -m gpu

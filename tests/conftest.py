@@ -1,10 +1,6 @@
 """Tiny scenes built in memory, the devices present, and skips for data that may be absent."""
 
 import os
-
-# before the first import that reads it: one thread in each of several workers
-os.environ.setdefault("OMP_NUM_THREADS", "1" if "PYTEST_XDIST_WORKER" in os.environ else "2")
-
 from pathlib import Path
 
 import pytest
@@ -15,6 +11,8 @@ from stages.core.scene.cameras import Cameras
 from stages.core.scene.gaussians import Gaussians, concatenate
 from stages.core.scene.scene import Scene, SceneObject
 
+if "OMP_NUM_THREADS" not in os.environ:  # plugins import PyTorch before this file, so the variable would be too late
+    torch.set_num_threads(1 if "PYTEST_XDIST_WORKER" in os.environ else 2)
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 SHARED = Path(__file__).resolve().parents[1].parent / "shared"
 

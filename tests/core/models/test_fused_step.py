@@ -51,7 +51,7 @@ def all_ways(model: ForceField, initial, steps: int, prompt=None, pinned: bool =
     single.load_state_dict(model.state_dict())
     shape = replace(scene.shape, initial=scene.shape.initial.to(torch.float32), blur=half)
     shape = replace(shape, **{k: getattr(shape, k).float() for k in ("arm", "normal", "spacing", "size", "inverse")})
-    known = {k: getattr(scene, k).float() for k in ("code", "stiffness", "damping", "yields")}
+    known = {k: getattr(scene, k).float() for k in ("embedding", "stiffness", "damping", "compliance_scale")}
     scene = replace(scene, shape=shape, **known)
     external = replace(external, **{k: getattr(external, k).float() for k in ("force", "torque", "start", "end")})
     assert fused_step.fits(single, scene)

@@ -104,7 +104,7 @@ class _Step:
         body, point_states, deformation, planes = self._drift(state)
         count, point, local_forces, record = self._contacts(body, point_states, planes)
         prior, wrenches, *friction = self._messages(count, point, local_forces, record)
-        wrench = tuple(friction)  # placeholder: not read by the kernel
+        wrench = tuple(friction)  # without external forces the kernel takes these arguments but does not read them
         if self.external.object.shape[1]:
             wrench = self.external.wrench(point_states[:, :, :3].mT, body[..., :3].contiguous(), t, self.dt)
         return self._update(body, point_states, deformation, wrenches, local_forces, friction, prior, wrench)

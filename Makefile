@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: setup demo test test-all test-gpu lint clean
+.PHONY: setup demo test test-slow test-all test-gpu lint clean
 
 setup: $(VENV)/.installed
 
@@ -18,8 +18,10 @@ demo: setup
 test: setup
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto -m "not slow"
 
-test-all: setup
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto
+test-slow: setup
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto -m slow
+
+test-all: test test-slow
 
 test-gpu:
 	$(PYTHON) -m pytest -m gpu

@@ -134,6 +134,7 @@ class PointDynamics(Dynamics):
     """A model whose state is a PointState and whose `scene` is the InitialConditions."""
 
     def initial_state(self, scene: InitialConditions) -> PointState:
+        """Keypoints in rigid motion with the velocity and spin of their object; velocity 0 where padded."""
         arm = offsets(scene, scene.points)
         velocity = scene.velocity[:, :, None] + torch.linalg.cross(scene.spin[:, :, None].expand_as(arm), arm)
         return PointState(scene.points, torch.where(scene.valid[..., None], velocity, 0.0))
@@ -141,10 +142,12 @@ class PointDynamics(Dynamics):
     def state_from_motion(
         self, scene: InitialConditions, points: Float[Tensor, "b o n 3"], velocities: Float[Tensor, "b o n 3"]
     ) -> PointState:
+        """The given positions [m] and velocities [m/s]; 0 where padded."""
         valid = scene.valid[..., None]
         return PointState(torch.where(valid, points, 0.0), torch.where(valid, velocities, 0.0))
 
     def points(self, scene: InitialConditions, state: PointState) -> Float[Tensor, "b o n 3"]:
+        """The positions of the state [m]."""
         return state.position
 
 

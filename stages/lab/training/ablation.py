@@ -45,6 +45,7 @@ class NoMaterialInputs(_UnfusedForceField):
     """The same stiffness, Poisson ratio and friction for all objects as network inputs; masses are the true ones."""
 
     def encode(self, shape: RestShape) -> FieldScene:
+        """Embeddings and springs for E = 1e5 Pa, Poisson ratio 0.3 and friction 0.5; `shape` is returned unchanged."""
         w = shape.initial
         same = replace(w, E=torch.full_like(w.E, 1e5), nu=torch.full_like(w.nu, 0.3),
                        friction=torch.full_like(w.friction, 0.5))  # fmt: skip

@@ -39,6 +39,7 @@ class GraphConv(nn.Module):
         nn.init.xavier_uniform_(self.linear.weight)
 
     def forward(self, x: Float[Tensor, "b p w"], A: Float[Tensor, "b p p"]) -> Float[Tensor, "b p v"]:
+        """Node features `x` -> A x W^T + b; `A` from `adjacency`."""
         return A.to(x) @ self.linear(x) + self.bias
 
 
@@ -57,6 +58,7 @@ class GCN(PointDynamics):
     def derivative(
         self, initial: InitialConditions, t: Tensor | float, state: PointState, external: ExternalForces
     ) -> PointState:
+        """Rates [m/s, m/s^2] from the current radius graph and external forces; 0 for points that may not move."""
         position = state.position.flatten(1, 2)
         A = adjacency(position, initial.valid.flatten(1))
         x = torch.cat([position, state.velocity.flatten(1, 2)], -1)

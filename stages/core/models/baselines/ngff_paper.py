@@ -75,6 +75,7 @@ class ResidualLinear(nn.Module):
         self.mlp = nn.Sequential(*blocks(1, width, width))
 
     def forward(self, x: Float[Tensor, "*b w"]) -> Float[Tensor, "*b w"]:
+        """Input plus its transformed copy, same width."""
         return x + self.mlp(x)
 
 
@@ -88,6 +89,7 @@ class ObjectEncoder(nn.Module):
         self.global_features = nn.Sequential(*blocks(1, hidden, hidden))
 
     def forward(self, local: Float[Tensor, "b o n 3"], counts: Bool[Tensor, "b o n"]) -> Float[Tensor, "b o h"]:
+        """Maximum-pooled embedding of the `local` points [m] in `counts`; objects without points pool to 0."""
         x = self.input_embedding(local)
         for block in self.extraction_blocks:
             x = block(x)
@@ -105,6 +107,7 @@ class StressNet(nn.Module):
         self.output_layer = nn.Sequential(nn.Linear(2 * h, h), nn.ReLU(), nn.Linear(h, h), nn.ReLU(), nn.Linear(h, 3))
 
     def forward(self, x: Float[Tensor, "b o n 12"], counts: Bool[Tensor, "b o n"]) -> Float[Tensor, "b o n 3"]:
+        """Accelerations [m/s^2] from each point's features and their maximum over the points in `counts`."""
         x = self.feature_layer(x)
         maximum = x.masked_fill(~counts[..., None], -torch.inf).amax(2, keepdim=True)
         maximum = torch.where(counts.any(2)[..., None, None], maximum, 0.0)
@@ -205,6 +208,7 @@ class PaperForceField(Dynamics):
     def state_from_motion(
         self, initial: InitialConditions, points: Float[Tensor, "b o n 3"], velocities: Float[Tensor, "b o n 3"]
     ) -> PaperState:
+        """Rigid motion fitted to the keypoints, as Euler angles and their rates; the residual is the deformation."""
         arm = offsets(initial, initial.points)
         inverse = torch.linalg.inv(inertia(initial.mass_fraction, arm))
         m = fit_rigid_motion(initial.mass_fraction, arm, inverse, points, velocities)
@@ -215,6 +219,7 @@ class PaperForceField(Dynamics):
     def derivative(
         self, initial: InitialConditions, t: Tensor | float, state: PaperState, external: ExternalForces
     ) -> PaperState:
+        """Rates of the state from predicted and external forces and gravity; 0 for padding and pinned objects."""
         force, torque, stress = self.predictor(initial, state, _rest(initial))
         applied, twist = external.wrench(world_points(state), state.com, t)
         # the external torque is divided by the mass twice, as published
@@ -228,6 +233,7 @@ class PaperForceField(Dynamics):
         )  # fmt: skip
 
     def points(self, initial: InitialConditions, state: PaperState) -> Float[Tensor, "b o n 3"]:
+        """Keypoints in world coordinates [m]."""
         return world_points(state)
 
 

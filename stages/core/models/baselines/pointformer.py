@@ -31,6 +31,7 @@ class Pointformer(PointDynamics):
     def derivative(
         self, initial: InitialConditions, t: Tensor | float, state: PointState, external: ExternalForces
     ) -> PointState:
+        """Network output plus velocity [m/s], and external accelerations [m/s^2]; 0 for points that may not move."""
         x = self.embed(state.position.flatten(1, 2))
         padding = ~initial.valid.flatten(1)
         for block in self.blocks:

@@ -29,6 +29,7 @@ class TransformerBlock(nn.Module):
         self.mlp = nn.Sequential(nn.Linear(width, 4 * width), nn.GELU(), nn.Linear(4 * width, width))
 
     def forward(self, x: Float[Tensor, "s p w"], keys: Bool[Tensor, "s p"]) -> Float[Tensor, "s p w"]:
+        """Tokens of s sequences after attention and feed-forward; only tokens in `keys` are attended to."""
         q, k, v = self.qkv(self.before(x)).unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
         y = scaled_dot_product_attention(q, k, v, attn_mask=keys[:, None, None])
         x = x + self.out(y.transpose(1, 2).flatten(2))
@@ -69,6 +70,7 @@ class Transformer(PointDynamics):
     def derivative(
         self, initial: InitialConditions, t: Tensor | float, state: PointState, external: ExternalForces
     ) -> PointState:
+        """Velocity [m/s], and acceleration by network, gravity and forces [m/s^2]; 0 for points that may not move."""
         b, o, n = initial.valid.shape
         # padded objects attend to their own padding, as a softmax over nothing is nan
         own = (initial.valid | ~initial.present[..., None]).flatten(0, 1)

@@ -85,6 +85,7 @@ class Perceptron(nn.Sequential):
     """Linear, SiLU, Linear."""
 
     def forward(self, x: Float[Tensor, "*b i"]) -> Float[Tensor, "*b j"]:
+        """Output of both layers, by one kernel where `apply_layers` allows it."""
         return apply_layers(x, (self[0], self[2]))
 
 

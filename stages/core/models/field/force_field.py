@@ -77,6 +77,7 @@ class ForceField(Dynamics):
         self.stress = DeformationNet(h) if deform else None
 
     def precompute(self, initial: InitialConditions) -> RestShape:
+        """Rest shapes of the objects: arms, normals, inertia and neighbourhoods."""
         # 16-bit neighbourhoods for rollouts on a GPU: reading them dominates the cost of a step with many keypoints
         return rest_shape_of(initial, half=triton_allowed(initial.points))
 
@@ -116,6 +117,7 @@ class ForceField(Dynamics):
         return self.code(torch.cat([(w.mass_fraction[..., None] * x).sum(2), maximum], -1))
 
     def initial_state(self, scene: FieldScene) -> BodyState:
+        """Undeformed objects at their initial pose, with the momentum of their initial spin."""
         w, shape = scene.shape.initial, scene.shape
         quat = torch.zeros_like(w.mass)[..., None].repeat(1, 1, 4)
         quat[..., 0] = 1
@@ -126,17 +128,20 @@ class ForceField(Dynamics):
     def state_from_motion(
         self, scene: FieldScene, points: Float[Tensor, "b o n 3"], velocities: Float[Tensor, "b o n 3"]
     ) -> BodyState:
+        """Rigid motion fitted to the keypoints; the residual is the deformation, 0 for a field without deformation."""
         shape = scene.shape
         m = fit_rigid_motion(shape.initial.mass_fraction, shape.arm, shape.inverse, points, velocities)
         u, du = (m.u, m.du) if self.stress is not None else (torch.zeros_like(m.u), torch.zeros_like(m.du))
         return BodyState(m.com, quaternion(m.R), m.velocity, m.momentum, projected(shape, u), projected(shape, du))
 
     def points(self, scene: FieldScene, state: BodyState) -> Float[Tensor, "b o n 3"]:
+        """Keypoints in world coordinates [m], by one kernel where the fused step is used."""
         if self._use_fused_step(scene):
             return fused_step.points(scene, state)
         return state.com[:, :, None] + matvec(matrix(state.quat)[:, :, None], scene.shape.arm + state.u)
 
     def point_velocity(self, scene: FieldScene, state: BodyState, external: ExternalForces) -> Float[Tensor, "b o n 3"]:
+        """Velocities of the keypoints [m/s], in closed form; `external` has no effect."""
         return self._kinematics(scene, state).point_velocity
 
     def derivative(self, scene: FieldScene, t: Tensor | float, state: BodyState, external: ExternalForces) -> BodyState:

@@ -28,6 +28,7 @@ class DeformableConv(nn.Module):
         self.regular_conv = nn.Conv2d(inputs, outputs, 3, padding=1, bias=False)
 
     def forward(self, x: Float[Tensor, "1 i h w"]) -> Float[Tensor, "1 o h w"]:
+        """Convolution of `x` with offsets of at most a quarter of the longer side [px]."""
         h, w = x.shape[2:]
         limit = max(h, w) / 4
         offsets = self.offset_conv(x).clamp(-limit, limit).reshape(9, 2, h, w)  # dy, dx of each tap
@@ -55,6 +56,7 @@ class ConvBlock(nn.Module):
         self.downsample = nn.Conv2d(inputs, outputs, 1) if shortcut else None
 
     def forward(self, x: Tensor) -> Tensor:
+        """Feature maps (1, i, h, w) -> (1, o, h, w)."""
         out = self.bn2(self.conv2(F.selu(self.bn1(self.conv1(x)))))
         return F.selu(out if self.downsample is None else out + self.downsample(x))
 
@@ -71,6 +73,7 @@ class Descriptor(nn.Module):
         self.agg_weights = nn.Parameter(torch.zeros(SAMPLES, DIM, DIM))
 
     def forward(self, x: Float[Tensor, "1 c h w"], keypoints: Float[Tensor, "k 2"]) -> Float[Tensor, "k c"]:
+        """Unit-length descriptors of keypoints (x, y) [px] in the feature maps `x`."""
         h, w = x.shape[2:]
         corner = (keypoints.long() - 1).clamp_min(0)
         corner = torch.minimum(corner, torch.tensor([w - 4, h - 4], device=x.device))

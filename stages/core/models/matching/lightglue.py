@@ -39,6 +39,7 @@ class Position(nn.Module):
         self.Wr = nn.Linear(2, DIM // HEADS // 2, bias=False)
 
     def forward(self, keypoints: Float[Tensor, "n 2"]) -> tuple[Tensor, Tensor]:
+        """Cosine and sine of the rotation angles, each (n, DIM / HEADS), at normalised keypoint positions."""
         angle = self.Wr(keypoints).repeat_interleave(2, 1)
         return angle.cos(), angle.sin()
 
@@ -57,6 +58,7 @@ class SelfBlock(nn.Module):
         self.Wqkv, self.out_proj, self.ffn = nn.Linear(DIM, 3 * DIM), nn.Linear(DIM, DIM), _ffn()
 
     def forward(self, x: Float[Tensor, "n d"], position: tuple[Tensor, Tensor]) -> Float[Tensor, "n d"]:
+        """Updated features; `position` as returned by `Position`."""
         q, k, v = self.Wqkv(x).unflatten(1, (HEADS, -1, 3)).permute(3, 1, 0, 2)
         message = self.out_proj(_attend(_rotated(q, position), _rotated(k, position), v))
         return x + self.ffn(torch.cat([x, message], 1))
@@ -71,6 +73,7 @@ class CrossBlock(nn.Module):
         self.ffn = _ffn()
 
     def forward(self, a: Float[Tensor, "n d"], b: Float[Tensor, "m d"]) -> tuple[Tensor, Tensor]:
+        """Updated features of both images, each attending to the other; shapes as the inputs."""
         qk = [_heads(self.to_qk(x)) for x in (a, b)]
         v = [_heads(self.to_v(x)) for x in (a, b)]
         messages = self.to_out(_attend(qk[0], qk[1], v[1])), self.to_out(_attend(qk[1], qk[0], v[0]))
@@ -85,6 +88,7 @@ class Layer(nn.Module):
         self.self_attn, self.cross_attn = SelfBlock(), CrossBlock()
 
     def forward(self, a: Tensor, b: Tensor, at_a: tuple, at_b: tuple) -> tuple[Tensor, Tensor]:
+        """Updated features of both images, `at_a` and `at_b` being their rotary embeddings."""
         return self.cross_attn(self.self_attn(a, at_a), self.self_attn(b, at_b))
 
 
@@ -96,6 +100,7 @@ class Assignment(nn.Module):
         self.matchability, self.final_proj = nn.Linear(DIM, 1), nn.Linear(DIM, DIM)
 
     def forward(self, a: Float[Tensor, "n d"], b: Float[Tensor, "m d"]) -> Float[Tensor, "n m"]:
+        """Log match probability of every pair of keypoints. Source: Lindenberger et al. 2023, "LightGlue"."""
         alike = self.final_proj(a) @ self.final_proj(b).mT / DIM**0.5
         matched = F.logsigmoid(self.matchability(a)) + F.logsigmoid(self.matchability(b)).mT
         return alike.log_softmax(0) + alike.log_softmax(1) + matched

@@ -27,6 +27,7 @@ class ResidualConv(nn.Module):
         self.conv2, self.norm2 = conv(width, width), nn.BatchNorm2d(width)
 
     def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
+        """Feature maps of the same shape; ReLU is applied after the addition."""
         return F.relu(x + self.norm2(self.conv2(F.relu(self.norm1(self.conv1(x))))))
 
 

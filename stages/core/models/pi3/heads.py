@@ -23,6 +23,7 @@ class TransformerDecoder(nn.Module):
         self.linear_out = nn.Linear(width, width_out)
 
     def forward(self, x: Float[Tensor, "b t c"], positions: RotaryEmbedding) -> Float[Tensor, "b t d"]:
+        """Decoded tokens; `positions` are the rotary embeddings of their image positions."""
         x = self.projects(x)
         for block in self.blocks:
             x = block(x, positions)
@@ -56,6 +57,7 @@ class ResidualMLP(nn.Module):
         self.res_conv1, self.res_conv2, self.res_conv3 = (nn.Linear(width, width) for _ in range(3))
 
     def forward(self, x: Float[Tensor, "b t c"]) -> Float[Tensor, "b t c"]:
+        """Tokens plus the output of the layers, same width."""
         inner = F.relu(self.res_conv2(F.relu(self.res_conv1(x))))
         return x + F.relu(self.res_conv3(inner))
 
@@ -83,7 +85,7 @@ class CameraHead(nn.Module):
 
 
 def orthogonal(nine: Float[Tensor, "b 9"]) -> Float[Tensor, "b 3 3"]:
-    """RotaryEmbeddings from nine numbers: the nearest rotation to the matrix of their normalised rows.
+    """Rotations from nine numbers: the nearest rotation to the matrix of their normalised rows.
 
     Source: Levinson et al. 2020, "An analysis of SVD for deep rotation estimation", eq. 3.
     """

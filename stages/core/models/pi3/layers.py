@@ -25,6 +25,7 @@ class Attention(nn.Module):
         self.attend = F.scaled_dot_product_attention  # never stores the t x t matrix; a benchmark replaces it
 
     def forward(self, x: Float[Tensor, "b t c"], positions: RotaryEmbedding | None = None) -> Float[Tensor, "b t c"]:
+        """Attention among the t tokens of each sequence; `positions`: their rotary embeddings, if any."""
         q, k, v = self.qkv(x).unflatten(-1, (3, -1, self.head)).permute(2, 0, 3, 1, 4)  # each (b, heads, t, d)
         q, k = self.q_norm(q), self.k_norm(k)
         if positions is not None:
@@ -42,6 +43,7 @@ class MLP(nn.Module):
         self.fc2 = nn.Linear(hidden, width)
 
     def forward(self, x: Float[Tensor, "b t c"]) -> Float[Tensor, "b t c"]:
+        """Tokens -> tokens of the same width, each on its own."""
         return self.fc2(F.gelu(self.fc1(x)))
 
 
@@ -53,6 +55,7 @@ class LayerScale(nn.Module):
         self.gamma = nn.Parameter(torch.full((width,), start))
 
     def forward(self, x: Float[Tensor, "b t c"]) -> Float[Tensor, "b t c"]:
+        """Tokens with each feature multiplied by its factor."""
         return x * self.gamma
 
 
@@ -69,5 +72,6 @@ class ViTBlock(nn.Module):
         self.ls2 = LayerScale(width) if scaled else nn.Identity()
 
     def forward(self, x: Float[Tensor, "b t c"], positions: RotaryEmbedding | None = None) -> Float[Tensor, "b t c"]:
+        """Tokens after attention and MLP, each with a residual connection; `positions` as in `Attention`."""
         x = x + self.ls1(self.attn(self.norm1(x), positions))
         return x + self.ls2(self.mlp(self.norm2(x)))

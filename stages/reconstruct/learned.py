@@ -96,7 +96,7 @@ def predict(model: nn.Module, images: Float[Tensor, "v 3 h w"], device: str) -> 
         model = model.to(device)
     views, _, *size = images.shape
     at_once = memory.plan(config, views, tuple(size), splats, half, memory.free(device))
-    need = memory.activations(config, views, *size, at_once, splats, half) + memory.weights(model)
+    need = memory.activations(config, views, tuple(size), at_once, splats, half) + memory.weights(model)
     log.info("%d photos at %dx%d, about %.1f GB of memory, %d at once", views, *size[::-1], need / 1e9, at_once)
     with torch.autocast(torch.device(device).type, torch.bfloat16, enabled=half):
         output = model(images.to(device), at_once)

@@ -9,6 +9,7 @@ import logging
 import math
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
@@ -60,7 +61,7 @@ def rollout(
     _warn_stuck(scene, setup, prompts)
     ids = [o.id for o in scene.objects]
     forces = [_PromptedForce(f, particles, setup, ids.index(f.object_id)) for f in prompts.forces]
-    follow = _follow(scene, keypoints, setup.bodies)
+    attachment = _attach(scene, keypoints, setup.bodies)
     gravity = torch.tensor([0.0, 0.0, -options.gravity]).repeat(len(particles), 1)
     gravity[particles.held > 0] = 0
     substeps = solver.substeps(options.dt, gravity)
@@ -73,7 +74,7 @@ def rollout(
         for frame in range(options.steps):
             now = solver.particles
             x = now.x.cpu()
-            yield _state(scene, keypoints, setup, follow, x / unit, now.F.cpu(), particles.mass)
+            yield _state(scene, setup, attachment, x / unit, now.F.cpu(), particles.mass)
             if frame < options.steps - 1:
                 t = frame * options.dt
                 acceleration = sum((f.acceleration(x, t, t + options.dt) for f in forces), gravity)
@@ -119,7 +120,7 @@ def _particles(
             message += f"; E {m.E:.2g} softened to {E:.2g} Pa at this quality"
         log.info("%s", message)
     E, density, nu, viscosity, friction, model = rows[body, :6].unbind(1)
-    particles = mpm.at_rest(setup.start * unit, volume, density, E, nu, viscosity, friction)
+    particles = mpm.at_rest(setup.start * unit, volume, mpm.ParticleMaterial(E, nu, density, viscosity, friction))
     particles.model, particles.plastic = model.to(torch.int8), rows[body, 6:].contiguous()
     particles.v, particles.held = velocity[body] * (held[body] == 0)[:, None], held[body]
     return particles
@@ -183,8 +184,15 @@ class _PromptedForce:
         return active * a
 
 
-def _follow(scene: Scene, keypoints: Keypoints, bodies: Bodies) -> tuple[Int[Tensor, "k j"], Float[Tensor, "k j"]]:
-    """Indices and weights of the particles of its object that each keypoint follows."""
+class _Attachment(NamedTuple):
+    """Keypoints, each with the particles of its object that it follows."""
+
+    keypoints: Keypoints
+    index: Int[Tensor, "k j"]  # rows of the particles
+    weight: Float[Tensor, "k j"]  # rows sum to 1
+
+
+def _attach(scene: Scene, keypoints: Keypoints, bodies: Bodies) -> _Attachment:
     index = torch.zeros(len(keypoints.rest), PARTICLES_PER_KEYPOINT, dtype=torch.int64)
     weight = torch.zeros(len(keypoints.rest), PARTICLES_PER_KEYPOINT)
     for row, o in enumerate(scene.objects):
@@ -193,18 +201,18 @@ def _follow(scene: Scene, keypoints: Keypoints, bodies: Bodies) -> tuple[Int[Ten
         if bool(mine.any()):
             near, weight[mine] = nearest_weights(bodies.x[own], keypoints.rest[mine], PARTICLES_PER_KEYPOINT)
             index[mine] = own[near]
-    return index, weight
+    return _Attachment(keypoints, index, weight)
 
 
 def _state(
-    scene: Scene, keypoints: Keypoints, setup: SceneSetup, follow: tuple[Tensor, Tensor], x: Float[Tensor, "p 3"],
-    F: Float[Tensor, "p 3 3"], mass: Float[Tensor, "p"],
+    scene: Scene, setup: SceneSetup, attachment: _Attachment, x: Float[Tensor, "p 3"], F: Float[Tensor, "p 3 3"],
+    mass: Float[Tensor, "p"],
 ) -> FrameState:  # fmt: skip
     """Keypoints moved and deformed with the particles that they follow; at the start they are moved by the lift alone.
 
     `x` in scene units, `mass` [kg].
     """
-    index, weight = follow
+    keypoints, index, weight = attachment
     bodies = setup.bodies
     row = bodies.body[index[:, 0]] if len(index) else torch.zeros(0, dtype=torch.int64)
     moved = x - setup.start

@@ -31,8 +31,9 @@ def run(scene: Path, out: Path, options: SimulateOptions = SimulateOptions()) ->
     rollout = choose({name: engine.rollout for name, engine in ENGINES.items()}, options.engine)
     world = with_objects(read_scene(scene), scene)
     prompts = forces.parse(
-        world.objects, Path(scene).stem, options.force, options.forces, options.pin, options.velocity, options.lift
-    )
+        world.objects, Path(scene).stem, force=options.force, forces=options.forces, pin=options.pin,
+        velocity=options.velocity, lift=options.lift,
+    )  # fmt: skip
     inputs = [Path(p) for p in (scene, options.materials, options.forces) if p is not None]
     world = replace(world, provenance={**provenance("simulate", inputs, options), "scene": world.provenance})
     keypoints = choose_keypoints(world, options.keypoints, options.seed)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -18,6 +19,8 @@ from stages.core.kernels.splat.binning import Bins, bin_splats
 from stages.core.kernels.splat.compositing import composite, dominant_splats
 from stages.core.kernels.splat.projection import pack_camera, project
 from stages.core.scene.gaussians import Gaussians
+
+NEAR = 0.01  # Gaussians with a smaller camera depth are left out [m]
 
 
 @dataclass(frozen=True)
@@ -48,14 +51,13 @@ def rasterise(
     width: int,
     height: int,
     background: Float[Tensor, "3"] | Float[Tensor, "h w 3"] | None = None,
-    near: float = 0.01,
 ) -> Rendering:
     """Render Gaussians in one or more cameras over a background colour or image (black when None).
 
-    Width and height are in pixels. Gaussians with a camera depth below `near` [m] are left out.
+    Width and height are in pixels. Gaussians with a camera depth below NEAR are left out.
     """
     draw = _draw_cuda if gaussians.means.is_cuda else _draw
-    views = [draw(gaussians, V, K, width, height, background, near) for V, K in zip(viewmats, Ks, strict=True)]
+    views = [draw(gaussians, _View(V, K, width, height), background) for V, K in zip(viewmats, Ks, strict=True)]
     *images, getters = zip(*views, strict=True)
     return Rendering(*(_stack(image) for image in images), getters)
 
@@ -67,11 +69,11 @@ def rasterise_features(
     Ks: Float[Tensor, "c 3 3"],
     width: int,
     height: int,
-    near: float = 0.01,
 ) -> Float[Tensor, "c h w f"]:
     """Composite feature vectors of the Gaussians like colours, over 0: sum of weight x feature. Differentiable."""
     draw = _features_cuda if gaussians.means.is_cuda else _features
-    return _stack([draw(gaussians, features, V, K, width, height, near) for V, K in zip(viewmats, Ks, strict=True)])
+    views = [_View(V, K, width, height) for V, K in zip(viewmats, Ks, strict=True)]
+    return _stack([draw(gaussians, features, view) for view in views])
 
 
 @torch.no_grad()
@@ -81,28 +83,41 @@ def visibility(
     K: Float[Tensor, "3 3"],
     width: int,
     height: int,
-    near: float = 0.01,
 ) -> tuple[Int[Tensor, "h w"], Float[Tensor, "n"]]:
     """The Gaussian with the largest weight in each pixel (-1: none), and each Gaussian's total weight [px]."""
+    view = _View(viewmat, K, width, height)
     if gaussians.means.is_cuda:
-        return _visibility_cuda(gaussians, viewmat, K, width, height, near)
-    return dominant_splats(*_splats(gaussians, viewmat, K, width, height, near))
+        return _visibility_cuda(gaussians, view)
+    return dominant_splats(*_splats(gaussians, view))
+
+
+class _View(NamedTuple):
+    """One camera and its image size [px]."""
+
+    viewmat: Float[Tensor, "4 4"]
+    K: Float[Tensor, "3 3"]
+    width: int
+    height: int
+
+    def for_gsplat(self, g: Gaussians) -> tuple[Tensor, Tensor, int, int]:
+        """Camera arguments of gsplat's functions, on the device of the Gaussians."""
+        return self.viewmat[None].to(g.means), self.K[None].to(g.means), self.width, self.height
 
 
 def _stack(images: list[Tensor] | tuple[Tensor, ...]) -> Tensor:
     return images[0][None] if len(images) == 1 else torch.stack(tuple(images))
 
 
-def _splats(g: Gaussians, viewmat: Tensor, K: Tensor, width: int, height: int, near: float) -> tuple[Tensor, Bins]:
+def _splats(g: Gaussians, view: _View) -> tuple[Tensor, Bins]:
     degree_of(g.sh.shape[1])
-    camera = pack_camera(viewmat, K, width, height, near)
+    camera = pack_camera(*view, NEAR)
     splats, keys, rects = project(camera, g.means, g.quats, g.scales, g.opacities, g.sh)
-    return splats, bin_splats(keys, rects, width, height)
+    return splats, bin_splats(keys, rects, view.width, view.height)
 
 
-def _draw(g: Gaussians, viewmat: Tensor, K: Tensor, width: int, height: int, background: Tensor | None, near: float):
+def _draw(g: Gaussians, view: _View, background: Tensor | None):
     """Image, alpha, depth, extents of one view, and a getter of its absolute gradients."""
-    splats, bins = _splats(g, viewmat, K, width, height, near)
+    splats, bins = _splats(g, view)
     absgrad: list[Tensor] = []
     if splats.requires_grad:
         splats.register_hook(lambda grad: absgrad.append(grad[:, 10:12]))
@@ -110,29 +125,23 @@ def _draw(g: Gaussians, viewmat: Tensor, K: Tensor, width: int, height: int, bac
     return rgb, alpha, depth, splats.detach()[:, 11:13], lambda: absgrad
 
 
-def _features(g: Gaussians, features: Tensor, viewmat: Tensor, K: Tensor, width: int, height: int, near: float):
+def _features(g: Gaussians, features: Tensor, view: _View):
     """Composite four features at a time in the columns of colour and depth."""
-    splats, bins = _splats(g, viewmat, K, width, height, near)
+    splats, bins = _splats(g, view)
     count = features.shape[1]
     padded = torch.nn.functional.pad(features.float(), (0, -count % 4))
     images = []
     for four in padded.split(4, dim=1):
         rgb, fourth, _ = composite(torch.cat([splats[:, :6], four, splats[:, 10:]], 1), bins)
         images += [rgb, fourth[..., None]]
-    return torch.cat(images, -1)[..., :count] if images else splats.new_zeros(height, width, 0)
+    return torch.cat(images, -1)[..., :count] if images else splats.new_zeros(view.height, view.width, 0)
 
 
-def _camera(g: Gaussians, viewmat: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
-    return viewmat[None].to(g.means), K[None].to(g.means)
-
-
-def _draw_cuda(
-    g: Gaussians, viewmat: Tensor, K: Tensor, width: int, height: int, background: Tensor | None, near: float
-):
+def _draw_cuda(g: Gaussians, view: _View, background: Tensor | None):
     import gsplat
 
     image, alpha, info = gsplat.rasterization(
-        g.means, g.quats, g.scales, g.opacities, g.sh, *_camera(g, viewmat, K), width, height, near_plane=near,
+        g.means, g.quats, g.scales, g.opacities, g.sh, *view.for_gsplat(g), near_plane=NEAR,
         sh_degree=degree_of(g.sh.shape[1]), packed=False, render_mode="RGB+ED", absgrad=True,
     )  # fmt: skip
     centres = info["means2d"]
@@ -146,31 +155,31 @@ def _draw_cuda(
     return rgb, alpha, image[0, ..., 3], info["radii"][0].float(), absgrad
 
 
-def _features_cuda(g: Gaussians, features: Tensor, viewmat: Tensor, K: Tensor, width: int, height: int, near: float):
+def _features_cuda(g: Gaussians, features: Tensor, view: _View):
     import gsplat
 
     image, _, _ = gsplat.rasterization(
-        g.means, g.quats, g.scales, g.opacities, features, *_camera(g, viewmat, K), width, height, near_plane=near,
+        g.means, g.quats, g.scales, g.opacities, features, *view.for_gsplat(g), near_plane=NEAR,
         packed=False,
     )  # fmt: skip
     return image[0]
 
 
-def _visibility_cuda(g: Gaussians, viewmat: Tensor, K: Tensor, width: int, height: int, near: float):
+def _visibility_cuda(g: Gaussians, view: _View):
     """Visibility from gsplat's projection and binning; gsplat does not return the dominant splat of a pixel."""
     import gsplat
 
     from stages.core.kernels.splat.compositing_pixel import composite_pixelwise
 
     radii, centres, depths, conics, _ = gsplat.fully_fused_projection(
-        g.means, None, g.quats, g.scales, *_camera(g, viewmat, K), width, height, near_plane=near,
+        g.means, None, g.quats, g.scales, *view.for_gsplat(g), near_plane=NEAR,
         opacities=g.opacities,
     )  # fmt: skip
-    tile, across, down = 16, -(-width // 16), -(-height // 16)
+    tile, across, down = 16, -(-view.width // 16), -(-view.height // 16)
     _, keys, members = gsplat.isect_tiles(centres, radii, depths, tile, across, down)
     starts = gsplat.isect_offset_encode(keys, 1, across, down).flatten()
     starts = torch.cat([starts, starts.new_tensor([len(members)])])
     splats = torch.zeros(len(g), 16, device=centres.device)
     splats[:, :6] = torch.cat([centres[0], conics[0], g.opacities[:, None]], 1)
-    _, _, index, weight = composite_pixelwise(splats, members, starts, tile, width, height)
+    _, _, index, weight = composite_pixelwise(splats, members, starts, tile, view.width, view.height)
     return index, weight

@@ -51,15 +51,15 @@ def falling_boxes(particles: int) -> tuple[mpm.Particles, mpm.Box, float]:
     parts = []
     for n, (E, density) in enumerate(MATERIALS):
         x = body * h + torch.tensor([0.05 * n - 0.3, 0.03 * n - 0.3, -0.93 + n * (layers * h + 0.06)])
-        fill = [torch.full((len(x),), value) for value in (h**3, density, E, 0.3, 0.0, 0.5)]
-        parts.append(mpm.at_rest(x, *fill))
+        fill = [torch.full((len(x),), value) for value in (E, 0.3, density, 0.0, 0.5)]
+        parts.append(mpm.at_rest(x, torch.full((len(x),), h**3), mpm.ParticleMaterial(*fill)))
     return mpm.join_particles(parts), mpm.Box((-1.94, -1.94, -0.94), (1.94, 1.94, 2.94)), 2 * h
 
 
 def measure(particles: int, scenes: int, device: str, frames: int, exact: bool = False) -> dict:
     """Time per substep of a batch and figures derived from it; `exact` makes sums independent of their order."""
     one, box, dx = falling_boxes(particles)
-    solver = mpm.Solver(mpm.join_particles([one] * scenes), box, dx, device, [len(one)] * scenes, exact=exact)
+    solver = mpm.Solver(mpm.join_particles([one] * scenes), box, dx, device, sizes=[len(one)] * scenes, exact=exact)
     push = torch.tensor(GRAVITY, device=device).repeat(len(solver.rows), 1)
     step = lambda: solver.enqueue_frame(SUBSTEP * SUBSTEPS, push, SUBSTEPS)  # noqa: E731
     for _ in range(3):

@@ -94,7 +94,7 @@ def run(
     for views in options.views:
         size = options.size, options.size
         at_once = memory.plan(config, views, size, options.splats, half, memory.free(device))
-        said = weights + memory.activations(config, views, *size, at_once, options.splats, half)
+        said = weights + memory.activations(config, views, size, at_once, options.splats, half)
         rows.append({"views": views, "estimated_bytes": _finite(said)})
         set_attention(model, nn.functional.scaled_dot_product_attention)
         try:

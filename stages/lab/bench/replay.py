@@ -80,8 +80,11 @@ def make_solver(data: dict[str, np.ndarray], device: str) -> mpm.Solver:
     each = {k: torch.from_numpy(data[k]).float().repeat_interleave(n) for k in ("E", "rho")}
     x = torch.from_numpy(data["positions"][0]).float()
     full = torch.ones(len(x))
-    particles = mpm.at_rest(x, torch.from_numpy(data["volume"]).float(), each["rho"], each["E"],
-                            float(data["nu"]) * full, 0 * full, 0 * full, COROTATED)  # fmt: skip
+    particles = mpm.at_rest(
+        x, torch.from_numpy(data["volume"]).float(),
+        mpm.ParticleMaterial(each["E"], float(data["nu"]) * full, each["rho"], viscosity=0 * full, friction=0 * full),
+        COROTATED,
+    )  # fmt: skip
     dx = float(data["grid_lim"]) / int(data["n_grid"])
     # the lower walls act on nodes up to WALL_LAYERS - 1, the upper ones on nodes from n_grid - WALL_LAYERS on
     low, high = (WALL_LAYERS - 1 + mpm.FLOOR_GAP) * dx, (int(data["n_grid"]) - WALL_LAYERS - mpm.FLOOR_GAP) * dx

@@ -163,7 +163,7 @@ def measure(kind: str, index: int, networks: list[str], options: SegmentBenchOpt
     for method, find in methods.items():
         start = time.perf_counter()
         found = find()
-        rows.append(_row(kind, index, method, scene, found, truth, start))
+        rows.append({"kind": kind, "scene": index, "way": method, **_scores(scene, found, truth, start)})
     return rows
 
 
@@ -181,13 +181,15 @@ def measure_reconstructed(kind: str, index: int, photos: int) -> dict:
     except InputError:
         names, truth = (), scene.gaussians.object_id
         labels = torch.zeros_like(truth)
-    return {**_row(kind, index, "reconstructed", scene, labels, truth, start), "placed": len(names)}
+    scores = _scores(scene, labels, truth, start)
+    return {"kind": kind, "scene": index, "way": "reconstructed", **scores, "placed": len(names)}
 
 
-def _row(kind: str, index: int, method: str, scene: Scene, found: Tensor, truth: Tensor, start: float) -> dict:
+def _scores(scene: Scene, found: Tensor, truth: Tensor, start: float) -> dict:
+    """IoU of each object and their mean, number of objects found, and seconds since `start`."""
     named = {scene.name_of(i): round(value, 3) for i, value in best_ious(found, truth).items()}
-    return {"kind": kind, "scene": index, "way": method, "iou": named, "found": len(found.unique()) - 1,
-            "mean": float(np.mean(list(named.values()))), "seconds": round(time.perf_counter() - start, 1)}  # fmt: skip
+    return {"iou": named, "found": len(found.unique()) - 1, "mean": float(np.mean(list(named.values()))),
+            "seconds": round(time.perf_counter() - start, 1)}  # fmt: skip
 
 
 def run(out: Path | None = None, options: SegmentBenchOptions = SegmentBenchOptions()) -> Iterator[str]:  # noqa: B008 -- frozen

@@ -65,8 +65,8 @@ class Asset:
     def particles(self, device: str = "cpu") -> mpm.Particles:
         """The object at rest about the origin."""
         n = torch.ones(len(self.points))
-        made = mpm.at_rest(self.points, self.volume, self.density * n, self.E * n, POISSON_RATIO * n, 0 * n,
-                           FRICTION * n, MODELS["corotated"].kernel)  # fmt: skip
+        material = mpm.ParticleMaterial(self.E * n, POISSON_RATIO * n, self.density * n, 0 * n, FRICTION * n)
+        made = mpm.at_rest(self.points, self.volume, material, MODELS["corotated"].kernel)
         return mpm.Particles(*(getattr(made, f.name).to(device) for f in fields(made)))
 
 

@@ -170,7 +170,7 @@ def test_gradient_descent_recovers_a_gaussian(device):
 def test_invisible_gaussians_have_no_effect(device):
     seen = random_gaussians(30, degree=1)
     hidden = random_gaussians(4, seed=1, degree=1)
-    # behind, at the camera, outside the image, nearer than `near`
+    # behind, at the camera, outside the image, nearer than NEAR
     hidden.means[:] = torch.tensor([[5.0, 0, 0], [2.0, 0, 0], [0, 30, 0], [1.995, 0, 0]])
     both = Gaussians(*(torch.cat([getattr(seen, f), getattr(hidden, f)]) for f in vars(seen)))
     tensors = leaves(both.to(device))

@@ -23,15 +23,15 @@ def weights(model: nn.Module) -> int:
 
 
 def activations(
-    config: Pi3Config, views: int, height: int, width: int, at_once: int, splats: bool, half: bool = False
+    config: Pi3Config, views: int, size: tuple[int, int], at_once: int, splats: bool, half: bool = False
 ) -> int:
-    """Peak bytes of activations during inference; linear in the number of tokens.
+    """Peak bytes of activations for images of `size` (height, width); linear in the number of tokens.
 
     Per token a block holds the residual stream, its norm, queries, keys, values and the temporaries of the rotary
     embedding (32 bit even if `half` computes the rest in 16). Afterwards the results of all views are kept, twice while
     they are concatenated.
     """
-    number, pixels = (2 if half else 4), height * width
+    number, pixels = (2 if half else 4), size[0] * size[1]
     tokens = pixels // PATCH**2 + CAMERA_REGISTERS
     inside = views * tokens * (config.width * (44 + 4 * number) + 16 * config.head)
     results = views * (8 * tokens * config.width + 8 * pixels * (4 + CHANNELS * splats))
@@ -62,13 +62,13 @@ def plan(config: Pi3Config, views: int, size: tuple[int, int], splats: bool, hal
     """
 
     def fits(views: int, at_once: int) -> bool:
-        return room is None or activations(config, views, *size, at_once, splats, half) <= MEMORY_FRACTION * room
+        return room is None or activations(config, views, size, at_once, splats, half) <= MEMORY_FRACTION * room
 
     for at_once in AT_ONCE:
         if fits(views, at_once):
             return at_once
     maximum = max((n for n in range(1, views) if fits(n, 1)), default=0)
-    need = activations(config, views, *size, 1, splats, half) / 1e9
+    need = activations(config, views, size, 1, splats, half) / 1e9
     remedy = f"{maximum} photos would fit" if maximum else "no photo fits"
     raise InputError(
         f"{views} photos of {size[1]}x{size[0]} need {need:.1f} GB beside the weights, and {room / 1e9:.1f} GB are "

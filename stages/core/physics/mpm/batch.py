@@ -6,11 +6,10 @@
         frame.of("b").x             # of one scene: a view
     batch.failures()                # {"b": "particle 17 left the box or is not finite (frame 31)"}
 
-Particles come from `solver.at_rest(x, volume, density, E, nu, viscosity, friction)`, with one value per particle; set
-`.v`, `.held` and `.model` afterwards, and join bodies with `solver.join_particles`. The caller keeps track of which
-body a particle belongs to: rows keep their order. Scenes share box, spacing, substep and colliders. On a GPU a scene
-takes about 52 bytes per node of the box, active or not, and 500 per particle: `Batch.fits` computes how many scenes
-fit.
+Particles come from `solver.at_rest(x, volume, ParticleMaterial(...))`, with one value per particle; set `.v`, `.held`
+and `.model` afterwards, and join bodies with `solver.join_particles`. The caller keeps track of which body a particle
+belongs to: rows keep their order. Scenes have the same box, spacing, substep and colliders. On a GPU a scene takes
+about 52 bytes per node of the box, active or not, and 500 per particle: `Batch.fits` computes how many scenes fit.
 
 `batch.solver.substeps(duration, acceleration)` is the number of substeps by the CFL condition; fewer may diverge. With
 `exact`, a scene gives the same bytes in every run on the same kind of GPU and in any batch, at about twice the time.
@@ -56,14 +55,14 @@ class Batch:
     """Scenes by name, each on its own grid; options as in Solver."""
 
     def __init__(
-        self, scenes: Mapping[str, Particles], box: Box, dx: float, device: str = "cuda",
+        self, scenes: Mapping[str, Particles], box: Box, dx: float, device: str = "cuda", *,
         colliders: Sequence[Collider] = (), damping: float = 0.0, exact: bool = False,
     ):  # fmt: skip
         self.names = tuple(scenes)
         sizes = [len(p) for p in scenes.values()]
         self.starts = tuple([0, *torch.tensor(sizes).cumsum(0).tolist()])
-        self.solver = Solver(join_particles(list(scenes.values())), box, dx, device, sizes, colliders, damping,
-                             exact=exact)  # fmt: skip
+        self.solver = Solver(join_particles(list(scenes.values())), box, dx, device, sizes=sizes,
+                             colliders=colliders, damping=damping, exact=exact)  # fmt: skip
         self._failure_frame = torch.full((len(sizes),), -1, dtype=torch.int32, device=device)
         self._frame = 0
 

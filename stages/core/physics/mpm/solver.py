@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from typing import NamedTuple
 
 import torch
 import warp as wp
@@ -74,17 +75,26 @@ class Particles:
         return len(self.x)
 
 
+class ParticleMaterial(NamedTuple):
+    """Material constants of each particle."""
+
+    E: Float[Tensor, "p"]  # Young's modulus [Pa]
+    nu: Float[Tensor, "p"]  # Poisson ratio
+    density: Float[Tensor, "p"]  # at rest [kg/m^3]
+    viscosity: Float[Tensor, "p"]  # [Pa s]
+    friction: Float[Tensor, "p"]  # Coulomb coefficient against floor and walls
+
+
 def at_rest(
-    x: Float[Tensor, "p 3"], volume: Float[Tensor, "p"], density: Float[Tensor, "p"], E: Float[Tensor, "p"],
-    nu: Float[Tensor, "p"], viscosity: Float[Tensor, "p"], friction: Float[Tensor, "p"], model: int = NEO_HOOKEAN,
+    x: Float[Tensor, "p 3"], volume: Float[Tensor, "p"], material: ParticleMaterial, model: int = NEO_HOOKEAN,
     plastic: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> Particles:  # fmt: skip
-    """Undeformed particles without velocity. E [Pa], density [kg/m^3], viscosity [Pa s].
+    """Undeformed particles at `x` [m] without velocity, of the given `volume` [m^3].
 
     `model` (number of the material model) and `plastic` (its parameters) apply to all; overwrite the fields for a
     mixture.
     """
-    p = len(x)
+    p, (E, nu, density, viscosity, friction) = len(x), material
     still, identity = torch.zeros(p, 3, 3), torch.eye(3).repeat(p, 1, 1)
     stiffness = torch.stack([E / (2 * (1 + nu)), E * nu / ((1 + nu) * (1 - 2 * nu)), viscosity], -1)
     held, models = torch.zeros(p, dtype=torch.int8), torch.full((p,), model, dtype=torch.int8)
@@ -119,7 +129,7 @@ class Solver:
     """
 
     def __init__(
-        self, particles: Particles, box: Box, dx: float, device: str = "cpu", sizes: Sequence[int] | None = None,
+        self, particles: Particles, box: Box, dx: float, device: str = "cpu", *, sizes: Sequence[int] | None = None,
         colliders: Sequence[Collider] = (), damping: float = 0.0, fused: bool | None = None, exact: bool = False,
     ):  # fmt: skip
         self.device, self.dx, self.grid = device, dx, make_grid(box, dx)

@@ -49,7 +49,7 @@ def test_the_estimate_is_near_and_not_below_what_is_used(network, views, at_once
     images = torch.rand(views, 3, 112, 112)
     with Alive([*model.state_dict().values(), images]) as alive:
         model(images, at_once)
-    said = activations(SMALL, views, 112, 112, at_once, network is Pi3Splat)
+    said = activations(SMALL, views, (112, 112), at_once, network is Pi3Splat)
     assert 0.95 * alive.most < said < 2 * alive.most
 
 

@@ -138,12 +138,12 @@ def test_output_of_random_weights_is_rejected(seen, tmp_path, caplog, monkeypatc
     pytest.importorskip("diffusers")
     pytest.importorskip("transformers")
     from stages.core.models.diffsplat import network
-    from tests.core.models.diffsplat.tiny import published
+    from tests.core.models.diffsplat.tiny_model import save_tiny_model
 
     monkeypatch.setattr(network, "STEPS", 3)
     write_scene(tmp_path / "scene.ply", seen)
     with caplog.at_level(logging.INFO):
-        options = RefineOptions(completer="diffsplat", weights=published(tmp_path / "weights"), background=False)
+        options = RefineOptions(completer="diffsplat", weights=save_tiny_model(tmp_path / "weights"), background=False)
         run(tmp_path / "scene.ply", tmp_path / "out.ply", options)
     assert "unchanged" in caplog.text and "the object generated from" in caplog.text
     before, after = (int((s.gaussians.object_id == 1).sum()) for s in (seen, read_scene(tmp_path / "out.ply")))

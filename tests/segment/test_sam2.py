@@ -30,9 +30,9 @@ def one_thread():
 
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory):
-    from tests.core.models.sam2.tiny import saved
+    from tests.core.models.sam2.tiny_model import save_tiny_model
 
-    return saved(tmp_path_factory.mktemp("sam2"))
+    return save_tiny_model(tmp_path_factory.mktemp("sam2"))
 
 
 @pytest.fixture

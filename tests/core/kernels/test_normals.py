@@ -4,11 +4,12 @@ import pytest
 import torch
 
 from stages.core.kernels.field.normals import invert_spd, normals_and_spacing, normals_and_spacing_reference
-from tests.core.models.worlds import crowd, padded
+from tests.core.models.dynamics_fixtures import add_padding, overlapping_objects
 
 
 @pytest.mark.parametrize("world", [
-    crowd(2, 3, 70), padded(crowd(2, 3, 70), 1, 3), crowd(1, 2, 7), crowd(1, 1, 2), crowd(1, 1, 1)
+    overlapping_objects(2, 3, 70), add_padding(overlapping_objects(2, 3, 70), 1, 3),
+    overlapping_objects(1, 2, 7), overlapping_objects(1, 1, 2), overlapping_objects(1, 1, 1)
 ], ids=["many", "padded", "few", "two", "one"])  # fmt: skip
 @pytest.mark.parametrize("dtype, near", [(torch.float64, 1e-12), (torch.float32, 1e-6)])
 def test_normals_and_spacing_equal_the_reference(world, dtype, near, device):

@@ -1,4 +1,4 @@
-"""Tensors are tiny here, and two threads would only wait for each other."""
+"""Run these tests on one thread: their tensors are too small for more to help."""
 
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""Weights on disk: round trips, and one clear sentence for what is wrong."""
+"""Saving and loading checkpoints: round trips and error messages."""
 
 import json
 import math
@@ -8,28 +8,28 @@ import torch
 
 from stages.core.errors import InputError
 from stages.core.models.checkpoints import MODELS, build, find, halve, load, save
-from tests.core.models.worlds import SMALL, crowd
+from tests.core.models.dynamics_fixtures import SMALL_CONFIGS, overlapping_objects
 
 
-@pytest.mark.parametrize("name", SMALL)
-def test_round_trip(tmp_path, name):
+@pytest.mark.parametrize("name", SMALL_CONFIGS)
+def test_save_load_round_trip(tmp_path, name):
     torch.manual_seed(1)
-    model = build(name, **SMALL[name]).eval()
+    model = build(name, **SMALL_CONFIGS[name]).eval()
     file = tmp_path / f"{name}.safetensors"
     save(file, name, model, {"score": 0.5, "seed": 3})
-    again, card = load(file)
-    assert card["score"] == 0.5 and card["model"] == name and type(again) is type(model)
-    initial = crowd().to(torch.float32)
+    loaded, card = load(file)
+    assert card["score"] == 0.5 and card["model"] == name and type(loaded) is type(model)
+    initial = overlapping_objects().to(torch.float32)
     with torch.no_grad():
-        assert torch.equal(again.rollout(initial, 4), model.rollout(initial, 4))
+        assert torch.equal(loaded.rollout(initial, 4), model.rollout(initial, 4))
     assert not list(tmp_path.glob(".part*"))
 
 
 def test_every_model_is_tested():
-    assert SMALL.keys() == MODELS.keys()
+    assert SMALL_CONFIGS.keys() == MODELS.keys()
 
 
-def test_half_precision_is_half_the_file_and_nearly_the_model(tmp_path):
+def test_half_precision_halves_the_file_and_keeps_parameters_within_1e_3(tmp_path):
     model = build("gcn").eval()
     for name in "ab":
         save(tmp_path / f"{name}.safetensors", "gcn", model, {"minutes": 2.0})
@@ -44,7 +44,7 @@ def test_half_precision_is_half_the_file_and_nearly_the_model(tmp_path):
         torch.testing.assert_close(q, p, rtol=1e-3, atol=1e-6)
 
 
-def test_numbers_too_large_for_16_bits_are_kept_whole(tmp_path):
+def test_tensors_out_of_half_precision_range_stay_in_float32(tmp_path):
     model = build("gcn", hidden=8, layers=1)
     with torch.no_grad():
         next(model.parameters()).view(-1)[0] = 1e6
@@ -52,7 +52,7 @@ def test_numbers_too_large_for_16_bits_are_kept_whole(tmp_path):
     assert float(next(load(tmp_path / "a.safetensors")[0].parameters()).view(-1)[0]) == 1e6
 
 
-def test_a_card_has_a_line_for_each_entry_and_row(tmp_path):
+def test_card_is_written_with_one_line_per_entry_and_run(tmp_path):
     runs = [{"minutes": 1 / 3, "loss": math.nan}, {"minutes": 1.0, "loss": 1.0}]
     save(tmp_path / "a.safetensors", "gcn", build("gcn", hidden=8), {"runs": runs, "curve": {"loss": [1.0]}})
     card = load(tmp_path / "a.safetensors")[1]
@@ -66,12 +66,12 @@ def saved(tmp_path):
     return tmp_path / "w.safetensors"
 
 
-def edit(file, **changes):
+def edit_card(file, **changes):
     card = json.loads(file.with_suffix(".json").read_text())
     file.with_suffix(".json").write_text(json.dumps({**card, **changes}))
 
 
-def test_one_flipped_bit(saved):
+def test_flipped_bit_fails_the_checksum(saved):
     data = bytearray(saved.read_bytes())
     data[-3] ^= 1
     saved.write_bytes(data)
@@ -79,11 +79,11 @@ def test_one_flipped_bit(saved):
         load(saved)
 
 
-def test_damaged_file_with_a_fitting_sum(saved):
+def test_damaged_file_with_matching_checksum_is_refused(saved):
     import hashlib
 
     saved.write_bytes(b"not weights at all")
-    edit(saved, sha256=hashlib.sha256(saved.read_bytes()).hexdigest())
+    edit_card(saved, sha256=hashlib.sha256(saved.read_bytes()).hexdigest())
     with pytest.raises(InputError, match="is no safetensors file"):
         load(saved)
 
@@ -95,20 +95,20 @@ def test_damaged_file_with_a_fitting_sum(saved):
     ({"model": "gnc"}, "w.json: needs model \\(one of ngff-paper"),
     ({"config": 3}, "w.json: needs model"),
 ])  # fmt: skip
-def test_a_card_of_something_else(saved, changes, message):
-    edit(saved, **changes)
+def test_card_of_another_model_is_refused(saved, changes, message):
+    edit_card(saved, **changes)
     with pytest.raises(InputError, match=message):
         load(saved)
 
 
 @pytest.mark.parametrize("text", ["{", "[1]", '{"model": "gcn"}'])
-def test_a_damaged_card(saved, text):
+def test_damaged_card_is_refused(saved, text):
     saved.with_suffix(".json").write_text(text)
     with pytest.raises(InputError, match="w.json: is not the card of weights"):
         load(saved)
 
 
-def test_missing_files(saved):
+def test_missing_files_are_reported(saved):
     with pytest.raises(InputError, match="none.safetensors: no such file"):
         load(saved.with_name("none.safetensors"))
     saved.with_suffix(".json").unlink()
@@ -116,8 +116,8 @@ def test_missing_files(saved):
         load(saved)
 
 
-@pytest.mark.parametrize("content", [b"rubbish", {"predictor.x": torch.zeros(2)}, {"epoch": 3}])
-def test_a_checkpoint_of_something_else(tmp_path, content):
+@pytest.mark.parametrize("content", [b"not a checkpoint", {"predictor.x": torch.zeros(2)}, {"epoch": 3}])
+def test_unrelated_checkpoint_is_refused(tmp_path, content):
     file = tmp_path / "c.pth"
     if isinstance(content, bytes):
         file.write_bytes(content)
@@ -127,7 +127,7 @@ def test_a_checkpoint_of_something_else(tmp_path, content):
         load(file)
 
 
-def test_weights_are_found(saved, monkeypatch, tmp_path):
+def test_weight_search_order(saved, monkeypatch, tmp_path):
     monkeypatch.delenv("NGFF_WEIGHTS", raising=False)
     assert find("w", saved) == saved and find("w", tmp_path) == saved
     with pytest.raises(InputError, match="w: no weights w.safetensors in .*; train them with `ngff-lab train w`"):

@@ -1,4 +1,4 @@
-"""Small pieces of algebra against PyTorch's own."""
+"""Batched 3 x 3 algebra against PyTorch's own functions."""
 
 import torch
 from torch.testing import assert_close
@@ -6,15 +6,15 @@ from torch.testing import assert_close
 from stages.core.models.field.equivariant import inner_products, symmetric_solve
 
 
-def test_symmetric_systems_are_solved():
+def test_symmetric_solve_equals_linalg_solve():
     rng = torch.Generator().manual_seed(0)
     root = torch.randn(2, 5, 3, 3, generator=rng, dtype=torch.float64)
     M, x, y = root @ root.mT + 0.1 * torch.eye(3), *torch.randn(2, 2, 5, 3, generator=rng, dtype=torch.float64)
-    for found, given in zip(symmetric_solve(M, x, y), (x, y), strict=True):
-        assert_close(found, torch.linalg.solve(M, given[..., None])[..., 0])
+    for solution, b in zip(symmetric_solve(M, x, y), (x, y), strict=True):
+        assert_close(solution, torch.linalg.solve(M, b[..., None])[..., 0])
 
 
-def test_products_are_those_of_each_pair_once_row_by_row():
+def test_inner_products_contain_each_pair_once_in_row_order():
     x = torch.randn(2, 5, 4, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    wanted = [torch.asinh((x[..., i, :] * x[..., j, :]).sum(-1)) for i in range(4) for j in range(i, 4)]
-    assert_close(inner_products(x), torch.stack(wanted, -1))
+    expected = [torch.asinh((x[..., i, :] * x[..., j, :]).sum(-1)) for i in range(4) for j in range(i, 4)]
+    assert_close(inner_products(x), torch.stack(expected, -1))

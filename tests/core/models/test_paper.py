@@ -1,4 +1,4 @@
-"""The published model: parity with recorded values of its code, and the shapes of its checkpoints."""
+"""The published model: parity with recorded outputs of its code, and the shapes of its checkpoints."""
 
 import json
 
@@ -18,9 +18,9 @@ from stages.core.models.external_forces import ExternalForces
 from stages.core.models.field.narrow_phase import near_walls, nearest
 from stages.core.models.initial_conditions import InitialConditions, centre_of_mass
 from stages.core.models.integrate import Integration
-from tests.core.models.worlds import push
+from tests.core.models.dynamics_fixtures import external_force
 
-CLOSE = {"rtol": 1e-5, "atol": 1e-6}  # single precision, another order of sums
+CLOSE = {"rtol": 1e-5, "atol": 1e-6}  # single precision, different order of summation
 
 
 @pytest.fixture
@@ -39,14 +39,14 @@ def published(recorded) -> PaperForceField:
     return model
 
 
-def world_of(data: dict) -> InitialConditions:
+def initial_conditions_of(data: dict) -> InitialConditions:
     return InitialConditions.of(
         data["in/points"], data["in/padding"] > 0, velocity=data["in/com_vel"], spin=data["in/angle_vel"]
     )
 
 
 @torch.no_grad()
-def test_one_force_call(recorded, published):
+def test_predictor_equals_recorded_values(recorded, published):
     d = recorded("predictor_call")
     names = ("points_local", "points_vel", "com", "com_vel", "angle", "angle_vel")
     state = PaperState(*(d[f"in/{name}"] for name in names))
@@ -69,40 +69,42 @@ def test_one_force_call(recorded, published):
 
 @pytest.mark.parametrize("name", ["rollout_free", "rollout_force"])
 @torch.no_grad()
-def test_rollout(recorded, published, name):
+def test_rollout_equals_recorded_values(recorded, published, name):
     d = recorded(name)
-    initial = world_of(d)
+    initial = initial_conditions_of(d)
     torch.testing.assert_close(centre_of_mass(initial, initial.points), d["in/com"], **CLOSE)
     external = ExternalForces.none(initial)
     if name == "rollout_force":
         p = {k: d[f"in/external_0/{k}"].tolist() for k in ("obj_id", "force", "torque", "start", "end")}
-        external = push(initial, p["obj_id"], p["force"], p["torque"], p["start"], p["end"])
-    ours = published.rollout(initial, len(d["out/com"][0]), external=external, integration=Integration("euler"))
-    theirs = d["out/points_world"].masked_fill(~initial.valid[:, None, ..., None], 0)
-    torch.testing.assert_close(ours, theirs, **CLOSE)
+        external = external_force(initial, p["obj_id"], p["force"], p["torque"], p["start"], p["end"])
+    actual = published.rollout(initial, len(d["out/com"][0]), external=external, integration=Integration("euler"))
+    expected = d["out/points_world"].masked_fill(~initial.valid[:, None, ..., None], 0)
+    torch.testing.assert_close(actual, expected, **CLOSE)
 
 
-def test_loss_and_adjoint_gradients(recorded, published):
-    # those of the adjoint equation: with Euler's method they differ much from the gradients through the steps
+def test_loss_and_adjoint_gradients_equal_recorded_values(recorded, published):
+    # gradients of the adjoint equation; with Euler's method they differ much from backpropagated ones
     d = recorded("loss_and_adjoint_grads")
-    initial = world_of(recorded("rollout_free"))
+    initial = initial_conditions_of(recorded("rollout_free"))
     loss = (
         (published.rollout(initial, 5, integration=Integration("euler", adjoint=True)) - d["in/target"]).square().mean()
     )
     loss.backward()
     torch.testing.assert_close(loss.detach(), d["out/loss"], **CLOSE)
-    wanted = {k.removeprefix("out/grad/"): v for k, v in d.items() if k.startswith("out/grad/")}
-    assert wanted.keys() == dict(published.named_parameters()).keys()
+    expected = {k.removeprefix("out/grad/"): v for k, v in d.items() if k.startswith("out/grad/")}
+    assert expected.keys() == dict(published.named_parameters()).keys()
     for key, p in published.named_parameters():
-        torch.testing.assert_close(p.grad / wanted[key].norm(), wanted[key] / wanted[key].norm(), rtol=0, atol=1e-5)
+        torch.testing.assert_close(
+            p.grad / expected[key].norm(), expected[key] / expected[key].norm(), rtol=0, atol=1e-5
+        )
 
 
 @pytest.mark.parametrize("hidden, count", [(128, 1_055_126), (200, 2_555_822), (256, 4_174_614)])
-def test_size(hidden, count):
+def test_published_parameter_counts(hidden, count):
     assert sum(x.numel() for x in build("ngff-paper", hidden=hidden).state_dict().values()) == count
 
 
-def test_names_and_shapes_of_a_public_checkpoint(shared):
+def test_names_and_shapes_equal_a_public_checkpoint(shared):
     shapes = json.loads((shared / "facts/ngff_state_dict.json").read_text())
     assert {k: list(v.shape) for k, v in build("ngff-paper").state_dict().items()} == shapes
 
@@ -119,9 +121,9 @@ def test_a_public_checkpoint_loads(tmp_path, wrapped):
     assert all(torch.equal(v, loaded.state_dict()[k]) for k, v in state.items())
 
 
-def test_without_deformation_bodies_keep_their_shape():
+def test_rigid_variant_preserves_shapes():
     model = build("ngff-paper-rigid", hidden=16, layers=2)
     assert not any("stress" in name for name in model.state_dict())
     points = torch.rand(1, 2, 10, 3, generator=torch.Generator().manual_seed(0)) * 0.3
-    end = model.rollout(InitialConditions.of(points), 10)[0, -1]
-    torch.testing.assert_close(torch.cdist(end, end), torch.cdist(points[0], points[0]), rtol=0, atol=1e-5)
+    final = model.rollout(InitialConditions.of(points), 10)[0, -1]
+    torch.testing.assert_close(torch.cdist(final, final), torch.cdist(points[0], points[0]), rtol=0, atol=1e-5)

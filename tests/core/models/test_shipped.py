@@ -14,7 +14,7 @@ from stages.lab.assets.objects import OBJECTS, make_object
 from stages.lab.assets.shapes import single_threaded
 
 DT = 0.02  # [s]
-SLOW = pytest.mark.slow  # long rollouts of the same kind with more keypoints and objects
+SLOW = pytest.mark.slow  # the same rollouts with more keypoints and objects
 FILES = sorted(SHIPPED.glob("*.safetensors"))
 MAX_BYTES = 5e5  # of all weights and cards
 MAX_DEPTH = 0.035  # of a keypoint in the floor [m]: MAX_PENETRATION and a margin for rounding
@@ -37,7 +37,7 @@ def keypoints_of(name, n):
 
 
 def pile(lower, upper):
-    """One object above the floor and another one above it, a little aside: (2, n, 3) [m]."""
+    """One object above the floor and another one above it, slightly offset: (2, n, 3) [m]."""
     lower = lower + torch.tensor([0.0, 0.0, -0.9 - float(lower[:, 2].min())])
     upper = upper + torch.tensor([0.05, 0.03, float(lower[:, 2].max()) + 0.15 - float(upper[:, 2].min())])
     return torch.stack([lower, upper])
@@ -50,8 +50,8 @@ def motion(initial, points):
 
 
 def assert_comes_to_rest(com, speed):
-    assert speed[:, :40].amax() > 0.8  # falls at first
-    # at most a fortieth of that, averaged over the last second
+    assert speed[:, :40].amax() > 0.8  # falls initially
+    # 1/40 of that, averaged over the last second
     assert float(speed[:, -50:].mean(1).max()) < 0.02
     assert float((com[:, -1] - com[:, -250])[..., :2].norm(dim=-1).max()) < 0.05  # and moved by less than 0.05 m in 5 s
 
@@ -85,10 +85,10 @@ def test_stacked_objects_come_to_rest(model, n):
     """A duck falling on a can and a phone falling on a pillow, n keypoints each, for 20 s."""
     pairs = ("can", "duck"), ("pillow", "phone")
     scenes = [pile(*(keypoints_of(name, n) for name in pair)) for pair in pairs]
-    kinds = [[OBJECTS[name] for name in pair] for pair in pairs]
+    specs = [[OBJECTS[name] for name in pair] for pair in pairs]
     initial = InitialConditions.of(
-        torch.stack(scenes), E=torch.tensor([[k.E for k in row] for row in kinds]), friction=torch.tensor(1.0),
-        mass=torch.tensor([[2e-3 * k.density for k in row] for row in kinds]),
+        torch.stack(scenes), E=torch.tensor([[k.E for k in row] for row in specs]), friction=torch.tensor(1.0),
+        mass=torch.tensor([[2e-3 * k.density for k in row] for row in specs]),
     )  # fmt: skip
     with torch.inference_mode(), single_threaded():
         points = model.rollout(initial, 1000)
@@ -107,13 +107,13 @@ ALL = tuple(name for name in OBJECTS if name not in ("ball", "cloth"))  # the ba
 def test_randomly_rotated_objects_come_to_rest(model, seed, names, n):
     """Single objects dropped from 0.3 m, for 20 s."""
     rng = torch.Generator().manual_seed(seed)
-    turns = {name: matrix(torch.nn.functional.normalize(torch.randn(4, generator=rng), dim=0)) for name in OBJECTS}
-    points = torch.stack([keypoints_of(name, n) @ turns[name].T for name in names])
+    rotations = {name: matrix(torch.nn.functional.normalize(torch.randn(4, generator=rng), dim=0)) for name in OBJECTS}
+    points = torch.stack([keypoints_of(name, n) @ rotations[name].T for name in names])
     points[..., 2] += -0.94 + 0.3 - points[..., 2].amin(1, keepdim=True)
-    kinds = [OBJECTS[name] for name in names]
+    specs = [OBJECTS[name] for name in names]
     initial = InitialConditions.of(
-        points[:, None], E=torch.tensor([[k.E] for k in kinds]), friction=torch.tensor(1.0),
-        mass=torch.tensor([[2e-3 * k.density] for k in kinds]),
+        points[:, None], E=torch.tensor([[k.E] for k in specs]), friction=torch.tensor(1.0),
+        mass=torch.tensor([[2e-3 * k.density] for k in specs]),
     )  # fmt: skip
     with torch.inference_mode(), single_threaded():
         com, speed = motion(initial, model.rollout(initial, 1000))
@@ -146,17 +146,17 @@ def test_rounding_weights_to_16_bits_changes_rollouts_by_millimetres(model, drop
         for p in other.parameters():
             p *= 1 + (2 * torch.rand(p.shape, generator=rng) - 1) * 2**-11
     with torch.inference_mode(), single_threaded():
-        again = other.rollout(initial, 40)
-    assert float((again - points[:, :40]).square().mean().sqrt()) < 2e-3
+        perturbed = other.rollout(initial, 40)
+    assert float((perturbed - points[:, :40]).square().mean().sqrt()) < 2e-3
 
 
-def test_all_weights_and_cards_together_are_small():
+def test_total_size_of_weights_and_cards_is_limited():
     assert sum(f.stat().st_size for f in SHIPPED.iterdir()) <= MAX_BYTES
     assert {f.stem for f in SHIPPED.glob("*.safetensors")} == {f.stem for f in SHIPPED.glob("*.json")}
 
 
 @pytest.mark.parametrize("file", FILES, ids=lambda f: f.stem)
-def test_every_weight_that_is_kept_loads_and_is_of_16_bits(file):
+def test_shipped_weights_load_and_are_in_half_precision(file):
     _, card = load(file)
     assert file.stat().st_size < 2.2 * sum(p.numel() for p in load(file)[0].parameters()) + 20_000
     assert len(json.dumps(card)) < 8192 and card["runs"] and card["curve"]["RMSE"]

@@ -1,4 +1,4 @@
-"""How much stiffer what is solid is, and how the force field hears of it."""
+"""Solidity of bodies, and its effect on the inputs and rollouts of the force field."""
 
 import pytest
 import torch
@@ -17,50 +17,50 @@ def slab(x=0.5, y=0.3, z=0.01):
     return points @ matrix(torch.tensor([0.9, 0.3, -0.2, 0.1]) / 0.95**0.5).mT
 
 
-def test_sides_are_those_of_a_slab():
+def test_box_sides_of_a_slab():
     assert box_sides(slab()).tolist() == pytest.approx([0.02, 0.6, 1.0], rel=0.1)
 
 
-def test_a_wall_twice_as_thick_as_in_training_is_eight_times_as_stiff():
+def test_solidity_grows_with_the_cube_of_the_thickness():
     a, b, c = box_sides(slab()).tolist()
-    usual = REFERENCE_THICKNESS * 2 * (a * b + b * c + c * a)
-    assert solidity(slab(), usual) == pytest.approx(1) and solidity(slab(), usual / 3) == 1
-    assert solidity(slab(), 2 * usual) == pytest.approx(8)
+    reference_volume = REFERENCE_THICKNESS * 2 * (a * b + b * c + c * a)
+    assert solidity(slab(), reference_volume) == pytest.approx(1) and solidity(slab(), reference_volume / 3) == 1
+    assert solidity(slab(), 2 * reference_volume) == pytest.approx(8)
 
 
 def encoded(E, solidity):
-    """What the network hears of a body [Pa], how much it yields, and mass / size [kg/m]."""
+    """Stiffness passed to the network [Pa], compliance scale, and mass / size [kg/m]."""
     points = 0.3 * torch.randn(1, 1, 60, 3, generator=torch.Generator().manual_seed(0))
     initial = InitialConditions.of(points, E=torch.tensor(E), solidity=torch.tensor(solidity))
-    model, heard = ForceField(16), []
-    model._embed_objects = lambda shape, E: heard.append(float(E)) or torch.zeros(1, 1, 16)
+    model, calls = ForceField(16), []
+    model._embed_objects = lambda shape, E: calls.append(float(E)) or torch.zeros(1, 1, 16)
     shape = model.precompute(initial)
     scene = model.encode(shape)
-    return heard[0], float(scene.compliance_scale), 1 / float(shape.size)
+    return calls[0], float(scene.compliance_scale), 1 / float(shape.size)
 
 
 def test_solid_body_is_encoded_as_a_stiffer_one_up_to_the_trained_range():
     """Encoded stiffness over compliance scale is always the effective stiffness."""
     assert encoded(1e3, 1.0)[:2] == (1e3, 1.0)
     assert encoded(1e3, 8.0)[:2] == pytest.approx((8e3, 1.0))
-    heard, compliance_scale, unit = encoded(2e3, 1e6)
-    assert heard == pytest.approx(
+    encoded_E, compliance_scale, unit = encoded(2e3, 1e6)
+    assert encoded_E == pytest.approx(
         MAX_TRAINED_SOLID_STIFFNESS * unit, rel=1e-4
-    ) and heard / compliance_scale == pytest.approx(2e9, rel=1e-4)
-    heard, compliance_scale, unit = encoded(
+    ) and encoded_E / compliance_scale == pytest.approx(2e9, rel=1e-4)
+    encoded_E, compliance_scale, unit = encoded(
         5 * MAX_TRAINED_SOLID_STIFFNESS * unit, 2.0
-    )  # never softer than its material
-    assert heard == pytest.approx(
+    )  # never softer than the material
+    assert encoded_E == pytest.approx(
         5 * MAX_TRAINED_SOLID_STIFFNESS * unit, rel=1e-4
     ) and compliance_scale == pytest.approx(0.5, rel=1e-4)
-    heard, compliance_scale, unit = encoded(7e10, 1.0)
-    assert heard == pytest.approx(MAX_TRAINED_STIFFNESS * unit, rel=1e-4) and heard / compliance_scale == pytest.approx(
-        7e10, rel=1e-4
-    )
+    encoded_E, compliance_scale, unit = encoded(7e10, 1.0)
+    assert encoded_E == pytest.approx(
+        MAX_TRAINED_STIFFNESS * unit, rel=1e-4
+    ) and encoded_E / compliance_scale == pytest.approx(7e10, rel=1e-4)
 
 
 def dropped(solidity, method="step", E=3e4):
-    """Height of a soft ball in every frame of a fall from 0.3 m, over that at the start."""
+    """Height of a soft ball relative to its initial height, in each frame after a drop from 0.3 m."""
     p = torch.nn.functional.normalize(torch.randn(1, 1, 200, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
     points = 0.25 * p + torch.tensor([0.0, 0.0, 0.3 + 0.25 - 0.94])
     initial = InitialConditions.of(points, E=torch.tensor(E), mass=torch.tensor(8.0), solidity=torch.tensor(solidity))
@@ -71,12 +71,12 @@ def dropped(solidity, method="step", E=3e4):
 
 
 def test_solid_ball_deforms_on_landing_and_recovers():
-    """MPM, with 0.0133 m between particles and the scheme of the published data: 14 % at most, 0 % after that."""
+    """Reference: MPM with 0.0133 m particle spacing: 14 % maximum compression, 0 % afterwards."""
     solid, hollow = dropped(38.0), dropped(1.0)
     assert 0.75 < solid.min() < 0.95 and solid[30:35].min() > 0.98
     assert hollow[30:35].max() < 0.9
 
 
-def test_springs_of_the_stiffest_solid_body_are_stable_in_explicit_steps():
+def test_springs_of_very_stiff_solid_bodies_are_stable_with_explicit_steps():
     height = dropped(1e3, "rk4", E=1e10)
     assert height.isfinite().all() and (height - 1).abs().max() < 0.1

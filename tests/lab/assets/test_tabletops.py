@@ -134,12 +134,12 @@ def test_network_backends_with_weights_take_part(tmp_path, monkeypatch):
     pytest.importorskip("transformers")
     from stages.core.models.sam2 import mask_generation, segmenter
     from stages.segment import discovery
-    from tests.core.models.sam2.tiny import saved
+    from tests.core.models.sam2.tiny_model import save_tiny_model
 
     few = mask_generation.MaskGenerationOptions(grid=2, min_iou=-9.0, min_stability=0.0)
     monkeypatch.setattr(segmenter, "propose_masks", partial(mask_generation.propose_masks, options=few))
     monkeypatch.setattr(discovery, "SEARCHED_VIEWS", 1)
-    scene, options = three_apart(), bench_segment.SegmentBenchOptions(weights=saved(tmp_path))
+    scene, options = three_apart(), bench_segment.SegmentBenchOptions(weights=save_tiny_model(tmp_path))
     assert bench_segment.available_networks(options) == (["sam2"], [])
     found = bench_segment.segment_by_network(scene, "sam2", options)
     assert found.shape == scene.gaussians.object_id.shape  # the network is random, so its objects are arbitrary

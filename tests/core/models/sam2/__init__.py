@@ -1,4 +1,4 @@
-"""All of these need the package transformers, which is optional."""
+"""Tests of SAM 2.1; they need the optional package transformers."""
 
 import pytest
 

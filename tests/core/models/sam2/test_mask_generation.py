@@ -8,7 +8,7 @@ from stages.core.models.sam2.mask_generation import (
     propose_masks,
     suppress_duplicates,
 )
-from tests.core.models.sam2.tiny import SIDE, random_model
+from tests.core.models.sam2.tiny_model import SIDE, random_model
 
 
 def test_masks_equal_those_of_the_image_model():
@@ -23,18 +23,18 @@ def test_masks_equal_those_of_the_image_model():
     steps = (torch.arange(4) + 0.5) / 4 * SIDE
     points = torch.cartesian_prod(steps, steps).flip(1)  # row by row
     with torch.no_grad():
-        theirs = image(pixel_values=pixels[None], input_points=points[None, :, None],
+        expected = image(pixel_values=pixels[None], input_points=points[None, :, None],
                        input_labels=torch.ones(1, 16, 1, dtype=torch.int32), multimask_output=True)  # fmt: skip
-    every = MaskGenerationOptions(grid=4, batch=5, min_iou=-9.0, min_stability=0.0, max_iou=1.0)
-    mine = propose_masks(video, pixels, every)
-    masks, scores = theirs.pred_masks.flatten(0, 2) > 0, theirs.iou_scores.flatten()
+    unfiltered = MaskGenerationOptions(grid=4, batch=5, min_iou=-9.0, min_stability=0.0, max_iou=1.0)
+    proposals = propose_masks(video, pixels, unfiltered)
+    masks, scores = expected.pred_masks.flatten(0, 2) > 0, expected.iou_scores.flatten()
     order = suppress_duplicates(masks, scores, 1.0)
-    assert len(order) > 10 and torch.equal(mine.masks, masks[order])
-    torch.testing.assert_close(mine.scores, scores[order], rtol=1e-5, atol=1e-5)
+    assert len(order) > 10 and torch.equal(proposals.masks, masks[order])
+    torch.testing.assert_close(proposals.scores, scores[order], rtol=1e-5, atol=1e-5)
     median = float(scores.median())
-    few = MaskGenerationOptions(grid=4, batch=16, min_iou=median, min_stability=0.0, max_iou=1.0)
-    some = propose_masks(video, pixels, few)
-    assert 0 < len(some.masks) < len(mine.masks) and float(some.scores.min()) >= median
+    filtered = MaskGenerationOptions(grid=4, batch=16, min_iou=median, min_stability=0.0, max_iou=1.0)
+    selected = propose_masks(video, pixels, filtered)
+    assert 0 < len(selected.masks) < len(proposals.masks) and float(selected.scores.min()) >= median
 
 
 def test_stability_of_known_logits():
@@ -49,7 +49,7 @@ def test_duplicate_with_the_lower_score_is_removed():
     masks[1, 0, 1:11] = True  # 9 of 11 shared with the first: 0.82
     masks[2, 0, :5] = True  # a part of the first: 0.5
     masks[3, 0, 12:] = True
-    scores = torch.tensor([0.8, 0.9, 0.95, 0.7, 1.0])  # and the fifth is empty
+    scores = torch.tensor([0.8, 0.9, 0.95, 0.7, 1.0])  # the fifth mask is empty
     assert suppress_duplicates(masks, scores, 0.7).tolist() == [2, 1, 3]
     assert suppress_duplicates(masks, scores, 0.9).tolist() == [2, 1, 0, 3]
     assert suppress_duplicates(masks[:0], scores[:0], 0.7).tolist() == []

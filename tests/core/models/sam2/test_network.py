@@ -7,7 +7,7 @@ import torch
 from stages.core.models.promptable import PointPrompts
 from stages.core.models.sam2 import network
 from stages.core.models.sam2.network import StreamingSession, pixel_values, propagate_masks
-from tests.core.models.sam2.tiny import SIDE, random_model
+from tests.core.models.sam2.tiny_model import SIDE, random_model
 
 COUNT, START = 13, 4
 BOX, POINT = torch.tensor([0.1, 0.1, 0.5, 0.6]), torch.tensor([0.7, 0.4])
@@ -23,12 +23,12 @@ def video():
     return torch.randn(COUNT, 3, SIDE, SIDE, generator=torch.Generator().manual_seed(1))
 
 
-def theirs(model, video, give) -> dict[int, torch.Tensor]:
+def reference_masks(model, video, add_prompts) -> dict[int, torch.Tensor]:
     """Reference masks: all frames and outputs in memory, by the iterators of transformers."""
     from transformers import Sam2VideoInferenceSession
 
     session = Sam2VideoInferenceSession(video=video, dtype=torch.float32)
-    session.obj_with_new_inputs = give(session)
+    session.obj_with_new_inputs = add_prompts(session)
     out = {}
     for reverse in (False, True):
         for frame in model.propagate_in_video_iterator(session, start_frame_idx=START, reverse=reverse):
@@ -36,7 +36,7 @@ def theirs(model, video, give) -> dict[int, torch.Tensor]:
     return out
 
 
-def by_clicks(session) -> list[int]:
+def add_clicks(session) -> list[int]:
     for i, (points, labels) in enumerate([(BOX.reshape(2, 2), [2, 3]), (POINT[None], [1])]):
         row = session.obj_id_to_idx(i)
         session.add_point_inputs(row, START, {"point_coords": points[None, None] * SIDE,
@@ -44,47 +44,48 @@ def by_clicks(session) -> list[int]:
     return [0, 1]
 
 
-def a_mask() -> torch.Tensor:
+def example_mask() -> torch.Tensor:
     mask = torch.zeros(SIDE // 4, SIDE // 4, dtype=torch.bool)
     mask[5:20, 8:16] = True
     return mask
 
 
-def by_mask(session) -> list[int]:
-    whole = torch.nn.functional.interpolate(a_mask()[None, None].float(), (SIDE, SIDE), mode="bilinear",
+def add_mask(session) -> list[int]:
+    upsampled = torch.nn.functional.interpolate(example_mask()[None, None].float(), (SIDE, SIDE), mode="bilinear",
                                             antialias=True)  # fmt: skip
-    session.add_mask_inputs(session.obj_id_to_idx(0), START, (whole >= 0.5).float())
+    session.add_mask_inputs(session.obj_id_to_idx(0), START, (upsampled >= 0.5).float())
     return [0]
 
 
 @pytest.mark.parametrize(
-    ("prompts", "give"),
-    [([PointPrompts.box(BOX), PointPrompts.inside(POINT)], by_clicks), (a_mask()[None], by_mask)],
+    ("prompts", "add_prompts"),
+    [([PointPrompts.box(BOX), PointPrompts.inside(POINT)], add_clicks), (example_mask()[None], add_mask)],
     ids=["clicks", "mask"],
 )
-def test_propagation_equals_transformers_with_full_memory(model, video, prompts, give):
-    mine = dict(propagate_masks(model, lambda i: video[i], COUNT, prompts, START))
-    assert list(mine) == [*range(START, COUNT), *range(START - 1, -1, -1)]
-    for t, masks in theirs(model, video, give).items():
-        torch.testing.assert_close(mine[t], masks, rtol=0, atol=0)
-    spread = torch.stack([mine[t] for t in range(COUNT)]).std(0)
+def test_propagation_equals_transformers_with_full_memory(model, video, prompts, add_prompts):
+    actual = dict(propagate_masks(model, lambda i: video[i], COUNT, prompts, START))
+    assert list(actual) == [*range(START, COUNT), *range(START - 1, -1, -1)]
+    for t, masks in reference_masks(model, video, add_prompts).items():
+        torch.testing.assert_close(actual[t], masks, rtol=0, atol=0)
+    spread = torch.stack([actual[t] for t in range(COUNT)]).std(0)
     assert float(spread.mean()) > 1e-3  # the frames differ, so the comparison is not trivial
 
 
 def test_masks_depend_on_earlier_frames(model, video):
-    """Another second photo changes the third one's masks, by memory alone."""
-    other = video.clone()
-    other[1] = other[1].flip(-1)
-    one, two = (
-        [m for _, m in propagate_masks(model, lambda i, v=v: v[i], 3, [PointPrompts.box(BOX)])] for v in (video, other)
+    """A change of the second frame changes the masks of the third through the memory."""
+    changed = video.clone()
+    changed[1] = changed[1].flip(-1)
+    original, altered = (
+        [m for _, m in propagate_masks(model, lambda i, v=v: v[i], 3, [PointPrompts.box(BOX)])]
+        for v in (video, changed)
     )
-    assert torch.equal(one[0], two[0]) and float((one[2] - two[2]).abs().max()) > 1e-3
+    assert torch.equal(original[0], altered[0]) and float((original[2] - altered[2]).abs().max()) > 1e-3
 
 
-def test_memory_is_bounded_and_each_photo_is_read_once(model, monkeypatch):
+def test_memory_is_bounded_and_each_frame_is_read_once(model, monkeypatch):
     sessions, read = [], []
 
-    class Watched(StreamingSession):
+    class RecordingSession(StreamingSession):
         def __init__(self, *args):
             super().__init__(*args)
             sessions.append(self)
@@ -93,13 +94,15 @@ def test_memory_is_bounded_and_each_photo_is_read_once(model, monkeypatch):
         read.append(i)
         return torch.full((3, SIDE, SIDE), i / 40)
 
-    def held() -> int:
+    def memory_bytes() -> int:
         outputs = sessions[-1].output_dict_per_obj[0]
         kept = (*outputs["cond_frame_outputs"].values(), *outputs["non_cond_frame_outputs"].values())
-        return sum(x.numel() * x.element_size() for one in kept for x in one.values() if isinstance(x, torch.Tensor))
+        return sum(
+            x.numel() * x.element_size() for output in kept for x in output.values() if isinstance(x, torch.Tensor)
+        )
 
-    monkeypatch.setattr(network, "StreamingSession", Watched)
-    sizes = [held() for _ in propagate_masks(model, frame, 40, [PointPrompts.box(BOX)])]
+    monkeypatch.setattr(network, "StreamingSession", RecordingSession)
+    sizes = [memory_bytes() for _ in propagate_masks(model, frame, 40, [PointPrompts.box(BOX)])]
     assert sorted(read) == list(range(40))
     assert sizes[39] <= sizes[14] and sizes[14] > 0
     assert sessions[-1].processed_frames is None
@@ -112,5 +115,5 @@ def test_pixel_values_equal_pillow_resize_and_published_normalisation():
     expected = (torch.from_numpy(np.array(pillow)).float() / 255 - torch.tensor([0.485, 0.456, 0.406])) / torch.tensor(
         [0.229, 0.224, 0.225]
     )
-    mine = pixel_values(pixels / 255, 64).permute(1, 2, 0)
-    torch.testing.assert_close(mine, expected, rtol=0, atol=1.01 / 255 / 0.224)  # Pillow rounds twice to 8 bits
+    actual = pixel_values(pixels / 255, 64).permute(1, 2, 0)
+    torch.testing.assert_close(actual, expected, rtol=0, atol=1.01 / 255 / 0.224)  # Pillow rounds twice to 8 bits

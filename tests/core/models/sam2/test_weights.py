@@ -12,11 +12,11 @@ from safetensors.torch import load_file, save_file
 from stages.core.errors import InputError
 from stages.core.models.sam2.weights import download, find, load
 from stages.core.scene.files import sha256
-from tests.core.models.sam2.tiny import random_model, saved
+from tests.core.models.sam2.tiny_model import random_model, save_tiny_model
 
 
 @pytest.fixture(autouse=True)
-def nothing_installed(monkeypatch, tmp_path):
+def empty_weight_folders(monkeypatch, tmp_path):
     monkeypatch.setenv("NGFF_WEIGHTS", str(tmp_path / "weights"))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
 
@@ -25,9 +25,9 @@ def test_weight_search_order(tmp_path):
     with pytest.raises(InputError, match=r"config.json with model.safetensors in .*weights/sam2 or .*ngff/sam2; fetch "
                                          r".*facebook/sam2.1-hiera-large \(0.9 GB.*Apache.*--download"):  # fmt: skip
         find()
-    saved(tmp_path / "cache/ngff/sam2")
+    save_tiny_model(tmp_path / "cache/ngff/sam2")
     assert find() == tmp_path / "cache/ngff/sam2/model.safetensors"
-    saved(tmp_path / "weights/sam2")
+    save_tiny_model(tmp_path / "weights/sam2")
     assert find() == tmp_path / "weights/sam2/model.safetensors"
     assert find(tmp_path / "cache/ngff/sam2") == find(tmp_path / "cache/ngff/sam2/model.safetensors")
     (tmp_path / "weights/sam2/config.json").unlink()
@@ -38,7 +38,7 @@ def test_weight_search_order(tmp_path):
 
 
 def test_saved_weights_load_in_float32(tmp_path):
-    saved(tmp_path / "a", seed=3)
+    save_tiny_model(tmp_path / "a", seed=3)
     state = random_model(3).state_dict()
     model = load(find(tmp_path / "a"))
     assert not any(p.requires_grad for p in model.parameters()) and not model.training
@@ -48,8 +48,8 @@ def test_saved_weights_load_in_float32(tmp_path):
     assert all(p.dtype == torch.float32 for p in load(file).parameters())
 
 
-def edited(folder, change):
-    file = saved(folder) / "model.safetensors"
+def modified_weights(folder, change):
+    file = save_tiny_model(folder) / "model.safetensors"
     state = load_file(file)
     change(state)
     save_file(state, file)
@@ -66,11 +66,11 @@ def edited(folder, change):
 )
 def test_mismatched_weights_are_refused(tmp_path, change, message):
     with pytest.raises(InputError, match=f"model.safetensors: does not fit the config.json.*{message}"):
-        load(edited(tmp_path / "a", change))
+        load(modified_weights(tmp_path / "a", change))
 
 
 def test_damaged_files_are_refused(tmp_path):
-    file = saved(tmp_path / "a") / "model.safetensors"
+    file = save_tiny_model(tmp_path / "a") / "model.safetensors"
     whole, config = file.read_bytes(), file.with_name("config.json").read_text()
     file.write_bytes(whole[:1000])
     with pytest.raises(InputError, match="no whole safetensors file"):
@@ -83,22 +83,22 @@ def test_damaged_files_are_refused(tmp_path):
 
 
 def test_missing_transformers_names_the_extra(tmp_path, monkeypatch):
-    file = find(saved(tmp_path / "a"))
+    file = find(save_tiny_model(tmp_path / "a"))
     monkeypatch.setitem(sys.modules, "transformers", None)
     with pytest.raises(InputError, match=r"pip install -U 'ngff\[sam2\]'"):
         load(file)
 
 
 def test_download_fetches_both_files_and_logs_them_first(tmp_path, monkeypatch, caplog):
-    remote = saved(tmp_path / "remote")
+    remote = save_tiny_model(tmp_path / "remote")
     weights = SimpleNamespace(rfilename="model.safetensors", size=10**6,
                               lfs=SimpleNamespace(sha256=sha256(remote / "model.safetensors")))  # fmt: skip
     others = [SimpleNamespace(rfilename=name, size=9, lfs=None) for name in ("README.md", "config.json")]
     info = SimpleNamespace(siblings=[weights, *others], sha="0123456789abcdef", card_data=None)
-    said = []
+    logs = []
 
     def hub_download(repository, filename, revision, local_dir):
-        said.append(caplog.text)
+        logs.append(caplog.text)
         local_dir.mkdir(parents=True, exist_ok=True)
         (local_dir / filename).write_bytes((remote / filename).read_bytes())
         return str(local_dir / filename)
@@ -109,7 +109,7 @@ def test_download_fetches_both_files_and_logs_them_first(tmp_path, monkeypatch, 
     with caplog.at_level(logging.INFO):
         path = download()
     assert path == find() == tmp_path / "weights/sam2/model.safetensors"
-    assert weights.lfs.sha256 in said[0] and "Apache-2.0" in said[0]
+    assert weights.lfs.sha256 in logs[0] and "Apache-2.0" in logs[0]
     info.siblings = others
     with pytest.raises(InputError, match="it holds no model.safetensors.*put config.json and model.safetensors in"):
         download()

@@ -1,4 +1,4 @@
-"""Values recorded from the published code, and the names and shapes of its weights."""
+"""Fixtures that read recorded outputs of the published code, and the names and shapes of its weights."""
 
 import json
 
@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-CLOSE = {"rtol": 1e-4, "atol": 1e-5}  # as the recordings state
+CLOSE = {"rtol": 1e-4, "atol": 1e-5}  # tolerances stated with the recordings
 
 
 @pytest.fixture
 def recorded(shared):
-    """A function that reads one recording: inputs, outputs, and the weights as a state dict."""
+    """Function that reads one recording: inputs, outputs and state dict."""
 
     def read(name: str) -> tuple[dict, dict, dict]:
         data = np.load(shared / "facts/pi3_parity" / f"{name}.npz")
@@ -26,6 +26,8 @@ def recorded(shared):
 
 @pytest.fixture
 def manifest(shared):
+    """Function that reads the shapes of a published state dict by tensor name."""
+
     def read(name: str) -> dict[str, tuple[int, ...]]:
         return {k: tuple(v) for k, v in json.loads((shared / "facts" / f"{name}.json").read_text()).items()}
 

@@ -4,11 +4,12 @@ from pathlib import Path
 
 import torch
 
-SIDE = 128  # of the images that it takes [px]
-WIDTH = 128  # of its tokens; the published 256 also splits object pointers into pieces of 64
+SIDE = 128  # of the input images [px]
+WIDTH = 128  # of the tokens; the published 256 also splits object pointers into pieces of 64
 
 
 def config(**changes):
+    """Configuration of the tiny model with `changes`."""
     from transformers import Sam2VideoConfig
 
     backbone = {
@@ -33,7 +34,7 @@ def config(**changes):
 
 
 def random_model(seed: int = 0, **changes):
-    """Weights large enough that prompts and memories show in the masks, and every object is taken to be there."""
+    """Model with weights large enough that prompts and memory affect the masks, and all objects count as visible."""
     from transformers import Sam2VideoModel
 
     model = Sam2VideoModel(config(**changes)).eval().requires_grad_(False)
@@ -43,15 +44,15 @@ def random_model(seed: int = 0, **changes):
             value.copy_(torch.randn(value.shape, generator=rng) / max(1, value[0].numel()) ** 0.5)
         else:
             value.fill_(0.0 if name.endswith("bias") else 1.0)
-    appears = model.mask_decoder.pred_obj_score_head.proj_out
-    appears.weight.zero_()
-    appears.bias.fill_(5.0)
+    object_score = model.mask_decoder.pred_obj_score_head.proj_out
+    object_score.weight.zero_()
+    object_score.bias.fill_(5.0)
     for mlp in model.mask_decoder.output_hypernetworks_mlps:
-        mlp.proj_out.bias.fill_(0.1)  # some of every mask is positive
+        mlp.proj_out.bias.fill_(0.1)  # every mask has positive pixels
     return model
 
 
-def saved(folder: Path, seed: int = 0) -> Path:
-    """A folder in the published layout."""
+def save_tiny_model(folder: Path, seed: int = 0) -> Path:
+    """Write a model into `folder` in the published layout."""
     random_model(seed).save_pretrained(folder)
     return folder

@@ -1,4 +1,4 @@
-"""A DiffSplat of random weights, small, in the published layout of folders and names."""
+"""A small DiffSplat with random weights, in the published layout of folders and names."""
 
 import json
 from pathlib import Path
@@ -10,7 +10,7 @@ from transformers import CLIPTextConfig, CLIPTextModel
 
 from stages.core.models.diffsplat.weights import BASE, GSVAE, UNET
 
-SIDE = 32  # of its pictures; their latents are half that
+SIDE = 32  # of the images [px]; latents have half of it
 WIDTHS = (8, 16)
 SCHEDULER = {  # that of Stable Diffusion 1.5
     "_class_name": "PNDMScheduler", "beta_end": 0.012, "beta_schedule": "scaled_linear", "beta_start": 0.00085,
@@ -27,7 +27,7 @@ UNET_CONFIG = {
 
 
 def unet() -> UNet2DConditionModel:
-    """What UNET_CONFIG describes, built by hand."""
+    """The U-Net that UNET_CONFIG describes, built directly."""
     torch.manual_seed(0)
     return UNet2DConditionModel(
         sample_size=SIDE // 2, in_channels=11, out_channels=4, block_out_channels=WIDTHS, layers_per_block=1,
@@ -37,6 +37,7 @@ def unet() -> UNet2DConditionModel:
 
 
 def autoencoder(channels: int) -> AutoencoderKL:
+    """Small autoencoder of `channels` channels with random weights."""
     torch.manual_seed(channels)
     return AutoencoderKL(
         in_channels=channels, out_channels=channels, down_block_types=("DownEncoderBlock2D",) * 2, layers_per_block=1,
@@ -44,8 +45,8 @@ def autoencoder(channels: int) -> AutoencoderKL:
     )  # fmt: skip
 
 
-def published(folder: Path) -> Path:
-    """Write all three parts into a folder."""
+def save_tiny_model(folder: Path) -> Path:
+    """Write U-Net, Gaussian autoencoder and Stable Diffusion parts into a folder."""
     ema = folder / UNET / "checkpoints/013020/unet_ema"
     ema.mkdir(parents=True)
     (ema / "config.json").write_text(json.dumps(UNET_CONFIG))
@@ -57,7 +58,7 @@ def published(folder: Path) -> Path:
     base = folder / BASE
     vae = autoencoder(3)
     vae.save_config(base / "vae")
-    save_file(classic(vae.state_dict()), base / "vae/diffusion_pytorch_model.safetensors")
+    save_file(legacy_names(vae.state_dict()), base / "vae/diffusion_pytorch_model.safetensors")
     torch.manual_seed(3)
     text = CLIPTextConfig(
         vocab_size=40, hidden_size=16, intermediate_size=32, num_hidden_layers=2, num_attention_heads=2,
@@ -72,8 +73,8 @@ def published(folder: Path) -> Path:
     return folder
 
 
-def classic(state: dict) -> dict:
-    """The names that the attention of Stable Diffusion 1.5's autoencoder has on the hub."""
+def legacy_names(state: dict) -> dict:
+    """State dict with the attention names of the published autoencoder of Stable Diffusion 1.5."""
     names = {"to_q": "query", "to_k": "key", "to_v": "value", "to_out.0": "proj_attn"}
     out = {}
     for name, value in state.items():
@@ -84,7 +85,7 @@ def classic(state: dict) -> dict:
 
 
 def _tokenizer(folder: Path) -> None:
-    """Letters, alone and ending a word; no merges."""
+    """Write a tokenizer of single letters, within and at the end of words, without merges."""
     letters = "abcdefghijklmnopq,"
     tokens = ["<|startoftext|>", "<|endoftext|>", *letters, *(f"{letter}</w>" for letter in letters)]
     folder.mkdir()

@@ -291,7 +291,7 @@ def evaluate(
     ],
     against: Annotated[Path, Option("--against", help="ground truth, of the same kind", show_default=False)],
     out: Annotated[
-        Path | None, Option("-o", "--out", help="metrics to write (.json); default: metrics.json beside the prediction")
+        Path | None, Option("-o", "--out", help="JSON file to write; default: metrics.json next to the prediction")
     ] = None,
     align: Annotated[
         bool, Option("--align", help="first align the prediction with the truth, by shared cameras or objects")

@@ -156,7 +156,7 @@ def bench_dynamics(
         Path | None, typer.Option(help="folder of weights to evaluate (.safetensors); default: those in the package")
     ] = None,
     out: Annotated[
-        Path, typer.Option("-o", "--out", help="results (.json), existing ones are kept; table and plots go beside it")
+        Path, typer.Option("-o", "--out", help="results (.json), existing ones are kept; also writes a table and plots")
     ] = Path("results.json"),
     nudged: Annotated[
         Path | None, typer.Option(help="data set of the same scenes with initial positions shifted by 1 mm")
@@ -190,7 +190,7 @@ def bench_dynamics(
 def bench_ablation(
     data: Annotated[Path, typer.Option(help="folder of motions, as `ngff-lab dataset` writes")],
     out: Annotated[
-        Path, typer.Option("-o", "--out", help="results (.json), existing ones are kept; a table (.md) goes beside it")
+        Path, typer.Option("-o", "--out", help="results (.json), existing ones are kept; also writes a table (.md)")
     ] = Path("ablation.json"),
     only: Annotated[str, typer.Option(help="names of the ablations, such as full,reaction; default: all")] = "",
     steps: Annotated[int, typer.Option(help="training steps of each ablation")] = 1500,

@@ -26,14 +26,14 @@ class Finding(NamedTuple):
 
     ok: bool
     subject: str
-    detail: str  # version or path, or what to do
+    detail: str  # version or path, or the remedy
 
     def __str__(self) -> str:
         return f"{'ok' if self.ok else '--'}  {self.subject:<12}{self.detail}"
 
 
 def check_installation() -> Iterator[Finding]:
-    """Every check in turn: packages, GPU, codec, disk, then the weights of each network."""
+    """Results of all checks in order: packages, GPU, codec, disk, then the weights of each network."""
     detail = f"{ngff_version()}, Python {platform.python_version()}, {platform.platform(terse=True)}"
     yield Finding(True, "ngff", detail)
     for check in (_torch, _gpu, _gsplat, _warp, _colmap, _codec, _disk):

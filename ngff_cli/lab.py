@@ -111,7 +111,7 @@ def import_(
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="mpm/<group>/<scene> of GSCollision, with %04d.h5")],
     out: Annotated[Path, typer.Option("-o", "--out", help="trajectory to write (.h5)")] = Path("traj.h5"),
     scene: Annotated[Path | None, typer.Option(help="its point_cloud.ply; default: searched in scenes/<group>/<scene>/ "
-                                               "beside mpm/")] = None,
+                                               "next to mpm/")] = None,
     keypoints: Annotated[int, typer.Option(help="maximum number of keypoints per object")] = 2048,
 ) -> None:
     """Convert a published scene of GSCollision to a trajectory for `ngff render` and `ngff evaluate`."""
@@ -199,7 +199,7 @@ def train(
     start: Annotated[
         Path | None, typer.Option("--from", help="initial weights (.safetensors); default: random")
     ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="continue from the .ckpt beside the weights")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="continue from the .ckpt next to the weights")] = False,
 ) -> None:
     """Train a dynamics model on simulated motion."""
     from stages.lab.training.train import TrainOptions, run

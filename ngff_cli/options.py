@@ -57,7 +57,7 @@ def set_up_logging(verbose: bool) -> None:
 def print_results(run: Callable[[Path | None], Iterable[str]], out: Path | None, as_json: bool) -> None:
     """Print the table lines of `run(out)`, or with --json the JSON file that it writes to `out`.
 
-    `out` is where the user wants that file, if anywhere; with --json the table lines go to stderr as progress.
+    `out` is the path of that file, if requested; with --json the table lines go to stderr as progress.
     """
     if not as_json:
         for line in run(out):

@@ -1,1 +1,1 @@
-"""What the stages share; a folder imports only from those above it (see tests/pipeline/test_layout.py)."""
+"""Modules used by several stages; a folder imports only from those above it (see tests/pipeline/test_layout.py)."""

@@ -58,8 +58,8 @@ def find_alignment(prediction: ReferenceFrame, truth: ReferenceFrame) -> tuple[S
         names = ", ".join(o.name for o in shared)
         return _upright(source, target), f"aligned by the centres of {names}, keeping the vertical"
     raise InputError(
-        f"--align: {prediction.file} and {truth.file} share fewer than two camera names and fewer than two object "
-        "names; use the same names of photos, or of objects, in both"
+        f"--align: {prediction.file} and {truth.file} have fewer than two camera names and fewer than two object names "
+        "in common; use the same names of photos, or of objects, in both"
     )
 
 

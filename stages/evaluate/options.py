@@ -10,7 +10,7 @@ from stages.core.errors import InputError
 
 @dataclass(frozen=True)
 class EvaluateOptions:
-    """What the user can choose."""
+    """Options of the evaluate stage."""
 
     align: bool = False  # first align the prediction with the truth, by shared cameras or else by objects
     frames: int | None = None  # compare the first N frames only; by default both must have the same number

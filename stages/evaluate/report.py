@@ -49,7 +49,7 @@ def _table(result: Result) -> str:
 
 
 def _plot(result: Result) -> str:
-    """Plot of the curves that share the unit of the axis; SSIM, which does not, is in the JSON only."""
+    """Plot of the curves in the unit of the axis; SSIM has another unit and is in the JSON only."""
     curves = [c for c in result.curves if c.name != "SSIM"]
     count = len(curves[0].values)
     top = _round_up(max((v for c in curves for v in c.values if math.isfinite(v)), default=1.0))

@@ -34,9 +34,9 @@ OPTION_KINDS = {  # options that apply to some kinds of data only
 def run(
     prediction: Path, truth: Path, out: Path | None, options: EvaluateOptions, as_json: bool = False
 ) -> dict:
-    """Compare a prediction with the truth; print a table (or JSON) and return what is written to `out`.
+    """Compare a prediction with the truth; print a table (or JSON) and return the metrics written to `out`.
 
-    `out` is metrics.json beside the prediction by default. Raises InputError for files that cannot be compared and for
+    `out` is metrics.json next to the prediction by default. Raises InputError for files that cannot be compared and for
     options that do not apply to them.
     """
     prediction, truth = Path(prediction), Path(truth)

@@ -1,4 +1,4 @@
-"""The steps after cameras and depth that all backends share: Gaussians, world frame, photometric fit, scale, advice."""
+"""The steps after cameras and depth, common to all backends: Gaussians, world frame, photometric fit, scale, advice."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ MAX_DISTANCE = 10.0  # Gaussians farther from the focus are dropped [camera dist
 
 @dataclass(frozen=True)
 class SceneGeometry:
-    """Cameras and depth of a photo set, in a frame and a unit of length of their own."""
+    """Cameras and depth of a photo set, in an arbitrary frame and unit of length."""
 
     source: Path  # of the photos, for error messages
     views: Views

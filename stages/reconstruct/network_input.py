@@ -32,7 +32,7 @@ def network_size(width: int, height: int, longest: int | None = None) -> tuple[i
 def crop_photos(photos: Photos, longest: int | None = None) -> list[UInt8[Tensor, "_ _ 3"]]:
     """The centre of every photo, cropped to the aspect ratio of `common_size`.
 
-    The optical axis stays in the centre and pixels stay square.
+    The optical axis remains in the centre and pixels remain square.
     """
     width, height = common_size(photos, longest)
     out = []

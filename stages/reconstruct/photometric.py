@@ -29,7 +29,7 @@ from stages.reconstruct.photos import Views
 SSIM_WEIGHT = 0.2  # of 1 - SSIM; L1 has the rest
 LEARNING_RATES = {"scales": 5e-3, "quats": 2e-3, "opacities": 3e-2, "base": 5e-3, "rest": 2.5e-4, "gains": 2e-3}
 MEANS_RATE = 2e-4  # learning rate of the means [camera distances]
-MEANS_DECAY = 0.01  # factor that this rate reaches at the end, exponentially
+MEANS_DECAY = 0.01  # factor on this rate at the end of the exponential decay
 DEPTH_WEIGHT = 0.1  # of the error in inverse depth [1 / camera distance]
 MIN_DEPTH = 0.1  # rendered depth is clamped to this in the depth term [camera distances]
 SCALE_WEIGHT = 0.01  # of the mean scale [camera distances]
@@ -154,7 +154,7 @@ def fit_gaussians(
 
 
 def _exposure_projection(cameras: Cameras) -> Float[Tensor, "c c"]:
-    """Projection that removes from one value per camera what is constant or linear in its pose.
+    """Projection that removes from one value per camera the part that is constant or linear in its pose.
 
     This part of the exposures is view-dependent colour, which the spherical harmonics represent. With few cameras only
     the main directions are removed, at most one for every four cameras.

@@ -46,8 +46,8 @@ class Report:
 def run(imgs: Path, out: Path, options: ReconstructOptions) -> Report:
     """Reconstruct a folder of photos or a video: photos/ -> scene.ply. Scores of held-out photos go to stdout.
 
-    Finished steps are kept in a hidden folder beside `out` until the scene is written; an interrupted run leaves it for
-    `options.resume`. Raises InputError, and deletes the folder, where the photos or options do not work.
+    Finished steps are kept in a hidden folder next to `out` until the scene is written; an interrupted run leaves it
+    for `options.resume`. Raises InputError, and deletes the folder, where the photos or options do not work.
     """
     backend = choose(BACKENDS, options.backend)
     photos = read_photos(imgs, options.max_side, min_count=1 if options.backend in SINGLE_PHOTO_BACKENDS else 2)
@@ -63,7 +63,7 @@ def run(imgs: Path, out: Path, options: ReconstructOptions) -> Report:
         steps.remove()
         raise
     except KeyboardInterrupt:
-        log.info("finished steps are kept beside %s; --resume continues from them", out)
+        log.info("finished steps are kept next to %s; --resume continues from them", out)
         raise
     steps.remove()
     report = _report(photos, made, steps, pick_device(options.device))

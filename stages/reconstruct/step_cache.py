@@ -43,7 +43,7 @@ class StepCache:
 
     @classmethod
     def for_output(cls, out: Path, key: str, resume: bool) -> StepCache:
-        """A cache in a hidden folder beside the output file; InputError where its folder is missing."""
+        """A cache in a hidden folder next to the output file; InputError where its folder is missing."""
         out = Path(out)
         if not out.parent.is_dir():
             raise InputError(f"{out}: there is no folder {out.parent}; make it first")

@@ -64,7 +64,7 @@ def refine_ground(ground: Ground, points: Float[Tensor, "n 3"], seed: int = 0) -
     """The supporting plane fitted again with equal weight for equal area instead of for each point.
 
     Textured objects, such as a keyboard and a book, may have more points than the table under them and tilt the first
-    plane. The band of points reaches less far above the plane than below, since points above may be on a tray.
+    plane. The band of points extends less far above the plane than below, since points above may be on a tray.
     """
     if ground.plane is None:
         return ground

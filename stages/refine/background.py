@@ -41,9 +41,9 @@ MIN_COLOUR_DIFFERENCE = 6.0  # of a stained cell from the table [CIELAB]
 MIN_COVERED_ALPHA = 0.92  # above which table is present
 MIN_COLOUR_ALPHA = 0.6  # above which the table's colour is known
 DENT_CELL = 0.015  # side of the cells in which depths below the surface are measured [camera distance]
-MAX_DENT = 0.1  # depth of a dent; objects reaching deeper hang over the edge [camera distance]
+MAX_DENT = 0.1  # depth of a dent; objects extending deeper hang over the edge [camera distance]
 STRAY_POINTS = 3  # deepest Gaussians of a dent cell that are ignored
-MIN_TABLE_GAUSSIANS = 50  # or the background is remaining as it is
+MIN_TABLE_GAUSSIANS = 50  # or the background is left unchanged
 
 
 @dataclass(frozen=True)

@@ -123,7 +123,7 @@ def _volume(
         seen_through = torch.zeros(len(centres), dtype=torch.bool)
         seen_through[cells] = observed.is_free(centres[cells], 1.5 * grid.cell)
         volume = volume & ~seen_through.numpy().reshape(grid.shape)
-    else:  # free space is unknown: fills only what the object encloses
+    else:  # free space is unknown: fills only the volume that the object encloses
         volume = ndimage.binary_fill_holes(
             ndimage.binary_closing(occupied | _cells_below(occupied, volume), iterations=2)
         )

@@ -1,8 +1,8 @@
-"""Registration of a whole object to a seen part of it: the similarity that maps the whole to the part.
+"""Registration of a whole object to an observed part of it: the similarity that maps the whole to the part.
 
-Feature matches give many pose hypotheses (registration_hypotheses.py); the best are refined by Gauss-Newton, at last
-against the whole with as much noise as the part has. Positions and colours are used throughout. It is tested for parts
-with 60 % of the surface, any rotation and scales 0.5 to 2. Computed on the device of the Gaussians.
+Feature matches give many pose hypotheses (registration_hypotheses.py); the best are refined by Gauss-Newton, in the
+last round against the whole with as much noise as the part has. Positions and colours are used throughout. It is
+tested for parts with 60 % of the surface, any rotation and scales 0.5 to 2. Computed on the device of the Gaussians.
 """
 
 from __future__ import annotations

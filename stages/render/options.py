@@ -11,8 +11,8 @@ from stages.core.scene.formats import suffixes
 
 VIEWS = "novel | orbit | input:K | all | path.json"
 
-# suffix of the output -> "module:function" that writes it; the function takes (path, Renderer) and returns what is to
-# be recorded beside the file. Images and videos are all those that stages/core/scene/formats.py can write.
+# suffix of the output -> "module:function" that writes it; the function takes (path, Renderer) and returns the facts
+# to record next to the file. Images and videos are all those that stages/core/scene/formats.py can write.
 OUTPUT_FORMATS = {
     **dict.fromkeys(suffixes("video", writable=True), "stages.render.video:write_video"),
     **dict.fromkeys(suffixes("image", writable=True), "stages.render.image:write_image"),
@@ -21,7 +21,7 @@ OUTPUT_FORMATS = {
 
 @dataclass(frozen=True)
 class RenderOptions:
-    """What the user can choose."""
+    """Options of the render stage."""
 
     view: str = "novel"  # one of VIEWS; K is an index from 0 or the name of a photo
     resolution: int = 640  # longest side of a view [px]; an image of many views is about twice as wide

@@ -26,7 +26,7 @@ def pan(
 ) -> tuple[Float[Tensor, "t 4 4"], float]:
     """World-to-camera matrices and focal length [px] of cameras at `offsets` from the subject that look at `aim`.
 
-    They turn by the least that keeps the moving points within images of this `size` at this `focal` length [px].
+    They rotate by the minimum that keeps the moving points within images of this `size` at this `focal` length [px].
     """
     points = _at_frames(subject.moving, len(offsets)) if subject.moving is not None else None
     distance_factor = 1.0
@@ -46,7 +46,7 @@ def _turned(
     points: Float[Tensor, "t m 3"] | None, subject: Subject, offsets: Float[Tensor, "t 3"], aim: Float[Tensor, "3"],
     half: Float[Tensor, "2"],
 ) -> Float[Tensor, "t 4 4"]:  # fmt: skip
-    """Each camera turned until the slopes x / z, y / z of the points are within `half`, or else centred."""
+    """Each camera rotated until the slopes x / z, y / z of the points are within `half`, or else centred."""
     eyes, aims = subject.target + offsets, aim.expand_as(offsets)
     viewmats = look_at(eyes, aims)
     if points is None:

@@ -64,7 +64,7 @@ class Clip:
 
 @dataclass(frozen=True)
 class Renderer:
-    """Renders its clips side by side; what the writers of the output formats work with."""
+    """Renders its clips side by side in one image; the input of the writers of the output formats."""
 
     clips: Sequence[Clip]
     options: RenderOptions
@@ -88,7 +88,7 @@ class Renderer:
     def cameras(self, frames: int, resolution: int) -> list[Cameras]:
         """For each clip one camera per frame, or for --view all every stored camera.
 
-        Clips whose stored cameras agree share one path, which frames all of them. Raises InputError where --view
+        Clips whose stored cameras agree use one common path, which frames all of them. Raises InputError where --view
         needs stored cameras and there are none, or not equally many in all files.
         """
         animations = [clip.animation for clip in self.clips]
@@ -141,7 +141,7 @@ def views_depth_range(views: Views) -> tuple[float, float]:
 
 
 def depth_facts(span: tuple[float, float] | None) -> dict:
-    """The depth range as recorded beside the output."""
+    """The depth range as recorded next to the output."""
     return {} if span is None else {"depth_near": span[0], "depth_far": span[1]}
 
 

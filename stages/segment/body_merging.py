@@ -54,7 +54,7 @@ def merge_bodies(g: Gaussians, support: Support) -> Gaussians:
 
     Criterion 1: each of two parts has points inside the convex hull of the other, as limbs and the trunk they
     embrace; separate bodies do not (a spoon enters the hull of its cup, but not the cup that of the spoon).
-    Criterion 2: a part that neither reaches the table nor lies on top of another is attached to what it touches.
+    Criterion 2: a part that neither extends to the table nor lies on top of another is attached to the part it touches.
     """
     ids = g.object_id.clone()
     finite = g.means.isfinite().all(1)

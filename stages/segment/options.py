@@ -32,7 +32,7 @@ class SegmentOptions:
     masks: Path | None = None  # folder of label images, named as the photos: 0 background, 1... the objects
     boxes: Path | None = None  # prompts.json in the public format: boxes (for networks also points) in the first view
     photos: Path | None = None  # folder of the scene's photos, for networks; by default the scene is rendered
-    weights: Path | None = None  # of a network: model.safetensors, its config.json beside it, or the folder of both
+    weights: Path | None = None  # of a network: model.safetensors, its config.json next to it, or the folder of both
     download: bool = False  # download missing weights
     names: str = ""  # "1=duck,2=bowl": replaces the automatic names
     max_objects: int = 24

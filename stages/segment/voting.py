@@ -89,7 +89,7 @@ def collect_votes(scene: Scene, images: Iterable[tuple[int, Int[Tensor, "h w"]]]
 
 
 def damp_votes(votes: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
-    """One view's votes, scaled so that each Gaussian's total is the square root of what it was.
+    """One view's votes, scaled so that each Gaussian's total is the square root of its previous value.
 
     Neighbouring pixels of a mask are not independent. This is between one vote per pixel, where one close view may
     outvote all others, and one vote per view.

@@ -36,14 +36,14 @@ from stages.simulate.setup import SceneSetup, set_up_scene
 from stages.simulate.sleep import SleepState
 
 log = logging.getLogger(__name__)
-# What the training data contain, in metres and seconds of the model:
+# Limits of the training data, in metres and seconds of the model:
 TYPICAL_SIZE = 0.55  # median longest side of an object [m]
 SIZE_RANGE = (0.25, 1.2)  # shortest and longest of these [m]
 MAX_OBJECTS = 6  # objects per scene of the benchmark
 MIN_THICKNESS = 0.044  # thickness of the thinnest object, the cloth [m]
 MIN_STIFFNESS = 3e3  # Young's modulus [Pa]; stiffer bodies than in training are extrapolated by linear elasticity
 TRAINING_GRAVITY = 5.0  # [m/s^2]
-MAX_SPEED = 5.0  # speed reached in falls [m/s]
+MAX_SPEED = 5.0  # maximum speed of falls [m/s]
 FAR_WALL = 100.0  # distance of walls where there are none [m]
 FLOOR_OUTLIERS = 0.02  # fraction of an object's keypoints that may lie below the floor under it
 

@@ -11,7 +11,7 @@ from stages.core.errors import InputError
 
 @dataclass(frozen=True)
 class Engine:
-    """A simulation engine: all that the command line, `ngff-lab doctor` and errors need to know of it."""
+    """A simulation engine: its properties for the command line, `ngff-lab doctor` and error messages."""
 
     rollout: str  # "module:function"; (scene, keypoints, prompts, options) -> an iterator of FrameState
     help: str

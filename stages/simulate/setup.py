@@ -1,4 +1,4 @@
-"""Initial state that the engines share: bodies, materials, the floor, lifts and the domain."""
+"""Initial state, common to all engines: bodies, materials, the floor, lifts and the domain."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def set_up_scene(scene: Scene, prompts: ForcePrompts, options: SimulateOptions, 
         if on_floor[row] and o.id not in prompts.pinned:
             floor_offset[row, 2] = -gap[row]
             if gap[row] < -4 * h:
-                log.warning("object %d (%s) reaches %.3g below the floor; it is placed on the floor",
+                log.warning("object %d (%s) extends %.3g below the floor; it is placed on the floor",
                             o.id, o.name, -gap[row])  # fmt: skip
     x = bodies.x + (lift + floor_offset)[bodies.body]
     box = asked or _default_box(x, floor, h)

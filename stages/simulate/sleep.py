@@ -1,10 +1,10 @@
-"""Sleeping objects: what is at rest at the start keeps its position until something hits it.
+"""Sleeping objects: objects at rest at the start keep their position until another object hits them.
 
 Photos show a static equilibrium, which a learned force field holds only approximately, and reconstructed objects
 overlap a little and would be pushed apart. Rigid body engines put islands of bodies at rest to sleep in the same way.
 
-Limits: support is contact in any direction, so an object that floats beside a supported one sleeps too; and objects
-that come to rest later do not fall asleep.
+Limits: support is contact in any direction, so an object that hangs in the air in contact with a supported one
+sleeps too; and objects that come to rest later do not fall asleep.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class SleepState:
         self._wake_unsupported()
 
     def wake_on_impact(self, points: Float[Tensor, "1 o n 3"], speed: Float[Tensor, "1 o n 3"]) -> bool:
-        """Wake objects that an awake object has hit, and what they supported; whether any woke.
+        """Wake objects hit by an awake object, and those that they supported; returns whether any woke.
 
         `points` [m] and their velocities `speed` [m/s] in model units.
         """

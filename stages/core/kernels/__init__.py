@@ -21,9 +21,9 @@ GPU, is used for the fused inference step of the force field; its modules are im
 | field/nearest, perceptron     | Triton                      | `..._reference` in each file                         |
 | field/skinny_matmul           | Triton                      | `A @ x` in double precision                          |
 | field/neighbourhoods          | Triton                      | `models.field.rest_shape`                            |
-| field/ the rest               | Triton                      | `ForceField.step` in `models.field.force_field`      |
+| field/ other modules          | Triton                      | `ForceField.step` in `models.field.force_field`      |
 
-`interop` shares tensors, device and stream between PyTorch and Warp; `threads` runs CPU launches side by side;
-`splat/simd`, `splat/pixel_blocks`, `field/vec3` and `field/layers` hold what several kernels share. `raster`,
+`interop` passes tensors, device and stream between PyTorch and Warp; `threads` runs CPU launches in parallel;
+`splat/simd`, `splat/pixel_blocks`, `field/vec3` and `field/layers` hold code used by several kernels. `raster`,
 `physics` and `models` are the callers.
 """

@@ -39,7 +39,7 @@ class Dynamics(nn.Module, ABC):
         return initial
 
     def prepare(self, initial: InitialConditions) -> Any:
-        """The `scene` argument of the other methods: whatever a model computes once per rollout."""
+        """The `scene` argument of the other methods: all values that a model computes once per rollout."""
         return self.encode(self.precompute(initial))
 
     def encode(self, precomputed: Any) -> Any:

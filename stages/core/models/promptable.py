@@ -46,7 +46,7 @@ class PromptableSegmenter(Protocol):
         ...
 
     def propose_masks(self, pixels: Float[Tensor, "3 s s"]) -> Bool[Tensor, "m l l"]:
-        """Masks of whatever is in a photo, without prompts; they may overlap and include parts of objects."""
+        """Masks of all regions of a photo, without prompts; they may overlap and include parts of objects."""
         ...
 
     def propagate(

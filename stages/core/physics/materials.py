@@ -40,7 +40,7 @@ class Material:
 class MaterialModel:
     """A constitutive law of the MPM solver; sources in stages/core/kernels/mpm/constitutive.py."""
 
-    kernel: int  # number by which the kernels know it
+    kernel: int  # number of the model in the kernels
     parameters: str  # meaning of Material.plastic
     plastic: bool = False  # whether it yields or flows; the first parameter must then be positive
     # parameters for the kernels, of a material whose E is reduced by a factor: it yields at the same strain

@@ -144,7 +144,7 @@ def _solid(
     of volume that each represents.
 
     A body that would tip over although it stood on the floor when `photographed` is extended down to the floor; the
-    last value tells whether it was.
+    last value is whether it was.
     """
     cells = np.floor(points / h).astype(np.int64)
     margin = 6  # room for closing

@@ -1,7 +1,8 @@
 """Rasterisation of Gaussians: gsplat on CUDA, `stages.core.kernels.splat` elsewhere, with the same conventions.
 
 Pixel centres at +0.5, 0.3 px^2 of blur, splats sorted by camera depth, alpha from 1/255 to 0.999, a pixel finished at
-a transmittance of 1e-4. Gradients reach means, quats, scales, opacities, sh and features, not cameras or background.
+a transmittance of 1e-4. Differentiable in means, quats, scales, opacities, sh and features, not in cameras or
+background.
 """
 
 from __future__ import annotations

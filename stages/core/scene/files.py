@@ -13,7 +13,7 @@ from stages.core.errors import InputError
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A temporary path beside `path`, with the same suffix, that replaces it on success and is deleted on failure.
+    """A temporary path next to `path`, with the same suffix, that replaces it on success and is deleted on failure.
 
     Raises InputError where `path` is a folder, its folder is missing, or the file cannot be written.
     """

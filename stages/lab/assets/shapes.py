@@ -19,7 +19,7 @@ from stages.core.scene.gaussians import Gaussians
 def single_threaded() -> Iterator[None]:
     """Run PyTorch on one thread inside the context, so that results are bitwise reproducible.
 
-    The vector and scalar versions of sin or pow differ in the last bit, and the number of threads that share a tensor
+    The vector and scalar versions of sin or pow differ in the last bit, and the number of threads that process a tensor
     decides which version computes an element.
     """
     threads = torch.get_num_threads()

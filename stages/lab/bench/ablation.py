@@ -90,7 +90,7 @@ def _measured(choice: Ablation, data: Path, base: TrainOptions, test: list[str],
             trainee, pieces, unseen.to(device), options, ProcessGroup(device=device), Path(folder) / "weights", {}
         )
         if not job.run():
-            raise InputError("stopped; rows measured so far are kept, and the same command goes on with the next")
+            raise InputError("stopped; rows measured so far are kept, and the same command continues with the next")
     found = validate(trainee.best_model(), scenes.to(device))
     return {"without": choice.without, **{k: float(f"{found[k]:.4g}") for k in METRICS}, "scenes": len(scenes),
             "frames": _frames(scenes), "minutes": float(f"{trainee.elapsed / 60:.3g}"),

@@ -105,7 +105,7 @@ def visible_scene(scene: Scene, options: CompleteBenchOptions) -> Scene:
 
 @torch.no_grad()
 def visible(scene: Scene) -> Bool[Tensor, "n"]:
-    """Whether each Gaussian's centre lies on a surface that some camera sees, whatever its size."""
+    """Whether each Gaussian's centre lies on a surface that is visible in some camera, regardless of its size."""
     g = scene.gaussians
     out = torch.zeros(len(g), dtype=torch.bool)
     for viewmat, K in zip(scene.cameras.viewmats, scene.cameras.Ks, strict=True):

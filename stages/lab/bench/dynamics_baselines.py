@@ -111,7 +111,7 @@ class Resimulation:
                 continue
             if _options(motions_folder(data) / f"{group}.h5") != made:
                 raise InputError(
-                    f"{data}: {group} and {groups[0]} were simulated with different discretisations; make them alike"
+                    f"{data}: {group} and {groups[0]} were simulated with different discretisations; use one for both"
                 )
             self.configs.update(read_scene_configs(folder / "scene_configs" / f"{group}.json"))
         self.discretisation = Discretisation(made["dx"], made["spacing"], made["substep"])

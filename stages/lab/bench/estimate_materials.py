@@ -143,7 +143,7 @@ def parse_reply(reply: str, names: list[str]) -> dict[str, dict]:
     except ValueError as error:
         raise InvalidReply(f"it is not JSON ({error})") from error
     if not isinstance(data, dict) or not data:
-        raise InvalidReply("it must be a JSON object with an entry for each thing")
+        raise InvalidReply("it must be a JSON object with an entry for each object")
     missing, unknown = [n for n in names if n not in data], [n for n in data if names and n not in names]
     if missing or unknown:
         what = f"no entry for {', '.join(missing)}" if missing else f"{', '.join(unknown)} was not asked for"

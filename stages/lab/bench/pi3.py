@@ -94,16 +94,17 @@ def run(
     for views in options.views:
         size = options.size, options.size
         at_once = memory.plan(config, views, size, options.splats, half, memory.free(device))
-        said = weights + memory.activations(config, views, size, at_once, options.splats, half)
-        rows.append({"views": views, "estimated_bytes": _finite(said)})
+        estimate = weights + memory.activations(config, views, size, at_once, options.splats, half)
+        rows.append({"views": views, "estimated_bytes": _finite(estimate)})
         set_attention(model, nn.functional.scaled_dot_product_attention)
         try:
             seconds, most = measure(model, views, options.size, at_once, device, options.repeat)
         except torch.OutOfMemoryError:
-            yield f"views {views:>3}  out of memory (estimate {_gb(said)})"
+            yield f"views {views:>3}  out of memory (estimate {_gb(estimate)})"
             continue
         rows[-1] |= {"seconds": seconds, "bytes": _finite(most)}
-        yield f"views {views:>3}  {seconds:8.3f} s  {_gb(most)} (estimate {_gb(said)})  {views / seconds:6.1f} photos/s"
+        used = f"{_gb(most)} (estimate {_gb(estimate)})"
+        yield f"views {views:>3}  {seconds:8.3f} s  {used}  {views / seconds:6.1f} photos/s"
         set_attention(model, naive_attention)
         try:
             if not half and _table(config, views, options.size) > 0.5 * (memory.free(device) or 0):

@@ -67,7 +67,7 @@ def read_recording(path: Path) -> dict[str, np.ndarray]:
         raise InputError(f"{path}: no {', '.join(missing)}; a recording has {', '.join(sorted(RECORDING_FIELDS))}")
     shape, p = data["positions"].shape, int(data["n"].sum())
     if len(shape) != 3 or shape[1:] != (p, 3) or not np.isfinite(data["positions"]).all():
-        raise InputError(f"{path}: positions must be finite and (frames, {p}, 3), as n says, not {shape}")
+        raise InputError(f"{path}: positions must be finite and (frames, {p}, 3), to match n, not {shape}")
     for name, count in (("volume", p), ("E", len(data["n"])), ("rho", len(data["n"]))):
         if data[name].shape != (count,):
             raise InputError(f"{path}: {name} must have {count} values, not {data[name].shape}")

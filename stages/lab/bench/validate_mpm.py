@@ -218,7 +218,7 @@ def figure(out: Path) -> None:
               [(g, 1e3 * w) for g, _, w in sags], theory="Timoshenko"),
         Panel("sand column: spread over height, in radii", [(a, s) for a, s, _ in heaps],
               [(a, s) for a, _, s in heaps], theory="Lube et al. 2004"),
-        Panel("change by the substep [s], share of the motion", in_time, log=True),
+        Panel("change by the substep [s], fraction of the motion", in_time, log=True),
         Panel("relative drift of momentum (o), spin (line) over substeps", [(n, a) for n, a, _ in kept],
               [(n, b) for n, _, b in kept], theory="spin"),
     ])  # fmt: skip

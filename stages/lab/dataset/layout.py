@@ -69,7 +69,7 @@ class Layout:
 
 @contextmanager
 def replacing_folder(path: Path) -> Iterator[Path]:
-    """An empty folder beside `path` that is renamed to `path` on success and removed on failure.
+    """An empty folder next to `path` that is renamed to `path` on success and removed on failure.
 
     A leftover of an earlier, killed run is removed first. Raises InputError when it cannot be written.
     """

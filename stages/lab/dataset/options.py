@@ -18,7 +18,7 @@ MAX_NUDGE = 0.02  # [m]; scenes leave 0.05 m between objects
 
 @dataclass(frozen=True)
 class DatasetOptions:
-    """What to generate, and the settings that determine its content."""
+    """Groups to generate, and the settings that determine their content."""
 
     groups: str = "3_0..3_9,4,6"
     only: str = "motions"  # parts
@@ -84,7 +84,7 @@ class DatasetOptions:
 
     @property
     def settings(self) -> dict:
-        """The settings that all files of a data set share, as stored in manifest.json."""
+        """The settings common to all files of a data set, as stored in manifest.json."""
         shared = ("frames", "keypoints", "dx", "spacing", "substep", "nudge", "resolution")
         return {**{name: getattr(self, name) for name in shared}, "exact": self.deterministic}
 

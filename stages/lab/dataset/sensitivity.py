@@ -1,6 +1,6 @@
 """Sensitivity to initial conditions: errors between two runs of the same scenes with slightly displaced objects.
 
-No model that knows the start only to this precision can be expected to do better, so this is a lower bound on the
+A model given initial conditions of this precision cannot be expected to do better, so this is a lower bound on the
 error: `ngff-lab bench dynamics` measures models on the same splits by the same metrics.
 """
 
@@ -31,7 +31,7 @@ METRICS = ("RMSE", "FPE", "PCE", "R", "R_pooled")
 def run(data: Path, nudged: Path, out: Path | None, keypoints: int, device: str) -> list[str]:
     """Compare two data sets on each split that both have; write JSON to `out` and return the lines of a table.
 
-    Raises InputError when they share no group, or the start positions are equal.
+    Raises InputError when they have no group in common, or the start positions are equal.
     """
     device, rows = pick_device(device), {}
     for split, (groups, frames) in SPLITS.items():

@@ -72,7 +72,7 @@ class _NoImpulseFeatures(ContactNet):
 
 
 class _ZeroFeatures(nn.Module):
-    """Zeros of some width in place of a network."""
+    """Zeros of a given width in place of a network output."""
 
     def __init__(self, width: int):
         super().__init__()

@@ -21,7 +21,7 @@ VALIDATION_SCENES = 100  # at the end of the last group: they only select the be
 # RMS change of velocity from frame to frame [m/s] above which an object is amid an impact, where central differences
 # do not approximate its velocity
 MAX_SPEED_CHANGE = 0.3
-REST_SPEED, REST_FRAMES = 0.02, 5  # scenes slower than this [m/s] in their last frames are at rest for ever after
+REST_SPEED, REST_FRAMES = 0.02, 5  # scenes slower than this [m/s] in their last frames are taken to remain at rest
 
 
 @dataclass(frozen=True)

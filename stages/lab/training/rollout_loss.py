@@ -1,4 +1,4 @@
-"""Loss of a batch and its gradient: a rollout over some frames and back, on a GPU replayed as one CUDA graph.
+"""Loss of a batch and its gradient: forward and backward pass of a rollout, replayed as one CUDA graph on a GPU.
 
 What a model computes once for a scene (`precompute`, `encode`, `state_from_motion`) decomposes matrices, for which the
 host must wait, so it stays outside of the graph; its gradients are chained to those of the graph by hand.
@@ -28,7 +28,7 @@ MIN_SPREAD, TYPICAL_SPREAD = 1.0, 5.0  # floor, and reference value, of the moti
 
 @dataclass(frozen=True)
 class LossOptions:
-    """What is minimised."""
+    """Weights and terms of the loss."""
 
     kind: str = "square"  # one of LOSSES
     velocity_time: float = 0.0  # [s]: a velocity error counts as this times it in position; 0: not at all
@@ -78,7 +78,7 @@ class RolloutLoss:
     """Callable on clips of one batch size and horizon: the loss, and its gradient for each of the model's parameters.
 
     `graph` records the rollout as a CUDA graph on a GPU; `compiled` compiles a step first. Where either fails, training
-    goes on without it.
+    continues without it.
     """
 
     def __init__(
@@ -148,7 +148,7 @@ class RolloutLoss:
         self.advance = _advance
 
     def _chain(self, scene: Any, grads: list[Tensor | None]) -> list[Tensor]:
-        """Gradients of the parameters, with those that reach them through the prepared scene."""
+        """Gradients of the parameters, including those through the prepared scene."""
         direct, inner = grads[: len(self.params)], grads[len(self.params) :]
         prepared = [(x, g) for x, g in zip([x for x in leaf_tensors(scene) if x.requires_grad], inner, strict=True)
                     if g is not None]  # fmt: skip
@@ -161,7 +161,7 @@ class RolloutLoss:
     def _capture(self, inputs: tuple) -> None:
         """Record the rollout as a CUDA graph; where that fails, log it and go on without."""
         self.record_graph = False
-        # leaves with memory of their own, which the graph reads
+        # leaf tensors with their own memory, which the graph reads
         static = [x.detach().clone(memory_format=torch.contiguous_format).requires_grad_(x.requires_grad)
                   for x in leaf_tensors(inputs)]  # fmt: skip
         static = replace_tensors(inputs, iter(static))

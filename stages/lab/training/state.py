@@ -73,7 +73,7 @@ class TrainingState:
     def record(self, row: dict) -> None:
         """Append a validation to the curve; keep the weights if they have the lowest RMSE so far.
 
-        On divergence training goes on from the best weights at half the learning rate: the gradients of long rollouts
+        On divergence training continues from the best weights at half the learning rate: the gradients of long rollouts
         can explode.
         """
         mean = torch.stack(self.losses).nanmean().item() if self.losses else math.nan

@@ -110,8 +110,8 @@ def run(
 ) -> list[str]:  # fmt: skip
     """Train on groups of motions; write the best weights to OUT and their card next to it. Returns lines of result.
 
-    OUT with the suffix .ckpt is the checkpoint that `resume` goes on from; with the same options the curve is the same
-    as without the interruption. `start` are weights to begin with; their runs come first in the new card. Raises
+    OUT with the suffix .ckpt is the checkpoint that `resume` continues from; with the same options the curve is the
+    same as without the interruption. `start` are weights to begin with; their runs come first in the new card. Raises
     InputError for missing or unfit files.
     """
     out = Path(out)
@@ -167,7 +167,7 @@ def _initial_state(
         if options.hidden and card["model"] == model == "ngff":
             network = widen(network, options.hidden)
         if card["model"] != model or options.hidden not in (0, network.config.get("hidden")):
-            raise InputError(f"{start}: holds {card['model']} {network.config}, not what is to be trained; leave "
+            raise InputError(f"{start}: holds {card['model']} {network.config}, not the model to be trained; leave "
                              "--hidden out and name weights of the same model")  # fmt: skip
         earlier = runs_of(card)
     state = TrainingState(network, options.lr, options.seed, options.optimizer)
@@ -178,7 +178,7 @@ def _initial_state(
 
 
 def _key(model: str, options: TrainOptions, earlier: list[dict]) -> dict:
-    """What must be equal for training to resume from a checkpoint."""
+    """Settings that must be equal for training to resume from a checkpoint."""
     start = earlier[-1]["sha256"] if earlier else None
     return {"model": model, "from": start, **{k: v for k, v in asdict(options).items() if k != "device"}}
 

@@ -1,4 +1,4 @@
-"""MLS-MPM with APIC transfers and quadratic B-splines, for batches of scenes: what both launch orders share.
+"""MLS-MPM with APIC transfers and quadratic B-splines, for batches of scenes: the code common to both launch orders.
 
 `fused` does a whole substep in one launch, which is fastest on a GPU; `split` launches particles and grid in turn,
 which is fastest on a CPU: division by mass and walls are then evaluated once per node instead of 27 times per particle.

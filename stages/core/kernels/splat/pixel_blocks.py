@@ -7,7 +7,7 @@ when the next splat would reduce its transmittance T to 1e-4 or less (that splat
 from stages.core.kernels.splat.projection import BIN_SIZE
 
 MAX_ALPHA = 0.999  # of a splat at a pixel, so that 1 / (1 - alpha) is finite
-MIN_TRANSMITTANCE = 1e-4  # a pixel is finished when the next splat would reach it
+MIN_TRANSMITTANCE = 1e-4  # a pixel is finished when the next splat would fall below it
 MIN_MEAN_ALPHA = 1e-10  # of a pixel, below which the weighted mean of the fourth channel is 0
 BLOCKS_PER_BIN = (BIN_SIZE // 4) ** 2
 PIXELS_PER_BIN = BLOCKS_PER_BIN * 16  # per-pixel state is stored by block, then by lane

@@ -36,7 +36,7 @@ class MultiViewAttention:
 
 
 def share_attention(unet: UNet2DConditionModel, views: int = VIEWS + 1) -> None:
-    """Make every self-attention of a U-Net multi-view; cross-attention to the text stays per view."""
+    """Make every self-attention of a U-Net multi-view; cross-attention to the text remains per view."""
     unet.set_attn_processor({
         name: MultiViewAttention(views) if name.endswith("attn1.processor") else AttnProcessor2_0()
         for name in unet.attn_processors

@@ -100,7 +100,7 @@ def _missing(files: Files) -> list[Path]:
 
 
 def load(files: Files, device: str = "cpu") -> DiffSplat:
-    """The model in 32 bit, for inference; sizes come from the configurations beside the weights.
+    """The model in 32 bit, for inference; sizes come from the configurations next to the weights.
 
     Raises InputError for missing packages and for files that are damaged or of another model.
     """

@@ -179,5 +179,5 @@ def _plane_contacts(
 
 
 def _within_cutoff(x: Tensor, gate: Tensor, extra_dims: int) -> Tensor:
-    """Features with 0 where the gate is 0: there they may be huge, and must not reach the gradient."""
+    """Features with 0 where the gate is 0: there they may be huge, and must not enter the gradient."""
     return torch.where(gate[(...,) + (None,) * extra_dims] > 0, x, 0.0)

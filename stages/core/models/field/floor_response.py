@@ -1,7 +1,7 @@
 """Hand-written response to floor and walls: normal push, penetration limit and a friction threshold.
 
-These rules stand beside the learned forces. They are heuristics, not a Coulomb contact solve; their constants were
-chosen by hand while looking at rollouts and have no published source.
+These rules are applied in addition to the learned forces. They are heuristics, not a Coulomb contact solve; their
+constants were chosen by hand while looking at rollouts and have no published source.
 """
 
 from __future__ import annotations

@@ -285,7 +285,7 @@ class ForceField(Dynamics):
         return F.sum(2) - self._reaction(shape, F), torque - self._reaction(shape, counter)
 
     def _reaction(self, shape: RestShape, x: Float[Tensor, "b o m c"]) -> Float[Tensor, "b o c"]:
-        """Sum over each object's partners of x, what the partner gets from the object: its reaction is subtracted."""
+        """Sum over each object's partners of x, the effect of the object on the partner; its reaction is subtracted."""
         return x[:, shape.others, shape.back].sum(2)
 
 

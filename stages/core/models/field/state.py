@@ -27,7 +27,7 @@ class BodyState(NamedTuple):
 
 @dataclass(frozen=True)
 class FieldScene:
-    """What is computed once per rollout: the rest shapes and what the network derives from shape and material."""
+    """Values computed once per rollout: the rest shapes and the network outputs for shape and material."""
 
     shape: RestShape
     embedding: Float[Tensor, "b o h"]  # of each object's shape and material

@@ -19,7 +19,7 @@ def conv(width_in: int, width_out: int) -> nn.Conv2d:
 
 
 class ResidualConv(nn.Module):
-    """Two convolutions beside an identity. Source: He et al. 2016, "Deep residual learning", fig. 2."""
+    """Two convolutions with a residual connection. Source: He et al. 2016, "Deep residual learning", fig. 2."""
 
     def __init__(self, width: int):
         super().__init__()

@@ -50,7 +50,7 @@ def local_points(raw: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
 
 
 class ResidualMLP(nn.Module):
-    """Three linear layers with ReLU beside an identity."""
+    """Three linear layers with ReLU and a residual connection."""
 
     def __init__(self, width: int):
         super().__init__()

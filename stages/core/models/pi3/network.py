@@ -21,7 +21,7 @@ CAMERA_REGISTERS = 5  # register tokens of each view, before its patches
 
 @dataclass(frozen=True)
 class Geometry:
-    """Network output for v views; lengths share one unknown unit."""
+    """Network output for v views; all lengths are in the same unknown unit."""
 
     points: Float[Tensor, "v h w 3"]  # of each pixel, in its camera's frame
     confidence: Float[Tensor, "v h w"]  # 0..1

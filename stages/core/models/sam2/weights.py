@@ -19,7 +19,7 @@ FILES = ("config.json", "model.safetensors")
 
 
 def find(given: Path | None = None) -> Path:
-    """Path of the weights: the file `given`, or model.safetensors in the folder `given`, with config.json beside it.
+    """Path of the weights: the file `given`, or model.safetensors in the folder `given`, with config.json next to it.
 
     Without `given`, the folder sam2/ is searched in $NGFF_WEIGHTS and in the user's cache. Raises InputError, naming
     the download, where the files are missing.
@@ -53,7 +53,7 @@ def _choose(files: list) -> list:
 
 
 def load(path: Path, device: str = "cpu") -> Sam2VideoModel:
-    """The network with the weights of a file and the architecture of the config.json beside it; float32, eval mode.
+    """The network with the weights of a file and the architecture of the config.json next to it; float32, eval mode.
 
     Raises InputError where transformers is absent or older than SAM 2, and for files that are damaged, incomplete or
     of another network.
@@ -93,5 +93,5 @@ def _config(kind: type, file: Path):
 
 
 def _unfit(path: Path, what: str) -> InputError:
-    return InputError(f"{path}: does not fit the config.json beside it: {what}; fetch both from one repository, such "
+    return InputError(f"{path}: does not fit the config.json next to it: {what}; fetch both from one repository, such "
                       f"as {SOURCE.repository}")  # fmt: skip

@@ -42,7 +42,7 @@ def _split_voxels(voxels: np.ndarray) -> np.ndarray:
 
 
 def _dilated(voxels: np.ndarray) -> np.ndarray:
-    """The voxels and those that share a face with them."""
+    """The voxels and their face neighbours."""
     low = voxels.min(0) - 1
     solid = np.zeros(voxels.max(0) - low + 2, bool)
     solid[tuple((voxels - low).T)] = True

@@ -120,12 +120,12 @@ def modulus_at_wave_speed(speed: float, nu: float, density: float) -> float:
 class Solver:
     """Particles in a box with grid spacing `dx` [m]; `advance` moves them through one frame.
 
-    `sizes` gives the number of particles of each scene of a batch; scenes share box and colliders and do not interact.
-    `damping` (0 to 1) removes that fraction of the symmetric part of C at every transfer (RPIC). `fused` selects the
-    schedule, by default the faster one for the device. `exact` sums in fixed point: a GPU then gives the same bytes in
-    every run at about twice the time, and a scene the same result in any batch (unless a surface has restitution,
-    whose stiffness follows from the stiffest material of the batch). Raises ValueError for sizes that do not fit the
-    particles and for grids that are too large.
+    `sizes` gives the number of particles of each scene of a batch; scenes have the same box and colliders and do not
+    interact. `damping` (0 to 1) removes that fraction of the symmetric part of C at every transfer (RPIC). `fused`
+    selects the schedule, by default the faster one for the device. `exact` sums in fixed point: a GPU then gives the
+    same bytes in every run at about twice the time, and a scene the same result in any batch (unless a surface has
+    restitution, whose stiffness follows from the stiffest material of the batch). Raises ValueError for sizes that do
+    not fit the particles and for grids that are too large.
     """
 
     def __init__(

@@ -19,7 +19,7 @@ from stages.core.physics.mpm.particle_rows import ParticleRows
 
 CPU_PARTS = 4  # parts that the particles are split into on the CPU
 LAUNCH_MULTIPLE = 32  # particle launches are padded to a multiple of a GPU warp
-MIN_SPLIT_ROWS = 20_000  # grid rows (of four nodes) above which the grid launch is split; a hand-over costs about 5,000
+MIN_SPLIT_ROWS = 20_000  # grid rows of four nodes above which the grid launch is split; a split costs about 5,000 rows
 
 
 class SplitSubsteps:

@@ -48,16 +48,16 @@ WRENCH_SIZE = tl.constexpr(6)  # columns: force and torque
 @triton.jit
 def nearest_wall(x, room):
     """Signed distance [m] to the nearest of the four walls and the ceiling, and its inward normal."""
-    near, other = x[0] - tl.load(room), x[1] - tl.load(room + 1)
-    nx, ny, nz = tl.where(other < near, 0.0, 1.0), tl.where(other < near, 1.0, 0.0), tl.zeros_like(near)
-    near = tl.minimum(near, other)
+    distance, other = x[0] - tl.load(room), x[1] - tl.load(room + 1)
+    nx, ny, nz = tl.where(other < distance, 0.0, 1.0), tl.where(other < distance, 1.0, 0.0), tl.zeros_like(distance)
+    distance = tl.minimum(distance, other)
     for axis in tl.static_range(3):
         other = tl.load(room + 3 + axis) - x[axis]
-        nx = tl.where(other < near, -1.0 if axis == 0 else 0.0, nx)
-        ny = tl.where(other < near, -1.0 if axis == 1 else 0.0, ny)
-        nz = tl.where(other < near, -1.0 if axis == 2 else 0.0, nz)
-        near = tl.minimum(near, other)
-    return near, (nx, ny, nz)
+        nx = tl.where(other < distance, -1.0 if axis == 0 else 0.0, nx)
+        ny = tl.where(other < distance, -1.0 if axis == 1 else 0.0, ny)
+        nz = tl.where(other < distance, -1.0 if axis == 2 else 0.0, nz)
+        distance = tl.minimum(distance, other)
+    return distance, (nx, ny, nz)
 
 
 @triton.jit
@@ -72,7 +72,7 @@ def drift_half_step(
     com, quat, velocity, momentum, u, du, arm, normal, valid, size, inverse, pinned, box, body, moved, field, keys,
     o, n, dt, MAX_DISPLACEMENT: tl.constexpr, NO_CONTACT: tl.constexpr, FRAME: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Drift bodies by dt / 2 and evaluate their points is_valid.
+    """Drift bodies by dt / 2 and evaluate their points at that time.
 
     Writes `body`, `moved` (points in the world) and `field` (points in the body frame). `keys` (b o, 2, n) are
     distances to the floor and to the nearest wall [m]: the smaller of now and FRAME seconds ahead.
@@ -109,18 +109,18 @@ def drift_half_step(
     store3(at_moved + NORMAL * n, n, matvec3(R, load3(normal + at, 1, inside)), inside)
     store3(at_moved + ARM * n, n, lever, inside)
 
-    far: tl.constexpr = float("inf")
+    infinity: tl.constexpr = float("inf")
     is_valid = tl.load(valid + i * n + r, mask=inside, other=0) != 0
-    write3(to + BOX_LOW, scale3(-1.0, max3(where3(is_valid, scale3(-1.0, x), -far))))
-    write3(to + BOX_HIGH, max3(where3(is_valid, x, -far)))
+    write3(to + BOX_LOW, scale3(-1.0, max3(where3(is_valid, scale3(-1.0, x), -infinity))))
+    write3(to + BOX_HIGH, max3(where3(is_valid, x, -infinity)))
     fastest = tl.sqrt(tl.max(tl.where(is_valid, dot(speed, speed), 0.0)))
     tl.store(to + CONTACT_RADIUS, NO_CONTACT / 2 + FRAME * fastest)
-    room = box + 6 * i
-    height = x[2] - tl.load(room + 2)
-    key = tl.where(is_valid, tl.minimum(height, height + FRAME * speed[2]), far)
+    bounds = box + 6 * i
+    height = x[2] - tl.load(bounds + 2)
+    key = tl.where(is_valid, tl.minimum(height, height + FRAME * speed[2]), infinity)
     tl.store(keys + 2 * i * n + r, key, mask=inside)
-    height, inward = nearest_wall(x, room)
-    key = tl.where(is_valid, tl.minimum(height, height + FRAME * dot(speed, inward)), far)
+    height, inward = nearest_wall(x, bounds)
+    key = tl.where(is_valid, tl.minimum(height, height + FRAME * dot(speed, inward)), infinity)
     tl.store(keys + (2 * i + 1) * n + r, key, mask=inside)
 
 

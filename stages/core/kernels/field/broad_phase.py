@@ -44,9 +44,9 @@ def gather_candidates(
         near &= x[axis] > tl.load(body + BODY_SIZE * j + BOX_LOW + axis) - radius
         near &= x[axis] < tl.load(body + BODY_SIZE * j + BOX_HIGH + axis) + radius
     row = i * (o - 1) + k
-    place = tl.cumsum(near.to(tl.int32), 0) - 1
-    store3(positions + 3 * row * n + place, n, x, near)
-    tl.store(which + row * n + place, r, mask=near)
+    slot = tl.cumsum(near.to(tl.int32), 0) - 1
+    store3(positions + 3 * row * n + slot, n, x, near)
+    tl.store(which + row * n + slot, r, mask=near)
     tl.store(candidates + row, tl.sum(near.to(tl.int32)))
 
 
@@ -64,15 +64,15 @@ def nearest_candidates(
     first = tl.program_id(1) * QUERY_BLOCK
     if first < count:
         radius = _contact_distance(body, i, j, SEARCH_RADIUS)
-        far: tl.constexpr = float("inf")
+        infinity: tl.constexpr = float("inf")
         e = first + tl.arange(0, QUERY_BLOCK)
         x = load3(positions + 3 * row * n + e, n, e < count)
         column = tl.arange(0, CANDIDATE_CHUNK)
-        smallest = tl.full([QUERY_BLOCK, CANDIDATE_CHUNK], far, tl.float32)
+        smallest = tl.full([QUERY_BLOCK, CANDIDATE_CHUNK], infinity, tl.float32)
         chunk = tl.zeros([QUERY_BLOCK, CANDIDATE_CHUNK], tl.int32)
         for start in range(0, last, CANDIDATE_CHUNK):
             s = start + column
-            y = load3(positions + 3 * other * n + s, n, s < last, far)
+            y = load3(positions + 3 * other * n + s, n, s < last, infinity)
             dx, dy, dz = x[0][:, None] - y[0][None, :], x[1][:, None] - y[1][None, :], x[2][:, None] - y[2][None, :]
             squared = dx * dx + dy * dy + dz * dz
             chunk = tl.where(squared < smallest, start, chunk)
@@ -80,13 +80,13 @@ def nearest_candidates(
         best = tl.min(smallest, 1)
         entry = tl.min(tl.where(smallest == best[:, None], chunk + column[None, :], n), 1)
         found = (e < count) & (best < radius * radius)
-        mine = tl.load(which + row * n + e, mask=found, other=0)
+        own_point = tl.load(which + row * n + e, mask=found, other=0)
         other_point = tl.load(which + other * n + entry, mask=found, other=0)
-        at_own, at_other = moved + POINT_SIZE * i * n + mine, moved + POINT_SIZE * j * n + other_point
-        way = sub(x, load3(at_other + POINT * n, n, found))
+        at_own, at_other = moved + POINT_SIZE * i * n + own_point, moved + POINT_SIZE * j * n + other_point
+        offset = sub(x, load3(at_other + POINT * n, n, found))
         rate = sub(load3(at_own + SPEED * n, n, found), load3(at_other + SPEED * n, n, found))
-        way = add(way, scale3(FRAME, rate))
-        key = tl.where(found, tl.sqrt(tl.minimum(best, dot(way, way))), far)
+        offset = add(offset, scale3(FRAME, rate))
+        key = tl.where(found, tl.sqrt(tl.minimum(best, dot(offset, offset))), infinity)
         tl.store(keys + row * n + e, key, mask=e < count)
         tl.store(partner + row * n + e, other_point, mask=e < count)
 
@@ -120,20 +120,20 @@ def select_contacts(
     i, k, m = tl.program_id(0), tl.program_id(1), o - 1
     r = tl.arange(0, BLOCK)
     limit_count = tl.sum(tl.load(valid + i * n + r, mask=r < n, other=0).to(tl.int32))
-    far: tl.constexpr = float("inf")
+    infinity: tl.constexpr = float("inf")
     zero = tl.zeros([BLOCK], tl.float32)
     store3(accelerations + (i * (o + 1) + k) * 3 * n + r, n, (zero, zero, zero), r < n)
     to = i * slots + k * wide
     if k < m:
         row = i * m + k
         listed = r < tl.load(candidates + row)
-        key = tl.load(keys + row * n + r, mask=listed, other=far)
-        mine = tl.load(which + row * n + r, mask=listed, other=0)
+        key = tl.load(keys + row * n + r, mask=listed, other=infinity)
+        own = tl.load(which + row * n + r, mask=listed, other=0)
         other = tl.load(partner + row * n + r, mask=listed, other=0)
         limit_count = tl.ceil(PAIR_FRACTION * limit_count).to(tl.int32)
     else:
-        key = tl.load(planes + (2 * i + k - m) * n + r, mask=r < n, other=far)
-        mine, other = r, r
+        key = tl.load(planes + (2 * i + k - m) * n + r, mask=r < n, other=infinity)
+        own, other = r, r
         if k > m:
             to = (i + 1) * slots - narrow
             limit_count = tl.ceil(WALL_FRACTION * limit_count).to(tl.int32)
@@ -141,8 +141,8 @@ def select_contacts(
     if tl.sum(near.to(tl.int32)) > limit_count:
         bits, limit = _smallest(key, near, limit_count)
         near &= bits <= limit
-    place = tl.cumsum(near.to(tl.int32), 0) - 1
-    near &= place < limit_count  # ties
-    tl.store(point + to + place, mine, mask=near)
-    tl.store(other_point + to + place, other, mask=near)
+    slot = tl.cumsum(near.to(tl.int32), 0) - 1
+    near &= slot < limit_count  # ties
+    tl.store(point + to + slot, own, mask=near)
+    tl.store(other_point + to + slot, other, mask=near)
     tl.store(count + i * (o + 1) + k, tl.sum(near.to(tl.int32)))

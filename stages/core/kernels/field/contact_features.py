@@ -39,7 +39,7 @@ def contact_list(slot, m, n, wide, narrow, slots):
 
 @triton.jit
 def _response(J, r):
-    """Inverse effective mass 1 - [r] J [r] of a point at other_arm arm r, for unit mass: the velocity per unit impulse.
+    """Inverse effective mass 1 - [r] J [r] of a point at arm r, for unit mass: the velocity per unit impulse.
 
     Symmetric, as xx, xy, xz, yy, yz, zz; J is the inverse inertia.
     """
@@ -74,71 +74,72 @@ def contact_features(
     i, m, slot = tl.program_id(0), o - 1, tl.program_id(1) * ROWS
     k, start = contact_list(slot, m, n, wide, narrow, slots)
     r = tl.arange(0, ROWS)
-    there = slot - start + r < tl.load(count + i * (o + 1) + k)
+    listed = slot - start + r < tl.load(count + i * (o + 1) + k)
     if slot - start < tl.load(count + i * (o + 1) + k):
         to = record + (i * slots + slot) * COLUMNS + r
-        mine = tl.load(point + i * slots + slot + r, mask=there, other=0)
-        at = moved + POINT_SIZE * i * n + mine
-        x, speed = load3(at + POINT * n, n, there), load3(at + SPEED * n, n, there)
-        normal, arm = load3(at + NORMAL * n, n, there), load3(at + ARM * n, n, there)
-        tl.store(to + MASS_FRACTION * ROWS, tl.load(mass_fraction + i * n + mine, mask=there, other=0.0))
-        gap = tl.load(spacing + i * n + mine, mask=there, other=0.0) / GAP_UNIT
+        own = tl.load(point + i * slots + slot + r, mask=listed, other=0)
+        at = moved + POINT_SIZE * i * n + own
+        x, speed = load3(at + POINT * n, n, listed), load3(at + SPEED * n, n, listed)
+        normal, arm = load3(at + NORMAL * n, n, listed), load3(at + ARM * n, n, listed)
+        tl.store(to + MASS_FRACTION * ROWS, tl.load(mass_fraction + i * n + own, mask=listed, other=0.0))
+        gap = tl.load(spacing + i * n + own, mask=listed, other=0.0) / GAP_UNIT
         extent = tl.log(tl.load(size + i))
         zero = x[0] * 0.0
         gravity_term = add(scale3(0.2, read3(gravity + 3 * (i // o))), (zero, zero, zero))
         v = read3(body + BODY_SIZE * i + VELOCITY)
-        one = _response(read9(body + BODY_SIZE * i + INVERSE_INERTIA), arm)
+        own_response = _response(read9(body + BODY_SIZE * i + INVERSE_INERTIA), arm)
         if k < m:
             j = other_object(i, k, o)
-            other = tl.load(other_point + i * slots + slot + r, mask=there, other=0)
+            other = tl.load(other_point + i * slots + slot + r, mask=listed, other=0)
             at = moved + POINT_SIZE * j * n + other
-            offset, rate = sub(x, load3(at + POINT * n, n, there)), sub(speed, load3(at + SPEED * n, n, there))
-            other_normal, other_arm = load3(at + NORMAL * n, n, there), load3(at + ARM * n, n, there)
-            here, their = tl.maximum(tl.load(mass + i), 1e-6), tl.maximum(tl.load(mass + j), 1e-6)
-            two = _response(read9(body + BODY_SIZE * j + INVERSE_INERTIA), other_arm)
-            f = their / (here + their)
+            offset, rate = sub(x, load3(at + POINT * n, n, listed)), sub(speed, load3(at + SPEED * n, n, listed))
+            other_normal, other_arm = load3(at + NORMAL * n, n, listed), load3(at + ARM * n, n, listed)
+            own_mass, other_mass = tl.maximum(tl.load(mass + i), 1e-6), tl.maximum(tl.load(mass + j), 1e-6)
+            other_response = _response(read9(body + BODY_SIZE * j + INVERSE_INERTIA), other_arm)
+            f = other_mass / (own_mass + other_mass)
             g = 1 - f
-            K = (f * one[0] + g * two[0], f * one[1] + g * two[1], f * one[2] + g * two[2],
-                 f * one[3] + g * two[3], f * one[4] + g * two[4], f * one[5] + g * two[5])  # fmt: skip
+            K = (f * own_response[0] + g * other_response[0], f * own_response[1] + g * other_response[1],
+                 f * own_response[2] + g * other_response[2], f * own_response[3] + g * other_response[3],
+                 f * own_response[4] + g * other_response[4], f * own_response[5] + g * other_response[5])  # fmt: skip
             now, ahead = _length(offset), _length(add(offset, scale3(FRAME, rate)))
             a, b = solve_symmetric(K, rate, other_normal)
             relative_velocity = sub(v, read3(body + BODY_SIZE * j + VELOCITY))
-            store3(to, MAX_VECTORS * ROWS, scale3(1 / GAP_UNIT, offset), there)
-            store3(to + ROWS, MAX_VECTORS * ROWS, normal, there)
-            store3(to + 2 * ROWS, MAX_VECTORS * ROWS, other_normal, there)
-            store3(to + 3 * ROWS, MAX_VECTORS * ROWS, rate, there)
-            store3(to + 4 * ROWS, MAX_VECTORS * ROWS, scale3(1 / ARM_UNIT, arm), there)
-            store3(to + 5 * ROWS, MAX_VECTORS * ROWS, scale3(1 / ARM_UNIT, other_arm), there)
-            store3(to + 6 * ROWS, MAX_VECTORS * ROWS, add(relative_velocity, (zero, zero, zero)), there)
-            store3(to + 7 * ROWS, MAX_VECTORS * ROWS, gravity_term, there)
-            store3(to + 8 * ROWS, MAX_VECTORS * ROWS, a, there)
-            store3(to + 9 * ROWS, MAX_VECTORS * ROWS, b, there)
+            store3(to, MAX_VECTORS * ROWS, scale3(1 / GAP_UNIT, offset), listed)
+            store3(to + ROWS, MAX_VECTORS * ROWS, normal, listed)
+            store3(to + 2 * ROWS, MAX_VECTORS * ROWS, other_normal, listed)
+            store3(to + 3 * ROWS, MAX_VECTORS * ROWS, rate, listed)
+            store3(to + 4 * ROWS, MAX_VECTORS * ROWS, scale3(1 / ARM_UNIT, arm), listed)
+            store3(to + 5 * ROWS, MAX_VECTORS * ROWS, scale3(1 / ARM_UNIT, other_arm), listed)
+            store3(to + 6 * ROWS, MAX_VECTORS * ROWS, add(relative_velocity, (zero, zero, zero)), listed)
+            store3(to + 7 * ROWS, MAX_VECTORS * ROWS, gravity_term, listed)
+            store3(to + 8 * ROWS, MAX_VECTORS * ROWS, a, listed)
+            store3(to + 9 * ROWS, MAX_VECTORS * ROWS, b, listed)
             to += FIRST_SCALAR * ROWS
-            tl.store(to, now / GAP_UNIT, mask=there)
-            tl.store(to + ROWS, ahead / GAP_UNIT, mask=there)
-            tl.store(to + 2 * ROWS, _fade(tl.minimum(now, ahead), FULL_CONTACT, NO_CONTACT), mask=there)
-            tl.store(to + 3 * ROWS, gap, mask=there)
-            tl.store(to + 4 * ROWS, tl.load(spacing + j * n + other, mask=there, other=0.0) / GAP_UNIT, mask=there)
-            tl.store(to + 5 * ROWS, extent + zero, mask=there)
-            tl.store(to + 6 * ROWS, tl.log(tl.load(size + j)) + zero, mask=there)
+            tl.store(to, now / GAP_UNIT, mask=listed)
+            tl.store(to + ROWS, ahead / GAP_UNIT, mask=listed)
+            tl.store(to + 2 * ROWS, _fade(tl.minimum(now, ahead), FULL_CONTACT, NO_CONTACT), mask=listed)
+            tl.store(to + 3 * ROWS, gap, mask=listed)
+            tl.store(to + 4 * ROWS, tl.load(spacing + j * n + other, mask=listed, other=0.0) / GAP_UNIT, mask=listed)
+            tl.store(to + 5 * ROWS, extent + zero, mask=listed)
+            tl.store(to + 6 * ROWS, tl.log(tl.load(size + j)) + zero, mask=listed)
         else:
-            room = box + 6 * i
-            now, inward = nearest_wall(x, room)
+            bounds = box + 6 * i
+            now, inward = nearest_wall(x, bounds)
             if k == m:
-                now, inward = x[2] - tl.load(room + 2), (zero, zero, zero + 1)
+                now, inward = x[2] - tl.load(bounds + 2), (zero, zero, zero + 1)
             ahead = now + FRAME * dot(speed, inward)
-            a, b = solve_symmetric(one, speed, inward)
-            store3(to, MAX_VECTORS * ROWS, inward, there)
-            store3(to + ROWS, MAX_VECTORS * ROWS, normal, there)
-            store3(to + 2 * ROWS, MAX_VECTORS * ROWS, speed, there)
-            store3(to + 3 * ROWS, MAX_VECTORS * ROWS, scale3(1 / ARM_UNIT, arm), there)
-            store3(to + 4 * ROWS, MAX_VECTORS * ROWS, add(v, (zero, zero, zero)), there)
-            store3(to + 5 * ROWS, MAX_VECTORS * ROWS, gravity_term, there)
-            store3(to + 6 * ROWS, MAX_VECTORS * ROWS, a, there)
-            store3(to + 7 * ROWS, MAX_VECTORS * ROWS, b, there)
+            a, b = solve_symmetric(own_response, speed, inward)
+            store3(to, MAX_VECTORS * ROWS, inward, listed)
+            store3(to + ROWS, MAX_VECTORS * ROWS, normal, listed)
+            store3(to + 2 * ROWS, MAX_VECTORS * ROWS, speed, listed)
+            store3(to + 3 * ROWS, MAX_VECTORS * ROWS, scale3(1 / ARM_UNIT, arm), listed)
+            store3(to + 4 * ROWS, MAX_VECTORS * ROWS, add(v, (zero, zero, zero)), listed)
+            store3(to + 5 * ROWS, MAX_VECTORS * ROWS, gravity_term, listed)
+            store3(to + 6 * ROWS, MAX_VECTORS * ROWS, a, listed)
+            store3(to + 7 * ROWS, MAX_VECTORS * ROWS, b, listed)
             to += FIRST_SCALAR * ROWS
-            tl.store(to, tl.minimum(tl.maximum(now / GAP_UNIT, -2.0), 2.0), mask=there)
-            tl.store(to + ROWS, tl.minimum(tl.maximum(ahead / GAP_UNIT, -2.0), 2.0), mask=there)
-            tl.store(to + 2 * ROWS, _fade(tl.minimum(now, ahead), FULL_CONTACT, NO_CONTACT), mask=there)
-            tl.store(to + 3 * ROWS, gap, mask=there)
-            tl.store(to + 4 * ROWS, extent + zero, mask=there)
+            tl.store(to, tl.minimum(tl.maximum(now / GAP_UNIT, -2.0), 2.0), mask=listed)
+            tl.store(to + ROWS, tl.minimum(tl.maximum(ahead / GAP_UNIT, -2.0), 2.0), mask=listed)
+            tl.store(to + 2 * ROWS, _fade(tl.minimum(now, ahead), FULL_CONTACT, NO_CONTACT), mask=listed)
+            tl.store(to + 3 * ROWS, gap, mask=listed)
+            tl.store(to + 4 * ROWS, extent + zero, mask=listed)

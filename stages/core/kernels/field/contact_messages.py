@@ -32,14 +32,19 @@ def project_embeddings(
     first layer of the deformation network."""
     i, k, m = tl.program_id(0), tl.program_id(1), o - 1
     h = tl.arange(0, H)
-    mine = tl.load(embedding + i * H + h)
+    own_embedding = tl.load(embedding + i * H + h)
     if k < m:
-        their = tl.load(embedding + other_object(i, k, o) * H + h)
-        y = matvec(own, mine, 0, H, H) + tl.load(own_b + h) + matvec(other, their, 0, H, H) + tl.load(other_b + h)
+        other_embedding = tl.load(embedding + other_object(i, k, o) * H + h)
+        y = (
+            matvec(own, own_embedding, 0, H, H)
+            + tl.load(own_b + h)
+            + matvec(other, other_embedding, 0, H, H)
+            + tl.load(other_b + h)
+        )
     elif k < m + 2:
-        y = matvec(plane, mine, 0, H, H) + tl.load(plane_b + h)
+        y = matvec(plane, own_embedding, 0, H, H) + tl.load(plane_b + h)
     else:
-        y = matvec(stress, mine, 0, H, H) + tl.load(stress_b + h)
+        y = matvec(stress, own_embedding, 0, H, H) + tl.load(stress_b + h)
     tl.store(prior + (i * (o + 2) + k) * H + h, y)
 
 
@@ -56,8 +61,9 @@ def _encode(
     attention = tl.sum(y * tl.load(net[4] + H * H + h)[None, :], 1) + tl.load(net[5] + H)
     y = linear_layer(y, net[4], net[5], H, H, H, PRECISION)
     attention = tl.exp(8 * tl.sigmoid(attention / 2) - 4)  # exp(4 tanh(attention / 4))
-    gate, share = tl.load(record + GATE * ROWS + r, mask=there, other=0.0), tl.load(record + MASS_FRACTION * ROWS + r)
-    w = tl.where(there, gate * share * attention, 0.0)
+    gate = tl.load(record + GATE * ROWS + r, mask=there, other=0.0)
+    mass_fraction = tl.load(record + MASS_FRACTION * ROWS + r)
+    w = tl.where(there, gate * mass_fraction * attention, 0.0)
     tl.store(message + r[:, None] * H + h[None, :], y)
     tl.store(weight + r, w)
     tl.store(message_sum + h, tl.sum(tl.where(there[:, None], w[:, None] * y, 0.0), 0))
@@ -72,14 +78,14 @@ def encode_messages(
     """Message and weight of each contact point; weighted sums over each block."""
     i, m, slot = tl.program_id(0), o - 1, tl.program_id(1) * ROWS
     k, start = contact_list(slot, m, n, wide, narrow, slots)
-    there = slot - start + tl.arange(0, ROWS) < tl.load(count + i * (o + 1) + k)
+    listed = slot - start + tl.arange(0, ROWS) < tl.load(count + i * (o + 1) + k)
     at, block = i * slots + slot, i * (slots // ROWS) + tl.program_id(1)
     if slot - start < tl.load(count + i * (o + 1) + k):
         if k < m:
-            _encode(record + at * COLUMNS, there, pairs, prior + (i * (o + 2) + k) * H, message + at * H, weight + at,
+            _encode(record + at * COLUMNS, listed, pairs, prior + (i * (o + 2) + k) * H, message + at * H, weight + at,
                     message_sum + block * H, total + block, 10, 7, ROWS, H, PRECISION)  # fmt: skip
         else:
-            _encode(record + at * COLUMNS, there, planes, prior + (i * (o + 2) + k) * H, message + at * H, weight + at,
+            _encode(record + at * COLUMNS, listed, planes, prior + (i * (o + 2) + k) * H, message + at * H, weight + at,
                     message_sum + block * H, total + block, 8, 5, ROWS, H, PRECISION)  # fmt: skip
     else:
         h = tl.arange(0, H)
@@ -100,16 +106,16 @@ def aggregate_messages(
     for k in range(o + 1):
         start = tl.where(k > m, slots - narrow, k * wide)
         end = tl.where(k > m, slots, tl.where(k < m, start + wide, slots - narrow))
-        first, some = (i * slots + start) // ROWS, block < (end - start) // ROWS
-        messages = tl.load(message_sum + (first + block)[:, None] * H + h[None, :], mask=some[:, None], other=0.0)
-        total_weight = tl.sum(tl.load(total + first + block, mask=some, other=0.0))
-        one = 1 / (total_weight + CONTACT_SATURATION)
-        x = one * tl.sum(messages, 0)
+        first, mask = (i * slots + start) // ROWS, block < (end - start) // ROWS
+        messages = tl.load(message_sum + (first + block)[:, None] * H + h[None, :], mask=mask[:, None], other=0.0)
+        total_weight = tl.sum(tl.load(total + first + block, mask=mask, other=0.0))
+        normaliser = 1 / (total_weight + CONTACT_SATURATION)
+        x = normaliser * tl.sum(messages, 0)
         tl.store(mean_message + (i * (o + 1) + k) * H + h, x)
-        tl.store(scale + i * (o + 1) + k, one)
+        tl.store(scale + i * (o + 1) + k, normaliser)
         others += tl.where(k < m, x, 0.0)
         planes += tl.where(k < m, 0.0, x)
-        supported += tl.where(k == m, total_weight * one, 0.0)
+        supported += tl.where(k == m, total_weight * normaliser, 0.0)
     y = matvec(net[0], tl.load(embedding + i * H + h), 0, 3 * H, H) + matvec(net[0], others, H, 3 * H, H)
     y = silu(y + matvec(net[0], planes, 2 * H, 3 * H, H) + tl.load(net[1] + h))
     y = matvec(net[2], y, 0, H, H) + tl.load(net[3] + h)
@@ -167,30 +173,30 @@ def decode_forces(
     k, start = contact_list(slot, m, n, wide, narrow, slots)
     row, to = i * (o + 1) + k, parts + (i * (slots // ROWS) + tl.program_id(1)) * WRENCH_SIZE
     r = tl.arange(0, ROWS)
-    there = slot - start + r < tl.load(count + row)
+    listed = slot - start + r < tl.load(count + row)
     if slot - start < tl.load(count + row):
         at = i * slots + slot
-        w = tl.load(weight + at + r, mask=there, other=0.0) * tl.load(scale + row)
+        w = tl.load(weight + at + r, mask=listed, other=0.0) * tl.load(scale + row)
         features = record + at * COLUMNS
         if k < m:
-            a = _decode(features, there, pairs, context + row * H, message + at * H, w, 10, ACCELERATION_UNIT, ROWS, H,
+            a = _decode(features, listed, pairs, context + row * H, message + at * H, w, 10, ACCELERATION_UNIT, ROWS, H,
                         PRECISION)  # fmt: skip
-            offset = load3(features + r, MAX_VECTORS * ROWS, there)
-            arm = load3(features + 4 * ROWS + r, MAX_VECTORS * ROWS, there)
+            offset = load3(features + r, MAX_VECTORS * ROWS, listed)
+            arm = load3(features + 4 * ROWS + r, MAX_VECTORS * ROWS, listed)
             arm = sub(scale3(ARM_UNIT, arm), scale3(GAP_UNIT / 2, offset))  # to the midpoint of the two points
         else:
-            a = _decode(features, there, planes, context + row * H, message + at * H, w, 8, ACCELERATION_UNIT, ROWS, H,
+            a = _decode(features, listed, planes, context + row * H, message + at * H, w, 8, ACCELERATION_UNIT, ROWS, H,
                         PRECISION)  # fmt: skip
-            inward = load3(features + r, MAX_VECTORS * ROWS, there)
-            arm = scale3(ARM_UNIT, load3(features + 3 * ROWS + r, MAX_VECTORS * ROWS, there))
-            separation_speed = dot(load3(features + 2 * ROWS + r, MAX_VECTORS * ROWS, there), inward)
+            inward = load3(features + r, MAX_VECTORS * ROWS, listed)
+            arm = scale3(ARM_UNIT, load3(features + 3 * ROWS + r, MAX_VECTORS * ROWS, listed))
+            separation_speed = dot(load3(features + 2 * ROWS + r, MAX_VECTORS * ROWS, listed), inward)
             along, unit = dot(a, inward), tl.maximum(w, 1e-9)
             x = along / unit
             push = unit * (tl.maximum(x, 0.0) + tl.log(1 + tl.exp(-tl.abs(x))))  # softplus: floor and walls only push
             push = push / (1 + tl.maximum(separation_speed, 0.0) / SEPARATION_SPEED)
             a = add(a, scale3(push - along, inward))
-        mine = tl.load(point + at + r, mask=there, other=0)
-        store3(acceleration + row * 3 * n + mine, n, a, there)
+        own = tl.load(point + at + r, mask=listed, other=0)
+        store3(acceleration + row * 3 * n + own, n, a, listed)
         F, T = sum3(a), sum3(cross(arm, a))
         write3(to, F)
         write3(to + 3, T)

@@ -1,6 +1,6 @@
 """Deformation network at blocks of points: features of the displacements, and internal accelerations from them.
 
-Reference: `stages.core.models.field.deformation`. Written in Triton (first_layer `compilers`).
+Reference: `stages.core.models.field.deformation`. Written in Triton (see `compilers`).
 """
 
 import triton

@@ -46,11 +46,11 @@ def invariant_layer(record, r, w, b, ROWS: tl.constexpr, VECTORS: tl.constexpr, 
         for v in tl.static_range(1, VECTORS):
             i += (c >= v * VECTORS - v * (v - 1) // 2).to(tl.int32)
         j = c - i * VECTORS + i * (i - 1) // 2 + i
-        some = (c < PRODUCTS)[None, :]
+        mask = (c < PRODUCTS)[None, :]
         p = tl.zeros([ROWS, 32], tl.float32)
         for axis in tl.static_range(3):
             at = record + axis * MAX_VECTORS * ROWS + r[:, None]
-            p += tl.load(at + i[None, :] * ROWS, mask=some, other=0.0) * tl.load(at + j[None, :] * ROWS, mask=some,
+            p += tl.load(at + i[None, :] * ROWS, mask=mask, other=0.0) * tl.load(at + j[None, :] * ROWS, mask=mask,
                                                                                  other=0.0)  # fmt: skip
         size = tl.log(tl.abs(p) + tl.sqrt(p * p + 1))  # asinh(|p|)
         p = tl.where(p < 0, -size, size)
@@ -68,7 +68,7 @@ def invariant_layer(record, r, w, b, ROWS: tl.constexpr, VECTORS: tl.constexpr, 
 def weighted_vectors(record, r, there, weights, ROWS: tl.constexpr, VECTORS: tl.constexpr):
     """Weighted sum of the first VECTORS vectors of each row, with `weights` (ROWS, PADDED_VECTORS)."""
     v = tl.arange(0, PADDED_VECTORS)
-    at, some = record + v[None, :] * ROWS + r[:, None], (v < VECTORS)[None, :] & there[:, None]
-    return (tl.sum(weights * tl.load(at, mask=some, other=0.0), 1),
-            tl.sum(weights * tl.load(at + MAX_VECTORS * ROWS, mask=some, other=0.0), 1),
-            tl.sum(weights * tl.load(at + 2 * MAX_VECTORS * ROWS, mask=some, other=0.0), 1))  # fmt: skip
+    at, mask = record + v[None, :] * ROWS + r[:, None], (v < VECTORS)[None, :] & there[:, None]
+    return (tl.sum(weights * tl.load(at, mask=mask, other=0.0), 1),
+            tl.sum(weights * tl.load(at + MAX_VECTORS * ROWS, mask=mask, other=0.0), 1),
+            tl.sum(weights * tl.load(at + 2 * MAX_VECTORS * ROWS, mask=mask, other=0.0), 1))  # fmt: skip

@@ -18,29 +18,29 @@ def _nearest_kernel(points, low, high, distance, index, radius, o, n, BLOCK: tl.
     i, j = pair // o, (pair // (o * o)) * o + pair % o  # rows of objects of the same scene
     r = block * BLOCK + tl.arange(0, BLOCK)
     p = points + 3 * i * n + r
-    far = float("inf")
-    x, y, z = (tl.load(p, mask=r < n, other=far), tl.load(p + n, mask=r < n, other=far),
-               tl.load(p + 2 * n, mask=r < n, other=far))  # fmt: skip
+    infinity = float("inf")
+    x, y, z = (tl.load(p, mask=r < n, other=infinity), tl.load(p + n, mask=r < n, other=infinity),
+               tl.load(p + 2 * n, mask=r < n, other=infinity))  # fmt: skip
     near = (i != j) & (x > tl.load(low + 3 * j) - radius) & (x < tl.load(high + 3 * j) + radius)
     near &= (y > tl.load(low + 3 * j + 1) - radius) & (y < tl.load(high + 3 * j + 1) + radius)
     near &= (z > tl.load(low + 3 * j + 2) - radius) & (z < tl.load(high + 3 * j + 2) + radius)
     column = tl.arange(0, CHUNK)
-    smallest = tl.full([BLOCK, CHUNK], far, tl.float32)
+    smallest = tl.full([BLOCK, CHUNK], infinity, tl.float32)
     which = tl.zeros([BLOCK, CHUNK], tl.int32)
     if tl.sum(near.to(tl.int32)) > 0:
         for first in range(0, n, CHUNK):
             s = first + column
             q = points + 3 * j * n + s
-            dx = x[:, None] - tl.load(q, mask=s < n, other=far)[None, :]
-            dy = y[:, None] - tl.load(q + n, mask=s < n, other=far)[None, :]
-            dz = z[:, None] - tl.load(q + 2 * n, mask=s < n, other=far)[None, :]
+            dx = x[:, None] - tl.load(q, mask=s < n, other=infinity)[None, :]
+            dy = y[:, None] - tl.load(q + n, mask=s < n, other=infinity)[None, :]
+            dz = z[:, None] - tl.load(q + 2 * n, mask=s < n, other=infinity)[None, :]
             squared = dx * dx + dy * dy + dz * dz
             nearer = squared < smallest
             smallest = tl.where(nearer, squared, smallest)
             which = tl.where(nearer, first, which)
     best = tl.min(smallest, 1)
     which = tl.min(tl.where(smallest == best[:, None], which + column[None, :], n), 1)
-    best = tl.where(near & (best < radius * radius), tl.sqrt(best), far)
+    best = tl.where(near & (best < radius * radius), tl.sqrt(best), infinity)
     tl.store(distance + pair * n + r, best, mask=r < n)
     tl.store(index + pair * n + r, tl.minimum(which, n - 1).to(tl.int64), mask=r < n)
 
@@ -77,5 +77,5 @@ def nearest_between_objects_reference(points: Tensor, valid: Tensor, radius: flo
     """`nearest_between_objects` from the full distance matrix, in any precision."""
     distance = (points[:, :, None, :, None] - points[:, None, :, None]).norm(dim=-1)
     distance, index = distance.masked_fill(~valid[:, None, :, None], torch.inf).min(-1)
-    own = torch.eye(points.shape[1], dtype=torch.bool, device=points.device)[:, :, None]
-    return distance.masked_fill(own | ~valid[:, :, None] | (distance >= radius), torch.inf), index
+    is_self = torch.eye(points.shape[1], dtype=torch.bool, device=points.device)[:, :, None]
+    return distance.masked_fill(is_self | ~valid[:, :, None] | (distance >= radius), torch.inf), index

@@ -35,8 +35,8 @@ def _neighbourhood_weights(arm, valid, mass_fraction, radii, out, n, scales, ROW
     total = tl.zeros([ROWS, CHUNK], tl.float32)
     for first in range(0, n, CHUNK):
         total += _weights(arm, mass_fraction, x, slope, first + column, n)
-    there = tl.load(valid + r, mask=r < n, other=0) != 0
-    unit = tl.where(there, 1 / tl.maximum(tl.sum(total, 1), 1e-12), 0.0)
+    is_valid = tl.load(valid + r, mask=r < n, other=0) != 0
+    unit = tl.where(is_valid, 1 / tl.maximum(tl.sum(total, 1), 1e-12), 0.0)
     for first in range(0, n, CHUNK):
         s = first + column
         weight = _weights(arm, mass_fraction, x, slope, s, n) * unit[:, None]

@@ -55,16 +55,16 @@ def _normals(points: wp.array2d[Any], valid: wp.array2d[wp.bool], sweeps: int,
     if not valid[o, i]:
         return
     x = points[o, i]
-    near, index = wp.vector(x.dtype(wp.inf), length=NORMAL_NEIGHBOURS), Indices(-1)
+    nearest, index = wp.vector(x.dtype(wp.inf), length=NORMAL_NEIGHBOURS), Indices(-1)
     for j in range(points.shape[1]):
         d = wp.length_sq(points[o, j] - x)
-        if d < near[NORMAL_NEIGHBOURS - 1] and valid[o, j]:
+        if d < nearest[NORMAL_NEIGHBOURS - 1] and valid[o, j]:
             which = wp.int32(j)
             for k in range(NORMAL_NEIGHBOURS):  # insertion into the sorted list
-                if d < near[k]:
-                    next_d = near[k]
+                if d < nearest[k]:
+                    next_d = nearest[k]
                     next_index = index[k]
-                    near[k] = d
+                    nearest[k] = d
                     index[k] = which
                     d = next_d
                     which = next_index
@@ -80,14 +80,14 @@ def _normals(points: wp.array2d[Any], valid: wp.array2d[wp.bool], sweeps: int,
             arm = wp.vec3d(points[o, index[k]] - x) - mean
             spread += wp.outer(arm, arm)
     extent, axes = _eigen(spread, sweeps)
-    least = wp.int32(wp.argmin(extent))
-    normal[o, i] = wp.vec3d(axes[0, least], axes[1, least], axes[2, least])
-    total, others = wp.float64(0.0), wp.float64(0.0)
+    smallest = wp.int32(wp.argmin(extent))
+    normal[o, i] = wp.vec3d(axes[0, smallest], axes[1, smallest], axes[2, smallest])
+    total, neighbours = wp.float64(0.0), wp.float64(0.0)
     for k in range(1, SPACING_NEIGHBOURS):
         if index[k] >= 0:
-            total += wp.sqrt(wp.float64(near[k]))
-            others += wp.float64(1.0)
-    spacing[o, i] = total / wp.max(others, wp.float64(1.0))
+            total += wp.sqrt(wp.float64(nearest[k]))
+            neighbours += wp.float64(1.0)
+    spacing[o, i] = total / wp.max(neighbours, wp.float64(1.0))
 
 
 for _vector in (wp.vec3, wp.vec3d):  # both at once: a later overload would recompile the module
@@ -114,12 +114,12 @@ def normals_and_spacing_reference(points: Tensor, valid: Tensor) -> tuple[Tensor
     """`normals_and_spacing` from the full distance matrix, in any precision."""
     gap = (points[..., :, None, :] - points[..., None, :, :]).norm(dim=-1)
     gap = gap.masked_fill(~(valid[..., :, None] & valid[..., None, :]), torch.inf)
-    near, index = gap.topk(min(NORMAL_NEIGHBOURS, gap.shape[-1]), largest=False)
-    there, next_ = near.isfinite().to(points)[..., None], near[..., 1:SPACING_NEIGHBOURS]
+    distances, index = gap.topk(min(NORMAL_NEIGHBOURS, gap.shape[-1]), largest=False)
+    found, next_ = distances.isfinite().to(points)[..., None], distances[..., 1:SPACING_NEIGHBOURS]
     rows = index[..., None].expand(*index.shape, 3)
     cloud = torch.gather(points[:, :, None].expand(*index.shape[:3], *points.shape[2:]), 3, rows)
-    mean = (there * cloud).sum(-2, keepdim=True) / there.sum(-2, keepdim=True).clamp_min(1)
-    cloud = there * (cloud - mean)
+    mean = (found * cloud).sum(-2, keepdim=True) / found.sum(-2, keepdim=True).clamp_min(1)
+    cloud = found * (cloud - mean)
     normal = torch.linalg.eigh(cloud.mT @ cloud).eigenvectors[..., 0]
     spacing = next_.masked_fill(~next_.isfinite(), 0).sum(-1) / next_.isfinite().sum(-1).clamp_min(1)
     return normal * valid[..., None], spacing
@@ -131,8 +131,8 @@ def _invert_spd(matrix: wp.array[wp.mat33d], sweeps: int, inverse: wp.array[wp.m
     extent, axes = _eigen(matrix[i], sweeps)
     d = wp.cw_div(wp.vec3d(wp.float64(1.0)), extent)
     inverse[i] = axes * wp.diag(d) * wp.transpose(axes)
-    least, most = wp.min(d), wp.max(d)
-    values[i] = wp.vec3d(least, d[0] + d[1] + d[2] - least - most, most)
+    minimum, maximum = wp.min(d), wp.max(d)
+    values[i] = wp.vec3d(minimum, d[0] + d[1] + d[2] - minimum - maximum, maximum)
 
 
 def invert_spd(matrix: Tensor) -> tuple[Tensor, Tensor]:

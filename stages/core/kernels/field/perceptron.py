@@ -44,12 +44,12 @@ def _perceptron(
     H: tl.constexpr, M: tl.constexpr, O: tl.constexpr,
 ):  # fmt: skip
     r = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    there = r < rows
+    in_range = r < rows
     o, h = tl.arange(0, O), tl.arange(0, H)
-    to, store = out + r[:, None] * OUTER + o[None, :], there[:, None] & (o[None, :] < OUTER)
+    to, store = out + r[:, None] * OUTER + o[None, :], in_range[:, None] & (o[None, :] < OUTER)
     needed = BLOCK
     if NEAR:
-        needed = tl.sum(tl.load(near + r, mask=there, other=0).to(tl.int32))
+        needed = tl.sum(tl.load(near + r, mask=in_range, other=0).to(tl.int32))
     if needed == 0:
         tl.store(to, tl.zeros([BLOCK, O], tl.float32), mask=store)
     else:
@@ -58,9 +58,9 @@ def _perceptron(
         y = tl.zeros([BLOCK, H], tl.float32)
         if VECTORS:
             for i in range(VECTORS):  # not unrolled, to limit register use
-                ax, ay, az = _component(vectors, r, there, i, VECTORS)
+                ax, ay, az = _component(vectors, r, in_range, i, VECTORS)
                 for j in range(i, VECTORS):
-                    bx, by, bz = _component(vectors, r, there, j, VECTORS)
+                    bx, by, bz = _component(vectors, r, in_range, j, VECTORS)
                     p = ax * bx + ay * by + az * bz
                     size = tl.log(tl.abs(p) + tl.sqrt(p * p + 1))  # asinh(|p|)
                     value = tl.where(p < 0, -size, size)
@@ -68,7 +68,7 @@ def _perceptron(
                     y += value[:, None] * tl.load(w0 + h * INNER + column, mask=h < HIDDEN, other=0.0)[None, :]
         for first in range(0, COLUMNS, K):
             k = first + tl.arange(0, K)
-            inside = there[:, None] & (k[None, :] < COLUMNS)
+            inside = in_range[:, None] & (k[None, :] < COLUMNS)
             part = tl.load(x + r[:, None] * COLUMNS + k[None, :], mask=inside, other=0.0)
             if ACTIVE:
                 if KNOWN:
@@ -79,7 +79,7 @@ def _perceptron(
             y += tl.dot(part, W, input_precision=PRECISION)
         y += tl.load(b0 + h, mask=h < HIDDEN, other=0.0)[None, :]
         if KNOWN and not ACTIVE:
-            wide = there[:, None] & (h[None, :] < HIDDEN)
+            wide = in_range[:, None] & (h[None, :] < HIDDEN)
             y += tl.load(known + (r // each)[:, None] * HIDDEN + h[None, :], mask=wide, other=0.0)
         if DEEP:
             y = _layer(y, w1, b1, HIDDEN, MIDDLE, H, M, PRECISION)
@@ -91,7 +91,7 @@ def _perceptron(
 
 @torch.library.custom_op("ngff::perceptron", mutates_args=())
 def _fused(
-    x: Tensor, vectors: Optional[Tensor], known: Optional[Tensor], near: Optional[Tensor], active: bool,  # noqa: UP045
+    x: Tensor, vectors: Optional[Tensor], offset: Optional[Tensor], needed: Optional[Tensor], active: bool,  # noqa: UP045
     weights: Sequence[Tensor], biases: Sequence[Tensor],
 ) -> Tensor:  # fmt: skip
     rows, widths = len(x), [w.shape[0] for w in weights]
@@ -104,40 +104,40 @@ def _fused(
     block = 32 if rows <= SMALL_BLOCK_ROWS else 64
     layers = [t for pair in zip(weights, biases, strict=True) for t in pair]
     _perceptron[(triton.cdiv(rows, block),)](
-        x, vectors, known, near, *layers[:4], *layers[-2:], out, rows, 1 if known is None else rows // len(known),
-        0 if vectors is None else vectors.shape[1], columns, widths[0], widths[-2], widths[-1], known is not None,
-        near is not None, active, len(weights) == 3, precision, block, K, H, M, O,
+        x, vectors, offset, needed, *layers[:4], *layers[-2:], out, rows, 1 if offset is None else rows // len(offset),
+        0 if vectors is None else vectors.shape[1], columns, widths[0], widths[-2], widths[-1], offset is not None,
+        needed is not None, active, len(weights) == 3, precision, block, K, H, M, O,
     )  # fmt: skip
     return out
 
 
 @_fused.register_fake
-def _(x, vectors, known, near, active, weights, biases):
+def _(x, vectors, offset, needed, active, weights, biases):
     return x.new_empty(len(x), weights[-1].shape[0])
 
 
 def perceptron(
     x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor], vectors: Tensor | None = None,
-    known: Tensor | None = None, near: Tensor | None = None, active: bool = False,
+    offset: Tensor | None = None, needed: Tensor | None = None, active: bool = False,
 ) -> Tensor:  # fmt: skip
     """Apply two or three linear layers with SiLU between them, in single precision, without gradients.
 
     The input of the first layer is the asinh of all dot products of `vectors` (r, v, 3), then the columns of `x`
-    (r, i). Rows come in g groups of equal size; the group's row of `known` (g, _) is added to the first layer's output
-    or, if `active`, to `x`, which is then activated as well. `near` (r) masks the rows that are needed: others may be
-    0 in the result. With torch.set_float32_matmul_precision("high") products are rounded to TF32.
+    (r, i). Rows come in g groups of equal size; the group's row of `offset` (g, _) is added to the first layer's output
+    or, if `active`, to `x`, which is then activated as well. `needed` (r) masks the rows whose result is used: others
+    may be 0. With torch.set_float32_matmul_precision("high") products are rounded to TF32.
     """
-    x, vectors, known, near = (t if t is None else t.contiguous() for t in (x, vectors, known, near))
-    return _fused(x, vectors, known, near, active, list(weights), list(biases))
+    x, vectors, offset, needed = (t if t is None else t.contiguous() for t in (x, vectors, offset, needed))
+    return _fused(x, vectors, offset, needed, active, list(weights), list(biases))
 
 
-def perceptron_reference(x, weights, biases, vectors=None, known=None, near=None, active: bool = False) -> Tensor:
+def perceptron_reference(x, weights, biases, vectors=None, offset=None, needed=None, active: bool = False) -> Tensor:
     """`perceptron` layer by layer, in any precision, for all rows."""
     if vectors is not None:
         i, j = torch.triu_indices(vectors.shape[1], vectors.shape[1], device=x.device)
         x = torch.cat([torch.asinh((vectors @ vectors.mT)[:, i, j]), x], -1)
-    known = 0.0 if known is None else known.repeat_interleave(len(x) // len(known), 0)
-    y = linear(silu(x + known), weights[0], biases[0]) if active else linear(x, weights[0], biases[0]) + known
+    offset = 0.0 if offset is None else offset.repeat_interleave(len(x) // len(offset), 0)
+    y = linear(silu(x + offset), weights[0], biases[0]) if active else linear(x, weights[0], biases[0]) + offset
     for w, b in zip(weights[1:], biases[1:], strict=True):
         y = linear(silu(y), w, b)
     return y

@@ -23,9 +23,9 @@ def _skinny_matmul(A, high, low, out, n, k, c, ROWS: tl.constexpr, CHUNK: tl.con
         s = first + tl.arange(0, CHUNK)
         a = tl.load(A + matrix * n * k + r[:, None] * k + s[None, :], mask=(r[:, None] < n) & (s[None, :] < k),
                     other=0.0)  # fmt: skip
-        at, some = matrix * k * c + s[:, None] + col[None, :] * k, (s[:, None] < k) & (col[None, :] < c)
-        total = tl.dot(a, tl.load(high + at, mask=some, other=0.0), total)
-        total = tl.dot(a, tl.load(low + at, mask=some, other=0.0), total)
+        at, mask = matrix * k * c + s[:, None] + col[None, :] * k, (s[:, None] < k) & (col[None, :] < c)
+        total = tl.dot(a, tl.load(high + at, mask=mask, other=0.0), total)
+        total = tl.dot(a, tl.load(low + at, mask=mask, other=0.0), total)
     tl.store(out + matrix * n * c + r[:, None] + col[None, :] * n, total, mask=(r[:, None] < n) & (col[None, :] < c))
 
 

@@ -53,8 +53,8 @@ from stages.core.kernels.field.vec3 import (
 def _total(parts, blocks, BLOCKS: tl.constexpr):
     """Sum of force and torque over consecutive blocks of contact points."""
     k = tl.arange(0, BLOCKS)
-    at, some = parts + k * WRENCH_SIZE, k < blocks
-    return sum3(load3(at, 1, some)), sum3(load3(at + 3, 1, some))
+    at, mask = parts + k * WRENCH_SIZE, k < blocks
+    return sum3(load3(at, 1, mask)), sum3(load3(at + 3, 1, mask))
 
 
 @triton.jit
@@ -62,15 +62,15 @@ def _contact(
     i, body, parts, accelerations, mass, pinned, o, n, places, wide, BLOCK: tl.constexpr, BLOCKS: tl.constexpr,
 ):  # fmt: skip
     """Force, torque and accelerations of the points of an object, per unit of mass, summed over its contacts."""
-    first, mine, m, kinds = i - i % o, i % o, o - 1, o + 1
+    first, index, m, kinds = i - i % o, i % o, o - 1, o + 1
     c = read3(body + BODY_SIZE * i + COM)
     mass_i, free = tl.maximum(tl.load(mass + i), 1e-6), 1 - tl.load(pinned + i).to(tl.float32)
     r = tl.arange(0, BLOCK)
     zero = tl.zeros([BLOCK], tl.float32)
     acceleration, force, torque = (zero, zero, zero), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
     for k in range(m):
-        j = first + k + (k >= mine)
-        index_in_j = mine - (mine > j - first)  # index of i among the other objects of j
+        j = first + k + (k >= index)
+        index_in_j = index - (index > j - first)  # index of i among the other objects of j
         mass_j, free_j = tl.maximum(tl.load(mass + j), 1e-6), 1 - tl.load(pinned + j).to(tl.float32)
         reduced = 1 / tl.maximum(free / mass_i + free_j / mass_j, 1e-9)
         F, T = _total(parts + (i * places + k * wide) * WRENCH_SIZE, wide, BLOCKS)
@@ -116,11 +116,12 @@ def update_velocities(
         mass_i = tl.maximum(tl.load(mass + i), 1e-6)
         force = add(force, scale3(1 / mass_i, read3(external_force + 3 * i)))
         torque = add(torque, scale3(1 / mass_i, read3(external_torque + 3 * i)))
-    now = body + BODY_SIZE * i
-    past_v, past_spin = read3(now + VELOCITY), matvec3(read9(now + INVERSE_INERTIA), read3(now + MOMENTUM))
-    L = add(read3(now + MOMENTUM), scale3(dt, torque))
+    own_body = body + BODY_SIZE * i
+    past_v = read3(own_body + VELOCITY)
+    past_spin = matvec3(read9(own_body + INVERSE_INERTIA), read3(own_body + MOMENTUM))
+    L = add(read3(own_body + MOMENTUM), scale3(dt, torque))
     v = add(past_v, scale3(dt, force))
-    spin = matvec3(read9(now + INVERSE_INERTIA), L)
+    spin = matvec3(read9(own_body + INVERSE_INERTIA), L)
     spin_limit = MAX_SPIN / tl.maximum(tl.sqrt(dot(spin, spin)), MAX_SPIN)
     L, spin = scale3(spin_limit, L), scale3(spin_limit, spin)
     v = scale3(MAX_SPEED / tl.maximum(tl.sqrt(dot(v, v)), MAX_SPEED), v)
@@ -132,35 +133,39 @@ def update_velocities(
     past_v, past_spin = add(past_v, v), add(past_spin, spin)
     moving = (dot(past_v, past_v) + extent * extent * dot(past_spin, past_spin)) / 4 + last * last
     drag = dt / FRAME * friction_speed * friction_speed * friction_speed * friction_speed
-    kept = (moving * moving + 1e-16) / (moving * moving + 1e-16 + drag)
-    v, L, spin = scale3(kept, v), scale3(kept, L), scale3(kept, spin)
+    factor = (moving * moving + 1e-16) / (moving * moving + 1e-16 + drag)
+    v, L, spin = scale3(factor, v), scale3(factor, L), scale3(factor, spin)
 
     r = tl.arange(0, BLOCK)
     inside = r < n
     valid_points = tl.load(valid + i * n + r, mask=inside, other=0) != 0
     at_point = moved + POINT_SIZE * i * n + r
     x = add(load3(at_point + POINT * n, n, inside), scale3(dt / 2, cross(spin, load3(at_point + ARM * n, n, inside))))
-    far: tl.constexpr = float("inf")
-    room = box + 6 * i
+    infinity: tl.constexpr = float("inf")
+    bounds = box + 6 * i
     slack = (MAX_PENETRATION, MAX_PENETRATION, MAX_PENETRATION)
-    deepest = max3(where3(valid_points, scale3(-1.0, x), -far))  # positions of the lowest points, negated [m]
-    up = scale3(2 / dt, sub(add(read3(room), deepest), slack))
-    down = scale3(2 / dt, add(sub(read3(room + 3), max3(where3(valid_points, x, -far))), slack))
+    deepest = max3(where3(valid_points, scale3(-1.0, x), -infinity))  # positions of the lowest points, negated [m]
+    up = scale3(2 / dt, sub(add(read3(bounds), deepest), slack))
+    down = scale3(2 / dt, add(sub(read3(bounds + 3), max3(where3(valid_points, x, -infinity))), slack))
     free = 1 - tl.load(pinned + i).to(tl.float32)
     v = (_guarded(v[0], up[0], down[0], MAX_RECOVERY_SPEED), _guarded(v[1], up[1], down[1], MAX_RECOVERY_SPEED),
          _guarded(v[2], up[2], down[2], MAX_RECOVERY_SPEED))  # fmt: skip
     v = scale3(free, v)
     L = scale3(free, L)
-    c, q = drift(read3(now + COM), read4(now + QUAT), v, L, read9(inverse + 9 * i), dt / 2)
+    c, q = drift(read3(own_body + COM), read4(own_body + QUAT), v, L, read9(inverse + 9 * i), dt / 2)
     write3(com + 3 * i, c)
     write4(quat + 4 * i, q)
     write3(velocity + 3 * i, v)
     write3(momentum + 3 * i, L)
 
     part = tl.load(mass_fraction + i * n + r, mask=inside, other=0.0)
-    one = tl.where(valid_points, 1 / tl.maximum(part, 1e-9), 0.0)
-    acceleration = (one * acceleration[0], one * acceleration[1], one * acceleration[2])
-    acceleration = transposed_matvec3(read9(now + ROTATION), acceleration)
+    inverse_fraction = tl.where(valid_points, 1 / tl.maximum(part, 1e-9), 0.0)
+    acceleration = (
+        inverse_fraction * acceleration[0],
+        inverse_fraction * acceleration[1],
+        inverse_fraction * acceleration[2],
+    )
+    acceleration = transposed_matvec3(read9(own_body + ROTATION), acceleration)
     arms = load3(arm + (i * n + r) * 3, 1, inside)
     at_point = field + FIELD_SIZE * i * n + r
     store3(at_point + VIRIAL * n, n, _spread(acceleration, arms, part, extent), inside)

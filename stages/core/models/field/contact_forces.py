@@ -58,43 +58,43 @@ class ContactNet(nn.Module):
         Weights sum to almost 1 in firm contact and go to 0 with the gates, so that neither the number of keypoints nor
         a point at the cutoff distance matters.
         """
-        known = self.own(own)[:, :, None, None]
+        embedding_term = self.own(own)[:, :, None, None]
         if self.other is not None:
-            known = known + self.other(other)[:, :, :, None]
-        x = _at_contacts(contacts.gate > 0, self._message, contacts.vectors, contacts.scalars, known)
+            embedding_term = embedding_term + self.other(other)[:, :, :, None]
+        x = _at_contacts(contacts.gate > 0, self._message, contacts.vectors, contacts.scalars, embedding_term)
         attention = torch.exp(4 * torch.tanh(x[..., -1] / 4))
         weight = contacts.gate * mass_fraction * attention
         weight = weight / (weight.sum(-1, keepdim=True) + CONTACT_SATURATION)
         return x[..., :-1], weight, (weight[..., None] * x[..., :-1]).sum(-2)
 
-    def _message(self, vectors: Tensor, scalars: Tensor, known: Tensor, near: Tensor | None = None) -> Tensor:
-        return apply_layers(scalars, (self.see, self.hear[0], self.hear[2]), vectors, known, near=near)
+    def _message(self, vectors: Tensor, scalars: Tensor, offset: Tensor, needed: Tensor | None = None) -> Tensor:
+        return apply_layers(scalars, (self.see, self.hear[0], self.hear[2]), vectors, offset, needed=needed)
 
     def decode(
         self, message: Float[Tensor, "b o m n h"], weight: Float[Tensor, "b o m n"], context: Float[Tensor, "b o m h"],
         vectors: Float[Tensor, "b o m n k 3"],
     ) -> Float[Tensor, "b o m n 3"]:  # fmt: skip
         """Acceleration of the object by each contact point, times its weight [m/s^2]."""
-        known = self.tell(context)[:, :, :, None]
-        return _at_contacts(weight > 0, self._force, message, known, vectors, weight[..., None])
+        context_term = self.tell(context)[:, :, :, None]
+        return _at_contacts(weight > 0, self._force, message, context_term, vectors, weight[..., None])
 
     def _force(
-        self, message: Tensor, known: Tensor, vectors: Tensor, weight: Tensor, near: Tensor | None = None
+        self, message: Tensor, offset: Tensor, vectors: Tensor, weight: Tensor, needed: Tensor | None = None
     ) -> Tensor:
-        coefficients = apply_layers(message, (self.say[0], self.say[2]), known=known, active=True, near=near)
+        coefficients = apply_layers(message, (self.say[0], self.say[2]), offset=offset, active=True, needed=needed)
         return weight * ACCELERATION_UNIT * weighted_sum(coefficients, vectors)
 
 
 def _at_contacts(
-    near: Bool[Tensor, "b o m n"], f: Callable[..., Tensor], *inputs: Tensor
+    needed: Bool[Tensor, "b o m n"], f: Callable[..., Tensor], *inputs: Tensor
 ) -> Float[Tensor, "b o m n _"]:
-    """f of the rows of `inputs`, needed only where `near`: a CPU gathers those rows and leaves 0 elsewhere.
+    """f of the rows of `inputs`, computed only where `needed`: a CPU gathers those rows and leaves 0 elsewhere.
 
     A GPU evaluates all rows: gathering would make the host wait for their count.
     """
-    if near.is_cuda or torch.compiler.is_compiling():
-        return f(*inputs, near)
-    rows, n = near.flatten().nonzero()[:, 0], near.shape[-1]
-    flat = [x.expand(*near.shape[:3], *x.shape[3:]).flatten(0, 3) for x in inputs]
-    found = f(*(x[rows if len(x) == near.numel() else rows // n] for x in flat))
-    return found.new_zeros(near.numel(), found.shape[-1]).index_copy(0, rows, found).unflatten(0, near.shape)
+    if needed.is_cuda or torch.compiler.is_compiling():
+        return f(*inputs, needed)
+    rows, n = needed.flatten().nonzero()[:, 0], needed.shape[-1]
+    flat = [x.expand(*needed.shape[:3], *x.shape[3:]).flatten(0, 3) for x in inputs]
+    values = f(*(x[rows if len(x) == needed.numel() else rows // n] for x in flat))
+    return values.new_zeros(needed.numel(), values.shape[-1]).index_copy(0, rows, values).unflatten(0, needed.shape)

@@ -46,12 +46,12 @@ def pair_contacts(shape: RestShape, bodies: BodyKinematics) -> ContactPoints:
     that would stop the relative velocity and that act along the partner's normal.
     """
     w, others = shape.initial, shape.others
-    mine, theirs, distance = _nearest_pairs(shape, bodies)
-    b, o, m, _ = mine.shape
+    own, partner, distance = _nearest_pairs(shape, bodies)
+    b, o, m, _ = own.shape
     state = torch.cat([bodies.points, bodies.point_velocity, bodies.normal, bodies.arm, shape.spacing[..., None]], -1)
-    here = _gather_points(state, mine + w.valid.shape[2] * torch.arange(o, device=mine.device)[:, None, None])
-    there = _gather_points(state, theirs)
-    gap, approach = (here - there)[..., :3], (here - there)[..., 3:6]
+    own_state = _gather_points(state, own + w.valid.shape[2] * torch.arange(o, device=own.device)[:, None, None])
+    partner_state = _gather_points(state, partner)
+    gap, approach = (own_state - partner_state)[..., :3], (own_state - partner_state)[..., 3:6]
     relative = (bodies.velocity[:, :, None] - bodies.velocity[:, others])[:, :, :, None].expand_as(gap)
     gravity = (w.gravity / 5)[:, None, None, None].expand_as(gap)
     now, ahead = smooth_norm(gap), smooth_norm(gap + FRAME * approach)
@@ -60,18 +60,20 @@ def pair_contacts(shape: RestShape, bodies: BodyKinematics) -> ContactPoints:
     )  # fmt: skip
     mass = w.mass.clamp_min(1e-6)
     ratio = (mass[:, others] / (mass[:, :, None] + mass[:, others]))[..., None, None, None]
-    K = ratio * _impulse_response(bodies.inverse[:, :, None, None], here[..., 9:12])
-    K = K + (1 - ratio) * _impulse_response(bodies.inverse[:, others][:, :, :, None], there[..., 9:12])
+    K = ratio * _impulse_response(bodies.inverse[:, :, None, None], own_state[..., 9:12])
+    K = K + (1 - ratio) * _impulse_response(bodies.inverse[:, others][:, :, :, None], partner_state[..., 9:12])
     vectors = torch.stack([
-        gap / GAP_UNIT, here[..., 6:9], there[..., 6:9], approach, here[..., 9:12] / ARM_UNIT,
-        there[..., 9:12] / ARM_UNIT, relative, gravity, *symmetric_solve(K, approach, there[..., 6:9]),
+        gap / GAP_UNIT, own_state[..., 6:9], partner_state[..., 6:9], approach, own_state[..., 9:12] / ARM_UNIT,
+        partner_state[..., 9:12] / ARM_UNIT, relative, gravity, *symmetric_solve(K, approach, partner_state[..., 6:9]),
     ], -2)  # fmt: skip
     sizes = torch.stack([shape.size[:, :, None].expand(b, o, m), shape.size[:, others]], -1).log()
     scalars = torch.cat([
-        torch.stack([now / GAP_UNIT, ahead / GAP_UNIT, gate, here[..., 12] / GAP_UNIT, there[..., 12] / GAP_UNIT], -1),
+        torch.stack([
+            now / GAP_UNIT, ahead / GAP_UNIT, gate, own_state[..., 12] / GAP_UNIT, partner_state[..., 12] / GAP_UNIT
+        ], -1),
         sizes[:, :, :, None].expand(*now.shape, 2),
     ], -1)  # fmt: skip
-    return ContactPoints(_within_cutoff(vectors, gate, 2), _within_cutoff(scalars, gate, 1), gate, mine)
+    return ContactPoints(_within_cutoff(vectors, gate, 2), _within_cutoff(scalars, gate, 1), gate, own)
 
 
 def _nearest_pairs(
@@ -87,16 +89,16 @@ def _nearest_pairs(
     count = math.ceil(PAIR_FRACTION * n)
     pick = others[None, :, :, None].expand(b, o, others.shape[1], n)
     distance, index = distance.gather(2, pick), index.gather(2, pick)
-    theirs = index + n * others[:, :, None]
+    partner = index + n * others[:, :, None]
     if count >= n:
-        return torch.arange(n, device=index.device).expand_as(index), theirs, distance
+        return torch.arange(n, device=index.device).expand_as(index), partner, distance
     with torch.no_grad():
         ahead = bodies.points + FRAME * bodies.point_velocity
-        ahead = smooth_norm(ahead[:, :, None] - _gather_points(ahead, theirs))
+        ahead = smooth_norm(ahead[:, :, None] - _gather_points(ahead, partner))
         key = torch.where(distance.isfinite(), torch.minimum(distance, ahead), torch.inf)
-        mine = key.topk(count, largest=False).indices
-    theirs, distance = theirs.gather(-1, mine), distance.gather(-1, mine)
-    return mine, theirs, distance.masked_fill(_beyond(mine, PAIR_FRACTION, w.valid)[:, :, None], torch.inf)
+        own = key.topk(count, largest=False).indices
+    partner, distance = partner.gather(-1, own), distance.gather(-1, own)
+    return own, partner, distance.masked_fill(_beyond(own, PAIR_FRACTION, w.valid)[:, :, None], torch.inf)
 
 
 def _gather_points(x: Float[Tensor, "b o n c"], rows: Int[Tensor, "b *p"]) -> Float[Tensor, "b *p c"]:
@@ -162,13 +164,13 @@ def _plane_contacts(
     state = [bodies.point_velocity, bodies.normal, bodies.arm, shape.spacing[..., None], w.valid[..., None]]
     state = _gather_own(torch.cat(state, -1), row)
     velocity, arm = state[..., :3], state[..., 6:9]
-    whole, gravity = bodies.velocity[:, :, None].expand_as(arm), (w.gravity / 5)[:, None, None].expand_as(arm)
+    body_velocity, gravity = bodies.velocity[:, :, None].expand_as(arm), (w.gravity / 5)[:, None, None].expand_as(arm)
     ahead = height + FRAME * (velocity * normal).sum(-1)
     gate = smooth_cutoff(torch.minimum(height, ahead), FULL_CONTACT, NO_CONTACT)
     gate = torch.where(state[..., 10] > 0, gate, 0.0)
     K = _impulse_response(bodies.inverse[:, :, None], arm)
     vectors = torch.stack([
-        normal, state[..., 3:6], velocity, arm / ARM_UNIT, whole, gravity, *symmetric_solve(K, velocity, normal)
+        normal, state[..., 3:6], velocity, arm / ARM_UNIT, body_velocity, gravity, *symmetric_solve(K, velocity, normal)
     ], -2)  # fmt: skip
     scalars = torch.stack([
         (height / GAP_UNIT).clamp(-2, 2), (ahead / GAP_UNIT).clamp(-2, 2), gate, state[..., 9] / GAP_UNIT,

@@ -56,26 +56,26 @@ def smooth_norm(x: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
 
 def apply_layers(
     x: Float[Tensor, "*b i"], layers: Sequence[nn.Linear], vectors: Float[Tensor, "*b v 3"] | None = None,
-    known: Float[Tensor, "*#b k"] | None = None, active: bool = False, near: Bool[Tensor, "*b"] | None = None,
+    offset: Float[Tensor, "*#b k"] | None = None, active: bool = False, needed: Bool[Tensor, "*b"] | None = None,
 ) -> Float[Tensor, "*b j"]:  # fmt: skip
     """Linear layers with SiLU between them; one Triton kernel where `kernel_choice.triton_allowed`.
 
     x: input; the inner products of `vectors` are put before it.
-    known: added to the output of the first layer or, if `active`, to x; the same along the last batch dimension.
-    active: apply SiLU to x + known before the first layer.
-    near: rows whose result is needed; the kernel may return 0 in the others.
+    offset: added to the output of the first layer or, if `active`, to x; the same along the last batch dimension.
+    active: apply SiLU to x + offset before the first layer.
+    needed: rows whose result is needed; the kernel may return 0 in the others.
     """
     if triton_allowed(x) and len(layers) in (2, 3) and max(layer.out_features for layer in layers) <= MAX_LAYER_WIDTH:
-        if known is not None:
-            known = known.expand(*x.shape[:-2], 1, known.shape[-1]).flatten(0, -2)
+        if offset is not None:
+            offset = offset.expand(*x.shape[:-2], 1, offset.shape[-1]).flatten(0, -2)
         vectors = None if vectors is None else vectors.flatten(0, -3)
-        near = None if near is None else near.flatten()
+        needed = None if needed is None else needed.flatten()
         weights, biases = [layer.weight for layer in layers], [layer.bias for layer in layers]
-        return perceptron(x.flatten(0, -2), weights, biases, vectors, known, near, active).unflatten(0, x.shape[:-1])
+        return perceptron(x.flatten(0, -2), weights, biases, vectors, offset, needed, active).unflatten(0, x.shape[:-1])
     if vectors is not None:
         x = torch.cat([inner_products(vectors), x], -1)
-    known = 0.0 if known is None else known
-    y = layers[0](silu(x + known)) if active else layers[0](x) + known
+    offset = 0.0 if offset is None else offset
+    y = layers[0](silu(x + offset)) if active else layers[0](x) + offset
     for layer in layers[1:]:
         y = layer(silu(y))
     return y

@@ -107,11 +107,11 @@ class ForceField(Dynamics):
         moments = (shape.principal * size[..., None] ** 2).log()
         mass = w.mass.clamp_min(1e-6)
         stiffness = (E * size / mass).log() / 5  # log of a squared frequency
-        whole = torch.stack([size.log(), E.log10() - 5, w.nu, w.friction, mass.log(), stiffness], -1)
-        whole = torch.cat([whole, moments], -1)[:, :, None].expand(*shape.spacing.shape, -1)
+        object_features = torch.stack([size.log(), E.log10() - 5, w.nu, w.friction, mass.log(), stiffness], -1)
+        object_features = torch.cat([object_features, moments], -1)[:, :, None].expand(*shape.spacing.shape, -1)
         arm, normal = shape.arm / size[..., None, None], shape.normal
         local = [arm.norm(dim=-1), normal.norm(dim=-1), (arm * normal).sum(-1), shape.spacing / size[..., None]]
-        x = self.point(torch.cat([torch.stack(local, -1), whole], -1))
+        x = self.point(torch.cat([torch.stack(local, -1), object_features], -1))
         maximum = x.masked_fill(~w.valid[..., None], -torch.inf).amax(2)
         maximum = torch.where(w.present[..., None], maximum, 0.0)
         return self.code(torch.cat([(w.mass_fraction[..., None] * x).sum(2), maximum], -1))
@@ -187,8 +187,8 @@ class ForceField(Dynamics):
         momentum, spin = momentum * slower, spin * slower
         velocity = clamp_norm(half.velocity + dt * rates.force, MAX_SPEED)
         before, after = (half.velocity, bodies.spin), (velocity, spin)
-        kept = friction_factor(scene.shape, rates.friction_speed, before, after, dt)
-        velocity, momentum, spin = velocity * kept, momentum * kept, spin * kept
+        factor = friction_factor(scene.shape, rates.friction_speed, before, after, dt)
+        velocity, momentum, spin = velocity * factor, momentum * factor, spin * factor
         rotating = torch.linalg.cross(spin[:, :, None].expand_as(bodies.arm), bodies.arm)
         velocity = limit_penetration(scene.shape, bodies.points + dt / 2 * rotating, velocity, dt / 2)
         k, c = scene.stiffness[..., None, None], scene.damping[..., None, None]
@@ -250,9 +250,9 @@ class ForceField(Dynamics):
         x_f, weight_f, mean_f = self.planes.encode(floor, _fractions(w, floor), embedding)
         x_w, weight_w, mean_w = self.planes.encode(wall, _fractions(w, wall), embedding)
         status = self.status(torch.cat([embedding, mean.sum(2), mean_f[:, :, 0] + mean_w[:, :, 0]], -1))
-        own, mine = status[:, :, None].expand_as(mean), status[:, :, None]
-        context = self.between(torch.cat([mean, mean[:, others, back], own, status[:, others]], -1))
-        context_f, context_w = (self.against(torch.cat([m, mine], -1)) for m in (mean_f, mean_w))
+        pair_status, plane_status = status[:, :, None].expand_as(mean), status[:, :, None]
+        context = self.between(torch.cat([mean, mean[:, others, back], pair_status, status[:, others]], -1))
+        context_f, context_w = (self.against(torch.cat([m, plane_status], -1)) for m in (mean_f, mean_w))
         a = self.pairs.decode(x, weight, context, pairs.vectors)
         a_f = push_only(self.planes.decode(x_f, weight_f, context_f, floor.vectors), floor, weight_f)
         a_w = push_only(self.planes.decode(x_w, weight_w, context_w, wall.vectors), wall, weight_w)

@@ -18,15 +18,15 @@ Nearest = tuple[Float[Tensor, "b o o n"], Int[Tensor, "b o o n"]]
 
 @torch.no_grad()
 def nearest(points: Float[Tensor, "b o n 3"], valid: Bool[Tensor, "b o n"], radius: float) -> Nearest:
-    """For point n of object i and every object j: the distance [m] to j's nearest point, and which one that is.
+    """For point n of object i and every object j: the distance [m] to j's nearest point, and its index.
 
     The distance is infinite where it is not below `radius` [m], to the own object, to padding and from padding; the
     index is then undefined.
     """
     if TRITON and points.is_cuda and points.dtype == torch.float32:
         return nearest_triton(points, valid, radius)
-    small = points.shape[1] * points.shape[2] < CULLING_MIN_POINTS
-    search = _all_pairs if small or points.is_cuda else _culled
+    is_small = points.shape[1] * points.shape[2] < CULLING_MIN_POINTS
+    search = _all_pairs if is_small or points.is_cuda else _culled
     distance, index = search(points, valid, radius)
     return distance.masked_fill(distance >= radius, torch.inf), index
 
@@ -36,8 +36,8 @@ def _all_pairs(points: Float[Tensor, "b o n 3"], valid: Bool[Tensor, "b o n"], r
     distance from the difference of the two points."""
     o = points.shape[1]
     count = valid.sum((1, 2)).clamp_min(1)
-    middle = torch.where(valid[..., None], points, 0.0).sum((1, 2)) / count[:, None]
-    x = torch.where(valid[..., None], points - middle[:, None, None], 0.0)
+    centre = torch.where(valid[..., None], points, 0.0).sum((1, 2)) / count[:, None]
+    x = torch.where(valid[..., None], points - centre[:, None, None], 0.0)
     with torch.autocast(x.device.type, enabled=False):
         half = torch.where(valid, x.float().square().sum(-1) / 2, torch.inf)
         gap = half[:, None, :, None] - torch.einsum("bind,bjmd->bijnm", x.float(), x.float())
@@ -45,9 +45,9 @@ def _all_pairs(points: Float[Tensor, "b o n 3"], valid: Bool[Tensor, "b o n"], r
     scene = torch.arange(len(x), device=x.device)[:, None, None, None]
     other = torch.arange(o, device=x.device)[None, None, :, None]
     distance = (x[:, :, None] - x[scene, other, index]).norm(dim=-1)
-    mine = torch.eye(o, dtype=torch.bool, device=x.device)[:, :, None]
-    unseen = mine | ~valid[:, :, None] | ~valid.any(-1)[:, None, :, None]
-    return distance.masked_fill(unseen, torch.inf), index
+    is_self = torch.eye(o, dtype=torch.bool, device=x.device)[:, :, None]
+    excluded = is_self | ~valid[:, :, None] | ~valid.any(-1)[:, None, :, None]
+    return distance.masked_fill(excluded, torch.inf), index
 
 
 def _culled(points: Float[Tensor, "b o n 3"], valid: Bool[Tensor, "b o n"], radius: float) -> Nearest:
@@ -60,21 +60,21 @@ def _culled(points: Float[Tensor, "b o n 3"], valid: Bool[Tensor, "b o n"], radi
     inside = ((points[:, :, None] > low[:, None, :, None]) & (points[:, :, None] < high[:, None, :, None])).all(-1)
     inside &= valid[:, :, None]
     for s, i, j in inside.any(-1).triu(1).nonzero().tolist():
-        mine, theirs = inside[s, i, j].nonzero()[:, 0], inside[s, j, i].nonzero()[:, 0]
-        if not len(theirs):
+        own, other = inside[s, i, j].nonzero()[:, 0], inside[s, j, i].nonzero()[:, 0]
+        if not len(other):
             continue
-        x, y = points[s, i, mine], points[s, j, theirs]
+        x, y = points[s, i, own], points[s, j, other]
         which = _nearest_index(x, y)
-        distance[s, i, j, mine], index[s, i, j, mine] = (x - y[which]).norm(dim=-1), theirs[which]
+        distance[s, i, j, own], index[s, i, j, own] = (x - y[which]).norm(dim=-1), other[which]
         which = _nearest_index(y, x)
-        distance[s, j, i, theirs], index[s, j, i, theirs] = (y - x[which]).norm(dim=-1), mine[which]
+        distance[s, j, i, other], index[s, j, i, other] = (y - x[which]).norm(dim=-1), own[which]
     return distance, index
 
 
 def _nearest_index(x: Float[Tensor, "p 3"], y: Float[Tensor, "q 3"]) -> Int[Tensor, "p"]:
     """Index of the nearest y to each x, by |y|^2 / 2 - x.y = (|x - y|^2 - |x|^2) / 2 from one matrix product."""
-    middle = y.mean(0)
-    x, y = x - middle, y - middle
+    centre = y.mean(0)
+    x, y = x - centre, y - centre
     return torch.addmm(y.square().sum(-1) / 2, x, y.T, alpha=-1).argmin(-1)
 
 

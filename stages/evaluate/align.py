@@ -24,7 +24,7 @@ Pairs = list[tuple[SceneObject, SceneObject]]  # predicted, true
 
 @dataclass(frozen=True)
 class ReferenceFrame:
-    """What locates the reference frame of a file: its cameras, and the points of each object at rest."""
+    """Data that locate the reference frame of a file: its cameras, and the points of each object at rest."""
 
     file: str
     cameras: Cameras | None

@@ -1,1 +1,1 @@
-"""What ngff-lab does: it may call any stage, no stage imports it."""
+"""Commands of ngff-lab; may import any stage, and no stage imports it."""

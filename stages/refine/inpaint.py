@@ -174,7 +174,7 @@ def _downsample(image: np.ndarray, hole: np.ndarray, known: np.ndarray) -> tuple
     """Image and masks at half the size; a pixel is known if mostly_known of it is, else hole if any of it is."""
     height, width = (side // 2 * 2 for side in hole.shape)
     four = lambda v: v[:height, :width].reshape(height // 2, 2, width // 2, 2, *v.shape[2:]).sum((1, 3))  # noqa: E731
-    weight = 999 * known + 1  # unknown pixels count only where no other does
+    weight = 999 * known + 1  # unknown pixels count only where no known one does
     half = np.rint(four(image * weight[..., None]) / four(weight)[..., None])
     mostly_known = four(known) >= 3
     return half, (four(hole) > 0) & ~mostly_known, mostly_known

@@ -1,4 +1,4 @@
-"""Observed free space: which points the cameras saw through, and which they saw."""
+"""Observed space: points that rays of the cameras passed through, and points on observed surfaces."""
 
 from __future__ import annotations
 

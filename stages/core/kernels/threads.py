@@ -1,9 +1,8 @@
 """One pool of threads for kernels on the CPU.
 
 A Warp launch on the CPU runs on the calling thread and releases Python's lock, so several threads launch the parts of
-a computation in parallel. The calling thread takes part: it works through the tasks that no other thread has claimed
-yet. When other processes occupy the cores and the helpers do not get to run, it does all of the work itself instead
-of waiting for them.
+a computation in parallel. The calling thread takes part: it runs the tasks that no pool thread has claimed yet. When
+other processes occupy the cores, it does all of the work instead of waiting for the pool.
 """
 
 from __future__ import annotations

@@ -62,7 +62,7 @@ def save(path: Path, name: str, model: Dynamics, card: Mapping | None = None, ha
     if half:
         state = {k: v.half() if v.is_floating_point() and v.half().isfinite().all() else v for k, v in state.items()}
     with replacing(path) as part:
-        part.write_bytes(to_bytes(state))  # save_file makes files that only their owner may read
+        part.write_bytes(to_bytes(state))  # save_file creates files readable by their owner only
     write_card(path.with_suffix(".json"), {**(card or {}), "model": name, "config": model.config,
                                            "sha256": sha256(path)})  # fmt: skip
 

@@ -1,4 +1,4 @@
-"""gsplat's default training recipe: what its published simple_trainer does without options.
+"""gsplat's default training recipe: that of its published simple_trainer without options.
 
 The loop is ours, with gsplat's rasteriser and DefaultStrategy inside. Gaussians start at the sparse points with opacity
 0.1 and the distance to their three nearest neighbours as scale; the SH degree grows every 1,000 steps, up to 3;

@@ -1,4 +1,4 @@
-"""Benchmark of object completion on scenes seen from one side only, compared with the true scenes.
+"""Benchmark of object completion on scenes observed from one side only, compared with the true scenes.
 
 A few objects stand on a table; ten cameras look from the front, and only Gaussians that they see are kept, with noise.
 Each completer of `refine` is measured by the surfaces (Chamfer distance), views from behind (PSNR), and the motion of

@@ -269,5 +269,5 @@ def evaluate_predictor(predict: Predict, motions: KeypointMotions, batch: int) -
 
 
 def _digits(x: float, count: int = 4) -> float | None:
-    """Rounded to significant digits; None for what is not finite, which JSON has no number for."""
+    """Rounded to significant digits; None for non-finite values, which JSON cannot represent."""
     return float(f"{x:.{count}g}") if abs(x) < float("inf") else None

@@ -9,7 +9,7 @@ from stages.lab.dataset.layout import PARTS, parse_backgrounds, parse_parts, par
 from stages.lab.dataset.object_particles import SUBSTEP, Discretisation
 from stages.lab.dataset.scene_configs import parse_groups
 
-PREREQUISITES = {  # parts that a part is made from
+PREREQUISITES = {  # parts that a part is generated from
     "motions": {"scene_configs"}, "scenes": {"scene_configs", "objects"}, "mpm": {"scene_configs", "objects"},
     "initial": {"scene_configs", "objects", "backgrounds"}, "dynamic": {"scene_configs", "objects", "backgrounds"},
 }  # fmt: skip
@@ -78,7 +78,7 @@ class DatasetOptions:
     def deterministic(self) -> bool:
         """Whether the simulation must be bitwise reproducible.
 
-        Always so for mpm and dynamic: missing scenes of these are simulated again on their own.
+        Always so for mpm and dynamic: missing scenes of these are simulated again separately.
         """
         return self.exact or bool({"mpm", "dynamic"} & {*self.parts})
 

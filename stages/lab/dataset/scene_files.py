@@ -59,7 +59,7 @@ class MissingFiles:
 
 @dataclass(frozen=True)
 class GroupFiles:
-    """The files of one group of scenes: where they are and how they are made."""
+    """The files of one group of scenes: their paths and the functions that generate them."""
 
     layout: Layout
     options: DatasetOptions

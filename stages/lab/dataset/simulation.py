@@ -36,7 +36,7 @@ WALL_BOX = ((-1.94, -1.94, -0.94), (1.94, 1.94, 2.94))  # [m]
 TRANSFER_DAMPING = 0.9
 WALL_RETENTION = 0.9  # of the tangential speed at walls, per published substep
 CPU_BATCH_SCENES = 4
-GPU_BATCH_PARTICLES = 1_500_000  # enough to keep a GPU busy; more only take memory
+GPU_BATCH_PARTICLES = 1_500_000  # enough to occupy a GPU; more only take memory
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,7 @@ def total_minutes(card: Mapping) -> float | None:
 
 
 def curve_columns(rows: Sequence[Mapping]) -> dict[str, list[float | None]]:
-    """A training curve as one list of values a column, rounded; None for what is missing or not finite."""
+    """A training curve as one list of values per column, rounded; None for missing and non-finite values."""
     return {key: [_rounded(row.get(key)) for row in rows] for key in CURVE}
 
 

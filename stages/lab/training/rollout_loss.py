@@ -1,7 +1,8 @@
 """Loss of a batch and its gradient: forward and backward pass of a rollout, replayed as one CUDA graph on a GPU.
 
-What a model computes once for a scene (`precompute`, `encode`, `state_from_motion`) decomposes matrices, for which the
-host must wait, so it stays outside of the graph; its gradients are chained to those of the graph by hand.
+The computations done once per scene (`precompute`, `encode`, `state_from_motion`) include matrix decompositions that
+synchronise with the host, so they are outside of the graph; their gradients are chained to those of the graph
+explicitly.
 """
 
 from __future__ import annotations
@@ -31,8 +32,8 @@ class LossOptions:
     """Weights and terms of the loss."""
 
     kind: str = "square"  # one of LOSSES
-    velocity_time: float = 0.0  # [s]: a velocity error counts as this times it in position; 0: not at all
-    gradient_discount: float = 1.0  # factor on a gradient for every frame it goes back: through contacts it grows
+    velocity_time: float = 0.0  # [s]: factor that converts velocity errors to position errors; 0: no velocity errors
+    gradient_discount: float = 1.0  # factor on a gradient per frame of backpropagation, which amplifies it at contacts
 
 
 def keypoint_loss(

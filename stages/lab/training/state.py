@@ -15,11 +15,11 @@ from stages.core.models.dynamics import Dynamics
 from stages.core.scene.files import must_exist, replacing
 
 EMA_DECAY = 0.999  # of the exponential moving average of the weights, after a few thousand steps
-GRADIENT_CLIP = 2.0  # gradients are clipped to so many times the moving average of their norm
+GRADIENT_CLIP = 2.0  # gradients are clipped to this multiple of the moving average of their norm
 GRADIENT_NORM_DECAY = 0.99  # of that moving average
 WARMUP_STEPS = 200  # steps until the full learning rate
-DIVERGENCE_RATIO = 1.25  # training has diverged at so many times the lowest RMSE so far,
-MAX_WORSENING_CHECKS = 4  # or when each of so many validations was worse than the one before
+DIVERGENCE_RATIO = 1.25  # training has diverged at this multiple of the lowest RMSE so far,
+MAX_WORSENING_CHECKS = 4  # or when this many consecutive validations were each worse than the one before
 OPTIMIZERS = ("adamw", "soap")
 
 

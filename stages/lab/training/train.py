@@ -61,7 +61,7 @@ class TrainOptions:
     loss: str = "scene"  # one of rollout_loss.LOSSES
     optimizer: str = "adamw"  # one of state.OPTIMIZERS
     speeds: float = 0.0  # weight of velocity errors: the time [s] over which one counts as a position error; 0: none
-    gradient_discount: float = 0.9  # factor on a gradient for every frame that it goes back
+    gradient_discount: float = 0.9  # factor on a gradient per frame of backpropagation
     groups: str = "3_0..3_8"  # training files; the last scenes of the last are for validation
     compiled: bool = False  # compile a step first: takes minutes, then faster; for GPUs
     seed: int = 0

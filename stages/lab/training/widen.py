@@ -1,4 +1,4 @@
-"""Function-preserving widening: a wider force field that computes the same as a narrower, trained one."""
+"""Function-preserving widening: a wider force field with the same outputs as a narrower, trained one."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from stages.core.models.field.force_field import ForceField
 
 @torch.no_grad()
 def widen(model: ForceField, hidden: int) -> ForceField:
-    """The same function with `hidden` channels, to train on from.
+    """The same function with `hidden` channels, as a start for further training.
 
     New channels have random input weights and zero output weights. Raises InputError for fewer channels than before.
     """

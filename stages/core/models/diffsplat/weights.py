@@ -8,7 +8,7 @@ A folder holds three parts under their published names:
 
 The U-Net's tensors have the names of Stable Diffusion's; its 859,541,124 32-bit numbers make the 3.44 GB that the
 hub lists. The names in the second file follow from the public code (`vae.` before those of an autoencoder with 12
-channels in and out, and a `tiny_decoder.` for training alone); the file itself has not been seen here.
+channels in and out, and a `tiny_decoder.` for training alone); the file itself was not available for testing.
 """
 
 from __future__ import annotations

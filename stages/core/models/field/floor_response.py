@@ -43,8 +43,8 @@ def friction_factor(
     """Factor in 0..1 on velocity and spin: about 1 above `friction_speed`, towards 0 below it (quartic).
 
     Without it, forces that balance only nearly let resting bodies creep. `before` and `after` are (velocity, spin)
-    [m/s, rad/s] before and after the forces of the step: slow bodies are judged by their mean, which is what moves them
-    within the step, because stiff contacts alternate from step to step and the mean cancels that.
+    [m/s, rad/s] before and after the forces of the step: for slow bodies the mean of both is used, because stiff
+    contact forces alternate from step to step and the mean cancels the alternation.
     """
     extent = shape.size[..., None].square()
     last = after[0].square().sum(-1, keepdim=True) + extent * after[1].square().sum(-1, keepdim=True)

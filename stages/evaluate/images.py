@@ -73,7 +73,7 @@ def compare(prediction: Path, truth: Path, options: EvaluateOptions) -> Result:
     if options.frames is not None and len(scores) < options.frames:
         raise InputError(f"--frames {options.frames}: both have only {len(scores)} frames; give {len(scores)} or fewer")
     if options.frames is not None:
-        notes.append(f"only the first {options.frames} frames were compared, as asked by --frames")
+        notes.append(f"only the first {options.frames} frames were compared, as given by --frames")
     values = torch.tensor(scores, dtype=torch.float64)
     overall = {"PSNR": float(values[:, 0].mean()), "SSIM": float(values[:, 1].mean()), "frames": len(scores)}
     curves = [Curve(name, values[:, i].tolist()) for i, name in enumerate(("PSNR", "SSIM"))]

@@ -108,7 +108,7 @@ def _same_frames(predicted: Track, true: Track, options: EvaluateOptions, notes:
     files = predicted.frame.file, true.frame.file
     if options.resample:
         predicted = _resampled(predicted, true)
-        notes.append(f"the prediction was interpolated to {1 / true.dt:g} frames a second, by --resample")
+        notes.append(f"the prediction was interpolated to {1 / true.dt:g} frames a second, as given by --resample")
     if abs(predicted.dt - true.dt) > 1e-4 * true.dt:
         raise InputError(
             f"{files[0]}: {1 / predicted.dt:g} frames a second, but {files[1]} has {1 / true.dt:g}; "
@@ -127,7 +127,7 @@ def _same_frames(predicted: Track, true: Track, options: EvaluateOptions, notes:
             f"--frames {options.frames}: {files[0]} has {len(predicted)} frames and {files[1]} {len(true)}; "
             f"give {shorter} or fewer"
         )
-    notes.append(f"only the first {options.frames} frames were compared, as asked by --frames")
+    notes.append(f"only the first {options.frames} frames were compared, as given by --frames")
     return tuple(replace(track, positions=track.positions[: options.frames]) for track in (predicted, true))
 
 

@@ -131,7 +131,7 @@ def _drop_reasons(photos: Photos, pairs: list[MatchedPair], best, models: dict) 
         if len(others_in_group) > 1:
             reasons[name] = f"is one of {len(others_in_group)} photos that match each other but not the rest"
         elif matches == 0:
-            reasons[name] = "shows nothing that was recognised in the other photos, or is blurred, dark or plain"
+            reasons[name] = "shows nothing that matches the other photos, or is blurred, dark or plain"
         else:
             reasons[name] = f"has at most {matches} points in common with any placed photo, too few or too much in line"
     return reasons

@@ -46,7 +46,7 @@ class StepCache:
         """A cache in a hidden folder next to the output file; InputError where its folder is missing."""
         out = Path(out)
         if not out.parent.is_dir():
-            raise InputError(f"{out}: there is no folder {out.parent}; make it first")
+            raise InputError(f"{out}: there is no folder {out.parent}; create it first")
         return cls(out.with_name(f".steps-{out.name}"), key, resume)
 
     @contextmanager

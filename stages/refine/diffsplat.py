@@ -41,7 +41,7 @@ def complete(
     if not TRAINED_ELEVATIONS[0] <= crop.elevation <= TRAINED_ELEVATIONS[1]:
         log.info("  %d  %s: seen from %.0f degrees above in %s; outside the %.0f to %.0f that DiffSplat was trained on",
                  number, name, crop.elevation, crop.name, *TRAINED_ELEVATIONS)  # fmt: skip
-    prompt = "" if name == f"object_{number}" else name.replace("_", " ")  # a number is no prompt
+    prompt = "" if name == f"object_{number}" else name.replace("_", " ")  # a number is not a prompt
     generated = model.generate(crop.image, crop.elevation, prompt, options.seed)
     generated = generated[generated.opacities > MIN_SURFACE_OPACITY]
     registration = (

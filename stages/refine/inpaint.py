@@ -2,7 +2,7 @@
 
 Patches are chosen, coarse to fine, to agree with the surroundings of the hole and with each other, which continues
 edges and texture. Finally, the difference in brightness between the boundary of the hole and the copied patches is
-interpolated smoothly over the hole, so that available is no seam.
+interpolated smoothly over the hole, so that there is no seam.
 
 Patches are compared in integers: colours of 8 bits, weights of 10 bits. Sums of their products are exact in float64
 in any order, so the result does not depend on the number of threads or on the processor.
@@ -273,7 +273,7 @@ def _usable(level: _Level, match: np.ndarray) -> Bool[np.ndarray, "t"]:
 
 
 def _field(level: _Level, match: np.ndarray) -> Int[np.ndarray, "h w 2"]:
-    """The match of every pixel; pixels that are no target match themselves."""
+    """The match of every pixel; pixels that are not targets match themselves."""
     field = np.stack(np.mgrid[: level.hole.shape[0], : level.hole.shape[1]], -1)
     field[level.at[:, 0], level.at[:, 1]] = match
     return field

@@ -87,7 +87,7 @@ def load_library(folder: Path, device: str) -> dict[str, tuple[Gaussians, Regist
     """
     folder = Path(folder)
     if not folder.is_dir():
-        raise InputError(f"{folder}: is no folder; --library takes whole objects, such as `ngff-lab objects` writes")
+        raise InputError(f"{folder}: is not a folder; --library takes whole objects, such as `ngff-lab objects` writes")
     files = {p.stem: p for p in sorted(folder.glob("*.ply"))}
     files.update(
         {p.relative_to(folder).parts[0]: p for p in sorted(folder.glob("*/**/*.ply"))}

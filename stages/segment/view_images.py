@@ -71,7 +71,7 @@ def match_files(folder: Path, names: tuple[str, ...], what: str, option: str) ->
     """
     folder = Path(folder)
     if not folder.is_dir():
-        raise InputError(f"{folder}: is no folder; {option} takes a folder of {what}s named as the photos")
+        raise InputError(f"{folder}: is not a folder; {option} takes a folder of {what}s named as the photos")
     images = {p.stem: p for p in sorted(folder.iterdir()) if p.suffix.lower() in IMAGE_SUFFIXES}
     found = {i: images[Path(name).stem] for i, name in enumerate(names) if Path(name).stem in images}
     if not found:

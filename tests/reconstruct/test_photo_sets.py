@@ -128,4 +128,4 @@ def test_photos_of_two_places_give_the_larger_set(tmp_path):
     model = sfm.estimate_cameras(as_photos(images, names, tmp_path))
     assert model.cameras.names == names[:4]
     assert set(model.dropped) == set(names[4:])
-    assert all("match each other" in why or "nothing that was recognised" in why for why in model.dropped.values())
+    assert all("match each other" in why or "nothing that matches" in why for why in model.dropped.values())

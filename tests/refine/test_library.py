@@ -110,7 +110,7 @@ def test_transformed_gaussians_render_equally_from_a_transformed_camera():
 
 def test_invalid_libraries_are_refused(seen, tmp_path):
     write_scene(tmp_path / "labelled.ply", seen)
-    for folder, message in ((tmp_path / "none", "is no folder"), (tmp_path / "empty", "holds no .ply")):
+    for folder, message in ((tmp_path / "none", "is not a folder"), (tmp_path / "empty", "holds no .ply")):
         (tmp_path / "empty").mkdir(exist_ok=True)
         with pytest.raises(InputError, match=message):
             run(tmp_path / "labelled.ply", tmp_path / "out.ply", RefineOptions(library=folder))

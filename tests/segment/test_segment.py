@@ -150,7 +150,7 @@ def test_boxes_give_named_objects(scene_file, truth, tmp_path):
 @pytest.mark.parametrize(
     ("prepare", "message"),
     [
-        (lambda p: {"masks": p / "nowhere"}, "is no folder"),
+        (lambda p: {"masks": p / "nowhere"}, "is not a folder"),
         (lambda p: (p / "m").mkdir() or {"masks": p / "m"}, "no label image is named as a photo"),
         (lambda p: {"boxes": p / "nowhere.json"}, "no such file"),
         (lambda p: (p / "b.json").write_text("{}") and {"boxes": p / "b.json"}, "is not a prompts file"),

@@ -13,7 +13,7 @@ def degree_of(k: int) -> int:
     """Degree of a set of k = (degree + 1)^2 coefficients; ValueError unless it is 0 to 3."""
     degree = round(k**0.5) - 1
     if (degree + 1) ** 2 != k or not 0 <= degree <= 3:
-        raise ValueError(f"{k} coefficients are no full set of degree 0 to 3")
+        raise ValueError(f"{k} coefficients are not a full set of degree 0 to 3")
     return degree
 
 

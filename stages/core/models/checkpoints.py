@@ -110,7 +110,7 @@ def load(path: Path, device: torch.device | str = "cpu") -> tuple[Dynamics, dict
     try:
         state = load_file(path)
     except SafetensorError as error:
-        raise InputError(f"{path}: is no safetensors file ({error}); fetch or train it again") from error
+        raise InputError(f"{path}: is not a safetensors file ({error}); fetch or train it again") from error
     try:
         model = build(card["model"], **card["config"])
         model.load_state_dict({k: v.float() if v.is_floating_point() else v for k, v in state.items()})

@@ -66,7 +66,7 @@ def fetch(source: HubSource, folder: Path, choose: Callable[[list], list], place
         if _checksum(file) and sha256(path) != _checksum(file):
             path.unlink()
             raise InputError(
-                f"{path}: did not arrive whole (its sha256 is not the one stated) and was removed; try again"
+                f"{path}: is incomplete or altered (its sha256 is not the one stated) and was removed; try again"
             )
     return paths
 

@@ -157,7 +157,7 @@ def find_object(key: str | int, objects: Sequence[SceneObject], where: str) -> S
     if len(near) == 1:
         return near[0]
     have = ", ".join(f"{o.id} ({o.name})" for o in objects) or "none"
-    problem = f"fits {len(near)} objects" if near else "is no object of this scene"
+    problem = f"fits {len(near)} objects" if near else "is not an object of this scene"
     raise InputError(f"{where}: {text!r} {problem}; there are: {have}")
 
 

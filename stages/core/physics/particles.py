@@ -130,7 +130,7 @@ def surface_points(scene: Scene, object_id: int, seed: int) -> np.ndarray:
 
 
 def inliers(points: Float[Tensor, "n 3"]) -> Tensor:
-    """Mask of points whose distance to the median centre is no outlier (robust z-score)."""
+    """Mask of points whose distance to the median centre is not an outlier (robust z-score)."""
     distance = (points - points.median(0).values).norm(dim=1)
     middle = distance.median()
     spread = (distance - middle).abs().median()

@@ -30,7 +30,7 @@ def read_mesh(path: Path, count: int, up: str = "auto", light: bool = True) -> G
     """
     path = Path(path)
     if path.suffix.lower() not in MESH_SUFFIXES:
-        raise InputError(f"{path}: is no mesh file that can be read; supported suffixes: {' '.join(MESH_SUFFIXES)}")
+        raise InputError(f"{path}: is not a readable mesh file; supported suffixes: {' '.join(MESH_SUFFIXES)}")
     if up not in (*UP_ROTATIONS, "auto"):
         raise InputError(f"--up {up}: choose from auto, x, y, z")
     if count < 100:

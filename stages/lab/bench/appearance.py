@@ -86,7 +86,7 @@ def run(sets: list[Path], out: Path, options: AppearanceBenchOptions) -> Iterato
     if not sets:
         raise InputError("name one or more photo sets: a folder of photos, or one with images/")
     if pick_device("auto") != "cuda":
-        raise InputError("gsplat needs an NVIDIA GPU, and PyTorch sees none here (see `ngff-lab doctor`)")
+        raise InputError("gsplat needs an NVIDIA GPU, and PyTorch finds none (see `ngff-lab doctor`)")
     folders = {folder: photo_folder(folder) for folder in map(Path, sets)}
     rows = json.loads(out.read_text())["sets"] if out.exists() else {}
     yield f"{machine('cuda')}; quality {options.quality}, every {options.holdout}th photo held out"

@@ -37,7 +37,7 @@ class ChatEndpoint:
         if not url.startswith(("http://", "https://")):
             raise InputError(f"OPENAI_BASE_URL={url}: must begin with http:// or https://, such as {URL}")
         if not model:
-            raise InputError(f"which model of {url}? name one that sees images with --model or OPENAI_MODEL")
+            raise InputError(f"which model of {url}? name one that accepts images with --model or OPENAI_MODEL")
         if timeout <= 0:
             raise InputError(f"--timeout {timeout:g}: give seconds above 0")
         return ChatEndpoint(url, model, os.environ.get("OPENAI_API_KEY", "").strip(), timeout)
@@ -81,7 +81,7 @@ class ChatEndpoint:
             return "check OPENAI_API_KEY" if self.key else "the server needs a key: set OPENAI_API_KEY"
         if code == 404:
             return f"check OPENAI_BASE_URL, which often ends in /v1, and that it has the model {self.model!r}"
-        return f"check that the model {self.model!r} sees images"
+        return f"check that the model {self.model!r} accepts images"
 
     def _silence(self, error: Exception) -> str:
         reason = getattr(error, "reason", error)

@@ -74,7 +74,7 @@ def run(folder: Path, out: Path, scene: Path | None = None, count: int = 2048) -
 def frame_files(folder: Path) -> list[Path]:
     """The frames 0000.h5, 0001.h5, ... of a folder; raises InputError when there are none or one is missing."""
     if not folder.is_dir():
-        raise InputError(f"{folder}: is no folder; give mpm/<group>/<scene> of the data set")
+        raise InputError(f"{folder}: is not a folder; give mpm/<group>/<scene> of the data set")
     frames = sorted(p for p in folder.glob("*.h5") if p.stem.isdigit())
     if not frames:
         raise InputError(f"{folder}: has no frames 0000.h5, 0001.h5, ...; give mpm/<group>/<scene> of the data set")

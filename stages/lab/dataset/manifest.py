@@ -86,7 +86,7 @@ def read_checksums(path: Path) -> dict[str, str]:
     """File name -> digest, from a file as `sha256sum` writes it; raises InputError for other content."""
     rows = [line.split("  ", 1) for line in path.read_text().splitlines() if line]
     if not all(len(row) == 2 and len(row[0]) == 64 for row in rows):
-        raise InputError(f"{path}: is no list of sha256 digests; remove it and run `ngff-lab dataset` again")
+        raise InputError(f"{path}: is not a list of sha256 digests; remove it and run `ngff-lab dataset` again")
     return {name: digest for digest, name in rows}
 
 
@@ -94,7 +94,7 @@ def verify_files(root: Path) -> int:
     """Number of listed files; raises InputError when one is missing or changed, or a file is not listed."""
     lists = sorted((root / "sums").glob("*.sha256"))
     if not lists:
-        raise InputError(f"{root}: has no sums/*.sha256; it is no data set of `ngff-lab dataset`, or is not complete")
+        raise InputError(f"{root}: has no sums/*.sha256; it is not a data set of `ngff-lab dataset`, or incomplete")
     listed = {name: digest for path in lists for name, digest in read_checksums(path).items()}
     problems = []
     for name, digest in tqdm(listed.items(), desc="check", unit="file"):

@@ -43,7 +43,7 @@ def run(out: Path, options: DatasetOptions, address: str) -> None:
         try:
             ray.init(address=None if address == "local" else address, log_to_driver=True)
         except (ConnectionError, ValueError) as error:
-            raise InputError(f"--ray {address}: no cluster answers ({error}); start one with `ray start --head`, or "
+            raise InputError(f"--ray {address}: no cluster responds ({error}); start one with `ray start --head`, or "
                              "use this machine alone with `--ray local`") from error  # fmt: skip
     gpus = float(options.device != "cpu" and ray.cluster_resources().get("GPU", 0) >= 1)
     if options.device == "cuda" and not gpus:

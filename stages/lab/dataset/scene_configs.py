@@ -178,4 +178,4 @@ def read_scene_configs(path: Path) -> dict[str, SceneConfig]:
             for name, row in rows.items()
         }  # fmt: skip
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise InputError(f"{path}: is no file of scene configurations ({error!r})") from error
+        raise InputError(f"{path}: is not a file of scene configurations ({error!r})") from error

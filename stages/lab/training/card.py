@@ -20,7 +20,7 @@ def run(cards: Sequence[Path], out: Path, half: bool = False) -> list[str]:
     """Plot the curves of the last training run of each card; return a line about each.
 
     `half` also rewrites the weights of each card in 16 bits, as weights are shipped. Raises InputError for files
-    that are no cards, and for two cards of one name.
+    that are not cards, and for two cards of one name.
     """
     rows = {Path(card).stem: _read(Path(card)) for card in cards}
     if len(rows) < len(cards):

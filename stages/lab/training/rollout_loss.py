@@ -179,7 +179,7 @@ class RolloutLoss:
             self.graph, self.static_inputs = graph, static
         except RuntimeError as error:
             torch.cuda.synchronize()
-            log.info("no CUDA graph, going on step by step: %s", str(error).splitlines()[0])
+            log.info("no CUDA graph, continuing step by step: %s", str(error).splitlines()[0])
 
 
 def _advance(

@@ -116,7 +116,7 @@ def run(
     """
     out = Path(out)
     if not out.parent.is_dir():
-        raise InputError(f"{out}: there is no folder {out.parent}; make it first")
+        raise InputError(f"{out}: there is no folder {out.parent}; create it first")
     groups = parse_groups(options.groups, more=EXTRA_GROUPS)
     training, validation = train_validation_split(read_groups(data, groups, options.keypoints), VALIDATION_SCENES)
     if training.points.shape[1] <= max(options.frames):
@@ -251,7 +251,7 @@ class TrainingRun:
             state.save(self.out.with_suffix(".ckpt"), self.key)
             log.info(PROGRESS_LINE.format(**state.curve[-1]))
             if state.curve[-1]["skipped"]:
-                log.warning("%d steps had no finite gradients and changed nothing", state.curve[-1]["skipped"])
+                log.warning("%d steps had non-finite gradients and were skipped", state.curve[-1]["skipped"])
 
 
 @contextmanager

@@ -84,7 +84,7 @@ def test_damaged_file_with_matching_checksum_is_refused(saved):
 
     saved.write_bytes(b"not weights at all")
     edit_card(saved, sha256=hashlib.sha256(saved.read_bytes()).hexdigest())
-    with pytest.raises(InputError, match="is no safetensors file"):
+    with pytest.raises(InputError, match="is not a safetensors file"):
         load(saved)
 
 

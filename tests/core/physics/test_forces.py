@@ -58,12 +58,12 @@ def test_the_file_format_of_ngff_counts_objects_from_0(tmp_path):
     ({"force": ["object=2 force=0,0,1 until=3"]}, "'until' is not a known key"),
     ({"force": ["object=2 force=0,0,1 from=x"]}, "'x' is not a number"),
     ({"force": ["object=2 force=0,0,1 from=0.3 to=0.1"]}, "the end must come after"),
-    ({"force": ["object=9 force=0,0,1"]}, "'9' is no object of this scene; there are: 1 \\(duck\\), 2 \\(phone\\)"),
+    ({"force": ["object=9 force=0,0,1"]}, "'9' is not an object of this scene; there are: 1 \\(duck\\), 2 \\(phone\\)"),
     ({"pin": ["cow"]}, "--pin 'cow'"),
     ({"velocity": ["1 0,0,2"]}, 'write "object=1 0,0,2"'),
     ({"velocity": ["object=1 fast"]}, "three numbers"),
     ({"lift": ["high"]}, "'high' is not a number"),
-    ({"lift": ["3=1"]}, "no object"),
+    ({"lift": ["3=1"]}, "not an object"),
     ({"lift": ["nan"]}, "not finite"),
 ])  # fmt: skip
 def test_invalid_prompts(prompt, message):

@@ -267,5 +267,5 @@ def test_gsplat_is_not_imported_without_a_gpu(monkeypatch):
 
 def test_incomplete_harmonics_raise():
     gaussians = random_gaussians(5, degree=1)
-    with pytest.raises(ValueError, match="no full set"):
+    with pytest.raises(ValueError, match="not a full set"):
         draw(replace(gaussians, sh=gaussians.sh[:, :3]))

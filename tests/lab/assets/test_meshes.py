@@ -140,7 +140,7 @@ def test_wrong_files_and_options_are_rejected(tmp_path, trimesh):
     for path, count, up, words in [
         (tmp_path / "points.ply", 1000, "z", "holds no triangles"),
         (tmp_path / "broken.glb", 1000, "z", "cannot be read as a mesh"),
-        (tmp_path / "shape.fbx", 1000, "z", "no mesh file that can be read"),
+        (tmp_path / "shape.fbx", 1000, "z", "not a readable mesh file"),
         (tmp_path / "absent.obj", 1000, "z", "no such file"),
         (box, 10, "z", "--count 10"),
         (box, 1000, "w", "--up w"),

@@ -164,7 +164,7 @@ def test_three_invalid_replies_are_an_error(server, video, tmp_path):
 
 
 @pytest.mark.parametrize(("script", "says"), [
-    ([401], "401 .*so it is.*; check OPENAI_API_KEY"), ([404], "404 .*has the model 'seer'"), ([400], "sees images"),
+    ([401], "401 .*so it is.*; check OPENAI_API_KEY"), ([404], "404 .*has the model 'seer'"), ([400], "accepts images"),
     ([503, 500, 429], "429 .*, 3 times; try later"), ([b"<html>"], "choices\\[0\\]"), ([b"{}"], "choices\\[0\\]"),
     ([1.0, 1.0, 1.0], "no answer within 0.2 s, 3 times"),
 ])  # fmt: skip

@@ -121,7 +121,7 @@ def test_generated_frames_round_trip(tmp_path, monkeypatch):
 
 def test_wrong_inputs_are_reported(published, small, tmp_path):
     out = tmp_path / "t.h5"
-    with pytest.raises(InputError, match="is no folder"):
+    with pytest.raises(InputError, match="is not a folder"):
         importer.run(tmp_path / "none", out)
     with pytest.raises(InputError, match="has no frames 0000.h5"):
         importer.run(tmp_path, out)

@@ -89,7 +89,7 @@ def read_state(path: Path) -> dict[str, Tensor]:
             return load_file(path)
         data = torch.load(path, map_location="cpu", weights_only=True)
     except SafetensorError as error:
-        raise InputError(f"{path}: is no whole safetensors file ({error}); fetch it again") from error
+        raise InputError(f"{path}: is not a complete safetensors file ({error}); fetch it again") from error
     except Exception as error:  # a damaged pickle raises anything
         raise InputError(f"{path}: cannot be read as a PyTorch checkpoint; fetch it again") from error
     for key in ("state_dict", "model_state_dict", "model", "module"):

@@ -161,7 +161,7 @@ def test_download_logs_licences_and_fetches_only_the_needed_files(hub, folder, t
 
 def test_damaged_download_is_removed(hub):
     hub.corrupted.append(True)
-    with pytest.raises(InputError, match="did not arrive whole") as caught:
+    with pytest.raises(InputError, match="is incomplete or altered") as caught:
         download()
     assert not Path(str(caught.value).split(": did not")[0]).exists()
 

@@ -133,7 +133,7 @@ def test_size_licence_and_checksum_are_logged_before_download(hub, caplog, monke
 
 def test_damaged_download_is_removed(hub, tmp_path):
     hub.file.lfs.sha256 = "0" * 64
-    with pytest.raises(InputError, match="did not arrive whole"):
+    with pytest.raises(InputError, match="is incomplete or altered"):
         download("pi3")
     assert not list((tmp_path / "weights/pi3").iterdir())
 

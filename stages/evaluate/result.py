@@ -30,7 +30,7 @@ class ImagePair:
 class Result:
     """Metrics by name: overall, and of each object (none for images)."""
 
-    kind: str  # kind of the compared data: "trajectories", "pictures" or "scenes"
+    kind: str  # of the compared data: "trajectories", "pictures" or "scenes"
     overall: dict[str, float | int]
     parts: dict[str, dict[str, float | int]]
     notes: list[str]  # sentences on how items were matched

@@ -59,10 +59,11 @@ class _NoImpulseFeatures(ContactNet):
         super().__init__(vectors - IMPULSE_VECTORS, scalars, hidden, partner)
 
     def encode(
-        self, places: ContactPoints, share: Float[Tensor, "b o m n"], own: Float[Tensor, "b o h"],
+        self, contacts: ContactPoints, mass_fraction: Float[Tensor, "b o m n"], own: Float[Tensor, "b o h"],
         other: Float[Tensor, "b o m h"] | None = None,
     ) -> tuple[Float[Tensor, "b o m n h"], Float[Tensor, "b o m n"], Float[Tensor, "b o m h"]]:  # fmt: skip
-        return super().encode(replace(places, vectors=places.vectors[..., :-IMPULSE_VECTORS, :]), share, own, other)
+        contacts = replace(contacts, vectors=contacts.vectors[..., :-IMPULSE_VECTORS, :])
+        return super().encode(contacts, mass_fraction, own, other)
 
     def decode(
         self, message: Float[Tensor, "b o m n h"], weight: Float[Tensor, "b o m n"], context: Float[Tensor, "b o m h"],

@@ -122,10 +122,10 @@ def segment(
     names: Annotated[str, Option(help='object names: "1=duck,2=bowl"')] = SegmentOptions.names,
     max_objects: Annotated[int, Option(help="maximum number of objects")] = SegmentOptions.max_objects,
     min_size: Annotated[
-        float, Option(help="smallest object, along its longest side [distance of the cameras]")
+        float, Option(help="ignore objects whose longest side is below this fraction of the camera distance")
     ] = SegmentOptions.min_size,
     detail: Annotated[
-        float, Option(help="largest dissimilarity of two regions of one object; smaller values give more objects")
+        float, Option(help="merge threshold of regions, 0 to 2; lower values give more objects")
     ] = SegmentOptions.detail,
     scale_reference: Annotated[
         str, Option(help='a length measured on an object [m]: "object=1 height=0.12" (or length=)')
@@ -200,7 +200,9 @@ def simulate(
     force: Annotated[
         list[str] | None, Option(help='"object=2 force=0,0,8 from=0.1 to=0.3" [N, s]; also torque= and at=x,y,z')
     ] = None,
-    forces: Annotated[Path | None, Option(help="JSON of force prompts in the public format")] = SimulateOptions.forces,
+    forces: Annotated[
+        Path | None, Option(help="JSON of forces: {scene: [{obj_id, start, end, force}]}")
+    ] = SimulateOptions.forces,
     pin: Annotated[list[str] | None, Option(help="object held fixed; repeatable")] = None,
     velocity: Annotated[
         list[str] | None, Option(help='initial velocity: "object=1 0,0,2" [scene units/s]; repeatable')

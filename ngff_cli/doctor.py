@@ -70,7 +70,7 @@ def _gpu() -> Finding:
     import torch
 
     if not torch.cuda.is_available():
-        return Finding(False, "GPU", "PyTorch finds none and uses the CPU; if there is one, install torch with CUDA")
+        return Finding(False, "GPU", "none found, using the CPU; if there is one, install a CUDA build of PyTorch")
     properties = torch.cuda.get_device_properties(0)
     detail = f"{properties.name}, {properties.total_memory / 2**30:.0f} GiB, CUDA {torch.version.cuda}"
     return Finding(True, "GPU", detail)

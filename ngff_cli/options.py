@@ -12,11 +12,6 @@ import typer
 
 from stages.core.errors import InputError
 
-# Threads that wait for each other sleep instead of spinning: OpenMP and OpenBLAS read these when they are loaded.
-# With other work on the machine a spinning thread takes the core from the one it waits for.
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-os.environ.setdefault("OPENBLAS_THREAD_TIMEOUT", "4")
-
 SceneIn = Annotated[Path, typer.Argument(metavar="SCENE.ply", help="scene to read (.ply)", show_default=False)]
 Device = Annotated[str, typer.Option(help="auto | cpu | cuda")]
 Seed = Annotated[int, typer.Option(help="random seed; the same seed and device give the same result")]

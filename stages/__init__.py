@@ -1,5 +1,12 @@
 """Photos to 4D: the library behind the six commands, one folder per stage."""
 
+import os
+
+# Threads that wait for each other sleep instead of spinning: with other work on the machine a spinning thread takes the
+# core from the one it waits for. OpenMP and OpenBLAS read these when PyTorch and NumPy are first imported.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+os.environ.setdefault("OPENBLAS_THREAD_TIMEOUT", "4")
+
 # command -> (files in, files out), in the order of the pipeline
 PIPELINE = {
     "reconstruct": (("photos/",), ("scene.ply",)),

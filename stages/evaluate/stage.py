@@ -32,7 +32,8 @@ OPTION_KINDS = {  # options that apply to some kinds of data only
 
 
 def run(
-    prediction: Path, truth: Path, out: Path | None, options: EvaluateOptions, as_json: bool = False
+    prediction: Path, truth: Path, out: Path | None = None, options: EvaluateOptions = EvaluateOptions(),  # noqa: B008
+    as_json: bool = False,
 ) -> dict:
     """Compare a prediction with the truth; print a table (or JSON) and return the metrics written to `out`.
 

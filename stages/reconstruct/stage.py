@@ -43,7 +43,7 @@ class Report:
     advice: list[str]
 
 
-def run(imgs: Path, out: Path, options: ReconstructOptions) -> Report:
+def run(imgs: Path, out: Path, options: ReconstructOptions = ReconstructOptions()) -> Report:  # noqa: B008 -- frozen
     """Reconstruct a folder of photos or a video: photos/ -> scene.ply. Scores of held-out photos go to stdout.
 
     Finished steps are kept in a hidden folder next to `out` until the scene is written; an interrupted run leaves it

@@ -42,7 +42,7 @@ class RefineOptions:
             raise InputError("--completer library: name its folder with --library, such as `ngff-lab objects` writes")
         if not self._is_generator and (self.photos or self.weights or self.download):
             raise InputError(
-                f"--photos, --weights and --download are of --completer {GENERATORS}: add that or leave them"
+                f"--photos, --weights and --download only work with --completer {GENERATORS}; add it or drop them"
             )
         if not 0 <= self.outliers < 1000:
             raise InputError(f"--outliers {self.outliers}: give 0 to keep all, or robust deviations such as 3")

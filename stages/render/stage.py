@@ -17,7 +17,9 @@ from stages.render.renderer import Clip, Renderer
 MAX_FILES = 8  # side by side
 
 
-def run(source: Path | Sequence[Path], out: Path | None, options: RenderOptions) -> Path:
+def run(
+    source: Path | Sequence[Path], out: Path | None = None, options: RenderOptions = RenderOptions()  # noqa: B008 -- frozen
+) -> Path:
     """Render a trajectory or a scene, or several side by side, and print the path of the output.
 
     The suffix of `out` selects the format: a video, or an image, which for a trajectory is a contact sheet of 12

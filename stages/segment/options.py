@@ -48,7 +48,9 @@ class SegmentOptions:
         if self._is_network and self.masks is not None:
             raise InputError(f"--backend {self.backend} makes masks itself; give no --masks, or leave --backend out")
         if not self._is_network and (self.photos or self.weights or self.download):
-            raise InputError(f"--photos, --weights and --download are of --backend {NETWORKS}: add that or leave them")
+            raise InputError(
+                f"--photos, --weights and --download only work with --backend {NETWORKS}; add it or drop them"
+            )
         if self.max_objects < 1:
             raise InputError(f"--max-objects {self.max_objects}: must be 1 or more")
         if not 0 < self.min_size < 1:

@@ -101,7 +101,7 @@ def rollout(
              options.engine, card["sha256"][:8], len(ids), len(keypoints.rest), units.length / scene.metres_per_unit,
              units.time, steps)  # fmt: skip
     sleep = SleepState(initial, _starts_awake(initial, units, setup), setup.on_floor)
-    log.info("%d objects at rest sleep until something hits them", int(sleep.asleep.sum()))
+    log.info("%d of %d objects are at rest and stay fixed until touched", int(sleep.asleep.sum()), len(ids))
     lifted = keypoints.rest + setup.lift[[ids.index(int(i)) for i in keypoints.object_id]]
 
     def states() -> Iterator[FrameState]:

@@ -117,7 +117,7 @@ def _particles(
         if choice.guessed:
             message += f"; material not known, taking {choice.name} (--material {o.id}=... changes it)"
         if m.E > E:
-            message += f"; E {m.E:.2g} softened to {E:.2g} Pa at this quality"
+            message += f"; Young's modulus reduced from {m.E:.2g} to {E:.2g} Pa for --quality {options.quality}"
         log.info("%s", message)
     E, density, nu, viscosity, friction, model = rows[body, :6].unbind(1)
     particles = mpm.at_rest(setup.start * unit, volume, mpm.ParticleMaterial(E, nu, density, viscosity, friction))

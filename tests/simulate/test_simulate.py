@@ -113,7 +113,7 @@ def test_torques_and_off_centre_forces_rotate(balls):
 def test_stiff_materials_are_softened_and_logged(balls, caplog):
     caplog.set_level(logging.INFO)
     roll(balls, steps=2, material=("thing=steel",))
-    assert "object 2 (thing): steel" in caplog.text and "2.1e+11 softened to" in caplog.text
+    assert "object 2 (thing): steel" in caplog.text and "reduced from 2.1e+11 to" in caplog.text
 
 
 @pytest.mark.parametrize(("gap", "warned"), [(0.0, True), (0.3, False)])

@@ -56,7 +56,7 @@ class ReplayErrors:
 
 
 def read_recording(path: Path) -> dict[str, np.ndarray]:
-    """The fields of a recording. Raises InputError for a file that is none."""
+    """The fields of a recording. Raises InputError if the file is not a recording."""
     must_exist(path, "a recording (.npz) with " + ", ".join(sorted(RECORDING_FIELDS)))
     try:
         with np.load(path) as file:

@@ -18,7 +18,7 @@ from stages.core.scene.files import sha256
 from stages.lab.dataset.keypoint_motions import KeypointMotions, concatenate_motions, read_motions
 
 VALIDATION_SCENES = 100  # at the end of the last group: they only select the best weights
-# RMS change of velocity from frame to frame [m/s] above which an object is amid an impact, where central differences
+# RMS change of velocity from frame to frame [m/s] above which an object is in a collision, where central differences
 # do not approximate its velocity
 MAX_SPEED_CHANGE = 0.3
 REST_SPEED, REST_FRAMES = 0.02, 5  # scenes slower than this [m/s] in their last frames are taken to remain at rest
@@ -129,7 +129,7 @@ def motion_spread(motions: KeypointMotions) -> Float[Tensor, "b o 3"]:
 
 
 def smooth_frames(motions: KeypointMotions) -> Bool[Tensor, "b t"]:
-    """Frames in which no object is amid an impact (the first and last frame count as such); on the CPU."""
+    """Frames in which no object is in a collision (the first and last frame count as such); on the CPU."""
     inner = torch.stack([smooth_motion(x, motions.dt).all(-1) for x in motions.points]).cpu()
     ends = torch.ones(len(inner), 1, dtype=torch.bool)
     return torch.cat([ends, inner, ends], 1)

@@ -66,7 +66,7 @@ def velocity_loss(
     """Error of velocities in all frames but the last, weighed as positions `options.velocity_time` later.
 
     It penalises oscillations whose positions cancel from step to step. `points` are the true keypoints, from the frame
-    before the first prediction on. The true velocities are central differences; frames of an object amid an impact,
+    before the first prediction on. The true velocities are central differences; frames of an object in a collision,
     where these mean nothing, do not count.
     """
     truth, time = (points[:, 2:] - points[:, :-2]) / (2 * dt), options.velocity_time

@@ -41,7 +41,7 @@ PROGRESS_LINE = (
     "{minutes:6.1f} min {step:7d} steps  horizon {horizon:2d}  loss {loss:.4f}  "
     "RMSE {RMSE:.4f}  FPE {FPE:.4f}  R {R:.3f}"
 )
-SPARSE_EVERY = 4  # every so manieth step uses few keypoints, where that is asked for
+SPARSE_EVERY = 4  # with --few, every fourth step uses fewer keypoints
 VALIDATION_FRAMES = 80  # of the rollouts that select the weights
 SCORES = ("step", "minutes", "RMSE", "FPE", "R")  # of the selected weights, in a card
 

@@ -90,7 +90,7 @@ class SkinnedScene:
     def at(self, x: Float[Tensor, "p 3"], F: Float[Tensor, "p 3 3"]) -> tuple[Gaussians, Float[Tensor, "n 3 3"]]:
         """The deformed Gaussians and the rotation of each, for particle positions [m] and deformation gradients.
 
-        Spherical harmonics are not rotated (as published).
+        All are on the device of the scene. Spherical harmonics are not rotated (as published).
         """
         g, identity = self.rest, torch.eye(3, device=x.device)
         means, quats, scales, R = skin_gaussians(self._index, self._weight, self._particles, x - self._particles,

@@ -125,14 +125,14 @@ def _keypoint_rows(
 def _to_motions(
     scenes: Sequence[SceneConfig], assets: Mapping[int, Asset], points: Float[Tensor, "t s o n 3"], max_objects: int
 ) -> KeypointMotions:
-    ids = torch.tensor([[*c.ids, *[-1] * (max_objects - len(c.ids))] for c in scenes]).reshape(-1, max_objects)
+    ids = [[*c.ids, *[-1] * (max_objects - len(c.ids))] for c in scenes]
     properties = {i: (a.mass, a.E, a.solidity) for i, a in assets.items()}
-    rows = [[properties.get(i, (1.0, 1.0, 1.0)) for i in row] for row in ids.tolist()]
-    mass, E, solidity = torch.tensor(rows).reshape(-1, max_objects, 3).unbind(-1)
-    ones = torch.ones(ids.shape)
-    present = (ids >= 0).to(points.device)
-    points = torch.where(present[:, None, :, None, None], points.transpose(0, 1), 0.0)
+    rows = [[properties.get(i, (1.0, 1.0, 1.0)) for i in row] for row in ids]
+    mass, E, solidity = torch.tensor(rows, device=points.device).reshape(-1, max_objects, 3).unbind(-1)
+    objects = torch.tensor(ids, dtype=torch.int64, device=points.device).reshape(-1, max_objects)
+    ones = torch.ones_like(mass)
+    points = torch.where((objects >= 0)[:, None, :, None, None], points.transpose(0, 1), 0.0)
     return KeypointMotions(
-        names=tuple(c.name for c in scenes), objects=ids, points=points, mass=mass, E=E, nu=POISSON_RATIO * ones,
+        names=tuple(c.name for c in scenes), objects=objects, points=points, mass=mass, E=E, nu=POISSON_RATIO * ones,
         friction=FRICTION * ones, dt=FRAME_INTERVAL, gravity=GRAVITY, box=WALL_BOX, solidity=solidity,
     )  # fmt: skip

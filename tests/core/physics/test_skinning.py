@@ -64,9 +64,12 @@ def test_gaussians_on_a_device_with_keypoints_on_the_cpu(device):
     positions = keypoints.rest @ TURN.mT
     moved = deform(g.to(device), binding, keypoints, positions)
     assert moved.means.device.type == device
-    expected = deform(g, binding, keypoints, positions)
-    for name in ("means", "quats", "scales", "sh"):
-        torch.testing.assert_close(getattr(moved, name).cpu(), getattr(expected, name), rtol=0, atol=1e-5)
+    moved, expected = moved.to("cpu"), deform(g, binding, keypoints, positions)
+    for name in ("means", "scales", "sh"):
+        torch.testing.assert_close(getattr(moved, name), getattr(expected, name), rtol=0, atol=1e-5)
+    # the axes of a Gaussian with two nearly equal scales are ill-conditioned, its covariance is not
+    ours, theirs = covariance(moved.quats, moved.scales), covariance(expected.quats, expected.scales)
+    torch.testing.assert_close(ours, theirs, rtol=0, atol=2e-5 * float(theirs.abs().max()))
 
 
 def test_a_line_rotates_with_its_direction():

@@ -96,9 +96,10 @@ def test_rotated_gaussians_are_stored_rotated(tmp_path, device):
     start = SceneConfig("a", (7,), ((0.1, 0.2, 0.3),), (1.0,))
     scene = SkinnedScene(start, {7: ObjectSkin(g, g, index.int(), weight)}, {7: asset}, device)
     R = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
-    positions, gradients = points @ R.T + centre, R.expand(len(points), 3, 3)
+    positions, gradients = (points @ R.T + centre).to(device), R.expand(len(points), 3, 3).to(device)
     write_frames(tmp_path, scene, [positions], [gradients])
-    torch.testing.assert_close(scene.at(positions, gradients)[0].means, g.means @ R.T + centre, rtol=0, atol=1e-5)
+    means = scene.at(positions, gradients)[0].means.cpu()
+    torch.testing.assert_close(means, g.means @ R.T + centre, rtol=0, atol=1e-5)
     with h5py.File(tmp_path / "0000.h5") as file:
         np.testing.assert_allclose(file["rot"][:], R.T.expand(len(g), 3, 3), atol=1e-3)
         cov = R @ covariance(g.quats, g.scales) @ R.T

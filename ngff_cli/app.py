@@ -264,7 +264,9 @@ def render(
     depth: Annotated[
         bool, Option("--depth", help="render depth: colour-coded in MP4, 16 bit in PNG")
     ] = RenderOptions.depth,
-    ids: Annotated[bool, Option("--ids", help="render each object in one flat colour")] = RenderOptions.ids,
+    ids: Annotated[
+        bool, Option("--ids", help="render each object in one flat colour, with its number and a legend")
+    ] = RenderOptions.ids,
     show_forces: Annotated[
         bool, Option("--show-forces", help="draw an arrow for each active force prompt")
     ] = RenderOptions.show_forces,

@@ -28,7 +28,7 @@ class RenderOptions:
     fps: float | None = None  # frames per second, at unchanged speed of motion; default: the trajectory's
     background: str | None = None  # scene.ply, #rrggbb or a photo that replaces the scene's own background
     depth: bool = False  # render depth: colour-coded in a video, 16 bit in a PNG
-    ids: bool = False  # render each object in one flat colour
+    ids: bool = False  # render each object in one flat colour, with its number and a legend
     show_forces: bool = False  # draw an arrow for each active force prompt
     frame: int | None = None  # render this frame only; -1 is the last
     side_by_side: bool = False  # several files in one image, with the same camera

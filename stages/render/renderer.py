@@ -14,10 +14,12 @@ from stages.core.errors import InputError
 from stages.core.geometry.cameras import centres
 from stages.core.scene.cameras import Cameras
 from stages.core.scene.gaussians import Gaussians
+from stages.core.scene.scene import SceneObject
 from stages.render.animation import Animation
 from stages.render.background import RenderBackground
 from stages.render.camera_paths import camera_path, scale_cameras
 from stages.render.draw import RenderedView, colour_by_object, colour_depth, depth_range, render_view
+from stages.render.object_labels import add_legend, draw_labels, visible_ids
 from stages.render.options import RenderOptions
 from stages.render.overlay import draw_arrows, draw_caption, force_arrows, grid_columns, tile_images
 from stages.render.subject import Subject, find_subject, merge_subjects
@@ -52,9 +54,14 @@ class Clip:
         return colour_by_object(shown) if self.options.ids else shown
 
     def render(self, time: float, cameras: Cameras, indices: list[int]) -> list[RenderedView]:
-        """Views of some of the cameras at a time [s], with force arrows if the options ask for them."""
+        """Views of some of the cameras at a time [s]; with the options, object numbers and force arrows."""
         gaussians = self.gaussians(time)
         views = [render_view(gaussians, cameras, i, self.background) for i in indices]
+        if self.options.ids:
+            objects = self.animation.scene.objects
+            images = [draw_labels(v.image, visible_ids(gaussians, cameras, i), objects)
+                      for v, i in zip(views, indices, strict=True)]  # fmt: skip
+            views = [v._replace(image=image) for v, image in zip(views, images, strict=True)]
         if self.options.show_forces:
             arrows = force_arrows(self.animation, time)
             images = [draw_arrows(v.image, cameras, i, arrows) for v, i in zip(views, indices, strict=True)]
@@ -120,12 +127,19 @@ class Renderer:
     ) -> Image:
         """One image of all views, in a grid of `columns`: colour, or depth in the range `span`; with captions if given.
 
-        The views of each camera are side by side in one cell of the grid.
+        The views of each camera are side by side in one cell of the grid. With --ids a legend is on the right.
         """
         images = [self._side_by_side(row, span) for row in views]
         if captions:
             images = [draw_caption(image, text) for image, text in zip(images, captions, strict=True)]
-        return images[0] if len(images) == 1 else tile_images(images, columns)
+        image = images[0] if len(images) == 1 else tile_images(images, columns)
+        return add_legend(image, self._objects) if self.options.ids else image
+
+    @cached_property
+    def _objects(self) -> list[SceneObject]:
+        """Objects of all clips by number; those of equal number and name once."""
+        named = {(o.id, o.name): o for clip in self.clips for o in clip.animation.scene.objects}
+        return [named[key] for key in sorted(named)]
 
     def _side_by_side(self, row: list[RenderedView], span: tuple[float, float] | None) -> Image:
         images = [v.image if span is None else colour_depth(v.depth, span) for v in row]

@@ -43,7 +43,8 @@ def test_geometric_writes_labels_names_cameras_and_provenance(scene_file, truth,
     assert labelled.objects[0].name == "tower of jelly"
     assert len(labelled.cameras) == len(truth.cameras)
     assert labelled.provenance["command"] == "segment"
-    assert "tower of jelly" in caplog.text and " cm" in caplog.text
+    counts = labelled.gaussians.object_id.bincount().tolist()
+    assert all(f"{o.id}  {o.name}: {counts[o.id]} Gaussians, " in caplog.text for o in labelled.objects)
 
 
 @pytest.mark.parametrize(("side", "axes"), [("height", [2]), ("length", [0, 1, 2])])

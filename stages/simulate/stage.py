@@ -54,7 +54,7 @@ def run(scene: Path, out: Path, options: SimulateOptions = SimulateOptions()) ->
 
 
 def with_objects(scene: Scene, path: Path) -> Scene:
-    """The scene with the objects that have Gaussians; a scene without objects is segmented by geometry first.
+    """The scene with the objects that have Gaussians; one without objects is segmented as by `ngff segment`.
 
     Raises InputError when no object is found.
     """

@@ -2,13 +2,14 @@
 
 import json
 import logging
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import pytest
 import torch
 
 from stages.core.errors import InputError
 from stages.core.geometry.cameras import project
+from stages.core.perception.grouping import GroupingOptions
 from stages.core.raster.rasterise import visibility
 from stages.core.scene.images import write_labels
 from stages.core.scene.scene_ply import read_scene, write_scene
@@ -45,6 +46,10 @@ def test_geometric_writes_labels_names_cameras_and_provenance(scene_file, truth,
     assert labelled.provenance["command"] == "segment"
     counts = labelled.gaussians.object_id.bincount().tolist()
     assert all(f"{o.id}  {o.name}: {counts[o.id]} Gaussians, " in caplog.text for o in labelled.objects)
+
+
+def test_defaults_are_those_of_the_grouping_that_simulate_uses():
+    assert all(getattr(SegmentOptions, f.name) == f.default for f in fields(GroupingOptions))
 
 
 @pytest.mark.parametrize(("side", "axes"), [("height", [2]), ("length", [0, 1, 2])])

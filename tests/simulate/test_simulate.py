@@ -14,11 +14,13 @@ from stages.core.scene.gaussians import concatenate
 from stages.core.scene.scene import Scene, SceneObject
 from stages.core.scene.scene_ply import read_scene, write_scene
 from stages.core.scene.trajectory import Trajectory, read_trajectory
+from stages.segment.stage import run as segment
 from stages.simulate import mpm as engine
 from stages.simulate.options import QUALITIES, MpmQuality, SimulateOptions
 from stages.simulate.setup import set_up_scene
 from stages.simulate.stage import run, with_objects
 from tests.conftest import ball
+from tests.segment.tabletop import three_apart
 
 # A ball of 9 kg in point contact indents by 5 mm (Hertz), twice that when set down suddenly, and by a few tenths of a
 # cell (here 5 cm) until enough particles carry it.
@@ -210,6 +212,17 @@ def test_doubled_resolution_keeps_bodies_on_the_floor(balls):
     assert fine.bodies.spacing == coarse.bodies.spacing / 2 and len(fine.start) > 6 * len(coarse.start)
     for s in (coarse, fine):
         assert float(s.start[s.bodies.body == 0, 2].quantile(0.01)) == pytest.approx(1.5 * s.bodies.spacing, rel=0.3)
+
+
+def test_objects_of_a_scene_without_labels_are_those_of_segment(tmp_path):
+    scene = three_apart(noise=0.002)
+    blank = replace(scene.gaussians, object_id=torch.zeros_like(scene.gaussians.object_id))
+    write_scene(tmp_path / "scene.ply", replace(scene, gaussians=blank))
+    segment(tmp_path / "scene.ply", tmp_path / "labelled.ply")
+    labelled, scene = (read_scene(tmp_path / name) for name in ("labelled.ply", "scene.ply"))
+    found = with_objects(scene, tmp_path / "scene.ply")
+    assert torch.equal(found.gaussians.object_id, labelled.gaussians.object_id)
+    assert found.objects == labelled.objects and len(found.objects) == 3
 
 
 @pytest.mark.gpu

@@ -7,11 +7,11 @@ from dataclasses import replace
 import torch
 
 from stages.core.geometry.neighbours import knn
+from stages.core.perception.boundary_refinement import BOUNDARY_WIDTH, HEIGHT_RESOLUTION, MIN_VISIBLE_WEIGHT
 from stages.core.perception.support import Support
 from stages.core.perception.visibility import summed_view_directions
 from stages.core.scene.gaussians import Gaussians
 from stages.core.scene.scene import Scene
-from stages.segment.boundary_refinement import BOUNDARY_WIDTH, HEIGHT_RESOLUTION, MIN_VISIBLE_WEIGHT
 
 MIN_OPACITY = 0.1  # of the Gaussians that are compared
 NEIGHBOURS = 8  # Gaussians of the table that each Gaussian of an object is compared with

@@ -5,8 +5,8 @@ from dataclasses import replace
 import pytest
 import torch
 
+from stages.core.perception.false_positives import remove_false_positives
 from stages.core.perception.support import find_support
-from stages.segment.false_positives import remove_false_positives
 from tests.segment.tabletop import block, scene_of, table_gaussians, three_apart
 
 

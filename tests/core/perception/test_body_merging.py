@@ -2,9 +2,9 @@
 
 import torch
 
+from stages.core.perception.body_merging import merge_bodies
 from stages.core.perception.support import find_support
 from stages.lab.assets.shapes import box, ellipsoid
-from stages.segment.body_merging import merge_bodies
 from tests.segment.tabletop import coloured_gaussians, scene_of, table_gaussians
 
 

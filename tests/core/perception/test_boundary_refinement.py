@@ -5,9 +5,9 @@ from dataclasses import replace
 import pytest
 import torch
 
+from stages.core.perception.boundary_refinement import MIN_VISIBLE_WEIGHT, refine_boundaries
 from stages.core.perception.support import find_support
 from stages.core.perception.visibility import summed_view_directions
-from stages.segment.boundary_refinement import MIN_VISIBLE_WEIGHT, refine_boundaries
 from tests.segment.tabletop import block, scene_of, table_gaussians, three_apart
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from stages.core.perception.grouping import GroupingOptions, group_objects
+from stages.core.perception.grouping import GroupingOptions
+from stages.core.perception.segmentation import segment_by_geometry
 from stages.core.scene.scene import Scene
 from stages.segment.options import SegmentOptions
 
@@ -10,4 +11,4 @@ from stages.segment.options import SegmentOptions
 def segment(scene: Scene, options: SegmentOptions) -> Scene:
     """Objects on the supporting plane, as `ngff simulate` finds them in a scene without labels."""
     settings = GroupingOptions(options.max_objects, options.min_size, options.detail, options.seed)
-    return group_objects(scene, settings)
+    return segment_by_geometry(scene, settings)

@@ -65,9 +65,9 @@ def with_objects(scene: Scene, path: Path) -> Scene:
             log.warning("object %d (%s) has no Gaussians and is skipped", o.id, o.name)
     if present:
         return replace(scene, objects=present)
-    from stages.core.perception.grouping import group_objects  # noqa: PLC0415 -- only unlabelled scenes need it
+    from stages.core.perception.segmentation import segment_by_geometry  # noqa: PLC0415 -- only unlabelled scenes need it
 
-    grouped = group_objects(scene)
+    grouped = segment_by_geometry(scene)
     if not grouped.objects or not torch.any(grouped.gaussians.object_id > 0):
         raise InputError(f"{path}: no objects were found in it; label them with `ngff segment`")
     names = ", ".join(f"{o.id} ({o.name})" for o in grouped.objects)

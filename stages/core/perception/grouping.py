@@ -13,9 +13,6 @@ from torch import Tensor
 from stages.core.geometry.cameras import centres
 from stages.core.geometry.neighbours import knn
 from stages.core.geometry.rotations import matrix
-from stages.core.perception.body_merging import merge_bodies
-from stages.core.perception.boundary_refinement import refine_boundaries
-from stages.core.perception.false_positives import remove_false_positives
 from stages.core.perception.object_naming import object_names
 from stages.core.perception.region_growing import cielab_colours, grow_objects, table_colour
 from stages.core.perception.region_merging import RegionMerger, Voxels, oversegment, voxel_edges
@@ -56,24 +53,20 @@ def group_objects(scene: Scene, grouping: GroupingOptions = GroupingOptions()) -
     """The scene with an object_id for every Gaussian (0 for the background) and its objects, largest first.
 
     The supporting plane is removed, the rest is oversegmented into small homogeneous regions, and these are merged
-    by similarity. Objects mostly outside the table become background. Parts of one body are then merged, boundaries
-    refined, and texture of the table removed. In a scene with a wall and no floor, objects on the wall are found in
-    the same way, without these three passes.
+    by similarity. Objects mostly outside the table become background. In a scene with a wall and no floor, objects
+    on the wall are found in the same way.
     """
     view = view_extent(scene)
     wall = find_wall(scene, view, grouping.seed)
-    if wall is not None:
-        laid = rotate_wall_to_floor(scene, wall)
-        view = view_extent(laid)
-        ids = _grouped(laid, view, find_support(laid, view, grouping.seed), grouping, MAX_WALL_OBJECT).object_id
-        return name_objects(replace(scene, gaussians=replace(scene.gaussians, object_id=ids)), None)
-    support = find_support(scene, view, grouping.seed)
-    g = _by_size(_grouped(scene, view, support, grouping, MAX_TABLE_OBJECT))
-    if support is not None and (g.object_id > 0).any():
-        g = merge_bodies(g, support)
-        g = refine_boundaries(replace(scene, gaussians=g), support)
-        g = remove_false_positives(replace(scene, gaussians=g), support)
-    return name_objects(replace(scene, gaussians=g), support)
+    if wall is None:
+        support = find_support(scene, view, grouping.seed)
+        return name_objects(
+            replace(scene, gaussians=_grouped(scene, view, support, grouping, MAX_TABLE_OBJECT)), support
+        )
+    laid = rotate_wall_to_floor(scene, wall)
+    view = view_extent(laid)
+    ids = _grouped(laid, view, find_support(laid, view, grouping.seed), grouping, MAX_WALL_OBJECT).object_id
+    return name_objects(replace(scene, gaussians=replace(scene.gaussians, object_id=ids)), None)
 
 
 def _grouped(
@@ -263,15 +256,12 @@ def _objects(
 
 def name_objects(scene: Scene, support: Support | None) -> Scene:
     """The scene with its objects renumbered by decreasing count of Gaussians, and default names."""
-    g = _by_size(scene.gaussians)
-    objects = tuple(SceneObject(i, name) for i, name in enumerate(object_names(g, support), start=1))
-    return replace(scene, gaussians=g, objects=objects)
-
-
-def _by_size(g: Gaussians) -> Gaussians:
-    """The Gaussians with objects renumbered by decreasing count of Gaussians."""
+    g = scene.gaussians
     counts = torch.bincount(g.object_id)
     order = [i for i in counts.argsort(descending=True, stable=True).tolist() if i > 0 and counts[i] > 0]
     number = torch.zeros(len(counts), dtype=torch.int64)
     number[order] = torch.arange(1, len(order) + 1)
-    return replace(g, object_id=number[g.object_id])
+    g = replace(g, object_id=number[g.object_id])
+    names = object_names(g, support)
+    objects = tuple(SceneObject(i, name) for i, name in enumerate(names, start=1))
+    return replace(scene, gaussians=g, objects=objects)

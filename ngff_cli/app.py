@@ -107,11 +107,15 @@ def segment(
         Path | None, Option(help="folder of label images named as the photos (0 background, 1... objects)")
     ] = SegmentOptions.masks,
     boxes: Annotated[
-        Path | None, Option(help=f"prompts.json: boxes in view 0 [px] and names; for {NETWORKS} also points")
+        Path | None, Option(help=f"prompts.json: boxes in the first photo [px] and names; for {NETWORKS} also points")
     ] = SegmentOptions.boxes,
     photos: Annotated[
         Path | None, Option(help=f"for {NETWORKS}: folder of the scene's photos; default: rendered images")
     ] = SegmentOptions.photos,
+    undistorted: Annotated[
+        bool, Option("--undistorted", help="masks, boxes and photos are of undistorted views; default: of the photos "
+                     "as taken")
+    ] = SegmentOptions.undistorted,
     weights: Annotated[
         Path | None, Option(help=f"for {NETWORKS}: file or folder of its weights; default: the folder of its name in "
                             "$NGFF_WEIGHTS and ~/.cache/ngff")
@@ -137,9 +141,9 @@ def segment(
     from stages.segment.stage import run
 
     options = SegmentOptions(
-        backend=backend, masks=masks, boxes=boxes, photos=photos, weights=weights, download=download, names=names,
-        max_objects=max_objects, min_size=min_size, detail=detail, scale_reference=scale_reference, seed=seed,
-        device=device,
+        backend=backend, masks=masks, boxes=boxes, photos=photos, undistorted=undistorted, weights=weights,
+        download=download, names=names, max_objects=max_objects, min_size=min_size, detail=detail,
+        scale_reference=scale_reference, seed=seed, device=device,
     )  # fmt: skip
     run(scene, out, options)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -64,7 +65,7 @@ def _rescale_to_photos(photos: Photos, cameras: Cameras) -> Cameras:
     sizes = torch.tensor([photos.size(i) for i in range(len(photos))])
     ratio = sizes / cameras.sizes
     Ks = torch.stack([resize(K, float(sx), float(sy)) for K, (sx, sy) in zip(cameras.Ks, ratio, strict=True)])
-    return Cameras(cameras.viewmats, Ks, sizes, cameras.names)
+    return replace(cameras, Ks=Ks, sizes=sizes)
 
 
 def _typical_depths(model: sfm.SparseModel) -> Tensor:

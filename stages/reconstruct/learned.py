@@ -6,6 +6,7 @@ Source of π³: Wang et al. 2025, arXiv:2507.13347.
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -118,6 +119,7 @@ def assemble(
     confident = pointmaps.confident_pixels(geometry)
     log.info("the network is confident in %.0f %% of the pixels", 100 * float(confident.float().mean()))
     cameras = pointmaps.cameras_from_pointmaps(geometry, confident, photos.names)
+    cameras = replace(cameras, photos=network_input.photo_intrinsics(photos, cameras))
     trained, held_out = split_holdout(len(photos), options.holdout)
     depth = geometry.points[..., 2]
     maps = pointmaps.depth_maps(depth[trained], confident[trained], cameras[trained])

@@ -8,7 +8,9 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from stages.core.geometry.cameras import resize as resize_K
 from stages.core.models.pi3.dinov2 import PATCH
+from stages.core.scene.cameras import Cameras, PhotoIntrinsics
 from stages.core.scene.images import resize
 from stages.reconstruct.photos import Photos
 
@@ -34,15 +36,34 @@ def crop_photos(photos: Photos, longest: int | None = None) -> list[UInt8[Tensor
 
     The optical axis remains in the centre and pixels remain square.
     """
-    width, height = common_size(photos, longest)
-    out = []
-    for image in photos.images:
-        h, w = image.shape[:2]
-        shrink = min(w / width, h / height)
-        wide, high = min(w, round(width * shrink)), min(h, round(height * shrink))
-        top, left = (h - high) // 2, (w - wide) // 2
+    target, out = common_size(photos, longest), []
+    for i, image in enumerate(photos.images):
+        left, top, wide, high = _centre(photos.size(i), target)
         out.append(image[top : top + high, left : left + wide].contiguous())
     return out
+
+
+def photo_intrinsics(photos: Photos, cameras: Cameras) -> PhotoIntrinsics:
+    """Intrinsics of the whole photos, in pixels of their files, for cameras of their cropped centres; no distortion.
+
+    `cameras` have the size `common_size`.
+    """
+    Ks = []
+    for i, (K, (w, h)) in enumerate(zip(cameras.Ks, cameras.sizes.tolist(), strict=True)):
+        left, top, wide, high = _centre(photos.size(i), (w, h))
+        whole = resize_K(K, wide / w, high / h)
+        whole[:2, 2] += torch.tensor([left, top])
+        Ks.append(resize_K(whole, *(f / s for f, s in zip(photos.file_size(i), photos.size(i), strict=True))))
+    sizes = torch.tensor([photos.file_size(i) for i in range(len(photos))])
+    return PhotoIntrinsics(torch.stack(Ks), sizes, torch.zeros(len(photos), 5))
+
+
+def _centre(size: tuple[int, int], target: tuple[int, int]) -> tuple[int, int, int, int]:
+    """Left, top, width and height of the largest centred part of an image with the aspect ratio of `target`."""
+    (w, h), (width, height) = size, target
+    shrink = min(w / width, h / height)
+    wide, high = min(w, round(width * shrink)), min(h, round(height * shrink))
+    return (w - wide) // 2, (h - high) // 2, wide, high
 
 
 def common_size(photos: Photos, longest: int | None = None) -> tuple[int, int]:

@@ -39,6 +39,7 @@ class LoadedImage(NamedTuple):
     name: str
     image: UInt8[Tensor, "h w 3"]
     focal: float  # from EXIF, in pixels of `image`; 0 where unknown
+    file_size: tuple[int, int]  # width, height before `image` was reduced [px]
 
 
 def read_photos(path: Path, side: int = 0, min_count: int = 2) -> Photos:
@@ -55,8 +56,8 @@ def read_photos(path: Path, side: int = 0, min_count: int = 2) -> Photos:
         raise InputError(f"{path}: is neither a folder of photos nor a video ({' '.join(sorted(VIDEO_SUFFIXES))})")
     else:
         loaded = _from_folder(path, side, min_count)
-    names, images, focals = zip(*loaded, strict=True)
-    return Photos(images, names, focals, path)
+    names, images, focals, file_sizes = zip(*loaded, strict=True)
+    return Photos(images, names, focals, path, file_sizes)
 
 
 def _from_folder(folder: Path, side: int, min_count: int) -> list[LoadedImage]:
@@ -121,7 +122,9 @@ def _read_files(files: list[Path], side: int, unread: dict[str, str]) -> Iterato
             unread[file.name] = str(error)
             continue
         bounded = _limit_size(to_bytes(image), side)
-        yield i, LoadedImage(file.name, bounded, _exif_focal(file) * max(bounded.shape[:2]) / max(image.shape[:2]))
+        height, width = image.shape[:2]
+        focal = _exif_focal(file) * max(bounded.shape[:2]) / max(width, height)
+        yield i, LoadedImage(file.name, bounded, focal, (width, height))
 
 
 def _is_truncated(file: Path) -> bool:
@@ -179,8 +182,10 @@ def _frames(path: Path, times: list[float], spans: int, side: int) -> Iterator[t
                 shrink = min(1.0, side / max(frame.width, frame.height))
                 size = max(2, round(frame.width * shrink)), max(2, round(frame.height * shrink))
                 pixels = frame.reformat(*size, format="rgb24", interpolation="AREA").to_ndarray()
-                pixels = np.rot90(pixels, round(getattr(frame, "rotation", 0) / 90))
-                yield span, LoadedImage(f"frame_{i:05d}", torch.from_numpy(np.ascontiguousarray(pixels)), 0.0)
+                turns = round(getattr(frame, "rotation", 0) / 90)
+                full = (frame.height, frame.width) if turns % 2 else (frame.width, frame.height)
+                image = torch.from_numpy(np.ascontiguousarray(np.rot90(pixels, turns)))
+                yield span, LoadedImage(f"frame_{i:05d}", image, 0.0, full)
         except av.FFmpegError as error:
             log.warning("%s: is truncated or damaged (%s); the frames before are used", path, error.strerror)
 

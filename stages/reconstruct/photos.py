@@ -6,12 +6,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
-import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from stages.core.scene.cameras import Cameras, LensDistortion
+from stages.core.geometry.cameras import resize
+from stages.core.scene.cameras import Cameras, LensDistortion, PhotoIntrinsics
+from stages.core.scene.lens import HALF_PIXEL, Undistortion
 from stages.core.scene.scene import Scene
 
 
@@ -23,16 +24,22 @@ class Photos:
     names: tuple[str, ...]
     focals: tuple[float, ...]  # from EXIF, in pixels of `images`; 0 where unknown
     source: Path  # folder or video, for error messages
+    file_sizes: tuple[tuple[int, int], ...] = ()  # width, height of the files [px]; empty: those of `images`
 
     def __len__(self) -> int:
         return len(self.images)
 
     def __getitem__(self, index: list[int]) -> Photos:
-        return Photos(*(tuple(x[i] for i in index) for x in (self.images, self.names, self.focals)), self.source)
+        images, names, focals = (tuple(x[i] for i in index) for x in (self.images, self.names, self.focals))
+        return Photos(images, names, focals, self.source, tuple(self.file_size(i) for i in index))
 
     def size(self, i: int) -> tuple[int, int]:
         """Width and height of photo i [px]."""
         return self.images[i].shape[1], self.images[i].shape[0]
+
+    def file_size(self, i: int) -> tuple[int, int]:
+        """Width and height of photo i before it was reduced [px]."""
+        return self.file_sizes[i] if self.file_sizes else self.size(i)
 
 
 @dataclass(frozen=True)
@@ -74,33 +81,32 @@ def split_holdout(count: int, holdout: int) -> tuple[list[int], list[int]]:
 def undistort(photos: Photos, cameras: Cameras, lenses: LensDistortion, side: int) -> Views:
     """Pinhole views of the photos named in `cameras`, at most `side` wide or high.
 
-    `cameras` are in pixels of `photos`. The new K is chosen so that every pixel of a view is inside the photo.
+    `cameras` are in pixels of `photos`. The new K is chosen so that every pixel of a view is inside the photo. The
+    cameras of the views remember the photos, in pixels of their files.
     """
     row = {name: i for i, name in enumerate(photos.names)}
-    images, Ks, sizes = [], [], []
+    images, Ks, sizes, photo_Ks, file_sizes = [], [], [], [], []
     for c, name in enumerate(cameras.names):
-        source = photos.images[row[name]].numpy()
-        height, width = source.shape[:2]
+        i, lens = row[name], lenses.coefficients[c]
+        width, height = photos.size(i)
+        K = _pinhole_K(cameras.Ks[c], lens, (width, height))
+        pixels = Undistortion(cameras.Ks[c], (width, height), lens, K, (width, height)).image(photos.images[i])
         scale = min(1.0, side / max(width, height))
-        size = round(width * scale), round(height * scale)
-        K = cameras.Ks[c].double().numpy()
-        pixels, K = _pinhole(source, K, lenses.coefficients[c].double().numpy())
+        size, file = (round(width * scale), round(height * scale)), photos.file_size(i)
         if scale < 1:
-            pixels = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
-            K = np.diag([size[0] / width, size[1] / height, 1]) @ K
-        images.append(torch.from_numpy(pixels))
-        Ks.append(torch.from_numpy(K).float())
+            pixels = torch.from_numpy(cv2.resize(pixels.numpy(), size, interpolation=cv2.INTER_AREA))
+        images.append(pixels)
+        Ks.append(resize(K, size[0] / width, size[1] / height))
         sizes.append(size)
-    return Views(tuple(images), Cameras(cameras.viewmats, torch.stack(Ks), torch.tensor(sizes), cameras.names))
+        photo_Ks.append(resize(cameras.Ks[c], file[0] / width, file[1] / height))
+        file_sizes.append(file)
+    taken = PhotoIntrinsics(torch.stack(photo_Ks), torch.tensor(file_sizes), lenses.coefficients)
+    return Views(tuple(images), Cameras(cameras.viewmats, torch.stack(Ks), torch.tensor(sizes), cameras.names, taken))
 
 
-def _pinhole(pixels: np.ndarray, K: np.ndarray, lens: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The undistorted image, same size, and its K; pixel centres are at 0 in OpenCV, at +0.5 here."""
+def _pinhole_K(K: Float[Tensor, "3 3"], lens: Float[Tensor, "5"], size: tuple[int, int]) -> Float[Tensor, "3 3"]:
+    """K of the largest undistorted view of the same size that shows only pixels of the photo."""
     if not lens.any():
-        return pixels, K
-    height, width = pixels.shape[:2]
-    half = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
-    K_cv = K - half
-    new, _ = cv2.getOptimalNewCameraMatrix(K_cv, lens, (width, height), 0)
-    maps = cv2.initUndistortRectifyMap(K_cv, lens, None, new, (width, height), cv2.CV_32FC1)
-    return cv2.remap(pixels, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), new + half
+        return K
+    new, _ = cv2.getOptimalNewCameraMatrix((K.double() - HALF_PIXEL).numpy(), lens.double().numpy(), size, 0)
+    return (torch.from_numpy(new) + HALF_PIXEL).float()

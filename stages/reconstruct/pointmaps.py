@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float, UInt8
@@ -96,7 +98,7 @@ def views_at_size(cropped: list[UInt8[Tensor, "_ _ 3"]], cameras: Cameras, side:
         images.append(resize_bytes(image, *size) if shrink < 1 else image)
         Ks.append(resize(K, size[0] / old[0], size[1] / old[1]))
     sizes = torch.tensor([[image.shape[1], image.shape[0]] for image in images])
-    return Views(tuple(images), Cameras(cameras.viewmats, torch.stack(Ks), sizes, cameras.names))
+    return Views(tuple(images), replace(cameras, Ks=torch.stack(Ks), sizes=sizes))
 
 
 def upsample(m: DepthMap, size: tuple[int, int]) -> DepthMap:

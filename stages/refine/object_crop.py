@@ -20,6 +20,7 @@ from stages.core.perception.visibility import MAX_VISIBILITY_SIDE
 from stages.core.raster.rasterise import rasterise, rasterise_features, visibility
 from stages.core.scene.gaussians import Gaussians
 from stages.core.scene.images import list_photos, read_image
+from stages.core.scene.lens import Undistortion
 from stages.core.scene.scene import Scene
 
 CROP_FILL = 0.8  # longer side of the object, relative to the side of the crop, as in the public code
@@ -55,7 +56,9 @@ def crop_object(scene: Scene, own: Gaussians, side: int, photos: Path | None = N
     if files is None:
         image = rasterise(scene.gaussians, viewmat[None], K[None], side, side).rgb[0].clamp(0, 1)
     else:
-        image = _rotated_photo(read_image(files[view]), scene, view, viewmat, K, side)
+        photo = read_image(files[view])
+        photo = Undistortion.of(scene.cameras, view, (photo.shape[1], photo.shape[0])).image(photo)
+        image = _rotated_photo(photo, scene, view, viewmat, K, side)
     alone = _mask(scene.gaussians, own, viewmat, K, side)[..., None]
     eye = centres(viewmat[None])[0]
     elevation = _elevation(eye, centre)
@@ -132,7 +135,7 @@ def _mask(
 def _rotated_photo(
     photo: Float[Tensor, "h w 3"], scene: Scene, view: int, viewmat: Tensor, K: Tensor, side: int
 ) -> Float[Tensor, "s s 3"]:
-    """A photo warped to the rotated camera by the homography K_photo R_photo R^T K^-1; white outside of it."""
+    """An undistorted photo warped to the rotated camera by K_photo R_photo R^T K^-1; white outside of it."""
     width, height = scene.cameras.sizes[view].tolist()
     K_photo = resize(scene.cameras.Ks[view], photo.shape[1] / width, photo.shape[0] / height).double()
     R = (scene.cameras.viewmats[view, :3, :3] @ viewmat[:3, :3].mT).double()

@@ -16,6 +16,7 @@ from tqdm import tqdm
 
 from stages.core.errors import InputError
 from stages.core.geometry.cameras import centres
+from stages.core.scene.lens import photo_of
 from stages.core.scene.scene import Scene
 from stages.segment.options import NETWORKS, SegmentOptions
 from stages.segment.prompts import read_prompts
@@ -39,14 +40,15 @@ def segment(scene: Scene, options: SegmentOptions) -> Scene:
     if scene.cameras is None or not len(scene.cameras):
         raise InputError("--boxes: the scene has no cameras; use one that `ngff reconstruct` wrote")
     size = scene.cameras.sizes[0].tolist()
-    prompts = read_prompts(options.boxes, size)
+    prompts = read_prompts(options.boxes, scene.cameras, options.undistorted)
     if prompts.boxes is None:
         raise InputError(f"{options.boxes}: has points and no bbox; points are for --backend {NETWORKS}")
-    boxes_fraction = prompts.boxes.clamp_min(0) / torch.tensor([*size, *size])
+    boxes_fraction = prompts.boxes / torch.tensor([*size, *size])
     for box, name in zip(boxes_fraction, prompts.names, strict=True):
-        if bool((box[:2] >= 1).any()) or not bool((box[2:] > box[:2]).all()):
+        if not bool((box[2:] > box[:2]).all()):
+            width, height = photo_of(scene.cameras, 0, options.undistorted)[1]
             raise InputError(f"{options.boxes}: the box of {name} lies outside of the first view, which has "
-                             f'{size[0]}x{size[1]} pixels; for another image size, add "size": [w, h]')  # fmt: skip
+                             f'{width}x{height} pixels; for another image size, add "size": [w, h]')  # fmt: skip
     votes = torch.zeros(len(scene.gaussians), 1 + len(boxes_fraction))
     for view in tqdm(nearest_first(scene), desc="segmenting", unit="view", leave=False):
         footprint = ViewFootprint.of(scene, view)

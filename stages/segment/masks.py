@@ -11,9 +11,10 @@ from tqdm import tqdm
 
 from stages.core.errors import InputError
 from stages.core.scene.images import read_labels
+from stages.core.scene.lens import Undistortion
 from stages.core.scene.scene import Scene
 from stages.segment.options import SegmentOptions
-from stages.segment.view_images import check_aspect_ratio, match_files
+from stages.segment.view_images import match_files
 from stages.segment.voting import apply_votes, collect_votes
 
 
@@ -26,18 +27,18 @@ def segment(scene: Scene, options: SegmentOptions) -> Scene:
         raise InputError("--masks: the scene has no cameras; use one that `ngff reconstruct` wrote")
     files = match_files(options.masks, scene.cameras.names, "label image", "--masks")
     bar = tqdm(files.items(), unit="mask")
-    votes = collect_votes(scene, ((view, _labels(scene, view, file)) for view, file in bar))
+    votes = collect_votes(scene, ((view, _labels(scene, view, file, options)) for view, file in bar))
     return apply_votes(scene, votes, read_names(options.masks), str(options.masks), options.seed)
 
 
-def _labels(scene: Scene, view: int, file: Path) -> Int[Tensor, "h w"]:
-    """A label image of any size; raises InputError unless it has the photo's aspect ratio."""
+def _labels(scene: Scene, view: int, file: Path, options: SegmentOptions) -> Int[Tensor, "h w"]:
+    """A label image of any size, undistorted; raises InputError unless it has the photo's aspect ratio."""
     labels = read_labels(file)
     try:
-        check_aspect_ratio(scene, view, labels.shape[1], labels.shape[0])
+        lens = Undistortion.of(scene.cameras, view, (labels.shape[1], labels.shape[0]), options.undistorted)
     except InputError as error:
         raise InputError(f"--masks: the label image of {error}") from error
-    return labels
+    return lens.labels(labels)
 
 
 def read_names(folder: Path) -> dict[int, str]:

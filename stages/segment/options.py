@@ -30,8 +30,9 @@ class SegmentOptions:
 
     backend: str = "geometric"  # --masks and --boxes select their own backend, unless this is a network
     masks: Path | None = None  # folder of label images, named as the photos: 0 background, 1... the objects
-    boxes: Path | None = None  # prompts.json in the public format: boxes (for networks also points) in the first view
+    boxes: Path | None = None  # prompts.json in the public format: boxes (for networks also points) in the first photo
     photos: Path | None = None  # folder of the scene's photos, for networks; by default the scene is rendered
+    undistorted: bool = False  # masks, boxes and photos are in pixels of the undistorted views, not of photos as taken
     weights: Path | None = None  # of a network: model.safetensors, its config.json next to it, or the folder of both
     download: bool = False  # download missing weights
     names: str = ""  # "1=duck,2=bowl": replaces the automatic names
@@ -51,6 +52,8 @@ class SegmentOptions:
             raise InputError(
                 f"--photos, --weights and --download only work with --backend {NETWORKS}; add it or drop them"
             )
+        if self.undistorted and not (self.masks or self.boxes or self.photos):
+            raise InputError("--undistorted: only applies to --masks, --boxes and --photos; add one of them or drop it")
         if self.max_objects < 1:
             raise InputError(f"--max-objects {self.max_objects}: must be 1 or more")
         if not 0 < self.min_size < 1:

@@ -35,8 +35,9 @@ def segment_with(
     name = options.backend
     if scene.cameras is None or not len(scene.cameras):
         raise InputError(f"--backend {name}: the scene has no cameras; use one that `ngff reconstruct` wrote")
-    images = view_images(scene, options.photos)
-    prompts = read_prompts(options.boxes, scene.cameras.sizes[0].tolist()) if options.boxes is not None else None
+    images = view_images(scene, options.photos, options.undistorted)
+    boxes = options.boxes
+    prompts = read_prompts(boxes, scene.cameras, options.undistorted) if boxes is not None else None
     if prompts is not None and images.views[0] != 0:
         raise InputError(f"{options.photos}: lacks {scene.cameras.names[0]}, the photo that --boxes is about")
     network = load(options, pick_device(options.device))

@@ -11,23 +11,26 @@ from jaxtyping import Float
 from torch import Tensor
 
 from stages.core.errors import InputError
+from stages.core.scene.cameras import Cameras
 from stages.core.scene.files import must_exist
+from stages.core.scene.lens import Undistortion, photo_of
 
 
 @dataclass(frozen=True)
 class ObjectPrompts:
     """One row per object; boxes or points may be None, not both."""
 
-    boxes: Float[Tensor, "o 4"] | None  # x0 y0 x1 y1 [px] of view 0
-    points: Float[Tensor, "o 2"] | None  # x y inside the object [px] of view 0
+    boxes: Float[Tensor, "o 4"] | None  # x0 y0 x1 y1 [px] of the undistorted view 0
+    points: Float[Tensor, "o 2"] | None  # x y inside the object [px] of the undistorted view 0
     names: tuple[str, ...]
 
 
-def read_prompts(path: Path, size: tuple[int, int] | None = None) -> ObjectPrompts:
+def read_prompts(path: Path, cameras: Cameras, undistorted: bool = False) -> ObjectPrompts:
     """prompts.json in the public format: {"bbox": [[x0, y0, x1, y1]..], "center_point": [[u, v]..], "text": [..]}.
 
-    Either of the first two may be absent or empty. "size": [width, height] is the size of the image that the
-    coordinates refer to, where it differs from `size`, that of view 0. Raises InputError for an invalid file.
+    Either of the first two may be absent or empty. Coordinates are those of the first photo as taken, or with
+    `undistorted` those of its undistorted view; "size": [width, height] is the size of the image that they refer to,
+    where it was resized. Raises InputError for an invalid file.
     """
     must_exist(path, "a prompts.json with bbox or center_point, and text")
     try:
@@ -35,9 +38,9 @@ def read_prompts(path: Path, size: tuple[int, int] | None = None) -> ObjectPromp
         boxes = torch.tensor(data.get("bbox") or [], dtype=torch.float32).reshape(-1, 4)
         points = torch.tensor(data.get("center_point") or [], dtype=torch.float32).reshape(-1, 2)
         count = len(boxes) or len(points)
-        if size is not None:
-            scale = torch.tensor(size) / torch.tensor(data.get("size") or size).reshape(2)
-            boxes, points = boxes * scale.repeat(2), points * scale
+        width, height = (int(side) for side in data.get("size") or photo_of(cameras, 0, undistorted)[1])
+        if width < 1 or height < 1:
+            raise ValueError(f"size {width}x{height}")
         names = tuple(str(name) for name in data.get("text") or [f"object_{i + 1}" for i in range(count)])
     except (ValueError, KeyError, TypeError, AttributeError, RuntimeError) as error:
         raise _wrong(path, repr(error)) from error
@@ -48,6 +51,13 @@ def read_prompts(path: Path, size: tuple[int, int] | None = None) -> ObjectPromp
                          "each, or of boxes or points none")  # fmt: skip
     if not bool((boxes[:, 2:] > boxes[:, :2]).all()):
         raise InputError(f"{path}: a box has no area; the order is x0, y0, x1, y1 in pixels of the first photo")
+    try:
+        lens = Undistortion.of(cameras, 0, (width, height), undistorted)
+    except InputError as error:
+        raise InputError(f"{path}: size of {error}") from error
+    boxes, points = lens.boxes(boxes), lens.points(points)
+    if not points.isfinite().all():
+        raise InputError(f"{path}: a center_point is where the lens of {cameras.names[0]} shows nothing")
     return ObjectPrompts(boxes if len(boxes) else None, points if len(points) else None, names)
 
 

@@ -15,11 +15,11 @@ from stages.core.geometry.cameras import resize as resize_K
 from stages.core.raster.rasterise import rasterise
 from stages.core.scene.formats import IMAGE_SUFFIXES
 from stages.core.scene.images import read_image
+from stages.core.scene.lens import Undistortion
 from stages.core.scene.scene import Scene
 
 log = logging.getLogger(__name__)
 MAX_RENDER_SIDE = 1024  # longest side of a rendered view [px]
-ASPECT_TOLERANCE = 0.03  # relative difference of the aspect ratios of a photo and its camera
 
 
 @dataclass(frozen=True)
@@ -33,16 +33,16 @@ class ViewImages:
         return len(self.views)
 
 
-def view_images(scene: Scene, photos: Path | None = None) -> ViewImages:
-    """The photos in folder `photos` that the scene's cameras name, or a rendering for each camera.
+def view_images(scene: Scene, photos: Path | None = None, undistorted: bool = False) -> ViewImages:
+    """The photos in folder `photos` that the scene's cameras name, undistorted, or a rendering for each camera.
 
-    One image is in memory at a time. Raises InputError for a folder without such photos, and, on access, for a photo
-    with another aspect ratio than its camera.
+    `undistorted`: the photos already are. One image is in memory at a time. Raises InputError for a folder without
+    such photos, and, on access, for a photo with another aspect ratio than its camera.
     """
     if photos is None:
         return ViewImages(list(range(len(scene.cameras))), lambda view: render_view(scene, view))
     files = match_files(photos, scene.cameras.names, "photo", "--photos")
-    return ViewImages(list(files), lambda view: _read(scene, view, files[view]))
+    return ViewImages(list(files), lambda view: _read(scene, view, files[view], undistorted))
 
 
 def render_view(scene: Scene, view: int) -> Float[Tensor, "h w 3"]:
@@ -54,13 +54,12 @@ def render_view(scene: Scene, view: int) -> Float[Tensor, "h w 3"]:
     return rasterise(scene.gaussians, scene.cameras.viewmats[view][None], K[None], w, h).rgb[0].clamp(0, 1)
 
 
-def _read(scene: Scene, view: int, file: Path) -> Float[Tensor, "h w 3"]:
+def _read(scene: Scene, view: int, file: Path, undistorted: bool) -> Float[Tensor, "h w 3"]:
     image = read_image(file)
     try:
-        check_aspect_ratio(scene, view, image.shape[1], image.shape[0])
+        return Undistortion.of(scene.cameras, view, (image.shape[1], image.shape[0]), undistorted).image(image)
     except InputError as error:
         raise InputError(f"--photos: {error}; without --photos the scene is rendered instead") from error
-    return image
 
 
 def match_files(folder: Path, names: tuple[str, ...], what: str, option: str) -> dict[int, Path]:
@@ -83,10 +82,3 @@ def match_files(folder: Path, names: tuple[str, ...], what: str, option: str) ->
         log.info("%s: %ss for %d of %d photos", folder, what, len(found), len(names))
     return found
 
-
-def check_aspect_ratio(scene: Scene, view: int, width: int, height: int) -> None:
-    """Raises InputError unless the aspect ratio is that of the camera."""
-    wide, high = scene.cameras.sizes[view].tolist()
-    if abs(width / height / (wide / high) - 1) > ASPECT_TOLERANCE:
-        raise InputError(f"{scene.cameras.names[view]} is {width}x{height}, in the scene {wide}x{high}; they must "
-                         "have the same aspect ratio")  # fmt: skip

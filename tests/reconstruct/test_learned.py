@@ -136,6 +136,7 @@ def test_complete_runs_with_a_tiny_network(tmp_path, monkeypatch, name, count):
     assert report.placed == count == len(scene.cameras) and len(scene.gaussians) > 0
     assert scene.gaussians.means.isfinite().all() and scene.floor == 0.0
     assert scene.provenance["options"]["backend"] == name
+    assert scene.cameras.photos.sizes.tolist() == [[170, 120]] * count  # of which the views are the centre
 
 
 def test_errors_for_missing_weights_and_given_cameras(tmp_path, monkeypatch):

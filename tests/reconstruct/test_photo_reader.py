@@ -199,6 +199,7 @@ def test_number_and_size_of_many_photos_are_limited(tmp_path, monkeypatch):
     photos = read_photos(tmp_path)
     assert len(photos) == photo_reader.MAX_PHOTOS == 200
     assert all(max(photos.size(i)) == 64 for i in range(200))
+    assert set(photos.file_sizes) == {(96, 64)} and photos[[3, 5]].file_size(1) == (96, 64)
     assert int(photos.names[0][:3]) < 3 and int(photos.names[-1][:3]) > 496  # from the whole range
 
 

@@ -6,6 +6,7 @@ import torch
 
 from stages.core.geometry.cameras import intrinsics
 from stages.core.models.pi3.network import Geometry
+from stages.core.scene.cameras import Cameras
 from stages.reconstruct import network_input, pointmaps
 from stages.reconstruct.photos import Photos
 from tests.reconstruct.oracle import truth
@@ -103,3 +104,13 @@ def test_crops_keep_the_image_centre(tmp_path):
         centre = (middle > 128).nonzero().float().mean(0) + 0.5
         assert (centre - torch.tensor(middle.shape) / 2).abs().max() <= 0.6
     assert network_input.make_batch(cut, size).shape == (3, 3, size[1], size[0])
+
+
+def test_photo_intrinsics_undo_the_crop(tmp_path):
+    # Of a 100x60 photo (200x120 in the file) at network size 56x56 the view is columns 20 to 80, as is 100 of the file.
+    photos = Photos((torch.zeros(60, 100, 3, dtype=torch.uint8),), ("a",), (0.0,), tmp_path, ((200, 120),))
+    K = torch.tensor([[[56.0, 0, 28], [0, 56, 28], [0, 0, 1]]])
+    cameras = Cameras(torch.eye(4)[None], K, torch.tensor([[56, 56]]), ("a",))
+    taken = network_input.photo_intrinsics(photos, cameras)
+    torch.testing.assert_close(taken.Ks[0], torch.tensor([[120.0, 0, 100], [0, 120, 60], [0, 0, 1]]))
+    assert taken.sizes.tolist() == [[200, 120]] and not taken.distortion.any()

@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import io
+import json
 import logging
 from pathlib import Path
 from typing import NamedTuple
@@ -211,6 +212,33 @@ def test_mixed_formats_sizes_and_unicode_names(small_preset, tmp_path):
     scene = read_scene(out)
     assert scene.cameras.names == tuple(f"foto {i} ä.jpg" for i in range(6))
     assert scene.cameras.sizes.tolist() == [[128, 96]] * 5 + [[96, 128]]
+    assert scene.cameras.photos.sizes.tolist() == [*[[320, 240]] * 4, [400, 300], [240, 320]]
+
+
+@pytest.mark.parametrize("source", ["transforms.json", "COLMAP"])
+def test_lens_of_given_cameras_is_stored(small_preset, tmp_path, source):
+    import pycolmap
+
+    true = arc(4, (96, 72), sweep=40.0)
+    path, lens = write_set(tmp_path, true), {"k1": 0.01, "k2": -0.004, "p1": 0.0005, "p2": 0.001}
+    if source == "COLMAP":
+        K, model, path = true.Ks[0].tolist(), pycolmap.Reconstruction(), tmp_path / "model"
+        params = [K[0][0], K[1][1], K[0][2], K[1][2], *lens.values()]
+        model.add_camera_with_trivial_rig(
+            pycolmap.Camera(model="OPENCV", width=96, height=72, params=params, camera_id=1)
+        )
+        for i, (name, viewmat) in enumerate(zip(true.names, true.viewmats, strict=True), start=1):
+            image = pycolmap.Image(name=name, camera_id=1, image_id=i)
+            model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(viewmat[:3].double().numpy()))
+        path.mkdir()
+        model.write(str(path))
+    else:
+        path.write_text(json.dumps({**json.loads(path.read_text()), **lens}))
+    run(tmp_path / "images", tmp_path / "s.ply", ReconstructOptions(cameras=path, quality="draft", resolution=64))
+    cameras = read_scene(tmp_path / "s.ply").cameras
+    assert cameras.sizes.tolist() == [[64, 48]] * 4 and cameras.photos.sizes.tolist() == [[96, 72]] * 4
+    torch.testing.assert_close(cameras.photos.Ks, true.Ks)
+    torch.testing.assert_close(cameras.photos.distortion, torch.tensor([[*lens.values(), 0]]).expand(4, 5))
 
 
 def test_scale_reference_gives_metres(small):

@@ -96,11 +96,15 @@ def test_invalid_boxes_are_refused(tmp_path, text, message):
 
 def test_box_coordinates_are_scaled_from_their_image_size(tmp_path):
     (tmp_path / "p.json").write_text('{"bbox": [[100, 50, 300, 200]], "center_point": [[40, 20]], "size": [1600, 800]}')
-    prompts = read_prompts(tmp_path / "p.json", (160, 80))
+    cameras = replace(orbit_cameras(1), sizes=torch.tensor([[160, 80]]))
+    prompts = read_prompts(tmp_path / "p.json", cameras)
     assert prompts.boxes.tolist() == [[10, 5, 30, 20]] and prompts.points.tolist() == [[4, 2]]
     (tmp_path / "p.json").write_text('{"bbox": [[100, 50, 300, 200]], "size": [1600]}')
     with pytest.raises(InputError, match="is not a prompts file"):
-        read_prompts(tmp_path / "p.json", (160, 80))
+        read_prompts(tmp_path / "p.json", cameras)
+    (tmp_path / "p.json").write_text('{"bbox": [[100, 50, 300, 200]], "size": [1600, 1600]}')
+    with pytest.raises(InputError, match="p.json: size of 00.jpg is 1600x1600, in the scene 160x80"):
+        read_prompts(tmp_path / "p.json", cameras)
 
 
 def test_scene_without_cameras_is_refused(tmp_path):

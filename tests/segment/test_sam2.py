@@ -129,9 +129,9 @@ def test_photos_of_another_aspect_ratio_are_refused(scene_file, truth, weights, 
         ({"bbox": [[5, 5, 1, 9]]}, "no area"),
     ],
 )
-def test_invalid_prompts_are_refused(tmp_path, data, message):
+def test_invalid_prompts_are_refused(truth, tmp_path, data, message):
     with pytest.raises(InputError, match=message):
-        read_prompts(prompts_file(tmp_path / "p.json", **data))
+        read_prompts(prompts_file(tmp_path / "p.json", **data), truth.cameras)
 
 
 def test_boxes_backend_refuses_points(scene_file, tmp_path):
@@ -141,7 +141,7 @@ def test_boxes_backend_refuses_points(scene_file, tmp_path):
 
 
 def test_point_prompts_are_fractions_of_the_view(truth, tmp_path):
-    box, point = (point_prompts(read_prompts(prompts_file(tmp_path / "p.json", **p)), truth)[0]
+    box, point = (point_prompts(read_prompts(prompts_file(tmp_path / "p.json", **p), truth.cameras), truth)[0]
                   for p in (BOXES, POINTS))  # fmt: skip
     torch.testing.assert_close(box.points, torch.tensor([[10 / 160, 20 / 160], [60 / 160, 90 / 160]]))
     torch.testing.assert_close(point.points, torch.tensor([[40 / 160, 60 / 160]]))

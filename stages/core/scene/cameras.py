@@ -1,9 +1,9 @@
-"""Pinhole cameras, and readers for the camera files of other tools."""
+"""Pinhole cameras, the photos they were made from, and readers for the camera files of other tools."""
 
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +14,22 @@ from torch import Tensor
 from stages.core.errors import InputError
 from stages.core.geometry.similarity import Similarity
 
+LENS_MODEL = "opencv"  # the only one: k1 k2 p1 p2 k3 of OpenCV
+DISTORTION = ("k1", "k2", "p1", "p2", "k3")
+PINHOLE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")  # of transforms.json
+
+
+@dataclass(frozen=True)
+class PhotoIntrinsics:
+    """Intrinsics and lens of the photos as taken, of which the images of `Cameras` are undistorted views."""
+
+    Ks: Float[Tensor, "c 3 3"]  # [px] of the photo, pixel centres at +0.5
+    sizes: Int[Tensor, "c 2"]  # width, height of the photo [px]
+    distortion: Float[Tensor, "c 5"]  # k1 k2 p1 p2 k3 of OpenCV; zeros: none
+
+    def __getitem__(self, rows: list[int]) -> PhotoIntrinsics:
+        return PhotoIntrinsics(self.Ks[rows], self.sizes[rows], self.distortion[rows])
+
 
 @dataclass(frozen=True)
 class Cameras:
@@ -23,37 +39,78 @@ class Cameras:
     Ks: Float[Tensor, "c 3 3"]  # [px]
     sizes: Int[Tensor, "c 2"]  # width, height [px]
     names: tuple[str, ...]  # of the photos
+    photos: PhotoIntrinsics | None = None  # the photos as taken; None: they equal the views, up to their resolution
 
     def __len__(self) -> int:
         return len(self.viewmats)
 
     def __getitem__(self, index: list[int] | slice) -> Cameras:
         rows = list(range(len(self)))[index] if isinstance(index, slice) else [int(i) for i in index]
-        return Cameras(self.viewmats[rows], self.Ks[rows], self.sizes[rows], tuple(self.names[i] for i in rows))
+        photos = None if self.photos is None else self.photos[rows]
+        return Cameras(self.viewmats[rows], self.Ks[rows], self.sizes[rows], tuple(self.names[i] for i in rows), photos)
 
     def transformed(self, similarity: Similarity) -> Cameras:
         """The same cameras in the transformed world."""
-        return Cameras(similarity.viewmats(self.viewmats), self.Ks, self.sizes, self.names)
+        return replace(self, viewmats=similarity.viewmats(self.viewmats))
 
 
 def to_json(cameras: Cameras) -> list[dict]:
     """One dict per camera, as stored in the header of scene.ply."""
-    return [
+    rows = [
         {"name": name, "viewmat": viewmat.tolist(), "K": K.tolist(), "size": size.tolist()}
         for name, viewmat, K, size in zip(cameras.names, cameras.viewmats, cameras.Ks, cameras.sizes, strict=True)
     ]
+    if cameras.photos is not None:
+        photos = cameras.photos
+        for row, K, size, lens in zip(rows, photos.Ks, photos.sizes, photos.distortion, strict=True):
+            row["photo"] = {
+                "K": K.tolist(), "size": size.tolist(), "model": LENS_MODEL, "distortion": lens.tolist()
+            }  # fmt: skip
+    return rows
 
 
 def from_json(rows: list[dict]) -> Cameras | None:
-    """The inverse of `to_json`; None for an empty list."""
+    """The inverse of `to_json`; None for an empty list. Cameras without a `photo` get one that equals the view.
+
+    Raises ValueError, with the name of the camera and of the field, for wrong shapes and values.
+    """
     if not rows:
         return None
-    return Cameras(
-        torch.tensor([r["viewmat"] for r in rows], dtype=torch.float32),
-        torch.tensor([r["K"] for r in rows], dtype=torch.float32),
-        torch.tensor([r["size"] for r in rows], dtype=torch.int64),
-        tuple(str(r["name"]) for r in rows),
-    )
+    names = tuple(str(row["name"]) for row in rows)
+    viewmats = torch.stack([_matrix(row["viewmat"], (4, 4), f"{row['name']}: viewmat") for row in rows])
+    Ks, sizes = _intrinsics(rows, names)
+    if not any("photo" in row for row in rows):
+        return Cameras(viewmats, Ks, sizes, names)
+    photos = [row.get("photo", {**row, "model": LENS_MODEL, "distortion": [0.0] * 5}) for row in rows]
+    labels = tuple(f"{name}: photo" for name in names)
+    if unknown := [photo["model"] for photo in photos if photo["model"] != LENS_MODEL]:
+        raise ValueError(f"lens model {unknown[0]!r} is not known; only {LENS_MODEL!r} is")
+    lenses = [_matrix(p["distortion"], (5,), f"{label}: distortion") for p, label in zip(photos, labels, strict=True)]
+    return Cameras(viewmats, Ks, sizes, names, PhotoIntrinsics(*_intrinsics(photos, labels), torch.stack(lenses)))
+
+
+def _intrinsics(rows: list[dict], labels: tuple[str, ...]) -> tuple[Float[Tensor, "c 3 3"], Int[Tensor, "c 2"]]:
+    """K and size of each row; `labels` name the rows in errors."""
+    Ks, sizes = [], []
+    for row, label in zip(rows, labels, strict=True):
+        K, size = _matrix(row["K"], (3, 3), f"{label}: K"), row["size"]
+        if not (K[0, 0] > 0 and K[1, 1] > 0):
+            raise ValueError(f"{label}: a focal length in K is not above 0")
+        if len(size) != 2 or not all(isinstance(side, int) and side > 0 for side in size):
+            raise ValueError(f"{label}: size {size} is not two whole numbers above 0")
+        Ks.append(K)
+        sizes.append(size)
+    return torch.stack(Ks), torch.tensor(sizes, dtype=torch.int64)
+
+
+def _matrix(values: list, shape: tuple[int, ...], label: str) -> Tensor:
+    """A float tensor; ValueError for another shape and for values that are not finite."""
+    matrix = torch.tensor(values, dtype=torch.float32)
+    if matrix.shape != shape:
+        raise ValueError(f"{label} has shape {tuple(matrix.shape)}, not {shape}")
+    if not matrix.isfinite().all():
+        raise ValueError(f"{label} has a value that is not finite")
+    return matrix
 
 
 @dataclass(frozen=True)
@@ -66,7 +123,8 @@ class LensDistortion:
 def read_cameras(path: Path) -> tuple[Cameras, LensDistortion]:
     """Cameras of a nerfstudio transforms.json or of a COLMAP model folder (cameras, images, points3D), sorted by name.
 
-    Raises InputError for other files and for camera models with other distortion parameters than OpenCV's first five.
+    K and size are those of the photos as taken. Raises InputError for other files and for camera models with other
+    distortion parameters than OpenCV's first five, such as fisheye lenses.
     """
     path = Path(path)
     if path.is_dir():
@@ -93,11 +151,21 @@ def _from_transforms(data: dict) -> tuple[Cameras, LensDistortion]:
         Ks.append([[value["fl_x"], 0, value["cx"]], [0, value["fl_y"], value["cy"]], [0, 0, 1]])
         sizes.append([value["w"], value["h"]])
         names.append(Path(frame["file_path"]).name)
-        lenses.append([value.get(k, 0.0) for k in ("k1", "k2", "p1", "p2", "k3")])
+        lenses.append(_transforms_lens(value))
     if not names:
         raise ValueError("no frames")
+    if not all(np.isfinite(rows).all() for rows in (viewmats, Ks, sizes, lenses)):
+        raise ValueError("a value is not finite")
     cameras = Cameras(_float(viewmats), _float(Ks), torch.tensor(sizes, dtype=torch.int64), tuple(names))
     return cameras, LensDistortion(_float(lenses))
+
+
+def _transforms_lens(value: dict) -> list[float]:
+    """k1 k2 p1 p2 k3 of a frame; ValueError for another lens model."""
+    model = value.get("camera_model", "OPENCV")
+    if model not in PINHOLE_MODELS or any(value.get(k, 0) for k in ("k4", "k5", "k6")):
+        raise ValueError(f"camera_model {model} with k4 {value.get('k4', 0)}: only k1 k2 p1 p2 k3 are supported")
+    return [value.get(k, 0.0) for k in DISTORTION]
 
 
 def _read_colmap(path: Path) -> tuple[Cameras, LensDistortion]:
@@ -123,11 +191,12 @@ def _read_colmap(path: Path) -> tuple[Cameras, LensDistortion]:
 
 def _colmap_lens(path: Path, camera) -> list[float]:
     """k1 k2 p1 p2 k3 of a COLMAP camera: its parameters after focal length and principal point."""
-    tail = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 3, "RADIAL": 3, "OPENCV": 4}
+    tail = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 3, "RADIAL": 3, "OPENCV": 4, "FULL_OPENCV": 4}
     model = camera.model.name
-    if model not in tail:
-        raise InputError(f"{path}: camera model {model} is not supported; undistort it with `colmap image_undistorter`")
-    k = list(camera.params[tail[model] :])
+    k = [float(x) for x in camera.params[tail.get(model, 0) :]]
+    if model not in tail or any(k[5:]):
+        raise InputError(f"{path}: camera model {model}{' with k4 to k6' if model in tail else ''} is not supported; "
+                         "undistort it with `colmap image_undistorter`")  # fmt: skip
     return (k + [0.0] * 5)[:5]
 
 

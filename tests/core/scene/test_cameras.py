@@ -1,3 +1,4 @@
+import dataclasses
 import json
 
 import pytest
@@ -5,8 +6,41 @@ import torch
 
 from stages.core.errors import InputError
 from stages.core.geometry.cameras import centres
-from stages.core.scene.cameras import from_json, read_cameras, to_json
+from stages.core.geometry.similarity import Similarity
+from stages.core.scene.cameras import Cameras, PhotoIntrinsics, from_json, read_cameras, to_json
 from tests.conftest import ring
+
+POSE = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 3], [0, 0, 0, 1]]  # 3 from the origin, looking at it
+LENS = {"k1": -0.25, "k2": 0.04, "p1": 0.001, "p2": -0.002, "k3": 0.01}
+
+
+def with_photos(cameras: Cameras) -> Cameras:
+    """Cameras that remember photos of twice the size, with another lens each."""
+    c = len(cameras)
+    lens = torch.tensor([-0.25, 0.04, 0.001, -0.002, 0.01]) * torch.arange(1, c + 1)[:, None]
+    return dataclasses.replace(cameras, photos=PhotoIntrinsics(2.1 * cameras.Ks, 2 * cameras.sizes, lens))
+
+
+def write_transforms(folder, **more):
+    data = {"fl_x": 50, "fl_y": 51, "cx": 32, "cy": 24, "w": 64, "h": 48, **LENS, **more,
+            "frames": [{"file_path": f"images/{name}.jpg", "transform_matrix": POSE} for name in "ba"]}  # fmt: skip
+    (folder / "transforms.json").write_text(json.dumps(data))
+    return folder / "transforms.json"
+
+
+def write_colmap(folder, model: str, params: list[float]):
+    """A COLMAP model of two photos with this camera model and these parameters."""
+    import pycolmap
+
+    reconstruction = pycolmap.Reconstruction()
+    camera = pycolmap.Camera(model=model, width=64, height=48, params=params, camera_id=1)
+    reconstruction.add_camera_with_trivial_rig(camera)
+    for i, name in enumerate("ba", start=1):
+        image = pycolmap.Image(name=f"{name}.jpg", camera_id=1, image_id=i)
+        reconstruction.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
+    (folder / "model").mkdir()
+    reconstruction.write(str(folder / "model"))
+    return folder / "model"
 
 
 def test_json_round_trip():
@@ -16,17 +50,90 @@ def test_json_round_trip():
     assert torch.equal(back.sizes, cameras.sizes) and back.names == cameras.names
 
 
+def test_json_round_trip_with_photos():
+    cameras = with_photos(ring())
+    back = from_json(json.loads(json.dumps(to_json(cameras))))
+    for field in dataclasses.fields(PhotoIntrinsics):
+        assert torch.equal(getattr(back.photos, field.name), getattr(cameras.photos, field.name))
+
+
+def test_cameras_without_photo_have_that_of_their_view():
+    rows = to_json(with_photos(ring(count=2)))
+    del rows[1]["photo"]
+    photos, view = from_json(rows).photos, ring(count=2)
+    assert photos.sizes.tolist() == [(2 * view.sizes[0]).tolist(), view.sizes[1].tolist()]
+    assert torch.equal(photos.Ks[1], view.Ks[1]) and not photos.distortion[1].any()
+    assert from_json([{k: v for k, v in row.items() if k != "photo"} for row in rows]).photos is None
+
+
+def test_selected_and_moved_cameras_keep_their_photos():
+    cameras = with_photos(ring())
+    moved = cameras.transformed(Similarity(2.0, torch.eye(3), torch.zeros(3)))[[2, 0]]
+    assert torch.equal(moved.photos.distortion, cameras.photos.distortion[[2, 0]])
+    assert torch.equal(moved.photos.Ks, cameras.photos.Ks[[2, 0]])
+    assert cameras[1:3].photos.sizes.shape == (2, 2)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [("distortion", [0.1, 0.2], r"00.png: photo: distortion has shape \(2,\), not \(5,\)"),
+     ("distortion", [0.1, float("nan"), 0, 0, 0], "distortion has a value that is not finite"),
+     ("K", [[1, 0, 0], [0, 1, 0]], r"K has shape \(2, 3\), not \(3, 3\)"),
+     ("K", [[0, 0, 1], [0, 1, 1], [0, 0, 1]], "a focal length in K is not above 0"),
+     ("size", [64.5, 48], r"size \[64.5, 48\] is not two whole numbers above 0"), ("size", [64], "not two whole"),
+     ("size", [64, 0], "not two whole"), ("model", "fisheye", "lens model 'fisheye' is not known; only 'opencv' is")],
+)  # fmt: skip
+def test_wrong_photo_fields_are_refused(field, value, message):
+    rows = to_json(with_photos(ring(count=1)))
+    rows[0]["photo"][field] = value
+    with pytest.raises(ValueError, match=message):
+        from_json(rows)
+
+
+@pytest.mark.parametrize(("field", "value"), [("viewmat", [[1.0]]), ("K", [[float("inf")] * 3] * 3), ("size", [0, 1])])
+def test_wrong_camera_fields_are_refused(field, value):
+    rows = to_json(ring(count=1))
+    rows[0][field] = value
+    with pytest.raises(ValueError, match=f"00.png: {field}"):
+        from_json(rows)
+
+
 def test_transforms_json_has_opengl_axes(tmp_path):
     # An OpenGL camera at (0, 0, 3) without rotation looks along -z: the origin is 3 ahead, and y is up.
-    pose = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 3], [0, 0, 0, 1]]
-    data = {"fl_x": 50, "fl_y": 50, "cx": 32, "cy": 24, "w": 64, "h": 48, "k1": 0.1,
-            "frames": [{"file_path": "images/a.jpg", "transform_matrix": pose}]}  # fmt: skip
-    (tmp_path / "transforms.json").write_text(json.dumps(data))
-    cameras, lenses = read_cameras(tmp_path / "transforms.json")
-    assert cameras.names == ("a.jpg",)
+    cameras, lenses = read_cameras(write_transforms(tmp_path))
+    assert cameras.names == ("a.jpg", "b.jpg")
     assert (cameras.viewmats[0] @ torch.tensor([0.0, 1, 0, 1])).tolist() == [0, -1, 3, 1]
-    torch.testing.assert_close(centres(cameras.viewmats), torch.tensor([[0.0, 0, 3]]))
-    assert lenses.coefficients[0].tolist() == pytest.approx([0.1, 0, 0, 0, 0])
+    torch.testing.assert_close(centres(cameras.viewmats), torch.tensor([[0.0, 0, 3]]).expand(2, 3))
+    assert lenses.coefficients[0].tolist() == pytest.approx(list(LENS.values()))
+
+
+@pytest.mark.parametrize(
+    ("model", "params", "expected"),
+    [("SIMPLE_PINHOLE", [], []), ("PINHOLE", [], []), ("SIMPLE_RADIAL", [-0.25], [-0.25]),
+     ("RADIAL", [-0.25, 0.04], [-0.25, 0.04]), ("OPENCV", [-0.25, 0.04, 0.001, -0.002], [-0.25, 0.04, 0.001, -0.002]),
+     ("FULL_OPENCV", [*LENS.values(), 0, 0, 0], [*LENS.values()])],
+)  # fmt: skip
+def test_colmap_models_keep_their_lens(tmp_path, model, params, expected):
+    focals = [50.0, 51.0] if model in ("PINHOLE", "OPENCV", "FULL_OPENCV") else [50.0]
+    cameras, lenses = read_cameras(write_colmap(tmp_path, model, [*focals, 32, 24, *params]))
+    assert cameras.names == ("a.jpg", "b.jpg")
+    assert cameras.Ks[0].tolist() == [[50, 0, 32], [0, focals[-1], 24], [0, 0, 1]]
+    assert lenses.coefficients[1].tolist() == pytest.approx(expected + [0.0] * (5 - len(expected)))
+
+
+@pytest.mark.parametrize(
+    ("model", "params"), [("FULL_OPENCV", [50, 51, 32, 24, 0.1, 0, 0, 0, 0, 0, 0, 0.3]),
+                          ("OPENCV_FISHEYE", [50, 51, 32, 24, 0.1, 0, 0, 0])],
+)  # fmt: skip
+def test_other_lenses_of_colmap_are_refused(tmp_path, model, params):
+    with pytest.raises(InputError, match=f"camera model {model}.* is not supported; undistort it"):
+        read_cameras(write_colmap(tmp_path, model, params))
+
+
+@pytest.mark.parametrize("more", [{"camera_model": "OPENCV_FISHEYE"}, {"k4": 0.1}, {"k1": float("nan")}])
+def test_other_lenses_of_transforms_are_refused(tmp_path, more):
+    with pytest.raises(InputError, match="only k1 k2 p1 p2 k3|not finite"):
+        read_cameras(write_transforms(tmp_path, **more))
 
 
 def test_real_reference_cameras_are_read(shared):

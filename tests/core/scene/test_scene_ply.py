@@ -11,6 +11,7 @@ from stages.core.geometry.rotations import covariance
 from stages.core.scene.scene import Scene
 from stages.core.scene.scene_ply import read_scene, write_scene
 from tests.conftest import random_gaussians
+from tests.core.scene.test_cameras import with_photos
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
@@ -31,6 +32,28 @@ def test_round_trip_of_metadata(tmp_path, two_balls):
         assert getattr(back, name) == getattr(scene, name)
     torch.testing.assert_close(back.cameras.viewmats, scene.cameras.viewmats)
     assert back.cameras.names == scene.cameras.names
+
+
+def test_round_trip_of_the_photos_as_taken(tmp_path, two_balls):
+    scene = dataclasses.replace(two_balls, cameras=with_photos(two_balls.cameras))
+    write_scene(tmp_path / "s.ply", scene)
+    photos = read_scene(tmp_path / "s.ply").cameras.photos
+    for field in dataclasses.fields(photos):
+        assert torch.equal(getattr(photos, field.name), getattr(scene.cameras.photos, field.name))
+
+
+def test_files_without_a_lens_have_none(tmp_path, two_balls):
+    write_scene(tmp_path / "s.ply", two_balls)
+    assert b'"photo"' not in (tmp_path / "s.ply").read_bytes()
+    assert read_scene(tmp_path / "s.ply").cameras.photos is None
+
+
+def test_damaged_lens_is_refused_in_one_line(tmp_path, two_balls):
+    write_scene(tmp_path / "s.ply", dataclasses.replace(two_balls, cameras=with_photos(two_balls.cameras)))
+    data = (tmp_path / "s.ply").read_bytes()
+    (tmp_path / "s.ply").write_bytes(data.replace(b'"model": "opencv"', b'"model": "pinole"', 1))
+    with pytest.raises(InputError, match=r"s.ply: a header comment .* is damaged .*lens model 'pinole' is not known"):
+        read_scene(tmp_path / "s.ply")
 
 
 def test_stored_values_follow_the_standard_layout(tmp_path):

@@ -142,5 +142,5 @@ def _scale(options: ReconstructOptions, units: float | None) -> dict:
         metres = parse_scale(options.scale_reference).distance
         return {"metres_per_unit": metres / units, "source": f"--scale-reference {options.scale_reference}"}
     if options.cameras is not None:
-        return {"metres_per_unit": 1.0, "source": f"cameras in {Path(options.cameras).name}, taken as metres"}
+        return {"metres_per_unit": 1.0, "source": f"assumed: cameras in {Path(options.cameras).name} are in metres"}
     return {"metres_per_unit": 1.0, "source": "assumed: cameras about 1 m from the scene"}

@@ -58,8 +58,15 @@ def log_objects(scene: Scene) -> None:
         if not len(means):
             log.info("  %d  %s: no Gaussians", o.id, o.name)
             continue
-        size = (_quantile(means, 0.99) - _quantile(means, 0.01)) * scene.metres_per_unit * 100
-        log.info("  %d  %s: %d Gaussians, %.1f x %.1f x %.1f cm", o.id, o.name, len(means), *size)
+        size = _quantile(means, 0.99) - _quantile(means, 0.01)
+        log.info("  %d  %s: %d Gaussians, %s", o.id, o.name, len(means), _size_text(size, scene))
+
+
+def _size_text(size, scene: Scene) -> str:
+    """Three lengths in cm, or in scene units where the scale is not known."""
+    if scene.has_known_scale:
+        return " x ".join(f"{100 * scene.metres_per_unit * side:.1f}" for side in size) + " cm"
+    return " x ".join(f"{side:.3g}" for side in size) + " scene units"
 
 
 def _quantile(values, fraction: float):

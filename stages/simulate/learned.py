@@ -157,7 +157,8 @@ def _initial_conditions(
             log.warning("object %d (%s): %s yields or flows, which the learned field does not model; use --engine mpm",
                         o.id, o.name, choice.name)  # fmt: skip
         guess = f"; material not known, taking {choice.name} (--material {o.id}=... changes it)" * choice.guessed
-        log.info("object %d (%s): %s, %.3g kg%s", o.id, o.name, choice.name, mass[0, row] / units.mass, guess)
+        weight = scene.mass_text(float(mass[0, row]) / units.mass)
+        log.info("object %d (%s): %s, %s%s", o.id, o.name, choice.name, weight, guess)
     box = torch.tensor([[-FAR_WALL, -FAR_WALL, FLOOR], [FAR_WALL] * 3]).repeat(count, 1, 1)
     if options.box:
         box[:] = torch.stack([units.to_model(torch.tensor(corner)) for corner in (setup.box.low, setup.box.high)])

@@ -112,8 +112,8 @@ def _particles(
                                   *model.solver_parameters(m.plastic, E / m.E)])  # fmt: skip
         velocity[row] = unit * torch.tensor(prompts.velocity.get(o.id, (0.0, 0.0, 0.0)))
         held[row] = o.id in prompts.pinned
-        mass = float(m.density * volume[body == row].sum())
-        message = f"object {o.id} ({o.name}): {choice.name}, {mass:.3g} kg" + (", pinned" if held[row] else "")
+        mass = scene.mass_text(float(m.density * volume[body == row].sum()))
+        message = f"object {o.id} ({o.name}): {choice.name}, {mass}" + (", pinned" if held[row] else "")
         if choice.guessed:
             message += f"; material not known, taking {choice.name} (--material {o.id}=... changes it)"
         if m.E > E:

@@ -106,7 +106,7 @@ def test_given_cameras_keep_scale_and_names(made):
     assert scene.cameras.names == tuple(f"photo_{i:02d}.png" for i in range(7))
     eyes, true = centres(scene.cameras.viewmats), centres(arc(7, sweep=70.0).viewmats)
     torch.testing.assert_close(torch.pdist(eyes), torch.pdist(true), rtol=1e-4, atol=1e-4)
-    assert "transforms.json" in scene.scale["source"]
+    assert "transforms.json" in scene.scale["source"] and not scene.has_known_scale
 
 
 def test_held_out_photos_are_rendered_well(made):
@@ -244,7 +244,7 @@ def test_lens_of_given_cameras_is_stored(small_preset, tmp_path, source):
 def test_scale_reference_gives_metres(small):
     eyes = centres(small.scene.cameras.viewmats)
     assert float((eyes[0] - eyes[3]).norm()) * small.scene.metres_per_unit == pytest.approx(0.25, rel=1e-4)
-    assert small.options.scale_reference in small.scene.scale["source"]
+    assert small.options.scale_reference in small.scene.scale["source"] and small.scene.has_known_scale
 
 
 def test_report_and_advice(small):

@@ -12,10 +12,12 @@ from stages.core.geometry.cameras import project
 from stages.core.perception.grouping import GroupingOptions
 from stages.core.raster.rasterise import visibility
 from stages.core.scene.images import write_labels
+from stages.core.scene.scene import Scene, SceneObject
 from stages.core.scene.scene_ply import read_scene, write_scene
 from stages.segment.options import SegmentOptions
-from stages.segment.stage import run
+from stages.segment.stage import log_objects, run
 from stages.segment.voting import damp_votes, majority_labels, pool_votes, remove_outliers
+from tests.conftest import random_gaussians
 from tests.segment.tabletop import best_overlap
 
 
@@ -50,6 +52,20 @@ def test_geometric_writes_labels_names_cameras_and_provenance(scene_file, truth,
 
 def test_defaults_are_those_of_the_grouping_that_simulate_uses():
     assert all(getattr(SegmentOptions, f.name) == f.default for f in fields(GroupingOptions))
+
+
+@pytest.mark.parametrize(("source", "size"), [
+    ("--scale-reference distance=0.5", "6.0 x 8.0 x 10.0 cm"),
+    ("assumed: cameras about 1 m away", "0.12 x 0.16 x 0.2 scene units"),
+    ("not stated in the file", "0.12 x 0.16 x 0.2 scene units"),
+])  # fmt: skip
+def test_sizes_are_in_cm_only_where_the_scale_is_known(source, size, caplog):
+    sides = torch.tensor([0.12, 0.16, 0.2]) / 0.98  # sizes are between the 1 % and the 99 % quantile
+    means = torch.linspace(0, 1, 101)[:, None] * sides
+    g = replace(random_gaussians(101), means=means, object_id=torch.ones(101, dtype=torch.int64))
+    with caplog.at_level(logging.INFO):
+        log_objects(Scene(g, (SceneObject(1, "cup"),), scale={"metres_per_unit": 0.5, "source": source}))
+    assert caplog.messages == [f"  1  cup: 101 Gaussians, {size}"]
 
 
 @pytest.mark.parametrize(("side", "axes"), [("height", [2]), ("length", [0, 1, 2])])

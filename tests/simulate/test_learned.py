@@ -56,7 +56,7 @@ def test_velocity_and_force_in_flight(two_balls, tmp_path, untrained, caplog):
     double = roll(two_balls, tmp_path, untrained, lift=("3",), gravity=0.0, force=("object=2 force=0,0,12",))
     assert float(com_shift(t, 1)[2]) > 1e-4
     assert float(com_shift(double, 1)[2]) == pytest.approx(2 * float(com_shift(t, 1)[2]), rel=0.02)
-    assert "untrained" in caplog.text
+    assert "untrained" in caplog.text and " kg if one unit is 1 m" in caplog.text
 
 
 def test_pinned_objects_stay_and_frame_rate_does_not_matter(two_balls, tmp_path, untrained):

@@ -67,6 +67,7 @@ def test_first_frame_is_the_scene_and_free_fall_is_a_parabola(balls, caplog):
     assert mean_shift(t, 1).norm() < SAG  # stands
     assert (t.binding.index[t.scene.gaussians.object_id == 0] == -1).all()
     assert f"material not known, taking {DEFAULT_MATERIAL}" in caplog.text and "substep" in caplog.text
+    assert " kg if one unit is 1 m" in caplog.text
     assert t.scene.provenance["command"] == "simulate"
 
 
@@ -75,10 +76,12 @@ def test_same_seed_gives_the_same_bytes(balls, device):
     assert torch.equal(first, second)
 
 
-def test_scene_units_other_than_metres(balls):
+def test_scene_units_other_than_metres(balls, caplog):
+    caplog.set_level(logging.INFO)
     scene = read_scene(balls)
     write_scene(balls, replace(scene, scale={"metres_per_unit": 0.5, "source": "test"}))
     t = roll(balls)
+    assert " kg" in caplog.text and "one unit is 1 m" not in caplog.text
     assert t.info.gravity[2] == pytest.approx(-2 * 9.81)
     assert float(mean_shift(t, 2)[2]) == pytest.approx(-2 * 9.81 * 0.1**2 / 2, rel=0.02)
 

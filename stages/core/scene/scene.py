@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 from stages.core.scene.cameras import Cameras
 from stages.core.scene.gaussians import Gaussians
 
+UNKNOWN_SCALE = ("assumed", "not stated")  # beginnings of `source` where the scale is not known
+
 
 @dataclass(frozen=True)
 class SceneObject:
@@ -33,6 +35,15 @@ class Scene:
     def metres_per_unit(self) -> float:
         """Length of a scene unit [m]."""
         return float(self.scale.get("metres_per_unit", 1.0))
+
+    @property
+    def has_known_scale(self) -> bool:
+        """Whether `metres_per_unit` was measured or given; otherwise a unit is only taken as 1 m."""
+        return not str(self.scale.get("source", "not stated")).startswith(UNKNOWN_SCALE)
+
+    def mass_text(self, mass: float) -> str:
+        """A mass [kg] for messages; it holds for a unit of 1 m where the scale is not known."""
+        return f"{mass:.3g} kg" + ("" if self.has_known_scale else " if one unit is 1 m")
 
     def name_of(self, object_id: int) -> str:
         """The name of an object, object_ID where it has none."""

@@ -65,7 +65,8 @@ def compose_scene(config: SceneConfig, bodies: Sequence[Gaussians], provenance: 
     for n, (i, p, g) in enumerate(zip(config.ids, config.translation, bodies, strict=True), start=1):
         parts.append(replace(g, means=g.means + torch.tensor(p), object_id=torch.full((len(g),), n)))
         objects.append(SceneObject(n, object_kind(i).name))
-    return Scene(concatenate(parts), tuple(objects), None, FLOOR_HEIGHT, provenance=provenance or {})
+    scale = {"metres_per_unit": 1.0, "source": "made in metres"}
+    return Scene(concatenate(parts), tuple(objects), None, FLOOR_HEIGHT, scale, provenance or {})
 
 
 def opaque_rest_gaussians(config: SceneConfig, skins: Mapping[int, ObjectSkin]) -> Gaussians:

@@ -50,6 +50,7 @@ def test_free_fall_at_any_scale(two_balls, tmp_path, untrained, unit):
 
 
 def test_velocity_and_force_in_flight(two_balls, tmp_path, untrained, caplog):
+    caplog.set_level(logging.INFO)
     t = roll(two_balls, tmp_path, untrained, lift=("3",), velocity=("object=1 1,0,0",), gravity=0.0,
              force=("object=2 force=0,0,6",))  # fmt: skip
     assert com_shift(t, 0).tolist() == pytest.approx([0.1, 0, 0], abs=1e-3)

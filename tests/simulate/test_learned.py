@@ -1,5 +1,6 @@
 """The learned engine: scaling to the training data, force prompts, warnings."""
 
+import logging
 import math
 from dataclasses import replace
 

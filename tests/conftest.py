@@ -18,8 +18,10 @@ SHARED = Path(__file__).resolve().parents[1].parent / "shared"
 
 
 def pytest_collection_modifyitems(items) -> None:
-    """What is parametrised with a GPU is selected by `-m gpu`."""
+    """What is parametrised with a GPU is selected by `-m gpu`, and what needs one is skipped without."""
     for item in items:
+        if item.get_closest_marker("gpu") and not torch.cuda.is_available():
+            item.add_marker(pytest.mark.skip(reason="needs an NVIDIA GPU"))
         if hasattr(item, "callspec") and any(isinstance(p, str) and p == "cuda" for p in item.callspec.params.values()):
             item.add_marker(pytest.mark.gpu)
 

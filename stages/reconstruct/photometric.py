@@ -10,18 +10,21 @@ The number of iterations is fixed beforehand and independent of time, so a seed 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
+from torch.optim.adam import adam
 from tqdm import tqdm
 
 from stages.core.geometry.cameras import centres
 from stages.core.geometry.rotations import matrix
+from stages.core.kernels.splat.projection import pack_camera
 from stages.core.kernels.splat.ssim import ssim
-from stages.core.raster.rasterise import rasterise
+from stages.core.kernels.splat.tiles import Capacity
+from stages.core.raster.rasterise import NEAR, count_pairs, rasterise, rasterise_packed
 from stages.core.scene.cameras import Cameras
 from stages.core.scene.gaussians import Gaussians
 from stages.reconstruct.photos import Views
@@ -64,15 +67,16 @@ class FitOptions:
 
 @dataclass
 class _Fit:
-    """Optimised tensors, one for each learning rate, and their optimiser."""
+    """Optimised tensors, one for each learning rate, with their Adam moments."""
 
     values: dict[str, Tensor]
-    optimiser: torch.optim.Optimizer
+    moments: dict[str, tuple[Tensor, Tensor]]  # means of the gradient and of its square
+    steps: dict[str, Tensor]  # number of steps, float32
     camera_distance: float  # [scene units]
-    exposure_projection: Float[Tensor, "c c"]
+    gradients: Float[Tensor, "n"]  # sum of the norms of the means' gradients since the last split
 
     @classmethod
-    def start(cls, gaussians: Gaussians, cameras: Cameras, camera_distance: float) -> _Fit:
+    def start(cls, gaussians: Gaussians, views: int, camera_distance: float) -> _Fit:
         """Parameters of these Gaussians, activations inverted, and zero log exposures."""
         device = gaussians.means.device
         values = {
@@ -82,13 +86,12 @@ class _Fit:
             "opacities": gaussians.opacities.clamp(1e-4, 1 - 1e-4).logit(),
             "base": gaussians.sh[:, :1],
             "rest": gaussians.sh[:, 1:],
-            "gains": torch.zeros(len(cameras), 3, device=device),  # log exposure of each photo and channel
+            "gains": torch.zeros(views, 3, device=device),  # log exposure of each photo and channel
         }
         values = {name: value.clone().requires_grad_() for name, value in values.items() if value.numel()}
-        rates = {**LEARNING_RATES, "means": MEANS_RATE * camera_distance}
-        groups = [{"params": [value], "lr": rates[name], "name": name} for name, value in values.items()]
-        optimiser = torch.optim.Adam(groups, eps=1e-15, fused=True)
-        return cls(values, optimiser, camera_distance, _exposure_projection(cameras).to(device))
+        moments = {name: (torch.zeros_like(v), torch.zeros_like(v)) for name, v in values.items()}
+        steps = {name: torch.zeros((), device=device) for name in values}
+        return cls(values, moments, steps, camera_distance, torch.zeros(len(gaussians), device=device))
 
     def gaussians(self) -> Gaussians:
         """The Gaussians with activations applied, differentiable."""
@@ -98,25 +101,55 @@ class _Fit:
         quats = F.normalize(v["quats"], dim=1)
         return Gaussians(v["means"], quats, v["scales"].exp(), v["opacities"].sigmoid(), sh, ids)
 
-    def gain(self, view: int) -> Float[Tensor, "3"]:
-        """Exposure factor of a photo per channel, without the part that its camera pose explains."""
-        return (self.exposure_projection[view] @ self.values["gains"]).exp()
+    def descend(self, grads: dict[str, Tensor], means_rate: float | Tensor) -> None:
+        """One step of Adam. A rate that is a tensor can change between replays of a CUDA graph."""
+        for name, value in self.values.items():
+            first, second = self.moments[name]
+            rate = means_rate if name == "means" else LEARNING_RATES[name]
+            adam([value], [grads[name]], [first], [second], [], [self.steps[name]], fused=True, amsgrad=False,
+                 beta1=0.9, beta2=0.999, lr=rate, weight_decay=0.0, eps=1e-15, maximize=False)  # fmt: skip
 
-    def select(self, index: Int[Tensor, "m"], fresh: Int[Tensor, "k"] | None = None) -> None:
+    def select(self, index: Int[Tensor, "m"], fresh: Int[Tensor, "k"]) -> None:
         """Keep (or repeat) these Gaussians with their Adam moments; moments at positions `fresh` are set to zero."""
-        for group in self.optimiser.param_groups:
-            if group["name"] == "gains":
-                continue
-            old = group["params"][0]
-            new = old.detach()[index].clone().requires_grad_()
-            state = self.optimiser.state.pop(old, None)
-            if state:
-                for key in ("exp_avg", "exp_avg_sq"):
-                    state[key] = state[key][index].clone()
-                    if fresh is not None:
-                        state[key][fresh] = 0
-                self.optimiser.state[new] = state
-            group["params"][0] = self.values[group["name"]] = new
+        for name in self.values.keys() - {"gains"}:
+            self.values[name] = self.values[name].detach()[index].clone().requires_grad_()
+            self.moments[name] = tuple(moment[index].clone() for moment in self.moments[name])
+            for moment in self.moments[name]:
+                moment[fresh] = 0
+        self.gradients = torch.zeros(len(index), device=index.device)
+
+
+@dataclass(frozen=True)
+class _Targets:
+    """Photos of one size with their cameras and target depths, on the device of the fit."""
+
+    rows: tuple[int, ...]  # views
+    images: UInt8[Tensor, "c h w 3"]
+    cameras: Float[Tensor, "c 26"]  # as `pack_camera` packs them
+    exposures: Float[Tensor, "c v"]  # rows of `_exposure_projection`
+    inverse: Float[Tensor, "c h w"] | None  # inverse depth times the camera distance, inf where unknown
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height [px]."""
+        return self.images.shape[2], self.images.shape[1]
+
+
+def _targets(views: Views, depths: Sequence[Tensor], distance: float, device: str) -> list[_Targets]:
+    """The views by size."""
+    projection = _exposure_projection(views.cameras)
+    groups: dict[tuple[int, int], list[int]] = {}
+    for row, image in enumerate(views.images):
+        groups.setdefault((image.shape[1], image.shape[0]), []).append(row)
+    targets = []
+    for (width, height), rows in groups.items():
+        images = torch.stack([views.images[row] for row in rows])
+        pairs = zip(views.cameras.viewmats[rows], views.cameras.Ks[rows], strict=True)
+        cameras = torch.stack([pack_camera(V, K, width, height, NEAR) for V, K in pairs])
+        inverse = torch.stack([distance / depths[row] for row in rows]).to(device) if depths else None
+        tensors = (images.to(device), cameras.to(device), projection[rows].to(device))
+        targets.append(_Targets(tuple(rows), *tensors, inverse))
+    return targets
 
 
 def fit_gaussians(
@@ -130,27 +163,25 @@ def fit_gaussians(
     steps, distance, device = options.iterations, options.camera_distance, options.device
     if not steps:
         return gaussians
-    fit = _Fit.start(gaussians.to(device), views.cameras, distance)
-    on_device = _to_device(views, device)
-    inverse = [(distance / depth).to(device) for depth in depths]
+    fit = _Fit.start(gaussians.to(device), len(views), distance)
+    targets = _targets(views, depths, distance, device)
+    kind = _CapturedSteps if fit.gradients.is_cuda else _Steps
     generator = torch.Generator().manual_seed(options.seed)
-    splits = {round(time * steps) for time in DENSITY.split_times if steps >= DENSITY.min_iterations}
-    gradients = torch.zeros(len(gaussians), device=device)
+    splits = [round(time * steps) for time in DENSITY.split_times if steps >= DENSITY.min_iterations]
+    rates = [MEANS_RATE * distance * MEANS_DECAY ** (max(step - 1, 0) / steps) for step in range(steps)]
     order: list[int] = []
-    with tqdm(range(steps), desc="fitting photos", unit="step", leave=False) as bar:
-        for step in bar:
-            order = order or torch.randperm(len(views), generator=generator).tolist()
-            view, grey = order.pop(), float(torch.rand((), generator=generator))
-            loss = _backward(fit, on_device, view, grey, device, inverse[view] if inverse else None)
-            gradients += fit.values["means"].grad.norm(dim=1)
-            fit.optimiser.step()
-            fit.optimiser.param_groups[0]["lr"] = MEANS_RATE * distance * MEANS_DECAY ** (step / steps)
-            if step in splits:
-                _split(fit, gradients, generator)
-                gradients = torch.zeros(len(fit.values["means"]), device=device)
-            if step % 20 == 0:
-                bar.set_postfix(loss=f"{loss.item():.4f}")
-    return _prune(fit, views, gradients > 0)
+    first = 0
+    with tqdm(total=steps, desc="fitting photos", unit="step", leave=False) as bar:
+        for last in [*splits, steps - 1]:  # the last steps of the parts between splits
+            schedule = []
+            for step in range(first, last + 1):
+                order = order or torch.randperm(len(views), generator=generator).tolist()
+                schedule.append((order.pop(), float(torch.rand((), generator=generator)), rates[step]))
+            kind(fit, targets, schedule).run(bar)
+            if last in splits:
+                _split(fit, generator)
+            first = last + 1
+    return _prune(fit, views, fit.gradients > 0)
 
 
 def _exposure_projection(cameras: Cameras) -> Float[Tensor, "c c"]:
@@ -168,40 +199,102 @@ def _exposure_projection(cameras: Cameras) -> Float[Tensor, "c c"]:
     return (torch.eye(count, dtype=main.dtype) - basis @ basis.T).float()
 
 
-def _to_device(views: Views, device: str) -> Views:
-    """The views on a device, copied at once: a copy per iteration would wait for the GPU."""
-    cameras = views.cameras
-    cameras = replace(cameras, viewmats=cameras.viewmats.to(device), Ks=cameras.Ks.to(device))
-    return Views(tuple(image.to(device) for image in views.images), cameras)
+class _Steps:
+    """Consecutive steps of the fit, each on one photo.
 
-
-def _backward(
-    fit: _Fit, views: Views, view: int, grey: float, device: str, inverse: Float[Tensor, "h w"] | None = None
-) -> Float[Tensor, ""]:
-    """The loss on one photo, with gradients computed.
-
-    `inverse` is the inverse target depth times the camera distance, inf where unknown.
+    `schedule` holds for each step the view, the grey of the background, and the learning rate of the means.
     """
-    photo = views.image(view, device)
-    height, width = photo.shape[:2]
-    background = torch.full((3,), grey, device=device)
-    one = slice(view, view + 1)
-    gaussians = fit.gaussians()
-    rendering = rasterise(gaussians, views.cameras.viewmats[one], views.cameras.Ks[one], width, height, background)
-    image = rendering.rgb[0] * fit.gain(view)
+
+    def __init__(self, fit: _Fit, targets: Sequence[_Targets], schedule: Sequence[tuple[int, float, float]]):
+        self.fit, self.schedule, self.device = fit, schedule, fit.gradients.device
+        place = {view: (group, row) for group in targets for row, view in enumerate(group.rows)}
+        self.places = [place[view] for view, _, _ in schedule]
+
+    def run(self, bar: tqdm) -> None:
+        """Take all steps."""
+        for step, ((group, row), (_, grey, rate)) in enumerate(zip(self.places, self.schedule, strict=True)):
+            loss = _descend(self.fit, group, torch.tensor([row]), torch.tensor([grey]), rate)
+            bar.update()
+            if step % 20 == 0:
+                bar.set_postfix(loss=f"{float(loss):.4f}")
+
+
+class _CapturedSteps(_Steps):
+    """The same on CUDA. A step is one launch of a graph, which reads its row of the schedule on the GPU; there is a
+    graph for each size of photos."""
+
+    def run(self, bar: tqdm) -> None:
+        """Take all steps."""
+        device = self.device
+        self.rows = torch.tensor([row for _, row in self.places], device=device)
+        self.greys, self.rates = torch.tensor([s[1:] for s in self.schedule], device=device).T.contiguous()
+        self.counter, self.loss = torch.zeros(1, dtype=torch.int64, device=device), torch.zeros((), device=device)
+        self.pairs = self._count_pairs()
+        self.graphs: dict[tuple[int, int], torch.cuda.CUDAGraph] = {}
+        for step, (group, _) in enumerate(self.places):
+            if group.size in self.graphs:
+                self.graphs[group.size].replay()
+            else:  # kernels are loaded in the first step, which cannot be captured
+                self._step(group)
+                self._capture(group)
+            bar.update()
+            if step % 100 == 99:
+                bar.set_postfix(loss=f"{float(self.loss):.4f}")
+                if int(self.pairs.needed) > 0.9 * self.pairs.slots:
+                    self.pairs = Capacity.at_least(int(self.pairs.needed), device)
+                    self.graphs.clear()
+
+    def _count_pairs(self) -> Capacity:
+        """Room for the pairs of Gaussian and tile of any view as the Gaussians are now, and more."""
+        with torch.no_grad():
+            g, groups = self.fit.gaussians(), {group.size: group for group, _ in self.places}
+            pairs = [count_pairs(g, camera, *size) for size, group in groups.items() for camera in group.cameras]
+        return Capacity.at_least(max(pairs), self.device)
+
+    def _capture(self, group: _Targets) -> None:
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(graph):
+            self._step(group)
+        self.graphs[group.size] = graph
+
+    def _step(self, group: _Targets) -> None:
+        row, grey, rate = (x.index_select(0, self.counter) for x in (self.rows, self.greys, self.rates))
+        self.loss.copy_(_descend(self.fit, group, row, grey, rate[0], self.pairs))
+        self.counter += 1
+
+
+def _descend(
+    fit: _Fit, group: _Targets, row: Int[Tensor, "1"], grey: Float[Tensor, "1"], means_rate: float | Tensor,
+    pairs: Capacity | None = None,
+) -> Float[Tensor, ""]:  # fmt: skip
+    """One step on the photo in this row of the group; returns the loss before it."""
+    loss = _loss(fit, group, row, grey, pairs)
+    grads = dict(zip(fit.values, torch.autograd.grad(loss, list(fit.values.values())), strict=True))
+    with torch.no_grad():
+        fit.gradients += grads["means"].norm(dim=1)
+        fit.descend(grads, means_rate)
+    return loss.detach()
+
+
+def _loss(
+    fit: _Fit, group: _Targets, row: Int[Tensor, "1"], grey: Float[Tensor, "1"], pairs: Capacity | None
+) -> Float[Tensor, ""]:
+    """Loss of the render of one photo in front of a grey background."""
+    photo, camera = group.images.index_select(0, row)[0].float() / 255, group.cameras.index_select(0, row)[0]
+    gaussians, gain = fit.gaussians(), (group.exposures.index_select(0, row)[0] @ fit.values["gains"]).exp()
+    rgb, alpha, depth, *_ = rasterise_packed(gaussians, camera, *group.size, grey.expand(3), pairs)
+    image = rgb * gain
     loss = (1 - SSIM_WEIGHT) * (image - photo).abs().mean() + SSIM_WEIGHT * (1 - ssim(image, photo))
     loss = loss + SCALE_WEIGHT * gaussians.scales.mean() / fit.camera_distance
-    if inverse is not None:
-        depth = rendering.depth[0].clamp_min(MIN_DEPTH * fit.camera_distance)
-        error = fit.camera_distance / depth - inverse
-        known = error.isfinite() & (rendering.alpha[0] > 0.5)
+    if group.inverse is not None:
+        depth = depth.clamp_min(MIN_DEPTH * fit.camera_distance)
+        error = fit.camera_distance / depth - group.inverse.index_select(0, row)[0]
+        known = error.isfinite() & (alpha > 0.5)
         loss = loss + DEPTH_WEIGHT * torch.where(known, error, torch.zeros_like(error)).abs().mean()
-    fit.optimiser.zero_grad(set_to_none=True)
-    loss.backward()
-    return loss.detach()  # converting to a Python number would wait for the GPU
+    return loss
 
 
-def _split(fit: _Fit, gradients: Float[Tensor, "n"], generator: torch.Generator) -> None:
+def _split(fit: _Fit, generator: torch.Generator) -> None:
     """Prune transparent Gaussians and split those with the largest gradients into two smaller ones.
 
     As sec. 5.2 of Kerbl et al. 2023, but ranked by the gradient of the mean times the size of the Gaussian: the change
@@ -211,7 +304,7 @@ def _split(fit: _Fit, gradients: Float[Tensor, "n"], generator: torch.Generator)
     alive = v["opacities"].sigmoid() > DENSITY.min_opacity
     size = v["scales"].exp().max(1).values
     count = int(DENSITY.split_fraction * int(alive.sum()))
-    chosen = torch.where(alive, gradients * size, -torch.ones_like(gradients)).topk(count).indices
+    chosen = torch.where(alive, fit.gradients * size, -torch.ones_like(size)).topk(count).indices
     keep = torch.cat([alive.nonzero()[:, 0], chosen])
     first = torch.searchsorted(alive.nonzero()[:, 0], chosen)  # new rows of the first halves
     second = torch.arange(len(keep) - count, len(keep), device=keep.device)

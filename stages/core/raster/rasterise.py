@@ -1,8 +1,8 @@
-"""Rasterisation of Gaussians: gsplat on CUDA, `stages.core.kernels.splat` elsewhere, with the same conventions.
+"""Rasterisation of Gaussians on the CPU and on CUDA, with the conventions of gsplat.
 
 Pixel centres at +0.5, 0.3 px^2 of blur, splats sorted by camera depth, alpha from 1/255 to 0.999, a pixel finished at
 a transmittance of 1e-4. Differentiable in means, quats, scales, opacities, sh and features, not in cameras or
-background.
+background. Images and gradients are bit-identical when repeated on the same device.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from stages.core.geometry.harmonics import degree_of
 from stages.core.kernels.splat.binning import Bins, bin_splats
 from stages.core.kernels.splat.compositing import composite, dominant_splats
 from stages.core.kernels.splat.projection import pack_camera, project
+from stages.core.kernels.splat.tiles import Capacity, Tiles, bin_tiles
 from stages.core.scene.gaussians import Gaussians
 
 NEAR = 0.01  # Gaussians with a smaller camera depth are left out [m]
@@ -57,10 +58,34 @@ def rasterise(
 
     Width and height are in pixels. Gaussians with a camera depth below NEAR are left out.
     """
-    draw = _draw_cuda if gaussians.means.is_cuda else _draw
-    views = [draw(gaussians, _View(V, K, width, height), background) for V, K in zip(viewmats, Ks, strict=True)]
-    *images, getters = zip(*views, strict=True)
+    packed = [_View(V, K, width, height).packed(gaussians) for V, K in zip(viewmats, Ks, strict=True)]
+    drawn = [rasterise_packed(gaussians, camera, width, height, background) for camera in packed]
+    *images, getters = zip(*drawn, strict=True)
     return Rendering(*(_stack(image) for image in images), getters)
+
+
+def rasterise_packed(
+    gaussians: Gaussians, camera: Float[Tensor, "26"], width: int, height: int, background: Tensor | None = None,
+    capacity: Capacity | None = None,
+):  # fmt: skip
+    """One view with a camera from `pack_camera` on the device of the Gaussians: rgb (h, w, 3), alpha (h, w), depth
+    (h, w), extents (n, 2) and a getter of the absolute gradients, see `Rendering`.
+
+    On CUDA, with a capacity for the pairs of a splat and a tile, nothing waits for the GPU, so that the call and its
+    gradient can be captured in a CUDA graph.
+    """
+    splats, bins = _splats(gaussians, camera, width, height, capacity)
+    absgrad: list[Tensor] = []
+    if splats.requires_grad:
+        splats.register_hook(lambda grad: absgrad.append(grad[:, 10:12]))
+    behind = None if background is None else background.detach()
+    rgb, depth, alpha = composite(splats, bins, behind, mean=True)
+    return rgb, alpha, depth, splats.detach()[:, 11:13], lambda: absgrad
+
+
+def count_pairs(gaussians: Gaussians, camera: Float[Tensor, "26"], width: int, height: int) -> int:
+    """The number of pairs of a splat and a tile in this view, on CUDA; see `Capacity`."""
+    return len(_splats(gaussians, camera, width, height)[1].slots)
 
 
 def rasterise_features(
@@ -72,9 +97,8 @@ def rasterise_features(
     height: int,
 ) -> Float[Tensor, "c h w f"]:
     """Composite feature vectors of the Gaussians like colours, over 0: sum of weight x feature. Differentiable."""
-    draw = _features_cuda if gaussians.means.is_cuda else _features
     views = [_View(V, K, width, height) for V, K in zip(viewmats, Ks, strict=True)]
-    return _stack([draw(gaussians, features, view) for view in views])
+    return _stack([_features(gaussians, features, view) for view in views])
 
 
 @torch.no_grad()
@@ -86,10 +110,8 @@ def visibility(
     height: int,
 ) -> tuple[Int[Tensor, "h w"], Float[Tensor, "n"]]:
     """The Gaussian with the largest weight in each pixel (-1: none), and each Gaussian's total weight [px]."""
-    view = _View(viewmat, K, width, height)
-    if gaussians.means.is_cuda:
-        return _visibility_cuda(gaussians, view)
-    return dominant_splats(*_splats(gaussians, view))
+    camera = _View(viewmat, K, width, height).packed(gaussians)
+    return dominant_splats(*_splats(gaussians, camera, width, height))
 
 
 class _View(NamedTuple):
@@ -100,35 +122,28 @@ class _View(NamedTuple):
     width: int
     height: int
 
-    def for_gsplat(self, g: Gaussians) -> tuple[Tensor, Tensor, int, int]:
-        """Camera arguments of gsplat's functions, on the device of the Gaussians."""
-        return self.viewmat[None].to(g.means), self.K[None].to(g.means), self.width, self.height
+    def packed(self, g: Gaussians) -> Float[Tensor, "26"]:
+        """The camera as the kernels read it, on the device of the Gaussians."""
+        return pack_camera(*self, NEAR).to(g.means.device)
 
 
 def _stack(images: list[Tensor] | tuple[Tensor, ...]) -> Tensor:
     return images[0][None] if len(images) == 1 else torch.stack(tuple(images))
 
 
-def _splats(g: Gaussians, view: _View) -> tuple[Tensor, Bins]:
+def _splats(
+    g: Gaussians, camera: Tensor, width: int, height: int, capacity: Capacity | None = None
+) -> tuple[Tensor, Bins | Tiles]:
     degree_of(g.sh.shape[1])
-    camera = pack_camera(*view, NEAR)
     splats, keys, rects = project(camera, g.means, g.quats, g.scales, g.opacities, g.sh)
-    return splats, bin_splats(keys, rects, view.width, view.height)
-
-
-def _draw(g: Gaussians, view: _View, background: Tensor | None):
-    """Image, alpha, depth, extents of one view, and a getter of its absolute gradients."""
-    splats, bins = _splats(g, view)
-    absgrad: list[Tensor] = []
-    if splats.requires_grad:
-        splats.register_hook(lambda grad: absgrad.append(grad[:, 10:12]))
-    rgb, depth, alpha = composite(splats, bins, None if background is None else background.detach(), mean=True)
-    return rgb, alpha, depth, splats.detach()[:, 11:13], lambda: absgrad
+    if splats.is_cuda:
+        return splats, bin_tiles(keys, rects, width, height, capacity)
+    return splats, bin_splats(keys, rects, width, height)
 
 
 def _features(g: Gaussians, features: Tensor, view: _View):
     """Composite four features at a time in the columns of colour and depth."""
-    splats, bins = _splats(g, view)
+    splats, bins = _splats(g, view.packed(g), view.width, view.height)
     count = features.shape[1]
     padded = torch.nn.functional.pad(features.float(), (0, -count % 4))
     images = []
@@ -136,51 +151,3 @@ def _features(g: Gaussians, features: Tensor, view: _View):
         rgb, fourth, _ = composite(torch.cat([splats[:, :6], four, splats[:, 10:]], 1), bins)
         images += [rgb, fourth[..., None]]
     return torch.cat(images, -1)[..., :count] if images else splats.new_zeros(view.height, view.width, 0)
-
-
-def _draw_cuda(g: Gaussians, view: _View, background: Tensor | None):
-    import gsplat
-
-    image, alpha, info = gsplat.rasterization(
-        g.means, g.quats, g.scales, g.opacities, g.sh, *view.for_gsplat(g), near_plane=NEAR,
-        sh_degree=degree_of(g.sh.shape[1]), packed=False, render_mode="RGB+ED", absgrad=True,
-    )  # fmt: skip
-    centres = info["means2d"]
-    rgb, alpha = image[0, ..., :3], alpha[0, ..., 0]
-    if background is not None:
-        rgb = rgb + (1 - alpha)[..., None] * background.detach().to(rgb)
-
-    def absgrad() -> list[Tensor]:  # no hook: a hook that holds its own tensor would never be freed
-        return [centres.absgrad[0]] if hasattr(centres, "absgrad") else []
-
-    return rgb, alpha, image[0, ..., 3], info["radii"][0].float(), absgrad
-
-
-def _features_cuda(g: Gaussians, features: Tensor, view: _View):
-    import gsplat
-
-    image, _, _ = gsplat.rasterization(
-        g.means, g.quats, g.scales, g.opacities, features, *view.for_gsplat(g), near_plane=NEAR,
-        packed=False,
-    )  # fmt: skip
-    return image[0]
-
-
-def _visibility_cuda(g: Gaussians, view: _View):
-    """Visibility from gsplat's projection and binning; gsplat does not return the dominant splat of a pixel."""
-    import gsplat
-
-    from stages.core.kernels.splat.compositing_pixel import composite_pixelwise
-
-    radii, centres, depths, conics, _ = gsplat.fully_fused_projection(
-        g.means, None, g.quats, g.scales, *view.for_gsplat(g), near_plane=NEAR,
-        opacities=g.opacities,
-    )  # fmt: skip
-    tile, across, down = 16, -(-view.width // 16), -(-view.height // 16)
-    _, keys, members = gsplat.isect_tiles(centres, radii, depths, tile, across, down)
-    starts = gsplat.isect_offset_encode(keys, 1, across, down).flatten()
-    starts = torch.cat([starts, starts.new_tensor([len(members)])])
-    splats = torch.zeros(len(g), 16, device=centres.device)
-    splats[:, :6] = torch.cat([centres[0], conics[0], g.opacities[:, None]], 1)
-    _, _, index, weight = composite_pixelwise(splats, members, starts, tile, view.width, view.height)
-    return index, weight

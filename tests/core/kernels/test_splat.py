@@ -5,12 +5,11 @@ import torch
 
 from stages.core.kernels.splat.binning import bin_splats, depth_order_reference
 from stages.core.kernels.splat.compositing import composite, composite_reference, dominant_splats
-from stages.core.kernels.splat.compositing_pixel import composite_pixelwise
-from stages.core.kernels.splat.projection import BIN_SIZE, pack_camera, project, project_reference
+from stages.core.kernels.splat.projection import BIN_SIZE, TILE_SIZE, pack_camera, project, project_reference
 from stages.core.kernels.splat.simd import even_bounds
+from stages.core.kernels.splat.tiles import Capacity, bin_tiles
 from tests.conftest import random_gaussians, ring
 
-devices = ["cpu"] + (["cuda"] if torch.cuda.is_available() else [])
 WIDTH, HEIGHT = 71, 53  # no multiples of block, bin or lane counts
 
 
@@ -23,13 +22,13 @@ def view_of(gaussians, closer: float = 0.0, size=(WIDTH, HEIGHT)):
     return camera, (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
 
 
-def random_splats(n: int, opacity: float = 1.0, seed: int = 0, size=(WIDTH, HEIGHT)):
+def random_splats(n: int, opacity: float = 1.0, seed: int = 0, size=(WIDTH, HEIGHT), device: str = "cpu"):
     gaussians = random_gaussians(n, seed=seed, degree=1)
     camera, tensors = view_of(gaussians, size=size)
     tensors = (*tensors[:3], (opacity * tensors[3]).clamp(max=1.0), tensors[4])
     with torch.no_grad():
-        splats, keys, rects = project(camera, *tensors)
-    return splats, bin_splats(keys, rects, *size)
+        splats, keys, rects = project(camera.to(device), *(t.to(device) for t in tensors))
+    return splats, (bin_tiles if device == "cuda" else bin_splats)(keys, rects, *size)
 
 
 def relative(ours, theirs) -> float:
@@ -38,12 +37,13 @@ def relative(ours, theirs) -> float:
 
 @pytest.mark.parametrize("closer", [0.0, 1.7], ids=["outside", "inside the cloud"])
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_projection_equals_its_reference(degree, closer):
+def test_projection_equals_its_reference(degree, closer, device):
     # inside the cloud, large Gaussians centred far outside the image overlap it: their Jacobian is clamped
     camera, tensors = view_of(random_gaussians(203, degree=degree, size=0.25 if closer else 0.05), closer)
     tensors = [t.clone().requires_grad_() for t in tensors]
     exact = [t.detach().double().requires_grad_() for t in tensors]
-    splats, theirs = project(camera, *tensors)[0], project_reference(camera, *exact)
+    splats = project(camera.to(device), *(t.to(device) for t in tensors))[0].cpu()
+    theirs = project_reference(camera, *exact)
     assert torch.equal(splats[:, 11] > 0, theirs[:, 11] > 0)
     assert 20 < (splats[:, 11] > 0).sum() <= 203
     torch.testing.assert_close(splats[:, :10].double(), theirs[:, :10], rtol=1e-4, atol=1e-5)
@@ -116,17 +116,18 @@ def test_balanced_bounds_cover_all_bins():
 
 # opacity 3: most splats clamp at alpha 0.999 and many pixels finish early
 @pytest.mark.parametrize("opacity", [0.1, 1.0, 3.0])
-def test_compositing_equals_its_reference(opacity):
-    splats, bins = random_splats(400, opacity)
+def test_compositing_equals_its_reference(opacity, device):
+    splats, bins = random_splats(400, opacity, device=device)
     splats.requires_grad_()
-    exact = splats.detach().double().requires_grad_()
-    *theirs, _ = composite_reference(exact, depth_order_reference(splats), WIDTH, HEIGHT)
-    ours = composite(splats, bins)
+    exact = splats.detach().double().cpu().requires_grad_()
+    *theirs, _ = composite_reference(exact, depth_order_reference(exact), WIDTH, HEIGHT)
+    ours = [image.cpu() for image in composite(splats, bins)]
     assert 0.05 < ours[2].mean() < 0.9 and (opacity == 0.1 or ours[2].max() > 0.999)
     for mine, true in zip(ours, theirs, strict=True):
         torch.testing.assert_close(mine.double(), true, rtol=0, atol=5e-6)
     weights = [torch.randn(image.shape, generator=torch.Generator().manual_seed(1)) for image in ours]
     (mine,) = torch.autograd.grad(sum((w * i).sum() for w, i in zip(weights, ours, strict=True)), splats)
+    mine = mine.cpu()
     (true,) = torch.autograd.grad(sum((w.double() * i).sum() for w, i in zip(weights, theirs, strict=True)), exact)
     for column in range(10):
         assert relative(mine[:, column], true[:, column]) < 1e-5, column
@@ -134,27 +135,27 @@ def test_compositing_equals_its_reference(opacity):
     torch.testing.assert_close(mine, true, rtol=1e-4, atol=1e-5 * float(true.abs().max()))
 
 
-def test_gradient_includes_mean_and_background():
-    splats, bins = random_splats(200)
+def test_gradient_includes_mean_and_background(device):
+    splats, bins = random_splats(200, device=device)
     splats.requires_grad_()
-    exact = splats.detach().double().requires_grad_()
+    exact = splats.detach().double().cpu().requires_grad_()
     behind = torch.rand(HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(2))
-    rgb, mean, _ = composite(splats, bins, behind, mean=True)
-    colour, fourth, alpha, _ = composite_reference(exact, depth_order_reference(splats), WIDTH, HEIGHT)
+    rgb, mean = (image.cpu() for image in composite(splats, bins, behind.to(device), mean=True)[:2])
+    colour, fourth, alpha, _ = composite_reference(exact, depth_order_reference(exact), WIDTH, HEIGHT)
     their_rgb, their_mean = colour + (1 - alpha)[..., None] * behind, fourth / alpha.clamp_min(1e-10)
     torch.testing.assert_close(rgb.double(), their_rgb, rtol=0, atol=5e-6)
     torch.testing.assert_close(mean.double(), their_mean, rtol=1e-4, atol=1e-5)
     (mine,) = torch.autograd.grad(rgb.square().sum() + mean.square().sum(), splats)
     (true,) = torch.autograd.grad(their_rgb.square().sum() + their_mean.square().sum(), exact)
-    assert relative(mine[:, :10], true[:, :10]) < 1e-4
+    assert relative(mine[:, :10].cpu(), true[:, :10]) < 1e-4
 
 
-def test_absolute_gradients_do_not_cancel():
+def test_absolute_gradients_do_not_cancel(device):
     # A uniform upstream gradient is odd in x about the splat's centre: signed terms cancel, absolute ones add up.
-    splats, keys, rects = one_splat(40.5, 20.5)
+    splats, bins = one_splat(40.5, 20.5, device)
     splats.requires_grad_()
-    upstream = torch.ones(HEIGHT, WIDTH, 3)
-    (grad,) = torch.autograd.grad(composite(splats, bin_splats(keys, rects, WIDTH, HEIGHT))[0], splats, upstream)
+    upstream = torch.ones(HEIGHT, WIDTH, 3, device=device)
+    grad = torch.autograd.grad(composite(splats, bins)[0], splats, upstream)[0].cpu()
     sigma, x = 3.0, torch.arange(-40, 31).float()
     profile = 0.5 * torch.exp(-0.5 * (x / sigma) ** 2) * x / sigma**2
     y = torch.arange(-20, 33).float()
@@ -164,37 +165,58 @@ def test_absolute_gradients_do_not_cancel():
     torch.testing.assert_close(grad[0, 10], both[seen].sum(), rtol=1e-4, atol=0)
 
 
-def one_splat(x: float, y: float, opacity: float = 0.5, sigma: float = 3.0):
+def one_splat(x: float, y: float, device: str, opacity: float = 0.5, sigma: float = 3.0):
     splats = torch.zeros(1, 16)
     radius = sigma * (2 * torch.tensor(255 * opacity).log()).sqrt()
     conic = [1 / sigma**2, 0, 1 / sigma**2]
     splats[0, :13] = torch.tensor([x, y, *conic, opacity, 1, 1, 1, 2, torch.tensor(opacity).log2(), radius, radius])
-    return splats, torch.ones(1, dtype=torch.int32), torch.tensor([[0, 0, 2, 1]], dtype=torch.int16)
+    bins, last = (bin_tiles, (4, 3)) if device == "cuda" else (bin_splats, (2, 1))
+    key, rect = torch.ones(1, dtype=torch.int32), torch.tensor([[0, 0, *last]], dtype=torch.int16)
+    return splats.to(device), bins(key.to(device), rect.to(device), WIDTH, HEIGHT)
 
 
-@pytest.mark.parametrize("device", devices)
-def test_per_pixel_compositing_agrees(device):
-    splats, bins = random_splats(1500)
-    image, alpha, index, totals = composite_pixelwise(
-        splats.to(device), bins.members.to(device), bins.starts.to(device), BIN_SIZE, WIDTH, HEIGHT
-    )
-    rgb, fourth, opaque = composite(splats, bins)
-    torch.testing.assert_close(image[..., :3].cpu(), rgb, rtol=0, atol=5e-6)
-    torch.testing.assert_close(image[..., 3].cpu(), fourth, rtol=0, atol=2e-5)
-    torch.testing.assert_close(alpha.cpu(), opaque, rtol=0, atol=5e-6)
-    which, weight = dominant_splats(splats, bins)
-    assert (index.cpu() == which).float().mean() > 0.999  # except for ties within rounding
-    torch.testing.assert_close(totals.cpu(), weight, rtol=1e-4, atol=1e-4)
-
-
-def test_dominant_splat_equals_the_reference():
-    splats, bins = random_splats(400)
-    order = depth_order_reference(splats)
-    *_, weights = composite_reference(splats.double(), order, WIDTH, HEIGHT)
+def test_dominant_splat_equals_the_reference(device):
+    splats, bins = random_splats(400, device=device)
+    exact = splats.double().cpu()
+    order = depth_order_reference(exact)
+    *_, weights = composite_reference(exact, order, WIDTH, HEIGHT)
     best = torch.where(weights.amax(-1) > 0, order[weights.argmax(-1)], -1)
-    index, totals = dominant_splats(splats, bins)
+    index, totals = (x.cpu() for x in dominant_splats(splats, bins))
     assert (index == best).float().mean() > 0.999 and (index == -1).any()
     torch.testing.assert_close(totals[order].double(), weights.sum((0, 1)), rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("n", [1, 17, 1500])
+def test_tiles_hold_overlapping_splats_nearest_first(n):
+    splats, tiles = random_splats(n, device="cuda")
+    order = depth_order_reference(splats.cpu())
+    members = tiles.ids[tiles.slots].cpu().long()
+    low, high = (splats[:, :2] - splats[:, 11:13]).cpu()[order], (splats[:, :2] + splats[:, 11:13]).cpu()[order]
+    assert len(tiles.starts) == tiles.columns * -(-HEIGHT // TILE_SIZE) + 1 and int(tiles.starts[-1]) == len(members)
+    for b in range(len(tiles.starts) - 1):
+        corner = torch.tensor([b % tiles.columns, b // tiles.columns]) * TILE_SIZE
+        touches = ((low <= corner + TILE_SIZE - 0.5) & (high >= corner + 0.5)).all(1)
+        listed = members[tiles.starts[b] : tiles.starts[b + 1]]
+        assert set(order[touches].tolist()) <= set(listed.tolist())
+        assert torch.equal(listed, order[torch.isin(order, listed)])
+
+
+@pytest.mark.gpu
+def test_capacity_changes_nothing_unless_it_is_too_small():
+    gaussians = random_gaussians(1500, degree=1)
+    camera, tensors = view_of(gaussians)
+    splats, *keys = project(camera.cuda(), *(t.cuda() for t in tensors))
+    splats = splats.detach().requires_grad_()
+    exact = bin_tiles(*keys, WIDTH, HEIGHT)
+    results = []
+    for capacity in (None, Capacity.at_least(len(exact.slots), splats.device), Capacity.at_least(0, splats.device)):
+        rgb, _, alpha = composite(splats, bin_tiles(*keys, WIDTH, HEIGHT, capacity))
+        results.append([rgb, alpha, *torch.autograd.grad(rgb.square().sum() + alpha.sum(), splats)])
+        assert capacity is None or int(capacity.needed) == len(exact.slots)
+    whole, roomy, small = results
+    assert all(torch.equal(a, b) for a, b in zip(whole, roomy, strict=True))
+    assert small[0].isfinite().all() and small[2].isfinite().all() and not torch.equal(small[0], whole[0])
 
 
 @pytest.mark.parametrize("threads", [2, 3])

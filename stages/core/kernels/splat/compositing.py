@@ -1,4 +1,4 @@
-"""Front-to-back compositing of binned splats, 16 pixels (4 x 4) at a time, on the CPU.
+"""Front-to-back compositing of binned splats: on the CPU 16 pixels (4 x 4) at a time, on CUDA by `compositing_cuda`.
 
 The state of a bin's 64 blocks of pixels stays in the first-level cache during one pass over the bin's splats. 64-bit
 masks hold the blocks that a splat overlaps and the blocks that are not yet finished.
@@ -11,6 +11,7 @@ import warp as wp
 from torch import Tensor
 
 from stages.core.kernels.interop import view
+from stages.core.kernels.splat import compositing_cuda
 from stages.core.kernels.splat.binning import Bins
 from stages.core.kernels.splat.compositing_adjoint import composite_adjoint
 from stages.core.kernels.splat.pixel_blocks import (
@@ -22,6 +23,7 @@ from stages.core.kernels.splat.pixel_blocks import (
 )
 from stages.core.kernels.splat.projection import MIN_ALPHA
 from stages.core.kernels.splat.simd import VECTORS, launch_ranges, num_threads
+from stages.core.kernels.splat.tiles import Tiles
 
 wp.set_module_options({"enable_backward": False})
 
@@ -173,7 +175,7 @@ class _Composite(torch.autograd.Function):
         return grads, None, None, None
 
 
-def composite(splats: Tensor, bins: Bins, behind: Tensor | None = None, mean: bool = False):
+def composite(splats: Tensor, bins: Bins | Tiles, behind: Tensor | None = None, mean: bool = False):
     """Composite splats (n, 16): image (h, w, 3), fourth channel (h, w) and alpha (h, w). Differentiable in the splats.
 
     `behind` is a background colour (3,) or image (h, w, 3), black when None. The fourth channel is composited like the
@@ -182,12 +184,15 @@ def composite(splats: Tensor, bins: Bins, behind: Tensor | None = None, mean: bo
     detail it covers.
     Source: Kerbl et al. 2023; Ye et al. 2024, "AbsGS", eq. 8.
     """
-    behind = torch.zeros(3) if behind is None else behind.float().contiguous()
-    return _Composite.apply(splats.contiguous(), bins, behind, mean)
+    behind = splats.new_zeros(3) if behind is None else behind.float().contiguous()
+    function = compositing_cuda.Composite if splats.is_cuda else _Composite
+    return function.apply(splats.contiguous(), bins, behind, mean)
 
 
-def dominant_splats(splats: Tensor, bins: Bins) -> tuple[Tensor, Tensor]:
+def dominant_splats(splats: Tensor, bins: Bins | Tiles) -> tuple[Tensor, Tensor]:
     """The splat with the largest weight in each pixel (h, w; -1: none), and each splat's total weight (n,) [px]."""
+    if splats.is_cuda:
+        return compositing_cuda.dominant_splats(splats, bins)
     bounds = bins.balanced_bounds(num_threads())
     index, totals = torch.empty(bins.height, bins.width, dtype=torch.int32), torch.zeros(len(bounds) - 1, len(splats))
     launch_ranges(_dominant, bounds, _arguments(splats, bins, torch.zeros(3), False, *_outputs(bins), index, totals))

@@ -1,4 +1,4 @@
-"""Projection of Gaussians to one camera (EWA splatting), 16 at a time on the CPU, and its adjoint.
+"""Projection of Gaussians to one camera (EWA splatting) and its adjoint: 16 at a time on a CPU, one per thread on CUDA.
 
 A splat, a projected Gaussian, is a row of 16 floats, one cache line:
 0-1 centre [px], 2-4 inverse covariance xx xy yy [1/px^2], 5 opacity, 6-8 colour, 9 depth, 10 log2 of the opacity,
@@ -14,20 +14,35 @@ from torch import Tensor
 
 from stages.core.geometry.harmonics import evaluate_sh
 from stages.core.geometry.rotations import matrix
-from stages.core.kernels.interop import view
+from stages.core.kernels.interop import device_of, launch, view
 from stages.core.kernels.splat.harmonics import HARMONICS, HARMONICS_ADJOINT
-from stages.core.kernels.splat.simd import LANES, VECTORS, even_bounds, launch_ranges, num_threads
+from stages.core.kernels.splat.simd import (
+    LANES,
+    SCALARS,
+    VECTORS,
+    by_device,
+    even_bounds,
+    launch_ranges,
+    num_threads,
+)
 
 wp.set_module_options({"enable_backward": False})  # the adjoint is written out below
 
 BLUR = 0.3  # added to the image covariance [px^2], so that no splat is thinner than a pixel
 MIN_ALPHA = 1 / 255  # smaller contributions are skipped
 SPLAT_SIZE = 16  # floats in a splat
-BIN_SIZE = 32  # [px], side of a bin
+BIN_SIZE = 32  # [px], side of a bin on a CPU
+TILE_SIZE = 16  # [px], side of a bin on CUDA: a thread per pixel, 256 in a block
 
-# In: a group of 16 Gaussians. Out: their covariance on the image and its inverse.
-_GEOMETRY = r"""
-const float* cam = camera.data;
+# Rows of a group of Gaussians: 16 on a CPU, one on CUDA.
+_ROWS = by_device(
+    SCALARS
+    + r"""
+const int row = group;
+auto gather = [row](const float* p, int stride, int column) { return p[(long long)row * stride + column]; };
+""",
+    VECTORS
+    + r"""
 const int count = n - 16 * group < 16 ? n - 16 * group : 16;
 int row[16];
 for (int l = 0; l < 16; ++l) row[l] = 16 * group + (l < count ? l : 0);
@@ -36,6 +51,12 @@ auto gather = [&row](const float* p, int stride, int column) {
     for (int l = 0; l < 16; ++l) v[l] = p[(long)row[l] * stride + column];
     return v;
 };
+""",
+)
+
+# Out: covariance on the image and its inverse.
+_GEOMETRY = r"""
+const float* cam = camera.data;
 F m[3], p[3], q[4], s[3];
 for (int i = 0; i < 3; ++i) m[i] = gather(means.data, 3, i);
 for (int i = 0; i < 3; ++i) p[i] = cam[3*i] * m[0] + cam[3*i+1] * m[1] + cam[3*i+2] * m[2] + cam[9+i];
@@ -81,6 +102,17 @@ F lo = log2v(visible ? o : (F)(1.0f));
 F radius2 = 2 * 0.693147181f * (lo + 7.99435344f) + 1e-3f;  // 2 ln(255 o), plus a margin for rounding
 F rx = vsqrt(radius2 * (aa + BLUR)), ry = vsqrt(radius2 * (bb + BLUR));
 visible &= (px + rx > 0) & (px - rx < cam[19]) & (py + ry > 0) & (py - ry < cam[20]);
+""".replace("MIN_ALPHA", f"{MIN_ALPHA!r}f").replace("BLUR", f"{BLUR}f")
+
+_INVISIBLE = by_device(
+    r"""
+if (!visible) {
+    for (int j = 0; j < 16; ++j) splats.data[16 * (long long)row + j] = 0;
+    keys.data[row] = -1;
+    return;
+}
+""",
+    r"""
 if (!bits(visible)) {
     for (int l = 0; l < count; ++l) {
         store(splats.data + 16 * (long)row[l], (F)(0.0f));
@@ -88,17 +120,19 @@ if (!bits(visible)) {
     }
     return;
 }
-""".replace("MIN_ALPHA", f"{MIN_ALPHA!r}f").replace("BLUR", f"{BLUR}f")
+""",
+)
 
-_WRITE = r"""
+_WRITE_GROUP = r"""
 const F none = (F)(0.0f);
 F f[13] = {px, py, A, B, C, o, vmax(rgb[0], none), vmax(rgb[1], none), vmax(rgb[2], none), z, lo, rx, ry};
 I key = visible ? __builtin_bit_cast(I, z) : (I)(-1);  // positive floats sort as integers
 auto bin = [&](F edge, float last) {
     return __builtin_convertvector(vmin(vmax(edge * (1.0f / BIN_SIZE), none), (F)(last)), I);
 };
-I x0 = bin(px - rx - 0.5f, cam[26]), x1 = bin(px + rx - 0.5f, cam[26]);
-I y0 = bin(py - ry - 0.5f, cam[27]), y1 = bin(py + ry - 0.5f, cam[27]);
+const float right = (int)(cam[19] - 1) / BIN_SIZE, bottom = (int)(cam[20] - 1) / BIN_SIZE;
+I x0 = bin(px - rx - 0.5f, right), x1 = bin(px + rx - 0.5f, right);
+I y0 = bin(py - ry - 0.5f, bottom), y1 = bin(py + ry - 0.5f, bottom);
 for (int l = 0; l < count; ++l) {
     F r = none;
     if (key[l] >= 0)
@@ -110,7 +144,36 @@ for (int l = 0; l < count; ++l) {
 }
 """.replace("BIN_SIZE", str(BIN_SIZE))
 
-_BACKWARD = r"""
+_WRITE_ONE = r"""
+float4* to = (float4*)(splats.data + 16 * (long long)row);
+to[0] = make_float4(px, py, A, B);
+to[1] = make_float4(C, o, fmaxf(rgb[0], 0.0f), fmaxf(rgb[1], 0.0f));
+to[2] = make_float4(fmaxf(rgb[2], 0.0f), z, lo, rx);
+to[3] = make_float4(ry, 0.0f, 0.0f, 0.0f);
+keys.data[row] = __float_as_int(z);
+auto tile = [](float edge, float size) {
+    return (short)fminf(fmaxf(edge * (1.0f / TILE_SIZE), 0.0f), (float)((int)(size - 1) / TILE_SIZE));
+};
+short* rect = rects.data + 4 * (long long)row;
+rect[0] = tile(px - rx - 0.5f, cam[19]);
+rect[1] = tile(py - ry - 0.5f, cam[20]);
+rect[2] = tile(px + rx - 0.5f, cam[19]);
+rect[3] = tile(py + ry - 0.5f, cam[20]);
+""".replace("TILE_SIZE", str(TILE_SIZE))
+
+_WRITE = by_device(_WRITE_ONE, _WRITE_GROUP)
+
+# Rows of the gradients: `slot` reads a column of the splats' gradient, `scatter` writes one of a Gaussian's.
+_ADJOINT_ROWS = by_device(
+    r"""
+const F none = 0;
+const bool drawn = splats.data[16 * (long long)row + 11] > 0;
+auto slot = [&](int j) { return drawn ? gather(grads.data, 16, j) : none; };
+auto scatter = [&](float* to, int stride, int column, F value) {
+    to[(long long)row * stride + column] = drawn ? value : none;
+};
+""",
+    r"""
 const F none = (F)(0.0f);
 I drawn;
 for (int l = 0; l < 16; ++l) drawn[l] = splats.data[16 * (long)row[l] + 11] > 0 ? -1 : 0;
@@ -119,6 +182,10 @@ auto scatter = [&](float* to, int stride, int column, F value) {
     value = drawn ? value : none;
     for (int l = 0; l < count; ++l) to[(long)row[l] * stride + column] = value[l];
 };
+""",
+)
+
+_BACKWARD = r"""
 // gradient by the covariance from that by its inverse C: G = -C V C with V symmetric
 F va = slot(2), vb = 0.5f * slot(3), vc = slot(4);
 F t00 = A*va + B*vb, t01 = A*vb + B*vc, t10 = B*va + C*vb, t11 = B*vb + C*vc;
@@ -166,7 +233,7 @@ for (int i = 0; i < 3; ++i) scatter(v_means.data, 3, i, vm[i] + (vd[i] - radial 
 """
 
 
-@wp.func_native(VECTORS + _GEOMETRY + _FORWARD + HARMONICS + _WRITE)
+@wp.func_native(_ROWS + _GEOMETRY + _FORWARD + _INVISIBLE + HARMONICS + _WRITE)
 def _project_group(
     group: int, n: int, k: int, camera: wp.array[float], means: wp.array[float], quats: wp.array[float],
     scales: wp.array[float], opacities: wp.array[float], sh: wp.array[float],
@@ -183,7 +250,7 @@ def _project(
     _project_group(start + wp.tid(), n, k, camera, means, quats, scales, opacities, sh, splats, keys, rects)
 
 
-@wp.func_native(VECTORS + _GEOMETRY + HARMONICS + _BACKWARD + HARMONICS_ADJOINT + _DIRECTION)
+@wp.func_native(_ROWS + _GEOMETRY + HARMONICS + _ADJOINT_ROWS + _BACKWARD + HARMONICS_ADJOINT + _DIRECTION)
 def _unproject_group(
     group: int, n: int, k: int, camera: wp.array[float], means: wp.array[float], quats: wp.array[float],
     scales: wp.array[float], opacities: wp.array[float], sh: wp.array[float], splats: wp.array[float],
@@ -204,18 +271,26 @@ def _project_adjoint(
 
 
 def pack_camera(viewmat: Tensor, K: Tensor, width: int, height: int, near: float) -> Tensor:
-    """Pack a camera into the 28 floats that the kernels read.
+    """Pack a camera into the 26 floats that the kernels read.
 
-    Rotation (9), translation (3), fx fy cx cy [px], centre (3) [m], width and height [px], near plane [m], limits of
-    x/z and y/z (15 % of the image outside each border), and the last column and row of bins.
+    Rotation (9), translation (3), fx fy cx cy [px], centre (3) [m], width and height [px], near plane [m], and limits
+    of x/z and y/z (15 % of the image outside each border).
     """
     W, k = np.asarray(viewmat.detach().cpu(), np.float64), np.asarray(K.detach().cpu(), np.float64)
     R, t, (fx, fy, cx, cy) = W[:3, :3], W[:3, 3], (k[0, 0], k[1, 1], k[0, 2], k[1, 2])
     mx, my = 0.15 * width / fx, 0.15 * height / fy
     limits = [-cx / fx - mx, (width - cx) / fx + mx, -cy / fy - my, (height - cy) / fy + my]
-    last = [(width - 1) // BIN_SIZE, (height - 1) // BIN_SIZE]
-    numbers = [*R.ravel(), *t, fx, fy, cx, cy, *(-R.T @ t), width, height, near, *limits, *last]
+    numbers = [*R.ravel(), *t, fx, fy, cx, cy, *(-R.T @ t), width, height, near, *limits]
     return torch.tensor(np.asarray(numbers, np.float32))
+
+
+def _launch(kernel: wp.Kernel, n: int, k: int, tensors: tuple[Tensor, ...]) -> None:
+    """Launch a kernel on all n Gaussians of k harmonics coefficients."""
+    flat = [view(t.view(-1)) for t in tensors]
+    if tensors[0].is_cuda:
+        launch(kernel, n, [0, 0, n, k, *flat], device=device_of(tensors[0]))
+    else:
+        launch_ranges(kernel, even_bounds(-(-n // LANES), num_threads()), [n, k, *flat])
 
 
 class _Project(torch.autograd.Function):
@@ -223,10 +298,8 @@ class _Project(torch.autograd.Function):
     def forward(ctx, camera, means, quats, scales, opacities, sh):
         n, k = len(means), sh.shape[1]
         splats = means.new_empty(n, SPLAT_SIZE)
-        keys, rects = torch.empty(n, dtype=torch.int32), torch.empty(n, 4, dtype=torch.int16)
-        flat = [view(t.view(-1)) for t in (camera, means, quats, scales, opacities, sh, splats, keys, rects)]
-        groups = -(-n // LANES)
-        launch_ranges(_project, even_bounds(groups, num_threads()), [n, k, *flat])
+        keys, rects = means.new_empty(n, dtype=torch.int32), means.new_empty(n, 4, dtype=torch.int16)
+        _launch(_project, n, k, (camera, means, quats, scales, opacities, sh, splats, keys, rects))
         ctx.save_for_backward(camera, means, quats, scales, opacities, sh, splats)
         ctx.mark_non_differentiable(keys, rects)
         return splats, keys, rects
@@ -237,15 +310,15 @@ class _Project(torch.autograd.Function):
         n, k = len(means), sh.shape[1]
         grads = [torch.empty_like(t) for t in (means, quats, scales, opacities, sh)]
         tensors = (camera, means, quats, scales, opacities, sh, splats, v_splats.contiguous(), *grads)
-        flat = [view(t.view(-1)) for t in tensors]
-        launch_ranges(_project_adjoint, even_bounds(-(-n // LANES), num_threads()), [n, k, *flat])
+        _launch(_project_adjoint, n, k, tensors)
         return None, *grads
 
 
 def project(camera: Tensor, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh: Tensor):
     """Project Gaussians: splats (n, 16), sort keys (n,) and bin rectangles (n, 4: first column, first row, last ones).
 
-    `camera` is from `pack_camera`. Only the splats are differentiable. Keys are the bits of the depth, -1 for Gaussians
+    `camera` is from `pack_camera`, on the device of the Gaussians. Bins have BIN_SIZE pixels on a CPU and TILE_SIZE on
+    CUDA. Only the splats are differentiable. Keys are the bits of the depth, -1 for Gaussians
     that are not visible.
     Source: Zwicker et al. 2001, "EWA splatting"; conventions of gsplat's classic mode.
     """

@@ -1,4 +1,4 @@
-"""SIMD types and functions of 16 lanes for the C++ snippets of the rasteriser, and their parallel launch.
+"""Types and functions for the C++ snippets of the rasteriser, and their parallel launch on a CPU.
 
 Warp runs a CPU launch on one thread and does not vectorise across its threads, so the snippets use the
 compiler's vector types, which are lowered to what the processor has (one AVX-512 register, two AVX registers,
@@ -53,6 +53,24 @@ auto log2v = [](F x) {
 };
 """
 """Vector types and functions; a Warp snippet is the body of a function, so helpers are lambdas."""
+
+SCALARS = r"""
+typedef float F;
+typedef int I;
+
+auto bits = [](I mask) -> unsigned { return mask; };
+auto vmin = [](F a, F b) { return fminf(a, b); };
+auto vmax = [](F a, F b) { return fmaxf(a, b); };
+auto vsqrt = [](F a) { return sqrtf(a); };
+auto log2v = [](F x) { return log2f(x); };
+"""
+"""The types and functions of VECTORS that snippets for both devices use, with one lane per thread, for CUDA."""
+
+
+def by_device(cuda: str, cpu: str) -> str:
+    """A snippet that is compiled as `cuda` for a GPU and as `cpu` otherwise."""
+    return f"#if defined(__CUDA_ARCH__)\n{cuda}\n#else\n{cpu}\n#endif\n"
+
 
 LANE_SUMS = r"""
 // lane i of the result is the sum over the lanes of v[i], i = 0..15

@@ -1,0 +1,320 @@
+"""Front-to-back compositing of splats in tiles on CUDA, and its adjoint: a block of threads per tile.
+
+A warp draws 8 x 4 pixels. It skips splats whose box does not reach these pixels. The adjoint sums over the pixels of a
+tile by warp shuffles and shared memory, writes one row per slot, and then sums each splat's rows: no atomics, so the
+result does not depend on the order of execution.
+"""
+
+from __future__ import annotations
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from stages.core.kernels.interop import device_of, launch, view
+from stages.core.kernels.splat.pixel_blocks import MAX_ALPHA, MIN_MEAN_ALPHA, MIN_TRANSMITTANCE
+from stages.core.kernels.splat.projection import SPLAT_SIZE, TILE_SIZE
+from stages.core.kernels.splat.simd import by_device
+from stages.core.kernels.splat.tiles import Tiles
+
+wp.set_module_options({"enable_backward": False})
+
+THREADS = TILE_SIZE * TILE_SIZE
+MOMENTS = 12  # sums over pixels for each slot: see `_BACKWARD`
+
+# The thread's pixel and the test whether a splat at x, y with the box rx, ry reaches the pixels of its warp.
+_PIXEL = r"""
+const int t = threadIdx.x, warp = t >> 5, lane = t & 31;
+const int X = (tile % across) * 16 + (warp & 1) * 8, Y = (tile / across) * 16 + (warp >> 1) * 4;
+const int px = X + (lane & 7), py = Y + (lane >> 3), pixel = py * width + px;
+const bool inside = px < width && py < height;
+const float fx = px + 0.5f, fy = py + 0.5f;
+const int begin = starts.data[tile], end = starts.data[tile + 1];
+auto reaches = [X, Y](float4 box) {
+    return box.x + box.z >= X + 0.5f && box.x - box.z <= X + 7.5f && box.y + box.w >= Y + 0.5f
+        && box.y - box.w <= Y + 3.5f;
+};
+"""
+
+# Shared copies of a batch: box (centre, half width and height), log2 alpha as a quadratic form, and colour.
+_LOAD = r"""
+__shared__ float4 box[BATCH], form[BATCH], colour[BATCH];
+auto load = [&](int at, int k) {
+    const float4* s = (const float4*)(splats.data + 16 * (long long)ids.data[slots.data[k]]);
+    const float4 a = s[0], b = s[1], c = s[2];
+    box[at] = make_float4(a.x, a.y, c.w, s[3].x);
+    form[at] = make_float4(-0.721347520f * a.z, -1.44269504f * a.w, -0.721347520f * b.x, c.z);
+    colour[at] = make_float4(b.z, b.w, c.x, c.y);
+};
+auto log2_alpha = [&](int j, float dx, float dy) {
+    const float4 q = form[j];
+    return fmaf(dx, fmaf(q.x, dx, q.y * dy), fmaf(q.z * dy, dy, q.w));
+};
+"""
+
+_FORWARD = r"""
+float T = 1, r = 0, g = 0, b = 0, z = 0, best = 0;
+int stop = end, which = -1;
+bool done = !inside;
+for (int base = begin; base < end; base += 256) {
+    if (__syncthreads_count(done) == 256) break;  // also: the batch before is no longer read
+    if (base + t < end) load(t, base + t);
+    __syncthreads();
+    const int count = end - base < 256 ? end - base : 256;
+    for (int j = 0; j < count && !done; ++j) {
+        const float4 at = box[j];
+        if (!reaches(at)) continue;
+        const float power = log2_alpha(j, fx - at.x, fy - at.y);
+        if (power < -7.99435344f) continue;
+        const float alpha = fminf(exp2f(power), MAX_ALPHA), next = T - alpha * T;
+        if (next <= MIN_TRANSMITTANCE) {
+            done = true;
+            stop = base + j;
+            break;
+        }
+        const float w = alpha * T;
+        const float4 c = colour[j];
+        r = fmaf(w, c.x, r); g = fmaf(w, c.y, g); b = fmaf(w, c.z, b); z = fmaf(w, c.w, z);
+        if (w > best) { best = w; which = base + j; }
+        T = next;
+    }
+}
+if (inside) {
+    const float alpha = 1 - T;
+    const float* behind_pixel = behind.data + step * (long long)pixel;
+    rgb.data[3 * pixel] = r + T * behind_pixel[0];
+    rgb.data[3 * pixel + 1] = g + T * behind_pixel[1];
+    rgb.data[3 * pixel + 2] = b + T * behind_pixel[2];
+    fourth.data[pixel] = mean ? z / fmaxf(alpha, MIN_MEAN_ALPHA) : z;
+    alphas.data[pixel] = alpha;
+    left.data[pixel] = T;
+    stops.data[pixel] = stop;
+    dominant.data[pixel] = which < 0 ? -1 : ids.data[slots.data[which]];
+}
+"""
+
+# As in `compositing_adjoint`: dL/dalpha = T (colour . v) - S / (1 - alpha), where S is the contribution from behind.
+# Moments of a slot: g dx, g dy, g dx^2, g dx dy, g dy^2, g with g = dL/dlog(alpha); four channels; absolute sums.
+_BACKWARD = r"""
+__shared__ float4 conic[32];
+__shared__ int slot[32], last;
+__shared__ float part[32][8][12];
+float T = 1, S = 0, v[4] = {0, 0, 0, 0};
+int stop = begin;
+if (inside) {
+    T = left.data[pixel];
+    stop = stops.data[pixel];
+    const float* behind_pixel = behind.data + step * (long long)pixel;
+    float v_alpha = v_alphas.data[pixel];
+    for (int c = 0; c < 3; ++c) {
+        v[c] = v_rgb.data[3 * pixel + c];
+        v_alpha -= v[c] * behind_pixel[c];
+    }
+    v[3] = v_fourth.data[pixel];
+    if (mean) {
+        v[3] = alphas.data[pixel] > MIN_MEAN_ALPHA ? v[3] / alphas.data[pixel] : 0;
+        v_alpha -= v[3] * fourth.data[pixel];
+    }
+    S = -v_alpha * T;
+}
+if (t == 0) last = begin;
+__syncthreads();
+atomicMax(&last, stop);
+__syncthreads();
+for (int i = t; i < 12 * (end - last); i += 256)  // members that no pixel reached
+    moments.data[12 * slots.data[last + i / 12] + i % 12] = 0;
+for (int top = last; top > begin; top -= 32) {
+    const int count = top - begin < 32 ? top - begin : 32;  // members top - 1, top - 2, ...
+    __syncthreads();
+    if (t < count) {
+        const int k = top - 1 - t;
+        load(t, k);
+        slot[t] = (int)slots.data[k];
+        const float* s = splats.data + 16 * (long long)ids.data[slot[t]];
+        conic[t] = make_float4(s[2], s[3], s[4], 0);
+    }
+    for (int i = t; i < count * 96; i += 256) ((float*)part)[i] = 0;
+    __syncthreads();
+    for (int j = 0; j < count; ++j) {
+        const float4 at = box[j];
+        if (!reaches(at)) continue;  // the same for all threads of the warp
+        const float dx = fx - at.x, dy = fy - at.y, power = log2_alpha(j, dx, dy);
+        const bool hit = top - 1 - j < stop && power >= -7.99435344f;
+        if (!__any_sync(0xffffffff, hit)) continue;
+        float sum[16];
+        for (int i = 0; i < 16; ++i) sum[i] = 0;
+        if (hit) {
+            const float raw = exp2f(power), alpha = fminf(raw, MAX_ALPHA), open = 1 / (1 - alpha);
+            const float before = T * open, w = alpha * before;
+            const float4 c = colour[j], k = conic[j];
+            const float v_weight = fmaf(v[3], c.w, fmaf(v[2], c.z, fmaf(v[1], c.y, v[0] * c.x)));
+            const float g = raw <= MAX_ALPHA ? alpha * (before * v_weight - S * open) : 0;
+            T = before;
+            S = fmaf(w, v_weight, S);
+            const float gx = g * dx, gy = g * dy;
+            sum[0] = gx; sum[1] = gy; sum[2] = gx * dx; sum[3] = gx * dy; sum[4] = gy * dy; sum[5] = g;
+            for (int i = 0; i < 4; ++i) sum[6 + i] = w * v[i];
+            sum[10] = fabsf(k.x * gx + k.y * gy);
+            sum[11] = fabsf(k.y * gx + k.z * gy);
+        }
+        // halve the values that a lane holds at each step: lane l ends up with the sum of value l / 2
+#pragma unroll
+        for (int n = 8, bit = 16; n; n /= 2, bit /= 2) {
+#pragma unroll
+            for (int i = 0; i < n; ++i) {
+                const bool upper = lane & bit;
+                const float sent = upper ? sum[i] : sum[i + n], kept = upper ? sum[i + n] : sum[i];
+                sum[i] = kept + __shfl_xor_sync(0xffffffff, sent, bit);
+            }
+        }
+        sum[0] += __shfl_xor_sync(0xffffffff, sum[0], 1);
+        if (!(lane & 1) && lane < 24) part[j][warp][lane >> 1] = sum[0];
+    }
+    __syncthreads();
+    for (int i = t; i < count * 12; i += 256) {
+        float total = 0;
+        for (int w = 0; w < 8; ++w) total += part[i / 12][w][i % 12];
+        moments.data[12 * (long long)slot[i / 12] + i % 12] = total;
+    }
+}
+"""
+
+# Sum of a splat's slots, 16 threads a splat, and conversion to the gradient of its row.
+_GRADIENT = r"""
+const int r = at / 16, c = at % 16, id = (int)order.data[r];
+int slot = ends.data[r] - counts.data[r], to = ends.data[r] < capacity ? ends.data[r] : capacity;
+float m = 0;
+if (c < 12)
+    for (; slot < to; ++slot) m += moments.data[12 * (long long)slot + c];
+const float x = __shfl_sync(0xffffffff, m, 0, 16), y = __shfl_sync(0xffffffff, m, 1, 16);
+const float* s = splats.data + 16 * (long long)id;
+if (c == 0) m = s[2] * x + s[3] * y;
+if (c == 1) m = s[3] * x + s[4] * y;
+if (c == 2 || c == 4) m *= -0.5f;
+if (c == 3) m = -m;
+if (c == 5) m = s[5] > 0 ? m / s[5] : 0;
+grads.data[16 * (long long)id + c] = m;
+"""
+
+
+def _on_cuda(code: str, batch: int = 0) -> str:
+    """The snippet with its constants, compiled for CUDA only."""
+    constants = {"MAX_ALPHA": MAX_ALPHA, "MIN_TRANSMITTANCE": MIN_TRANSMITTANCE, "MIN_MEAN_ALPHA": MIN_MEAN_ALPHA}
+    for name, value in constants.items():
+        code = code.replace(name, f"{value}f")
+    return by_device(code.replace("BATCH", str(batch)), "")
+
+
+@wp.func_native(_on_cuda(_PIXEL + _LOAD + _FORWARD, batch=256))
+def _draw_pixel(
+    tile: int, width: int, height: int, across: int, step: int, mean: int, splats: wp.array[float],
+    slots: wp.array[wp.int64], ids: wp.array[int], starts: wp.array[int], behind: wp.array[float],
+    left: wp.array[float], stops: wp.array[int], rgb: wp.array[float], fourth: wp.array[float],
+    alphas: wp.array[float], dominant: wp.array[int],
+): ...  # fmt: skip
+
+
+@wp.kernel
+def _composite(
+    width: int, height: int, across: int, step: int, mean: int, splats: wp.array[float],
+    slots: wp.array[wp.int64], ids: wp.array[int], starts: wp.array[int], behind: wp.array[float],
+    left: wp.array[float], stops: wp.array[int], rgb: wp.array[float], fourth: wp.array[float],
+    alphas: wp.array[float], dominant: wp.array[int],
+):  # fmt: skip
+    _draw_pixel(wp.tid() // wp.static(THREADS), width, height, across, step, mean, splats, slots, ids, starts, behind,
+                left, stops, rgb, fourth, alphas, dominant)  # fmt: skip
+
+
+@wp.func_native(_on_cuda(_PIXEL + _LOAD + _BACKWARD, batch=32))
+def _adjoint_of_pixel(
+    tile: int, width: int, height: int, across: int, step: int, mean: int, splats: wp.array[float],
+    slots: wp.array[wp.int64], ids: wp.array[int], starts: wp.array[int], behind: wp.array[float],
+    left: wp.array[float], stops: wp.array[int], fourth: wp.array[float], alphas: wp.array[float],
+    v_rgb: wp.array[float], v_fourth: wp.array[float], v_alphas: wp.array[float], moments: wp.array[float],
+): ...  # fmt: skip
+
+
+@wp.kernel
+def _composite_adjoint(
+    width: int, height: int, across: int, step: int, mean: int, splats: wp.array[float],
+    slots: wp.array[wp.int64], ids: wp.array[int], starts: wp.array[int], behind: wp.array[float],
+    left: wp.array[float], stops: wp.array[int], fourth: wp.array[float], alphas: wp.array[float],
+    v_rgb: wp.array[float], v_fourth: wp.array[float], v_alphas: wp.array[float], moments: wp.array[float],
+):  # fmt: skip
+    _adjoint_of_pixel(wp.tid() // wp.static(THREADS), width, height, across, step, mean, splats, slots, ids, starts,
+                      behind, left, stops, fourth, alphas, v_rgb, v_fourth, v_alphas, moments)  # fmt: skip
+
+
+@wp.func_native(_on_cuda(_GRADIENT))
+def _gradient_value(
+    at: int, capacity: int, order: wp.array[wp.int64], counts: wp.array[int], ends: wp.array[int],
+    splats: wp.array[float], moments: wp.array[float], grads: wp.array[float],
+): ...  # fmt: skip
+
+
+@wp.kernel
+def _gradients(
+    capacity: int, order: wp.array[wp.int64], counts: wp.array[int], ends: wp.array[int], splats: wp.array[float],
+    moments: wp.array[float], grads: wp.array[float],
+):  # fmt: skip
+    _gradient_value(wp.tid(), capacity, order, counts, ends, splats, moments, grads)
+
+
+def _launch(kernel: wp.Kernel, splats: Tensor, tiles: Tiles, behind: Tensor, mean: bool, *tensors: Tensor) -> None:
+    """Launch a kernel with a block of threads for each tile."""
+    step = 0 if behind.dim() == 1 else 3
+    flat = [view(t.view(-1)) for t in (splats, tiles.slots, tiles.ids, tiles.starts, behind, *tensors)]
+    sizes = [tiles.width, tiles.height, tiles.columns, step, int(mean)]
+    launch(kernel, THREADS * (len(tiles.starts) - 1), [*sizes, *flat], device=device_of(splats), block_dim=THREADS)
+
+
+def draw(splats: Tensor, tiles: Tiles, behind: Tensor, mean: bool) -> tuple[Tensor, ...]:
+    """Images (rgb (h, w, 3), fourth channel and alpha (h, w)), and the transmittance (h, w) left, the end of the list
+    (h, w) and the splat with the largest weight (h, w; -1: none) of each pixel."""
+    new, size = splats.new_empty, (tiles.height, tiles.width)
+    left, stops, rgb = new(size), new(size, dtype=torch.int32), new(*size, 3)
+    fourth, alpha, dominant = new(size), new(size), new(size, dtype=torch.int32)
+    _launch(_composite, splats, tiles, behind, mean, left, stops, rgb, fourth, alpha, dominant)
+    return rgb, fourth, alpha, left, stops, dominant
+
+
+def draw_adjoint(splats: Tensor, tiles: Tiles, behind: Tensor, mean: bool, *state: Tensor) -> Tensor:
+    """Gradient (n, 16) of the splats. `state`: transmittance, list ends, fourth channel and alpha as `draw` returns
+    them, then the gradients of rgb, fourth channel and alpha."""
+    n, capacity = len(splats), len(tiles.slots)
+    moments, grads = splats.new_empty(capacity, MOMENTS), torch.empty_like(splats)
+    _launch(_composite_adjoint, splats, tiles, behind, mean, *state, moments)
+    flat = [view(t.view(-1)) for t in (tiles.order, tiles.counts, tiles.ends, splats, moments, grads)]
+    launch(_gradients, n * SPLAT_SIZE, [capacity, *flat], device=device_of(splats))
+    return grads
+
+
+class Composite(torch.autograd.Function):
+    """As `compositing.composite`, without defaults."""
+
+    @staticmethod
+    def forward(ctx, splats, tiles, behind, mean):
+        rgb, fourth, alpha, left, stops, _ = draw(splats, tiles, behind, mean)
+        ctx.save_for_backward(splats, behind, left, stops, fourth, alpha)
+        ctx.tiles, ctx.mean = tiles, mean
+        return rgb, fourth, alpha
+
+    @staticmethod
+    def backward(ctx, *upstream):
+        splats, behind, *state = ctx.saved_tensors
+        upstream = [v.float().contiguous() for v in upstream]
+        return draw_adjoint(splats, ctx.tiles, behind, ctx.mean, *state, *upstream), None, None, None
+
+
+def dominant_splats(splats: Tensor, tiles: Tiles) -> tuple[Tensor, Tensor]:
+    """As `compositing.dominant_splats`, for splats and tiles on a CUDA device.
+
+    A splat's total weight is the derivative of the sum over all pixels of a colour channel by the splat's colour.
+    """
+    behind = splats.new_zeros(3)
+    rgb, fourth, alpha, left, stops, dominant = draw(splats, tiles, behind, False)
+    v_rgb = torch.zeros_like(rgb)
+    v_rgb[..., 0] = 1
+    none = torch.zeros_like(alpha)
+    grads = draw_adjoint(splats, tiles, behind, False, left, stops, fourth, alpha, v_rgb, none, none)
+    return dominant.long(), grads[:, 6].contiguous()

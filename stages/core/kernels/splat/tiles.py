@@ -1,0 +1,126 @@
+"""Binning on CUDA: the splats that overlap each tile of TILE_SIZE x TILE_SIZE pixels, sorted by depth.
+
+The splats are sorted by depth, listed in that order once for every tile that they overlap, and the list is sorted by
+tile; both sorts are stable. An entry of the unsorted list is called a slot: the slots of a splat are contiguous, so
+that the adjoint sums a splat's gradient over its tiles in a fixed order, without atomics.
+
+With a given capacity nothing waits for the GPU, so the functions can be captured in a CUDA graph.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from stages.core.kernels.interop import device_of, launch, view
+from stages.core.kernels.splat.projection import TILE_SIZE
+
+wp.set_module_options({"enable_backward": False})
+
+MAX_INT16 = 2**15 - 1
+
+
+@wp.kernel
+def _count(order: wp.array[wp.int64], keys: wp.array[int], rects: wp.array2d[wp.int16], counts: wp.array[int]):
+    r = wp.tid()
+    i = wp.int32(order[r])
+    if keys[i] >= 0:
+        counts[r] = (int(rects[i, 2] - rects[i, 0]) + 1) * (int(rects[i, 3] - rects[i, 1]) + 1)
+    else:
+        counts[r] = 0
+
+
+@wp.kernel
+def _fill(
+    order: wp.array[wp.int64], rects: wp.array2d[wp.int16], counts: wp.array[int], ends: wp.array[int], across: int,
+    tiles: wp.array[wp.int32], ids: wp.array[int],
+):  # fmt: skip
+    r = wp.tid()
+    i = wp.int32(order[r])
+    if counts[r] == 0:
+        return
+    slot = ends[r] - counts[r]
+    for y in range(int(rects[i, 1]), int(rects[i, 3]) + 1):
+        for x in range(int(rects[i, 0]), int(rects[i, 2]) + 1):
+            if slot < tiles.shape[0]:
+                tiles[slot] = y * across + x
+                ids[slot] = i
+            slot += 1
+
+
+@wp.kernel
+def _starts(tiles: wp.array[wp.int32], starts: wp.array[int]):
+    """Position of the first entry of each tile in the sorted list; entries of tile -1 are unused capacity."""
+    k = wp.tid()
+    tile = tiles[k]
+    before = wp.int32(-1)
+    if k > 0:
+        before = tiles[k - 1]
+    for t in range(before + 1, tile + 1):
+        starts[t] = k
+    if k == tiles.shape[0] - 1:
+        for t in range(tile + 1, starts.shape[0]):
+            starts[t] = k + 1
+
+
+@dataclass(frozen=True)
+class Capacity:
+    """Room for the slots of repeated calls that must not wait for the GPU."""
+
+    slots: int
+    needed: Tensor  # (1,) int32: the most slots that any call needed
+
+    @classmethod
+    def at_least(cls, needed: int, device: torch.device) -> Capacity:
+        """Half as much again as needed."""
+        return cls(needed + needed // 2 + 1024, torch.zeros(1, dtype=torch.int32, device=device))
+
+
+@dataclass(frozen=True)
+class Tiles:
+    """The splats of each tile, nearest first; tiles are numbered row by row. m is the number of slots."""
+
+    slots: Tensor  # (m,) int64: tile b holds slots[starts[b]:starts[b + 1]]
+    ids: Tensor  # (m,) int32, splat of each slot
+    starts: Tensor  # (tiles + 1,) int32
+    order: Tensor  # (n,) int64, splats by depth
+    counts: Tensor  # (n,) int32, number of slots of the splats in this order
+    ends: Tensor  # (n,) int32, one past the last slot of each; may exceed m if the capacity was too small
+    width: int  # [px]
+    height: int
+
+    @property
+    def columns(self) -> int:
+        """Number of tiles in a row."""
+        return -(-self.width // TILE_SIZE)
+
+
+def bin_tiles(keys: Tensor, rects: Tensor, width: int, height: int, capacity: Capacity | None = None) -> Tiles:
+    """Sort splats into tiles, by sort keys (n,) and tile rectangles (n, 4) as `project` returns them.
+
+    There are as many slots as needed or, with a capacity, as many as that has: those beyond it are dropped.
+    """
+    device, n = keys.device, len(keys)
+    across, down = -(-width // TILE_SIZE), -(-height // TILE_SIZE)
+    order = keys.sort(stable=True).indices
+    counts = torch.empty(n, dtype=torch.int32, device=device)
+    launch(_count, n, [view(order), view(keys), view(rects)], [view(counts)], device_of(keys))
+    ends = counts.cumsum(0, dtype=torch.int32)
+    if capacity is None:
+        size = int(ends[-1]) if n else 0
+    else:
+        size = capacity.slots
+        torch.maximum(capacity.needed, ends[-1:], out=capacity.needed)
+    tiles = torch.full((size,), -1, dtype=torch.int32, device=device)
+    ids = torch.zeros(size, dtype=torch.int32, device=device)
+    launch(_fill, n, [view(order), view(rects), view(counts), view(ends), across], [view(tiles), view(ids)],
+           device_of(keys))  # fmt: skip
+    # a narrow key takes fewer passes of the radix sort
+    narrow = tiles.to(torch.int16) if across * down <= MAX_INT16 else tiles
+    tiles, slots = narrow.sort(stable=True)
+    starts = torch.zeros(across * down + 1, dtype=torch.int32, device=device)
+    launch(_starts, size, [view(tiles.int())], [view(starts)], device_of(keys))
+    return Tiles(slots, ids, starts, order, counts, ends, width, height)

@@ -106,7 +106,7 @@ class _Fit:
         for name, value in self.values.items():
             first, second = self.moments[name]
             rate = means_rate if name == "means" else LEARNING_RATES[name]
-            adam([value], [grads[name]], [first], [second], [], [self.steps[name]], fused=True, amsgrad=False,
+            adam([value], [grads[name].contiguous()], [first], [second], [], [self.steps[name]], fused=True, amsgrad=False,
                  beta1=0.9, beta2=0.999, lr=rate, weight_decay=0.0, eps=1e-15, maximize=False)  # fmt: skip
 
     def select(self, index: Int[Tensor, "m"], fresh: Int[Tensor, "k"]) -> None:

@@ -16,11 +16,11 @@ import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
-from torch.optim.adam import adam
 from tqdm import tqdm
 
 from stages.core.geometry.cameras import centres
 from stages.core.geometry.rotations import matrix
+from stages.core.kernels.adam import Moments, adam_step
 from stages.core.kernels.splat.projection import pack_camera
 from stages.core.kernels.splat.ssim import ssim
 from stages.core.kernels.splat.tiles import Capacity
@@ -70,8 +70,7 @@ class _Fit:
     """Optimised tensors, one for each learning rate, with their Adam moments."""
 
     values: dict[str, Tensor]
-    moments: dict[str, tuple[Tensor, Tensor]]  # means of the gradient and of its square
-    steps: dict[str, Tensor]  # number of steps, float32
+    moments: dict[str, Moments]
     camera_distance: float  # [scene units]
     gradients: Float[Tensor, "n"]  # sum of the norms of the means' gradients since the last split
 
@@ -89,9 +88,8 @@ class _Fit:
             "gains": torch.zeros(views, 3, device=device),  # log exposure of each photo and channel
         }
         values = {name: value.clone().requires_grad_() for name, value in values.items() if value.numel()}
-        moments = {name: (torch.zeros_like(v), torch.zeros_like(v)) for name, v in values.items()}
-        steps = {name: torch.zeros((), device=device) for name in values}
-        return cls(values, moments, steps, camera_distance, torch.zeros(len(gaussians), device=device))
+        moments = {name: Moments.like(value) for name, value in values.items()}
+        return cls(values, moments, camera_distance, torch.zeros(len(gaussians), device=device))
 
     def gaussians(self) -> Gaussians:
         """The Gaussians with activations applied, differentiable."""
@@ -102,20 +100,19 @@ class _Fit:
         return Gaussians(v["means"], quats, v["scales"].exp(), v["opacities"].sigmoid(), sh, ids)
 
     def descend(self, grads: dict[str, Tensor], means_rate: float | Tensor) -> None:
-        """One step of Adam. A rate that is a tensor can change between replays of a CUDA graph."""
+        """One step of Adam."""
         for name, value in self.values.items():
-            first, second = self.moments[name]
             rate = means_rate if name == "means" else LEARNING_RATES[name]
-            adam([value], [grads[name].contiguous()], [first], [second], [], [self.steps[name]], fused=True, amsgrad=False,
-                 beta1=0.9, beta2=0.999, lr=rate, weight_decay=0.0, eps=1e-15, maximize=False)  # fmt: skip
+            adam_step(value, grads[name], self.moments[name], rate)
 
     def select(self, index: Int[Tensor, "m"], fresh: Int[Tensor, "k"]) -> None:
         """Keep (or repeat) these Gaussians with their Adam moments; moments at positions `fresh` are set to zero."""
         for name in self.values.keys() - {"gains"}:
             self.values[name] = self.values[name].detach()[index].clone().requires_grad_()
-            self.moments[name] = tuple(moment[index].clone() for moment in self.moments[name])
-            for moment in self.moments[name]:
-                moment[fresh] = 0
+            old = self.moments[name]
+            self.moments[name] = Moments(old.first[index], old.second[index], old.steps)
+            self.moments[name].first[fresh] = 0
+            self.moments[name].second[fresh] = 0
         self.gradients = torch.zeros(len(index), device=index.device)
 
 
@@ -259,7 +256,7 @@ class _CapturedSteps(_Steps):
 
     def _step(self, group: _Targets) -> None:
         row, grey, rate = (x.index_select(0, self.counter) for x in (self.rows, self.greys, self.rates))
-        self.loss.copy_(_descend(self.fit, group, row, grey, rate[0], self.pairs))
+        self.loss.copy_(_descend(self.fit, group, row, grey, rate, self.pairs))
         self.counter += 1
 
 
@@ -270,9 +267,8 @@ def _descend(
     """One step on the photo in this row of the group; returns the loss before it."""
     loss = _loss(fit, group, row, grey, pairs)
     grads = dict(zip(fit.values, torch.autograd.grad(loss, list(fit.values.values())), strict=True))
-    with torch.no_grad():
-        fit.gradients += grads["means"].norm(dim=1)
-        fit.descend(grads, means_rate)
+    fit.gradients += grads["means"].norm(dim=1)
+    fit.descend(grads, means_rate)
     return loss.detach()
 
 

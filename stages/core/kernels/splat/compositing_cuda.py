@@ -96,6 +96,11 @@ if (inside) {
 # As in `compositing_adjoint`: dL/dalpha = T (colour . v) - S / (1 - alpha), where S is the contribution from behind.
 # Moments of a slot: g dx, g dy, g dx^2, g dx dy, g dy^2, g with g = dL/dlog(alpha); four channels; absolute sums.
 _BACKWARD = r"""
+#define EXCHANGE(half, bit) _Pragma("unroll") for (int i = 0; i < half; ++i) { \
+    const bool upper = lane & bit; \
+    const float sent = upper ? sum[i] : sum[i + half], kept = upper ? sum[i + half] : sum[i]; \
+    sum[i] = kept + __shfl_xor_sync(0xffffffff, sent, bit); \
+}
 __shared__ float4 conic[32];
 __shared__ int slot[32], last;
 __shared__ float part[32][8][12];
@@ -141,8 +146,7 @@ for (int top = last; top > begin; top -= 32) {
         const float dx = fx - at.x, dy = fy - at.y, power = log2_alpha(j, dx, dy);
         const bool hit = top - 1 - j < stop && power >= -7.99435344f;
         if (!__any_sync(0xffffffff, hit)) continue;
-        float sum[16];
-        for (int i = 0; i < 16; ++i) sum[i] = 0;
+        float sum[16] = {0};
         if (hit) {
             const float raw = exp2f(power), alpha = fminf(raw, MAX_ALPHA), open = 1 / (1 - alpha);
             const float before = T * open, w = alpha * before;
@@ -157,16 +161,11 @@ for (int top = last; top > begin; top -= 32) {
             sum[10] = fabsf(k.x * gx + k.y * gy);
             sum[11] = fabsf(k.y * gx + k.z * gy);
         }
-        // halve the values that a lane holds at each step: lane l ends up with the sum of value l / 2
-#pragma unroll
-        for (int n = 8, bit = 16; n; n /= 2, bit /= 2) {
-#pragma unroll
-            for (int i = 0; i < n; ++i) {
-                const bool upper = lane & bit;
-                const float sent = upper ? sum[i] : sum[i + n], kept = upper ? sum[i + n] : sum[i];
-                sum[i] = kept + __shfl_xor_sync(0xffffffff, sent, bit);
-            }
-        }
+        // lanes exchange half of their values at each step: lane l ends up with the sum of value l / 2
+        EXCHANGE(8, 16)
+        EXCHANGE(4, 8)
+        EXCHANGE(2, 4)
+        EXCHANGE(1, 2)
         sum[0] += __shfl_xor_sync(0xffffffff, sum[0], 1);
         if (!(lane & 1) && lane < 24) part[j][warp][lane >> 1] = sum[0];
     }
@@ -177,6 +176,7 @@ for (int top = last; top > begin; top -= 32) {
         moments.data[12 * (long long)slot[i / 12] + i % 12] = total;
     }
 }
+#undef EXCHANGE
 """
 
 # Sum of a splat's slots, 16 threads a splat, and conversion to the gradient of its row.

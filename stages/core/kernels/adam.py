@@ -1,0 +1,71 @@
+"""A step of the optimiser Adam on one tensor: one fused pass on any device.
+
+PyTorch's own fused step is used on the CPU. On CUDA it launches few blocks for a single large tensor, which takes ten
+times as long as this kernel.
+
+Source: Kingma and Ba 2015, "Adam: a method for stochastic optimization", algorithm 1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import warp as wp
+from torch import Tensor
+from torch.optim.adam import adam
+
+from stages.core.kernels.interop import device_of, launch, view
+
+wp.set_module_options({"enable_backward": False})
+
+BETA1, BETA2 = 0.9, 0.999
+EPSILON = 1e-15  # as in 3D Gaussian splatting: gradients of one splat are small
+
+
+@wp.kernel
+def _step(
+    grads: wp.array[float], steps: wp.array[float], rate: wp.array[float], values: wp.array[float],
+    first: wp.array[float], second: wp.array[float],
+):  # fmt: skip
+    i = wp.tid()
+    g = grads[i]
+    m = wp.static(BETA1) * first[i] + wp.static(1 - BETA1) * g
+    v = wp.static(BETA2) * second[i] + wp.static(1 - BETA2) * g * g
+    first[i] = m
+    second[i] = v
+    m /= 1.0 - wp.pow(wp.float32(wp.static(BETA1)), steps[0])
+    v /= 1.0 - wp.pow(wp.float32(wp.static(BETA2)), steps[0])
+    values[i] -= rate[0] * m / (wp.sqrt(v) + wp.static(EPSILON))
+
+
+@dataclass
+class Moments:
+    """State of Adam for one tensor: running means of the gradient and of its square, and the number of steps (1,)."""
+
+    first: Tensor
+    second: Tensor
+    steps: Tensor
+
+    @classmethod
+    def like(cls, value: Tensor) -> Moments:
+        """Of a tensor before its first step."""
+        zeros = torch.zeros_like(value.detach())
+        return cls(zeros, zeros.clone(), torch.zeros(1, device=value.device))
+
+
+@torch.no_grad()
+def adam_step(value: Tensor, grad: Tensor, moments: Moments, rate: float | Tensor) -> None:
+    """Change `value` and its moments in place by one step with this learning rate.
+
+    On CUDA a rate (1,) on the device can change between replays of a CUDA graph.
+    """
+    grad = grad.contiguous()
+    if not value.is_cuda:
+        adam([value], [grad], [moments.first], [moments.second], [], [moments.steps], fused=True, amsgrad=False,
+             beta1=BETA1, beta2=BETA2, lr=float(rate), weight_decay=0.0, eps=EPSILON, maximize=False)  # fmt: skip
+        return
+    moments.steps += 1
+    rate = rate if isinstance(rate, Tensor) else torch.full((1,), rate, device=value.device)
+    flat = [view(t.view(-1)) for t in (grad, moments.steps, rate, value, moments.first, moments.second)]
+    launch(_step, value.numel(), flat, device=device_of(value))

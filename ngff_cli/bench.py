@@ -75,6 +75,27 @@ def bench_reconstruct(
     print_results(lambda path: run(sets, path, options), out, as_json)
 
 
+@app.command("chain")
+def bench_chain(
+    photos: Annotated[Path, typer.Argument(metavar="PHOTOS", help="folder of photos or a video")],
+    quality: Annotated[str, typer.Option(help="quality of the reconstruction")] = "normal",
+    device: Device = "auto",
+    steps: Annotated[int, typer.Option(help="frames of the film")] = 100,
+    refine: Annotated[bool, typer.Option(help="complete the objects before they are simulated")] = True,
+    repeat: Annotated[int, typer.Option(help="runs in one process; the first one loads kernels")] = 2,
+    commands: Annotated[bool, typer.Option(help="also run each stage as a command")] = True,
+    out: Out = None,
+    as_json: AsJson = False,
+) -> None:
+    """All stages from photos to a film: seconds, busy share of the GPU, and whether repeated runs give equal files."""
+    from stages.lab.bench.chain import ChainBenchOptions, run
+
+    options = ChainBenchOptions(
+        quality=quality, device=device, steps=steps, refine=refine, repeat=repeat, commands=commands
+    )
+    print_results(lambda path: run(photos, path, options), out, as_json)
+
+
 @app.command("appearance")
 def bench_appearance(
     sets: Annotated[list[Path], typer.Argument(metavar="PHOTOSET...", help="folders of photos, or with images/")],

@@ -1,0 +1,42 @@
+"""The chain's benchmark, with small functions in the place of the stages."""
+
+import json
+
+import pytest
+
+from stages.core.errors import InputError
+from stages.core.scene.scene_ply import write_scene
+from stages.lab.bench import chain
+from stages.lab.bench.chain import ChainBenchOptions
+from tests.conftest import two_balls_scene
+
+
+def test_repeated_files_are_compared_and_times_written(tmp_path, monkeypatch):
+    def calls(photos, folder, options):
+        return {
+            "reconstruct": lambda: write_scene(folder / "scene.ply", two_balls_scene()),
+            "segment": lambda: write_scene(folder / "labelled.ply", two_balls_scene()),
+            "render": lambda: (folder / "film.mp4").write_text(folder.name),  # differs from run to run
+        }
+
+    monkeypatch.setattr(chain, "stage_calls", calls)
+    monkeypatch.setattr(chain, "_command_seconds", lambda line: 1.5)
+    lines = list(chain.run(tmp_path, tmp_path / "chain.json", ChainBenchOptions(device="cpu")))
+    assert "files that differ between runs: film.mp4" in lines
+    facts = json.loads((tmp_path / "chain.json").read_text())
+    assert facts["objects"] == [2, 2] and len(facts["runs"]) == 2 and facts["commands"]["refine"] == 1.5
+    assert facts["sha256"][0]["scene.ply"] == facts["sha256"][1]["scene.ply"]
+
+
+@pytest.mark.parametrize("refine", [True, False])
+def test_functions_and_commands_are_the_same_stages(tmp_path, refine):
+    options = ChainBenchOptions(refine=refine)
+    names = list(chain.stage_calls(tmp_path, tmp_path, options))
+    lines = chain.command_lines(tmp_path, tmp_path, options)
+    assert names == list(lines) and ("refine" in names) == refine
+    assert (str(tmp_path / "refined.ply") in lines["simulate"]) == refine
+
+
+def test_a_failing_command_is_named(tmp_path):
+    with pytest.raises(InputError, match="ngff segment failed: .*no such file"):
+        chain._command_seconds(["segment", str(tmp_path / "none.ply"), "-o", str(tmp_path / "out.ply")])

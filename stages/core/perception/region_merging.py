@@ -109,6 +109,7 @@ class Region:
     sample: np.ndarray  # (s, 3) subset of its points
     corners: np.ndarray  # (c, 3) of its convex hull
     hull: np.ndarray | None  # (f, 4) outward planes of its convex hull
+    depth: float  # sum over the sample of the depth below the hull
 
 
 @dataclass
@@ -143,7 +144,11 @@ class RegionMerger:
     def _region(self, members: np.ndarray, colours: np.ndarray) -> Region:
         points = self.voxels.points[members]
         sample = points[:: max(1, len(points) // MAX_SAMPLE_POINTS)]
-        return Region(members, colours, sample, *_hull(points))
+        hull = _hull(points)
+        if hull is None:
+            return Region(members, colours, sample, points, None, 0.0)
+        planes = hull.equations
+        return Region(members, colours, sample, points[hull.vertices], planes, _depth(sample, planes).sum())
 
     def _add_borders(self, edges: VoxelEdges, labels: np.ndarray) -> None:
         a, b = labels[edges.i], labels[edges.j]
@@ -162,6 +167,8 @@ class RegionMerger:
         It increases with a concave boundary, with a union less convex than its parts, with a narrow boundary, and
         with different colours, which count less where the union is convex. It decreases where one region lies in the
         convex hull of the other (the wheels of a car), and for regions smaller than `min_voxels`.
+
+        Where a lower bound, without the terms that need convex hulls, is above the limit, the bound is returned.
         """
         one, two, border = self.regions[a], self.regions[b], self.borders[a][b]
         small = min(len(one.members), len(two.members))
@@ -169,12 +176,20 @@ class RegionMerger:
         colour_distance = 1 - np.minimum(one.colours, two.colours).sum()
         concave = np.clip(border.bend / border.count, -0.1, 0.5)
         neck = 1 - min(1.0, border.count / (6 * small**0.5))
+        too_large = self._too_large(one, two)
+
+        def value(within: float, hollow: float) -> float:
+            colour = colour_distance * (0.35 + 0.1 * step) * min(0.6 + 20 * hollow, 1.4)
+            shape = 1.5 * concave + 0.2 * neck + 3 * hollow
+            total = colour + shape * (0.2 + 0.8 * colour_distance) - 0.5 * min(within, 1.0) + too_large
+            return total - (0.5 if small < self.min_voxels else 0.0)
+
+        if (bound := value(1.0, 0.0)) > self.limit:
+            return bound
         within = _inside(one.sample, two.hull, self.voxels.size) + _inside(two.sample, one.hull, self.voxels.size)
-        hollow = self._hollow(one, two)
-        colour = colour_distance * (0.35 + 0.1 * step) * min(0.6 + 20 * hollow, 1.4)
-        shape = 1.5 * concave + 0.2 * neck + 3 * hollow
-        value = colour + shape * (0.2 + 0.8 * colour_distance) - 0.5 * min(within, 1.0) + self._too_large(one, two)
-        return value - (0.5 if small < self.min_voxels else 0.0)
+        if (bound := value(within, 0.0)) > self.limit:
+            return bound
+        return value(within, self._hollow(one, two))
 
     def _too_large(self, one: Region, two: Region) -> float:
         """Penalty 0..1 of a union that exceeds `max_extent`."""
@@ -184,10 +199,10 @@ class RegionMerger:
     def _hollow(self, one: Region, two: Region) -> float:
         """Mean depth of points in the hull of the union minus that in their own hulls, relative to the smaller size."""
         both = np.concatenate([one.sample, two.sample])
-        _, hull = _hull(np.concatenate([one.corners, two.corners]))
+        hull = _hull(np.concatenate([one.corners, two.corners]))
         if hull is None:
             return 0.0
-        deep = _depth(both, hull).sum() - _depth(one.sample, one.hull).sum() - _depth(two.sample, two.hull).sum()
+        deep = _depth(both, hull.equations).sum() - one.depth - two.depth
         size = min(np.linalg.norm(np.ptp(r.sample, axis=0)) for r in (one, two)) + self.voxels.size
         return float(np.clip(deep / len(both) / size, 0, 0.5))
 
@@ -246,15 +261,14 @@ def _soft_bins(lab: np.ndarray, palette: np.ndarray) -> np.ndarray:
     return weight / weight.sum(1, keepdims=True)
 
 
-def _hull(points: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
-    """Vertices and outward planes of the convex hull; all points and None where they have no volume."""
+def _hull(points: np.ndarray) -> ConvexHull | None:
+    """Convex hull of the points; None where they have no volume."""
     if len(points) < 8:
-        return points, None
+        return None
     try:
-        hull = ConvexHull(points)
+        return ConvexHull(points)
     except (QhullError, ValueError):
-        return points, None
-    return points[hull.vertices], hull.equations
+        return None
 
 
 def _inside(points: np.ndarray, hull: np.ndarray | None, margin: float) -> float:
@@ -264,8 +278,6 @@ def _inside(points: np.ndarray, hull: np.ndarray | None, margin: float) -> float
     return float(((points @ hull[:, :3].T + hull[:, 3]).max(1) < -0.25 * margin).mean())
 
 
-def _depth(points: np.ndarray, hull: np.ndarray | None) -> np.ndarray:
+def _depth(points: np.ndarray, hull: np.ndarray) -> np.ndarray:
     """Depth of points below the surface of a hull; 0 outside."""
-    if hull is None:
-        return np.zeros(1)
     return -(points @ hull[:, :3].T + hull[:, 3]).max(1).clip(max=0)

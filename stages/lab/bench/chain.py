@@ -1,7 +1,7 @@
 """Benchmark of the chain from photos to a film: seconds of each stage, busy share of the GPU, and repeatability.
 
-The stages run in one process, as often as asked, and then once as separate commands, which adds their start-up. Files of
-all runs are compared by their sha256.
+The stages run in one process, as often as asked, and then once as separate commands, which adds their start-up. The
+files of all runs are compared by their sha256.
 """
 
 from __future__ import annotations

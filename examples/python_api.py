@@ -5,8 +5,8 @@ simulates, renders and evaluates it. Every stage is a function `run(inputs, outp
 files; its options are a frozen dataclass with the defaults of the command line. The asserts check the outcome of each.
 """
 
+import argparse
 import json
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -102,4 +102,6 @@ def main(out: Path) -> dict:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("out", type=Path, help="folder for all files, created if absent")
+    main(parser.parse_args().out)

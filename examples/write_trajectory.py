@@ -1,9 +1,13 @@
 """Write a traj.h5 with h5py alone, as another tool would: a thrown ball. python write_trajectory.py traj.h5"""
 
-import sys
+import argparse
 
 import h5py
 import numpy as np
+
+parser = argparse.ArgumentParser(description=__doc__)
+parser.add_argument("out", help="trajectory to write (.h5)")
+out = parser.parse_args().out
 
 n, frames, dt = 500, 50, 0.02
 rng = np.random.default_rng(0)
@@ -12,7 +16,7 @@ means = 0.1 * normals / np.linalg.norm(normals, axis=1, keepdims=True) + [0, 0, 
 time = dt * np.arange(frames)[:, None]
 path = time * [1.0, 0, 3] - [0, 0, 9.81 / 2] * time**2
 
-with h5py.File(sys.argv[1], "w") as f:
+with h5py.File(out, "w") as f:
     f.attrs.update(format="ngff-trajectory", version=1, fps=1 / dt, dt=dt, gravity=[0, 0, -9.81], engine="mine")
     f["gaussians/means"], f["gaussians/scales"] = np.float32(means), np.full((n, 3), 0.01, np.float32)
     f["gaussians/quats"] = np.tile(np.float32([1, 0, 0, 0]), (n, 1))

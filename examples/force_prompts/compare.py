@@ -9,8 +9,8 @@ the difference. The forces are in pillow_up.json and cloth_left.json. The same w
     ngff render pillow_mpm.h5 pillow_ngff.h5 --side-by-side --show-forces -o pillow.mp4
 """
 
+import argparse
 import json
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -76,4 +76,6 @@ def main(out: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("out", type=Path, help="folder for all files, created if absent")
+    main(parser.parse_args().out)

@@ -1,6 +1,6 @@
 """A custom simulator: every object is a rigid body that falls and bounces. python bounce.py scene.ply traj.h5"""
 
-import sys
+import argparse
 from pathlib import Path
 
 import torch
@@ -45,6 +45,9 @@ def simulate(scene: Scene, out: Path) -> None:
 
 
 if __name__ == "__main__":
-    source, target = Path(sys.argv[1]), Path(sys.argv[2])
-    simulate(read_scene(source), target)
-    print(target, provenance("bounce", [source])["inputs"])
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("scene", type=Path, help="scene with labelled objects (.ply), as `ngff segment` writes")
+    parser.add_argument("out", type=Path, help="trajectory to write (.h5)")
+    given = parser.parse_args()
+    simulate(read_scene(given.scene), given.out)
+    print(given.out, provenance("bounce", [given.scene])["inputs"])

@@ -7,7 +7,7 @@ import typer
 from typer import Argument, Option
 
 from ngff_cli.options import AsJson, CommandGroup, Device, SceneIn, Seed, Threads, limit_threads, set_up_logging
-from stages.core.backends import describe
+from stages.core.backends import describe, load
 from stages.evaluate.options import EvaluateOptions
 from stages.reconstruct.options import BACKENDS as RECONSTRUCT
 from stages.reconstruct.options import FEATURE_EXTRACTORS as MATCHERS
@@ -88,14 +88,12 @@ def reconstruct(
 
     Cameras are estimated from the photos unless given; the scene is rotated upright with its floor at z = 0.
     """
-    from stages.reconstruct.stage import run
-
     options = ReconstructOptions(
         backend=backend, matcher=matcher, cameras=cameras, holdout=holdout, quality=quality, resolution=resolution,
         scale_reference=scale_reference, resume=resume, weights=weights, download=download, iterations=iterations,
         seed=seed, device=device,
     )  # fmt: skip
-    run(imgs, out, options)
+    load("stages.reconstruct.stage:run")(imgs, out, options)
 
 
 @app.command()
@@ -138,14 +136,12 @@ def segment(
     device: Device = SegmentOptions.device,
 ) -> None:
     """Label the Gaussians of each object: SCENE.ply -> LABELLED.ply (object_id: 0 background, 1... objects)."""
-    from stages.segment.stage import run
-
     options = SegmentOptions(
         backend=backend, masks=masks, boxes=boxes, photos=photos, undistorted=undistorted, weights=weights,
         download=download, names=names, max_objects=max_objects, min_size=min_size, detail=detail,
         scale_reference=scale_reference, seed=seed, device=device,
     )  # fmt: skip
-    run(scene, out, options)
+    load("stages.segment.stage:run")(scene, out, options)
 
 
 @app.command()
@@ -179,13 +175,11 @@ def refine(
     device: Device = RefineOptions.device,
 ) -> None:
     """Complete the objects and fill the table beneath them: LABELLED.ply -> REFINED.ply."""
-    from stages.refine.stage import run
-
     options = RefineOptions(
         completer=completer, library=library, photos=photos, weights=weights, download=download, keep_raw=keep_raw,
         outliers=outliers, background=background, resolution=resolution, seed=seed, device=device,
     )  # fmt: skip
-    run(scene, out, options)
+    load("stages.refine.stage:run")(scene, out, options)
 
 
 @app.command()
@@ -235,15 +229,13 @@ def simulate(
     device: Device = SimulateOptions.device,
 ) -> None:
     """Simulate the motion of the objects of a scene: SCENE.ply -> TRAJ.h5."""
-    from stages.simulate.stage import run
-
     options = SimulateOptions(
         steps=steps, dt=dt, engine=engine, gravity=gravity, quality=quality, material=tuple(material or ()),
         materials=materials, force=tuple(force or ()), forces=forces, pin=tuple(pin or ()),
         velocity=tuple(velocity or ()), lift=tuple(lift or ()), floor=floor, friction=friction, box=box,
         keypoints=keypoints, weights=weights, integrator=integrator, seed=seed, device=device,
     )  # fmt: skip
-    run(scene, out, options)
+    load("stages.simulate.stage:run")(scene, out, options)
 
 
 @app.command()
@@ -283,13 +275,11 @@ def render(
     device: Device = RenderOptions.device,
 ) -> None:
     """Render a trajectory or a scene: TRAJ.h5 or SCENE.ply -> MP4 or PNG."""
-    from stages.render.stage import run
-
     options = RenderOptions(
         view=view, resolution=resolution, fps=fps, background=background, depth=depth, ids=ids,
         show_forces=show_forces, frame=frame, side_by_side=side_by_side, device=device,
     )  # fmt: skip
-    run(source, out, options)
+    load("stages.render.stage:run")(source, out, options)
 
 
 @app.command()
@@ -319,10 +309,8 @@ def evaluate(
     as_json: AsJson = False,
 ) -> None:
     """Compare a prediction with the ground truth: PREDICTION and TRUTH -> a table and METRICS.json."""
-    from stages.evaluate.stage import run
-
     options = EvaluateOptions(align=align, frames=frames, resample=resample, objects=objects, report=report)
-    run(prediction, against, out, options, as_json=as_json)
+    load("stages.evaluate.stage:run")(prediction, against, out, options, as_json=as_json)
 
 
 def main() -> None:

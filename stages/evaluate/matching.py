@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import torch
-from scipy.optimize import linear_sum_assignment
 
 from stages.core.errors import InputError
 from stages.core.scene.scene import SceneObject
@@ -40,6 +39,8 @@ def _nearest_pairs(
     predicted: list[SceneObject], true: list[SceneObject], prediction: ReferenceFrame, truth: ReferenceFrame
 ) -> Pairs:
     """One-to-one assignment with the smallest sum of distances between centres."""
+    from scipy.optimize import linear_sum_assignment
+
     a = torch.stack([prediction.centre(o) for o in predicted])
     b = torch.stack([truth.centre(o) for o in true])
     rows, columns = linear_sum_assignment(torch.cdist(b.double(), a.double()).numpy())

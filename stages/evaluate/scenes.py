@@ -7,7 +7,6 @@ from pathlib import Path
 
 import torch
 from jaxtyping import Float, Int
-from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
 from stages.core.errors import InputError
@@ -66,6 +65,8 @@ def label_iou(predicted: Int[Tensor, "n"], true: Int[Tensor, "n"]) -> dict[int, 
     Both label the same points; 0 is the background. Objects are matched one to one, maximising the sum of IoU.
     Returns {true id: (predicted id, IoU)}.
     """
+    from scipy.optimize import linear_sum_assignment
+
     ids = [int(i) for i in true.unique() if i > 0]
     others = [int(i) for i in predicted.unique() if i > 0]
     table = torch.zeros(len(ids), len(others), dtype=torch.float64)

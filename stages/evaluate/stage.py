@@ -11,7 +11,6 @@ from stages.core.errors import InputError
 from stages.core.scene.files import must_exist, provenance, replacing
 from stages.core.scene.formats import FORMATS
 from stages.evaluate.options import EvaluateOptions
-from stages.evaluate.report import write_report
 from stages.evaluate.result import format_table, to_json
 
 log = logging.getLogger(__name__)
@@ -54,6 +53,8 @@ def run(
     with replacing(out or prediction.parent / "metrics.json") as part:
         part.write_text(json.dumps(facts, indent=1) + "\n")
     if options.report:
+        from stages.evaluate.report import write_report
+
         write_report(options.report, result, prediction, truth)
     print(json.dumps(facts, indent=1) if as_json else format_table(result))
     return facts

@@ -11,8 +11,6 @@ from torch import Tensor
 
 from stages.core.errors import InputError
 from stages.core.geometry.similarity import Similarity
-from stages.core.physics.keypoints import bind_gaussians
-from stages.core.physics.skinning import Skinning
 from stages.core.scene.gaussians import Gaussians
 from stages.core.scene.scene import Scene
 from stages.core.scene.trajectory import Keypoints, Trajectory, read_trajectory
@@ -183,6 +181,9 @@ def transfer_motion(
 
     The offset of each point from the keypoints is rotated and stretched with their local deformation.
     """
+    from stages.core.physics.keypoints import bind_gaussians  # they import Warp and SciPy
+    from stages.core.physics.skinning import Skinning
+
     q = len(points)
     ones = torch.ones(q, dtype=torch.int64)
     identity = torch.tensor([[1.0, 0, 0, 0]]).repeat(q, 1)

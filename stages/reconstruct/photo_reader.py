@@ -8,7 +8,6 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-import av
 import cv2
 import numpy as np
 import torch
@@ -167,6 +166,8 @@ def _from_video(path: Path, side: int) -> list[LoadedImage]:
 
 def _frames(path: Path, times: list[float], spans: int, side: int) -> Iterator[tuple[int, LoadedImage]]:
     """Up to about MAX_CANDIDATES rotated frames per span, each with its span; reading ends at damaged data."""
+    import av
+
     seen: Counter[int] = Counter()
     interval = max(1, len(times) // max(1, spans * MAX_CANDIDATES))
     with open_video(path) as file:

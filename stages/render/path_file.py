@@ -11,8 +11,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from scipy.interpolate import PchipInterpolator
-from scipy.spatial.transform import Rotation, Slerp
 
 from stages.core.errors import InputError
 from stages.core.geometry.cameras import centres
@@ -67,6 +65,9 @@ def interpolate_cameras(cameras: Cameras, frames: int) -> Cameras:
     Rotations are interpolated by slerp, positions and intrinsics by monotone cubics (PCHIP), which pass through
     every camera without overshoot.
     """
+    from scipy.interpolate import PchipInterpolator  # 0.3 s to import with scipy.optimize, only for camera paths
+    from scipy.spatial.transform import Rotation, Slerp
+
     c = len(cameras)
     sizes = cameras.sizes[:1].expand(frames, 2)
     if c == 1:

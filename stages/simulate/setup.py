@@ -13,8 +13,8 @@ from torch import Tensor
 from stages.core.errors import InputError
 from stages.core.physics.forces import ForcePrompts, vector
 from stages.core.physics.materials import MaterialChoice, choose_materials
+from stages.core.physics.mpm.domain import MAX_NODES, Box
 from stages.core.physics.mpm.resample import subdivide
-from stages.core.physics.mpm.solver import MAX_NODES, Box
 from stages.core.physics.particles import Bodies, sample_bodies
 from stages.core.scene.scene import Scene
 from stages.simulate.options import SimulateOptions

@@ -4,7 +4,6 @@ from math import inf
 
 import torch
 from jaxtyping import Float, Int
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 
@@ -12,6 +11,8 @@ class KDTree:
     """k-d tree on the CPU, for repeated queries."""
 
     def __init__(self, points: Float[Tensor, "n d"]):
+        from scipy.spatial import cKDTree  # 0.2 s to import, and many runs search no neighbours
+
         if not len(points):
             raise ValueError("the tree needs at least one point")
         self.size, self.tree = len(points), cKDTree(points.detach().numpy())

@@ -26,6 +26,7 @@ GPU, is used for the fused inference step of the force field; its modules are im
 | field/ other modules          | Triton                      | `ForceField.step` in `models.field.force_field`      |
 
 `interop` passes tensors, device and stream between PyTorch and Warp; `threads` runs CPU launches in parallel;
+`operators` hides kernels from torch.compile;
 `splat/simd`, `splat/pixel_blocks`, `field/vec3` and `field/layers` hold code used by several kernels. `raster`,
 `physics` and `models` are the callers.
 """

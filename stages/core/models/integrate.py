@@ -17,7 +17,6 @@ from typing import TypeVar
 
 import torch
 from torch import Tensor
-from torchdiffeq import odeint, odeint_adjoint
 
 from stages.core.errors import InputError
 
@@ -51,6 +50,8 @@ def solve_ode(
         Ordinary Differential Equations"); without it gradients are backpropagated through the steps.
     Raises InputError for an unknown method and where the step of dopri5 vanishes, as at stiff contacts.
     """
+    from torchdiffeq import odeint, odeint_adjoint  # imports scipy.optimize, which the method "step" does not need
+
     if method not in METHODS:
         raise InputError(f"no integration method called {method!r}; choose from {', '.join(METHODS)}")
     kind = type(start)

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
-import av
 import cv2
 import numpy as np
 import torch
@@ -112,12 +112,16 @@ class VideoWriter:
         self._stream = None
 
     def __enter__(self) -> VideoWriter:
+        import av
+
         self._replacing = replacing(self.path)
         self._file = av.open(str(self._replacing.__enter__()), "w", options={"movflags": "faststart"})
         return self
 
     def append(self, image: Float[Tensor, "h w 3"]) -> None:
         """Encode one frame, RGB in 0..1; all frames have the size of the first."""
+        import av
+
         pixels = to_bytes(image)
         pixels = pixels[: pixels.shape[0] // 2 * 2, : pixels.shape[1] // 2 * 2]
         if self._stream is None:
@@ -146,6 +150,8 @@ def video_info(path: Path) -> tuple[int, float]:
 
 def read_video(path: Path) -> Iterator[Float[Tensor, "h w 3"]]:
     """The frames of a video in order, RGB in 0..1. Raises InputError for a damaged video."""
+    import av
+
     with open_video(path) as file:
         try:
             for frame in file.decode(video=0):
@@ -154,8 +160,10 @@ def read_video(path: Path) -> Iterator[Float[Tensor, "h w 3"]]:
             raise InputError(f"{path}: the video breaks off or is damaged ({error.strerror})") from error
 
 
-def open_video(path: Path) -> av.container.InputContainer:
-    """Open a video for decoding. Raises InputError for other files."""
+def open_video(path: Path) -> Any:
+    """Open a video for decoding, as an av.container.InputContainer. Raises InputError for other files."""
+    import av  # not at the top, since most commands read no video
+
     must_exist(path, "a video")
     try:
         file = av.open(str(path))

@@ -26,6 +26,13 @@ def test_drift_and_pose_equal_their_tensor_form(device):
     torch.testing.assert_close(found[1][0, 0], quat[0, 0], rtol=0, atol=2e-7)  # no momentum: only normalised again
 
 
+@torch.no_grad()
+def test_kernels_are_opaque_to_the_compiler(device):
+    given = bodies(device)
+    compiled = torch.compile(lambda *x: kernels.drift(*x, 0.1), fullgraph=True, dynamic=False, backend="aot_eager")
+    assert all(map(torch.equal, compiled(*given), kernels.drift(*given, 0.1)))
+
+
 def test_tensor_form_is_used_when_gradients_are_required():
     given = bodies("cpu")
     given[3].requires_grad_()

@@ -8,6 +8,8 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from stages.core.kernels.operators import operator
+
 BLOCK, CHUNK = 16, 128  # query points per program, and points that it reads at a time
 
 
@@ -45,7 +47,12 @@ def _nearest_kernel(points, low, high, distance, index, radius, o, n, BLOCK: tl.
     tl.store(index + pair * n + r, tl.minimum(which, n - 1).to(tl.int64), mask=r < n)
 
 
-@torch.library.custom_op("ngff::nearest", mutates_args=())
+def _nearest_shapes(points: Tensor, low: Tensor, high: Tensor, radius: float) -> tuple[Tensor, Tensor]:
+    b, o, _, n = points.shape
+    return points.new_empty(b, o, o, n), torch.empty(b, o, o, n, dtype=torch.int64, device=points.device)
+
+
+@operator("nearest", _nearest_shapes)
 def _nearest(points: Tensor, low: Tensor, high: Tensor, radius: float) -> tuple[Tensor, Tensor]:
     b, o, _, n = points.shape
     distance = points.new_empty(b, o, o, n)
@@ -53,12 +60,6 @@ def _nearest(points: Tensor, low: Tensor, high: Tensor, radius: float) -> tuple[
     grid = (b * o * o * triton.cdiv(n, BLOCK),)
     _nearest_kernel[grid](points, low, high, distance, index, radius, o, n, BLOCK, CHUNK)
     return distance, index
-
-
-@_nearest.register_fake
-def _(points: Tensor, low: Tensor, high: Tensor, radius: float) -> tuple[Tensor, Tensor]:
-    b, o, _, n = points.shape
-    return points.new_empty(b, o, o, n), torch.empty(b, o, o, n, dtype=torch.int64, device=points.device)
 
 
 def nearest_between_objects(points: Tensor, valid: Tensor, radius: float) -> tuple[Tensor, Tensor]:

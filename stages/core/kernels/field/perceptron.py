@@ -12,6 +12,8 @@ import triton.language as tl
 from torch import Tensor
 from torch.nn.functional import linear, silu
 
+from stages.core.kernels.operators import operator
+
 MAX_LAYER_WIDTH = 128  # hidden and output layers: their weights and a block of rows are kept on chip
 CHUNK = 64  # input columns read at a time
 SMALL_BLOCK_ROWS = 65_536  # up to so many rows use smaller blocks, to occupy all multiprocessors
@@ -89,7 +91,11 @@ def _perceptron(
         tl.store(to, y, mask=store)
 
 
-@torch.library.custom_op("ngff::perceptron", mutates_args=())
+def _fused_shapes(x, vectors, offset, needed, active, weights, biases):
+    return x.new_empty(len(x), weights[-1].shape[0])
+
+
+@operator("perceptron", _fused_shapes)
 def _fused(
     x: Tensor, vectors: Optional[Tensor], offset: Optional[Tensor], needed: Optional[Tensor], active: bool,  # noqa: UP045
     weights: Sequence[Tensor], biases: Sequence[Tensor],
@@ -109,11 +115,6 @@ def _fused(
         needed is not None, active, len(weights) == 3, precision, block, K, H, M, O,
     )  # fmt: skip
     return out
-
-
-@_fused.register_fake
-def _(x, vectors, offset, needed, active, weights, biases):
-    return x.new_empty(len(x), weights[-1].shape[0])
 
 
 def perceptron(

@@ -1,10 +1,10 @@
 """Free rigid-body motion, one thread per body: one launch instead of dozens of small tensor operations."""
 
-import torch
 import warp as wp
 from torch import Tensor
 
 from stages.core.kernels.interop import device_of, launch, view
+from stages.core.kernels.operators import operator
 
 
 @wp.func
@@ -51,7 +51,11 @@ def _rows(x: Tensor, dims: int, dtype) -> wp.array:
     return view(x.contiguous().flatten(0, -1 - dims), dtype)
 
 
-@torch.library.custom_op("ngff::drift", mutates_args=())
+def _drift_shapes(com, quat, velocity, momentum, inverse, dt):
+    return com.new_empty(com.shape), quat.new_empty(quat.shape)
+
+
+@operator("drift", _drift_shapes)
 def drift(
     com: Tensor, quat: Tensor, velocity: Tensor, momentum: Tensor, inverse: Tensor, dt: float
 ) -> tuple[Tensor, Tensor]:
@@ -68,12 +72,11 @@ def drift(
     return moved, rotated
 
 
-@drift.register_fake
-def _(com, quat, velocity, momentum, inverse, dt):
-    return com.new_empty(com.shape), quat.new_empty(quat.shape)
+def _pose_shapes(quat, momentum, inverse):
+    return inverse.new_empty(inverse.shape), momentum.new_empty(momentum.shape)
 
 
-@torch.library.custom_op("ngff::pose", mutates_args=())
+@operator("pose", _pose_shapes)
 def pose(quat: Tensor, momentum: Tensor, inverse: Tensor) -> tuple[Tensor, Tensor]:
     """Rotation matrices (..., 3, 3) and angular velocities (..., 3) [rad/s] of bodies. Without gradients.
 
@@ -84,8 +87,3 @@ def pose(quat: Tensor, momentum: Tensor, inverse: Tensor) -> tuple[Tensor, Tenso
         _rows(quat, 1, wp.vec4), _rows(momentum, 1, wp.vec3), _rows(inverse, 2, wp.mat33),
     ], [_rows(R, 2, wp.mat33), _rows(spin, 1, wp.vec3)], device_of(quat))  # fmt: skip
     return R, spin
-
-
-@pose.register_fake
-def _(quat, momentum, inverse):
-    return inverse.new_empty(inverse.shape), momentum.new_empty(momentum.shape)

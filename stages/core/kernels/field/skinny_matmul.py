@@ -8,6 +8,8 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from stages.core.kernels.operators import operator
+
 ROWS, CHUNK = 64, 128  # rows per program, and inner dimension read at a time
 MAX_COLUMNS = 16
 
@@ -29,7 +31,11 @@ def _skinny_matmul(A, high, low, out, n, k, c, ROWS: tl.constexpr, CHUNK: tl.con
     tl.store(out + matrix * n * c + r[:, None] + col[None, :] * n, total, mask=(r[:, None] < n) & (col[None, :] < c))
 
 
-@torch.library.custom_op("ngff::skinny_matmul", mutates_args=())
+def _split_matmul_shapes(A: Tensor, high: Tensor, low: Tensor) -> Tensor:
+    return torch.empty(A.shape[0], high.shape[1], A.shape[1], dtype=torch.float32, device=A.device)
+
+
+@operator("skinny_matmul", _split_matmul_shapes)
 def split_matmul(A: Tensor, high: Tensor, low: Tensor) -> Tensor:
     """A (g, n, k) times the columns high + low (g, c, k), all in half precision: (g, c, n) in single precision."""
     g, n, k = A.shape
@@ -37,11 +43,6 @@ def split_matmul(A: Tensor, high: Tensor, low: Tensor) -> Tensor:
     blocks = (g * triton.cdiv(n, ROWS),)
     _skinny_matmul[blocks](A, high, low, out, n, k, high.shape[1], ROWS, CHUNK, MAX_COLUMNS, num_stages=4)
     return out
-
-
-@split_matmul.register_fake
-def _(A: Tensor, high: Tensor, low: Tensor) -> Tensor:
-    return torch.empty(A.shape[0], high.shape[1], A.shape[1], dtype=torch.float32, device=A.device)
 
 
 def skinny_matmul(A: Tensor, x: Tensor) -> Tensor:

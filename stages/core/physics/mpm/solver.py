@@ -25,6 +25,7 @@ from torch import Tensor
 from stages.core.kernels.mpm import grid as mpm_grid
 from stages.core.kernels.mpm.constitutive import MAX_SNOW_HARDENING, NEO_HOOKEAN, SNOW
 from stages.core.physics.colliders import Collider, as_obstacles
+from stages.core.physics.mpm.domain import MAX_NODES, Box
 from stages.core.physics.mpm.fused import FusedSubsteps
 from stages.core.physics.mpm.particle_rows import NEVER, ParticleRows
 from stages.core.physics.mpm.split import SplitSubsteps
@@ -32,7 +33,6 @@ from stages.core.physics.mpm.split import SplitSubsteps
 SAFETY = 0.5  # fraction of a cell that a wave or a particle may cross in a substep; free vibration diverges from 1.1
 VISCOUS = 0.15  # maximum of dt eta / (density dx^2); violent vibration diverges from 0.3
 FLOOR_GAP = mpm_grid.FLOOR_GAP
-MAX_NODES = 60_000_000  # of the grid of a scene: about 1 GB of address space per copy
 SUBSTEP_MULTIPLE = 8  # on a GPU substeps per frame are a multiple of this, so that few CUDA graphs are captured
 
 
@@ -42,16 +42,6 @@ class Diverged(Exception):
     def __init__(self, particle: int):
         super().__init__(f"particle {particle} left the box or is not finite")
         self.particle = particle
-
-
-@dataclass(frozen=True)
-class Box:
-    """Axis-aligned floor, walls and ceiling [m], with the friction of the body in contact."""
-
-    low: tuple[float | int, float | int, float | int]  # z is the floor
-    high: tuple[float | int, float | int, float | int]
-    restitution: float = 0.0  # fraction of normal speed returned; 0: only the body's own elasticity
-    tangential_retention: float = -1.0  # 0 to 1: tangential speed kept per substep, as NGFF has it; -1: Coulomb
 
 
 @dataclass

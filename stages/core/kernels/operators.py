@@ -1,0 +1,29 @@
+"""Functions that torch.compile does not look into."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import wraps
+
+import torch
+
+
+def operator(name: str, shapes: Callable) -> Callable[[Callable], Callable]:
+    """Decorator: while torch.compile traces, the function is the custom operator ngff::`name`; else it runs directly.
+
+    `shapes` takes the same arguments and returns uninitialised results, from which the compiler reads shapes and types.
+    The function has no gradient. Calling a custom operator costs more than these kernels do, and its first call imports
+    torch._dynamo, which takes over a second.
+    """
+
+    def decorate(function: Callable) -> Callable:
+        traced = torch.library.custom_op(f"ngff::{name}", function, mutates_args=())
+        traced.register_fake(shapes)
+
+        @wraps(function)
+        def call(*args):
+            return traced(*args) if torch.compiler.is_compiling() else function(*args)
+
+        return call
+
+    return decorate

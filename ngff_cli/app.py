@@ -287,7 +287,10 @@ def evaluate(
     prediction: Annotated[
         Path, Argument(metavar="PREDICTION", help=".h5, .ply, .mp4 or a folder of PNGs", show_default=False)
     ],
-    against: Annotated[Path, Option("--against", help="ground truth, of the same kind", show_default=False)],
+    against: Annotated[
+        Path, Option("--against", help="ground truth, of the same kind; for a .ply also a folder of label images named "
+                     "as its photos, with names.json", show_default=False)
+    ],
     out: Annotated[
         Path | None, Option("-o", "--out", help="JSON file to write; default: metrics.json next to the prediction")
     ] = None,
@@ -303,13 +306,22 @@ def evaluate(
     objects: Annotated[
         str, Option(help="names of the objects to compare, such as duck,ball; default: all")
     ] = EvaluateOptions.objects,
+    undistorted: Annotated[
+        bool, Option("--undistorted", help="label images are of undistorted views; default: of the photos as taken")
+    ] = EvaluateOptions.undistorted,
+    photos: Annotated[
+        Path | None, Option(help="folder of the labelled photos, for the report; default: rendered images")
+    ] = EvaluateOptions.photos,
     report: Annotated[
         Path | None, Option(help="HTML report with curves and images to write (.html)")
     ] = EvaluateOptions.report,
     as_json: AsJson = False,
 ) -> None:
     """Compare a prediction with the ground truth: PREDICTION and TRUTH -> a table and METRICS.json."""
-    options = EvaluateOptions(align=align, frames=frames, resample=resample, objects=objects, report=report)
+    options = EvaluateOptions(
+        align=align, frames=frames, resample=resample, objects=objects, undistorted=undistorted, photos=photos,
+        report=report,
+    )  # fmt: skip
     load("stages.evaluate.stage:run")(prediction, against, out, options, as_json=as_json)
 
 

@@ -16,7 +16,7 @@ from stages.core.errors import InputError
 from stages.core.scene.formats import VIDEO_SUFFIXES
 from stages.core.scene.images import list_photos, read_image, read_video, video_info
 from stages.evaluate.options import EvaluateOptions
-from stages.evaluate.result import Curve, ImagePair, Result
+from stages.evaluate.result import Curve, Pictures, Result
 
 WINDOW, SIGMA = 11, 1.5  # of SSIM [px]
 REPORT_FRAMES = 4  # pairs of frames shown in the report
@@ -58,7 +58,7 @@ def compare(prediction: Path, truth: Path, options: EvaluateOptions) -> Result:
     notes = _check_rates(prediction, truth)
     total = options.frames or _count(truth)
     shown = set(torch.linspace(0, total - 1, min(REPORT_FRAMES, total)).round().int().tolist())
-    scores, pairs = [], []
+    scores, pictures = [], []
     frames = zip_longest(_frames(prediction), _frames(truth))
     for i, (predicted, true) in enumerate(tqdm(frames, total=total, unit="frame")):
         if options.frames is not None and i == options.frames:
@@ -69,7 +69,7 @@ def compare(prediction: Path, truth: Path, options: EvaluateOptions) -> Result:
         scores.append((psnr(predicted, true), ssim(predicted, true)))
         if i in shown:
             caption = f"frame {i}: PSNR {scores[-1][0]:.2f} dB, SSIM {scores[-1][1]:.3f}"
-            pairs.append(ImagePair(caption, predicted, true))
+            pictures.append(Pictures(caption, {"prediction": predicted, "truth": true}))
     if options.frames is not None and len(scores) < options.frames:
         raise InputError(f"--frames {options.frames}: both have only {len(scores)} frames; give {len(scores)} or fewer")
     if options.frames is not None:
@@ -77,7 +77,7 @@ def compare(prediction: Path, truth: Path, options: EvaluateOptions) -> Result:
     values = torch.tensor(scores, dtype=torch.float64)
     overall = {"PSNR": float(values[:, 0].mean()), "SSIM": float(values[:, 1].mean()), "frames": len(scores)}
     curves = [Curve(name, values[:, i].tolist()) for i, name in enumerate(("PSNR", "SSIM"))]
-    return Result("pictures", overall, {}, notes, curves, "PSNR [dB] of each frame", pairs=pairs)
+    return Result("pictures", overall, {}, notes, curves, "PSNR [dB] of each frame", pictures=pictures)
 
 
 def _frames(path: Path) -> Iterator[Image]:

@@ -16,6 +16,8 @@ class EvaluateOptions:
     frames: int | None = None  # compare the first N frames only; by default both must have the same number
     resample: bool = False  # interpolate the predicted motion at the frame times of the truth
     objects: str = ""  # names of the objects of the truth to compare: "duck,ball"; default: all
+    undistorted: bool = False  # label images are of the undistorted views, not of the photos as taken
+    photos: Path | None = None  # folder of the labelled photos, for the report; by default the scene is rendered
     report: Path | None = None  # HTML report with curves and images to write
 
     def __post_init__(self):
@@ -23,6 +25,9 @@ class EvaluateOptions:
             raise InputError(f"--frames {self.frames}: give the number of frames to compare, 1 or more")
         if self.report is not None and Path(self.report).suffix.lower() not in (".html", ".htm"):
             raise InputError(f"--report {self.report}: the report is an HTML file; use the suffix .html")
+
+        if self.photos is not None and self.report is None:
+            raise InputError(f"--photos {self.photos}: are shown in the report; add --report FILE.html")
 
     @property
     def object_names(self) -> list[str]:

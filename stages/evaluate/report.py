@@ -13,7 +13,7 @@ from torch import Tensor
 
 from stages.core.scene.files import replacing
 from stages.core.scene.images import resize, write_png
-from stages.evaluate.result import Curve, ImagePair, Result, format_number
+from stages.evaluate.result import Curve, Pictures, Result, format_number
 
 WIDTH, HEIGHT, LEFT, BOTTOM = 720, 280, 60, 36  # of the plot [px]; margins for the labels
 LINE_COLOURS = ("#1f6fb4", "#d1491f", "#2e8b57", "#8e44ad", "#b8860b", "#16808a", "#c2185b", "#5d6d7e")
@@ -21,7 +21,7 @@ MAX_IMAGE_SIDE = 420  # longest side of an image in the report [px]
 STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 900px; margin: 2em auto; padding: 0 1em; color: #222 }
 table { border-collapse: collapse } th, td { padding: .25em .9em; text-align: right; border-bottom: 1px solid #ddd }
-th:first-child, td:first-child { text-align: left } figure { margin: 1.2em 0 } img { max-width: 49% }
+th:first-child, td:first-child { text-align: left } figure { margin: 1.2em 0 }
 figcaption, .notes { color: #555 } svg text { font: 12px system-ui, sans-serif; fill: #444 }
 """
 
@@ -32,7 +32,8 @@ def write_report(path: Path, result: Result, prediction: Path, truth: Path) -> N
     body = [f"<h1>{escape(title)}</h1>", _table(result)]
     body += [f'<p class="notes">{escape(note)}</p>' for note in result.notes]
     body += [_plot(result)] if result.curves and len(result.curves[0].values) > 1 else []
-    body += [_figure(pair) for pair in result.pairs]
+    body += [_legend(result)] if result.legend else []
+    body += [_figure(pictures) for pictures in result.pictures]
     head = f'<meta charset="utf-8"><title>{escape(title)}</title><style>{STYLE}</style>'
     with replacing(path) as part:
         part.write_text(f"<!doctype html>\n<html><head>{head}</head><body>\n" + "\n".join(body) + "\n</body></html>\n")
@@ -100,11 +101,22 @@ def _round_up(value: float) -> float:
     return next(m * step for m in (1, 2, 5, 10) if m * step >= value * (1 - 1e-9))
 
 
-def _figure(pair: ImagePair) -> str:
-    """Prediction on the left, truth on the right."""
-    images = "".join(f'<img alt="{name}" src="data:image/png;base64,{_png(image)}"> ' for name, image in
-                     (("prediction", pair.predicted), ("truth", pair.truth)))  # fmt: skip
-    return f"<figure>{images}<figcaption>prediction, truth; {escape(pair.caption)}</figcaption></figure>"
+def _legend(result: Result) -> str:
+    """Names of the colours in the pictures."""
+    colours = {name: ",".join(str(round(255 * x)) for x in rgb) for name, rgb in result.legend.items()}
+    names = [f'<span style="color:rgb({rgb})">&#9632;</span> {escape(name)}' for name, rgb in colours.items()]
+    return f'<p class="notes">{" &nbsp; ".join(names)}</p>'
+
+
+def _figure(pictures: Pictures) -> str:
+    """Images side by side, in order."""
+    width = 98 // len(pictures.images)
+    images = "".join(
+        f'<img alt="{escape(name)}" style="max-width:{width}%" src="data:image/png;base64,{_png(image)}"> '
+        for name, image in pictures.images.items()
+    )
+    names = escape(", ".join(pictures.images))
+    return f"<figure>{images}<figcaption>{names}; {escape(pictures.caption)}</figcaption></figure>"
 
 
 def _png(image: Float[Tensor, "h w 3"]) -> str:

@@ -18,26 +18,26 @@ class Curve:
 
 
 @dataclass(frozen=True)
-class ImagePair:
-    """A predicted and a true image for the report."""
+class Pictures:
+    """Images shown side by side in the report."""
 
     caption: str
-    predicted: Float[Tensor, "h w 3"]
-    truth: Float[Tensor, "h w 3"]
+    images: dict[str, Float[Tensor, "h w 3"]]  # by name, from left to right
 
 
 @dataclass(frozen=True)
 class Result:
     """Metrics by name: overall, and of each object (none for images)."""
 
-    kind: str  # of the compared data: "trajectories", "pictures" or "scenes"
+    kind: str  # of the compared data: "trajectories", "pictures", "scenes" or "labels"
     overall: dict[str, float | int]
     parts: dict[str, dict[str, float | int]]
     notes: list[str]  # sentences on how items were matched
     curves: list[Curve] = field(default_factory=list)
     curve_title: str = ""
     fps: float | None = None  # of the curves, where frames have a time
-    pairs: list[ImagePair] = field(default_factory=list)
+    pictures: list[Pictures] = field(default_factory=list)
+    legend: dict[str, tuple[float, float, float]] = field(default_factory=dict)  # of the pictures: name to RGB 0..1
 
     def rows(self) -> list[tuple[str, dict[str, float | int]]]:
         """Rows of the table: each object, then "all"."""

@@ -1,4 +1,4 @@
-"""Stage evaluate: prediction and truth, both trajectories, scenes, or images and videos -> metrics.json."""
+"""Stage evaluate: a prediction and the truth (trajectories, scenes, videos, or label images) -> metrics.json."""
 
 from __future__ import annotations
 
@@ -15,18 +15,21 @@ from stages.evaluate.result import format_table, to_json
 
 log = logging.getLogger(__name__)
 
-# kind of data (a folder counts as images) -> "module:function" that takes (prediction, truth, options)
+# kind of the truth (a folder counts as images) -> "module:function" that takes (prediction, truth, options)
 COMPARISONS = {
     "trajectory": "stages.evaluate.trajectories:compare",
     "scene": "stages.evaluate.scenes:compare",
     "image": "stages.evaluate.images:compare",
     "video": "stages.evaluate.images:compare",
+    "labels": "stages.evaluate.labels:compare",  # of a scene: a folder of label images of its photos
 }
 OPTION_KINDS = {  # options that apply to some kinds of data only
     "align": ("trajectory", "scene"),
     "frames": ("trajectory", "image", "video"),
     "resample": ("trajectory",),
     "objects": ("trajectory",),
+    "undistorted": ("labels",),
+    "photos": ("labels",),
 }
 
 
@@ -40,13 +43,9 @@ def run(
     options that do not apply to them.
     """
     prediction, truth = Path(prediction), Path(truth)
-    kinds = [_kind(prediction), _kind(truth)]
-    if COMPARISONS[kinds[0]] != COMPARISONS[kinds[1]]:
-        raise InputError(
-            f"{prediction}: is of kind {kinds[0]}, but {truth} is of kind {kinds[1]}; give two files of one kind"
-        )
-    _check_options(kinds[0], options)
-    result = choose(COMPARISONS, kinds[0])(prediction, truth, options)
+    kind = _common_kind(prediction, truth)
+    _check_options(kind, options)
+    result = choose(COMPARISONS, kind)(prediction, truth, options)
     for note in result.notes:
         log.info("%s", note)
     facts = to_json(result) | {"provenance": provenance("evaluate", [prediction, truth], options)}
@@ -58,6 +57,18 @@ def run(
         write_report(options.report, result, prediction, truth)
     print(json.dumps(facts, indent=1) if as_json else format_table(result))
     return facts
+
+
+def _common_kind(prediction: Path, truth: Path) -> str:
+    """Kind of data of both, which is "labels" for a scene and a folder; InputError where they differ."""
+    kinds = _kind(prediction), _kind(truth)
+    if kinds[0] == "scene" and truth.is_dir():
+        return "labels"
+    if COMPARISONS[kinds[0]] != COMPARISONS[kinds[1]]:
+        raise InputError(
+            f"{prediction}: is of kind {kinds[0]}, but {truth} is of kind {kinds[1]}; give two files of one kind"
+        )
+    return kinds[0]
 
 
 def _kind(path: Path) -> str:

@@ -37,12 +37,14 @@ def read_image(path: Path) -> Float[Tensor, "h w 3"]:
     return torch.from_numpy(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB).astype(np.float32) / np.float32(white))
 
 
-def read_labels(path: Path) -> Int[Tensor, "h w"]:
-    """A label image: one integer per pixel (8 or 16 bit, one channel). InputError for several channels."""
+def read_labels(path: Path, max_bits: int = 16) -> Int[Tensor, "h w"]:
+    """A label image: one integer per pixel (8 bit, or 16 where `max_bits` allows). InputError for several channels."""
     must_exist(path, "a label image")
     pixels = _decode(path, cv2.IMREAD_UNCHANGED)
     if pixels.ndim != 2:
         raise InputError(f"{path}: has {pixels.shape[2]} channels; a label image has one, with the object's number")
+    if 8 * pixels.itemsize > max_bits:
+        raise InputError(f"{path}: has {8 * pixels.itemsize} bits per pixel; save the label image with {max_bits}")
     return torch.from_numpy(pixels.astype(np.int64))
 
 

@@ -1,0 +1,107 @@
+"""Pictures of label images for the report: photo, labelled objects and found objects side by side."""
+
+from __future__ import annotations
+
+import colorsys
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from stages.core.errors import InputError
+from stages.core.raster.rasterise import rasterise
+from stages.core.scene.formats import IMAGE_SUFFIXES
+from stages.core.scene.images import read_image, resize
+from stages.core.scene.lens import Undistortion
+from stages.core.scene.scene import Scene
+from stages.evaluate.options import EvaluateOptions
+from stages.evaluate.result import Pictures, Result
+
+MAX_PICTURES = 12  # photos in the report
+GOLDEN_RATIO = 0.618034  # steps of the hue, so that neighbouring numbers have different colours
+HUES = (0.08, 0.92)  # of labelled objects; red is for false ones
+GREY, RED = (0.6, 0.6, 0.6), (0.9, 0.1, 0.1)  # pixels that are not judged; false objects
+OVERLAY = 0.6  # opacity of the colours over the photo
+
+Image = Float[Tensor, "h w 3"]
+Colour = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class LabelledView:
+    """Labelled and found objects in a view."""
+
+    view: int  # index of the camera
+    truth: Int[Tensor, "h w"]
+    found: Int[Tensor, "h w"]
+    judged: Bool[Tensor, "h w"]  # pixels that are compared
+
+
+@dataclass(frozen=True)
+class LabelColours:
+    """Colour of each labelled and of each found object."""
+
+    truth: dict[int, Colour]
+    found: dict[int, Colour]  # that of the labelled object that it is; others are RED
+
+    @classmethod
+    def of(cls, labelled: dict[int, float], hits: dict[int, int]) -> LabelColours:
+        """Colours of the labelled objects, and of the found objects that are one of them (labelled to found)."""
+        truth = {t: _colour(i) for i, t in enumerate(labelled)}
+        return cls(truth, {p: truth[t] for t, p in hits.items()})
+
+
+def _colour(i: int) -> Colour:
+    hue = HUES[0] + (HUES[1] - HUES[0]) * (i * GOLDEN_RATIO % 1)
+    return colorsys.hsv_to_rgb(hue, 1.0 if i % 2 else 0.6, 1.0)
+
+
+def draw_pictures(
+    result: Result, scene: Scene, views: list[LabelledView], colours: LabelColours, names: dict[int, str],
+    options: EvaluateOptions,
+) -> Result:  # fmt: skip
+    """The result with pictures of the first MAX_PICTURES views and the colours of the labelled objects."""
+    pictures = []
+    for v in views[:MAX_PICTURES]:
+        photo = _photo(scene, v.view, options)
+        pictures.append(Pictures(scene.cameras.names[v.view], {
+            "photo" if options.photos else "rendered photo": photo,
+            "truth": paint(photo, v.truth, colours.truth, v.judged),
+            "found": paint(photo, v.found, colours.found, v.judged),
+        }))  # fmt: skip
+    legend = {name: colours.truth[t] for t, name in names.items()}
+    legend |= {"no labelled object": RED, "not judged": GREY}
+    return replace(result, pictures=pictures, legend=legend)
+
+
+def paint(photo: Image, ids: Int[Tensor, "h w"], colours: dict[int, Colour], judged: Bool[Tensor, "h w"]) -> Image:
+    """The photo in grey, with objects in their colours (RED without one), white borders, and GREY where not judged."""
+    out = photo.mean(2, keepdim=True).expand(-1, -1, 3).clone() * 0.6
+    for i in ids[judged & (ids != 0)].unique().tolist():
+        own = judged & (ids == i)
+        out[own] = torch.lerp(out[own], torch.tensor(colours.get(i, RED)), OVERLAY)
+    out[~judged] = torch.lerp(out[~judged], torch.tensor(GREY), OVERLAY)
+    border = torch.zeros_like(judged)
+    shown = torch.where(judged, ids, -1)
+    border[:, 1:] |= shown[:, 1:] != shown[:, :-1]
+    border[1:] |= shown[1:] != shown[:-1]
+    out[border] = 1.0
+    return out
+
+
+def _photo(scene: Scene, view: int, options: EvaluateOptions) -> Image:
+    """The photo in folder `options.photos`, undistorted and at the size of the view; without folder a rendering."""
+    cameras = scene.cameras
+    width, height = cameras.sizes[view].tolist()
+    if options.photos is None:
+        drawn = rasterise(scene.gaussians, cameras.viewmats[view][None], cameras.Ks[view][None], width, height)
+        return drawn.rgb[0].clamp(0, 1)
+    stem, folder = Path(cameras.names[view]).stem, Path(options.photos)
+    files = [p for p in sorted(folder.glob("*")) if p.stem == stem and p.suffix.lower() in IMAGE_SUFFIXES]
+    if not files:
+        raise InputError(f"--photos {folder}: holds no photo {cameras.names[view]}; give the folder of the photos")
+    image = read_image(files[0])
+    size = (image.shape[1], image.shape[0])
+    return resize(Undistortion.of(cameras, view, size, options.undistorted).image(image), width, height)

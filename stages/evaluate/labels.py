@@ -1,0 +1,213 @@
+"""Comparison of a scene's objects with label images of its photos: IoU of each object, recall and panoptic quality.
+
+Each Gaussian's object is composited into the view of a labelled photo, and each pixel shows the object with the largest
+share. Labelled and found objects are compared over all labelled photos together.
+"""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Int
+from scipy.optimize import linear_sum_assignment
+from torch import Tensor
+from tqdm import tqdm
+
+from stages.core.errors import InputError
+from stages.core.raster.rasterise import rasterise_features
+from stages.core.scene.cameras import Cameras
+from stages.core.scene.files import must_exist
+from stages.core.scene.images import read_labels
+from stages.core.scene.lens import Undistortion, photo_of
+from stages.core.scene.scene import Scene, SceneObject
+from stages.core.scene.scene_ply import read_scene
+from stages.evaluate.label_pictures import LabelColours, LabelledView, draw_pictures
+from stages.evaluate.matching import object_labels
+from stages.evaluate.options import EvaluateOptions
+from stages.evaluate.result import Result
+
+NOT_JUDGED = 255  # value of pixels that are left out
+MIN_FOUND_PIXELS = 60  # of a found object in all photos [px of the views]; smaller ones are no objects
+NAMES_EXAMPLE = '{"1": {"name": "duck", "core": true}}'
+MATCHING_IOU = 0.5  # above which a found object is the labelled one (Kirillov et al. 2019)
+
+
+@dataclass(frozen=True)
+class LabelledObject:
+    """An object of names.json."""
+
+    name: str
+    core: bool  # whether it is asked for; others are neither asked for nor held against what finds them
+
+
+@dataclass(frozen=True)
+class PanopticScores:
+    """Objects of the truth and of the prediction, and their overlap, by number."""
+
+    iou: dict[int, float]  # of each labelled object with the found one matched to it
+    matched: dict[int, int]  # labelled to found, of any IoU above 0
+    truth_pixels: dict[int, int]  # of each labelled object
+    found_pixels: dict[int, int]  # of each found object of MIN_FOUND_PIXELS or more
+    pixels: int  # that are compared, the background included
+
+    @property
+    def hits(self) -> dict[int, int]:
+        """Labelled to found, of an IoU above MATCHING_IOU."""
+        return {t: p for t, p in self.matched.items() if self.iou[t] > MATCHING_IOU}
+
+    @property
+    def false(self) -> list[int]:
+        """Found objects that are no labelled one."""
+        return [p for p in self.found_pixels if p not in self.hits.values()]
+
+    def summary(self) -> dict[str, float | int]:
+        """The metrics over all objects, by their names in tables; SQ, RQ, PQ by Kirillov et al. 2019."""
+        hits, asked, found = len(self.hits), len(self.iou), len(self.found_pixels)
+        sq = sum(self.iou[t] for t in self.hits) / hits if hits else 0.0
+        rq = hits / ((asked + found) / 2) if asked + found else 0.0
+        return {
+            "IoU": sum(self.iou.values()) / asked if asked else 0.0,
+            "pixels": self.pixels,
+            "recall": hits / asked if asked else 0.0,
+            "SQ": sq,
+            "RQ": rq,
+            "PQ": sq * rq,
+            "objects": asked,
+            "found": found,
+            "false": len(self.false),
+            "false_share": sum(self.found_pixels[p] for p in self.false) / max(1, self.pixels),
+        }
+
+
+@dataclass
+class LabelOverlap:
+    """Number of pixels of each pair of a labelled and a found object, summed over images; 0 is the background."""
+
+    table: Counter[tuple[int, int]] = field(default_factory=Counter)
+
+    def add(self, truth: Int[Tensor, "h w"], found: Int[Tensor, "h w"], judged: Bool[Tensor, "h w"]) -> None:
+        """Count the judged pixels of one image."""
+        base = 1 + max(found.flatten().tolist(), default=0)
+        pairs, counts = (truth[judged] * base + found[judged]).unique(return_counts=True)
+        for pair, n in zip(pairs.tolist(), counts.tolist(), strict=True):
+            self.table[divmod(pair, base)] += n
+
+    def scores(self) -> PanopticScores:
+        """Objects matched one to one with the largest sum of IoU."""
+        truth, found = Counter(), Counter()
+        for (t, p), n in self.table.items():
+            truth[t] += n
+            found[p] += n
+        ts = sorted(t for t in truth if t)
+        ps = sorted(p for p in found if p and found[p] >= MIN_FOUND_PIXELS)
+        iou = np.zeros((len(ts), len(ps)))
+        for (r, t), (c, p) in ((a, b) for a in enumerate(ts) for b in enumerate(ps)):
+            iou[r, c] = self.table[t, p] / (truth[t] + found[p] - self.table[t, p])
+        pairs = [(r, c) for r, c in zip(*linear_sum_assignment(iou, maximize=True), strict=True) if iou[r, c] > 0]
+        best = {ts[r]: float(iou[r, c]) for r, c in pairs}
+        return PanopticScores(
+            {t: best.get(t, 0.0) for t in ts}, {ts[r]: ps[c] for r, c in pairs}, {t: truth[t] for t in ts},
+            {p: found[p] for p in ps}, sum(self.table.values()),
+        )  # fmt: skip
+
+
+def compare(prediction: Path, truth: Path, options: EvaluateOptions) -> Result:
+    """The metrics of a scene against the folder `truth` of label images; pictures of each photo if a report is asked.
+
+    Raises InputError for a scene without cameras, a folder without names.json or without a label image of a photo of
+    the scene, and label images that are not 8-bit with one channel, or of another size than their photo.
+    """
+    scene, names = read_scene(prediction), read_label_names(truth)
+    files = label_files(truth, prediction, scene.cameras)
+    spare = torch.tensor([i for i, o in names.items() if not o.core], dtype=torch.int64)
+    overlap, views = LabelOverlap(), []
+    for view, file in tqdm(files.items(), unit="photo", leave=False):
+        labels, found = read_truth(file, scene.cameras, view, options.undistorted), found_objects(scene, view)
+        judged = (labels != NOT_JUDGED) & ~torch.isin(labels, spare)
+        overlap.add(labels, found, judged)
+        views += [LabelledView(view, labels, found, judged)] if options.report else []
+    scores = overlap.scores()
+    asked = [SceneObject(t, names[t].name if t in names else f"object_{t}") for t in scores.iou]
+    rows = dict(zip(scores.iou, object_labels(asked), strict=True))
+    parts = {rows[t]: {"IoU": iou, "pixels": scores.truth_pixels[t]} for t, iou in scores.iou.items()}
+    notes = _notes(scene, scores, rows)
+    if len(spare):
+        notes.append("neither asked for nor held against the result: " + ", ".join(names[int(i)].name for i in spare))
+    if absent := sorted({file.name for file in truth.glob("*.png")} - {file.name for file in files.values()}):
+        notes.append(f"label images of photos that the scene has no camera for: {', '.join(absent)}")
+    result = Result("labels", {**scores.summary(), "photos": len(files)}, parts, notes)
+    colours = LabelColours.of(scores.iou, scores.hits)
+    return draw_pictures(result, scene, views, colours, rows, options) if views else result
+
+
+def read_label_names(folder: Path) -> dict[int, LabelledObject]:
+    """The objects of names.json by number: {"1": {"name": "duck", "core": true}}, or {"1": "duck"}; core by default."""
+    path = must_exist(folder / "names.json", f"the names of the labelled objects, {NAMES_EXAMPLE},")
+    try:
+        rows = json.loads(path.read_text()).items()
+        named = {int(i): row if isinstance(row, dict) else {"name": row} for i, row in rows}
+        return {i: LabelledObject(str(row["name"]), bool(row.get("core", True))) for i, row in named.items()}
+    except (ValueError, KeyError, AttributeError) as error:
+        raise InputError(f"{path}: is not readable ({error!r}); write {NAMES_EXAMPLE}") from error
+
+
+def label_files(folder: Path, prediction: Path, cameras: Cameras | None) -> dict[int, Path]:
+    """The label image NAME.png of each camera's photo NAME that has one; InputError where none has."""
+    if cameras is None or not len(cameras):
+        raise InputError(f"{prediction}: has no cameras; label images need a scene that `ngff reconstruct` wrote")
+    paths = {i: folder / f"{Path(name).stem}.png" for i, name in enumerate(cameras.names)}
+    files = {i: path for i, path in paths.items() if path.exists()}
+    if not files:
+        raise InputError(f"{folder}: no label image is named as a photo of {prediction}, such as {paths[0].name}")
+    return files
+
+
+def read_truth(file: Path, cameras: Cameras, view: int, undistorted: bool = False) -> Int[Tensor, "h w"]:
+    """A label image in the view of its photo's camera: undistorted, and at the view's size.
+
+    Raises InputError unless it is 8-bit, of one channel, and of the size of the photo (of the view, if `undistorted`).
+    """
+    labels = read_labels(file, max_bits=8)
+    height, width = labels.shape
+    (w, h), known = photo_of(cameras, view, undistorted)[1], cameras.photos is not None and not undistorted
+    # a view may be smaller, and its sides are rounded to whole pixels
+    same = (width, height) == (w, h) if known else abs(width / height * h - w) <= 0.5 * (1 + width / height)
+    if not same:
+        raise InputError(
+            f"{file}: has {width}x{height} pixels, but the {'photo' if known else 'view'} {cameras.names[view]} has "
+            f"{w}x{h}; label the photos as they were given to `ngff reconstruct`, or add --undistorted for labels of "
+            "undistorted views"
+        )
+    return Undistortion.of(cameras, view, (width, height), undistorted).labels(labels)
+
+
+@torch.no_grad()
+def found_objects(scene: Scene, view: int) -> Int[Tensor, "h w"]:
+    """The object with the largest share of each pixel of a view; 0 where the background's share is larger."""
+    g, cameras = scene.gaussians, scene.cameras
+    width, height = cameras.sizes[view].tolist()
+    ids = g.object_id.unique()
+    ids = ids[ids != 0]
+    if not len(ids):
+        return torch.zeros(height, width, dtype=torch.int64)
+    member = (g.object_id[:, None] == ids).float()
+    share = rasterise_features(g, member, cameras.viewmats[view][None], cameras.Ks[view][None], width, height)[0]
+    best, index = share.max(-1)
+    return torch.where(best > 1 - share.sum(-1), ids[index], 0)
+
+
+def _notes(scene: Scene, scores: PanopticScores, rows: dict[int, str]) -> list[str]:
+    """Sentences on which objects correspond."""
+    listed = ", ".join(
+        f"{name} = {scene.name_of(scores.matched[t]) if t in scores.matched else 'nothing'}" for t, name in rows.items()
+    )
+    notes = [f"objects are compared in the pixels of all labelled photos; matched {listed or 'nothing'}"]
+    if scores.false:
+        sizes = ", ".join(f"{scene.name_of(p)} ({scores.found_pixels[p]} px)" for p in scores.false)
+        notes.append(f"found objects that are no labelled one: {sizes}")
+    return notes

@@ -171,9 +171,11 @@ def train(
     steps: Annotated[int, typer.Option(help="optimizer steps instead of --minutes; 0: use --minutes")] = 0,
     batch: Annotated[int, typer.Option(help="scenes per step")] = 32,
     keypoints: Annotated[int, typer.Option(help="keypoints per object")] = 256,
-    few: Annotated[int, typer.Option(help="keypoints per object in every fourth step; 0: the same in all steps")] = 0,
+    sparse_keypoints: Annotated[
+        int, typer.Option(help="keypoints per object in every fourth step; 0: the same in all steps")
+    ] = 0,
     lr: Annotated[float, typer.Option(help="maximum learning rate")] = 1e-3,
-    hidden: Annotated[
+    width: Annotated[
         int, typer.Option(help="width of the network, may exceed that of --from; 0: the model's default")
     ] = 0,
     horizons: Annotated[str, typer.Option(help="rollout length of each phase [frames]")] = "8,20,40",
@@ -183,12 +185,11 @@ def train(
                      "relative: axes, divided by the amount of motion"),
     ] = "scene",  # fmt: skip
     optimizer: Annotated[str, typer.Option(help="adamw | soap (extra `train`)")] = "adamw",
-    speeds: Annotated[
+    velocity_weight: Annotated[
         float, typer.Option(help="weight of velocity errors relative to position errors [s]; 0: none")
     ] = 0.0,
     gradient_discount: Annotated[
-        float,
-        typer.Option("--gradient-discount", "--memory", help="factor on the gradient per frame of backpropagation"),
+        float, typer.Option(help="factor on the gradient per frame of backpropagation")
     ] = 0.9,
     groups: Annotated[
         str, typer.Option(help="groups to train on, also varied, solid, turned; the last 100 scenes are for validation")
@@ -205,8 +206,8 @@ def train(
     from stages.lab.training.train import TrainOptions, run
 
     options = TrainOptions(
-        minutes=minutes, steps=steps, batch=batch, keypoints=keypoints, few=few, lr=lr, horizons=horizons,
-        hidden=hidden, loss=loss, optimizer=optimizer, speeds=speeds,
+        minutes=minutes, steps=steps, batch=batch, keypoints=keypoints, sparse_keypoints=sparse_keypoints, lr=lr,
+        horizons=horizons, width=width, loss=loss, optimizer=optimizer, velocity_weight=velocity_weight,
         gradient_discount=gradient_discount, groups=groups, compiled=compiled, seed=seed, device=device,
     )  # fmt: skip
     for line in run(model, data, out, options, resume, start):
@@ -230,13 +231,13 @@ def card(
 def average(
     files: Annotated[list[Path], typer.Argument(metavar="WEIGHTS", help="two or more, of one model (.safetensors)")],
     out: Annotated[Path, typer.Option("-o", "--out", help="weights to write (.safetensors)")],
-    shares: Annotated[str, typer.Option(help="weighting of each file, such as 0.7,0.3")],
+    ratios: Annotated[str, typer.Option(help="weighting of each file, such as 0.7,0.3")],
     half: Half = False,
 ) -> None:
     """Average the weights of several training runs."""
     from stages.lab.training.average import run
 
-    print(run(files, shares, out, half))
+    print(run(files, ratios, out, half))
 
 
 @app.command("train-splatter")

@@ -28,7 +28,7 @@ def run(files: Sequence[Path], given: str, out: Path, half: bool = False) -> str
     """
     ratios = _numbers(given)
     if len(files) != len(ratios) or len(files) < 2 or min(ratios) < 0 or not math.isclose(sum(ratios), 1):
-        raise InputError(f"--shares {given}: takes a number for each of at least two files; they add up to 1, such as "
+        raise InputError(f"--ratios {given}: takes a number for each of at least two files; they add up to 1, such as "
                          "0.7,0.3")  # fmt: skip
     models, cards = zip(*(load(file) for file in files), strict=True)
     for file, card in zip(files[1:], cards[1:], strict=True):

@@ -41,7 +41,7 @@ PROGRESS_LINE = (
     "{minutes:6.1f} min {step:7d} steps  horizon {horizon:2d}  loss {loss:.4f}  "
     "RMSE {RMSE:.4f}  FPE {FPE:.4f}  R {R:.3f}"
 )
-SPARSE_EVERY = 4  # with --few, every fourth step uses fewer keypoints
+SPARSE_EVERY = 4  # with --sparse-keypoints, every fourth step uses fewer keypoints
 VALIDATION_FRAMES = 80  # of the rollouts that select the weights
 SCORES = ("step", "minutes", "RMSE", "FPE", "R")  # of the selected weights, in a card
 
@@ -54,13 +54,13 @@ class TrainOptions:
     steps: int = 0  # budget in optimizer steps instead, when not 0: the same on every machine
     batch: int = 32  # scenes a step
     keypoints: int = 256  # of an object
-    few: int = 0  # keypoints of an object in every fourth step, for robustness to their number; 0: never
+    sparse_keypoints: int = 0  # keypoints of an object in every fourth step, for robustness to their number; 0: never
     lr: float = 1e-3  # peak learning rate
     horizons: str = "8,20,40"  # frames of a rollout, one phase each
-    hidden: int = 0  # width of the network; 0: the model's own
+    width: int = 0  # width of the network; 0: the model's own
     loss: str = "scene"  # one of rollout_loss.LOSSES
     optimizer: str = "adamw"  # one of state.OPTIMIZERS
-    speeds: float = 0.0  # weight of velocity errors: the time [s] over which one counts as a position error; 0: none
+    velocity_weight: float = 0.0  # time over which a velocity error counts as a position error [s]; 0: none
     gradient_discount: float = 0.9  # factor on a gradient per frame of backpropagation
     groups: str = "3_0..3_8"  # training files; the last scenes of the last are for validation
     compiled: bool = False  # compile a step first: takes minutes, then faster; for GPUs
@@ -71,10 +71,10 @@ class TrainOptions:
     def __post_init__(self):
         if self.minutes <= 0 or self.steps < 0 or min(self.batch, self.keypoints) < 1 or self.lr <= 0:
             raise InputError("--minutes, --batch, --keypoints and --lr must be positive, --steps at least 0")
-        if not 0 <= self.few <= self.keypoints:
-            raise InputError(f"--few {self.few}: must be between 0 and --keypoints")
-        if self.speeds < 0:
-            raise InputError(f"--speeds {self.speeds}: a time in seconds, or 0")
+        if not 0 <= self.sparse_keypoints <= self.keypoints:
+            raise InputError(f"--sparse-keypoints {self.sparse_keypoints}: must be between 0 and --keypoints")
+        if self.velocity_weight < 0:
+            raise InputError(f"--velocity-weight {self.velocity_weight}: a time in seconds, or 0")
         if not 0 <= self.gradient_discount <= 1:
             raise InputError(f"--gradient-discount {self.gradient_discount}: must be between 0 and 1")
         if self.loss not in LOSSES:
@@ -126,7 +126,8 @@ def run(
         if processes.is_main:
             log.info("%s, %s parameters: %d training scenes, %d validation scenes", model,
                      f"{sum(p.numel() for p in state.params):,}", len(training), len(validation))  # fmt: skip
-        samplers = [ClipSampler(part, processes.device, state.model) for part in _with_few(training, options.few)]
+        parts = _with_sparse(training, options.sparse_keypoints)
+        samplers = [ClipSampler(part, processes.device, state.model) for part in parts]
         key = _key(model, options, earlier)
         job = TrainingRun(state, samplers, validation.to(processes.device), options, processes, out, key)
         finished = job.run()
@@ -149,9 +150,9 @@ def run(
             f"of unseen scenes, after {best['minutes']:.1f} of {state.elapsed / 60:.1f} min{ended}"]  # fmt: skip
 
 
-def _with_few(motions: KeypointMotions, few: int) -> list[KeypointMotions]:
-    """The motions, and a copy with few keypoints where that is asked for."""
-    return [motions, replace(motions, points=motions.points[:, :, :, :few].clone())] if few else [motions]
+def _with_sparse(motions: KeypointMotions, count: int) -> list[KeypointMotions]:
+    """The motions, and a copy with `count` keypoints per object if that is not 0."""
+    return [motions, replace(motions, points=motions.points[:, :, :, :count].clone())] if count else [motions]
 
 
 def _initial_state(
@@ -161,14 +162,14 @@ def _initial_state(
     torch.manual_seed(options.seed)
     earlier = []
     if start is None:
-        network = build(model, **({"hidden": options.hidden} if options.hidden else {})).to(device)
+        network = build(model, **({"hidden": options.width} if options.width else {})).to(device)
     else:
         network, card = load(start, device)
-        if options.hidden and card["model"] == model == "ngff":
-            network = widen(network, options.hidden)
-        if card["model"] != model or options.hidden not in (0, network.config.get("hidden")):
+        if options.width and card["model"] == model == "ngff":
+            network = widen(network, options.width)
+        if card["model"] != model or options.width not in (0, network.config.get("hidden")):
             raise InputError(f"{start}: holds {card['model']} {network.config}, not the model to be trained; leave "
-                             "--hidden out and name weights of the same model")  # fmt: skip
+                             "--width out and name weights of the same model")  # fmt: skip
         earlier = runs_of(card)
     state = TrainingState(network, options.lr, options.seed, options.optimizer)
     if resume:
@@ -188,7 +189,7 @@ class TrainingRun:
     """One run of training, by one process or several."""
 
     state: TrainingState
-    samplers: list[ClipSampler]  # with all keypoints; with few, for every fourth step, where asked for
+    samplers: list[ClipSampler]  # with all keypoints; with fewer, for every fourth step, if asked for
     validation: KeypointMotions
     options: TrainOptions
     processes: ProcessGroup
@@ -232,7 +233,7 @@ class TrainingRun:
         return RolloutLoss(
             self.state.model,
             sampler.motions.dt,
-            LossOptions(o.loss, o.speeds, o.gradient_discount),
+            LossOptions(o.loss, o.velocity_weight, o.gradient_discount),
             compiled=o.compiled,
         )
 

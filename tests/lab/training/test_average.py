@@ -26,7 +26,7 @@ def digest(path):
 def test_parameters_are_averaged_and_the_card_lists_all_runs(tmp_path):
     old = trained(tmp_path / "old.safetensors", 0)
     a, b = (trained(tmp_path / f"{n}.safetensors", i, runs=runs_of(load(old)[1])) for n, i in (("a", 1), ("b", 2)))
-    args = ["average", str(a), str(b), str(old), "--shares", "0.5,0.2,0.3", "-o", str(tmp_path / "mean.safetensors")]
+    args = ["average", str(a), str(b), str(old), "--ratios", "0.5,0.2,0.3", "-o", str(tmp_path / "mean.safetensors")]
     done = CliRunner().invoke(app, args)
     assert done.exit_code == 0 and "0.5 of" in done.stdout, done.stderr
     mean, card = load(tmp_path / "mean.safetensors")
@@ -71,7 +71,7 @@ def test_half_precision_shrinks_the_file(tmp_path):
 @pytest.mark.parametrize("shares", ["0.5", "0.5,0.6", "1.5,-0.5", "half,half", "nan,nan", "0.4,0.3,0.3"])
 def test_ratios_must_add_up_to_one(shares, tmp_path):
     a, b = trained(tmp_path / "a.safetensors", 1), trained(tmp_path / "b.safetensors", 2)
-    with pytest.raises(InputError, match="--shares"):
+    with pytest.raises(InputError, match="--ratios"):
         run([a, b], shares, tmp_path / "mean.safetensors")
 
 

@@ -73,7 +73,7 @@ def data(tmp_path: Path) -> Path:
     return tmp_path / "data"
 
 
-QUICK = TrainOptions(steps=12, batch=2, keypoints=8, horizons="2,3", hidden=8, groups="3_0..3_1", checks=4)
+QUICK = TrainOptions(steps=12, batch=2, keypoints=8, horizons="2,3", width=8, groups="3_0..3_1", checks=4)
 
 
 def test_clips_start_with_the_velocity_of_free_fall():
@@ -343,7 +343,7 @@ def test_a_new_horizon_resets_moments_and_warm_up():
 def test_training_learns_free_fall(tmp_path):
     """A graph network from scratch learns gravity."""
     write_motions(tmp_path / "3_0.h5", falling(scenes=30, n=6, frames=6), {})
-    options = replace(QUICK, steps=80, batch=8, keypoints=6, horizons="1", lr=2e-2, hidden=16, groups="3_0")
+    options = replace(QUICK, steps=80, batch=8, keypoints=6, horizons="1", lr=2e-2, width=16, groups="3_0")
     torch.manual_seed(options.seed)
     unseen = train_validation_split(read_groups(tmp_path, ["3_0"], 6), 100)[1]
     before = validate(build("gcn", hidden=16), unseen)["RMSE"]
@@ -400,7 +400,7 @@ def test_resumed_training_repeats_the_curve(data, tmp_path, monkeypatch, after, 
 def test_training_from_weights_extends_their_runs(data, tmp_path):
     first, second = tmp_path / "first.safetensors", tmp_path / "second.safetensors"
     run("gcn", data, first, QUICK)
-    still = replace(QUICK, steps=1, lr=1e-9, hidden=0)
+    still = replace(QUICK, steps=1, lr=1e-9, width=0)
     run("gcn", data, second, still, start=first)
     (a, before), (b, card) = load(first), load(second)
     assert card["runs"][0] == {**before["runs"][0], "sha256": before["sha256"]}
@@ -410,7 +410,7 @@ def test_training_from_weights_extends_their_runs(data, tmp_path):
     run("gcn", data, second, still, resume=True, start=first)
     with pytest.raises(InputError, match="another from"):
         run("gcn", data, second, still, resume=True)
-    for wrong in ({"model": "ngff"}, {"model": "gcn", "options": replace(still, hidden=16)}):
+    for wrong in ({"model": "ngff"}, {"model": "gcn", "options": replace(still, width=16)}):
         with pytest.raises(InputError, match="first.safetensors: holds gcn"):
             run(**{"data": data, "out": second, "options": still, "start": first, **wrong})
 
@@ -448,9 +448,9 @@ def test_nonfinite_rmse_is_infinite():
         ({"horizons": "3,8"}, "6 frames"),
         ({"horizons": "8,x"}, "--horizons"),
         ({"lr": 0.0}, "--lr"),
-        ({"few": 9}, "--few"),
+        ({"sparse_keypoints": 9}, "--sparse-keypoints"),
         ({"optimizer": "newton"}, "--optimizer newton"),
-        ({"speeds": -0.1}, "--speeds"),
+        ({"velocity_weight": -0.1}, "--velocity-weight"),
     ],
 )
 def test_unusable_data_and_options_are_reported(data, tmp_path, change, message):
@@ -459,7 +459,7 @@ def test_unusable_data_and_options_are_reported(data, tmp_path, change, message)
     assert not (tmp_path / "a.safetensors").exists()
 
 
-def test_every_fourth_step_uses_few_keypoints(data, tmp_path, monkeypatch):
+def test_every_fourth_step_uses_fewer_keypoints(data, tmp_path, monkeypatch):
     seen, draw = [], ClipSampler.draw
 
     def watched(self, *args):
@@ -468,14 +468,14 @@ def test_every_fourth_step_uses_few_keypoints(data, tmp_path, monkeypatch):
         return clip
 
     monkeypatch.setattr(ClipSampler, "draw", watched)
-    run("ngff", data, tmp_path / "a.safetensors", replace(QUICK, steps=6, few=4, speeds=0.1))
+    run("ngff", data, tmp_path / "a.safetensors", replace(QUICK, steps=6, sparse_keypoints=4, velocity_weight=0.1))
     assert seen == [4, 8, 8, 8, 4, 8]
 
 
 def test_the_command_trains(data, tmp_path):
     out = tmp_path / "gcn.safetensors"
-    words = "--steps 2 --batch 2 --keypoints 8 --few 4 --speeds 0.1 --horizons 3 --loss relative --hidden 8"
-    words += f" --groups 3_0,3_1 -o {out}"
+    words = "--steps 2 --batch 2 --keypoints 8 --sparse-keypoints 4 --velocity-weight 0.1 --horizons 3"
+    words += f" --loss relative --width 8 --groups 3_0,3_1 -o {out}"
     result = CliRunner().invoke(app, ["train", "gcn", "--data", str(data), *words.split()])
     assert result.exit_code == 0, result.output
     assert "RMSE" in result.stdout
@@ -486,7 +486,7 @@ def test_the_command_trains(data, tmp_path):
 def test_two_processes_equal_one_with_the_whole_batch(data, tmp_path):
     """Each computes half of every batch and gradients are averaged: only the order of sums differs."""
     words = ["train", "gcn", "--data", str(data), "--device", "cpu"]
-    words += ["--steps", "6", "--batch", "4", "--keypoints", "8", "--horizons", "3", "--hidden", "8"]
+    words += ["--steps", "6", "--batch", "4", "--keypoints", "8", "--horizons", "3", "--width", "8"]
     words += ["--groups", "3_0,3_1"]
     assert CliRunner().invoke(app, [*words, "-o", str(tmp_path / "one.safetensors")]).exit_code == 0
     command = f"from ngff_cli.lab import app; app({[*words, '-o', str(tmp_path / 'two.safetensors')]!r})"

@@ -20,6 +20,7 @@ from tqdm import tqdm
 
 from stages.core.geometry.cameras import centres, depths, resize
 from stages.core.geometry.planes import Plane
+from stages.core.kernels.semi_global import path_costs
 from stages.reconstruct.photos import Views
 from stages.reconstruct.sfm import SparseModel
 
@@ -29,6 +30,7 @@ MAX_LABELS = 192  # depth hypotheses per pixel
 STEP_PENALTY, JUMP_PENALTY = 0.03, 0.25  # P1 and P2 of semi-global matching, for costs 0..1
 DEPTH_TOLERANCE, PIXEL_TOLERANCE = 0.01, 1.5  # of consistent depths: relative, and reprojected [px]
 REFINE_STEPS = (0.5, 0.2)  # of the two refinement rounds [steps of the hypothesis grid]
+CPU_CHUNK, CUDA_CHUNK = 8, 64  # hypotheses warped at once: few that stay in the cache, or few launches
 MOVE_COST = 0.02  # cost added per refinement step away from the current depth
 
 
@@ -139,14 +141,14 @@ class _Stereo:
         count = int(torch.stack(ends).max().clamp(32, MAX_LABELS))
         return torch.linspace(1 / far, 1 / near, count, device=self.rays.device)
 
-    def cost(self, depth: Float[Tensor, "d h w"], chunk: int = 8) -> Float[Tensor, "d h w"]:
+    def cost(self, depth: Float[Tensor, "d h w"]) -> Float[Tensor, "d h w"]:
         """Cost 0 (equal) to 1 (uncorrelated) of each hypothesis: the mean over the better half of the sources.
 
         The point may be occluded in the other half.
         """
         keep = max(1, (len(self.sources) + 1) // 2)
         out = []
-        for part in depth.split(chunk):
+        for part in depth.split(CUDA_CHUNK if depth.is_cuda else CPU_CHUNK):
             scores = torch.stack([self._correlation(part, *source) for source in self.sources])
             out.append(1 - scores.topk(keep, dim=0).values.mean(0).clamp(0, 1))
         return torch.cat(out)
@@ -222,32 +224,14 @@ def _slanted_cost(
 def semi_global_matching(cost: Float[Tensor, "d h w"]) -> Float[Tensor, "h w"]:
     """The label of each pixel, with subpixel fraction, by semi-global matching along rows and columns."""
     lines = cost.permute(2, 1, 0).contiguous()  # (w, h, d): one slice per step along the row
-    total = _passes(lines).transpose(0, 1)
-    total = total + _passes(lines.transpose(0, 1).contiguous())
+    total = path_costs(lines, STEP_PENALTY, JUMP_PENALTY).transpose(0, 1)
+    total = total + path_costs(lines.transpose(0, 1).contiguous(), STEP_PENALTY, JUMP_PENALTY)
     best = total.argmin(-1)
     centre = best.clamp(1, total.shape[-1] - 2)[..., None]
     before, here, after = (total.gather(-1, centre + k)[..., 0] for k in (-1, 0, 1))
     curvature = (before - 2 * here + after).clamp_min(1e-6)
     fraction = ((before - after) / (2 * curvature)).clamp(-0.5, 0.5)
     return torch.where(best == centre[..., 0], best + fraction, best.to(fraction))
-
-
-def _passes(lines: Float[Tensor, "l m d"]) -> Float[Tensor, "l m d"]:
-    """Path costs along the first dimension, forward plus backward."""
-    total = torch.zeros_like(lines)
-    for order in (range(len(lines)), range(len(lines) - 1, -1, -1)):
-        previous = None
-        for k in order:
-            if previous is None:
-                path = lines[k]
-            else:
-                lowest = previous.min(-1, keepdim=True).values
-                near = F.pad(previous, (1, 1), value=float("inf"))
-                near = torch.minimum(near[:, :-2], near[:, 2:]) + STEP_PENALTY
-                path = lines[k] + torch.minimum(torch.minimum(previous, near), lowest + JUMP_PENALTY) - lowest
-            total[k] += path
-            previous = path
-    return total
 
 
 def _refined(stereo: _Stereo, inverse: Float[Tensor, "h w"], step: float) -> Float[Tensor, "h w"]:

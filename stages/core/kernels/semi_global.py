@@ -1,0 +1,104 @@
+"""Path costs of semi-global matching along one dimension, forward plus backward.
+
+On CUDA a block of threads follows each line, a thread for each label. On the CPU the steps along all lines are PyTorch
+operations, which also specify the kernel.
+
+Source: Hirschmueller 2008, "Stereo processing by semiglobal matching and mutual information", eq. 13.
+"""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+import warp as wp
+from jaxtyping import Float
+from torch import Tensor
+
+from stages.core.kernels.interop import device_of, launch, view
+from stages.core.kernels.splat.simd import by_device
+
+wp.set_module_options({"enable_backward": False})
+
+THREADS = 256
+
+_FOLLOW = r"""
+__shared__ float before[258], lowest_of_warp[8];
+const int t = threadIdx.x;
+const float none = INFINITY;
+for (int direction = 0; direction < 2; ++direction) {
+    float path = none;
+    for (int step = 0; step < steps; ++step) {
+        const int k = direction ? steps - 1 - step : step;
+        const long long at = ((long long)k * lines + line) * labels + t;
+        const float cost = t < labels ? costs.data[at] : none;
+        __syncthreads();  // the row before is no longer read
+        before[t + 1] = path;
+        if (t == 0) before[0] = before[257] = none;
+        float lowest = path;
+        for (int offset = 16; offset; offset /= 2)
+            lowest = fminf(lowest, __shfl_xor_sync(0xffffffff, lowest, offset));
+        if (t % 32 == 0) lowest_of_warp[t / 32] = lowest;
+        __syncthreads();
+        for (int w = 0; w < 8; ++w) lowest = fminf(lowest, lowest_of_warp[w]);
+        if (step == 0) path = cost;
+        else {
+            const float near = fminf(before[t], before[t + 2]) + step_penalty;
+            path = cost + fminf(fminf(path, near), lowest + jump_penalty) - lowest;
+        }
+        if (t < labels) total.data[at] = direction ? total.data[at] + path : path;
+        else path = none;
+    }
+}
+"""
+
+
+@wp.func_native(by_device(_FOLLOW, ""))
+def _follow(
+    line: int, steps: int, lines: int, labels: int, step_penalty: float, jump_penalty: float, costs: wp.array[float],
+    total: wp.array[float],
+): ...  # fmt: skip
+
+
+@wp.kernel
+def _paths(
+    steps: int, lines: int, labels: int, step_penalty: float, jump_penalty: float, costs: wp.array[float],
+    total: wp.array[float],
+):  # fmt: skip
+    _follow(wp.tid() // wp.static(THREADS), steps, lines, labels, step_penalty, jump_penalty, costs, total)
+
+
+def path_costs(
+    costs: Float[Tensor, "l m d"], step_penalty: float, jump_penalty: float
+) -> Float[Tensor, "l m d"]:
+    """Path costs of the d labels along the first dimension, forward plus backward.
+
+    A change of the label by one costs `step_penalty`, any other `jump_penalty`.
+    """
+    steps, lines, labels = costs.shape
+    if not costs.is_cuda or labels > THREADS:
+        return path_costs_reference(costs, step_penalty, jump_penalty)
+    costs = costs.contiguous()
+    total = torch.empty_like(costs)
+    arguments = [steps, lines, labels, step_penalty, jump_penalty, view(costs.view(-1)), view(total.view(-1))]
+    launch(_paths, THREADS * lines, arguments, device=device_of(costs), block_dim=THREADS)
+    return total
+
+
+def path_costs_reference(
+    costs: Float[Tensor, "l m d"], step_penalty: float, jump_penalty: float
+) -> Float[Tensor, "l m d"]:
+    """`path_costs` in PyTorch."""
+    total = torch.zeros_like(costs)
+    for order in (range(len(costs)), range(len(costs) - 1, -1, -1)):
+        previous = None
+        for k in order:
+            if previous is None:
+                path = costs[k]
+            else:
+                lowest = previous.min(-1, keepdim=True).values
+                near = F.pad(previous, (1, 1), value=float("inf"))
+                near = torch.minimum(near[:, :-2], near[:, 2:]) + step_penalty
+                path = costs[k] + torch.minimum(torch.minimum(previous, near), lowest + jump_penalty) - lowest
+            total[k] += path
+            previous = path
+    return total

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Callable
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -27,24 +29,50 @@ Feature = tuple[Tensor, Tensor]
 
 def extract(photos: Photos, device: str = "cpu") -> list[Feature]:
     """SIFT keypoints and root-SIFT descriptors of every photo, the largest first; always on the CPU."""
+    limit = MAX_FEATURES if len(photos) <= MAX_EXHAUSTIVE else MAX_FEATURES_MANY_PHOTOS
+    at_once = 4 * torch.get_num_threads()
+    out = []
+    with tqdm(total=len(photos), desc="finding features", unit="photo", leave=False) as bar:
+        for first in range(0, len(photos), at_once):
+            images = [_grey(image) for image in photos.images[first : first + at_once]]
+            for (shrink, _), (keypoints, descriptors) in zip(images, _sift([grey for _, grey in images]), strict=True):
+                x, y, cosine, _, sine, _ = keypoints.T  # a scaled rotation follows the position
+                scale = np.hypot(cosine.astype(np.float64), sine).astype(np.float32)
+                table = np.stack([x / shrink, y / shrink, scale / shrink, np.arctan2(sine, cosine)], 1)
+                # rounded, so that keypoints that differ in orientation alone keep their order
+                largest = np.argsort(-np.round(scale, 5), kind="stable")[:limit]
+                out.append((torch.from_numpy(table[largest]), torch.from_numpy(descriptors[largest])))
+            bar.update(len(images))
+    return out
+
+
+def _grey(image: UInt8[Tensor, "h w 3"]) -> tuple[float, np.ndarray]:
+    """The size relative to the photo and the grey image, at most MAX_SIDE wide or high."""
+    grey = cv2.cvtColor(image.numpy(), cv2.COLOR_RGB2GRAY)
+    shrink = min(1.0, MAX_SIDE / max(grey.shape))
+    if shrink < 1:
+        grey = cv2.resize(grey, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
+    return shrink, grey
+
+
+def _sift(images: list[np.ndarray]) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Keypoints (k, 6: x, y and a 2 x 2 matrix) and descriptors (k, 128) of each image.
+
+    Through files, since only COLMAP's own loop over files uses several threads.
+    """
     import pycolmap
 
-    options = pycolmap.FeatureExtractionOptions(use_gpu=False, num_threads=1)
-    extractor = pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
-    limit = MAX_FEATURES if len(photos) <= MAX_EXHAUSTIVE else MAX_FEATURES_MANY_PHOTOS
-    out = []
-    for image in tqdm(photos.images, desc="finding features", unit="photo", leave=False):
-        grey = cv2.cvtColor(image.numpy(), cv2.COLOR_RGB2GRAY)
-        shrink = min(1.0, MAX_SIDE / max(grey.shape))
-        if shrink < 1:
-            grey = cv2.resize(grey, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
-        keypoints, descriptors = extractor.extract_from_uint8_array(np.ascontiguousarray(grey))
-        table = pycolmap.keypoints_to_matrix(keypoints).reshape(-1, 4)
-        largest = np.argsort(-table[:, 2], kind="stable")[:limit]
-        table = table[largest] / np.array([shrink, shrink, shrink, 1], np.float32)
-        vectors = np.asarray(descriptors.data, np.uint8).reshape(-1, 128)[largest]
-        out.append((torch.from_numpy(table), torch.from_numpy(vectors)))
-    return out
+    options = pycolmap.FeatureExtractionOptions(use_gpu=False, num_threads=torch.get_num_threads())
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        names = [f"{i}.pgm" for i in range(len(images))]
+        for name, image in zip(names, images, strict=True):
+            (folder / name).write_bytes(b"P5 %d %d 255\n" % image.shape[::-1] + image.tobytes())
+        pycolmap.extract_features(folder / "features.db", folder, names, extraction_options=options,
+                                  device=pycolmap.Device.cpu)  # fmt: skip
+        with pycolmap.Database.open(folder / "features.db") as database:
+            ids = {image.name: image.image_id for image in database.read_all_images()}
+            return [(database.read_keypoints(ids[name]), database.read_descriptors(ids[name]).data) for name in names]
 
 
 def normalise(descriptors: UInt8[Tensor, "k d"]) -> Float[Tensor, "k d"]:

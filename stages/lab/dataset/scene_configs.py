@@ -30,6 +30,7 @@ HELDOUT = "heldout"  # group of scenes of eight other objects that are never tra
 VARIED, SOLID, ROTATED = "varied", "solid", "turned"  # groups of random shapes, solid random shapes, rotated objects
 EXTRA_GROUPS = (VARIED, SOLID, ROTATED)  # unpublished groups that may be trained on
 MORE_GROUPS = {f"more_{i}": 300 for i in range(10)}  # unpublished groups of three objects, for training
+SCENE_NAME = re.compile(r"[\w-][\w.-]{0,199}")  # no separators, not hidden, not ".."
 SCENE_COUNTS = {**{f"3_{i}": 300 for i in range(10)}, "4": 100, "6": 100, **MORE_GROUPS}  # scenes in each group
 
 
@@ -167,11 +168,15 @@ def write_scene_configs(path: Path, configs: Mapping[str, SceneConfig]) -> None:
 
 
 def read_scene_configs(path: Path) -> dict[str, SceneConfig]:
-    """Scene configurations by name from a JSON file; raises InputError when it has another format."""
+    """Scene configurations by name from a JSON file.
+
+    Raises InputError when it has another format, or a scene name that is not a plain file name, since names become
+    files and folders of the data set.
+    """
     must_exist(path, "scene configurations (.json)")
     try:
         rows = json.loads(Path(path).read_text())
-        return {
+        configs = {
             name: SceneConfig(name, tuple(int(i) for i in row["scene_object_idxs"]),
                          tuple(tuple(float(v) for v in p) for p in row["translation"]),
                          tuple(float(s) for s in row["scale"]))
@@ -179,3 +184,8 @@ def read_scene_configs(path: Path) -> dict[str, SceneConfig]:
         }  # fmt: skip
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(f"{path}: is not a file of scene configurations ({error!r})") from error
+    wrong = next((name for name in configs if not SCENE_NAME.fullmatch(name)), None)
+    if wrong is not None:
+        raise InputError(f"{path}: the scene name {wrong!r} cannot be a file name; use letters, digits, '_', '-' "
+                         "and '.', such as 2700_0_7_11")  # fmt: skip
+    return configs

@@ -88,6 +88,17 @@ def test_groups_are_parsed_sampled_and_stored(tmp_path, extents, monkeypatch):
         read_scene_configs(tmp_path / "bad.json")
 
 
+@pytest.mark.parametrize("name", ["../../evil", "..", "a/b", "a\\b", "/tmp/evil", ".hidden", "", "a" * 300],
+                         ids=["up", "parent", "slash", "backslash", "absolute", "hidden", "empty", "long"])  # fmt: skip
+def test_scene_names_that_are_no_file_names_are_rejected(tmp_path, name):
+    path = tmp_path / "scene_configs" / "3_9.json"
+    path.parent.mkdir()
+    write_scene_configs(path, {name: SceneConfig(name, (0,), ((0.0, 0.0, 0.0),), (1.0,))})
+    with pytest.raises(InputError, match="3_9.json: the scene name .* cannot be a file name"):
+        generate.run(tmp_path, DatasetOptions(groups="3_9", only="scene_configs,motions", device="cpu"))
+    assert not [*tmp_path.rglob("*.h5")]
+
+
 def test_objects_fall_freely_and_rest_on_the_floor(assets, device):
     configs = {n: SceneConfig(n, ids, at, (1.0,) * len(ids)) for n, ids, at in (
         ("0_0_7", (0, 7), ((0.0, 0.0, 0.5), (0.8, 0.0, 0.2))), ("1_2", (2,), ((0.0, 0.0, -0.88),)))}  # fmt: skip
@@ -180,3 +191,4 @@ def test_perturbed_scenes_start_displaced_by_the_given_distance(extents, monkeyp
     apart = np.array([np.subtract(moved[n].translation, c.translation) for n, c in configs.items()]).reshape(-1, 3)
     np.testing.assert_allclose(np.linalg.norm(apart, axis=1), 1e-3, rtol=1e-9)
     assert np.linalg.matrix_rank(apart) == 3  # in different directions
+    assert len(np.unique(apart.round(9), axis=0)) == len(apart)  # in every scene

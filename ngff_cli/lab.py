@@ -16,7 +16,9 @@ Sheet = Annotated[Path | None, typer.Option(help="contact sheet to write (.jpg)"
 Half = Annotated[bool, typer.Option("--half", help="also store the weights in 16 bits, for the package")]
 Dx = Annotated[float, typer.Option(help="grid spacing [m]; published: 0.02")]
 ParticleSpacing = Annotated[float, typer.Option(help="spacing of particles on a surface [m]")]
-Substep = Annotated[float, typer.Option(help="simulation time step [s]; published: 1e-4")]
+Substep = Annotated[
+    float, typer.Option(help="longest simulation time step [s], shortened for stiff light objects; published: 1e-4")
+]
 
 
 @app.callback()
@@ -277,8 +279,8 @@ def objects(
     only: Annotated[
         str, typer.Option(help="names of the objects, such as ball,duck; default: all ten")
     ] = ObjectsOptions.only,
-    meshes: Annotated[list[Path], typer.Option("--from", metavar="MESH", help="textured mesh (.obj .glb .ply ...) to "
-                                               "convert instead; repeatable")] = [],  # noqa: B006
+    meshes: Annotated[list[Path], typer.Option("--from", metavar="MESH", help="textured mesh (.obj .glb .ply ...), or "
+                                               "folder of meshes, to convert instead; repeatable")] = [],  # noqa: B006
     count: Annotated[int, typer.Option(help="approximate number of Gaussians of a mesh")] = ObjectsOptions.count,
     up: Annotated[str, typer.Option(help="up axis of a mesh: auto | x | y | z")] = ObjectsOptions.up,
     light: Annotated[bool, typer.Option(help="bake soft light into the colours of a mesh")] = ObjectsOptions.light,
@@ -307,8 +309,8 @@ def backgrounds(
 @app.command()
 def heldout(
     out: Annotated[Path, typer.Argument(metavar="FOLDER", help="folder of a data set; existing files are kept")],
-    meshes: Annotated[list[Path], typer.Option("--from", metavar="MESH", help="mesh (.obj .glb .ply ...) that replaces "
-                                               "the eight shapes; repeatable")] = [],  # noqa: B006
+    meshes: Annotated[list[Path], typer.Option("--from", metavar="MESH", help="mesh (.obj .glb .ply ...), or folder of "
+                                               "meshes, that replaces the eight shapes; repeatable")] = [],  # noqa: B006
     scenes: Annotated[int, typer.Option(help="number of scenes")] = 100,
     objects: Annotated[int, typer.Option(help="objects per scene")] = 3,
     frames: Annotated[int, typer.Option(help="frames per scene, of 0.02 s each")] = 100,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,41 +15,41 @@ from stages.core.errors import InputError
 from stages.core.scene.files import must_exist
 from stages.core.scene.gaussians import Gaussians
 from stages.lab.assets.field_sampling import diffuse_light, normalise_size
+from stages.lab.assets.mesh_files import MESH_SUFFIXES
 from stages.lab.assets.shapes import Surface, single_threaded, to_gaussians
+from stages.lab.assets.winding import winding_signs
 
-MESH_SUFFIXES = (".obj", ".glb", ".gltf", ".ply", ".stl", ".off")
 UP_ROTATIONS = {"x": [[0, 1, 0], [0, 0, 1], [1, 0, 0]], "y": [[1, 0, 0], [0, 0, -1], [0, 1, 0]],
            "z": [[1, 0, 0], [0, 1, 0], [0, 0, 1]]}  # fmt: skip
+MIN_AREA = 1e-9  # of all faces, relative to the longest side; less is rounding
 
 
-def read_mesh(path: Path, count: int, up: str = "auto", light: bool = True) -> Gaussians:
-    """About `count` flat Gaussians on the faces of a mesh, z up, centred, longest side 1, object_id 1.
+def read_mesh(files: Path | Sequence[Path], count: int, up: str = "auto", light: bool = True) -> Gaussians:
+    """About `count` flat Gaussians on the faces of an object, z up, centred, longest side 1, object_id 1.
 
-    `up` is the axis that points up in the file (auto: y for glTF, as its standard defines, else z). `light` bakes the
-    soft light of the generated objects into the colours of the file. Raises InputError when the file cannot be read,
-    has no faces, trimesh is missing, or an argument is invalid.
+    The object is all meshes of a file, or of several, in their common coordinates. `up` is the axis that points up
+    (auto: y for glTF, as its standard defines, else z). `light` bakes the soft light of the generated objects into the
+    colours of the file. Raises InputError when a file cannot be read, has no faces, trimesh is missing, or an argument
+    is invalid.
     """
-    path = Path(path)
-    if path.suffix.lower() not in MESH_SUFFIXES:
-        raise InputError(f"{path}: is not a readable mesh file; supported suffixes: {' '.join(MESH_SUFFIXES)}")
+    files = [Path(path) for path in ([files] if isinstance(files, str | Path) else files)]
+    path = files[0]
+    wrong = next((p for p in files if p.suffix.lower() not in MESH_SUFFIXES), None)
+    if wrong is not None:
+        raise InputError(f"{wrong}: is not a readable mesh file; supported suffixes: {' '.join(MESH_SUFFIXES)}")
     if up not in (*UP_ROTATIONS, "auto"):
         raise InputError(f"--up {up}: choose from auto, x, y, z")
     if count < 100:
         raise InputError(f"--count {count}: at least 100 Gaussians are needed")
     up = ("y" if path.suffix.lower() in (".glb", ".gltf") else "z") if up == "auto" else up
-    meshes = _load(path)
+    meshes = [mesh for path in files for mesh in _load(path)]
     with single_threaded():
-        return _splat(path, meshes, count, torch.tensor(UP_ROTATIONS[up], dtype=torch.float32), light)
-
-
-def _splat(path: Path, meshes: list, count: int, R: Float[Tensor, "3 3"], light: bool) -> Gaussians:
-    points, normals, rgb = _sample_faces(path, meshes, 5 * count)
-    keep = _poisson_disk_subset(points, normals, count)
-    surface = Surface(points[keep] @ R.mT, normals[keep] @ R.mT)
-    size = (surface.points.amax(0) - surface.points.amin(0)).max()
-    surface = Surface(surface.points / size, surface.normals)  # Gaussian widths are limited in these units
-    colours = rgb[keep] * diffuse_light(surface)[:, None] if light else rgb[keep]
-    return normalise_size(to_gaussians(surface, colours, 1, width=0.62))
+        points, normals, rgb = _sample_faces(files, meshes, 5 * count)
+        keep = _poisson_disk_subset(points, normals, count)
+        R = torch.tensor(UP_ROTATIONS[up], dtype=torch.float32)
+        surface = Surface(points[keep] @ R.mT, normals[keep] @ R.mT)
+        colours = rgb[keep] * diffuse_light(surface)[:, None] if light else rgb[keep]
+        return normalise_size(to_gaussians(surface, colours, 1, width=0.62))
 
 
 def _load(path: Path) -> list:
@@ -59,34 +60,46 @@ def _load(path: Path) -> list:
     except ImportError as error:
         raise InputError(f"{path}: reading meshes needs trimesh; install it with `pip install 'ngff[mesh]'`") from error
     try:
-        scene = trimesh.load_scene(path)
+        scene = trimesh.load_scene(path, process=False)  # processing would merge vertices closer than 1e-8
+        meshes = [m for m in scene.dump() if isinstance(m, trimesh.Trimesh) and len(m.faces)]
     except Exception as error:  # its readers raise many types
-        raise InputError(f"{path}: cannot be read as a mesh ({error})") from error
-    meshes = [m for m in scene.dump() if isinstance(m, trimesh.Trimesh) and len(m.faces) and m.area > 0]
+        raise InputError(f"{path}: cannot be read as a mesh ({error}); export it again") from error
     if not meshes:
         raise InputError(f"{path}: holds no triangles; a mesh with faces is needed (this may be a point cloud)")
+    if not all(np.isfinite(m.triangles).all() for m in meshes):
+        raise InputError(f"{path}: has vertices that are not finite; repair the mesh or export it again")
     return meshes
 
 
-def _sample_faces(path: Path, meshes: list, n: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Positions (n, 3), unit normals (n, 3) and colours (n, 3) of about n points, uniform over the faces."""
-    generator = torch.Generator().manual_seed(n)
-    area = torch.tensor([float(m.area) for m in meshes], dtype=torch.float64)
+def _sample_faces(files: Sequence[Path], meshes: list, n: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Positions (n, 3), unit normals (n, 3) and colours (n, 3) of about n points, uniform over the faces.
+
+    The bounding box is centred and its longest side 1. Raises InputError, which names `files`, without any area.
+    """
+    triangles = np.concatenate([np.asarray(mesh.triangles, np.float64) for mesh in meshes])
+    low, high = triangles.min((0, 1)), triangles.max((0, 1))
+    triangles = (triangles - (low + high) / 2) / max((high - low).max(), np.finfo(float).tiny)
+    cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    if not np.linalg.norm(cross, axis=1).sum() > MIN_AREA:
+        raise InputError(f"{files[0]}: its triangles have no area, all vertices are on a line; export it again as a "
+                         "surface")  # fmt: skip
+    cross *= winding_signs(triangles)[:, None]
+    sizes = [len(mesh.faces) for mesh in meshes]
+    parts = list(zip(meshes, *(torch.from_numpy(t).split(sizes) for t in (triangles, cross)), strict=True))
+    area = torch.stack([cross.norm(dim=1).sum() for _, _, cross in parts])
     counts = (n * area / area.sum()).ceil().long().tolist()
-    rows = []
-    for mesh, m in zip(meshes, counts, strict=True):
-        corners = torch.from_numpy(np.array(mesh.triangles, np.float32))
-        if not corners.isfinite().all():
-            raise InputError(f"{path}: has vertices that are not finite")
-        cross = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        edges = cross.norm(dim=1).double().cumsum(0)
+    generator, rows = torch.Generator().manual_seed(n), []
+    for (mesh, corners, cross), m in zip(parts, counts, strict=True):
+        if not m:
+            continue
+        edges = cross.norm(dim=1).cumsum(0)
         # stratified: one sample in each of m equal parts of the total area
         level = (torch.arange(m, dtype=torch.float64) + torch.rand(m, generator=generator).double()) / m * edges[-1]
         face = torch.searchsorted(edges, level).clamp_max(len(edges) - 1)
         a, b = torch.rand(m, 2, generator=generator).unbind(1)
         weight = torch.stack([1 - a.sqrt(), a.sqrt() * (1 - b), a.sqrt() * b], 1)  # Osada et al. 2002, eq. 1
-        points = (corners[face] * weight[..., None]).sum(1)
-        normals = torch.nn.functional.normalize(cross[face], dim=1)
+        points = (corners[face].float() * weight[..., None]).sum(1)
+        normals = (cross[face] / cross[face].norm(dim=1, keepdim=True).clamp_min(np.finfo(float).tiny)).float()
         rows.append((points, normals, _colours(mesh, face, weight)))
     return tuple(torch.cat(column) for column in zip(*rows, strict=True))
 

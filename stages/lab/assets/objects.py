@@ -95,41 +95,39 @@ def _known(name: str) -> str:
 def run(
     out: Path, options: ObjectsOptions = ObjectsOptions(), meshes: Sequence[Path] = (), sheet: Path | None = None
 ) -> Iterator[str]:
-    """Write OUT/<name>/ for each object, or for each mesh if any are given, and an image of all to `sheet`.
+    """Write OUT/<name>/ for each object, or for each in `meshes` (files or folders), and an image of all to `sheet`.
 
     Yields a line per object; raises InputError for unknown names, unreadable meshes or two meshes of one name.
     """
     from stages.core.scene.files import provenance
     from stages.core.scene.images import write_jpeg
+    from stages.lab.assets.mesh_files import find_objects, object_name
     from stages.lab.assets.splat_files import object_portrait, write_object
     from stages.render.overlay import tile_images
 
     if meshes and options.only:
         raise InputError("--only names objects of the data set and --from meshes; give one of the two")
     out, images = Path(out), []
-    sources = {_mesh_name(path): path for path in meshes} or dict.fromkeys(options.names)
-    if len(sources) < len(meshes):
-        raise InputError(f"--from: two meshes would both be written to {out}/<name>; rename one of them or its folder")
-    for name, path in tqdm(sources.items(), desc="objects", unit="object"):
-        g = make_object(name) if path is None else _from_mesh(path, options)
-        made_by = provenance("objects", [path], options) if path else provenance("objects", [])
+    sources: dict[str, Sequence[Path]] = {}
+    for files in find_objects(meshes):
+        name = object_name(files)
+        if name in sources:
+            raise InputError(f"--from: {sources[name][0]} and {files[0]} would both be written to {out / name}; rename "
+                             "one of them or its folder")  # fmt: skip
+        sources[name] = files
+    for name, files in tqdm((sources or dict.fromkeys(options.names, ())).items(), desc="objects", unit="object"):
+        g = _from_mesh(files, options) if files else make_object(name)
+        made_by = provenance("objects", list(files), options) if files else provenance("objects", [])
         write_object(out / name, g, name, made_by)  # the file does not depend on the other objects
         if sheet:
-            images.append(object_portrait(g, ELEVATION.get(name, 24.0) if path is None else 24.0, name))
+            images.append(object_portrait(g, 24.0 if files else ELEVATION.get(name, 24.0), name))
         sides = " x ".join(f"{side:.2f}" for side in (g.means.amax(0) - g.means.amin(0)).tolist())
         yield f"{name}: {len(g)} Gaussians, {sides}"
     if sheet:
         write_jpeg(sheet, tile_images(images, min(5, len(images))), 88)
 
 
-def _from_mesh(path: Path, options: ObjectsOptions) -> Gaussians:
+def _from_mesh(files: Sequence[Path], options: ObjectsOptions) -> Gaussians:
     from stages.lab.assets.meshes import read_mesh
 
-    return read_mesh(path, options.count, options.up, options.light)
-
-
-def _mesh_name(path: Path) -> str:
-    """The file's stem, or the name of its folder if the stem is generic (mesh, model, ...)."""
-    path = Path(path)
-    generic = path.stem.lower() in ("mesh", "model", "object", "scene", "textured") and path.resolve().parent.name
-    return path.resolve().parent.name if generic else path.stem
+    return read_mesh(files, options.count, options.up, options.light)

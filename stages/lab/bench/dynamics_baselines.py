@@ -24,7 +24,7 @@ from stages.lab.bench import common as bench
 from stages.lab.dataset.keypoint_motions import KeypointMotions, concatenate_motions
 from stages.lab.dataset.object_particles import Asset, Discretisation, load_assets
 from stages.lab.dataset.scene_configs import SceneConfig, read_scene_configs
-from stages.lab.dataset.simulation import SimulationSettings, simulate
+from stages.lab.dataset.simulation import SimulationSettings, simulate, stable_substep
 from stages.lab.training.data import motions_folder
 
 log = logging.getLogger(__name__)
@@ -114,10 +114,10 @@ class Resimulation:
                     f"{data}: {group} and {groups[0]} were simulated with different discretisations; use one for both"
                 )
             self.configs.update(read_scene_configs(folder / "scene_configs" / f"{group}.json"))
-        self.discretisation = Discretisation(made["dx"], made["spacing"], made["substep"])
-        self.objects = with_estimated_materials(
-            load_assets(self.discretisation, made["keypoints"], folder / "particles.npz")
-        )
+        given = Discretisation(made["dx"], made["spacing"], made["substep"])
+        self.objects = with_estimated_materials(load_assets(given, made["keypoints"], folder / "particles.npz"))
+        substep = stable_substep(given, [(a.E, a.density) for a in self.objects.values()])
+        self.discretisation = replace(given, substep=substep)
 
     def __call__(self, names: tuple[str, ...], frames: int, keypoints: int) -> KeypointMotions:
         """Simulate scenes by name; failed ones are missing from the result."""

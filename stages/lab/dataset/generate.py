@@ -9,6 +9,7 @@ from __future__ import annotations
 import shutil
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -34,7 +35,7 @@ from stages.lab.dataset.scene_configs import (
     sample_group,
     write_scene_configs,
 )
-from stages.lab.dataset.simulation import SimulationSettings, simulate
+from stages.lab.dataset.simulation import SimulationSettings, simulate, stable_substep
 
 if TYPE_CHECKING:
     from stages.lab.dataset.scene_files import SceneAssets
@@ -59,9 +60,11 @@ class DatasetGenerator:
     """Generates the parts of a data set; shared inputs are made or read on first use."""
 
     def __init__(self, out: Path, options: DatasetOptions):
-        self.layout, self.options, self.device = Layout(out), options, pick_device(options.device)
+        materials = [(kind.E, kind.density) for kind in objects.OBJECTS.values()]
+        self.options = replace(options, substep=stable_substep(options.discretisation, materials))
+        self.layout, self.device = Layout(out), pick_device(options.device)
         out.mkdir(parents=True, exist_ok=True)
-        manifest.open_manifest(out, options.settings)
+        manifest.open_manifest(out, self.options.settings)
 
     @cached_property
     def assets(self) -> dict[int, Asset]:

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -32,6 +32,7 @@ from stages.core.physics.materials import choose_materials
 from stages.core.scene.files import provenance
 from stages.core.scene.scene import SceneObject
 from stages.lab.assets.heldout_shapes import HELDOUT_SHAPES, ShapeKind, surface_and_interior_points, surface_points
+from stages.lab.assets.mesh_files import find_objects, object_name
 from stages.lab.assets.random_shapes import random_shapes
 from stages.lab.assets.shapes import single_threaded
 from stages.lab.dataset import object_particles
@@ -53,7 +54,7 @@ from stages.lab.dataset.scene_configs import (
     sample_scene,
     write_scene_configs,
 )
-from stages.lab.dataset.simulation import SimulationSettings, simulate
+from stages.lab.dataset.simulation import SimulationSettings, simulate, stable_substep
 
 log = logging.getLogger(__name__)
 FIRST_SCENE = {HELDOUT: 10_000, VARIED: 20_000, SOLID: 30_000, ROTATED: 40_000}  # index, and seed, of the first scene
@@ -61,7 +62,7 @@ SHAPE_SEEDS = {VARIED: 0, SOLID: 1}  # of random shapes
 FIRST_MESH_ID, FIRST_ROTATED_ID = 100, 2000  # object ids
 PARTICLES_PER_CELL_AXIS = 1.5  # of solid bodies
 SURFACE_POINTS = 30_000  # of a shape, from which particles are sampled
-MAX_YOUNG = 2e7  # stable at the published substep, as of the phone [Pa]
+MAX_YOUNG = 2e7  # of a mesh, as of the stiffest of the ten (phone): hardly deforms, and substeps stay affordable [Pa]
 
 
 @dataclass(frozen=True)
@@ -74,7 +75,7 @@ class HeldoutOptions:
     keypoints: int = 2048  # per object
     dx: float = 0.02  # grid spacing [m]
     spacing: float = 0.009  # between particles on a surface [m]
-    substep: float = SUBSTEP  # [s]
+    substep: float = SUBSTEP  # the longest; shorter for objects that are too stiff for it [s]
     size: float = 0.5  # longest side of a mesh [m]
     shapes: int = 0  # random shapes and materials, instead of the eight
     solid: bool = False  # fill the random shapes
@@ -100,14 +101,15 @@ class HeldoutOptions:
 
     @property
     def discretisation(self) -> Discretisation:
-        """Grid spacing, particle spacing and substep of the simulation."""
+        """Grid spacing, particle spacing and longest substep of the simulation."""
         return Discretisation(self.dx, self.spacing, self.substep)
 
 
 def run(out: Path, options: HeldoutOptions = HeldoutOptions(), meshes: list[Path] | None = None) -> str:
     """Write one group of scenes and return a one-line summary; an existing group is kept.
 
-    Raises InputError when meshes are combined with --shapes or --turned, or a mesh cannot be read.
+    `meshes` are files and folders. Raises InputError when they are combined with --shapes or --turned, or a mesh cannot
+    be read.
     """
     group = options.group
     file, motions = Path(out) / "scene_configs" / f"{group}.json", Path(out) / "motions" / f"{group}.h5"
@@ -118,10 +120,13 @@ def run(out: Path, options: HeldoutOptions = HeldoutOptions(), meshes: list[Path
     for folder in (file.parent, motions.parent):
         folder.mkdir(parents=True, exist_ok=True)
     device, start = pick_device(options.device), time.perf_counter()
-    assets = _assets(options, meshes, Path(out) / f"particles_{group}.npz")
+    objects = find_objects(meshes or [])
+    assets = _assets(options, objects, Path(out) / f"particles_{group}.npz")
+    materials = [(asset.E, asset.density) for asset in assets.values()]
+    options = replace(options, substep=stable_substep(options.discretisation, materials))
     configs = sample_configs(assets, options.scenes, options.objects, FIRST_SCENE[group])
     write_scene_configs(file, configs)
-    made_by, count = provenance("heldout", [file, *(meshes or [])], options), 0
+    made_by, count = provenance("heldout", [file, *(path for files in objects for path in files)], options), 0
     settings = SimulationSettings(options.discretisation, options.frames, options.keypoints, device)
     bar = tqdm(total=len(configs), desc=group, unit="scene")
     with bar, KeypointMotionsWriter(motions, made_by) as writer:
@@ -129,10 +134,11 @@ def run(out: Path, options: HeldoutOptions = HeldoutOptions(), meshes: list[Path
             writer.append(batch)
             count += len(batch)
             bar.update(len(batch))
-    return f"{motions}: {count} scenes of {len(assets)} objects in {time.perf_counter() - start:.0f} s"
+    lost = f", {len(configs) - count} failed" if count < len(configs) else ""
+    return f"{motions}: {count} scenes of {len(assets)} objects in {time.perf_counter() - start:.0f} s{lost}"
 
 
-def _assets(options: HeldoutOptions, meshes: list[Path] | None, cache: Path) -> dict[int, Asset]:
+def _assets(options: HeldoutOptions, meshes: Sequence[Sequence[Path]], cache: Path) -> dict[int, Asset]:
     """The objects that the options choose."""
     if meshes:
         return mesh_assets(meshes, options)
@@ -187,17 +193,17 @@ def load_shape_assets(
     return {i: replace(a, solidity=solidity(a.points[:min_particles], float(a.volume.sum()))) for i, a in made.items()}
 
 
-def mesh_assets(meshes: list[Path], options: HeldoutOptions) -> dict[int, Asset]:
-    """Meshes as objects 100, 101, ...; materials are chosen by the names of file and folder."""
+def mesh_assets(meshes: Sequence[Sequence[Path]], options: HeldoutOptions) -> dict[int, Asset]:
+    """Meshes, each of one or several files, as objects 100, 101, ...; file and folder names choose the materials."""
     from stages.lab.assets.meshes import read_mesh  # noqa: PLC0415 -- needs an optional extra
 
     assets = {}
-    for id, path in enumerate(tqdm(meshes, desc="meshes", unit="mesh"), start=FIRST_MESH_ID):
-        name = f"{Path(path).resolve().parent.name} {Path(path).stem}"
+    for id, files in enumerate(tqdm(meshes, desc="meshes", unit="mesh"), start=FIRST_MESH_ID):
+        name = f"{files[0].resolve().parent.name} {object_name(files)}"
         choice = choose_materials([SceneObject(id, name)])[id]
         E = min(choice.material.E, MAX_YOUNG)
         log.info("%s: %s%s, E %.3g Pa", name, choice.name, " (a guess)" * choice.guessed, E)
-        points = options.size * read_mesh(path, SURFACE_POINTS).means
+        points = options.size * read_mesh(files, SURFACE_POINTS).means
         points = _sample_points(points, options.discretisation, options.keypoints)
         assets[id] = _asset(id, options.size, points, (E, choice.material.density), options.discretisation)
     return assets

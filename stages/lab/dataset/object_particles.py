@@ -37,7 +37,7 @@ class Discretisation:
 
     dx: float = 0.02  # grid spacing [m]
     spacing: float = 0.009  # between particles on a surface [m]
-    substep: float = SUBSTEP  # [s]
+    substep: float = SUBSTEP  # [s]; the longest, where stable_substep applies
 
     @property
     def substeps(self) -> int:

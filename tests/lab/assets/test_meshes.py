@@ -1,4 +1,4 @@
-"""Conversion of meshes: a textured box, colours of vertices and faces, glTF, and invalid files."""
+"""Conversion of meshes: textured boxes, colours, glTF, parts, inverted faces, units, and invalid files."""
 
 import sys
 
@@ -11,7 +11,9 @@ from stages.core.geometry.harmonics import C0
 from stages.core.geometry.neighbours import knn
 from stages.core.geometry.rotations import matrix
 from stages.core.scene.images import write_png
+from stages.lab.assets.mesh_files import find_objects, object_name
 from stages.lab.assets.meshes import read_mesh
+from stages.lab.assets.winding import winding_signs
 
 CORNERS = [(x, y, z) for z in (0, 1) for y in (0, 2) for x in (0, 2)]  # 2 x 2 x 1
 SIDES = [(0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5)]  # -z +z -y +y -x +x
@@ -162,3 +164,156 @@ def test_real_meshes(shared, name):
     g = read_mesh(path, 5000)
     assert abs(len(g) - 5000) < 1000
     assert rgb(g).std(0).max() > 0.02  # more than one colour
+
+
+def obj_box(low=(0, 0, 0), sides=(1, 1, 1), start: int = 0, inverted: tuple[int, ...] = ()) -> list[str]:
+    """Lines of an OBJ box with its corner at `low`; `start` vertices precede it, some of its 6 faces are inverted."""
+    v = [f"v {low[0] + sides[0] * x} {low[1] + sides[1] * y} {low[2] + sides[2] * z}"
+         for z in (0, 1) for y in (0, 1) for x in (0, 1)]  # fmt: skip
+    quads = [tuple(reversed(quad)) if i in inverted else quad for i, quad in enumerate(SIDES)]
+    return v + ["f " + " ".join(str(start + corner + 1) for corner in quad) for quad in quads]
+
+
+def sides_of(g) -> list[float]:
+    return (g.means.amax(0) - g.means.amin(0)).tolist()
+
+
+TWO = ((0, 0, 0), (1, 1, 1)), ((3, 0, 0), (1, 1, 1))  # two unit boxes, 4 long together, apart by 2
+
+
+def two_boxes(folder, trimesh, kind: str):
+    """One object of two boxes, in the forms in which files store the parts of an object."""
+    folder.mkdir()
+    lines = [obj_box(*box, start=8 * i) for i, box in enumerate(TWO)]
+    if kind in ("o", "g"):
+        text = "\n".join(line for i, part in enumerate(lines) for line in (f"{kind} part{i}", *part))
+        (folder / "a.obj").write_text(text)
+    elif kind == "materials":
+        (folder / "a.mtl").write_text("newmtl red\nKd 1 0 0\nnewmtl blue\nKd 0 0 1\n")
+        text = [line for name, part in zip(("red", "blue"), lines, strict=True) for line in (f"usemtl {name}", *part)]
+        (folder / "a.obj").write_text("\n".join(["mtllib a.mtl", *text]))
+    elif kind == "files":
+        for i, box in enumerate(TWO):
+            (folder / f"leg_{i}.obj").write_text("\n".join(obj_box(*box)))
+    else:
+        scene = trimesh.Scene()
+        for (x, _, _), _ in TWO:
+            to = trimesh.transformations.translation_matrix((x, 0, 0))
+            scene.add_geometry(trimesh.creation.box((1, 1, 1)), transform=to)
+        scene.export(folder / "a.glb")
+    return folder
+
+
+@pytest.mark.parametrize("kind", ["o", "g", "materials", "files", "nodes"])
+def test_parts_are_one_object(tmp_path, trimesh, kind):
+    (files,) = find_objects([two_boxes(tmp_path / "chair", trimesh, kind)])
+    g = read_mesh(files, 2000, light=False)
+    assert sides_of(g) == pytest.approx([1, 0.25, 0.25], abs=0.01)
+    left, right = g.means[:, 0] < -0.24, g.means[:, 0] > 0.24
+    assert (left | right).all() and abs(float(left.float().mean()) - 0.5) < 0.03
+    if kind == "materials":
+        torch.testing.assert_close(rgb(g)[left].mean(0), torch.tensor([0.98, 0.02, 0.02]), rtol=0, atol=1e-3)
+        torch.testing.assert_close(rgb(g)[right].mean(0), torch.tensor([0.02, 0.02, 0.98]), rtol=0, atol=1e-3)
+
+
+def test_folders_are_searched_for_objects(tmp_path):
+    """Numbered parts are grouped, formats of one mesh are not repeated, different names stay different objects."""
+    names = ["mug/mug.obj", "mug/mug.stl", "chair/seat.obj", "chair/leg_1.obj", "chair/leg_2.obj", "bed/Part1.ply",
+             "bed/Part2.ply", "bed/frame.001.ply", "bed/frame.ply", "flat/towel2.obj", "flat/towel3.obj", "n/1.obj",
+             "n/2.obj", "n/.hidden.obj", "n/paint.png"]  # fmt: skip
+    for name in names:
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    found = [[p.relative_to(tmp_path).as_posix() for p in files] for files in find_objects([tmp_path])]
+    assert found == [["bed/Part1.ply", "bed/Part2.ply"], ["bed/frame.ply", "bed/frame.001.ply"],
+                     ["chair/leg_1.obj", "chair/leg_2.obj"], ["chair/seat.obj"], ["flat/towel2.obj"],
+                     ["flat/towel3.obj"], ["mug/mug.obj"], ["n/1.obj"], ["n/2.obj"]]  # fmt: skip
+    assert find_objects([tmp_path / "a.obj"]) == [(tmp_path / "a.obj",)]
+    assert object_name([tmp_path / "bed/Part1.ply", tmp_path / "bed/Part2.ply"]) == "bed"
+    assert object_name([tmp_path / "chair/leg_1.obj", tmp_path / "chair/leg_2.obj"]) == "leg"
+    assert object_name([tmp_path / "chair/model.obj"]) == "chair" and object_name([tmp_path / "mug_2.obj"]) == "mug_2"
+    with pytest.raises(InputError, match="holds no meshes; give a folder"):
+        (tmp_path / "empty").mkdir()
+        find_objects([tmp_path / "empty"])
+
+
+@pytest.mark.parametrize("inverted", [(1,), (0, 2, 4), (0, 1, 2, 3, 4, 5)])
+@pytest.mark.parametrize("split", [False, True], ids=["shared", "split"])
+def test_inverted_faces_are_lit_as_right_ones(tmp_path, inverted, split):
+    """Also where each face has its own vertices."""
+    def box(name, faces):
+        lines = obj_box(inverted=faces)
+        if split:
+            vertices = [line for line in lines if line[0] == "v"]
+            quads = [[vertices[int(i) - 1] for i in line.split()[1:]] for line in lines if line[0] == "f"]
+            lines = [line for i, q in enumerate(quads) for line in (*q, f"f {4*i+1} {4*i+2} {4*i+3} {4*i+4}")]
+        (tmp_path / name).write_text("\n".join(lines))
+        return read_mesh(tmp_path / name, 3000)
+
+    right, wrong = box("right.obj", ()), box("wrong.obj", inverted)
+    for axis in range(3):
+        for side in (-0.5, 0.5):
+            own, other = ((g.means[:, axis] - side).abs() < 1e-3 for g in (right, wrong))
+            assert float(rgb(right)[own].median()) == pytest.approx(float(rgb(wrong)[other].median()), abs=1e-4)
+
+
+def test_winding_of_open_and_twisted_surfaces():
+    """An open strip follows the larger part of its area; a Moebius strip is kept; distant parts are independent."""
+    def strip(n, twist, close):
+        u = torch.linspace(0, 2 * torch.pi * (1 if close else 0.8), n + 1).double()
+        half = twist * u / 2
+        edge = [torch.stack([(1 + s * half.cos()) * u.cos(), (1 + s * half.cos()) * u.sin(), s * half.sin()], 1)
+                for s in (-0.3, 0.3)]  # fmt: skip
+        a, b = edge
+        return torch.cat([torch.stack([a[:-1], a[1:], b[1:]], 1), torch.stack([a[:-1], b[1:], b[:-1]], 1)]).numpy()
+
+    flat = strip(12, 0, close=False)
+    mixed = flat.copy()
+    mixed[[2, 3, 17]] = mixed[[2, 3, 17], ::-1]
+    assert winding_signs(flat).tolist() == [1] * 24
+    assert (winding_signs(mixed) < 0).nonzero()[0].tolist() == [2, 3, 17]
+    both = winding_signs(np.concatenate([mixed, flat[:, ::-1] + 5]))
+    assert (both < 0).nonzero()[0].tolist() == [2, 3, 17]
+    assert set(winding_signs(strip(12, 1, close=True)).tolist()) == {1.0}
+
+
+def test_open_meshes_and_sheets_are_read(tmp_path):
+    """A box without its top, and a square without thickness."""
+    lines = obj_box()
+    (tmp_path / "open.obj").write_text("\n".join(lines[:9] + lines[10:]))
+    g = read_mesh(tmp_path / "open.obj", 2000)
+    assert sides_of(g) == pytest.approx([1, 1, 1], abs=0.01)
+    assert not ((g.means[:, 2] > 0.499) & (g.means[:, :2].abs() < 0.49).all(1)).any()
+    (tmp_path / "sheet.obj").write_text("v 0 0 0\nv 2 0 0\nv 2 1 0\nv 0 1 0\nf 1 2 3 4\n")
+    g = read_mesh(tmp_path / "sheet.obj", 2000)
+    assert sides_of(g) == pytest.approx([1, 0.5, 0], abs=0.01) and abs(len(g) - 2000) < 300
+
+
+@pytest.mark.parametrize("size", [1e-12, 1e-9, 1e9, 1e30])
+@pytest.mark.parametrize("at", [0.0, 1e4])
+def test_units_do_not_matter(tmp_path, size, at):
+    """Nor does the position: an object 10,000 of its sizes away from the origin."""
+    (tmp_path / "box.obj").write_text("\n".join(obj_box((at * size,) * 3, (2 * size, size, size))))
+    g = read_mesh(tmp_path / "box.obj", 1000)
+    assert sides_of(g) == pytest.approx([1, 0.5, 0.5], abs=0.01) and g.scales.isfinite().all()
+
+
+def test_missing_textures_leave_the_colour_of_the_material(tmp_path):
+    (tmp_path / "box.mtl").write_text("newmtl skin\nKd 0.2 0.4 0.8\nmap_Kd absent.png\n")
+    for first, colour in (("mtllib box.mtl\nusemtl skin\n", [0.2, 0.4, 0.8]), ("", [0.6] * 3)):
+        (tmp_path / "box.obj").write_text(first + "\n".join(obj_box()))
+        g = read_mesh(tmp_path / "box.obj", 1000, light=False)
+        torch.testing.assert_close(rgb(g).mean(0), torch.tensor(colour), rtol=0, atol=0.01)
+
+
+@pytest.mark.parametrize(("text", "words"), [
+    ("v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "no area"),
+    ("v 5 5 5\nv 5 5 5\nv 5 5 5\nf 1 2 3\n", "no area"),
+    ("v 0 0 0\nv 1 0 0\nv 0 1 nan\nf 1 2 3\n", "not finite"),
+    ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "cannot be read as a mesh"),
+    ("v 0 0 0\nv 1 0 0\nv 0 1 0\n", "holds no triangles|cannot be read as a mesh"),
+], ids=["line", "point", "nan", "index", "faces"])  # fmt: skip
+def test_meshes_without_a_surface_are_rejected(tmp_path, text, words):
+    (tmp_path / "bad.obj").write_text(text)
+    with pytest.raises(InputError, match=rf"bad\.obj: .*({words})"):
+        read_mesh(tmp_path / "bad.obj", 1000)

@@ -2,7 +2,7 @@
 
 import inspect
 import json
-from dataclasses import fields
+from dataclasses import fields, replace
 from itertools import combinations
 
 import h5py
@@ -12,6 +12,8 @@ import torch
 
 from ngff_cli import lab
 from stages.core.errors import InputError
+from stages.core.physics.mpm.solver import SAFETY, wave_speed
+from stages.lab.assets.objects import OBJECTS
 from stages.lab.dataset import generate, object_particles
 from stages.lab.dataset.keypoint_motions import POSITION_STEP, concatenate_motions, read_motions, write_motions
 from stages.lab.dataset.object_particles import Asset, Discretisation, particle_volumes
@@ -27,7 +29,7 @@ from stages.lab.dataset.scene_configs import (
     sample_scene,
     write_scene_configs,
 )
-from stages.lab.dataset.simulation import SimulationSettings, simulate
+from stages.lab.dataset.simulation import SimulationSettings, simulate, simulation_batches, stable_substep
 from stages.lab.training.data import read_groups
 from tests.lab.small_world import COARSE, box_shell
 
@@ -113,6 +115,70 @@ def test_objects_fall_freely_and_rest_on_the_floor(assets, device):
     assert float(made.mass[0, 0]) == pytest.approx(500 * float(assets[0].volume.sum()))
     initial = made.initial_conditions(50)
     assert initial.points.shape == (2, 2, 50, 3) and initial.present.tolist() == [[True, True], [True, False]]
+
+
+STIFF, LIGHT = 2e7, 200.0  # [Pa], [kg/m^3]: a wave speed of 367 m/s
+
+
+def falling_boxes(substep: float, device: str = "cpu", frames: int = 35) -> tuple[torch.Tensor, torch.Tensor]:
+    """Two stiff light boxes without contact, one dropped from 0.4 m, one from 5 mm: positions (t, 2, p, 3) [m] and
+    energies per mass (t, 2) [m^2/s^2]; no frames if the simulation fails."""
+    half, discretisation = torch.tensor([0.2, 0.15, 0.1]), Discretisation(0.1, 0.05, substep)
+    p = torch.cartesian_prod(*[torch.linspace(-h, h, round(h / 0.025) + 1) for h in half.tolist()])
+    p = p[((p.abs() - half).abs() < 1e-5).any(1)]
+    box = Asset(0, 1.0, p, particle_volumes(p, 0.1), STIFF, LIGHT)
+    config = SceneConfig("0_0", (0, 0), ((-0.5, 0.0, -0.44), (0.5, 0.0, -0.835)), (1.0, 1.0))
+    made = [*simulate({"0_0": config}, {0: box}, SimulationSettings(discretisation, frames, len(p), device))][0]
+    x = made.points[0].cpu() if len(made) else torch.zeros(0, 2, len(p), 3)
+    v = torch.gradient(x, spacing=0.02, dim=0)[0] if len(x) else x
+    return x, (v.square().sum(-1) / 2 + 5 * (x[..., 2] + 0.94)).mean(2)
+
+
+def test_stiff_light_boxes_fall_stay_intact_and_rest(device):
+    substep = stable_substep(Discretisation(0.1, 0.05, 5e-4), [(1e4, 500.0), (STIFF, LIGHT)])
+    x, energy = falling_boxes(substep, device)
+    t = 0.02 * torch.arange(14)  # before the floor acts, at a distance of about a cell
+    fallen = (x[0] - x[:14])[:, 0, :, 2].mean(1)
+    torch.testing.assert_close(fallen, 5 / 2 * t**2, rtol=0, atol=5 * 0.3 * substep + 1e-4)
+    assert (energy.amax(0) < 1.01 * energy[0]).all()
+    torch.testing.assert_close(torch.cdist(x[-1], x[-1]), torch.cdist(x[0], x[0]), rtol=0.01, atol=1e-3)
+    assert float((x[-1, 1] - x[-2, 1]).norm(dim=1).max()) / 0.02 < 0.02  # the lower box rests on the floor
+    assert (x[-1, 1] - x[0, 1]).norm(dim=1).max() < 0.02
+
+
+def test_too_long_substeps_are_shortened_and_would_fail():
+    given = Discretisation(0.1, 0.05, 5e-4)
+    assert not len(falling_boxes(given.substep)[0])
+    stable = stable_substep(given, [(1e4, 500.0), (STIFF, LIGHT)])
+    assert 0.4 < stable * wave_speed(STIFF, 0.3, LIGHT) / 0.1 < SAFETY
+    assert stable_substep(replace(given, substep=stable), [(STIFF, LIGHT)]) == stable
+    assert Discretisation(substep=stable).substeps * stable == pytest.approx(0.02)
+    assert stable_substep(given, [(1e4, 500.0)]) == 5e-4
+
+
+def test_published_substep_is_kept_for_the_published_objects():
+    materials = [(kind.E, kind.density) for kind in OBJECTS.values()]
+    assert stable_substep(Discretisation(), materials) == 1e-4
+
+
+def test_damping_per_second_does_not_depend_on_the_substep():
+    """The axial vibration of a bar, at the published substep and shorter ones."""
+    x = torch.cartesian_prod(*[torch.arange(n) * 0.01 for n in (24, 4, 4)])
+    x = x - x.mean(0)
+    start = torch.zeros_like(x)
+    start[:, 0] = 0.05 * torch.sin(torch.pi * x[:, 0] / 0.24)
+    bar = Asset(0, 1.0, x, torch.full((len(x),), 1e-6), 1e6, 500.0)
+    curves = []
+    for substep in (1e-4, 5e-5, 2.5e-5):
+        settings = SimulationSettings(Discretisation(0.02, 0.01, substep), 2, 1, "cpu")
+        config = SceneConfig("0_0", (0,), ((0.0, 0.0, 1.0),), (1.0,))
+        ((_, batch),) = simulation_batches({"0_0": config}, {0: bar}, settings)
+        batch.solver.set(v=start)
+        frames = batch.frames(21, 1e-3, round(1e-3 / substep), (0.0, 0.0, 0.0))
+        curves.append(torch.stack([(batch.solver.particles.v * start).sum() / start.square().sum() for _ in frames]))
+    assert float(curves[0][-1].abs()) < 0.5  # it vibrates and decays
+    for curve in curves[1:]:
+        torch.testing.assert_close(curve, curves[0], rtol=0, atol=0.05)
 
 
 def test_failed_scene_is_logged_and_left_out(assets, caplog, device):

@@ -2,6 +2,7 @@
 
 import json
 
+import h5py
 import pytest
 import torch
 from typer.testing import CliRunner
@@ -125,6 +126,32 @@ def test_meshes_replace_the_shapes(tmp_path, caplog):
     assert found.items() <= stiffness.items()
     config = json.loads((tmp_path / "scene_configs" / f"{HELDOUT}.json").read_text())
     assert len(config) == 1
+
+
+def test_a_folder_of_stiff_meshes_is_simulated_without_loss(tmp_path):
+    """A sheet without thickness and a plank of two files, at a substep that their stiffness forbids."""
+    pytest.importorskip("trimesh")
+    meshes = tmp_path / "meshes"
+    (meshes / "wood").mkdir(parents=True)
+    (meshes / "paper sheet.obj").write_text("v 0 0 0\nv 2 0 0\nv 2 1 0\nv 0 1 0\nf 1 2 3 4\n")
+    for i in range(2):
+        at = 300 * i  # millimetres, say
+        corners = "".join(f"v {x} {y} {at + z}\n" for z in (0, 200) for y in (0, 200) for x in (0, 200))
+        sides = "f 1 3 4 2\nf 5 6 8 7\nf 1 2 6 5\nf 3 7 8 4\nf 1 5 7 3\nf 2 4 8 6\n"
+        (meshes / "wood" / f"plank_{i}.obj").write_text(corners + sides)
+    options = HeldoutOptions(scenes=2, objects=2, size=0.3, **(COARSE | {"frames": 12}))
+    summary = run(tmp_path / "out", options, [meshes])
+    assert "2 scenes of 2 objects" in summary and "failed" not in summary
+    with h5py.File(tmp_path / "out" / "motions" / f"{HELDOUT}.h5") as file:
+        made_by = json.loads(file.attrs["provenance"])
+    assert [i["name"] for i in made_by["inputs"]][1:] == ["paper sheet.obj", "plank_0.obj", "plank_1.obj"]
+    assert made_by["options"]["substep"] < options.substep  # as simulated
+    made = read_motions(tmp_path / "out" / "motions" / f"{HELDOUT}.h5")
+    sides = (made.points[:, 0].amax(2) - made.points[:, 0].amin(2)).flatten(0, 1)
+    for id, row in zip(made.objects.flatten().tolist(), sides.tolist(), strict=True):
+        assert sorted(row) == pytest.approx([0, 0.15, 0.3] if id == 100 else [0.12, 0.12, 0.3], abs=0.03)
+    start, end = (torch.cdist(made.points[:, i], made.points[:, i]) for i in (0, -1))
+    assert (start - end).abs().max() < 0.05  # no object breaks
 
 
 def test_random_shapes_are_reproducible_and_within_the_range_of_the_ten():

@@ -91,8 +91,9 @@ class SplitSubsteps:
         rows = len(at) * B * B
         ranges = self._ranges(rows) if rows > MIN_SPLIT_ROWS else [(0, rows)]
         self._grid_commands = [
-            self._record(kernels.grid_step, stop - start, [self.grid, start, *inputs]) for start, stop in ranges
-        ]
+            self._record(kernels.grid_step, stop - start, [self.grid, start, *inputs])
+            for start, stop in ranges if stop > start  # nothing to do when all particles are lost
+        ]  # fmt: skip
 
     def _clear_friction(self) -> None:
         rows = len(self._blocks) * kernels.BLOCK**2

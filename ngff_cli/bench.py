@@ -135,8 +135,23 @@ def bench_pi3(
 
 @app.command("segment")
 def bench_segment(
+    sets: Annotated[
+        list[Path] | None, typer.Argument(metavar="PHOTOSET...", show_default=False,
+                                          help="with --photos: folders of photos, or with images/")
+    ] = None,
+    photos: Annotated[
+        bool, typer.Option("--photos", help="real photo sets with label images, instead of synthetic scenes")
+    ] = False,
+    labels: Annotated[
+        Path | None, typer.Option(help="with --photos: folder of label images, or of such folders named as the sets; "
+                                  "default: PHOTOSET/labels")
+    ] = None,
+    labelled: Annotated[
+        Path | None, typer.Option(help="with --photos: folder of labelled scenes PHOTOSET.ply; missing ones are made "
+                                  "and kept there")
+    ] = None,
     scenes: Annotated[int, typer.Option(help="scenes of each kind: objects apart, and touching")] = 4,
-    photos: Annotated[int, typer.Option(help="number of cameras per scene")] = 24,
+    views: Annotated[int, typer.Option(help="number of cameras per scene")] = 24,
     weights: Annotated[
         Path | None, typer.Option(help="weights of network backends; default: searched; without any, they are skipped")
     ] = None,
@@ -147,26 +162,38 @@ def bench_segment(
     device: Device = "auto",
     as_json: AsJson = False,
 ) -> None:
-    """Segmentation by geometry, by true and by corrupted masks, and by networks: IoU with the true labels."""
-    from stages.lab.bench.segment import SegmentBenchOptions, run
+    """Segmentation by geometry, by true and by corrupted masks, and by networks: IoU with the true labels.
 
-    options = SegmentBenchOptions(
-        scenes=scenes, photos=photos, weights=weights, device=device, reconstruct=reconstruct
-    )
-    print_results(lambda path: run(path, options), out, as_json)
+    With --photos: objects in real photos against label images: recall, IoU and panoptic quality.
+    """
+    if not photos:
+        if sets or labels or labelled:
+            raise InputError("PHOTOSET, --labels and --labelled: only apply to real photos; add --photos")
+        from stages.lab.bench.segment import SegmentBenchOptions, run
+
+        options = SegmentBenchOptions(
+            scenes=scenes, views=views, weights=weights, device=device, reconstruct=reconstruct
+        )
+        print_results(lambda path: run(path, options), out, as_json)
+        return
+    from stages.lab.bench.segment_photos import SegmentPhotosOptions
+    from stages.lab.bench.segment_photos import run as run_photos
+
+    chosen = SegmentPhotosOptions(labels=labels, labelled=labelled, device=device)
+    print_results(lambda path: run_photos(sets or [], path, chosen), out, as_json)
 
 
 @app.command("refine")
 def bench_refine(
     scenes: Annotated[int, typer.Option(help="number of scenes, with objects apart")] = 4,
-    photos: Annotated[int, typer.Option(help="number of cameras per scene")] = 24,
+    views: Annotated[int, typer.Option(help="number of cameras per scene")] = 24,
     out: Out = None,
     as_json: AsJson = False,
 ) -> None:
     """Filling of the table under removed objects: error against the true table in new views."""
     from stages.lab.bench.refine import RefineBenchOptions, run
 
-    options = RefineBenchOptions(scenes=scenes, photos=photos)
+    options = RefineBenchOptions(scenes=scenes, views=views)
     print_results(lambda path: run(path, options), out, as_json)
 
 

@@ -36,14 +36,14 @@ MIN_TABLE_ALPHA = 0.9  # alpha of a pixel that shows the table
 
 @dataclass(frozen=True)
 class RefineBenchOptions:
-    """Number of scenes and of photos each."""
+    """Number of scenes and of cameras of each."""
 
     scenes: int = 4
-    photos: int = 24
+    views: int = 24
 
     def __post_init__(self):
-        if not 1 <= self.scenes <= 100 or not 8 <= self.photos <= 200:
-            raise InputError("--scenes 1 to 100, --photos 8 to 200")
+        if not 1 <= self.scenes <= 100 or not 8 <= self.views <= 200:
+            raise InputError("--scenes 1 to 100, --views 8 to 200")
 
 
 @torch.no_grad()
@@ -70,9 +70,9 @@ def masked_psnr(one: Float[Tensor, "c h w 3"], two: Float[Tensor, "c h w 3"], wh
     return -10 * math.log10(max(float((one - two)[where].square().mean()), 1e-10))
 
 
-def measure(index: int, photos: int) -> dict:
+def measure(index: int, views: int) -> dict:
     """Metrics of one scene, with the true object labels."""
-    scene = tabletop("apart", index, photos)
+    scene = tabletop("apart", index, views)
     seen = remove_unseen_background(scene)
     start = time.perf_counter()
     refined = refine(seen, RefineOptions(completer="none"))  # objects are removed anyway
@@ -98,7 +98,7 @@ def run(out: Path | None = None, options: RefineBenchOptions = RefineBenchOption
     yield bench.machine("cpu")
     rows = []
     for i in tqdm(range(options.scenes), unit="scene"):
-        rows.append(measure(i, options.photos))
+        rows.append(measure(i, options.views))
         r = rows[-1]
         yield (
             f"scene {i}: PSNR of the holes from new views {r['before_db']:.1f} dB open, {r['after_db']:.1f} dB filled; "

@@ -41,14 +41,14 @@ class SegmentBenchOptions:
     """Scenes and methods; two scenes show all ten objects."""
 
     scenes: int = 4  # of each arrangement
-    photos: int = 24  # cameras of a scene
+    views: int = 24  # cameras of a scene
     weights: Path | None = None  # of SAM 2.1; None: the default locations
     device: str = "auto"  # of SAM 2.1
     reconstruct: bool = False  # also from rendered photos: minutes per scene
 
     def __post_init__(self):
-        if not 1 <= self.scenes <= 100 or not 8 <= self.photos <= 200:
-            raise InputError("--scenes 1 to 100, --photos 8 to 200")
+        if not 1 <= self.scenes <= 100 or not 8 <= self.views <= 200:
+            raise InputError("--scenes 1 to 100, --views 8 to 200")
 
 
 def best_ious(found: Int[torch.Tensor, "n"], truth: Int[torch.Tensor, "n"]) -> dict[int, float]:
@@ -152,7 +152,7 @@ def available_networks(options: SegmentBenchOptions) -> tuple[list[str], list[st
 
 def measure(kind: str, index: int, networks: list[str], options: SegmentBenchOptions) -> list[dict]:
     """A row for each method on one scene: IoU of each object, and seconds without rendering label images."""
-    scene = tabletop(kind, index, options.photos)
+    scene = tabletop(kind, index, options.views)
     truth = scene.gaussians.object_id
     blank = replace(scene, gaussians=replace(scene.gaussians, object_id=torch.zeros_like(truth)), objects=())
     methods = {"geometric": lambda: segment(blank, SegmentOptions()).gaussians.object_id,
@@ -201,7 +201,7 @@ def run(out: Path | None = None, options: SegmentBenchOptions = SegmentBenchOpti
     for kind in ARRANGEMENTS:
         for i in tqdm(range(options.scenes), desc=kind, unit="scene"):
             rows += measure(kind, i, networks, options)
-            rows += [measure_reconstructed(kind, i, options.photos)] if options.reconstruct else []
+            rows += [measure_reconstructed(kind, i, options.views)] if options.reconstruct else []
             for row in rows[-len({r["way"] for r in rows}) :]:
                 listed = ", ".join(f"{n} {v:.2f}" for n, v in row["iou"].items())
                 yield f"{kind} {i}, {row['way']}: mean {row['mean']:.3f}; {listed}"

@@ -95,7 +95,7 @@ def test_best_iou_of_each_object():
 def test_segment_benchmark_finds_blocks_and_voting_repairs_wrong_masks(tmp_path, monkeypatch):
     monkeypatch.setenv("NGFF_WEIGHTS", str(tmp_path))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    lines = list(bench_segment.run(tmp_path / "s.json", bench_segment.SegmentBenchOptions(scenes=1, photos=8)))
+    lines = list(bench_segment.run(tmp_path / "s.json", bench_segment.SegmentBenchOptions(scenes=1, views=8)))
     means = json.loads((tmp_path / "s.json").read_text())["mean_iou"]
     assert set(means) == set(tabletops.ARRANGEMENTS) and "without sam2: " in lines[1]
     for by in means.values():  # Gaussians this large are partly transparent, so no mask is perfect
@@ -157,13 +157,13 @@ def test_label_errors_have_the_given_rate():
 
 @pytest.mark.slow
 def test_filled_hole_is_closer_to_the_truth_than_an_open_one():
-    row = bench_refine.measure(0, photos=8)
+    row = bench_refine.measure(0, views=8)
     assert row["pixels"] > 500
     assert row["after_db"] > row["before_db"] + 6
     assert row["elsewhere_db"] > 32  # the border of the hole
 
 
-@pytest.mark.parametrize("wrong", [{"scenes": 0}, {"photos": 3}])
+@pytest.mark.parametrize("wrong", [{"scenes": 0}, {"views": 3}])
 def test_invalid_options_are_rejected(wrong):
     with pytest.raises(InputError):
         bench_segment.SegmentBenchOptions(**wrong)

@@ -49,6 +49,7 @@ def test_commands_do_not_import_what_they_do_not_use(command, inputs, device):
     code = f"import sys; sys.argv = {['ngff', *words]!r}\nimport ngff_cli.app as a\n"
     code += "try:\n a.main()\nexcept SystemExit as ended: status = ended.code\n"
     code += f"print(status, sorted({UNUSED | COMMANDS[command]!r} & set(sys.modules)))"
+    path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=inputs,
-                          env={**os.environ, "PYTHONPATH": str(ROOT)})  # fmt: skip
+                          env={**os.environ, "PYTHONPATH": path})  # fmt: skip
     assert done.returncode == 0 and done.stdout.splitlines()[-1] == "0 []", done.stdout + done.stderr

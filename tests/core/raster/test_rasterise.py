@@ -88,7 +88,7 @@ def test_background_fills_the_remaining_transmittance(device):
     torch.testing.assert_close(shot.rgb[0, 0, 0].cpu(), blue)
     torch.testing.assert_close(shot.rgb[0, 20, 20].cpu(), torch.tensor([0.8, 0.05, 0.1]), rtol=0, atol=1e-5)
     picture = torch.rand(SIZE, SIZE, 3)
-    shot, plain = draw(spot, picture.to(device)), draw(spot)
+    shot, plain = draw(spot, picture), draw(spot)
     wanted = plain.rgb[0].cpu() + (1 - plain.alpha[0].cpu())[..., None] * picture
     torch.testing.assert_close(shot.rgb[0].cpu(), wanted, rtol=0, atol=1e-6)
     assert torch.equal(shot.alpha, plain.alpha)

@@ -184,7 +184,7 @@ def composite(splats: Tensor, bins: Bins | Tiles, behind: Tensor | None = None, 
     detail it covers.
     Source: Kerbl et al. 2023; Ye et al. 2024, "AbsGS", eq. 8.
     """
-    behind = splats.new_zeros(3) if behind is None else behind.float().contiguous()
+    behind = splats.new_zeros(3) if behind is None else behind.to(splats).contiguous()
     function = compositing_cuda.Composite if splats.is_cuda else _Composite
     return function.apply(splats.contiguous(), bins, behind, mean)
 

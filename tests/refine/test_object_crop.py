@@ -12,8 +12,8 @@ from stages.core.geometry.rotations import matrix
 from stages.core.geometry.similarity import Similarity
 from stages.core.models.diffsplat.maps import FOCAL, cameras
 from stages.core.raster.rasterise import rasterise
-from stages.core.scene.cameras import Cameras
-from stages.core.scene.images import write_png
+from stages.core.scene.cameras import Cameras, PhotoIntrinsics
+from stages.core.scene.images import read_image, write_png
 from stages.core.scene.scene import Scene, SceneObject
 from stages.refine.library import opaque_gaussians, transformed
 from stages.refine.object_crop import CROP_FILL, crop_object
@@ -75,6 +75,22 @@ def test_rotated_photo_equals_the_view_of_a_rotated_camera(scene, shown):
     direct = torch.nn.functional.avg_pool2d(fine.permute(2, 0, 1), 4).permute(1, 2, 0)
     error = (direct - shown.image).square().mean()
     assert -10 * math.log10(error) > 27  # the photo has a lower resolution than the crop
+
+
+def test_photos_as_taken_are_mapped_to_the_views(scene, photos, shown, tmp_path):
+    """The photos have a border around the view, which the stored intrinsics of the photo describe."""
+    border = 40
+    for file in photos.iterdir():
+        image = read_image(file)
+        padded = torch.zeros(image.shape[0] + 2 * border, image.shape[1] + 2 * border, 3)
+        padded[border:-border, border:-border] = image
+        write_png(tmp_path / file.name, padded)
+    c = scene.cameras
+    Ks = c.Ks + border * torch.tensor([[0.0, 0, 1], [0, 0, 1], [0, 0, 0]])
+    taken = PhotoIntrinsics(Ks, c.sizes + 2 * border, torch.zeros(len(c), 5))
+    bordered = replace(scene, cameras=replace(c, photos=taken))
+    crop = crop_object(bordered, opaque_gaussians(scene, 1), SIDE, tmp_path)
+    assert crop.name == shown.name and (crop.image - shown.image).abs().mean() < 2e-3
 
 
 def test_crop_without_photos_is_rendered(scene, shown):

@@ -107,11 +107,11 @@ def match_descriptors(a: Float[Tensor, "n d"], b: Float[Tensor, "m d"]) -> Int[T
         return torch.zeros(0, 2, dtype=torch.int64)
     similarity = a @ b.mT
     best, to_b = similarity.topk(2, dim=1)
-    to_a = similarity.argmax(0)
-    index = torch.arange(len(a), device=a.device)
     distance = (2 - 2 * best).clamp_min(0).sqrt()
-    keep = (to_a[to_b[:, 0]] == index) & (distance[:, 0] < MAX_DISTANCE) & (distance[:, 0] < MAX_RATIO * distance[:, 1])
-    return torch.stack([index[keep], to_b[keep, 0]], 1).cpu()
+    keep = ((distance[:, 0] < MAX_DISTANCE) & (distance[:, 0] < MAX_RATIO * distance[:, 1])).nonzero()[:, 0]
+    to_b = to_b[keep, 0]
+    mutual = similarity[:, to_b].argmax(0) == keep  # the best rows of these columns only: down columns is slow
+    return torch.stack([keep[mutual], to_b[mutual]], 1).cpu()
 
 
 def make_matcher(found: list[Feature], sizes: list[tuple[int, int]], device: str) -> Callable[[int, int], Tensor]:

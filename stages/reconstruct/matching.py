@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import torch
 from tqdm import tqdm
 
 from stages.core.backends import choose
@@ -100,7 +101,7 @@ def _write_database(
 
 
 def _match_and_verify(found: list[features.Feature], cameras: list, matching: MatchingOptions) -> list[tuple]:
-    """Matches and two-view geometry of the selected pairs; one thread verifies while the next pairs are matched."""
+    """Matches and two-view geometry of the selected pairs; other threads verify while the next pairs are matched."""
     import pycolmap
 
     options = pycolmap.TwoViewGeometryOptions()
@@ -115,7 +116,7 @@ def _match_and_verify(found: list[features.Feature], cameras: list, matching: Ma
         return i, j, matches, geometry
 
     pending = []
-    with ThreadPoolExecutor(1) as background:
+    with ThreadPoolExecutor(max(1, torch.get_num_threads() - 1)) as background:
         for i, j in tqdm(features.select_pairs(vectors), desc="matching photos", unit="pair", leave=False):
             matches = match(i, j).numpy().astype(np.uint32)
             if len(matches) >= options.min_num_inliers:

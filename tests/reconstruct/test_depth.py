@@ -51,6 +51,14 @@ def test_sources_are_the_neighbours(block):
     assert all(i not in chosen for i, chosen in enumerate(sources))
 
 
+@pytest.mark.parametrize("count", [1, 2, 3, 4])
+def test_better_half_of_the_sources(count, device):
+    scores = torch.rand(count, 5, 7, generator=torch.Generator().manual_seed(0)).to(device)
+    scores[:, 0] = 0.5  # equal scores
+    expected = scores.topk((count + 1) // 2, dim=0).values.mean(0)
+    torch.testing.assert_close(stereo._mean_of_better_half(list(scores)), expected, rtol=0, atol=1e-6)
+
+
 def test_semi_global_matching_fills_gaps_and_keeps_edges():
     # Left half at label 3, right half at label 8; in a band of columns all labels have the same cost.
     cost = torch.full((12, 20, 40), 0.6)

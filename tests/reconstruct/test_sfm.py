@@ -76,6 +76,20 @@ def test_mutual_matches():
     assert features.match_descriptors(a, b).tolist() == [[0, 1], [1, 0]]
 
 
+def test_matches_are_mutual_nearest_neighbours_one_by_one(device):
+    generator = torch.Generator().manual_seed(0)
+    a = torch.nn.functional.normalize(torch.randn(60, 8, generator=generator), dim=1)
+    b = torch.nn.functional.normalize(a[torch.randperm(60, generator=generator)[:50]] + 0.1, dim=1)
+    similarity = a @ b.mT
+    expected = []
+    for i, row in enumerate(similarity):
+        second, best = (2 - 2 * row.topk(2).values).clamp_min(0).sqrt().flip(0).tolist()
+        near = best < features.MAX_DISTANCE and best < features.MAX_RATIO * second
+        if near and int(similarity[:, row.argmax()].argmax()) == i:
+            expected.append([i, int(row.argmax())])
+    assert features.match_descriptors(a.to(device), b.to(device)).tolist() == expected and len(expected) > 10
+
+
 def test_pairs_of_many_photos_are_neighbours_and_similar_photos(monkeypatch):
     monkeypatch.setattr(features, "MAX_EXHAUSTIVE", 10)
     generator = torch.Generator().manual_seed(0)

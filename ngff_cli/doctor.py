@@ -98,13 +98,13 @@ def _gsplat() -> Finding:
 
 
 def _warp() -> Finding:
-    import torch
     import warp
 
-    from stages.core.kernels.interop import view
+    from stages.core.kernels.interop import compiles_for_cpu
 
-    total = float(view(torch.ones(3)).numpy().sum())
-    return Finding(total == 3, "Warp", f"{warp.__version__}, kernels cached in {warp.config.kernel_cache_dir}")
+    works = compiles_for_cpu()
+    remedy = "" if works else "; no compiler for the CPU: `pip install --force-reinstall warp-lang`"
+    return Finding(works, "Warp", f"{warp.__version__}, kernels cached in {warp.config.kernel_cache_dir}{remedy}")
 
 
 def _colmap() -> Finding:
@@ -114,8 +114,10 @@ def _colmap() -> Finding:
 
 
 def _codec() -> Finding:
-    import av
-
+    try:
+        import av
+    except ImportError:
+        return Finding(False, "H.264", "PyAV is absent: `pip install av`; needed for videos")
     works = "libx264" in av.codecs_available
     remedy = "" if works else " lacks libx264: reinstall it from its wheel"
     return Finding(works, "H.264", f"PyAV {av.__version__}{remedy}")

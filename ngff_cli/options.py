@@ -17,6 +17,8 @@ Device = Annotated[str, typer.Option(help="auto | cpu | cuda")]
 Seed = Annotated[int, typer.Option(help="random seed; the same seed and device give the same result")]
 Threads = Annotated[int | None, typer.Option(help="CPU threads; default: all cores", show_default=False)]
 AsJson = Annotated[bool, typer.Option("--json", help="print the results as JSON instead of a table")]
+SIZE_OPTIONS = ("quality", "resolution", "keypoints", "max_objects", "batch", "views", "side", "size", "particles",
+                "scenes")  # on which the memory of a command depends, the most effective first  # fmt: skip
 
 
 def limit_threads(count: int | None) -> None:
@@ -66,7 +68,10 @@ def print_results(run: Callable[[Path | None], Iterable[str]], out: Path | None,
 
 
 class CommandGroup(typer.core.TyperGroup):
-    """Commands in the order of their definition; an InputError or OSError exits with one line and status 2."""
+    """Commands in the order of their definition.
+
+    An InputError or OSError exits with one line and status 2, a GPU out of memory with one line and status 1.
+    """
 
     def list_commands(self, ctx) -> list[str]:
         """Names in the order of definition."""
@@ -90,8 +95,31 @@ class CommandGroup(typer.core.TyperGroup):
                 raise
             where = f"{error.filename}: " if error.filename else ""
             fail(f"{where}{error.strerror or error}", 2)
+        except RuntimeError as error:
+            if not _is_gpu_out_of_memory(error):
+                raise
+            fail(_less_memory(self.commands[ctx.invoked_subcommand]), 1)
         except KeyboardInterrupt:
             fail("interrupted; no incomplete file is left", 130)
+
+
+def _is_gpu_out_of_memory(error: RuntimeError) -> bool:
+    """Whether PyTorch, CUDA or Warp failed to allocate memory on a GPU."""
+    torch = sys.modules.get("torch")  # not imported for this: that takes a second
+    if torch is not None and isinstance(error, torch.cuda.OutOfMemoryError):
+        return True
+    text = str(error)
+    return "CUDA error: out of memory" in text or ("Failed to allocate" in text and "cuda" in text)
+
+
+def _less_memory(command) -> str:
+    """Sentence for a command that ran out of GPU memory: which of its options to lower."""
+    names = [p.name for p in command.params]
+    sizes = ["--" + name.replace("_", "-") for name in SIZE_OPTIONS if name in names]
+    remedies = [f"lower {' or '.join(sizes)}"] if sizes else []
+    if "device" in names:
+        remedies.append("use --device cpu")
+    return ", ".join(["the GPU is out of memory: close other programs that use it", *remedies])
 
 
 def fail(message: str, status: int) -> None:

@@ -1,11 +1,14 @@
 """Tiny scenes built in memory, the devices present, and skips for data that may be absent."""
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 import torch
 
+from stages.core.errors import MissingPackage
 from stages.core.geometry.cameras import intrinsics, orbit
 from stages.core.scene.cameras import Cameras
 from stages.core.scene.gaussians import Gaussians, concatenate
@@ -24,6 +27,32 @@ def pytest_collection_modifyitems(items) -> None:
             item.add_marker(pytest.mark.skip(reason="needs an NVIDIA GPU"))
         if hasattr(item, "callspec") and any(isinstance(p, str) and p == "cuda" for p in item.callspec.params.values()):
             item.add_marker(pytest.mark.gpu)
+
+
+@contextmanager
+def skipped_without_package() -> Iterator[None]:
+    """Skip the test, with the name of the package, where an error follows from a package that is not installed."""
+    try:
+        yield
+    except Exception as error:
+        cause = error
+        while cause is not None and not isinstance(cause, MissingPackage):
+            cause = cause.__cause__ or cause.__context__
+        if cause is None:
+            raise
+        pytest.skip(str(cause))
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_setup():
+    with skipped_without_package():
+        return (yield)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call():
+    with skipped_without_package():
+        return (yield)
 
 
 @pytest.fixture(params=DEVICES)

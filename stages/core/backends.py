@@ -58,7 +58,7 @@ def pick_device(name: str) -> str:
     import torch  # takes a second to import, so only when a stage runs
 
     if name not in ("auto", "cpu", "cuda"):
-        raise InputError(f"--device {name}: choose from auto, cpu, cuda")
+        raise InputError(f"--device {name}: choose from auto, cpu, cuda (another GPU: set CUDA_VISIBLE_DEVICES)")
     if name == "cuda" and not torch.cuda.is_available():
         raise InputError("--device cuda: PyTorch sees no NVIDIA GPU here; use --device cpu (see `ngff-lab doctor`)")
     return "cuda" if name != "cpu" and torch.cuda.is_available() else "cpu"

@@ -1,4 +1,4 @@
-"""The exception for mistakes in the input."""
+"""Exceptions for mistakes in the input and in the installation."""
 
 
 class InputError(Exception):
@@ -6,3 +6,7 @@ class InputError(Exception):
 
     The command line prints it without a traceback and exits with status 2.
     """
+
+
+class MissingPackage(InputError):
+    """A package that this input or option needs is not installed, or not completely; the message says how to."""

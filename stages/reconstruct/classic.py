@@ -14,6 +14,7 @@ from stages.core.geometry.cameras import depths, resize
 from stages.core.scene.cameras import Cameras, LensDistortion, read_cameras
 from stages.reconstruct import depth, sfm, world_frame
 from stages.reconstruct.build_scene import SceneGeometry, build_scene
+from stages.reconstruct.matching import MatchingOptions
 from stages.reconstruct.options import ReconstructOptions
 from stages.reconstruct.photos import Photos, Reconstruction, split_holdout, undistort
 from stages.reconstruct.step_cache import StepCache
@@ -42,8 +43,9 @@ def _cameras(
     photos: Photos, options: ReconstructOptions, device: str, steps: StepCache
 ) -> tuple[sfm.SparseModel, Photos]:
     """Cameras and sparse points: estimated, or triangulated with the given cameras; and the photos that have one."""
+    matching = MatchingOptions(options.matcher, options.seed, device)
     if options.cameras is None:
-        return sfm.estimate_cameras(photos, options.seed, device, steps, options.matcher), photos
+        return sfm.estimate_cameras(photos, matching, steps), photos
     cameras, lenses = read_cameras(options.cameras)
     row = {name: i for i, name in enumerate(cameras.names)}
     both = [i for i, name in enumerate(photos.names) if name in row]
@@ -57,7 +59,7 @@ def _cameras(
     photos = photos[both]
     rows = [row[name] for name in photos.names]
     cameras, lenses = _rescale_to_photos(photos, cameras[rows]), LensDistortion(lenses.coefficients[rows])
-    return sfm.triangulate(photos, cameras, lenses, options.seed, steps, options.matcher), photos
+    return sfm.triangulate(photos, cameras, lenses, matching, steps), photos
 
 
 def _rescale_to_photos(photos: Photos, cameras: Cameras) -> Cameras:

@@ -18,7 +18,7 @@ from tqdm import tqdm
 from stages.core.errors import InputError
 from stages.core.scene.files import must_exist
 from stages.core.scene.formats import IMAGE_SUFFIXES, VIDEO_SUFFIXES
-from stages.core.scene.images import list_photos, open_video, read_image, to_bytes
+from stages.core.scene.images import import_av, list_photos, open_video, read_image, to_bytes
 from stages.reconstruct.photos import Photos
 
 log = logging.getLogger(__name__)
@@ -141,9 +141,14 @@ def _is_truncated(file: Path) -> bool:
 
 
 def _exif_focal(file: Path) -> float:
-    """Focal length in pixels of the stored photo from EXIF (and COLMAP's table of sensors), 0 where unknown."""
-    import pycolmap
+    """Focal length in pixels of the stored photo from EXIF (and COLMAP's table of sensors), 0 where unknown.
 
+    It is also 0 without pycolmap: estimate_cameras, which needs it, reports that; networks do without.
+    """
+    try:
+        import pycolmap
+    except ImportError:
+        return 0.0
     try:
         camera = pycolmap.infer_camera_from_image(str(file))
     except (ValueError, RuntimeError):  # a format that OpenCV reads and COLMAP does not
@@ -166,8 +171,6 @@ def _from_video(path: Path, side: int) -> list[LoadedImage]:
 
 def _frames(path: Path, times: list[float], spans: int, side: int) -> Iterator[tuple[int, LoadedImage]]:
     """Up to about MAX_CANDIDATES rotated frames per span, each with its span; reading ends at damaged data."""
-    import av
-
     seen: Counter[int] = Counter()
     interval = max(1, len(times) // max(1, spans * MAX_CANDIDATES))
     with open_video(path) as file:
@@ -187,7 +190,7 @@ def _frames(path: Path, times: list[float], spans: int, side: int) -> Iterator[t
                 full = (frame.height, frame.width) if turns % 2 else (frame.width, frame.height)
                 image = torch.from_numpy(np.ascontiguousarray(np.rot90(pixels, turns)))
                 yield span, LoadedImage(f"frame_{i:05d}", image, 0.0, full)
-        except av.FFmpegError as error:
+        except import_av(path).FFmpegError as error:
             log.warning("%s: is truncated or damaged (%s); the frames before are used", path, error.strerror)
 
 

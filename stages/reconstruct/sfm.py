@@ -11,6 +11,7 @@ import logging
 import tempfile
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import torch
@@ -18,7 +19,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from tqdm import tqdm
 
-from stages.core.errors import InputError
+from stages.core.errors import InputError, MissingPackage
 from stages.core.scene.cameras import Cameras, LensDistortion
 from stages.reconstruct import matching
 from stages.reconstruct.matching import MatchedPair, MatchingOptions
@@ -44,17 +45,17 @@ class SparseModel:
 
 
 def estimate_cameras(
-    photos: Photos, seed: int = 0, device: str = "cpu", steps: StepCache | None = None, matcher: str = "sift"
+    photos: Photos, options: MatchingOptions = MatchingOptions(), steps: StepCache | None = None  # noqa: B008 -- frozen
 ) -> SparseModel:
     """Cameras of as many photos as can be registered.
 
     Raises InputError, with what to change, where the photos do not match, the camera is stationary, or mapping fails.
     """
     steps = steps or StepCache()
-    _configure_pycolmap(seed)
-    cameras, options = matching.initial_cameras(photos), MatchingOptions(matcher, seed, device)
-    database = matching.build_database(photos, cameras, steps, options)
-    return steps.cached("model", lambda: _run_mapper(photos, database, seed), (SparseModel, Cameras, LensDistortion))
+    _load_pycolmap(options.seed)
+    database = matching.build_database(photos, matching.initial_cameras(photos), steps, options)
+    types = (SparseModel, Cameras, LensDistortion)
+    return steps.cached("model", lambda: _run_mapper(photos, database, options.seed), types)
 
 
 def _run_mapper(photos: Photos, database: Path, seed: int) -> SparseModel:
@@ -138,24 +139,22 @@ def _drop_reasons(photos: Photos, pairs: list[MatchedPair], best, models: dict) 
 
 
 def triangulate(
-    photos: Photos, cameras: Cameras, lenses: LensDistortion, seed: int = 0, steps: StepCache | None = None,
-    matcher: str = "sift",
-) -> SparseModel:
+    photos: Photos, cameras: Cameras, lenses: LensDistortion,
+    options: MatchingOptions = MatchingOptions(), steps: StepCache | None = None,  # noqa: B008 -- frozen
+) -> SparseModel:  # fmt: skip
     """Sparse points for known cameras; `photos` and `cameras` in the same order, K in pixels of the photos.
 
     Raises InputError where the cameras do not fit the photos or these overlap too little.
     """
-    import pycolmap
-
     steps = steps or StepCache()
-    _configure_pycolmap(seed)
+    pycolmap = _load_pycolmap(options.seed)
     known = []
     for i in range(len(photos)):
         K, k = cameras.Ks[i].tolist(), lenses.coefficients[i].tolist()
         width, height = photos.size(i)
         params = [K[0][0], K[1][1], K[0][2], K[1][2], *k[:4], k[4], 0, 0, 0]
         known.append(pycolmap.Camera(model="FULL_OPENCV", width=width, height=height, params=params, camera_id=i + 1))
-    database = matching.build_database(photos, known, steps, MatchingOptions(matcher, seed))
+    database = matching.build_database(photos, known, steps, options)
     pairs = matching.verified_pairs(database)
     if not pairs:
         raise InputError(f"{photos.source}: no two photos show the same objects clearly enough; {CAPTURE_ADVICE}")
@@ -170,9 +169,9 @@ def triangulate(
         model.add_camera_with_trivial_rig(known[i])
         image = pycolmap.Image(name=name, keypoints=np.zeros((0, 2)), camera_id=i + 1, image_id=i + 1)
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(viewmat[:3].double().numpy()))
-    options = _mapper_options(photos, seed)
+    mapper = _mapper_options(photos, options.seed)
     with tempfile.TemporaryDirectory() as folder, steps.timed("model"):
-        done = pycolmap.triangulate_points(model, database, folder, folder, options=options)
+        done = pycolmap.triangulate_points(model, database, folder, folder, options=mapper)
     if done.num_points3D() < 50:
         raise InputError(f"{photos.source}: the photos overlap too little to find depth; {CAPTURE_ADVICE}")
     log.info("%d points found with the given cameras, which fit the photos to %.2f px", done.num_points3D(), error)
@@ -198,12 +197,16 @@ def _rays(camera, pixels: np.ndarray) -> np.ndarray:
     return np.pad(np.asarray(camera.cam_from_img(pixels.astype(np.float64))), ((0, 0), (0, 1)), constant_values=1)
 
 
-def _configure_pycolmap(seed: int) -> None:
-    """Silence COLMAP's log and seed its random numbers."""
-    import pycolmap
-
+def _load_pycolmap(seed: int) -> ModuleType:
+    """The package pycolmap, its log silenced and its random numbers seeded; MissingPackage where absent."""
+    try:
+        import pycolmap
+    except ImportError as error:
+        raise MissingPackage("--backend classic needs the package pycolmap, which is not installed; "
+                             "`pip install pycolmap`, or use --backend pi3") from error  # fmt: skip
     pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
     pycolmap.set_random_seed(seed)
+    return pycolmap
 
 
 def _from_colmap(model, dropped: dict[str, str] | None = None) -> SparseModel:

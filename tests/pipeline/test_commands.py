@@ -17,6 +17,7 @@ from ngff_cli.app import app
 from ngff_cli.lab import app as lab_app
 from ngff_cli.options import print_results
 from stages import PIPELINE
+from stages.core.errors import MissingPackage
 from stages.core.scene.scene_ply import read_scene, write_scene
 from stages.core.scene.trajectory import read_trajectory
 
@@ -25,8 +26,10 @@ NOT_OPTIONS = {"out", "imgs", "scene", "source", "prediction", "against", "as_js
 
 
 def call(*args) -> tuple[int, str, str]:
-    """Exit status, stdout and stderr of `ngff ARGS`."""
+    """Exit status, stdout and stderr of `ngff ARGS`. Raises MissingPackage where one is the reason of its failure."""
     done = CliRunner().invoke(app, [str(a) for a in args])
+    if isinstance(done.exception, SystemExit) and isinstance(done.exception.__context__, MissingPackage):
+        raise done.exception.__context__
     return done.exit_code, done.stdout, done.stderr
 
 

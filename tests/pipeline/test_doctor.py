@@ -2,12 +2,15 @@
 
 import json
 import re
+import sys
 
+import pytest
 from typer.testing import CliRunner
 
 from ngff_cli import doctor
 from ngff_cli.doctor import check_installation
 from ngff_cli.lab import app
+from stages.core.kernels import interop
 from stages.reconstruct import features_learned
 from tests.pipeline.test_documentation import unknown_part
 
@@ -17,6 +20,9 @@ def by_subject() -> dict[str, doctor.Finding]:
 
 
 def test_findings_of_this_installation():
+    pytest.importorskip("av")
+    if not interop.compiles_for_cpu():
+        pytest.skip("Warp has no compiler for the CPU")
     found = by_subject()
     assert found["torch"].ok and found["Warp"].ok and found["H.264"].ok
     assert found["ngff weights"].ok and "ngff.safetensors" in found["ngff weights"].detail
@@ -29,6 +35,14 @@ def test_command_prints_lines_or_json(monkeypatch):
     assert done.stdout.splitlines() == ["ok  torch             2.4", "--  GPU               absent: buy one"]
     done = CliRunner().invoke(app, ["doctor", "--json"])
     assert json.loads(done.stdout) == [finding._asdict() for finding in findings]
+
+
+def test_missing_parts_are_reported_with_their_remedy(monkeypatch):
+    monkeypatch.setitem(sys.modules, "av", None)
+    monkeypatch.setattr(interop, "compiles_for_cpu", lambda: False)
+    found = by_subject()
+    assert not found["H.264"].ok and "`pip install av`" in found["H.264"].detail
+    assert not found["Warp"].ok and "--force-reinstall warp-lang`" in found["Warp"].detail
 
 
 def test_corrupt_weights_are_reported(monkeypatch, tmp_path):

@@ -2,8 +2,10 @@
 
 import resource
 from contextlib import contextmanager
+from importlib import import_module
 
 import pytest
+import torch
 
 from stages.core.scene.scene_ply import write_scene
 from stages.simulate.options import SimulateOptions
@@ -69,12 +71,12 @@ def input_files(tmp_path_factory):
     return folder
 
 
-def fails_cleanly(folder, args, command=call) -> str:
-    """Assert one line on stderr, status 2, empty stdout and no new file; return the line."""
+def fails_cleanly(folder, args, command=call, expected=2) -> str:
+    """Assert one line on stderr, the expected status, empty stdout and no new file; return the line."""
     before = sorted(p.name for p in folder.iterdir())
     status, out, err = command(*(str(a).format(folder) for a in args))
     lines = [line for line in err.splitlines() if line.startswith("ngff: ")]
-    assert status == 2 and len(lines) == 1, err
+    assert status == expected and len(lines) == 1, err
     assert "Traceback" not in err and out == ""
     assert sorted(p.name for p in folder.iterdir()) == before
     return lines[0]
@@ -113,3 +115,32 @@ def test_full_disk_gives_one_line_and_status_2(input_files, args):
             return call(*args)
 
     assert "cannot be written" in fails_cleanly(input_files, args, limited)
+
+
+EXHAUSTED = [
+    (("reconstruct", "{}/damaged", "-o", "{}/o.ply"), "photo_reader:_is_truncated", "--quality or --resolution"),
+    (("segment", "{}/good.ply", "-o", "{}/o.ply"), "stage:rename_objects", "--max-objects"),
+    (("refine", "{}/good.ply", "-o", "{}/o.ply"), "stage:fill_background", "--resolution"),
+    (("simulate", "{}/good.ply", "-o", "{}/o.h5", "--steps", 3), "sleep:nearest", "--quality or --keypoints"),
+    (("render", "{}/good.h5", "-o", "{}/o.mp4"), "draw:rasterise", "--resolution"),
+]
+
+
+@pytest.mark.parametrize(("args", "where", "options"), EXHAUSTED, ids=lambda a: a[0] if isinstance(a, tuple) else "")
+def test_gpu_out_of_memory_gives_one_line_and_status_1(input_files, monkeypatch, args, where, options):
+    def exhausted(*_, **__):
+        raise torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB")
+
+    module, name = where.split(":")
+    monkeypatch.setattr(import_module(f"stages.{args[0]}.{module}"), name, exhausted)
+    line = fails_cleanly(input_files, args, expected=1)
+    assert "the GPU is out of memory" in line and f"lower {options}, use --device cpu" in line
+
+
+def test_other_runtime_errors_are_not_reported_as_out_of_memory(input_files, monkeypatch):
+    def broken(*_, **__):
+        raise RuntimeError("a mistake of ours")
+
+    monkeypatch.setattr(import_module("stages.render.draw"), "rasterise", broken)
+    status, _, err = call("render", input_files / "good.ply", "-o", input_files / "o.png")
+    assert status == 1 and "out of memory" not in err and not (input_files / "o.png").exists()

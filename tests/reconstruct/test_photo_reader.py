@@ -5,17 +5,16 @@ import struct
 import zlib
 from fractions import Fraction
 
-import av
 import cv2
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 
 from stages.core.errors import InputError
 from stages.reconstruct import photo_reader
 from stages.reconstruct.photo_reader import read_photos
 
+Image = pytest.importorskip("PIL.Image")
 MILLISECOND = Fraction(1, 1000)
 rng = np.random.default_rng(0)
 
@@ -81,6 +80,7 @@ def test_exif_rotation_is_applied(folder):
 
 
 def test_mixed_sizes_and_focal_lengths_give_separate_cameras(folder):
+    pytest.importorskip("pycolmap")  # reads EXIF
     from stages.reconstruct.matching import initial_cameras
 
     exif = Image.Exif()
@@ -96,6 +96,7 @@ def test_mixed_sizes_and_focal_lengths_give_separate_cameras(folder):
 
 
 def test_large_photos_and_their_focal_lengths_are_reduced(tmp_path):
+    pytest.importorskip("pycolmap")  # reads EXIF
     exif = Image.Exif()
     exif.get_ifd(0x8769)[0xA405] = 36  # the focal length equals the image width
     for name in ("a.jpg", "b.jpg"):
@@ -205,6 +206,7 @@ def test_number_and_size_of_many_photos_are_limited(tmp_path, monkeypatch):
 
 def write_video(path, times: list[float], size: tuple[int, int] = (96, 64), blurred: tuple[int, ...] = ()) -> None:
     """A video with frames at these times [s]; the red channel is the time in tenths of a second."""
+    av = pytest.importorskip("av")
     with av.open(str(path), "w") as file:
         stream = file.add_stream("libx264", rate=1000, options={"crf": "10", "g": "10"})
         stream.width, stream.height, stream.pix_fmt = *size, "yuv420p"

@@ -1,15 +1,19 @@
 """Structure from motion: its parts, and its errors."""
 
+import sys
+
 import pytest
 import torch
 
-from stages.core.errors import InputError
+from stages.core.errors import InputError, MissingPackage
 from stages.core.geometry.cameras import centres
 from stages.core.geometry.similarity import umeyama
-from stages.core.scene.cameras import LensDistortion
+from stages.core.scene.cameras import LensDistortion, read_cameras
 from stages.reconstruct import features, sfm
+from stages.reconstruct.matching import MatchingOptions
+from stages.reconstruct.photo_reader import read_photos
 from stages.reconstruct.photos import Photos, undistort
-from tests.reconstruct.raycast import arc, photograph
+from tests.reconstruct.raycast import arc, photograph, write_set
 
 
 def as_photos(cameras, folder) -> Photos:
@@ -24,6 +28,20 @@ def test_blank_photos_are_refused(tmp_path):
     )  # fmt: skip
     with pytest.raises(InputError, match=r"photos: no two photos show the same objects.*take 10 or more"):
         sfm.estimate_cameras(blank)
+
+
+def test_absent_pycolmap_is_reported(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    with pytest.raises(MissingPackage, match="`pip install pycolmap`, or use --backend pi3"):
+        sfm.estimate_cameras(as_photos(arc(2, (64, 48)), tmp_path))
+    with pytest.raises(MissingPackage, match="COLMAP model needs the package pycolmap"):
+        read_cameras(tmp_path)
+
+
+def test_photos_are_read_without_pycolmap(tmp_path, monkeypatch):
+    write_set(tmp_path, arc(2, (64, 48)))
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    assert read_photos(tmp_path / "images").focals == (0.0, 0.0)
 
 
 def test_cameras_of_a_ray_cast_scene(tmp_path):
@@ -42,7 +60,7 @@ def test_cameras_of_a_ray_cast_scene(tmp_path):
 
 def test_the_same_seed_gives_the_same_cameras(tmp_path):
     photos = as_photos(arc(3, (240, 180), sweep=30.0), tmp_path)
-    first, second = (sfm.estimate_cameras(photos, seed=4) for _ in range(2))
+    first, second = (sfm.estimate_cameras(photos, MatchingOptions(seed=4)) for _ in range(2))
     assert torch.equal(first.cameras.viewmats, second.cameras.viewmats)
     assert torch.equal(first.points, second.points)
 

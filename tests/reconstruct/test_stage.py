@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import pytest
 import torch
-from PIL import Image
 
 from stages.core.errors import InputError
 from stages.core.geometry.cameras import centres
@@ -191,6 +190,7 @@ def test_input_error_leaves_no_files(small, small_preset, tmp_path):
 
 def test_mixed_formats_sizes_and_unicode_names(small_preset, tmp_path):
     # Landscape and portrait, large and small, grey, CMYK, rotated by EXIF: photos of three cameras, not given.
+    Image = pytest.importorskip("PIL.Image")
     folder = tmp_path / "Küche 写真 № 1"
     folder.mkdir()
     wide, tall = arc(6, (320, 240), sweep=50.0), arc(6, (240, 320), sweep=50.0)
@@ -217,7 +217,7 @@ def test_mixed_formats_sizes_and_unicode_names(small_preset, tmp_path):
 
 @pytest.mark.parametrize("source", ["transforms.json", "COLMAP"])
 def test_lens_of_given_cameras_is_stored(small_preset, tmp_path, source):
-    import pycolmap
+    pycolmap = pytest.importorskip("pycolmap")
 
     true = arc(4, (96, 72), sweep=40.0)
     path, lens = write_set(tmp_path, true), {"k1": 0.01, "k2": -0.004, "p1": 0.0005, "p2": 0.001}

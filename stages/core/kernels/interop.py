@@ -6,6 +6,8 @@ from functools import cache
 import torch
 import warp as wp
 
+from stages.core.errors import MissingPackage
+
 wp.config.log_level = wp.LOG_ERROR
 
 
@@ -26,12 +28,23 @@ def _ready() -> None:
         os.close(null)
 
 
-def view(tensor: torch.Tensor, dtype=None) -> wp.array:
-    """Wrap a tensor as a Warp array over the same memory (no copy, no gradient).
+@cache
+def compiles_for_cpu() -> bool:
+    """Whether Warp can compile kernels for the CPU: some builds of it lack the library that does."""
+    _ready()
+    return bool(wp.is_cpu_available())
 
-    `dtype` is a Warp type such as wp.vec3 when the last dimensions form a vector or matrix.
+
+def view(tensor: torch.Tensor, dtype=None) -> wp.array:
+    """Wrap a tensor as a Warp array over the same memory (no copy, no gradient), for a kernel on its device.
+
+    `dtype` is a Warp type such as wp.vec3 when the last dimensions form a vector or matrix. Raises MissingPackage
+    for a tensor on the CPU where no kernel can be compiled for it.
     """
     _ready()
+    if not (tensor.is_cuda or compiles_for_cpu()):
+        raise MissingPackage("Warp has no compiler for the CPU here (its library warp-clang is missing); install it "
+                             "with `pip install --force-reinstall warp-lang`, or use a GPU")  # fmt: skip
     return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False)
 
 

@@ -3,6 +3,8 @@
 Pixel centres at +0.5, 0.3 px^2 of blur, splats sorted by camera depth, alpha from 1/255 to 0.999, a pixel finished at
 a transmittance of 1e-4. Differentiable in means, quats, scales, opacities, sh and features, not in cameras or
 background. Images and gradients are bit-identical when repeated on the same device.
+
+A CPU for which Warp has no compiler leaves the work to a GPU; images are returned on the device of the Gaussians.
 """
 
 from __future__ import annotations
@@ -16,6 +18,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from stages.core.geometry.harmonics import degree_of
+from stages.core.kernels.interop import compiles_for_cpu
 from stages.core.kernels.splat.binning import Bins, bin_splats
 from stages.core.kernels.splat.compositing import composite, dominant_splats
 from stages.core.kernels.splat.projection import pack_camera, project
@@ -43,7 +46,8 @@ class Rendering:
     @property
     def absgrad(self) -> Float[Tensor, "c n 2"]:
         """Sum over pixels of |dL / d image centre| [1/px] of each Gaussian, after backward(); 0 before."""
-        return _stack([sum(get(), torch.zeros_like(self.extents[0])) for get in self.absgrad_getters])
+        nothing = torch.zeros_like(self.extents[0])
+        return _stack([sum((grad.to(nothing) for grad in get()), nothing) for get in self.absgrad_getters])
 
 
 def rasterise(
@@ -58,10 +62,11 @@ def rasterise(
 
     Width and height are in pixels. Gaussians with a camera depth below NEAR are left out.
     """
-    packed = [_View(V, K, width, height).packed(gaussians) for V, K in zip(viewmats, Ks, strict=True)]
-    drawn = [rasterise_packed(gaussians, camera, width, height, background) for camera in packed]
+    g = _drawable(gaussians)
+    packed = [_View(V, K, width, height).packed(g) for V, K in zip(viewmats, Ks, strict=True)]
+    drawn = [rasterise_packed(g, camera, width, height, background) for camera in packed]
     *images, getters = zip(*drawn, strict=True)
-    return Rendering(*(_stack(image) for image in images), getters)
+    return Rendering(*(_stack(image).to(gaussians.means.device) for image in images), getters)
 
 
 def rasterise_packed(
@@ -97,8 +102,9 @@ def rasterise_features(
     height: int,
 ) -> Float[Tensor, "c h w f"]:
     """Composite feature vectors of the Gaussians like colours, over 0: sum of weight x feature. Differentiable."""
+    g = _drawable(gaussians)
     views = [_View(V, K, width, height) for V, K in zip(viewmats, Ks, strict=True)]
-    return _stack([_features(gaussians, features, view) for view in views])
+    return _stack([_features(g, features.to(g.means.device), view) for view in views]).to(gaussians.means.device)
 
 
 @torch.no_grad()
@@ -110,8 +116,14 @@ def visibility(
     height: int,
 ) -> tuple[Int[Tensor, "h w"], Float[Tensor, "n"]]:
     """The Gaussian with the largest weight in each pixel (-1: none), and each Gaussian's total weight [px]."""
-    camera = _View(viewmat, K, width, height).packed(gaussians)
-    return dominant_splats(*_splats(gaussians, camera, width, height))
+    g = _drawable(gaussians)
+    index, weight = dominant_splats(*_splats(g, _View(viewmat, K, width, height).packed(g), width, height))
+    return index.to(gaussians.means.device), weight.to(gaussians.means.device)
+
+
+def _drawable(g: Gaussians) -> Gaussians:
+    """The Gaussians on their device, or on a GPU where no kernel can be compiled for the CPU."""
+    return g if g.means.is_cuda or compiles_for_cpu() or not torch.cuda.is_available() else g.to("cuda")
 
 
 class _View(NamedTuple):

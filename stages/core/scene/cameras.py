@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from stages.core.errors import InputError
+from stages.core.errors import InputError, MissingPackage
 from stages.core.geometry.similarity import Similarity
 
 LENS_MODEL = "opencv"  # the only one: k1 k2 p1 p2 k3 of OpenCV
@@ -169,8 +169,11 @@ def _transforms_lens(value: dict) -> list[float]:
 
 
 def _read_colmap(path: Path) -> tuple[Cameras, LensDistortion]:
-    import pycolmap  # takes a second to import, and only this reader needs it
-
+    try:
+        import pycolmap  # takes a second to import, and only this reader needs it
+    except ImportError as error:
+        raise MissingPackage(f"{path}: a COLMAP model needs the package pycolmap, which is not installed; "
+                             "`pip install pycolmap`, or give a transforms.json") from error  # fmt: skip
     try:
         model = pycolmap.Reconstruction(str(path))
     except (ValueError, RuntimeError, IndexError) as error:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from fractions import Fraction
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import cv2
@@ -13,7 +14,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from stages.core.errors import InputError
+from stages.core.errors import InputError, MissingPackage
 from stages.core.scene.files import must_exist, replacing
 from stages.core.scene.formats import IMAGE_SUFFIXES
 
@@ -114,16 +115,13 @@ class VideoWriter:
         self._stream = None
 
     def __enter__(self) -> VideoWriter:
-        import av
-
+        self._av = import_av(self.path)
         self._replacing = replacing(self.path)
-        self._file = av.open(str(self._replacing.__enter__()), "w", options={"movflags": "faststart"})
+        self._file = self._av.open(str(self._replacing.__enter__()), "w", options={"movflags": "faststart"})
         return self
 
     def append(self, image: Float[Tensor, "h w 3"]) -> None:
         """Encode one frame, RGB in 0..1; all frames have the size of the first."""
-        import av
-
         pixels = to_bytes(image)
         pixels = pixels[: pixels.shape[0] // 2 * 2, : pixels.shape[1] // 2 * 2]
         if self._stream is None:
@@ -131,7 +129,8 @@ class VideoWriter:
             self._stream = self._file.add_stream("libx264", rate=rate, options={"crf": "17", "preset": "medium"})
             self._stream.height, self._stream.width = pixels.shape[:2]
             self._stream.pix_fmt = "yuv420p"
-        self._file.mux(self._stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(pixels), format="rgb24")))
+        frame = self._av.VideoFrame.from_ndarray(np.ascontiguousarray(pixels), format="rgb24")
+        self._file.mux(self._stream.encode(frame))
 
     def __exit__(self, kind, error, trace) -> None:
         try:
@@ -152,21 +151,27 @@ def video_info(path: Path) -> tuple[int, float]:
 
 def read_video(path: Path) -> Iterator[Float[Tensor, "h w 3"]]:
     """The frames of a video in order, RGB in 0..1. Raises InputError for a damaged video."""
-    import av
-
     with open_video(path) as file:
         try:
             for frame in file.decode(video=0):
                 yield torch.from_numpy(frame.to_ndarray(format="rgb24").astype(np.float32) / 255)
-        except av.FFmpegError as error:
+        except import_av(path).FFmpegError as error:
             raise InputError(f"{path}: the video breaks off or is damaged ({error.strerror})") from error
 
 
-def open_video(path: Path) -> Any:
-    """Open a video for decoding, as an av.container.InputContainer. Raises InputError for other files."""
-    import av  # not at the top, since most commands read no video
+def import_av(path: Path) -> ModuleType:
+    """PyAV, which only videos need; MissingPackage, for the video `path`, where it is not installed."""
+    try:
+        import av
+    except ImportError as error:
+        raise MissingPackage(f"{path}: videos need the package av, which is not installed; `pip install av`") from error
+    return av
 
+
+def open_video(path: Path) -> Any:
+    """Open a video for decoding: an av.container.InputContainer. Raises InputError for other files."""
     must_exist(path, "a video")
+    av = import_av(path)
     try:
         file = av.open(str(path))
     except (av.FFmpegError, OSError) as error:

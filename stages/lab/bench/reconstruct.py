@@ -137,12 +137,13 @@ def _scene(images: Path, options: ReconstructBenchOptions) -> tuple[dict, Camera
 def _cameras(images: Path, options: ReconstructBenchOptions) -> tuple[dict, Cameras, None]:
     """The report of camera estimation alone, and the cameras, in a world that is not yet upright."""
     from stages.reconstruct import sfm
+    from stages.reconstruct.matching import MatchingOptions
     from stages.reconstruct.options import ReconstructOptions
     from stages.reconstruct.photo_reader import read_photos
     from stages.reconstruct.step_cache import StepCache, peak_memory
 
     photos, steps = read_photos(images, ReconstructOptions(quality=options.quality).max_side), StepCache()
-    model = sfm.estimate_cameras(photos, 0, pick_device(options.device), steps, options.matcher)
+    model = sfm.estimate_cameras(photos, MatchingOptions(options.matcher, 0, pick_device(options.device)), steps)
     facts = {"photos": len(photos), "placed": len(model.cameras), "dropped": model.dropped, "held_out": None}
     return {**facts, "seconds": steps.seconds, "memory": peak_memory()}, model.cameras, None
 

@@ -12,6 +12,7 @@ from stages.core.geometry.harmonics import rgb_to_sh
 from stages.core.kernels.splat.binning import depth_order_reference
 from stages.core.kernels.splat.compositing import composite_reference
 from stages.core.kernels.splat.projection import pack_camera, project_reference
+from stages.core.raster import rasterise as rasteriser
 from stages.core.raster.rasterise import rasterise, rasterise_features, visibility
 from stages.core.scene.gaussians import Gaussians
 from tests.conftest import random_gaussians, ring
@@ -156,6 +157,27 @@ def test_gsplat_agrees_on_a_large_scene():
     assert 10 * float(torch.log10(1 / (image - peer).square().mean())) >= 45
     for name, a, b in zip(("means", "quats", "scales", "opacities", "sh"), mine, true, strict=True):
         assert float((a - b).norm() / b.norm()) < 1e-3, name
+
+
+@pytest.mark.gpu
+def test_a_gpu_draws_where_no_kernel_can_be_compiled_for_the_cpu(monkeypatch):
+    if not torch.cuda.is_available():
+        pytest.skip("needs an NVIDIA GPU")
+    g, cameras = random_gaussians(300, seed=1), ring(1, 48)
+    view, one = (cameras.viewmats, cameras.Ks, 48, 48), (cameras.viewmats[0], cameras.Ks[0], 48, 48)
+    weight = torch.randn(1, 48, 48, 3, generator=torch.Generator().manual_seed(0))
+
+    def drawn(home):
+        leaf = g.means.clone().to(home).requires_grad_()
+        shot = rasterise(replace(g.to(home), means=leaf), *view, torch.ones(3, device=home))
+        (shot.rgb * weight.to(home)).sum().backward()
+        features = rasterise_features(g.to(home), g.scales.to(home), *view)
+        return shot.rgb.detach(), leaf.grad, features, shot.absgrad, *visibility(g.to(home), *one)
+
+    expected = drawn("cuda")
+    monkeypatch.setattr(rasteriser, "compiles_for_cpu", lambda: False)
+    for ours, theirs in zip(drawn("cpu"), expected, strict=True):
+        assert ours.device.type == "cpu" and torch.equal(ours, theirs.cpu())
 
 
 @pytest.mark.parametrize("device", devices)

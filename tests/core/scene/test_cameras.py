@@ -30,7 +30,7 @@ def write_transforms(folder, **more):
 
 def write_colmap(folder, model: str, params: list[float]):
     """A COLMAP model of two photos with this camera model and these parameters."""
-    import pycolmap
+    pycolmap = pytest.importorskip("pycolmap")
 
     reconstruction = pycolmap.Reconstruction()
     camera = pycolmap.Camera(model=model, width=64, height=48, params=params, camera_id=1)

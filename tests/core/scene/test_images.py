@@ -1,13 +1,13 @@
 import struct
+import sys
 import zlib
 
-import av
 import cv2
 import numpy as np
 import pytest
 import torch
 
-from stages.core.errors import InputError
+from stages.core.errors import InputError, MissingPackage
 from stages.core.scene.images import (
     VideoWriter,
     list_photos,
@@ -52,7 +52,7 @@ def test_video_is_h264_with_leading_index(tmp_path):
     with VideoWriter(path, fps=50.0) as video:
         for shade in shades:
             video.append(torch.full((33, 48, 3), shade))  # an odd height loses a row
-    with av.open(str(path)) as file:
+    with pytest.importorskip("av").open(str(path)) as file:
         stream = file.streams.video[0]
         assert (stream.codec_context.name, stream.pix_fmt, stream.average_rate) == ("h264", "yuv420p", 50)
     data = path.read_bytes()
@@ -79,3 +79,13 @@ def test_image_with_too_many_pixels_is_refused(tmp_path, reader):
     path.write_bytes(data[:12] + header + struct.pack(">I", zlib.crc32(header)) + data[33:])
     with pytest.raises(InputError, match="x.png: is damaged, or far too large"):
         reader(path)
+
+
+def test_absent_av_is_reported_for_videos(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "av", None)
+    (tmp_path / "a.mp4").write_bytes(b"video")
+    with pytest.raises(MissingPackage, match="b.mp4: videos need the package av.*`pip install av`"):
+        VideoWriter(tmp_path / "b.mp4", 25.0).__enter__()
+    with pytest.raises(MissingPackage, match="a.mp4: videos need"):
+        next(read_video(tmp_path / "a.mp4"))
+    assert [p.name for p in tmp_path.iterdir()] == ["a.mp4"]

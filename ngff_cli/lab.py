@@ -323,7 +323,7 @@ def heldout(
         int, typer.Option(help="number of random objects for training, written as the group varied; 0: none")
     ] = 0,
     solid: Annotated[bool, typer.Option("--solid", help="fill the random objects: the group solid")] = False,
-    turned: Annotated[
+    rotations: Annotated[
         int, typer.Option(help="random rotations of the ten objects for training, written as the group turned; 0: none")
     ] = 0,
     device: Device = "auto",
@@ -333,7 +333,7 @@ def heldout(
 
     options = HeldoutOptions(
         scenes=scenes, objects=objects, frames=frames, keypoints=keypoints, dx=dx, spacing=spacing, substep=substep,
-        size=size, shapes=shapes, solid=solid, turned=turned, device=device,
+        size=size, shapes=shapes, solid=solid, rotations=rotations, device=device,
     )  # fmt: skip
     print(run(out, options, meshes))
 

@@ -79,7 +79,7 @@ class HeldoutOptions:
     size: float = 0.5  # longest side of a mesh [m]
     shapes: int = 0  # random shapes and materials, instead of the eight
     solid: bool = False  # fill the random shapes
-    turned: int = 0  # random rotations of the ten objects, instead of the eight
+    rotations: int = 0  # random rotations of the ten objects, instead of the eight
     device: str = "auto"
 
     def __post_init__(self):
@@ -87,17 +87,17 @@ class HeldoutOptions:
             raise InputError(f"--scenes {self.scenes} --objects {self.objects}: at least one scene, of 1 to 6 objects")
         if not 0 <= self.shapes <= 1000:
             raise InputError(f"--shapes {self.shapes}: 0 for the eight, or up to 1000 random ones")
-        if not 0 <= self.turned <= 1000:
-            raise InputError(f"--turned {self.turned}: 0 for the eight, or up to 1000 rotations of the ten objects")
-        if self.solid and not self.shapes or self.shapes and self.turned:
-            raise InputError("--solid needs --shapes, and --turned cannot be combined with them")
+        if not 0 <= self.rotations <= 1000:
+            raise InputError(f"--rotations {self.rotations}: 0 for the eight, or up to 1000 rotated objects")
+        if self.solid and not self.shapes or self.shapes and self.rotations:
+            raise InputError("--solid needs --shapes, and --rotations cannot be combined with them")
         if not 0.1 <= self.size <= 1.0:
             raise InputError(f"--size {self.size}: from 0.1 to 1 m; objects are placed in a cube of 1.8 m")
 
     @property
     def group(self) -> str:
         """Name of the group of scenes."""
-        return SOLID if self.solid else VARIED if self.shapes else ROTATED if self.turned else HELDOUT
+        return SOLID if self.solid else VARIED if self.shapes else ROTATED if self.rotations else HELDOUT
 
     @property
     def discretisation(self) -> Discretisation:
@@ -108,13 +108,13 @@ class HeldoutOptions:
 def run(out: Path, options: HeldoutOptions = HeldoutOptions(), meshes: list[Path] | None = None) -> str:
     """Write one group of scenes and return a one-line summary; an existing group is kept.
 
-    `meshes` are files and folders. Raises InputError when they are combined with --shapes or --turned, or a mesh cannot
-    be read.
+    `meshes` are files and folders. Raises InputError when they are combined with --shapes or --rotations, or a mesh
+    cannot be read.
     """
     group = options.group
     file, motions = Path(out) / "scene_configs" / f"{group}.json", Path(out) / "motions" / f"{group}.h5"
-    if meshes and (options.shapes or options.turned):
-        raise InputError("--from cannot be combined with --shapes or --turned")
+    if meshes and (options.shapes or options.rotations):
+        raise InputError("--from cannot be combined with --shapes or --rotations")
     if motions.exists():
         return f"{motions}: exists already"
     for folder in (file.parent, motions.parent):
@@ -142,9 +142,9 @@ def _assets(options: HeldoutOptions, meshes: Sequence[Sequence[Path]], cache: Pa
     """The objects that the options choose."""
     if meshes:
         return mesh_assets(meshes, options)
-    if options.turned:
+    if options.rotations:
         ten = object_particles.load_assets(options.discretisation, options.keypoints, cache)
-        return rotated_assets(ten, options.turned, options.discretisation)
+        return rotated_assets(ten, options.rotations, options.discretisation)
     shapes = random_shapes(options.shapes, SHAPE_SEEDS[options.group]) if options.shapes else HELDOUT_SHAPES
     return load_shape_assets(shapes, options.discretisation, options.keypoints, cache, options.solid)
 

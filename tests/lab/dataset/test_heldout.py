@@ -214,15 +214,15 @@ def test_rotated_objects_keep_shape_and_material(tmp_path, monkeypatch):
     one, other = made[2000].points, made[2002].points
     assert (one - one.mean(0) - (other - other.mean(0))).norm(dim=1).mean() > 0.05
     monkeypatch.setattr(heldout.object_particles, "load_assets", lambda *_: ten)
-    assert "2 scenes of 4 objects" in run(tmp_path, HeldoutOptions(scenes=2, turned=4, **COARSE))
+    assert "2 scenes of 4 objects" in run(tmp_path, HeldoutOptions(scenes=2, rotations=4, **COARSE))
     assert bool((read_motions(tmp_path / "motions" / "turned.h5").objects >= 2000).all())
 
 
 @pytest.mark.parametrize(
     ("choices", "message"),
     [({"scenes": 0}, "at least one scene"), ({"objects": 9}, "1 to 6 objects"), ({"size": 3.0}, "--size 3.0"),
-     ({"solid": True}, "--solid needs --shapes"), ({"shapes": 2, "turned": 2}, "cannot be combined"),
-     ({"turned": -1}, "--turned -1")],
+     ({"solid": True}, "--solid needs --shapes"), ({"shapes": 2, "rotations": 2}, "cannot be combined"),
+     ({"rotations": -1}, "--rotations -1")],
 )  # fmt: skip
 def test_invalid_options_are_rejected(choices, message):
     with pytest.raises(InputError, match=message):

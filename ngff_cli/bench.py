@@ -39,16 +39,23 @@ def bench_mpm(
 
 @app.command("raster")
 def bench_raster(
+    device: Annotated[str, typer.Option(help="cpu, or cuda to compare with gsplat on a GPU")] = "cpu",
     out: Out = None,
     repeat: Annotated[int, typer.Option(help="timed calls of each; the fastest counts")] = 15,
     shrink: Annotated[int, typer.Option(help="divide the numbers of Gaussians and pixels by this factor")] = 1,
     as_json: AsJson = False,
 ) -> None:
-    """CPU rasteriser: frames per second and time on one thread, compared with a per-pixel rasteriser."""
-    from stages.lab.bench.raster import RasterBenchOptions, run
+    """Rasteriser: on the CPU compared with a per-pixel rasteriser, on a GPU (--device cuda) with gsplat."""
+    from stages.core.backends import pick_device
+    from stages.lab.bench import raster
 
-    options = RasterBenchOptions(repeat=repeat, shrink=shrink)
-    print_results(lambda path: run(path, options), out, as_json)
+    options = raster.RasterBenchOptions(repeat=repeat, shrink=shrink)
+    if (at := pick_device(device)) == "cpu":
+        print_results(lambda path: raster.run(path, options), out, as_json)
+        return
+    from stages.lab.bench import raster_cuda
+
+    print_results(lambda path: raster_cuda.run(at, path, options), out, as_json)
 
 
 @app.command("reconstruct")

@@ -46,3 +46,14 @@ def test_report_has_every_row_and_the_machine(tmp_path):
 def test_invalid_options_are_rejected():
     with pytest.raises(InputError, match="--repeat"):
         RasterBenchOptions(repeat=0)
+
+
+@pytest.mark.gpu
+def test_gpu_report_compares_with_gsplat(tmp_path):
+    pytest.importorskip("gsplat")
+    from stages.lab.bench import raster_cuda
+
+    lines = list(raster_cuda.run("cuda", tmp_path / "raster.json", RasterBenchOptions(repeat=2, shrink=10)))
+    assert len(lines) == 2 + 8
+    for row in json.loads((tmp_path / "raster.json").read_text())["rows"]:
+        assert 0 < row["kernels"] < 100 and 0 < row["gsplat_kernels"] < 100

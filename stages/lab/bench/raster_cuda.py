@@ -1,0 +1,115 @@
+"""Benchmark of the rasteriser on a GPU, compared with gsplat in the same run.
+
+The scenes are those of the CPU benchmark. Times are sums over kernels, since single calls are bound by their launches;
+wall times stand beside them. Compositing tests every pixel of a tile against every splat of its list, unless the splat's
+box misses the warp's pixels or the pixel is finished; the arithmetic of all these tests, 10 operations each, is given as
+a share of the rate of a float32 matrix product in the same run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import torch
+from torch.profiler import ProfilerActivity, profile
+
+from stages.core.errors import InputError
+from stages.core.kernels.splat.projection import TILE_SIZE, pack_camera
+from stages.core.raster.rasterise import NEAR, count_pairs, rasterise_packed
+from stages.core.scene.gaussians import Gaussians
+from stages.lab.bench import common as bench
+from stages.lab.bench.raster import FORWARD, RasterBenchOptions, random_gaussians, view_camera
+
+OPERATIONS_PER_TEST = 10  # of the quadratic form and the comparison
+
+
+@dataclass(frozen=True)
+class CudaRasterTiming:
+    """One comparison [ms]: kernels and wall time of a call, ours and gsplat's."""
+
+    what: str
+    gaussians: int
+    pixels: int  # along a side of the image
+    kernels: float
+    wall: float
+    gsplat_kernels: float
+    gsplat_wall: float
+    arithmetic: float | None  # share of the float32 rate reached by the tests of a forward pass
+
+    def __str__(self) -> str:
+        share = "" if self.arithmetic is None else f"; tests {100 * self.arithmetic:.0f} % of the float32 rate"
+        return (
+            f"{self.what:<18}{self.gaussians:>8,} {self.pixels:4d} px: kernels {self.kernels:6.3f} ms, wall"
+            f" {self.wall:6.3f} ms; gsplat {self.gsplat_kernels:6.3f} and {self.gsplat_wall:6.3f} ms:"
+            f" {self.gsplat_kernels / self.kernels:4.2f}x{share}"
+        )
+
+
+def run(device: str, out: Path | None, options: RasterBenchOptions) -> Iterator[str]:
+    """Yield the lines of the report; all results go to `out` as JSON."""
+    try:
+        import gsplat
+    except ImportError as error:
+        raise InputError("the comparison needs gsplat: `pip install gsplat`") from error
+    yield bench.machine(device)
+    rate, rows = _float32_rate(device), []
+    yield f"float32 matrix product {rate / 1e12:.0f} TFLOP/s"
+    for n, pixels in FORWARD:
+        g = random_gaussians(n // options.shrink).to(device)
+        pixels = -(-pixels // options.shrink)
+        viewmat, K = view_camera(pixels)
+        camera = pack_camera(viewmat, K, pixels, pixels, NEAR).to(device)
+        tensors = [t.requires_grad_() for t in (g.means, g.quats, g.scales, g.opacities, g.sh)]
+        viewmats, Ks = viewmat[None].to(device), K[None].to(device)
+
+        def ours(g=g, camera=camera, pixels=pixels) -> torch.Tensor:
+            rgb, _, depth, *_ = rasterise_packed(g, camera, pixels, pixels)
+            return rgb.sum() + depth.sum()
+
+        def theirs(tensors=tensors, viewmats=viewmats, Ks=Ks, pixels=pixels) -> torch.Tensor:
+            return gsplat.rasterization(*tensors, viewmats, Ks, pixels, pixels, sh_degree=0, packed=False,
+                                        render_mode="RGB+ED")[0].sum()  # fmt: skip
+
+        with torch.no_grad():
+            forward = _times(ours, options.repeat, device), _times(theirs, options.repeat, device)
+            tests = count_pairs(g, camera, pixels, pixels) * TILE_SIZE**2
+        rows.append(_row("forward", g, pixels, *forward, OPERATIONS_PER_TEST * tests / rate))
+        yield str(rows[-1])
+        pulled = [lambda f=f, t=tensors: torch.autograd.grad(f(), t) for f in (ours, theirs)]
+        both = [_times(call, options.repeat, device) for call in pulled]
+        rows.append(_row("forward, backward", g, pixels, *both, None))
+        yield str(rows[-1])
+    bench.write_results(out, "raster", device, {"float32_rate": rate, "rows": [asdict(row) for row in rows]})
+
+
+def _row(
+    what: str, g: Gaussians, pixels: int, ours: tuple[float, float], theirs: tuple[float, float], floor: float | None
+) -> CudaRasterTiming:
+    share = None if floor is None else 1e3 * floor / ours[0]
+    return CudaRasterTiming(what, len(g), pixels, *ours, *theirs, share)
+
+
+def _times(call: Callable[[], object], repeat: int, device: str) -> tuple[float, float]:
+    """Time of a call in kernels, and wall time [ms]."""
+    call()
+    wall = 1e3 * bench.median_seconds(call, device, repeat)
+    with profile(activities=[ProfilerActivity.CUDA]) as profiler:
+        for _ in range(repeat):
+            call()
+        torch.cuda.synchronize(device)
+    kernels = sum(event.self_device_time_total for event in profiler.key_averages())
+    return kernels / repeat / 1e3, wall
+
+
+def _float32_rate(device: str, size: int = 8192) -> float:
+    """Operations per second of a matrix product in float32, without TF32."""
+    a, b = (torch.randn(size, size, device=device) for _ in range(2))
+    allowed = torch.backends.cuda.matmul.allow_tf32
+    torch.backends.cuda.matmul.allow_tf32 = False
+    try:
+        a @ b
+        return 2 * size**3 / bench.median_seconds(lambda: a @ b, device)
+    finally:
+        torch.backends.cuda.matmul.allow_tf32 = allowed

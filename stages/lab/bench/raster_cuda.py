@@ -1,9 +1,9 @@
 """Benchmark of the rasteriser on a GPU, compared with gsplat in the same run.
 
 The scenes are those of the CPU benchmark. Times are sums over kernels, since single calls are bound by their launches;
-wall times stand beside them. Compositing tests every pixel of a tile against every splat of its list, unless the splat's
-box misses the warp's pixels or the pixel is finished; the arithmetic of all these tests, 10 operations each, is given as
-a share of the rate of a float32 matrix product in the same run.
+wall times stand beside them. Compositing tests every pixel of a tile against every splat of its list, unless the
+splat's box misses the pixels of the warp or the pixel is finished. The arithmetic of all these tests, 10 operations each, is
+given as a share of the rate of a float32 matrix product in the same run.
 """
 
 from __future__ import annotations

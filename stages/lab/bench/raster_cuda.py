@@ -2,8 +2,8 @@
 
 The scenes are those of the CPU benchmark. Times are sums over kernels, since single calls are bound by their launches;
 wall times stand beside them. Compositing tests every pixel of a tile against every splat of its list, unless the
-splat's box misses the pixels of the warp or the pixel is finished. The arithmetic of all these tests, 10 operations each, is
-given as a share of the rate of a float32 matrix product in the same run.
+splat's box misses the pixels of the warp or the pixel is finished. The arithmetic of all these tests, 10 operations
+each, is given as a share of the rate of a float32 matrix product in the same run.
 """
 
 from __future__ import annotations

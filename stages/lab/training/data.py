@@ -104,11 +104,12 @@ class ClipSampler:
         starts = self.starts[row, torch.where(self.resting[row], frames, frames - horizon) - 1]
         which = (torch.rand(count, generator=generator, dtype=torch.float64) * starts).long()
         start = torch.searchsorted(self.starts[row], which[:, None], right=True)[:, 0]
-        return self.take(row[part].to(points.device), start[part].to(points.device), horizon)
+        return self.take(row[part], start[part], horizon)
 
     def take(self, row: Tensor, start: Tensor, horizon: int) -> MotionClip:
         """Clips of given scenes from given frames on; velocities are central differences, and 0 in frame 0."""
         points, dt = self.motions.points, self.motions.dt
+        row, start = row.to(points.device), start.to(points.device)
         frames = start[:, None] + torch.arange(1, horizon + 1, device=start.device)
         truth = points[row[:, None], frames.clamp_max(points.shape[1] - 1)]
         speed = (truth[:, 0] - points[row, (start - 1).clamp_min(0)]) / (2 * dt)

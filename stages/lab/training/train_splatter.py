@@ -187,16 +187,21 @@ def held_out_psnr(model: Pi3Splat, scene: PosedViews, options: SplatterOptions, 
     return float((-10 * error.clamp_min(1e-10).log10()).mean())
 
 
+def _autocast(device: torch.device) -> torch.autocast:
+    """The network runs in bfloat16 on a GPU; geometry needs single precision."""
+    return torch.autocast(device.type, torch.bfloat16, enabled=device.type != "cpu")
+
+
 def _drawn(model, views: PosedViews, sources: list[int], targets: list[int], options) -> tuple[Geometry, Rendering]:
     """3D points of the source views' pixels, and renders of their Gaussians in the target views."""
     device = views.images.device
     used = views[sources]
-    with torch.autocast(device.type, torch.bfloat16, enabled=device.type != "cpu"):
+    with _autocast(device):
         with torch.no_grad():
             hidden, positions = model.encoder.tokens(used.images, 8)
-        geometry = view_geometry(model, used, options, hidden, positions)
         raw = model.encoder.raw(used.images, hidden, positions, len(sources))
-    gaussians = splat(geometry, raw)[(geometry.points[..., 2] > 0).flatten()]
+    geometry = view_geometry(model, used, options, hidden, positions)
+    gaussians = splat(geometry, raw.float())[(geometry.points[..., 2] > 0).flatten()]
     size = views.images.shape[3], views.images.shape[2]
     white = torch.tensor(WHITE, device=device)
     return geometry, rasterise(gaussians, views.viewmats[targets], views.Ks[targets], *size, white)
@@ -208,11 +213,12 @@ def view_geometry(model, views: PosedViews, options: SplatterOptions, hidden=Non
     if options.depth == "given":
         depths = views.depths
     else:
-        if hidden is None:
-            hidden, positions = model.encoder.tokens(views.images, 8)
-        predicted = model.encoder.geometry(hidden, positions, views.images.shape[2:], 8)
-        scale = umeyama(predicted.poses[:, :3, 3].cpu(), centres(views.viewmats).cpu()).scale
-        depths = predicted.points[..., 2] * scale
+        with _autocast(views.images.device):
+            if hidden is None:
+                hidden, positions = model.encoder.tokens(views.images, 8)
+            predicted = model.encoder.geometry(hidden, positions, views.images.shape[2:], 8)
+        scale = umeyama(predicted.poses[:, :3, 3].float().cpu(), centres(views.viewmats).cpu()).scale
+        depths = predicted.points[..., 2].float() * scale
     local = [unproject(d, K, torch.eye(4).to(d))[1] for d, K in zip(depths, views.Ks, strict=True)]
     return Geometry(torch.stack(local), torch.ones_like(depths), torch.linalg.inv(views.viewmats))
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from typer import testing
 
 from stages.core.errors import MissingPackage
 from stages.core.geometry.cameras import intrinsics, orbit
@@ -43,6 +44,16 @@ def skipped_without_package() -> Iterator[None]:
         pytest.skip(str(cause))
 
 
+class CliRunner(testing.CliRunner):
+    """Runs commands; raises MissingPackage where that is why one failed, so that the test is skipped."""
+
+    def invoke(self, *args, **options):
+        done = super().invoke(*args, **options)
+        if isinstance(done.exception, SystemExit) and isinstance(done.exception.__context__, MissingPackage):
+            raise done.exception.__context__
+        return done
+
+
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_setup():
     with skipped_without_package():
@@ -55,9 +66,22 @@ def pytest_runtest_call():
         return (yield)
 
 
-@pytest.fixture(params=DEVICES)
+@pytest.fixture(scope="module", params=DEVICES)
 def device(request) -> str:
+    """The device of a test: also what `--device auto`, the default of every command, picks while the test runs.
+
+    Fixtures of a whole module run before that is arranged, and name the device to the commands that they call.
+    """
     return request.param
+
+
+@pytest.fixture(autouse=True)
+def auto_picks_the_device_of_the_test(request) -> Iterator[None]:
+    """No GPU is available to tests on the CPU."""
+    with pytest.MonkeyPatch.context() as patch:
+        if "device" in request.fixturenames and request.getfixturevalue("device") == "cpu":
+            patch.setattr(torch.cuda, "is_available", lambda: False)
+        yield
 
 
 @pytest.fixture

@@ -18,9 +18,9 @@ def example():
 
 
 @pytest.fixture(scope="module")
-def results(example, tmp_path_factory):
-    out = tmp_path_factory.mktemp("force_prompts")
-    return {name: example.compare(name, out, 25, keypoints=64, quality="draft") for name in example.PROMPTS}
+def results(example, tmp_path_factory, device):
+    out, quick = tmp_path_factory.mktemp("force_prompts"), {"keypoints": 64, "quality": "draft", "device": device}
+    return {name: example.compare(name, out, 25, **quick) for name in example.PROMPTS}
 
 
 @pytest.mark.parametrize("name", ["pillow", "cloth"])

@@ -13,6 +13,7 @@ from stages.simulate.stage import run
 from tests.conftest import two_balls_scene
 from tests.pipeline.test_commands import call
 
+pytestmark = pytest.mark.usefixtures("device")
 WRONG = [
     ("reconstruct", "{}/absent", "-o", "{}/o.ply"),
     ("reconstruct", "{}/empty", "-o", "{}/o.ply"),
@@ -52,7 +53,7 @@ WRONG = [
 
 
 @pytest.fixture(scope="module")
-def input_files(tmp_path_factory):
+def input_files(tmp_path_factory, device):
     """A valid scene and trajectory, and files that are absent, empty, truncated, or of another format."""
     folder = tmp_path_factory.mktemp("wrong")
     for name in ("empty", "damaged"):
@@ -64,7 +65,7 @@ def input_files(tmp_path_factory):
     for name in ("text.ply", "text.h5"):
         (folder / name).write_text("not the format of the suffix")
     write_scene(folder / "good.ply", two_balls_scene())
-    run(folder / "good.ply", folder / "good.h5", SimulateOptions(steps=3, quality="draft"))
+    run(folder / "good.ply", folder / "good.h5", SimulateOptions(steps=3, quality="draft", device=device))
     for kind in ("ply", "h5"):
         content = (folder / f"good.{kind}").read_bytes()
         (folder / f"cut.{kind}").write_bytes(content[: 2 * len(content) // 3])

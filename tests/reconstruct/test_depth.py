@@ -32,9 +32,9 @@ def block():
     return views, truth, sparse(cameras, truth)
 
 
-def test_consistent_depth_is_accurate(block):
+def test_consistent_depth_is_accurate(block, device):
     views, truth, model = block
-    maps = stereo.estimate_depth_maps(views, model, Plane(torch.tensor([0.0, 0, 1]), 0.0))
+    maps = stereo.estimate_depth_maps(views, model, Plane(torch.tensor([0.0, 0, 1]), 0.0), device)
     for found, true in zip(maps, truth, strict=True):
         consistent = found.support >= 2
         error = ((found.depth - true).abs() / true)[consistent]

@@ -56,7 +56,7 @@ class IdentityMatcher:
         return torch.arange(len(keypoints[0]))[:, None].expand(-1, 2)
 
 
-def test_learned_matches_only_for_pairs_with_few_sift_matches(monkeypatch):
+def test_learned_matches_only_for_pairs_with_few_sift_matches(monkeypatch, device):
     monkeypatch.setattr(features_learned, "_load", lambda network, name: IdentityMatcher())
     rng = torch.Generator().manual_seed(0)
     sift = torch.randint(0, 256, (features_learned.ENOUGH_SIFT_MATCHES, 128), generator=rng, dtype=torch.uint8)
@@ -66,45 +66,45 @@ def test_learned_matches_only_for_pairs_with_few_sift_matches(monkeypatch):
         return keypoints[: count + 7], sift[:count], learned
 
     enough, fewer = photo(len(sift)), photo(len(sift) - 1)
-    rows = features_learned.make_matcher([enough, enough], [(640, 480), (320, 240)], "cpu")(0, 1)
+    rows = features_learned.make_matcher([enough, enough], [(640, 480), (320, 240)], device)(0, 1)
     assert torch.equal(rows, torch.arange(len(sift))[:, None].expand(-1, 2))
-    rows = features_learned.make_matcher([enough, fewer], [(640, 480), (320, 240)], "cpu")(0, 1)
-    found = features.make_matcher([enough[:2], fewer[:2]], [], "cpu")(0, 1)
+    rows = features_learned.make_matcher([enough, fewer], [(640, 480), (320, 240)], device)(0, 1)
+    found = features.make_matcher([enough[:2], fewer[:2]], [], device)(0, 1)
     assert torch.equal(rows[:-7], found) and len(found) == len(fewer[1])
     assert torch.equal(rows[-7:], torch.stack([torch.arange(7) + len(enough[1]), torch.arange(7) + len(fewer[1])], 1))
 
 
 @pytest.mark.parametrize("shrink", [1, 2])
-def test_keypoints_lie_on_dark_spots(published, monkeypatch, shrink):
+def test_keypoints_lie_on_dark_spots(published, monkeypatch, shrink, device):
     """With pixel centres at +0.5, also in photos that are reduced for the network; aliked-n16 is 3 px off."""
     monkeypatch.setattr(features, "MAX_SIDE", 128)
     spots = shrink * torch.tensor([[40.3, 40.0], [80.0, 60.6], [64.0, 96.0], [30.0, 90.2], [100.0, 30.0]])
     at = torch.arange(128.0 * shrink) + 0.5
     square = (at - spots[:, :1]).square()[:, None] + (at - spots[:, 1:]).square()[:, :, None]
     grey = 1 - (-square / (2 * (2.0 * shrink) ** 2)).exp().sum(0).clamp(max=1)
-    network = features_learned._load(ALIKED(), "aliked")
-    keypoints, _ = features_learned._learned(network, as_bytes(grey[..., None].repeat(1, 1, 3)).numpy(), "cpu")
+    network = features_learned._load(ALIKED(), "aliked").to(device)
+    keypoints, _ = features_learned._learned(network, as_bytes(grey[..., None].repeat(1, 1, 3)).numpy(), device)
     off = torch.cdist(spots, keypoints).min(1).values / shrink
     assert off.max() < 1 and off.median() < 0.75
 
 
-def test_keypoints_are_rotation_invariant(published):
+def test_keypoints_are_rotation_invariant(published, device):
     """With aliked-n16 no keypoint is repeated."""
     image = as_bytes(photograph(arc(1, (320, 240)), 0)[0])
-    network = features_learned._load(ALIKED(), "aliked")
-    keypoints, _ = features_learned._learned(network, image.numpy(), "cpu")
-    rotated, _ = features_learned._learned(network, image.flip(0, 1).contiguous().numpy(), "cpu")
+    network = features_learned._load(ALIKED(), "aliked").to(device)
+    keypoints, _ = features_learned._learned(network, image.numpy(), device)
+    rotated, _ = features_learned._learned(network, image.flip(0, 1).contiguous().numpy(), device)
     off = torch.cdist(keypoints[:200], torch.tensor([320.0, 240.0]) - rotated).min(1).values
     assert (off < 2).float().mean() > 0.7
 
 
-def test_matches_agree_with_true_depth(published, monkeypatch):
+def test_matches_agree_with_true_depth(published, monkeypatch, device):
     """Views 40 degrees apart: median error below 0.6 px; 1.1 px with aliked-n16."""
     monkeypatch.setattr(features_learned, "MAX_FEATURES", 400)
     cameras = arc(2, (320, 240), sweep=40.0)
     (first, depth), (second, _) = (photograph(cameras, i) for i in range(2))
-    network = features_learned._load(ALIKED(), "aliked")
-    found = [features_learned._learned(network, as_bytes(image).numpy(), "cpu") for image in (first, second)]
+    network = features_learned._load(ALIKED(), "aliked").to(device)
+    found = [features_learned._learned(network, as_bytes(image).numpy(), device) for image in (first, second)]
     glue = features_learned._load(LightGlue(), "lightglue")
     rows = glue.match(*zip(*found, strict=True), ((320, 240), (320, 240)))
     a, b = found[0][0][rows[:, 0]], found[1][0][rows[:, 1]]

@@ -85,12 +85,12 @@ def test_interpolated_depth_continues_known_depth():
     torch.testing.assert_close(initialise.interpolate_depth(depth, known), torch.full((32, 48), 2.0), rtol=1e-3, atol=0)
 
 
-def test_only_uncovered_pixels_are_filled(block):
+def test_only_uncovered_pixels_are_filled(block, device):
     known = torch.arange(80) < 40
     maps = [DepthMap(m.depth, m.support.where(known, torch.zeros_like(m.support))) for m in block.maps]
     half = DepthViews(block.views, maps, 1)
     cloud = initialise.fuse(half)
-    more = initialise.fill_unmatched(half, cloud, None, far=5.0)
+    more = initialise.fill_unmatched(half, cloud, None, far=5.0, device=device)
     assert len(more) > 50
     for i in range(3):
         before, after = (

@@ -7,6 +7,7 @@ import torch
 import torch.nn.functional as F
 from safetensors.torch import save_file
 
+from stages.core.backends import pick_device
 from stages.core.errors import InputError
 from stages.core.geometry.cameras import centres
 from stages.core.geometry.similarity import umeyama
@@ -25,6 +26,7 @@ from tests.core.models.pi3.test_splat import TINY_SPLAT
 from tests.reconstruct.oracle import photos_of, true_splats, truth
 from tests.reconstruct.raycast import BLOCK, arc, write_set
 
+pytestmark = pytest.mark.usefixtures("device")
 SIZE = (112, 84)  # multiples of the patch size, so that photos are not resized
 
 
@@ -53,8 +55,8 @@ def assembled(tmp_path, count=4, splats=False, noise=0.0, **given):
         geometry = dataclasses.replace(geometry, points=geometry.points * factor[..., None])
     raw = true_splats(photos, SIZE, geometry, float(cameras.Ks[0, 0, 0])) if splats else None
     options = ReconstructOptions(**{"quality": "draft", **given})
-    made = learned.assemble(photos, list(photos.images), NetworkOutput(geometry, raw), options, StepCache(), "cpu")
-    return made, cameras
+    output, device = NetworkOutput(geometry, raw), pick_device(options.device)
+    return learned.assemble(photos, list(photos.images), output, options, StepCache(), device), cameras
 
 
 def to_truth(made, cameras):

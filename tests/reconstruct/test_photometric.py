@@ -30,9 +30,9 @@ def target() -> tuple[Gaussians, Views]:
 def test_wrong_colours_are_corrected(target, device):
     true, views = target
     start = replace(true, sh=true.sh + 1)
-    before, _ = photometric.score_views(start, views, list(range(6)))
+    before, _ = photometric.score_views(start, views, list(range(6)), device)
     fitted = photometric.fit_gaussians(start, views, FitOptions(150, 2.0, device=device))
-    after, _ = photometric.score_views(fitted, views, list(range(6)))
+    after, _ = photometric.score_views(fitted, views, list(range(6)), device)
     assert after > before + 6
 
 
@@ -64,38 +64,40 @@ def test_captured_steps_equal_single_steps(target):
     assert abs(mine - before) > 1 and abs(mine - theirs) < 0.05
 
 
-def test_scores_with_fitted_exposure(target):
+def test_scores_with_fitted_exposure(target, device):
     """Photos 0.8 times as bright lose more than 15 dB, which a fitted exposure recovers."""
     true, views = target
     dark = replace(views, images=tuple((0.8 * image.float()).round().to(torch.uint8) for image in views.images))
-    exact, _ = photometric.score_views(true, views, [0, 1])
-    raw, _ = photometric.score_views(true, dark, [0, 1])
-    fitted, _ = photometric.score_views(true, dark, [0, 1], exposed=True)
+    exact, _ = photometric.score_views(true, views, [0, 1], device)
+    raw, _ = photometric.score_views(true, dark, [0, 1], device)
+    fitted, _ = photometric.score_views(true, dark, [0, 1], device, exposed=True)
     assert raw < 30 < 45 < fitted and exact > 45
 
 
-def test_darker_photo_gets_lower_exposure(target):
+def test_darker_photo_gets_lower_exposure(target, device):
     true, views = target
     images = list(views.images)
     images[0] = (images[0].float() * 0.6).to(torch.uint8)
-    fit = photometric._Fit.start(true, len(views), 2.0)
-    (group,) = photometric._targets(Views(tuple(images), views.cameras), (), 2.0, "cpu")
+    fit = photometric._Fit.start(true.to(device), len(views), 2.0)
+    (group,) = photometric._targets(Views(tuple(images), views.cameras), (), 2.0, device)
+    black = torch.zeros(1, device=device)
     for _ in range(100):
         for view in (0, 3):
-            photometric._descend(fit, group, torch.tensor([view]), torch.zeros(1), means_rate=0.0)
+            photometric._descend(fit, group, torch.tensor([view], device=device), black, means_rate=0.0)
     gains = group.exposures @ fit.values["gains"].detach()
     assert float(gains[0].mean()) < float(gains[3].mean())
 
 
-def test_scale_regularisation_shrinks_invisible_gaussians_only_in_size(target):
+def test_scale_regularisation_shrinks_invisible_gaussians_only_in_size(target, device):
     """The last Gaussian is behind all cameras."""
     true, views = target
     unseen = replace(true[[0]], means=torch.tensor([[0.0, 0, 60.0]]))
-    fit = photometric._Fit.start(concatenate([true, unseen]), len(views), 2.0)
-    (group,) = photometric._targets(views, (), 2.0, "cpu")
+    fit = photometric._Fit.start(concatenate([true, unseen]).to(device), len(views), 2.0)
+    (group,) = photometric._targets(views, (), 2.0, device)
+    first, black = torch.tensor([0], device=device), torch.zeros(1, device=device)
     for _ in range(20):
-        photometric._descend(fit, group, torch.tensor([0]), torch.zeros(1), means_rate=1e-4)
-    after = fit.gaussians()
+        photometric._descend(fit, group, first, black, means_rate=1e-4)
+    after = fit.gaussians().to("cpu")
     assert (after.scales[-1] < 0.95 * unseen.scales).all()
     torch.testing.assert_close(after.opacities[-1:], unseen.opacities)
 
@@ -119,7 +121,7 @@ def test_exposure_projection_for_few_photos(count):
     assert projection.isfinite().all() and round(float(projection.trace())) == count - 1 - count // 4
 
 
-def test_invisible_and_transparent_gaussians_are_pruned():
+def test_invisible_and_transparent_gaussians_are_pruned(device):
     true = random_gaussians(60, seed=2)
     cameras = ring(4, 48)
     views = photographed(true, cameras)
@@ -128,18 +130,18 @@ def test_invisible_and_transparent_gaussians_are_pruned():
     opacities = true.opacities.clone()
     opacities[5:10] = 1e-3
     start = Gaussians(means, true.quats, true.scales, opacities, true.sh, true.object_id)
-    done = photometric.fit_gaussians(start, views, FitOptions(5, 2.0))
+    done = photometric.fit_gaussians(start, views, FitOptions(5, 2.0, device=device))
     assert len(done) <= 50
     assert done.means[:, 2].max() < 10
 
 
-def test_split_halves_are_symmetric_and_smaller():
+def test_split_halves_are_symmetric_and_smaller(device):
     start = random_gaussians(100, seed=3)
-    fit = photometric._Fit.start(start, 1, 1.0)
+    fit = photometric._Fit.start(start.to(device), 1, 1.0)
     size = fit.values["scales"].detach().exp().max(1).values
     fit.gradients[7] = 1 / size[7]
     photometric._split(fit, torch.Generator().manual_seed(0))
-    after = fit.gaussians()
+    after = fit.gaussians().to("cpu")
     count = int(photometric.DENSITY.split_fraction * 100)
     assert len(after) == 100 + count
     torch.testing.assert_close((after.means[7] + after.means[100]) / 2, start.means[7], rtol=1e-4, atol=1e-5)

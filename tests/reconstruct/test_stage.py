@@ -51,22 +51,24 @@ def reconstruct_set(folder: Path, cameras: Cameras, preset: dict, **options) -> 
     return Run(folder, chosen, report, read_scene(folder / "scene.ply"), stdout.getvalue(), log.getvalue())
 
 
-SMALL = {"gaussians": 2000, "iterations": 5}
+pytestmark = pytest.mark.usefixtures("device")
+SMALL = {"gaussians": 2000, "iterations": 5, "iterations_cuda": 5}
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory) -> Run:
+def made(tmp_path_factory, device) -> Run:
     """Seven photos, every third held out, with enough iterations to be judged."""
-    preset = {"gaussians": 6000, "iterations": 120}
-    return reconstruct_set(tmp_path_factory.mktemp("set"), arc(7, (160, 120), sweep=70.0), preset, holdout=3)
+    preset, cameras = {"gaussians": 6000, "iterations": 120, "iterations_cuda": 120}, arc(7, (160, 120), sweep=70.0)
+    return reconstruct_set(tmp_path_factory.mktemp("set"), cameras, preset, holdout=3, device=device)
 
 
 @pytest.fixture(scope="module")
-def small(tmp_path_factory) -> Run:
+def small(tmp_path_factory, device) -> Run:
     """Four small photos with a scale reference and hardly any iterations."""
     reference = "photos=photo_00.png,photo_03.png distance=0.25"
     cameras = arc(4, (96, 72), sweep=40.0)
-    return reconstruct_set(tmp_path_factory.mktemp("small"), cameras, SMALL, scale_reference=reference)
+    folder = tmp_path_factory.mktemp("small")
+    return reconstruct_set(folder, cameras, SMALL, scale_reference=reference, device=device)
 
 
 @pytest.fixture

@@ -31,6 +31,7 @@ from tests.refine.sample_objects import asymmetric_object
 from tests.segment.tabletop import coloured_gaussians, scene_of, table_gaussians
 
 SIDE = 128
+pytestmark = pytest.mark.usefixtures("device")
 PLACE = Similarity(0.3, matrix(torch.tensor([0.9, 0.0, 0.0, 0.4])), torch.tensor([0.02, -0.03, 0.04]))
 OFF = Similarity(0.94, matrix(torch.tensor([1.0, 0.02, -0.03, 0.02])), torch.tensor([0.03, -0.02, 0.03]))  # 5 degrees
 
@@ -79,10 +80,10 @@ def perfect(seen, truth):
 
 
 @pytest.fixture(scope="module")
-def whole(seen, perfect) -> Scene:
+def whole(seen, perfect, device) -> Scene:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(diffsplat, "_model", lambda *_: perfect)
-        return refine(seen, RefineOptions(completer="diffsplat", background=False, keep_raw=True))
+        return refine(seen, RefineOptions(completer="diffsplat", background=False, keep_raw=True, device=device))
 
 
 def test_unseen_side_is_completed(seen, whole, truth):

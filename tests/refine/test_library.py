@@ -27,6 +27,7 @@ from tests.segment.tabletop import coloured_gaussians, scene_of, table_gaussians
 
 SIZE, TURN = 0.3, matrix(torch.tensor([0.9, 0.0, 0.0, 0.4]))
 PLACE = Similarity(SIZE, TURN, torch.tensor([0.02, -0.03, 0.1 * SIZE]))
+pytestmark = pytest.mark.usefixtures("device")
 DARK = 0.85  # brightness of the object in the photos, relative to the library
 
 
@@ -64,8 +65,8 @@ def folder(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def whole(seen, folder) -> Scene:
-    return refine(seen, RefineOptions(library=folder, background=False, keep_raw=True))
+def whole(seen, folder, device) -> Scene:
+    return refine(seen, RefineOptions(library=folder, background=False, keep_raw=True, device=device))
 
 
 def test_unseen_side_is_completed(seen, whole, truth):

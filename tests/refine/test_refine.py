@@ -28,6 +28,7 @@ from tests.conftest import random_gaussians
 from tests.segment.tabletop import WOOD, block, coloured_gaussians, orbit_cameras, scene_of, table_gaussians
 
 SIDES = (0.2, 0.16, 0.12)
+pytestmark = pytest.mark.usefixtures("device")
 REMAINS = {-0.035: (0.8, 0.7, 0.1), 0.035: (0.08, 0.08, 0.08)}  # y [m]: colour
 
 
@@ -55,8 +56,8 @@ def before() -> Scene:
 
 
 @pytest.fixture(scope="module")
-def after(before) -> Scene:
-    return refine(before)
+def after(before, device) -> Scene:
+    return refine(before, RefineOptions(device=device))
 
 
 def seen(scene: Scene, eye: tuple, keep: int, target: tuple = (0.0, 0, 0)):

@@ -1,20 +1,15 @@
-"""Runs every test of this folder on each device present: the CPU and, if there is one, a GPU."""
+"""Runs every test of this folder on each device."""
 
 import pytest
 
 from stages.render.options import RenderOptions
-from tests.conftest import DEVICES
-
-_current = {"device": "cpu"}
 
 
-@pytest.fixture(params=DEVICES, autouse=True)
-def render_device(request):
-    """The device that `render_options` selects during a test."""
-    _current["device"] = request.param
-    return request.param
+@pytest.fixture(autouse=True)
+def on_each_device(device):
+    """`render_options` leave --device at auto, which is the device of the test."""
 
 
 def render_options(**choices) -> RenderOptions:
-    """Options for small images, on the device of the test."""
-    return RenderOptions(**{"resolution": 96, **_current, **choices})
+    """Options for small images."""
+    return RenderOptions(**{"resolution": 96, **choices})

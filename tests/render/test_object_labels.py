@@ -33,10 +33,10 @@ def test_label_ignores_thin_parts_and_is_inside_the_object():
     assert ring[y, x]
 
 
-def test_ids_are_those_of_the_front_most_objects(two_balls, render_device):
-    ids = visible_ids(two_balls.gaussians.to(render_device), two_balls.cameras, 0)
+def test_ids_are_those_of_the_front_most_objects(two_balls, device):
+    ids = visible_ids(two_balls.gaussians.to(device), two_balls.cameras, 0)
     assert ids.shape == (64, 64) and ids.unique().tolist() == [0, 1, 2]
-    behind = two_balls.gaussians[two_balls.gaussians.object_id != 1].to(render_device)
+    behind = two_balls.gaussians[two_balls.gaussians.object_id != 1].to(device)
     assert 1 not in visible_ids(behind, two_balls.cameras, 0)
 
 

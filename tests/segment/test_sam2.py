@@ -17,6 +17,7 @@ from stages.segment.stage import run
 from stages.segment.view_images import render_view, view_images
 
 pytest.importorskip("transformers")
+pytestmark = pytest.mark.usefixtures("device")
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -20,6 +20,8 @@ from stages.segment.voting import damp_votes, majority_labels, pool_votes, remov
 from tests.conftest import random_gaussians
 from tests.segment.tabletop import best_overlap
 
+pytestmark = pytest.mark.usefixtures("device")
+
 
 def true_masks(scene):
     """A label image for each camera: the object that each pixel shows."""

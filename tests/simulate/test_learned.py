@@ -20,6 +20,8 @@ from stages.simulate.options import SimulateOptions
 from stages.simulate.stage import run
 from tests.conftest import ball
 
+pytestmark = pytest.mark.usefixtures("device")
+
 
 @pytest.fixture(scope="module")
 def untrained(tmp_path_factory):

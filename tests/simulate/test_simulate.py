@@ -25,6 +25,7 @@ from tests.segment.tabletop import three_apart
 # A ball of 9 kg in point contact indents by 5 mm (Hertz), twice that when set down suddenly, and by a few tenths of a
 # cell (here 5 cm) until enough particles carry it.
 SAG = 0.025
+pytestmark = pytest.mark.usefixtures("device")
 
 
 @pytest.fixture(autouse=True)
@@ -228,9 +229,8 @@ def test_objects_of_a_scene_without_labels_are_those_of_segment(tmp_path):
     assert found.objects == labelled.objects and len(found.objects) == 3
 
 
-@pytest.mark.gpu
-def test_gpu_agrees_with_cpu(balls):
-    if not torch.cuda.is_available():
+def test_gpu_agrees_with_cpu(balls, device):
+    if device == "cpu":
         pytest.skip("needs an NVIDIA GPU")
     cpu, gpu = roll(balls, device="cpu"), roll(balls, device="cuda", quality="normal")
     assert mean_shift(gpu, 1).norm() < SAG

@@ -161,8 +161,6 @@ def test_gsplat_agrees_on_a_large_scene():
 
 @pytest.mark.gpu
 def test_a_gpu_draws_where_no_kernel_can_be_compiled_for_the_cpu(monkeypatch):
-    if not torch.cuda.is_available():
-        pytest.skip("needs an NVIDIA GPU")
     g, cameras = random_gaussians(300, seed=1), ring(1, 48)
     view, one = (cameras.viewmats, cameras.Ks, 48, 48), (cameras.viewmats[0], cameras.Ks[0], 48, 48)
     weight = torch.randn(1, 48, 48, 3, generator=torch.Generator().manual_seed(0))

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 from scipy import ndimage
-from typer.testing import CliRunner
 
 from ngff_cli.lab import app
 from stages.core.errors import InputError
@@ -30,6 +29,7 @@ from stages.lab.assets.field_sampling import (
 from stages.lab.assets.objects import OBJECTS, POINT_CLOUD, make_object
 from stages.lab.assets.shapes import Surface, to_gaussians
 from stages.lab.assets.splat_files import camera_rows
+from tests.conftest import CliRunner
 from tests.lab.small_world import shrink
 
 

@@ -5,7 +5,6 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
-from typer.testing import CliRunner
 
 from ngff_cli.lab import app
 from stages.core.errors import InputError
@@ -15,6 +14,7 @@ from stages.core.raster.rasterise import rasterise
 from stages.core.scene.scene_ply import read_scene
 from stages.lab.assets.background_paint import line_distance, voronoi_cells
 from stages.lab.assets.backgrounds import BACKGROUND_PLY, BACKGROUNDS, ROOM_HALF_WIDTH, make_background
+from tests.conftest import CliRunner
 
 NAMES = list(BACKGROUNDS)
 

@@ -5,7 +5,6 @@ import json
 import pytest
 import torch
 from torch.testing import assert_close
-from typer.testing import CliRunner
 
 from ngff_cli.lab import app
 from stages.core.errors import InputError
@@ -18,6 +17,7 @@ from stages.lab.bench.ablation import AblationBenchOptions, run
 from stages.lab.dataset.keypoint_motions import write_motions
 from stages.lab.training.ablation import ABLATIONS, IMPULSE_VECTORS
 from stages.lab.training.train import TrainOptions
+from tests.conftest import CliRunner
 from tests.lab.training.test_train import falling
 
 DT = 0.02

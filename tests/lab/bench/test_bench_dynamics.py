@@ -9,7 +9,6 @@ import cv2
 import pytest
 import torch
 from torch.testing import assert_close
-from typer.testing import CliRunner
 
 from ngff_cli.lab import app
 from stages.core.errors import InputError
@@ -45,6 +44,7 @@ from stages.lab.dataset.object_particles import Asset, particle_volumes
 from stages.lab.dataset.scene_configs import SceneConfig, write_scene_configs
 from stages.lab.dataset.simulation import SimulationSettings, simulate
 from stages.lab.plot import LEGEND_HEIGHT, PANEL_HEIGHT, PANEL_WIDTH
+from tests.conftest import CliRunner
 from tests.lab.small_world import COARSE, box_shell
 from tests.lab.training.test_train import falling, without_last
 

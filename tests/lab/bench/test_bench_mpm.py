@@ -37,17 +37,17 @@ def test_scenes_have_the_requested_particles_eight_per_cell(particles):
     assert bool((one.x > low).all() and (one.x < high).all())
 
 
-def test_report_has_ratios_and_the_machine(monkeypatch):
+def test_report_has_ratios_and_the_machine(monkeypatch, device):
     monkeypatch.setattr(bench_mpm.bench, "copy_bandwidth", lambda device: 1e10)
-    lines = list(bench_mpm.run(MpmBenchOptions("cpu", (400,), scenes=2, frames=1)))
+    lines = list(bench_mpm.run(MpmBenchOptions(device, (400,), scenes=2, frames=1)))
     assert "torch" in lines[0] and "10 GB/s" in lines[1] and len(lines) == 5
     assert sum("mpm exact" in line for line in lines) == 1
     for line in lines[2:]:
         assert "us a substep" in line and "scenes a minute" in line and "the speed of the three-kernel form" in line
 
 
-def test_the_figures_follow_from_each_other():
-    r = bench_mpm.measure(400, 2, "cpu", 1)
+def test_the_figures_follow_from_each_other(device):
+    r = bench_mpm.measure(400, 2, device, 1)
     count = 2 * r["particles"]
     assert r["ns_per_particle"] == pytest.approx(1e3 * r["substep_us"] / count)
     assert r["scenes_per_minute"] == pytest.approx(2 * 60 / (r["substep_us"] * 1e-6 * 200 * 100))

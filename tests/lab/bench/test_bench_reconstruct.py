@@ -109,6 +109,7 @@ def test_failures_have_a_row_and_matchers_separate_rows(tmp_path, monkeypatch):
 
 
 def test_cameras_alone_are_compared_with_references(tmp_path, monkeypatch):
+    pytest.importorskip("pycolmap")
     write_set(tmp_path / "set", arc(4, (240, 180), sweep=40.0)).rename(tmp_path / "set" / "cameras.json")
     monkeypatch.setattr(bench, "measure_in_subprocess", bench.measure)
     lines = list(

@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from typer.testing import CliRunner
 
 from ngff_cli.lab import app
 from stages.core.errors import InputError
@@ -23,6 +22,7 @@ from stages.lab.bench import chat_completions
 from stages.lab.bench import estimate_materials as estimate
 from stages.lab.bench.dynamics_baselines import VLM_MATERIALS
 from stages.lab.bench.estimate_materials import RANGES, EstimateOptions, InvalidReply, parse_reply, run, sample_frames
+from tests.conftest import CliRunner
 
 GOOD = {"duck": {"material": "rubber", "E": 3e5, "density": 300}, "ball": {"material": "foam", "E": 1e5, "density": 50}}
 KEY = "not-a-real-key"

@@ -46,6 +46,7 @@ def test_grid_nodes_match_the_public_solver():
     torch.testing.assert_close(at[1], torch.full((3,), 197.0), rtol=0, atol=1e-4)
 
 
+@pytest.mark.usefixtures("device")
 def test_output_is_a_recording(tmp_path):
     np.savez(tmp_path / "a.npz", **small())
     lines = list(replay.run(tmp_path / "a.npz", tmp_path / "ours.npz", replay.ReplayOptions()))

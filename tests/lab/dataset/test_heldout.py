@@ -5,7 +5,6 @@ import json
 import h5py
 import pytest
 import torch
-from typer.testing import CliRunner
 
 from ngff_cli.lab import app
 from stages.core.errors import InputError
@@ -19,6 +18,7 @@ from stages.lab.dataset.heldout import HeldoutOptions, load_shape_assets, rotate
 from stages.lab.dataset.keypoint_motions import read_motions
 from stages.lab.dataset.object_particles import Asset, Discretisation, particle_volumes
 from stages.lab.dataset.scene_configs import EXTRA_GROUPS, HELDOUT, parse_groups, read_scene_configs
+from tests.conftest import CliRunner
 
 DISCRETISATION = Discretisation(dx=0.1, spacing=0.06, substep=5e-4)
 COARSE = {"keypoints": 40, "dx": 0.1, "spacing": 0.06, "substep": 5e-4, "frames": 3}

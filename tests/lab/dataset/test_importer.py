@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 from plyfile import PlyData, PlyElement
-from typer.testing import CliRunner
 
 from ngff_cli.app import app as ngff
 from ngff_cli.lab import app as lab
@@ -17,6 +16,7 @@ from stages.core.geometry.rotations import matrix
 from stages.core.physics.skinning import Skinning
 from stages.core.scene.trajectory import read_trajectory
 from stages.lab.dataset import generate, importer
+from tests.conftest import CliRunner
 from tests.lab.small_world import OPTIONS, shrink
 
 DUCK, PHONE, FRAMES = 60, 40, 5

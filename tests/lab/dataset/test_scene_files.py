@@ -30,12 +30,17 @@ SHAPES = {"pos": (3,), "cov3D": (6,), "rot": (3, 3)}
 
 
 @pytest.fixture(scope="module")
-def data(tmp_path_factory):
+def options(device) -> DatasetOptions:
+    return replace(OPTIONS, device=device)
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory, options):
     """All parts of two small scenes."""
     with pytest.MonkeyPatch.context() as patch:
         shrink(patch.setattr, patch.setitem)
         root = tmp_path_factory.mktemp("data")
-        generate.run(root, OPTIONS)
+        generate.run(root, options)
         yield root
 
 
@@ -133,7 +138,7 @@ def test_videos_cameras_prompts_and_depth(data):
     assert nearest - 0.6 < depth[0, v, u] < 5.5
 
 
-def test_checksums_are_listed_and_settings_must_stay(data, capsys):
+def test_checksums_are_listed_and_settings_must_stay(data, capsys, options):
     generate.check(data)
     assert "files, all unchanged" in capsys.readouterr().out
     listed = sorted(line for path in (data / "sums").iterdir() for line in path.read_text().splitlines())
@@ -141,10 +146,10 @@ def test_checksums_are_listed_and_settings_must_stay(data, capsys):
     done = subprocess.run(f"sha256sum --quiet -c {data}/sums/*.sha256", cwd=data, shell=True, capture_output=True)
     assert done.returncode == 0, done.stderr
     with pytest.raises(InputError, match="was started with frames 3, not 4"):
-        generate.run(data, replace(OPTIONS, frames=4))
+        generate.run(data, replace(options, frames=4))
 
 
-def test_damaged_files_are_found_and_repaired(data):
+def test_damaged_files_are_found_and_repaired(data, options):
     victim = next((data / "mpm").rglob("0001.h5"))
     before = digests(data)
     whole = victim.read_bytes()
@@ -157,21 +162,22 @@ def test_damaged_files_are_found_and_repaired(data):
     next((data / "dynamic").rglob("*.mp4")).unlink()
     with pytest.raises(InputError, match="is missing"):
         generate.check(data)
-    generate.run(data, OPTIONS)
+    generate.run(data, options)
     assert digests(data) == before  # although only one scene was simulated again
 
 
-def test_killed_run_resumes_to_the_same_bytes(data, tmp_path):
+def test_killed_run_resumes_to_the_same_bytes(data, tmp_path, options):
+    part = f"replace(OPTIONS, only='scenes,mpm', device={options.device!r})"
     code = ("from dataclasses import replace; from pathlib import Path; from stages.lab.dataset import generate\n"
             "from tests.lab.small_world import OPTIONS, shrink_process; shrink_process()\n"
-            f"generate.run(Path({str(tmp_path)!r}), replace(OPTIONS, only='scenes,mpm'))")  # fmt: skip
+            f"generate.run(Path({str(tmp_path)!r}), {part})")  # fmt: skip
     process = subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.DEVNULL)
     while process.poll() is None and not list(tmp_path.glob("mpm/3_9/.part-*/0000.h5")):
         time.sleep(0.002)
     process.kill()
     process.wait()
     assert not (tmp_path / "sums" / "3_9.sha256").exists()  # the group was not complete
-    generate.run(tmp_path, replace(OPTIONS, only="scenes,mpm"))
+    generate.run(tmp_path, replace(options, only="scenes,mpm"))
     files = {n: d for n, d in digests(tmp_path).items() if n.startswith(("scene", "mpm", "objects"))}
     whole = digests(data)
     assert files == {n: whole.get(n) for n in files} and len(list((tmp_path / "mpm" / "3_9").iterdir())) == 2

@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import pytest
 import torch
-from typer.testing import CliRunner
 
 from ngff_cli.lab import app
 from stages.core.errors import InputError
 from stages.lab.dataset import scene_statistics, sensitivity
 from stages.lab.dataset.keypoint_motions import KeypointMotions, concatenate_motions, write_motions
 from stages.lab.dataset.scene_statistics import compute_statistics
+from tests.conftest import CliRunner
 
 T, N = 20, 300
 BOX = ((-1.94, -1.94, -0.94), (1.94, 1.94, 2.94))

@@ -2,13 +2,13 @@
 
 import pytest
 import torch
-from typer.testing import CliRunner
 
 from ngff_cli.lab import app
 from stages.core.errors import InputError
 from stages.core.models.checkpoints import build, load, save
 from stages.lab.training.average import run
 from stages.lab.training.history import runs_of, total_minutes
+from tests.conftest import CliRunner
 
 
 def trained(path, seed, of="ngff", runs=()):

@@ -3,7 +3,6 @@ from pathlib import Path
 
 import cv2
 import pytest
-from typer.testing import CliRunner
 
 from ngff_cli.lab import app
 from stages import lab
@@ -11,6 +10,7 @@ from stages.core.errors import InputError
 from stages.core.models.checkpoints import SHIPPED, build, load, save
 from stages.lab.plot import LEGEND_HEIGHT, PANEL_HEIGHT, PANEL_WIDTH
 from stages.lab.training.card import run
+from tests.conftest import CliRunner
 
 CURVES = {"runs": [{"minutes": 1.0}], "curve": {"minutes": [], "loss": [], "RMSE": [], "R": []}}
 

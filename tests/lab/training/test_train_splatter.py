@@ -46,7 +46,8 @@ def folder(tmp_path):
     return tmp_path / "data"
 
 
-QUICK = SplatterOptions(steps=20, views=2, side=28, depth="given", width=16, lr=1e-2, device="cpu")
+QUICK = SplatterOptions(steps=20, views=2, side=28, depth="given", width=16, lr=1e-2)
+pytestmark = pytest.mark.usefixtures("device")
 
 
 def test_held_out_views_improve_and_only_the_head_changes(folder, tmp_path):
@@ -63,12 +64,13 @@ def test_held_out_views_improve_and_only_the_head_changes(folder, tmp_path):
     assert changed and all(name.startswith("encoder.feature_") for name in changed)
 
 
-def test_weights_serve_reconstruct_and_further_training(folder, tmp_path):
+def test_weights_serve_reconstruct_and_further_training(folder, tmp_path, device):
     list(run(folder, tmp_path / "w.safetensors", dataclasses.replace(QUICK, steps=4)))
-    model = load(tmp_path / "w.safetensors", "pi3-splat")
+    model = load(tmp_path / "w.safetensors", "pi3-splat").to(device)
     scene = read_training_scenes(folder, QUICK.side)[0]
     again, fresh = load_network(tmp_path / "w.safetensors", dataclasses.replace(QUICK, width=0))
-    assert not fresh and held_out_psnr(again, scene, QUICK, "cpu") == held_out_psnr(model, scene, QUICK, "cpu")
+    ours, theirs = (held_out_psnr(network, scene, QUICK, device) for network in (again.to(device), model))
+    assert not fresh and ours == theirs
 
 
 def test_pi3_weights_get_an_untrained_head(tmp_path):
@@ -80,10 +82,10 @@ def test_pi3_weights_get_an_untrained_head(tmp_path):
     assert frozen.isdisjoint({"feature_decoder", "feature_head"}) and {"encoder", "decoder", "point_head"} <= frozen
 
 
-def test_true_depth_gives_points_on_the_surface():
-    scene = render_views("balls", dataclasses.replace(two_balls_scene(), cameras=ring(8, 64, 0.1)), 56)
-    geometry = view_geometry(None, scene, QUICK)
-    world = geometry.points @ geometry.poses[:, None, :3, :3].mT + geometry.poses[:, None, None, :3, 3]
+def test_true_depth_gives_points_on_the_surface(device):
+    scene = render_views("balls", dataclasses.replace(two_balls_scene(), cameras=ring(8, 64, 0.1)), 56, device)
+    geometry = view_geometry(None, scene.to(device), QUICK)
+    world = (geometry.points @ geometry.poses[:, None, :3, :3].mT + geometry.poses[:, None, None, :3, 3]).cpu()
     known = scene.depths > 0
     assert known.float().mean() > 0.5
     on_floor = world[known][:, 2].abs() < 0.025  # drawn depth is that of the centres of discs 4 cm wide
@@ -126,12 +128,13 @@ def test_predicted_depth_is_scaled_to_the_given_cameras():
     torch.testing.assert_close(geometry.poses, torch.linalg.inv(cameras.viewmats))
 
 
-def test_photos_train_the_head_at_predicted_depth():
+def test_photos_train_the_head_at_predicted_depth(device):
     cameras = arc(4, (56, 42))
     images = torch.stack([photograph(cameras, i)[0] for i in range(4)]).permute(0, 3, 1, 2)
     options = dataclasses.replace(QUICK, depth="network")
     torch.manual_seed(0)
     model, _ = load_network(None, options)
-    step_loss(model, PosedViews("table", images, cameras.viewmats, cameras.Ks, None), options).backward()
+    views = PosedViews("table", images, cameras.viewmats, cameras.Ks, None)
+    step_loss(model.to(device), views.to(device), options).backward()
     assert model.encoder.feature_head.down_proj.weight.grad.isfinite().all()
     assert all(p.grad is None for name, p in model.encoder.named_parameters() if not name.startswith("feature_"))

@@ -13,8 +13,8 @@ def folder(tmp_path_factory):
     return save_tiny_model(tmp_path_factory.mktemp("weights") / "diffsplat")
 
 
-@pytest.fixture(scope="session")
-def model(folder):
+@pytest.fixture(scope="module")
+def model(folder, device):
     from stages.core.models.diffsplat.weights import find, load
 
-    return load(find(folder))
+    return load(find(folder), device)

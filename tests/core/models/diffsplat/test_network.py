@@ -87,10 +87,11 @@ class Oracle:
     the betas are evenly spaced from 0.00085 to 0.012 (Rombach et al. 2022).
     """
 
-    device, config = torch.device("cpu"), SimpleNamespace(sample_size=LATENT)
+    config = SimpleNamespace(sample_size=LATENT)
 
     def __init__(self, unconditional: torch.Tensor, conditional: torch.Tensor):
         self.targets, self.calls = torch.stack([unconditional, conditional]), []
+        self.device = unconditional.device
         betas = np.linspace(0.00085**0.5, 0.012**0.5, 1000) ** 2
         self.alpha2 = np.cumprod(1 - betas)
 
@@ -104,17 +105,18 @@ class Oracle:
 
 
 @torch.no_grad()
-def test_sampling_with_an_oracle_reaches_its_target(model):
+def test_sampling_with_an_oracle_reaches_its_target(model, device):
     rng = torch.Generator().manual_seed(4)
-    unconditional, conditional = torch.randn(2, VIEWS, 4, LATENT, LATENT, generator=rng)
+    unconditional, conditional = torch.randn(2, VIEWS, 4, LATENT, LATENT, generator=rng).to(device)
     oracle, image = Oracle(unconditional, conditional), torch.rand(SIDE, SIDE, 3, generator=rng)
     actual = replace(model, unet=oracle).sample(image, cameras(10.0), "a duck", seed=1)
-    guidance = torch.tensor([1.0, 1.5, 2.0, 1.5])[:, None, None, None]
+    guidance = torch.tensor([1.0, 1.5, 2.0, 1.5], device=device)[:, None, None, None]
     latents = (unconditional + guidance * (conditional - unconditional)) / model.gsvae.config.scaling_factor
     expected = model.gsvae.decode(latents).sample.clamp(-1, 1)
-    torch.testing.assert_close(actual, expected, rtol=0, atol=2e-3)
+    # a GPU rounds the inputs of convolutions to TF32
+    torch.testing.assert_close(actual, expected, rtol=0, atol=2e-3 if device == "cpu" else 2e-2)
     assert len(oracle.calls) == STEPS
-    check_network_inputs(model, image, *oracle.calls[0])
+    check_network_inputs(model, image.to(device), *oracle.calls[0])
 
 
 def check_network_inputs(model, image, views, text):
@@ -124,7 +126,7 @@ def check_network_inputs(model, image, views, text):
     assert not views[0, 0, :4].any()
     torch.testing.assert_close(views[1, 0, :4], latent * model.vae.config.scaling_factor)
     assert torch.equal(views[0, 1:], views[1, 1:])
-    rays = plucker(cameras(10.0), SIDE)
+    rays = plucker(cameras(10.0), SIDE).to(views)
     halved = (rays[..., ::2, ::2] + rays[..., 1::2, ::2] + rays[..., ::2, 1::2] + rays[..., 1::2, 1::2]) / 4
     torch.testing.assert_close(views[0, 1:, 4:10], halved)
     assert torch.equal(views[:, 0, 4:10], views[:, 1, 4:10])
@@ -142,10 +144,9 @@ def test_generation_is_deterministic_for_a_seed(model):
     torch.testing.assert_close(norms, torch.ones_like(norms))
 
 
-@pytest.mark.gpu
 @torch.no_grad()
-def test_gpu_equals_cpu(folder):
-    if not torch.cuda.is_available():
+def test_gpu_equals_cpu(folder, device):
+    if device == "cpu":
         pytest.skip("no NVIDIA GPU")
     image = torch.rand(SIDE, SIDE, 3, generator=torch.Generator().manual_seed(0))
     maps = [load(find(folder), device).sample(image, cameras(10.0), "a duck").cpu() for device in ("cpu", "cuda")]

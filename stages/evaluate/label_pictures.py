@@ -72,7 +72,7 @@ def draw_pictures(
             "found": paint(photo, v.found, colours.found, v.judged),
         }))  # fmt: skip
     legend = {name: colours.truth[t] for t, name in names.items()}
-    legend |= {"no labelled object": RED, "not judged": GREY}
+    legend |= {"false object": RED, "not judged": GREY}
     return replace(result, pictures=pictures, legend=legend)
 
 

@@ -209,5 +209,5 @@ def _notes(scene: Scene, scores: PanopticScores, rows: dict[int, str]) -> list[s
     notes = [f"objects are compared in the pixels of all labelled photos; matched {listed or 'nothing'}"]
     if scores.false:
         sizes = ", ".join(f"{scene.name_of(p)} ({scores.found_pixels[p]} px)" for p in scores.false)
-        notes.append(f"found objects that are no labelled one: {sizes}")
+        notes.append(f"false objects, with an IoU of {MATCHING_IOU} or less: {sizes}")
     return notes

@@ -127,7 +127,7 @@ def test_objects_that_are_not_core_are_left_out(labelled, capsys):
     assert (overall["objects"], overall["found"], overall["false"], overall["photos"]) == (2, 2, 1, 1)
     assert overall["recall"] == overall["RQ"] == 0.5 and overall["PQ"] == pytest.approx(overall["SQ"] / 2)
     assert overall["false_share"] == pytest.approx(200 / overall["pixels"], rel=0.08)
-    assert any("object_7" in note and "no labelled one" in note for note in facts["notes"])
+    assert any("object_7" in note and note.startswith("false objects") for note in facts["notes"])
     assert json.loads((labelled / "metrics.json").read_text())["overall"] == overall
     assert capsys.readouterr().out.splitlines()[1].startswith("duck")
 
@@ -138,7 +138,7 @@ def test_report_shows_photo_truth_and_found(labelled):
     evaluate(labelled, report=labelled / "r.html", photos=labelled / "photos")
     html = (labelled / "r.html").read_text()
     assert re.findall(r'<img alt="([^"]*)"', html) == ["photo", "truth", "found"] and "a.b.jpg" in html
-    assert "&#9632;</span> duck" in html and "no labelled object" in html and "http" not in html
+    assert "&#9632;</span> duck" in html and "false object" in html and "http" not in html
     evaluate(labelled, report=labelled / "r.html")
     assert "rendered photo, truth, found; a.b.jpg" in (labelled / "r.html").read_text()
 

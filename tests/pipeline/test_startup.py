@@ -14,9 +14,10 @@ from tests.conftest import two_balls_scene
 from tests.reconstruct.raycast import arc, write_set
 
 ROOT = Path(__file__).resolve().parents[2]
-# no command compiles with PyTorch (`import torch` itself imports torch.distributed, but not these) or solves ODEs
+# no command compiles with PyTorch (`import torch` itself imports torch.distributed, but not these) or solves ODEs;
+# gsplat is for comparisons
 COMPILERS = {"torch._dynamo", "torch._inductor", "torch.distributed.fsdp", "torch.onnx", "sympy"}
-UNUSED = {*COMPILERS, "torchdiffeq", "scipy.interpolate", "transformers", "diffusers", "av"}
+UNUSED = {*COMPILERS, "gsplat", "torchdiffeq", "scipy.interpolate", "transformers", "diffusers", "av"}
 
 # command line -> further packages that it must not import
 COMMANDS = {

@@ -50,10 +50,11 @@ def test_out_of_memory_is_reported(monkeypatch, device):
     assert line.startswith("views   3  out of memory (estimate") and "nan" not in line
 
 
-def test_time_and_memory_are_measured():
-    model = random_weights(Pi3(TINY))
-    few, many = (measure(model, n, 56, 8, "cpu", 3)[0] for n in (1, 40))
-    assert many > few > 0
+def test_time_and_memory_are_measured(device):
+    model = random_weights(Pi3(TINY)).to(device)
+    few, many = (measure(model, n, 56, 8, device, 3) for n in (1, 40))
+    assert few[0] > 0 and many[0] > 0
+    assert many[0] > few[0] if device == "cpu" else many[1] > few[1] > 0  # launches take most of the time on a GPU
 
 
 def test_sizes_must_be_multiples_of_a_patch():

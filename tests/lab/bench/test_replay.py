@@ -26,11 +26,11 @@ def small(frames: int = 3) -> dict[str, np.ndarray]:
 
 
 @pytest.mark.slow
-def test_agrees_with_the_public_solver_through_first_contacts():
+def test_agrees_with_the_public_solver_through_first_contacts(device):
     if not RECORDING.exists():
         pytest.skip("the recording is not on this machine")
     data = replay.read_recording(RECORDING)
-    ours = torch.stack(list(replay.simulate(data, ALL_HAVE_TOUCHED, "cpu")))
+    ours = torch.stack(list(replay.simulate(data, ALL_HAVE_TOUCHED, device)))
     c = replay.compare(data, ours)
     assert c.contact == 16
     assert float(c.particles[: c.contact].max()) < 1e-4  # free flight: rounding only
@@ -39,8 +39,8 @@ def test_agrees_with_the_public_solver_through_first_contacts():
     assert float(moved) > 0.3  # the bodies did move
 
 
-def test_grid_nodes_match_the_public_solver():
-    grid = replay.make_solver(small(), "cpu").grid
+def test_grid_nodes_match_the_public_solver(device):
+    grid = replay.make_solver(small(), device).grid
     at = [(torch.tensor(list(grid.origin)) + 0.02 * torch.tensor(list(edge))) / 0.02 for edge in (grid.low, grid.high)]
     torch.testing.assert_close(at[0], torch.full((3,), 2.0), rtol=0, atol=1e-4)  # the third node is the last held one
     torch.testing.assert_close(at[1], torch.full((3,), 197.0), rtol=0, atol=1e-4)

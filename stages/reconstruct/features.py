@@ -36,11 +36,10 @@ def extract(photos: Photos, device: str = "cpu") -> list[Feature]:
         for first in range(0, len(photos), at_once):
             images = [_grey(image) for image in photos.images[first : first + at_once]]
             for (shrink, _), (keypoints, descriptors) in zip(images, _sift([grey for _, grey in images]), strict=True):
-                x, y, cosine, _, sine, _ = keypoints.T  # a scaled rotation follows the position
-                scale = np.hypot(cosine.astype(np.float64), sine).astype(np.float32)
-                table = np.stack([x / shrink, y / shrink, scale / shrink, np.arctan2(sine, cosine)], 1)
-                # rounded, so that keypoints that differ in orientation alone keep their order
-                largest = np.argsort(-np.round(scale, 5), kind="stable")[:limit]
+                x, y, a, b, c, d = keypoints.T  # position and affine shape [[a, b], [c, d]], as COLMAP stores them
+                scale = (np.sqrt(a * a + c * c) + np.sqrt(b * b + d * d)) / 2
+                table = np.stack([x, y, scale, np.arctan2(c, a)], 1) / np.array([shrink, shrink, shrink, 1], np.float32)
+                largest = np.argsort(-scale, kind="stable")[:limit]
                 out.append((torch.from_numpy(table[largest]), torch.from_numpy(descriptors[largest])))
             bar.update(len(images))
     return out

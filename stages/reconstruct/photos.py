@@ -96,7 +96,7 @@ def undistort(photos: Photos, cameras: Cameras, lenses: LensDistortion, side: in
         if scale < 1:
             pixels = torch.from_numpy(cv2.resize(pixels.numpy(), size, interpolation=cv2.INTER_AREA))
         images.append(pixels)
-        Ks.append(resize(K, size[0] / width, size[1] / height))
+        Ks.append(resize(K, size[0] / width, size[1] / height).float())
         sizes.append(size)
         photo_Ks.append(resize(cameras.Ks[c], file[0] / width, file[1] / height))
         file_sizes.append(file)
@@ -109,4 +109,4 @@ def _pinhole_K(K: Float[Tensor, "3 3"], lens: Float[Tensor, "5"], size: tuple[in
     if not lens.any():
         return K
     new, _ = cv2.getOptimalNewCameraMatrix((K.double() - HALF_PIXEL).numpy(), lens.double().numpy(), size, 0)
-    return (torch.from_numpy(new) + HALF_PIXEL).float()
+    return torch.from_numpy(new) + HALF_PIXEL  # in double precision: rounded once, when stored

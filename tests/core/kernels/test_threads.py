@@ -6,7 +6,7 @@ import time
 import pytest
 import torch
 
-from stages.core.kernels.threads import run_parallel
+from stages.core.kernels.threads import large_operation, run_parallel, small_operations
 
 
 @pytest.fixture(params=[1, 2, 4])
@@ -62,3 +62,20 @@ def test_the_calling_thread_does_the_work_that_no_helper_has_claimed(threads):
     release.set()
     other.join(10)
     assert not other.is_alive()
+
+
+def test_small_operations_use_one_thread_and_large_ones_all(threads):
+    with large_operation():
+        assert torch.get_num_threads() == threads
+    with small_operations():
+        assert torch.get_num_threads() == 1
+        with large_operation():
+            assert torch.get_num_threads() == threads
+        assert torch.get_num_threads() == 1
+    assert torch.get_num_threads() == threads
+
+
+def test_number_of_threads_is_restored_after_an_exception(threads):
+    with pytest.raises(ValueError, match="inside"), small_operations(), large_operation():
+        raise ValueError("inside")
+    assert torch.get_num_threads() == threads

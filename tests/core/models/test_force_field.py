@@ -8,6 +8,7 @@ import torch
 
 from stages.core.geometry.rotations import matrix
 from stages.core.models.external_forces import ExternalForces
+from stages.core.models.field import deformation, force_field
 from stages.core.models.field.contact_forces import ContactPoints
 from stages.core.models.field.deformation import DeformationInputs, projected
 from stages.core.models.field.floor_response import MAX_PENETRATION, SEPARATION_SPEED, friction_factor, push_only
@@ -339,6 +340,33 @@ def test_rollouts_are_deterministic():
     initial = overlapping_objects().to(torch.float32)
     model = model_with_amplified_forces().float()
     assert torch.equal(model.rollout(initial, 30), model.rollout(initial, 30))
+
+
+@pytest.mark.parametrize("grad, maximum, expected", [(False, 99, (1, 2)), (False, 0, (2, 2)), (True, 99, (2, 2))])
+def test_small_scenes_without_gradients_use_one_thread_but_for_large_products(grad, maximum, expected, monkeypatch):
+    used = set()
+    accelerations, product = ForceField._accelerations, deformation._product
+
+    def watched_accelerations(*args):
+        used.add(("step", torch.get_num_threads()))
+        return accelerations(*args)
+
+    def watched_product(*args):
+        used.add(("product", torch.get_num_threads()))
+        return product(*args)
+
+    monkeypatch.setattr(ForceField, "_accelerations", watched_accelerations)
+    monkeypatch.setattr(deformation, "_product", watched_product)
+    monkeypatch.setattr(force_field, "MAX_SINGLE_THREAD_POINTS", maximum)
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        with torch.set_grad_enabled(grad):
+            simulate(model_with_amplified_forces(), colliding_bodies(), 1)
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
+    assert used == {("step", expected[0]), ("product", expected[1])}
 
 
 @torch.no_grad()

@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from stages.core.geometry.rotations import matrix, multiply, quaternion
 from stages.core.kernels.compilers import TRITON
+from stages.core.kernels.threads import small_operations
 from stages.core.models.dynamics import FRAME, Dynamics
 from stages.core.models.external_forces import ExternalForces
 from stages.core.models.field.contact_forces import ContactNet, ContactPoints
@@ -39,6 +40,7 @@ from stages.core.models.initial_conditions import InitialConditions, centre_of_m
 if TRITON:
     from stages.core.models.field import fused_step
 
+MAX_SINGLE_THREAD_POINTS = 10_000  # keypoints of a batch; one thread was measured to be faster up to 6,144
 # All three in units of E * size / mass, the squared frequency of an elastic body.
 MAX_TRAINED_STIFFNESS = 3.2e5  # largest in the training data [1/s^2]; the network gets at most this, see `encode`
 MAX_TRAINED_SOLID_STIFFNESS = 3e4  # of the stiffest compact object in training, the duck [1/s^2]; cap for solid bodies
@@ -177,6 +179,15 @@ class ForceField(Dynamics):
         """
         if self._use_fused_step(scene):
             return fused_step.step(self, scene, state, t, dt, external)
+        if _has_small_operations(scene.shape.arm):
+            with small_operations():
+                return self._split_step(scene, state, t, dt, external)
+        return self._split_step(scene, state, t, dt, external)
+
+    def _split_step(
+        self, scene: FieldScene, state: BodyState, t: Tensor | float, dt: float, external: ExternalForces
+    ) -> BodyState:
+        """`step` by PyTorch operations."""
         movable = ~external.pinned[..., None]
         half = self._drifted(scene, _without_pinned(state, movable), dt / 2)
         bodies = self._kinematics(scene, half)
@@ -287,6 +298,12 @@ class ForceField(Dynamics):
     def _reaction(self, shape: RestShape, x: Float[Tensor, "b o m c"]) -> Float[Tensor, "b o c"]:
         """Sum over each object's partners of x, the effect of the object on the partner; its reaction is subtracted."""
         return x[:, shape.others, shape.back].sum(2)
+
+
+def _has_small_operations(arm: Float[Tensor, "b o n 3"]) -> bool:
+    """Whether most operations of a step are too small for several CPU threads; with gradients, threads are kept."""
+    points = arm.shape[0] * arm.shape[1] * arm.shape[2]
+    return not arm.is_cuda and not torch.is_grad_enabled() and points <= MAX_SINGLE_THREAD_POINTS
 
 
 def _without_pinned(state: BodyState, movable: Bool[Tensor, "b o 1"]) -> BodyState:

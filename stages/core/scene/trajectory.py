@@ -23,6 +23,7 @@ from stages.core.scene.scene import Scene, SceneObject
 log = logging.getLogger(__name__)
 FORMAT, VERSION = "ngff-trajectory", 1
 EXPECTED = "a trajectory (.h5), such as `ngff simulate` writes"
+COMPRESSED = {"compression": "gzip", "compression_opts": 4, "shuffle": True}
 
 
 @dataclass(frozen=True)
@@ -123,6 +124,8 @@ class TrajectoryWriter:
         try:
             self._raw = _ErrorDeferringFile(self._part, "w+b")
             self._file = h5py.File(self._raw, "w")
+            _write_gaussians(self._file, self._contents[0].gaussians)
+            self._raw.check()  # HDF5 may crash when it stores strings after a failed write
             _write_rest(self._file, *self._contents)
             self._raw.check()
         except BaseException as error:
@@ -159,29 +162,30 @@ class TrajectoryWriter:
         self._replacing.__exit__(kind, error, trace)
 
 
+def _write_gaussians(file: h5py.File, gaussians: Gaussians) -> None:
+    for field in fields(Gaussians):
+        file.create_dataset(f"gaussians/{field.name}", data=getattr(gaussians, field.name).cpu().numpy(), **COMPRESSED)
+
+
 def _write_rest(file: h5py.File, scene: Scene, info: SimulationInfo, keypoints: Keypoints, binding: Binding) -> None:
-    compressed = {"compression": "gzip", "compression_opts": 4, "shuffle": True}
     file.attrs.update(
         format=FORMAT, version=VERSION, fps=1 / info.dt, dt=info.dt, gravity=info.gravity, up="z",
         units="scene units, seconds", engine=info.engine, scale=json.dumps(scene.scale),
         provenance=json.dumps(scene.provenance), **({} if scene.floor is None else {"floor": scene.floor}),
         **({} if scene.background is None else {"background": scene.background}),
     )  # fmt: skip
-    for field in fields(Gaussians):
-        value = getattr(scene.gaussians, field.name).cpu().numpy()
-        file.create_dataset(f"gaussians/{field.name}", data=value, **compressed)
     file["objects/id"] = np.array([o.id for o in scene.objects], np.int64)
     text = h5py.string_dtype()
     file.create_dataset("objects/name", data=[o.name for o in scene.objects], dtype=text)
     file.create_dataset("objects/material", data=[o.material for o in scene.objects], dtype=text)
-    file.create_dataset("keypoints/rest", data=keypoints.rest.cpu().numpy(), **compressed)
-    file.create_dataset("keypoints/object_id", data=keypoints.object_id.cpu().numpy(), **compressed)
-    file.create_dataset("binding/index", data=binding.index.cpu().numpy().astype(np.int32), **compressed)
-    file.create_dataset("binding/weight", data=binding.weight.cpu().numpy(), **compressed)
+    file.create_dataset("keypoints/rest", data=keypoints.rest.cpu().numpy(), **COMPRESSED)
+    file.create_dataset("keypoints/object_id", data=keypoints.object_id.cpu().numpy(), **COMPRESSED)
+    file.create_dataset("binding/index", data=binding.index.cpu().numpy().astype(np.int32), **COMPRESSED)
+    file.create_dataset("binding/weight", data=binding.weight.cpu().numpy(), **COMPRESSED)
     p, o = len(keypoints.rest), len(scene.objects)
     for name, shape in (("keypoints/positions", (p, 3)), ("objects/com", (o, 3)), ("objects/rotation", (o, 4))):
         chunk = (1, *(max(s, 1) for s in shape))
-        file.create_dataset(name, (0, *shape), maxshape=(None, *shape), chunks=chunk, dtype="f4", **compressed)
+        file.create_dataset(name, (0, *shape), maxshape=(None, *shape), chunks=chunk, dtype="f4", **COMPRESSED)
     if scene.cameras is not None:
         for name in ("viewmats", "Ks", "sizes"):
             file[f"cameras/{name}"] = getattr(scene.cameras, name).cpu().numpy()

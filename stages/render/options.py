@@ -16,6 +16,7 @@ VIEWS = "novel | orbit | input:K | all | path.json"
 OUTPUT_FORMATS = {
     **dict.fromkeys(suffixes("video", writable=True), "stages.render.video:write_video"),
     **dict.fromkeys(suffixes("image", writable=True), "stages.render.image:write_image"),
+    ".html": "stages.render.page:write_page",
 }
 
 

@@ -8,7 +8,7 @@ from collections import Counter
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
-CORE = ["errors", "backends", "geometry", "scene", "kernels", "raster", "perception", "physics", "models"]
+CORE = ["errors", "backends", "geometry", "scene", "kernels", "raster", "perception", "physics", "models", "player"]
 STAGES = {"reconstruct", "segment", "refine", "simulate", "render", "evaluate"}
 HEAVY = {"torch", "warp", "cv2", "pycolmap", "h5py", "numpy"}  # packages that take long to import
 

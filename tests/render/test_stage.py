@@ -202,3 +202,19 @@ def test_wrong_inputs_give_one_line_and_write_nothing(scene, tmp_path, out, choi
     with pytest.raises(InputError, match=message) as caught:
         run(scene, tmp_path / out, render_options(**choices))
     assert not re.search("\n", str(caught.value)) and [p.name for p in tmp_path.iterdir()] == ["scene.ply"]
+
+
+def test_page_is_one_file_and_says_what_it_cannot_show(trajectory, scene, tmp_path):
+    out = run(trajectory, tmp_path / "film.html", render_options(show_forces=True))
+    text = out.read_text()
+    assert text.startswith("<!doctype html>") and "http" not in text.split('id="film"')[0].replace("http-equiv", "")
+    facts = json.loads(out.with_name("film.html.json").read_text())
+    assert facts["frames"] == 6 and facts["bytes"] == len(out.read_bytes())
+    run(scene, tmp_path / "still.html", render_options(background=str(scene)))
+    write_png(tmp_path / "photo.png", torch.zeros(8, 8, 3))
+    for wrong, said in (({"view": "all"}, "--view all"), ({"background": str(tmp_path / "photo.png")}, "photo")):
+        with pytest.raises(InputError, match=said):
+            run(trajectory, tmp_path / "no.html", render_options(**wrong))
+    with pytest.raises(InputError, match="one file"):
+        run([trajectory, scene], tmp_path / "no.html", render_options(side_by_side=True))
+    assert not (tmp_path / "no.html").exists()

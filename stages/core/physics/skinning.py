@@ -28,7 +28,7 @@ class Skinning:
         self._weight = binding.weight[moving].float().contiguous().to(device)
         self._moving = moving.to(device)
         self._part = gaussians[self._moving]
-        self._neighbours_of = _neighbours(self.rest, keypoints.object_id)
+        self._neighbours_of = keypoint_neighbours(keypoints)
         d = self.rest[self._neighbours_of] - self.rest[:, None]
         a = 1 / (d.square().sum(-1) + 1e-12 + d.square().sum(-1).mean(1, keepdim=True))
         a[self._neighbours_of == torch.arange(len(d))[:, None]] = 0  # padding with the keypoint itself
@@ -111,11 +111,12 @@ def object_rotations(
     return out[: len(ids)]
 
 
-def _neighbours(rest: Float[Tensor, "p 3"], object_id: Int[Tensor, "p"]) -> Int[Tensor, "p j"]:
+def keypoint_neighbours(keypoints: Keypoints) -> Int[Tensor, "p j"]:
     """The nearest other keypoints of the same object, padded with the keypoint itself."""
+    rest = keypoints.rest.float()
     around = torch.zeros(len(rest), NEIGHBOURS, dtype=torch.int64)
-    for id in object_id.unique():
-        own = (object_id == id).nonzero()[:, 0]
+    for id in keypoints.object_id.unique():
+        own = (keypoints.object_id == id).nonzero()[:, 0]
         _, index = knn(rest[own], rest[own], NEIGHBOURS + 1)
         around[own] = own[index[:, 1:]]
     return around

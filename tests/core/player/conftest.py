@@ -1,0 +1,60 @@
+"""A real browser, drawn by software: Debian's chromium, started once and given a new page for each test."""
+
+import os
+import shutil
+import time
+from pathlib import Path
+
+import pytest
+
+FLAGS = (
+    "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-quic", "--no-first-run",
+    "--disable-background-networking", "--disable-component-update", "--disable-sync",
+)  # fmt: skip
+SIZE = {"width": 480, "height": 360}  # of the window [px]
+
+
+def until(page, condition: str, seconds: float = 20.0) -> None:
+    """Wait until a JavaScript expression is true; the page's policy forbids playwright's own way, which needs eval."""
+    end = time.monotonic() + seconds
+    while not page.evaluate(condition):
+        assert time.monotonic() < end, f"{condition} did not become true; {page.inner_text('#message')}"
+        page.wait_for_timeout(20)
+
+
+@pytest.fixture(scope="session")
+def chromium(tmp_path_factory):
+    """The running browser; the tests that need it are skipped where it is not installed."""
+    path = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    if path is None:
+        pytest.skip("no chromium on this machine (apt-get install chromium)")
+    sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    profile = tmp_path_factory.mktemp("profile")
+    with sync_api.sync_playwright() as playwright:
+        context = playwright.chromium.launch_persistent_context(
+            profile, executable_path=path, args=FLAGS, headless=True, viewport=SIZE,
+            env={**os.environ, "HOME": str(profile)},
+        )  # fmt: skip
+        yield context
+        context.close()
+
+
+@pytest.fixture
+def open_page(chromium):
+    """A function that opens a page file and returns it once its player runs; the test fails on errors of the page."""
+    errors, pages = [], []
+
+    def open_(path: Path):
+        page = chromium.new_page()
+        pages.append(page)
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
+        page.on("request", lambda request: errors.append(request.url) if request.url.startswith("http") else None)
+        page.goto(path.as_uri() if isinstance(path, Path) else path)
+        until(page, "window.player !== undefined")
+        return page
+
+    yield open_
+    for page in pages:
+        page.close()
+    assert not errors

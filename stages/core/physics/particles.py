@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -193,23 +194,25 @@ def _fill(shell: np.ndarray, gap: int, standing: bool) -> np.ndarray:
     grown = ndimage.binary_dilation(enclosed, CROSS, iterations=gap) & wide if enclosed.any() else enclosed
     closed = ndimage.binary_erosion(wide, CROSS, iterations=gap)
     body = shell | closed | enclosed | (grown & ~ndimage.binary_dilation(outside, CROSS, iterations=gap))
-    if not standing:  # a cloth on the floor has folds that look like leaking cavities
-        body |= _cavities(shell | closed)
-    if standing:
-        body[:, :, : layers[0]] = False
+    if not standing:
+        return body | _cavities(shell | closed, LEAK_RADII)
+    # gaps that closing just misses leak too, but a cloth on the floor has folds that look like cavities with wide leaks
+    body |= _cavities(shell | closed, (gap + 1,))
+    body[:, :, : layers[0]] = False
     return body
 
 
-def _cavities(walls: np.ndarray) -> np.ndarray:
+def _cavities(walls: np.ndarray, leaks: Sequence[int]) -> np.ndarray:
     """Cavities with leaks narrower than the cavity by MIN_CAVITY_RATIO: a jug is filled, a mug or a bowl is not.
 
-    Reconstructed shells have holes; left hollow, they would crumple like paper bags.
+    Reconstructed shells have holes; left hollow, they would crumple like paper bags. `leaks` are the half widths of the
+    holes to close [voxels], increasing.
     """
-    room = LEAK_RADII[-1]  # margin, so that leaks lead outside
+    room = leaks[-1]  # margin, so that leaks lead outside
     walls = np.pad(walls, room)
     away = ndimage.distance_transform_edt(~walls)
     filled = np.zeros_like(walls)
-    for leak in LEAK_RADII:
+    for leak in leaks:
         free = away > leak
         outside = _outside(free)
         hollow = _components_with(free & ~outside, away >= MIN_CAVITY_RATIO * leak)

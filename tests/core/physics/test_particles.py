@@ -12,6 +12,7 @@ from stages.core.physics.particles import MIN_PARTICLES, inliers, sample_bodies
 from stages.core.scene.gaussians import Gaussians, concatenate
 from stages.core.scene.scene import Scene, SceneObject
 from stages.lab.assets.objects import OBJECTS
+from stages.lab.assets.shapes import box, to_gaussians
 from stages.lab.assets.soft_objects import SHIRT, folds, polygon, rounded
 from tests.conftest import ring
 
@@ -96,6 +97,16 @@ def test_the_floor_closes_standing_objects():
     middle = torch.tensor([0.0, 0, 0.05])
     assert ((standing.x - middle).norm(dim=1) < 0.04).sum() > 100
     assert not ((flying.x - middle).norm(dim=1) < 0.04).any()
+
+
+@pytest.mark.parametrize("floor", [-1.0, 0.0])
+def test_a_box_is_filled_at_every_resolution(floor):
+    """Also where its surface has gaps that closing just misses, in the air and standing on the floor."""
+    surface = box((0.2, 0.2, 0.2), 0.2 / 24).moved((0.0, 0.0, 0.1))
+    g = to_gaussians(surface, torch.full((len(surface.points), 3), 0.5), 1)
+    for count in (25_000, 80_000):
+        bodies = sample_bodies(scene(g, floor=floor), count)
+        assert 0.9 < float(bodies.volume.sum()) / 0.2**3 < 1.15  # the Gaussians are half a voxel thick
 
 
 def test_a_sheet_gets_three_layers():

@@ -17,7 +17,7 @@ from stages.refine.options import GENERATORS, RefineOptions
 from stages.render.options import OUTPUT_FORMATS, VIEWS, RenderOptions
 from stages.segment.options import BACKENDS as SEGMENT
 from stages.segment.options import NETWORKS, SegmentOptions
-from stages.simulate.options import ENGINE_HELP, SimulateOptions
+from stages.simulate.options import DEFAULT_KEYPOINTS, ENGINE_HELP, LIVE_KEYPOINTS, SimulateOptions
 
 app = typer.Typer(cls=CommandGroup, no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False)
 QUALITY_HELP = " | ".join(QUALITY_PRESETS)
@@ -199,7 +199,8 @@ def simulate(
         list[str] | None, Option(help='"object=2 force=0,0,8 from=0.1 to=0.3" [N, s]; also torque= and at=x,y,z')
     ] = None,
     forces: Annotated[
-        Path | None, Option(help="JSON of forces: {scene: [{obj_id, start, end, force}]}")
+        Path | None, Option(help="JSON of forces {scene: [{obj_id, start, end, force}]}, or a trajectory (.h5) whose "
+                            "forces, changes and options are repeated")
     ] = SimulateOptions.forces,
     pin: Annotated[list[str] | None, Option(help="object held fixed; repeatable")] = None,
     velocity: Annotated[
@@ -217,7 +218,10 @@ def simulate(
     box: Annotated[
         str | None, Option(help="floor, walls and ceiling x0,y0,z0,x1,y1,z1 [scene units]; default: around the objects")
     ] = SimulateOptions.box,
-    keypoints: Annotated[int, Option(help="maximum number of keypoints per object")] = SimulateOptions.keypoints,
+    keypoints: Annotated[
+        int | None, Option(help=f"maximum number of keypoints per object; default: {DEFAULT_KEYPOINTS}, with --live "
+                           f"{LIVE_KEYPOINTS}")
+    ] = SimulateOptions.keypoints,
     weights: Annotated[
         Path | None, Option(help="weights of the learned engine (.safetensors with its card, or a published .pth); "
                             "default: those in the package")
@@ -225,6 +229,14 @@ def simulate(
     integrator: Annotated[
         str, Option(help="learned engine: step (the model's own) or an ODE solver: euler | rk4 | dopri5")
     ] = SimulateOptions.integrator,
+    live: Annotated[
+        bool, Option("--live", help="simulate in real time and open a page to drag, push, lift and pin the objects; "
+                     "Ctrl-C ends and writes what was recorded")
+    ] = SimulateOptions.live,
+    browser: Annotated[
+        bool, Option("--browser/--no-browser", help="with --live: open the page, or only print its address")
+    ] = SimulateOptions.browser,
+    port: Annotated[int, Option(help="with --live: port on 127.0.0.1; 0: any free one")] = SimulateOptions.port,
     seed: Seed = SimulateOptions.seed,
     device: Device = SimulateOptions.device,
 ) -> None:
@@ -233,7 +245,8 @@ def simulate(
         steps=steps, dt=dt, engine=engine, gravity=gravity, quality=quality, material=tuple(material or ()),
         materials=materials, force=tuple(force or ()), forces=forces, pin=tuple(pin or ()),
         velocity=tuple(velocity or ()), lift=tuple(lift or ()), floor=floor, friction=friction, box=box,
-        keypoints=keypoints, weights=weights, integrator=integrator, seed=seed, device=device,
+        keypoints=keypoints, weights=weights, integrator=integrator, live=live, browser=browser, port=port, seed=seed,
+        device=device,
     )  # fmt: skip
     load("stages.simulate.stage:run")(scene, out, options)
 

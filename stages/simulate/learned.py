@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -25,12 +25,13 @@ from stages.core.models.external_forces import ExternalForces
 from stages.core.models.field.solidity import box_sides, solidity
 from stages.core.models.initial_conditions import FLOOR, InitialConditions, centre_of_mass
 from stages.core.models.rollout import TimeStepper
-from stages.core.physics.forces import Force, ForcePrompts
-from stages.core.physics.materials import MODELS
+from stages.core.physics.forces import Change, Force, ForcePrompts
+from stages.core.physics.materials import MODELS, choose_materials
 from stages.core.physics.skinning import object_rotations
 from stages.core.physics.state import FrameState
 from stages.core.scene.scene import Scene, SceneObject
 from stages.core.scene.trajectory import Keypoints
+from stages.simulate.changes import changed_options, changed_pins
 from stages.simulate.options import ENGINES, SimulateOptions
 from stages.simulate.setup import SceneSetup, set_up_scene
 from stages.simulate.sleep import SleepState
@@ -95,7 +96,8 @@ def rollout(
     units = ModelUnits.for_objects(per_object, setup.box.low[2], scene.metres_per_unit, options.gravity)
     initial = _initial_conditions(scene, per_object, setup, units, prompts, options)
     _warn_extrapolation(initial, model)
-    forces = ExternalForces.from_prompts(initial, _to_model_units(prompts, units, setup, ids), ids)
+    in_model_units = ForcePrompts(_to_model_units(prompts.forces, units, setup, ids), prompts.pinned)
+    forces = ExternalForces.from_prompts(initial, in_model_units, ids)
     steps = max(1, math.ceil(options.dt * units.time / FRAME - 1e-6))
     log.info("%s (%s): %d objects, %d keypoints, lengths scaled by %.3g, times by %.3g, %d steps per frame",
              options.engine, card["sha256"][:8], len(ids), len(keypoints.rest), units.length / scene.metres_per_unit,
@@ -105,8 +107,8 @@ def rollout(
     lifted = keypoints.rest + setup.lift[[ids.index(int(i)) for i in keypoints.object_id]]
 
     def states() -> Iterator[FrameState]:
-        pinned, dt = forces.pinned, options.dt * units.time / steps
-        external = replace(forces, pinned=pinned | sleep.asleep)
+        current, held, acting, dt = options, prompts.pinned, prompts.forces, options.dt * units.time / steps
+        external = replace(forces, pinned=forces.pinned | sleep.asleep)
         stepper = TimeStepper(model, initial.to(device), dt, external.to(device), options.integrator)
         first, before = stepper.points.clone(), initial.points
         for n in range(options.steps):
@@ -117,16 +119,23 @@ def rollout(
             yield _state(keypoints, ids, lifted, initial, moved)
             if n == options.steps - 1:
                 continue
-            if sleep.wake(_pushed(prompts, ids, n * options.dt, (n + 1) * options.dt)):
-                stepper.external.pinned.copy_(pinned | sleep.asleep)
+            start, end = n * options.dt, (n + 1) * options.dt
+            active, changes = prompts.during(start, end)
+            if active is not acting:
+                _load_forces(stepper.external, initial, _to_model_units(active, units, setup, ids), ids)
+                acting = active
+            if changes:
+                current, held = changed_options(current, changes), changed_pins(held, changes)
+                stepper.change(_changed(scene, per_object, setup, units, prompts, current).to(device))
+            sleep.wake(_pushed(active, ids, start, end) | _roused(changes, ids))
+            stepper.external.pinned.copy_(_rows(held, ids) | sleep.asleep)
             if bool(sleep.asleep.all()):
                 stepper.step_count += steps
                 continue
             for _ in range(steps):
                 stepper.step()
             points = stepper.points.cpu()
-            if sleep.wake_on_impact(points, (points - before) / (steps * dt)):
-                stepper.external.pinned.copy_(pinned | sleep.asleep)
+            sleep.wake_on_impact(points, (points - before) / (steps * dt))
             before = points.clone()
 
     return states()
@@ -195,14 +204,45 @@ def _starts_awake(initial: InitialConditions, units: ModelUnits, setup: SceneSet
     return (initial.velocity[0] != 0).any(-1) | (setup.lift != 0).any(-1) | (units.gravity <= 0)
 
 
-def _pushed(prompts: ForcePrompts, ids: list[int], start: float, end: float) -> Bool[Tensor, "o"]:
+def _rows(chosen: Collection[int], ids: list[int]) -> Bool[Tensor, "o"]:
+    """Mask of the objects with these ids."""
+    return torch.tensor([i in chosen for i in ids])
+
+
+def _pushed(forces: Sequence[Force], ids: list[int], start: float, end: float) -> Bool[Tensor, "o"]:
     """Objects on which a force acts at some time from `start` to `end` [s]."""
-    active = {f.object_id for f in prompts.forces if f.active_fraction(start, end) > 0}
-    return torch.tensor([i in active for i in ids])
+    return _rows({f.object_id for f in forces if f.active_fraction(start, end) > 0}, ids)
 
 
-def _to_model_units(prompts: ForcePrompts, units: ModelUnits, setup: SceneSetup, ids: list[int]) -> ForcePrompts:
-    """The force prompts in model units."""
+def _roused(changes: Sequence[Change], ids: list[int]) -> Bool[Tensor, "o"]:
+    """Objects that changes wake: all by another gravity, and those that are released or get another material."""
+    whole = any(c.what == "gravity" for c in changes)
+    return _rows(ids if whole else {c.object_id for c in changes}, ids)
+
+
+def _changed(
+    scene: Scene, per_object: list[Tensor], setup: SceneSetup, units: ModelUnits, prompts: ForcePrompts,
+    options: SimulateOptions,
+) -> InitialConditions:  # fmt: skip
+    """`_initial_conditions` with other materials, friction and gravity in the same units."""
+    materials = choose_materials(scene.objects, options.material, options.materials)
+    gravity = options.gravity * units.length / scene.metres_per_unit / units.time**2
+    setup, units = replace(setup, materials=materials), replace(units, gravity=gravity)
+    return _initial_conditions(scene, per_object, setup, units, prompts, options)
+
+
+def _load_forces(slots: ExternalForces, initial: InitialConditions, forces: Sequence[Force], ids: list[int]) -> None:
+    """Write these forces to the slots of `slots`, of which the rest has no effect; there must be enough."""
+    rest = [Force(ids[0], start=0.0, end=0.0)] * (slots.object.shape[1] - len(forces))
+    new = ExternalForces.from_prompts(initial, ForcePrompts((*forces, *rest)), ids)
+    for name in ("object", "force", "torque", "start", "end", "point"):
+        getattr(slots, name).copy_(getattr(new, name))
+
+
+def _to_model_units(
+    forces: Sequence[Force], units: ModelUnits, setup: SceneSetup, ids: list[int]
+) -> tuple[Force, ...]:
+    """The forces in model units."""
     metres = units.mass ** (1 / 3)
     newtons = units.mass * metres / units.time**2
 
@@ -216,7 +256,7 @@ def _to_model_units(prompts: ForcePrompts, units: ModelUnits, setup: SceneSetup,
             start=f.start * units.time, end=f.end * units.time, at=at,
         )  # fmt: skip
 
-    return replace(prompts, forces=tuple(scaled(f) for f in prompts.forces))
+    return tuple(scaled(f) for f in forces)
 
 
 def _warn_extrapolation(initial: InitialConditions, model: Dynamics) -> None:

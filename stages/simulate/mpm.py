@@ -20,13 +20,14 @@ from stages.core.errors import InputError
 from stages.core.geometry.neighbours import knn
 from stages.core.physics.forces import Force, ForcePrompts
 from stages.core.physics.keypoints import nearest_weights
-from stages.core.physics.materials import MODELS, Material
+from stages.core.physics.materials import MODELS, Material, choose_materials
 from stages.core.physics.mpm import solver as mpm
 from stages.core.physics.particles import Bodies
 from stages.core.physics.skinning import object_rotations
 from stages.core.physics.state import FrameState
 from stages.core.scene.scene import Scene, SceneObject
 from stages.core.scene.trajectory import Keypoints
+from stages.simulate.changes import changed_options, changed_pins
 from stages.simulate.options import MpmQuality, SimulateOptions
 from stages.simulate.setup import SceneSetup, set_up_scene
 
@@ -60,10 +61,8 @@ def rollout(
     solver = mpm.Solver(particles, box, dx, device, exact=device != "cpu")
     _warn_stuck(scene, setup, prompts)
     ids = [o.id for o in scene.objects]
-    forces = [_PromptedForce(f, particles, setup, ids.index(f.object_id)) for f in prompts.forces]
     attachment = _attach(scene, keypoints, setup.bodies)
-    gravity = torch.tensor([0.0, 0.0, -options.gravity]).repeat(len(particles), 1)
-    gravity[particles.held > 0] = 0
+    gravity = _gravity(particles, options)
     substeps = solver.substeps(options.dt, gravity)
     log.info(
         "%d particles, grid spacing %.3g m, %d nodes, substep %.3g s (%d per frame; more for fast motion)",
@@ -71,19 +70,57 @@ def rollout(
     )  # fmt: skip
 
     def states() -> Iterator[FrameState]:
+        current, held, weight, acting, forces = options, prompts.pinned, gravity, None, []
         for frame in range(options.steps):
             now = solver.particles
             x = now.x.cpu()
             yield _state(scene, setup, attachment, x / unit, now.F.cpu(), particles.mass)
             if frame < options.steps - 1:
                 t = frame * options.dt
-                acceleration = sum((f.acceleration(x, t, t + options.dt) for f in forces), gravity)
+                active, changes = prompts.during(t, (frame + 1) * options.dt)
+                if changes:
+                    current, held = changed_options(current, changes), changed_pins(held, changes)
+                    _change(solver, particles, _changed(scene, setup, replace(prompts, pinned=held), current, level))
+                    weight = _gravity(particles, current)
+                if active is not acting or changes:
+                    forces = [_PromptedForce(f, particles, setup, ids.index(f.object_id)) for f in active]
+                    acting = active
+                acceleration = sum((f.acceleration(x, t, t + options.dt) for f in forces), weight)
                 try:
                     solver.advance(options.dt, acceleration)
                 except mpm.Diverged as error:
                     raise _divergence(scene.objects[int(body[error.particle])], t) from error
 
     return states()
+
+
+def _gravity(particles: mpm.Particles, options: SimulateOptions) -> Float[Tensor, "p 3"]:
+    """Acceleration of the particles that are not held [m/s^2]."""
+    gravity = torch.tensor([0.0, 0.0, -options.gravity]).repeat(len(particles), 1)
+    gravity[particles.held > 0] = 0
+    return gravity
+
+
+def _changed(
+    scene: Scene, setup: SceneSetup, prompts: ForcePrompts, options: SimulateOptions, level: MpmQuality
+) -> mpm.Particles:
+    """`_particles` with other materials, friction and pins. Raises InputError for another material model."""
+    materials = choose_materials(scene.objects, options.material, options.materials)
+    for o in scene.objects:
+        if materials[o.id].material.model != setup.materials[o.id].material.model:
+            raise InputError(f"object {o.id} ({o.name}) cannot become {materials[o.id].name} during a simulation with "
+                             "--engine mpm: its material model is another one")  # fmt: skip
+    return _particles(scene, replace(setup, materials=materials), prompts, options, level)
+
+
+def _change(solver: mpm.Solver, particles: mpm.Particles, new: mpm.Particles) -> None:
+    """Give the particles the material and the pins of `new`; those that are pinned now stop."""
+    stopped = (new.held > 0) & (particles.held == 0)
+    now = solver.particles
+    for name in ("mass", "stiffness", "friction", "held", "plastic"):
+        setattr(particles, name, getattr(new, name))
+    solver.set(mass=new.mass, stiffness=new.stiffness, friction=new.friction, held=new.held, plastic=new.plastic,
+               v=now.v * ~stopped[:, None].to(now.v.device), C=now.C * ~stopped[:, None, None].to(now.C.device))
 
 
 def _divergence(o: SceneObject, time: float) -> InputError:

@@ -22,6 +22,7 @@ ENGINES = {
     "ngff": Engine("stages.simulate.learned:rollout", "learned force field, for elastic bodies", weights="ngff"),
     "mpm": Engine("stages.simulate.mpm:rollout", "material point method, for any material"),
 }
+DEFAULT_KEYPOINTS, LIVE_KEYPOINTS = 1024, 128  # with the latter two CPU cores keep up with real time
 # The model's own step, or a solver of torchdiffeq for its rate of change (see stages/core/models/integrate.py).
 INTEGRATORS = ("step", "euler", "rk4", "dopri5")
 ENGINE_HELP = " | ".join(f"{name}: {engine.help}" for name, engine in ENGINES.items())
@@ -61,9 +62,12 @@ class SimulateOptions:
     floor: float | None = None  # height of the floor [scene units]; by default the scene's
     friction: float | None = None  # Coulomb coefficient at floor and walls; by default each material's
     box: str | None = None  # floor, walls and ceiling: x0,y0,z0,x1,y1,z1 [scene units]; by default around the objects
-    keypoints: int = 1024  # maximum number of keypoints per object
+    keypoints: int | None = None  # maximum number per object; None: see keypoint_count
     weights: Path | None = None  # of a learned engine: .safetensors with its card, or a published checkpoint (.pth)
     integrator: str = "step"  # of a learned engine, one of INTEGRATORS
+    live: bool = False  # in real time, with a page in the browser to act on the objects
+    browser: bool = True  # whether --live opens it
+    port: int = 0  # of --live on 127.0.0.1; 0: any free one
     seed: int = 0
     device: str = "auto"
 
@@ -82,10 +86,20 @@ class SimulateOptions:
             raise InputError(f"--gravity {self.gravity}: give metres per second squared, such as 9.81")
         if self.friction is not None and not 0 <= self.friction < 100:
             raise InputError(f"--friction {self.friction}: must be 0 or more")
-        if not 8 <= self.keypoints <= 100_000:
+        if self.keypoints is not None and not 8 <= self.keypoints <= 100_000:
             raise InputError(f"--keypoints {self.keypoints}: must be 8 to 100000")
         if self.floor is not None and not math.isfinite(self.floor):
             raise InputError(f"--floor {self.floor}: must be a finite height")
+
+        if not 0 <= self.port < 65536:
+            raise InputError(f"--port {self.port}: must be 0 (any free one) to 65535")
+        if not self.live and (self.port or not self.browser):
+            raise InputError("--port and --no-browser: only with --live")
+
+    @property
+    def keypoint_count(self) -> int:
+        """Maximum number of keypoints per object."""
+        return self.keypoints or (LIVE_KEYPOINTS if self.live else DEFAULT_KEYPOINTS)
 
     @property
     def level(self) -> MpmQuality:

@@ -14,9 +14,10 @@ from stages.core.errors import InputError
 from stages.core.physics import forces
 from stages.core.physics.keypoints import bind_gaussians, choose_keypoints
 from stages.core.scene.files import provenance
+from stages.core.scene.formats import suffixes
 from stages.core.scene.scene import Scene
 from stages.core.scene.scene_ply import read_scene
-from stages.core.scene.trajectory import SimulationInfo, TrajectoryWriter
+from stages.core.scene.trajectory import SimulationInfo, TrajectoryWriter, read_trajectory
 from stages.simulate.options import ENGINES, SimulateOptions
 
 log = logging.getLogger(__name__)
@@ -25,9 +26,11 @@ log = logging.getLogger(__name__)
 def run(scene: Path, out: Path, options: SimulateOptions = SimulateOptions()) -> None:  # noqa: B008 -- frozen
     """Simulate the objects of a scene: scene.ply -> traj.h5.
 
-    Raises InputError for wrong options or input, and when the simulation diverges; the frames up to then are kept in
-    OUT.partial.h5.
+    With --live it runs until Ctrl-C. Raises InputError for wrong options or input, and when the simulation diverges;
+    the frames up to then are kept in OUT.partial.h5.
     """
+    options = with_recorded(options)
+    options = replace(options, keypoints=options.keypoint_count)
     rollout = choose({name: engine.rollout for name, engine in ENGINES.items()}, options.engine)
     world = with_objects(read_scene(scene), scene)
     prompts = forces.parse(
@@ -36,9 +39,13 @@ def run(scene: Path, out: Path, options: SimulateOptions = SimulateOptions()) ->
     )  # fmt: skip
     inputs = [Path(p) for p in (scene, options.materials, options.forces) if p is not None]
     world = replace(world, provenance={**provenance("simulate", inputs, options), "scene": world.provenance})
-    keypoints = choose_keypoints(world, options.keypoints, options.seed)
+    keypoints = choose_keypoints(world, options.keypoint_count, options.seed)
     gravity = (0.0, 0.0, -options.gravity / world.metres_per_unit)
     motion = SimulationInfo(options.dt, gravity, options.engine, prompts.as_dicts())
+    if options.live:
+        from stages.simulate.live.loop import LiveScene, run_live  # noqa: PLC0415 -- most runs are not live
+
+        return run_live(LiveScene(world, keypoints, prompts, options, rollout), Path(out), motion)
     states = rollout(world, keypoints, prompts, options)
     start, max_displacement = None, 0.0
     with TrajectoryWriter(out, world, motion, keypoints, bind_gaussians(world, keypoints)) as trajectory:
@@ -51,6 +58,27 @@ def run(scene: Path, out: Path, options: SimulateOptions = SimulateOptions()) ->
     if max_displacement < 0.02 * size and not prompts:
         log.info("everything is at rest (maximum displacement %.2g); try --lift 0.3 or a --force", max_displacement)
     log.info("%s: %d frames, %.2f s", out, options.steps, options.steps * options.dt)
+
+
+RECORDED = (  # options that --forces traj.h5 repeats
+    "steps", "dt", "engine", "gravity", "quality", "material", "floor", "friction", "box", "keypoints", "integrator",
+    "seed",
+)  # fmt: skip
+
+
+def with_recorded(options: SimulateOptions) -> SimulateOptions:
+    """With --forces traj.h5 the options that made it, and its number of frames, where none are given.
+
+    Not those that name other files (--materials, --weights), which must be given again.
+    """
+    if options.forces is None or Path(options.forces).suffix.lower() not in suffixes("trajectory"):
+        return options
+    trajectory = read_trajectory(options.forces)
+    made_by, default = trajectory.scene.provenance.get("options", {}), SimulateOptions()
+    recorded = {name: made_by[name] for name in RECORDED if name in made_by} | {"steps": len(trajectory)}
+    if "material" in recorded:
+        recorded["material"] = tuple(recorded["material"])
+    return replace(options, **{k: v for k, v in recorded.items() if getattr(options, k) == getattr(default, k)})
 
 
 def with_objects(scene: Scene, path: Path) -> Scene:

@@ -62,6 +62,12 @@ class TimeStepper:
         _load((self.initial, self.external), (initial, external))
         self.begin()
 
+    @torch.no_grad()
+    def change(self, initial: InitialConditions) -> None:
+        """Continue from the present state with other masses, materials or gravity, for the same shapes."""
+        _load((self.initial,), (initial,))
+        _load((self.scene,), (self.model.prepare(self.initial),))
+
     def _prepared(self) -> tuple[Any, tuple, Tensor]:
         """The scene, its state at time 0 and the positions of its keypoints."""
         scene = self.model.prepare(self.initial)

@@ -16,6 +16,7 @@ from pathlib import Path
 from stages.core.errors import InputError
 from stages.core.physics.materials import find_object
 from stages.core.scene.files import must_exist
+from stages.core.scene.formats import FORMATS, suffixes
 from stages.core.scene.scene import SceneObject
 
 Vector = tuple[float, float, float]
@@ -39,16 +40,42 @@ class Force:
 
 
 @dataclass(frozen=True)
+class Change:
+    """A condition that changes during the simulation, with the frame that begins at `start` [s]."""
+
+    what: str  # key of CHANGES
+    value: float | str | bool
+    start: float
+    object_id: int | None = None  # None: all objects
+
+
+CHANGES = {  # what changes -> type of its value
+    "gravity": float,  # downward acceleration [m/s^2]
+    "friction": float,  # Coulomb coefficient of all objects
+    "material": str,  # name of an object's material
+    "pinned": bool,  # whether an object is held at its position
+}
+
+
+@dataclass(frozen=True)
 class ForcePrompts:
     """Forces and constraints given by the user; false if there are none. Objects by id."""
 
     forces: tuple[Force, ...] = ()
-    pinned: frozenset[int] = frozenset()
+    pinned: frozenset[int] = frozenset()  # from the start
     velocity: dict[int, Vector] = field(default_factory=dict)  # at the start [scene units/s]
     lift: dict[int, float] = field(default_factory=dict)  # initial displacement upwards [scene units]
+    changes: tuple[Change, ...] = ()
 
     def __bool__(self) -> bool:
-        return bool(self.forces or self.pinned or self.velocity or self.lift)
+        return bool(self.forces or self.pinned or self.velocity or self.lift or self.changes)
+
+    def during(self, start: float, end: float) -> tuple[tuple[Force, ...], tuple[Change, ...]]:
+        """Forces that may act, and changes that take effect, in the frame from `start` to `end` [s].
+
+        Engines ask once for each frame, in order, before they compute it.
+        """
+        return self.forces, tuple(c for c in self.changes if start <= c.start < end)
 
     def as_dicts(self) -> tuple[dict, ...]:
         """One plain dict per prompt for the trajectory file, `kind` first; an infinite end time is None."""
@@ -59,7 +86,28 @@ class ForcePrompts:
         rows += [{"kind": "pin", "object_id": i} for i in sorted(self.pinned)]
         rows += [{"kind": "velocity", "object_id": i, "velocity": v} for i, v in sorted(self.velocity.items())]
         rows += [{"kind": "lift", "object_id": i, "height": h} for i, h in sorted(self.lift.items())]
+        rows += [{"kind": "change", **asdict(c)} for c in self.changes]
         return tuple(rows)
+
+    @classmethod
+    def from_dicts(cls, rows: Sequence[dict]) -> ForcePrompts:
+        """The inverse of `as_dicts`. Raises KeyError, TypeError or ValueError for rows that are none of its."""
+        of = {kind: [{k: v for k, v in row.items() if k != "kind"} for row in rows if row.get("kind", "force") == kind]
+              for kind in ("force", "pin", "velocity", "lift", "change")}  # fmt: skip
+        if sum(map(len, of.values())) != len(rows):
+            raise ValueError("a prompt of unknown kind")
+        forces = [
+            Force(int(f["object_id"]), _floats(f["force"]), _floats(f.get("torque", (0, 0, 0))), float(f["start"]),
+                  math.inf if f["end"] is None else float(f["end"]), None if f.get("at") is None else _floats(f["at"]))
+            for f in of["force"]
+        ]  # fmt: skip
+        return cls(
+            tuple(forces), frozenset(int(row["object_id"]) for row in of["pin"]),
+            {int(row["object_id"]): _floats(row["velocity"]) for row in of["velocity"]},
+            {int(row["object_id"]): float(row["height"]) for row in of["lift"]},
+            tuple(Change(c["what"], CHANGES[c["what"]](c["value"]), float(c["start"]), c["object_id"])
+                  for c in of["change"]),
+        )  # fmt: skip
 
 
 def parse(
@@ -68,17 +116,34 @@ def parse(
 ) -> ForcePrompts:  # fmt: skip
     """Parse the prompts of the command line and of a forces file; objects are given by id or name.
 
-    Raises InputError for malformed prompts and unknown objects.
+    A forces file is JSON, or a trajectory whose prompts are repeated. Raises InputError for malformed prompts and
+    unknown objects.
     """
-    parsed = [_force(text, objects) for text in force]
-    if forces is not None:
-        parsed += read_forces(forces, scene_name, objects)
+    stored = ForcePrompts()
+    if forces is not None and Path(forces).suffix.lower() in suffixes("trajectory"):
+        stored = stored_prompts(forces, objects)
+    elif forces is not None:
+        stored = ForcePrompts(tuple(read_forces(forces, scene_name, objects)))
     return ForcePrompts(
-        tuple(parsed),
-        frozenset(find_object(p, objects, f"--pin {p!r}").id for p in pin),
-        dict(_velocity(text, objects) for text in velocity),
-        {id: height for text in lift for id, height in _lift(text, objects)},
+        (*(_force(text, objects) for text in force), *stored.forces),
+        stored.pinned | {find_object(p, objects, f"--pin {p!r}").id for p in pin},
+        stored.velocity | dict(_velocity(text, objects) for text in velocity),
+        stored.lift | {id: height for text in lift for id, height in _lift(text, objects)},
+        stored.changes,
     )
+
+
+def stored_prompts(path: Path, objects: Sequence[SceneObject]) -> ForcePrompts:
+    """The prompts that a trajectory was made with. Raises InputError for objects that are not in this scene."""
+    try:
+        prompts = ForcePrompts.from_dicts(FORMATS[Path(path).suffix.lower()].read(Path(path)).info.forces)
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{path}: its forces/json is not as `ngff simulate` writes it ({error!r})") from error
+    acted_on = {f.object_id for f in prompts.forces} | {c.object_id for c in prompts.changes} - {None}
+    missing = (acted_on | prompts.pinned | set(prompts.velocity) | set(prompts.lift)) - {o.id for o in objects}
+    if missing:
+        raise InputError(f"{path}: acts on object {min(missing)}, which this scene does not have")
+    return prompts
 
 
 def _force(text: str, objects: Sequence[SceneObject]) -> Force:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 
@@ -147,6 +148,29 @@ class TrajectoryWriter:
         self._raw.check()
         self.frames += 1
 
+    @property
+    def part(self) -> Path:
+        """The file while it is being written, readable after `store_prompts`."""
+        return self._part
+
+    def restart(self) -> None:
+        """Drop all frames, and the prompts that were added."""
+        self.frames = 0
+        for name in ("keypoints/positions", "objects/com", "objects/rotation"):
+            self._file[name].resize(0, axis=0)
+        self._file["forces/json"].resize(len(self._contents[1].forces), axis=0)
+
+    def store_prompts(self, prompts: Sequence[dict]) -> None:
+        """Add to the applied prompts those that are new in this longer list, and write everything to the disk."""
+        self._raw.check()
+        data = self._file["forces/json"]
+        stored = data.shape[0]
+        data.resize(len(prompts), axis=0)
+        if len(prompts) > stored:
+            data[stored:] = [json.dumps(f) for f in prompts[stored:]]
+        self._file.flush()
+        self._raw.check()
+
     def _close(self) -> None:
         self._file.close()
         self._raw.close()
@@ -191,7 +215,7 @@ def _write_rest(file: h5py.File, scene: Scene, info: SimulationInfo, keypoints: 
             file[f"cameras/{name}"] = getattr(scene.cameras, name).cpu().numpy()
         file.create_dataset("cameras/names", data=list(scene.cameras.names), dtype=text)
     prompts = [json.dumps(f) for f in info.forces]
-    file.create_dataset("forces/json", data=prompts, dtype=text, shape=(len(prompts),))
+    file.create_dataset("forces/json", data=prompts, dtype=text, shape=(len(prompts),), maxshape=(None,), chunks=(64,))
 
 
 def read_trajectory(path: Path) -> Trajectory:

@@ -15,8 +15,8 @@ from stages.core.player.film import Motion, film_page, pack_film
 from stages.core.raster.rasterise import rasterise
 from stages.core.scene.gaussians import Gaussians, concatenate
 from stages.core.scene.trajectory import Keypoints
+from tests.browser import until
 from tests.conftest import random_gaussians, two_balls_scene
-from tests.core.player.conftest import until
 
 PIXELS = """async (view) => {
   const bytes = await player.pixels(view);

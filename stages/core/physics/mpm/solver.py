@@ -168,6 +168,8 @@ class Solver:
         """Overwrite fields of all particles, in the original order."""
         for name, value in changes.items():
             self.rows.put(name, value)
+        if {"mass", "stiffness", "held"} & changes.keys():
+            self._rates = self._max_rates()
 
     def substeps(self, duration: float, acceleration: Float[Tensor, "p 3"]) -> int:
         """Number of substeps that are stable (substep_rate). Raises Diverged when a velocity is not finite."""

@@ -85,7 +85,7 @@ function objectRow(player, o) {
   Object.assign(material, { textContent: o.material, title: o.material });
   Object.assign(only, { textContent: "only", title: "show only this object; again: all", onclick: () => player.isolate(o.id) });
   row.dataset.id = o.id;
-  row.append(shown, swatch, name, material, only);
+  row.append(shown, swatch, name, player.live ? player.live.materialSelect(o.id) : material, only);
   row.onmouseenter = () => player.highlight(o.id);
   row.onmouseleave = () => player.highlight(null);
   return row;

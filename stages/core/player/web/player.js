@@ -29,7 +29,7 @@ export class Player {
     Object.assign(this, { film, picture, overlay });
     Object.assign(this, { time: 0, playing: false, speed: 1, loop: true, arrowsShown: Boolean(film.arrows), keys: new Set() });
     Object.assign(this, { hidden: new Set(), highlighted: null, onchange: () => {}, arrows: null });
-    Object.assign(this, { quality: 0, changed: true, sent: null, drawing: null, waiting: [] });
+    Object.assign(this, { quality: 0, changed: true, sent: null, drawing: null, restUntil: 0, waiting: [] });
     const a = film.arrays;
     this.rest = a.keypoints ? a.keypoints.subarray(0, 3 * a.keypoint_object.length) : new Float32Array(0);
     this.positions = this.rest; // of the keypoints, shown
@@ -102,7 +102,8 @@ export class Player {
     this.before = now;
     if (this.playing) this.advance(seconds);
     if (this.camera.advance(seconds, this.keys)) this.wake();
-    if (this.busy || !this.drawn(now)) return;
+    if (this.busy || !this.drawn() || now < this.restUntil) return;
+    this.live?.drawn();
     if (this.changed) this.lastChange = now;
     const sharpen = this.shownQuality > 0 && now - this.lastChange > 250; // at rest, once more at full resolution
     if (!this.changed && !sharpen) return;
@@ -126,6 +127,7 @@ export class Player {
     gl.deleteSync(sync);
     this.drawing = null;
     const seconds = (performance.now() - since) / 1000;
+    if (this.live && seconds > SLOW) this.restUntil = performance.now() + 1000 * seconds; // leave time to the engine
     if (seconds > SLOW && this.shownQuality === this.quality) this.quality = Math.min(this.quality + 1, QUALITIES.length - 1);
     else if (seconds < FAST) this.quality = Math.max(this.quality - 1, 0);
     return true;
@@ -137,13 +139,12 @@ export class Player {
 
   drawOverlay() {
     const context = this.overlay.getContext("2d");
-    context.clearRect(0, 0, this.overlay.width, this.overlay.height);
+    this.overlay.width = this.overlay.width; // clears; clearRect leaves the arrows in Chromium 150 without a GPU
     if (!this.arrowsShown) return;
     const ratio = this.overlay.width / Math.max(1, this.overlay.clientWidth);
     context.setTransform(ratio, 0, 0, ratio, 0, 0);
     const view = this.camera.view(this.overlay.clientWidth, this.overlay.clientHeight);
     drawArrows(context, view, this.arrows ?? (this.film.frames ? filmArrows(this.film, this.frame) : []));
-    context.setTransform(1, 0, 0, 1, 0, 0);
   }
 
   // --- time ---

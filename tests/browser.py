@@ -41,16 +41,21 @@ def chromium(tmp_path_factory):
 
 @pytest.fixture
 def open_page(chromium):
-    """A function that opens a page file and returns it once its player runs; the test fails on errors of the page."""
+    """A function that opens a page, a file or an address, and returns it once its player runs.
+
+    The test fails on errors of the page, and where it fetches anything else than an address that was given.
+    """
     errors, pages = [], []
 
-    def open_(path: Path):
+    def open_(place: Path | str):
         page = chromium.new_page()
+        address = place.as_uri() if isinstance(place, Path) else place
         pages.append(page)
         page.on("pageerror", lambda error: errors.append(str(error)))
         page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
-        page.on("request", lambda request: errors.append(request.url) if request.url.startswith("http") else None)
-        page.goto(path.as_uri() if isinstance(path, Path) else path)
+        page.on("request", lambda request: None if request.url.startswith((address, "data:", "blob:"))
+                else errors.append(request.url))  # fmt: skip
+        page.goto(address)
         until(page, "window.player !== undefined")
         return page
 

@@ -1,0 +1,218 @@
+"""`ngff simulate scene.ply --live`: the engine in real time, a page that shows it, and the recording."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import logging
+import shutil
+import signal
+import struct
+import threading
+import time
+import webbrowser
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from stages.core.errors import InputError
+from stages.core.physics.forces import ForcePrompts
+from stages.core.physics.keypoints import bind_gaussians
+from stages.core.physics.state import FrameState
+from stages.core.player.film import Motion, film_page, pack_film
+from stages.core.scene.files import replacing
+from stages.core.scene.scene import Scene
+from stages.core.scene.trajectory import Keypoints, SimulationInfo, TrajectoryWriter
+from stages.simulate.live.messages import ELASTIC
+from stages.simulate.live.server import LiveServer
+from stages.simulate.live.session import Session
+from stages.simulate.options import SimulateOptions
+from stages.simulate.setup import SceneSetup, set_up_scene
+
+log = logging.getLogger(__name__)
+ENDLESS = 10**9  # frames
+FLUSH_TIME = 1.0  # between writes of the recording to the disk [s]
+RATE_TIME = 1.0  # over which the rate is measured [s]
+IDLE_TIME = 0.1  # between frames sent while nothing moves [s]
+MAX_LAG = 0.25  # behind the clock, which is then set back: time passes more slowly instead of in jumps [s]
+
+
+@dataclass(frozen=True)
+class LiveScene:
+    """A scene that is ready to be simulated."""
+
+    world: Scene
+    keypoints: Keypoints
+    prompts: ForcePrompts
+    options: SimulateOptions
+    rollout: object  # the engine, a function as in `stages.simulate.options.Engine`
+
+
+def run_live(scene: LiveScene, out: Path, info: SimulationInfo, stop: threading.Event | None = None) -> None:
+    """Simulate until Ctrl-C (or `stop`) and write what was recorded since the last start.
+
+    Raises InputError for unusable options, and MissingPackage without websockets.
+    """
+    stop = _stop_on_signals() if stop is None else stop
+    setup = set_up_scene(scene.world, scene.prompts, scene.options)
+    binding = bind_gaussians(scene.world, scene.keypoints)
+    page = _page(scene, binding, setup, out)
+    with LiveServer(page, scene.options.port) as server, \
+            TrajectoryWriter(out, scene.world, info, scene.keypoints, binding) as writer:  # fmt: skip
+        print(server.url, flush=True)
+        if scene.options.browser:
+            webbrowser.open(server.url)
+        log.info("listening on this machine only; Ctrl-C ends and writes %s", out)
+        live = _Live(scene, setup, server, writer, out)
+        while not stop.is_set():
+            live.turn()
+        if not writer.frames:
+            live.advance()
+        writer.store_prompts(live.session.record)
+    log.info("%s: %d frames; the same motion again: ngff simulate SCENE.ply --forces %s", out, writer.frames, out)
+
+
+class _Live:
+    """The state between turns of the loop."""
+
+    def __init__(self, scene: LiveScene, setup: SceneSetup, server: LiveServer, writer: TrajectoryWriter, out: Path):
+        self.scene, self.setup, self.server, self.writer, self.out = scene, setup, server, writer, out
+        self.dt, self.speed, self.paused, self.note = scene.options.dt, 1.0, False, ""
+        self.flushed = self.shown = 0.0
+        self.start()
+
+    def start(self) -> None:
+        """Begin again at the start, with a new recording."""
+        self.session = _session(self.scene, self.setup)
+        endless = replace(self.scene.options, steps=ENDLESS)
+        self.states: Iterator[FrameState] = self.scene.rollout(
+            self.scene.world, self.scene.keypoints, self.session.prompts(), endless
+        )
+        self.writer.restart()
+        self.note, self.due = "", time.monotonic()
+        self.turns: deque[tuple[float, int]] = deque()
+        self.advance()
+
+    def turn(self) -> None:
+        """Take messages, advance when it is time, show and write."""
+        now = time.monotonic()
+        for message in self.server.messages(wait=IDLE_TIME if self.paused else max(0.0, self.due - now)):
+            self.take(message)
+        now = time.monotonic()
+        if not self.paused and now >= self.due:
+            self.due = max(self.due + self.dt / self.speed, now - MAX_LAG)
+            self.advance()
+        elif now - self.shown > IDLE_TIME:
+            self.show()
+        if now - self.flushed > FLUSH_TIME:
+            self.writer.store_prompts(self.session.record)
+            self.flushed = now
+
+    def take(self, message: dict) -> None:
+        """A message about time and the recording; the others are the session's."""
+        match message["do"]:
+            case "pause":
+                self.paused, self.due = message["value"], time.monotonic()
+                self.turns.clear()
+            case "step" if self.paused:
+                self.advance()
+            case "speed":
+                self.speed, self.due = message["value"], time.monotonic()
+                self.turns.clear()
+            case "reset":
+                self.start()
+            case "save":
+                self.save()
+            case _:
+                self.session.handle(message)
+
+    def advance(self) -> None:
+        """One frame; where the engine fails, pause with a note, as only a new start helps."""
+        try:
+            state = next(self.states)
+        except InputError as error:
+            log.warning("%s", error)
+            self.note, self.paused = f"{error} Start again with R.", True
+            return self.show()
+        except StopIteration:  # after an error
+            return self.show()
+        self.session.observe(state)
+        self.writer.append(state.positions, state.com, state.rotation)
+        self.turns.append((time.monotonic(), self.writer.frames))
+        while self.turns[-1][0] - self.turns[0][0] > RATE_TIME:
+            self.turns.popleft()
+        self.show()
+
+    def save(self) -> None:
+        """A copy of the recording so far, beside the file that is written at the end: traj-1.h5, traj-2.h5, ..."""
+        numbered = (self.out.with_name(f"{self.out.stem}-{i}{self.out.suffix}") for i in itertools.count(1))
+        path = next(p for p in numbered if not p.exists())
+        self.writer.store_prompts(self.session.record)
+        with replacing(path) as part:
+            shutil.copyfile(self.writer.part, part)
+        self.note = f"{path.name}: {self.writer.frames} frames"
+        log.info("saved %s", self.note)
+
+    def show(self) -> None:
+        """Send the present frame: length of the header (uint32), the header (JSON), padding to 4 bytes, float32."""
+        session = self.session
+        self.shown = time.monotonic()
+        span = self.turns[-1][0] - self.turns[0][0] if len(self.turns) > 1 else 0.0
+        frames_per_second = (self.turns[-1][1] - self.turns[0][1]) / span if span > 0 else 0.0
+        header = {
+            "time": (self.writer.frames - 1) * self.dt, "frames": self.writer.frames, "paused": self.paused,
+            "speed": self.speed, "rate": frames_per_second, "arrows": session.arrows, "pinned": sorted(session.pinned),
+            "lifted": sorted(session.lifted), "gravity": session.gravity, "note": self.note,
+        }  # fmt: skip
+        text = json.dumps(header).encode()
+        text += b" " * (-len(text) % 4)
+        positions = session.state.positions.float().contiguous().numpy().tobytes()
+        self.server.publish(struct.pack("<I", len(text)) + text + positions)
+
+
+def _page(scene: LiveScene, binding, setup: SceneSetup, out: Path) -> str:
+    """The page of the session; the keypoints of its film are at rest."""
+    world, rest = scene.world, scene.keypoints.rest
+    count = len(world.objects)
+    motion = Motion(
+        scene.keypoints, binding, rest[None], rest.new_zeros(1, count, 3), rest.new_zeros(1, count, 4), scene.options.dt
+    )
+    settings = {
+        "live": {
+            "dt": scene.options.dt, "gravity": scene.options.gravity, "materials": ELASTIC, "out": str(out),
+            "material": {o.id: setup.materials[o.id].name for o in world.objects}, "engine": scene.options.engine,
+        },
+        "arrows": True,
+    }  # fmt: skip
+    return film_page(pack_film(world, motion, settings), f"{out.stem} live")
+
+
+def _session(scene: LiveScene, setup: SceneSetup) -> Session:
+    unit, room = scene.world.metres_per_unit, {}
+    if scene.options.engine == "mpm" or scene.options.box:  # a grid ends somewhere
+        margin = 0.15 * (setup.bodies.x.amax(0) - setup.bodies.x.amin(0)).max().item()
+        room = {"low": tuple(a + margin for a in setup.box.low), "high": tuple(b - margin for b in setup.box.high)}
+    mass = object_masses(scene.world, setup)
+    return Session(scene.prompts, scene.keypoints, mass, scene.options.gravity, unit, **room)
+
+
+def object_masses(world: Scene, setup: SceneSetup) -> dict[int, float]:
+    """Mass of each object [kg], in the order of the scene."""
+    volumes = (setup.bodies.volume[setup.bodies.body == row].sum() for row in range(len(world.objects)))
+    cubic_metres = world.metres_per_unit**3
+    return {o.id: float(volume) * cubic_metres * setup.materials[o.id].material.density
+            for o, volume in zip(world.objects, volumes, strict=True)}  # fmt: skip
+
+
+def _stop_on_signals() -> threading.Event:
+    """An event that Ctrl-C and SIGTERM set; a second Ctrl-C interrupts."""
+    stop = threading.Event()
+
+    def end(number, _frame) -> None:
+        stop.set()
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, end)
+    return stop

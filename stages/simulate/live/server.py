@@ -1,0 +1,205 @@
+"""The local server of a live session: the page, and a WebSocket for messages and frames.
+
+It listens on 127.0.0.1 only. The address has a random token; requests with another host, path or origin are refused.
+One client controls, the first; any others watch, and the eldest takes over when it leaves. A frame is sent to a client
+when it has drawn the one before, so that none falls behind. It runs in a thread of its own.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import hmac
+import json
+import logging
+import secrets
+import socket
+import threading
+import time
+from collections import deque
+from contextlib import suppress
+from dataclasses import dataclass
+from http import HTTPStatus
+
+from stages.core.errors import InputError, MissingPackage
+from stages.simulate.live.messages import MAX_BYTES, BadMessage, parse_message
+
+log = logging.getLogger(__name__)
+HOST = "127.0.0.1"
+MAX_CLIENTS = 16
+MAX_ERRORS = 10  # wrong messages after which a client is disconnected
+MAX_RATE = 500  # messages per second of one client
+MAX_WAITING = 1000  # messages that the engine has not read; older ones are dropped
+HANDSHAKE_TIME = 5.0  # after which a connection that asks for nothing is closed [s]
+
+
+@dataclass(eq=False)
+class Client:
+    """A connected page."""
+
+    socket: object
+    ready: bool = False  # has drawn what it was sent
+    sent: int = -1  # number of the last frame it was sent
+    errors: int = 0
+    second: int = 0  # in which its messages are being counted
+    count: int = 0
+
+
+class LiveServer:
+    """Context manager; inside, `url` serves the page, `messages` are those of the controlling client."""
+
+    def __init__(self, page: str, port: int = 0):
+        try:
+            import websockets.asyncio.server  # noqa: F401, PLC0415 -- only live sessions need it
+        except ImportError as error:
+            raise MissingPackage("--live needs the package websockets: `pip install websockets`") from error
+        self._page, self._token = page.encode(), secrets.token_urlsafe(24)
+        try:
+            self._listener = socket.create_server((HOST, port))
+        except OSError as error:
+            raise InputError(f"--port {port}: cannot listen on it ({error.strerror}); choose another") from error
+        self.port = self._listener.getsockname()[1]
+        self.url = f"http://{HOST}:{self.port}/{self._token}/"
+        self._clients: list[Client] = []
+        self._waiting: deque[dict] = deque(maxlen=MAX_WAITING)
+        self._frame, self._number = b"", -1
+        self._arrived = threading.Event()
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._run, name="live server", daemon=True)
+
+    def __enter__(self) -> LiveServer:
+        self._started = threading.Event()
+        self._thread.start()
+        self._started.wait()
+        return self
+
+    def __exit__(self, *_) -> None:
+        self._loop.call_soon_threadsafe(self._stop.set)
+        self._thread.join(timeout=5)
+
+    @property
+    def clients(self) -> int:
+        """Number of connected pages."""
+        return len(self._clients)
+
+    def messages(self, wait: float = 0.0) -> list[dict]:
+        """Messages of the controlling client since the last call; waits up to `wait` [s] for one."""
+        if wait:
+            self._arrived.wait(wait)
+        self._arrived.clear()
+        return [self._waiting.popleft() for _ in range(len(self._waiting))]
+
+    def publish(self, frame: bytes) -> None:
+        """Send a frame to all clients that are ready for it; the others get the newest when they are."""
+        self._loop.call_soon_threadsafe(self._publish, frame)
+
+    # --- in the thread of the server ---
+
+    def _run(self) -> None:
+        asyncio.set_event_loop(self._loop)
+        self._loop.run_until_complete(self._serve())
+        self._loop.close()
+
+    async def _serve(self) -> None:
+        from websockets.asyncio.server import serve  # noqa: PLC0415
+
+        quiet = logging.getLogger(f"{__name__}.websockets")  # failed handshakes are expected
+        quiet.setLevel(logging.CRITICAL)
+        self._stop = asyncio.Event()
+        server = serve(
+            self._talk, sock=self._listener, origins=[f"http://{HOST}:{self.port}"], process_request=self._answer,
+            max_size=MAX_BYTES, max_queue=16, compression=None, open_timeout=HANDSHAKE_TIME, close_timeout=1,
+            logger=quiet,
+        )  # fmt: skip
+        async with server:
+            self._started.set()
+            await self._stop.wait()
+
+    def _answer(self, connection, request):
+        """The page, or an error; None lets the handshake of a WebSocket go on."""
+        from websockets.datastructures import Headers  # noqa: PLC0415
+        from websockets.http11 import Response  # noqa: PLC0415
+
+        path = request.path.encode("ascii", "replace")
+        if request.headers.get_all("Host") != [f"{HOST}:{self.port}"]:
+            return connection.respond(HTTPStatus.FORBIDDEN, "wrong host\n")
+        if hmac.compare_digest(path, f"/{self._token}/live".encode()):
+            full = len(self._clients) >= MAX_CLIENTS
+            return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, "too many pages\n") if full else None
+        if not hmac.compare_digest(path, f"/{self._token}/".encode()):
+            return connection.respond(HTTPStatus.NOT_FOUND, "not found\n")
+        headers = Headers({
+            "Content-Type": "text/html; charset=utf-8", "Content-Length": str(len(self._page)), "Connection": "close",
+            "Cache-Control": "no-store", "Referrer-Policy": "no-referrer", "X-Content-Type-Options": "nosniff",
+            "Content-Security-Policy": "frame-ancestors 'none'",
+        })  # fmt: skip
+        return Response(HTTPStatus.OK, "OK", headers, self._page)
+
+    async def _talk(self, connection) -> None:
+        """Serve one client until it leaves."""
+        from websockets.exceptions import ConnectionClosed  # noqa: PLC0415
+
+        client = Client(connection)
+        if len(self._clients) >= MAX_CLIENTS:  # several handshakes at once
+            return
+        self._clients.append(client)
+        self._tell_roles()
+        try:
+            async for text in connection:
+                if not self._receive(client, text):
+                    await connection.close(1008, "too many wrong messages")
+                    break
+        except ConnectionClosed:
+            pass
+        finally:
+            controlled = self._clients[0] is client
+            self._clients.remove(client)
+            if controlled:
+                self._put({"do": "release"})  # nothing is dragged by nobody
+                self._tell_roles()
+
+    def _receive(self, client: Client, text: str | bytes) -> bool:
+        """Take a message; False when the client is to be disconnected."""
+        second = int(time.monotonic())
+        client.count = client.count + 1 if second == client.second else 1
+        client.second = second
+        if client.count > MAX_RATE:
+            return False
+        try:
+            message = parse_message(text)
+        except BadMessage:
+            client.errors += 1
+            return client.errors < MAX_ERRORS
+        if message["do"] == "drawn":
+            client.ready = True
+            self._send_frame(client)
+        elif client is self._clients[0]:
+            self._put(message)
+        return True
+
+    def _put(self, message: dict) -> None:
+        self._waiting.append(message)
+        self._arrived.set()
+
+    def _publish(self, frame: bytes) -> None:
+        self._frame, self._number = frame, self._number + 1
+        for client in self._clients:
+            self._send_frame(client)
+
+    def _send_frame(self, client: Client) -> None:
+        if client.ready and client.sent < self._number:
+            client.ready, client.sent = False, self._number
+            self._send(client, self._frame)
+
+    def _tell_roles(self) -> None:
+        for client in self._clients:
+            self._send(client, json.dumps({"control": client is self._clients[0]}))
+
+    def _send(self, client: Client, data: str | bytes) -> None:
+        async def send() -> None:
+            from websockets.exceptions import ConnectionClosed  # noqa: PLC0415
+
+            with suppress(ConnectionClosed):  # `_talk` removes it
+                await client.socket.send(data)
+
+        task = self._loop.create_task(send())
+        task.add_done_callback(lambda done: done.exception())

@@ -1,0 +1,182 @@
+"""A user's actions as force prompts, one frame at a time, and their record."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from stages.core.physics.forces import Change, Force, ForcePrompts
+from stages.core.physics.state import FrameState
+from stages.core.scene.trajectory import Keypoints
+
+SPRING = 7.0  # angular frequency of the spring from a grabbed point to the cursor [1/s]
+DAMPING = 0.8  # of critical
+MAX_ACCELERATION = 60.0  # by a spring [m/s^2]
+MARGIN = 0.01  # of a frame at both ends in which its forces do not act, so that rounding moves none to another frame
+MAX_PUSHES = 3  # in one frame
+ARROW_TIME = 0.4  # for which the arrow of a push is shown [s]
+PUSH_ARROW = 0.25  # length of the arrow of a push of 1 scene unit per second [scene units]
+
+Vector = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class LivePrompts(ForcePrompts):
+    """Prompts that a session decides about from frame to frame."""
+
+    session: Session | None = None
+
+    def during(self, start: float, end: float) -> tuple[tuple[Force, ...], tuple[Change, ...]]:
+        """What the user does in the frame from `start` to `end` [s]."""
+        forces, changes = super().during(start, end)
+        return self.session.during(start, end, forces, changes)
+
+
+@dataclass
+class Session:
+    """What the user holds, pushes and changes.
+
+    Messages are those of `messages.py`. `observe` is given every frame before the engine asks for what acts next.
+    """
+
+    given: ForcePrompts  # of the command line
+    keypoints: Keypoints
+    mass: dict[int, float]  # of each object, in the order of the scene [kg]
+    gravity: float  # downwards [m/s^2]
+    unit: float = 1.0  # [m per scene unit]
+    low: Vector = (-math.inf,) * 3  # room in which objects are pulled [scene units]
+    high: Vector = (math.inf,) * 3
+
+    record: list[dict] = field(default_factory=list)  # prompts that repeat what was done, as ForcePrompts.as_dicts
+    arrows: list[tuple[Vector, Vector]] = field(default_factory=list)  # of the forces of the last frame
+    dragged: tuple[int, int] | None = None  # object and keypoint
+    target: Float[Tensor, "3"] | None = None  # of the dragged keypoint
+    lifted: dict[int, Float[Tensor, "3"]] = field(default_factory=dict)  # object -> where its centre of mass is held
+    pinned: set[int] = field(default_factory=set)
+
+    def __post_init__(self):
+        self.ids = list(self.mass)  # in the order of the scene, as rows of the state
+        self.pinned, self.record = set(self.given.pinned), list(self.given.as_dicts())
+        self._pending: list[Change] = []
+        self._pushes: list[dict] = []
+        self._push_arrows: list[tuple[float, Vector, Vector]] = []
+        self._before: Tensor | None = None
+        self.state: FrameState | None = None
+
+    def prompts(self) -> LivePrompts:
+        """The prompts for the engine, with room for the forces of a frame."""
+        most = len(self.ids) + 2 + MAX_PUSHES  # a lift of each object, a drag and its weight, pushes
+        room = [Force(self.ids[0], start=0.0, end=0.0)] * most
+        given = {name: getattr(self.given, name) for name in ("pinned", "velocity", "lift", "changes")}
+        return LivePrompts((*self.given.forces, *room), **given, session=self)
+
+    def observe(self, state: FrameState) -> None:
+        """The present frame."""
+        self._before = None if self.state is None else self.state
+        self.state = state
+
+    def handle(self, message: dict) -> None:
+        """Take a message about the objects; those about unknown objects have no effect."""
+        id = message.get("object")
+        if self.state is None or (id is not None and id not in self.mass):
+            return
+        match message["do"]:
+            case "grab":
+                self.dragged = id, self._nearest(id, message["point"])
+                self.target = torch.tensor(message["target"])
+            case "move":
+                self.target = torch.tensor(message["target"])
+            case "release":
+                self.dragged = None
+            case "push" if len(self._pushes) < MAX_PUSHES:
+                self._pushes.append(message)
+            case "lift":
+                at = self.lifted.get(id, self.state.com[self.ids.index(id)])
+                self.lifted[id] = at + torch.tensor([0.0, 0.0, message["height"]])
+            case "drop":
+                self.lifted.pop(id, None)
+            case "pin":
+                self._change("pinned", message["value"], id)
+                (self.pinned.add if message["value"] else self.pinned.discard)(id)
+            case "gravity" | "friction":
+                self._change(message["do"], message["value"])
+            case "material":
+                self._change("material", message["name"], id)
+
+    def during(
+        self, start: float, end: float, forces: tuple[Force, ...], changes: tuple[Change, ...]
+    ) -> tuple[tuple[Force, ...], tuple[Change, ...]]:
+        """The given forces and changes with those of the user in a frame; they are recorded."""
+        new = [replace(change, start=start) for change in self._pending]
+        for change in (*changes, *new):
+            self.gravity = change.value if change.what == "gravity" else self.gravity
+        dt = end - start
+        times = {"start": start + MARGIN * dt, "end": end - MARGIN * dt}
+        acting = [self._force(*acts, **times) for acts in self._actions(dt, start)]
+        self._pending, self._pushes = [], []
+        self.record += ForcePrompts(tuple(acting), changes=tuple(new)).as_dicts()
+        if not acting:
+            return forces, (*changes, *new)
+        return (*self.given.forces, *acting), (*changes, *new)
+
+    def _change(self, what: str, value: float | str | bool, object_id: int | None = None) -> None:
+        """Take effect with the next frame, instead of the same change of the same object."""
+        same = (what, object_id)
+        self._pending = [c for c in self._pending if (c.what, c.object_id) != same]
+        self._pending.append(Change(what, value, 0.0, object_id))
+
+    def _actions(self, dt: float, start: float) -> list[tuple[int, Tensor, int | None]]:
+        """Object, acceleration [m/s^2] and keypoint (None: the whole object) of what the user does, and the arrows."""
+        actions: list[tuple[int, Tensor, int | None]] = []
+        self.arrows = []
+        if self.dragged is not None and self.dragged[0] not in self.pinned:
+            id, k = self.dragged
+            here, before = (None if s is None else s.positions[k] for s in (self.state, self._before))
+            actions.append((id, self._spring(here, before, self.target, dt), k))
+            actions.append((id, self._weight(), None))
+            self.arrows.append((_vector(here), _vector(self.target)))
+        for id, target in self.lifted.items():
+            if id not in self.pinned and (self.dragged is None or self.dragged[0] != id):
+                row = self.ids.index(id)
+                here, before = (None if s is None else s.com[row] for s in (self.state, self._before))
+                actions.append((id, self._spring(here, before, target, dt) + self._weight(), None))
+        for push in self._pushes:
+            id, direction = push["object"], torch.tensor(push["direction"])
+            k = self._nearest(id, push["point"])
+            actions.append((id, direction * push["strength"] * self.unit / dt, k))
+            tip = self.state.positions[k]
+            tail = tip - PUSH_ARROW * push["strength"] * direction
+            self._push_arrows.append((start, _vector(tail), _vector(tip)))
+        self._push_arrows = [arrow for arrow in self._push_arrows if start - arrow[0] < ARROW_TIME]
+        self.arrows += [(tail, tip) for _, tail, tip in self._push_arrows]
+        return actions
+
+    def _spring(self, here: Tensor, before: Tensor | None, target: Tensor, dt: float) -> Float[Tensor, "3"]:
+        """Acceleration [m/s^2] of a damped spring to the target."""
+        target = target.maximum(torch.tensor(self.low)).minimum(torch.tensor(self.high))
+        velocity = torch.zeros(3) if before is None else (here - before) / dt
+        pull = self.unit * (SPRING**2 * (target - here) - 2 * DAMPING * SPRING * velocity)
+        return pull * min(1.0, MAX_ACCELERATION / max(float(pull.norm()), 1e-9))
+
+    def _weight(self) -> Float[Tensor, "3"]:
+        """Acceleration that carries the weight [m/s^2]."""
+        return torch.tensor([0.0, 0.0, self.gravity])
+
+    def _force(self, id: int, acceleration: Tensor, k: int | None, start: float, end: float) -> Force:
+        at = None if k is None else _vector(self.keypoints.rest[k])
+        newtons = self.mass[id] * acceleration / (1 - 2 * MARGIN)
+        return Force(id, _vector(newtons), start=start, end=end, at=at)
+
+    def _nearest(self, id: int, point: Vector) -> int:
+        """The keypoint of an object nearest to a point."""
+        distance = (self.state.positions - torch.tensor(point)).norm(dim=1)
+        return int(torch.where(self.keypoints.object_id == id, distance, math.inf).argmin())
+
+
+def _vector(x: Tensor) -> Vector:
+    a, b, c = x.tolist()
+    return a, b, c

@@ -1,0 +1,353 @@
+"""Live sessions: what was done is repeated exactly, hostile clients change nothing, and a page drags objects."""
+
+import json
+import os
+import signal
+import socket
+import struct
+import subprocess
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import connect
+
+from stages.core.backends import choose
+from stages.core.physics.forces import Change, ForcePrompts
+from stages.core.physics.keypoints import choose_keypoints
+from stages.core.scene.scene_ply import write_scene
+from stages.core.scene.trajectory import read_trajectory
+from stages.simulate.live.loop import object_masses
+from stages.simulate.live.messages import BadMessage, parse_message
+from stages.simulate.live.server import MAX_CLIENTS, LiveServer
+from stages.simulate.live.session import Session
+from stages.simulate.options import ENGINES, QUALITIES, MpmQuality, SimulateOptions
+from stages.simulate.setup import set_up_scene
+from stages.simulate.stage import run
+from tests.browser import until
+from tests.conftest import two_balls_scene
+
+FIND_RED = """() => {
+  for (let y = 20; y < 340; y += 8) for (let x = 200; x < 470; x += 8)
+    if (player.pick(x, y)?.object === 1) return [x + 8, y + 16];
+}"""  # a point of object 1 in the part of the page without the panel [px]
+ROOT = Path(__file__).resolve().parents[2]
+
+
+# --- messages ---
+
+
+def test_messages_are_those_of_the_table():
+    assert parse_message('{"do": "step"}') == {"do": "step"}
+    push = {"do": "push", "object": 1, "point": [0, 0, 1], "direction": [0, 3, 4], "strength": 2}
+    assert parse_message(json.dumps(push))["direction"] == (0.0, 0.6, 0.8)
+
+
+@pytest.mark.parametrize("text", [
+    "", "{", "[]", "null", "7", b"\x00\x01", '{"do": 3}', '{"do": "exec"}', '{"do": "step", "more": 1}',
+    '{"do": "move"}', '{"do": "move", "target": [1, 2]}', '{"do": "move", "target": [1, 2, NaN]}',
+    '{"do": "move", "target": [1, 2, 1e9]}',
+    '{"do": "pause", "value": 1}', '{"do": "gravity", "value": "9"}', '{"do": "gravity", "value": true}',
+    '{"do": "drop", "object": -1}', '{"do": "drop", "object": 1.5}', '{"do": "speed", "value": 0}',
+    '{"do": "material", "object": 1, "name": "sand"}', '{"do": "push", "object": 1, "point": [0, 0, 0], "direction": '
+    '[0, 0, 0], "strength": 1}', "[" * 2000, " " * 3000,
+])  # fmt: skip
+def test_other_messages_are_refused(text):
+    with pytest.raises(BadMessage):
+        parse_message(text)
+
+
+# --- recording ---
+
+
+def prompts_of_a_session(engine, monkeypatch, actions, frames=26):
+    """Keypoints of a session with messages at some frames, and of its record, in one engine."""
+    monkeypatch.setitem(QUALITIES, "draft", MpmQuality(particles=800, substep=1e-3))
+    world = two_balls_scene()
+    options = SimulateOptions(engine=engine, quality="draft", steps=frames, keypoints=32, box="-1,-1,0,1,1,2")
+    keypoints = choose_keypoints(world, 32)
+    rollout = choose({name: e.rollout for name, e in ENGINES.items()}, engine)
+    mass = object_masses(world, set_up_scene(world, ForcePrompts(), options))
+    session = Session(ForcePrompts(), keypoints, mass, options.gravity)
+    live = []
+    for n, state in enumerate(rollout(world, keypoints, session.prompts(), options)):
+        live.append(state.positions)
+        session.observe(state)
+        for message in actions(n, state):
+            session.handle(message)
+    record = ForcePrompts.from_dicts(json.loads(json.dumps(session.record)))
+    again = [state.positions for state in rollout(world, keypoints, record, options)]
+    return torch.stack(live), torch.stack(again), keypoints, session
+
+
+def a_busy_user(n, state):
+    """Drags the red ball up, pushes the green one, then changes gravity, friction and a material, and pins."""
+    red = [-0.3, 0.0, 0.3]
+    return {
+        2: [{"do": "grab", "object": 1, "point": red, "target": red}],
+        4: [{"do": "move", "target": [-0.3, 0.0, 0.6]}],
+        12: [{"do": "push", "object": 2, "point": [0.3, 0.0, 0.3], "direction": [0.0, 1.0, 0.0], "strength": 1.0}],
+        14: [{"do": "release"}, {"do": "lift", "object": 2, "height": 0.1}],
+        16: [{"do": "gravity", "value": 3.0}, {"do": "friction", "value": 0.2}],
+        18: [{"do": "material", "object": 1, "name": "jelly"}, {"do": "drop", "object": 2}],
+        20: [{"do": "pin", "object": 1, "value": True}, {"do": "drop", "object": 99}],
+    }.get(n, [])
+
+
+@pytest.mark.parametrize("engine", ["ngff", "mpm"])
+def test_a_record_repeats_the_motion_exactly(engine, monkeypatch):
+    live, again, keypoints, session = prompts_of_a_session(engine, monkeypatch, a_busy_user)
+    assert torch.equal(live, again)
+    red = keypoints.object_id == 1
+    assert (live[14, red] - live[2, red]).mean(0)[2] > 0.05  # dragged up
+    assert (live[20:, red] - live[21, red]).norm(dim=-1)[1:].max() < 1e-5  # pinned
+    assert {row.get("what") for row in session.record} == {None, "gravity", "friction", "material", "pinned"}
+
+
+def test_what_is_held_hangs_where_the_cursor_is(monkeypatch):
+    goal = torch.tensor([-0.3, 0.0, 0.5])
+
+    def hold(n, state):
+        return [{"do": "grab", "object": 1, "point": [-0.3, 0.0, 0.3], "target": goal.tolist()}] if n == 0 else []
+
+    live, _, keypoints, session = prompts_of_a_session("ngff", monkeypatch, hold, frames=60)
+    _, k = session.dragged
+    assert (live[-1, k] - goal).norm() < 0.03
+
+
+def test_changes_come_back_from_json():
+    prompts = ForcePrompts(changes=(Change("gravity", 1.6, 0.5), Change("pinned", True, 0.7, 2)), lift={1: 0.2})
+    assert ForcePrompts.from_dicts(json.loads(json.dumps(prompts.as_dicts()))) == prompts
+    for wrong in ({"kind": "spell"}, {"kind": "change", "what": "colour", "value": 1, "start": 0, "object_id": None}):
+        with pytest.raises((KeyError, ValueError)):
+            ForcePrompts.from_dicts([wrong])
+
+
+# --- the server ---
+
+
+@pytest.fixture
+def server():
+    with LiveServer("<p>page</p>") as server:
+        yield server
+
+
+def client(server, **options):
+    origin = f"http://127.0.0.1:{server.port}"
+    address = server.url.replace("http", "ws") + "live"
+    return connect(**{"uri": address, "origin": origin, "compression": None, "max_size": None, **options})
+
+
+def say(socket, **message):
+    socket.send(json.dumps(message))
+
+
+def heard(server, seconds=5.0):
+    """The next messages of the controlling client."""
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        if messages := server.messages(wait=0.1):
+            return messages
+    return []
+
+
+def eventually(condition, seconds=5.0):
+    end = time.monotonic() + seconds
+    while not condition() and time.monotonic() < end:
+        time.sleep(0.01)
+    return condition()
+
+
+def answer(server, request: bytes) -> bytes:
+    with socket.create_connection(("127.0.0.1", server.port), timeout=5) as raw:
+        raw.sendall(request)
+        raw.settimeout(2)
+        try:
+            return b"".join(iter(lambda: raw.recv(65536), b""))
+        except (TimeoutError, ConnectionError):
+            return b""
+
+
+def test_page_needs_the_token_and_the_host(server):
+    path = server.url.partition(str(server.port))[2]
+    host = f"127.0.0.1:{server.port}"
+    assert answer(server, f"GET {path} HTTP/1.1\r\nHost: {host}\r\n\r\n".encode()).endswith(b"<p>page</p>")
+    for wrong in (f"GET / HTTP/1.1\r\nHost: {host}\r\n\r\n", f"GET /{'A' * 32}/ HTTP/1.1\r\nHost: {host}\r\n\r\n",
+                  f"GET {path} HTTP/1.1\r\nHost: evil.example\r\n\r\n", f"GET {path} HTTP/1.1\r\n\r\n",
+                  "POST / HTTP/1.1\r\n\r\n", f"GET /../../etc/passwd HTTP/1.1\r\nHost: {host}\r\n\r\n"):  # fmt: skip
+        assert b"page" not in answer(server, wrong.encode())
+    assert b"page" not in answer(server, os.urandom(5000))
+    with pytest.raises(OSError):  # other addresses of this machine
+        socket.create_connection(("127.0.0.2", server.port), timeout=1)
+
+
+def test_socket_needs_token_and_origin(server):
+    wrong = server.url.replace("http", "ws").replace(server.url.split("/")[-2], "A" * 32) + "live"
+    for options in ({"uri": wrong}, {"origin": "http://evil.example"}, {"origin": None}, {"origin": "null"}):
+        with pytest.raises(InvalidStatus) as refused:
+            client(server, **options)
+        assert refused.value.response.status_code in (403, 404)
+    with client(server) as good:
+        assert json.loads(good.recv(timeout=5)) == {"control": True}
+
+
+def test_one_client_controls_and_the_next_takes_over(server):
+    with client(server) as first, client(server) as next_one:
+        assert json.loads(next_one.recv(timeout=5)) == {"control": False}
+        say(next_one, do="step")
+        say(first, do="pause", value=True)
+        assert heard(server) == [{"do": "pause", "value": True}]
+        first.close()
+        assert json.loads(next_one.recv(timeout=5)) == {"control": True}
+        assert {"do": "release"} in heard(server)
+        say(next_one, do="save")
+        assert {"do": "save"} in heard(server)
+
+
+def test_frames_wait_until_the_last_is_drawn(server):
+    with client(server) as page:
+        page.recv(timeout=5)
+        server.publish(b"first")
+        say(page, do="drawn")
+        assert page.recv(timeout=5) == b"first"
+        for i in range(5):
+            server.publish(b"%d" % i)
+        with pytest.raises(TimeoutError):
+            page.recv(timeout=0.2)
+        say(page, do="drawn")
+        assert page.recv(timeout=5) == b"4"
+
+
+def test_hostile_clients_are_closed_and_others_go_on(server):
+    with client(server) as good:
+        good.recv(timeout=5)
+        for hostility in (["garbage"] * 20, [b"\x00" * 100] * 20, ["x" * 10_000_000], ['{"do": "drawn"}'] * 2000):
+            bad = client(server)
+            with pytest.raises((ConnectionClosed, OSError)):
+                for text in hostility:
+                    bad.send(text)
+                while True:
+                    bad.recv(timeout=5)
+            bad.close()
+        with socket.create_connection(("127.0.0.1", server.port)) as raw:
+            raw.sendall(b"\x00" * 100_000)
+        say(good, do="step")
+        assert heard(server) == [{"do": "step"}]
+    assert eventually(lambda: server.clients == 0)
+
+
+def test_two_hundred_connections_leave_nothing_behind(server):
+    before = len(os.listdir("/proc/self/fd")) if Path("/proc/self/fd").exists() else 0
+
+    def attempt(_):
+        try:
+            return client(server)
+        except (InvalidStatus, OSError, EOFError):
+            return None
+
+    with ExitStack() as stack, ThreadPoolExecutor(16) as pool:
+        connected = [stack.enter_context(c) for c in pool.map(attempt, range(200)) if c is not None]
+        assert len(connected) >= 1 and server.clients <= MAX_CLIENTS
+    assert eventually(lambda: server.clients == 0)
+    if before:
+        assert eventually(lambda: len(os.listdir("/proc/self/fd")) <= before)
+    server.messages()
+    with client(server) as good:
+        say(good, do="step")
+        assert heard(server) == [{"do": "step"}]
+
+
+# --- a session as users have it ---
+
+
+def start_session(folder: Path, *options: str):
+    """The command in a process of its own, and its address."""
+    code = "from ngff_cli.app import main; main()"
+    words = ["simulate", "scene.ply", "-o", "traj.h5", "--live", "--no-browser", "--device", "cpu", *options]
+    path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
+    process = subprocess.Popen([sys.executable, "-c", code, *words], cwd=folder, stdout=subprocess.PIPE, text=True,
+                               env={**os.environ, "PYTHONPATH": path})  # fmt: skip
+    return process, process.stdout.readline().strip()
+
+
+@pytest.fixture
+def session(tmp_path):
+    write_scene(tmp_path / "scene.ply", two_balls_scene())
+    process, url = start_session(tmp_path, "--keypoints", "32")
+    yield process, url, tmp_path
+    if process.poll() is None:
+        process.kill()
+    process.wait()
+
+
+@pytest.mark.slow
+def test_the_mouse_drags_an_object_and_the_file_repeats_it(session, open_page):
+    process, url, folder = session
+    page = open_page(url)
+    until(page, "player.live.state !== null && player.live.control")
+    spot = page.evaluate(FIND_RED)
+    page.mouse.move(*spot)
+    page.mouse.down()
+    for i in range(12):
+        page.mouse.move(spot[0], spot[1] - 5 * i)
+        page.wait_for_timeout(40)
+    until(page, "player.live.state.arrows.length === 1")
+    page.mouse.up()
+    page.keyboard.press("Space")
+    until(page, "player.live.state.paused")
+    page.close()
+    process.send_signal(signal.SIGINT)
+    assert process.wait(timeout=20) == 0
+    t = read_trajectory(folder / "traj.h5")
+    red = t.keypoints.object_id == 1
+    assert (t.positions[:, red] - t.positions[0, red]).mean(1)[:, 2].max() > 0.02
+    assert all(f["object_id"] == 1 for f in t.info.forces) and len(t.info.forces) > 5
+    run(folder / "scene.ply", folder / "again.h5", SimulateOptions(forces=folder / "traj.h5", device="cpu"))
+    assert torch.equal(read_trajectory(folder / "again.h5").positions, t.positions)
+
+
+@pytest.mark.slow
+def test_a_killed_session_leaves_its_recording(session):
+    process, url, folder = session
+    port = int(url.split(":")[2].split("/")[0])
+    with connect(url.replace("http", "ws") + "live", origin=f"http://127.0.0.1:{port}") as page:
+        say(page, do="gravity", value=2.0)
+        say(page, do="drawn")
+        frames = 0
+        while frames < 60:
+            data = page.recv(timeout=20)
+            if isinstance(data, bytes):
+                (length,) = struct.unpack("<I", data[:4])
+                frames = json.loads(data[4 : 4 + length])["frames"]
+                say(page, do="drawn")
+    process.kill()
+    process.wait()
+    t = read_trajectory(folder / ".part-traj.h5")
+    assert len(t) > 5 and t.info.forces[0]["what"] == "gravity"
+
+
+@pytest.mark.slow
+def test_reset_starts_a_new_recording_and_save_keeps_the_old(session):
+    process, url, folder = session
+    port = int(url.split(":")[2].split("/")[0])
+    with connect(url.replace("http", "ws") + "live", origin=f"http://127.0.0.1:{port}") as page:
+        say(page, do="pause", value=True)
+        say(page, do="lift", object=2, height=0.1)
+        for _ in range(3):
+            say(page, do="step")
+        say(page, do="save")
+        say(page, do="reset")
+        assert eventually(lambda: (folder / "traj-1.h5").exists(), 20)
+        time.sleep(0.2)
+    process.send_signal(signal.SIGTERM)
+    assert process.wait(timeout=20) == 0
+    kept, last = read_trajectory(folder / "traj-1.h5"), read_trajectory(folder / "traj.h5")
+    assert len(kept) > 3 and {f["kind"] for f in kept.info.forces} == {"force"}
+    assert len(last) < len(kept) + 3 and not last.info.forces
+    assert replace(last.info, forces=()) == replace(kept.info, forces=())

@@ -18,7 +18,7 @@ def until(page, condition: str, seconds: float = 20.0) -> None:
     """Wait until a JavaScript expression is true; the page's policy forbids playwright's own way, which needs eval."""
     end = time.monotonic() + seconds
     while not page.evaluate(condition):
-        assert time.monotonic() < end, f"{condition} did not become true; {page.inner_text('#message')}"
+        assert time.monotonic() < end, f"{condition} did not become true"
         page.wait_for_timeout(20)
 
 
@@ -41,13 +41,13 @@ def chromium(tmp_path_factory):
 
 @pytest.fixture
 def open_page(chromium):
-    """A function that opens a page, a file or an address, and returns it once its player runs.
+    """A function that opens a page, a file or an address, and returns it once it is `loaded`.
 
     The test fails on errors of the page, and where it fetches anything else than an address that was given.
     """
     errors, pages = [], []
 
-    def open_(place: Path | str):
+    def open_(place: Path | str, loaded: str = "window.player !== undefined"):
         page = chromium.new_page()
         address = place.as_uri() if isinstance(place, Path) else place
         pages.append(page)
@@ -56,7 +56,7 @@ def open_page(chromium):
         page.on("request", lambda request: None if request.url.startswith((address, "data:", "blob:"))
                 else errors.append(request.url))  # fmt: skip
         page.goto(address)
-        until(page, "window.player !== undefined")
+        until(page, loaded)
         return page
 
     yield open_

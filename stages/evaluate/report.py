@@ -27,14 +27,20 @@ figcaption, .notes { color: #555 } svg text { font: 12px system-ui, sans-serif; 
 
 
 def write_report(path: Path, result: Result, prediction: Path, truth: Path) -> None:
-    """Write the report; it refers to no other file."""
+    """Write the report; it refers to no other file. One of trajectories has the player of the prediction."""
     title = f"{Path(prediction).name} against {Path(truth).name}"
     body = [f"<h1>{escape(title)}</h1>", _table(result)]
     body += [f'<p class="notes">{escape(note)}</p>' for note in result.notes]
     body += [_plot(result)] if result.curves and len(result.curves[0].values) > 1 else []
     body += [_legend(result)] if result.legend else []
     body += [_figure(pictures) for pictures in result.pictures]
-    head = f'<meta charset="utf-8"><title>{escape(title)}</title><style>{STYLE}</style>'
+    style = STYLE
+    if result.kind == "trajectories":
+        from stages.evaluate import film_section as film  # only this kind needs Warp, which takes long to import
+
+        body[1:1] = [film.film_section(prediction)]
+        body, style = [*body, f"<script>{film.SCRIPT}</script>"], STYLE + film.STYLE
+    head = f'<meta charset="utf-8"><title>{escape(title)}</title><style>{style}</style>'
     with replacing(path) as part:
         part.write_text(f"<!doctype html>\n<html><head>{head}</head><body>\n" + "\n".join(body) + "\n</body></html>\n")
 
@@ -62,7 +68,9 @@ def _plot(result: Result) -> str:
         f'<span style="color:{LINE_COLOURS[i % len(LINE_COLOURS)]}">&#9632; {escape(c.name)}</span>'
         for i, c in enumerate(curves)
     )
-    svg = f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img">{"".join(up + across + lines)}</svg>'
+    cursor = (f'<line id="cursor" data-left="{LEFT}" data-right="{WIDTH - 10}" x1="{LEFT}" x2="{LEFT}" y1="16" '
+              f'y2="{HEIGHT - BOTTOM}" stroke="#d65c00" stroke-dasharray="4 3"/>')  # fmt: skip
+    svg = f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img">{"".join([*up, *across, *lines, cursor])}</svg>'
     return f"<figure>{svg}<figcaption>{escape(result.curve_title)}: {names}</figcaption></figure>"
 
 

@@ -10,6 +10,7 @@ from stages.core.errors import InputError
 from stages.evaluate.options import EvaluateOptions
 from stages.evaluate.result import Result, format_table, to_json
 from stages.evaluate.stage import run
+from tests.browser import until
 from tests.evaluate.motions import write_motion
 
 
@@ -36,10 +37,25 @@ def test_report_of_trajectories_has_a_curve_per_object(tmp_path, two_balls):
     mine = write_motion(tmp_path / "mine.h5", two_balls, speed=0.05)
     run(mine, true, None, EvaluateOptions(report=tmp_path / "report.html"))
     html = (tmp_path / "report.html").read_text()
-    assert html.count("<polyline") == 2 and "red ball" in html and "http" not in html
+    assert html.count("<polyline") == 2 and "red ball" in html and "http" not in html.replace("http-equiv", "")
     ends = [float(points.split()[-1].split(",")[1]) for points in re.findall(r'points="([^"]*)"', html)]
     starts = [float(points.split()[0].split(",")[1]) for points in re.findall(r'points="([^"]*)"', html)]
     assert starts[0] == starts[1] > ends[0] > ends[1]  # errors grow, those of the faster ball more (y points down)
+
+
+def test_report_has_a_player_whose_time_is_that_of_the_curves(tmp_path, two_balls, open_page):
+    true = write_motion(tmp_path / "true.h5", two_balls)
+    run(true, true, None, EvaluateOptions(report=tmp_path / "report.html"))
+    page = open_page(tmp_path / "report.html", "document.querySelector('iframe').contentWindow.player !== undefined")
+    assert "1 red ball" in page.inner_text("table >> nth=0") and "--lift 1=0.3" in page.inner_text("pre")
+    of_player = "document.querySelector('iframe').contentWindow.player"
+    page.evaluate(f"{of_player}.play(false); {of_player}.seek({of_player}.duration / 2)")
+    cursor = page.locator("#cursor")
+    left, right = (float(cursor.get_attribute(f"data-{side}")) for side in ("left", "right"))
+    until(page, f"Math.abs(document.getElementById('cursor').getAttribute('x1') - {(left + right) / 2}) < 1")
+    plot = page.locator("body > figure svg")
+    plot.click(position={"x": plot.bounding_box()["width"] * right / 720, "y": 20})
+    until(page, f"{of_player}.time > 0.98 * {of_player}.duration")
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,105 @@
+"""The part of a report that shows a trajectory: the player, its objects, and what to try next."""
+
+from __future__ import annotations
+
+from html import escape
+from pathlib import Path
+
+from stages.core.errors import InputError
+from stages.core.physics.materials import MaterialChoice, choose_materials
+from stages.core.physics.particles import sample_bodies
+from stages.core.player.film import Motion, film_page, pack_film
+from stages.core.scene.scene import SceneObject
+from stages.core.scene.trajectory import Trajectory, read_trajectory
+
+PARTICLES = 6000  # from which masses are estimated
+STYLE = "iframe { width: 100%; height: 480px; border: 1px solid #ddd; border-radius: 8px } pre { overflow: auto }"
+# The curves' cursor follows the player's time, and a click on the curves sets it.
+SCRIPT = """
+const frame = document.querySelector("iframe"), plot = document.querySelector("svg");
+const cursor = document.getElementById("cursor");
+if (plot && cursor) {
+  const [left, right] = [Number(cursor.dataset.left), Number(cursor.dataset.right)];
+  const follow = () => {
+    const player = frame.contentWindow?.player;
+    if (player?.duration) {
+      const x = left + player.time / player.duration * (right - left);
+      cursor.setAttribute("x1", x);
+      cursor.setAttribute("x2", x);
+    }
+    requestAnimationFrame(follow);
+  };
+  follow();
+  plot.addEventListener("click", (event) => {
+    const player = frame.contentWindow?.player, box = plot.getBoundingClientRect();
+    const x = (event.clientX - box.left) / box.width * plot.viewBox.baseVal.width;
+    player?.play(false);
+    player?.seek((x - left) / (right - left) * player.duration);
+  });
+}
+"""
+
+
+def film_section(path: Path) -> str:
+    """HTML with the player of a trajectory in a frame, its objects, and commands for other motions."""
+    trajectory = read_trajectory(path)
+    parts = [] if trajectory.dense else [_player(trajectory, Path(path).stem)]
+    return "\n".join([*parts, _objects(trajectory), _next_steps(trajectory, Path(path))])
+
+
+def _player(trajectory: Trajectory, title: str) -> str:
+    page = film_page(pack_film(trajectory.scene, Motion.of(trajectory), {"arrows": True}), title)
+    return f'<iframe title="{escape(title)}" srcdoc="{escape(page)}"></iframe>'
+
+
+def _objects(trajectory: Trajectory) -> str:
+    """A table of the objects: size, mass and material, and where the material is from."""
+    scene, choices = trajectory.scene, _materials(trajectory)
+    given = {text.partition("=")[0] for text in trajectory.scene.provenance.get("options", {}).get("material", ())}
+    try:
+        bodies = sample_bodies(scene, PARTICLES)
+        volumes = [float(bodies.volume[bodies.body == row].sum()) for row in range(len(scene.objects))]
+    except InputError:
+        volumes = [float("nan")] * len(scene.objects)
+    unit = "m" if scene.has_known_scale else "units"
+    factor = scene.metres_per_unit if scene.has_known_scale else 1.0
+    rows = []
+    for o, volume in zip(scene.objects, volumes, strict=True):
+        rest = trajectory.keypoints.rest[trajectory.keypoints.object_id == o.id]
+        sides = (rest.amax(0) - rest.amin(0)).tolist() if len(rest) else [0.0] * 3
+        size = " × ".join(f"{factor * side:.3g}" for side in sides)
+        mass = scene.mass_text(choices[o.id].material.density * volume * scene.metres_per_unit**3)
+        cells = [f"{o.id} {o.name}", f"{size} {unit}", mass, choices[o.id].name, _source(o, choices[o.id], given)]
+        rows.append("".join(f"<td>{escape(cell)}</td>" for cell in cells))
+    head = "".join(f"<th>{name}</th>" for name in ("object", "size", "mass, about", "material", "which is"))
+    return f"<table><tr>{head}</tr>{''.join(f'<tr>{row}</tr>' for row in rows)}</table>"
+
+
+def _materials(trajectory: Trajectory) -> dict[int, MaterialChoice]:
+    """As the simulation chose them, but for a --materials file, of which only the name is stored."""
+    prompts = tuple(trajectory.scene.provenance.get("options", {}).get("material", ()))
+    try:
+        return choose_materials(trajectory.scene.objects, prompts)
+    except InputError:  # a file of another tool
+        return choose_materials([SceneObject(o.id, o.name) for o in trajectory.scene.objects])
+
+
+def _source(o: SceneObject, choice: MaterialChoice, given: set[str]) -> str:
+    if str(o.id) in given or o.name in given:
+        return "given (--material)"
+    if o.material:
+        return "stored in the scene"
+    return "a guess: nothing is known" if choice.guessed else "inferred from the name"
+
+
+def _next_steps(trajectory: Trajectory, path: Path) -> str:
+    """Commands that move the first objects in other ways."""
+    inputs = trajectory.scene.provenance.get("inputs") or [{"name": "SCENE.ply"}]
+    scene, ids = inputs[0]["name"], [o.id for o in trajectory.scene.objects] or [1]
+    commands = [
+        f"ngff simulate {scene} --lift {ids[0]}=0.3",
+        f'ngff simulate {scene} --velocity "object={ids[-1]} 1,0,1"',
+        f"ngff simulate {scene} --live    # drag, push and throw the objects",
+        f"ngff render {path.name} -o film.html    # this page's player, to be sent to others",
+    ]
+    return f"<p>To try next:</p><pre>{escape(chr(10).join(commands))}</pre>"

@@ -1,17 +1,11 @@
-"""The learned force field as an engine: the scene is scaled to the size and gravity of the training data.
-
-Motion under gravity is the same at any size when times scale with the square root of length over gravity. A scene of
-objects outside the sizes of the training data is therefore scaled to them and to the gravity of training, simulated,
-and scaled back. With lengths s times longer and gravity g' instead of g: times are sqrt(s g / g') longer, masses s^3,
-Young's moduli s g' / g, forces s^3 g' / g.
-"""
+"""The learned force field as an engine: scenes in the units of its training data, bodies with their solid inertia."""
 
 from __future__ import annotations
 
 import logging
 import math
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -32,54 +26,21 @@ from stages.core.physics.state import FrameState
 from stages.core.scene.scene import Scene, SceneObject
 from stages.core.scene.trajectory import Keypoints
 from stages.simulate.changes import changed_options, changed_pins
+from stages.simulate.model_units import ModelUnits
 from stages.simulate.options import ENGINES, SimulateOptions
 from stages.simulate.setup import SceneSetup, set_up_scene
 from stages.simulate.sleep import SleepState
+from stages.simulate.solid_bodies import SolidBody, mass_fractions, solid_bodies
 
 log = logging.getLogger(__name__)
 # Limits of the training data, in metres and seconds of the model:
-TYPICAL_SIZE = 0.55  # median longest side of an object [m]
-SIZE_RANGE = (0.25, 1.2)  # shortest and longest of these [m]
+SIZE_RANGE = (0.25, 1.2)  # shortest and longest of the longest sides of an object [m]
 MAX_OBJECTS = 6  # objects per scene of the benchmark
 MIN_THICKNESS = 0.044  # thickness of the thinnest object, the cloth [m]
 MIN_STIFFNESS = 3e3  # Young's modulus [Pa]; stiffer bodies than in training are extrapolated by linear elasticity
-TRAINING_GRAVITY = 5.0  # [m/s^2]
 MAX_SPEED = 5.0  # maximum speed of falls [m/s]
 FAR_WALL = 100.0  # distance of walls where there are none [m]
 FLOOR_OUTLIERS = 0.02  # fraction of an object's keypoints that may lie below the floor under it
-
-
-@dataclass(frozen=True)
-class ModelUnits:
-    """Units of the model: factors from the units of the scene (lengths) and SI (others), and the origin."""
-
-    length: float  # model metres per scene unit
-    time: float  # model seconds per second
-    mass: float  # model kilograms per kilogram
-    stress: float  # model pascals per pascal
-    origin: Float[Tensor, "3"]  # scene point that becomes (0, 0, FLOOR) [scene units]
-    gravity: float  # downwards, in model units [m/s^2]
-
-    @staticmethod
-    def for_objects(keypoints: list[Float[Tensor, "k 3"]], floor: float, unit: float, gravity: float) -> ModelUnits:
-        """Units that bring objects outside SIZE_RANGE to TYPICAL_SIZE, and gravity to that of training.
-
-        `keypoints` of each object and `floor` are in scene units of `unit` metres; `gravity` is downwards [m/s^2].
-        """
-        sides = torch.stack([(p.amax(0) - p.amin(0)).amax() for p in keypoints])
-        size = unit * float(sides.median().clamp_min(1e-9))
-        scale = 1.0 if SIZE_RANGE[0] <= size <= SIZE_RANGE[1] else TYPICAL_SIZE / size
-        length = scale * unit
-        model_gravity = math.copysign(TRAINING_GRAVITY, gravity) if abs(gravity) > 1e-3 else 0.0
-        gravity_ratio = model_gravity / gravity if model_gravity else 1.0  # without gravity, time is not scaled for it
-        middle = torch.cat(keypoints).mean(0)
-        origin = torch.tensor([float(middle[0]), float(middle[1]), floor])
-        time = math.sqrt(scale / gravity_ratio)
-        return ModelUnits(length, time, scale**3, scale * gravity_ratio, origin, model_gravity)
-
-    def to_model(self, points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
-        """Points in scene units to model metres."""
-        return (points - self.origin) * self.length + torch.tensor([0.0, 0.0, FLOOR])
 
 
 def rollout(
@@ -93,10 +54,14 @@ def rollout(
     setup = set_up_scene(scene, prompts, options)
     ids = [o.id for o in scene.objects]
     per_object = [keypoints.rest[keypoints.object_id == i] for i in ids]
-    units = ModelUnits.for_objects(per_object, setup.box.low[2], scene.metres_per_unit, options.gravity)
-    initial = _initial_conditions(scene, per_object, setup, units, prompts, options)
+    solids = solid_bodies(scene, setup.bodies.spacing)
+    density = torch.tensor([setup.materials[i].material.density for i in ids])
+    volumes = torch.tensor([solid.volume for solid in solids]) * scene.metres_per_unit**3
+    masses = density * volumes
+    units = ModelUnits.for_objects(per_object, masses, setup.box.low[2], scene.metres_per_unit, options.gravity)
+    initial = _initial_conditions(scene, per_object, setup, units, solids, prompts, options)
     _warn_extrapolation(initial, model)
-    in_model_units = ForcePrompts(_to_model_units(prompts.forces, units, setup, ids), prompts.pinned)
+    in_model_units = ForcePrompts(units.forces(prompts.forces, setup.lift, ids), prompts.pinned)
     forces = ExternalForces.from_prompts(initial, in_model_units, ids)
     steps = max(1, math.ceil(options.dt * units.time / FRAME - 1e-6))
     log.info("%s (%s): %d objects, %d keypoints, lengths scaled by %.3g, times by %.3g, %d steps per frame",
@@ -122,11 +87,11 @@ def rollout(
             start, end = n * options.dt, (n + 1) * options.dt
             active, changes = prompts.during(start, end)
             if active is not acting:
-                _load_forces(stepper.external, initial, _to_model_units(active, units, setup, ids), ids)
+                _load_forces(stepper.external, initial, units.forces(active, setup.lift, ids), ids)
                 acting = active
             if changes:
                 current, held = changed_options(current, changes), changed_pins(held, changes)
-                stepper.change(_changed(scene, per_object, setup, units, prompts, current).to(device))
+                stepper.change(_changed(scene, per_object, setup, units, solids, prompts, current).to(device))
             sleep.wake(_pushed(active, ids, start, end) | _roused(changes, ids))
             stepper.external.pinned.copy_(_rows(held, ids) | sleep.asleep)
             if bool(sleep.asleep.all()):
@@ -142,25 +107,29 @@ def rollout(
 
 
 def _initial_conditions(
-    scene: Scene, per_object: list[Tensor], setup: SceneSetup, units: ModelUnits, prompts: ForcePrompts,
-    options: SimulateOptions,
+    scene: Scene, per_object: list[Tensor], setup: SceneSetup, units: ModelUnits, solids: list[SolidBody],
+    prompts: ForcePrompts, options: SimulateOptions,
 ) -> InitialConditions:  # fmt: skip
     """Keypoints, materials and velocities of the objects at the start, in model units."""
     count, most = len(per_object), max(len(p) for p in per_object)
     points, valid = torch.zeros(1, count, most, 3), torch.zeros(1, count, most, dtype=torch.bool)
-    mass, E, ratio, nu, friction = torch.ones(5, 1, count)
+    mass, E, ratio, nu, friction, loss = torch.ones(6, 1, count)
+    fraction, inertia = torch.zeros(1, count, most), torch.zeros(1, count, 3, 3)
     velocity, floors = torch.zeros(1, count, 3), _floor_heights(per_object, setup)
     for row, (o, p) in enumerate(zip(scene.objects, per_object, strict=True)):
         low = torch.tensor([-math.inf, -math.inf, float(floors[row])])  # points below the floor would be thrown up
         points[0, row, : len(p)] = units.to_model(p.maximum(low) + setup.lift[row])
         valid[0, row, : len(p)] = True
         choice = setup.materials[o.id]
-        volume = float(setup.bodies.volume[setup.bodies.body == row].sum()) * scene.metres_per_unit**3
+        fraction[0, row, : len(p)] = mass_fractions(p, solids[row].centre)
+        inertia[0, row] = solids[row].inertia * units.length**2
+        volume = solids[row].volume * scene.metres_per_unit**3
         mass[0, row] = choice.material.density * volume * units.mass
-        ratio[0, row] = solidity(points[0, row, : len(p)], volume * units.mass)
+        ratio[0, row] = solidity(points[0, row, : len(p)], volume * units.scale**3)
         E[0, row] = _model_stiffness(o, choice.material.E * units.stress, float(ratio[0, row]))
         nu[0, row] = choice.material.nu
         friction[0, row] = choice.material.friction if options.friction is None else options.friction
+        loss[0, row] = choice.material.loss
         velocity[0, row] = torch.tensor(prompts.velocity.get(o.id, (0.0, 0.0, 0.0))) * units.length / units.time
         if MODELS[choice.material.model].plastic:
             log.warning("object %d (%s): %s yields or flows, which the learned field does not model; use --engine mpm",
@@ -173,8 +142,10 @@ def _initial_conditions(
         box[:] = torch.stack([units.to_model(torch.tensor(corner)) for corner in (setup.box.low, setup.box.high)])
     box[:, 0, 2] = (floors - units.origin[2]) * units.length + FLOOR
     gravity = torch.tensor([0.0, 0.0, -units.gravity])
-    return InitialConditions.of(points, valid, mass=mass, E=E, solidity=ratio, nu=nu, friction=friction,
-                                velocity=velocity, gravity=gravity, box=box)  # fmt: skip
+    return InitialConditions.of(
+        points, valid, mass_fraction=fraction, mass=mass, body_inertia=inertia, E=E,
+        solidity=ratio, nu=nu, friction=friction, loss=loss, velocity=velocity, gravity=gravity, box=box,
+    )  # fmt: skip
 
 
 def _floor_heights(per_object: list[Float[Tensor, "k 3"]], setup: SceneSetup) -> Float[Tensor, "o"]:
@@ -221,14 +192,14 @@ def _roused(changes: Sequence[Change], ids: list[int]) -> Bool[Tensor, "o"]:
 
 
 def _changed(
-    scene: Scene, per_object: list[Tensor], setup: SceneSetup, units: ModelUnits, prompts: ForcePrompts,
-    options: SimulateOptions,
+    scene: Scene, per_object: list[Tensor], setup: SceneSetup, units: ModelUnits, solids: list[SolidBody],
+    prompts: ForcePrompts, options: SimulateOptions,
 ) -> InitialConditions:  # fmt: skip
     """`_initial_conditions` with other materials, friction and gravity in the same units."""
     materials = choose_materials(scene.objects, options.material, options.materials)
     gravity = options.gravity * units.length / scene.metres_per_unit / units.time**2
     setup, units = replace(setup, materials=materials), replace(units, gravity=gravity)
-    return _initial_conditions(scene, per_object, setup, units, prompts, options)
+    return _initial_conditions(scene, per_object, setup, units, solids, prompts, options)
 
 
 def _load_forces(slots: ExternalForces, initial: InitialConditions, forces: Sequence[Force], ids: list[int]) -> None:
@@ -237,26 +208,6 @@ def _load_forces(slots: ExternalForces, initial: InitialConditions, forces: Sequ
     new = ExternalForces.from_prompts(initial, ForcePrompts((*forces, *rest)), ids)
     for name in ("object", "force", "torque", "start", "end", "point"):
         getattr(slots, name).copy_(getattr(new, name))
-
-
-def _to_model_units(
-    forces: Sequence[Force], units: ModelUnits, setup: SceneSetup, ids: list[int]
-) -> tuple[Force, ...]:
-    """The forces in model units."""
-    metres = units.mass ** (1 / 3)
-    newtons = units.mass * metres / units.time**2
-
-    def scaled(f: Force) -> Force:
-        at = None
-        if f.at is not None:
-            row = ids.index(f.object_id)
-            at = tuple(units.to_model(torch.tensor(f.at) + setup.lift[row]).tolist())
-        return replace(
-            f, force=tuple(newtons * v for v in f.force), torque=tuple(newtons * metres * v for v in f.torque),
-            start=f.start * units.time, end=f.end * units.time, at=at,
-        )  # fmt: skip
-
-    return tuple(scaled(f) for f in forces)
 
 
 def _warn_extrapolation(initial: InitialConditions, model: Dynamics) -> None:

@@ -29,9 +29,11 @@ class InitialConditions:
     solidity: Float[Tensor, "b o"]  # stiffness relative to a hollow or thin body of that modulus, see field.solidity
     nu: Float[Tensor, "b o"]  # Poisson's ratio
     friction: Float[Tensor, "b o"]  # Coulomb coefficient
+    loss: Float[Tensor, "b o"]  # loss factor of the material, see physics.materials
     velocity: Float[Tensor, "b o 3"]  # of the centre of mass [m/s]
     spin: Float[Tensor, "b o 3"]  # angular velocity, world axes [rad/s]
     gravity: Float[Tensor, "b 3"]  # [m/s^2]
+    body_inertia: Float[Tensor, "b o 3 3"]  # tensor about the centre of mass at time 0, per unit of mass [m^2]
     box: Float[Tensor, "b o 2 3"]  # lower and upper corner of the room for each object; the floor is the lower z [m]
 
     @classmethod
@@ -40,7 +42,8 @@ class InitialConditions:
     ) -> InitialConditions:
         """Initial conditions of keypoints, other fields by keyword; tensors are broadcast to their field's shape.
 
-        Defaults: 1 kg, 1e5 Pa, solidity 1, Poisson 0.3, friction 0.5, at rest, and the published gravity and room.
+        Defaults: 1 kg, 1e5 Pa, solidity 1, Poisson 0.3, friction 0.5, loss factor 0.1, at rest, the published gravity
+        and room, and the inertia of the keypoints, which are those of a hollow body.
         Raises TypeError for an unknown field.
         """
         b, o, n, _ = points.shape
@@ -48,19 +51,26 @@ class InitialConditions:
         if "mass_fraction" not in given:
             mass_fraction = valid.to(points)
             given["mass_fraction"] = mass_fraction / mass_fraction.sum(-1, keepdim=True).clamp_min(1)
+        if "body_inertia" not in given:
+            fraction = given["mass_fraction"].to(points)
+            x = torch.where(valid[..., None], points, 0.0)
+            arm = x - (fraction[..., None] * x).sum(2, keepdim=True)
+            given["body_inertia"] = inertia(fraction, torch.where(valid[..., None], arm, 0.0))
         default = {
-            "mass": 1.0, "E": 1e5, "solidity": 1.0, "nu": 0.3, "friction": 0.5, "velocity": 0.0, "spin": 0.0,
-            "gravity": GRAVITY, "box": BOX,
+            "mass": 1.0, "E": 1e5, "solidity": 1.0, "nu": 0.3, "friction": 0.5, "loss": 0.1, "velocity": 0.0,
+            "spin": 0.0, "gravity": GRAVITY, "box": BOX,
         }  # fmt: skip
         shape = {
             "mass_fraction": (b, o, n),
+            "body_inertia": (b, o, 3, 3),
             "velocity": (b, o, 3),
             "spin": (b, o, 3),
             "gravity": (b, 3),
             "box": (b, o, 2, 3),
         }
         filled = {
-            name: torch.as_tensor(given.pop(name, default.get(name))).to(points) for name in ("mass_fraction", *default)
+            name: torch.as_tensor(given.pop(name, default.get(name))).to(points)
+            for name in ("mass_fraction", "body_inertia", *default)
         }
         # contiguous, or kernels would copy them at every step
         filled = {name: x.expand(shape.get(name, (b, o))).contiguous() for name, x in filled.items()}

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from stages.core.models.dynamics import Dynamics
 from stages.core.models.external_forces import ExternalForces
 from stages.core.models.field.narrow_phase import near_walls, nearest
-from stages.core.models.field.rigid_body import angular_velocity, fit_rigid_motion
+from stages.core.models.field.rigid_body import fit_rigid_motion
 from stages.core.models.initial_conditions import GRAVITY, InitialConditions, centre_of_mass, inertia, offsets
 
 MASS = 0.1  # of every object [kg]
@@ -213,7 +213,7 @@ class PaperForceField(Dynamics):
         inverse = torch.linalg.inv(inertia(initial.mass_fraction, arm))
         m = fit_rigid_motion(initial.mass_fraction, arm, inverse, points, velocities)
         angle = euler_angles(m.R)
-        rate = angle_rates(angle, angular_velocity(m.momentum, inverse, m.R))
+        rate = angle_rates(angle, m.spin)
         return PaperState(_rest(initial) + m.u, m.du, m.com, m.velocity, angle, rate)
 
     def derivative(

@@ -107,7 +107,7 @@ def projected(shape: RestShape, field: Float[Tensor, "b o n 3"]) -> Float[Tensor
     mass_fraction = shape.initial.mass_fraction[..., None]
     field = field - (mass_fraction * field).sum(2, keepdim=True)
     momentum = (mass_fraction * torch.linalg.cross(shape.arm, field)).sum(2)
-    rotation = matvec(shape.inverse, momentum)
+    rotation = matvec(shape.keypoint_inverse, momentum)
     field = field - torch.linalg.cross(rotation[:, :, None].expand_as(field), shape.arm)
     return torch.where(shape.initial.valid[..., None], field, 0.0)
 

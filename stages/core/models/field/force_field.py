@@ -35,7 +35,7 @@ from stages.core.models.field.kernel_choice import triton_allowed
 from stages.core.models.field.rest_shape import RestShape, rest_shape_of
 from stages.core.models.field.rigid_body import angular_velocity, clamp_norm, drift, fit_rigid_motion, pose
 from stages.core.models.field.state import MAX_SPEED, MAX_SPIN, Accelerations, BodyState, FieldScene
-from stages.core.models.initial_conditions import InitialConditions, centre_of_mass, inertia
+from stages.core.models.initial_conditions import InitialConditions, centre_of_mass
 
 if TRITON:
     from stages.core.models.field import fused_step
@@ -123,7 +123,7 @@ class ForceField(Dynamics):
         w, shape = scene.shape.initial, scene.shape
         quat = torch.zeros_like(w.mass)[..., None].repeat(1, 1, 4)
         quat[..., 0] = 1
-        momentum = matvec(inertia(w.mass_fraction, shape.arm), w.spin)
+        momentum = matvec(w.body_inertia, w.spin)
         rest = torch.zeros_like(shape.arm)
         return BodyState(centre_of_mass(w, w.points), quat, w.velocity, momentum, rest, rest)
 
@@ -132,9 +132,11 @@ class ForceField(Dynamics):
     ) -> BodyState:
         """Rigid motion fitted to the keypoints; the residual is the deformation, 0 for a field without deformation."""
         shape = scene.shape
-        m = fit_rigid_motion(shape.initial.mass_fraction, shape.arm, shape.inverse, points, velocities)
+        m = fit_rigid_motion(shape.initial.mass_fraction, shape.arm, shape.keypoint_inverse, points, velocities)
         u, du = (m.u, m.du) if self.stress is not None else (torch.zeros_like(m.u), torch.zeros_like(m.du))
-        return BodyState(m.com, quaternion(m.R), m.velocity, m.momentum, projected(shape, u), projected(shape, du))
+        # the body turns as its keypoints do, with its own inertia
+        momentum = matvec(m.R, matvec(shape.initial.body_inertia, matvec(m.R.mT, m.spin)))
+        return BodyState(m.com, quaternion(m.R), m.velocity, momentum, projected(shape, u), projected(shape, du))
 
     def points(self, scene: FieldScene, state: BodyState) -> Float[Tensor, "b o n 3"]:
         """Keypoints in world coordinates [m], by one kernel where the fused step is used."""

@@ -86,7 +86,7 @@ class _Step:
         self.field, self.scene, self.external, self.dt = field, scene, external, dt
         self.b, self.o, self.n, _ = scene.shape.arm.shape
         self.objects, self.kinds, self.hidden = self.b * self.o, self.o + 1, field.config["hidden"]
-        for name in ("arm", "normal", "spacing", "size", "inverse"):
+        for name in ("arm", "normal", "spacing", "size", "inverse", "keypoint_inverse"):
             setattr(self, name, getattr(scene.shape, name).contiguous())
         for name in ("valid", "mass_fraction", "mass", "gravity", "box"):
             setattr(self, name, getattr(scene.shape.initial, name).contiguous())
@@ -221,7 +221,8 @@ class _Step:
         u, du = self._new(n, 3), self._new(n, 3)
         stiffness, damping = scene.stiffness.contiguous(), scene.damping.contiguous()
         velocity_update.update_displacements[(self.objects,)](
-            deformation, field, self.arm, self.valid, self.mass_fraction, self.size, self.inverse, stiffness, damping,
-            self.pinned, u, du, n, self.dt, MAX_SPEED=MAX_SPEED, MAX_DISPLACEMENT=MAX_DISPLACEMENT, **self.whole,
+            deformation, field, self.arm, self.valid, self.mass_fraction, self.size, self.keypoint_inverse, stiffness,
+            damping, self.pinned, u, du, n, self.dt, MAX_SPEED=MAX_SPEED, MAX_DISPLACEMENT=MAX_DISPLACEMENT,
+            **self.whole,
         )  # fmt: skip
         return BodyState(com, quat, velocity, momentum, u, du)

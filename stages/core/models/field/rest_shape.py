@@ -28,15 +28,16 @@ class RestShape:
     normal: Float[Tensor, "b o n 3"]  # outward, of length up to 1; shorter where the outward side is uncertain
     spacing: Float[Tensor, "b o n"]  # distance to the nearest keypoints [m]
     size: Float[Tensor, "b o"]  # radius of gyration [m]
-    inverse: Float[Tensor, "b o 3 3"]  # of the inertia tensor per unit of mass, rest orientation [1/m^2]
-    principal: Float[Tensor, "b o 3"]  # eigenvalues of `inverse`, ascending [1/m^2]
+    inverse: Float[Tensor, "b o 3 3"]  # of the body's inertia tensor per unit of mass, rest orientation [1/m^2]
+    keypoint_inverse: Float[Tensor, "b o 3 3"]  # the same of the keypoints alone, as of a hollow body [1/m^2]
+    principal: Float[Tensor, "b o 3"]  # eigenvalues of `keypoint_inverse`, ascending [1/m^2]
     blur: Float[Tensor, "b o s n n"]  # averaging weights of the neighbourhoods, rows sum to 1; 16-bit for the kernels
     others: Int[Tensor, "o m"]  # for each object the indices of the m = o - 1 others
     back: Int[Tensor, "o m"]  # others[others[i, k], back[i, k]] is i
 
     def __getitem__(self, rows: slice | Tensor) -> RestShape:
         """The scenes `rows`, still a batch."""
-        batched = ("initial", "arm", "normal", "spacing", "size", "inverse", "principal", "blur")
+        batched = ("initial", "arm", "normal", "spacing", "size", "inverse", "keypoint_inverse", "principal", "blur")
         return replace(self, **{name: getattr(self, name)[rows] for name in batched})
 
 
@@ -48,12 +49,14 @@ def rest_shape_of(initial: InitialConditions, half: bool = False) -> RestShape:
     normal, spacing = normals_and_spacing(arm, initial.valid)
     side = (normal * arm).sum(-1) / (0.1 * size[..., None])
     normal = normal * side.tanh()[..., None]  # flipped to point away from the centre of mass
-    inverse, principal = invert_spd(inertia(initial.mass_fraction.double(), arm.double()))
+    keypoint_inverse, principal = invert_spd(inertia(initial.mass_fraction.double(), arm.double()))
+    inverse, _ = invert_spd(initial.body_inertia.double())
     radii = torch.stack([factor * size for factor in NEIGHBOURHOOD_RADII], -1)
     blur = neighbourhood_weights if half else _neighbourhoods
     others, back = _others(initial.valid.shape[1], arm.device)
     blurred = blur(arm, initial.valid, initial.mass_fraction, radii)
-    return RestShape(initial, arm, normal, spacing, size, inverse.to(arm), principal.to(arm), blurred, others, back)
+    inverses = inverse.to(arm), keypoint_inverse.to(arm)
+    return RestShape(initial, arm, normal, spacing, size, *inverses, principal.to(arm), blurred, others, back)
 
 
 def _neighbourhoods(

@@ -78,7 +78,7 @@ class RigidFit(NamedTuple):
     R: Float[Tensor, "b o 3 3"]
     com: Float[Tensor, "b o 3"]  # [m]
     velocity: Float[Tensor, "b o 3"]  # [m/s]
-    momentum: Float[Tensor, "b o 3"]  # angular, per unit of mass, about the centre of mass [m^2/s]
+    spin: Float[Tensor, "b o 3"]  # angular velocity [rad/s]
     u: Float[Tensor, "b o n 3"]  # residual displacements, body frame [m]
     du: Float[Tensor, "b o n 3"]  # residual velocities, body frame [m/s]
 
@@ -105,5 +105,5 @@ def fit_rigid_motion(
     spin = angular_velocity(momentum, inverse, R)
     rotating = torch.linalg.cross(spin[:, :, None].expand_as(offset), offset)
     return RigidFit(
-        R, com, velocity, momentum, offset @ R - arm, torch.where(present, relative - rotating, 0.0) @ R
+        R, com, velocity, spin, offset @ R - arm, torch.where(present, relative - rotating, 0.0) @ R
     )  # fmt: skip

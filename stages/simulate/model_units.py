@@ -1,0 +1,83 @@
+"""Units of the learned model: every scene is brought to the size, mass and gravity of the training data.
+
+Motion under gravity is the same at any size when times scale with the square root of length over gravity, and for any
+unit of mass when stresses and forces scale with it. Lengths, times and masses are therefore in units of the scene
+itself, so that neither its size nor a common factor of masses and Young's moduli changes the motion. With lengths L,
+masses M and times T = sqrt(L g / g') of the model per SI unit: stresses M / (L T^2), forces M L / T^2.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from stages.core.models.initial_conditions import FLOOR
+from stages.core.physics.forces import Force
+
+TYPICAL_SIZE = 0.55  # median longest side of an object of the training data [m]
+TYPICAL_MASS = 8.0  # geometric mean of their masses, all published objects hollow [kg]
+TRAINING_GRAVITY = 5.0  # [m/s^2]
+
+
+@dataclass(frozen=True)
+class ModelUnits:
+    """Units of the model: factors from the units of the scene (lengths) and SI (others), and the origin."""
+
+    length: float  # model metres per scene unit
+    scale: float  # model metres per metre
+    time: float  # model seconds per second
+    mass: float  # model kilograms per kilogram
+    origin: Float[Tensor, "3"]  # scene point that becomes (0, 0, FLOOR) [scene units]
+    gravity: float  # downwards, in model units [m/s^2]
+
+    @staticmethod
+    def for_objects(
+        keypoints: list[Float[Tensor, "k 3"]], masses: Float[Tensor, "o"], floor: float, unit: float, gravity: float
+    ) -> ModelUnits:
+        """Units in which objects have typical sizes and masses (as geometric means) and gravity is that of training.
+
+        `keypoints` of each object and `floor` are in scene units of `unit` metres, `masses` in kg; `gravity` is
+        downwards [m/s^2].
+        """
+        sides = torch.stack([(p.amax(0) - p.amin(0)).amax() for p in keypoints]).clamp_min(1e-9)
+        scale = TYPICAL_SIZE / (unit * float(sides.double().log().mean().exp()))
+        model_gravity = math.copysign(TRAINING_GRAVITY, gravity) if abs(gravity) > 1e-3 else 0.0
+        gravity_ratio = model_gravity / gravity if model_gravity else 1.0  # without gravity, time is not scaled for it
+        middle = torch.cat(keypoints).mean(0)
+        origin = torch.tensor([float(middle[0]), float(middle[1]), floor])
+        mass = TYPICAL_MASS / float(masses.double().clamp_min(1e-30).log().mean().exp())
+        return ModelUnits(scale * unit, scale, math.sqrt(scale / gravity_ratio), mass, origin, model_gravity)
+
+    @property
+    def force(self) -> float:
+        """Model newtons per newton."""
+        return self.mass * self.scale / self.time**2
+
+    @property
+    def stress(self) -> float:
+        """Model pascals per pascal."""
+        return self.force / self.scale**2
+
+    def to_model(self, points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
+        """Points in scene units to model metres."""
+        return (points - self.origin) * self.length + torch.tensor([0.0, 0.0, FLOOR])
+
+    def forces(self, forces: Sequence[Force], lift: Float[Tensor, "o 3"], ids: list[int]) -> tuple[Force, ...]:
+        """Forces in model units; points of application move with the `lift` of their object [scene units]."""
+
+        def scaled(f: Force) -> Force:
+            at = None
+            if f.at is not None:
+                at = tuple(self.to_model(torch.tensor(f.at) + lift[ids.index(f.object_id)]).tolist())
+            newton, newton_metre = self.force, self.force * self.scale
+            return replace(
+                f, force=tuple(newton * v for v in f.force), torque=tuple(newton_metre * v for v in f.torque),
+                start=f.start * self.time, end=f.end * self.time, at=at,
+            )  # fmt: skip
+
+        return tuple(scaled(f) for f in forces)

@@ -1,0 +1,51 @@
+"""Bodies of the learned engine: keypoints with masses, and the signed distance and inertia of the filled object."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from stages.core.physics.particles import inliers, usable
+from stages.core.physics.signed_distance import DistanceGrid, distance_grid, mass_properties
+from stages.core.scene.scene import Scene
+
+SMALLEST_SHARE = 0.1  # least mass of a keypoint relative to the mean, when the centre of mass is matched
+
+
+@dataclass(frozen=True)
+class SolidBody:
+    """The filled body of an object at its reconstructed position, in scene units."""
+
+    grid: DistanceGrid
+    volume: float
+    centre: Float[Tensor, "3"]  # of mass
+    inertia: Float[Tensor, "3 3"]  # about the centre of mass, per unit of mass
+
+
+def solid_bodies(scene: Scene, sheet: float) -> list[SolidBody]:
+    """The solid body of every object, from the centres of its Gaussians; open sheets get the thickness `sheet`."""
+    out = []
+    g = scene.gaussians.to("cpu")
+    good = usable(g)
+    for o in scene.objects:
+        mine = (g.object_id == o.id) & g.means.isfinite().all(1)
+        surface = g.means[mine & good] if bool((mine & good).any()) else g.means[mine]
+        grid = distance_grid(surface[inliers(surface)], sheet)
+        out.append(SolidBody(grid, *mass_properties(grid)))
+    return out
+
+
+def mass_fractions(points: Float[Tensor, "k 3"], centre: Float[Tensor, "3"]) -> Float[Tensor, "k"]:
+    """Fractions of the mass at points, as equal as possible and with the given centre of mass.
+
+    Least squares; where that takes less than SMALLEST_SHARE at a point, the centre is approximated.
+    """
+    offset = (points - points.mean(0)).double()
+    spread = offset.T @ offset / len(points)
+    spread = spread + 1e-6 * spread.trace().clamp_min(1e-30) * torch.eye(3, dtype=spread.dtype)
+    share = 1 + offset @ torch.linalg.solve(spread, (centre - points.mean(0)).double())
+    share = share.clamp_min(SMALLEST_SHARE)
+    return (share / share.sum()).to(points)

@@ -17,6 +17,8 @@ OUTPUT_FORMATS = {
     **dict.fromkeys(suffixes("video", writable=True), "stages.render.video:write_video"),
     **dict.fromkeys(suffixes("image", writable=True), "stages.render.image:write_image"),
     ".html": "stages.render.page:write_page",
+    ".glb": "stages.render.splat_files:write_glb",
+    ".spz": "stages.render.splat_files:write_spz",
 }
 
 

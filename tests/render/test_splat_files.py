@@ -1,0 +1,139 @@
+"""GLB and SPZ: what other readers find is the scene, and the animation moves objects as skinning does."""
+
+import gzip
+import json
+import shutil
+import struct
+import subprocess
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from stages.core.errors import InputError
+from stages.core.geometry.rotations import matrix
+from stages.core.physics.skinning import deform
+from stages.core.scene.scene_ply import read_scene, write_scene
+from stages.core.scene.trajectory import SimulationInfo, TrajectoryWriter
+from stages.render.splat_files import _y_up
+from stages.render.stage import run
+from tests.core.player.test_player import motion_of, world
+from tests.render.conftest import render_options
+
+pytestmark = pytest.mark.usefixtures("device")
+
+
+@pytest.fixture
+def scene(tmp_path):
+    scene = world()
+    write_scene(tmp_path / "scene.ply", scene)
+    return scene
+
+
+def read_glb(path):
+    """The JSON of a GLB, and a function from the number of an accessor to its rows."""
+    data = path.read_bytes()
+    magic, version, size, length, kind = struct.unpack("<IIIII", data[:20])
+    assert (magic, version, size, kind) == (0x46546C67, 2, len(data), 0x4E4F534A)
+    document, start = json.loads(data[20 : 20 + length]), 28 + length
+
+    def rows(number):
+        accessor = document["accessors"][number]
+        view = document["bufferViews"][accessor["bufferView"]]
+        values = np.frombuffer(data, "<f4", view["byteLength"] // 4, start + view["byteOffset"])
+        return torch.from_numpy(values.reshape(accessor["count"], -1).copy())
+
+    return document, rows
+
+
+def test_glb_holds_the_scene(scene, tmp_path):
+    run(tmp_path / "scene.ply", tmp_path / "scene.glb", render_options())
+    document, rows = read_glb(tmp_path / "scene.glb")
+    (primitive,) = document["meshes"][0]["primitives"]
+    assert primitive["extensions"]["KHR_gaussian_splatting"]["kernel"] == "ellipse" and primitive["mode"] == 0
+    a, truth = primitive["attributes"], _y_up(scene.gaussians)
+    torch.testing.assert_close(rows(a["POSITION"]), truth.means)
+    torch.testing.assert_close(truth.means[:, 1], scene.gaussians.means[:, 2])  # y is up
+    found = matrix(rows(a["KHR_gaussian_splatting:ROTATION"])[:, [3, 0, 1, 2]])
+    torch.testing.assert_close(found, matrix(truth.quats), rtol=0, atol=1e-5)
+    torch.testing.assert_close(rows(a["KHR_gaussian_splatting:SCALE"]), truth.scales, rtol=1e-5, atol=0)
+    torch.testing.assert_close(rows(a["KHR_gaussian_splatting:OPACITY"])[:, 0], truth.opacities, rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(rows(a["KHR_gaussian_splatting:SH_DEGREE_3_COEF_5"]), truth.sh[:, 14], rtol=0, atol=1e-5)
+
+
+def test_trimesh_reads_the_points_of_a_glb(scene, tmp_path):
+    trimesh = pytest.importorskip("trimesh")
+    run(tmp_path / "scene.ply", tmp_path / "scene.glb", render_options())
+    (points,) = trimesh.load(tmp_path / "scene.glb").geometry.values()
+    np.testing.assert_allclose(points.vertices, _y_up(scene.gaussians).means.numpy(), rtol=0, atol=1e-6)
+
+
+def test_glb_moves_rigid_objects_and_stores_the_frames_of_the_others(scene, tmp_path, caplog):
+    motion, path = motion_of(scene, frames=4), tmp_path / "traj.h5"
+    info = SimulationInfo(motion.dt, (0.0, 0.0, 0.0), "test")
+    with TrajectoryWriter(path, scene, info, motion.keypoints, motion.binding) as out:
+        for frame in zip(motion.positions, motion.com, motion.rotation, strict=True):
+            out.append(*frame)
+    run(path, tmp_path / "traj.glb", render_options())
+    assert "green ball deform" in caplog.text
+    document, rows = read_glb(tmp_path / "traj.glb")
+    names = [node["name"] for node in document["nodes"]]
+    assert names == ["background", "red ball", *(f"green ball {i}" for i in range(4))]
+    animation, t = document["animations"][0], 3
+    samplers = {(names[c["target"]["node"]], c["target"]["path"]): animation["samplers"][c["sampler"]]
+                for c in animation["channels"]}  # fmt: skip
+    turn, shift = (rows(samplers["red ball", path]["output"])[t] for path in ("rotation", "translation"))
+    local = rows(document["meshes"][1]["primitives"][0]["attributes"]["POSITION"])
+    moved = deform(scene.gaussians, motion.binding, motion.keypoints, motion.positions[t])
+    truth = _y_up(moved[moved.object_id == 1])
+    torch.testing.assert_close(local @ matrix(turn[[3, 0, 1, 2]]).T + shift, truth.means, rtol=0, atol=1e-4)
+    for time in (0.5, 1.5, 2.5, 3.5):  # frames
+        shown = []
+        for name in names[2:]:
+            sampler = samplers[name, "scale"]
+            times = rows(sampler["input"])[:, 0]
+            before = max(int((times <= time * motion.dt).sum()) - 1, 0)
+            shown.append(float(rows(sampler["output"])[before, 0]))
+        assert shown == [float(i == int(time)) for i in range(4)]
+
+
+def test_spz_holds_the_scene_within_its_precision(scene, tmp_path):
+    run(tmp_path / "scene.ply", tmp_path / "scene.spz", render_options())
+    data = gzip.decompress((tmp_path / "scene.spz").read_bytes())
+    magic, version, n, degree, fraction, flags, _ = struct.unpack("<IIIBBBB", data[:16])
+    assert (magic, version, n, degree, fraction, flags) == (0x5053474E, 3, len(scene.gaussians), 3, 12, 0)
+    assert len(data) == 16 + n * (9 + 1 + 3 + 3 + 4 + 45)
+    truth = _y_up(scene.gaussians)
+    low, middle, high = np.frombuffer(data, np.uint8, 9 * n, 16).reshape(n, 3, 3).transpose(2, 0, 1).astype(np.int64)
+    position = ((low | middle << 8 | high << 16) ^ 1 << 23) - (1 << 23)  # signed
+    np.testing.assert_allclose(position / 4096, truth.means.numpy(), rtol=0, atol=1 / 8192 + 1e-6)
+
+
+def test_splat_transform_reads_spz(scene, tmp_path):
+    program = shutil.which("splat-transform")
+    if program is None:
+        pytest.skip("no splat-transform on this machine (npm install -g @playcanvas/splat-transform)")
+    run(tmp_path / "scene.ply", tmp_path / "scene.spz", render_options())
+    subprocess.run([program, "-w", tmp_path / "scene.spz", tmp_path / "back.ply"], check=True, capture_output=True)
+    back, truth = read_scene(tmp_path / "back.ply").gaussians, _y_up(scene.gaussians)
+    torch.testing.assert_close(back.means, truth.means, rtol=0, atol=2e-4)
+    torch.testing.assert_close(back.scales.log(), truth.scales.log(), rtol=0, atol=0.04)
+    torch.testing.assert_close(matrix(back.quats), matrix(truth.quats), rtol=0, atol=5e-3)
+    torch.testing.assert_close(back.opacities, truth.opacities, rtol=0, atol=3e-3)
+    torch.testing.assert_close(back.sh[:, :4].clamp(-0.9, 0.9), truth.sh[:, :4].clamp(-0.9, 0.9), rtol=0, atol=0.04)
+
+
+def test_what_a_file_cannot_hold_is_said(scene, tmp_path):
+    motion, path = motion_of(scene), tmp_path / "traj.h5"
+    with TrajectoryWriter(path, scene, SimulationInfo(0.02, (0.0, 0.0, 0.0), "test"), motion.keypoints,
+                          motion.binding) as out:  # fmt: skip
+        for frame in zip(motion.positions, motion.com, motion.rotation, strict=True):
+            out.append(*frame)
+    with pytest.raises(InputError, match="one frame"):
+        run(path, tmp_path / "x.spz", render_options())
+    run(path, tmp_path / "x.spz", render_options(frame=1))
+    far = replace(scene.gaussians, means=3000 * scene.gaussians.means)
+    write_scene(tmp_path / "far.ply", replace(scene, gaussians=far))
+    with pytest.raises(InputError, match="reaches further"):
+        run(tmp_path / "far.ply", tmp_path / "x.spz", render_options())

@@ -21,6 +21,7 @@ class Engine:
 ENGINES = {
     "ngff": Engine("stages.simulate.learned:rollout", "learned force field, for elastic bodies", weights="ngff"),
     "mpm": Engine("stages.simulate.mpm:rollout", "material point method, for any material"),
+    "rigid": Engine("stages.simulate.rigid:rollout", "rigid bodies by MuJoCo, for stiff ones"),
 }
 DEFAULT_KEYPOINTS, LIVE_KEYPOINTS = 1024, 128  # with the latter two CPU cores keep up with real time
 # The model's own step, or a solver of torchdiffeq for its rate of change (see stages/core/models/integrate.py).

@@ -138,11 +138,36 @@ def inliers(points: Float[Tensor, "n 3"]) -> Tensor:
     return 0.6745 * (distance - middle) <= MAX_OUTLIER_SCORE * spread.clamp_min(1e-12 + 1e-3 * float(middle))
 
 
+def filled_voxels(scene: Scene, object_id: int, along: int, seed: int = 0) -> tuple[Float[Tensor, "m 3"], float]:
+    """Centres of the voxels of an object's filled body, its skin included, and their edge.
+
+    There are about `along` voxels along its longest side, fewer where its surface is sampled too coarsely. Raises
+    InputError for an object without any usable Gaussian.
+    """
+    points = surface_points(scene, object_id, seed)
+    gap = _gap(points)
+    h = max(float((points.max(0) - points.min(0)).max()) / along, gap / 8, 1e-9)
+    body, low, _ = _closed_body(points, h, gap, scene.floor, scene.cameras is not None)
+    return torch.from_numpy((np.argwhere(body) + low + 0.5) * h).float(), h
+
+
 def _solid(
     points: np.ndarray, h: float, gap: float, floor: float | None, photographed: bool
 ) -> tuple[np.ndarray, float, bool]:
     """Voxels of an object: indices (m, 3) of voxels of edge h in its closed and filled body, and the number of voxels
-    of volume that each represents.
+    of volume that each represents; the last value as in _closed_body.
+    """
+    body, low, extended = _closed_body(points, h, gap, floor, photographed)
+    inside = body & ~_thick_skin(body)
+    if inside.sum() < MIN_PARTICLES:
+        inside = body
+    return np.argwhere(inside) + low, float(body.sum() / inside.sum()), extended
+
+
+def _closed_body(
+    points: np.ndarray, h: float, gap: float, floor: float | None, photographed: bool
+) -> tuple[np.ndarray, np.ndarray, bool]:
+    """The closed and filled body of an object as voxels of edge h, and the index of its first voxel.
 
     A body that would tip over although it stood on the floor when `photographed` is extended down to the floor; the
     last value is whether it was.
@@ -169,10 +194,7 @@ def _solid(
     while body.sum() < MIN_PARTICLES:
         body = ndimage.binary_dilation(np.pad(body, 1), CROSS)
         low = low - 1
-    inside = body & ~_thick_skin(body)
-    if inside.sum() < MIN_PARTICLES:
-        inside = body
-    return np.argwhere(inside) + low, float(body.sum() / inside.sum()), extended
+    return body, low, extended
 
 
 def _gap(points: np.ndarray) -> float:

@@ -1,0 +1,297 @@
+"""The rigid-body engine: convex parts of each object, moved by MuJoCo with Coulomb friction and restitution.
+
+Units are those of the scene's own scales, so that no constant of the solver depends on size or gravity: the smallest
+object's longest side, the median mass, and SUBSTEPS substeps.
+
+A contact is a damped spring. Its damping ratio is half the loss factor of the materials, weighted by their compliance:
+a stiff body on a soft one rebounds as the soft one does. Below REST_SPEED it is critically damped, since stacks that
+rebound at any speed never come to rest. The frequency is the highest that the substep resolves, so that resting bodies
+sink in by less than 1e-3 of the smallest object. The friction of a pair is the larger coefficient, as in the others.
+Source: Todorov, Erez and Tassa 2012, "MuJoCo: a physics engine for model-based control"; restitution of a damped
+spring: Schwager and Poeschel 2007, "Coefficient of restitution and linear-dashpot model revisited".
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from stages.core.errors import InputError, MissingPackage
+from stages.core.geometry.rotations import matrix
+from stages.core.physics.convex_parts import ConvexParts, convex_parts
+from stages.core.physics.forces import ForcePrompts
+from stages.core.physics.materials import MODELS, Material
+from stages.core.physics.state import FrameState
+from stages.core.scene.scene import Scene
+from stages.core.scene.trajectory import Keypoints
+from stages.simulate.options import SimulateOptions
+from stages.simulate.setup import SceneSetup, set_up_scene
+
+log = logging.getLogger(__name__)
+SUBSTEPS = 200  # substeps in a unit of time: that of falling half the size of the smallest object from rest
+CONTACT_SUBSTEPS = 12  # substeps during which bodies that collide touch
+REST_SPEED = 0.1  # normal speed below which contacts do not rebound [units]; a fall of 0.5 % of the smallest object
+IMPEDANCE = 0.99  # of a contact: 1 would be exact, but the forces between several contacts undetermined
+MAX_SUBSTEPS = 5_000  # in a frame
+MAX_TRAVEL = 0.05  # of the smallest object's size in a substep, so that nothing passes through it
+SOFT = 0.02  # compression under its own weight above which a body is not rigid
+SEPARATION_ROUNDS, CONTACT_SLACK = 200, 1e-3  # of bodies that overlap at the start; slack in sizes of the smallest
+FREE, FALLING = 7, 6  # numbers of a free joint's coordinates and velocities
+
+
+@dataclass(frozen=True)
+class Units:
+    """Units of the simulation."""
+
+    length: float  # [m]
+    time: float  # [s]
+    mass: float  # [kg]
+
+    @property
+    def force(self) -> float:
+        """[N]"""
+        return self.mass * self.length / self.time**2
+
+
+@dataclass(frozen=True)
+class Body:
+    """An object as a rigid body, in metres and kilograms."""
+
+    parts: ConvexParts  # in scene units, where reconstructed
+    material: Material
+    friction: float
+    mass: float
+    start: Float[Tensor, "3"]  # centre of mass at the start
+    pinned: bool
+
+
+def rollout(
+    scene: Scene, keypoints: Keypoints, prompts: ForcePrompts, options: SimulateOptions
+) -> Iterator[FrameState]:
+    """One state per frame, the first being the start. Raises InputError when the motion is no longer finite, and
+    MissingPackage without MuJoCo."""
+    try:
+        import mujoco  # noqa: F401, PLC0415 -- an optional package
+    except ImportError as error:
+        raise MissingPackage("--engine rigid needs the package mujoco: `pip install 'ngff[rigid]'`") from error
+    setup = set_up_scene(scene, prompts, options)
+    bodies, floor_offset = _bodies(scene, setup, prompts, options)
+    world = _World(scene, setup, bodies, prompts, options)
+    floor_offset += world.separate()
+    log.info("%d bodies of %d convex parts, substep %.3g s (%d per frame)", len(bodies),
+             sum(len(b.parts.hulls) for b in bodies), options.dt / world.substeps, world.substeps)  # fmt: skip
+    return _states(scene, keypoints, setup, bodies, floor_offset, world, options)
+
+
+def _states(
+    scene: Scene, keypoints: Keypoints, setup: SceneSetup, bodies: list[Body], floor_offset: Float[Tensor, "o 3"],
+    world: _World, options: SimulateOptions,
+) -> Iterator[FrameState]:  # fmt: skip
+    """Keypoints moved with their bodies; displacements onto the floor and apart are not part of the output."""
+    row = torch.tensor([[o.id for o in scene.objects].index(int(i)) for i in keypoints.object_id], dtype=torch.int64)
+    com = torch.stack([b.parts.com for b in bodies])
+    arm = (keypoints.rest - com[row])[..., None]
+    for frame in range(options.steps):
+        centre, quat = world.pose()
+        if not bool(centre.isfinite().all() and quat.isfinite().all()):
+            raise InputError(f"the motion ceased to be finite at {frame * options.dt:.2f} s; use a smaller --velocity "
+                             "or --force")  # fmt: skip
+        centre = centre / scene.metres_per_unit - floor_offset
+        if frame == 0:  # without rounding
+            yield FrameState(keypoints.rest + setup.lift[row], com + setup.lift, quat)
+        else:
+            yield FrameState(centre[row] + (matrix(quat)[row] @ arm)[..., 0], centre, quat)
+        if frame < options.steps - 1:
+            world.advance(frame * options.dt)
+
+
+def _bodies(
+    scene: Scene, setup: SceneSetup, prompts: ForcePrompts, options: SimulateOptions
+) -> tuple[list[Body], Float[Tensor, "o 3"]]:
+    """The bodies, and their displacements onto the floor [scene units], as in setup but exact for the convex parts."""
+    unit, bodies, offsets = scene.metres_per_unit, [], []
+    for row, o in enumerate(scene.objects):
+        choice, parts = setup.materials[o.id], convex_parts(scene, o.id, options.seed)
+        m, pinned = choice.material, o.id in prompts.pinned
+        mass = m.density * parts.volume * unit**3
+        lowest = float(torch.cat(parts.hulls)[:, 2].min() + setup.lift[row, 2])
+        below = lowest - setup.box.low[2]
+        offset = torch.tensor([0.0, 0.0, -below if not pinned and (setup.on_floor[row] or below < 0) else 0.0])
+        friction = m.friction if options.friction is None else options.friction
+        start = unit * (parts.com + setup.lift[row] + offset)
+        bodies.append(Body(parts, m, friction, mass, start, pinned))
+        offsets.append(offset)
+        guess = f"; material not known, taking {choice.name} (--material {o.id}=... changes it)" * choice.guessed
+        log.info("object %d (%s): %s, %s%s%s", o.id, o.name, choice.name, scene.mass_text(mass), ", pinned" * pinned,
+                 guess)  # fmt: skip
+        height = unit * float(torch.cat(parts.hulls)[:, 2].max()) - unit * (lowest - float(setup.lift[row, 2]))
+        if MODELS[m.model].plastic:
+            log.warning("object %d (%s): %s yields or flows, but rigid bodies keep their shape; use --engine mpm",
+                        o.id, o.name, choice.name)  # fmt: skip
+        elif m.density * abs(options.gravity) * height > SOFT * m.E:
+            log.warning("object %d (%s): %s yields by %.0f %% under its own weight, but rigid bodies keep their shape; "
+                        "use --engine ngff or mpm", o.id, o.name, choice.name,
+                        100 * m.density * abs(options.gravity) * height / m.E)  # fmt: skip
+    return bodies, torch.stack(offsets)
+
+
+class _World:
+    """MuJoCo's model and state of the bodies."""
+
+    def __init__(self, scene: Scene, setup: SceneSetup, bodies: list[Body], prompts: ForcePrompts,
+                 options: SimulateOptions):  # fmt: skip
+        import mujoco  # noqa: PLC0415 -- an optional package
+
+        self._mujoco, self._bodies, self._dt = mujoco, bodies, options.dt
+        self._omega = math.pi * SUBSTEPS / CONTACT_SUBSTEPS
+        unit = scene.metres_per_unit
+        velocity = [unit * torch.tensor(prompts.velocity.get(o.id, (0.0, 0.0, 0.0))) for o in scene.objects]
+        size = min(unit * float((p.amax(0) - p.amin(0)).max()) for p in (torch.cat(b.parts.hulls) for b in bodies))
+        floor = unit * setup.box.low[2]
+        fall = max(float(b.start[2]) - floor for b in bodies)
+        speed = max(float(v.norm()) for v in velocity) + math.sqrt(2 * abs(options.gravity) * max(fall, size))
+        mass_of = {o.id: b.mass for o, b in zip(scene.objects, bodies, strict=True)}
+        pushes = ((math.hypot(*f.force) + math.hypot(*f.torque) / size) / mass_of[f.object_id] for f in prompts.forces)
+        acceleration = max(abs(options.gravity), *pushes, 1e-9)
+        substep = min(math.sqrt(size / acceleration) / SUBSTEPS, MAX_TRAVEL * size / max(speed, 1e-9))
+        self.substeps = max(1, math.ceil(min(options.dt / substep, MAX_SUBSTEPS)))
+        mass = sorted(b.mass for b in bodies)[len(bodies) // 2]
+        self.units = Units(size, SUBSTEPS * options.dt / self.substeps, mass)
+        box = [[unit * v / size for v in corner] for corner in (setup.box.low, setup.box.high)]
+        self.model = _model(mujoco, bodies, self.units, options, box if options.box else None, floor / size,
+                            self._omega)  # fmt: skip
+        self.data = mujoco.MjData(self.model)
+        self._free = [i for i, b in enumerate(bodies) if not b.pinned]
+        for k, i in enumerate(self._free):
+            self.data.qvel[FALLING * k : FALLING * k + 3] = velocity[i].numpy() * self.units.time / size
+        ids = [o.id for o in scene.objects]
+        self._forces = [(f, ids.index(f.object_id), None if f.at is None else self._arm(f.at, scene, setup, ids, f))
+                        for f in prompts.forces if f.object_id not in prompts.pinned]  # fmt: skip
+
+    def _arm(self, at, scene: Scene, setup: SceneSetup, ids: list[int], force) -> np.ndarray:
+        """From the centre of mass to the point of application, in the body's frame."""
+        com = self._bodies[ids.index(force.object_id)].parts.com
+        return ((torch.tensor(at) - com) * scene.metres_per_unit / self.units.length).double().numpy()
+
+    def pose(self) -> tuple[Float[Tensor, "o 3"], Float[Tensor, "o 4"]]:
+        """Centres of mass [m] and rotations relative to the start (w x y z)."""
+        self._mujoco.mj_kinematics(self.model, self.data)
+        count = len(self._bodies) + 1  # 0 is the world
+        centre, quat = (torch.from_numpy(a[1:count].copy()).float() for a in (self.data.xpos, self.data.xquat))
+        return centre * self.units.length, quat
+
+    def separate(self) -> Float[Tensor, "o 3"]:
+        """Move apart bodies that overlap at the start; return their displacements [m].
+
+        Otherwise the contacts would throw them apart. Lighter bodies move more; pinned bodies and the floor do not.
+        """
+        mujoco, start = self._mujoco, self.data.qpos.copy()
+        weight = np.zeros(len(self._bodies) + 1)
+        for i in self._free:
+            weight[i + 1] = self.units.mass / self._bodies[i].mass
+        column = {i + 1: FREE * k for k, i in enumerate(self._free)}
+        for _ in range(SEPARATION_ROUNDS if self._free else 0):
+            mujoco.mj_fwdPosition(self.model, self.data)
+            deepest: dict[tuple[int, int], tuple[float, np.ndarray]] = {}
+            for c in self.data.contact[: self.data.ncon]:
+                pair = tuple(int(self.model.geom_bodyid[g]) for g in c.geom)
+                if c.dist < -CONTACT_SLACK and c.dist < deepest.get(pair, (0.0, None))[0]:
+                    deepest[pair] = (float(c.dist), c.frame[:3].copy())
+            if not deepest:
+                break
+            for (a, b), (distance, normal) in deepest.items():  # the normal points from a to b
+                for body, sign in ((a, 1.0), (b, -1.0)):
+                    if body in column:
+                        at = slice(column[body], column[body] + 3)
+                        self.data.qpos[at] += sign * distance * weight[body] / (weight[a] + weight[b]) * normal
+        moved = torch.zeros(len(self._bodies), 3)
+        for k, i in enumerate(self._free):
+            shift = (self.data.qpos - start)[FREE * k : FREE * k + 3]
+            moved[i] = torch.from_numpy(shift * self.units.length)
+        return moved
+
+    def advance(self, time: float) -> None:
+        """Advance by a frame that begins at `time` [s]."""
+        step = self._dt / self.substeps
+        for n in range(self.substeps):
+            if self._forces:
+                self._apply_forces(time + n * step, step)
+            self._step()
+
+    def _step(self) -> None:
+        """A substep: mj_step with the damping of slow contacts added to their reference acceleration."""
+        mujoco, model, data = self._mujoco, self.model, self.data
+        mujoco.mj_fwdPosition(model, data)
+        mujoco.mj_fwdVelocity(model, data)
+        if data.ncon:
+            normal = data.contact.efc_address
+            normal = normal[normal >= 0]
+            speed = data.efc_vel[normal]
+            missing = np.maximum(2 * self._omega - data.efc_KBIP[normal, 1], 0)
+            data.efc_aref[normal] -= missing * np.maximum(1 - np.abs(speed) / REST_SPEED, 0) * speed
+        mujoco.mj_fwdActuation(model, data)
+        mujoco.mj_fwdAcceleration(model, data)
+        mujoco.mj_fwdConstraint(model, data)
+        mujoco.mj_Euler(model, data)
+
+    def _apply_forces(self, time: float, step: float) -> None:
+        """Set the mean force and torque on each body during a substep."""
+        self.data.xfrc_applied[:] = 0
+        for f, row, arm in self._forces:
+            active = f.active_fraction(time, time + step)
+            force = np.array(f.force) * (active / self.units.force)
+            torque = np.array(f.torque) * (active / (self.units.force * self.units.length))
+            if arm is not None:
+                torque = torque + np.cross(self.data.xmat[row + 1].reshape(3, 3) @ arm, force)
+            self.data.xfrc_applied[row + 1] += np.concatenate([force, torque])
+
+
+def _model(mujoco, bodies: list[Body], units: Units, options: SimulateOptions, box, floor: float, omega: float):
+    """MuJoCo's model: a body for each object, a mesh for each convex part, and a plane for the floor or each wall."""
+    spec = mujoco.MjSpec()
+    spec.option.timestep = 1 / SUBSTEPS
+    spec.option.gravity = [0, 0, -options.gravity * units.time**2 / units.length]
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    spec.option.impratio = 10  # friction this much firmer than the normal force, so that slopes hold
+    if hasattr(mujoco.mjtEnableBit, "mjENBL_MULTICCD"):  # several contacts between two parts; always so from version 4
+        spec.option.enableflags |= mujoco.mjtEnableBit.mjENBL_MULTICCD
+    softest = min(b.material.E for b in bodies)
+    impedance = [IMPEDANCE, IMPEDANCE, 0.001, 0.5, 2.0]
+    planes = [((0.0, 0.0, floor), (0.0, 0.0, 1.0))]
+    if box:
+        planes += [(box[side], tuple((-1.0 if side else 1.0) * (a == axis) for a in range(3)))
+                   for axis in range(3) for side in (0, 1) if (axis, side) != (2, 0)]  # fmt: skip
+    for at, normal in planes:
+        quat = np.zeros(4)
+        mujoco.mju_quatZ2Vec(quat, np.array(normal))
+        spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], pos=at, quat=quat, condim=3,
+                                friction=[0, 0, 0], solmix=0, solimp=impedance, solref=[-(omega**2), 0])  # fmt: skip
+    for i, b in enumerate(bodies):
+        _add_body(mujoco, spec, f"body{i}", b, units, omega, softest, impedance)
+    return spec.compile()
+
+
+def _add_body(mujoco, spec, name: str, b: Body, units: Units, omega: float, softest: float, impedance: list) -> None:
+    unit = float(b.mass / (b.material.density * b.parts.volume)) ** (1 / 3)  # metres in a scene unit
+    body = spec.worldbody.add_body(name=name, pos=(b.start / units.length).tolist())
+    body.explicitinertial, body.mass, body.ipos = True, b.mass / units.mass, [0, 0, 0]
+    inertia = b.parts.inertia.double() * b.material.density * unit**5 / (units.mass * units.length**2)
+    body.fullinertia = [float(inertia[r, c]) for r, c in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))]
+    if not b.pinned:
+        body.add_freejoint()
+    damping = b.material.loss / 2  # ratio to critical: the energy lost in a cycle is 4 pi damping of that stored
+    for n, hull in enumerate(b.parts.hulls):
+        vertices = (hull - b.parts.com).double() * unit / units.length
+        mesh = spec.add_mesh(name=f"{name}_{n}", uservert=vertices.flatten().tolist())
+        mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
+        # negative: stiffness and damping themselves, of which MuJoCo takes the mean, weighted by solmix
+        body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh.name, condim=3, friction=[b.friction, 0, 0],
+                      solref=[-(omega**2), -2 * damping * omega], solimp=impedance,
+                      solmix=softest / b.material.E)  # fmt: skip

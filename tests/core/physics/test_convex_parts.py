@@ -1,0 +1,58 @@
+"""Convex parts: moments of solids, concave objects, and the surface of voxels."""
+
+import pytest
+import torch
+from scipy.spatial import ConvexHull
+
+from stages.core.physics.convex_parts import convex_parts, voxel_surface
+from stages.core.scene.scene import Scene, SceneObject
+from stages.lab.assets.shapes import Surface, box, ellipsoid, to_gaussians, union
+
+
+def scene(surface: Surface) -> Scene:
+    g = to_gaussians(surface, torch.full((len(surface.points), 3), 0.5), 1)
+    return Scene(g, (SceneObject(1, "thing"),))
+
+
+def test_a_box_is_one_part_with_its_own_volume_and_inertia():
+    a, b, c = sides = (0.2, 0.1, 0.3)
+    parts = convex_parts(scene(box(sides, 0.01).moved((1.0, 2.0, 3.0))), 1)
+    assert len(parts.hulls) == 1 and parts.volume == pytest.approx(a * b * c, rel=0.02)  # edges between points are cut
+    torch.testing.assert_close(parts.com, torch.tensor([1.0, 2.0, 3.0]), rtol=0, atol=1e-4)
+    expected = parts.volume / 12 * torch.diag(torch.tensor([b * b + c * c, a * a + c * c, a * a + b * b]))
+    torch.testing.assert_close(parts.inertia, expected, rtol=0.02, atol=1e-6)
+
+
+def test_a_ball_is_round_to_one_percent():
+    parts = convex_parts(scene(ellipsoid((0.1, 0.1, 0.1), 3000)), 1)
+    (hull,) = parts.hulls
+    assert len(hull) == 200
+    torch.testing.assert_close(hull.norm(dim=1), torch.full((200,), 0.1), rtol=1e-3, atol=0)
+    assert float(parts.inertia[0, 0]) == pytest.approx(0.4 * parts.volume * 0.01, rel=0.01)
+
+
+def test_a_concave_object_is_divided():
+    """A dumb-bell: no part fills more than the bottom of the groove between its balls."""
+    def sphere(x):
+        centre = torch.tensor([x, 0.0, 0.0])
+        return ellipsoid((0.1,) * 3, 2000).moved((x, 0.0, 0.0)), lambda p: (p - centre).norm(dim=1) < 0.0999
+
+    parts = convex_parts(scene(union(sphere(-0.09), sphere(0.09))), 1)
+    assert 2 <= len(parts.hulls) <= 12
+    groove = torch.tensor([[0.0, 0.09, 0.0]])  # the balls meet in a ring of radius .044
+    for hull in parts.hulls:
+        assert ConvexHull(torch.cat([hull, groove]).numpy()).volume > 1.001 * ConvexHull(hull.numpy()).volume
+    corners = torch.cat(parts.hulls)
+    torch.testing.assert_close(corners.amax(0), torch.tensor([0.19, 0.1, 0.1]), rtol=0, atol=0.01)
+    torch.testing.assert_close(corners.amin(0), -torch.tensor([0.19, 0.1, 0.1]), rtol=0, atol=0.01)
+    torch.testing.assert_close(parts.com, torch.zeros(3), rtol=0, atol=0.002)
+
+
+def test_the_surface_of_voxels_is_closed_and_encloses_them():
+    cells = torch.tensor([[0, 0, 0], [1, 0, 0], [1, 1, 0], [1, 1, 1]])
+    vertices, triangles = voxel_surface(cells)
+    corners = vertices.double()[triangles.long()]
+    assert float(torch.linalg.det(corners).sum() / 6) == pytest.approx(4)  # outward triangles: volume by Gauss
+    edges = torch.cat([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
+    forward = {tuple(e) for e in edges.tolist()}
+    assert len(forward) == len(edges) and all((b, a) in forward for a, b in forward)

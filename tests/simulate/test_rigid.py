@@ -1,0 +1,108 @@
+"""The rigid engine: free fall, friction, restitution, stacks, prompts and scale, each against its analytic value."""
+
+import json
+import logging
+import math
+from pathlib import Path
+
+import pytest
+import torch
+
+from stages.core.errors import InputError
+from stages.core.scene.gaussians import concatenate
+from stages.core.scene.scene import Scene, SceneObject
+from stages.core.scene.scene_ply import write_scene
+from stages.core.scene.trajectory import Trajectory, read_trajectory
+from stages.lab.assets.shapes import Surface, box, ellipsoid, to_gaussians
+from stages.simulate.options import SimulateOptions
+from stages.simulate.stage import run
+
+G = 9.81
+
+
+def cube(side: float, x: float, bottom: float) -> Surface:
+    return box((side, side, side), side / 16).moved((x, 0.0, bottom + side / 2))
+
+
+def roll(folder: Path, *surfaces: Surface, density: float = 500.0, loss: float = 0.3, **options) -> Trajectory:
+    parts = [to_gaussians(s, torch.full((len(s.points), 3), 0.5), i + 1) for i, s in enumerate(surfaces)]
+    objects = tuple(SceneObject(i + 1, f"body{i + 1}") for i in range(len(parts)))
+    write_scene(folder / "scene.ply", Scene(concatenate(parts), objects, None, 0.0))
+    material = {o.name: {"E": 1e7, "density": density, "loss": loss, "friction": 0.3} for o in objects}
+    (folder / "m.json").write_text(json.dumps(material))
+    chosen = {"engine": "rigid", "keypoints": 32, "materials": folder / "m.json", "quality": "draft", **options}
+    run(folder / "scene.ply", folder / "t.h5", SimulateOptions(**chosen))
+    return read_trajectory(folder / "t.h5")
+
+
+def test_first_frame_is_the_scene_and_free_fall_is_a_parabola(tmp_path):
+    t = roll(tmp_path, cube(0.1, 0, 0.5), steps=11)
+    assert torch.equal(t.positions[0], t.keypoints.rest) and t.info.engine == "rigid"
+    # semi-implicit Euler falls g t dt / 2 further; the substep is below 1 ms
+    assert float(t.com[-1, 0, 2] - t.com[0, 0, 2]) == pytest.approx(-G * 0.2**2 / 2, rel=0.01)
+
+
+@pytest.mark.parametrize("friction", [0.1, 0.3, 0.6])
+def test_a_box_slides_by_v2_over_2_mu_g(tmp_path, friction):
+    flat = box((0.3, 0.2, 0.1), 0.02).moved((0.0, 0.0, 0.05))
+    t = roll(tmp_path, flat, velocity=("object=1 2,0,0",), friction=friction, steps=110)
+    assert float(t.com[-1, 0, 0]) == pytest.approx(4 / (2 * friction * G), rel=0.03)
+
+
+@pytest.mark.parametrize("loss", [0.1, 0.4])
+def test_a_ball_rebounds_by_its_loss_factor(tmp_path, loss):
+    t = roll(tmp_path, ellipsoid((0.1,) * 3, 2000).moved((0, 0, 0.1)), loss=loss, lift=("0.5",), dt=0.01, steps=110)
+    z = t.com[:, 0, 2] - 0.1
+    hit = int((z < 0.02).nonzero()[0])
+    restitution = math.sqrt(float(z[hit:].max()) / 0.5)
+    assert restitution == pytest.approx(math.exp(-math.pi * loss / 2), abs=0.03)  # half an oscillation at low damping
+
+
+def test_a_tower_stands(tmp_path):
+    t = roll(tmp_path, *(cube(0.1, 0, 0.1 * i) for i in range(5)), steps=60, loss=0.15)
+    assert float((t.com[-1] - t.com[0]).norm(dim=1).max()) < 1e-3
+
+
+def test_overlapping_bodies_are_moved_apart_without_a_jump(tmp_path):
+    t = roll(tmp_path, cube(0.1, 0, 0.0), cube(0.1, 0, 0.08), steps=20)
+    assert torch.equal(t.positions[0], t.keypoints.rest)
+    assert float((t.com - t.com[0]).norm(dim=-1).max()) < 2e-3
+
+
+def test_force_torque_and_pin(tmp_path):
+    boxes = cube(0.2, 0, 0.5), cube(0.2, 1, 0.5)
+    mass = 500 * 0.2**3
+    inertia = mass * 0.2**2 / 6
+    t = roll(tmp_path, *boxes, gravity=0.0, pin=("2",), steps=12, force=(
+        f"object=1 force={mass},0,0 torque=0,0,{inertia} to=0.1", "object=2 force=9,9,9"))  # fmt: skip
+    assert torch.equal(t.com[-1, 1], t.com[0, 1])
+    assert float((t.com[-1] - t.com[-2])[0, 0] / 0.02) == pytest.approx(0.1, rel=0.02)
+    turned = 2 * torch.atan2(t.rotation[:, 0, 3], t.rotation[:, 0, 0])
+    assert float(turned[-1] - turned[-2]) / 0.02 == pytest.approx(0.1, rel=0.03)  # edges between points are cut
+    hit = roll(tmp_path, boxes[0], gravity=0.0, steps=5, force=("object=1 force=0,2,0 at=0.1,0,0.6",))
+    assert float(hit.rotation[-1, 0, 3]) > 1e-3 and float(hit.com[-1, 0, 1]) > 0
+
+
+@pytest.mark.parametrize("scale", [0.01, 100.0])
+def test_motion_is_the_same_at_any_size(tmp_path, scale):
+    one, other = (
+        roll(tmp_path, cube(0.2 * s, 0, 0), cube(0.1 * s, 0.02 * s, 0.23 * s), steps=25, dt=0.02 * math.sqrt(s))
+        for s in (1.0, scale)
+    )
+    torch.testing.assert_close(other.com / scale, one.com, rtol=0, atol=1e-3)
+
+
+def test_walls_hold_and_soft_or_plastic_bodies_are_warned_of(tmp_path, caplog):
+    caplog.set_level(logging.WARNING)
+    t = roll(
+        tmp_path, cube(0.1, 0, 0), box="-0.2,-0.2,0,0.2,0.2,1", velocity=("object=1 2,0,0",), friction=0.0,
+        material=("1=sand",), steps=40,
+    )  # fmt: skip
+    assert float(t.positions[..., 0].max()) < 0.215 and "sand yields or flows" in caplog.text
+    roll(tmp_path, cube(0.1, 0, 0), material=("1=jelly",), steps=1)
+    assert "jelly yields by" in caplog.text
+
+
+def test_motion_without_limit_is_an_error(tmp_path):
+    with pytest.raises(InputError, match="ceased to be finite"):
+        roll(tmp_path, cube(0.1, 0, 0.5), force=("object=1 force=1e300,0,0",), steps=2, dt=0.001)

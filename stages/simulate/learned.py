@@ -75,13 +75,13 @@ def rollout(
         current, held, acting, dt = options, prompts.pinned, prompts.forces, options.dt * units.time / steps
         external = replace(forces, pinned=forces.pinned | sleep.asleep)
         stepper = TimeStepper(model, initial.to(device), dt, external.to(device), options.integrator)
-        first, before = stepper.points.clone(), initial.points
+        first, before, mass = stepper.points.clone(), initial.points, initial.mass[0]
         for n in range(options.steps):
             if not bool(stepper.points.isfinite().all()):
                 raise InputError(f"the motion ceased to be finite at {n * options.dt:.2f} s; use a smaller --velocity "
                                  "or --force, or --engine mpm")  # fmt: skip
             moved = ((stepper.points - first) / units.length).cpu()
-            yield _state(keypoints, ids, lifted, initial, moved)
+            yield replace(_state(keypoints, ids, lifted, initial, moved), mass=mass / units.mass)
             if n == options.steps - 1:
                 continue
             start, end = n * options.dt, (n + 1) * options.dt
@@ -91,7 +91,9 @@ def rollout(
                 acting = active
             if changes:
                 current, held = changed_options(current, changes), changed_pins(held, changes)
-                stepper.change(_changed(scene, per_object, setup, units, solids, prompts, current).to(device))
+                new = _changed(scene, per_object, setup, units, solids, prompts, current)
+                stepper.change(new.to(device))
+                mass = new.mass[0]
             sleep.wake(_pushed(active, ids, start, end) | _roused(changes, ids))
             stepper.external.pinned.copy_(_rows(held, ids) | sleep.asleep)
             if bool(sleep.asleep.all()):

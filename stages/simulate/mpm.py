@@ -259,4 +259,4 @@ def _state(
     total = torch.zeros(len(scene.objects)).index_add(0, bodies.body, mass)
     com = torch.zeros(len(scene.objects), 3).index_add(0, bodies.body, mass[:, None] * x) / total[:, None]
     rotation = object_rotations(keypoints, positions, [o.id for o in scene.objects])
-    return FrameState(positions, com - setup.floor_offset, rotation)
+    return FrameState(positions, com - setup.floor_offset, rotation, total)

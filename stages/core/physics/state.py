@@ -13,3 +13,4 @@ class FrameState:
     positions: Float[Tensor, "p 3"]  # of the keypoints
     com: Float[Tensor, "o 3"]  # centre of mass of each object, in the order of scene.objects
     rotation: Float[Tensor, "o 4"]  # w x y z, relative to the rest pose
+    mass: Float[Tensor, "o"] | None = None  # of each object [kg]; live sessions need it

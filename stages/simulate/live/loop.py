@@ -193,16 +193,8 @@ def _session(scene: LiveScene, setup: SceneSetup) -> Session:
     if scene.options.engine == "mpm" or scene.options.box:  # a grid ends somewhere
         margin = 0.15 * (setup.bodies.x.amax(0) - setup.bodies.x.amin(0)).max().item()
         room = {"low": tuple(a + margin for a in setup.box.low), "high": tuple(b - margin for b in setup.box.high)}
-    mass = object_masses(scene.world, setup)
-    return Session(scene.prompts, scene.keypoints, mass, scene.options.gravity, unit, **room)
-
-
-def object_masses(world: Scene, setup: SceneSetup) -> dict[int, float]:
-    """Mass of each object [kg], in the order of the scene."""
-    volumes = (setup.bodies.volume[setup.bodies.body == row].sum() for row in range(len(world.objects)))
-    cubic_metres = world.metres_per_unit**3
-    return {o.id: float(volume) * cubic_metres * setup.materials[o.id].material.density
-            for o, volume in zip(world.objects, volumes, strict=True)}  # fmt: skip
+    ids = [o.id for o in scene.world.objects]
+    return Session(scene.prompts, scene.keypoints, ids, scene.options.gravity, unit, **room)
 
 
 def _stop_on_signals() -> threading.Event:

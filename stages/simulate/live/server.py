@@ -69,7 +69,7 @@ class LiveServer:
     def __enter__(self) -> LiveServer:
         self._started = threading.Event()
         self._thread.start()
-        self._started.wait()
+        self._started.wait(timeout=10)
         return self
 
     def __exit__(self, *_) -> None:

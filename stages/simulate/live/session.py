@@ -45,7 +45,7 @@ class Session:
 
     given: ForcePrompts  # of the command line
     keypoints: Keypoints
-    mass: dict[int, float]  # of each object, in the order of the scene [kg]
+    ids: list[int]  # of the objects, in the order of the scene, as rows of the states
     gravity: float  # downwards [m/s^2]
     unit: float = 1.0  # [m per scene unit]
     low: Vector = (-math.inf,) * 3  # room in which objects are pulled [scene units]
@@ -59,7 +59,6 @@ class Session:
     pinned: set[int] = field(default_factory=set)
 
     def __post_init__(self):
-        self.ids = list(self.mass)  # in the order of the scene, as rows of the state
         self.pinned, self.record = set(self.given.pinned), list(self.given.as_dicts())
         self._pending: list[Change] = []
         self._pushes: list[dict] = []
@@ -82,7 +81,7 @@ class Session:
     def handle(self, message: dict) -> None:
         """Take a message about the objects; those about unknown objects have no effect."""
         id = message.get("object")
-        if self.state is None or (id is not None and id not in self.mass):
+        if self.state is None or (id is not None and id not in self.ids):
             return
         match message["do"]:
             case "grab":
@@ -168,7 +167,7 @@ class Session:
 
     def _force(self, id: int, acceleration: Tensor, k: int | None, start: float, end: float) -> Force:
         at = None if k is None else _vector(self.keypoints.rest[k])
-        newtons = self.mass[id] * acceleration / (1 - 2 * MARGIN)
+        newtons = self.state.mass[self.ids.index(id)] * acceleration / (1 - 2 * MARGIN)
         return Force(id, _vector(newtons), start=start, end=end, at=at)
 
     def _nearest(self, id: int, point: Vector) -> int:

@@ -49,7 +49,7 @@ export function buildInterface(player) {
   element("colours").selectedIndex = player.renderer.mode;
   element("colours").onchange = (event) => player.setMode(event.target.selectedIndex);
 
-  options(element("view"), [film.view ? "start" : "overview", ...film.cameras.map((c) => c.name)]);
+  options(element("view"), ["start", ...film.cameras.map((c) => c.name)]);
   element("view").onchange = (event) => player.showCamera(event.target.selectedIndex - 1);
 
   element("arrows").checked = player.arrowsShown;

@@ -241,6 +241,33 @@ def bench_dynamics(
     print_results(lines, results or out, as_json)
 
 
+@app.command("physics")
+def bench_physics(
+    out: Annotated[
+        Path, typer.Option("-o", "--out", help="results (.json), existing ones are kept; also writes a table (.md)")
+    ] = Path("physics.json"),
+    only: Annotated[
+        list[str], typer.Option(help="experiments by group or pattern, such as slide or 'boxes/0.3m*'; repeatable")
+    ] = [],  # noqa: B006
+    engine: Annotated[list[str], typer.Option(help="rigid | mpm | ngff; repeatable; default: all")] = [],  # noqa: B006
+    quality: Annotated[str, typer.Option(help="quality of MPM: draft | normal | high")] = "draft",
+    keypoints: Annotated[int, typer.Option(help="keypoints per object")] = 256,
+    weights: Annotated[
+        Path | None, typer.Option(help="weights of the learned engine; default: those in the package")
+    ] = None,
+    device: Device = "auto",
+    as_json: AsJson = False,
+) -> None:
+    """School experiments (slides, slopes, towers, rebounds, ...): each engine compared with the analytic value."""
+    from stages.lab.bench.physics import PhysicsBenchOptions, run
+
+    chosen = {"engines": tuple(engine)} if engine else {}
+    options = PhysicsBenchOptions(
+        only=tuple(only), quality=quality, keypoints=keypoints, weights=weights, device=device, **chosen
+    )
+    print_results(lambda path: run(path, options), out, as_json)
+
+
 @app.command("ablation")
 def bench_ablation(
     data: Annotated[Path, typer.Option(help="folder of motions, as `ngff-lab dataset` writes")],

@@ -1,0 +1,171 @@
+"""Benchmark of the engines against school physics, through the path that `ngff simulate` takes."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import logging
+import tempfile
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from fnmatch import fnmatch
+from pathlib import Path
+
+from stages.core.backends import pick_device
+from stages.core.errors import InputError
+from stages.core.scene.files import replacing
+from stages.core.scene.scene_ply import write_scene
+from stages.core.scene.trajectory import Trajectory, read_trajectory
+from stages.lab.bench.common import machine, write_json
+from stages.lab.bench.physics_experiments import Experiment, Run, experiments
+from stages.simulate.options import ENGINES, SimulateOptions
+from stages.simulate.stage import run as simulate
+
+FAILED = "failed"  # in place of a value, where the engine ended with an error
+
+
+@dataclass(frozen=True)
+class PhysicsBenchOptions:
+    """What is measured, with which engines."""
+
+    only: tuple[str, ...] = ()  # patterns of names, such as "slide*"; empty: all
+    engines: tuple[str, ...] = ("rigid", "mpm", "ngff")
+    quality: str = "draft"  # of MPM
+    keypoints: int = 256
+    weights: Path | None = None  # of the learned engine
+    device: str = "auto"
+
+    def __post_init__(self):
+        unknown = [name for name in self.engines if name not in ENGINES]
+        if unknown:
+            raise InputError(f"--engine {unknown[0]}: choose from {', '.join(ENGINES)}")
+
+    def chosen(self) -> list[Experiment]:
+        """The experiments whose name fits one of the patterns. Raises InputError where a pattern fits none."""
+        table = experiments()
+        for pattern in self.only:
+            if not any(_fits(name, pattern) for name in table):
+                groups = ", ".join(sorted({name.partition("/")[0] for name in table}))
+                raise InputError(f"--only {pattern}: fits no experiment; groups are {groups}")
+        return [e for name, e in table.items() if not self.only or any(_fits(name, p) for p in self.only)]
+
+
+def _fits(name: str, pattern: str) -> bool:
+    return fnmatch(name, pattern) or fnmatch(name.partition("/")[0], pattern)
+
+
+def measure(experiment: Experiment, engine: str, options: PhysicsBenchOptions) -> dict:
+    """What is measured with one engine, whether it agrees with theory, and the seconds of all runs."""
+    start = time.perf_counter()
+    try:
+        value = experiment.measure(*(trajectory(run, engine, options) for run in experiment.runs))
+    except InputError as error:
+        return {"value": FAILED, "passes": False, "seconds": time.perf_counter() - start, "error": str(error)}
+    return {"value": value, "passes": experiment.passes(engine, value), "seconds": time.perf_counter() - start}
+
+
+def trajectory(run: Run, engine: str, options: PhysicsBenchOptions) -> Trajectory:
+    """Write the scene, simulate it, and read the trajectory."""
+    with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stderr(io.StringIO()), _quiet():
+        scene, materials, out = (Path(folder) / name for name in ("scene.ply", "materials.json", "traj.h5"))
+        write_scene(scene, run.scene())
+        materials.write_text(json.dumps({str(i + 1): thing.material() for i, thing in enumerate(run.things)}))
+        weights = options.weights if ENGINES[engine].weights else None
+        simulate(scene, out, SimulateOptions(
+            engine=engine, materials=materials, quality=options.quality, keypoints=options.keypoints, weights=weights,
+            device=options.device, **run.options,
+        ))  # fmt: skip
+        return read_trajectory(out)
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Without the messages of the stage: a bench repeats them a hundred times."""
+    before = logging.root.manager.disable
+    logging.disable(logging.WARNING)
+    try:
+        yield
+    finally:
+        logging.disable(before)
+
+
+def run(out: Path, options: PhysicsBenchOptions = PhysicsBenchOptions()) -> Iterator[str]:  # noqa: B008 -- frozen
+    """Yield a line for each experiment and engine; rows that `out` has already are kept and not measured again.
+
+    Also writes the table beside it as Markdown.
+    """
+    table, device = experiments(), pick_device(options.device)
+    facts = _before(Path(out)) or {"command": "ngff-lab bench physics", "rows": {}}
+    facts |= {"machine": machine(device), "quality": options.quality}
+    for experiment in options.chosen():
+        row = facts["rows"].setdefault(experiment.name, {})
+        for engine in options.engines:
+            if engine not in row:
+                row[engine] = measure(experiment, engine, options)
+                facts["rows"] = {name: facts["rows"][name] for name in table if name in facts["rows"]}
+                facts["date"] = datetime.now(timezone.utc).date().isoformat()
+                write_json(Path(out), facts)
+                with replacing(Path(out).with_suffix(".md")) as part:
+                    part.write_text("\n".join(markdown(facts)) + "\n")
+            yield _line(experiment, engine, row[engine])
+    for engine in options.engines:
+        rows = [row[engine] for row in facts["rows"].values() if engine in row]
+        yield f"{engine}: {sum(row['passes'] for row in rows)} of {len(rows)} agree with theory"
+
+
+def _before(out: Path) -> dict | None:
+    """Results of an earlier run."""
+    if not out.exists():
+        return None
+    try:
+        facts = json.loads(out.read_text())
+        facts["rows"].items()
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InputError(f"{out}: holds no results of `ngff-lab bench physics` ({error!r}); name another") from error
+    return facts
+
+
+def _line(experiment: Experiment, engine: str, row: Mapping) -> str:
+    verdict = "ok" if row["passes"] else "--"
+    return (f"{verdict}  {experiment.name:34} {engine:6} {_number(row['value']):>8}  analytic "
+            f"{_number(experiment.value):>7}  {experiment.what}  ({row['seconds']:.0f} s)")  # fmt: skip
+
+
+def _number(value: float | str) -> str:
+    return value if isinstance(value, str) else f"{value:.3f}"
+
+
+def markdown(facts: Mapping) -> Iterator[str]:
+    """The results as a Markdown page; values that do not agree with theory are in brackets."""
+    table, rows = experiments(), facts["rows"]
+    engines = [name for name in ("rigid", "mpm", "ngff") if any(name in row for row in rows.values())]
+    yield "# School physics"
+    yield ""
+    yield "    ngff-lab bench physics"
+    yield ""
+    yield (
+        f"{facts['machine']}, {facts['date']}; MPM at quality {facts['quality']}. Each experiment is a scene file and "
+        "a call of the stage `simulate`. Values in brackets differ from theory by more than the engine's tolerance: "
+        "5 % for `rigid`, 10 % for `mpm` and `ngff` (slides of `ngff` 15 %); gaps of -3 to 5 % of the upper body's "
+        "height (`mpm` -10 to 10 %)."
+    )
+    yield ""
+    agree = (f"`{e}` {sum(r[e]['passes'] for r in rows.values() if e in r)} of {sum(e in r for r in rows.values())}"
+             for e in engines)  # fmt: skip
+    yield f"Rows that agree with theory: {', '.join(agree)}."
+    yield ""
+    yield f"| experiment | measured | analytic | {' | '.join(f'`{name}`' for name in engines)} |"
+    yield "| --- | --- | --- |" + " --- |" * len(engines)
+    for name, row in rows.items():
+        e = table[name]
+        cells = (_cell(row.get(engine)) for engine in engines)
+        yield f"| {name} | {e.what} | {_number(e.value)} | {' | '.join(cells)} |"
+
+
+def _cell(row: Mapping | None) -> str:
+    if row is None:
+        return ""
+    return _number(row["value"]) if row["passes"] else f"({_number(row['value'])})"

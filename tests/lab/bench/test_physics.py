@@ -1,0 +1,52 @@
+"""School experiments: the rigid engine agrees with theory, and the bench keeps rows and writes a page."""
+
+import json
+
+import pytest
+
+from stages.core.errors import InputError
+from stages.lab.bench.physics import PhysicsBenchOptions, measure, run
+from stages.lab.bench.physics_experiments import experiments
+
+ALL = experiments()
+QUICK = ("slide/friction=0.3", "slope/25deg friction=0.3", "fall/gravity=1.62", "torque/ball", "rebound/ball loss=0.15",
+         "collision/momentum", "stack/heavy on soft", "scale/100")  # fmt: skip
+BOXES = [name for name in ALL if name.startswith("boxes/")]
+
+
+@pytest.mark.parametrize(
+    "name", [*QUICK, *(pytest.param(n, marks=pytest.mark.slow) for n in ALL if n not in QUICK)]
+)
+def test_rigid_bodies_agree_with_theory(name):
+    row = measure(ALL[name], "rigid", PhysicsBenchOptions(device="cpu"))
+    assert row["passes"], row
+
+
+def test_names_say_the_case_and_tolerances_exclude_failures():
+    assert len(BOXES) == 60
+    boxes, slide = ALL[BOXES[0]], ALL["slide/friction=0.3"]
+    assert slide.value == pytest.approx(2**2 / (2 * 0.3 * 9.81))
+    assert boxes.passes("ngff", 0.04) and not boxes.passes("ngff", -0.04) and not boxes.passes("rigid", 0.06)
+    assert slide.passes("rigid", 1.04 * slide.value) and not slide.passes("rigid", 1.06 * slide.value)
+
+
+def test_measured_rows_are_kept_and_the_page_marks_failures(tmp_path):
+    options = PhysicsBenchOptions(only=("fall/gravity=25",), engines=("rigid",), device="cpu")
+    (line, total) = run(tmp_path / "p.json", options)
+    assert line.startswith("ok") and total == "rigid: 1 of 1 agree with theory"
+    facts = json.loads((tmp_path / "p.json").read_text())
+    facts["rows"]["fall/gravity=25"]["rigid"] |= {"value": 9.0, "passes": False}
+    (tmp_path / "p.json").write_text(json.dumps(facts))
+    (line, total) = run(tmp_path / "p.json", options)
+    assert line.startswith("--") and "9.000" in line and total == "rigid: 0 of 1 agree with theory"
+    more = PhysicsBenchOptions(only=("fall/gravity=9.81",), engines=("rigid",), device="cpu")
+    list(run(tmp_path / "p.json", more))
+    page = (tmp_path / "p.md").read_text()
+    assert "| fall/gravity=25 | fall [m] | 0.180 | (9.000) |" in page and "`rigid` 1 of 2" in page
+
+
+def test_unknown_experiments_and_engines_are_errors():
+    with pytest.raises(InputError, match="groups are boxes, collision"):
+        PhysicsBenchOptions(only=("jump",)).chosen()
+    with pytest.raises(InputError, match="--engine warp"):
+        PhysicsBenchOptions(engines=("warp",))

@@ -216,7 +216,7 @@ def simulate(
         float | None, Option(help="Coulomb coefficient at floor and walls; default: each material's")
     ] = SimulateOptions.friction,
     box: Annotated[
-        str | None, Option(help="floor, walls and ceiling x0,y0,z0,x1,y1,z1 [scene units]; default: around the objects")
+        str | None, Option(help="floor, walls and ceiling x0,y0,z0,x1,y1,z1 [scene units]; default: only a floor")
     ] = SimulateOptions.box,
     keypoints: Annotated[
         int | None, Option(help=f"maximum number of keypoints per object; default: {DEFAULT_KEYPOINTS}, with --live "

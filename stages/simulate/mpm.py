@@ -28,6 +28,7 @@ from stages.core.physics.state import FrameState
 from stages.core.scene.scene import Scene, SceneObject
 from stages.core.scene.trajectory import Keypoints
 from stages.simulate.changes import changed_options, changed_pins
+from stages.simulate.moving_grid import MovingGrid
 from stages.simulate.options import MpmQuality, SimulateOptions
 from stages.simulate.setup import SceneSetup, set_up_scene
 
@@ -58,21 +59,21 @@ def rollout(
     # thick bodies leave their outermost layer of voxels empty, so the floor is raised by as much
     low = (*setup.box.low[:2], setup.box.low[2] + setup.bodies.spacing)
     box = mpm.Box(tuple(unit * v for v in low), tuple(unit * v for v in setup.box.high))
-    solver = mpm.Solver(particles, box, dx, device, exact=device != "cpu")
+    grid = MovingGrid(particles, box, dx, device, body, scene.objects, fixed=options.box is not None)
     _warn_stuck(scene, setup, prompts)
     ids = [o.id for o in scene.objects]
     attachment = _attach(scene, keypoints, setup.bodies)
     gravity = _gravity(particles, options)
-    substeps = solver.substeps(options.dt, gravity)
+    substeps = grid.solver.substeps(options.dt, gravity)
     log.info(
         "%d particles, grid spacing %.3g m, %d nodes, substep %.3g s (%d per frame; more for fast motion)",
-        len(particles), dx, solver.grid.count, options.dt / substeps, substeps,
+        len(particles), dx, grid.solver.grid.count, options.dt / substeps, substeps,
     )  # fmt: skip
 
     def states() -> Iterator[FrameState]:
         current, held, weight, acting, forces = options, prompts.pinned, gravity, None, []
         for frame in range(options.steps):
-            now = solver.particles
+            now = grid.solver.particles
             x = now.x.cpu()
             yield _state(scene, setup, attachment, x / unit, now.F.cpu(), particles.mass)
             if frame < options.steps - 1:
@@ -80,14 +81,15 @@ def rollout(
                 active, changes = prompts.during(t, (frame + 1) * options.dt)
                 if changes:
                     current, held = changed_options(current, changes), changed_pins(held, changes)
-                    _change(solver, particles, _changed(scene, setup, replace(prompts, pinned=held), current, level))
+                    new = _changed(scene, setup, replace(prompts, pinned=held), current, level)
+                    _change(grid.solver, particles, new)
                     weight = _gravity(particles, current)
                 if active is not acting or changes:
                     forces = [_PromptedForce(f, particles, setup, ids.index(f.object_id)) for f in active]
                     acting = active
                 acceleration = sum((f.acceleration(x, t, t + options.dt) for f in forces), weight)
                 try:
-                    solver.advance(options.dt, acceleration)
+                    grid.advance(options.dt, acceleration)
                 except mpm.Diverged as error:
                     raise _divergence(scene.objects[int(body[error.particle])], t) from error
 
@@ -126,7 +128,7 @@ def _change(solver: mpm.Solver, particles: mpm.Particles, new: mpm.Particles) ->
 def _divergence(o: SceneObject, time: float) -> InputError:
     return InputError(
         f"object {o.id} ({o.name}) left the domain or its motion ceased to be finite at {time:.2f} s; use a finer "
-        "--quality, a softer --material, a wider --box, or a smaller --velocity or --force"
+        "--quality, a softer --material, a wider --box if there is one, or a smaller --velocity or --force"
     )
 
 

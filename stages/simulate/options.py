@@ -62,7 +62,7 @@ class SimulateOptions:
     lift: tuple[str, ...] = ()  # HEIGHT for all or OBJECT=HEIGHT [scene units]
     floor: float | None = None  # height of the floor [scene units]; by default the scene's
     friction: float | None = None  # Coulomb coefficient at floor and walls; by default each material's
-    box: str | None = None  # floor, walls and ceiling: x0,y0,z0,x1,y1,z1 [scene units]; by default around the objects
+    box: str | None = None  # floor, walls and ceiling: x0,y0,z0,x1,y1,z1 [scene units]; by default only a floor
     keypoints: int | None = None  # maximum number per object; None: see keypoint_count
     weights: Path | None = None  # of a learned engine: .safetensors with its card, or a published checkpoint (.pth)
     integrator: str = "step"  # of a learned engine, one of INTEGRATORS

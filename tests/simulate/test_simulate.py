@@ -15,6 +15,7 @@ from stages.core.scene.scene import Scene, SceneObject
 from stages.core.scene.scene_ply import read_scene, write_scene
 from stages.core.scene.trajectory import Trajectory, read_trajectory
 from stages.segment.stage import run as segment
+from stages.simulate import moving_grid
 from stages.simulate import mpm as engine
 from stages.simulate.options import QUALITIES, MpmQuality, SimulateOptions
 from stages.simulate.setup import set_up_scene
@@ -192,6 +193,20 @@ def test_walls_hold(balls):
     t = roll(balls, steps=20, box="-0.6,-0.4,0,0.6,0.4,1", velocity=("object=2 2,0,0",), material=("thing=rubber",))
     mine = t.keypoints.object_id == 2
     assert float(t.positions[:, mine, 0].max()) < 0.6 + 2 * 0.065  # walls are accurate to two cells
+
+
+def test_nothing_stops_what_slides_or_rises_but_the_box_that_was_asked_for(balls):
+    """Without friction a ball keeps its 3 m/s for 2.3 m, and another rises as in empty space."""
+    t = roll(balls, steps=40, friction=0.0, gravity=1.0, velocity=("object=1 3,0,0", "object=2 0,0,4"))
+    assert float(mean_shift(t, 1)[0]) == pytest.approx(3 * 39 * 0.02, rel=0.02)
+    assert float(mean_shift(t, 2)[2]) == pytest.approx(4 * 0.78 - 0.78**2 / 2, rel=0.02)
+
+
+def test_what_flies_too_far_for_a_grid_is_named(balls, monkeypatch, caplog):
+    monkeypatch.setattr(moving_grid, "MAX_NODES", 400_000)
+    t = roll(balls, steps=25, gravity=0.0, velocity=("object=2 8,0,0",))
+    assert "(thing) moves too far from the other objects" in caplog.text
+    assert float(mean_shift(t, 2)[0]) < 8 * 24 * 0.02
 
 
 @pytest.mark.parametrize("options, message", [

@@ -190,7 +190,7 @@ def _page(scene: LiveScene, binding, setup: SceneSetup, out: Path) -> str:
 
 def _session(scene: LiveScene, setup: SceneSetup) -> Session:
     unit, room = scene.world.metres_per_unit, {}
-    if scene.options.engine == "mpm" or scene.options.box:  # a grid ends somewhere
+    if scene.options.box:
         margin = 0.15 * (setup.bodies.x.amax(0) - setup.bodies.x.amin(0)).max().item()
         room = {"low": tuple(a + margin for a in setup.box.low), "high": tuple(b - margin for b in setup.box.high)}
     ids = [o.id for o in scene.world.objects]

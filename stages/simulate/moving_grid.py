@@ -1,0 +1,82 @@
+"""An MPM grid that follows the particles: there is a floor, but no walls and no ceiling.
+
+Before a frame in which a particle could come near a face of the grid, the solver is built again on a grid around the
+particles, with its nodes on the same lattice, so that nothing else changes.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from stages.core.kernels.mpm.grid import BLOCK
+from stages.core.physics.mpm import solver as mpm
+from stages.core.physics.mpm.domain import MAX_NODES
+from stages.core.scene.scene import SceneObject
+
+log = logging.getLogger(__name__)
+MARGIN = 6  # nodes between the particles and the faces of the grid: stencils, and the elastic rebound of what was hit
+FRAMES = 10  # frames for which a new grid has room at the present speed
+
+
+class MovingGrid:
+    """Particles on a grid that follows them; `box` is the first domain [m], and the only one if it is `fixed`."""
+
+    def __init__(self, particles: mpm.Particles, box: mpm.Box, dx: float, device: str, body: Int[Tensor, "p"],
+                 objects: Sequence[SceneObject], fixed: bool):  # fmt: skip
+        self.box, self._body, self._objects, self._fixed = box, body, objects, fixed
+        self._build = lambda p, b: mpm.Solver(p, b, dx, device, exact=device != "cpu")
+        self.solver = self._build(particles, box)
+
+    def advance(self, duration: float, acceleration: Float[Tensor, "p 3"]) -> None:
+        """As mpm.Solver.advance."""
+        self._make_room(duration, acceleration)
+        self.solver.advance(duration, acceleration)
+
+    def _make_room(self, duration: float, acceleration: Float[Tensor, "p 3"]) -> None:
+        """Move the grid if a particle could come near one of its faces, except the floor, within a frame."""
+        rows, dx = self.solver.rows, self.solver.dx
+        x, speed = rows["x"], float(rows["v"].norm(dim=1).max()) + duration * float(acceleration.norm(dim=1).max())
+        if not math.isfinite(speed) or self._fixed:
+            return
+        low, high = x.amin(0).tolist(), x.amax(0).tolist()
+        reach = duration * speed + MARGIN * dx
+        near = any(a - reach < b for a, b in zip(low[:2], self.box.low[:2], strict=True))
+        if not near and all(a + reach <= b for a, b in zip(high, self.box.high, strict=True)):
+            return
+        room = reach + FRAMES * duration * speed
+        while self._nodes(box := self._around(low, high, room)) > MAX_NODES / 2 and room > reach:
+            room *= 0.8
+        if self._nodes(box) > MAX_NODES / 2:
+            self._fixed = True
+            log.warning("%s moves too far from the other objects for one grid, and is stopped at %s; use a coarser "
+                        "--quality, or simulate it alone", self._farthest(), self._ends())  # fmt: skip
+            return
+        self.box = box
+        self.solver = self._build(self.solver.particles, box)
+
+    def _around(self, low: Sequence[float], high: Sequence[float], room: float) -> mpm.Box:
+        """A box that leaves `room` [m] around the particles, its lower corner on the lattice of the present one."""
+        step = BLOCK * self.solver.dx
+        corner = [b + step * math.floor((a - room - b) / step) for a, b in zip(low[:2], self.box.low[:2], strict=True)]
+        return replace(self.box, low=(*corner, self.box.low[2]), high=tuple(a + room for a in high))
+
+    def _nodes(self, box: mpm.Box) -> float:
+        return math.prod((b - a) / self.solver.dx + 16 for a, b in zip(box.low, box.high, strict=True))
+
+    def _farthest(self) -> str:
+        """The object whose middle is farthest from the median of all."""
+        x = self.solver.particles.x.cpu()
+        middles = torch.stack([x[self._body == row].mean(0) for row in range(len(self._objects))])
+        o = self._objects[int((middles - middles.median(0).values).norm(dim=1).argmax())]
+        return f"object {o.id} ({o.name})"
+
+    def _ends(self) -> str:
+        sides = zip("xyz", self.box.low, self.box.high, strict=True)
+        return ", ".join(f"{name} = {low:.3g} and {high:.3g} m" for name, low, high in sides)

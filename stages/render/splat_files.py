@@ -41,7 +41,7 @@ MAX_SPZ_POSITION = 2**23 / 2**FRACTION_BITS  # [scene units]
 
 def write_spz(out: Path, renderer: Renderer) -> dict:
     """Write one frame as SPZ. Raises InputError for a motion, and for scenes that its 24-bit positions cannot hold."""
-    clip = _only_clip(out, renderer)
+    clip = only_clip(out, renderer)
     if clip.animation.is_moving:
         raise InputError(f"{out}: SPZ holds one frame; choose it with --frame, or write a .glb or .html")
     g = _y_up(clip.gaussians(0.0).to("cpu"))
@@ -87,7 +87,7 @@ def write_glb(out: Path, renderer: Renderer) -> dict:
     Objects that deform have a node for each frame, of which one is shown at a time. Raises InputError for trajectories
     that store every Gaussian.
     """
-    clip = _only_clip(out, renderer)
+    clip = only_clip(out, renderer)
     animation, trajectory = clip.animation, clip.animation.trajectory
     if animation.is_moving and trajectory.dense:
         raise InputError(f"{trajectory.path}: stores every Gaussian of every frame; write one frame with --frame")
@@ -102,7 +102,7 @@ def write_glb(out: Path, renderer: Renderer) -> dict:
         mine = g[g.object_id == o.id]
         if not len(mine):
             continue
-        pose = _rigid_motion(trajectory, o)
+        pose = rigid_motion(trajectory, o)
         if pose is None:
             baked.append(o.name)
             _add_frames(glb, clip, scene, o)
@@ -117,7 +117,8 @@ def write_glb(out: Path, renderer: Renderer) -> dict:
     return {"gaussians": len(g), "rigid": len(moving) - len(baked), "baked": len(baked), "bytes": size}
 
 
-def _only_clip(out: Path, renderer: Renderer) -> Clip:
+def only_clip(out: Path, renderer: Renderer) -> Clip:
+    """The clip of a file that holds one scene; InputError for options that such a file cannot follow."""
     options = renderer.options
     if len(renderer.clips) > 1 or options.view == "all" or options.depth:
         raise InputError(f"{out}: holds one scene; omit --side-by-side, --view all and --depth")
@@ -128,7 +129,7 @@ def _y_up(g: Gaussians) -> Gaussians:
     return transformed(g, Similarity(1.0, Y_UP, torch.zeros(3)))
 
 
-def _rigid_motion(t: Trajectory, o: SceneObject) -> tuple[Tensor, Tensor, Tensor] | None:
+def rigid_motion(t: Trajectory, o: SceneObject) -> tuple[Tensor, Tensor, Tensor] | None:
     """Centre at rest (3,), rotations (t, 3, 3) and centres (t, 3) of an object's keypoints; None where it deforms."""
     own = t.keypoints.object_id == o.id
     rest, positions = t.keypoints.rest[own], t.positions[:, own]

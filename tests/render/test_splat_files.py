@@ -31,6 +31,16 @@ def scene(tmp_path):
     return scene
 
 
+def write_motion(path, scene, frames=3):
+    """The motion of the test of the player, also as a file: the red ball is rigid, the green one is not."""
+    motion = motion_of(scene, frames)
+    info = SimulationInfo(motion.dt, (0.0, 0.0, 0.0), "test")
+    with TrajectoryWriter(path, scene, info, motion.keypoints, motion.binding) as out:
+        for frame in zip(motion.positions, motion.com, motion.rotation, strict=True):
+            out.append(*frame)
+    return motion, path
+
+
 def read_glb(path):
     """The JSON of a GLB, and a function from the number of an accessor to its rows."""
     data = path.read_bytes()
@@ -70,11 +80,7 @@ def test_trimesh_reads_the_points_of_a_glb(scene, tmp_path):
 
 
 def test_glb_moves_rigid_objects_and_stores_the_frames_of_the_others(scene, tmp_path, caplog):
-    motion, path = motion_of(scene, frames=4), tmp_path / "traj.h5"
-    info = SimulationInfo(motion.dt, (0.0, 0.0, 0.0), "test")
-    with TrajectoryWriter(path, scene, info, motion.keypoints, motion.binding) as out:
-        for frame in zip(motion.positions, motion.com, motion.rotation, strict=True):
-            out.append(*frame)
+    motion, path = write_motion(tmp_path / "traj.h5", scene, frames=4)
     run(path, tmp_path / "traj.glb", render_options())
     assert "green ball deform" in caplog.text
     document, rows = read_glb(tmp_path / "traj.glb")
@@ -125,11 +131,7 @@ def test_splat_transform_reads_spz(scene, tmp_path):
 
 
 def test_what_a_file_cannot_hold_is_said(scene, tmp_path):
-    motion, path = motion_of(scene), tmp_path / "traj.h5"
-    with TrajectoryWriter(path, scene, SimulationInfo(0.02, (0.0, 0.0, 0.0), "test"), motion.keypoints,
-                          motion.binding) as out:  # fmt: skip
-        for frame in zip(motion.positions, motion.com, motion.rotation, strict=True):
-            out.append(*frame)
+    _, path = write_motion(tmp_path / "traj.h5", scene)
     with pytest.raises(InputError, match="one frame"):
         run(path, tmp_path / "x.spz", render_options())
     run(path, tmp_path / "x.spz", render_options(frame=1))
@@ -137,3 +139,27 @@ def test_what_a_file_cannot_hold_is_said(scene, tmp_path):
     write_scene(tmp_path / "far.ply", replace(scene, gaussians=far))
     with pytest.raises(InputError, match="reaches further"):
         run(tmp_path / "far.ply", tmp_path / "x.spz", render_options())
+
+
+def test_usd_core_reads_the_motion(scene, tmp_path):
+    pytest.importorskip("pxr", reason="usd-core is not installed")
+    from pxr import Usd, UsdGeom
+
+    motion, path = write_motion(tmp_path / "traj.h5", scene)
+    run(path, tmp_path / "traj.usdc", render_options())
+    stage = Usd.Stage.Open(str(tmp_path / "traj.usdc"))
+    assert (stage.GetTimeCodesPerSecond(), stage.GetEndTimeCode()) == (50, 2)
+    assert UsdGeom.GetStageUpAxis(stage) == "Z"
+    moved = deform(scene.gaussians, motion.binding, motion.keypoints, motion.positions[2])
+    for id, name in ((0, "background"), (1, "object_1_red_ball"), (2, "object_2_green_ball")):
+        prim, truth = stage.GetPrimAtPath(f"/scene/{name}"), moved[moved.object_id == id]
+        assert prim.GetTypeName() == "ParticleField3DGaussianSplat"
+        world = np.array(UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(2))  # of row vectors
+        local = np.array(prim.GetAttribute("positions").Get(2))
+        np.testing.assert_allclose(local @ world[:3, :3] + world[3, :3], truth.means.numpy(), rtol=0, atol=1e-4)
+        quats = torch.tensor([[q.real, *q.imaginary] for q in prim.GetAttribute("orientations").Get(2)])
+        turn = torch.from_numpy(world[:3, :3].T.copy()).float()
+        found = turn @ matrix(quats) * torch.tensor(np.array(prim.GetAttribute("scales").Get(2)))[:, None]
+        expected = matrix(truth.quats) * truth.scales[:, None]
+        torch.testing.assert_close(found @ found.mT, expected @ expected.mT, rtol=0, atol=1e-4)
+        assert len(prim.GetAttribute("radiance:sphericalHarmonicsCoefficients").Get(2)) == 16 * len(truth)

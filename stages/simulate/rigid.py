@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,11 +26,12 @@ from torch import Tensor
 from stages.core.errors import InputError, MissingPackage
 from stages.core.geometry.rotations import matrix
 from stages.core.physics.convex_parts import ConvexParts, convex_parts
-from stages.core.physics.forces import ForcePrompts
-from stages.core.physics.materials import MODELS, Material
+from stages.core.physics.forces import Force, ForcePrompts
+from stages.core.physics.materials import MODELS, Material, MaterialChoice, choose_materials
 from stages.core.physics.state import FrameState
 from stages.core.scene.scene import Scene
 from stages.core.scene.trajectory import Keypoints
+from stages.simulate.changes import changed_options, changed_pins
 from stages.simulate.options import SimulateOptions
 from stages.simulate.setup import SceneSetup, set_up_scene
 
@@ -87,17 +88,18 @@ def rollout(
     floor_offset += world.separate()
     log.info("%d bodies of %d convex parts, substep %.3g s (%d per frame)", len(bodies),
              sum(len(b.parts.hulls) for b in bodies), options.dt / world.substeps, world.substeps)  # fmt: skip
-    return _states(scene, keypoints, setup, bodies, floor_offset, world, options)
+    return _states(scene, keypoints, setup, bodies, floor_offset, world, prompts, options)
 
 
 def _states(
     scene: Scene, keypoints: Keypoints, setup: SceneSetup, bodies: list[Body], floor_offset: Float[Tensor, "o 3"],
-    world: _World, options: SimulateOptions,
+    world: _World, prompts: ForcePrompts, options: SimulateOptions,
 ) -> Iterator[FrameState]:  # fmt: skip
     """Keypoints moved with their bodies; displacements onto the floor and apart are not part of the output."""
     row = torch.tensor([[o.id for o in scene.objects].index(int(i)) for i in keypoints.object_id], dtype=torch.int64)
     com = torch.stack([b.parts.com for b in bodies])
     arm = (keypoints.rest - com[row])[..., None]
+    current, held, acting = options, prompts.pinned, prompts.forces
     for frame in range(options.steps):
         centre, quat = world.pose()
         if not bool(centre.isfinite().all() and quat.isfinite().all()):
@@ -105,10 +107,17 @@ def _states(
                              "or --force")  # fmt: skip
         centre = centre / scene.metres_per_unit - floor_offset
         if frame == 0:  # without rounding
-            yield FrameState(keypoints.rest + setup.lift[row], com + setup.lift, quat)
+            yield FrameState(keypoints.rest + setup.lift[row], com + setup.lift, quat, world.mass)
         else:
-            yield FrameState(centre[row] + (matrix(quat)[row] @ arm)[..., 0], centre, quat)
+            yield FrameState(centre[row] + (matrix(quat)[row] @ arm)[..., 0], centre, quat, world.mass)
         if frame < options.steps - 1:
+            active, changes = prompts.during(frame * options.dt, (frame + 1) * options.dt)
+            if active is not acting:
+                world.set_forces(active, held)
+                acting = active
+            if changes:
+                current, held = changed_options(current, changes), changed_pins(held, changes)
+                world.change(choose_materials(scene.objects, current.material, current.materials), held, current)
             world.advance(frame * options.dt)
 
 
@@ -150,6 +159,9 @@ class _World:
         import mujoco  # noqa: PLC0415 -- an optional package
 
         self._mujoco, self._bodies, self._dt = mujoco, bodies, options.dt
+        self._scene, self._ids = scene, [o.id for o in scene.objects]
+        self._held: dict[int, np.ndarray] = {}  # free bodies that are held during the simulation -> their pose
+        self.mass = torch.tensor([b.mass for b in bodies])  # [kg]
         self._omega = math.pi * SUBSTEPS / CONTACT_SUBSTEPS
         unit = scene.metres_per_unit
         velocity = [unit * torch.tensor(prompts.velocity.get(o.id, (0.0, 0.0, 0.0))) for o in scene.objects]
@@ -158,7 +170,9 @@ class _World:
         fall = max(float(b.start[2]) - floor for b in bodies)
         speed = max(float(v.norm()) for v in velocity) + math.sqrt(2 * abs(options.gravity) * max(fall, size))
         mass_of = {o.id: b.mass for o, b in zip(scene.objects, bodies, strict=True)}
-        pushes = ((math.hypot(*f.force) + math.hypot(*f.torque) / size) / mass_of[f.object_id] for f in prompts.forces)
+        # forces that last less than a frame are impulses, of which live sessions know nothing at the start
+        pushes = ((math.hypot(*f.force) + math.hypot(*f.torque) / size) / mass_of[f.object_id] for f in prompts.forces
+                  if f.end - f.start > options.dt)  # fmt: skip
         acceleration = max(abs(options.gravity), *pushes, 1e-9)
         substep = min(math.sqrt(size / acceleration) / SUBSTEPS, MAX_TRAVEL * size / max(speed, 1e-9))
         self.substeps = max(1, math.ceil(min(options.dt / substep, MAX_SUBSTEPS)))
@@ -171,14 +185,37 @@ class _World:
         self._free = [i for i, b in enumerate(bodies) if not b.pinned]
         for k, i in enumerate(self._free):
             self.data.qvel[FALLING * k : FALLING * k + 3] = velocity[i].numpy() * self.units.time / size
-        ids = [o.id for o in scene.objects]
-        self._forces = [(f, ids.index(f.object_id), None if f.at is None else self._arm(f.at, scene, setup, ids, f))
-                        for f in prompts.forces if f.object_id not in prompts.pinned]  # fmt: skip
+        self.set_forces(prompts.forces, prompts.pinned)
 
-    def _arm(self, at, scene: Scene, setup: SceneSetup, ids: list[int], force) -> np.ndarray:
+    def set_forces(self, forces: Sequence[Force], pinned: Collection[int]) -> None:
+        """The forces from now on; those on pinned objects have no effect."""
+        rows = ((f, self._ids.index(f.object_id)) for f in forces if f.object_id not in pinned)
+        self._forces = [(f, row, None if f.at is None else self._arm(f.at, row)) for f, row in rows]
+        self.data.xfrc_applied[:] = 0
+
+    def _arm(self, at, row: int) -> np.ndarray:
         """From the centre of mass to the point of application, in the body's frame."""
-        com = self._bodies[ids.index(force.object_id)].parts.com
-        return ((torch.tensor(at) - com) * scene.metres_per_unit / self.units.length).double().numpy()
+        com = self._bodies[row].parts.com
+        return ((torch.tensor(at) - com) * self._scene.metres_per_unit / self.units.length).double().numpy()
+
+    def change(self, materials: dict[int, MaterialChoice], pinned: Collection[int], options: SimulateOptions) -> None:
+        """Other materials, pins, friction and gravity from now on; objects pinned at the start stay so."""
+        model = self.model
+        model.opt.gravity[2] = -options.gravity * self.units.time**2 / self.units.length
+        softest = min(materials[id].material.E for id in self._ids)
+        for row, id in enumerate(self._ids):
+            m, b = materials[id].material, self._bodies[row]
+            factor = m.density / b.material.density * b.mass / self.units.mass / model.body_mass[row + 1]
+            model.body_mass[row + 1] *= factor
+            model.body_inertia[row + 1] *= factor
+            self.mass[row] = b.mass * m.density / b.material.density
+            for geom in np.nonzero(model.geom_bodyid == row + 1)[0]:
+                model.geom_friction[geom, 0] = m.friction if options.friction is None else options.friction
+                model.geom_solref[geom, 1] = -m.loss * self._omega
+                model.geom_solmix[geom] = softest / m.E
+        self._mujoco.mj_setConst(model, self._mujoco.MjData(model))
+        free = {self._ids[i]: k for k, i in enumerate(self._free)}
+        self._held = {k: self.data.qpos[FREE * k : FREE * (k + 1)].copy() for id, k in free.items() if id in pinned}
 
     def pose(self) -> tuple[Float[Tensor, "o 3"], Float[Tensor, "o 4"]]:
         """Centres of mass [m] and rotations relative to the start (w x y z)."""
@@ -240,6 +277,9 @@ class _World:
         mujoco.mj_fwdAcceleration(model, data)
         mujoco.mj_fwdConstraint(model, data)
         mujoco.mj_Euler(model, data)
+        for k, pose in self._held.items():
+            data.qpos[FREE * k : FREE * (k + 1)] = pose
+            data.qvel[FALLING * k : FALLING * (k + 1)] = 0
 
     def _apply_forces(self, time: float, step: float) -> None:
         """Set the mean force and torque on each body during a substep."""

@@ -101,7 +101,7 @@ def a_busy_user(n, state):
     }.get(n, [])
 
 
-@pytest.mark.parametrize("engine", ["ngff", "mpm"])
+@pytest.mark.parametrize("engine", ["ngff", "mpm", "rigid"])
 def test_a_record_repeats_the_motion_exactly(engine, monkeypatch):
     live, again, keypoints, session = prompts_of_a_session(engine, monkeypatch, a_busy_user)
     assert torch.equal(live, again)

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from stages.core.errors import InputError
 from stages.core.physics.forces import Change, Force, ForcePrompts
 from stages.core.physics.state import FrameState
 from stages.core.scene.trajectory import Keypoints
@@ -74,7 +75,9 @@ class Session:
         return LivePrompts((*self.given.forces, *room), **given, session=self)
 
     def observe(self, state: FrameState) -> None:
-        """The present frame."""
+        """The present frame. Raises InputError for engines that do not tell the masses of the objects."""
+        if state.mass is None:
+            raise InputError("--live: this engine does not tell the masses of the objects (FrameState.mass)")
         self._before = None if self.state is None else self.state
         self.state = state
 

@@ -188,3 +188,22 @@ def test_double_click_turns_around_the_point_under_the_cursor(film, open_page):
     until(page, "player.camera.transition === null")
     _, pivot = eye_and_pivot(page)
     assert float((pivot - green).norm()) < 0.15  # on the ball of radius 0.12, in front of its centre
+
+
+def test_arrows_of_forces_start_at_the_object_while_they_act(tmp_path, open_page):
+    scene = two_balls_scene()
+    push = {"kind": "force", "object_id": 2, "force": (0.0, 0.0, 8.0), "start": 0.0, "end": 0.03, "at": None}
+    motion = replace(motion_of(scene), forces=(push,))
+    path = tmp_path / "film.html"
+    path.write_text(film_page(pack_film(scene, motion, {"arrows": True}), "arrows"))
+    page = open_page(path)
+    page.evaluate("player.play(false); player.seek(0)")
+    page.select_option("#view", label="00.png")
+    drawn = "document.querySelector('#overlay path').getAttribute('d')"
+    until(page, f"{drawn}.length > 0")
+    x, y = (float(v) for v in page.evaluate(drawn).split(" ")[0].removeprefix("M").split(","))
+    until(page, "!player.changed && !player.busy")
+    centre = page.evaluate(PIXEL_OF, motion.com[0, 1].tolist())
+    assert math.dist(centre, (x, y)) < 1
+    page.evaluate(f"player.seek({2 * motion.dt})")
+    until(page, f"{drawn} === ''")

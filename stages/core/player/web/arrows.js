@@ -42,21 +42,13 @@ function radius(film, own) {
   return length([side(0), side(1), side(2)]) / 2;
 }
 
-export function drawArrows(context, view, arrows) {
-  for (const [start, end] of arrows) {
+// The arrows in a view as data of an SVG path; those behind the camera are left out.
+export function arrowPath(view, arrows) {
+  return arrows.map(([start, end]) => {
     const a = Camera.pixel(view, start), b = Camera.pixel(view, end);
-    if (!a || !b) continue;
+    if (!a || !b) return "";
     const angle = Math.atan2(b[1] - a[1], b[0] - a[0]), head = Math.min(14, 0.4 * Math.hypot(b[0] - a[0], b[1] - a[1]));
-    for (const [colour, width] of [["#281400", 6], ["#ff7a14", 3.5]]) {
-      context.beginPath();
-      context.moveTo(...a);
-      context.lineTo(...b);
-      for (const side of [-0.5, 0.5]) {
-        context.moveTo(...b);
-        context.lineTo(b[0] - head * Math.cos(angle + side), b[1] - head * Math.sin(angle + side));
-      }
-      Object.assign(context, { strokeStyle: colour, lineWidth: width, lineCap: "round" });
-      context.stroke();
-    }
-  }
+    const [left, right] = [-0.5, 0.5].map((side) => [b[0] - head * Math.cos(angle + side), b[1] - head * Math.sin(angle + side)]);
+    return `M${a} L${b} M${left} L${b} L${right}`;
+  }).join(" ");
 }

@@ -4,6 +4,7 @@ import { Camera } from "player/camera.js";
 
 const LIFT = 0.15; // of a press of U [distances of the camera]
 const RETRY = 1000; // [ms]
+const SHOW_TIME = 150; // between changes of the text [ms]
 
 export function startLive(player) { return new Live(player); }
 
@@ -42,10 +43,12 @@ class Live {
 
   take(data) {
     const length = new DataView(data).getUint32(0, true);
+    const { player } = this, before = player.positions, positions = new Float32Array(data, 4 + length);
     this.state = JSON.parse(new TextDecoder().decode(new Uint8Array(data, 4, length)));
-    this.player.positions = new Float32Array(data, 4 + length);
-    this.player.arrows = this.state.arrows;
-    this.player.wake();
+    const { arrows } = this.state, arrowsBefore = player.arrows ?? [];
+    player.arrows = arrows;
+    if (positions.some((x, i) => x !== before[i])) player.positions = positions;
+    if (player.positions !== before || arrows.length || arrowsBefore.length) player.wake();
     this.unanswered = true;
     this.show();
   }
@@ -56,6 +59,8 @@ class Live {
   }
 
   show() {
+    if (performance.now() - (this.shown ?? -Infinity) < SHOW_TIME) return;
+    this.shown = performance.now();
     const { time, rate, paused, speed, note, gravity } = this.state, { dt } = this.player.film.live;
     const real = rate * dt, slow = !paused && rate > 0 && real < 0.9 * speed;
     this.rate.textContent = `${time.toFixed(2)} s` + (paused ? ", paused" : `, ${rate.toFixed(0)} steps/s, ${real.toFixed(2)}× real time`)

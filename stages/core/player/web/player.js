@@ -1,6 +1,6 @@
 // The player: the state of a film, its clock and its pictures. `window.player` is the page's.
 
-import { drawArrows, filmArrows } from "player/arrows.js";
+import { arrowPath, filmArrows } from "player/arrows.js";
 import { Camera, controlCamera } from "player/camera.js";
 import { unpack } from "player/container.js";
 import { buildInterface } from "player/interface.js";
@@ -87,10 +87,8 @@ export class Player {
 
   resize() {
     const ratio = Math.min(devicePixelRatio || 1, 2);
-    for (const canvas of [this.picture, this.overlay]) {
-      canvas.width = Math.max(1, Math.round(ratio * this.overlay.clientWidth));
-      canvas.height = Math.max(1, Math.round(ratio * this.overlay.clientHeight));
-    }
+    this.picture.width = Math.max(1, Math.round(ratio * this.overlay.clientWidth));
+    this.picture.height = Math.max(1, Math.round(ratio * this.overlay.clientHeight));
     this.wake();
   }
 
@@ -112,7 +110,7 @@ export class Player {
     await this.pose(this.view(1));
     this.shownQuality = sharpen ? 0 : this.quality;
     this.renderer.draw(this.view(QUALITIES[this.shownQuality]));
-    this.drawOverlay();
+    this.drawArrows();
     const gl = this.renderer.gl;
     this.drawing = { sync: gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0), since: performance.now() };
     gl.flush();
@@ -137,14 +135,10 @@ export class Player {
     return this.camera.view(Math.max(1, Math.round(quality * this.picture.width)), Math.max(1, Math.round(quality * this.picture.height)));
   }
 
-  drawOverlay() {
-    const context = this.overlay.getContext("2d");
-    this.overlay.width = this.overlay.width; // clears; clearRect leaves the arrows in Chromium 150 without a GPU
-    if (!this.arrowsShown) return;
-    const ratio = this.overlay.width / Math.max(1, this.overlay.clientWidth);
-    context.setTransform(ratio, 0, 0, ratio, 0, 0);
-    const view = this.camera.view(this.overlay.clientWidth, this.overlay.clientHeight);
-    drawArrows(context, view, this.arrows ?? (this.film.frames ? filmArrows(this.film, this.frame) : []));
+  drawArrows() {
+    const shown = !this.arrowsShown ? [] : this.arrows ?? (this.film.frames ? filmArrows(this.film, this.frame) : []);
+    const path = arrowPath(this.camera.view(this.overlay.clientWidth, this.overlay.clientHeight), shown);
+    for (const element of this.overlay.querySelectorAll("path")) element.setAttribute("d", path);
   }
 
   // --- time ---

@@ -341,3 +341,7 @@ def evaluate(
 def main() -> None:
     """Entry point of the script `ngff`."""
     app()
+
+
+if __name__ == "__main__":
+    main()

@@ -366,3 +366,7 @@ app.add_typer(bench.app, name="bench")
 def main() -> None:
     """Entry point of the script `ngff-lab`."""
     app()
+
+
+if __name__ == "__main__":
+    main()

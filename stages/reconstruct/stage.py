@@ -8,7 +8,7 @@ from pathlib import Path
 
 from stages.core.backends import choose, pick_device
 from stages.core.errors import InputError
-from stages.core.scene.files import ngff_version, provenance
+from stages.core.scene.files import ngff_version, provenance, sha256
 from stages.core.scene.scene_ply import write_scene
 from stages.reconstruct.options import BACKENDS, SINGLE_PHOTO_BACKENDS, ReconstructOptions
 from stages.reconstruct.photo_reader import read_photos
@@ -73,7 +73,18 @@ def run(imgs: Path, out: Path, options: ReconstructOptions = ReconstructOptions(
 
 def _cache_key(photos: Photos, options: ReconstructOptions) -> str:
     """Fingerprint of everything that the results of the steps depend on."""
-    return fingerprint(ngff_version(), replace(options, resume=False), photos.names, photos.focals, *photos.images)
+    cameras = [(p.name, sha256(p)) for p in _camera_files(options.cameras)]
+    return fingerprint(
+        ngff_version(), replace(options, resume=False), photos.names, photos.focals, cameras, *photos.images
+    )
+
+
+def _camera_files(cameras: Path | None) -> list[Path]:
+    """The file given with --cameras, or the files of the folder."""
+    if cameras is None:
+        return []
+    files = Path(cameras).iterdir() if Path(cameras).is_dir() else [Path(cameras)]
+    return sorted(file for file in files if file.is_file())
 
 
 def _report(photos: Photos, made: Reconstruction, steps: StepCache, device: str) -> Report:

@@ -36,7 +36,7 @@ class StepCache:
         note = self.folder / "key"
         if not (resume and note.exists() and note.read_text() == key):
             if resume:
-                log.info("nothing to resume: there is no interrupted run with these photos and options")
+                log.info("nothing to resume: there is no interrupted run with these photos, cameras and options")
             self.remove()
         self.folder.mkdir(exist_ok=True)
         note.write_text(key)
@@ -67,8 +67,8 @@ class StepCache:
             return torch.load(path, weights_only=True)
         with self.timed(name):
             made = make()
-        with replacing(path) as part:
-            torch.save(made, part)
+        with replacing(path) as part, part.open("wb") as file:  # a full disk is an OSError only with a file object
+            torch.save(made, file)
         return made
 
     def cached_file(self, name: str, write: Callable[[Path], None]) -> Path:

@@ -2,13 +2,17 @@
 
 import pickle
 import resource
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
 
 from stages.core.errors import InputError
 from stages.reconstruct.depth import DepthMap
+from stages.reconstruct.options import ReconstructOptions
+from stages.reconstruct.stage import _cache_key
 from stages.reconstruct.step_cache import StepCache, fingerprint, peak_memory
 
 
@@ -76,3 +80,22 @@ def test_peak_memory_grows_with_an_allocation():
     assert before + 0.2 < peak_memory() < before + 0.4
     del block
     assert peak_memory() > before + 0.2
+
+
+def test_key_of_a_reconstruction_follows_the_photos_and_the_cameras_file(tmp_path):
+    """A resumed run must not use the results of other photos, or of cameras that were corrected in place."""
+    options = ReconstructOptions(cameras=tmp_path / "transforms.json")
+    options.cameras.write_text("{}")
+    photos = SimpleNamespace(names=("a.png",), focals=[1.0], images=[torch.zeros(2, 2, 3)])
+    key = _cache_key(photos, options)
+    assert _cache_key(photos, replace(options, resume=True)) == key
+    assert _cache_key(SimpleNamespace(**{**vars(photos), "images": [torch.ones(2, 2, 3)]}), options) != key
+    options.cameras.write_text('{"frames": []}')
+    assert _cache_key(photos, options) != key
+    folder = tmp_path / "model"
+    folder.mkdir()
+    (folder / "cameras.txt").write_text("1")
+    of_folder = replace(options, cameras=folder)
+    key = _cache_key(photos, of_folder)
+    (folder / "cameras.txt").write_text("2")
+    assert _cache_key(photos, of_folder) != key

@@ -1,7 +1,10 @@
 """Atomic writing, checks before reading, and provenance."""
 
 import hashlib
+import itertools
 import os
+import platform
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, is_dataclass
@@ -10,11 +13,17 @@ from pathlib import Path
 
 from stages.core.errors import InputError
 
+_HOST = hashlib.sha256(platform.node().encode()).hexdigest()[:6]
+_count = itertools.count()
+_swept: set[Path] = set()  # folders in which this process has looked for files of killed processes
+
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """A temporary path next to `path`, with the same suffix, that replaces it on success and is deleted on failure.
 
+    Its name .part-HOST-PID-COUNT-NAME is unique: of several processes that write the same file, the last one wins.
+    The first call for a folder deletes what killed processes of this machine left there.
     Raises InputError where `path` is a folder, its folder is missing, or the file cannot be written.
     """
     path = Path(path)
@@ -22,7 +31,8 @@ def replacing(path: Path) -> Iterator[Path]:
         raise InputError(f"{path}: is a folder; name the file to write")
     if not path.parent.is_dir():
         raise InputError(f"{path}: there is no folder {path.parent}; create it first")
-    part = path.with_name(f".part-{path.name}")
+    _sweep(path.parent)
+    part = path.with_name(f".part-{_HOST}-{os.getpid()}-{next(_count)}-{path.name}")
     try:
         yield part
         os.replace(part, path)
@@ -30,6 +40,27 @@ def replacing(path: Path) -> Iterator[Path]:
         raise InputError(f"{path}: cannot be written ({error.strerror or error})") from error
     finally:
         part.unlink(missing_ok=True)
+
+
+def _sweep(folder: Path) -> None:
+    """Delete the temporary files of processes of this machine that have ended."""
+    if folder in _swept or os.name != "posix":
+        return
+    _swept.add(folder)
+    for stale in folder.glob(f".part-{_HOST}-*"):
+        pid = stale.name.split("-")[2]
+        if pid.isdecimal() and not _is_running(int(pid)):
+            shutil.rmtree(stale, ignore_errors=True) if stale.is_dir() else stale.unlink(missing_ok=True)
+
+
+def _is_running(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except PermissionError:  # of another user
+        return True
+    return True
 
 
 def must_exist(path: Path, what: str) -> Path:

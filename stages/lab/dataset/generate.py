@@ -154,6 +154,6 @@ def _files(path: Path) -> Iterator[Path]:
 def _remove_partial(paths: list[Path]) -> None:
     """Remove the `.part-*` files and folders of a killed run, inside folders or next to files."""
     for path in paths:
-        partial = path.parent.glob(f".part-{path.name}") if path.suffix else path.rglob(".part-*")
+        partial = path.parent.glob(f".part-*-{path.name}") if path.suffix else path.rglob(".part-*")
         for p in sorted(partial, key=lambda p: len(p.parts), reverse=True):
             shutil.rmtree(p) if p.is_dir() else p.unlink()

@@ -103,8 +103,9 @@ def verify_files(root: Path) -> int:
         elif sha256(root / name) != digest:
             problems.append(f"{name} has changed")
     unlisted = {str(p.relative_to(root).as_posix()) for p in root.rglob("*") if p.is_file()} - set(listed)
-    ignored = (*UNLISTED_FILES, *(f".part-{n}" for n in UNLISTED_FILES))  # another run may be writing them
-    problems += [f"{n} is not listed" for n in sorted(unlisted) if n not in ignored and not n.startswith("sums/")]
+    unlisted -= {n for n in unlisted if n in UNLISTED_FILES or n.startswith("sums/")}
+    being_written = {n for n in unlisted if n.startswith(".part-") and n.endswith(tuple(UNLISTED_FILES))}
+    problems += [f"{n} is not listed" for n in sorted(unlisted - being_written)]
     if problems:
         more = f", and {len(problems) - MAX_REPORTED} more" if len(problems) > MAX_REPORTED else ""
         raise InputError(f"{root}: {', '.join(problems[:MAX_REPORTED])}{more}; remove the wrong files and run the same "

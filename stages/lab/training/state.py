@@ -132,8 +132,8 @@ class TrainingState:
             "rate_factor": self.rate_factor, "warmup_start": self.warmup_start, "horizon": self.horizon,
             "cuda": torch.cuda.get_rng_state() if self.gradient_norm.is_cuda else None,
         }  # fmt: skip
-        with replacing(path) as part:
-            torch.save(state, part)
+        with replacing(path) as part, part.open("wb") as file:  # a full disk is an OSError only with a file object
+            torch.save(state, file)
 
     def load(self, path: Path, key: dict) -> None:
         """Resume from a checkpoint. Raises InputError for one that is damaged or of another training."""

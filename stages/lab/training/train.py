@@ -122,13 +122,14 @@ def run(
     if training.points.shape[1] <= max(options.frames):
         raise InputError(f"--horizons: the motions have {training.points.shape[1]} frames; take shorter ones")
     with process_group(pick_device(options.device), options.batch) as processes:
-        state, earlier = _initial_state(model, out, options, processes.device, resume, start)
+        sums = describe_groups(data, groups)
+        state, earlier = _initial_state(model, out, options, processes.device, resume, start, sums)
         if processes.is_main:
             log.info("%s, %s parameters: %d training scenes, %d validation scenes", model,
                      f"{sum(p.numel() for p in state.params):,}", len(training), len(validation))  # fmt: skip
         parts = _with_sparse(training, options.sparse_keypoints)
         samplers = [ClipSampler(part, processes.device, state.model) for part in parts]
-        key = _key(model, options, earlier)
+        key = _key(model, options, earlier, sums)
         job = TrainingRun(state, samplers, validation.to(processes.device), options, processes, out, key)
         finished = job.run()
         if not processes.is_main:
@@ -138,7 +139,7 @@ def run(
             "command": shlex.join(["ngff-lab", *sys.argv[1:]]), "seed": options.seed, "groups": options.groups,
             "processes": processes.size, "scenes": len(training), "validation scenes": len(validation),
             "steps": state.step, "minutes": state.elapsed / 60, "finished": finished,
-            "validation": {k: best[k] for k in SCORES}, "data": describe_groups(data, groups),
+            "validation": {k: best[k] for k in SCORES}, "data": sums,
         }  # fmt: skip
         save(out, model, state.best_model(), {
             "ngff": ngff_version(), "torch": torch.__version__,
@@ -156,7 +157,8 @@ def _with_sparse(motions: KeypointMotions, count: int) -> list[KeypointMotions]:
 
 
 def _initial_state(
-    model: str, out: Path, options: TrainOptions, device: str, resume: bool, start: Path | None
+    model: str, out: Path, options: TrainOptions, device: str, resume: bool, start: Path | None,
+    sums: dict[str, str],
 ) -> tuple[TrainingState, list[dict]]:
     """A model that is new, from other weights, or from its checkpoint; and the earlier runs of its weights."""
     torch.manual_seed(options.seed)
@@ -173,15 +175,15 @@ def _initial_state(
         earlier = runs_of(card)
     state = TrainingState(network, options.lr, options.seed, options.optimizer)
     if resume:
-        state.load(out.with_suffix(".ckpt"), _key(model, options, earlier))
+        state.load(out.with_suffix(".ckpt"), _key(model, options, earlier, sums))
         log.info("going on from step %d, %.1f min", state.step, state.elapsed / 60)
     return state, earlier
 
 
-def _key(model: str, options: TrainOptions, earlier: list[dict]) -> dict:
-    """Settings that must be equal for training to resume from a checkpoint."""
+def _key(model: str, options: TrainOptions, earlier: list[dict], sums: dict[str, str]) -> dict:
+    """Settings and checksums of the data that must be equal for training to resume from a checkpoint."""
     start = earlier[-1]["sha256"] if earlier else None
-    return {"model": model, "from": start, **{k: v for k, v in asdict(options).items() if k != "device"}}
+    return {"model": model, "from": start, "data": sums, **{k: v for k, v in asdict(options).items() if k != "device"}}
 
 
 @dataclass

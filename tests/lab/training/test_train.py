@@ -2,6 +2,7 @@
 
 import math
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -9,6 +10,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import h5py
 import pytest
 import torch
 from torch.testing import assert_close
@@ -431,6 +433,11 @@ def test_other_checkpoints_are_rejected(data, tmp_path):
     run("gcn", data, out, replace(QUICK, steps=2))
     with pytest.raises(InputError, match="another steps, lr"):
         run("gcn", data, out, replace(QUICK, lr=0.1), resume=True)
+    other = shutil.copytree(data, tmp_path / "other")
+    with h5py.File(next(other.rglob("3_0.h5")), "a") as file:
+        file.attrs["note"] = "made again"
+    with pytest.raises(InputError, match="another data"):
+        run("gcn", other, out, replace(QUICK, steps=2), resume=True)
     out.with_suffix(".ckpt").write_bytes(b"broken")
     with pytest.raises(InputError, match="checkpoint"):
         run("gcn", data, out, QUICK, resume=True)

@@ -1,0 +1,47 @@
+"""Files that are replaced when complete."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from stages.core.errors import InputError
+from stages.core.scene import files
+from stages.core.scene.files import replacing
+
+
+def test_two_writers_of_one_file_do_not_mix(tmp_path):
+    out = tmp_path / "a.txt"
+    with replacing(out) as first:
+        first.write_text("first")
+        with replacing(out) as second:
+            second.write_text("second")
+        assert out.read_text() == "second"
+    assert out.read_text() == "first"  # the last one to finish
+    assert os.listdir(tmp_path) == ["a.txt"]
+
+
+def test_failure_keeps_the_old_file(tmp_path):
+    (tmp_path / "a.txt").write_text("old")
+    with pytest.raises(KeyboardInterrupt), replacing(tmp_path / "a.txt") as part:
+        part.write_text("half")
+        raise KeyboardInterrupt
+    with pytest.raises(InputError, match="a.txt: cannot be written"), replacing(tmp_path / "a.txt"):
+        raise OSError(28, "No space left on device")
+    assert os.listdir(tmp_path) == ["a.txt"] and (tmp_path / "a.txt").read_text() == "old"
+
+
+def test_next_run_deletes_what_a_killed_one_left_and_nothing_else(tmp_path, monkeypatch):
+    code = "import os, sys, pathlib, stages.core.scene.files as f\n"
+    code += "with f.replacing(pathlib.Path(sys.argv[1])) as part:\n part.write_text('half')\n os.kill(os.getpid(), 9)"
+    subprocess.run([sys.executable, "-c", code, tmp_path / "a.txt"], check=False)
+    (left,) = os.listdir(tmp_path)
+    assert left.startswith(".part-")
+    monkeypatch.setattr(files, "_swept", set())
+    with replacing(tmp_path / "b.txt") as running:
+        running.write_text("b")
+        monkeypatch.setattr(files, "_swept", set())
+        with replacing(tmp_path / "c.txt") as part:
+            part.write_text("c")
+    assert sorted(os.listdir(tmp_path)) == ["b.txt", "c.txt"]

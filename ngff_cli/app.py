@@ -116,7 +116,7 @@ def segment(
     ] = SegmentOptions.undistorted,
     weights: Annotated[
         Path | None, Option(help=f"for {NETWORKS}: file or folder of its weights; default: the folder of its name in "
-                            "$NGFF_WEIGHTS and ~/.cache/ngff")
+                            "$NGFF_WEIGHTS and ~/.cache/ngff; for learned: segmenter.safetensors, by default ours")
     ] = SegmentOptions.weights,
     download: Annotated[
         bool, Option("--download", help=f"for {NETWORKS}: download missing weights, after logging size and licence")

@@ -14,6 +14,9 @@ BACKENDS = {
     "geometric": Backend(
         "stages.segment.geometric:segment", "objects on the supporting plane, by position, colour and shape"
     ),
+    "learned": Backend(
+        "stages.segment.learned:segment", "objects by a network trained on simulated clutter (in development)",
+    ),
     "masks": Backend("stages.segment.masks:segment", "label images of the photos (--masks), voted over all views"),
     "boxes": Backend("stages.segment.boxes:segment", "bounding boxes in the first view (--boxes), cut out by colour"),
     "sam2": Backend(
@@ -33,7 +36,7 @@ class SegmentOptions:
     boxes: Path | None = None  # prompts.json in the public format: boxes (for networks also points) in the first photo
     photos: Path | None = None  # folder of the scene's photos, for networks; by default the scene is rendered
     undistorted: bool = False  # masks, boxes and photos are in pixels of the undistorted views, not of photos as taken
-    weights: Path | None = None  # of a network: model.safetensors, its config.json next to it, or the folder of both
+    weights: Path | None = None  # of `learned`: segmenter.safetensors; of others: model.safetensors and config.json
     download: bool = False  # download missing weights
     names: str = ""  # "1=duck,2=bowl": replaces the automatic names
     max_objects: int = 24
@@ -48,10 +51,10 @@ class SegmentOptions:
             raise InputError("--masks and --boxes: give one of them")
         if self._is_network and self.masks is not None:
             raise InputError(f"--backend {self.backend} makes masks itself; give no --masks, or leave --backend out")
-        if not self._is_network and (self.photos or self.weights or self.download):
-            raise InputError(
-                f"--photos, --weights and --download only work with --backend {NETWORKS}; add it or drop them"
-            )
+        if not self._is_network and (self.photos or self.download):
+            raise InputError(f"--photos and --download only work with --backend {NETWORKS}; add it or drop them")
+        if not self._is_network and self.weights and self.backend != "learned":
+            raise InputError(f"--weights only works with --backend {NETWORKS} or learned; add it or drop --weights")
         if self.undistorted and not (self.masks or self.boxes or self.photos):
             raise InputError("--undistorted: only applies to --masks, --boxes and --photos; add one of them or drop it")
         if self.max_objects < 1:

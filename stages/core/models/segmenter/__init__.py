@@ -1,0 +1,1 @@
+"""Instance segmentation of reconstructed scenes by a sparse 3D network and agglomerative clustering."""

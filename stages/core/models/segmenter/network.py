@@ -1,0 +1,156 @@
+"""A sparse 3D U-Net over voxels: class, offset to the object's centre, and an embedding for pairs of voxels.
+
+The classes are surface (tables, walls, floors, furniture), object, and clutter (floaters, things too small to tell).
+Offsets as in PointGroup (Jiang et al. 2020); convolutions touch occupied voxels only, as in Graham et al. 2018.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from stages.core.models.segmenter.voxels import FEATURES, VOXEL, coarser, neighbour_table
+
+CLASSES = ("surface", "object", "clutter")
+OFFSET_UNIT = 0.1  # of predicted offsets [camera distance]
+PAIR_FEATURES = 24  # of the embedding
+
+
+@dataclass(frozen=True)
+class Level:
+    """Voxels of one resolution."""
+
+    neighbours: Int[Tensor, "v 27"]
+    parent: Int[Tensor, "v"] | None  # voxel of the next coarser level; None at the coarsest
+    parents: int
+
+    @cached_property
+    def children(self) -> Float[Tensor, "w 1"]:
+        """Number of voxels in each parent."""
+        return torch.bincount(self.parent, minlength=self.parents)[:, None].float()
+
+
+def pyramid(cells: Int[Tensor, "v 3"], levels: int) -> list[Level]:
+    """The voxels at all resolutions, finest first."""
+    out = []
+    for depth in range(levels):
+        up, parent = coarser(cells) if depth < levels - 1 else (cells, None)
+        out.append(Level(neighbour_table(cells), parent, len(up)))
+        cells = up
+    return out
+
+
+class _Gathered(torch.autograd.Function):
+    """x[neighbours] @ weight for a symmetric table of neighbours; the gradient gathers too, and needs no scatter.
+
+    Within `torch.autocast` the products are in its precision; the result is in that of x.
+    """
+
+    @staticmethod
+    def forward(ctx, x: Tensor, neighbours: Tensor, weight: Tensor) -> Tensor:
+        device = x.device.type
+        ctx.dtype = torch.get_autocast_dtype(device) if torch.is_autocast_enabled(device) else x.dtype
+        ctx.save_for_backward(x, neighbours, weight)
+        with torch.autocast(device, enabled=False):
+            return (_rows(x.to(ctx.dtype), neighbours) @ weight.flatten(0, 1).to(ctx.dtype)).to(x.dtype)
+
+    @staticmethod
+    def backward(ctx, grad: Tensor) -> tuple[Tensor, None, Tensor]:
+        x, neighbours, weight = ctx.saved_tensors
+        mirrored = weight.flip(0).transpose(1, 2)  # the neighbour at offset k has this voxel at offset -k
+        low = grad.to(ctx.dtype)
+        with torch.autocast(x.device.type, enabled=False):
+            to_x = _rows(low, neighbours) @ mirrored.flatten(0, 1).to(ctx.dtype)
+            to_weight = (_rows(x.to(ctx.dtype), neighbours).mT @ low).reshape(weight.shape)
+        return to_x.to(x.dtype), None, to_weight.to(weight.dtype)
+
+
+def _rows(x: Float[Tensor, "v c"], neighbours: Int[Tensor, "v 27"]) -> Float[Tensor, "v 27*c"]:
+    """The features of all neighbours side by side, zeros where there is none."""
+    return torch.nn.functional.pad(x, (0, 0, 0, 1)).index_select(0, neighbours.flatten()).reshape(len(x), -1)
+
+
+class Convolution(nn.Module):
+    """A 3 x 3 x 3 convolution over occupied voxels."""
+
+    def __init__(self, inward: int, outward: int):
+        super().__init__()
+        self.weight = nn.Parameter(torch.randn(27, inward, outward) * (2 / (10 * inward)) ** 0.5)  # 10 are occupied
+
+    def forward(self, x: Float[Tensor, "v c"], level: Level) -> Float[Tensor, "v d"]:
+        return _Gathered.apply(x, level.neighbours, self.weight)
+
+
+class ResidualBlock(nn.Module):
+    """Two convolutions with a residual."""
+
+    def __init__(self, width: int):
+        super().__init__()
+        self.norms = nn.ModuleList([nn.LayerNorm(width), nn.LayerNorm(width)])
+        self.convolutions = nn.ModuleList([Convolution(width, width), Convolution(width, width)])
+
+    def forward(self, x: Float[Tensor, "v c"], level: Level) -> Float[Tensor, "v c"]:
+        y = x
+        for norm, convolution in zip(self.norms, self.convolutions, strict=True):
+            y = convolution(nn.functional.gelu(norm(y)), level)
+        return x + y
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Outputs of the network for each voxel."""
+
+    logits: Float[Tensor, "v 3"]  # of CLASSES
+    offsets: Float[Tensor, "v 3"]  # to the centre of the object [camera distance]
+    embedding: Float[Tensor, "v e"]
+
+
+class Segmenter(nn.Module):
+    """The network, and the affinity of pairs of voxels."""
+
+    def __init__(self, widths: tuple[int, ...] = (32, 48, 64, 96), blocks: int = 1):
+        super().__init__()
+        self.config = {"widths": list(widths), "blocks": blocks}
+        self.enter = nn.Linear(FEATURES, widths[0])
+        self.first = Convolution(widths[0], widths[0])
+        self.down = nn.ModuleList(nn.ModuleList(ResidualBlock(w) for _ in range(blocks)) for w in widths)
+        self.deeper = nn.ModuleList(nn.Linear(a, b) for a, b in zip(widths, widths[1:], strict=False))
+        self.upper = nn.ModuleList(nn.Linear(b, a) for a, b in zip(widths, widths[1:], strict=False))
+        self.up = nn.ModuleList(nn.ModuleList(ResidualBlock(w) for _ in range(blocks)) for w in widths[:-1])
+        self.leave = nn.Sequential(nn.LayerNorm(widths[0]), nn.Linear(widths[0], 64), nn.GELU())
+        self.heads = nn.Linear(64, len(CLASSES) + 3 + PAIR_FEATURES)
+        self.pair = nn.Sequential(nn.Linear(2 * PAIR_FEATURES + 3, 32), nn.GELU(), nn.Linear(32, 1))
+
+    def forward(self, features: Float[Tensor, "v f"], levels: list[Level]) -> Prediction:
+        """Predictions for the voxels of the finest level."""
+        x = self.first(self.enter(features), levels[0])
+        skipped = []
+        for depth, level in enumerate(levels):
+            for block in self.down[depth]:
+                x = block(x, level)
+            if depth < len(levels) - 1:
+                skipped.append(x)
+                x = torch.zeros(level.parents, x.shape[1]).to(x).index_add(0, level.parent, x) / level.children.to(x)
+                x = self.deeper[depth](x)
+        for depth in reversed(range(len(levels) - 1)):
+            x = skipped[depth] + self.upper[depth](x)[levels[depth].parent]
+            for block in self.up[depth]:
+                x = block(x, levels[depth])
+        logits, offsets, embedding = self.heads(self.leave(x)).split([len(CLASSES), 3, PAIR_FEATURES], 1)
+        return Prediction(logits, offsets * OFFSET_UNIT, embedding)
+
+    def affinity(
+        self, found: Prediction, points: Float[Tensor, "v 3"], pairs: Int[Tensor, "e 2"]
+    ) -> Float[Tensor, "e"]:
+        """Log odds that the voxels of each pair belong to the same object; symmetric."""
+        i, j = pairs.unbind(1)
+        a, b = found.embedding[i], found.embedding[j]
+        centres = points + found.offsets
+        step = (points[i] - points[j]).norm(dim=1, keepdim=True) / (5 * VOXEL)
+        apart = (centres[i] - centres[j]).norm(dim=1, keepdim=True) / (5 * VOXEL)
+        reach = (found.offsets[i].norm(dim=1) + found.offsets[j].norm(dim=1))[:, None] / OFFSET_UNIT
+        return self.pair(torch.cat([(a - b).abs(), a * b, step, apart, reach], 1))[:, 0]

@@ -1,0 +1,130 @@
+"""Gaussians of a scene as voxels with features, the input of the segmentation network.
+
+Lengths are in units of the distance of the cameras from what they look at, so that the network sees scenes of any size
+alike.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from stages.core.geometry.neighbours import knn
+from stages.core.geometry.rotations import matrix
+
+VOXEL = 0.01  # side [camera distance]
+REACH = 1.5  # Gaussians farther from the focus are left out [camera distance]
+MIN_OPACITY = 0.1
+MAX_SCALE = 0.1  # standard deviation above which a Gaussian is a backdrop [camera distance]
+NORMAL_NEIGHBOURS = 16
+FEATURES = 11  # of a voxel
+
+
+@dataclass(frozen=True)
+class ScenePoints:
+    """What the network is told about each Gaussian; lengths in camera distances about the focus, z up."""
+
+    points: Float[Tensor, "n 3"]  # z above the supporting plane
+    lab: Float[Tensor, "n 3"]  # CIELAB
+    normals: Float[Tensor, "n 3"]  # shortest axis, not oriented
+    flatness: Float[Tensor, "n"]  # 0 for a ball, 1 for a disc
+    toward: Float[Tensor, "n 3"]  # summed unit directions to the cameras that show it; 0: not seen
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def __getitem__(self, index) -> ScenePoints:
+        return ScenePoints(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
+
+
+@dataclass(frozen=True)
+class VoxelGrid:
+    """Occupied voxels, their features, and the voxel of each surfel."""
+
+    cells: Int[Tensor, "v 3"]
+    points: Float[Tensor, "v 3"]  # mean position [camera distance]
+    features: Float[Tensor, "v f"]
+    owner: Int[Tensor, "n"]  # voxel of each surfel
+
+    def __len__(self) -> int:
+        return len(self.cells)
+
+
+def shortest_axes(quats: Float[Tensor, "n 4"], scales: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+    """Direction of each Gaussian's shortest axis: the normal of a flat one."""
+    return matrix(quats)[torch.arange(len(quats)), :, scales.argmin(1)]
+
+
+def voxelise(surfels: ScenePoints, shift: Float[Tensor, "3"] | None = None) -> VoxelGrid:
+    """The voxels of a scene; `shift` moves the grid, for training."""
+    cell = (surfels.points + (0 if shift is None else shift)).div(VOXEL).floor().long()
+    cells, owner, count = unique_cells(cell)
+
+    def mean(values: Tensor) -> Tensor:
+        total = torch.zeros(len(cells), *values.shape[1:]).index_add_(0, owner, values)
+        return total / count.reshape(-1, *[1] * (values.ndim - 1))
+
+    points, lab, toward = mean(surfels.points), mean(surfels.lab), mean(surfels.toward)
+    normals = _normals(points, mean(surfels.flatness[:, None, None] * _outer(surfels.normals)), toward)
+    within = (points + (0 if shift is None else shift)) / VOXEL - cells - 0.5
+    z = points[:, 2:]
+    columns = [within, normals, lab / 50 - torch.tensor([1.0, 0, 0]), (z / 0.02).tanh(), (z / 0.15).tanh()]
+    return VoxelGrid(cells, points, torch.cat(columns, 1), owner)
+
+
+def _outer(v: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3 3"]:
+    return v[:, :, None] * v[:, None]
+
+
+def _normals(points: Tensor, axes: Float[Tensor, "v 3 3"], toward: Float[Tensor, "v 3"]) -> Float[Tensor, "v 3"]:
+    """Unit normals from the shortest axes of Gaussians and the planes of neighbours, towards the cameras or up."""
+    k = min(NORMAL_NEIGHBOURS, len(points))
+    around = points[knn(points, points, k)[1]]
+    centred = around - around.mean(1, keepdim=True)
+    spread = centred.mT @ centred
+    spread = spread / spread.diagonal(dim1=1, dim2=2).sum(1).clamp_min(1e-12)[:, None, None]
+    normals = torch.linalg.eigh(axes + torch.eye(3) - 2 * spread).eigenvectors[:, :, -1]
+    outward = torch.where(toward.norm(dim=1, keepdim=True) > 1e-6, toward, torch.tensor([0.0, 0, 1]))
+    return normals * torch.where((normals * outward).sum(1, keepdim=True) < 0, -1.0, 1.0)
+
+
+def neighbour_table(cells: Int[Tensor, "v 3"]) -> Int[Tensor, "v 27"]:
+    """Index of the voxel at each of the 27 offsets -1..1 of every voxel, v where there is none.
+
+    Column k is offset (k // 9, k // 3 % 3, k % 3) - 1, so that column 26 - k is the opposite one.
+    """
+    keys, order = _keys(cells).sort()
+    offsets = torch.cartesian_prod(*[torch.arange(-1, 2)] * 3).to(cells)
+    wanted = _keys(cells[:, None] + offsets)
+    at = torch.searchsorted(keys, wanted).clamp_max(len(keys) - 1)
+    return torch.where(keys[at] == wanted, order[at], len(cells))
+
+
+def _keys(cells: Int[Tensor, "*b 3"]) -> Int[Tensor, "*b"]:
+    """One number for each cell, of coordinates within 2^20."""
+    x, y, z = (cells + (1 << 20)).unbind(-1)
+    return (x << 42) | (y << 21) | z
+
+
+def unique_cells(cells: Int[Tensor, "n 3"]) -> tuple[Int[Tensor, "v 3"], Int[Tensor, "n"], Int[Tensor, "v"]]:
+    """The distinct cells, that of each row, and the number of rows of each."""
+    keys, owner, count = _keys(cells).unique(return_inverse=True, return_counts=True)
+    low = (1 << 21) - 1
+    return torch.stack([keys >> 42, (keys >> 21) & low, keys & low], 1) - (1 << 20), owner, count
+
+
+def coarser(cells: Int[Tensor, "v 3"]) -> tuple[Int[Tensor, "w 3"], Int[Tensor, "v"]]:
+    """The voxels of twice the side, and that of each voxel."""
+    up, owner, _ = unique_cells(cells >> 1)
+    return up, owner
+
+
+def within_reach(
+    points: Float[Tensor, "n 3"], opacity: Float[Tensor, "n"], size: Float[Tensor, "n"]
+) -> Bool[Tensor, "n"]:
+    """The Gaussians that the network looks at; lengths in camera distances about the focus."""
+    finite = points.isfinite().all(1) & size.isfinite()
+    return finite & (points.norm(dim=1) < REACH) & (opacity > MIN_OPACITY) & (size < MAX_SCALE)

@@ -1,0 +1,46 @@
+"""The learned backend with the weights in the package."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from stages.core.errors import InputError
+from stages.core.models.segmenter.segment import find, load_segmenter
+from stages.core.scene.scene import Scene
+from stages.segment.learned import segment
+from stages.segment.options import SegmentOptions
+from stages.segment.stage import run
+from tests.segment.tabletop import best_overlap, scene_of, table_gaussians, three_apart
+
+
+def without_labels(scene: Scene) -> Scene:
+    """The scene with all Gaussians in the background."""
+    return replace(scene, gaussians=replace(scene.gaussians, object_id=torch.zeros_like(scene.gaussians.object_id)))
+
+
+def test_objects_apart_on_a_table_are_found():
+    scene = three_apart()
+    found = segment(without_labels(scene), SegmentOptions(backend="learned")).gaussians.object_id
+    overlaps = best_overlap(found, scene.gaussians.object_id)
+    assert min(overlaps.values()) > 0.7, overlaps
+
+
+def test_a_bare_table_has_no_objects():
+    assert not segment(scene_of(table_gaussians()), SegmentOptions(backend="learned")).objects
+
+
+def test_weights_that_do_not_exist_are_named(tmp_path):
+    with pytest.raises(InputError, match="train-segmenter"):
+        find(tmp_path / "nothing.safetensors")
+
+
+def test_weights_in_the_package_are_small_and_have_a_card():
+    path = find()
+    assert path.stat().st_size < 8e6
+    assert load_segmenter(path).config["widths"]
+
+
+def test_weights_are_refused_for_other_backends(tmp_path):
+    with pytest.raises(InputError, match="--weights only works"):
+        run(tmp_path / "scene.ply", tmp_path / "out.ply", SegmentOptions(weights=tmp_path / "w.safetensors"))

@@ -274,6 +274,58 @@ def train_splatter(
 
 
 @app.command()
+def clutter(
+    out: Annotated[Path, typer.Argument(metavar="FOLDER", help="folder of scenes; finished ones are kept")],
+    meshes: Annotated[list[Path], typer.Option("--from", metavar="MESH", help="textured mesh (.obj .glb .ply ...), or "
+                                               "folder of meshes, that lie around too; repeatable")] = [],  # noqa: B006
+    count: Annotated[int, typer.Option(help="number of scenes")] = 20,
+    first: Annotated[int, typer.Option(help="number of the first scene")] = 0,
+    photos: Annotated[int, typer.Option(help="photos of each scene")] = 12,
+    size: Annotated[int, typer.Option(help="longest side of a photo [px]")] = 512,
+    observations: Annotated[int, typer.Option(help="write this many outcomes of a model of reconstruction noise per "
+                                              "scene in place of photos; 0: photos to reconstruct")] = 0,
+    seed: Seed = 0,
+) -> None:
+    """Generate labelled scenes of things on tables, desks, shelves and floors, to train the segmentation.
+
+    With photos: run `ngff reconstruct NNNN/photos --cameras NNNN/transforms.json -o NNNN/scene.ply` on each scene.
+    """
+    from stages.lab.clutter.scenes import ClutterOptions, run
+
+    options = ClutterOptions(
+        count=count, first=first, photos=photos, size=size, observations=observations, seed=seed
+    )
+    for line in run(out, options, meshes):
+        print(line, flush=True)
+
+
+@app.command("train-segmenter")
+def train_segmenter(
+    data: Annotated[list[Path], typer.Argument(metavar="FOLDER", help="scenes of `ngff-lab clutter`; several folders")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="weights to write (.safetensors)")],
+    minutes: Annotated[float, typer.Option(help="training time [min]")] = 30.0,
+    steps: Annotated[int, typer.Option(help="optimizer steps instead of --minutes; 0: use --minutes")] = 0,
+    rate: Annotated[float, typer.Option(help="maximum learning rate")] = 2e-3,
+    voxels: Annotated[int, typer.Option(help="largest number of voxels of a training crop")] = 14_000,
+    batch: Annotated[int, typer.Option(help="crops per step")] = 1,
+    workers: Annotated[int, typer.Option(help="processes that prepare crops; 0: the training process itself")] = 0,
+    start: Annotated[
+        Path | None, typer.Option("--from", help="initial weights (.safetensors); default: random")
+    ] = None,
+    seed: Seed = 0,
+    device: Device = "auto",
+) -> None:
+    """Train the network that `ngff segment` finds objects with."""
+    from stages.lab.training.train_segmenter import SegmenterTraining, run
+
+    options = SegmenterTraining(
+        minutes=minutes, steps=steps, rate=rate, voxels=voxels, batch=batch, workers=workers, seed=seed, device=device
+    )
+    for line in run(data, out, options, start):
+        print(line, flush=True)
+
+
+@app.command()
 def objects(
     out: Annotated[Path, typer.Argument(metavar="FOLDER", help="output folder, with one folder per object")],
     only: Annotated[

@@ -1,0 +1,276 @@
+"""Scenes of clutter: photos, their cameras, and the true Gaussians with labels."""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from safetensors.torch import save_file
+from scipy import ndimage
+from torch import Tensor
+from tqdm import tqdm
+
+from stages.core.errors import InputError
+from stages.core.geometry.cameras import intrinsics, look_at
+from stages.core.geometry.rotations import matrix
+from stages.core.models.segmenter.voxels import ScenePoints
+from stages.core.raster.rasterise import rasterise
+from stages.core.scene.cameras import Cameras
+from stages.core.scene.files import provenance, replacing
+from stages.core.scene.gaussians import Gaussians, concatenate
+from stages.core.scene.images import write_jpeg
+from stages.core.scene.scene import Scene, SceneObject
+from stages.core.scene.scene_ply import write_scene
+from stages.lab.assets.mesh_files import find_objects, object_name
+from stages.lab.assets.objects import OBJECTS, make_object
+from stages.lab.clutter.noise_model import observed
+from stages.lab.clutter.props import Prop, make_prop, mesh_prop, placed, random_turn, recoloured
+from stages.lab.clutter.settle import hull_corners, settle
+from stages.lab.clutter.supports import Furniture, painted, random_furniture
+
+log = logging.getLogger(__name__)
+Rng = np.random.Generator
+PROPS = 160  # shapes from code that scenes are made of
+TRUTH, PHOTOS, TRANSFORMS, OBSERVED = "truth.ply", "photos", "transforms.json", "observed_{}.safetensors"
+DATA_SET_POINTS = 15_000  # Gaussians kept of one of the ten objects
+SHADOW_CELL = 0.01  # [camera distance]
+MESH_SHARE = 0.4  # of the things of a scene that are meshes, where there are any
+
+
+@dataclass(frozen=True)
+class ClutterOptions:
+    """How many scenes, and what they are made of."""
+
+    count: int = 20
+    first: int = 0  # number of the first scene, which decides its content together with the seed
+    photos: int = 12
+    size: int = 512  # longest side of the photos [px]
+    observations: int = 0  # by the noise model, in place of photos and the true scene; 0: photos to reconstruct
+    seed: int = 0
+
+    def __post_init__(self):
+        if self.count < 1 or not 4 <= self.photos <= 200 or not 64 <= self.size <= 4096 or self.observations < 0:
+            raise InputError("--count 1 or more, --photos 4 to 200, --size 64 to 4096, --observations 0 or more")
+
+
+class Shelf:
+    """The props that scenes are made of, each made when it is first used."""
+
+    def __init__(self, meshes: Sequence[Path], seed: int):
+        self.meshes, self.seed = find_objects(meshes) if meshes else [], seed
+
+    def pick(self, rng: Rng) -> Prop:
+        """A random prop: a mesh, one of the ten objects, or a shape from code."""
+        while self.meshes and rng.uniform() < MESH_SHARE:
+            files = self.meshes[rng.integers(len(self.meshes))]
+            try:
+                return _mesh(files)
+            except InputError as error:
+                log.warning("%s", error)
+                self.meshes.remove(files)
+        if rng.uniform() < 0.12:
+            return _data_set_object(str(rng.choice(list(OBJECTS))))
+        return _shape(1000 * self.seed + int(rng.integers(PROPS)))
+
+
+@cache
+def _mesh(files: tuple[Path, ...]) -> Prop:
+    return mesh_prop(files, object_name(files))
+
+
+@cache
+def _shape(seed: int) -> Prop:
+    return make_prop(seed)
+
+
+@cache
+def _data_set_object(name: str) -> Prop:
+    g = make_object(name)
+    keep = torch.randperm(len(g), generator=torch.Generator().manual_seed(0))[:DATA_SET_POINTS]
+    thinned = g[keep]
+    return Prop(name, replace(thinned, scales=thinned.scales * (len(g) / len(keep)) ** 0.5), (0.1, 0.4))
+
+
+def run(out: Path, options: ClutterOptions, meshes: Sequence[Path] = ()) -> Iterator[str]:
+    """Write OUT/NNNN/ for each scene; finished scenes are kept. Yields a line per scene.
+
+    A folder has photos/, transforms.json and truth.ply, to be reconstructed; or with `options.observations` as many
+    files observed_K.safetensors, what the noise model makes of a reconstruction.
+    """
+    shelf = Shelf(meshes, options.seed)
+    inputs = [f for files in shelf.meshes for f in files]
+    for index in tqdm(range(options.first, options.first + options.count), desc="scenes", unit="scene"):
+        folder = Path(out) / f"{index:04d}"
+        last = OBSERVED.format(options.observations - 1) if options.observations else TRUTH
+        if (folder / last).exists():
+            continue
+        scene, things = make_scene(index, shelf, options)
+        folder.mkdir(parents=True, exist_ok=True)
+        rng = np.random.default_rng([options.seed, index, 2])
+        for k in range(options.observations):
+            surfels, labels = observed(scene, rng)
+            write_observation(folder / OBSERVED.format(k), surfels, labels)
+        if not options.observations:
+            (folder / PHOTOS).mkdir(exist_ok=True)
+            _write_photos(scene, folder, rng)
+            facts = provenance("clutter", inputs, options)
+            write_scene(folder / TRUTH, replace(scene, provenance=facts))  # last: it marks the scene as finished
+        yield f"{folder}: {things} things, {len(scene.cameras)} photos"
+
+
+def write_observation(path: Path, surfels: ScenePoints, labels: Int[Tensor, "n"]) -> None:
+    """ScenePoints in half precision, with their labels."""
+    table = {name: getattr(surfels, name).half().contiguous() for name in surfels.__dataclass_fields__}
+    with replacing(path) as part:
+        save_file({**table, "labels": labels.short()}, part)
+
+
+def make_scene(index: int, shelf: Shelf, options: ClutterOptions) -> tuple[Scene, int]:
+    """A scene with true labels, and how many things are in it."""
+    rng = np.random.default_rng([options.seed, index])
+    furniture = random_furniture(rng)
+    wanted = int(round(math.exp(rng.uniform(math.log(2), math.log(40)))))
+    props = [shelf.pick(rng) for _ in range(wanted)]
+    size = [math.exp(rng.uniform(*np.log(prop.sizes))) for prop in props]
+    if rng.uniform() < 0.3:  # a few large things
+        size = [min(0.6, 1.6 * s) for s in size]
+    things = _arranged(furniture, props, size, rng)
+    objects, parts = [], [painted(furniture, rng)]
+    for prop, g in things:
+        number = 0 if prop.clutter else len(objects) + 1
+        if number:
+            objects.append(SceneObject(number, prop.name))
+        parts.append(replace(g, object_id=torch.full((len(g),), number)))
+    parts[0] = _shaded(parts[0], parts[1:], rng)
+    cameras = _cameras(furniture, concatenate(parts[1:]).means if things else torch.zeros(1, 3), rng, options)
+    return Scene(concatenate(parts), tuple(objects), cameras, 0.0), len(things)
+
+
+def _arranged(furniture: Furniture, props: list[Prop], size: list[float], rng: Rng) -> list[tuple[Prop, Gaussians]]:
+    """The things at rest on the furniture; those that fell off are left out."""
+    order = sorted(range(len(props)), key=lambda i: (not props[i].flat, -size[i]))  # sheets lie at the bottom
+    centre = rng.uniform(-0.3, 0.3, 2)
+    close = rng.uniform(0.3, 1.0)  # how far apart things lie
+    turned, hulls, starts, height = [], [], [], {}
+    for i in order:
+        area = furniture.areas[rng.integers(len(furniture.areas))] if rng.uniform() < 0.35 else furniture.areas[0]
+        g = placed(recoloured(props[i].gaussians, rng), size[i], random_turn(rng, props[i].flat), torch.zeros(3))
+        low, high = g.means.amin(0).numpy(), g.means.amax(0).numpy()
+        x0, x1, y0, y1, z = area
+        x, y = (
+            rng.uniform(x0, x1) * close + centre[0] * (x1 - x0) / 2,
+            rng.uniform(y0, y1) * close + centre[1] * (y1 - y0) / 2,
+        )
+        if area is not furniture.areas[0]:
+            x, y = rng.uniform(x0, x1), rng.uniform(y0, y1)
+            if high[2] - low[2] > 0.2 or len(furniture.areas) == 1:
+                continue
+        cell = (round(x / 0.2), round(y / 0.2), area is furniture.areas[0])
+        around = [height.get((cell[0] + a, cell[1] + b, cell[2]), z) for a in (-1, 0, 1) for b in (-1, 0, 1)]
+        base = max(around) if rng.uniform() < 0.75 or area is not furniture.areas[0] else z
+        height[cell] = base + high[2] - low[2]
+        turned.append((props[i], g))
+        hulls.append(hull_corners(g.means, 0.002))
+        starts.append((x, y, base + 0.012 - low[2]))
+    if not turned:
+        return []
+    at, quats = settle(furniture, hulls, np.array(starts))
+    floor = min(area[4] for area in furniture.areas) - 0.03
+    out = []
+    for (prop, g), t, q in zip(turned, at, quats, strict=True):
+        if np.isfinite(t).all() and t[2] > floor and np.abs(t[:2]).max() < 1.4:
+            R = matrix(torch.from_numpy(q)[None].float())[0]
+            out.append((prop, placed(g, 1.0, R, torch.from_numpy(t).float())))
+    return out
+
+
+def _shaded(furniture: Gaussians, things: list[Gaussians], rng: Rng) -> Gaussians:
+    """The furniture darkened where things cast a soft shadow or touch it."""
+    if not things:
+        return furniture
+    points = concatenate(things).means
+    toward = torch.tensor([rng.uniform(-0.8, 0.8), rng.uniform(-0.8, 0.8)]).float()
+    level = furniture.means[:, 2].round(decimals=2)
+    light = torch.ones(len(furniture))
+    for z in (0.0,):
+        on = (level - z).abs() < 0.02
+        above = points[points[:, 2] > z - 0.01]
+        fallen = above[:, :2] + toward * (above[:, 2:] - z)
+        near = above[above[:, 2] < z + 0.05][:, :2]
+        shade = 0.45 * rng.uniform() * _density(fallen, furniture.means[on, :2], rng.uniform(1, 4))
+        shade = shade + 0.35 * rng.uniform() * _density(near, furniture.means[on, :2], 2.0)
+        light[on] = 1 - shade.clamp(0, 0.8)
+    sh = furniture.sh.clone()
+    sh[:, 0] = (sh[:, 0] + 0.5 / 0.28209479) * light[:, None] - 0.5 / 0.28209479
+    return replace(furniture, sh=sh)
+
+
+def _density(points: Float[Tensor, "n 2"], at: Float[Tensor, "m 2"], blur: float) -> Float[Tensor, "m"]:
+    """How much points cover each place, 0 to 1, blurred by `blur` cells."""
+    half = 150
+    grid = np.zeros((2 * half, 2 * half))
+    cell = (points / SHADOW_CELL + half).floor().long().clamp(0, 2 * half - 1).numpy()
+    grid[cell[:, 0], cell[:, 1]] = 1
+    soft = ndimage.gaussian_filter(grid, blur)
+    place = (at / SHADOW_CELL + half).floor().long().clamp(0, 2 * half - 1).numpy()
+    return torch.from_numpy(soft[place[:, 0], place[:, 1]]).float()
+
+
+def _cameras(furniture: Furniture, points: Float[Tensor, "n 3"], rng: Rng, options: ClutterOptions) -> Cameras:
+    """A full orbit, an arc of 60 to 140 degrees, or a hand-held path, looking at the things from distance 1 or so."""
+    start, stop = furniture.open_sides
+    orbit = stop - start > 6 and rng.uniform() < 0.5
+    if not orbit:
+        sweep = min(math.radians(rng.uniform(60, 140)), stop - start)
+        start = rng.uniform(start, stop - sweep)
+        stop = start + sweep
+    n = options.photos
+    t = np.linspace(0, 1, n, endpoint=not orbit)
+    shake = rng.uniform(0.0, 0.12)
+    azimuth = start + t * (stop - start) + shake * 0.3 * rng.normal(size=n)
+    high = math.radians(rng.uniform(18, 50)) + math.radians(rng.uniform(0, 12)) * np.sin(
+        2 * math.pi * t * rng.uniform(0.5, 2)
+    )
+    high = np.clip(high + shake * 0.4 * rng.normal(size=n), math.radians(8), math.radians(75))
+    focus = points.median(0).values.numpy() * 0.7 + rng.normal(size=3) * [0.05, 0.05, 0.02]
+    distance = rng.uniform(0.85, 1.3) * (1 + shake * rng.normal(size=n))
+    eye = focus + distance[:, None] * np.stack(
+        [np.cos(high) * np.cos(azimuth), np.cos(high) * np.sin(azimuth), np.sin(high)], 1
+    )
+    target = focus + 0.06 * rng.normal(size=(n, 3))
+    viewmats = look_at(torch.from_numpy(eye).float(), torch.from_numpy(target).float())
+    wide, tall = options.size, int(options.size * 0.75)
+    if rng.uniform() < 0.25:
+        wide, tall = tall, wide
+    K = intrinsics(wide, tall, options.size * rng.uniform(0.85, 1.3)).expand(n, 3, 3).clone()
+    names = tuple(f"{i:03d}.jpg" for i in range(n))
+    return Cameras(viewmats, K, torch.tensor([[wide, tall]] * n), names)
+
+
+def _write_photos(scene: Scene, folder: Path, rng: Rng) -> None:
+    """Photos with noise, blur and changes of exposure, and their cameras as a transforms.json."""
+    cameras = scene.cameras
+    sky = torch.from_numpy(rng.uniform(0.2, 0.9, 3)).float()
+    blur, grain, sway = rng.uniform(0, 0.7), rng.uniform(0.0, 0.015), rng.uniform(0, 0.06)
+    frames = []
+    for i, name in enumerate(cameras.names):
+        width, height = cameras.sizes[i].tolist()
+        drawn = rasterise(scene.gaussians, cameras.viewmats[[i]], cameras.Ks[[i]], width, height, sky).rgb[0].numpy()
+        drawn = ndimage.gaussian_filter(drawn, (blur, blur, 0)) * (1 + sway * rng.normal())
+        drawn = (drawn + grain * rng.normal(size=drawn.shape)).clip(0, 1)
+        write_jpeg(folder / PHOTOS / name, torch.from_numpy(drawn).float())
+        pose = np.linalg.inv(cameras.viewmats[i].double().numpy()) @ np.diag([1.0, -1, -1, 1])  # y up, looking along -z
+        frames.append({"file_path": f"{PHOTOS}/{name}", "transform_matrix": pose.tolist()})
+    K = cameras.Ks[0]
+    width, height = cameras.sizes[0].tolist()
+    lens = {"fl_x": float(K[0, 0]), "fl_y": float(K[1, 1]), "cx": float(K[0, 2]), "cy": float(K[1, 2])}
+    table = {**lens, "w": width, "h": height, "frames": frames}
+    (folder / TRANSFORMS).write_text(json.dumps(table))

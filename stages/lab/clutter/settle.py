@@ -1,0 +1,63 @@
+"""Rest poses of things dropped on furniture, as convex bodies, by MuJoCo."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import ConvexHull
+from torch import Tensor
+
+from stages.core.errors import MissingPackage
+from stages.lab.clutter.supports import Furniture
+
+TIMESTEP, DURATION = 0.004, 1.6  # [s]
+CORNERS = 60  # of a hull, at most
+DENSITY = 300.0
+
+
+def hull_corners(points: Tensor, margin: float) -> np.ndarray:
+    """At most CORNERS corners of the convex hull of points, made `margin` thick where it is flat."""
+    p = points.double().numpy()
+    directions = np.random.default_rng(0).normal(size=(CORNERS - 8, 3))
+    extreme = p[(p @ directions.T).argmax(0)]
+    low, high = p.min(0), p.max(0)
+    thin = (high - low) < 2 * margin
+    middle = (low + high) / 2
+    out = np.concatenate(
+        [extreme, p[(p @ np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]).T).argmax(0)]]
+    )
+    if thin.any():
+        out = np.concatenate([out, out])
+        half = len(out) // 2
+        out[:half, thin], out[half:, thin] = middle[thin] - margin, middle[thin] + margin
+    return out[ConvexHull(out).vertices]
+
+
+def settle(furniture: Furniture, hulls: list[np.ndarray], starts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Translations (n, 3) and quaternions (n, 4; w x y z) of bodies after they fell from `starts` (n, 3).
+
+    `hulls` are corners (m, 3) about the body's origin.
+    """
+    try:
+        import mujoco  # an optional extra
+    except ImportError as error:
+        raise MissingPackage("scenes of clutter need mujoco; install it with `pip install 'ngff[rigid]'`") from error
+    spec = mujoco.MjSpec()
+    spec.option.timestep, spec.option.gravity = TIMESTEP, [0, 0, -4.0]
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    for block in furniture.blocks:
+        spec.worldbody.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_BOX, size=block.half, pos=block.centre, friction=[0.8, 0.01, 0.001]
+        )
+    for i, (corners, start) in enumerate(zip(hulls, starts, strict=True)):
+        spec.add_mesh(
+            name=f"m{i}", uservert=corners.ravel().tolist(), inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
+        )
+        body = spec.worldbody.add_body(pos=start)
+        body.add_freejoint()
+        body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=f"m{i}", density=DENSITY, friction=[0.7, 0.02, 0.01])
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    for _ in range(int(DURATION / TIMESTEP)):
+        mujoco.mj_step(model, data)
+        data.qvel[:] *= 0.995
+    return data.xpos[1:].copy(), data.xquat[1:].copy()

@@ -1,0 +1,204 @@
+"""Training scenes of the segmentation network: reconstructed clutter with the labels of the true scene."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from safetensors.torch import load_file
+from torch import Tensor
+
+from stages.core.errors import InputError
+from stages.core.geometry.cameras import centres
+from stages.core.geometry.neighbours import knn
+from stages.core.geometry.similarity import umeyama
+from stages.core.models.segmenter.surfels import scene_surfels
+from stages.core.models.segmenter.voxels import VOXEL, ScenePoints, VoxelGrid, voxelise
+from stages.core.scene.scene import Scene
+from stages.core.scene.scene_ply import read_scene
+from stages.lab.clutter.scenes import OBSERVED, TRUTH, write_observation
+
+RECONSTRUCTION = "scene.ply"
+MAX_DISTANCE = 0.025  # from the true surface; farther Gaussians are floaters [camera distance]
+FLOATER = -1  # label
+MIN_OBJECT = 8  # voxels of an object that counts
+MAX_FLOATERS = 25  # clouds of points that belong to nothing
+APART = 2048  # voxels between the scenes of a batch, a multiple of the coarsest voxel
+MAX_RELIEF = 0.012  # [camera distance]
+LONG_REACH = 0.12  # of distant pairs of voxels [camera distance]
+
+
+@dataclass(frozen=True)
+class Example:
+    """ScenePoints of a reconstruction and the true object of each: 0 surface, 1... objects, -1 floaters."""
+
+    surfels: ScenePoints
+    labels: Int[Tensor, "n"]
+
+
+def find_examples(folders: Sequence[Path]) -> list[Path]:
+    """Files of observations in the scenes of the folders; reconstructed scenes are compared with their truth first.
+
+    Raises InputError if there are none.
+    """
+    scenes = [p for folder in folders for p in sorted(Path(folder).glob("*")) if p.is_dir()]
+    for scene in scenes:
+        done = scene / OBSERVED.format("reconstruction")
+        if (scene / RECONSTRUCTION).is_file() and (scene / TRUTH).is_file() and not done.exists():
+            made = read_scene(scene / RECONSTRUCTION)
+            surfels, index, _ = scene_surfels(made)
+            write_observation(done, surfels, true_labels(made, read_scene(scene / TRUTH))[index])
+    found = [p for scene in scenes for p in sorted(scene.glob(OBSERVED.format("*")))]
+    if not found:
+        raise InputError(f"{folders[0]}: no scene in it has observations, or {RECONSTRUCTION} and {TRUTH}; make them "
+                         "with `ngff-lab clutter`")  # fmt: skip
+    return found
+
+
+def read_example(path: Path) -> Example:
+    """A file of observations."""
+    table = load_file(path)
+    labels = table.pop("labels").long()
+    return Example(ScenePoints(**{name: table[name].float() for name in ScenePoints.__dataclass_fields__}), labels)
+
+
+def true_labels(made: Scene, truth: Scene) -> Int[Tensor, "n"]:
+    """Label of each Gaussian of `made`, by the nearest Gaussian of `truth`; the cameras are matched by name."""
+    rows = [truth.cameras.names.index(name) for name in made.cameras.names]
+    to_made = umeyama(_frames(truth.cameras.viewmats[rows]), _frames(made.cameras.viewmats))
+    g = truth.gaussians
+    distance, nearest = knn(to_made(g.means), made.gaussians.means.nan_to_num(1e6), 1)
+    radius = float(
+        (centres(made.cameras.viewmats) - made.gaussians.means.nan_to_num(0).median(0).values).norm(dim=1).median()
+    )
+    labels = g.object_id[nearest[:, 0]]
+    return torch.where(distance[:, 0] < MAX_DISTANCE * radius, labels, FLOATER)
+
+
+def _frames(viewmats: Float[Tensor, "c 4 4"]) -> Float[Tensor, "m 3"]:
+    """Camera centres and points one unit along their axes, which fix a rotation even for two cameras."""
+    eyes = centres(viewmats)
+    return torch.cat([eyes, *(eyes + 0.3 * viewmats[:, i, :3] for i in range(3))])
+
+
+@dataclass(frozen=True)
+class Targets:
+    """What the network should say about the voxels of an example."""
+
+    grid: VoxelGrid
+    labels: Int[Tensor, "v"]  # of the majority of surfels: -1 floater or clutter, 0 surface, 1... objects
+    classes: Int[Tensor, "v"]  # of CLASSES
+    offsets: Float[Tensor, "v 3"]  # to the centre of the object; 0 elsewhere
+
+
+def augmented(example: Example, rng: np.random.Generator) -> tuple[ScenePoints, Int[Tensor, "n"]]:
+    """The example turned, mirrored, scaled, tilted, thinned, shaken, and in other colours."""
+    s, labels = example.surfels, example.labels
+    keep = _with_holes(s, rng)
+    s, labels = _with_floaters(s[keep], labels[keep], rng)
+    angle, tilt = rng.uniform(0, 2 * np.pi), rng.normal(0, 0.015, 2)
+    c, sn = np.cos(angle), np.sin(angle)
+    turn = np.array([[c, -sn, 0], [sn, c, 0], [0, 0, 1]]) @ np.diag([rng.choice([-1, 1]), 1, 1])
+    lean = np.array([[1, 0, tilt[0]], [0, 1, tilt[1]], [-tilt[0], -tilt[1], 1]])
+    R = torch.from_numpy(lean @ turn).float()
+    scale = float(np.exp(rng.uniform(np.log(0.8), np.log(1.25))))
+    points = scale * s.points @ R.mT + torch.tensor([0, 0, float(rng.normal(0, 0.004))])
+    points = points + 0.004 * float(rng.uniform()) ** 2 * torch.from_numpy(rng.normal(size=points.shape)).float()
+    points = torch.cat([points[:, :2], points[:, 2:] + _relief(points[:, :2], rng)], 1)
+    lab = s.lab * torch.tensor([float(rng.uniform(0.7, 1.2)), 1, 1]) + torch.tensor([float(rng.normal(0, 8)), 0, 0])
+    hue, chroma = rng.uniform(0, 2 * np.pi), float(rng.choice([0.0, 0.5, 1.0, 1.0, 1.3]))
+    spin = torch.tensor([[np.cos(hue), -np.sin(hue)], [np.sin(hue), np.cos(hue)]]).float()
+    lab = torch.cat([lab[:, :1], chroma * lab[:, 1:] @ spin.mT + torch.from_numpy(rng.normal(0, 4, 2)).float()], 1)
+    lab = lab + 8 * float(rng.uniform()) ** 2 * torch.from_numpy(rng.normal(size=lab.shape)).float()
+    normals = s.normals @ R.mT + 0.5 * float(rng.uniform()) ** 2 * torch.from_numpy(rng.normal(size=lab.shape)).float()
+    normals = torch.nn.functional.normalize(normals, dim=1)
+    moved = replace(s, points=points, lab=lab, normals=normals, toward=s.toward @ R.mT)
+    return moved, labels
+
+
+def _with_holes(s: ScenePoints, rng: np.random.Generator) -> Bool[Tensor, "n"]:
+    """Which surfels stay when round patches and a share of the rest are missing."""
+    keep = torch.from_numpy(rng.uniform(size=len(s)) < rng.choice([1.0, 1.0, 0.8, 0.5]))
+    for middle in s.points[torch.from_numpy(rng.integers(0, len(s), rng.integers(0, 12)))]:
+        keep &= (s.points - middle).norm(dim=1) > float(rng.uniform(0.01, 0.12))
+    return keep
+
+
+def _with_floaters(
+    s: ScenePoints, labels: Int[Tensor, "n"], rng: np.random.Generator
+) -> tuple[ScenePoints, Int[Tensor, "n"]]:
+    """The surfels and up to MAX_FLOATERS clouds of points of any colour that belong to nothing."""
+    clouds, parts = int(rng.integers(0, MAX_FLOATERS + 1)), []
+    for _ in range(clouds):
+        n = int(np.exp(rng.uniform(3, 6.5)))
+        middle = rng.uniform(-1.2, 1.2, 3) * [1, 1, 0.5] + [0, 0, 0.2]
+        spread = np.exp(rng.uniform(-4.2, -1.8, 3))
+        points = torch.from_numpy(middle + spread * rng.normal(size=(n, 3))).float()
+        colour = torch.from_numpy(rng.uniform([10, -40, -40], [95, 40, 40]) + rng.normal(0, 8, (n, 3))).float()
+        normals = torch.nn.functional.normalize(torch.from_numpy(rng.normal(size=(n, 3))).float(), dim=1)
+        flatness = torch.from_numpy(rng.uniform(0.1, 0.8, n)).float()
+        parts.append(ScenePoints(points, colour, normals, flatness, normals))
+    joined = [torch.cat([getattr(p, name) for p in (s, *parts)]) for name in ScenePoints.__dataclass_fields__]
+    extra = sum(len(p) for p in parts)
+    return ScenePoints(*joined), torch.cat([labels, torch.full((extra,), FLOATER)])
+
+
+def _relief(xy: Float[Tensor, "n 2"], rng: np.random.Generator) -> Float[Tensor, "n 1"]:
+    """Waves that a reconstruction adds to surfaces, up to MAX_RELIEF high."""
+    waves = torch.from_numpy(rng.normal(size=(2, 4)) * rng.uniform(4, 40, 4)).float()
+    phase = torch.from_numpy(rng.uniform(0, 6.3, 4)).float()
+    return MAX_RELIEF * float(rng.uniform()) ** 2 * torch.sin(xy @ waves + phase).mean(1, keepdim=True)
+
+
+def targets(surfels: ScenePoints, labels: Int[Tensor, "n"], shift: Float[Tensor, "3"] | None = None) -> Targets:
+    """Voxels and what they should be; tiny objects count as clutter."""
+    grid = voxelise(surfels, shift)
+    numbers = labels + 1
+    count = torch.zeros(len(grid), int(numbers.max()) + 1 if len(numbers) else 1)
+    count.view(-1).index_add_(0, grid.owner * count.shape[1] + numbers, torch.ones(len(numbers)))
+    own = count.argmax(1) - 1
+    size = torch.bincount(own.clamp_min(0), minlength=count.shape[1])
+    own = torch.where((own > 0) & (size[own.clamp_min(0)] < MIN_OBJECT), FLOATER, own)
+    classes = torch.where(own > 0, 1, torch.where(own == 0, 0, 2))
+    middle = torch.zeros(count.shape[1], 3).index_add_(0, own.clamp_min(0), grid.points)
+    middle = middle / size[: len(middle), None].clamp_min(1)
+    offsets = torch.where((own > 0)[:, None], middle[own.clamp_min(0)] - grid.points, torch.zeros(3))
+    return Targets(grid, own, classes, offsets)
+
+
+def joined(parts: Sequence[Targets]) -> Targets:
+    """Several scenes as one, far apart, with their own object numbers."""
+    if len(parts) == 1:
+        return parts[0]
+    shifts = [torch.tensor([APART * k, 0, 0]) for k in range(len(parts))]
+    highest = max(int(p.labels.max()) for p in parts) + 1
+    grid = VoxelGrid(
+        torch.cat([p.grid.cells + shift for p, shift in zip(parts, shifts, strict=True)]),
+        torch.cat([p.grid.points + VOXEL * shift for p, shift in zip(parts, shifts, strict=True)]),
+        torch.cat([p.grid.features for p in parts]),
+        torch.zeros(0, dtype=torch.int64),
+    )
+    labels = [torch.where(p.labels > 0, p.labels + k * highest, p.labels) for k, p in enumerate(parts)]
+    return Targets(
+        grid, torch.cat(labels), *(torch.cat([getattr(p, n) for p in parts]) for n in ("classes", "offsets"))
+    )
+
+
+def voxel_pairs(
+    neighbours: Int[Tensor, "v 27"], points: Float[Tensor, "v 3"], rng: np.random.Generator, distant: int
+) -> Int[Tensor, "e 2"]:
+    """All pairs of adjacent voxels, and about `distant` times as many voxels' pairs up to LONG_REACH apart."""
+    i, k = torch.nonzero(neighbours[:, :13] < len(points), as_tuple=True)
+    near = torch.stack([i, neighbours[i, k]], 1)
+    if not distant or len(points) < 2:
+        return near
+    order = torch.from_numpy(rng.integers(0, len(points), distant * len(points)))
+    step = torch.from_numpy(rng.normal(0, LONG_REACH / 2, (len(order), 3))).float()
+    _, other = knn(points, points[order] + step, 1)
+    far = torch.stack([order, other[:, 0]], 1)
+    apart = (points[far[:, 0]] - points[far[:, 1]]).norm(dim=1)
+    return torch.cat([near, far[(apart > 1.5 * VOXEL) & (apart < 2 * LONG_REACH)]])

@@ -1,0 +1,166 @@
+"""Training of the segmentation network on reconstructed clutter."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+from torch.nn.functional import binary_cross_entropy_with_logits, cross_entropy
+from torch.utils.data import DataLoader, IterableDataset, get_worker_info
+
+from stages.core.backends import pick_device
+from stages.core.errors import InputError
+from stages.core.models.segmenter.network import OFFSET_UNIT, Prediction, Segmenter, pyramid
+from stages.core.models.segmenter.voxels import VOXEL, unique_cells
+from stages.core.scene.files import replacing
+from stages.lab.training.segmenter_data import (
+    Targets,
+    augmented,
+    find_examples,
+    joined,
+    read_example,
+    targets,
+    voxel_pairs,
+)
+
+CLASS_WEIGHTS = torch.tensor([0.5, 1.0, 0.5])
+MAX_PAIRS = 60_000
+REPORT_STEPS = 50
+
+
+@dataclass(frozen=True)
+class SegmenterTraining:
+    """Settings of the training."""
+
+    minutes: float = 30.0
+    steps: int = 0  # 0: as many as fit in `minutes`
+    rate: float = 2e-3
+    voxels: int = 14_000  # of a training crop
+    batch: int = 1  # crops per step
+    workers: int = 0  # processes that prepare crops; 0: the training process
+    seed: int = 0
+    device: str = "auto"
+    widths: tuple[int, ...] = (32, 48, 64, 96)
+
+    def __post_init__(self):
+        if not (self.minutes > 0 and self.rate > 0 and self.voxels >= 1000 and self.batch >= 1):
+            raise InputError("--minutes and --rate must be above 0, --voxels at least 1000, --batch at least 1")
+
+
+def losses(model: Segmenter, t: Targets, rng: np.random.Generator) -> dict[str, Tensor]:
+    """Class, offset and affinity losses on one scene."""
+    device = next(model.parameters()).device
+    levels = pyramid(t.grid.cells.to(device), len(model.config["widths"]))
+    with torch.autocast(device.type, torch.bfloat16):
+        found = model(t.grid.features.to(device), levels)
+    found = Prediction(*(getattr(found, name).float() for name in found.__dataclass_fields__))
+    classes = t.classes.to(device)
+    kind = cross_entropy(found.logits, classes, CLASS_WEIGHTS.to(device))
+    own = classes == 1
+    apart = (found.offsets - t.offsets.to(device))[own].norm(dim=1) / OFFSET_UNIT
+    offset = torch.nn.functional.smooth_l1_loss(apart, torch.zeros_like(apart)) if own.any() else 0 * kind
+    objects = torch.nonzero(t.classes == 1)[:, 0]
+    if len(objects) < 2:
+        return {"class": kind, "offset": offset, "pair": 0 * kind}
+    pairs = _pairs(t, levels[0].neighbours.cpu(), rng)
+    same = (t.labels[pairs[:, 0]] == t.labels[pairs[:, 1]]).float()
+    odds = model.affinity(found, t.grid.points.to(device), pairs.to(device))
+    weight = torch.where(same > 0, 0.5 / same.mean().clamp(0.05, 0.95), 0.5 / (1 - same).mean().clamp(0.05, 0.95))
+    pair = binary_cross_entropy_with_logits(odds, same.to(device), weight.to(device))
+    return {"class": kind, "offset": offset, "pair": pair}
+
+
+def _pairs(t: Targets, neighbours: Tensor, rng: np.random.Generator) -> Tensor:
+    """Pairs of voxels that are not surface, at most MAX_PAIRS."""
+    kept = t.classes != 0
+    pairs = voxel_pairs(neighbours, t.grid.points, rng, 1)
+    pairs = pairs[kept[pairs[:, 0]] & kept[pairs[:, 1]]]
+    pairs = pairs[(t.labels[pairs[:, 0]] > 0) | (t.labels[pairs[:, 1]] > 0)]
+    return pairs[torch.from_numpy(rng.permutation(len(pairs))[:MAX_PAIRS])]
+
+
+class Crops(IterableDataset):
+    """Endless batches of targets: augmented examples of random files, cropped to about `voxels` around an object.
+
+    Every worker of a `DataLoader` draws others.
+    """
+
+    def __init__(self, files: Sequence[Path], voxels: int, batch: int, seed: int):
+        self.files, self.voxels, self.batch, self.seed = list(files), voxels, batch, seed
+
+    def __iter__(self) -> Iterator[Targets]:
+        worker = get_worker_info()
+        rng = np.random.default_rng([self.seed, 0 if worker is None else worker.id])
+        torch.set_num_threads(1 if worker is not None else torch.get_num_threads())
+        while True:
+            yield joined([self._crop(rng) for _ in range(self.batch)])
+
+    def _crop(self, rng: np.random.Generator) -> Targets:
+        surfels, labels = augmented(read_example(self.files[rng.integers(len(self.files))]), rng)
+        shift = VOXEL * torch.from_numpy(rng.uniform(0, 1, 3)).float()
+        own = torch.nonzero(labels > 0)[:, 0]
+        middle = surfels.points[own[int(rng.integers(len(own)))]] if len(own) else torch.zeros(3)
+        cells, owner, _ = unique_cells((surfels.points / VOXEL).floor().long())
+        distance = (cells * VOXEL - middle)[:, :2].norm(dim=1)
+        reach = distance.kthvalue(self.voxels).values if len(cells) > self.voxels else torch.inf
+        near = distance[owner] < reach
+        return targets(surfels[near], labels[near], shift)
+
+
+def run(folders: Sequence[Path], out: Path, options: SegmenterTraining, start: Path | None = None) -> Iterator[str]:
+    """Train on the scenes of `folders`, write OUT (.safetensors) and its card; yields a line per REPORT_STEPS steps.
+
+    `start`: weights to continue from.
+    """
+    torch.manual_seed(options.seed)
+    rng = np.random.default_rng(options.seed)
+    files = find_examples(folders)
+    model = Segmenter(options.widths).to(pick_device(options.device))
+    if start is not None:
+        model.load_state_dict({k: v.float() for k, v in load_file(start).items()})
+    optimiser = torch.optim.AdamW(model.parameters(), options.rate, weight_decay=0.01)
+    dataset = Crops(files, options.voxels, options.batch, options.seed)
+    crops = iter(DataLoader(dataset, batch_size=None, num_workers=options.workers))
+    begun, step, mean, curve = time.monotonic(), 0, {}, []
+    yield f"{len(files)} files, {sum(p.numel() for p in model.parameters())} parameters"
+    while (part := _progress(options, step, begun)) < 1:
+        for group in optimiser.param_groups:
+            group["lr"] = options.rate * min(1, (step + 1) / 50) * (0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * part)))
+        found = losses(model, next(crops), rng)
+        optimiser.zero_grad(set_to_none=True)
+        sum(found.values()).backward()
+        torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
+        optimiser.step()
+        step += 1
+        for name, value in found.items():
+            mean[name] = mean.get(name, 0.0) + float(value.detach()) / REPORT_STEPS
+        if step % REPORT_STEPS == 0:
+            curve.append(
+                {"step": step, "seconds": round(time.monotonic() - begun), **{k: round(v, 4) for k, v in mean.items()}}
+            )
+            yield ", ".join(f"{k} {v}" for k, v in curve[-1].items())
+            mean = {}
+            _save(out, model, options, len(files), curve)
+    _save(out, model, options, len(files), curve)
+
+
+def _progress(options: SegmenterTraining, step: int, begun: float) -> float:
+    """Share of the training that is done."""
+    return step / options.steps if options.steps else (time.monotonic() - begun) / (60 * options.minutes)
+
+
+def _save(out: Path, model: Segmenter, options: SegmenterTraining, files: int, curve: list[dict]) -> None:
+    """Weights in half precision, and their card."""
+    card = {"model": "segmenter", "config": model.config, "training": asdict(options), "files": files, "curve": curve}
+    with replacing(Path(out)) as part:
+        save_file({k: v.detach().cpu().contiguous().half() for k, v in model.state_dict().items()}, part)
+    with replacing(Path(out).with_suffix(".json")) as part:
+        part.write_text(json.dumps(card, indent=1))

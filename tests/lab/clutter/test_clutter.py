@@ -1,0 +1,87 @@
+"""Scenes of clutter: at rest, labelled, the same from one seed; observations with noise; a short training."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from stages.core.models.segmenter.segment import load_segmenter, object_ids
+from stages.core.scene.scene_ply import read_scene
+from stages.lab.clutter.noise_model import Degradation, observed
+from stages.lab.clutter.scenes import ClutterOptions, Shelf, make_scene, run
+from stages.lab.training import train_segmenter
+from stages.lab.training.segmenter_data import read_example, targets
+
+pytest.importorskip("mujoco")
+PERFECT = Degradation(
+    bend=0.0, fatten=0.0, drift=0.0, patch=8.0, grain=0.0, plain=0.0, holes=-1.0, merge=0.005
+)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """A scene of a few things."""
+    return make_scene(6, Shelf((), 0), ClutterOptions(photos=6))[0]
+
+
+def test_things_rest_on_the_furniture_and_do_not_reach_into_each_other(scene):
+    g = scene.gaussians
+    assert len(scene.objects) >= 2
+    assert sorted(g.object_id.unique().tolist()) == [0, *(o.id for o in scene.objects)]
+    for o in scene.objects:
+        low = float(g.means[g.object_id == o.id, 2].min())
+        assert low > -0.01, o.name  # the table's top is z = 0
+    assert min(float(g.means[g.object_id == o.id, 2].min()) for o in scene.objects) < 0.02
+
+
+def test_a_scene_is_the_same_from_one_seed(scene):
+    again = make_scene(6, Shelf((), 0), ClutterOptions(photos=6))[0]
+    assert torch.equal(again.gaussians.means, scene.gaussians.means)
+    assert torch.equal(again.cameras.viewmats, scene.cameras.viewmats)
+
+
+def test_an_observation_without_noise_lies_on_the_true_surface(scene):
+    surfels, labels = observed(scene, np.random.default_rng(0), PERFECT)
+    t = targets(surfels, labels)
+    assert set(labels.unique().tolist()) <= set(scene.gaussians.object_id.unique().tolist())
+    assert (t.classes == 1).any()
+    assert (t.classes == 0).any()
+    flat = surfels.points[labels == 0]
+    level = (flat[:, 2].abs() < 0.006).float().mean()
+    noisy, noisy_labels = observed(scene, np.random.default_rng(0), Degradation(2.0, 0.3, 0.01, 8, 0.003, 0, -1, 0.005))
+    assert level > 1.2 * (noisy.points[noisy_labels == 0, 2].abs() < 0.006).float().mean()
+
+
+def test_offsets_lead_to_the_middle_of_the_object(scene):
+    t = targets(*observed(scene, np.random.default_rng(0), PERFECT))
+    for label in t.labels.unique().tolist():
+        if label > 0:
+            own = t.labels == label
+            ends = (t.grid.points + t.offsets)[own]
+            assert float((ends - ends[0]).abs().max()) < 1e-5
+
+
+def test_files_of_scenes_are_kept_and_trained_on(tmp_path: Path):
+    """Photos with cameras that a reconstruction can use; observations; weights that load and label a scene."""
+    options = ClutterOptions(count=1, photos=4, size=96, first=6)
+    assert len(list(run(tmp_path / "photos", options))) == 1
+    assert not list(run(tmp_path / "photos", options))  # finished scenes are kept
+    folder = tmp_path / "photos" / "0006"
+    frames = json.loads((folder / "transforms.json").read_text())["frames"]
+    assert all((folder / frame["file_path"]).is_file() for frame in frames)
+    truth = read_scene(folder / "truth.ply")
+    truth = replace(truth, gaussians=truth.gaussians[::10])
+
+    list(run(tmp_path / "noisy", ClutterOptions(count=1, photos=4, size=96, first=6, observations=1)))
+    example = read_example(tmp_path / "noisy" / "0006" / "observed_0.safetensors")
+    assert len(example.surfels) == len(example.labels) > 1000
+
+    weights = tmp_path / "w.safetensors"
+    training = train_segmenter.SegmenterTraining(steps=2, voxels=2000, widths=(8, 12), device="cpu")
+    lines = list(train_segmenter.run([tmp_path / "noisy"], weights, training))
+    assert "1 files" in lines[0]
+    ids = object_ids(truth, load_segmenter(weights), None)
+    assert len(ids) == len(truth.gaussians)

@@ -71,7 +71,7 @@ def rollout(
     )  # fmt: skip
 
     def states() -> Iterator[FrameState]:
-        current, held, weight, acting, forces = options, prompts.pinned, gravity, None, []
+        current, held, weight = options, prompts.pinned, gravity
         for frame in range(options.steps):
             now = grid.solver.particles
             x = now.x.cpu()
@@ -84,9 +84,8 @@ def rollout(
                     new = _changed(scene, setup, replace(prompts, pinned=held), current, level)
                     _change(grid.solver, particles, new)
                     weight = _gravity(particles, current)
-                if active is not acting or changes:
-                    forces = [_PromptedForce(f, particles, setup, ids.index(f.object_id)) for f in active]
-                    acting = active
+                forces = [_PromptedForce(f, particles, setup, ids.index(f.object_id)) for f in active
+                          if f.active_fraction(t, t + options.dt) > 0]  # fmt: skip
                 acceleration = sum((f.acceleration(x, t, t + options.dt) for f in forces), weight)
                 try:
                     grid.advance(options.dt, acceleration)

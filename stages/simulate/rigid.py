@@ -191,7 +191,6 @@ class _World:
         """The forces from now on; those on pinned objects have no effect."""
         rows = ((f, self._ids.index(f.object_id)) for f in forces if f.object_id not in pinned)
         self._forces = [(f, row, None if f.at is None else self._arm(f.at, row)) for f, row in rows]
-        self.data.xfrc_applied[:] = 0
 
     def _arm(self, at, row: int) -> np.ndarray:
         """From the centre of mass to the point of application, in the body's frame."""
@@ -257,9 +256,11 @@ class _World:
     def advance(self, time: float) -> None:
         """Advance by a frame that begins at `time` [s]."""
         step = self._dt / self.substeps
+        acting = [row for row in self._forces if row[0].active_fraction(time, time + self._dt) > 0]
+        self.data.xfrc_applied[:] = 0
         for n in range(self.substeps):
-            if self._forces:
-                self._apply_forces(time + n * step, step)
+            if acting:
+                self._apply_forces(acting, time + n * step, step)
             self._step()
 
     def _step(self) -> None:
@@ -281,10 +282,10 @@ class _World:
             data.qpos[FREE * k : FREE * (k + 1)] = pose
             data.qvel[FALLING * k : FALLING * (k + 1)] = 0
 
-    def _apply_forces(self, time: float, step: float) -> None:
+    def _apply_forces(self, acting: list, time: float, step: float) -> None:
         """Set the mean force and torque on each body during a substep."""
         self.data.xfrc_applied[:] = 0
-        for f, row, arm in self._forces:
+        for f, row, arm in acting:
             active = f.active_fraction(time, time + step)
             force = np.array(f.force) * (active / self.units.force)
             torque = np.array(f.torque) * (active / (self.units.force * self.units.length))

@@ -26,12 +26,17 @@ FRAMES = 10  # frames for which a new grid has room at the present speed
 
 
 class MovingGrid:
-    """Particles on a grid that follows them; `box` is the first domain [m], and the only one if it is `fixed`."""
+    """Particles on a grid that follows them; `box` is the first domain [m], and the only one if it is `fixed`.
+
+    With `touch` each body has its own velocity field (mpm.Solver's bodies_touch); otherwise the grid sums exactly.
+    """
 
     def __init__(self, particles: mpm.Particles, box: mpm.Box, dx: float, device: str, body: Int[Tensor, "p"],
-                 objects: Sequence[SceneObject], fixed: bool):  # fmt: skip
+                 objects: Sequence[SceneObject], fixed: bool, touch: bool):  # fmt: skip
         self.box, self._body, self._objects, self._fixed = box, body, objects, fixed
-        self._build = lambda p, b: mpm.Solver(p, b, dx, device, exact=device != "cpu")
+        sizes = torch.bincount(body).tolist() if touch else None  # particles are in the order of their bodies
+        self._copies = len(sizes) if touch else 1  # of the grid
+        self._build = lambda p, b: mpm.Solver(p, b, dx, device, sizes=sizes, bodies_touch=touch, exact=not touch)
         self.solver = self._build(particles, box)
 
     def advance(self, duration: float, acceleration: Float[Tensor, "p 3"]) -> None:
@@ -68,7 +73,7 @@ class MovingGrid:
         return replace(self.box, low=(*corner, self.box.low[2]), high=tuple(a + room for a in high))
 
     def _nodes(self, box: mpm.Box) -> float:
-        return math.prod((b - a) / self.solver.dx + 16 for a, b in zip(box.low, box.high, strict=True))
+        return self._copies * math.prod((b - a) / self.solver.dx + 16 for a, b in zip(box.low, box.high, strict=True))
 
     def _farthest(self) -> str:
         """The object whose middle is farthest from the median of all."""

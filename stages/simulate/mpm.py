@@ -53,14 +53,16 @@ def rollout(
     level, fine = options.level, device != "cpu" and options.quality != "draft"
     if fine:
         level = replace(level, substep=min(level.substep, GPU_SUBSTEP))
-    setup = set_up_scene(scene, prompts, options, fine)
+    touch = device == "cpu"  # the schedule for GPUs has one velocity at a node
+    setup = set_up_scene(scene, prompts, options, fine, skin=touch)
     body, dx = setup.bodies.body, 2 * setup.bodies.spacing * unit
     particles = _particles(scene, setup, prompts, options, level)
-    # thick bodies leave their outermost layer of voxels empty, so the floor is raised by as much
-    low = (*setup.box.low[:2], setup.box.low[2] + setup.bodies.spacing)
+    # without skin the floor is raised by the layer of voxels that is empty
+    low = (*setup.box.low[:2], setup.box.low[2] + (0.0 if touch else setup.bodies.spacing))
     box = mpm.Box(tuple(unit * v for v in low), tuple(unit * v for v in setup.box.high))
-    grid = MovingGrid(particles, box, dx, device, body, scene.objects, fixed=options.box is not None)
-    _warn_stuck(scene, setup, prompts)
+    grid = MovingGrid(particles, box, dx, device, body, scene.objects, options.box is not None, touch)
+    if not touch:
+        _warn_stuck(scene, setup, prompts)
     ids = [o.id for o in scene.objects]
     attachment = _attach(scene, keypoints, setup.bodies)
     gravity = _gravity(particles, options)

@@ -42,23 +42,27 @@ class SceneSetup:
         return self.bodies.x + (self.lift + self.floor_offset)[self.bodies.body]
 
 
-def set_up_scene(scene: Scene, prompts: ForcePrompts, options: SimulateOptions, fine: bool = False) -> SceneSetup:
+def set_up_scene(
+    scene: Scene, prompts: ForcePrompts, options: SimulateOptions, fine: bool = False, skin: bool = False
+) -> SceneSetup:
     """Sample the particles, choose the materials and place the objects in the domain.
 
     Objects whose bottom is within two particle spacings of the floor, or below it, are moved onto it. `fine` doubles
-    the resolution of the particles. Raises InputError for a --box that does not contain the objects.
+    the resolution of the particles; with `skin` they fill the bodies up to the surface. Raises InputError for a --box
+    that does not contain the objects.
     """
     materials = choose_materials(scene.objects, options.material, options.materials)
-    bodies = sample_bodies(scene, options.level.particles, options.seed)
+    bodies = sample_bodies(scene, options.level.particles, options.seed, skin)
     if fine:
         bodies = subdivide(bodies, options.seed)
     count, h = len(scene.objects), bodies.spacing
     lift = torch.zeros(count, 3)
     for row, o in enumerate(scene.objects):
         lift[row, 2] = prompts.lift.get(o.id, 0.0)
-    # a voxel ends half a spacing below its particle, and the visible body one spacing further down
+    # a voxel ends half a spacing below its particle, and without skin the visible body one spacing further down
+    below = 0.5 if skin else 1.5
     lowest = torch.stack([bodies.x[bodies.body == row, 2].quantile(0.01) for row in range(count)])
-    bottom = lowest - 1.5 * h
+    bottom = lowest - below * h
     start = bottom + lift[:, 2]
     asked = parse_box(options.box) if options.box else None
     floor = _floor_height(scene, options, asked, start)
@@ -76,7 +80,7 @@ def set_up_scene(scene: Scene, prompts: ForcePrompts, options: SimulateOptions, 
     box = Box((*box.low[:2], floor), box.high)
     low, high = torch.tensor(box.low), torch.tensor(box.high)
     # particles below the 1 % quantile may still lie under the floor, which would throw them up
-    x[:, 2].clamp_(min=floor + 1.25 * h)
+    x[:, 2].clamp_(min=floor + (below - 0.25) * h)
     outside = ((x < low) | (x > high)).any(1)
     if bool(outside.any()):
         row = int(bodies.body[outside.nonzero()[0, 0]])

@@ -40,6 +40,7 @@ LEAK_RADII = (2, 3, 4, 5, 6, 8)  # half widths of the holes in shells that are c
 MIN_CAVITY_RATIO = 1.5  # minimum half width of a cavity relative to that of its leaks
 CROSS = ndimage.generate_binary_structure(3, 1)
 CUBE = np.ones((2, 2, 2), bool)
+SURROUNDINGS = np.ones((3, 3, 3), bool)
 
 
 @dataclass(frozen=True)
@@ -52,8 +53,10 @@ class Bodies:
     spacing: float  # edge of a voxel; particles of thick bodies stay this far inside
 
 
-def sample_bodies(scene: Scene, count: int, seed: int = 0) -> Bodies:
+def sample_bodies(scene: Scene, count: int, seed: int = 0, skin: bool = False) -> Bodies:
     """Sample about `count` particles for all objects together, in bounded time and memory.
+
+    With `skin` the outermost layer of voxels of thick bodies has particles too.
 
     Objects that stood on the floor in photos but would tip over as reconstructed are extended down to the floor.
     Raises InputError for an object without any usable Gaussian.
@@ -66,7 +69,7 @@ def sample_bodies(scene: Scene, count: int, seed: int = 0) -> Bodies:
     finest = max(extent / MAX_VOXELS_ALONG, max(gaps) / 8, 1e-4 * scene_size(scene), 1e-9)
     h = max(extent / 40, finest)
     for _ in range(5):  # filled bodies hold ~ h^-3 voxels, shells ~ h^-2
-        solids = [_solid(c, h, gap, scene.floor, photographed) for c, gap in zip(clouds, gaps, strict=True)]
+        solids = [_solid(c, h, gap, scene.floor, photographed, skin) for c, gap in zip(clouds, gaps, strict=True)]
         voxels = _without_overlap([v for v, _, _ in solids])
         ratio = sum(map(len, voxels)) / count
         if 0.9 < ratio < 1.05 or (ratio < 1 and h <= finest):
@@ -152,13 +155,13 @@ def filled_voxels(scene: Scene, object_id: int, along: int, seed: int = 0) -> tu
 
 
 def _solid(
-    points: np.ndarray, h: float, gap: float, floor: float | None, photographed: bool
+    points: np.ndarray, h: float, gap: float, floor: float | None, photographed: bool, skin: bool
 ) -> tuple[np.ndarray, float, bool]:
     """Voxels of an object: indices (m, 3) of voxels of edge h in its closed and filled body, and the number of voxels
     of volume that each represents; the last value as in _closed_body.
     """
     body, low, extended = _closed_body(points, h, gap, floor, photographed)
-    inside = body & ~_thick_skin(body)
+    inside = body if skin else body & ~_thick_skin(body)
     if inside.sum() < MIN_PARTICLES:
         inside = body
     return np.argwhere(inside) + low, float(body.sum() / inside.sum()), extended
@@ -188,7 +191,10 @@ def _closed_body(
         bottom = int(np.flatnonzero(body.any((0, 1)))[0])
         body = np.flip(np.logical_or.accumulate(np.flip(body, 2), 2), 2)  # all voxels below the body
         body[:, :, :bottom] = False
-    thin = body & ~ndimage.binary_opening(body, CUBE)
+    thick = ndimage.binary_opening(body, CUBE)
+    thin = body & ~thick
+    fringe = thin & ndimage.binary_dilation(thick, SURROUNDINGS)  # what trimming left at edges, not a sheet
+    body, thin = body & ~fringe, thin & ~fringe
     if thin.any():
         body |= ndimage.binary_dilation(thin, CROSS)
     while body.sum() < MIN_PARTICLES:

@@ -21,7 +21,7 @@ from stages.core.scene.trajectory import Trajectory
 from stages.lab.assets.shapes import Surface, box, ellipsoid, to_gaussians
 
 G = 9.81
-POINTS_ALONG = 14  # Gaussians along the side of a cube
+POINTS_ALONG = 28  # Gaussians along the side of a cube
 TOLERANCES = {"rigid": 0.05, "mpm": 0.1, "ngff": 0.1}
 SLIDES = TOLERANCES | {"ngff": 0.15}
 GAPS = {"rigid": (-0.03, 0.05), "mpm": (-0.1, 0.1), "ngff": (-0.03, 0.05)}  # penetration, gap in heights
@@ -50,7 +50,7 @@ class Run:
 
     def scene(self) -> Scene:
         """The bodies as objects 1, 2, ..."""
-        parts = [to_gaussians(t.surface, torch.full((len(t.surface.points), 3), 0.5), i + 1)
+        parts = [to_gaussians(t.surface, torch.full((len(t.surface.points), 3), 0.5), i + 1, widest=math.inf)
                  for i, t in enumerate(self.things)]  # fmt: skip
         objects = tuple(SceneObject(i + 1, f"body{i + 1}") for i in range(len(parts)))
         return Scene(concatenate(parts), objects, None, 0.0, {"metres_per_unit": 1.0, "source": "made in code"})
@@ -87,8 +87,8 @@ def cube(side: float, x: float = 0.0, bottom: float = 0.0, **material) -> Thing:
 
 
 def block(sides: tuple[float, float, float], centre: tuple[float, float, float], **material) -> Thing:
-    """An upright box; its Gaussians are at most a fourteenth of its longest side apart."""
-    return Thing(box(sides, max(sides) / POINTS_ALONG if min(sides) > max(sides) / 4 else min(sides) / 4).moved(centre),
+    """An upright box; its Gaussians are a twenty-eighth of its longest side apart, or less."""
+    return Thing(box(sides, max(sides) / POINTS_ALONG if min(sides) > max(sides) / 4 else min(sides) / 7).moved(centre),
                  **material)  # fmt: skip
 
 
@@ -181,8 +181,8 @@ def _slopes() -> Iterator[Experiment]:
     for degrees, mu in product((10, 25, 40), (0.0, 0.3, 0.8)):
         a, time = math.radians(degrees), 30 * 0.02
         pull = G * max(math.sin(a) - mu * math.cos(a), 0.0)
-        ramp = tilted(box((2.0, 0.6, 0.2), 0.04).moved((0, 0, -0.1)), degrees).moved((0, 0, 1.2))
-        slider = tilted(box((0.2, 0.2, 0.1), 0.014).moved((-0.5, 0, 0.05)), degrees).moved((0, 0, 1.2))
+        ramp = tilted(box((2.0, 0.6, 0.2), 0.025).moved((0, 0, -0.1)), degrees).moved((0, 0, 1.2))
+        slider = tilted(box((0.2, 0.2, 0.1), 0.008).moved((-0.5, 0, 0.05)), degrees).moved((0, 0, 1.2))
         options = {"pin": ("1",), "friction": mu, "steps": 31}
         yield Experiment(f"slope/{degrees}deg friction={mu:g}", (Run((Thing(ramp), Thing(slider)), options),),
                          lambda t: float(path(t, 1)[-1].norm()), pull * time**2 / 2, "distance in .6 s [m]",

@@ -109,6 +109,15 @@ def test_a_box_is_filled_at_every_resolution(floor):
         assert 0.9 < float(bodies.volume.sum()) / 0.2**3 < 1.15  # the Gaussians are half a voxel thick
 
 
+def test_a_box_has_no_rods_along_its_edges():
+    """Voxels that trimming left there were thickened like sheets, and held other objects at a distance."""
+    surface = box((0.2, 0.2, 0.2), 0.2 / 24)
+    g = to_gaussians(surface, torch.full((len(surface.points), 3), 0.5), 1)
+    for count in (6_000, 25_000):
+        bodies = sample_bodies(scene(g), count)
+        assert float((bodies.x.abs().amax(1) > 0.1 + 0.6 * bodies.spacing).float().mean()) < 1e-3
+
+
 def test_a_sheet_gets_three_layers():
     rng = torch.Generator().manual_seed(0)
     flat = torch.cat([0.3 * torch.rand(6000, 2, generator=rng), torch.full((6000, 1), 0.2)], 1)

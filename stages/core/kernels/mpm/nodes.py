@@ -170,21 +170,21 @@ def scatter_nodes(
         }
     const lanes mass = __builtin_shufflevector(sum, sum, 3, 3, 3, 3, 7, 7, 7, 7, 11, 11, 11, 11, 15, 15, 15, 15);
     const lanes safe = __builtin_elementwise_max(mass, (lanes)1e-30f);
-    *(lanes*)to = sum / safe;
+    *(lanes*)to = __builtin_shufflevector(sum / safe, sum, 0, 1, 2, 19, 4, 5, 6, 23, 8, 9, 10, 27, 12, 13, 14, 31);
 #else
     for (int n = 0; n < 4; ++n) {
         float4* from = (float4*)(momentum.data + first) + n;
         const float4 s = *from;
         *from = make_float4(0.0f, 0.0f, 0.0f, 0.0f);
         const float inverse = 1.0f / fmaxf(s.w, 1e-30f);
-        ((float4*)to)[n] = make_float4(s.x * inverse, s.y * inverse, s.z * inverse, s.w > 0.0f ? 1.0f : 0.0f);
+        ((float4*)to)[n] = make_float4(s.x * inverse, s.y * inverse, s.z * inverse, s.w);
     }
 #endif
 """)
 def velocity_from_momentum(
     momentum: wp.array[wp.vec4], velocity: wp.array[wp.vec4], first: int, count: int, copies: int
 ):
-    """Velocities of a row of four nodes from the sum of the momentum copies, which are cleared.
+    """Velocities and masses of a row of four nodes from the sum of the momentum copies, which are cleared.
 
     Bit c of `copies` is set if copy c, which starts at node c x count, may be non-zero.
     """

@@ -24,11 +24,12 @@ from torch import Tensor
 
 from stages.core.kernels.mpm import grid as mpm_grid
 from stages.core.kernels.mpm.constitutive import MAX_SNOW_HARDENING, NEO_HOOKEAN, SNOW
+from stages.core.kernels.mpm.transfers import KINEMATIC_MASS_FACTOR
 from stages.core.physics.colliders import Collider, as_obstacles
 from stages.core.physics.mpm.domain import MAX_NODES, Box
 from stages.core.physics.mpm.fused import FusedSubsteps
 from stages.core.physics.mpm.particle_rows import NEVER, ParticleRows
-from stages.core.physics.mpm.split import SplitSubsteps
+from stages.core.physics.mpm.split import BodyContact, SplitSubsteps
 
 SAFETY = 0.5  # fraction of a cell that a wave and a particle may cross in a substep, see substep_rate
 VISCOUS = 0.15  # maximum of dt eta / (density dx^2); violent vibration diverges from 0.3
@@ -126,13 +127,16 @@ class Solver:
     interact. `damping` (0 to 1) removes that fraction of the symmetric part of C at every transfer (RPIC). `fused`
     selects the schedule, by default the faster one for the device. `exact` sums in fixed point: a GPU then gives the
     same bytes in every run at about twice the time, and a scene the same result in any batch (unless a surface has
-    restitution, whose stiffness follows from the stiffest material of the batch). Raises ValueError for sizes that do
-    not fit the particles and for grids that are too large.
+    restitution, whose stiffness follows from the stiffest material of the batch). With `bodies_touch` the scenes are
+    bodies in one space, each with its own velocity field, in contact with Coulomb friction (kernels/mpm/contact.py; not
+    `fused`); otherwise bodies in one scene share the velocity of a node, and stick to each other. Raises ValueError for
+    sizes that do not fit the particles and for grids that are too large.
     """
 
     def __init__(
         self, particles: Particles, box: Box, dx: float, device: str = "cpu", *, sizes: Sequence[int] | None = None,
         colliders: Sequence[Collider] = (), damping: float = 0.0, fused: bool | None = None, exact: bool = False,
+        bodies_touch: bool = False,
     ):  # fmt: skip
         self.device, self.dx, self.grid = device, dx, make_grid(box, dx)
         sizes = [len(particles)] if sizes is None else list(sizes)
@@ -146,12 +150,15 @@ class Solver:
         self._obstacles = as_obstacles(self.colliders, device)
         self._rates = self._max_rates()
         self.grid.spring = self._rates[0] / (2 * dx)  # as stiff as the bodies, so that the CFL substep is stable
-        fused = exact or (device != "cpu" if fused is None else fused)
+        fused = exact or (device != "cpu" and not bodies_touch if fused is None else fused)
+        if fused and bodies_touch:
+            raise ValueError("the fused schedule has one velocity at a node: bodies_touch needs fused=False")
         plastic = bool((particles.model != NEO_HOOKEAN).any())
         bouncy = any(surface.restitution > 0 for surface in (box, *self.colliders))
         options = self.rows, plastic, bouncy, damping, self._obstacles
         quanta = self._quanta() if exact else None
-        self._substepper = FusedSubsteps(*options, quanta) if fused else SplitSubsteps(*options)
+        contact = self._body_contact(particles, sizes) if bodies_touch else None
+        self._substepper = FusedSubsteps(*options, quanta) if fused else SplitSubsteps(*options, contact)
         self._substep_multiple = SUBSTEP_MULTIPLE if fused and device != "cpu" else 1
 
     @property
@@ -208,6 +215,14 @@ class Solver:
     def lost(self) -> Int[Tensor, "s"]:
         """First lost particle of each scene, or -1."""
         return torch.where(self.rows.lost == NEVER, -1, self.rows.lost)
+
+    def _body_contact(self, particles: Particles, sizes: Sequence[int]) -> BodyContact:
+        """Density and friction of each body; those of its particles are equal."""
+        first = torch.tensor([0, *sizes[:-1]]).cumsum(0)
+        mass, volume, held, friction = (t[first].float().to(self.device) for t in (
+            particles.mass, particles.volume, particles.held, particles.friction))  # fmt: skip
+        factor = torch.where(held > 0, float(KINEMATIC_MASS_FACTOR), 1.0)
+        return BodyContact((factor * mass / volume * self.dx**3).contiguous(), friction.contiguous())
 
     def _quanta(self) -> tuple[float, float]:
         """Fixed-point units per kg m/s and per kg: powers of two that depend on dx alone, not on the batch.

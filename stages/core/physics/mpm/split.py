@@ -7,13 +7,17 @@ of addition depend on the number of threads, neither does the result.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import torch
 import warp as wp
+from jaxtyping import Float
 from torch import Tensor
 
 from stages.core.kernels.interop import launch, view
 from stages.core.kernels.mpm import split as kernels
+from stages.core.kernels.mpm.contact import contact_step
 from stages.core.kernels.threads import run_parallel
 from stages.core.physics.mpm.particle_rows import ParticleRows
 
@@ -22,14 +26,27 @@ LAUNCH_MULTIPLE = 32  # particle launches are padded to a multiple of a GPU warp
 MIN_SPLIT_ROWS = 20_000  # grid rows of four nodes above which the grid launch is split; a split costs about 5,000 rows
 
 
+@dataclass(frozen=True)
+class BodyContact:
+    """What contact between bodies depends on, for each body."""
+
+    full_cell: Float[Tensor, "s"]  # mass of a filled grid cell, as it is on the grid [kg]
+    friction: Float[Tensor, "s"]  # Coulomb coefficient
+
+
 class SplitSubsteps:
     """Runs the substeps of a frame for the particles in `rows`.
 
     `plastic` compiles all material models instead of neo-Hookean alone, `bouncy` the restitution of surfaces;
-    `damping` as in Solver; `obstacles` are the colliders as kernels read them.
+    `damping` as in Solver; `obstacles` are the colliders as kernels read them. With `contact` the scenes of `rows` are
+    bodies in contact with each other.
     """
 
-    def __init__(self, rows: ParticleRows, plastic: bool, bouncy: bool, damping: float, obstacles: wp.array):
+    def __init__(
+        self, rows: ParticleRows, plastic: bool, bouncy: bool, damping: float, obstacles: wp.array,
+        contact: BodyContact | None = None,
+    ):  # fmt: skip
+        self._contact, self._contact_commands = contact, []
         self.rows, self.grid, self.device, self.damping = rows, rows.grid, rows.device, damping
         self.parts = CPU_PARTS if self.device == "cpu" else 1
         self._step, self._obstacles = kernels.particle_step(plastic, bouncy), obstacles
@@ -56,6 +73,7 @@ class SplitSubsteps:
                 self._list_blocks()
             self._clock.fill_(step * dt)
             self._run(self._grid_commands)
+            self._run(self._contact_commands)
             self._run(last if step == steps - 1 else between)
 
     @property
@@ -94,6 +112,22 @@ class SplitSubsteps:
             self._record(kernels.grid_step, stop - start, [self.grid, start, *inputs])
             for start, stop in ranges if stop > start  # nothing to do when all particles are lost
         ]  # fmt: skip
+        if self._contact is not None:
+            self._contact_commands = self._shared_blocks(at[:, 0].int(), first - at[:, 0] * self.grid.count)
+
+    def _shared_blocks(self, body: Tensor, corner: Tensor) -> list[wp.Launch]:
+        """The launch for the blocks that are active for several bodies; `corner` is the first node of each block."""
+        corners, block, count = corner.unique(return_inverse=True, return_counts=True)
+        mine = (count[block] > 1).nonzero()[:, 0]
+        if not len(mine):
+            return []
+        mine = mine[block[mine].argsort(stable=True)]
+        corners, count = corners[count > 1].int(), count[count > 1]
+        starts = torch.cat([torch.zeros(1, dtype=torch.int64, device=count.device), count.cumsum(0)]).int()
+        self._shared = corners.contiguous(), starts.contiguous(), body[mine].contiguous()
+        inputs = [self.grid, view(self._velocity, wp.vec4), *map(view, self._shared), view(self._contact.full_cell),
+                  view(self._contact.friction), view(self._friction)]  # fmt: skip
+        return [self._record(contact_step, len(corners) * kernels.BLOCK**3, inputs)]
 
     def _clear_friction(self) -> None:
         rows = len(self._blocks) * kernels.BLOCK**2

@@ -1,0 +1,70 @@
+"""Bodies with a velocity field each: they neither stick nor pass through, and rub by Coulomb's law."""
+
+import pytest
+import torch
+
+from stages.core.physics.mpm.solver import Box, ParticleMaterial, Particles, Solver, at_rest, join_particles
+
+DX, G = 0.05, 9.81
+BOX = Box((-1.0, -1.0, 0.0), (3.0, 1.0, 1.5))
+
+
+def block(low: tuple, high: tuple, friction: float = 0.3, speed: float = 0.0, held: bool = False) -> Particles:
+    """Eight particles in a cell of 1e6 Pa and 500 kg/m^3."""
+    axes = [torch.arange(a + DX / 4, b, DX / 2) for a, b in zip(low, high, strict=True)]
+    x = torch.cartesian_prod(*axes)
+    n = torch.ones(len(x))
+    p = at_rest(x, n * (DX / 2) ** 3, ParticleMaterial(1e6 * n, 0.3 * n, 500 * n, 30 * n, friction * n))
+    p.v[:, 0], p.held[:] = speed, int(held)
+    return p
+
+
+def solve(bodies: list[Particles], frames: int, gravity: float, touch: bool = True) -> tuple[list, list]:
+    """Positions and velocities of each body after frames of 0.02 s."""
+    sizes = [len(b) for b in bodies]
+    solver = Solver(join_particles(bodies), BOX, DX, sizes=sizes if touch else None, bodies_touch=touch)
+    held = solver.particles.held > 0
+    pull = torch.tensor([0.0, 0.0, -gravity]) * ~held[:, None]
+    for _ in range(frames):
+        solver.advance(0.02, pull)
+    return list(solver.particles.x.split(sizes)), list(solver.particles.v.split(sizes))
+
+
+def test_blocks_that_meet_keep_their_momentum_and_part_again():
+    blocks = [block((0, 0, 0.5), (0.3, 0.3, 0.8), speed=1.0), block((0.4, 0, 0.5), (0.7, 0.3, 0.8))]
+    x, v = solve(blocks, 25, 0.0)
+    one, other = (float(w[:, 0].mean()) for w in v)
+    assert one + other == pytest.approx(1.0, abs=1e-3)
+    assert other - one > 0.5 and float(x[1][:, 0].min() - x[0][:, 0].max()) > 0.1
+    _, stuck = solve(blocks, 25, 0.0, touch=False)
+    assert float(stuck[1][:, 0].mean() - stuck[0][:, 0].mean()) < other - one
+
+
+@pytest.mark.parametrize("friction", [0.1, 0.5])
+def test_a_block_slides_on_another_nearly_by_v2_over_2_mu_g(friction):
+    """At its edges the normals are tilted against the motion, which costs up to a quarter of the distance."""
+    slab = block((-0.5, -0.3, 0.0), (2.0, 0.6, 0.3), friction, held=True)
+    slider = block((0, 0, 0.3), (0.3, 0.3, 0.4), friction, speed=1.2)
+    x, _ = solve([slab, slider], 60 if friction < 0.3 else 30, G)
+    time = 1.2 if friction < 0.3 else 0.6
+    stop = min(1.2 / (friction * G), time)
+    assert float(x[1][:, 0].mean()) - 0.15 == pytest.approx(1.2 * stop - friction * G * stop**2 / 2, rel=0.3)
+
+
+def test_a_block_rests_on_another_with_a_gap_of_at_most_a_quarter_cell():
+    x, v = solve([block((0, 0, 0), (0.5, 0.5, 0.3)), block((0.1, 0.1, 0.33), (0.4, 0.4, 0.63))], 60, G)
+    gap = float(x[1][:, 2].min() - x[0][:, 2].max()) - DX / 2  # a particle is a quarter cell inside its body
+    assert abs(gap) < 0.25 * DX and float(v[1].norm(dim=1).mean()) < 0.02
+
+
+def test_three_blocks_at_one_place_keep_their_momentum():
+    blocks = [block((0, 0, 0.5), (0.2, 0.2, 0.7), speed=1.0), block((0.22, 0, 0.5), (0.42, 0.2, 0.7)),
+              block((0.22, 0.2, 0.5), (0.42, 0.4, 0.7))]  # fmt: skip
+    _, v = solve(blocks, 10, 0.0)
+    total = sum(w.mean(0) for w in v)
+    torch.testing.assert_close(total, torch.tensor([1.0, 0.0, 0.0]), rtol=0, atol=2e-3)
+
+
+def test_the_fused_schedule_has_one_velocity_at_a_node():
+    with pytest.raises(ValueError, match="fused=False"):
+        Solver(block((0, 0, 0), (0.2, 0.2, 0.2)), BOX, DX, fused=True, bodies_touch=True)

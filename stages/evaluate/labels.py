@@ -6,7 +6,6 @@ share. Labelled and found objects are compared over all labelled photos together
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -26,6 +25,7 @@ from stages.core.scene.images import read_labels
 from stages.core.scene.lens import Undistortion, photo_of
 from stages.core.scene.scene import Scene, SceneObject
 from stages.core.scene.scene_ply import read_scene
+from stages.core.scene.schema import read_json, reason
 from stages.evaluate.label_pictures import LabelColours, LabelledView, draw_pictures
 from stages.evaluate.matching import object_labels
 from stages.evaluate.options import EvaluateOptions
@@ -149,11 +149,11 @@ def read_label_names(folder: Path) -> dict[int, LabelledObject]:
     """The objects of names.json by number: {"1": {"name": "duck", "core": true}}, or {"1": "duck"}; core by default."""
     path = must_exist(folder / "names.json", f"the names of the labelled objects, {NAMES_EXAMPLE},")
     try:
-        rows = json.loads(path.read_text()).items()
+        rows = read_json(path).items()
         named = {int(i): row if isinstance(row, dict) else {"name": row} for i, row in rows}
         return {i: LabelledObject(str(row["name"]), bool(row.get("core", True))) for i, row in named.items()}
-    except (ValueError, KeyError, AttributeError) as error:
-        raise InputError(f"{path}: is not readable ({error!r}); write {NAMES_EXAMPLE}") from error
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RuntimeError, IndexError) as error:
+        raise InputError(f"{path}: is not readable ({reason(error)}); write {NAMES_EXAMPLE}") from error
 
 
 def label_files(folder: Path, prediction: Path, cameras: Cameras | None) -> dict[int, Path]:

@@ -6,7 +6,6 @@ Each entry is {rotation (3x3, camera to world), position, width, height, fx, fy}
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +16,7 @@ from stages.core.geometry.cameras import centres
 from stages.core.geometry.rotations import nearest_rotation
 from stages.core.scene.cameras import Cameras
 from stages.core.scene.files import must_exist
+from stages.core.scene.schema import read_json, reason
 
 EXPECTED = "a camera path (.json: a list of {rotation, position, width, height, fx, fy} or of {viewmat, K, size})"
 
@@ -26,14 +26,14 @@ def read_camera_path(path: str | Path) -> Cameras:
     path = Path(path)
     must_exist(path, EXPECTED)
     try:
-        rows = json.loads(path.read_text())
+        rows = read_json(path)
         if not isinstance(rows, list) or not rows:
             raise TypeError("not a list of cameras")
         entries = [_entry(row) for row in rows]
         viewmats, Ks = (torch.from_numpy(np.stack([e[i] for e in entries])).float() for i in (0, 1))
         sizes = torch.tensor([entry[2] for entry in entries])
-    except (ValueError, KeyError, TypeError, np.linalg.LinAlgError) as error:
-        raise InputError(f"{path}: is not a valid camera path ({error!r}); {EXPECTED} is expected") from error
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RuntimeError, IndexError) as error:
+        raise InputError(f"{path}: is not a valid camera path ({reason(error)}); {EXPECTED} is expected") from error
     if not (sizes == sizes[0]).all() or not (sizes > 0).all():
         raise InputError(f"{path}: the cameras differ in image size, or it is zero; give all the same size")
     if not (viewmats.isfinite().all() and Ks.isfinite().all() and (Ks[:, [0, 1], [0, 1]] > 0).all()):

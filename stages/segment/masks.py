@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 from jaxtyping import Int
@@ -13,6 +12,7 @@ from stages.core.errors import InputError
 from stages.core.scene.images import read_labels
 from stages.core.scene.lens import Undistortion
 from stages.core.scene.scene import Scene
+from stages.core.scene.schema import quote, read_json, reason
 from stages.segment.options import SegmentOptions
 from stages.segment.view_images import match_files
 from stages.segment.voting import apply_votes, collect_votes
@@ -47,8 +47,8 @@ def read_names(folder: Path) -> dict[int, str]:
     if not path.exists():
         return {}
     try:
-        data = json.loads(path.read_text())
+        data = read_json(path)
         rows = enumerate(data, start=1) if isinstance(data, list) else data.items()
-        return {int(number): str(name) for number, name in rows}
-    except (ValueError, AttributeError) as error:
-        raise InputError(f'{path}: is not readable ({error}); write {{"1": "duck", "2": "bowl"}}') from error
+        return {int(number): quote(name, 200) for number, name in rows}
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RuntimeError, IndexError) as error:
+        raise InputError(f'{path}: is not readable ({reason(error)}); write {{"1": "duck", "2": "bowl"}}') from error

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +13,7 @@ from stages.core.errors import InputError
 from stages.core.scene.cameras import Cameras
 from stages.core.scene.files import must_exist
 from stages.core.scene.lens import Undistortion, photo_of
+from stages.core.scene.schema import quote, read_json, reason
 
 
 @dataclass(frozen=True)
@@ -34,16 +34,18 @@ def read_prompts(path: Path, cameras: Cameras, undistorted: bool = False) -> Obj
     """
     must_exist(path, "a prompts.json with bbox or center_point, and text")
     try:
-        data = json.loads(Path(path).read_text())
+        data = read_json(path)
         boxes = torch.tensor(data.get("bbox") or [], dtype=torch.float32).reshape(-1, 4)
         points = torch.tensor(data.get("center_point") or [], dtype=torch.float32).reshape(-1, 2)
         count = len(boxes) or len(points)
         width, height = (int(side) for side in data.get("size") or photo_of(cameras, 0, undistorted)[1])
+        if not (boxes.isfinite().all() and points.isfinite().all()):
+            raise ValueError("a coordinate is not finite")
         if width < 1 or height < 1:
             raise ValueError(f"size {width}x{height}")
-        names = tuple(str(name) for name in data.get("text") or [f"object_{i + 1}" for i in range(count)])
-    except (ValueError, KeyError, TypeError, AttributeError, RuntimeError) as error:
-        raise _wrong(path, repr(error)) from error
+        names = tuple(quote(name, 200) for name in data.get("text") or [f"object_{i + 1}" for i in range(count)])
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RuntimeError, IndexError) as error:
+        raise _wrong(path, reason(error)) from error
     if not count:
         raise _wrong(path, "neither a bbox nor a center_point")
     if {len(boxes), len(points), len(names)} - {0, count}:

@@ -18,6 +18,7 @@ from stages.core.backends import choose
 from stages.core.errors import InputError
 from stages.core.models.dynamics import Dynamics
 from stages.core.scene.files import must_exist, replacing, sha256
+from stages.core.scene.schema import quote, read_json, reason
 
 MODELS = {
     "ngff-paper": "stages.core.models.baselines.ngff_paper:PaperForceField",
@@ -111,6 +112,9 @@ def load(path: Path, device: torch.device | str = "cpu") -> tuple[Dynamics, dict
         state = load_file(path)
     except SafetensorError as error:
         raise InputError(f"{path}: is not a safetensors file ({error}); fetch or train it again") from error
+    wrong = [k for k, v in state.items() if v.is_floating_point() and not v.isfinite().all()]
+    if wrong:
+        raise InputError(f"{path}: {quote(wrong[0])} has values that are not finite; fetch or train it again")
     try:
         model = build(card["model"], **card["config"])
         model.load_state_dict({k: v.float() if v.is_floating_point() else v for k, v in state.items()})
@@ -123,11 +127,11 @@ def _card(path: Path) -> dict:
     file = path.with_suffix(".json")
     must_exist(file, f"the card of {path.name}")
     try:
-        card = json.loads(file.read_text())
+        card = read_json(file)
         wrong = not (isinstance(card["model"], str) and isinstance(card["sha256"], str))
         wrong |= not isinstance(card["config"], dict)
     except (ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{file}: is not the card of weights ({error!r}); fetch or train it again") from error
+        raise InputError(f"{file}: is not the card of weights ({reason(error)}); fetch or train it again") from error
     if wrong or card["model"] not in MODELS:
         raise InputError(f"{file}: needs model (one of {', '.join(MODELS)}), config and sha256")
     return card

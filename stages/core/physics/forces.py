@@ -7,7 +7,6 @@ object i + 1 here, where 0 is the background.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
@@ -18,6 +17,7 @@ from stages.core.physics.materials import find_object
 from stages.core.scene.files import must_exist
 from stages.core.scene.formats import FORMATS, suffixes
 from stages.core.scene.scene import SceneObject
+from stages.core.scene.schema import quote, read_json, reason
 
 Vector = tuple[float, float, float]
 FORCE_SYNTAX = 'write "object=2 force=0,0,8 from=0.1 to=0.3", optionally with torque=x,y,z or at=x,y,z'
@@ -191,12 +191,12 @@ def read_forces(path: Path, scene_name: str, objects: Sequence[SceneObject]) -> 
     """
     must_exist(path, "a JSON file {scene name: [{obj_id, start, end, force}]}")
     try:
-        data = json.loads(Path(path).read_text())
+        data = read_json(path)
     except ValueError as error:
-        raise InputError(f"{path}: is not JSON ({error})") from error
+        raise InputError(f"{path}: is not JSON ({reason(error)})") from error
     if isinstance(data, dict):
         if scene_name not in data and len(data) != 1:
-            raise InputError(f"{path}: has no scene {scene_name!r}; it has {', '.join(map(str, data)) or 'none'}")
+            raise InputError(f"{path}: has no scene {scene_name!r}; it has {quote(', '.join(data)) or 'none'}")
         data = data[scene_name] if scene_name in data else next(iter(data.values()))
     if not isinstance(data, list):
         raise InputError(f"{path}: must be {{scene name: [{{obj_id, start, end, force?, torque?}}]}}")
@@ -207,8 +207,9 @@ def _parse_entry(row: object, objects: Sequence[SceneObject], where: str) -> For
     try:
         id, start, end = int(row["obj_id"]) + 1, float(row["start"]), float(row["end"])
         push, torque = (_floats(row.get(name, [0, 0, 0])) for name in ("force", "torque"))
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise InputError(f"{where}: {error!r}; needs obj_id, start, end and force or torque of 3 numbers") from error
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RuntimeError, IndexError) as error:
+        why = reason(error)
+        raise InputError(f"{where}: {why}; needs obj_id, start, end and force or torque of 3 numbers") from error
     if id not in {o.id for o in objects}:
         raise InputError(f"{where}: obj_id {id - 1} (counted from 0) is object {id}, which this scene does not have")
     return _checked(Force(id, push, torque, start, end), where)

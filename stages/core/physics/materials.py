@@ -7,7 +7,6 @@ vibration of a whole body: the energy lost per cycle divided by 2 pi times the s
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -18,6 +17,7 @@ from stages.core.errors import InputError
 from stages.core.kernels.mpm.constitutive import COROTATED, NEO_HOOKEAN, SAND, SNOW, VON_MISES, sand_slope
 from stages.core.scene.files import must_exist
 from stages.core.scene.scene import SceneObject
+from stages.core.scene.schema import read_json, reason
 
 Triple = tuple[float | int, float | int, float | int]
 
@@ -209,9 +209,9 @@ def _read(file: Path) -> dict:
     """Contents of a materials file."""
     must_exist(file, "a JSON file {object name or id: material}")
     try:
-        data = json.loads(Path(file).read_text())
+        data = read_json(file)
     except ValueError as error:
-        raise InputError(f"{file}: is not JSON ({error})") from error
+        raise InputError(f"{file}: is not JSON ({reason(error)})") from error
     if not isinstance(data, dict):
         raise InputError(f"{file}: must be {{object name or id: material name or {{E, nu, density, friction}}}}")
     return data

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -13,9 +12,11 @@ from torch import Tensor
 
 from stages.core.errors import InputError, MissingPackage
 from stages.core.geometry.similarity import Similarity
+from stages.core.scene.schema import numbers, quote, read_json, reason
 
 LENS_MODEL = "opencv"  # the only one: k1 k2 p1 p2 k3 of OpenCV
 DISTORTION = ("k1", "k2", "p1", "p2", "k3")
+MAX_SIDE = 65536  # of an image [px]
 PINHOLE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")  # of transforms.json
 
 
@@ -54,6 +55,25 @@ class Cameras:
         return replace(self, viewmats=similarity.viewmats(self.viewmats))
 
 
+def check_cameras(cameras: Cameras) -> Cameras:
+    """The same cameras; ValueError, with the name of the first wrong one, unless they are rigid and finite."""
+    V, R = cameras.viewmats.double(), cameras.viewmats[:, :3, :3].double()
+    rigid = (R @ R.mT - torch.eye(3, dtype=R.dtype)).abs().amax((1, 2)) < 1e-2
+    rigid &= (torch.linalg.det(R) > 0) & ((V[:, 3] - V.new_tensor([0, 0, 0, 1])).abs().amax(1) < 1e-4)
+    focals, sizes = cameras.Ks[:, [0, 1], [0, 1]], cameras.sizes
+    checks = {
+        "a value of viewmat that is not finite": cameras.viewmats.isfinite().all((1, 2)),
+        "a value of K that is not finite": cameras.Ks.isfinite().all((1, 2)),
+        "a viewmat that is not a rotation and a translation": rigid,
+        "a focal length in K that is not above 0": (focals > 0).all(1),
+        f"a size that is not 1 to {MAX_SIDE} px": ((sizes > 0) & (sizes <= MAX_SIDE)).all(1),
+    }
+    for what, right in checks.items():
+        if not right.all():
+            raise ValueError(f"{quote(cameras.names[int((~right).nonzero()[0])])} has {what}")
+    return cameras
+
+
 def to_json(cameras: Cameras) -> list[dict]:
     """One dict per camera, as stored in the header of scene.ply."""
     rows = [
@@ -76,17 +96,18 @@ def from_json(rows: list[dict]) -> Cameras | None:
     """
     if not rows:
         return None
-    names = tuple(str(row["name"]) for row in rows)
+    names = tuple(quote(row["name"], 255) for row in rows)
     viewmats = torch.stack([_matrix(row["viewmat"], (4, 4), f"{row['name']}: viewmat") for row in rows])
     Ks, sizes = _intrinsics(rows, names)
     if not any("photo" in row for row in rows):
-        return Cameras(viewmats, Ks, sizes, names)
+        return check_cameras(Cameras(viewmats, Ks, sizes, names))
     photos = [row.get("photo", {**row, "model": LENS_MODEL, "distortion": [0.0] * 5}) for row in rows]
     labels = tuple(f"{name}: photo" for name in names)
     if unknown := [photo["model"] for photo in photos if photo["model"] != LENS_MODEL]:
-        raise ValueError(f"lens model {unknown[0]!r} is not known; only {LENS_MODEL!r} is")
+        raise ValueError(f"lens model {quote(repr(unknown[0]))} is not known; only {LENS_MODEL!r} is")
     lenses = [_matrix(p["distortion"], (5,), f"{label}: distortion") for p, label in zip(photos, labels, strict=True)]
-    return Cameras(viewmats, Ks, sizes, names, PhotoIntrinsics(*_intrinsics(photos, labels), torch.stack(lenses)))
+    taken = PhotoIntrinsics(*_intrinsics(photos, labels), torch.stack(lenses))
+    return check_cameras(Cameras(viewmats, Ks, sizes, names, taken))
 
 
 def _intrinsics(rows: list[dict], labels: tuple[str, ...]) -> tuple[Float[Tensor, "c 3 3"], Int[Tensor, "c 2"]]:
@@ -96,8 +117,8 @@ def _intrinsics(rows: list[dict], labels: tuple[str, ...]) -> tuple[Float[Tensor
         K, size = _matrix(row["K"], (3, 3), f"{label}: K"), row["size"]
         if not (K[0, 0] > 0 and K[1, 1] > 0):
             raise ValueError(f"{label}: a focal length in K is not above 0")
-        if len(size) != 2 or not all(isinstance(side, int) and side > 0 for side in size):
-            raise ValueError(f"{label}: size {size} is not two whole numbers above 0")
+        if len(size) != 2 or not all(isinstance(side, int) and 0 < side <= MAX_SIDE for side in size):
+            raise ValueError(f"{label}: size {quote(size, 40)} is not two whole numbers above 0")
         Ks.append(K)
         sizes.append(size)
     return torch.stack(Ks), torch.tensor(sizes, dtype=torch.int64)
@@ -132,11 +153,11 @@ def read_cameras(path: Path) -> tuple[Cameras, LensDistortion]:
     if not path.exists():
         raise InputError(f"{path}: no such file; give a transforms.json or a COLMAP model folder")
     try:
-        data = json.loads(path.read_text())
-        return _from_transforms(data)
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        return _from_transforms(read_json(path))
+    except (ValueError, KeyError, TypeError, AttributeError, RuntimeError, OverflowError) as error:
+        why = reason(error)
         raise InputError(
-            f"{path}: is not a nerfstudio transforms file ({error!r}); it needs frames with file_path and "
+            f"{path}: is not a nerfstudio transforms file ({why}); it needs frames with file_path and "
             "transform_matrix, and fl_x fl_y cx cy w h"
         ) from error
 
@@ -156,8 +177,9 @@ def _from_transforms(data: dict) -> tuple[Cameras, LensDistortion]:
         raise ValueError("no frames")
     if not all(np.isfinite(rows).all() for rows in (viewmats, Ks, sizes, lenses)):
         raise ValueError("a value is not finite")
-    cameras = Cameras(_float(viewmats), _float(Ks), torch.tensor(sizes, dtype=torch.int64), tuple(names))
-    return cameras, LensDistortion(_float(lenses))
+    sizes = [numbers(size, 2, "w h", 1, MAX_SIDE) for size in sizes]
+    cameras = Cameras(_float(viewmats), _float(Ks), torch.tensor(sizes).long(), tuple(names))
+    return check_cameras(cameras), LensDistortion(_float(lenses))
 
 
 def _transforms_lens(value: dict) -> list[float]:
@@ -189,7 +211,13 @@ def _read_colmap(path: Path) -> tuple[Cameras, LensDistortion]:
     if not names:
         raise InputError(f"{path}: the COLMAP model has no registered image")
     cameras = Cameras(_float(viewmats), _float(Ks), torch.tensor(sizes, dtype=torch.int64), tuple(names))
-    return cameras, LensDistortion(_float(lenses))
+    lens = LensDistortion(_float(lenses))
+    try:
+        if not lens.coefficients.isfinite().all():
+            raise ValueError("a lens has a coefficient that is not finite")
+        return check_cameras(cameras), lens
+    except ValueError as error:
+        raise InputError(f"{path}: {error}; make the COLMAP model again") from error
 
 
 def _colmap_lens(path: Path, camera) -> list[float]:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 from stages.core.scene.cameras import Cameras
 from stages.core.scene.gaussians import Gaussians
+from stages.core.scene.schema import MAX_OBJECT_ID, number, numbers, quote
 
 UNKNOWN_SCALE = ("assumed", "not stated")  # beginnings of `source` where the scale is not known
 
@@ -48,3 +49,25 @@ class Scene:
     def name_of(self, object_id: int) -> str:
         """The name of an object, object_ID where it has none."""
         return next((o.name for o in self.objects if o.id == object_id), f"object_{object_id}")
+
+
+def read_object(id: object, name: object, material: object = "") -> SceneObject:
+    """An object as a file states it; ValueError for another id than a whole number from 0 to MAX_OBJECT_ID."""
+    if number(id, "an object's id", 0, MAX_OBJECT_ID) != int(id):
+        raise ValueError(f"an object's id is {id}, not a whole number")
+    if not isinstance(name, str) or not isinstance(material, str):
+        raise ValueError(f"name or material of object {id} is not text")
+    return SceneObject(int(id), quote(name, 200), quote(material, 200))
+
+
+def read_metadata(floor: object, scale: object, provenance: object, background: object) -> dict:
+    """The arguments of a Scene of these names as a file states them; ValueError for wrong types and values."""
+    if not isinstance(scale, dict) or not isinstance(provenance, dict):
+        raise ValueError("scale or provenance is not a JSON object")
+    if "metres_per_unit" in scale:
+        number(scale["metres_per_unit"], "metres_per_unit", 1e-6, 1e6)
+    colour = None if background is None else [min(max(x, 0.0), 1.0) for x in numbers(background, 3, "background")]
+    return {
+        "floor": None if floor is None else number(floor, "floor"), "scale": scale, "provenance": provenance,
+        "background": None if colour is None else tuple(colour),
+    }  # fmt: skip

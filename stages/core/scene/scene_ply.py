@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import re
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,8 @@ from stages.core.scene import cameras as camera_json
 from stages.core.scene.files import must_exist, replacing
 from stages.core.scene.gaussians import Gaussians
 from stages.core.scene.packed_ply import is_packed, unpack
-from stages.core.scene.scene import Scene, SceneObject
+from stages.core.scene.scene import Scene, SceneObject, read_metadata, read_object
+from stages.core.scene.schema import LARGEST, MAX_OBJECT_ID, check_ply_counts, number, parse_json, reason
 
 log = logging.getLogger(__name__)
 VERSION = 1
@@ -27,22 +29,41 @@ EXPECTED = "a 3D-Gaussian PLY, such as `ngff reconstruct` writes"
 def read_scene(path: Path) -> Scene:
     """Read a 3D-Gaussian PLY of any tool (SH degree 0 to 3, either byte order, packed or not).
 
-    Gaussians with a non-finite value or a zero quaternion are dropped with a warning. Raises InputError for other
-    files, files without Gaussians and newer versions.
+    Gaussians with a non-finite value, one beyond LARGEST or a zero quaternion are dropped with a warning. Raises
+    InputError for other files, files without Gaussians and newer versions.
     """
     path = Path(path)
     must_exist(path, EXPECTED)
     try:
+        _check_counts(path)
         ply = PlyData.read(str(path))
-    except (PlyParseError, ValueError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: is not a readable PLY file ({error}); {EXPECTED} is expected") from error
+    except (PlyParseError, ValueError, OverflowError, MemoryError, IndexError) as error:
+        why = reason(error)
+        raise InputError(f"{path}: is not a readable PLY file ({why}); {EXPECTED} is expected") from error
     if "vertex" not in ply:
         raise InputError(f"{path}: has no element called vertex; {EXPECTED} is expected")
-    raw = unpack(ply) if is_packed(ply) else {p.name: ply["vertex"][p.name] for p in ply["vertex"].properties}
-    gaussians = _activate(path, raw)
+    if not len(ply["vertex"].data):
+        raise InputError(f"{path}: holds no Gaussians; {EXPECTED} is expected")
+    try:
+        raw = unpack(ply) if is_packed(ply) else {p.name: ply["vertex"][p.name] for p in ply["vertex"].properties}
+        gaussians = _activate(path, raw)
+    except (ValueError, KeyError, IndexError, TypeError) as error:
+        raise InputError(f"{path}: its properties are damaged ({reason(error)}); {EXPECTED} is expected") from error
     if not len(gaussians):
         raise InputError(f"{path}: holds no Gaussians; {EXPECTED} is expected")
     return _with_header(path, gaussians, ply.comments)
+
+
+def _check_counts(path: Path) -> None:
+    """ValueError where the file is shorter than its header declares."""
+    header = []
+    with path.open("rb") as file:
+        while line := file.readline(16 << 20):
+            header.append(line.decode(errors="replace"))
+            if line.strip() == b"end_header":
+                return check_ply_counts(header, path.stat().st_size - file.tell())
+            if len(header) == 1 and line.strip() != b"ply":
+                break  # plyfile says what it is
 
 
 def _activate(path: Path, raw: dict[str, np.ndarray]) -> Gaussians:
@@ -53,17 +74,22 @@ def _activate(path: Path, raw: dict[str, np.ndarray]) -> Gaussians:
             f"{path}: no vertex property {', '.join(missing)}; {EXPECTED} is expected "
             "(this may be a plain point cloud)"
         )
-    rest = sorted((n for n in raw if n.startswith("f_rest_")), key=lambda n: int(n.rsplit("_", 1)[1]))
+    rest = sorted((n for n in raw if re.fullmatch(r"f_rest_[0-9]{1,3}", n)), key=lambda n: int(n.rsplit("_", 1)[1]))
     if len(rest) not in (0, 9, 24, 45):
         raise InputError(f"{path}: {len(rest)} f_rest properties; SH of degree 1, 2 or 3 has 9, 24 or 45")
-    columns = {name: np.asarray(raw[name], np.float32) for name in REQUIRED + COLOURS + rest}
+    with np.errstate(over="ignore", invalid="ignore"):
+        columns = {name: np.asarray(raw[name], np.float32) for name in REQUIRED + COLOURS + rest}
     table = torch.from_numpy(np.stack(list(columns.values()), 1))
     n, quats = len(table), table[:, 7:11]
     sh = torch.cat([table[:, 11:14, None], table[:, 14:].reshape(n, 3, -1)], 2).mT.contiguous()  # channel-major
-    ids = torch.from_numpy(np.asarray(raw.get("object_id", np.zeros(n))).astype(np.int64))
-    keep = table.isfinite().all(1) & (quats.norm(dim=1) > 1e-12)
+    stored = np.asarray(raw.get("object_id", np.zeros(n)))
+    if not ((stored >= 0) & (stored <= MAX_OBJECT_ID)).all():
+        raise ValueError(f"an object_id is not from 0 to {MAX_OBJECT_ID}")
+    ids = torch.from_numpy(stored.astype(np.int64))
+    keep = (table.abs() <= LARGEST).all(1) & (table[:, 4:7] <= np.log(LARGEST)).all(1) & (quats.norm(dim=1) > 1e-12)
     if not keep.all():
-        log.warning("%s: dropped %d Gaussians with values that are not finite", path, int((~keep).sum()))
+        dropped = int((~keep).sum())
+        log.warning("%s: dropped %d Gaussians with values that are not finite, or far too large", path, dropped)
     everything = Gaussians(
         table[:, :3].contiguous(), torch.nn.functional.normalize(quats, dim=1), table[:, 4:7].exp(),
         table[:, 3].sigmoid(), sh, ids,
@@ -78,31 +104,27 @@ def _with_header(path: Path, gaussians: Gaussians, comments: list[str]) -> Scene
         for comment in comments:
             if comment.startswith("ngff:"):
                 key, value = comment[5:].split(" ", 1)
-                metadata.setdefault(key, []).append(json.loads(value))
-        version = metadata.get("version", [VERSION])[0]
+                metadata.setdefault(key, []).append(parse_json(value, finite=key != "provenance"))
+        version = number(metadata.get("version", [VERSION])[0], "version", 0)
         if version > VERSION:
-            raise InputError(f"{path}: format version {version} is newer than {VERSION}; upgrade ngff")
+            raise InputError(f"{path}: format version {version:g} is newer than {VERSION}; upgrade ngff")
         ids = gaussians.object_id.unique().tolist()
-        named = {o["id"]: SceneObject(o["id"], o["name"], o.get("material", "")) for o in metadata.get("object", [])}
+        named = {o["id"]: read_object(o["id"], o["name"], o.get("material", "")) for o in metadata.get("object", [])}
         unnamed = {i: SceneObject(i, f"object_{i}") for i in ids if i > 0 and i not in named}
         return Scene(
             gaussians,
             tuple(o for _, o in sorted((named | unnamed).items())),
             camera_json.from_json(metadata.get("camera", [])),
-            metadata.get("floor", [None])[0],
-            metadata.get("scale", [{"metres_per_unit": 1.0, "source": "not stated in the file"}])[0],
-            metadata.get("provenance", [{}])[0],
-            _colour(metadata.get("background", [None])[0]),
+            **read_metadata(
+                metadata.get("floor", [None])[0],
+                metadata.get("scale", [{"metres_per_unit": 1.0, "source": "not stated in the file"}])[0],
+                metadata.get("provenance", [{}])[0],
+                metadata.get("background", [None])[0],
+            ),
         )
-    except (ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{path}: a header comment ngff:KEY is damaged ({error!r}); write the file again") from error
-
-
-def _colour(value: list | None) -> tuple[float, float, float] | None:
-    if value is None:
-        return None
-    red, green, blue = (min(max(float(x), 0.0), 1.0) for x in value)
-    return red, green, blue
+    except (ValueError, KeyError, TypeError, AttributeError, RuntimeError) as error:
+        why = reason(error)
+        raise InputError(f"{path}: a header comment ngff:KEY is damaged ({why}); write the file again") from error
 
 
 def write_scene(path: Path, scene: Scene) -> None:

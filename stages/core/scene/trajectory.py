@@ -16,14 +16,41 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from stages.core.errors import InputError
-from stages.core.scene.cameras import Cameras
+from stages.core.scene.cameras import MAX_SIDE, Cameras, check_cameras
 from stages.core.scene.files import must_exist, replacing
 from stages.core.scene.gaussians import Gaussians
-from stages.core.scene.scene import Scene, SceneObject
+from stages.core.scene.scene import Scene, read_metadata, read_object
+from stages.core.scene.schema import MAX_OBJECT_ID, Dataset, number, numbers, parse_json, quote, reason
 
 log = logging.getLogger(__name__)
 FORMAT, VERSION = "ngff-trajectory", 1
 EXPECTED = "a trajectory (.h5), such as `ngff simulate` writes"
+DATASETS = {  # n Gaussians, k coefficients, o objects, p keypoints, t frames, c cameras, j keypoints of a Gaussian
+    "gaussians/means": Dataset("n 3"),
+    "gaussians/quats": Dataset("n 4"),
+    "gaussians/scales": Dataset("n 3", low=0),
+    "gaussians/opacities": Dataset("n", low=-1e-3, high=1.001),  # as rounded by 16-bit floats
+    "gaussians/sh": Dataset("n k 3"),
+    "gaussians/object_id": Dataset("n", "int", 0, MAX_OBJECT_ID),
+    "objects/id": Dataset("o", "int", 0, MAX_OBJECT_ID),
+    "objects/name": Dataset("o", "text"),
+    "objects/material": Dataset("o", "text"),
+    "objects/com": Dataset("t o 3"),
+    "objects/rotation": Dataset("t o 4"),
+    "keypoints/rest": Dataset("p 3"),
+    "keypoints/object_id": Dataset("p", "int", 0, MAX_OBJECT_ID),
+    "keypoints/positions": Dataset("t p 3"),
+    "binding/index": Dataset("b j", "int", -1),  # b is n, but where there are dense frames
+    "binding/weight": Dataset("b j", low=-1e-3, high=1.001),
+    "cameras/viewmats": Dataset("c 4 4"),
+    "cameras/Ks": Dataset("c 3 3"),
+    "cameras/sizes": Dataset("c 2", "int", 1, MAX_SIDE),
+    "cameras/names": Dataset("c", "text"),
+    "forces/json": Dataset("f", "text"),
+    "frames/means": Dataset("t n 3"),
+    "frames/quats": Dataset("t n 4"),
+    "frames/scales": Dataset("t n 3", low=0),
+}
 COMPRESSED = {"compression": "gzip", "compression_opts": 4, "shuffle": True}
 
 
@@ -73,9 +100,13 @@ class Trajectory:
     def frame(self, t: int) -> Gaussians:
         """All Gaussians in frame t, read from the file; only where `dense`."""
         with h5py.File(self.path, "r") as file:
-            parts = {name: torch.from_numpy(file[f"frames/{name}"][t]) for name in ("means", "quats", "scales")}
+            names = [f"frames/{name}" for name in ("means", "quats", "scales")]
+            try:
+                rows = [torch.from_numpy(DATASETS[name].checked(file[name][t], name)) for name in names]
+            except (OSError, ValueError) as error:
+                raise InputError(f"{self.path}: frame {t} is damaged ({reason(error)})") from error
         g = self.scene.gaussians
-        return Gaussians(**parts, opacities=g.opacities, sh=g.sh, object_id=g.object_id)
+        return Gaussians(*rows, opacities=g.opacities, sh=g.sh, object_id=g.object_id)
 
 
 class _ErrorDeferringFile(io.FileIO):
@@ -226,59 +257,58 @@ def read_trajectory(path: Path) -> Trajectory:
         with h5py.File(path, "r") as file:
             kind = file.attrs.get("format", "")
             if kind != FORMAT:
-                raise InputError(f"{path}: its format attribute is {kind!r}, not {FORMAT!r}; {EXPECTED} is expected")
-            if int(file.attrs["version"]) > VERSION:
-                raise InputError(f"{path}: version {file.attrs['version']} is newer than {VERSION}; upgrade ngff")
-            _check(path, file)
+                kind = quote(repr(kind))
+                raise InputError(f"{path}: its format attribute is {kind}, not {FORMAT!r}; {EXPECTED} is expected")
+            version = number(file.attrs["version"], "version", 0)
+            if version > VERSION:
+                raise InputError(f"{path}: version {version:g} is newer than {VERSION}; upgrade ngff")
             return _read(path, file)
     except KeyError as error:
-        missing = error.args[0]
-        raise InputError(
-            f"{path}: a part of the trajectory is missing ({missing}); see stages/core/scene/README.md"
-        ) from error
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: is not a readable HDF5 file ({error}); {EXPECTED} is expected") from error
+        raise InputError(f"{path}: a part of the trajectory is missing ({quote(error.args[0])}); see "
+                         "stages/core/scene/README.md") from error  # fmt: skip
+    except (OSError, ValueError, TypeError, RuntimeError, MemoryError) as error:  # h5py raises all of them
+        why = reason(error)
+        raise InputError(f"{path}: is not a readable HDF5 file ({why}); {EXPECTED} is expected") from error
 
 
 def _read(path: Path, file: h5py.File) -> Trajectory:
-    def tensor(name: str) -> Tensor:
-        return torch.from_numpy(np.asarray(file[name][()]))
+    lengths: dict[str, int] = {}
 
-    def names(name: str) -> list[str]:
-        return [str(s) for s in file[name].asstr()[()]] if name in file else []
+    def values(name: str) -> Tensor | list[str]:
+        found = DATASETS[name].read(file, name, lengths)
+        return found if isinstance(found, list) else torch.from_numpy(found)
 
-    gaussians = Gaussians(**{f.name: tensor(f"gaussians/{f.name}") for f in fields(Gaussians)})
-    ids = [int(i) for i in file["objects/id"][()]]
-    materials = names("objects/material") or [""] * len(ids)
-    objects = tuple(SceneObject(*row) for row in zip(ids, names("objects/name"), materials, strict=True))
+    keypoints = Keypoints(values("keypoints/rest"), values("keypoints/object_id"))
+    motion = (values("keypoints/positions"), values("objects/com"), values("objects/rotation"))
+    gaussians = Gaussians(**{f.name: values(f"gaussians/{f.name}") for f in fields(Gaussians)})
+    if not len(motion[0]) or not len(gaussians):
+        raise InputError(f"{path}: has no {'Gaussians' if len(motion[0]) else 'frames'}")
+    if lengths["k"] not in (1, 4, 9, 16):
+        raise ValueError(f"gaussians/sh has {lengths['k']} coefficients, not 1, 4, 9 or 16")
+    if not (gaussians.quats.norm(dim=1) > 1e-6).all():
+        raise ValueError("gaussians/quats has a quaternion of zero length")
+    dense = "frames/means" in file
+    if dense:
+        for name in ("means", "quats", "scales"):
+            DATASETS[f"frames/{name}"].open(file, f"frames/{name}", lengths)
+    binding = Binding(values("binding/index"), values("binding/weight"))
+    if not dense and (len(binding.index) != lengths["n"] or bool((binding.index >= lengths["p"]).any())):
+        raise InputError(f"{path}: the binding does not fit the {lengths['n']} Gaussians and {lengths['p']} keypoints")
+    ids = values("objects/id").tolist()
+    materials = values("objects/material") if "objects/material" in file else [""] * len(ids)
+    objects = tuple(read_object(*row) for row in zip(ids, values("objects/name"), materials, strict=True))
     cameras = None
     if "cameras/viewmats" in file:
-        cameras = Cameras(*(tensor(f"cameras/{n}") for n in ("viewmats", "Ks", "sizes")), tuple(names("cameras/names")))
-    floor = float(file.attrs["floor"]) if "floor" in file.attrs else None
-    scale = json.loads(file.attrs.get("scale", '{"metres_per_unit": 1.0, "source": "not stated"}'))
-    background = tuple(float(x) for x in file.attrs["background"]) if "background" in file.attrs else None
-    scene = Scene(gaussians, objects, cameras, floor, scale, json.loads(file.attrs.get("provenance", "{}")), background)
-    gravity = tuple(float(g) for g in file.attrs["gravity"])
-    forces = tuple(json.loads(f) for f in names("forces/json"))
-    info = SimulationInfo(float(file.attrs["dt"]), gravity, str(file.attrs["engine"]), forces)
-    keypoints = Keypoints(tensor("keypoints/rest"), tensor("keypoints/object_id").long())
-    binding = Binding(tensor("binding/index").long(), tensor("binding/weight"))
-    motion = (tensor("keypoints/positions"), tensor("objects/com"), tensor("objects/rotation"))
-    return Trajectory(scene, info, keypoints, binding, *motion, path, "frames/means" in file)
-
-
-def _check(path: Path, file: h5py.File) -> None:
-    """Raise InputError unless the shapes agree and the positions are finite."""
-    t, p = file["keypoints/positions"].shape[0], len(file["keypoints/rest"])
-    o, n = len(file["objects/id"]), len(file["gaussians/means"])
-    if not t:
-        raise InputError(f"{path}: has no frames")
-    expected = {"keypoints/positions": (t, p, 3), "objects/com": (t, o, 3), "objects/rotation": (t, o, 4)}
-    for name, shape in expected.items():
-        if file[name].shape != shape:
-            raise InputError(f"{path}: {name} has shape {file[name].shape}; the other datasets need {shape}")
-    index = file["binding/index"]
-    if "frames/means" not in file and (len(index) != n or (index.size and int(index[()].max()) >= p)):
-        raise InputError(f"{path}: the binding does not fit the {n} Gaussians and {p} keypoints")
-    if not np.isfinite(file["keypoints/positions"][()]).all():
-        raise InputError(f"{path}: some keypoint positions are not finite")
+        *matrices, names = (values(f"cameras/{n}") for n in ("viewmats", "Ks", "sizes", "names"))
+        cameras = check_cameras(Cameras(*matrices, tuple(quote(name, 255) for name in names)))
+    attributes = file.attrs
+    scale = parse_json(str(attributes.get("scale", '{"metres_per_unit": 1.0, "source": "not stated"}')))
+    made_by = parse_json(str(attributes.get("provenance", "{}")), finite=False)
+    metadata = read_metadata(attributes.get("floor"), scale, made_by, attributes.get("background"))
+    scene = Scene(gaussians, objects, cameras, **metadata)
+    forces = tuple(parse_json(f) for f in (values("forces/json") if "forces/json" in file else []))
+    if not all(isinstance(force, dict) for force in forces):
+        raise ValueError("forces/json has a row that is not a JSON object")
+    dt, gravity = number(attributes["dt"], "dt", 1e-6, 1e4), numbers(attributes["gravity"], 3, "gravity")
+    info = SimulationInfo(dt, gravity, quote(attributes["engine"]), forces)
+    return Trajectory(scene, info, keypoints, binding, *motion, path, dense)

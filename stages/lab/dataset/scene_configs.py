@@ -19,6 +19,7 @@ from scipy.spatial import cKDTree
 
 from stages.core.errors import InputError
 from stages.core.scene.files import must_exist, replacing
+from stages.core.scene.schema import quote, read_json, reason
 
 SEED = 42
 HALF_EXTENT = 0.9  # of the cube that contains all bounding spheres [m]
@@ -175,17 +176,17 @@ def read_scene_configs(path: Path) -> dict[str, SceneConfig]:
     """
     must_exist(path, "scene configurations (.json)")
     try:
-        rows = json.loads(Path(path).read_text())
+        rows = read_json(path)
         configs = {
             name: SceneConfig(name, tuple(int(i) for i in row["scene_object_idxs"]),
                          tuple(tuple(float(v) for v in p) for p in row["translation"]),
                          tuple(float(s) for s in row["scale"]))
             for name, row in rows.items()
         }  # fmt: skip
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise InputError(f"{path}: is not a file of scene configurations ({error!r})") from error
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RuntimeError, IndexError) as error:
+        raise InputError(f"{path}: is not a file of scene configurations ({reason(error)})") from error
     wrong = next((name for name in configs if not SCENE_NAME.fullmatch(name)), None)
     if wrong is not None:
-        raise InputError(f"{path}: the scene name {wrong!r} cannot be a file name; use letters, digits, '_', '-' "
-                         "and '.', such as 2700_0_7_11")  # fmt: skip
+        raise InputError(f"{path}: the scene name {quote(repr(wrong))} cannot be a file name; use letters, digits, "
+                         "'_', '-' and '.', such as 2700_0_7_11")  # fmt: skip
     return configs

@@ -88,3 +88,9 @@ def test_damaged_files_are_refused_in_one_line(tmp_path, two_balls, how, message
     with pytest.raises(InputError, match=message) as caught:
         read_trajectory(tmp_path / "t.h5")
     assert "\n" not in str(caught.value)
+
+
+def test_frame_rate_for_other_readers_is_the_inverse_of_the_time_step(tmp_path, two_balls):
+    write(tmp_path / "t.h5", two_balls)
+    with h5py.File(tmp_path / "t.h5") as file:
+        assert file.attrs["dt"] == 0.02 and file.attrs["fps"] == pytest.approx(50)

@@ -8,14 +8,11 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
-import h5py
 import numpy as np
 
 MAX_JSON_BYTES, MAX_JSON_DEPTH = 256 << 20, 100
-MAX_COMPRESSION = 1100  # deflate reaches 1032
 MAX_OBJECT_ID = 65535  # label images have 16 bits
 LARGEST = 1e9  # of coordinates and sizes [scene units]; squares stay far from the limit of float32
 MAX_QUOTED = 80
@@ -87,59 +84,6 @@ def _int64(text: str) -> int:
 
 
 FINITE = {"parse_constant": _finite, "parse_float": _finite, "parse_int": _int64}
-
-
-@dataclass(frozen=True)
-class Dataset:
-    """What an HDF5 dataset must be; its lengths are numbers, or letters that stand for the same number in all."""
-
-    shape: str
-    kind: str = "float"  # float (of any width, or integers), int or text
-    low: Bound = -LARGEST
-    high: Bound = LARGEST
-
-    def open(self, file: h5py.File, name: str, lengths: dict[str, int]) -> h5py.Dataset:
-        """The dataset, checked but for its values; adds new letters to `lengths`. KeyError where there is none."""
-        parts = name.split("/")
-        for i in range(len(parts)):  # a soft link may be a loop, and an external one names any file of the machine
-            link = file.get("/".join(parts[: i + 1]), getlink=True)
-            if link is None:
-                raise KeyError(name)
-            if not isinstance(link, h5py.HardLink):
-                raise ValueError(f"{name} is a link")
-        data = file[name]
-        if not isinstance(data, h5py.Dataset) or data.is_virtual or data.external or data.shape is None:
-            raise ValueError(f"{name} is not a dataset with values of its own")
-        expected = tuple(lengths.get(s, -1) if s.isalpha() else int(s) for s in self.shape.split())
-        fits = len(expected) == len(data.shape) and all(e in (-1, s) for e, s in zip(expected, data.shape, strict=True))
-        if not fits:
-            wanted = ", ".join(str(lengths.get(s, s)) for s in self.shape.split())
-            raise ValueError(f"{name} has shape {data.shape}; the other datasets need ({wanted})")
-        text = h5py.check_string_dtype(data.dtype) is not None
-        kind = "text" if text else data.dtype.kind
-        if kind not in {"float": ("f", "i", "u"), "int": ("i", "u"), "text": ("text",)}[self.kind]:
-            raise ValueError(f"{name} has values of type {quote(data.dtype, 40)}, not {self.kind}")
-        stored = data.id.get_storage_size()
-        if data.size * data.dtype.itemsize > MAX_COMPRESSION * stored + 4096:
-            raise ValueError(f"{name} declares {data.size} values, but the file stores only {stored} bytes of them")
-        lengths.update({s: n for s, n in zip(self.shape.split(), data.shape, strict=True) if s.isalpha()})
-        return data
-
-    def read(self, file: h5py.File, name: str, lengths: dict[str, int]) -> np.ndarray | list[str]:
-        """The values as float32, int64 or text; ValueError where one is not finite or out of range."""
-        data = self.open(file, name, lengths)
-        if self.kind == "text":
-            return [str(s) for s in data.asstr(errors="replace")[()]]
-        return self.checked(data[()], name)
-
-    def checked(self, values: np.ndarray, name: str) -> np.ndarray:
-        """Values in native byte order, float32 or int64; ValueError where one is not finite or out of range."""
-        if values.dtype.kind == "f" and values.dtype.itemsize < 4:
-            values = values.astype(np.float32)
-        if not ((values >= self.low) & (values <= self.high)).all():  # false for NaN
-            why = "some are not finite" if not np.isfinite(values).all() else "out of range"
-            raise ValueError(f"{name} must be from {self.low:g} to {self.high:g}; {why}")
-        return np.ascontiguousarray(values, np.float32 if self.kind == "float" else np.int64)
 
 
 def check_ply_counts(header: Sequence[str], size: int) -> None:

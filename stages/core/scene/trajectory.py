@@ -19,8 +19,9 @@ from stages.core.errors import InputError
 from stages.core.scene.cameras import MAX_SIDE, Cameras, check_cameras
 from stages.core.scene.files import must_exist, replacing
 from stages.core.scene.gaussians import Gaussians
+from stages.core.scene.h5_schema import Dataset
 from stages.core.scene.scene import Scene, read_metadata, read_object
-from stages.core.scene.schema import MAX_OBJECT_ID, Dataset, number, numbers, parse_json, quote, reason
+from stages.core.scene.schema import MAX_OBJECT_ID, number, numbers, parse_json, quote, reason
 
 log = logging.getLogger(__name__)
 FORMAT, VERSION = "ngff-trajectory", 1

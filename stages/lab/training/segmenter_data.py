@@ -17,7 +17,7 @@ from stages.core.geometry.cameras import centres
 from stages.core.geometry.neighbours import knn
 from stages.core.geometry.similarity import umeyama
 from stages.core.models.segmenter.surfels import scene_surfels
-from stages.core.models.segmenter.voxels import VOXEL, ScenePoints, VoxelGrid, voxelise
+from stages.core.models.segmenter.voxels import VOXEL, ScenePoints, VoxelGrid, neighbour_table, voxelise
 from stages.core.scene.scene import Scene
 from stages.core.scene.scene_ply import read_scene
 from stages.lab.clutter.scenes import OBSERVED, TRUTH, write_observation
@@ -26,6 +26,7 @@ RECONSTRUCTION = "scene.ply"
 MAX_DISTANCE = 0.025  # from the true surface; farther Gaussians are floaters [camera distance]
 FLOATER = -1  # label
 MIN_OBJECT = 8  # voxels of an object that counts
+MAX_PAIRS = 60_000  # of a scene
 MAX_FLOATERS = 25  # clouds of points that belong to nothing
 APART = 2048  # voxels between the scenes of a batch, a multiple of the coarsest voxel
 MAX_RELIEF = 0.012  # [camera distance]
@@ -93,6 +94,7 @@ class Targets:
     labels: Int[Tensor, "v"]  # of the majority of surfels: -1 floater or clutter, 0 surface, 1... objects
     classes: Int[Tensor, "v"]  # of CLASSES
     offsets: Float[Tensor, "v 3"]  # to the centre of the object; 0 elsewhere
+    pairs: Int[Tensor, "e 2"]  # of voxels that are not both surface, at least one of them an object's
 
 
 def augmented(example: Example, rng: np.random.Generator) -> tuple[ScenePoints, Int[Tensor, "n"]]:
@@ -167,7 +169,7 @@ def targets(surfels: ScenePoints, labels: Int[Tensor, "n"], shift: Float[Tensor,
     middle = torch.zeros(count.shape[1], 3).index_add_(0, own.clamp_min(0), grid.points)
     middle = middle / size[: len(middle), None].clamp_min(1)
     offsets = torch.where((own > 0)[:, None], middle[own.clamp_min(0)] - grid.points, torch.zeros(3))
-    return Targets(grid, own, classes, offsets)
+    return Targets(grid, own, classes, offsets, torch.zeros(0, 2, dtype=torch.int64))
 
 
 def joined(parts: Sequence[Targets]) -> Targets:
@@ -183,9 +185,19 @@ def joined(parts: Sequence[Targets]) -> Targets:
         torch.zeros(0, dtype=torch.int64),
     )
     labels = [torch.where(p.labels > 0, p.labels + k * highest, p.labels) for k, p in enumerate(parts)]
-    return Targets(
-        grid, torch.cat(labels), *(torch.cat([getattr(p, n) for p in parts]) for n in ("classes", "offsets"))
-    )
+    first = np.cumsum([0, *(len(p.grid) for p in parts)])
+    pairs = [p.pairs + int(n) for p, n in zip(parts, first, strict=False)]
+    classes, offsets = (torch.cat([getattr(p, name) for p in parts]) for name in ("classes", "offsets"))
+    return Targets(grid, torch.cat(labels), classes, offsets, torch.cat(pairs))
+
+
+def with_pairs(t: Targets, rng: np.random.Generator) -> Targets:
+    """The targets with at most MAX_PAIRS random pairs of voxels to be judged."""
+    kept = t.classes != 0
+    pairs = voxel_pairs(neighbour_table(t.grid.cells), t.grid.points, rng, 1)
+    pairs = pairs[kept[pairs[:, 0]] & kept[pairs[:, 1]]]
+    pairs = pairs[(t.labels[pairs[:, 0]] > 0) | (t.labels[pairs[:, 1]] > 0)]
+    return replace(t, pairs=pairs[torch.from_numpy(rng.permutation(len(pairs))[:MAX_PAIRS])])
 
 
 def voxel_pairs(

@@ -28,11 +28,10 @@ from stages.lab.training.segmenter_data import (
     joined,
     read_example,
     targets,
-    voxel_pairs,
+    with_pairs,
 )
 
 CLASS_WEIGHTS = torch.tensor([0.5, 1.0, 0.5])
-MAX_PAIRS = 60_000
 REPORT_STEPS = 50
 
 
@@ -49,13 +48,14 @@ class SegmenterTraining:
     seed: int = 0
     device: str = "auto"
     widths: tuple[int, ...] = (32, 48, 64, 96)
+    blocks: int = 1  # residual blocks of each level, down and up
 
     def __post_init__(self):
         if not (self.minutes > 0 and self.rate > 0 and self.voxels >= 1000 and self.batch >= 1):
             raise InputError("--minutes and --rate must be above 0, --voxels at least 1000, --batch at least 1")
 
 
-def losses(model: Segmenter, t: Targets, rng: np.random.Generator) -> dict[str, Tensor]:
+def losses(model: Segmenter, t: Targets) -> dict[str, Tensor]:
     """Class, offset and affinity losses on one scene."""
     device = next(model.parameters()).device
     levels = pyramid(t.grid.cells.to(device), len(model.config["widths"]))
@@ -67,24 +67,12 @@ def losses(model: Segmenter, t: Targets, rng: np.random.Generator) -> dict[str, 
     own = classes == 1
     apart = (found.offsets - t.offsets.to(device))[own].norm(dim=1) / OFFSET_UNIT
     offset = torch.nn.functional.smooth_l1_loss(apart, torch.zeros_like(apart)) if own.any() else 0 * kind
-    objects = torch.nonzero(t.classes == 1)[:, 0]
-    if len(objects) < 2:
+    if not len(t.pairs):
         return {"class": kind, "offset": offset, "pair": 0 * kind}
-    pairs = _pairs(t, levels[0].neighbours.cpu(), rng)
-    same = (t.labels[pairs[:, 0]] == t.labels[pairs[:, 1]]).float()
-    odds = model.affinity(found, t.grid.points.to(device), pairs.to(device))
-    weight = torch.where(same > 0, 0.5 / same.mean().clamp(0.05, 0.95), 0.5 / (1 - same).mean().clamp(0.05, 0.95))
-    pair = binary_cross_entropy_with_logits(odds, same.to(device), weight.to(device))
+    same = (t.labels[t.pairs[:, 0]] == t.labels[t.pairs[:, 1]]).float().to(device)
+    odds = model.affinity(found, t.grid.points.to(device), t.pairs.to(device))
+    pair = binary_cross_entropy_with_logits(odds, same)
     return {"class": kind, "offset": offset, "pair": pair}
-
-
-def _pairs(t: Targets, neighbours: Tensor, rng: np.random.Generator) -> Tensor:
-    """Pairs of voxels that are not surface, at most MAX_PAIRS."""
-    kept = t.classes != 0
-    pairs = voxel_pairs(neighbours, t.grid.points, rng, 1)
-    pairs = pairs[kept[pairs[:, 0]] & kept[pairs[:, 1]]]
-    pairs = pairs[(t.labels[pairs[:, 0]] > 0) | (t.labels[pairs[:, 1]] > 0)]
-    return pairs[torch.from_numpy(rng.permutation(len(pairs))[:MAX_PAIRS])]
 
 
 class Crops(IterableDataset):
@@ -112,7 +100,7 @@ class Crops(IterableDataset):
         distance = (cells * VOXEL - middle)[:, :2].norm(dim=1)
         reach = distance.kthvalue(self.voxels).values if len(cells) > self.voxels else torch.inf
         near = distance[owner] < reach
-        return targets(surfels[near], labels[near], shift)
+        return with_pairs(targets(surfels[near], labels[near], shift), rng)
 
 
 def run(folders: Sequence[Path], out: Path, options: SegmenterTraining, start: Path | None = None) -> Iterator[str]:
@@ -121,9 +109,8 @@ def run(folders: Sequence[Path], out: Path, options: SegmenterTraining, start: P
     `start`: weights to continue from.
     """
     torch.manual_seed(options.seed)
-    rng = np.random.default_rng(options.seed)
     files = find_examples(folders)
-    model = Segmenter(options.widths).to(pick_device(options.device))
+    model = Segmenter(options.widths, options.blocks).to(pick_device(options.device))
     if start is not None:
         model.load_state_dict({k: v.float() for k, v in load_file(start).items()})
     optimiser = torch.optim.AdamW(model.parameters(), options.rate, weight_decay=0.01)
@@ -134,7 +121,7 @@ def run(folders: Sequence[Path], out: Path, options: SegmenterTraining, start: P
     while (part := _progress(options, step, begun)) < 1:
         for group in optimiser.param_groups:
             group["lr"] = options.rate * min(1, (step + 1) / 50) * (0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * part)))
-        found = losses(model, next(crops), rng)
+        found = losses(model, next(crops))
         optimiser.zero_grad(set_to_none=True)
         sum(found.values()).backward()
         torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)

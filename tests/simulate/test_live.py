@@ -15,8 +15,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from websockets.exceptions import ConnectionClosed, InvalidStatus
-from websockets.sync.client import connect
 
 from stages.core.backends import choose
 from stages.core.physics.forces import Change, ForcePrompts
@@ -30,6 +28,9 @@ from stages.simulate.options import ENGINES, QUALITIES, MpmQuality, SimulateOpti
 from stages.simulate.stage import run
 from tests.browser import until
 from tests.conftest import two_balls_scene
+
+connect = pytest.importorskip("websockets.sync.client").connect
+exceptions = pytest.importorskip("websockets.exceptions")
 
 FIND_RED = """() => {
   for (let y = 20; y < 340; y += 8) for (let x = 200; x < 470; x += 8)
@@ -191,7 +192,7 @@ def test_page_needs_the_token_and_the_host(server):
 def test_socket_needs_token_and_origin(server):
     wrong = server.url.replace("http", "ws").replace(server.url.split("/")[-2], "A" * 32) + "live"
     for options in ({"uri": wrong}, {"origin": "http://evil.example"}, {"origin": None}, {"origin": "null"}):
-        with pytest.raises(InvalidStatus) as refused:
+        with pytest.raises(exceptions.InvalidStatus) as refused:
             client(server, **options)
         assert refused.value.response.status_code in (403, 404)
     with client(server) as good:
@@ -230,7 +231,7 @@ def test_hostile_clients_are_closed_and_others_go_on(server):
         good.recv(timeout=5)
         for hostility in (["garbage"] * 20, [b"\x00" * 100] * 20, ["x" * 10_000_000], ['{"do": "drawn"}'] * 2000):
             bad = client(server)
-            with pytest.raises((ConnectionClosed, OSError)):
+            with pytest.raises((exceptions.ConnectionClosed, OSError)):
                 for text in hostility:
                     bad.send(text)
                 while True:
@@ -249,7 +250,7 @@ def test_two_hundred_connections_leave_nothing_behind(server):
     def attempt(_):
         try:
             return client(server)
-        except (InvalidStatus, OSError, EOFError):
+        except (exceptions.InvalidStatus, OSError, EOFError):
             return None
 
     with ExitStack() as stack, ThreadPoolExecutor(16) as pool:

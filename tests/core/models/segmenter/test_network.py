@@ -16,21 +16,22 @@ def some_cells(seed: int = 0) -> torch.Tensor:
 
 def test_a_convolution_is_that_of_a_dense_grid_with_zeros_elsewhere(device):
     cells = some_cells().to(device)
-    x = torch.randn(len(cells), 3, generator=torch.Generator().manual_seed(1)).to(device).requires_grad_()
-    layer = Convolution(3, 4).to(device)
+    x = torch.randn(len(cells), 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    x = x.to(device).requires_grad_()
+    layer = Convolution(3, 4).to(device, torch.float64)  # cuDNN's products of float32 have the precision of TF32
     level = pyramid(cells, 1)[0]
     found = layer(x, level)
 
     index = (cells + 2).unbind(1)
-    dense = torch.zeros(6, 5, 4, 3, device=device).index_put(index, x).permute(3, 0, 1, 2)
+    dense = x.new_zeros(6, 5, 4, 3).index_put(index, x).permute(3, 0, 1, 2)
     kernel = layer.weight.reshape(3, 3, 3, 3, 4).permute(4, 3, 0, 1, 2)
     wanted = torch.nn.functional.conv3d(dense[None], kernel, padding=1)[0][(slice(None), *index)].mT
-    torch.testing.assert_close(found, wanted, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(found, wanted, rtol=1e-9, atol=1e-9)
 
     probe = torch.randn_like(found)
     ours = torch.autograd.grad((found * probe).sum(), [x, layer.weight])
     theirs = torch.autograd.grad((wanted * probe).sum(), [x, layer.weight])
-    torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(ours, theirs, rtol=1e-9, atol=1e-9)
 
 
 def test_neighbours_are_mutual():

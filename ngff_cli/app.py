@@ -276,6 +276,7 @@ def render(
     ids: Annotated[
         bool, Option("--ids", help="render each object in one flat colour, with its number and a legend")
     ] = RenderOptions.ids,
+    shadows: Annotated[str, Option(help="soft shadows of objects that moved: on | off")] = RenderOptions.shadows,
     show_forces: Annotated[
         bool, Option("--show-forces", help="draw an arrow for each active force prompt")
     ] = RenderOptions.show_forces,
@@ -290,7 +291,7 @@ def render(
     """Render a trajectory or a scene: TRAJ.h5 or SCENE.ply -> MP4 or PNG."""
     options = RenderOptions(
         view=view, resolution=resolution, fps=fps, background=background, depth=depth, ids=ids,
-        show_forces=show_forces, frame=frame, side_by_side=side_by_side, device=device,
+        shadows=shadows, show_forces=show_forces, frame=frame, side_by_side=side_by_side, device=device,
     )  # fmt: skip
     load("stages.render.stage:run")(source, out, options)
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from stages.core.errors import InputError
 from stages.core.physics.materials import MaterialChoice, choose_materials
 from stages.core.physics.particles import sample_bodies
+from stages.core.physics.shadow_casting import find_shadows
 from stages.core.player.film import Motion, film_page, pack_film
 from stages.core.scene.scene import SceneObject
 from stages.core.scene.trajectory import Trajectory, read_trajectory
@@ -48,7 +49,8 @@ def film_section(path: Path) -> str:
 
 
 def _player(trajectory: Trajectory, title: str) -> str:
-    page = film_page(pack_film(trajectory.scene, Motion.of(trajectory), {"arrows": True}), title)
+    shadows = find_shadows(trajectory.scene, trajectory.keypoints)
+    page = film_page(pack_film(trajectory.scene, Motion.of(trajectory), {"arrows": True}, shadows), title)
     return f'<iframe title="{escape(title)}" srcdoc="{escape(page)}"></iframe>'
 
 

@@ -39,7 +39,7 @@ def write_image(out: Path, renderer: Renderer) -> dict:
         return _write_depth(out, views[0][0].depth)
     span = views_depth_range(views) if options.depth else None
     format_of(out, "image", writable=True).load_writer()(out, renderer.compose(views, span, columns, captions))
-    return {"views": sum(len(row) for row in views), **depth_facts(span)}
+    return {"views": sum(len(row) for row in views), **depth_facts(span), **renderer.light_facts()}
 
 
 def _sheet_times(animation: Animation) -> list[float]:

@@ -33,6 +33,7 @@ class RenderOptions:
     background: str | None = None  # scene.ply, #rrggbb or a photo that replaces the scene's own background
     depth: bool = False  # render depth: colour-coded in a video, 16 bit in a PNG
     ids: bool = False  # render each object in one flat colour, with its number and a legend
+    shadows: str = "on"  # on | off: soft shadows of objects that moved
     show_forces: bool = False  # draw an arrow for each active force prompt
     frame: int | None = None  # render this frame only; -1 is the last
     side_by_side: bool = False  # several files in one image, with the same camera
@@ -50,6 +51,8 @@ class RenderOptions:
             raise InputError(f"--fps {self.fps}: must be above 0 and at most 1000 frames per second")
         if self.depth and self.ids:
             raise InputError("--depth and --ids: give only one of them")
+        if self.shadows not in ("on", "off"):
+            raise InputError(f"--shadows {self.shadows}: choose from on | off")
         if self.background is not None and self.background.startswith("#"):
             hex_colour(self.background)
 

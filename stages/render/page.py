@@ -39,11 +39,12 @@ def write_page(out: Path, renderer: Renderer) -> dict:
         "colours": modes[0] if modes else 0,
         "arrows": options.show_forces,
     }
-    page = film_page(pack_film(scene, motion, settings), clip.name)
+    page = film_page(pack_film(scene, motion, settings, clip.shadows if motion else None), clip.name)
     with replacing(out) as part:
         part.write_text(page, encoding="utf-8")
     frames = 1 if motion is None else len(motion.positions)
-    return {"frames": frames, "gaussians": len(scene.gaussians), "bytes": len(page.encode())}
+    return {"frames": frames, "gaussians": len(scene.gaussians), "bytes": len(page.encode()),
+            **renderer.light_facts()}  # fmt: skip
 
 
 def _check(out: Path, renderer: Renderer) -> None:
@@ -66,20 +67,20 @@ def _check(out: Path, renderer: Renderer) -> None:
 def _contents(clip: Clip) -> tuple[Scene, Motion | None]:
     """The scene with the background that was chosen, and its motion; a frozen frame is a scene at rest."""
     animation, background = clip.animation, clip.background
-    gaussians = (animation.scene.gaussians if animation.is_moving else animation.gaussians(0.0)).to("cpu")
+    if not animation.is_moving:
+        return replace(animation.scene, gaussians=clip.shaded(0.0).to("cpu"), background=background.colour), None
+    gaussians = animation.scene.gaussians.to("cpu")
     scene = replace(animation.scene, gaussians=gaussians, background=background.colour)
-    motion = Motion.of(animation.trajectory) if animation.is_moving else None
+    motion = Motion.of(animation.trajectory)
     kept = _kept_rows(scene, background)
     if kept is None:
         return scene, motion
     added = 0 if background.gaussians is None else len(background.gaussians)
     own = gaussians[kept]
     scene = replace(scene, gaussians=own if not added else concatenate([background.gaussians.to("cpu"), own]))
-    if motion is not None:
-        index, weight = motion.binding.index[kept], motion.binding.weight[kept]
-        unbound = torch.full((added, index.shape[1]), -1), torch.zeros(added, index.shape[1])
-        motion = replace(motion, binding=Binding(torch.cat([unbound[0], index]), torch.cat([unbound[1], weight])))
-    return scene, motion
+    index, weight = motion.binding.index[kept], motion.binding.weight[kept]
+    unbound = torch.full((added, index.shape[1]), -1), torch.zeros(added, index.shape[1])
+    return scene, replace(motion, binding=Binding(torch.cat([unbound[0], index]), torch.cat([unbound[1], weight])))
 
 
 def _kept_rows(scene: Scene, background: RenderBackground) -> torch.Tensor | None:

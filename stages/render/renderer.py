@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 from jaxtyping import Float
 from torch import Tensor
@@ -23,6 +24,9 @@ from stages.render.object_labels import add_legend, draw_labels, visible_ids
 from stages.render.options import RenderOptions
 from stages.render.overlay import draw_arrows, draw_caption, force_arrows, grid_columns, tile_images
 from stages.render.subject import Subject, find_subject, merge_subjects
+
+if TYPE_CHECKING:
+    from stages.core.physics.shadow_casting import ShadowCaster
 
 log = logging.getLogger(__name__)
 SAME_CAMERAS = 1e-3  # largest difference of equal cameras: of positions [their extent], of rotation matrix entries
@@ -43,15 +47,37 @@ class Clip:
 
     def gaussians(self, time: float) -> Gaussians:
         """All Gaussians to render at a time [s]."""
-        return self._prepared(self.animation.gaussians(time)) if self.animation.is_moving else self._static
+        return self._prepared(time) if self.animation.is_moving else self._static
 
     @cached_property
     def _static(self) -> Gaussians:
-        return self._prepared(self.animation.gaussians(0.0))
+        return self._prepared(0.0)
 
-    def _prepared(self, gaussians: Gaussians) -> Gaussians:
-        shown = self.background.compose(gaussians.to(self.device))
+    def _prepared(self, time: float) -> Gaussians:
+        shown = self.shaded(time)
         return colour_by_object(shown) if self.options.ids else shown
+
+    def shaded(self, time: float) -> Gaussians:
+        """The Gaussians at a time [s] with the background that was chosen and the shadows of moved objects."""
+        g = self.background.compose(self.animation.gaussians(time).to(self.device))
+        if self.shadows is None:
+            return g
+        positions = self.animation.interpolate(time, self.animation.trajectory.positions)
+        return self.shadows.shade(g, positions, self._rest_irradiance)
+
+    @cached_property
+    def shadows(self) -> ShadowCaster | None:
+        """What casts shadows; None for scenes at rest, other colours than the photos', and with --shadows off."""
+        trajectory, options = self.animation.trajectory, self.options
+        if options.shadows == "off" or options.ids or options.depth or trajectory is None or trajectory.dense:
+            return None
+        from stages.core.physics.shadow_casting import find_shadows  # noqa: PLC0415 -- 0.3 s of scipy
+
+        return find_shadows(self.animation.scene, trajectory.keypoints, not self.background.keep_scene)
+
+    @cached_property
+    def _rest_irradiance(self) -> Float[Tensor, "n"]:
+        return self.shadows.rest_irradiance(self.background.compose(self.animation.scene.gaussians.to(self.device)))
 
     def render(self, time: float, cameras: Cameras, indices: list[int]) -> list[RenderedView]:
         """Views of some of the cameras at a time [s]; with the options, object numbers and force arrows."""
@@ -91,6 +117,11 @@ class Renderer:
         """Frames per second: those of the options, or else the highest rate of the moving clips."""
         moving = [clip.animation.fps for clip in self.clips if clip.animation.is_moving]
         return float(self.options.fps or max(moving, default=self.longest.fps))
+
+    def light_facts(self) -> dict:
+        """The light that shadows were drawn by, as recorded next to the output."""
+        lights = [asdict(clip.shadows.light) for clip in self.clips if clip.shadows is not None]
+        return {"light": lights if len(lights) > 1 else lights[0]} if lights else {}
 
     def cameras(self, frames: int, resolution: int) -> list[Cameras]:
         """For each clip one camera per frame, or for --view all every stored camera.

@@ -31,4 +31,4 @@ def write_video(out: Path, renderer: Renderer) -> dict:
     with format_of(out, "video", writable=True).load_writer()(out, fps) as video:
         for i in tqdm(range(len(times)), unit="frame"):
             video.append(renderer.compose(views(i), span, columns))
-    return {"frames": len(times), "fps": fps, **depth_facts(span)}
+    return {"frames": len(times), "fps": fps, **depth_facts(span), **renderer.light_facts()}

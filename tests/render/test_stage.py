@@ -72,6 +72,22 @@ def test_first_frame_equals_the_scene_at_rest(scene, trajectory, tmp_path):
     assert torch.equal(still, first) and colour_fraction(still, RED) > 0.005 and colour_fraction(still, GREEN) > 0.005
 
 
+def test_shadows_are_drawn_once_an_object_moved_and_can_be_switched_off(two_balls, tmp_path):
+    """The red ball rises from the floor and shades it: only the floor, in grey, becomes darker."""
+    source = rising(tmp_path / "traj.h5", two_balls, frames=6, step=0.04)
+    view = {"view": "input:0", "resolution": 128}
+    for frame in (0, 5):
+        on, off = (render_image(source, tmp_path / f"{s}.png", frame=frame, shadows=s, **view) for s in ("on", "off"))
+        floor = (off - 0.5).abs().amax(-1) < 0.03
+        darker = (off - on).amax(-1)[floor]
+        assert float(darker.min()) >= 0
+        assert (float(darker.max()) > 0.05) == (frame > 0)
+    facts = [json.loads((tmp_path / f"{s}.png.json").read_text()) for s in ("on", "off")]
+    assert facts[0]["light"]["in_colours"] is False and "light" not in facts[1]
+    with pytest.raises(InputError, match="--shadows maybe: choose from on | off"):
+        render_options(shadows="maybe")
+
+
 def test_image_of_a_trajectory_is_a_contact_sheet(trajectory, tmp_path):
     sheet = render_image(trajectory, tmp_path / "sheet.png", view="input:0")
     assert sheet.shape == (2 * 48, 4 * 48, 3)  # six frames in two rows of four

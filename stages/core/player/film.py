@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from html import escape
 from pathlib import Path
 
@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from stages.core.physics.shadow_casting import ShadowCaster
 from stages.core.physics.skinning import keypoint_neighbours
 from stages.core.player.container import PackedArray, bits_for, pack, quantised, whole
 from stages.core.scene.gaussians import Gaussians
@@ -24,7 +25,7 @@ MIN_OPACITY = 1 / 255  # Gaussians below are not drawn by the rasteriser either
 KEYPOINT_BITS = 16  # of the extent of the keypoints at rest; more where they leave it
 POSITION_STEP = 0.05  # of centres [typical smallest scale of the Gaussians]
 HARMONICS_BITS = (10, 8, 7, 6)  # of each band
-WEIGHT_BITS, OPACITY_BITS, SCALE_BITS, QUATERNION_BITS = 8, 8, 10, 10
+WEIGHT_BITS, OPACITY_BITS, SCALE_BITS, QUATERNION_BITS, IRRADIANCE_BITS = 8, 8, 10, 10, 12
 OUTLIERS = 1e-4  # fraction of the harmonics at either end that are clipped
 
 
@@ -46,10 +47,13 @@ class Motion:
         return cls(t.keypoints, t.binding, t.positions, t.com, t.rotation, t.info.dt, t.info.forces)
 
 
-def pack_film(scene: Scene, motion: Motion | None = None, settings: Mapping = {}) -> bytes:  # noqa: B006 -- read only
+def pack_film(
+    scene: Scene, motion: Motion | None = None, settings: Mapping = {}, shadows: ShadowCaster | None = None  # noqa: B006
+) -> bytes:
     """The container of a scene at rest or in motion, without the Gaussians that no picture shows.
 
     `settings` are passed on to the page: `view` {viewmat, K, size}, `target`, `colours`, `arrows`, `live`, `title`.
+    With `shadows` the page draws those of what moves.
     """
     g = scene.gaussians.to("cpu")
     bound = torch.zeros(len(g), dtype=torch.bool) if motion is None else (motion.binding.index >= 0).any(1)
@@ -69,7 +73,23 @@ def pack_film(scene: Scene, motion: Motion | None = None, settings: Mapping = {}
     if motion is not None:
         header |= {"dt": motion.dt, "frames": len(motion.positions), "forces": motion.forces}
         arrays |= _motion_arrays(motion, rows[:count])
+    if motion is not None and shadows is not None:
+        header["light"] = asdict(shadows.light)
+        arrays |= _shadow_arrays(shadows, g)
     return pack(header, arrays)
+
+
+def _shadow_arrays(shadows: ShadowCaster, g: Gaussians) -> dict[str, PackedArray]:
+    """The spheres of the objects at rest with their binding, and the irradiance that the colours hold."""
+    rest, binding = shadows.occluders.rest, shadows.occluders.binding
+    return {
+        "spheres": quantised(torch.cat([rest.centres, rest.radii[:, None]], 1), KEYPOINT_BITS),
+        "sphere_object": whole(rest.object_id[:, None]),
+        "sphere_share": quantised(rest.weights[:, None], KEYPOINT_BITS),
+        "sphere_index": whole(binding.index.clamp_min(0)),
+        "sphere_weight": quantised(binding.weight, WEIGHT_BITS, axes=1),
+        "rest_irradiance": quantised(shadows.rest_irradiance(g)[:, None], IRRADIANCE_BITS),
+    }
 
 
 def film_page(film: bytes, title: str) -> str:

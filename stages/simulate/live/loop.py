@@ -19,6 +19,7 @@ from pathlib import Path
 from stages.core.errors import InputError
 from stages.core.physics.forces import ForcePrompts
 from stages.core.physics.keypoints import bind_gaussians
+from stages.core.physics.shadow_casting import find_shadows
 from stages.core.physics.state import FrameState
 from stages.core.player.film import Motion, film_page, pack_film
 from stages.core.scene.files import replacing
@@ -185,7 +186,8 @@ def _page(scene: LiveScene, binding, setup: SceneSetup, out: Path) -> str:
         },
         "arrows": True,
     }  # fmt: skip
-    return film_page(pack_film(world, motion, settings), f"{out.stem} live")
+    film = pack_film(world, motion, settings, find_shadows(world, scene.keypoints))
+    return film_page(film, f"{out.stem} live")
 
 
 def _session(scene: LiveScene, setup: SceneSetup) -> Session:

@@ -9,7 +9,9 @@ import pytest
 import torch
 
 from stages.core.geometry.rotations import matrix
-from stages.core.physics.keypoints import bind_gaussians
+from stages.core.physics.keypoints import bind_gaussians, choose_keypoints
+from stages.core.physics.occluders import make_occluders
+from stages.core.physics.shadow_casting import ShadowCaster
 from stages.core.physics.skinning import deform
 from stages.core.player.film import Motion, film_page, pack_film
 from stages.core.raster.rasterise import rasterise
@@ -17,6 +19,7 @@ from stages.core.scene.gaussians import Gaussians, concatenate
 from stages.core.scene.trajectory import Keypoints
 from tests.browser import until
 from tests.conftest import random_gaussians, two_balls_scene
+from tests.core.raster.lit_world import LIGHT, MOVED, REST, lit_scene, moved_points
 
 PIXELS = """async (view) => {
   const bytes = await player.pixels(view);
@@ -79,9 +82,9 @@ def picture_of_the_page(page, cameras, index):
     return torch.from_numpy(data.reshape(h, w, 4)[..., :3].copy()).float() / 255
 
 
-def picture_of_the_rasteriser(g: Gaussians, cameras, index):
+def picture_of_the_rasteriser(g: Gaussians, cameras, index, background=torch.tensor(BACKGROUND)):  # noqa: B008
     w, h = cameras.sizes[index].tolist()
-    drawn = rasterise(g, cameras.viewmats[[index]], cameras.Ks[[index]], w, h, background=torch.tensor(BACKGROUND))
+    drawn = rasterise(g, cameras.viewmats[[index]], cameras.Ks[[index]], w, h, background=background)
     return drawn.rgb[0].clamp(0, 1)
 
 
@@ -106,6 +109,29 @@ def test_pictures_equal_those_of_the_rasteriser(film, open_page):
         assert psnr(picture_of_the_page(page, cameras, index), mine) >= 35
     still = picture_of_the_rasteriser(scene.gaussians, cameras, 4)
     assert psnr(still, mine) < 25  # the frames differ
+
+
+def test_shadows_equal_those_of_the_rasteriser(tmp_path, open_page):
+    """Also those in the colours are lifted alike, and without the box there are none."""
+    scene = lit_scene(spacing=0.03)
+    keypoints = choose_keypoints(scene, 48)
+    positions = torch.stack([moved_points(keypoints.rest, keypoints.object_id, p) for p in (REST, MOVED)])
+    com, turns = torch.zeros(2, 2, 3), torch.tensor([1.0, 0, 0, 0]).expand(2, 2, 4)
+    motion = Motion(keypoints, bind_gaussians(scene, keypoints), positions, com, turns, 0.02)
+    occluders, cameras = make_occluders(scene, keypoints), larger(scene.cameras, 2)
+    truth = deform(scene.gaussians, motion.binding, keypoints, positions[1])
+    background = torch.tensor(scene.background)
+    for light in (replace(LIGHT, beneath=0.3), replace(LIGHT, in_colours=False)):
+        caster = ShadowCaster(light, occluders)
+        path = tmp_path / "film.html"
+        path.write_text(film_page(pack_film(scene, motion, {}, caster), "shadows"))
+        page = open_page(path)
+        page.evaluate("player.play(false); player.seek(player.duration)")
+        shaded = caster.shade(truth, positions[1], caster.rest_irradiance(scene.gaussians))
+        with_shadows, without = (picture_of_the_rasteriser(g, cameras, 0, background) for g in (shaded, truth))
+        assert psnr(picture_of_the_page(page, cameras, 0), with_shadows) >= 35 > 32 > psnr(with_shadows, without)
+        page.keyboard.press("k")
+        assert psnr(picture_of_the_page(page, cameras, 0), without) >= 35
 
 
 def test_a_scene_at_rest_is_a_page_without_a_clock(tmp_path, open_page):

@@ -26,6 +26,7 @@ function keyTable(player) {
     ["c", "C", "the view of the next photo", () => cycle(element("view"))],
     ["f", "F", "next colours", () => cycle(element("colours"))],
     ["v", "V", "force arrows", () => element("arrows").click()],
+    ...(player.film.light ? [["k", "K", "shadows of what moved", () => element("shadows").click()]] : []),
     ["0", "1 to 9, 0", "show only this object; 0: all", () => player.isolate(null)],
     ...player.film.objects.slice(0, 9).map((o, i) => [`${i + 1}`, null, null, () => player.isolate(o.id)]),
     ["h", "H", "hide the panel", () => element("hide").click()],
@@ -51,6 +52,9 @@ export function buildInterface(player) {
 
   options(element("view"), ["start", ...film.cameras.map((c) => c.name)]);
   element("view").onchange = (event) => player.showCamera(event.target.selectedIndex - 1);
+
+  element("shadows-row").hidden = !film.light;
+  element("shadows").onchange = (event) => player.showShadows(event.target.checked);
 
   element("arrows").checked = player.arrowsShown;
   element("arrows").onchange = (event) => player.showArrows(event.target.checked);

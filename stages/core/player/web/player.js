@@ -65,6 +65,9 @@ export class Player {
       rest: this.rest, object: a.keypoint_object, neighbours: a.neighbours, index: a.binding_index,
       weight: normalised(a.binding_weight),
     });
+    if (this.film.light) film.spheres = {
+      means: this.renderer.occluders.rest, index: a.sphere_index, weight: normalised(a.sphere_weight),
+    };
     this.worker.postMessage({ film });
   }
 
@@ -215,6 +218,11 @@ export class Player {
 
   showArrows(shown) {
     this.arrowsShown = shown;
+    this.wake();
+  }
+
+  showShadows(shown) {
+    this.renderer.shadows = shown;
     this.wake();
   }
 

@@ -16,6 +16,11 @@ uniform sampler2D harmonics; // a texel for each coefficient
 uniform usampler2D bindings; // 2 texels each: eight keypoints of 16 bits | eight weights of 8 bits
 uniform sampler2D motion; // 3 texels for each keypoint: rows (G, c) of its affine displacement
 uniform sampler2D objects; // a texel each: flat colour, and 0 hidden, 1 shown or 2 highlighted
+uniform sampler2D restIrradiance; // four Gaussians a texel: what their colours hold
+uniform sampler2D occluders; // of shadows.js
+uniform int casters; // objects in it; 0 draws no shadows
+uniform vec4 light; // shares of sky and lamp, tangent of the lamp's angular radius, irradiance beneath objects
+uniform vec3 lamp; // direction to it
 uniform uint bound, coefficients; // Gaussians that follow keypoints, the first ones; harmonics of each
 uniform mat3 rotation; // world to camera
 uniform vec3 translation, eye, depths; // depths: nearest drawn, range of the colours of depth
@@ -76,6 +81,40 @@ vec3 colour(vec3 d) {
   return max(c, 0.0);
 }
 
+// Irradiance at x on an object: that of stages/core/raster/shadows.py.
+float irradiance(vec3 x, float object) {
+  vec2 logs = vec2(0.0);
+  for (int o = 0; o < casters; o++) {
+    vec4 ball = texelFetch(occluders, texel(uint(2 * o)), 0), row = texelFetch(occluders, texel(uint(2 * o + 1)), 0);
+    if (row.x == object || row.w == 0.0) continue;
+    vec3 v = ball.xyz - x;
+    float R = ball.w, square = dot(v, v), along = dot(v, lamp), across = sqrt(max(square - along * along, 0.0));
+    bool sky = R * R * (v.z + R) > 0.01 * square * sqrt(square);
+    if (!sky && !(along > -R && across < R + light.z * (along + R))) continue;
+    vec2 seen = vec2(1.0);
+    for (int i = int(row.y); i < int(row.y + row.z); i++) {
+      vec4 sphere = texelFetch(occluders, texel(uint(i)), 0);
+      v = sphere.xyz - x;
+      float r = sphere.w;
+      square = max(dot(v, v), 1e-12);
+      along = dot(v, lamp);
+      across = sqrt(max(square - along * along, 0.0));
+      float disc = max(light.z * along, 1e-6);
+      float edge = smoothstep(0.0, 1.0, (across - abs(disc - r)) / (2.0 * min(disc, r)));
+      vec2 hidden = vec2(max(v.z, 0.0) * inversesqrt(square) * min(r * r / square, 1.0),
+                         along > 0.0 ? min(r * r / (disc * disc), 1.0) * (1.0 - edge) : 0.0);
+      seen *= 1.0 - min(hidden, 0.999);
+    }
+    logs += row.w * log(seen);
+  }
+  return 1.0 - dot(light.xy, 1.0 - exp(logs));
+}
+
+float shadow(vec3 x, float object) { // factor of the colour
+  float now = irradiance(x, object), rest = texelFetch(restIrradiance, texel(gaussian >> 2), 0)[gaussian & 3u];
+  return pow(now / (now < rest ? rest : max(rest, min(now, light.w))), 1.0 / 2.2);
+}
+
 vec3 ramp(float t) { // bright to dark
   const vec3 colours[5] = vec3[5](vec3(0.99, 0.93, 0.60), vec3(0.98, 0.62, 0.30), vec3(0.85, 0.27, 0.34),
                                   vec3(0.49, 0.14, 0.45), vec3(0.09, 0.07, 0.25));
@@ -134,7 +173,10 @@ void main() {
   splat = vec4(centre, float(gaussian), p.z);
   axes = vec4(sqrt(larger) * along, sqrt(det / larger) * vec2(-along.y, along.x));
   vec3 rgb;
-  if (mode == 0) rgb = colour(transpose(coefficients > 1u ? rotationOf(F) : mat3(1.0)) * normalize(x - eye));
+  if (mode == 0) {
+    rgb = colour(transpose(coefficients > 1u ? rotationOf(F) : mat3(1.0)) * normalize(x - eye));
+    if (casters > 0) rgb *= shadow(x, last.w);
+  }
   else if (mode == 1)
     rgb = last.w > 0.0 ? shown.rgb
       : vec3(0.35 + 0.5 * dot(clamp(0.5 + 0.28209479177387814 * harmonic(0u), 0.0, 1.0), vec3(1.0 / 3.0)));

@@ -1,5 +1,6 @@
 // Draws the Gaussians of a film with WebGL2: one pass projects them (transform feedback), one draws a quad for each.
 
+import { Occluders } from "player/shadows.js";
 import { BLEND, COVER, PICK, PRESENT, PROJECT, QUAD } from "player/shaders.js";
 
 const NEAREST = 0.01; // Gaussians with a smaller depth are left out, as by stages/core/raster
@@ -15,6 +16,11 @@ export class SplatRenderer {
     this.background = film.background;
     this.reach = reach;
     this.mode = 0;
+    this.light = film.light;
+    this.occluders = film.light ? new Occluders(film) : null;
+    this.shadows = true;
+    this.casters = 0;
+    this.hidden = new Set();
     this.count = film.arrays.opacities.length;
     this.range = [NEAREST, 1];
     this.programs = {
@@ -87,6 +93,8 @@ export class SplatRenderer {
       bindings: this.texture(gl.RGBA32UI, gl.RGBA_INTEGER, gl.UNSIGNED_INT, bindings),
       motion: this.texture(gl.RGBA32F, gl.RGBA, gl.FLOAT, new Float32Array(4)),
       objects: this.texture(gl.RGBA32F, gl.RGBA, gl.FLOAT, new Float32Array(4)),
+      occluders: this.texture(gl.RGBA32F, gl.RGBA, gl.FLOAT, new Float32Array(4)),
+      restIrradiance: this.texture(gl.RGBA32F, gl.RGBA, gl.FLOAT, a.rest_irradiance ?? new Float32Array(4)),
     };
   }
 
@@ -122,18 +130,28 @@ export class SplatRenderer {
     gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, target.texture, 0);
   }
 
-  setOrder({ order, near, far, motion }) {
+  setOrder({ order, near, far, motion, spheres }) {
     const gl = this.gl;
     gl.bindBuffer(gl.ARRAY_BUFFER, this.order);
     gl.bufferData(gl.ARRAY_BUFFER, order, gl.DYNAMIC_DRAW);
     this.drawn = order.length;
     this.range = [near, Math.max(far, near + 1e-6)];
     if (motion) this.texture(gl.RGBA32F, gl.RGBA, gl.FLOAT, motion, this.textures.motion);
+    if (spheres) this.occluders.centres = spheres;
+    if (spheres) this.setOccluders();
+  }
+
+  setOccluders() {
+    const gl = this.gl, { values, count } = this.occluders.texels(this.hidden);
+    this.casters = count;
+    this.texture(gl.RGBA32F, gl.RGBA, gl.FLOAT, values, this.textures.occluders);
   }
 
   // rows: for each object id from 0 the flat colour, and 0 hidden, 1 shown or 2 highlighted
   setObjects(rows) {
     const gl = this.gl;
+    this.hidden = new Set(rows.flatMap((row, id) => row[3] === 0 ? [id] : []));
+    if (this.occluders) this.setOccluders();
     this.texture(gl.RGBA32F, gl.RGBA, gl.FLOAT, Float32Array.from(rows.flat()), this.textures.objects);
   }
 
@@ -156,6 +174,11 @@ export class SplatRenderer {
     gl.uniform2fv(at("size"), view.size);
     gl.uniform1i(at("mode"), this.mode);
     gl.uniform1f(at("reach"), this.reach);
+    gl.uniform1i(at("casters"), this.shadows ? this.casters : 0);
+    if (this.light) {
+      gl.uniform4f(at("light"), this.light.sky, this.light.lamp, this.light.spread, this.light.beneath);
+      gl.uniform3fv(at("lamp"), this.light.direction);
+    }
     gl.bindVertexArray(this.orderInput);
     gl.bindBuffer(gl.ARRAY_BUFFER, null); // the splats may have one use at a time
     gl.bindTransformFeedback(gl.TRANSFORM_FEEDBACK, this.feedback);

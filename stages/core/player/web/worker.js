@@ -17,13 +17,17 @@ function serve() {
       if (film.rest) skinning = new Skinning(film.rest, film.object, film.neighbours);
       return;
     }
-    let motion = null;
+    let motion = null, spheres = null;
     if (data.positions) {
       motion = skinning.motion(data.positions);
       displace(film, motion, moved);
+      if (film.spheres) {
+        spheres = film.spheres.means.slice();
+        displace(film.spheres, motion, spheres);
+      }
     }
     const { order, near, far } = farToNear(moved, data.depthRow, data.nearest);
-    self.postMessage({ order, near, far, motion }, motion ? [order.buffer, motion.buffer] : [order.buffer]);
+    self.postMessage({ order, near, far, motion, spheres }, motion ? [order.buffer, motion.buffer] : [order.buffer]);
   };
 }
 

@@ -1,0 +1,145 @@
+"""The light of a scene, estimated from the shadows that its objects cast on the supporting surface."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from stages.core.geometry.harmonics import C0
+from stages.core.perception.support import Support, cell_medians, find_support
+from stages.core.raster.shadows import GAMMA, OVERHEAD, Light, Spheres, blocked
+from stages.core.scene.scene import Scene
+
+ELEVATIONS, AZIMUTHS, SPREADS = (25.0, 40.0, 55.0, 70.0), 12, (0.1, 0.3)  # lamps that are tried [degrees], [tangents]
+REACH = 3.0  # of the surface that is examined [radii of the object], beyond the object
+BENEATH = 0.6  # of the sky blocked: beneath an object, not seen in any photo
+MIN_CELLS = 60  # of the surface around the objects
+MAX_SHARE = 0.95  # of the irradiance that sky and lamp have together
+MIN_SHARE = 0.1  # of the irradiance: fainter shadows cannot be told from the texture
+MIN_ODDS = 0.1  # variance of log colour around the objects that the shadows explain, over what is left
+MIN_RATIO = 4.0  # of these odds to those of displaced shadows
+MIN_NOISE = 0.01  # of log colours
+MIN_BENEATH = 0.05
+MAX_CELLS = 4000
+DARKEST = 0.01  # linear colours below are noise
+CONTROLS, CONTROL_SHIFT = 8, 0.7  # fits of displaced shadows, by this [mean distance of the cells from their centre]
+STEPS = 6  # of the robust fit
+
+
+def estimate_light(scene: Scene, spheres: Spheres) -> Light:
+    """The light whose shadows of the objects at rest explain the colours of the surface best; OVERHEAD where none does.
+
+    Log colours of the cells of the supporting surface around the objects are fitted by the surface's own colour and the
+    shadows of a sky and of one of many lamps. They count as found if the same shadows, displaced, explain much less.
+    """
+    support = find_support(scene)
+    if support is None:
+        return OVERHEAD
+    points, colours = _surface_cells(scene, support, spheres)
+    beneath = _hidden(points, spheres, OVERHEAD)[:, 0] > BENEATH
+    if int((~beneath).sum()) < MIN_CELLS:
+        return OVERHEAD
+    brightness, terms = _surface_terms(points, colours)
+    seen, y, A = points[~beneath], brightness[~beneath], terms[~beneath]
+    best = max((_fit(A, _hidden(seen, spheres, lamp), y, lamp) for lamp in _lamps()), key=lambda fit: fit.odds)
+    reach = float((seen[:, :2] - seen[:, :2].mean(0)).norm(dim=1).mean())
+    turns = [2 * math.pi * i / CONTROLS for i in range(CONTROLS)]
+    shifts = [CONTROL_SHIFT * reach * seen.new_tensor([math.cos(a), math.sin(a), 0.0]) for a in turns]
+    chance = max(_fit(A, _hidden(seen + shift, spheres, best.light), y, best.light).odds for shift in shifts)
+    if best.odds < max(MIN_ODDS, MIN_RATIO * chance):
+        return OVERHEAD
+    if not bool(beneath.any()):
+        return best.light
+    left = (brightness[beneath] - terms[beneath] @ best.own.float()).exp().median()
+    return replace(best.light, beneath=min(max(float(left), MIN_BENEATH), 1.0))
+
+
+def _hidden(points: Tensor, spheres: Spheres, light: Light) -> Float[Tensor, "n 2"]:
+    """Fractions of the sky and of the lamp that are blocked at points of the surface."""
+    return torch.stack(blocked(points, torch.zeros(len(points), dtype=torch.int64), spheres, light), 1)
+
+
+def _surface_cells(
+    scene: Scene, support: Support, spheres: Spheres
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
+    """Centres of the cells of bare surface around the objects, and the logarithm of their linear colours."""
+    g = scene.gaussians.to("cpu")
+    near = torch.zeros(len(g), dtype=torch.bool)
+    for id in spheres.object_id.unique():
+        own = spheres.object_id == id
+        middle = spheres.centres[own].mean(0)
+        radius = float(((spheres.centres[own] - middle).norm(dim=1) + spheres.radii[own]).max())
+        near |= (g.means - middle)[:, :2].norm(dim=1) < (1 + REACH) * radius
+    heights = support.heights(g.means)
+    on = near & (g.object_id == 0) & (g.opacities > 0.1) & (heights.abs() < support.tolerance) & support.inside(g.means)
+    rows = on.nonzero()[:, 0]
+    if not len(rows):
+        return torch.zeros(0, 3), torch.zeros(0, 3)
+    rgb = g.sh[rows, 0] * C0 + 0.5
+    cells = cell_medians(support, g.means[rows], torch.cat([g.means[rows], rgb], 1)).reshape(-1, 6)
+    cells = cells[cells.isfinite().all(1)]
+    points, colours = cells[:, :3], GAMMA * cells[:, 3:].clamp_min(DARKEST ** (1 / GAMMA)).log()
+    step = 1 + len(points) // MAX_CELLS
+    return points[::step], colours[::step]
+
+
+def _surface_terms(points: Tensor, colours: Tensor) -> tuple[Float[Tensor, "n"], Float[Tensor, "n k"]]:
+    """Log brightness, and terms of the surface's own: of second degree in x and y, and in log chromaticity.
+
+    Shadows leave the chromaticity unchanged, so that it tells a texture from a shadow.
+    """
+    x, y = ((points[:, :2] - points[:, :2].mean(0)) / points[:, :2].std().clamp_min(1e-9)).unbind(1)
+    brightness = colours.mean(1)
+    u, v = (colours[:, :2] - brightness[:, None]).unbind(1)
+    u, v = ((c - c.mean()) / c.std().clamp_min(1e-3) for c in (u, v))
+    return brightness, torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y, u, v, u * u, u * v, v * v], 1)
+
+
+def _lamps() -> list[Light]:
+    """The lamps that are tried, with any strength."""
+    directions = [(0.0, 0.0, 1.0)]
+    for elevation in map(math.radians, ELEVATIONS):
+        angles = [2 * math.pi * i / AZIMUTHS for i in range(AZIMUTHS)]
+        level = math.cos(elevation)
+        directions += [(level * math.cos(a), level * math.sin(a), math.sin(elevation)) for a in angles]
+    return [Light(0.0, 0.0, d, spread, in_colours=True) for d in directions for spread in SPREADS]
+
+
+class _Fit(NamedTuple):
+    odds: float  # variance that the shadows explain over what is left
+    light: Light
+    own: Tensor  # coefficients of the surface's own colour
+
+
+def _fit(A: Tensor, hidden: Tensor, y: Tensor, lamp: Light) -> _Fit:
+    """The light of this lamp's direction and spread that explains log colours y best, by Tukey's biweight.
+
+    y = A a + log(1 - hidden s) is linearised about the shares s of sky and lamp in every step.
+    """
+    A, y, hidden = A.double(), y.double(), hidden.double()
+    weights, s = torch.ones_like(y), y.new_zeros(2)
+    for _ in range(STEPS):
+        left = (1 - hidden @ s).clamp_min(1 - MAX_SHARE)
+        J = -hidden / left[:, None]
+        s = _solve(torch.cat([A, J], 1), y - left.log() + J @ s, weights)[-2:].clamp_min(0)
+        s = s * min(1.0, MAX_SHARE / max(float(s.sum()), 1e-9))
+        shadow = (1 - hidden @ s).log()
+        own = _solve(A, y - shadow, weights)
+        residual = y - shadow - A @ own
+        scale = (1.4826 * residual.abs().median()).clamp_min(MIN_NOISE)
+        weights = (1 - (residual / (4.685 * scale)) ** 2).clamp_min(0) ** 2
+    sky, strength = s.tolist()
+    before, after = (float((weights * r**2).sum()) for r in (y - A @ _solve(A, y, weights), residual))
+    odds = before / max(after, 1e-12) - 1 if sky + strength >= MIN_SHARE else 0.0
+    return _Fit(odds, replace(lamp, sky=sky, lamp=strength), own)
+
+
+def _solve(A: Tensor, y: Tensor, weights: Tensor) -> Tensor:
+    """Weighted least squares with a small ridge."""
+    normal = A.mT @ (weights[:, None] * A)
+    return torch.linalg.solve(normal + 1e-6 * weights.sum() * torch.eye(A.shape[1]).to(A), A.mT @ (weights * y))

@@ -1,0 +1,111 @@
+"""Spheres that stand for the objects where shadows are computed; they move with the keypoints as Gaussians do."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from stages.core.errors import InputError
+from stages.core.physics.keypoints import KEYPOINTS_PER_GAUSSIAN, farthest_points, nearest_weights
+from stages.core.physics.particles import sample_bodies
+from stages.core.physics.skinning import Skinning
+from stages.core.raster.shadows import Spheres
+from stages.core.scene.gaussians import Gaussians
+from stages.core.scene.scene import Scene
+from stages.core.scene.trajectory import Binding, Keypoints
+
+log = logging.getLogger(__name__)
+PARTICLES = 4000  # of all objects, from which the spheres are made
+SPHERES = 8  # for each object
+MAX_SPHERES = 480  # for all objects
+LLOYD_STEPS = 8
+_VIEWS = torch.nn.functional.normalize(torch.tensor(  # axes, face and space diagonals of a cube
+    [[1.0, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0], [1, -1, 0], [1, 0, 1], [1, 0, -1], [0, 1, 1], [0, 1, -1],
+     [1, 1, 1], [1, -1, 1], [1, 1, -1], [-1, 1, 1]]), dim=1)  # fmt: skip
+
+
+class Occluders:
+    """The spheres at rest, with their binding to keypoints."""
+
+    def __init__(self, rest: Spheres, keypoints: Keypoints):
+        self.rest, m = rest, len(rest.radii)
+        self.binding = _bind(rest, keypoints)
+        carriers = Gaussians(
+            rest.centres, torch.tensor([[1.0, 0, 0, 0]]).repeat(m, 1), rest.radii[:, None].repeat(1, 3), torch.ones(m),
+            torch.zeros(m, 1, 3), rest.object_id,
+        )  # fmt: skip
+        self._skinning = Skinning(carriers, self.binding, keypoints)
+        self._objects = [rest.object_id == id for id in rest.object_id.unique()]
+
+    def moved(self, positions: Float[Tensor, "p 3"], fade: bool = False) -> Spheres:
+        """The spheres for these keypoint positions [scene units].
+
+        With `fade` an object blocks nothing at rest, and more the farther it moved, up to its radius.
+        """
+        centres, weights = self._skinning(positions).means, self.rest.weights.clone()
+        for own in self._objects if fade else ():
+            at = self.rest.centres[own]
+            radius = ((at - at.mean(0)).norm(dim=1) + self.rest.radii[own]).max()
+            weights[own] *= ((centres[own] - at).norm(dim=1).mean() / radius).clamp_max(1)
+        return replace(self.rest, centres=centres, weights=weights)
+
+
+def make_occluders(scene: Scene, keypoints: Keypoints) -> Occluders | None:
+    """Spheres of the objects that have keypoints; None where there are none, or where their bodies are unusable."""
+    moving = [o for o in scene.objects if bool((keypoints.object_id == o.id).any())]
+    count = min(SPHERES, MAX_SPHERES // max(len(moving), 1))
+    if not count or not moving:
+        return None
+    try:
+        bodies = sample_bodies(scene, PARTICLES, skin=True)
+    except InputError as error:
+        log.warning("no shadows: %s", error)
+        return None
+    parts = []
+    for row, o in enumerate(scene.objects):
+        own = bodies.body == row
+        if o in moving and bool(own.any()):
+            parts.append(_spheres(bodies.x[own].float(), bodies.volume[own].float(), bodies.spacing, count, o.id))
+    fields = zip(*((s.centres, s.radii, s.weights, s.object_id) for s in parts), strict=True)
+    return Occluders(Spheres(*(torch.cat(f) for f in fields)), keypoints) if parts else None
+
+
+def _spheres(x: Tensor, volume: Tensor, spacing: float, count: int, id: int) -> Spheres:
+    """Clusters of the particles by Lloyd's algorithm, each as the sphere of equal volume."""
+    centres = x[farthest_points(x, count)]
+    for _ in range(LLOYD_STEPS):
+        nearest = torch.cdist(x, centres).argmin(1)
+        size = torch.bincount(nearest, minlength=len(centres))
+        sums = torch.zeros_like(centres).index_add(0, nearest, x)
+        centres = torch.where(size[:, None] > 0, sums / size.clamp_min(1)[:, None], centres)
+    volumes = torch.zeros(len(centres)).index_add(0, torch.cdist(x, centres).argmin(1), volume)
+    centres, volumes = centres[volumes > 0], volumes[volumes > 0]
+    radii = (0.75 / torch.pi * volumes) ** (1 / 3)
+    weight = float(_projected_area(x, spacing) / (torch.pi * radii.square().sum()))
+    m = len(radii)
+    return Spheres(centres, radii, torch.full((m,), weight), torch.full((m,), id))
+
+
+def _projected_area(x: Tensor, spacing: float) -> float:
+    """Area of the outline of a body of voxels [square scene units], the mean of several views."""
+    areas = []
+    for view in _VIEWS:
+        a = torch.nn.functional.normalize(torch.linalg.cross(view, torch.tensor([0.12, 0.52, -0.7])), dim=0)
+        cells = (torch.stack([x @ a, x @ torch.linalg.cross(view, a)], 1) / spacing).round().long()
+        areas.append(len(cells.unique(dim=0)))
+    return sum(areas) / len(areas) * spacing**2
+
+
+def _bind(spheres: Spheres, keypoints: Keypoints) -> Binding:
+    """Each sphere follows the nearest keypoints of its object."""
+    m = len(spheres.radii)
+    index, weight = torch.full((m, KEYPOINTS_PER_GAUSSIAN), -1), torch.zeros(m, KEYPOINTS_PER_GAUSSIAN)
+    for id in spheres.object_id.unique():
+        rows, own = spheres.object_id == id, (keypoints.object_id == id).nonzero()[:, 0]
+        near, weight[rows] = nearest_weights(keypoints.rest[own].float(), spheres.centres[rows], KEYPOINTS_PER_GAUSSIAN)
+        index[rows] = own[near]
+    return Binding(index, weight)

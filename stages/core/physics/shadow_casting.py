@@ -1,0 +1,55 @@
+"""The shadows of a trajectory: light and spheres of the objects, found once, and the shaded Gaussians of a frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from stages.core.physics.lighting import estimate_light
+from stages.core.physics.occluders import Occluders, make_occluders
+from stages.core.raster.shadows import Light, Spheres, irradiance, shaded, shadow_factor
+from stages.core.scene.gaussians import Gaussians
+from stages.core.scene.scene import Scene
+from stages.core.scene.trajectory import Keypoints
+
+
+@dataclass(frozen=True)
+class ShadowCaster:
+    """Shades Gaussians by objects that are no longer where the photos show them."""
+
+    light: Light
+    occluders: Occluders
+
+    def rest_irradiance(self, rest: Gaussians) -> Float[Tensor, "n"]:
+        """The irradiance that the colours of the Gaussians at rest hold."""
+        if not self.light.in_colours:
+            return torch.ones_like(rest.opacities)
+        return irradiance(rest.means, rest.object_id, _on(self.occluders.rest, rest), self.light)
+
+    def shade(self, g: Gaussians, positions: Float[Tensor, "p 3"], at_rest: Float[Tensor, "n"]) -> Gaussians:
+        """The Gaussians of a frame with these keypoint positions; `at_rest` is what `rest_irradiance` gives."""
+        spheres = self.occluders.moved(positions, fade=not self.light.in_colours)
+        if bool((spheres.centres == self.occluders.rest.centres).all()):
+            return g
+        now = irradiance(g.means, g.object_id, _on(spheres, g), self.light)
+        return shaded(g, shadow_factor(now, at_rest, self.light))
+
+
+def find_shadows(scene: Scene, keypoints: Keypoints, other_background: bool = False) -> ShadowCaster | None:
+    """Light and occluders of a scene at rest; None without objects that move.
+
+    Where the background is not that of the photos, its colours hold no shadows.
+    """
+    occluders = make_occluders(scene, keypoints)
+    if occluders is None:
+        return None
+    light = estimate_light(scene, occluders.rest)
+    return ShadowCaster(replace(light, in_colours=light.in_colours and not other_background), occluders)
+
+
+def _on(spheres: Spheres, g: Gaussians) -> Spheres:
+    """The spheres on the device of the Gaussians."""
+    return Spheres(*(getattr(spheres, field.name).to(g.means.device) for field in fields(Spheres)))

@@ -299,12 +299,13 @@ def render(
 @app.command()
 def evaluate(
     prediction: Annotated[
-        Path, Argument(metavar="PREDICTION", help=".h5, .ply, .mp4 or a folder of PNGs", show_default=False)
+        list[Path], Argument(metavar="PREDICTION", help=".h5, .ply, .mp4 or a folder of PNGs; with --judge one film or "
+                             "several, or folders of films", show_default=False)
     ],
     against: Annotated[
-        Path, Option("--against", help="ground truth, of the same kind; for a .ply also a folder of label images named "
-                     "as its photos, with names.json", show_default=False)
-    ],
+        Path | None, Option("--against", help="ground truth, of the same kind; for a .ply also a folder of label "
+                            "images named as its photos, with names.json", show_default=False)
+    ] = None,
     out: Annotated[
         Path | None, Option("-o", "--out", help="JSON file to write; default: metrics.json next to the prediction")
     ] = None,
@@ -329,12 +330,41 @@ def evaluate(
     report: Annotated[
         Path | None, Option(help="HTML report with curves and images to write (.html)")
     ] = EvaluateOptions.report,
+    judge: Annotated[
+        bool, Option("--judge", help="score films from 0 to 1 by a vision-language model: PhysR and PhotoR. Sends ten "
+                     "frames of each film (JPEG, at most 512 px) and nothing else, no names, to $OPENAI_BASE_URL with "
+                     "$OPENAI_API_KEY; without --judge nothing is sent anywhere")
+    ] = EvaluateOptions.judge,
+    model: Annotated[
+        str, Option(help="with --judge: name of a model that accepts images; default: $OPENAI_MODEL")
+    ] = EvaluateOptions.model,
+    base_url: Annotated[
+        str, Option(help="with --judge: address of a server with OpenAI's protocol; default: $OPENAI_BASE_URL, else "
+                    "OpenAI's own")
+    ] = EvaluateOptions.base_url,
+    askings: Annotated[
+        int, Option(help="with --judge: how often each film is scored; mean and standard deviation are given")
+    ] = EvaluateOptions.askings,
+    together: Annotated[
+        int, Option(help="with --judge: most films in one question, in random order under letters")
+    ] = EvaluateOptions.together,
+    timeout: Annotated[
+        float, Option(help="with --judge: maximum waiting time for an answer [s]")
+    ] = EvaluateOptions.timeout,
+    resume: Annotated[
+        bool, Option("--resume", help="with --judge: continue an interrupted run, from the answers it has written")
+    ] = EvaluateOptions.resume,
+    seed: Annotated[int, Option(help="with --judge: random seed of the order of the films")] = EvaluateOptions.seed,
     as_json: AsJson = False,
 ) -> None:
-    """Compare a prediction with the ground truth: PREDICTION and TRUTH -> a table and METRICS.json."""
+    """Compare a prediction with the ground truth: PREDICTION and TRUTH -> a table and METRICS.json.
+
+    With --judge and without a truth: films -> PhysR and PhotoR, as a vision-language model sees them.
+    """
     options = EvaluateOptions(
         align=align, frames=frames, resample=resample, objects=objects, undistorted=undistorted, photos=photos,
-        report=report,
+        report=report, judge=judge, model=model, base_url=base_url, askings=askings, together=together,
+        timeout=timeout, resume=resume, seed=seed,
     )  # fmt: skip
     load("stages.evaluate.stage:run")(prediction, against, out, options, as_json=as_json)
 

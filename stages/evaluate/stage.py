@@ -1,9 +1,13 @@
-"""Stage evaluate: a prediction and the truth (trajectories, scenes, videos, or label images) -> metrics.json."""
+"""Stage evaluate: a prediction and the truth (trajectories, scenes, videos, or label images) -> metrics.json.
+
+With --judge instead: films, without a truth, scored by a vision-language model.
+"""
 
 from __future__ import annotations
 
 import json
 import logging
+from collections.abc import Sequence
 from pathlib import Path
 
 from stages.core.backends import choose
@@ -11,7 +15,7 @@ from stages.core.errors import InputError
 from stages.core.scene.files import must_exist, provenance, replacing
 from stages.core.scene.formats import FORMATS
 from stages.evaluate.options import EvaluateOptions
-from stages.evaluate.result import format_table, to_json
+from stages.evaluate.result import Result, format_table, to_json
 
 log = logging.getLogger(__name__)
 
@@ -30,33 +34,64 @@ OPTION_KINDS = {  # options that apply to some kinds of data only
     "objects": ("trajectory",),
     "undistorted": ("labels",),
     "photos": ("labels",),
+    "report": tuple(COMPARISONS),
+    **dict.fromkeys(["model", "base_url", "askings", "together", "timeout", "resume", "seed"], ("films",)),
 }
+DEFAULTS = EvaluateOptions()
 
 
 def run(
-    prediction: Path, truth: Path, out: Path | None = None, options: EvaluateOptions = EvaluateOptions(),  # noqa: B008
-    as_json: bool = False,
-) -> dict:
-    """Compare a prediction with the truth; print a table (or JSON) and return the metrics written to `out`.
+    prediction: Path | Sequence[Path], truth: Path | None, out: Path | None = None,
+    options: EvaluateOptions = DEFAULTS, as_json: bool = False,
+) -> dict:  # fmt: skip
+    """Compare a prediction with the truth, or judge films; print a table (or JSON) and return the metrics written.
 
-    `out` is metrics.json next to the prediction by default. Raises InputError for files that cannot be compared and for
-    options that do not apply to them.
+    They are written to `out`, by default metrics.json next to the (first) prediction. With `options.judge` the
+    prediction is one film or several, or folders of them, and the truth is None. Raises InputError for files that
+    cannot be compared and for options that do not apply to them.
     """
-    prediction, truth = Path(prediction), Path(truth)
-    kind = _common_kind(prediction, truth)
-    _check_options(kind, options)
-    result = choose(COMPARISONS, kind)(prediction, truth, options)
+    predictions = [Path(p) for p in ([prediction] if isinstance(prediction, (str, Path)) else prediction)]
+    out = Path(out or predictions[0].parent / "metrics.json")
+    if options.judge:
+        result, inputs = _judge(predictions, truth, out, options)
+    else:
+        result, inputs = _compare(predictions, truth, options)
     for note in result.notes:
         log.info("%s", note)
-    facts = to_json(result) | {"provenance": provenance("evaluate", [prediction, truth], options)}
-    with replacing(out or prediction.parent / "metrics.json") as part:
+    facts = to_json(result) | {"provenance": provenance("evaluate", inputs, options)}
+    with replacing(out) as part:
         part.write_text(json.dumps(facts, indent=1) + "\n")
     if options.report:
         from stages.evaluate.report import write_report
 
-        write_report(options.report, result, prediction, truth)
+        write_report(options.report, result, *inputs)
     print(json.dumps(facts, indent=1) if as_json else format_table(result))
     return facts
+
+
+def _compare(predictions: list[Path], truth: Path | None, options: EvaluateOptions) -> tuple[Result, list[Path]]:
+    """The metrics of a prediction, and both files."""
+    if truth is None:
+        raise InputError(f"{predictions[0]}: name the truth with --against, or have films scored with --judge")
+    if len(predictions) > 1:
+        raise InputError(f"{predictions[1]}: is a second prediction; with --against give one")
+    prediction, truth = predictions[0], Path(truth)
+    kind = _common_kind(prediction, truth)
+    _check_options(kind, options)
+    return choose(COMPARISONS, kind)(prediction, truth, options), [prediction, truth]
+
+
+def _judge(
+    films: list[Path], truth: Path | None, out: Path, options: EvaluateOptions
+) -> tuple[Result, list[Path]]:
+    """The scores of films, and their files."""
+    from stages.evaluate.judge import find_films, judge
+
+    if truth is not None:
+        raise InputError(f"--against {truth}: --judge scores films by themselves; give one of the two")
+    _check_options("films", options)
+    films = find_films(films)
+    return judge(films, out, options), films
 
 
 def _common_kind(prediction: Path, truth: Path) -> str:
@@ -87,5 +122,6 @@ def _kind(path: Path) -> str:
 def _check_options(kind: str, options: EvaluateOptions) -> None:
     """InputError for an option that has no effect on this kind of data."""
     for name, kinds in OPTION_KINDS.items():
-        if getattr(options, name) not in (None, False, "") and kind not in kinds:
-            raise InputError(f"--{name}: does not apply to files of kind {kind}; omit it")
+        if getattr(options, name) != getattr(DEFAULTS, name) and kind not in kinds:
+            only = "; it belongs to --judge" if kinds == ("films",) else "; omit it"
+            raise InputError(f"--{name.replace('_', '-')}: does not apply to files of kind {kind}{only}")

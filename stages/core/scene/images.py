@@ -79,10 +79,14 @@ def write_png(path: Path, image: Float[Tensor, "h w 3"]) -> None:
 
 def write_jpeg(path: Path, image: Float[Tensor, "h w 3"], quality: int = 92) -> None:
     """Write an 8-bit JPEG."""
-    pixels = cv2.cvtColor(to_bytes(image), cv2.COLOR_RGB2BGR)
-    _, data = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, quality])
     with replacing(path) as part:
-        part.write_bytes(data.tobytes())
+        part.write_bytes(to_jpeg(image, quality))
+
+
+def to_jpeg(image: Float[Tensor, "h w 3"], quality: int = 92) -> bytes:
+    """The contents of an 8-bit JPEG file."""
+    pixels = cv2.cvtColor(to_bytes(image), cv2.COLOR_RGB2BGR)
+    return cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
 
 
 def write_labels(path: Path, labels: Int[Tensor, "h w"]) -> None:
@@ -157,6 +161,32 @@ def read_video(path: Path) -> Iterator[Float[Tensor, "h w 3"]]:
                 yield torch.from_numpy(frame.to_ndarray(format="rgb24").astype(np.float32) / 255)
         except import_av(path).FFmpegError as error:
             raise InputError(f"{path}: the video breaks off or is damaged ({error.strerror})") from error
+
+
+def sample_frames(video: Path, count: int, longest: int) -> list[bytes]:
+    """`count` evenly spaced frames of a video, the first and the last among them, as JPEG of `longest` px or less.
+
+    A video with fewer frames gives all of them. Raises InputError for a video that cannot be read or has no frames.
+    """
+    total = video_info(video)[0] or sum(1 for _ in read_video(video))
+    jpegs, frames = _sample(video, total, count, longest)
+    if frames != total:  # the container declares another number than it holds
+        jpegs, _ = _sample(video, frames, count, longest)
+    if not jpegs:
+        raise InputError(f"{video}: holds no frames")
+    return jpegs
+
+
+def _sample(video: Path, total: int, count: int, longest: int) -> tuple[list[bytes], int]:
+    """`count` evenly spaced frames of the first `total`, and the number of all frames."""
+    wanted = {round(i * (total - 1) / max(count - 1, 1)) for i in range(count)}
+    jpegs, frames = [], 0
+    for frames, image in enumerate(read_video(video), 1):
+        if frames - 1 in wanted:
+            h, w = image.shape[:2]
+            factor = min(1.0, longest / max(h, w))
+            jpegs.append(to_jpeg(resize(image, max(1, round(w * factor)), max(1, round(h * factor))), 85))
+    return jpegs, frames
 
 
 def import_av(path: Path) -> ModuleType:

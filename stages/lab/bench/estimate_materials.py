@@ -8,17 +8,15 @@ from __future__ import annotations
 
 import json
 import logging
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
-from tqdm import tqdm
-
 from stages.core.errors import InputError
+from stages.core.models.chat_completions import ChatEndpoint, InvalidReply, image_part, json_object
 from stages.core.scene.files import provenance, replacing
-from stages.core.scene.images import read_video, resize, video_info, write_jpeg
+from stages.core.scene.images import sample_frames
 from stages.core.scene.scene_ply import read_scene
-from stages.lab.bench.chat_completions import ChatEndpoint, image_part
+from stages.core.scene.schema import quote
 
 log = logging.getLogger(__name__)
 RANGES = {"E": (1e2, 1e12), "density": (5.0, 25_000.0)}  # from foams and gels to metals [Pa] [kg/m^3]
@@ -50,10 +48,6 @@ class EstimateOptions:
     frames: int = 10  # evenly spaced
     longest: int = 512  # longest side of a frame as sent [px]
     tries: int = 3  # replies, before giving up
-
-
-class InvalidReply(ValueError):
-    """A reply that cannot be used; its message is sent back to the model."""
 
 
 def run(video: Path, out: Path, options: EstimateOptions = EstimateOptions()) -> list[str]:
@@ -91,23 +85,6 @@ def object_names(objects: str) -> list[str]:
     return names
 
 
-def sample_frames(video: Path, count: int, longest: int) -> list[bytes]:
-    """`count` evenly spaced frames, the first and the last among them (fewer if there are fewer), as JPEG."""
-    total = video_info(video)[0] or sum(1 for _ in read_video(video))
-    wanted = {round(i * (total - 1) / max(count - 1, 1)) for i in range(count)}
-    jpegs = []
-    with tempfile.TemporaryDirectory() as folder:
-        for i, image in enumerate(tqdm(read_video(video), total=total, unit="frame")):
-            if i in wanted:
-                h, w = image.shape[:2]
-                factor = min(1.0, longest / max(h, w))
-                write_jpeg(Path(folder) / "frame.jpg", resize(image, round(w * factor), round(h * factor)), 85)
-                jpegs.append((Path(folder) / "frame.jpg").read_bytes())
-    if not jpegs:
-        raise InputError(f"{video}: holds no frames")
-    return jpegs
-
-
 def estimate(
     endpoint: ChatEndpoint, jpegs: list[bytes], names: list[str], tries: int
 ) -> tuple[dict[str, dict], list[str]]:
@@ -115,38 +92,21 @@ def estimate(
     which = f"The objects are called: {', '.join(names)}." if names else "Give every object a short name of its own."
     text = PROMPT.format(frames=len(jpegs), which=which, example=names[0] if names else "duck", **RANGES)
     messages = [{"role": "user", "content": [{"type": "text", "text": text}, *map(image_part, jpegs)]}]
-    replies: list[str] = []
-    for _ in range(tries):
-        replies.append(endpoint.ask(messages))
-        try:
-            return parse_reply(replies[-1], names), replies
-        except InvalidReply as error:
-            problem = str(error)
-            log.info("%s's answer cannot be used: %s", endpoint.model, problem)
-            messages += [
-                {"role": "assistant", "content": replies[-1]},
-                {"role": "user", "content": f"That cannot be used: {problem}. Answer again, with JSON alone."},
-            ]
-    raise InputError(f"{endpoint.model} at {endpoint.url}: {tries} answers could not be used, the last because "
-                     f"{problem}; try another --model, or write the materials yourself")  # fmt: skip
+    try:
+        return endpoint.ask_until_valid(messages, lambda reply: parse_reply(reply, names), tries)
+    except InvalidReply as error:
+        raise InputError(f"{endpoint.model} at {endpoint.url}: {tries} answers could not be used, the last because "
+                         f"{error}; try another --model, or write the materials yourself") from error  # fmt: skip
 
 
 def parse_reply(reply: str, names: list[str]) -> dict[str, dict]:
     """A reply as {name: {material, E, density}}, in the order of the names. Raises InvalidReply for anything else."""
-    text = reply.strip()
-    if text.startswith("```") and text.endswith("```"):  # a Markdown fence around the JSON is accepted
-        text = text.strip("`").removeprefix("json")
-    try:
-        data = json.loads(text, object_pairs_hook=_once, parse_constant=_not_a_number)
-    except InvalidReply:
-        raise
-    except ValueError as error:
-        raise InvalidReply(f"it is not JSON ({error})") from error
-    if not isinstance(data, dict) or not data:
-        raise InvalidReply("it must be a JSON object with an entry for each object")
+    data = json_object(reply)
+    if not data:
+        raise InvalidReply("it must have an entry for each object")
     missing, unknown = [n for n in names if n not in data], [n for n in data if names and n not in names]
     if missing or unknown:
-        what = f"no entry for {', '.join(missing)}" if missing else f"{', '.join(unknown)} was not asked for"
+        what = f"no entry for {', '.join(missing)}" if missing else f"{quote(', '.join(unknown))} was not asked for"
         raise InvalidReply(f"{what}; the names are {', '.join(names)}")
     return {name: _entry(name, data[name]) for name in names or data}
 
@@ -165,14 +125,3 @@ def _entry(name: str, row: object) -> dict:
                 f"{key} of {name} is {str(value)[:20]} {UNITS[key]}, which is not within {low:g} to {high:g}"
             )
     return {"material": " ".join(row["material"].split()), "E": float(row["E"]), "density": float(row["density"])}
-
-
-def _once(pairs: list[tuple[str, object]]) -> dict:
-    keys = [key for key, _ in pairs]
-    if len(set(keys)) < len(keys):
-        raise InvalidReply("a name is there twice")
-    return dict(pairs)
-
-
-def _not_a_number(word: str) -> float:
-    raise InvalidReply(f"{word} is not a number")

@@ -8,7 +8,7 @@ import torch
 from stages.core.errors import InputError, MissingPackage
 from stages.core.geometry.cameras import centres
 from stages.core.geometry.similarity import umeyama
-from stages.core.scene.cameras import LensDistortion, read_cameras
+from stages.core.scene.cameras import LensDistortion
 from stages.reconstruct import features, sfm
 from stages.reconstruct.matching import MatchingOptions
 from stages.reconstruct.photo_reader import read_photos
@@ -34,8 +34,6 @@ def test_absent_pycolmap_is_reported(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     with pytest.raises(MissingPackage, match="`pip install pycolmap`, or use --backend pi3"):
         sfm.estimate_cameras(as_photos(arc(2, (64, 48)), tmp_path))
-    with pytest.raises(MissingPackage, match="COLMAP model needs the package pycolmap"):
-        read_cameras(tmp_path)
 
 
 def test_photos_are_read_without_pycolmap(tmp_path, monkeypatch):

@@ -10,9 +10,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from stages.core.errors import InputError, MissingPackage
+from stages.core.errors import InputError
 from stages.core.geometry.similarity import Similarity
-from stages.core.scene.schema import numbers, quote, read_json, reason
+from stages.core.scene.colmap_model import read_colmap
+from stages.core.scene.schema import number, numbers, quote, read_json, reason
 
 LENS_MODEL = "opencv"  # the only one: k1 k2 p1 p2 k3 of OpenCV
 DISTORTION = ("k1", "k2", "p1", "p2", "k3")
@@ -142,7 +143,7 @@ class LensDistortion:
 
 
 def read_cameras(path: Path) -> tuple[Cameras, LensDistortion]:
-    """Cameras of a nerfstudio transforms.json or of a COLMAP model folder (cameras, images, points3D), sorted by name.
+    """Cameras of a nerfstudio transforms.json or of a COLMAP model folder (cameras and images), sorted by name.
 
     K and size are those of the photos as taken. Raises InputError for other files and for camera models with other
     distortion parameters than OpenCV's first five, such as fisheye lenses.
@@ -167,17 +168,15 @@ def _from_transforms(data: dict) -> tuple[Cameras, LensDistortion]:
     viewmats, Ks, sizes, names, lenses = [], [], [], [], []
     for frame in sorted(data["frames"], key=lambda frame: frame["file_path"]):
         value = {**data, **frame}
-        c2w = np.array(frame["transform_matrix"], dtype=np.float64) @ np.diag([1.0, -1, -1, 1])
-        viewmats.append(np.linalg.inv(c2w))
-        Ks.append([[value["fl_x"], 0, value["cx"]], [0, value["fl_y"], value["cy"]], [0, 0, 1]])
-        sizes.append([value["w"], value["h"]])
-        names.append(Path(frame["file_path"]).name)
+        c2w = np.array([numbers(row, 4, "transform_matrix") for row in frame["transform_matrix"]])
+        viewmats.append(np.linalg.inv(c2w @ np.diag([1.0, -1, -1, 1])))
+        fx, fy, cx, cy = (number(value[name], name) for name in ("fl_x", "fl_y", "cx", "cy"))
+        Ks.append([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+        sizes.append([number(value[name], name, 1, MAX_SIDE) for name in ("w", "h")])
+        names.append(quote(Path(frame["file_path"]).name, 255))
         lenses.append(_transforms_lens(value))
     if not names:
         raise ValueError("no frames")
-    if not all(np.isfinite(rows).all() for rows in (viewmats, Ks, sizes, lenses)):
-        raise ValueError("a value is not finite")
-    sizes = [numbers(size, 2, "w h", 1, MAX_SIDE) for size in sizes]
     cameras = Cameras(_float(viewmats), _float(Ks), torch.tensor(sizes).long(), tuple(names))
     return check_cameras(cameras), LensDistortion(_float(lenses))
 
@@ -187,48 +186,25 @@ def _transforms_lens(value: dict) -> list[float]:
     model = value.get("camera_model", "OPENCV")
     if model not in PINHOLE_MODELS or any(value.get(k, 0) for k in ("k4", "k5", "k6")):
         raise ValueError(f"camera_model {model} with k4 {value.get('k4', 0)}: only k1 k2 p1 p2 k3 are supported")
-    return [value.get(k, 0.0) for k in DISTORTION]
+    return [number(value.get(k, 0.0), k) for k in DISTORTION]
 
 
 def _read_colmap(path: Path) -> tuple[Cameras, LensDistortion]:
     try:
-        import pycolmap  # takes a second to import, and only this reader needs it
-    except ImportError as error:
-        raise MissingPackage(f"{path}: a COLMAP model needs the package pycolmap, which is not installed; "
-                             "`pip install pycolmap`, or give a transforms.json") from error  # fmt: skip
-    try:
-        model = pycolmap.Reconstruction(str(path))
-    except (ValueError, RuntimeError, IndexError) as error:
-        raise InputError(f"{path}: holds no COLMAP model (cameras, images and points3D, .bin or .txt)") from error
-    viewmats, Ks, sizes, names, lenses = [], [], [], [], []
-    for image in sorted(model.images.values(), key=lambda image: image.name):
-        camera = model.cameras[image.camera_id]
-        viewmats.append(np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]]))
-        Ks.append(camera.calibration_matrix())
-        sizes.append([camera.width, camera.height])
-        names.append(Path(image.name).name)
-        lenses.append(_colmap_lens(path, camera))
-    if not names:
-        raise InputError(f"{path}: the COLMAP model has no registered image")
-    cameras = Cameras(_float(viewmats), _float(Ks), torch.tensor(sizes, dtype=torch.int64), tuple(names))
-    lens = LensDistortion(_float(lenses))
-    try:
-        if not lens.coefficients.isfinite().all():
-            raise ValueError("a lens has a coefficient that is not finite")
-        return check_cameras(cameras), lens
-    except ValueError as error:
-        raise InputError(f"{path}: {error}; make the COLMAP model again") from error
-
-
-def _colmap_lens(path: Path, camera) -> list[float]:
-    """k1 k2 p1 p2 k3 of a COLMAP camera: its parameters after focal length and principal point."""
-    tail = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 3, "RADIAL": 3, "OPENCV": 4, "FULL_OPENCV": 4}
-    model = camera.model.name
-    k = [float(x) for x in camera.params[tail.get(model, 0) :]]
-    if model not in tail or any(k[5:]):
-        raise InputError(f"{path}: camera model {model}{' with k4 to k6' if model in tail else ''} is not supported; "
-                         "undistort it with `colmap image_undistorter`")  # fmt: skip
-    return (k + [0.0] * 5)[:5]
+        images = read_colmap(path)
+        if not images:
+            raise ValueError("it has no registered image")
+        if any(any(image.lens[5:]) for image in images):
+            raise ValueError("camera model FULL_OPENCV with k4 to k6 is not supported; undistort it with `colmap "
+                             "image_undistorter`")  # fmt: skip
+        sizes = [numbers(image.size, 2, f"the size of {image.name}", 1, MAX_SIDE) for image in images]
+        cameras = Cameras(_float([image.viewmat for image in images]), _float([image.K for image in images]),
+                          torch.tensor(sizes).long(), tuple(image.name for image in images))  # fmt: skip
+        return check_cameras(cameras), LensDistortion(_float([image.lens[:5] for image in images]))
+    except OSError as error:
+        raise InputError(f"{path}: holds no COLMAP model (cameras and images, .bin or .txt)") from error
+    except (ValueError, OverflowError) as error:
+        raise InputError(f"{path}: the COLMAP model cannot be used: {reason(error)}") from error
 
 
 def _float(rows: list) -> Tensor:

@@ -16,6 +16,7 @@ MAX_JSON_BYTES, MAX_JSON_DEPTH = 256 << 20, 100
 MAX_OBJECT_ID = 65535  # label images have 16 bits
 LARGEST = 1e9  # of coordinates and sizes [scene units]; squares stay far from the limit of float32
 MAX_QUOTED = 80
+MAX_ROWS = 10**6  # of a list that a user writes
 Bound = int | float
 PLY_WIDTHS = {"char": 1, "uchar": 1, "int8": 1, "uint8": 1, "short": 2, "ushort": 2, "int16": 2, "uint16": 2,
               "double": 8, "float64": 8}  # bytes; the others have 4  # fmt: skip
@@ -45,6 +46,34 @@ def numbers(values: object, count: int, what: str, low: Bound = -LARGEST, high: 
     if isinstance(values, (str, bytes, dict)) or not hasattr(values, "__len__") or len(values) != count:
         raise ValueError(f"{what} is {quote(repr(values), 40)}, not {count} numbers")
     return tuple(number(value, what, low, high) for value in values)
+
+
+def whole(value: object, what: str, low: int = 0, high: int = MAX_OBJECT_ID) -> int:
+    """A whole number between two bounds, also one written as 3.0; ValueError for anything else."""
+    if number(value, what, low, high) != int(value):
+        raise ValueError(f"{what} is {quote(repr(value), 40)}, not a whole number")
+    return int(value)
+
+
+def texts(values: object, what: str) -> tuple[str, ...]:
+    """A list of texts, each on one line and at most 200 characters long; ValueError for anything else."""
+    if not isinstance(values, (list, tuple)) or not all(isinstance(value, str) for value in values):
+        raise ValueError(f"{what} is {quote(repr(values), 40)}, not a list of texts")
+    return tuple(quote(value, 200) for value in values)
+
+
+def flag(value: object, what: str) -> bool:
+    """True or false; ValueError for anything else."""
+    if not isinstance(value, bool):
+        raise ValueError(f"{what} is {quote(repr(value), 40)}, not true or false")
+    return value
+
+
+def rows(values: object, what: str) -> list:
+    """A list of at most MAX_ROWS values; ValueError for anything else."""
+    if not isinstance(values, list) or len(values) > MAX_ROWS:
+        raise ValueError(f"{what} is {quote(repr(values), 40)}, not a list of at most {MAX_ROWS} values")
+    return values
 
 
 def parse_json(text: str, finite: bool = True) -> object:

@@ -1,6 +1,7 @@
 import dataclasses
 import json
 
+import numpy as np
 import pytest
 import torch
 
@@ -28,8 +29,8 @@ def write_transforms(folder, **more):
     return folder / "transforms.json"
 
 
-def write_colmap(folder, model: str, params: list[float]):
-    """A COLMAP model of two photos with this camera model and these parameters."""
+def write_colmap(folder, model: str, params: list[float], text: bool = False):
+    """A COLMAP model of two photos with this camera model and these parameters, as COLMAP writes it."""
     pycolmap = pytest.importorskip("pycolmap")
 
     reconstruction = pycolmap.Reconstruction()
@@ -37,9 +38,11 @@ def write_colmap(folder, model: str, params: list[float]):
     reconstruction.add_camera_with_trivial_rig(camera)
     for i, name in enumerate("ba", start=1):
         image = pycolmap.Image(name=f"{name}.jpg", camera_id=1, image_id=i)
-        reconstruction.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
+        image.points2D = pycolmap.Point2DList([pycolmap.Point2D(np.array([1.0, 2.0]))] * (i - 1))
+        turned = pycolmap.Rotation3d(np.array([0.5, 0.1, -0.3, 0.8]) / np.linalg.norm([0.5, 0.1, -0.3, 0.8]))
+        reconstruction.add_image_with_trivial_frame(image, pycolmap.Rigid3d(turned, np.array([i, 2.0, 3.0])))
     (folder / "model").mkdir()
-    reconstruction.write(str(folder / "model"))
+    (reconstruction.write_text if text else reconstruction.write)(str(folder / "model"))
     return folder / "model"
 
 
@@ -119,6 +122,16 @@ def test_colmap_models_keep_their_lens(tmp_path, model, params, expected):
     assert cameras.names == ("a.jpg", "b.jpg")
     assert cameras.Ks[0].tolist() == [[50, 0, 32], [0, focals[-1], 24], [0, 0, 1]]
     assert lenses.coefficients[1].tolist() == pytest.approx(expected + [0.0] * (5 - len(expected)))
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_colmap_poses_are_those_that_colmap_reads(tmp_path, text):
+    pycolmap = pytest.importorskip("pycolmap")
+    path = write_colmap(tmp_path, "PINHOLE", [50, 51, 32, 24], text)
+    images = sorted(pycolmap.Reconstruction(str(path)).images.values(), key=lambda image: image.name)
+    (path / f"points3D.{'txt' if text else 'bin'}").write_bytes(b"\xff" * 20)  # damaged points do not matter
+    poses = np.array([image.cam_from_world().matrix() for image in images])
+    torch.testing.assert_close(read_cameras(path)[0].viewmats[:, :3], torch.from_numpy(poses).float())
 
 
 @pytest.mark.parametrize(

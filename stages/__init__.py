@@ -6,6 +6,7 @@ import os
 # core from the one it waits for. OpenMP and OpenBLAS read these when PyTorch and NumPy are first imported.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 os.environ.setdefault("OPENBLAS_THREAD_TIMEOUT", "4")
+os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(1 << 27))  # a file of 200 kB can declare 2^30 pixels
 
 # command -> (files in, files out), in the order of the pipeline
 PIPELINE = {

@@ -14,9 +14,9 @@ import torch
 from stages.core.errors import InputError
 from stages.core.geometry.cameras import centres
 from stages.core.geometry.rotations import nearest_rotation
-from stages.core.scene.cameras import Cameras
+from stages.core.scene.cameras import MAX_SIDE, Cameras, check_cameras
 from stages.core.scene.files import must_exist
-from stages.core.scene.schema import read_json, reason
+from stages.core.scene.schema import number, numbers, read_json, reason, whole
 
 EXPECTED = "a camera path (.json: a list of {rotation, position, width, height, fx, fy} or of {viewmat, K, size})"
 
@@ -32,31 +32,37 @@ def read_camera_path(path: str | Path) -> Cameras:
         entries = [_entry(row) for row in rows]
         viewmats, Ks = (torch.from_numpy(np.stack([e[i] for e in entries])).float() for i in (0, 1))
         sizes = torch.tensor([entry[2] for entry in entries])
+        if not (sizes == sizes[0]).all():
+            raise ValueError("the cameras differ in image size; give all the same size")
+        return check_cameras(Cameras(viewmats, Ks, sizes, tuple(f"{path.stem} {i}" for i in range(len(entries)))))
     except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RuntimeError, IndexError) as error:
         raise InputError(f"{path}: is not a valid camera path ({reason(error)}); {EXPECTED} is expected") from error
-    if not (sizes == sizes[0]).all() or not (sizes > 0).all():
-        raise InputError(f"{path}: the cameras differ in image size, or it is zero; give all the same size")
-    if not (viewmats.isfinite().all() and Ks.isfinite().all() and (Ks[:, [0, 1], [0, 1]] > 0).all()):
-        raise InputError(f"{path}: values must be finite and focal lengths above 0")
-    return Cameras(viewmats, Ks, sizes, tuple(f"{path.stem} {i}" for i in range(len(entries))))
 
 
 def _entry(row: dict) -> tuple[np.ndarray, np.ndarray, list[int]]:
     """viewmat, K and size of one camera in either format."""
     if "viewmat" in row:
-        viewmat, K = np.array(row["viewmat"], np.float64).reshape(4, 4), np.array(row["K"], np.float64).reshape(3, 3)
-        width, height = row["size"]
+        viewmat, K = _matrix(row, "viewmat", 4, 4), _matrix(row, "K", 3, 3)
+        width, height = numbers(row["size"], 2, "size", 1, MAX_SIDE)
     else:
-        R = np.array(row["rotation"], np.float64).reshape(3, 3).T  # world to camera
+        R = _matrix(row, "rotation", 3, 3).T  # world to camera
         viewmat = np.eye(4)
-        viewmat[:3, :3], viewmat[:3, 3] = R, -R @ np.array(row["position"], np.float64).reshape(3)
-        width, height = row["width"], row["height"]
-        K = np.array([[row["fx"], 0, width / 2], [0, row["fy"], height / 2], [0, 0, 1]], np.float64)
+        viewmat[:3, :3], viewmat[:3, 3] = R, -R @ numbers(row["position"], 3, "position")
+        width, height, fx, fy = (number(row[name], name) for name in ("width", "height", "fx", "fy"))
+        K = np.array([[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1]])
     R = viewmat[:3, :3]
     if np.abs(R @ R.T - np.eye(3)).max() > 1e-2 or np.linalg.det(R) < 0:
         raise ValueError("a rotation is not orthonormal")
     viewmat[:3, :3] = nearest_rotation(torch.from_numpy(R)).numpy()
-    return viewmat, K, [int(width), int(height)]
+    return viewmat, K, [whole(width, "width", 1, MAX_SIDE), whole(height, "height", 1, MAX_SIDE)]
+
+
+def _matrix(row: dict, name: str, height: int, width: int) -> np.ndarray:
+    """Rows of numbers, or all in one list."""
+    values = row[name]
+    if isinstance(values, list) and len(values) == height and isinstance(values[0], list):
+        return np.array([numbers(line, width, name) for line in values])
+    return np.array(numbers(values, height * width, name)).reshape(height, width)
 
 
 def interpolate_cameras(cameras: Cameras, frames: int) -> Cameras:

@@ -12,7 +12,7 @@ from stages.core.errors import InputError
 from stages.core.scene.images import read_labels
 from stages.core.scene.lens import Undistortion
 from stages.core.scene.scene import Scene
-from stages.core.scene.schema import quote, read_json, reason
+from stages.core.scene.schema import read_json, reason, texts, whole
 from stages.segment.options import SegmentOptions
 from stages.segment.view_images import match_files
 from stages.segment.voting import apply_votes, collect_votes
@@ -48,7 +48,8 @@ def read_names(folder: Path) -> dict[int, str]:
         return {}
     try:
         data = read_json(path)
-        rows = enumerate(data, start=1) if isinstance(data, list) else data.items()
-        return {int(number): quote(name, 200) for number, name in rows}
+        labels = range(1, len(data) + 1) if isinstance(data, list) else data.keys()
+        names = texts(list(data) if isinstance(data, list) else list(data.values()), "the names")
+        return {whole(int(label), "a label"): name for label, name in zip(labels, names, strict=True)}
     except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RuntimeError, IndexError) as error:
         raise InputError(f'{path}: is not readable ({reason(error)}); write {{"1": "duck", "2": "bowl"}}') from error

@@ -10,10 +10,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from stages.core.errors import InputError
-from stages.core.scene.cameras import Cameras
+from stages.core.scene.cameras import MAX_SIDE, Cameras
 from stages.core.scene.files import must_exist
 from stages.core.scene.lens import Undistortion, photo_of
-from stages.core.scene.schema import quote, read_json, reason
+from stages.core.scene.schema import MAX_OBJECT_ID, numbers, read_json, reason, rows, texts, whole
 
 
 @dataclass(frozen=True)
@@ -35,15 +35,11 @@ def read_prompts(path: Path, cameras: Cameras, undistorted: bool = False) -> Obj
     must_exist(path, "a prompts.json with bbox or center_point, and text")
     try:
         data = read_json(path)
-        boxes = torch.tensor(data.get("bbox") or [], dtype=torch.float32).reshape(-1, 4)
-        points = torch.tensor(data.get("center_point") or [], dtype=torch.float32).reshape(-1, 2)
+        boxes, points = _table(data, "bbox", 4), _table(data, "center_point", 2)
         count = len(boxes) or len(points)
-        width, height = (int(side) for side in data.get("size") or photo_of(cameras, 0, undistorted)[1])
-        if not (boxes.isfinite().all() and points.isfinite().all()):
-            raise ValueError("a coordinate is not finite")
-        if width < 1 or height < 1:
-            raise ValueError(f"size {width}x{height}")
-        names = tuple(quote(name, 200) for name in data.get("text") or [f"object_{i + 1}" for i in range(count)])
+        size = numbers(data.get("size") or photo_of(cameras, 0, undistorted)[1], 2, "size", 1, MAX_SIDE)
+        width, height = (whole(side, "size", 1, MAX_SIDE) for side in size)
+        names = texts(data.get("text") or [f"object_{i + 1}" for i in range(count)], "text")
     except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RuntimeError, IndexError) as error:
         raise _wrong(path, reason(error)) from error
     if not count:
@@ -61,6 +57,15 @@ def read_prompts(path: Path, cameras: Cameras, undistorted: bool = False) -> Obj
     if not points.isfinite().all():
         raise InputError(f"{path}: a center_point is where the lens of {cameras.names[0]} shows nothing")
     return ObjectPrompts(boxes if len(boxes) else None, points if len(points) else None, names)
+
+
+def _table(data: dict, name: str, width: int) -> Float[Tensor, "n w"]:
+    """Rows of pixel coordinates; none where there is no such key."""
+    found = rows(data.get(name) or [], name)
+    if len(found) > MAX_OBJECT_ID:
+        raise ValueError(f"{name} has {len(found)} rows; at most {MAX_OBJECT_ID} are read")
+    found = [found] if found and not isinstance(found[0], list) else found  # a single row without its brackets
+    return torch.tensor([numbers(row, width, name, -1e6, 1e6) for row in found]).reshape(-1, width)
 
 
 def _wrong(path: Path, what: str) -> InputError:

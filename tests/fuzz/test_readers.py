@@ -1,6 +1,10 @@
 """Damaged and hostile files end in a right result or one clear sentence."""
 
-from collections import Counter
+import json
+import os
+import signal
+import time
+from pathlib import Path
 
 import h5py
 import pytest
@@ -8,24 +12,69 @@ import pytest
 from stages.core.errors import InputError
 from stages.core.scene.schema import MAX_JSON_DEPTH, parse_json, quote
 from stages.core.scene.trajectory import read_trajectory
-from stages.lab.fuzz import KINDS, result_of, run, write_trajectory
+from stages.lab.fuzz import campaign
+from stages.lab.fuzz.cases import GOOD, Examples, result_of, run_here
+from stages.lab.fuzz.kinds import KINDS, Kind, write_trajectory
 
 
 def test_two_thousand_damaged_files(tmp_path):
-    counts, failures = run(tmp_path, 2001)
+    counts, failures = run_here(tmp_path, 2000)
     assert not failures, "\n".join(failures[:5])
-    per_kind = Counter()
-    for (kind, result), count in counts.items():
-        per_kind[kind] += count
-        assert result in ("right", "clear error")
-    assert per_kind == {kind.name: 667 for kind in KINDS}
-    assert all(counts[kind.name, "right"] > 20 for kind in KINDS)  # the changes are not all fatal
+    assert sum(counts.values()) == 2000 and {result for _, result in counts} == set(GOOD)
+    assert {kind for kind, _ in counts} == {kind.name for kind in KINDS}
+    assert sum(counts[kind.name, "right"] for kind in KINDS) > 200  # the changes are not all fatal
+
+
+@pytest.fixture(scope="module")
+def examples(tmp_path_factory):
+    return Examples(tmp_path_factory.mktemp("fuzz"))
 
 
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.name)
-def test_valid_files_are_right(kind, tmp_path):
-    kind.write(tmp_path / kind.name)
-    assert result_of(kind, tmp_path / kind.name) == ("right", "")
+def test_valid_files_are_right(kind, examples):
+    assert result_of(kind, examples.place(kind)) == ("right", "")
+
+
+def test_results_that_are_not_good(tmp_path):
+    def fail(error):
+        def read(folder):
+            raise error
+
+        return Kind("x", None, {}, read)
+
+    assert result_of(fail(KeyError("x")), tmp_path)[0] == "traceback"
+    assert result_of(fail(AssertionError("x")), tmp_path)[0] == "nonsense"
+    assert result_of(fail(InputError("x" * 2000)), tmp_path)[0] == "nonsense"
+    assert result_of(fail(InputError("\x1b[31m")), tmp_path)[0] == "nonsense"
+    assert result_of(fail(MemoryError()), tmp_path)[0] == "more than 2 GB"
+
+
+def hostile_work(*arguments):
+    """The work of a process in which case 2 ends it and case 5 does not end."""
+    run = Examples.run
+
+    def hostile(self, seed, number):
+        if number == 2:
+            os.kill(os.getpid(), signal.SIGKILL)
+        time.sleep(60 if number == 5 else 0)
+        return run(self, seed, number)
+
+    Examples.run = hostile
+    WORK(*arguments)
+
+
+WORK = campaign._work
+
+
+@pytest.mark.slow
+def test_campaign_survives_crashes_and_hangs(tmp_path, monkeypatch):
+    monkeypatch.setattr(campaign, "MAX_SECONDS", 3.0)
+    monkeypatch.setattr(campaign, "_work", hostile_work)
+    lines = list(campaign.run(tmp_path / "r.json", 8))
+    report = json.loads((tmp_path / "r.json").read_text())
+    total = report["total"]
+    assert (total["signal"], total["more than 10 s"], sum(total.values())) == (1, 1, 8) and "2 failures" in lines[-1]
+    assert all(list(Path(failure["files"]).iterdir()) for failure in report["failures"])
 
 
 @pytest.mark.parametrize("dtype", ["f2", "f8", ">f4", ">f8"])

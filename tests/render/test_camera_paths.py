@@ -124,7 +124,7 @@ def test_path_passes_through_its_cameras_and_repeats_a_single_one(tmp_path):
      ('[{"rotation": [[1,0,0],[0,1,0],[0,0,2]], "position": [0,0,0], "width": 4, "height": 4, "fx": 1, "fy": 1}]',
       "not orthonormal"),
      ('[{"rotation": [[1,0,0],[0,1,0],[0,0,1]], "position": [0,0,0], "width": 0, "height": 4, "fx": 1, "fy": 1}]',
-      "it is zero")],
+      "width is 0.0, not a number from 1")],
 )  # fmt: skip
 def test_invalid_path_files(tmp_path, text, message):
     (tmp_path / "p.json").write_text(text)

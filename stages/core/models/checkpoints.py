@@ -18,7 +18,7 @@ from stages.core.backends import choose
 from stages.core.errors import InputError
 from stages.core.models.dynamics import Dynamics
 from stages.core.scene.files import must_exist, replacing, sha256
-from stages.core.scene.schema import quote, read_json, reason
+from stages.core.scene.schema import number, quote, read_json, reason, whole
 
 MODELS = {
     "ngff-paper": "stages.core.models.baselines.ngff_paper:PaperForceField",
@@ -28,6 +28,7 @@ MODELS = {
     "pointformer": "stages.core.models.baselines.pointformer:Pointformer",
     "transformer": "stages.core.models.baselines.transformer:Transformer",
 }
+MAX_CONFIG = 4096  # of widths and numbers of layers
 SHIPPED = Path(__file__).parent / "weights"  # shipped in the package
 
 
@@ -105,22 +106,44 @@ def load(path: Path, device: torch.device | str = "cpu") -> tuple[Dynamics, dict
     if path.suffix in (".pt", ".pth"):
         return _public(path).to(device).eval(), {"model": "ngff-paper", "sha256": sha256(path)}
     card = _card(path)
+    state = read_state(path, card)
+    try:
+        _check_config(card["config"])
+        with torch.device("meta"):  # shapes first: they may need any amount of memory
+            build(card["model"], **card["config"]).load_state_dict(state, assign=True)
+        model = build(card["model"], **card["config"])
+        model.load_state_dict(state)
+    except (TypeError, RuntimeError, ValueError) as error:
+        raise _unfit(path, f"the model {card['model']!r} of its card", error) from error
+    return model.to(device).eval(), card
+
+
+def read_state(path: Path, card: Mapping) -> dict[str, Tensor]:
+    """Tensors of a .safetensors file in 32 bits; InputError where it is damaged or not the one of its card."""
     if sha256(path) != card["sha256"]:
         raise InputError(f"{path}: does not have the sha256 that {path.with_suffix('.json').name} states; the file is "
                          "damaged or of another training; fetch or train both again")  # fmt: skip
     try:
         state = load_file(path)
-    except SafetensorError as error:
-        raise InputError(f"{path}: is not a safetensors file ({error}); fetch or train it again") from error
-    wrong = [k for k, v in state.items() if v.is_floating_point() and not v.isfinite().all()]
-    if wrong:
-        raise InputError(f"{path}: {quote(wrong[0])} has values that are not finite; fetch or train it again")
-    try:
-        model = build(card["model"], **card["config"])
-        model.load_state_dict({k: v.float() if v.is_floating_point() else v for k, v in state.items()})
-    except (TypeError, RuntimeError, ValueError) as error:
-        raise _unfit(path, f"the model {card['model']!r} of its card", error) from error
-    return model.to(device).eval(), card
+    except (SafetensorError, ValueError, KeyError, RuntimeError) as error:
+        raise InputError(f"{path}: is not a safetensors file ({reason(error)}); fetch or train it again") from error
+    _check_finite(path, state)
+    return {k: v.float() if v.is_floating_point() else v for k, v in state.items()}
+
+
+def _check_finite(path: Path, state: Mapping[str, Tensor]) -> None:
+    for name, values in state.items():
+        if values.is_floating_point() and not values.float().isfinite().all():  # float() also of 8 bits
+            raise InputError(f"{path}: {quote(name)} has values that are not finite; fetch or train it again")
+
+
+def _check_config(config: Mapping) -> None:
+    """ValueError for values that no model takes: layers without number are built one by one."""
+    for name, value in config.items():
+        if isinstance(value, float):  # dropout
+            number(value, quote(name, 40), 0, 1)
+        elif not isinstance(value, bool):
+            whole(value, quote(name, 40), 1, MAX_CONFIG)
 
 
 def _card(path: Path) -> dict:
@@ -144,6 +167,7 @@ def _public(path: Path) -> Dynamics:
     except Exception as error:  # a damaged pickle raises anything
         raise InputError(f"{path}: cannot be read as a PyTorch checkpoint ({_line(error)})") from error
     state = _tensors(data)
+    _check_finite(path, state)
     try:
         hidden = len(state["predictor.state_embedding.0.weight"])
         layers = sum(k.startswith("predictor.pointnet.extraction_blocks.") and k.endswith("0.weight") for k in state)
@@ -159,7 +183,8 @@ def _tensors(data: object) -> dict[str, Tensor]:
     """The state dict in a checkpoint, without the prefix of data-parallel training."""
     while isinstance(data, dict) and not any(isinstance(v, Tensor) for v in data.values()):
         data = next((data[k] for k in ("model_state_dict", "state_dict", "model") if k in data), None)
-    return {k.removeprefix("module."): v for k, v in data.items()} if isinstance(data, dict) else {}
+    items = data.items() if isinstance(data, dict) else ()
+    return {k.removeprefix("module."): v for k, v in items if isinstance(k, str) and isinstance(v, Tensor)}
 
 
 def _unfit(path: Path, what: str, error: Exception) -> InputError:
@@ -168,4 +193,4 @@ def _unfit(path: Path, what: str, error: Exception) -> InputError:
 
 def _line(error: Exception) -> str:
     """An error message on one line, at most 200 characters."""
-    return " ".join(str(error).split())[:200]
+    return quote(" ".join(str(error).split()), 200)

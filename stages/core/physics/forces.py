@@ -17,7 +17,8 @@ from stages.core.physics.materials import find_object
 from stages.core.scene.files import must_exist
 from stages.core.scene.formats import FORMATS, suffixes
 from stages.core.scene.scene import SceneObject
-from stages.core.scene.schema import quote, read_json, reason
+from stages.core.scene.schema import LARGEST, MAX_ROWS, numbers, quote, read_json, reason, whole
+from stages.core.scene.schema import number as finite
 
 Vector = tuple[float, float, float]
 FORCE_SYNTAX = 'write "object=2 force=0,0,8 from=0.1 to=0.3", optionally with torque=x,y,z or at=x,y,z'
@@ -126,7 +127,7 @@ def parse(
         stored = ForcePrompts(tuple(read_forces(forces, scene_name, objects)))
     return ForcePrompts(
         (*(_force(text, objects) for text in force), *stored.forces),
-        stored.pinned | {find_object(p, objects, f"--pin {p!r}").id for p in pin},
+        stored.pinned | {find_object(p, objects, f"--pin {quote(repr(p))}").id for p in pin},
         stored.velocity | dict(_velocity(text, objects) for text in velocity),
         stored.lift | {id: height for text in lift for id, height in _lift(text, objects)},
         stored.changes,
@@ -147,11 +148,11 @@ def stored_prompts(path: Path, objects: Sequence[SceneObject]) -> ForcePrompts:
 
 
 def _force(text: str, objects: Sequence[SceneObject]) -> Force:
-    where = f"--force {text!r}"
+    where = f"--force {quote(repr(text))}"
     words = dict(word.partition("=")[::2] for word in text.split())
     unknown = words.keys() - {"object", "force", "torque", "from", "to", "at"}
     if unknown:
-        raise InputError(f"{where}: {sorted(unknown)[0]!r} is not a known key; {FORCE_SYNTAX}")
+        raise InputError(f"{where}: {quote(repr(sorted(unknown)[0]))} is not a known key; {FORCE_SYNTAX}")
     if "object" not in words or not {"force", "torque"} & words.keys():
         raise InputError(f"{where}: needs object= and force= or torque=; {FORCE_SYNTAX}")
     at = vector(words["at"], where) if "at" in words else None
@@ -169,7 +170,7 @@ def _checked(force: Force, where: str) -> Force:
 
 
 def _velocity(text: str, objects: Sequence[SceneObject]) -> tuple[int, Vector]:
-    where = f"--velocity {text!r}"
+    where = f"--velocity {quote(repr(text))}"
     words = text.split()
     if len(words) != 2 or not words[0].startswith("object="):
         raise InputError(f'{where}: write "object=1 0,0,2"')
@@ -177,7 +178,7 @@ def _velocity(text: str, objects: Sequence[SceneObject]) -> tuple[int, Vector]:
 
 
 def _lift(text: str, objects: Sequence[SceneObject]) -> list[tuple[int, float]]:
-    where = f"--lift {text!r}"
+    where = f"--lift {quote(repr(text))}"
     key, equals, height = text.rpartition("=")
     value = number(height, where)
     chosen = [find_object(key, objects, where)] if equals else objects
@@ -200,13 +201,16 @@ def read_forces(path: Path, scene_name: str, objects: Sequence[SceneObject]) -> 
         data = data[scene_name] if scene_name in data else next(iter(data.values()))
     if not isinstance(data, list):
         raise InputError(f"{path}: must be {{scene name: [{{obj_id, start, end, force?, torque?}}]}}")
+    if len(data) > MAX_ROWS:
+        raise InputError(f"{path}: has {len(data)} entries; at most {MAX_ROWS} are read")
     return [_parse_entry(row, objects, f"{path}: entry {i + 1}") for i, row in enumerate(data)]
 
 
 def _parse_entry(row: object, objects: Sequence[SceneObject], where: str) -> Force:
     try:
-        id, start, end = int(row["obj_id"]) + 1, float(row["start"]), float(row["end"])
-        push, torque = (_floats(row.get(name, [0, 0, 0])) for name in ("force", "torque"))
+        id = whole(row["obj_id"], "obj_id") + 1
+        start, end = (finite(row[name], name) for name in ("start", "end"))
+        push, torque = (numbers(row.get(name, [0, 0, 0]), 3, name) for name in ("force", "torque"))
     except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RuntimeError, IndexError) as error:
         why = reason(error)
         raise InputError(f"{where}: {why}; needs obj_id, start, end and force or torque of 3 numbers") from error
@@ -216,10 +220,7 @@ def _parse_entry(row: object, objects: Sequence[SceneObject], where: str) -> For
 
 
 def _floats(values: Sequence[float | int | str]) -> Vector:
-    x, y, z = (float(v) for v in values)
-    if not all(map(math.isfinite, (x, y, z))):
-        raise ValueError("a number is not finite")
-    return x, y, z
+    return numbers([float(v) for v in values], 3, "a vector")
 
 
 def vector(text: str, where: str) -> Vector:
@@ -227,7 +228,7 @@ def vector(text: str, where: str) -> Vector:
     try:
         return _floats(text.split(","))
     except ValueError as error:
-        raise InputError(f"{where}: {text!r} is not three numbers such as 0,0,2") from error
+        raise InputError(f"{where}: {quote(repr(text))} is not three numbers such as 0,0,2") from error
 
 
 def number(text: str, where: str) -> float:
@@ -235,7 +236,7 @@ def number(text: str, where: str) -> float:
     try:
         value = float(text)
     except ValueError as error:
-        raise InputError(f"{where}: {text!r} is not a number") from error
-    if not math.isfinite(value):
-        raise InputError(f"{where}: {text!r} is not finite")
+        raise InputError(f"{where}: {quote(repr(text))} is not a number") from error
+    if not abs(value) <= LARGEST:
+        raise InputError(f"{where}: {quote(repr(text))} is not finite, or beyond {LARGEST:g}")
     return value

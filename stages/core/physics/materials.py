@@ -7,7 +7,6 @@ vibration of a whole body: the energy lost per cycle divided by 2 pi times the s
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
@@ -17,7 +16,7 @@ from stages.core.errors import InputError
 from stages.core.kernels.mpm.constitutive import COROTATED, NEO_HOOKEAN, SAND, SNOW, VON_MISES, sand_slope
 from stages.core.scene.files import must_exist
 from stages.core.scene.scene import SceneObject
-from stages.core.scene.schema import read_json, reason
+from stages.core.scene.schema import number, numbers, quote, read_json, reason
 
 Triple = tuple[float | int, float | int, float | int]
 
@@ -136,12 +135,12 @@ def choose_materials(
     """
     given: dict[int, MaterialChoice] = {}
     for key, value in (_read(file) if file else {}).items():
-        given[find_object(key, objects, f"{file}").id] = _material(value, f"{file}: {key}")
+        given[find_object(key, objects, f"{file}").id] = _material(value, f"{file}: {quote(key)}")
     for prompt in prompts:
         key, equals, value = prompt.partition("=")
         if not equals or not value.strip():
-            raise InputError(f"--material {prompt!r}: write OBJECT=MATERIAL, such as duck=rubber")
-        where = f"--material {prompt!r}"
+            raise InputError(f"--material {quote(repr(prompt))}: write OBJECT=MATERIAL, such as duck=rubber")
+        where = f"--material {quote(repr(prompt))}"
         given[find_object(key, objects, where).id] = _material(value.strip(), where)
     return {o.id: given.get(o.id) or _by_name(o) for o in objects}
 
@@ -156,15 +155,15 @@ def find_object(key: str | int, objects: Sequence[SceneObject], where: str) -> S
     near = exact or [o for o in objects if text and text in o.name.lower()]
     if len(near) == 1:
         return near[0]
-    have = ", ".join(f"{o.id} ({o.name})" for o in objects) or "none"
+    have = quote(", ".join(f"{o.id} ({o.name})" for o in objects) or "none", 300)
     problem = f"fits {len(near)} objects" if near else "is not an object of this scene"
-    raise InputError(f"{where}: {text!r} {problem}; there are: {have}")
+    raise InputError(f"{where}: {quote(repr(text))} {problem}; there are: {have}")
 
 
 def _by_name(o: SceneObject) -> MaterialChoice:
     """The scene's material of an object, or the one that its name suggests."""
     if o.material:
-        return _material(o.material, f"object {o.id} ({o.name}) of the scene")
+        return _material(o.material, f"object {o.id} ({quote(o.name)}) of the scene")
     words = set(re.findall(r"[a-z]+(?:-[a-z]+)?", o.name.lower()))
     words |= {word.removesuffix("s") for word in words}
     # objects of the paper before substances: a "rubber duck" is a duck
@@ -180,25 +179,26 @@ def _material(value: object, where: str) -> MaterialChoice:
     """A material by name, or one of a dict of values, checked."""
     if isinstance(value, str):
         if value.lower() not in MATERIALS:
-            raise InputError(f"{where}: no material called {value!r}; choose from {', '.join(MATERIALS)}")
+            raise InputError(f"{where}: no material called {quote(repr(value))}; choose from {', '.join(MATERIALS)}")
         return MaterialChoice(value.lower(), MATERIALS[value.lower()])
     known = [f.name for f in fields(Material) if f.name != "source"]
     model, plastic = Material.model, Material.plastic
     if not isinstance(value, dict) or not {"E", "density"} <= value.keys() or value.keys() - set(known):
         raise InputError(f"{where}: give a material's name or {{E, density}} with any of {', '.join(known)}")
-    if value.get("model", model) not in MODELS:
-        raise InputError(f"{where}: no material model called {value['model']!r}; choose from {', '.join(MODELS)}")
+    if not isinstance(value.get("model", model), str) or value.get("model", model) not in MODELS:
+        given = quote(repr(value["model"]), 40)
+        raise InputError(f"{where}: no material model called {given}; choose from {', '.join(MODELS)}")
     try:
-        a, b, c = (float(v) for v in value.get("plastic", plastic))
-        numbers = {k: float(v) for k, v in value.items() if k not in ("model", "plastic")}
-        material = Material(**numbers, model=value.get("model", model), plastic=(a, b, c))
+        plastic = numbers(value.get("plastic", plastic), 3, "plastic", -1e13, 1e13)
+        values = {k: number(v, k, -1e13, 1e13) for k, v in value.items() if k not in ("model", "plastic")}
+        material = Material(**values, model=value.get("model", model), plastic=plastic)
     except (TypeError, ValueError) as error:
-        problem = f"{error}; E [Pa], density [kg/m^3] and the rest are numbers, plastic three of them"
+        problem = f"{reason(error)}; E [Pa], density [kg/m^3] and the rest are numbers, plastic three of them"
         raise InputError(f"{where}: {problem}") from error
-    if not all(map(math.isfinite, material.plastic)) or MODELS[material.model].plastic and material.plastic[0] <= 0:
-        raise InputError(f"{where}: plastic must be finite, and for {material.model} the first must be positive; the "
+    if MODELS[material.model].plastic and material.plastic[0] <= 0:
+        raise InputError(f"{where}: the first of plastic must be positive for {material.model}; the "
                          f"parameters are: {MODELS[material.model].parameters}")  # fmt: skip
-    if not (0 < material.E < 1e13 and 0 < material.density < 1e5 and -0.5 < material.nu < 0.49):
+    if not (1e-3 <= material.E < 1e13 and 1e-3 <= material.density < 1e5 and -0.5 < material.nu < 0.49):
         raise InputError(f"{where}: E and density must be positive and nu between -0.5 and 0.49")
     if not (0 <= material.friction < 100 and 0 <= material.loss <= 2):
         raise InputError(f"{where}: friction must be 0 or more and loss between 0 and 2")

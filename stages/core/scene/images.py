@@ -18,6 +18,8 @@ from stages.core.errors import InputError, MissingPackage
 from stages.core.scene.files import must_exist, replacing
 from stages.core.scene.formats import IMAGE_SUFFIXES
 
+MAX_VIDEO_PIXELS = 1 << 26  # of a frame; 8K has half as many
+
 
 def list_photos(folder: Path) -> list[Path]:
     """Image files of a folder, sorted by name, without hidden files; InputError if there are none."""
@@ -35,7 +37,11 @@ def read_image(path: Path) -> Float[Tensor, "h w 3"]:
     must_exist(path, "an image")
     pixels = _decode(path, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
     white = np.iinfo(pixels.dtype).max if pixels.dtype.kind == "u" else 1.0
-    return torch.from_numpy(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB).astype(np.float32) / np.float32(white))
+    image = cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB).astype(np.float32)
+    image /= np.float32(white)
+    if pixels.dtype.kind == "f" and not np.isfinite(image).all():
+        raise InputError(f"{path}: has values that are not finite; convert it to JPEG or PNG")
+    return torch.from_numpy(image)
 
 
 def read_labels(path: Path, max_bits: int = 16) -> Int[Tensor, "h w"]:
@@ -203,10 +209,19 @@ def open_video(path: Path) -> Any:
     must_exist(path, "a video")
     av = import_av(path)
     try:
-        file = av.open(str(path))
-    except (av.FFmpegError, OSError) as error:
+        file = av.open(str(path), metadata_errors="replace")
+    except (av.FFmpegError, OSError, ValueError) as error:
         raise InputError(f"{path}: is not a video that can be read") from error
     if not file.streams.video:
         file.close()
         raise InputError(f"{path}: holds no video stream")
+    codec = file.streams.video[0].codec_context  # None for a codec that the library does not have
+    width, height = (codec.width, codec.height) if codec is not None else (0, 0)
+    if not width * height:
+        file.close()
+        raise InputError(f"{path}: is not a video that can be read")
+    if width * height > MAX_VIDEO_PIXELS:
+        file.close()
+        raise InputError(f"{path}: has frames of {width}x{height} pixels; at most {MAX_VIDEO_PIXELS >> 20} million are "
+                         "read")  # fmt: skip
     return file

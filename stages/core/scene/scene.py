@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 from stages.core.scene.cameras import Cameras
 from stages.core.scene.gaussians import Gaussians
-from stages.core.scene.schema import MAX_OBJECT_ID, number, numbers, quote
+from stages.core.scene.schema import number, numbers, quote, whole
 
 UNKNOWN_SCALE = ("assumed", "not stated")  # beginnings of `source` where the scale is not known
 
@@ -53,11 +53,10 @@ class Scene:
 
 def read_object(id: object, name: object, material: object = "") -> SceneObject:
     """An object as a file states it; ValueError for another id than a whole number from 0 to MAX_OBJECT_ID."""
-    if number(id, "an object's id", 0, MAX_OBJECT_ID) != int(id):
-        raise ValueError(f"an object's id is {id}, not a whole number")
+    id = whole(id, "an object's id")
     if not isinstance(name, str) or not isinstance(material, str):
         raise ValueError(f"name or material of object {id} is not text")
-    return SceneObject(int(id), quote(name, 200), quote(material, 200))
+    return SceneObject(id, quote(name, 200), quote(material, 200))
 
 
 def read_metadata(floor: object, scale: object, provenance: object, background: object) -> dict:

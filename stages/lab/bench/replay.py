@@ -12,7 +12,6 @@ import logging
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 import torch
@@ -23,11 +22,13 @@ from stages.core.backends import pick_device
 from stages.core.errors import InputError
 from stages.core.kernels.mpm.constitutive import COROTATED
 from stages.core.physics.mpm import solver as mpm
-from stages.core.scene.files import must_exist, replacing
+from stages.core.scene.files import replacing
+from stages.core.scene.npz import read_npz
 
 log = logging.getLogger(__name__)
 RECORDING_FIELDS = {"positions", "n", "volume", "E", "rho", "nu", "dt", "substeps_per_frame", "n_grid", "grid_lim", 
                     "gravity", "rpic_damping"}  # fmt: skip
+SCALARS = ("nu", "dt", "substeps_per_frame", "n_grid", "grid_lim", "rpic_damping")
 WALL_LAYERS = 3  # layers of nodes outside the walls
 WALL_DAMPING = 0.9  # factor on the tangential velocity at a wall, every substep
 CONTACT_DEVIATION = 1e-3  # deviation from free fall that shows a contact [drop heights]
@@ -57,20 +58,25 @@ class ReplayErrors:
 
 def read_recording(path: Path) -> dict[str, np.ndarray]:
     """The fields of a recording. Raises InputError if the file is not a recording."""
-    must_exist(path, "a recording (.npz) with " + ", ".join(sorted(RECORDING_FIELDS)))
-    try:
-        with np.load(path) as file:
-            data = {name: file[name] for name in file.files}
-    except (ValueError, BadZipFile, EOFError) as error:
-        raise InputError(f"{path}: is not an NPZ file ({error})") from error
+    data = read_npz(path, "a recording (.npz) with " + ", ".join(sorted(RECORDING_FIELDS)))
     if missing := sorted(RECORDING_FIELDS - data.keys()):
         raise InputError(f"{path}: no {', '.join(missing)}; a recording has {', '.join(sorted(RECORDING_FIELDS))}")
+    if data["n"].ndim != 1 or data["n"].dtype.kind not in "iu" or not ((data["n"] > 0) & (data["n"] < 1 << 31)).all():
+        raise InputError(f"{path}: n must be a list of numbers of particles above 0")
     shape, p = data["positions"].shape, int(data["n"].sum())
-    if len(shape) != 3 or shape[1:] != (p, 3) or not np.isfinite(data["positions"]).all():
-        raise InputError(f"{path}: positions must be finite and (frames, {p}, 3), to match n, not {shape}")
-    for name, count in (("volume", p), ("E", len(data["n"])), ("rho", len(data["n"]))):
-        if data[name].shape != (count,):
-            raise InputError(f"{path}: {name} must have {count} values, not {data[name].shape}")
+    if len(shape) != 3 or shape[1:] != (p, 3) or not shape[0]:
+        raise InputError(f"{path}: positions must be (frames, {p}, 3), to match n, not {shape}")
+    bodies = (len(data["n"]),)
+    shapes = {"volume": (p,), "E": bodies, "rho": bodies, "gravity": (3,), **dict.fromkeys(SCALARS, ())}
+    for name, size in shapes.items():
+        if data[name].shape != size:
+            raise InputError(f"{path}: {name} must have the shape {size} to match n, not {data[name].shape}")
+    ranges = {"positions": (-1e6, 1e6), "gravity": (-1e6, 1e6), "nu": (-0.5, 0.4999), "rpic_damping": (0, 1),
+              "n_grid": (2 * WALL_LAYERS + 1, 1024), "substeps_per_frame": (1, 10**6)}  # fmt: skip
+    for name in RECORDING_FIELDS - {"n"}:
+        low, high = ranges.get(name, (1e-12, 1e12))
+        if data[name].dtype.kind not in "iuf" or not ((data[name] >= low) & (data[name] <= high)).all():
+            raise InputError(f"{path}: {name} must be from {low:g} to {high:g}")
     return data
 
 

@@ -27,6 +27,8 @@ from torch import Tensor
 from stages.core.errors import InputError
 from stages.core.models.initial_conditions import InitialConditions
 from stages.core.scene.files import must_exist, replacing
+from stages.core.scene.h5_schema import Dataset
+from stages.core.scene.schema import MAX_OBJECT_ID, number, numbers, parse_json, quote, reason
 
 FORMAT, VERSION = "ngff-motions", 1
 POSITION_STEP = 1e-4  # quantisation of the stored positions [m]: int16 spans 3.2 m around the origin
@@ -78,6 +80,16 @@ class KeypointMotions:
         )  # fmt: skip
 
 
+DATASETS = {  # as stored; s scenes, t frames, o objects, n keypoints
+    "names": Dataset("s", "text"),
+    "objects": Dataset("s o", "int", -1, MAX_OBJECT_ID),
+    "points": Dataset("s t o n 3", "int"),
+    "mass": Dataset("s o", low=0),
+    "E": Dataset("s o", low=0, high=1e13),
+    "nu": Dataset("s o", low=-1, high=0.5),
+    "friction": Dataset("s o", low=0),
+    "solidity": Dataset("s o", low=0),
+}
 TENSORS = ("objects", "points", "mass", "E", "nu", "friction", "solidity")
 
 
@@ -161,8 +173,13 @@ def write_motions(path: Path, motions: KeypointMotions, provenance: dict) -> Non
 
 def read_provenance(path: Path) -> dict:
     """The provenance stored in a file of keypoint trajectories; raises InputError when the file is missing."""
-    with h5py.File(must_exist(path, FILE_KIND), "r") as file:
-        return json.loads(file.attrs.get("provenance", "{}"))
+    must_exist(path, FILE_KIND)
+    try:
+        with h5py.File(path, "r") as file:
+            found = parse_json(str(file.attrs.get("provenance", "{}")), finite=False)
+    except (OSError, ValueError, RuntimeError) as error:
+        raise InputError(f"{path}: cannot be read ({reason(error)}); {FILE_KIND} is expected") from error
+    return found if isinstance(found, dict) else {}
 
 
 def read_motions(path: Path) -> KeypointMotions:
@@ -171,17 +188,24 @@ def read_motions(path: Path) -> KeypointMotions:
     try:
         with h5py.File(path, "r") as file:
             if file.attrs.get("format") != FORMAT:
-                raise InputError(f"{path}: its format attribute is {file.attrs.get('format')!r}, not {FORMAT!r}; "
-                                 f"{FILE_KIND} is expected")  # fmt: skip
-            points = torch.from_numpy(file["points"][:]).float() * float(file["points"].attrs["step"])
-            names = [n for n in TENSORS if n != "points" and (n in file or n != "solidity")]
-            rest = {"solidity": torch.ones(len(points), points.shape[2])}
-            rest |= {name: torch.from_numpy(file[name][:]) for name in names}
-            box = tuple(tuple(float(v) for v in corner) for corner in file.attrs["box"])
-            gravity = tuple(float(v) for v in file.attrs["gravity"])
+                raise InputError(f"{path}: its format attribute is {quote(repr(file.attrs.get('format')))}, not "
+                                 f"{FORMAT!r}; {FILE_KIND} is expected")  # fmt: skip
+            lengths: dict[str, int] = {}
+            rows = {name: table.read(file, name, lengths) for name, table in DATASETS.items()
+                    if name != "points" and (name in file or name != "solidity")}  # fmt: skip
+            steps = DATASETS["points"].open(file, "points", lengths)
+            if steps.dtype.itemsize != 2:
+                raise ValueError(f"points has values of type {steps.dtype}, not int16")
+            if not all(lengths.values()):
+                raise ValueError("it holds no scene, frame, object or keypoint")
+            step = number(file["points"].attrs["step"], "the step of points", 1e-9, 1)
+            tensors = {name: torch.from_numpy(rows[name]) for name in rows if name != "names"}
+            tensors.setdefault("solidity", torch.ones(lengths["s"], lengths["o"]))
             return KeypointMotions(
-                names=tuple(file["names"].asstr()[:]), points=points, dt=float(file.attrs["dt"]), gravity=gravity,
-                box=box, **rest,
+                names=tuple(quote(name, 200) for name in rows["names"]), dt=number(file.attrs["dt"], "dt", 1e-6, 1e4),
+                gravity=numbers(file.attrs["gravity"], 3, "gravity"),
+                box=tuple(numbers(corner, 3, "box") for corner in np.asarray(file.attrs["box"]).reshape(2, -1)),
+                points=torch.from_numpy(steps[()].astype(np.float32)) * step, **tensors,
             )  # fmt: skip
-    except (KeyError, OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot be read ({error}); {FILE_KIND} is expected") from error
+    except (KeyError, OSError, ValueError, TypeError, RuntimeError) as error:
+        raise InputError(f"{path}: cannot be read ({reason(error)}); {FILE_KIND} is expected") from error

@@ -20,6 +20,7 @@ from stages.core.physics.materials import MODELS
 from stages.core.physics.mpm import solver as mpm
 from stages.core.scene.files import replacing
 from stages.core.scene.gaussians import Gaussians
+from stages.core.scene.npz import read_npz
 from stages.lab.assets.objects import OBJECTS, ObjectKind, make_object
 from stages.lab.assets.shapes import single_threaded
 from stages.lab.dataset.scene_configs import PlacementExtent
@@ -104,12 +105,11 @@ def cached_points(
     Otherwise they are sampled, and written to the file. Raises InputError when the file cannot be read.
     """
     if cache is not None and cache.exists():
-        try:
-            with np.load(cache) as file:
-                if str(file["key"]) == key and {*names} <= set(file.files):
-                    return {name: torch.from_numpy(file[name]) for name in names}
-        except (KeyError, OSError, ValueError) as error:
-            raise InputError(f"{cache}: cannot be read ({error}); remove it to make it again") from error
+        arrays = read_npz(cache, "particles of objects, which are made again where there is no such file")
+        if str(arrays.pop("key", "")) == key and {*names} <= set(arrays):
+            if any(arrays[n].shape[1:] != (3,) or arrays[n].dtype.kind != "f" for n in names):
+                raise InputError(f"{cache}: an object's particles are not (particles, 3); remove it to make it again")
+            return {name: torch.from_numpy(arrays[name]) for name in names}
     points = sample()
     if cache is not None:
         with replacing(cache) as part:

@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 
 from stages.core.errors import InputError
 from stages.core.scene.files import must_exist, replacing
-from stages.core.scene.schema import quote, read_json, reason
+from stages.core.scene.schema import number, numbers, quote, read_json, reason, rows, whole
 
 SEED = 42
 HALF_EXTENT = 0.9  # of the cube that contains all bounding spheres [m]
@@ -176,17 +176,22 @@ def read_scene_configs(path: Path) -> dict[str, SceneConfig]:
     """
     must_exist(path, "scene configurations (.json)")
     try:
-        rows = read_json(path)
-        configs = {
-            name: SceneConfig(name, tuple(int(i) for i in row["scene_object_idxs"]),
-                         tuple(tuple(float(v) for v in p) for p in row["translation"]),
-                         tuple(float(s) for s in row["scale"]))
-            for name, row in rows.items()
-        }  # fmt: skip
+        table = read_json(path)
+        configs = {name: _parse_row(name, row) for name, row in table.items()}
     except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RuntimeError, IndexError) as error:
         raise InputError(f"{path}: is not a file of scene configurations ({reason(error)})") from error
+    if not configs:
+        raise InputError(f"{path}: holds no scene configurations")
     wrong = next((name for name in configs if not SCENE_NAME.fullmatch(name)), None)
     if wrong is not None:
         raise InputError(f"{path}: the scene name {quote(repr(wrong))} cannot be a file name; use letters, digits, "
                          "'_', '-' and '.', such as 2700_0_7_11")  # fmt: skip
     return configs
+
+
+def _parse_row(name: str, row: dict) -> SceneConfig:
+    ids = tuple(whole(i, "scene_object_idxs") for i in rows(row["scene_object_idxs"], "scene_object_idxs"))
+    if not len(ids) == len(rows(row["translation"], "translation")) == len(rows(row["scale"], "scale")) > 0:
+        raise ValueError(f"{quote(name)} has {len(ids)} objects, and other numbers of translations or scales")
+    translation = tuple(numbers(p, 3, "translation", -1e4, 1e4) for p in row["translation"])
+    return SceneConfig(name, ids, translation, tuple(number(s, "scale", 1e-6, 1e6) for s in row["scale"]))

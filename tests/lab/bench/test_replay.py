@@ -60,9 +60,11 @@ def spoiled(**changes) -> dict[str, np.ndarray]:
 
 
 @pytest.mark.parametrize("data, message", [
-    (spoiled(E=None), "no E; a recording has"), (spoiled(n=np.array([7])), "positions must be finite"),
-    (spoiled(volume=np.ones(3)), "volume must have 8 values"),
-    (spoiled(positions=np.full((3, 8, 3), np.nan)), "positions must be finite"),
+    (spoiled(E=None), "no E; a recording has"), (spoiled(n=np.array([7])), r"positions must be \(frames, 7, 3\)"),
+    (spoiled(volume=np.ones(3)), r"volume must have the shape \(8,\)"),
+    (spoiled(positions=np.full((3, 8, 3), np.nan)), "positions has values that are not finite"),
+    (spoiled(n_grid=np.array(10**6)), "n_grid must be from 7 to 1024"),
+    (spoiled(n=np.array([9, -1])), "n must be a list"),
 ])  # fmt: skip
 def test_invalid_recordings_are_rejected(tmp_path, data, message):
     np.savez(tmp_path / "a.npz", **data)

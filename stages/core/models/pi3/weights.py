@@ -17,6 +17,7 @@ from stages.core.models.pi3.config import Pi3Config
 from stages.core.models.pi3.network import Pi3
 from stages.core.models.pi3.splat import Pi3Splat
 from stages.core.scene.files import must_exist
+from stages.core.scene.schema import reason
 
 SUFFIXES = (".safetensors", ".pth", ".pt", ".ckpt", ".bin")
 
@@ -89,7 +90,7 @@ def read_state(path: Path) -> dict[str, Tensor]:
             return load_file(path)
         data = torch.load(path, map_location="cpu", weights_only=True)
     except SafetensorError as error:
-        raise InputError(f"{path}: is not a complete safetensors file ({error}); fetch it again") from error
+        raise InputError(f"{path}: is not a complete safetensors file ({reason(error)}); fetch it again") from error
     except Exception as error:  # a damaged pickle raises anything
         raise InputError(f"{path}: cannot be read as a PyTorch checkpoint; fetch it again") from error
     for key in ("state_dict", "model_state_dict", "model", "module"):

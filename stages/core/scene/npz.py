@@ -1,0 +1,56 @@
+"""NPZ files: arrays whose sizes are checked before memory is taken for them."""
+
+from __future__ import annotations
+
+import zipfile
+import zlib
+from pathlib import Path
+
+import numpy as np
+
+from stages.core.errors import InputError
+from stages.core.scene.files import must_exist
+from stages.core.scene.schema import quote, reason
+
+MAX_BYTES = 16 << 30  # of all arrays
+MAX_COMPRESSION = 1100  # deflate reaches 1032
+
+
+def read_npz(path: Path, what: str) -> dict[str, np.ndarray]:
+    """The arrays of an NPZ file by name, without Python objects; `what` is expected, for errors.
+
+    Raises InputError for other files, damaged ones, and numbers that are not finite.
+    """
+    must_exist(path, what)
+    try:
+        with zipfile.ZipFile(path) as archive:
+            if sum(info.file_size for info in archive.infolist()) > min(MAX_BYTES, MAX_COMPRESSION * _size(path)):
+                raise ValueError("it declares more bytes than it can hold")
+            for info in archive.infolist():
+                with archive.open(info) as file:
+                    _check_header(file, info)
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+    except (ValueError, KeyError, TypeError, EOFError, OSError, OverflowError, SyntaxError, RecursionError,
+            NotImplementedError, RuntimeError, MemoryError, zipfile.BadZipFile, zlib.error) as error:  # fmt: skip
+        raise InputError(f"{path}: is not an NPZ file ({reason(error)}); {what} is expected") from error
+    for name, array in arrays.items():
+        if array.dtype.kind not in "biufU" or array.dtype.kind == "f" and not np.isfinite(array).all():
+            raise InputError(f"{path}: {quote(name)} has values that are not finite numbers; {what} is expected")
+    return arrays
+
+
+def _size(path: Path) -> int:
+    return Path(path).stat().st_size
+
+
+def _check_header(file: zipfile.ZipExtFile, info: zipfile.ZipInfo) -> None:
+    """ValueError where an array's shape needs another number of bytes than there are."""
+    version = np.lib.format.read_magic(file)
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, _, dtype = read(file)
+    count = 1
+    for side in shape:
+        count *= side
+    if dtype.hasobject or count * dtype.itemsize + 10 > info.file_size or min(shape, default=0) < 0:
+        raise ValueError(f"{info.filename} declares {count} values, but has {info.file_size} bytes")

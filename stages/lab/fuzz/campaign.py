@@ -1,0 +1,109 @@
+"""Many cases in a process of their own, which may crash, hang or take all memory: a report in JSON."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import resource
+import shutil
+import signal
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Iterator
+from multiprocessing.connection import Connection
+from pathlib import Path
+
+from tqdm import tqdm
+
+from stages.core.errors import InputError
+from stages.core.scene.files import ngff_version, replacing
+from stages.lab.fuzz.cases import GOOD, KINDS, Examples, quiet
+
+RESULTS = (*GOOD, "nonsense", "traceback", "signal", "more than 10 s", "more than 2 GB")
+MAX_SECONDS = 10.0
+MAX_MEMORY = 2 << 30  # more than before the case [bytes]
+START = 120.0  # a process may take so long to import and to write the examples [s]
+
+
+def run(out: Path, count: int, seed: int = 0) -> Iterator[str]:
+    """Run cases 0 to `count` - 1 of a seed and write OUT (.json); the files of failures go to OUT's folder NAME.cases.
+
+    Yields the lines of a table. Raises InputError for a count below 1.
+    """
+    if count < 1:
+        raise InputError(f"--count must be 1 or more, got {count}")
+    kept, begun = out.with_suffix(".cases"), time.monotonic()
+    counts: dict[str, Counter] = {kind.name: Counter() for kind in KINDS}
+    failures = []
+    with replacing(out) as part, tempfile.TemporaryDirectory(prefix="ngff-fuzz-") as folder:
+        cases = tqdm(_results(Path(folder), count, seed), total=count, unit="case")
+        for number, kind, result, why, files in cases:
+            counts[kind][result] += 1
+            if result not in GOOD:
+                place = kept / f"{kind}-{seed}-{number}"
+                shutil.copytree(files, place, dirs_exist_ok=True)
+                failures.append({"kind": kind, "case": number, "result": result, "why": why, "files": str(place)})
+                cases.set_postfix(failures=len(failures))
+        total = sum(counts.values(), Counter())
+        report = {"ngff": ngff_version(), "seed": seed, "count": count, "seconds": round(time.monotonic() - begun, 1),
+                  "total": {r: total[r] for r in RESULTS}, "counts": counts, "failures": failures}  # fmt: skip
+        part.write_text(json.dumps(report, indent=1) + "\n")
+    for name, of_kind in [*counts.items(), ("total", total)]:
+        yield f"{name:20s}" + ", ".join(f"{of_kind[r]} {r}" for r in RESULTS if of_kind[r])
+    if failures:
+        yield f"the files of {len(failures)} failures are in {kept}"
+
+
+def _results(folder: Path, count: int, seed: int) -> Iterator[tuple[int, str, str, str, Path]]:
+    """Number, kind, result, explanation and folder of each case, from processes that are started again as needed."""
+    context, number, failed = multiprocessing.get_context("spawn"), 0, 0
+    while number < count:
+        place = folder / f"process {failed}"
+        ours, theirs = context.Pipe()
+        process = context.Process(target=_work, args=(theirs, place, seed, number, count), daemon=True)
+        process.start()
+        theirs.close()
+        try:
+            if not ours.poll(START) or ours.recv() != "ready":
+                raise InputError("the process that reads the files did not start")
+            while number < count:
+                if not ours.poll(MAX_SECONDS):
+                    result, why = "more than 10 s", ""
+                else:
+                    result, why = ours.recv()
+                files = Examples.place_in(place, number)
+                yield number, files.name, result, why, files
+                number += 1
+                if result.startswith("more than"):
+                    break
+                ours.send("next")
+        except EOFError:  # the process has ended
+            process.join()
+            files = Examples.place_in(place, number)
+            yield number, files.name, "signal", f"exit status {process.exitcode}", files
+            number += 1
+        finally:
+            process.kill()
+            process.join()
+            ours.close()
+        failed += 1
+        shutil.rmtree(place, ignore_errors=True)
+
+
+def _work(parent: Connection, folder: Path, seed: int, start: int, stop: int) -> None:
+    """Run cases and send the result of each; wait for an answer, so that its files are left as they are."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends this process
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # libraries for images and videos write there
+    examples = Examples(folder)
+    size = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
+    resource.setrlimit(resource.RLIMIT_AS, (size + 2 * MAX_MEMORY,) * 2)  # the machine is not ours
+    parent.send("ready")
+    with quiet():
+        for number in range(start, stop):
+            before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+            _, result, why = examples.run(seed, number)
+            grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) << 10
+            parent.send(("more than 2 GB", f"{grown >> 20} MB") if grown > MAX_MEMORY else (result, why))
+            parent.recv()

@@ -1,0 +1,282 @@
+"""Small valid files of every format that ngff reads, each with the changes it suffers and its reader."""
+
+from __future__ import annotations
+
+import json
+import random
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from plyfile import PlyData, PlyElement
+
+from stages.core.models import checkpoints
+from stages.core.physics.forces import parse, read_forces, stored_prompts
+from stages.core.physics.materials import choose_materials
+from stages.core.scene.cameras import Cameras, read_cameras
+from stages.core.scene.files import sha256
+from stages.core.scene.gaussians import Gaussians
+from stages.core.scene.images import VideoWriter, read_image, read_labels, read_video, write_labels, write_png
+from stages.core.scene.npz import read_npz
+from stages.core.scene.scene import Scene, SceneObject
+from stages.core.scene.scene_ply import read_scene, write_scene
+from stages.core.scene.trajectory import Binding, Keypoints, SimulationInfo, TrajectoryWriter, read_trajectory
+from stages.evaluate.labels import read_label_names
+from stages.lab.bench.replay import read_recording
+from stages.lab.dataset.keypoint_motions import KeypointMotions, read_motions, write_motions
+from stages.lab.dataset.scene_configs import SceneConfig, read_scene_configs, write_scene_configs
+from stages.lab.fuzz import checks
+from stages.lab.fuzz.mutations import (
+    change_arrays,
+    change_bytes,
+    change_datasets,
+    change_doubles,
+    change_json,
+    change_tensors,
+    change_vertices,
+    change_words,
+)
+from stages.reconstruct.photo_reader import read_photos
+from stages.render.path_file import read_camera_path
+from stages.segment.masks import read_names
+from stages.segment.prompts import read_prompts
+
+Change = Callable[[Path, random.Random], None]
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A format under test: a folder with a small valid example, which files change and how, and the reader."""
+
+    name: str
+    write: Callable[[Path], object]  # into a folder
+    changes: Mapping[str, Change]  # one of these files is changed
+    read: Callable[[Path], object]  # from the folder; AssertionError for nonsense
+    share: int = 1  # of the cases, relative to the others
+    repair: Callable[[Path], object] | None = None  # makes the check sums right again, in half of the cases
+
+
+def example_scene() -> Scene:
+    """Sixty Gaussians, two objects, two cameras."""
+    generator = torch.Generator().manual_seed(0)
+    n = 60
+    gaussians = Gaussians(
+        torch.randn(n, 3, generator=generator),
+        torch.nn.functional.normalize(torch.randn(n, 4, generator=generator), dim=1),
+        torch.rand(n, 3, generator=generator) * 0.1 + 0.01, torch.rand(n, generator=generator) * 0.8 + 0.1,
+        torch.randn(n, 4, 3, generator=generator), torch.arange(n) % 3,
+    )  # fmt: skip
+    K = torch.tensor([[40.0, 0, 16], [0, 40, 12], [0, 0, 1]])
+    cameras = Cameras(torch.eye(4).repeat(2, 1, 1), K.repeat(2, 1, 1), torch.tensor([[32, 24]] * 2), ("a.png", "b.png"))
+    objects = (SceneObject(1, "duck", "rubber"), SceneObject(2, "bowl"))
+    return Scene(gaussians, objects, cameras, 0.0, {"metres_per_unit": 1.0, "source": "known"}, {"seed": 1})
+
+
+OBJECTS = example_scene().objects
+
+
+def write_trajectory(path: Path) -> None:
+    """Three frames of twelve keypoints."""
+    scene = example_scene()
+    n, rest = len(scene.gaussians), torch.randn(12, 3, generator=torch.Generator().manual_seed(1))
+    binding = Binding(torch.arange(n)[:, None] % 12, torch.ones(n, 1))
+    info = SimulationInfo(0.02, (0.0, 0.0, -9.81), "test", ({"kind": "pin", "object_id": 1},))
+    with TrajectoryWriter(path, scene, info, Keypoints(rest, torch.arange(12) % 2 + 1), binding) as writer:
+        for _ in range(3):
+            writer.append(rest, torch.zeros(2, 3), torch.eye(4)[:2])
+
+
+def write_transforms(path: Path) -> None:
+    """A transforms.json of two frames."""
+    frames = [{"file_path": f"{name}.png", "transform_matrix": np.eye(4).tolist()} for name in "ab"]
+    path.write_text(json.dumps({"fl_x": 40.0, "fl_y": 40.0, "cx": 16.0, "cy": 12.0, "w": 32, "h": 24, "k1": 0.1,
+                                "frames": frames}))  # fmt: skip
+
+
+def write_packed(path: Path) -> None:
+    """Sixty Gaussians in the layout of PlayCanvas: 11, 10 and 11 bits between the bounds of a chunk."""
+    rng = np.random.default_rng(0)
+    words = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
+    vertices = np.zeros(60, [(name, "<u4") for name in words])
+    for name in words:
+        vertices[name] = rng.integers(0, 2**32, 60, dtype=np.uint32)
+    chunk = np.zeros(1, [(f"{end}_{part}{axis}", "<f4") for part in ("", "scale_") for end in ("min", "max")
+                         for axis in "xyz"])  # fmt: skip
+    for name in chunk.dtype.names:
+        chunk[name] = (-3.0 if "scale" in name else -1.0) if name.startswith("min") else 1.0
+    elements = [PlyElement.describe(chunk, "chunk"), PlyElement.describe(vertices, "vertex")]
+    PlyData(elements, byte_order="<").write(str(path))
+
+
+def write_colmap(folder: Path) -> None:
+    """Two images of one camera, as text and in binary form."""
+    poses = [(0.8, 0.1, -0.3, 0.5, 1.0, 2.0, 3.0), (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)]
+    camera = (40.0, 41.0, 16.0, 12.0, 0.1, -0.02, 0.001, 0.002)
+    lines = [f"{i + 1} {' '.join(map(str, pose))} 1 {'ab'[i]}.png\n1.0 2.0 -1" for i, pose in enumerate(poses)]
+    (folder / "images.txt").write_text("# images\n" + "\n".join(lines) + "\n")
+    (folder / "cameras.txt").write_text("# cameras\n1 OPENCV 32 24 " + " ".join(map(str, camera)) + "\n")
+    pack = np.array  # of little-endian values
+    count, none = pack([2], "<u8").tobytes(), pack([0], "<u8").tobytes()
+    rows = [pack([i + 1], "<u4").tobytes() + pack(pose, "<f8").tobytes() + pack([1], "<u4").tobytes()
+            + f"{'ab'[i]}.png".encode() + b"\0" + none for i, pose in enumerate(poses)]  # fmt: skip
+    (folder / "images.bin").write_bytes(count + b"".join(rows))
+    size = pack([1, 4], "<i4").tobytes() + pack([32, 24], "<u8").tobytes()
+    (folder / "cameras.bin").write_bytes(pack([1], "<u8").tobytes() + size + pack(camera, "<f8").tobytes())
+
+
+def write_colmap_text(folder: Path) -> None:
+    """The same as text only."""
+    write_colmap(folder)
+    for name in ("images.bin", "cameras.bin"):
+        (folder / name).unlink()
+
+
+def write_weights(folder: Path) -> None:
+    """A small untrained model with its card."""
+    torch.manual_seed(0)
+    checkpoints.save(folder / "w.safetensors", "gcn", checkpoints.build("gcn", hidden=4, layers=2))
+
+
+def repair_card(folder: Path, name: str = "w") -> None:
+    """State the sha256 that the changed weights have."""
+    try:
+        card = json.loads((folder / f"{name}.json").read_text())
+        card["sha256"] = sha256(folder / f"{name}.safetensors")
+        (folder / f"{name}.json").write_text(json.dumps(card))
+    except (ValueError, TypeError, RecursionError):
+        pass  # the card itself is damaged
+
+
+def write_checkpoint(folder: Path) -> None:
+    """A checkpoint of the public code."""
+    torch.save(checkpoints.build("ngff-paper", hidden=2, layers=1).state_dict(), folder / "w.pt")
+
+
+def write_recording(path: Path) -> None:
+    """Two frames of three particles in two bodies."""
+    np.savez(path, positions=np.ones((2, 3, 3), "f4"), n=np.array([1, 2]), volume=np.full(3, 1e-5), E=np.full(2, 1e5),
+             rho=np.full(2, 500.0), nu=0.3, dt=1e-4, substeps_per_frame=20, n_grid=20, grid_lim=2.0,
+             gravity=np.array([0, 0, -9.8]), rpic_damping=0.1)  # fmt: skip
+
+
+def example_motions(folder: Path) -> None:
+    """Two scenes, of one and of two objects with four keypoints, over three frames."""
+    one, generator = torch.ones(2, 2), torch.Generator().manual_seed(0)
+    motions = KeypointMotions(
+        ("0_1_2", "1_4"), torch.tensor([[1, 2], [4, -1]]), torch.rand(2, 3, 2, 4, 3, generator=generator), 0.1 * one,
+        1e5 * one, 0.3 * one, 0.5 * one, 0.02, (0.0, 0.0, -9.8), ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)), one,
+    )  # fmt: skip
+    write_motions(folder / "m.h5", motions, {"seed": 0})
+
+
+def write_video(folder: Path) -> None:
+    """Four frames of 32 x 24 pixels."""
+    with VideoWriter(folder / "v.mp4", 25.0) as video:
+        for frame in torch.rand(4, 24, 32, 3, generator=torch.Generator().manual_seed(0)):
+            video.append(frame)
+
+
+def write_photos(folder: Path) -> None:
+    """Two photos, of different formats."""
+    image = torch.rand(24, 32, 3, generator=torch.Generator().manual_seed(0))
+    write_png(folder / "a.png", image)
+    import cv2
+
+    for suffix in (".jpg", ".tif", ".webp", ".bmp"):
+        (folder / f"b{suffix}").write_bytes(cv2.imencode(suffix, (image.numpy() * 255).astype(np.uint8))[1].tobytes())
+
+
+def as_json(name: str, value: object) -> Callable[[Path], None]:
+    """A writer of one JSON file."""
+    return lambda folder: (folder / name).write_text(json.dumps(value))
+
+
+EYE = np.eye(3).tolist()
+PATH = [{"rotation": EYE, "position": [0.0, 0, i], "width": 32, "height": 24, "fx": 40.0, "fy": 40.0} for i in range(2)]
+VIEWS = [{"viewmat": np.eye(4).tolist(), "K": [[40.0, 0, 16], [0, 40, 12], [0, 0, 1]], "size": [32, 24]}] * 2
+FORCES = {"scene": [{"obj_id": 0, "start": 0.0, "end": 0.5, "force": [0, 0, 2.0]},
+                    {"obj_id": 1, "start": 0.1, "end": 0.3, "torque": [0.0, 1.0, 0]}]}  # fmt: skip
+MATERIALS = {"duck": "rubber", "2": {"E": 1e5, "density": 500.0, "nu": 0.3, "friction": 0.4, "loss": 0.1,
+                                     "model": "von-mises", "plastic": [1e4, 0.0, 0.0]}}  # fmt: skip
+PROMPTS = {"bbox": [[2, 3, 10, 12], [12.0, 4, 20, 20]], "center_point": [[5, 6], [15.0, 10]], "text": ["duck", "bowl"],
+           "size": [32, 24]}  # fmt: skip
+LABELS = {"1": {"name": "duck", "core": True}, "2": "bowl"}
+OPTIONS = "object=duck force=0,0,2 from=0.1 to=0.3 at=1,2,3\nobject=1 0,0,2\n1=0.3\nbowl\nduck=rubber\n"
+CONFIG = {"0_1_2": SceneConfig("0_1_2", (1, 2), ((0.0, 0, 0), (0.1, 0.2, 0.5)), (0.4, 0.3))}
+
+
+def read_options(folder: Path) -> None:
+    """The options --force --velocity --lift --pin --material of `ngff simulate`, one in a line."""
+    lines = [*(folder / "options").read_text(errors="replace").split("\n"), *[""] * 5]
+    force, velocity, lift, pin, material = ([line] if line else [] for line in lines[:5])
+    checks.check_force_prompts(parse(OBJECTS, force=force, velocity=velocity, lift=lift, pin=pin))
+    checks.check_materials(choose_materials(OBJECTS, material))
+
+
+def check_trajectory_and_prompts(folder: Path) -> None:
+    """A trajectory, and its prompts as --forces reads them."""
+    found = read_trajectory(folder / "traj.h5")
+    checks.check_trajectory(found)
+    checks.check_force_prompts(stored_prompts(folder / "traj.h5", OBJECTS))
+
+
+def check_video(folder: Path) -> None:
+    """The frames of a video as images, and as photos."""
+    checks.check_images(read_video(folder / "v.mp4"))
+    checks.check_images(image for image in read_photos(folder / "v.mp4").images)
+
+
+def single(read: Callable, name: str, check: Callable) -> Callable[[Path], None]:
+    """A reader of one file of the folder, with a check of what it returns."""
+    return lambda folder: check(read(folder / name))
+
+
+def file_kind(name: str, write: Callable, change: Change, read: Callable, check: Callable, share: int = 1) -> Kind:
+    """A kind of a single file."""
+    return Kind(name, lambda folder: write(folder / name), {name: change}, single(read, name, check), share)
+
+
+def json_kind(name: str, value: object, read: Callable, check: Callable) -> Kind:
+    """A kind of a single JSON file, of which a reader gets the path."""
+    return Kind(name, as_json(name, value), {name: change_json}, single(read, name, check))
+
+
+KINDS = (
+    file_kind("scene.ply", lambda path: write_scene(path, example_scene()), change_vertices, read_scene,
+              checks.check_scene, 4),
+    file_kind("packed.ply", write_packed, change_vertices, read_scene, checks.check_scene, 2),
+    Kind("traj.h5", lambda folder: write_trajectory(folder / "traj.h5"), {"traj.h5": change_datasets},
+         check_trajectory_and_prompts, 4),
+    file_kind("transforms.json", write_transforms, change_json, read_cameras, checks.check_lenses, 2),
+    Kind("colmap.bin", write_colmap, {"images.bin": change_doubles, "cameras.bin": change_doubles},
+         lambda folder: checks.check_lenses(read_cameras(folder)), 2),
+    Kind("colmap.txt", write_colmap_text, {"images.txt": change_words, "cameras.txt": change_words},
+         lambda folder: checks.check_lenses(read_cameras(folder))),
+    json_kind("path.json", PATH, read_camera_path, checks.check_cameras_of),
+    json_kind("views.json", VIEWS, read_camera_path, checks.check_cameras_of),
+    json_kind("forces.json", FORCES, lambda path: read_forces(path, "scene", OBJECTS), checks.check_forces),
+    json_kind("materials.json", MATERIALS, lambda path: choose_materials(OBJECTS, file=path), checks.check_materials),
+    json_kind("prompts.json", PROMPTS, lambda path: read_prompts(path, example_scene().cameras), checks.check_prompts),
+    json_kind("names.json", {"1": "duck", "2": "bowl"}, lambda path: read_names(path.parent), checks.check_names),
+    Kind("labels.json", as_json("names.json", LABELS), {"names.json": change_json},
+         lambda folder: checks.check_names(read_label_names(folder))),
+    Kind("scene_configs.json", lambda folder: write_scene_configs(folder / "c.json", CONFIG), {"c.json": change_json},
+         single(read_scene_configs, "c.json", checks.check_configs)),
+    Kind("options", lambda folder: (folder / "options").write_text(OPTIONS), {"options": change_words}, read_options),
+    Kind("weights", write_weights, {"w.safetensors": change_tensors, "w.json": change_json},
+         lambda folder: checks.check_parameters(checkpoints.load(folder / "w.safetensors")[0]), 2, repair_card),
+    Kind("checkpoint.pt", write_checkpoint, {"w.pt": change_doubles},
+         lambda folder: checks.check_parameters(checkpoints.load(folder / "w.pt")[0])),
+    file_kind("recording.npz", write_recording, change_arrays, read_recording, lambda arrays: None),
+    file_kind("arrays.npz", write_recording, change_bytes, lambda path: read_npz(path, "arrays"), lambda arrays: None),
+    Kind("motions.h5", example_motions, {"m.h5": change_datasets}, single(read_motions, "m.h5", checks.check_motions),
+         2),
+    Kind("video.mp4", write_video, {"v.mp4": change_bytes}, check_video),
+    file_kind("label.png", lambda path: write_labels(path, torch.arange(300).reshape(15, 20)), change_bytes,
+              read_labels, lambda image: checks.check_images([image])),
+    *(Kind(f"photo{name[1:]}", write_photos, {name: change_bytes},
+           single(read_image, name, lambda image: checks.check_images([image])))
+      for name in ("a.png", "b.jpg", "b.tif", "b.webp", "b.bmp")),
+)  # fmt: skip

@@ -19,6 +19,7 @@ OUTPUT_FORMATS = {
     ".html": "stages.render.page:write_page",
     ".glb": "stages.render.splat_files:write_glb",
     ".spz": "stages.render.splat_files:write_spz",
+    ".ply": "stages.render.ply_frames:write_ply_frames",
     **dict.fromkeys([".usdc", ".usda"], "stages.render.usd_file:write_usd"),
 }
 

@@ -23,8 +23,8 @@ def run(
     """Render a trajectory or a scene, or several side by side, and print the path of the output.
 
     The suffix of `out` selects the format: a video, or an image, which for a trajectory is a contact sheet of 12
-    frames. Without `out` the name is derived from source and view. OUT.json records inputs, options and what was
-    rendered. Raises InputError for unusable inputs and options.
+    frames; a folder gets numbered PLY files. Without `out` the name is derived from source and view. OUT.json records
+    inputs, options and what was rendered. Raises InputError for unusable inputs and options.
     """
     sources = [Path(source)] if isinstance(source, (str, Path)) else [Path(s) for s in source]
     _check_count(sources, options)
@@ -34,6 +34,8 @@ def run(
              for animation, name in zip(animations, _captions(sources), strict=True)]  # fmt: skip
     renderer = Renderer(clips, options)
     out = Path(out) if out is not None else _default_output(sources, renderer)
+    if out.is_dir():
+        out = out / "frame.ply"
     facts = _writer(out)(out, renderer)
     used = [Path(p) for p in (*sources, options.background, options.view) if p is not None and Path(p).is_file()]
     scenes = [animation.scene.provenance for animation in animations]
@@ -50,7 +52,7 @@ def _writer(out: Path):
     if suffix not in OUTPUT_FORMATS:
         known = ", ".join(OUTPUT_FORMATS)
         raise InputError(f"{out}: files with {f'suffix {suffix}' if suffix else 'no suffix'} cannot be written; "
-                         f"use {known}")  # fmt: skip
+                         f"use {known}, or an existing folder for PLY files")  # fmt: skip
     return load(OUTPUT_FORMATS[suffix])
 
 

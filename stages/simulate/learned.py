@@ -12,7 +12,6 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from stages.core.backends import pick_device
-from stages.core.errors import InputError
 from stages.core.models import checkpoints as weights
 from stages.core.models.dynamics import FRAME, Dynamics
 from stages.core.models.external_forces import ExternalForces
@@ -28,7 +27,7 @@ from stages.core.scene.trajectory import Keypoints
 from stages.simulate.changes import changed_options, changed_pins
 from stages.simulate.model_units import ModelUnits
 from stages.simulate.options import ENGINES, SimulateOptions
-from stages.simulate.setup import SceneSetup, set_up_scene
+from stages.simulate.setup import SceneSetup, check_motion, set_up_scene
 from stages.simulate.sleep import SleepState
 from stages.simulate.solid_bodies import SolidBody, mass_fractions, solid_bodies
 
@@ -77,10 +76,8 @@ def rollout(
         stepper = TimeStepper(model, initial.to(device), dt, external.to(device), options.integrator)
         first, before, mass = stepper.points.clone(), initial.points, initial.mass[0]
         for n in range(options.steps):
-            if not bool(stepper.points.isfinite().all()):
-                raise InputError(f"the motion ceased to be finite at {n * options.dt:.2f} s; use a smaller --velocity "
-                                 "or --force, or --engine mpm")  # fmt: skip
             moved = ((stepper.points - first) / units.length).cpu()
+            check_motion(moved, n, options)
             yield replace(_state(keypoints, ids, lifted, initial, moved), mass=mass / units.mass)
             if n == options.steps - 1:
                 continue

@@ -23,7 +23,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from stages.core.errors import InputError, MissingPackage
+from stages.core.errors import MissingPackage
 from stages.core.geometry.rotations import matrix
 from stages.core.physics.convex_parts import ConvexParts, convex_parts
 from stages.core.physics.forces import Force, ForcePrompts
@@ -33,7 +33,7 @@ from stages.core.scene.scene import Scene
 from stages.core.scene.trajectory import Keypoints
 from stages.simulate.changes import changed_options, changed_pins
 from stages.simulate.options import SimulateOptions
-from stages.simulate.setup import SceneSetup, set_up_scene
+from stages.simulate.setup import SceneSetup, check_motion, set_up_scene
 
 log = logging.getLogger(__name__)
 SUBSTEPS = 200  # substeps in a unit of time: that of falling half the size of the smallest object from rest
@@ -102,10 +102,8 @@ def _states(
     current, held, acting = options, prompts.pinned, prompts.forces
     for frame in range(options.steps):
         centre, quat = world.pose()
-        if not bool(centre.isfinite().all() and quat.isfinite().all()):
-            raise InputError(f"the motion ceased to be finite at {frame * options.dt:.2f} s; use a smaller --velocity "
-                             "or --force")  # fmt: skip
         centre = centre / scene.metres_per_unit - floor_offset
+        check_motion(torch.cat([centre, quat[:, 1:]]), frame, options)
         if frame == 0:  # without rounding
             yield FrameState(keypoints.rest + setup.lift[row], com + setup.lift, quat, world.mass)
         else:

@@ -17,6 +17,7 @@ from stages.core.physics.mpm.domain import MAX_NODES, Box
 from stages.core.physics.mpm.resample import subdivide
 from stages.core.physics.particles import Bodies, sample_bodies
 from stages.core.scene.scene import Scene
+from stages.core.scene.schema import LARGEST
 from stages.simulate.options import SimulateOptions
 
 log = logging.getLogger(__name__)
@@ -138,3 +139,10 @@ def _default_box(x: Float[Tensor, "p 3"], floor: float, h: float) -> Box:
             return box
         room *= 0.8
         size *= 0.8
+
+
+def check_motion(points: Float[Tensor, "*k 3"], frame: int, options: SimulateOptions) -> None:
+    """Raise InputError if points [scene units] are not finite, or too far away for a trajectory file."""
+    if not bool((points.abs() < LARGEST).all()):
+        raise InputError(f"the motion ceased to be finite at {frame * options.dt:.2f} s; use a smaller --velocity or "
+                         "--force, or another --engine")  # fmt: skip

@@ -118,7 +118,7 @@ def test_what_is_held_hangs_where_the_cursor_is(monkeypatch):
     def hold(n, state):
         return [{"do": "grab", "object": 1, "point": [-0.3, 0.0, 0.3], "target": goal.tolist()}] if n == 0 else []
 
-    live, _, keypoints, session = prompts_of_a_session("ngff", monkeypatch, hold, frames=60)
+    live, _, keypoints, session = prompts_of_a_session("ngff", monkeypatch, hold, frames=45)
     _, k = session.dragged
     assert (live[-1, k] - goal).norm() < 0.03
 

@@ -14,7 +14,6 @@ from stages.lab.assets.objects import OBJECTS, make_object
 from stages.lab.assets.shapes import single_threaded
 
 DT = 0.02  # [s]
-SLOW = pytest.mark.slow  # the same rollouts with more keypoints and objects
 FILES = sorted(SHIPPED.glob("*.safetensors"))
 MAX_BYTES = 5e5  # of all weights and cards
 MAX_DEPTH = 0.035  # of a keypoint in the floor [m]: MAX_PENETRATION and a margin for rounding
@@ -80,7 +79,8 @@ def test_a_thousand_steps_stay_finite_and_above_the_floor(dropped):
     assert float(points[..., 2].amin() - initial.floor[0, 0]) > -MAX_DEPTH
 
 
-@pytest.mark.parametrize("n", [64, pytest.param(128, marks=SLOW), pytest.param(256, marks=SLOW)])
+@pytest.mark.slow
+@pytest.mark.parametrize("n", [64, 128, 256])
 def test_stacked_objects_come_to_rest(model, n):
     """A duck falling on a can and a phone falling on a pillow, n keypoints each, for 10 s."""
     pairs = ("can", "duck"), ("pillow", "phone")

@@ -40,7 +40,7 @@ def test_blocks_that_meet_keep_their_momentum_and_part_again():
     assert float(stuck[1][:, 0].mean() - stuck[0][:, 0].mean()) < other - one
 
 
-@pytest.mark.parametrize("friction", [0.1, 0.5])
+@pytest.mark.parametrize("friction", [pytest.param(0.1, marks=pytest.mark.slow), 0.5])
 def test_a_block_slides_on_another_nearly_by_v2_over_2_mu_g(friction):
     """At its edges the normals are tilted against the motion, which costs up to a quarter of the distance."""
     slab = block((-0.5, -0.3, 0.0), (2.0, 0.6, 0.3), friction, held=True)

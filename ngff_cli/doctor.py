@@ -21,8 +21,6 @@ NETWORKS = {  # command that runs a published network: its row
 }
 OPTIONAL = {  # package: (what needs it, the extra that installs it)
     "huggingface_hub": ("--download", "hub"),
-    "mujoco": ("simulate --engine rigid", "rigid"),
-    "coacd": ("simulate --engine rigid", "rigid"),
     **{row.package: (user, row.extra) for user, (_, row) in NETWORKS.items() if row.package},
 }
 

@@ -18,15 +18,16 @@ class Engine:
     weights: str | None = None  # model whose weights it needs (see stages/core/models/checkpoints.py)
 
 
+AUTO = "auto"  # see engine_choice.py
 ENGINES = {
-    "ngff": Engine("stages.simulate.learned:rollout", "learned force field, for elastic bodies", weights="ngff"),
+    "ngff": Engine("stages.simulate.learned:rollout", "learned force field, for soft elastic bodies", weights="ngff"),
     "mpm": Engine("stages.simulate.mpm:rollout", "material point method, for any material"),
     "rigid": Engine("stages.simulate.rigid:rollout", "rigid bodies by MuJoCo, for stiff ones"),
 }
 DEFAULT_KEYPOINTS, LIVE_KEYPOINTS = 1024, 128  # with the latter two CPU cores keep up with real time
 # The model's own step, or a solver of torchdiffeq for its rate of change (see stages/core/models/integrate.py).
 INTEGRATORS = ("step", "euler", "rk4", "dopri5")
-ENGINE_HELP = " | ".join(f"{name}: {engine.help}" for name, engine in ENGINES.items())
+ENGINE_HELP = " | ".join(["auto: by the materials of the objects", *(f"{k}: {v.help}" for k, v in ENGINES.items())])
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,7 @@ class SimulateOptions:
 
     steps: int = 100  # frames, the first being the start
     dt: float = 0.02  # time between frames [s]
-    engine: str = "ngff"
+    engine: str = AUTO
     gravity: float = 9.81  # downwards [m/s^2]
     quality: str = "normal"
     material: tuple[str, ...] = ()  # OBJECT=MATERIAL

@@ -23,7 +23,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from stages.core.errors import MissingPackage
 from stages.core.geometry.rotations import matrix
 from stages.core.physics.convex_parts import ConvexParts, convex_parts
 from stages.core.physics.forces import Force, ForcePrompts
@@ -32,6 +31,7 @@ from stages.core.physics.state import FrameState
 from stages.core.scene.scene import Scene
 from stages.core.scene.trajectory import Keypoints
 from stages.simulate.changes import changed_options, changed_pins
+from stages.simulate.engine_choice import MAX_RIGID_SAG, sag
 from stages.simulate.options import SimulateOptions
 from stages.simulate.setup import SceneSetup, check_motion, set_up_scene
 
@@ -42,7 +42,6 @@ REST_SPEED = 0.1  # normal speed below which contacts do not rebound [units]; a 
 IMPEDANCE = 0.99  # of a contact: 1 would be exact, but the forces between several contacts undetermined
 MAX_SUBSTEPS = 5_000  # in a frame
 MAX_TRAVEL = 0.05  # of the smallest object's size in a substep, so that nothing passes through it
-SOFT = 0.02  # compression under its own weight above which a body is not rigid
 SEPARATION_ROUNDS, CONTACT_SLACK = 200, 1e-3  # of bodies that overlap at the start; slack in sizes of the smallest
 FREE, FALLING = 7, 6  # numbers of a free joint's coordinates and velocities
 
@@ -76,12 +75,7 @@ class Body:
 def rollout(
     scene: Scene, keypoints: Keypoints, prompts: ForcePrompts, options: SimulateOptions
 ) -> Iterator[FrameState]:
-    """One state per frame, the first being the start. Raises InputError when the motion is no longer finite, and
-    MissingPackage without MuJoCo."""
-    try:
-        import mujoco  # noqa: F401, PLC0415 -- an optional package
-    except ImportError as error:
-        raise MissingPackage("--engine rigid needs the package mujoco: `pip install 'ngff[rigid]'`") from error
+    """One state per frame, the first being the start. Raises InputError when the motion is no longer finite."""
     setup = set_up_scene(scene, prompts, options)
     bodies, floor_offset = _bodies(scene, setup, prompts, options)
     world = _World(scene, setup, bodies, prompts, options)
@@ -142,10 +136,10 @@ def _bodies(
         if MODELS[m.model].plastic:
             log.warning("object %d (%s): %s yields or flows, but rigid bodies keep their shape; use --engine mpm",
                         o.id, o.name, choice.name)  # fmt: skip
-        elif m.density * abs(options.gravity) * height > SOFT * m.E:
+        elif sag(m, height, options.gravity) > MAX_RIGID_SAG:
             log.warning("object %d (%s): %s yields by %.0f %% under its own weight, but rigid bodies keep their shape; "
                         "use --engine ngff or mpm", o.id, o.name, choice.name,
-                        100 * m.density * abs(options.gravity) * height / m.E)  # fmt: skip
+                        100 * sag(m, height, options.gravity))  # fmt: skip
     return bodies, torch.stack(offsets)
 
 
@@ -154,7 +148,7 @@ class _World:
 
     def __init__(self, scene: Scene, setup: SceneSetup, bodies: list[Body], prompts: ForcePrompts,
                  options: SimulateOptions):  # fmt: skip
-        import mujoco  # noqa: PLC0415 -- an optional package
+        import mujoco  # noqa: PLC0415 -- slow to import
 
         self._mujoco, self._bodies, self._dt = mujoco, bodies, options.dt
         self._scene, self._ids = scene, [o.id for o in scene.objects]

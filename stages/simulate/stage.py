@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 from tqdm import tqdm
 
-from stages.core.backends import choose
+from stages.core.backends import choose, pick_device
 from stages.core.errors import InputError
 from stages.core.physics import forces
 from stages.core.physics.keypoints import bind_gaussians, choose_keypoints
@@ -18,7 +18,8 @@ from stages.core.scene.formats import suffixes
 from stages.core.scene.scene import Scene
 from stages.core.scene.scene_ply import read_scene
 from stages.core.scene.trajectory import SimulationInfo, TrajectoryWriter, read_trajectory
-from stages.simulate.options import ENGINES, SimulateOptions
+from stages.simulate.engine_choice import with_engine
+from stages.simulate.options import AUTO, ENGINES, SimulateOptions
 
 log = logging.getLogger(__name__)
 
@@ -31,15 +32,19 @@ def run(scene: Path, out: Path, options: SimulateOptions = SimulateOptions()) ->
     """
     options = with_recorded(options)
     options = replace(options, keypoints=options.keypoint_count)
-    rollout = choose({name: engine.rollout for name, engine in ENGINES.items()}, options.engine)
+    if options.engine not in (AUTO, *ENGINES):
+        raise InputError(f"--engine {options.engine}: choose from {', '.join((AUTO, *ENGINES))}")
+    pick_device(options.device)  # a wrong name is an error with every engine
     world = with_objects(read_scene(scene), scene)
     prompts = forces.parse(
         world.objects, Path(scene).stem, force=options.force, forces=options.forces, pin=options.pin,
         velocity=options.velocity, lift=options.lift,
     )  # fmt: skip
+    keypoints = choose_keypoints(world, options.keypoint_count, options.seed)
+    options = with_engine(options, world, keypoints)
+    rollout = choose({name: engine.rollout for name, engine in ENGINES.items()}, options.engine)
     inputs = [Path(p) for p in (scene, options.materials, options.forces) if p is not None]
     world = replace(world, provenance={**provenance("simulate", inputs, options), "scene": world.provenance})
-    keypoints = choose_keypoints(world, options.keypoint_count, options.seed)
     gravity = (0.0, 0.0, -options.gravity / world.metres_per_unit)
     motion = SimulationInfo(options.dt, gravity, options.engine, prompts.as_dicts())
     if options.live:

@@ -221,7 +221,7 @@ def test_invalid_options(options, message):
 
 
 def test_unknown_engine(balls):
-    with pytest.raises(InputError, match="no backend called 'magic'; choose from ngff, mpm"):
+    with pytest.raises(InputError, match="--engine magic: choose from auto, ngff, mpm"):
         roll(balls, engine="magic")
 
 

@@ -17,7 +17,6 @@ from scipy.sparse import coo_matrix
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 from torch import Tensor
 
-from stages.core.errors import MissingPackage
 from stages.core.physics.keypoints import farthest_points
 from stages.core.physics.particles import filled_voxels, inliers, usable
 from stages.core.scene.scene import Scene
@@ -44,7 +43,7 @@ class ConvexParts:
 def convex_parts(scene: Scene, object_id: int, seed: int = 0) -> ConvexParts:
     """Divide an object into convex parts.
 
-    Raises InputError for an object without any usable Gaussian, and MissingPackage if it must be divided without coacd.
+    Raises InputError for an object without any usable Gaussian.
     """
     voxels, h = filled_voxels(scene, object_id, VOXELS_ALONG, seed)
     g = scene.gaussians.to("cpu")[(scene.gaussians.object_id == object_id).cpu()]
@@ -107,11 +106,8 @@ def _on_surface(part: np.ndarray, surface: np.ndarray, h: float) -> ConvexHull:
 
 def _decompose(voxels: Float[Tensor, "m 3"], h: float, seed: int) -> list[np.ndarray]:
     """Vertices (v, 3) of convex parts of the body of these voxels."""
-    try:
-        import coacd  # noqa: PLC0415 -- an optional package, which only hollow and branched objects need
-    except ImportError as error:
-        raise MissingPackage("--engine rigid needs the package coacd to divide objects into convex parts: "
-                             "`pip install 'ngff[rigid]'`") from error  # fmt: skip
+    import coacd  # noqa: PLC0415 -- only hollow and branched objects need it
+
     coacd.set_log_level("off")
     vertices, triangles = voxel_surface(torch.floor(voxels / h).long())
     parts = coacd.run_coacd(

@@ -6,7 +6,6 @@ import numpy as np
 from scipy.spatial import ConvexHull
 from torch import Tensor
 
-from stages.core.errors import MissingPackage
 from stages.lab.clutter.supports import Furniture
 
 TIMESTEP, DURATION = 0.004, 1.6  # [s]
@@ -37,10 +36,8 @@ def settle(furniture: Furniture, hulls: list[np.ndarray], starts: np.ndarray) ->
 
     `hulls` are corners (m, 3) about the body's origin.
     """
-    try:
-        import mujoco  # an optional extra
-    except ImportError as error:
-        raise MissingPackage("scenes of clutter need mujoco; install it with `pip install 'ngff[rigid]'`") from error
+    import mujoco  # slow to import
+
     spec = mujoco.MjSpec()
     spec.option.timestep, spec.option.gravity = TIMESTEP, [0, 0, -4.0]
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST

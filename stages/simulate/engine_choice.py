@@ -1,0 +1,60 @@
+"""The engine of `--engine auto`: by the materials of the objects."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+
+from stages.core.physics.materials import MODELS, Material, choose_materials
+from stages.core.scene.scene import Scene
+from stages.core.scene.trajectory import Keypoints
+from stages.simulate.options import AUTO, SimulateOptions
+
+log = logging.getLogger(__name__)
+MAX_RIGID_SAG = 0.02  # largest compression under its own weight of a body that counts as rigid
+
+
+def with_engine(options: SimulateOptions, scene: Scene, keypoints: Keypoints) -> SimulateOptions:
+    """The options with an engine in place of `auto`.
+
+    MPM if an object yields or flows; else the learned field if one is softer than MAX_RIGID_SAG, or if the scene was
+    reconstructed from photos, since reconstructed objects overlap and would be thrown apart as rigid bodies; else rigid
+    bodies. Options of learned engines (weights, an integrator) select the learned field.
+    """
+    if options.engine != AUTO:
+        return options
+    if options.weights is not None or options.integrator != "step":
+        return replace(options, engine="ngff")
+    materials = choose_materials(scene.objects, options.material, options.materials)
+    plastic = [o for o in scene.objects if MODELS[materials[o.id].material.model].plastic]
+    soft = [o for o in scene.objects if sag(materials[o.id].material, _height(scene, keypoints, o.id), options.gravity)
+            > MAX_RIGID_SAG]  # fmt: skip
+    if plastic:
+        engine, reason = "mpm", f"object {plastic[0].id} yields or flows"
+    elif soft:
+        engine, reason = "ngff", f"object {soft[0].id} is compressed by more than {MAX_RIGID_SAG:.0%} by its own weight"
+    elif _reconstructed(scene.provenance):
+        engine, reason = "ngff", "reconstructed objects overlap slightly"
+    else:
+        engine, reason = "rigid", "all objects are stiff"
+    log.info("--engine %s, as %s", engine, reason)
+    return replace(options, engine=engine)
+
+
+def sag(material: Material, height: float, gravity: float) -> float:
+    """Compression of a body of some height [m] under its own weight, about; gravity in m/s^2."""
+    return material.density * abs(gravity) * height / material.E
+
+
+def _reconstructed(provenance: dict) -> bool:
+    """Whether `ngff reconstruct` is among the commands that made a scene."""
+    while isinstance(provenance, dict):
+        if provenance.get("command") == "reconstruct":
+            return True
+        provenance = provenance.get("scene")
+    return False
+
+
+def _height(scene: Scene, keypoints: Keypoints, object_id: int) -> float:
+    z = keypoints.rest[keypoints.object_id == object_id, 2]
+    return float(z.max() - z.min()) * scene.metres_per_unit

@@ -1,0 +1,42 @@
+"""The engine that `--engine auto` stands for."""
+
+from dataclasses import replace
+
+import pytest
+
+from stages.core.physics.keypoints import choose_keypoints
+from stages.core.physics.materials import Material
+from stages.simulate.engine_choice import sag, with_engine
+from stages.simulate.options import SimulateOptions
+from tests.conftest import two_balls_scene
+
+
+def chosen(**options):
+    scene = two_balls_scene()
+    return with_engine(SimulateOptions(**options), scene, choose_keypoints(scene, 32)).engine
+
+
+@pytest.mark.parametrize(("options", "engine"), [
+    ({}, "rigid"), ({"material": ("1=pillow",)}, "ngff"), ({"material": ("1=pillow", "2=sand")}, "mpm"),
+    ({"material": ("1=pillow",), "gravity": 0.0}, "rigid"), ({"integrator": "rk4"}, "ngff"),
+    ({"engine": "mpm", "material": ("1=steel",)}, "mpm"),
+])  # fmt: skip
+def test_the_softest_object_decides(options, engine):
+    assert chosen(**options) == engine
+
+
+def test_scenes_from_photos_take_the_learned_field():
+    scene = two_balls_scene()
+    photographed = replace(scene, provenance={"command": "segment", "scene": {"command": "reconstruct"}})
+    assert with_engine(SimulateOptions(), photographed, choose_keypoints(scene, 32)).engine == "ngff"
+
+
+def test_what_is_a_hundred_times_larger_is_softer():
+    scene = two_balls_scene()
+    large = replace(scene, scale={"metres_per_unit": 100.0})
+    assert with_engine(SimulateOptions(), large, choose_keypoints(large, 32)).engine == "ngff"
+
+
+def test_sag_of_a_column():
+    """A column of height h is compressed by rho g h / 2 E on average and rho g h / E at its base."""
+    assert sag(Material(E=1e5, density=1000.0), 0.5, 10.0) == pytest.approx(0.05)

@@ -284,17 +284,21 @@ def clutter(
     size: Annotated[int, typer.Option(help="longest side of a photo [px]")] = 512,
     observations: Annotated[int, typer.Option(help="write this many outcomes of a model of reconstruction noise per "
                                               "scene in place of photos; 0: photos to reconstruct")] = 0,
+    reconstruct: Annotated[bool, typer.Option("--reconstruct", help="reconstruct the photos with their true cameras, "
+                                              "and write the labelled result in place of them")] = False,
     seed: Seed = 0,
+    device: Device = "auto",
 ) -> None:
     """Generate labelled scenes of things on tables, desks, shelves and floors, to train the segmentation.
 
-    With photos: run `ngff reconstruct NNNN/photos --cameras NNNN/transforms.json -o NNNN/scene.ply` on each scene.
+    Without options, run `ngff reconstruct NNNN/photos --cameras NNNN/transforms.json -o NNNN/scene.ply` on each scene.
     """
     from stages.lab.clutter.scenes import ClutterOptions, run
 
     options = ClutterOptions(
-        count=count, first=first, photos=photos, size=size, observations=observations, seed=seed
-    )
+        count=count, first=first, photos=photos, size=size, observations=observations, reconstruct=reconstruct,
+        seed=seed, device=device,
+    )  # fmt: skip
     for line in run(out, options, meshes):
         print(line, flush=True)
 
@@ -303,12 +307,16 @@ def clutter(
 def train_segmenter(
     data: Annotated[list[Path], typer.Argument(metavar="FOLDER", help="scenes of `ngff-lab clutter`; several folders")],
     out: Annotated[Path, typer.Option("-o", "--out", help="weights to write (.safetensors)")],
-    minutes: Annotated[float, typer.Option(help="training time [min]")] = 30.0,
+    minutes: Annotated[
+        float, typer.Option(help="training time of the network [min]; 0: only the scores of candidates")
+    ] = 30.0,
     steps: Annotated[int, typer.Option(help="optimizer steps instead of --minutes; 0: use --minutes")] = 0,
     rate: Annotated[float, typer.Option(help="maximum learning rate")] = 2e-3,
     voxels: Annotated[int, typer.Option(help="largest number of voxels of a training crop")] = 14_000,
     batch: Annotated[int, typer.Option(help="crops per step")] = 1,
     workers: Annotated[int, typer.Option(help="processes that prepare crops; 0: the training process itself")] = 0,
+    blocks: Annotated[int, typer.Option(help="residual blocks of each level, down and up")] = 2,
+    score_scenes: Annotated[int, typer.Option(help="augmented scenes whose candidates train the scores")] = 200,
     start: Annotated[
         Path | None, typer.Option("--from", help="initial weights (.safetensors); default: random")
     ] = None,
@@ -319,8 +327,9 @@ def train_segmenter(
     from stages.lab.training.train_segmenter import SegmenterTraining, run
 
     options = SegmenterTraining(
-        minutes=minutes, steps=steps, rate=rate, voxels=voxels, batch=batch, workers=workers, seed=seed, device=device
-    )
+        minutes=minutes, steps=steps, rate=rate, voxels=voxels, batch=batch, workers=workers, blocks=blocks,
+        score_scenes=score_scenes, seed=seed, device=device,
+    )  # fmt: skip
     for line in run(data, out, options, start):
         print(line, flush=True)
 

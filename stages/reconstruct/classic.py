@@ -26,6 +26,13 @@ def reconstruct(photos: Photos, options: ReconstructOptions, steps: StepCache) -
     """Backend `classic`: cameras by COLMAP or as given, depth by plane sweep, Gaussians by a photometric fit."""
     device = pick_device(options.device)
     model, photos = _cameras(photos, options, device, steps)
+    return reconstruct_from_model(photos, model, options, steps, device)
+
+
+def reconstruct_from_model(
+    photos: Photos, model: sfm.SparseModel, options: ReconstructOptions, steps: StepCache, device: str
+) -> Reconstruction:
+    """The steps after structure from motion; the model has a camera for each photo."""
     views = undistort(photos, model.cameras, model.lenses, options.max_side)
     focus = world_frame.focus_point(model.cameras.viewmats, _typical_depths(model))
     ground = world_frame.find_ground(model.points, model.cameras.viewmats, focus, options.seed)

@@ -18,9 +18,11 @@ from scipy import ndimage
 from torch import Tensor
 from tqdm import tqdm
 
+from stages.core.backends import pick_device
 from stages.core.errors import InputError
 from stages.core.geometry.cameras import intrinsics, look_at
 from stages.core.geometry.rotations import matrix
+from stages.core.models.segmenter.surfels import scene_surfels
 from stages.core.models.segmenter.voxels import ScenePoints
 from stages.core.raster.rasterise import rasterise
 from stages.core.scene.cameras import Cameras
@@ -33,6 +35,7 @@ from stages.lab.assets.mesh_files import find_objects, object_name
 from stages.lab.assets.objects import OBJECTS, make_object
 from stages.lab.clutter.noise_model import observed
 from stages.lab.clutter.props import Prop, make_prop, mesh_prop, placed, random_turn, recoloured
+from stages.lab.clutter.reconstruction import reconstructed, true_labels
 from stages.lab.clutter.settle import hull_corners, settle
 from stages.lab.clutter.supports import Furniture, painted, random_furniture
 
@@ -40,6 +43,7 @@ log = logging.getLogger(__name__)
 Rng = np.random.Generator
 PROPS = 160  # shapes from code that scenes are made of
 TRUTH, PHOTOS, TRANSFORMS, OBSERVED = "truth.ply", "photos", "transforms.json", "observed_{}.safetensors"
+RECONSTRUCTED = "reconstruction"  # in place of the number of an observation
 DATA_SET_POINTS = 15_000  # Gaussians kept of one of the ten objects
 SHADOW_CELL = 0.01  # [camera distance]
 MESH_SHARE = 0.4  # of the things of a scene that are meshes, where there are any
@@ -54,7 +58,9 @@ class ClutterOptions:
     photos: int = 12
     size: int = 512  # longest side of the photos [px]
     observations: int = 0  # by the noise model, in place of photos and the true scene; 0: photos to reconstruct
+    reconstruct: bool = False  # write an observation of the reconstructed photos, in place of them and the true scene
     seed: int = 0
+    device: str = "auto"  # of the reconstruction
 
     def __post_init__(self):
         if self.count < 1 or not 4 <= self.photos <= 200 or not 64 <= self.size <= 4096 or self.observations < 0:
@@ -103,14 +109,14 @@ def run(out: Path, options: ClutterOptions, meshes: Sequence[Path] = ()) -> Iter
     """Write OUT/NNNN/ for each scene; finished scenes are kept. Yields a line per scene.
 
     A folder has photos/, transforms.json and truth.ply, to be reconstructed; or with `options.observations` as many
-    files observed_K.safetensors, what the noise model makes of a reconstruction.
+    files observed_K.safetensors, what the noise model makes of a reconstruction; or with `options.reconstruct`
+    observed_reconstruction.safetensors, of a real one.
     """
     shelf = Shelf(meshes, options.seed)
     inputs = [f for files in shelf.meshes for f in files]
     for index in tqdm(range(options.first, options.first + options.count), desc="scenes", unit="scene"):
         folder = Path(out) / f"{index:04d}"
-        last = OBSERVED.format(options.observations - 1) if options.observations else TRUTH
-        if (folder / last).exists():
+        if all((folder / name).exists() for name in _outputs(options)):
             continue
         scene, things = make_scene(index, shelf, options)
         folder.mkdir(parents=True, exist_ok=True)
@@ -118,12 +124,23 @@ def run(out: Path, options: ClutterOptions, meshes: Sequence[Path] = ()) -> Iter
         for k in range(options.observations):
             surfels, labels = observed(scene, rng)
             write_observation(folder / OBSERVED.format(k), surfels, labels)
-        if not options.observations:
-            (folder / PHOTOS).mkdir(exist_ok=True)
+        if options.reconstruct:
+            photos = [(255 * photo).round().byte() for photo in _photos(scene, rng)]
+            made = reconstructed(scene, photos, rng, pick_device(options.device))
+            surfels, index, _ = scene_surfels(made)
+            write_observation(folder / OBSERVED.format(RECONSTRUCTED), surfels, true_labels(made, scene)[index])
+        if TRUTH in _outputs(options):
             _write_photos(scene, folder, rng)
             facts = provenance("clutter", inputs, options)
             write_scene(folder / TRUTH, replace(scene, provenance=facts))  # last: it marks the scene as finished
         yield f"{folder}: {things} things, {len(scene.cameras)} photos"
+
+
+def _outputs(options: ClutterOptions) -> list[str]:
+    """Names of the files of a finished scene."""
+    names = [OBSERVED.format(k) for k in range(options.observations)]
+    names += [OBSERVED.format(RECONSTRUCTED)] if options.reconstruct else []
+    return names or [TRUTH]
 
 
 def write_observation(path: Path, surfels: ScenePoints, labels: Int[Tensor, "n"]) -> None:
@@ -255,18 +272,23 @@ def _cameras(furniture: Furniture, points: Float[Tensor, "n 3"], rng: Rng, optio
     return Cameras(viewmats, K, torch.tensor([[wide, tall]] * n), names)
 
 
-def _write_photos(scene: Scene, folder: Path, rng: Rng) -> None:
-    """Photos with noise, blur and changes of exposure, and their cameras as a transforms.json."""
-    cameras = scene.cameras
-    sky = torch.from_numpy(rng.uniform(0.2, 0.9, 3)).float()
+def _photos(scene: Scene, rng: Rng) -> Iterator[Float[Tensor, "h w 3"]]:
+    """Photos with noise, blur and changes of exposure."""
+    cameras, sky = scene.cameras, torch.from_numpy(rng.uniform(0.2, 0.9, 3)).float()
     blur, grain, sway = rng.uniform(0, 0.7), rng.uniform(0.0, 0.015), rng.uniform(0, 0.06)
-    frames = []
-    for i, name in enumerate(cameras.names):
+    for i in range(len(cameras)):
         width, height = cameras.sizes[i].tolist()
         drawn = rasterise(scene.gaussians, cameras.viewmats[[i]], cameras.Ks[[i]], width, height, sky).rgb[0].numpy()
         drawn = ndimage.gaussian_filter(drawn, (blur, blur, 0)) * (1 + sway * rng.normal())
-        drawn = (drawn + grain * rng.normal(size=drawn.shape)).clip(0, 1)
-        write_jpeg(folder / PHOTOS / name, torch.from_numpy(drawn).float())
+        yield torch.from_numpy((drawn + grain * rng.normal(size=drawn.shape)).clip(0, 1)).float()
+
+
+def _write_photos(scene: Scene, folder: Path, rng: Rng) -> None:
+    """The photos, and their cameras as a transforms.json."""
+    cameras, frames = scene.cameras, []
+    (folder / PHOTOS).mkdir(exist_ok=True)
+    for i, (name, photo) in enumerate(zip(cameras.names, _photos(scene, rng), strict=True)):
+        write_jpeg(folder / PHOTOS / name, photo)
         pose = np.linalg.inv(cameras.viewmats[i].double().numpy()) @ np.diag([1.0, -1, -1, 1])  # y up, looking along -z
         frames.append({"file_path": f"{PHOTOS}/{name}", "transform_matrix": pose.tolist()})
     K = cameras.Ks[0]

@@ -13,22 +13,19 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from stages.core.errors import InputError
-from stages.core.geometry.cameras import centres
 from stages.core.geometry.neighbours import knn
-from stages.core.geometry.similarity import umeyama
 from stages.core.models.segmenter.surfels import scene_surfels
 from stages.core.models.segmenter.voxels import VOXEL, ScenePoints, VoxelGrid, neighbour_table, voxelise
-from stages.core.scene.scene import Scene
 from stages.core.scene.scene_ply import read_scene
-from stages.lab.clutter.scenes import OBSERVED, TRUTH, write_observation
+from stages.lab.clutter.reconstruction import FLOATER, true_labels
+from stages.lab.clutter.scenes import OBSERVED, RECONSTRUCTED, TRUTH, write_observation
 
 RECONSTRUCTION = "scene.ply"
-MAX_DISTANCE = 0.025  # from the true surface; farther Gaussians are floaters [camera distance]
-FLOATER = -1  # label
 MIN_OBJECT = 8  # voxels of an object that counts
 MAX_PAIRS = 60_000  # of a scene
 MAX_FLOATERS = 25  # clouds of points that belong to nothing
 APART = 2048  # voxels between the scenes of a batch, a multiple of the coarsest voxel
+SCALE_RANGE = 0.8, 2.4  # of augmented examples; includes voxels.SCALES
 MAX_RELIEF = 0.012  # [camera distance]
 LONG_REACH = 0.12  # of distant pairs of voxels [camera distance]
 
@@ -48,7 +45,7 @@ def find_examples(folders: Sequence[Path]) -> list[Path]:
     """
     scenes = [p for folder in folders for p in sorted(Path(folder).glob("*")) if p.is_dir()]
     for scene in scenes:
-        done = scene / OBSERVED.format("reconstruction")
+        done = scene / OBSERVED.format(RECONSTRUCTED)
         if (scene / RECONSTRUCTION).is_file() and (scene / TRUTH).is_file() and not done.exists():
             made = read_scene(scene / RECONSTRUCTION)
             surfels, index, _ = scene_surfels(made)
@@ -65,25 +62,6 @@ def read_example(path: Path) -> Example:
     table = load_file(path)
     labels = table.pop("labels").long()
     return Example(ScenePoints(**{name: table[name].float() for name in ScenePoints.__dataclass_fields__}), labels)
-
-
-def true_labels(made: Scene, truth: Scene) -> Int[Tensor, "n"]:
-    """Label of each Gaussian of `made`, by the nearest Gaussian of `truth`; the cameras are matched by name."""
-    rows = [truth.cameras.names.index(name) for name in made.cameras.names]
-    to_made = umeyama(_frames(truth.cameras.viewmats[rows]), _frames(made.cameras.viewmats))
-    g = truth.gaussians
-    distance, nearest = knn(to_made(g.means), made.gaussians.means.nan_to_num(1e6), 1)
-    radius = float(
-        (centres(made.cameras.viewmats) - made.gaussians.means.nan_to_num(0).median(0).values).norm(dim=1).median()
-    )
-    labels = g.object_id[nearest[:, 0]]
-    return torch.where(distance[:, 0] < MAX_DISTANCE * radius, labels, FLOATER)
-
-
-def _frames(viewmats: Float[Tensor, "c 4 4"]) -> Float[Tensor, "m 3"]:
-    """Camera centres and points one unit along their axes, which fix a rotation even for two cameras."""
-    eyes = centres(viewmats)
-    return torch.cat([eyes, *(eyes + 0.3 * viewmats[:, i, :3] for i in range(3))])
 
 
 @dataclass(frozen=True)
@@ -107,7 +85,7 @@ def augmented(example: Example, rng: np.random.Generator) -> tuple[ScenePoints, 
     turn = np.array([[c, -sn, 0], [sn, c, 0], [0, 0, 1]]) @ np.diag([rng.choice([-1, 1]), 1, 1])
     lean = np.array([[1, 0, tilt[0]], [0, 1, tilt[1]], [-tilt[0], -tilt[1], 1]])
     R = torch.from_numpy(lean @ turn).float()
-    scale = float(np.exp(rng.uniform(np.log(0.8), np.log(1.25))))
+    scale = float(np.exp(rng.uniform(*np.log(SCALE_RANGE))))
     points = scale * s.points @ R.mT + torch.tensor([0, 0, float(rng.normal(0, 0.004))])
     points = points + 0.004 * float(rng.uniform()) ** 2 * torch.from_numpy(rng.normal(size=points.shape)).float()
     points = torch.cat([points[:, :2], points[:, 2:] + _relief(points[:, :2], rng)], 1)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from safetensors.torch import load_file, save_file
+from safetensors.torch import save_file
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits, cross_entropy
 from torch.utils.data import DataLoader, IterableDataset, get_worker_info
@@ -19,6 +19,7 @@ from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 from stages.core.backends import pick_device
 from stages.core.errors import InputError
 from stages.core.models.segmenter.network import OFFSET_UNIT, Prediction, Segmenter, pyramid
+from stages.core.models.segmenter.segment import load_segmenter
 from stages.core.models.segmenter.voxels import VOXEL, unique_cells
 from stages.core.scene.files import replacing
 from stages.lab.training.segmenter_data import (
@@ -30,6 +31,7 @@ from stages.lab.training.segmenter_data import (
     targets,
     with_pairs,
 )
+from stages.lab.training.segmenter_scores import fit_scores
 
 CLASS_WEIGHTS = torch.tensor([0.5, 1.0, 0.5])
 REPORT_STEPS = 50
@@ -39,7 +41,7 @@ REPORT_STEPS = 50
 class SegmenterTraining:
     """Settings of the training."""
 
-    minutes: float = 30.0
+    minutes: float = 30.0  # of the network; 0: its weights stay as they are
     steps: int = 0  # 0: as many as fit in `minutes`
     rate: float = 2e-3
     voxels: int = 14_000  # of a training crop
@@ -48,11 +50,13 @@ class SegmenterTraining:
     seed: int = 0
     device: str = "auto"
     widths: tuple[int, ...] = (32, 48, 64, 96)
-    blocks: int = 1  # residual blocks of each level, down and up
+    blocks: int = 2  # residual blocks of each level, down and up
+    score_scenes: int = 200  # augmented examples whose candidates train the scores
+    score_steps: int = 3000
 
     def __post_init__(self):
-        if not (self.minutes > 0 and self.rate > 0 and self.voxels >= 1000 and self.batch >= 1):
-            raise InputError("--minutes and --rate must be above 0, --voxels at least 1000, --batch at least 1")
+        if not (self.minutes >= 0 and self.rate > 0 and self.voxels >= 1000 and self.batch >= 1):
+            raise InputError("--rate must be above 0, --minutes 0 or more, --voxels at least 1000, --batch at least 1")
 
 
 def losses(model: Segmenter, t: Targets) -> dict[str, Tensor]:
@@ -106,13 +110,12 @@ class Crops(IterableDataset):
 def run(folders: Sequence[Path], out: Path, options: SegmenterTraining, start: Path | None = None) -> Iterator[str]:
     """Train on the scenes of `folders`, write OUT (.safetensors) and its card; yields a line per REPORT_STEPS steps.
 
-    `start`: weights to continue from.
+    `start`: weights to continue from, with the widths and blocks of their card.
     """
     torch.manual_seed(options.seed)
     files = find_examples(folders)
-    model = Segmenter(options.widths, options.blocks).to(pick_device(options.device))
-    if start is not None:
-        model.load_state_dict({k: v.float() for k, v in load_file(start).items()})
+    model = Segmenter(options.widths, options.blocks) if start is None else load_segmenter(start)
+    model = model.to(pick_device(options.device)).train()
     optimiser = torch.optim.AdamW(model.parameters(), options.rate, weight_decay=0.01)
     dataset = Crops(files, options.voxels, options.batch, options.seed)
     crops = iter(DataLoader(dataset, batch_size=None, num_workers=options.workers))
@@ -136,17 +139,24 @@ def run(folders: Sequence[Path], out: Path, options: SegmenterTraining, start: P
             yield ", ".join(f"{k} {v}" for k, v in curve[-1].items())
             mean = {}
             _save(out, model, options, len(files), curve)
-    _save(out, model, options, len(files), curve)
+    scores = fit_scores(model, files, options.score_scenes, options.score_steps, options.seed)
+    yield ", ".join(f"{k} {v}" for k, v in scores.items())
+    _save(out, model, options, len(files), curve, scores)
 
 
 def _progress(options: SegmenterTraining, step: int, begun: float) -> float:
     """Share of the training that is done."""
+    if not options.minutes:
+        return 1.0
     return step / options.steps if options.steps else (time.monotonic() - begun) / (60 * options.minutes)
 
 
-def _save(out: Path, model: Segmenter, options: SegmenterTraining, files: int, curve: list[dict]) -> None:
+def _save(
+    out: Path, model: Segmenter, options: SegmenterTraining, files: int, curve: list[dict], scores: dict | None = None
+) -> None:
     """Weights in half precision, and their card."""
-    card = {"model": "segmenter", "config": model.config, "training": asdict(options), "files": files, "curve": curve}
+    card = {"model": "segmenter", "config": model.config, "training": asdict(options), "files": files,
+            "scores": scores or {}, "curve": curve}  # fmt: skip
     with replacing(Path(out)) as part:
         save_file({k: v.detach().cpu().contiguous().half() for k, v in model.state_dict().items()}, part)
     with replacing(Path(out).with_suffix(".json")) as part:

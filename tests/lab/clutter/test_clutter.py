@@ -80,7 +80,9 @@ def test_files_of_scenes_are_kept_and_trained_on(tmp_path: Path):
     assert len(example.surfels) == len(example.labels) > 1000
 
     weights = tmp_path / "w.safetensors"
-    training = train_segmenter.SegmenterTraining(steps=2, voxels=2000, widths=(8, 12), device="cpu")
+    training = train_segmenter.SegmenterTraining(
+        steps=2, voxels=2000, widths=(8, 12), blocks=1, score_scenes=2, score_steps=20, device="cpu"
+    )
     lines = list(train_segmenter.run([tmp_path / "noisy"], weights, training))
     assert "1 files" in lines[0]
     ids = object_ids(truth, load_segmenter(weights), None)

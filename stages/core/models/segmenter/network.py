@@ -1,5 +1,7 @@
 """A sparse 3D U-Net over voxels: class, offset to the object's centre, and an embedding for pairs of voxels.
 
+A perceptron scores candidate objects.
+
 The classes are surface (tables, walls, floors, furniture), object, and clutter (floaters, things too small to tell).
 Offsets as in PointGroup (Jiang et al. 2020); convolutions touch occupied voxels only, as in Graham et al. 2018.
 """
@@ -18,6 +20,7 @@ from stages.core.models.segmenter.voxels import FEATURES, VOXEL, coarser, neighb
 CLASSES = ("surface", "object", "clutter")
 OFFSET_UNIT = 0.1  # of predicted offsets [camera distance]
 PAIR_FEATURES = 24  # of the embedding
+CANDIDATE_FEATURES = 27  # of a candidate object, see candidates.py
 
 
 @dataclass(frozen=True)
@@ -124,6 +127,12 @@ class Segmenter(nn.Module):
         self.leave = nn.Sequential(nn.LayerNorm(widths[0]), nn.Linear(widths[0], 64), nn.GELU())
         self.heads = nn.Linear(64, len(CLASSES) + 3 + PAIR_FEATURES)
         self.pair = nn.Sequential(nn.Linear(2 * PAIR_FEATURES + 3, 32), nn.GELU(), nn.Linear(32, 1))
+        self.register_buffer("feature_mean", torch.zeros(CANDIDATE_FEATURES))
+        self.register_buffer("feature_scale", torch.ones(CANDIDATE_FEATURES))
+        width = 48
+        self.candidate = nn.Sequential(
+            nn.Linear(CANDIDATE_FEATURES, width), nn.GELU(), nn.Linear(width, width), nn.GELU(), nn.Linear(width, 1)
+        )
 
     def forward(self, features: Float[Tensor, "v f"], levels: list[Level]) -> Prediction:
         """Predictions for the voxels of the finest level."""
@@ -154,3 +163,8 @@ class Segmenter(nn.Module):
         apart = (centres[i] - centres[j]).norm(dim=1, keepdim=True) / (5 * VOXEL)
         reach = (found.offsets[i].norm(dim=1) + found.offsets[j].norm(dim=1))[:, None] / OFFSET_UNIT
         return self.pair(torch.cat([(a - b).abs(), a * b, step, apart, reach], 1))[:, 0]
+
+    def score(self, features: Float[Tensor, "k f"]) -> Float[Tensor, "k"]:
+        """Log odds of the IoU of candidates with the object that they fit best."""
+        x = ((features - self.feature_mean) / self.feature_scale).clamp(-4, 4)
+        return self.candidate(x)[:, 0]

@@ -1,31 +1,35 @@
-"""Objects of a scene by the trained network: voxels -> classes, offsets and affinities -> clusters -> Gaussians."""
+"""Objects of a scene by the trained network: voxels -> classes, offsets and affinities -> candidates -> Gaussians."""
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from safetensors.torch import load_file
 from torch import Tensor
 
 from stages.core.errors import InputError
-from stages.core.models.segmenter.clustering import agglomerate
-from stages.core.models.segmenter.network import Prediction, Segmenter, pyramid
+from stages.core.models.segmenter.candidates import MIN_VOXELS, find_candidates
+from stages.core.models.segmenter.network import Segmenter, pyramid
 from stages.core.models.segmenter.outlines import cut_outlines
 from stages.core.models.segmenter.surfels import scene_surfels
-from stages.core.models.segmenter.voxels import VOXEL, VoxelGrid, voxelise
+from stages.core.models.segmenter.voxels import SCALES, ScenePoints, VoxelGrid, voxelise
 from stages.core.perception.support import Support
 from stages.core.scene.scene import Scene
 
 WEIGHTS = Path(__file__).parent / "segmenter.safetensors"
 MAX_VOXELS = 80_000  # nearest to the focus
 MAX_BASE_HEIGHT = 0.4  # of an object's lowest points above the surface [camera distance]
-MIN_VOXELS = 6  # of an object
+OBJECT_COST = 0.3  # least IoU that a candidate must be expected to have; chosen on simulated scenes
 MIN_GAUSSIANS = 30  # of an object
+MAX_OVERLAP = 0.25  # of two objects, of the smaller
 
 
 @dataclass(frozen=True)
@@ -70,13 +74,13 @@ def object_ids(
     surfels, index, _ = scene_surfels(scene)
     if len(surfels) < 20:
         return ids
-    grid = voxelise(surfels)
-    if len(grid) > MAX_VOXELS:
-        near = (grid.points.norm(dim=1) <= grid.points.norm(dim=1).kthvalue(MAX_VOXELS).values)[grid.owner]
-        surfels, index = surfels[near], index[near]
-        grid = voxelise(surfels)
-    found, labels = cluster(grid, model, options)
-    ids[index] = cut_outlines(surfels, grid, labels, found.logits.softmax(1))
+    found = [find_at(surfels, scale, model, options) for scale in SCALES]
+    labels = best_objects(found)
+    labels = torch.where(labels <= options.max_objects, labels, 0)
+    chance = torch.stack([f.chance for f in found]).nanmean(0)
+    fine = surfels.enlarged(SCALES[-1])
+    grid = voxelise(fine)
+    ids[index] = cut_outlines(fine, grid, *_by_voxel(grid, labels, chance))
     means = scene.gaussians.means
     for number in range(1, int(ids.max()) + 1):
         own = means[ids == number]
@@ -91,40 +95,84 @@ def _is_over(points: Float[Tensor, "m 3"], support: Support) -> bool:
     return float(support.inside(points).float().mean()) > 0.5 and low < MAX_BASE_HEIGHT * support.view.radius
 
 
-@torch.no_grad()
-def cluster(grid: VoxelGrid, model: Segmenter, options: SegmenterOptions) -> tuple[Prediction, Int[Tensor, "v"]]:
-    """The network's output, and the object of each voxel: 1 for the largest, 0 for none."""
+@dataclass(frozen=True)
+class Segmentation:
+    """The best choice of objects at one scale."""
+
+    labels: Int[Tensor, "n"]  # of surfels: row of `gains`, -1 for none
+    gains: Float[Tensor, "k"]  # expected IoU less OBJECT_COST
+    sizes: Int[Tensor, "k"]  # surfels
+    chance: Float[Tensor, "n 3"]  # of the classes; NaN beyond MAX_VOXELS
+
+
+def find_at(surfels: ScenePoints, scale: float, model: Segmenter, options: SegmenterOptions) -> Segmentation:
+    """Objects among the surfels enlarged by `scale`.
+
+    They are the disjoint candidates with the largest sum of expected IoU, less OBJECT_COST for each.
+    """
+    grid, near = voxelise(surfels.enlarged(scale)), torch.ones(len(surfels), dtype=torch.bool)
+    if len(grid) > MAX_VOXELS:
+        distance = grid.points.norm(dim=1)
+        near = (distance <= distance.kthvalue(MAX_VOXELS).values)[grid.owner]
+        grid = voxelise(surfels[near].enlarged(scale))
     levels = pyramid(grid.cells, len(model.config["widths"]))
     found = model(grid.features, levels)
-    chance = found.logits.softmax(1)
-    loose = torch.nonzero(chance[:, 0] < 0.5)[:, 0]
-    labels = torch.zeros(len(grid), dtype=torch.int64)
-    if len(loose) < MIN_VOXELS:
-        return found, labels
-    pairs = adjacent_pairs(levels[0].neighbours, loose)
-    if not len(pairs):
-        return found, labels
-    odds = model.affinity(found, grid.points, pairs)
-    number = torch.full((len(grid),), -1)
-    number[loose] = torch.arange(len(loose))
-    clusters = torch.from_numpy(agglomerate(len(loose), number[pairs].numpy(), odds.double().numpy()))
-    sizes = []
-    for c in range(int(clusters.max()) + 1):
-        own = loose[clusters == c]
-        low, high = grid.points[own].amin(0), grid.points[own].amax(0)
-        mean = chance[own].mean(0)
-        if len(own) >= MIN_VOXELS and float((high - low).max()) + VOXEL >= options.min_size and int(mean.argmax()) == 1:
-            sizes.append((len(own), c))
-    for i, (_, c) in enumerate(sorted(sizes, reverse=True)[: options.max_objects], start=1):
-        labels[loose[clusters == c]] = i
-    return found, labels
+    candidates = find_candidates(grid, levels, found, model)
+    gain = model.score(candidates.features).sigmoid() - OBJECT_COST
+    usable = (candidates.sizes > MIN_VOXELS - 0.5) & (candidates.extents >= scale * options.min_size)
+    nodes = candidates.tree.best(torch.where(usable, gain, -1.0).double().numpy())
+    own = torch.full((len(grid),), -1)
+    own[candidates.voxels] = torch.from_numpy(candidates.tree.labels(nodes))
+    labels, chance = torch.full((len(surfels),), -1), torch.full((len(surfels), 3), torch.nan)
+    labels[near], chance[near] = own[grid.owner], found.logits.softmax(1)[grid.owner]
+    sizes = torch.bincount(labels[labels >= 0], minlength=len(nodes))
+    return Segmentation(labels, gain[nodes], sizes, chance)
 
 
-def adjacent_pairs(neighbours: Int[Tensor, "v 27"], loose: Int[Tensor, "m"]) -> Int[Tensor, "e 2"]:
-    """All pairs of adjacent voxels among `loose`, each once."""
-    count = len(neighbours)
-    inside = torch.zeros(count + 1, dtype=torch.bool)
-    inside[loose] = True
-    i, k = torch.nonzero(neighbours[:, :13] < count, as_tuple=True)
-    pairs = torch.stack([i, neighbours[i, k]], 1)
-    return pairs[inside[pairs].all(1)]
+def best_objects(found: Sequence[Segmentation]) -> Int[Tensor, "n"]:
+    """Object of each surfel, 1 for the largest and 0 for none: the best choice among the objects of all scales.
+
+    No two overlap by more than MAX_OVERLAP of the smaller, and the sum of their gains is the largest (found by integer
+    linear programming).
+    """
+    first = [0, *itertools.accumulate(len(f.gains) for f in found)]
+    gains, sizes = torch.cat([f.gains for f in found]), torch.cat([f.sizes for f in found])
+    labels = torch.zeros(len(found[0].labels), dtype=torch.int64)
+    conflicts = [
+        (first[i] + x, first[j] + y)
+        for (i, a), (j, b) in itertools.combinations(enumerate(found), 2)
+        for x, y in torch.nonzero(_shared(a, b) > MAX_OVERLAP * torch.minimum(a.sizes[:, None], b.sizes)).tolist()
+    ]
+    chosen = np.ones(len(gains)) if not conflicts else _best_without(conflicts, gains.double().numpy())
+    for number, k in enumerate(sorted(np.nonzero(chosen > 0.5)[0], key=lambda k: -int(sizes[k])), start=1):
+        scale = int(np.searchsorted(first, k, side="right")) - 1
+        labels[(found[scale].labels == k - first[scale]) & (labels == 0)] = number
+    return labels
+
+
+def _shared(a: Segmentation, b: Segmentation) -> Int[Tensor, "x y"]:
+    """Surfels that each object of `a` shares with each of `b`."""
+    both = (a.labels >= 0) & (b.labels >= 0)
+    number = a.labels[both] * len(b.gains) + b.labels[both]
+    return torch.bincount(number, minlength=len(a.gains) * len(b.gains)).view(len(a.gains), len(b.gains))
+
+
+def _best_without(conflicts: list[tuple[int, int]], gains: np.ndarray) -> np.ndarray:
+    """1 for what is chosen and 0 for the rest, so that of two in conflict at most one is chosen."""
+    from scipy.optimize import Bounds, LinearConstraint, milp
+
+    rows = np.zeros((len(conflicts), len(gains)))
+    np.put_along_axis(rows, np.array(conflicts), 1.0, axis=1)
+    at_most_one = LinearConstraint(rows, ub=1)
+    return milp(-gains, integrality=np.ones(len(gains)), bounds=Bounds(0, 1), constraints=at_most_one).x
+
+
+def _by_voxel(
+    grid: VoxelGrid, labels: Int[Tensor, "n"], chance: Float[Tensor, "n 3"]
+) -> tuple[Int[Tensor, "v"], Float[Tensor, "v 3"]]:
+    """The label that most surfels of each voxel have, and their mean probabilities."""
+    count, kinds = len(grid), int(labels.max()) + 1
+    most = torch.bincount(grid.owner * kinds + labels, minlength=count * kinds).view(count, kinds).argmax(1)
+    known = chance.nan_to_num(1 / 3)
+    number = torch.bincount(grid.owner, minlength=count)[:, None]
+    return most, torch.zeros(count, 3).index_add_(0, grid.owner, known) / number

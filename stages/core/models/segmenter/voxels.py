@@ -6,7 +6,7 @@ alike.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -16,6 +16,7 @@ from stages.core.geometry.neighbours import knn
 from stages.core.geometry.rotations import matrix
 
 VOXEL = 0.01  # side [camera distance]
+SCALES = (1.0, 1.5, 2.25)  # by which scenes are enlarged in turn, so that objects of all sizes are many voxels
 REACH = 1.5  # Gaussians farther from the focus are left out [camera distance]
 MIN_OPACITY = 0.1
 MAX_SCALE = 0.1  # standard deviation above which a Gaussian is a backdrop [camera distance]
@@ -38,6 +39,10 @@ class ScenePoints:
 
     def __getitem__(self, index) -> ScenePoints:
         return ScenePoints(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
+
+    def enlarged(self, scale: float) -> ScenePoints:
+        """The same with `scale` times the lengths."""
+        return replace(self, points=scale * self.points)
 
 
 @dataclass(frozen=True)

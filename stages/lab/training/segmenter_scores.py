@@ -1,0 +1,85 @@
+"""Training of the scores of candidate objects, after the rest of the segmentation network."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.nn.functional import binary_cross_entropy_with_logits
+from tqdm import tqdm
+
+from stages.core.errors import InputError
+from stages.core.models.segmenter.candidates import MIN_VOXELS, Candidates, find_candidates
+from stages.core.models.segmenter.network import Segmenter, pyramid
+from stages.core.models.segmenter.voxels import SCALES, VoxelGrid, voxelise
+from stages.lab.training.segmenter_data import augmented, read_example
+
+BATCH, RATE = 512, 3e-3
+LARGE, GOOD = 20, 0.3  # voxels and IoU of candidates that a third of each batch has at least: most are small and bad
+MIN_SURFELS = 60  # of a true object that counts
+FLOATER_WEIGHT = 0.3  # of surfels without a true label, in the size of a candidate
+MAX_SURFELS = 160_000
+JITTER = 0.05  # of the normalised features
+
+
+def fit_scores(model: Segmenter, files: Sequence[Path], scenes: int, steps: int, seed: int) -> dict[str, float]:
+    """Train `model.score`, in place, on the candidates in `scenes` augmented examples; returns figures for the card."""
+    rng = np.random.default_rng([seed, 1])
+    torch.manual_seed(seed)
+    model = model.cpu().eval()
+    features, quality = [], []
+    for k in tqdm(range(scenes), desc="candidates", unit="scene"):
+        surfels, labels = augmented(read_example(files[k % len(files)]), rng)
+        if len(surfels) > MAX_SURFELS or len(surfels) < LARGE:
+            continue
+        grid = voxelise(surfels.enlarged(float(rng.choice(SCALES))))
+        with torch.no_grad():
+            levels = pyramid(grid.cells, len(model.config["widths"]))
+            found = find_candidates(grid, levels, model(grid.features, levels), model)
+        keep = found.sizes > MIN_VOXELS - 0.5
+        features.append(found.features[keep])
+        quality.append(true_iou(found, grid, labels)[keep])
+    if not features:
+        raise InputError(f"none of {scenes} examples has {LARGE} to {MAX_SURFELS} surfels; raise --score-scenes")
+    x, y = torch.cat(features), torch.cat(quality)
+    model.feature_mean.copy_(x.mean(0))
+    model.feature_scale.copy_(x.std(0) + 1e-6)
+    loss = _train(model, x, y, steps)
+    return {"scenes": len(features), "candidates": len(x), "loss": round(loss, 4)}
+
+
+def _train(model: Segmenter, x: Float[Tensor, "k f"], y: Float[Tensor, "k"], steps: int) -> float:
+    """The loss of the last hundred steps."""
+    optimiser = torch.optim.AdamW(model.candidate.parameters(), RATE, weight_decay=1e-3)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
+    groups = [torch.arange(len(x)), torch.nonzero(x[:, 0].exp() >= LARGE)[:, 0], torch.nonzero(y > GOOD)[:, 0]]
+    losses = []
+    for _ in tqdm(range(steps), desc="scores", unit="step"):
+        rows = torch.cat([group[torch.randint(len(group), (BATCH,))] for group in groups if len(group)])
+        noisy = x[rows] + JITTER * model.feature_scale * torch.randn(len(rows), x.shape[1])
+        loss = binary_cross_entropy_with_logits(model.score(noisy), y[rows])
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        schedule.step()
+        losses.append(float(loss.detach()))
+    return float(np.mean(losses[-100:]))
+
+
+def true_iou(found: Candidates, grid: VoxelGrid, labels: Int[Tensor, "n"]) -> Float[Tensor, "k"]:
+    """IoU of each candidate with the true object that it fits best, in surfels."""
+    count = int(labels.max()) + 1 if len(labels) else 1
+    judged, total = labels >= 0, torch.bincount(grid.owner, minlength=len(grid)).double()
+    known = torch.bincount(grid.owner[judged], minlength=len(grid)).double()
+    size = found.tree.sums((known + FLOATER_WEIGHT * (total - known))[found.voxels, None].numpy())
+    true = torch.bincount(labels[judged], minlength=count).double()
+    objects = [k for k in range(1, count) if true[k] >= MIN_SURFELS]
+    if not objects:
+        return torch.zeros(len(found.tree))
+    owned = torch.stack([torch.bincount(grid.owner[labels == k], minlength=len(grid)) for k in objects], 1)
+    both = found.tree.sums(owned[found.voxels].double().numpy())
+    return torch.from_numpy((both / (size + true[objects].numpy() - both)).max(1)).float()

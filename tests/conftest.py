@@ -132,7 +132,7 @@ def two_balls() -> Scene:
     return two_balls_scene()
 
 
-def two_balls_scene(points: int = 400) -> Scene:
+def two_balls_scene() -> Scene:
     """A red and a green ball above a grey floor at z = 0, and six cameras."""
     grid = torch.cartesian_prod(torch.linspace(-1, 1, 30), torch.linspace(-1, 1, 30))
     floor = Gaussians(
@@ -140,7 +140,7 @@ def two_balls_scene(points: int = 400) -> Scene:
         torch.tensor([[0.04, 0.04, 0.002]]).repeat(900, 1), torch.full((900,), 0.9), torch.zeros(900, 1, 3),
         torch.zeros(900, dtype=torch.int64),
     )  # fmt: skip
-    red = ball((-0.3, 0.0, 0.15), 0.15, points, (0.9, 0.1, 0.1), 1)
-    green = ball((0.3, 0.0, 0.40), 0.12, points, (0.1, 0.8, 0.1), 2, seed=1)
+    red = ball((-0.3, 0.0, 0.15), 0.15, 400, (0.9, 0.1, 0.1), 1)
+    green = ball((0.3, 0.0, 0.40), 0.12, 400, (0.1, 0.8, 0.1), 2, seed=1)
     objects = (SceneObject(1, "red ball", "rubber"), SceneObject(2, "green ball", "rubber"))
     return Scene(concatenate([floor, red, green]), objects, ring(target=0.1), 0.0)

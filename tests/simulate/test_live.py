@@ -72,7 +72,7 @@ def test_other_messages_are_refused(text):
 def prompts_of_a_session(engine, monkeypatch, actions, frames=26):
     """Keypoints of a session with messages at some frames, and of its record, in one engine."""
     monkeypatch.setitem(QUALITIES, "draft", MpmQuality(particles=800, substep=1e-3))
-    world = two_balls_scene(1500)  # dense enough to be filled, that is convex
+    world = two_balls_scene()
     options = SimulateOptions(engine=engine, quality="draft", steps=frames, keypoints=32, box="-1,-1,0,1,1,2")
     keypoints = choose_keypoints(world, 32)
     rollout = choose({name: e.rollout for name, e in ENGINES.items()}, engine)

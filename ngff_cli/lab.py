@@ -286,6 +286,7 @@ def clutter(
                                               "scene in place of photos; 0: photos to reconstruct")] = 0,
     reconstruct: Annotated[bool, typer.Option("--reconstruct", help="reconstruct the photos with their true cameras, "
                                               "and write the labelled result in place of them")] = False,
+    exact: Annotated[bool, typer.Option("--exact", help="write the true Gaussians, labelled, not photos")] = False,
     seed: Seed = 0,
     device: Device = "auto",
 ) -> None:
@@ -297,7 +298,7 @@ def clutter(
 
     options = ClutterOptions(
         count=count, first=first, photos=photos, size=size, observations=observations, reconstruct=reconstruct,
-        seed=seed, device=device,
+        exact=exact, seed=seed, device=device,
     )  # fmt: skip
     for line in run(out, options, meshes):
         print(line, flush=True)

@@ -12,8 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
-from safetensors.torch import save_file
+from jaxtyping import Float
 from scipy import ndimage
 from torch import Tensor
 from tqdm import tqdm
@@ -22,20 +21,19 @@ from stages.core.backends import pick_device
 from stages.core.errors import InputError
 from stages.core.geometry.cameras import intrinsics, look_at
 from stages.core.geometry.rotations import matrix
-from stages.core.models.segmenter.surfels import scene_surfels
-from stages.core.models.segmenter.voxels import ScenePoints
 from stages.core.raster.rasterise import rasterise
 from stages.core.scene.cameras import Cameras
-from stages.core.scene.files import provenance, replacing
+from stages.core.scene.files import provenance
 from stages.core.scene.gaussians import Gaussians, concatenate
 from stages.core.scene.images import write_jpeg
 from stages.core.scene.scene import Scene, SceneObject
 from stages.core.scene.scene_ply import write_scene
 from stages.lab.assets.mesh_files import find_objects, object_name
 from stages.lab.assets.objects import OBJECTS, make_object
+from stages.lab.clutter.examples import Example, labelled, write_example
 from stages.lab.clutter.noise_model import observed
 from stages.lab.clutter.props import Prop, make_prop, mesh_prop, placed, random_turn, recoloured
-from stages.lab.clutter.reconstruction import reconstructed, true_labels
+from stages.lab.clutter.reconstruction import reconstructed
 from stages.lab.clutter.settle import hull_corners, settle
 from stages.lab.clutter.supports import Furniture, painted, random_furniture
 
@@ -43,7 +41,7 @@ log = logging.getLogger(__name__)
 Rng = np.random.Generator
 PROPS = 160  # shapes from code that scenes are made of
 TRUTH, PHOTOS, TRANSFORMS, OBSERVED = "truth.ply", "photos", "transforms.json", "observed_{}.safetensors"
-RECONSTRUCTED = "reconstruction"  # in place of the number of an observation
+RECONSTRUCTED, EXACT = "reconstruction", "exact"  # in place of the number of an observation
 DATA_SET_POINTS = 15_000  # Gaussians kept of one of the ten objects
 SHADOW_CELL = 0.01  # [camera distance]
 MESH_SHARE = 0.4  # of the things of a scene that are meshes, where there are any
@@ -59,6 +57,7 @@ class ClutterOptions:
     size: int = 512  # longest side of the photos [px]
     observations: int = 0  # by the noise model, in place of photos and the true scene; 0: photos to reconstruct
     reconstruct: bool = False  # write an observation of the reconstructed photos, in place of them and the true scene
+    exact: bool = False  # write an observation of the true Gaussians, in place of photos
     seed: int = 0
     device: str = "auto"  # of the reconstruction
 
@@ -110,7 +109,8 @@ def run(out: Path, options: ClutterOptions, meshes: Sequence[Path] = ()) -> Iter
 
     A folder has photos/, transforms.json and truth.ply, to be reconstructed; or with `options.observations` as many
     files observed_K.safetensors, what the noise model makes of a reconstruction; or with `options.reconstruct`
-    observed_reconstruction.safetensors, of a real one.
+    observed_reconstruction.safetensors, of a real one; or with `options.exact` observed_exact.safetensors, of the true
+    Gaussians themselves.
     """
     shelf = Shelf(meshes, options.seed)
     inputs = [f for files in shelf.meshes for f in files]
@@ -122,13 +122,13 @@ def run(out: Path, options: ClutterOptions, meshes: Sequence[Path] = ()) -> Iter
         folder.mkdir(parents=True, exist_ok=True)
         rng = np.random.default_rng([options.seed, index, 2])
         for k in range(options.observations):
-            surfels, labels = observed(scene, rng)
-            write_observation(folder / OBSERVED.format(k), surfels, labels)
+            write_example(folder / OBSERVED.format(k), Example(*observed(scene, rng)))
         if options.reconstruct:
             photos = [(255 * photo).round().byte() for photo in _photos(scene, rng)]
             made = reconstructed(scene, photos, rng, pick_device(options.device))
-            surfels, index, _ = scene_surfels(made)
-            write_observation(folder / OBSERVED.format(RECONSTRUCTED), surfels, true_labels(made, scene)[index])
+            write_example(folder / OBSERVED.format(RECONSTRUCTED), labelled(made, scene))
+        if options.exact:
+            write_example(folder / OBSERVED.format(EXACT), labelled(scene, scene))
         if TRUTH in _outputs(options):
             _write_photos(scene, folder, rng)
             facts = provenance("clutter", inputs, options)
@@ -140,14 +140,8 @@ def _outputs(options: ClutterOptions) -> list[str]:
     """Names of the files of a finished scene."""
     names = [OBSERVED.format(k) for k in range(options.observations)]
     names += [OBSERVED.format(RECONSTRUCTED)] if options.reconstruct else []
+    names += [OBSERVED.format(EXACT)] if options.exact else []
     return names or [TRUTH]
-
-
-def write_observation(path: Path, surfels: ScenePoints, labels: Int[Tensor, "n"]) -> None:
-    """ScenePoints in half precision, with their labels."""
-    table = {name: getattr(surfels, name).half().contiguous() for name in surfels.__dataclass_fields__}
-    with replacing(path) as part:
-        save_file({**table, "labels": labels.short()}, part)
 
 
 def make_scene(index: int, shelf: Shelf, options: ClutterOptions) -> tuple[Scene, int]:

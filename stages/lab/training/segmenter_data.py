@@ -9,16 +9,15 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from safetensors.torch import load_file
 from torch import Tensor
 
 from stages.core.errors import InputError
 from stages.core.geometry.neighbours import knn
-from stages.core.models.segmenter.surfels import scene_surfels
 from stages.core.models.segmenter.voxels import VOXEL, ScenePoints, VoxelGrid, neighbour_table, voxelise
 from stages.core.scene.scene_ply import read_scene
-from stages.lab.clutter.reconstruction import FLOATER, true_labels
-from stages.lab.clutter.scenes import OBSERVED, RECONSTRUCTED, TRUTH, write_observation
+from stages.lab.clutter.examples import Example, labelled, write_example
+from stages.lab.clutter.reconstruction import FLOATER
+from stages.lab.clutter.scenes import OBSERVED, RECONSTRUCTED, TRUTH
 
 RECONSTRUCTION = "scene.ply"
 MIN_OBJECT = 8  # voxels of an object that counts
@@ -30,14 +29,6 @@ MAX_RELIEF = 0.012  # [camera distance]
 LONG_REACH = 0.12  # of distant pairs of voxels [camera distance]
 
 
-@dataclass(frozen=True)
-class Example:
-    """ScenePoints of a reconstruction and the true object of each: 0 surface, 1... objects, -1 floaters."""
-
-    surfels: ScenePoints
-    labels: Int[Tensor, "n"]
-
-
 def find_examples(folders: Sequence[Path]) -> list[Path]:
     """Files of observations in the scenes of the folders; reconstructed scenes are compared with their truth first.
 
@@ -47,21 +38,12 @@ def find_examples(folders: Sequence[Path]) -> list[Path]:
     for scene in scenes:
         done = scene / OBSERVED.format(RECONSTRUCTED)
         if (scene / RECONSTRUCTION).is_file() and (scene / TRUTH).is_file() and not done.exists():
-            made = read_scene(scene / RECONSTRUCTION)
-            surfels, index, _ = scene_surfels(made)
-            write_observation(done, surfels, true_labels(made, read_scene(scene / TRUTH))[index])
+            write_example(done, labelled(read_scene(scene / RECONSTRUCTION), read_scene(scene / TRUTH)))
     found = [p for scene in scenes for p in sorted(scene.glob(OBSERVED.format("*")))]
     if not found:
         raise InputError(f"{folders[0]}: no scene in it has observations, or {RECONSTRUCTION} and {TRUTH}; make them "
                          "with `ngff-lab clutter`")  # fmt: skip
     return found
-
-
-def read_example(path: Path) -> Example:
-    """A file of observations."""
-    table = load_file(path)
-    labels = table.pop("labels").long()
-    return Example(ScenePoints(**{name: table[name].float() for name in ScenePoints.__dataclass_fields__}), labels)
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,8 @@ from stages.core.errors import InputError
 from stages.core.models.segmenter.candidates import MIN_VOXELS, Candidates, find_candidates
 from stages.core.models.segmenter.network import Segmenter, pyramid
 from stages.core.models.segmenter.voxels import SCALES, VoxelGrid, voxelise
-from stages.lab.training.segmenter_data import augmented, read_example
+from stages.lab.clutter.examples import read_example
+from stages.lab.training.segmenter_data import augmented
 
 BATCH, RATE = 512, 3e-3
 LARGE, GOOD = 20, 0.3  # voxels and IoU of candidates that a third of each batch has at least: most are small and bad

@@ -22,12 +22,12 @@ from stages.core.models.segmenter.network import OFFSET_UNIT, Prediction, Segmen
 from stages.core.models.segmenter.segment import load_segmenter
 from stages.core.models.segmenter.voxels import VOXEL, unique_cells
 from stages.core.scene.files import replacing
+from stages.lab.clutter.examples import read_example
 from stages.lab.training.segmenter_data import (
     Targets,
     augmented,
     find_examples,
     joined,
-    read_example,
     targets,
     with_pairs,
 )

@@ -10,10 +10,11 @@ import torch
 
 from stages.core.models.segmenter.segment import load_segmenter, object_ids
 from stages.core.scene.scene_ply import read_scene
+from stages.lab.clutter.examples import read_example
 from stages.lab.clutter.noise_model import Degradation, observed
 from stages.lab.clutter.scenes import ClutterOptions, Shelf, make_scene, run
 from stages.lab.training import train_segmenter
-from stages.lab.training.segmenter_data import read_example, targets
+from stages.lab.training.segmenter_data import targets
 
 pytest.importorskip("mujoco")
 PERFECT = Degradation(
@@ -78,6 +79,10 @@ def test_files_of_scenes_are_kept_and_trained_on(tmp_path: Path):
     list(run(tmp_path / "noisy", ClutterOptions(count=1, photos=4, size=96, first=6, observations=1)))
     example = read_example(tmp_path / "noisy" / "0006" / "observed_0.safetensors")
     assert len(example.surfels) == len(example.labels) > 1000
+
+    list(run(tmp_path / "exact", ClutterOptions(count=1, photos=4, size=96, first=6, exact=True)))
+    exact = read_example(tmp_path / "exact" / "0006" / "observed_exact.safetensors")
+    assert exact.labels.min() == 0 and exact.labels.max() == len(truth.objects)
 
     weights = tmp_path / "w.safetensors"
     training = train_segmenter.SegmenterTraining(

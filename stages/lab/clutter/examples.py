@@ -1,0 +1,45 @@
+"""Labelled surfels of a reconstruction: what the segmentation network is trained on, and their files."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from jaxtyping import Int
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from stages.core.models.segmenter.surfels import scene_surfels
+from stages.core.models.segmenter.voxels import ScenePoints
+from stages.core.scene.files import replacing
+from stages.core.scene.scene import Scene
+from stages.lab.clutter.reconstruction import true_labels
+
+
+@dataclass(frozen=True)
+class Example:
+    """ScenePoints of a reconstruction and the true object of each: 0 surface, 1... objects, -1 floaters."""
+
+    surfels: ScenePoints
+    labels: Int[Tensor, "n"]
+
+
+def labelled(made: Scene, truth: Scene) -> Example:
+    """Surfels of the reconstruction `made`, with the labels of the true scene."""
+    surfels, index, _ = scene_surfels(made)
+    return Example(surfels, true_labels(made, truth)[index])
+
+
+def write_example(path: Path, example: Example) -> None:
+    """A file of an example (.safetensors), in half precision."""
+    table = {name: getattr(example.surfels, name).half().contiguous() for name in ScenePoints.__dataclass_fields__}
+    with replacing(path) as part:
+        save_file({**table, "labels": example.labels.short()}, part)
+
+
+def read_example(path: Path) -> Example:
+    """An example of a file, in single precision."""
+    table = load_file(path)
+    labels = table.pop("labels").to(torch.int64)
+    return Example(ScenePoints(**{name: table[name].float() for name in ScenePoints.__dataclass_fields__}), labels)

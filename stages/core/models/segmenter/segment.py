@@ -27,7 +27,7 @@ from stages.core.scene.scene import Scene
 WEIGHTS = Path(__file__).parent / "segmenter.safetensors"
 MAX_VOXELS = 80_000  # nearest to the focus
 MAX_BASE_HEIGHT = 0.4  # of an object's lowest points above the surface [camera distance]
-OBJECT_COST = 0.3  # least IoU that a candidate must be expected to have; chosen on simulated scenes
+OBJECT_COST = 0.4  # least IoU that a candidate must be expected to have; chosen on simulated scenes
 MIN_GAUSSIANS = 30  # of an object
 MAX_OVERLAP = 0.25  # of two objects, of the smaller
 

@@ -35,6 +35,12 @@ def compiles_for_cpu() -> bool:
     return bool(wp.is_cpu_available())
 
 
+def kernel_device(tensor: torch.Tensor) -> torch.device:
+    """Where kernels for a tensor run: on its device, or on a GPU where none can be compiled for the CPU."""
+    possible = tensor.is_cuda or compiles_for_cpu() or not torch.cuda.is_available()
+    return tensor.device if possible else torch.device("cuda")
+
+
 def view(tensor: torch.Tensor, dtype=None) -> wp.array:
     """Wrap a tensor as a Warp array over the same memory (no copy, no gradient), for a kernel on its device.
 

@@ -12,7 +12,7 @@ import warp as wp
 from torch import Tensor
 
 from stages.core.geometry.rotations import matrix, nearest_rotation, quaternion
-from stages.core.kernels.interop import device_of, launch, view
+from stages.core.kernels.interop import device_of, kernel_device, launch, view
 from stages.core.kernels.threads import run_parallel
 
 
@@ -127,6 +127,10 @@ def skin_gaussians(
     index (n, j): keypoints of each Gaussian, int32, -1 for none; weight (n, j); rest, displacement (p, 3) [m] and
     displacement gradient (p, 3, 3) of the keypoints.
     """
+    where = kernel_device(means)
+    if where != means.device:
+        given = (index, weight, rest, displacement, gradient, means, quats, scales)
+        return tuple(x.to(means.device) for x in skin_gaussians(*(t.to(where) for t in given)))
     n, device = len(means), device_of(means)
     out = [torch.empty_like(means), torch.empty_like(quats), torch.empty_like(scales), means.new_empty(n, 3, 3)]
     inputs = [

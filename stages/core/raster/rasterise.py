@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from stages.core.geometry.harmonics import degree_of
-from stages.core.kernels.interop import compiles_for_cpu
+from stages.core.kernels.interop import kernel_device
 from stages.core.kernels.splat.binning import Bins, bin_splats
 from stages.core.kernels.splat.compositing import composite, dominant_splats
 from stages.core.kernels.splat.projection import pack_camera, project
@@ -123,7 +123,7 @@ def visibility(
 
 def _drawable(g: Gaussians) -> Gaussians:
     """The Gaussians on their device, or on a GPU where no kernel can be compiled for the CPU."""
-    return g if g.means.is_cuda or compiles_for_cpu() or not torch.cuda.is_available() else g.to("cuda")
+    return g.to(kernel_device(g.means))
 
 
 class _View(NamedTuple):

@@ -9,10 +9,10 @@ import torch
 
 from stages.core.geometry.cameras import intrinsics, look_at
 from stages.core.geometry.harmonics import rgb_to_sh
+from stages.core.kernels import interop
 from stages.core.kernels.splat.binning import depth_order_reference
 from stages.core.kernels.splat.compositing import composite_reference
 from stages.core.kernels.splat.projection import pack_camera, project_reference
-from stages.core.raster import rasterise as rasteriser
 from stages.core.raster.rasterise import rasterise, rasterise_features, visibility
 from stages.core.scene.gaussians import Gaussians
 from tests.conftest import random_gaussians, ring
@@ -173,7 +173,7 @@ def test_a_gpu_draws_where_no_kernel_can_be_compiled_for_the_cpu(monkeypatch):
         return shot.rgb.detach(), leaf.grad, features, shot.absgrad, *visibility(g.to(home), *one)
 
     expected = drawn("cuda")
-    monkeypatch.setattr(rasteriser, "compiles_for_cpu", lambda: False)
+    monkeypatch.setattr(interop, "compiles_for_cpu", lambda: False)
     for ours, theirs in zip(drawn("cpu"), expected, strict=True):
         assert ours.device.type == "cpu" and torch.equal(ours, theirs.cpu())
 

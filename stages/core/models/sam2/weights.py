@@ -86,7 +86,11 @@ def _config(kind: type, file: Path):
         data, _ = kind.get_config_dict(str(file))
         if data.get("model_type") != kind.model_type:
             raise ValueError(f"model_type {data.get('model_type')!r} instead of {kind.model_type!r}")
-        return kind.from_dict(data)
+        # transformers 5.17 reads the settings of the decoder as those of the prompt encoder
+        from transformers.models.sam2_video.configuration_sam2_video import Sam2VideoMaskDecoderConfig
+
+        decoder = Sam2VideoMaskDecoderConfig(**(data.get("mask_decoder_config") or {}))
+        return kind.from_dict({**data, "mask_decoder_config": decoder})
     except Exception as error:  # each release of transformers raises other types
         raise InputError(f"{file}: does not describe SAM 2.1 ({' '.join(str(error).split())[:120]}); use the one "
                          f"published with the weights, as in {SOURCE.repository}") from error  # fmt: skip

@@ -11,6 +11,7 @@ WIDTH = 128  # of the tokens; the published 256 also splits object pointers into
 def config(**changes):
     """Configuration of the tiny model with `changes`."""
     from transformers import Sam2VideoConfig
+    from transformers.models.sam2_video.configuration_sam2_video import Sam2VideoMaskDecoderConfig
 
     backbone = {
         "model_type": "sam2_hiera_det_model", "hidden_size": 8, "image_size": [SIDE, SIDE],
@@ -22,7 +23,7 @@ def config(**changes):
         "model_type": "sam2_vision_model", "backbone_config": backbone, "backbone_channel_list": [64, 32, 16, 8],
         "backbone_feature_sizes": [[SIDE // d] * 2 for d in (4, 8, 16)], "fpn_hidden_size": WIDTH,
     }  # fmt: skip
-    decoder = {"hidden_size": WIDTH, "mlp_dim": 32, "num_attention_heads": 2, "iou_head_hidden_dim": 32}
+    decoder = Sam2VideoMaskDecoderConfig(hidden_size=WIDTH, mlp_dim=32, num_attention_heads=2, iou_head_hidden_dim=32)
     return Sam2VideoConfig(**{
         "vision_config": vision, "prompt_encoder_config": {"hidden_size": WIDTH, "image_size": SIDE},
         "mask_decoder_config": decoder, "image_size": SIDE, "num_maskmem": 3, "max_object_pointers_in_encoder": 5,

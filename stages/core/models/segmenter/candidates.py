@@ -13,12 +13,14 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from stages.core.geometry.neighbours import knn
 from stages.core.models.segmenter.merge_tree import MergeTree, merge_tree
 from stages.core.models.segmenter.network import Level, Prediction, Segmenter
 from stages.core.models.segmenter.voxels import VOXEL, VoxelGrid
 
 MAX_SURFACE = 0.5  # probability of surface, up to which a voxel may be of an object
 MIN_VOXELS = 6  # of a candidate
+LINK_REACH, LINKS = 3.0, 8  # voxels and nearest voxels, within which links cross gaps of sparse Gaussians
 NO_PARENT = -6.0  # log odds of the merge above a root
 SMALL = 0.003  # of logarithms of distances [camera distance]
 
@@ -44,23 +46,25 @@ class Candidates:
 
 @torch.no_grad()
 def find_candidates(grid: VoxelGrid, levels: list[Level], found: Prediction, model: Segmenter) -> Candidates:
-    """The merge tree of the voxels that may be of an object, by the affinities of adjacent ones."""
+    """The merge tree of the voxels that may be of an object, by the affinities of those close to each other."""
     log_chance = found.logits.log_softmax(1)
     chance = log_chance.exp()
     voxels = torch.nonzero(chance[:, 0] < MAX_SURFACE)[:, 0]
-    pairs = adjacent_pairs(levels[0].neighbours, voxels)
+    adjacent = adjacent_pairs(levels[0].neighbours, voxels)
+    pairs = torch.cat([adjacent, nearby_pairs(grid.points, voxels)]).sort(1).values.unique(dim=0)
     odds = model.affinity(found, grid.points, pairs).double().numpy()
     number = torch.full((len(grid),), -1)
     number[voxels] = torch.arange(len(voxels))
     edges = number[pairs].numpy()
     tree = merge_tree(len(voxels), edges, odds)
     degree = np.stack([sum(np.bincount(end, w, len(voxels)) for end in edges.T) for w in (odds, np.ones(len(odds)))], 1)
-    occupied = (levels[0].neighbours[voxels] < len(grid)).sum(1).numpy() - 1
+    occupied = (levels[0].neighbours[voxels] < len(grid)).sum(1) - 1
+    surface = occupied - torch.bincount(adjacent.flatten(), None, len(grid))[voxels]
     offsets, points = found.offsets[voxels], grid.points[voxels]
     centres = points + offsets
     columns = [torch.ones(len(voxels), 1), chance[voxels], points, points**2, centres, centres**2,
                offsets.norm(dim=1, keepdim=True), log_chance[voxels]]  # fmt: skip
-    leaves = np.concatenate([torch.cat(columns, 1).double().numpy(), degree, (occupied - degree[:, 1])[:, None]], 1)
+    leaves = np.concatenate([torch.cat(columns, 1).double().numpy(), degree, surface[:, None].numpy()], 1)
     corners = torch.cat([points, -points], 1).double().numpy()
     return Candidates(voxels, tree, torch.from_numpy(_features(tree, leaves, corners)).float())
 
@@ -73,6 +77,16 @@ def adjacent_pairs(neighbours: Int[Tensor, "v 27"], voxels: Int[Tensor, "m"]) ->
     i, k = torch.nonzero(neighbours[:, :13] < count, as_tuple=True)
     pairs = torch.stack([i, neighbours[i, k]], 1)
     return pairs[inside[pairs].all(1)]
+
+
+def nearby_pairs(points: Float[Tensor, "v 3"], voxels: Int[Tensor, "m"]) -> Int[Tensor, "e 2"]:
+    """Pairs of voxels among `voxels` with their LINKS nearest within LINK_REACH."""
+    if not len(voxels):
+        return torch.zeros(0, 2, dtype=torch.int64)
+    distance, index = knn(points[voxels], points[voxels], min(LINKS + 1, len(voxels)))
+    i, k = torch.nonzero(distance < LINK_REACH * VOXEL, as_tuple=True)
+    pairs = torch.stack([voxels[i], voxels[index[i, k]]], 1)
+    return pairs[pairs[:, 0] != pairs[:, 1]]
 
 
 def _features(tree: MergeTree, leaves: np.ndarray, corners: np.ndarray) -> np.ndarray:

@@ -27,7 +27,8 @@ from stages.core.scene.scene import Scene
 WEIGHTS = Path(__file__).parent / "segmenter.safetensors"
 MAX_VOXELS = 80_000  # nearest to the focus
 MAX_BASE_HEIGHT = 0.4  # of an object's lowest points above the surface [camera distance]
-OBJECT_COST = 0.4  # least IoU that a candidate must be expected to have; chosen on simulated scenes
+OBJECT_COST = 0.3  # least IoU that a candidate must be expected to have; chosen on simulated scenes
+SIZE_POWER = 0.5  # weight of n surfels: n**SIZE_POWER. 0 prefers parts, 1 merged objects; chosen on simulated scenes
 MIN_GAUSSIANS = 30  # of an object
 MAX_OVERLAP = 0.25  # of two objects, of the smaller
 
@@ -100,7 +101,7 @@ class Segmentation:
     """The best choice of objects at one scale."""
 
     labels: Int[Tensor, "n"]  # of surfels: row of `gains`, -1 for none
-    gains: Float[Tensor, "k"]  # expected IoU less OBJECT_COST
+    gains: Float[Tensor, "k"]  # expected IoU less OBJECT_COST, weighted by size
     sizes: Int[Tensor, "k"]  # surfels
     chance: Float[Tensor, "n 3"]  # of the classes; NaN beyond MAX_VOXELS
 
@@ -108,7 +109,9 @@ class Segmentation:
 def find_at(surfels: ScenePoints, scale: float, model: Segmenter, options: SegmenterOptions) -> Segmentation:
     """Objects among the surfels enlarged by `scale`.
 
-    They are the disjoint candidates with the largest sum of expected IoU, less OBJECT_COST for each.
+    They are the disjoint candidates with the largest sum of expected IoU less OBJECT_COST, weighted by size. Weighted
+    by surfels this is the segmentation covering of Arbelaez et al. 2011, "Contour detection and hierarchical
+    image segmentation"; without weights two parts of an object, each half as good, count as much as the object.
     """
     grid, near = voxelise(surfels.enlarged(scale)), torch.ones(len(surfels), dtype=torch.bool)
     if len(grid) > MAX_VOXELS:
@@ -118,7 +121,9 @@ def find_at(surfels: ScenePoints, scale: float, model: Segmenter, options: Segme
     levels = pyramid(grid.cells, len(model.config["widths"]))
     found = model(grid.features, levels)
     candidates = find_candidates(grid, levels, found, model)
-    gain = model.score(candidates.features).sigmoid() - OBJECT_COST
+    inside = torch.bincount(grid.owner, minlength=len(grid))[candidates.voxels]  # surfels of each leaf
+    weight = torch.from_numpy(candidates.tree.sums(inside[:, None].numpy())[:, 0]) ** SIZE_POWER
+    gain = weight * (model.score(candidates.features).sigmoid() - OBJECT_COST)
     usable = (candidates.sizes > MIN_VOXELS - 0.5) & (candidates.extents >= scale * options.min_size)
     nodes = candidates.tree.best(torch.where(usable, gain, -1.0).double().numpy())
     own = torch.full((len(grid),), -1)

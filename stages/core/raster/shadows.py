@@ -28,7 +28,8 @@ from stages.core.scene.gaussians import Gaussians
 GAMMA = 2.2  # of the colours; irradiance is linear
 MAX_BLOCKED = 0.999  # by one sphere; the product over those of an object is no denormal number
 MIN_EFFECT = 0.01  # objects that block less of the sky are left out
-CHUNK = 2**15  # pairs of a Gaussian and a sphere at a time: they fit into the cache
+CHUNK = 2**15  # pairs of a Gaussian and a sphere at a time on a CPU: they fit into the cache
+GPU_CHUNK = 2**24  # on a GPU, where each chunk is some twenty launches
 
 
 @dataclass(frozen=True)
@@ -68,12 +69,12 @@ def blocked(
     points: Float[Tensor, "n 3"], ids: Int[Tensor, "n"], spheres: Spheres, light: Light
 ) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
     """The fractions 1 - V of the sky and of the lamp that the spheres block at points of objects `ids`."""
-    logs = points.new_zeros(len(points), 2)
+    logs, pairs = points.new_zeros(len(points), 2), GPU_CHUNK if points.is_cuda else CHUNK
     for id in spheres.object_id.unique().tolist():
         own = spheres.object_id == id
         c, r, w = spheres.centres[own], spheres.radii[own], float(spheres.weights[own][0])
         rows = (_reached(points, c, r, light) & (ids != id)).nonzero()[:, 0]
-        for part in rows.split(max(1, CHUNK // len(c))):
+        for part in rows.split(max(1, pairs // len(c))):
             logs[part] += w * _visibility(points[part], c, r, light).log()
     return tuple((1 - logs.exp()).unbind(1))
 

@@ -209,7 +209,9 @@ def open_video(path: Path) -> Any:
     must_exist(path, "a video")
     av = import_av(path)
     try:
-        file = av.open(str(path), metadata_errors="replace")
+        # titles and comments may be in any encoding; PyAV 19 has no such argument, and never fails on them
+        options = {"metadata_errors": "replace"} if int(av.__version__.split(".")[0]) < 19 else {}
+        file = av.open(str(path), **options)
     except (av.FFmpegError, OSError, ValueError) as error:
         raise InputError(f"{path}: is not a video that can be read") from error
     if not file.streams.video:

@@ -225,7 +225,7 @@ def test_arrows_of_forces_start_at_the_object_while_they_act(tmp_path, open_page
     page = open_page(path)
     page.evaluate("player.play(false); player.seek(0)")
     page.select_option("#view", label="00.png")
-    drawn = "document.querySelector('#overlay path').getAttribute('d')"
+    drawn = "(document.querySelector('#overlay path').getAttribute('d') ?? '')"  # no attribute before the first image
     until(page, f"{drawn}.length > 0")
     x, y = (float(v) for v in page.evaluate(drawn).split(" ")[0].removeprefix("M").split(","))
     until(page, "!player.changed && !player.busy")

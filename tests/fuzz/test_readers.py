@@ -17,12 +17,12 @@ from stages.lab.fuzz.cases import GOOD, Examples, result_of, run_here
 from stages.lab.fuzz.kinds import KINDS, Kind, write_trajectory
 
 
-def test_two_thousand_damaged_files(tmp_path):
-    counts, failures = run_here(tmp_path, 2000)
+def test_a_thousand_damaged_files(tmp_path):
+    counts, failures = run_here(tmp_path, 1000)
     assert not failures, "\n".join(failures[:5])
-    assert sum(counts.values()) == 2000 and {result for _, result in counts} == set(GOOD)
+    assert sum(counts.values()) == 1000 and {result for _, result in counts} == set(GOOD)
     assert {kind for kind, _ in counts} == {kind.name for kind in KINDS}
-    assert sum(counts[kind.name, "right"] for kind in KINDS) > 200  # the changes are not all fatal
+    assert sum(counts[kind.name, "right"] for kind in KINDS) > 100  # the changes are not all fatal
 
 
 @pytest.fixture(scope="module")

@@ -31,7 +31,7 @@ CONTROLS, CONTROL_SHIFT = 8, 0.7  # fits of displaced shadows, by this [mean dis
 STEPS = 6  # of the robust fit
 
 
-def estimate_light(scene: Scene, spheres: Spheres) -> Light:
+def estimate_light(scene: Scene, spheres: Spheres, device: str = "cpu") -> Light:
     """The light whose shadows of the objects at rest explain the colours of the surface best; OVERHEAD where none does.
 
     Log colours of the cells of the supporting surface around the objects are fitted by the surface's own colour and the
@@ -40,7 +40,8 @@ def estimate_light(scene: Scene, spheres: Spheres) -> Light:
     support = find_support(scene)
     if support is None:
         return OVERHEAD
-    points, colours = _surface_cells(scene, support, spheres)
+    points, colours = (t.to(device) for t in _surface_cells(scene, support, spheres))
+    spheres = spheres.to(device)
     beneath = _hidden(points, spheres, OVERHEAD)[:, 0] > BENEATH
     if int((~beneath).sum()) < MIN_CELLS:
         return OVERHEAD
@@ -61,7 +62,7 @@ def estimate_light(scene: Scene, spheres: Spheres) -> Light:
 
 def _hidden(points: Tensor, spheres: Spheres, light: Light) -> Float[Tensor, "n 2"]:
     """Fractions of the sky and of the lamp that are blocked at points of the surface."""
-    return torch.stack(blocked(points, torch.zeros(len(points), dtype=torch.int64), spheres, light), 1)
+    return torch.stack(blocked(points, torch.zeros(len(points)).to(spheres.object_id), spheres, light), 1)
 
 
 def _surface_cells(

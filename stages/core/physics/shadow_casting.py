@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -10,7 +10,7 @@ from torch import Tensor
 
 from stages.core.physics.lighting import estimate_light
 from stages.core.physics.occluders import Occluders, make_occluders
-from stages.core.raster.shadows import Light, Spheres, irradiance, shaded, shadow_factor
+from stages.core.raster.shadows import Light, irradiance, shaded, shadow_factor
 from stages.core.scene.gaussians import Gaussians
 from stages.core.scene.scene import Scene
 from stages.core.scene.trajectory import Keypoints
@@ -27,29 +27,26 @@ class ShadowCaster:
         """The irradiance that the colours of the Gaussians at rest hold."""
         if not self.light.in_colours:
             return torch.ones_like(rest.opacities)
-        return irradiance(rest.means, rest.object_id, _on(self.occluders.rest, rest), self.light)
+        return irradiance(rest.means, rest.object_id, self.occluders.rest.to(rest.means.device), self.light)
 
     def shade(self, g: Gaussians, positions: Float[Tensor, "p 3"], at_rest: Float[Tensor, "n"]) -> Gaussians:
         """The Gaussians of a frame with these keypoint positions; `at_rest` is what `rest_irradiance` gives."""
         spheres = self.occluders.moved(positions, fade=not self.light.in_colours)
         if bool((spheres.centres == self.occluders.rest.centres).all()):
             return g
-        now = irradiance(g.means, g.object_id, _on(spheres, g), self.light)
+        now = irradiance(g.means, g.object_id, spheres.to(g.means.device), self.light)
         return shaded(g, shadow_factor(now, at_rest, self.light))
 
 
-def find_shadows(scene: Scene, keypoints: Keypoints, other_background: bool = False) -> ShadowCaster | None:
-    """Light and occluders of a scene at rest; None without objects that move.
+def find_shadows(
+    scene: Scene, keypoints: Keypoints, other_background: bool = False, device: str = "cpu"
+) -> ShadowCaster | None:
+    """Light and occluders of a scene at rest, on the CPU; None without objects that move.
 
-    Where the background is not that of the photos, its colours hold no shadows.
+    Where the background is not that of the photos, its colours hold no shadows. `device`: where the light is fitted.
     """
     occluders = make_occluders(scene, keypoints)
     if occluders is None:
         return None
-    light = estimate_light(scene, occluders.rest)
+    light = estimate_light(scene, occluders.rest, device)
     return ShadowCaster(replace(light, in_colours=light.in_colours and not other_background), occluders)
-
-
-def _on(spheres: Spheres, g: Gaussians) -> Spheres:
-    """The spheres on the device of the Gaussians."""
-    return Spheres(*(getattr(spheres, field.name).to(g.means.device) for field in fields(Spheres)))

@@ -16,7 +16,7 @@ E at rest (in linear light). web/shaders.js of the player computes the same.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import torch
 from jaxtyping import Float, Int
@@ -55,6 +55,10 @@ class Spheres:
     radii: Float[Tensor, "m"]
     weights: Float[Tensor, "m"]  # w, the same for all spheres of an object
     object_id: Int[Tensor, "m"]
+
+    def to(self, device: torch.device | str) -> Spheres:
+        """The spheres on a device."""
+        return Spheres(*(getattr(self, field.name).to(device) for field in fields(self)))
 
 
 def irradiance(

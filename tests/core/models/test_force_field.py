@@ -228,7 +228,7 @@ def test_friction_ignores_velocities_that_alternate_between_steps():
 
 
 @torch.no_grad()
-@pytest.mark.parametrize("depth", [0.0, 2.0])
+@pytest.mark.parametrize("depth", [pytest.param(0.0, marks=pytest.mark.slow), 2.0])
 def test_penetration_of_floor_and_walls_is_resolved(depth):
     initial = overlapping_objects(1, 2)
     low = initial.points.amin((1, 2, 3))[:, None, None, None]
@@ -263,7 +263,7 @@ def test_floor_pushes_only_and_less_on_separating_points():
     assert torch.equal(separating[..., :2], a[..., :2])  # tangential components are unchanged
 
 
-@pytest.mark.parametrize("steps", [200, pytest.param(1000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("steps", [pytest.param(1000, marks=pytest.mark.slow), 100])
 @torch.no_grad()
 def test_long_rollouts_stay_finite_and_bounded_in_size(steps):
     initial = overlapping_objects(1, 2, 10)

@@ -73,6 +73,7 @@ def dropped(model):
         return initial, model.rollout(initial, 1000)
 
 
+@pytest.mark.slow
 def test_a_thousand_steps_stay_finite_and_above_the_floor(dropped):
     initial, points = dropped
     assert points.isfinite().all()
@@ -95,6 +96,7 @@ def test_stacked_objects_come_to_rest(model, n):
     assert_comes_to_rest(*motion(initial, points))
 
 
+@pytest.mark.slow
 def test_unseen_shapes_come_to_rest(dropped):
     assert_comes_to_rest(*motion(*dropped))
 
@@ -137,6 +139,7 @@ def test_collision_of_free_bodies_conserves_momentum(model, E):
     assert (momentum - momentum[0]).norm(dim=-1).max() < 0.01 * scale
 
 
+@pytest.mark.slow
 def test_rounding_weights_to_16_bits_changes_rollouts_by_millimetres(model, dropped):
     """Weights perturbed by the rounding error of 16 bits; root mean square difference over 0.8 s."""
     initial, points = dropped

@@ -56,6 +56,14 @@ def test_light_is_found_in_the_shadows_of_the_photos(world):
     assert light.beneath < 0.5  # beneath the block it is dark, as in this world nothing was filled in
 
 
+def test_light_is_the_same_on_every_device(world, device):
+    scene, _, caster = world
+    light = estimate_light(scene, caster.occluders.rest, device)
+    assert light.direction == caster.light.direction and light.spread == caster.light.spread
+    found, expected = ((x.sky, x.lamp, x.beneath) for x in (light, caster.light))
+    assert found == pytest.approx(expected, abs=1e-3)
+
+
 def test_without_shadows_in_the_photos_the_light_is_overhead(world):
     """Texture alone is not taken for shadows; neither is a scene without a floor."""
     _, _, caster = world

@@ -40,7 +40,7 @@ def made(name: str) -> Gaussians:
     return replace(g, means=g.means / side, scales=g.scales / side)
 
 
-SLOW = ("cloth", "miku", "pillow", "rope")  # take seconds each
+SLOW = ("bowl", "cloth", "miku", "phone", "pillow", "rope")  # take seconds each
 NAMES = [pytest.param(name, marks=pytest.mark.slow) if name in SLOW else name for name in OBJECTS]
 CLOSED = {
     "ball": 0.4,

@@ -78,6 +78,7 @@ def test_touching_objects_touch_without_overlap(index):
     assert between[:3, 3:].min() > 0.9 * MIN_GAP  # the two groups are separate
 
 
+@pytest.mark.slow
 def test_scenes_are_deterministic():
     one, two = (tabletop("touching", 1).gaussians for _ in range(2))
     assert torch.equal(one.means, two.means) and torch.equal(one.object_id, two.object_id)

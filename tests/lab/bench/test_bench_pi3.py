@@ -29,7 +29,7 @@ def test_naive_attention_equals_fused_attention():
     torch.testing.assert_close(model(views()).points, ours.points, rtol=1e-4, atol=1e-5)
 
 
-@pytest.mark.parametrize("splats", [False, True])
+@pytest.mark.parametrize("splats", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_report_has_a_line_per_view_count_and_baseline(splats, device):
     lines = list(run(Pi3BenchOptions(device, (1, 2), 28, 1, splats), TINY_SPLAT))
     assert len(lines) == 6 and lines[1].startswith("Pi3Splat" if splats else "Pi3,")

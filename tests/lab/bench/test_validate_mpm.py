@@ -28,6 +28,7 @@ def test_cantilever_sag_matches_timoshenko():
     assert measured == pytest.approx(exact, rel=0.05)
 
 
+@pytest.mark.slow
 def test_sand_column_spread_matches_experiments():
     # measured over many grains by Lube et al.; 6 cells in the radius, and the front is thinner than a cell
     measured, published = validate.sand_column_spread(0.6)

@@ -65,6 +65,7 @@ def test_offsets_lead_to_the_middle_of_the_object(scene):
             assert float((ends - ends[0]).abs().max()) < 1e-5
 
 
+@pytest.mark.slow
 def test_files_of_scenes_are_kept_and_trained_on(tmp_path: Path):
     """Photos with cameras that a reconstruction can use; observations; weights that load and label a scene."""
     options = ClutterOptions(count=1, photos=4, size=96, first=6)

@@ -134,6 +134,7 @@ def check_network_inputs(model, image, views, text):
     assert not torch.equal(text[0, 0], text[1, 0]) and torch.equal(text[:, 0], text[:, VIEWS])
 
 
+@pytest.mark.slow
 def test_generation_is_deterministic_for_a_seed(model):
     image = torch.rand(SIDE, SIDE, 3, generator=torch.Generator().manual_seed(0))
     first, repeated, other = (model.generate(image, 10.0, "a duck", seed) for seed in (0, 0, 1))

@@ -63,12 +63,12 @@ class Skinning:
         determines the rotation about the axis when the neighbours lie on a line.
         """
         relative = (u[self._neighbours_of] - u[:, None]).mT @ self._ad  # A - M
-        whole = self._object_rotations(u)[self._body]
-        R = nearest_rotation(self._M + relative + 0.3 * self._ridge * whole)
-        one = torch.eye(3)
-        G = (relative + self._ridge * (R - one)) @ self._inverse
-        still = (relative == 0).flatten(1).all(1)
-        return torch.where(still[:, None, None], 0.0, G)
+        moved = (relative != 0).flatten(1).any(1).nonzero()[:, 0]  # mostly few: what rests keeps its place exactly
+        ridge, relative = self._ridge[moved], relative[moved]
+        whole = self._object_rotations(u)[self._body[moved]]
+        R = nearest_rotation(self._M[moved] + relative + 0.3 * ridge * whole)
+        G = (relative + ridge * (R - torch.eye(3))) @ self._inverse[moved]
+        return torch.zeros_like(self._M).index_copy(0, moved, G)
 
     def _object_rotations(self, u: Float[Tensor, "p 3"]) -> Float[Tensor, "o 3 3"]:
         return fit_rotations(self.rest, self.rest + u, self._body)

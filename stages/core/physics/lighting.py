@@ -40,19 +40,21 @@ def estimate_light(scene: Scene, spheres: Spheres, device: str = "cpu") -> Light
     support = find_support(scene)
     if support is None:
         return OVERHEAD
-    points, colours = (t.to(device) for t in _surface_cells(scene, support, spheres))
+    points, colours = (t.to(device) for t in _surface_cells(scene, support, spheres.to("cpu")))
     spheres = spheres.to(device)
     beneath = _hidden(points, spheres, OVERHEAD)[:, 0] > BENEATH
     if int((~beneath).sum()) < MIN_CELLS:
         return OVERHEAD
     brightness, terms = _surface_terms(points, colours)
     seen, y, A = points[~beneath], brightness[~beneath], terms[~beneath]
-    best = max((_fit(A, _hidden(seen, spheres, lamp), y, lamp) for lamp in _lamps()), key=lambda fit: fit.odds)
+    lamps = _lamps()
+    best = _best_fit(A, torch.stack([_hidden(seen, spheres, lamp) for lamp in lamps]), y, lamps)
     reach = float((seen[:, :2] - seen[:, :2].mean(0)).norm(dim=1).mean())
     turns = [2 * math.pi * i / CONTROLS for i in range(CONTROLS)]
     shifts = [CONTROL_SHIFT * reach * seen.new_tensor([math.cos(a), math.sin(a), 0.0]) for a in turns]
-    chance = max(_fit(A, _hidden(seen + shift, spheres, best.light), y, best.light).odds for shift in shifts)
-    if best.odds < max(MIN_ODDS, MIN_RATIO * chance):
+    displaced = torch.stack([_hidden(seen + shift, spheres, best.light) for shift in shifts])
+    chance = _best_fit(A, displaced, y, [best.light] * CONTROLS)
+    if best.odds < max(MIN_ODDS, MIN_RATIO * chance.odds):
         return OVERHEAD
     if not bool(beneath.any()):
         return best.light
@@ -117,30 +119,37 @@ class _Fit(NamedTuple):
     own: Tensor  # coefficients of the surface's own colour
 
 
-def _fit(A: Tensor, hidden: Tensor, y: Tensor, lamp: Light) -> _Fit:
-    """The light of this lamp's direction and spread that explains log colours y best, by Tukey's biweight.
+def _best_fit(A: Tensor, hidden: Float[Tensor, "l n 2"], y: Tensor, lamps: list[Light]) -> _Fit:
+    """The lamp that explains log colours y best, with its strength and that of the sky, by Tukey's biweight.
 
-    y = A a + log(1 - hidden s) is linearised about the shares s of sky and lamp in every step.
+    y = A a + log(1 - hidden s) is linearised about the shares s of sky and lamp in every step, for all lamps at once.
     """
-    A, y, hidden = A.double(), y.double(), hidden.double()
-    weights, s = torch.ones_like(y), y.new_zeros(2)
+    A, y, hidden = A.double().expand(len(lamps), -1, -1), y.double().expand(len(lamps), -1), hidden.double()
+    weights, s = torch.ones_like(y), y.new_zeros(len(lamps), 2)
     for _ in range(STEPS):
-        left = (1 - hidden @ s).clamp_min(1 - MAX_SHARE)
-        J = -hidden / left[:, None]
-        s = _solve(torch.cat([A, J], 1), y - left.log() + J @ s, weights)[-2:].clamp_min(0)
-        s = s * min(1.0, MAX_SHARE / max(float(s.sum()), 1e-9))
-        shadow = (1 - hidden @ s).log()
+        left = (1 - _times(hidden, s)).clamp_min(1 - MAX_SHARE)
+        J = -hidden / left[..., None]
+        s = _solve(torch.cat([A, J], 2), y - left.log() + _times(J, s), weights)[:, -2:].clamp_min(0)
+        s = s * (MAX_SHARE / s.sum(1, keepdim=True).clamp_min(1e-9)).clamp_max(1)
+        shadow = (1 - _times(hidden, s)).log()
         own = _solve(A, y - shadow, weights)
-        residual = y - shadow - A @ own
-        scale = (1.4826 * residual.abs().median()).clamp_min(MIN_NOISE)
+        residual = y - shadow - _times(A, own)
+        scale = (1.4826 * residual.abs().median(1, keepdim=True).values).clamp_min(MIN_NOISE)
         weights = (1 - (residual / (4.685 * scale)) ** 2).clamp_min(0) ** 2
-    sky, strength = s.tolist()
-    before, after = (float((weights * r**2).sum()) for r in (y - A @ _solve(A, y, weights), residual))
-    odds = before / max(after, 1e-12) - 1 if sky + strength >= MIN_SHARE else 0.0
-    return _Fit(odds, replace(lamp, sky=sky, lamp=strength), own)
+    without = y - _times(A, _solve(A, y, weights))
+    before, after = ((weights * r**2).sum(1) for r in (without, residual))
+    odds = torch.where(s.sum(1) >= MIN_SHARE, before / after.clamp_min(1e-12) - 1, 0)
+    i = int(odds.argmax())
+    sky, strength = s[i].tolist()
+    return _Fit(float(odds[i]), replace(lamps[i], sky=sky, lamp=strength), own[i])
 
 
-def _solve(A: Tensor, y: Tensor, weights: Tensor) -> Tensor:
+def _times(A: Float[Tensor, "l n k"], x: Float[Tensor, "l k"]) -> Float[Tensor, "l n"]:
+    return (A @ x[..., None])[..., 0]
+
+
+def _solve(A: Float[Tensor, "l n k"], y: Float[Tensor, "l n"], weights: Float[Tensor, "l n"]) -> Float[Tensor, "l k"]:
     """Weighted least squares with a small ridge."""
-    normal = A.mT @ (weights[:, None] * A)
-    return torch.linalg.solve(normal + 1e-6 * weights.sum() * torch.eye(A.shape[1]).to(A), A.mT @ (weights * y))
+    normal = A.mT @ (weights[..., None] * A)
+    ridge = 1e-6 * weights.sum(1)[:, None, None] * torch.eye(A.shape[2]).to(A)
+    return torch.linalg.solve(normal + ridge, (A.mT @ (weights * y)[..., None]))[..., 0]

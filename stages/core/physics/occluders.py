@@ -29,32 +29,41 @@ _VIEWS = torch.nn.functional.normalize(torch.tensor(  # axes, face and space dia
 
 
 class Occluders:
-    """The spheres at rest, with their binding to keypoints."""
+    """The spheres at rest, with their binding to keypoints; those of frames are on `device`."""
 
-    def __init__(self, rest: Spheres, keypoints: Keypoints):
-        self.rest, m = rest, len(rest.radii)
+    def __init__(self, rest: Spheres, keypoints: Keypoints, device: str = "cpu"):
         self.binding = _bind(rest, keypoints)
+        self.rest, m = rest.to(device), len(rest.radii)
         carriers = Gaussians(
             rest.centres, torch.tensor([[1.0, 0, 0, 0]]).repeat(m, 1), rest.radii[:, None].repeat(1, 3), torch.ones(m),
             torch.zeros(m, 1, 3), rest.object_id,
         )  # fmt: skip
-        self._skinning = Skinning(carriers, self.binding, keypoints)
-        self._objects = [rest.object_id == id for id in rest.object_id.unique()]
+        self._skinning = Skinning(carriers.to(device), self.binding, keypoints)
+        _, self._object = self.rest.object_id.unique(return_inverse=True)
+        self._radius = self._per_object(self._from_middle() + self.rest.radii, "amax")
 
     def moved(self, positions: Float[Tensor, "p 3"], fade: bool = False) -> Spheres:
         """The spheres for these keypoint positions [scene units].
 
         With `fade` an object blocks nothing at rest, and more the farther it moved, up to its radius.
         """
-        centres, weights = self._skinning(positions).means, self.rest.weights.clone()
-        for own in self._objects if fade else ():
-            at = self.rest.centres[own]
-            radius = ((at - at.mean(0)).norm(dim=1) + self.rest.radii[own]).max()
-            weights[own] *= ((centres[own] - at).norm(dim=1).mean() / radius).clamp_max(1)
+        centres, weights = self._skinning(positions).means, self.rest.weights
+        if fade:
+            distance = self._per_object((centres - self.rest.centres).norm(dim=1), "mean")
+            weights = weights * (distance / self._radius).clamp_max(1)
         return replace(self.rest, centres=centres, weights=weights)
 
+    def _from_middle(self) -> Float[Tensor, "m"]:
+        middle = torch.stack([self._per_object(axis, "mean") for axis in self.rest.centres.unbind(1)], 1)
+        return (self.rest.centres - middle).norm(dim=1)
 
-def make_occluders(scene: Scene, keypoints: Keypoints) -> Occluders | None:
+    def _per_object(self, values: Float[Tensor, "m"], reduce: str) -> Float[Tensor, "m"]:
+        """The mean or maximum over the spheres of an object, at each of its spheres."""
+        count = int(self._object.max()) + 1
+        return values.new_zeros(count).scatter_reduce(0, self._object, values, reduce, include_self=False)[self._object]
+
+
+def make_occluders(scene: Scene, keypoints: Keypoints, device: str = "cpu") -> Occluders | None:
     """Spheres of the objects that have keypoints; None where there are none, or where their bodies are unusable."""
     moving = [o for o in scene.objects if bool((keypoints.object_id == o.id).any())]
     count = min(SPHERES, MAX_SPHERES // max(len(moving), 1))
@@ -71,7 +80,7 @@ def make_occluders(scene: Scene, keypoints: Keypoints) -> Occluders | None:
         if o in moving and bool(own.any()):
             parts.append(_spheres(bodies.x[own].float(), bodies.volume[own].float(), bodies.spacing, count, o.id))
     fields = zip(*((s.centres, s.radii, s.weights, s.object_id) for s in parts), strict=True)
-    return Occluders(Spheres(*(torch.cat(f) for f in fields)), keypoints) if parts else None
+    return Occluders(Spheres(*(torch.cat(f) for f in fields)), keypoints, device) if parts else None
 
 
 def _spheres(x: Tensor, volume: Tensor, spacing: float, count: int, id: int) -> Spheres:

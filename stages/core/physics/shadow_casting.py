@@ -27,25 +27,25 @@ class ShadowCaster:
         """The irradiance that the colours of the Gaussians at rest hold."""
         if not self.light.in_colours:
             return torch.ones_like(rest.opacities)
-        return irradiance(rest.means, rest.object_id, self.occluders.rest.to(rest.means.device), self.light)
+        return irradiance(rest.means, rest.object_id, self.occluders.rest, self.light)
 
     def shade(self, g: Gaussians, positions: Float[Tensor, "p 3"], at_rest: Float[Tensor, "n"]) -> Gaussians:
         """The Gaussians of a frame with these keypoint positions; `at_rest` is what `rest_irradiance` gives."""
         spheres = self.occluders.moved(positions, fade=not self.light.in_colours)
         if bool((spheres.centres == self.occluders.rest.centres).all()):
             return g
-        now = irradiance(g.means, g.object_id, spheres.to(g.means.device), self.light)
+        now = irradiance(g.means, g.object_id, spheres, self.light)
         return shaded(g, shadow_factor(now, at_rest, self.light))
 
 
 def find_shadows(
     scene: Scene, keypoints: Keypoints, other_background: bool = False, device: str = "cpu"
 ) -> ShadowCaster | None:
-    """Light and occluders of a scene at rest, on the CPU; None without objects that move.
+    """Light and occluders of a scene at rest, for frames on `device`; None without objects that move.
 
-    Where the background is not that of the photos, its colours hold no shadows. `device`: where the light is fitted.
+    Where the background is not that of the photos, its colours hold no shadows.
     """
-    occluders = make_occluders(scene, keypoints)
+    occluders = make_occluders(scene, keypoints, device)
     if occluders is None:
         return None
     light = estimate_light(scene, occluders.rest, device)

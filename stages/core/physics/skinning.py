@@ -21,22 +21,22 @@ class Skinning:
     """Linear blend skinning with deformation gradients, prepared once for many frames."""
 
     def __init__(self, gaussians: Gaussians, binding: Binding, keypoints: Keypoints):
-        self.gaussians, self.rest = gaussians, keypoints.rest.float().contiguous()
-        device = gaussians.means.device  # binding and keypoints stay on their device, usually the CPU
+        device = gaussians.means.device  # everything a frame needs; binding and keypoints stay on their own
+        self.gaussians, self.rest = gaussians, keypoints.rest.float().contiguous().to(device)
         moving = (binding.index >= 0).any(1).nonzero()[:, 0]
         self._index = binding.index[moving].int().contiguous().to(device)
         self._weight = binding.weight[moving].float().contiguous().to(device)
         self._moving = moving.to(device)
         self._part = gaussians[self._moving]
-        self._neighbours_of = keypoint_neighbours(keypoints)
+        self._neighbours_of = keypoint_neighbours(keypoints).to(device)
         d = self.rest[self._neighbours_of] - self.rest[:, None]
         a = 1 / (d.square().sum(-1) + 1e-12 + d.square().sum(-1).mean(1, keepdim=True))
-        a[self._neighbours_of == torch.arange(len(d))[:, None]] = 0  # padding with the keypoint itself
+        a[self._neighbours_of == torch.arange(len(d), device=device)[:, None]] = 0  # padding with the keypoint itself
         self._d, self._ad = d, a[..., None] * d
         self._M = self._ad.mT @ d  # (p, 3, 3) sum a d d^T
         self._ridge = RIDGE / 3 * self._M.diagonal(dim1=1, dim2=2).sum(-1)[:, None, None].clamp_min(1e-12)
-        self._inverse = torch.linalg.inv(self._M.double() + self._ridge * torch.eye(3)).float()
-        _, self._body = keypoints.object_id.unique(return_inverse=True)
+        self._inverse = torch.linalg.inv(self._M.double() + self._ridge * torch.eye(3, device=device)).float()
+        _, self._body = keypoints.object_id.to(device).unique(return_inverse=True)
 
     def __call__(self, positions: Float[Tensor, "p 3"]) -> Gaussians:
         """The Gaussians for these keypoint positions [scene units]."""
@@ -46,7 +46,7 @@ class Skinning:
             return g
         G = self._gradients(u)
         means, quats, scales, R = skin_gaussians(
-            self._index, self._weight, *(t.to(part.means.device) for t in (self.rest, u, G)),
+            self._index, self._weight, self.rest, u, G,
             part.means.contiguous(), part.quats.contiguous(), part.scales.contiguous(),
         )  # fmt: skip
         moved = {"means": means, "quats": quats, "scales": scales, "sh": _rotate_sh(part.sh, R)}
@@ -67,7 +67,7 @@ class Skinning:
         ridge, relative = self._ridge[moved], relative[moved]
         whole = self._object_rotations(u)[self._body[moved]]
         R = nearest_rotation(self._M[moved] + relative + 0.3 * ridge * whole)
-        G = (relative + ridge * (R - torch.eye(3))) @ self._inverse[moved]
+        G = (relative + ridge * (R - torch.eye(3, device=R.device))) @ self._inverse[moved]
         return torch.zeros_like(self._M).index_copy(0, moved, G)
 
     def _object_rotations(self, u: Float[Tensor, "p 3"]) -> Float[Tensor, "o 3 3"]:

@@ -19,14 +19,14 @@ from __future__ import annotations
 from dataclasses import dataclass, fields, replace
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from stages.core.geometry.harmonics import C0
 from stages.core.scene.gaussians import Gaussians
 
 GAMMA = 2.2  # of the colours; irradiance is linear
-MAX_BLOCKED = 0.999  # by one sphere; the product over those of an object is no denormal number
+MAX_BLOCKED = 0.999  # by one sphere: its logarithm is finite
 MIN_EFFECT = 0.01  # objects that block less of the sky are left out
 CHUNK = 2**15  # pairs of a Gaussian and a sphere at a time on a CPU: they fit into the cache
 GPU_CHUNK = 2**24  # on a GPU, where each chunk is some twenty launches
@@ -73,30 +73,37 @@ def blocked(
     points: Float[Tensor, "n 3"], ids: Int[Tensor, "n"], spheres: Spheres, light: Light
 ) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
     """The fractions 1 - V of the sky and of the lamp that the spheres block at points of objects `ids`."""
-    logs, pairs = points.new_zeros(len(points), 2), GPU_CHUNK if points.is_cuda else CHUNK
-    for id in spheres.object_id.unique().tolist():
-        own = spheres.object_id == id
-        c, r, w = spheres.centres[own], spheres.radii[own], float(spheres.weights[own][0])
-        rows = (_reached(points, c, r, light) & (ids != id)).nonzero()[:, 0]
-        for part in rows.split(max(1, pairs // len(c))):
-            logs[part] += w * _visibility(points[part], c, r, light).log()
+    objects, of = spheres.object_id.unique(return_inverse=True)
+    shades = _reached(points, spheres, of, len(objects), light) & (ids[:, None] != objects)
+    if points.is_cuda:  # all objects in one pass: what counts is the number of launches
+        parts = zip(*(t.split(max(1, GPU_CHUNK // max(len(of), 1))) for t in (points, shades)), strict=True)
+        logs = torch.cat([_log_visibility(x, spheres, light, near[:, of]) for x, near in parts])
+    else:  # only the points that an object reaches
+        logs = points.new_zeros(len(points), 2)
+        for i in range(len(objects)):
+            own = Spheres(*(getattr(spheres, field.name)[of == i] for field in fields(spheres)))
+            for part in shades[:, i].nonzero()[:, 0].split(max(1, CHUNK // len(own.radii))):
+                logs[part] += _log_visibility(points[part], own, light)
     return tuple((1 - logs.exp()).unbind(1))
 
 
-def _reached(points: Tensor, c: Tensor, r: Tensor, light: Light) -> Tensor:
-    """Whether an object of spheres (c, r) blocks a part of the sky or of the lamp that matters."""
-    middle = c.mean(0)
-    R = float(((c - middle).norm(dim=1) + r).max())
-    v = middle - points
-    d = v.norm(dim=1)
-    along = v @ v.new_tensor(light.direction)
-    across = (d * d - along * along).clamp_min(0).sqrt()
-    sky = R * R * (v[:, 2] + R) > MIN_EFFECT * d**3
+def _reached(points: Tensor, spheres: Spheres, of: Tensor, count: int, light: Light) -> Bool[Tensor, "n o"]:
+    """Whether each object blocks a part of the sky or of the lamp that matters."""
+    size = torch.zeros(count).to(points).index_add(0, of, torch.ones_like(spheres.radii))
+    middle = torch.zeros(count, 3).to(points).index_add(0, of, spheres.centres) / size[:, None]
+    R = torch.zeros(count).to(points)
+    R = R.scatter_reduce(0, of, (spheres.centres - middle[of]).norm(dim=1) + spheres.radii, "amax")
+    x, y, z = (a - b[:, None] for a, b in zip(middle.unbind(1), points.unbind(1), strict=True))
+    square = x * x + y * y + z * z
+    along = light.direction[0] * x + light.direction[1] * y + light.direction[2] * z
+    across = (square - along * along).clamp_min(0).sqrt()
+    sky = R * R * (z + R) > MIN_EFFECT * square**1.5
     return sky | ((along > -R) & (across < R + light.spread * (along + R)))
 
 
-def _visibility(points: Tensor, c: Tensor, r: Tensor, light: Light) -> Tensor:
-    """Product over spheres of 1 - o, for the sky and for the lamp (n, 2)."""
+def _log_visibility(points: Tensor, spheres: Spheres, light: Light, counts: Tensor | None = None) -> Tensor:
+    """Logarithm of V for the sky and for the lamp (n, 2); `counts` (n, m): which spheres shade which point."""
+    c, r = spheres.centres, spheres.radii
     x, y, z = (a - b[:, None] for a, b in zip(c.unbind(1), points.unbind(1), strict=True))
     square = (x * x + y * y + z * z).clamp_min(1e-12)
     sky = (z * square.rsqrt()).clamp_min(0) * (r * r / square).clamp_max(1)
@@ -105,7 +112,8 @@ def _visibility(points: Tensor, c: Tensor, r: Tensor, light: Light) -> Tensor:
     disc = (light.spread * along).clamp_min(1e-6)  # radius of the lamp, seen at the distance of the sphere
     edge = ((across - (disc - r).abs()) / (2 * torch.minimum(disc, r))).clamp(0, 1)
     lamp = (r / disc).square().clamp_max(1) * (1 - edge * edge * (3 - 2 * edge)) * (along > 0)
-    return torch.stack([(1 - o.clamp_max(MAX_BLOCKED)).prod(1) for o in (sky, lamp)], 1)
+    weights = spheres.weights if counts is None else spheres.weights * counts
+    return torch.stack([((1 - o.clamp_max(MAX_BLOCKED)).log() * weights).sum(1) for o in (sky, lamp)], 1)
 
 
 def shadow_factor(now: Float[Tensor, "n"], rest: Float[Tensor, "n"], light: Light) -> Float[Tensor, "n"]:

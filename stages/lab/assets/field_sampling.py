@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from stages.core.geometry.harmonics import C0, basis
@@ -41,6 +41,13 @@ def gaussians_from_parts(
     the nearest part. `skin` is half the width of the band that is sampled, less than half the thinnest wall.
     Deterministic.
     """
+    return normalise_size(sample_parts(parts, half, n, smooth, skin)[0])
+
+
+def sample_parts(
+    parts: list[PaintedPart], half: Vec, n: int, smooth: float = 0.0, skin: float = 0.008
+) -> tuple[Gaussians, Int[Tensor, "n"]]:
+    """The same before normalisation, and the part that each Gaussian is nearest to."""
     field = union(*(part.field for part in parts), smooth=smooth)
     surface = relax_points(field, sample_surface(field, half, n, skin))
     p = surface.points
@@ -52,7 +59,7 @@ def gaussians_from_parts(
             rgb[own], gloss[own] = part.paint(p[own]), part.gloss
     light = diffuse_light(surface) * ambient_occlusion(field, surface)
     flat = to_gaussians(surface, rgb * light[:, None], 1, width=0.62)
-    return normalise_size(replace(flat, sh=add_highlight(flat.sh, surface.normals, gloss)))
+    return replace(flat, sh=add_highlight(flat.sh, surface.normals, gloss)), owner
 
 
 def normalise_size(g: Gaussians) -> Gaussians:

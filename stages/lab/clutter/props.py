@@ -12,13 +12,20 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from stages.core.geometry.rotations import matrix
 from stages.core.geometry.similarity import Similarity
 from stages.core.scene.gaussians import Gaussians, transformed
-from stages.lab.assets.field_sampling import ambient_occlusion, diffuse_light, sample_surface
+from stages.lab.assets.field_sampling import (
+    PaintedPart,
+    ambient_occlusion,
+    diffuse_light,
+    normalise_size,
+    sample_parts,
+    sample_surface,
+)
 from stages.lab.assets.paint import overlay
 from stages.lab.assets.random_shapes import FAMILIES
 from stages.lab.assets.shapes import noise, single_threaded, to_gaussians
@@ -49,6 +56,7 @@ class Prop:
     sizes: tuple[float, float]  # smallest and largest longest side
     flat: bool = False  # lies on its largest side, which is level here
     clutter: bool = False  # too thin to be an object that a user would move
+    parts: Int[Tensor, "n"] | None = None  # convex part of each Gaussian; None: its convex hull stands for the object
 
 
 def _book(rng: Rng) -> Field:
@@ -135,7 +143,7 @@ def make_prop(seed: int) -> Prop:
         light = diffuse_light(surface) * ambient_occlusion(field, surface)
         rgb = random_paint(rng)(surface.points) * light[:, None]
         g = to_gaussians(surface, rgb, 1, width=0.75)
-    return Prop(f"{name}{seed}", _unit(g), sizes, flat, name in CLUTTER)
+    return Prop(f"{name}{seed}", normalise_size(g), sizes, flat, name in CLUTTER)
 
 
 def mesh_prop(files: Sequence[Path], name: str) -> Prop:
@@ -147,10 +155,11 @@ def mesh_prop(files: Sequence[Path], name: str) -> Prop:
     return Prop(name, g, (0.1, 0.4), bool(sides[2] < 0.15 * sides.max()))
 
 
-def _unit(g: Gaussians) -> Gaussians:
-    low, high = g.means.amin(0), g.means.amax(0)
-    side = (high - low).max()
-    return replace(g, means=(g.means - (low + high) / 2) / side, scales=g.scales / side)
+def composite_prop(name: str, parts: list[PaintedPart], sizes: tuple[float, float], flat: bool = False) -> Prop:
+    """An object of several convex parts."""
+    with single_threaded():
+        g, owner = sample_parts(parts, (EXTENT,) * 3, POINTS, smooth=0.004, skin=SKIN)
+    return Prop(name, normalise_size(replace(g, sh=g.sh[:, :1])), sizes, flat, parts=owner)
 
 
 def random_colour(rng: Rng) -> Float[Tensor, "3"]:

@@ -30,6 +30,7 @@ from stages.core.scene.scene import Scene, SceneObject
 from stages.core.scene.scene_ply import write_scene
 from stages.lab.assets.mesh_files import find_objects, object_name
 from stages.lab.assets.objects import OBJECTS, make_object
+from stages.lab.clutter.composites import make_composite
 from stages.lab.clutter.examples import Example, labelled, write_example
 from stages.lab.clutter.noise_model import observed
 from stages.lab.clutter.props import Prop, make_prop, mesh_prop, placed, random_turn, recoloured
@@ -44,6 +45,7 @@ TRUTH, PHOTOS, TRANSFORMS, OBSERVED = "truth.ply", "photos", "transforms.json", 
 RECONSTRUCTED, EXACT = "reconstruction", "exact"  # in place of the number of an observation
 DATA_SET_POINTS = 15_000  # Gaussians kept of one of the ten objects
 SHADOW_CELL = 0.01  # [camera distance]
+COMPOSITE_SHARE = 0.45  # of the things from code that have several parts
 MESH_SHARE = 0.4  # of the things of a scene that are meshes, where there are any
 
 
@@ -83,6 +85,8 @@ class Shelf:
                 self.meshes.remove(files)
         if rng.uniform() < 0.12:
             return _data_set_object(str(rng.choice(list(OBJECTS))))
+        if rng.uniform() < COMPOSITE_SHARE:
+            return _composite(1000 * self.seed + int(rng.integers(PROPS)))
         return _shape(1000 * self.seed + int(rng.integers(PROPS)))
 
 
@@ -94,6 +98,11 @@ def _mesh(files: tuple[Path, ...]) -> Prop:
 @cache
 def _shape(seed: int) -> Prop:
     return make_prop(seed)
+
+
+@cache
+def _composite(seed: int) -> Prop:
+    return make_composite(seed)
 
 
 @cache
@@ -189,7 +198,7 @@ def _arranged(furniture: Furniture, props: list[Prop], size: list[float], rng: R
         base = max(around) if rng.uniform() < 0.75 or area is not furniture.areas[0] else z
         height[cell] = base + high[2] - low[2]
         turned.append((props[i], g))
-        hulls.append(hull_corners(g.means, 0.002))
+        hulls.append(_hulls(props[i], g))
         starts.append((x, y, base + 0.012 - low[2]))
     if not turned:
         return []
@@ -201,6 +210,14 @@ def _arranged(furniture: Furniture, props: list[Prop], size: list[float], rng: R
             R = matrix(torch.from_numpy(q)[None].float())[0]
             out.append((prop, placed(g, 1.0, R, torch.from_numpy(t).float())))
     return out
+
+
+def _hulls(prop: Prop, g: Gaussians) -> list[np.ndarray]:
+    """Corners of the convex parts of a placed prop; parts of a few Gaussians are left out."""
+    if prop.parts is None:
+        return [hull_corners(g.means, 0.002)]
+    count = torch.bincount(prop.parts)
+    return [hull_corners(g.means[prop.parts == k], 0.002) for k in torch.nonzero(count >= 20)[:, 0].tolist()]
 
 
 def _shaded(furniture: Gaussians, things: list[Gaussians], rng: Rng) -> Gaussians:

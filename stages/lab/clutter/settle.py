@@ -31,10 +31,10 @@ def hull_corners(points: Tensor, margin: float) -> np.ndarray:
     return out[ConvexHull(out).vertices]
 
 
-def settle(furniture: Furniture, hulls: list[np.ndarray], starts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def settle(furniture: Furniture, hulls: list[list[np.ndarray]], starts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Translations (n, 3) and quaternions (n, 4; w x y z) of bodies after they fell from `starts` (n, 3).
 
-    `hulls` are corners (m, 3) about the body's origin.
+    `hulls` are the corners (m, 3) of the convex parts of each body, about its origin.
     """
     import mujoco  # slow to import
 
@@ -45,13 +45,15 @@ def settle(furniture: Furniture, hulls: list[np.ndarray], starts: np.ndarray) ->
         spec.worldbody.add_geom(
             type=mujoco.mjtGeom.mjGEOM_BOX, size=block.half, pos=block.centre, friction=[0.8, 0.01, 0.001]
         )
-    for i, (corners, start) in enumerate(zip(hulls, starts, strict=True)):
-        spec.add_mesh(
-            name=f"m{i}", uservert=corners.ravel().tolist(), inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
-        )
+    for i, (parts, start) in enumerate(zip(hulls, starts, strict=True)):
         body = spec.worldbody.add_body(pos=start)
         body.add_freejoint()
-        body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=f"m{i}", density=DENSITY, friction=[0.7, 0.02, 0.01])
+        for k, corners in enumerate(parts):
+            name = f"m{i}-{k}"
+            spec.add_mesh(
+                name=name, uservert=corners.ravel().tolist(), inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
+            )
+            body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, density=DENSITY, friction=[0.7, 0.02, 0.01])
     model = spec.compile()
     data = mujoco.MjData(model)
     for _ in range(int(DURATION / TIMESTEP)):

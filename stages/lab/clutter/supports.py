@@ -18,6 +18,7 @@ from stages.lab.clutter.props import random_colour
 
 Rng = np.random.Generator
 SPACING, COARSE = 0.008, 0.035  # of Gaussians on faces near the objects, and on the room [camera distance]
+MAT_SHARE = 0.5  # of scenes with mats
 PATTERNS = (paint.oak, paint.marble, paint.gingham, paint.flagstones, paint.worn_paint, paint.slate, paint.azulejo,
             paint.felt, paint.wooden_floor, paint.dark_floor, paint.bricks, paint.garden)  # fmt: skip
 
@@ -76,7 +77,17 @@ def random_furniture(rng: Rng) -> Furniture:
                    *(StaticBox((s * wide, y, high / 2), (0.01, deep, high / 2)) for s in (-1, 1))]  # fmt: skip
         areas.append((-wide + 0.05, wide - 0.05, y - deep + 0.04, y + deep - 0.04, high + 0.01))
         sides = (1.1 * math.pi, 1.9 * math.pi) if sides[0] == 0 else sides
+    for _ in range(rng.integers(1, 5) if rng.uniform() < MAT_SHARE else 0):
+        blocks.append(_mat(used, rng))
     return Furniture(blocks, areas, sides)
+
+
+def _mat(used: tuple[float, float], rng: Rng) -> StaticBox:
+    """A mat, cloth or sheet of paper that lies on the surface: too thin to be an object."""
+    half = (rng.uniform(0.06, 0.4), rng.uniform(0.06, 0.3), math.exp(rng.uniform(math.log(0.0005), math.log(0.003))))
+    x, y = rng.uniform(-used[0], used[0]), rng.uniform(-used[1], used[1])
+    half = (min(half[0], abs(used[0] - abs(x)) + 0.05), min(half[1], abs(used[1] - abs(y)) + 0.05), half[2])
+    return StaticBox((x, y, half[2]), half, SPACING)
 
 
 def painted(furniture: Furniture, rng: Rng) -> Gaussians:

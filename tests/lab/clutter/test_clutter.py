@@ -10,6 +10,7 @@ import torch
 
 from stages.core.models.segmenter.segment import load_segmenter, object_ids
 from stages.core.scene.scene_ply import read_scene
+from stages.lab.clutter.composites import make_composite
 from stages.lab.clutter.examples import read_example
 from stages.lab.clutter.noise_model import Degradation, observed
 from stages.lab.clutter.scenes import ClutterOptions, Shelf, make_scene, run
@@ -93,3 +94,32 @@ def test_files_of_scenes_are_kept_and_trained_on(tmp_path: Path):
     assert "1 files" in lines[0]
     ids = object_ids(truth, load_segmenter(weights), None)
     assert len(ids) == len(truth.gaussians)
+
+
+def test_objects_of_several_parts_rest_in_each_others_concavities():
+    """A block under the bridge of another object touches neither of its posts: parts collide, not convex hulls."""
+    from stages.lab.clutter.settle import settle
+    from stages.lab.clutter.supports import Furniture, StaticBox
+
+    def block(centre, half):
+        signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+        return np.array(centre) + signs * np.array(half)
+
+    bridge = [block((0, 0, 0.1), (0.2, 0.05, 0.02)), *(block((s * 0.18, 0, 0.04), (0.02, 0.05, 0.04)) for s in (-1, 1))]
+    floor = Furniture([StaticBox((0, 0, -0.05), (1, 1, 0.05))], [(-1, 1, -1, 1, 0)], (0, 6.28))
+    at, _ = settle(floor, [bridge, [block((0, 0, 0.02), (0.05, 0.05, 0.02))]], np.array([[0, 0, 0.01], [0, 0, 0.01]]))
+    assert np.abs(at[:, 2]).max() < 0.005
+    assert np.abs(at[1, :2]).max() < 0.01
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_composites_are_one_normalised_object_of_several_parts(seed):
+    prop = make_composite(seed)
+    g = prop.gaussians
+    low, high = g.means.amin(0), g.means.amax(0)
+    assert abs(float((high - low).max()) - 1) < 1e-5
+    assert float((low + high).abs().max()) < 1e-5
+    assert len(prop.parts) == len(g)
+    assert len(prop.parts.unique()) >= 3
+    again = make_composite(seed)
+    assert torch.equal(again.gaussians.means, g.means) and torch.equal(again.parts, prop.parts)

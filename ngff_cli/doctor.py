@@ -1,6 +1,7 @@
 """Check of the installation: each finding with its remedy."""
 
 import json
+import os
 import platform
 import shutil
 import textwrap
@@ -69,7 +70,8 @@ def _installed(package: str) -> str | None:
 def _torch() -> Finding:
     import torch
 
-    return Finding(True, "torch", f"{torch.__version__}, {torch.get_num_threads()} threads")
+    waiting = os.environ["OMP_WAIT_POLICY"].lower()  # set on import of `stages`
+    return Finding(True, "torch", f"{torch.__version__}, {torch.get_num_threads()} threads, {waiting} waiting")
 
 
 def _gpu() -> Finding:

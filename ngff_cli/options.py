@@ -15,7 +15,9 @@ from stages.core.errors import InputError
 SceneIn = Annotated[Path, typer.Argument(metavar="SCENE.ply", help="scene to read (.ply)", show_default=False)]
 Device = Annotated[str, typer.Option(help="auto | cpu | cuda")]
 Seed = Annotated[int, typer.Option(help="random seed; the same seed and device give the same result")]
-Threads = Annotated[int | None, typer.Option(help="CPU threads; default: all cores", show_default=False)]
+Threads = Annotated[int | None, typer.Option(
+    help="CPU threads; default: all cores. With OMP_WAIT_POLICY=ACTIVE in the environment waiting threads spin: faster "
+         "on an idle machine, slower beside other work", show_default=False)]  # fmt: skip
 AsJson = Annotated[bool, typer.Option("--json", help="print the results as JSON instead of a table")]
 SIZE_OPTIONS = ("quality", "resolution", "keypoints", "max_objects", "batch", "views", "side", "size", "particles",
                 "scenes")  # on which the memory of a command depends, the most effective first  # fmt: skip

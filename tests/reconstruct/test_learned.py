@@ -26,17 +26,8 @@ from tests.core.models.pi3.test_splat import TINY_SPLAT
 from tests.reconstruct.oracle import photos_of, true_splats, truth
 from tests.reconstruct.raycast import BLOCK, arc, write_set
 
-pytestmark = pytest.mark.usefixtures("device")
+pytestmark = pytest.mark.usefixtures("device", "one_thread")
 SIZE = (112, 84)  # multiples of the patch size, so that photos are not resized
-
-
-@pytest.fixture(autouse=True)
-def one_thread():
-    """One thread is faster for tiny tensors."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.fixture(autouse=True)

@@ -17,16 +17,7 @@ from stages.segment.stage import run
 from stages.segment.view_images import render_view, view_images
 
 pytest.importorskip("transformers")
-pytestmark = pytest.mark.usefixtures("device")
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    """For matrices this small a second thread costs more than it saves."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+pytestmark = pytest.mark.usefixtures("device", "one_thread")
 
 
 @pytest.fixture(scope="module")

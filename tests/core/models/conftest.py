@@ -1,12 +1,8 @@
-"""Run these tests on one thread: their tensors are too small for more to help."""
+"""These tests run on one thread: their tensors are too small for more to help."""
 
 import pytest
-import torch
 
 
 @pytest.fixture(autouse=True)
-def one_thread():
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+def _one_thread(one_thread):
+    """Applies the fixture to every test of the folder."""

@@ -9,14 +9,7 @@ from stages.lab.bench.pi3 import Pi3BenchOptions, measure, naive_attention, run,
 from tests.core.models.pi3.test_network import TINY, random_weights, views
 from tests.core.models.pi3.test_splat import TINY_SPLAT
 
-
-@pytest.fixture(autouse=True)
-def one_thread():
-    """Tensors are tiny here; a second thread only costs time."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @torch.no_grad()

@@ -29,15 +29,6 @@ from tests.reconstruct.oracle import truth
 from tests.reconstruct.raycast import arc, photograph, write_set
 
 
-@pytest.fixture(autouse=True)
-def one_thread():
-    """Images are tiny here; a second thread only costs time."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
-
-
 @pytest.fixture
 def folder(tmp_path):
     """One scene of two balls with eight cameras."""
@@ -47,7 +38,7 @@ def folder(tmp_path):
 
 
 QUICK = SplatterOptions(steps=20, views=2, side=28, depth="given", width=16, lr=1e-2)
-pytestmark = pytest.mark.usefixtures("device")
+pytestmark = pytest.mark.usefixtures("device", "one_thread")
 
 
 def test_held_out_views_improve_and_only_the_head_changes(folder, tmp_path):

@@ -258,7 +258,7 @@ def bench_physics(
     device: Device = "auto",
     as_json: AsJson = False,
 ) -> None:
-    """School experiments (slides, slopes, towers, rebounds, ...): each engine compared with the analytic value."""
+    """Textbook experiments (slides, slopes, towers, rebounds, ...): each engine compared with the analytic value."""
     from stages.lab.bench.physics import PhysicsBenchOptions, run
 
     chosen = {"engines": tuple(engine)} if engine else {}

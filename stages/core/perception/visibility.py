@@ -18,7 +18,7 @@ MAX_VISIBILITY_VIEWS = 24  # cameras that visibility is rendered for
 def downscaled_views(
     cameras: Cameras, max_views: int = MAX_VISIBILITY_VIEWS, side: int = MAX_VISIBILITY_SIDE
 ) -> list[tuple[Tensor, Tensor, int, int]]:
-    """(viewmat, K, width, height) of at max_views `max_views` evenly spaced cameras, images scaled down to `side`."""
+    """(viewmat, K, width, height) of at most `max_views` evenly spaced cameras, images scaled down to `side`."""
     picked = torch.linspace(0, len(cameras) - 1, min(max_views, len(cameras))).round().long().tolist()
     views = []
     for i in picked:

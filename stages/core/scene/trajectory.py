@@ -111,7 +111,7 @@ class Trajectory:
 
 
 class _ErrorDeferringFile(io.FileIO):
-    """A file that stores write errors in `error` instead of raising them, which HDF5 does not survive."""
+    """A file that stores write errors in `error` instead of raising them, since HDF5 may crash when a write fails."""
 
     error: OSError | None = None
 

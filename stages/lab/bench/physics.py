@@ -1,4 +1,4 @@
-"""Benchmark of the engines against school physics, through the path that `ngff simulate` takes."""
+"""Benchmark of the engines against textbook physics, through the path that `ngff simulate` takes."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def trajectory(run: Run, engine: str, options: PhysicsBenchOptions) -> Trajector
     with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stderr(io.StringIO()), _quiet():
         scene, materials, out = (Path(folder) / name for name in ("scene.ply", "materials.json", "traj.h5"))
         write_scene(scene, run.scene())
-        materials.write_text(json.dumps({str(i + 1): thing.material() for i, thing in enumerate(run.things)}))
+        materials.write_text(json.dumps({str(i + 1): body.material() for i, body in enumerate(run.bodies)}))
         weights = options.weights if ENGINES[engine].weights else None
         simulate(scene, out, SimulateOptions(
             engine=engine, materials=materials, quality=options.quality, keypoints=options.keypoints, weights=weights,
@@ -142,7 +142,7 @@ def markdown(facts: Mapping) -> Iterator[str]:
     """The results as a Markdown page; values that do not agree with theory are in brackets."""
     table, rows = experiments(), facts["rows"]
     engines = [name for name in ("rigid", "mpm", "ngff") if any(name in row for row in rows.values())]
-    yield "# School physics"
+    yield "# Textbook physics"
     yield ""
     yield "    ngff-lab bench physics"
     yield ""

@@ -1,4 +1,4 @@
-"""School experiments for the engines of `ngff simulate`: scene, prompts, what is measured, and its analytic value.
+"""Textbook experiments for the engines of `ngff simulate`: scene, prompts, what is measured, and its analytic value.
 
 Bodies are closed surfaces of Gaussians, as a perfect reconstruction would give them. What is measured is read from the
 trajectory alone. Tolerances are relative to `scale`: what the engines are required to reach, not what they do.
@@ -28,7 +28,7 @@ GAPS = {"rigid": (-0.03, 0.05), "mpm": (-0.1, 0.1), "ngff": (-0.03, 0.05)}  # pe
 
 
 @dataclass(frozen=True)
-class Thing:
+class Specimen:
     """A body and its material."""
 
     surface: Surface
@@ -45,13 +45,13 @@ class Thing:
 class Run:
     """A scene in metres with its floor at z = 0, and options of `ngff simulate` that are not the default."""
 
-    things: tuple[Thing, ...]
+    bodies: tuple[Specimen, ...]
     options: Mapping = field(default_factory=dict)
 
     def scene(self) -> Scene:
         """The bodies as objects 1, 2, ..."""
         parts = [to_gaussians(t.surface, torch.full((len(t.surface.points), 3), 0.5), i + 1, widest=math.inf)
-                 for i, t in enumerate(self.things)]  # fmt: skip
+                 for i, t in enumerate(self.bodies)]  # fmt: skip
         objects = tuple(SceneObject(i + 1, f"body{i + 1}") for i in range(len(parts)))
         return Scene(concatenate(parts), objects, None, 0.0, {"metres_per_unit": 1.0, "source": "made in code"})
 
@@ -81,20 +81,20 @@ def experiments() -> dict[str, Experiment]:
     return {e.name: e for group in groups for e in group()}
 
 
-def cube(side: float, x: float = 0.0, bottom: float = 0.0, **material) -> Thing:
+def cube(side: float, x: float = 0.0, bottom: float = 0.0, **material) -> Specimen:
     """A cube over (x, 0)."""
     return block((side,) * 3, (x, 0.0, bottom + side / 2), **material)
 
 
-def block(sides: tuple[float, float, float], centre: tuple[float, float, float], **material) -> Thing:
+def block(sides: tuple[float, float, float], centre: tuple[float, float, float], **material) -> Specimen:
     """An upright box; its Gaussians are a twenty-eighth of its longest side apart, or less."""
-    return Thing(box(sides, max(sides) / POINTS_ALONG if min(sides) > max(sides) / 4 else min(sides) / 7).moved(centre),
-                 **material)  # fmt: skip
+    spacing = max(sides) / POINTS_ALONG if min(sides) > max(sides) / 4 else min(sides) / 7
+    return Specimen(box(sides, spacing).moved(centre), **material)
 
 
-def ball(radius: float, centre: tuple[float, float, float], **material) -> Thing:
+def ball(radius: float, centre: tuple[float, float, float], **material) -> Specimen:
     """A ball."""
-    return Thing(ellipsoid((radius,) * 3, 1500).moved(centre), **material)
+    return Specimen(ellipsoid((radius,) * 3, 1500).moved(centre), **material)
 
 
 def tilted(surface: Surface, degrees: float) -> Surface:
@@ -184,7 +184,7 @@ def _slopes() -> Iterator[Experiment]:
         ramp = tilted(box((2.0, 0.6, 0.2), 0.025).moved((0, 0, -0.1)), degrees).moved((0, 0, 1.2))
         slider = tilted(box((0.2, 0.2, 0.1), 0.008).moved((-0.5, 0, 0.05)), degrees).moved((0, 0, 1.2))
         options = {"pin": ("1",), "friction": mu, "steps": 31}
-        yield Experiment(f"slope/{degrees}deg friction={mu:g}", (Run((Thing(ramp), Thing(slider)), options),),
+        yield Experiment(f"slope/{degrees}deg friction={mu:g}", (Run((Specimen(ramp), Specimen(slider)), options),),
                          lambda t: float(path(t, 1)[-1].norm()), pull * time**2 / 2, "distance in .6 s [m]",
                          G * math.sin(a) * time**2 / 2, SLIDES)  # fmt: skip
 
@@ -202,13 +202,13 @@ def _torques() -> Iterator[Experiment]:
     density, side, radius = 540.0, 0.3, 0.15
     mass = {"box": density * side**3, "ball": density * 4 / 3 * math.pi * radius**3}
     inertia = {"box": mass["box"] * side**2 / 6, "ball": 0.4 * mass["ball"] * radius**2}
-    things = {"box": cube(side, bottom=0.6), "ball": ball(radius, (0, 0, 0.75))}
-    for name, thing in things.items():
+    bodies = {"box": cube(side, bottom=0.6), "ball": ball(radius, (0, 0, 0.75))}
+    for name, body in bodies.items():
         options = {"gravity": 0.0, "force": (f"object=1 torque=0,0,{5 * inertia[name]:.6g} to=0.2",), "steps": 26}
-        yield Experiment(f"torque/{name}", (Run((thing,), options),), spin, 1.0, "angular speed [rad/s]", 1.0,
+        yield Experiment(f"torque/{name}", (Run((body,), options),), spin, 1.0, "angular speed [rad/s]", 1.0,
                          TOLERANCES)  # fmt: skip
         options = {"gravity": 0.0, "force": (f"object=1 force={5 * mass[name]:.6g},0,0 to=0.2",), "steps": 26}
-        yield Experiment(f"push/{name}", (Run((thing,), options),),
+        yield Experiment(f"push/{name}", (Run((body,), options),),
                          lambda t: float(path(t, 0)[-1, 0] - path(t, 0)[-2, 0]) / t.info.dt, 1.0, "speed [m/s]", 1.0,
                          TOLERANCES)  # fmt: skip
 
@@ -272,7 +272,7 @@ def _stacks() -> Iterator[Experiment]:
 
 
 def _piles() -> Iterator[Experiment]:
-    inside = Run((Thing(bowl(0.25, 0.3), E=1e7), ball(0.08, (0.0, 0.0, 0.14), loss=0.4)), {"steps": 150})
+    inside = Run((Specimen(bowl(0.25, 0.3), E=1e7), ball(0.08, (0.0, 0.0, 0.14), loss=0.4)), {"steps": 150})
     yield Experiment("pile/ball in a bowl", (inside,), lambda t: float(t.com[-1, 1, 2]) / 0.08, 0.13 / 0.08,
                      "height of its middle [radii]", 1.0, TOLERANCES)  # fmt: skip
     for count in (20, 40):

@@ -1,4 +1,4 @@
-"""School experiments: the rigid engine agrees with theory, and the bench keeps rows and writes a page."""
+"""Textbook experiments: the rigid engine agrees with theory, and the bench keeps rows and writes a page."""
 
 import json
 

@@ -256,8 +256,8 @@ def _collisions() -> Iterator[Experiment]:
 
 
 def _rebounds() -> Iterator[Experiment]:
-    for (name, thing), loss in product((("ball", ball(0.15, (0, 0, 0.15))), ("box", cube(0.3))), (0.05, 0.15, 0.4)):
-        run = Run((replace(thing, loss=loss),), {"lift": ("0.5",), "dt": 0.01, "steps": 100})
+    for (name, body), loss in product((("ball", ball(0.15, (0, 0, 0.15))), ("box", cube(0.3))), (0.05, 0.15, 0.4)):
+        run = Run((replace(body, loss=loss),), {"lift": ("0.5",), "dt": 0.01, "steps": 100})
         yield Experiment(f"rebound/{name} loss={loss:g}", (run,), lambda t: rebound(t, 0.5),
                          math.exp(-math.pi * loss / 2), "restitution", 1.0, TOLERANCES)  # fmt: skip
 

@@ -28,6 +28,7 @@ from torch import Tensor
 NEO_HOOKEAN, COROTATED, VON_MISES, SAND, SNOW = range(5)
 MIN_VOLUME_RATIO = 0.05  # smaller volume ratios (and principal stretches) are clamped in the stress
 MAX_SNOW_HARDENING = 4.0  # limit of snow's stiffness factor, so that the CFL condition holds with twice the wave speed
+MAX_STIFFENING = (1.0, 1.0, 1.0, 1.0, MAX_SNOW_HARDENING)  # largest factor on the stiffness, by model
 RESIDUAL_STRENGTH = 0.1  # minimum yield stress after softening, as a fraction of the initial one
 
 

@@ -23,7 +23,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from stages.core.kernels.mpm import grid as mpm_grid
-from stages.core.kernels.mpm.constitutive import MAX_SNOW_HARDENING, NEO_HOOKEAN, SNOW
+from stages.core.kernels.mpm.constitutive import MAX_STIFFENING, NEO_HOOKEAN
 from stages.core.kernels.mpm.transfers import KINEMATIC_MASS_FACTOR
 from stages.core.physics.colliders import Collider, as_obstacles
 from stages.core.physics.mpm.domain import MAX_NODES, Box
@@ -240,8 +240,8 @@ class Solver:
             return 0.0, 0.0
         density = (self.rows["mass"] / self.rows["volume"])[moving]
         mu, lam, eta = self.rows["stiffness"][moving].unbind(1)
-        harder = torch.where(self.rows["model"][moving] == SNOW, MAX_SNOW_HARDENING, 1.0)
-        return float((harder * (lam + 2 * mu) / density).sqrt().max()), float((eta / density).max())
+        stiffening = torch.tensor(MAX_STIFFENING, device=mu.device)[self.rows["model"][moving].long()]
+        return float((stiffening * (lam + 2 * mu) / density).sqrt().max()), float((eta / density).max())
 
 
 def max_batch_nodes(device: str) -> int:

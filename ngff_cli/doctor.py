@@ -22,6 +22,7 @@ NETWORKS = {  # command that runs a published network: its row
 }
 OPTIONAL = {  # package: (what needs it, the extra that installs it)
     "huggingface_hub": ("--download", "hub"),
+    "gsplat": ("ngff-lab bench appearance and raster", "bench"),
     **{row.package: (user, row.extra) for user, (_, row) in NETWORKS.items() if row.package},
 }
 
@@ -43,7 +44,7 @@ def check_installation() -> Iterator[Finding]:
     """Results of all checks in order: packages, GPU, codec, disk, weights of each network, optional packages."""
     detail = f"{ngff_version()}, Python {platform.python_version()}, {platform.platform(terse=True)}"
     yield Finding(True, "ngff", detail)
-    for check in (_torch, _gpu, _gsplat, _warp, _colmap, _codec, _disk):
+    for check in (_torch, _gpu, _warp, _colmap, _codec, _disk):
         yield check()
     yield from _own_weights()
     yield from _published_weights()
@@ -82,10 +83,6 @@ def _gpu() -> Finding:
     properties = torch.cuda.get_device_properties(0)
     detail = f"{properties.name}, {properties.total_memory / 2**30:.0f} GiB, CUDA {torch.version.cuda}"
     return Finding(True, "GPU", detail)
-
-
-def _gsplat() -> Finding:
-    return Finding(True, "gsplat", f"{_installed('gsplat') or 'absent'}; only benchmarks compare with it")
 
 
 def _warp() -> Finding:

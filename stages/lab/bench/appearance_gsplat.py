@@ -25,6 +25,7 @@ from stages.core.geometry.harmonics import rgb_to_sh
 from stages.core.geometry.neighbours import spacing
 from stages.core.kernels.splat.ssim import ssim
 from stages.core.scene.gaussians import Gaussians
+from stages.lab.bench.common import import_gsplat
 from stages.reconstruct.photos import Views
 
 FULL_STEPS = 30_000  # steps of the published schedule, to which these belong:
@@ -54,10 +55,9 @@ def train(
 
     `draw` replaces gsplat.rasterization in tests.
     """
-    from gsplat import DefaultStrategy, rasterization
-
+    gsplat = import_gsplat()
     torch.manual_seed(SEED)  # the strategy draws from PyTorch's own generator
-    draw, scale = draw or rasterization, steps / FULL_STEPS
+    draw, scale = draw or gsplat.rasterization, steps / FULL_STEPS
     eyes = centres(views.cameras.viewmats)
     size = 1.1 * float((eyes - eyes.mean(0)).norm(dim=1).max())
     values = initial_parameters(start, device)
@@ -67,7 +67,7 @@ def train(
         )
         for name, value in values.items()
     }
-    strategy = DefaultStrategy(**{name: max(1, int(count * scale)) for name, count in SCHEDULE.items()})
+    strategy = gsplat.DefaultStrategy(**{name: max(1, int(count * scale)) for name, count in SCHEDULE.items()})
     strategy.check_sanity(values, optimisers)
     state = strategy.initialize_state(scene_scale=size)
     photos = [image.to(device) for image in views.images]

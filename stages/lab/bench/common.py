@@ -1,4 +1,4 @@
-"""Shared by the benchmarks: name of the machine, timing that waits for the GPU, copy bandwidth, result files."""
+"""Shared by the benchmarks: name of the machine, the peer gsplat, timing with the GPU's work, result files."""
 
 from __future__ import annotations
 
@@ -9,10 +9,12 @@ import re
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from types import ModuleType
 
 import torch
 import warp as wp
 
+from stages.core.errors import MissingPackage
 from stages.core.scene.files import replacing
 
 
@@ -20,6 +22,15 @@ def machine(device: str) -> str:
     """Name of the device (or CPU and its core count) and versions of torch, warp and Python."""
     name = torch.cuda.get_device_name(device) if device != "cpu" else f"{_cpu()}, {len(os.sched_getaffinity(0))} cores"
     return f"{name}; torch {torch.__version__}, warp {wp.__version__}, python {platform.python_version()}"
+
+
+def import_gsplat() -> ModuleType:
+    """The package gsplat, which only benchmarks use; MissingPackage where it is absent."""
+    try:
+        import gsplat
+    except ImportError as error:
+        raise MissingPackage("the comparison needs gsplat: `pip install 'ngff[bench]'`") from error
+    return gsplat
 
 
 def _cpu() -> str:

@@ -15,7 +15,6 @@ from pathlib import Path
 import torch
 from torch.profiler import ProfilerActivity, profile
 
-from stages.core.errors import InputError
 from stages.core.kernels.splat.projection import TILE_SIZE, pack_camera
 from stages.core.raster.rasterise import NEAR, count_pairs, rasterise_packed
 from stages.core.scene.gaussians import Gaussians
@@ -48,11 +47,8 @@ class CudaRasterTiming:
 
 
 def run(device: str, out: Path | None, options: RasterBenchOptions) -> Iterator[str]:
-    """Yield the lines of the report; all results go to `out` as JSON."""
-    try:
-        import gsplat
-    except ImportError as error:
-        raise InputError("the comparison needs gsplat: `pip install gsplat`") from error
+    """Yield the lines of the report; all results go to `out` as JSON. Raises MissingPackage without gsplat."""
+    gsplat = bench.import_gsplat()
     yield bench.machine(device)
     rate, rows = _float32_rate(device), []
     yield f"float32 matrix product {rate / 1e12:.0f} TFLOP/s"

@@ -1,24 +1,16 @@
-"""`ngff-lab`: data generation, training, benchmarks, and a check of the installation."""
+"""`ngff-lab`: training, and a check of the installation; data.py and bench.py have its other commands."""
 
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from ngff_cli import bench
+from ngff_cli import bench, data
 from ngff_cli.options import AsJson, CommandGroup, Device, Seed, Threads, limit_threads, print_results, set_up_logging
-from stages.lab.assets.objects import ObjectsOptions
 
 app = typer.Typer(cls=CommandGroup, no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False)
 
-Groups = Annotated[str, typer.Option(help="groups of scenes, such as 3_0..3_9,4")]
-Sheet = Annotated[Path | None, typer.Option(help="contact sheet to write (.jpg)")]
 Half = Annotated[bool, typer.Option("--half", help="also store the weights in 16 bits, for the package")]
-Dx = Annotated[float, typer.Option(help="grid spacing [m]; published: 0.02")]
-ParticleSpacing = Annotated[float, typer.Option(help="spacing of particles on a surface [m]")]
-Substep = Annotated[
-    float, typer.Option(help="longest simulation time step [s], shortened for stiff light objects; published: 1e-4")
-]
 
 
 @app.callback()
@@ -37,17 +29,6 @@ def doctor(as_json: AsJson = False) -> None:
 
 
 @app.command()
-def example(
-    out: Annotated[Path, typer.Argument(metavar="FOLDER", help="folder for photos/, masks/ and the ground truth")],
-    photos: Annotated[int, typer.Option(help="number of photos")] = 26,
-) -> None:
-    """Generate the example: rendered photos of toys on a table, with true cameras, labels and motion."""
-    from stages.lab.assets.example import make_example
-
-    make_example(out, photos)
-
-
-@app.command()
 def replay(
     recording: Annotated[Path, typer.Argument(metavar="RECORDING.npz", help="run of the published MPM solver")],
     out: Annotated[Path, typer.Option("-o", "--out", help="our run to write, as RECORDING")] = Path("ours.npz"),
@@ -62,106 +43,16 @@ def replay(
 
 
 @app.command()
-def dataset(
-    out: Annotated[Path, typer.Argument(metavar="FOLDER", help="folder of the data set; existing files are kept")],
-    groups: Annotated[
-        str, typer.Option(help="groups of scenes; more_0..more_9 are further scenes of three objects")
-    ] = "3_0..3_9,4,6",
-    only: Annotated[str, typer.Option(help="parts, separated by commas: motions, scenes, mpm, initial, dynamic, "
-                                      "objects, backgrounds, scene_configs")] = "motions",
-    frames: Annotated[int, typer.Option(help="frames per scene, of 0.02 s each")] = 100,
-    keypoints: Annotated[int, typer.Option(help="keypoints per object in motions")] = 2048,
-    dx: Dx = 0.02,
-    spacing: ParticleSpacing = 0.009,
-    substep: Substep = 1e-4,
-    nudge: Annotated[
-        float, typer.Option(help="shift of each object's initial position [m]; see `statistics --against`")
-    ] = 0.0,
-    exact: Annotated[bool, typer.Option("--exact", help="bitwise identical results in every run on a GPU, in twice the "
-                                        "time; always on for mpm and dynamic")] = False,
-    views: Annotated[str, typer.Option(help="views of the videos: some of 0,4,...,96, or all")] = "all",
-    backgrounds: Annotated[
-        str, typer.Option(help="backgrounds of the videos: some of table0,...,table7, or all")
-    ] = "all",
-    resolution: Annotated[int, typer.Option(help="side of the videos [px]")] = 448,
-    shard: Annotated[str, typer.Option(help="i/n: the i-th of n equal parts of the groups")] = "1/1",
-    limit: Annotated[int, typer.Option(help="scenes of each group; 0: all")] = 0,
-    check: Annotated[bool, typer.Option("--check", help="only compare all files with their checksums")] = False,
-    ray: Annotated[str, typer.Option(help="Ray cluster: local, auto or an address. All machines need the same ngff and "
-                                     "FOLDER at the same path; each makes one group at a time")] = "",
-    device: Device = "auto",
+def fuzz(
+    out: Annotated[Path, typer.Option("-o", "--out", help="report to write (.json)")] = Path("fuzz.json"),
+    count: Annotated[int, typer.Option(help="number of damaged files")] = 10_000,
+    seed: Annotated[int, typer.Option(help="random seed of the damage")] = 0,
 ) -> None:
-    """Generate GSCollision: scenes, their motion, and videos, in the published layout."""
-    from stages.lab.dataset import generate, ray_cluster
-    from stages.lab.dataset.options import DatasetOptions
+    """Read randomly damaged files of every format, and keep those that end in anything but a clear error."""
+    from stages.lab.fuzz.campaign import run
 
-    options = DatasetOptions(
-        groups=groups, only=only, frames=frames, keypoints=keypoints, dx=dx, spacing=spacing, substep=substep,
-        nudge=nudge, exact=exact, views=views, backgrounds=backgrounds, resolution=resolution, shard=shard,
-        limit=limit, device=device,
-    )  # fmt: skip
-    if check:
-        generate.check(out)
-    elif ray:
-        ray_cluster.run(out, options, ray)
-    else:
-        generate.run(out, options)
-
-
-@app.command("import")
-def import_(
-    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="mpm/<group>/<scene> of GSCollision, with %04d.h5")],
-    out: Annotated[Path, typer.Option("-o", "--out", help="trajectory to write (.h5)")] = Path("traj.h5"),
-    scene: Annotated[Path | None, typer.Option(help="its point_cloud.ply; default: searched in scenes/<group>/<scene>/ "
-                                               "next to mpm/")] = None,
-    keypoints: Annotated[int, typer.Option(help="maximum number of keypoints per object")] = 2048,
-) -> None:
-    """Convert a published scene of GSCollision to a trajectory for `ngff render` and `ngff evaluate`."""
-    from stages.lab.dataset.importer import run
-
-    print(run(folder, out, scene, keypoints))
-
-
-@app.command()
-def statistics(
-    data: Annotated[Path, typer.Argument(metavar="FOLDER", help="data set, as `ngff-lab dataset` writes")],
-    out: Annotated[Path | None, typer.Option("-o", "--out", help="JSON file to write the results to")] = None,
-    groups: Groups = "3_0..3_9,4,6",
-    keypoints: Annotated[int, typer.Option(help="maximum number of keypoints per object")] = 512,
-    against: Annotated[Path | None, typer.Option(help="the same scenes made with --nudge: report the predictability "
-                                                 "instead")] = None,
-    sheet: Sheet = None,
-    scenes: Annotated[int, typer.Option(help="rows of the contact sheet, one scene each")] = 10,
-    device: Device = "auto",
-    as_json: AsJson = False,
-) -> None:
-    """Statistics of a data set: falls, contacts, tipping and rest of the objects; or its predictability."""
-    from stages.lab.dataset import scene_statistics, sensitivity
-    from stages.lab.dataset.scene_configs import parse_groups
-
-    def lines(path: Path | None) -> list[str]:
-        if against is not None:
-            return sensitivity.run(data, against, path, min(keypoints, 256), device)
-        return scene_statistics.run(data, path, parse_groups(groups), keypoints, device)
-
-    print_results(lines, out, as_json)
-    if sheet is not None:
-        from stages.lab.dataset.contact_sheet import SheetOptions, write_sheet
-
-        write_sheet(data, sheet, SheetOptions(groups=tuple(parse_groups(groups)), count=scenes, device=device))
-
-
-@app.command()
-def study(
-    out: Annotated[Path | None, typer.Option("-o", "--out", help="JSON file to write the results to")] = None,
-    scenes: Annotated[int, typer.Option(help="number of scenes")] = 24,
-    device: Device = "auto",
-    as_json: AsJson = False,
-) -> None:
-    """Resolution study: motion simulated at several resolutions compared with the published one."""
-    from stages.lab.dataset.resolution_study import run
-
-    print_results(lambda path: run(path, scenes, device), out, as_json)
+    for line in run(out, count, seed):
+        print(line)
 
 
 @app.command()
@@ -290,7 +181,7 @@ def clutter(
     seed: Seed = 0,
     device: Device = "auto",
 ) -> None:
-    """Generate labelled scenes of things on tables, desks, shelves and floors, to train the segmentation.
+    """Generate labelled scenes of objects on tables, desks, shelves and floors, to train the segmentation.
 
     Without options, run `ngff reconstruct NNNN/photos --cameras NNNN/transforms.json -o NNNN/scene.ply` on each scene.
     """
@@ -335,71 +226,6 @@ def train_segmenter(
         print(line, flush=True)
 
 
-@app.command()
-def objects(
-    out: Annotated[Path, typer.Argument(metavar="FOLDER", help="output folder, with one folder per object")],
-    only: Annotated[
-        str, typer.Option(help="names of the objects, such as ball,duck; default: all ten")
-    ] = ObjectsOptions.only,
-    meshes: Annotated[list[Path], typer.Option("--from", metavar="MESH", help="textured mesh (.obj .glb .ply ...), or "
-                                               "folder of meshes, to convert instead; repeatable")] = [],  # noqa: B006
-    count: Annotated[int, typer.Option(help="approximate number of Gaussians of a mesh")] = ObjectsOptions.count,
-    up: Annotated[str, typer.Option(help="up axis of a mesh: auto | x | y | z")] = ObjectsOptions.up,
-    light: Annotated[bool, typer.Option(help="bake soft light into the colours of a mesh")] = ObjectsOptions.light,
-    sheet: Sheet = None,
-) -> None:
-    """Generate the ten objects of the data set as Gaussians, or convert meshes to such objects."""
-    from stages.lab.assets.objects import run
-
-    for line in run(out, ObjectsOptions(only=only, count=count, up=up, light=light), meshes, sheet):
-        print(line, flush=True)
-
-
-@app.command()
-def backgrounds(
-    out: Annotated[Path, typer.Argument(metavar="FOLDER", help="output folder, with one folder per background")],
-    only: Annotated[str, typer.Option(help="names of the backgrounds, such as table0,table3; default: all eight")] = "",
-    sheet: Sheet = None,
-) -> None:
-    """Generate the eight tables of the data set with their surroundings as Gaussians."""
-    from stages.lab.assets.backgrounds import run
-
-    for line in run(out, only, sheet):
-        print(line, flush=True)
-
-
-@app.command()
-def heldout(
-    out: Annotated[Path, typer.Argument(metavar="FOLDER", help="folder of a data set; existing files are kept")],
-    meshes: Annotated[list[Path], typer.Option("--from", metavar="MESH", help="mesh (.obj .glb .ply ...), or folder of "
-                                               "meshes, that replaces the eight shapes; repeatable")] = [],  # noqa: B006
-    scenes: Annotated[int, typer.Option(help="number of scenes")] = 100,
-    objects: Annotated[int, typer.Option(help="objects per scene")] = 3,
-    frames: Annotated[int, typer.Option(help="frames per scene, of 0.02 s each")] = 100,
-    keypoints: Annotated[int, typer.Option(help="keypoints per object")] = 2048,
-    dx: Dx = 0.02,
-    spacing: ParticleSpacing = 0.009,
-    substep: Substep = 1e-4,
-    size: Annotated[float, typer.Option(help="longest side of a mesh [m]")] = 0.5,
-    shapes: Annotated[
-        int, typer.Option(help="number of random objects for training, written as the group varied; 0: none")
-    ] = 0,
-    solid: Annotated[bool, typer.Option("--solid", help="fill the random objects: the group solid")] = False,
-    rotations: Annotated[
-        int, typer.Option(help="random rotations of the ten objects for training, written as the group turned; 0: none")
-    ] = 0,
-    device: Device = "auto",
-) -> None:
-    """Simulate scenes of other objects than the ten: by default of eight that are never used in training."""
-    from stages.lab.dataset.heldout import HeldoutOptions, run
-
-    options = HeldoutOptions(
-        scenes=scenes, objects=objects, frames=frames, keypoints=keypoints, dx=dx, spacing=spacing, substep=substep,
-        size=size, shapes=shapes, solid=solid, rotations=rotations, device=device,
-    )  # fmt: skip
-    print(run(out, options, meshes))
-
-
 @app.command("estimate-materials")
 def estimate_materials(
     video: Annotated[Path, typer.Argument(metavar="VIDEO.mp4", help="video of moving objects")],
@@ -422,6 +248,7 @@ def estimate_materials(
         print(line)
 
 
+app.add_typer(data.app)
 app.add_typer(bench.app, name="bench")
 
 

@@ -37,7 +37,7 @@ def all_commands(app, prefix=()):
     for command in app.registered_commands:
         yield (*prefix, command.name or command.callback.__name__), command.callback
     for group in app.registered_groups:
-        yield from all_commands(group.typer_instance, (*prefix, group.name))
+        yield from all_commands(group.typer_instance, (*prefix, *filter(None, [group.name])))
 
 
 COMMANDS = {" ".join(words): callback for words, callback in

@@ -66,6 +66,12 @@ def rotation_between(a: Float[Tensor, "3"], b: Float[Tensor, "3"]) -> Float[Tens
     return matrix(q)
 
 
+def rotation_angle(R: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b"]:
+    """Angle of a rotation, 0 to 180 [degrees]."""
+    cosine = (R.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2
+    return torch.rad2deg(torch.acos(cosine.clamp(-1, 1)))
+
+
 def nearest_rotation(M: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3 3"]:
     """The rotation nearest to M in the Frobenius norm (polar factor, determinant +1)."""
     U, _, Vt = torch.linalg.svd(M)

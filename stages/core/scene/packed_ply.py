@@ -7,8 +7,9 @@ standard 3D-Gaussian PLY stores.
 import numpy as np
 from plyfile import PlyData
 
+from stages.core.geometry.harmonics import C0
+
 CHUNK = 256
-C0 = 0.28209479177387814
 
 
 def is_packed(ply: PlyData) -> bool:

@@ -41,17 +41,13 @@ from stages.lab.bench.dynamics_baselines import (
     shared_scenes,
 )
 from stages.lab.bench.dynamics_report import PUBLISHED, report, table
+from stages.lab.dataset import sensitivity
 from stages.lab.dataset.keypoint_motions import KeypointMotions
 from stages.lab.training.data import motions_folder, read_groups
 from stages.lab.training.history import total_minutes
 
 log = logging.getLogger(__name__)
-TRAINED = tuple(f"3_{i}" for i in range(9))
-SPLITS = {
-    "spatial": (("3_9",), 80), "temporal": (TRAINED, 100), "4 objects": (("4",), 80), "6 objects": (("6",), 80),
-    "held-out objects": (("heldout",), 80),
-}  # fmt: skip
-TEMPORAL_SCENES = 300  # scenes of the temporal split
+SPLITS = {**sensitivity.SPLITS, "held-out objects": (("heldout",), 80)}
 TIMED_STEPS = 100  # steps of the timed rollout
 STRIDE = 8  # frames between the values of an object's error curve
 COMPARABLE_KEYS = ("machine", "keypoints", "scenes", "frames")  # results in one table must agree in these
@@ -170,7 +166,7 @@ def split_scenes(data: Path, split: str, options: DynamicsBenchOptions) -> Keypo
     motions = read_groups(data, groups, options.keypoints)
     count = min(len(motions), options.limit or len(motions))
     if split == "temporal":
-        count = min(count, TEMPORAL_SCENES)
+        count = min(count, sensitivity.TEMPORAL_SCENES)
         rows = torch.randperm(len(motions), generator=torch.Generator().manual_seed(options.seed))[:count]
     else:
         rows = torch.arange(count)

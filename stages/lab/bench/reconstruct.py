@@ -25,6 +25,7 @@ from torch import Tensor
 from stages.core.backends import pick_device
 from stages.core.errors import InputError
 from stages.core.geometry.cameras import centres
+from stages.core.geometry.rotations import rotation_angle
 from stages.core.geometry.similarity import Similarity, umeyama
 from stages.core.scene.cameras import Cameras, read_cameras
 from stages.core.scene.scene_ply import read_scene
@@ -197,12 +198,6 @@ def matched_cameras(found: Cameras, reference: Cameras) -> tuple[Cameras, Camera
     if len(both) < 3:
         raise InputError(f"the reference cameras name {len(both)} of the photos; 3 or more are needed to compare")
     return found[[found.names.index(name) for name in both]], reference[[row[name] for name in both]]
-
-
-def rotation_angle(R: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b"]:
-    """Angle of a rotation [degrees]."""
-    cosine = (R.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2
-    return torch.rad2deg(torch.acos(cosine.clamp(-1, 1)))
 
 
 def _line(name: str, row: dict) -> str:

@@ -23,7 +23,7 @@ from tqdm import tqdm
 
 from stages.core.backends import pick_device
 from stages.core.geometry.harmonics import C0, rgb_to_sh
-from stages.core.geometry.rotations import matrix, multiply, nearest_rotation, quaternion
+from stages.core.geometry.rotations import matrix, multiply, nearest_rotation, quaternion, rotation_angle
 from stages.core.geometry.similarity import Similarity, umeyama
 from stages.core.scene.files import replacing
 from stages.core.scene.gaussians import Gaussians
@@ -88,7 +88,7 @@ def errors(found: Similarity, trial: RegistrationTrial, whole: Gaussians, revolv
     middle = (whole.means.amin(0) + whole.means.amax(0)) / 2
     shift = float((found(middle) - trial.truth(middle)).norm()) / (trial.truth.scale * diameter(whole.means))
     R = found.rotation.mT @ trial.truth.rotation  # the identity where the registration is exact
-    angle = rotation_angle(R)
+    angle = float(rotation_angle(R))
     out = {"rotation": angle, "scale": 100 * abs(found.scale / trial.truth.scale - 1), "shift": 100 * shift}
     symmetry = nearest_z_rotation(R)
     free = (
@@ -96,12 +96,7 @@ def errors(found: Similarity, trial: RegistrationTrial, whole: Gaussians, revolv
         and angle > LIMITS["rotation"]
         and symmetry_residual(whole, trial.seen, symmetry) < MAX_SYMMETRY_RESIDUAL
     )
-    return {**out, "rotation up to symmetry": rotation_angle(R @ symmetry.mT) if free else angle}
-
-
-def rotation_angle(R: Float[Tensor, "3 3"]) -> float:
-    """Angle of a rotation [deg]."""
-    return float(torch.rad2deg(((R.trace() - 1) / 2).clamp(-1, 1).arccos()))
+    return {**out, "rotation up to symmetry": float(rotation_angle(R @ symmetry.mT)) if free else angle}
 
 
 def nearest_z_rotation(R: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:

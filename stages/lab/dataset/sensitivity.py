@@ -19,10 +19,12 @@ from stages.core.errors import InputError
 from stages.core.scene.files import replacing
 from stages.evaluate.dynamics import all_metrics
 from stages.lab.dataset.keypoint_motions import KeypointMotions
-from stages.lab.dataset.scene_configs import parse_groups
 from stages.lab.training.data import motions_folder, read_groups
 
-SPLITS = {"spatial": ("3_9", 80), "temporal": ("3_0..3_8", 100), "4 objects": ("4", 80), "6 objects": ("6", 80)}
+TRAINED = tuple(f"3_{i}" for i in range(9))
+SPLITS = {  # groups of scenes, and frames that are compared
+    "spatial": (("3_9",), 80), "temporal": (TRAINED, 100), "4 objects": (("4",), 80), "6 objects": (("6",), 80),
+}  # fmt: skip
 TEMPORAL_SCENES = 300  # random scenes of the temporal split
 SCENE_BATCH = 50  # scenes compared at once
 METRICS = ("RMSE", "FPE", "PCE", "R", "R_pooled")
@@ -35,9 +37,7 @@ def run(data: Path, nudged: Path, out: Path | None, keypoints: int, device: str)
     """
     device, rows = pick_device(device), {}
     for split, (groups, frames) in SPLITS.items():
-        names = [
-            g for g in parse_groups(groups) if all((motions_folder(d) / f"{g}.h5").is_file() for d in (data, nudged))
-        ]
+        names = [g for g in groups if all((motions_folder(d) / f"{g}.h5").is_file() for d in (data, nudged))]
         if not names:
             continue
         truth, other = common_scenes(read_groups(data, names, keypoints), read_groups(nudged, names, keypoints))

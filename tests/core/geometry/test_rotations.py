@@ -1,6 +1,14 @@
 import torch
 
-from stages.core.geometry.rotations import covariance, matrix, multiply, nearest_rotation, quaternion, rotation_between
+from stages.core.geometry.rotations import (
+    covariance,
+    matrix,
+    multiply,
+    nearest_rotation,
+    quaternion,
+    rotation_angle,
+    rotation_between,
+)
 
 
 def random_quats(n: int) -> torch.Tensor:
@@ -18,6 +26,11 @@ def test_quaternion_inverts_matrix_also_at_half_turns():
     half_turns = torch.cat([torch.zeros(3, 1), torch.eye(3)], 1).double()
     R = matrix(torch.cat([random_quats(100), half_turns]))
     torch.testing.assert_close(matrix(quaternion(R)), R)
+
+
+def test_angle_of_a_rotation():
+    quats = torch.tensor([[1.0, 0, 0, 0], [0.5**0.5, 0, 0, -(0.5**0.5)], [0, 0, 1.0, 0]], dtype=torch.float64)
+    torch.testing.assert_close(rotation_angle(matrix(quats)), torch.tensor([0.0, 90.0, 180.0]).double())
 
 
 def test_multiply_is_composition():

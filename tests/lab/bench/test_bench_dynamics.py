@@ -168,7 +168,7 @@ def test_scenes_are_matched_by_name():
 
 
 def test_temporal_sample_is_reproducible(data, monkeypatch):
-    monkeypatch.setattr(bench_dynamics, "TEMPORAL_SCENES", 5)
+    monkeypatch.setattr(bench_dynamics.sensitivity, "TEMPORAL_SCENES", 5)
     options = DynamicsBenchOptions(keypoints=8)
     a, b = (split_scenes(data, "temporal", options) for _ in range(2))
     assert len(a) == 5 and torch.equal(a.points, b.points)

@@ -10,7 +10,7 @@ import torch
 
 from stages.core.backends import pick_device
 from stages.core.geometry.harmonics import rgb_to_sh
-from stages.core.geometry.rotations import matrix
+from stages.core.geometry.rotations import matrix, rotation_angle
 from stages.core.geometry.similarity import Similarity, umeyama
 from stages.lab.assets.shapes import ellipsoid
 from stages.lab.bench import common as bench
@@ -21,7 +21,6 @@ from stages.lab.bench.register import (
     icp,
     make_trial,
     nearest_z_rotation,
-    rotation_angle,
     run,
     splatreg,
 )

@@ -7,13 +7,3 @@ import os
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 os.environ.setdefault("OPENBLAS_THREAD_TIMEOUT", "4")
 os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(1 << 27))  # a file of 200 kB can declare 2^30 pixels
-
-# command -> (files in, files out), in the order of the pipeline
-PIPELINE = {
-    "reconstruct": (("photos/",), ("scene.ply",)),
-    "segment": (("scene.ply",), ("labelled.ply",)),
-    "refine": (("labelled.ply",), ("refined.ply",)),
-    "simulate": (("refined.ply",), ("traj.h5",)),
-    "render": (("traj.h5",), ("video.mp4",)),
-    "evaluate": (("traj.h5", "truth.h5"), ("metrics.json",)),
-}

@@ -9,6 +9,7 @@ GPU, is used for the fused inference step of the force field; its modules are im
 |-------------------------------|-----------------------------|------------------------------------------------------|
 | skinning                      | Warp                        | `skin_gaussians_reference` in the file               |
 | adam                          | PyTorch (CPU), Warp         | `torch.optim.Adam`                                   |
+| semi_global                   | PyTorch (CPU), CUDA snippet | `path_costs_reference` in the file                   |
 | splat/projection, harmonics   | C++ and CUDA snippets       | `projection.project_reference`                       |
 | splat/binning                 | C++ snippets, CPU only      | `depth_order_reference` in the file                  |
 | splat/tiles                   | Warp, CUDA only             | `binning.depth_order_reference`                      |
@@ -17,6 +18,7 @@ GPU, is used for the fused inference step of the force field; its modules are im
 | splat/ssim, ssim_pixel        | C++ snippets (CPU), Warp    | `ssim.ssim_reference`                                |
 | mpm/transfers, grid, nodes,   | Warp with C++ and CUDA      | `transfers.substep_reference` (one free substep);    |
 |   split, fused, exact         |   snippets                  |   split and fused are tested against each other      |
+| mpm/contact                   | Warp                        | momentum, Coulomb's law, slopes                      |
 | mpm/constitutive              | Warp                        | theory, and `corotated_reference` in the file        |
 | field/normals                 | Warp                        | `normals_and_spacing_reference` in the file          |
 | field/rigid_motion            | Warp                        | `models.field.rigid_body` (drift, pose)              |
@@ -26,7 +28,7 @@ GPU, is used for the fused inference step of the force field; its modules are im
 | field/ other modules          | Triton                      | `ForceField.step` in `models.field.force_field`      |
 
 `interop` passes tensors, device and stream between PyTorch and Warp; `threads` runs CPU launches in parallel;
-`operators` hides kernels from torch.compile;
+`operators` hides kernels from torch.compile; `compilers` says which compilers are there;
 `splat/simd`, `splat/pixel_blocks`, `field/vec3` and `field/layers` hold code used by several kernels. `raster`,
 `physics` and `models` are the callers.
 """

@@ -1,6 +1,5 @@
 """The refine stage: outlier removal, completion, background filling."""
 
-import time
 from dataclasses import replace
 
 import pytest
@@ -263,9 +262,7 @@ def test_degenerate_objects_terminate(kind):
         "far apart": lambda: replace(g, means=g.means * 1e5),
     }[kind]()
     top = table_gaussians(0.03)
-    start = time.perf_counter()
     refined = refine(scene_of(top, g), RefineOptions(resolution=24))
-    assert time.perf_counter() - start < 30
     assert len(refined.gaussians) < 60_000
     assert bool(refined.gaussians.means[-10:].isfinite().all())
 

@@ -1,7 +1,6 @@
 """Sampling of particles: volumes, cavities, sheets, overlaps and degenerate input."""
 
 import math
-import time
 from dataclasses import replace
 
 import pytest
@@ -135,7 +134,6 @@ def test_overlapping_objects_share_no_voxel():
 
 
 NAN, INF = float("nan"), float("inf")
-MAX_SECONDS = 60.0  # CPU time: twenty times that of the slowest case
 BAD = {
     "a point": lambda: splats(torch.zeros(1, 3)),
     "the same point many times": lambda: splats(torch.zeros(500, 3)),
@@ -144,9 +142,7 @@ BAD = {
     "sizes of 1e30, 0 and nan": lambda: broken(scales=[1e30, 0.0, NAN]),
     "places of 1e20, infinity and nan": lambda: broken(means=[1e20, INF, NAN]),
     "quats of zero and nan": lambda: broken(quats=[0.0, NAN]),
-    "all transparent": lambda: Gaussians(*splats(sphere(200)).__dict__.values()).__class__(
-        **{**splats(sphere(200)).__dict__, "opacities": torch.zeros(200)}
-    ),
+    "all transparent": lambda: replace(splats(sphere(200)), opacities=torch.zeros(200)),
     "a plane": lambda: splats(torch.rand(3000, 3) * torch.tensor([1.0, 1, 0])),
     "a plane a thousand times as large": lambda: splats(1000 * torch.rand(3000, 3) * torch.tensor([1.0, 1, 0])),
     "a few huge discs": lambda: splats(sphere(8), scale=50.0),
@@ -167,10 +163,9 @@ def broken(**fields: list) -> Gaussians:
 
 @pytest.mark.parametrize("name", BAD)
 def test_degenerate_objects_get_particles(name):
-    start = time.process_time()
-    bodies = sample_bodies(scene(splats(sphere(2000) + 0.5), Gaussians(**{
-        **BAD[name]().__dict__, "object_id": torch.full((len(BAD[name]()),), 2)})), 4000)  # fmt: skip
-    assert time.process_time() - start < MAX_SECONDS
+    bad = BAD[name]()
+    bad = replace(bad, object_id=torch.full((len(bad),), 2))
+    bodies = sample_bodies(scene(splats(sphere(2000) + 0.5), bad), 4000)
     counts = bodies.body.bincount(minlength=2)
     assert counts.min() >= MIN_PARTICLES and len(bodies.x) < 20_000
     assert bodies.x.isfinite().all() and bodies.spacing > 0

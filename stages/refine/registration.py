@@ -50,7 +50,7 @@ def register(part: Gaussians, whole: Gaussians, seed: int = 0, hint: Similarity 
 def register_clouds(
     part: RegistrationCloud, whole: RegistrationCloud, seed: int = 0, hint: Similarity | None = None
 ) -> Registration | None:
-    """As `register`, for existing clouds."""
+    """As `register`, for clouds that exist already; `hint` maps the whole to the part."""
     coarse = coarse_registration(part, whole, seed, hint)
     return fine_registration(coarse, part, whole, seed) if len(coarse) else None
 

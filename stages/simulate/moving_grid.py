@@ -40,7 +40,7 @@ class MovingGrid:
         self.solver = self._build(particles, box)
 
     def advance(self, duration: float, acceleration: Float[Tensor, "p 3"]) -> None:
-        """As mpm.Solver.advance."""
+        """Advance by `duration` [s] under these accelerations [m/s^2], on a new grid where the old one is too small."""
         self._make_room(duration, acceleration)
         self.solver.advance(duration, acceleration)
 

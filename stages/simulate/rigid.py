@@ -56,7 +56,7 @@ class Units:
 
     @property
     def force(self) -> float:
-        """[N]"""
+        """Unit of force [N]."""
         return self.mass * self.length / self.time**2
 
 

@@ -49,7 +49,7 @@ class Moments:
 
     @classmethod
     def like(cls, value: Tensor) -> Moments:
-        """Of a tensor before its first step."""
+        """The moments of a tensor before its first step: zeros."""
         zeros = torch.zeros_like(value.detach())
         return cls(zeros, zeros.clone(), torch.zeros(1, device=value.device))
 

@@ -39,7 +39,7 @@ class PackedArray:
 
 
 def whole(values: Int[Tensor, "r c"]) -> PackedArray:
-    """Whole numbers from 0, stored exactly."""
+    """Values that are whole numbers from 0 on, stored exactly in as few bytes as they need."""
     return PackedArray(values.long(), (0.0,), (1.0,), max(1, int(values.max()).bit_length()) if values.numel() else 1)
 
 

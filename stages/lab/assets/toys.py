@@ -26,7 +26,7 @@ def falling_toys() -> Scene:
 
 
 def mix(a: tuple, b: tuple, t: Float[Tensor, "n"]) -> Float[Tensor, "n 3"]:
-    """Colour a where t is 0, b where it is 1."""
+    """Linear blend of the colours a (where t is 0) and b (where it is 1)."""
     return torch.tensor(a) + (torch.tensor(b) - torch.tensor(a)) * t[:, None]
 
 

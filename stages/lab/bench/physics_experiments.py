@@ -37,7 +37,7 @@ class Specimen:
     loss: float = 0.15
 
     def material(self) -> dict:
-        """As --materials reads it."""
+        """The material in the form that `ngff simulate --materials` reads."""
         return {"E": self.E, "density": self.density, "loss": self.loss, "friction": 0.5}
 
 
@@ -49,7 +49,7 @@ class Run:
     options: Mapping = field(default_factory=dict)
 
     def scene(self) -> Scene:
-        """The bodies as objects 1, 2, ..."""
+        """The scene with the bodies as objects 1, 2, ..., of grey Gaussians."""
         parts = [to_gaussians(t.surface, torch.full((len(t.surface.points), 3), 0.5), i + 1, widest=math.inf)
                  for i, t in enumerate(self.bodies)]  # fmt: skip
         objects = tuple(SceneObject(i + 1, f"body{i + 1}") for i in range(len(parts)))
@@ -82,7 +82,7 @@ def experiments() -> dict[str, Experiment]:
 
 
 def cube(side: float, x: float = 0.0, bottom: float = 0.0, **material) -> Specimen:
-    """A cube over (x, 0)."""
+    """A cube of this side [m] over (x, 0), its lower face at the height `bottom` [m]."""
     return block((side,) * 3, (x, 0.0, bottom + side / 2), **material)
 
 
@@ -93,7 +93,7 @@ def block(sides: tuple[float, float, float], centre: tuple[float, float, float],
 
 
 def ball(radius: float, centre: tuple[float, float, float], **material) -> Specimen:
-    """A ball."""
+    """A ball of this radius and centre [m]."""
     return Specimen(ellipsoid((radius,) * 3, 1500).moved(centre), **material)
 
 

@@ -110,7 +110,7 @@ def _fastest(call: Callable[[], object], clock: Callable[[], float], repeat: int
 
 
 def measure_forward(n: int, pixels: int, repeat: int) -> RasterTiming:
-    """Forward pass."""
+    """Time of a forward pass over n Gaussians in an image of `pixels` x `pixels`, ours and the baseline's [ms]."""
     g, (viewmat, K) = random_gaussians(n), view_camera(pixels)
     ours = lambda: rasterise(g, viewmat[None], K[None], pixels, pixels)  # noqa: E731
     plain = lambda: render_per_pixel(g, viewmat, K, pixels)  # noqa: E731
@@ -118,7 +118,7 @@ def measure_forward(n: int, pixels: int, repeat: int) -> RasterTiming:
 
 
 def measure_forward_backward(n: int, pixels: int, repeat: int) -> RasterTiming:
-    """Forward and backward pass, with gradients of all Gaussian parameters."""
+    """The same with the backward pass: gradients of all Gaussian parameters."""
     g, (viewmat, K) = random_gaussians(n), view_camera(pixels)
     tensors = [t.requires_grad_() for t in (g.means, g.quats, g.scales, g.opacities, g.sh)]
     ours = lambda: rasterise(g, viewmat[None], K[None], pixels, pixels).rgb.sum()  # noqa: E731

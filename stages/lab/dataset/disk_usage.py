@@ -28,27 +28,27 @@ class SizeEstimate:
     resolution: int
 
     def config(self, objects: int) -> float:
-        """One scene in the JSON file of its group."""
+        """Bytes of one scene in the JSON file of its group."""
         return 42 + 100 * objects
 
     def motion(self, objects: int) -> float:
-        """Keypoints of one scene."""
+        """Bytes of the keypoints of one scene."""
         return KEYPOINT_COMPRESSION * self.frames * objects * self.keypoints * 6
 
     def scene(self, gaussians: float) -> float:
-        """Point cloud of one scene."""
+        """Bytes of the point cloud of one scene."""
         return 168 * gaussians
 
     def mpm(self, gaussians: float) -> float:
-        """Gaussians of one scene in every frame."""
+        """Bytes of the Gaussians of one scene in every frame."""
         return gaussians * (self.frames * 36 + 56) + 2600 * self.frames
 
     def initial(self, views: int) -> float:
-        """Orbit video and depth maps of one scene over one background."""
+        """Bytes of the orbit video and depth maps of one scene over one background."""
         return self.resolution**2 * (ORBIT_VIEWS * VIDEO_MOVING_CAMERA + views * DEPTH_MAP)
 
     def video(self) -> float:
-        """One video of one scene over time."""
+        """Bytes of one video of one scene over time."""
         return self.resolution**2 * self.frames * VIDEO_FIXED_CAMERA
 
 

@@ -68,7 +68,7 @@ class DatasetGenerator:
 
     @cached_property
     def assets(self) -> dict[int, Asset]:
-        """The objects as particles, by id."""
+        """The objects of the data set as particles, by id; made or read on first use."""
         return load_assets(self.options.discretisation, self.options.keypoints, self.layout.root / "particles.npz")
 
     @cached_property

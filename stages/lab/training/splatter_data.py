@@ -49,7 +49,7 @@ class PosedViews:
 
     @property
     def held(self) -> list[int]:
-        """Indices of the held-out views."""
+        """Indices of the views that are held out for validation."""
         return list(range(HELD_OUT_EVERY // 2, len(self.images), HELD_OUT_EVERY))
 
     @property

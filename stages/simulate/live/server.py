@@ -154,7 +154,7 @@ class LiveServer:
             controlled = self._clients[0] is client
             self._clients.remove(client)
             if controlled:
-                self._put({"do": "release"})  # nothing is dragged by nobody
+                self._put({"do": "release"})  # a drag ends with the client that made it
                 self._tell_roles()
 
     def _receive(self, client: Client, text: str | bytes) -> bool:

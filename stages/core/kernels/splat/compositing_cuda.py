@@ -294,6 +294,7 @@ class Composite(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, splats, tiles, behind, mean):
+        """Images rgb (h, w, 3), fourth channel (h, w) and alpha (h, w) of splats (n, 16)."""
         rgb, fourth, alpha, left, stops, _ = draw(splats, tiles, behind, mean)
         ctx.save_for_backward(splats, behind, left, stops, fourth, alpha)
         ctx.tiles, ctx.mean = tiles, mean
@@ -301,6 +302,7 @@ class Composite(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, *upstream):
+        """Gradient (n, 16) of the splats from those of the three images."""
         splats, behind, *state = ctx.saved_tensors
         upstream = [v.float().contiguous() for v in upstream]
         return draw_adjoint(splats, ctx.tiles, behind, ctx.mean, *state, *upstream), None, None, None

@@ -75,7 +75,7 @@ class Capacity:
 
     @classmethod
     def at_least(cls, needed: int, device: torch.device) -> Capacity:
-        """Half as much again as needed."""
+        """A capacity of 1.5 times the `needed` slots and some more, since later calls may need more."""
         return cls(needed + needed // 2 + 1024, torch.zeros(1, dtype=torch.int32, device=device))
 
 

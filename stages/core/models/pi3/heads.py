@@ -38,7 +38,7 @@ class LinearMap(nn.Module):
         self.proj = nn.Linear(width, channels * PATCH * PATCH)
 
     def forward(self, tokens: Float[Tensor, "b t c"], rows: int, columns: int) -> Float[Tensor, "b h w k"]:
-        """`rows` and `columns` of patches."""
+        """A map of k values per pixel from the tokens of `rows` x `columns` patches, in row order."""
         maps = self.proj(tokens).mT.unflatten(2, (rows, columns))
         return F.pixel_shuffle(maps, PATCH).permute(0, 2, 3, 1)
 

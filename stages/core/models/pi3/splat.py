@@ -75,7 +75,7 @@ def splat(geometry: Geometry, raw: Float[Tensor, "v h w k"]) -> Gaussians:
 
 
 def band_factors(device=None) -> Float[Tensor, "k"]:
-    """Factor of each of the k harmonics."""
+    """Published factor of each of the k harmonics, by its degree."""
     return torch.cat([torch.full((2 * l + 1,), factor, device=device) for l, factor in enumerate(BANDS)])
 
 

@@ -50,9 +50,9 @@ def test_no_file_outside_the_list_of_folders():
     assert {folder(module) for module in TREES} <= {"lab", *STAGES, *(f"core.{name}" for name in CORE)}
 
 
-def test_public_class_names_are_unique():
+def test_class_names_are_unique():
     names = Counter(node.name for tree in TREES.values() for node in tree.body if isinstance(node, ast.ClassDef))
-    assert not [name for name, count in names.items() if count > 1 and not name.startswith("_")]
+    assert not [name for name, count in names.items() if count > 1]
 
 
 def test_help_imports_nothing_heavy():

@@ -16,7 +16,7 @@ from stages.core.raster.shadows import GAMMA, OVERHEAD, Light, Spheres, blocked
 from stages.core.scene.scene import Scene
 
 ELEVATIONS, AZIMUTHS, SPREADS = (25.0, 40.0, 55.0, 70.0), 12, (0.1, 0.3)  # lamps that are tried [degrees], [tangents]
-REACH = 3.0  # of the surface that is examined [radii of the object], beyond the object
+SURFACE_MARGIN = 3.0  # of the surface that is examined [radii of the object], beyond the object
 BENEATH = 0.6  # of the sky blocked: beneath an object, not seen in any photo
 MIN_CELLS = 60  # of the surface around the objects
 MAX_SHARE = 0.95  # of the irradiance that sky and lamp have together
@@ -77,7 +77,7 @@ def _surface_cells(
         own = spheres.object_id == id
         middle = spheres.centres[own].mean(0)
         radius = float(((spheres.centres[own] - middle).norm(dim=1) + spheres.radii[own]).max())
-        near |= (g.means - middle)[:, :2].norm(dim=1) < (1 + REACH) * radius
+        near |= (g.means - middle)[:, :2].norm(dim=1) < (1 + SURFACE_MARGIN) * radius
     heights = support.heights(g.means)
     on = near & (g.object_id == 0) & (g.opacities > 0.1) & (heights.abs() < support.tolerance) & support.inside(g.means)
     rows = on.nonzero()[:, 0]
@@ -113,13 +113,13 @@ def _lamps() -> list[Light]:
     return [Light(0.0, 0.0, d, spread, in_colours=True) for d in directions for spread in SPREADS]
 
 
-class _Fit(NamedTuple):
+class _LampFit(NamedTuple):
     odds: float  # variance that the shadows explain over what is left
     light: Light
     own: Tensor  # coefficients of the surface's own colour
 
 
-def _best_fit(A: Tensor, hidden: Float[Tensor, "l n 2"], y: Tensor, lamps: list[Light]) -> _Fit:
+def _best_fit(A: Tensor, hidden: Float[Tensor, "l n 2"], y: Tensor, lamps: list[Light]) -> _LampFit:
     """The lamp that explains log colours y best, with its strength and that of the sky, by Tukey's biweight.
 
     y = A a + log(1 - hidden s) is linearised about the shares s of sky and lamp in every step, for all lamps at once.
@@ -141,7 +141,7 @@ def _best_fit(A: Tensor, hidden: Float[Tensor, "l n 2"], y: Tensor, lamps: list[
     odds = torch.where(s.sum(1) >= MIN_SHARE, before / after.clamp_min(1e-12) - 1, 0)
     i = int(odds.argmax())
     sky, strength = s[i].tolist()
-    return _Fit(float(odds[i]), replace(lamps[i], sky=sky, lamp=strength), own[i])
+    return _LampFit(float(odds[i]), replace(lamps[i], sky=sky, lamp=strength), own[i])
 
 
 def _times(A: Float[Tensor, "l n k"], x: Float[Tensor, "l k"]) -> Float[Tensor, "l n"]:

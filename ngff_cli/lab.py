@@ -47,12 +47,12 @@ def fuzz(
     out: Annotated[Path, typer.Option("-o", "--out", help="report to write (.json)")] = Path("fuzz.json"),
     count: Annotated[int, typer.Option(help="number of damaged files")] = 10_000,
     seed: Annotated[int, typer.Option(help="random seed of the damage")] = 0,
+    as_json: AsJson = False,
 ) -> None:
     """Read randomly damaged files of every format, and keep those that end in anything but a clear error."""
     from stages.lab.fuzz.campaign import run
 
-    for line in run(out, count, seed):
-        print(line)
+    print_results(lambda path: run(path, count, seed), out, as_json)
 
 
 @app.command()

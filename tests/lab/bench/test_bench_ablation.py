@@ -18,7 +18,7 @@ from stages.lab.dataset.keypoint_motions import write_motions
 from stages.lab.training.ablation import ABLATIONS, IMPULSE_VECTORS
 from stages.lab.training.train import TrainOptions
 from tests.conftest import CliRunner
-from tests.lab.training.test_train import falling
+from tests.lab.training.motions import falling
 
 DT = 0.02
 TINY = AblationBenchOptions(steps=2, batch=2, keypoints=8, horizons="1,2", groups="3_0", test="3_1")

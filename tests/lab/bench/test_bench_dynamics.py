@@ -46,7 +46,7 @@ from stages.lab.dataset.simulation import SimulationSettings, simulate
 from stages.lab.plot import LEGEND_HEIGHT, PANEL_HEIGHT, PANEL_WIDTH
 from tests.conftest import CliRunner
 from tests.lab.small_world import COARSE, box_shell
-from tests.lab.training.test_train import falling, without_last
+from tests.lab.training.motions import falling, without_last
 
 GROUPS = [*(f"3_{i}" for i in range(10)), "4", "6", "heldout"]
 NONE = DynamicsBenchOptions(keypoints=8, mpm=0)

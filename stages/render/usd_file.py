@@ -24,7 +24,7 @@ from stages.render.splat_files import only_clip, rigid_motion
 def write_usd(out: Path, renderer: Renderer) -> dict:
     """Write the scene and its motion. Raises MissingPackage without usd-core, and InputError as for a GLB."""
     try:
-        from pxr import Gf, Usd, UsdGeom, UsdVol  # noqa: PLC0415 -- only this format needs it
+        from pxr import Gf, Usd, UsdGeom, UsdVol  # only this format needs it
 
         UsdVol.ParticleField3DGaussianSplat  # noqa: B018 -- the schema is younger than the package
     except (ImportError, AttributeError) as error:
@@ -73,7 +73,7 @@ def write_usd(out: Path, renderer: Renderer) -> dict:
 
 def _fill(field, g: Gaussians, frame: int | None = None) -> None:
     """Set the attributes of a field of Gaussians, or the time samples of those that change with the frame."""
-    from pxr import Vt  # noqa: PLC0415
+    from pxr import Vt
 
     prim, time = field.GetPrim(), [] if frame is None else [frame]
 

@@ -135,7 +135,7 @@ def psnr_behind(scene: Scene, true: Scene) -> float:
     return sum(values) / len(values)
 
 
-def run(out: Path | None, options: CompleteBenchOptions = CompleteBenchOptions()) -> Iterator[str]:  # noqa: B008 -- frozen
+def run(out: Path | None, options: CompleteBenchOptions = CompleteBenchOptions()) -> Iterator[str]:
     """Yield a line for each scene and completer and the means over scenes; all figures go to `out` as JSON."""
     yield f"{'scene':16}{'completer':12}{'Chamfer [mm]':>14}{'PSNR behind [dB]':>18}{'RMSE of motion [mm]':>21}"
     scenes = {}

@@ -92,7 +92,7 @@ def _quiet() -> Iterator[None]:
         logging.disable(before)
 
 
-def run(out: Path, options: PhysicsBenchOptions = PhysicsBenchOptions()) -> Iterator[str]:  # noqa: B008 -- frozen
+def run(out: Path, options: PhysicsBenchOptions = PhysicsBenchOptions()) -> Iterator[str]:
     """Yield a line for each experiment and engine; rows that `out` has already are kept and not measured again.
 
     Also writes the table beside it as Markdown.

@@ -143,7 +143,7 @@ def _row(what: str, n: int, pixels: int, ours: Callable, plain: Callable, repeat
     )
 
 
-def run(out: Path | None = None, options: RasterBenchOptions = RasterBenchOptions()) -> Iterator[str]:  # noqa: B008 -- frozen
+def run(out: Path | None = None, options: RasterBenchOptions = RasterBenchOptions()) -> Iterator[str]:
     """Yield the lines of the report; all results go to `out` as JSON."""
     yield bench.machine("cpu")
     by = options.shrink

@@ -93,7 +93,7 @@ def measure(index: int, views: int) -> dict:
     }  # fmt: skip
 
 
-def run(out: Path | None = None, options: RefineBenchOptions = RefineBenchOptions()) -> Iterator[str]:  # noqa: B008 -- frozen
+def run(out: Path | None = None, options: RefineBenchOptions = RefineBenchOptions()) -> Iterator[str]:
     """Yield the lines of the report; all results go to `out` as JSON."""
     yield bench.machine("cpu")
     rows = []

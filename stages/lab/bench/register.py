@@ -189,7 +189,7 @@ if find_spec("splatreg"):
     METHODS["splatreg"] = splatreg
 
 
-def run(out: Path | None, options: RegisterBenchOptions = RegisterBenchOptions()) -> Iterator[str]:  # noqa: B008 -- frozen
+def run(out: Path | None, options: RegisterBenchOptions = RegisterBenchOptions()) -> Iterator[str]:
     """Register the same parts with every method; yield a line for each object. All trials go to `out` as JSON."""
     names, compared, device = ObjectsOptions(options.only).names, METHODS, pick_device(options.device)
     yield f"{'correct of ' + str(options.trials):14}" + "".join(f"{name:>12}" for name in compared)

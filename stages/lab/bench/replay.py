@@ -144,7 +144,7 @@ def report(c: ReplayErrors) -> Iterator[str]:
     yield f"centres of mass agree to 1 % of the drop height through frame {last} of {len(c.com) - 1}"
 
 
-def run(recording: Path, out: Path, options: ReplayOptions = ReplayOptions()) -> Iterator[str]:  # noqa: B008 -- frozen
+def run(recording: Path, out: Path, options: ReplayOptions = ReplayOptions()) -> Iterator[str]:
     """Replay RECORDING.npz into OURS.npz and yield the lines of a report."""
     data = read_recording(recording)
     frames = options.frames or len(data["positions"])

@@ -192,7 +192,7 @@ def _scores(scene: Scene, found: Tensor, truth: Tensor, start: float) -> dict:
             "seconds": round(time.perf_counter() - start, 1)}  # fmt: skip
 
 
-def run(out: Path | None = None, options: SegmentBenchOptions = SegmentBenchOptions()) -> Iterator[str]:  # noqa: B008 -- frozen
+def run(out: Path | None = None, options: SegmentBenchOptions = SegmentBenchOptions()) -> Iterator[str]:
     """Yield the lines of the report; all results go to `out` as JSON."""
     yield bench.machine("cpu")
     networks, absent = available_networks(options)

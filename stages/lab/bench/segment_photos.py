@@ -43,7 +43,7 @@ class SegmentPhotosOptions:
 
 
 def run(
-    sets: list[Path], out: Path | None = None, options: SegmentPhotosOptions = SegmentPhotosOptions()  # noqa: B008
+    sets: list[Path], out: Path | None = None, options: SegmentPhotosOptions = SegmentPhotosOptions()
 ) -> Iterator[str]:
     """Yield a line for each set; all results go to `out` as JSON, and as a table to a Markdown file beside it.
 

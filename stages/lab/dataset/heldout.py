@@ -195,7 +195,7 @@ def load_shape_assets(
 
 def mesh_assets(meshes: Sequence[Sequence[Path]], options: HeldoutOptions) -> dict[int, Asset]:
     """Meshes, each of one or several files, as objects 100, 101, ...; file and folder names choose the materials."""
-    from stages.lab.assets.meshes import read_mesh  # noqa: PLC0415 -- needs an optional extra
+    from stages.lab.assets.meshes import read_mesh  # needs an optional extra
 
     assets = {}
     for id, files in enumerate(tqdm(meshes, desc="meshes", unit="mesh"), start=FIRST_MESH_ID):

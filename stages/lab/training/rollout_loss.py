@@ -83,7 +83,7 @@ class RolloutLoss:
     """
 
     def __init__(
-        self, model: Dynamics, dt: float, options: LossOptions = LossOptions(), graph: bool = True,  # noqa: B008 -- frozen
+        self, model: Dynamics, dt: float, options: LossOptions = LossOptions(), graph: bool = True,
         compiled: bool = False,
     ):  # fmt: skip
         self.model, self.dt, self.options = model, dt, options

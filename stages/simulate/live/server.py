@@ -49,7 +49,7 @@ class LiveServer:
 
     def __init__(self, page: str, port: int = 0):
         try:
-            import websockets.asyncio.server  # noqa: F401, PLC0415 -- only live sessions need it
+            import websockets.asyncio.server  # noqa: F401 -- only live sessions need it
         except ImportError as error:
             raise MissingPackage("--live needs the package websockets: `pip install websockets`") from error
         self._page, self._token = page.encode(), secrets.token_urlsafe(24)
@@ -100,7 +100,7 @@ class LiveServer:
         self._loop.close()
 
     async def _serve(self) -> None:
-        from websockets.asyncio.server import serve  # noqa: PLC0415
+        from websockets.asyncio.server import serve
 
         quiet = logging.getLogger(f"{__name__}.websockets")  # failed handshakes are expected
         quiet.setLevel(logging.CRITICAL)
@@ -116,8 +116,8 @@ class LiveServer:
 
     def _answer(self, connection, request):
         """The page, or an error; None lets the handshake of a WebSocket go on."""
-        from websockets.datastructures import Headers  # noqa: PLC0415
-        from websockets.http11 import Response  # noqa: PLC0415
+        from websockets.datastructures import Headers
+        from websockets.http11 import Response
 
         path = request.path.encode("ascii", "replace")
         if request.headers.get_all("Host") != [f"{HOST}:{self.port}"]:
@@ -136,7 +136,7 @@ class LiveServer:
 
     async def _talk(self, connection) -> None:
         """Serve one client until it leaves."""
-        from websockets.exceptions import ConnectionClosed  # noqa: PLC0415
+        from websockets.exceptions import ConnectionClosed
 
         client = Client(connection)
         if len(self._clients) >= MAX_CLIENTS:  # several handshakes at once
@@ -196,7 +196,7 @@ class LiveServer:
 
     def _send(self, client: Client, data: str | bytes) -> None:
         async def send() -> None:
-            from websockets.exceptions import ConnectionClosed  # noqa: PLC0415
+            from websockets.exceptions import ConnectionClosed
 
             with suppress(ConnectionClosed):  # `_talk` removes it
                 await client.socket.send(data)

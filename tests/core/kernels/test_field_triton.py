@@ -7,9 +7,9 @@ pytest.importorskip("triton")
 if not torch.cuda.is_available():
     pytest.skip("Triton's kernels need an NVIDIA GPU", allow_module_level=True)
 
-from stages.core.kernels.field.nearest import nearest_between_objects, nearest_between_objects_reference  # noqa: E402
-from stages.core.kernels.field.perceptron import perceptron, perceptron_reference  # noqa: E402
-from stages.core.kernels.field.skinny_matmul import skinny_matmul  # noqa: E402
+from stages.core.kernels.field.nearest import nearest_between_objects, nearest_between_objects_reference
+from stages.core.kernels.field.perceptron import perceptron, perceptron_reference
+from stages.core.kernels.field.skinny_matmul import skinny_matmul
 
 pytestmark = pytest.mark.gpu
 

@@ -9,11 +9,11 @@ pytest.importorskip("triton")
 if not torch.cuda.is_available():
     pytest.skip("Triton's kernels need an NVIDIA GPU", allow_module_level=True)
 
-from stages.core.models.external_forces import ExternalForces  # noqa: E402
-from stages.core.models.field import fused_step  # noqa: E402
-from stages.core.models.field.force_field import ForceField  # noqa: E402
-from stages.core.models.rollout import TimeStepper, record_frames  # noqa: E402
-from tests.core.models.dynamics_fixtures import add_padding, external_force, overlapping_objects  # noqa: E402
+from stages.core.models.external_forces import ExternalForces
+from stages.core.models.field import fused_step
+from stages.core.models.field.force_field import ForceField
+from stages.core.models.rollout import TimeStepper, record_frames
+from tests.core.models.dynamics_fixtures import add_padding, external_force, overlapping_objects
 
 pytestmark = pytest.mark.gpu
 NARROW = torch.tensor([[-0.08, -0.05, -0.94], [0.3, 0.35, -0.55]], dtype=torch.float64)  # walls among the objects

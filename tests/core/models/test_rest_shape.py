@@ -9,8 +9,8 @@ pytest.importorskip("triton")
 if not torch.cuda.is_available():
     pytest.skip("Triton's kernels need an NVIDIA GPU", allow_module_level=True)
 
-from stages.core.models.field.force_field import ForceField  # noqa: E402
-from tests.core.models.dynamics_fixtures import add_padding, overlapping_objects  # noqa: E402
+from stages.core.models.field.force_field import ForceField
+from tests.core.models.dynamics_fixtures import add_padding, overlapping_objects
 
 pytestmark = pytest.mark.gpu
 

@@ -37,7 +37,7 @@ class MaskProposals:
 
 @torch.no_grad()
 def propose_masks(
-    model: Sam2VideoModel, pixels: Float[Tensor, "3 s s"], options: MaskGenerationOptions = MaskGenerationOptions()  # noqa: B008 -- frozen
+    model: Sam2VideoModel, pixels: Float[Tensor, "3 s s"], options: MaskGenerationOptions = MaskGenerationOptions()
 ) -> MaskProposals:
     """Masks of a photo, at a quarter of the network's input size; each point gives up to three, of different extent.
 

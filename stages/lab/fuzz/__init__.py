@@ -1,0 +1,1 @@
+"""Small files of every format, damaged at random, and what their readers make of them."""

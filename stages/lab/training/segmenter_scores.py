@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits
+from torch.utils.data import DataLoader, Dataset
 from tqdm import tqdm
 
 from stages.core.errors import InputError
@@ -27,30 +28,46 @@ MAX_SURFELS = 160_000
 JITTER = 0.05  # of the normalised features
 
 
-def fit_scores(model: Segmenter, files: Sequence[Path], scenes: int, steps: int, seed: int) -> dict[str, float]:
-    """Train `model.score`, in place, on the candidates in `scenes` augmented examples; returns figures for the card."""
-    rng = np.random.default_rng([seed, 1])
+class _Candidates(Dataset):
+    """Features and true IoUs of all candidates of `scenes` augmented examples; None for too many or too few surfels."""
+
+    def __init__(self, model: Segmenter, files: Sequence[Path], scenes: int, seed: int):
+        self.model, self.files, self.scenes, self.seed = model, list(files), scenes, seed
+
+    def __len__(self) -> int:
+        return self.scenes
+
+    @torch.no_grad()
+    def __getitem__(self, k: int) -> tuple[Tensor, Tensor] | None:
+        rng = np.random.default_rng([self.seed, 1, k])
+        surfels, labels = augmented(read_example(self.files[k % len(self.files)]), rng)
+        if not LARGE <= len(surfels) <= MAX_SURFELS:
+            return None
+        grid = voxelise(surfels.enlarged(float(rng.choice(SCALES))))
+        levels = pyramid(grid.cells, len(self.model.config["widths"]))
+        found = find_candidates(grid, levels, self.model(grid.features, levels), self.model)
+        keep = found.sizes > MIN_VOXELS - 0.5
+        return found.features[keep], true_iou(found, grid, labels)[keep]
+
+
+def fit_scores(
+    model: Segmenter, files: Sequence[Path], scenes: int, steps: int, seed: int, workers: int = 0
+) -> dict[str, float]:
+    """Train `model.score`, in place, on the candidates in `scenes` augmented examples; returns figures for the card.
+
+    The examples are prepared by `workers` processes; the result does not depend on their number.
+    """
     torch.manual_seed(seed)
     model = model.cpu().eval()
-    features, quality = [], []
-    for k in tqdm(range(scenes), desc="candidates", unit="scene"):
-        surfels, labels = augmented(read_example(files[k % len(files)]), rng)
-        if len(surfels) > MAX_SURFELS or len(surfels) < LARGE:
-            continue
-        grid = voxelise(surfels.enlarged(float(rng.choice(SCALES))))
-        with torch.no_grad():
-            levels = pyramid(grid.cells, len(model.config["widths"]))
-            found = find_candidates(grid, levels, model(grid.features, levels), model)
-        keep = found.sizes > MIN_VOXELS - 0.5
-        features.append(found.features[keep])
-        quality.append(true_iou(found, grid, labels)[keep])
-    if not features:
+    examples = DataLoader(_Candidates(model, files, scenes, seed), batch_size=None, num_workers=workers)
+    found = [item for item in tqdm(examples, total=scenes, desc="candidates", unit="scene") if item is not None]
+    if not found:
         raise InputError(f"none of {scenes} examples has {LARGE} to {MAX_SURFELS} surfels; raise --score-scenes")
-    x, y = torch.cat(features), torch.cat(quality)
+    x, y = (torch.cat(column) for column in zip(*found, strict=True))
     model.feature_mean.copy_(x.mean(0))
     model.feature_scale.copy_(x.std(0) + 1e-6)
     loss = _train(model, x, y, steps)
-    return {"scenes": len(features), "candidates": len(x), "loss": round(loss, 4)}
+    return {"scenes": len(found), "candidates": len(x), "loss": round(loss, 4)}
 
 
 def _train(model: Segmenter, x: Float[Tensor, "k f"], y: Float[Tensor, "k"], steps: int) -> float:

@@ -139,7 +139,9 @@ def run(folders: Sequence[Path], out: Path, options: SegmenterTraining, start: P
             yield ", ".join(f"{k} {v}" for k, v in curve[-1].items())
             mean = {}
             _save(out, model, options, len(files), curve)
-    scores = fit_scores(model, files, options.score_scenes, options.score_steps, options.seed)
+    scores = fit_scores(
+        model, files, options.score_scenes, options.score_steps, options.seed, options.workers
+    )
     yield ", ".join(f"{k} {v}" for k, v in scores.items())
     _save(out, model, options, len(files), curve, scores)
 

@@ -1,4 +1,4 @@
-"""Fast rollouts without gradients: on CUDA, `prepare` and `step` are captured as CUDA graphs and replayed.
+"""Fast rollouts without gradients: on CUDA, `prepare` and `step` are captured as CUDA graphs, when first used again.
 
     stepper = TimeStepper(model, initial)
     for _ in range(steps):
@@ -44,23 +44,28 @@ class TimeStepper:
         self.step_count = torch.zeros((), dtype=torch.int64, device=initial.points.device)
         self.scene, state, points = self._prepared()
         self.state, self.points = _copy((state, points))
-        self.begin, self.advance = self._begin, self._step
-        if self.step_count.is_cuda:
-            self.begin = _captured(self._begin)
-            self.advance = _captured(self._step) if method == "step" else self._step
-            self.begin()
+        self._replay_begin: Callable[[], None] | None = None
+        self._replay_step: Callable[[], None] | None = None
 
     @torch.no_grad()
     def step(self) -> None:
         """Advance by dt."""
-        self.advance()
+        if not self.step_count.is_cuda or self.method != "step":
+            return self._step()
+        if self._replay_step is None:
+            self._replay_step = self._captured_step()
+        self._replay_step()
 
     @torch.no_grad()
     def restart(self, initial: InitialConditions, external: ExternalForces | None = None) -> None:
         """Start again at time 0 from inputs of the same shapes. Raises ValueError for other shapes."""
         external = ExternalForces.none(initial) if external is None else external
         _load((self.initial, self.external), (initial, external))
-        self.begin()
+        if not self.step_count.is_cuda:
+            return self._begin()
+        if self._replay_begin is None:  # the scene then lies in the memory of this graph, which steps must read
+            self._replay_begin, self._replay_step = _captured(self._begin), None
+        self._replay_begin()
 
     @torch.no_grad()
     def change(self, initial: InitialConditions) -> None:
@@ -75,7 +80,7 @@ class TimeStepper:
         return scene, state, self.model.points(scene, state)
 
     def _begin(self) -> None:
-        self.scene, state, points = self._prepared()  # a captured scene lies in the memory of its graph
+        self.scene, state, points = self._prepared()
         _load((self.state, self.points), (state, points))
         self.step_count.zero_()
 
@@ -86,6 +91,15 @@ class TimeStepper:
         # on a GPU one kernel for all copies
         torch._foreach_copy_([*self.state, self.points], [*new, self.model.points(self.scene, new)])
         self.step_count += 1
+
+
+    def _captured_step(self) -> Callable[[], None]:
+        """`_step` as a CUDA graph, with the state as before the capture, which takes some steps."""
+        changing = *self.state, self.points, self.step_count
+        before = [x.clone() for x in changing]
+        replay = _captured(self._step)
+        torch._foreach_copy_(list(changing), before)
+        return replay
 
 
 def _copy(tree: Any) -> Any:
@@ -103,8 +117,7 @@ def _load(target: tuple, source: tuple) -> None:
 def _captured(work: Callable[[], None]) -> Callable[[], None]:
     """`work` as a CUDA graph; calling the result replays its kernel launches.
 
-    `work` runs twice before the capture, which loads and tunes kernels, and is replayed once after it, because capture
-    does not execute the kernels.
+    `work` runs twice before the capture, which loads and tunes kernels; the capture itself does not execute them.
     """
     side = torch.cuda.Stream()
     side.wait_stream(torch.cuda.current_stream())
@@ -115,7 +128,6 @@ def _captured(work: Callable[[], None]) -> Callable[[], None]:
     graph = torch.cuda.CUDAGraph()
     with torch.cuda.graph(graph):
         work()
-    graph.replay()
     return graph.replay
 
 

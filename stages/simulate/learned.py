@@ -53,7 +53,7 @@ def rollout(
     setup = set_up_scene(scene, prompts, options)
     ids = [o.id for o in scene.objects]
     per_object = [keypoints.rest[keypoints.object_id == i] for i in ids]
-    solids = solid_bodies(scene, setup.bodies.spacing)
+    solids = solid_bodies(scene, setup.bodies.spacing, device)
     density = torch.tensor([setup.materials[i].material.density for i in ids])
     volumes = torch.tensor([solid.volume for solid in solids]) * scene.metres_per_unit**3
     masses = density * volumes

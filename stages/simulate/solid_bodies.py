@@ -1,4 +1,4 @@
-"""Bodies of the learned engine: keypoints with masses, and the signed distance and inertia of the filled object."""
+"""Bodies of the learned engine: keypoints with masses, and the volume and inertia of the filled object."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from stages.core.physics.particles import inliers, usable
-from stages.core.physics.signed_distance import DistanceGrid, distance_grid, mass_properties
+from stages.core.physics.signed_distance import distance_grid, mass_properties
 from stages.core.scene.scene import Scene
 
 SMALLEST_SHARE = 0.1  # least mass of a keypoint relative to the mean, when the centre of mass is matched
@@ -19,22 +19,25 @@ SMALLEST_SHARE = 0.1  # least mass of a keypoint relative to the mean, when the 
 class SolidBody:
     """The filled body of an object at its reconstructed position, in scene units."""
 
-    grid: DistanceGrid
     volume: float
     centre: Float[Tensor, "3"]  # of mass
     inertia: Float[Tensor, "3 3"]  # about the centre of mass, per unit of mass
 
 
-def solid_bodies(scene: Scene, sheet: float) -> list[SolidBody]:
-    """The solid body of every object, from the centres of its Gaussians; open sheets get the thickness `sheet`."""
+def solid_bodies(scene: Scene, sheet: float, device: str = "cpu") -> list[SolidBody]:
+    """The solid body of every object, from the centres of its Gaussians; open sheets get the thickness `sheet`.
+
+    They are computed on `device`.
+    """
     out = []
     g = scene.gaussians.to("cpu")
     good = usable(g)
     for o in scene.objects:
         mine = (g.object_id == o.id) & g.means.isfinite().all(1)
         surface = g.means[mine & good] if bool((mine & good).any()) else g.means[mine]
-        grid = distance_grid(surface[inliers(surface)], sheet)
-        out.append(SolidBody(grid, *mass_properties(grid)))
+        grid = distance_grid(surface[inliers(surface)].to(device), sheet)
+        volume, centre, inertia = mass_properties(grid)
+        out.append(SolidBody(volume, centre.cpu(), inertia.cpu()))
     return out
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -21,18 +22,21 @@ def farthest_points(points: Float[Tensor, "n 3"], count: int, seed: int = 0) -> 
     Source: Gonzalez 1985, "Clustering to minimize the maximum intercluster distance": within a factor of two
     of the smallest possible covering radius.
     """
-    count = min(count, len(points))
-    chosen = torch.empty(count, dtype=torch.int64)
+    count, xyz = min(count, len(points)), np.ascontiguousarray(points.detach().cpu().numpy().T)
+    chosen = np.empty(count, np.int64)
     if not count:
-        return chosen
-    xyz = points.detach().cpu().T.contiguous()
-    distance = torch.full((xyz.shape[1],), torch.inf, dtype=xyz.dtype)
+        return torch.from_numpy(chosen)
+    distance = np.full(xyz.shape[1], np.inf, xyz.dtype)
+    offset, square = np.empty_like(xyz), np.empty_like(distance)
     at = int(torch.randint(xyz.shape[1], (1,), generator=torch.Generator().manual_seed(seed)))
-    for i in range(count):
+    for i in range(count):  # in place: for most objects the time is that of the calls
         chosen[i] = at
-        torch.minimum(distance, (xyz - xyz[:, at, None]).square_().sum(0), out=distance)
-        at = int(distance.argmax())
-    return chosen
+        np.subtract(xyz, xyz[:, at, None], out=offset)
+        np.square(offset, out=offset)
+        np.add(offset[0], offset[1], out=square)
+        np.add(square, offset[2], out=square)
+        at = int(np.minimum(distance, square, out=distance).argmax())
+    return torch.from_numpy(chosen)
 
 
 def choose_keypoints(scene: Scene, count: int, seed: int = 0) -> Keypoints:

@@ -14,8 +14,10 @@ from itertools import product
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
+
+from stages.core.geometry.neighbours import BruteForce, KDTree, neighbour_index
 
 RESOLUTION = 36  # nodes of the grid along each axis
 MARGIN = 4  # cells of the grid around the body
@@ -27,6 +29,7 @@ OVERLAP = 2.0  # discs are extended by this factor, so that they cover random po
 SURFACE = 0.75  # a node this close to a disc stops rays [cells]
 PROBE = 1.5  # distance from a disc at which the rays of a side start [cells]
 FAR = 2.0  # distance from the surface at which the rays from a node decide on its side [cells]
+MIN_DIFFERENCE = 1e-6  # of the openness of the sides of a disc, of which the more open one is outside
 OPEN = 0.06  # fraction of the rays that escape from an open side, at least
 DIRECTIONS = [d for d in product((-1, 0, 1), repeat=3) if any(d)]  # of the rays, in cells
 
@@ -48,33 +51,35 @@ class DistanceGrid:
 class Surfels:
     """Discs that cover a surface."""
 
-    centre: np.ndarray  # (m, 3)
-    normal: np.ndarray  # (m, 3), unit, outward
-    radius: np.ndarray  # (m,)
-    half_thickness: np.ndarray  # (m,); 0 on the surface of a solid, positive on sheets, which have two sides
+    centre: Float[Tensor, "m 3"]
+    normal: Float[Tensor, "m 3"]  # unit, outward
+    radius: Float[Tensor, "m"]
+    half_thickness: Float[Tensor, "m"]  # 0 on the surface of a solid, positive on sheets, which have two sides
 
 
 def distance_grid(points: Float[Tensor, "n 3"], sheet: float, resolution: int = RESOLUTION) -> DistanceGrid:
-    """Signed distance to the surface through `points`; sheets get the thickness `sheet`."""
-    x = points.double().numpy()
-    if len(x) > MAX_SURFELS:
-        x = x[np.random.default_rng(0).choice(len(x), MAX_SURFELS, replace=False)]
-    side = np.maximum(x.max(0) - x.min(0), max(1e-3 * float(np.ptp(x, axis=0).max()), 1e-9))
+    """Signed distance to the surface through `points`, on their device; sheets get the thickness `sheet`."""
+    if len(points) > MAX_SURFELS:
+        points = points[np.random.default_rng(0).choice(len(points), MAX_SURFELS, replace=False)]
+    middle = (points.amin(0) + points.amax(0)).double() / 2
+    x = points.double() - middle
+    extent = x.amax(0) - x.amin(0)
+    side = extent.maximum((1e-3 * extent.max()).clamp_min(1e-9))
     cell = side / (resolution - 1 - 2 * MARGIN)
-    low, cell = torch.from_numpy(x.min(0) - MARGIN * cell), torch.from_numpy(cell)
-    nodes = _nodes(low, cell, resolution).reshape(-1, 3).numpy()
-    surfels = _unoriented(x)
-    nearest = _tree(x).query(nodes, _ranks(BLENDED, len(x)))
-    surface = _on_surface(surfels, nodes, nearest[1], cell.numpy()).reshape((resolution,) * 3)
+    low = x.amin(0) - MARGIN * cell
+    nodes = _nodes(low, cell, resolution).reshape(-1, 3)
+    tree = neighbour_index(x)
+    surfels = _unoriented(x, tree)
+    nearest = tree.query(nodes, min(BLENDED, len(x)))
+    surface = _on_surface(surfels, nodes, nearest[1], cell).reshape((resolution,) * 3)
     surface[:, :, MARGIN] = True  # what a body stands on closes it: photos do not show its lower side
     openness = _openness(surface)
-    surfels = _oriented(surfels, openness, low.numpy(), cell.numpy(), sheet)
+    surfels = _oriented(surfels, tree, openness, low, cell, sheet)
     values = _distance(surfels, nodes, nearest)
     # the side of a single disc can be wrong where walls are thin; away from the surface rays decide
-    far = np.abs(values) > FAR * float(cell.max())
-    values = np.where(far, np.where(openness.ravel() > OPEN, 1, -1) * np.abs(values), values)
-    values = torch.from_numpy(values).reshape((resolution,) * 3)
-    return DistanceGrid(values.float(), low.float(), cell.float())
+    side = torch.where(openness.flatten() > OPEN, 1.0, -1.0)
+    values = torch.where(values.abs() > FAR * cell.max(), side * values.abs(), values)
+    return DistanceGrid(values.reshape((resolution,) * 3).float(), (low + middle).float(), cell.float())
 
 
 def mass_properties(grid: DistanceGrid) -> tuple[float, Float[Tensor, "3"], Float[Tensor, "3 3"]]:
@@ -89,89 +94,91 @@ def mass_properties(grid: DistanceGrid) -> tuple[float, Float[Tensor, "3"], Floa
     weight = weight / weight.sum().clamp_min(1e-12)
     centre = weight @ x
     moment = (weight[:, None] * (x - centre)).T @ (x - centre)
-    return volume, centre.float(), (moment.trace() * torch.eye(3, dtype=moment.dtype) - moment).float()
+    return volume, centre.float(), (moment.trace() * torch.eye(3).to(moment) - moment).float()
 
 
-def _unoriented(points: np.ndarray) -> Surfels:
+def _unoriented(points: Float[Tensor, "m 3"], tree: KDTree | BruteForce) -> Surfels:
     """Discs at the points, with normals of either sign."""
-    distance, index = _tree(points).query(points, _ranks(NEIGHBOURS, len(points)))
-    local = points[index] - points[index].mean(1, keepdims=True)
-    _, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", local, local))
-    radius = distance[:, min(4, distance.shape[1] - 1)]
-    return Surfels(points, axes[:, :, 0], radius, np.zeros(len(points)))
+    distance, index = tree.query(points, min(NEIGHBOURS, len(points)))
+    local = points[index] - points[index].mean(1, keepdim=True)
+    _, axes = torch.linalg.eigh(local.mT @ local)
+    return Surfels(points, axes[:, :, 0], distance[:, min(4, distance.shape[1] - 1)], torch.zeros_like(distance[:, 0]))
 
 
-def _on_surface(surfels: Surfels, nodes: np.ndarray, index: np.ndarray, cell: np.ndarray) -> np.ndarray:
+def _on_surface(surfels: Surfels, nodes: Tensor, index: Int[Tensor, "g k"], cell: Tensor) -> Bool[Tensor, "g"]:
     """Mask of the nodes within SURFACE cells of one of their nearest discs."""
     offset, normal = nodes[:, None] - surfels.centre[index], surfels.normal[index]
     height = (offset * normal).sum(-1)
-    beside = np.sqrt(np.maximum((offset**2).sum(-1) - height**2, 0))
-    reach = SURFACE * np.sqrt(((normal * cell) ** 2).sum(-1))
-    return ((np.abs(height) < reach) & (beside < surfels.radius[index] + reach)).any(1)
+    beside = (offset.square().sum(-1) - height.square()).clamp_min(0).sqrt()
+    reach = SURFACE * (surfels.normal * cell).norm(dim=-1)[index]
+    return ((height.abs() < reach) & (beside < surfels.radius[index] + reach)).any(1)
 
 
-def _openness(surface: np.ndarray) -> np.ndarray:
-    """Fraction (g, g, g) of the rays from each node that leave the grid without meeting the surface."""
-    count = len(surface)
-    out = np.zeros(surface.shape, np.float32)
+def _openness(surface: Bool[Tensor, "g g g"]) -> Float[Tensor, "g g g"]:
+    """Fraction of the rays from each node that leave the grid without meeting the surface."""
+    out = torch.zeros(surface.shape, device=surface.device)
     for direction in DIRECTIONS:
-        axis = next(a for a in range(3) if direction[a])
-        free, escapes = np.moveaxis(~surface, axis, 0), np.ones(surface.shape, bool)
-        shift = [direction[a] for a in range(3) if a != axis]
-        order = range(count - 2, -1, -1) if direction[axis] > 0 else range(1, count)
-        for k in order:
-            ahead = np.pad(free[k + direction[axis]] & escapes[k + direction[axis]], 1, constant_values=True)
-            escapes[k] = ahead[1 + shift[0] :, 1 + shift[1] :][:count, :count]
-        out += np.moveaxis(escapes, 0, axis)
+        hit, reach = _shifted(surface, direction, 1), 1  # by the next `reach` nodes of the ray
+        while reach < len(surface):
+            hit, reach = hit | _shifted(hit, direction, reach), 2 * reach
+        out += ~hit
     return out / len(DIRECTIONS)
 
 
-def _oriented(surfels: Surfels, openness: np.ndarray, low: np.ndarray, cell: np.ndarray, sheet: float) -> Surfels:
-    """The discs with outward normals, and of thickness `sheet` where both sides are open; neighbours vote."""
-    step = PROBE * np.sqrt(((surfels.normal * cell) ** 2).sum(1, keepdims=True)) * surfels.normal
-    sides = []
-    for x in (surfels.centre + step, surfels.centre - step):
-        at = np.rint((x - low) / cell).astype(int).clip(0, len(openness) - 1)
-        sides.append(openness[tuple(at.T)])
-    _, index = _tree(surfels.centre).query(surfels.centre, _ranks(NEIGHBOURS, len(surfels.centre)))
-    same = np.einsum("nki,ni->nk", surfels.normal[index], surfels.normal)
-    weight = np.maximum(np.abs(same) - SAME_FACE, 0)
-    weight /= weight.sum(1, keepdims=True)
-    ahead, behind = (
-        (weight * np.where(same > 0, sides[k][index], sides[1 - k][index])).sum(1) for k in (0, 1)
-    )  # fmt: skip
-    normal = np.where((ahead < behind)[:, None], -surfels.normal, surfels.normal)
-    thickness = np.where(np.minimum(ahead, behind) > OPEN, 0.5 * sheet, 0.0)
+def _shifted(mask: Bool[Tensor, "g g g"], direction: tuple[int, int, int], steps: int) -> Bool[Tensor, "g g g"]:
+    """The mask at the node `steps` further along a direction; False outside of the grid."""
+    out, count = torch.zeros_like(mask), len(mask)
+    here = tuple(slice(max(0, -d * steps), count - max(0, d * steps)) for d in direction)
+    there = tuple(slice(max(0, d * steps), count - max(0, -d * steps)) for d in direction)
+    out[here] = mask[there]
+    return out
+
+
+def _oriented(
+    surfels: Surfels, tree: KDTree | BruteForce, openness: Float[Tensor, "g g g"], low: Tensor, cell: Tensor,
+    sheet: float,
+) -> Surfels:  # fmt: skip
+    """The discs with outward normals, and of thickness `sheet` where both sides are open; neighbours vote.
+
+    The origin is in the middle of the discs.
+    """
+    step = PROBE * (surfels.normal * cell).norm(dim=1, keepdim=True) * surfels.normal
+    at = [((x - low) / cell).round().long().clamp(0, len(openness) - 1)
+          for x in (surfels.centre + step, surfels.centre - step)]  # fmt: skip
+    sides = [openness[tuple(i.unbind(1))].double() for i in at]
+    _, index = tree.query(surfels.centre, min(NEIGHBOURS, len(surfels.centre)))
+    same = (surfels.normal[index] @ surfels.normal[:, :, None])[..., 0]
+    weight = (same.abs() - SAME_FACE).clamp_min(0)
+    weight = weight / weight.sum(1, keepdim=True)
+    ahead, behind = ((weight * torch.where(same > 0, sides[k][index], sides[1 - k][index])).sum(1) for k in (0, 1))
+    # rounding must not decide between equal sides: then outward is away from the middle
+    equal = (ahead - behind).abs() < MIN_DIFFERENCE
+    outward = torch.where(equal, (surfels.normal * surfels.centre).sum(1) > 0, ahead > behind)
+    normal = torch.where(outward[:, None], surfels.normal, -surfels.normal)
+    thickness = 0.5 * sheet * (torch.minimum(ahead, behind) > OPEN).to(normal)
     return Surfels(surfels.centre, normal, surfels.radius, thickness)
 
 
-def _tree(points: np.ndarray):
-    from scipy.spatial import cKDTree  # noqa: PLC0415 -- slow to import, and only simulations need it
-
-    return cKDTree(points)
-
-
-def _ranks(count: int, available: int) -> list[int]:
-    """Neighbours to query, nearest first; a list keeps their axis where there is only one."""
-    return list(range(1, min(count, available) + 1))
-
-
-def _distance(surfels: Surfels, x: np.ndarray, nearest: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """Signed distance of positions (m, 3) to their nearest discs."""
+def _distance(
+    surfels: Surfels, x: Float[Tensor, "g 3"], nearest: tuple[Float[Tensor, "g k"], Int[Tensor, "g k"]]
+) -> Float[Tensor, "g"]:
+    """Signed distance of positions to their nearest discs."""
     near, index = nearest
     offset, normal = x[:, None] - surfels.centre[index], surfels.normal[index]
-    height = np.einsum("nki,nki->nk", offset, normal)
-    beyond = np.sqrt(np.maximum((offset**2).sum(-1) - height**2, 0)) - OVERLAP * surfels.radius[index]
+    height = (offset * normal).sum(-1)
+    beside = (offset.square().sum(-1) - height.square()).clamp_min(0).sqrt()
+    beyond = beside - OVERLAP * surfels.radius[index]
     sheet = surfels.half_thickness[index]
-    length = np.hypot(height, np.maximum(beyond, 0))
-    distance = np.where(sheet > 0, length - sheet, np.copysign(length, height))
-    weight = np.exp(-(near**2 - near[:, :1] ** 2) / np.maximum(surfels.radius[index[:, :1]], 1e-12) ** 2)
-    along = np.einsum("nki,ni->nk", normal, normal[:, 0])
-    weight = weight * np.where(sheet > 0, 1.0, along > SAME_FACE)
+    length = torch.hypot(height, beyond.clamp_min(0))
+    distance = torch.where(sheet > 0, length - sheet, torch.copysign(length, height))
+    spread = surfels.radius[index[:, :1]].square().clamp_min(1e-24)
+    weight = torch.exp((near[:, :1].square() - near.square()) / spread)
+    along = (normal * normal[:, :1]).sum(-1)
+    weight = weight * ((sheet > 0) | (along > SAME_FACE))
     return (weight * distance).sum(1) / weight.sum(1)
 
 
 def _nodes(low: Tensor, cell: Tensor, resolution: int) -> Tensor:
     """Positions (g, g, g, 3) of the nodes of a grid."""
-    lines = [low[a] + cell[a] * torch.arange(resolution, dtype=low.dtype) for a in range(3)]
+    lines = [low[a] + cell[a] * torch.arange(resolution).to(low) for a in range(3)]
     return torch.stack(torch.meshgrid(*lines, indexing="ij"), -1)

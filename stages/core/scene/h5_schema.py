@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import h5py
 import numpy as np
 
+from stages.core.scene.h5_chunks import read_compressed
 from stages.core.scene.schema import LARGEST, Bound, quote
 
 MAX_COMPRESSION = 1100  # deflate reaches 1032
@@ -53,7 +54,7 @@ class Dataset:
         data = self.open(file, name, lengths)
         if self.kind == "text":
             return [str(s) for s in data.asstr(errors="replace")[()]]
-        return self.checked(data[()], name)
+        return self.checked(read_compressed(data), name)
 
     def checked(self, values: np.ndarray, name: str) -> np.ndarray:
         """Values in native byte order, float32 or int64; ValueError where one is not finite or out of range."""

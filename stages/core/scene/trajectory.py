@@ -19,6 +19,7 @@ from stages.core.errors import InputError
 from stages.core.scene.cameras import MAX_SIDE, Cameras, check_cameras
 from stages.core.scene.files import must_exist, replacing
 from stages.core.scene.gaussians import Gaussians
+from stages.core.scene.h5_chunks import COMPRESSED, append_rows, write_compressed
 from stages.core.scene.h5_schema import Dataset
 from stages.core.scene.scene import Scene, read_metadata, read_object
 from stages.core.scene.schema import MAX_OBJECT_ID, number, numbers, parse_json, quote, reason
@@ -52,7 +53,8 @@ DATASETS = {  # n Gaussians, k coefficients, o objects, p keypoints, t frames, c
     "frames/quats": Dataset("t n 4"),
     "frames/scales": Dataset("t n 3", low=0),
 }
-COMPRESSED = {"compression": "gzip", "compression_opts": 4, "shuffle": True}
+SERIES = ("keypoints/positions", "objects/com", "objects/rotation")  # a row for each frame
+BUFFERED = 32  # frames that are compressed and written together
 
 
 @dataclass(frozen=True)
@@ -149,6 +151,7 @@ class TrajectoryWriter:
 
     def __init__(self, path: Path, scene: Scene, info: SimulationInfo, keypoints: Keypoints, binding: Binding):
         self.path, self.frames = Path(path), 0
+        self._buffer: list[tuple[np.ndarray, ...]] = []  # frames that are not in the file yet
         self._contents = scene, info, keypoints, binding
 
     def __enter__(self) -> TrajectoryWriter:
@@ -172,13 +175,17 @@ class TrajectoryWriter:
         self, positions: Float[Tensor, "p 3"], com: Float[Tensor, "o 3"], rotation: Float[Tensor, "o 4"]
     ) -> None:
         """Write one frame: keypoint positions, and centre of mass and rotation (w x y z) of each object."""
-        rows = {"keypoints/positions": positions, "objects/com": com, "objects/rotation": rotation}
-        for name, row in rows.items():
-            data = self._file[name]
-            data.resize(self.frames + 1, axis=0)
-            data[self.frames] = row.detach().cpu().numpy()
-        self._raw.check()
+        self._buffer.append(tuple(row.detach().cpu().numpy().copy() for row in (positions, com, rotation)))
         self.frames += 1
+        if len(self._buffer) == BUFFERED:
+            self._write_buffer()
+        self._raw.check()
+
+    def _write_buffer(self) -> None:
+        if self._buffer:
+            for name, rows in zip(SERIES, zip(*self._buffer, strict=True), strict=True):
+                append_rows(self._file[name], np.stack(rows))
+        self._buffer.clear()
 
     @property
     def part(self) -> Path:
@@ -188,12 +195,14 @@ class TrajectoryWriter:
     def restart(self) -> None:
         """Drop all frames, and the prompts that were added."""
         self.frames = 0
-        for name in ("keypoints/positions", "objects/com", "objects/rotation"):
+        self._buffer.clear()
+        for name in SERIES:
             self._file[name].resize(0, axis=0)
         self._file["forces/json"].resize(len(self._contents[1].forces), axis=0)
 
     def store_prompts(self, prompts: Sequence[dict]) -> None:
         """Add to the applied prompts those that are new in this longer list, and write everything to the disk."""
+        self._write_buffer()
         self._raw.check()
         data = self._file["forces/json"]
         stored = data.shape[0]
@@ -208,6 +217,8 @@ class TrajectoryWriter:
         self._raw.close()
 
     def __exit__(self, kind, error, trace) -> None:
+        if self._raw.error is None:
+            self._write_buffer()
         self._close()
         if kind is None and self._raw.error is not None:
             kind, error = OSError, self._raw.error
@@ -220,7 +231,7 @@ class TrajectoryWriter:
 
 def _write_gaussians(file: h5py.File, gaussians: Gaussians) -> None:
     for field in fields(Gaussians):
-        file.create_dataset(f"gaussians/{field.name}", data=getattr(gaussians, field.name).cpu().numpy(), **COMPRESSED)
+        write_compressed(file, f"gaussians/{field.name}", getattr(gaussians, field.name).cpu().numpy())
 
 
 def _write_rest(file: h5py.File, scene: Scene, info: SimulationInfo, keypoints: Keypoints, binding: Binding) -> None:
@@ -234,12 +245,12 @@ def _write_rest(file: h5py.File, scene: Scene, info: SimulationInfo, keypoints: 
     text = h5py.string_dtype()
     file.create_dataset("objects/name", data=[o.name for o in scene.objects], dtype=text)
     file.create_dataset("objects/material", data=[o.material for o in scene.objects], dtype=text)
-    file.create_dataset("keypoints/rest", data=keypoints.rest.cpu().numpy(), **COMPRESSED)
-    file.create_dataset("keypoints/object_id", data=keypoints.object_id.cpu().numpy(), **COMPRESSED)
-    file.create_dataset("binding/index", data=binding.index.cpu().numpy().astype(np.int32), **COMPRESSED)
-    file.create_dataset("binding/weight", data=binding.weight.cpu().numpy(), **COMPRESSED)
+    write_compressed(file, "keypoints/rest", keypoints.rest.cpu().numpy())
+    write_compressed(file, "keypoints/object_id", keypoints.object_id.cpu().numpy())
+    write_compressed(file, "binding/index", binding.index.cpu().numpy().astype(np.int32))
+    write_compressed(file, "binding/weight", binding.weight.cpu().numpy())
     p, o = len(keypoints.rest), len(scene.objects)
-    for name, shape in (("keypoints/positions", (p, 3)), ("objects/com", (o, 3)), ("objects/rotation", (o, 4))):
+    for name, shape in zip(SERIES, ((p, 3), (o, 3), (o, 4)), strict=True):
         chunk = (1, *(max(s, 1) for s in shape))
         file.create_dataset(name, (0, *shape), maxshape=(None, *shape), chunks=chunk, dtype="f4", **COMPRESSED)
     if scene.cameras is not None:

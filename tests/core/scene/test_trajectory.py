@@ -2,11 +2,19 @@ import os
 from dataclasses import replace
 
 import h5py
+import numpy as np
 import pytest
 import torch
 
 from stages.core.errors import InputError
-from stages.core.scene.trajectory import Binding, Keypoints, SimulationInfo, TrajectoryWriter, read_trajectory
+from stages.core.scene.trajectory import (
+    BUFFERED,
+    Binding,
+    Keypoints,
+    SimulationInfo,
+    TrajectoryWriter,
+    read_trajectory,
+)
 
 
 def parts(scene, p: int = 10):
@@ -60,6 +68,21 @@ def test_interrupted_write_leaves_no_file(tmp_path, two_balls):
         writer.append(keypoints.rest, torch.zeros(2, 3), torch.zeros(2, 4))
         raise KeyboardInterrupt
     assert os.listdir(tmp_path) == []
+
+
+def test_frames_in_the_buffer_are_in_the_file_when_it_is_read(tmp_path, two_balls):
+    """While it is written, after `store_prompts`; and after a restart only the new frames."""
+    info, keypoints, binding = parts(two_balls)
+    with TrajectoryWriter(tmp_path / "t.h5", two_balls, info, keypoints, binding) as writer:
+        for t in range(BUFFERED + 3):
+            writer.append(keypoints.rest + t, torch.zeros(2, 3), torch.zeros(2, 4))
+        writer.store_prompts(info.forces)
+        with h5py.File(writer.part) as file:
+            assert len(file["keypoints/positions"]) == BUFFERED + 3
+        writer.restart()
+        writer.append(keypoints.rest + 7, torch.zeros(2, 3), torch.zeros(2, 4))
+    with h5py.File(tmp_path / "t.h5") as file:
+        assert np.array_equal(file["keypoints/positions"][()], (keypoints.rest + 7).numpy()[None])
 
 
 def damage(path, scene, how: str):

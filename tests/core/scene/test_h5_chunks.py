@@ -1,0 +1,50 @@
+"""Datasets that are compressed here can be read by HDF5, and the reverse."""
+
+import h5py
+import numpy as np
+import pytest
+
+from stages.core.scene.h5_chunks import CHUNK_BYTES, COMPRESSED, append_rows, read_compressed, write_compressed
+
+COUNT = CHUNK_BYTES // 12 + 1000  # rows of three floats: two chunks, the second one not full
+ARRAYS = {
+    "floats": np.random.default_rng(0).normal(size=(COUNT, 3)).astype("f4"),
+    "harmonics": np.random.default_rng(1).normal(size=(COUNT // 3, 4, 3)).astype("f4"),
+    "numbers": np.arange(4 * COUNT).astype("i8"),
+    "none": np.zeros((0, 3), "f4"),
+    "one": np.ones((1, 8), "i4"),
+}
+
+
+@pytest.mark.parametrize("name", ARRAYS)
+def test_both_ways_agree_with_hdf5(tmp_path, name):
+    values = ARRAYS[name]
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        write_compressed(file, "ours", values)
+        file.create_dataset("theirs", data=values, **COMPRESSED)
+        file.create_dataset("other", data=values)
+    with h5py.File(tmp_path / "a.h5") as file:
+        assert np.array_equal(file["ours"][()], values) and file["ours"].dtype == values.dtype
+        for data in file.values():
+            assert np.array_equal(read_compressed(data), values)
+        assert file["ours"].id.get_storage_size() < 1.1 * file["theirs"].id.get_storage_size() + 100
+
+
+def test_rows_are_appended(tmp_path):
+    rows = np.random.default_rng(0).normal(size=(5, 7, 3)).astype("f4")
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        data = file.create_dataset("rows", (0, 7, 3), maxshape=(None, 7, 3), chunks=(1, 7, 3), dtype="f4", **COMPRESSED)
+        append_rows(data, rows[:2])
+        append_rows(data, rows[2:])
+    with h5py.File(tmp_path / "a.h5") as file:
+        assert np.array_equal(file["rows"][()], rows) and np.array_equal(read_compressed(file["rows"]), rows)
+
+
+def test_missing_chunks_hold_the_fill_value_and_damaged_ones_are_refused(tmp_path):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        data = file.create_dataset("rows", (4, 3), "f4", chunks=(1, 3), fillvalue=2.0, **COMPRESSED)
+        data[1] = 1.0
+        assert np.array_equal(read_compressed(data), data[()])
+        data.id.write_direct_chunk((2, 0), b"not deflated")
+        with pytest.raises(OSError, match="damaged"):
+            read_compressed(data)

@@ -14,6 +14,7 @@ from scipy import ndimage
 from torch import Tensor
 
 from stages.core.geometry.cameras import centres
+from stages.core.geometry.cells import distinct_cells
 from stages.core.geometry.harmonics import evaluate_sh, rgb_to_sh
 from stages.core.geometry.neighbours import knn
 from stages.core.perception.support import Support
@@ -210,7 +211,7 @@ def _top_view(table: Gaussians, objects: Float[Tensor, "m 3"], support: Support)
         return None
     spacing = float(knn(table.means, table.means[:: max(1, len(table) // 5000)], 4)[0][:, -1].median())
     side = DENT_CELL * support.view.radius
-    area = len((objects[:, :2] / side).floor().unique(dim=0)) * side**2
+    area = len(distinct_cells((objects[:, :2] / side).floor().long())[1]) * side**2
     # half the spacing, since Gaussians are longer than wide
     cell = max(longest / MAX_VIEW_CELLS, spacing / 2, (area / FOOTPRINT_CELLS) ** 0.5)
     width, height = (((high - low) / cell).ceil().long().clamp_min(2)).tolist()

@@ -1,28 +1,33 @@
 """Nearest-neighbour search."""
 
+import os
 from math import inf
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+QUERIES_PER_THREAD = 500  # that take longer than to start a thread
+
 
 class KDTree:
-    """k-d tree on the CPU, for repeated queries."""
+    """k-d tree on the CPU, for repeated queries. Its cells are halved: to balance them takes as long again."""
 
     def __init__(self, points: Float[Tensor, "n d"]):
         from scipy.spatial import cKDTree  # 0.2 s to import, and many runs search no neighbours
 
         if not len(points):
             raise ValueError("the tree needs at least one point")
-        self.size, self.tree = len(points), cKDTree(points.detach().numpy())
+        self.size = len(points)
+        self.tree = cKDTree(points.detach().numpy(), balanced_tree=False, compact_nodes=False)
 
     def query(
         self, points: Float[Tensor, "*b d"], k: int = 1, within: float = inf
     ) -> tuple[Float[Tensor, "*b k"], Int[Tensor, "*b k"]]:
         """Distances and indices of the k nearest points, nearest first; beyond `within` the distance is inf."""
         ranks = list(range(1, k + 1))  # a list keeps the last axis where k is 1
-        distance, index = self.tree.query(points.detach().numpy(), ranks, distance_upper_bound=within, workers=-1)
+        workers = max(1, min(os.cpu_count() or 1, points.numel() // points.shape[-1] // QUERIES_PER_THREAD))
+        distance, index = self.tree.query(points.detach().numpy(), ranks, distance_upper_bound=within, workers=workers)
         return torch.from_numpy(distance).to(points), torch.from_numpy(index).clamp_(max=self.size - 1)
 
 

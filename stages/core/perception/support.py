@@ -12,6 +12,7 @@ from scipy.spatial import ConvexHull, QhullError
 from torch import Tensor
 
 from stages.core.geometry.cameras import centres
+from stages.core.geometry.cells import distinct_cells
 from stages.core.geometry.planes import ransac
 from stages.core.scene.cameras import Cameras
 from stages.core.scene.gaussians import Gaussians
@@ -162,9 +163,7 @@ def _fit(band: Float[Tensor, "n 3"], floor: float, view: ViewExtent, seed: int) 
     """
     R = view.radius
     local = (band - torch.cat([view.focus[:2], torch.tensor([floor])])) / R
-    _, patch, count = (
-        ((local[:, :2] + SEARCH_RADIUS) / 0.02).floor().long().unique(dim=0, return_inverse=True, return_counts=True)
-    )
+    patch, count = distinct_cells(((local[:, :2] + SEARCH_RADIUS) / 0.02).floor().long())
     even = (1 / count[patch].float()) / (1 + (local[:, :2].norm(dim=1) / 0.7) ** 4)
     coefficients = torch.zeros(6, dtype=torch.float64)
     found = ransac(local, 0.004, even, lambda normals: normals[:, 2] > 0.99, trials=300, seed=seed)
@@ -254,20 +253,23 @@ def _region(bare: Support, band: Float[Tensor, "n 3"]) -> Bool[Tensor, "gx gy"]:
     middle = slice(GRID_CELLS // 2 - GRID_CELLS // 8, GRID_CELLS // 2 + GRID_CELLS // 8)
     usual = density[middle, middle]
     seen = density > 0.1 * np.median(usual[usual > 0]) if (usual > 0).any() else density > 0  # ignores stray Gaussians
-    seen = ndimage.binary_closing(np.pad(seen, 40), _disc(4))
+    seen = _closed(np.pad(seen, 40), 4)
     parts, count = ndimage.label(seen)
     if not count:
         return torch.zeros(GRID_CELLS, GRID_CELLS, dtype=torch.bool)
     middle = (np.arange(GRID_CELLS + 80) - GRID_CELLS / 2 - 39.5) * bare.cell / bare.view.radius
     near = 1 / (1 + (np.hypot(*np.meshgrid(middle, middle, indexing="ij")) / 0.5) ** 4)
     best = 1 + int(np.argmax(ndimage.sum(near, parts, np.arange(1, count + 1))))
-    part = ndimage.binary_fill_holes(ndimage.binary_closing(parts == best, _disc(20)))
+    part = ndimage.binary_fill_holes(_closed(parts == best, 20))
     return torch.from_numpy(part[40:-40, 40:-40].copy())
 
 
-def _disc(radius: int) -> np.ndarray:
-    x = np.arange(-radius, radius + 1)
-    return x[:, None] ** 2 + x[None] ** 2 <= radius**2
+def _closed(mask: np.ndarray, radius: int) -> np.ndarray:
+    """Morphological closing by a disc, as `ndimage.binary_closing`, but by distances: the radius costs no time."""
+    if not mask.any():
+        return mask
+    outside = np.pad(ndimage.distance_transform_edt(~mask) > radius, 1, constant_values=True)
+    return (ndimage.distance_transform_edt(~outside) > radius)[1:-1, 1:-1]
 
 
 def topples(points: Float[Tensor, "n 2"], base: Float[Tensor, "m 2"]) -> bool:

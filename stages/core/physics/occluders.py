@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from stages.core.errors import InputError
+from stages.core.geometry.cells import distinct_cells
 from stages.core.physics.keypoints import KEYPOINTS_PER_GAUSSIAN, farthest_points, nearest_weights
 from stages.core.physics.particles import sample_bodies
 from stages.core.physics.skinning import Skinning
@@ -105,7 +106,7 @@ def _projected_area(x: Tensor, spacing: float) -> float:
     for view in _VIEWS:
         a = torch.nn.functional.normalize(torch.linalg.cross(view, torch.tensor([0.12, 0.52, -0.7])), dim=0)
         cells = (torch.stack([x @ a, x @ torch.linalg.cross(view, a)], 1) / spacing).round().long()
-        areas.append(len(cells.unique(dim=0)))
+        areas.append(len(distinct_cells(cells)[1]))
     return sum(areas) / len(areas) * spacing**2
 
 

@@ -1,10 +1,13 @@
-"""Focus and distance of a scene without cameras."""
+"""Focus and distance of a scene without cameras, and the closing of its surface."""
 
 from dataclasses import replace
 
+import numpy as np
+import pytest
 import torch
+from scipy import ndimage
 
-from stages.core.perception.support import MAX_QUANTILE_POINTS, evenly_spaced, view_extent
+from stages.core.perception.support import MAX_QUANTILE_POINTS, _closed, evenly_spaced, view_extent
 from stages.core.scene.scene import Scene
 from tests.conftest import random_gaussians
 
@@ -29,3 +32,12 @@ def test_view_extent_of_many_gaussians_does_not_depend_on_random_state_or_order(
     assert view_extent(Scene(many[torch.arange(len(many) - 1, -1, -1)])).radius == first.radius
     expected = 1.5 * float((means - first.focus).norm(dim=1).sort().values[int(0.8 * len(means))])
     assert abs(first.radius - expected) < 1e-3 * expected
+
+
+@pytest.mark.parametrize("radius", [1, 4, 9])
+def test_closing_by_distances_is_that_by_a_disc(radius):
+    x = np.arange(-radius, radius + 1)
+    disc = x[:, None] ** 2 + x[None] ** 2 <= radius**2
+    for share in (0.0, 0.005, 0.1, 1.0):
+        mask = np.random.default_rng(0).random((60, 45)) < share
+        assert np.array_equal(_closed(mask, radius), ndimage.binary_closing(mask, disc))

@@ -8,7 +8,7 @@ from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from stages.core.backends import pick_device
@@ -68,7 +68,8 @@ def rollout(
              units.time, steps)  # fmt: skip
     sleep = SleepState(initial, _starts_awake(initial, units, setup), setup.on_floor)
     log.info("%d of %d objects are at rest and stay fixed until touched", int(sleep.asleep.sum()), len(ids))
-    lifted = keypoints.rest + setup.lift[[ids.index(int(i)) for i in keypoints.object_id]]
+    row = torch.tensor([ids.index(i) for i in keypoints.object_id.tolist()], dtype=torch.int64)
+    lifted = keypoints.rest + setup.lift[row]
 
     def states() -> Iterator[FrameState]:
         current, held, acting, dt = options, prompts.pinned, prompts.forces, options.dt * units.time / steps
@@ -78,7 +79,7 @@ def rollout(
         for n in range(options.steps):
             moved = ((stepper.points - first) / units.length).cpu()
             check_motion(moved, n, options)
-            yield replace(_state(keypoints, ids, lifted, initial, moved), mass=mass / units.mass)
+            yield replace(_state(keypoints, ids, (row, lifted), initial, moved), mass=mass / units.mass)
             if n == options.steps - 1:
                 continue
             start, end = n * options.dt, (n + 1) * options.dt
@@ -231,14 +232,16 @@ def _warn_extrapolation(initial: InitialConditions, model: Dynamics) -> None:
 
 
 def _state(
-    keypoints: Keypoints, ids: list[int], lifted: Float[Tensor, "p 3"], initial: InitialConditions,
-    moved: Float[Tensor, "1 o n 3"],
+    keypoints: Keypoints, ids: list[int], start: tuple[Int[Tensor, "p"], Float[Tensor, "p 3"]],
+    initial: InitialConditions, moved: Float[Tensor, "1 o n 3"],
 ) -> FrameState:  # fmt: skip
-    """Keypoints and centres of mass displaced by `moved` [scene units] from the `lifted` keypoints."""
-    positions = lifted.clone()
-    for row, i in enumerate(ids):
-        mine = keypoints.object_id == i
-        positions[mine] += moved[0, row, : int(mine.sum())]
-    start = torch.stack([lifted[keypoints.object_id == i].mean(0) for i in ids])
-    centre = start + centre_of_mass(initial, moved)[0]
+    """Keypoints and centres of mass displaced by `moved` [scene units].
+
+    start: the row of the object of each keypoint, and its position once lifted.
+    """
+    row, lifted = start
+    order = row.argsort(stable=True)  # the keypoints of the objects one after the other, as in `initial`
+    positions = lifted.index_add(0, order, moved[0][initial.valid[0]])
+    count = torch.bincount(row, minlength=len(ids))[:, None]
+    centre = torch.zeros(len(ids), 3).index_add(0, row, lifted) / count + centre_of_mass(initial, moved)[0]
     return FrameState(positions, centre, object_rotations(keypoints, positions, ids))

@@ -15,9 +15,10 @@ import os
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import cache
+from functools import cache, partial
 from queue import SimpleQueue
 from threading import Thread
+from typing import Any
 
 import torch
 
@@ -39,6 +40,20 @@ def run_parallel(tasks: Sequence[Task]) -> None:
     errors = [error for _ in tasks if (error := batch[1].get()) is not None]
     if errors:
         raise errors[0]
+
+
+def parallel_map(function: Callable[[Any], Any], items: Sequence[Any]) -> list[Any]:
+    """Results of a function for independent items, in order, by `run_parallel`.
+
+    For functions that spend their time in NumPy, SciPy or PyTorch, which release Python's lock.
+    """
+    results: list[Any] = [None] * len(items)
+
+    def task(i: int) -> None:
+        results[i] = function(items[i])
+
+    run_parallel([partial(task, i) for i in range(len(items))])
+    return results
 
 
 def _work(batch: Batch) -> None:

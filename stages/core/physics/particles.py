@@ -25,6 +25,7 @@ from torch import Tensor
 from stages.core.errors import InputError
 from stages.core.geometry.neighbours import knn
 from stages.core.geometry.rotations import matrix
+from stages.core.kernels.threads import parallel_map
 from stages.core.perception.support import topples
 from stages.core.scene.gaussians import Gaussians
 from stages.core.scene.scene import Scene
@@ -61,15 +62,16 @@ def sample_bodies(scene: Scene, count: int, seed: int = 0, skin: bool = False) -
     Objects that stood on the floor in photos but would tip over as reconstructed are extended down to the floor.
     Raises InputError for an object without any usable Gaussian.
     """
-    clouds = [surface_points(scene, o.id, seed) for o in scene.objects]
+    clouds = parallel_map(lambda o: surface_points(scene, o.id, seed), scene.objects)
     photographed = scene.cameras is not None  # so the objects were at rest
-    gaps = [_gap(c) for c in clouds]
+    gaps = parallel_map(_gap, clouds)
     extent = max(float((c.max(0) - c.min(0)).max()) for c in clouds)
     # closing bridges up to eight voxels; smaller voxels would break a sparse object into pieces
     finest = max(extent / MAX_VOXELS_ALONG, max(gaps) / 8, 1e-4 * scene_size(scene), 1e-9)
     h = max(extent / 40, finest)
     for _ in range(5):  # filled bodies hold ~ h^-3 voxels, shells ~ h^-2
-        solids = [_solid(c, h, gap, scene.floor, photographed, skin) for c, gap in zip(clouds, gaps, strict=True)]
+        rows = list(zip(clouds, gaps, strict=True))
+        solids = parallel_map(lambda row, h=h: _solid(row[0], h, row[1], scene.floor, photographed, skin), rows)
         voxels = _without_overlap([v for v, _, _ in solids])
         ratio = sum(map(len, voxels)) / count
         if 0.9 < ratio < 1.05 or (ratio < 1 and h <= finest):

@@ -6,7 +6,7 @@ import time
 import pytest
 import torch
 
-from stages.core.kernels.threads import large_operation, run_parallel, small_operations
+from stages.core.kernels.threads import large_operation, parallel_map, run_parallel, small_operations
 
 
 @pytest.fixture(params=[1, 2, 4])
@@ -22,6 +22,12 @@ def test_each_task_runs_once(threads, count):
     done = []
     run_parallel([lambda i=i: done.append(i) for i in range(count)])
     assert sorted(done) == list(range(count))
+
+
+def test_results_are_in_the_order_of_the_items(threads):
+    """Also where a task has tasks of its own."""
+    assert parallel_map(lambda i: sum(parallel_map(lambda j: i * j, range(4))), range(7)) == [6 * i for i in range(7)]
+    assert parallel_map(str, []) == []
 
 
 def test_an_exception_is_raised_after_all_tasks_have_ended(threads):

@@ -24,14 +24,14 @@ DEPTH_COLOURS = ((0.99, 0.93, 0.60), (0.98, 0.62, 0.30), (0.85, 0.27, 0.34), (0.
 
 
 class RenderedView(NamedTuple):
-    """Image and depth of one camera, on the CPU."""
+    """Image and depth of one camera, on the device of the Gaussians."""
 
     image: Tensor  # (h, w, 3) RGB over the background
     depth: Tensor  # (h, w) [scene units], 0 where there is no surface
 
 
 def render_view(gaussians: Gaussians, camera: Cameras, index: int, background: RenderBackground) -> RenderedView:
-    """Render one of the cameras on the device of the Gaussians."""
+    """Render one of the cameras."""
     device = gaussians.means.device
     width, height = camera.sizes[index].tolist()
     with torch.no_grad():
@@ -39,7 +39,7 @@ def render_view(gaussians: Gaussians, camera: Cameras, index: int, background: R
             gaussians, camera.viewmats[[index]].to(device), camera.Ks[[index]].to(device), width, height,
             background=background.image(width, height),
         )  # fmt: skip
-    image, alpha, depth = (x[0].float().cpu() for x in (drawn.rgb, drawn.alpha, drawn.depth))
+    image, alpha, depth = (x[0].float() for x in (drawn.rgb, drawn.alpha, drawn.depth))
     return RenderedView(image.clamp(0, 1), torch.where(alpha > MIN_DEPTH_OPACITY, depth, 0.0))
 
 
@@ -65,14 +65,14 @@ def depth_range(depths: list[Float[Tensor, "h w"]]) -> tuple[float, float]:
     if not len(values):
         return 0.0, 1.0
     values = values[:: max(1, len(values) // MAX_QUANTILE_SAMPLES)]
-    low, high = torch.quantile(values, torch.tensor(DEPTH_QUANTILES)).tolist()
+    low, high = torch.quantile(values, torch.tensor(DEPTH_QUANTILES).to(values)).tolist()
     return low, max(high, low + 1e-6)
 
 
 def colour_depth(depth: Float[Tensor, "h w"], span: tuple[float, float]) -> Float[Tensor, "h w 3"]:
     """Colour-coded depth: bright is near, dark is far, black is no surface."""
     low, high = span
-    colours = torch.tensor(DEPTH_COLOURS)
+    colours = torch.tensor(DEPTH_COLOURS).to(depth)
     position = ((depth - low) / (high - low)).clamp(0, 1) * (len(colours) - 1)
     first = position.floor().long().clamp(max=len(colours) - 2)
     image = torch.lerp(colours[first], colours[first + 1], (position - first)[..., None])

@@ -87,4 +87,4 @@ def add_legend(image: Image, objects: Sequence[SceneObject]) -> Image:
         left, top = i // rows * column + MARGIN, i % rows * ROW_HEIGHT + MARGIN
         cv2.rectangle(panel, (left, top), (left + 16, top + 14), colour, cv2.FILLED)
         cv2.putText(panel, text, (left + 16 + MARGIN, top + 12), FONT, LEGEND_TEXT_SIZE, (0, 0, 0), 1, cv2.LINE_AA)
-    return torch.cat([image, torch.from_numpy(panel).float() / 255], 1)
+    return torch.cat([image.cpu(), torch.from_numpy(panel).float() / 255], 1)

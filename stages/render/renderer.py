@@ -71,6 +71,8 @@ class Clip:
         trajectory, options = self.animation.trajectory, self.options
         if options.shadows == "off" or options.ids or options.depth or trajectory is None or trajectory.dense:
             return None
+        if bool((trajectory.positions == trajectory.keypoints.rest).all()):
+            return None
         from stages.core.physics.shadow_casting import find_shadows  # noqa: PLC0415 -- 0.3 s of scipy
 
         return find_shadows(

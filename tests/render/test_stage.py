@@ -88,6 +88,12 @@ def test_shadows_are_drawn_once_an_object_moved_and_can_be_switched_off(two_ball
         render_options(shadows="maybe")
 
 
+def test_no_light_is_estimated_where_nothing_moves(two_balls, tmp_path):
+    out = tmp_path / "still.png"
+    render_image(rising(tmp_path / "still.h5", two_balls, frames=3, step=0.0), out, resolution=32)
+    assert "light" not in json.loads(out.with_name("still.png.json").read_text())
+
+
 def test_image_of_a_trajectory_is_a_contact_sheet(trajectory, tmp_path):
     sheet = render_image(trajectory, tmp_path / "sheet.png", view="input:0")
     assert sheet.shape == (2 * 48, 4 * 48, 3)  # six frames in two rows of four

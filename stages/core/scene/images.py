@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from fractions import Fraction
 from pathlib import Path
 from types import ModuleType
@@ -19,6 +21,8 @@ from stages.core.scene.files import must_exist, replacing
 from stages.core.scene.formats import IMAGE_SUFFIXES
 
 MAX_VIDEO_PIXELS = 1 << 26  # of a frame; 8K has half as many
+ENCODER_THREADS = 4  # not those of the machine: the file depends on their number
+MAX_PENDING_FRAMES = 8  # of a video, that wait for the encoder
 
 
 def list_photos(folder: Path) -> list[Path]:
@@ -75,7 +79,7 @@ def resize(image: Float[Tensor, "h w c"], width: int, height: int) -> Float[Tens
 
 def to_bytes(image: Float[Tensor, "h w 3"]) -> np.ndarray:
     """8-bit RGB (h, w, 3), clamped and rounded."""
-    return (image.detach().cpu().clamp(0, 1) * 255).round().to(torch.uint8).numpy()
+    return (image.detach().clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
 
 
 def write_png(path: Path, image: Float[Tensor, "h w 3"]) -> None:
@@ -117,33 +121,44 @@ def _write_pixels(path: Path, pixels: np.ndarray) -> None:
 class VideoWriter:
     """Context manager that writes an H.264 MP4 (yuv420p, index first, as browsers need it) frame by frame.
 
-    The file appears only on success. yuv420p needs even sizes: the last row or column of odd ones is dropped.
+    A thread encodes while the next frames are made. The file appears only on success. yuv420p needs even sizes: the
+    last row or column of odd ones is dropped.
     """
 
     def __init__(self, path: Path, fps: float):
         self.path, self.fps = Path(path), fps
         self._stream = None
+        self._pending: deque[Future] = deque()
 
     def __enter__(self) -> VideoWriter:
         self._av = import_av(self.path)
         self._replacing = replacing(self.path)
         self._file = self._av.open(str(self._replacing.__enter__()), "w", options={"movflags": "faststart"})
+        self._thread = ThreadPoolExecutor(1)
         return self
 
     def append(self, image: Float[Tensor, "h w 3"]) -> None:
-        """Encode one frame, RGB in 0..1; all frames have the size of the first."""
-        pixels = to_bytes(image)
+        """Encode one frame, RGB in 0..1; all frames have the size of the first. Raises the errors of earlier ones."""
+        self._pending.append(self._thread.submit(self._encode, to_bytes(image)))
+        while len(self._pending) > MAX_PENDING_FRAMES:
+            self._pending.popleft().result()
+
+    def _encode(self, pixels: np.ndarray) -> None:
         pixels = pixels[: pixels.shape[0] // 2 * 2, : pixels.shape[1] // 2 * 2]
         if self._stream is None:
             rate = Fraction(self.fps).limit_denominator(1000)
             self._stream = self._file.add_stream("libx264", rate=rate, options={"crf": "17", "preset": "medium"})
             self._stream.height, self._stream.width = pixels.shape[:2]
             self._stream.pix_fmt = "yuv420p"
+            self._stream.codec_context.thread_count = ENCODER_THREADS
         frame = self._av.VideoFrame.from_ndarray(np.ascontiguousarray(pixels), format="rgb24")
         self._file.mux(self._stream.encode(frame))
 
     def __exit__(self, kind, error, trace) -> None:
+        self._thread.shutdown(cancel_futures=kind is not None)
         try:
+            for encoded in self._pending if kind is None else ():
+                encoded.result()
             if kind is None and self._stream is not None:
                 self._file.mux(self._stream.encode())
             self._file.close()

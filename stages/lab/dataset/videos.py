@@ -14,8 +14,7 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -56,7 +55,7 @@ def write_initial(
             rendered = render_view(gaussians, cameras, i, backdrop)
             video.append(rendered.image)
             if i in views:
-                depths.append(rendered.depth)
+                depths.append(rendered.depth.cpu())
     (folder / "cameras.json").write_text(json.dumps(camera_rows(cameras.viewmats, resolution)))
     (folder / "prompts.json").write_text(json.dumps(prompts(config, rest, cameras)))
     (folder / "depth.h5").write_bytes(_depth_file(torch.stack(depths), views))
@@ -91,19 +90,16 @@ def write_dynamic(
     paths: dict[int, Path], scene: SkinnedScene, x: Sequence[Tensor], F: Sequence[Tensor], background: Gaussians,
     resolution: int,
 ) -> None:  # fmt: skip
-    """Write one video for each view in `paths`; threads encode a frame while the next one is rendered.
+    """Write one video for each view in `paths`.
 
     `x` and `F` are the particle positions (p, 3) [m] and deformation gradients (p, 3, 3) of each frame.
     """
     cameras, backdrop = orbit_cameras(resolution), RenderBackground(keep_scene=False, gaussians=background)
     for path in paths.values():
         path.parent.mkdir(parents=True, exist_ok=True)
-    with ExitStack() as stack, ThreadPoolExecutor(len(paths)) as pool:
-        videos = [stack.enter_context(VideoWriter(path, FPS)) for path in paths.values()]
-        pending: Iterator[None] = iter(())
+    with ExitStack() as stack:
+        videos = {i: stack.enter_context(VideoWriter(path, FPS)) for i, path in paths.items()}
         for positions, gradients in zip(x, F, strict=True):
             gaussians = backdrop.compose(scene.at(positions, gradients)[0])
-            images = [render_view(gaussians, cameras, i, backdrop).image for i in paths]
-            list(pending)  # the frames of a video are encoded in order
-            pending = pool.map(VideoWriter.append, videos, images)
-        list(pending)
+            for i, video in videos.items():
+                video.append(render_view(gaussians, cameras, i, backdrop).image)

@@ -28,22 +28,23 @@ class ObservedSpace:
     views: list[tuple[Tensor, Tensor, int, int]]  # viewmat, K, width, height
     depth: list[Float[Tensor, "h w"]]
     weight: Float[Tensor, "n"]  # of each Gaussian, maximum over the views [px]; empty without views
+    device: str = "cpu"  # that renders; the maps are on the CPU
 
     @staticmethod
     @torch.no_grad()
-    def of(scene: Scene) -> ObservedSpace:
+    def of(scene: Scene, device: str = "cpu") -> ObservedSpace:
         """Depth maps rendered from the scene; each pixel takes the minimum over 3 x 3 pixels, to be conservative."""
         if scene.cameras is None or not len(scene.cameras):
             return ObservedSpace([], [], torch.zeros(0))
-        views, maps = downscaled_views(scene.cameras), []
-        weight = torch.zeros(len(scene.gaussians))
+        views, maps, g = downscaled_views(scene.cameras), [], scene.gaussians.to(device)
+        weight = torch.zeros_like(g.opacities)
         for viewmat, K, width, height in views:
-            rendered = rasterise(scene.gaussians, viewmat[None], K[None], width, height)
+            rendered = rasterise(g, viewmat[None], K[None], width, height)
             depth = torch.where(rendered.alpha[0] > MIN_OPAQUE_ALPHA, rendered.depth[0], 0.0)
             depth = torch.where(rendered.alpha[0] < MAX_EMPTY_ALPHA, FAR, depth)
-            maps.append(-torch.nn.functional.max_pool2d(-depth[None], 3, 1, 1)[0])
-            weight = torch.maximum(weight, visibility(scene.gaussians, viewmat, K, width, height)[1])
-        return ObservedSpace(views, maps, weight)
+            maps.append(-torch.nn.functional.max_pool2d(-depth[None], 3, 1, 1)[0].cpu())
+            weight = torch.maximum(weight, visibility(g, viewmat, K, width, height)[1])
+        return ObservedSpace(views, maps, weight.cpu(), device)
 
     def is_free(self, points: Float[Tensor, "n 3"], margin: float) -> Bool[Tensor, "n"]:
         """Points more than `margin` in front of the surface in the depth map of a camera.
@@ -80,25 +81,26 @@ class ObservedSpace:
         In each view, the weight of one must not exceed `max_weight` [px of the downscaled images], or `max_leak` times
         its unoccluded weight, since a large disc behind a slightly transparent surface has some weight.
         """
-        keep = torch.ones(len(added), dtype=torch.bool)
-        joint = concatenate([scene, added])
+        joint, added = concatenate([scene, added]).to(self.device), added.to(self.device)
+        keep = torch.ones(len(added), dtype=torch.bool, device=self.device)
         for viewmat, K, width, height in self.views:
             weight = visibility(joint, viewmat, K, width, height)[1][len(scene) :]
             bare = visibility(added, viewmat, K, width, height)[1]
             keep &= weight <= (max_leak * bare).clamp_min(max_weight)
-        return keep
+        return keep.cpu()
 
 
 @torch.no_grad()
-def object_psnr(before: Scene, after: Scene, max_views: int = 4) -> float | None:
+def object_psnr(before: Scene, after: Scene, max_views: int = 4, device: str = "cpu") -> float | None:
     """PSNR [dB] between two states of a scene in the pixels of objects, over `max_views` cameras; None without any."""
     if before.cameras is None or not len(before.cameras):
         return None
     error = count = 0.0
+    states = [scene.gaussians.to(device) for scene in (before, after)]
     for viewmat, K, width, height in downscaled_views(before.cameras, max_views):
-        one, two = (rasterise(s.gaussians, viewmat[None], K[None], width, height).rgb[0] for s in (before, after))
-        index, _ = visibility(before.gaussians, viewmat, K, width, height)
-        on = (index >= 0) & (before.gaussians.object_id[index.clamp_min(0)] > 0)
+        one, two = (rasterise(g, viewmat[None], K[None], width, height).rgb[0] for g in states)
+        index, _ = visibility(states[0], viewmat, K, width, height)
+        on = (index >= 0) & (states[0].object_id[index.clamp_min(0)] > 0)
         error += float((one.clamp(0, 1) - two.clamp(0, 1))[on].square().sum())
         count += 3 * float(on.sum())
     return None if not count else -10 * math.log10(max(error / count, 1e-10))

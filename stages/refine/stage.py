@@ -33,14 +33,14 @@ def run(scene: Path, out: Path, options: RefineOptions = RefineOptions()) -> Non
 
     Raises InputError for invalid inputs, such as a scene without objects; then nothing is written.
     """
-    pick_device(options.device)  # raises for an absent GPU; only registration and generators use one
+    device = pick_device(options.device)
     whole = read_scene(scene)
     if not bool((whole.gaussians.object_id > 0).any()):
         raise InputError(f"{scene}: has no objects; label them with `ngff segment {scene} -o labelled.ply` first")
     refined = refine(whole, options)
     facts = {**provenance("refine", [Path(scene)], options), "scene": whole.provenance}
     write_scene(out, replace(refined, provenance=facts))
-    psnr = object_psnr(whole, refined)
+    psnr = object_psnr(whole, refined, device=device)
     seen = "" if psnr is None else f"; PSNR against the input in the views of the photos {psnr:.1f} dB"
     log.info("%s: %d Gaussians, from %d%s", out, len(refined.gaussians), len(whole.gaussians), seen)
 
@@ -65,7 +65,7 @@ def _refined(scene: Scene, support: Support | None, options: RefineOptions) -> S
     g = grow_objects(scene.gaussians, support, _growth_radius(scene.gaussians))
     outliers = floaters(g, options.outliers) if options.outliers else torch.zeros(len(g), dtype=torch.bool)
     scene = replace(scene, gaussians=g[~outliers])
-    observed = ObservedSpace.of(scene)
+    observed = ObservedSpace.of(scene, pick_device(options.device))
     numbers = [i for i in scene.gaussians.object_id.unique().tolist() if i > 0]
     added = [completer(scene, i, observed, support, options) for i in tqdm(numbers, unit="object")]
     added = concatenate([empty_like(scene.gaussians), *added])

@@ -166,21 +166,21 @@ def passes(eyes: torch.Tensor, places: torch.Tensor, grown: float) -> torch.Tens
     return torch.minimum(one, two).amax(2) > torch.maximum(one, two).amin(2).clamp_max(1.0)
 
 
-def test_visible_fraction_equals_ray_casting(before):
+def test_visible_fraction_equals_ray_casting(before, device):
     """Beside the block a place is seen by those cameras that it does not stand in the way of."""
     places = 0.36 * torch.rand(60, 3, generator=torch.Generator().manual_seed(0)) - 0.18
     places[:, 2] = 0.0
     places = places[((places[:, 0].abs() > 0.13) | (places[:, 1].abs() > 0.11))]
     eyes = centres(before.cameras.viewmats)
     least, most = (passes(eyes, places, grown).float().mean(0) for grown in (0.02, -0.005))
-    found = ObservedSpace.of(before).visible_fraction(places, 0.02)
+    found = ObservedSpace.of(before, device).visible_fraction(places, 0.02)
     assert bool((found >= least - 1e-6).all() and (found <= most + 1e-6).all())
     assert bool((least == most).float().mean() > 0.3) and float(least.min()) < 0.7 < float(most.max())
     inside = torch.tensor([[0.0, 0.0, 0.0], [0.05, -0.04, 0.0]])
-    assert float(ObservedSpace.of(before).visible_fraction(inside, 0.02).max()) == 0.0
+    assert float(ObservedSpace.of(before, device).visible_fraction(inside, 0.02).max()) == 0.0
 
 
-def test_large_discs_are_hidden_only_behind_a_surface():
+def test_large_discs_are_hidden_only_behind_a_surface(device):
     x = torch.cartesian_prod(torch.linspace(-0.2, 0.2, 41), torch.linspace(-0.2, 0.2, 41))
     up = torch.tensor([0.0, 0.0, 1.0])
     flat = torch.cat([x, torch.zeros(len(x), 1)], 1)
@@ -191,11 +191,11 @@ def test_large_discs_are_hidden_only_behind_a_surface():
     scene = Scene(fur, cameras=Cameras(viewmats, Ks, torch.tensor([[200, 200]]), ("a",)))
     _, weight = visibility(concatenate([fur, wide[:1]]), viewmats[0], Ks[0], 200, 200)
     assert float(weight[-1]) > 0.3  # [px]: a little through each of many pixels
-    assert ObservedSpace.of(scene).is_hidden(fur, wide).tolist() == [True, False]
+    assert ObservedSpace.of(scene, device).is_hidden(fur, wide).tolist() == [True, False]
 
 
-def test_views_of_the_photos_are_unchanged(before, after):
-    assert object_psnr(before, after) > 35
+def test_views_of_the_photos_are_unchanged(before, after, device):
+    assert object_psnr(before, after, device=device) > 35
 
 
 def test_object_in_a_dent_is_not_covered():

@@ -10,7 +10,7 @@ The number of iterations is fixed beforehand and independent of time, so a seed 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import torch
 import torch.nn.functional as F
@@ -71,6 +71,8 @@ class _Fit:
 
     values: dict[str, Tensor]
     moments: dict[str, Moments]
+    rates: dict[str, Float[Tensor, "1"]]  # learning rates, but for that of the means, which decays
+    steps: Float[Tensor, "1"]  # that were taken
     camera_distance: float  # [scene units]
     gradients: Float[Tensor, "n"]  # sum of the norms of the means' gradients since the last split
 
@@ -89,28 +91,30 @@ class _Fit:
         }
         values = {name: value.clone().requires_grad_() for name, value in values.items() if value.numel()}
         moments = {name: Moments.like(value) for name, value in values.items()}
-        return cls(values, moments, camera_distance, torch.zeros(len(gaussians), device=device))
+        rates = {name: torch.full((1,), rate, device=device) for name, rate in LEARNING_RATES.items()}
+        steps, gradients = torch.zeros(1, device=device), torch.zeros(len(gaussians), device=device)
+        return cls(values, moments, rates, steps, camera_distance, gradients)
 
     def gaussians(self) -> Gaussians:
-        """The Gaussians with activations applied, differentiable."""
+        """The Gaussians with activations applied, differentiable; the projection normalises the quats."""
         v = self.values
         sh = torch.cat([v["base"], v["rest"]], 1) if "rest" in v else v["base"]
         ids = torch.zeros(len(sh), dtype=torch.int64, device=sh.device)
-        quats = F.normalize(v["quats"], dim=1)
-        return Gaussians(v["means"], quats, v["scales"].exp(), v["opacities"].sigmoid(), sh, ids)
+        return Gaussians(v["means"], v["quats"], v["scales"].exp(), v["opacities"].sigmoid(), sh, ids)
 
-    def descend(self, grads: dict[str, Tensor], means_rate: float | Tensor) -> None:
+    def descend(self, grads: dict[str, Tensor], means_rate: Float[Tensor, "1"]) -> None:
         """One step of Adam."""
+        self.steps += 1
         for name, value in self.values.items():
-            rate = means_rate if name == "means" else LEARNING_RATES[name]
-            adam_step(value, grads[name], self.moments[name], rate)
+            rate = means_rate if name == "means" else self.rates[name]
+            adam_step(value, grads[name], self.moments[name], rate, self.steps)
 
     def select(self, index: Int[Tensor, "m"], fresh: Int[Tensor, "k"]) -> None:
         """Keep (or repeat) these Gaussians with their Adam moments; moments at positions `fresh` are set to zero."""
         for name in self.values.keys() - {"gains"}:
             self.values[name] = self.values[name].detach()[index].clone().requires_grad_()
             old = self.moments[name]
-            self.moments[name] = Moments(old.first[index], old.second[index], old.steps)
+            self.moments[name] = Moments(old.first[index], old.second[index])
             self.moments[name].first[fresh] = 0
             self.moments[name].second[fresh] = 0
         self.gradients = torch.zeros(len(index), device=index.device)
@@ -210,7 +214,7 @@ class _Steps:
     def run(self, bar: tqdm) -> None:
         """Take all steps."""
         for step, ((group, row), (_, grey, rate)) in enumerate(zip(self.places, self.schedule, strict=True)):
-            loss = _descend(self.fit, group, torch.tensor([row]), torch.tensor([grey]), rate)
+            loss = _descend(self.fit, group, torch.tensor([row]), torch.tensor([grey]), torch.tensor([rate]))
             bar.update()
             if step % 20 == 0:
                 bar.set_postfix(loss=f"{float(loss):.4f}")
@@ -261,8 +265,8 @@ class _CapturedSteps(_Steps):
 
 
 def _descend(
-    fit: _Fit, group: _Targets, row: Int[Tensor, "1"], grey: Float[Tensor, "1"], means_rate: float | Tensor,
-    pairs: Capacity | None = None,
+    fit: _Fit, group: _Targets, row: Int[Tensor, "1"], grey: Float[Tensor, "1"],
+    means_rate: Float[Tensor, "1"], pairs: Capacity | None = None,
 ) -> Float[Tensor, ""]:  # fmt: skip
     """One step on the photo in this row of the group; returns the loss before it."""
     loss = _loss(fit, group, row, grey, pairs)
@@ -321,6 +325,7 @@ def _rotate(quats: Float[Tensor, "n 4"], vectors: Float[Tensor, "n 3"]) -> Float
 def _prune(fit: _Fit, views: Views, visible: Bool[Tensor, "n"]) -> Gaussians:
     """The Gaussians without those that are transparent, in no photo, too large, or right in front of a camera."""
     done = fit.gaussians()
+    done = replace(done, quats=F.normalize(done.quats, dim=1))
     done = Gaussians(*(getattr(done, field.name).detach().cpu() for field in fields(Gaussians)))
     eyes = centres(views.cameras.viewmats)
     close = torch.cdist(done.means, eyes).min(1).values < DENSITY.min_lens_distance * fit.camera_distance

@@ -41,31 +41,29 @@ def _step(
 
 @dataclass
 class Moments:
-    """State of Adam for one tensor: running means of the gradient and of its square, and the number of steps (1,)."""
+    """State of Adam for one tensor: running means of the gradient and of its square."""
 
     first: Tensor
     second: Tensor
-    steps: Tensor
 
     @classmethod
     def like(cls, value: Tensor) -> Moments:
         """The moments of a tensor before its first step: zeros."""
         zeros = torch.zeros_like(value.detach())
-        return cls(zeros, zeros.clone(), torch.zeros(1, device=value.device))
+        return cls(zeros, zeros.clone())
 
 
 @torch.no_grad()
-def adam_step(value: Tensor, grad: Tensor, moments: Moments, rate: float | Tensor) -> None:
-    """Change `value` and its moments in place by one step with this learning rate.
+def adam_step(value: Tensor, grad: Tensor, moments: Moments, rate: Tensor, steps: Tensor) -> None:
+    """Change `value` and its moments in place by one step with this learning rate (1,), the `steps`-th (1,).
 
-    On CUDA a rate (1,) on the device can change between replays of a CUDA graph.
+    All are on one device. On CUDA nothing waits for the GPU, and steps and rate can change between replays of a CUDA
+    graph.
     """
     grad = grad.contiguous()
     if not value.is_cuda:
-        adam([value], [grad], [moments.first], [moments.second], [], [moments.steps], fused=True, amsgrad=False,
+        adam([value], [grad], [moments.first], [moments.second], [], [steps - 1], fused=True, amsgrad=False,
              beta1=BETA1, beta2=BETA2, lr=float(rate), weight_decay=0.0, eps=EPSILON, maximize=False)  # fmt: skip
         return
-    moments.steps += 1
-    rate = rate if isinstance(rate, Tensor) else torch.full((1,), rate, device=value.device)
-    flat = [view(t.view(-1)) for t in (grad, moments.steps, rate, value, moments.first, moments.second)]
+    flat = [view(t.view(-1)) for t in (grad, steps, rate, value, moments.first, moments.second)]
     launch(_step, value.numel(), flat, device=device_of(value))

@@ -21,6 +21,7 @@ from tqdm import tqdm
 from stages.core.geometry.cameras import centres
 from stages.core.geometry.rotations import matrix
 from stages.core.kernels.adam import Moments, adam_step
+from stages.core.kernels.splat.photometric_loss import LossTerms, photometric_loss
 from stages.core.kernels.splat.projection import pack_camera
 from stages.core.kernels.splat.ssim import ssim
 from stages.core.kernels.splat.tiles import Capacity
@@ -280,18 +281,13 @@ def _loss(
     fit: _Fit, group: _Targets, row: Int[Tensor, "1"], grey: Float[Tensor, "1"], pairs: Capacity | None
 ) -> Float[Tensor, ""]:
     """Loss of the render of one photo in front of a grey background."""
-    photo, camera = group.images.index_select(0, row)[0].float() / 255, group.cameras.index_select(0, row)[0]
+    photo, camera = group.images.index_select(0, row)[0], group.cameras.index_select(0, row)[0]
     gaussians, gain = fit.gaussians(), (group.exposures.index_select(0, row)[0] @ fit.values["gains"]).exp()
     rgb, alpha, depth, *_ = rasterise_packed(gaussians, camera, *group.size, grey.expand(3), pairs)
-    image = rgb * gain
-    loss = (1 - SSIM_WEIGHT) * (image - photo).abs().mean() + SSIM_WEIGHT * (1 - ssim(image, photo))
-    loss = loss + SCALE_WEIGHT * gaussians.scales.mean() / fit.camera_distance
-    if group.inverse is not None:
-        depth = depth.clamp_min(MIN_DEPTH * fit.camera_distance)
-        error = fit.camera_distance / depth - group.inverse.index_select(0, row)[0]
-        known = error.isfinite() & (alpha > 0.5)
-        loss = loss + DEPTH_WEIGHT * torch.where(known, error, torch.zeros_like(error)).abs().mean()
-    return loss
+    inverse = None if group.inverse is None else group.inverse.index_select(0, row)[0]
+    terms = LossTerms(SSIM_WEIGHT, DEPTH_WEIGHT, fit.camera_distance, MIN_DEPTH * fit.camera_distance)
+    loss = photometric_loss(rgb, alpha, depth, gain, photo, inverse, terms)
+    return loss + SCALE_WEIGHT * gaussians.scales.mean() / fit.camera_distance
 
 
 def _split(fit: _Fit, generator: torch.Generator) -> None:

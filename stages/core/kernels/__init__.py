@@ -16,6 +16,7 @@ GPU, is used for the fused inference step of the force field; its modules are im
 | splat/compositing(_adjoint)   | C++ snippets, CPU only      | `compositing.composite_reference`                    |
 | splat/compositing_cuda        | CUDA snippets               | `compositing.composite_reference`                    |
 | splat/ssim, ssim_pixel        | C++ snippets (CPU), Warp    | `ssim.ssim_reference`                                |
+| splat/photometric_loss        | PyTorch (CPU), Warp         | `photometric_loss_reference` in the file             |
 | mpm/transfers, grid, nodes,   | Warp with C++ and CUDA      | `transfers.substep_reference` (one free substep);    |
 |   split, fused, exact         |   snippets                  |   split and fused are tested against each other      |
 | mpm/contact                   | Warp                        | momentum, Coulomb's law, slopes                      |

@@ -163,7 +163,13 @@ def _launch(kernel: wp.Kernel, first: Tensor, second: Tensor, maps: int, *output
 
 def _passes(image: Tensor):
     """Forward and backward pass for the image's device."""
-    return (ssim_pixel.ssim_forward, ssim_pixel.ssim_backward) if image.is_cuda else (_forward, _backward)
+    return (_pixel_forward, ssim_pixel.ssim_backward) if image.is_cuda else (_forward, _backward)
+
+
+def _pixel_forward(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
+    """As `_forward`; the derivatives are in the order of `ssim_pixel`."""
+    ssim_map, derivatives = ssim_pixel.ssim_forward(first, second)
+    return ssim_map.mean(), derivatives
 
 
 class _Ssim(torch.autograd.Function):

@@ -92,14 +92,14 @@ def _gather(
 
 
 def ssim_forward(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean SSIM of images (h, w, c), and the derivatives (h, w * c, 3) of the SSIM map by the first image's mean and
-    variance and by the covariance."""
+    """SSIM map (h, w * c) of images (h, w, c), and its derivatives (h, w * c, 3) by the first image's mean and variance
+    and by the covariance."""
     x, y = first.flatten(1), second.flatten(1)
     sums, ssim_map, derivatives = x.new_empty(*x.shape, 5), torch.empty_like(x), x.new_empty(*x.shape, 3)
     launch(_down, x.shape, [taps(WINDOW), view(x), view(y)], [view(sums, maps5)], device_of(x))
     launch(_compare, x.shape, [taps(WINDOW), first.shape[2], view(sums, maps5)],
            [view(ssim_map), view(derivatives, wp.vec3)], device_of(x))  # fmt: skip
-    return ssim_map.mean(), derivatives
+    return ssim_map, derivatives
 
 
 def ssim_backward(first: Tensor, second: Tensor, derivatives: Tensor) -> Tensor:

@@ -58,7 +58,7 @@ def build_scene(found: SceneGeometry, options: ReconstructOptions, steps: StepCa
     reference = parse_scale(options.scale_reference)
     length = reference.in_scene_units(found.views.cameras, found.radius) if reference else None
     with steps.timed("Gaussians"):
-        cloud = _fused_points(observed, found, options)
+        cloud = _fused_points(observed, found, options, device)
         ground = _find_ground(cloud, observed.views, found, options)
         to_world = world_frame.to_world(
             ground, cloud.points, observed.views.cameras.viewmats, metric=options.cameras is not None
@@ -86,9 +86,11 @@ def build_scene(found: SceneGeometry, options: ReconstructOptions, steps: StepCa
     return Reconstruction(scene, views, found.trained, found.held_out, found.dropped, advice)
 
 
-def _fused_points(observed: DepthViews, found: SceneGeometry, options: ReconstructOptions) -> OrientedPoints:
+def _fused_points(
+    observed: DepthViews, found: SceneGeometry, options: ReconstructOptions, device: str
+) -> OrientedPoints:
     """Points of the consistent depth, as many as the quality preset has Gaussians."""
-    cloud = initialise.fuse(observed)
+    cloud = initialise.fuse(observed.to(device)).to("cpu")
     if len(cloud) < MIN_DEPTH_SAMPLES:
         raise InputError(f"{found.source}: depth is consistent at too few points ({len(cloud)}); give more, sharper "
                          "photos, closer together and of objects with some pattern")  # fmt: skip
@@ -110,8 +112,8 @@ def unmatched_gaussians(
     observed: DepthViews, cloud: OrientedPoints, ground: Ground, options: ReconstructOptions, device: str
 ) -> list[Gaussians]:
     """Sparser, more transparent Gaussians for pixels without consistent depth; an empty list if there are few."""
-    more = initialise.fill_unmatched(observed, cloud, ground.plane, FAR_DEPTH * ground.radius, device=device)
-    more = initialise.downsample(more, options.preset.gaussians // 4, ground.focus, ground.radius)
+    more = initialise.fill_unmatched(observed.to(device), cloud, ground.plane, FAR_DEPTH * ground.radius)
+    more = initialise.downsample(more.to("cpu"), options.preset.gaussians // 4, ground.focus, ground.radius)
     return [initialise.to_gaussians(more, torch.full((len(more),), 0.5), 0)] if len(more) > 10 else []
 
 

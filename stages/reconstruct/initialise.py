@@ -34,6 +34,11 @@ class DepthViews:
         """The pixels of view i with consistent depth."""
         return self.maps[i].support >= self.min_support
 
+    def to(self, device: str) -> DepthViews:
+        """With the depth maps on a device; the photos and cameras stay."""
+        maps = [DepthMap(m.depth.to(device), m.support.to(device)) for m in self.maps]
+        return DepthViews(self.views, maps, self.min_support)
+
 
 @dataclass(frozen=True)
 class OrientedPoints:
@@ -51,6 +56,10 @@ class OrientedPoints:
     def __getitem__(self, index) -> OrientedPoints:
         return OrientedPoints(*(getattr(self, f.name)[index] for f in fields(self)))
 
+    def to(self, device: torch.device | str) -> OrientedPoints:
+        """The points on a device."""
+        return OrientedPoints(*(getattr(self, f.name).to(device) for f in fields(self)))
+
 
 def concatenate_points(clouds: list[OrientedPoints]) -> OrientedPoints:
     """All points in order."""
@@ -59,14 +68,14 @@ def concatenate_points(clouds: list[OrientedPoints]) -> OrientedPoints:
 
 def unproject_view(views: Views, i: int, depth: Float[Tensor, "h w"], support: Float[Tensor, "h w"]) -> OrientedPoints:
     """Every pixel of view i as an oriented point (h * w in row order); normals from central differences over 4 px."""
-    K, viewmat = views.cameras.Ks[i], views.cameras.viewmats[i]
+    K, viewmat = views.cameras.Ks[i].to(depth), views.cameras.viewmats[i].to(depth)
     _, points = unproject(depth, K, viewmat)
     padded = F.pad(points.permute(2, 0, 1)[None], (2, 2, 2, 2), mode="replicate")[0].permute(1, 2, 0)
     across, down = padded[2:-2, 4:] - padded[2:-2, :-4], padded[4:, 2:-2] - padded[:-4, 2:-2]
     normals = F.normalize(torch.linalg.cross(down, across), dim=-1)  # y down: this order points to the camera
     towards = F.normalize(-viewmat[:3, :3].mT @ viewmat[:3, 3] - points, dim=-1)
     normals = torch.where((normals * towards).sum(-1, keepdim=True) > 0.1, normals, towards)
-    parts = points, normals, views.image(i), depth / K[0, 0], support
+    parts = points, normals, views.image(i, depth.device), depth / K[0, 0], support
     return OrientedPoints(*(part.flatten(0, 1) for part in parts))
 
 
@@ -81,7 +90,7 @@ def fuse(observed: DepthViews) -> OrientedPoints:
         keep = observed.consistent(i).flatten()
         if pixels > MAX_POINTS:
             generator = torch.Generator().manual_seed(i)
-            keep &= torch.rand(len(keep), generator=generator) < MAX_POINTS / pixels
+            keep &= (torch.rand(len(keep), generator=generator) < MAX_POINTS / pixels).to(keep.device)
         clouds.append(unproject_view(observed.views, i, m.depth, m.support)[keep])
     cloud = concatenate_points(clouds)
     violations = free_space_violations(cloud.points, observed, observed.min_support)
@@ -92,8 +101,8 @@ def free_space_violations(
     points: Float[Tensor, "n 3"], observed: DepthViews, min_support: int
 ) -> Float[Tensor, "n"]:
     """Number of views that have a surface with `min_support` behind each point, so that the point is in free space."""
-    count, cameras = torch.zeros(len(points)), observed.views.cameras
-    for K, viewmat, m in zip(cameras.Ks, cameras.viewmats, observed.maps, strict=True):
+    count, cameras = torch.zeros_like(points[:, 0]), observed.views.cameras
+    for K, viewmat, m in zip(cameras.Ks.to(points), cameras.viewmats.to(points), observed.maps, strict=True):
         known = torch.where(m.support >= min_support, m.depth, torch.zeros_like(m.depth))
         surface, inside = look_up_points(known, points, K, viewmat)
         surface_depth = surface @ viewmat[2, :3] + viewmat[2, 3]
@@ -141,24 +150,25 @@ def _cells(points: Float[Tensor, "n 3"], size: Float[Tensor, "n"]) -> Int[Tensor
 
 
 def fill_unmatched(
-    observed: DepthViews, cloud: OrientedPoints, plane: Plane | None, far: float, stride: int = 3, device: str = "cpu"
+    observed: DepthViews, cloud: OrientedPoints, plane: Plane | None, far: float, stride: int = 3
 ) -> OrientedPoints:
     """Points for pixels without consistent depth: every `stride`-th pixel that `cloud` does not cover.
 
     Their depth is, in this order: that of the supporting plane, where its points are near or the matched depth is close
     to it; the matched depth, if at least one view agrees; the depth interpolated from consistent pixels, where these
     surround the pixel; otherwise `far`, where a wrong point occludes nothing. Points in the free space before a surface
-    that a view confirms are moved to `far` too.
+    that a view confirms are moved to `far` too. The points are on the device of the depth maps.
     """
-    views, clouds = observed.views, []
+    views, clouds, device = observed.views, [], observed.maps[0].depth.device
     opaque = to_gaussians(cloud, torch.full((len(cloud),), 0.8), degree=0).to(device)
+    on_plane = None if plane is None else _PlanePoints.of(cloud, plane, device)
     for i, m in enumerate(observed.maps):
         consistent = observed.consistent(i)
         away = torch.full_like(m.depth, far)
         depth = torch.where(surrounded_pixels(consistent), interpolate_depth(m.depth, consistent), away)
         depth = torch.where(m.support >= 1, m.depth, depth)
-        if plane is not None:
-            depth = _depth_on_plane(views, i, depth, m.depth, cloud, plane)
+        if on_plane is not None:
+            depth = _depth_on_plane(views, i, depth, m.depth, on_plane)
         grid = torch.zeros_like(consistent)
         grid[stride // 2 :: stride, stride // 2 :: stride] = True
         missing = (grid & ~covered_pixels(views, i, opaque)).flatten()
@@ -172,7 +182,9 @@ def fill_unmatched(
 
 def surrounded_pixels(known: Bool[Tensor, "h w"], radius: int = 16) -> Bool[Tensor, "h w"]:
     """Pixels with more than 30 % known pixels within `radius`: holes in a surface rather than its open boundary."""
-    fraction = F.avg_pool2d(known[None, None].float(), 2 * radius + 1, 1, radius, count_include_pad=True)
+    fraction, side = known[None, None].float(), 2 * radius + 1
+    for window, border in (((side, 1), (radius, 0)), ((1, side), (0, radius))):
+        fraction = F.avg_pool2d(fraction, window, 1, border, count_include_pad=True)
     return fraction[0, 0] > 0.3
 
 
@@ -198,25 +210,35 @@ def interpolate_depth(depth: Float[Tensor, "h w"], known: Bool[Tensor, "h w"]) -
     return 1 / inverse[0, 0].clamp_min(1e-9)
 
 
+@dataclass(frozen=True)
+class _PlanePoints:
+    """The supporting plane, and the cells of the points that lie on it."""
+
+    plane: Plane
+    side: float  # of a cell [scene units]
+    cells: Int[Tensor, "c"]
+
+    @classmethod
+    def of(cls, cloud: OrientedPoints, plane: Plane, device: torch.device) -> _PlanePoints | None:
+        """None where no point lies on the plane."""
+        size = float((cloud.points - cloud.points.median(0).values).norm(dim=1).median())
+        known = cloud.points[plane.heights(cloud.points).abs() < 0.02 * size]
+        cells = _cells(known, torch.full((1,), 0.1 * size)).unique().to(device)
+        return cls(Plane(plane.normal.to(device), plane.offset), 0.1 * size, cells) if len(known) else None
+
+
 def _depth_on_plane(
-    views: Views, i: int, depth: Float[Tensor, "h w"], matched: Float[Tensor, "h w"], cloud: OrientedPoints,
-    plane: Plane,
+    views: Views, i: int, depth: Float[Tensor, "h w"], matched: Float[Tensor, "h w"], on: _PlanePoints
 ) -> Float[Tensor, "h w"]:
-    """`depth`, replaced by that of the supporting plane where points of `cloud` on the plane are near, or where the
-    depth `matched` is within 3 % of it."""
-    K, viewmat = views.cameras.Ks[i], views.cameras.viewmats[i]
+    """`depth`, replaced by that of the supporting plane where points on the plane are near, or where the depth
+    `matched` is within 3 % of it."""
+    K, viewmat = views.cameras.Ks[i].to(depth), views.cameras.viewmats[i].to(depth)
     _, ones = unproject(torch.ones_like(depth), K, viewmat)
     eye = -viewmat[:3, :3].mT @ viewmat[:3, 3]
-    along = ((ones - eye) @ plane.normal).clamp(max=-1e-6)
-    z = -plane.heights(eye) / along
+    along = ((ones - eye) @ on.plane.normal).clamp(max=-1e-6)
+    z = -on.plane.heights(eye) / along
     hit = eye + z[..., None] * (ones - eye)
-    size = float((cloud.points - cloud.points.median(0).values).norm(dim=1).median())
-    known = cloud.points[plane.heights(cloud.points).abs() < 0.02 * size]
-    if not len(known):
-        return depth
-    cell = 0.1 * size
-    side = torch.full((1,), cell)
-    near = torch.isin(_cells(hit.flatten(0, 1), side).reshape(depth.shape), _cells(known, side).unique())
+    near = torch.isin(_cells(hit.flatten(0, 1), depth.new_full((1,), on.side)).reshape(depth.shape), on.cells)
     near |= (matched - z).abs() < 0.03 * z
     return torch.where(near & (z > 0) & (along < -0.05), z, depth)
 
@@ -226,7 +248,7 @@ def covered_pixels(views: Views, i: int, gaussians: Gaussians) -> Bool[Tensor, "
     """Pixels of view i where the Gaussians have an alpha above 0.5."""
     height, width = views.images[i].shape[:2]
     viewmats, Ks = (x[[i]].to(gaussians.means) for x in (views.cameras.viewmats, views.cameras.Ks))
-    return rasterise(gaussians, viewmats, Ks, width, height).alpha[0].cpu() > 0.5
+    return rasterise(gaussians, viewmats, Ks, width, height).alpha[0] > 0.5
 
 
 def to_gaussians(cloud: OrientedPoints, opacity: Float[Tensor, "n"], degree: int) -> Gaussians:

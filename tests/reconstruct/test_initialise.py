@@ -89,8 +89,8 @@ def test_only_uncovered_pixels_are_filled(block, device):
     known = torch.arange(80) < 40
     maps = [DepthMap(m.depth, m.support.where(known, torch.zeros_like(m.support))) for m in block.maps]
     half = DepthViews(block.views, maps, 1)
-    cloud = initialise.fuse(half)
-    more = initialise.fill_unmatched(half, cloud, None, far=5.0, device=device)
+    cloud = initialise.fuse(half.to(device)).to("cpu")
+    more = initialise.fill_unmatched(half.to(device), cloud, None, far=5.0).to("cpu")
     assert len(more) > 50
     for i in range(3):
         before, after = (

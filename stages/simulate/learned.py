@@ -66,7 +66,7 @@ def rollout(
     log.info("%s (%s): %d objects, %d keypoints, lengths scaled by %.3g, times by %.3g, %d steps per frame",
              options.engine, card["sha256"][:8], len(ids), len(keypoints.rest), units.length / scene.metres_per_unit,
              units.time, steps)  # fmt: skip
-    sleep = SleepState(initial, _starts_awake(initial, units, setup), setup.on_floor)
+    sleep = SleepState(initial.to(device), _starts_awake(initial, units, setup), setup.on_floor)
     log.info("%d of %d objects are at rest and stay fixed until touched", int(sleep.asleep.sum()), len(ids))
     row = torch.tensor([ids.index(i) for i in keypoints.object_id.tolist()], dtype=torch.int64)
     lifted = keypoints.rest + setup.lift[row]
@@ -75,7 +75,8 @@ def rollout(
         current, held, acting, dt = options, prompts.pinned, prompts.forces, options.dt * units.time / steps
         external = replace(forces, pinned=forces.pinned | sleep.asleep)
         stepper = TimeStepper(model, initial.to(device), dt, external.to(device), options.integrator)
-        first, before, mass = stepper.points.clone(), initial.points, initial.mass[0]
+        first, mass = stepper.points.clone(), initial.mass[0]
+        before = first
         for n in range(options.steps):
             moved = ((stepper.points - first) / units.length).cpu()
             check_motion(moved, n, options)
@@ -99,9 +100,9 @@ def rollout(
                 continue
             for _ in range(steps):
                 stepper.step()
-            points = stepper.points.cpu()
+            points = stepper.points.clone()
             sleep.wake_on_impact(points, (points - before) / (steps * dt))
-            before = points.clone()
+            before = points
 
     return states()
 

@@ -25,13 +25,13 @@ class SleepState:
     """Tracks which of `o` objects are `asleep`.
 
     At the start, the objects that are not `awake` sleep if they are `standing` on the floor or touch a sleeping object
-    that is itself supported.
+    that is itself supported. Contacts are found on the device of `initial`; masks of objects are on the CPU.
     """
 
     def __init__(self, initial: InitialConditions, awake: Bool[Tensor, "o"], standing: Bool[Tensor, "o"]):
         self.valid, self.mass = initial.valid, initial.mass[0].clamp_min(1e-6)
         self.spacing = _keypoint_spacing(initial)
-        near = self._near(initial.points, INITIAL_CONTACT_DISTANCE).any(-1)
+        near = self._near(initial.points, INITIAL_CONTACT_DISTANCE).any(-1).cpu()
         self.in_contact = near | near.T
         self.standing, self.asleep = standing, ~awake
         self._wake_unsupported()
@@ -45,7 +45,7 @@ class SleepState:
             return False
         ratio = self.mass[:, None] / (self.mass[:, None] + self.mass)
         fast = speed[0].norm(dim=-1)[:, None] * ratio[..., None] > WAKE_SPEED
-        hit = (self._near(points, CONTACT_DISTANCE) & fast).any(-1) & ~self.asleep[:, None]
+        hit = (self._near(points, CONTACT_DISTANCE) & fast).any(-1).cpu() & ~self.asleep[:, None]
         return self.wake(hit.any(0))
 
     def wake(self, rows: Bool[Tensor, "o"]) -> bool:

@@ -24,19 +24,19 @@ def stacked(*heights: float, aside: float = 0.0) -> InitialConditions:
     return InitialConditions.of(points[None])
 
 
-def sleep_state(world: InitialConditions, awake: torch.Tensor) -> SleepState:
+def sleep_state(world: InitialConditions, awake: torch.Tensor, device: str = "cpu") -> SleepState:
     """The sleep state with objects at floor height standing on the floor."""
-    return SleepState(world, awake, world.points[0, ..., 2].amin(1) < FLOOR + 1e-3)
+    return SleepState(world.to(device), awake, world.points[0, ..., 2].amin(1) < FLOOR + 1e-3)
 
 
 def none(count: int) -> torch.Tensor:
     return torch.zeros(count, dtype=torch.bool)
 
 
-def test_a_stack_sleeps_and_a_floating_object_does_not():
-    assert sleep_state(stacked(0.0, SIDE, 2 * SIDE), none(3)).asleep.all()
+def test_a_stack_sleeps_and_a_floating_object_does_not(device):
+    assert sleep_state(stacked(0.0, SIDE, 2 * SIDE), none(3), device).asleep.all()
     high = 2 * SIDE + 3 * INITIAL_CONTACT_DISTANCE  # above the second
-    assert sleep_state(stacked(0.0, SIDE, SIDE + high), none(3)).asleep.tolist() == [True, True, False]
+    assert sleep_state(stacked(0.0, SIDE, SIDE + high), none(3), device).asleep.tolist() == [True, True, False]
 
 
 def test_objects_that_lose_their_support_wake():
@@ -50,12 +50,13 @@ def test_objects_that_lose_their_support_wake():
 @pytest.mark.parametrize(("speed", "height", "mass", "wakes"), [
     (1.0, SIDE, 1.0, True), (0.1, SIDE, 1.0, False), (1.0, 3 * SIDE, 1.0, False), (1.0, SIDE, 0.1, False),
 ])  # fmt: skip
-def test_only_fast_and_heavy_impacts_wake(speed, height, mass, wakes):
+def test_only_fast_and_heavy_impacts_wake(speed, height, mass, wakes, device):
     world = replace(stacked(0.0, 3 * SIDE), mass=torch.tensor([[1.0, mass]]))
-    state = sleep_state(world, torch.tensor([False, True]))
-    points = world.points.clone()
+    state = sleep_state(world, torch.tensor([False, True]), device)
+    points = world.points.clone().to(device)
     points[0, 1, :, 2] += height - 3 * SIDE
-    assert state.wake_on_impact(points, torch.tensor([[0.0, -speed]])[..., None, None].expand_as(points)) is wakes
+    velocity = torch.tensor([[0.0, -speed]], device=device)[..., None, None].expand_as(points)
+    assert state.wake_on_impact(points, velocity) is wakes
     assert state.asleep.tolist() == [not wakes, False]
 
 

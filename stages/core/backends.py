@@ -54,11 +54,19 @@ def load(entry: str) -> Callable:
 
 
 def pick_device(name: str) -> str:
-    """The PyTorch device for --device auto, cpu or cuda; InputError for another name or without a GPU."""
+    """The PyTorch device, "cpu" or "cuda", for --device auto, cpu, cuda or cuda:N, which makes GPU N the current one.
+
+    Raises InputError for another name and for a GPU that is not there.
+    """
     import torch  # takes a second to import, so only when a stage runs
 
-    if name not in ("auto", "cpu", "cuda"):
-        raise InputError(f"--device {name}: choose from auto, cpu, cuda (another GPU: set CUDA_VISIBLE_DEVICES)")
-    if name == "cuda" and not torch.cuda.is_available():
-        raise InputError("--device cuda: PyTorch sees no NVIDIA GPU here; use --device cpu (see `ngff-lab doctor`)")
-    return "cuda" if name != "cpu" and torch.cuda.is_available() else "cpu"
+    kind, _, number = name.partition(":")
+    if kind not in ("auto", "cpu", "cuda") or (":" in name and (kind != "cuda" or not number.isdecimal())):
+        raise InputError(f"--device {name}: choose from auto, cpu, cuda, or cuda:1 for the second GPU, and so on")
+    if kind == "cuda" and not torch.cuda.is_available():
+        raise InputError(f"--device {name}: PyTorch sees no NVIDIA GPU here; use --device cpu (see `ngff-lab doctor`)")
+    if number and int(number) >= torch.cuda.device_count():
+        raise InputError(f"--device {name}: PyTorch sees {torch.cuda.device_count()} GPUs here, numbered from 0")
+    if number:
+        torch.cuda.set_device(int(number))
+    return "cuda" if kind != "cpu" and torch.cuda.is_available() else "cpu"

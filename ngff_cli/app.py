@@ -280,6 +280,10 @@ def render(
     show_forces: Annotated[
         bool, Option("--show-forces", help="draw an arrow for each active force prompt")
     ] = RenderOptions.show_forces,
+    playable: Annotated[
+        bool, Option("--playable", help="with -o film.html: objects can be dragged, pushed and lifted in the page, which "
+                     "computes their motion (trajectories of the engine ngff)")
+    ] = RenderOptions.playable,
     frame: Annotated[
         int | None, Option(help="render this frame only, from 0; -1 is the last; default: all")
     ] = RenderOptions.frame,
@@ -291,7 +295,8 @@ def render(
     """Render a trajectory or a scene: TRAJ.h5 or SCENE.ply -> MP4 or PNG."""
     options = RenderOptions(
         view=view, resolution=resolution, fps=fps, background=background, depth=depth, ids=ids,
-        shadows=shadows, show_forces=show_forces, frame=frame, side_by_side=side_by_side, device=device,
+        shadows=shadows, show_forces=show_forces, playable=playable, frame=frame, side_by_side=side_by_side,
+        device=device,
     )  # fmt: skip
     load("stages.render.stage:run")(source, out, options)
 

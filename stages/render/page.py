@@ -9,6 +9,7 @@ import torch
 
 from stages.core.errors import InputError
 from stages.core.player.film import Motion, film_page, pack_film
+from stages.core.player.playable import playable_parts
 from stages.core.scene.files import replacing
 from stages.core.scene.gaussians import concatenate
 from stages.core.scene.scene import Scene
@@ -25,12 +26,14 @@ def write_page(out: Path, renderer: Renderer) -> dict:
     """Write the page; returns its size and the numbers of Gaussians and frames.
 
     Raises InputError for what a page cannot show: several files, all views at once, a photo behind the objects, and
-    trajectories of Gaussians without keypoints.
+    trajectories of Gaussians without keypoints; with `playable` for motions of other engines than the learned field.
     """
     options = renderer.options
     _check(out, renderer)
     clip = renderer.clips[0]
     scene, motion = _contents(clip)
+    if options.playable:
+        motion = replace(motion, field=playable_parts(clip.animation.trajectory))
     camera = renderer.cameras(1, options.resolution)[0]
     modes = [mode for name, mode in COLOUR_MODES.items() if getattr(options, name)]
     settings = {
@@ -56,6 +59,8 @@ def _check(out: Path, renderer: Renderer) -> None:
     if clip.background.photo is not None:
         raise InputError(f"{out}: --background of a page is a colour or a scene.ply, not a photo")
     trajectory = clip.animation.trajectory
+    if options.playable and not clip.animation.is_moving:
+        raise InputError(f"--playable: {clip.name} has no motion to go on from; give a trajectory (.h5), without --frame")
     if clip.animation.is_moving and len(trajectory.keypoints.rest) > MAX_KEYPOINTS:
         raise InputError(f"{trajectory.path}: has {len(trajectory.keypoints.rest)} keypoints, and a page holds "
                          f"{MAX_KEYPOINTS}; simulate with fewer --keypoints, or write a video (.mp4)")  # fmt: skip

@@ -34,6 +34,8 @@ def run(
              for animation, name in zip(animations, _captions(sources), strict=True)]  # fmt: skip
     renderer = Renderer(clips, options)
     out = Path(out) if out is not None else _default_output(sources, renderer)
+    if options.playable and out.suffix.lower() != ".html":
+        raise InputError(f"--playable: only a page (-o {out.with_suffix('.html').name}) computes motion, not {out.name}")
     if out.is_dir():
         out = out / "frame.ply"
     facts = _writer(out)(out, renderer)

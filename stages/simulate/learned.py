@@ -15,13 +15,14 @@ from stages.core.backends import pick_device
 from stages.core.models import checkpoints as weights
 from stages.core.models.dynamics import FRAME, Dynamics
 from stages.core.models.external_forces import ExternalForces
-from stages.core.models.field.solidity import box_sides, solidity
+from stages.core.models.field.solidity import MIN_STIFFNESS, box_sides, solidity
 from stages.core.models.initial_conditions import FLOOR, InitialConditions, centre_of_mass
 from stages.core.models.rollout import TimeStepper
 from stages.core.physics.forces import Change, Force, ForcePrompts
 from stages.core.physics.materials import MODELS, choose_materials
 from stages.core.physics.skinning import object_rotations
 from stages.core.physics.state import FrameState
+from stages.core.scene.field_start import FieldStart, FieldUnits
 from stages.core.scene.scene import Scene, SceneObject
 from stages.core.scene.trajectory import Keypoints
 from stages.simulate.changes import changed_options, changed_pins
@@ -36,7 +37,6 @@ log = logging.getLogger(__name__)
 SIZE_RANGE = (0.25, 1.2)  # shortest and longest of the longest sides of an object [m]
 MAX_OBJECTS = 6  # objects per scene of the benchmark
 MIN_THICKNESS = 0.044  # thickness of the thinnest object, the cloth [m]
-MIN_STIFFNESS = 3e3  # Young's modulus [Pa]; stiffer bodies than in training are extrapolated by linear elasticity
 MAX_SPEED = 5.0  # maximum speed of falls [m/s]
 FAR_WALL = 100.0  # distance of walls where there are none [m]
 FLOOR_OUTLIERS = 0.02  # fraction of an object's keypoints that may lie below the floor under it
@@ -66,8 +66,14 @@ def rollout(
     log.info("%s (%s): %d objects, %d keypoints, lengths scaled by %.3g, times by %.3g, %d steps per frame",
              options.engine, card["sha256"][:8], len(ids), len(keypoints.rest), units.length / scene.metres_per_unit,
              units.time, steps)  # fmt: skip
-    sleep = SleepState(initial.to(device), _starts_awake(initial, units, setup), setup.on_floor)
+    awake = _starts_awake(initial, units, setup)
+    sleep = SleepState(initial.to(device), awake, setup.on_floor)
     log.info("%d of %d objects are at rest and stay fixed until touched", int(sleep.asleep.sum()), len(ids))
+    model_units = FieldUnits(
+        units.length, units.scale, units.time, units.mass, tuple(units.origin.tolist()), units.gravity, steps,
+        card["sha256"], options.friction,
+    )  # fmt: skip
+    field_start = _field_start(keypoints, ids, initial, setup, awake, volumes, model_units)
     row = torch.tensor([ids.index(i) for i in keypoints.object_id.tolist()], dtype=torch.int64)
     lifted = keypoints.rest + setup.lift[row]
 
@@ -80,7 +86,8 @@ def rollout(
         for n in range(options.steps):
             moved = ((stepper.points - first) / units.length).cpu()
             check_motion(moved, n, options)
-            yield replace(_state(keypoints, ids, (row, lifted), initial, moved), mass=mass / units.mass)
+            state = _state(keypoints, ids, (row, lifted), initial, moved)
+            yield replace(state, mass=mass / units.mass, start=None if n else field_start)
             if n == options.steps - 1:
                 continue
             start, end = n * options.dt, (n + 1) * options.dt
@@ -105,6 +112,25 @@ def rollout(
             before = points
 
     return states()
+
+
+def _field_start(
+    keypoints: Keypoints, ids: list[int], initial: InitialConditions, setup: SceneSetup, awake: Bool[Tensor, "o"],
+    volumes: Float[Tensor, "o"], units: FieldUnits,
+) -> FieldStart:  # fmt: skip
+    """What the engine starts from, for the trajectory; values of keypoints in the order of `keypoints`."""
+
+    def of_keypoints(values: Tensor) -> Tensor:
+        out = values.new_zeros(len(keypoints.rest), *values.shape[3:])
+        for row, i in enumerate(ids):
+            out[keypoints.object_id == i] = values[0, row, initial.valid[0, row]]
+        return out
+
+    return FieldStart(
+        of_keypoints(initial.points), of_keypoints(initial.mass_fraction), initial.mass[0], volumes, initial.E[0],
+        initial.solidity[0], initial.nu[0], initial.friction[0], initial.velocity[0], initial.body_inertia[0],
+        initial.box[0], awake.long(), setup.on_floor.long(), tuple(setup.materials[i].name for i in ids), units,
+    )  # fmt: skip
 
 
 def _initial_conditions(

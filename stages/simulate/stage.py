@@ -56,6 +56,7 @@ def run(scene: Path, out: Path, options: SimulateOptions = SimulateOptions()) ->
     with TrajectoryWriter(out, world, motion, keypoints, bind_gaussians(world, keypoints)) as trajectory:
         for state in tqdm(states, total=options.steps, unit="frame"):
             trajectory.append(state.positions, state.com, state.rotation)
+            trajectory.store_field(state.start)
             start = state.positions if start is None else start
             displacement = float((state.positions - start).norm(dim=1).max())
             max_displacement = max(max_displacement, displacement)

@@ -101,6 +101,7 @@ MATERIALS: Mapping[str, Material] = {
                      "dry quartz sand, angle of repose 30-35 degrees; E as in Klar et al. 2016"),
     "snow": Material(1.4e5, 400.0, 0.2, 0.5, 0.01, "snow", (0.025, 0.0075, 10.0), "Stomakhin et al. 2013, table 2"),
 }  # fmt: skip
+ELASTIC = tuple(name for name, m in MATERIALS.items() if not MODELS[m.model].plastic)
 ALIASES = {  # material of objects whose name contains one of these words
     "soft": ["plush", "teddy", "bear", "doll", "toy", "frog", "kermit", "bunny"],
     "cloth": ["shirt", "t-shirt", "towel", "sock", "scarf", "glove"],

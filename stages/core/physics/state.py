@@ -5,6 +5,8 @@ from dataclasses import dataclass
 from jaxtyping import Float
 from torch import Tensor
 
+from stages.core.scene.field_start import FieldStart
+
 
 @dataclass(frozen=True)
 class FrameState:
@@ -14,3 +16,4 @@ class FrameState:
     com: Float[Tensor, "o 3"]  # centre of mass of each object, in the order of scene.objects
     rotation: Float[Tensor, "o 4"]  # w x y z, relative to the rest pose
     mass: Float[Tensor, "o"] | None = None  # of each object [kg]; live sessions need it
+    start: FieldStart | None = None  # of the learned engine, in the first frame

@@ -3,7 +3,7 @@
 Layout after inflation: length of the header (uint32, little endian), the header (JSON), the arrays. The header's
 `arrays` describe each: `rows` x `columns` values low[c] + step[c] q, of which q is stored in `planes` bytes: first the
 low bytes of all values, column after column, then the next bytes. With `delta`, q are differences to the row before,
-modulo 256^planes. web/container.js reads it.
+modulo 256^planes; with `float`, q are the bits of float32 values. web/container.js reads it.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ class PackedArray:
     step: tuple[float, ...]
     bits: int
     delta: bool = False
+    float: bool = False  # q are the bits of float32 values
 
     def values(self) -> Float[Tensor, "r c"]:
         """The values as the page sees them, up to rounding to float32."""
@@ -41,6 +42,12 @@ class PackedArray:
 def whole(values: Int[Tensor, "r c"]) -> PackedArray:
     """Values that are whole numbers from 0 on, stored exactly in as few bytes as they need."""
     return PackedArray(values.long(), (0.0,), (1.0,), max(1, int(values.max()).bit_length()) if values.numel() else 1)
+
+
+def exact(values: Float[Tensor, "r c"]) -> PackedArray:
+    """Numbers stored as float32, without rounding."""
+    bits = torch.from_numpy(values.float().contiguous().numpy().view(np.uint32).astype(np.int64))
+    return PackedArray(bits, (0.0,), (1.0,), 32, float=True)
 
 
 def quantised(values: Float[Tensor, "r c"], bits: int, axes: int | None = None, delta: bool = False) -> PackedArray:
@@ -67,7 +74,7 @@ def pack(header: dict, arrays: dict[str, PackedArray]) -> bytes:
         planes = -(-array.bits // 8)
         rows, columns = array.q.shape
         described[name] = {"rows": rows, "columns": columns, "planes": planes, "offset": offset, "low": array.low,
-                           "step": array.step, "delta": array.delta}  # fmt: skip
+                           "step": array.step, "delta": array.delta, "float": array.float}  # fmt: skip
         q = array.q.T.numpy()
         if array.delta:
             q = np.diff(q, axis=1, prepend=0) % 256**planes

@@ -40,6 +40,7 @@ class Motion:
     rotation: Float[Tensor, "t o 4"]  # w x y z, relative to the rest frame
     dt: float  # between frames [s]
     forces: tuple[dict, ...] = ()  # as SimulationInfo has them
+    field: tuple[dict, dict[str, PackedArray]] | None = None  # of `playable_parts`, for a page that simulates
 
     @classmethod
     def of(cls, t: Trajectory) -> Motion:
@@ -73,6 +74,9 @@ def pack_film(
     if motion is not None:
         header |= {"dt": motion.dt, "frames": len(motion.positions), "forces": motion.forces}
         arrays |= _motion_arrays(motion, rows[:count])
+    if motion is not None and motion.field is not None:
+        header |= {"field": motion.field[0]}
+        arrays |= motion.field[1]
     if motion is not None and shadows is not None:
         header["light"] = asdict(shadows.light)
         arrays |= _shadow_arrays(shadows, g)

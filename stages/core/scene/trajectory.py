@@ -17,6 +17,7 @@ from torch import Tensor
 
 from stages.core.errors import InputError
 from stages.core.scene.cameras import MAX_SIDE, Cameras, check_cameras
+from stages.core.scene.field_start import FieldStart, read_field_start, write_field_start
 from stages.core.scene.files import must_exist, replacing
 from stages.core.scene.gaussians import Gaussians
 from stages.core.scene.h5_chunks import COMPRESSED, append_rows, write_compressed
@@ -96,6 +97,7 @@ class Trajectory:
     rotation: Float[Tensor, "t o 4"]  # w x y z, relative to the rest frame
     path: Path
     dense: bool = False  # whether the file has every Gaussian in every frame
+    field: FieldStart | None = None  # what the learned engine started from, where it made the motion
 
     def __len__(self) -> int:
         return len(self.positions)
@@ -212,6 +214,12 @@ class TrajectoryWriter:
         self._file.flush()
         self._raw.check()
 
+    def store_field(self, start: FieldStart | None) -> None:
+        """Write what the learned engine started from, if it did."""
+        if start is not None:
+            write_field_start(self._file, start)
+            self._raw.check()
+
     def _close(self) -> None:
         self._file.close()
         self._raw.close()
@@ -323,4 +331,4 @@ def _read(path: Path, file: h5py.File) -> Trajectory:
         raise ValueError("forces/json has a row that is not a JSON object")
     dt, gravity = number(attributes["dt"], "dt", 1e-6, 1e4), numbers(attributes["gravity"], 3, "gravity")
     info = SimulationInfo(dt, gravity, quote(attributes["engine"]), forces)
-    return Trajectory(scene, info, keypoints, binding, *motion, path, dense)
+    return Trajectory(scene, info, keypoints, binding, *motion, path, dense, read_field_start(file, lengths))

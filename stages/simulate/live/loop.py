@@ -19,13 +19,13 @@ from pathlib import Path
 from stages.core.errors import InputError
 from stages.core.physics.forces import ForcePrompts
 from stages.core.physics.keypoints import bind_gaussians
+from stages.core.physics.materials import ELASTIC
 from stages.core.physics.shadow_casting import find_shadows
 from stages.core.physics.state import FrameState
 from stages.core.player.film import Motion, film_page, pack_film
 from stages.core.scene.files import replacing
 from stages.core.scene.scene import Scene
 from stages.core.scene.trajectory import Keypoints, SimulationInfo, TrajectoryWriter
-from stages.simulate.live.messages import ELASTIC
 from stages.simulate.live.server import LiveServer
 from stages.simulate.live.session import Session
 from stages.simulate.options import SimulateOptions
@@ -140,6 +140,7 @@ class _Live:
             return self.show()
         self.session.observe(state)
         self.writer.append(state.positions, state.com, state.rotation)
+        self.writer.store_field(state.start)
         self.turns.append((time.monotonic(), self.writer.frames))
         while self.turns[-1][0] - self.turns[0][0] > RATE_TIME:
             self.turns.popleft()

@@ -7,12 +7,10 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from stages.core.physics.materials import MATERIALS, MODELS
+from stages.core.physics.materials import ELASTIC
 
 MAX_BYTES = 2048  # of a message
 MAX_LENGTH = 1e4  # of coordinates [scene units]
-
-ELASTIC = tuple(name for name, m in MATERIALS.items() if not MODELS[m.model].plastic)
 
 
 class BadMessage(ValueError):

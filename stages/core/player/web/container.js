@@ -13,15 +13,15 @@ export async function unpack(base64) {
 }
 
 // Row after row, as Float32Array.
-function values(bytes, { rows, columns, planes, low, step, delta }) {
-  const count = rows * columns, out = new Float32Array(count), modulus = 256 ** planes;
+function values(bytes, { rows, columns, planes, low, step, delta, float }) {
+  const count = rows * columns, out = new Float32Array(count), bits = new Uint32Array(out.buffer), modulus = 256 ** planes;
   for (let c = 0; c < columns; c++) {
     const offset = low[c % low.length], scale = step[c % low.length];
     for (let r = 0, before = 0; r < rows; r++) {
       let q = 0;
       for (let plane = 0; plane < planes; plane++) q += bytes[plane * count + c * rows + r] << (8 * plane);
       if (delta) before = q = (before + q) % modulus;
-      out[r * columns + c] = offset + scale * q;
+      if (float) bits[r * columns + c] = q; else out[r * columns + c] = offset + scale * q;
     }
   }
   return out;

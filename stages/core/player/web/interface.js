@@ -13,7 +13,7 @@ function keyTable(player) {
     select.dispatchEvent(new Event("change"));
   };
   const films = player.film.live ? [] : [
-    [" ", "space", "play or pause", () => player.play(!player.playing)],
+    [" ", "space", "play or pause", () => player.live ? player.live.pause() : player.play(!player.playing)],
     ["ArrowLeft", "← →", "one frame back or forward", () => jump(-player.film.dt)],
     ["ArrowRight", null, null, () => jump(player.film.dt)],
     ["Home", "Home", "to the start", () => player.seek(0)],
@@ -43,7 +43,6 @@ const POINTER = [
 
 export function buildInterface(player) {
   const { film } = player, moving = film.frames > 1;
-  for (const id of ["play", "time", "clock", "speed", "loop-label"]) element(id).hidden = !moving || film.live;
   element("arrows-row").hidden = !moving && !film.live;
 
   options(element("colours"), MODES, moving || film.live ? MODES.length : 3);
@@ -101,8 +100,9 @@ function toggleTheme() {
   root.dataset.theme = dark ? "light" : "dark";
 }
 
-// The controls follow the player's state.
+// The controls follow the player's state; those of time are the film's.
 function showState(player) {
+  for (const id of ["play", "time", "clock", "speed", "loop-label"]) element(id).hidden = !(player.film.frames > 1) || Boolean(player.live?.running);
   element("play").textContent = player.playing ? "❚❚" : "▶";
   element("time").value = player.time;
   element("clock").textContent = `${player.time.toFixed(2)} s`;

@@ -48,7 +48,7 @@ export class Player {
     picture.addEventListener("webglcontextlost", () => {
       document.getElementById("message").textContent = "The graphics processor was reset; reload the page.";
     });
-    this.live = film.live ? startLive(this) : null;
+    this.live = film.live || film.field ? startLive(this) : null;
     buildInterface(this);
     this.resize();
     this.seek(0);
@@ -128,7 +128,7 @@ export class Player {
     gl.deleteSync(sync);
     this.drawing = null;
     const seconds = (performance.now() - since) / 1000;
-    if (this.live && seconds > SLOW) this.restUntil = performance.now() + 1000 * seconds; // leave time to the engine
+    if (this.live?.running && seconds > SLOW) this.restUntil = performance.now() + 1000 * seconds; // leave time to the engine
     if (seconds > SLOW && this.shownQuality === this.quality) this.quality = Math.min(this.quality + 1, QUALITIES.length - 1);
     else if (seconds < FAST) this.quality = Math.max(this.quality - 1, 0);
     return true;
@@ -170,14 +170,18 @@ export class Player {
 
   seek(time) {
     this.time = Math.max(0, Math.min(this.duration, time));
-    if (this.film.frames && !this.film.live) {
-      const p3 = this.rest.length, all = this.film.arrays.keypoints, frame = this.frame, first = Math.floor(frame);
-      const at = (t) => all.subarray(p3 * (t + 1), p3 * (t + 2));
-      const next = at(Math.min(first + 1, this.film.frames - 1));
-      this.positions = frame === first ? at(first) : at(first).map((x, i) => x + (frame - first) * (next[i] - x));
+    if (this.film.frames && !this.live?.running) {
+      const { frame } = this, first = Math.floor(frame), here = this.filmPositions(first);
+      const next = this.filmPositions(Math.min(first + 1, this.film.frames - 1));
+      this.positions = frame === first ? here : here.map((x, i) => x + (frame - first) * (next[i] - x));
     }
     this.wake();
     this.onchange();
+  }
+
+  filmPositions(frame) { // of the keypoints in a whole frame
+    const p3 = this.rest.length;
+    return this.film.arrays.keypoints.subarray(p3 * (frame + 1), p3 * (frame + 2));
   }
 
   // --- objects, colours, views ---

@@ -2,10 +2,14 @@
 
 import { Skinning, inverseOf, largestEigenvector, nearestRotation } from "player/skinning.js";
 
-// A worker made from the source of the functions that it needs: a page opened as a file cannot load a worker's script.
 export function startWorker() {
-  const source = [nearestRotation, largestEigenvector, inverseOf, Skinning, displace, farToNear, serve, "serve()"];
-  return new Worker(URL.createObjectURL(new Blob([source.join("\n")], { type: "text/javascript" })));
+  return workerOf([nearestRotation, largestEigenvector, inverseOf, Skinning, displace, farToNear, serve], "serve");
+}
+
+// A worker made from the source of the functions and classes that it needs, of which it calls `main`: a page opened as a
+// file cannot load a worker's script.
+export function workerOf(source, main) {
+  return new Worker(URL.createObjectURL(new Blob([[...source, `${main}()`].join("\n")], { type: "text/javascript" })));
 }
 
 function serve() {

@@ -1,0 +1,85 @@
+"""What a page needs to go on with a motion of the learned field: the network, rest shapes, materials and units."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from stages.core.errors import InputError
+from stages.core.models import checkpoints
+from stages.core.models.field.force_field import ForceField
+from stages.core.models.field.rest_shape import RestShape
+from stages.core.models.field.solidity import MIN_STIFFNESS
+from stages.core.models.initial_conditions import FLOOR, InitialConditions
+from stages.core.physics.materials import ELASTIC, MATERIALS
+from stages.core.player.container import PackedArray, exact
+from stages.core.scene.field_start import FieldStart
+from stages.core.scene.trajectory import Trajectory
+
+
+def playable_parts(t: Trajectory) -> tuple[dict, dict[str, PackedArray]]:
+    """Header entry `field` and arrays for `pack_film`. Raises InputError for motions of other engines."""
+    model = _model(t)
+    start = t.field
+    mine = [t.keypoints.object_id == o.id for o in t.scene.objects]
+    shape = model.precompute(_initial_conditions(start, mine))
+    bodies = torch.stack([start.mass, start.E, start.solidity, start.nu, start.friction, start.volume], 1)
+    arrays = {
+        "points": start.points, "mass_fraction": start.mass_fraction[:, None], "material": bodies,
+        "normal": _of_keypoints(shape, shape.normal, mine), "principal": shape.principal[0],
+        "spacing": _of_keypoints(shape, shape.spacing[..., None], mine), "inverse": shape.inverse[0].flatten(1),
+        "keypoint_inverse": shape.keypoint_inverse[0].flatten(1), "inertia": start.inertia.flatten(1),
+        "box": start.box.flatten(1), "velocity": start.velocity,
+    }  # fmt: skip
+    weights = {f"weights_{name}": exact(x.reshape(len(x), -1)) for name, x in model.state_dict().items()}
+    unit = t.scene.metres_per_unit
+    header = {
+        **asdict(start.units), "real_gravity": -t.info.gravity[2] * unit, "floor": FLOOR, "unit": unit,
+        "min_stiffness": MIN_STIFFNESS, "awake": start.awake.tolist(), "standing": start.standing.tolist(),
+        "names": start.material,
+        "materials": {name: {k: getattr(MATERIALS[name], k) for k in ("E", "density", "nu", "friction")}
+                      for name in ELASTIC},
+    }  # fmt: skip
+    return header, {f"field_{name}": exact(x) for name, x in arrays.items()} | weights
+
+
+def _model(t: Trajectory) -> ForceField:
+    """The field that made the motion."""
+    path: Path = t.path
+    if t.info.engine != "ngff":
+        raise InputError(f"{path}: was simulated by {t.info.engine}, and a page computes only the learned field; simulate "
+                         "with --engine ngff for --playable")  # fmt: skip
+    integrator = t.scene.provenance.get("options", {}).get("integrator", "step")
+    if t.field is None or integrator != "step":
+        raise InputError(f"{path}: does not say what the learned field started from, or was made with another "
+                         "--integrator; simulate again for --playable")  # fmt: skip
+    model, card = checkpoints.load(checkpoints.find("ngff"))
+    if card["sha256"] != t.field.units.weights or not isinstance(model, ForceField):
+        raise InputError(f"{path}: was simulated with other weights than those found; set $NGFF_WEIGHTS to their folder "
+                         "for --playable")  # fmt: skip
+    return model
+
+
+def _initial_conditions(start: FieldStart, mine: list[Tensor]) -> InitialConditions:
+    """The start as a batch of one scene; `mine`: masks of the keypoints of each object."""
+    most = max(int(rows.sum()) for rows in mine)
+
+    def padded(values: Tensor) -> Tensor:
+        return torch.stack([torch.nn.functional.pad(values[rows], (0, 0, 0, most - int(rows.sum()))) for rows in mine])
+
+    valid = padded(torch.ones(len(start.points), 1))[None, ..., 0] > 0
+    return InitialConditions.of(
+        padded(start.points)[None], valid, mass_fraction=padded(start.mass_fraction[:, None])[None, ..., 0],
+        body_inertia=start.inertia[None],
+    )  # fmt: skip
+
+
+def _of_keypoints(shape: RestShape, values: Tensor, mine: list[Tensor]) -> Tensor:
+    """Values of a batch of one scene in the order of the trajectory's keypoints."""
+    out = values.new_zeros(len(mine[0]), values.shape[-1])
+    for row, rows in enumerate(mine):
+        out[rows] = values[0, row, shape.initial.valid[0, row]]
+    return out

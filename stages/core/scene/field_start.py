@@ -1,0 +1,99 @@
+"""The group `field` of a trajectory: what the learned engine started from, so that a page can go on simulating."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import h5py
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from stages.core.scene.h5_schema import Dataset
+from stages.core.scene.schema import number, numbers, quote, whole
+
+GROUP = "field"
+LARGE = 1e30
+DATASETS = {  # p keypoints, o objects
+    "points": Dataset("p 3"),
+    "mass_fraction": Dataset("p", low=0, high=1.001),
+    "mass": Dataset("o", low=0, high=LARGE),
+    "volume": Dataset("o", low=0, high=LARGE),
+    "E": Dataset("o", low=0, high=LARGE),
+    "solidity": Dataset("o", low=1, high=LARGE),
+    "nu": Dataset("o", low=-1, high=0.5),
+    "friction": Dataset("o", low=0),
+    "velocity": Dataset("o 3"),
+    "inertia": Dataset("o 3 3"),
+    "box": Dataset("o 2 3"),
+    "awake": Dataset("o", "int", 0, 1),
+    "standing": Dataset("o", "int", 0, 1),
+    "material": Dataset("o", "text"),
+}
+
+
+@dataclass(frozen=True)
+class FieldUnits:
+    """Units of the model, and how it is stepped."""
+
+    length: float  # model metres per scene unit
+    scale: float  # model metres per metre
+    time: float  # model seconds per second
+    mass: float  # model kilograms per kilogram
+    origin: tuple[float, float, float]  # scene point that becomes (0, 0, FLOOR) [scene units]
+    gravity: float  # downwards, in model units [m/s^2]
+    steps: int  # of the model in a frame
+    weights: str  # sha256 of the model's weights
+    friction: float | None = None  # of all objects, in place of each material's
+
+
+@dataclass(frozen=True)
+class FieldStart:
+    """Keypoints, bodies and materials at the start, in model units; keypoints and objects in the file's order."""
+
+    points: Float[Tensor, "p 3"]  # [m]
+    mass_fraction: Float[Tensor, "p"]  # of each keypoint in its object's mass
+    mass: Float[Tensor, "o"]  # [kg]
+    volume: Float[Tensor, "o"]  # not in model units [m^3]
+    E: Float[Tensor, "o"]  # Young's modulus [Pa]
+    solidity: Float[Tensor, "o"]  # stiffness relative to a hollow body
+    nu: Float[Tensor, "o"]  # Poisson's ratio
+    friction: Float[Tensor, "o"]
+    velocity: Float[Tensor, "o 3"]  # of the centre of mass [m/s]
+    inertia: Float[Tensor, "o 3 3"]  # about the centre of mass, per unit of mass [m^2]
+    box: Float[Tensor, "o 2 3"]  # lower and upper corner of the room of each object [m]
+    awake: Int[Tensor, "o"]  # 0: at rest until touched
+    standing: Int[Tensor, "o"]  # 1: on the floor
+    material: tuple[str, ...]  # names
+    units: FieldUnits
+
+
+def write_field_start(file: h5py.File, start: FieldStart) -> None:
+    """Write the group, in place of one that is there."""
+    if GROUP in file:
+        del file[GROUP]
+    group = file.create_group(GROUP)
+    for name, dataset in DATASETS.items():
+        values = getattr(start, name)
+        text = dataset.kind == "text"
+        group.create_dataset(name, data=list(values) if text else values.cpu().numpy(),
+                             dtype=h5py.string_dtype() if text else None)  # fmt: skip
+    group.attrs.update({f.name: value for f in fields(FieldUnits) if (value := getattr(start.units, f.name)) is not None})
+
+
+def read_field_start(file: h5py.File, lengths: dict[str, int]) -> FieldStart | None:
+    """The group, or None where the file has none. Raises KeyError and ValueError for a damaged one."""
+    if GROUP not in file:
+        return None
+    read = {name: dataset.read(file, f"{GROUP}/{name}", lengths) for name, dataset in DATASETS.items()}
+    values = {k: torch.from_numpy(v) if isinstance(v, np.ndarray) else tuple(quote(s, 40) for s in v)
+              for k, v in read.items()}  # fmt: skip
+    attributes = file[GROUP].attrs
+    factors = {name: number(attributes[name], name, 1e-12, 1e12) for name in ("length", "scale", "time", "mass")}
+    friction = number(attributes["friction"], "friction", 0, 100) if "friction" in attributes else None
+    units = FieldUnits(
+        **factors, origin=numbers(attributes["origin"], 3, "origin"), gravity=number(attributes["gravity"], "gravity"), steps=whole(attributes["steps"], "steps", 1, 10_000),
+        weights=quote(str(attributes["weights"]), 64), friction=friction,
+    )  # fmt: skip
+    return FieldStart(**values, units=units)

@@ -281,8 +281,8 @@ def render(
         bool, Option("--show-forces", help="draw an arrow for each active force prompt")
     ] = RenderOptions.show_forces,
     playable: Annotated[
-        bool, Option("--playable", help="with -o film.html: objects can be dragged, pushed and lifted in the page, which "
-                     "computes their motion (trajectories of the engine ngff)")
+        bool, Option("--playable", help="with -o film.html: objects can be dragged, pushed and lifted in the page, "
+                     "which computes their motion (trajectories of the engine ngff)")
     ] = RenderOptions.playable,
     frame: Annotated[
         int | None, Option(help="render this frame only, from 0; -1 is the last; default: all")

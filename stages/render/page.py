@@ -60,7 +60,7 @@ def _check(out: Path, renderer: Renderer) -> None:
         raise InputError(f"{out}: --background of a page is a colour or a scene.ply, not a photo")
     trajectory = clip.animation.trajectory
     if options.playable and not clip.animation.is_moving:
-        raise InputError(f"--playable: {clip.name} has no motion to go on from; give a trajectory (.h5), without --frame")
+        raise InputError(f"--playable: {clip.name} has no motion to go on from; give a trajectory, without --frame")
     if clip.animation.is_moving and len(trajectory.keypoints.rest) > MAX_KEYPOINTS:
         raise InputError(f"{trajectory.path}: has {len(trajectory.keypoints.rest)} keypoints, and a page holds "
                          f"{MAX_KEYPOINTS}; simulate with fewer --keypoints, or write a video (.mp4)")  # fmt: skip

@@ -35,7 +35,8 @@ def run(
     renderer = Renderer(clips, options)
     out = Path(out) if out is not None else _default_output(sources, renderer)
     if options.playable and out.suffix.lower() != ".html":
-        raise InputError(f"--playable: only a page (-o {out.with_suffix('.html').name}) computes motion, not {out.name}")
+        page = out.with_suffix(".html").name
+        raise InputError(f"--playable: only a page (-o {page}) computes motion, not {out.name}")
     if out.is_dir():
         out = out / "frame.ply"
     facts = _writer(out)(out, renderer)

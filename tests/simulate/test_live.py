@@ -21,6 +21,8 @@ from stages.core.physics.forces import Change, ForcePrompts
 from stages.core.physics.keypoints import choose_keypoints
 from stages.core.scene.scene_ply import write_scene
 from stages.core.scene.trajectory import read_trajectory
+from stages.render.options import RenderOptions
+from stages.render.stage import run as render
 from stages.simulate.live.messages import BadMessage, parse_message
 from stages.simulate.live.server import MAX_CLIENTS, LiveServer
 from stages.simulate.live.session import Session
@@ -121,6 +123,30 @@ def test_what_is_held_hangs_where_the_cursor_is(monkeypatch):
     live, _, keypoints, session = prompts_of_a_session("ngff", monkeypatch, hold, frames=45)
     _, k = session.dragged
     assert (live[-1, k] - goal).norm() < 0.03
+
+
+PAGE_SESSION = """async ([frames, actions]) => {
+  const { engineInput } = await import("player/local.js"), { FieldEngine } = await import("player/engine.js");
+  const { Session } = await import("player/session.js");
+  const session = new Session(new FieldEngine(engineInput(player.film, player.rest)));
+  for (let n = 0; n < frames - 1; n++) {
+    for (const message of actions[n] ?? []) session.handle(message);
+    session.advance();
+  }
+  return Array.from(session.now.positions);
+}"""
+
+
+def test_a_page_without_server_answers_alike(tmp_path, monkeypatch, open_page):
+    """The same messages move the same objects, whether the engine or the page of a playable film takes them."""
+    frames, actions = 26, {n: a_busy_user(n, None) for n in range(26)}
+    live, _, _, _ = prompts_of_a_session("ngff", monkeypatch, a_busy_user, frames)
+    write_scene(tmp_path / "scene.ply", two_balls_scene())
+    options = SimulateOptions(engine="ngff", quality="draft", steps=2, keypoints=32, box="-1,-1,0,1,1,2", device="cpu")
+    run(tmp_path / "scene.ply", tmp_path / "traj.h5", options)
+    page = open_page(render(tmp_path / "traj.h5", tmp_path / "film.html", RenderOptions(playable=True)))
+    end = torch.tensor(page.evaluate(PAGE_SESSION, [frames, actions])).view(-1, 3)
+    assert (end - live[-1]).norm(dim=1).max() < 1e-3
 
 
 def test_changes_come_back_from_json():

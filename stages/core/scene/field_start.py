@@ -79,7 +79,8 @@ def write_field_start(file: h5py.File, start: FieldStart) -> None:
         text = dataset.kind == "text"
         group.create_dataset(name, data=list(values) if text else values.cpu().numpy(),
                              dtype=h5py.string_dtype() if text else None)  # fmt: skip
-    group.attrs.update({f.name: value for f in fields(FieldUnits) if (value := getattr(start.units, f.name)) is not None})
+    units = {f.name: getattr(start.units, f.name) for f in fields(FieldUnits)}
+    group.attrs.update({name: value for name, value in units.items() if value is not None})
 
 
 def read_field_start(file: h5py.File, lengths: dict[str, int]) -> FieldStart | None:
@@ -93,7 +94,8 @@ def read_field_start(file: h5py.File, lengths: dict[str, int]) -> FieldStart | N
     factors = {name: number(attributes[name], name, 1e-12, 1e12) for name in ("length", "scale", "time", "mass")}
     friction = number(attributes["friction"], "friction", 0, 100) if "friction" in attributes else None
     units = FieldUnits(
-        **factors, origin=numbers(attributes["origin"], 3, "origin"), gravity=number(attributes["gravity"], "gravity"), steps=whole(attributes["steps"], "steps", 1, 10_000),
-        weights=quote(str(attributes["weights"]), 64), friction=friction,
+        **factors, origin=numbers(attributes["origin"], 3, "origin"), gravity=number(attributes["gravity"], "gravity"),
+        steps=whole(attributes["steps"], "steps", 1, 10_000), weights=quote(str(attributes["weights"]), 64),
+        friction=friction,
     )  # fmt: skip
     return FieldStart(**values, units=units)

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-MIN_STIFFNESS = 3e3  # Young's modulus of the softest bodies in training [Pa]; for stiffer ones linear elasticity is used
+MIN_STIFFNESS = 3e3  # Young's modulus of the softest bodies in training [Pa]; stiffer ones are extrapolated
 REFERENCE_THICKNESS = 0.015  # volume over surface of the published objects, all hollow or thin [m]; measured on them
 
 

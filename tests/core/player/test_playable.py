@@ -1,0 +1,144 @@
+"""A playable film: the page computes the motion that the learned engine computes, and the mouse drags its objects."""
+
+import base64
+from dataclasses import replace
+
+import pytest
+import torch
+
+from stages.core.errors import InputError
+from stages.core.player.film import Motion, film_page, pack_film
+from stages.core.player.playable import playable_parts
+from stages.core.scene.gaussians import concatenate
+from stages.core.scene.scene import Scene, SceneObject
+from stages.core.scene.scene_ply import write_scene
+from stages.core.scene.trajectory import read_trajectory
+from stages.render.options import RenderOptions
+from stages.render.stage import run as render
+from stages.simulate.options import SimulateOptions
+from stages.simulate.stage import run as simulate
+from tests.browser import until
+from tests.conftest import ball, ring, two_balls_scene
+
+LIMIT = 1e-3  # between the page and the engine, after 50 frames [m]
+RUN = """async (films) => {
+  const { unpack } = await import("player/container.js"), { engineInput } = await import("player/local.js");
+  const { FieldEngine } = await import("player/engine.js"), out = [];
+  for (const text of films) {
+    const film = await unpack(text), rest = film.arrays.keypoints.subarray(0, 3 * film.arrays.keypoint_object.length);
+    const engine = new FieldEngine(engineInput(film, rest));
+    for (let n = 1; n < film.frames; n++) engine.advance();
+    out.push(Array.from(engine.positions()));
+  }
+  return out;
+}"""  # the last positions of the keypoints of each film
+RISE = """() => {
+  const ids = player.film.arrays.keypoint_object, own = [...ids.keys()].filter((k) => ids[k] === 1);
+  return own.reduce((sum, k) => sum + player.positions[3 * k + 2] - player.rest[3 * k + 2], 0) / own.length;
+}"""  # of object 1
+
+
+FIND = """() => {
+  for (let y = 50; y < 350; y += 6) for (let x = 250; x < 780; x += 6)
+    if (player.pick(x, y)?.object === 1) return [x + 6, y + 6];
+}"""  # a point of object 1 beside the panel [px]
+
+
+def thing(centre, radii, id):
+    """An ellipsoid of Gaussians."""
+    g = ball((0.0, 0.0, 0.0), 1.0, 150, (0.5, 0.5, 0.5), id, seed=id)
+    means = g.means * torch.tensor(radii) + torch.tensor(centre)
+    return replace(g, means=means, scales=g.scales * min(radii))
+
+
+def scene_of(*things):
+    """Ellipsoids (centre, radii) on a floor at 0."""
+    gaussians = concatenate([thing(*t, id) for id, t in enumerate(things, start=1)])
+    objects = tuple(SceneObject(id, f"thing {id}") for id in range(1, len(things) + 1))
+    return Scene(gaussians, objects, ring(), 0.0)
+
+
+BALL, FLAT, TALL = (0.1, 0.1, 0.1), (0.2, 0.15, 0.06), (0.06, 0.08, 0.2)
+SCENES = {  # scene, options
+    "a fall": (scene_of(((0, 0, 0.5), BALL)), {}),
+    "two meet": (two_balls_scene(), {"velocity": ("object=2 -0.8,0,0",)}),
+    "a push at a point": (two_balls_scene(), {"force": ("object=1 force=0,40,10 from=0.1 to=0.3 at=-0.3,0.1,0.2",)}),
+    "a torque": (scene_of(((0, 0, 0.3), TALL)), {"force": ("object=1 torque=0.2,0.1,0.3 to=0.2",), "lift": ("0.1",)}),
+    "three in a pile": (scene_of(((0, 0, 0.1), FLAT), ((0.05, 0, 0.32), BALL), ((0, 0.08, 0.7), TALL)), {}),
+    "soft": (scene_of(((0, 0, 0.1), BALL), ((0.02, 0, 0.4), FLAT)), {"material": ("1=jelly", "2=cloth")}),
+    "against walls": (scene_of(((0, 0, 0.2), BALL), ((0.3, 0, 0.2), FLAT)), {
+        "box": "-0.6,-0.6,0,0.6,0.6,2", "velocity": ("object=1 -2,1,0", "object=2 2,0,1")}),
+    "pinned": (scene_of(((0, 0, 0.3), FLAT), ((0.05, 0, 0.6), BALL)), {"pin": ("1",), "friction": 0.1}),
+    "no gravity": (two_balls_scene(), {"gravity": 0.0, "velocity": ("object=2 -1,0,-0.4",)}),
+    "asleep until hit": (scene_of(((0, 0, 0.1), BALL), ((0.18, 0, 0.1), BALL), ((-0.6, 0, 0.3), TALL)), {
+        "velocity": ("object=3 3,0,0",), "material": ("3=wood",)}),
+}  # fmt: skip
+
+
+def simulated(folder, scene, frames=51, **options):
+    """A trajectory of the learned engine, 32 keypoints for each object."""
+    write_scene(folder / "scene.ply", scene)
+    options = SimulateOptions(engine="ngff", keypoints=32, steps=frames, **options)
+    simulate(folder / "scene.ply", folder / "traj.h5", options)
+    return read_trajectory(folder / "traj.h5")
+
+
+def playable(trajectory):
+    return pack_film(trajectory.scene, replace(Motion.of(trajectory), field=playable_parts(trajectory)))
+
+
+def page_and_engine(folder, open_page, names, device, frames=51):
+    """For each scene the largest distance between the keypoints of the page and of the engine in the last frame [m]."""
+    trajectories = [simulated(folder, scene, frames, **options) for scene, options in map(SCENES.get, names)]
+    films = [playable(t) for t in trajectories]
+    (folder / "film.html").write_text(film_page(films[0], "parity"))
+    ends = open_page(folder / "film.html").evaluate(RUN, [base64.b64encode(film).decode() for film in films])
+    for t, end in zip(trajectories, ends, strict=True):
+        assert (t.positions[-1] - t.positions[0]).norm(dim=1).max() > 0.02
+        yield (t.positions[-1] - torch.tensor(end).view(-1, 3)).norm(dim=1).max()
+
+
+def test_the_page_computes_the_motion_of_the_engine(tmp_path, open_page, device):
+    names = ["two meet", "against walls"]
+    assert max(page_and_engine(tmp_path, open_page, names, device, frames=16)) < LIMIT
+
+
+@pytest.mark.slow
+def test_ten_motions_agree_after_fifty_frames(tmp_path, open_page, device):
+    distances = dict(zip(SCENES, page_and_engine(tmp_path, open_page, SCENES, device), strict=True))
+    assert max(distances.values()) < LIMIT, distances
+
+
+def test_the_mouse_takes_an_object_out_of_the_film(tmp_path, open_page):
+    simulated(tmp_path, two_balls_scene(), frames=5, lift=("2=0.1",), device="cpu")
+    page = open_page(render(tmp_path / "traj.h5", tmp_path / "film.html", RenderOptions(playable=True, view="input:0")))
+    page.set_viewport_size({"width": 800, "height": 400})
+    page.evaluate("player.play(false); player.seek(0)")
+    until(page, "!player.changed && !player.busy && player.drawn()")
+    spot = page.evaluate(FIND)
+    page.mouse.move(*spot)
+    page.mouse.down()
+    for i in range(12):
+        page.mouse.move(spot[0], spot[1] - 8 * i)
+        page.wait_for_timeout(20)
+    until(page, f"player.live.state?.arrows.length === 1 && ({RISE})() > 0.05")
+    page.mouse.up()
+    assert not page.is_visible("#time")
+    page.keyboard.press("b")  # back to the film
+    until(page, f"({RISE})() === 0")
+    assert page.is_visible("#time") and page.evaluate("player.live.running") is False
+
+
+def test_only_motions_of_the_learned_field_are_playable(tmp_path):
+    t = simulated(tmp_path, two_balls_scene(), frames=2, device="cpu")
+    for wrong, message in (
+        (replace(t, info=replace(t.info, engine="rigid")), "simulated by rigid"),
+        (replace(t, field=None), "simulate again"),
+        (replace(t, field=replace(t.field, units=replace(t.field.units, weights="0" * 64))), "NGFF_WEIGHTS"),
+    ):
+        with pytest.raises(InputError, match=message):
+            playable_parts(wrong)
+    with pytest.raises(InputError, match="only a page"):
+        render(tmp_path / "traj.h5", tmp_path / "film.mp4", RenderOptions(playable=True))
+    with pytest.raises(InputError, match="no motion"):
+        render(tmp_path / "scene.ply", tmp_path / "film.html", RenderOptions(playable=True))

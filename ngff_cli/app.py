@@ -330,7 +330,7 @@ def evaluate(
         bool, Option("--undistorted", help="label images are of undistorted views; default: of the photos as taken")
     ] = EvaluateOptions.undistorted,
     photos: Annotated[
-        Path | None, Option(help="folder of the labelled photos, for the report; default: rendered images")
+        Path | None, Option(help="folder of the photos, for the report of a trajectory or of label images")
     ] = EvaluateOptions.photos,
     report: Annotated[
         Path | None, Option(help="HTML report with curves and images to write (.html)")

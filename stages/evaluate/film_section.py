@@ -1,7 +1,8 @@
-"""The part of a report that shows a trajectory: the player, its objects, and what to try next."""
+"""The part of a report that shows a trajectory: the player, its objects, times of the stages, and what to try next."""
 
 from __future__ import annotations
 
+import math
 from html import escape
 from pathlib import Path
 
@@ -45,7 +46,8 @@ def film_section(path: Path) -> str:
     """HTML with the player of a trajectory in a frame, its objects, and commands for other motions."""
     trajectory = read_trajectory(path)
     parts = [] if trajectory.dense else [_player(trajectory, Path(path).stem)]
-    return "\n".join([*parts, _objects(trajectory), _next_steps(trajectory, Path(path))])
+    parts += [_objects(trajectory), _certainty(trajectory), _times(trajectory), _next_steps(trajectory, Path(path))]
+    return "\n".join(parts)
 
 
 def _player(trajectory: Trajectory, title: str) -> str:
@@ -58,23 +60,31 @@ def _objects(trajectory: Trajectory) -> str:
     """A table of the objects: size, mass and material, and where the material is from."""
     scene, choices = trajectory.scene, _materials(trajectory)
     given = {text.partition("=")[0] for text in trajectory.scene.provenance.get("options", {}).get("material", ())}
-    try:
-        bodies = sample_bodies(scene, PARTICLES)
-        volumes = [float(bodies.volume[bodies.body == row].sum()) for row in range(len(scene.objects))]
-    except InputError:
-        volumes = [float("nan")] * len(scene.objects)
     unit = "m" if scene.has_known_scale else "units"
     factor = scene.metres_per_unit if scene.has_known_scale else 1.0
     rows = []
-    for o, volume in zip(scene.objects, volumes, strict=True):
+    for o, volume in zip(scene.objects, _volumes(trajectory), strict=True):
         rest = trajectory.keypoints.rest[trajectory.keypoints.object_id == o.id]
         sides = (rest.amax(0) - rest.amin(0)).tolist() if len(rest) else [0.0] * 3
         size = " × ".join(f"{factor * side:.3g}" for side in sides)
-        mass = scene.mass_text(choices[o.id].material.density * volume * scene.metres_per_unit**3)
+        mass = scene.mass_text(choices[o.id].material.density * volume)
         cells = [f"{o.id} {o.name}", f"{size} {unit}", mass, choices[o.id].name, _source(o, choices[o.id], given)]
         rows.append("".join(f"<td>{escape(cell)}</td>" for cell in cells))
     head = "".join(f"<th>{name}</th>" for name in ("object", "size", "mass, about", "material", "which is"))
     return f"<table><tr>{head}</tr>{''.join(f'<tr>{row}</tr>' for row in rows)}</table>"
+
+
+def _volumes(trajectory: Trajectory) -> list[float]:
+    """Volume of each object [m^3]: as simulated, or estimated as an engine would."""
+    if trajectory.field is not None:
+        return trajectory.field.volume.tolist()
+    scene = trajectory.scene
+    try:
+        bodies = sample_bodies(scene, PARTICLES)
+    except InputError:
+        return [math.nan] * len(scene.objects)
+    volume = bodies.volume * scene.metres_per_unit**3
+    return [float(volume[bodies.body == row].sum()) for row in range(len(scene.objects))]
 
 
 def _materials(trajectory: Trajectory) -> dict[int, MaterialChoice]:
@@ -92,6 +102,39 @@ def _source(o: SceneObject, choice: MaterialChoice, given: set[str]) -> str:
     if o.material:
         return "stored in the scene"
     return "a guess: nothing is known" if choice.guessed else "inferred from the name"
+
+
+def _certainty(trajectory: Trajectory) -> str:
+    """Where the scale and the objects are from."""
+    scene, notes = trajectory.scene, []
+    known = "" if scene.has_known_scale else "; sizes and masses are relative to it"
+    notes.append(f"One unit is {scene.metres_per_unit:.4g} m: {scene.scale.get('source', 'not stated')}{known}.")
+    options = next((facts.get("options", {}) for facts in _stages(trajectory) if facts["command"] == "segment"), None)
+    if options is not None:
+        by = next((f"given (--{name})" for name in ("masks", "boxes") if options.get(name)), None)
+        notes.append(f"The objects were {by or 'found by the segmenter, which may cut or merge things'}.")
+    notes.append("Masses are volumes, with the unseen sides closed, times the density of the material.")
+    return f'<p class="notes">{escape(" ".join(notes))}</p>'
+
+
+def _stages(trajectory: Trajectory) -> list[dict]:
+    """Provenance of each stage, from the first on."""
+    found, facts = [], trajectory.scene.provenance
+    while isinstance(facts, dict) and "command" in facts:
+        found.insert(0, facts)
+        facts = facts.get("scene")
+    return found
+
+
+def _times(trajectory: Trajectory) -> str:
+    """Wall time of each stage that the file knows of."""
+    steps = [(str(facts["command"]), facts["seconds"]) for facts in _stages(trajectory)
+             if isinstance(facts.get("seconds"), (int, float))]  # fmt: skip
+    if not steps:
+        return ""
+    rows = [*steps, ("all", sum(seconds for _, seconds in steps))]
+    cells = "".join(f"<tr><td>{escape(name)}</td><td>{seconds:.1f} s</td></tr>" for name, seconds in rows)
+    return f"<table><tr><th>stage</th><th>time</th></tr>{cells}</table>"
 
 
 def _next_steps(trajectory: Trajectory, path: Path) -> str:

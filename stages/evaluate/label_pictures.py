@@ -1,4 +1,4 @@
-"""Pictures of label images for the report: photo, labelled objects and found objects side by side."""
+"""Pictures of objects in the views of the photos for the report: of a scene, and of label images beside it."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from stages.core.errors import InputError
-from stages.core.raster.rasterise import rasterise
+from stages.core.raster.rasterise import rasterise, rasterise_features
 from stages.core.scene.formats import IMAGE_SUFFIXES
 from stages.core.scene.images import read_image, resize
 from stages.core.scene.lens import Undistortion
@@ -19,7 +19,8 @@ from stages.core.scene.scene import Scene
 from stages.evaluate.options import EvaluateOptions
 from stages.evaluate.result import Pictures, Result
 
-MAX_PICTURES = 12  # photos in the report
+MAX_PICTURES = 12  # photos in the report of label images
+SCENE_PICTURES = 3  # in the report of a trajectory
 GOLDEN_RATIO = 0.618034  # steps of the hue, so that neighbouring numbers have different colours
 HUES = (0.08, 0.92)  # of labelled objects; red is for false ones
 GREY, RED = (0.6, 0.6, 0.6), (0.9, 0.1, 0.1)  # pixels that are not judged; false objects
@@ -76,6 +77,40 @@ def draw_pictures(
     return replace(result, pictures=pictures, legend=legend)
 
 
+@torch.no_grad()
+def found_objects(scene: Scene, view: int) -> Int[Tensor, "h w"]:
+    """The object with the largest share of each pixel of a view; 0 where the background's share is larger."""
+    g, cameras = scene.gaussians, scene.cameras
+    width, height = cameras.sizes[view].tolist()
+    ids = g.object_id.unique()
+    ids = ids[ids != 0]
+    if not len(ids):
+        return torch.zeros(height, width, dtype=torch.int64)
+    member = (g.object_id[:, None] == ids).float()
+    share = rasterise_features(g, member, cameras.viewmats[view][None], cameras.Ks[view][None], width, height)[0]
+    best, index = share.max(-1)
+    return torch.where(best > 1 - share.sum(-1), ids[index], 0)
+
+
+def draw_objects(result: Result, scene: Scene, options: EvaluateOptions) -> Result:
+    """The result with photo, drawing and objects of a scene at rest in SCENE_PICTURES of its cameras.
+
+    Photos are shown where `options.photos` names their folder.
+    """
+    cameras = scene.cameras
+    if cameras is None or not len(cameras):
+        return result
+    colours = {o.id: _colour(i) for i, o in enumerate(scene.objects)}
+    pictures = []
+    for view in sorted({round(f * (len(cameras) - 1)) for f in torch.linspace(0, 1, SCENE_PICTURES).tolist()}):
+        drawing, found = _rendered(scene, view), found_objects(scene, view)
+        everywhere = torch.ones_like(found, dtype=torch.bool)
+        images = {"drawing": drawing, "objects": paint(drawing, found, colours, everywhere)}
+        photo = {"photo": _photo(scene, view, options)} if options.photos else {}
+        pictures.append(Pictures(cameras.names[view], photo | images))
+    return replace(result, pictures=pictures, legend={o.name: colours[o.id] for o in scene.objects})
+
+
 def paint(photo: Image, ids: Int[Tensor, "h w"], colours: dict[int, Colour], judged: Bool[Tensor, "h w"]) -> Image:
     """The photo in grey, with objects in their colours (RED without one), white borders, and GREY where not judged."""
     out = photo.mean(2, keepdim=True).expand(-1, -1, 3).clone() * 0.6
@@ -91,13 +126,21 @@ def paint(photo: Image, ids: Int[Tensor, "h w"], colours: dict[int, Colour], jud
     return out
 
 
+def _rendered(scene: Scene, view: int) -> Image:
+    """The scene in the view of a camera."""
+    cameras, background = scene.cameras, scene.background
+    width, height = cameras.sizes[view].tolist()
+    drawn = rasterise(scene.gaussians, cameras.viewmats[view][None], cameras.Ks[view][None], width, height,
+                      background=None if background is None else torch.tensor(background))  # fmt: skip
+    return drawn.rgb[0].clamp(0, 1)
+
+
 def _photo(scene: Scene, view: int, options: EvaluateOptions) -> Image:
     """The photo in folder `options.photos`, undistorted and at the size of the view; without folder a rendering."""
     cameras = scene.cameras
     width, height = cameras.sizes[view].tolist()
     if options.photos is None:
-        drawn = rasterise(scene.gaussians, cameras.viewmats[view][None], cameras.Ks[view][None], width, height)
-        return drawn.rgb[0].clamp(0, 1)
+        return _rendered(scene, view)
     stem, folder = Path(cameras.names[view]).stem, Path(options.photos)
     files = [p for p in sorted(folder.glob("*")) if p.stem == stem and p.suffix.lower() in IMAGE_SUFFIXES]
     if not files:

@@ -18,7 +18,6 @@ from torch import Tensor
 from tqdm import tqdm
 
 from stages.core.errors import InputError
-from stages.core.raster.rasterise import rasterise_features
 from stages.core.scene.cameras import Cameras
 from stages.core.scene.files import must_exist
 from stages.core.scene.images import read_labels
@@ -26,7 +25,7 @@ from stages.core.scene.lens import Undistortion, photo_of
 from stages.core.scene.scene import Scene, SceneObject
 from stages.core.scene.scene_ply import read_scene
 from stages.core.scene.schema import flag, read_json, reason, texts, whole
-from stages.evaluate.label_pictures import LabelColours, LabelledView, draw_pictures
+from stages.evaluate.label_pictures import LabelColours, LabelledView, draw_pictures, found_objects
 from stages.evaluate.matching import object_labels
 from stages.evaluate.options import EvaluateOptions
 from stages.evaluate.result import Result
@@ -185,21 +184,6 @@ def read_truth(file: Path, cameras: Cameras, view: int, undistorted: bool = Fals
             "undistorted views"
         )
     return Undistortion.of(cameras, view, (width, height), undistorted).labels(labels)
-
-
-@torch.no_grad()
-def found_objects(scene: Scene, view: int) -> Int[Tensor, "h w"]:
-    """The object with the largest share of each pixel of a view; 0 where the background's share is larger."""
-    g, cameras = scene.gaussians, scene.cameras
-    width, height = cameras.sizes[view].tolist()
-    ids = g.object_id.unique()
-    ids = ids[ids != 0]
-    if not len(ids):
-        return torch.zeros(height, width, dtype=torch.int64)
-    member = (g.object_id[:, None] == ids).float()
-    share = rasterise_features(g, member, cameras.viewmats[view][None], cameras.Ks[view][None], width, height)[0]
-    best, index = share.max(-1)
-    return torch.where(best > 1 - share.sum(-1), ids[index], 0)
 
 
 def _notes(scene: Scene, scores: PanopticScores, rows: dict[int, str]) -> list[str]:

@@ -19,7 +19,7 @@ class EvaluateOptions:
     resample: bool = False  # interpolate the predicted motion at the frame times of the truth
     objects: str = ""  # names of the objects of the truth to compare: "duck,ball"; default: all
     undistorted: bool = False  # label images are of the undistorted views, not of the photos as taken
-    photos: Path | None = None  # folder of the labelled photos, for the report; by default the scene is rendered
+    photos: Path | None = None  # folder of the photos, for the report; without, those that are labelled are rendered
     report: Path | None = None  # HTML report with curves and images to write
     judge: bool = False  # have films scored by a vision-language model, to which frames of them are sent
     model: str = ""  # that scores; empty: OPENAI_MODEL

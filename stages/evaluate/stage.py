@@ -33,7 +33,7 @@ OPTION_KINDS = {  # options that apply to some kinds of data only
     "resample": ("trajectory",),
     "objects": ("trajectory",),
     "undistorted": ("labels",),
-    "photos": ("labels",),
+    "photos": ("trajectory", "labels"),
     "report": tuple(COMPARISONS),
     **dict.fromkeys(["model", "base_url", "askings", "together", "timeout", "resume", "seed"], ("films",)),
 }

@@ -60,8 +60,8 @@ class MatchedMotion:
 
 def compare(prediction: Path, truth: Path, options: EvaluateOptions) -> Result:
     """Match objects and points, then compute every metric per object and over all objects."""
-    true_scene = read_trajectory(truth)
-    predicted, true = _track(read_trajectory(prediction)), _track(true_scene)
+    mine, true_scene = read_trajectory(prediction), read_trajectory(truth)
+    predicted, true = _track(mine), _track(true_scene)
     notes: list[str] = []
     if options.align:
         similarity, how = find_alignment(predicted.frame, true.frame)
@@ -73,7 +73,12 @@ def compare(prediction: Path, truth: Path, options: EvaluateOptions) -> Result:
         check_same_reference_frame(predicted.frame, true.frame, pairs)
     predicted, true = _same_frames(predicted, true, options, notes)
     motion = _same_points(predicted, true, pairs, notes)
-    return _result(motion, 1 / true.dt, MIN_MOTION / true_scene.scene.metres_per_unit, notes)
+    result = _result(motion, 1 / true.dt, MIN_MOTION / true_scene.scene.metres_per_unit, notes)
+    if not options.report:
+        return result
+    from stages.evaluate.label_pictures import draw_objects  # imports Warp
+
+    return draw_objects(result, mine.scene, options)
 
 
 def _track(trajectory: Trajectory) -> Track:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import logging
+import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from stages.core.backends import choose, pick_device
 from stages.core.errors import InputError
-from stages.core.scene.files import ngff_version, provenance, sha256
+from stages.core.scene.files import ngff_version, provenance, seconds_since, sha256
 from stages.core.scene.scene_ply import write_scene
 from stages.reconstruct.options import BACKENDS, SINGLE_PHOTO_BACKENDS, ReconstructOptions
 from stages.reconstruct.photo_reader import read_photos
@@ -49,7 +50,7 @@ def run(imgs: Path, out: Path, options: ReconstructOptions = ReconstructOptions(
     Finished steps are kept in a hidden folder next to `out` until the scene is written; an interrupted run leaves it
     for `options.resume`. Raises InputError, and deletes the folder, where the photos or options do not work.
     """
-    backend = choose(BACKENDS, options.backend)
+    began, backend = time.monotonic(), choose(BACKENDS, options.backend)
     photos = read_photos(imgs, options.max_side, min_count=1 if options.backend in SINGLE_PHOTO_BACKENDS else 2)
     if known := parse_scale(options.scale_reference):
         known.check(photos.names)
@@ -57,7 +58,7 @@ def run(imgs: Path, out: Path, options: ReconstructOptions = ReconstructOptions(
     try:
         made = backend(photos, options, steps)
         inputs = [Path(imgs), *([options.cameras] if options.cameras else [])]
-        facts = {**provenance("reconstruct", inputs, options), **made.scene.provenance}
+        facts = {**provenance("reconstruct", inputs, options), **seconds_since(began), **made.scene.provenance}
         write_scene(out, replace(made.scene, provenance=facts))
     except InputError:
         steps.remove()

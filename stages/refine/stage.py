@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from stages.core.geometry.neighbours import knn
 from stages.core.perception.region_growing import grow_objects
 from stages.core.perception.support import Support, find_support, view_extent
 from stages.core.perception.wall import find_wall, rotate_wall_to_floor
-from stages.core.scene.files import provenance
+from stages.core.scene.files import provenance, seconds_since
 from stages.core.scene.gaussians import Gaussians, concatenate, transformed
 from stages.core.scene.scene import Scene
 from stages.core.scene.scene_ply import read_scene, write_scene
@@ -33,12 +34,13 @@ def run(scene: Path, out: Path, options: RefineOptions = RefineOptions()) -> Non
 
     Raises InputError for invalid inputs, such as a scene without objects; then nothing is written.
     """
+    began = time.monotonic()
     device = pick_device(options.device)
     whole = read_scene(scene)
     if not bool((whole.gaussians.object_id > 0).any()):
         raise InputError(f"{scene}: has no objects; label them with `ngff segment {scene} -o labelled.ply` first")
     refined = refine(whole, options)
-    facts = {**provenance("refine", [Path(scene)], options), "scene": whole.provenance}
+    facts = {**provenance("refine", [Path(scene)], options), **seconds_since(began), "scene": whole.provenance}
     write_scene(out, replace(refined, provenance=facts))
     psnr = object_psnr(whole, refined, device=device)
     seen = "" if psnr is None else f"; PSNR against the input in the views of the photos {psnr:.1f} dB"

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import logging
+import time
 from dataclasses import replace
 from pathlib import Path
 
 from stages.core.backends import choose, pick_device
 from stages.core.errors import InputError
-from stages.core.scene.files import provenance
+from stages.core.scene.files import provenance, seconds_since
 from stages.core.scene.scene import Scene
 from stages.core.scene.scene_ply import read_scene, write_scene
 from stages.segment.object_scale import parse_object_scale
@@ -22,14 +23,14 @@ def run(scene: Path, out: Path, options: SegmentOptions = SegmentOptions()) -> N
 
     Raises InputError for invalid inputs; then nothing is written.
     """
-    segment = choose(BACKENDS, options.chosen)
+    began, segment = time.monotonic(), choose(BACKENDS, options.chosen)
     pick_device(options.device)  # raises for an absent GPU; only networks use one
     whole = read_scene(scene)
     labelled = rename_objects(segment(whole, options), options)
     reference = parse_object_scale(options.scale_reference)
     labelled = reference.applied(labelled) if reference else labelled
     inputs = [Path(p) for p in (scene, options.boxes, options.photos) if p is not None]
-    facts = {**provenance("segment", inputs, options), "scene": whole.provenance}
+    facts = {**provenance("segment", inputs, options), **seconds_since(began), "scene": whole.provenance}
     write_scene(out, replace(labelled, provenance=facts))
     log_objects(labelled)
     log.info("%s: %d objects", out, len(labelled.objects))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from stages.core.backends import choose, pick_device
 from stages.core.errors import InputError
 from stages.core.physics import forces
 from stages.core.physics.keypoints import bind_gaussians, choose_keypoints
-from stages.core.scene.files import provenance
+from stages.core.scene.files import provenance, seconds_since
 from stages.core.scene.formats import suffixes
 from stages.core.scene.scene import Scene
 from stages.core.scene.scene_ply import read_scene
@@ -30,7 +31,7 @@ def run(scene: Path, out: Path, options: SimulateOptions = SimulateOptions()) ->
     With --live it runs until Ctrl-C. Raises InputError for wrong options or input, and when the simulation diverges;
     the frames up to then are kept in OUT.partial.h5.
     """
-    options = with_recorded(options)
+    began, options = time.monotonic(), with_recorded(options)
     options = replace(options, keypoints=options.keypoint_count)
     if options.engine not in (AUTO, *ENGINES):
         raise InputError(f"--engine {options.engine}: choose from {', '.join((AUTO, *ENGINES))}")
@@ -60,6 +61,7 @@ def run(scene: Path, out: Path, options: SimulateOptions = SimulateOptions()) ->
             start = state.positions if start is None else start
             displacement = float((state.positions - start).norm(dim=1).max())
             max_displacement = max(max_displacement, displacement)
+        trajectory.store_provenance({**world.provenance, **seconds_since(began)})
     size = float((keypoints.rest.amax(0) - keypoints.rest.amin(0)).max())
     if max_displacement < 0.02 * size and not prompts:
         log.info("everything is at rest (maximum displacement %.2g); try --lift 0.3 or a --force", max_displacement)

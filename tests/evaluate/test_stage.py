@@ -2,11 +2,14 @@
 
 import math
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
 
 from stages.core.errors import InputError
+from stages.core.scene.images import write_png
 from stages.evaluate.options import EvaluateOptions
 from stages.evaluate.result import Result, format_table, to_json
 from stages.evaluate.stage import run
@@ -56,6 +59,21 @@ def test_report_has_a_player_whose_time_is_that_of_the_curves(tmp_path, two_ball
     plot = page.locator("body > figure svg")
     plot.click(position={"x": plot.bounding_box()["width"] * right / 720, "y": 20})
     until(page, f"{of_player}.time > 0.98 * {of_player}.duration")
+
+
+def test_report_shows_photos_objects_and_times(tmp_path, two_balls):
+    reconstruct, segment = {"command": "reconstruct", "seconds": 130.2}, {"command": "segment", "seconds": 9.8}
+    scene = replace(two_balls, provenance={**segment, "options": {"masks": "labels"}, "scene": reconstruct})
+    true = write_motion(tmp_path / "true.h5", scene)
+    (tmp_path / "photos").mkdir()
+    for name in scene.cameras.names:
+        write_png(tmp_path / "photos" / name, torch.full((64, 64, 3), 0.5))
+    for photos, shown in ((tmp_path / "photos", ["photo", "drawing", "objects"]), (None, ["drawing", "objects"])):
+        run(true, true, None, EvaluateOptions(report=tmp_path / "report.html", photos=photos))
+        html = (tmp_path / "report.html").read_text()
+        assert re.findall(r'<img alt="([^"]*)"', html) == shown * 3
+    for text in ("reconstruct</td><td>130.2 s", "all</td><td>140.0 s", "were given (--masks)", "</span> red ball"):
+        assert text in html
 
 
 @pytest.mark.parametrize(

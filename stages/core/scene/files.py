@@ -5,6 +5,7 @@ import itertools
 import os
 import platform
 import shutil
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, is_dataclass
@@ -97,6 +98,11 @@ def ngff_version() -> str:
         return version("ngff")
     except PackageNotFoundError:
         return "0 (not installed)"
+
+
+def seconds_since(began: float) -> dict[str, float]:
+    """{"seconds": wall time since `began` (time.monotonic())}; empty where $SOURCE_DATE_EPOCH asks for equal files."""
+    return {} if "SOURCE_DATE_EPOCH" in os.environ else {"seconds": round(time.monotonic() - began, 1)}
 
 
 def provenance(command: str, inputs: list[Path], options: object = None) -> dict:

@@ -214,6 +214,11 @@ class TrajectoryWriter:
         self._file.flush()
         self._raw.check()
 
+    def store_provenance(self, facts: dict) -> None:
+        """Write the provenance of the scene with what is known at the end."""
+        self._file.attrs["provenance"] = json.dumps(facts)
+        self._raw.check()
+
     def store_field(self, start: FieldStart | None) -> None:
         """Write what the learned engine started from, if it did."""
         if start is not None:

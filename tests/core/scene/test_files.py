@@ -8,7 +8,7 @@ import pytest
 
 from stages.core.errors import InputError
 from stages.core.scene import files
-from stages.core.scene.files import replacing
+from stages.core.scene.files import replacing, seconds_since
 
 
 def test_two_writers_of_one_file_do_not_mix(tmp_path):
@@ -45,3 +45,10 @@ def test_next_run_deletes_what_a_killed_one_left_and_nothing_else(tmp_path, monk
         with replacing(tmp_path / "c.txt") as part:
             part.write_text("c")
     assert sorted(os.listdir(tmp_path)) == ["b.txt", "c.txt"]
+
+
+def test_times_are_left_out_where_files_are_to_be_equal(monkeypatch):
+    monkeypatch.setattr(files.time, "monotonic", lambda: 12.04)
+    assert seconds_since(10.0) == {"seconds": 2.0}
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", "0")
+    assert seconds_since(10.0) == {}

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from contextlib import suppress
+from dataclasses import replace
 from html import escape
 from pathlib import Path
 
@@ -11,6 +13,7 @@ from stages.core.physics.materials import MaterialChoice, choose_materials
 from stages.core.physics.particles import sample_bodies
 from stages.core.physics.shadow_casting import find_shadows
 from stages.core.player.film import Motion, film_page, pack_film
+from stages.core.player.playable import playable_parts
 from stages.core.scene.scene import SceneObject
 from stages.core.scene.trajectory import Trajectory, read_trajectory
 
@@ -52,7 +55,11 @@ def film_section(path: Path) -> str:
 
 def _player(trajectory: Trajectory, title: str) -> str:
     shadows = find_shadows(trajectory.scene, trajectory.keypoints)
-    page = film_page(pack_film(trajectory.scene, Motion.of(trajectory), {"arrows": True}, shadows), title)
+    motion = Motion.of(trajectory)
+    if trajectory.field is not None:
+        with suppress(InputError):  # of other weights, say: the film alone is shown
+            motion = replace(motion, field=playable_parts(trajectory))
+    page = film_page(pack_film(trajectory.scene, motion, {"arrows": True}, shadows), title)
     return f'<iframe title="{escape(title)}" srcdoc="{escape(page)}"></iframe>'
 
 

@@ -47,6 +47,10 @@ def check_trajectory(t: Trajectory) -> None:
     assert all(x.isfinite().all() for x in (t.positions, t.com, t.rotation, t.binding.weight, t.keypoints.rest)), "nan"
     assert t.binding.index.shape == t.binding.weight.shape and int(t.binding.index.max()) < t.positions.shape[1], "bind"
     assert 0 < t.info.dt < 1e5 and all(abs(x) < 1e10 for x in t.info.gravity), "info"
+    if t.field is not None:
+        values = [x for x in vars(t.field).values() if isinstance(x, torch.Tensor)]
+        assert all(x.float().isfinite().all() for x in values), "field"
+        assert len(t.field.points) == len(t.keypoints.rest) and len(t.field.mass) == len(t.scene.objects), "field"
 
 
 def check_lenses(found: tuple[Cameras, LensDistortion]) -> None:

@@ -16,6 +16,7 @@ from stages.core.models import checkpoints
 from stages.core.physics.forces import parse, read_forces, stored_prompts
 from stages.core.physics.materials import choose_materials
 from stages.core.scene.cameras import Cameras, read_cameras
+from stages.core.scene.field_start import FieldStart, FieldUnits
 from stages.core.scene.files import sha256
 from stages.core.scene.gaussians import Gaussians
 from stages.core.scene.images import VideoWriter, read_image, read_labels, read_video, write_labels, write_png
@@ -86,6 +87,13 @@ def write_trajectory(path: Path) -> None:
     with TrajectoryWriter(path, scene, info, Keypoints(rest, torch.arange(12) % 2 + 1), binding) as writer:
         for _ in range(3):
             writer.append(rest, torch.zeros(2, 3), torch.eye(4)[:2])
+        one = torch.ones(2)
+        units = FieldUnits(2.0, 2.0, 1.4, 0.5, (0.0, 0.0, 0.0), 5.0, 2, "0" * 64)
+        writer.store_field(FieldStart(
+            rest, torch.full((12,), 1 / 6), one, one, 1e5 * one, one, 0.3 * one, 0.5 * one, torch.zeros(2, 3),
+            torch.eye(3).repeat(2, 1, 1), torch.tensor([[-1.0] * 3, [1.0] * 3]).repeat(2, 1, 1), one.long(), one.long(),
+            ("rubber", "common"), units,
+        ))  # fmt: skip
 
 
 def write_transforms(path: Path) -> None:

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from stages.core.backends import pick_device
+from stages.core.errors import InputError
 from stages.core.models import checkpoints as weights
 from stages.core.models.dynamics import FRAME, Dynamics
 from stages.core.models.external_forces import ExternalForces
@@ -26,7 +27,7 @@ from stages.core.scene.field_start import FieldStart, FieldUnits
 from stages.core.scene.scene import Scene, SceneObject
 from stages.core.scene.trajectory import Keypoints
 from stages.simulate.changes import changed_options, changed_pins
-from stages.simulate.model_units import ModelUnits
+from stages.simulate.model_units import TYPICAL_SIZE, ModelUnits
 from stages.simulate.options import ENGINES, SimulateOptions
 from stages.simulate.setup import SceneSetup, check_motion, set_up_scene
 from stages.simulate.sleep import SleepState
@@ -39,6 +40,7 @@ MAX_OBJECTS = 6  # objects per scene of the benchmark
 MIN_THICKNESS = 0.044  # thickness of the thinnest object, the cloth [m]
 MAX_SPEED = 5.0  # maximum speed of falls [m/s]
 FAR_WALL = 100.0  # distance of walls where there are none [m]
+MAX_STEPS = 1000  # of the model for one frame
 FLOOR_OUTLIERS = 0.02  # fraction of an object's keypoints that may lie below the floor under it
 
 
@@ -63,6 +65,10 @@ def rollout(
     in_model_units = ForcePrompts(units.forces(prompts.forces, setup.lift, ids), prompts.pinned)
     forces = ExternalForces.from_prompts(initial, in_model_units, ids)
     steps = max(1, math.ceil(options.dt * units.time / FRAME - 1e-6))
+    if steps > MAX_STEPS:
+        raise InputError(f"the objects are about {TYPICAL_SIZE / units.length:.2g} scene units large, so that a frame of "
+                         f"{options.dt:g} s takes {steps} steps of the learned field; give a smaller --dt or another "
+                         "--engine")  # fmt: skip
     log.info("%s (%s): %d objects, %d keypoints, lengths scaled by %.3g, times by %.3g, %d steps per frame",
              options.engine, card["sha256"][:8], len(ids), len(keypoints.rest), units.length / scene.metres_per_unit,
              units.time, steps)  # fmt: skip

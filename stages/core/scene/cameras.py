@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from stages.core.errors import InputError
 from stages.core.geometry.similarity import Similarity
 from stages.core.scene.colmap_model import read_colmap
-from stages.core.scene.schema import number, numbers, quote, read_json, reason
+from stages.core.scene.schema import LARGEST, number, numbers, quote, read_json, reason
 
 LENS_MODEL = "opencv"  # the only one: k1 k2 p1 p2 k3 of OpenCV
 DISTORTION = ("k1", "k2", "p1", "p2", "k3")
@@ -61,18 +62,34 @@ def check_cameras(cameras: Cameras) -> Cameras:
     V, R = cameras.viewmats.double(), cameras.viewmats[:, :3, :3].double()
     rigid = (R @ R.mT - torch.eye(3, dtype=R.dtype)).abs().amax((1, 2)) < 1e-2
     rigid &= (torch.linalg.det(R) > 0) & ((V[:, 3] - V.new_tensor([0, 0, 0, 1])).abs().amax(1) < 1e-4)
-    focals, sizes = cameras.Ks[:, [0, 1], [0, 1]], cameras.sizes
-    checks = {
-        "a value of viewmat that is not finite": cameras.viewmats.isfinite().all((1, 2)),
-        "a value of K that is not finite": cameras.Ks.isfinite().all((1, 2)),
+    _check_each(cameras.names, {
+        "a value of viewmat that is not finite, or far too large": (V.abs() <= LARGEST).all(2).all(1),
         "a viewmat that is not a rotation and a translation": rigid,
-        "a focal length in K that is not above 0": (focals > 0).all(1),
+    })  # fmt: skip
+    _check_intrinsics(cameras.names, cameras.Ks, cameras.sizes)
+    if cameras.photos is not None:
+        names = [f"{name}: photo" for name in cameras.names]
+        _check_intrinsics(names, cameras.photos.Ks, cameras.photos.sizes)
+        lens = (cameras.photos.distortion.abs() <= LARGEST).all(1)
+        _check_each(names, {"a value of distortion that is not finite, or far too large": lens})
+    return cameras
+
+
+def _check_intrinsics(names: Sequence[str], Ks: Float[Tensor, "c 3 3"], sizes: Int[Tensor, "c 2"]) -> None:
+    others = Ks[:, [0, 1, 2, 2, 2], [1, 0, 0, 1, 2]] - Ks.new_tensor([0, 0, 0, 0, 1])
+    _check_each(names, {
+        "a value of K that is not finite, or far too large": (Ks.abs() <= LARGEST).all(2).all(1),
+        "a focal length in K that is not above 0": (Ks[:, [0, 1], [0, 1]] > 0).all(1),
+        "a K that is not [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]": (others.abs() < 1e-3).all(1),
         f"a size that is not 1 to {MAX_SIDE} px": ((sizes > 0) & (sizes <= MAX_SIDE)).all(1),
-    }
+    })  # fmt: skip
+
+
+def _check_each(names: Sequence[str], checks: dict[str, Bool[Tensor, "c"]]) -> None:
+    """ValueError with the name of the first camera that is not right, and what it has instead."""
     for what, right in checks.items():
         if not right.all():
-            raise ValueError(f"{quote(cameras.names[int((~right).nonzero()[0])])} has {what}")
-    return cameras
+            raise ValueError(f"{quote(names[int((~right).nonzero()[0])])} has {what}")
 
 
 def to_json(cameras: Cameras) -> list[dict]:
@@ -116,8 +133,6 @@ def _intrinsics(rows: list[dict], labels: tuple[str, ...]) -> tuple[Float[Tensor
     Ks, sizes = [], []
     for row, label in zip(rows, labels, strict=True):
         K, size = _matrix(row["K"], (3, 3), f"{label}: K"), row["size"]
-        if not (K[0, 0] > 0 and K[1, 1] > 0):
-            raise ValueError(f"{label}: a focal length in K is not above 0")
         if len(size) != 2 or not all(isinstance(side, int) and 0 < side <= MAX_SIDE for side in size):
             raise ValueError(f"{label}: size {quote(size, 40)} is not two whole numbers above 0")
         Ks.append(K)

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from stages.core.errors import InputError
-from stages.core.geometry.cameras import centres
+from stages.core.geometry.cameras import centres, resize
 from stages.core.geometry.similarity import Similarity
 from stages.core.scene.cameras import Cameras, PhotoIntrinsics, from_json, read_cameras, to_json
 from tests.conftest import ring
@@ -19,7 +19,7 @@ def with_photos(cameras: Cameras) -> Cameras:
     """Cameras that remember photos of twice the size, with another lens each."""
     c = len(cameras)
     lens = torch.tensor([-0.25, 0.04, 0.001, -0.002, 0.01]) * torch.arange(1, c + 1)[:, None]
-    return dataclasses.replace(cameras, photos=PhotoIntrinsics(2.1 * cameras.Ks, 2 * cameras.sizes, lens))
+    return dataclasses.replace(cameras, photos=PhotoIntrinsics(resize(cameras.Ks, 2.1, 2.1), 2 * cameras.sizes, lens))
 
 
 def write_transforms(folder, **more):
@@ -82,7 +82,8 @@ def test_selected_and_moved_cameras_keep_their_photos():
     [("distortion", [0.1, 0.2], r"00.png: photo: distortion has shape \(2,\), not \(5,\)"),
      ("distortion", [0.1, float("nan"), 0, 0, 0], "distortion has a value that is not finite"),
      ("K", [[1, 0, 0], [0, 1, 0]], r"K has shape \(2, 3\), not \(3, 3\)"),
-     ("K", [[0, 0, 1], [0, 1, 1], [0, 0, 1]], "a focal length in K is not above 0"),
+     ("K", [[0, 0, 1], [0, 1, 1], [0, 0, 1]], "00.png: photo has a focal length in K that is not above 0"),
+     ("K", [[1, 9, 1], [0, 1, 1], [0, 0, 1]], r"00.png: photo has a K that is not \[\[fx, 0, cx\]"),
      ("size", [64.5, 48], r"size \[64.5, 48\] is not two whole numbers above 0"), ("size", [64], "not two whole"),
      ("size", [64, 0], "not two whole"), ("model", "fisheye", "lens model 'fisheye' is not known; only 'opencv' is")],
 )  # fmt: skip

@@ -10,11 +10,14 @@ from typing import Annotated
 
 import typer
 
+from stages.core.backends import MAX_SEED
 from stages.core.errors import InputError
 
 SceneIn = Annotated[Path, typer.Argument(metavar="SCENE.ply", help="scene to read (.ply)", show_default=False)]
 Device = Annotated[str, typer.Option(help="auto | cpu | cuda | cuda:N")]
-Seed = Annotated[int, typer.Option(help="random seed; the same seed and device give the same result")]
+Seed = Annotated[
+    int, typer.Option(min=0, max=MAX_SEED, help="random seed; the same seed and device give the same result")
+]
 Threads = Annotated[int | None, typer.Option(
     help="CPU threads; default: all cores. With OMP_WAIT_POLICY=ACTIVE in the environment waiting threads spin: faster "
          "on an idle machine, slower beside other work", show_default=False)]  # fmt: skip

@@ -7,6 +7,7 @@ from importlib import import_module
 
 from stages.core.errors import InputError
 
+MAX_SEED = 2**31 - 1  # which every library takes
 
 @dataclass(frozen=True)
 class Backend:

@@ -15,6 +15,7 @@ from stages.core.physics.shadow_casting import find_shadows
 from stages.core.player.film import Motion, film_page, pack_film
 from stages.core.player.playable import playable_parts
 from stages.core.scene.scene import SceneObject
+from stages.core.scene.schema import texts
 from stages.core.scene.trajectory import Trajectory, read_trajectory
 
 PARTICLES = 6000  # from which masses are estimated
@@ -66,7 +67,7 @@ def _player(trajectory: Trajectory, title: str) -> str:
 def _objects(trajectory: Trajectory) -> str:
     """A table of the objects: size, mass and material, and where the material is from."""
     scene, choices = trajectory.scene, _materials(trajectory)
-    given = {text.partition("=")[0] for text in trajectory.scene.provenance.get("options", {}).get("material", ())}
+    given = {text.partition("=")[0] for text in _given_materials(trajectory)}
     unit = "m" if scene.has_known_scale else "units"
     factor = scene.metres_per_unit if scene.has_known_scale else 1.0
     rows = []
@@ -96,11 +97,18 @@ def _volumes(trajectory: Trajectory) -> list[float]:
 
 def _materials(trajectory: Trajectory) -> dict[int, MaterialChoice]:
     """As the simulation chose them, but for a --materials file, of which only the name is stored."""
-    prompts = tuple(trajectory.scene.provenance.get("options", {}).get("material", ()))
     try:
-        return choose_materials(trajectory.scene.objects, prompts)
+        return choose_materials(trajectory.scene.objects, _given_materials(trajectory))
     except InputError:  # a file of another tool
         return choose_materials([SceneObject(o.id, o.name) for o in trajectory.scene.objects])
+
+
+def _given_materials(trajectory: Trajectory) -> tuple[str, ...]:
+    """The --material options of the simulation; none in a file of another tool."""
+    try:
+        return texts(trajectory.scene.provenance.get("options", {}).get("material") or [], "material")
+    except ValueError:
+        return ()
 
 
 def _source(o: SceneObject, choice: MaterialChoice, given: set[str]) -> str:

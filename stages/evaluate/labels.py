@@ -24,7 +24,7 @@ from stages.core.scene.images import read_labels
 from stages.core.scene.lens import Undistortion, photo_of
 from stages.core.scene.scene import Scene, SceneObject
 from stages.core.scene.scene_ply import read_scene
-from stages.core.scene.schema import flag, read_json, reason, texts, whole
+from stages.core.scene.schema import flag, numbered, read_json, reason, text
 from stages.evaluate.label_pictures import LabelColours, LabelledView, draw_pictures, found_objects
 from stages.evaluate.matching import object_labels
 from stages.evaluate.options import EvaluateOptions
@@ -148,9 +148,9 @@ def read_label_names(folder: Path) -> dict[int, LabelledObject]:
     """The objects of names.json by number: {"1": {"name": "duck", "core": true}}, or {"1": "duck"}; core by default."""
     path = must_exist(folder / "names.json", f"the names of the labelled objects, {NAMES_EXAMPLE},")
     try:
-        rows = read_json(path).items()
-        named = {whole(int(i), "a label"): row if isinstance(row, dict) else {"name": row} for i, row in rows}
-        return {i: LabelledObject(*texts([row["name"]], "a name"), flag(row.get("core", True), "core"))
+        rows = numbered(read_json(path), "a label").items()
+        named = {i: row if isinstance(row, dict) else {"name": row} for i, row in rows}
+        return {i: LabelledObject(text(row["name"], "a name"), flag(row.get("core", True), "core"))
                 for i, row in named.items()}  # fmt: skip
     except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RuntimeError, IndexError) as error:
         raise InputError(f"{path}: is not readable ({reason(error)}); write {NAMES_EXAMPLE}") from error

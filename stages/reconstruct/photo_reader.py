@@ -18,7 +18,7 @@ from tqdm import tqdm
 from stages.core.errors import InputError
 from stages.core.scene.files import must_exist
 from stages.core.scene.formats import IMAGE_SUFFIXES, VIDEO_SUFFIXES
-from stages.core.scene.images import import_av, list_photos, open_video, read_image, to_bytes
+from stages.core.scene.images import import_av, list_photos, open_video, read_8_bit
 from stages.reconstruct.photos import Photos
 
 log = logging.getLogger(__name__)
@@ -116,11 +116,11 @@ def _read_files(files: list[Path], side: int, unread: dict[str, str]) -> Iterato
         try:
             if _is_truncated(must_exist(file, "a photo")):
                 raise InputError(f"{file}: is truncated; copy it again from its source")
-            image = read_image(file)
+            image = read_8_bit(file).numpy()
         except InputError as error:
             unread[file.name] = str(error)
             continue
-        bounded = _limit_size(to_bytes(image), side)
+        bounded = _limit_size(image, side)
         height, width = image.shape[:2]
         focal = _exif_focal(file) * max(bounded.shape[:2]) / max(width, height)
         yield i, LoadedImage(file.name, bounded, focal, (width, height))

@@ -34,7 +34,8 @@ class Animation:
     @property
     def is_moving(self) -> bool:
         """Whether the Gaussians change over time."""
-        return self.trajectory is not None and self.frozen is None and len(self.trajectory) > 1
+        t = self.trajectory
+        return t is not None and self.frozen is None and len(t) > 1 and (t.dense or bool(len(t.keypoints.rest)))
 
     @property
     def fps(self) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import torch
 from jaxtyping import Int
 from torch import Tensor
 from tqdm import tqdm
@@ -12,10 +13,12 @@ from stages.core.errors import InputError
 from stages.core.scene.images import read_labels
 from stages.core.scene.lens import Undistortion
 from stages.core.scene.scene import Scene
-from stages.core.scene.schema import read_json, reason, texts, whole
+from stages.core.scene.schema import numbered, read_json, reason, texts
 from stages.segment.options import SegmentOptions
 from stages.segment.view_images import match_files
 from stages.segment.voting import apply_votes, collect_votes
+
+MAX_LABELS = 1000  # different numbers in all label images
 
 
 def segment(scene: Scene, options: SegmentOptions) -> Scene:
@@ -25,10 +28,22 @@ def segment(scene: Scene, options: SegmentOptions) -> Scene:
     """
     if scene.cameras is None:
         raise InputError("--masks: the scene has no cameras; use one that `ngff reconstruct` wrote")
-    files = match_files(options.masks, scene.cameras.names, "label image", "--masks")
-    bar = tqdm(files.items(), unit="mask")
-    votes = collect_votes(scene, ((view, _labels(scene, view, file, options)) for view, file in bar))
-    return apply_votes(scene, votes, read_names(options.masks), str(options.masks), options.seed)
+    files, names = match_files(options.masks, scene.cameras.names, "label image", "--masks"), read_names(options.masks)
+    bar, columns = tqdm(files.items(), unit="mask"), {0: 0}
+    votes = collect_votes(scene, ((view, _columns(_labels(scene, view, file, options), columns)) for view, file in bar))
+    order = sorted(columns)
+    votes = votes[:, [columns[number] for number in order]]
+    return apply_votes(scene, votes, names, str(options.masks), options.seed, order)
+
+
+def _columns(labels: Int[Tensor, "h w"], columns: dict[int, int]) -> Int[Tensor, "h w"]:
+    """The labels by their columns in the table of votes; new ones are added to `columns`."""
+    numbers, index = labels.unique(return_inverse=True)
+    for number in numbers.tolist():
+        columns.setdefault(number, len(columns))
+    if len(columns) > MAX_LABELS:
+        raise InputError(f"--masks: the label images have more than {MAX_LABELS} different numbers; each is an object")
+    return torch.tensor([columns[number] for number in numbers.tolist()])[index]
 
 
 def _labels(scene: Scene, view: int, file: Path, options: SegmentOptions) -> Int[Tensor, "h w"]:
@@ -48,8 +63,7 @@ def read_names(folder: Path) -> dict[int, str]:
         return {}
     try:
         data = read_json(path)
-        labels = range(1, len(data) + 1) if isinstance(data, list) else data.keys()
-        names = texts(list(data) if isinstance(data, list) else list(data.values()), "the names")
-        return {whole(int(label), "a label"): name for label, name in zip(labels, names, strict=True)}
+        named = dict(enumerate(data, start=1)) if isinstance(data, list) else numbered(data, "a label")
+        return dict(zip(named, texts(list(named.values()), "the names"), strict=True))
     except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RuntimeError, IndexError) as error:
         raise InputError(f'{path}: is not readable ({reason(error)}); write {{"1": "duck", "2": "bowl"}}') from error

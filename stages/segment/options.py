@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -82,7 +83,7 @@ class SegmentOptions:
         names = {}
         for part in filter(None, (p.strip() for p in self.names.split(","))):
             number, sign, name = part.partition("=")
-            if not sign or not number.strip().isdecimal() or int(number) < 1 or not name.strip():
-                raise InputError(f'--names {self.names}: {part!r} is not NUMBER=NAME; write "1=duck,2=bowl"')
+            if not sign or not re.fullmatch(r"0*[1-9][0-9]{0,4}", number.strip()) or not name.strip():
+                raise InputError(f'--names: {part[:80]!r} is not NUMBER=NAME; write "1=duck,2=bowl"')
             names[int(number)] = name.strip()
         return names

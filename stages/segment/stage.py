@@ -12,6 +12,7 @@ from stages.core.errors import InputError
 from stages.core.scene.files import provenance, seconds_since
 from stages.core.scene.scene import Scene
 from stages.core.scene.scene_ply import read_scene, write_scene
+from stages.core.scene.schema import quote, text
 from stages.segment.object_scale import parse_object_scale
 from stages.segment.options import BACKENDS, SegmentOptions
 
@@ -43,12 +44,13 @@ def rename_objects(scene: Scene, options: SegmentOptions) -> Scene:
     have = {o.id for o in scene.objects}
     for number in options.renamed:
         if number not in have:
-            raise InputError(f"--names {options.names}: there is no object {number}; found were {_listed(scene)}")
-    return replace(scene, objects=tuple(replace(o, name=options.renamed.get(o.id, o.name)) for o in scene.objects))
+            raise InputError(f"--names: there is no object {number}; found were {_listed(scene)}")
+    names = {number: text(name, "--names") for number, name in options.renamed.items()}
+    return replace(scene, objects=tuple(replace(o, name=names.get(o.id, o.name)) for o in scene.objects))
 
 
 def _listed(scene: Scene) -> str:
-    return ", ".join(f"{o.id} ({o.name})" for o in scene.objects) or "none"
+    return quote(", ".join(f"{o.id} ({o.name})" for o in scene.objects) or "none", 300)
 
 
 def log_objects(scene: Scene) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -118,23 +118,27 @@ def add_votes(a: Float[Tensor, "n j"], b: Float[Tensor, "n k"]) -> Float[Tensor,
 
 
 def apply_votes(
-    scene: Scene, votes: Float[Tensor, "n k"], names: Mapping[int, str], source: str, seed: int = 0
-) -> Scene:
+    scene: Scene, votes: Float[Tensor, "n k"], names: Mapping[int, str], source: str, seed: int = 0,
+    numbers: Sequence[int] | None = None,
+) -> Scene:  # fmt: skip
     """The scene labelled by majority, labels grown to whole objects, with its objects.
 
-    An object without a name becomes object_NUMBER. `source` names the origin of the labels in messages. Raises
-    InputError where the labels contain no object.
+    `numbers` of the columns are the ids of the objects, by default 0, 1, 2 and so on. An object without a name becomes
+    object_NUMBER. `source` names the origin of the labels in messages. Raises InputError where the labels contain no
+    object.
     """
+    numbers = range(votes.shape[1]) if numbers is None else numbers
     if votes.shape[1] == 1:
         raise InputError(f"{source}: the label images contain no object: every pixel is 0")
     means = scene.gaussians.means
     ids = remove_outliers(means, majority_labels(scene, pool_votes(means, votes)))
-    present = set(ids.unique().tolist())
-    objects = tuple(SceneObject(i, names.get(i, f"object_{i}")) for i in range(1, votes.shape[1]) if i in present)
-    if missing := [i for i in range(1, votes.shape[1]) if i not in present]:
+    present = {numbers[i] for i in ids.unique().tolist()}
+    objects = tuple(SceneObject(i, names.get(i, f"object_{i}")) for i in numbers[1:] if i in present)
+    if missing := [i for i in numbers[1:] if i not in present]:
         log.warning("%s: labels %s won no Gaussian", source, ", ".join(map(str, missing)))
     g = replace(scene.gaussians, object_id=ids)
     grown = grow_objects(g, find_support(scene, seed=seed), _growth_radius(means, ids)) if objects else g
+    grown = replace(grown, object_id=torch.tensor(numbers)[grown.object_id])
     return replace(scene, gaussians=grown, objects=objects)
 
 

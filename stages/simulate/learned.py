@@ -66,8 +66,8 @@ def rollout(
     forces = ExternalForces.from_prompts(initial, in_model_units, ids)
     steps = max(1, math.ceil(options.dt * units.time / FRAME - 1e-6))
     if steps > MAX_STEPS:
-        raise InputError(f"the objects are about {TYPICAL_SIZE / units.length:.2g} scene units large, so that a frame of "
-                         f"{options.dt:g} s takes {steps} steps of the learned field; give a smaller --dt or another "
+        raise InputError(f"a frame of {options.dt:g} s takes {steps} steps of the learned field, as the objects are "
+                         f"about {TYPICAL_SIZE / units.length:.2g} scene units large; give a smaller --dt or another "
                          "--engine")  # fmt: skip
     log.info("%s (%s): %d objects, %d keypoints, lengths scaled by %.3g, times by %.3g, %d steps per frame",
              options.engine, card["sha256"][:8], len(ids), len(keypoints.rest), units.length / scene.metres_per_unit,

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import torch
 from tqdm import tqdm
 
-from stages.core.backends import choose, pick_device
+from stages.core.backends import MAX_SEED, choose, pick_device
 from stages.core.errors import InputError
 from stages.core.physics import forces
 from stages.core.physics.keypoints import bind_gaussians, choose_keypoints
@@ -18,11 +19,13 @@ from stages.core.scene.files import provenance, seconds_since
 from stages.core.scene.formats import suffixes
 from stages.core.scene.scene import Scene
 from stages.core.scene.scene_ply import read_scene
+from stages.core.scene.schema import number, reason, text, texts, whole
 from stages.core.scene.trajectory import SimulationInfo, TrajectoryWriter, read_trajectory
 from stages.simulate.engine_choice import with_engine
 from stages.simulate.options import AUTO, ENGINES, SimulateOptions
 
 log = logging.getLogger(__name__)
+MIN_EXTENT = 1e-5  # of an object, relative to its coordinates, which have 24 bits
 
 
 def run(scene: Path, out: Path, options: SimulateOptions = SimulateOptions()) -> None:  # noqa: B008 -- frozen
@@ -68,10 +71,11 @@ def run(scene: Path, out: Path, options: SimulateOptions = SimulateOptions()) ->
     log.info("%s: %d frames, %.2f s", out, options.steps, options.steps * options.dt)
 
 
-RECORDED = (  # options that --forces traj.h5 repeats
-    "steps", "dt", "engine", "gravity", "quality", "material", "floor", "friction", "box", "keypoints", "integrator",
-    "seed",
-)  # fmt: skip
+RECORDED: dict[str, Callable] = {  # options that --forces traj.h5 repeats -> checks of their values
+    "dt": number, "engine": text, "gravity": number, "quality": text, "material": texts, "floor": number,
+    "friction": number, "box": text, "keypoints": whole, "integrator": text,
+    "seed": lambda value, what: whole(value, what, 0, MAX_SEED),
+}  # fmt: skip
 
 
 def with_recorded(options: SimulateOptions) -> SimulateOptions:
@@ -83,24 +87,33 @@ def with_recorded(options: SimulateOptions) -> SimulateOptions:
         return options
     trajectory = read_trajectory(options.forces)
     made_by, default = trajectory.scene.provenance.get("options", {}), SimulateOptions()
-    recorded = {name: made_by[name] for name in RECORDED if name in made_by} | {"steps": len(trajectory)}
-    if "material" in recorded:
-        recorded["material"] = tuple(recorded["material"])
+    try:
+        recorded = {name: check(made_by[name], name) for name, check in RECORDED.items()
+                    if made_by.get(name) is not None}  # fmt: skip
+    except ValueError as error:
+        raise InputError(f"{options.forces}: the options in its provenance are damaged ({reason(error)})") from error
+    recorded["steps"] = len(trajectory)
     return replace(options, **{k: v for k, v in recorded.items() if getattr(options, k) == getattr(default, k)})
 
 
 def with_objects(scene: Scene, path: Path) -> Scene:
-    """The scene with the objects that have Gaussians; one without objects is segmented as by `ngff segment`.
+    """The scene with the objects that can move; one without labelled Gaussians is segmented as by `ngff segment`.
 
-    Raises InputError when no object is found.
+    Objects without Gaussians, or without extent, are left out. Raises InputError when no object is found.
     """
-    have = set(scene.gaussians.object_id.unique().tolist())
-    present = tuple(o for o in scene.objects if o.id in have)
+    present = []
     for o in scene.objects:
-        if o.id not in have:
+        means = scene.gaussians.means[scene.gaussians.object_id == o.id].double()
+        if not len(means):
             log.warning("object %d (%s) has no Gaussians and is skipped", o.id, o.name)
+        elif float((means.amax(0) - means.amin(0)).max()) <= MIN_EXTENT * float(means.abs().max()):
+            log.warning("object %d (%s) is a point (%d Gaussians) and is skipped", o.id, o.name, len(means))
+        else:
+            present.append(o)
     if present:
-        return replace(scene, objects=present)
+        return replace(scene, objects=tuple(present))
+    if scene.gaussians.object_id.any():
+        raise InputError(f"{path}: its objects are points, which cannot be simulated; label it with `ngff segment`")
     from stages.core.perception.segmentation import segment_by_geometry  # noqa: PLC0415 -- only unlabelled scenes need it
 
     grouped = segment_by_geometry(scene)

@@ -16,6 +16,7 @@ from stages.core.errors import InputError
 from stages.core.physics.materials import find_object
 from stages.core.scene.files import must_exist
 from stages.core.scene.formats import FORMATS, suffixes
+from stages.core.scene.prompt_rows import FIELDS, read_prompts
 from stages.core.scene.scene import SceneObject
 from stages.core.scene.schema import LARGEST, MAX_ROWS, numbers, quote, read_json, reason, whole
 from stages.core.scene.schema import number as finite
@@ -44,18 +45,10 @@ class Force:
 class Change:
     """A condition that changes during the simulation, with the frame that begins at `start` [s]."""
 
-    what: str  # key of CHANGES
+    what: str  # key of CHANGES in stages/core/scene/prompt_rows.py
     value: float | str | bool
     start: float
     object_id: int | None = None  # None: all objects
-
-
-CHANGES = {  # what changes -> type of its value
-    "gravity": float,  # downward acceleration [m/s^2]
-    "friction": float,  # Coulomb coefficient of all objects
-    "material": str,  # name of an object's material
-    "pinned": bool,  # whether an object is held at its position
-}
 
 
 @dataclass(frozen=True)
@@ -92,23 +85,17 @@ class ForcePrompts:
 
     @classmethod
     def from_dicts(cls, rows: Sequence[dict]) -> ForcePrompts:
-        """The inverse of `as_dicts`. Raises KeyError, TypeError or ValueError for rows that are none of its."""
-        of = {kind: [{k: v for k, v in row.items() if k != "kind"} for row in rows if row.get("kind", "force") == kind]
-              for kind in ("force", "pin", "velocity", "lift", "change")}  # fmt: skip
-        if sum(map(len, of.values())) != len(rows):
-            raise ValueError("a prompt of unknown kind")
-        forces = [
-            Force(int(f["object_id"]), _floats(f["force"]), _floats(f.get("torque", (0, 0, 0))), float(f["start"]),
-                  math.inf if f["end"] is None else float(f["end"]), None if f.get("at") is None else _floats(f["at"]))
-            for f in of["force"]
-        ]  # fmt: skip
+        """The inverse of `as_dicts`. Raises ValueError for rows that are none of its."""
+        of: dict[str, list[dict]] = {kind: [] for kind in FIELDS}
+        for row in read_prompts(rows):
+            of[row.pop("kind")].append(row)
         return cls(
-            tuple(forces), frozenset(int(row["object_id"]) for row in of["pin"]),
-            {int(row["object_id"]): _floats(row["velocity"]) for row in of["velocity"]},
-            {int(row["object_id"]): float(row["height"]) for row in of["lift"]},
-            tuple(Change(c["what"], CHANGES[c["what"]](c["value"]), float(c["start"]), c["object_id"])
-                  for c in of["change"]),
-        )  # fmt: skip
+            tuple(Force(**{**f, "end": math.inf if f["end"] is None else f["end"]}) for f in of["force"]),
+            frozenset(row["object_id"] for row in of["pin"]),
+            {row["object_id"]: row["velocity"] for row in of["velocity"]},
+            {row["object_id"]: row["height"] for row in of["lift"]},
+            tuple(Change(**row) for row in of["change"]),
+        )
 
 
 def parse(
@@ -136,10 +123,7 @@ def parse(
 
 def stored_prompts(path: Path, objects: Sequence[SceneObject]) -> ForcePrompts:
     """The prompts that a trajectory was made with. Raises InputError for objects that are not in this scene."""
-    try:
-        prompts = ForcePrompts.from_dicts(FORMATS[Path(path).suffix.lower()].read(Path(path)).info.forces)
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{path}: its forces/json is not as `ngff simulate` writes it ({error!r})") from error
+    prompts = ForcePrompts.from_dicts(FORMATS[Path(path).suffix.lower()].read(Path(path)).info.forces)
     acted_on = {f.object_id for f in prompts.forces} | {c.object_id for c in prompts.changes} - {None}
     missing = (acted_on | prompts.pinned | set(prompts.velocity) | set(prompts.lift)) - {o.id for o in objects}
     if missing:

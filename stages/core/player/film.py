@@ -117,7 +117,8 @@ def _drawing_order(g: Gaussians, bound: Tensor) -> Int[Tensor, "m"]:
     finite = torch.stack([getattr(g, name).flatten(1).isfinite().all(1) for name in ("means", "quats", "scales", "sh")])
     rows = (finite.all(0) & (g.opacities >= MIN_OPACITY)).nonzero()[:, 0]
     x = g.means[rows].double()
-    low, high = (torch.quantile(x[:: 1 + len(x) // 100_000], q, dim=0) for q in (0.01, 0.99)) if len(x) else (0.0, 1.0)
+    some = x[:: 1 + len(x) // 100_000] if len(x) else x.new_zeros(1, 3)
+    low, high = (torch.quantile(some, q, dim=0) for q in (0.01, 0.99))
     cell = ((x - low) / (high - low).clamp_min(1e-9) * 1023).clamp(0, 1023).long()
     code = sum(((cell[:, axis] >> bit) & 1) << (3 * bit + axis) for bit in range(10) for axis in range(3))  # Morton
     key = (~bound[rows]).long() << 62 | g.object_id[rows].long() << 31 | code

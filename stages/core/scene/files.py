@@ -30,6 +30,8 @@ def replacing(path: Path) -> Iterator[Path]:
     path = Path(path)
     if path.is_dir():
         raise InputError(f"{path}: is a folder; name the file to write")
+    if path.exists() and not path.is_file():
+        raise InputError(f"{path}: is no file, but a device or a pipe, which cannot be replaced; name another")
     if not path.parent.is_dir():
         raise InputError(f"{path}: there is no folder {path.parent}; create it first")
     _sweep(path.parent)
@@ -71,6 +73,8 @@ def must_exist(path: Path, what: str) -> Path:
         raise InputError(f"{path}: is a folder; {what} is expected")
     if not path.exists():
         raise InputError(f"{path}: no such file; {what} is expected")
+    if not path.is_file():
+        raise InputError(f"{path}: is no file, but a device or a pipe; {what} is expected")
     if not os.access(path, os.R_OK):
         raise InputError(f"{path}: cannot be read; check its permissions")
     if path.stat().st_size == 0:

@@ -13,7 +13,7 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from stages.core.errors import InputError, MissingPackage
@@ -38,11 +38,23 @@ def list_photos(folder: Path) -> list[Path]:
 
 def read_image(path: Path) -> Float[Tensor, "h w 3"]:
     """RGB in 0..1, rotated by its EXIF tag; alpha is dropped, 16-bit values keep float32 precision."""
+    return _to_floats(path, _read_rgb(path))
+
+
+def read_8_bit(path: Path) -> UInt8[Tensor, "h w 3"]:
+    """The same with 8 bits; a large photo takes a fifth of the memory."""
+    pixels = _read_rgb(path)
+    return torch.from_numpy(pixels if pixels.dtype == np.uint8 else to_bytes(_to_floats(path, pixels)))
+
+
+def _read_rgb(path: Path) -> np.ndarray:
     must_exist(path, "an image")
-    pixels = _decode(path, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
-    white = np.iinfo(pixels.dtype).max if pixels.dtype.kind == "u" else 1.0
-    image = cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB).astype(np.float32)
-    image /= np.float32(white)
+    return cv2.cvtColor(_decode(path, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH), cv2.COLOR_BGR2RGB)
+
+
+def _to_floats(path: Path, pixels: np.ndarray) -> Float[Tensor, "h w 3"]:
+    image = pixels.astype(np.float32)
+    image /= np.float32(np.iinfo(pixels.dtype).max if pixels.dtype.kind == "u" else 1.0)
     if pixels.dtype.kind == "f" and not np.isfinite(image).all():
         raise InputError(f"{path}: has values that are not finite; convert it to JPEG or PNG")
     return torch.from_numpy(image)

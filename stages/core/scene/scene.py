@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 from stages.core.scene.cameras import Cameras
 from stages.core.scene.gaussians import Gaussians
-from stages.core.scene.schema import number, numbers, quote, whole
+from stages.core.scene.schema import number, numbers, rows, text, texts, whole
 
 UNKNOWN_SCALE = ("assumed", "not stated")  # beginnings of `source` where the scale is not known
 
@@ -51,18 +53,28 @@ class Scene:
         return next((o.name for o in self.objects if o.id == object_id), f"object_{object_id}")
 
 
-def read_object(id: object, name: object, material: object = "") -> SceneObject:
-    """An object as a file states it; ValueError for another id than a whole number from 0 to MAX_OBJECT_ID."""
-    id = whole(id, "an object's id")
-    if not isinstance(name, str) or not isinstance(material, str):
-        raise ValueError(f"name or material of object {id} is not text")
-    return SceneObject(id, quote(name, 200), quote(material, 200))
+def read_objects(rows: Iterable[Sequence]) -> tuple[SceneObject, ...]:
+    """Objects as a file states them: id, name, material; ValueError for an id that is given twice."""
+    objects = tuple(_read_object(*row) for row in rows)
+    if twice := [id for id, count in Counter(o.id for o in objects).items() if count > 1]:
+        raise ValueError(f"object {twice[0]} is there twice")
+    return objects
+
+
+def _read_object(id: object, name: object, material: object) -> SceneObject:
+    """ValueError for another id than a whole number from 1 to MAX_OBJECT_ID."""
+    id = whole(id, "an object's id", 1)
+    return SceneObject(id, text(name, f"the name of object {id}"), text(material, f"the material of object {id}"))
 
 
 def read_metadata(floor: object, scale: object, provenance: object, background: object) -> dict:
     """The arguments of a Scene of these names as a file states them; ValueError for wrong types and values."""
     if not isinstance(scale, dict) or not isinstance(provenance, dict):
         raise ValueError("scale or provenance is not a JSON object")
+    if not isinstance(provenance.get("options", {}), dict):
+        raise ValueError("the options in provenance are not a JSON object")
+    inputs = rows(provenance.get("inputs", []), "inputs in provenance")
+    texts([isinstance(row, dict) and row.get("name") for row in inputs], "the names of inputs in provenance")
     if "metres_per_unit" in scale:
         number(scale["metres_per_unit"], "metres_per_unit", 1e-6, 1e6)
     colour = None if background is None else [min(max(x, 0.0), 1.0) for x in numbers(background, 3, "background")]

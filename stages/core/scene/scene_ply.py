@@ -16,7 +16,7 @@ from stages.core.scene import cameras as camera_json
 from stages.core.scene.files import must_exist, replacing
 from stages.core.scene.gaussians import Gaussians
 from stages.core.scene.packed_ply import is_packed, unpack
-from stages.core.scene.scene import Scene, SceneObject, read_metadata, read_object
+from stages.core.scene.scene import Scene, SceneObject, read_metadata, read_objects
 from stages.core.scene.schema import LARGEST, MAX_OBJECT_ID, check_ply_counts, number, parse_json, reason
 
 log = logging.getLogger(__name__)
@@ -109,7 +109,8 @@ def _with_header(path: Path, gaussians: Gaussians, comments: list[str]) -> Scene
         if version > VERSION:
             raise InputError(f"{path}: format version {version:g} is newer than {VERSION}; upgrade ngff")
         ids = gaussians.object_id.unique().tolist()
-        named = {o["id"]: read_object(o["id"], o["name"], o.get("material", "")) for o in metadata.get("object", [])}
+        objects = read_objects((o["id"], o["name"], o.get("material", "")) for o in metadata.get("object", []))
+        named = {o.id: o for o in objects}
         unnamed = {i: SceneObject(i, f"object_{i}") for i in ids if i > 0 and i not in named}
         return Scene(
             gaussians,
@@ -128,7 +129,14 @@ def _with_header(path: Path, gaussians: Gaussians, comments: list[str]) -> Scene
 
 
 def write_scene(path: Path, scene: Scene) -> None:
-    """Write a binary little-endian 3D-Gaussian PLY with the metadata in comments; InputError if that fails."""
+    """Write a binary little-endian 3D-Gaussian PLY with the metadata in comments; InputError if that fails.
+
+    Also where `read_scene` would refuse the metadata, such as a scale out of range.
+    """
+    try:
+        read_metadata(scene.floor, scene.scale, scene.provenance, scene.background)
+    except ValueError as error:
+        raise InputError(f"{path}: cannot be written, as {reason(error)}") from error
     g = scene.gaussians.to("cpu")
     n, k = g.sh.shape[:2]
     rest = [f"f_rest_{i}" for i in range(3 * (k - 1))]

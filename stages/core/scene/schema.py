@@ -22,9 +22,9 @@ PLY_WIDTHS = {"char": 1, "uchar": 1, "int8": 1, "uint8": 1, "short": 2, "ushort"
               "double": 8, "float64": 8}  # bytes; the others have 4  # fmt: skip
 
 
-def quote(text: object, limit: int = MAX_QUOTED) -> str:
-    """Text of a user's file for a message: printable, on one line, at most `limit` characters."""
-    line = "".join(c if c.isprintable() else "?" for c in str(text)[: limit + 1])
+def quote(value: object, limit: int = MAX_QUOTED) -> str:
+    """A value of a user's file for a message: printable, on one line, at most `limit` characters."""
+    line = "".join(c if c.isprintable() else "?" for c in str(value)[: limit + 1])
     return line if len(line) <= limit else f"{line[: limit - 3]}..."
 
 
@@ -55,11 +55,29 @@ def whole(value: object, what: str, low: int = 0, high: int = MAX_OBJECT_ID) -> 
     return int(value)
 
 
+def text(value: object, what: str) -> str:
+    """A text, on one line and at most 200 characters long; ValueError for anything else."""
+    if not isinstance(value, str):
+        raise ValueError(f"{what} is {quote(repr(value), 40)}, not text")
+    return quote(value, 200)
+
+
+def numbered(values: dict, what: str) -> dict[int, object]:
+    """The same values by whole number, as which their keys are written; ValueError for others, or one given twice."""
+    wrong = [key for key in values if not (key.isascii() and key.isdecimal() and len(key) < 10)]
+    if wrong:
+        raise ValueError(f"{what} is {quote(repr(wrong[0]), 40)}, not a whole number")
+    found = {whole(int(key), what): value for key, value in values.items()}
+    if len(found) < len(values):
+        raise ValueError(f"{what} is there twice")
+    return found
+
+
 def texts(values: object, what: str) -> tuple[str, ...]:
     """A list of texts, each on one line and at most 200 characters long; ValueError for anything else."""
     if not isinstance(values, (list, tuple)) or not all(isinstance(value, str) for value in values):
         raise ValueError(f"{what} is {quote(repr(values), 40)}, not a list of texts")
-    return tuple(quote(value, 200) for value in values)
+    return tuple(text(value, what) for value in values)
 
 
 def flag(value: object, what: str) -> bool:
@@ -76,10 +94,10 @@ def rows(values: object, what: str) -> list:
     return values
 
 
-def parse_json(text: str, finite: bool = True) -> object:
+def parse_json(data: str, finite: bool = True) -> object:
     """The value of a JSON text of bounded depth; `finite` refuses NaN, infinities and integers beyond 64 bits."""
     try:
-        value = json.loads(text, **(FINITE if finite else {}))
+        value = json.loads(data, **(FINITE if finite else {}))
     except RecursionError:
         raise ValueError(f"it is nested more than {MAX_JSON_DEPTH} deep") from None
     level = [value]
@@ -93,23 +111,25 @@ def parse_json(text: str, finite: bool = True) -> object:
 
 def read_json(path: Path) -> object:
     """The value of a JSON file (UTF-8) of bounded size and depth."""
+    if Path(path).exists() and not Path(path).is_file():  # a pipe would wait for ever
+        raise ValueError("it is not a file")
     size = Path(path).stat().st_size
     if size > MAX_JSON_BYTES:
         raise ValueError(f"it has {size >> 20} MB; at most {MAX_JSON_BYTES >> 20} are read")
     return parse_json(Path(path).read_text(encoding="utf-8"))
 
 
-def _finite(text: str) -> float:
-    value = float(text)
+def _finite(digits: str) -> float:
+    value = float(digits)
     if not math.isfinite(value):
-        raise ValueError(f"{quote(text, 20)} is not finite")
+        raise ValueError(f"{quote(digits, 20)} is not finite")
     return value
 
 
-def _int64(text: str) -> int:
-    if len(text) > 19:
-        raise ValueError(f"{quote(text, 20)} is too large a number")
-    return int(text)
+def _int64(digits: str) -> int:
+    if len(digits) > 19:
+        raise ValueError(f"{quote(digits, 20)} is too large a number")
+    return int(digits)
 
 
 FINITE = {"parse_constant": _finite, "parse_float": _finite, "parse_int": _int64}

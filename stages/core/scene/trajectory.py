@@ -22,7 +22,8 @@ from stages.core.scene.files import must_exist, replacing
 from stages.core.scene.gaussians import Gaussians
 from stages.core.scene.h5_chunks import COMPRESSED, append_rows, write_compressed
 from stages.core.scene.h5_schema import Dataset
-from stages.core.scene.scene import Scene, read_metadata, read_object
+from stages.core.scene.prompt_rows import read_prompts
+from stages.core.scene.scene import Scene, read_metadata, read_objects
 from stages.core.scene.schema import MAX_OBJECT_ID, number, numbers, parse_json, quote, reason
 
 log = logging.getLogger(__name__)
@@ -35,7 +36,7 @@ DATASETS = {  # n Gaussians, k coefficients, o objects, p keypoints, t frames, c
     "gaussians/opacities": Dataset("n", low=-1e-3, high=1.001),  # as rounded by 16-bit floats
     "gaussians/sh": Dataset("n k 3"),
     "gaussians/object_id": Dataset("n", "int", 0, MAX_OBJECT_ID),
-    "objects/id": Dataset("o", "int", 0, MAX_OBJECT_ID),
+    "objects/id": Dataset("o", "int", 1, MAX_OBJECT_ID),
     "objects/name": Dataset("o", "text"),
     "objects/material": Dataset("o", "text"),
     "objects/com": Dataset("t o 3"),
@@ -56,6 +57,7 @@ DATASETS = {  # n Gaussians, k coefficients, o objects, p keypoints, t frames, c
 }
 SERIES = ("keypoints/positions", "objects/com", "objects/rotation")  # a row for each frame
 BUFFERED = 32  # frames that are compressed and written together
+ROUNDING = 1e-2  # of sums and lengths that are 1, as stored in 16-bit floats
 
 
 @dataclass(frozen=True)
@@ -108,6 +110,7 @@ class Trajectory:
             names = [f"frames/{name}" for name in ("means", "quats", "scales")]
             try:
                 rows = [torch.from_numpy(DATASETS[name].checked(file[name][t], name)) for name in names]
+                _check_unit(rows[1], names[1])
             except (OSError, ValueError) as error:
                 raise InputError(f"{self.path}: frame {t} is damaged ({reason(error)})") from error
         g = self.scene.gaussians
@@ -274,6 +277,11 @@ def _write_rest(file: h5py.File, scene: Scene, info: SimulationInfo, keypoints: 
     file.create_dataset("forces/json", data=prompts, dtype=text, shape=(len(prompts),), maxshape=(None,), chunks=(64,))
 
 
+def _check_unit(quats: Float[Tensor, "*n 4"], name: str) -> None:
+    if not ((quats.norm(dim=-1) - 1).abs() < ROUNDING).all():
+        raise ValueError(f"{name} has a quaternion that is not of length 1")
+
+
 def read_trajectory(path: Path) -> Trajectory:
     """Read a trajectory except its dense frames. Raises InputError for other files and damaged or newer ones."""
     path = Path(path)
@@ -310,8 +318,8 @@ def _read(path: Path, file: h5py.File) -> Trajectory:
         raise InputError(f"{path}: has no {'Gaussians' if len(motion[0]) else 'frames'}")
     if lengths["k"] not in (1, 4, 9, 16):
         raise ValueError(f"gaussians/sh has {lengths['k']} coefficients, not 1, 4, 9 or 16")
-    if not (gaussians.quats.norm(dim=1) > 1e-6).all():
-        raise ValueError("gaussians/quats has a quaternion of zero length")
+    _check_unit(gaussians.quats, "gaussians/quats")
+    _check_unit(motion[2], "objects/rotation")
     dense = "frames/means" in file
     if dense:
         for name in ("means", "quats", "scales"):
@@ -319,9 +327,12 @@ def _read(path: Path, file: h5py.File) -> Trajectory:
     binding = Binding(values("binding/index"), values("binding/weight"))
     if not dense and (len(binding.index) != lengths["n"] or bool((binding.index >= lengths["p"]).any())):
         raise InputError(f"{path}: the binding does not fit the {lengths['n']} Gaussians and {lengths['p']} keypoints")
+    sums = binding.weight.sum(1)
+    if not ((sums - 1).abs() < ROUNDING).logical_or((binding.index < 0).all(1) & (sums.abs() < ROUNDING)).all():
+        raise ValueError("binding/weight has a row that does not sum to 1")
     ids = values("objects/id").tolist()
     materials = values("objects/material") if "objects/material" in file else [""] * len(ids)
-    objects = tuple(read_object(*row) for row in zip(ids, values("objects/name"), materials, strict=True))
+    objects = read_objects(zip(ids, values("objects/name"), materials, strict=True))
     cameras = None
     if "cameras/viewmats" in file:
         *matrices, names = (values(f"cameras/{n}") for n in ("viewmats", "Ks", "sizes", "names"))
@@ -331,9 +342,8 @@ def _read(path: Path, file: h5py.File) -> Trajectory:
     made_by = parse_json(str(attributes.get("provenance", "{}")), finite=False)
     metadata = read_metadata(attributes.get("floor"), scale, made_by, attributes.get("background"))
     scene = Scene(gaussians, objects, cameras, **metadata)
-    forces = tuple(parse_json(f) for f in (values("forces/json") if "forces/json" in file else []))
-    if not all(isinstance(force, dict) for force in forces):
-        raise ValueError("forces/json has a row that is not a JSON object")
+    texts = values("forces/json") if "forces/json" in file else []
+    forces = read_prompts(map(parse_json, texts), ids)
     dt, gravity = number(attributes["dt"], "dt", 1e-6, 1e4), numbers(attributes["gravity"], 3, "gravity")
     info = SimulationInfo(dt, gravity, quote(attributes["engine"]), forces)
     return Trajectory(scene, info, keypoints, binding, *motion, path, dense, read_field_start(file, lengths))

@@ -22,7 +22,7 @@ def parts(scene, p: int = 10):
     rest = torch.randn(p, 3, generator=torch.Generator().manual_seed(0))
     keypoints = Keypoints(rest, torch.ones(p, dtype=torch.int64))
     index = torch.randint(0, p, (n, 8), generator=torch.Generator().manual_seed(1))
-    info = SimulationInfo(0.02, (0.0, 0.0, -9.81), "test", ({"object": 1},))
+    info = SimulationInfo(0.02, (0.0, 0.0, -9.81), "test", ({"kind": "pin", "object_id": 1},))
     return info, keypoints, Binding(index, torch.full((n, 8), 1 / 8))
 
 
@@ -53,7 +53,7 @@ def test_input_error_keeps_the_written_frames(tmp_path, two_balls):
         pytest.raises(InputError, match="escaped"),
         TrajectoryWriter(tmp_path / "t.h5", two_balls, info, keypoints, binding) as writer,
     ):
-        writer.append(keypoints.rest, torch.zeros(2, 3), torch.zeros(2, 4))
+        writer.append(keypoints.rest, torch.zeros(2, 3), torch.eye(4)[[0, 0]])
         raise InputError("green ball escaped")
     assert os.listdir(tmp_path) == ["t.partial.h5"]
     assert len(read_trajectory(tmp_path / "t.partial.h5")) == 1
@@ -65,7 +65,7 @@ def test_interrupted_write_leaves_no_file(tmp_path, two_balls):
         pytest.raises(KeyboardInterrupt),
         TrajectoryWriter(tmp_path / "t.h5", two_balls, info, keypoints, binding) as writer,
     ):
-        writer.append(keypoints.rest, torch.zeros(2, 3), torch.zeros(2, 4))
+        writer.append(keypoints.rest, torch.zeros(2, 3), torch.eye(4)[[0, 0]])
         raise KeyboardInterrupt
     assert os.listdir(tmp_path) == []
 

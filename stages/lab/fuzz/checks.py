@@ -16,6 +16,7 @@ from stages.core.scene.trajectory import Trajectory
 from stages.lab.dataset.keypoint_motions import KeypointMotions
 from stages.lab.dataset.scene_configs import SceneConfig
 from stages.segment.prompts import ObjectPrompts
+from stages.simulate.options import SimulateOptions
 
 
 def check_scene(scene: Scene) -> None:
@@ -26,6 +27,7 @@ def check_scene(scene: Scene) -> None:
     assert g.means.dtype == g.scales.dtype == g.sh.dtype == torch.float32 and g.object_id.dtype == torch.int64, "types"
     assert g.sh.shape[1] in (1, 4, 9, 16) and (g.scales >= 0).all() and (g.quats.norm(dim=1) > 0).all(), "Gaussians"
     assert g.object_id.min() >= 0 and g.object_id.max() < 1 << 16 and g.means.abs().max() < 1e10, "ranges"
+    assert len({o.id for o in scene.objects}) == len(scene.objects), "objects"
     assert scene.floor is None or isinstance(scene.floor, float) and abs(scene.floor) < 1e10, "floor"
     assert 0 < scene.metres_per_unit < 1e10 and all(o.name.isprintable() for o in scene.objects), "header"
     if scene.cameras is not None:
@@ -46,6 +48,9 @@ def check_trajectory(t: Trajectory) -> None:
     assert len(t) and t.positions.shape == (len(t), len(t.keypoints.rest), 3), "positions"
     assert all(x.isfinite().all() for x in (t.positions, t.com, t.rotation, t.binding.weight, t.keypoints.rest)), "nan"
     assert t.binding.index.shape == t.binding.weight.shape and int(t.binding.index.max()) < t.positions.shape[1], "bind"
+    bound, sums = (t.binding.index >= 0).any(1), t.binding.weight.sum(1)
+    assert ((sums - 1).abs()[bound] < 0.1).all() and (sums[~bound].abs() < 1.1).all(), "weights"
+    assert ((t.rotation.norm(dim=-1) - 1).abs() < 0.1).all(), "rotations"
     assert 0 < t.info.dt < 1e5 and all(abs(x) < 1e10 for x in t.info.gravity), "info"
     if t.field is not None:
         values = [x for x in vars(t.field).values() if isinstance(x, torch.Tensor)]
@@ -71,6 +76,16 @@ def check_force_prompts(prompts: ForcePrompts) -> None:
     check_forces(prompts.forces)
     assert all(abs(x) < 1e10 for v in prompts.velocity.values() for x in v), "velocity"
     assert all(abs(x) < 1e10 for x in prompts.lift.values()), "lift"
+    ids = {*prompts.pinned, *prompts.velocity, *prompts.lift, *(c.object_id for c in prompts.changes)}
+    assert ids <= {1, 2, None} and all(0 <= c.start < 1e10 for c in prompts.changes), "objects"
+
+
+def check_simulate_options(options: SimulateOptions) -> None:
+    """AssertionError unless options have the types of their fields."""
+    texts = (options.engine, options.quality, options.integrator, options.box or "", *options.material)
+    assert all(isinstance(x, str) for x in texts) and 0 < options.steps < 1e6 and 0 < options.dt <= 1, "options"
+    numbers = (options.gravity, options.floor or 0.0, options.friction or 0.0, options.keypoints or 8, options.seed)
+    assert all(isinstance(x, (int, float)) and abs(x) < 1e10 for x in numbers), "numbers"
 
 
 def check_materials(found: dict[int, MaterialChoice]) -> None:

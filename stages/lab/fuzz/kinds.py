@@ -43,6 +43,8 @@ from stages.reconstruct.photo_reader import read_photos
 from stages.render.path_file import read_camera_path
 from stages.segment.masks import read_names
 from stages.segment.prompts import read_prompts
+from stages.simulate.options import SimulateOptions
+from stages.simulate.stage import with_recorded
 
 Change = Callable[[Path, random.Random], None]
 
@@ -59,6 +61,20 @@ class Kind:
     repair: Callable[[Path], object] | None = None  # makes the check sums right again, in half of the cases
 
 
+PROVENANCE = {"command": "simulate", "inputs": [{"name": "scene.ply"}], "options": {
+    "dt": 0.02, "engine": "ngff", "gravity": 9.81, "quality": "draft", "material": ["1=rubber"], "floor": None,
+    "friction": 0.5, "box": None, "keypoints": 16, "integrator": "step", "seed": 0}}  # fmt: skip
+PROMPT_ROWS = (
+    {"kind": "force", "object_id": 2, "force": [0, 0, 8.0], "torque": [0, 0, 0], "start": 0.1, "end": None, "at": None},
+    {"kind": "pin", "object_id": 1},
+    {"kind": "velocity", "object_id": 1, "velocity": [0, 0, 2.0]},
+    {"kind": "lift", "object_id": 2, "height": 0.3},
+    {"kind": "change", "what": "gravity", "value": 1.6, "start": 0.5, "object_id": None},
+    {"kind": "change", "what": "material", "value": "rubber", "start": 0.5, "object_id": 1},
+    {"kind": "change", "what": "pinned", "value": True, "start": 0.5, "object_id": 1},
+)
+
+
 def example_scene() -> Scene:
     """Sixty Gaussians, two objects, two cameras."""
     generator = torch.Generator().manual_seed(0)
@@ -72,7 +88,7 @@ def example_scene() -> Scene:
     K = torch.tensor([[40.0, 0, 16], [0, 40, 12], [0, 0, 1]])
     cameras = Cameras(torch.eye(4).repeat(2, 1, 1), K.repeat(2, 1, 1), torch.tensor([[32, 24]] * 2), ("a.png", "b.png"))
     objects = (SceneObject(1, "duck", "rubber"), SceneObject(2, "bowl"))
-    return Scene(gaussians, objects, cameras, 0.0, {"metres_per_unit": 1.0, "source": "known"}, {"seed": 1})
+    return Scene(gaussians, objects, cameras, 0.0, {"metres_per_unit": 1.0, "source": "known"}, PROVENANCE)
 
 
 OBJECTS = example_scene().objects
@@ -83,7 +99,7 @@ def write_trajectory(path: Path) -> None:
     scene = example_scene()
     n, rest = len(scene.gaussians), torch.randn(12, 3, generator=torch.Generator().manual_seed(1))
     binding = Binding(torch.arange(n)[:, None] % 12, torch.ones(n, 1))
-    info = SimulationInfo(0.02, (0.0, 0.0, -9.81), "test", ({"kind": "pin", "object_id": 1},))
+    info = SimulationInfo(0.02, (0.0, 0.0, -9.81), "test", PROMPT_ROWS)
     with TrajectoryWriter(path, scene, info, Keypoints(rest, torch.arange(12) % 2 + 1), binding) as writer:
         for _ in range(3):
             writer.append(rest, torch.zeros(2, 3), torch.eye(4)[:2])
@@ -224,10 +240,11 @@ def read_options(folder: Path) -> None:
 
 
 def check_trajectory_and_prompts(folder: Path) -> None:
-    """A trajectory, and its prompts as --forces reads them."""
+    """A trajectory, and its prompts and options as --forces reads them."""
     found = read_trajectory(folder / "traj.h5")
     checks.check_trajectory(found)
     checks.check_force_prompts(stored_prompts(folder / "traj.h5", OBJECTS))
+    checks.check_simulate_options(with_recorded(SimulateOptions(forces=folder / "traj.h5")))
 
 
 def check_video(folder: Path) -> None:

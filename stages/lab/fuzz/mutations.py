@@ -12,7 +12,8 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-NUMBERS = [0, -1, 1e-40, 1e20, 1e300, 10**12, 2**31 - 1, 2**31, 2**64, float("nan"), float("inf"), -float("inf")]
+NUMBERS = [0, 1, 2, 0.5, -1, 1e-40, 1e20, 1e300, 10**12, 2**31 - 1, 2**31, 2**64, float("nan"), float("inf"),
+           -float("inf")]  # fmt: skip
 VALUES = [*NUMBERS, None, True, "abc", "", "\x1b[31m\n", "<script>", "../x", "x" * 5000, [], {}, [[]], [1, 2], {"a": 1}]
 WORDS = [b"nan", b"inf", b"1000000000000", b"18446744073709551616", b"-1", b"list uchar int", b"double", b"ascii",
          b"\xff\xfe", b"f_rest_x", b"[" * 5000, b'"abc"', b"{}", b"0", b"end_header\n"]  # fmt: skip
@@ -55,25 +56,40 @@ def change_words(path: Path, rng: random.Random) -> None:
 
 
 def change_vertices(path: Path, rng: random.Random) -> None:
-    """A value of the properties of a PLY, or its text."""
-    if rng.random() < 0.7:
-        return change_words(path, rng)
+    """A value of the properties of a PLY, or of the JSON in its comments, or its text."""
     head, mark, body = path.read_bytes().partition(b"end_header\n")
-    path.write_bytes(head + mark + _other_floats(body, rng))
+    lines = head.decode().split("\n")
+    comments = [i for i, line in enumerate(lines) if line.startswith("comment ngff:")]
+    if rng.random() < 0.5:
+        return change_words(path, rng)
+    if comments and rng.random() < 0.6:
+        i = rng.choice(comments)
+        key, _, value = lines[i].partition(" ")[2].partition(" ")
+        changed = f"comment {key} {_other_json(value, rng)}"
+        lines[i : i + 1] = [lines[i], changed] if rng.random() < 0.2 else [changed]
+        path.write_bytes("\n".join(lines).encode() + mark + body)
+    else:
+        path.write_bytes(head + mark + _other_floats(body, rng))
 
 
 def change_json(path: Path, rng: random.Random) -> None:
     """Replace, remove or wrap a value somewhere in a JSON file, or change its bytes."""
     if rng.random() < 0.3:
         return change_words(path, rng)
-    data = json.loads(path.read_text())
+    path.write_text(_other_json(path.read_text(), rng))
+
+
+def _other_json(text: str, rng: random.Random) -> str:
+    """A JSON text with a value somewhere replaced, by another of its own or by one of VALUES, removed or wrapped."""
+    data = [json.loads(text)]
     places = list(_places(data))
-    parent, key = rng.choice(places)
-    if rng.random() < 0.15:
+    parent, key = rng.choice(places[1:] or places)
+    if rng.random() < 0.15 and parent is not data:
         del parent[key]
     else:
-        parent[key] = rng.choice([*VALUES, [parent[key]], str(parent[key])])
-    path.write_text(json.dumps(data))
+        other, place = rng.choice(places)
+        parent[key] = json.loads(json.dumps(rng.choice([*VALUES, [parent[key]], str(parent[key]), other[place]])))
+    return json.dumps(data[0])
 
 
 def _places(data: object) -> Iterator[tuple]:
@@ -92,11 +108,19 @@ def change_datasets(path: Path, rng: random.Random) -> None:
         file.visit(names.append)
         if rng.random() < 0.25:
             key = rng.choice(list(file.attrs))
+            if key in ("scale", "provenance") and rng.random() < 0.7:
+                file.attrs[key] = _other_json(file.attrs[key], rng)
+                return
             value = rng.choice([*NUMBERS, "abc", "", "[" * 5000, "{}", [0.0, float("nan"), 1], [1.0], "\x1b[1m"])
             file.attrs[key] = np.uint64(2**63) if isinstance(value, int) and value >= 2**63 else value
             return
         name = rng.choice(names)
         old = file[name][()] if isinstance(file[name], h5py.Dataset) else None
+        if name == "forces/json" and rng.random() < 0.7:
+            rows = file[name].asstr()[()]
+            i = rng.randrange(len(rows))
+            file[name][i] = _other_json(rows[i], rng)
+            return
         del file[name]
         how = rng.randrange(10)
         if how == 0:

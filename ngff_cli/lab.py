@@ -7,6 +7,7 @@ import typer
 
 from ngff_cli import bench, data
 from ngff_cli.options import AsJson, CommandGroup, Device, Seed, Threads, limit_threads, print_results, set_up_logging
+from stages.lab.questionnaire.options import StudyOptions
 
 app = typer.Typer(cls=CommandGroup, no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False)
 
@@ -246,6 +247,30 @@ def estimate_materials(
 
     for line in run(video, out, EstimateOptions(objects=objects, model=model, timeout=timeout)):
         print(line)
+
+
+@app.command()
+def questionnaire(
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="folder of films, one folder for each model, in it "
+                                           "one for each split if there are several; with --answers: a study")],
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", help="folder of the study to write, default: study; with --answers: "
+                                  "JSON file to write the table to")
+    ] = None,
+    answers: Annotated[
+        list[Path], typer.Option(help="file that a participant returned, or a folder of them; repeatable")
+    ] = [],  # noqa: B006
+    participants: Annotated[int, typer.Option(help="number of pages")] = StudyOptions.participants,
+    films: Annotated[int, typer.Option(help="films per page")] = StudyOptions.films,
+    seed: Seed = StudyOptions.seed,
+) -> None:
+    """Write pages on which people judge films, or with --answers the table of what they answered."""
+    from stages.lab.questionnaire import answers as table
+    from stages.lab.questionnaire import study
+
+    options = StudyOptions(participants=participants, films=films, seed=seed)
+    lines = table.run(folder, answers, out, seed) if answers else study.run(folder, out or Path("study"), options)
+    print("\n".join(lines))
 
 
 app.add_typer(data.app)

@@ -43,17 +43,18 @@ def chromium(tmp_path_factory):
 def open_page(chromium):
     """A function that opens a page, a file or an address, and returns it once it is `loaded`.
 
-    The test fails on errors of the page, and where it fetches anything else than an address that was given.
+    The test fails on errors of the page, and where it fetches anything else than its address and what is `beside` it.
     """
     errors, pages = [], []
 
-    def open_(place: Path | str, loaded: str = "window.player !== undefined"):
+    def open_(place: Path | str, loaded: str = "window.player !== undefined", beside: Path | None = None):
         page = chromium.new_page()
         address = place.as_uri() if isinstance(place, Path) else place
+        allowed = (address, "data:", "blob:", *([beside.as_uri()] if beside else []))
         pages.append(page)
         page.on("pageerror", lambda error: errors.append(str(error)))
         page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
-        page.on("request", lambda request: None if request.url.startswith((address, "data:", "blob:"))
+        page.on("request", lambda request: None if request.url.startswith(allowed)
                 else errors.append(request.url))  # fmt: skip
         page.goto(address)
         until(page, loaded)

@@ -103,7 +103,12 @@ def film_page(film: bytes, title: str) -> str:
         "TITLE": escape(title), "STYLE": (WEB / "style.css").read_text(),
         "IMPORTS": json.dumps({"imports": modules}), "FILM": base64.b64encode(film).decode(),
     }  # fmt: skip
-    before, *rest = (WEB / "index.html").read_text().split("{{")
+    return fill_template((WEB / "index.html").read_text(), parts)
+
+
+def fill_template(template: str, parts: dict[str, str]) -> str:
+    """The text with every {{NAME}} replaced by its part."""
+    before, *rest = template.split("{{")
     pieces = [piece.partition("}}") for piece in rest]
     return before + "".join(parts[name] + after for name, _, after in pieces)
 

@@ -1,0 +1,1 @@
+"""Questionnaire on films: pages for participants, and the table of their answers."""

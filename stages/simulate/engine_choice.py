@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from dataclasses import replace
 
+from stages.core.physics.forces import ForcePrompts
 from stages.core.physics.materials import MODELS, Material, choose_materials
 from stages.core.scene.scene import Scene
 from stages.core.scene.trajectory import Keypoints
@@ -17,20 +18,24 @@ MAX_RIGID_SAG = 0.02  # largest compression under its own weight of a body that 
 def with_engine(options: SimulateOptions, scene: Scene, keypoints: Keypoints) -> SimulateOptions:
     """The options with an engine in place of `auto`.
 
-    MPM if an object yields or flows; else the learned field if one is softer than MAX_RIGID_SAG, or if the scene was
-    reconstructed from photos, since reconstructed objects overlap and would be thrown apart as rigid bodies; else rigid
-    bodies. Options of learned engines (weights, an integrator) select the learned field.
+    MPM if an object yields or flows, or has parts of different materials; else the learned field if one is softer than
+    MAX_RIGID_SAG, or if the scene was reconstructed from photos, since reconstructed objects overlap and would be
+    thrown apart as rigid bodies; else rigid bodies. Options of learned engines (weights, an integrator) select the
+    learned field.
     """
     if options.engine != AUTO:
         return options
     if options.weights is not None or options.integrator != "step":
         return replace(options, engine="ngff")
     materials = choose_materials(scene.objects, options.material, options.materials)
+    uneven = [o for o in scene.objects if materials[o.id].several]
     plastic = [o for o in scene.objects if MODELS[materials[o.id].material.model].plastic]
     soft = [o for o in scene.objects if sag(materials[o.id].material, _height(scene, keypoints, o.id), options.gravity)
             > MAX_RIGID_SAG]  # fmt: skip
     if plastic:
         engine, reason = "mpm", f"object {plastic[0].id} yields or flows"
+    elif uneven:
+        engine, reason = "mpm", f"object {uneven[0].id} has parts of different materials"
     elif soft:
         engine, reason = "ngff", f"object {soft[0].id} is compressed by more than {MAX_RIGID_SAG:.0%} by its own weight"
     elif _reconstructed(scene.provenance):
@@ -39,6 +44,22 @@ def with_engine(options: SimulateOptions, scene: Scene, keypoints: Keypoints) ->
         engine, reason = "rigid", "all objects are stiff"
     log.info("--engine %s, as %s", engine, reason)
     return replace(options, engine=engine)
+
+
+def for_engine(prompts: ForcePrompts, scene: Scene, options: SimulateOptions) -> ForcePrompts:
+    """The prompts, with objects that have a pinned part pinned as a whole where the engine has no parts."""
+    if options.engine == "mpm":
+        return prompts
+    choices = choose_materials(scene.objects, options.material, options.materials)
+    for o in scene.objects:
+        parts = choices[o.id].several
+        held = any(part.pinned for part in parts)
+        if parts:
+            log.warning("object %d (%s): --engine %s has one material for an object and takes the average of its parts"
+                        "%s; with --engine mpm each part has its own", o.id, o.name, options.engine,
+                        ", and pins it as a whole" * held)  # fmt: skip
+        prompts = replace(prompts, pinned=prompts.pinned | {o.id}) if held else prompts
+    return prompts
 
 
 def sag(material: Material, height: float, gravity: float) -> float:

@@ -20,7 +20,7 @@ from stages.core.models.field.solidity import MIN_STIFFNESS, box_sides, solidity
 from stages.core.models.initial_conditions import FLOOR, InitialConditions, centre_of_mass
 from stages.core.models.rollout import TimeStepper
 from stages.core.physics.forces import Change, Force, ForcePrompts
-from stages.core.physics.materials import MODELS, choose_materials
+from stages.core.physics.materials import MODELS
 from stages.core.physics.skinning import object_rotations
 from stages.core.physics.state import FrameState
 from stages.core.scene.field_start import FieldStart, FieldUnits
@@ -29,7 +29,7 @@ from stages.core.scene.trajectory import Keypoints
 from stages.simulate.changes import changed_options, changed_pins
 from stages.simulate.model_units import TYPICAL_SIZE, ModelUnits
 from stages.simulate.options import ENGINES, SimulateOptions
-from stages.simulate.setup import SceneSetup, check_motion, set_up_scene
+from stages.simulate.setup import SceneSetup, check_motion, choose_for_bodies, set_up_scene
 from stages.simulate.sleep import SleepState
 from stages.simulate.solid_bodies import SolidBody, mass_fractions, solid_bodies
 
@@ -55,7 +55,9 @@ def rollout(
     setup = set_up_scene(scene, prompts, options)
     ids = [o.id for o in scene.objects]
     per_object = [keypoints.rest[keypoints.object_id == i] for i in ids]
-    solids = solid_bodies(scene, setup.bodies.spacing, device)
+    solids = [replace(s, centre=s.centre + shift, inertia=s.inertia + inertia) for s, (shift, inertia)
+              in zip(solid_bodies(scene, setup.bodies.spacing, device), map(setup.uneven_moments, range(len(ids))),
+                     strict=True)]  # fmt: skip
     density = torch.tensor([setup.materials[i].material.density for i in ids])
     volumes = torch.tensor([solid.volume for solid in solids]) * scene.metres_per_unit**3
     masses = density * volumes
@@ -229,7 +231,7 @@ def _changed(
     prompts: ForcePrompts, options: SimulateOptions,
 ) -> InitialConditions:  # fmt: skip
     """`_initial_conditions` with other materials, friction and gravity in the same units."""
-    materials = choose_materials(scene.objects, options.material, options.materials)
+    materials = choose_for_bodies(scene, setup.bodies, options)
     gravity = options.gravity * units.length / scene.metres_per_unit / units.time**2
     setup, units = replace(setup, materials=materials), replace(units, gravity=gravity)
     return _initial_conditions(scene, per_object, setup, units, solids, prompts, options)

@@ -20,7 +20,8 @@ from stages.core.errors import InputError
 from stages.core.geometry.neighbours import knn
 from stages.core.physics.forces import Force, ForcePrompts
 from stages.core.physics.keypoints import nearest_weights
-from stages.core.physics.materials import MODELS, Material, choose_materials
+from stages.core.physics.material_parts import part_of_points
+from stages.core.physics.materials import MODELS, Material
 from stages.core.physics.mpm import solver as mpm
 from stages.core.physics.particles import Bodies
 from stages.core.physics.skinning import object_rotations
@@ -30,7 +31,7 @@ from stages.core.scene.trajectory import Keypoints
 from stages.simulate.changes import changed_options, changed_pins
 from stages.simulate.moving_grid import MovingGrid
 from stages.simulate.options import MpmQuality, SimulateOptions
-from stages.simulate.setup import SceneSetup, set_up_scene
+from stages.simulate.setup import SceneSetup, choose_for_bodies, set_up_scene
 
 log = logging.getLogger(__name__)
 PARTICLES_PER_KEYPOINT = 8  # particles whose motion a keypoint follows
@@ -108,9 +109,10 @@ def _changed(
     scene: Scene, setup: SceneSetup, prompts: ForcePrompts, options: SimulateOptions, level: MpmQuality
 ) -> mpm.Particles:
     """`_particles` with other materials, friction and pins. Raises InputError for another material model."""
-    materials = choose_materials(scene.objects, options.material, options.materials)
+    materials = choose_for_bodies(scene, setup.bodies, options)
     for o in scene.objects:
-        if materials[o.id].material.model != setup.materials[o.id].material.model:
+        models = [{part.material.model for part in m[o.id].parts} for m in (materials, setup.materials)]
+        if models[0] != models[1]:
             raise InputError(f"object {o.id} ({o.name}) cannot become {materials[o.id].name} during a simulation with "
                              "--engine mpm: its material model is another one")  # fmt: skip
     return _particles(scene, replace(setup, materials=materials), prompts, options, level)
@@ -137,32 +139,36 @@ def _particles(
     scene: Scene, setup: SceneSetup, prompts: ForcePrompts, options: SimulateOptions, level: MpmQuality
 ) -> mpm.Particles:
     """Particles in metres with each object's material, softened where the quality's substep demands it."""
-    unit, body = scene.metres_per_unit, setup.bodies.body
+    unit, body, x = scene.metres_per_unit, setup.bodies.body, setup.bodies.x
     h, volume = setup.bodies.spacing * unit, setup.bodies.volume * unit**3
-    rows = torch.zeros(len(scene.objects), 9)  # E density nu viscosity friction model, and its three parameters
-    velocity, held = torch.zeros(len(scene.objects), 3), torch.zeros(len(scene.objects), dtype=torch.int8)
+    columns = torch.zeros(len(body), 9)  # E density nu viscosity friction model, and its three parameters
+    velocity, held = torch.zeros(len(body), 3), torch.zeros(len(body), dtype=torch.int8)
     for row, o in enumerate(scene.objects):
-        choice, x = setup.materials[o.id], setup.bodies.x[body == row]
-        m = choice.material
-        length = unit * float((x.amax(0) - x.amin(0)).max())
-        E, viscosity = _stable_material(m, length, h, level)
-        friction = m.friction if options.friction is None else options.friction
-        model = MODELS[m.model]
-        rows[row] = torch.tensor([E, m.density, m.nu, viscosity, friction, model.kernel,
-                                  *model.solver_parameters(m.plastic, E / m.E)])  # fmt: skip
-        velocity[row] = unit * torch.tensor(prompts.velocity.get(o.id, (0.0, 0.0, 0.0)))
-        held[row] = o.id in prompts.pinned
-        mass = scene.mass_text(float(m.density * volume[body == row].sum()))
-        message = f"object {o.id} ({o.name}): {choice.name}, {mass}" + (", pinned" if held[row] else "")
-        if choice.guessed:
-            message += f"; material not known, taking {choice.name} (--material {o.id}=... changes it)"
-        if m.E > E:
-            message += f"; Young's modulus reduced from {m.E:.2g} to {E:.2g} Pa for --quality {options.quality}"
-        log.info("%s", message)
-    E, density, nu, viscosity, friction, model = rows[body, :6].unbind(1)
+        choice, mine = setup.materials[o.id], (body == row).nonzero()[:, 0]
+        length = unit * float((x[mine].amax(0) - x[mine].amin(0)).max())
+        friction = choice.material.friction if options.friction is None else options.friction
+        part_of = part_of_points(choice, x[mine])
+        for k, part in enumerate(choice.parts):
+            m, rows = part.material, mine[part_of == k]
+            E, viscosity = _stable_material(m, length, h, level)
+            model = MODELS[m.model]
+            columns[rows] = torch.tensor([E, m.density, m.nu, viscosity, friction, model.kernel,
+                                          *model.solver_parameters(m.plastic, E / m.E)])  # fmt: skip
+            held[rows] = part.pinned or o.id in prompts.pinned
+            message = f"object {o.id} ({o.name}): {part.name}, {scene.mass_text(float(m.density * volume[rows].sum()))}"
+            message += ", pinned" if part.pinned or o.id in prompts.pinned else ""
+            if choice.guessed:
+                message += f"; material not known, taking {choice.name} (--material {o.id}=... changes it)"
+            if m.E > E:
+                message += f"; Young's modulus reduced from {m.E:.2g} to {E:.2g} Pa for --quality {options.quality}"
+            if not len(rows):
+                message = f"object {o.id} ({o.name}): nothing of it is in the part of {part.name}"
+            log.info("%s", message)
+        velocity[mine] = unit * torch.tensor(prompts.velocity.get(o.id, (0.0, 0.0, 0.0)))
+    E, density, nu, viscosity, friction, model = columns[:, :6].unbind(1)
     particles = mpm.at_rest(setup.start * unit, volume, mpm.ParticleMaterial(E, nu, density, viscosity, friction))
-    particles.model, particles.plastic = model.to(torch.int8), rows[body, 6:].contiguous()
-    particles.v, particles.held = velocity[body] * (held[body] == 0)[:, None], held[body]
+    particles.model, particles.plastic = model.to(torch.int8), columns[:, 6:].contiguous()
+    particles.v, particles.held = velocity * (held == 0)[:, None], held
     return particles
 
 

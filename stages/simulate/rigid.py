@@ -16,7 +16,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -26,14 +26,14 @@ from torch import Tensor
 from stages.core.geometry.rotations import matrix
 from stages.core.physics.convex_parts import ConvexParts, convex_parts
 from stages.core.physics.forces import Force, ForcePrompts
-from stages.core.physics.materials import MODELS, Material, MaterialChoice, choose_materials
+from stages.core.physics.materials import MODELS, Material, MaterialChoice
 from stages.core.physics.state import FrameState
 from stages.core.scene.scene import Scene
 from stages.core.scene.trajectory import Keypoints
 from stages.simulate.changes import changed_options, changed_pins
 from stages.simulate.engine_choice import MAX_RIGID_SAG, sag
 from stages.simulate.options import SimulateOptions
-from stages.simulate.setup import SceneSetup, check_motion, set_up_scene
+from stages.simulate.setup import SceneSetup, check_motion, choose_for_bodies, set_up_scene
 
 log = logging.getLogger(__name__)
 SUBSTEPS = 200  # substeps in a unit of time: that of falling half the size of the smallest object from rest
@@ -109,7 +109,7 @@ def _states(
                 acting = active
             if changes:
                 current, held = changed_options(current, changes), changed_pins(held, changes)
-                world.change(choose_materials(scene.objects, current.material, current.materials), held, current)
+                world.change(choose_for_bodies(scene, setup.bodies, current), held, current)
             world.advance(frame * options.dt)
 
 
@@ -120,6 +120,8 @@ def _bodies(
     unit, bodies, offsets = scene.metres_per_unit, [], []
     for row, o in enumerate(scene.objects):
         choice, parts = setup.materials[o.id], convex_parts(scene, o.id, options.seed)
+        shift, inertia = setup.uneven_moments(row)
+        parts = replace(parts, com=parts.com + shift, inertia=parts.inertia + parts.volume * inertia)
         m, pinned = choice.material, o.id in prompts.pinned
         mass = m.density * parts.volume * unit**3
         lowest = float(torch.cat(parts.hulls)[:, 2].min() + setup.lift[row, 2])

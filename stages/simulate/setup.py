@@ -12,6 +12,7 @@ from torch import Tensor
 
 from stages.core.errors import InputError
 from stages.core.physics.forces import ForcePrompts, vector
+from stages.core.physics.material_parts import averaged, uneven_moments
 from stages.core.physics.materials import MaterialChoice, choose_materials
 from stages.core.physics.mpm.domain import MAX_NODES, Box
 from stages.core.physics.mpm.resample import subdivide
@@ -42,6 +43,11 @@ class SceneSetup:
         """Particle positions at the start of the simulation."""
         return self.bodies.x + (self.lift + self.floor_offset)[self.bodies.body]
 
+    def uneven_moments(self, row: int) -> tuple[Float[Tensor, "3"], Float[Tensor, "3 3"]]:
+        """`material_parts.uneven_moments` of an object."""
+        mine = self.bodies.body == row
+        return uneven_moments(list(self.materials.values())[row], self.bodies.x[mine], self.bodies.volume[mine])
+
 
 def set_up_scene(
     scene: Scene, prompts: ForcePrompts, options: SimulateOptions, fine: bool = False, skin: bool = False
@@ -52,10 +58,10 @@ def set_up_scene(
     the resolution of the particles; with `skin` they fill the bodies up to the surface. Raises InputError for a --box
     that does not contain the objects.
     """
-    materials = choose_materials(scene.objects, options.material, options.materials)
     bodies = sample_bodies(scene, options.level.particles, options.seed, skin)
     if fine:
         bodies = subdivide(bodies, options.seed)
+    materials = choose_for_bodies(scene, bodies, options)
     count, h = len(scene.objects), bodies.spacing
     lift = torch.zeros(count, 3)
     for row, o in enumerate(scene.objects):
@@ -91,6 +97,13 @@ def set_up_scene(
     at_rest = x - (lift + floor_offset)[bodies.body]
     bodies = replace(bodies, x=at_rest)
     return SceneSetup(bodies, materials, lift, on_floor, floor_offset, bottom, on_floor_as_seen, box)
+
+
+def choose_for_bodies(scene: Scene, bodies: Bodies, options: SimulateOptions) -> dict[int, MaterialChoice]:
+    """The materials that the options name, by object id, each the average of its parts over the object's body."""
+    chosen = choose_materials(scene.objects, options.material, options.materials)
+    mine = {o.id: bodies.body == row for row, o in enumerate(scene.objects)}
+    return {i: averaged(choice, bodies.x[mine[i]], bodies.volume[mine[i]]) for i, choice in chosen.items()}
 
 
 def _floor_height(scene: Scene, options: SimulateOptions, box: Box | None, bottom: Float[Tensor, "o"]) -> float:

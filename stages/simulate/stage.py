@@ -21,7 +21,7 @@ from stages.core.scene.scene import Scene
 from stages.core.scene.scene_ply import read_scene
 from stages.core.scene.schema import number, reason, text, texts, whole
 from stages.core.scene.trajectory import SimulationInfo, TrajectoryWriter, read_trajectory
-from stages.simulate.engine_choice import with_engine
+from stages.simulate.engine_choice import for_engine, with_engine
 from stages.simulate.options import AUTO, ENGINES, SimulateOptions
 
 log = logging.getLogger(__name__)
@@ -46,6 +46,7 @@ def run(scene: Path, out: Path, options: SimulateOptions = SimulateOptions()) ->
     )  # fmt: skip
     keypoints = choose_keypoints(world, options.keypoint_count, options.seed)
     options = with_engine(options, world, keypoints)
+    prompts = for_engine(prompts, world, options)
     rollout = choose({name: engine.rollout for name, engine in ENGINES.items()}, options.engine)
     inputs = [Path(p) for p in (scene, options.materials, options.forces) if p is not None]
     world = replace(world, provenance={**provenance("simulate", inputs, options), "scene": world.provenance})

@@ -16,7 +16,7 @@ from stages.core.errors import InputError
 from stages.core.kernels.mpm.constitutive import COROTATED, NEO_HOOKEAN, SAND, SNOW, VON_MISES, sand_slope
 from stages.core.scene.files import must_exist
 from stages.core.scene.scene import SceneObject
-from stages.core.scene.schema import number, numbers, quote, read_json, reason
+from stages.core.scene.schema import flag, number, numbers, quote, read_json, reason
 
 Triple = tuple[float | int, float | int, float | int]
 
@@ -114,16 +114,34 @@ ALIASES = {  # material of objects whose name contains one of these words
     "fruit": ["apple", "banana", "orange", "lemon", "pear"],
     "ball": ["soccer", "football", "basketball"],
 }
+MAX_PARTS = 100  # of an object
 DEFAULT_MATERIAL = "common"  # of objects whose name suggests none
 
 
 @dataclass(frozen=True)
+class MaterialPart:
+    """A part of an object and its material; what is in several parts is of the first of them."""
+
+    name: str
+    material: Material
+    below: float | None = None  # height above the object's lowest point [scene units]
+    box: tuple[float, ...] | None = None  # lower and upper corner, in the scene at rest [scene units]
+    pinned: bool = False  # held at its position
+
+
+@dataclass(frozen=True)
 class MaterialChoice:
-    """The material of an object."""
+    """The material of an object: of all its parts, or one that stands for them (see material_parts.py)."""
 
     name: str
     material: Material
     guessed: bool = False  # neither given nor inferred from the object's name
+    several: tuple[MaterialPart, ...] = ()  # parts of different materials, the last without a region
+
+    @property
+    def parts(self) -> tuple[MaterialPart, ...]:
+        """The parts, one where the object is uniform."""
+        return self.several or (MaterialPart(self.name, self.material),)
 
 
 def choose_materials(
@@ -131,12 +149,13 @@ def choose_materials(
 ) -> dict[int, MaterialChoice]:
     """Material of each object id: --material over --materials over the scene file over the object's name.
 
-    `file` is JSON {object name or id: material name or {E, density, ...}}. Raises InputError for unknown objects and
-    materials and for values out of range.
+    `file` is JSON {object name or id: material name, or {E, density, ...}, or {parts: [...]}}. Raises InputError for
+    unknown objects and materials and for values out of range.
     """
     given: dict[int, MaterialChoice] = {}
     for key, value in (_read(file) if file else {}).items():
-        given[find_object(key, objects, f"{file}").id] = _material(value, f"{file}: {quote(key)}")
+        read = _parts if isinstance(value, dict) and "parts" in value else _material
+        given[find_object(key, objects, f"{file}").id] = read(value, f"{file}: {quote(key)}")
     for prompt in prompts:
         key, equals, value = prompt.partition("=")
         if not equals or not value.strip():
@@ -204,6 +223,30 @@ def _material(value: object, where: str) -> MaterialChoice:
     if not (0 <= material.friction < 100 and 0 <= material.loss <= 2):
         raise InputError(f"{where}: friction must be 0 or more and loss between 0 and 2")
     return MaterialChoice("custom", material)
+
+
+def _parts(value: dict, where: str) -> MaterialChoice:
+    """An object of several parts: {"parts": [{below or box or both, material, pinned}, ..., {material, pinned}]}."""
+    rows = value["parts"]
+    if value.keys() != {"parts"} or not isinstance(rows, list) or not 2 <= len(rows) <= MAX_PARTS:
+        raise InputError(f"{where}: give {{parts: [...]}} with 2 to {MAX_PARTS} parts")
+    parts = []
+    for k, row in enumerate(rows, 1):
+        at = f"{where}: part {k}"
+        if not isinstance(row, dict) or row.keys() - {"below", "box", "material", "pinned"} or "material" not in row:
+            raise InputError(f"{at}: give a material and below (a height), box (two corners) or both, and pinned if it "
+                             "is held")  # fmt: skip
+        if (k < len(rows)) != bool(row.keys() & {"below", "box"}):
+            raise InputError(f"{at}: every part but the last needs below or box; the last is what the others leave")
+        choice = _material(row["material"], at)
+        try:
+            below = number(row["below"], "below", 0) if "below" in row else None
+            box = numbers(row["box"], 6, "box") if "box" in row else None
+            pinned = flag(row.get("pinned", False), "pinned")
+        except ValueError as error:
+            raise InputError(f"{at}: {reason(error)}") from error
+        parts.append(MaterialPart(choice.name, choice.material, below, box, pinned))
+    return MaterialChoice(" and ".join(dict.fromkeys(p.name for p in parts)), parts[-1].material, several=tuple(parts))
 
 
 def _read(file: Path) -> dict:

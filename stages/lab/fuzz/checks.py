@@ -89,9 +89,9 @@ def check_simulate_options(options: SimulateOptions) -> None:
 
 
 def check_materials(found: dict[int, MaterialChoice]) -> None:
-    """AssertionError unless each object has an elastic solid as its material."""
-    for choice in found.values():
-        m = choice.material
+    """AssertionError unless each object has elastic solids as its materials."""
+    for part in (part for choice in found.values() for part in choice.parts):
+        m = part.material
         assert 1e-4 < m.E < 1e14 and 1e-4 < m.density < 1e6 and -0.5 < m.nu < 0.5 and 0 <= m.friction < 1e3, "material"
         assert 0 <= m.loss < 10 and all(math.isfinite(x) for x in m.plastic), "loss"
 

@@ -222,8 +222,11 @@ PATH = [{"rotation": EYE, "position": [0.0, 0, i], "width": 32, "height": 24, "f
 VIEWS = [{"viewmat": np.eye(4).tolist(), "K": [[40.0, 0, 16], [0, 40, 12], [0, 0, 1]], "size": [32, 24]}] * 2
 FORCES = {"scene": [{"obj_id": 0, "start": 0.0, "end": 0.5, "force": [0, 0, 2.0]},
                     {"obj_id": 1, "start": 0.1, "end": 0.3, "torque": [0.0, 1.0, 0]}]}  # fmt: skip
-MATERIALS = {"duck": "rubber", "2": {"E": 1e5, "density": 500.0, "nu": 0.3, "friction": 0.4, "loss": 0.1,
-                                     "model": "von-mises", "plastic": [1e4, 0.0, 0.0]}}  # fmt: skip
+CUSTOM = {"E": 1e5, "density": 500.0, "nu": 0.3, "friction": 0.4, "loss": 0.1, "model": "von-mises",
+          "plastic": [1e4, 0.0, 0.0]}  # fmt: skip
+PARTS = [{"below": 0.1, "material": CUSTOM}, {"box": [0, 0, 0.1, 1, 1, 1.0], "material": "steel", "pinned": True},
+         {"material": "rubber"}]  # fmt: skip
+MATERIALS = {"duck": CUSTOM, "2": {"parts": PARTS}}
 PROMPTS = {"bbox": [[2, 3, 10, 12], [12.0, 4, 20, 20]], "center_point": [[5, 6], [15.0, 10]], "text": ["duck", "bowl"],
            "size": [32, 24]}  # fmt: skip
 LABELS = {"1": {"name": "duck", "core": True}, "2": "bowl"}

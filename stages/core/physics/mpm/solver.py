@@ -217,12 +217,15 @@ class Solver:
         return torch.where(self.rows.lost == NEVER, -1, self.rows.lost)
 
     def _body_contact(self, particles: Particles, sizes: Sequence[int]) -> BodyContact:
-        """Density and friction of each body; those of its particles are equal."""
-        first = torch.tensor([0, *sizes[:-1]]).cumsum(0)
-        mass, volume, held, friction = (t[first].float().to(self.device) for t in (
-            particles.mass, particles.volume, particles.held, particles.friction))  # fmt: skip
-        factor = torch.where(held > 0, float(KINEMATIC_MASS_FACTOR), 1.0)
-        return BodyContact((factor * mass / volume * self.dx**3).contiguous(), friction.contiguous())
+        """Mass of a filled cell and friction of each body; the friction of its particles is equal.
+
+        Where a body has several densities the mass is that of the lightest part: denser parts then count as full a
+        fraction of a cell outside their surface, and touch others there.
+        """
+        density = particles.mass / particles.volume * torch.where(particles.held > 0, KINEMATIC_MASS_FACTOR, 1.0)
+        full = torch.stack([part.min() for part in density.split(sizes)]) * self.dx**3
+        friction = torch.stack([part[0] for part in particles.friction.split(sizes)])
+        return BodyContact(*(t.float().to(self.device).contiguous() for t in (full, friction)))
 
     def _quanta(self) -> tuple[float, float]:
         """Fixed-point units per kg m/s and per kg: powers of two that depend on dx alone, not on the batch.

@@ -1,0 +1,76 @@
+"""Objects of several materials: which particles are of which part, and the one material that stands for all."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from stages.core.physics.materials import MODELS, Material, MaterialChoice
+
+
+def part_of_points(choice: MaterialChoice, x: Float[Tensor, "p 3"]) -> Int[Tensor, "p"]:
+    """Index into `choice.parts` of the part that each point of an object at rest is in [scene units].
+
+    Heights are counted from the lowest point.
+    """
+    index = torch.full((len(x),), len(choice.parts) - 1)
+    height = x[:, 2] - x[:, 2].min()
+    for k in reversed(range(len(choice.parts) - 1)):
+        part = choice.parts[k]
+        inside = torch.ones(len(x), dtype=torch.bool)
+        if part.below is not None:
+            inside &= height < part.below
+        if part.box is not None:
+            inside &= ((x >= torch.tensor(part.box[:3])) & (x <= torch.tensor(part.box[3:]))).all(1)
+        index[inside] = k
+    return index
+
+
+def averaged(choice: MaterialChoice, x: Float[Tensor, "p 3"], volume: Float[Tensor, "p"]) -> MaterialChoice:
+    """The choice with the average of its parts as its material; unchanged where it has one part.
+
+    Density, Poisson's ratio and loss are means by volume, so that the mass is that of the parts; friction is the mean
+    by mass; Young's modulus is the harmonic mean by volume, that of the parts stacked on each other. A plastic part
+    gives its model to the whole.
+    """
+    if len(choice.parts) == 1:
+        return choice
+    share = torch.zeros(len(choice.parts)).index_add(0, part_of_points(choice, x), volume).double()
+    materials = [part.material for part in choice.parts]
+    of = {name: torch.tensor([getattr(m, name) for m in materials], dtype=torch.float64)
+          for name in ("E", "density", "nu", "friction", "loss")}  # fmt: skip
+    mass, total = share * of["density"], share.sum()
+    plastic = next((m for m in materials if MODELS[m.model].plastic), materials[-1])
+    mean = Material(
+        E=float(total / (share / of["E"]).sum()), density=float(mass.sum() / total),
+        nu=float((share * of["nu"]).sum() / total), friction=float((mass * of["friction"]).sum() / mass.sum()),
+        loss=float((share * of["loss"]).sum() / total), model=plastic.model, plastic=plastic.plastic,
+        source="the average of its parts",
+    )  # fmt: skip
+    return replace(choice, material=mean)
+
+
+def uneven_moments(
+    choice: MaterialChoice, x: Float[Tensor, "p 3"], volume: Float[Tensor, "p"]
+) -> tuple[Float[Tensor, "3"], Float[Tensor, "3 3"]]:
+    """What the parts' densities add to the centre of mass and to the inertia about it, per unit of mass, of an object.
+
+    Both are zero for a uniform object.
+    """
+    if len(choice.parts) == 1:
+        return torch.zeros(3), torch.zeros(3, 3)
+    density = torch.tensor([part.material.density for part in choice.parts])[part_of_points(choice, x)]
+    (com, inertia), (middle, uniform) = (_moments(x.double(), m.double()) for m in (density * volume, volume))
+    return (com - middle).float(), (inertia - uniform).float()
+
+
+def _moments(x: Float[Tensor, "p 3"], mass: Float[Tensor, "p"]) -> tuple[Float[Tensor, "3"], Float[Tensor, "3 3"]]:
+    """Centre of mass and inertia about it per unit of mass."""
+    share = (mass / mass.sum())[:, None]
+    com = (share * x).sum(0)
+    r = x - com
+    second = (share * r).mT @ r
+    return com, second.trace() * torch.eye(3, dtype=x.dtype) - second

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from stages.core.physics.particles import inliers, usable
 from stages.core.physics.signed_distance import distance_grid, mass_properties
+from stages.core.scene.cached import cached_in_scene
 from stages.core.scene.scene import Scene
 
 SMALLEST_SHARE = 0.1  # least mass of a keypoint relative to the mean, when the centre of mass is matched
@@ -24,6 +25,7 @@ class SolidBody:
     inertia: Float[Tensor, "3 3"]  # about the centre of mass, per unit of mass
 
 
+@cached_in_scene
 def solid_bodies(scene: Scene, sheet: float, device: str = "cpu") -> list[SolidBody]:
     """The solid body of every object, from the centres of its Gaussians; open sheets get the thickness `sheet`.
 

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from stages.core.physics.keypoints import farthest_points
 from stages.core.physics.particles import filled_voxels, inliers, usable
+from stages.core.scene.cached import cached_in_scene
 from stages.core.scene.scene import Scene
 
 VOXELS_ALONG = 32  # voxels along the longest side of an object
@@ -40,6 +41,7 @@ class ConvexParts:
     inertia: Float[Tensor, "3 3"]  # about the centre of mass [unit^5]
 
 
+@cached_in_scene
 def convex_parts(scene: Scene, object_id: int, seed: int = 0) -> ConvexParts:
     """Divide an object into convex parts.
 

@@ -27,6 +27,7 @@ from stages.core.geometry.neighbours import knn
 from stages.core.geometry.rotations import matrix
 from stages.core.kernels.threads import parallel_map
 from stages.core.perception.support import topples
+from stages.core.scene.cached import cached_in_scene
 from stages.core.scene.gaussians import Gaussians
 from stages.core.scene.scene import Scene
 
@@ -54,6 +55,7 @@ class Bodies:
     spacing: float  # edge of a voxel; particles of thick bodies stay this far inside
 
 
+@cached_in_scene
 def sample_bodies(scene: Scene, count: int, seed: int = 0, skin: bool = False) -> Bodies:
     """Sample about `count` particles for all objects together, in bounded time and memory.
 

@@ -95,7 +95,7 @@ def found_objects(scene: Scene, view: int) -> Int[Tensor, "h w"]:
 def draw_objects(result: Result, scene: Scene, options: EvaluateOptions) -> Result:
     """The result with photo, drawing and objects of a scene at rest in SCENE_PICTURES of its cameras.
 
-    Photos are shown where `options.photos` names their folder.
+    Photos are shown as taken, where `options.photos` names their folder: trajectories do not keep the lenses.
     """
     cameras = scene.cameras
     if cameras is None or not len(cameras):
@@ -106,7 +106,7 @@ def draw_objects(result: Result, scene: Scene, options: EvaluateOptions) -> Resu
         drawing, found = _rendered(scene, view), found_objects(scene, view)
         everywhere = torch.ones_like(found, dtype=torch.bool)
         images = {"drawing": drawing, "objects": paint(drawing, found, colours, everywhere)}
-        photo = {"photo": _photo(scene, view, options)} if options.photos else {}
+        photo = {"photo": _read_photo(scene, view, options.photos)} if options.photos else {}
         pictures.append(Pictures(cameras.names[view], photo | images))
     return replace(result, pictures=pictures, legend={o.name: colours[o.id] for o in scene.objects})
 
@@ -141,10 +141,16 @@ def _photo(scene: Scene, view: int, options: EvaluateOptions) -> Image:
     width, height = cameras.sizes[view].tolist()
     if options.photos is None:
         return _rendered(scene, view)
-    stem, folder = Path(cameras.names[view]).stem, Path(options.photos)
-    files = [p for p in sorted(folder.glob("*")) if p.stem == stem and p.suffix.lower() in IMAGE_SUFFIXES]
-    if not files:
-        raise InputError(f"--photos {folder}: holds no photo {cameras.names[view]}; give the folder of the photos")
-    image = read_image(files[0])
+    image = _read_photo(scene, view, options.photos)
     size = (image.shape[1], image.shape[0])
     return resize(Undistortion.of(cameras, view, size, options.undistorted).image(image), width, height)
+
+
+def _read_photo(scene: Scene, view: int, folder: Path) -> Image:
+    """The photo of a camera; InputError where the folder has none."""
+    name = scene.cameras.names[view]
+    files = [p for p in sorted(Path(folder).glob("*"))
+             if p.stem == Path(name).stem and p.suffix.lower() in IMAGE_SUFFIXES]  # fmt: skip
+    if not files:
+        raise InputError(f"--photos {folder}: holds no photo {name}; give the folder of the photos")
+    return read_image(files[0])

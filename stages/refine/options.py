@@ -19,6 +19,7 @@ BACKENDS = {
     "none": Backend("stages.refine.hull_completion:no_completion", "add nothing to objects"),
 }  # fmt: skip
 GENERATORS = with_weights(BACKENDS)
+CONCURRENT = {"close", "none"}  # completers of which several run at a time: they use the CPU alone
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from tqdm import tqdm
 from stages.core.backends import choose, pick_device
 from stages.core.errors import InputError
 from stages.core.geometry.neighbours import knn
+from stages.core.kernels.threads import parallel_map
 from stages.core.perception.region_growing import grow_objects
 from stages.core.perception.support import Support, find_support, view_extent
 from stages.core.perception.wall import find_wall, rotate_wall_to_floor
@@ -23,7 +24,7 @@ from stages.core.scene.scene_ply import read_scene, write_scene
 from stages.refine.background import fill_background
 from stages.refine.disc_gaussians import empty_like
 from stages.refine.observed_space import ObservedSpace, object_psnr
-from stages.refine.options import BACKENDS, RefineOptions
+from stages.refine.options import BACKENDS, CONCURRENT, RefineOptions
 from stages.refine.outliers import floaters
 
 log = logging.getLogger(__name__)
@@ -69,8 +70,15 @@ def _refined(scene: Scene, support: Support | None, options: RefineOptions) -> S
     scene = replace(scene, gaussians=g[~outliers])
     observed = ObservedSpace.of(scene, pick_device(options.device))
     numbers = [i for i in scene.gaussians.object_id.unique().tolist() if i > 0]
-    added = [completer(scene, i, observed, support, options) for i in tqdm(numbers, unit="object")]
-    added = concatenate([empty_like(scene.gaussians), *added])
+    with tqdm(total=len(numbers), unit="object") as bar:
+
+        def complete(i: int) -> Gaussians:
+            made = completer(scene, i, observed, support, options)
+            bar.update()
+            return made
+
+        added = (parallel_map if options.chosen in CONCURRENT else map)(complete, numbers)
+        added = concatenate([empty_like(scene.gaussians), *added])
     added = added[observed.is_hidden(scene.gaussians, added)]
     for i in numbers:
         count = int((added.object_id == i).sum())

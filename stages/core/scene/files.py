@@ -105,8 +105,8 @@ def ngff_version() -> str:
 
 
 def seconds_since(began: float) -> dict[str, float]:
-    """{"seconds": wall time since `began` (time.monotonic())}; empty where $SOURCE_DATE_EPOCH asks for equal files."""
-    return {} if "SOURCE_DATE_EPOCH" in os.environ else {"seconds": round(time.monotonic() - began, 1)}
+    """{"seconds": wall time since `began` (time.monotonic())}; empty without $NGFF_TIMES, so that equal runs are equal."""
+    return {"seconds": round(time.monotonic() - began, 1)} if os.environ.get("NGFF_TIMES") else {}
 
 
 def provenance(command: str, inputs: list[Path], options: object = None) -> dict:

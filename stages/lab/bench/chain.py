@@ -6,7 +6,6 @@ files of all runs are compared by their sha256.
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 import tempfile
@@ -91,7 +90,6 @@ def run(photos: Path, out: Path | None = None, options: ChainBenchOptions = Chai
     device = pick_device(options.device)
     yield machine(device)
     rows, files, objects, commands = [], [], [], {}
-    os.environ.setdefault("SOURCE_DATE_EPOCH", "0")  # no times in the files, which are compared
     with tempfile.TemporaryDirectory() as temporary:
         for i in range(options.repeat):
             folder = Path(temporary) / str(i)

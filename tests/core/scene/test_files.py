@@ -47,8 +47,9 @@ def test_next_run_deletes_what_a_killed_one_left_and_nothing_else(tmp_path, monk
     assert sorted(os.listdir(tmp_path)) == ["b.txt", "c.txt"]
 
 
-def test_times_are_left_out_where_files_are_to_be_equal(monkeypatch):
+def test_times_are_stored_only_where_asked_for(monkeypatch):
     monkeypatch.setattr(files.time, "monotonic", lambda: 12.04)
-    assert seconds_since(10.0) == {"seconds": 2.0}
-    monkeypatch.setenv("SOURCE_DATE_EPOCH", "0")
+    monkeypatch.delenv("NGFF_TIMES", raising=False)
     assert seconds_since(10.0) == {}
+    monkeypatch.setenv("NGFF_TIMES", "1")
+    assert seconds_since(10.0) == {"seconds": 2.0}

@@ -105,7 +105,7 @@ def ngff_version() -> str:
 
 
 def seconds_since(began: float) -> dict[str, float]:
-    """{"seconds": wall time since `began` (time.monotonic())}; empty without $NGFF_TIMES, so that equal runs are equal."""
+    """{"seconds": wall time since `began` (time.monotonic())}; empty unless $NGFF_TIMES is set."""
     return {"seconds": round(time.monotonic() - began, 1)} if os.environ.get("NGFF_TIMES") else {}
 
 

@@ -54,7 +54,7 @@ def quantised(values: Float[Tensor, "r c"], bits: int, axes: int | None = None, 
     """Values rounded to 2^bits levels between their extremes, per column or, with `axes`, per column modulo `axes`."""
     rows, columns = values.shape
     axes = columns if axes is None else axes
-    grouped = values.double().reshape(-1, axes)
+    grouped = values.detach().cpu().double().reshape(-1, axes)
     low, high = (grouped.amin(0), grouped.amax(0)) if len(grouped) else (torch.zeros(axes), torch.zeros(axes))
     step = (high - low) / (2**bits - 1)
     q = ((grouped - low) / torch.where(step > 0, step, 1.0)).round().long().reshape(rows, columns)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from ngff_cli import lab
+from ngff_cli import data
 from stages.core.errors import InputError
 from stages.core.physics.mpm.solver import SAFETY, wave_speed
 from stages.lab.assets.objects import OBJECTS
@@ -243,7 +243,7 @@ def test_particles_are_cached(tmp_path, monkeypatch):
 
 
 def test_command_has_every_option_with_its_default():
-    command = inspect.signature(lab.dataset).parameters
+    command = inspect.signature(data.dataset).parameters
     for field in fields(DatasetOptions):
         assert command[field.name].default == field.default, field.name
     assert set(command) - {f.name for f in fields(DatasetOptions)} == {"out", "check", "ray"}

@@ -27,6 +27,7 @@ from stages.core.scene.scene import Scene
 WEIGHTS = Path(__file__).parent / "segmenter.safetensors"
 MAX_VOXELS = 80_000  # nearest to the focus
 MAX_BASE_HEIGHT = 0.4  # of an object's lowest points above the surface [camera distance]
+MAX_BASE_DEPTH = 0.05  # of an object's lowest points below the surface; what stands on the floor is lower
 OBJECT_COST = 0.3  # least IoU that a candidate must be expected to have; chosen on simulated scenes
 SIZE_POWER = 0.5  # weight of n surfels: n**SIZE_POWER. 0 prefers parts, 1 merged objects; chosen on simulated scenes
 MIN_GAUSSIANS = 30  # of an object
@@ -69,7 +70,7 @@ def object_ids(
 ) -> Int[Tensor, "n"]:
     """Object number of each Gaussian; 0 for the rest.
 
-    With a supporting surface, objects are those over it; they may stand on something that stands on it.
+    With a supporting surface, objects are those that stand on it or on something that stands on it.
     """
     ids = torch.zeros(len(scene.gaussians), dtype=torch.int64)
     surfels, index, _ = scene_surfels(scene)
@@ -85,15 +86,18 @@ def object_ids(
     means = scene.gaussians.means
     for number in range(1, int(ids.max()) + 1):
         own = means[ids == number]
-        if len(own) < MIN_GAUSSIANS or (support is not None and not _is_over(own, support)):
+        if len(own) < MIN_GAUSSIANS or (support is not None and not _stands_on(own, support)):
             ids[ids == number] = 0
     return ids
 
 
-def _is_over(points: Float[Tensor, "m 3"], support: Support) -> bool:
-    """Whether an object is mostly over the surface, and its lowest points are not far above it."""
-    low = float(support.heights(points).quantile(0.05))
-    return float(support.inside(points).float().mean()) > 0.5 and low < MAX_BASE_HEIGHT * support.view.radius
+def _stands_on(points: Float[Tensor, "m 3"], support: Support) -> bool:
+    """Whether the lowest points of an object are at the height of the surface, or of something that stands on it.
+
+    The surface may go on beyond the part of it that is visible.
+    """
+    low = float(support.heights(points).quantile(0.05)) / support.view.radius
+    return -MAX_BASE_DEPTH < low < MAX_BASE_HEIGHT
 
 
 @dataclass(frozen=True)

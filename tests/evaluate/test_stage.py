@@ -67,7 +67,7 @@ def test_report_shows_photos_objects_and_times(tmp_path, two_balls):
     true = write_motion(tmp_path / "true.h5", scene)
     (tmp_path / "photos").mkdir()
     for name in scene.cameras.names:
-        write_png(tmp_path / "photos" / name, torch.full((64, 64, 3), 0.5))
+        write_png(tmp_path / "photos" / name, torch.full((64, 90, 3), 0.5))  # the lens is not known
     for photos, shown in ((tmp_path / "photos", ["photo", "drawing", "objects"]), (None, ["drawing", "objects"])):
         run(true, true, None, EvaluateOptions(report=tmp_path / "report.html", photos=photos))
         html = (tmp_path / "report.html").read_text()

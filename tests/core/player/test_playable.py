@@ -142,3 +142,21 @@ def test_only_motions_of_the_learned_field_are_playable(tmp_path):
         render(tmp_path / "traj.h5", tmp_path / "film.mp4", RenderOptions(playable=True))
     with pytest.raises(InputError, match="no motion"):
         render(tmp_path / "scene.ply", tmp_path / "film.html", RenderOptions(playable=True))
+
+
+FOLLOW = """([frame]) => Promise.all(["local", "engine"].map((name) => import(`player/${name}.js`))).then(
+  ([{ engineInput }, { FieldEngine }]) => {
+    const engine = new FieldEngine(engineInput(player.film, player.rest)), at = (n) => player.filmPositions(n);
+    engine.follow(frame, at(frame), at(frame - 1));
+    while (engine.frame < player.film.frames - 1) engine.advance();
+    return Array.from(engine.positions());
+  })"""  # the end of a film whose last frames are computed
+
+
+def test_motion_goes_on_from_within_a_film(tmp_path, open_page):
+    t = simulated(tmp_path, two_balls_scene(), frames=16, velocity=("object=2 -0.8,0,0",), device="cpu")
+    page = open_page(render(tmp_path / "traj.h5", tmp_path / "film.html", RenderOptions(playable=True)))
+    end = torch.tensor(page.evaluate(FOLLOW, [8])).view(-1, 3)
+    travelled = (t.positions[-1] - t.positions[8]).norm(dim=1).max()
+    # velocities are differences of frames, half a frame late
+    assert (end - t.positions[-1]).norm(dim=1).max() < 0.15 * travelled

@@ -57,6 +57,7 @@ export class FieldEngine {
     this.restart();
     this.frame = frame;
     if (frame === 0) return;
+    for (const change of this.changes) if (change.start < frame * this.dt) this.change(change);
     const at = (all, o, k, a) => this.first[o][3 * k + a] + (all[3 * this.rows[o][k] + a] - this.rest[3 * this.rows[o][k] + a] - (a === 2 ? this.lift[o] : 0)) * this.field.length;
     const seconds = this.dt * this.field.time, moved = [];
     this.bodies.forEach((body, o) => {

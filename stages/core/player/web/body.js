@@ -6,7 +6,7 @@ import { Linear3 } from "player/layers.js";
 export class Body {
   static FRAME = 0.02; // time between frames of the training data
   static RADII = [0.12, 0.4]; // of the neighbourhoods [radii of gyration]
-  static MIN_NEIGHBOUR_WEIGHT = 1e-20;
+  static MIN_NEIGHBOUR_WEIGHT = 1e-9; // relative to the point's own; rounding in the engine is larger
   static MAX_DISPLACEMENT = 1.5; // of a keypoint [radii of gyration]
   static MAX_SPEED = 8;
   static MAX_SPIN = 60;
@@ -199,23 +199,27 @@ export class Body {
     if (factor < 1) for (let i = 0; i < field.length; i++) field[i] *= factor;
   }
 
-  // Averaging weights of the neighbourhoods: for each radius n rows of n, summing to 1; computed when first needed.
+  // Averaging weights of the neighbourhoods: for each radius the neighbours of each point, from `first` on, and their
+  // weights, which sum to 1; computed when first needed.
   get blur() {
-    if (this.weights) return this.weights;
+    if (this.neighbourhoods) return this.neighbourhoods;
     const { n, arm, massFraction } = this;
-    this.weights = Body.RADII.map((radius) => {
-      const out = new Float32Array(n * n), squared = (radius * this.size) ** 2;
+    this.neighbourhoods = Body.RADII.map((radius) => {
+      const squared = (radius * this.size) ** 2, first = new Int32Array(n + 1), which = [], weight = [];
       for (let k = 0; k < n; k++) {
         let sum = 0;
         for (let j = 0; j < n; j++) {
           const d = (arm[3 * k] - arm[3 * j]) ** 2 + (arm[3 * k + 1] - arm[3 * j + 1]) ** 2 + (arm[3 * k + 2] - arm[3 * j + 2]) ** 2;
           const w = Math.exp(-d / squared);
-          sum += out[n * k + j] = w > Body.MIN_NEIGHBOUR_WEIGHT ? w * massFraction[j] : 0;
+          if (w < Body.MIN_NEIGHBOUR_WEIGHT) continue;
+          which.push(j);
+          sum += weight[weight.push(w * massFraction[j]) - 1];
         }
-        for (let j = 0; j < n; j++) out[n * k + j] /= Math.max(sum, 1e-12);
+        first[k + 1] = which.length;
+        for (let i = first[k]; i < first[k + 1]; i++) weight[i] /= Math.max(sum, 1e-12);
       }
-      return out;
+      return { first, which: Int32Array.from(which), weight: Float32Array.from(weight) };
     });
-    return this.weights;
+    return this.neighbourhoods;
   }
 }

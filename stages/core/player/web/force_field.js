@@ -243,7 +243,7 @@ export class ForceField {
         for (let b = 0; b < 3; b++) virial[3 * a + b] += massFraction[k] * fields[9 * k + a] * arm[i + b] / (size * size);
       }
     }
-    const [near, far] = body.blur.map((weights) => this.means(weights, fields, n));
+    const [near, far] = body.blur.map((neighbours) => this.means(neighbours, fields, n));
     const spread = virial.map((x, i) => x + virial[3 * (i % 3) + Math.floor(i / 3)]), v = new Float64Array(36 * n), x = new Float64Array(78 * n);
     for (let k = 0, at = 0, i = 0; k < n; k++, i += 3) {
       const w = 36 * k, f = 9 * k;
@@ -266,13 +266,12 @@ export class ForceField {
     body.project(stress);
   }
 
-  means(weights, fields, n) { // of nine values at each point over its neighbourhood
+  means({ first, which, weight }, fields, n) { // of nine values at each point over its neighbourhood
     const out = new Float64Array(9 * n);
     for (let k = 0; k < n; k++) {
       let a0 = 0, a1 = 0, a2 = 0, a3 = 0, a4 = 0, a5 = 0, a6 = 0, a7 = 0, a8 = 0;
-      for (let j = 0, w = n * k, f = 0; j < n; j++, w++, f += 9) {
-        const m = weights[w];
-        if (m === 0) continue;
+      for (let i = first[k]; i < first[k + 1]; i++) {
+        const m = weight[i], f = 9 * which[i];
         a0 += m * fields[f]; a1 += m * fields[f + 1]; a2 += m * fields[f + 2]; a3 += m * fields[f + 3]; a4 += m * fields[f + 4];
         a5 += m * fields[f + 5]; a6 += m * fields[f + 6]; a7 += m * fields[f + 7]; a8 += m * fields[f + 8];
       }

@@ -157,7 +157,7 @@ class Live {
 
   keys() {
     return [
-      [" ", "space", "pause or go on", () => this.pause()],
+      ...(this.local ? [] : [[" ", "space", "pause or go on", () => this.pause()]]), // the film's pauses both
       [".", ".", "one step, while paused", () => this.act({ do: "step" })],
       ["p", "P", "push the object under the cursor away", () => this.push()],
       ["u", "U", "lift it and hold it", () => this.lift()],

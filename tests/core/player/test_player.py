@@ -226,9 +226,8 @@ def test_arrows_of_forces_start_at_the_object_while_they_act(tmp_path, open_page
     page.evaluate("player.play(false); player.seek(0)")
     page.select_option("#view", label="00.png")
     drawn = "(document.querySelector('#overlay path').getAttribute('d') ?? '')"  # no attribute before the first image
-    until(page, f"{drawn}.length > 0")
+    until(page, f"!player.changed && !player.busy && {drawn}.length > 0")
     x, y = (float(v) for v in page.evaluate(drawn).split(" ")[0].removeprefix("M").split(","))
-    until(page, "!player.changed && !player.busy")
     centre = page.evaluate(PIXEL_OF, motion.com[0, 1].tolist())
     assert math.dist(centre, (x, y)) < 1
     page.evaluate(f"player.seek({2 * motion.dt})")

@@ -6,7 +6,17 @@ from typing import Annotated
 import typer
 from typer import Argument, Option
 
-from ngff_cli.options import AsJson, CommandGroup, Device, SceneIn, Seed, Threads, limit_threads, set_up_logging
+from ngff_cli.options import (
+    AsJson,
+    CommandGroup,
+    Device,
+    SceneIn,
+    Seed,
+    Threads,
+    limit_threads,
+    set_up_logging,
+    terminate_as_interrupted,
+)
 from stages.core.backends import describe, load
 from stages.evaluate.options import EvaluateOptions
 from stages.reconstruct.options import BACKENDS as RECONSTRUCT
@@ -376,6 +386,7 @@ def evaluate(
 
 def main() -> None:
     """Entry point of the script `ngff`."""
+    terminate_as_interrupted()
     app()
 
 

@@ -6,7 +6,17 @@ from typing import Annotated
 import typer
 
 from ngff_cli import bench, data
-from ngff_cli.options import AsJson, CommandGroup, Device, Seed, Threads, limit_threads, print_results, set_up_logging
+from ngff_cli.options import (
+    AsJson,
+    CommandGroup,
+    Device,
+    Seed,
+    Threads,
+    limit_threads,
+    print_results,
+    set_up_logging,
+    terminate_as_interrupted,
+)
 from stages.lab.questionnaire.options import StudyOptions
 
 app = typer.Typer(cls=CommandGroup, no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False)
@@ -279,6 +289,7 @@ app.add_typer(bench.app, name="bench")
 
 def main() -> None:
     """Entry point of the script `ngff-lab`."""
+    terminate_as_interrupted()
     app()
 
 

@@ -2,6 +2,7 @@
 
 import logging
 import os
+import signal
 import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -47,8 +48,15 @@ class StderrHandler(logging.Handler):
         print(self.format(record), file=sys.stderr)
 
 
+def terminate_as_interrupted() -> None:
+    """Let SIGTERM end a command as Ctrl-C does, without temporary files."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+
+
 def set_up_logging(verbose: bool) -> None:
     """Send log messages to stderr; stdout is reserved for results. `verbose` includes debug messages."""
+    if hasattr(sys.stdout, "reconfigure"):  # paths that are not UTF-8 are printed as they are
+        sys.stdout.reconfigure(errors="surrogateescape")
     if not sys.stderr.isatty():  # in a log file a progress line every 10 s is enough
         os.environ.setdefault("TQDM_MININTERVAL", "10")
     logging.basicConfig(handlers=[StderrHandler()], format="%(message)s", level=logging.WARNING, force=True)

@@ -19,6 +19,7 @@ from stages.core.errors import InputError
 from stages.core.scene.files import must_exist
 from stages.core.scene.formats import IMAGE_SUFFIXES, VIDEO_SUFFIXES
 from stages.core.scene.images import import_av, list_photos, open_video, read_8_bit
+from stages.reconstruct.colmap import import_pycolmap
 from stages.reconstruct.photos import Photos
 
 log = logging.getLogger(__name__)
@@ -146,7 +147,7 @@ def _exif_focal(file: Path) -> float:
     It is also 0 without pycolmap: estimate_cameras, which needs it, reports that; networks do without.
     """
     try:
-        import pycolmap
+        pycolmap = import_pycolmap()
     except ImportError:
         return 0.0
     try:

@@ -22,6 +22,7 @@ from tqdm import tqdm
 from stages.core.errors import InputError, MissingPackage
 from stages.core.scene.cameras import Cameras, LensDistortion
 from stages.reconstruct import matching
+from stages.reconstruct.colmap import import_pycolmap
 from stages.reconstruct.matching import MatchedPair, MatchingOptions
 from stages.reconstruct.photos import Photos
 from stages.reconstruct.step_cache import StepCache
@@ -200,7 +201,7 @@ def _rays(camera, pixels: np.ndarray) -> np.ndarray:
 def _load_pycolmap(seed: int) -> ModuleType:
     """The package pycolmap, its log silenced and its random numbers seeded; MissingPackage where absent."""
     try:
-        import pycolmap
+        pycolmap = import_pycolmap()
     except ImportError as error:
         raise MissingPackage("--backend classic needs the package pycolmap, which is not installed; "
                              "`pip install pycolmap`, or use --backend pi3") from error  # fmt: skip

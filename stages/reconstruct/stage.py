@@ -58,7 +58,8 @@ def run(imgs: Path, out: Path, options: ReconstructOptions = ReconstructOptions(
     try:
         made = backend(photos, options, steps)
         inputs = [Path(imgs), *([options.cameras] if options.cameras else [])]
-        facts = {**provenance("reconstruct", inputs, options), **seconds_since(began), **made.scene.provenance}
+        facts = {**provenance("reconstruct", inputs, replace(options, resume=False)), **seconds_since(began),
+                 **made.scene.provenance}  # fmt: skip
         write_scene(out, replace(made.scene, provenance=facts))
     except InputError:
         steps.remove()

@@ -14,6 +14,7 @@ from stages.core.raster.rasterise import visibility
 from stages.core.scene.images import write_labels
 from stages.core.scene.scene import Scene, SceneObject
 from stages.core.scene.scene_ply import read_scene, write_scene
+from stages.segment.masks import read_names
 from stages.segment.options import SegmentOptions
 from stages.segment.stage import log_objects, run
 from stages.segment.voting import damp_votes, majority_labels, pool_votes, remove_outliers
@@ -94,6 +95,28 @@ def test_wrong_pixels_of_masks_are_outvoted(scene_file, truth, tmp_path):
     for i in (1, 2, 3):
         mine, theirs = labelled.gaussians.object_id == i, truth.gaussians.object_id == i
         assert float((mine & theirs).sum() / (mine | theirs).sum()) >= 0.9
+
+
+def test_labels_may_be_any_numbers_but_not_more_than_a_thousand(scene_file, truth, tmp_path):
+    folder = write_masks(tmp_path / "masks", truth, [torch.tensor([0, 900, 7, 65535])[m] for m in true_masks(truth)])
+    (folder / "names.json").write_text(json.dumps({"7": "duck"}))
+    run(scene_file, tmp_path / "out.ply", SegmentOptions(masks=folder))
+    labelled = read_scene(tmp_path / "out.ply")
+    assert {o.id: o.name for o in labelled.objects} == {7: "duck", 900: "object_900", 65535: "object_65535"}
+    for i, number in enumerate((900, 7, 65535), start=1):
+        mine, theirs = labelled.gaussians.object_id == number, truth.gaussians.object_id == i
+        assert float((mine & theirs).sum() / (mine | theirs).sum()) >= 0.9
+    noise = [torch.arange(m.numel()).reshape(m.shape) % 1500 for m in true_masks(truth)]
+    folder = write_masks(tmp_path / "noise", truth, noise)
+    with pytest.raises(InputError, match="more than 1000 different numbers"):
+        run(scene_file, tmp_path / "out.ply", SegmentOptions(masks=folder))
+
+
+@pytest.mark.parametrize("names", ['{"1": "a", "01": "b"}', '{"1_0": "a"}', '{"\u0661": "a"}', '{"-1": "a"}'])
+def test_labels_of_names_are_plain_numbers_each_once(tmp_path, names):
+    (tmp_path / "names.json").write_text(names)
+    with pytest.raises(InputError, match="names.json: is not readable"):
+        read_names(tmp_path)
 
 
 def test_permuted_labels_of_one_mask_are_outvoted(scene_file, truth, tmp_path):

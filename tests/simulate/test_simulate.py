@@ -1,9 +1,11 @@
 """ngff simulate: motion, force prompts, materials, reproducibility and errors."""
 
+import json
 import logging
 from dataclasses import replace
 from pathlib import Path
 
+import h5py
 import pytest
 import torch
 
@@ -218,6 +220,35 @@ def test_what_flies_too_far_for_a_grid_is_named(balls, monkeypatch, caplog):
 def test_invalid_options(options, message):
     with pytest.raises(InputError, match=message):
         SimulateOptions(**options)
+
+
+@pytest.mark.parametrize(("name", "value"), [("dt", "abc"), ("material", 5), ("seed", 1e99), ("engine", ["mpm"])])
+def test_damaged_options_of_a_trajectory_are_refused(tmp_path, balls, name, value):
+    roll(balls, steps=2)
+    with h5py.File(balls.with_name("traj.h5"), "a") as file:
+        made_by = json.loads(file.attrs["provenance"])
+        file.attrs["provenance"] = json.dumps({**made_by, "options": {**made_by["options"], name: value}})
+    with pytest.raises(InputError, match=f"options in its provenance are damaged.*{name}"):
+        run(balls, tmp_path / "again.h5", SimulateOptions(forces=balls.with_name("traj.h5")))
+
+
+def test_objects_without_extent_are_left_out(balls, caplog):
+    scene = read_scene(balls)
+    means = torch.where((scene.gaussians.object_id == 2)[:, None], torch.tensor([0.3, 0.0, 0.5]), scene.gaussians.means)
+    scene = replace(scene, gaussians=replace(scene.gaussians, means=means))
+    assert [o.id for o in with_objects(scene, balls).objects] == [1]
+    assert "object 2 (thing) is a point (600 Gaussians) and is skipped" in caplog.text
+    only = scene.gaussians[scene.gaussians.object_id == 2]
+    with pytest.raises(InputError, match="its objects are points"):
+        with_objects(replace(scene, gaussians=only), balls)
+
+
+def test_frames_of_thousands_of_steps_of_the_learned_field_are_refused(balls):
+    scene = read_scene(balls)
+    g = scene.gaussians
+    write_scene(balls, replace(scene, gaussians=replace(g, means=1e-6 * g.means, scales=1e-6 * g.scales)))
+    with pytest.raises(InputError, match="steps of the learned field.*smaller --dt"):
+        roll(balls, engine="ngff")
 
 
 def test_unknown_engine(balls):

@@ -21,7 +21,8 @@ def unpack(data: bytes) -> dict:
     out = {}
     for name, a in json.loads(data[4 : 4 + length])["arrays"].items():
         count = a["rows"] * a["columns"]
-        planes = np.frombuffer(data, np.uint8, a["planes"] * count, 4 + length + a["offset"]).reshape(-1, count)
+        planes = np.frombuffer(data, np.uint8, a["planes"] * count, 4 + length + a["offset"])
+        planes = planes.reshape(a["planes"], count)
         q = sum(plane.astype(np.int64) << 8 * i for i, plane in enumerate(planes)).reshape(a["columns"], a["rows"]).T
         if a["delta"]:
             q = np.cumsum(q, axis=0) % 256 ** a["planes"]
@@ -74,3 +75,9 @@ def test_invisible_gaussians_are_left_out():
     scene.gaussians.opacities[:40] = 0.003
     scene.gaussians.means[50] = float("nan")
     assert len(unpack(pack_film(scene))["means"]) == 59
+
+
+def test_a_scene_of_invisible_gaussians_is_an_empty_page():
+    scene = Scene(random_gaussians(20))
+    scene.gaussians.opacities[:] = 0.0
+    assert len(unpack(pack_film(scene))["means"]) == 0

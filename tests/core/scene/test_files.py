@@ -8,7 +8,8 @@ import pytest
 
 from stages.core.errors import InputError
 from stages.core.scene import files
-from stages.core.scene.files import replacing, seconds_since
+from stages.core.scene.files import must_exist, replacing, seconds_since
+from stages.core.scene.schema import read_json
 
 
 def test_two_writers_of_one_file_do_not_mix(tmp_path):
@@ -53,3 +54,15 @@ def test_times_are_stored_only_where_asked_for(monkeypatch):
     assert seconds_since(10.0) == {}
     monkeypatch.setenv("NGFF_TIMES", "1")
     assert seconds_since(10.0) == {"seconds": 2.0}
+
+
+def test_pipes_and_devices_are_neither_read_nor_replaced(tmp_path):
+    pipe = tmp_path / "a.json"
+    os.mkfifo(pipe)
+    with pytest.raises(InputError, match="a device or a pipe"):
+        must_exist(pipe, "a file")
+    with pytest.raises(ValueError, match="not a file"):
+        read_json(pipe)
+    with pytest.raises(InputError, match="a device or a pipe"), replacing(pipe):
+        pass
+    assert not pipe.is_file() and os.listdir(tmp_path) == ["a.json"]

@@ -1,5 +1,6 @@
 import dataclasses
 import os
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -133,3 +134,16 @@ def test_failed_write_keeps_the_old_file(tmp_path, two_balls, monkeypatch):
     with pytest.raises(InputError, match="No space left"):
         write_scene(path, two_balls)
     assert path.read_bytes() == before and os.listdir(tmp_path) == ["s.ply"]
+
+
+def test_what_could_not_be_read_is_not_written(tmp_path, two_balls):
+    tiny = replace(two_balls, scale={"metres_per_unit": 1e-9, "source": "given"})
+    with pytest.raises(InputError, match="cannot be written, as metres_per_unit is 1e-09"):
+        write_scene(tmp_path / "s.ply", tiny)
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_object_that_is_there_twice_is_refused(tmp_path, two_balls):
+    write_scene(tmp_path / "s.ply", replace(two_balls, objects=two_balls.objects[:1] * 2))
+    with pytest.raises(InputError, match="object 1 is there twice"):
+        read_scene(tmp_path / "s.ply")

@@ -99,12 +99,21 @@ def damage(path, scene, how: str):
             file["keypoints/positions"][0, 0, 0] = float("nan")
         elif how == "frames":
             file["keypoints/positions"].resize(2, axis=0)
+        elif how == "ids":
+            file["objects/id"][:] = 1
+        elif how == "weights":
+            file["binding/weight"][3] = 0.2
+        elif how == "quats":
+            file["gaussians/quats"][5] = 2.0
+        elif how == "rotation":
+            file["objects/rotation"][1, 0] = 0.0
 
 
 @pytest.mark.parametrize(
     ("how", "message"),
     [("text", "not a readable HDF5"), ("format", "format attribute"), ("part", "missing"), ("nan", "not finite"),
-     ("frames", "other datasets need")],
+     ("frames", "other datasets need"), ("ids", "object 1 is there twice"), ("weights", "does not sum to 1"),
+     ("quats", "gaussians/quats has a quaternion that is not of length 1"), ("rotation", "objects/rotation has a")],
 )  # fmt: skip
 def test_damaged_files_are_refused_in_one_line(tmp_path, two_balls, how, message):
     damage(tmp_path / "t.h5", two_balls, how)

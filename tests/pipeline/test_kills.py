@@ -1,0 +1,174 @@
+"""Commands that are killed, interrupted or out of disk space at random moments leave no part of a file behind.
+
+`NGFF_KILLS=200 python -m pytest -s -m slow tests/pipeline/test_kills.py` tries so many moments and prints a table.
+"""
+
+import multiprocessing
+import os
+import random
+import resource
+import shutil
+import signal
+import sys
+import time
+from collections import Counter
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import pytest
+
+from ngff_cli.app import app
+from ngff_cli.lab import app as lab
+from ngff_cli.options import terminate_as_interrupted
+from stages.core.scene.images import video_info
+from stages.core.scene.scene_ply import write_scene
+from stages.lab.dataset.keypoint_motions import write_motions
+from stages.reconstruct.options import QUALITY_PRESETS
+from tests.conftest import two_balls_scene
+from tests.lab.small_world import shrink_process
+from tests.lab.training.test_train import falling
+from tests.reconstruct.raycast import arc, write_set
+
+MOMENTS = int(os.environ.get("NGFF_KILLS", 16))
+HOWS = ("SIGKILL", "SIGINT", "SIGTERM", "full disk")
+SIMULATE = "simulate scene.ply --keypoints 16 --steps 20 --lift 0.2"
+COMMANDS = {  # words of ngff or ngff-lab; `--resume` is added to the run after the disturbed one
+    "reconstruct": "reconstruct images -o out/scene.ply --cameras transforms.json --quality draft",
+    "segment": "segment scene.ply -o out/labelled.ply",
+    "refine": "refine scene.ply -o out/refined.ply",
+    "simulate": f"{SIMULATE} --engine ngff -o out/traj.h5",
+    "simulate rigid": f"{SIMULATE} --engine rigid -o out/traj.h5",
+    "render": "render traj.h5 --resolution 64 -o out/film.mp4",
+    "render html": "render traj.h5 -o out/film.html",
+    "evaluate": "evaluate traj.h5 --against traj.h5 -o out/metrics.json",
+    "train": "train gcn --data data -o out/w.safetensors --steps 12 --batch 2 --keypoints 8 --horizons 2,3 --width 8 "
+             "--groups 3_0..3_1",
+    "dataset": "dataset out --groups 3_9 --only scenes,motions --frames 3 --keypoints 64 --dx .08 --spacing .04 "
+               "--substep 2e-3 --exact --device cpu",
+}  # fmt: skip
+RESUMED = {"reconstruct": ".steps-scene.ply", "train": "w.ckpt"}  # where there is such a file
+
+
+def work(command: str, words: list[str], folder: Path, largest: int) -> None:
+    """Run a command in a process of its own, which can write files of at most `largest` bytes."""
+    os.chdir(folder)
+    os.environ["TMPDIR"] = str(folder / "tmp")
+    for stream in (1, 2):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream)
+    terminate_as_interrupted()
+    small = {"gaussians": 1000, "iterations": 5}
+    QUALITY_PRESETS["draft"] = replace(QUALITY_PRESETS["draft"], **small)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (largest, resource.getrlimit(resource.RLIMIT_FSIZE)[1]))
+    shrink_process()
+    (lab if command in ("train", "dataset") else app)(words)
+
+
+@dataclass(frozen=True)
+class Undisturbed:
+    """What a command writes, and how long it takes."""
+
+    inputs: Path
+    files: dict[str, bytes]
+    seconds: float
+
+
+def files_in(folder: Path) -> dict[str, bytes]:
+    """The files below a folder; of videos, and of training times, which differ between runs, what does not."""
+    found = {}
+    for path in sorted(p for p in folder.rglob("*") if p.is_file()):
+        name = str(path.relative_to(folder))
+        if path.suffix == ".mp4" and not name.startswith("."):
+            found[name] = repr(video_info(path)).encode()
+        else:
+            found[name] = b"" if name in ("w.json", "w.ckpt") else path.read_bytes()
+    return found
+
+
+def start(command: str, folder: Path, resume: bool = False, largest: int = resource.RLIM_INFINITY):
+    """A process that runs a command in a folder."""
+    (folder / "out").mkdir(exist_ok=True)
+    (folder / "tmp").mkdir(exist_ok=True)
+    resume = resume and command in RESUMED and (folder / "out" / RESUMED[command]).exists()
+    words = COMMANDS[command].split() + ["--resume"] * resume
+    process = CONTEXT.Process(target=work, args=(command, words, folder, largest))
+    process.start()
+    return process
+
+
+CONTEXT = multiprocessing.get_context("forkserver")
+CONTEXT.set_forkserver_preload([__name__, "stages.reconstruct.classic", "stages.simulate.stage"])
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("inputs")
+    write_set(folder, arc(4, (96, 72), sweep=40.0))
+    write_scene(folder / "scene.ply", two_balls_scene())
+    (folder / "data" / "motions").mkdir(parents=True)
+    for seed, name in enumerate(("3_0", "3_1")):
+        write_motions(folder / "data" / "motions" / f"{name}.h5", falling(frames=6, seed=seed), {"command": name})
+    process = start("simulate", folder)
+    process.join()
+    (folder / "out" / "traj.h5").rename(folder / "traj.h5")
+    return folder
+
+
+def disturbed(command: str, how: str, rng: random.Random, known: Undisturbed, folder: Path) -> tuple[str, str]:
+    """Run a command, disturb it, and run it again; what became of it, and what is wrong with what it left."""
+    shutil.copytree(known.inputs, folder)
+    if how == "full disk":
+        process = start(command, folder, largest=int(rng.uniform(0, 1.05 * max(map(len, known.files.values())))))
+        process.join()
+    else:
+        process = start(command, folder)
+        time.sleep(rng.uniform(0, 1.05 * known.seconds))
+        if process.is_alive():
+            os.kill(process.pid, getattr(signal, how))
+        process.join()
+    code, wrong = process.exitcode, []
+    left = {name: data for name, data in files_in(folder / "out").items() if not name.split("/")[-1].startswith(".")
+            and ".steps-" not in name and not name.endswith((".ckpt", ".partial.h5"))}  # fmt: skip
+    partial = [name for name in left if left[name] != known.files.get(name)]
+    if partial:
+        wrong.append(f"{partial} not as undisturbed")
+    allowed = {"SIGKILL": (0, -9), "full disk": (0, 2)}.get(how, (0, 130, -2, -15))
+    if code not in allowed:
+        wrong.append(f"exit status {code}")
+    again = start(command, folder, resume=True)
+    again.join()
+    if again.exitcode != 0:
+        wrong.append(f"exit status {again.exitcode} of the next run")
+    after = files_in(folder / "out")
+    if after != known.files:
+        other = sorted({name for name, _ in after.items() ^ known.files.items()})
+        wrong.append(f"after the next run {other} are not as undisturbed")
+    temporary = [path.name for path in (folder / "tmp").iterdir() if not path.name.startswith("torchinductor")]
+    if temporary and how != "SIGKILL":
+        wrong.append(f"temporary files {temporary}")
+    shutil.rmtree(folder)
+    return "complete" if code == 0 else "ended", "; ".join(wrong)
+
+
+@pytest.mark.slow
+def test_nothing_is_left_in_parts(inputs, tmp_path):
+    rng, counts, failures, known = random.Random(MOMENTS), Counter(), [], {}
+    for n in range(MOMENTS):
+        command, how = list(COMMANDS)[n % len(COMMANDS)], HOWS[(n // len(COMMANDS) + n) % len(HOWS)]
+        if command not in known:
+            folder = tmp_path / command
+            shutil.copytree(inputs, folder)
+            begun = time.monotonic()
+            process = start(command, folder)
+            process.join()
+            known[command] = Undisturbed(inputs, files_in(folder / "out"), time.monotonic() - begun)
+            assert process.exitcode == 0 and known[command].files, command
+        result, wrong = disturbed(command, how, rng, known[command], tmp_path / f"{n}")
+        counts[command, how, "wrong" if wrong else result] += 1
+        if wrong:
+            failures.append(f"{command}, {how}: {wrong}")
+    for command in known:
+        row = ", ".join(f"{how}: {sum(counts[command, how, r] for r in ('ended', 'complete', 'wrong'))} "
+                        f"({counts[command, how, 'complete']} had ended, {counts[command, how, 'wrong']} wrong)"
+                        for how in HOWS)  # fmt: skip
+        print(f"{command:15s} {row}", file=sys.stderr)
+    assert not failures, "\n".join(failures)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import logging
 from collections.abc import Sequence
@@ -17,6 +16,7 @@ from torch import Tensor
 
 from stages.core.errors import InputError
 from stages.core.scene.cameras import MAX_SIDE, Cameras, check_cameras
+from stages.core.scene.error_deferring_file import ErrorDeferringFile
 from stages.core.scene.field_start import FieldStart, read_field_start, write_field_start
 from stages.core.scene.files import must_exist, replacing
 from stages.core.scene.gaussians import Gaussians
@@ -117,36 +117,6 @@ class Trajectory:
         return Gaussians(*rows, opacities=g.opacities, sh=g.sh, object_id=g.object_id)
 
 
-class _ErrorDeferringFile(io.FileIO):
-    """A file that stores write errors in `error` instead of raising them, since HDF5 may crash when a write fails."""
-
-    error: OSError | None = None
-
-    def write(self, data) -> int:
-        rest = memoryview(data).cast("B")
-        while len(rest) and self.error is None:
-            try:
-                rest = rest[super().write(rest) :]
-            except OSError as error:
-                self.error = error
-        return len(data)
-
-    def truncate(self, size: int | None = None) -> int:
-        try:
-            return super().truncate(size)
-        except OSError as error:
-            self.error = self.error or error
-            return size or 0
-
-    def flush(self) -> None:
-        """Writes are not buffered."""
-
-    def check(self) -> None:
-        """Raise the stored OSError, if any."""
-        if self.error is not None:
-            raise self.error
-
-
 class TrajectoryWriter:
     """Context manager that writes a trajectory frame by frame; the file appears only on success.
 
@@ -163,10 +133,9 @@ class TrajectoryWriter:
         self._replacing = replacing(self.path)
         self._part = self._replacing.__enter__()
         try:
-            self._raw = _ErrorDeferringFile(self._part, "w+b")
+            self._raw = ErrorDeferringFile(self._part, "w+b")
             self._file = h5py.File(self._raw, "w")
             _write_gaussians(self._file, self._contents[0].gaussians)
-            self._raw.check()  # HDF5 may crash when it stores strings after a failed write
             _write_rest(self._file, *self._contents)
             self._raw.check()
         except BaseException as error:

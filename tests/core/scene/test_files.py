@@ -1,6 +1,7 @@
 """Files that are replaced when complete."""
 
 import os
+import resource
 import subprocess
 import sys
 
@@ -8,6 +9,7 @@ import pytest
 
 from stages.core.errors import InputError
 from stages.core.scene import files
+from stages.core.scene.error_deferring_file import ErrorDeferringFile
 from stages.core.scene.files import must_exist, replacing, seconds_since
 from stages.core.scene.schema import read_json
 
@@ -66,3 +68,22 @@ def test_pipes_and_devices_are_neither_read_nor_replaced(tmp_path):
     with pytest.raises(InputError, match="a device or a pipe"), replacing(pipe):
         pass
     assert not pipe.is_file() and os.listdir(tmp_path) == ["a.json"]
+
+
+def test_what_a_full_disk_does_not_take_is_read_back_until_the_error_is_reported(tmp_path):
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    with ErrorDeferringFile(tmp_path / "a", "w+b") as file:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (10, hard))
+        try:
+            file.write(b"0123456")
+            file.write(b"789abcdef")
+            file.seek(20)
+            file.write(b"xyz")
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        file.seek(6)
+        back = bytearray(20)
+        assert file.readinto(back) == 20
+        assert bytes(back) == b"6789abcdef" + bytes(4) + b"xyz" + bytes(3)
+        with pytest.raises(OSError, match="File too large"):
+            file.check()

@@ -10,6 +10,7 @@ from ngff_cli.options import (
     AsJson,
     CommandGroup,
     Device,
+    SceneIn,
     Seed,
     Threads,
     limit_threads,
@@ -17,6 +18,7 @@ from ngff_cli.options import (
     set_up_logging,
     terminate_as_interrupted,
 )
+from stages.lab.fit.options import FitOptions
 from stages.lab.questionnaire.options import StudyOptions
 
 app = typer.Typer(cls=CommandGroup, no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False)
@@ -256,6 +258,42 @@ def estimate_materials(
     from stages.lab.bench.estimate_materials import EstimateOptions, run
 
     for line in run(video, out, EstimateOptions(objects=objects, model=model, timeout=timeout)):
+        print(line)
+
+
+@app.command()
+def fit(
+    scene: SceneIn,
+    track: Annotated[Path, typer.Argument(metavar="TRACK.h5", help="trajectory of the scene's objects, of which the "
+                                          "first frame is the scene")],
+    out: Annotated[
+        Path, typer.Option("-o", "--out", help="materials for `ngff simulate --materials` to write (.json)")
+    ] = Path("materials.json"),
+    engine: Annotated[str, typer.Option(help="auto | rigid | mpm | ngff: through which motions are compared")] = "auto",
+    quality: Annotated[str, typer.Option(help="of --engine mpm: draft | normal | high")] = FitOptions.quality,
+    material: Annotated[
+        list[str], typer.Option(help="OBJECT=MATERIAL where the search starts, and where it stays if the motion shows "
+                                "nothing; repeatable")
+    ] = [],  # noqa: B006
+    keypoints: Annotated[int, typer.Option(help="keypoints compared per object")] = FitOptions.keypoints,
+    frames: Annotated[int, typer.Option(help="frames of the track; 0: all")] = FitOptions.frames,
+    noise: Annotated[
+        float, typer.Option(help="standard deviation of the track's errors [scene units]; 0: estimated from it")
+    ] = FitOptions.noise,
+    evaluations: Annotated[int, typer.Option(help="largest number of simulations")] = FitOptions.evaluations,
+    minutes: Annotated[float, typer.Option(help="longest time of the search [min]")] = FitOptions.minutes,
+    workers: Annotated[int, typer.Option(help="processes")] = FitOptions.workers,
+    seed: Seed = FitOptions.seed,
+    device: Device = FitOptions.device,
+) -> None:
+    """Find materials and start velocities of objects from their tracked motion."""
+    from stages.lab.fit.fit import run
+
+    options = FitOptions(
+        engine=engine, quality=quality, material=tuple(material), keypoints=keypoints, frames=frames, noise=noise,
+        evaluations=evaluations, minutes=minutes, workers=workers, seed=seed, device=device,
+    )  # fmt: skip
+    for line in run(scene, track, out, options):
         print(line)
 
 

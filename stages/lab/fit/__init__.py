@@ -1,0 +1,1 @@
+"""Materials and start velocities of objects from a tracked motion."""

@@ -1,0 +1,128 @@
+"""`ngff-lab fit`: scene.ply and a track -> materials.json."""
+
+from __future__ import annotations
+
+import json
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from stages.core.scene.files import provenance, replacing
+from stages.lab.fit.options import FitOptions
+from stages.lab.fit.parameters import AXES, QUANTITIES, Parameter, as_json, fitted
+from stages.lab.fit.problem import Problem, read_problem
+from stages.lab.fit.search import deviations, search, simulations
+
+log = logging.getLogger(__name__)
+NOISE_MARGIN = 1.1  # on the variance of the track's noise, which is estimated to a tenth
+SMALLEST_ERROR = 1e-3  # of a coordinate [tolerances]: engines are no better
+
+
+@dataclass(frozen=True)
+class Fit:
+    """The parameters that explain a track."""
+
+    problem: Problem
+    x: np.ndarray  # best point [ranges]
+    half: np.ndarray  # half widths of 95 % intervals [ranges]
+    rmse: tuple[float, float]  # of the motion before and after [scene units]
+    evaluations: int
+    seconds: float
+
+    def value(self, k: int) -> float:
+        """Of the k-th parameter; log10 of it where it is searched so."""
+        return self.problem.parameters[k].value(float(self.x[k]))
+
+    def half_width(self, k: int) -> float:
+        """Of its 95 % interval."""
+        p = self.problem.parameters[k]
+        return float(self.half[k]) * (p.high - p.low)
+
+    def shows(self, k: int) -> bool:
+        """Whether the motion tells the k-th parameter."""
+        name = self.problem.parameters[k].name
+        return name in AXES or self.half_width(k) <= QUANTITIES[name].shown
+
+    def shown_point(self) -> np.ndarray:
+        """The best point, with what the motion does not tell where the search started."""
+        return np.array([self.x[k] if self.shows(k) else p.coordinate(p.start)
+                         for k, p in enumerate(self.problem.parameters)])  # fmt: skip
+
+
+def run(scene: Path, track: Path, out: Path, options: FitOptions) -> list[str]:
+    """Write OUT for `ngff simulate --materials OUT`, and OUT's name with .fit.json with intervals; lines of text.
+
+    Raises InputError for a track that is not of the scene, and MissingPackage without the package cma.
+    """
+    fit = solve(read_problem(Path(scene), Path(track), options), options)
+    materials, velocity = fitted(fit.problem.parameters, fit.shown_point(), fit.problem.materials)
+    names = {o.id: o.name for o in fit.problem.scene.objects}
+    with replacing(out) as part:
+        part.write_text(json.dumps({str(i): as_json(materials[i]) for i in names}, indent=1) + "\n")
+    rows = [{"object": p.object_id, "name": names[p.object_id], "quantity": p.name, "log10": _is_log(p),
+             "value": fit.value(k), "half_width": fit.half_width(k), "shown": fit.shows(k)}
+            for k, p in enumerate(fit.problem.parameters)]  # fmt: skip
+    facts = {**provenance("fit", [scene, track], options), "engine": fit.problem.options.engine, "parameters": rows,
+             "velocity": velocity, "rmse_before": fit.rmse[0], "rmse": fit.rmse[1], "evaluations": fit.evaluations,
+             "seconds": round(fit.seconds, 1)}  # fmt: skip
+    with replacing(out.with_suffix(".fit.json")) as part:
+        part.write_text(json.dumps(facts, indent=1) + "\n")
+    return [*describe(fit), _command(Path(scene), out, fit, velocity)]
+
+
+def solve(problem: Problem, options: FitOptions) -> Fit:
+    """Search for the parameters, and find how well the motion tells them."""
+    log.info("%d parameters of %d objects, --engine %s, %d frames", len(problem.parameters), len(problem.moving),
+             problem.options.engine, len(problem.track))  # fmt: skip
+    start = np.array([p.coordinate(p.start) for p in problem.parameters])
+    frames = len(problem.track)
+    with simulations(problem, options.workers) as sims:
+        found = search(sims, options)
+        before, after = (problem.errors(motion).mean() for motion in sims.motions([start, found.x], frames))
+        half = 1.96 * deviations(sims, frames, found.x, _error(problem, float(after) / 3))
+        return Fit(problem, found.x, half, (float(before) ** 0.5, float(after) ** 0.5), sims.count, found.seconds)
+
+
+def _error(problem: Problem, residual: float) -> float:
+    """Standard deviation of a coordinate [tolerances] for intervals, from the mean square of what a fit leaves.
+
+    The noise of the track is independent from frame to frame; what is left beyond it is not, and counts once.
+    """
+    excess = max(0.0, residual - NOISE_MARGIN * problem.noise**2)
+    tolerance = float(problem.tolerance.mean())
+    return max((problem.noise**2 + len(problem.track) * excess) ** 0.5 / tolerance, SMALLEST_ERROR)
+
+
+def describe(fit: Fit) -> list[str]:
+    """A line about each object, and about the whole."""
+    names = {o.id: o.name for o in fit.problem.scene.objects}
+    lines = []
+    for i in fit.problem.moving:
+        shown, hidden = [], []
+        for k, p in enumerate(fit.problem.parameters):
+            if p.object_id == i:
+                (shown if fit.shows(k) else hidden).append(_text(fit, k, p))
+        line = f"object {i} ({names[i]}): {', '.join(shown) or 'nothing is shown by the motion'}"
+        lines.append(line + (f"; not shown by the motion: {', '.join(hidden)}" if hidden else ""))
+    lines.append(f"RMSE {fit.rmse[0]:.3g} before, {fit.rmse[1]:.3g} after [scene units]; {fit.evaluations} motions in "
+                 f"{fit.seconds:.0f} s")  # fmt: skip
+    return lines
+
+
+def _is_log(p: Parameter) -> bool:
+    return p.name in QUANTITIES and QUANTITIES[p.name].log
+
+
+def _text(fit: Fit, k: int, p: Parameter) -> str:
+    name = f"velocity {p.name}" if p.name in AXES else f"log10 {p.name}" if _is_log(p) else p.name
+    return f"{name} {fit.value(k):.3g} +- {fit.half_width(k):.2g}"
+
+
+def _command(scene: Path, out: Path, fit: Fit, velocity: dict) -> str:
+    """The command that repeats the motion."""
+    words = [f"--engine {fit.problem.options.engine}", f"--materials {out}"]
+    words += [f'--velocity "object={i} {",".join(f"{c:.4g}" for c in v)}"' for i, v in velocity.items()]
+    words += [f"--lift {i}={height:.4g}" for i, height in fit.problem.prompts.lift.items()]
+    return f"ngff simulate {scene} {' '.join(words)}"

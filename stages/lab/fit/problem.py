@@ -1,0 +1,238 @@
+"""A track to be explained: the motion that parameters give, and its distance from the track."""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from stages.core.backends import load
+from stages.core.errors import InputError
+from stages.core.physics.forces import ForcePrompts, stored_prompts
+from stages.core.physics.keypoints import choose_keypoints, farthest_points
+from stages.core.physics.materials import Material, choose_materials
+from stages.core.scene.scene import Scene
+from stages.core.scene.scene_ply import read_scene
+from stages.core.scene.trajectory import Keypoints, Trajectory, read_trajectory
+from stages.lab.fit.options import FitOptions
+from stages.lab.fit.parameters import (
+    AXES,
+    OF_ENGINE,
+    QUANTITIES,
+    Parameter,
+    as_json,
+    fitted,
+    material_parameters,
+    velocity_parameters,
+)
+from stages.simulate.engine_choice import with_engine
+from stages.simulate.options import AUTO, ENGINES, SimulateOptions
+
+log = logging.getLogger(__name__)
+TOLERANCE = 0.03  # error above which the cost of a frame grows by its logarithm only [sizes of the object]
+FAILED = 50.0  # cost of a motion that diverges; larger than any other
+FIRST_FRAMES = 4  # from which start velocities are guessed
+STILL = 0.01  # largest displacement of an object that does not move [sizes of the object]
+MISPLACED = 0.1  # error of the first frame above which a track is of another scene [sizes of the object]
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A scene, a track of keypoints on its objects, and what is known of how the motion came about."""
+
+    scene: Scene
+    keypoints: Keypoints
+    track: Float[Tensor, "t k 3"]
+    prompts: ForcePrompts
+    options: SimulateOptions
+    materials: dict[int, Material]  # where the search starts
+    parameters: tuple[Parameter, ...]
+    noise: float  # standard deviation of a coordinate of the track [scene units]
+
+    @property
+    def moving(self) -> list[int]:
+        """Ids of the objects that are compared: those that have parameters."""
+        return list(dict.fromkeys(p.object_id for p in self.parameters))
+
+    def motion(self, x: Sequence[float]) -> Float[Tensor, "t k 3"]:
+        """The keypoints as the engine moves them; nan where the motion diverges."""
+        materials, velocity = fitted(self.parameters, x, self.materials)
+        names = {o.id: o.name for o in self.scene.objects}
+        with tempfile.TemporaryDirectory() as folder:
+            file = Path(folder) / "materials.json"
+            file.write_text(json.dumps({str(i): as_json(m) for i, m in materials.items() if i in names}))
+            options = replace(self.options, material=(), materials=file)
+            prompts = replace(self.prompts, velocity={**self.prompts.velocity, **velocity})
+            logging.disable(logging.WARNING)  # the engine's messages, the same every time
+            try:
+                states = load(ENGINES[options.engine].rollout)(self.scene, self.keypoints, prompts, options)
+                return torch.stack([state.positions for state in states])
+            except InputError:
+                return torch.full_like(self.track, torch.nan)
+            finally:
+                logging.disable(logging.NOTSET)
+
+    def errors(self, motion: Float[Tensor, "t k 3"]) -> Float[Tensor, "t o"]:
+        """Mean squared distance of each moving object's keypoints from the track [scene units^2]."""
+        squared = (motion - self.track).square().sum(-1)
+        return torch.stack([squared[:, self.keypoints.object_id == i].mean(1) for i in self.moving], 1)
+
+    @property
+    def tolerance(self) -> Float[Tensor, "o"]:
+        """Error of each moving object that counts as one [scene units]."""
+        return TOLERANCE * torch.stack([_size(self.keypoints, i) for i in self.moving])
+
+    def cost(self, motion: Float[Tensor, "t k 3"]) -> float:
+        """Mean of log(1 + squared error / tolerance^2) over frames and objects.
+
+        After a collision motions diverge from each other; the logarithm keeps such frames from outweighing the others.
+        """
+        cost = float(torch.log1p(self.errors(motion) / self.tolerance**2).mean())
+        return cost if math.isfinite(cost) else FAILED
+
+    def weighted(self, motion: Float[Tensor, "t k 3"]) -> np.ndarray:
+        """All coordinates of the moving objects [tolerances], so that an object has the weight of one point in a frame.
+
+        Those that are not finite are 0: where a motion diverges, it tells nothing.
+        """
+        parts = [motion.nan_to_num()[:, self.keypoints.object_id == i] for i in self.moving]
+        return torch.cat([(part / t / part.shape[1] ** 0.5).flatten()
+                          for part, t in zip(parts, self.tolerance, strict=True)]).double().numpy()  # fmt: skip
+
+    def beginning(self, frames: int) -> Problem:
+        """The same with the first frames only."""
+        options = replace(self.options, steps=min(frames, len(self.track)))
+        return replace(self, track=self.track[:frames], options=options)
+
+
+def read_problem(scene: Path, track: Path, options: FitOptions) -> Problem:
+    """Pose the problem of a scene file and a trajectory file. Raises InputError where they do not fit each other."""
+    truth = read_trajectory(track)
+    return pose_problem(read_scene(scene), truth, stored_prompts(track, read_scene(scene).objects), options, str(track))
+
+
+def pose_problem(
+    scene: Scene, truth: Trajectory, prompts: ForcePrompts, options: FitOptions, where: str = "the track"
+) -> Problem:
+    """The problem of a scene and a track of its objects; `prompts` tell the forces, pins and lifts, but not velocities.
+
+    Raises InputError for a track of other objects, or one that does not start where the scene is.
+    """
+    tracked = set(truth.keypoints.object_id.tolist())
+    scene = replace(scene, objects=tuple(o for o in scene.objects if o.id in tracked))
+    if not scene.objects:
+        raise InputError(f"{where}: has no object of this scene in it; their ids must be the same")
+    rows = torch.cat([_spread(truth.keypoints, o.id, options) for o in scene.objects])
+    keypoints = Keypoints(truth.keypoints.rest[rows], truth.keypoints.object_id[rows])
+    frames = truth.positions[: options.frames or None, rows]
+    if len(frames) < 3:
+        raise InputError(f"{where}: has {len(frames)} frames; motion is seen in three or more")
+    prompts = replace(prompts, velocity={}, lift=_lifts(scene, keypoints, frames, prompts, where))
+    simulate = SimulateOptions(
+        steps=len(frames), dt=truth.info.dt, engine=options.engine, quality=options.quality, seed=options.seed,
+        gravity=-truth.info.gravity[2] * scene.metres_per_unit, material=options.material, device=options.device,
+        keypoints=options.keypoints,
+    )  # fmt: skip
+    if simulate.engine not in (AUTO, *ENGINES):
+        raise InputError(f"--engine {simulate.engine}: choose from {', '.join((AUTO, *ENGINES))}")
+    simulate = with_engine(simulate, scene, choose_keypoints(scene, options.keypoints, options.seed))
+    choices = choose_materials(scene.objects, options.material)
+    materials = {i: choice.material for i, choice in choices.items()}
+    parameters = _parameters(scene, keypoints, frames, prompts, simulate, materials)
+    if not parameters:
+        raise InputError(f"{where}: nothing moves in it")
+    noise = options.noise or estimate_noise(frames)
+    return Problem(scene, keypoints, frames, prompts, simulate, materials, tuple(parameters), noise)
+
+
+def estimate_noise(track: Float[Tensor, "t k 3"]) -> float:
+    """Standard deviation of a track's errors, from the median size of its third differences in time.
+
+    Those of a smooth motion are nearly zero, and collisions are few; of independent errors of variance 1 they have the
+    variance 1 + 9 + 9 + 1.
+    """
+    if len(track) < 8:
+        return 0.0
+    third = track.diff(n=3, dim=0).abs()
+    moving = third.flatten(1).amax(0) > 0  # keypoints at rest without noise say nothing
+    return float(third.flatten(1)[:, moving].median()) / 0.6745 / 20**0.5 if bool(moving.any()) else 0.0
+
+
+def _spread(keypoints: Keypoints, object_id: int, options: FitOptions) -> Tensor:
+    """Rows of at most `options.keypoints` keypoints of an object, far from each other."""
+    rows = (keypoints.object_id == object_id).nonzero()[:, 0]
+    return rows[farthest_points(keypoints.rest[rows], options.keypoints, options.seed)].sort().values
+
+
+def _size(keypoints: Keypoints, object_id: int) -> Tensor:
+    rest = keypoints.rest[keypoints.object_id == object_id]
+    return (rest.amax(0) - rest.amin(0)).max().clamp_min(1e-9)
+
+
+def _lifts(
+    scene: Scene, keypoints: Keypoints, frames: Float[Tensor, "t k 3"], prompts: ForcePrompts, where: str
+) -> dict[int, float]:
+    """How high above its place in the scene each object starts. Raises InputError for a start elsewhere."""
+    lifts = dict(prompts.lift)
+    for o in scene.objects:
+        mine = keypoints.object_id == o.id
+        moved = frames[0, mine] - keypoints.rest[mine]
+        if o.id not in lifts and float(moved[:, 2].mean()) > STILL * float(_size(keypoints, o.id)):
+            lifts[o.id] = float(moved[:, 2].mean())
+        moved = moved - torch.tensor([0.0, 0.0, lifts.get(o.id, 0.0)])
+        if float(moved.square().sum(1).mean().sqrt()) > MISPLACED * float(_size(keypoints, o.id)):
+            raise InputError(f"{where}: object {o.id} ({o.name}) starts elsewhere than in the scene; the scene must be "
+                             "that of the first frame")  # fmt: skip
+    return lifts
+
+
+def _parameters(
+    scene: Scene, keypoints: Keypoints, frames: Float[Tensor, "t k 3"], prompts: ForcePrompts,
+    options: SimulateOptions, materials: dict[int, Material],
+) -> list[Parameter]:  # fmt: skip
+    """Quantities of the objects that move, and velocities of those that do so from the start.
+
+    Without forces a common factor of all densities changes nothing: the first object's stays.
+    """
+    parameters: list[Parameter] = []
+    names = OF_ENGINE.get(options.engine, tuple(QUANTITIES))
+    weighed = bool(prompts.forces)
+    for o in scene.objects:
+        mine = keypoints.object_id == o.id
+        size = float(_size(keypoints, o.id))
+        centre = frames[:, mine].mean(1)
+        if float((centre - centre[0]).norm(dim=1).max()) < STILL * size or o.id in prompts.pinned:
+            log.info("object %d (%s) does not move; its material stays", o.id, o.name)
+            continue
+        chosen = [name for name in names if name != "density" or weighed]
+        weighed = True
+        parameters += material_parameters(o.id, materials[o.id], chosen)
+        parameters += velocity_parameters(o.id, _first_velocity(centre, STILL * size, scene, options))
+    return parameters
+
+
+def _first_velocity(
+    centre: Float[Tensor, "t 3"], still: float, scene: Scene, options: SimulateOptions
+) -> dict[str, float]:
+    """A guess of the start velocity of an object by axis [scene units/s], from the first frames of its middle.
+
+    Nothing for one that is released from rest, and no vertical velocity of one that is carried.
+    """
+    first = centre[: FIRST_FRAMES + 1]
+    t = options.dt * torch.arange(len(first))
+    fall = options.gravity / scene.metres_per_unit * t**2 / 2  # of what nothing carries
+    carried = bool(((first[:, 2] - first[0, 2]).abs() < still).all())
+    path = first - first[0] + (0.0 if carried else 1.0) * fall[:, None] * torch.tensor([0.0, 0.0, 1.0])
+    velocity = (t[:, None] * path).sum(0) / t.square().sum()
+    if float(path.norm(dim=1).max()) < still:
+        return {}
+    return dict(zip(AXES[: 2 if carried else 3], velocity.tolist(), strict=False))

@@ -1,0 +1,174 @@
+"""The search for the parameters, over longer and longer beginnings of the track, and their intervals.
+
+What happens first depends on few parameters, and the rest on where it led; over the whole track at once, collisions
+make the error rugged. A beginning that is not explained yet is fitted by Levenberg and Marquardt's method from where
+the one before led, and, where that leaves an error, by CMA-ES, which takes the parameters that the beginning tells
+little about from their range.
+Source of CMA-ES: Hansen 2016, "The CMA evolution strategy: a tutorial".
+"""
+
+from __future__ import annotations
+
+import logging
+import multiprocessing
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from scipy.optimize import least_squares
+from tqdm import tqdm
+
+from stages.core.errors import MissingPackage
+from stages.lab.fit.options import FitOptions
+from stages.lab.fit.problem import Problem
+
+log = logging.getLogger(__name__)
+PRIOR = 1 / 12**0.5  # standard deviation of a uniform distribution over the range
+FIRST, GROWTH = 8, 1.25  # frames of the first beginning, and factor from one to the next
+STEP, STEPS = 0.004, 10  # differences [ranges] and iterations of Levenberg and Marquardt's method
+PULL = 0.01  # towards the start, of what a beginning tells nothing about
+PRECISION, FALL = 1e-3, 1e-3  # of CMA-ES: step [ranges] and change of the cost at which it ends
+GENERATIONS = 15  # of CMA-ES for a beginning
+ENOUGH = 1.3, 0.0005  # cost that is left to be improved: a factor on that of the track's noise, and a constant
+SPANS = 0.01, (0.002, 0.1)  # first differences for intervals, and bounds of the second ones [ranges]
+
+
+class Found(NamedTuple):
+    """The best point of a search."""
+
+    x: np.ndarray
+    motions: int
+    seconds: float
+
+
+class Simulations:
+    """Simulates the problem at many points at once and counts them; `map` is that of a pool of processes."""
+
+    def __init__(self, problem: Problem, map_: Callable):
+        self.problem, self._map, self.count = problem, map_, 0
+
+    def motions(self, points: list[np.ndarray], frames: int) -> list[torch.Tensor]:
+        """Keypoints in the first frames."""
+        self.count += len(points)
+        return list(self._map(_motion, points, [frames] * len(points)))
+
+    def costs(self, points: list[np.ndarray], frames: int) -> list[float]:
+        """Costs of the first frames."""
+        part = self.problem.beginning(frames)
+        return [part.cost(motion) for motion in self.motions(points, frames)]
+
+
+_problem: Problem | None = None  # of this process
+
+
+def _set_problem(problem: Problem, threads: int) -> None:
+    global _problem  # noqa: PLW0603 -- pools can pass arguments to workers in no other way
+    _problem = problem
+    torch.set_num_threads(threads)
+
+
+def _motion(x: np.ndarray, frames: int) -> torch.Tensor:
+    return _problem.beginning(frames).motion(x)
+
+
+@contextmanager
+def simulations(problem: Problem, workers: int) -> Iterator[Simulations]:
+    """Simulations of a problem, in `workers` processes if several."""
+    if workers == 1:
+        _set_problem(problem, torch.get_num_threads())
+        yield Simulations(problem, map)
+        return
+    with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _set_problem, (problem, 1)) as pool:
+        yield Simulations(problem, pool.map)
+
+
+def search(sims: Simulations, options: FitOptions) -> Found:
+    """Fit longer and longer beginnings of the track. Raises MissingPackage without the package cma."""
+    begun, total = time.perf_counter(), len(sims.problem.track)
+    x = np.array([p.coordinate(p.start) for p in sims.problem.parameters])
+    lengths = [min(FIRST, total)]
+    while lengths[-1] < total:
+        lengths.append(min(total, int(GROWTH * lengths[-1])))
+    for frames in tqdm(lengths, unit="beginning"):
+        left = 60 * options.minutes - (time.perf_counter() - begun)
+        if left <= 0 or sims.count > options.evaluations:
+            break
+        if not _explained(sims, frames, x):
+            x = _descend(sims, frames, x)
+        if not _explained(sims, frames, x):
+            x = _descend(sims, frames, _evolve(sims, frames, x, left, options))
+        log.debug("%d frames, cost %.3g, %d motions: %s", frames, sims.costs([x], frames)[0], sims.count, x.round(3))
+    return Found(_descend(sims, frames, x), sims.count, time.perf_counter() - begun)
+
+
+def _explained(sims: Simulations, frames: int, x: np.ndarray) -> bool:
+    """Whether what is left is about the noise of the track."""
+    expected = torch.log1p(3 * (sims.problem.noise / sims.problem.tolerance) ** 2).mean()
+    return sims.costs([x], frames)[0] < ENOUGH[0] * float(expected) + ENOUGH[1]
+
+
+def _descend(sims: Simulations, frames: int, x: np.ndarray) -> np.ndarray:
+    """The minimum near `x`, by Levenberg and Marquardt's method with derivatives by differences, or `x` itself."""
+    part, start = sims.problem.beginning(frames), x
+    pull = PULL * np.eye(len(x))
+
+    def errors(x: np.ndarray) -> np.ndarray:
+        return np.append(part.weighted(sims.motions([x], frames)[0] - part.track), PULL * (x - start))
+
+    found = least_squares(
+        errors, np.clip(x, 1e-6, 1 - 1e-6), lambda x: np.vstack([_derivatives(sims, frames, x, STEP), pull]),
+        bounds=(0, 1), max_nfev=STEPS, xtol=PRECISION / 10, ftol=FALL,
+    )  # fmt: skip
+    before, after = sims.costs([x, found.x], frames)
+    return found.x if after < before else x
+
+
+def _evolve(sims: Simulations, frames: int, x: np.ndarray, seconds: float, options: FitOptions) -> np.ndarray:
+    """The best of some generations of CMA-ES, whose first spread is what the beginning leaves open."""
+    try:
+        import cma  # noqa: PLC0415 -- only a fit needs it
+    except ImportError as error:
+        raise MissingPackage("a fit needs the package cma, which is not installed; `pip install cma`") from error
+
+    until = time.perf_counter() + seconds
+    size = options.workers * -(-(4 + int(3 * np.log(len(x)))) // options.workers)  # the usual one, for all workers
+    spread = np.maximum(deviations(sims, frames, x, 1.0), 0.02)
+    strategy = cma.CMAEvolutionStrategy(x, 1.0, {
+        "CMA_stds": spread.tolist(), "bounds": [0, 1], "popsize": size, "seed": options.seed + 1, "verbose": -9,
+        "maxiter": GENERATIONS, "tolx": PRECISION, "tolfunhist": FALL, "tolfun": FALL,
+    })  # fmt: skip
+    best, lowest = x, sims.costs([x], frames)[0]
+    while not strategy.stop() and time.perf_counter() < until and sims.count < options.evaluations:
+        points = strategy.ask()
+        costs = sims.costs(points, frames)
+        strategy.tell(points, costs)
+        if min(costs) < lowest:
+            best, lowest = np.array(points[int(np.argmin(costs))]), min(costs)
+    return best
+
+
+def deviations(sims: Simulations, frames: int, x: np.ndarray, error: float) -> np.ndarray:
+    """Standard deviations of the parameters at `x` [ranges], by the curvature of the squared error (Gauss and Newton).
+
+    `error` is the standard deviation of a coordinate [tolerances]. Keypoints of one object in one frame count as one
+    observation, since their errors are not independent; the ranges count as prior knowledge.
+    """
+    step = np.full(len(x), SPANS[0])
+    for _ in range(2):
+        J = _derivatives(sims, frames, x, step) / error
+        deviation = np.sqrt(np.diag(np.linalg.inv(J.T @ J + np.eye(len(x)) / PRIOR**2)))
+        step = np.clip(2 * deviation, *SPANS[1])
+    return deviation
+
+
+def _derivatives(sims: Simulations, frames: int, x: np.ndarray, step: np.ndarray | float) -> np.ndarray:
+    """Derivatives of the weighted coordinates by each parameter, central where the range allows it."""
+    ends = [np.clip(x + sign * step * unit, 0, 1) for unit in np.eye(len(x)) for sign in (1, -1)]
+    moved = sims.motions(ends, frames)
+    spans = [float((a - b).sum()) for a, b in zip(ends[::2], ends[1::2], strict=True)]
+    columns = [sims.problem.weighted((a - b) / span) for a, b, span in zip(moved[::2], moved[1::2], spans, strict=True)]
+    return np.stack(columns, 1)

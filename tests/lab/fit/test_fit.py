@@ -1,0 +1,140 @@
+"""Materials from motion: true values come back from tracks of known motion, and what a motion does not show is said."""
+
+import json
+from dataclasses import replace
+from importlib.util import find_spec
+
+import numpy as np
+import pytest
+import torch
+
+from ngff_cli.lab import app
+from stages.core.errors import InputError
+from stages.core.physics.forces import ForcePrompts
+from stages.core.physics.materials import Material, choose_materials
+from stages.core.scene.scene_ply import read_scene, write_scene
+from stages.core.scene.trajectory import TrajectoryWriter, read_trajectory
+from stages.lab.bench.physics_experiments import Run, ball, block
+from stages.lab.fit.fit import solve
+from stages.lab.fit.options import FitOptions
+from stages.lab.fit.parameters import fitted, material_parameters, velocity_parameters
+from stages.lab.fit.problem import estimate_noise, pose_problem, read_problem
+from stages.lab.fit.search import _evolve, simulations
+from stages.simulate.options import SimulateOptions
+from stages.simulate.stage import run as simulate
+from tests.conftest import CliRunner
+
+NOISE = 0.002  # of the tracks [m]
+TRUTH = {"E": 1e7, "density": 540.0, "friction": 0.3, "loss": 0.35}
+OPTIONS = FitOptions(workers=1, keypoints=16, evaluations=400)
+
+
+def make_track(folder, thing, noise=NOISE, **options):
+    """A scene of one object and a noisy track of its motion, as files."""
+    write_scene(folder / "scene.ply", Run((thing,)).scene())
+    (folder / "truth.json").write_text(json.dumps({"1": TRUTH}))
+    simulate(folder / "scene.ply", folder / "exact.h5", SimulateOptions(
+        engine="rigid", materials=folder / "truth.json", keypoints=16, quality="draft", **options))  # fmt: skip
+    exact = read_trajectory(folder / "exact.h5")
+    rng = torch.Generator().manual_seed(0)
+    with TrajectoryWriter(folder / "track.h5", exact.scene, exact.info, exact.keypoints, exact.binding) as track:
+        for x, com, rotation in zip(exact.positions, exact.com, exact.rotation, strict=True):
+            track.append(x + noise * torch.randn(x.shape, generator=rng), com, rotation)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def slide(tmp_path_factory):
+    """A flat block slides on the floor and comes to rest."""
+    flat = block((0.3, 0.2, 0.1), (0.0, 0.0, 0.05))
+    return make_track(tmp_path_factory.mktemp("slide"), flat, velocity=("object=1 2,0.5,0",), steps=20)
+
+
+@pytest.fixture(scope="module")
+def bounce(tmp_path_factory):
+    """A ball falls without turning and rebounds once."""
+    folder = tmp_path_factory.mktemp("bounce")
+    return make_track(folder, ball(0.1, (0.0, 0.0, 0.1)), lift=("0.2",), steps=25)
+
+
+def of(fit, name):
+    """Index of a parameter."""
+    return [p.name for p in fit.problem.parameters].index(name)
+
+
+def test_a_slide_shows_friction_and_nothing_of_the_rebound(slide, device):
+    fit = solve(read_problem(slide / "scene.ply", slide / "track.h5", OPTIONS), OPTIONS)
+    assert fit.problem.options.engine == "rigid"
+    assert fit.problem.noise == pytest.approx(NOISE, rel=0.1)
+    for name, true in (("friction", 0.3), ("x", 2.0), ("y", 0.5)):
+        k = of(fit, name)
+        assert fit.shows(k) and abs(fit.value(k) - true) < 2 * fit.half_width(k) < 0.05, name
+    assert not fit.shows(of(fit, "loss"))
+    assert fit.rmse[1] == pytest.approx(3**0.5 * NOISE, rel=0.1) and fit.rmse[0] > 0.02
+    materials, velocity = fitted(fit.problem.parameters, fit.shown_point(), fit.problem.materials)
+    assert materials[1].loss == pytest.approx(fit.problem.materials[1].loss)  # as the search started
+
+
+def test_a_rebound_shows_the_loss_factor_and_nothing_of_friction(bounce, device):
+    fit = solve(read_problem(bounce / "scene.ply", bounce / "track.h5", OPTIONS), OPTIONS)
+    k = of(fit, "loss")
+    assert fit.shows(k) and abs(fit.value(k) - 0.35) < 2 * fit.half_width(k) < 0.05
+    assert not fit.shows(of(fit, "friction"))
+    assert len(fit.problem.parameters) == 2  # neither a velocity, as it is released from rest, nor a density
+
+
+def test_the_command_writes_materials_that_simulate_takes(slide, tmp_path):
+    done = CliRunner().invoke(app, ["fit", str(slide / "scene.ply"), str(slide / "track.h5"), "-o",
+                                    str(tmp_path / "m.json"), "--workers", "1", "--keypoints", "8"])  # fmt: skip
+    assert done.exit_code == 0, done.output
+    assert "not shown by the motion: loss" in done.stdout
+    chosen = choose_materials(read_scene(slide / "scene.ply").objects, file=tmp_path / "m.json")
+    assert chosen[1].material.friction == pytest.approx(0.3, abs=0.01)
+    rows = json.loads((tmp_path / "m.fit.json").read_text())["parameters"]
+    assert [row["quantity"] for row in rows if row["shown"]] == ["friction", "x", "y"]
+    assert f"--materials {tmp_path / 'm.json'} --velocity" in done.stdout
+
+
+@pytest.mark.skipif(find_spec("cma") is None, reason="cma is not installed")
+def test_cma_es_comes_nearer_from_far_away(slide, device):
+    options = replace(OPTIONS, frames=12)
+    problem = read_problem(slide / "scene.ply", slide / "track.h5", options)
+    far = np.array([0.9, 0.5, 0.6, 0.4])
+    with simulations(problem, 1) as sims:
+        near = _evolve(sims, 12, far, 60.0, options)
+        before, after = sims.costs([far, near], 12)
+    assert after < before / 2
+
+
+def test_tracks_that_do_not_fit_the_scene_are_refused(slide):
+    scene, truth = read_scene(slide / "scene.ply"), read_trajectory(slide / "track.h5")
+    nothing = ForcePrompts()
+    with pytest.raises(InputError, match="no object of this scene"):
+        pose_problem(replace(scene, objects=()), truth, nothing, OPTIONS)
+    with pytest.raises(InputError, match="starts elsewhere"):
+        pose_problem(scene, replace(truth, positions=truth.positions + torch.tensor([0.2, 0, 0])), nothing, OPTIONS)
+    with pytest.raises(InputError, match="nothing moves"):
+        pose_problem(scene, replace(truth, positions=truth.positions[:1].expand(len(truth), -1, -1)), nothing, OPTIONS)
+    with pytest.raises(InputError, match="three or more"):
+        pose_problem(scene, truth, nothing, replace(OPTIONS, frames=2))
+
+
+def test_parameters_become_materials_and_velocities():
+    m = Material(E=1e6, density=500.0)
+    parameters = material_parameters(1, m, ("friction", "density", "E")) + velocity_parameters(1, {"x": 1.0, "y": 0.0})
+    x = [p.coordinate(p.start) for p in parameters]
+    materials, velocity = fitted(parameters, x, {1: m})
+    assert pytest.approx(1e6) == materials[1].E and materials[1].density == pytest.approx(500)
+    assert velocity == {1: (pytest.approx(1.0), pytest.approx(0.0), 0.0)}
+    materials, velocity = fitted(parameters, [1.0, 1.0, 0.0, 1.0, 0.0], {1: m})
+    assert materials[1].friction == 1.2 and materials[1].density == pytest.approx(5000)  # ten times
+    assert pytest.approx(1e3) == materials[1].E and velocity == {1: (2.0, -1.0, 0.0)}
+
+
+def test_noise_is_estimated_beside_motion_and_collisions():
+    t = torch.arange(50)[:, None, None] * 0.02
+    path = torch.where(t < 0.5, 2 * t, 2 - 2 * t) * torch.tensor([1.0, 0, 0]) - 4.9 * t**2 * torch.tensor([0, 0, 1.0])
+    rng = torch.Generator().manual_seed(0)
+    track = path + 0.003 * torch.randn(50, 20, 3, generator=rng)
+    # 3,000 correlated third differences: a few per cent
+    assert estimate_noise(track) == pytest.approx(0.003, rel=0.06)

@@ -66,6 +66,19 @@ def copy_bandwidth(device: str) -> float:
     return 2 * 4 * count / median_seconds(lambda: b.copy_(a), device)
 
 
+def float32_rate(device: str) -> float:
+    """Operations per second of a matrix product in float32, without TF32."""
+    size = 8192 if device != "cpu" else 2048
+    a, b = (torch.randn(size, size, device=device) for _ in range(2))
+    allowed = torch.backends.cuda.matmul.allow_tf32
+    torch.backends.cuda.matmul.allow_tf32 = False
+    try:
+        a @ b
+        return 2 * size**3 / median_seconds(lambda: a @ b, device)
+    finally:
+        torch.backends.cuda.matmul.allow_tf32 = allowed
+
+
 def write_json(out: Path, facts: Mapping) -> None:
     """Write results as JSON, every list of plain values on one line."""
     text = re.sub(r"\[[^][{}]*\]", lambda found: json.dumps(json.loads(found[0])), json.dumps(facts, indent=1))

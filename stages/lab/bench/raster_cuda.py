@@ -3,13 +3,14 @@
 The scenes are those of the CPU benchmark. Times are sums over kernels, since single calls are bound by their launches;
 wall times stand beside them. Compositing tests every pixel of a tile against every splat of its list, unless the
 splat's box misses the pixels of the warp or the pixel is finished. The arithmetic of all these tests, 10 operations
-each, is given as a share of the rate of a float32 matrix product in the same run.
+each, is given as a share of the rate of a float32 matrix product in the same run. A step of the photometric fit is
+compared with the copy bandwidth.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import torch
@@ -17,11 +18,16 @@ from torch.profiler import ProfilerActivity, profile
 
 from stages.core.kernels.splat.projection import TILE_SIZE, pack_camera
 from stages.core.raster.rasterise import NEAR, count_pairs, rasterise_packed
+from stages.core.scene.cameras import Cameras
 from stages.core.scene.gaussians import Gaussians
 from stages.lab.bench import common as bench
 from stages.lab.bench.raster import FORWARD, RasterBenchOptions, random_gaussians, view_camera
+from stages.reconstruct.photometric import FitOptions, fit_gaussians
+from stages.reconstruct.photos import Views
 
 OPERATIONS_PER_TEST = 10  # of the quadratic form and the comparison
+FIT_PIXELS = 640  # along a side of the image
+FIT_STEPS = 50, 190  # fits of these lengths are compared; longer ones split Gaussians
 
 
 @dataclass(frozen=True)
@@ -50,7 +56,7 @@ def run(device: str, out: Path | None, options: RasterBenchOptions) -> Iterator[
     """Yield the lines of the report; all results go to `out` as JSON. Raises MissingPackage without gsplat."""
     gsplat = bench.import_gsplat()
     yield bench.machine(device)
-    rate, rows = _float32_rate(device), []
+    rate, rows = bench.float32_rate(device), []
     yield f"float32 matrix product {rate / 1e12:.0f} TFLOP/s"
     for n, pixels in FORWARD:
         g = random_gaussians(n // options.shrink).to(device)
@@ -77,7 +83,37 @@ def run(device: str, out: Path | None, options: RasterBenchOptions) -> Iterator[
         both = [_times(call, options.repeat, device) for call in pulled]
         rows.append(_row("forward, backward", g, pixels, *both, None))
         yield str(rows[-1])
-    bench.write_results(out, "raster", device, {"float32_rate": rate, "rows": [asdict(row) for row in rows]})
+    fit = _fit_step(device, options.shrink)
+    yield fit["text"]
+    facts = {"float32_rate": rate, "rows": [asdict(row) for row in rows], "fit": fit}
+    bench.write_results(out, "raster", device, facts)
+
+
+def _fit_step(device: str, shrink: int) -> dict:
+    """Time of a step of the photometric fit, and what it must move at least as a share of the copy bandwidth.
+
+    That is every parameter with its gradient and its two moments, once read and once written.
+    """
+    n, pixels = FORWARD[0][0] // shrink, -(-FIT_PIXELS // shrink)
+    g, (viewmat, K) = random_gaussians(n), view_camera(pixels)
+    with torch.no_grad():
+        camera = pack_camera(viewmat, K, pixels, pixels, NEAR).to(device)
+        image = (rasterise_packed(g.to(device), camera, pixels, pixels)[0].clamp(0, 1) * 255).to(torch.uint8).cpu()
+    cameras = Cameras(viewmat[None], K[None], torch.tensor([[pixels, pixels]]), ("0",))
+    views, g = Views((image,), cameras), replace(g, sh=g.sh + 0.1)
+
+    def seconds(steps: int) -> float:
+        call = lambda: fit_gaussians(g, views, FitOptions(steps, 2.0, device=device))  # noqa: E731
+        call()
+        return bench.median_seconds(call, device, 3)
+
+    some, more = FIT_STEPS
+    step, floats = (seconds(more) - seconds(some)) / (more - some), 11 + 3 * g.sh.shape[1]
+    copy = bench.copy_bandwidth(device)
+    share = 4 * 8 * floats * n / step / copy
+    text = f"fit step {n:,} Gaussians {pixels} px: {1e3 * step:.3f} ms; parameters at {100 * share:.0f} % of the " \
+           f"copy bandwidth, {copy / 1e12:.2f} TB/s"  # fmt: skip
+    return {"gaussians": n, "pixels": pixels, "seconds": step, "share": share, "copy_bandwidth": copy, "text": text}
 
 
 def _row(
@@ -97,15 +133,3 @@ def _times(call: Callable[[], object], repeat: int, device: str) -> tuple[float,
         torch.cuda.synchronize(device)
     kernels = sum(event.self_device_time_total for event in profiler.key_averages())
     return kernels / repeat / 1e3, wall
-
-
-def _float32_rate(device: str, size: int = 8192) -> float:
-    """Operations per second of a matrix product in float32, without TF32."""
-    a, b = (torch.randn(size, size, device=device) for _ in range(2))
-    allowed = torch.backends.cuda.matmul.allow_tf32
-    torch.backends.cuda.matmul.allow_tf32 = False
-    try:
-        a @ b
-        return 2 * size**3 / bench.median_seconds(lambda: a @ b, device)
-    finally:
-        torch.backends.cuda.matmul.allow_tf32 = allowed

@@ -2,11 +2,13 @@
 
 Three ellipsoids fall onto each other and onto the floor, 100 steps of 0.02 s. The time covers everything from the
 keypoints of a new scene at rest to its keypoints in every frame: precomputation, contact search, networks, integration;
-Gaussians are not moved. Recording a CUDA graph, once for a model and a problem size, is reported separately.
+Gaussians are not moved. The operations of the networks are given as a share of the rate of a float32 matrix product.
+Recording a CUDA graph, once for a model and a problem size, is reported separately.
 """
 
 from __future__ import annotations
 
+import copy
 import json
 import logging
 import time
@@ -18,6 +20,7 @@ from pathlib import Path
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.utils.flop_counter import FlopCounterMode
 
 from stages.core.backends import pick_device
 from stages.core.errors import InputError
@@ -71,10 +74,14 @@ def run(out: Path, options: RolloutBenchOptions = RolloutBenchOptions()) -> Iter
         "date": datetime.now(timezone.utc).date().isoformat(), "weights": card["sha256"], "objects": SCENE_OBJECTS,
         "keypoints": options.keypoints, "steps": options.steps, "rows": [],
     }  # fmt: skip
-    out = Path(out)
+    rate, out = bench.float32_rate(device), Path(out)
+    facts |= {"float32_rate": rate, "operations": _operations(model, options)}
+    yield f"float32 matrix product {rate / 1e12:.3g} TFLOP/s"
     known = json.loads(out.read_text()) if out.is_file() else {}
     for scenes in options.scenes or ((1, 64) if device != "cpu" else (1,)):
         group = list(_measured(model, paper, scenes, device, options))
+        for row in (r for r in group if r["what"].startswith("ngff, ")):
+            row["arithmetic"] = _rounded(facts["operations"] * scenes / row["seconds"] / rate)
         yield from table(group)
         facts["rows"] += group
         bench.write_json(out, {**known, device.partition(":")[0]: facts})
@@ -112,6 +119,13 @@ def _measured(
     yield {"what": f"MPM, {mpm['particles']:,} particles", "scenes": scenes, "seconds": _rounded(seconds)}
 
 
+def _operations(model: Dynamics, options: RolloutBenchOptions) -> int:
+    """Operations of the matrix products in a rollout of one scene, counted in PyTorch on a CPU."""
+    with FlopCounterMode(display=False) as counter:
+        rollout_stepwise(copy.deepcopy(model).cpu(), ellipsoids(1, options.keypoints), options.steps + 1)
+    return counter.get_total_flops()
+
+
 @torch.no_grad()
 def rollout_stepwise(model: Dynamics, start: InitialConditions, count: int) -> Float[Tensor, "b t o n 3"]:
     """A rollout step by step, without a CUDA graph. [m]"""
@@ -143,6 +157,8 @@ def table(rows: list[dict]) -> list[str]:
         more = []
         if "processor_seconds" in row:
             more.append(f"{row['processor_seconds']:.2f} s of CPU time")
+        if "arithmetic" in row:
+            more.append(f"matrix products at {100 * row['arithmetic']:.2g} % of the float32 rate")
         if "ready_seconds" in row:
             more.append(f"set-up: {row['ready_seconds']:.1f} s; deviates by {row['strays_m']:.1e} m")
         lines.append(

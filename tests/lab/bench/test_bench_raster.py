@@ -54,6 +54,6 @@ def test_gpu_report_compares_with_gsplat(tmp_path):
     from stages.lab.bench import raster_cuda
 
     lines = list(raster_cuda.run("cuda", tmp_path / "raster.json", RasterBenchOptions(repeat=2, shrink=10)))
-    assert len(lines) == 2 + 8
+    assert len(lines) == 2 + 8 + 1
     for row in json.loads((tmp_path / "raster.json").read_text())["rows"]:
         assert 0 < row["kernels"] < 100 and 0 < row["gsplat_kernels"] < 100

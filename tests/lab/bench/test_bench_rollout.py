@@ -39,9 +39,10 @@ def test_run_has_all_rows_and_keeps_other_devices(tmp_path, monkeypatch):
     facts = json.loads(out.read_text())
     assert facts["cuda"] == {"machine": "a large one"}
     rows = facts["cpu"]["rows"]
-    assert [row["scenes"] for row in rows] == [1, 1, 1, 2, 2, 2] and len(lines) == 7
+    assert [row["scenes"] for row in rows] == [1, 1, 1, 2, 2, 2] and len(lines) == 8
     assert {row["what"] for row in rows} == {"ngff, step by step", PEER, "MPM, 30 particles"}
     assert all(row["processor_seconds"] > 0 for row in rows if "MPM" not in row["what"])
+    assert all(0 < row["arithmetic"] < 1 for row in rows if row["what"].startswith("ngff, "))
     assert rows[2]["seconds"] == pytest.approx(2e-6 * 200 * 3)  # 200 substeps for each of the steps
 
 

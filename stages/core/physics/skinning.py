@@ -126,7 +126,9 @@ def _rotate_sh(sh: Float[Tensor, "n k 3"], R: Float[Tensor, "n 3 3"]) -> Float[T
     """SH coefficients rotated with each Gaussian; those with the identity rotation stay the same bit by bit."""
     if sh.shape[1] == 1:
         return sh
-    rotated = R.ne(torch.eye(3).to(R)).flatten(1).any(1)[:, None, None]
-    # in pieces that fit into the cache: three times faster
-    pieces = zip(sh.split(8192), R.split(8192), strict=True)
-    return torch.where(rotated, torch.cat([rotate_sh(part, rotation) for part, rotation in pieces]), sh)
+    rotated = R.ne(torch.eye(3).to(R)).flatten(1).any(1).nonzero()[:, 0]
+    if not len(rotated):
+        return sh
+    # on a CPU in pieces that fit into the cache: three times faster
+    pieces = rotated.split(len(rotated) if sh.is_cuda else 8192)
+    return sh.index_copy(0, rotated, torch.cat([rotate_sh(sh[part], R[part]) for part in pieces]))

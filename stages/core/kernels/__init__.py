@@ -8,6 +8,7 @@ GPU, is used for the fused inference step of the force field; its modules are im
 | file                          | written in                  | specified and tested by                              |
 |-------------------------------|-----------------------------|------------------------------------------------------|
 | skinning                      | Warp                        | `skin_gaussians_reference` in the file               |
+| nearest_rotations             | Warp                        | `geometry.rotations.nearest_rotation`                |
 | sphere_shadows                | Warp                        | `blocked_light_reference` in the file                |
 | adam                          | PyTorch (CPU), Warp         | `torch.optim.Adam`                                   |
 | semi_global                   | PyTorch (CPU), CUDA snippet | `path_costs_reference` in the file                   |

@@ -8,7 +8,8 @@ from torch import Tensor
 
 from stages.core.geometry.harmonics import rotate_sh
 from stages.core.geometry.neighbours import knn
-from stages.core.geometry.rotations import nearest_rotation, quaternion
+from stages.core.geometry.rotations import quaternion
+from stages.core.kernels.nearest_rotations import nearest_rotations
 from stages.core.kernels.skinning import skin_gaussians
 from stages.core.scene.gaussians import Gaussians
 from stages.core.scene.trajectory import Binding, Keypoints
@@ -66,7 +67,7 @@ class Skinning:
         moved = (relative != 0).flatten(1).any(1).nonzero()[:, 0]  # mostly few: what rests keeps its place exactly
         ridge, relative = self._ridge[moved], relative[moved]
         whole = self._object_rotations(u)[self._body[moved]]
-        R = nearest_rotation(self._M[moved] + relative + 0.3 * ridge * whole)
+        R = nearest_rotations(self._M[moved] + relative + 0.3 * ridge * whole)
         G = (relative + ridge * (R - torch.eye(3, device=R.device))) @ self._inverse[moved]
         return torch.zeros_like(self._M).index_copy(0, moved, G)
 
@@ -95,7 +96,7 @@ def fit_rotations(
     H = torch.zeros(count, 3, 3).to(x).index_add(0, body, x[:, :, None] * X[:, None, :])
     # a small weight of the identity, for points on a line or coincident points
     H = H + 1e-6 * (X.square().sum() / max(len(X), 1) + 1e-12) * torch.eye(3).to(H)
-    return nearest_rotation(H).to(rest)
+    return nearest_rotations(H).to(rest)
 
 
 def object_rotations(

@@ -1,9 +1,8 @@
 """Convex parts of an object, for rigid-body collision, and its volume, centre of mass and inertia.
 
-An object that fills its convex hull is one part. Others are divided by CoACD, from the surface of their filled voxels;
-the vertices of the parts are then moved from the voxels onto the points of the surface. Lengths are in the unit of the
-Gaussians.
-Source: Wei et al. 2022, "Approximate convex decomposition for 3D meshes with collision-aware concavity".
+An object that fills its convex hull is one part. The filled voxels of others are cut by planes, one part at a time: the
+part whose hull has most empty space, along the plane after which the hulls of both sides together are smallest. The
+hulls are then those of the surface points at each part's voxels. Lengths are in the unit of the Gaussians.
 """
 
 from __future__ import annotations
@@ -12,8 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
-from scipy.sparse import coo_matrix
+from jaxtyping import Float
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 from torch import Tensor
 
@@ -24,11 +22,13 @@ from stages.core.scene.scene import Scene
 
 VOXELS_ALONG = 32  # voxels along the longest side of an object
 CONVEX = 0.9  # fraction of its hull that a convex object fills: voxels are accurate to about 5 %
-MAX_CONCAVITY = 0.1  # of a part, relative to the size of the object; a voxel is 0.03
-SMOOTHING = 10, (0.5, -0.53)  # rounds and factors of Taubin 1995, "A signal processing approach to fair surface design"
-# tree search shorter than by default, which takes minutes; vertices are replaced by those of the surface
-SEARCH = {"mcts_iterations": 30, "mcts_nodes": 10, "mcts_max_depth": 2, "resolution": 500, "max_ch_vertex": 64}
+MAX_PARTS = 24  # of an object
+EMPTY, PART_EMPTY = 0.05, 0.1  # share of empty space in the hulls, of all parts together or of one, that is accepted
+MIN_VOXELS = 30  # of a part that is divided
+CUTS = 7  # planes tried along each of six axes: those of the world, and the principal ones of the part
+DIRECTIONS = 64  # in which a hull is measured; the hull of a ball in these has 91 % of its volume
 MAX_VERTICES = 200  # of a part: a ball is round to 1 %
+CORNERS = np.stack(np.meshgrid(*[[-0.5, 0.5]] * 3), -1).reshape(-1, 3)
 
 
 @dataclass(frozen=True)
@@ -42,27 +42,29 @@ class ConvexParts:
 
 
 @cached_in_scene
-def convex_parts(scene: Scene, object_id: int, seed: int = 0) -> ConvexParts:
-    """Divide an object into convex parts.
+def convex_parts(scene: Scene, object_id: int, seed: int = 0, bottom: float = -np.inf) -> ConvexParts:
+    """Divide an object into convex parts; what lies below the height `bottom` is cut off.
 
     Raises InputError for an object without any usable Gaussian.
     """
     voxels, h = filled_voxels(scene, object_id, VOXELS_ALONG, seed)
+    voxels = voxels[voxels[:, 2] > min(bottom, float(voxels[:, 2].max()) - h)]
     g = scene.gaussians.to("cpu")[(scene.gaussians.object_id == object_id).cpu()]
     surface = g.means[usable(g)]
     surface = (surface[inliers(surface)] if len(surface) else voxels).double().numpy()
+    surface[:, 2] = surface[:, 2].clip(min=bottom)
     volume = len(voxels) * h**3
     whole = _hull(surface)
     if whole is not None and whole.volume * CONVEX < volume:
         volume, com, inertia = _solid_moments(whole)
         return ConvexParts((_vertices(whole, seed),), volume, com, inertia)
-    parts = [_on_surface(part, surface, h) for part in _decompose(voxels, h, seed)]
     x = voxels.double()
+    hulls = _hulls(x.numpy(), divide(np.floor(x.numpy() / h)), surface, h)
     com = x.mean(0)
     r = x - com
     eye = torch.eye(3, dtype=torch.float64)
     inertia = volume * ((r.square().sum(1).mean() + h**2 / 6) * eye - r.mT @ r / len(r))
-    return ConvexParts(tuple(_vertices(part, seed) for part in parts), volume, com.float(), inertia.float())
+    return ConvexParts(tuple(_vertices(hull, seed) for hull in hulls), volume, com.float(), inertia.float())
 
 
 def _hull(points: np.ndarray) -> ConvexHull | None:
@@ -94,58 +96,91 @@ def _solid_moments(hull: ConvexHull) -> tuple[float, Float[Tensor, "3"], Float[T
     return float(total), torch.from_numpy(middle + com).float(), torch.from_numpy(inertia).float()
 
 
-def _on_surface(part: np.ndarray, surface: np.ndarray, h: float) -> ConvexHull:
-    """Hull of a part with the points of the surface near it in place of those of its vertices that are near them."""
-    hull = ConvexHull(part)
-    outside = (surface @ hull.equations[:, :3].T + hull.equations[:, 3]).max(1)
-    near = surface[outside < h]
-    if not len(near):
-        return hull
-    away = cKDTree(near).query(part)[0] > 2 * h
-    moved = _hull(np.concatenate([near, part[away]]))
-    return moved if moved is not None and moved.volume > hull.volume / 2 else hull
+def _hulls(voxels: np.ndarray, part: np.ndarray, surface: np.ndarray, h: float) -> list[ConvexHull]:
+    """The hull of each part: of the points of the surface at its voxels, and of its voxels that are away from these."""
+    near = cKDTree(voxels).query(surface, 8, distance_upper_bound=h)[1]
+    of = np.append(part, -1)[near]
+    inner = cKDTree(surface).query(voxels)[0] > 2 * h
+    hulls = []
+    for k in range(part.max() + 1):
+        points = np.concatenate([surface[(of == k).any(1)], _corners(voxels[inner & (part == k)], h)])
+        hulls.append(_hull(points) or ConvexHull(_corners(voxels[part == k], h)))
+    return hulls
 
 
-def _decompose(voxels: Float[Tensor, "m 3"], h: float, seed: int) -> list[np.ndarray]:
-    """Vertices (v, 3) of convex parts of the body of these voxels."""
-    import coacd  # noqa: PLC0415 -- only hollow and branched objects need it
-
-    coacd.set_log_level("off")
-    vertices, triangles = voxel_surface(torch.floor(voxels / h).long())
-    parts = coacd.run_coacd(
-        coacd.Mesh(h * _smooth(vertices, triangles), triangles.numpy()), threshold=MAX_CONCAVITY, seed=seed,
-        preprocess_mode="off", **SEARCH,
-    )  # fmt: skip
-    return [np.asarray(v) for v, _ in parts]
+def _corners(voxels: np.ndarray, h: float) -> np.ndarray:
+    """Corners (8 m, 3) of voxels (m, 3) of edge h."""
+    return (voxels[:, None] + h * CORNERS).reshape(-1, 3)
 
 
-def _smooth(vertices: Int[Tensor, "v 3"], triangles: Int[Tensor, "t 3"]) -> np.ndarray:
-    """The vertices without the steps of the voxels, in which CoACD would see concavities."""
-    x, t, count = vertices.double().numpy(), triangles.numpy(), len(vertices)
-    edges = np.concatenate([t[:, [0, 1]], t[:, [1, 2]], t[:, [2, 0]]])
-    joined = coo_matrix((np.ones(len(edges)), edges.T), (count, count)).tocsr()
-    joined = ((joined + joined.T) > 0).astype(float)
-    degree = np.asarray(joined.sum(1)).reshape(-1, 1)
-    rounds, factors = SMOOTHING
-    for factor in rounds * factors:
-        x = x + factor * ((joined @ x) / degree - x)
-    return x
+def divide(cells: np.ndarray) -> np.ndarray:
+    """The part, from 0, of each of the unit voxels at cells (m, 3) of a body."""
+    part = np.zeros(len(cells), np.int64)
+    empty = {0: _hull_volume(cells) - len(cells)}  # volume of a part's hull that the part does not fill
+    while len(empty) < MAX_PARTS and sum(empty.values()) > EMPTY * len(cells):
+        worst = max(empty, key=lambda k: empty[k])
+        rows = np.flatnonzero(part == worst)
+        if empty[worst] <= PART_EMPTY * len(rows):
+            break
+        side = _best_cut(cells[rows]) if len(rows) >= MIN_VOXELS else None
+        if side is None:
+            empty[worst] = 0.0
+            continue
+        part[rows[side]] = other = len(empty)
+        for k in (worst, other):
+            own = cells[part == k]
+            empty[k] = _hull_volume(own) - len(own)
+    return part
 
 
-def voxel_surface(cells: Int[Tensor, "m 3"]) -> tuple[Int[Tensor, "v 3"], Int[Tensor, "t 3"]]:
-    """Corners and triangles, counter-clockwise from outside, of the surface of the unit voxels at these cells."""
-    low = cells.amin(0) - 1
-    shape = (cells.amax(0) - low + 2).tolist()
-    full = torch.zeros(shape, dtype=torch.bool)
-    full[tuple((cells - low).T)] = True
-    quads = []
-    for axis in range(3):
-        u, v = torch.eye(3, dtype=torch.int64)[[(axis + 1) % 3, (axis + 2) % 3]]
-        for side in (1, 0):  # faces towards larger and smaller coordinates
-            at = (full & ~full.roll(1 - 2 * side, axis)).nonzero()
-            corner = at + side * torch.eye(3, dtype=torch.int64)[axis]
-            ring = torch.stack([corner, corner + u, corner + u + v, corner + v], 1)
-            quads.append(ring if side else ring.flip(1))
-    corners, index = torch.cat(quads).reshape(-1, 3).unique(dim=0, return_inverse=True)
-    a, b, c, d = index.reshape(-1, 4).T
-    return corners + low, torch.cat([torch.stack([a, b, c], 1), torch.stack([a, c, d], 1)]).int()
+def _hull_volume(cells: np.ndarray) -> float:
+    """Volume of the hull of a body of voxels: it lies about half way between those of their centres and corners."""
+    return _volume(cells[(cells @ SPREAD.T).argmax(0)], 0.5)
+
+
+def _volume(extreme: np.ndarray, edge: float = 1.0) -> float:
+    """Volume of the hull of voxels of some edge of which these are the extreme ones in each direction of SPREAD."""
+    hull = _hull(extreme + edge / 2 * np.sign(SPREAD))
+    return 0.0 if hull is None else hull.volume
+
+
+def _best_cut(cells: np.ndarray) -> np.ndarray | None:
+    """The side (m,) of each voxel of the plane after which the hulls of both sides are smallest; None without any."""
+    smallest, best = np.inf, None
+    along = cells @ SPREAD.T
+    for axis in np.concatenate([np.eye(3), np.linalg.eigh(np.cov(cells.T))[1].T]):
+        x = cells @ axis
+        slab = np.searchsorted(np.linspace(x.min(), x.max(), CUTS + 2)[1:-1], x)
+        slabs = [np.flatnonzero(slab == k) for k in range(CUTS + 1)]
+        extreme = [rows[along[rows].argmax(0)] if len(rows) else None for rows in slabs]
+        below, above = _accumulated(along, extreme), _accumulated(along, extreme[::-1])[::-1]
+        for k in range(CUTS):
+            if below[k] is not None and above[k + 1] is not None:
+                volume = _volume(cells[below[k]]) + _volume(cells[above[k + 1]])
+                if volume < smallest:
+                    smallest, best = volume, slab <= k
+    return best
+
+
+def _accumulated(along: np.ndarray, extreme: list[np.ndarray | None]) -> list[np.ndarray | None]:
+    """The extreme voxels in each direction of the first slab, of the first two, and so on."""
+    out, now = [], None
+    for rows in extreme:
+        if now is None or rows is None:
+            now = rows if now is None else now
+        else:
+            direction = np.arange(along.shape[1])
+            now = np.where(along[rows, direction] > along[now, direction], rows, now)
+        out.append(now)
+    return out
+
+
+def _fibonacci(count: int) -> np.ndarray:
+    """Unit vectors (count, 3), spread evenly (Fibonacci lattice)."""
+    k = np.arange(count) + 0.5
+    z, turn = 1 - 2 * k / count, np.pi * (1 + 5**0.5) * k
+    r = np.sqrt(1 - z * z)
+    return np.stack([r * np.cos(turn), r * np.sin(turn), z], 1)
+
+
+SPREAD = _fibonacci(DIRECTIONS)

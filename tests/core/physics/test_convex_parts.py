@@ -4,7 +4,7 @@ import pytest
 import torch
 from scipy.spatial import ConvexHull
 
-from stages.core.physics.convex_parts import convex_parts, voxel_surface
+from stages.core.physics.convex_parts import convex_parts
 from stages.core.scene.scene import Scene, SceneObject
 from stages.lab.assets.shapes import Surface, box, ellipsoid, to_gaussians, union
 from tests.conftest import two_balls_scene
@@ -52,13 +52,3 @@ def test_a_concave_object_is_divided():
     torch.testing.assert_close(corners.amax(0), torch.tensor([0.19, 0.1, 0.1]), rtol=0, atol=0.01)
     torch.testing.assert_close(corners.amin(0), -torch.tensor([0.19, 0.1, 0.1]), rtol=0, atol=0.01)
     torch.testing.assert_close(parts.com, torch.zeros(3), rtol=0, atol=0.002)
-
-
-def test_the_surface_of_voxels_is_closed_and_encloses_them():
-    cells = torch.tensor([[0, 0, 0], [1, 0, 0], [1, 1, 0], [1, 1, 1]])
-    vertices, triangles = voxel_surface(cells)
-    corners = vertices.double()[triangles.long()]
-    assert float(torch.linalg.det(corners).sum() / 6) == pytest.approx(4)  # outward triangles: volume by Gauss
-    edges = torch.cat([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
-    forward = {tuple(e) for e in edges.tolist()}
-    assert len(forward) == len(edges) and all((b, a) in forward for a, b in forward)

@@ -10,6 +10,7 @@ from stages.core.physics.materials import MODELS, Material, choose_materials
 from stages.core.scene.scene import Scene
 from stages.core.scene.trajectory import Keypoints
 from stages.simulate.options import AUTO, SimulateOptions
+from stages.simulate.setup import from_photos
 
 log = logging.getLogger(__name__)
 MAX_RIGID_SAG = 0.02  # largest compression under its own weight of a body that counts as rigid
@@ -38,7 +39,7 @@ def with_engine(options: SimulateOptions, scene: Scene, keypoints: Keypoints) ->
         engine, reason = "mpm", f"object {uneven[0].id} has parts of different materials"
     elif soft:
         engine, reason = "ngff", f"object {soft[0].id} is compressed by more than {MAX_RIGID_SAG:.0%} by its own weight"
-    elif _reconstructed(scene.provenance):
+    elif from_photos(scene):
         engine, reason = "ngff", "reconstructed objects overlap slightly"
     else:
         engine, reason = "rigid", "all objects are stiff"
@@ -65,15 +66,6 @@ def for_engine(prompts: ForcePrompts, scene: Scene, options: SimulateOptions) ->
 def sag(material: Material, height: float, gravity: float) -> float:
     """Compression of a body of some height [m] under its own weight, about; gravity in m/s^2."""
     return material.density * abs(gravity) * height / material.E
-
-
-def _reconstructed(provenance: dict) -> bool:
-    """Whether `ngff reconstruct` is among the commands that made a scene."""
-    while isinstance(provenance, dict):
-        if provenance.get("command") == "reconstruct":
-            return True
-        provenance = provenance.get("scene")
-    return False
 
 
 def _height(scene: Scene, keypoints: Keypoints, object_id: int) -> float:

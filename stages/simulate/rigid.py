@@ -9,13 +9,16 @@ rebound at any speed never come to rest. The frequency is the highest that the s
 sink in by less than 1e-3 of the smallest object. The friction of a pair is the larger coefficient, as in the others.
 Source: Todorov, Erez and Tassa 2012, "MuJoCo: a physics engine for model-based control"; restitution of a damped
 spring: Schwager and Poeschel 2007, "Coefficient of restitution and linear-dashpot model revisited".
+
+Overlaps at the start are kept (`initial_overlaps.py`); objects of photos rest until disturbed (`resting_bodies.py`).
 """
 
 from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -32,8 +35,10 @@ from stages.core.scene.scene import Scene
 from stages.core.scene.trajectory import Keypoints
 from stages.simulate.changes import changed_options, changed_pins
 from stages.simulate.engine_choice import MAX_RIGID_SAG, sag
+from stages.simulate.initial_overlaps import InitialOverlaps
 from stages.simulate.options import SimulateOptions
-from stages.simulate.setup import SceneSetup, check_motion, choose_for_bodies, set_up_scene
+from stages.simulate.resting_bodies import FALLING, FREE, SUPPORT_GAP, RestingBodies, Stance
+from stages.simulate.setup import SceneSetup, check_motion, choose_for_bodies, from_photos, set_up_scene
 
 log = logging.getLogger(__name__)
 SUBSTEPS = 200  # substeps in a unit of time: that of falling half the size of the smallest object from rest
@@ -42,8 +47,8 @@ REST_SPEED = 0.1  # normal speed below which contacts do not rebound [units]; a 
 IMPEDANCE = 0.99  # of a contact: 1 would be exact, but the forces between several contacts undetermined
 MAX_SUBSTEPS = 5_000  # in a frame
 MAX_TRAVEL = 0.05  # of the smallest object's size in a substep, so that nothing passes through it
-SEPARATION_ROUNDS, CONTACT_SLACK = 200, 1e-3  # of bodies that overlap at the start; slack in sizes of the smallest
-FREE, FALLING = 7, 6  # numbers of a free joint's coordinates and velocities
+MAX_SETTLING = 2.0  # largest displacement of an object of photos onto the floor [particle spacings]
+ON_FLOOR = 0.02  # gap up to which a body stands on the floor [units]
 
 
 @dataclass(frozen=True)
@@ -79,7 +84,6 @@ def rollout(
     setup = set_up_scene(scene, prompts, options)
     bodies, floor_offset = _bodies(scene, setup, prompts, options)
     world = _World(scene, setup, bodies, prompts, options)
-    floor_offset += world.separate()
     log.info("%d bodies of %d convex parts, substep %.3g s (%d per frame)", len(bodies),
              sum(len(b.parts.hulls) for b in bodies), options.dt / world.substeps, world.substeps)  # fmt: skip
     return _states(scene, keypoints, setup, bodies, floor_offset, world, prompts, options)
@@ -89,7 +93,7 @@ def _states(
     scene: Scene, keypoints: Keypoints, setup: SceneSetup, bodies: list[Body], floor_offset: Float[Tensor, "o 3"],
     world: _World, prompts: ForcePrompts, options: SimulateOptions,
 ) -> Iterator[FrameState]:  # fmt: skip
-    """Keypoints moved with their bodies; displacements onto the floor and apart are not part of the output."""
+    """Keypoints moved with their bodies; displacements onto the floor are not part of the output."""
     row = torch.tensor([[o.id for o in scene.objects].index(int(i)) for i in keypoints.object_id], dtype=torch.int64)
     com = torch.stack([b.parts.com for b in bodies])
     arm = (keypoints.rest - com[row])[..., None]
@@ -110,17 +114,24 @@ def _states(
             if changes:
                 current, held = changed_options(current, changes), changed_pins(held, changes)
                 world.change(choose_for_bodies(scene, setup.bodies, current), held, current)
+                whole = any(c.what == "gravity" for c in changes)
+                world.release(i for i, o in enumerate(scene.objects) if whole or o.id in {c.object_id for c in changes})
             world.advance(frame * options.dt)
 
 
 def _bodies(
     scene: Scene, setup: SceneSetup, prompts: ForcePrompts, options: SimulateOptions
 ) -> tuple[list[Body], Float[Tensor, "o 3"]]:
-    """The bodies, and their displacements onto the floor [scene units], as in setup but exact for the convex parts."""
+    """The bodies, and their displacements onto the floor [scene units], as in setup but exact for the convex parts.
+
+    What lies deeper below the floor in an object of photos is cut off.
+    """
     unit, bodies, offsets = scene.metres_per_unit, [], []
-    for row, o in enumerate(scene.objects):
-        choice, parts = setup.materials[o.id], convex_parts(scene, o.id, options.seed)
-        shift, inertia = setup.uneven_moments(row)
+    deepest = setup.box.low[2] - MAX_SETTLING * setup.bodies.spacing if from_photos(scene) else -math.inf
+    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
+        divided = list(pool.map(lambda o: convex_parts(scene, o.id, options.seed, deepest), scene.objects))
+    for row, (o, parts) in enumerate(zip(scene.objects, divided, strict=True)):
+        choice, (shift, inertia) = setup.materials[o.id], setup.uneven_moments(row)
         parts = replace(parts, com=parts.com + shift, inertia=parts.inertia + parts.volume * inertia)
         m, pinned = choice.material, o.id in prompts.pinned
         mass = m.density * parts.volume * unit**3
@@ -180,6 +191,12 @@ class _World:
         for k, i in enumerate(self._free):
             self.data.qvel[FALLING * k : FALLING * k + 3] = velocity[i].numpy() * self.units.time / size
         self.set_forces(prompts.forces, prompts.pinned)
+        at_rest = self._at_rest(scene, setup, prompts, options)
+        self._start = self.data.qpos.reshape(-1, FREE).copy()
+        mujoco.mj_fwdPosition(self.model, self.data)
+        self._overlaps = InitialOverlaps(self.model, self.data)
+        self._resting = self._resting_bodies(setup, at_rest)
+        self.release(i for i in self._free if i not in at_rest)
 
     def set_forces(self, forces: Sequence[Force], pinned: Collection[int]) -> None:
         """The forces from now on; those on pinned objects have no effect."""
@@ -217,41 +234,45 @@ class _World:
         centre, quat = (torch.from_numpy(a[1:count].copy()).float() for a in (self.data.xpos, self.data.xquat))
         return centre * self.units.length, quat
 
-    def separate(self) -> Float[Tensor, "o 3"]:
-        """Move apart bodies that overlap at the start; return their displacements [m].
+    def _at_rest(self, scene: Scene, setup: SceneSetup, prompts: ForcePrompts, options: SimulateOptions) -> list[int]:
+        """Rows of the objects that are at rest in photos and that no prompt moves at the start."""
+        if not from_photos(scene) or options.gravity <= 0:
+            return []
+        return [i for i in self._free if not setup.lift[i].any() and not any(prompts.velocity.get(self._ids[i], ()))]
 
-        Otherwise the contacts would throw them apart. Lighter bodies move more; pinned bodies and the floor do not.
-        """
-        mujoco, start = self._mujoco, self.data.qpos.copy()
-        weight = np.zeros(len(self._bodies) + 1)
-        for i in self._free:
-            weight[i + 1] = self.units.mass / self._bodies[i].mass
-        column = {i + 1: FREE * k for k, i in enumerate(self._free)}
-        for _ in range(SEPARATION_ROUNDS if self._free else 0):
-            mujoco.mj_fwdPosition(self.model, self.data)
-            deepest: dict[tuple[int, int], tuple[float, np.ndarray]] = {}
-            for c in self.data.contact[: self.data.ncon]:
-                pair = tuple(int(self.model.geom_bodyid[g]) for g in c.geom)
-                if c.dist < -CONTACT_SLACK and c.dist < deepest.get(pair, (0.0, None))[0]:
-                    deepest[pair] = (float(c.dist), c.frame[:3].copy())
-            if not deepest:
-                break
-            for (a, b), (distance, normal) in deepest.items():  # the normal points from a to b
-                for body, sign in ((a, 1.0), (b, -1.0)):
-                    if body in column:
-                        at = slice(column[body], column[body] + 3)
-                        self.data.qpos[at] += sign * distance * weight[body] / (weight[a] + weight[b]) * normal
-        moved = torch.zeros(len(self._bodies), 3)
-        for k, i in enumerate(self._free):
-            shift = (self.data.qpos - start)[FREE * k : FREE * k + 3]
-            moved[i] = torch.from_numpy(shift * self.units.length)
-        return moved
+    def _resting_bodies(self, setup: SceneSetup, at_rest: list[int]) -> RestingBodies:
+        """As the objects are in the photos, without lifts."""
+        unit = self._scene.metres_per_unit / self.units.length
+        lift = setup.lift.double().numpy() * unit
+        self.data.qpos.reshape(-1, FREE)[:, :3] -= lift[self._free]
+        self.model.geom_margin[:] = SUPPORT_GAP
+        self._mujoco.mj_fwdPosition(self.model, self.data)
+        stances = []
+        for i, b in enumerate(self._bodies):
+            points = torch.cat(b.parts.hulls).double() * unit
+            height = float(b.parts.com[2] * unit - points[:, 2].min())
+            bottom = float(b.start[2]) / self.units.length - lift[i, 2] - height - setup.box.low[2] * unit
+            width = float((points.amax(0) - points.amin(0))[:2].min())
+            stances.append(Stance(b.friction, height, width / 2, bottom < ON_FLOOR))
+        resting = RestingBodies(self.model, self.data, stances, [i + 1 for i in at_rest])
+        self.model.geom_margin[:] = 0
+        self.data.qpos.reshape(-1, FREE)[:, :3] += lift[self._free]
+        return resting
+
+    def release(self, rows: Iterable[int]) -> None:
+        """Let objects move that rested until now."""
+        released = self._resting.release(i + 1 for i in rows)
+        if released:
+            log.debug("moved from rest: %s", ", ".join(self._scene.objects[i - 1].name for i in released))
 
     def advance(self, time: float) -> None:
         """Advance by a frame that begins at `time` [s]."""
         step = self._dt / self.substeps
         acting = [row for row in self._forces if row[0].active_fraction(time, time + self._dt) > 0]
+        self.release(row for _, row, _ in acting)
         self.data.xfrc_applied[:] = 0
+        if self._resting.fixed.all():
+            return
         for n in range(self.substeps):
             if acting:
                 self._apply_forces(acting, time + n * step, step)
@@ -261,6 +282,8 @@ class _World:
         """A substep: mj_step with the damping of slow contacts added to their reference acceleration."""
         mujoco, model, data = self._mujoco, self.model, self.data
         mujoco.mj_fwdPosition(model, data)
+        if data.ncon:
+            self._overlaps.subtract(data, self._resting.fixed)
         mujoco.mj_fwdVelocity(model, data)
         if data.ncon:
             normal = data.contact.efc_address
@@ -272,6 +295,8 @@ class _World:
         mujoco.mj_fwdAcceleration(model, data)
         mujoco.mj_fwdConstraint(model, data)
         mujoco.mj_Euler(model, data)
+        self._resting.restore(data, self._start)
+        self._resting.release_disturbed(data)
         for k, pose in self._held.items():
             data.qpos[FREE * k : FREE * (k + 1)] = pose
             data.qvel[FALLING * k : FALLING * (k + 1)] = 0

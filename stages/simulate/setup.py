@@ -159,3 +159,13 @@ def check_motion(points: Float[Tensor, "*k 3"], frame: int, options: SimulateOpt
     if not bool((points.abs() < LARGEST).all()):
         raise InputError(f"the motion ceased to be finite at {frame * options.dt:.2f} s; use a smaller --velocity or "
                          "--force, or another --engine")  # fmt: skip
+
+
+def from_photos(scene: Scene) -> bool:
+    """Whether `ngff reconstruct` is among the commands that made a scene."""
+    provenance = scene.provenance
+    while isinstance(provenance, dict):
+        if provenance.get("command") == "reconstruct":
+            return True
+        provenance = provenance.get("scene")
+    return False

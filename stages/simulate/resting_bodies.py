@@ -1,0 +1,117 @@
+"""Rigid bodies that are at rest in photos, and held until their equilibrium is disturbed.
+
+Photos show a static equilibrium, but not all that keeps it: undersides, the relief of the table and things that are no
+objects are missing. A body is held until one that it rests on is released, until a user acts on it, or until contact
+forces exceed what weight and friction can resist: a force F slides a body of mass m when |Fxy| > friction (m g - Fz),
+lifts it when Fz > m g, and tips it over when its moment about the base exceeds (m g - Fz) times half the shorter side.
+The excess must last until it would have given the body the speed RELEASE_SPEED. Held bodies are so heavy that contacts
+do not move them, and do not collide with each other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+HELD_MASS = 1e6  # added inertia of a held body, relative to its own or the median mass, whichever is larger
+RELEASE_SPEED = 0.02  # [units]; that after a fall of 0.02 % of the smallest object
+SUPPORT_GAP = 0.05  # gap up to which a body supports another, as photos show little of contact regions [units]
+SUPPORT_COSINE = 0.5  # least upward component of the normal of a contact that supports
+FREE, FALLING = 7, 6  # numbers of a free joint's coordinates and velocities
+
+
+@dataclass(frozen=True)
+class Stance:
+    """What a body resists disturbances with, in units of the simulation."""
+
+    friction: float
+    height: float  # of the centre of mass above the lowest point
+    half_width: float  # half the shorter horizontal side
+    on_floor: bool
+
+
+class RestingBodies:
+    """Which bodies are held. Bodies are numbered as in the model: 0 is the world."""
+
+    def __init__(self, model, data, stances: list[Stance], at_rest: Iterable[int]):
+        """`stances` of bodies 1.. ; `data` has the contacts at rest, with gaps of up to SUPPORT_GAP."""
+        self._model = model
+        self._bodies = model.dof_bodyid[::FALLING].copy()  # of each joint
+        self._stances = [stances[i - 1] for i in self._bodies]
+        self._friction, self._height, self._half_width = (
+            np.array([getattr(s, name) for s in self._stances]) for name in ("friction", "height", "half_width")
+        )
+        self.resting_on = _supports(model, data, stances)
+        chosen = set(at_rest)
+        self.held = np.array([int(i) in chosen for i in self._bodies], bool)
+        self.fixed = np.ones(model.nbody, bool)  # bodies that do not move
+        self.fixed[self._bodies] = self.held
+        self._impulse = np.zeros(len(self._bodies))
+        self._added = np.where(self.held, HELD_MASS * np.maximum(1.0, model.body_mass[self._bodies]), 0.0)
+        self._add_inertia(self._added)
+        self._set_collisions()
+
+    def _add_inertia(self, added: np.ndarray) -> None:
+        each = np.repeat(added, FALLING)
+        self._model.dof_armature += each
+        self._model.dof_M0 += each  # the inertia of bodies with a diagonal tensor is taken from here
+
+    def _set_collisions(self) -> None:
+        """Let pairs collide of which one body moves."""
+        model = self._model
+        model.body_contype[:] = np.where(self.fixed, 1, 3)
+        model.body_conaffinity[:] = np.where(self.fixed, 2, 3)
+        model.geom_contype[:] = model.body_contype[model.geom_bodyid]
+        model.geom_conaffinity[:] = model.body_conaffinity[model.geom_bodyid]
+
+    def restore(self, data, start: np.ndarray) -> None:
+        """Put the held bodies at the rows of `start`, the coordinates of all free bodies."""
+        if self.held.any():
+            data.qpos.reshape(-1, FREE)[self.held] = start[self.held]
+            data.qvel.reshape(-1, FALLING)[self.held] = 0
+
+    def release_disturbed(self, data) -> list[int]:
+        """After a substep: release the bodies that contact forces would move; returns them."""
+        if not self.held.any():
+            return []
+        model = self._model
+        wrench = data.qfrc_constraint.reshape(-1, FALLING)  # on held bodies, which are not turned: in world axes
+        mass = model.body_mass[self._bodies]
+        load = -model.opt.gravity[2] * mass - wrench[:, 2]
+        push = np.hypot(wrench[:, 0], wrench[:, 1])
+        moment = np.hypot(wrench[:, 3] - self._height * wrench[:, 1], wrench[:, 4] + self._height * wrench[:, 0])
+        grip = np.maximum(load, 0)
+        excess = np.maximum(push - self._friction * grip, (moment - self._half_width * grip) / self._height)
+        excess = np.maximum(excess, -load)
+        self._impulse = np.where(excess > 0, self._impulse + excess * model.opt.timestep, 0.0)
+        moved = self.held & (self._impulse > mass * RELEASE_SPEED)
+        return self.release(self._bodies[moved]) if moved.any() else []
+
+    def release(self, bodies: Iterable[int]) -> list[int]:
+        """Release bodies, if they are held, and those that rest on them; returns those that were held."""
+        todo, done, released = [int(i) for i in bodies], set(), []
+        while todo:
+            i = todo.pop()
+            if i not in done:
+                done.add(i)
+                todo += self.resting_on.get(i, ())
+                released += [i] if self.fixed[i] and i in self._bodies else []
+        if released:
+            rows = np.isin(self._bodies, released)
+            self._add_inertia(np.where(rows, -self._added, 0.0))
+            self.held &= ~rows
+            self.fixed[released] = False
+            self._set_collisions()
+        return released
+
+
+def _supports(model, data, stances: list[Stance]) -> dict[int, set[int]]:
+    """Body -> the bodies that rest on it, in contact from above and not on the floor."""
+    found: dict[int, set[int]] = {}
+    for pair, up in zip(model.geom_bodyid[data.contact.geom], data.contact.frame[:, 2], strict=True):
+        lower, upper = pair if up > 0 else pair[::-1]  # the normal points from the first to the second
+        if lower > 0 and upper > 0 and abs(up) > SUPPORT_COSINE and not stances[upper - 1].on_floor:
+            found.setdefault(int(lower), set()).add(int(upper))
+    return found

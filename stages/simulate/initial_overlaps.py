@@ -2,23 +2,31 @@
 
 Reconstructed objects overlap by the errors of their surfaces, which contacts would turn into speed. The overlap that
 two parts have at the start is therefore no contact. The overlap allowed to them decreases with the overlap itself and
-never grows again, so that nothing is pushed apart, and what was once separated does not sink in again.
+never grows again, so that nothing is pushed apart, and what was once separated does not sink in again. Parts that
+overlap by more than half the thickness of the thinner one, where the direction of a contact says nothing, do not touch
+until they are separated.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
+MAX_OVERLAP = 0.5  # of parts that touch at the start, relative to the thickness of the thinner one
+NO_CONTACT = 1e3  # allowed overlap of parts that do not touch [units]
+
 
 class InitialOverlaps:
     """The overlap allowed to each pair of geometries that overlapped at the start [units of the simulation]."""
 
-    def __init__(self, model, data):
+    def __init__(self, mujoco, model, data):
         """`data` has the contacts of the start."""
         deep = data.contact.dist < 0
         self._pairs, row = np.unique(np.sort(data.contact.geom[deep], 1), axis=0, return_inverse=True)
         self.allowed = np.zeros(len(self._pairs))
         np.maximum.at(self.allowed, row.ravel(), -data.contact.dist[deep])
+        thickness = 2 * model.geom_size.min(1)  # of meshes the half sizes along the principal axes
+        thickness[model.geom_type != mujoco.mjtGeom.mjGEOM_MESH] = np.inf
+        self.allowed[self.allowed > MAX_OVERLAP * thickness[self._pairs].min(1)] = NO_CONTACT
         self._row = np.full((model.ngeom, model.ngeom), -1, np.int32)
         for a, b in ((0, 1), (1, 0)):
             self._row[self._pairs[:, a], self._pairs[:, b]] = np.arange(len(self._pairs))
@@ -37,7 +45,8 @@ class InitialOverlaps:
         overlap = np.zeros(len(self._pairs))
         np.maximum.at(overlap, row[known], -contact.dist[known])
         free = ~fixed[self._bodies].all(1)
-        self.allowed[free] = np.minimum(self.allowed, overlap)[free]
+        apart = (self.allowed < NO_CONTACT) | (overlap == 0)
+        self.allowed[free & apart] = np.minimum(self.allowed, overlap)[free & apart]
         address = contact.efc_address[known]
         active = address >= 0
         data.efc_pos[address[active]] += self.allowed[row[known[active]]]

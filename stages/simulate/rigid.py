@@ -18,7 +18,6 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Collection, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -47,7 +46,7 @@ REST_SPEED = 0.1  # normal speed below which contacts do not rebound [units]; a 
 IMPEDANCE = 0.99  # of a contact: 1 would be exact, but the forces between several contacts undetermined
 MAX_SUBSTEPS = 5_000  # in a frame
 MAX_TRAVEL = 0.05  # of the smallest object's size in a substep, so that nothing passes through it
-MAX_SETTLING = 2.0  # largest displacement of an object of photos onto the floor [particle spacings]
+MAX_SETTLING = 1.0  # largest displacement of an object of photos onto the floor [particle spacings]
 ON_FLOOR = 0.02  # gap up to which a body stands on the floor [units]
 
 
@@ -127,9 +126,8 @@ def _bodies(
     What lies deeper below the floor in an object of photos is cut off.
     """
     unit, bodies, offsets = scene.metres_per_unit, [], []
-    deepest = setup.box.low[2] - MAX_SETTLING * setup.bodies.spacing if from_photos(scene) else -math.inf
-    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
-        divided = list(pool.map(lambda o: convex_parts(scene, o.id, options.seed, deepest), scene.objects))
+    settling = MAX_SETTLING * setup.bodies.spacing if from_photos(scene) else math.inf
+    divided = convex_parts(scene, options.seed, setup.box.low[2] - settling)
     for row, (o, parts) in enumerate(zip(scene.objects, divided, strict=True)):
         choice, (shift, inertia) = setup.materials[o.id], setup.uneven_moments(row)
         parts = replace(parts, com=parts.com + shift, inertia=parts.inertia + parts.volume * inertia)
@@ -137,7 +135,8 @@ def _bodies(
         mass = m.density * parts.volume * unit**3
         lowest = float(torch.cat(parts.hulls)[:, 2].min() + setup.lift[row, 2])
         below = lowest - setup.box.low[2]
-        offset = torch.tensor([0.0, 0.0, -below if not pinned and (setup.on_floor[row] or below < 0) else 0.0])
+        stands = below < settling and (bool(setup.on_floor[row]) or below < 0)
+        offset = torch.tensor([0.0, 0.0, -below if stands and not pinned else 0.0])
         friction = m.friction if options.friction is None else options.friction
         start = unit * (parts.com + setup.lift[row] + offset)
         bodies.append(Body(parts, m, friction, mass, start, pinned))
@@ -194,7 +193,7 @@ class _World:
         at_rest = self._at_rest(scene, setup, prompts, options)
         self._start = self.data.qpos.reshape(-1, FREE).copy()
         mujoco.mj_fwdPosition(self.model, self.data)
-        self._overlaps = InitialOverlaps(self.model, self.data)
+        self._overlaps = InitialOverlaps(mujoco, self.model, self.data)
         self._resting = self._resting_bodies(setup, at_rest)
         self.release(i for i in self._free if i not in at_rest)
 

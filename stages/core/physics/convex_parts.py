@@ -7,11 +7,14 @@ hulls are then those of the surface points at each part's voxels. Lengths are in
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from jaxtyping import Float
+from scipy import ndimage
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 from torch import Tensor
 
@@ -32,6 +35,30 @@ CORNERS = np.stack(np.meshgrid(*[[-0.5, 0.5]] * 3), -1).reshape(-1, 3)
 
 
 @dataclass(frozen=True)
+class Solid:
+    """The filled body of an object."""
+
+    voxels: np.ndarray  # (m, 3), centres
+    h: float  # edge of a voxel
+    surface: np.ndarray  # (n, 3), points on it
+
+    def inside(self) -> Callable[[np.ndarray], np.ndarray]:
+        """A function that tells which points (k, 3) are inside, in voxels of which all six neighbours are full."""
+        cells = np.floor(self.voxels / self.h).astype(np.int64)
+        low = cells.min(0) - 1
+        full = np.zeros(cells.max(0) - low + 2, bool)
+        full[tuple((cells - low).T)] = True
+        full = ndimage.binary_erosion(full)
+
+        def found(points: np.ndarray) -> np.ndarray:
+            at = np.floor(points / self.h).astype(np.int64) - low
+            at = np.where(((at >= 0) & (at < full.shape)).all(1, keepdims=True), at, 0)  # the first one is empty
+            return full[tuple(at.T)]
+
+        return found
+
+
+@dataclass(frozen=True)
 class ConvexParts:
     """Convex parts of an object and the properties of its filled body at density 1."""
 
@@ -42,28 +69,55 @@ class ConvexParts:
 
 
 @cached_in_scene
-def convex_parts(scene: Scene, object_id: int, seed: int = 0, bottom: float = -np.inf) -> ConvexParts:
-    """Divide an object into convex parts; what lies below the height `bottom` is cut off.
+def convex_parts(scene: Scene, seed: int = 0, bottom: float = -np.inf) -> list[ConvexParts]:
+    """Divide each object into convex parts, in the order of scene.objects.
 
-    Raises InputError for an object without any usable Gaussian.
+    What lies below the height `bottom`, or inside a smaller object, is cut off. Raises InputError for an object without
+    any usable Gaussian.
     """
+    ids = [o.id for o in scene.objects]
+    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
+        solids = list(pool.map(lambda id: _solid(scene, id, seed, bottom), ids))
+        return list(pool.map(lambda solid: _parts(solid, seed), _without_overlaps(solids)))
+
+
+def _solid(scene: Scene, object_id: int, seed: int, bottom: float) -> Solid:
     voxels, h = filled_voxels(scene, object_id, VOXELS_ALONG, seed)
-    voxels = voxels[voxels[:, 2] > min(bottom, float(voxels[:, 2].max()) - h)]
+    voxels = voxels[voxels[:, 2] > min(bottom, float(voxels[:, 2].max()) - h)].double().numpy()
     g = scene.gaussians.to("cpu")[(scene.gaussians.object_id == object_id).cpu()]
     surface = g.means[usable(g)]
-    surface = (surface[inliers(surface)] if len(surface) else voxels).double().numpy()
+    surface = surface[inliers(surface)].double().numpy() if len(surface) else voxels.copy()
     surface[:, 2] = surface[:, 2].clip(min=bottom)
-    volume = len(voxels) * h**3
-    whole = _hull(surface)
+    return Solid(voxels, h, surface)
+
+
+def _without_overlaps(solids: list[Solid]) -> list[Solid]:
+    """The solids without what is inside smaller ones, by more than a voxel of these."""
+    order = sorted(range(len(solids)), key=lambda i: len(solids[i].voxels) * solids[i].h ** 3)
+    out, insides = list(solids), []
+    for i in order:
+        s = solids[i]
+        for inside in insides:
+            free = ~inside(s.voxels)
+            if free.sum() >= max(MIN_VOXELS, len(free) / 2) and not free.all():
+                s = Solid(s.voxels[free], s.h, s.surface[~inside(s.surface)])
+        out[i] = s
+        insides.append(s.inside())
+    return out
+
+
+def _parts(solid: Solid, seed: int) -> ConvexParts:
+    volume = len(solid.voxels) * solid.h**3
+    whole = _hull(solid.surface)
     if whole is not None and whole.volume * CONVEX < volume:
         volume, com, inertia = _solid_moments(whole)
         return ConvexParts((_vertices(whole, seed),), volume, com, inertia)
-    x = voxels.double()
-    hulls = _hulls(x.numpy(), divide(np.floor(x.numpy() / h)), surface, h)
+    hulls = _hulls(solid, divide(np.floor(solid.voxels / solid.h)))
+    x = torch.from_numpy(solid.voxels)
     com = x.mean(0)
     r = x - com
     eye = torch.eye(3, dtype=torch.float64)
-    inertia = volume * ((r.square().sum(1).mean() + h**2 / 6) * eye - r.mT @ r / len(r))
+    inertia = volume * ((r.square().sum(1).mean() + solid.h**2 / 6) * eye - r.mT @ r / len(r))
     return ConvexParts(tuple(_vertices(hull, seed) for hull in hulls), volume, com.float(), inertia.float())
 
 
@@ -96,8 +150,9 @@ def _solid_moments(hull: ConvexHull) -> tuple[float, Float[Tensor, "3"], Float[T
     return float(total), torch.from_numpy(middle + com).float(), torch.from_numpy(inertia).float()
 
 
-def _hulls(voxels: np.ndarray, part: np.ndarray, surface: np.ndarray, h: float) -> list[ConvexHull]:
+def _hulls(solid: Solid, part: np.ndarray) -> list[ConvexHull]:
     """The hull of each part: of the points of the surface at its voxels, and of its voxels that are away from these."""
+    voxels, h, surface = solid.voxels, solid.h, solid.surface
     near = cKDTree(voxels).query(surface, 8, distance_upper_bound=h)[1]
     of = np.append(part, -1)[near]
     inner = cKDTree(surface).query(voxels)[0] > 2 * h

@@ -156,7 +156,7 @@ def filled_voxels(scene: Scene, object_id: int, along: int, seed: int = 0) -> tu
     h = max(float((points.max(0) - points.min(0)).max()) / along, gap / 8, 1e-9)
     # as an object that stands, closed by the floor, or as one that hangs, with wider leaks: what fills more
     floors = (scene.floor, None) if scene.floor is not None else (None,)
-    bodies = [_closed_body(points, h, gap, floor, scene.cameras is not None)[:2] for floor in floors]
+    bodies = [_closed_body(points, h, gap, floor, photographed=False)[:2] for floor in floors]
     body, low = max(bodies, key=lambda found: found[0].sum())
     return torch.from_numpy((np.argwhere(body) + low + 0.5) * h).float(), h
 

@@ -13,6 +13,8 @@ import numpy as np
 
 MAX_OVERLAP = 0.5  # of parts that touch at the start, relative to the thickness of the thinner one
 NO_CONTACT = 1e3  # allowed overlap of parts that do not touch [units]
+MEMORY = 0.95  # of the largest overlap, in a substep: a contact that is missed once is not taken for a separation
+SEPARATED = 1e-3  # [units]
 
 
 class InitialOverlaps:
@@ -27,6 +29,7 @@ class InitialOverlaps:
         thickness = 2 * model.geom_size.min(1)  # of meshes the half sizes along the principal axes
         thickness[model.geom_type != mujoco.mjtGeom.mjGEOM_MESH] = np.inf
         self.allowed[self.allowed > MAX_OVERLAP * thickness[self._pairs].min(1)] = NO_CONTACT
+        self._recent = self.allowed.clip(max=1.0)  # overlap, as a maximum that decays
         self._row = np.full((model.ngeom, model.ngeom), -1, np.int32)
         for a, b in ((0, 1), (1, 0)):
             self._row[self._pairs[:, a], self._pairs[:, b]] = np.arange(len(self._pairs))
@@ -45,8 +48,9 @@ class InitialOverlaps:
         overlap = np.zeros(len(self._pairs))
         np.maximum.at(overlap, row[known], -contact.dist[known])
         free = ~fixed[self._bodies].all(1)
-        apart = (self.allowed < NO_CONTACT) | (overlap == 0)
-        self.allowed[free & apart] = np.minimum(self.allowed, overlap)[free & apart]
+        self._recent = np.maximum(overlap, MEMORY * self._recent, where=free, out=self._recent)
+        changed = free & ((self.allowed < NO_CONTACT) | (self._recent < SEPARATED))
+        self.allowed[changed] = np.minimum(self.allowed, self._recent)[changed]
         address = contact.efc_address[known]
         active = address >= 0
         data.efc_pos[address[active]] += self.allowed[row[known[active]]]

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 HELD_MASS = 1e6  # added inertia of a held body, relative to its own or the median mass, whichever is larger
-RELEASE_SPEED = 0.02  # [units]; that after a fall of 0.02 % of the smallest object
+RELEASE_SPEED = 0.1  # [units]; that after a fall of 0.5 % of the smallest object
 SUPPORT_GAP = 0.05  # gap up to which a body supports another, as photos show little of contact regions [units]
 SUPPORT_COSINE = 0.5  # least upward component of the normal of a contact that supports
 FREE, FALLING = 7, 6  # numbers of a free joint's coordinates and velocities

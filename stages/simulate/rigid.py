@@ -43,6 +43,7 @@ log = logging.getLogger(__name__)
 SUBSTEPS = 200  # substeps in a unit of time: that of falling half the size of the smallest object from rest
 CONTACT_SUBSTEPS = 12  # substeps during which bodies that collide touch
 REST_SPEED = 0.1  # normal speed below which contacts do not rebound [units]; a fall of 0.5 % of the smallest object
+PARTS_DAMPING = 0.4  # least damping ratio of bodies of several parts, of which contacts come and go during a collision
 IMPEDANCE = 0.99  # of a contact: 1 would be exact, but the forces between several contacts undetermined
 MAX_SUBSTEPS = 5_000  # in a frame
 MAX_TRAVEL = 0.05  # of the smallest object's size in a substep, so that nothing passes through it
@@ -74,6 +75,10 @@ class Body:
     mass: float
     start: Float[Tensor, "3"]  # centre of mass at the start
     pinned: bool
+
+    def damping(self, material: Material) -> float:
+        """Ratio to critical of a contact's damping. The energy lost in a cycle is 4 pi damping of that stored."""
+        return max(material.loss / 2, PARTS_DAMPING if len(self.parts.hulls) > 1 else 0.0)
 
 
 def rollout(
@@ -220,7 +225,7 @@ class _World:
             self.mass[row] = b.mass * m.density / b.material.density
             for geom in np.nonzero(model.geom_bodyid == row + 1)[0]:
                 model.geom_friction[geom, 0] = m.friction if options.friction is None else options.friction
-                model.geom_solref[geom, 1] = -m.loss * self._omega
+                model.geom_solref[geom, 1] = -2 * b.damping(m) * self._omega
                 model.geom_solmix[geom] = softest / m.E
         self._mujoco.mj_setConst(model, self._mujoco.MjData(model))
         free = {self._ids[i]: k for k, i in enumerate(self._free)}
@@ -345,12 +350,11 @@ def _add_body(mujoco, spec, name: str, b: Body, units: Units, omega: float, soft
     body.fullinertia = [float(inertia[r, c]) for r, c in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))]
     if not b.pinned:
         body.add_freejoint()
-    damping = b.material.loss / 2  # ratio to critical: the energy lost in a cycle is 4 pi damping of that stored
     for n, hull in enumerate(b.parts.hulls):
         vertices = (hull - b.parts.com).double() * unit / units.length
         mesh = spec.add_mesh(name=f"{name}_{n}", uservert=vertices.flatten().tolist())
         mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
         # negative: stiffness and damping themselves, of which MuJoCo takes the mean, weighted by solmix
         body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh.name, condim=3, friction=[b.friction, 0, 0],
-                      solref=[-(omega**2), -2 * damping * omega], solimp=impedance,
+                      solref=[-(omega**2), -2 * b.damping(b.material) * omega], solimp=impedance,
                       solmix=softest / b.material.E)  # fmt: skip

@@ -10,7 +10,6 @@ from stages.core.physics.materials import MODELS, Material, choose_materials
 from stages.core.scene.scene import Scene
 from stages.core.scene.trajectory import Keypoints
 from stages.simulate.options import AUTO, SimulateOptions
-from stages.simulate.setup import from_photos
 
 log = logging.getLogger(__name__)
 MAX_RIGID_SAG = 0.02  # largest compression under its own weight of a body that counts as rigid
@@ -20,9 +19,7 @@ def with_engine(options: SimulateOptions, scene: Scene, keypoints: Keypoints) ->
     """The options with an engine in place of `auto`.
 
     MPM if an object yields or flows, or has parts of different materials; else the learned field if one is softer than
-    MAX_RIGID_SAG, or if the scene was reconstructed from photos, since reconstructed objects overlap and would be
-    thrown apart as rigid bodies; else rigid bodies. Options of learned engines (weights, an integrator) select the
-    learned field.
+    MAX_RIGID_SAG; else rigid bodies. Options of learned engines (weights, an integrator) select the learned field.
     """
     if options.engine != AUTO:
         return options
@@ -39,8 +36,6 @@ def with_engine(options: SimulateOptions, scene: Scene, keypoints: Keypoints) ->
         engine, reason = "mpm", f"object {uneven[0].id} has parts of different materials"
     elif soft:
         engine, reason = "ngff", f"object {soft[0].id} is compressed by more than {MAX_RIGID_SAG:.0%} by its own weight"
-    elif from_photos(scene):
-        engine, reason = "ngff", "reconstructed objects overlap slightly"
     else:
         engine, reason = "rigid", "all objects are stiff"
     log.info("--engine %s, as %s", engine, reason)

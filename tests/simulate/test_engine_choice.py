@@ -25,12 +25,6 @@ def test_the_softest_object_decides(options, engine):
     assert chosen(**options) == engine
 
 
-def test_scenes_from_photos_take_the_learned_field():
-    scene = two_balls_scene()
-    photographed = replace(scene, provenance={"command": "segment", "scene": {"command": "reconstruct"}})
-    assert with_engine(SimulateOptions(), photographed, choose_keypoints(scene, 32)).engine == "ngff"
-
-
 def test_what_is_a_hundred_times_larger_is_softer():
     scene = two_balls_scene()
     large = replace(scene, scale={"metres_per_unit": 100.0})

@@ -74,11 +74,21 @@ def compare(prediction: Path, truth: Path, options: EvaluateOptions) -> Result:
     predicted, true = _same_frames(predicted, true, options, notes)
     motion = _same_points(predicted, true, pairs, notes)
     result = _result(motion, 1 / true.dt, MIN_MOTION / true_scene.scene.metres_per_unit, notes)
+    result = _with_plausibility(result, mine.plausibility or {}, [a.id for a, _ in pairs])
     if not options.report:
         return result
     from stages.evaluate.label_pictures import draw_objects  # imports Warp
 
     return draw_objects(result, mine.scene, options)
+
+
+def _with_plausibility(result: Result, measures: dict, ids: list[int]) -> Result:
+    """The result with what `ngff simulate` measured of the prediction, if the file has it; overall the largest."""
+    found = [measures.get("objects", {}).get(str(id), {}) for id in ids]
+    parts = {name: {**metrics, **more} for (name, metrics), more in zip(result.parts.items(), found, strict=True)}
+    largest = {name: max(f[name] for f in found if name in f) for name in dict.fromkeys(k for f in found for k in f)}
+    scene = {name: value for name, value in measures.items() if name != "objects"}
+    return replace(result, overall={**result.overall, **largest, **scene}, parts=parts)
 
 
 def _track(trajectory: Trajectory) -> Track:

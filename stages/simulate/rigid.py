@@ -167,6 +167,7 @@ class _World:
                  options: SimulateOptions):  # fmt: skip
         import mujoco  # noqa: PLC0415 -- slow to import
 
+        mujoco.set_mju_user_warning(log.debug)  # by default it writes a file where the command was started
         self._mujoco, self._bodies, self._dt = mujoco, bodies, options.dt
         self._scene, self._ids = scene, [o.id for o in scene.objects]
         self._held: dict[int, np.ndarray] = {}  # free bodies that are held during the simulation -> their pose

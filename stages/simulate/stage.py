@@ -23,6 +23,7 @@ from stages.core.scene.schema import number, reason, text, texts, whole
 from stages.core.scene.trajectory import SimulationInfo, TrajectoryWriter, read_trajectory
 from stages.simulate.engine_choice import for_engine, with_engine
 from stages.simulate.options import AUTO, ENGINES, SimulateOptions
+from stages.simulate.plausibility import PlausibilityMonitor
 
 log = logging.getLogger(__name__)
 MIN_EXTENT = 1e-5  # of an object, relative to its coordinates, which have 24 bits
@@ -57,15 +58,20 @@ def run(scene: Path, out: Path, options: SimulateOptions = SimulateOptions()) ->
 
         return run_live(LiveScene(world, keypoints, prompts, options, rollout), Path(out), motion)
     states = rollout(world, keypoints, prompts, options)
+    monitor = PlausibilityMonitor(world, keypoints, prompts, options)
     start, max_displacement = None, 0.0
     with TrajectoryWriter(out, world, motion, keypoints, bind_gaussians(world, keypoints)) as trajectory:
         for state in tqdm(states, total=options.steps, unit="frame"):
             trajectory.append(state.positions, state.com, state.rotation)
             trajectory.store_field(state.start)
+            monitor.add(state)
             start = state.positions if start is None else start
             displacement = float((state.positions - start).norm(dim=1).max())
             max_displacement = max(max_displacement, displacement)
+        measured = monitor.result()
+        trajectory.store_plausibility(measured)
         trajectory.store_provenance({**world.provenance, **seconds_since(began)})
+    monitor.warn(measured)
     size = float((keypoints.rest.amax(0) - keypoints.rest.amin(0)).max())
     if max_displacement < 0.02 * size and not prompts:
         log.info("everything is at rest (maximum displacement %.2g); try --lift 0.3 or a --force", max_displacement)

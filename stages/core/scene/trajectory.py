@@ -100,6 +100,7 @@ class Trajectory:
     path: Path
     dense: bool = False  # whether the file has every Gaussian in every frame
     field: FieldStart | None = None  # what the learned engine started from, where it made the motion
+    plausibility: dict | None = None  # measures of the simulation, {"objects": {id: {name: x}}, name: x}
 
     def __len__(self) -> int:
         return len(self.positions)
@@ -196,6 +197,12 @@ class TrajectoryWriter:
         if start is not None:
             write_field_start(self._file, start)
             self._raw.check()
+
+    def store_plausibility(self, measures: dict) -> None:
+        """Store what `ngff simulate` measured, a dict as in Trajectory.plausibility."""
+        self._raw.check()
+        self._file.attrs["plausibility"] = json.dumps(measures)
+        self._raw.check()
 
     def _close(self) -> None:
         self._file.close()
@@ -315,4 +322,18 @@ def _read(path: Path, file: h5py.File) -> Trajectory:
     forces = read_prompts(map(parse_json, texts), ids)
     dt, gravity = number(attributes["dt"], "dt", 1e-6, 1e4), numbers(attributes["gravity"], 3, "gravity")
     info = SimulationInfo(dt, gravity, quote(attributes["engine"]), forces)
-    return Trajectory(scene, info, keypoints, binding, *motion, path, dense, read_field_start(file, lengths))
+    measures = _read_plausibility(parse_json(str(attributes.get("plausibility", "{}"))))
+    return Trajectory(scene, info, keypoints, binding, *motion, path, dense, read_field_start(file, lengths), measures)
+
+
+def _read_plausibility(measures: object) -> dict | None:
+    """The measures of a file, or None where it has none; ValueError unless they are numbers from 0 by name."""
+    if not isinstance(measures, dict) or not isinstance(measures.get("objects", {}), dict):
+        raise ValueError("plausibility is not a JSON object with objects")
+    groups = {**measures.get("objects", {}), "": {k: v for k, v in measures.items() if k != "objects"}}
+    if not all(isinstance(group, dict) for group in groups.values()):
+        raise ValueError("plausibility has an object whose measures are not a JSON object")
+    read = {id: {quote(name, 40): number(value, "plausibility", 0) for name, value in group.items()}
+            for id, group in groups.items()}  # fmt: skip
+    overall = read.pop("")
+    return {"objects": read, **overall} if measures else None

@@ -1,0 +1,164 @@
+"""What a simulation that went wrong shows: penetration, energy gain, creep and spread, measured in every frame.
+
+penetration: deepest keypoint of an object inside another one or below the floor, beyond the depth at rest, relative to
+the smaller height of both.
+creep: speed in the last quarter of the time of an object that is slow in all of it [its size / s].
+spread: largest change of the root mean square distance of an object's keypoints from their mean, relative to rest.
+energy_gain: largest mechanical energy of all objects above that at the start, or after the last force, relative to the
+energy that was converted.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from functools import cache
+
+import numpy as np
+from scipy import ndimage
+
+from stages.core.geometry.rotations import matrix
+from stages.core.physics.forces import ForcePrompts
+from stages.core.physics.materials import MODELS, choose_materials
+from stages.core.physics.particles import filled_voxels
+from stages.core.physics.state import FrameState
+from stages.core.scene.scene import Scene
+from stages.core.scene.trajectory import Keypoints
+from stages.simulate.options import SimulateOptions
+
+log = logging.getLogger(__name__)
+BOUNDS = {"penetration": 0.03, "creep": 0.01, "spread": 0.1, "energy_gain": 0.05}  # beyond these a run is warned of
+VOXELS_ALONG = 24  # of the bodies in which depths are measured
+MAX_POINTS = 256  # keypoints of an object whose depth is measured
+SLOW = 0.1  # largest speed of what creeps, relative to that of a fall by half the object's size
+MOVED = 1e-3  # least displacement of one of two objects whose penetration is measured [size]
+
+
+class PlausibilityMonitor:
+    """Takes the frames of a run one by one; rows of objects follow scene.objects. Lengths in scene units."""
+
+    def __init__(self, scene: Scene, keypoints: Keypoints, prompts: ForcePrompts, options: SimulateOptions):
+        self._scene, self._prompts, self._options = scene, prompts, options
+        self._g = options.gravity / scene.metres_per_unit
+        self._rows = [(keypoints.object_id == o.id).nonzero()[:, 0] for o in scene.objects]
+        self._rest = [keypoints.rest[rows].double().numpy() for rows in self._rows]
+        self._few = [slice(None, None, -(-max(len(r), 1) // MAX_POINTS)) for r in self._rest]
+        self._size = np.array([np.ptp(r, axis=0).max() if len(r) else np.inf for r in self._rest])
+        self._height = np.array([np.ptp(r[:, 2]) if len(r) else np.inf for r in self._rest]).clip(1e-9)
+        self._floor = options.floor if options.floor is not None else scene.floor
+        self._body = cache(self._depth_function)
+        self._at_rest = cache(self._rest_depth)
+        count = len(scene.objects)
+        self.penetration, self._partner = np.zeros(count), [""] * count
+        self._spread = np.zeros(count)
+        self._com: list[np.ndarray] = []
+        self._energy: list[float] = []
+        self._before: tuple[list[np.ndarray], np.ndarray] | None = None
+
+    def add(self, state: FrameState) -> None:
+        """The next frame."""
+        x = state.positions.double().cpu().numpy()
+        points = [x[rows.numpy()] for rows in self._rows]
+        com, R = state.com.double().cpu().numpy(), matrix(state.rotation.double().cpu()).numpy()
+        if not self._com:
+            lift = np.array([[0.0, 0.0, self._prompts.lift.get(o.id, 0.0)] for o in self._scene.objects])
+            self._origin = com - lift
+        self._com.append(com)
+        for i, (p, rest) in enumerate(zip(points, self._rest, strict=True)):
+            if len(p):
+                self._spread[i] = max(self._spread[i], abs(_radius(p) / max(_radius(rest), 1e-12) - 1))
+        self._measure_penetration(points, com, R)
+        mass = np.ones(len(com)) if state.mass is None else state.mass.double().numpy()
+        if self._before is not None:
+            self._energy.append(self._mechanical_energy(points, self._before[0], mass))
+        self._before = points, com
+
+    def _measure_penetration(self, points: list[np.ndarray], com: np.ndarray, R: np.ndarray) -> None:
+        moved = np.linalg.norm(com - self._origin, axis=1) > MOVED * self._size
+        low = np.array([p.min(0) if len(p) else np.full(3, np.inf) for p in points])
+        high = np.array([p.max(0) if len(p) else np.full(3, -np.inf) for p in points])
+        for a in np.flatnonzero(moved):
+            if self._floor is not None and len(points[a]):
+                seen = max(0.0, self._floor - self._rest[a][:, 2].min())
+                self._record(a, self._floor - low[a, 2] - seen, self._height[a], "the floor")
+        near = ((low[:, None] < high) & (low < high[:, None])).all(-1) & (moved[:, None] | moved)
+        for a, b in zip(*np.nonzero(near), strict=True):
+            if a != b:
+                local = (points[a][self._few[a]] - com[b]) @ R[b] + self._origin[b]
+                depth = float(self._body(b)(local).max()) - self._at_rest(a, b)
+                smaller = min(self._height[a], self._height[b])
+                for i, other in ((a, b), (b, a)):
+                    o = self._scene.objects[other]
+                    self._record(i, depth, smaller, f"object {o.id} ({o.name})")
+
+    def _record(self, row: int, depth: float, height: float, partner: str) -> None:
+        if depth / height > self.penetration[row]:
+            self.penetration[row], self._partner[row] = depth / height, partner
+
+    def _rest_depth(self, a: int, b: int) -> float:
+        return max(0.0, float(self._body(b)(self._rest[a][self._few[a]]).max()))
+
+    def _depth_function(self, row: int):
+        """A function from points (k, 3), in the rest frame, to their depths below the surface of an object's body."""
+        voxels, h = filled_voxels(self._scene, self._scene.objects[row].id, VOXELS_ALONG, self._options.seed)
+        cells = np.floor(voxels.double().numpy() / h).astype(np.int64)
+        low = cells.min(0) - 2
+        full = np.zeros(cells.max(0) - low + 3, bool)
+        full[tuple((cells - low).T)] = True
+        depth = h * (ndimage.distance_transform_edt(full) - ndimage.distance_transform_edt(~full))
+        return lambda x: ndimage.map_coordinates(depth, (x / h - low - 0.5).T, order=1, mode="nearest") - h / 2
+
+    def _mechanical_energy(self, points: list[np.ndarray], before: list[np.ndarray], mass: np.ndarray) -> float:
+        """Kinetic and potential energy per unit of mass between two frames, by the keypoints [units^2 / s^2]."""
+        each = [(((p - q) ** 2).sum(1).mean() / (2 * self._options.dt**2) + self._g * (p + q)[:, 2].mean() / 2)
+                if len(p) else 0.0 for p, q in zip(points, before, strict=True)]  # fmt: skip
+        return float(mass @ np.array(each) / mass.sum())
+
+    def result(self) -> dict:
+        """The measures: of each object by its id, and of the whole scene."""
+        com, dt = np.array(self._com), self._options.dt
+        last = com[-max(2, len(com) // 4) :]
+        speed = np.linalg.norm(np.diff(last, axis=0), axis=2).max(0, initial=0) / dt
+        creep = np.linalg.norm(last[-1] - last[0], axis=1) / (max(len(last) - 1, 1) * dt) / self._size
+        creep[speed > SLOW * np.sqrt(abs(self._g) * self._size)] = 0
+        if len(com) < 8:
+            creep[:] = 0
+        measures = {"penetration": self.penetration, "creep": creep, "spread": self._spread}
+        objects = {str(o.id): {name: float(v[i]) for name, v in measures.items()}
+                   for i, o in enumerate(self._scene.objects)}  # fmt: skip
+        return {"objects": objects, "energy_gain": self._energy_gain()}
+
+    def _energy_gain(self) -> float:
+        ends = [f.end for f in self._prompts.forces] + [c.start for c in self._prompts.changes]
+        first = 0 if not ends else min(max(ends) / self._options.dt, math.inf)
+        energy = np.array(self._energy[math.ceil(first) :] if math.isfinite(first) else [])
+        if len(energy) < 2:
+            return 0.0
+        converted = max(energy[0] - energy.min(), 1e-3 * abs(self._g) * float(self._size.min()), 1e-12)
+        return float(max(energy.max() - energy[0], 0.0) / converted)
+
+    def warn(self, result: dict) -> None:
+        """Log what is out of bounds, with the objects and what to do."""
+        materials = choose_materials(self._scene.objects, self._options.material, self._options.materials)
+        other = "rigid or mpm" if self._options.engine not in ("rigid", "mpm") else (
+            "mpm" if self._options.engine == "rigid" else "rigid, or a higher --quality")  # fmt: skip
+        for row, o in enumerate(self._scene.objects):
+            found = result["objects"][str(o.id)]
+            what = f"object {o.id} ({o.name})"
+            if found["penetration"] > BOUNDS["penetration"]:
+                log.warning("%s sinks into %s by %.0f %% of the smaller height; compare with --engine %s",
+                            what, self._partner[row], 100 * found["penetration"], other)  # fmt: skip
+            if found["creep"] > BOUNDS["creep"]:
+                log.warning("%s does not come to rest: it creeps by %.1f %% of its size a second; compare with "
+                            "--engine %s", what, 100 * found["creep"], other)  # fmt: skip
+            elastic = not MODELS[materials[o.id].material.model].plastic
+            if found["spread"] > BOUNDS["spread"] and elastic:
+                log.warning("%s changes its size by %.0f %%; compare with --engine %s, or give a stiffer --material",
+                            what, 100 * found["spread"], other)  # fmt: skip
+        if result["energy_gain"] > BOUNDS["energy_gain"]:
+            log.warning("the objects gain %.0f %% of the energy that was converted; compare with --engine %s",
+                        100 * result["energy_gain"], other)  # fmt: skip
+
+
+def _radius(points: np.ndarray) -> float:
+    return float(np.sqrt(((points - points.mean(0)) ** 2).sum(1).mean()))

@@ -4,7 +4,7 @@ Reconstructed objects overlap by the errors of their surfaces, which contacts wo
 two parts have at the start is therefore no contact. The overlap allowed to them decreases with the overlap itself and
 never grows again, so that nothing is pushed apart, and what was once separated does not sink in again. Parts that
 overlap by more than half the thickness of the thinner one, where the direction of a contact says nothing, do not touch
-until they are separated.
+until they are separated; nor do parts that a lift put into others.
 """
 
 from __future__ import annotations
@@ -21,19 +21,31 @@ class InitialOverlaps:
     """The overlap allowed to each pair of geometries that overlapped at the start [units of the simulation]."""
 
     def __init__(self, mujoco, model, data):
-        """`data` has the contacts of the start."""
-        deep = data.contact.dist < 0
-        self._pairs, row = np.unique(np.sort(data.contact.geom[deep], 1), axis=0, return_inverse=True)
-        self.allowed = np.zeros(len(self._pairs))
-        np.maximum.at(self.allowed, row.ravel(), -data.contact.dist[deep])
+        """`data` has the contacts as seen in the photos, without lifts."""
+        self._model = model
         thickness = 2 * model.geom_size.min(1)  # of meshes the half sizes along the principal axes
         thickness[model.geom_type != mujoco.mjtGeom.mjGEOM_MESH] = np.inf
-        self.allowed[self.allowed > MAX_OVERLAP * thickness[self._pairs].min(1)] = NO_CONTACT
-        self._recent = self.allowed.clip(max=1.0)  # overlap, as a maximum that decays
-        self._row = np.full((model.ngeom, model.ngeom), -1, np.int32)
+        pairs, overlap = _overlaps(data)
+        overlap[overlap > MAX_OVERLAP * thickness[pairs].min(1)] = NO_CONTACT
+        self._set(pairs, overlap)
+
+    def _set(self, pairs: np.ndarray, allowed: np.ndarray) -> None:
+        self._pairs, self.allowed = pairs, allowed
+        self._recent = allowed.clip(max=1.0)  # overlap, as a maximum that decays
+        self._row = np.full((self._model.ngeom,) * 2, -1, np.int32)
         for a, b in ((0, 1), (1, 0)):
-            self._row[self._pairs[:, a], self._pairs[:, b]] = np.arange(len(self._pairs))
-        self._bodies = model.geom_bodyid[self._pairs]
+            self._row[pairs[:, a], pairs[:, b]] = np.arange(len(pairs))
+        self._bodies = self._model.geom_bodyid[pairs]
+
+    def add_lifted(self, data) -> None:
+        """Add the overlaps of the start, with lifts: parts that a lift put deeper into others do not touch at first."""
+        pairs, overlap = _overlaps(data)
+        row = self._row[pairs[:, 0], pairs[:, 1]]
+        known = row >= 0
+        deeper = known & (overlap > self.allowed[row] + SEPARATED)
+        self.allowed[row[deeper]] = NO_CONTACT
+        new = np.full((~known).sum(), NO_CONTACT)
+        self._set(np.concatenate([self._pairs, pairs[~known]]), np.concatenate([self.allowed, new]))
 
     def subtract(self, data, fixed: np.ndarray) -> None:
         """Subtract the allowed overlaps from those of the contacts; `fixed` masks bodies that do not move.
@@ -54,3 +66,12 @@ class InitialOverlaps:
         address = contact.efc_address[known]
         active = address >= 0
         data.efc_pos[address[active]] += self.allowed[row[known[active]]]
+
+
+def _overlaps(data) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs (k, 2) of geometries that overlap, and the deepest overlap of each."""
+    deep = data.contact.dist < 0
+    pairs, row = np.unique(np.sort(data.contact.geom[deep], 1), axis=0, return_inverse=True)
+    overlap = np.zeros(len(pairs))
+    np.maximum.at(overlap, row.ravel(), -data.contact.dist[deep])
+    return pairs, overlap

@@ -32,6 +32,7 @@ from stages.core.physics.materials import MODELS, Material, MaterialChoice
 from stages.core.physics.state import FrameState
 from stages.core.scene.scene import Scene
 from stages.core.scene.trajectory import Keypoints
+from stages.simulate.background import background_boxes
 from stages.simulate.changes import changed_options, changed_pins
 from stages.simulate.engine_choice import MAX_RIGID_SAG, sag
 from stages.simulate.initial_overlaps import InitialOverlaps
@@ -189,7 +190,9 @@ class _World:
         mass = sorted(b.mass for b in bodies)[len(bodies) // 2]
         self.units = Units(size, SUBSTEPS * options.dt / self.substeps, mass)
         box = [[unit * v / size for v in corner] for corner in (setup.box.low, setup.box.high)]
-        self.model = _model(mujoco, bodies, self.units, options, box if options.box else None, floor / size,
+        around = background_boxes(scene, setup.box.low[2]) if from_photos(scene) else []
+        around = [np.array(corners) * unit / size for corners in around]
+        self.model = _model(mujoco, bodies, self.units, options, box if options.box else None, floor / size, around,
                             self._omega)  # fmt: skip
         self.data = mujoco.MjData(self.model)
         self._free = [i for i, b in enumerate(bodies) if not b.pinned]
@@ -198,9 +201,14 @@ class _World:
         self.set_forces(prompts.forces, prompts.pinned)
         at_rest = self._at_rest(scene, setup, prompts, options)
         self._start = self.data.qpos.reshape(-1, FREE).copy()
+        lift = setup.lift.double().numpy()[self._free] * scene.metres_per_unit / size
+        self.data.qpos.reshape(-1, FREE)[:, :3] -= lift
         mujoco.mj_fwdPosition(self.model, self.data)
         self._overlaps = InitialOverlaps(mujoco, self.model, self.data)
         self._resting = self._resting_bodies(setup, at_rest)
+        self.data.qpos.reshape(-1, FREE)[:, :3] += lift
+        mujoco.mj_fwdPosition(self.model, self.data)
+        self._overlaps.add_lifted(self.data)
         self.release(i for i in self._free if i not in at_rest)
 
     def set_forces(self, forces: Sequence[Force], pinned: Collection[int]) -> None:
@@ -246,10 +254,9 @@ class _World:
         return [i for i in self._free if not setup.lift[i].any() and not any(prompts.velocity.get(self._ids[i], ()))]
 
     def _resting_bodies(self, setup: SceneSetup, at_rest: list[int]) -> RestingBodies:
-        """As the objects are in the photos, without lifts."""
+        """`data` has the objects as they are in the photos, without lifts."""
         unit = self._scene.metres_per_unit / self.units.length
         lift = setup.lift.double().numpy() * unit
-        self.data.qpos.reshape(-1, FREE)[:, :3] -= lift[self._free]
         self.model.geom_margin[:] = SUPPORT_GAP
         self._mujoco.mj_fwdPosition(self.model, self.data)
         stances = []
@@ -261,7 +268,6 @@ class _World:
             stances.append(Stance(b.friction, height, width / 2, bottom < ON_FLOOR))
         resting = RestingBodies(self.model, self.data, stances, [i + 1 for i in at_rest])
         self.model.geom_margin[:] = 0
-        self.data.qpos.reshape(-1, FREE)[:, :3] += lift[self._free]
         return resting
 
     def release(self, rows: Iterable[int]) -> None:
@@ -318,8 +324,12 @@ class _World:
             self.data.xfrc_applied[row + 1] += np.concatenate([force, torque])
 
 
-def _model(mujoco, bodies: list[Body], units: Units, options: SimulateOptions, box, floor: float, omega: float):
-    """MuJoCo's model: a body for each object, a mesh for each convex part, and a plane for the floor or each wall."""
+def _model(
+    mujoco, bodies: list[Body], units: Units, options: SimulateOptions, box, floor: float, around: list, omega: float
+):
+    """MuJoCo's model: a body for each object, a mesh for each convex part, a plane for the floor and each wall, and the
+    fixed boxes `around`, as pairs of corners.
+    """
     spec = mujoco.MjSpec()
     spec.option.timestep = 1 / SUBSTEPS
     spec.option.gravity = [0, 0, -options.gravity * units.time**2 / units.length]
@@ -333,11 +343,13 @@ def _model(mujoco, bodies: list[Body], units: Units, options: SimulateOptions, b
     if box:
         planes += [(box[side], tuple((-1.0 if side else 1.0) * (a == axis) for a in range(3)))
                    for axis in range(3) for side in (0, 1) if (axis, side) != (2, 0)]  # fmt: skip
+    fixed = {"condim": 3, "friction": [0, 0, 0], "solmix": 0, "solimp": impedance, "solref": [-(omega**2), 0]}
     for at, normal in planes:
         quat = np.zeros(4)
         mujoco.mju_quatZ2Vec(quat, np.array(normal))
-        spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], pos=at, quat=quat, condim=3,
-                                friction=[0, 0, 0], solmix=0, solimp=impedance, solref=[-(omega**2), 0])  # fmt: skip
+        spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], pos=at, quat=quat, **fixed)
+    for low, high in around:
+        spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=(high - low) / 2, pos=(low + high) / 2, **fixed)
     for i, b in enumerate(bodies):
         _add_body(mujoco, spec, f"body{i}", b, units, omega, softest, impedance)
     return spec.compile()

@@ -1,0 +1,66 @@
+"""The background of a scene of photos as fixed boxes: what stands around the objects and is not one of them.
+
+The opaque Gaussians above the floor are counted in voxels. Voxels next to an object, which may be its halo, and small
+groups of voxels are left out; the rest is merged into boxes.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import ndimage
+
+from stages.core.physics.particles import usable
+from stages.core.scene.scene import Scene
+
+VOXELS_ALONG = 64  # voxels along the region that is examined
+REACH = 0.5  # of the region beyond the objects, relative to their extent
+MIN_OPACITY = 0.5
+MIN_COUNT = 2  # Gaussians in a full voxel
+MIN_HEIGHT = 2  # voxels above the floor that are left out: the floor is a plane
+MIN_GROUP = 20  # voxels of the smallest group
+Box = tuple[tuple[float, float, float], tuple[float, float, float]]
+
+
+def background_boxes(scene: Scene, floor: float) -> list[Box]:
+    """Lower and upper corners of boxes, in scene units."""
+    g = scene.gaussians.to("cpu")
+    good = usable(g) & (g.opacities > MIN_OPACITY)
+    means, own = g.means[good].double().numpy(), (g.object_id[good] > 0).numpy()
+    if not own.any():
+        return []
+    low, high = np.quantile(means[own], [0.01, 0.99], axis=0)
+    reach = REACH * float((high - low).max())
+    low, high = low - reach, high + reach
+    h = float((high - low).max()) / VOXELS_ALONG
+    low[2] = floor
+    cells = np.floor((means - low) / h).astype(np.int64)
+    shape = np.ceil((high - low) / h).astype(np.int64).clip(1)
+    inside = ((cells >= 0) & (cells < shape)).all(1)
+    count, objects = (np.zeros(shape, np.int32) for _ in range(2))
+    np.add.at(count, tuple(cells[inside & ~own].T), 1)
+    np.add.at(objects, tuple(cells[inside & own].T), 1)
+    full = (count >= MIN_COUNT) & ~ndimage.binary_dilation(objects > 0, np.ones((3, 3, 3)))
+    full[:, :, :MIN_HEIGHT] = False
+    groups, number = ndimage.label(full, np.ones((3, 3, 3)))
+    large = np.bincount(groups.ravel(), minlength=number + 1) >= MIN_GROUP
+    large[0] = False
+    return [(tuple(low + h * np.array(a)), tuple(low + h * np.array(b))) for a, b in merged(large[groups])]
+
+
+def merged(full: np.ndarray) -> list[tuple[tuple[int, ...], tuple[int, ...]]]:
+    """Boxes of cells, first and one beyond the last, that cover the full cells once: each grown in z, y and then x."""
+    left, boxes = full.copy(), []
+    for x, y, z in np.argwhere(full):
+        if not left[x, y, z]:
+            continue
+        first, last = (x, y, z), [x + 1, y + 1, z + 1]
+        for axis in (2, 1, 0):
+            while last[axis] < full.shape[axis]:
+                at = [slice(a, b) for a, b in zip(first, last, strict=True)]
+                at[axis] = slice(last[axis], last[axis] + 1)
+                if not left[tuple(at)].all():
+                    break
+                last[axis] += 1
+        left[tuple(slice(a, b) for a, b in zip(first, last, strict=True))] = False
+        boxes.append((first, tuple(last)))
+    return boxes

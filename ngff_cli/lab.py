@@ -18,7 +18,7 @@ from ngff_cli.options import (
     set_up_logging,
     terminate_as_interrupted,
 )
-from stages.lab.fit.options import FitOptions
+from stages.lab.fit.options import MaterialFitOptions
 from stages.lab.questionnaire.options import StudyOptions
 
 app = typer.Typer(cls=CommandGroup, no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False)
@@ -270,26 +270,26 @@ def fit(
         Path, typer.Option("-o", "--out", help="materials for `ngff simulate --materials` to write (.json)")
     ] = Path("materials.json"),
     engine: Annotated[str, typer.Option(help="auto | rigid | mpm | ngff: through which motions are compared")] = "auto",
-    quality: Annotated[str, typer.Option(help="of --engine mpm: draft | normal | high")] = FitOptions.quality,
+    quality: Annotated[str, typer.Option(help="of --engine mpm: draft | normal | high")] = MaterialFitOptions.quality,
     material: Annotated[
         list[str], typer.Option(help="OBJECT=MATERIAL where the search starts, and where it stays if the motion shows "
                                 "nothing; repeatable")
     ] = [],  # noqa: B006
-    keypoints: Annotated[int, typer.Option(help="keypoints compared per object")] = FitOptions.keypoints,
-    frames: Annotated[int, typer.Option(help="frames of the track; 0: all")] = FitOptions.frames,
+    keypoints: Annotated[int, typer.Option(help="keypoints compared per object")] = MaterialFitOptions.keypoints,
+    frames: Annotated[int, typer.Option(help="frames of the track; 0: all")] = MaterialFitOptions.frames,
     noise: Annotated[
         float, typer.Option(help="standard deviation of the track's errors [scene units]; 0: estimated from it")
-    ] = FitOptions.noise,
-    evaluations: Annotated[int, typer.Option(help="largest number of simulations")] = FitOptions.evaluations,
-    minutes: Annotated[float, typer.Option(help="longest time of the search [min]")] = FitOptions.minutes,
-    workers: Annotated[int, typer.Option(help="processes")] = FitOptions.workers,
-    seed: Seed = FitOptions.seed,
-    device: Device = FitOptions.device,
+    ] = MaterialFitOptions.noise,
+    evaluations: Annotated[int, typer.Option(help="largest number of simulations")] = MaterialFitOptions.evaluations,
+    minutes: Annotated[float, typer.Option(help="longest time of the search [min]")] = MaterialFitOptions.minutes,
+    workers: Annotated[int, typer.Option(help="processes")] = MaterialFitOptions.workers,
+    seed: Seed = MaterialFitOptions.seed,
+    device: Device = MaterialFitOptions.device,
 ) -> None:
     """Find materials and start velocities of objects from their tracked motion."""
     from stages.lab.fit.fit import run
 
-    options = FitOptions(
+    options = MaterialFitOptions(
         engine=engine, quality=quality, material=tuple(material), keypoints=keypoints, frames=frames, noise=noise,
         evaluations=evaluations, minutes=minutes, workers=workers, seed=seed, device=device,
     )  # fmt: skip

@@ -33,7 +33,7 @@ def reconstruct_two_balls(photos, options, steps) -> Reconstruction:
 
 
 def hold_still(scene, keypoints, prompts, options) -> Iterator[FrameState]:
-    """The engine `ngff` of `simulate` during this test: two frames without motion."""
+    """The engine `rigid` of `simulate` during this test: two frames without motion."""
     centres = torch.stack([keypoints.rest[keypoints.object_id == o.id].mean(0) for o in scene.objects])
     for _ in range(2):
         yield FrameState(keypoints.rest, centres, torch.tensor([[1.0, 0, 0, 0]]).repeat(len(scene.objects), 1))
@@ -43,7 +43,7 @@ def hold_still(scene, keypoints, prompts, options) -> Iterator[FrameState]:
 def folder(tmp_path, monkeypatch, two_balls):
     """The current folder, with the files that the blocks begin with."""
     monkeypatch.setitem(BACKENDS, "classic", f"{__name__}:reconstruct_two_balls")
-    monkeypatch.setitem(ENGINES, "ngff", Engine(f"{__name__}:hold_still", "", weights="ngff"))
+    monkeypatch.setitem(ENGINES, "rigid", Engine(f"{__name__}:hold_still", ""))
     monkeypatch.chdir(tmp_path)
     (tmp_path / "photos").mkdir()
     for name in ("a.jpg", "b.jpg"):
@@ -54,7 +54,7 @@ def folder(tmp_path, monkeypatch, two_balls):
 def test_readme_goes_from_photos_to_a_video(folder):
     exec(BLOCKS["README.md"], {})
     trajectory = read_trajectory(folder / "traj.h5")
-    assert len(trajectory) == 2 and trajectory.info.engine == "ngff"
+    assert len(trajectory) == 2 and trajectory.info.engine == "rigid"
     assert (folder / "scene.ply").exists() and (folder / "traj_novel.mp4").exists()
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from stages.core.scene.files import provenance, replacing
-from stages.lab.fit.options import FitOptions
+from stages.lab.fit.options import MaterialFitOptions
 from stages.lab.fit.parameters import AXES, QUANTITIES, Parameter, as_json, fitted
 from stages.lab.fit.problem import Problem, read_problem
 from stages.lab.fit.search import deviations, search, simulations
@@ -51,7 +51,7 @@ class Fit:
                          for k, p in enumerate(self.problem.parameters)])  # fmt: skip
 
 
-def run(scene: Path, track: Path, out: Path, options: FitOptions) -> list[str]:
+def run(scene: Path, track: Path, out: Path, options: MaterialFitOptions) -> list[str]:
     """Write OUT for `ngff simulate --materials OUT`, and OUT's name with .fit.json with intervals; lines of text.
 
     Raises InputError for a track that is not of the scene, and MissingPackage without the package cma.
@@ -72,7 +72,7 @@ def run(scene: Path, track: Path, out: Path, options: FitOptions) -> list[str]:
     return [*describe(fit), _command(Path(scene), out, fit, velocity)]
 
 
-def solve(problem: Problem, options: FitOptions) -> Fit:
+def solve(problem: Problem, options: MaterialFitOptions) -> Fit:
     """Search for the parameters, and find how well the motion tells them."""
     log.info("%d parameters of %d objects, --engine %s, %d frames", len(problem.parameters), len(problem.moving),
              problem.options.engine, len(problem.track))  # fmt: skip

@@ -7,7 +7,7 @@ from stages.core.errors import InputError
 
 
 @dataclass(frozen=True)
-class FitOptions:
+class MaterialFitOptions:
     """What is fitted, through which engine, and for how long."""
 
     engine: str = "auto"

@@ -23,7 +23,7 @@ from stages.core.physics.materials import Material, choose_materials
 from stages.core.scene.scene import Scene
 from stages.core.scene.scene_ply import read_scene
 from stages.core.scene.trajectory import Keypoints, Trajectory, read_trajectory
-from stages.lab.fit.options import FitOptions
+from stages.lab.fit.options import MaterialFitOptions
 from stages.lab.fit.parameters import (
     AXES,
     OF_ENGINE,
@@ -114,14 +114,14 @@ class Problem:
         return replace(self, track=self.track[:frames], options=options)
 
 
-def read_problem(scene: Path, track: Path, options: FitOptions) -> Problem:
+def read_problem(scene: Path, track: Path, options: MaterialFitOptions) -> Problem:
     """Pose the problem of a scene file and a trajectory file. Raises InputError where they do not fit each other."""
     truth = read_trajectory(track)
     return pose_problem(read_scene(scene), truth, stored_prompts(track, read_scene(scene).objects), options, str(track))
 
 
 def pose_problem(
-    scene: Scene, truth: Trajectory, prompts: ForcePrompts, options: FitOptions, where: str = "the track"
+    scene: Scene, truth: Trajectory, prompts: ForcePrompts, options: MaterialFitOptions, where: str = "the track"
 ) -> Problem:
     """The problem of a scene and a track of its objects; `prompts` tell the forces, pins and lifts, but not velocities.
 
@@ -167,7 +167,7 @@ def estimate_noise(track: Float[Tensor, "t k 3"]) -> float:
     return float(third.flatten(1)[:, moving].median()) / 0.6745 / 20**0.5 if bool(moving.any()) else 0.0
 
 
-def _spread(keypoints: Keypoints, object_id: int, options: FitOptions) -> Tensor:
+def _spread(keypoints: Keypoints, object_id: int, options: MaterialFitOptions) -> Tensor:
     """Rows of at most `options.keypoints` keypoints of an object, far from each other."""
     rows = (keypoints.object_id == object_id).nonzero()[:, 0]
     return rows[farthest_points(keypoints.rest[rows], options.keypoints, options.seed)].sort().values

@@ -23,7 +23,7 @@ from scipy.optimize import least_squares
 from tqdm import tqdm
 
 from stages.core.errors import MissingPackage
-from stages.lab.fit.options import FitOptions
+from stages.lab.fit.options import MaterialFitOptions
 from stages.lab.fit.problem import Problem
 
 log = logging.getLogger(__name__)
@@ -86,7 +86,7 @@ def simulations(problem: Problem, workers: int) -> Iterator[Simulations]:
         yield Simulations(problem, pool.map)
 
 
-def search(sims: Simulations, options: FitOptions) -> Found:
+def search(sims: Simulations, options: MaterialFitOptions) -> Found:
     """Fit longer and longer beginnings of the track. Raises MissingPackage without the package cma."""
     begun, total = time.perf_counter(), len(sims.problem.track)
     x = np.array([p.coordinate(p.start) for p in sims.problem.parameters])
@@ -127,7 +127,7 @@ def _descend(sims: Simulations, frames: int, x: np.ndarray) -> np.ndarray:
     return found.x if after < before else x
 
 
-def _evolve(sims: Simulations, frames: int, x: np.ndarray, seconds: float, options: FitOptions) -> np.ndarray:
+def _evolve(sims: Simulations, frames: int, x: np.ndarray, seconds: float, options: MaterialFitOptions) -> np.ndarray:
     """The best of some generations of CMA-ES, whose first spread is what the beginning leaves open."""
     try:
         import cma  # noqa: PLC0415 -- only a fit needs it

@@ -16,7 +16,7 @@ from stages.core.scene.scene_ply import read_scene, write_scene
 from stages.core.scene.trajectory import TrajectoryWriter, read_trajectory
 from stages.lab.bench.physics_experiments import Run, ball, block
 from stages.lab.fit.fit import solve
-from stages.lab.fit.options import FitOptions
+from stages.lab.fit.options import MaterialFitOptions
 from stages.lab.fit.parameters import fitted, material_parameters, velocity_parameters
 from stages.lab.fit.problem import estimate_noise, pose_problem, read_problem
 from stages.lab.fit.search import _evolve, simulations
@@ -26,7 +26,7 @@ from tests.conftest import CliRunner
 
 NOISE = 0.002  # of the tracks [m]
 TRUTH = {"E": 1e7, "density": 540.0, "friction": 0.3, "loss": 0.35}
-OPTIONS = FitOptions(workers=1, keypoints=16, evaluations=400)
+OPTIONS = MaterialFitOptions(workers=1, keypoints=16, evaluations=400)
 
 
 def make_track(folder, thing, noise=NOISE, **options):

@@ -12,11 +12,9 @@ from stages.segment.object_scale import parse_object_scale
 
 # a backend takes (scene, SegmentOptions) and returns the scene with labels and objects
 BACKENDS = {
+    "learned": Backend("stages.segment.learned:segment", "objects by a network trained on simulated clutter"),
     "geometric": Backend(
         "stages.segment.geometric:segment", "objects on the supporting plane, by position, colour and shape"
-    ),
-    "learned": Backend(
-        "stages.segment.learned:segment", "objects by a network trained on simulated clutter (in development)",
     ),
     "masks": Backend("stages.segment.masks:segment", "label images of the photos (--masks), voted over all views"),
     "boxes": Backend("stages.segment.boxes:segment", "bounding boxes in the first view (--boxes), cut out by colour"),
@@ -32,7 +30,7 @@ NETWORKS = with_weights(BACKENDS)
 class SegmentOptions:
     """Parameters of segmentation; raises InputError for values outside their range and for conflicting ones."""
 
-    backend: str = "geometric"  # --masks and --boxes select their own backend, unless this is a network
+    backend: str = "learned"  # --masks and --boxes select their own backend, unless this is a network
     masks: Path | None = None  # folder of label images, named as the photos: 0 background, 1... the objects
     boxes: Path | None = None  # prompts.json in the public format: boxes (for networks also points) in the first photo
     photos: Path | None = None  # folder of the scene's photos, for networks; by default the scene is rendered

@@ -121,11 +121,11 @@ def with_objects(scene: Scene, path: Path) -> Scene:
         return replace(scene, objects=tuple(present))
     if scene.gaussians.object_id.any():
         raise InputError(f"{path}: its objects are points, which cannot be simulated; label it with `ngff segment`")
-    from stages.core.perception.segmentation import segment_by_geometry  # noqa: PLC0415 -- only unlabelled scenes need it
+    from stages.core.models.segmenter.segment import segment_by_network  # noqa: PLC0415 -- only unlabelled scenes need it
 
-    grouped = segment_by_geometry(scene)
+    grouped = segment_by_network(scene)
     if not grouped.objects or not torch.any(grouped.gaussians.object_id > 0):
         raise InputError(f"{path}: no objects were found in it; label them with `ngff segment`")
     names = ", ".join(f"{o.id} ({o.name})" for o in grouped.objects)
-    log.info("%s has no objects yet; segmented it by geometry into %d: %s", path, len(grouped.objects), names)
+    log.info("%s has no objects yet; found %d: %s", path, len(grouped.objects), names)
     return grouped

@@ -6,7 +6,7 @@ import itertools
 import json
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -21,15 +21,17 @@ from stages.core.models.segmenter.network import Segmenter, pyramid
 from stages.core.models.segmenter.outlines import cut_outlines
 from stages.core.models.segmenter.surfels import scene_surfels
 from stages.core.models.segmenter.voxels import SCALES, ScenePoints, VoxelGrid, voxelise
-from stages.core.perception.support import Support
+from stages.core.perception.grouping import name_objects
+from stages.core.perception.support import Support, find_support, view_extent
 from stages.core.scene.scene import Scene
 
 WEIGHTS = Path(__file__).parent / "segmenter.safetensors"
 MAX_VOXELS = 80_000  # nearest to the focus
 MAX_BASE_HEIGHT = 0.4  # of an object's lowest points above the surface [camera distance]
 MAX_BASE_DEPTH = 0.05  # of an object's lowest points below the surface; what stands on the floor is lower
-OBJECT_COST = 0.3  # least IoU that a candidate must be expected to have; chosen on simulated scenes
-SIZE_POWER = 0.5  # weight of n surfels: n**SIZE_POWER. 0 prefers parts, 1 merged objects; chosen on simulated scenes
+OBJECT_COST = 0.5  # least IoU that a candidate must be expected to have; chosen on simulated scenes
+SIZE_POWER = 0.75  # weight of n surfels: n**SIZE_POWER. 0 prefers parts, 1 merged objects; chosen on simulated scenes
+MAX_SIZE = 0.7  # longest side of an object; the largest of the training have 0.6 [camera distance]
 MIN_GAUSSIANS = 30  # of an object
 MAX_OVERLAP = 0.25  # of two objects, of the smaller
 
@@ -38,7 +40,7 @@ MAX_OVERLAP = 0.25  # of two objects, of the smaller
 class SegmenterOptions:
     """What counts as an object."""
 
-    max_objects: int = 64
+    max_objects: int = 24
     min_size: float = 0.03  # along its longest side [camera distance]
 
 
@@ -59,6 +61,21 @@ def load_segmenter(path: Path) -> Segmenter:
     model = Segmenter(tuple(config["widths"]), config["blocks"])
     model.load_state_dict({k: v.float() for k, v in load_file(path).items()})
     return model.eval()
+
+
+def segment_by_network(
+    scene: Scene,
+    options: SegmenterOptions = SegmenterOptions(),  # noqa: B008 -- frozen
+    weights: Path | None = None,
+    seed: int = 0,
+) -> Scene:
+    """The scene with an object_id for every Gaussian (0 for the background) and its objects, largest first.
+
+    `seed` is of the search for the supporting surface. Raises InputError if there are no weights at `weights`.
+    """
+    support = find_support(scene, view_extent(scene), seed)
+    ids = object_ids(scene, load_segmenter(find(weights)), support, options)
+    return name_objects(replace(scene, gaussians=replace(scene.gaussians, object_id=ids)), support)
 
 
 @torch.no_grad()
@@ -128,7 +145,8 @@ def find_at(surfels: ScenePoints, scale: float, model: Segmenter, options: Segme
     inside = torch.bincount(grid.owner, minlength=len(grid))[candidates.voxels]  # surfels of each leaf
     weight = torch.from_numpy(candidates.tree.sums(inside[:, None].numpy())[:, 0]) ** SIZE_POWER
     gain = weight * (model.score(candidates.features).sigmoid() - OBJECT_COST)
-    usable = (candidates.sizes > MIN_VOXELS - 0.5) & (candidates.extents >= scale * options.min_size)
+    extents = candidates.extents / scale
+    usable = (candidates.sizes > MIN_VOXELS - 0.5) & (extents >= options.min_size) & (extents <= MAX_SIZE)
     nodes = candidates.tree.best(torch.where(usable, gain, -1.0).double().numpy())
     own = torch.full((len(grid),), -1)
     own[candidates.voxels] = torch.from_numpy(candidates.tree.labels(nodes))

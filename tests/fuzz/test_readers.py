@@ -100,7 +100,7 @@ def test_links_are_not_followed(tmp_path, target):
 
 def test_json_is_bounded_and_quoted_text_too():
     assert parse_json("[" * (MAX_JSON_DEPTH - 1) + "]" * (MAX_JSON_DEPTH - 1))
-    for text in ("[" * (MAX_JSON_DEPTH + 1) + "]" * (MAX_JSON_DEPTH + 1), "[" * 10**5, "NaN", "1e999", "9" * 30):
+    for text in ("[" * (MAX_JSON_DEPTH + 1) + "]" * (MAX_JSON_DEPTH + 1), "[" * 10**5, "NaN", "1e999", "9" * 20):
         with pytest.raises(ValueError) as caught:
             parse_json(text)
         assert len(str(caught.value)) < 120

@@ -215,7 +215,8 @@ def test_what_flies_too_far_for_a_grid_is_named(balls, monkeypatch, caplog):
 @pytest.mark.parametrize("options, message", [
     ({"quality": "best"}, "draft, normal, high"), ({"steps": 0}, "at least 1"), ({"dt": 0.0}, "--dt"),
     ({"gravity": float("nan")}, "--gravity"), ({"friction": -1.0}, "--friction"), ({"keypoints": 2}, "--keypoints"),
-    ({"floor": float("inf")}, "--floor"),
+    ({"floor": float("inf")}, "--floor"), ({"port": 8000}, "only with --live"),
+    ({"browser": False}, "only with --live"),
 ])  # fmt: skip
 def test_invalid_options(options, message):
     with pytest.raises(InputError, match=message):

@@ -11,6 +11,7 @@ from stages.core.errors import InputError, MissingPackage
 from stages.core.scene.images import (
     VideoWriter,
     list_photos,
+    read_8_bit,
     read_image,
     read_labels,
     read_video,
@@ -34,8 +35,9 @@ def test_grey_alpha_and_16_bit_images_are_read_as_rgb(tmp_path, pixels):
     torch.testing.assert_close(read_image(tmp_path / "a.png"), torch.full((3, 3, 3), 128 / 255))
 
 
-def test_label_round_trip_with_16_bits(tmp_path):
-    labels = torch.tensor([[0, 1], [300, 2]])
+@pytest.mark.parametrize("largest", [256, 300, 65535])
+def test_label_round_trip_with_16_bits(tmp_path, largest):
+    labels = torch.tensor([[0, 1], [largest, 2]])
     write_labels(tmp_path / "l.png", labels)
     assert torch.equal(read_labels(tmp_path / "l.png"), labels)
 
@@ -89,3 +91,10 @@ def test_absent_av_is_reported_for_videos(tmp_path, monkeypatch):
     with pytest.raises(MissingPackage, match="a.mp4: videos need"):
         next(read_video(tmp_path / "a.mp4"))
     assert [p.name for p in tmp_path.iterdir()] == ["a.mp4"]
+
+
+@pytest.mark.parametrize("pixels", [np.full((3, 4, 3), 128, np.uint8), np.full((3, 4, 3), 32896, np.uint16)])
+def test_8_bit_photos_are_those_of_read_image(tmp_path, pixels):
+    pixels[..., 0] = 7
+    cv2.imwrite(str(tmp_path / "a.png"), pixels)
+    assert torch.equal(read_8_bit(tmp_path / "a.png"), (read_image(tmp_path / "a.png") * 255).round().byte())

@@ -93,12 +93,37 @@ def test_packed_layout_decodes_to_the_same_gaussians(shared):
     torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-6)
 
 
-def test_non_finite_rows_are_dropped_and_counted(tmp_path, caplog):
-    g = random_gaussians(5)
-    g.means[2, 0] = torch.nan
+def test_rows_that_are_not_finite_or_far_too_large_are_dropped_and_counted(tmp_path, caplog):
+    g = random_gaussians(6)
+    g.means[0, 0], g.means[1, 1], g.scales[2, 0], g.quats[3] = torch.nan, 1e12, 1e12, 0.0
     write_scene(tmp_path / "s.ply", Scene(g))
-    assert len(read_scene(tmp_path / "s.ply").gaussians) == 4
-    assert "dropped 1" in caplog.text
+    assert torch.equal(read_scene(tmp_path / "s.ply").gaussians.means, g.means[4:])
+    assert "dropped 4" in caplog.text
+
+
+def test_packed_values_are_fractions_between_the_bounds_of_their_chunk(tmp_path):
+    """Gaussian 0 has the lowest values and 300, in the second chunk, the highest; w, then z, is the omitted one."""
+    n, ends = 301, ((-1.0, 3.0), (-5.0, 7.0))
+    chunk = np.zeros(2, [(f"{end}_{part}{axis}", "<f4") for part in ("", "scale_") for end in ("min", "max")
+                         for axis in "xyz"])  # fmt: skip
+    for i, (low, high) in enumerate(ends):
+        for axis in "xyz":
+            chunk[f"min_{axis}"][i], chunk[f"max_{axis}"][i] = low, high
+            chunk[f"min_scale_{axis}"][i], chunk[f"max_scale_{axis}"][i] = low - 9, high - 9
+    names = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
+    vertex = np.zeros(n, [(name, "<u4") for name in names])
+    vertex["packed_rotation"] = 511 << 20 | 511 << 10 | 511  # w, as nearly as 10 bits allow
+    vertex["packed_rotation"][300] = 3 << 30 | 511 << 20 | 511 << 10 | 511
+    vertex["packed_position"][300], vertex["packed_scale"][300], vertex["packed_color"][300] = [2**32 - 1] * 3
+    vertex["packed_position"][1] = 1024 << 21 | 512 << 11 | 256
+    PlyData([PlyElement.describe(chunk, "chunk"), PlyElement.describe(vertex, "vertex")]).write(tmp_path / "p.ply")
+    g = read_scene(tmp_path / "p.ply").gaussians
+    torch.testing.assert_close(g.means[[0, 300]], torch.tensor([[-1.0] * 3, [7.0] * 3]))
+    torch.testing.assert_close(g.means[1], -1 + 4 * torch.tensor([1024 / 2047, 512 / 1023, 256 / 2047]))
+    torch.testing.assert_close(g.scales[[0, 300]].log(), torch.tensor([[-10.0] * 3, [-2.0] * 3]))
+    torch.testing.assert_close(g.quats[[0, 300]], torch.eye(4)[[0, 3]], atol=2e-3, rtol=0)
+    torch.testing.assert_close(g.opacities[[0, 300]], torch.tensor([1 / 512, 1 - 1 / 512]))
+    torch.testing.assert_close(g.sh[[0, 300], 0] * 0.28209479177387814 + 0.5, torch.tensor([[0.0] * 3, [1.0] * 3]))
 
 
 def write_invalid_files(folder):

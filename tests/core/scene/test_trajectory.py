@@ -103,6 +103,8 @@ def damage(path, scene, how: str):
             file["objects/id"][:] = 1
         elif how == "weights":
             file["binding/weight"][3] = 0.2
+        elif how == "index":
+            file["binding/index"][3, 0] = 10
         elif how == "quats":
             file["gaussians/quats"][5] = 2.0
         elif how == "rotation":
@@ -113,6 +115,7 @@ def damage(path, scene, how: str):
     ("how", "message"),
     [("text", "not a readable HDF5"), ("format", "format attribute"), ("part", "missing"), ("nan", "not finite"),
      ("frames", "other datasets need"), ("ids", "object 1 is there twice"), ("weights", "does not sum to 1"),
+     ("index", "binding does not fit the 1700 Gaussians and 10 keypoints"),
      ("quats", "gaussians/quats has a quaternion that is not of length 1"), ("rotation", "objects/rotation has a")],
 )  # fmt: skip
 def test_damaged_files_are_refused_in_one_line(tmp_path, two_balls, how, message):

@@ -351,3 +351,26 @@ def bench_complete(
 
     options = CompleteBenchOptions(scenes=tuple(scene), known=known, seed=seed)
     print_results(lambda path: run(path, options), out, as_json)
+
+
+@app.command("fit")
+def bench_fit(
+    scenes: Annotated[int, typer.Option(help="number of scenes")] = 20,
+    only: Annotated[str, typer.Option(help="slide | bounce | collision | soft; default: in turn")] = "",
+    noise: Annotated[float, typer.Option(help="standard deviation of the tracks' errors [m]")] = 0.002,
+    evaluations: Annotated[int, typer.Option(help="largest number of simulations of a scene")] = 1500,
+    minutes: Annotated[float, typer.Option(help="longest time of a scene [min]")] = 10.0,
+    workers: Annotated[int, typer.Option(help="processes")] = 2,
+    out: Out = None,
+    seed: Seed = 0,
+    device: Device = "auto",
+    as_json: AsJson = False,
+) -> None:
+    """Materials from motion: errors on scenes of known materials, and of the prediction of another motion."""
+    from stages.lab.bench.fit import FitBenchOptions, run
+
+    options = FitBenchOptions(
+        scenes=scenes, only=only, noise=noise, evaluations=evaluations, minutes=minutes, workers=workers, seed=seed,
+        device=device,
+    )  # fmt: skip
+    print_results(lambda path: run(path, options), out, as_json)

@@ -34,7 +34,7 @@ PULL = 0.01  # towards the start, of what a beginning tells nothing about
 PRECISION, FALL = 1e-3, 1e-3  # of CMA-ES: step [ranges] and change of the cost at which it ends
 GENERATIONS = 15  # of CMA-ES for a beginning
 ENOUGH = 1.3, 0.0005  # cost that is left to be improved: a factor on that of the track's noise, and a constant
-SPANS = 0.01, (0.002, 0.1)  # first differences for intervals, and bounds of the second ones [ranges]
+SPANS = 0.01, (0.002, 0.1), 0.2  # first, second (bounds) and large differences for intervals [ranges]
 
 
 class Found(NamedTuple):
@@ -155,14 +155,17 @@ def deviations(sims: Simulations, frames: int, x: np.ndarray, error: float) -> n
     """Standard deviations of the parameters at `x` [ranges], by the curvature of the squared error (Gauss and Newton).
 
     `error` is the standard deviation of a coordinate [tolerances]. Keypoints of one object in one frame count as one
-    observation, since their errors are not independent; the ranges count as prior knowledge.
+    observation, since their errors are not independent; the ranges count as prior knowledge. Near a contact,
+    small differences may show more than large ones; the deviation is as much larger as the latter show less.
     """
     step = np.full(len(x), SPANS[0])
     for _ in range(2):
-        J = _derivatives(sims, frames, x, step) / error
-        deviation = np.sqrt(np.diag(np.linalg.inv(J.T @ J + np.eye(len(x)) / PRIOR**2)))
+        near = _derivatives(sims, frames, x, step) / error
+        deviation = np.sqrt(np.diag(np.linalg.inv(near.T @ near + np.eye(len(x)) / PRIOR**2)))
         step = np.clip(2 * deviation, *SPANS[1])
-    return deviation
+    far = _derivatives(sims, frames, x, SPANS[2]) / error
+    weaker = np.linalg.norm(near, axis=0) / np.maximum(np.linalg.norm(far, axis=0), 1e-12)
+    return np.minimum(deviation * np.maximum(weaker, 1.0), PRIOR)
 
 
 def _derivatives(sims: Simulations, frames: int, x: np.ndarray, step: np.ndarray | float) -> np.ndarray:

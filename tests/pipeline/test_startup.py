@@ -23,7 +23,7 @@ UNUSED = {*COMPILERS, "gsplat", "torchdiffeq", "scipy.interpolate", "transformer
 COMMANDS = {
     "reconstruct set/images --cameras set/transforms.json --quality draft --iterations 0 -o out.ply":
         {"h5py", "scipy.optimize"},
-    "segment scene.ply -o out.ply": {"h5py", "pycolmap", "scipy.optimize"},
+    "segment scene.ply -o out.ply": {"h5py", "pycolmap"},
     "refine scene.ply -o out.ply": {"h5py", "pycolmap", "scipy.optimize"},
     "simulate scene.ply --quality draft --steps 3 -o out.h5": {"cv2", "pycolmap", "scipy.optimize"},
     "render traj.h5 --resolution 32 -o out.png": {"pycolmap", "scipy.optimize"},

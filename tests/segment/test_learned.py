@@ -10,7 +10,6 @@ from stages.core.models.segmenter.segment import find, load_segmenter
 from stages.core.scene.scene import Scene
 from stages.segment.learned import segment
 from stages.segment.options import SegmentOptions
-from stages.segment.stage import run
 from tests.segment.tabletop import best_overlap, scene_of, table_gaussians, three_apart
 
 
@@ -43,4 +42,4 @@ def test_weights_in_the_package_are_small_and_have_a_card():
 
 def test_weights_are_refused_for_other_backends(tmp_path):
     with pytest.raises(InputError, match="--weights only works"):
-        run(tmp_path / "scene.ply", tmp_path / "out.ply", SegmentOptions(weights=tmp_path / "w.safetensors"))
+        SegmentOptions(backend="geometric", weights=tmp_path / "w.safetensors")

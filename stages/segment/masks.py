@@ -57,13 +57,14 @@ def _labels(scene: Scene, view: int, file: Path, options: SegmentOptions) -> Int
 
 
 def read_names(folder: Path) -> dict[int, str]:
-    """Names by label, from names.json ({"1": "duck"} or ["duck", ...]); empty without that file."""
+    """Names by label, from names.json ({"1": "duck"}, {"1": {"name": "duck"}} or ["duck", ...]); empty without it."""
     path = Path(folder) / "names.json"
     if not path.exists():
         return {}
     try:
         data = read_json(path)
         named = dict(enumerate(data, start=1)) if isinstance(data, list) else numbered(data, "a label")
-        return dict(zip(named, texts(list(named.values()), "the names"), strict=True))
+        names = [row.get("name") if isinstance(row, dict) else row for row in named.values()]
+        return dict(zip(named, texts(names, "the names"), strict=True))
     except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RuntimeError, IndexError) as error:
         raise InputError(f'{path}: is not readable ({reason(error)}); write {{"1": "duck", "2": "bowl"}}') from error

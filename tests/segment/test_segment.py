@@ -119,6 +119,12 @@ def test_labels_of_names_are_plain_numbers_each_once(tmp_path, names):
         read_names(tmp_path)
 
 
+def test_names_of_labelled_photos_are_read_too(tmp_path):
+    """The names.json of `ngff evaluate --against LABELS/` has more than names."""
+    (tmp_path / "names.json").write_text(json.dumps({"1": {"name": "duck", "core": True}, "4": "tower"}))
+    assert read_names(tmp_path) == {1: "duck", 4: "tower"}
+
+
 def test_permuted_labels_of_one_mask_are_outvoted(scene_file, truth, tmp_path):
     masks = true_masks(truth)
     masks[3] = torch.tensor([0, 2, 3, 1])[masks[3]]  # a tool that numbered one photo in another order

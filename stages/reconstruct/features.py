@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import shutil
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import cv2
@@ -14,11 +16,14 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 from tqdm import tqdm
 
+from stages.core.errors import InputError
+from stages.core.scene.schema import reason
 from stages.reconstruct.photos import Photos
 
 MAX_SIDE = 1024  # longest side for feature extraction [px]
 # Features kept per photo, the largest first; matching time grows with the square.
 MAX_FEATURES, MAX_FEATURES_MANY_PHOTOS = 6000, 3000
+DATABASE_BYTES = 1_500_000  # of the features of a photo in a COLMAP database
 MAX_EXHAUSTIVE = 60  # up to this many photos all pairs are matched
 MAX_RATIO = 0.8  # of the distances of best and second best match (Lowe 2004)
 MAX_DISTANCE = 0.7  # of matching descriptors of unit length
@@ -54,6 +59,23 @@ def _grey(image: UInt8[Tensor, "h w 3"]) -> tuple[float, np.ndarray]:
     return shrink, grey
 
 
+@contextmanager
+def writing_database(folder: Path) -> Iterator[None]:
+    """COLMAP's errors in writing its database, such as those of a full disk, as an InputError that names the folder."""
+    try:
+        yield
+    except RuntimeError as error:
+        raise InputError(f"{folder}: COLMAP cannot write its files ({reason(error)}); is the disk full?") from error
+
+
+def _check_space(folder: Path, needed: int) -> None:
+    """Raise InputError unless a folder has this many bytes free: COLMAP aborts the process on a full disk."""
+    free = shutil.disk_usage(folder).free
+    if free < needed:
+        raise InputError(f"{folder}: has {free / 1e6:.0f} MB free, and these features need {needed / 1e6:.0f} "
+                         "MB; free some space, or set TMPDIR to a folder of another disk")  # fmt: skip
+
+
 def _sift(images: list[np.ndarray]) -> list[tuple[np.ndarray, np.ndarray]]:
     """Keypoints (k, 6: x, y and a 2 x 2 matrix) and descriptors (k, 128) of each image.
 
@@ -64,11 +86,13 @@ def _sift(images: list[np.ndarray]) -> list[tuple[np.ndarray, np.ndarray]]:
     options = pycolmap.FeatureExtractionOptions(use_gpu=False, num_threads=torch.get_num_threads())
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
+        _check_space(folder, sum(image.nbytes + DATABASE_BYTES for image in images))
         names = [f"{i}.pgm" for i in range(len(images))]
         for name, image in zip(names, images, strict=True):
             (folder / name).write_bytes(b"P5 %d %d 255\n" % image.shape[::-1] + image.tobytes())
-        pycolmap.extract_features(folder / "features.db", folder, names, extraction_options=options,
-                                  device=pycolmap.Device.cpu)  # fmt: skip
+        with writing_database(folder):
+            pycolmap.extract_features(folder / "features.db", folder, names, extraction_options=options,
+                                      device=pycolmap.Device.cpu)  # fmt: skip
         with pycolmap.Database.open(folder / "features.db") as database:
             ids = {image.name: image.image_id for image in database.read_all_images()}
             return [(database.read_keypoints(ids[name]), database.read_descriptors(ids[name]).data) for name in names]

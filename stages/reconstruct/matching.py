@@ -33,7 +33,7 @@ def build_database(photos: Photos, cameras: list, steps: StepCache, matching: Ma
 
     def write(path: Path) -> None:
         found = steps.cached("features", lambda: extract(photos, matching.device))
-        with steps.timed("matches"):
+        with steps.timed("matches"), features.writing_database(path.parent):
             _write_database(path, photos, cameras, found, matching)
 
     return steps.cached_file("matches.db", write)

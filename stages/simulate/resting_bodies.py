@@ -1,11 +1,11 @@
 """Rigid bodies that are at rest in photos, and held until their equilibrium is disturbed.
 
-Photos show a static equilibrium, but not all that keeps it: undersides, the relief of the table and things that are no
-objects are missing. A body that touches nothing falls. Any other is held until one that it rests on is released, until a
-user acts on it, or until contact forces exceed what weight and friction can resist: a force F slides a body of mass m when
-|Fxy| > friction (m g - Fz), lifts it when Fz > m g, and tips it over when its moment about the base exceeds (m g - Fz)
-times half the shorter side. The excess must last until it would have given the body the speed RELEASE_SPEED. Held bodies
-are so heavy that contacts do not move them, and do not collide with each other.
+Photos show a static equilibrium, but not all that keeps it: undersides, the relief of the table and things that are
+no objects are missing. A body that touches nothing falls. Any other is held until one that it rests on is released,
+until a user acts on it, or until contact forces exceed what weight and friction can resist: a force F slides a body
+of mass m when |Fxy| > friction (m g - Fz), lifts it when Fz > m g, and tips it over when its moment about the base
+exceeds (m g - Fz) times half the shorter side. The excess must last until it would have given the body the speed
+RELEASE_SPEED. Held bodies are so heavy that contacts do not move them, and do not collide with each other.
 """
 
 from __future__ import annotations

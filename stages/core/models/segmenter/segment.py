@@ -30,8 +30,8 @@ MAX_VOXELS = 80_000  # nearest to the focus
 MAX_BASE_HEIGHT = 0.4  # of an object's lowest points above the surface [camera distance]
 MAX_BASE_DEPTH = 0.05  # of an object's lowest points below the surface; what stands on the floor is lower
 OBJECT_COST = 0.5  # least IoU that a candidate must be expected to have; chosen on simulated scenes
-SIZE_POWER = 0.75  # weight of n surfels: n**SIZE_POWER. 0 prefers parts, 1 merged objects; chosen on simulated scenes
-MAX_SIZE = 0.7  # longest side of an object; the largest of the training have 0.6 [camera distance]
+SIZE_POWER = 0.6  # weight of n surfels: n**SIZE_POWER. 0 prefers parts, 1 merged objects; see results/segment.md
+MAX_SIZE = 0.6  # longest side of an object, as of the largest in the training [camera distance]
 MIN_GAUSSIANS = 30  # of an object
 MAX_OVERLAP = 0.25  # of two objects, of the smaller
 

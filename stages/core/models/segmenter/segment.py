@@ -97,7 +97,6 @@ def object_ids(
     labels = best_objects(found)
     labels = torch.where(labels <= options.max_objects, labels, 0)
     chance = torch.stack([f.chance for f in found]).nanmean(0)
-    labels = torch.where(chance[:, 0] > 0.5, 0, labels)  # a fine scale knows the rim of an object from its support
     fine = surfels.enlarged(SCALES[-1])
     grid = voxelise(fine)
     ids[index] = cut_outlines(fine, grid, *_by_voxel(grid, labels, chance))

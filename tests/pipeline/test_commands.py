@@ -134,7 +134,7 @@ def test_six_commands_in_a_row(tmp_path, monkeypatch, device):
         assert status == 0, err
     assert "t_input_0.mp4" in out
     status, out, err = call("evaluate", motion, "--against", motion)
-    assert status == 0 and "_object " in out, err
+    assert status == 0 and "pink_object" in out, err
 
 
 def test_json_replaces_the_table_on_stdout(tmp_path, capsys):

@@ -82,5 +82,5 @@ def test_exchanged_axes_exchange_the_distances(device):
     exchanged = distance_grid(points[:, [1, 0, 2]], 0.02).values.transpose(0, 1)
     assert (values.abs() - exchanged.abs()).abs().max() < 1e-6
     different = (values - exchanged).abs() > 1e-4  # nodes in the plane of a disc beside it: either sign
-    assert different.float().mean() < 1e-3
+    assert different.float().mean() < 1e-4
     assert (values.abs() * different).max() < 0.1 * 0.02

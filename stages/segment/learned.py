@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from stages.core.backends import pick_device
 from stages.core.models.segmenter.segment import SegmenterOptions, segment_by_network
 from stages.core.scene.scene import Scene
 from stages.segment.options import SegmentOptions
@@ -10,4 +11,4 @@ from stages.segment.options import SegmentOptions
 def segment(scene: Scene, options: SegmentOptions) -> Scene:
     """Objects of the scene, largest first, as `ngff simulate` finds them in a scene without labels."""
     settings = SegmenterOptions(options.max_objects, options.min_size)
-    return segment_by_network(scene, settings, options.weights, options.seed)
+    return segment_by_network(scene, settings, options.weights, options.seed, pick_device(options.device))

@@ -40,7 +40,7 @@ def run(scene: Path, out: Path, options: SimulateOptions = SimulateOptions()) ->
     if options.engine not in (AUTO, *ENGINES):
         raise InputError(f"--engine {options.engine}: choose from {', '.join((AUTO, *ENGINES))}")
     pick_device(options.device)  # a wrong name is an error with every engine
-    world = with_objects(read_scene(scene), scene)
+    world = with_objects(read_scene(scene), scene, options.device)
     prompts = forces.parse(
         world.objects, Path(scene).stem, force=options.force, forces=options.forces, pin=options.pin,
         velocity=options.velocity, lift=options.lift,
@@ -103,10 +103,11 @@ def with_recorded(options: SimulateOptions) -> SimulateOptions:
     return replace(options, **{k: v for k, v in recorded.items() if getattr(options, k) == getattr(default, k)})
 
 
-def with_objects(scene: Scene, path: Path) -> Scene:
+def with_objects(scene: Scene, path: Path, device: str = "auto") -> Scene:
     """The scene with the objects that can move; one without labelled Gaussians is segmented as by `ngff segment`.
 
-    Objects without Gaussians, or without extent, are left out. Raises InputError when no object is found.
+    `device` is of the network. Objects without Gaussians, or without extent, are left out. Raises InputError when no
+    object is found.
     """
     present = []
     for o in scene.objects:
@@ -123,7 +124,7 @@ def with_objects(scene: Scene, path: Path) -> Scene:
         raise InputError(f"{path}: its objects are points, which cannot be simulated; label it with `ngff segment`")
     from stages.core.models.segmenter.segment import segment_by_network  # noqa: PLC0415 -- only unlabelled scenes need it
 
-    grouped = segment_by_network(scene)
+    grouped = segment_by_network(scene, device=pick_device(device))
     if not grouped.objects or not torch.any(grouped.gaussians.object_id > 0):
         raise InputError(f"{path}: no objects were found in it; label them with `ngff segment`")
     names = ", ".join(f"{o.id} ({o.name})" for o in grouped.objects)

@@ -1,6 +1,5 @@
 """Nearest-neighbour search."""
 
-import os
 from math import inf
 
 import torch
@@ -26,7 +25,7 @@ class KDTree:
     ) -> tuple[Float[Tensor, "*b k"], Int[Tensor, "*b k"]]:
         """Distances and indices of the k nearest points, nearest first; beyond `within` the distance is inf."""
         ranks = list(range(1, k + 1))  # a list keeps the last axis where k is 1
-        workers = max(1, min(os.cpu_count() or 1, points.numel() // points.shape[-1] // QUERIES_PER_THREAD))
+        workers = max(1, min(torch.get_num_threads(), points.numel() // points.shape[-1] // QUERIES_PER_THREAD))
         distance, index = self.tree.query(points.detach().numpy(), ranks, distance_upper_bound=within, workers=workers)
         return torch.from_numpy(distance).to(points), torch.from_numpy(index).clamp_(max=self.size - 1)
 

@@ -93,11 +93,11 @@ def true_iou(found: Candidates, grid: VoxelGrid, labels: Int[Tensor, "n"]) -> Fl
     count = int(labels.max()) + 1 if len(labels) else 1
     judged, total = labels >= 0, torch.bincount(grid.owner, minlength=len(grid)).double()
     known = torch.bincount(grid.owner[judged], minlength=len(grid)).double()
-    size = found.tree.sums((known + FLOATER_WEIGHT * (total - known))[found.voxels, None].numpy())
+    size = found.sums((known + FLOATER_WEIGHT * (total - known))[:, None])
     true = torch.bincount(labels[judged], minlength=count).double()
     objects = [k for k in range(1, count) if true[k] >= MIN_SURFELS]
     if not objects:
         return torch.zeros(len(found.tree))
     owned = torch.stack([torch.bincount(grid.owner[labels == k], minlength=len(grid)) for k in objects], 1)
-    both = found.tree.sums(owned[found.voxels].double().numpy())
+    both = found.sums(owned)
     return torch.from_numpy((both / (size + true[objects].numpy() - both)).max(1)).float()

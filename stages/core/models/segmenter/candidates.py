@@ -10,7 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Num
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from stages.core.geometry.neighbours import knn
@@ -18,6 +20,7 @@ from stages.core.models.segmenter.merge_tree import MergeTree, merge_tree
 from stages.core.models.segmenter.network import Level, Prediction, Segmenter
 from stages.core.models.segmenter.voxels import VOXEL, VoxelGrid
 
+TOGETHER = 2.0  # log odds above which voxels of one cell of the next coarser grid are not parted
 MAX_SURFACE = 0.5  # probability of surface, up to which a voxel may be of an object
 MIN_VOXELS = 6  # of a candidate
 LINK_REACH, LINKS = 3.0, 8  # voxels and nearest voxels, within which links cross gaps of sparse Gaussians
@@ -27,9 +30,10 @@ SMALL = 0.003  # of logarithms of distances [camera distance]
 
 @dataclass(frozen=True)
 class Candidates:
-    """Nodes of a merge tree over some voxels."""
+    """Nodes of a merge tree over groups of up to eight voxels."""
 
-    voxels: Int[Tensor, "m"]  # of the grid, the leaves of the tree
+    voxels: Int[Tensor, "m"]  # of the grid
+    leaf: Int[Tensor, "m"]  # of the tree, for each of these voxels
     tree: MergeTree
     features: Float[Tensor, "k f"]  # of every node
 
@@ -43,6 +47,11 @@ class Candidates:
         """Longest side of each node along the axes [camera distance]."""
         return self.features[:, 6].exp()
 
+    def sums(self, values: Num[Tensor, "v d"]) -> np.ndarray:
+        """(nodes, d) sums over the voxels of each node, of values for the voxels of the grid."""
+        leaves = torch.zeros(self.tree.count, values.shape[1]).double()
+        return self.tree.sums(leaves.index_add_(0, self.leaf, values[self.voxels].double()).numpy())
+
 
 @torch.no_grad()
 def find_candidates(grid: VoxelGrid, levels: list[Level], found: Prediction, model: Segmenter) -> Candidates:
@@ -51,28 +60,54 @@ def find_candidates(grid: VoxelGrid, levels: list[Level], found: Prediction, mod
     chance = log_chance.exp()
     voxels = torch.nonzero(chance[:, 0] < MAX_SURFACE)[:, 0]
     adjacent = adjacent_pairs(levels[0].neighbours, voxels)
-    pairs = torch.cat([adjacent, nearby_pairs(grid.points, voxels)]).sort(1).values.unique(dim=0)
-    odds = model.affinity(found, grid.points, pairs).double().numpy()
-    number = torch.full((len(grid),), -1)
-    number[voxels] = torch.arange(len(voxels))
-    edges = number[pairs].numpy()
-    tree = merge_tree(len(voxels), edges, odds)
-    degree = np.stack([sum(np.bincount(end, w, len(voxels)) for end in edges.T) for w in (odds, np.ones(len(odds)))], 1)
+    pairs = _unique_pairs(torch.cat([adjacent, nearby_pairs(grid.points, voxels)]), len(grid))
+    odds = model.affinity(found, grid.points, pairs).double().cpu()
+    number = torch.full((len(grid),), -1, device=voxels.device)
+    number[voxels] = torch.arange(len(voxels), device=voxels.device)
+    edges = number[pairs].cpu()
+    leaf, count = _leaves(edges, odds, levels[0].parent[voxels].cpu())
+    ends = leaf[edges]
+    between = ends[:, 0] != ends[:, 1]
+    tree = merge_tree(count, ends[between].numpy(), odds[between].numpy())
+
+    both = torch.stack([odds, torch.ones_like(odds)], 1)[between]
+    degree = torch.zeros(count, 2).double().index_add_(0, ends[between].T.flatten(), both.repeat(2, 1))
     occupied = (levels[0].neighbours[voxels] < len(grid)).sum(1) - 1
     surface = occupied - torch.bincount(adjacent.flatten(), None, len(grid))[voxels]
     offsets, points = found.offsets[voxels], grid.points[voxels]
     centres = points + offsets
-    columns = [torch.ones(len(voxels), 1), chance[voxels], points, points**2, centres, centres**2,
-               offsets.norm(dim=1, keepdim=True), log_chance[voxels]]  # fmt: skip
-    leaves = np.concatenate([torch.cat(columns, 1).double().numpy(), degree, surface[:, None].numpy()], 1)
-    corners = torch.cat([points, -points], 1).double().numpy()
-    return Candidates(voxels, tree, torch.from_numpy(_features(tree, leaves, corners)).float())
+    columns = [torch.ones_like(points[:, :1]), chance[voxels], points, points**2, centres, centres**2,
+               offsets.norm(dim=1, keepdim=True), log_chance[voxels], surface[:, None]]  # fmt: skip
+    each = torch.cat(columns, 1).double().cpu()
+    leaves = torch.zeros(count, each.shape[1]).double().index_add_(0, leaf, each)
+    top = torch.full((count, 6), -torch.inf).double()
+    corners = torch.cat([points, -points], 1).double().cpu()
+    top.scatter_reduce_(0, leaf[:, None].expand_as(corners), corners, "amax")
+    features = _features(tree, torch.cat([leaves, degree], 1).numpy(), top.numpy())
+    return Candidates(voxels.cpu(), leaf, tree, torch.from_numpy(features).float())
+
+
+def _unique_pairs(pairs: Int[Tensor, "e 2"], count: int) -> Int[Tensor, "u 2"]:
+    """Each pair of numbers below `count` once, the smaller number first."""
+    low, high = pairs.sort(1).values.unbind(1)
+    key = (low * count + high).unique()
+    return torch.stack([key // count, key % count], 1)
+
+
+def _leaves(
+    edges: Int[Tensor, "e 2"], odds: Float[Tensor, "e"], cell: Int[Tensor, "m"]
+) -> tuple[Int[Tensor, "m"], int]:
+    """The leaf of each voxel and their number: voxels of one cell that are connected by odds above TOGETHER."""
+    i, j = edges[(odds > TOGETHER) & (cell[edges[:, 0]] == cell[edges[:, 1]])].T.numpy()
+    graph = coo_matrix((np.ones(len(i)), (i, j)), shape=(len(cell), len(cell)))
+    count, leaf = connected_components(graph, directed=False)
+    return torch.from_numpy(leaf).long(), int(count)
 
 
 def adjacent_pairs(neighbours: Int[Tensor, "v 27"], voxels: Int[Tensor, "m"]) -> Int[Tensor, "e 2"]:
     """All pairs of adjacent voxels among `voxels`, each once."""
     count = len(neighbours)
-    inside = torch.zeros(count + 1, dtype=torch.bool)
+    inside = torch.zeros(count + 1, dtype=torch.bool, device=voxels.device)
     inside[voxels] = True
     i, k = torch.nonzero(neighbours[:, :13] < count, as_tuple=True)
     pairs = torch.stack([i, neighbours[i, k]], 1)
@@ -82,7 +117,7 @@ def adjacent_pairs(neighbours: Int[Tensor, "v 27"], voxels: Int[Tensor, "m"]) ->
 def nearby_pairs(points: Float[Tensor, "v 3"], voxels: Int[Tensor, "m"]) -> Int[Tensor, "e 2"]:
     """Pairs of voxels among `voxels` with their LINKS nearest within LINK_REACH."""
     if not len(voxels):
-        return torch.zeros(0, 2, dtype=torch.int64)
+        return torch.zeros(0, 2, dtype=torch.int64, device=voxels.device)
     distance, index = knn(points[voxels], points[voxels], min(LINKS + 1, len(voxels)))
     i, k = torch.nonzero(distance < LINK_REACH * VOXEL, as_tuple=True)
     pairs = torch.stack([voxels[i], voxels[index[i, k]]], 1)
@@ -97,7 +132,7 @@ def _features(tree: MergeTree, leaves: np.ndarray, corners: np.ndarray) -> np.nd
     inner = np.concatenate([np.zeros((tree.count, 2)), links])  # sum and number of the links inside each node
     for node, (a, b) in enumerate(tree.children.tolist(), tree.count):
         inner[node] += inner[a] + inner[b]
-    border = sums[:, 20:22] - 2 * inner
+    border = sums[:, 21:] - 2 * inner
     merged = np.concatenate([np.zeros(tree.count), links[:, 0] / np.maximum(links[:, 1], 1)])
     parents, sibling = tree.parents(), np.zeros(len(tree))
     sibling[tree.children[:, 0]], sibling[tree.children[:, 1]] = n[tree.children[:, 1]], n[tree.children[:, 0]]
@@ -111,7 +146,7 @@ def _features(tree: MergeTree, leaves: np.ndarray, corners: np.ndarray) -> np.nd
         scatter / radius, shift / radius, mean[:, 16] / radius, np.log(scatter + SMALL), np.log(shift + SMALL),
         inner[:, 0] / np.maximum(inner[:, 1], 1), merged, np.where(parents < 0, NO_PARENT, merged[parents]),
         border[:, 0] / np.maximum(border[:, 1], 1), np.log1p(border[:, 1]) - np.log(n), np.log1p(border[:, 1]),
-        np.log1p(sums[:, 22]) - np.log(n), np.log1p(sibling) - np.log(n), -top[:, 5], top[:, 2], *mean[:, 17:20].T,
+        np.log1p(sums[:, 20]) - np.log(n), np.log1p(sibling) - np.log(n), -top[:, 5], top[:, 2], *mean[:, 17:20].T,
         np.log(n * VOXEL**3 / extent.prod(1)),
     ]  # fmt: skip
     return np.stack(columns, 1)

@@ -9,7 +9,6 @@ Offsets as in PointGroup (Jiang et al. 2020); convolutions touch occupied voxels
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import torch
 from jaxtyping import Float, Int
@@ -28,21 +27,16 @@ class Level:
     """Voxels of one resolution."""
 
     neighbours: Int[Tensor, "v 27"]
-    parent: Int[Tensor, "v"] | None  # voxel of the next coarser level; None at the coarsest
-    parents: int
-
-    @cached_property
-    def children(self) -> Float[Tensor, "w 1"]:
-        """Number of voxels in each parent."""
-        return torch.bincount(self.parent, minlength=self.parents)[:, None].float()
+    parent: Int[Tensor, "v"]  # voxel of the next coarser level
+    children: Int[Tensor, "w 8"]  # of each voxel of the next coarser level; v where there is none
 
 
 def pyramid(cells: Int[Tensor, "v 3"], levels: int) -> list[Level]:
     """The voxels at all resolutions, finest first."""
     out = []
-    for depth in range(levels):
-        up, parent = coarser(cells) if depth < levels - 1 else (cells, None)
-        out.append(Level(neighbour_table(cells), parent, len(up)))
+    for _ in range(levels):
+        up, parent, children = coarser(cells)
+        out.append(Level(neighbour_table(cells), parent, children))
         cells = up
     return out
 
@@ -72,9 +66,15 @@ class _Gathered(torch.autograd.Function):
         return to_x.to(x.dtype), None, to_weight.to(weight.dtype)
 
 
-def _rows(x: Float[Tensor, "v c"], neighbours: Int[Tensor, "v 27"]) -> Float[Tensor, "v 27*c"]:
-    """The features of all neighbours side by side, zeros where there is none."""
-    return torch.nn.functional.pad(x, (0, 0, 0, 1)).index_select(0, neighbours.flatten()).reshape(len(x), -1)
+def _rows(x: Float[Tensor, "v c"], table: Int[Tensor, "w k"]) -> Float[Tensor, "w k*c"]:
+    """The features of k voxels side by side, zeros where there is none."""
+    return torch.nn.functional.pad(x, (0, 0, 0, 1)).index_select(0, table.flatten()).reshape(len(table), -1)
+
+
+def _pooled(x: Float[Tensor, "v c"], children: Int[Tensor, "w 8"]) -> Float[Tensor, "w c"]:
+    """The mean of the voxels in each coarser one."""
+    count = (children < len(x)).sum(1, keepdim=True)
+    return _rows(x, children).view(len(children), 8, -1).sum(1) / count
 
 
 class Convolution(nn.Module):
@@ -143,8 +143,7 @@ class Segmenter(nn.Module):
                 x = block(x, level)
             if depth < len(levels) - 1:
                 skipped.append(x)
-                x = torch.zeros(level.parents, x.shape[1]).to(x).index_add(0, level.parent, x) / level.children.to(x)
-                x = self.deeper[depth](x)
+                x = self.deeper[depth](_pooled(x, level.children))
         for depth in reversed(range(len(levels) - 1)):
             x = skipped[depth] + self.upper[depth](x)[levels[depth].parent]
             for block in self.up[depth]:

@@ -55,12 +55,12 @@ def find(given: Path | None = None) -> Path:
     return found
 
 
-def load_segmenter(path: Path) -> Segmenter:
-    """The network with its trained weights, in single precision, on the CPU."""
+def load_segmenter(path: Path, device: torch.device | str = "cpu") -> Segmenter:
+    """The network with its trained weights, in single precision."""
     config = json.loads(path.with_suffix(".json").read_text())["config"]
     model = Segmenter(tuple(config["widths"]), config["blocks"])
     model.load_state_dict({k: v.float() for k, v in load_file(path).items()})
-    return model.eval()
+    return model.to(device).eval()
 
 
 def segment_by_network(
@@ -68,13 +68,15 @@ def segment_by_network(
     options: SegmenterOptions = SegmenterOptions(),  # noqa: B008 -- frozen
     weights: Path | None = None,
     seed: int = 0,
+    device: torch.device | str = "cpu",
 ) -> Scene:
     """The scene with an object_id for every Gaussian (0 for the background) and its objects, largest first.
 
-    `seed` is of the search for the supporting surface. Raises InputError if there are no weights at `weights`.
+    `seed` is of the search for the supporting surface, `device` of the network. Raises InputError if there are no
+    weights at `weights`.
     """
     support = find_support(scene, view_extent(scene), seed)
-    ids = object_ids(scene, load_segmenter(find(weights)), support, options)
+    ids = object_ids(scene, load_segmenter(find(weights), device), support, options)
     return name_objects(replace(scene, gaussians=replace(scene.gaussians, object_id=ids)), support)
 
 
@@ -134,24 +136,27 @@ def find_at(surfels: ScenePoints, scale: float, model: Segmenter, options: Segme
     by surfels this is the segmentation covering of Arbelaez et al. 2011, "Contour detection and hierarchical
     image segmentation"; without weights two parts of an object, each half as good, count as much as the object.
     """
-    grid, near = voxelise(surfels.enlarged(scale)), torch.ones(len(surfels), dtype=torch.bool)
+    scaled, near = surfels.enlarged(scale).to(model.enter.weight.device), torch.ones(len(surfels), dtype=torch.bool)
+    grid = voxelise(scaled)
     if len(grid) > MAX_VOXELS:
         distance = grid.points.norm(dim=1)
-        near = (distance <= distance.kthvalue(MAX_VOXELS).values)[grid.owner]
-        grid = voxelise(surfels[near].enlarged(scale))
+        within = (distance <= distance.kthvalue(MAX_VOXELS).values)[grid.owner]
+        grid, near = voxelise(scaled[within]), within.cpu()
     levels = pyramid(grid.cells, len(model.config["widths"]))
     found = model(grid.features, levels)
     candidates = find_candidates(grid, levels, found, model)
-    inside = torch.bincount(grid.owner, minlength=len(grid))[candidates.voxels]  # surfels of each leaf
-    weight = torch.from_numpy(candidates.tree.sums(inside[:, None].numpy())[:, 0]) ** SIZE_POWER
-    gain = weight * (model.score(candidates.features).sigmoid() - OBJECT_COST)
+    owner, chances = grid.owner.cpu(), found.logits.softmax(1).cpu()
+    surfels_of = torch.bincount(owner, minlength=len(grid))
+    weight = torch.from_numpy(candidates.sums(surfels_of[:, None])[:, 0]) ** SIZE_POWER
+    scores = model.score(candidates.features.to(grid.points.device)).sigmoid().cpu()
+    gain = weight * (scores - OBJECT_COST)
     extents = candidates.extents / scale
     usable = (candidates.sizes > MIN_VOXELS - 0.5) & (extents >= options.min_size) & (extents <= MAX_SIZE)
     nodes = candidates.tree.best(torch.where(usable, gain, -1.0).double().numpy())
     own = torch.full((len(grid),), -1)
-    own[candidates.voxels] = torch.from_numpy(candidates.tree.labels(nodes))
+    own[candidates.voxels] = torch.from_numpy(candidates.tree.labels(nodes))[candidates.leaf]
     labels, chance = torch.full((len(surfels),), -1), torch.full((len(surfels), 3), torch.nan)
-    labels[near], chance[near] = own[grid.owner], found.logits.softmax(1)[grid.owner]
+    labels[near], chance[near] = own[owner], chances[owner]
     sizes = torch.bincount(labels[labels >= 0], minlength=len(nodes))
     return Segmentation(labels, gain[nodes], sizes, chance)
 

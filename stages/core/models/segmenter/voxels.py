@@ -40,6 +40,10 @@ class ScenePoints:
     def __getitem__(self, index) -> ScenePoints:
         return ScenePoints(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
 
+    def to(self, device: torch.device | str) -> ScenePoints:
+        """The same on another device."""
+        return ScenePoints(*(getattr(self, name).to(device) for name in self.__dataclass_fields__))
+
     def enlarged(self, scale: float) -> ScenePoints:
         """The same with `scale` times the lengths."""
         return replace(self, points=scale * self.points)
@@ -67,16 +71,18 @@ def voxelise(surfels: ScenePoints, shift: Float[Tensor, "3"] | None = None) -> V
     """The voxels of a scene; `shift` moves the grid, for training."""
     cell = (surfels.points + (0 if shift is None else shift)).div(VOXEL).floor().long()
     cells, owner, count = unique_cells(cell)
+    order = owner.argsort(stable=True)  # sums in a fixed order, on a GPU too
 
     def mean(values: Tensor) -> Tensor:
-        total = torch.zeros(len(cells), *values.shape[1:]).index_add_(0, owner, values)
-        return total / count.reshape(-1, *[1] * (values.ndim - 1))
+        total = torch.segment_reduce(values[order].flatten(1), "sum", lengths=count, axis=0)
+        return (total / count[:, None]).reshape(-1, *values.shape[1:])
 
     points, lab, toward = mean(surfels.points), mean(surfels.lab), mean(surfels.toward)
     normals = _normals(points, mean(surfels.flatness[:, None, None] * _outer(surfels.normals)), toward)
     within = (points + (0 if shift is None else shift)) / VOXEL - cells - 0.5
     z = points[:, 2:]
-    columns = [within, normals, lab / 50 - torch.tensor([1.0, 0, 0]), (z / 0.02).tanh(), (z / 0.15).tanh()]
+    lab = lab / 50 - lab.new_tensor([1.0, 0, 0])
+    columns = [within, normals, lab, (z / 0.02).tanh(), (z / 0.15).tanh()]
     return VoxelGrid(cells, points, torch.cat(columns, 1), owner)
 
 
@@ -91,8 +97,8 @@ def _normals(points: Tensor, axes: Float[Tensor, "v 3 3"], toward: Float[Tensor,
     centred = around - around.mean(1, keepdim=True)
     spread = centred.mT @ centred
     spread = spread / spread.diagonal(dim1=1, dim2=2).sum(1).clamp_min(1e-12)[:, None, None]
-    normals = torch.linalg.eigh(axes + torch.eye(3) - 2 * spread).eigenvectors[:, :, -1]
-    outward = torch.where(toward.norm(dim=1, keepdim=True) > 1e-6, toward, torch.tensor([0.0, 0, 1]))
+    normals = torch.linalg.eigh(axes + torch.eye(3).to(axes) - 2 * spread).eigenvectors[:, :, -1]
+    outward = torch.where(toward.norm(dim=1, keepdim=True) > 1e-6, toward, toward.new_tensor([0.0, 0, 1]))
     return normals * torch.where((normals * outward).sum(1, keepdim=True) < 0, -1.0, 1.0)
 
 
@@ -121,10 +127,13 @@ def unique_cells(cells: Int[Tensor, "n 3"]) -> tuple[Int[Tensor, "v 3"], Int[Ten
     return torch.stack([keys >> 42, (keys >> 21) & low, keys & low], 1) - (1 << 20), owner, count
 
 
-def coarser(cells: Int[Tensor, "v 3"]) -> tuple[Int[Tensor, "w 3"], Int[Tensor, "v"]]:
-    """The voxels of twice the side, and that of each voxel."""
+def coarser(cells: Int[Tensor, "v 3"]) -> tuple[Int[Tensor, "w 3"], Int[Tensor, "v"], Int[Tensor, "w 8"]]:
+    """The voxels of twice the side, that of each voxel, and the voxels in each (v where there is none)."""
     up, owner, _ = unique_cells(cells >> 1)
-    return up, owner
+    children = torch.full((len(up), 8), len(cells), device=cells.device)
+    x, y, z = (cells & 1).unbind(1)
+    children[owner, 4 * x + 2 * y + z] = torch.arange(len(cells), device=cells.device)
+    return up, owner, children
 
 
 def within_reach(

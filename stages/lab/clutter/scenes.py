@@ -46,6 +46,7 @@ RECONSTRUCTED, EXACT = "reconstruction", "exact"  # in place of the number of an
 DATA_SET_POINTS = 15_000  # Gaussians kept of one of the ten objects
 SHADOW_CELL = 0.01  # [camera distance]
 COMPOSITE_SHARE = 0.45  # of the things from code that have several parts
+ROW_SHARE = 0.35  # of scenes with a row of books on edge
 MESH_SHARE = 0.4  # of the things of a scene that are meshes, where there are any
 
 
@@ -162,7 +163,8 @@ def make_scene(index: int, shelf: Shelf, options: ClutterOptions) -> tuple[Scene
     size = [math.exp(rng.uniform(*np.log(prop.sizes))) for prop in props]
     if rng.uniform() < 0.3:  # a few large things
         size = [min(0.6, 1.6 * s) for s in size]
-    things = _arranged(furniture, props, size, rng)
+    row = _row_of_books(shelf, furniture, rng) if rng.uniform() < ROW_SHARE else []
+    things = _arranged(furniture, props, size, row, rng)
     objects, parts = [], [painted(furniture, rng)]
     for prop, g in things:
         number = 0 if prop.clutter else len(objects) + 1
@@ -174,12 +176,44 @@ def make_scene(index: int, shelf: Shelf, options: ClutterOptions) -> tuple[Scene
     return Scene(concatenate(parts), tuple(objects), cameras, 0.0), len(things)
 
 
-def _arranged(furniture: Furniture, props: list[Prop], size: list[float], rng: Rng) -> list[tuple[Prop, Gaussians]]:
-    """The things at rest on the furniture; those that fell off are left out."""
+@dataclass(frozen=True)
+class _Start:
+    """A thing before it falls: its Gaussians about its origin, and where that is."""
+
+    prop: Prop
+    gaussians: Gaussians
+    at: tuple[float, float, float]
+
+
+def _row_of_books(shelf: Shelf, furniture: Furniture, rng: Rng) -> list[_Start]:
+    """Two to seven flat things on edge, side by side: some stay upright, some lean or fall over."""
+    picked = [shelf.pick(rng) for _ in range(int(rng.integers(6, 30)))]
+    books = [p for p in picked if p.flat and not p.clutter][:7]
+    x0, x1, y0, y1, z = furniture.areas[rng.integers(len(furniture.areas))]
+    yaw, size = rng.uniform(0, 2 * math.pi), math.exp(rng.uniform(math.log(0.1), math.log(0.3)))
+    along, across = np.array([math.cos(yaw), math.sin(yaw)]), np.array([-math.sin(yaw), math.cos(yaw)])
+    at, out = np.array([rng.uniform(x0, x1), rng.uniform(y0, y1)]) * 0.7, []
+    for prop in books:
+        columns = [across, (0, 0), along] if rng.uniform() < 0.5 else [(0, 0), -across, along]  # which side is up
+        R = np.array([[*c, 0] for c in columns]).T
+        R[2] = [0, 1, 0] if columns[0] is across else [1, 0, 0]
+        g = placed(recoloured(prop.gaussians, rng), size * rng.uniform(0.8, 1.1), torch.from_numpy(R).float(),
+                   torch.zeros(3))  # fmt: skip
+        reach = g.means[:, :2] @ torch.from_numpy(along).float()
+        at = at - along * float(reach.min())
+        out.append(_Start(prop, g, (*at, z + 0.004 - float(g.means[:, 2].min()))))
+        at = at + along * (float(reach.max()) + 0.015 * rng.uniform() ** 2 + 0.001)
+    return out
+
+
+def _arranged(
+    furniture: Furniture, props: list[Prop], size: list[float], row: list[_Start], rng: Rng
+) -> list[tuple[Prop, Gaussians]]:
+    """The things, and those of `row`, at rest on the furniture; those that fell off are left out."""
     order = sorted(range(len(props)), key=lambda i: (not props[i].flat, -size[i]))  # sheets lie at the bottom
     centre = rng.uniform(-0.3, 0.3, 2)
     close = rng.uniform(0.3, 1.0)  # how far apart things lie
-    turned, hulls, starts, height = [], [], [], {}
+    falling, height = [*row], {}
     for i in order:
         area = furniture.areas[rng.integers(len(furniture.areas))] if rng.uniform() < 0.35 else furniture.areas[0]
         g = placed(recoloured(props[i].gaussians, rng), size[i], random_turn(rng, props[i].flat), torch.zeros(3))
@@ -197,18 +231,17 @@ def _arranged(furniture: Furniture, props: list[Prop], size: list[float], rng: R
         around = [height.get((cell[0] + a, cell[1] + b, cell[2]), z) for a in (-1, 0, 1) for b in (-1, 0, 1)]
         base = max(around) if rng.uniform() < 0.75 or area is not furniture.areas[0] else z
         height[cell] = base + high[2] - low[2]
-        turned.append((props[i], g))
-        hulls.append(_hulls(props[i], g))
-        starts.append((x, y, base + 0.012 - low[2]))
-    if not turned:
+        falling.append(_Start(props[i], g, (x, y, base + 0.012 - low[2])))
+    if not falling:
         return []
-    at, quats = settle(furniture, hulls, np.array(starts))
+    hulls = [_hulls(f.prop, f.gaussians) for f in falling]
+    at, quats = settle(furniture, hulls, np.array([f.at for f in falling]))
     floor = min(area[4] for area in furniture.areas) - 0.03
     out = []
-    for (prop, g), t, q in zip(turned, at, quats, strict=True):
+    for f, t, q in zip(falling, at, quats, strict=True):
         if np.isfinite(t).all() and t[2] > floor and np.abs(t[:2]).max() < 1.4:
             R = matrix(torch.from_numpy(q)[None].float())[0]
-            out.append((prop, placed(g, 1.0, R, torch.from_numpy(t).float())))
+            out.append((f.prop, placed(f.gaussians, 1.0, R, torch.from_numpy(t).float())))
     return out
 
 

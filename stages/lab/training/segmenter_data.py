@@ -59,7 +59,7 @@ class Targets:
 
 def augmented(example: Example, rng: np.random.Generator) -> tuple[ScenePoints, Int[Tensor, "n"]]:
     """The example turned, mirrored, scaled, tilted, thinned, shaken, and in other colours."""
-    s, labels = example.surfels, example.labels
+    s, labels = _repainted(example.surfels, example.labels, rng), example.labels
     keep = _with_holes(s, rng)
     s, labels = _with_floaters(s[keep], labels[keep], rng)
     angle, tilt = rng.uniform(0, 2 * np.pi), rng.normal(0, 0.015, 2)
@@ -80,6 +80,23 @@ def augmented(example: Example, rng: np.random.Generator) -> tuple[ScenePoints, 
     normals = torch.nn.functional.normalize(normals, dim=1)
     moved = replace(s, points=points, lab=lab, normals=normals, toward=s.toward @ R.mT)
     return moved, labels
+
+
+def _repainted(s: ScenePoints, labels: Int[Tensor, "n"], rng: np.random.Generator) -> ScenePoints:
+    """Some objects in parts of other colours, divided by planes: an edge of colour need not part two objects."""
+    if rng.uniform() < 0.4:
+        return s
+    lab, share = s.lab.clone(), rng.uniform(0, 0.8)
+    for k in range(1, int(labels.max()) + 1 if len(labels) else 1):
+        own = torch.nonzero(labels == k)[:, 0]
+        if len(own) and rng.uniform() < share:
+            part = torch.zeros(len(own), dtype=torch.int64)
+            for _ in range(int(rng.integers(1, 4))):
+                along = s.points[own] @ torch.from_numpy(rng.normal(size=3)).float()
+                part = 2 * part + (along > along.quantile(float(rng.uniform(0.1, 0.9))))
+            lab[own] += torch.from_numpy(rng.normal(0, [25, 20, 20], (8, 3))).float()[part]
+    lab[:, 0].clamp_(2, 98)
+    return replace(s, lab=lab)
 
 
 def _with_holes(s: ScenePoints, rng: np.random.Generator) -> Bool[Tensor, "n"]:

@@ -54,7 +54,7 @@ class ProcessGroup:
 
 
 @contextmanager
-def process_group(device: str, batch: int) -> Iterator[ProcessGroup]:
+def process_group(device: str, batch: int = 0) -> Iterator[ProcessGroup]:
     """The process group that torchrun started; without torchrun this process alone.
 
     Raises InputError for a batch that the processes cannot divide evenly.

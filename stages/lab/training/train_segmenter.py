@@ -23,6 +23,7 @@ from stages.core.models.segmenter.segment import load_segmenter
 from stages.core.models.segmenter.voxels import VOXEL, unique_cells
 from stages.core.scene.files import replacing
 from stages.lab.clutter.examples import read_example
+from stages.lab.training.distributed import ProcessGroup, process_group
 from stages.lab.training.segmenter_data import (
     Targets,
     augmented,
@@ -45,7 +46,7 @@ class SegmenterTraining:
     steps: int = 0  # 0: as many as fit in `minutes`
     rate: float = 2e-3
     voxels: int = 14_000  # of a training crop
-    batch: int = 1  # crops per step
+    batch: int = 1  # crops per step, of each process
     workers: int = 0  # processes that prepare crops; 0: the training process
     seed: int = 0
     device: str = "auto"
@@ -82,15 +83,15 @@ def losses(model: Segmenter, t: Targets) -> dict[str, Tensor]:
 class Crops(IterableDataset):
     """Endless batches of targets: augmented examples of random files, cropped to about `voxels` around an object.
 
-    Every worker of a `DataLoader` draws others.
+    Every worker of a `DataLoader`, and every process `rank`, draws others.
     """
 
-    def __init__(self, files: Sequence[Path], voxels: int, batch: int, seed: int):
-        self.files, self.voxels, self.batch, self.seed = list(files), voxels, batch, seed
+    def __init__(self, files: Sequence[Path], voxels: int, batch: int, seed: int, rank: int = 0):
+        self.files, self.voxels, self.batch, self.seed, self.rank = list(files), voxels, batch, seed, rank
 
     def __iter__(self) -> Iterator[Targets]:
         worker = get_worker_info()
-        rng = np.random.default_rng([self.seed, 0 if worker is None else worker.id])
+        rng = np.random.default_rng([self.seed, 0 if worker is None else worker.id, self.rank])
         torch.set_num_threads(1 if worker is not None else torch.get_num_threads())
         while True:
             yield joined([self._crop(rng) for _ in range(self.batch)])
@@ -110,24 +111,45 @@ class Crops(IterableDataset):
 def run(folders: Sequence[Path], out: Path, options: SegmenterTraining, start: Path | None = None) -> Iterator[str]:
     """Train on the scenes of `folders`, write OUT (.safetensors) and its card; yields a line per REPORT_STEPS steps.
 
-    `start`: weights to continue from, with the widths and blocks of their card.
+    `start`: weights to continue from, with the widths and blocks of their card. Under `torchrun` every process draws
+    its own crops, and the gradients are averaged.
     """
     torch.manual_seed(options.seed)
     files = find_examples(folders)
     model = Segmenter(options.widths, options.blocks) if start is None else load_segmenter(start)
-    model = model.to(pick_device(options.device)).train()
-    optimiser = torch.optim.AdamW(model.parameters(), options.rate, weight_decay=0.01)
-    dataset = Crops(files, options.voxels, options.batch, options.seed)
+    curve: list[dict] = []
+    with process_group(pick_device(options.device)) as group:
+        model = model.to(group.device).train()
+        for line in _train(model, files, options, group, curve):
+            if group.is_main:
+                yield line
+                _save(out, model, options, len(files), curve)
+        if not group.is_main:
+            return
+    scores = fit_scores(model, files, options.score_scenes, options.score_steps, options.seed, options.workers)
+    yield ", ".join(f"{k} {v}" for k, v in scores.items())
+    _save(out, model, options, len(files), curve, scores)
+
+
+def _train(
+    model: Segmenter, files: Sequence[Path], options: SegmenterTraining, group: ProcessGroup, curve: list[dict]
+) -> Iterator[str]:
+    """Train in place; appends to `curve` and yields a line every REPORT_STEPS steps."""
+    trained = [p for name, p in model.named_parameters() if not name.startswith("candidate.")]
+    optimiser = torch.optim.AdamW(trained, options.rate, weight_decay=0.01)
+    dataset = Crops(files, options.voxels, options.batch, options.seed, group.rank)
     crops = iter(DataLoader(dataset, batch_size=None, num_workers=options.workers))
-    begun, step, mean, curve = time.monotonic(), 0, {}, []
+    begun, step, mean = time.monotonic(), 0, {}
     yield f"{len(files)} files, {sum(p.numel() for p in model.parameters())} parameters"
-    while (part := _progress(options, step, begun)) < 1:
-        for group in optimiser.param_groups:
-            group["lr"] = options.rate * min(1, (step + 1) / 50) * (0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * part)))
+    while (part := group.broadcast(_progress(options, step, begun))) < 1:
+        for settings in optimiser.param_groups:
+            warm, decay = min(1, (step + 1) / 50), 0.5 * (1 + math.cos(math.pi * part))
+            settings["lr"] = options.rate * warm * (0.02 + 0.98 * decay)
         found = losses(model, next(crops))
-        optimiser.zero_grad(set_to_none=True)
-        sum(found.values()).backward()
-        torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
+        gradients = torch.autograd.grad(sum(found.values()), trained, materialize_grads=True)
+        for p, gradient in zip(trained, group.mean(list(gradients)), strict=True):
+            p.grad = gradient
+        torch.nn.utils.clip_grad_norm_(trained, 1.0)
         optimiser.step()
         step += 1
         for name, value in found.items():
@@ -138,12 +160,6 @@ def run(folders: Sequence[Path], out: Path, options: SegmenterTraining, start: P
             )
             yield ", ".join(f"{k} {v}" for k, v in curve[-1].items())
             mean = {}
-            _save(out, model, options, len(files), curve)
-    scores = fit_scores(
-        model, files, options.score_scenes, options.score_steps, options.seed, options.workers
-    )
-    yield ", ".join(f"{k} {v}" for k, v in scores.items())
-    _save(out, model, options, len(files), curve, scores)
 
 
 def _progress(options: SegmenterTraining, step: int, begun: float) -> float:

@@ -27,8 +27,8 @@ def model_with_amplified_forces(seed: int = 0, deform: bool = True) -> ForceFiel
     torch.manual_seed(seed)
     model = ForceField(hidden=16, deform=deform).double().eval()
     with torch.no_grad():
-        for net in (model.pairs, model.planes, *([model.stress] if deform else [])):
-            net.say[-1].weight *= 10
+        for net in (model.pairs, model.planes, *([model.deformation] if deform else [])):
+            net.decoder[-1].weight *= 10
     return model
 
 
@@ -167,7 +167,7 @@ def test_deformation_scales_with_compliance_beyond_the_trained_stiffness():
     accelerations = []
     for E in (stiffest / 10, stiffest, 5 * stiffest, 1e4 * stiffest):
         scene = model.prepare(replace(initial, E=torch.full_like(initial.E, E)))
-        accelerations.append(model.stress(scene.shape, scene.embedding, scene.compliance_scale, inputs))
+        accelerations.append(model.deformation(scene.shape, scene.embedding, scene.compliance_scale, inputs))
     soft, reference, stiff, rigid = accelerations
     assert not torch.allclose(soft, reference, rtol=1e-3)
     torch.testing.assert_close(stiff, reference / 5)
@@ -178,9 +178,9 @@ def test_deformation_scales_with_compliance_beyond_the_trained_stiffness():
 @torch.no_grad()
 def test_floor_friction_stops_slow_bodies_and_lets_fast_ones_slide():
     model = model_with_amplified_forces(deform=False)
-    model.planes.say[-1].weight.zero_()  # no floor force except friction
-    model.planes.say[-1].bias.zero_()
-    model.hold.bias.fill_(3.0)
+    model.planes.decoder[-1].weight.zero_()  # no floor force except friction
+    model.planes.decoder[-1].bias.zero_()
+    model.friction.bias.fill_(3.0)
     points = overlapping_objects(1, 1).points
     points = points - points.amin((1, 2), keepdim=True) + torch.tensor([0, 0, BOX[0][2] + 0.01]).double()
 
@@ -196,9 +196,9 @@ def test_floor_friction_stops_slow_bodies_and_lets_fast_ones_slide():
 def test_friction_acts_on_stacked_bodies_and_not_on_free_ones():
     model = model_with_amplified_forces(deform=False)
     for net in (model.planes, model.pairs):  # no contact forces
-        net.say[-1].weight.zero_()
-        net.say[-1].bias.zero_()
-    model.hold.bias.fill_(3.0)
+        net.decoder[-1].weight.zero_()
+        net.decoder[-1].bias.zero_()
+    model.friction.bias.fill_(3.0)
     box = overlapping_objects(1, 1, 100).points[0, 0]
     box = box - box.amin(0)
     floor = torch.tensor([0, 0, BOX[0][2] + 0.01]).double()

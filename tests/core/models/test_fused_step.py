@@ -27,8 +27,8 @@ def model_with_amplified_forces(hidden: int) -> ForceField:
     torch.manual_seed(0)
     model = ForceField(hidden=hidden).double().cuda().eval()
     with torch.no_grad():
-        for net in (model.pairs, model.planes, model.stress):
-            net.say[-1].weight *= 10
+        for net in (model.pairs, model.planes, model.deformation):
+            net.decoder[-1].weight *= 10
     return model
 
 

@@ -54,7 +54,7 @@ def test_widened_network_is_the_same_function_and_trains_new_channels(device):
     clip = sampler.take(torch.tensor([0, 3]), torch.tensor([0, 5]), 4)
     (was, _), (loss, grads) = RolloutLoss(narrow, DT)(clip), RolloutLoss(wide, DT)(clip)
     assert_close(loss, was)
-    new = dict(zip((name for name, _ in wide.named_parameters()), grads, strict=True))["planes.say.2.weight"]
+    new = dict(zip((name for name, _ in wide.named_parameters()), grads, strict=True))["planes.decoder.2.weight"]
     assert new.shape[1] == 16 and (new[:, 8:].abs().sum(0) > 0).all()
     with pytest.raises(InputError, match="can only be widened"):
         widen(wide, 8)

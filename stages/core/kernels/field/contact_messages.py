@@ -26,7 +26,7 @@ from stages.core.kernels.field.vec3 import add, cross, dot, load3, scale3, store
 
 @triton.jit
 def project_embeddings(
-    embedding, own, own_b, other, other_b, plane, plane_b, stress, stress_b, prior, o, H: tl.constexpr,
+    embedding, own, own_b, partner, partner_b, plane, plane_b, deformation, deformation_b, offset, o, H: tl.constexpr,
 ):  # fmt: skip
     """Contribution of the object embeddings to the first layer of each contact; in the row after all contacts, to the
     first layer of the deformation network."""
@@ -34,29 +34,29 @@ def project_embeddings(
     h = tl.arange(0, H)
     own_embedding = tl.load(embedding + i * H + h)
     if k < m:
-        other_embedding = tl.load(embedding + other_object(i, k, o) * H + h)
+        partner_embedding = tl.load(embedding + other_object(i, k, o) * H + h)
         y = (
             matvec(own, own_embedding, 0, H, H)
             + tl.load(own_b + h)
-            + matvec(other, other_embedding, 0, H, H)
-            + tl.load(other_b + h)
+            + matvec(partner, partner_embedding, 0, H, H)
+            + tl.load(partner_b + h)
         )
     elif k < m + 2:
         y = matvec(plane, own_embedding, 0, H, H) + tl.load(plane_b + h)
     else:
-        y = matvec(stress, own_embedding, 0, H, H) + tl.load(stress_b + h)
-    tl.store(prior + (i * (o + 2) + k) * H + h, y)
+        y = matvec(deformation, own_embedding, 0, H, H) + tl.load(deformation_b + h)
+    tl.store(offset + (i * (o + 2) + k) * H + h, y)
 
 
 @triton.jit
 def _encode(
-    record, there, net, prior, message, weight, message_sum, total, VECTORS: tl.constexpr, SCALARS: tl.constexpr,
+    record, there, net, offset, message, weight, message_sum, total, VECTORS: tl.constexpr, SCALARS: tl.constexpr,
     ROWS: tl.constexpr, H: tl.constexpr, PRECISION: tl.constexpr,
 ):  # fmt: skip
     """Messages of a block of contact points, their weights, and the weighted sums of both over the block."""
     r, h = tl.arange(0, ROWS), tl.arange(0, H)
     y = invariant_layer(record, r, net[0], net[1], ROWS, VECTORS, SCALARS, H, PRECISION)
-    y = silu(y + tl.load(prior + h)[None, :])
+    y = silu(y + tl.load(offset + h)[None, :])
     y = silu(linear_layer(y, net[2], net[3], H, H, H, PRECISION))
     attention = tl.sum(y * tl.load(net[4] + H * H + h)[None, :], 1) + tl.load(net[5] + H)
     y = linear_layer(y, net[4], net[5], H, H, H, PRECISION)
@@ -72,7 +72,7 @@ def _encode(
 
 @triton.jit
 def encode_messages(
-    record, count, pairs, planes, prior, message, weight, message_sum, total, o, n, wide, narrow, slots,
+    record, count, pairs, planes, offset, message, weight, message_sum, total, o, n, wide, narrow, slots,
     ROWS: tl.constexpr, H: tl.constexpr, PRECISION: tl.constexpr,
 ):  # fmt: skip
     """Message and weight of each contact point; weighted sums over each block."""
@@ -82,11 +82,11 @@ def encode_messages(
     at, block = i * slots + slot, i * (slots // ROWS) + tl.program_id(1)
     if slot - start < tl.load(count + i * (o + 1) + k):
         if k < m:
-            _encode(record + at * COLUMNS, listed, pairs, prior + (i * (o + 2) + k) * H, message + at * H, weight + at,
-                    message_sum + block * H, total + block, 10, 7, ROWS, H, PRECISION)  # fmt: skip
+            _encode(record + at * COLUMNS, listed, pairs, offset + (i * (o + 2) + k) * H, message + at * H,
+                    weight + at, message_sum + block * H, total + block, 10, 7, ROWS, H, PRECISION)  # fmt: skip
         else:
-            _encode(record + at * COLUMNS, listed, planes, prior + (i * (o + 2) + k) * H, message + at * H, weight + at,
-                    message_sum + block * H, total + block, 8, 5, ROWS, H, PRECISION)  # fmt: skip
+            _encode(record + at * COLUMNS, listed, planes, offset + (i * (o + 2) + k) * H, message + at * H,
+                    weight + at, message_sum + block * H, total + block, 8, 5, ROWS, H, PRECISION)  # fmt: skip
     else:
         h = tl.arange(0, H)
         tl.store(message_sum + block * H + h, tl.zeros([H], tl.float32))
@@ -126,7 +126,7 @@ def aggregate_messages(
 
 @triton.jit
 def update_contacts(
-    mean_message, status, between, against, pairs, pairs_b, planes, planes_b, context, o, H: tl.constexpr,
+    mean_message, status, pair_update, plane_update, pairs, pairs_b, planes, planes_b, context, o, H: tl.constexpr,
 ):  # fmt: skip
     """Second-layer input of a contact's points: from both objects' mean messages of it and their status vectors."""
     i, k, m = tl.program_id(0), tl.program_id(1), o - 1
@@ -135,14 +135,14 @@ def update_contacts(
     if k < m:
         j = other_object(i, k, o)
         other = tl.load(mean_message + (j * (o + 1) + i % o - (i > j)) * H + h)
-        y = matvec(between[0], x, 0, 4 * H, H) + matvec(between[0], other, H, 4 * H, H)
-        y += matvec(between[0], own, 2 * H, 4 * H, H)
-        y += matvec(between[0], tl.load(status + j * H + h), 3 * H, 4 * H, H)
-        y = matvec(between[2], silu(y + tl.load(between[1] + h)), 0, H, H) + tl.load(between[3] + h)
+        y = matvec(pair_update[0], x, 0, 4 * H, H) + matvec(pair_update[0], other, H, 4 * H, H)
+        y += matvec(pair_update[0], own, 2 * H, 4 * H, H)
+        y += matvec(pair_update[0], tl.load(status + j * H + h), 3 * H, 4 * H, H)
+        y = matvec(pair_update[2], silu(y + tl.load(pair_update[1] + h)), 0, H, H) + tl.load(pair_update[3] + h)
         y = matvec(pairs, y, 0, H, H) + tl.load(pairs_b + h)
     else:
-        y = matvec(against[0], x, 0, 2 * H, H) + matvec(against[0], own, H, 2 * H, H)
-        y = matvec(against[2], silu(y + tl.load(against[1] + h)), 0, H, H) + tl.load(against[3] + h)
+        y = matvec(plane_update[0], x, 0, 2 * H, H) + matvec(plane_update[0], own, H, 2 * H, H)
+        y = matvec(plane_update[2], silu(y + tl.load(plane_update[1] + h)), 0, H, H) + tl.load(plane_update[3] + h)
         y = matvec(planes, y, 0, H, H) + tl.load(planes_b + h)
     tl.store(context + (i * (o + 1) + k) * H + h, y)
 

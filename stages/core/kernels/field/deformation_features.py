@@ -61,7 +61,7 @@ def deformation_features(
 
 @triton.jit
 def internal_accelerations(
-    record, prior, compliance, first_layer, output_layers, stress, n, blocks, kinds,
+    record, offset, compliance, first_layer, output_layers, acceleration, n, blocks, kinds,
     MAX_SPRING_WEIGHT: tl.constexpr, MAX_DAMPER_WEIGHT: tl.constexpr, ROWS: tl.constexpr, H: tl.constexpr,
     PRECISION: tl.constexpr,
 ):  # fmt: skip
@@ -71,7 +71,7 @@ def internal_accelerations(
     p = block * ROWS + r
     record += (i * blocks + block) * FEATURE_COLUMNS * ROWS
     y = invariant_layer(record, r, first_layer[0], first_layer[1], ROWS, MAX_VECTORS, 0, H, PRECISION)
-    y = silu(y + tl.load(prior + (i * (kinds + 1) + kinds) * H + h)[None, :])
+    y = silu(y + tl.load(offset + (i * (kinds + 1) + kinds) * H + h)[None, :])
     y = silu(linear_layer(y, output_layers[0], output_layers[1], H, H, H, PRECISION))
     y = linear_layer(y, output_layers[2], output_layers[3], 9, H, PADDED_VECTORS, PRECISION)
     v = tl.arange(0, PADDED_VECTORS)[None, :]
@@ -79,4 +79,4 @@ def internal_accelerations(
     damping = tl.where(v < 6, -MAX_DAMPER_WEIGHT * tl.sigmoid(y - 2), driving)
     y = tl.where(v < 3, -MAX_SPRING_WEIGHT * tl.sigmoid(y - 3), damping)
     a = weighted_vectors(record, r, p < n, y, ROWS, 9)
-    store3(stress + 3 * i * n + p, n, scale3(10.0, a), p < n)
+    store3(acceleration + 3 * i * n + p, n, scale3(10.0, a), p < n)

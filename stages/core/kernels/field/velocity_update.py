@@ -200,7 +200,7 @@ def _split(a, high, low, scale, n, mask):
 
 @triton.jit
 def update_displacements(
-    field, stress, arm, valid, mass_fraction, size, inverse, stiffness, damping, pinned, u, du, n, dt,
+    field, acceleration, arm, valid, mass_fraction, size, inverse, stiffness, damping, pinned, u, du, n, dt,
     MAX_SPEED: tl.constexpr, MAX_DISPLACEMENT: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Update displacements and their rates by internal accelerations, after removing their mean and net rotation."""
@@ -210,7 +210,7 @@ def update_displacements(
     valid_points = tl.load(valid + i * n + r, mask=inside, other=0) != 0
     part = tl.load(mass_fraction + i * n + r, mask=inside, other=0.0)
     arms = load3(arm + (i * n + r) * 3, 1, inside)
-    a = load3(stress + 3 * i * n + r, n, inside)
+    a = load3(acceleration + 3 * i * n + r, n, inside)
     a = sub(a, sum3(scale3(part, a)))
     rotation_rate = matvec3(read9(inverse + 9 * i), sum3(scale3(part, cross(arms, a))))
     a = sub(a, cross(rotation_rate, arms))

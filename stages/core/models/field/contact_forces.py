@@ -36,17 +36,17 @@ class ContactPoints:
 class ContactNet(nn.Module):
     """Network of one kind of contact (pairs of objects, or planes): `encode` messages, then `decode` them into forces.
 
-    Attribute names are keys of the published state dicts.
+    Attribute names are the keys of its state dict.
     """
 
     def __init__(self, vectors: int, scalars: int, hidden: int, partner: bool):
         super().__init__()
-        self.see = nn.Linear(vectors * (vectors + 1) // 2 + scalars, hidden)  # first layer, of the invariant features
-        self.own = nn.Linear(hidden, hidden)  # of the object's embedding
-        self.other = nn.Linear(hidden, hidden) if partner else None  # of the partner's embedding
-        self.hear = mlp(hidden, hidden, hidden + 1)  # message and attention logit
-        self.tell = nn.Linear(hidden, hidden)  # of the context
-        self.say = mlp(hidden, hidden, vectors, output_scale=0.1)  # weights of the vector features
+        self.input_layer = nn.Linear(vectors * (vectors + 1) // 2 + scalars, hidden)  # of the invariant features
+        self.own_projection = nn.Linear(hidden, hidden)  # of the object's embedding
+        self.partner_projection = nn.Linear(hidden, hidden) if partner else None  # of the partner's embedding
+        self.message = mlp(hidden, hidden, hidden + 1)  # message and attention logit
+        self.context_projection = nn.Linear(hidden, hidden)  # of the context
+        self.decoder = mlp(hidden, hidden, vectors, output_scale=0.1)  # weights of the vector features
 
     def encode(
         self, contacts: ContactPoints, mass_fraction: Float[Tensor, "b o m n"], own: Float[Tensor, "b o h"],
@@ -58,9 +58,9 @@ class ContactNet(nn.Module):
         Weights sum to almost 1 in firm contact and go to 0 with the gates, so that neither the number of keypoints nor
         a point at the cutoff distance matters.
         """
-        embedding_term = self.own(own)[:, :, None, None]
-        if self.other is not None:
-            embedding_term = embedding_term + self.other(other)[:, :, :, None]
+        embedding_term = self.own_projection(own)[:, :, None, None]
+        if self.partner_projection is not None:
+            embedding_term = embedding_term + self.partner_projection(other)[:, :, :, None]
         x = _at_contacts(contacts.gate > 0, self._message, contacts.vectors, contacts.scalars, embedding_term)
         attention = torch.exp(4 * torch.tanh(x[..., -1] / 4))
         weight = contacts.gate * mass_fraction * attention
@@ -68,20 +68,22 @@ class ContactNet(nn.Module):
         return x[..., :-1], weight, (weight[..., None] * x[..., :-1]).sum(-2)
 
     def _message(self, vectors: Tensor, scalars: Tensor, offset: Tensor, needed: Tensor | None = None) -> Tensor:
-        return apply_layers(scalars, (self.see, self.hear[0], self.hear[2]), vectors, offset, needed=needed)
+        layers = self.input_layer, self.message[0], self.message[2]
+        return apply_layers(scalars, layers, vectors, offset, needed=needed)
 
     def decode(
         self, message: Float[Tensor, "b o m n h"], weight: Float[Tensor, "b o m n"], context: Float[Tensor, "b o m h"],
         vectors: Float[Tensor, "b o m n k 3"],
     ) -> Float[Tensor, "b o m n 3"]:  # fmt: skip
         """Acceleration of the object by each contact point, times its weight [m/s^2]."""
-        context_term = self.tell(context)[:, :, :, None]
+        context_term = self.context_projection(context)[:, :, :, None]
         return _at_contacts(weight > 0, self._force, message, context_term, vectors, weight[..., None])
 
     def _force(
         self, message: Tensor, offset: Tensor, vectors: Tensor, weight: Tensor, needed: Tensor | None = None
     ) -> Tensor:
-        coefficients = apply_layers(message, (self.say[0], self.say[2]), offset=offset, active=True, needed=needed)
+        layers = self.decoder[0], self.decoder[2]
+        coefficients = apply_layers(message, layers, offset=offset, active=True, needed=needed)
         return weight * ACCELERATION_UNIT * weighted_sum(coefficients, vectors)
 
 

@@ -38,19 +38,19 @@ class DeformationInputs(NamedTuple):
 class DeformationNet(nn.Module):
     """Acceleration of the displacements; springs to the rest shape are added by the integrator (`springs`).
 
-    Attribute names are keys of the published state dicts.
+    Attribute names are the keys of its state dict.
     """
 
     def __init__(self, hidden: int):
         super().__init__()
-        self.see = nn.Linear(VECTOR_COUNT * (VECTOR_COUNT + 1) // 2, hidden)  # first layer, of the invariant features
-        self.own = nn.Linear(hidden, hidden)  # of the object's embedding
-        self.say = mlp(hidden, hidden, 3 * SCALE_COUNT, output_scale=0.1)  # weights of the vector features
-        self.spring = mlp(hidden, hidden, 2)  # stiffness and damping, from the embedding
+        self.input_layer = nn.Linear(VECTOR_COUNT * (VECTOR_COUNT + 1) // 2, hidden)  # of the invariant features
+        self.embedding_projection = nn.Linear(hidden, hidden)  # of the object's embedding
+        self.decoder = mlp(hidden, hidden, 3 * SCALE_COUNT, output_scale=0.1)  # weights of the vector features
+        self.spring_constants = mlp(hidden, hidden, 2)  # stiffness and damping, from the embedding
 
     def springs(self, embedding: Float[Tensor, "b o h"]) -> tuple[Float[Tensor, "b o"], Float[Tensor, "b o"]]:
         """Stiffness [1/s^2] and damping [1/s] of an object."""
-        stiffness, damping = torch.sigmoid(self.spring(embedding)).unbind(-1)
+        stiffness, damping = torch.sigmoid(self.spring_constants(embedding)).unbind(-1)
         return MAX_STIFFNESS * stiffness, MAX_DAMPING * damping
 
     def forward(
@@ -74,8 +74,8 @@ class DeformationNet(nn.Module):
         dynamic = torch.cat([20 * springs, 2 * dampers, mean_contact / 10, spread / 10], -2)
         gravity = (inputs.gravity / 5)[:, :, None].expand_as(arm)
         static = torch.stack([shape.normal, arm, gravity], -2)
-        weights = apply_layers(arm[..., :0], (self.see, self.say[0], self.say[2]), torch.cat([dynamic, static], -2),
-                               self.own(embedding)[:, :, None])  # fmt: skip
+        layers, offset = (self.input_layer, self.decoder[0], self.decoder[2]), self.embedding_projection(embedding)
+        weights = apply_layers(arm[..., :0], layers, torch.cat([dynamic, static], -2), offset[:, :, None])
         # only features that vanish at rest are weighted, so a body without contact keeps its rest shape; springs
         # restore (negative weights) and dampers slow down
         spring, damper, drive = weights.unflatten(-1, (3, SCALE_COUNT)).unbind(-2)

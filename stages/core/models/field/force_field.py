@@ -58,7 +58,7 @@ class ContactEffect(NamedTuple):
 
 
 class ForceField(Dynamics):
-    """Engine `ngff`, the default. Attribute names are keys of the published state dicts."""
+    """Engine `ngff`, the default. Attribute names are the keys of the shipped weights."""
 
     inputs = frozenset({
         "points", "mass_fraction", "mass", "E", "solidity", "nu", "friction", "velocity", "spin", "gravity", "box"
@@ -68,15 +68,15 @@ class ForceField(Dynamics):
         super().__init__()
         self.config = {"hidden": hidden, "deform": deform}
         h = hidden
-        self.point = mlp(13, h, h)  # encoder of keypoints
-        self.code = mlp(2 * h, h, h)  # embedding of an object, from its pooled keypoints
+        self.keypoint_encoder = mlp(13, h, h)
+        self.object_encoder = mlp(2 * h, h, h)  # embedding of an object, from its pooled keypoints
         self.pairs = ContactNet(10, 7, h, partner=True)  # contacts between objects
         self.planes = ContactNet(8, 5, h, partner=False)  # contacts with floor and walls
-        self.status = mlp(3 * h, h, h)  # an object's embedding updated with its messages
-        self.between, self.against = mlp(4 * h, h, h), mlp(2 * h, h, h)  # contexts of pairs and of planes
-        self.hold = nn.Linear(h, 1)  # friction threshold
-        nn.init.constant_(self.hold.bias, -3.0)
-        self.stress = DeformationNet(h) if deform else None
+        self.object_update = mlp(3 * h, h, h)  # an object's embedding updated with its messages
+        self.pair_update, self.plane_update = mlp(4 * h, h, h), mlp(2 * h, h, h)  # contexts of pairs and of planes
+        self.friction = nn.Linear(h, 1)  # logit of the friction threshold
+        nn.init.constant_(self.friction.bias, -3.0)
+        self.deformation = DeformationNet(h) if deform else None
 
     def precompute(self, initial: InitialConditions) -> RestShape:
         """Rest shapes of the objects: arms, normals, inertia and neighbourhoods."""
@@ -95,10 +95,10 @@ class ForceField(Dynamics):
         E = torch.minimum(effective_E, torch.maximum(w.E, MAX_TRAINED_SOLID_STIFFNESS * unit))
         E = E.minimum(MAX_TRAINED_STIFFNESS * unit)
         embedding, compliance_scale = self._embed_objects(shape, E), E / effective_E
-        if self.stress is None:
+        if self.deformation is None:
             none = torch.zeros_like(compliance_scale)
             return FieldScene(shape, embedding, none, none, compliance_scale)
-        stiffness, damping = self.stress.springs(embedding)
+        stiffness, damping = self.deformation.springs(embedding)
         # hollow bodies (solidity 1), as in the published data, get learned springs alone and may stay dented
         elastic = (ELASTIC_STIFFNESS_RATIO * w.E / unit).clamp_max(MAX_ELASTIC_STIFFNESS) * (1 - 1 / w.solidity)
         return FieldScene(shape, embedding, stiffness + elastic, damping, compliance_scale)
@@ -113,10 +113,10 @@ class ForceField(Dynamics):
         object_features = torch.cat([object_features, moments], -1)[:, :, None].expand(*shape.spacing.shape, -1)
         arm, normal = shape.arm / size[..., None, None], shape.normal
         local = [arm.norm(dim=-1), normal.norm(dim=-1), (arm * normal).sum(-1), shape.spacing / size[..., None]]
-        x = self.point(torch.cat([torch.stack(local, -1), object_features], -1))
+        x = self.keypoint_encoder(torch.cat([torch.stack(local, -1), object_features], -1))
         maximum = x.masked_fill(~w.valid[..., None], -torch.inf).amax(2)
         maximum = torch.where(w.present[..., None], maximum, 0.0)
-        return self.code(torch.cat([(w.mass_fraction[..., None] * x).sum(2), maximum], -1))
+        return self.object_encoder(torch.cat([(w.mass_fraction[..., None] * x).sum(2), maximum], -1))
 
     def initial_state(self, scene: FieldScene) -> BodyState:
         """Undeformed objects at their initial pose, with the momentum of their initial spin."""
@@ -133,7 +133,7 @@ class ForceField(Dynamics):
         """Rigid motion fitted to the keypoints; the residual is the deformation, 0 for a field without deformation."""
         shape = scene.shape
         m = fit_rigid_motion(shape.initial.mass_fraction, shape.arm, shape.keypoint_inverse, points, velocities)
-        u, du = (m.u, m.du) if self.stress is not None else (torch.zeros_like(m.u), torch.zeros_like(m.du))
+        u, du = (m.u, m.du) if self.deformation is not None else (torch.zeros_like(m.u), torch.zeros_like(m.du))
         # the body turns as its keypoints do, with its own inertia
         momentum = matvec(m.R, matvec(shape.initial.body_inertia, matvec(m.R.mT, m.spin)))
         return BodyState(m.com, quaternion(m.R), m.velocity, momentum, projected(shape, u), projected(shape, du))
@@ -160,14 +160,16 @@ class ForceField(Dynamics):
         same = state.velocity, bodies.spin
         lost = 1 - friction_factor(scene.shape, rates.friction_speed, same, same, FRAME)
         spin = torch.cat([torch.zeros_like(bodies.spin[..., :1]), bodies.spin], -1)
-        stress = rates.stress - scene.stiffness[..., None, None] * state.u - scene.damping[..., None, None] * state.du
+        k, c = scene.stiffness[..., None, None], scene.damping[..., None, None]
+        displacement_rate = rates.internal - k * state.u - c * state.du
         ahead = state.velocity * (1 - lost) + FRAME * rates.force
         correction = limit_penetration(scene.shape, bodies.points, ahead, FRAME) - ahead
         force = rates.force + (correction - lost * state.velocity) / FRAME
         torque = rates.torque - lost * state.momentum / FRAME
         quat_rate = multiply(spin, state.quat) / 2
         return BodyState(
-            state.velocity, quat_rate, force * movable, torque * movable, state.du, stress * movable[..., None]
+            state.velocity, quat_rate, force * movable, torque * movable, state.du,
+            displacement_rate * movable[..., None],
         )  # fmt: skip
 
     def step(
@@ -205,7 +207,7 @@ class ForceField(Dynamics):
         rotating = torch.linalg.cross(spin[:, :, None].expand_as(bodies.arm), bodies.arm)
         velocity = limit_penetration(scene.shape, bodies.points + dt / 2 * rotating, velocity, dt / 2)
         k, c = scene.stiffness[..., None, None], scene.damping[..., None, None]
-        du = (half.du + dt * (rates.stress - k * half.u)) / (1 + dt * c + dt * dt / 2 * k)
+        du = (half.du + dt * (rates.internal - k * half.u)) / (1 + dt * c + dt * dt / 2 * k)
         du = bounded(scene.shape, du / MAX_SPEED) * MAX_SPEED
         updated = half._replace(velocity=velocity, momentum=momentum, du=du)
         return self._drifted(scene, _without_pinned(updated, movable), dt / 2)
@@ -237,22 +239,22 @@ class ForceField(Dynamics):
         self, scene: FieldScene, state: BodyState, bodies: BodyKinematics, external: ExternalForces,
         interval: tuple[Tensor | float, float],
     ) -> Accelerations:  # fmt: skip
-        """Contact, external forces, gravity and stress in the `interval` (t, dt) [s]."""
+        """Contact, external forces, gravity and internal accelerations in the `interval` (t, dt) [s]."""
         w = scene.shape.initial
         contact = self._contact(scene, bodies, external)
         applied, twist = external.wrench(bodies.points, bodies.com, *interval)
         mass = w.mass[..., None].clamp_min(1e-6)
         force = contact.force + applied / mass + w.gravity[:, None]
         torque = contact.torque + twist / mass
-        if self.stress is None:
+        if self.deformation is None:
             return Accelerations(force, torque, torch.zeros_like(contact.accelerations), contact.friction_speed)
         to_body = bodies.R.mT
         inputs = DeformationInputs(
             state.u, state.du, matvec(to_body[:, :, None], contact.accelerations),
             matvec(to_body, w.gravity[:, None]),
         )  # fmt: skip
-        stress = self.stress(scene.shape, scene.embedding, scene.compliance_scale, inputs)
-        return Accelerations(force, torque, stress, contact.friction_speed)
+        internal = self.deformation(scene.shape, scene.embedding, scene.compliance_scale, inputs)
+        return Accelerations(force, torque, internal, contact.friction_speed)
 
     def _contact(self, scene: FieldScene, bodies: BodyKinematics, external: ExternalForces) -> ContactEffect:
         """One round of contact message passing: encode, aggregate, update, decode; then the sum of the forces."""
@@ -262,14 +264,14 @@ class ForceField(Dynamics):
         x, weight, mean = self.pairs.encode(pairs, _fractions(w, pairs), embedding, embedding[:, others])
         x_f, weight_f, mean_f = self.planes.encode(floor, _fractions(w, floor), embedding)
         x_w, weight_w, mean_w = self.planes.encode(wall, _fractions(w, wall), embedding)
-        status = self.status(torch.cat([embedding, mean.sum(2), mean_f[:, :, 0] + mean_w[:, :, 0]], -1))
+        status = self.object_update(torch.cat([embedding, mean.sum(2), mean_f[:, :, 0] + mean_w[:, :, 0]], -1))
         pair_status, plane_status = status[:, :, None].expand_as(mean), status[:, :, None]
-        context = self.between(torch.cat([mean, mean[:, others, back], pair_status, status[:, others]], -1))
-        context_f, context_w = (self.against(torch.cat([m, plane_status], -1)) for m in (mean_f, mean_w))
+        context = self.pair_update(torch.cat([mean, mean[:, others, back], pair_status, status[:, others]], -1))
+        context_f, context_w = (self.plane_update(torch.cat([m, plane_status], -1)) for m in (mean_f, mean_w))
         a = self.pairs.decode(x, weight, context, pairs.vectors)
         a_f = push_only(self.planes.decode(x_f, weight_f, context_f, floor.vectors), floor, weight_f)
         a_w = push_only(self.planes.decode(x_w, weight_w, context_w, wall.vectors), wall, weight_w)
-        friction = MAX_FRICTION_SPEED * torch.sigmoid(self.hold(status)) * weight_f[:, :, 0].sum(-1, keepdim=True)
+        friction = MAX_FRICTION_SPEED * torch.sigmoid(self.friction(status)) * weight_f[:, :, 0].sum(-1, keepdim=True)
         if others.shape[1]:  # an object also gets the friction of those it touches, as of one it stands on
             friction = torch.maximum(friction, (weight.sum(-1) * friction[:, others, 0]).amax(-1, keepdim=True))
         mass, inverse_mass = w.mass.clamp_min(1e-6), 1 / w.mass.clamp_min(1e-6) * ~external.pinned

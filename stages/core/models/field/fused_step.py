@@ -103,11 +103,11 @@ class _Step:
     def run(self, state: BodyState, t: Tensor | float) -> BodyState:
         body, point_states, deformation, planes = self._drift(state)
         count, point, local_forces, record = self._contacts(body, point_states, planes)
-        prior, wrenches, *friction = self._messages(count, point, local_forces, record)
+        offset, wrenches, *friction = self._messages(count, point, local_forces, record)
         wrench = tuple(friction)  # without external forces the kernel takes these arguments but does not read them
         if self.external.object.shape[1]:
             wrench = self.external.wrench(point_states[:, :, :3].mT, body[..., :3].contiguous(), t, self.dt)
-        return self._update(body, point_states, deformation, wrenches, local_forces, friction, prior, wrench)
+        return self._update(body, point_states, deformation, wrenches, local_forces, friction, offset, wrench)
 
     def _new(self, *shape: int) -> Tensor:
         return self.arm.new_empty(self.b, self.o, *shape)
@@ -157,41 +157,47 @@ class _Step:
 
     def _messages(self, count: Tensor, point: Tensor, local_forces: Tensor, record: Tensor) -> tuple[Tensor, ...]:
         field, pair, plane, h = self.field, self.field.pairs, self.field.planes, self.hidden
-        prior, context = self._new(self.kinds + 1, h), self._new(self.kinds, h)
-        own = _layers(pair.own, pair.other, plane.own, field.stress.own)
-        contact_messages.project_embeddings[(self.objects, self.kinds + 1)](self.embedding, *own, prior, self.o, H=h)
+        offset, context = self._new(self.kinds + 1, h), self._new(self.kinds, h)
+        projections = _layers(
+            pair.own_projection, pair.partner_projection, plane.own_projection, field.deformation.embedding_projection
+        )  # fmt: skip
+        contact_messages.project_embeddings[(self.objects, self.kinds + 1)](
+            self.embedding, *projections, offset, self.o, H=h
+        )  # fmt: skip
         message, weight = self._new(self.slots, h), self._new(self.slots)
         message_sum, total = self._new(self.blocks, h), self._new(self.blocks)
-        encoders = (_layers(net.see, net.hear[0], net.hear[2]) for net in (pair, plane))
+        encoders = (_layers(net.input_layer, net.message[0], net.message[2]) for net in (pair, plane))
         contact_messages.encode_messages[(self.objects, self.blocks)](
-            record, count, *encoders, prior, message, weight, message_sum, total, *self.segments, **self.network,
+            record, count, *encoders, offset, message, weight, message_sum, total, *self.segments, **self.network,
         )  # fmt: skip
         mean_message, scale, status = self._new(self.kinds, h), self._new(self.kinds), self._new(h)
         friction = self._new()
         contact_messages.aggregate_messages[(self.objects,)](
-            self.embedding, message_sum, total, _layers(field.status[0], field.status[2]), *_layers(field.hold),
-            mean_message, scale, status, friction, *self.segments, CONTACT_SATURATION=CONTACT_SATURATION,
+            self.embedding, message_sum, total, _layers(field.object_update[0], field.object_update[2]),
+            *_layers(field.friction), mean_message, scale, status, friction, *self.segments,
+            CONTACT_SATURATION=CONTACT_SATURATION,
             MAX_FRICTION_SPEED=MAX_FRICTION_SPEED, ROWS=ROWS, BLOCKS=triton.next_power_of_2(self.floor), H=h,
             num_warps=8,
         )  # fmt: skip
         contact_messages.update_contacts[(self.objects, self.kinds)](
-            mean_message, status, _layers(field.between[0], field.between[2]),
-            _layers(field.against[0], field.against[2]), *_layers(pair.tell, plane.tell), context, self.o, H=h,
+            mean_message, status, _layers(field.pair_update[0], field.pair_update[2]),
+            _layers(field.plane_update[0], field.plane_update[2]),
+            *_layers(pair.context_projection, plane.context_projection), context, self.o, H=h,
         )  # fmt: skip
         wrenches = self._new(self.blocks, bodies.WRENCH_SIZE.value)
-        decoders = (_layers(net.say[0], net.say[2]) for net in (pair, plane))
+        decoders = (_layers(net.decoder[0], net.decoder[2]) for net in (pair, plane))
         contact_messages.decode_forces[(self.objects, self.blocks)](
             record, count, point, *decoders, context, message, weight, scale, local_forces, wrenches, *self.segments,
             ACCELERATION_UNIT=ACCELERATION_UNIT, SEPARATION_SPEED=SEPARATION_SPEED, GAP_UNIT=near.GAP_UNIT,
             ARM_UNIT=near.ARM_UNIT, **self.network,
         )  # fmt: skip
-        return prior, wrenches, friction, scale
+        return offset, wrenches, friction, scale
 
     def _update(
         self, body: Tensor, point_states: Tensor, deformation: Tensor, wrenches: Tensor, local_forces: Tensor,
-        friction: list[Tensor], prior: Tensor, wrench: tuple[Tensor, Tensor],
+        friction: list[Tensor], offset: Tensor, wrench: tuple[Tensor, Tensor],
     ) -> BodyState:  # fmt: skip
-        o, n, scene, stress = self.o, self.n, self.scene, self.field.stress
+        o, n, scene, net = self.o, self.n, self.scene, self.field.deformation
         com, quat, velocity, momentum = (self._new(width) for width in (3, 4, 3, 3))
         high, low = (torch.empty(self.b, o, 9, n, dtype=torch.float16, device=self.arm.device) for _ in range(2))
         scale = self._new(9)
@@ -214,9 +220,9 @@ class _Step:
             ROWS=ROWS, num_warps=2,
         )  # fmt: skip
         deformation_features.internal_accelerations[(self.objects, blocks)](
-            record, prior, scene.compliance_scale.contiguous(), _layers(stress.see),
-            _layers(stress.say[0], stress.say[2]), field, n, blocks, self.kinds, MAX_SPRING_WEIGHT=MAX_SPRING_WEIGHT,
-            MAX_DAMPER_WEIGHT=MAX_DAMPER_WEIGHT, **self.network,
+            record, offset, scene.compliance_scale.contiguous(), _layers(net.input_layer),
+            _layers(net.decoder[0], net.decoder[2]), field, n, blocks, self.kinds,
+            MAX_SPRING_WEIGHT=MAX_SPRING_WEIGHT, MAX_DAMPER_WEIGHT=MAX_DAMPER_WEIGHT, **self.network,
         )  # fmt: skip
         u, du = self._new(n, 3), self._new(n, 3)
         stiffness, damping = scene.stiffness.contiguous(), scene.damping.contiguous()

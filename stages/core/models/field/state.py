@@ -39,9 +39,9 @@ class FieldScene:
 
 
 class Accelerations(NamedTuple):
-    """Forces and torques on the bodies per unit of mass, deformation accelerations and the friction threshold."""
+    """Forces and torques on the bodies per unit of mass, internal accelerations and the friction threshold."""
 
     force: Float[Tensor, "b o 3"]  # [m/s^2]
     torque: Float[Tensor, "b o 3"]  # about the centre of mass [m^2/s^2]
-    stress: Float[Tensor, "b o n 3"]  # acceleration of the displacements, body frame [m/s^2]
+    internal: Float[Tensor, "b o n 3"]  # acceleration of the displacements, body frame [m/s^2]
     friction_speed: Float[Tensor, "b o 1"]  # bodies slower than this are stopped by dry friction [m/s]

@@ -23,7 +23,7 @@ export class Body {
     let square = 0;
     for (let k = 0; k < this.n; k++) square += this.massFraction[k] * Linear3.square(this.arm, 3 * k);
     this.size = Math.sqrt(Math.max(square, 1e-8));
-    for (const name of ["u", "du", "armNow", "points", "pointVelocity", "normalNow", "local", "stress"])
+    for (const name of ["u", "du", "armNow", "points", "pointVelocity", "normalNow", "local", "internal"])
       this[name] = new Float64Array(3 * this.n);
     this.low = new Float64Array(3);
     this.high = new Float64Array(3);
@@ -47,8 +47,8 @@ export class Body {
   }
 
   changed() { // the state was set from outside
-    this.still = this.held = false;
-    this.move();
+    this.unchanged = this.wasPinned = false;
+    this.updateKinematics();
   }
 
   // The state with keypoints at `points` that move with `velocities`: a rigid motion and its residual.
@@ -81,7 +81,7 @@ export class Body {
     this.changed();
   }
 
-  hold() { // a pinned body
+  stop() { // a pinned body
     this.velocity = [0, 0, 0];
     this.momentum = [0, 0, 0];
     this.du.fill(0);
@@ -99,7 +99,7 @@ export class Body {
   }
 
   // Positions, velocities and normals of the keypoints in the world, and their bounding box.
-  move() {
+  updateKinematics() {
     const { n, com, armNow, points, pointVelocity } = this, R = this.R = Linear3.rotation(this.quat);
     this.worldInverse = Linear3.product(Linear3.product(R, this.inverse), Linear3.transposed(R));
     const [sx, sy, sz] = this.spin = Linear3.spin(this.inverse, this.momentum, R), [vx, vy, vz] = this.velocity;
@@ -133,7 +133,7 @@ export class Body {
     return out;
   }
 
-  // Velocities after dt of the accelerations `force`, `torque` and `stress`, with friction below `frictionSpeed`.
+  // Velocities after dt of the accelerations `force`, `torque` and `internal`, with friction below `frictionSpeed`.
   accelerate(dt, force, torque, frictionSpeed) {
     const spinBefore = this.spin, before = this.velocity, norm = (x) => Math.hypot(...x);
     let momentum = this.momentum.map((x, a) => x + dt * torque[a]), velocity = before.map((x, a) => x + dt * force[a]);
@@ -151,7 +151,7 @@ export class Body {
     this.velocity = this.aboveFloor(velocity.map((x) => factor * x), spin.map((x) => factor * x), dt / 2);
     const k = this.stiffness, c = this.damping;
     for (let i = 0; i < 3 * this.n; i++)
-      this.du[i] = (this.du[i] + dt * (this.stress[i] - k * this.u[i])) / (1 + dt * c + dt * dt / 2 * k);
+      this.du[i] = (this.du[i] + dt * (this.internal[i] - k * this.u[i])) / (1 + dt * c + dt * dt / 2 * k);
     this.bound(this.du, Body.MAX_DISPLACEMENT * this.size * Body.MAX_SPEED);
   }
 

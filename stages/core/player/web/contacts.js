@@ -27,13 +27,13 @@ export class Contacts {
     for (let other = 0; other < this.bodies.length; other++) if (other !== own) yield this.pairs.get(this.key(own, other));
   }
 
-  // All contacts at the present positions. A list is `fresh` if it was made now.
+  // All contacts at the present positions. A list is `updated` if it was computed now.
   find(gravity) {
     const { bodies, pairs } = this;
     for (let i = 0; i < bodies.length; i++) for (let j = 0; j < i; j++) {
       const lists = [pairs.get(this.key(i, j)), pairs.get(this.key(j, i))];
-      if (lists[0] && bodies[i].still && bodies[j].still) {
-        for (const list of lists) list.fresh = false;
+      if (lists[0] && bodies[i].unchanged && bodies[j].unchanged) {
+        for (const list of lists) list.updated = false;
         continue;
       }
       const [a, b] = this.nearestPairs(i, j);
@@ -41,8 +41,8 @@ export class Contacts {
       pairs.set(this.key(j, i), this.pairList(j, i, b, gravity));
     }
     bodies.forEach((body, i) => {
-      if (this.floor[i] && body.still) {
-        this.floor[i].fresh = this.walls[i].fresh = false;
+      if (this.floor[i] && body.unchanged) {
+        this.floor[i].updated = this.walls[i].updated = false;
         return;
       }
       this.floor[i] = this.planeList(i, this.floorPoints(body), gravity);
@@ -133,7 +133,8 @@ export class Contacts {
   list(own, entries, vectorCount, scalarCount) {
     const count = entries.length, { massFraction } = this.bodies[own];
     return {
-      own, count, vectorCount, scalarCount, fresh: true, row: entries.map(({ k }) => k), share: entries.map(({ k }) => massFraction[k]),
+      own, count, vectorCount, scalarCount, updated: true, row: entries.map(({ k }) => k),
+      massFraction: entries.map(({ k }) => massFraction[k]),
       gate: new Float64Array(count), vectors: new Float64Array(3 * vectorCount * count), scalars: new Float64Array(scalarCount * count),
     };
   }

@@ -24,16 +24,20 @@ export class ForceField {
   constructor(weights, bodies, gravity) {
     const layers = (...names) => new Layers(weights, ...names), mlp = (name) => layers(`${name}.0`, `${name}.2`);
     const contact = (name) => ({
-      message: layers(`${name}.see`, `${name}.hear.0`, `${name}.hear.2`), own: layers(`${name}.own`),
-      other: weights[`${name}.other.weight`] && layers(`${name}.other`), tell: layers(`${name}.tell`), force: mlp(`${name}.say`),
+      message: layers(`${name}.input_layer`, `${name}.message.0`, `${name}.message.2`), own: layers(`${name}.own_projection`),
+      partner: weights[`${name}.partner_projection.weight`] && layers(`${name}.partner_projection`),
+      context: layers(`${name}.context_projection`), decoder: mlp(`${name}.decoder`),
     });
     Object.assign(this, { bodies, gravity, pairs: contact("pairs"), planes: contact("planes"), contacts: new Contacts(bodies) });
-    for (const name of ["point", "code", "status", "between", "against"]) this[name] = mlp(name);
-    this.hold = layers("hold");
-    this.stress = {
-      layers: layers("stress.see", "stress.say.0", "stress.say.2"), own: layers("stress.own"), spring: mlp("stress.spring"),
+    Object.assign(this, {
+      keypointEncoder: mlp("keypoint_encoder"), objectEncoder: mlp("object_encoder"), objectUpdate: mlp("object_update"),
+      pairUpdate: mlp("pair_update"), planeUpdate: mlp("plane_update"), friction: layers("friction"),
+    });
+    this.deformation = {
+      layers: layers("deformation.input_layer", "deformation.decoder.0", "deformation.decoder.2"),
+      embedding: layers("deformation.embedding_projection"), springConstants: mlp("deformation.spring_constants"),
     };
-    this.width = this.status.width;
+    this.width = this.objectUpdate.width;
     for (const body of bodies) this.encode(body);
   }
 
@@ -51,57 +55,61 @@ export class ForceField {
       const i = 3 * k, inner = arm[i] * normal[i] + arm[i + 1] * normal[i + 1] + arm[i + 2] * normal[i + 2];
       x.set([Math.sqrt(Linear3.square(arm, i)) / size, Math.sqrt(Linear3.square(normal, i)), inner / size, spacing[k] / size, ...features], 13 * k);
     }
-    const encoded = this.point.apply(x, n);
+    const encoded = this.keypointEncoder.apply(x, n);
     for (let k = 0; k < n; k++) for (let j = 0; j < h; j++) {
       pooled[j] += body.massFraction[k] * encoded[h * k + j];
       pooled[h + j] = Math.max(pooled[h + j], encoded[h * k + j]);
     }
-    const sigmoid = (y) => 1 / (1 + Math.exp(-y)), embedding = body.embedding = this.code.apply(pooled, 1).slice(0, h);
-    const term = (layers) => layers.apply(embedding, 1).slice(0, h);
-    const [stiffness, damping] = this.stress.spring.apply(embedding, 1);
+    const sigmoid = (y) => 1 / (1 + Math.exp(-y)), embedding = body.embedding = this.objectEncoder.apply(pooled, 1).slice(0, h);
+    const offset = (layers) => layers.apply(embedding, 1).slice(0, h);
+    const [stiffness, damping] = this.deformation.springConstants.apply(embedding, 1);
     const elastic = Math.min(F.ELASTIC_STIFFNESS_RATIO * E / unit, F.MAX_ELASTIC_STIFFNESS) * (1 - 1 / solidity);
     Object.assign(body, {
       compliance: clamped / effective, stiffness: F.MAX_STIFFNESS * sigmoid(stiffness) + elastic, damping: F.MAX_DAMPING * sigmoid(damping),
-      terms: { own: term(this.pairs.own), other: term(this.pairs.other), plane: term(this.planes.own), stress: term(this.stress.own) },
-      still: false,
+      offsets: {
+        own: offset(this.pairs.own), partner: offset(this.pairs.partner), plane: offset(this.planes.own),
+        deformation: offset(this.deformation.embedding),
+      },
+      unchanged: false,
     });
   }
 
   setGravity(gravity) {
     this.gravity = gravity;
-    for (const body of this.bodies) body.still = false;
+    for (const body of this.bodies) body.unchanged = false;
   }
 
   // From t to t + dt. forces: [{body, force, torque, start, end, point}], where point is a keypoint of the body or -1.
   step(t, dt, forces) {
     const { bodies } = this;
     for (const body of bodies) {
-      const still = body.pinned && body.held;
-      if (body.pinned) body.hold(); else body.drift(dt / 2);
-      if (!still) body.move();
-      body.still = still && body.still;
-      body.held = body.pinned;
+      const unchanged = body.pinned && body.wasPinned;
+      if (body.pinned) body.stop(); else body.drift(dt / 2);
+      if (!unchanged) body.updateKinematics();
+      body.unchanged = unchanged && body.unchanged;
+      body.wasPinned = body.pinned;
     }
     const rates = this.accelerations(t, dt, forces);
     bodies.forEach((body, i) => {
-      body.still = body.pinned;
+      body.unchanged = body.pinned;
       if (body.pinned) return;
       body.accelerate(dt, rates[i].force, rates[i].torque, rates[i].frictionSpeed);
       body.drift(dt / 2);
     });
   }
 
-  // Accelerations by contact, gravity, `forces` and stress, with the friction threshold; stress goes to body.stress.
+  // Accelerations by contact, gravity and `forces`, with the friction threshold; internal accelerations go to
+  // body.internal.
   accelerations(t, dt, forces) {
     const rates = this.contactEffects();
     for (const { body, force, torque, start, end, point } of forces) {
       const on = Math.max(0, Math.min(end, t + dt) - Math.max(start, t)) / dt, { mass, armNow } = this.bodies[body];
       if (!on) continue;
       const [fx, fy, fz] = force, [x, y, z] = point < 0 ? [0, 0, 0] : armNow.subarray(3 * point, 3 * point + 3);
-      const twist = [y * fz - z * fy, z * fx - x * fz, x * fy - y * fx];
+      const moment = [y * fz - z * fy, z * fx - x * fz, x * fy - y * fx];
       for (let a = 0; a < 3; a++) {
         rates[body].force[a] += on * force[a] / Math.max(mass, 1e-6);
-        rates[body].torque[a] += on * (torque[a] + twist[a]) / Math.max(mass, 1e-6);
+        rates[body].torque[a] += on * (torque[a] + moment[a]) / Math.max(mass, 1e-6);
       }
     }
     this.bodies.forEach((body, i) => {
@@ -115,13 +123,15 @@ export class ForceField {
   contactEffects() {
     const { bodies, contacts } = this, h = this.width, zero = new Float64Array(h);
     contacts.find(this.gravity);
-    for (const list of contacts.pairs.values()) if (list.fresh) this.listen(this.pairs, list, this.sum(bodies[list.own].terms.own, bodies[list.other].terms.other));
-    for (const list of [...contacts.floor, ...contacts.walls]) if (list.fresh) this.listen(this.planes, list, bodies[list.own].terms.plane);
+    for (const list of contacts.pairs.values())
+      if (list.updated) this.encodeContacts(this.pairs, list, this.sum(bodies[list.own].offsets.own, bodies[list.other].offsets.partner));
+    for (const list of [...contacts.floor, ...contacts.walls])
+      if (list.updated) this.encodeContacts(this.planes, list, bodies[list.own].offsets.plane);
     const rates = bodies.map((body, i) => {
-      const heard = [...contacts.of(i)].reduce((sum, list) => this.sum(sum, list.mean), zero);
+      const messages = [...contacts.of(i)].reduce((sum, list) => this.sum(sum, list.mean), zero);
       const plane = this.sum(contacts.floor[i].mean ?? zero, contacts.walls[i].mean ?? zero);
-      const status = this.status.apply(Float64Array.of(...body.embedding, ...heard, ...plane), 1).slice(0, h);
-      const own = ForceField.MAX_FRICTION_SPEED / (1 + Math.exp(-this.hold.apply(status, 1)[0])) * contacts.floor[i].total;
+      const status = this.objectUpdate.apply(Float64Array.of(...body.embedding, ...messages, ...plane), 1).slice(0, h);
+      const own = ForceField.MAX_FRICTION_SPEED / (1 + Math.exp(-this.friction.apply(status, 1)[0])) * contacts.floor[i].total;
       body.local.fill(0);
       return { force: [0, 0, 0], torque: [0, 0, 0], status, own, frictionSpeed: own };
     });
@@ -130,14 +140,14 @@ export class ForceField {
       rates[own].frictionSpeed = Math.max(rates[own].frictionSpeed, list.total * rates[other].own);
       if (!list.count || (a.pinned && b.pinned)) continue;
       const back = contacts.pairs.get(contacts.key(other, own)).mean ?? zero;
-      const context = this.between.apply(Float64Array.of(...list.mean, ...back, ...rates[own].status, ...rates[other].status), 1);
-      this.pull(list, a, b, this.decode(this.pairs, list, context), rates);
+      const context = this.pairUpdate.apply(Float64Array.of(...list.mean, ...back, ...rates[own].status, ...rates[other].status), 1);
+      this.applyPairForces(list, a, b, this.decode(this.pairs, list, context), rates);
     }
     bodies.forEach((body, i) => {
       for (const list of [contacts.floor[i], contacts.walls[i]]) {
         if (!list.count || body.pinned) continue;
-        const context = this.against.apply(Float64Array.of(...list.mean, ...rates[i].status), 1);
-        this.push(list, body, this.decode(this.planes, list, context), rates[i]);
+        const context = this.planeUpdate.apply(Float64Array.of(...list.mean, ...rates[i].status), 1);
+        this.applyPlaneForces(list, body, this.decode(this.planes, list, context), rates[i]);
       }
       for (let k = 0; k < 3 * body.n; k++) body.local[k] /= Math.max(body.massFraction[(k - k % 3) / 3], 1e-9);
     });
@@ -147,8 +157,8 @@ export class ForceField {
   sum(a, b) { return a.map((x, i) => x + b[i]); }
 
   // Messages and weights of contact points, and the mean message.
-  listen(net, list, offset) {
-    const { count, gate, share } = list, h = this.width, out = net.message.width;
+  encodeContacts(net, list, offset) {
+    const { count, gate, massFraction } = list, h = this.width, out = net.message.width;
     list.mean = new Float64Array(h);
     list.total = 0;
     if (!count) return;
@@ -157,7 +167,7 @@ export class ForceField {
     list.weight = new Float64Array(count);
     for (let r = 0; r < count; r++) {
       for (let j = 0; j < h; j++) list.message[r * h + j] = x[r * out + j];
-      list.total += list.weight[r] = gate[r] * share[r] * Math.exp(4 * Math.tanh(x[r * out + h] / 4));
+      list.total += list.weight[r] = gate[r] * massFraction[r] * Math.exp(4 * Math.tanh(x[r * out + h] / 4));
     }
     const scale = 1 / (list.total + ForceField.CONTACT_SATURATION);
     list.total *= scale;
@@ -186,10 +196,10 @@ export class ForceField {
   // Acceleration of the body by each contact point, times its weight.
   decode(net, list, context) {
     const { count, message, weight, vectors, vectorCount: k } = list, h = this.width, x = message.slice(), out = new Float64Array(3 * count);
-    const term = net.tell.apply(context, 1);
-    for (let i = 0; i < x.length; i++) x[i] += term[i % h];
+    const offset = net.context.apply(context, 1);
+    for (let i = 0; i < x.length; i++) x[i] += offset[i % h];
     Layers.silu(x, x.length);
-    const coefficients = net.force.apply(x, count);
+    const coefficients = net.decoder.apply(x, count);
     for (let r = 0; r < count; r++) for (let v = 0; v < k; v++) {
       const c = weight[r] * ForceField.ACCELERATION_UNIT * coefficients[r * k + v];
       for (let a = 0; a < 3; a++) out[3 * r + a] += c * vectors[3 * (r * k + v) + a];
@@ -198,7 +208,7 @@ export class ForceField {
   }
 
   // The forces of a pair on both bodies, at the middles of the gaps.
-  pull(list, a, b, acceleration, rates) {
+  applyPairForces(list, a, b, acceleration, rates) {
     const inverse = (body) => body.pinned ? 0 : 1 / Math.max(body.mass, 1e-6);
     const reduced = 1 / Math.max(inverse(a) + inverse(b), 1e-9), massA = Math.max(a.mass, 1e-6), massB = Math.max(b.mass, 1e-6);
     for (let r = 0; r < list.count; r++) {
@@ -217,7 +227,7 @@ export class ForceField {
   }
 
   // The forces of a plane, whose normal part only pushes.
-  push(list, body, acceleration, rate) {
+  applyPlaneForces(list, body, acceleration, rate) {
     const { vectors, vectorCount, weight } = list;
     for (let r = 0; r < list.count; r++) {
       const v = 3 * vectorCount * r, along = this.dot(acceleration, 3 * r, vectors, v), separation = Math.max(0, this.dot(vectors, v + 6, vectors, v));
@@ -231,9 +241,9 @@ export class ForceField {
 
   dot(x, i, y, j) { return x[i] * y[j] + x[i + 1] * y[j + 1] + x[i + 2] * y[j + 2]; }
 
-  // Acceleration of a body's displacements, in its frame, into body.stress.
+  // Acceleration of a body's displacements, in its frame, into body.internal.
   deform(body) {
-    const { n, R, u, du, local, arm, size, massFraction, normal, stress } = body, back = Linear3.transposed(R);
+    const { n, R, u, du, local, arm, size, massFraction, normal, internal } = body, back = Linear3.transposed(R);
     const fields = new Float64Array(9 * n), virial = new Float64Array(9), gravity = Linear3.times(back, [0, 0, -this.gravity]);
     for (let k = 0, i = 0; k < n; k++, i += 3) {
       Linear3.matvec(back, local, fields, i, 9 * k);
@@ -256,14 +266,14 @@ export class ForceField {
       }
       at = ForceField.innerProducts(v, w, 12, x, at);
     }
-    const out = this.stress.layers.apply(x, n, body.terms.stress), F = ForceField, sigmoid = (y) => 1 / (1 + Math.exp(-y));
-    stress.fill(0);
+    const out = this.deformation.layers.apply(x, n, body.offsets.deformation), F = ForceField, sigmoid = (y) => 1 / (1 + Math.exp(-y));
+    internal.fill(0);
     for (let k = 0; k < n; k++) for (let j = 0; j < 9; j++) {
       const y = out[9 * k + j];
       const weight = j < 3 ? -F.MAX_SPRING_WEIGHT * sigmoid(y - 3) : j < 6 ? -F.MAX_DAMPER_WEIGHT * sigmoid(y - 2) : body.compliance * y;
-      for (let a = 0; a < 3; a++) stress[3 * k + a] += 10 * weight * v[36 * k + 3 * j + a];
+      for (let a = 0; a < 3; a++) internal[3 * k + a] += 10 * weight * v[36 * k + 3 * j + a];
     }
-    body.project(stress);
+    body.project(internal);
   }
 
   means({ first, which, weight }, fields, n) { // of nine values at each point over its neighbourhood

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Collection, Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -44,6 +44,23 @@ MAX_STEPS = 1000  # of the model for one frame
 FLOOR_OUTLIERS = 0.02  # fraction of an object's keypoints that may lie below the floor under it
 
 
+@dataclass(frozen=True)
+class FieldObjects:
+    """The objects of a scene as the learned field takes them, before the conversion to model units."""
+
+    scene: Scene
+    keypoints: list[Float[Tensor, "k 3"]]  # of each object at rest [scene units]
+    solids: list[SolidBody]
+    setup: SceneSetup
+    units: ModelUnits
+    velocity: Mapping[int, Sequence[float]]  # initial velocity by object id [scene units/s]
+
+    @property
+    def volumes(self) -> Float[Tensor, "o"]:
+        """Volumes of the solid bodies [m^3]."""
+        return torch.tensor([s.volume for s in self.solids]) * self.scene.metres_per_unit**3
+
+
 def rollout(
     scene: Scene, keypoints: Keypoints, prompts: ForcePrompts, options: SimulateOptions
 ) -> Iterator[FrameState]:
@@ -59,10 +76,10 @@ def rollout(
               in zip(solid_bodies(scene, setup.bodies.spacing, device), map(setup.uneven_moments, range(len(ids))),
                      strict=True)]  # fmt: skip
     density = torch.tensor([setup.materials[i].material.density for i in ids])
-    volumes = torch.tensor([solid.volume for solid in solids]) * scene.metres_per_unit**3
-    masses = density * volumes
+    masses = density * (torch.tensor([solid.volume for solid in solids]) * scene.metres_per_unit**3)
     units = ModelUnits.for_objects(per_object, masses, setup.box.low[2], scene.metres_per_unit, options.gravity)
-    initial = _initial_conditions(scene, per_object, setup, units, solids, prompts, options)
+    objects = FieldObjects(scene, per_object, solids, setup, units, prompts.velocity)
+    initial = _initial_conditions(objects, options)
     _warn_extrapolation(initial, model)
     in_model_units = ForcePrompts(units.forces(prompts.forces, setup.lift, ids), prompts.pinned)
     forces = ExternalForces.from_prompts(initial, in_model_units, ids)
@@ -81,7 +98,7 @@ def rollout(
         units.length, units.scale, units.time, units.mass, tuple(units.origin.tolist()), units.gravity, steps,
         card["sha256"], options.friction,
     )  # fmt: skip
-    field_start = _field_start(keypoints, ids, initial, setup, awake, volumes, model_units)
+    field_start = _field_start(keypoints, objects, initial, awake, model_units)
     row = torch.tensor([ids.index(i) for i in keypoints.object_id.tolist()], dtype=torch.int64)
     lifted = keypoints.rest + setup.lift[row]
 
@@ -105,7 +122,7 @@ def rollout(
                 acting = active
             if changes:
                 current, held = changed_options(current, changes), changed_pins(held, changes)
-                new = _changed(scene, per_object, setup, units, solids, prompts, current)
+                new = _changed(objects, current)
                 stepper.change(new.to(device))
                 mass = new.mass[0]
             sleep.wake(_pushed(active, ids, start, end) | _roused(changes, ids))
@@ -123,10 +140,10 @@ def rollout(
 
 
 def _field_start(
-    keypoints: Keypoints, ids: list[int], initial: InitialConditions, setup: SceneSetup, awake: Bool[Tensor, "o"],
-    volumes: Float[Tensor, "o"], units: FieldUnits,
-) -> FieldStart:  # fmt: skip
+    keypoints: Keypoints, objects: FieldObjects, initial: InitialConditions, awake: Bool[Tensor, "o"], units: FieldUnits
+) -> FieldStart:
     """What the engine starts from, for the trajectory; values of keypoints in the order of `keypoints`."""
+    setup, ids = objects.setup, [o.id for o in objects.scene.objects]
 
     def of_keypoints(values: Tensor) -> Tensor:
         out = values.new_zeros(len(keypoints.rest), *values.shape[3:])
@@ -135,17 +152,17 @@ def _field_start(
         return out
 
     return FieldStart(
-        of_keypoints(initial.points), of_keypoints(initial.mass_fraction), initial.mass[0], volumes, initial.E[0],
-        initial.solidity[0], initial.nu[0], initial.friction[0], initial.velocity[0], initial.body_inertia[0],
-        initial.box[0], awake.long(), setup.on_floor.long(), tuple(setup.materials[i].name for i in ids), units,
+        of_keypoints(initial.points), of_keypoints(initial.mass_fraction), initial.mass[0], objects.volumes,
+        initial.E[0], initial.solidity[0], initial.nu[0], initial.friction[0], initial.velocity[0],
+        initial.body_inertia[0], initial.box[0], awake.long(), setup.on_floor.long(),
+        tuple(setup.materials[i].name for i in ids), units,
     )  # fmt: skip
 
 
-def _initial_conditions(
-    scene: Scene, per_object: list[Tensor], setup: SceneSetup, units: ModelUnits, solids: list[SolidBody],
-    prompts: ForcePrompts, options: SimulateOptions,
-) -> InitialConditions:  # fmt: skip
+def _initial_conditions(objects: FieldObjects, options: SimulateOptions) -> InitialConditions:
     """Keypoints, materials and velocities of the objects at the start, in model units."""
+    scene, setup, units = objects.scene, objects.setup, objects.units
+    per_object, solids = objects.keypoints, objects.solids
     count, most = len(per_object), max(len(p) for p in per_object)
     points, valid = torch.zeros(1, count, most, 3), torch.zeros(1, count, most, dtype=torch.bool)
     mass, E, ratio, nu, friction, loss = torch.ones(6, 1, count)
@@ -165,7 +182,7 @@ def _initial_conditions(
         nu[0, row] = choice.material.nu
         friction[0, row] = choice.material.friction if options.friction is None else options.friction
         loss[0, row] = choice.material.loss
-        velocity[0, row] = torch.tensor(prompts.velocity.get(o.id, (0.0, 0.0, 0.0))) * units.length / units.time
+        velocity[0, row] = torch.tensor(objects.velocity.get(o.id, (0.0, 0.0, 0.0))) * units.length / units.time
         if MODELS[choice.material.model].plastic:
             log.warning("object %d (%s): %s yields or flows, which the learned field does not model; use --engine mpm",
                         o.id, o.name, choice.name)  # fmt: skip
@@ -226,15 +243,12 @@ def _roused(changes: Sequence[Change], ids: list[int]) -> Bool[Tensor, "o"]:
     return _rows(ids if whole else {c.object_id for c in changes}, ids)
 
 
-def _changed(
-    scene: Scene, per_object: list[Tensor], setup: SceneSetup, units: ModelUnits, solids: list[SolidBody],
-    prompts: ForcePrompts, options: SimulateOptions,
-) -> InitialConditions:  # fmt: skip
+def _changed(objects: FieldObjects, options: SimulateOptions) -> InitialConditions:
     """`_initial_conditions` with other materials, friction and gravity in the same units."""
-    materials = choose_for_bodies(scene, setup.bodies, options)
-    gravity = options.gravity * units.length / scene.metres_per_unit / units.time**2
-    setup, units = replace(setup, materials=materials), replace(units, gravity=gravity)
-    return _initial_conditions(scene, per_object, setup, units, solids, prompts, options)
+    setup, units = objects.setup, objects.units
+    setup = replace(setup, materials=choose_for_bodies(objects.scene, setup.bodies, options))
+    gravity = options.gravity * units.length / objects.scene.metres_per_unit / units.time**2
+    return _initial_conditions(replace(objects, setup=setup, units=replace(units, gravity=gravity)), options)
 
 
 def _load_forces(slots: ExternalForces, initial: InitialConditions, forces: Sequence[Force], ids: list[int]) -> None:

@@ -41,10 +41,10 @@ def run(scene: Path, out: Path, options: SimulateOptions = SimulateOptions()) ->
         raise InputError(f"--engine {options.engine}: choose from {', '.join((AUTO, *ENGINES))}")
     pick_device(options.device)  # a wrong name is an error with every engine
     world = with_objects(read_scene(scene), scene, options.device)
-    prompts = forces.parse(
-        world.objects, Path(scene).stem, force=options.force, forces=options.forces, pin=options.pin,
-        velocity=options.velocity, lift=options.lift,
-    )  # fmt: skip
+    stored = forces.ForcePrompts()
+    if options.forces is not None:
+        stored = forces.read_prompts_file(options.forces, Path(scene).stem, world.objects)
+    prompts = forces.parse(world.objects, options.force, options.pin, options.velocity, options.lift, stored)
     keypoints = choose_keypoints(world, options.keypoint_count, options.seed)
     options = with_engine(options, world, keypoints)
     prompts = for_engine(prompts, world, options)

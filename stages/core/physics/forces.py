@@ -99,19 +99,13 @@ class ForcePrompts:
 
 
 def parse(
-    objects: Sequence[SceneObject], scene_name: str = "", force: Sequence[str] = (), forces: Path | None = None,
-    pin: Sequence[str] = (), velocity: Sequence[str] = (), lift: Sequence[str] = (),
+    objects: Sequence[SceneObject], force: Sequence[str] = (), pin: Sequence[str] = (), velocity: Sequence[str] = (),
+    lift: Sequence[str] = (), stored: ForcePrompts = ForcePrompts(),  # noqa: B008 -- frozen
 ) -> ForcePrompts:  # fmt: skip
-    """Parse the prompts of the command line and of a forces file; objects are given by id or name.
+    """Parse the prompts of the command line, and add them to `stored` ones; objects are given by id or name.
 
-    A forces file is JSON, or a trajectory whose prompts are repeated. Raises InputError for malformed prompts and
-    unknown objects.
+    Raises InputError for malformed prompts and unknown objects.
     """
-    stored = ForcePrompts()
-    if forces is not None and Path(forces).suffix.lower() in suffixes("trajectory"):
-        stored = stored_prompts(forces, objects)
-    elif forces is not None:
-        stored = ForcePrompts(tuple(read_forces(forces, scene_name, objects)))
     return ForcePrompts(
         (*(_force(text, objects) for text in force), *stored.forces),
         stored.pinned | {find_object(p, objects, f"--pin {quote(repr(p))}").id for p in pin},
@@ -119,6 +113,13 @@ def parse(
         stored.lift | {id: height for text in lift for id, height in _lift(text, objects)},
         stored.changes,
     )
+
+
+def read_prompts_file(path: Path, scene_name: str, objects: Sequence[SceneObject]) -> ForcePrompts:
+    """The prompts of a forces file: JSON (`read_forces`), or a trajectory whose prompts are repeated."""
+    if Path(path).suffix.lower() in suffixes("trajectory"):
+        return stored_prompts(path, objects)
+    return ForcePrompts(tuple(read_forces(path, scene_name, objects)))
 
 
 def stored_prompts(path: Path, objects: Sequence[SceneObject]) -> ForcePrompts:

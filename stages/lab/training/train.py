@@ -123,13 +123,16 @@ def run(
         raise InputError(f"--horizons: the motions have {training.points.shape[1]} frames; take shorter ones")
     with process_group(pick_device(options.device), options.batch) as processes:
         sums = describe_groups(data, groups)
-        state, earlier = _initial_state(model, out, options, processes.device, resume, start, sums)
+        state, earlier = _initial_state(model, options, processes.device, start)
+        key = _key(model, options, earlier, sums)
+        if resume:
+            state.load(out.with_suffix(".ckpt"), key)
+            log.info("going on from step %d, %.1f min", state.step, state.elapsed / 60)
         if processes.is_main:
             log.info("%s, %s parameters: %d training scenes, %d validation scenes", model,
                      f"{sum(p.numel() for p in state.params):,}", len(training), len(validation))  # fmt: skip
         parts = _with_sparse(training, options.sparse_keypoints)
         samplers = [ClipSampler(part, processes.device, state.model) for part in parts]
-        key = _key(model, options, earlier, sums)
         job = TrainingRun(state, samplers, validation.to(processes.device), options, processes, out, key)
         finished = job.run()
         if not processes.is_main:
@@ -157,10 +160,9 @@ def _with_sparse(motions: KeypointMotions, count: int) -> list[KeypointMotions]:
 
 
 def _initial_state(
-    model: str, out: Path, options: TrainOptions, device: str, resume: bool, start: Path | None,
-    sums: dict[str, str],
+    model: str, options: TrainOptions, device: str, start: Path | None
 ) -> tuple[TrainingState, list[dict]]:
-    """A model that is new, from other weights, or from its checkpoint; and the earlier runs of its weights."""
+    """A model that is new or has the weights `start`; and the earlier runs of these weights."""
     torch.manual_seed(options.seed)
     earlier = []
     if start is None:
@@ -173,11 +175,7 @@ def _initial_state(
             raise InputError(f"{start}: holds {card['model']} {network.config}, not the model to be trained; leave "
                              "--width out and name weights of the same model")  # fmt: skip
         earlier = runs_of(card)
-    state = TrainingState(network, options.lr, options.seed, options.optimizer)
-    if resume:
-        state.load(out.with_suffix(".ckpt"), _key(model, options, earlier, sums))
-        log.info("going on from step %d, %.1f min", state.step, state.elapsed / 60)
-    return state, earlier
+    return TrainingState(network, options.lr, options.seed, options.optimizer), earlier
 
 
 def _key(model: str, options: TrainOptions, earlier: list[dict], sums: dict[str, str]) -> dict:

@@ -6,7 +6,7 @@ import math
 import pytest
 
 from stages.core.errors import InputError
-from stages.core.physics.forces import Force, ForcePrompts, parse
+from stages.core.physics.forces import Force, ForcePrompts, parse, read_prompts_file
 from stages.core.scene.scene import SceneObject
 
 OBJECTS = (SceneObject(1, "duck"), SceneObject(2, "phone"))
@@ -42,12 +42,12 @@ def test_the_file_format_of_ngff_counts_objects_from_0(tmp_path):
     file = tmp_path / "forces.json"
     row = {"obj_id": 0, "start": 0.2, "end": 0.4, "force": [0, 0, 8]}
     file.write_text(json.dumps({"12_duck_phone": [row], "other": [{**row, "obj_id": 1, "torque": [1, 2, 3]}]}))
-    assert parse(OBJECTS, "12_duck_phone", forces=file).forces == (Force(1, (0.0, 0.0, 8.0), start=0.2, end=0.4),)
-    assert parse(OBJECTS, "other", forces=file).forces[0].object_id == 2
+    assert read_prompts_file(file, "12_duck_phone", OBJECTS).forces == (Force(1, (0.0, 0.0, 8.0), start=0.2, end=0.4),)
+    assert read_prompts_file(file, "other", OBJECTS).forces[0].object_id == 2
     with pytest.raises(InputError, match="has no scene 'mine'; it has 12_duck_phone, other"):
-        parse(OBJECTS, "mine", forces=file)
+        read_prompts_file(file, "mine", OBJECTS)
     file.write_text(json.dumps({"only": [row]}))
-    assert parse(OBJECTS, "mine", forces=file).forces[0].object_id == 1  # a single scene matches any name
+    assert read_prompts_file(file, "mine", OBJECTS).forces[0].object_id == 1  # a single scene matches any name
 
 
 @pytest.mark.parametrize("prompt, message", [
@@ -81,5 +81,5 @@ def test_invalid_files(tmp_path, text, message):
     file = tmp_path / "f.json"
     file.write_text(text)
     with pytest.raises(InputError, match=message) as error:
-        parse(OBJECTS, "a", forces=file)
+        read_prompts_file(file, "a", OBJECTS)
     assert str(file) in str(error.value)

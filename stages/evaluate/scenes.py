@@ -12,15 +12,13 @@ from torch import Tensor
 from stages.core.errors import InputError
 from stages.core.geometry.harmonics import C0
 from stages.core.geometry.neighbours import knn
-from stages.core.scene.gaussians import Gaussians
+from stages.core.scene.gaussians import SURFACE_OPACITY, Gaussians
 from stages.core.scene.scene import Scene
 from stages.core.scene.scene_ply import read_scene
 from stages.evaluate.align import ReferenceFrame, check_same_reference_frame, find_alignment
 from stages.evaluate.matching import object_labels
 from stages.evaluate.options import EvaluateOptions
 from stages.evaluate.result import Result
-
-MIN_OPACITY = 0.1  # above which a Gaussian is part of a surface
 
 
 @dataclass(frozen=True)
@@ -86,7 +84,7 @@ def compare(prediction: Path, truth: Path, options: EvaluateOptions) -> Result:
     scenes = [read_scene(prediction), read_scene(truth)]
     frames = [scene_reference_frame(path, scene) for path, scene in zip((prediction, truth), scenes, strict=True)]
     predicted, true = (_surfaces(path, s) for path, s in zip((prediction, truth), scenes, strict=True))
-    notes = [f"only Gaussians of opacity above {MIN_OPACITY} are compared"]
+    notes = [f"only Gaussians of opacity above {SURFACE_OPACITY} are compared"]
     means = predicted.means
     if options.align:
         similarity, how = find_alignment(*frames)
@@ -123,8 +121,9 @@ def scene_reference_frame(path: Path, scene: Scene) -> ReferenceFrame:
 
 
 def _surfaces(path: Path, scene: Scene) -> Gaussians:
-    """The Gaussians above MIN_OPACITY; InputError if there are none."""
-    g = scene.gaussians[scene.gaussians.opacities > MIN_OPACITY]
+    """The Gaussians above SURFACE_OPACITY; InputError if there are none."""
+    g = scene.gaussians[scene.gaussians.opacities > SURFACE_OPACITY]
     if not len(g):
-        raise InputError(f"{path}: no Gaussian has an opacity above {MIN_OPACITY}, so there is no surface to compare")
+        raise InputError(f"{path}: no Gaussian has an opacity above {SURFACE_OPACITY}, so there is no surface to "
+                         "compare")  # fmt: skip
     return g

@@ -29,7 +29,7 @@ from stages.reconstruct.world_frame import Ground
 log = logging.getLogger(__name__)
 MIN_DEPTH_SAMPLES = 1000  # consistent depth samples that a scene needs
 FAR_DEPTH = 3.0  # depth of pixels without a known one [camera distances]
-MAX_DISTANCE = 10.0  # Gaussians farther from the focus are dropped [camera distances]
+MAX_SCENE_DISTANCE = 10.0  # Gaussians farther from the focus are dropped [camera distances]
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ def build_scene(found: SceneGeometry, options: ReconstructOptions, steps: StepCa
     focus, distance = to_world(ground.focus), to_world.scale * ground.radius
     views = dataclasses.replace(found.views, cameras=found.views.cameras.transformed(to_world))
     gaussians = transformed(gaussians, to_world)
-    gaussians = gaussians[(gaussians.means - focus).norm(dim=1) < MAX_DISTANCE * distance]
+    gaussians = gaussians[(gaussians.means - focus).norm(dim=1) < MAX_SCENE_DISTANCE * distance]
     fit = photometric.FitOptions(options.iteration_count(len(found.trained), device), distance, options.seed, device)
     with steps.timed("fit"):
         depths = [_known_depth(observed, i, to_world.scale) for i in range(len(observed.maps))]

@@ -26,7 +26,7 @@ MAX_FEATURES, MAX_FEATURES_MANY_PHOTOS = 6000, 3000
 DATABASE_BYTES = 1_500_000  # of the features of a photo in a COLMAP database
 MAX_EXHAUSTIVE = 60  # up to this many photos all pairs are matched
 MAX_RATIO = 0.8  # of the distances of best and second best match (Lowe 2004)
-MAX_DISTANCE = 0.7  # of matching descriptors of unit length
+MAX_DESCRIPTOR_DISTANCE = 0.7  # of matching descriptors of unit length
 
 # Keypoints (k, 4): x, y [px of the photo, centres at +0.5], scale, orientation; descriptors (k, 128), bytes.
 Feature = tuple[Tensor, Tensor]
@@ -131,7 +131,7 @@ def match_descriptors(a: Float[Tensor, "n d"], b: Float[Tensor, "m d"]) -> Int[T
     similarity = a @ b.mT
     best, to_b = similarity.topk(2, dim=1)
     distance = (2 - 2 * best).clamp_min(0).sqrt()
-    keep = ((distance[:, 0] < MAX_DISTANCE) & (distance[:, 0] < MAX_RATIO * distance[:, 1])).nonzero()[:, 0]
+    keep = ((distance[:, 0] < MAX_DESCRIPTOR_DISTANCE) & (distance[:, 0] < MAX_RATIO * distance[:, 1])).nonzero()[:, 0]
     to_b = to_b[keep, 0]
     mutual = similarity[:, to_b].argmax(0) == keep  # the best rows of these columns only: down columns is slow
     return torch.stack([keep[mutual], to_b[mutual]], 1).cpu()

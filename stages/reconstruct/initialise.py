@@ -17,7 +17,7 @@ from stages.core.scene.gaussians import Gaussians
 from stages.reconstruct.depth import DepthMap, look_up_points, unproject
 from stages.reconstruct.photos import Views
 
-MAX_POINTS = 6_000_000  # before downsampling; bounds memory at about 1 GB
+MAX_INITIAL_POINTS = 6_000_000  # before downsampling; bounds memory at about 1 GB
 FREE_SPACE_MARGIN = 1.04  # a surface farther than this times the depth of a point proves free space at the point
 FOCUS_DETAIL = 3.0  # cells in focus are up to this much finer than the rest
 
@@ -88,9 +88,9 @@ def fuse(observed: DepthViews) -> OrientedPoints:
     clouds = []
     for i, m in enumerate(observed.maps):
         keep = observed.consistent(i).flatten()
-        if pixels > MAX_POINTS:
+        if pixels > MAX_INITIAL_POINTS:
             generator = torch.Generator().manual_seed(i)
-            keep &= (torch.rand(len(keep), generator=generator) < MAX_POINTS / pixels).to(keep.device)
+            keep &= (torch.rand(len(keep), generator=generator) < MAX_INITIAL_POINTS / pixels).to(keep.device)
         clouds.append(unproject_view(observed.views, i, m.depth, m.support)[keep])
     cloud = concatenate_points(clouds)
     violations = free_space_violations(cloud.points, observed, observed.min_support)

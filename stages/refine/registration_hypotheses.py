@@ -19,7 +19,7 @@ KEYPOINTS, MATCHES_PER_KEYPOINT = 500, 4  # of the part
 TARGETS = 2000  # points of the whole that keypoints are matched to
 TRIPLES = 40_000  # of matches, drawn for each scale
 MAX_HYPOTHESES = 6000
-MAX_DISTANCE = 0.06  # joint distance in position and colour at which residuals are truncated [diameters]
+MAX_RESIDUAL = 0.06  # joint distance in position and colour at which residuals are truncated [diameters]
 
 
 @dataclass(frozen=True)
@@ -83,11 +83,11 @@ def misfit(
 ) -> Float[Tensor, "h"]:
     """Truncated mean squared distance in position and colour of the part's points from the whole, 0 to 1.
 
-    In units of MAX_DISTANCE^2. One-sided, since the part is incomplete; truncated, for robustness to outliers.
+    In units of MAX_RESIDUAL^2. One-sided, since the part is incomplete; truncated, for robustness to outliers.
     """
     moved = poses(points)
-    distance, _ = tree.query(torch.cat([moved, colours.expand_as(moved)], 2), within=MAX_DISTANCE)
-    return (distance[..., 0].clamp_max(MAX_DISTANCE) / MAX_DISTANCE).square().mean(1)
+    distance, _ = tree.query(torch.cat([moved, colours.expand_as(moved)], 2), within=MAX_RESIDUAL)
+    return (distance[..., 0].clamp_max(MAX_RESIDUAL) / MAX_RESIDUAL).square().mean(1)
 
 
 def local_features(cloud: RegistrationCloud, at: Int[Tensor, "k"], unit: float) -> Float[Tensor, "k f"]:

@@ -11,11 +11,10 @@ from torch import Tensor
 
 from stages.core.geometry.cameras import centres, depths, project
 from stages.core.scene.cameras import Cameras
-from stages.core.scene.gaussians import Gaussians
+from stages.core.scene.gaussians import SURFACE_OPACITY, Gaussians
 from stages.render.animation import Animation
 
 EXTENT_QUANTILES = (0.05, 0.95)  # of each coordinate, the extent of a set of points
-MIN_OPACITY = 0.1  # of the Gaussians that are framed
 # The radius of the cameras' focus is a third of their distance from it; these three are multiples of that radius.
 MAX_OBJECT_DISTANCE = 2.0  # objects farther from the focus are scenery
 MAX_POINT_DISTANCE = 4.0  # moving points farther from the focus have left the scene
@@ -57,7 +56,7 @@ def find_subject(animation: Animation) -> Subject:
     With photos the camera aims at their focus, shifted by at most MAX_AIM_SHIFT towards the objects.
     """
     g, cameras = animation.scene.gaussians, animation.scene.cameras
-    opaque = g[g.opacities > MIN_OPACITY] if (g.opacities > MIN_OPACITY).any() else g
+    opaque = g[g.opacities > SURFACE_OPACITY] if (g.opacities > SURFACE_OPACITY).any() else g
     focus = (axes_focus(cameras) or common_view_centre(cameras, opaque.means)) if cameras is not None else None
     ids = _central_objects(opaque, focus)
     if not len(ids):

@@ -21,7 +21,7 @@ MIN_KNOWN_FRACTION = 0.5  # fraction of a mask inside tracked objects from which
 MAX_HEIGHT = 0.4  # largest height above the table of an object's lowest points [camera distance]
 MAX_SIZE = 1.2  # longest side of an object [camera distance]
 MIN_POINTS = 20  # visible Gaussians of an object
-MAX_POINTS = 5000  # pixels of a mask that are examined
+MAX_MASK_PIXELS = 5000  # pixels of a mask that are examined
 
 
 def discover_objects(
@@ -98,7 +98,7 @@ def is_on_support(scene: Scene, front: Int[Tensor, "p"], support: Support | None
     near the table.
     """
     front = front[front >= 0]
-    points = scene.gaussians.means[front[:: max(1, len(front) // MAX_POINTS)].long()]
+    points = scene.gaussians.means[front[:: max(1, len(front) // MAX_MASK_PIXELS)].long()]
     if len(points) < MIN_POINTS:
         return False
     view = support.view if support is not None else view_extent(scene)

@@ -14,7 +14,7 @@ from stages.core.scene.scene import Scene
 
 VOXELS_ALONG = 64  # voxels along the region that is examined
 REACH = 0.5  # of the region beyond the objects, relative to their extent
-MIN_OPACITY = 0.5
+OBSTACLE_OPACITY = 0.5  # above which a Gaussian of the background can be hit
 MIN_COUNT = 2  # Gaussians in a full voxel
 MIN_HEIGHT = 2  # voxels above the floor that are left out: the floor is a plane
 MIN_GROUP = 20  # voxels of the smallest group
@@ -24,7 +24,7 @@ Box = tuple[tuple[float, float, float], tuple[float, float, float]]
 def background_boxes(scene: Scene, floor: float) -> list[Box]:
     """Lower and upper corners of boxes, in scene units."""
     g = scene.gaussians.to("cpu")
-    good = usable(g) & (g.opacities > MIN_OPACITY)
+    good = usable(g) & (g.opacities > OBSTACLE_OPACITY)
     means, own = g.means[good].double().numpy(), (g.object_id[good] > 0).numpy()
     if not own.any():
         return []

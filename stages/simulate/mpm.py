@@ -35,7 +35,7 @@ from stages.simulate.setup import SceneSetup, choose_for_bodies, set_up_scene
 
 log = logging.getLogger(__name__)
 PARTICLES_PER_KEYPOINT = 8  # particles whose motion a keypoint follows
-CONTACT_DISTANCE = 3.0  # particle spacings within which bodies are in contact on the grid
+GRID_CONTACT_DISTANCE = 3.0  # particle spacings within which bodies are in contact on the grid
 MIN_STUCK_FRACTION = 0.1  # fraction of a body's particles in contact above which a push is reported to be hindered
 GPU_SUBSTEP = 2e-5  # shortest substep worth taking on a GPU [s]
 CFL_MARGIN = 0.85  # fraction of the stability limit that materials may use up
@@ -193,7 +193,7 @@ def _warn_stuck(scene: Scene, setup: SceneSetup, prompts: ForcePrompts) -> None:
         if o.id not in pushed or bool(mine.all()):
             continue
         distance, nearest = knn(x[~mine], x[mine], 1)
-        touching = distance[:, 0] < CONTACT_DISTANCE * setup.bodies.spacing
+        touching = distance[:, 0] < GRID_CONTACT_DISTANCE * setup.bodies.spacing
         if float(touching.float().mean()) > MIN_STUCK_FRACTION:
             others = body[~mine][nearest[touching, 0]].unique().tolist()
             log.warning("object %d (%s) touches %s: bodies in contact on the MPM grid hardly slide or separate, so a "

@@ -29,7 +29,7 @@ from stages.simulate.options import SimulateOptions
 log = logging.getLogger(__name__)
 BOUNDS = {"penetration": 0.03, "creep": 0.01, "spread": 0.1, "energy_gain": 0.05}  # beyond these a run is warned of
 VOXELS_ALONG = 24  # of the bodies in which depths are measured
-MAX_POINTS = 256  # keypoints of an object whose depth is measured
+MAX_CHECKED_KEYPOINTS = 256  # keypoints of an object whose depth is measured
 SLOW = 0.1  # largest speed of what creeps, relative to that of a fall by half the object's size
 MOVED = 1e-3  # least displacement of one of two objects whose penetration is measured [size]
 
@@ -42,7 +42,7 @@ class PlausibilityMonitor:
         self._g = options.gravity / scene.metres_per_unit
         self._rows = [(keypoints.object_id == o.id).nonzero()[:, 0] for o in scene.objects]
         self._rest = [keypoints.rest[rows].double().numpy() for rows in self._rows]
-        self._few = [slice(None, None, -(-max(len(r), 1) // MAX_POINTS)) for r in self._rest]
+        self._few = [slice(None, None, -(-max(len(r), 1) // MAX_CHECKED_KEYPOINTS)) for r in self._rest]
         self._size = np.array([np.ptp(r, axis=0).max() if len(r) else np.inf for r in self._rest])
         self._height = np.array([np.ptp(r[:, 2]) if len(r) else np.inf for r in self._rest]).clip(1e-9)
         self._floor = options.floor if options.floor is not None else scene.floor

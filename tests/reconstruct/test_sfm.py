@@ -100,7 +100,7 @@ def test_matches_are_mutual_nearest_neighbours_one_by_one(device):
     expected = []
     for i, row in enumerate(similarity):
         second, best = (2 - 2 * row.topk(2).values).clamp_min(0).sqrt().flip(0).tolist()
-        near = best < features.MAX_DISTANCE and best < features.MAX_RATIO * second
+        near = best < features.MAX_DESCRIPTOR_DISTANCE and best < features.MAX_RATIO * second
         if near and int(similarity[:, row.argmax()].argmax()) == i:
             expected.append([i, int(row.argmax())])
     assert features.match_descriptors(a.to(device), b.to(device)).tolist() == expected and len(expected) > 10

@@ -36,7 +36,7 @@ MAX_BASE_HEIGHT = 0.4  # largest height above the table of an object's lowest po
 MAX_BUMP_HEIGHT = 0.05  # height up to which a region of the table's colour is unevenness of the table [camera distance]
 MAX_TABLE_OBJECT = 0.4  # longest side of an object on a table [camera distance]
 MAX_WALL_OBJECT = 0.9  # longest side of an object on a wall, which often fills the photos [camera distance]
-MIN_GAUSSIANS = 20  # above the plane, or there are no objects
+MIN_GAUSSIANS_ABOVE = 20  # above the plane, or there are no objects
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ def _grouped(
     g = replace(scene.gaussians, object_id=torch.zeros(len(scene.gaussians), dtype=torch.int64))
     index = _candidates(g, view, support)
     index = index[_is_dense(g.means[index], view)]
-    if len(index) < MIN_GAUSSIANS:
+    if len(index) < MIN_GAUSSIANS_ABOVE:
         log.info("no Gaussians above the supporting plane: no objects")
         return g
     seen = summed_view_directions(g, scene.cameras) if scene.cameras is not None and len(scene.cameras) else None
@@ -137,7 +137,7 @@ def _shortest(g: Gaussians) -> Float[Tensor, "n 3"]:
 
 def _is_dense(points: Float[Tensor, "m 3"], view: ViewExtent) -> Bool[Tensor, "m"]:
     """Points whose neighbours are about as near as usual; the others are floaters."""
-    if len(points) < MIN_GAUSSIANS:
+    if len(points) < MIN_GAUSSIANS_ABOVE:
         return torch.ones(len(points), dtype=torch.bool)
     distance = knn(points, points, 9)[0][:, -1]
     return distance < min(max(3.5 * float(distance.median()), 0.01 * view.radius), 0.06 * view.radius)

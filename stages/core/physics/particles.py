@@ -33,7 +33,7 @@ from stages.core.scene.scene import Scene
 
 log = logging.getLogger(__name__)
 
-MIN_OPACITY = 0.02  # Gaussians of lower opacity are ignored
+MIN_PARTICLE_OPACITY = 0.02  # Gaussians of lower opacity are ignored, as published
 MAX_OUTLIER_SCORE = 3.5  # robust z-score of the distance to the median centre (Iglewicz and Hoaglin 1993)
 MIN_PARTICLES = 40  # per object
 MAX_VOXELS_ALONG = 300  # maximum number of voxels along an object
@@ -102,7 +102,7 @@ def scene_size(scene: Scene) -> float:
 def usable(g: Gaussians) -> Tensor:
     """Mask of Gaussians with finite parameters, positive size and sufficient opacity."""
     finite = g.means.isfinite().all(1) & g.scales.isfinite().all(1) & g.quats.isfinite().all(1)
-    return finite & (g.scales > 0).all(1) & (g.quats.norm(dim=1) > 0) & (g.opacities > MIN_OPACITY)
+    return finite & (g.scales > 0).all(1) & (g.quats.norm(dim=1) > 0) & (g.opacities > MIN_PARTICLE_OPACITY)
 
 
 def surface_points(scene: Scene, object_id: int, seed: int) -> np.ndarray:

@@ -21,7 +21,7 @@ from stages.core.geometry.neighbours import BruteForce, KDTree, neighbour_index
 
 RESOLUTION = 36  # nodes of the grid along each axis
 MARGIN = 4  # cells of the grid around the body
-NEIGHBOURS = 12  # surface points that determine a normal
+NORMAL_NEIGHBOURS = 12  # surface points that determine a normal
 BLENDED = 6  # discs whose distances are averaged
 MAX_SURFELS = 6_000  # surface points used; more make no difference at this resolution
 SAME_FACE = 0.5  # smallest cosine of the angle between the normals of discs that are averaged
@@ -99,7 +99,7 @@ def mass_properties(grid: DistanceGrid) -> tuple[float, Float[Tensor, "3"], Floa
 
 def _unoriented(points: Float[Tensor, "m 3"], tree: KDTree | BruteForce) -> Surfels:
     """Discs at the points, with normals of either sign."""
-    distance, index = tree.query(points, min(NEIGHBOURS, len(points)))
+    distance, index = tree.query(points, min(NORMAL_NEIGHBOURS, len(points)))
     local = points[index] - points[index].mean(1, keepdim=True)
     _, axes = torch.linalg.eigh(local.mT @ local)
     return Surfels(points, axes[:, :, 0], distance[:, min(4, distance.shape[1] - 1)], torch.zeros_like(distance[:, 0]))
@@ -146,7 +146,7 @@ def _oriented(
     at = [((x - low) / cell).round().long().clamp(0, len(openness) - 1)
           for x in (surfels.centre + step, surfels.centre - step)]  # fmt: skip
     sides = [openness[tuple(i.unbind(1))].double() for i in at]
-    _, index = tree.query(surfels.centre, min(NEIGHBOURS, len(surfels.centre)))
+    _, index = tree.query(surfels.centre, min(NORMAL_NEIGHBOURS, len(surfels.centre)))
     same = (surfels.normal[index] @ surfels.normal[:, :, None])[..., 0]
     weight = (same.abs() - SAME_FACE).clamp_min(0)
     weight = weight / weight.sum(1, keepdim=True)

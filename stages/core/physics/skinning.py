@@ -14,7 +14,7 @@ from stages.core.kernels.skinning import skin_gaussians
 from stages.core.scene.gaussians import Gaussians
 from stages.core.scene.trajectory import Binding, Keypoints
 
-NEIGHBOURS = 16  # keypoints from which the deformation around a keypoint is estimated
+DEFORMATION_NEIGHBOURS = 16  # keypoints from which the deformation around a keypoint is estimated
 RIDGE = 1e-3  # weight of a rigid rotation relative to the neighbours' deformation
 
 
@@ -115,10 +115,10 @@ def object_rotations(
 def keypoint_neighbours(keypoints: Keypoints) -> Int[Tensor, "p j"]:
     """The nearest other keypoints of the same object, padded with the keypoint itself."""
     rest = keypoints.rest.float()
-    around = torch.zeros(len(rest), NEIGHBOURS, dtype=torch.int64)
+    around = torch.zeros(len(rest), DEFORMATION_NEIGHBOURS, dtype=torch.int64)
     for id in keypoints.object_id.unique():
         own = (keypoints.object_id == id).nonzero()[:, 0]
-        _, index = knn(rest[own], rest[own], NEIGHBOURS + 1)
+        _, index = knn(rest[own], rest[own], DEFORMATION_NEIGHBOURS + 1)
         around[own] = own[index[:, 1:]]
     return around
 

@@ -21,7 +21,7 @@ from stages.core.scene.scene import Scene
 from stages.core.scene.trajectory import Binding, Keypoints, Trajectory
 
 WEB = Path(__file__).parent / "web"
-MIN_OPACITY = 1 / 255  # Gaussians below are not drawn by the rasteriser either
+MIN_DRAWN_OPACITY = 1 / 255  # Gaussians below are not drawn by the rasteriser either
 KEYPOINT_BITS = 16  # of the extent of the keypoints at rest; more where they leave it
 POSITION_STEP = 0.05  # of centres [typical smallest scale of the Gaussians]
 HARMONICS_BITS = (10, 8, 7, 6)  # of each band
@@ -120,7 +120,7 @@ def _data_url(file: Path) -> str:
 def _drawing_order(g: Gaussians, bound: Tensor) -> Int[Tensor, "m"]:
     """Rows of the drawable Gaussians: those that follow keypoints first, by object, neighbours near each other."""
     finite = torch.stack([getattr(g, name).flatten(1).isfinite().all(1) for name in ("means", "quats", "scales", "sh")])
-    rows = (finite.all(0) & (g.opacities >= MIN_OPACITY)).nonzero()[:, 0]
+    rows = (finite.all(0) & (g.opacities >= MIN_DRAWN_OPACITY)).nonzero()[:, 0]
     x = g.means[rows].double()
     some = x[:: 1 + len(x) // 100_000] if len(x) else x.new_zeros(1, 3)
     low, high = (torch.quantile(some, q, dim=0) for q in (0.01, 0.99))

@@ -13,6 +13,8 @@ from stages.core.geometry.harmonics import rotate_sh
 from stages.core.geometry.rotations import multiply, quaternion
 from stages.core.geometry.similarity import Similarity
 
+SURFACE_OPACITY = 0.1  # Gaussians above it are part of a visible surface
+
 
 @dataclass(frozen=True)
 class Gaussians:

@@ -8,9 +8,7 @@ import h5py
 import numpy as np
 
 from stages.core.scene.h5_chunks import read_compressed
-from stages.core.scene.schema import LARGEST, Bound, quote
-
-MAX_COMPRESSION = 1100  # deflate reaches 1032
+from stages.core.scene.schema import LARGEST, MAX_DEFLATE_RATIO, Bound, quote
 
 
 @dataclass(frozen=True)
@@ -44,7 +42,7 @@ class Dataset:
         if kind not in {"float": ("f", "i", "u"), "int": ("i", "u"), "text": ("text",)}[self.kind]:
             raise ValueError(f"{name} has values of type {quote(data.dtype, 40)}, not {self.kind}")
         stored = data.id.get_storage_size()
-        if data.size * data.dtype.itemsize > MAX_COMPRESSION * stored + 4096:
+        if data.size * data.dtype.itemsize > MAX_DEFLATE_RATIO * stored + 4096:
             raise ValueError(f"{name} declares {data.size} values, but the file stores only {stored} bytes of them")
         lengths.update({s: n for s, n in zip(self.shape.split(), data.shape, strict=True) if s.isalpha()})
         return data

@@ -10,10 +10,9 @@ import numpy as np
 
 from stages.core.errors import InputError
 from stages.core.scene.files import must_exist
-from stages.core.scene.schema import quote, reason
+from stages.core.scene.schema import MAX_DEFLATE_RATIO, quote, reason
 
 MAX_BYTES = 16 << 30  # of all arrays
-MAX_COMPRESSION = 1100  # deflate reaches 1032
 
 
 def read_npz(path: Path, what: str) -> dict[str, np.ndarray]:
@@ -24,7 +23,7 @@ def read_npz(path: Path, what: str) -> dict[str, np.ndarray]:
     must_exist(path, what)
     try:
         with zipfile.ZipFile(path) as archive:
-            if sum(info.file_size for info in archive.infolist()) > min(MAX_BYTES, MAX_COMPRESSION * _size(path)):
+            if sum(info.file_size for info in archive.infolist()) > min(MAX_BYTES, MAX_DEFLATE_RATIO * _size(path)):
                 raise ValueError("it declares more bytes than it can hold")
             for info in archive.infolist():
                 with archive.open(info) as file:

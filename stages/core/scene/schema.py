@@ -15,6 +15,7 @@ import numpy as np
 MAX_JSON_BYTES, MAX_JSON_DEPTH = 256 << 20, 100
 MAX_OBJECT_ID = 65535  # label images have 16 bits
 LARGEST = 1e9  # of coordinates and sizes [scene units]; squares stay far from the limit of float32
+MAX_DEFLATE_RATIO = 1100  # of uncompressed to compressed bytes; deflate reaches 1032
 MAX_QUOTED = 80
 MAX_ROWS = 10**6  # of a list that a user writes
 Bound = int | float

@@ -15,13 +15,13 @@ from pathlib import Path
 import torch
 
 from stages.core.errors import InputError
+from stages.core.models.initial_conditions import GRAVITY
 from stages.core.physics.mpm import solver as mpm
 from stages.lab.bench import common as bench
 from stages.lab.bench import mpm_three_kernel
 
 log = logging.getLogger(__name__)
 SUBSTEP, SUBSTEPS, FRAMES = 1e-4, 200, 100  # as published
-GRAVITY = (0.0, 0.0, -5.0)
 BODIES_PER_SCENE = 3
 PARTICLE_BYTES = 145  # read and written per particle and substep, without the grid
 STENCIL_NODES = 27  # of a particle's stencil: 16 bytes read and 16 bytes added each

@@ -22,16 +22,17 @@ from torch import Tensor
 
 from stages.core.geometry.rotations import covariance
 from stages.core.kernels.skinning import skin_gaussians
+from stages.core.models.initial_conditions import FLOOR
 from stages.core.physics.keypoints import KEYPOINTS_PER_GAUSSIAN, nearest_weights
+from stages.core.physics.particles import MIN_PARTICLE_OPACITY
 from stages.core.scene.gaussians import Gaussians, concatenate
 from stages.core.scene.scene import Scene, SceneObject
 from stages.core.scene.scene_ply import read_scene
 from stages.lab.dataset.layout import Layout, object_kind
-from stages.lab.dataset.object_particles import MIN_OPACITY, Asset, at_scale_prior
+from stages.lab.dataset.object_particles import Asset, at_scale_prior
 from stages.lab.dataset.scene_configs import SceneConfig
 
 SH_COEFFICIENTS = 9  # stored per channel (degree 2)
-FLOOR_HEIGHT = -0.94  # [m]
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,7 @@ class ObjectSkin:
     """Gaussians of one object about the origin, and the binding of the opaque ones to its particles."""
 
     gaussians: Gaussians  # all of them
-    opaque: Gaussians  # n of them, those with opacity above MIN_OPACITY
+    opaque: Gaussians  # n of them, those with opacity above MIN_PARTICLE_OPACITY
     index: Tensor  # (n, 8) int32, rows of the object's particles
     weight: Float[Tensor, "n 8"]
 
@@ -50,7 +51,7 @@ def load_skins(layout: Layout, assets: Mapping[int, Asset]) -> dict[int, ObjectS
     for i, asset in assets.items():
         kind = object_kind(i)
         gaussians = at_scale_prior(read_scene(layout.object(kind.name)).gaussians, kind.scale)
-        opaque = gaussians[gaussians.opacities > MIN_OPACITY]
+        opaque = gaussians[gaussians.opacities > MIN_PARTICLE_OPACITY]
         index, weight = nearest_weights(asset.points, opaque.means, KEYPOINTS_PER_GAUSSIAN)
         out[i] = ObjectSkin(gaussians, opaque, index.int().contiguous(), weight.contiguous())
     return out
@@ -66,7 +67,7 @@ def compose_scene(config: SceneConfig, bodies: Sequence[Gaussians], provenance: 
         parts.append(replace(g, means=g.means + torch.tensor(p), object_id=torch.full((len(g),), n)))
         objects.append(SceneObject(n, object_kind(i).name))
     scale = {"metres_per_unit": 1.0, "source": "made in metres"}
-    return Scene(concatenate(parts), tuple(objects), None, FLOOR_HEIGHT, scale, provenance or {})
+    return Scene(concatenate(parts), tuple(objects), None, FLOOR, scale, provenance or {})
 
 
 def opaque_rest_gaussians(config: SceneConfig, skins: Mapping[int, ObjectSkin]) -> Gaussians:

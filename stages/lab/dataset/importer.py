@@ -21,18 +21,18 @@ from torch import Tensor
 from tqdm import tqdm
 
 from stages.core.errors import InputError
+from stages.core.models.initial_conditions import FLOOR, GRAVITY
 from stages.core.physics.keypoints import bind_gaussians, farthest_points
+from stages.core.physics.particles import MIN_PARTICLE_OPACITY
 from stages.core.physics.skinning import object_rotations
 from stages.core.scene.files import must_exist, provenance
 from stages.core.scene.scene import Scene, SceneObject
 from stages.core.scene.scene_ply import read_scene
 from stages.core.scene.trajectory import Keypoints, SimulationInfo, TrajectoryWriter
 from stages.lab.dataset.cameras import orbit_cameras
-from stages.lab.dataset.gaussian_frames import FLOOR_HEIGHT
 from stages.lab.dataset.layout import Layout, object_kind
-from stages.lab.dataset.object_particles import FRAME_INTERVAL, MIN_OPACITY
+from stages.lab.dataset.object_particles import FRAME_INTERVAL
 from stages.lab.dataset.scene_configs import read_scene_configs
-from stages.lab.dataset.simulation import GRAVITY
 
 FILE_KIND = "a frame of GSCollision (.h5 with pos, cov3D and rot)"
 HALF_EXTENT = 1.0  # of the simulated cube [m]
@@ -58,7 +58,7 @@ def run(folder: Path, out: Path, scene: Path | None = None, count: int = 2048) -
     chosen, keypoints = _choose_keypoints(labelled, rows, count)
     made_by = {**provenance("import", [source, frames[0]]), "scene": labelled.provenance}
     initial = replace(labelled, cameras=labelled.cameras or orbit_cameras(RESOLUTION), provenance=made_by,
-                      floor=FLOOR_HEIGHT if labelled.floor is None else labelled.floor)  # fmt: skip
+                      floor=FLOOR if labelled.floor is None else labelled.floor)  # fmt: skip
     ids = [o.id for o in initial.objects]
     owner = initial.gaussians.object_id[rows]
     info = SimulationInfo(FRAME_INTERVAL, GRAVITY, "mpm")
@@ -132,12 +132,12 @@ def _gaussian_count(layout: Layout, name: str) -> int:
 def _frame_rows(scene: Scene, first: Path, source: Path) -> Int[Tensor, "r"]:
     """Index of the Gaussian of each row; raises InputError when the frames do not belong to the scene."""
     g = scene.gaussians
-    rows = ((g.opacities > MIN_OPACITY) & (g.means.abs() <= HALF_EXTENT).all(1)).nonzero()[:, 0]
+    rows = ((g.opacities > MIN_PARTICLE_OPACITY) & (g.means.abs() <= HALF_EXTENT).all(1)).nonzero()[:, 0]
     positions = _read(first, "pos", (3,))
     if len(positions) != len(rows):
         raise InputError(
             f"{first}: has {len(positions)} rows, but {source} has {len(rows)} Gaussians with opacity above "
-            f"{MIN_OPACITY} within {HALF_EXTENT} m; give the scene it was made from as --scene"
+            f"{MIN_PARTICLE_OPACITY} within {HALF_EXTENT} m; give the scene it was made from as --scene"
         )
     distance = float((positions - g.means[rows]).abs().amax())
     if not distance <= POSITION_TOLERANCE:

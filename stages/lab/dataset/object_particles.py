@@ -18,6 +18,7 @@ from stages.core.geometry.neighbours import knn
 from stages.core.physics.keypoints import farthest_points
 from stages.core.physics.materials import MODELS
 from stages.core.physics.mpm import solver as mpm
+from stages.core.physics.particles import MIN_PARTICLE_OPACITY
 from stages.core.scene.files import replacing
 from stages.core.scene.gaussians import Gaussians
 from stages.core.scene.npz import read_npz
@@ -28,7 +29,6 @@ from stages.lab.dataset.scene_configs import PlacementExtent
 FRAME_INTERVAL, SUBSTEP = 0.02, 1e-4  # as published [s]
 POISSON_RATIO = 0.3  # of all objects, as published
 FRICTION = 1.0  # walls that keep 0.9 of the tangential speed per substep act like a coefficient of 1 or more
-MIN_OPACITY = 0.02  # of a Gaussian that becomes a particle, as published
 PLACEMENT_POINTS = 2048  # first particles of an object, of which distances between objects are computed
 
 
@@ -120,14 +120,14 @@ def cached_points(
 def at_scale_prior(g: Gaussians, scale: float) -> Gaussians:
     """An object's Gaussians scaled by its scale prior, centred on the bounding box of the opaque ones [m]."""
     means = g.means * scale
-    opaque = means[g.opacities > MIN_OPACITY]
+    opaque = means[g.opacities > MIN_PARTICLE_OPACITY]
     return replace(g, means=means - (opaque.amax(0) + opaque.amin(0)) / 2, scales=g.scales * scale)
 
 
 def _sample_particles(kind: ObjectKind, discretisation: Discretisation, min_particles: int) -> Float[Tensor, "p 3"]:
     """Centres of some of the object's Gaussians, by farthest-point sampling."""
     g = at_scale_prior(make_object(kind.name), kind.scale)
-    means = g.means[g.opacities > MIN_OPACITY]
+    means = g.means[g.opacities > MIN_PARTICLE_OPACITY]
     if len(means) < min_particles:
         raise InputError(f"--keypoints {min_particles}: {kind.name} has only {len(means)} Gaussians")
     count = max(min_particles, count_for_spacing(means, discretisation.spacing))

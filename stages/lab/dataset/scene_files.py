@@ -9,6 +9,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
+from stages.core.models.initial_conditions import GRAVITY
 from stages.core.physics.mpm.batch import BatchFrame
 from stages.core.scene.files import provenance
 from stages.core.scene.gaussians import Gaussians
@@ -24,7 +25,7 @@ from stages.lab.dataset.layout import Layout, replacing_folder
 from stages.lab.dataset.object_particles import FRAME_INTERVAL, Asset
 from stages.lab.dataset.options import DatasetOptions
 from stages.lab.dataset.scene_configs import SceneConfig
-from stages.lab.dataset.simulation import GRAVITY, SimulationSettings, simulation_batches, valid_scenes
+from stages.lab.dataset.simulation import SimulationSettings, simulation_batches, valid_scenes
 from stages.lab.dataset.videos import write_dynamic, write_initial
 
 MAX_BATCH_PARTICLES = 400_000  # when all frames of a batch are kept: 2 GB for 100 frames

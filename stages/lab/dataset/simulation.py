@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from stages.core.models.initial_conditions import BOX, GRAVITY
 from stages.core.physics.mpm import solver as mpm
 from stages.core.physics.mpm.batch import Batch
 from stages.lab.dataset.keypoint_motions import KeypointMotions
@@ -31,12 +32,10 @@ from stages.lab.dataset.object_particles import (
 from stages.lab.dataset.scene_configs import SceneConfig
 
 log = logging.getLogger(__name__)
-GRAVITY = (0.0, 0.0, -5.0)  # [m/s^2]
-WALL_BOX = ((-1.94, -1.94, -0.94), (1.94, 1.94, 2.94))  # [m]
 TRANSFER_DAMPING = 0.9  # per published substep
 WALL_RETENTION = 0.9  # of the tangential speed at walls, per published substep
 MAX_COURANT = 0.68  # of a given substep, as of the bowl at the published one; shells gain energy from 0.7
-MAX_FALL_SPEED = math.sqrt(-2 * GRAVITY[2] * (WALL_BOX[1][2] - WALL_BOX[0][2]))  # from the ceiling to the floor [m/s]
+MAX_FALL_SPEED = math.sqrt(-2 * GRAVITY[2] * (BOX[1][2] - BOX[0][2]))  # from the ceiling to the floor [m/s]
 CPU_BATCH_SCENES = 4
 GPU_BATCH_PARTICLES = 1_500_000  # enough to occupy a GPU; more only take memory
 
@@ -93,7 +92,7 @@ def simulation_batches(
 ) -> Iterator[tuple[list[SceneConfig], Batch]]:  # fmt: skip
     """All scenes at rest, in batches of about equal size with at most about `max_particles` particles on a GPU."""
     dx, device = settings.discretisation.dx, settings.device
-    low, high = WALL_BOX
+    low, high = BOX
     length = settings.discretisation.substep / SUBSTEP
     box = mpm.Box(low, high, tangential_retention=WALL_RETENTION**length)
     # Strain rates decay by diffusion between particles, at a rate proportional to damping / substep (measured).
@@ -155,5 +154,5 @@ def _to_motions(
     points = torch.where((objects >= 0)[:, None, :, None, None], points.transpose(0, 1), 0.0)
     return KeypointMotions(
         names=tuple(c.name for c in scenes), objects=objects, points=points, mass=mass, E=E, nu=POISSON_RATIO * ones,
-        friction=FRICTION * ones, dt=FRAME_INTERVAL, gravity=GRAVITY, box=WALL_BOX, solidity=solidity,
+        friction=FRICTION * ones, dt=FRAME_INTERVAL, gravity=GRAVITY, box=BOX, solidity=solidity,
     )  # fmt: skip

@@ -21,7 +21,7 @@ VALIDATION_SCENES = 100  # at the end of the last group: they only select the be
 # RMS change of velocity from frame to frame [m/s] above which an object is in a collision, where central differences
 # do not approximate its velocity
 MAX_SPEED_CHANGE = 0.3
-REST_SPEED, REST_FRAMES = 0.02, 5  # scenes slower than this [m/s] in their last frames are taken to remain at rest
+MAX_RESTING_SPEED, REST_FRAMES = 0.02, 5  # scenes slower [m/s] in their last frames are taken to remain at rest
 
 
 @dataclass(frozen=True)
@@ -121,7 +121,7 @@ def ends_at_rest(motions: KeypointMotions) -> Bool[Tensor, "b"]:
     """Whether each scene has come to rest at its end; on the CPU."""
     last = motions.points[:, -REST_FRAMES - 1 :]
     speed = (last[:, 1:] - last[:, :-1]).norm(dim=-1).mean(1) / motions.dt
-    return (speed.flatten(1).amax(1) < REST_SPEED).cpu()
+    return (speed.flatten(1).amax(1) < MAX_RESTING_SPEED).cpu()
 
 
 def motion_spread(motions: KeypointMotions) -> Float[Tensor, "b o 3"]:

@@ -19,7 +19,7 @@ from stages.core.kernels.splat.ssim_pixel import ssim_backward, ssim_forward
 
 wp.set_module_options({"enable_backward": False})
 
-MIN_ALPHA = 0.5  # of pixels whose depth counts
+MIN_DEPTH_ALPHA = 0.5  # of pixels whose depth counts
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ def _add_up(
         v_rgb[i, k] = v * gain[c]
         sums[i, j, 1 + c] = v * rgb[i, k]
     v_depth[i, j] = 0.0
-    if has_depth != 0 and alpha[i, j] > wp.static(MIN_ALPHA) and wp.isfinite(inverse[i, j]):
+    if has_depth != 0 and alpha[i, j] > wp.static(MIN_DEPTH_ALPHA) and wp.isfinite(inverse[i, j]):
         z = wp.max(depth[i, j], min_depth)
         error = distance / z - inverse[i, j]
         loss += depth_weight * wp.abs(error) / pixels
@@ -127,6 +127,6 @@ def photometric_loss_reference(
     loss = (1 - terms.ssim) * (image - photo).abs().mean() + terms.ssim * (1 - ssim(image, photo))
     if inverse is not None:
         error = terms.camera_distance / depth.clamp_min(terms.min_depth) - inverse
-        known = error.isfinite() & (alpha > MIN_ALPHA)
+        known = error.isfinite() & (alpha > MIN_DEPTH_ALPHA)
         loss = loss + terms.depth * torch.where(known, error, torch.zeros_like(error)).abs().mean()
     return loss

@@ -34,11 +34,11 @@ COMMANDS = {
 
 
 @pytest.fixture(scope="module")
-def inputs(tmp_path_factory) -> Path:
+def inputs(tmp_path_factory, device) -> Path:
     """A folder with a scene, a trajectory and a photo set with cameras."""
     folder = tmp_path_factory.mktemp("inputs")
     write_scene(folder / "scene.ply", two_balls_scene())
-    simulate(folder / "scene.ply", folder / "traj.h5", SimulateOptions(steps=3, quality="draft", device="cpu"))
+    simulate(folder / "scene.ply", folder / "traj.h5", SimulateOptions(steps=3, quality="draft", device=device))
     (folder / "set").mkdir()
     write_set(folder / "set", arc(4, (96, 72), sweep=40.0))
     return folder

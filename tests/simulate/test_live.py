@@ -137,12 +137,13 @@ PAGE_SESSION = """async ([frames, actions]) => {
 }"""
 
 
+@pytest.mark.usefixtures("device")
 def test_a_page_without_server_answers_alike(tmp_path, monkeypatch, open_page):
     """The same messages move the same objects, whether the engine or the page of a playable film takes them."""
     frames, actions = 26, {n: a_busy_user(n, None) for n in range(26)}
     live, _, _, _ = prompts_of_a_session("ngff", monkeypatch, a_busy_user, frames)
     write_scene(tmp_path / "scene.ply", two_balls_scene())
-    options = SimulateOptions(engine="ngff", quality="draft", steps=2, keypoints=32, box="-1,-1,0,1,1,2", device="cpu")
+    options = SimulateOptions(engine="ngff", quality="draft", steps=2, keypoints=32, box="-1,-1,0,1,1,2")
     run(tmp_path / "scene.ply", tmp_path / "traj.h5", options)
     page = open_page(render(tmp_path / "traj.h5", tmp_path / "film.html", RenderOptions(playable=True)))
     end = torch.tensor(page.evaluate(PAGE_SESSION, [frames, actions])).view(-1, 3)
@@ -295,7 +296,7 @@ def test_two_hundred_connections_leave_nothing_behind(server):
 
 
 def start_session(folder: Path, *options: str):
-    """The command in a process of its own, and its address."""
+    """The command in a process of its own, on the CPU, where a motion repeats to the bit; and its address."""
     code = "from ngff_cli.app import main; main()"
     words = ["simulate", "scene.ply", "-o", "traj.h5", "--live", "--no-browser", "--device", "cpu", *options]
     path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])

@@ -73,7 +73,7 @@ def test_failed_scenes_are_named_and_others_finish(device):
         torch.testing.assert_close(last.of(name).x, expected.of(name).x, rtol=0, atol=2e-5)
 
 
-def test_number_of_scenes_that_fit():
+def test_number_of_scenes_that_fit_on_a_cpu():
     count = mpm.make_grid(BOX, DX).count
     fits = Batch.fits(BOX, DX, 1000, "cpu")
     assert fits > 1 and fits * count < 2**31

@@ -109,8 +109,9 @@ def test_ten_motions_agree_after_fifty_frames(tmp_path, open_page, device):
     assert max(distances.values()) < LIMIT, distances
 
 
+@pytest.mark.usefixtures("device")
 def test_the_mouse_takes_an_object_out_of_the_film(tmp_path, open_page):
-    simulated(tmp_path, two_balls_scene(), frames=5, lift=("2=0.1",), device="cpu")
+    simulated(tmp_path, two_balls_scene(), frames=5, lift=("2=0.1",))
     page = open_page(render(tmp_path / "traj.h5", tmp_path / "film.html", RenderOptions(playable=True, view="input:0")))
     page.set_viewport_size({"width": 800, "height": 400})
     page.evaluate("player.play(false); player.seek(0)")
@@ -129,8 +130,9 @@ def test_the_mouse_takes_an_object_out_of_the_film(tmp_path, open_page):
     assert page.is_visible("#time") and page.evaluate("player.live.running") is False
 
 
+@pytest.mark.usefixtures("device")
 def test_only_motions_of_the_learned_field_are_playable(tmp_path):
-    t = simulated(tmp_path, two_balls_scene(), frames=2, device="cpu")
+    t = simulated(tmp_path, two_balls_scene(), frames=2)
     for wrong, message in (
         (replace(t, info=replace(t.info, engine="rigid")), "simulated by rigid"),
         (replace(t, field=None), "simulate again"),
@@ -153,8 +155,9 @@ FOLLOW = """([frame]) => Promise.all(["local", "engine"].map((name) => import(`p
   })"""  # the end of a film whose last frames are computed
 
 
+@pytest.mark.usefixtures("device")
 def test_motion_goes_on_from_within_a_film(tmp_path, open_page):
-    t = simulated(tmp_path, two_balls_scene(), frames=16, velocity=("object=2 -0.8,0,0",), device="cpu")
+    t = simulated(tmp_path, two_balls_scene(), frames=16, velocity=("object=2 -0.8,0,0",))
     page = open_page(render(tmp_path / "traj.h5", tmp_path / "film.html", RenderOptions(playable=True)))
     end = torch.tensor(page.evaluate(FOLLOW, [8])).view(-1, 3)
     travelled = (t.positions[-1] - t.positions[8]).norm(dim=1).max()

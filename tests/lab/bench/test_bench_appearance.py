@@ -61,9 +61,11 @@ def test_recipe_fits_photos_and_densifies():
     assert (many.sh[:, 1:4] != 0).any() and (many.sh[:, 4:] == 0).all()
 
 
-def test_initial_scales_are_neighbour_distances():
+def test_initial_scales_are_neighbour_distances(device):
     points = torch.cartesian_prod(*3 * [torch.arange(4.0)])
-    values = peer.initial_parameters(peer.ColouredPoints(points, torch.full((64, 3), 0.5)), "cpu")
+    values = peer.initial_parameters(peer.ColouredPoints(points, torch.full((64, 3), 0.5)), device)
+    assert {value.device.type for value in values.values()} == {device}
+    values = {name: value.cpu() for name, value in values.items()}
     torch.testing.assert_close(values["scales"].exp(), torch.ones(64, 3))
     torch.testing.assert_close(values["opacities"].sigmoid(), torch.full((64,), 0.1))
     assert (values["sh0"] == 0).all() and values["shN"].shape == (64, 15, 3)
@@ -87,7 +89,7 @@ def _colours(views: Views, i: int, points: torch.Tensor) -> torch.Tensor:
     return views.image(i)[y, x]
 
 
-def test_gsplat_steps_match_our_time(monkeypatch):
+def test_gsplat_steps_match_our_time(monkeypatch, device):
     """With a clock that a step advances by 10 ms in the first half of the schedule and 40 ms in the second."""
     clock = [0.0]
     monkeypatch.setattr(bench.time, "perf_counter", lambda: clock[0])
@@ -107,7 +109,7 @@ def test_gsplat_steps_match_our_time(monkeypatch):
     made = Reconstruction(scene, views, [1, 2, 3, 4, 5], [0], {}, [])
     seen = torch.zeros(1, dtype=torch.int64)
     model = SparseModel(cameras, LensDistortion(torch.zeros(6, 5)), torch.zeros(1, 3), seen, seen + 1)
-    side = bench.gsplat_result(made, model, 50.0, "cpu")
+    side = bench.gsplat_result(made, model, 50.0, device)
     assert side.seconds == pytest.approx(50, rel=0.2) and side.steps == pytest.approx(2000, rel=0.2)
     assert side.gaussians == len(scene.gaussians) and side.psnr < 30
 

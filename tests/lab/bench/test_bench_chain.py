@@ -11,6 +11,7 @@ from stages.lab.bench.chain import ChainBenchOptions
 from tests.conftest import two_balls_scene
 
 
+@pytest.mark.usefixtures("device")
 def test_repeated_files_are_compared_and_times_written(tmp_path, monkeypatch):
     def calls(photos, folder, options):
         return {
@@ -21,7 +22,7 @@ def test_repeated_files_are_compared_and_times_written(tmp_path, monkeypatch):
 
     monkeypatch.setattr(chain, "stage_calls", calls)
     monkeypatch.setattr(chain, "_command_seconds", lambda line: 1.5)
-    lines = list(chain.run(tmp_path, tmp_path / "chain.json", ChainBenchOptions(device="cpu")))
+    lines = list(chain.run(tmp_path, tmp_path / "chain.json", ChainBenchOptions()))
     assert "files that differ between runs: film.mp4" in lines
     facts = json.loads((tmp_path / "chain.json").read_text())
     assert facts["objects"] == [2, 2] and len(facts["runs"]) == 2 and facts["commands"]["refine"] == 1.5

@@ -269,7 +269,8 @@ def simulated(tmp_path, monkeypatch):
         (tmp_path / "set" / folder).mkdir(parents=True)
     write_scene_configs(tmp_path / "set" / "scene_configs" / "3_9.json", configs)
     options = {"dx": COARSE.dx, "spacing": COARSE.spacing, "substep": COARSE.substep, "keypoints": 60}
-    made = concatenate_motions(list(simulate(configs, things, SimulationSettings(COARSE, 12, 60, "cpu"))))
+    settings = SimulationSettings(COARSE, 12, 60, "cpu")  # whose sums are the same in every run
+    made = concatenate_motions(list(simulate(configs, things, settings)))
     write_motions(tmp_path / "set" / "motions" / "3_9.h5", made, {"options": options})
     monkeypatch.setattr(dynamics_baselines, "load_assets", lambda fineness, least, kept: things)
     return tmp_path / "set", things

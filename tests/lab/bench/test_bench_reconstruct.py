@@ -83,39 +83,39 @@ def test_photo_folder_is_found(tmp_path):
         list(bench.run([], tmp_path / "r.json", bench.ReconstructBenchOptions()))
 
 
-def test_rows_of_other_sets_are_kept(tmp_path, monkeypatch):
+def test_rows_of_other_sets_are_kept(tmp_path, monkeypatch, device):
     report = dict(
         photos=5, placed=5, held_out={"photos": 1, "psnr": 20.0, "ssim": 0.7}, seconds={"model": 2.0}, memory=1.0,
-        cpu_seconds=3.0, device="cpu",
+        cpu_seconds=3.0, device=device,
     )  # fmt: skip
     monkeypatch.setattr(bench, "measure_in_subprocess", lambda *_: report)
     for name in ("one", "two"):
         (tmp_path / name).mkdir()
-        lines = list(bench.run([tmp_path / name], tmp_path / "r.json", bench.ReconstructBenchOptions(device="cpu")))
+        lines = list(bench.run([tmp_path / name], tmp_path / "r.json", bench.ReconstructBenchOptions()))
     assert "5/  5" in lines[1] and "20.00 dB" in lines[1]
-    assert set(json.loads((tmp_path / "r.json").read_text())["sets"]) == {"one, normal, cpu", "two, normal, cpu"}
+    rows = json.loads((tmp_path / "r.json").read_text())["sets"]
+    assert set(rows) == {f"{name}, normal, {device}" for name in ("one", "two")}
 
 
-def test_failures_have_a_row_and_matchers_separate_rows(tmp_path, monkeypatch):
+def test_failures_have_a_row_and_matchers_separate_rows(tmp_path, monkeypatch, device):
     (tmp_path / "set").mkdir()
     monkeypatch.setattr(bench, "measure_in_subprocess", bench.measure)  # a process is not needed to fail
     for matcher in ("sift", "aliked-lightglue"):
-        options = bench.ReconstructBenchOptions(device="cpu", matcher=matcher)
+        options = bench.ReconstructBenchOptions(matcher=matcher)
         lines = list(bench.run([tmp_path / "set"], tmp_path / "r.json", options))
         assert lines[1].startswith("set ") and "no photos" in lines[1]
     rows = json.loads((tmp_path / "r.json").read_text())["sets"]
-    assert set(rows) == {"set, normal, cpu", "set, normal, cpu, aliked-lightglue"}
+    assert set(rows) == {f"set, normal, {device}", f"set, normal, {device}, aliked-lightglue"}
     assert str(tmp_path) not in str(rows)
 
 
-def test_cameras_alone_are_compared_with_references(tmp_path, monkeypatch):
+def test_cameras_alone_are_compared_with_references(tmp_path, monkeypatch, device):
     pytest.importorskip("pycolmap")
     write_set(tmp_path / "set", arc(4, (240, 180), sweep=40.0)).rename(tmp_path / "set" / "cameras.json")
     monkeypatch.setattr(bench, "measure_in_subprocess", bench.measure)
-    lines = list(
-        bench.run([tmp_path / "set"], tmp_path / "r.json", bench.ReconstructBenchOptions(device="cpu", cameras=True))
-    )
-    row = json.loads((tmp_path / "r.json").read_text())["sets"]["set, normal, cpu, cameras"]
+    options = bench.ReconstructBenchOptions(cameras=True)
+    lines = list(bench.run([tmp_path / "set"], tmp_path / "r.json", options))
+    row = json.loads((tmp_path / "r.json").read_text())["sets"][f"set, normal, {device}, cameras"]
     assert row["placed"] == row["photos"] == row["poses"]["cameras"] == 4 and "4/  4" in lines[1]
     assert row["poses"]["rotation"] < 0.5 and row["poses"]["shift"] < 2.0
     assert set(row["seconds"]) == {"features", "matches", "model"}  # and nothing after them

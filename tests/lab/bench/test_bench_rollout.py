@@ -23,7 +23,7 @@ def test_scene_has_contacts():
     assert end[..., 2].min() > float(start.floor[0, 0]) - 0.1
 
 
-def test_run_has_all_rows_and_keeps_other_devices(tmp_path, monkeypatch):
+def test_run_on_a_cpu_has_all_rows_and_keeps_those_of_a_gpu(tmp_path, monkeypatch):
     torch.manual_seed(0)
     save(tmp_path / "small.safetensors", "ngff", build("ngff", hidden=8))
     small = build("ngff-paper", hidden=8, layers=1)

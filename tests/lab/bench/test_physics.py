@@ -18,7 +18,7 @@ BOXES = [name for name in ALL if name.startswith("boxes/")]
     "name", [*QUICK, *(pytest.param(n, marks=pytest.mark.slow) for n in ALL if n not in QUICK)]
 )
 def test_rigid_bodies_agree_with_theory(name):
-    row = measure(ALL[name], "rigid", PhysicsBenchOptions(device="cpu"))
+    row = measure(ALL[name], "rigid", PhysicsBenchOptions())
     assert row["passes"], row
 
 
@@ -31,7 +31,7 @@ def test_names_say_the_case_and_tolerances_exclude_failures():
 
 
 def test_measured_rows_are_kept_and_the_page_marks_failures(tmp_path):
-    options = PhysicsBenchOptions(only=("fall/gravity=25",), engines=("rigid",), device="cpu")
+    options = PhysicsBenchOptions(only=("fall/gravity=25",), engines=("rigid",))
     (line, total) = run(tmp_path / "p.json", options)
     assert line.startswith("ok") and total == "rigid: 1 of 1 agree with theory"
     facts = json.loads((tmp_path / "p.json").read_text())
@@ -39,7 +39,7 @@ def test_measured_rows_are_kept_and_the_page_marks_failures(tmp_path):
     (tmp_path / "p.json").write_text(json.dumps(facts))
     (line, total) = run(tmp_path / "p.json", options)
     assert line.startswith("--") and "9.000" in line and total == "rigid: 0 of 1 agree with theory"
-    more = PhysicsBenchOptions(only=("fall/gravity=9.81",), engines=("rigid",), device="cpu")
+    more = PhysicsBenchOptions(only=("fall/gravity=9.81",), engines=("rigid",))
     list(run(tmp_path / "p.json", more))
     page = (tmp_path / "p.md").read_text()
     assert "| fall/gravity=25 | fall [m] | 0.180 | (9.000) |" in page and "`rigid` 1 of 2" in page

@@ -78,7 +78,7 @@ def test_invalid_files_and_options_are_rejected(tmp_path):
         replay.read_recording(tmp_path / "a.npz")
     np.savez(tmp_path / "b.npz", **small())
     with pytest.raises(InputError, match="--frames 9"):
-        list(replay.run(tmp_path / "b.npz", tmp_path / "c.npz", replay.ReplayOptions(9, "cpu")))
+        list(replay.run(tmp_path / "b.npz", tmp_path / "c.npz", replay.ReplayOptions(9)))
     assert not (tmp_path / "c.npz").exists()
     with pytest.raises(InputError, match="--frames"):
         replay.ReplayOptions(-1)

@@ -309,7 +309,10 @@ def test_the_command_trains(data, tmp_path):
 
 @pytest.mark.slow
 def test_two_processes_equal_one_with_the_whole_batch(data, tmp_path):
-    """Each computes half of every batch and gradients are averaged: only the order of sums differs."""
+    """Each computes half of every batch and gradients are averaged: only the order of sums differs.
+
+    On the CPU, since two processes cannot share one GPU.
+    """
     words = ["train", "gcn", "--data", str(data), "--device", "cpu"]
     words += ["--steps", "6", "--batch", "4", "--keypoints", "8", "--horizons", "3", "--width", "8"]
     words += ["--groups", "3_0,3_1"]

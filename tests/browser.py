@@ -22,6 +22,15 @@ def until(page, condition: str, seconds: float = 20.0) -> None:
         page.wait_for_timeout(20)
 
 
+def drag_up(page, spot: tuple[float, float], steps: int, rise: float) -> None:
+    """Press the mouse at a point [px] and move it up by `rise` [px] in each of the steps, without releasing it."""
+    page.mouse.move(*spot)
+    page.mouse.down()
+    for i in range(steps):
+        page.mouse.move(spot[0], spot[1] - rise * i)
+        page.wait_for_timeout(40)
+
+
 @pytest.fixture(scope="session")
 def chromium(tmp_path_factory):
     """The running browser; the tests that need it are skipped where it is not installed."""

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from stages.core.models.initial_conditions import FLOOR
 from stages.core.physics.forces import Force
+from stages.core.scene.field_start import UnitFactors
 
 TYPICAL_SIZE = 0.55  # median longest side of an object of the training data [m]
 TYPICAL_MASS = 8.0  # geometric mean of their masses, all published objects hollow [kg]
@@ -25,13 +26,9 @@ TRAINING_GRAVITY = 5.0  # [m/s^2]
 
 
 @dataclass(frozen=True)
-class ModelUnits:
-    """Units of the model: factors from the units of the scene (lengths) and SI (others), and the origin."""
+class ModelUnits(UnitFactors):
+    """Units of the model, its origin and its gravity."""
 
-    length: float  # model metres per scene unit
-    scale: float  # model metres per metre
-    time: float  # model seconds per second
-    mass: float  # model kilograms per kilogram
     origin: Float[Tensor, "3"]  # scene point that becomes (0, 0, FLOOR) [scene units]
     gravity: float  # downwards, in model units [m/s^2]
 

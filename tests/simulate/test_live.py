@@ -28,7 +28,7 @@ from stages.simulate.live.server import MAX_CLIENTS, LiveServer
 from stages.simulate.live.session import Session
 from stages.simulate.options import ENGINES, QUALITIES, MpmQuality, SimulateOptions
 from stages.simulate.stage import run
-from tests.browser import until
+from tests.browser import drag_up, until
 from tests.conftest import two_balls_scene
 
 connect = pytest.importorskip("websockets.sync.client").connect
@@ -320,12 +320,7 @@ def test_the_mouse_drags_an_object_and_the_file_repeats_it(session, open_page):
     process, url, folder = session
     page = open_page(url)
     until(page, "player.live.state !== null && player.live.control")
-    spot = page.evaluate(FIND_RED)
-    page.mouse.move(*spot)
-    page.mouse.down()
-    for i in range(24):
-        page.mouse.move(spot[0], spot[1] - 5 * i)
-        page.wait_for_timeout(40)
+    drag_up(page, page.evaluate(FIND_RED), 24, 5)
     until(page, f"player.live.state.arrows.length === 1 && ({RED_HEIGHT})() > 0.05")
     page.mouse.up()
     page.keyboard.press("Space")

@@ -14,11 +14,11 @@ from pathlib import Path
 
 from stages.core.errors import InputError
 from stages.core.physics.materials import find_object
-from stages.core.scene.files import must_exist
+from stages.core.scene.files import read_json_file
 from stages.core.scene.formats import FORMATS, suffixes
 from stages.core.scene.prompt_rows import FIELDS, read_prompts
 from stages.core.scene.scene import SceneObject
-from stages.core.scene.schema import LARGEST, MAX_ROWS, numbers, quote, read_json, reason, whole
+from stages.core.scene.schema import LARGEST, MAX_ROWS, numbers, quote, reason, whole
 from stages.core.scene.schema import number as finite
 
 Vector = tuple[float, float, float]
@@ -175,11 +175,7 @@ def read_forces(path: Path, scene_name: str, objects: Sequence[SceneObject]) -> 
 
     Raises InputError for malformed files and unknown objects.
     """
-    must_exist(path, "a JSON file {scene name: [{obj_id, start, end, force}]}")
-    try:
-        data = read_json(path)
-    except ValueError as error:
-        raise InputError(f"{path}: is not JSON ({reason(error)})") from error
+    data = read_json_file(path, "a JSON file {scene name: [{obj_id, start, end, force?, torque?}]}", (dict, list))
     if isinstance(data, dict):
         if scene_name not in data and len(data) != 1:
             raise InputError(f"{path}: has no scene {scene_name!r}; it has {quote(', '.join(data)) or 'none'}")

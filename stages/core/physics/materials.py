@@ -14,10 +14,11 @@ from pathlib import Path
 
 from stages.core.errors import InputError
 from stages.core.kernels.mpm.constitutive import COROTATED, NEO_HOOKEAN, SAND, SNOW, VON_MISES, sand_slope
-from stages.core.scene.files import must_exist
+from stages.core.scene.files import read_json_file
 from stages.core.scene.scene import SceneObject
-from stages.core.scene.schema import flag, number, numbers, quote, read_json, reason
+from stages.core.scene.schema import flag, number, numbers, quote, reason
 
+MATERIALS_FILE = "a JSON file {object name or id: material name or {E, nu, density, friction}}"
 Triple = tuple[float | int, float | int, float | int]
 
 
@@ -153,7 +154,7 @@ def choose_materials(
     unknown objects and materials and for values out of range.
     """
     given: dict[int, MaterialChoice] = {}
-    for key, value in (_read(file) if file else {}).items():
+    for key, value in (read_json_file(file, MATERIALS_FILE) if file else {}).items():
         read = _parts if isinstance(value, dict) and "parts" in value else _material
         given[find_object(key, objects, f"{file}").id] = read(value, f"{file}: {quote(key)}")
     for prompt in prompts:
@@ -247,15 +248,3 @@ def _parts(value: dict, where: str) -> MaterialChoice:
             raise InputError(f"{at}: {reason(error)}") from error
         parts.append(MaterialPart(choice.name, choice.material, below, box, pinned))
     return MaterialChoice(" and ".join(dict.fromkeys(p.name for p in parts)), parts[-1].material, several=tuple(parts))
-
-
-def _read(file: Path) -> dict:
-    """Contents of a materials file."""
-    must_exist(file, "a JSON file {object name or id: material}")
-    try:
-        data = read_json(file)
-    except ValueError as error:
-        raise InputError(f"{file}: is not JSON ({reason(error)})") from error
-    if not isinstance(data, dict):
-        raise InputError(f"{file}: must be {{object name or id: material name or {{E, nu, density, friction}}}}")
-    return data

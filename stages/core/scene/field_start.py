@@ -34,13 +34,19 @@ DATASETS = {  # p keypoints, o objects
 
 
 @dataclass(frozen=True)
-class FieldUnits:
-    """Units of the model, and how it is stepped."""
+class UnitFactors:
+    """Factors from the units of the scene (lengths) and SI (others) to those of the learned model."""
 
     length: float  # model metres per scene unit
     scale: float  # model metres per metre
     time: float  # model seconds per second
     mass: float  # model kilograms per kilogram
+
+
+@dataclass(frozen=True)
+class FieldUnits(UnitFactors):
+    """Units of the model, and how it is stepped."""
+
     origin: tuple[float, float, float]  # scene point that becomes (0, 0, FLOOR) [scene units]
     gravity: float  # downwards, in model units [m/s^2]
     steps: int  # of the model in a frame

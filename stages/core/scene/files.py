@@ -11,8 +11,10 @@ from contextlib import contextmanager
 from dataclasses import asdict, is_dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from typing import Any
 
 from stages.core.errors import InputError
+from stages.core.scene.schema import read_json, reason
 
 _HOST = hashlib.sha256(platform.node().encode()).hexdigest()[:6]
 _count = itertools.count()
@@ -80,6 +82,18 @@ def must_exist(path: Path, what: str) -> Path:
     if path.stat().st_size == 0:
         raise InputError(f"{path}: is empty; {what} is expected")
     return path
+
+
+def read_json_file(path: Path, what: str, kind: type | tuple[type, ...] = dict) -> Any:
+    """The value of a JSON file, an object or as `kind` says; InputError naming `what` is expected for anything else."""
+    must_exist(path, what)
+    try:
+        data = read_json(path)
+    except ValueError as error:
+        raise InputError(f"{path}: is not JSON ({reason(error)}); {what} is expected") from error
+    if not isinstance(data, kind):
+        raise InputError(f"{path}: is not {what}")
+    return data
 
 
 def sha256(path: Path) -> str:

@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 
 from stages.core.errors import InputError
-from stages.core.scene.files import must_exist, provenance, replacing
-from stages.core.scene.schema import quote, read_json, reason, whole
+from stages.core.scene.files import provenance, read_json_file, replacing
+from stages.core.scene.schema import quote, reason, whole
 from stages.evaluate.result import format_number
 from stages.lab.questionnaire.agreement import coincidences, krippendorff_alpha
 
@@ -57,14 +57,14 @@ def find_answers(paths: Sequence[Path]) -> list[Path]:
 
 def read_answers(study: Path, paths: Sequence[Path]) -> Answers:
     """The answers in the files. Raises InputError for files of another study, and for two of one participant."""
-    key = _read(study / "key.json", "the key of a study, as `ngff-lab questionnaire FILMS/ -o STUDY/` writes")
+    key = read_json_file(study / "key.json", "the key of a study, as `ngff-lab questionnaire FILMS/ -o STUDY/` writes")
     films, participants, points, scales = (key[name] for name in ("films", "participants", "points", "scales"))
     column = {film: i for i, film in enumerate(films)}
     ratings = {scale: np.zeros((len(paths), len(films)), dtype=np.int8) for scale in scales}
     seen: dict[str, Path] = {}
     missing = unplayable = 0
     for row, path in enumerate(paths):
-        data = _read(path, "the answers of a participant")
+        data = read_json_file(path, "the answers of a participant")
         if data.get("study") != key["study"] or data.get("participant") not in participants:
             raise InputError(f"{path}: is not of the study {study}; leave it out")
         who = data["participant"]
@@ -95,17 +95,6 @@ def _checked(data: dict, shown: list[str], scales: list[str], points: int) -> tu
         else:
             rated[film] = [whole(answer[scale], f"{scale} of film {film}", 1, points) for scale in scales]
     return rated, len(skipped)
-
-
-def _read(path: Path, what: str) -> dict:
-    must_exist(path, what)
-    try:
-        data = read_json(path)
-    except ValueError as error:
-        raise InputError(f"{path}: is not JSON ({reason(error)}); {what} is expected") from error
-    if not isinstance(data, dict):
-        raise InputError(f"{path}: is not {what}")
-    return data
 
 
 def _groups(films: dict[str, dict]) -> dict[str, np.ndarray]:

@@ -17,7 +17,7 @@ from stages.render.options import RenderOptions
 from stages.render.stage import run as render
 from stages.simulate.options import SimulateOptions
 from stages.simulate.stage import run as simulate
-from tests.browser import until
+from tests.browser import drag_up, until
 from tests.conftest import ball, ring, two_balls_scene
 
 LIMIT = 1e-3  # between the page and the engine, after 50 frames [m]
@@ -116,12 +116,7 @@ def test_the_mouse_takes_an_object_out_of_the_film(tmp_path, open_page):
     page.set_viewport_size({"width": 800, "height": 400})
     page.evaluate("player.play(false); player.seek(0)")
     until(page, "!player.changed && !player.busy && player.drawn()")
-    spot = page.evaluate(FIND)
-    page.mouse.move(*spot)
-    page.mouse.down()
-    for i in range(12):
-        page.mouse.move(spot[0], spot[1] - 8 * i)
-        page.wait_for_timeout(20)
+    drag_up(page, page.evaluate(FIND), 12, 8)
     until(page, f"player.live.state?.arrows.length === 1 && ({RISE})() > 0.05")
     page.mouse.up()
     assert not page.is_visible("#time")

@@ -1,5 +1,6 @@
 """Documentation: relative links lead to existing files and headings, and command lines parse."""
 
+import json
 import re
 import shlex
 from functools import cache
@@ -9,6 +10,7 @@ import pytest
 
 from ngff_cli.app import app
 from ngff_cli.lab import app as lab_app
+from stages.core.models.checkpoints import SHIPPED
 from tests.pipeline.test_commands import ROOT
 
 PATTERNS = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "stages/**/README.md", "stages/lab/results/*.md")
@@ -87,6 +89,17 @@ def test_command_lines_exist(page):
     for line in command_lines(page.read_text()):
         unknown = unknown_part(line)
         assert unknown is None, f"{page.name}: `{line}`: there is no {unknown}"
+
+
+def test_recipe_of_the_shipped_weights_consists_of_commands():
+    recipe = json.loads((SHIPPED / "ngff.json").read_text())["recipe"]
+    made = {"ds"}
+    for line in recipe:
+        assert unknown_part(line) is None and line.startswith("ngff-lab "), line
+        words = shlex.split(line)
+        assert {w for w in words if w.endswith(".safetensors")} - {words[-1]} <= made, line  # inputs come first
+        made.add(words[-1])
+    assert words[-1] == "ngff.safetensors"
 
 
 def test_wrong_command_lines_are_detected():

@@ -272,8 +272,8 @@ def fit(
     engine: Annotated[str, typer.Option(help="auto | rigid | mpm | ngff: through which motions are compared")] = "auto",
     quality: Annotated[str, typer.Option(help="of --engine mpm: draft | normal | high")] = MaterialFitOptions.quality,
     material: Annotated[
-        list[str], typer.Option(help="OBJECT=MATERIAL where the search starts, and where it stays if the motion shows "
-                                "nothing; repeatable")
+        list[str], typer.Option(help="OBJECT=MATERIAL: initial values, kept where the motion does not determine "
+                                "them; repeatable")
     ] = [],  # noqa: B006
     keypoints: Annotated[int, typer.Option(help="keypoints compared per object")] = MaterialFitOptions.keypoints,
     frames: Annotated[int, typer.Option(help="frames of the track; 0: all")] = MaterialFitOptions.frames,

@@ -28,7 +28,7 @@ from stages.lab.fit.problem import pose_problem
 from stages.simulate.options import ENGINES, SimulateOptions
 
 KEYPOINTS, STEPS = 32, 50
-REQUIRED = {"friction": 0.1, "loss": 0.1, "density": 0.15, "E": 0.5}  # largest error of what is shown
+REQUIRED = {"friction": 0.1, "loss": 0.1, "density": 0.15, "E": 0.5}  # largest error of identifiable parameters
 KINDS = ("slide", "bounce", "collision", "soft")
 
 
@@ -92,7 +92,7 @@ def fit_case(index: int, kind: str, seed: int) -> FitCase:
 
 
 def measure(case: FitCase, options: FitBenchOptions) -> dict:
-    """Errors of what a fit shows, and of the prediction of another motion with fitted and with default materials."""
+    """Errors of the parameters, and of another motion predicted with fitted and with default materials."""
     scene = Run(case.things).scene()
     keypoints = choose_keypoints(scene, KEYPOINTS)
     simulate = SimulateOptions(engine=case.engine, quality="draft", steps=STEPS, keypoints=KEYPOINTS,
@@ -106,7 +106,7 @@ def measure(case: FitCase, options: FitBenchOptions) -> dict:
     fit_options = MaterialFitOptions(engine=case.engine, keypoints=KEYPOINTS, evaluations=options.evaluations,
                              minutes=options.minutes, workers=options.workers, device=options.device)  # fmt: skip
     fit = solve(pose_problem(scene, truth, replace(case.seen, velocity={}), fit_options), fit_options)
-    found, _ = fitted(fit.problem.parameters, fit.shown_point(), fit.problem.materials)
+    found, _ = fitted(fit.problem.parameters, fit.accepted_point(), fit.problem.materials)
     other = _motion(scene, keypoints, case.other, case.materials, simulate)
     rmse = [float((_motion(scene, keypoints, case.other, m, simulate) - other).square().sum(-1).mean().sqrt())
             for m in (fit.problem.materials, found)]  # fmt: skip
@@ -124,7 +124,7 @@ def _motion(scene, keypoints: Keypoints, prompts: ForcePrompts, materials: dict[
 
 
 def _rows(fit: Fit, case: FitCase) -> list[dict]:
-    """Each material constant that was searched: its error, half width, and whether the motion shows it.
+    """Each material constant that was searched: its error, half width, and whether it is identifiable.
 
     Densities are compared as ratios to the first object's, which stays as it is.
     """
@@ -135,7 +135,7 @@ def _rows(fit: Fit, case: FitCase) -> list[dict]:
             continue
         true = getattr(case.materials[p.object_id], p.name) * (ratio if p.name == "density" else 1.0)
         true = math.log10(true) if QUANTITIES[p.name].log else true
-        rows.append({"object": p.object_id, "quantity": p.name, "shown": fit.shows(k), "true": true,
+        rows.append({"object": p.object_id, "quantity": p.name, "identifiable": fit.is_identifiable(k), "true": true,
                      "error": fit.value(k) - true, "half_width": fit.half_width(k)})  # fmt: skip
     return rows
 
@@ -144,13 +144,13 @@ def run(out: Path | None, options: FitBenchOptions) -> Iterator[str]:
     """Lines of a table of all scenes, and JSON in `out`."""
     device, results = pick_device(options.device), {}
     kinds = [options.only] if options.only else KINDS
-    yield f"{'scene':<14} what is shown: error +- half width of its interval"
+    yield f"{'scene':<14} identifiable: error +- half width of its interval"
     for index in range(options.scenes):
         case = fit_case(index, kinds[index % len(kinds)], options.seed)
         results[case.name] = row = measure(case, options)
-        shown = ", ".join(f"{r['quantity']}{r['object']} {r['error']:+.3f} +- {r['half_width']:.3f}"
-                          for r in row["rows"] if r["shown"])  # fmt: skip
-        yield (f"{case.name:<14} {shown or 'nothing'}; another motion: RMSE {row['default_rmse']:.3f} by default, "
+        found = ", ".join(f"{r['quantity']}{r['object']} {r['error']:+.3f} +- {r['half_width']:.3f}"
+                          for r in row["rows"] if r["identifiable"])  # fmt: skip
+        yield (f"{case.name:<14} {found or 'nothing'}; another motion: RMSE {row['default_rmse']:.3f} by default, "
                f"{row['fitted_rmse']:.3f} fitted; {row['motions']} motions, {row['seconds']:.0f} s")  # fmt: skip
         write_results(out, "fit", device, {"noise": options.noise, "scenes": results})
     yield from ["", *summary(results)]
@@ -161,10 +161,12 @@ def summary(results: dict[str, dict]) -> list[str]:
     lines, rows = [], [r for row in results.values() for r in row["rows"]]
     for name, required in REQUIRED.items():
         mine = [r for r in rows if r["quantity"] == name]
-        errors = [abs(r["error"]) for r in mine if r["shown"]]
+        errors = [abs(r["error"]) for r in mine if r["identifiable"]]
         if errors:
-            lines.append(f"{name}: {len(errors)} of {len(mine)} shown, median error {median(errors):.3f}, largest "
-                         f"{max(errors):.3f}; {sum(e <= required for e in errors)} within {required}")  # fmt: skip
+            lines.append(
+                f"{name}: {len(errors)} of {len(mine)} identifiable, median error {median(errors):.3f}, "
+                f"largest {max(errors):.3f}; {sum(e <= required for e in errors)} within {required}"
+            )  # fmt: skip
     gains = [row["fitted_rmse"] / max(row["default_rmse"], 1e-9) for row in results.values()]
     halved = sum(g <= 0.5 for g in gains)
     return [*lines, f"another motion: RMSE over that by default {median(gains):.2f} (median), {halved} of "

@@ -17,12 +17,12 @@ from stages.lab.fit.search import deviations, search, simulations
 
 log = logging.getLogger(__name__)
 NOISE_MARGIN = 1.1  # on the variance of the track's noise, which is estimated to a tenth
-SMALLEST_ERROR = 1e-3  # of a coordinate [tolerances]: engines are no better
+SMALLEST_ERROR = 1e-3  # of a coordinate [tolerances]: the accuracy of the engines
 
 
 @dataclass(frozen=True)
 class Fit:
-    """The parameters that explain a track."""
+    """Parameters fitted to a track, and their uncertainty."""
 
     problem: Problem
     x: np.ndarray  # best point [ranges]
@@ -40,14 +40,14 @@ class Fit:
         p = self.problem.parameters[k]
         return float(self.half[k]) * (p.high - p.low)
 
-    def shows(self, k: int) -> bool:
-        """Whether the motion tells the k-th parameter."""
+    def is_identifiable(self, k: int) -> bool:
+        """Whether the motion determines the k-th parameter accurately enough."""
         name = self.problem.parameters[k].name
-        return name in AXES or self.half_width(k) <= QUANTITIES[name].shown
+        return name in AXES or self.half_width(k) <= QUANTITIES[name].max_half_width
 
-    def shown_point(self) -> np.ndarray:
-        """The best point, with what the motion does not tell where the search started."""
-        return np.array([self.x[k] if self.shows(k) else p.coordinate(p.start)
+    def accepted_point(self) -> np.ndarray:
+        """The best point, with parameters that are not identifiable at their initial values."""
+        return np.array([self.x[k] if self.is_identifiable(k) else p.coordinate(p.start)
                          for k, p in enumerate(self.problem.parameters)])  # fmt: skip
 
 
@@ -57,12 +57,12 @@ def run(scene: Path, track: Path, out: Path, options: MaterialFitOptions) -> lis
     Raises InputError for a track that is not of the scene, and MissingPackage without the package cma.
     """
     fit = solve(read_problem(Path(scene), Path(track), options), options)
-    materials, velocity = fitted(fit.problem.parameters, fit.shown_point(), fit.problem.materials)
+    materials, velocity = fitted(fit.problem.parameters, fit.accepted_point(), fit.problem.materials)
     names = {o.id: o.name for o in fit.problem.scene.objects}
     with replacing(out) as part:
         part.write_text(json.dumps({str(i): as_json(materials[i]) for i in names}, indent=1) + "\n")
     rows = [{"object": p.object_id, "name": names[p.object_id], "quantity": p.name, "log10": _is_log(p),
-             "value": fit.value(k), "half_width": fit.half_width(k), "shown": fit.shows(k)}
+             "value": fit.value(k), "half_width": fit.half_width(k), "identifiable": fit.is_identifiable(k)}
             for k, p in enumerate(fit.problem.parameters)]  # fmt: skip
     facts = {**provenance("fit", [scene, track], options), "engine": fit.problem.options.engine, "parameters": rows,
              "velocity": velocity, "rmse_before": fit.rmse[0], "rmse": fit.rmse[1], "evaluations": fit.evaluations,
@@ -73,7 +73,7 @@ def run(scene: Path, track: Path, out: Path, options: MaterialFitOptions) -> lis
 
 
 def solve(problem: Problem, options: MaterialFitOptions) -> Fit:
-    """Search for the parameters, and find how well the motion tells them."""
+    """Search for the parameters, and estimate how accurately the motion determines them."""
     log.info("%d parameters of %d objects, --engine %s, %d frames", len(problem.parameters), len(problem.moving),
              problem.options.engine, len(problem.track))  # fmt: skip
     start = np.array([p.coordinate(p.start) for p in problem.parameters])
@@ -86,9 +86,10 @@ def solve(problem: Problem, options: MaterialFitOptions) -> Fit:
 
 
 def _error(problem: Problem, residual: float) -> float:
-    """Standard deviation of a coordinate [tolerances] for intervals, from the mean square of what a fit leaves.
+    """Standard deviation of a coordinate [tolerances] for intervals, from the mean squared residual of a fit.
 
-    The noise of the track is independent from frame to frame; what is left beyond it is not, and counts once.
+    The noise of the track is independent from frame to frame. Residuals beyond it are taken as fully correlated: they
+    count as one observation.
     """
     excess = max(0.0, residual - NOISE_MARGIN * problem.noise**2)
     tolerance = float(problem.tolerance.mean())
@@ -100,12 +101,12 @@ def describe(fit: Fit) -> list[str]:
     names = {o.id: o.name for o in fit.problem.scene.objects}
     lines = []
     for i in fit.problem.moving:
-        shown, hidden = [], []
+        found, unknown = [], []
         for k, p in enumerate(fit.problem.parameters):
             if p.object_id == i:
-                (shown if fit.shows(k) else hidden).append(_text(fit, k, p))
-        line = f"object {i} ({names[i]}): {', '.join(shown) or 'nothing is shown by the motion'}"
-        lines.append(line + (f"; not shown by the motion: {', '.join(hidden)}" if hidden else ""))
+                (found if fit.is_identifiable(k) else unknown).append(_text(fit, k, p))
+        line = f"object {i} ({names[i]}): {', '.join(found) or 'nothing is identifiable from the motion'}"
+        lines.append(line + (f"; not identifiable from the motion: {', '.join(unknown)}" if unknown else ""))
     lines.append(f"RMSE {fit.rmse[0]:.3g} before, {fit.rmse[1]:.3g} after [scene units]; {fit.evaluations} motions in "
                  f"{fit.seconds:.0f} s")  # fmt: skip
     return lines

@@ -12,7 +12,7 @@ class MaterialFitOptions:
 
     engine: str = "auto"
     quality: str = "draft"  # of the MPM engine
-    material: tuple[str, ...] = ()  # OBJECT=MATERIAL, where the search starts and what is not shown stays
+    material: tuple[str, ...] = ()  # OBJECT=MATERIAL: initial values, kept where not identifiable
     keypoints: int = 48  # of the track that are compared, for each object
     frames: int = 0  # of the track; 0: all
     noise: float = 0.0  # standard deviation of the track's errors [scene units]; 0: the residual of the fit

@@ -11,11 +11,11 @@ from stages.core.physics.materials import Material
 
 @dataclass(frozen=True)
 class Quantity:
-    """A material constant as it is searched: its range, and what counts as shown by a motion."""
+    """A material constant as a search parameter: its range, and the accuracy from which it counts as identifiable."""
 
     low: float
     high: float
-    shown: float  # half width of a 95 % interval up to which the value is used
+    max_half_width: float  # of a 95 % interval, up to which the value is used
     log: bool = False  # the range and the interval are of log10
     relative: bool = False  # the range is that of the ratio to the material that the search starts from
     what: str = ""
@@ -27,7 +27,7 @@ QUANTITIES: Mapping[str, Quantity] = {
     "density": Quantity(-1.0, 1.0, 0.15, log=True, relative=True, what="density over that of the first object"),
     "E": Quantity(3.0, 8.0, 0.5, log=True, what="Young's modulus [Pa]"),
 }
-OF_ENGINE = {"rigid": ("friction", "loss", "density")}  # others have them all; friction without effect is found out
+OF_ENGINE = {"rigid": ("friction", "loss", "density")}  # others: all; without effect, it is not identifiable
 AXES = "xyz"
 SPEED_RANGE = 1.0  # about the speed that the first frames suggest [scene units/s]
 STEP, SPEED_STEP = 0.25, 0.1  # first standard deviations of the search, in ranges

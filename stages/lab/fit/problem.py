@@ -1,4 +1,4 @@
-"""A track to be explained: the motion that parameters give, and its distance from the track."""
+"""The fit of a track: the motion for given parameters, and its distance from the track."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ MISPLACED = 0.1  # error of the first frame above which a track is of another sc
 
 @dataclass(frozen=True)
 class Problem:
-    """A scene, a track of keypoints on its objects, and what is known of how the motion came about."""
+    """A scene, a track of keypoints on its objects, and the known conditions of the motion."""
 
     scene: Scene
     keypoints: Keypoints
@@ -102,14 +102,14 @@ class Problem:
     def weighted(self, motion: Float[Tensor, "t k 3"]) -> np.ndarray:
         """All coordinates of the moving objects [tolerances], so that an object has the weight of one point in a frame.
 
-        Those that are not finite are 0: where a motion diverges, it tells nothing.
+        Values that are not finite are set to 0: a diverged motion carries no information.
         """
         parts = [motion.nan_to_num()[:, self.keypoints.object_id == i] for i in self.moving]
         return torch.cat([(part / t / part.shape[1] ** 0.5).flatten()
                           for part, t in zip(parts, self.tolerance, strict=True)]).double().numpy()  # fmt: skip
 
-    def beginning(self, frames: int) -> Problem:
-        """The same with the first frames only."""
+    def first_frames(self, frames: int) -> Problem:
+        """The same problem for the first frames of the track only."""
         options = replace(self.options, steps=min(frames, len(self.track)))
         return replace(self, track=self.track[:frames], options=options)
 
@@ -123,7 +123,7 @@ def read_problem(scene: Path, track: Path, options: MaterialFitOptions) -> Probl
 def pose_problem(
     scene: Scene, truth: Trajectory, prompts: ForcePrompts, options: MaterialFitOptions, where: str = "the track"
 ) -> Problem:
-    """The problem of a scene and a track of its objects; `prompts` tell the forces, pins and lifts, but not velocities.
+    """The problem of a scene and a track of its objects; `prompts` are its forces, pins and lifts, without velocities.
 
     Raises InputError for a track of other objects, or one that does not start where the scene is.
     """
@@ -163,7 +163,7 @@ def estimate_noise(track: Float[Tensor, "t k 3"]) -> float:
     if len(track) < 8:
         return 0.0
     third = track.diff(n=3, dim=0).abs()
-    moving = third.flatten(1).amax(0) > 0  # keypoints at rest without noise say nothing
+    moving = third.flatten(1).amax(0) > 0  # keypoints at rest without noise carry no information
     return float(third.flatten(1)[:, moving].median()) / 0.6745 / 20**0.5 if bool(moving.any()) else 0.0
 
 
@@ -225,14 +225,14 @@ def _first_velocity(
 ) -> dict[str, float]:
     """A guess of the start velocity of an object by axis [scene units/s], from the first frames of its middle.
 
-    Nothing for one that is released from rest, and no vertical velocity of one that is carried.
+    Nothing for one that is released from rest, and no vertical velocity of one that is supported.
     """
     first = centre[: FIRST_FRAMES + 1]
     t = options.dt * torch.arange(len(first))
-    fall = options.gravity / scene.metres_per_unit * t**2 / 2  # of what nothing carries
-    carried = bool(((first[:, 2] - first[0, 2]).abs() < still).all())
-    path = first - first[0] + (0.0 if carried else 1.0) * fall[:, None] * torch.tensor([0.0, 0.0, 1.0])
+    fall = options.gravity / scene.metres_per_unit * t**2 / 2  # of an unsupported object
+    supported = bool(((first[:, 2] - first[0, 2]).abs() < still).all())
+    path = first - first[0] + (0.0 if supported else 1.0) * fall[:, None] * torch.tensor([0.0, 0.0, 1.0])
     velocity = (t[:, None] * path).sum(0) / t.square().sum()
     if float(path.norm(dim=1).max()) < still:
         return {}
-    return dict(zip(AXES[: 2 if carried else 3], velocity.tolist(), strict=False))
+    return dict(zip(AXES[: 2 if supported else 3], velocity.tolist(), strict=False))

@@ -1,9 +1,9 @@
-"""The search for the parameters, over longer and longer beginnings of the track, and their intervals.
+"""The search for the parameters, over increasingly long initial segments of the track, and their intervals.
 
-What happens first depends on few parameters, and the rest on where it led; over the whole track at once, collisions
-make the error rugged. A beginning that is not explained yet is fitted by Levenberg and Marquardt's method from where
-the one before led, and, where that leaves an error, by CMA-ES, which takes the parameters that the beginning tells
-little about from their range.
+Over the whole track at once, collisions give the cost many local minima; the first frames depend on few parameters.
+Each segment is fitted from the result of the one before: by Levenberg and Marquardt's method and, where residuals
+larger than the noise remain, by CMA-ES, which samples the parameters that the segment hardly determines over their
+whole range.
 Source of CMA-ES: Hansen 2016, "The CMA evolution strategy: a tutorial".
 """
 
@@ -28,12 +28,12 @@ from stages.lab.fit.problem import Problem
 
 log = logging.getLogger(__name__)
 PRIOR = 1 / 12**0.5  # standard deviation of a uniform distribution over the range
-FIRST, GROWTH = 8, 1.25  # frames of the first beginning, and factor from one to the next
+FIRST, GROWTH = 8, 1.25  # frames of the first segment, and factor from one to the next
 STEP, STEPS = 0.004, 10  # differences [ranges] and iterations of Levenberg and Marquardt's method
-PULL = 0.01  # towards the start, of what a beginning tells nothing about
+REGULARISATION = 0.01  # weight of the distance from the start, for parameters that a segment does not determine
 PRECISION, FALL = 1e-3, 1e-3  # of CMA-ES: step [ranges] and change of the cost at which it ends
-GENERATIONS = 15  # of CMA-ES for a beginning
-ENOUGH = 1.3, 0.0005  # cost that is left to be improved: a factor on that of the track's noise, and a constant
+GENERATIONS = 15  # of CMA-ES for a segment
+ENOUGH = 1.3, 0.0005  # cost at which a fit ends: a factor on that of the track's noise, and a constant
 SPANS = 0.01, (0.002, 0.1), 0.2  # first, second (bounds) and large differences for intervals [ranges]
 
 
@@ -58,7 +58,7 @@ class Simulations:
 
     def costs(self, points: list[np.ndarray], frames: int) -> list[float]:
         """Costs of the first frames."""
-        part = self.problem.beginning(frames)
+        part = self.problem.first_frames(frames)
         return [part.cost(motion) for motion in self.motions(points, frames)]
 
 
@@ -72,7 +72,7 @@ def _set_problem(problem: Problem, threads: int) -> None:
 
 
 def _motion(x: np.ndarray, frames: int) -> torch.Tensor:
-    return _problem.beginning(frames).motion(x)
+    return _problem.first_frames(frames).motion(x)
 
 
 @contextmanager
@@ -87,40 +87,40 @@ def simulations(problem: Problem, workers: int) -> Iterator[Simulations]:
 
 
 def search(sims: Simulations, options: MaterialFitOptions) -> Found:
-    """Fit longer and longer beginnings of the track. Raises MissingPackage without the package cma."""
+    """Fit increasingly long initial segments of the track. Raises MissingPackage without the package cma."""
     begun, total = time.perf_counter(), len(sims.problem.track)
     x = np.array([p.coordinate(p.start) for p in sims.problem.parameters])
     lengths = [min(FIRST, total)]
     while lengths[-1] < total:
         lengths.append(min(total, int(GROWTH * lengths[-1])))
-    for frames in tqdm(lengths, unit="beginning"):
+    for frames in tqdm(lengths, unit="segment"):
         left = 60 * options.minutes - (time.perf_counter() - begun)
         if left <= 0 or sims.count > options.evaluations:
             break
-        if not _explained(sims, frames, x):
+        if not _within_noise(sims, frames, x):
             x = _descend(sims, frames, x)
-        if not _explained(sims, frames, x):
+        if not _within_noise(sims, frames, x):
             x = _descend(sims, frames, _evolve(sims, frames, x, left, options))
         log.debug("%d frames, cost %.3g, %d motions: %s", frames, sims.costs([x], frames)[0], sims.count, x.round(3))
     return Found(_descend(sims, frames, x), sims.count, time.perf_counter() - begun)
 
 
-def _explained(sims: Simulations, frames: int, x: np.ndarray) -> bool:
-    """Whether what is left is about the noise of the track."""
+def _within_noise(sims: Simulations, frames: int, x: np.ndarray) -> bool:
+    """Whether the residual is about the noise of the track."""
     expected = torch.log1p(3 * (sims.problem.noise / sims.problem.tolerance) ** 2).mean()
     return sims.costs([x], frames)[0] < ENOUGH[0] * float(expected) + ENOUGH[1]
 
 
 def _descend(sims: Simulations, frames: int, x: np.ndarray) -> np.ndarray:
     """The minimum near `x`, by Levenberg and Marquardt's method with derivatives by differences, or `x` itself."""
-    part, start = sims.problem.beginning(frames), x
-    pull = PULL * np.eye(len(x))
+    part, start = sims.problem.first_frames(frames), x
+    damping = REGULARISATION * np.eye(len(x))
 
     def errors(x: np.ndarray) -> np.ndarray:
-        return np.append(part.weighted(sims.motions([x], frames)[0] - part.track), PULL * (x - start))
+        return np.append(part.weighted(sims.motions([x], frames)[0] - part.track), REGULARISATION * (x - start))
 
     found = least_squares(
-        errors, np.clip(x, 1e-6, 1 - 1e-6), lambda x: np.vstack([_derivatives(sims, frames, x, STEP), pull]),
+        errors, np.clip(x, 1e-6, 1 - 1e-6), lambda x: np.vstack([_derivatives(sims, frames, x, STEP), damping]),
         bounds=(0, 1), max_nfev=STEPS, xtol=PRECISION / 10, ftol=FALL,
     )  # fmt: skip
     before, after = sims.costs([x, found.x], frames)
@@ -128,7 +128,7 @@ def _descend(sims: Simulations, frames: int, x: np.ndarray) -> np.ndarray:
 
 
 def _evolve(sims: Simulations, frames: int, x: np.ndarray, seconds: float, options: MaterialFitOptions) -> np.ndarray:
-    """The best of some generations of CMA-ES, whose first spread is what the beginning leaves open."""
+    """The best of some generations of CMA-ES, whose initial spread is the uncertainty after the segment."""
     try:
         import cma  # noqa: PLC0415 -- only a fit needs it
     except ImportError as error:
@@ -155,8 +155,9 @@ def deviations(sims: Simulations, frames: int, x: np.ndarray, error: float) -> n
     """Standard deviations of the parameters at `x` [ranges], by the curvature of the squared error (Gauss and Newton).
 
     `error` is the standard deviation of a coordinate [tolerances]. Keypoints of one object in one frame count as one
-    observation, since their errors are not independent; the ranges count as prior knowledge. Near a contact,
-    small differences may show more than large ones; the deviation is as much larger as the latter show less.
+    observation, since their errors are not independent; the ranges count as a prior. Near a contact,
+    the derivatives for small differences may be larger than those for large ones; the deviation is increased by that
+    ratio.
     """
     step = np.full(len(x), SPANS[0])
     for _ in range(2):

@@ -21,13 +21,13 @@ def test_an_unknown_kind_is_refused():
 
 
 def test_the_summary_counts_what_is_shown():
-    def row(error, shown):
-        return {"quantity": "friction", "error": error, "shown": shown}
+    def row(error, identifiable):
+        return {"quantity": "friction", "error": error, "identifiable": identifiable}
 
     results = {"a": {"rows": [row(0.05, True), row(-0.3, True)], "default_rmse": 1.0, "fitted_rmse": 0.2},
                "b": {"rows": [row(9.0, False)], "default_rmse": 1.0, "fitted_rmse": 0.8}}  # fmt: skip
     assert summary(results) == [
-        "friction: 2 of 3 shown, median error 0.175, largest 0.300; 1 within 0.1",
+        "friction: 2 of 3 identifiable, median error 0.175, largest 0.300; 1 within 0.1",
         "another motion: RMSE over that by default 0.50 (median), 1 of 2 halved",
     ]
 
@@ -36,5 +36,5 @@ def test_the_summary_counts_what_is_shown():
 def test_friction_of_two_blocks_that_slide(device):
     row = measure(fit_case(0, "slide", 0), FitBenchOptions(workers=1, evaluations=300))
     friction = [r for r in row["rows"] if r["quantity"] == "friction"]
-    assert [r["shown"] for r in friction] == [True, True]
+    assert [r["identifiable"] for r in friction] == [True, True]
     assert max(abs(r["error"]) for r in friction) < 0.1 and row["fitted_rmse"] < row["default_rmse"] / 2

@@ -68,18 +68,18 @@ def test_a_slide_shows_friction_and_nothing_of_the_rebound(slide, device):
     assert fit.problem.noise == pytest.approx(NOISE, rel=0.1)
     for name, true in (("friction", 0.3), ("x", 2.0), ("y", 0.5)):
         k = of(fit, name)
-        assert fit.shows(k) and abs(fit.value(k) - true) < 2 * fit.half_width(k) < 0.05, name
-    assert not fit.shows(of(fit, "loss"))
+        assert fit.is_identifiable(k) and abs(fit.value(k) - true) < 2 * fit.half_width(k) < 0.05, name
+    assert not fit.is_identifiable(of(fit, "loss"))
     assert fit.rmse[1] == pytest.approx(3**0.5 * NOISE, rel=0.1) and fit.rmse[0] > 0.02
-    materials, velocity = fitted(fit.problem.parameters, fit.shown_point(), fit.problem.materials)
+    materials, velocity = fitted(fit.problem.parameters, fit.accepted_point(), fit.problem.materials)
     assert materials[1].loss == pytest.approx(fit.problem.materials[1].loss)  # as the search started
 
 
 def test_a_rebound_shows_the_loss_factor_and_nothing_of_friction(bounce, device):
     fit = solve(read_problem(bounce / "scene.ply", bounce / "track.h5", OPTIONS), OPTIONS)
     k = of(fit, "loss")
-    assert fit.shows(k) and abs(fit.value(k) - 0.35) < 2 * fit.half_width(k) < 0.05
-    assert not fit.shows(of(fit, "friction"))
+    assert fit.is_identifiable(k) and abs(fit.value(k) - 0.35) < 2 * fit.half_width(k) < 0.05
+    assert not fit.is_identifiable(of(fit, "friction"))
     assert len(fit.problem.parameters) == 2  # neither a velocity, as it is released from rest, nor a density
 
 
@@ -87,11 +87,11 @@ def test_the_command_writes_materials_that_simulate_takes(slide, tmp_path):
     done = CliRunner().invoke(app, ["fit", str(slide / "scene.ply"), str(slide / "track.h5"), "-o",
                                     str(tmp_path / "m.json"), "--workers", "1", "--keypoints", "8"])  # fmt: skip
     assert done.exit_code == 0, done.output
-    assert "not shown by the motion: loss" in done.stdout
+    assert "not identifiable from the motion: loss" in done.stdout
     chosen = choose_materials(read_scene(slide / "scene.ply").objects, file=tmp_path / "m.json")
     assert chosen[1].material.friction == pytest.approx(0.3, abs=0.01)
     rows = json.loads((tmp_path / "m.fit.json").read_text())["parameters"]
-    assert [row["quantity"] for row in rows if row["shown"]] == ["friction", "x", "y"]
+    assert [row["quantity"] for row in rows if row["identifiable"]] == ["friction", "x", "y"]
     assert f"--materials {tmp_path / 'm.json'} --velocity" in done.stdout
 
 

@@ -357,12 +357,12 @@ def evaluate(
         str, Option(help="with --judge: address of a server with OpenAI's protocol; default: $OPENAI_BASE_URL, else "
                     "OpenAI's own")
     ] = EvaluateOptions.base_url,
-    askings: Annotated[
+    repeats: Annotated[
         int, Option(help="with --judge: how often each film is scored; mean and standard deviation are given")
-    ] = EvaluateOptions.askings,
-    together: Annotated[
+    ] = EvaluateOptions.repeats,
+    films_per_question: Annotated[
         int, Option(help="with --judge: most films in one question, in random order under letters")
-    ] = EvaluateOptions.together,
+    ] = EvaluateOptions.films_per_question,
     timeout: Annotated[
         float, Option(help="with --judge: maximum waiting time for an answer [s]")
     ] = EvaluateOptions.timeout,
@@ -378,8 +378,8 @@ def evaluate(
     """
     options = EvaluateOptions(
         align=align, frames=frames, resample=resample, objects=objects, undistorted=undistorted, photos=photos,
-        report=report, judge=judge, model=model, base_url=base_url, askings=askings, together=together,
-        timeout=timeout, resume=resume, seed=seed,
+        report=report, judge=judge, model=model, base_url=base_url, repeats=repeats,
+        films_per_question=films_per_question, timeout=timeout, resume=resume, seed=seed,
     )  # fmt: skip
     load("stages.evaluate.stage:run")(prediction, against, out, options, as_json=as_json)
 

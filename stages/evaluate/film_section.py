@@ -142,7 +142,7 @@ def _stages(trajectory: Trajectory) -> list[dict]:
 
 
 def _times(trajectory: Trajectory) -> str:
-    """Wall time of each stage that the file knows of."""
+    """Wall time of each stage that the file records."""
     steps = [(str(facts["command"]), facts["seconds"]) for facts in _stages(trajectory)
              if isinstance(facts.get("seconds"), (int, float))]  # fmt: skip
     if not steps:

@@ -1,7 +1,7 @@
 """Films judged by a vision-language model: PhysR and PhotoR of the NGFF paper (ICLR 2026), section on video generation.
 
-The model sees ten evenly spaced frames of each film and answers with two scores from 0 to 1. In every asking the films
-come in another random order, several in one question, under letters that say nothing of their origin. The prompt is our
+The model sees ten evenly spaced frames of each film and answers with two scores from 0 to 1. In every repeat the films
+come in another random order, several in one question, under letters that do not reveal their origin. The prompt is our
 own.
 """
 
@@ -53,7 +53,7 @@ Rows = dict[str, dict[str, float]]  # name of a film in a question: scores
 
 
 def judge(films: Sequence[Path], out: Path, options: EvaluateOptions) -> Result:
-    """Mean and standard deviation of the scores of each film over the askings.
+    """Mean and standard deviation of the scores of each film over the repeats.
 
     `out` is where the metrics will be written; beside it OUT.replies.json keeps every usable reply as it comes, from
     which --resume continues. A question without a usable reply is left out, and said in the notes. Raises InputError
@@ -65,7 +65,7 @@ def judge(films: Sequence[Path], out: Path, options: EvaluateOptions) -> Result:
         if len(frames) < 2:
             raise InputError(f"{film}: has one frame only; motion is judged in two or more")
     log.info("sending %d frames of %d films, %d times, to %s at %s", sum(map(len, jpegs)), len(films),
-             options.askings, endpoint.model, endpoint.url)  # fmt: skip
+             options.repeats, endpoint.model, endpoint.url)  # fmt: skip
     questions = draw_questions(len(films), options)
     answers = _ask_all(endpoint, questions, jpegs, _Record(out, films, endpoint, options))
     scores: list[dict[str, list[float]]] = [{name: [] for name in SCORES} for _ in films]
@@ -101,10 +101,10 @@ def _is_film(path: Path) -> bool:
 
 
 def draw_questions(count: int, options: EvaluateOptions) -> list[dict[str, int]]:
-    """Films of each question, by letter: every asking is a new random order, cut into questions of similar size."""
+    """Films of each question, by letter: every repeat is a new random order, cut into questions of similar size."""
     rng, questions = random.Random(options.seed), []
-    parts = math.ceil(count / options.together)
-    for _ in range(options.askings):
+    parts = math.ceil(count / options.films_per_question)
+    for _ in range(options.repeats):
         order = rng.sample(range(count), count)
         for k in range(parts):
             group = order[count * k // parts : count * (k + 1) // parts]
@@ -164,8 +164,8 @@ class _Record:
         if not out.parent.is_dir():  # said before anything is asked
             raise InputError(f"{out}: there is no folder {out.parent}; create it first")
         self.path = out.with_suffix(".replies.json")
-        settings = {"url": endpoint.url, "model": endpoint.model, "askings": options.askings, "seed": options.seed,
-                    "together": options.together, "frames": FRAMES, "longest": LONGEST,
+        settings = {"url": endpoint.url, "model": endpoint.model, "repeats": options.repeats, "seed": options.seed,
+                    "films_per_question": options.films_per_question, "frames": FRAMES, "longest": LONGEST,
                     "prompt": hashlib.sha256(PROMPT.encode()).hexdigest()}  # fmt: skip
         self.head = {"settings": settings, "films": [{"name": f.name, "sha256": sha256(f)} for f in films]}
         self.replies: dict[str, str] = self._earlier() if options.resume and self.path.exists() else {}
@@ -210,14 +210,14 @@ def _summary(scores: dict[str, list[float]]) -> dict[str, float | int]:
     for name, values in scores.items():
         row[name] = fmean(values) if values else math.nan
         row[f"{name}_sd"] = stdev(values) if len(values) > 1 else math.nan
-    return {**row, "askings": len(next(iter(scores.values())))}
+    return {**row, "repeats": len(next(iter(scores.values())))}
 
 
 def _over_films(rows: list[dict[str, float | int]]) -> dict[str, float | int]:
-    """Mean and sample standard deviation of the scores of several films, each the mean of its askings."""
-    judged = [row for row in rows if row["askings"]]
+    """Mean and sample standard deviation of the scores of several films, each the mean of its repeats."""
+    judged = [row for row in rows if row["repeats"]]
     return {**_summary({name: [row[name] for row in judged] for name in SCORES}),
-            "askings": sum(row["askings"] for row in rows)}  # fmt: skip
+            "repeats": sum(row["repeats"] for row in rows)}  # fmt: skip
 
 
 def _notes(

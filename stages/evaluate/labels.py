@@ -41,7 +41,7 @@ class LabelledObject:
     """An object of names.json."""
 
     name: str
-    core: bool  # whether it is asked for; others are neither asked for nor held against what finds them
+    core: bool  # whether it must be found; others count neither as missed nor as false
 
 
 @dataclass(frozen=True)
@@ -56,12 +56,12 @@ class PanopticScores:
 
     @property
     def hits(self) -> dict[int, int]:
-        """Labelled to found, of an IoU above MATCHING_IOU."""
+        """Matched objects (labelled to found) with an IoU above MATCHING_IOU."""
         return {t: p for t, p in self.matched.items() if self.iou[t] > MATCHING_IOU}
 
     @property
     def false(self) -> list[int]:
-        """Found objects that are no labelled one."""
+        """Found objects that match no labelled one."""
         return [p for p in self.found_pixels if p not in self.hits.values()]
 
     def summary(self) -> dict[str, float | int]:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from stages.core.errors import InputError
 
-MOST_TOGETHER = 26  # films in one question, which have letters as names
+MAX_FILMS_PER_QUESTION = 26  # films in one question, which have letters as names
 
 
 @dataclass(frozen=True)
@@ -24,8 +24,8 @@ class EvaluateOptions:
     judge: bool = False  # have films scored by a vision-language model, to which frames of them are sent
     model: str = ""  # that scores; empty: OPENAI_MODEL
     base_url: str = ""  # of a server with OpenAI's protocol; empty: OPENAI_BASE_URL, or OpenAI's own
-    askings: int = 3  # scores of each film, each with the films in another random order
-    together: int = 4  # most films in one question
+    repeats: int = 3  # scores of each film, each with the films in another random order
+    films_per_question: int = 4  # most films in one question
     timeout: float = 120.0  # of one question [s]
     resume: bool = False  # continue an interrupted judgement
     seed: int = 0  # of the order of the films
@@ -35,10 +35,10 @@ class EvaluateOptions:
             raise InputError(f"--frames {self.frames}: give the number of frames to compare, 1 or more")
         if self.report is not None and Path(self.report).suffix.lower() not in (".html", ".htm"):
             raise InputError(f"--report {self.report}: the report is an HTML file; use the suffix .html")
-        if self.askings < 1:
-            raise InputError(f"--askings {self.askings}: give 1 or more")
-        if not 1 <= self.together <= MOST_TOGETHER:
-            raise InputError(f"--together {self.together}: give 1 to {MOST_TOGETHER} films")
+        if self.repeats < 1:
+            raise InputError(f"--repeats {self.repeats}: give 1 or more")
+        if not 1 <= self.films_per_question <= MAX_FILMS_PER_QUESTION:
+            raise InputError(f"--films-per-question {self.films_per_question}: give 1 to {MAX_FILMS_PER_QUESTION}")
         if self.photos is not None and self.report is None:
             raise InputError(f"--photos {self.photos}: are shown in the report; add --report FILE.html")
 

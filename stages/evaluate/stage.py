@@ -35,7 +35,7 @@ OPTION_KINDS = {  # options that apply to some kinds of data only
     "undistorted": ("labels",),
     "photos": ("trajectory", "labels"),
     "report": tuple(COMPARISONS),
-    **dict.fromkeys(["model", "base_url", "askings", "together", "timeout", "resume", "seed"], ("films",)),
+    **dict.fromkeys(["model", "base_url", "repeats", "films_per_question", "timeout", "resume", "seed"], ("films",)),
 }
 DEFAULTS = EvaluateOptions()
 

@@ -57,23 +57,23 @@ def judged(films, tmp_path, **options):
 
 def test_scores_return_to_their_films_from_any_order(chat_server, films, tmp_path, capsys):
     chat_server.script = by_brightness
-    facts = judged([films / "cosmos", films / "ours"], tmp_path, together=2)
+    facts = judged([films / "cosmos", films / "ours"], tmp_path, films_per_question=2)
     for name, value in BRIGHTNESS.items():
         row = facts["objects"][f"{films / name}.mp4"]
         assert row["PhotoR"] == pytest.approx(value, abs=0.01) and row["PhysR"] == pytest.approx(1 - value, abs=0.01)
-        assert row["PhotoR_sd"] == pytest.approx(0, abs=1e-9) and row["askings"] == 3
+        assert row["PhotoR_sd"] == pytest.approx(0, abs=1e-9) and row["repeats"] == 3
     ours, values = facts["objects"][f"{films / 'ours'}/"], [0.6, 0.8, 0.9]
-    assert ours["PhotoR"] == pytest.approx(sum(values) / 3, abs=0.01) and ours["askings"] == 9
+    assert ours["PhotoR"] == pytest.approx(sum(values) / 3, abs=0.01) and ours["repeats"] == 9
     assert ours["PhotoR_sd"] == pytest.approx(stdev(values), abs=0.01)
     assert facts["overall"]["PhotoR"] == pytest.approx(sum(BRIGHTNESS.values()) / 5, abs=0.01)
     assert len(chat_server.asked) == 9 and len(json.loads((tmp_path / "m.replies.json").read_text())["replies"]) == 9
     table = capsys.readouterr().out.splitlines()
-    assert table[0].split() == ["PhysR", "PhysR_sd", "PhotoR", "PhotoR_sd", "askings"] and len(table) == 9
+    assert table[0].split() == ["PhysR", "PhysR_sd", "PhotoR", "PhotoR_sd", "repeats"] and len(table) == 9
 
 
 def test_nothing_but_frames_and_letters_is_sent(chat_server, films, tmp_path):
     chat_server.script = by_brightness
-    judged([films / "cosmos/a.mp4", films / "ours/a.mp4"], tmp_path, askings=1)
+    judged([films / "cosmos/a.mp4", films / "ours/a.mp4"], tmp_path, repeats=1)
     (_, body), = chat_server.asked
     texts = [part["text"] for part in body["messages"][0]["content"] if part["type"] == "text"]
     assert texts[1:] == ["Film A, 10 frames:", "Film B, 10 frames:"]
@@ -81,16 +81,16 @@ def test_nothing_but_frames_and_letters_is_sent(chat_server, films, tmp_path):
     assert KEY not in (tmp_path / "m.json").read_text() + (tmp_path / "m.replies.json").read_text()
 
 
-def test_every_asking_has_each_film_once_in_another_order():
-    questions = draw_questions(10, EvaluateOptions(askings=3, together=4))
+def test_every_repeat_has_each_film_once_in_another_order():
+    questions = draw_questions(10, EvaluateOptions(repeats=3, films_per_question=4))
     assert [len(q) for q in questions] == [3, 3, 4] * 3
     orders = [[i for q in questions[k : k + 3] for i in q.values()] for k in (0, 3, 6)]
     assert all(sorted(order) == list(range(10)) for order in orders) and len(set(map(tuple, orders))) == 3
-    assert questions == draw_questions(10, EvaluateOptions(askings=3, together=4))
-    assert questions != draw_questions(10, EvaluateOptions(askings=3, together=4, seed=1))
+    assert questions == draw_questions(10, EvaluateOptions(repeats=3, films_per_question=4))
+    assert questions != draw_questions(10, EvaluateOptions(repeats=3, films_per_question=4, seed=1))
 
 
-def test_mean_and_spread_over_the_askings(chat_server, films, tmp_path):
+def test_mean_and_spread_over_the_repeats(chat_server, films, tmp_path):
     scores = (0.2, 0.5, 0.8)
     chat_server.script = [json.dumps({"A": {"physical_realism": s, "photo_realism": 1}}) for s in scores]
     row = judged([films / "ours/a.mp4"], tmp_path)["overall"]
@@ -117,7 +117,7 @@ def test_a_question_without_a_usable_reply_is_left_out_and_said(chat_server, fil
     chat_server.script = ["no", json.dumps(GOOD), "no", "about 0.7", json.dumps(GOOD).replace("0.5", "7"),
                           "Gladly:\n" + json.dumps(GOOD)]  # fmt: skip
     facts = judged([films / "ours/a.mp4"], tmp_path)
-    assert facts["overall"]["askings"] == 2 and facts["overall"]["PhysR"] == 0.5
+    assert facts["overall"]["repeats"] == 2 and facts["overall"]["PhysR"] == 0.5
     assert "1 of 3 questions got no usable answer in 3 tries and are left out" in facts["notes"]
     chat_server.script = ["no"] * 9
     (tmp_path / "m.json").unlink()
@@ -134,7 +134,7 @@ def test_an_interrupted_run_continues(chat_server, films, tmp_path):
     with pytest.raises(InputError, match="m.replies.json: is of other films or options"):
         judged([films / "ours/b.mp4"], tmp_path, resume=True)
     chat_server.script, chat_server.asked = [json.dumps(GOOD)] * 2, []
-    assert judged([films / "ours/a.mp4"], tmp_path, resume=True)["overall"]["askings"] == 3
+    assert judged([films / "ours/a.mp4"], tmp_path, resume=True)["overall"]["repeats"] == 3
     assert len(chat_server.asked) == 2
     for text, says in (("{", "is damaged"), ("[]", "is of other")):
         (tmp_path / "m.replies.json").write_text(text)
@@ -162,7 +162,7 @@ def test_wrong_films_and_options_send_nothing(chat_server, films, tmp_path):
         run(film, None, None, EvaluateOptions(judge=True, align=True))
     with pytest.raises(InputError, match="--base-url: .*; it belongs to --judge"):
         run(film, film, tmp_path / "m.json", EvaluateOptions(base_url="x"))
-    for options, says in (({"askings": 0}, "--askings 0"), ({"together": 27}, "--together 27")):
+    for options, says in (({"repeats": 0}, "--repeats 0"), ({"films_per_question": 27}, "--films-per-question 27")):
         with pytest.raises(InputError, match=says):
             EvaluateOptions(**options)
     assert not chat_server.asked and not (tmp_path / "m.json").exists()

@@ -36,7 +36,7 @@ class RenderOptions:
     ids: bool = False  # render each object in one flat colour, with its number and a legend
     shadows: str = "on"  # on | off: soft shadows of objects that moved
     show_forces: bool = False  # draw an arrow for each active force prompt
-    playable: bool = False  # a page that goes on with the motion of the learned field when the user takes an object
+    playable: bool = False  # a page that continues the motion by the learned field when the user grabs an object
     frame: int | None = None  # render this frame only; -1 is the last
     side_by_side: bool = False  # several files in one image, with the same camera
     device: str = "auto"

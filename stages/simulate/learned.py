@@ -125,7 +125,7 @@ def rollout(
                 new = _changed(objects, current)
                 stepper.change(new.to(device))
                 mass = new.mass[0]
-            sleep.wake(_pushed(active, ids, start, end) | _roused(changes, ids))
+            sleep.wake(_pushed(active, ids, start, end) | _woken(changes, ids))
             stepper.external.pinned.copy_(_rows(held, ids) | sleep.asleep)
             if bool(sleep.asleep.all()):
                 stepper.step_count += steps
@@ -237,8 +237,8 @@ def _pushed(forces: Sequence[Force], ids: list[int], start: float, end: float) -
     return _rows({f.object_id for f in forces if f.active_fraction(start, end) > 0}, ids)
 
 
-def _roused(changes: Sequence[Change], ids: list[int]) -> Bool[Tensor, "o"]:
-    """Objects that changes wake: all by another gravity, and those that are released or get another material."""
+def _woken(changes: Sequence[Change], ids: list[int]) -> Bool[Tensor, "o"]:
+    """Objects woken by changes: all by another gravity, else those that are released or get another material."""
     whole = any(c.what == "gravity" for c in changes)
     return _rows(ids if whole else {c.object_id for c in changes}, ids)
 

@@ -1,4 +1,4 @@
-"""What a simulation that went wrong shows: penetration, energy gain, creep and spread, measured in every frame.
+"""Measures of implausible motion: penetration, energy gain, creep and spread, taken in every frame.
 
 penetration: deepest keypoint of an object inside another one or below the floor, beyond the depth at rest, relative to
 the smaller height of both.
@@ -27,10 +27,10 @@ from stages.core.scene.trajectory import Keypoints
 from stages.simulate.options import SimulateOptions
 
 log = logging.getLogger(__name__)
-BOUNDS = {"penetration": 0.03, "creep": 0.01, "spread": 0.1, "energy_gain": 0.05}  # beyond these a run is warned of
+BOUNDS = {"penetration": 0.03, "creep": 0.01, "spread": 0.1, "energy_gain": 0.05}  # beyond these a warning is logged
 VOXELS_ALONG = 24  # of the bodies in which depths are measured
 MAX_CHECKED_KEYPOINTS = 256  # keypoints of an object whose depth is measured
-SLOW = 0.1  # largest speed of what creeps, relative to that of a fall by half the object's size
+SLOW = 0.1  # largest speed of an object that creeps, relative to that of a fall by half the object's size
 MOVED = 1e-3  # least displacement of one of two objects whose penetration is measured [size]
 
 

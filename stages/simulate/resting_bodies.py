@@ -24,7 +24,7 @@ FREE, FALLING = 7, 6  # numbers of a free joint's coordinates and velocities
 
 @dataclass(frozen=True)
 class Stance:
-    """What a body resists disturbances with, in units of the simulation."""
+    """Properties that determine how a body resists disturbances, in units of the simulation."""
 
     friction: float
     height: float  # of the centre of mass above the lowest point

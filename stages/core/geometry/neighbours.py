@@ -6,11 +6,11 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-QUERIES_PER_THREAD = 500  # that take longer than to start a thread
+QUERIES_PER_THREAD = 500  # fewer take less time than starting a thread
 
 
 class KDTree:
-    """k-d tree on the CPU, for repeated queries. Its cells are halved: to balance them takes as long again."""
+    """k-d tree on the CPU, for repeated queries. Cells are split in the middle: balancing doubles the building time."""
 
     def __init__(self, points: Float[Tensor, "n d"]):
         from scipy.spatial import cKDTree  # 0.2 s to import, and many runs search no neighbours

@@ -1,4 +1,4 @@
-"""Functions that torch.compile does not look into."""
+"""Functions that torch.compile treats as opaque operators."""
 
 from __future__ import annotations
 

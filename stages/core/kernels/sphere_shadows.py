@@ -1,4 +1,4 @@
-"""How much of an overhead sky and of a lamp spheres block at points: one thread per point, over all objects.
+"""Fractions of an overhead sky and of a lamp that spheres block at points: one thread per point, over all objects.
 
 See `stages.core.raster.shadows` for the formula and its sources. The spheres of an object have one weight, so that an
 object takes two logarithms, of products over its spheres.

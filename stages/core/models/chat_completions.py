@@ -22,7 +22,7 @@ URL = "https://api.openai.com/v1"
 ATTEMPTS, PAUSE = 3, 2.0  # on a busy or silent server; pause before the second attempt, then doubling [s]
 LONGEST_PAUSE = 60.0  # that a server may ask for with Retry-After [s]
 RETRY_STATUSES = (408, 409, 429, 500, 502, 503, 504)  # HTTP statuses worth retrying
-LARGEST_REPLY = 4 << 20  # of which a few thousand characters would do [bytes]
+LARGEST_REPLY = 4 << 20  # usable replies have a few thousand characters [bytes]
 T = TypeVar("T")
 
 

@@ -29,7 +29,7 @@ def farthest_points(points: Float[Tensor, "n 3"], count: int, seed: int = 0) -> 
     distance = np.full(xyz.shape[1], np.inf, xyz.dtype)
     offset, square = np.empty_like(xyz), np.empty_like(distance)
     at = int(torch.randint(xyz.shape[1], (1,), generator=torch.Generator().manual_seed(seed)))
-    for i in range(count):  # in place: for most objects the time is that of the calls
+    for i in range(count):  # in place: for most objects the overhead of the calls dominates
         chosen[i] = at
         np.subtract(xyz, xyz[:, at, None], out=offset)
         np.square(offset, out=offset)

@@ -1,4 +1,4 @@
-"""Spheres that stand for the objects where shadows are computed; they move with the keypoints as Gaussians do."""
+"""Spheres that approximate the objects in the computation of shadows; they move with the keypoints as Gaussians do."""
 
 from __future__ import annotations
 

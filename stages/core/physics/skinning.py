@@ -1,4 +1,4 @@
-"""Deform Gaussians with their keypoints: displaced, rotated and stretched; at rest they are the input bit by bit."""
+"""Deform Gaussians with their keypoints: displaced, rotated and stretched; at rest they are the input, bit for bit."""
 
 from __future__ import annotations
 
@@ -124,7 +124,7 @@ def keypoint_neighbours(keypoints: Keypoints) -> Int[Tensor, "p j"]:
 
 
 def _rotate_sh(sh: Float[Tensor, "n k 3"], R: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n k 3"]:
-    """SH coefficients rotated with each Gaussian; those with the identity rotation stay the same bit by bit."""
+    """SH coefficients rotated with each Gaussian; those with the identity rotation stay the same, bit for bit."""
     if sh.shape[1] == 1:
         return sh
     rotated = R.ne(torch.eye(3).to(R)).flatten(1).any(1).nonzero()[:, 0]

@@ -1,4 +1,4 @@
-"""The binary container of a page: arrays of whole numbers of few bits, as byte planes, deflated.
+"""The binary container of a page: arrays of integers of few bits, stored as byte planes and deflated.
 
 Layout after inflation: length of the header (uint32, little endian), the header (JSON), the arrays. The header's
 `arrays` describe each: `rows` x `columns` values low[c] + step[c] q, of which q is stored in `planes` bytes: first the
@@ -40,7 +40,7 @@ class PackedArray:
 
 
 def whole(values: Int[Tensor, "r c"]) -> PackedArray:
-    """Values that are whole numbers from 0 on, stored exactly in as few bytes as they need."""
+    """Non-negative integers, stored exactly in as few bytes as they need."""
     return PackedArray(values.long(), (0.0,), (1.0,), max(1, int(values.max()).bit_length()) if values.numel() else 1)
 
 

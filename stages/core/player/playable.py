@@ -1,4 +1,4 @@
-"""What a page needs to go on with a motion of the learned field: the network, rest shapes, materials and units."""
+"""What a page needs to continue a motion of the learned field: the network, rest shapes, materials and units."""
 
 from __future__ import annotations
 

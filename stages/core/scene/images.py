@@ -21,7 +21,7 @@ from stages.core.scene.files import must_exist, replacing
 from stages.core.scene.formats import IMAGE_SUFFIXES
 
 MAX_VIDEO_PIXELS = 1 << 26  # of a frame; 8K has half as many
-ENCODER_THREADS = 4  # not those of the machine: the file depends on their number
+ENCODER_THREADS = 4  # fixed, since the file depends on the number of threads
 MAX_PENDING_FRAMES = 8  # of a video, that wait for the encoder
 
 

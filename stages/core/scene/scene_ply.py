@@ -63,7 +63,7 @@ def _check_counts(path: Path) -> None:
             if line.strip() == b"end_header":
                 return check_ply_counts(header, path.stat().st_size - file.tell())
             if len(header) == 1 and line.strip() != b"ply":
-                break  # plyfile says what it is
+                break  # plyfile reports the error
 
 
 def _activate(path: Path, raw: dict[str, np.ndarray] | np.ndarray) -> Gaussians:
@@ -101,7 +101,7 @@ def _columns(raw: dict[str, np.ndarray] | np.ndarray, names: list[str]) -> np.nd
     if isinstance(raw, np.ndarray) and raw.flags.c_contiguous:
         kinds = [raw.dtype[name] for name in raw.dtype.names]
         if all(kind == "<f4" or kind == "<i4" for kind in kinds) and all(raw.dtype[name] == "<f4" for name in names):
-            rows = raw.view("<f4").reshape(len(raw), -1)  # at once: passes for each property take many times as long
+            rows = raw.view("<f4").reshape(len(raw), -1)  # in one pass: one for each property takes many times as long
             return rows.take([raw.dtype.names.index(name) for name in names], 1).astype(np.float32, copy=False)
     with np.errstate(over="ignore", invalid="ignore"):
         return np.stack([np.asarray(raw[name], np.float32) for name in names], 1)

@@ -1,4 +1,4 @@
-"""Benchmark of the chain from photos to a film: seconds of each stage, busy share of the GPU, and repeatability.
+"""Benchmark of the chain from photos to a film: seconds of each stage, utilisation of the GPU, and repeatability.
 
 The stages run in one process, as often as asked, and then once as separate commands, which adds their start-up. The
 files of all runs are compared by their sha256.

@@ -24,7 +24,7 @@ from stages.lab.fuzz.cases import GOOD, KINDS, Examples, quiet
 RESULTS = (*GOOD, "nonsense", "traceback", "signal", "more than 10 s", "more than 2 GB")
 MAX_SECONDS = 10.0
 MAX_MEMORY = 2 << 30  # more than before the case [bytes]
-START = 120.0  # a process may take so long to import and to write the examples [s]
+START = 120.0  # allowed to a process for imports and for writing the examples [s]
 
 
 def run(out: Path, count: int, seed: int = 0) -> Iterator[str]:

@@ -22,7 +22,7 @@ from stages.lab.fuzz.kinds import KINDS, Kind
 
 MAX_MESSAGE = 600  # characters of an error, without the path
 GOOD = ("right", "clear error")
-TURNS = [kind for kind in KINDS for _ in range(kind.share)]  # the kinds of the cases, again and again
+TURNS = [kind for kind in KINDS for _ in range(kind.share)]  # the kinds of the cases, repeated in this order
 
 
 class Examples:

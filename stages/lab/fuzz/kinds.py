@@ -1,4 +1,4 @@
-"""Small valid files of every format that ngff reads, each with the changes it suffers and its reader."""
+"""Small valid files of every format that ngff reads, each with the changes applied to it and its reader."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class Kind:
     changes: Mapping[str, Change]  # one of these files is changed
     read: Callable[[Path], object]  # from the folder; AssertionError for nonsense
     share: int = 1  # of the cases, relative to the others
-    repair: Callable[[Path], object] | None = None  # makes the check sums right again, in half of the cases
+    repair: Callable[[Path], object] | None = None  # corrects the checksums, in half of the cases
 
 
 PROVENANCE = {"command": "simulate", "inputs": [{"name": "scene.ply"}], "options": {

@@ -1,4 +1,4 @@
-"""A study: pages for participants, the films that they show, and the key that says which film is whose."""
+"""A study: pages for participants, the films that they show, and the key that maps each film to its model."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ SCALES = {  # name in tables: the question, what it means, and what the lowest a
 def run(folder: Path, out: Path, options: StudyOptions) -> list[str]:
     """FOLDER/MODEL/SPLIT/*.mp4 or FOLDER/MODEL/*.mp4 -> OUT/key.json and OUT/pages/; a line about what was written.
 
-    The films are encoded anew, without sound and titles, under names that say nothing of their origin. Raises
+    The films are encoded anew, without sound and titles, under names that do not reveal their origin. Raises
     InputError for a folder without films, films that cannot be read, and an output folder that has a study already.
     """
     folder, out = Path(folder), Path(out)

@@ -1,1 +1,1 @@
-"""A simulation that answers to the user in a browser while it runs."""
+"""Interactive simulation: the user acts on the objects in a browser while it runs."""

@@ -1,4 +1,4 @@
-"""What the page may say to a live session: one table; everything else is refused."""
+"""Messages that the page may send to a live session: one table; everything else is refused."""
 
 from __future__ import annotations
 

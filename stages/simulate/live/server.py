@@ -1,8 +1,8 @@
 """The local server of a live session: the page, and a WebSocket for messages and frames.
 
 It listens on 127.0.0.1 only. The address has a random token; requests with another host, path or origin are refused.
-One client controls, the first; any others watch, and the eldest takes over when it leaves. A frame is sent to a client
-when it has drawn the one before, so that none falls behind. It runs in a thread of its own.
+One client controls, the first; any others watch, and the one connected longest takes over when it leaves. A frame is
+sent to a client when it has drawn the one before, so that none falls behind. It runs in a thread of its own.
 """
 
 from __future__ import annotations

@@ -27,7 +27,7 @@ Vector = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class LivePrompts(ForcePrompts):
-    """Prompts that a session decides about from frame to frame."""
+    """Prompts whose forces and changes a session determines frame by frame."""
 
     session: Session | None = None
 
@@ -165,7 +165,7 @@ class Session:
         return pull * min(1.0, MAX_ACCELERATION / max(float(pull.norm()), 1e-9))
 
     def _weight(self) -> Float[Tensor, "3"]:
-        """Acceleration that carries the weight [m/s^2]."""
+        """Acceleration that balances gravity [m/s^2]."""
         return torch.tensor([0.0, 0.0, self.gravity])
 
     def _force(self, id: int, acceleration: Tensor, k: int | None, start: float, end: float) -> Force:

@@ -109,7 +109,7 @@ def run(
         raise InputError(f"{folder}: holds no weights (.safetensors); make some with `ngff-lab train`")
     before = _earlier(Path(out))
     device = pick_device(options.device)
-    splits = {name: split_scenes(data, name, options).to(device) for name in SPLITS if _there(data, name)}
+    splits = {name: split_scenes(data, name, options).to(device) for name in SPLITS if _groups_exist(data, name)}
     if not splits:
         split_scenes(data, "spatial", options)  # raises InputError with what is missing
     rows = {
@@ -118,7 +118,7 @@ def run(
         }
     }
     if nudged is not None:
-        rows[NUDGED] = {"splits": dict(_again_made(nudged, splits, options))}
+        rows[NUDGED] = {"splits": dict(_nudged_metrics(nudged, splits, options))}
     rows[RIGID_FIT] = {
         "splits": {name: evaluate_predictor(predict_rigid_fit, m, options.batch) for name, m in splits.items()}
     }
@@ -152,7 +152,7 @@ def _earlier(out: Path) -> dict:
         raise InputError(f"{out}: holds no results of `ngff-lab bench dynamics` ({error!r})") from error
 
 
-def _there(data: Path, split: str) -> bool:
+def _groups_exist(data: Path, split: str) -> bool:
     """Whether all groups of a split exist; logs a warning for a split that is left out."""
     missing = [g for g in SPLITS[split][0] if not (motions_folder(data) / f"{g}.h5").is_file()]
     if missing:
@@ -173,12 +173,12 @@ def split_scenes(data: Path, split: str, options: DynamicsBenchOptions) -> Keypo
     return replace(motions[rows], points=motions.points[rows, :frames])
 
 
-def _again_made(
+def _nudged_metrics(
     nudged: Path, splits: dict[str, KeypointMotions], options: DynamicsBenchOptions
 ) -> Iterator[tuple[str, dict]]:
     """Metrics of the nudged scenes against the true ones, split by split."""
     for split, motions in splits.items():
-        if _there(nudged, split):
+        if _groups_exist(nudged, split):
             made = read_groups(nudged, SPLITS[split][0], options.keypoints)
             yield split, _compared(made, motions, options.batch)
 

@@ -88,7 +88,7 @@ def _contact(
 
 
 @triton.jit
-def _guarded(v, up, down, MAX_RECOVERY_SPEED: tl.constexpr):
+def _limited(v, up, down, MAX_RECOVERY_SPEED: tl.constexpr):
     """Velocity along one axis limited to [up, down], where each limit is cut at MAX_RECOVERY_SPEED [m/s]."""
     return tl.minimum(tl.maximum(v, tl.minimum(up, MAX_RECOVERY_SPEED)), tl.maximum(down, -MAX_RECOVERY_SPEED))
 
@@ -148,8 +148,8 @@ def update_velocities(
     up = scale3(2 / dt, sub(add(read3(bounds), deepest), slack))
     down = scale3(2 / dt, add(sub(read3(bounds + 3), max3(where3(valid_points, x, -infinity))), slack))
     free = 1 - tl.load(pinned + i).to(tl.float32)
-    v = (_guarded(v[0], up[0], down[0], MAX_RECOVERY_SPEED), _guarded(v[1], up[1], down[1], MAX_RECOVERY_SPEED),
-         _guarded(v[2], up[2], down[2], MAX_RECOVERY_SPEED))  # fmt: skip
+    v = (_limited(v[0], up[0], down[0], MAX_RECOVERY_SPEED), _limited(v[1], up[1], down[1], MAX_RECOVERY_SPEED),
+         _limited(v[2], up[2], down[2], MAX_RECOVERY_SPEED))  # fmt: skip
     v = scale3(free, v)
     L = scale3(free, L)
     c, q = drift(read3(own_body + COM), read4(own_body + QUAT), v, L, read9(inverse + 9 * i), dt / 2)

@@ -112,7 +112,8 @@ def segment(
     out: Annotated[Path, Option("-o", "--out", help="labelled scene to write (.ply)")] = Path("labelled.ply"),
     backend: Annotated[str, Option(help=describe(SEGMENT))] = SegmentOptions.backend,
     masks: Annotated[
-        Path | None, Option(help="folder of label images named as the photos (0 background, 1... objects)")
+        Path | None, Option(help="folder of label images named as the photos: 0 background, 1... objects; 255 is "
+                            "ignored where its names.json does not name it")
     ] = SegmentOptions.masks,
     boxes: Annotated[
         Path | None, Option(help=f"prompts.json: boxes in the first photo [px] and names; for {NETWORKS} also points")

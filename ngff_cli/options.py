@@ -1,5 +1,6 @@
 """Shared by both command lines: option types, --json, logging and error reports."""
 
+import errno
 import logging
 import os
 import signal
@@ -25,6 +26,8 @@ Threads = Annotated[int | None, typer.Option(
 AsJson = Annotated[bool, typer.Option("--json", help="print the results as JSON instead of a table")]
 SIZE_OPTIONS = ("quality", "resolution", "keypoints", "max_objects", "batch", "views", "side", "size", "particles",
                 "scenes")  # on which the memory of a command depends, the most effective first  # fmt: skip
+NO_MEMORY = ("can't allocate memory", "Insufficient memory", "can't start new thread", "bad alloc", "bad_alloc",
+             "failed to map segment")  # in messages of PyTorch, OpenCV, Python, C++ and the loader  # fmt: skip
 
 
 def limit_threads(count: int | None) -> None:
@@ -83,7 +86,7 @@ def print_results(run: Callable[[Path | None], Iterable[str]], out: Path | None,
 class CommandGroup(typer.core.TyperGroup):
     """Commands in the order of their definition.
 
-    An InputError or OSError exits with one line and status 2, a GPU out of memory with one line and status 1.
+    An InputError or OSError exits with one line and status 2, memory that runs out with one line and status 1.
     """
 
     def list_commands(self, ctx) -> list[str]:
@@ -103,20 +106,21 @@ class CommandGroup(typer.core.TyperGroup):
             return super().invoke(ctx)
         except InputError as error:
             fail(str(error), 2)
-        except OSError as error:
-            if error.filename is None and error.errno is None:
+        except KeyboardInterrupt:
+            fail("interrupted; no incomplete file is left", 130)
+        except Exception as error:
+            command = self.commands[ctx.invoked_subcommand]
+            if _is_gpu_out_of_memory(error):
+                fail(_less_memory("the GPU", command, ["use --device cpu"]), 1)
+            if _is_out_of_memory(error):
+                fail(_less_memory("the machine", command, []), 1)
+            if not isinstance(error, OSError) or error.filename is None and error.errno is None:
                 raise
             where = f"{error.filename}: " if error.filename else ""
             fail(f"{where}{error.strerror or error}", 2)
-        except RuntimeError as error:
-            if not _is_gpu_out_of_memory(error):
-                raise
-            fail(_less_memory(self.commands[ctx.invoked_subcommand]), 1)
-        except KeyboardInterrupt:
-            fail("interrupted; no incomplete file is left", 130)
 
 
-def _is_gpu_out_of_memory(error: RuntimeError) -> bool:
+def _is_gpu_out_of_memory(error: Exception) -> bool:
     """Whether PyTorch, CUDA or Warp failed to allocate memory on a GPU."""
     torch = sys.modules.get("torch")  # not imported for this: that takes a second
     if torch is not None and isinstance(error, torch.cuda.OutOfMemoryError):
@@ -125,14 +129,20 @@ def _is_gpu_out_of_memory(error: RuntimeError) -> bool:
     return "CUDA error: out of memory" in text or ("Failed to allocate" in text and "cuda" in text)
 
 
-def _less_memory(command) -> str:
-    """Sentence for a command that ran out of GPU memory: which of its options to lower."""
+def _is_out_of_memory(error: Exception) -> bool:
+    """Whether Python, NumPy, PyTorch, OpenCV, a new thread or a library that is loaded got no memory."""
+    return isinstance(error, MemoryError) or getattr(error, "errno", None) == errno.ENOMEM or any(
+        text in str(error) for text in NO_MEMORY
+    )
+
+
+def _less_memory(what: str, command, remedies: list[str]) -> str:
+    """Sentence for a command that ran out of memory: which of its options to lower, and what else helps."""
     names = [p.name for p in command.params]
     sizes = ["--" + name.replace("_", "-") for name in SIZE_OPTIONS if name in names]
-    remedies = [f"lower {' or '.join(sizes)}"] if sizes else []
-    if "device" in names:
-        remedies.append("use --device cpu")
-    return ", ".join(["the GPU is out of memory: close other programs that use it", *remedies])
+    lower = [f"lower {' or '.join(sizes)}"] if sizes else []
+    remedies = remedies if "device" in names else []
+    return ", ".join([f"{what} is out of memory: close other programs that use it", *lower, *remedies])
 
 
 def fail(message: str, status: int) -> None:

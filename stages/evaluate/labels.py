@@ -20,7 +20,7 @@ from tqdm import tqdm
 from stages.core.errors import InputError
 from stages.core.scene.cameras import Cameras
 from stages.core.scene.files import must_exist
-from stages.core.scene.images import read_labels
+from stages.core.scene.images import NOT_JUDGED, read_labels
 from stages.core.scene.lens import Undistortion, photo_of
 from stages.core.scene.scene import Scene, SceneObject
 from stages.core.scene.scene_ply import read_scene
@@ -30,7 +30,6 @@ from stages.evaluate.matching import object_labels
 from stages.evaluate.options import EvaluateOptions
 from stages.evaluate.result import Result
 
-NOT_JUDGED = 255  # value of pixels that are left out
 MIN_FOUND_PIXELS = 60  # of a found object in all photos [px of the views]; smaller ones are no objects
 NAMES_EXAMPLE = '{"1": {"name": "duck", "core": true}}'
 MATCHING_IOU = 0.5  # above which a found object is the labelled one (Kirillov et al. 2019)

@@ -10,7 +10,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from stages.core.errors import InputError
-from stages.core.scene.images import read_labels
+from stages.core.scene.images import NOT_JUDGED, read_labels
 from stages.core.scene.lens import Undistortion
 from stages.core.scene.scene import Scene
 from stages.core.scene.schema import numbered, read_json, reason, texts
@@ -24,6 +24,7 @@ MAX_LABELS = 1000  # different numbers in all label images
 def segment(scene: Scene, options: SegmentOptions) -> Scene:
     """Labels of the images in the folder `options.masks`, projected with visibility and voted over all views.
 
+    Where names.json names the objects but not 255, pixels of that value have no vote, as `ngff evaluate` ignores them.
     Raises InputError for a scene without cameras, a folder without matching images, and wrong aspect ratios.
     """
     if scene.cameras is None:
@@ -31,7 +32,8 @@ def segment(scene: Scene, options: SegmentOptions) -> Scene:
     files, names = match_files(options.masks, scene.cameras.names, "label image", "--masks"), read_names(options.masks)
     bar, columns = tqdm(files.items(), unit="mask"), {0: 0}
     votes = collect_votes(scene, ((view, _columns(_labels(scene, view, file, options), columns)) for view, file in bar))
-    order = sorted(columns)
+    ignored = {NOT_JUDGED} if names and NOT_JUDGED not in names else set()
+    order = sorted(columns.keys() - ignored)
     votes = votes[:, [columns[number] for number in order]]
     return apply_votes(scene, votes, names, str(options.masks), options.seed, order)
 

@@ -129,7 +129,7 @@ def apply_votes(
     """
     numbers = range(votes.shape[1]) if numbers is None else numbers
     if votes.shape[1] == 1:
-        raise InputError(f"{source}: the label images contain no object: every pixel is 0")
+        raise InputError(f"{source}: the label images contain no object: every pixel is 0 or ignored")
     means = scene.gaussians.means
     ids = remove_outliers(means, majority_labels(scene, pool_votes(means, votes)))
     present = {numbers[i] for i in ids.unique().tolist()}

@@ -1,4 +1,4 @@
-"""Commands that are killed, interrupted or out of disk space at random moments leave no part of a file behind.
+"""Commands that are killed, interrupted, or out of disk space or memory at random moments leave no part of a file.
 
 `NGFF_KILLS=200 python -m pytest -s -m slow tests/pipeline/test_kills.py` tries so many moments and prints a table.
 """
@@ -30,7 +30,8 @@ from tests.lab.training.test_train import falling
 from tests.reconstruct.raycast import arc, write_set
 
 MOMENTS = int(os.environ.get("NGFF_KILLS", 16))
-HOWS = ("SIGKILL", "SIGINT", "SIGTERM", "full disk")
+HOWS = ("SIGKILL", "SIGINT", "SIGTERM", "full disk", "no memory")
+NO_LIMIT = resource.RLIM_INFINITY
 SIMULATE = "simulate scene.ply --keypoints 16 --steps 20 --lift 0.2"
 COMMANDS = {  # words of ngff or ngff-lab; `--resume` is added to the run after the disturbed one
     "reconstruct": "reconstruct images -o out/scene.ply --cameras transforms.json --quality draft",
@@ -49,27 +50,36 @@ COMMANDS = {  # words of ngff or ngff-lab; `--resume` is added to the run after 
 RESUMED = {"reconstruct": ".steps-scene.ply", "train": "w.ckpt"}  # where there is such a file
 
 
-def work(command: str, words: list[str], folder: Path, largest: int) -> None:
-    """Run a command in a process of its own, which can write files of at most `largest` bytes."""
+def memory(key: str, process: int | str = "self") -> int:
+    """VmSize, the memory that a process has mapped, or VmPeak, the largest so far [bytes]."""
+    lines = Path(f"/proc/{process}/status").read_text().splitlines()
+    return next((int(line.split()[1]) << 10 for line in lines if line.startswith(key)), 0)  # 0 once it has ended
+
+
+def work(command: str, words: list[str], folder: Path, largest: int, more: int) -> None:
+    """Run a command in a process of its own, which can write `largest` bytes per file and map `more` bytes."""
     os.chdir(folder)
     os.environ["TMPDIR"] = str(folder / "tmp")
-    for stream in (1, 2):
-        os.dup2(os.open(os.devnull, os.O_WRONLY), stream)
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    os.dup2(os.open("errors", os.O_WRONLY | os.O_CREAT | os.O_TRUNC), 2)
     terminate_as_interrupted()
     small = {"gaussians": 1000, "iterations": 5}
     QUALITY_PRESETS["draft"] = replace(QUALITY_PRESETS["draft"], **small)
     resource.setrlimit(resource.RLIMIT_FSIZE, (largest, resource.getrlimit(resource.RLIMIT_FSIZE)[1]))
     shrink_process()
+    if more != NO_LIMIT:
+        resource.setrlimit(resource.RLIMIT_AS, (memory("VmSize") + more, resource.getrlimit(resource.RLIMIT_AS)[1]))
     (lab if command in ("train", "dataset") else app)(words)
 
 
 @dataclass(frozen=True)
 class Undisturbed:
-    """What a command writes, and how long it takes."""
+    """What a command writes, how long it takes, and how much memory it maps beyond that of its parent."""
 
     inputs: Path
     files: dict[str, bytes]
     seconds: float
+    mapped: int  # [bytes]
 
 
 def files_in(folder: Path) -> dict[str, bytes]:
@@ -84,13 +94,13 @@ def files_in(folder: Path) -> dict[str, bytes]:
     return found
 
 
-def start(command: str, folder: Path, resume: bool = False, largest: int = resource.RLIM_INFINITY):
-    """A process that runs a command in a folder."""
+def start(command: str, folder: Path, resume: bool = False, largest: int = NO_LIMIT, more: int = NO_LIMIT):
+    """A process that runs a command in a folder; its limits are those of `work`."""
     (folder / "out").mkdir(exist_ok=True)
     (folder / "tmp").mkdir(exist_ok=True)
     resume = resume and command in RESUMED and (folder / "out" / RESUMED[command]).exists()
     words = COMMANDS[command].split() + ["--resume"] * resume
-    process = CONTEXT.Process(target=work, args=(command, words, folder, largest))
+    process = CONTEXT.Process(target=work, args=(command, words, folder, largest, more))
     process.start()
     return process
 
@@ -119,21 +129,24 @@ def disturbed(command: str, how: str, rng: random.Random, known: Undisturbed, fo
     if how == "full disk":
         process = start(command, folder, largest=int(rng.uniform(0, 1.05 * max(map(len, known.files.values())))))
         process.join()
+    elif how == "no memory":
+        process = start(command, folder, more=int(rng.uniform(0, 1.05 * known.mapped)))
+        process.join()
     else:
         process = start(command, folder)
         time.sleep(rng.uniform(0, 1.05 * known.seconds))
         if process.is_alive():
             os.kill(process.pid, getattr(signal, how))
         process.join()
-    code, wrong = process.exitcode, []
+    code, wrong, errors = process.exitcode, [], (folder / "errors").read_text(errors="replace")
     left = {name: data for name, data in files_in(folder / "out").items() if not name.split("/")[-1].startswith(".")
             and ".steps-" not in name and not name.endswith((".ckpt", ".partial.h5"))}  # fmt: skip
     partial = [name for name in left if left[name] != known.files.get(name)]
     if partial:
         wrong.append(f"{partial} not as undisturbed")
-    allowed = {"SIGKILL": (0, -9), "full disk": (0, 2)}.get(how, (0, 130, -2, -15))
-    if code not in allowed:
-        wrong.append(f"exit status {code}")
+    allowed = {"SIGKILL": (0, -9), "full disk": (0, 2), "no memory": (0, 1, 2)}.get(how, (0, 130, -2, -15))
+    if code not in allowed or how in ("full disk", "no memory") and "Traceback" in errors:
+        wrong.append(f"exit status {code}: {errors[-300:]}")
     again = start(command, folder, resume=True)
     again.join()
     if again.exitcode != 0:
@@ -149,19 +162,27 @@ def disturbed(command: str, how: str, rng: random.Random, known: Undisturbed, fo
     return "complete" if code == 0 else "ended", "; ".join(wrong)
 
 
+def run_undisturbed(command: str, inputs: Path, folder: Path) -> Undisturbed:
+    """Run a command to its end."""
+    shutil.copytree(inputs, folder)
+    begun = time.monotonic()
+    process = start(command, folder)
+    first = peak = memory("VmSize", process.pid)
+    while process.is_alive():
+        peak = max(peak, memory("VmPeak", process.pid))
+        time.sleep(0.02)
+    files = files_in(folder / "out")
+    assert process.exitcode == 0 and files, (command, (folder / "errors").read_text())
+    return Undisturbed(inputs, files, time.monotonic() - begun, peak - first)
+
+
 @pytest.mark.slow
 def test_nothing_is_left_in_parts(inputs, tmp_path):
     rng, counts, failures, known = random.Random(MOMENTS), Counter(), [], {}
     for n in range(MOMENTS):
         command, how = list(COMMANDS)[n % len(COMMANDS)], HOWS[(n // len(COMMANDS) + n) % len(HOWS)]
         if command not in known:
-            folder = tmp_path / command
-            shutil.copytree(inputs, folder)
-            begun = time.monotonic()
-            process = start(command, folder)
-            process.join()
-            known[command] = Undisturbed(inputs, files_in(folder / "out"), time.monotonic() - begun)
-            assert process.exitcode == 0 and known[command].files, command
+            known[command] = run_undisturbed(command, inputs, tmp_path / command)
         result, wrong = disturbed(command, how, rng, known[command], tmp_path / f"{n}")
         counts[command, how, "wrong" if wrong else result] += 1
         if wrong:

@@ -4,6 +4,7 @@ import resource
 from contextlib import contextmanager
 from importlib import import_module
 
+import numpy as np
 import pytest
 import torch
 
@@ -136,6 +137,14 @@ def test_gpu_out_of_memory_gives_one_line_and_status_1(input_files, monkeypatch,
     monkeypatch.setattr(import_module(f"stages.{args[0]}.{module}"), name, exhausted)
     line = fails_cleanly(input_files, args, expected=1)
     assert "the GPU is out of memory" in line and f"lower {options}, use --device cpu" in line
+
+
+@pytest.mark.parametrize("allocate", [torch.empty, np.empty], ids=["torch", "numpy"])
+def test_out_of_memory_gives_one_line_and_status_1(input_files, monkeypatch, allocate):
+    monkeypatch.setattr(import_module("stages.render.draw"), "rasterise", lambda *_, **__: allocate(1 << 50))
+    args = ("render", "{}/good.h5", "-o", "{}/o.mp4")
+    line = fails_cleanly(input_files, args, expected=1)
+    assert line.endswith("the machine is out of memory: close other programs that use it, lower --resolution")
 
 
 def test_other_runtime_errors_are_not_reported_as_out_of_memory(input_files, monkeypatch):

@@ -20,6 +20,7 @@ from stages.core.errors import InputError, MissingPackage
 from stages.core.scene.files import must_exist, replacing
 from stages.core.scene.formats import IMAGE_SUFFIXES
 
+NOT_JUDGED = 255  # value of pixels of label images that are left out
 MAX_VIDEO_PIXELS = 1 << 26  # of a frame; 8K has half as many
 ENCODER_THREADS = 4  # fixed, since the file depends on the number of threads
 MAX_PENDING_FRAMES = 8  # of a video, that wait for the encoder

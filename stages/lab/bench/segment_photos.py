@@ -18,10 +18,10 @@ import torch
 from stages.core.backends import pick_device
 from stages.core.errors import InputError
 from stages.core.scene.files import replacing
-from stages.core.scene.images import list_photos
+from stages.core.scene.images import NOT_JUDGED, list_photos
 from stages.core.scene.scene import Scene
 from stages.core.scene.scene_ply import read_scene, write_scene
-from stages.evaluate.labels import NOT_JUDGED, compare, label_files, read_truth
+from stages.evaluate.labels import compare, label_files, read_truth
 from stages.evaluate.options import EvaluateOptions
 from stages.evaluate.result import Result
 from stages.lab.bench import common as bench

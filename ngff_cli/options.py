@@ -131,9 +131,9 @@ def _is_gpu_out_of_memory(error: Exception) -> bool:
 
 def _is_out_of_memory(error: Exception) -> bool:
     """Whether Python, NumPy, PyTorch, OpenCV, a new thread or a library that is loaded got no memory."""
-    return isinstance(error, MemoryError) or getattr(error, "errno", None) == errno.ENOMEM or any(
-        text in str(error) for text in NO_MEMORY
-    )
+    known = isinstance(error, MemoryError) or getattr(error, "errno", None) == errno.ENOMEM
+    known = known or any(text in str(error) for text in NO_MEMORY)
+    return known or isinstance(error.__cause__, Exception) and _is_out_of_memory(error.__cause__)
 
 
 def _less_memory(what: str, command, remedies: list[str]) -> str:

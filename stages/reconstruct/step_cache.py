@@ -16,7 +16,7 @@ from typing import TypeVar
 import torch
 
 from stages.core.errors import InputError
-from stages.core.scene.files import replacing
+from stages.core.scene.files import replacing, save_tensors
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -67,8 +67,7 @@ class StepCache:
             return torch.load(path, weights_only=True)
         with self.timed(name):
             made = make()
-        with replacing(path) as part, part.open("wb") as file:  # a full disk is an OSError only with a file object
-            torch.save(made, file)
+        save_tensors(path, made)
         return made
 
     def cached_file(self, name: str, write: Callable[[Path], None]) -> Path:

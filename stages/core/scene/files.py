@@ -47,6 +47,17 @@ def replacing(path: Path) -> Iterator[Path]:
         part.unlink(missing_ok=True)
 
 
+def save_tensors(path: Path, values: object) -> None:
+    """Write tensors, and containers of them, with torch.save; raises InputError as `replacing` does."""
+    import torch
+
+    with replacing(path) as part, part.open("wb") as file:  # a full disk is an OSError only with a file object
+        try:
+            torch.save(values, file)
+        except RuntimeError as error:  # it ends its archive also after a write that failed
+            raise error.__context__ if isinstance(error.__context__, OSError) else error from None
+
+
 def _sweep(folder: Path) -> None:
     """Delete the temporary files of processes of this machine that have ended."""
     if folder in _swept or os.name != "posix":

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from stages.core.errors import InputError
 from stages.core.models.dynamics import Dynamics
-from stages.core.scene.files import must_exist, replacing
+from stages.core.scene.files import must_exist, save_tensors
 
 EMA_DECAY = 0.999  # of the exponential moving average of the weights, after a few thousand steps
 GRADIENT_CLIP = 2.0  # gradients are clipped to this multiple of the moving average of their norm
@@ -132,8 +132,7 @@ class TrainingState:
             "rate_factor": self.rate_factor, "warmup_start": self.warmup_start, "horizon": self.horizon,
             "cuda": torch.cuda.get_rng_state() if self.gradient_norm.is_cuda else None,
         }  # fmt: skip
-        with replacing(path) as part, part.open("wb") as file:  # a full disk is an OSError only with a file object
-            torch.save(state, file)
+        save_tensors(path, state)
 
     def load(self, path: Path, key: dict) -> None:
         """Resume from a checkpoint. Raises InputError for one that is damaged or of another training."""

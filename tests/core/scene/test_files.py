@@ -4,13 +4,15 @@ import os
 import resource
 import subprocess
 import sys
+from contextlib import contextmanager
 
 import pytest
+import torch
 
 from stages.core.errors import InputError
 from stages.core.scene import files
 from stages.core.scene.error_deferring_file import ErrorDeferringFile
-from stages.core.scene.files import must_exist, replacing, seconds_since
+from stages.core.scene.files import must_exist, replacing, save_tensors, seconds_since
 from stages.core.scene.schema import read_json
 
 
@@ -70,17 +72,31 @@ def test_pipes_and_devices_are_neither_read_nor_replaced(tmp_path):
     assert not pipe.is_file() and os.listdir(tmp_path) == ["a.json"]
 
 
-def test_what_a_full_disk_does_not_take_is_read_back_until_the_error_is_reported(tmp_path):
+@contextmanager
+def disk_for(size):
+    """Files can be no longer than `size` bytes."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+@pytest.mark.parametrize("size", [0, 1, 100, 5000, 20000])
+def test_tensors_that_do_not_fit_on_the_disk_are_refused(tmp_path, size):
+    with pytest.raises(InputError, match=r"a\.pt: cannot be written \(File too large\)"), disk_for(size):
+        save_tensors(tmp_path / "a.pt", {"a": torch.zeros(1000), "b": [torch.zeros(5000)]})
+    assert not os.listdir(tmp_path)
+
+
+def test_what_a_full_disk_does_not_take_is_read_back_until_the_error_is_reported(tmp_path):
     with ErrorDeferringFile(tmp_path / "a", "w+b") as file:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (10, hard))
-        try:
+        with disk_for(10):
             file.write(b"0123456")
             file.write(b"789abcdef")
             file.seek(20)
             file.write(b"xyz")
-        finally:
-            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
         file.seek(6)
         back = bytearray(20)
         assert file.readinto(back) == 20

@@ -226,6 +226,7 @@ class _World:
         model = self.model
         model.opt.gravity[2] = -options.gravity * self.units.time**2 / self.units.length
         softest = min(materials[id].material.E for id in self._ids)
+        self.mass = self.mass.clone()  # frames that were yielded keep theirs
         for row, id in enumerate(self._ids):
             m, b = materials[id].material, self._bodies[row]
             factor = m.density / b.material.density * b.mass / self.units.mass / model.body_mass[row + 1]

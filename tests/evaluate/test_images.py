@@ -103,3 +103,14 @@ def test_report_of_videos_contains_curves_and_images(tmp_path):
     html = (tmp_path / "report.html").read_text()
     assert html.count("<polyline") == 1 and html.count("data:image/png;base64,iVBOR") == 8
     assert "PSNR" in html and "http" not in html.replace("http-equiv", "")
+
+
+def test_frames_compares_the_first_ones_and_says_so(tmp_path):
+    rng = torch.Generator().manual_seed(0)
+    mine, true = (folder(tmp_path / name, torch.rand(3, 16, 16, 3, generator=rng)) for name in ("mine", "true"))
+    whole, first = evaluate(mine, true, tmp_path), evaluate(mine, true, tmp_path, frames=2)
+    assert whole["overall"]["frames"] == 3 and first["per_frame"]["PSNR"] == whole["per_frame"]["PSNR"][:2]
+    assert any("only the first 2 frames" in note for note in first["notes"])
+    assert not any("only the first" in note for note in whole["notes"])
+    with pytest.raises(InputError, match="both have only 3 frames; give 3 or fewer"):
+        evaluate(mine, true, tmp_path, frames=4)

@@ -14,7 +14,7 @@ from ngff_cli.app import app
 from stages.core.errors import InputError
 from stages.core.models.chat_completions import InvalidReply
 from stages.core.scene.images import VideoWriter, write_png
-from stages.evaluate.judge import draw_questions, parse_scores
+from stages.evaluate.judge import draw_questions, find_films, parse_scores
 from stages.evaluate.options import EvaluateOptions
 from stages.evaluate.stage import run
 from tests.chat_server import KEY
@@ -182,3 +182,12 @@ def test_the_command(chat_server, films, tmp_path, monkeypatch):
     monkeypatch.delenv("OPENAI_BASE_URL")
     done = CliRunner().invoke(app, words)
     assert done.exit_code == 2 and done.stderr.count("\n") == 1 and "set OPENAI_API_KEY" in done.stderr
+
+
+def test_films_of_a_folder_are_in_the_order_of_their_names(tmp_path, monkeypatch):
+    for name in ("b.mp4", "a.mp4", ".part-c.mp4", "d.txt"):
+        (tmp_path / name).touch()
+    listed = sorted(tmp_path.iterdir())
+    for order in (listed, listed[::-1]):
+        monkeypatch.setattr(type(tmp_path), "iterdir", lambda path, order=order: iter(order))
+        assert [p.name for p in find_films([tmp_path])] == ["a.mp4", "b.mp4"]

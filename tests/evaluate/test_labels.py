@@ -19,6 +19,7 @@ from stages.core.scene.gaussians import Gaussians
 from stages.core.scene.images import read_labels, write_labels, write_png
 from stages.core.scene.scene import Scene, SceneObject
 from stages.core.scene.scene_ply import write_scene
+from stages.evaluate.label_pictures import paint
 from stages.evaluate.labels import LabelOverlap
 from stages.evaluate.options import EvaluateOptions
 from stages.evaluate.stage import run
@@ -130,6 +131,16 @@ def test_objects_that_are_not_core_are_left_out(labelled, capsys):
     assert any("object_7" in note and note.startswith("false objects") for note in facts["notes"])
     assert json.loads((labelled / "metrics.json").read_text())["overall"] == overall
     assert capsys.readouterr().out.splitlines()[1].startswith("duck")
+
+
+def test_objects_are_painted_over_the_photo_in_grey_with_white_borders():
+    ids = torch.tensor([0] * 3 + [1] * 3 + [2] * 3 + [1] * 3).repeat(2, 1)
+    judged = torch.ones(2, 12, dtype=torch.bool)
+    judged[:, 9:] = False  # what is labelled 1 there does not count
+    out = paint(torch.full((2, 12, 3), 0.5), ids, {1: (0.0, 1.0, 0.0)}, judged)
+    expected = torch.tensor([[0.3] * 3, [0.12, 0.72, 0.12], [0.66, 0.18, 0.18], [0.48] * 3])  # 2 has no colour: red
+    torch.testing.assert_close(out[0, [1, 5, 8, 10]], expected)
+    assert (out[:, [3, 6, 9]] == 1).all() and (out == 1).all(-1).sum() == 6
 
 
 def test_report_shows_photo_truth_and_found(labelled):

@@ -60,3 +60,10 @@ def test_another_reference_frame_needs_align(tmp_path, two_balls):
     with pytest.raises(InputError, match="another frame of reference.*--align"):
         evaluate(tmp_path, predicted, two_balls)
     assert evaluate(tmp_path, predicted, two_balls, align=True)["overall"]["chamfer"] < 1e-5
+
+
+def test_scenes_without_objects_have_no_overlap_and_alignment_is_noted(tmp_path, two_balls):
+    blank = replace(two_balls.gaussians, object_id=torch.zeros_like(two_balls.gaussians.object_id))
+    facts = evaluate(tmp_path, replace(two_balls, gaussians=blank, objects=()), two_balls, align=True)
+    assert "IoU" not in facts["overall"] and not facts["objects"]
+    assert any("aligned by" in note for note in facts["notes"])

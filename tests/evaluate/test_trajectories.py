@@ -1,6 +1,7 @@
 """Comparison of trajectories: matching, alignment and resampling."""
 
 import json
+from contextlib import nullcontext
 from dataclasses import replace
 
 import h5py
@@ -9,10 +10,14 @@ import torch
 
 from stages.core.errors import InputError
 from stages.core.geometry.similarity import Similarity
-from stages.evaluate.align import ReferenceFrame, find_alignment
+from stages.core.scene.scene import SceneObject
+from stages.evaluate.align import ReferenceFrame, check_same_reference_frame, find_alignment
+from stages.evaluate.label_pictures import draw_objects
 from stages.evaluate.options import EvaluateOptions
+from stages.evaluate.result import Result
 from stages.evaluate.stage import run
 from stages.evaluate.trajectories import transfer_motion
+from tests.conftest import ring
 from tests.evaluate.motions import renamed, rotation, transformed_scene, write_motion
 
 
@@ -135,3 +140,21 @@ def test_missing_objects_are_named_in_the_error(tmp_path, two_balls):
     assert list(evaluate(tmp_path, objects="red ball")["objects"]) == ["red ball"]
     with pytest.raises(InputError, match="--objects blue: .* has red ball, green ball"):
         evaluate(tmp_path, objects="blue")
+
+
+@pytest.mark.parametrize(("shift", "same"), [(0.0, True), (1.9, True), (2.1, False)])
+def test_objects_far_apart_are_in_another_frame_of_reference(shift, same):
+    """Without cameras: beyond two root mean square radii, here of points at distance 1 from their mean."""
+    points = torch.tensor([[1.0, 0, 0], [-1, 0, 0]]) + torch.tensor([50.0, 0, 0])
+    ball = SceneObject(1, "ball")
+    truth = ReferenceFrame("true.h5", None, (ball,), {1: points})
+    moved = replace(truth, file="mine.h5", points={1: points + torch.tensor([0, shift, 0])})
+    with nullcontext() if same else pytest.raises(InputError, match="matching objects are 2.1 units apart"):
+        check_same_reference_frame(moved, truth, [(ball, ball)])
+
+
+def test_report_draws_the_first_the_middle_and_the_last_view(two_balls):
+    scene = replace(two_balls, cameras=ring(count=5, size=16))
+    drawn = draw_objects(Result("trajectories", {}, {}, []), scene, EvaluateOptions())
+    assert [p.caption for p in drawn.pictures] == [scene.cameras.names[i] for i in (0, 2, 4)]
+    assert drawn.legend.keys() == {"red ball", "green ball"}

@@ -9,6 +9,7 @@ import torch
 
 from stages.core.errors import InputError
 from stages.core.geometry.cameras import project
+from stages.segment import boxes
 from stages.segment.boxes import MAX_VIEWS, clean_mask, nearest_first, segment, segment_prompted_view
 from stages.segment.options import SegmentOptions
 from stages.segment.prompts import read_prompts
@@ -75,6 +76,16 @@ def test_box_of_the_whole_image_labels_all_of_it():
     assert (segment_prompted_view(picture, torch.tensor([[0.0, 0.0, 1.0, 1.0]]), 0) == 1).all()
 
 
+@pytest.mark.parametrize("order", [[0, 1], [1, 0]])
+def test_where_boxes_overlap_the_smaller_is_on_top(order, monkeypatch):
+    """Each object fills its box."""
+    monkeypatch.setattr(boxes, "grabcut", lambda image, unlikely, likely, sure, seed: unlikely | likely)
+    picture = np.random.default_rng(0).integers(0, 255, (40, 40, 3), dtype=np.uint8)
+    wide, tall = [0.0, 0.0, 1.0, 0.5], [0.6, 0.0, 1.0, 1.0]  # areas of .5 and .4
+    labels = segment_prompted_view(picture, torch.tensor([[wide, tall][i] for i in order]), 0)
+    assert (labels[:, 24:] == order.index(1) + 1).all() and (labels[:20, :24] == order.index(0) + 1).all()
+
+
 def test_small_pieces_and_small_holes_are_removed():
     mask = np.zeros((40, 40), dtype=bool)
     mask[5:35, 5:35] = True
@@ -86,7 +97,8 @@ def test_small_pieces_and_small_holes_are_removed():
 @pytest.mark.parametrize(
     ("text", "message"),
     [('{"bbox": [[200, 10, 300, 50]], "text": ["duck"]}', "of duck lies outside of the first view, which has 160x160"),
-     ('{"center_point": [[5, 5]], "text": ["duck"]}', "points are for --backend sam2")],
+     ('{"center_point": [[5, 5]], "text": ["duck"]}', "points are for --backend sam2"),
+     ('{"bbox": [[20, 10, 20, 50]], "text": ["duck"]}', "a box has no area")],
 )  # fmt: skip
 def test_invalid_boxes_are_refused(tmp_path, text, message):
     (tmp_path / "p.json").write_text(text)

@@ -17,7 +17,8 @@ from stages.core.scene.scene_ply import read_scene, write_scene
 from stages.segment.masks import read_names
 from stages.segment.options import SegmentOptions
 from stages.segment.stage import log_objects, run
-from stages.segment.voting import damp_votes, majority_labels, pool_votes, remove_outliers
+from stages.segment.view_images import MAX_RENDER_SIDE, render_view
+from stages.segment.voting import ViewFootprint, damp_votes, majority_labels, pool_votes, remove_outliers
 from tests.conftest import random_gaussians
 from tests.segment.tabletop import best_overlap
 
@@ -253,3 +254,20 @@ def test_empty_table_has_no_objects(truth, tmp_path, caplog):
     run(tmp_path / "bare.ply", tmp_path / "out.ply")
     assert read_scene(tmp_path / "out.ply").objects == ()
     assert "no objects were found" in caplog.text
+
+
+def test_votes_of_pixels_and_of_centres_on_the_surface():
+    """Gaussian 0 is in front in one pixel; 1 and 2 lie on the surface, with weights of 2 and 0."""
+    front = torch.tensor([[0, -1], [-1, -1]])
+    on, pixels, weights = torch.tensor([1, 2]), torch.tensor([3, 3]), torch.tensor([2.0, 0.0])
+    footprint = ViewFootprint(front, on, pixels, weights, 4, torch.zeros(2, 2, 3))
+    votes = footprint.votes(torch.tensor([[1, 0], [0, 2]]).repeat_interleave(3, 0).repeat_interleave(3, 1))
+    expected = torch.tensor([[0, 1, 0], [0, 0, 2.001], [0, 0, 0.001], [0, 0, 0]])
+    torch.testing.assert_close(votes, expected)
+
+
+def test_large_views_are_rendered_smaller(two_balls):
+    side = 2 * MAX_RENDER_SIDE
+    cameras = two_balls.cameras[[0]]
+    wide = replace(two_balls, cameras=replace(cameras, sizes=torch.tensor([[side, 16]])))
+    assert render_view(wide, 0).shape == (8, MAX_RENDER_SIDE, 3)

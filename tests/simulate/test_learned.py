@@ -3,6 +3,7 @@
 import json
 import logging
 import math
+import re
 from dataclasses import replace
 
 import pytest
@@ -51,7 +52,7 @@ def test_free_fall_at_any_scale(two_balls, tmp_path, untrained, unit):
     t = roll(scene, tmp_path, untrained, lift=("2=2",))
     assert torch.equal(t.positions[0, t.keypoints.object_id == 1], t.keypoints.rest[t.keypoints.object_id == 1])
     assert com_shift(t, 1).tolist() == pytest.approx([0, 0, -9.81 / unit * 0.1**2 / 2], rel=1e-3, abs=1e-4)
-    assert t.info.engine == "ngff"
+    assert t.info.engine == "ngff" and t.info.gravity == (0, 0, pytest.approx(-9.81 / unit))
 
 
 def test_velocity_and_force_in_flight(two_balls, tmp_path, untrained, caplog):
@@ -63,6 +64,28 @@ def test_velocity_and_force_in_flight(two_balls, tmp_path, untrained, caplog):
     assert float(com_shift(t, 1)[2]) > 1e-4
     assert float(com_shift(double, 1)[2]) == pytest.approx(2 * float(com_shift(t, 1)[2]), rel=0.02)
     assert "untrained" in caplog.text and " kg if one unit is 1 m" in caplog.text
+
+
+@pytest.mark.parametrize("unit", [1.0, 0.1])
+def test_newtons_kilograms_and_velocities_at_any_scale(tmp_path, untrained, caplog, unit):
+    """F t^2 / 2 m of a ball of 540 kg/m^3, and a velocity in scene units per second, without gravity."""
+    caplog.set_level(logging.INFO)
+    parts = [ball((x, 0, 1.0), 0.15, 1500, (1, 0, 0), i, seed=i) for i, x in ((1, -1.0), (2, 1.0))]
+    objects = (SceneObject(1, "thing", "common"), SceneObject(2, "thing", "common"))
+    scene = Scene(concatenate(parts), objects, None, 0.0, {"metres_per_unit": unit, "source": "test"})
+    newton = 20 * unit**4  # by which both move alike
+    t = roll(scene, tmp_path, untrained, gravity=0.0, velocity=("object=1 1,2,0",),
+             force=(f"object=2 force=0,0,{newton}",))  # fmt: skip
+    assert com_shift(t, 0).tolist() == pytest.approx([0.1, 0.2, 0], abs=1e-3)
+    volume = 4 / 3 * math.pi * (0.15 * unit) ** 3
+    assert t.field.volume.tolist() == pytest.approx([volume] * 2, rel=0.08)  # of 1,500 points
+    mass = 540 * float(t.field.volume[1])
+    assert float(t.field.mass[1]) == pytest.approx(mass * t.field.units.mass, rel=1e-5)
+    assert com_shift(t, 1).tolist() == pytest.approx([0, 0, newton * 0.1**2 / (2 * mass) / unit], rel=0.02, abs=1e-5)
+    logged = float(re.search(r"object 2 \(thing\): common, ([\d.e-]+) (kg|g)", caplog.text)[1])
+    logged /= 1000 if re.search(r"object 2 \(thing\): common, [\d.e-]+ g", caplog.text) else 1
+    assert logged == pytest.approx(mass, rel=0.06)
+    assert t.field.awake.tolist() == [1, 1]  # nothing holds them down
 
 
 def test_pinned_objects_stay_and_frame_rate_does_not_matter(two_balls, tmp_path, untrained):
@@ -109,7 +132,9 @@ def test_scenes_are_brought_to_the_size_mass_and_gravity_of_training(size):
     assert units.length == pytest.approx(TYPICAL_SIZE / (2 * size)) and units.mass == pytest.approx(TYPICAL_MASS / 4)
     assert units.time == pytest.approx((2 * units.length) ** 0.5)  # lengths over gravity
     assert units.force * 10 * 4 == pytest.approx(TYPICAL_MASS * 5 * units.mass * 4 / TYPICAL_MASS)  # weight to weight
-    assert float(units.to_model(torch.tensor([0.0, 0, 2.0]))[2]) == pytest.approx(FLOOR)
+    middle = 1.25 * size  # the mean of all four corners
+    here = units.to_model(torch.tensor([middle, middle + 1, 3.0]))
+    torch.testing.assert_close(here, torch.tensor([0.0, units.length, units.length + FLOOR]), atol=1e-4, rtol=1e-4)
 
 
 def resized(scene, factor):

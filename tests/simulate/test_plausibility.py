@@ -71,11 +71,16 @@ def test_overlap_at_rest_is_not_counted(scene):
     assert found["objects"]["2"]["penetration"] == pytest.approx(0.1, abs=0.03)
 
 
-def test_creep_spread_and_energy(scene):
+def test_creep_spread_and_energy(scene, caplog):
     found, _ = measured(scene, lambda t: (0.02 * t, 0.0, 0.0))
     assert found["objects"]["2"]["creep"] == pytest.approx(0.1, rel=0.02) and found["objects"]["1"]["creep"] == 0
     found, _ = measured(scene, lambda t: (0.0, 0.0, 0.0), lambda t: 1 + 0.5 * t)
     assert found["objects"]["2"]["spread"] == pytest.approx(0.39, abs=0.01)
+    for speed, creeps in ((0.13, True), (0.15, False)):  # beside .1 sqrt(g size) = .14
+        found, _ = measured(scene, lambda t, speed=speed: (speed * t, 0.0, 0.0))
+        assert found["objects"]["2"]["creep"] == pytest.approx(speed / 0.2 if creeps else 0.0, rel=0.02)
     fall = 0.2
-    found, _ = measured(scene, lambda t: (0.3, 0.0, -G * t * t / 2 if t < fall else -0.196 + 3.0 * (t - fall)))
+    found, monitor = measured(scene, lambda t: (0.3, 0.0, -G * t * t / 2 if t < fall else -0.196 + 3.0 * (t - fall)))
     assert found["energy_gain"] > 1.0
+    monitor.warn(found)
+    assert "the objects gain" in caplog.text and "--engine rigid or mpm" in caplog.text

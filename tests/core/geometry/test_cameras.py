@@ -34,3 +34,9 @@ def test_orbit_equals_the_public_code(shared):
     viewmats = orbit(100, torch.tensor([0.0, 0, -0.3]), 4.0, 20.0)
     np.testing.assert_allclose(centres(viewmats).numpy(), data["dynamic/position"], atol=1e-4)
     np.testing.assert_allclose(viewmats[:, :3, :3].mT.numpy(), data["dynamic/rotation_c2w"], atol=1e-4)
+
+
+def test_depth_is_the_distance_along_the_viewing_axis_and_negative_behind():
+    viewmat = look_at(torch.tensor([3.0, 0, 1]), torch.tensor([0.0, 0, 1]))
+    points = torch.tensor([[1.0, 5, 2], [4.0, -2, 0]])
+    torch.testing.assert_close(depths(points, viewmat), torch.tensor([2.0, -1.0]))

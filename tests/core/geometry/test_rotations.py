@@ -50,3 +50,8 @@ def test_nearest_rotation_removes_a_stretch():
     R = matrix(random_quats(10))
     stretch = torch.diag(torch.tensor([1.5, 1.0, 0.5], dtype=torch.float64))
     torch.testing.assert_close(nearest_rotation(R @ stretch), R)
+
+
+def test_quaternions_of_any_number_of_batch_dimensions():
+    R = matrix(random_quats(24))
+    torch.testing.assert_close(quaternion(R.reshape(2, 3, 4, 3, 3)), quaternion(R).reshape(2, 3, 4, 4))

@@ -2,11 +2,12 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 
 from stages.core.errors import InputError
-from stages.core.physics.colliders import Collider
+from stages.core.physics.colliders import Collider, as_obstacles
 from stages.core.physics.mpm import solver as mpm
 from tests.conftest import DEVICES
 from tests.core.physics.test_mpm import FREE, block, roll
@@ -143,3 +144,10 @@ def test_prescribed_motion_of_colliders():
 def test_invalid_colliders(wrong, message):
     with pytest.raises(InputError, match=message):
         Collider(**{"kind": "plane", "centre": PLANE, **wrong})
+
+
+def test_rotations_of_colliders_need_not_have_length_1():
+    longer, unit = (as_obstacles([Collider("box", PLANE, rotation=r)], "cpu").numpy()
+                    for r in ((0.0, 3.0, 0.0, 4.0), (0.0, 0.6, 0.0, 0.8)))  # fmt: skip
+    np.testing.assert_allclose(longer["turn"], unit["turn"])
+    np.testing.assert_allclose(unit["turn"][0], [0.6, 0.0, 0.8, 0.0])  # x y z w

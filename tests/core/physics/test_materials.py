@@ -55,6 +55,8 @@ def test_invalid_prompts(prompt, message):
     ('{"duck": {"E": 1e5}}', "E, density"), ('{"duck": {"E": -1, "density": 1}}', "positive"),
     ('{"duck": {"E": 1e5, "density": 100, "nu": 0.5}}', "nu"), ('{"duck": {"E": "x", "density": 1}}', "numbers"),
     ('{"duck": {"E": 1e5, "density": 1, "colour": 1}}', "friction"),
+    ('{"duck": {"E": 1e5, "density": 1, "friction": -1}}', "friction must be"),
+    ('{"duck": {"E": 1e5, "density": 1, "loss": 2.1}}', "loss between"),
 ])  # fmt: skip
 def test_invalid_files(tmp_path, text, message):
     file = tmp_path / "m.json"

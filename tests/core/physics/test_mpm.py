@@ -6,6 +6,7 @@ import pytest
 import torch
 import warp as wp
 
+from stages.core.kernels.mpm import grid as mpm_grid
 from stages.core.physics.mpm import solver as mpm
 from tests.conftest import DEVICES
 
@@ -244,6 +245,21 @@ def test_substeps_follow_the_cfl_condition():
     solver.set(v=torch.full((len(p), 3), 10.0))
     speed = 10 * math.sqrt(3)
     assert solver.substeps(0.02, torch.zeros(1, 3)) == math.ceil(0.02 * (wave + speed) / (mpm.SAFETY * dx))
+
+
+def test_substeps_of_a_viscous_solid_are_those_of_diffusion():
+    assert mpm.substep_rate(0.02, 0.0, 3.0) == pytest.approx(mpm.substep_rate(0.01, 0.0, 3.0) / 4)
+    assert mpm.substep_rate(0.01, 0.0, 3.0) == pytest.approx(3.0 / (mpm.VISCOUS * 1e-4))
+    assert mpm.substep_rate(0.01, 50.0, 1e-9) == pytest.approx(50.0 / (mpm.SAFETY * 0.01))
+
+
+def test_a_grid_has_whole_blocks_around_the_box():
+    grid = mpm.make_grid(mpm.Box((0, 0, 0), (1, 2, 0.5)), 0.1)
+    margin = 1 + 2 * mpm_grid.GRID_PADDING
+    for nodes, cells in zip((grid.nodes[a] for a in range(3)), (10, 20, 5), strict=True):
+        inside = math.ceil(cells + 2 * mpm.FLOOR_GAP - 1e-6)
+        assert nodes % mpm_grid.BLOCK == 0 and 0 <= nodes - inside - margin < mpm_grid.BLOCK
+    assert [grid.origin[a] for a in range(3)] == pytest.approx([-(mpm_grid.GRID_PADDING + mpm.FLOOR_GAP) * 0.1] * 3)
 
 
 def test_divergence_names_the_particle():

@@ -77,6 +77,7 @@ def test_number_of_scenes_that_fit_on_a_cpu():
     count = mpm.make_grid(BOX, DX).count
     fits = Batch.fits(BOX, DX, 1000, "cpu")
     assert fits > 1 and fits * count < 2**31
+    assert Batch.fits(BOX, DX, 1000, "cpu", exact=True) == fits // 2  # sums of 64 bits
     with pytest.raises(ValueError, match="too many"):
         one = block((0.05, 0.05, 0.05), 0.05)
         mpm.Solver(mpm.join_particles([one] * 40), mpm.Box((-4, -4, 0), (4, 4, 4)), 0.02, sizes=[len(one)] * 40)

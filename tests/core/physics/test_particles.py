@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from stages.core.errors import InputError
-from stages.core.physics.particles import MIN_PARTICLES, inliers, sample_bodies
+from stages.core.physics.particles import MIN_PARTICLES, inliers, sample_bodies, surface_points
 from stages.core.scene.gaussians import Gaussians, concatenate
 from stages.core.scene.scene import Scene, SceneObject
 from stages.lab.assets.objects import OBJECTS
@@ -193,3 +193,14 @@ def test_toppling_objects_of_photos_are_extended_to_the_floor(photographed, exte
     assert bool(under.any()) == extended and ("would tip over" in caplog.text) == extended
     upright = sample_bodies(replace(scene(splats(p), floor=0.0), cameras=ring() if photographed else None), 8000)
     assert float(upright.volume.sum()) == pytest.approx(0.06 * 0.2 * 0.3, rel=0.25)
+
+
+def test_a_gaussian_much_larger_than_its_object_is_clamped():
+    """Points are within 0.7 standard deviations, of at most a sixth of the diagonal of the object's centres."""
+    g = splats(sphere(500))
+    g.scales[0] = 100.0
+    size = float((g.means.amax(0) - g.means.amin(0)).norm())
+    points = torch.from_numpy(surface_points(Scene(g, (SceneObject(1, "ball"),), None, 0.0), 1, 0))
+    reach = float((points - g.means[0]).norm(dim=1).amax())
+    assert float(points.norm(dim=1).max()) < 0.1 + 0.7 * size / 6 and reach > 0.1
+    assert float(points.norm(dim=1).max()) > 0.1 + 0.7 * size / 14

@@ -138,3 +138,9 @@ def test_object_rotations():
 def test_a_single_point_has_the_identity_rotation():
     body = torch.zeros(1, dtype=torch.int64)
     torch.testing.assert_close(fit_rotations(torch.ones(1, 3), torch.zeros(1, 3), body), torch.eye(3)[None])
+
+
+def test_a_body_without_points_has_the_identity_rotation():
+    points = torch.tensor([[1.0, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]])
+    fitted = fit_rotations(points, points @ TURN.mT, torch.full((4,), 2))
+    torch.testing.assert_close(fitted, torch.stack([torch.eye(3), torch.eye(3), TURN]), rtol=0, atol=1e-4)

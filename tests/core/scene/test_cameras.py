@@ -1,5 +1,6 @@
 import dataclasses
 import json
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -8,7 +9,15 @@ import torch
 from stages.core.errors import InputError
 from stages.core.geometry.cameras import centres, resize
 from stages.core.geometry.similarity import Similarity
-from stages.core.scene.cameras import Cameras, PhotoIntrinsics, from_json, read_cameras, to_json
+from stages.core.scene.cameras import (
+    MAX_SIDE,
+    Cameras,
+    PhotoIntrinsics,
+    check_cameras,
+    from_json,
+    read_cameras,
+    to_json,
+)
 from tests.conftest import ring
 
 POSE = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 3], [0, 0, 0, 1]]  # 3 from the origin, looking at it
@@ -94,6 +103,13 @@ def test_wrong_photo_fields_are_refused(field, value, message):
         from_json(rows)
 
 
+@pytest.mark.parametrize(("side", "right"), [(0, False), (1, True), (MAX_SIDE, True), (MAX_SIDE + 1, False)])
+def test_sizes_of_cameras_are_bounded(side, right):
+    cameras = dataclasses.replace(ring(count=2), sizes=torch.tensor([[9, 9], [9, side]]))
+    with nullcontext() if right else pytest.raises(ValueError, match=f"{cameras.names[1]}.*has a size that is not 1"):
+        check_cameras(cameras)
+
+
 @pytest.mark.parametrize(("field", "value"), [("viewmat", [[1.0]]), ("K", [[float("inf")] * 3] * 3), ("size", [0, 1])])
 def test_wrong_camera_fields_are_refused(field, value):
     rows = to_json(ring(count=1))
@@ -133,6 +149,15 @@ def test_colmap_poses_are_those_that_colmap_reads(tmp_path, text):
     (path / f"points3D.{'txt' if text else 'bin'}").write_bytes(b"\xff" * 20)  # damaged points do not matter
     poses = np.array([image.cam_from_world().matrix() for image in images])
     torch.testing.assert_close(read_cameras(path)[0].viewmats[:, :3], torch.from_numpy(poses).float())
+
+
+@pytest.mark.parametrize("quaternion", [[0, 0, 0, 0], [float("nan"), 0, 0, 1], [1e300, 0, 0, 1]])
+def test_colmap_poses_without_a_rotation_are_refused(tmp_path, quaternion):
+    path = write_colmap(tmp_path, "PINHOLE", [50, 51, 32, 24], text=True)
+    pose = " ".join(map(str, quaternion))
+    (path / "images.txt").write_text(f"1 {pose} 0 0 1 1 a.png\n\n")
+    with pytest.raises(InputError, match="quaternion"):
+        read_cameras(path)
 
 
 @pytest.mark.parametrize(

@@ -103,7 +103,24 @@ def test_points_agree_with_opencv(lens):
 def test_points_beyond_what_the_lens_shows_are_nan():
     # r (1 - r^2 / 4) is 0.77 at most: no direction is seen at 1.2 focal lengths from the centre.
     lens = Undistortion.of(camera(LENSES["barrel"]), 0, SIZE)
-    assert lens.points(torch.tensor([[165 + 1.2 * 260, 118.0]])).isnan().all()
+    beyond = torch.tensor([[165 + 1.2 * 260, 118.0], [165 - 1.2 * 260, 118.0], [165, 118 + 1.2 * 255]])
+    assert lens.points(beyond).isnan().all()
+
+
+def test_a_box_beyond_what_the_lens_shows_is_that_of_the_rest():
+    cameras = camera([-1.0, 0, 0, 0, 0])  # r (1 - r^2) is 0.385 at most
+    lens = Undistortion.of(cameras, 0, SIZE)
+    box = lens.boxes(torch.tensor([[165.0, 118.0, 320.0, 119.0]]))[0]
+    torch.testing.assert_close(box[:2], torch.tensor([80.0, 60.0]), rtol=0, atol=1e-3)  # the principal point
+    assert 100 < box[2] < 80 + 0.58 * 125 and box.isfinite().all()  # r is below 1 / sqrt 3
+
+
+def test_the_map_of_a_photo_without_distortion_is_that_of_its_pinhole():
+    lens = Undistortion.of(camera([0.0] * 5), 0, SIZE)
+    x, y = lens._map(lens.view_K, lens.view_size)
+    u, v = (grid(160, 120) - (80, 60)).transpose(2, 0, 1)
+    np.testing.assert_allclose(x, 260 * u / 125 + 165 - 0.5, atol=1e-3)
+    np.testing.assert_allclose(y, 255 * v / 125 + 118 - 0.5, atol=1e-3)
 
 
 def test_box_contains_the_edges_that_the_lens_bends():

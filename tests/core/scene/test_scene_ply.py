@@ -116,14 +116,37 @@ def test_packed_values_are_fractions_between_the_bounds_of_their_chunk(tmp_path)
     vertex["packed_rotation"][300] = 3 << 30 | 511 << 20 | 511 << 10 | 511
     vertex["packed_position"][300], vertex["packed_scale"][300], vertex["packed_color"][300] = [2**32 - 1] * 3
     vertex["packed_position"][1] = 1024 << 21 | 512 << 11 | 256
+    vertex["packed_rotation"][2] = 2 << 30 | 700 << 20 | 300 << 10 | 600  # w x z, of which y is the rest
     PlyData([PlyElement.describe(chunk, "chunk"), PlyElement.describe(vertex, "vertex")]).write(tmp_path / "p.ply")
     g = read_scene(tmp_path / "p.ply").gaussians
     torch.testing.assert_close(g.means[[0, 300]], torch.tensor([[-1.0] * 3, [7.0] * 3]))
     torch.testing.assert_close(g.means[1], -1 + 4 * torch.tensor([1024 / 2047, 512 / 1023, 256 / 2047]))
     torch.testing.assert_close(g.scales[[0, 300]].log(), torch.tensor([[-10.0] * 3, [-2.0] * 3]))
     torch.testing.assert_close(g.quats[[0, 300]], torch.eye(4)[[0, 3]], atol=2e-3, rtol=0)
+    w, x, z = ((bits / 1023 - 0.5) * 2**0.5 for bits in (700, 300, 600))
+    torch.testing.assert_close(g.quats[2], torch.tensor([w, x, (1 - w * w - x * x - z * z) ** 0.5, z]))
     torch.testing.assert_close(g.opacities[[0, 300]], torch.tensor([1 / 512, 1 - 1 / 512]))
     torch.testing.assert_close(g.sh[[0, 300], 0] * 0.28209479177387814 + 0.5, torch.tensor([[0.0] * 3, [1.0] * 3]))
+
+
+def test_packed_colours_between_bounds_and_harmonics_in_bytes(tmp_path):
+    """Colours 0.2 + 0.6 f between the chunk's bounds; coefficients from -4 in steps of 8 / 256."""
+    bounds = [(f"{end}_{part}{axis}", "<f4") for part in ("", "scale_") for end in ("min", "max") for axis in "xyz"]
+    chunk = np.zeros(1, bounds + [(f"{end}_{c}", "<f4") for end in ("min", "max") for c in "rgb"])
+    for c in "rgb":
+        chunk[f"min_{c}"], chunk[f"max_{c}"] = 0.2, 0.8
+    vertex = np.zeros(1, [(f"packed_{name}", "<u4") for name in ("position", "rotation", "scale", "color")])
+    vertex["packed_color"] = 0 << 24 | 51 << 16 | 255 << 8 | 102
+    sh = np.zeros(1, [(f"f_rest_{i}", "u1") for i in range(9)])
+    for i in range(9):
+        sh[f"f_rest_{i}"] = 28 * i
+    elements = [PlyElement.describe(*row) for row in ((chunk, "chunk"), (vertex, "vertex"), (sh, "sh"))]
+    PlyData(elements).write(tmp_path / "p.ply")
+    g = read_scene(tmp_path / "p.ply").gaussians
+    torch.testing.assert_close(g.sh[0, 0] * 0.28209479177387814 + 0.5, torch.tensor([0.2, 0.32, 0.8]))
+    torch.testing.assert_close(g.opacities, torch.tensor([0.4]))
+    coefficients = (28 * torch.arange(9) / 256 - 0.5) * 8  # the three of red, of green, of blue
+    torch.testing.assert_close(g.sh[0, 1:], coefficients.reshape(3, 3).T)
 
 
 def write_invalid_files(folder):

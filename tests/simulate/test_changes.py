@@ -1,0 +1,128 @@
+"""Conditions that change during a simulation, uneven bodies and options, with every engine."""
+
+import json
+from dataclasses import replace
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from stages.core.backends import choose
+from stages.core.errors import InputError
+from stages.core.physics.forces import Change, Force, ForcePrompts
+from stages.core.physics.keypoints import choose_keypoints
+from stages.core.scene.gaussians import concatenate
+from stages.core.scene.scene import Scene, SceneObject
+from stages.lab.assets.shapes import box, to_gaussians
+from stages.simulate.mpm import _PromptedForce, _warn_stuck
+from stages.simulate.options import ENGINES, QUALITIES, MpmQuality, SimulateOptions
+from stages.simulate.setup import set_up_scene
+from tests.conftest import ball
+
+pytestmark = pytest.mark.usefixtures("device")
+DT = 0.02
+
+
+@pytest.fixture(autouse=True)
+def small_draft(monkeypatch):
+    monkeypatch.setitem(QUALITIES, "draft", MpmQuality(particles=800, substep=8e-4))
+
+
+def frames(scene: Scene, prompts: ForcePrompts, **chosen) -> list:
+    options = SimulateOptions(keypoints=16, quality="draft", dt=DT, **chosen)
+    rollout = choose({name: engine.rollout for name, engine in ENGINES.items()}, options.engine)
+    return list(rollout(scene, choose_keypoints(scene, 16), prompts, options))
+
+
+@pytest.fixture(scope="module")
+def apart() -> Scene:
+    """Two balls of radius .15 in the air."""
+    parts = [ball((x, 0, 1.0), 0.15, 600, (1, 0, 0), i, seed=i) for i, x in ((1, -1.0), (2, 1.0))]
+    return Scene(concatenate(parts), (SceneObject(1, "a", "common"), SceneObject(2, "b", "common")), None, 0.0)
+
+
+@pytest.mark.parametrize("engine", ["rigid", "mpm", "ngff"])
+def test_a_denser_material_slows_a_push_and_a_pin_stops_a_body(apart, engine):
+    """A force on 1, which becomes rubber at .1 s; 2 is pinned from .1 s to .2 s. Without gravity until .2 s."""
+    changes = (Change("material", "rubber", 0.1, 1), Change("pinned", True, 0.1, 2),
+               Change("pinned", False, 0.2, 2), Change("gravity", 2.0, 0.2))  # fmt: skip
+    prompts = ForcePrompts((Force(1, (0.0, 20.0, 0.0)),), velocity={2: (1.0, 0.0, 0.0)}, changes=changes)
+    states = frames(apart, prompts, engine=engine, gravity=0.0, steps=15)
+    com = torch.stack([s.com for s in states]).double()
+    speed = com.diff(dim=0) / DT
+    light, heavy = float(states[0].mass[0]), float(states[-1].mass[0])
+    assert heavy / light == pytest.approx(930 / 540, rel=1e-3)
+    gained = [float(speed[b, 0, 1] - speed[a, 0, 1]) / ((b - a) * DT) for a, b in ((0, 4), (5, 9))]
+    assert gained == pytest.approx([20 / light, 20 / heavy], rel=0.03)
+    assert speed[1:5, 1, 0].tolist() == pytest.approx([1.0] * 4, abs=0.02)
+    assert float(speed[5:, 1, :2].abs().max()) < 0.01  # a released body starts from rest
+    fall = (speed[13, :, 2] - speed[10, :, 2]) / (3 * DT)
+    assert fall.tolist() == pytest.approx([-2.0, -2.0], rel=0.03)
+
+
+@pytest.mark.parametrize("engine", ["rigid", "mpm"])
+def test_the_centre_of_mass_of_an_uneven_bar(tmp_path, monkeypatch, engine):
+    """The half at x < 0 of a bar of length .4 is four times as dense: the centre is at -3/20 of the length."""
+    monkeypatch.setitem(QUALITIES, "draft", MpmQuality(particles=6000, substep=8e-4))
+    bar = box((0.4, 0.1, 0.1), 0.0125).moved((0, 0, 1.0))
+    bar = to_gaussians(bar, torch.full((len(bar.points), 3), 0.5), 1)
+    scene = Scene(bar, (SceneObject(1, "bar"),), None, 0.0)
+    material = {"E": 1e7, "density": 400}
+    parts = [{"box": [-1, -1, 0, 0, 1, 2], "material": {**material, "density": 1600}}, {"material": material}]
+    (tmp_path / "m.json").write_text(json.dumps({"bar": {"parts": parts}}))
+    state = frames(scene, ForcePrompts(), engine=engine, gravity=0.0, steps=1, materials=tmp_path / "m.json")[0]
+    assert state.com[0].tolist() == pytest.approx([-0.06, 0, 1.0], abs=0.006)
+
+
+def test_a_fine_setup_has_half_the_spacing_and_the_same_mass(apart):
+    coarse, fine = (set_up_scene(apart, ForcePrompts(), SimulateOptions(quality="draft"), fine=f).bodies
+                    for f in (False, True))  # fmt: skip
+    assert fine.spacing == coarse.spacing / 2 and len(fine.x) > 4 * len(coarse.x)
+    torch.testing.assert_close(fine.volume.sum(), coarse.volume.sum())
+
+
+def small_setup(x: torch.Tensor, body: list[int]) -> SimpleNamespace:
+    return SimpleNamespace(start=x, bodies=SimpleNamespace(x=x, body=torch.tensor(body), spacing=0.1))
+
+
+def test_forces_on_particles_sum_to_the_force_and_the_torque_that_are_asked_for():
+    rng = torch.Generator().manual_seed(0)
+    x, mass = torch.rand(40, 3, generator=rng) + 3, torch.rand(40, generator=rng) + 0.5
+    setup = small_setup(x, [0] * 30 + [1] * 10)
+    particles = SimpleNamespace(mass=mass, held=torch.zeros(40))
+    push, turn = torch.tensor([1.0, -2.0, 3.0]), torch.tensor([0.5, 0.2, -0.3])
+    force = Force(1, tuple(push.tolist()), tuple(turn.tolist()), start=0.0, end=0.3)
+    a = _PromptedForce(force, particles, setup, 0).acceleration(x, 0.2, 0.4)  # acts half the time
+    total = (mass[:, None] * a)[:30]
+    torch.testing.assert_close(total.sum(0), push / 2)
+    centre = (mass[:30, None] * x[:30]).sum(0) / mass[:30].sum()
+    torch.testing.assert_close(torch.linalg.cross(x[:30] - centre, total).sum(0), turn / 2, atol=1e-4, rtol=1e-4)
+    assert not a[30:].any()
+
+
+def test_a_force_at_a_point_acts_on_the_particles_near_it():
+    """Gaussian weights of width 4 spacings about the nearest particle, none beyond twice that."""
+    x = torch.tensor([[0.2, 0, 0], [0.6, 0, 0], [0.95, 0, 0], [1.05, 0, 0]])
+    particles = SimpleNamespace(mass=torch.ones(4), held=torch.zeros(4))
+    a = _PromptedForce(Force(1, (1.0, 0.0, 0.0), at=(0.0, 0.0, 0.0)), particles, small_setup(x, [0] * 4), 0)
+    weight = torch.exp(-((torch.tensor([0.0, 0.4, 0.75]) / 0.4) ** 2) / 2)
+    torch.testing.assert_close(a.acceleration(x, 0.0, 1.0)[:, 0], torch.cat([weight / weight.sum(), torch.zeros(1)]))
+
+
+def test_a_push_of_touching_bodies_is_warned_of_where_they_stick(caplog):
+    line = torch.arange(8)[:, None] * torch.tensor([0.1, 0.0, 0.0])
+    scene = SimpleNamespace(objects=[SceneObject(i, f"thing {i}") for i in (1, 2, 3)])
+    setup = small_setup(torch.cat([line[:4], line[4:], line[:2] + 9]), [0] * 4 + [1] * 4 + [2] * 2)
+    _warn_stuck(scene, setup, ForcePrompts((Force(3, (1.0, 0.0, 0.0)),)))
+    assert not caplog.text  # it touches nothing
+    _warn_stuck(scene, setup, ForcePrompts((Force(2, (1.0, 0.0, 0.0)),)))
+    assert "object 2 (thing 2) touches 1:" in caplog.text and len(caplog.records) == 1
+    _warn_stuck(scene, small_setup(line, [0] * 8), ForcePrompts((Force(1, (1.0, 0.0, 0.0)),)))
+    assert len(caplog.records) == 1  # alone
+
+
+@pytest.mark.parametrize("options", [{"port": 8000}, {"browser": False}])
+def test_options_of_the_page_need_live(options):
+    assert replace(SimulateOptions(live=True), **options).live
+    with pytest.raises(InputError, match="only with --live"):
+        SimulateOptions(**options)

@@ -1,6 +1,7 @@
 """Material tables and the choice of a material for an object."""
 
 import json
+from pathlib import Path
 
 import pytest
 
@@ -8,6 +9,7 @@ from stages.core.errors import InputError
 from stages.core.physics.materials import ALIASES, DEFAULT_MATERIAL, MATERIALS, choose_materials, find_object
 from stages.core.scene.scene import SceneObject
 
+README = Path(__file__).parents[3] / "stages/simulate/README.md"
 OBJECTS = (SceneObject(1, "rubber duck"), SceneObject(2, "object_2"), SceneObject(3, "green mug", "plastic"))
 
 
@@ -16,6 +18,12 @@ def test_every_material_is_plausible_and_has_a_source():
         assert 1e2 < m.E < 1e12 and 10 < m.density < 1e4 and 0 < m.nu < 0.49, name
         assert 0 < m.friction < 1.5 and 0 < m.loss < 1 and len(m.source) > 20, name
     assert ALIASES.keys() <= MATERIALS.keys()
+
+
+def test_the_table_of_the_documentation_is_that_of_the_code():
+    rows = [line.strip("| ").split(" | ") for line in README.read_text().splitlines() if line.count("|") == 7]
+    values = {row[0]: [float(v) for v in row[1:]] for row in rows[2:]}
+    assert values == {n: [m.E, m.density, m.nu, m.friction, m.loss] for n, m in MATERIALS.items()}
 
 
 @pytest.mark.parametrize("name, E, density", [("ball", 8e5, 600), ("phone", 2e7, 2600), ("rope", 5e3, 500)])

@@ -2,6 +2,7 @@
 
 import base64
 import json
+import logging
 import math
 from statistics import stdev
 
@@ -71,12 +72,15 @@ def test_scores_return_to_their_films_from_any_order(chat_server, films, tmp_pat
     assert table[0].split() == ["PhysR", "PhysR_sd", "PhotoR", "PhotoR_sd", "repeats"] and len(table) == 9
 
 
-def test_nothing_but_frames_and_letters_is_sent(chat_server, films, tmp_path):
+def test_nothing_but_frames_and_letters_is_sent(chat_server, films, tmp_path, caplog):
+    caplog.set_level(logging.INFO)
     chat_server.script = by_brightness
     judged([films / "cosmos/a.mp4", films / "ours/a.mp4"], tmp_path, repeats=1)
     (_, body), = chat_server.asked
     texts = [part["text"] for part in body["messages"][0]["content"] if part["type"] == "text"]
     assert texts[1:] == ["Film A, 10 frames:", "Film B, 10 frames:"]
+    assert "sending 20 frames of 2 films, 1 times, to judge" in caplog.text.replace(body["model"], "judge")
+    assert not any("fewer than" in note for note in json.loads((tmp_path / "m.json").read_text())["notes"])
     assert body.keys() == {"model", "messages"} and "cosmos" not in json.dumps(body).lower()
     assert KEY not in (tmp_path / "m.json").read_text() + (tmp_path / "m.replies.json").read_text()
 

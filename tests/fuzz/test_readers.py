@@ -10,11 +10,12 @@ import h5py
 import pytest
 
 from stages.core.errors import InputError
-from stages.core.scene.schema import MAX_JSON_DEPTH, parse_json, quote
+from stages.core.scene.scene_ply import read_scene, write_scene
+from stages.core.scene.schema import MAX_JSON_DEPTH, parse_json, quote, text
 from stages.core.scene.trajectory import read_trajectory
 from stages.lab.fuzz import campaign
 from stages.lab.fuzz.cases import GOOD, Examples, result_of, run_here
-from stages.lab.fuzz.kinds import KINDS, Kind, write_trajectory
+from stages.lab.fuzz.kinds import KINDS, Kind, example_scene, write_trajectory
 
 
 def test_a_thousand_damaged_files(tmp_path):
@@ -100,8 +101,21 @@ def test_links_are_not_followed(tmp_path, target):
 
 def test_json_is_bounded_and_quoted_text_too():
     assert parse_json("[" * (MAX_JSON_DEPTH - 1) + "]" * (MAX_JSON_DEPTH - 1))
-    for text in ("[" * (MAX_JSON_DEPTH + 1) + "]" * (MAX_JSON_DEPTH + 1), "[" * 10**5, "NaN", "1e999", "9" * 20):
+    for data in ("[" * (MAX_JSON_DEPTH + 1) + "]" * (MAX_JSON_DEPTH + 1), "[" * 10**5, "NaN", "1e999", "9" * 20):
         with pytest.raises(ValueError) as caught:
-            parse_json(text)
+            parse_json(data)
         assert len(str(caught.value)) < 120
     assert quote("\x1b[31m\n" + "x" * 100) == "?[31m?" + "x" * 71 + "..."
+    assert text("x" * 200, "a name") == "x" * 200 and text("x" * 201, "a name") == "x" * 197 + "..."
+    with pytest.raises(ValueError, match="too large a number"):
+        parse_json("9" * 20)
+    assert parse_json("9" * 18) == 10**18 - 1
+
+
+@pytest.mark.parametrize("line", ["property", "property list uchar int ids", "element", "element vertex 1_0"])
+def test_headers_of_ply_that_say_nothing_are_refused(tmp_path, line):
+    write_scene(tmp_path / "s.ply", example_scene())
+    data = (tmp_path / "s.ply").read_bytes().replace(b"property float x\n", f"{line}\nproperty float x\n".encode())
+    (tmp_path / "s.ply").write_bytes(data)
+    with pytest.raises(InputError, match="s.ply"):
+        read_scene(tmp_path / "s.ply")

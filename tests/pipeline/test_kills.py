@@ -14,12 +14,13 @@ import time
 from collections import Counter
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from ngff_cli.app import app
 from ngff_cli.lab import app as lab
-from ngff_cli.options import terminate_as_interrupted
+from ngff_cli.options import interrupt, terminate_as_interrupted
 from stages.core.scene.images import video_info
 from stages.core.scene.scene_ply import write_scene
 from stages.lab.dataset.keypoint_motions import write_motions
@@ -31,6 +32,7 @@ from tests.reconstruct.raycast import arc, write_set
 
 MOMENTS = int(os.environ.get("NGFF_KILLS", 16))
 HOWS = ("SIGKILL", "SIGINT", "SIGTERM", "full disk", "no memory")
+HANGING = 120.0  # a process that takes so long hangs [s]
 NO_LIMIT = resource.RLIM_INFINITY
 SIMULATE = "simulate scene.ply --keypoints 16 --steps 20 --lift 0.2"
 COMMANDS = {  # words of ngff or ngff-lab; `--resume` is added to the run after the disturbed one
@@ -62,7 +64,7 @@ def work(command: str, words: list[str], folder: Path, largest: int, more: int) 
     os.environ["TMPDIR"] = str(folder / "tmp")
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     os.dup2(os.open("errors", os.O_WRONLY | os.O_CREAT | os.O_TRUNC), 2)
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # background processes of a shell ignore it
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # processes in the background of a shell ignore it
     terminate_as_interrupted()
     small = {"gaussians": 1000, "iterations": 5}
     QUALITY_PRESETS["draft"] = replace(QUALITY_PRESETS["draft"], **small)
@@ -129,16 +131,16 @@ def disturbed(command: str, how: str, rng: random.Random, known: Undisturbed, fo
     shutil.copytree(known.inputs, folder)
     if how == "full disk":
         process = start(command, folder, largest=int(rng.uniform(0, 1.05 * max(map(len, known.files.values())))))
-        process.join()
     elif how == "no memory":
         process = start(command, folder, more=int(rng.uniform(0, 1.05 * known.mapped)))
-        process.join()
     else:
         process = start(command, folder)
         time.sleep(rng.uniform(0, 1.05 * known.seconds))
         if process.is_alive():
             os.kill(process.pid, getattr(signal, how))
-        process.join()
+    process.join(HANGING)
+    process.kill()  # if it hangs
+    process.join()
     code, wrong, errors = process.exitcode, [], (folder / "errors").read_text(errors="replace")
     left = {name: data for name, data in files_in(folder / "out").items() if not name.split("/")[-1].startswith(".")
             and ".steps-" not in name and not name.endswith((".ckpt", ".partial.h5"))}  # fmt: skip
@@ -194,3 +196,17 @@ def test_nothing_is_left_in_parts(inputs, tmp_path):
                         for how in HOWS)  # fmt: skip
         print(f"{command:15s} {row}", file=sys.stderr)
     assert not failures, "\n".join(failures)
+
+
+def test_an_interrupt_waits_until_an_import_has_ended():
+    """Raised in a callback of the import system it would be ignored, and the lock of imports would stay taken."""
+    before = signal.getsignal(signal.SIGALRM)
+    importing = SimpleNamespace(f_code=SimpleNamespace(co_filename="<frozen importlib._bootstrap>"))
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            interrupt(signal.SIGINT, sys._getframe())
+        interrupt(signal.SIGINT, importing)
+        with pytest.raises(KeyboardInterrupt):
+            time.sleep(10)
+    finally:
+        signal.signal(signal.SIGALRM, before)

@@ -60,6 +60,16 @@ def test_a_denser_material_slows_a_push_and_a_pin_stops_a_body(apart, engine):
     assert fall.tolist() == pytest.approx([-2.0, -2.0], rel=0.03)
 
 
+@pytest.mark.parametrize("engine", ["rigid", "mpm", "ngff"])
+def test_the_first_frame_is_the_lifted_scene(apart, engine):
+    keypoints = choose_keypoints(apart, 16)
+    first, second = frames(apart, ForcePrompts(lift={2: 0.5}), engine=engine, steps=2)
+    up = 0.5 * (keypoints.object_id == 2)[:, None] * torch.tensor([0.0, 0.0, 1.0])
+    torch.testing.assert_close(first.positions, keypoints.rest + up)
+    assert first.com[:, 2].tolist() == pytest.approx([1.0, 1.5], abs=0.02)
+    assert float((second.com - first.com).norm(dim=1).max()) < 0.005  # 2 mm of fall
+
+
 @pytest.mark.parametrize("engine", ["rigid", "mpm"])
 def test_the_centre_of_mass_of_an_uneven_bar(tmp_path, monkeypatch, engine):
     """The half at x < 0 of a bar of length .4 is four times as dense: the centre is at -3/20 of the length."""

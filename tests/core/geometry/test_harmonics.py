@@ -3,7 +3,10 @@ import torch
 from scipy.special import sph_harm_y
 
 from stages.core.geometry.harmonics import basis, evaluate_sh, rgb_to_sh, rotate_sh
-from stages.core.geometry.rotations import matrix
+from stages.core.geometry.rotations import covariance, matrix
+from stages.core.geometry.similarity import Similarity
+from stages.core.scene.gaussians import transformed
+from tests.conftest import random_gaussians
 
 
 def random_dirs(n: int) -> torch.Tensor:
@@ -37,3 +40,15 @@ def test_rotated_coefficients_give_the_same_colour_in_the_rotated_direction(degr
 def test_degree_zero_is_constant_colour():
     rgb = torch.rand(5, 3)
     torch.testing.assert_close(evaluate_sh(rgb_to_sh(rgb), random_dirs(5).float()), rgb)
+
+
+@pytest.mark.parametrize("degree", [0, 2])
+def test_transformed_gaussians_have_their_colours_in_the_rotated_direction(degree):
+    g = random_gaussians(20, degree=degree)
+    similarity = Similarity(2.0, matrix(torch.tensor([0.8, 0.0, 0.6, 0.0])), torch.tensor([1.0, 2.0, 3.0]))
+    moved, dirs = transformed(g, similarity), random_dirs(20).float()
+    torch.testing.assert_close(moved.means, 2 * g.means @ similarity.rotation.T + similarity.translation)
+    rotated = dirs @ similarity.rotation.T
+    torch.testing.assert_close(evaluate_sh(moved.sh, rotated), evaluate_sh(g.sh, dirs), atol=1e-5, rtol=1e-5)
+    R, C = similarity.rotation, covariance(g.quats, g.scales)
+    torch.testing.assert_close(covariance(moved.quats, moved.scales), 4 * R @ C @ R.T, atol=1e-5, rtol=1e-5)

@@ -110,6 +110,14 @@ def test_sizes_of_cameras_are_bounded(side, right):
         check_cameras(cameras)
 
 
+@pytest.mark.parametrize(("value", "message"), [(float("nan"), "viewmat that is not finite"), (0.5, "not a rotation")])
+def test_viewmats_are_finite_and_rigid(value, message):
+    cameras = ring(count=3)
+    cameras.viewmats[1, 0, 0] = value
+    with pytest.raises(ValueError, match=f"{cameras.names[1]}.*{message}"):
+        check_cameras(cameras)
+
+
 @pytest.mark.parametrize(("field", "value"), [("viewmat", [[1.0]]), ("K", [[float("inf")] * 3] * 3), ("size", [0, 1])])
 def test_wrong_camera_fields_are_refused(field, value):
     rows = to_json(ring(count=1))

@@ -14,8 +14,8 @@ from ngff_cli.options import (
     Seed,
     Threads,
     limit_threads,
+    run_command_line,
     set_up_logging,
-    terminate_as_interrupted,
 )
 from stages.core.backends import describe, load
 from stages.evaluate.options import EvaluateOptions
@@ -387,8 +387,7 @@ def evaluate(
 
 def main() -> None:
     """Entry point of the script `ngff`."""
-    terminate_as_interrupted()
-    app()
+    run_command_line(app)
 
 
 if __name__ == "__main__":

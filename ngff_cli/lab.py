@@ -15,8 +15,8 @@ from ngff_cli.options import (
     Threads,
     limit_threads,
     print_results,
+    run_command_line,
     set_up_logging,
-    terminate_as_interrupted,
 )
 from stages.lab.fit.options import MaterialFitOptions
 from stages.lab.questionnaire.options import StudyOptions
@@ -327,8 +327,7 @@ app.add_typer(bench.app, name="bench")
 
 def main() -> None:
     """Entry point of the script `ngff-lab`."""
-    terminate_as_interrupted()
-    app()
+    run_command_line(app)
 
 
 if __name__ == "__main__":

@@ -26,6 +26,7 @@ Threads = Annotated[int | None, typer.Option(
 AsJson = Annotated[bool, typer.Option("--json", help="print the results as JSON instead of a table")]
 SIZE_OPTIONS = ("quality", "resolution", "keypoints", "max_objects", "batch", "views", "side", "size", "particles",
                 "scenes")  # on which the memory of a command depends, the most effective first  # fmt: skip
+INTERRUPTED = "interrupted; no incomplete file is left"
 NO_MEMORY = ("can't allocate memory", "Insufficient memory", "can't start new thread", "bad alloc", "bad_alloc",
              "failed to map segment")  # in messages of PyTorch, OpenCV, Python, C++ and the loader  # fmt: skip
 
@@ -51,11 +52,18 @@ class StderrHandler(logging.Handler):
         print(self.format(record), file=sys.stderr)
 
 
-def terminate_as_interrupted() -> None:
-    """Let SIGTERM end a command as Ctrl-C does, without temporary files."""
+def run_command_line(app: typer.Typer, words: list[str] | None = None) -> None:
+    """Run the command that `words`, by default those of this process, name. Does not return.
+
+    SIGTERM ends it as Ctrl-C does, without temporary files.
+    """
     signal.signal(signal.SIGTERM, interrupt)
     if signal.getsignal(signal.SIGINT) == signal.default_int_handler:  # a shell may have it ignored
         signal.signal(signal.SIGINT, interrupt)
+    try:
+        app(words)
+    except KeyboardInterrupt:  # before the command has begun
+        fail(INTERRUPTED, 130)
 
 
 def interrupt(number: int, frame) -> None:
@@ -121,7 +129,7 @@ class CommandGroup(typer.core.TyperGroup):
         except InputError as error:
             fail(str(error), 2)
         except KeyboardInterrupt:
-            fail("interrupted; no incomplete file is left", 130)
+            fail(INTERRUPTED, 130)
         except Exception as error:
             command = self.commands[ctx.invoked_subcommand]
             if _is_gpu_out_of_memory(error):

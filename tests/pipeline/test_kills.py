@@ -20,7 +20,7 @@ import pytest
 
 from ngff_cli.app import app
 from ngff_cli.lab import app as lab
-from ngff_cli.options import interrupt, terminate_as_interrupted
+from ngff_cli.options import interrupt, run_command_line
 from stages.core.scene.images import video_info
 from stages.core.scene.scene_ply import write_scene
 from stages.lab.dataset.keypoint_motions import write_motions
@@ -63,16 +63,15 @@ def work(command: str, words: list[str], folder: Path, largest: int, more: int) 
     os.chdir(folder)
     os.environ["TMPDIR"] = str(folder / "tmp")
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-    os.dup2(os.open("errors", os.O_WRONLY | os.O_CREAT | os.O_TRUNC), 2)
+    os.dup2(os.open("errors" if largest == NO_LIMIT else os.devnull, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), 2)
     signal.signal(signal.SIGINT, signal.default_int_handler)  # processes in the background of a shell ignore it
-    terminate_as_interrupted()
     small = {"gaussians": 1000, "iterations": 5}
     QUALITY_PRESETS["draft"] = replace(QUALITY_PRESETS["draft"], **small)
     resource.setrlimit(resource.RLIMIT_FSIZE, (largest, resource.getrlimit(resource.RLIMIT_FSIZE)[1]))
     shrink_process()
     if more != NO_LIMIT:
         resource.setrlimit(resource.RLIMIT_AS, (memory("VmSize") + more, resource.getrlimit(resource.RLIMIT_AS)[1]))
-    (lab if command in ("train", "dataset") else app)(words)
+    run_command_line(lab if command in ("train", "dataset") else app, words)
 
 
 @dataclass(frozen=True)
@@ -141,7 +140,8 @@ def disturbed(command: str, how: str, rng: random.Random, known: Undisturbed, fo
     process.join(HANGING)
     process.kill()  # if it hangs
     process.join()
-    code, wrong, errors = process.exitcode, [], (folder / "errors").read_text(errors="replace")
+    code, wrong, errors = process.exitcode, [], folder / "errors"
+    errors = errors.read_text(errors="replace") if errors.exists() else ""
     left = {name: data for name, data in files_in(folder / "out").items() if not name.split("/")[-1].startswith(".")
             and ".steps-" not in name and not name.endswith((".ckpt", ".partial.h5"))}  # fmt: skip
     partial = [name for name in left if left[name] != known.files.get(name)]

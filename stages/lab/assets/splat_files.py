@@ -30,9 +30,10 @@ def write_object(folder: Path, g: Gaussians, name: str, provenance: dict) -> Non
     """Write FOLDER/point_cloud/iteration_30000/point_cloud.ply, and an orbit around it as FOLDER/cameras.json."""
     ply = folder / POINT_CLOUD
     ply.parent.mkdir(parents=True, exist_ok=True)
-    write_scene(ply, Scene(g, (SceneObject(1, name),), None, None, provenance=provenance))
     with replacing(folder / "cameras.json") as part:
         part.write_text(json.dumps(camera_rows(orbit(VIEWS, torch.zeros(3), 2.4, 20.0), RESOLUTION)))
+    # last, since what has this file is complete
+    write_scene(ply, Scene(g, (SceneObject(1, name),), None, None, provenance=provenance))
 
 
 def camera_rows(viewmats: Float[Tensor, "c 4 4"], size: int) -> list[dict]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 
 import torch
@@ -105,7 +105,7 @@ def load(path: Path, device: torch.device | str = "cpu") -> tuple[Dynamics, dict
     must_exist(path, "weights (.safetensors) such as `ngff-lab train` writes")
     if path.suffix in (".pt", ".pth"):
         return _public(path).to(device).eval(), {"model": "ngff-paper", "sha256": sha256(path)}
-    card = _card(path)
+    card = read_card(path, MODELS)
     state = read_state(path, card)
     try:
         _check_config(card["config"])
@@ -114,7 +114,7 @@ def load(path: Path, device: torch.device | str = "cpu") -> tuple[Dynamics, dict
         model = build(card["model"], **card["config"])
         model.load_state_dict(state)
     except (TypeError, RuntimeError, ValueError) as error:
-        raise _unfit(path, f"the model {card['model']!r} of its card", error) from error
+        raise unfit(path, f"the model {card['model']!r} of its card", error) from error
     return model.to(device).eval(), card
 
 
@@ -146,7 +146,8 @@ def _check_config(config: Mapping) -> None:
             whole(value, quote(name, 40), 1, MAX_CONFIG)
 
 
-def _card(path: Path) -> dict:
+def read_card(path: Path, models: Collection[str]) -> dict:
+    """The card of weights, of one of these models: model, config and sha256. InputError where it is damaged."""
     file = path.with_suffix(".json")
     must_exist(file, f"the card of {path.name}")
     try:
@@ -155,8 +156,8 @@ def _card(path: Path) -> dict:
         wrong |= not isinstance(card["config"], dict)
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(f"{file}: is not the card of weights ({reason(error)}); fetch or train it again") from error
-    if wrong or card["model"] not in MODELS:
-        raise InputError(f"{file}: needs model (one of {', '.join(MODELS)}), config and sha256")
+    if wrong or card["model"] not in models:
+        raise InputError(f"{file}: needs model (one of {', '.join(models)}), config and sha256")
     return card
 
 
@@ -175,7 +176,7 @@ def _public(path: Path) -> Dynamics:
         model = build("ngff-paper", hidden=hidden, layers=layers, deform=deform)
         model.load_state_dict(state)
     except (KeyError, RuntimeError) as error:
-        raise _unfit(path, "the published NGFF model", error) from error
+        raise unfit(path, "the published NGFF model", error) from error
     return model
 
 
@@ -187,7 +188,8 @@ def _tensors(data: object) -> dict[str, Tensor]:
     return {k.removeprefix("module."): v for k, v in items if isinstance(k, str) and isinstance(v, Tensor)}
 
 
-def _unfit(path: Path, what: str, error: Exception) -> InputError:
+def unfit(path: Path, what: str, error: Exception) -> InputError:
+    """The error of weights that do not fit `what`."""
     return InputError(f"{path}: does not fit {what} ({_line(error)})")
 
 

@@ -13,7 +13,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import h5py
-import numpy as np
 import torch
 from jaxtyping import Float, Int
 from plyfile import PlyData, PlyParseError
@@ -26,8 +25,10 @@ from stages.core.physics.keypoints import bind_gaussians, farthest_points
 from stages.core.physics.particles import MIN_PARTICLE_OPACITY
 from stages.core.physics.skinning import object_rotations
 from stages.core.scene.files import must_exist, provenance
+from stages.core.scene.h5_schema import Dataset
 from stages.core.scene.scene import Scene, SceneObject
 from stages.core.scene.scene_ply import read_scene
+from stages.core.scene.schema import reason
 from stages.core.scene.trajectory import Keypoints, SimulationInfo, TrajectoryWriter
 from stages.lab.dataset.cameras import orbit_cameras
 from stages.lab.dataset.layout import Layout, object_kind
@@ -133,7 +134,7 @@ def _frame_rows(scene: Scene, first: Path, source: Path) -> Int[Tensor, "r"]:
     """Index of the Gaussian of each row; raises InputError when the frames do not belong to the scene."""
     g = scene.gaussians
     rows = ((g.opacities > MIN_PARTICLE_OPACITY) & (g.means.abs() <= HALF_EXTENT).all(1)).nonzero()[:, 0]
-    positions = _read(first, "pos", (3,))
+    positions = read_frame(first, "pos", (3,))
     if len(positions) != len(rows):
         raise InputError(
             f"{first}: has {len(positions)} rows, but {source} has {len(rows)} Gaussians with opacity above "
@@ -160,22 +161,18 @@ def _choose_keypoints(scene: Scene, rows: Int[Tensor, "r"], count: int) -> tuple
 
 def _read_positions(frames: list[Path], count: int) -> Iterator[Float[Tensor, "r 3"]]:
     for path in tqdm(frames, unit="frame"):
-        positions = _read(path, "pos", (3,))
+        positions = read_frame(path, "pos", (3,))
         if len(positions) != count:
             raise InputError(f"{path}: has {len(positions)} rows and the first frame {count}; download it again")
-        if not positions.isfinite().all():
-            raise InputError(f"{path}: some positions are not finite; this scene cannot be used")
         yield positions
 
 
-def _read(path: Path, name: str, shape: tuple[int, ...]) -> Tensor:
+def read_frame(path: Path, name: str, shape: tuple[int, ...]) -> Tensor:
     """Dataset `name` of a frame, (n, *shape), as float32."""
     must_exist(path, FILE_KIND)
     try:
         with h5py.File(path, "r") as file:
-            data = np.asarray(file[name][()], np.float32)
-    except (OSError, KeyError, ValueError, TypeError) as error:
-        raise InputError(f"{path}: cannot be read ({error}); {FILE_KIND} is expected") from error
-    if data.shape[1:] != shape:
-        raise InputError(f"{path}: {name} has shape {data.shape}; (n, {', '.join(map(str, shape))}) is expected")
-    return torch.from_numpy(data)
+            table = Dataset(" ".join(("n", *map(str, shape))))
+            return torch.from_numpy(table.read(file, name, {}))
+    except (OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
+        raise InputError(f"{path}: cannot be read ({reason(error)}); {FILE_KIND} is expected") from error

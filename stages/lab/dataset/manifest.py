@@ -17,6 +17,7 @@ from tqdm import tqdm
 
 from stages.core.errors import InputError
 from stages.core.scene.files import ngff_version, replacing, sha256
+from stages.core.scene.schema import read_json
 
 FORMAT, VERSION = "ngff-dataset", 1
 SOLVER_SOURCES = ("core/physics/mpm/*.py", "core/kernels/mpm/*.py")  # under stages/
@@ -29,7 +30,7 @@ def open_manifest(root: Path, settings: dict) -> None:
     path, current = root / "manifest.json", {"settings": settings, "solver": solver_digest()}
     if path.exists():
         try:
-            content = json.loads(path.read_text())
+            content = read_json(path)
             existing = {"settings": content["settings"], "solver": content["solver"]}
         except (ValueError, KeyError, TypeError) as error:
             raise InputError(f"{path}: cannot be read ({error!r}); is {root} a data set?") from error
@@ -84,7 +85,7 @@ def write_checksums(root: Path, name: str, files: Iterable[Path]) -> None:
 
 def read_checksums(path: Path) -> dict[str, str]:
     """File name -> digest, from a file as `sha256sum` writes it; raises InputError for other content."""
-    rows = [line.split("  ", 1) for line in path.read_text().splitlines() if line]
+    rows = [line.split("  ", 1) for line in path.read_text(errors="replace").splitlines() if line]
     if not all(len(row) == 2 and len(row[0]) == 64 for row in rows):
         raise InputError(f"{path}: is not a list of sha256 digests; remove it and run `ngff-lab dataset` again")
     return {name: digest for digest, name in rows}

@@ -13,8 +13,10 @@ from stages.core.physics.materials import MaterialChoice
 from stages.core.scene.cameras import Cameras, LensDistortion, check_cameras
 from stages.core.scene.scene import Scene
 from stages.core.scene.trajectory import Trajectory
+from stages.lab.clutter.examples import Example
 from stages.lab.dataset.keypoint_motions import KeypointMotions
 from stages.lab.dataset.scene_configs import SceneConfig
+from stages.lab.questionnaire.answers import Answers
 from stages.segment.prompts import ObjectPrompts
 from stages.simulate.options import SimulateOptions
 
@@ -139,3 +141,38 @@ def check_images(images: Iterable[torch.Tensor]) -> None:
     for image in images:
         assert image.numel() and image.isfinite().all() and image.min() >= 0, "pixels"
         assert image.ndim == 2 or image.shape[2] == 3, "channels"
+
+
+def check_labelled(scene: Scene) -> None:
+    """AssertionError unless a scene with labels satisfies its types, and its objects have Gaussians of their id."""
+    check_scene(scene)
+    assert {o.id for o in scene.objects} >= set(scene.gaussians.object_id.unique().tolist()) - {0}, "objects"
+
+
+def check_example(example: Example) -> None:
+    """AssertionError unless surfels are finite and each has a label."""
+    values = vars(example.surfels).values()
+    assert all(x.dtype == torch.float32 and x.isfinite().all() and len(x) == len(example.labels) for x in values)
+    assert example.labels.dtype == torch.int64, "labels"
+
+
+def check_points(x: torch.Tensor) -> None:
+    """AssertionError unless points are finite."""
+    assert x.shape[1:] == (3,) and x.dtype == torch.float32 and x.isfinite().all(), "points"
+
+
+def check_answers(answers: Answers) -> None:
+    """AssertionError unless ratings are points of the scale, or none."""
+    for table in answers.ratings.values():
+        assert table.shape == (1, len(answers.films)) and table.min() >= 0 and table.max() <= answers.points, "ratings"
+
+
+def check_sums(sums: dict[str, str]) -> None:
+    """AssertionError unless digests have their length."""
+    assert all(len(digest) == 64 for digest in sums.values()), "digests"
+
+
+def check_message(message: dict) -> None:
+    """AssertionError unless the numbers of a message are finite."""
+    values = [v for value in message.values() for v in (value if isinstance(value, tuple) else (value,))]
+    assert all(abs(v) < 1e10 for v in values if isinstance(v, (int, float))), "numbers"

@@ -8,11 +8,17 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+import h5py
 import numpy as np
 import torch
 from plyfile import PlyData, PlyElement
+from safetensors.torch import save_file
 
+from stages.core.errors import InputError
 from stages.core.models import checkpoints
+from stages.core.models.segmenter.network import Segmenter
+from stages.core.models.segmenter.segment import load_segmenter
+from stages.core.models.segmenter.voxels import ScenePoints
 from stages.core.physics.forces import parse, read_forces, stored_prompts
 from stages.core.physics.materials import choose_materials
 from stages.core.scene.cameras import Cameras, read_cameras
@@ -26,7 +32,10 @@ from stages.core.scene.scene_ply import read_scene, write_scene
 from stages.core.scene.trajectory import Binding, Keypoints, SimulationInfo, TrajectoryWriter, read_trajectory
 from stages.evaluate.labels import read_label_names
 from stages.lab.bench.replay import read_recording
+from stages.lab.clutter.examples import Example, read_example, write_example
+from stages.lab.dataset.importer import read_frame
 from stages.lab.dataset.keypoint_motions import KeypointMotions, read_motions, write_motions
+from stages.lab.dataset.manifest import read_checksums
 from stages.lab.dataset.scene_configs import SceneConfig, read_scene_configs, write_scene_configs
 from stages.lab.fuzz import checks
 from stages.lab.fuzz.mutations import (
@@ -39,10 +48,14 @@ from stages.lab.fuzz.mutations import (
     change_vertices,
     change_words,
 )
+from stages.lab.questionnaire.answers import read_answers
 from stages.reconstruct.photo_reader import read_photos
 from stages.render.path_file import read_camera_path
 from stages.segment.masks import read_names
+from stages.segment.masks import segment as segment_masks
+from stages.segment.options import SegmentOptions
 from stages.segment.prompts import read_prompts
+from stages.simulate.live.messages import BadMessage, parse_message
 from stages.simulate.options import SimulateOptions
 from stages.simulate.stage import with_recorded
 
@@ -173,6 +186,63 @@ def repair_card(folder: Path, name: str = "w") -> None:
         pass  # the card itself is damaged
 
 
+def write_segmenter(folder: Path) -> None:
+    """A small untrained segmentation network with its card."""
+    torch.manual_seed(0)
+    model = Segmenter((4, 6), 1)
+    save_file({name: value.half() for name, value in model.state_dict().items()}, folder / "w.safetensors")
+    card = {"model": "segmenter", "config": model.config, "sha256": sha256(folder / "w.safetensors")}
+    (folder / "w.json").write_text(json.dumps(card))
+
+
+def write_clutter(path: Path) -> None:
+    """An example of clutter: six surfels."""
+    points = ScenePoints(*(torch.rand(6, 3)[:, 0] if name == "flatness" else torch.rand(6, 3) for name in
+                           ScenePoints.__dataclass_fields__))  # fmt: skip
+    write_example(path, Example(points, torch.arange(6) - 1))
+
+
+def write_masks(folder: Path) -> None:
+    """Label images of two photos, and the names of what they show."""
+    for name in "ab":
+        write_labels(folder / f"{name}.png", torch.arange(768).reshape(24, 32) % 3)
+    (folder / "names.json").write_text(json.dumps({"1": "duck", "2": {"name": "bowl"}}))
+
+
+def write_study(folder: Path) -> None:
+    """The key of a study of two films, and the answers of a participant."""
+    films = {name: {"model": "ngff", "split": split, "file": "a.mp4"} for name, split in (("f1", "a"), ("f2", ""))}
+    shown, scales = {"1": ["f1", "f2"], "2": ["f2"]}, ["PhysR", "PhotoR"]
+    key = {"study": "abc", "films": films, "participants": shown, "points": 5, "scales": scales}
+    (folder / "key.json").write_text(json.dumps(key))
+    answers = [{"film": "f1", "PhysR": 3, "PhotoR": 5}, {"film": "f2", "unplayable": True}]
+    (folder / "1.json").write_text(json.dumps({"study": "abc", "participant": "1", "answers": answers}))
+
+
+def write_frame(path: Path) -> None:
+    """A frame of the published simulations."""
+    with h5py.File(path, "w") as file:
+        file["x"], file.attrs["step"] = np.ones((5, 3), "f4"), 0
+
+
+def write_sums(path: Path) -> None:
+    """A list of digests."""
+    path.write_text(f"{'0' * 64}  objects/ball.ply\n{'f' * 64}  scenes/a b.h5\n")
+
+
+def read_message(path: Path) -> None:
+    """A message of a live page; one that is refused is no error of the server."""
+    try:
+        checks.check_message(parse_message(path.read_text(errors="replace")))
+    except BadMessage as error:
+        raise InputError(str(error)) from error
+
+
+def read_masks(folder: Path) -> None:
+    """The label images of a folder, through the first stage of `segment --masks`."""
+    checks.check_labelled(segment_masks(example_scene(), SegmentOptions(masks=folder)))
+
+
 def write_checkpoint(folder: Path) -> None:
     """A checkpoint of the public code."""
     torch.save(checkpoints.build("ngff-paper", hidden=2, layers=1).state_dict(), folder / "w.pt")
@@ -217,6 +287,11 @@ def as_json(name: str, value: object) -> Callable[[Path], None]:
     return lambda folder: (folder / name).write_text(json.dumps(value))
 
 
+def as_text(value: object) -> Callable[[Path], object]:
+    """A writer of a JSON file of any name."""
+    return lambda path: path.write_text(json.dumps(value))
+
+
 EYE = np.eye(3).tolist()
 PATH = [{"rotation": EYE, "position": [0.0, 0, i], "width": 32, "height": 24, "fx": 40.0, "fy": 40.0} for i in range(2)]
 VIEWS = [{"viewmat": np.eye(4).tolist(), "K": [[40.0, 0, 16], [0, 40, 12], [0, 0, 1]], "size": [32, 24]}] * 2
@@ -230,6 +305,7 @@ MATERIALS = {"duck": CUSTOM, "2": {"parts": PARTS}}
 PROMPTS = {"bbox": [[2, 3, 10, 12], [12.0, 4, 20, 20]], "center_point": [[5, 6], [15.0, 10]], "text": ["duck", "bowl"],
            "size": [32, 24]}  # fmt: skip
 LABELS = {"1": {"name": "duck", "core": True}, "2": "bowl"}
+MESSAGE = {"do": "push", "object": 1, "point": [0.0, 0.0, 1.0], "direction": [0, 3, 4.0], "strength": 2.0}
 OPTIONS = "object=duck force=0,0,2 from=0.1 to=0.3 at=1,2,3\nobject=1 0,0,2\n1=0.3\nbowl\nduck=rubber\n"
 CONFIG = {"0_1_2": SceneConfig("0_1_2", (1, 2), ((0.0, 0, 0), (0.1, 0.2, 0.5)), (0.4, 0.3))}
 
@@ -295,6 +371,16 @@ KINDS = (
     Kind("options", lambda folder: (folder / "options").write_text(OPTIONS), {"options": change_words}, read_options),
     Kind("weights", write_weights, {"w.safetensors": change_tensors, "w.json": change_json},
          lambda folder: checks.check_parameters(checkpoints.load(folder / "w.safetensors")[0]), 2, repair_card),
+    Kind("segmenter", write_segmenter, {"w.safetensors": change_tensors, "w.json": change_json},
+         lambda folder: checks.check_parameters(load_segmenter(folder / "w.safetensors")), 2, repair_card),
+    file_kind("clutter.safetensors", write_clutter, change_tensors, read_example, checks.check_example),
+    Kind("masks", write_masks, {"a.png": change_bytes, "names.json": change_json}, read_masks),
+    Kind("study", write_study, {"key.json": change_json, "1.json": change_json},
+         lambda folder: checks.check_answers(read_answers(folder, [folder / "1.json"]))),
+    file_kind("frame.h5", write_frame, change_datasets, lambda path: read_frame(path, "x", (3,)),
+              checks.check_points),
+    file_kind("list.sha256", write_sums, change_words, read_checksums, checks.check_sums),
+    file_kind("message", as_text(MESSAGE), change_json, read_message, lambda _: None),
     Kind("checkpoint.pt", write_checkpoint, {"w.pt": change_doubles},
          lambda folder: checks.check_parameters(checkpoints.load(folder / "w.pt")[0])),
     file_kind("recording.npz", write_recording, change_arrays, read_recording, lambda arrays: None),

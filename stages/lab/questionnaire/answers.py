@@ -11,7 +11,7 @@ import numpy as np
 
 from stages.core.errors import InputError
 from stages.core.scene.files import provenance, read_json_file, replacing
-from stages.core.scene.schema import quote, reason, whole
+from stages.core.scene.schema import quote, reason, text, texts, whole
 from stages.evaluate.result import format_number
 from stages.lab.questionnaire.agreement import coincidences, krippendorff_alpha
 
@@ -57,7 +57,7 @@ def find_answers(paths: Sequence[Path]) -> list[Path]:
 
 def read_answers(study: Path, paths: Sequence[Path]) -> Answers:
     """The answers in the files. Raises InputError for files of another study, and for two of one participant."""
-    key = read_json_file(study / "key.json", "the key of a study, as `ngff-lab questionnaire FILMS/ -o STUDY/` writes")
+    key = _read_key(study / "key.json")
     films, participants, points, scales = (key[name] for name in ("films", "participants", "points", "scales"))
     column = {film: i for i, film in enumerate(films)}
     ratings = {scale: np.zeros((len(paths), len(films)), dtype=np.int8) for scale in scales}
@@ -81,6 +81,22 @@ def read_answers(study: Path, paths: Sequence[Path]) -> Answers:
         unplayable += skipped
         missing += len(participants[who]) - len(rated) - skipped
     return Answers(ratings, films, points, missing, unplayable)
+
+
+def _read_key(path: Path) -> dict:
+    """The key of a study: its name, films, the films that each participant is shown, the scales and their points."""
+    what = "the key of a study, as `ngff-lab questionnaire FILMS/ -o STUDY/` writes"
+    key = _read(path, what)
+    try:
+        films = {name: {k: text(film[k], k) for k in ("model", "split", "file")} for name, film in key["films"].items()}
+        shown = {who: texts(row, "the films of a participant") for who, row in key["participants"].items()}
+        points, scales = whole(key["points"], "points", 2, 100), texts(key["scales"], "scales")
+        if not films or not set().union(*shown.values()) <= films.keys():
+            raise ValueError("a participant is shown a film that is not listed")
+        return {"study": text(key["study"], "study"), "films": films, "participants": shown, "points": points,
+                "scales": scales}  # fmt: skip
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InputError(f"{path}: is damaged ({reason(error)}); {what} is expected") from error
 
 
 def _checked(data: dict, shown: list[str], scales: list[str], points: int) -> tuple[dict[str, list[int]], int]:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
 from stages.core.errors import InputError
 from stages.core.models.checkpoints import halve
 from stages.core.scene.files import must_exist
+from stages.core.scene.schema import read_json
 from stages.lab.plot import Panel, draw_panels
 from stages.lab.training.history import total_minutes
 
@@ -39,11 +39,11 @@ def _read(card: Path) -> dict:
     """A card with its curve as lists of one length."""
     must_exist(card, CARD)
     try:
-        row = json.loads(card.read_text())
+        row = read_json(card)
         curve = {key: list(row["curve"][key]) for key in ("minutes", *PANELS)}
         list(zip(*curve.values(), strict=True))
         return {**row, "curve": curve, "model": str(row["model"]), "runs": [dict(run) for run in row["runs"]]}
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(f"{card}: has no training curve ({error!r}); {CARD} is expected") from error
 
 

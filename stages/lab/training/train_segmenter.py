@@ -21,7 +21,7 @@ from stages.core.errors import InputError
 from stages.core.models.segmenter.network import OFFSET_UNIT, Prediction, Segmenter, pyramid
 from stages.core.models.segmenter.segment import load_segmenter
 from stages.core.models.segmenter.voxels import VOXEL, unique_cells
-from stages.core.scene.files import replacing
+from stages.core.scene.files import replacing, sha256
 from stages.lab.clutter.examples import read_example
 from stages.lab.training.distributed import ProcessGroup, process_group
 from stages.lab.training.segmenter_data import (
@@ -173,9 +173,9 @@ def _save(
     out: Path, model: Segmenter, options: SegmenterTraining, files: int, curve: list[dict], scores: dict | None = None
 ) -> None:
     """Weights in half precision, and their card."""
-    card = {"model": "segmenter", "config": model.config, "training": asdict(options), "files": files,
-            "scores": scores or {}, "curve": curve}  # fmt: skip
     with replacing(Path(out)) as part:
         save_file({k: v.detach().cpu().contiguous().half() for k, v in model.state_dict().items()}, part)
+    card = {"model": "segmenter", "config": model.config, "sha256": sha256(out), "training": asdict(options),
+            "files": files, "scores": scores or {}, "curve": curve}  # fmt: skip
     with replacing(Path(out).with_suffix(".json")) as part:
         part.write_text(json.dumps(card, indent=1))

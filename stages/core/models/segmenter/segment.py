@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -12,10 +11,10 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from safetensors.torch import load_file
 from torch import Tensor
 
 from stages.core.errors import InputError
+from stages.core.models.checkpoints import MAX_CONFIG, read_card, read_state, unfit
 from stages.core.models.segmenter.candidates import MIN_VOXELS, find_candidates
 from stages.core.models.segmenter.network import Segmenter, pyramid
 from stages.core.models.segmenter.outlines import cut_outlines
@@ -23,9 +22,12 @@ from stages.core.models.segmenter.surfels import scene_surfels
 from stages.core.models.segmenter.voxels import SCALES, ScenePoints, VoxelGrid, voxelise
 from stages.core.perception.grouping import name_objects
 from stages.core.perception.support import Support, find_support, view_extent
+from stages.core.scene.files import must_exist
 from stages.core.scene.scene import Scene
+from stages.core.scene.schema import whole
 
 WEIGHTS = Path(__file__).parent / "segmenter.safetensors"
+MAX_BLOCKS, MAX_LEVELS = 100, 12  # of a network
 MAX_VOXELS = 80_000  # nearest to the focus
 MAX_BASE_HEIGHT = 0.4  # of an object's lowest points above the surface [camera distance]
 MAX_BASE_DEPTH = 0.05  # of an object's lowest points below the surface; what stands on the floor is lower
@@ -56,10 +58,22 @@ def find(given: Path | None = None) -> Path:
 
 
 def load_segmenter(path: Path, device: torch.device | str = "cpu") -> Segmenter:
-    """The network with its trained weights, in single precision."""
-    config = json.loads(path.with_suffix(".json").read_text())["config"]
-    model = Segmenter(tuple(config["widths"]), config["blocks"])
-    model.load_state_dict({k: v.float() for k, v in load_file(path).items()})
+    """The network with its trained weights, in single precision.
+
+    Raises InputError for weights that are missing, damaged or do not fit their card.
+    """
+    must_exist(path, "weights (.safetensors) such as `ngff-lab train-segmenter` writes")
+    card = read_card(path, ("segmenter",))
+    state = read_state(path, card)
+    try:
+        blocks, widths = whole(card["config"]["blocks"], "blocks", 1, MAX_BLOCKS), card["config"]["widths"]
+        widths = tuple(whole(width, "widths", 1, MAX_CONFIG) for width in widths[:MAX_LEVELS])
+        with torch.device("meta"):  # shapes first: they may need any amount of memory
+            Segmenter(widths, blocks).load_state_dict(state, assign=True)
+        model = Segmenter(widths, blocks)
+        model.load_state_dict(state)
+    except (KeyError, IndexError, TypeError, ValueError, RuntimeError) as error:
+        raise unfit(path, "the segmentation network of its card", error) from error
     return model.to(device).eval()
 
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import logging
 import math
+from collections import deque
 from functools import cache
 
 import numpy as np
@@ -51,7 +52,7 @@ class PlausibilityMonitor:
         count = len(scene.objects)
         self.penetration, self._partner = np.zeros(count), [""] * count
         self._spread = np.zeros(count)
-        self._com: list[np.ndarray] = []
+        self._frames, self._com = 0, deque[np.ndarray](maxlen=max(2, options.steps // 4))  # of the last quarter
         self._energy: list[float] = []
         self._before: tuple[list[np.ndarray], np.ndarray] | None = None
 
@@ -60,10 +61,11 @@ class PlausibilityMonitor:
         x = state.positions.double().cpu().numpy()
         points = [x[rows.numpy()] for rows in self._rows]
         com, R = state.com.double().cpu().numpy(), matrix(state.rotation.double().cpu()).numpy()
-        if not self._com:
+        if not self._frames:
             lift = np.array([[0.0, 0.0, self._prompts.lift.get(o.id, 0.0)] for o in self._scene.objects])
             self._origin = com - lift
         self._com.append(com)
+        self._frames += 1
         for i, (p, rest) in enumerate(zip(points, self._rest, strict=True)):
             if len(p):
                 self._spread[i] = max(self._spread[i], abs(_radius(p) / max(_radius(rest), 1e-12) - 1))
@@ -116,12 +118,12 @@ class PlausibilityMonitor:
 
     def result(self) -> dict:
         """The measures: of each object by its id, and of the whole scene."""
-        com, dt = np.array(self._com), self._options.dt
-        last = com[-max(2, len(com) // 4) :]
+        dt = self._options.dt
+        last = np.array(self._com)[-max(2, self._frames // 4) :]
         speed = np.linalg.norm(np.diff(last, axis=0), axis=2).max(0, initial=0) / dt
         creep = np.linalg.norm(last[-1] - last[0], axis=1) / (max(len(last) - 1, 1) * dt) / self._size
         creep[speed > SLOW * np.sqrt(abs(self._g) * self._size)] = 0
-        if len(com) < 8:
+        if self._frames < 8:
             creep[:] = 0
         measures = {"penetration": self.penetration, "creep": creep, "spread": self._spread}
         objects = {str(o.id): {name: float(v[i]) for name, v in measures.items()}

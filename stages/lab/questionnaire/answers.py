@@ -86,7 +86,7 @@ def read_answers(study: Path, paths: Sequence[Path]) -> Answers:
 def _read_key(path: Path) -> dict:
     """The key of a study: its name, films, the films that each participant is shown, the scales and their points."""
     what = "the key of a study, as `ngff-lab questionnaire FILMS/ -o STUDY/` writes"
-    key = _read(path, what)
+    key = read_json_file(path, what)
     try:
         films = {name: {k: text(film[k], k) for k in ("model", "split", "file")} for name, film in key["films"].items()}
         shown = {who: texts(row, "the films of a participant") for who, row in key["participants"].items()}

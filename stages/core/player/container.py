@@ -41,12 +41,12 @@ class PackedArray:
 
 def whole(values: Int[Tensor, "r c"]) -> PackedArray:
     """Non-negative integers, stored exactly in as few bytes as they need."""
-    return PackedArray(values.long(), (0.0,), (1.0,), max(1, int(values.max()).bit_length()) if values.numel() else 1)
+    return PackedArray(values.long().cpu(), (0.0,), (1.0,), max(1, int(values.max()).bit_length()) if values.numel() else 1)
 
 
 def exact(values: Float[Tensor, "r c"]) -> PackedArray:
     """Numbers stored as float32, without rounding."""
-    bits = torch.from_numpy(values.float().contiguous().numpy().view(np.uint32).astype(np.int64))
+    bits = torch.from_numpy(values.float().cpu().contiguous().numpy().view(np.uint32).astype(np.int64))
     return PackedArray(bits, (0.0,), (1.0,), 32, float=True)
 
 

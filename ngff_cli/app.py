@@ -74,6 +74,9 @@ def reconstruct(
     resolution: Annotated[
         int | None, Option(help="longest side to which photos are resized [px]; default: set by --quality")
     ] = ReconstructOptions.resolution,
+    up: Annotated[
+        str, Option(help="side of the photos that is up: auto (by the table or floor) | top | right | bottom | left")
+    ] = ReconstructOptions.up,
     scale_reference: Annotated[
         str, Option(help='a known length [m]: "photos=A.jpg,B.jpg distance=0.5" between two cameras, or "distance=0.6" '
                          "from the cameras to the point they look at")
@@ -100,8 +103,8 @@ def reconstruct(
     """
     options = ReconstructOptions(
         backend=backend, matcher=matcher, cameras=cameras, holdout=holdout, quality=quality, resolution=resolution,
-        scale_reference=scale_reference, resume=resume, weights=weights, download=download, iterations=iterations,
-        seed=seed, device=device,
+        up=up, scale_reference=scale_reference, resume=resume, weights=weights, download=download,
+        iterations=iterations, seed=seed, device=device,
     )  # fmt: skip
     load("stages.reconstruct.stage:run")(imgs, out, options)
 

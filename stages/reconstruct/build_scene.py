@@ -99,12 +99,17 @@ def _fused_points(
 
 
 def _find_ground(cloud: OrientedPoints, views: Views, found: SceneGeometry, options: ReconstructOptions) -> Ground:
-    ground = world_frame.find_ground(cloud.points, views.cameras.viewmats, found.focus, options.seed)
+    ground = world_frame.find_ground(cloud.points, views.cameras.viewmats, found.focus, options.seed, options.up)
     ground = world_frame.refine_ground(ground, cloud.points, options.seed)
     if ground.plane is None:
         log.info("no supporting plane found: up is how the cameras were held, z = 0 is at the lowest points")
     else:
         log.info("the supporting plane has %.0f %% of the points in focus", 100 * ground.inlier_fraction)
+    if ground.up_side != "top" and options.up == "auto":
+        log.info("the photos are turned: their %s side is up", ground.up_side)
+    if ground.rival:
+        log.warning("it is not certain that the %s side of the photos is up and not the %s one; if the scene comes out "
+                    "tilted, give --up %s", ground.up_side, ground.rival, ground.rival)  # fmt: skip
     return ground
 
 

@@ -35,7 +35,7 @@ def reconstruct_from_model(
     """The steps after structure from motion; the model has a camera for each photo."""
     views = undistort(photos, model.cameras, model.lenses, options.max_side)
     focus = world_frame.focus_point(model.cameras.viewmats, _typical_depths(model))
-    ground = world_frame.find_ground(model.points, model.cameras.viewmats, focus, options.seed)
+    ground = world_frame.find_ground(model.points, model.cameras.viewmats, focus, options.seed, options.up)
     trained, held_out = split_holdout(len(views), options.holdout)
     used, part = views[trained], _subset(model, trained)
     maps = steps.cached("depth", lambda: depth.estimate_depth_maps(used, part, ground.plane, device), (depth.DepthMap,))

@@ -21,6 +21,7 @@ FEATURE_MATCHERS = {
     "sift": "stages.reconstruct.features:make_matcher",
     "aliked-lightglue": "stages.reconstruct.features_learned:make_matcher",
 }
+UP_SIDES = ("top", "right", "bottom", "left")  # of photos, where up may be
 SINGLE_PHOTO_BACKENDS = {"pi3", "pi3-splat"}  # backends that accept a single photo
 
 
@@ -52,6 +53,7 @@ class ReconstructOptions:
     holdout: int = 0  # keep every N-th photo out of the fit and evaluate it; 0 for none
     quality: str = "normal"
     resolution: int | None = None  # longest side of the views [px]; by default that of the quality
+    up: str = "auto"  # side of the photos that is up: auto, or one of UP_SIDES
     scale_reference: str = ""  # a measured length, in the form of scale.parse_scale; empty for none
     resume: bool = False  # continue an interrupted run from its finished steps
     weights: Path | None = None  # of pi3 and pi3-splat: a file or a folder; by default searched for
@@ -65,6 +67,8 @@ class ReconstructOptions:
             raise InputError(f"--matcher {self.matcher}: choose from {', '.join(FEATURE_EXTRACTORS)}")
         if self.quality not in QUALITY_PRESETS:
             raise InputError(f"--quality {self.quality}: choose from {', '.join(QUALITY_PRESETS)}")
+        if self.up not in ("auto", *UP_SIDES):
+            raise InputError(f"--up {self.up}: choose auto, or the side of photos that is up: {', '.join(UP_SIDES)}")
         if self.holdout < 0 or self.holdout == 1:
             raise InputError(f"--holdout {self.holdout}: give 0 for none, or 2 or more for every N-th photo")
         if self.resolution is not None and not 64 <= self.resolution <= 4096:

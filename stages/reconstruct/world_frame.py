@@ -12,9 +12,11 @@ from torch import Tensor
 from stages.core.geometry.cameras import centres
 from stages.core.geometry.planes import Plane, ransac
 from stages.core.geometry.similarity import Similarity
+from stages.reconstruct.options import UP_SIDES
 
 # Minimum cosine of the cameras' pitch and minimum fraction of the points in focus, tried in this order.
 PLANE_CRITERIA = ((0.5, 0.04), (0.05, 0.3))
+TURNED_SUPPORT = 1.5  # times the plane's share of points if the photos are upright, from which they count as turned
 # Band around the first plane in which it is fitted again, and side of a surface patch [camera distances].
 BAND_BELOW, BAND_ABOVE, PATCH_SIZE = 0.08, 0.03, 0.04
 
@@ -28,6 +30,8 @@ class Ground:
     focus: Float[Tensor, "3"]  # the point that the cameras look at
     radius: float  # median distance of the cameras from it
     inlier_fraction: float = 0.0  # of the points in focus, on the plane
+    up_side: str = "top"  # of the photos: which of their sides is up
+    rival: str = ""  # another side that may be up as well
 
 
 def focus_point(viewmats: Float[Tensor, "c 4 4"], distances: Float[Tensor, "c"]) -> Float[Tensor, "3"]:
@@ -37,9 +41,35 @@ def focus_point(viewmats: Float[Tensor, "c 4 4"], distances: Float[Tensor, "c"])
 
 
 def find_ground(
-    points: Float[Tensor, "n 3"], viewmats: Float[Tensor, "c 4 4"], focus: Float[Tensor, "3"], seed: int = 0
+    points: Float[Tensor, "n 3"], viewmats: Float[Tensor, "c 4 4"], focus: Float[Tensor, "3"], seed: int = 0,
+    up_side: str = "auto",
+) -> Ground:  # fmt: skip
+    """The supporting plane of the objects in focus, or only the up direction of the cameras.
+
+    `up_side` is the side of the photos that is up, one of UP_SIDES. With "auto" it is the top, unless the plane found
+    for photos that were turned by 90 or 180 degrees has TURNED_SUPPORT times as many of the points in focus.
+    """
+    sides = UP_SIDES if up_side == "auto" else (up_side,)
+    found = {side: replace(_find_ground(points, turned(viewmats, side), focus, seed), up_side=side) for side in sides}
+    support = {side: ground.inlier_fraction for side, ground in found.items()}
+    if "top" in support:
+        support["top"] *= TURNED_SUPPORT
+    best, *rest = sorted(sides, key=lambda side: -support[side])
+    near = rest[0] if rest and support[best] < TURNED_SUPPORT * support[rest[0]] else ""
+    return replace(found[best], rival=near)
+
+
+def turned(viewmats: Float[Tensor, "c 4 4"], up_side: str) -> Float[Tensor, "c 4 4"]:
+    """The cameras turned about their optical axes so that `up_side` of their pictures becomes the top."""
+    quarter = torch.eye(4).to(viewmats)
+    quarter[:2, :2] = torch.tensor([[0.0, 1], [-1, 0]])  # the right side becomes the top
+    return torch.linalg.matrix_power(quarter, UP_SIDES.index(up_side)) @ viewmats
+
+
+def _find_ground(
+    points: Float[Tensor, "n 3"], viewmats: Float[Tensor, "c 4 4"], focus: Float[Tensor, "3"], seed: int
 ) -> Ground:
-    """The supporting plane of the objects in focus by RANSAC, or only the up direction of the cameras.
+    """The plane by RANSAC, with cameras that are held upright.
 
     Points are weighted by their distance from the focus, so that a table is preferred to the floor around it; most
     cameras must be above the plane. Planes that the cameras look down on by less than 60 degrees are tried first, since

@@ -9,6 +9,7 @@ from stages.core.geometry.cameras import centres, look_at, orbit
 from stages.core.geometry.rotations import matrix
 from stages.core.geometry.similarity import Similarity
 from stages.reconstruct import world_frame
+from stages.reconstruct.options import UP_SIDES
 
 
 def tabletop(seed: int = 0) -> torch.Tensor:
@@ -67,6 +68,30 @@ def test_textured_objects_do_not_tilt_the_plane():
     tilt = lambda up: math.degrees(math.acos(min(1.0, float(up[2]))))  # noqa: E731
     assert tilt(first.up) > 2
     assert tilt(ground.up) < 0.3 and abs(float(ground.plane.heights(torch.zeros(3)))) < 0.002
+
+
+@pytest.mark.parametrize("cameras", [full_ring, one_sided])
+@pytest.mark.parametrize("side", UP_SIDES)
+def test_up_is_found_in_turned_photos(cameras, side):
+    points, viewmats, move = displaced(tabletop(), cameras(), 4)
+    opposite = {"right": "left", "left": "right"}.get(side, side)
+    ground = world_frame.find_ground(points, world_frame.turned(viewmats, opposite), move(torch.tensor([0.0, 0, 0.1])))
+    assert ground.up_side == side and not ground.rival
+    assert float(ground.up @ move.rotation[:, 2]) > math.cos(math.radians(3))
+
+
+def test_a_table_and_a_wall_of_like_size_are_told_apart_by_the_given_side():
+    """Photos from one side of a corner: the table lies below the cameras, and for turned photos the wall does."""
+    generator = torch.Generator().manual_seed(0)
+    table = torch.rand(3000, 3, generator=generator) * torch.tensor([2.0, 2, 0]) - torch.tensor([1.0, 1, 0])
+    wall = torch.rand(3000, 3, generator=generator) * torch.tensor([0.0, 2, 2]) - torch.tensor([1.0, 1, 0])
+    eyes = torch.tensor([[1.0, 0.2 * k, 1.0] for k in range(-3, 4)])
+    viewmats, points = look_at(eyes, torch.tensor([[-0.5, 0.0, 0.5]]).expand(7, 3)), torch.cat([table, wall])
+    focus = torch.tensor([-0.7, 0.0, 0.3])
+    assert float(world_frame.find_ground(points, viewmats, focus).up[2]) > 0.99
+    sideways = world_frame.turned(viewmats, "bottom")
+    found = world_frame.find_ground(points, sideways, focus, up_side="bottom")
+    assert float(found.up[2]) > 0.99 and not found.rival
 
 
 def test_focus_scale_and_heading():

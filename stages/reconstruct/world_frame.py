@@ -16,7 +16,9 @@ from stages.reconstruct.options import UP_SIDES
 
 # Minimum cosine of the cameras' pitch and minimum fraction of the points in focus, tried in this order.
 PLANE_CRITERIA = ((0.5, 0.04), (0.05, 0.3))
-TURNED_SUPPORT = 1.5  # times the plane's share of points if the photos are upright, from which they count as turned
+UPRIGHT_FACTOR = 1.5  # of a plane's share of points, if the photos are upright for it; squared if they look down on it
+LOOKS_DOWN = 0.25  # sine of the mean pitch of cameras that are taken to look down
+ROLL_RATIO = 4.0  # of the spreads of the cameras' axes, from which one of them is the horizontal one
 # Band around the first plane in which it is fitted again, and side of a surface patch [camera distances].
 BAND_BELOW, BAND_ABOVE, PATCH_SIZE = 0.08, 0.03, 0.04
 
@@ -46,17 +48,38 @@ def find_ground(
 ) -> Ground:  # fmt: skip
     """The supporting plane of the objects in focus, or only the up direction of the cameras.
 
-    `up_side` is the side of the photos that is up, one of UP_SIDES. With "auto" it is the top, unless the plane found
-    for photos that were turned by 90 or 180 degrees has TURNED_SUPPORT times as many of the points in focus.
+    `up_side` is the side of the photos that is up, one of UP_SIDES. With "auto" it is a side that the roll of the
+    cameras allows, and of these the one whose plane has most points in focus, weighted by UPRIGHT_FACTOR.
     """
-    sides = UP_SIDES if up_side == "auto" else (up_side,)
+    sides, looks_down = _sides_by_roll(viewmats) if up_side == "auto" else ((up_side,), "")
     found = {side: replace(_find_ground(points, turned(viewmats, side), focus, seed), up_side=side) for side in sides}
-    support = {side: ground.inlier_fraction for side, ground in found.items()}
-    if "top" in support:
-        support["top"] *= TURNED_SUPPORT
-    best, *rest = sorted(sides, key=lambda side: -support[side])
-    near = rest[0] if rest and support[best] < TURNED_SUPPORT * support[rest[0]] else ""
+    support = {
+        side: ground.inlier_fraction * UPRIGHT_FACTOR ** ((side == "top") + 2 * (side == looks_down))
+        for side, ground in found.items()
+    }
+    best, *rest = sorted(sides, key=lambda side: (-support[side], side != looks_down, side != "top"))
+    near = rest[0] if rest and support[best] < UPRIGHT_FACTOR * support[rest[0]] else ""
     return replace(found[best], rival=near)
+
+
+def _sides_by_roll(viewmats: Float[Tensor, "c 4 4"]) -> tuple[tuple[str, ...], str]:
+    """Sides of the photos that may be up, and which of them is if the cameras look down ("" where that is unknown).
+
+    Cameras that move around a scene turn about the vertical: one of the axes of their pictures stays horizontal, that
+    is, orthogonal to one direction, while the other does not.
+    """
+    right, down, ahead = (viewmats[:, axis, :3] for axis in range(3))
+    (flat, wide), (upright, other) = (torch.linalg.eigh(axis.mT @ axis / len(axis)) for axis in (right, down))
+    spans = float(min(flat[1], upright[1])) > 0.02  # else the cameras are too much alike
+    if not spans or max(flat[0], upright[0]) < ROLL_RATIO * min(flat[0], upright[0]):
+        return UP_SIDES, ""
+    landscape = bool(flat[0] < upright[0])
+    up = (wide if landscape else other)[:, 0]
+    pitch = float((ahead @ up).mean())
+    up = up if pitch < 0 else -up
+    sides = ("top", "bottom") if landscape else ("right", "left")
+    along = -down if landscape else right
+    return sides, "" if abs(pitch) < LOOKS_DOWN else sides[0 if float((along @ up).mean()) > 0 else 1]
 
 
 def turned(viewmats: Float[Tensor, "c 4 4"], up_side: str) -> Float[Tensor, "c 4 4"]:

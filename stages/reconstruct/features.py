@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 from tqdm import tqdm
 
@@ -124,11 +124,18 @@ def select_pairs(vectors: list[Float[Tensor, "_ d"]], neighbours: int = 8, simil
     return sorted(chosen)
 
 
-def match_descriptors(a: Float[Tensor, "n d"], b: Float[Tensor, "m d"]) -> Int[Tensor, "k 2"]:
-    """Mutual nearest neighbours that pass the ratio and distance tests, as rows (index in a, index in b)."""
+def match_descriptors(
+    a: Float[Tensor, "n d"], b: Float[Tensor, "m d"], allowed: Bool[Tensor, "n m"] | None = None
+) -> Int[Tensor, "k 2"]:
+    """Mutual nearest neighbours that pass the ratio and distance tests, as rows (index in a, index in b).
+
+    Only pairs that are `allowed` are compared.
+    """
     if len(a) < 2 or len(b) < 2:
         return torch.zeros(0, 2, dtype=torch.int64)
     similarity = a @ b.mT
+    if allowed is not None:
+        similarity.masked_fill_(~allowed.to(similarity.device), -1.0)  # as far apart as descriptors can be
     best, to_b = similarity.topk(2, dim=1)
     distance = (2 - 2 * best).clamp_min(0).sqrt()
     keep = ((distance[:, 0] < MAX_DESCRIPTOR_DISTANCE) & (distance[:, 0] < MAX_RATIO * distance[:, 1])).nonzero()[:, 0]
@@ -137,7 +144,7 @@ def match_descriptors(a: Float[Tensor, "n d"], b: Float[Tensor, "m d"]) -> Int[T
     return torch.stack([keep[mutual], to_b[mutual]], 1).cpu()
 
 
-def make_matcher(found: list[Feature], sizes: list[tuple[int, int]], device: str) -> Callable[[int, int], Tensor]:
-    """A function (i, j) -> matches of photos i and j as rows of `match_descriptors`; `sizes` are not used."""
+def make_matcher(found: list[Feature], sizes: list[tuple[int, int]], device: str) -> Callable[..., Tensor]:
+    """A function (i, j, allowed) -> matches of photos i and j by `match_descriptors`; `sizes` are not used."""
     vectors = [normalise(descriptors).to(device) for _, descriptors in found]
-    return lambda i, j: match_descriptors(vectors[i], vectors[j])
+    return lambda i, j, allowed=None: match_descriptors(vectors[i], vectors[j], allowed)

@@ -60,16 +60,19 @@ def _learned(network: ALIKED, pixels: np.ndarray, device: str) -> tuple[Float[Te
 
 def make_matcher(
     found: list[HybridFeatures], sizes: list[tuple[int, int]], device: str
-) -> Callable[[int, int], Int[Tensor, "k 2"]]:
-    """A function (i, j) -> matches of photos i and j as rows (index in i, index in j); `sizes` in pixels."""
+) -> Callable[..., Int[Tensor, "k 2"]]:
+    """A function (i, j, allowed) -> matches of photos i and j as rows (index in i, index in j); `sizes` in pixels.
+
+    `allowed` (n, m) restricts those by SIFT.
+    """
     network = _load(LightGlue(), "lightglue").to(device)
     sift = features.make_matcher([(table, descriptors) for table, descriptors, _ in found], sizes, device)
     first = [len(descriptors) for _, descriptors, _ in found]  # row of the first learned keypoint
     keypoints = [table[k:, :2].to(device) for k, (table, _, _) in zip(first, found, strict=True)]
     learned = [descriptors.to(device) for _, _, descriptors in found]
 
-    def match(i: int, j: int) -> Int[Tensor, "k 2"]:
-        rows = sift(i, j)
+    def match(i: int, j: int, allowed: Bool[Tensor, "n m"] | None = None) -> Int[Tensor, "k 2"]:
+        rows = sift(i, j, None if allowed is None else allowed[: first[i], : first[j]])
         if len(rows) >= ENOUGH_SIFT_MATCHES:
             return rows
         more = network.match((keypoints[i], keypoints[j]), (learned[i], learned[j]), (sizes[i], sizes[j])).cpu()

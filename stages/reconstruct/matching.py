@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import torch
+from jaxtyping import Float
+from torch import Tensor
 from tqdm import tqdm
 
 from stages.core.backends import choose
 from stages.reconstruct import features
+from stages.reconstruct.epipolar import EpipolarLines
 from stages.reconstruct.options import FEATURE_EXTRACTORS, FEATURE_MATCHERS
 from stages.reconstruct.photos import Photos
 from stages.reconstruct.step_cache import StepCache
 
+MAX_EPIPOLAR_ERROR = 0.006  # for given cameras [photo sizes]: 4 px of 640
 MatchedPair = tuple[int, int, np.ndarray, np.ndarray]  # indices of two photos, and matching pixels (k, 2) in each
 
 
@@ -27,14 +32,21 @@ class MatchingOptions(NamedTuple):
     device: str = "cpu"
 
 
-def build_database(photos: Photos, cameras: list, steps: StepCache, matching: MatchingOptions) -> Path:
-    """Path of a COLMAP database with verified matches of the photos; `cameras` are pycolmap cameras, one per photo."""
+def build_database(
+    photos: Photos, cameras: list, steps: StepCache, matching: MatchingOptions,
+    viewmats: Float[Tensor, "c 4 4"] | None = None,
+) -> Path:  # fmt: skip
+    """Path of a COLMAP database with verified matches of the photos; `cameras` are pycolmap cameras, one per photo.
+
+    Where the poses `viewmats` are known, verified matches are those along their epipolar lines; else a geometry is
+    fitted to the matches, which a pattern that repeats may mislead.
+    """
     extract = choose(FEATURE_EXTRACTORS, matching.matcher)
 
     def write(path: Path) -> None:
         found = steps.cached("features", lambda: extract(photos, matching.device))
         with steps.timed("matches"), features.writing_database(path.parent):
-            _write_database(path, photos, cameras, found, matching)
+            _write_database(path, photos, cameras, found, matching, viewmats)
 
     return steps.cached_file("matches.db", write)
 
@@ -61,14 +73,26 @@ def initial_cameras(photos: Photos) -> list:
 
 def verified_pairs(database: Path) -> list[MatchedPair]:
     """The pairs of photos with verified matches; photos are numbered from 0 in the order of the database."""
+    return _pairs(
+        database,
+        lambda file: ((pair, g.inlier_matches) for pair, g in zip(*file.read_two_view_geometries(), strict=True)),
+    )
+
+
+def all_pairs(database: Path) -> list[MatchedPair]:
+    """The pairs of photos with matches, verified or not, as `verified_pairs`."""
+    return _pairs(database, lambda file: zip(*file.read_all_matches(), strict=True))
+
+
+def _pairs(database: Path, read: Callable) -> list[MatchedPair]:
     import pycolmap
 
     file = pycolmap.Database.open(database)
     pixels = {image.image_id: file.read_keypoints(image.image_id)[:, :2] for image in file.read_all_images()}
     out = []
-    for pair, geometry in zip(*file.read_two_view_geometries(), strict=True):
+    for pair, matches in read(file):
         i, j = pycolmap.pair_id_to_image_pair(pair)
-        rows = np.asarray(geometry.inlier_matches)
+        rows = np.asarray(matches)
         if len(rows):
             out.append((i - 1, j - 1, pixels[i][rows[:, 0]], pixels[j][rows[:, 1]]))
     file.close()
@@ -76,8 +100,9 @@ def verified_pairs(database: Path) -> list[MatchedPair]:
 
 
 def _write_database(
-    path: Path, photos: Photos, cameras: list, found: list[features.Feature], matching: MatchingOptions
-) -> None:
+    path: Path, photos: Photos, cameras: list, found: list[features.Feature], matching: MatchingOptions,
+    viewmats: Float[Tensor, "c 4 4"] | None,
+) -> None:  # fmt: skip
     """Write cameras, photos, keypoints, matches and two-view geometries."""
     import pycolmap
 
@@ -94,13 +119,15 @@ def _write_database(
         frame.add_data_id(image.data_id)
         database.write_frame(frame, use_frame_id=True)
         database.write_keypoints(i + 1, found[i][0].numpy())
-    for i, j, matches, geometry in _match_and_verify(found, cameras, matching):
+    for i, j, matches, geometry in _match_and_verify(found, cameras, matching, viewmats):
         database.write_matches(i + 1, j + 1, matches)
         database.write_two_view_geometry(i + 1, j + 1, geometry)
     database.close()
 
 
-def _match_and_verify(found: list[features.Feature], cameras: list, matching: MatchingOptions) -> list[tuple]:
+def _match_and_verify(
+    found: list[features.Feature], cameras: list, matching: MatchingOptions, viewmats: Float[Tensor, "c 4 4"] | None
+) -> list[tuple]:
     """Matches and two-view geometry of the selected pairs; other threads verify while the next pairs are matched."""
     import pycolmap
 
@@ -111,6 +138,16 @@ def _match_and_verify(found: list[features.Feature], cameras: list, matching: Ma
     vectors = [features.normalise(descriptors) for _, descriptors, *_ in found]
     match = choose(FEATURE_MATCHERS, matching.matcher)(found, [(c.width, c.height) for c in cameras], matching.device)
 
+    def guided(i: int, j: int, matches: np.ndarray) -> tuple:
+        """The same with matches along epipolar lines: other tiles of a pattern are mostly not on them."""
+        lines = EpipolarLines(cameras[i], cameras[j], viewmats[[i, j]], pixels[i], pixels[j])
+        near = lines.distances() < MAX_EPIPOLAR_ERROR * max(cameras[i].width, cameras[i].height)
+        rows = match(i, j, near)
+        geometry = pycolmap.TwoViewGeometry()
+        geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
+        geometry.inlier_matches = rows[near[rows[:, 0], rows[:, 1]]].numpy().astype(np.uint32)
+        return i, j, matches, geometry
+
     def verify(i: int, j: int, matches: np.ndarray) -> tuple:
         geometry = pycolmap.estimate_two_view_geometry(cameras[i], pixels[i], cameras[j], pixels[j], matches, options)
         return i, j, matches, geometry
@@ -120,5 +157,5 @@ def _match_and_verify(found: list[features.Feature], cameras: list, matching: Ma
         for i, j in tqdm(features.select_pairs(vectors), desc="matching photos", unit="pair", leave=False):
             matches = match(i, j).numpy().astype(np.uint32)
             if len(matches) >= options.min_num_inliers:
-                pending.append(background.submit(verify, i, j, matches))
+                pending.append(background.submit(verify if viewmats is None else guided, i, j, matches))
         return [job.result() for job in pending]

@@ -23,12 +23,13 @@ from stages.core.errors import InputError, MissingPackage
 from stages.core.scene.cameras import Cameras, LensDistortion
 from stages.reconstruct import matching
 from stages.reconstruct.colmap import import_pycolmap
+from stages.reconstruct.epipolar import EpipolarLines
 from stages.reconstruct.matching import MatchedPair, MatchingOptions
 from stages.reconstruct.photos import Photos
 from stages.reconstruct.step_cache import StepCache
 
 log = logging.getLogger(__name__)
-MAX_EPIPOLAR_ERROR = 0.006  # median of the matches for given cameras [photo sizes]: 4 px of 640
+MIN_FITTING = 0.2  # of the matches, that given cameras explain
 MIN_IMAGE_MOTION = 0.005  # median displacement of matches of a camera that moves [photo sizes]
 CAPTURE_ADVICE = "take 10 or more sharp photos, each showing at least two thirds of what the one before it shows"
 
@@ -155,15 +156,17 @@ def triangulate(
         width, height = photos.size(i)
         params = [K[0][0], K[1][1], K[0][2], K[1][2], *k[:4], k[4], 0, 0, 0]
         known.append(pycolmap.Camera(model="FULL_OPENCV", width=width, height=height, params=params, camera_id=i + 1))
-    database = matching.build_database(photos, known, steps, options)
-    pairs = matching.verified_pairs(database)
+    database = matching.build_database(photos, known, steps, options, cameras.viewmats)
+    pairs = matching.all_pairs(database)
     if not pairs:
         raise InputError(f"{photos.source}: no two photos show the same objects clearly enough; {CAPTURE_ADVICE}")
-    error = epipolar_error(cameras, known, pairs)
-    if error > MAX_EPIPOLAR_ERROR * max(photos.size(0)):
+    lines = [EpipolarLines(known[i], known[j], cameras.viewmats[[i, j]], a, b) for i, j, a, b in pairs]
+    errors = torch.cat([pair.of_matches() for pair in lines]).numpy()
+    fitting = errors < matching.MAX_EPIPOLAR_ERROR * max(photos.size(0))
+    if fitting.mean() < MIN_FITTING:
         raise InputError(
-            f"{photos.source}: the given cameras are {error:.0f} px off what the photos show; check that they "
-            "belong to these photos (OpenGL axes and pixels of the stored photos in transforms.json)"
+            f"{photos.source}: the given cameras are {np.median(errors):.0f} px off what the photos show; check that "
+            "they belong to these photos (OpenGL axes and pixels of the stored photos in transforms.json)"
         )
     model = pycolmap.Reconstruction()
     for i, (name, viewmat) in enumerate(zip(photos.names, cameras.viewmats, strict=True)):
@@ -175,27 +178,10 @@ def triangulate(
         done = pycolmap.triangulate_points(model, database, folder, folder, options=mapper)
     if done.num_points3D() < 50:
         raise InputError(f"{photos.source}: the photos overlap too little to find depth; {CAPTURE_ADVICE}")
-    log.info("%d points found with the given cameras, which fit the photos to %.2f px", done.num_points3D(), error)
+    log.info("%d points found with the given cameras, which fit %.0f %% of the matches to %.2f px", done.num_points3D(),
+             100 * fitting.mean(), np.median(errors[fitting]))  # fmt: skip
     found = _from_colmap(done)
     return SparseModel(cameras, lenses, found.points, found.point_index, found.view_index)
-
-
-def epipolar_error(cameras: Cameras, models: list, pairs: list[MatchedPair]) -> float:
-    """Median distance of matches from the epipolar geometry of the cameras [px], first-order (Sampson 1982)."""
-    errors = []
-    for i, j, a, b in pairs:
-        a, b = _rays(models[i], a), _rays(models[j], b)
-        motion = (cameras.viewmats[j].double() @ torch.linalg.inv(cameras.viewmats[i].double())).numpy()
-        E = np.cross(motion[:3, 3], motion[:3, :3], axisb=0, axisc=0)
-        line_b, line_a = a @ E.T, b @ E
-        slope = np.sqrt((line_b[:, :2] ** 2).sum(1) + (line_a[:, :2] ** 2).sum(1))
-        errors.append(np.abs((b * line_b).sum(1)) / slope.clip(1e-12) * models[i].mean_focal_length())
-    return float(np.median(np.concatenate(errors)))
-
-
-def _rays(camera, pixels: np.ndarray) -> np.ndarray:
-    """Undistorted ray directions (k, 3), z = 1, of pixels (k, 2)."""
-    return np.pad(np.asarray(camera.cam_from_img(pixels.astype(np.float64))), ((0, 0), (0, 1)), constant_values=1)
 
 
 def _load_pycolmap(seed: int) -> ModuleType:

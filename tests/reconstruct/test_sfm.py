@@ -13,6 +13,7 @@ from stages.reconstruct import features, sfm
 from stages.reconstruct.matching import MatchingOptions
 from stages.reconstruct.photo_reader import read_photos
 from stages.reconstruct.photos import Photos, undistort
+from tests.reconstruct import raycast
 from tests.reconstruct.raycast import arc, photograph, write_set
 
 
@@ -77,6 +78,22 @@ def test_cameras_that_do_not_fit_the_photos_are_refused(tmp_path):
     photos = as_photos(cameras, tmp_path)
     with pytest.raises(InputError, match="the given cameras are .* px off"):
         sfm.triangulate(photos, cameras[[3, 2, 1, 0]], LensDistortion(torch.zeros(4, 5)))
+
+
+def test_known_cameras_work_above_a_table_whose_pattern_repeats(tmp_path, monkeypatch):
+    """Most matches join different tiles, and a geometry fitted to them is wrong."""
+    plain = raycast.texture
+
+    def tiles(u, v, seed):
+        return plain(torch.remainder(u, 0.12), torch.remainder(v, 0.12), seed) if seed == 0 else plain(u, v, seed)
+
+    monkeypatch.setattr(raycast, "texture", tiles)
+    cameras = arc(5, (320, 240), sweep=60.0)
+    model = sfm.triangulate(as_photos(cameras, tmp_path), cameras, LensDistortion(torch.zeros(5, 5)))
+    beside = (model.points[:, :2].abs() > 0.3).any(1)
+    assert len(model.points) > 100
+    assert model.points[beside, 2].abs().median() < 0.01
+    assert (model.points[:, 2] > 0.05).sum() > 20  # of the block, whose texture does not repeat
 
 
 def test_failure_reason_by_number_of_pairs():

@@ -28,7 +28,8 @@ FRAMES = 10  # frames for which a new grid has room at the present speed
 class MovingGrid:
     """Particles on a grid that follows them; `box` is the first domain [m], and the only one if it is `fixed`.
 
-    With `touch` each body has its own velocity field (mpm.Solver's bodies_touch); otherwise the grid sums exactly.
+    With `touch` each body has its own velocity field (schedule `contact` of mpm.Solver); otherwise the grid sums
+    exactly.
     """
 
     def __init__(self, particles: mpm.Particles, box: mpm.Box, dx: float, device: str, body: Int[Tensor, "p"],
@@ -36,7 +37,8 @@ class MovingGrid:
         self.box, self._body, self._objects, self._fixed = box, body, objects, fixed
         sizes = torch.bincount(body).tolist() if touch else None  # particles are in the order of their bodies
         self._copies = len(sizes) if touch else 1  # of the grid
-        self._build = lambda p, b: mpm.Solver(p, b, dx, device, sizes=sizes, bodies_touch=touch, exact=not touch)
+        schedule = "contact" if touch else "exact"
+        self._build = lambda p, b: mpm.Solver(p, b, dx, device, sizes=sizes, schedule=schedule)
         self.solver = self._build(particles, box)
 
     def advance(self, duration: float, acceleration: Float[Tensor, "p 3"]) -> None:

@@ -59,7 +59,8 @@ def falling_boxes(particles: int) -> tuple[mpm.Particles, mpm.Box, float]:
 def measure(particles: int, scenes: int, device: str, frames: int, exact: bool = False) -> dict:
     """Time per substep of a batch and figures derived from it; `exact` makes sums independent of their order."""
     one, box, dx = falling_boxes(particles)
-    solver = mpm.Solver(mpm.join_particles([one] * scenes), box, dx, device, sizes=[len(one)] * scenes, exact=exact)
+    schedule, sizes = "exact" if exact else "auto", [len(one)] * scenes
+    solver = mpm.Solver(mpm.join_particles([one] * scenes), box, dx, device, sizes=sizes, schedule=schedule)
     push = torch.tensor(GRAVITY, device=device).repeat(len(solver.rows), 1)
     step = lambda: solver.enqueue_frame(SUBSTEP * SUBSTEPS, push, SUBSTEPS)  # noqa: E731
     for _ in range(3):
@@ -80,7 +81,7 @@ def measure(particles: int, scenes: int, device: str, frames: int, exact: bool =
 def measure_three_kernel(particles: int, device: str) -> float:
     """Time per substep of one scene in the three-kernel form [s]."""
     one, box, dx = falling_boxes(particles)
-    solver = mpm.Solver(one, box, dx, device, fused=True)
+    solver = mpm.Solver(one, box, dx, device, schedule="fused")
     push = torch.tensor(GRAVITY, device=device).repeat(len(one), 1)
     solver.enqueue_frame(SUBSTEP * SUBSTEPS, push, SUBSTEPS)
     nodes = torch.zeros(solver.grid.count, 4, device=device)

@@ -99,11 +99,11 @@ def test_bodies_do_not_penetrate_a_sphere_and_slide_off_it():
     assert float(x[:, 0].mean()) > 0.1  # it was placed off centre
 
 
-@pytest.mark.parametrize("device, fused", [(d, f) for d in DEVICES for f in (False, True)])
-def test_a_moving_wall_pushes_and_a_rotating_table_carries(device, fused):
+@pytest.mark.parametrize("device, schedule", [(d, s) for d in DEVICES for s in ("split", "fused")])
+def test_a_moving_wall_pushes_and_a_rotating_table_carries(device, schedule):
     wall = Collider("box", (-0.2, 0.1, 0.1), (0.15, 0.4, 0.4), velocity=(0.5, 0.0, 0.0), friction=0.0)
     p = block((0.1, 0.1, 0.1), 0.025, E=2e5, viscosity=100.0)
-    solver = mpm.Solver(p, FREE, 0.05, device, colliders=[wall], fused=fused)
+    solver = mpm.Solver(p, FREE, 0.05, device, colliders=[wall], schedule=schedule)
     roll(solver, 0.6)
     assert solver.colliders[0].centre == pytest.approx((0.1, 0.1, 0.1))
     now = solver.particles
@@ -111,19 +111,19 @@ def test_a_moving_wall_pushes_and_a_rotating_table_carries(device, fused):
     assert 0.45 < float(now.v[:, 0].mean()) < 1.0 and float(now.x[:, 0].min()) > 0.25 - 0.05
     table = Collider("box", PLANE, (0.5, 0.5, 0.15), angular_velocity=(0.0, 0.0, 1.0), surface="sticky")
     solver = mpm.Solver(block((0.1, 0.1, 0.1), 0.025, E=2e5, viscosity=50.0, low=(0.2, -0.05, 0.13)), FREE, 0.05,
-                        device, colliders=[table], fused=fused)  # fmt: skip
+                        device, colliders=[table], schedule=schedule)  # fmt: skip
     roll(solver, 0.6, (0.0, 0.0, -9.81))
     x, y = solver.particles.x[:, :2].mean(0).tolist()
     assert math.atan2(y, x) == pytest.approx(0.6, abs=0.1)  # radians, after 0.6 s at 1 rad/s
 
 
-@pytest.mark.parametrize("device, fused", [(d, f) for d in DEVICES for f in (False, True)])
-def test_a_kinematic_body_moves_as_prescribed_and_drags_others(device, fused):
+@pytest.mark.parametrize("device, schedule", [(d, s) for d in DEVICES for s in ("split", "fused")])
+def test_a_kinematic_body_moves_as_prescribed_and_drags_others(device, schedule):
     low, high = block((0.3, 0.2, 0.1), 0.025), block((0.1, 0.1, 0.1), 0.025, low=(0.1, 0.05, 0.11), viscosity=50.0)
     p = mpm.join_particles([low, high])
     p.held[: len(low)] = 1
     p.v[: len(low), 0] = 0.3
-    solver = mpm.Solver(p, FREE, 0.05, device, fused=fused)
+    solver = mpm.Solver(p, FREE, 0.05, device, schedule=schedule)
     roll(solver, 0.5, (0.0, 0.0, -9.81))
     end = mpm.Particles(*(getattr(solver.particles, f).cpu() for f in p.__dataclass_fields__))
     torch.testing.assert_close(end.x[: len(low)] - low.x, torch.tensor([[0.15, 0.0, 0.0]]).expand(len(low), 3),

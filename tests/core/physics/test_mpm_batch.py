@@ -9,7 +9,7 @@ from tests.conftest import DEVICES
 from tests.core.physics.test_mpm import block
 
 BOX, DX, SUBSTEPS, GRAVITY = mpm.Box((-0.3, -0.3, 0.0), (0.5, 0.5, 0.6)), 0.05, 40, (0.0, 0.0, -9.81)
-ORDERS = [("cpu", False), ("cpu", True)] + [("cuda", True)] * (len(DEVICES) > 1)
+ORDERS = [("cpu", "split"), ("cpu", "fused")] + [("cuda", "fused")] * (len(DEVICES) > 1)
 
 
 def scenes() -> dict[str, mpm.Particles]:
@@ -23,13 +23,13 @@ def scenes() -> dict[str, mpm.Particles]:
     return made
 
 
-@pytest.mark.parametrize("device, fused", ORDERS)
-def test_scenes_of_a_batch_are_independent(device, fused):
+@pytest.mark.parametrize("device, schedule", ORDERS)
+def test_scenes_of_a_batch_are_independent(device, schedule):
     # sums are split into parts at other particles: rounding
     batch = Batch(scenes(), BOX, DX, device)
     together = [frame for frame in batch.frames(7, 0.02, SUBSTEPS, GRAVITY)][-1]
     for name, particles in scenes().items():
-        alone = mpm.Solver(particles, BOX, DX, device, fused=fused)
+        alone = mpm.Solver(particles, BOX, DX, device, schedule=schedule)
         for _ in range(6):
             alone.advance(0.02, torch.tensor(GRAVITY).repeat(len(particles), 1), SUBSTEPS)
         torch.testing.assert_close(together.of(name).x, alone.particles.x, rtol=0, atol=2e-5)

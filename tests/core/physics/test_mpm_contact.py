@@ -22,7 +22,8 @@ def block(low: tuple, high: tuple, friction: float = 0.3, speed: float = 0.0, he
 def solve(bodies: list[Particles], frames: int, gravity: float, touch: bool = True) -> tuple[list, list]:
     """Positions and velocities of each body after frames of 0.02 s."""
     sizes = [len(b) for b in bodies]
-    solver = Solver(join_particles(bodies), BOX, DX, sizes=sizes if touch else None, bodies_touch=touch)
+    choice = {"sizes": sizes, "schedule": "contact"} if touch else {}
+    solver = Solver(join_particles(bodies), BOX, DX, **choice)
     held = solver.particles.held > 0
     pull = torch.tensor([0.0, 0.0, -gravity]) * ~held[:, None]
     for _ in range(frames):
@@ -65,6 +66,6 @@ def test_three_blocks_at_one_place_keep_their_momentum():
     torch.testing.assert_close(total, torch.tensor([1.0, 0.0, 0.0]), rtol=0, atol=2e-3)
 
 
-def test_the_fused_schedule_has_one_velocity_at_a_node():
-    with pytest.raises(ValueError, match="fused=False"):
-        Solver(block((0, 0, 0), (0.2, 0.2, 0.2)), BOX, DX, fused=True, bodies_touch=True)
+def test_unknown_schedules_are_refused():
+    with pytest.raises(ValueError, match="'both' is not a schedule"):
+        Solver(block((0, 0, 0), (0.2, 0.2, 0.2)), BOX, DX, schedule="both")

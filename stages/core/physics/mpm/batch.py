@@ -62,7 +62,7 @@ class Batch:
         sizes = [len(p) for p in scenes.values()]
         self.starts = tuple([0, *torch.tensor(sizes).cumsum(0).tolist()])
         self.solver = Solver(join_particles(list(scenes.values())), box, dx, device, sizes=sizes,
-                             colliders=colliders, damping=damping, exact=exact)  # fmt: skip
+                             colliders=colliders, damping=damping, schedule="exact" if exact else "auto")  # fmt: skip
         self._failure_frame = torch.full((len(sizes),), -1, dtype=torch.int32, device=device)
         self._frame = 0
 

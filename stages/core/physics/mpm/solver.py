@@ -34,6 +34,7 @@ from stages.core.physics.mpm.split import BodyContact, SplitSubsteps
 SAFETY = 0.5  # fraction of a cell that a wave and a particle may cross in a substep, see substep_rate
 VISCOUS = 0.15  # maximum of dt eta / (density dx^2); violent vibration diverges from 0.3
 FLOOR_GAP = mpm_grid.FLOOR_GAP
+SCHEDULES = ("auto", "split", "fused", "exact", "contact")
 SUBSTEP_MULTIPLE = 8  # on a GPU substeps per frame are a multiple of this, so that few CUDA graphs are captured
 
 
@@ -124,20 +125,31 @@ class Solver:
     """Particles in a box with grid spacing `dx` [m]; `advance` moves them through one frame.
 
     `sizes` gives the number of particles of each scene of a batch; scenes have the same box and colliders and do not
-    interact. `damping` (0 to 1) removes that fraction of the symmetric part of C at every transfer (RPIC). `fused`
-    selects the schedule, by default the faster one for the device. `exact` sums in fixed point: a GPU then gives the
-    same bytes in every run at about twice the time, and a scene the same result in any batch (unless a surface has
-    restitution, whose stiffness follows from the stiffest material of the batch). With `bodies_touch` the scenes are
-    bodies in one space, each with its own velocity field, in contact with Coulomb friction (kernels/mpm/contact.py; not
-    `fused`); otherwise bodies in one scene share the velocity of a node, and stick to each other. Raises ValueError for
-    sizes that do not fit the particles and for grids that are too large.
+    interact. `damping` (0 to 1) removes that fraction of the symmetric part of C at every transfer (RPIC). `schedule`
+    is one of
+
+        auto      `split` on a CPU, `fused` on a GPU
+        split     two launches per substep (split.py)
+        fused     one launch per substep (fused.py)
+        exact     `fused` with sums in fixed point: a GPU then gives the same bytes in every run at about twice the
+                  time, and a scene the same result in any batch (unless a surface has restitution, whose stiffness
+                  follows from the stiffest material of the batch)
+        contact   `split`, and the scenes are bodies in one space, each with its own velocity field, in contact with
+                  Coulomb friction (kernels/mpm/contact.py); otherwise bodies in one scene share the velocity of a
+                  node, and stick to each other
+
+    Raises ValueError for another schedule, sizes that do not fit the particles, and grids that are too large.
     """
 
     def __init__(
         self, particles: Particles, box: Box, dx: float, device: str = "cpu", *, sizes: Sequence[int] | None = None,
-        colliders: Sequence[Collider] = (), damping: float = 0.0, fused: bool | None = None, exact: bool = False,
-        bodies_touch: bool = False,
+        colliders: Sequence[Collider] = (), damping: float = 0.0, schedule: str = "auto",
     ):  # fmt: skip
+        if schedule not in SCHEDULES:
+            raise ValueError(f"{schedule!r} is not a schedule of the solver; choose from {', '.join(SCHEDULES)}")
+        if schedule == "auto":
+            schedule = "split" if device == "cpu" else "fused"
+        exact, fused = schedule == "exact", schedule in ("fused", "exact")
         self.device, self.dx, self.grid = device, dx, make_grid(box, dx)
         sizes = [len(particles)] if sizes is None else list(sizes)
         if sum(sizes) != len(particles) or min(sizes) < 1:
@@ -150,14 +162,11 @@ class Solver:
         self._obstacles = as_obstacles(self.colliders, device)
         self._rates = self._max_rates()
         self.grid.spring = self._rates[0] / (2 * dx)  # as stiff as the bodies, so that the CFL substep is stable
-        fused = exact or (device != "cpu" and not bodies_touch if fused is None else fused)
-        if fused and bodies_touch:
-            raise ValueError("the fused schedule has one velocity at a node: bodies_touch needs fused=False")
         plastic = bool((particles.model != NEO_HOOKEAN).any())
         bouncy = any(surface.restitution > 0 for surface in (box, *self.colliders))
         options = self.rows, plastic, bouncy, damping, self._obstacles
         quanta = self._quanta() if exact else None
-        contact = self._body_contact(particles, sizes) if bodies_touch else None
+        contact = self._body_contact(particles, sizes) if schedule == "contact" else None
         self._substepper = FusedSubsteps(*options, quanta) if fused else SplitSubsteps(*options, contact)
         self._substep_multiple = SUBSTEP_MULTIPLE if fused and device != "cpu" else 1
 

@@ -41,7 +41,8 @@ class PackedArray:
 
 def whole(values: Int[Tensor, "r c"]) -> PackedArray:
     """Non-negative integers, stored exactly in as few bytes as they need."""
-    return PackedArray(values.long().cpu(), (0.0,), (1.0,), max(1, int(values.max()).bit_length()) if values.numel() else 1)
+    bits = max(1, int(values.max()).bit_length()) if values.numel() else 1
+    return PackedArray(values.long().cpu(), (0.0,), (1.0,), bits)
 
 
 def exact(values: Float[Tensor, "r c"]) -> PackedArray:

@@ -185,7 +185,7 @@ class _Record:
 
     def _earlier(self) -> dict[str, str]:
         try:
-            data = parse_json(self.path.read_text())
+            data = parse_json(self.path.read_text(encoding="utf-8"))
         except ValueError as error:
             raise InputError(f"{self.path}: is damaged ({quote(error)}); ask again without --resume") from error
         if not isinstance(data, dict) or {k: data.get(k) for k in self.head} != self.head or \

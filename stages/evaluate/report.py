@@ -42,7 +42,8 @@ def write_report(path: Path, result: Result, prediction: Path, truth: Path) -> N
         body, style = [*body, f"<script>{film.SCRIPT}</script>"], STYLE + film.STYLE
     head = f'<meta charset="utf-8"><title>{escape(title)}</title><style>{style}</style>'
     with replacing(path) as part:
-        part.write_text(f"<!doctype html>\n<html><head>{head}</head><body>\n" + "\n".join(body) + "\n</body></html>\n")
+        page = f"<!doctype html>\n<html><head>{head}</head><body>\n" + "\n".join(body) + "\n</body></html>\n"
+        part.write_bytes(page.encode(errors="replace"))  # file names need not be UTF-8
 
 
 def _table(result: Result) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator
@@ -23,6 +24,7 @@ from stages.reconstruct.photos import Photos
 MAX_SIDE = 1024  # longest side for feature extraction [px]
 # Features kept per photo, the largest first; matching time grows with the square.
 MAX_FEATURES, MAX_FEATURES_MANY_PHOTOS = 6000, 3000
+MAX_FOLDER_PATH = 440  # of a COLMAP database, whose own path SQLite limits to 512 bytes
 DATABASE_BYTES = 1_500_000  # of the features of a photo in a COLMAP database
 MAX_EXHAUSTIVE = 60  # up to this many photos all pairs are matched
 MAX_RATIO = 0.8  # of the distances of best and second best match (Lowe 2004)
@@ -62,6 +64,10 @@ def _grey(image: UInt8[Tensor, "h w 3"]) -> tuple[float, np.ndarray]:
 @contextmanager
 def writing_database(folder: Path) -> Iterator[None]:
     """COLMAP's errors in writing its database, such as those of a full disk, as an InputError that names the folder."""
+    length = len(os.fsencode(folder.absolute()))
+    if length > MAX_FOLDER_PATH:
+        raise InputError(f"the path of the folder {folder.name} has {length} bytes; COLMAP's database can be in one of "
+                         f"at most {MAX_FOLDER_PATH}: write to a folder with a shorter path, or set TMPDIR to one")
     try:
         yield
     except RuntimeError as error:

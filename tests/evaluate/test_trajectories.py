@@ -17,6 +17,8 @@ from stages.evaluate.options import EvaluateOptions
 from stages.evaluate.result import Result
 from stages.evaluate.stage import run
 from stages.evaluate.trajectories import transfer_motion
+from stages.simulate.options import SimulateOptions
+from stages.simulate.stage import with_recorded
 from tests.conftest import ring
 from tests.evaluate.motions import renamed, rotation, transformed_scene, write_motion
 
@@ -158,3 +160,12 @@ def test_report_draws_the_first_the_middle_and_the_last_view(two_balls):
     drawn = draw_objects(Result("trajectories", {}, {}, []), scene, EvaluateOptions())
     assert [p.caption for p in drawn.pictures] == [scene.cameras.names[i] for i in (0, 2, 4)]
     assert drawn.legend.keys() == {"red ball", "green ball"}
+
+
+def test_suffixes_may_be_in_capitals(tmp_path, two_balls):
+    for name in ("MINE.H5", "TRUE.H5"):
+        write_motion(tmp_path / name, two_balls)
+    facts = run(tmp_path / "MINE.H5", tmp_path / "TRUE.H5", None, EvaluateOptions())
+    assert facts["kind"] == "trajectories" and facts["overall"]["FPE"] == 0
+    options = SimulateOptions(forces=tmp_path / "MINE.H5")
+    assert with_recorded(options).steps == 12 and with_recorded(SimulateOptions()).steps == SimulateOptions().steps

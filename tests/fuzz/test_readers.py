@@ -4,6 +4,7 @@ import json
 import os
 import signal
 import time
+from contextlib import nullcontext
 from pathlib import Path
 
 import h5py
@@ -119,3 +120,30 @@ def test_headers_of_ply_that_say_nothing_are_refused(tmp_path, line):
     (tmp_path / "s.ply").write_bytes(data)
     with pytest.raises(InputError, match="s.ply"):
         read_scene(tmp_path / "s.ply")
+
+
+@pytest.mark.parametrize(("name", "value", "message"), [
+    ("field/nu", 0.51, "nu must be from -1 to 0.5"), ("field/solidity", 0.9, "solidity must be from 1"),
+    ("field/mass_fraction", 1.01, "mass_fraction must be from 0"), ("binding/weight", 1.01, "weight must be from"),
+    ("binding/index", 12, "binding"), ("field/awake", 2, "awake must be from 0 to 1"),
+])  # fmt: skip
+def test_values_out_of_range_are_refused(tmp_path, name, value, message):
+    write_trajectory(tmp_path / "t.h5")
+    with h5py.File(tmp_path / "t.h5", "a") as file:
+        file[name][...] = value
+    with pytest.raises(InputError, match=message):
+        read_trajectory(tmp_path / "t.h5")
+
+
+@pytest.mark.parametrize(("weight", "right"), [(0.0, True), (0.5, False)])
+def test_what_is_bound_to_nothing_has_no_weights(tmp_path, weight, right):
+    write_trajectory(tmp_path / "t.h5")
+    with h5py.File(tmp_path / "t.h5", "a") as file:
+        file["binding/index"][3], file["binding/weight"][3] = -1, weight
+    with nullcontext() if right else pytest.raises(InputError, match="t.h5"):
+        read_trajectory(tmp_path / "t.h5")
+
+
+def test_files_that_are_absent_are_named(tmp_path):
+    with pytest.raises(InputError, match="absent.h5: no such file; a trajectory"):
+        read_trajectory(tmp_path / "absent.h5")

@@ -114,11 +114,13 @@ def test_labels_may_be_any_numbers_but_not_more_than_a_thousand(scene_file, trut
 
 
 @pytest.mark.parametrize(("names", "ids"), [({"1": "duck"}, [1, 3]), ({"255": "duck"}, [1, 3, 255]), ({}, [1, 3, 255])])
-def test_255_is_ignored_where_names_do_not_have_it(scene_file, truth, tmp_path, names, ids):
+def test_255_is_ignored_where_names_do_not_have_it(scene_file, truth, tmp_path, caplog, names, ids):
+    caplog.set_level(logging.INFO)
     folder = write_masks(tmp_path / "masks", truth, [torch.tensor([0, 1, 255, 3])[m] for m in true_masks(truth)])
     (folder / "names.json").write_text(json.dumps(names))
     run(scene_file, tmp_path / "out.ply", SegmentOptions(masks=folder))
     labelled = read_scene(tmp_path / "out.ply")
+    assert f"out.ply: {len(ids)} objects" in caplog.text
     assert [o.id for o in labelled.objects] == ids == labelled.gaussians.object_id.unique().tolist()[1:]
 
 

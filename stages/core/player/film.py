@@ -100,10 +100,11 @@ def film_page(film: bytes, title: str) -> str:
     """The HTML file that plays a film from `pack_film`; it fetches nothing."""
     modules = {f"player/{file.name}": _data_url(file) for file in sorted(WEB.glob("*.js"))}
     parts = {
-        "TITLE": escape(title), "STYLE": (WEB / "style.css").read_text(),
+        "TITLE": escape(title.encode(errors="replace").decode()),  # a file name need not be UTF-8
+        "STYLE": (WEB / "style.css").read_text(encoding="utf-8"),
         "IMPORTS": json.dumps({"imports": modules}), "FILM": base64.b64encode(film).decode(),
     }  # fmt: skip
-    return fill_template((WEB / "index.html").read_text(), parts)
+    return fill_template((WEB / "index.html").read_text(encoding="utf-8"), parts)
 
 
 def fill_template(template: str, parts: dict[str, str]) -> str:

@@ -65,9 +65,9 @@ def read_answers(study: Path, paths: Sequence[Path]) -> Answers:
     missing = unplayable = 0
     for row, path in enumerate(paths):
         data = read_json_file(path, "the answers of a participant")
-        if data.get("study") != key["study"] or data.get("participant") not in participants:
+        if data.get("study") != key["study"] or str(data.get("participant")) not in participants:
             raise InputError(f"{path}: is not of the study {study}; leave it out")
-        who = data["participant"]
+        who = str(data["participant"])
         if who in seen:
             raise InputError(f"{path}: is of participant {who}, as {seen[who]} is; leave one of them out")
         seen[who] = path

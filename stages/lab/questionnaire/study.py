@@ -64,7 +64,7 @@ def run(folder: Path, out: Path, options: StudyOptions) -> list[str]:
     study = hashlib.sha256(json.dumps(content).encode()).hexdigest()[:12]
     for participant, shown in participants.items():
         with replacing(pages / f"{participant}.html") as part:
-            part.write_text(_page(study, participant, shown))
+            part.write_text(_page(study, participant, shown), encoding="utf-8")
     with replacing(out / "key.json") as part:  # last: a study with a key is complete
         info = {"study": study, **content, "provenance": provenance("questionnaire", [folder], options)}
         part.write_text(json.dumps(info, indent=1) + "\n")
@@ -112,7 +112,8 @@ def _page(study: str, participant: str, films: list[str]) -> str:
         + f"<small>{high}</small></fieldset>"
         for name, (question, _, low, high) in SCALES.items()
     )
-    return fill_template((WEB / "page.html").read_text(), {
+    return fill_template((WEB / "page.html").read_text(encoding="utf-8"), {
         "PARTICIPANT": participant, "COUNT": str(len(films)), "EXPLANATIONS": explanations, "QUESTIONS": questions,
-        "STUDY": json.dumps(data), "STYLE": (WEB / "page.css").read_text(), "SCRIPT": (WEB / "page.js").read_text(),
+        "STUDY": json.dumps(data), "STYLE": (WEB / "page.css").read_text(encoding="utf-8"),
+        "SCRIPT": (WEB / "page.js").read_text(encoding="utf-8"),
     })  # fmt: skip

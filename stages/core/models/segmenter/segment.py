@@ -68,8 +68,8 @@ def load_segmenter(path: Path, device: torch.device | str = "cpu") -> Segmenter:
     try:
         blocks, widths = whole(card["config"]["blocks"], "blocks", 1, MAX_BLOCKS), card["config"]["widths"]
         widths = tuple(whole(width, "widths", 1, MAX_CONFIG) for width in widths[:MAX_LEVELS])
-        with torch.device("meta"):  # shapes first: they may need any amount of memory
-            Segmenter(widths, blocks).load_state_dict(state, assign=True)
+        if blocks * sum(w * w for w in widths) > sum(v.numel() for v in state.values()):  # before it takes memory
+            raise ValueError("the card is of a larger network")
         model = Segmenter(widths, blocks)
         model.load_state_dict(state)
     except (KeyError, IndexError, TypeError, ValueError, RuntimeError) as error:

@@ -144,3 +144,8 @@ def test_a_body_without_points_has_the_identity_rotation():
     points = torch.tensor([[1.0, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]])
     fitted = fit_rotations(points, points @ TURN.mT, torch.full((4,), 2))
     torch.testing.assert_close(fitted, torch.stack([torch.eye(3), torch.eye(3), TURN]), rtol=0, atol=1e-4)
+
+
+def test_a_scene_without_objects_has_no_keypoints():
+    keypoints = choose_keypoints(replace(scene_of("cloud"), objects=()), 8)
+    assert keypoints.rest.shape == (0, 3) and keypoints.object_id.shape == (0,)

@@ -21,7 +21,7 @@ from stages.core.backends import describe, load
 from stages.evaluate.options import EvaluateOptions
 from stages.reconstruct.options import BACKENDS as RECONSTRUCT
 from stages.reconstruct.options import FEATURE_EXTRACTORS as MATCHERS
-from stages.reconstruct.options import QUALITY_PRESETS, ReconstructOptions
+from stages.reconstruct.options import QUALITY_PRESETS, SYNCHRONISATIONS, ReconstructOptions
 from stages.refine.options import BACKENDS as REFINE
 from stages.refine.options import GENERATORS, RefineOptions
 from stages.render.options import OUTPUT_FORMATS, VIEWS, RenderOptions
@@ -57,8 +57,25 @@ def ngff(
 
 @app.command()
 def reconstruct(
-    imgs: Annotated[Path, Argument(metavar="PHOTOS", help="folder of photos, or a video", show_default=False)],
+    imgs: Annotated[
+        Path, Argument(metavar="PHOTOS", help="folder of photos, or a video; with --sequence a folder of films",
+                       show_default=False)
+    ],
     out: Annotated[Path, Option("-o", "--out", help="scene to write (.ply)")] = Path("scene.ply"),
+    sequence: Annotated[
+        bool, Option("--sequence", help="PHOTOS has a video, or a folder of frames, for each of several fixed cameras: "
+                     "reconstruct the moment at which the objects are released")
+    ] = ReconstructOptions.sequence,
+    sync: Annotated[
+        str, Option(help="with --sequence, how films are aligned in time: " + " | ".join(SYNCHRONISATIONS))
+    ] = ReconstructOptions.sync,
+    offsets: Annotated[
+        str, Option(help='with --sequence, in place of --sync: the frame of each film at one moment, '
+                    '"A.mp4=0,B.mp4=3.33"')
+    ] = ReconstructOptions.offsets,
+    fps: Annotated[
+        float, Option(help="with --sequence: frames a second of folders of frames")
+    ] = ReconstructOptions.fps,
     backend: Annotated[str, Option(help=" | ".join(RECONSTRUCT))] = ReconstructOptions.backend,
     matcher: Annotated[
         str, Option(help="features matched between photos: " + " | ".join(MATCHERS) + "; the learned ones match photos "
@@ -102,9 +119,9 @@ def reconstruct(
     Cameras are estimated from the photos unless given; the scene is rotated upright with its floor at z = 0.
     """
     options = ReconstructOptions(
-        backend=backend, matcher=matcher, cameras=cameras, holdout=holdout, quality=quality, resolution=resolution,
-        up=up, scale_reference=scale_reference, resume=resume, weights=weights, download=download,
-        iterations=iterations, seed=seed, device=device,
+        sequence=sequence, sync=sync, offsets=offsets, fps=fps, backend=backend, matcher=matcher, cameras=cameras,
+        holdout=holdout, quality=quality, resolution=resolution, up=up, scale_reference=scale_reference,
+        resume=resume, weights=weights, download=download, iterations=iterations, seed=seed, device=device,
     )  # fmt: skip
     load("stages.reconstruct.stage:run")(imgs, out, options)
 

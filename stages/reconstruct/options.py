@@ -22,6 +22,7 @@ FEATURE_MATCHERS = {
     "aliked-lightglue": "stages.reconstruct.features_learned:make_matcher",
 }
 UP_SIDES = ("top", "right", "bottom", "left")  # of photos, where up may be
+SYNCHRONISATIONS = ("motion", "audio")
 SINGLE_PHOTO_BACKENDS = {"pi3", "pi3-splat"}  # backends that accept a single photo
 
 
@@ -47,6 +48,10 @@ QUALITY_PRESETS = {
 class ReconstructOptions:
     """Options of `ngff reconstruct`; raises InputError for values out of range."""
 
+    sequence: bool = False  # the photos are the first frames of films, in a folder with one for each camera
+    sync: str = "motion"  # of SYNCHRONISATIONS, by which films are aligned in time
+    offsets: str = ""  # of the films in place of that: "A.mp4=0,B.mp4=3.33" [frames]
+    fps: float = 50.0  # frames a second of folders of frames
     backend: str = "classic"
     matcher: str = "sift"  # of features, for the classic backend
     cameras: Path | None = None  # known cameras: a nerfstudio transforms.json or a COLMAP model folder
@@ -73,6 +78,12 @@ class ReconstructOptions:
             raise InputError(f"--holdout {self.holdout}: give 0 for none, or 2 or more for every N-th photo")
         if self.resolution is not None and not 64 <= self.resolution <= 4096:
             raise InputError(f"--resolution {self.resolution}: the longest side must be 64 to 4096 pixels")
+        if self.sync not in SYNCHRONISATIONS:
+            raise InputError(f"--sync {self.sync}: choose from {', '.join(SYNCHRONISATIONS)}")
+        if not 0.1 <= self.fps <= 100_000:
+            raise InputError(f"--fps {self.fps:g}: give the frames a second, 0.1 to 100000")
+        if not self.sequence and (self.offsets or self.sync != "motion"):
+            raise InputError("--sync and --offsets: only with --sequence")
         parse_scale(self.scale_reference)
         if self.iterations is not None and self.iterations < 0:
             raise InputError(f"--iterations {self.iterations}: give 0 for none, or more")

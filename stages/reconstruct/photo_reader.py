@@ -9,8 +9,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import cv2
-import numpy as np
-import torch
 from jaxtyping import UInt8
 from torch import Tensor
 from tqdm import tqdm
@@ -18,7 +16,8 @@ from tqdm import tqdm
 from stages.core.errors import InputError
 from stages.core.scene.files import must_exist
 from stages.core.scene.formats import IMAGE_SUFFIXES, VIDEO_SUFFIXES
-from stages.core.scene.images import import_av, list_photos, open_video, read_8_bit
+from stages.core.scene.images import import_av, list_photos, open_video, read_8_bit, reduce_frame
+from stages.core.scene.recordings import limit_size
 from stages.reconstruct.colmap import import_pycolmap
 from stages.reconstruct.photos import Photos
 
@@ -117,11 +116,11 @@ def _read_files(files: list[Path], side: int, unread: dict[str, str]) -> Iterato
         try:
             if _is_truncated(must_exist(file, "a photo")):
                 raise InputError(f"{file}: is truncated; copy it again from its source")
-            image = read_8_bit(file).numpy()
+            image = read_8_bit(file)
         except InputError as error:
             unread[file.name] = str(error)
             continue
-        bounded = _limit_size(image, side)
+        bounded = limit_size(image, side)
         height, width = image.shape[:2]
         focal = _exif_focal(file) * max(bounded.shape[:2]) / max(width, height)
         yield i, LoadedImage(file.name, bounded, focal, (width, height))
@@ -184,12 +183,7 @@ def _frames(path: Path, times: list[float], spans: int, side: int) -> Iterator[t
                 if i % interval and seen[span]:
                     continue
                 seen[span] += 1
-                shrink = min(1.0, side / max(frame.width, frame.height))
-                size = max(2, round(frame.width * shrink)), max(2, round(frame.height * shrink))
-                pixels = frame.reformat(*size, format="rgb24", interpolation="AREA").to_ndarray()
-                turns = round(getattr(frame, "rotation", 0) / 90)
-                full = (frame.height, frame.width) if turns % 2 else (frame.width, frame.height)
-                image = torch.from_numpy(np.ascontiguousarray(np.rot90(pixels, turns)))
+                image, full = reduce_frame(frame, side)
                 yield span, LoadedImage(f"frame_{i:05d}", image, 0.0, full)
         except import_av(path).FFmpegError as error:
             log.warning("%s: is truncated or damaged (%s); the frames before are used", path, error.strerror)
@@ -207,15 +201,5 @@ def _sharpest(photos: Iterable[tuple[int, LoadedImage]], spans: int) -> list[Loa
 
 def sharpness(image: UInt8[Tensor, "h w 3"]) -> float:
     """Variance of the Laplacian of the grey image, at most 512 px large."""
-    grey = cv2.cvtColor(_limit_size(image.numpy(), 512).numpy(), cv2.COLOR_RGB2GRAY)
+    grey = cv2.cvtColor(limit_size(image, 512).numpy(), cv2.COLOR_RGB2GRAY)
     return float(cv2.Laplacian(grey, cv2.CV_32F).var())
-
-
-def _limit_size(pixels: np.ndarray, side: int) -> UInt8[Tensor, "h2 w2 3"]:
-    """The image, reduced to at most `side` pixels."""
-    height, width = pixels.shape[:2]
-    shrink = min(1.0, side / max(height, width))
-    if shrink < 1:
-        size = max(1, round(width * shrink)), max(1, round(height * shrink))
-        pixels = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
-    return torch.from_numpy(np.ascontiguousarray(pixels))

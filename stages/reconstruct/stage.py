@@ -47,11 +47,19 @@ class Report:
 def run(imgs: Path, out: Path, options: ReconstructOptions = ReconstructOptions()) -> Report:  # noqa: B008 -- frozen
     """Reconstruct a folder of photos or a video: photos/ -> scene.ply. Scores of held-out photos go to stdout.
 
+    With `options.sequence` the folder has a film of each camera: their frames at the release are reconstructed.
+
     Finished steps are kept in a hidden folder next to `out` until the scene is written; an interrupted run leaves it
     for `options.resume`. Raises InputError, and deletes the folder, where the photos or options do not work.
     """
     began, backend = time.monotonic(), choose(BACKENDS, options.backend)
-    photos = read_photos(imgs, options.max_side, min_count=1 if options.backend in SINGLE_PHOTO_BACKENDS else 2)
+    if options.sequence:
+        from stages.reconstruct.filmed_sequence import read_sequence  # noqa: PLC0415 -- most runs read photos
+
+        photos, sequence = read_sequence(imgs, options)
+    else:
+        photos = read_photos(imgs, options.max_side, min_count=1 if options.backend in SINGLE_PHOTO_BACKENDS else 2)
+        sequence = None
     if known := parse_scale(options.scale_reference):
         known.check(photos.names)
     steps = StepCache.for_output(out, _cache_key(photos, options), options.resume)
@@ -60,7 +68,7 @@ def run(imgs: Path, out: Path, options: ReconstructOptions = ReconstructOptions(
         inputs = [Path(imgs), *([options.cameras] if options.cameras else [])]
         facts = {**provenance("reconstruct", inputs, replace(options, resume=False)), **seconds_since(began),
                  **made.scene.provenance}  # fmt: skip
-        write_scene(out, replace(made.scene, provenance=facts))
+        write_scene(out, replace(made.scene, provenance=facts, sequence=sequence))
     except InputError:
         steps.remove()
         raise

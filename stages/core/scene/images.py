@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -20,6 +21,7 @@ from stages.core.errors import InputError, MissingPackage
 from stages.core.scene.files import must_exist, replacing
 from stages.core.scene.formats import IMAGE_SUFFIXES
 
+log = logging.getLogger(__name__)
 NOT_JUDGED = 255  # value of pixels of label images that are left out
 MAX_VIDEO_PIXELS = 1 << 26  # of a frame; 8K has half as many
 ENCODER_THREADS = 4  # fixed, since the file depends on the number of threads
@@ -195,6 +197,30 @@ def read_video(path: Path) -> Iterator[Float[Tensor, "h w 3"]]:
                 yield torch.from_numpy(frame.to_ndarray(format="rgb24").astype(np.float32) / 255)
         except import_av(path).FFmpegError as error:
             raise InputError(f"{path}: the video breaks off or is damaged ({error.strerror})") from error
+
+
+def read_reduced_video(path: Path, side: int) -> Iterator[tuple[UInt8[Tensor, "h w 3"], tuple[int, int]]]:
+    """The frames of a video as it is shown, reduced to at most `side` pixels, and their width and height before.
+
+    Ends with a warning where the video breaks off.
+    """
+    with open_video(path) as file:
+        file.streams.video[0].thread_type = "AUTO"
+        try:
+            for frame in file.decode(video=0):
+                yield reduce_frame(frame, side)
+        except import_av(path).FFmpegError as error:
+            log.warning("%s: is truncated or damaged (%s); the frames before are used", path, error.strerror)
+
+
+def reduce_frame(frame: Any, side: int) -> tuple[UInt8[Tensor, "h w 3"], tuple[int, int]]:
+    """A frame of PyAV turned as it is shown and reduced to at most `side` pixels, and its width and height before."""
+    shrink = min(1.0, side / max(frame.width, frame.height))
+    size = max(2, round(frame.width * shrink)), max(2, round(frame.height * shrink))
+    pixels = frame.reformat(*size, format="rgb24", interpolation="AREA").to_ndarray()
+    turns = round(getattr(frame, "rotation", 0) / 90)
+    full = (frame.height, frame.width) if turns % 2 else (frame.width, frame.height)
+    return torch.from_numpy(np.ascontiguousarray(np.rot90(pixels, turns))), full
 
 
 def sample_frames(video: Path, count: int, longest: int) -> list[bytes]:

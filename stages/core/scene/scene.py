@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from stages.core.scene.cameras import Cameras
 from stages.core.scene.gaussians import Gaussians
 from stages.core.scene.schema import number, numbers, rows, text, texts, whole
+from stages.core.scene.sequence import FilmedSequence
 
 UNKNOWN_SCALE = ("assumed", "not stated")  # beginnings of `source` where the scale is not known
 
@@ -33,6 +34,7 @@ class Scene:
     scale: dict = field(default_factory=lambda: {"metres_per_unit": 1.0, "source": "not stated"})
     provenance: dict = field(default_factory=dict)
     background: tuple[float, float, float] | None = None  # RGB 0..1 where there is no Gaussian
+    sequence: FilmedSequence | None = None  # the films of which the scene is the first frame
 
     @property
     def metres_per_unit(self) -> float:

@@ -18,6 +18,7 @@ from stages.core.scene.gaussians import Gaussians
 from stages.core.scene.packed_ply import is_packed, unpack
 from stages.core.scene.scene import Scene, SceneObject, read_metadata, read_objects
 from stages.core.scene.schema import LARGEST, MAX_OBJECT_ID, check_ply_counts, number, parse_json, reason
+from stages.core.scene.sequence import read_sequence_json
 
 log = logging.getLogger(__name__)
 VERSION = 1
@@ -132,6 +133,7 @@ def _with_header(path: Path, gaussians: Gaussians, comments: list[str]) -> Scene
                 metadata.get("provenance", [{}])[0],
                 metadata.get("background", [None])[0],
             ),
+            sequence=read_sequence_json(metadata.get("sequence", [None])[0]),
         )
     except (ValueError, KeyError, TypeError, AttributeError, RuntimeError) as error:
         why = reason(error)
@@ -167,6 +169,7 @@ def write_scene(path: Path, scene: Scene) -> None:
 def _header(scene: Scene) -> list[str]:
     metadata = [("version", VERSION), ("up", [0, 0, 1]), ("scale", scene.scale), ("floor", scene.floor)]
     metadata += [("background", scene.background)] if scene.background else []
+    metadata += [("sequence", scene.sequence.to_json())] if scene.sequence else []
     metadata += [("object", {"id": o.id, "name": o.name, "material": o.material}) for o in scene.objects]
     metadata += [("camera", row) for row in (camera_json.to_json(scene.cameras) if scene.cameras else [])]
     metadata += [("provenance", scene.provenance)]

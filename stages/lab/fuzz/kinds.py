@@ -29,6 +29,7 @@ from stages.core.scene.images import VideoWriter, read_image, read_labels, read_
 from stages.core.scene.npz import read_npz
 from stages.core.scene.scene import Scene, SceneObject
 from stages.core.scene.scene_ply import read_scene, write_scene
+from stages.core.scene.sequence import FilmedSequence
 from stages.core.scene.trajectory import Binding, Keypoints, SimulationInfo, TrajectoryWriter, read_trajectory
 from stages.evaluate.labels import read_label_names
 from stages.lab.bench.replay import read_recording
@@ -101,7 +102,8 @@ def example_scene() -> Scene:
     K = torch.tensor([[40.0, 0, 16], [0, 40, 12], [0, 0, 1]])
     cameras = Cameras(torch.eye(4).repeat(2, 1, 1), K.repeat(2, 1, 1), torch.tensor([[32, 24]] * 2), ("a.png", "b.png"))
     objects = (SceneObject(1, "duck", "rubber"), SceneObject(2, "bowl"))
-    return Scene(gaussians, objects, cameras, 0.0, {"metres_per_unit": 1.0, "source": "known"}, PROVENANCE)
+    return Scene(gaussians, objects, cameras, 0.0, {"metres_per_unit": 1.0, "source": "known"}, PROVENANCE,
+                 sequence=FilmedSequence(50.0, 40, {"a.png": 12.5, "b.png": 3.0}))  # fmt: skip
 
 
 OBJECTS = example_scene().objects

@@ -11,6 +11,7 @@ from stages.core.errors import InputError
 from stages.core.geometry.rotations import covariance
 from stages.core.scene.scene import Scene
 from stages.core.scene.scene_ply import read_scene, write_scene
+from stages.core.scene.sequence import FilmedSequence
 from tests.conftest import random_gaussians
 from tests.core.scene.test_cameras import with_photos
 
@@ -33,6 +34,16 @@ def test_round_trip_of_metadata(tmp_path, two_balls):
         assert getattr(back, name) == getattr(scene, name)
     torch.testing.assert_close(back.cameras.viewmats, scene.cameras.viewmats)
     assert back.cameras.names == scene.cameras.names
+
+
+def test_round_trip_of_the_films(tmp_path, two_balls):
+    sequence = FilmedSequence(50.0, 40, {"a.mp4": 12.25, "b.mp4": -1.5})
+    write_scene(tmp_path / "s.ply", dataclasses.replace(two_balls, sequence=sequence))
+    assert read_scene(tmp_path / "s.ply").sequence == sequence
+    data = (tmp_path / "s.ply").read_bytes()
+    (tmp_path / "s.ply").write_bytes(data.replace(b'"a.mp4": 12.25', b'"a.mp4": "aaa"', 1))
+    with pytest.raises(InputError, match=r"s.ply: .* is damaged .*the start of a.mp4"):
+        read_scene(tmp_path / "s.ply")
 
 
 def test_round_trip_of_the_photos_as_taken(tmp_path, two_balls):

@@ -1,0 +1,64 @@
+"""Recordings of several fixed cameras: a folder with one video, or one folder of frames, for each."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import UInt8
+from torch import Tensor
+
+from stages.core.errors import InputError
+from stages.core.scene.formats import IMAGE_SUFFIXES, VIDEO_SUFFIXES
+from stages.core.scene.images import list_photos, read_8_bit, read_reduced_video, video_info
+
+
+def list_recordings(folder: Path) -> dict[str, Path]:
+    """The videos, or folders of frames, of a folder, by name. Raises InputError unless there are two or more."""
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise InputError(f"{folder}: is not a folder; give one with a video, or a folder of frames, for each camera")
+    found = {p.name: p for p in sorted(folder.iterdir()) if p.name[0] != "." and _is_recording(p)}
+    if len(found) < 2:
+        raise InputError(f"{folder}: holds {len(found)} videos or folders of frames; two cameras or more are needed")
+    return found
+
+
+def _is_recording(path: Path) -> bool:
+    if path.is_dir():
+        return any(p.suffix.lower() in IMAGE_SUFFIXES for p in path.iterdir())
+    return path.suffix.lower() in VIDEO_SUFFIXES
+
+
+def common_frame_rate(recordings: dict[str, Path], fps: float) -> float:
+    """Frames a second of all videos, and `fps` where there are only folders. Raises InputError where they differ."""
+    rates = {name: video_info(path)[1] if path.is_file() else fps for name, path in recordings.items()}
+    name, rate = next(iter(rates.items()))
+    other = next((n for n, r in rates.items() if abs(r - rate) > 1e-3 * rate), None)
+    if other is not None:
+        raise InputError(f"{recordings[other]}: has {rates[other]:g} frames a second, {name} has {rate:g}; all films "
+                         "must have the same rate, and --fps is that of folders of frames")  # fmt: skip
+    return rate
+
+
+def read_recording(path: Path, side: int) -> Iterator[tuple[UInt8[Tensor, "h w 3"], tuple[int, int]]]:
+    """The frames of a recording in order, reduced to at most `side` pixels, and their width and height before."""
+    if path.is_file():
+        yield from read_reduced_video(path, side)
+        return
+    for file in list_photos(path):
+        image = read_8_bit(file)
+        yield limit_size(image, side), (image.shape[1], image.shape[0])
+
+
+def limit_size(image: UInt8[Tensor, "h w 3"], side: int) -> UInt8[Tensor, "h2 w2 3"]:
+    """The image, reduced to at most `side` pixels by area averaging."""
+    height, width = image.shape[:2]
+    shrink = min(1.0, side / max(height, width))
+    if shrink == 1:
+        return image
+    size = max(1, round(width * shrink)), max(1, round(height * shrink))
+    return torch.from_numpy(np.ascontiguousarray(cv2.resize(image.numpy(), size, interpolation=cv2.INTER_AREA)))

@@ -1,0 +1,34 @@
+"""When several fixed cameras filmed the motion of a scene."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+
+from stages.core.scene.schema import number, quote, whole
+
+MAX_FRAMES = 10**6
+
+
+@dataclass(frozen=True)
+class FilmedSequence:
+    """The motion that begins with a scene, as filmed by cameras that do not move."""
+
+    fps: float  # frames a second, of all films
+    frames: int  # from the release to rest, the first being the release
+    starts: dict[str, float]  # by camera: number of the frame that its film shows at the release, with fractions
+
+    def to_json(self) -> dict:
+        """As stored in the header of scene.ply."""
+        return asdict(self)
+
+
+def read_sequence_json(value: object) -> FilmedSequence | None:
+    """The inverse of `to_json`, and None for None; ValueError for wrong types and values."""
+    if value is None:
+        return None
+    if not isinstance(value, dict) or not isinstance(value.get("starts"), dict):
+        raise ValueError("sequence is not a JSON object with starts")
+    starts = {quote(name, 255): number(start, f"the start of {quote(name, 40)}", -MAX_FRAMES, MAX_FRAMES)
+              for name, start in value["starts"].items()}  # fmt: skip
+    fps, frames = number(value["fps"], "fps of sequence", 1e-3, 1e6), value["frames"]
+    return FilmedSequence(fps, whole(frames, "frames of sequence", 1, MAX_FRAMES), starts)

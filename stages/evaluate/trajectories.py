@@ -56,6 +56,7 @@ class MatchedMotion:
     predicted: Float[Tensor, "t o p 3"]
     truth: Float[Tensor, "t o p 3"]
     mask: Bool[Tensor, "o p"]
+    seen: Bool[Tensor, "t o"] | None = None  # frames in which the truth has each object; None: all
 
 
 def compare(prediction: Path, truth: Path, options: EvaluateOptions) -> Result:
@@ -72,7 +73,8 @@ def compare(prediction: Path, truth: Path, options: EvaluateOptions) -> Result:
     if not options.align:
         check_same_reference_frame(predicted.frame, true.frame, pairs)
     predicted, true = _same_frames(predicted, true, options, notes)
-    motion = _same_points(predicted, true, pairs, notes)
+    seen = _seen(true_scene, pairs, len(true), notes)
+    motion = replace(_same_points(predicted, true, pairs, notes), seen=seen)
     result = _result(motion, 1 / true.dt, MIN_MOTION / true_scene.scene.metres_per_unit, notes)
     result = _with_plausibility(result, mine.plausibility or {}, [a.id for a, _ in pairs])
     if not options.report:
@@ -80,6 +82,18 @@ def compare(prediction: Path, truth: Path, options: EvaluateOptions) -> Result:
     from stages.evaluate.label_pictures import draw_objects  # imports Warp
 
     return draw_objects(result, mine.scene, options)
+
+
+def _seen(truth: Trajectory, pairs: Pairs, frames: int, notes: list[str]) -> Bool[Tensor, "t o"] | None:
+    """The frames in which a tracked truth has each object of the pairs; None where it has all."""
+    if truth.confidence is None:
+        return None
+    column = {o.id: i for i, o in enumerate(truth.scene.objects)}
+    seen = truth.confidence[:frames, [column[b.id] for _, b in pairs]] > 0
+    for (_, b), lost in zip(pairs, (~seen).sum(0).tolist(), strict=True):
+        if lost:
+            notes.append(f"the truth lost {b.name} in {lost} of {frames} frames, which do not count")
+    return None if seen.all() else seen
 
 
 def _with_plausibility(result: Result, measures: dict, ids: list[int]) -> Result:
@@ -101,9 +115,12 @@ def _track(trajectory: Trajectory) -> Track:
 
 
 def _result(motion: MatchedMotion, fps: float, min_motion: float, notes: list[str]) -> Result:
-    overall = _floats(all_metrics(motion.predicted, motion.truth, motion.mask, min_motion))
+    overall = _floats(all_metrics(motion.predicted, motion.truth, motion.mask, min_motion, motion.seen))
     parts = {
-        name: _floats(all_metrics(motion.predicted[:, [i]], motion.truth[:, [i]], motion.mask[[i]], min_motion))
+        name: _floats(all_metrics(
+            motion.predicted[:, [i]], motion.truth[:, [i]], motion.mask[[i]], min_motion,
+            None if motion.seen is None else motion.seen[:, [i]],
+        ))  # fmt: skip
         for i, name in enumerate(motion.names)
     }
     errors = error_over_time(motion.predicted, motion.truth, motion.mask)

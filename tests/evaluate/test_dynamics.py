@@ -103,3 +103,16 @@ def test_batch_dimension_gives_one_value_per_scene():
         assert value.shape == (2,)
         for b in range(2):
             torch.testing.assert_close(value[b], all_metrics(predicted[b], truth[b])[name])
+
+
+def test_frames_in_which_an_object_is_lost_do_not_count():
+    truth = torch.randn(6, 2, 5, 3, generator=torch.Generator().manual_seed(0)).double().cumsum(0)
+    predicted, seen = truth + 0.1, torch.ones(6, 2, dtype=torch.bool)
+    seen[2:4, 0] = seen[5, 1] = False
+    wrong = torch.where(seen[:, :, None, None], predicted, 100.0)
+    for name, value in all_metrics(wrong, truth, seen=seen).items():
+        torch.testing.assert_close(value, all_metrics(predicted, truth, seen=seen)[name])
+    every = all_metrics(predicted, truth, seen=torch.ones(6, 2, dtype=torch.bool))
+    for name, value in all_metrics(predicted, truth).items():
+        torch.testing.assert_close(value, every[name])
+    assert float(fpe(wrong, truth, seen=seen)) == pytest.approx(0.1 * 3**0.5)

@@ -41,6 +41,7 @@ DATASETS = {  # n Gaussians, k coefficients, o objects, p keypoints, t frames, c
     "objects/material": Dataset("o", "text"),
     "objects/com": Dataset("t o 3"),
     "objects/rotation": Dataset("t o 4"),
+    "objects/confidence": Dataset("t o", low=0, high=1),
     "keypoints/rest": Dataset("p 3"),
     "keypoints/object_id": Dataset("p", "int", 0, MAX_OBJECT_ID),
     "keypoints/positions": Dataset("t p 3"),
@@ -100,6 +101,7 @@ class Trajectory:
     path: Path
     dense: bool = False  # whether the file has every Gaussian in every frame
     field: FieldStart | None = None  # what the learned engine started from, where it made the motion
+    confidence: Float[Tensor, "t o"] | None = None  # of a tracked motion, 0 where an object was lost; None: all certain
     plausibility: dict | None = None  # measures of the simulation, {"objects": {id: {name: x}}, name: x}
 
     def __len__(self) -> int:
@@ -197,6 +199,11 @@ class TrajectoryWriter:
         if start is not None:
             write_field_start(self._file, start)
             self._raw.check()
+
+    def store_confidence(self, confidence: Float[Tensor, "t o"]) -> None:
+        """Store how certain a tracked motion is, as in Trajectory.confidence."""
+        write_compressed(self._file, "objects/confidence", confidence.cpu().numpy())
+        self._raw.check()
 
     def store_plausibility(self, measures: dict) -> None:
         """Store what `ngff simulate` measured, a dict as in Trajectory.plausibility."""
@@ -323,7 +330,10 @@ def _read(path: Path, file: h5py.File) -> Trajectory:
     dt, gravity = number(attributes["dt"], "dt", 1e-6, 1e4), numbers(attributes["gravity"], 3, "gravity")
     info = SimulationInfo(dt, gravity, quote(attributes["engine"]), forces)
     measures = _read_plausibility(parse_json(str(attributes.get("plausibility", "{}"))))
-    return Trajectory(scene, info, keypoints, binding, *motion, path, dense, read_field_start(file, lengths), measures)
+    confidence = values("objects/confidence") if "objects/confidence" in file else None
+    return Trajectory(
+        scene, info, keypoints, binding, *motion, path, dense, read_field_start(file, lengths), confidence, measures
+    )
 
 
 def _read_plausibility(measures: object) -> dict | None:

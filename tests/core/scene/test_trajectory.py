@@ -47,6 +47,22 @@ def test_round_trip(tmp_path, two_balls):
     assert torch.equal(t.com[:, 0, 0], torch.tensor([0.0, 1, 2]))
 
 
+def test_confidence_of_a_tracked_motion(tmp_path, two_balls):
+    info, keypoints, binding = parts(two_balls)
+    write(tmp_path / "simulated.h5", two_balls)
+    assert read_trajectory(tmp_path / "simulated.h5").confidence is None
+    confidence = torch.tensor([[1.0, 0.5], [0.0, 0.25]])
+    with TrajectoryWriter(tmp_path / "t.h5", two_balls, info, keypoints, binding) as writer:
+        for _ in range(2):
+            writer.append(keypoints.rest, torch.zeros(2, 3), torch.eye(4)[[0, 0]])
+        writer.store_confidence(confidence)
+    assert torch.equal(read_trajectory(tmp_path / "t.h5").confidence, confidence)
+    with h5py.File(tmp_path / "t.h5", "r+") as file:
+        file["objects/confidence"][0, 0] = 1.5
+    with pytest.raises(InputError, match="objects/confidence must be from 0 to 1"):
+        read_trajectory(tmp_path / "t.h5")
+
+
 def test_input_error_keeps_the_written_frames(tmp_path, two_balls):
     info, keypoints, binding = parts(two_balls)
     with (

@@ -103,6 +103,23 @@ def bench_chain(
     print_results(lambda path: run(photos, path, options), out, as_json)
 
 
+@app.command("track")
+def bench_track(
+    sequences: Annotated[int, typer.Option(help="number of sequences")] = 5,
+    first: Annotated[int, typer.Option(help="seed of the first sequence")] = 0,
+    width: Annotated[int, typer.Option(help="width of the films [px]")] = 240,
+    frames: Annotated[int, typer.Option(help="frames of motion")] = 50,
+    device: Device = "auto",
+    out: Out = None,
+    as_json: AsJson = False,
+) -> None:
+    """Tracking: errors of pose, time and lost frames, in rendered films of ten cameras with known motion."""
+    from stages.lab.bench.track import TrackBenchOptions, run
+
+    options = TrackBenchOptions(sequences=sequences, first=first, width=width, frames=frames, device=device)
+    print_results(lambda path: run(path, options), out, as_json)
+
+
 @app.command("appearance")
 def bench_appearance(
     sets: Annotated[list[Path], typer.Argument(metavar="PHOTOSET...", help="folders of photos, or with images/")],

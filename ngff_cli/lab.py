@@ -20,6 +20,7 @@ from ngff_cli.options import (
 )
 from stages.lab.fit.options import MaterialFitOptions
 from stages.lab.questionnaire.options import StudyOptions
+from stages.lab.track.options import TrackOptions
 
 app = typer.Typer(cls=CommandGroup, no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False)
 
@@ -294,6 +295,33 @@ def fit(
         evaluations=evaluations, minutes=minutes, workers=workers, seed=seed, device=device,
     )  # fmt: skip
     for line in run(scene, track, out, options):
+        print(line)
+
+
+@app.command()
+def track(
+    scene: SceneIn,
+    films: Annotated[Path, typer.Argument(metavar="CAMERAS/", help="folder of the films that the scene was made from")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="trajectory to write (.h5)")] = Path("truth.h5"),
+    resolution: Annotated[
+        int, typer.Option(help="longest side at which pictures and renderings are compared [px]")
+    ] = TrackOptions.resolution,
+    frames: Annotated[
+        int, typer.Option(help="frames from the release on; 0: until everything rests")
+    ] = TrackOptions.frames,
+    keypoints: Annotated[int, typer.Option(help="keypoints per object, in the trajectory")] = TrackOptions.keypoints,
+    seed: Seed = TrackOptions.seed,
+    device: Device = TrackOptions.device,
+) -> None:
+    """Follow the objects of a scene through the films of several cameras: SCENE.ply and CAMERAS/ -> TRUTH.h5.
+
+    The scene is made by `ngff reconstruct CAMERAS/ --sequence` and `ngff segment`; `ngff evaluate` takes the result as
+    the truth.
+    """
+    from stages.lab.track.track import run
+
+    options = TrackOptions(resolution=resolution, frames=frames, keypoints=keypoints, seed=seed, device=device)
+    for line in run(scene, films, out, options):
         print(line)
 
 

@@ -54,6 +54,20 @@ def test_offset_of_one_object_affects_its_row_only(tmp_path, two_balls):
     assert facts["overall"]["MSE"] == pytest.approx(0.3**2 / 6, abs=1e-6)
 
 
+def test_frames_that_the_truth_has_lost_do_not_count(tmp_path, two_balls):
+    wrong = iter(range(12))
+    write_motion(tmp_path / "mine.h5", two_balls)
+    write_motion(tmp_path / "true.h5", two_balls, change=lambda x: x + (0.5 if next(wrong) > 8 else 0.0))
+    with h5py.File(tmp_path / "true.h5", "r+") as file:
+        confidence = torch.ones(12, 2)
+        confidence[9:, 1] = 0
+        file["objects/confidence"] = confidence.numpy()
+    facts = evaluate(tmp_path)
+    assert facts["objects"]["green ball"]["RMSE"] == facts["objects"]["green ball"]["FPE"] == 0
+    assert facts["objects"]["red ball"]["FPE"] == pytest.approx(0.5 * 3**0.5, abs=1e-5)
+    assert "the truth lost green ball in 3 of 12 frames, which do not count" in facts["notes"]
+
+
 def test_different_keypoints_with_the_same_motion_agree(tmp_path, two_balls):
     # Skinning reproduces rigid motion exactly, independent of the keypoints: only rounding errors remain.
     write_motion(tmp_path / "true.h5", two_balls, seed=0, count=100)

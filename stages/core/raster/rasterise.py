@@ -122,6 +122,22 @@ def visibility(
     return index.to(gaussians.means.device), weight.to(gaussians.means.device)
 
 
+@torch.no_grad()
+def rasterise_with_index(
+    gaussians: Gaussians,
+    viewmat: Float[Tensor, "4 4"],
+    K: Float[Tensor, "3 3"],
+    width: int,
+    height: int,
+) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"], Float[Tensor, "h w"], Int[Tensor, "h w"]]:
+    """One view over black, projected once: rgb, alpha and depth as in `Rendering`, and the index of `visibility`."""
+    g = _drawable(gaussians)
+    splats, bins = _splats(g, _View(viewmat, K, width, height).packed(g), width, height)
+    rgb, depth, alpha = composite(splats, bins, None, mean=True)
+    index, _ = dominant_splats(splats, bins)
+    return tuple(x.to(gaussians.means.device) for x in (rgb, alpha, depth, index))
+
+
 def _drawable(g: Gaussians) -> Gaussians:
     """The Gaussians on their device, or on a GPU where no kernel can be compiled for the CPU."""
     return g.to(kernel_device(g.means))

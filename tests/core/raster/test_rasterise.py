@@ -13,7 +13,7 @@ from stages.core.kernels import interop
 from stages.core.kernels.splat.binning import depth_order_reference
 from stages.core.kernels.splat.compositing import composite_reference
 from stages.core.kernels.splat.projection import pack_camera, project_reference
-from stages.core.raster.rasterise import rasterise, rasterise_features, visibility
+from stages.core.raster.rasterise import rasterise, rasterise_features, rasterise_with_index, visibility
 from stages.core.scene.gaussians import Gaussians
 from tests.conftest import random_gaussians, ring
 
@@ -234,6 +234,16 @@ def test_features_are_composited_like_colours(device, count):
     (grad,) = torch.autograd.grad(image.sum(), colours)
     weights = sum(visibility(gaussians, V, K, 48, 40)[1] for V, K in zip(cameras.viewmats, cameras.Ks, strict=True))
     torch.testing.assert_close(grad[:, -1], weights, rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize("device", devices)
+def test_one_projection_gives_image_and_index(device):
+    gaussians = random_gaussians(300).to(device)
+    rgb, alpha, depth, index = rasterise_with_index(gaussians, EYE, K, SIZE, SIZE)
+    shot = draw(gaussians)
+    for found, separate in ((rgb, shot.rgb[0]), (alpha, shot.alpha[0]), (depth, shot.depth[0])):
+        torch.testing.assert_close(found, separate)
+    assert torch.equal(index, visibility(gaussians, EYE, K, SIZE, SIZE)[0])
 
 
 @pytest.mark.parametrize("device", devices)

@@ -1,0 +1,1 @@
+"""Tracking of objects through the pictures of several fixed cameras."""

@@ -1,0 +1,138 @@
+"""Poses of objects from the difference between pictures and renderings: Gauss and Newton's method, coarse to fine.
+
+A rendering I changes with a small motion of an object as its pixels move, dI = -grad I . du, where du is the projection
+of the motion of the point seen there. Pixels on an outline move with what is in front. Residuals are weighted by
+Geman and McClure's function, so that pixels which the scene does not explain (a hand, a shadow) have little effect.
+The gradient is the mean of those of rendering and picture, which converges in fewer steps. Both are reduced by the same
+means of blocks of pixels: renderings at a lower resolution would be biased.
+Source: Baker and Matthews 2004, "Lucas-Kanade 20 years on"; Geman and McClure 1987, "Statistical methods for
+tomographic image reconstruction"; Benhimane and Malis 2004, "Real-time image-based tracking of planes using efficient
+second-order minimization".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from stages.core.geometry.cameras import resize
+from stages.lab.track.poses import Poses
+from stages.lab.track.synthesis import Camera, Synthesis, Synthesiser
+
+PRIOR = (0.5, 0.5)  # standard deviations of the prediction: turn [rad] and displacement [sizes of the object]
+PIXEL_NOISE = 0.05  # standard deviation of a channel against which the prediction is weighed
+CONVERGED = 0.05  # largest displacement of the last step [px]
+
+
+@dataclass(frozen=True)
+class Observation:
+    """A picture at one resolution, and how far the objects are from their poses when it was taken."""
+
+    film: int  # its number
+    late: float  # time after that of the poses [frames]
+    camera: Camera
+    reduction: int  # of the picture
+    image: Float[Tensor, "h w 3"]
+    displacement: Float[Tensor, "o 6"]  # turn [rad] and displacement [scene units]
+
+    def draw(self, synthesiser: Synthesiser, poses: Poses) -> Synthesis:
+        """The rendering that this picture is compared with."""
+        return synthesiser.draw(self.camera, poses.moved(self.displacement), self.reduction)
+
+
+@dataclass(frozen=True)
+class PixelChanges:
+    """The pixels of a picture that show moving objects, and how they change."""
+
+    row: Tensor  # (p) object
+    residual: Float[Tensor, "p 3"]
+    jacobian: Float[Tensor, "p 3 6"]  # of the rendering by turn [1/rad] and displacement [1/scene unit]
+
+
+def change_of(seen: Observation, drawn: Synthesis, centre: Float[Tensor, "o 3"]) -> PixelChanges:
+    """Residuals, and derivatives of the rendering by the motion of the objects about `centre`."""
+    at = drawn.moving >= 0
+    mean = (drawn.image + seen.image) / 2
+    gradient = torch.stack([_central(mean, 1), _central(mean, 0)], -1)[at]  # (p, 3, 2)
+    row, point = drawn.moving[at], drawn.point[at]
+    V, K = seen.camera.viewmat, resize(seen.camera.K, 1 / seen.reduction, 1 / seen.reduction)
+    p = point @ V[:3, :3].mT + V[:3, 3]
+    z = p[:, 2].clamp_min(1e-6)
+    zero = torch.zeros_like(z)
+    projection = torch.stack([
+        torch.stack([K[0, 0] / z, zero, -K[0, 0] * p[:, 0] / z**2], 1),
+        torch.stack([zero, K[1, 1] / z, -K[1, 1] * p[:, 1] / z**2], 1),
+    ], 1) @ V[:3, :3]  # fmt: skip  # (p, 2, 3), by motion of the point in the world
+    by_place = -gradient @ projection  # (p, 3, 3)
+    arm = (point - centre[row])[:, None].expand_as(by_place)
+    by_turn = torch.linalg.cross(arm, by_place)  # a . (w x r) = w . (r x a)
+    return PixelChanges(row, (seen.image - drawn.image)[at], torch.cat([by_turn, by_place], -1))
+
+
+def _central(image: Float[Tensor, "h w 3"], dim: int) -> Float[Tensor, "h w 3"]:
+    """Derivative along rows (0) or columns (1) by central differences, 0 on the border."""
+    out = torch.zeros_like(image)
+    n = image.shape[dim]
+    out.narrow(dim, 1, n - 2).copy_((image.narrow(dim, 2, n - 2) - image.narrow(dim, 0, n - 2)) / 2)
+    return out
+
+
+def robust_weights(residual: Float[Tensor, "p 3"], scale: float) -> Float[Tensor, "p"]:
+    """Geman and McClure's weights, for residuals of this scale."""
+    return (scale**2 / (scale**2 + residual.square().mean(1))).square()
+
+
+def robust_cost(residual: Float[Tensor, "*b 3"], scale: float) -> float:
+    """Mean of Geman and McClure's function, from 0 to 1."""
+    square = residual.square().mean(-1)
+    return float((square / (scale**2 + square)).mean())
+
+
+def align(
+    synthesiser: Synthesiser, levels: Sequence[tuple[list[Observation], int]], poses: Poses, scale: Sequence[float],
+    fixed: Tensor | None = None,
+) -> Poses:  # fmt: skip
+    """The poses that explain the pictures best, found from poses nearby.
+
+    `levels` are the observations at each resolution, coarse to fine, with the largest number of steps there; `scale` is
+    that of the residuals of each object. Objects in the mask `fixed` stay.
+    """
+    start = poses
+    for observations, steps in levels:
+        for _ in range(steps):
+            step = _step(synthesiser, observations, poses, start, scale)
+            if fixed is not None:
+                step = torch.where(fixed[:, None], 0.0, step)
+            poses = poses.moved(step)
+            pixel = float(observations[0].camera.K[0, 0]) / observations[0].reduction
+            reach = step[:, :3].norm(dim=1) * synthesiser.sizes + step[:, 3:].norm(dim=1)
+            if float(reach.max()) * pixel < CONVERGED:
+                break
+    return poses
+
+
+def _step(
+    synthesiser: Synthesiser, observations: list[Observation], poses: Poses, predicted: Poses, scale: Sequence[float]
+) -> Float[Tensor, "o 6"]:
+    """A step of all objects from the pictures of all cameras."""
+    changes = [change_of(o, o.draw(synthesiser, poses), poses.centre) for o in observations]
+    row = torch.cat([c.row for c in changes])
+    residual, jacobian = torch.cat([c.residual for c in changes]), torch.cat([c.jacobian for c in changes])
+    steps, off = [], poses.step_to(predicted)
+    for i, size in enumerate(synthesiser.sizes):
+        mine = row == i
+        r, J = residual[mine], jacobian[mine]
+        w = robust_weights(r, scale[i])
+        H = torch.einsum("p,pci,pcj->ij", w, J, J)
+        b = torch.einsum("p,pci,pc->i", w, J, r)
+        prior = PIXEL_NOISE**2 / torch.cat([size.new_full((3,), PRIOR[0]), PRIOR[1] * size.expand(3)]).square()
+        H = H + prior.diag() + 1e-4 * H.diagonal().diag()
+        step = torch.linalg.solve(H.double(), (b + prior * off[i]).double()).float()
+        # no further than half the object in a step
+        reach = (step[:3].norm() * size + step[3:].norm()) / (0.5 * size)
+        steps.append(step / reach.clamp_min(1.0))
+    return torch.stack(steps)

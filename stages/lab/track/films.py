@@ -1,0 +1,72 @@
+"""Films of a scene's cameras, as undistorted views at the resolution at which they are compared with renderings."""
+
+from __future__ import annotations
+
+import logging
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+from jaxtyping import UInt8
+from torch import Tensor
+
+from stages.core.errors import InputError
+from stages.core.geometry.cameras import resize as resize_K
+from stages.core.scene.cameras import Cameras
+from stages.core.scene.images import resize
+from stages.core.scene.lens import Undistortion
+from stages.core.scene.recordings import list_recordings, read_recording
+from stages.core.scene.scene import Scene
+
+log = logging.getLogger(__name__)
+MULTIPLE = 8  # of which sizes are, so that pictures can be reduced
+
+
+@dataclass(frozen=True)
+class Film:
+    """The pictures of one camera."""
+
+    name: str
+    frames: UInt8[Tensor, "t h w 3"]
+    start: float  # number of the frame at the release, with fractions
+
+
+def read_films(scene: Scene, folder: Path, frames: int, resolution: int) -> tuple[Cameras, list[Film]]:
+    """The cameras of the scene that have films in the folder, at the resolution of the films, and these films.
+
+    Films are read until `frames` after the release. Raises InputError where fewer than one camera has a film.
+    """
+    recordings = list_recordings(folder)
+    cameras, starts = scene.cameras, scene.sequence.starts
+    rows = [i for i, name in enumerate(cameras.names) if name in recordings and name in starts]
+    if missing := [name for name in cameras.names if name in starts and name not in recordings]:
+        log.warning("%s: holds no film named %s; tracking goes on without", folder, ", ".join(missing))
+    if not rows:
+        raise InputError(f"{folder}: holds no film of the scene's cameras ({', '.join(cameras.names[:3])}, ...)")
+    reduced = _reduced_cameras(cameras[rows], resolution)
+    films = []
+    for row, size in zip(rows, reduced.sizes.tolist(), strict=True):
+        name = cameras.names[row]
+        last = math.ceil(starts[name] + frames) + 1
+        pictures = []
+        for image, _ in read_recording(recordings[name], 2 * resolution):
+            lens = Undistortion.of(cameras, row, (image.shape[1], image.shape[0]))
+            view = resize(lens.image(image).float() / 255, *size)
+            pictures.append((255 * view).round().to(torch.uint8))
+            if len(pictures) > last:
+                break
+        if pictures:
+            films.append(Film(name, torch.stack(pictures), starts[name]))
+    if len(films) < len(rows):
+        raise InputError(f"{folder}: a film has no frames; remove it")
+    return reduced, films
+
+
+def _reduced_cameras(cameras: Cameras, resolution: int) -> Cameras:
+    """The cameras with sizes that are multiples of MULTIPLE, no larger than the views."""
+    scale = (resolution / cameras.sizes.max(1).values).clamp_max(1.0)
+    sizes = (cameras.sizes * scale[:, None] / MULTIPLE).round().long().clamp_min(1) * MULTIPLE
+    ratio = sizes / cameras.sizes
+    Ks = torch.stack([resize_K(K, float(x), float(y)) for K, (x, y) in zip(cameras.Ks, ratio, strict=True)])
+    return replace(cameras, Ks=Ks, sizes=sizes, photos=None)

@@ -1,0 +1,242 @@
+"""Follow objects through the pictures of several cameras."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from tqdm import tqdm
+
+from stages.core.scene.cameras import Cameras
+from stages.core.scene.scene import Scene
+from stages.lab.track.alignment import Observation, align, change_of, robust_weights
+from stages.lab.track.confidence import confidences, differences, tolerances
+from stages.lab.track.films import Film
+from stages.lab.track.poses import Poses
+from stages.lab.track.search import search
+from stages.lab.track.synthesis import Camera, Synthesiser, reduced
+
+log = logging.getLogger(__name__)
+FIRST = {8: 4, 4: 4}  # largest number of steps by reduction of the pictures, in the first pass
+REFINING = {4: 2, 2: 2}  # the same where both neighbours in time are known
+JUDGING = 2  # reduction of the pictures from which confidences are taken
+RETIMING = (4, 2)  # reduction of the pictures from which starts are corrected, before each later pass
+RETIMING_STEPS = 2
+CERTAIN = 0.85  # confidence from which a lost object counts as found
+FALLING = 6  # frames of a fall from which the time of the release is found
+MAX_MISFIT = 0.1  # of a free fall in them [frames]
+
+
+@dataclass(frozen=True)
+class TrackedMotion:
+    """Poses of all objects in all frames, and how far the pictures confirm them."""
+
+    poses: Poses  # t frames
+    confidence: Float[Tensor, "t o"]  # 0: lost
+    pixels: Float[Tensor, "t o"]  # in which each object should be seen
+    starts: dict[str, float]  # of the films, as refined
+
+
+class Tracker:
+    """A scene and its films, at several resolutions."""
+
+    def __init__(self, scene: Scene, cameras: Cameras, films: list[Film], device: str):
+        self.synthesiser, self.films, self.device = Synthesiser(scene, device), films, device
+        views = zip(cameras.viewmats, cameras.Ks, cameras.sizes.tolist(), strict=True)
+        self.cameras: list[Camera] = [self.synthesiser.camera(V, K, *size) for V, K, size in views]
+        self.rest = self.synthesiser.at_rest()
+        self.still = torch.zeros(len(self.rest.centre), 6, device=device)
+        self.gains = [self._gain(i) for i in range(len(films))]
+        first = self.observe(0, JUDGING, self.still, self.still)
+        self.tolerance = tolerances(differences(self.synthesiser, first, self.rest))
+
+    def _gain(self, i: int) -> Float[Tensor, "3"]:
+        """Brightness of a film's channels over those of the scene, at the release."""
+        film = self.films[i]
+        drawn = self.synthesiser.draw(self.cameras[i], self.rest).image
+        first = film.frames[min(max(int(film.start), 0), len(film.frames) - 1)].to(self.device).float() / 255
+        return ((first * drawn).sum((0, 1)) / drawn.square().sum((0, 1)).clamp_min(1e-6)).clamp(0.5, 2.0)
+
+    def observe(self, frame: int, reduction: int, before: Tensor, after: Tensor) -> list[Observation]:
+        """The pictures taken nearest to the time of a frame, without those of films that have ended.
+
+        `before` and `after` are the motions of the objects from the previous frame and to the next one.
+        """
+        seen = []
+        for i, film in enumerate(self.films):
+            time = film.start + frame
+            k = round(time)
+            if 0 <= k < len(film.frames):
+                late = k - time
+                image = reduced(film.frames[k].to(self.device).float() / 255, reduction) / self.gains[i]
+                moved = late * (after if late > 0 else before)
+                seen.append(Observation(i, late, self.cameras[i], reduction, image, moved))
+        return seen
+
+    def fit(
+        self, frame: int, steps: dict[int, int], poses: Poses, motion: tuple[Tensor, Tensor],
+        fixed: Tensor | None = None,
+    ) -> Poses:  # fmt: skip
+        """The poses in a frame from poses nearby; `fixed` objects stay."""
+        levels = [(self.observe(frame, reduction, *motion), count) for reduction, count in steps.items()]
+        return align(self.synthesiser, levels, poses, self.tolerance, fixed)
+
+    def judge(self, frame: int, poses: Poses, motion: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+        """Confidence and number of pixels of each object in a frame."""
+        found = differences(self.synthesiser, self.observe(frame, JUDGING, *motion), poses)
+        return confidences(found, self.tolerance)
+
+
+def follow(tracker: Tracker, frames: int, gravity: Float[Tensor, "3"]) -> TrackedMotion:
+    """The motion of all objects from rest, with confidences. `gravity` is in scene units / frame^2."""
+    track = first_pass(tracker, frames, gravity)
+    for reduction in RETIMING:
+        track = from_release(tracker, track)
+        tracker.films = retimed(tracker, track, reduction)
+        track = refined(tracker, track)
+    track = from_release(tracker, track)
+    return replace(track, starts={film.name: film.start for film in tracker.films})
+
+
+def first_pass(tracker: Tracker, frames: int, gravity: Float[Tensor, "3"]) -> TrackedMotion:
+    """Frame by frame, from poses extrapolated at constant velocity. What is lost is searched for in each frame."""
+    rest, velocity = tracker.rest, tracker.still
+    share, number = tracker.judge(0, rest, (velocity, velocity))
+    poses, shares, pixels = [rest], [share], [number]
+    last, missing = rest, torch.zeros_like(velocity[:, 0])  # where last seen, and how many frames ago
+    for frame in tqdm(range(1, frames), desc="tracking", unit="frame", leave=False):
+        away, motion = missing > 0, (velocity, velocity)
+        n = (missing + 1)[:, None]
+        fall = n * missing[:, None] / 2 * torch.cat([torch.zeros_like(gravity), gravity])
+        found = tracker.fit(frame, FIRST, last.moved(n * velocity + fall), motion)
+        share, number = tracker.judge(frame, found, motion)
+        for i in (away.cpu() & (share < CERTAIN)).nonzero()[:, 0].tolist():
+            again = search(tracker, frame, i, found, velocity, int(missing[i]))
+            if again is not None:
+                found, (share, number) = again, tracker.judge(frame, again, motion)
+        share = _certain(share, away.cpu())
+        lost = (share == 0).to(tracker.device)
+        step = torch.where(away[:, None], 0.0, last.step_to(found))
+        velocity = torch.where(lost[:, None], velocity, step)
+        poses.append(_choose(lost, last, found))
+        shares.append(share)
+        pixels.append(number)
+        last, missing = poses[-1], torch.where(lost, missing + 1, 0.0)
+    return TrackedMotion(Poses.stack(poses), torch.stack(shares), torch.stack(pixels), {})
+
+
+def from_release(tracker: Tracker, track: TrackedMotion) -> TrackedMotion:
+    """The track without gaps, from the release as it is seen in it; the films start that much later."""
+    late = release_time(track)
+    log.debug("released %.2f frames later than assumed", late)
+    tracker.films = [replace(film, start=film.start + late) for film in tracker.films]
+    return replace(track, poses=_shifted(interpolated(track), late))
+
+
+def release_time(track: TrackedMotion) -> float:
+    """When the objects that fall at the start were released [frames]: the square root of their drop grows linearly."""
+    times = []
+    drop = track.poses.centre[0, :, 2] - track.poses.centre[..., 2]
+    for i in range(drop.shape[1]):
+        first = next((t for t in range(1, len(drop)) if drop[t, i] < drop[t - 1, i] or not track.confidence[t, i]),
+                     len(drop))  # fmt: skip
+        fallen = drop[:first, i].clamp_min(0).sqrt().cpu()
+        used = torch.arange(2, min(first, 2 + FALLING))
+        if len(used) < FALLING:
+            continue
+        design = torch.stack([used.float(), torch.ones(len(used))], 1)
+        slope, offset = torch.linalg.lstsq(design, fallen[used][:, None]).solution[:, 0].tolist()
+        misfit = float((design @ torch.tensor([slope, offset]) - fallen[used]).abs().max())
+        if slope > 0 and misfit < MAX_MISFIT * slope:  # it falls freely
+            times.append(-offset / slope)
+    return float(torch.tensor(times).median().clamp(-1, 1)) if times else 0.0
+
+
+def _shifted(poses: Poses, late: float) -> Poses:
+    """The poses at times `late` frames later, linear between frames; those before the first frame are the first."""
+    last = len(poses.centre) - 1
+    time = (torch.arange(last + 1) + late).clamp(0, last)
+    time[0] = 0  # at rest
+    at = time.floor().long().clamp(max=max(last - 1, 0))
+    part = (time - at)[:, None, None].to(poses.centre)
+    return poses[at].moved(part * poses[at].step_to(poses[(at + 1).clamp(max=last)]))
+
+
+def _certain(share: Float[Tensor, "o"], was_lost: Bool[Tensor, "o"]) -> Float[Tensor, "o"]:
+    """The confidences, 0 for what was lost and is not found again with certainty: it may be turned wrongly."""
+    return torch.where(was_lost & (share < CERTAIN), 0.0, share)
+
+
+def _choose(mask: Tensor, yes: Poses, no: Poses) -> Poses:
+    """The poses `yes` of the objects in the mask, and `no` of the others."""
+    return Poses(torch.where(mask[:, None, None], yes.rotation, no.rotation),
+                 torch.where(mask[:, None], yes.centre, no.centre))  # fmt: skip
+
+
+def _motions(track: TrackedMotion, frame: int) -> tuple[Tensor, Tensor]:
+    """The motions from the frame before, and to the frame after; at either end the same twice."""
+    p, last = track.poses, len(track.poses.centre) - 1
+    before = p[frame - 1].step_to(p[frame]) if frame > 0 else None
+    after = p[frame].step_to(p[frame + 1]) if frame < last else before
+    return (after if before is None else before), after
+
+
+def refined(tracker: Tracker, track: TrackedMotion) -> TrackedMotion:
+    """The track with every pose fitted again, with the motions between frames as they are known now."""
+    rotation, centre = track.poses.rotation.clone(), track.poses.centre.clone()
+    shares, pixels = track.confidence.clone(), track.pixels.clone()
+    now = replace(track, poses=Poses(rotation, centre))
+    for frame in tqdm(range(1, len(centre)), desc="refining", unit="frame", leave=False):
+        motion = _motions(now, frame)
+        found = tracker.fit(frame, REFINING, now.poses[frame], motion)
+        share, pixels[frame] = tracker.judge(frame, found, motion)
+        shares[frame] = _certain(share, shares[frame] == 0)
+        found = _choose((shares[frame] == 0).to(tracker.device), now.poses[frame], found)
+        rotation[frame], centre[frame] = found.rotation, found.centre
+    return replace(now, confidence=shares, pixels=pixels)
+
+
+def retimed(tracker: Tracker, track: TrackedMotion, reduction: int) -> list[Film]:
+    """The films with the starts that explain the differences along the motion best; their mean stays."""
+    films = tracker.films
+    for _ in range(RETIMING_STEPS):
+        late = _lateness(tracker, track, reduction)
+        late -= late.mean()
+        log.debug("starts moved by %s frames", [round(-float(x), 3) for x in late])
+        tracker.films = [replace(f, start=f.start - float(x)) for f, x in zip(tracker.films, late, strict=True)]
+    found, tracker.films = tracker.films, films
+    return found
+
+
+def _lateness(tracker: Tracker, track: TrackedMotion, reduction: int) -> Float[Tensor, "c"]:
+    """How much later each film's pictures were taken than assumed [frames], by a step of Gauss and Newton's method."""
+    along, square = torch.zeros(len(tracker.films)), torch.full((len(tracker.films),), 1e-9)
+    for frame in range(1, len(track.confidence)):
+        motion = _motions(track, frame)
+        poses, seen = track.poses[frame], track.confidence[frame].to(tracker.device) > 0
+        for o in tracker.observe(frame, reduction, *motion):
+            change = change_of(o, o.draw(tracker.synthesiser, poses), poses.centre)
+            keep = seen[change.row]
+            speed = (motion[1] if o.late > 0 else motion[0])[change.row[keep]]
+            r, by_time = change.residual[keep], torch.einsum("pci,pi->pc", change.jacobian[keep], speed)
+            w = robust_weights(r, max(tracker.tolerance))[:, None]
+            along[o.film] += float((w * by_time * r).sum())
+            square[o.film] += float((w * by_time.square()).sum())
+    return along / square
+
+
+def interpolated(track: TrackedMotion) -> Poses:
+    """The poses, with those of lost frames interpolated between those before and after."""
+    seen = track.confidence > 0
+    t = torch.arange(len(seen))[:, None].expand_as(seen)
+    before = torch.where(seen, t, -1).cummax(0).values
+    after = torch.where(seen, t, len(seen)).flip(0).cummin(0).values.flip(0)
+    before, after = torch.where(before < 0, after, before), torch.where(after == len(seen), before, after)
+    before, after = before.clamp(0, len(seen) - 1), after.clamp(0, len(seen) - 1)
+    part = (t - before) / (after - before).clamp_min(1)
+    column = torch.arange(seen.shape[1])
+    first, last = track.poses[before, column], track.poses[after, column]
+    return first.moved(part[..., None].to(first.centre) * first.step_to(last))

@@ -1,0 +1,97 @@
+"""Find an object that was lost: where several pictures show something that the rest of the scene does not explain."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from stages.core.geometry.cameras import depths, project
+from stages.core.geometry.rotations import matrix
+from stages.lab.track.alignment import Observation, robust_cost
+from stages.lab.track.poses import Poses
+
+if TYPE_CHECKING:
+    from stages.lab.track.follow import Tracker
+
+COARSE = 4  # reduction of the pictures
+SEARCHING = {4: 10}  # largest number of steps by reduction
+MAX_REACH = 12  # half width of the grid of places [half sizes of the object]
+SPREAD = 0.15  # of that share below the highest
+MIN_VIEWS = 3  # pictures that must show a place
+MIN_SUPPORT = 0.7  # share of the pictures that must show something unexplained at a place
+ROTATIONS = 72  # that are tried
+STARTS = 6  # rotations from which the object is aligned, the best of all tried
+VIEWS = 5  # pictures in which rotations are compared
+LIKE = 0.15  # difference from the nearest colour of an object up to which a pixel may show it
+AWAY = 1e4  # where an object is not seen [scene units]
+
+
+def search(tracker: Tracker, frame: int, i: int, poses: Poses, velocity: Tensor, missing: int) -> Poses | None:
+    """The poses with object i, which was last seen `missing` frames ago, at its best pose; None if it is not seen."""
+    seen = tracker.observe(frame, COARSE, velocity, velocity)
+    gone = Poses(poses.rotation, poses.centre.clone())
+    gone.centre[i] = AWAY
+    places = _places(tracker, seen, gone, i, poses.centre[i], missing)
+    if not len(places):
+        return None
+    starts = []
+    some = seen[:: math.ceil(len(seen) / VIEWS)]
+    for turn in [torch.eye(3), *spread_rotations(ROTATIONS)]:
+        start = Poses(poses.rotation.clone(), poses.centre.clone())
+        start.rotation[i], start.centre[i] = turn.to(places) @ poses.rotation[i], places.mean(0)
+        starts.append((_cost(tracker, some, start), len(starts), start))
+    others = torch.arange(len(poses.centre), device=tracker.device) != i
+    motion = (velocity, velocity)
+    aligned = [tracker.fit(frame, SEARCHING, start, motion, others) for _, _, start in sorted(starts)[:STARTS]]
+    return min(aligned, key=lambda p: _cost(tracker, seen, p))
+
+
+def _cost(tracker: Tracker, seen: list[Observation], poses: Poses) -> float:
+    scale = max(tracker.tolerance)
+    return sum(robust_cost(o.image - o.draw(tracker.synthesiser, poses).image, scale) for o in seen)
+
+
+def _places(
+    tracker: Tracker, seen: list[Observation], gone: Poses, i: int, middle: Float[Tensor, "3"], missing: int
+) -> Float[Tensor, "n 3"]:
+    """Places around where an object is expected, at which most pictures show something unexplained in its colours."""
+    size, limit = tracker.synthesiser.sizes[i], tracker.tolerance[i]
+    reach = min(MAX_REACH, 4 + 2 * missing)
+    steps = torch.arange(-reach, reach + 1, device=tracker.device) * size / 2
+    places = middle + torch.cartesian_prod(steps, steps, steps)
+    palette = tracker.synthesiser.palettes[i]
+    votes, views = torch.zeros(len(places)).to(places), torch.zeros(len(places)).to(places)
+    for o in seen:
+        drawn = o.draw(tracker.synthesiser, gone)
+        off = (o.image - drawn.image).square().mean(-1).sqrt()
+        like = (o.image[:, :, None] - palette).square().mean(-1).sqrt().amin(-1)
+        vote, counted = _looked_up((off > limit) & (like < LIKE), drawn.label < 0, o, places)
+        votes, views = votes + vote, views + counted
+    support = torch.where(views >= min(MIN_VIEWS, len(seen)), votes / views.clamp_min(1), 0.0)
+    return places[support >= max(float(support.max()) - SPREAD, MIN_SUPPORT)]
+
+
+def _looked_up(
+    mask: Bool[Tensor, "h w"], free: Bool[Tensor, "h w"], o: Observation, places: Float[Tensor, "n 3"]
+) -> tuple[Bool[Tensor, "n"], Bool[Tensor, "n"]]:
+    """The mask where the places are seen, and whether they are inside the picture and nothing may hide them."""
+    height, width = mask.shape
+    x, y = (project(places, o.camera.viewmat, o.camera.K) / o.reduction).floor().long().unbind(1)
+    inside = (depths(places, o.camera.viewmat) > 0) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
+    at = y.clamp(0, height - 1), x.clamp(0, width - 1)
+    return mask[at] & free[at] & inside, free[at] & inside
+
+
+def spread_rotations(count: int) -> Float[Tensor, "n 3 3"]:
+    """Rotations evenly spread, the same for every call.
+
+    Source: Alexa 2022, "Super-Fibonacci spirals: fast, low-discrepancy sampling of SO(3)".
+    """
+    s = torch.arange(count) + 0.5
+    inner, outer = (s / count).sqrt(), (1 - s / count).sqrt()
+    a, b = 2 * torch.pi * s / 2**0.5, 2 * torch.pi * s / 1.533751168755204288118041
+    return matrix(torch.stack([inner * a.sin(), inner * a.cos(), outer * b.sin(), outer * b.cos()], 1))

@@ -1,0 +1,128 @@
+"""Pictures of the scene with its objects at given poses, and what they show in each pixel."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from stages.core.geometry.cameras import centres, resize
+from stages.core.geometry.harmonics import C0, rotate_sh
+from stages.core.geometry.rotations import multiply, quaternion
+from stages.core.physics.keypoints import farthest_points
+from stages.core.raster.rasterise import rasterise, rasterise_with_index
+from stages.core.scene.gaussians import Gaussians
+from stages.core.scene.scene import Scene
+from stages.lab.track.poses import Poses
+
+MIN_ALPHA = 0.5  # opacity above which a pixel shows an object
+FAR = 1e6  # depth where there is nothing [scene units]
+PALETTE = 12  # colours of an object
+BEHIND = 0.02  # how far an object may be behind the background's depth and still be drawn [of its depth]
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A camera at one resolution, and the picture of what does not move."""
+
+    viewmat: Float[Tensor, "4 4"]
+    K: Float[Tensor, "3 3"]
+    background: Float[Tensor, "h w 3"]
+    background_depth: Float[Tensor, "h w"]
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height [px]."""
+        return self.background.shape[1], self.background.shape[0]
+
+
+@dataclass(frozen=True)
+class Synthesis:
+    """A picture, and for each pixel the object whose motion changes it and the point of it that is seen there."""
+
+    image: Float[Tensor, "h w 3"]
+    label: Int[Tensor, "h w"]  # row of the object, -1: background
+    moving: Int[Tensor, "h w"]  # the same, with the frontmost of the neighbours on outlines
+    point: Float[Tensor, "h w 3"]  # of the object in `moving`, in the world
+
+
+class Synthesiser:
+    """Draws the objects of a scene at any poses in front of its background."""
+
+    def __init__(self, scene: Scene, device: str):
+        g = scene.gaussians.to(device)
+        self.background = g[g.object_id == 0]
+        self.rest_gaussians = g[g.object_id > 0]
+        ids = torch.tensor([o.id for o in scene.objects], device=device)
+        self.row = (self.rest_gaussians.object_id[:, None] == ids).int().argmax(1)
+        means = [self.rest_gaussians.means[self.row == i] for i in range(len(ids))]
+        self.rest = torch.stack([_middle(x) for x in means])
+        self.sizes = torch.stack([(x - c).norm(dim=1).quantile(0.9) for x, c in zip(means, self.rest, strict=True)])
+        self.arm = self.rest_gaussians.means - self.rest[self.row]
+        colours = C0 * self.rest_gaussians.sh[:, 0] + 0.5
+        self.palettes = [_palette(colours[self.row == i]) for i in range(len(ids))]
+        self.colour = torch.tensor(scene.background or (0.0, 0.0, 0.0), device=device)
+        self.device = device
+
+    def at_rest(self) -> Poses:
+        """The poses of the scene file."""
+        return Poses(torch.eye(3, device=self.device).repeat(len(self.rest), 1, 1), self.rest.clone())
+
+    def camera(self, viewmat: Tensor, K: Tensor, width: int, height: int) -> Camera:
+        """A camera, with the scene without its objects."""
+        K, viewmat = K.to(self.device), viewmat.to(self.device)
+        drawn = rasterise(self.background, viewmat[None], K[None], width, height, self.colour)
+        depth = torch.where(drawn.alpha[0] > MIN_ALPHA, drawn.depth[0], FAR)
+        return Camera(viewmat, K, drawn.rgb[0], depth)
+
+    def objects(self, poses: Poses) -> Gaussians:
+        """The Gaussians of all objects at these poses."""
+        g, R = self.rest_gaussians, poses.rotation[self.row]
+        means = (R @ self.arm[..., None])[..., 0] + poses.centre[self.row]
+        sh = g.sh if g.sh.shape[1] == 1 else rotate_sh(g.sh, R)
+        return replace(g, means=means, quats=multiply(quaternion(poses.rotation)[self.row], g.quats), sh=sh)
+
+    def draw(self, camera: Camera, poses: Poses, reduction: int = 1) -> Synthesis:
+        """What a camera sees of the objects at these poses, at a whole fraction of its resolution."""
+        g, (width, height) = self.objects(poses), camera.size
+        rgb, alpha, depth, index = rasterise_with_index(g, camera.viewmat, camera.K, width, height)
+        front = (alpha > 0) & (depth < camera.background_depth * (1 + BEHIND))
+        image = torch.where(front[..., None], rgb + (1 - alpha)[..., None] * camera.background, camera.background)
+        seen = front & (alpha > MIN_ALPHA) & (index >= 0)
+        label = torch.where(seen, self.row[index.clamp_min(0)], -1)
+        depth = torch.where(seen, depth, camera.background_depth)
+        middle = slice(reduction // 2, None, reduction)
+        label, depth = label[middle, middle], depth[middle, middle]
+        # outlines move with what is in front
+        nearest, source = F.max_pool2d(-depth[None, None], 3, 1, 1, return_indices=True)
+        source = source[0, 0]
+        K = resize(camera.K, 1 / reduction, 1 / reduction)
+        point = _points(camera.viewmat, K, -nearest[0, 0], source)
+        return Synthesis(reduced(image, reduction), label, label.flatten()[source], point)
+
+
+def reduced(image: Float[Tensor, "h w 3"], reduction: int) -> Float[Tensor, "h2 w2 3"]:
+    """The means of blocks of pixels."""
+    return F.avg_pool2d(image.permute(2, 0, 1), reduction).permute(1, 2, 0) if reduction > 1 else image
+
+
+def _palette(colours: Float[Tensor, "n 3"]) -> Float[Tensor, "k 3"]:
+    """A few colours of an object, far from each other."""
+    return colours[farthest_points(colours, PALETTE).to(colours.device)].clamp(0, 1)
+
+
+def _middle(points: Float[Tensor, "n 3"]) -> Float[Tensor, "3"]:
+    return (points.quantile(0.02, dim=0) + points.quantile(0.98, dim=0)) / 2
+
+
+def _points(
+    viewmat: Float[Tensor, "4 4"], K: Float[Tensor, "3 3"], depth: Float[Tensor, "h w"], pixel: Int[Tensor, "h w"]
+) -> Float[Tensor, "h w 3"]:
+    """The points of the world at these depths [scene units] behind these pixels."""
+    width = depth.shape[1]
+    x, y = (pixel % width) + 0.5, (pixel // width) + 0.5
+    ray = torch.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], torch.ones_like(depth)], -1)
+    return centres(viewmat[None])[0] + depth[..., None] * ray @ viewmat[:3, :3]

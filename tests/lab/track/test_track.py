@@ -1,0 +1,186 @@
+"""Tracking of rendered films of known motion: poses, times of the films, lost objects, files."""
+
+import json
+from dataclasses import replace
+
+import pytest
+import torch
+
+from ngff_cli.app import app as ngff
+from ngff_cli.lab import app
+from stages.core.errors import InputError
+from stages.core.geometry.rotations import matrix, rotation_angle
+from stages.core.scene.scene import Scene
+from stages.core.scene.scene_ply import write_scene
+from stages.core.scene.sequence import FilmedSequence
+from stages.core.scene.trajectory import read_trajectory
+from stages.lab.bench.track import measure, pose_errors
+from stages.lab.track.confidence import confidences
+from stages.lab.track.films import read_films
+from stages.lab.track.follow import TrackedMotion, Tracker, interpolated, release_time
+from stages.lab.track.options import TrackOptions
+from stages.lab.track.poses import Poses, rotation_of, rotation_vector
+from stages.lab.track.search import search, spread_rotations
+from stages.lab.track.stand_in import (
+    KEYPOINTS,
+    StandInOptions,
+    make_stand_in,
+    write_films,
+    write_truth,
+)
+from stages.lab.track.track import report, run
+from tests.conftest import CliRunner, two_balls_scene
+
+SMALL = StandInOptions(objects=2, cameras=4, width=160, frames=7, hidden=0, seed=8)
+LATE = (0.2, -0.2, 0.1, -0.1)  # of the films' times in the scene file [frames]
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory):
+    """A folder with films of which one breaks off, the scene with wrong times, and the true motion."""
+    folder = tmp_path_factory.mktemp("stand-in")
+    stand_in = make_stand_in(SMALL)
+    write_films(stand_in, folder / "films")
+    write_truth(stand_in, folder / "truth.h5")
+    starts = {name: start + late for (name, start), late in zip(stand_in.starts.items(), LATE, strict=True)}
+    write_scene(folder / "scene.ply", replace(stand_in.scene, sequence=FilmedSequence(SMALL.fps, SMALL.frames, starts)))
+    return folder, stand_in
+
+
+@pytest.fixture(scope="module")
+def tracked(small, device):
+    """The track of these films, written by the command."""
+    folder, _ = small
+    words = ["track", folder / "scene.ply", folder / "films", "-o", folder / "track.h5", "--resolution", SMALL.width,
+             "--keypoints", KEYPOINTS, "--seed", SMALL.seed, "--device", device]  # fmt: skip
+    done = CliRunner().invoke(app, [str(word) for word in words])
+    assert done.exit_code == 0, done.output
+    return read_trajectory(folder / "track.h5"), done.stdout
+
+
+def test_motion_is_within_four_millimetres_and_two_degrees(small, tracked):
+    folder, _ = small
+    error, angle = pose_errors(tracked[0], read_trajectory(folder / "truth.h5"))
+    assert error.median() < 0.004 and angle.median() < 2
+    assert error.max() < 0.01 and angle.max() < 6
+    assert (tracked[0].confidence > 0.8).all()
+
+
+def test_times_of_the_films_are_corrected(small, tracked):
+    _, stand_in = small
+    found = tracked[0].scene.provenance["starts"]
+    late = torch.tensor([found[name] - start for name, start in stand_in.starts.items()])
+    assert (late - late.mean()).abs().max() < 0.1
+
+
+def test_every_object_has_a_line(tracked):
+    assert tracked[1].count("seen in 7 of 7 frames") == 2
+
+
+def test_evaluate_takes_the_track_as_truth(small, tracked):
+    folder, _ = small
+    words = ["evaluate", folder / "truth.h5", "--against", folder / "track.h5", "-o", folder / "metrics.json"]
+    done = CliRunner().invoke(ngff, [str(word) for word in words])
+    assert done.exit_code == 0, done.output
+    assert json.loads((folder / "metrics.json").read_text())["overall"]["RMSE"] < 0.004
+
+
+def test_films_of_other_cameras_are_refused(small, tmp_path):
+    folder, _ = small
+    for name in ("one.mp4", "two.mp4"):
+        (tmp_path / name).write_bytes((folder / "films/camera00.mp4").read_bytes())
+    with pytest.raises(InputError, match="no film of the scene's cameras"):
+        list(run(folder / "scene.ply", tmp_path, tmp_path / "out.h5", TrackOptions()))
+
+
+def test_scenes_without_films_or_objects_are_refused(small, tmp_path):
+    folder, stand_in = small
+    write_scene(tmp_path / "photos.ply", two_balls_scene())
+    with pytest.raises(InputError, match="--sequence"):
+        list(run(tmp_path / "photos.ply", folder / "films", tmp_path / "out.h5", TrackOptions()))
+    blank = replace(stand_in.scene.gaussians, object_id=torch.zeros_like(stand_in.scene.gaussians.object_id))
+    bare = Scene(blank, (), stand_in.scene.cameras, sequence=FilmedSequence(50.0, 5, stand_in.starts))
+    write_scene(tmp_path / "bare.ply", bare)
+    with pytest.raises(InputError, match="no objects; label"):
+        list(run(tmp_path / "bare.ply", folder / "films", tmp_path / "out.h5", TrackOptions()))
+
+
+def small_tracker(small, device) -> Tracker:
+    folder, stand_in = small
+    scene = replace(stand_in.scene, sequence=FilmedSequence(SMALL.fps, SMALL.frames, stand_in.starts))
+    return Tracker(scene, *read_films(scene, folder / "films", 2, SMALL.width), device)
+
+
+def test_alignment_returns_to_the_true_pose(small, device):
+    tracker = small_tracker(small, device)
+    still = (tracker.still, tracker.still)
+    off = torch.tensor([0.1, -0.15, 0.1, 0.01, -0.01, 0.01], device=device).expand_as(tracker.still)
+    found = tracker.fit(0, {8: 6, 4: 6, 2: 4}, tracker.rest.moved(off), still)
+    assert (found.centre - tracker.rest.centre).norm(dim=1).max() < 0.002
+    assert rotation_angle(found.rotation).max() < 2
+
+
+@pytest.mark.slow
+def test_a_lost_object_is_found_again(small, device):
+    tracker = small_tracker(small, device)
+    moved = torch.zeros_like(tracker.still)
+    moved[0] = torch.tensor([1.5, 1.0, -0.5, 0.08, 0.06, -0.05])
+    found = search(tracker, 0, 0, tracker.rest.moved(moved), tracker.still, 5)
+    assert found is not None
+    assert (found.centre - tracker.rest.centre).norm(dim=1).max() < 0.004
+    share, _ = tracker.judge(0, found, (tracker.still, tracker.still))
+    assert share.min() > 0.9
+
+
+@pytest.mark.slow
+def test_ten_cameras_with_a_hidden_object_and_a_broken_film(tmp_path, device):
+    row = measure(make_stand_in(StandInOptions(width=160, frames=30, seed=101)), tmp_path, device)
+    assert row["position_mm"] < 4 and row["rotation_deg"] < 2
+    assert row["covered_flagged"] == row["covered"] > 5
+    assert row["refined_offset_frames"] < 0.1
+
+
+def test_a_rotation_and_its_vector_are_inverse():
+    vector = torch.tensor([[0.3, -1.2, 0.7], [0.0, 0.0, 0.0], [1e-6, 0.0, 0.0], [0.0, 3.1, 0.0]])
+    torch.testing.assert_close(rotation_vector(rotation_of(vector)), vector, atol=2e-5, rtol=1e-4)
+
+
+def test_spread_rotations_leave_no_gap():
+    rotations, rng = spread_rotations(72), torch.Generator().manual_seed(0)
+    anywhere = matrix(torch.nn.functional.normalize(torch.randn(200, 4, generator=rng), dim=1))
+    nearest = rotation_angle(rotations[:, None].mT @ anywhere[None]).amin(0)
+    assert nearest.max() < 60
+
+
+def motion(height: list[float], confidence: list[float]) -> TrackedMotion:
+    """One object on these heights."""
+    centre = torch.zeros(len(height), 1, 3)
+    centre[:, 0, 2] = torch.tensor(height)
+    share = torch.tensor(confidence)[:, None]
+    return TrackedMotion(Poses(torch.eye(3).expand(len(height), 1, 3, 3), centre), share, 100 * share, {})
+
+
+def test_the_release_is_where_a_fall_begins():
+    fall = [max(t - 0.4, 0.0) ** 2 * 0.002 for t in range(12)]
+    assert release_time(motion([1 - x for x in fall], [1.0] * 12)) == pytest.approx(0.4, abs=0.02)
+    assert release_time(motion([1 - 0.001 * t for t in range(12)], [1.0] * 12)) == 0  # it does not fall freely
+
+
+def test_gaps_are_interpolated():
+    track = motion([0.0, 1.0, 99.0, 99.0, 4.0, 99.0], [1.0, 1.0, 0.0, 0.0, 1.0, 0.0])
+    torch.testing.assert_close(interpolated(track).centre[:, 0, 2], torch.tensor([0.0, 1.0, 2.0, 3.0, 4.0, 4.0]))
+
+
+def test_an_object_is_lost_unless_two_pictures_confirm_it():
+    good, bad, few = torch.full((40,), 0.02), torch.full((40,), 0.5), torch.full((3,), 0.02)
+    share, pixels = confidences([[good, good], [good, bad], [bad, few]], [0.1, 0.1])
+    assert share.tolist() == pytest.approx([2 / 3, 0.0]) and pixels.tolist() == [120, 80]
+
+
+def test_the_report_says_where_objects_were_lost():
+    world = two_balls_scene()
+    share = torch.tensor([[1.0, 1.0], [0.0, 1.0], [0.0, 0.0], [1.0, 1.0]])
+    pixels = torch.tensor([[50.0, 50.0], [50.0, 50.0], [50.0, 0.0], [50.0, 50.0]])
+    poses = Poses(torch.eye(3).expand(4, 2, 3, 3), torch.zeros(4, 2, 3))
+    lines = list(report(world, TrackedMotion(poses, share, pixels, {})))
+    assert lines[0].endswith("lost in 1 to 2 (hidden)") and lines[1].endswith("lost in 2 (out of view)")

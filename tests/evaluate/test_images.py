@@ -112,5 +112,6 @@ def test_frames_compares_the_first_ones_and_says_so(tmp_path):
     assert whole["overall"]["frames"] == 3 and first["per_frame"]["PSNR"] == whole["per_frame"]["PSNR"][:2]
     assert any("only the first 2 frames" in note for note in first["notes"])
     assert not any("only the first" in note for note in whole["notes"])
+    assert evaluate(mine, true, tmp_path, frames=1)["overall"]["frames"] == 1
     with pytest.raises(InputError, match="both have only 3 frames; give 3 or fewer"):
         evaluate(mine, true, tmp_path, frames=4)

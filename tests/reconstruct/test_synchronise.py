@@ -8,11 +8,14 @@ import pytest
 import torch
 
 from stages.core.errors import InputError
-from stages.core.scene.images import VideoWriter, write_png
+from stages.core.scene.images import VideoWriter, read_image, write_png
 from stages.core.scene.recordings import common_frame_rate, list_recordings, read_recording
+from stages.core.scene.scene_ply import read_scene
 from stages.reconstruct.filmed_sequence import loudness, read_sequence
 from stages.reconstruct.options import ReconstructOptions
+from stages.reconstruct.stage import run
 from stages.reconstruct.synchronise import find_motion, find_offsets, motion_signal, parse_offsets
+from tests.reconstruct.raycast import arc, write_set
 
 SIZE = 64  # of the films [px]
 STARTS = {"a": 8.0, "b": 12.0 + 1 / 3, "c": 6.0 + 2 / 3}  # frame of each film at the release
@@ -159,3 +162,24 @@ def test_films_are_synchronised_by_sound(tmp_path):
 def test_frames_have_no_sound(tmp_path):
     with pytest.raises(InputError, match="no sound"):
         loudness(tmp_path, 25)
+
+
+def test_the_scene_of_the_release_has_the_times_of_the_films(tmp_path):
+    """Cameras around a still scene; something crosses the pictures from a frame that differs between the films."""
+    pytest.importorskip("pycolmap")
+    cameras = write_set(tmp_path / "set", arc(4, (96, 72), sweep=40.0))
+    for view, photo in enumerate(sorted((tmp_path / "set/images").iterdir())):
+        folder = tmp_path / "films" / photo.name
+        folder.mkdir(parents=True)
+        image = read_image(photo)
+        for k in range(30):
+            t = min(max(k - 6 - view, 0), 12)
+            frame = image.clone()
+            frame[int(2 + 0.2 * t**2) :][:8, 40:56] = torch.rand(8, 16, 3, generator=torch.Generator().manual_seed(0))
+            write_png(folder / f"{k:03d}.png", frame)
+    options = ReconstructOptions(sequence=True, cameras=cameras, quality="draft", iterations=0)
+    run(tmp_path / "films", tmp_path / "scene.ply", options)
+    scene = read_scene(tmp_path / "scene.ply")
+    assert scene.sequence.fps == 50 and len(scene.cameras) == 4
+    for view, name in enumerate(scene.cameras.names):
+        assert 8 + view - 0.5 < scene.sequence.starts[name] < 9 + view + 0.5  # the pictures first differ

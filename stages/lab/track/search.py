@@ -24,8 +24,8 @@ SPREAD = 0.15  # of that share below the highest
 MIN_VIEWS = 3  # pictures that must show a place
 MIN_SUPPORT = 0.7  # share of the pictures that must show something unexplained at a place
 ROTATIONS = 72  # that are tried
-STARTS = 6  # rotations from which the object is aligned, the best of all tried
-VIEWS = 5  # pictures in which rotations are compared
+STARTS = 4  # rotations from which the object is aligned, the best of all tried
+VIEWS = 3  # pictures in which rotations are compared
 LIKE = 0.15  # difference from the nearest colour of an object up to which a pixel may show it
 AWAY = 1e4  # where an object is not seen [scene units]
 
@@ -43,10 +43,13 @@ def search(tracker: Tracker, frame: int, i: int, poses: Poses, velocity: Tensor,
     for turn in [torch.eye(3), *spread_rotations(ROTATIONS)]:
         start = Poses(poses.rotation.clone(), poses.centre.clone())
         start.rotation[i], start.centre[i] = turn.to(places) @ poses.rotation[i], places.mean(0)
-        starts.append((_cost(tracker, some, start), len(starts), start))
+        starts.append((_cost(tracker, some, start), start))
+    starts.sort(key=lambda start: start[0])
+    if starts[0][0] >= _cost(tracker, some, gone):  # the pictures are explained better without the object
+        return None
     others = torch.arange(len(poses.centre), device=tracker.device) != i
     motion = (velocity, velocity)
-    aligned = [tracker.fit(frame, SEARCHING, start, motion, others) for _, _, start in sorted(starts)[:STARTS]]
+    aligned = [tracker.fit(frame, SEARCHING, start, motion, others) for _, start in starts[:STARTS]]
     return min(aligned, key=lambda p: _cost(tracker, seen, p))
 
 

@@ -19,6 +19,7 @@ import numpy as np
 from scipy import ndimage
 
 from stages.core.geometry.rotations import matrix
+from stages.core.physics.convex_parts import VOXELS_ALONG
 from stages.core.physics.forces import ForcePrompts
 from stages.core.physics.materials import MODELS, choose_materials
 from stages.core.physics.particles import filled_voxels
@@ -29,7 +30,6 @@ from stages.simulate.options import SimulateOptions
 
 log = logging.getLogger(__name__)
 BOUNDS = {"penetration": 0.03, "creep": 0.01, "spread": 0.1, "energy_gain": 0.05}  # beyond these a warning is logged
-VOXELS_ALONG = 24  # of the bodies in which depths are measured
 MAX_CHECKED_KEYPOINTS = 256  # keypoints of an object whose depth is measured
 SLOW = 0.1  # largest speed of an object that creeps, relative to that of a fall by half the object's size
 MOVED = 1e-3  # least displacement of one of two objects whose penetration is measured [size]

@@ -48,7 +48,6 @@ PARTS_DAMPING = 0.4  # least damping ratio of bodies of several parts, of which 
 IMPEDANCE = 0.99  # of a contact: 1 would be exact, but the forces between several contacts undetermined
 MAX_SUBSTEPS = 5_000  # in a frame
 MAX_TRAVEL = 0.05  # of the smallest object's size in a substep, so that nothing passes through it
-MAX_SETTLING = 1.0  # largest displacement of an object of photos onto the floor [particle spacings]
 ON_FLOOR = 0.02  # gap up to which a body stands on the floor [units]
 
 
@@ -87,25 +86,25 @@ def rollout(
 ) -> Iterator[FrameState]:
     """One state per frame, the first being the start. Raises InputError when the motion is no longer finite."""
     setup = set_up_scene(scene, prompts, options)
-    bodies, floor_offset = _bodies(scene, setup, prompts, options)
+    bodies = _bodies(scene, setup, prompts, options)
     world = _World(scene, setup, bodies, prompts, options)
     log.info("%d bodies of %d convex parts, substep %.3g s (%d per frame)", len(bodies),
              sum(len(b.parts.hulls) for b in bodies), options.dt / world.substeps, world.substeps)  # fmt: skip
-    return _states(scene, keypoints, setup, bodies, floor_offset, world, prompts, options)
+    return _states(scene, keypoints, setup, bodies, world, prompts, options)
 
 
 def _states(
-    scene: Scene, keypoints: Keypoints, setup: SceneSetup, bodies: list[Body], floor_offset: Float[Tensor, "o 3"],
-    world: _World, prompts: ForcePrompts, options: SimulateOptions,
+    scene: Scene, keypoints: Keypoints, setup: SceneSetup, bodies: list[Body], world: _World, prompts: ForcePrompts,
+    options: SimulateOptions,
 ) -> Iterator[FrameState]:  # fmt: skip
-    """Keypoints moved with their bodies; displacements onto the floor are not part of the output."""
+    """Keypoints moved with their bodies."""
     row = torch.tensor([[o.id for o in scene.objects].index(int(i)) for i in keypoints.object_id], dtype=torch.int64)
     com = torch.stack([b.parts.com for b in bodies])
     arm = (keypoints.rest - com[row])[..., None]
     current, held, acting = options, prompts.pinned, prompts.forces
     for frame in range(options.steps):
         centre, quat = world.pose()
-        centre = centre / scene.metres_per_unit - floor_offset
+        centre = centre / scene.metres_per_unit
         check_motion(torch.cat([centre, quat[:, 1:]]), frame, options)
         if frame == 0:  # without rounding
             yield FrameState(keypoints.rest + setup.lift[row], com + setup.lift, quat, world.mass)
@@ -124,33 +123,23 @@ def _states(
             world.advance(frame * options.dt)
 
 
-def _bodies(
-    scene: Scene, setup: SceneSetup, prompts: ForcePrompts, options: SimulateOptions
-) -> tuple[list[Body], Float[Tensor, "o 3"]]:
-    """The bodies, and their displacements onto the floor [scene units], as in setup but exact for the convex parts.
-
-    What lies deeper below the floor in an object of photos is cut off.
-    """
-    unit, bodies, offsets = scene.metres_per_unit, [], []
-    settling = MAX_SETTLING * setup.bodies.spacing if from_photos(scene) else math.inf
-    divided = convex_parts(scene, options.seed, setup.box.low[2] - settling)
+def _bodies(scene: Scene, setup: SceneSetup, prompts: ForcePrompts, options: SimulateOptions) -> list[Body]:
+    """The bodies where the scene has them; what lies below the floor is cut off."""
+    unit, bodies = scene.metres_per_unit, []
+    divided = convex_parts(scene, options.seed, setup.box.low[2])
     for row, (o, parts) in enumerate(zip(scene.objects, divided, strict=True)):
         choice, (shift, inertia) = setup.materials[o.id], setup.uneven_moments(row)
         parts = replace(parts, com=parts.com + shift, inertia=parts.inertia + parts.volume * inertia)
         m, pinned = choice.material, o.id in prompts.pinned
         mass = m.density * parts.volume * unit**3
-        lowest = float(torch.cat(parts.hulls)[:, 2].min() + setup.lift[row, 2])
-        below = lowest - setup.box.low[2]
-        stands = below < settling and (bool(setup.on_floor[row]) or below < 0)
-        offset = torch.tensor([0.0, 0.0, -below if stands and not pinned else 0.0])
         friction = m.friction if options.friction is None else options.friction
-        start = unit * (parts.com + setup.lift[row] + offset)
+        start = unit * (parts.com + setup.lift[row])
         bodies.append(Body(parts, m, friction, mass, start, pinned))
-        offsets.append(offset)
         guess = f"; material not known, taking {choice.name} (--material {o.id}=... changes it)" * choice.guessed
         log.info("object %d (%s): %s, %s%s%s", o.id, o.name, choice.name, scene.mass_text(mass), ", pinned" * pinned,
                  guess)  # fmt: skip
-        height = unit * float(torch.cat(parts.hulls)[:, 2].max()) - unit * (lowest - float(setup.lift[row, 2]))
+        z = torch.cat(parts.hulls)[:, 2]
+        height = unit * float(z.max() - z.min())
         if MODELS[m.model].plastic:
             log.warning("object %d (%s): %s yields or flows, but rigid bodies keep their shape; use --engine mpm",
                         o.id, o.name, choice.name)  # fmt: skip
@@ -158,7 +147,7 @@ def _bodies(
             log.warning("object %d (%s): %s yields by %.0f %% under its own weight, but rigid bodies keep their shape; "
                         "use --engine ngff or mpm", o.id, o.name, choice.name,
                         100 * sag(m, height, options.gravity))  # fmt: skip
-    return bodies, torch.stack(offsets)
+    return bodies
 
 
 class _World:
@@ -202,13 +191,11 @@ class _World:
         at_rest = self._at_rest(scene, setup, prompts, options)
         self._start = self.data.qpos.reshape(-1, FREE).copy()
         lift = setup.lift.double().numpy()[self._free] * scene.metres_per_unit / size
-        self.data.qpos.reshape(-1, FREE)[:, :3] -= lift
         mujoco.mj_fwdPosition(self.model, self.data)
-        self._overlaps = InitialOverlaps(mujoco, self.model, self.data)
+        self._overlaps = InitialOverlaps(self.model, self.data)
+        self.data.qpos.reshape(-1, FREE)[:, :3] -= lift
         self._resting = self._resting_bodies(setup, at_rest)
         self.data.qpos.reshape(-1, FREE)[:, :3] += lift
-        mujoco.mj_fwdPosition(self.model, self.data)
-        self._overlaps.add_lifted(self.data)
         self.release(i for i in self._free if i not in at_rest)
 
     def set_forces(self, forces: Sequence[Force], pinned: Collection[int]) -> None:

@@ -1,20 +1,20 @@
 """Convex parts of an object, for rigid-body collision, and its volume, centre of mass and inertia.
 
 An object that fills its convex hull is one part. The filled voxels of others are cut by planes, one part at a time: the
-part whose hull has most empty space, along the plane after which the hulls of both sides together are smallest. The
-hulls are then those of the surface points at each part's voxels. Lengths are in the unit of the Gaussians.
+part whose hull has most empty space, along the plane after which the hulls of both sides together are smallest. Space
+of other objects counts OTHERS times, so that parts of different objects overlap at the start only where the objects do.
+The hulls are then those of each part's voxel centres and of the surface points at them. Lengths are in the unit of the
+Gaussians.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from jaxtyping import Float
-from scipy import ndimage
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 from torch import Tensor
 
@@ -23,10 +23,11 @@ from stages.core.physics.particles import filled_voxels, inliers, usable
 from stages.core.scene.cached import cached_in_scene
 from stages.core.scene.scene import Scene
 
-VOXELS_ALONG = 32  # voxels along the longest side of an object
+VOXELS_ALONG = 48  # voxels along the longest side of an object
 CONVEX = 0.9  # fraction of its hull that a convex object fills: voxels are accurate to about 5 %
 MAX_PARTS = 24  # of an object
 EMPTY, PART_EMPTY = 0.05, 0.1  # share of empty space in the hulls, of all parts together or of one, that is accepted
+OTHERS = 10  # weight of the space in a hull that belongs to other objects, relative to empty space
 MIN_VOXELS = 30  # of a part that is divided
 CUTS = 7  # planes tried along each of six axes: those of the world, and the principal ones of the part
 DIRECTIONS = 64  # in which a hull is measured; the hull of a ball in these has 91 % of its volume
@@ -41,21 +42,6 @@ class Solid:
     voxels: np.ndarray  # (m, 3), centres
     h: float  # edge of a voxel
     surface: np.ndarray  # (n, 3), points on it
-
-    def inside(self) -> Callable[[np.ndarray], np.ndarray]:
-        """A function that tells which points (k, 3) are inside, in voxels of which all six neighbours are full."""
-        cells = np.floor(self.voxels / self.h).astype(np.int64)
-        low = cells.min(0) - 1
-        full = np.zeros(cells.max(0) - low + 2, bool)
-        full[tuple((cells - low).T)] = True
-        full = ndimage.binary_erosion(full)
-
-        def found(points: np.ndarray) -> np.ndarray:
-            at = np.floor(points / self.h).astype(np.int64) - low
-            at = np.where(((at >= 0) & (at < full.shape)).all(1, keepdims=True), at, 0)  # the first one is empty
-            return full[tuple(at.T)]
-
-        return found
 
 
 @dataclass(frozen=True)
@@ -72,13 +58,13 @@ class ConvexParts:
 def convex_parts(scene: Scene, seed: int = 0, bottom: float = -np.inf) -> list[ConvexParts]:
     """Divide each object into convex parts, in the order of scene.objects.
 
-    What lies below the height `bottom`, or inside a smaller object, is cut off. Raises InputError for an object without
+    What lies below the height `bottom` is cut off. Raises InputError for an object without
     any usable Gaussian.
     """
     ids = [o.id for o in scene.objects]
     with ThreadPoolExecutor(torch.get_num_threads()) as pool:
         solids = list(pool.map(lambda id: _solid(scene, id, seed, bottom), ids))
-        return list(pool.map(lambda solid: _parts(solid, seed), _without_overlaps(solids)))
+        return list(pool.map(lambda row: _parts(solids[row], _around(solids, row), seed), range(len(solids))))
 
 
 def _solid(scene: Scene, object_id: int, seed: int, bottom: float) -> Solid:
@@ -91,28 +77,22 @@ def _solid(scene: Scene, object_id: int, seed: int, bottom: float) -> Solid:
     return Solid(voxels, h, surface)
 
 
-def _without_overlaps(solids: list[Solid]) -> list[Solid]:
-    """The solids without what is inside smaller ones, by more than a voxel of these."""
-    order = sorted(range(len(solids)), key=lambda i: len(solids[i].voxels) * solids[i].h ** 3)
-    out, insides = list(solids), []
-    for i in order:
-        s = solids[i]
-        for inside in insides:
-            free = ~inside(s.voxels)
-            if free.sum() >= max(MIN_VOXELS, len(free) / 2) and not free.all():
-                s = Solid(s.voxels[free], s.h, s.surface[~inside(s.surface)])
-        out[i] = s
-        insides.append(s.inside())
-    return out
+def _around(solids: list[Solid], row: int) -> np.ndarray:
+    """Centres (n, 3) of the voxels of the other solids within the bounds of one of them and not in or next to it."""
+    own = solids[row]
+    low, high = own.voxels.min(0) - own.h, own.voxels.max(0) + own.h
+    near = [s.voxels[((s.voxels > low) & (s.voxels < high)).all(1)] for k, s in enumerate(solids) if k != row]
+    others = np.concatenate([np.empty((0, 3)), *near])
+    return others[cKDTree(own.voxels).query(others, distance_upper_bound=own.h)[0] == np.inf]
 
 
-def _parts(solid: Solid, seed: int) -> ConvexParts:
+def _parts(solid: Solid, others: np.ndarray, seed: int) -> ConvexParts:
     volume = len(solid.voxels) * solid.h**3
     whole = _hull(solid.surface)
     if whole is not None and whole.volume * CONVEX < volume:
         volume, com, inertia = _solid_moments(whole)
         return ConvexParts((_vertices(whole, seed),), volume, com, inertia)
-    hulls = _hulls(solid, divide(np.floor(solid.voxels / solid.h)))
+    hulls = _hulls(solid, divide(solid.voxels / solid.h, others / solid.h))
     x = torch.from_numpy(solid.voxels)
     com = x.mean(0)
     r = x - com
@@ -155,10 +135,9 @@ def _hulls(solid: Solid, part: np.ndarray) -> list[ConvexHull]:
     voxels, h, surface = solid.voxels, solid.h, solid.surface
     near = cKDTree(voxels).query(surface, 8, distance_upper_bound=h)[1]
     of = np.append(part, -1)[near]
-    inner = cKDTree(surface).query(voxels)[0] > 2 * h
     hulls = []
     for k in range(part.max() + 1):
-        points = np.concatenate([surface[(of == k).any(1)], _corners(voxels[inner & (part == k)], h)])
+        points = np.concatenate([surface[(of == k).any(1)], voxels[part == k]])
         hulls.append(_hull(points) or ConvexHull(_corners(voxels[part == k], h)))
     return hulls
 
@@ -168,29 +147,37 @@ def _corners(voxels: np.ndarray, h: float) -> np.ndarray:
     return (voxels[:, None] + h * CORNERS).reshape(-1, 3)
 
 
-def divide(cells: np.ndarray) -> np.ndarray:
-    """The part, from 0, of each of the unit voxels at cells (m, 3) of a body."""
+def divide(cells: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """The part, from 0, of each of the unit voxels at cells (m, 3) of a body; `others` (n, 3) are points outside it."""
     part = np.zeros(len(cells), np.int64)
-    empty = {0: _hull_volume(cells) - len(cells)}  # volume of a part's hull that the part does not fill
-    while len(empty) < MAX_PARTS and sum(empty.values()) > EMPTY * len(cells):
-        worst = max(empty, key=lambda k: empty[k])
+    cost = {0: _hull_cost(cells, others) - len(cells)}  # volume of a part's hull that the part does not fill
+    while len(cost) < MAX_PARTS and sum(cost.values()) > EMPTY * len(cells):
+        worst = max(cost, key=lambda k: cost[k])
         rows = np.flatnonzero(part == worst)
-        if empty[worst] <= PART_EMPTY * len(rows):
+        if cost[worst] <= PART_EMPTY * len(rows):
             break
-        side = _best_cut(cells[rows]) if len(rows) >= MIN_VOXELS else None
+        side = _best_cut(cells[rows], others) if len(rows) >= MIN_VOXELS else None
         if side is None:
-            empty[worst] = 0.0
+            cost[worst] = 0.0
             continue
-        part[rows[side]] = other = len(empty)
+        part[rows[side]] = other = len(cost)
         for k in (worst, other):
             own = cells[part == k]
-            empty[k] = _hull_volume(own) - len(own)
+            cost[k] = _hull_cost(own, others) - len(own)
     return part
 
 
-def _hull_volume(cells: np.ndarray) -> float:
-    """Volume of the hull of a body of voxels: it lies about half way between those of their centres and corners."""
-    return _volume(cells[(cells @ SPREAD.T).argmax(0)], 0.5)
+def _hull_cost(cells: np.ndarray, others: np.ndarray) -> float:
+    """Volume of the hull of a body of voxels, which lies about half way between those of their centres and corners,
+    where the space of others counts OTHERS times.
+    """
+    extreme = cells[(cells @ SPREAD.T).argmax(0)]
+    return _volume(extreme, 0.5) + OTHERS * _inside(extreme, others @ SPREAD.T)
+
+
+def _inside(extreme: np.ndarray, along: np.ndarray) -> int:
+    """How many points, given (n, d) along SPREAD, are inside the hull of the extreme voxels by half a voxel or more."""
+    return int((along < (extreme * SPREAD).sum(1) - 0.5).all(1).sum())
 
 
 def _volume(extreme: np.ndarray, edge: float = 1.0) -> float:
@@ -199,10 +186,12 @@ def _volume(extreme: np.ndarray, edge: float = 1.0) -> float:
     return 0.0 if hull is None else hull.volume
 
 
-def _best_cut(cells: np.ndarray) -> np.ndarray | None:
+def _best_cut(cells: np.ndarray, others: np.ndarray) -> np.ndarray | None:
     """The side (m,) of each voxel of the plane after which the hulls of both sides are smallest; None without any."""
     smallest, best = np.inf, None
     along = cells @ SPREAD.T
+    outside = others @ SPREAD.T
+    outside = outside[(outside < along.max(0)).all(1)]
     for axis in np.concatenate([np.eye(3), np.linalg.eigh(np.cov(cells.T))[1].T]):
         x = cells @ axis
         slab = np.searchsorted(np.linspace(x.min(), x.max(), CUTS + 2)[1:-1], x)
@@ -211,7 +200,7 @@ def _best_cut(cells: np.ndarray) -> np.ndarray | None:
         below, above = _accumulated(along, extreme), _accumulated(along, extreme[::-1])[::-1]
         for k in range(CUTS):
             if below[k] is not None and above[k + 1] is not None:
-                volume = _volume(cells[below[k]]) + _volume(cells[above[k + 1]])
+                volume = sum(_volume(e) + OTHERS * _inside(e, outside) for e in (cells[below[k]], cells[above[k + 1]]))
                 if volume < smallest:
                     smallest, best = volume, slab <= k
     return best

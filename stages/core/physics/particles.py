@@ -123,8 +123,7 @@ def surface_points(scene: Scene, object_id: int, seed: int) -> np.ndarray:
     good = good[inliers(good.means)]
     means = good.means.double()
     size = float((means.amax(0) - means.amin(0)).norm())
-    _, index = knn(means, means[:: max(1, len(means) // 2000)], 2)
-    gap = float((means[:: max(1, len(means) // 2000)] - means[index[:, 1]]).norm(dim=1).median()) or size / 50
+    gap = _spacing(means) or size / 50
     scales = good.scales.double().clamp(max=max(size / 6, 1e-9) if len(good) > 1 else float(good.scales.median()))
     area = scales.sort(1).values[:, 1:].prod(1) * 4 / max(gap, 1e-12) ** 2
     each = area.clamp(1, 32).ceil().long()
@@ -145,6 +144,7 @@ def inliers(points: Float[Tensor, "n 3"]) -> Tensor:
     return 0.6745 * (distance - middle) <= MAX_OUTLIER_SCORE * spread.clamp_min(1e-12 + 1e-3 * float(middle))
 
 
+@cached_in_scene
 def filled_voxels(scene: Scene, object_id: int, along: int, seed: int = 0) -> tuple[Float[Tensor, "m 3"], float]:
     """Centres of the voxels of an object's filled body, its skin included, and their edge.
 
@@ -153,7 +153,9 @@ def filled_voxels(scene: Scene, object_id: int, along: int, seed: int = 0) -> tu
     """
     points = surface_points(scene, object_id, seed)
     gap = _gap(points)
-    h = max(float((points.max(0) - points.min(0)).max()) / along, gap / 8, 1e-9)
+    g = scene.gaussians.to("cpu")
+    spacing = _spacing(g.means[(g.object_id == object_id) & usable(g)].double())
+    h = max(float((points.max(0) - points.min(0)).max()) / along, gap / 8, spacing / 3, 1e-9)
     # as an object that stands, closed by the floor, or as one that hangs, with wider leaks: what fills more
     floors = (scene.floor, None) if scene.floor is not None else (None,)
     bodies = [_closed_body(points, h, gap, floor, photographed=False)[:2] for floor in floors]
@@ -210,6 +212,13 @@ def _closed_body(
     return body, low, extended
 
 
+def _spacing(means: Float[Tensor, "n 3"]) -> float:
+    """Median distance of Gaussians to the nearest other; 0 for one alone."""
+    some = means[:: max(1, len(means) // 2000)]
+    _, index = knn(means, some, 2)
+    return float((some - means[index[:, -1]]).norm(dim=1).median())
+
+
 def _gap(points: np.ndarray) -> float:
     """Gap that closing must bridge: the 90 % quantile of the distance to the third neighbour."""
     some = torch.from_numpy(points)
@@ -230,9 +239,9 @@ def _fill(shell: np.ndarray, gap: int, standing: bool) -> np.ndarray:
     closed = ndimage.binary_erosion(wide, CROSS, iterations=gap)
     body = shell | closed | enclosed | (grown & ~ndimage.binary_dilation(outside, CROSS, iterations=gap))
     if not standing:
-        return body | _cavities(shell | closed, LEAK_RADII)
+        return body | _cavities(body, LEAK_RADII)
     # gaps that closing just misses leak too, but a cloth on the floor has folds that look like cavities with wide leaks
-    body |= _cavities(shell | closed, (gap + 1,))
+    body |= _cavities(body, (gap + 1,))
     body[:, :, : layers[0]] = False
     return body
 
@@ -250,7 +259,7 @@ def _cavities(walls: np.ndarray, leaks: Sequence[int]) -> np.ndarray:
     for leak in leaks:
         free = away > leak
         outside = _outside(free)
-        hollow = _components_with(free & ~outside, away >= MIN_CAVITY_RATIO * leak)
+        hollow = _components_with(free & ~outside & ~filled, away >= MIN_CAVITY_RATIO * leak)
         if hollow.any():  # grow back to the walls, but not through the leaks
             filled |= _components_with(~walls & (ndimage.distance_transform_edt(~outside) > leak + 1), hollow)
     return filled[room:-room, room:-room, room:-room]
@@ -303,15 +312,14 @@ def _largest(body: np.ndarray) -> np.ndarray:
 
 def _without_overlap(bodies: list[np.ndarray]) -> list[np.ndarray]:
     """Assign each voxel to one body, smaller bodies first, unless too few voxels would remain."""
-    taken = np.zeros(0, np.int64)
-    out = list(bodies)
-    low = np.min([b.min(0) for b in bodies], axis=0)
+    out, low = list(bodies), np.min([b.min(0) for b in bodies], axis=0)
     span = np.max([b.max(0) for b in bodies], axis=0) - low + 1
-    for i in sorted(range(len(bodies)), key=lambda i: len(bodies[i])):
-        at = bodies[i] - low
-        key = (at[:, 0] * span[1] + at[:, 1]) * span[2] + at[:, 2]
-        free = ~np.isin(key, taken)
-        if free.sum() >= MIN_PARTICLES:
-            out[i] = bodies[i][free]
-        taken = np.union1d(taken, key)
+    order = sorted(range(len(bodies)), key=lambda i: len(bodies[i]))
+    cells = np.concatenate([bodies[i] for i in order]) - low
+    first = np.unique((cells[:, 0] * span[1] + cells[:, 1]) * span[2] + cells[:, 2], return_index=True)[1]
+    free = np.zeros(len(cells), bool)
+    free[first] = True
+    for i, own in zip(order, np.split(free, np.cumsum([len(bodies[i]) for i in order])[:-1]), strict=True):
+        if own.sum() >= MIN_PARTICLES:
+            out[i] = bodies[i][own]
     return out

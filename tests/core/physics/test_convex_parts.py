@@ -1,10 +1,11 @@
 """Convex parts: moments of solids, concave objects, and the surface of voxels."""
 
+import numpy as np
 import pytest
 import torch
-from scipy.spatial import ConvexHull
+from scipy.spatial import ConvexHull, Delaunay
 
-from stages.core.physics.convex_parts import convex_parts
+from stages.core.physics.convex_parts import convex_parts, divide
 from stages.core.scene.scene import Scene, SceneObject
 from stages.lab.assets.shapes import Surface, box, ellipsoid, to_gaussians, union
 from tests.conftest import two_balls_scene
@@ -52,3 +53,16 @@ def test_a_concave_object_is_divided():
     torch.testing.assert_close(corners.amax(0), torch.tensor([0.19, 0.1, 0.1]), rtol=0, atol=0.01)
     torch.testing.assert_close(corners.amin(0), -torch.tensor([0.19, 0.1, 0.1]), rtol=0, atol=0.01)
     torch.testing.assert_close(parts.com, torch.zeros(3), rtol=0, atol=0.002)
+
+
+def test_parts_leave_out_the_space_of_other_objects():
+    """A shallow arch over a plate: the plate is in the hull of the arch, but not in those of its parts."""
+    arch = np.stack(np.meshgrid(np.arange(-14, 15), np.arange(-6, 7), np.arange(40, 60)), -1).reshape(-1, 3)
+    arch = arch[np.hypot(arch[:, 0], arch[:, 2]) >= 45]
+    plate = np.stack(np.meshgrid(np.arange(-4, 5), np.arange(-4, 5), [43.5]), -1).reshape(-1, 3)
+
+    def inside(part: np.ndarray) -> int:
+        hulls = [Delaunay(arch[part == k]) for k in range(part.max() + 1)]
+        return sum((hull.find_simplex(plate) >= 0).sum() for hull in hulls)
+
+    assert inside(divide(arch, np.empty((0, 3)))) == len(plate) and inside(divide(arch, plate)) == 0

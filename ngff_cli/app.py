@@ -138,6 +138,10 @@ def segment(
     boxes: Annotated[
         Path | None, Option(help=f"prompts.json: boxes in the first photo [px] and names; for {NETWORKS} also points")
     ] = SegmentOptions.boxes,
+    points: Annotated[
+        list[str] | None, Option(help='a point on an object in a photo [px]: "view=IMG.jpg xy=310,220 name=duck"; '
+                                 "repeatable; points of one name are on one object")
+    ] = None,
     photos: Annotated[
         Path | None, Option(help=f"for {NETWORKS}: folder of the scene's photos; default: rendered images")
     ] = SegmentOptions.photos,
@@ -168,8 +172,8 @@ def segment(
 ) -> None:
     """Label the Gaussians of each object: SCENE.ply -> LABELLED.ply (object_id: 0 background, 1... objects)."""
     options = SegmentOptions(
-        backend=backend, masks=masks, boxes=boxes, photos=photos, undistorted=undistorted, weights=weights,
-        download=download, names=names, max_objects=max_objects, min_size=min_size, detail=detail,
+        backend=backend, masks=masks, boxes=boxes, points=tuple(points or ()), photos=photos, undistorted=undistorted,
+        weights=weights, download=download, names=names, max_objects=max_objects, min_size=min_size, detail=detail,
         scale_reference=scale_reference, seed=seed, device=device,
     )  # fmt: skip
     load("stages.segment.stage:run")(scene, out, options)

@@ -17,6 +17,7 @@ BACKENDS = {
         "stages.segment.geometric:segment", "objects on the supporting plane, by position, colour and shape"
     ),
     "masks": Backend("stages.segment.masks:segment", "label images of the photos (--masks), voted over all views"),
+    "points": Backend("stages.segment.points:segment", "the objects at points in photos (--points), by the network"),
     "boxes": Backend("stages.segment.boxes:segment", "bounding boxes in the first view (--boxes), cut out by colour"),
     "sam2": Backend(
         "stages.segment.sam2:segment", "SAM 2.1: boxes, points or automatic masks, propagated through the photos",
@@ -33,6 +34,7 @@ class SegmentOptions:
     backend: str = "learned"  # --masks and --boxes select their own backend, unless this is a network
     masks: Path | None = None  # folder of label images, named as the photos: 0 background, 1... the objects
     boxes: Path | None = None  # prompts.json in the public format: boxes (for networks also points) in the first photo
+    points: tuple[str, ...] = ()  # "view=a.jpg xy=310,220 name=duck", see points.py
     photos: Path | None = None  # folder of the scene's photos, for networks; by default the scene is rendered
     undistorted: bool = False  # masks, boxes and photos are in pixels of the undistorted views, not of photos as taken
     weights: Path | None = None  # of `learned`: segmenter.safetensors; of others: model.safetensors and config.json
@@ -46,16 +48,17 @@ class SegmentOptions:
     device: str = "auto"
 
     def __post_init__(self):
-        if self.masks is not None and self.boxes is not None:
-            raise InputError("--masks and --boxes: give one of them")
-        if self._is_network and self.masks is not None:
-            raise InputError(f"--backend {self.backend} makes masks itself; give no --masks, or leave --backend out")
+        if (self.masks is not None) + (self.boxes is not None) + bool(self.points) > 1:
+            raise InputError("--masks, --boxes and --points: give one of them")
+        if self._is_network and (self.masks is not None or self.points):
+            raise InputError(f"--backend {self.backend} makes masks itself; give no --masks or --points, or leave "
+                             "--backend out")  # fmt: skip
         if not self._is_network and (self.photos or self.download):
             raise InputError(f"--photos and --download only work with --backend {NETWORKS}; add it or drop them")
         if not self._is_network and self.weights and self.backend != "learned":
             raise InputError(f"--weights only works with --backend {NETWORKS} or learned; add it or drop --weights")
-        if self.undistorted and not (self.masks or self.boxes or self.photos):
-            raise InputError("--undistorted: only applies to --masks, --boxes and --photos; add one of them or drop it")
+        if self.undistorted and not (self.masks or self.boxes or self.points or self.photos):
+            raise InputError("--undistorted: only applies to --masks, --boxes, --points, --photos; add one or drop it")
         if self.max_objects < 1:
             raise InputError(f"--max-objects {self.max_objects}: must be 1 or more")
         if not 0 < self.min_size < 1:
@@ -73,7 +76,8 @@ class SegmentOptions:
         """Name of the backend that the options select."""
         if self._is_network:
             return self.backend
-        return "masks" if self.masks is not None else "boxes" if self.boxes is not None else self.backend
+        given = {"masks": self.masks is not None, "boxes": self.boxes is not None, "points": bool(self.points)}
+        return next((name for name, is_given in given.items() if is_given), self.backend)
 
     @property
     def renamed(self) -> dict[int, str]:

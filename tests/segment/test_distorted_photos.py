@@ -134,5 +134,5 @@ def test_opencv_bends_the_same_way():
 
 
 def test_undistorted_without_images_is_refused():
-    with pytest.raises(InputError, match="--undistorted: only applies to --masks, --boxes and --photos"):
+    with pytest.raises(InputError, match="--undistorted: only applies to --masks, --boxes, --points, --photos"):
         SegmentOptions(undistorted=True)

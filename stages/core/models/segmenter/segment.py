@@ -10,12 +10,12 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from stages.core.errors import InputError
 from stages.core.models.checkpoints import MAX_CONFIG, read_card, read_state, unfit
-from stages.core.models.segmenter.candidates import MIN_VOXELS, find_candidates
+from stages.core.models.segmenter.candidates import MIN_VOXELS, Candidates, find_candidates
 from stages.core.models.segmenter.network import Segmenter, pyramid
 from stages.core.models.segmenter.outlines import cut_outlines
 from stages.core.models.segmenter.surfels import scene_surfels
@@ -109,13 +109,10 @@ def object_ids(
     surfels, index, _ = scene_surfels(scene)
     if len(surfels) < 20:
         return ids
-    found = [find_at(surfels, scale, model, options) for scale in SCALES]
-    labels = best_objects(found)
+    scored = [score_at(surfels, scale, model) for scale in SCALES]
+    labels = best_objects([s.best(options) for s in scored])
     labels = torch.where(labels <= options.max_objects, labels, 0)
-    chance = torch.stack([f.chance for f in found]).nanmean(0)
-    fine = surfels.enlarged(SCALES[-1])
-    grid = voxelise(fine)
-    ids[index] = cut_outlines(fine, grid, *_by_voxel(grid, labels, chance))
+    ids[index] = outlined(surfels, labels, scored)
     means = scene.gaussians.means
     for number in range(1, int(ids.max()) + 1):
         own = means[ids == number]
@@ -140,16 +137,47 @@ class Segmentation:
     labels: Int[Tensor, "n"]  # of surfels: row of `gains`, -1 for none
     gains: Float[Tensor, "k"]  # expected IoU less OBJECT_COST, weighted by size
     sizes: Int[Tensor, "k"]  # surfels
-    chance: Float[Tensor, "n 3"]  # of the classes; NaN beyond MAX_VOXELS
 
 
-def find_at(surfels: ScenePoints, scale: float, model: Segmenter, options: SegmenterOptions) -> Segmentation:
-    """Objects among the surfels enlarged by `scale`.
+@dataclass(frozen=True)
+class ScoredCandidates:
+    """Candidate objects at one scale, and how well each is expected to fit an object."""
 
-    They are the disjoint candidates with the largest sum of expected IoU less OBJECT_COST, weighted by size. Weighted
-    by surfels this is the segmentation covering of Arbelaez et al. 2011, "Contour detection and hierarchical
-    image segmentation"; without weights two parts of an object, each half as good, count as much as the object.
-    """
+    candidates: Candidates
+    ious: Float[Tensor, "k"]  # expected
+    extents: Float[Tensor, "k"]  # longest side along the axes [camera distance]
+    owner: Int[Tensor, "n"]  # voxel of each surfel, -1 beyond MAX_VOXELS
+    chance: Float[Tensor, "n 3"]  # of the classes, of each surfel; NaN beyond MAX_VOXELS
+
+    def usable(self, min_size: float) -> Bool[Tensor, "k"]:
+        """Which candidates are neither too small nor too large."""
+        many = self.candidates.sizes > MIN_VOXELS - 0.5
+        return many & (self.extents >= min_size) & (self.extents <= MAX_SIZE)
+
+    def labels(self, nodes: np.ndarray) -> Int[Tensor, "n"]:
+        """The place in `nodes`, which are disjoint, of the one that holds each surfel; -1 for none."""
+        own = torch.full((int(self.owner.max()) + 2,), -1)  # the last is for surfels without a voxel
+        own[self.candidates.voxels] = torch.from_numpy(self.candidates.tree.labels(nodes))[self.candidates.leaf]
+        return own[self.owner]
+
+    def best(self, options: SegmenterOptions) -> Segmentation:
+        """The disjoint candidates with the largest sum of expected IoU less OBJECT_COST, weighted by size.
+
+        Weighted by surfels this is the segmentation covering of Arbelaez et al. 2011, "Contour detection and
+        hierarchical image segmentation"; without weights two parts of an object, each half as good, count as much as
+        the object.
+        """
+        count = int(self.owner.max()) + 1
+        surfels = torch.bincount(self.owner[self.owner >= 0], minlength=count)
+        weight = torch.from_numpy(self.candidates.sums(surfels[:, None])[:, 0]) ** SIZE_POWER
+        gain = weight * (self.ious - OBJECT_COST)
+        nodes = self.candidates.tree.best(torch.where(self.usable(options.min_size), gain, -1.0).double().numpy())
+        labels = self.labels(nodes)
+        return Segmentation(labels, gain[nodes], torch.bincount(labels[labels >= 0], minlength=len(nodes)))
+
+
+def score_at(surfels: ScenePoints, scale: float, model: Segmenter) -> ScoredCandidates:
+    """Candidate objects among the surfels enlarged by `scale`, those nearest to the focus where there are many."""
     scaled, near = surfels.enlarged(scale).to(model.enter.weight.device), torch.ones(len(surfels), dtype=torch.bool)
     grid = voxelise(scaled)
     if len(grid) > MAX_VOXELS:
@@ -159,20 +187,19 @@ def find_at(surfels: ScenePoints, scale: float, model: Segmenter, options: Segme
     levels = pyramid(grid.cells, len(model.config["widths"]))
     found = model(grid.features, levels)
     candidates = find_candidates(grid, levels, found, model)
-    owner, chances = grid.owner.cpu(), found.logits.softmax(1).cpu()
-    surfels_of = torch.bincount(owner, minlength=len(grid))
-    weight = torch.from_numpy(candidates.sums(surfels_of[:, None])[:, 0]) ** SIZE_POWER
-    scores = model.score(candidates.features.to(grid.points.device)).sigmoid().cpu()
-    gain = weight * (scores - OBJECT_COST)
-    extents = candidates.extents / scale
-    usable = (candidates.sizes > MIN_VOXELS - 0.5) & (extents >= options.min_size) & (extents <= MAX_SIZE)
-    nodes = candidates.tree.best(torch.where(usable, gain, -1.0).double().numpy())
-    own = torch.full((len(grid),), -1)
-    own[candidates.voxels] = torch.from_numpy(candidates.tree.labels(nodes))[candidates.leaf]
-    labels, chance = torch.full((len(surfels),), -1), torch.full((len(surfels), 3), torch.nan)
-    labels[near], chance[near] = own[owner], chances[owner]
-    sizes = torch.bincount(labels[labels >= 0], minlength=len(nodes))
-    return Segmentation(labels, gain[nodes], sizes, chance)
+    ious = model.score(candidates.features.to(grid.points.device)).sigmoid().cpu()
+    owner, chance = torch.full((len(surfels),), -1), torch.full((len(surfels), 3), torch.nan)
+    owner[near] = grid.owner.cpu()
+    chance[near] = found.logits.softmax(1).cpu()[owner[near]]
+    return ScoredCandidates(candidates, ious, candidates.extents / scale, owner, chance)
+
+
+def outlined(surfels: ScenePoints, labels: Int[Tensor, "n"], scored: Sequence[ScoredCandidates]) -> Int[Tensor, "n"]:
+    """Object of each surfel, 0 for none, after the cut along the outlines of the objects `labels`."""
+    chance = torch.stack([s.chance for s in scored]).nanmean(0)
+    fine = surfels.enlarged(SCALES[-1])
+    grid = voxelise(fine)
+    return cut_outlines(fine, grid, *_by_voxel(grid, labels, chance))
 
 
 def best_objects(found: Sequence[Segmentation]) -> Int[Tensor, "n"]:

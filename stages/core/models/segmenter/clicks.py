@@ -1,0 +1,86 @@
+"""Objects that the user points at: of the candidates of the network, those with the points in them."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from stages.core.errors import InputError
+from stages.core.models.segmenter.network import Segmenter
+from stages.core.models.segmenter.segment import ScoredCandidates, SegmenterOptions, outlined, score_at
+from stages.core.models.segmenter.surfels import scene_surfels
+from stages.core.models.segmenter.voxels import SCALES
+from stages.core.scene.scene import Scene
+
+log = logging.getLogger(__name__)
+CLICK_REACH = 0.03  # of a candidate's surfels from the point [camera distance]
+
+
+@dataclass(frozen=True)
+class Click:
+    """A point on an object."""
+
+    point: Float[Tensor, "3"]  # on its surface, world frame
+    object: int  # 1 or more
+    text: str  # as the user gave it, for messages
+
+
+@torch.no_grad()
+def clicked_ids(
+    scene: Scene, model: Segmenter, clicks: Sequence[Click], options: SegmenterOptions
+) -> Int[Tensor, "n"]:
+    """Object number of each Gaussian, that of the clicks on it; 0 for the rest.
+
+    An object is the candidate with the largest expected IoU that has all clicks of the object and none of the others.
+    Clicks where nothing may be an object, or which no candidate has together, are logged. Raises InputError where
+    nothing was found for any of them.
+    """
+    ids = torch.zeros(len(scene.gaussians), dtype=torch.int64)
+    surfels, index, view = scene_surfels(scene)
+    if not len(surfels):
+        raise InputError(f"--points {clicks[0].text!r}: the scene has no surface in reach of its cameras")
+    means = scene.gaussians.means[index]
+    found: dict[int, tuple[float, Int[Tensor, "n"]]] = {}
+    scored = [score_at(surfels, scale, model) for scale in SCALES]
+    for at_scale in scored:
+        paths = [_path(at_scale, (means - click.point).norm(dim=1) / view.radius) for click in clicks]
+        usable = at_scale.usable(options.min_size).numpy()
+        for number in {click.object for click in clicks}:
+            own = [path for path, click in zip(paths, clicks, strict=True) if click.object == number]
+            others = [path for path, click in zip(paths, clicks, strict=True) if click.object != number]
+            nodes = set.intersection(*own).difference(*others)
+            best = max((n for n in nodes if usable[n]), key=lambda n: float(at_scale.ious[n]), default=None)
+            if best is not None and float(at_scale.ious[best]) > found.get(number, (-1.0,))[0]:
+                found[number] = float(at_scale.ious[best]), at_scale.labels(np.array([best])) == 0
+    for click in clicks:
+        if click.object not in found:
+            log.warning("--points %r: no object was found there; click on the middle of one, or mark it with --boxes "
+                        "or --masks", click.text)  # fmt: skip
+    if not found:
+        raise InputError(f"--points {clicks[0].text!r}: there is no object at any of the points")
+    labels = torch.zeros(len(surfels), dtype=torch.int64)
+    for number, (_, members) in sorted(found.items(), key=lambda item: -int(item[1][1].sum())):  # small ones last
+        labels[members] = number
+    ids[index] = outlined(surfels, labels, scored)
+    return ids
+
+
+def _path(scored: ScoredCandidates, distance: Float[Tensor, "n"]) -> set[int]:
+    """The candidates with the surfel at the least distance in them; none where it is beyond CLICK_REACH."""
+    leaf = torch.full((int(scored.owner.max()) + 2,), -1)  # the last is for surfels without a voxel
+    leaf[scored.candidates.voxels] = scored.candidates.leaf
+    leaves = leaf[scored.owner]
+    nearest = torch.where(leaves >= 0, distance, torch.inf).argmin()
+    if leaves[nearest] < 0 or distance[nearest] > CLICK_REACH:
+        return set()
+    parents, node, path = scored.candidates.tree.parents(), int(leaves[nearest]), set()
+    while node >= 0:
+        path.add(node)
+        node = int(parents[node])
+    return path

@@ -1,0 +1,76 @@
+"""Objects at points that the user gives."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from stages.core.errors import InputError
+from stages.core.geometry.cameras import project
+from stages.core.scene.scene import Scene
+from stages.segment.options import SegmentOptions
+from stages.segment.points import parse_points, segment
+from tests.segment.tabletop import best_overlap, three_apart
+
+
+def unlabelled(scene: Scene) -> Scene:
+    return replace(scene, gaussians=replace(scene.gaussians, object_id=torch.zeros_like(scene.gaussians.object_id)))
+
+
+def at(scene: Scene, number: int, view: int, name: str) -> str:
+    """The text of a point at the top of an object, in a view."""
+    means = scene.gaussians.means[scene.gaussians.object_id == number]
+    top = torch.cat([means[:, :2].mean(0), means[:, 2].max()[None]])
+    x, y = project(top[None], scene.cameras.viewmats[view], scene.cameras.Ks[view])[0].tolist()
+    return f"view={scene.cameras.names[view]} xy={x:.1f},{y:.1f} name={name}"
+
+
+def test_the_objects_at_the_points_are_found_with_their_names(device):
+    scene = three_apart()
+    points = at(scene, 3, 0, "green tower"), at(scene, 1, 4, "brick")
+    found = segment(unlabelled(scene), SegmentOptions(points=points, device=device))
+    assert [(o.id, o.name) for o in found.objects] == [(1, "green tower"), (2, "brick")]
+    overlap = best_overlap(found.gaussians.object_id, scene.gaussians.object_id)
+    assert overlap[3] > 0.85 and overlap[1] > 0.85
+    assert not (found.gaussians.object_id[scene.gaussians.object_id == 2] > 0).any()
+
+
+def test_points_of_one_name_are_on_one_object():
+    scene = three_apart()
+    points = at(scene, 2, 0, "egg"), at(scene, 2, 5, "egg")
+    found = segment(unlabelled(scene), SegmentOptions(points=points))
+    assert [o.name for o in found.objects] == ["egg"]
+    assert best_overlap(found.gaussians.object_id, scene.gaussians.object_id)[2] > 0.85
+
+
+def test_a_point_without_an_object_is_logged_and_the_others_are_found(caplog):
+    scene = three_apart()
+    nothing = "xy=3,150"  # the table's corner
+    found = segment(unlabelled(scene), SegmentOptions(points=(nothing, at(scene, 2, 0, "egg"))))
+    assert [(o.id, o.name) for o in found.objects] == [(2, "egg")] and "xy=3,150" in caplog.text
+    with pytest.raises(InputError, match="no object at any of the points"):
+        segment(unlabelled(scene), SegmentOptions(points=(nothing,)))
+
+
+@pytest.mark.parametrize("text, reason", [
+    ("view=99.jpg xy=3,4", "has no photo of this name; its first is 00.jpg"),
+    ("xy=500,20", "outside of the photo, which has 160x160 pixels"),
+])  # fmt: skip
+def test_points_that_are_in_no_photo_are_refused(text, reason):
+    with pytest.raises(InputError, match=reason):
+        segment(three_apart(), SegmentOptions(points=(text,)))
+
+
+@pytest.mark.parametrize("text", ["310,220", "xy=1", "view=a.jpg xy=1,2,3", "xy=1.2.3,4", "xy=nan,1"])
+def test_other_forms_are_refused(text):
+    with pytest.raises(InputError, match="write .view=IMG.jpg xy=310,220 name=duck"):
+        parse_points((text,))
+
+
+def test_one_way_of_marking_at_a_time(tmp_path):
+    with pytest.raises(InputError, match="give one of them"):
+        SegmentOptions(points=("xy=1,2",), masks=tmp_path)
+    with pytest.raises(InputError, match="give no --masks or --points"):
+        SegmentOptions(points=("xy=1,2",), backend="sam2")
+    with pytest.raises(InputError, match="has no cameras"):
+        segment(three_apart(cameras=False), SegmentOptions(points=("xy=1,2",)))

@@ -70,6 +70,7 @@ def rollout(
     if card.get("warning"):
         log.warning("%s", card["warning"])
     setup = set_up_scene(scene, prompts, options)
+    setup.warn_of_lifted(scene)
     ids = [o.id for o in scene.objects]
     per_object = [keypoints.rest[keypoints.object_id == i] for i in ids]
     solids = [replace(s, centre=s.centre + shift, inertia=s.inertia + inertia) for s, (shift, inertia)

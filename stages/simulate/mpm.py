@@ -56,6 +56,7 @@ def rollout(
         level = replace(level, substep=min(level.substep, GPU_SUBSTEP))
     touch = device == "cpu"  # the schedule for GPUs has one velocity at a node
     setup = set_up_scene(scene, prompts, options, fine, skin=touch)
+    setup.warn_of_lifted(scene)
     body, dx = setup.bodies.body, 2 * setup.bodies.spacing * unit
     particles = _particles(scene, setup, prompts, options, level)
     # without skin the floor is raised by the layer of voxels that is empty

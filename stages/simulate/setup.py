@@ -43,6 +43,13 @@ class SceneSetup:
         """Particle positions at the start of the simulation."""
         return self.bodies.x + (self.lift + self.floor_offset)[self.bodies.body]
 
+    def warn_of_lifted(self, scene: Scene) -> None:
+        """Log the objects that reach far below the floor; for engines that put them on it."""
+        for o, raised in zip(scene.objects, self.floor_offset[:, 2].tolist(), strict=True):
+            if raised > 4 * self.bodies.spacing:
+                log.warning("object %d (%s) extends %.3g below the floor; it is placed on the floor",
+                            o.id, o.name, raised)  # fmt: skip
+
     def uneven_moments(self, row: int) -> tuple[Float[Tensor, "3"], Float[Tensor, "3 3"]]:
         """`material_parts.uneven_moments` of an object."""
         mine = self.bodies.body == row
@@ -79,9 +86,6 @@ def set_up_scene(
     for row, o in enumerate(scene.objects):
         if on_floor[row] and o.id not in prompts.pinned:
             floor_offset[row, 2] = -gap[row]
-            if gap[row] < -4 * h:
-                log.warning("object %d (%s) extends %.3g below the floor; it is placed on the floor",
-                            o.id, o.name, -gap[row])  # fmt: skip
     x = bodies.x + (lift + floor_offset)[bodies.body]
     box = asked or _default_box(x, floor, h)
     box = Box((*box.low[:2], floor), box.high)

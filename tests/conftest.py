@@ -16,6 +16,7 @@ from stages.core.scene.gaussians import Gaussians, concatenate
 from stages.core.scene.scene import Scene, SceneObject
 from tests.browser import chromium, open_page  # noqa: F401 -- fixtures
 from tests.chat_server import chat_server  # noqa: F401 -- a fixture
+from tests.firefox import open_firefox  # noqa: F401 -- fixture
 
 if "OMP_NUM_THREADS" not in os.environ:  # plugins import PyTorch before this file, so the variable would be too late
     torch.set_num_threads(1 if "PYTEST_XDIST_WORKER" in os.environ else 2)

@@ -98,9 +98,9 @@ def larger(cameras, factor=4):
     return replace(cameras, Ks=cameras.Ks * scaling, sizes=cameras.sizes * factor)
 
 
-def test_pictures_equal_those_of_the_rasteriser(film, open_page):
-    scene, motion, path = film
-    page, cameras = open_page(path), larger(scene.cameras)
+def check_pictures(film, page):
+    scene, motion, _ = film
+    cameras = larger(scene.cameras)
     page.evaluate("player.play(false)")
     for frame, index in ((0, 0), (2, 1), (2, 4)):
         page.evaluate("t => player.seek(t)", frame * motion.dt)
@@ -109,6 +109,17 @@ def test_pictures_equal_those_of_the_rasteriser(film, open_page):
         assert psnr(picture_of_the_page(page, cameras, index), mine) >= 35
     still = picture_of_the_rasteriser(scene.gaussians, cameras, 4)
     assert psnr(still, mine) < 25  # the frames differ
+
+
+def test_pictures_equal_those_of_the_rasteriser(film, open_page):
+    check_pictures(film, open_page(film[2]))
+
+
+@pytest.mark.slow  # Firefox takes seconds to start
+def test_pictures_in_firefox_equal_those_of_the_rasteriser(film, open_firefox):
+    page = open_firefox(film[2])
+    until(page, "window.player !== undefined")
+    check_pictures(film, page)
 
 
 def test_shadows_equal_those_of_the_rasteriser(tmp_path, open_page):

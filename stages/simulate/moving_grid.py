@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float, Int
@@ -25,20 +25,24 @@ MARGIN = 6  # nodes between the particles and the faces of the grid: stencils, a
 FRAMES = 10  # frames for which a new grid has room at the present speed
 
 
+@dataclass(frozen=True)
+class GridBodies:
+    """The bodies on a grid."""
+
+    body: Int[Tensor, "p"]  # row of each particle's object in `objects`; particles are in the order of their bodies
+    objects: Sequence[SceneObject]
+    separate: bool  # each has its own velocity field (schedule `contact`); otherwise one grid sums exactly
+
+
 class MovingGrid:
-    """Particles on a grid that follows them; `box` is the first domain [m], and the only one if it is `fixed`.
+    """Particles on a grid that follows them; `box` is the first domain [m], and the only one if it is `fixed`."""
 
-    With `touch` each body has its own velocity field (schedule `contact` of mpm.Solver); otherwise the grid sums
-    exactly.
-    """
-
-    def __init__(self, particles: mpm.Particles, box: mpm.Box, dx: float, device: str, body: Int[Tensor, "p"],
-                 objects: Sequence[SceneObject], fixed: bool, touch: bool):  # fmt: skip
-        self.box, self._body, self._objects, self._fixed = box, body, objects, fixed
-        sizes = torch.bincount(body).tolist() if touch else None  # particles are in the order of their bodies
-        self._copies = len(sizes) if touch else 1  # of the grid
-        schedule = "contact" if touch else "exact"
-        self._build = lambda p, b: mpm.Solver(p, b, dx, device, sizes=sizes, schedule=schedule)
+    def __init__(self, particles: mpm.Particles, box: mpm.Box, dx: float, device: str, bodies: GridBodies, fixed: bool):
+        self.box, self._bodies, self._fixed = box, bodies, fixed
+        sizes = torch.bincount(bodies.body).tolist() if bodies.separate else None
+        self._copies = len(sizes) if bodies.separate else 1  # of the grid
+        options = mpm.SolverOptions(schedule="contact" if bodies.separate else "exact")
+        self._build = lambda p, b: mpm.Solver(p, b, dx, device, options, sizes)
         self.solver = self._build(particles, box)
 
     def advance(self, duration: float, acceleration: Float[Tensor, "p 3"]) -> None:
@@ -80,8 +84,9 @@ class MovingGrid:
     def _farthest(self) -> str:
         """The object whose middle is farthest from the median of all."""
         x = self.solver.particles.x.cpu()
-        middles = torch.stack([x[self._body == row].mean(0) for row in range(len(self._objects))])
-        o = self._objects[int((middles - middles.median(0).values).norm(dim=1).argmax())]
+        body, objects = self._bodies.body, self._bodies.objects
+        middles = torch.stack([x[body == row].mean(0) for row in range(len(objects))])
+        o = objects[int((middles - middles.median(0).values).norm(dim=1).argmax())]
         return f"object {o.id} ({o.name})"
 
     def _ends(self) -> str:

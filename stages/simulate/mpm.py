@@ -29,7 +29,7 @@ from stages.core.physics.state import FrameState
 from stages.core.scene.scene import Scene, SceneObject
 from stages.core.scene.trajectory import Keypoints
 from stages.simulate.changes import changed_options, changed_pins
-from stages.simulate.moving_grid import MovingGrid
+from stages.simulate.moving_grid import GridBodies, MovingGrid
 from stages.simulate.options import MpmQuality, SimulateOptions
 from stages.simulate.setup import SceneSetup, choose_for_bodies, set_up_scene
 
@@ -62,7 +62,9 @@ def rollout(
     # without skin the floor is raised by the layer of voxels that is empty
     low = (*setup.box.low[:2], setup.box.low[2] + (0.0 if touch else setup.bodies.spacing))
     box = mpm.Box(tuple(unit * v for v in low), tuple(unit * v for v in setup.box.high))
-    grid = MovingGrid(particles, box, dx, device, body, scene.objects, options.box is not None, touch)
+    grid = MovingGrid(
+        particles, box, dx, device, GridBodies(body, scene.objects, separate=touch), fixed=options.box is not None
+    )
     if not touch:
         _warn_stuck(scene, setup, prompts)
     ids = [o.id for o in scene.objects]

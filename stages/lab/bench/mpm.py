@@ -60,7 +60,8 @@ def measure(particles: int, scenes: int, device: str, frames: int, exact: bool =
     """Time per substep of a batch and figures derived from it; `exact` makes sums independent of their order."""
     one, box, dx = falling_boxes(particles)
     schedule, sizes = "exact" if exact else "auto", [len(one)] * scenes
-    solver = mpm.Solver(mpm.join_particles([one] * scenes), box, dx, device, sizes=sizes, schedule=schedule)
+    options = mpm.SolverOptions(schedule=schedule)
+    solver = mpm.Solver(mpm.join_particles([one] * scenes), box, dx, device, options, sizes)
     push = torch.tensor(GRAVITY, device=device).repeat(len(solver.rows), 1)
     step = lambda: solver.enqueue_frame(SUBSTEP * SUBSTEPS, push, SUBSTEPS)  # noqa: E731
     for _ in range(3):
@@ -81,7 +82,7 @@ def measure(particles: int, scenes: int, device: str, frames: int, exact: bool =
 def measure_three_kernel(particles: int, device: str) -> float:
     """Time per substep of one scene in the three-kernel form [s]."""
     one, box, dx = falling_boxes(particles)
-    solver = mpm.Solver(one, box, dx, device, schedule="fused")
+    solver = mpm.Solver(one, box, dx, device, mpm.SolverOptions(schedule="fused"))
     push = torch.tensor(GRAVITY, device=device).repeat(len(one), 1)
     solver.enqueue_frame(SUBSTEP * SUBSTEPS, push, SUBSTEPS)
     nodes = torch.zeros(solver.grid.count, 4, device=device)

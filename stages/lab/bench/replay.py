@@ -95,7 +95,7 @@ def make_solver(data: dict[str, np.ndarray], device: str) -> mpm.Solver:
     # the lower walls act on nodes up to WALL_LAYERS - 1, the upper ones on nodes from n_grid - WALL_LAYERS on
     low, high = (WALL_LAYERS - 1 + mpm.FLOOR_GAP) * dx, (int(data["n_grid"]) - WALL_LAYERS - mpm.FLOOR_GAP) * dx
     return mpm.Solver(particles, mpm.Box((low,) * 3, (high,) * 3, tangential_retention=WALL_DAMPING), dx, device,
-                      damping=float(data["rpic_damping"]))  # fmt: skip
+                      mpm.SolverOptions(damping=float(data["rpic_damping"])))  # fmt: skip
 
 
 def simulate(data: dict[str, np.ndarray], frames: int, device: str) -> Iterator[Tensor]:

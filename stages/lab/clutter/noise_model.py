@@ -7,6 +7,7 @@ there is no texture or only one view sees a place; the points of all views are t
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -48,6 +49,19 @@ class Degradation:
         )  # fmt: skip
 
 
+class _Points(NamedTuple):
+    """Points of views before they are merged."""
+
+    points: Float[Tensor, "p 3"]
+    normals: Float[Tensor, "p 3"]
+    rgb: Float[Tensor, "p 3"]
+    toward: Float[Tensor, "p 3"]  # unit vectors to the camera
+    label: Int[Tensor, "p"]  # true object
+
+    def select(self, rows: Tensor) -> _Points:
+        return _Points(*(column[rows] for column in self))
+
+
 @torch.no_grad()
 def observed(
     scene: Scene, rng: np.random.Generator, degradation: Degradation | None = None
@@ -66,16 +80,16 @@ def observed(
         seen += weight > 0.5
         fronts.append(front)
         parts.append(_view_points(drawn.rgb[0].numpy(), drawn.depth[0].numpy(), scene.cameras.viewmats[i], K, d, rng))
-    rows = []
+    views = []
     for (points, normals, rgb, toward, kept), front in zip(parts, fronts, strict=True):
         front = front.flatten().long()
         ok = kept & (front >= 0) & (seen[front.clamp_min(0)] >= 2)
         label = torch.where(front >= 0, g.object_id[front.clamp_min(0)], 0)
-        rows.append((points[ok], normals[ok], rgb[ok], toward[ok], label[ok]))
-    points, normals, rgb, toward, labels = (torch.cat(column) for column in zip(*rows, strict=True))
-    local = (points - view.focus) / view.radius
-    local[:, 2] = (points[:, 2] - (scene.floor or 0.0)) / view.radius
-    return _merged(local, normals, rgb, toward, labels, d.merge, rng)
+        views.append(_Points(points, normals, rgb, toward, label).select(ok))
+    every = _Points(*(torch.cat(column) for column in zip(*views, strict=True)))
+    local = (every.points - view.focus) / view.radius
+    local[:, 2] = (every.points[:, 2] - (scene.floor or 0.0)) / view.radius
+    return _merged(every._replace(points=local), d.merge, rng)
 
 
 def _view_points(rgb: np.ndarray, depth: np.ndarray, viewmat: Tensor, K: Tensor, d: Degradation, rng) -> tuple:
@@ -128,12 +142,10 @@ def _smooth(h: int, w: int, patch: float, rng) -> np.ndarray:
     return out / max(out.std(), 1e-6)
 
 
-def _merged(
-    points: Float[Tensor, "p 3"], normals: Tensor, rgb: Tensor, toward: Tensor, labels: Tensor, side: float, rng
-) -> tuple[ScenePoints, Int[Tensor, "n"]]:
+def _merged(views: _Points, side: float, rng: np.random.Generator) -> tuple[ScenePoints, Int[Tensor, "n"]]:
     """One surfel for each occupied cell, with the most frequent label."""
-    near = within_reach(points, torch.ones(len(points)), torch.zeros(len(points)))
-    points, normals, rgb, toward, labels = (x[near] for x in (points, normals, rgb, toward, labels))
+    near = within_reach(views.points, torch.ones(len(views.points)), torch.zeros(len(views.points)))
+    points, normals, rgb, toward, labels = views.select(near)
     _, owner, count = (points / side).floor().long().unique(dim=0, return_inverse=True, return_counts=True)
 
     def total(x: Tensor) -> Tensor:

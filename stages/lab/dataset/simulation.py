@@ -97,6 +97,7 @@ def simulation_batches(
     box = mpm.Box(low, high, tangential_retention=WALL_RETENTION**length)
     # Strain rates decay by diffusion between particles, at a rate proportional to damping / substep (measured).
     damping = min(TRANSFER_DAMPING * length, 1.0)
+    options = mpm.SolverOptions(damping=damping, schedule="exact" if settings.exact else "auto")
     todo = list(configs.values())
     largest = max(sum(len(assets[i].points) for i in c.ids) for c in todo)
     count = math.ceil(len(todo) / _max_batch_scenes(box, largest, settings, max_particles))
@@ -107,7 +108,7 @@ def simulation_batches(
             c.name: mpm.join_particles([translated(bodies[i], p) for i, p in zip(c.ids, c.translation, strict=True)])
             for c in scenes
         }
-        yield scenes, Batch(particles, box, dx, device, damping=damping, exact=settings.exact)
+        yield scenes, Batch(particles, box, dx, device, options)
 
 
 def _max_batch_scenes(box: mpm.Box, particles: int, settings: SimulationSettings, max_particles: int) -> int:

@@ -25,7 +25,8 @@ def along_slope(slope: float, friction: float = 0.5, surface: str = "separate", 
     """Acceleration of a flat block on a tilted plane [m/s^2]; the block lies aligned with it, gravity is rotated."""
     p = block((0.4, 0.4, 0.1), 1 / 60, E=5e5, viscosity=200.0)
     ground = Collider("plane", PLANE, surface=surface, friction=friction)
-    solver, angle = mpm.Solver(p, mpm.Box((-1, -1, -0.5), (2, 1.4, 1)), 1 / 30, colliders=[ground]), math.atan(slope)
+    box, angle = mpm.Box((-1, -1, -0.5), (2, 1.4, 1)), math.atan(slope)
+    solver = mpm.Solver(p, box, 1 / 30, options=mpm.SolverOptions((ground,)))
     push = (9.81 * math.sin(angle), 0.0, -9.81 * math.cos(angle))
     steps = finer * solver.substeps(0.02, torch.tensor([push]))
     roll(solver, 0.2, (0.0, 0.0, push[2]), substeps=steps)
@@ -50,7 +51,8 @@ def test_sticky_and_slip_surfaces():
 @pytest.mark.parametrize("surface, leaves", [("separate", True), ("slip", False), ("sticky", False)])
 def test_only_separate_surfaces_release_bodies(surface, leaves):
     p = block((0.2, 0.2, 0.1), 0.025, E=2e5)
-    solver = mpm.Solver(p, FREE, 0.05, colliders=[Collider("plane", PLANE, surface=surface)])
+    ground = Collider("plane", PLANE, surface=surface)
+    solver = mpm.Solver(p, FREE, 0.05, options=mpm.SolverOptions((ground,)))
     roll(solver, 0.1, (0.0, 0.0, -9.81))
     bottom = float(solver.particles.x[:, 2].min())
     roll(solver, 0.2, (0.0, 0.0, 20.0))
@@ -64,7 +66,8 @@ def dropped(restitution: float, finer: int, collider: bool) -> float:
     p.x[:, 2] = 0.1
     p.v[:, 2] = -1.0
     if collider:
-        solver = mpm.Solver(p, FREE, 0.05, colliders=[Collider("plane", PLANE, restitution=restitution, friction=0.0)])
+        ground = Collider("plane", PLANE, restitution=restitution, friction=0.0)
+        solver = mpm.Solver(p, FREE, 0.05, options=mpm.SolverOptions((ground,)))
     else:
         solver = mpm.Solver(p, mpm.Box((-1, -1, 0), (2, 2, 1), restitution=restitution), 0.05)
     roll(solver, 0.3, substeps=finer * solver.substeps(0.02, torch.zeros(1, 3)))
@@ -82,7 +85,7 @@ def test_restitution_does_not_depend_on_the_substep(restitution, collider):
 def test_a_block_rests_on_a_box_and_falls_past_its_edge():
     table = Collider("box", (0.1, 0.1, 0.2), (0.3, 0.3, 0.1))
     on, beside = block((0.2, 0.2, 0.1), 0.025, low=(0, 0, 0.31)), block((0.1, 0.1, 0.1), 0.025, low=(0.5, 0, 0.31))
-    solver = mpm.Solver(mpm.join_particles([on, beside]), FREE, 0.05, colliders=[table])
+    solver = mpm.Solver(mpm.join_particles([on, beside]), FREE, 0.05, options=mpm.SolverOptions((table,)))
     roll(solver, 0.3, (0.0, 0.0, -9.81))
     z = solver.particles.x[:, 2]
     assert abs(float(z[: len(on)].min()) - 0.3) < 0.05  # a cell
@@ -92,7 +95,7 @@ def test_a_block_rests_on_a_box_and_falls_past_its_edge():
 def test_bodies_do_not_penetrate_a_sphere_and_slide_off_it():
     ball = Collider("sphere", (0.1, 0.1, 0.0), (0.2, 0.0, 0.0), friction=0.1)
     p = block((0.1, 0.1, 0.1), 0.0125, E=2e5, low=(0.09, 0.05, 0.22))
-    solver = mpm.Solver(p, FREE, 0.025, colliders=[ball])
+    solver = mpm.Solver(p, FREE, 0.025, options=mpm.SolverOptions((ball,)))
     roll(solver, 0.6, (0.0, 0.0, -9.81))
     x = solver.particles.x - torch.tensor([0.1, 0.1, 0.0])
     assert float(x.norm(dim=1).min()) > 0.2 - 0.025
@@ -103,7 +106,7 @@ def test_bodies_do_not_penetrate_a_sphere_and_slide_off_it():
 def test_a_moving_wall_pushes_and_a_rotating_table_carries(device, schedule):
     wall = Collider("box", (-0.2, 0.1, 0.1), (0.15, 0.4, 0.4), velocity=(0.5, 0.0, 0.0), friction=0.0)
     p = block((0.1, 0.1, 0.1), 0.025, E=2e5, viscosity=100.0)
-    solver = mpm.Solver(p, FREE, 0.05, device, colliders=[wall], schedule=schedule)
+    solver = mpm.Solver(p, FREE, 0.05, device, mpm.SolverOptions((wall,), schedule=schedule))
     roll(solver, 0.6)
     assert solver.colliders[0].centre == pytest.approx((0.1, 0.1, 0.1))
     now = solver.particles
@@ -111,7 +114,7 @@ def test_a_moving_wall_pushes_and_a_rotating_table_carries(device, schedule):
     assert 0.45 < float(now.v[:, 0].mean()) < 1.0 and float(now.x[:, 0].min()) > 0.25 - 0.05
     table = Collider("box", PLANE, (0.5, 0.5, 0.15), angular_velocity=(0.0, 0.0, 1.0), surface="sticky")
     solver = mpm.Solver(block((0.1, 0.1, 0.1), 0.025, E=2e5, viscosity=50.0, low=(0.2, -0.05, 0.13)), FREE, 0.05,
-                        device, colliders=[table], schedule=schedule)  # fmt: skip
+                        device, mpm.SolverOptions((table,), schedule=schedule))  # fmt: skip
     roll(solver, 0.6, (0.0, 0.0, -9.81))
     x, y = solver.particles.x[:, :2].mean(0).tolist()
     assert math.atan2(y, x) == pytest.approx(0.6, abs=0.1)  # radians, after 0.6 s at 1 rad/s
@@ -123,7 +126,7 @@ def test_a_kinematic_body_moves_as_prescribed_and_drags_others(device, schedule)
     p = mpm.join_particles([low, high])
     p.held[: len(low)] = 1
     p.v[: len(low), 0] = 0.3
-    solver = mpm.Solver(p, FREE, 0.05, device, schedule=schedule)
+    solver = mpm.Solver(p, FREE, 0.05, device, mpm.SolverOptions(schedule=schedule))
     roll(solver, 0.5, (0.0, 0.0, -9.81))
     end = mpm.Particles(*(getattr(solver.particles, f).cpu() for f in p.__dataclass_fields__))
     torch.testing.assert_close(end.x[: len(low)] - low.x, torch.tensor([[0.15, 0.0, 0.0]]).expand(len(low), 3),

@@ -207,7 +207,8 @@ def test_both_schedules_agree():
     for schedule in ("split", "fused"):
         p = block(low=(0, 0, 0.05))
         p.v[:, 0] = 1.0
-        solver = mpm.Solver(p, mpm.Box((-0.2, -0.2, 0), (0.8, 0.5, 0.5)), 0.025, schedule=schedule)
+        box, options = mpm.Box((-0.2, -0.2, 0), (0.8, 0.5, 0.5)), mpm.SolverOptions(schedule=schedule)
+        solver = mpm.Solver(p, box, 0.025, options=options)
         roll(solver, 0.2, (0.0, 0.0, -9.81), substeps=80)
         ends.append(solver.particles.x)
         grids = solver._substepper._grids if schedule == "fused" else [solver._substepper._momentum]

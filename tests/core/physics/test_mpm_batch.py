@@ -29,7 +29,7 @@ def test_scenes_of_a_batch_are_independent(device, schedule):
     batch = Batch(scenes(), BOX, DX, device)
     together = [frame for frame in batch.frames(7, 0.02, SUBSTEPS, GRAVITY)][-1]
     for name, particles in scenes().items():
-        alone = mpm.Solver(particles, BOX, DX, device, schedule=schedule)
+        alone = mpm.Solver(particles, BOX, DX, device, mpm.SolverOptions(schedule=schedule))
         for _ in range(6):
             alone.advance(0.02, torch.tensor(GRAVITY).repeat(len(particles), 1), SUBSTEPS)
         torch.testing.assert_close(together.of(name).x, alone.particles.x, rtol=0, atol=2e-5)
@@ -40,8 +40,8 @@ def test_scenes_of_a_batch_are_independent(device, schedule):
 @pytest.mark.parametrize("device", DEVICES)
 def test_exact_sums_do_not_depend_on_batch_and_order(device):
     def last(made: dict[str, mpm.Particles]):
-        frames = list(Batch(made, BOX, DX, device, exact=True).frames(5, 0.02, SUBSTEPS, GRAVITY))
-        return frames[-1]
+        batch = Batch(made, BOX, DX, device, mpm.SolverOptions(schedule="exact"))
+        return list(batch.frames(5, 0.02, SUBSTEPS, GRAVITY))[-1]
 
     made = scenes()
     together = last(made)

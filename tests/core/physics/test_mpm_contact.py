@@ -3,7 +3,15 @@
 import pytest
 import torch
 
-from stages.core.physics.mpm.solver import Box, ParticleMaterial, Particles, Solver, at_rest, join_particles
+from stages.core.physics.mpm.solver import (
+    Box,
+    ParticleMaterial,
+    Particles,
+    Solver,
+    SolverOptions,
+    at_rest,
+    join_particles,
+)
 
 DX, G = 0.05, 9.81
 BOX = Box((-1.0, -1.0, 0.0), (3.0, 1.0, 1.5))
@@ -22,8 +30,8 @@ def block(low: tuple, high: tuple, friction: float = 0.3, speed: float = 0.0, he
 def solve(bodies: list[Particles], frames: int, gravity: float, touch: bool = True) -> tuple[list, list]:
     """Positions and velocities of each body after frames of 0.02 s."""
     sizes = [len(b) for b in bodies]
-    choice = {"sizes": sizes, "schedule": "contact"} if touch else {}
-    solver = Solver(join_particles(bodies), BOX, DX, **choice)
+    options = SolverOptions(schedule="contact" if touch else "auto")
+    solver = Solver(join_particles(bodies), BOX, DX, options=options, sizes=sizes if touch else None)
     held = solver.particles.held > 0
     pull = torch.tensor([0.0, 0.0, -gravity]) * ~held[:, None]
     for _ in range(frames):
@@ -68,4 +76,4 @@ def test_three_blocks_at_one_place_keep_their_momentum():
 
 def test_unknown_schedules_are_refused():
     with pytest.raises(ValueError, match="'both' is not a schedule"):
-        Solver(block((0, 0, 0), (0.2, 0.2, 0.2)), BOX, DX, schedule="both")
+        SolverOptions(schedule="both")

@@ -12,6 +12,7 @@ all z. Contact points of an object lie in one list: a segment for each other obj
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import torch
 import triton
@@ -79,6 +80,33 @@ def _layers(*layers: nn.Linear) -> tuple[Tensor, ...]:
     return tuple(x for layer in layers for x in (layer.weight, layer.bias))
 
 
+class _Kinematics(NamedTuple):
+    """Bodies and keypoints after half a drift, in the layout of kernels/field/bodies.py."""
+
+    body: Tensor
+    point_states: Tensor
+    deformation: Tensor
+    planes: Tensor  # distances of the keypoints from floor and walls, as sort keys
+
+
+class _Contacts(NamedTuple):
+    """Contact points: their number in each segment, their keypoints, forces at keypoints and input features."""
+
+    count: Tensor
+    point: Tensor
+    local_forces: Tensor
+    record: Tensor
+
+
+class _ContactEffect(NamedTuple):
+    """What the contact messages give: an offset to the networks' first layers, wrenches and friction of each object."""
+
+    offset: Tensor
+    wrenches: Tensor
+    friction: Tensor
+    scale: Tensor
+
+
 class _Step:
     """Sizes, contiguous inputs and the four groups of kernel launches of one step."""
 
@@ -101,13 +129,15 @@ class _Step:
         self.network = {"ROWS": ROWS, "H": self.hidden, "PRECISION": precision}
 
     def run(self, state: BodyState, t: Tensor | float) -> BodyState:
-        body, point_states, deformation, planes = self._drift(state)
-        count, point, local_forces, record = self._contacts(body, point_states, planes)
-        offset, wrenches, *friction = self._messages(count, point, local_forces, record)
-        wrench = tuple(friction)  # without external forces the kernel takes these arguments but does not read them
+        drifted = self._drift(state)
+        contacts = self._contacts(drifted)
+        effect = self._messages(contacts)
+        # without external forces the kernel takes these arguments but does not read them
+        wrench = effect.friction, effect.scale
         if self.external.object.shape[1]:
-            wrench = self.external.wrench(point_states[:, :, :3].mT, body[..., :3].contiguous(), t, self.dt)
-        return self._update(body, point_states, deformation, wrenches, local_forces, friction, offset, wrench)
+            positions, com = drifted.point_states[:, :, :3].mT, drifted.body[..., :3].contiguous()
+            wrench = self.external.wrench(positions, com, t, self.dt)
+        return self._update(drifted, contacts.local_forces, effect, wrench)
 
     def _new(self, *shape: int) -> Tensor:
         return self.arm.new_empty(self.b, self.o, *shape)
@@ -115,7 +145,7 @@ class _Step:
     def _count(self, *shape: int) -> Tensor:
         return torch.empty(self.b, self.o, *shape, dtype=torch.int32, device=self.arm.device)
 
-    def _drift(self, state: BodyState) -> tuple[Tensor, ...]:
+    def _drift(self, state: BodyState) -> _Kinematics:
         body, point_states = self._new(bodies.BODY_SIZE.value), self._new(bodies.POINT_SIZE.value, self.n)
         deformation, planes = self._new(bodies.FIELD_SIZE.value, self.n), self._new(2, self.n)
         bodies.drift_half_step[(self.objects,)](
@@ -123,9 +153,10 @@ class _Step:
             self.box, body, point_states, deformation, planes, self.o, self.n, self.dt,
             MAX_DISPLACEMENT=MAX_DISPLACEMENT, NO_CONTACT=near.NO_CONTACT, FRAME=FRAME, **self.whole,
         )  # fmt: skip
-        return body, point_states, deformation, planes
+        return _Kinematics(body, point_states, deformation, planes)
 
-    def _contacts(self, body: Tensor, point_states: Tensor, planes: Tensor) -> tuple[Tensor, ...]:
+    def _contacts(self, drifted: _Kinematics) -> _Contacts:
+        body, point_states, _, planes = drifted
         o, n, m = self.o, self.n, self.o - 1
         candidates, keys, which, partner = self._new(m, 3, n), self._new(m, n), self._count(m, n), self._count(m, n)
         candidate_count = self._count(m)
@@ -153,9 +184,10 @@ class _Step:
             NO_CONTACT=near.NO_CONTACT, GAP_UNIT=near.GAP_UNIT, ARM_UNIT=near.ARM_UNIT, FRAME=FRAME, ROWS=ROWS,
             num_warps=2,
         )  # fmt: skip
-        return count, point, local_forces, record
+        return _Contacts(count, point, local_forces, record)
 
-    def _messages(self, count: Tensor, point: Tensor, local_forces: Tensor, record: Tensor) -> tuple[Tensor, ...]:
+    def _messages(self, contacts: _Contacts) -> _ContactEffect:
+        count, point, local_forces, record = contacts
         field, pair, plane, h = self.field, self.field.pairs, self.field.planes, self.hidden
         offset, context = self._new(self.kinds + 1, h), self._new(self.kinds, h)
         projections = _layers(
@@ -191,20 +223,20 @@ class _Step:
             ACCELERATION_UNIT=ACCELERATION_UNIT, SEPARATION_SPEED=SEPARATION_SPEED, GAP_UNIT=near.GAP_UNIT,
             ARM_UNIT=near.ARM_UNIT, **self.network,
         )  # fmt: skip
-        return offset, wrenches, friction, scale
+        return _ContactEffect(offset, wrenches, friction, scale)
 
     def _update(
-        self, body: Tensor, point_states: Tensor, deformation: Tensor, wrenches: Tensor, local_forces: Tensor,
-        friction: list[Tensor], offset: Tensor, wrench: tuple[Tensor, Tensor],
-    ) -> BodyState:  # fmt: skip
+        self, drifted: _Kinematics, local_forces: Tensor, effect: _ContactEffect, wrench: tuple[Tensor, Tensor]
+    ) -> BodyState:
+        body, point_states, deformation, _ = drifted
         o, n, scene, net = self.o, self.n, self.scene, self.field.deformation
         com, quat, velocity, momentum = (self._new(width) for width in (3, 4, 3, 3))
         high, low = (torch.empty(self.b, o, 9, n, dtype=torch.float16, device=self.arm.device) for _ in range(2))
         scale = self._new(9)
         velocity_update.update_velocities[(self.objects,)](
-            body, point_states, deformation, wrenches, local_forces, *friction, *wrench, self.arm, self.valid,
-            self.mass_fraction, self.size, self.mass, self.inverse, self.pinned, self.gravity, self.box, com, quat,
-            velocity, momentum, high, low, scale, o, n, self.dt, self.blocks, self.wide,
+            body, point_states, deformation, effect.wrenches, local_forces, effect.friction, effect.scale, *wrench,
+            self.arm, self.valid, self.mass_fraction, self.size, self.mass, self.inverse, self.pinned, self.gravity,
+            self.box, com, quat, velocity, momentum, high, low, scale, o, n, self.dt, self.blocks, self.wide,
             HAS_EXTERNAL=self.external.object.shape[1] > 0, CONTACT_SATURATION=CONTACT_SATURATION,
             MAX_PENETRATION=MAX_PENETRATION, MAX_RECOVERY_SPEED=MAX_RECOVERY_SPEED, MAX_SPEED=MAX_SPEED,
             MAX_SPIN=MAX_SPIN, FRICTION_CUTOFF_SPEED=FRICTION_CUTOFF_SPEED, FRAME=FRAME,
@@ -220,7 +252,7 @@ class _Step:
             ROWS=ROWS, num_warps=2,
         )  # fmt: skip
         deformation_features.internal_accelerations[(self.objects, blocks)](
-            record, offset, scene.compliance_scale.contiguous(), _layers(net.input_layer),
+            record, effect.offset, scene.compliance_scale.contiguous(), _layers(net.input_layer),
             _layers(net.decoder[0], net.decoder[2]), field, n, blocks, self.kinds,
             MAX_SPRING_WEIGHT=MAX_SPRING_WEIGHT, MAX_DAMPER_WEIGHT=MAX_DAMPER_WEIGHT, **self.network,
         )  # fmt: skip

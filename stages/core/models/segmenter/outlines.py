@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 from torch import Tensor
@@ -18,6 +20,18 @@ FLOOR = 0.02  # of a label's probability
 SMOOTHNESS = 2.0  # cost of a cut between equal neighbours [nats]
 COLOUR_SIGMA, TURN_SIGMA = 8.0, 0.5  # of the similarity of neighbours [CIELAB], [1 - cosine]
 PRECISION = 1000  # capacities are whole numbers
+
+
+@dataclass(frozen=True)
+class _Neighbourhood:
+    """Surfels whose label may change, and their neighbours."""
+
+    rows: Int[Tensor, "m"]
+    neighbours: Int[Tensor, "m k"]
+    similarity: Float[Tensor, "m k"]
+
+    def select(self, which: Int[Tensor, "s"]) -> _Neighbourhood:
+        return _Neighbourhood(self.rows[which], self.neighbours[which], self.similarity[which])
 
 
 def cut_outlines(
@@ -38,8 +52,8 @@ def cut_outlines(
     border = torch.nonzero((around != around[:, :1]).any(1))[:, 0]
     if not len(border):
         return out
-    links = knn(surfels.points, surfels.points[border], NEIGHBOURS + 1)[1][:, 1:]
-    alike = _similarity(surfels, border, links)
+    neighbours = knn(surfels.points, surfels.points[border], NEIGHBOURS + 1)[1][:, 1:]
+    neighbourhood = _Neighbourhood(border, neighbours, _similarity(surfels, border, neighbours))
     for label in around[border].unique().tolist():
         if label == 0:
             continue
@@ -50,34 +64,38 @@ def cut_outlines(
         to_label = (weight[at] * (around[at] == label) * sure[at]).sum(1)
         now = out[at]
         same = around[at] == now[:, None]
-        to_now = torch.where(now == 0, nothing[at], (weight[at] * same * sure[at]).sum(1))
-        to_now = torch.where(now == label, nothing[at], to_now)
+        to_other = torch.where(now == 0, nothing[at], (weight[at] * same * sure[at]).sum(1))
+        to_other = torch.where(now == label, nothing[at], to_other)
         other = torch.where(now == label, 0, now)
-        taken = _expansion(label, other, to_label, to_now, out, at, links[rows], alike[rows])
+        taken = _expansion(label, other, to_label, to_other, out, neighbourhood.select(rows))
         out[at] = torch.where(taken, label, other)
     return out
 
 
-def _similarity(surfels: ScenePoints, at: Int[Tensor, "m"], links: Int[Tensor, "m k"]) -> Float[Tensor, "m k"]:
+def _similarity(surfels: ScenePoints, at: Int[Tensor, "m"], neighbours: Int[Tensor, "m k"]) -> Float[Tensor, "m k"]:
     """1 for neighbours of equal colour and orientation, less for others."""
-    colour = (surfels.lab[at][:, None] - surfels.lab[links]).norm(dim=2) / COLOUR_SIGMA
-    turn = (1 - (surfels.normals[at][:, None] * surfels.normals[links]).sum(2).abs()) / TURN_SIGMA
+    colour = (surfels.lab[at][:, None] - surfels.lab[neighbours]).norm(dim=2) / COLOUR_SIGMA
+    turn = (1 - (surfels.normals[at][:, None] * surfels.normals[neighbours]).sum(2).abs()) / TURN_SIGMA
     return torch.exp(-0.5 * (colour**2 + turn**2)) + 0.05
 
 
 def _expansion(
-    label: int, other: Tensor, to_label: Tensor, to_now: Tensor, ids: Tensor, at: Tensor, links: Tensor, alike: Tensor
-) -> Tensor:
-    """Which surfels take the label: the minimum cut of the graph of an expansion move."""
-    m = len(at)
-    number = torch.full((len(ids),), -1)
-    number[at] = torch.arange(m)
-    inner = number[links]
+    label: int, other: Int[Tensor, "m"], to_label: Float[Tensor, "m"], to_other: Float[Tensor, "m"],
+    labels: Int[Tensor, "n"], neighbourhood: _Neighbourhood,
+) -> Bool[Tensor, "m"]:  # fmt: skip
+    """Which surfels of the neighbourhood take `label` rather than `other`: the minimum cut of an expansion move.
+
+    `to_label` and `to_other` are the probabilities of the two; `labels` those of all surfels now.
+    """
+    m = len(neighbourhood.rows)
+    number = torch.full((len(labels),), -1)
+    number[neighbourhood.rows] = torch.arange(m)
+    inner = number[neighbourhood.neighbours]
     cost_label = -(to_label + FLOOR).log()
-    cost_other = -(to_now + FLOOR).log()
-    cut = SMOOTHNESS * alike
+    cost_other = -(to_other + FLOOR).log()
+    cut = SMOOTHNESS * neighbourhood.similarity
     outside = inner < 0
-    fixed = ids[links]
+    fixed = labels[neighbourhood.neighbours]
     cost_label = cost_label + (cut * (outside & (fixed != label))).sum(1)
     cost_other = cost_other + (cut * (outside & (fixed != other[:, None]))).sum(1)
     low = torch.minimum(cost_label, cost_other)

@@ -12,7 +12,8 @@ belongs to: rows keep their order. Scenes have the same box, spacing, substep an
 about 52 bytes per node of the box, active or not, and 500 per particle: `Batch.fits` computes how many scenes fit.
 
 `batch.solver.substeps(duration, acceleration)` is the number of substeps by the CFL condition; fewer may diverge. With
-`exact`, a scene gives the same bytes in every run on the same kind of GPU and in any batch, at about twice the time.
+the schedule `exact`, a scene gives the same bytes in every run on the same kind of GPU and in any batch, at about twice
+the time.
 
 Frames do not wait for the device, and their tensors stay valid. A scene in which a particle leaves the box or is not
 finite is listed by `failures` with the frame in which that happened; the other scenes are not affected.
@@ -20,15 +21,23 @@ finite is listed by `failures` with the frame in which that happened; the other 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from stages.core.physics.colliders import Collider
-from stages.core.physics.mpm.solver import Box, Particles, Solver, join_particles, make_grid, max_batch_nodes
+from stages.core.physics.mpm.solver import (
+    DEFAULTS,
+    Box,
+    Particles,
+    Solver,
+    SolverOptions,
+    join_particles,
+    make_grid,
+    max_batch_nodes,
+)
 
 GRID_BYTES = 48  # per node: three grids, twice as much when exact
 NODE_BYTES = 4.5  # per node: friction and block flags
@@ -52,17 +61,16 @@ class BatchFrame:
 
 
 class Batch:
-    """Scenes by name, each on its own grid; options as in Solver."""
+    """Scenes by name, each on its own grid."""
 
     def __init__(
-        self, scenes: Mapping[str, Particles], box: Box, dx: float, device: str = "cuda", *,
-        colliders: Sequence[Collider] = (), damping: float = 0.0, exact: bool = False,
+        self, scenes: Mapping[str, Particles], box: Box, dx: float, device: str = "cuda",
+        options: SolverOptions = DEFAULTS,
     ):  # fmt: skip
         self.names = tuple(scenes)
         sizes = [len(p) for p in scenes.values()]
         self.starts = tuple([0, *torch.tensor(sizes).cumsum(0).tolist()])
-        self.solver = Solver(join_particles(list(scenes.values())), box, dx, device, sizes=sizes,
-                             colliders=colliders, damping=damping, schedule="exact" if exact else "auto")  # fmt: skip
+        self.solver = Solver(join_particles(list(scenes.values())), box, dx, device, options, sizes)
         self._failure_frame = torch.full((len(sizes),), -1, dtype=torch.int32, device=device)
         self._frame = 0
 

@@ -4,9 +4,9 @@ Explicit MLS-MPM with APIC transfers in float32; kernels and sources are in core
 by the schedule of split.py on the CPU and of fused.py on a GPU, with the same physics. batch.py runs named scenes.
 
 Reproducibility: on the CPU a run gives the same bytes for any number of threads. On a GPU floating-point sums depend on
-the order of atomic additions, so runs differ in the last bits, unless `exact` is set, which sums in fixed point. Even
-then the friction of a node shared by bodies of different friction may change one substep earlier or later, since the
-fused kernel raises it while others read it.
+the order of atomic additions, so runs differ in the last bits, unless the schedule is `exact`, which sums in fixed
+point. Even then the friction of a node shared by bodies of different friction may change one substep earlier or later,
+since the fused kernel raises it while others read it.
 Gradients through the solver are not available.
 """
 
@@ -121,12 +121,11 @@ def substep_rate(dx: float, speed: float, viscosity: float = 0.0) -> float:
     return max(speed / (SAFETY * dx), viscosity / (VISCOUS * dx**2))
 
 
-class Solver:
-    """Particles in a box with grid spacing `dx` [m]; `advance` moves them through one frame.
+@dataclass(frozen=True)
+class SolverOptions:
+    """What moves in the box besides the particles, and how the solver computes.
 
-    `sizes` gives the number of particles of each scene of a batch; scenes have the same box and colliders and do not
-    interact. `damping` (0 to 1) removes that fraction of the symmetric part of C at every transfer (RPIC). `schedule`
-    is one of
+    `damping` (0 to 1) removes that fraction of the symmetric part of C at every transfer (RPIC). `schedule` is one of
 
         auto      `split` on a CPU, `fused` on a GPU
         split     two launches per substep (split.py)
@@ -138,15 +137,33 @@ class Solver:
                   Coulomb friction (kernels/mpm/contact.py); otherwise bodies in one scene share the velocity of a
                   node, and stick to each other
 
-    Raises ValueError for another schedule, sizes that do not fit the particles, and grids that are too large.
+    Raises ValueError for another schedule.
+    """
+
+    colliders: tuple[Collider, ...] = ()
+    damping: float = 0.0
+    schedule: str = "auto"
+
+    def __post_init__(self):
+        if self.schedule not in SCHEDULES:
+            raise ValueError(f"{self.schedule!r} is not a schedule of the solver; choose from {', '.join(SCHEDULES)}")
+
+
+DEFAULTS = SolverOptions()
+
+
+class Solver:
+    """Particles in a box with grid spacing `dx` [m]; `advance` moves them through one frame.
+
+    `sizes` gives the number of particles of each scene of a batch; scenes have the same box and colliders and do not
+    interact. Raises ValueError for sizes that do not fit the particles and for grids that are too large.
     """
 
     def __init__(
-        self, particles: Particles, box: Box, dx: float, device: str = "cpu", *, sizes: Sequence[int] | None = None,
-        colliders: Sequence[Collider] = (), damping: float = 0.0, schedule: str = "auto",
+        self, particles: Particles, box: Box, dx: float, device: str = "cpu", options: SolverOptions = DEFAULTS,
+        sizes: Sequence[int] | None = None,
     ):  # fmt: skip
-        if schedule not in SCHEDULES:
-            raise ValueError(f"{schedule!r} is not a schedule of the solver; choose from {', '.join(SCHEDULES)}")
+        schedule = options.schedule
         if schedule == "auto":
             schedule = "split" if device == "cpu" else "fused"
         exact, fused = schedule == "exact", schedule in ("fused", "exact")
@@ -158,16 +175,16 @@ class Solver:
             raise ValueError(f"{len(sizes)} scenes of {self.grid.count} nodes are too many for one batch")
         columns = {f.name: getattr(particles, f.name) for f in fields(Particles)}
         self.rows = ParticleRows(columns, sizes, self.grid, device)
-        self.colliders = tuple(colliders)
+        self.colliders = options.colliders
         self._obstacles = as_obstacles(self.colliders, device)
         self._rates = self._max_rates()
         self.grid.spring = self._rates[0] / (2 * dx)  # as stiff as the bodies, so that the CFL substep is stable
         plastic = bool((particles.model != NEO_HOOKEAN).any())
         bouncy = any(surface.restitution > 0 for surface in (box, *self.colliders))
-        options = self.rows, plastic, bouncy, damping, self._obstacles
+        shared = self.rows, plastic, bouncy, options.damping, self._obstacles
         quanta = self._quanta() if exact else None
         contact = self._body_contact(particles, sizes) if schedule == "contact" else None
-        self._substepper = FusedSubsteps(*options, quanta) if fused else SplitSubsteps(*options, contact)
+        self._substepper = FusedSubsteps(*shared, quanta) if fused else SplitSubsteps(*shared, contact)
         self._substep_multiple = SUBSTEP_MULTIPLE if fused and device != "cpu" else 1
 
     @property

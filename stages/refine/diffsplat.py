@@ -14,10 +14,10 @@ from stages.core.backends import pick_device
 from stages.core.errors import InputError
 from stages.core.models.diffsplat.weights import Files, find, load
 from stages.core.perception.support import Support
-from stages.core.scene.gaussians import Gaussians
+from stages.core.scene.gaussians import SURFACE_OPACITY, Gaussians
 from stages.core.scene.scene import Scene
 from stages.refine.disc_gaussians import empty_like
-from stages.refine.library import MIN_SURFACE_OPACITY, opaque_gaussians, place_whole
+from stages.refine.library import opaque_gaussians, place_whole
 from stages.refine.object_crop import TRAINED_ELEVATIONS, crop_object
 from stages.refine.observed_space import ObservedSpace
 from stages.refine.options import RefineOptions
@@ -43,7 +43,7 @@ def complete(
                  number, name, crop.elevation, crop.name, *TRAINED_ELEVATIONS)  # fmt: skip
     prompt = "" if name == f"object_{number}" else name.replace("_", " ")  # a number is not a prompt
     generated = model.generate(crop.image, crop.elevation, prompt, options.seed)
-    generated = generated[generated.opacities > MIN_SURFACE_OPACITY]
+    generated = generated[generated.opacities > SURFACE_OPACITY]
     registration = (
         register(own.to(device), generated.to(device), options.seed, crop.place)
         if len(generated) >= MIN_REGISTRATION_POINTS

@@ -15,7 +15,7 @@ from stages.core.geometry.harmonics import C0
 from stages.core.geometry.neighbours import knn
 from stages.core.geometry.rotations import matrix
 from stages.core.perception.support import Support, topples
-from stages.core.scene.gaussians import Gaussians
+from stages.core.scene.gaussians import SURFACE_OPACITY, Gaussians
 from stages.core.scene.scene import Scene
 from stages.refine.disc_gaussians import disc_gaussians, empty_like
 from stages.refine.observed_space import ObservedSpace
@@ -111,7 +111,7 @@ def _volume(
     inside = torch.from_numpy(_in_hull(_grounded_points(own, support), centres, 0.5 * grid.cell))
     if support is not None:
         inside &= support.heights(centres) > 0
-    other = (everything.object_id != number) & (everything.opacities > 0.1)
+    other = (everything.object_id != number) & (everything.opacities > SURFACE_OPACITY)
     if support is not None:
         other &= (support.heights(everything.means) > support.tolerance) | (everything.object_id > 0)
     taken = grid.occupancy(everything.means[other])

@@ -18,7 +18,7 @@ from stages.core.backends import pick_device
 from stages.core.errors import InputError
 from stages.core.geometry.neighbours import knn
 from stages.core.perception.support import Support
-from stages.core.scene.gaussians import Gaussians, transformed
+from stages.core.scene.gaussians import SURFACE_OPACITY, Gaussians, transformed
 from stages.core.scene.scene import Scene
 from stages.core.scene.scene_ply import read_scene
 from stages.refine.disc_gaussians import empty_like
@@ -39,7 +39,6 @@ MAX_FREE_FRACTION = 0.1  # of an asset's Gaussians in observed free space; above
 FINE_CANDIDATES = 2  # assets that are registered accurately, those with the best coarse fit
 SEEN_DISTANCE = 0.02  # distance from the part within which the asset is not used [diameters]
 MIN_ASSET_GAUSSIANS = 100  # opaque ones, or the asset is refused
-MIN_SURFACE_OPACITY = 0.1  # of Gaussians that count as surface
 
 
 def complete(
@@ -58,9 +57,9 @@ def complete(
 
 
 def opaque_gaussians(scene: Scene, number: int) -> Gaussians:
-    """The Gaussians of an object with at least MIN_SURFACE_OPACITY."""
+    """The Gaussians of an object with at least SURFACE_OPACITY."""
     g = scene.gaussians
-    return g[(g.object_id == number) & (g.opacities > MIN_SURFACE_OPACITY) & g.means.isfinite().all(1)]
+    return g[(g.object_id == number) & (g.opacities > SURFACE_OPACITY) & g.means.isfinite().all(1)]
 
 
 def place_whole(
@@ -97,7 +96,7 @@ def load_library(folder: Path, device: str) -> dict[str, tuple[Gaussians, Regist
     out = {}
     for name, path in files.items():
         g = read_scene(path).gaussians
-        g = g[(g.opacities > MIN_SURFACE_OPACITY) & g.scales.isfinite().all(1)]
+        g = g[(g.opacities > SURFACE_OPACITY) & g.scales.isfinite().all(1)]
         if len(g) < MIN_ASSET_GAUSSIANS:
             raise InputError(f"{path}: {len(g)} opaque Gaussians are too few for an object; remove it from the library")
         out[name] = g, RegistrationCloud.of(g.to(device))

@@ -26,7 +26,7 @@ from stages.core.perception.support import (
 )
 from stages.core.perception.visibility import summed_view_directions
 from stages.core.perception.wall import find_wall, rotate_wall_to_floor
-from stages.core.scene.gaussians import Gaussians
+from stages.core.scene.gaussians import SURFACE_OPACITY, Gaussians
 from stages.core.scene.scene import Scene, SceneObject
 
 log = logging.getLogger(__name__)
@@ -97,7 +97,8 @@ def _candidates(g: Gaussians, view: ViewExtent, support: Support | None) -> Int[
     """Indices of opaque Gaussians near the focus that are not part of the supporting plane."""
     R = view.radius
     ok = g.means.isfinite().all(1) & g.quats.isfinite().all(1) & g.scales.isfinite().all(1)
-    ok &= (g.opacities > 0.1) & (g.scales.amax(1) < 0.1 * R) & ((g.means - view.focus).norm(dim=1) < 1.5 * R)
+    ok &= (g.opacities > SURFACE_OPACITY) & (g.scales.amax(1) < 0.1 * R)
+    ok &= (g.means - view.focus).norm(dim=1) < 1.5 * R
     if support is None:
         return torch.nonzero(ok & ((g.means - view.focus).norm(dim=1) < 0.8 * R))[:, 0]
     h = support.heights(g.means)
@@ -115,7 +116,8 @@ def _against_table(g: Gaussians, h: Float[Tensor, "n"], support: Support) -> tup
     colour, a bump of the reconstruction only in height.
     """
     like, flat = torch.zeros(2, len(g), dtype=torch.bool)
-    near = torch.nonzero((h.abs() < 2.5 * support.tolerance) & (g.opacities > 0.1) & support.inside(g.means))[:, 0]
+    near = (h.abs() < 2.5 * support.tolerance) & (g.opacities > SURFACE_OPACITY) & support.inside(g.means)
+    near = torch.nonzero(near)[:, 0]
     if len(near) < 50:
         return like, flat
     values = torch.cat([cielab_colours(g[near]), h[near, None]], 1)

@@ -13,6 +13,7 @@ from torch import Tensor
 from stages.core.geometry.harmonics import C0
 from stages.core.perception.support import Support, cell_medians, find_support
 from stages.core.raster.shadows import GAMMA, OVERHEAD, Light, Spheres, blocked
+from stages.core.scene.gaussians import SURFACE_OPACITY
 from stages.core.scene.scene import Scene
 
 ELEVATIONS, AZIMUTHS, SPREADS = (25.0, 40.0, 55.0, 70.0), 12, (0.1, 0.3)  # lamps that are tried [degrees], [tangents]
@@ -79,7 +80,8 @@ def _surface_cells(
         radius = float(((spheres.centres[own] - middle).norm(dim=1) + spheres.radii[own]).max())
         near |= (g.means - middle)[:, :2].norm(dim=1) < (1 + SURFACE_MARGIN) * radius
     heights = support.heights(g.means)
-    on = near & (g.object_id == 0) & (g.opacities > 0.1) & (heights.abs() < support.tolerance) & support.inside(g.means)
+    on = near & (g.object_id == 0) & (g.opacities > SURFACE_OPACITY)
+    on &= (heights.abs() < support.tolerance) & support.inside(g.means)
     rows = on.nonzero()[:, 0]
     if not len(rows):
         return torch.zeros(0, 3), torch.zeros(0, 3)

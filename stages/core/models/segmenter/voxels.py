@@ -14,11 +14,11 @@ from torch import Tensor
 
 from stages.core.geometry.neighbours import knn
 from stages.core.geometry.rotations import matrix
+from stages.core.scene.gaussians import SURFACE_OPACITY
 
 VOXEL = 0.01  # side [camera distance]
 SCALES = (1.0, 1.5, 2.25)  # by which scenes are enlarged in turn, so that objects of all sizes are many voxels
 REACH = 1.5  # Gaussians farther from the focus are left out [camera distance]
-MIN_OPACITY = 0.1
 MAX_SCALE = 0.1  # standard deviation above which a Gaussian is a backdrop [camera distance]
 NORMAL_NEIGHBOURS = 16
 FEATURES = 11  # of a voxel
@@ -26,7 +26,7 @@ FEATURES = 11  # of a voxel
 
 @dataclass(frozen=True)
 class ScenePoints:
-    """What the network is told about each Gaussian; lengths in camera distances about the focus, z up."""
+    """Inputs of the network for each Gaussian; lengths in camera distances about the focus, z up."""
 
     points: Float[Tensor, "n 3"]  # z above the supporting plane
     lab: Float[Tensor, "n 3"]  # CIELAB
@@ -139,6 +139,6 @@ def coarser(cells: Int[Tensor, "v 3"]) -> tuple[Int[Tensor, "w 3"], Int[Tensor, 
 def within_reach(
     points: Float[Tensor, "n 3"], opacity: Float[Tensor, "n"], size: Float[Tensor, "n"]
 ) -> Bool[Tensor, "n"]:
-    """The Gaussians that the network looks at; lengths in camera distances about the focus."""
+    """Which Gaussians the network takes as inputs; lengths in camera distances about the focus."""
     finite = points.isfinite().all(1) & size.isfinite()
-    return finite & (points.norm(dim=1) < REACH) & (opacity > MIN_OPACITY) & (size < MAX_SCALE)
+    return finite & (points.norm(dim=1) < REACH) & (opacity > SURFACE_OPACITY) & (size < MAX_SCALE)

@@ -72,7 +72,7 @@ def fit_scores(
 
 def _train(model: Segmenter, x: Float[Tensor, "k f"], y: Float[Tensor, "k"], steps: int) -> float:
     """The loss of the last hundred steps."""
-    optimiser = torch.optim.AdamW(model.candidate.parameters(), RATE, weight_decay=1e-3)
+    optimiser = torch.optim.AdamW(model.candidate_head.parameters(), RATE, weight_decay=1e-3)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
     groups = [torch.arange(len(x)), torch.nonzero(x[:, 0].exp() >= LARGE)[:, 0], torch.nonzero(y > GOOD)[:, 0]]
     losses = []

@@ -35,14 +35,14 @@ def pyramid(cells: Int[Tensor, "v 3"], levels: int) -> list[Level]:
     """The voxels at all resolutions, finest first."""
     out = []
     for _ in range(levels):
-        up, parent, children = coarser(cells)
+        coarse, parent, children = coarser(cells)
         out.append(Level(neighbour_table(cells), parent, children))
-        cells = up
+        cells = coarse
     return out
 
 
-class _Gathered(torch.autograd.Function):
-    """x[neighbours] @ weight for a symmetric table of neighbours; the gradient gathers too, and needs no scatter.
+class _SparseConvolution(torch.autograd.Function):
+    """x[neighbours] @ weight for a symmetric table of neighbours; the gradient gathers as well, without a scatter.
 
     Within `torch.autocast` the products are in its precision; the result is in that of x.
     """
@@ -53,20 +53,20 @@ class _Gathered(torch.autograd.Function):
         ctx.dtype = torch.get_autocast_dtype(device) if torch.is_autocast_enabled(device) else x.dtype
         ctx.save_for_backward(x, neighbours, weight)
         with torch.autocast(device, enabled=False):
-            return (_rows(x.to(ctx.dtype), neighbours) @ weight.flatten(0, 1).to(ctx.dtype)).to(x.dtype)
+            return (_gather(x.to(ctx.dtype), neighbours) @ weight.flatten(0, 1).to(ctx.dtype)).to(x.dtype)
 
     @staticmethod
     def backward(ctx, grad: Tensor) -> tuple[Tensor, None, Tensor]:
         x, neighbours, weight = ctx.saved_tensors
         mirrored = weight.flip(0).transpose(1, 2)  # the neighbour at offset k has this voxel at offset -k
-        low = grad.to(ctx.dtype)
+        narrow = grad.to(ctx.dtype)
         with torch.autocast(x.device.type, enabled=False):
-            to_x = _rows(low, neighbours) @ mirrored.flatten(0, 1).to(ctx.dtype)
-            to_weight = (_rows(x.to(ctx.dtype), neighbours).mT @ low).reshape(weight.shape)
+            to_x = _gather(narrow, neighbours) @ mirrored.flatten(0, 1).to(ctx.dtype)
+            to_weight = (_gather(x.to(ctx.dtype), neighbours).mT @ narrow).reshape(weight.shape)
         return to_x.to(x.dtype), None, to_weight.to(weight.dtype)
 
 
-def _rows(x: Float[Tensor, "v c"], table: Int[Tensor, "w k"]) -> Float[Tensor, "w k*c"]:
+def _gather(x: Float[Tensor, "v c"], table: Int[Tensor, "w k"]) -> Float[Tensor, "w k*c"]:
     """The features of k voxels side by side, zeros where there is none."""
     return torch.nn.functional.pad(x, (0, 0, 0, 1)).index_select(0, table.flatten()).reshape(len(table), -1)
 
@@ -74,18 +74,19 @@ def _rows(x: Float[Tensor, "v c"], table: Int[Tensor, "w k"]) -> Float[Tensor, "
 def _pooled(x: Float[Tensor, "v c"], children: Int[Tensor, "w 8"]) -> Float[Tensor, "w c"]:
     """The mean of the voxels in each coarser one."""
     count = (children < len(x)).sum(1, keepdim=True)
-    return _rows(x, children).view(len(children), 8, -1).sum(1) / count
+    return _gather(x, children).view(len(children), 8, -1).sum(1) / count
 
 
 class Convolution(nn.Module):
     """A 3 x 3 x 3 convolution over occupied voxels."""
 
-    def __init__(self, inward: int, outward: int):
+    def __init__(self, in_channels: int, out_channels: int):
         super().__init__()
-        self.weight = nn.Parameter(torch.randn(27, inward, outward) * (2 / (10 * inward)) ** 0.5)  # 10 are occupied
+        scale = (2 / (10 * in_channels)) ** 0.5  # about 10 of the 27 are occupied
+        self.weight = nn.Parameter(scale * torch.randn(27, in_channels, out_channels))
 
     def forward(self, x: Float[Tensor, "v c"], level: Level) -> Float[Tensor, "v d"]:
-        return _Gathered.apply(x, level.neighbours, self.weight)
+        return _SparseConvolution.apply(x, level.neighbours, self.weight)
 
 
 class ResidualBlock(nn.Module):
@@ -113,42 +114,42 @@ class Prediction:
 
 
 class Segmenter(nn.Module):
-    """The network, and the affinity of pairs of voxels."""
+    """The network, and the affinity of pairs of voxels. Attribute names are the keys of the shipped weights."""
 
     def __init__(self, widths: tuple[int, ...] = (32, 48, 64, 96), blocks: int = 1):
         super().__init__()
         self.config = {"widths": list(widths), "blocks": blocks}
-        self.enter = nn.Linear(FEATURES, widths[0])
-        self.first = Convolution(widths[0], widths[0])
-        self.down = nn.ModuleList(nn.ModuleList(ResidualBlock(w) for _ in range(blocks)) for w in widths)
-        self.deeper = nn.ModuleList(nn.Linear(a, b) for a, b in zip(widths, widths[1:], strict=False))
-        self.upper = nn.ModuleList(nn.Linear(b, a) for a, b in zip(widths, widths[1:], strict=False))
-        self.up = nn.ModuleList(nn.ModuleList(ResidualBlock(w) for _ in range(blocks)) for w in widths[:-1])
-        self.leave = nn.Sequential(nn.LayerNorm(widths[0]), nn.Linear(widths[0], 64), nn.GELU())
+        self.input_projection = nn.Linear(FEATURES, widths[0])
+        self.input_convolution = Convolution(widths[0], widths[0])
+        self.encoder = nn.ModuleList(nn.ModuleList(ResidualBlock(w) for _ in range(blocks)) for w in widths)
+        self.downsample = nn.ModuleList(nn.Linear(a, b) for a, b in zip(widths, widths[1:], strict=False))
+        self.upsample = nn.ModuleList(nn.Linear(b, a) for a, b in zip(widths, widths[1:], strict=False))
+        self.decoder = nn.ModuleList(nn.ModuleList(ResidualBlock(w) for _ in range(blocks)) for w in widths[:-1])
+        self.head_input = nn.Sequential(nn.LayerNorm(widths[0]), nn.Linear(widths[0], 64), nn.GELU())
         self.heads = nn.Linear(64, len(CLASSES) + 3 + PAIR_FEATURES)
-        self.pair = nn.Sequential(nn.Linear(2 * PAIR_FEATURES + 3, 32), nn.GELU(), nn.Linear(32, 1))
+        self.affinity_head = nn.Sequential(nn.Linear(2 * PAIR_FEATURES + 3, 32), nn.GELU(), nn.Linear(32, 1))
         self.register_buffer("feature_mean", torch.zeros(CANDIDATE_FEATURES))
         self.register_buffer("feature_scale", torch.ones(CANDIDATE_FEATURES))
         width = 48
-        self.candidate = nn.Sequential(
+        self.candidate_head = nn.Sequential(
             nn.Linear(CANDIDATE_FEATURES, width), nn.GELU(), nn.Linear(width, width), nn.GELU(), nn.Linear(width, 1)
         )
 
     def forward(self, features: Float[Tensor, "v f"], levels: list[Level]) -> Prediction:
         """Predictions for the voxels of the finest level."""
-        x = self.first(self.enter(features), levels[0])
-        skipped = []
+        x = self.input_convolution(self.input_projection(features), levels[0])
+        skips = []
         for depth, level in enumerate(levels):
-            for block in self.down[depth]:
+            for block in self.encoder[depth]:
                 x = block(x, level)
             if depth < len(levels) - 1:
-                skipped.append(x)
-                x = self.deeper[depth](_pooled(x, level.children))
+                skips.append(x)
+                x = self.downsample[depth](_pooled(x, level.children))
         for depth in reversed(range(len(levels) - 1)):
-            x = skipped[depth] + self.upper[depth](x)[levels[depth].parent]
-            for block in self.up[depth]:
+            x = skips[depth] + self.upsample[depth](x)[levels[depth].parent]
+            for block in self.decoder[depth]:
                 x = block(x, levels[depth])
-        logits, offsets, embedding = self.heads(self.leave(x)).split([len(CLASSES), 3, PAIR_FEATURES], 1)
+        logits, offsets, embedding = self.heads(self.head_input(x)).split([len(CLASSES), 3, PAIR_FEATURES], 1)
         return Prediction(logits, offsets * OFFSET_UNIT, embedding)
 
     def affinity(
@@ -158,12 +159,13 @@ class Segmenter(nn.Module):
         i, j = pairs.unbind(1)
         a, b = found.embedding[i], found.embedding[j]
         centres = points + found.offsets
-        step = (points[i] - points[j]).norm(dim=1, keepdim=True) / (5 * VOXEL)
-        apart = (centres[i] - centres[j]).norm(dim=1, keepdim=True) / (5 * VOXEL)
-        reach = (found.offsets[i].norm(dim=1) + found.offsets[j].norm(dim=1))[:, None] / OFFSET_UNIT
-        return self.pair(torch.cat([(a - b).abs(), a * b, step, apart, reach], 1))[:, 0]
+        distance = (points[i] - points[j]).norm(dim=1, keepdim=True) / (5 * VOXEL)
+        centre_distance = (centres[i] - centres[j]).norm(dim=1, keepdim=True) / (5 * VOXEL)
+        offset_length = (found.offsets[i].norm(dim=1) + found.offsets[j].norm(dim=1))[:, None] / OFFSET_UNIT
+        inputs = [(a - b).abs(), a * b, distance, centre_distance, offset_length]
+        return self.affinity_head(torch.cat(inputs, 1))[:, 0]
 
     def score(self, features: Float[Tensor, "k f"]) -> Float[Tensor, "k"]:
         """Log odds of the IoU of candidates with the object that they fit best."""
         x = ((features - self.feature_mean) / self.feature_scale).clamp(-4, 4)
-        return self.candidate(x)[:, 0]
+        return self.candidate_head(x)[:, 0]

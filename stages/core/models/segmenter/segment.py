@@ -178,7 +178,8 @@ class ScoredCandidates:
 
 def score_at(surfels: ScenePoints, scale: float, model: Segmenter) -> ScoredCandidates:
     """Candidate objects among the surfels enlarged by `scale`, those nearest to the focus where there are many."""
-    scaled, near = surfels.enlarged(scale).to(model.enter.weight.device), torch.ones(len(surfels), dtype=torch.bool)
+    scaled = surfels.enlarged(scale).to(model.input_projection.weight.device)
+    near = torch.ones(len(surfels), dtype=torch.bool)
     grid = voxelise(scaled)
     if len(grid) > MAX_VOXELS:
         distance = grid.points.norm(dim=1)

@@ -1,4 +1,4 @@
-"""What the segmentation network is told about the Gaussians of a scene."""
+"""Inputs of the segmentation network from the Gaussians of a scene."""
 
 from __future__ import annotations
 

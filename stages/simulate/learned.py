@@ -17,7 +17,7 @@ from stages.core.models import checkpoints as weights
 from stages.core.models.dynamics import FRAME, Dynamics
 from stages.core.models.external_forces import ExternalForces
 from stages.core.models.field.solidity import MIN_STIFFNESS, box_sides, solidity
-from stages.core.models.initial_conditions import FLOOR, InitialConditions, centre_of_mass
+from stages.core.models.initial_conditions import FLOOR, InitialConditions
 from stages.core.models.rollout import TimeStepper
 from stages.core.physics.forces import Change, Force, ForcePrompts
 from stages.core.physics.materials import MODELS
@@ -285,13 +285,14 @@ def _state(
     keypoints: Keypoints, ids: list[int], start: tuple[Int[Tensor, "p"], Float[Tensor, "p 3"]],
     initial: InitialConditions, moved: Float[Tensor, "1 o n 3"],
 ) -> FrameState:  # fmt: skip
-    """Keypoints and centres of mass displaced by `moved` [scene units].
+    """Keypoints displaced by `moved` [scene units], and the centres of their masses.
 
     start: the row of the object of each keypoint, and its position once lifted.
     """
     row, lifted = start
     order = row.argsort(stable=True)  # the keypoints of the objects one after the other, as in `initial`
-    positions = lifted.index_add(0, order, moved[0][initial.valid[0]])
-    count = torch.bincount(row, minlength=len(ids))[:, None]
-    centre = torch.zeros(len(ids), 3).index_add(0, row, lifted) / count + centre_of_mass(initial, moved)[0]
+    valid = initial.valid[0]
+    positions = lifted.index_add(0, order, moved[0][valid])
+    weighted = initial.mass_fraction[0][valid][:, None] * positions[order]
+    centre = torch.zeros(len(ids), 3).index_add(0, row[order], weighted)
     return FrameState(positions, centre, object_rotations(keypoints, positions, ids))

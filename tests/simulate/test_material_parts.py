@@ -91,9 +91,8 @@ def test_masses_add_up_and_the_centre_of_mass_is_that_of_the_parts(tmp_path, eng
     assert ("the average of its parts" in caplog.text) == (engine != "mpm")
     if engine == "mpm":
         assert masses(caplog.text) == pytest.approx([heavy, light], rel=0.08)
-    if engine != "ngff":  # which gives the mean of the keypoints as the centre
-        centre = (heavy * 0.05 + light * 0.2) / (heavy + light)
-        assert float(t.com[0, 0, 2]) == pytest.approx(centre, abs=0.008)
+    centre = (heavy * 0.05 + light * 0.2) / (heavy + light)
+    assert float(t.com[0, 0, 2]) == pytest.approx(centre, abs=0.008)
 
 
 @pytest.mark.parametrize("engine", ["mpm", "rigid", "ngff"])

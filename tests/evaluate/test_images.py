@@ -87,6 +87,8 @@ def test_videos_must_have_equal_length_rate_and_size(tmp_path):
     assert evaluate(tmp_path / "short.mp4", true, tmp_path, frames=4)["overall"]["PSNR"] == "inf"
     with pytest.raises(InputError, match="give 4 or fewer"):
         evaluate(tmp_path / "short.mp4", true, tmp_path, frames=5)
+    with pytest.raises(InputError, match="1 frames, but .* has 6; give --frames 1"):
+        evaluate(video(tmp_path / "single.mp4", 1), true, tmp_path)
     with pytest.raises(InputError, match="50 frames a second.*--fps 25"):
         evaluate(video(tmp_path / "fast.mp4", 6, fps=50.0), true, tmp_path)
     with pytest.raises(InputError, match="64x64.*--resolution 48"):

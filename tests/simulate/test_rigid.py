@@ -28,12 +28,14 @@ PHOTOS = {"command": "segment", "scene": {"command": "reconstruct"}}
 
 
 def roll(
-    folder: Path, *surfaces: Surface, density: float = 500.0, loss: float = 0.3, made_by: dict | None = None, **options
-) -> Trajectory:
+    folder: Path, *surfaces: Surface, density: float = 500.0, loss: float = 0.3, made_by: dict | None = None,
+    unit: float = 1.0, **options,
+) -> Trajectory:  # fmt: skip
     grey = [torch.full((len(s.points), 3), 0.5) for s in surfaces]
     parts = [to_gaussians(s, grey[i], i + 1, widest=math.inf) for i, s in enumerate(surfaces)]
     objects = tuple(SceneObject(i + 1, f"body{i + 1}") for i in range(len(parts)))
-    write_scene(folder / "scene.ply", Scene(concatenate(parts), objects, None, 0.0, provenance=made_by or {}))
+    scale = {"metres_per_unit": unit, "source": "test"}
+    write_scene(folder / "scene.ply", Scene(concatenate(parts), objects, None, 0.0, scale, made_by or {}))
     material = {o.name: {"E": 1e7, "density": density, "loss": loss, "friction": 0.3} for o in objects}
     (folder / "m.json").write_text(json.dumps(material))
     chosen = {"engine": "rigid", "keypoints": 32, "materials": folder / "m.json", "quality": "draft", **options}
@@ -115,18 +117,35 @@ def test_a_body_of_several_parts_gains_no_energy_on_the_floor(tmp_path):
     assert float(t.com[60:, 0, 2].max()) < 0.2
 
 
-def test_force_torque_and_pin(tmp_path):
+@pytest.mark.parametrize("unit", [1.0, 0.5])
+def test_force_torque_and_pin(tmp_path, unit):
+    """Newtons and newton metres in scenes of any scale; velocities and places are in scene units."""
     boxes = cube(0.2, 0, 0.5), cube(0.2, 1, 0.5)
-    mass = 500 * 0.2**3
-    inertia = mass * 0.2**2 / 6
-    t = roll(tmp_path, *boxes, gravity=0.0, pin=("2",), steps=12, force=(
+    mass = 500 * (0.2 * unit) ** 3
+    inertia = mass * (0.2 * unit) ** 2 / 6
+    t = roll(tmp_path, *boxes, gravity=0.0, pin=("2",), steps=12, unit=unit, force=(
         f"object=1 force={mass},0,0 torque=0,0,{inertia} to=0.1", "object=2 force=9,9,9"))  # fmt: skip
     assert torch.equal(t.com[-1, 1], t.com[0, 1])
-    assert float((t.com[-1] - t.com[-2])[0, 0] / 0.02) == pytest.approx(0.1, rel=0.02)
+    assert float((t.com[-1] - t.com[-2])[0, 0] / 0.02) == pytest.approx(0.1 / unit, rel=0.02)
+    assert turning(t) == pytest.approx(0.1, rel=0.03)  # edges between points are cut
+    # a push at half a side from the centre: as its torque
+    hit = roll(tmp_path, boxes[0], gravity=0.0, steps=8, unit=unit,
+               force=(f"object=1 force=0,{mass},0 at=0.1,0,0.6 to=0.1",))  # fmt: skip
+    assert turning(hit) == pytest.approx(mass * 0.1 * unit / inertia * 0.1, rel=0.03)
+    assert float((hit.com[-1] - hit.com[-2])[0, 1] / 0.02) == pytest.approx(0.1 / unit, rel=0.02)
+
+
+def turning(t: Trajectory) -> float:
+    """Angular velocity of the first body about z at the end [rad/s]."""
     turned = 2 * torch.atan2(t.rotation[:, 0, 3], t.rotation[:, 0, 0])
-    assert float(turned[-1] - turned[-2]) / 0.02 == pytest.approx(0.1, rel=0.03)  # edges between points are cut
-    hit = roll(tmp_path, boxes[0], gravity=0.0, steps=5, force=("object=1 force=0,2,0 at=0.1,0,0.6",))
-    assert float(hit.rotation[-1, 0, 3]) > 1e-3 and float(hit.com[-1, 0, 1]) > 0
+    return float(turned[-1] - turned[-2]) / t.info.dt
+
+
+def test_a_box_is_slowed_by_the_friction_of_its_material_at_any_scale(tmp_path):
+    """v^2 / 2 mu g with mu = .3, in metres, of a box that starts with 1 m/s; one unit is 5 m."""
+    t = roll(tmp_path, box((0.3, 0.2, 0.1), 0.02).moved((0.0, 0.0, 0.05)), velocity=("object=1 .2,0,0",), unit=5.0,
+             steps=25)  # fmt: skip
+    assert 5 * float(t.com[-1, 0, 0]) == pytest.approx(1 / (2 * 0.3 * G), rel=0.04)
 
 
 @pytest.mark.parametrize("scale", [0.01, 100.0])

@@ -33,6 +33,27 @@ def test_a_ball_is_round_to_one_percent():
     assert float(parts.inertia[0, 0]) == pytest.approx(0.4 * parts.volume * 0.01, rel=0.01)
 
 
+def test_inertia_of_two_cubes_that_are_one_object():
+    """Cubes of side .1, at .2 on both sides of the middle: their own inertia and that of their places."""
+    cubes = [(box((0.1,) * 3, 0.01).moved((x, 0.0, 0.0)), lambda p: p[:, 0] > 9) for x in (-0.2, 0.2)]
+    parts = convex_parts(scene(union(*cubes)))[0]
+    side = (parts.volume / 2) ** (1 / 3)
+    assert side == pytest.approx(0.1, abs=0.5 / 48)  # to a voxel
+    own = side**2 / 6
+    expected = torch.diag(torch.tensor([own, own + 0.04, own + 0.04]))
+    torch.testing.assert_close(parts.inertia / parts.volume, expected, rtol=0.02, atol=0.02 * own)
+
+
+def test_what_is_below_the_floor_is_cut_off():
+    """A cube sunk in by a quarter of its height; one that is below the floor as a whole keeps its upper layer."""
+    cube = scene(box((0.2,) * 3, 0.01))
+    parts = convex_parts(cube, bottom=-0.05)[0]
+    assert parts.volume == pytest.approx(0.75 * 0.2**3, rel=0.03)
+    torch.testing.assert_close(parts.com, torch.tensor([0.0, 0.0, 0.025]), rtol=0, atol=2e-3)
+    assert float(torch.cat(parts.hulls)[:, 2].min()) == pytest.approx(-0.05, abs=1e-6)
+    assert convex_parts(cube, bottom=0.3)[0].volume > 0
+
+
 def test_a_sparse_ball_on_the_floor_is_filled():
     """Its gaps leak where the floor is part of the surface; divided as a shell it would have 95 parts."""
     assert len(convex_parts(two_balls_scene())[0].hulls) == 1

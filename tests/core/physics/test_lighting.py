@@ -1,0 +1,61 @@
+"""The fit of the light to log colours: against colours that are made from known shadows."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from stages.core.physics.lighting import _best_fit, _lamps, _surface_terms
+from stages.core.raster.shadows import Light
+
+
+def surface(count: int = 600):
+    """Random cells of a surface: log colours, the terms of its own colour, and what two lamps hide of it."""
+    rng = torch.Generator().manual_seed(0)
+    points, colours = torch.rand(count, 3, generator=rng), 0.2 * torch.randn(count, 3, generator=rng)
+    hidden = torch.rand(3, count, 2, generator=rng) * (torch.rand(3, count, 2, generator=rng) < 0.5)
+    return _surface_terms(points, colours), hidden, 0.003 * torch.randn(count, generator=rng)
+
+
+LAMPS = [Light(0.0, 0.0, (0.0, 0.0, 1.0), spread, in_colours=True) for spread in (0.1, 0.2, 0.3)]
+
+
+@pytest.mark.parametrize("outliers", [0.0, 0.1])
+@pytest.mark.parametrize("shares", [(0.3, 0.5), (0.6, 0.1), (0.0, 0.7)])
+def test_the_lamp_and_the_shares_of_sky_and_lamp_are_found(shares, outliers):
+    """y = A a + log(1 - hidden s) with noise, and with a tenth of the cells dark for another reason."""
+    (_, A), hidden, noise = surface()
+    own = torch.linspace(-0.3, 0.4, A.shape[1])
+    y = A @ own + (1 - hidden[1] @ torch.tensor(shares)).log() + noise
+    y[: int(outliers * len(y))] -= 1.0
+    fit = _best_fit(A, hidden, y, LAMPS)
+    assert fit.light == replace(LAMPS[1], sky=fit.light.sky, lamp=fit.light.lamp)
+    assert (fit.light.sky, fit.light.lamp) == pytest.approx(shares, abs=0.005)
+    torch.testing.assert_close(fit.own.float(), own, rtol=0, atol=0.01)
+    assert fit.odds > 20
+
+
+def test_brightness_without_shadows_has_no_odds():
+    (_, A), hidden, noise = surface()
+    assert _best_fit(A, hidden, A @ torch.ones(A.shape[1]) + noise, LAMPS).odds < 0.05
+
+
+def test_the_own_terms_of_a_surface_leave_out_what_shadows_do():
+    """A shadow changes the brightness by the same logarithm in all channels and no other term."""
+    rng = torch.Generator().manual_seed(1)
+    points, colours = torch.rand(50, 3, generator=rng), torch.randn(50, 3, generator=rng)
+    (before, terms), (after, same) = (_surface_terms(points, c) for c in (colours, colours - 0.7))
+    torch.testing.assert_close(after, before - 0.7)
+    torch.testing.assert_close(same, terms)
+    torch.testing.assert_close(before, colours.mean(1))
+
+
+def test_lamps_are_all_around_above_the_horizon():
+    directions = torch.tensor([lamp.direction for lamp in _lamps()])
+    torch.testing.assert_close(directions.norm(dim=1), torch.ones(len(directions)))
+    elevations = torch.rad2deg(torch.asin(directions[:, 2])).round().int()
+    assert elevations.unique().tolist() == [25, 40, 55, 70, 90]
+    assert len({(lamp.direction, lamp.spread) for lamp in _lamps()}) == len(_lamps()) == 2 * (4 * 12 + 1)
+    around = torch.atan2(directions[elevations == 25, 1], directions[elevations == 25, 0]) % (2 * math.pi)
+    assert sorted(torch.rad2deg(around).round().int().unique().tolist()) == list(range(0, 360, 30))

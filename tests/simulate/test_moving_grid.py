@@ -1,0 +1,46 @@
+"""The MPM grid that follows its particles: against one fixed grid that is large enough for all of the motion."""
+
+import pytest
+import torch
+
+from stages.core.kernels.mpm.grid import BLOCK
+from stages.core.physics.mpm.domain import Box
+from stages.core.physics.mpm.solver import ParticleMaterial, at_rest, join_particles
+from stages.core.scene.scene import SceneObject
+from stages.simulate.moving_grid import MARGIN, MovingGrid
+
+DX, DT, STEPS = 0.05, 0.02, 20
+OBJECTS = (SceneObject(1, "fast"), SceneObject(2, "slow"))
+
+
+def cube(at: tuple, velocity: tuple):
+    """27 particles of rubber, half a cell apart."""
+    x = torch.cartesian_prod(*[torch.arange(3) * DX / 2] * 3) + torch.tensor(at)
+    material = ParticleMaterial(*(torch.full((27,), value) for value in (1e5, 0.3, 1000.0, 0.0, 0.0)))
+    particles = at_rest(x, torch.full((27,), (DX / 2) ** 3), material)
+    particles.v[:] = torch.tensor(velocity)
+    return particles
+
+
+@pytest.mark.parametrize("touch", [False, True])
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_grid_that_follows_changes_nothing_and_keeps_its_margin(device, touch, sign):
+    """Two bodies that fly apart, upwards, with 5 and 2 m/s."""
+    particles = join_particles([cube((0.0, 0.0, 0.5), (4.0 * sign, 3.0 * sign, 2.0)), cube((0.3, 0, 0.5), (0, 0, 2.0))])
+    body = torch.arange(2).repeat_interleave(27)
+    small, large = Box((-0.5, -0.5, 0.0), (0.9, 0.9, 1.2)), Box((-0.5 - 10 * BLOCK * DX,) * 2 + (0.0,), (3.0, 3.0, 3.0))
+    moving = MovingGrid(particles, small, DX, device, body, OBJECTS, fixed=False, touch=touch)
+    still = MovingGrid(particles, large, DX, device, body, OBJECTS, fixed=True, touch=touch)
+    boxes = {moving.box.low + moving.box.high}
+    for _ in range(STEPS):
+        for grid in (moving, still):
+            grid.advance(DT, torch.zeros(54, 3))
+        x = moving.solver.particles.x.cpu()
+        room = torch.cat([(x - torch.tensor(moving.box.low))[:, :2], torch.tensor(moving.box.high) - x], 1)
+        assert float(room.min()) > MARGIN * DX - 1e-4
+        boxes.add(moving.box.low + moving.box.high)
+    torch.testing.assert_close(x, still.solver.particles.x.cpu(), rtol=0, atol=1e-4)
+    assert still.box == large and moving.box.low[2] == 0
+    assert 2 <= len(boxes) <= 3  # each new one has room for ten frames
+    moved = (torch.tensor(moving.box.low) - torch.tensor(small.low))[:2] / (BLOCK * DX)
+    torch.testing.assert_close(moved, moved.round(), rtol=0, atol=1e-3)  # on the same lattice

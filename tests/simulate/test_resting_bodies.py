@@ -1,0 +1,115 @@
+"""Bodies at rest in photos: what slides, lifts and tips them, and what falls with what is taken away."""
+
+import math
+
+import pytest
+
+from stages.simulate.resting_bodies import RELEASE_SPEED, RestingBodies, Stance
+
+mujoco = pytest.importorskip("mujoco")
+MASS, G, STEP = 2.0, 9.81, 0.01
+WEIGHT = MASS * G
+HEIGHT, HALF_WIDTH = 0.5, 0.3
+
+
+def world(boxes: list[tuple], stances: list[Stance] | None = None):
+    """Boxes of half sides (half, half, half) at (x, y, z), above a plane at z = 0, all of them at rest."""
+    spec = mujoco.MjSpec()
+    spec.option.timestep, spec.option.gravity = STEP, [0, 0, -G]
+    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1])
+    for x, y, z, half in boxes:
+        body = spec.worldbody.add_body(pos=[x, y, z])
+        body.add_freejoint()
+        body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=[half] * 3, mass=MASS, margin=0.01)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    stances = stances or [Stance(0.5, b[3], b[3], math.isclose(b[2], b[3])) for b in boxes]
+    return model, data, RestingBodies(model, data, stances, range(1, len(boxes) + 1))
+
+
+def steps_until_released(wrench: tuple, friction: float, most: int = 300) -> int | None:
+    """Substeps under contact forces and moments about the centre of mass until a body is released; None for never."""
+    _, data, resting = world([(0, 0, 0.5, 0.5)], [Stance(friction, HEIGHT, HALF_WIDTH, True)])
+    for n in range(1, most + 1):
+        data.qfrc_constraint[:6] = wrench
+        if resting.release_disturbed(data):
+            return n
+    return None
+
+
+def steps_of(excess: float) -> int:
+    """Substeps in which this force gives the body the speed at which it is released."""
+    return math.floor(MASS * RELEASE_SPEED / (excess * STEP)) + 1
+
+
+@pytest.mark.parametrize("turn", [0.0, 1.0, 2.5])
+def test_a_push_slides_a_body_when_it_exceeds_friction(turn):
+    """In any direction, and with what lifts the body taken off its weight."""
+    def push(force, lift=0.0):
+        # at the base, where it does not tip the body
+        x, y = force * math.cos(turn), force * math.sin(turn)
+        return x, y, lift, HEIGHT * y, -HEIGHT * x, 0.0
+
+    assert steps_until_released(push(0.99 * 0.4 * WEIGHT), 0.4) is None
+    assert steps_until_released(push(1.5 * 0.4 * WEIGHT), 0.4) == steps_of(0.5 * 0.4 * WEIGHT)
+    assert steps_until_released(push(0.4 * WEIGHT, lift=0.5 * WEIGHT), 0.4) == steps_of(0.2 * WEIGHT)
+
+
+def test_a_body_is_lifted_by_more_than_its_weight():
+    assert steps_until_released((0, 0, 0.99 * WEIGHT, 0, 0, 0), 0.4) is None
+    assert steps_until_released((0, 0, 1.2 * WEIGHT, 0, 0, 0), 0.4) == steps_of(0.2 * WEIGHT)
+
+
+@pytest.mark.parametrize("turn", [0.0, 1.0, 2.5])
+@pytest.mark.parametrize("above", [0.0, 0.5])
+def test_a_push_tips_a_body_by_its_moment_about_the_base(turn, above):
+    """At a height `above` the centre of mass; friction holds."""
+    tips = WEIGHT * HALF_WIDTH / (HEIGHT + above)
+    for share, expected in ((0.98, None), (1.5, steps_of(0.5 * WEIGHT * HALF_WIDTH / HEIGHT))):
+        x, y = share * tips * math.cos(turn), share * tips * math.sin(turn)
+        assert steps_until_released((x, y, 0, -above * y, above * x, 0), 10.0) == expected
+
+
+def test_a_short_disturbance_is_forgotten():
+    _, data, resting = world([(0, 0, 0.5, 0.5)])
+    lasting = steps_of(0.2 * WEIGHT)
+    for _ in range(3):
+        for lift in [1.2 * WEIGHT] * (lasting - 1) + [0.0]:
+            data.qfrc_constraint[:6] = 0, 0, lift, 0, 0, 0
+            assert resting.release_disturbed(data) == []
+    assert resting.held.all()
+
+
+def test_what_rests_on_a_released_body_is_released_with_it():
+    """In any order of the bodies: a tower of three, a box that touches it from the side, and one in the air."""
+    tower = [(0, 0, 0.5, 0.1), (0, 0, 0.3, 0.1), (0, 0, 0.1, 0.1)]
+    beside, floating = (0.2, 0, 0.105, 0.1), (2.0, 0, 0.5, 0.1)
+    _, _, resting = world([*tower, beside, floating])
+    assert resting.held.tolist() == [True] * 4 + [False]  # what touches nothing falls
+    assert resting.resting_on == {3: {2}, 2: {1}}
+    assert sorted(resting.release([2])) == [1, 2] and resting.held.tolist() == [False, False, True, True, False]
+    assert resting.release([2]) == [] and sorted(resting.release([3])) == [3]
+    _, _, resting = world([*tower[::-1], beside])
+    assert resting.resting_on == {1: {2}, 2: {3}} and sorted(resting.release([1])) == [1, 2, 3]
+
+
+def test_held_bodies_are_put_back_and_collide_only_with_what_moves():
+    model, data, resting = world([(0, 0, 0.1, 0.1), (0.19, 0, 0.1, 0.1), (2.0, 0, 0.5, 0.1)])
+    start = data.qpos.reshape(-1, 7).copy()
+    data.qpos.reshape(-1, 7)[:, 0] += 0.001
+    data.qvel[:] = 1.0
+    resting.restore(data, start)
+    assert (data.qpos.reshape(-1, 7)[:2] == start[:2]).all() and data.qpos.reshape(-1, 7)[2, 0] == pytest.approx(2.001)
+    assert data.qvel.reshape(-1, 6).any(1).tolist() == [False, False, True]
+
+    def collide(a: int, b: int) -> bool:
+        mujoco.mj_forward(model, data)
+        return {a, b} in [set(model.geom_bodyid[pair]) for pair in data.contact.geom]
+
+    assert not collide(1, 2) and not collide(0, 1)
+    inertia = model.dof_M0[:6].copy()
+    resting.release([1])
+    assert collide(1, 2) and collide(0, 1)
+    assert (inertia > 1e5 * model.dof_M0[:6]).all()  # contacts did not move it
+    assert model.dof_M0[:3].tolist() == pytest.approx([MASS] * 3, rel=1e-3)

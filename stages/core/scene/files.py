@@ -16,6 +16,7 @@ from typing import Any
 from stages.core.errors import InputError
 from stages.core.scene.schema import read_json, reason
 
+KEPT_OF_NAME = 50  # characters of a file's name in that of its temporary file; names have up to 255 bytes
 _HOST = hashlib.sha256(platform.node().encode()).hexdigest()[:6]
 _count = itertools.count()
 _swept: set[Path] = set()  # folders in which this process has looked for files of killed processes
@@ -26,6 +27,7 @@ def replacing(path: Path) -> Iterator[Path]:
     """A temporary path next to `path`, with the same suffix, that replaces it on success and is deleted on failure.
 
     Its name .part-HOST-PID-COUNT-NAME is unique: of several processes that write the same file, the last one wins.
+    Only the end of a long NAME is part of it, so that names may be as long as the file system allows.
     The first call for a folder deletes what killed processes of this machine left there.
     Raises InputError where `path` is a folder, its folder is missing, or the file cannot be written.
     """
@@ -37,7 +39,7 @@ def replacing(path: Path) -> Iterator[Path]:
     if not path.parent.is_dir():
         raise InputError(f"{path}: there is no folder {path.parent}; create it first")
     _sweep(path.parent)
-    part = path.with_name(f".part-{_HOST}-{os.getpid()}-{next(_count)}-{path.name}")
+    part = path.with_name(f".part-{_HOST}-{os.getpid()}-{next(_count)}-{path.name[-KEPT_OF_NAME:]}")
     try:
         yield part
         os.replace(part, path)

@@ -27,6 +27,15 @@ def test_two_writers_of_one_file_do_not_mix(tmp_path):
     assert os.listdir(tmp_path) == ["a.txt"]
 
 
+@pytest.mark.parametrize("letter", ["n", "图"])
+def test_names_may_be_as_long_as_the_file_system_allows(tmp_path, letter):
+    name = letter * ((255 - 4) // len(letter.encode())) + ".txt"
+    with replacing(tmp_path / name) as part:
+        assert part.suffix == ".txt"
+        part.write_text("long")
+    assert os.listdir(tmp_path) == [name]
+
+
 def test_failure_keeps_the_old_file(tmp_path):
     (tmp_path / "a.txt").write_text("old")
     with pytest.raises(KeyboardInterrupt), replacing(tmp_path / "a.txt") as part:

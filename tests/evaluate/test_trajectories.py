@@ -147,6 +147,25 @@ def test_different_lengths_and_rates_need_an_option(tmp_path, two_balls):
     assert facts["overall"]["FPE"] == pytest.approx(0.11, abs=1e-6)  # both fall by 0.01 per frame: 22 frames against 11
 
 
+def test_resampling_takes_the_nearest_frames_before_and_after(tmp_path, two_balls):
+    """Of a motion with acceleration, which other frames would not give: exact at its own frames, a mean in between."""
+    def accelerated(dt: float, count: int):
+        frames = iter(range(count))
+        return lambda x: x + (next(frames) * dt) ** 2
+
+    still = {"spin": 0.0, "speed": 0.0}
+    write_motion(tmp_path / "mine.h5", two_balls, frames=7, dt=0.02, change=accelerated(0.02, 7), **still)
+    write_motion(tmp_path / "true.h5", two_balls, frames=5, dt=0.03, change=accelerated(0.03, 5), **still)
+    facts = evaluate(tmp_path, resample=True)
+    # the fall of .01 per frame of `write_motion` differs as well: by half a frame in frame 1, and so on
+    expected = []
+    for n in range(5):
+        before, after = (n * 3 // 2) * 0.02, -(-n * 3 // 2) * 0.02
+        side, fall = (before**2 + after**2) / 2 - (n * 0.03) ** 2, 0.01 * n - 0.015 * n
+        expected.append((2 * side**2 + (side + fall) ** 2) ** 0.5)
+    assert facts["per_frame"]["red ball"] == pytest.approx(expected, abs=1e-6)
+
+
 def test_missing_objects_are_named_in_the_error(tmp_path, two_balls):
     write_motion(tmp_path / "true.h5", two_balls)
     fewer = replace(two_balls, objects=two_balls.objects[:1])

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from stages.core.errors import InputError
 from stages.core.physics.forces import ForcePrompts, vector
-from stages.core.physics.material_parts import averaged, uneven_moments
+from stages.core.physics.material_parts import averaged, located, uneven_moments
 from stages.core.physics.materials import MaterialChoice, choose_materials
 from stages.core.physics.mpm.domain import MAX_NODES, Box
 from stages.core.physics.mpm.resample import subdivide
@@ -106,8 +106,10 @@ def set_up_scene(
 def choose_for_bodies(scene: Scene, bodies: Bodies, options: SimulateOptions) -> dict[int, MaterialChoice]:
     """The materials that the options name, by object id, each the average of its parts over the object's body."""
     chosen = choose_materials(scene.objects, options.material, options.materials)
-    mine = {o.id: bodies.body == row for row, o in enumerate(scene.objects)}
-    return {i: averaged(choice, bodies.x[mine[i]], bodies.volume[mine[i]]) for i, choice in chosen.items()}
+    for row, o in enumerate(scene.objects):
+        mine = bodies.body == row
+        chosen[o.id] = averaged(located(chosen[o.id], scene.gaussians, o), bodies.x[mine], bodies.volume[mine])
+    return chosen
 
 
 def _floor_height(scene: Scene, options: SimulateOptions, box: Box | None, bottom: Float[Tensor, "o"]) -> float:

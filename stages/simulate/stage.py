@@ -15,6 +15,8 @@ from stages.core.backends import MAX_SEED, choose, pick_device
 from stages.core.errors import InputError
 from stages.core.physics import forces
 from stages.core.physics.keypoints import bind_gaussians, choose_keypoints
+from stages.core.physics.material_parts import segment_files
+from stages.core.physics.materials import choose_materials
 from stages.core.scene.files import provenance, seconds_since
 from stages.core.scene.formats import suffixes
 from stages.core.scene.scene import Scene
@@ -50,6 +52,7 @@ def run(scene: Path, out: Path, options: SimulateOptions = SimulateOptions()) ->
     prompts = for_engine(prompts, world, options)
     rollout = choose({name: engine.rollout for name, engine in ENGINES.items()}, options.engine)
     inputs = [Path(p) for p in (scene, options.materials, options.forces) if p is not None]
+    inputs += segment_files(choose_materials(world.objects, options.material, options.materials))
     world = replace(world, provenance={**provenance("simulate", inputs, options), "scene": world.provenance})
     gravity = (0.0, 0.0, -options.gravity / world.metres_per_unit)
     motion = SimulationInfo(options.dt, gravity, options.engine, prompts.as_dicts())

@@ -4,6 +4,7 @@ import json
 import logging
 import math
 import re
+from dataclasses import replace
 
 import pytest
 import torch
@@ -20,9 +21,11 @@ G = 0.5  # [m/s^2]
 
 
 def roll(folder, surface: Surface, parts: list, **options) -> Trajectory:
-    """The motion of an object of several parts above a floor at z = 0."""
+    """The motion of an object of several parts above a floor at z = 0; parts.ply has what is below z = .1 as "pot"."""
     g = to_gaussians(surface, torch.full((len(surface.points), 3), 0.5), 1, widest=math.inf)
     write_scene(folder / "scene.ply", Scene(concatenate([g]), (SceneObject(1, "plant"),), None, 0.0))
+    pot = replace(g, object_id=(g.means[:, 2] < 0.1).long())
+    write_scene(folder / "parts.ply", Scene(pot, (SceneObject(1, "pot"),), None, 0.0))
     (folder / "m.json").write_text(json.dumps({"plant": {"parts": parts}}))
     chosen = {"quality": "draft", "keypoints": 64, "materials": folder / "m.json", **options}
     run(folder / "scene.ply", folder / "t.h5", SimulateOptions(**chosen))
@@ -65,6 +68,7 @@ def test_a_beam_bends_by_the_stiffness_of_its_parts(tmp_path, E):
 
 
 POT = {"below": 0.1, "material": {"E": 1e6, "density": 1500.0}}
+POT_BY_SEGMENT = {"segment": "pot", "in": "parts.ply", "material": {"E": 1e6, "density": 1500.0}}
 STEM = {"material": {"E": 1e6, "density": 300.0}}
 
 
@@ -95,11 +99,12 @@ def test_masses_add_up_and_the_centre_of_mass_is_that_of_the_parts(tmp_path, eng
     assert float(t.com[0, 0, 2]) == pytest.approx(centre, abs=0.008)
 
 
-@pytest.mark.parametrize("engine", ["mpm", "rigid", "ngff"])
-def test_what_is_pinned_stays(tmp_path, engine, device):
+@pytest.mark.parametrize(("engine", "pot"), [("mpm", POT), ("mpm", POT_BY_SEGMENT), ("rigid", POT_BY_SEGMENT),
+                                             ("ngff", POT)])  # fmt: skip
+def test_what_is_pinned_stays(tmp_path, engine, pot, device):
     """Pushed to the side for .1 s, the free part bends; engines of whole bodies hold all of it."""
     stem = {"material": {"E": 3e4, "density": 300.0}}
-    t = roll(tmp_path, column(), [POT | {"pinned": True}, stem], engine=engine, steps=6,
+    t = roll(tmp_path, column(), [pot | {"pinned": True}, stem], engine=engine, steps=6,
              force=("object=1 force=3,0,0 from=0 to=0.1",))  # fmt: skip
     z = t.keypoints.rest[:, 2]
     moved = (t.positions[-1] - t.positions[0]).norm(dim=1)

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
+from pathlib import Path
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from stages.core.physics.materials import MODELS, Material, MaterialChoice
+from stages.core.scene.gaussians import Gaussians
+from stages.core.scene.scene import SceneObject
 
 
 def part_of_points(choice: MaterialChoice, x: Float[Tensor, "p 3"]) -> Int[Tensor, "p"]:
@@ -25,8 +29,21 @@ def part_of_points(choice: MaterialChoice, x: Float[Tensor, "p 3"]) -> Int[Tenso
             inside &= height < part.below
         if part.box is not None:
             inside &= ((x >= torch.tensor(part.box[:3])) & (x <= torch.tensor(part.box[3:]))).all(1)
+        if part.segment is not None:
+            inside &= part.segment.contains(x)
         index[inside] = k
     return index
+
+
+def located(choice: MaterialChoice, gaussians: Gaussians, o: SceneObject) -> MaterialChoice:
+    """The choice with its segments among the Gaussians of the object; raises InputError as `Segment.of_object` does."""
+    parts = [p if p.segment is None else replace(p, segment=p.segment.of_object(gaussians, o)) for p in choice.several]
+    return replace(choice, several=tuple(parts))
+
+
+def segment_files(choices: Mapping[int, MaterialChoice]) -> list[Path]:
+    """The labelled PLY files whose segments are parts of objects."""
+    return sorted({part.segment.path for c in choices.values() for part in c.parts if part.segment is not None})
 
 
 def averaged(choice: MaterialChoice, x: Float[Tensor, "p 3"], volume: Float[Tensor, "p"]) -> MaterialChoice:

@@ -14,9 +14,11 @@ from pathlib import Path
 
 from stages.core.errors import InputError
 from stages.core.kernels.mpm.constitutive import COROTATED, NEO_HOOKEAN, SAND, SNOW, VON_MISES, sand_slope
+from stages.core.physics.material_segments import Segment
 from stages.core.scene.files import read_json_file
 from stages.core.scene.scene import SceneObject
-from stages.core.scene.schema import flag, number, numbers, quote, reason
+from stages.core.scene.scene_ply import read_scene
+from stages.core.scene.schema import flag, number, numbers, quote, reason, text
 
 MATERIALS_FILE = "a JSON file {object name or id: material name or {E, nu, density, friction}}"
 Triple = tuple[float | int, float | int, float | int]
@@ -116,6 +118,7 @@ ALIASES = {  # material of objects whose name contains one of these words
     "ball": ["soccer", "football", "basketball"],
 }
 MAX_PARTS = 100  # of an object
+REGION = ("below", "box", "segment")  # keys that say where a part is
 DEFAULT_MATERIAL = "common"  # of objects whose name suggests none
 
 
@@ -128,6 +131,7 @@ class MaterialPart:
     below: float | None = None  # height above the object's lowest point [scene units]
     box: tuple[float, ...] | None = None  # lower and upper corner, in the scene at rest [scene units]
     pinned: bool = False  # held at its position
+    segment: Segment | None = None  # an object of another labelling of the scene
 
 
 @dataclass(frozen=True)
@@ -155,8 +159,9 @@ def choose_materials(
     """
     given: dict[int, MaterialChoice] = {}
     for key, value in (read_json_file(file, MATERIALS_FILE) if file else {}).items():
-        read = _parts if isinstance(value, dict) and "parts" in value else _material
-        given[find_object(key, objects, f"{file}").id] = read(value, f"{file}: {quote(key)}")
+        o, where = find_object(key, objects, f"{file}"), f"{file}: {quote(key)}"
+        several = isinstance(value, dict) and "parts" in value
+        given[o.id] = _parts(value, where, Path(file).parent) if several else _material(value, where)
     for prompt in prompts:
         key, equals, value = prompt.partition("=")
         if not equals or not value.strip():
@@ -226,25 +231,42 @@ def _material(value: object, where: str) -> MaterialChoice:
     return MaterialChoice("custom", material)
 
 
-def _parts(value: dict, where: str) -> MaterialChoice:
-    """An object of several parts: {"parts": [{below or box or both, material, pinned}, ..., {material, pinned}]}."""
+def _parts(value: dict, where: str, folder: Path) -> MaterialChoice:
+    """An object of several parts: {"parts": [{below, box, segment and in, material, pinned}, ..., {material, pinned}]}.
+
+    The PLY files of segments are relative to `folder`.
+    """
     rows = value["parts"]
     if value.keys() != {"parts"} or not isinstance(rows, list) or not 2 <= len(rows) <= MAX_PARTS:
         raise InputError(f"{where}: give {{parts: [...]}} with 2 to {MAX_PARTS} parts")
     parts = []
     for k, row in enumerate(rows, 1):
         at = f"{where}: part {k}"
-        if not isinstance(row, dict) or row.keys() - {"below", "box", "material", "pinned"} or "material" not in row:
-            raise InputError(f"{at}: give a material and below (a height), box (two corners) or both, and pinned if it "
-                             "is held")  # fmt: skip
-        if (k < len(rows)) != bool(row.keys() & {"below", "box"}):
-            raise InputError(f"{at}: every part but the last needs below or box; the last is what the others leave")
+        if not isinstance(row, dict) or row.keys() - {*REGION, "in", "material", "pinned"} or "material" not in row:
+            raise InputError(f"{at}: give a material, its region by below (a height), box (two corners) or segment (an "
+                             "object in a labelled PLY), and pinned if it is held")  # fmt: skip
+        if (k < len(rows)) != bool(row.keys() & set(REGION)):
+            raise InputError(f"{at}: every part but the last needs {' or '.join(REGION)}; the last is what the others "
+                             "leave")  # fmt: skip
         choice = _material(row["material"], at)
         try:
             below = number(row["below"], "below", 0) if "below" in row else None
             box = numbers(row["box"], 6, "box") if "box" in row else None
             pinned = flag(row.get("pinned", False), "pinned")
+            segment = _segment(row, at, folder)
         except ValueError as error:
             raise InputError(f"{at}: {reason(error)}") from error
-        parts.append(MaterialPart(choice.name, choice.material, below, box, pinned))
+        parts.append(MaterialPart(choice.name, choice.material, below, box, pinned, segment))
     return MaterialChoice(" and ".join(dict.fromkeys(p.name for p in parts)), parts[-1].material, several=tuple(parts))
+
+
+def _segment(row: dict, where: str, folder: Path) -> Segment | None:
+    """The segment of a part, if it has one; ValueError or InputError for a wrong one."""
+    if ("segment" in row) != ("in" in row):
+        raise ValueError("segment (a name or id) and in (the labelled PLY that has it) belong together")
+    if "segment" not in row:
+        return None
+    path = folder / text(row["in"], "in")
+    scene = read_scene(path)
+    o = find_object(text(str(row["segment"]), "segment"), scene.objects, f"{where}: {path}")
+    return Segment(path, o.name, scene.gaussians.means, scene.gaussians.object_id == o.id)

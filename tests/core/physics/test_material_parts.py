@@ -6,9 +6,11 @@ import pytest
 import torch
 
 from stages.core.errors import InputError
-from stages.core.physics.material_parts import averaged, part_of_points, uneven_moments
+from stages.core.physics.material_parts import averaged, located, part_of_points, segment_files, uneven_moments
 from stages.core.physics.materials import choose_materials
-from stages.core.scene.scene import SceneObject
+from stages.core.scene.gaussians import Gaussians
+from stages.core.scene.scene import Scene, SceneObject
+from stages.core.scene.scene_ply import write_scene
 
 OBJECTS = (SceneObject(1, "plant"), SceneObject(2, "duck"))
 POT, LEAF = {"E": 1e7, "density": 2000.0, "friction": 0.4}, {"E": 1e5, "density": 500.0, "friction": 0.8}
@@ -51,6 +53,38 @@ def test_averages_and_moments_of_a_column(tmp_path):
     torch.testing.assert_close(inertia, torch.diag(torch.tensor([about - uniform, about - uniform, 0.0])))
 
 
+def gaussians_at(x: torch.Tensor, object_id: list[int]) -> Gaussians:
+    n = len(x)
+    return Gaussians(x, torch.eye(4)[:1].repeat(n, 1), torch.full((n, 3), 0.1), torch.ones(n), torch.zeros(n, 1, 3),
+                     torch.tensor(object_id))  # fmt: skip
+
+
+def write_parts(folder, x: torch.Tensor, object_id: list[int]) -> None:
+    """The Gaussians of a plant on a table, its pot being object 4 and its leaves unlabelled."""
+    objects = SceneObject(4, "pot"), SceneObject(5, "duck")
+    write_scene(folder / "parts.ply", Scene(gaussians_at(x, object_id), objects))
+
+
+@pytest.mark.parametrize("segment", ["pot", 4])
+def test_a_segment_has_what_is_nearest_to_its_gaussians(tmp_path, segment):
+    table = column()[:1] - torch.tensor([0.0, 0.0, 0.7])  # unlabelled too, but never nearest to a point of the plant
+    write_parts(tmp_path, torch.cat([column(), table]), [4, 4, 4, 0, 0, 0, 0, 0, 0])
+    pot = {"segment": segment, "in": "parts.ply", "below": 2, "material": POT}
+    choice = choose(tmp_path, [pot, {"material": LEAF}])
+    scene = gaussians_at(torch.cat([column() + 0.01, table]), [1] * 8 + [0])
+    found = located(choice, scene, OBJECTS[0])
+    inner = column() + torch.tensor([0.2, 0.0, -0.4])
+    assert part_of_points(found, inner).tolist() == [0, 0, 1, 1, 1, 1, 1, 1]  # of the three in the pot one is too high
+    assert segment_files({1: choice}) == [tmp_path / "parts.ply"]
+
+
+def test_a_segment_elsewhere_is_refused(tmp_path):
+    write_parts(tmp_path, torch.cat([column(), column() + 100]), [0] * 8 + [4] * 8)
+    choice = choose(tmp_path, [{"segment": "pot", "in": "parts.ply", "material": POT}, {"material": LEAF}])
+    with pytest.raises(InputError, match=r"parts.ply: nothing of object 1 \(plant\) is in its pot"):
+        located(choice, gaussians_at(column(), [1] * 8), OBJECTS[0])
+
+
 def test_a_uniform_object_stays_as_it_is():
     choice = choose_materials(OBJECTS)[2]
     assert len(choice.parts) == 1 and averaged(choice, column(), torch.ones(8)) is choice
@@ -65,8 +99,15 @@ def test_a_uniform_object_stays_as_it_is():
     ([{"below": -1, "material": "steel"}, {"material": "soft"}], "part 1: below is -1"),
     ([{"box": [0, 1], "material": "steel"}, {"material": "soft"}], "part 1: box"),
     ([{"below": 1, "material": "cheese"}, {"material": "soft"}], "part 1: no material called 'cheese'"),
+    ([{"segment": "pot", "material": "steel"}, {"material": "soft"}], "part 1: segment .* together"),
+    ([{"below": 1, "material": "steel"}, {"in": "parts.ply", "material": "soft"}], "part 2: segment .* together"),
+    ([{"segment": "pot", "in": 3, "material": "steel"}, {"material": "soft"}], "part 1: in is 3, not text"),
+    ([{"segment": "pot", "in": "absent.ply", "material": "steel"}, {"material": "soft"}], "absent.ply: no such file"),
+    ([{"segment": "leaf", "in": "parts.ply", "material": "steel"}, {"material": "soft"}],
+     r"part 1: .*parts.ply: 'leaf' is not an object .* 4 \(pot\), 5 \(duck\)"),
     ([{"below": 1, "material": "steel", "pinned": 1}, {"material": "soft"}], "pinned is 1, not true or false"),
 ])  # fmt: skip
 def test_wrong_parts_are_refused(tmp_path, parts, message):
+    write_parts(tmp_path, column(), [4] * 8)
     with pytest.raises(InputError, match=message):
         choose(tmp_path, parts)

@@ -309,6 +309,9 @@ def track(
     frames: Annotated[
         int, typer.Option(help="frames from the release on; 0: until everything rests")
     ] = TrackOptions.frames,
+    masks: Annotated[
+        Path | None, typer.Option(help="folder with a folder of label images for each film, one for each frame")
+    ] = TrackOptions.masks,
     keypoints: Annotated[int, typer.Option(help="keypoints per object, in the trajectory")] = TrackOptions.keypoints,
     seed: Seed = TrackOptions.seed,
     device: Device = TrackOptions.device,
@@ -320,7 +323,8 @@ def track(
     """
     from stages.lab.track.track import run
 
-    options = TrackOptions(resolution=resolution, frames=frames, keypoints=keypoints, seed=seed, device=device)
+    options = TrackOptions(resolution=resolution, frames=frames, masks=masks, keypoints=keypoints, seed=seed,
+                           device=device)  # fmt: skip
     for line in run(scene, films, out, options):
         print(line)
 

@@ -104,10 +104,12 @@ def _mapper_options(photos: Photos, seed: int):
 def _failure_reason(photos: int, pairs: int) -> str:
     """Why mapping failed, by the number of matching pairs: too little overlap, or misleading matches."""
     if pairs < 2 * photos:
-        return f"the photos overlap too little to find where they were taken from; {CAPTURE_ADVICE}"
+        what = "the photos overlap too little to find where they were taken from"
+        return f"{what}; {CAPTURE_ADVICE}, or give known cameras (--cameras)"
     return (
         f"{pairs} pairs of photos match, but no camera positions explain the matches; where a pattern repeats "
-        "(tiles, a checked cloth) its parts are confused: cover it, with newspaper for instance"
+        "(tiles, a checked cloth) its parts are confused: cover it, with newspaper for instance; where cameras are far "
+        "apart, as those of a few films, give known ones (--cameras)"
     )
 
 

@@ -36,12 +36,16 @@ class Observation:
     late: float  # time after that of the poses [frames]
     camera: Camera
     reduction: int  # of the picture
-    image: Float[Tensor, "h w 3"]
+    image: Float[Tensor, "h w c"]  # nan where not known
     displacement: Float[Tensor, "o 6"]  # turn [rad] and displacement [scene units]
 
     def draw(self, synthesiser: Synthesiser, poses: Poses) -> Synthesis:
         """The rendering that this picture is compared with."""
         return synthesiser.draw(self.camera, poses.moved(self.displacement), self.reduction)
+
+    def difference(self, drawn: Synthesis) -> Float[Tensor, "h w c"]:
+        """Of the picture to the rendering, 0 where the picture is not known."""
+        return (self.image - drawn.image).nan_to_num(0.0)
 
 
 @dataclass(frozen=True)
@@ -49,15 +53,16 @@ class PixelChanges:
     """The pixels of a picture that show moving objects, and how they change."""
 
     row: Tensor  # (p) object
-    residual: Float[Tensor, "p 3"]
-    jacobian: Float[Tensor, "p 3 6"]  # of the rendering by turn [1/rad] and displacement [1/scene unit]
+    residual: Float[Tensor, "p c"]
+    jacobian: Float[Tensor, "p c 6"]  # of the rendering by turn [1/rad] and displacement [1/scene unit]
 
 
 def change_of(seen: Observation, drawn: Synthesis, centre: Float[Tensor, "o 3"]) -> PixelChanges:
     """Residuals, and derivatives of the rendering by the motion of the objects about `centre`."""
     at = drawn.moving >= 0
-    mean = (drawn.image + seen.image) / 2
-    gradient = torch.stack([_central(mean, 1), _central(mean, 0)], -1)[at]  # (p, 3, 2)
+    difference = seen.difference(drawn)
+    mean = drawn.image + difference / 2
+    gradient = torch.stack([_central(mean, 1), _central(mean, 0)], -1)[at]  # (p, c, 2)
     row, point = drawn.moving[at], drawn.point[at]
     V, K = seen.camera.viewmat, resize(seen.camera.K, 1 / seen.reduction, 1 / seen.reduction)
     p = point @ V[:3, :3].mT + V[:3, 3]
@@ -67,13 +72,13 @@ def change_of(seen: Observation, drawn: Synthesis, centre: Float[Tensor, "o 3"])
         torch.stack([K[0, 0] / z, zero, -K[0, 0] * p[:, 0] / z**2], 1),
         torch.stack([zero, K[1, 1] / z, -K[1, 1] * p[:, 1] / z**2], 1),
     ], 1) @ V[:3, :3]  # fmt: skip  # (p, 2, 3), by motion of the point in the world
-    by_place = -gradient @ projection  # (p, 3, 3)
+    by_place = -gradient @ projection  # (p, c, 3)
     arm = (point - centre[row])[:, None].expand_as(by_place)
     by_turn = torch.linalg.cross(arm, by_place)  # a . (w x r) = w . (r x a)
-    return PixelChanges(row, (seen.image - drawn.image)[at], torch.cat([by_turn, by_place], -1))
+    return PixelChanges(row, difference[at], torch.cat([by_turn, by_place], -1))
 
 
-def _central(image: Float[Tensor, "h w 3"], dim: int) -> Float[Tensor, "h w 3"]:
+def _central(image: Float[Tensor, "h w c"], dim: int) -> Float[Tensor, "h w c"]:
     """Derivative along rows (0) or columns (1) by central differences, 0 on the border."""
     out = torch.zeros_like(image)
     n = image.shape[dim]
@@ -81,12 +86,12 @@ def _central(image: Float[Tensor, "h w 3"], dim: int) -> Float[Tensor, "h w 3"]:
     return out
 
 
-def robust_weights(residual: Float[Tensor, "p 3"], scale: float) -> Float[Tensor, "p"]:
+def robust_weights(residual: Float[Tensor, "p c"], scale: float) -> Float[Tensor, "p"]:
     """Geman and McClure's weights, for residuals of this scale."""
     return (scale**2 / (scale**2 + residual.square().mean(1))).square()
 
 
-def robust_cost(residual: Float[Tensor, "*b 3"], scale: float) -> float:
+def robust_cost(residual: Float[Tensor, "*b c"], scale: float) -> float:
     """Mean of Geman and McClure's function, from 0 to 1."""
     square = residual.square().mean(-1)
     return float((square / (scale**2 + square)).mean())

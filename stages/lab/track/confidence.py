@@ -27,7 +27,7 @@ def differences(
     found = []
     for seen in observations:
         drawn = seen.draw(synthesiser, poses)
-        off = (seen.image - drawn.image).square().mean(-1).sqrt()
+        off = seen.difference(drawn).square().mean(-1).sqrt()
         found.append([off[drawn.label == i] for i in rows])
     return found
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
-from jaxtyping import UInt8
+from jaxtyping import Int16, UInt8
 from torch import Tensor
 
 from stages.core.errors import InputError
@@ -18,6 +18,7 @@ from stages.core.scene.images import resize
 from stages.core.scene.lens import Undistortion
 from stages.core.scene.recordings import list_recordings, read_recording
 from stages.core.scene.scene import Scene
+from stages.lab.track.film_masks import find_film_masks
 
 log = logging.getLogger(__name__)
 MULTIPLE = 8  # of which sizes are, so that pictures can be reduced
@@ -30,12 +31,16 @@ class Film:
     name: str
     frames: UInt8[Tensor, "t h w 3"]
     start: float  # number of the frame at the release, with fractions
+    labels: Int16[Tensor, "t h w"] | None = None  # of the objects in each pixel, as FilmMasks.read gives them
 
 
-def read_films(scene: Scene, folder: Path, frames: int, resolution: int) -> tuple[Cameras, list[Film]]:
+def read_films(
+    scene: Scene, folder: Path, frames: int, resolution: int, masks: Path | None = None
+) -> tuple[Cameras, list[Film]]:
     """The cameras of the scene that have films in the folder, at the resolution of the films, and these films.
 
-    Films are read until `frames` after the release. Raises InputError where fewer than one camera has a film.
+    Films are read until `frames` after the release, with their label images in the folder `masks`. Raises InputError
+    where fewer than one camera has a film, and for a film of more frames than label images.
     """
     recordings = list_recordings(folder)
     cameras, starts = scene.cameras, scene.sequence.starts
@@ -45,19 +50,26 @@ def read_films(scene: Scene, folder: Path, frames: int, resolution: int) -> tupl
     if not rows:
         raise InputError(f"{folder}: holds no film of the scene's cameras ({', '.join(cameras.names[:3])}, ...)")
     reduced = _reduced_cameras(cameras[rows], resolution)
+    labelled = None if masks is None else find_film_masks(masks, scene, [cameras.names[row] for row in rows])
     films = []
     for row, size in zip(rows, reduced.sizes.tolist(), strict=True):
         name = cameras.names[row]
         last = math.ceil(starts[name] + frames) + 1
-        pictures = []
+        pictures, labels = [], []
+        files = labelled.of_film(name) if labelled else []
         for image, _ in read_recording(recordings[name], 2 * resolution):
             lens = Undistortion.of(cameras, row, (image.shape[1], image.shape[0]))
             view = resize(lens.image(image).float() / 255, *size)
             pictures.append((255 * view).round().to(torch.uint8))
+            if files and len(pictures) > len(files):
+                raise InputError(f"{files[0].parent}: holds {len(files)} label images, but {recordings[name]} has more "
+                                 "frames; give one for each")  # fmt: skip
+            if files:
+                labels.append(labelled.read(files[len(labels)], cameras, row, size))
             if len(pictures) > last:
                 break
         if pictures:
-            films.append(Film(name, torch.stack(pictures), starts[name]))
+            films.append(Film(name, torch.stack(pictures), starts[name], torch.stack(labels) if labels else None))
     if len(films) < len(rows):
         raise InputError(f"{folder}: a film has no frames; remove it")
     return reduced, films

@@ -14,6 +14,7 @@ from stages.core.scene.cameras import Cameras
 from stages.core.scene.scene import Scene
 from stages.lab.track.alignment import Observation, align, change_of, robust_weights
 from stages.lab.track.confidence import confidences, differences, tolerances
+from stages.lab.track.film_masks import UNKNOWN
 from stages.lab.track.films import Film
 from stages.lab.track.poses import Poses
 from stages.lab.track.search import search
@@ -44,7 +45,8 @@ class Tracker:
     """A scene and its films, at several resolutions."""
 
     def __init__(self, scene: Scene, cameras: Cameras, films: list[Film], device: str):
-        self.synthesiser, self.films, self.device = Synthesiser(scene, device), films, device
+        labelled = any(film.labels is not None for film in films)
+        self.synthesiser, self.films, self.device = Synthesiser(scene, device, labelled), films, device
         views = zip(cameras.viewmats, cameras.Ks, cameras.sizes.tolist(), strict=True)
         self.cameras: list[Camera] = [self.synthesiser.camera(V, K, *size) for V, K, size in views]
         self.rest = self.synthesiser.at_rest()
@@ -56,7 +58,7 @@ class Tracker:
     def _gain(self, i: int) -> Float[Tensor, "3"]:
         """Brightness of a film's channels over those of the scene, at the release."""
         film = self.films[i]
-        drawn = self.synthesiser.draw(self.cameras[i], self.rest).image
+        drawn = self.synthesiser.draw(self.cameras[i], self.rest).image[..., :3]
         first = film.frames[min(max(int(film.start), 0), len(film.frames) - 1)].to(self.device).float() / 255
         return ((first * drawn).sum((0, 1)) / drawn.square().sum((0, 1)).clamp_min(1e-6)).clamp(0.5, 2.0)
 
@@ -71,10 +73,19 @@ class Tracker:
             k = round(time)
             if 0 <= k < len(film.frames):
                 late = k - time
-                image = reduced(film.frames[k].to(self.device).float() / 255, reduction) / self.gains[i]
+                image = reduced(self._picture(i, k), reduction)
                 moved = late * (after if late > 0 else before)
                 seen.append(Observation(i, late, self.cameras[i], reduction, image, moved))
         return seen
+
+    def _picture(self, i: int, k: int) -> Float[Tensor, "h w c"]:
+        """Frame k of film i at the brightness of the scene, with its painted labels where any film has some."""
+        film = self.films[i]
+        image = film.frames[k].to(self.device).float() / 255 / self.gains[i]
+        if self.synthesiser.paint is None:
+            return image
+        label = image.new_full(image.shape[:2], UNKNOWN) if film.labels is None else film.labels[k].to(self.device)
+        return torch.cat([image, self.synthesiser.painted(label - 1)], -1)
 
     def fit(
         self, frame: int, steps: dict[int, int], poses: Poses, motion: tuple[Tensor, Tensor],

@@ -13,6 +13,7 @@ from stages.core.geometry.cameras import depths, project
 from stages.core.geometry.rotations import matrix
 from stages.lab.track.alignment import Observation, robust_cost
 from stages.lab.track.poses import Poses
+from stages.lab.track.synthesis import MASK_CONTRAST
 
 if TYPE_CHECKING:
     from stages.lab.track.follow import Tracker
@@ -55,7 +56,7 @@ def search(tracker: Tracker, frame: int, i: int, poses: Poses, velocity: Tensor,
 
 def _cost(tracker: Tracker, seen: list[Observation], poses: Poses) -> float:
     scale = max(tracker.tolerance)
-    return sum(robust_cost(o.image - o.draw(tracker.synthesiser, poses).image, scale) for o in seen)
+    return sum(robust_cost(o.difference(o.draw(tracker.synthesiser, poses)), scale) for o in seen)
 
 
 def _places(
@@ -66,13 +67,15 @@ def _places(
     reach = min(MAX_REACH, 4 + 2 * missing)
     steps = torch.arange(-reach, reach + 1, device=tracker.device) * size / 2
     places = middle + torch.cartesian_prod(steps, steps, steps)
-    palette = tracker.synthesiser.palettes[i]
+    palette, paint = tracker.synthesiser.palettes[i], tracker.synthesiser.paint
     votes, views = torch.zeros(len(places)).to(places), torch.zeros(len(places)).to(places)
     for o in seen:
         drawn = o.draw(tracker.synthesiser, gone)
-        off = (o.image - drawn.image).square().mean(-1).sqrt()
-        like = (o.image[:, :, None] - palette).square().mean(-1).sqrt().amin(-1)
-        vote, counted = _looked_up((off > limit) & (like < LIKE), drawn.label < 0, o, places)
+        off = o.difference(drawn).square().mean(-1).sqrt()
+        like = (o.image[..., None, :3] - palette).square().mean(-1).sqrt().amin(-1) < LIKE
+        if paint is not None:  # nan where label images say nothing, which is not far
+            like &= ~((o.image[..., 3:] - paint[i]).norm(dim=-1) > MASK_CONTRAST / 2)
+        vote, counted = _looked_up((off > limit) & like, drawn.label < 0, o, places)
         votes, views = votes + vote, views + counted
     support = torch.where(views >= min(MIN_VIEWS, len(seen)), votes / views.clamp_min(1), 0.0)
     return places[support >= max(float(support.max()) - SPREAD, MIN_SUPPORT)]

@@ -21,6 +21,7 @@ from stages.lab.track.poses import Poses
 MIN_ALPHA = 0.5  # opacity above which a pixel shows an object
 FAR = 1e6  # depth where there is nothing [scene units]
 PALETTE = 12  # colours of an object
+MASK_CONTRAST = 0.5  # between the label image of an object and its surroundings, where that of colours is 0 to 1
 BEHIND = 0.02  # how far an object may be behind the background's depth and still be drawn [of its depth]
 
 
@@ -43,16 +44,20 @@ class Camera:
 class Synthesis:
     """A picture, and for each pixel the object whose motion changes it and the point of it that is seen there."""
 
-    image: Float[Tensor, "h w 3"]
+    image: Float[Tensor, "h w c"]  # RGB, and with label images their painted labels
     label: Int[Tensor, "h w"]  # row of the object, -1: background
     moving: Int[Tensor, "h w"]  # the same, with the frontmost of the neighbours on outlines
     point: Float[Tensor, "h w 3"]  # of the object in `moving`, in the world
 
 
 class Synthesiser:
-    """Draws the objects of a scene at any poses in front of its background."""
+    """Draws the objects of a scene at any poses in front of its background.
 
-    def __init__(self, scene: Scene, device: str):
+    With `labelled`, pictures have three more channels: those of label images, in which each object has a value of its
+    own, so that outlines and what hides what are compared as colours are.
+    """
+
+    def __init__(self, scene: Scene, device: str, labelled: bool = False):
         g = scene.gaussians.to(device)
         self.background = g[g.object_id == 0]
         self.rest_gaussians = g[g.object_id > 0]
@@ -66,6 +71,12 @@ class Synthesiser:
         self.palettes = [_palette(colours[self.row == i]) for i in range(len(ids))]
         self.colour = torch.tensor(scene.background or (0.0, 0.0, 0.0), device=device)
         self.device = device
+        self.paint = MASK_CONTRAST * spread_directions(len(ids)).to(device) if labelled else None
+
+    def painted(self, label: Int[Tensor, "h w"]) -> Float[Tensor, "h w 3"]:
+        """The channels of a label image: rows of objects, -1 for the background, -2 for what is not known (nan)."""
+        values = torch.cat([self.paint, self.paint.new_full((1, 3), torch.nan), self.paint.new_zeros(1, 3)])
+        return values[label.long()]
 
     def at_rest(self) -> Poses:
         """The poses of the scene file."""
@@ -93,6 +104,7 @@ class Synthesiser:
         image = torch.where(front[..., None], rgb + (1 - alpha)[..., None] * camera.background, camera.background)
         seen = front & (alpha > MIN_ALPHA) & (index >= 0)
         label = torch.where(seen, self.row[index.clamp_min(0)], -1)
+        image = image if self.paint is None else torch.cat([image, self.painted(label)], -1)
         depth = torch.where(seen, depth, camera.background_depth)
         middle = slice(reduction // 2, None, reduction)
         label, depth = label[middle, middle], depth[middle, middle]
@@ -104,7 +116,7 @@ class Synthesiser:
         return Synthesis(reduced(image, reduction), label, label.flatten()[source], point)
 
 
-def reduced(image: Float[Tensor, "h w 3"], reduction: int) -> Float[Tensor, "h2 w2 3"]:
+def reduced(image: Float[Tensor, "h w c"], reduction: int) -> Float[Tensor, "h2 w2 c"]:
     """The means of blocks of pixels."""
     return F.avg_pool2d(image.permute(2, 0, 1), reduction).permute(1, 2, 0) if reduction > 1 else image
 
@@ -112,6 +124,14 @@ def reduced(image: Float[Tensor, "h w 3"], reduction: int) -> Float[Tensor, "h2 
 def _palette(colours: Float[Tensor, "n 3"]) -> Float[Tensor, "k 3"]:
     """A few colours of an object, far from each other."""
     return colours[farthest_points(colours, PALETTE).to(colours.device)].clamp(0, 1)
+
+
+def spread_directions(count: int) -> Float[Tensor, "n 3"]:
+    """Unit vectors far from each other: a Fibonacci lattice on the sphere."""
+    i = torch.arange(count)
+    z, turn = 1 - (2 * i + 1) / count, i * torch.pi * (3 - 5**0.5)
+    r = (1 - z * z).sqrt()
+    return torch.stack([r * turn.cos(), r * turn.sin(), z], 1)
 
 
 def _middle(points: Float[Tensor, "n 3"]) -> Float[Tensor, "3"]:

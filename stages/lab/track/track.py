@@ -27,12 +27,12 @@ GRAVITY = 9.81  # [m/s^2]
 def run(scene: Path, folder: Path, out: Path, options: TrackOptions) -> Iterator[str]:
     """Follow the objects of a scene through films, write their motion, and yield a line for each object.
 
-    Raises InputError for a scene without objects or films, and films of other cameras.
+    Raises InputError for a scene without objects or films, films of other cameras, and label images of other films.
     """
     world, device = read_scene(scene), pick_device(options.device)
     _check(world, scene)
     fps, frames = world.sequence.fps, options.frames or world.sequence.frames
-    cameras, films = read_films(world, folder, frames, options.resolution)
+    cameras, films = read_films(world, folder, frames, options.resolution, options.masks)
     tracker = Tracker(world, cameras, films, device)
     fall = torch.tensor([0.0, 0.0, -GRAVITY / world.metres_per_unit], device=device)
     track = follow(tracker, frames, fall / fps**2)

@@ -9,14 +9,18 @@ import torch
 from ngff_cli.app import app as ngff
 from ngff_cli.lab import app
 from stages.core.errors import InputError
+from stages.core.geometry.cameras import intrinsics
 from stages.core.geometry.rotations import matrix, rotation_angle
+from stages.core.scene.cameras import Cameras
+from stages.core.scene.images import write_labels
 from stages.core.scene.scene import Scene
 from stages.core.scene.scene_ply import write_scene
 from stages.core.scene.sequence import FilmedSequence
 from stages.core.scene.trajectory import read_trajectory
 from stages.lab.bench.track import measure, pose_errors
 from stages.lab.track.confidence import confidences
-from stages.lab.track.films import read_films
+from stages.lab.track.film_masks import UNKNOWN, find_film_masks
+from stages.lab.track.films import Film, read_films
 from stages.lab.track.follow import TrackedMotion, Tracker, interpolated, release_time
 from stages.lab.track.options import TrackOptions
 from stages.lab.track.poses import Poses, rotation_of, rotation_vector
@@ -25,6 +29,7 @@ from stages.lab.track.stand_in import (
     KEYPOINTS,
     StandInOptions,
     make_stand_in,
+    true_labels,
     write_films,
     write_truth,
 )
@@ -118,6 +123,50 @@ def test_alignment_returns_to_the_true_pose(small, device):
     found = tracker.fit(0, {8: 6, 4: 6, 2: 4}, tracker.rest.moved(off), still)
     assert (found.centre - tracker.rest.centre).norm(dim=1).max() < 0.002
     assert rotation_angle(found.rotation).max() < 2
+
+
+def test_label_images_alone_give_the_place(small, device):
+    """Grey objects on grey are where their label images are, in three of four films; the last has none."""
+    _, stand_in = small
+    g = stand_in.scene.gaussians
+    scene = replace(stand_in.scene, gaussians=replace(g, sh=torch.zeros_like(g.sh)))
+    cameras, films = scene.cameras, []
+    for i, name in enumerate(cameras.names):
+        labels = torch.stack([next(true_labels(stand_in, i))]).to(torch.int16)
+        films.append(Film(name, torch.full((*labels.shape, 3), 128, dtype=torch.uint8), 0.0, labels if i < 3 else None))
+    tracker = Tracker(scene, cameras, films, device)
+    off = torch.tensor([0.0, 0.0, 0.0, 0.01, -0.01, 0.01], device=device).expand_as(tracker.still)
+    found = tracker.fit(0, {8: 6, 4: 6, 2: 4}, tracker.rest.moved(off), (tracker.still, tracker.still))
+    pixel = 1.1 / (1.25 * SMALL.width)  # at the distance of the objects
+    assert (found.centre - tracker.rest.centre).norm(dim=1).max() < pixel / 2
+    (there, _), (away, _) = (tracker.judge(0, p, (tracker.still,) * 2) for p in (found, tracker.rest.moved(off)))
+    assert there.min() > 0.95 and (away < there - 0.02).all()
+
+
+def test_numbers_of_label_images_are_those_of_objects(tmp_path):
+    world = two_balls_scene()
+    first, second = world.objects
+    (tmp_path / "a").mkdir()
+    (tmp_path / "names.json").write_text(json.dumps({"7": second.name}))
+    write_labels(tmp_path / "a/0.png", torch.tensor([[0, first.id, 7, 255, 99]]))
+    size = torch.tensor([[5, 1]])
+    cameras = Cameras(torch.eye(4)[None], intrinsics(5, 1, 5.0)[None], size, ("a.mp4",))
+    masks = find_film_masks(tmp_path, world, ["a.mp4", "b.mp4"])
+    assert len(masks.of_film("a.mp4")) == 1 and not masks.of_film("b.mp4")
+    assert masks.read(tmp_path / "a/0.png", cameras, 0, (5, 1)).tolist() == [[0, 1, 2, UNKNOWN, 0]]
+
+
+def test_label_images_of_other_films_are_refused(small, tmp_path):
+    folder, stand_in = small
+    arguments = folder / "scene.ply", folder / "films", tmp_path / "out.h5"
+    with pytest.raises(InputError, match="absent: is not a folder; --masks"):
+        list(run(*arguments, TrackOptions(masks=tmp_path / "absent")))
+    with pytest.raises(InputError, match="no folder of label images named as a film, such as camera00"):
+        list(run(*arguments, TrackOptions(masks=tmp_path)))
+    (tmp_path / "camera00").mkdir()
+    write_labels(tmp_path / "camera00/0.png", torch.zeros(120, 160, dtype=torch.int64))
+    with pytest.raises(InputError, match="holds 1 label images, but .*camera00.mp4 has more"):
+        list(run(*arguments, TrackOptions(masks=tmp_path)))
 
 
 @pytest.mark.slow

@@ -1,0 +1,69 @@
+"""Label images of the frames of films: which object each pixel shows, from any tool."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from jaxtyping import Int16
+from torch import Tensor
+
+from stages.core.errors import InputError
+from stages.core.scene.cameras import Cameras
+from stages.core.scene.images import NOT_JUDGED, list_photos, read_labels
+from stages.core.scene.lens import Undistortion
+from stages.core.scene.scene import Scene
+from stages.segment.masks import read_names
+
+UNKNOWN = -1  # of a pixel that the label images say nothing about
+
+
+@dataclass(frozen=True)
+class FilmMasks:
+    """A folder with a folder of label images for each film, one for each frame, in the order of their names."""
+
+    folder: Path
+    rows: Mapping[int, int]  # row of the object that a number in the images stands for
+    ignored: frozenset[int]  # numbers of pixels that say nothing
+
+    def of_film(self, name: str) -> list[Path]:
+        """The label images of a film, in a folder of its name with or without suffix; empty without such a folder."""
+        found = [self.folder / stem for stem in (name, Path(name).stem) if (self.folder / stem).is_dir()]
+        return list_photos(found[0]) if found else []
+
+    def read(self, file: Path, cameras: Cameras, view: int, size: tuple[int, int]) -> Int16[Tensor, "h w"]:
+        """1 + row of the object in each pixel of a reduced view, 0 for others, UNKNOWN where ignored.
+
+        Raises InputError for an image of another aspect ratio than the film, or without any object's number.
+        """
+        labels = read_labels(file)
+        try:
+            labels = Undistortion.of(cameras, view, (labels.shape[1], labels.shape[0])).labels(labels)
+        except InputError as error:
+            raise InputError(f"{file}: the label image of {error}") from error
+        width, height = size
+        y = ((torch.arange(height) + 0.5) * labels.shape[0] / height).long()
+        x = ((torch.arange(width) + 0.5) * labels.shape[1] / width).long()
+        numbers, index = labels[y[:, None], x].unique(return_inverse=True)
+        values = [UNKNOWN if n in self.ignored else 1 + self.rows.get(n, -1) for n in numbers.tolist()]
+        return torch.tensor(values, dtype=torch.int16)[index]
+
+
+def find_film_masks(folder: Path, scene: Scene, films: list[str]) -> FilmMasks:
+    """The label images of films. Numbers are ids of the scene's objects, or of names.json those of the same name.
+
+    Pixels of NOT_JUDGED say nothing, unless it is the number of an object. Raises InputError for a folder without label
+    images of any of the films.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise InputError(f"{folder}: is not a folder; --masks takes one with a folder of label images for each film")
+    by_name, names = {o.name: row for row, o in enumerate(scene.objects)}, read_names(folder)
+    rows = {o.id: row for row, o in enumerate(scene.objects)}
+    rows |= {number: by_name[name] for number, name in names.items() if name in by_name}
+    masks = FilmMasks(folder, rows, frozenset({NOT_JUDGED} - rows.keys()))
+    if not any(masks.of_film(name) for name in films):
+        raise InputError(f"{folder}: holds no folder of label images named as a film, such as {Path(films[0]).stem}")
+    return masks

@@ -7,7 +7,7 @@ from stages.core.kernels.mpm.grid import BLOCK
 from stages.core.physics.mpm.domain import Box
 from stages.core.physics.mpm.solver import ParticleMaterial, at_rest, join_particles
 from stages.core.scene.scene import SceneObject
-from stages.simulate.moving_grid import MARGIN, MovingGrid
+from stages.simulate.moving_grid import MARGIN, GridBodies, MovingGrid
 
 DX, DT, STEPS = 0.05, 0.02, 20
 OBJECTS = (SceneObject(1, "fast"), SceneObject(2, "slow"))
@@ -29,8 +29,9 @@ def test_a_grid_that_follows_changes_nothing_and_keeps_its_margin(device, touch,
     particles = join_particles([cube((0.0, 0.0, 0.5), (4.0 * sign, 3.0 * sign, 2.0)), cube((0.3, 0, 0.5), (0, 0, 2.0))])
     body = torch.arange(2).repeat_interleave(27)
     small, large = Box((-0.5, -0.5, 0.0), (0.9, 0.9, 1.2)), Box((-0.5 - 10 * BLOCK * DX,) * 2 + (0.0,), (3.0, 3.0, 3.0))
-    moving = MovingGrid(particles, small, DX, device, body, OBJECTS, fixed=False, touch=touch)
-    still = MovingGrid(particles, large, DX, device, body, OBJECTS, fixed=True, touch=touch)
+    bodies = GridBodies(body, OBJECTS, separate=touch)
+    moving = MovingGrid(particles, small, DX, device, bodies, fixed=False)
+    still = MovingGrid(particles, large, DX, device, bodies, fixed=True)
     boxes = {moving.box.low + moving.box.high}
     for _ in range(STEPS):
         for grid in (moving, still):

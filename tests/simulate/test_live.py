@@ -320,6 +320,7 @@ def test_the_mouse_drags_an_object_and_the_file_repeats_it(session, open_page):
     process, url, folder = session
     page = open_page(url)
     until(page, "player.live.state !== null && player.live.control")
+    until(page, f"({FIND_RED})() !== undefined")  # once the splats are sorted for the first time
     drag_up(page, page.evaluate(FIND_RED), 24, 5)
     until(page, f"player.live.state.arrows.length === 1 && ({RED_HEIGHT})() > 0.05")
     page.mouse.up()

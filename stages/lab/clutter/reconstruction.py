@@ -13,7 +13,8 @@ from torch import Tensor
 from stages.core.geometry.cameras import centres, depths, project
 from stages.core.geometry.neighbours import knn
 from stages.core.geometry.similarity import umeyama
-from stages.core.raster.rasterise import rasterise
+from stages.core.perception.voting import collect_votes
+from stages.core.raster.rasterise import rasterise, visibility
 from stages.core.scene.cameras import LensDistortion
 from stages.core.scene.scene import Scene
 from stages.reconstruct.classic import reconstruct_from_model
@@ -62,13 +63,28 @@ def _sparse_model(scene: Scene, rng: np.random.Generator, device: str) -> Sparse
 
 
 def true_labels(made: Scene, truth: Scene) -> Int[Tensor, "n"]:
-    """Label of each Gaussian of `made`, by the nearest Gaussian of `truth`; the cameras are matched by name."""
+    """Label of each Gaussian of `made`: what the true label images show in its pixels, by vote over the views.
+
+    Where the reconstruction spreads an object over the table beside it, the nearest true Gaussian would say "object",
+    although photos show the table there. Gaussians in no view take the label of the nearest true Gaussian; those far
+    from every true surface are floaters. The cameras are matched by name.
+    """
     rows = [truth.cameras.names.index(name) for name in made.cameras.names]
     to_made = umeyama(_frames(truth.cameras.viewmats[rows]), _frames(made.cameras.viewmats))
     g, means = truth.gaussians, made.gaussians.means
     distance, nearest = knn(to_made(g.means), means.nan_to_num(1e6), 1)
     radius = float((centres(made.cameras.viewmats) - means.nan_to_num(0).median(0).values).norm(dim=1).median())
-    return torch.where(distance[:, 0] < MAX_DISTANCE * radius, g.object_id[nearest[:, 0]], FLOATER)
+    votes = collect_votes(made, ((i, label_image(truth, row)) for i, row in enumerate(rows)))
+    best, label = votes.max(1)
+    label = torch.where(best > 0, label, g.object_id[nearest[:, 0]])
+    return torch.where(distance[:, 0] < MAX_DISTANCE * radius, label, FLOATER)
+
+
+def label_image(scene: Scene, view: int) -> Int[Tensor, "h w"]:
+    """The object of the Gaussian with the largest weight in each pixel of a view; 0 where there is none."""
+    width, height = scene.cameras.sizes[view].tolist()
+    front, _ = visibility(scene.gaussians, scene.cameras.viewmats[view], scene.cameras.Ks[view], width, height)
+    return torch.where(front >= 0, scene.gaussians.object_id[front.clamp_min(0).long()], 0)
 
 
 def _frames(viewmats: Tensor) -> Tensor:

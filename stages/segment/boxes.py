@@ -10,17 +10,18 @@ import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
-from scipy.ndimage import binary_fill_holes, distance_transform_edt, gaussian_filter
+from scipy.ndimage import distance_transform_edt, gaussian_filter
 from torch import Tensor
 from tqdm import tqdm
 
 from stages.core.errors import InputError
 from stages.core.geometry.cameras import centres
+from stages.core.perception.grabcut import grabcut
+from stages.core.perception.voting import ViewFootprint, add_votes, apply_votes, damp_votes
 from stages.core.scene.lens import photo_of
 from stages.core.scene.scene import Scene
 from stages.segment.options import NETWORKS, SegmentOptions
 from stages.segment.prompts import read_prompts
-from stages.segment.voting import ViewFootprint, add_votes, apply_votes, damp_votes
 
 MAX_VIEWS = 32  # that are segmented; more are redundant
 COLOUR_BINS = 32  # per channel of a colour histogram
@@ -29,7 +30,6 @@ CONTEXT_WIDTH = 0.5  # width of the frame around a box that is compared with it 
 MAX_SHIFT_KNOWN = 0.1  # distance of a pixel from an object's predicted mask [square root of its area]
 MAX_SHIFT_UNSEEN = 0.5  # the same where no earlier view showed the surface
 MIN_LABELLED_PIXELS = 20  # of an object that is segmented in another view
-MIN_PIECE_FRACTION = 0.1  # area of a connected piece of a mask, relative to the largest
 
 
 def segment(scene: Scene, options: SegmentOptions) -> Scene:
@@ -127,27 +127,3 @@ def segment_next_view(
         labels = np.where(found & ((labels == 0) | (own_depth > depth)), i, labels)
         depth = np.where(labels == i, own_depth, depth)
     return labels
-
-
-def grabcut(
-    image: UInt8[np.ndarray, "h w 3"], unlikely: Bool[np.ndarray, "h w"], likely: Bool[np.ndarray, "h w"],
-    sure: Bool[np.ndarray, "h w"], seed: int,
-) -> Bool[np.ndarray, "h w"]:  # fmt: skip
-    """The object's pixels by GrabCut; pixels neither likely, unlikely nor sure are background."""
-    trimap = np.full(likely.shape, cv2.GC_BGD, dtype=np.uint8)
-    trimap[unlikely], trimap[likely], trimap[sure] = cv2.GC_PR_BGD, cv2.GC_PR_FGD, cv2.GC_FGD
-    if ((trimap == cv2.GC_BGD) | (trimap == cv2.GC_PR_BGD)).any() and (likely | sure).any():
-        cv2.setRNGSeed(seed)
-        # one iteration: with more, background visible between limbs is added to the colour model of the object
-        cv2.grabCut(image, trimap, None, *np.zeros((2, 1, 65)), 1, cv2.GC_INIT_WITH_MASK)
-    return clean_mask((trimap == cv2.GC_FGD) | (trimap == cv2.GC_PR_FGD))
-
-
-def clean_mask(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """The mask without small separate pieces and small holes."""
-    _, piece, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
-    areas = np.where(np.arange(len(stats)) > 0, stats[:, cv2.CC_STAT_AREA], 0)
-    kept = (areas >= MIN_PIECE_FRACTION * areas.max())[piece] & mask
-    holes = binary_fill_holes(kept) & ~kept
-    _, hole, stats, _ = cv2.connectedComponentsWithStats(holes.astype(np.uint8))
-    return kept | (holes & (stats[:, cv2.CC_STAT_AREA] < MIN_PIECE_FRACTION**2 * kept.sum())[hole])

@@ -9,10 +9,10 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from stages.core.perception.support import Support, view_extent
+from stages.core.perception.voting import ViewFootprint
 from stages.core.scene.scene import Scene
 from stages.segment.options import SegmentOptions
 from stages.segment.propagation import MaskTracker, resize_logits
-from stages.segment.voting import ViewFootprint
 
 log = logging.getLogger(__name__)
 SEARCHED_VIEWS = 4  # images, evenly spread, that are searched: an object occluded in one is visible in another

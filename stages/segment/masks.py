@@ -10,13 +10,13 @@ from torch import Tensor
 from tqdm import tqdm
 
 from stages.core.errors import InputError
+from stages.core.perception.voting import apply_votes, collect_votes
 from stages.core.scene.images import NOT_JUDGED, read_labels
 from stages.core.scene.lens import Undistortion
 from stages.core.scene.scene import Scene
 from stages.core.scene.schema import numbered, read_json, reason, texts
 from stages.segment.options import SegmentOptions
 from stages.segment.view_images import match_files
-from stages.segment.voting import apply_votes, collect_votes
 
 MAX_LABELS = 1000  # different numbers in all label images
 

@@ -12,13 +12,13 @@ from stages.core.errors import InputError
 from stages.core.models.promptable import PointPrompts, PromptableSegmenter
 from stages.core.perception.grouping import name_objects
 from stages.core.perception.support import find_support
+from stages.core.perception.voting import apply_votes, collect_votes
 from stages.core.scene.scene import Scene
 from stages.segment.discovery import discover_objects
 from stages.segment.options import SegmentOptions
 from stages.segment.prompts import ObjectPrompts, read_prompts
 from stages.segment.propagation import MaskTracker
 from stages.segment.view_images import view_images
-from stages.segment.voting import apply_votes, collect_votes
 
 log = logging.getLogger(__name__)
 

@@ -11,9 +11,9 @@ from torch import Tensor
 from tqdm import tqdm
 
 from stages.core.models.promptable import PointPrompts, PromptableSegmenter
+from stages.core.perception.voting import voting_intrinsics
 from stages.core.scene.scene import Scene
 from stages.segment.view_images import ViewImages
-from stages.segment.voting import voting_intrinsics
 
 
 @dataclass(frozen=True)

@@ -81,4 +81,3 @@ def match_files(folder: Path, names: tuple[str, ...], what: str, option: str) ->
     if len(found) < len(names):
         log.info("%s: %ss for %d of %d photos", folder, what, len(found), len(names))
     return found
-

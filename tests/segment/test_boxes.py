@@ -9,8 +9,9 @@ import torch
 
 from stages.core.errors import InputError
 from stages.core.geometry.cameras import project
+from stages.core.perception.grabcut import clean_mask
 from stages.segment import boxes
-from stages.segment.boxes import MAX_VIEWS, clean_mask, nearest_first, segment, segment_prompted_view
+from stages.segment.boxes import MAX_VIEWS, nearest_first, segment, segment_prompted_view
 from stages.segment.options import SegmentOptions
 from stages.segment.prompts import read_prompts
 from tests.segment.tabletop import WOOD, block, egg, orbit_cameras, scene_of, table_gaussians, three_apart

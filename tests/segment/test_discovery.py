@@ -6,11 +6,11 @@ import pytest
 import torch
 
 from stages.core.perception.support import find_support
+from stages.core.perception.voting import ViewFootprint, apply_votes, collect_votes
 from stages.core.scene.scene import Scene
 from stages.segment.discovery import discover_objects, is_on_support, match_labels, remove_nested_masks
 from stages.segment.options import SegmentOptions
 from stages.segment.view_images import ViewImages, view_images
-from stages.segment.voting import ViewFootprint, apply_votes, collect_votes
 from tests.segment.tabletop import best_overlap, three_apart
 
 SIDE = 64  # of the proposed masks [px]

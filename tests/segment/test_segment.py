@@ -10,6 +10,7 @@ import torch
 from stages.core.errors import InputError
 from stages.core.geometry.cameras import project
 from stages.core.perception.grouping import GroupingOptions
+from stages.core.perception.voting import ViewFootprint, damp_votes, majority_labels, pool_votes, remove_outliers
 from stages.core.raster.rasterise import visibility
 from stages.core.scene.images import write_labels
 from stages.core.scene.scene import Scene, SceneObject
@@ -18,7 +19,6 @@ from stages.segment.masks import read_names
 from stages.segment.options import SegmentOptions
 from stages.segment.stage import log_objects, run
 from stages.segment.view_images import MAX_RENDER_SIDE, render_view
-from stages.segment.voting import ViewFootprint, damp_votes, majority_labels, pool_votes, remove_outliers
 from tests.conftest import random_gaussians
 from tests.segment.tabletop import best_overlap
 

@@ -23,6 +23,7 @@ from tqdm import tqdm
 
 from stages.core.backends import choose, load
 from stages.core.errors import InputError
+from stages.core.perception.voting import ViewFootprint, add_votes, apply_votes, damp_votes
 from stages.core.scene.scene import Scene
 from stages.lab.assets.tabletops import ARRANGEMENTS, tabletop
 from stages.lab.bench import common as bench
@@ -30,7 +31,6 @@ from stages.lab.bench.reconstructed_scene import reconstruct_from_renders, visib
 from stages.segment.boxes import segment as boxes_segment
 from stages.segment.geometric import segment
 from stages.segment.options import BACKENDS, SegmentOptions
-from stages.segment.voting import ViewFootprint, add_votes, apply_votes, damp_votes
 
 ERROR_RATES = (0.0, 0.2, 0.4)  # fraction of wrong objects and pixels in each photo
 MASK_SHIFT = 20  # standard deviation of the shift of masks at an error rate of 1 [px]

@@ -17,6 +17,7 @@ import torch
 
 from stages.core.backends import pick_device
 from stages.core.errors import InputError
+from stages.core.perception.voting import apply_votes, collect_votes
 from stages.core.scene.files import replacing
 from stages.core.scene.images import NOT_JUDGED, list_photos
 from stages.core.scene.scene import Scene
@@ -26,7 +27,6 @@ from stages.evaluate.options import EvaluateOptions
 from stages.evaluate.result import Result
 from stages.lab.bench import common as bench
 from stages.lab.bench.reconstruct import photo_folder
-from stages.segment.voting import apply_votes, collect_votes
 
 METRICS = {"recall": "recall", "PQ": "PQ", "SQ": "SQ", "RQ": "RQ", "IoU": "mean IoU"}  # key: heading
 HEADINGS = ["set", "photos placed", "labelled", "objects", "found", *METRICS.values(), "false share", "PQ by labels",

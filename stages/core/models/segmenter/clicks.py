@@ -16,6 +16,7 @@ from stages.core.models.segmenter.network import Segmenter
 from stages.core.models.segmenter.segment import ScoredCandidates, SegmenterOptions, outlined, score_at
 from stages.core.models.segmenter.surfels import scene_surfels
 from stages.core.models.segmenter.voxels import SCALES
+from stages.core.perception.view_outlines import refine_outlines
 from stages.core.scene.scene import Scene
 
 log = logging.getLogger(__name__)
@@ -68,7 +69,7 @@ def clicked_ids(
     for number, (_, members) in sorted(found.items(), key=lambda item: -int(item[1][1].sum())):  # small ones last
         labels[members] = number
     ids[index] = outlined(surfels, labels, scored)
-    return ids
+    return refine_outlines(scene, ids)
 
 
 def _path(scored: ScoredCandidates, distance: Float[Tensor, "n"]) -> set[int]:

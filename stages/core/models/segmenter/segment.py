@@ -22,6 +22,7 @@ from stages.core.models.segmenter.surfels import scene_surfels
 from stages.core.models.segmenter.voxels import SCALES, ScenePoints, VoxelGrid, voxelise
 from stages.core.perception.grouping import name_objects
 from stages.core.perception.support import Support, find_support, view_extent
+from stages.core.perception.view_outlines import refine_outlines
 from stages.core.scene.files import must_exist
 from stages.core.scene.scene import Scene
 from stages.core.scene.schema import whole
@@ -113,6 +114,7 @@ def object_ids(
     labels = best_objects([s.best(options) for s in scored])
     labels = torch.where(labels <= options.max_objects, labels, 0)
     ids[index] = outlined(surfels, labels, scored)
+    ids = refine_outlines(scene, ids)
     means = scene.gaussians.means
     for number in range(1, int(ids.max()) + 1):
         own = means[ids == number]

@@ -1,0 +1,78 @@
+"""Outlines of objects cut by colour in the views."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from stages.core.perception.view_outlines import MIN_PIXELS, cut_outlines, refine_outlines
+from stages.core.raster.rasterise import visibility
+from stages.lab.assets.tabletops import tabletop
+
+
+def disc(shape, middle, radius):
+    rows, columns = np.mgrid[: shape[0], : shape[1]]
+    return np.hypot(rows - middle[0], columns - middle[1]) < radius
+
+
+def test_an_outline_within_the_band_moves_to_the_edge_of_colour():
+    rng = np.random.default_rng(0)
+    true = disc((120, 160), (60, 80), 25)
+    colours = np.where(true[..., None], [200, 40, 30], [180, 180, 175])
+    image = (colours + rng.normal(0, 4, (120, 160, 3))).astype(np.uint8)
+    spread = np.where(disc((120, 160), (60, 80), 31), 3, 0)
+    found = cut_outlines(image, spread, {3: 8.0}, 0)
+    assert (found == 3)[true].mean() > 0.99
+    assert (found == 3)[~true].sum() < 0.02 * true.sum()
+
+
+def test_nothing_moves_farther_than_the_band_or_into_another_object():
+    true = disc((120, 160), (60, 80), 40)
+    image = np.where(true[..., None], [200, 40, 30], [180, 180, 175]).astype(np.uint8)
+    labels = np.where(disc((120, 160), (60, 80), 20), 1, 0)
+    labels[55:65, 102:118] = 2
+    found = cut_outlines(image, labels, {1: 3.0, 2: 3.0}, 0)
+    assert not (found == 1)[~disc((120, 160), (60, 80), 24.5)].any()
+    assert (found == 2)[labels == 2].all()
+
+
+def test_where_colours_say_nothing_the_outline_stays_within_the_band():
+    image = np.full((80, 80, 3), 128, np.uint8)
+    found = cut_outlines(image, np.where(disc((80, 80), (40, 40), 15), 1, 0), {1: 4.0}, 0)
+    assert (found == 1)[disc((80, 80), (40, 40), 10)].all()
+    assert not (found == 1)[~disc((80, 80), (40, 40), 20)].any()
+
+
+def test_an_object_of_few_pixels_keeps_them():
+    labels = np.zeros((40, 40), np.int64)
+    labels[10:16, 10:16] = 1  # less than MIN_PIXELS
+    assert (labels > 0).sum() < MIN_PIXELS
+    assert (cut_outlines(np.zeros((40, 40, 3), np.uint8), labels, {1: 3.0}, 0) == labels).all()
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return tabletop("apart", 0, photos=6)
+
+
+def test_a_ring_of_table_around_each_object_is_given_back(scene):
+    g, ids = scene.gaussians, scene.gaussians.object_id.clone()
+    table = torch.nonzero(ids == 0)[:, 0]
+    for number in range(1, 6):
+        own = g.means[g.object_id == number]
+        near = torch.cdist(g.means[table], own[:: max(1, len(own) // 2000)]).amin(1) < 0.035
+        ids[table[near]] = number
+    cameras = scene.cameras
+    seen = sum(visibility(g, V, K, 640, 480)[1] for V, K in zip(cameras.viewmats, cameras.Ks, strict=True)) > 5
+    found, wrong = refine_outlines(scene, ids), (ids > 0) & (g.object_id == 0) & seen
+    assert wrong.sum() > 100
+    assert (found == 0)[wrong].float().mean() > 0.6
+    assert (found == g.object_id)[g.object_id > 0].float().mean() > 0.97
+
+
+def test_without_cameras_or_objects_nothing_changes(scene):
+    ids = scene.gaussians.object_id
+    assert refine_outlines(replace(scene, cameras=None), ids) is ids
+    nothing = torch.zeros_like(ids)
+    assert refine_outlines(scene, nothing) is nothing

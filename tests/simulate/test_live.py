@@ -18,7 +18,7 @@ import torch
 
 from stages.core.backends import choose
 from stages.core.physics.forces import Change, ForcePrompts
-from stages.core.physics.keypoints import choose_keypoints
+from stages.core.physics.keypoints import choose_keypoints, pull_range
 from stages.core.scene.scene_ply import write_scene
 from stages.core.scene.trajectory import read_trajectory
 from stages.render.options import RenderOptions
@@ -27,6 +27,7 @@ from stages.simulate.live.messages import BadMessage, parse_message
 from stages.simulate.live.server import MAX_CLIENTS, LiveServer
 from stages.simulate.live.session import Session
 from stages.simulate.options import ENGINES, QUALITIES, MpmQuality, SimulateOptions
+from stages.simulate.setup import parse_box
 from stages.simulate.stage import run
 from tests.browser import drag_up, until
 from tests.conftest import two_balls_scene
@@ -71,14 +72,17 @@ def test_other_messages_are_refused(text):
 # --- recording ---
 
 
-def prompts_of_a_session(engine, monkeypatch, actions, frames=26):
+def prompts_of_a_session(engine, monkeypatch, actions, frames=26, box="-1,-1,0,1,1,2"):
     """Keypoints of a session with messages at some frames, and of its record, in one engine."""
     monkeypatch.setitem(QUALITIES, "draft", MpmQuality(particles=800, substep=1e-3))
     world = two_balls_scene()
-    options = SimulateOptions(engine=engine, quality="draft", steps=frames, keypoints=32, box="-1,-1,0,1,1,2")
+    options = SimulateOptions(engine=engine, quality="draft", steps=frames, keypoints=32, box=box)
     keypoints = choose_keypoints(world, 32)
     rollout = choose({name: e.rollout for name, e in ENGINES.items()}, engine)
-    session = Session(ForcePrompts(), keypoints, [1, 2], options.gravity)
+    walls = parse_box(box)
+    session = Session(
+        ForcePrompts(), keypoints, [1, 2], options.gravity, 1.0, *pull_range(keypoints, walls.low, walls.high)
+    )
     live = []
     for n, state in enumerate(rollout(world, keypoints, session.prompts(), options)):
         live.append(state.positions)
@@ -140,14 +144,39 @@ PAGE_SESSION = """async ([frames, actions]) => {
 @pytest.mark.usefixtures("device")
 def test_a_page_without_server_answers_alike(tmp_path, monkeypatch, open_page):
     """The same messages move the same objects, whether the engine or the page of a playable film takes them."""
-    frames, actions = 26, {n: a_busy_user(n, None) for n in range(26)}
-    live, _, _, _ = prompts_of_a_session("ngff", monkeypatch, a_busy_user, frames)
-    write_scene(tmp_path / "scene.ply", two_balls_scene())
-    options = SimulateOptions(engine="ngff", quality="draft", steps=2, keypoints=32, box="-1,-1,0,1,1,2")
-    run(tmp_path / "scene.ply", tmp_path / "traj.h5", options)
-    page = open_page(render(tmp_path / "traj.h5", tmp_path / "film.html", RenderOptions(playable=True)))
-    end = torch.tensor(page.evaluate(PAGE_SESSION, [frames, actions])).view(-1, 3)
+    live, _, _, _ = prompts_of_a_session("ngff", monkeypatch, a_busy_user)
+    assert (page_session(tmp_path, open_page, a_busy_user) - live[-1]).norm(dim=1).max() < 1e-3
+
+
+def page_session(folder, open_page, actions, frames=26, box="-1,-1,0,1,1,2"):
+    """Keypoints after a session like that of `prompts_of_a_session` in a page without server."""
+    write_scene(folder / "scene.ply", two_balls_scene())
+    options = SimulateOptions(engine="ngff", quality="draft", steps=2, keypoints=32, box=box)
+    run(folder / "scene.ply", folder / "traj.h5", options)
+    page = open_page(render(folder / "traj.h5", folder / "film.html", RenderOptions(playable=True)))
+    messages = {n: actions(n, None) for n in range(frames)}
+    return torch.tensor(page.evaluate(PAGE_SESSION, [frames, messages])).view(-1, 3)
+
+
+def a_user_against_the_walls(n, state):
+    """Pulls the red ball far beyond a wall, throws the green one at another, and lifts it to above the ceiling."""
+    return {
+        0: [{"do": "grab", "object": 1, "point": [-0.3, 0.0, 0.3], "target": [-3.0, 0.1, 0.4]}],
+        2: [{"do": "push", "object": 2, "point": [0.3, 0.0, 0.3], "direction": [0.0, 1.0, 0.0], "strength": 3.0}],
+        25: [{"do": "lift", "object": 2, "height": 5.0}],
+    }.get(n, [])
+
+
+@pytest.mark.usefixtures("device")
+def test_walls_stop_what_is_pulled_and_pushed_in_the_page_as_in_the_engine(tmp_path, monkeypatch, open_page):
+    box = "-0.7,-0.5,0,0.7,0.5,1"
+    live, _, keypoints, _ = prompts_of_a_session("ngff", monkeypatch, a_user_against_the_walls, 51, box)
+    end = page_session(tmp_path, open_page, a_user_against_the_walls, 51, box)
     assert (end - live[-1]).norm(dim=1).max() < 1e-3
+    radius, walls = 0.15, parse_box(box)
+    assert live[:, keypoints.object_id == 1].mean(1)[:, 0].min() < -0.7 + 2 * radius  # it was pulled to the wall
+    inside = (end > torch.tensor(walls.low) - 0.1 * radius) & (end < torch.tensor(walls.high) + 0.1 * radius)
+    assert inside.all()
 
 
 def test_changes_come_back_from_json():

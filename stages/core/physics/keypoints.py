@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from jaxtyping import Float, Int
@@ -14,6 +16,7 @@ from stages.core.scene.trajectory import Binding, Keypoints
 
 KEYPOINTS_PER_GAUSSIAN = 8  # keypoints that each Gaussian follows
 MAX_CANDIDATES = 30_000  # Gaussians of an object among which keypoints are chosen
+PULL_MARGIN = 0.15  # between the walls and the points to which a user can pull objects [extent of all objects]
 
 
 def farthest_points(points: Float[Tensor, "n 3"], count: int, seed: int = 0) -> Int[Tensor, "k"]:
@@ -94,3 +97,13 @@ def nearest_weights(
     weight[:, have:] = 0  # repeated points
     weight = torch.where(weight.sum(1, keepdim=True) > 0, weight, (torch.arange(k) < have).to(weight).expand_as(weight))
     return index[:, :k], weight / weight.sum(1, keepdim=True)
+
+
+def pull_range(keypoints: Keypoints, low: Sequence[float], high: Sequence[float]) -> tuple[tuple, tuple]:
+    """Lower and upper corner of the region to which a user can pull objects, within the walls `low` and `high`.
+
+    All in scene units.
+    """
+    rest = keypoints.rest
+    margin = PULL_MARGIN * float((rest.amax(0) - rest.amin(0)).max())
+    return tuple(a + margin for a in low), tuple(b - margin for b in high)

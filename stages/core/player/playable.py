@@ -14,6 +14,7 @@ from stages.core.models.field.force_field import ForceField
 from stages.core.models.field.rest_shape import RestShape
 from stages.core.models.field.solidity import MIN_STIFFNESS
 from stages.core.models.initial_conditions import FLOOR, InitialConditions
+from stages.core.physics.keypoints import pull_range
 from stages.core.physics.materials import ELASTIC, MATERIALS
 from stages.core.player.container import PackedArray, exact
 from stages.core.scene.field_start import FieldStart
@@ -35,15 +36,23 @@ def playable_parts(t: Trajectory) -> tuple[dict, dict[str, PackedArray]]:
         "box": start.box.flatten(1), "velocity": start.velocity,
     }  # fmt: skip
     weights = {f"weights_{name}": exact(x.reshape(len(x), -1)) for name, x in model.state_dict().items()}
-    unit = t.scene.metres_per_unit
+    unit, options = t.scene.metres_per_unit, t.scene.provenance.get("options", {})
     header = {
         **asdict(start.units), "real_gravity": -t.info.gravity[2] * unit, "floor": FLOOR, "unit": unit,
         "min_stiffness": MIN_STIFFNESS, "awake": start.awake.tolist(), "standing": start.standing.tolist(),
         "names": start.material,
+        "pull_range": _pull_range(t) if options.get("box") else None,
         "materials": {name: {k: getattr(MATERIALS[name], k) for k in ("E", "density", "nu", "friction")}
                       for name in ELASTIC},
     }  # fmt: skip
     return header, {f"field_{name}": exact(x) for name, x in arrays.items()} | weights
+
+
+def _pull_range(t: Trajectory) -> tuple[tuple, tuple]:
+    """`pull_range` within the walls, which the file has in model units."""
+    units = t.field.units
+    low, high = ((corner / units.length + torch.tensor(units.origin)).tolist() for corner in t.field.box[0])
+    return pull_range(t.keypoints, (*low[:2], units.origin[2]), (*high[:2], high[2] - FLOOR / units.length))
 
 
 def _model(t: Trajectory) -> ForceField:

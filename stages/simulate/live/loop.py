@@ -18,7 +18,7 @@ from pathlib import Path
 
 from stages.core.errors import InputError
 from stages.core.physics.forces import ForcePrompts
-from stages.core.physics.keypoints import bind_gaussians
+from stages.core.physics.keypoints import bind_gaussians, pull_range
 from stages.core.physics.materials import ELASTIC
 from stages.core.physics.shadow_casting import find_shadows
 from stages.core.physics.state import FrameState
@@ -194,8 +194,7 @@ def _page(scene: LiveScene, binding, setup: SceneSetup, out: Path) -> str:
 def _session(scene: LiveScene, setup: SceneSetup) -> Session:
     unit, room = scene.world.metres_per_unit, {}
     if scene.options.box:
-        margin = 0.15 * (setup.bodies.x.amax(0) - setup.bodies.x.amin(0)).max().item()
-        room = {"low": tuple(a + margin for a in setup.box.low), "high": tuple(b - margin for b in setup.box.high)}
+        room = dict(zip(("low", "high"), pull_range(scene.keypoints, setup.box.low, setup.box.high), strict=True))
     ids = [o.id for o in scene.world.objects]
     return Session(scene.prompts, scene.keypoints, ids, scene.options.gravity, unit, **room)
 

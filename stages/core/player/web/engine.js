@@ -143,12 +143,10 @@ export class FieldEngine {
     return out;
   }
 
-  // Centres of the objects in scene units: the mean keypoint at rest, moved as the mass moved.
+  // Centres of the objects' masses in scene units.
   centres(positions) {
-    return this.rows.map((rows, o) => [0, 1, 2].map((a) => rows.reduce((sum, k, row) => {
-      const lifted = this.rest[3 * k + a] + (a === 2 ? this.lift[o] : 0);
-      return sum + lifted / rows.length + this.bodies[o].massFraction[row] * (positions[3 * k + a] - lifted);
-    }, 0)));
+    const { bodies, rows } = this, centre = (o, a) => rows[o].reduce((sum, k, row) => sum + bodies[o].massFraction[row] * positions[3 * k + a], 0);
+    return bodies.map((_, o) => [0, 1, 2].map((a) => centre(o, a)));
   }
 
   get masses() { return this.bodies.map((body) => body.mass / this.field.mass); } // [kg]

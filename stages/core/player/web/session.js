@@ -96,10 +96,11 @@ export class Session {
     return forces;
   }
 
-  // Acceleration of a damped spring [m/s^2].
+  // Acceleration of a damped spring [m/s^2] to the target, or to the point within the walls that is nearest to it.
   spring(here, before, target) {
-    const { SPRING, DAMPING, MAX_ACCELERATION } = Session;
-    const pull = here.map((x, a) => this.unit * (SPRING ** 2 * (target[a] - x) - 2 * DAMPING * SPRING * (before ? (x - before[a]) / this.dt : 0)));
+    const { SPRING, DAMPING, MAX_ACCELERATION } = Session, { pull_range: range } = this.engine.field;
+    const goal = range ? target.map((x, a) => Math.min(Math.max(x, range[0][a]), range[1][a])) : target;
+    const pull = here.map((x, a) => this.unit * (SPRING ** 2 * (goal[a] - x) - 2 * DAMPING * SPRING * (before ? (x - before[a]) / this.dt : 0)));
     const most = Math.min(1, MAX_ACCELERATION / Math.max(Math.hypot(...pull), 1e-9));
     return pull.map((x) => most * x);
   }

@@ -234,8 +234,8 @@ def simulate(
         list[str] | None, Option(help='"object=2 force=0,0,8 from=0.1 to=0.3" [N, s]; also torque= and at=x,y,z')
     ] = None,
     forces: Annotated[
-        Path | None, Option(help="JSON of forces {scene: [{obj_id, start, end, force}]}, or a trajectory (.h5) whose "
-                            "forces, changes and options are repeated")
+        Path | None, Option(help="JSON of forces {scene: [{obj_id, start, end, force}]}; or a trajectory (.h5), or "
+                            "JSON saved by a playable page, whose forces, changes and options are repeated")
     ] = SimulateOptions.forces,
     pin: Annotated[list[str] | None, Option(help="object held fixed; repeatable")] = None,
     velocity: Annotated[

@@ -57,7 +57,7 @@ class SimulateOptions:
     material: tuple[str, ...] = ()  # OBJECT=MATERIAL
     materials: Path | None = None  # JSON {object name or id: material name or {E, nu, density, friction}}
     force: tuple[str, ...] = ()  # "object=2 force=0,0,8 from=0.1 to=0.3"; also torque= and at= (point of application)
-    forces: Path | None = None  # JSON in the format of NGFF; its obj_id 0 is object 1
+    forces: Path | None = None  # JSON in the format of NGFF, whose obj_id 0 is object 1, or a recording to be repeated
     pin: tuple[str, ...] = ()  # objects held at their position
     velocity: tuple[str, ...] = ()  # "object=1 0,0,2" at the start [scene units/s]
     lift: tuple[str, ...] = ()  # HEIGHT for all or OBJECT=HEIGHT [scene units]

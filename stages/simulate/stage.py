@@ -4,25 +4,23 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import torch
 from tqdm import tqdm
 
-from stages.core.backends import MAX_SEED, choose, pick_device
+from stages.core.backends import choose, pick_device
 from stages.core.errors import InputError
 from stages.core.physics import forces
 from stages.core.physics.keypoints import bind_gaussians, choose_keypoints
 from stages.core.physics.material_parts import segment_files
 from stages.core.physics.materials import choose_materials
+from stages.core.physics.recording import read_prompts_file, read_recording
 from stages.core.scene.files import provenance, seconds_since
-from stages.core.scene.formats import suffixes
 from stages.core.scene.scene import Scene
 from stages.core.scene.scene_ply import read_scene
-from stages.core.scene.schema import number, reason, text, texts, whole
-from stages.core.scene.trajectory import SimulationInfo, TrajectoryWriter, read_trajectory
+from stages.core.scene.trajectory import SimulationInfo, TrajectoryWriter
 from stages.simulate.engine_choice import for_engine, with_engine
 from stages.simulate.options import AUTO, ENGINES, SimulateOptions
 from stages.simulate.plausibility import PlausibilityMonitor
@@ -45,7 +43,7 @@ def run(scene: Path, out: Path, options: SimulateOptions = SimulateOptions()) ->
     world = with_objects(read_scene(scene), scene, options.device)
     stored = forces.ForcePrompts()
     if options.forces is not None:
-        stored = forces.read_prompts_file(options.forces, Path(scene).stem, world.objects)
+        stored = read_prompts_file(options.forces, Path(scene).stem, world.objects)
     prompts = forces.parse(world.objects, options.force, options.pin, options.velocity, options.lift, stored)
     keypoints = choose_keypoints(world, options.keypoint_count, options.seed)
     options = with_engine(options, world, keypoints)
@@ -81,28 +79,15 @@ def run(scene: Path, out: Path, options: SimulateOptions = SimulateOptions()) ->
     log.info("%s: %d frames, %.2f s", out, options.steps, options.steps * options.dt)
 
 
-RECORDED: dict[str, Callable] = {  # options that --forces traj.h5 repeats -> checks of their values
-    "dt": number, "engine": text, "gravity": number, "quality": text, "material": texts, "floor": number,
-    "friction": number, "box": text, "keypoints": whole, "integrator": text,
-    "seed": lambda value, what: whole(value, what, 0, MAX_SEED),
-}  # fmt: skip
-
-
 def with_recorded(options: SimulateOptions) -> SimulateOptions:
-    """With --forces traj.h5 the options that made it, and its number of frames, where none are given.
+    """With --forces RECORDING the options that made it, and its number of frames, where none are given.
 
     Not those that name other files (--materials, --weights), which must be given again.
     """
-    if options.forces is None or Path(options.forces).suffix.lower() not in suffixes("trajectory"):
+    recording = None if options.forces is None else read_recording(options.forces)
+    if recording is None:
         return options
-    trajectory = read_trajectory(options.forces)
-    made_by, default = trajectory.scene.provenance.get("options", {}), SimulateOptions()
-    try:
-        recorded = {name: check(made_by[name], name) for name, check in RECORDED.items()
-                    if made_by.get(name) is not None}  # fmt: skip
-    except ValueError as error:
-        raise InputError(f"{options.forces}: the options in its provenance are damaged ({reason(error)})") from error
-    recorded["steps"] = len(trajectory)
+    default, recorded = SimulateOptions(), {**recording.options, "steps": recording.frames}
     return replace(options, **{k: v for k, v in recorded.items() if getattr(options, k) == getattr(default, k)})
 
 

@@ -15,7 +15,6 @@ from pathlib import Path
 from stages.core.errors import InputError
 from stages.core.physics.materials import find_object
 from stages.core.scene.files import read_json_file
-from stages.core.scene.formats import FORMATS, suffixes
 from stages.core.scene.prompt_rows import FIELDS, read_prompts
 from stages.core.scene.scene import SceneObject
 from stages.core.scene.schema import LARGEST, MAX_ROWS, numbers, quote, reason, whole
@@ -113,23 +112,6 @@ def parse(
         stored.lift | {id: height for text in lift for id, height in _lift(text, objects)},
         stored.changes,
     )
-
-
-def read_prompts_file(path: Path, scene_name: str, objects: Sequence[SceneObject]) -> ForcePrompts:
-    """The prompts of a forces file: JSON (`read_forces`), or a trajectory whose prompts are repeated."""
-    if Path(path).suffix.lower() in suffixes("trajectory"):
-        return stored_prompts(path, objects)
-    return ForcePrompts(tuple(read_forces(path, scene_name, objects)))
-
-
-def stored_prompts(path: Path, objects: Sequence[SceneObject]) -> ForcePrompts:
-    """The prompts that a trajectory was made with. Raises InputError for objects that are not in this scene."""
-    prompts = ForcePrompts.from_dicts(FORMATS[Path(path).suffix.lower()].read(Path(path)).info.forces)
-    acted_on = {f.object_id for f in prompts.forces} | {c.object_id for c in prompts.changes} - {None}
-    missing = (acted_on | prompts.pinned | set(prompts.velocity) | set(prompts.lift)) - {o.id for o in objects}
-    if missing:
-        raise InputError(f"{path}: acts on object {min(missing)}, which this scene does not have")
-    return prompts
 
 
 def _force(text: str, objects: Sequence[SceneObject]) -> Force:

@@ -16,6 +16,7 @@ from stages.core.models.field.solidity import MIN_STIFFNESS
 from stages.core.models.initial_conditions import FLOOR, InitialConditions
 from stages.core.physics.keypoints import pull_range
 from stages.core.physics.materials import ELASTIC, MATERIALS
+from stages.core.physics.recording import OPTIONS
 from stages.core.player.container import PackedArray, exact
 from stages.core.scene.field_start import FieldStart
 from stages.core.scene.trajectory import Trajectory
@@ -32,7 +33,7 @@ def playable_parts(t: Trajectory) -> tuple[dict, dict[str, PackedArray]]:
         "points": start.points, "mass_fraction": start.mass_fraction[:, None], "material": bodies,
         "normal": _of_keypoints(shape, shape.normal, mine), "principal": shape.principal[0],
         "spacing": _of_keypoints(shape, shape.spacing[..., None], mine), "inverse": shape.inverse[0].flatten(1),
-        "keypoint_inverse": shape.keypoint_inverse[0].flatten(1), "inertia": start.inertia.flatten(1),
+        "keypoint_inverse": shape.keypoint_inverse[0].flatten(1),
         "box": start.box.flatten(1), "velocity": start.velocity,
     }  # fmt: skip
     weights = {f"weights_{name}": exact(x.reshape(len(x), -1)) for name, x in model.state_dict().items()}
@@ -41,6 +42,7 @@ def playable_parts(t: Trajectory) -> tuple[dict, dict[str, PackedArray]]:
         **asdict(start.units), "real_gravity": -t.info.gravity[2] * unit, "floor": FLOOR, "unit": unit,
         "min_stiffness": MIN_STIFFNESS, "awake": start.awake.tolist(), "standing": start.standing.tolist(),
         "names": start.material,
+        "options": {name: options[name] for name in OPTIONS if options.get(name) is not None},
         "pull_range": _pull_range(t) if options.get("box") else None,
         "materials": {name: {k: getattr(MATERIALS[name], k) for k in ("E", "density", "nu", "friction")}
                       for name in ELASTIC},

@@ -17,9 +17,10 @@ from torch import Tensor
 
 from stages.core.backends import load
 from stages.core.errors import InputError
-from stages.core.physics.forces import ForcePrompts, stored_prompts
+from stages.core.physics.forces import ForcePrompts
 from stages.core.physics.keypoints import choose_keypoints, farthest_points
 from stages.core.physics.materials import Material, choose_materials
+from stages.core.physics.recording import read_prompts_file
 from stages.core.scene.scene import Scene
 from stages.core.scene.scene_ply import read_scene
 from stages.core.scene.trajectory import Keypoints, Trajectory, read_trajectory
@@ -116,8 +117,8 @@ class Problem:
 
 def read_problem(scene: Path, track: Path, options: MaterialFitOptions) -> Problem:
     """Pose the problem of a scene file and a trajectory file. Raises InputError where they do not fit each other."""
-    truth = read_trajectory(track)
-    return pose_problem(read_scene(scene), truth, stored_prompts(track, read_scene(scene).objects), options, str(track))
+    truth, world = read_trajectory(track), read_scene(scene)
+    return pose_problem(world, truth, read_prompts_file(track, scene.stem, world.objects), options, str(track))
 
 
 def pose_problem(

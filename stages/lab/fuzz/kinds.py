@@ -19,8 +19,9 @@ from stages.core.models import checkpoints
 from stages.core.models.segmenter.network import Segmenter
 from stages.core.models.segmenter.segment import load_segmenter
 from stages.core.models.segmenter.voxels import ScenePoints
-from stages.core.physics.forces import parse, read_forces, stored_prompts
+from stages.core.physics.forces import parse
 from stages.core.physics.materials import choose_materials
+from stages.core.physics.recording import read_prompts_file
 from stages.core.scene.cameras import Cameras, read_cameras
 from stages.core.scene.field_start import FieldStart, FieldUnits
 from stages.core.scene.files import sha256
@@ -303,6 +304,10 @@ CUSTOM = {"E": 1e5, "density": 500.0, "nu": 0.3, "friction": 0.4, "loss": 0.1, "
           "plastic": [1e4, 0.0, 0.0]}  # fmt: skip
 PARTS = [{"below": 0.1, "material": CUSTOM}, {"box": [0, 0, 0.1, 1, 1, 1.0], "material": "steel", "pinned": True},
          {"material": "rubber"}]  # fmt: skip
+PULLED = {"kind": "force", "object_id": 1, "force": [0, 0, 2.0], "start": 0.1, "end": 0.12, "at": [0, 0, 1.0]}
+RECORDING = {"frames": 4, "options": {"dt": 0.02, "engine": "ngff", "material": ["duck=rubber"], "seed": 1},
+             "prompts": [PULLED, {"kind": "change", "what": "pinned", "value": True, "start": 0.1, "object_id": 2},
+                         {"kind": "lift", "object_id": 2, "height": 0.1}]}  # fmt: skip
 MATERIALS = {"duck": CUSTOM, "2": {"parts": PARTS}}
 PROMPTS = {"bbox": [[2, 3, 10, 12], [12.0, 4, 20, 20]], "center_point": [[5, 6], [15.0, 10]], "text": ["duck", "bowl"],
            "size": [32, 24]}  # fmt: skip
@@ -324,8 +329,13 @@ def check_trajectory_and_prompts(folder: Path) -> None:
     """A trajectory, and its prompts and options as --forces reads them."""
     found = read_trajectory(folder / "traj.h5")
     checks.check_trajectory(found)
-    checks.check_force_prompts(stored_prompts(folder / "traj.h5", OBJECTS))
-    checks.check_simulate_options(with_recorded(SimulateOptions(forces=folder / "traj.h5")))
+    check_recording(folder / "traj.h5")
+
+
+def check_recording(path: Path) -> None:
+    """The prompts and options that --forces takes from a file."""
+    checks.check_force_prompts(read_prompts_file(path, "scene", OBJECTS))
+    checks.check_simulate_options(with_recorded(SimulateOptions(forces=path)))
 
 
 def check_video(folder: Path) -> None:
@@ -362,7 +372,9 @@ KINDS = (
          lambda folder: checks.check_lenses(read_cameras(folder))),
     json_kind("path.json", PATH, read_camera_path, checks.check_cameras_of),
     json_kind("views.json", VIEWS, read_camera_path, checks.check_cameras_of),
-    json_kind("forces.json", FORCES, lambda path: read_forces(path, "scene", OBJECTS), checks.check_forces),
+    *(Kind(f"{name}.json", as_json(f"{name}.json", value), {f"{name}.json": change_json},
+           lambda folder, name=name: check_recording(folder / f"{name}.json"))
+      for name, value in {"forces": FORCES, "recording": RECORDING}.items()),
     json_kind("materials.json", MATERIALS, lambda path: choose_materials(OBJECTS, file=path), checks.check_materials),
     json_kind("prompts.json", PROMPTS, lambda path: read_prompts(path, example_scene().cameras), checks.check_prompts),
     json_kind("names.json", {"1": "duck", "2": "bowl"}, lambda path: read_names(path.parent), checks.check_names),

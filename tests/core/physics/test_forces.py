@@ -6,7 +6,8 @@ import math
 import pytest
 
 from stages.core.errors import InputError
-from stages.core.physics.forces import Force, ForcePrompts, parse, read_prompts_file
+from stages.core.physics.forces import Force, ForcePrompts, parse
+from stages.core.physics.recording import read_prompts_file
 from stages.core.scene.scene import SceneObject
 
 OBJECTS = (SceneObject(1, "duck"), SceneObject(2, "phone"))

@@ -1,6 +1,7 @@
 """A playable film: the page computes the motion that the learned engine computes, and the mouse drags its objects."""
 
 import base64
+import json
 from dataclasses import replace
 
 import pytest
@@ -141,20 +142,57 @@ def test_only_motions_of_the_learned_field_are_playable(tmp_path):
         render(tmp_path / "scene.ply", tmp_path / "film.html", RenderOptions(playable=True))
 
 
-FOLLOW = """([frame]) => Promise.all(["local", "engine"].map((name) => import(`player/${name}.js`))).then(
+GO_TO = """([frame]) => Promise.all(["local", "engine"].map((name) => import(`player/${name}.js`))).then(
   ([{ engineInput }, { FieldEngine }]) => {
-    const engine = new FieldEngine(engineInput(player.film, player.rest)), at = (n) => player.filmPositions(n);
-    engine.follow(frame, at(frame), at(frame - 1));
+    const engine = new FieldEngine(engineInput(player.film, player.rest));
+    for (const n of [player.film.frames - 1, 0, frame]) engine.goTo(n);  // the last from a state that was kept
+    engine.advance([], [{ what: "gravity", value: 0, object_id: null }]);
+    engine.goTo(frame);
     while (engine.frame < player.film.frames - 1) engine.advance();
     return Array.from(engine.positions());
-  })"""  # the end of a film whose last frames are computed
+  })"""  # the end of a film whose last frames are computed from within it
 
 
 @pytest.mark.usefixtures("device")
 def test_motion_goes_on_from_within_a_film(tmp_path, open_page):
-    t = simulated(tmp_path, two_balls_scene(), frames=16, velocity=("object=2 -0.8,0,0",))
+    """A change of the first visit of the frame does not remain, and one of the film is repeated."""
+    (tmp_path / "given.json").write_text(json.dumps({"options": {}, "frames": 16, "prompts": [
+        {"kind": "change", "what": "gravity", "value": 4.0, "start": 0.1, "object_id": None}]}))  # fmt: skip
+    options = {"velocity": ("object=2 -0.8,0,0",), "forces": tmp_path / "given.json"}
+    t = simulated(tmp_path, two_balls_scene(), frames=16, **options)
     page = open_page(render(tmp_path / "traj.h5", tmp_path / "film.html", RenderOptions(playable=True)))
-    end = torch.tensor(page.evaluate(FOLLOW, [8])).view(-1, 3)
-    travelled = (t.positions[-1] - t.positions[8]).norm(dim=1).max()
-    # velocities are differences of frames, half a frame late
-    assert (end - t.positions[-1]).norm(dim=1).max() < 0.15 * travelled
+    end = torch.tensor(page.evaluate(GO_TO, [12])).view(-1, 3)
+    assert (t.positions[-1] - t.positions[12]).norm(dim=1).max() > 0.02
+    assert (end - t.positions[-1]).norm(dim=1).max() < LIMIT
+
+
+@pytest.mark.parametrize("first", [0, 6])
+@pytest.mark.usefixtures("device")
+def test_what_was_done_in_a_page_is_saved_and_repeated_by_the_engine(tmp_path, open_page, first):
+    """From a frame of the film on: a drag by the mouse, a push and a pin."""
+    simulated(tmp_path, two_balls_scene(), frames=8, velocity=("object=2 -0.8,0,0",), box="-1,-1,0,1,1,1.5")
+    page = open_page(render(tmp_path / "traj.h5", tmp_path / "film.html", RenderOptions(playable=True, view="input:0")))
+    page.set_viewport_size({"width": 800, "height": 400})
+    page.evaluate(f"player.play(false); player.seek({first} * player.film.dt)")
+    until(page, "!player.changed && !player.busy && player.drawn()")
+    drag_up(page, page.evaluate(FIND), 12, 8)
+    until(page, f"player.live.state?.arrows.length === 1 && ({RISE})() > 0.05")
+    page.keyboard.press("p")  # what is under the cursor, which holds object 1
+    page.mouse.up()
+    page.keyboard.press("n")
+    page.keyboard.press("Space")
+    until(page, "player.live.state.paused")
+    page.wait_for_timeout(300)
+    with page.expect_download() as download:
+        page.keyboard.press("x")
+    download.value.save_as(tmp_path / "done.json")
+    assert download.value.suggested_filename == "traj-forces.json"
+    shown, frames = page.evaluate("[Array.from(player.positions), player.live.state.frames]")
+    simulate(tmp_path / "scene.ply", tmp_path / "again.h5", SimulateOptions(forces=tmp_path / "done.json"))
+    again = read_trajectory(tmp_path / "again.h5")
+    assert len(again) == frames > first + 10
+    assert min(f["start"] for f in again.info.forces if f["kind"] == "force") > (first - 1) * 0.02
+    red = again.keypoints.object_id == 1
+    assert (again.positions[:, red] - again.positions[0, red]).mean(1)[:, 2].max() > 0.05
+    # in 50 frames page and engine part by LIMIT
+    assert (again.positions[-1] - torch.tensor(shown).view(-1, 3)).norm(dim=1).max() < LIMIT * max(1, frames / 50)

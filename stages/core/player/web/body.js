@@ -14,7 +14,7 @@ export class Body {
   static MAX_RECOVERY_SPEED = 1;
   static FRICTION_CUTOFF_SPEED = 0.3;
 
-  // given: points, massFraction, normal, spacing, bodyInertia, inverse, keypointInverse, principal, box (low, high),
+  // given: points, massFraction, normal, spacing, inverse, keypointInverse, principal, box (low, high),
   // mass, E, solidity, nu, friction, velocity
   constructor(given) {
     Object.assign(this, given, { given: given.points, n: given.massFraction.length, pinned: false });
@@ -51,33 +51,15 @@ export class Body {
     this.updateKinematics();
   }
 
-  // The state with keypoints at `points` that move with `velocities`: a rigid motion and its residual.
-  follow(points, velocities, nearestRotation) {
-    const { n, massFraction, arm } = this, com = this.centre(points), velocity = this.centre(velocities);
-    const H = new Float64Array(9), R = new Float64Array(9), angular = [0, 0, 0];
-    let spread = 0;
-    for (let i = 0; i < 3 * n; i += 3) {
-      const m = massFraction[i / 3];
-      spread += m * Linear3.square(arm, i);
-      for (let a = 0; a < 3; a++) for (let b = 0; b < 3; b++) H[3 * a + b] += m * (points[i + a] - com[a]) * arm[i + b];
-      const [x, y, z] = [0, 1, 2].map((a) => points[i + a] - com[a]), [u, v, w] = [0, 1, 2].map((a) => velocities[i + a] - velocity[a]);
-      angular[0] += m * (y * w - z * v); angular[1] += m * (z * u - x * w); angular[2] += m * (x * v - y * u);
-    }
-    for (const i of [0, 4, 8]) H[i] += 1e-6 * (spread + 1e-6);
-    nearestRotation(H, R);
-    const back = Linear3.transposed(R), turned = (m, x) => Linear3.times(R, Linear3.times(m, Linear3.times(back, x)));
-    const spin = turned(this.keypointInverse, angular);
-    Object.assign(this, { com, velocity, quat: Linear3.quaternion(R), momentum: turned(this.bodyInertia, spin) });
-    for (let i = 0; i < 3 * n; i += 3) {
-      const offset = [0, 1, 2].map((a) => points[i + a] - com[a]), [x, y, z] = offset;
-      const rate = [0, 1, 2].map((a) => velocities[i + a] - velocity[a]);
-      rate[0] -= spin[1] * z - spin[2] * y; rate[1] -= spin[2] * x - spin[0] * z; rate[2] -= spin[0] * y - spin[1] * x;
-      Linear3.matvec(back, offset, this.u, 0, i);
-      Linear3.matvec(back, rate, this.du, 0, i);
-      for (let a = 0; a < 3; a++) this.u[i + a] -= arm[i + a];
-    }
-    this.project(this.u);
-    this.project(this.du);
+  get state() {
+    const { com, quat, velocity, momentum, u, du } = this;
+    return { com: [...com], quat, velocity, momentum, u: u.slice(), du: du.slice() };
+  }
+
+  set state({ com, quat, velocity, momentum, u, du }) {
+    Object.assign(this, { com: [...com], quat, velocity, momentum });
+    this.u.set(u);
+    this.du.set(du);
     this.changed();
   }
 

@@ -3,9 +3,10 @@
 
 import { Body } from "player/body.js";
 import { ForceField } from "player/force_field.js";
-import { nearestRotation } from "player/skinning.js";
 
 export class FieldEngine {
+  static KEPT = 10; // frames from one kept state to the next
+
   // film: `field` and `forces` of its header, objects, dt, rest and object of the keypoints, and the arrays field_* and
   // weights_* (stages/core/player/playable.py)
   constructor({ field, forces, objects, dt, rest, object, arrays }) {
@@ -20,7 +21,7 @@ export class FieldEngine {
       const [mass, E, solidity, nu, friction, volume] = part("material");
       return new Body({
         points: own("points", 3), massFraction: own("mass_fraction", 1), normal: own("normal", 3), spacing: own("spacing", 1),
-        inverse: part("inverse"), keypointInverse: part("keypoint_inverse"), principal: part("principal"), bodyInertia: part("inertia"),
+        inverse: part("inverse"), keypointInverse: part("keypoint_inverse"), principal: part("principal"),
         box: part("box"), startVelocity: part("velocity"), mass, E, solidity, nu, friction, volume,
       });
     });
@@ -31,6 +32,7 @@ export class FieldEngine {
     this.sleep = new Sleep(this.bodies, field.awake, field.standing);
     this.given = this.modelForces(forces.filter((f) => (f.kind ?? "force") === "force"));
     this.changes = forces.filter((f) => f.kind === "change");
+    this.kept = [];
     this.restart();
   }
 
@@ -52,23 +54,26 @@ export class FieldEngine {
     this.before = this.bodies.map((body) => Float64Array.from(body.given));
   }
 
-  // Go on from a frame of the film: positions of all keypoints there and in the frame before.
-  follow(frame, positions, before) {
+  // To a frame of the motion without a user's actions, computed from the start or from the last state that was kept.
+  goTo(frame) {
     this.restart();
-    this.frame = frame;
-    if (frame === 0) return;
-    for (const change of this.changes) if (change.start < frame * this.dt) this.change(change);
-    const at = (all, o, k, a) => this.first[o][3 * k + a] + (all[3 * this.rows[o][k] + a] - this.rest[3 * this.rows[o][k] + a] - (a === 2 ? this.lift[o] : 0)) * this.field.length;
-    const seconds = this.dt * this.field.time, moved = [];
-    this.bodies.forEach((body, o) => {
-      const now = Float64Array.from(body.points.keys(), (i) => at(positions, o, Math.floor(i / 3), i % 3));
-      const velocities = now.map((x, i) => (x - at(before, o, Math.floor(i / 3), i % 3)) / seconds);
-      moved.push(now.some((x, i) => Math.abs(x - this.first[o][i]) > 1e-4));
-      if (moved[o]) body.follow(now, velocities, nearestRotation);
-    });
-    this.sleep.wake(moved);
-    this.points = this.bodies.map((body) => body.positions());
-    this.before = this.points;
+    const state = this.kept.findLast((s) => s.frame <= frame);
+    if (state) {
+      this.frame = state.frame;
+      for (const change of this.changes) if (change.start < this.frame * this.dt) this.change(change);
+      this.bodies.forEach((body, o) => { body.state = state.bodies[o]; });
+      this.sleep.asleep = [...state.asleep];
+      this.points = this.before = state.points;
+    }
+    while (this.frame < frame) this.prepare();
+  }
+
+  // One frame without a user's actions; some states are kept for `goTo`.
+  prepare() {
+    this.advance();
+    if (this.frame % FieldEngine.KEPT || this.frame <= (this.kept.at(-1)?.frame ?? 0)) return;
+    const { frame, bodies, points, sleep } = this;
+    this.kept.push({ frame, points, bodies: bodies.map((body) => body.state), asleep: [...sleep.asleep] });
   }
 
   // Forces in newtons and scene units, at = a point at rest or keypoint = a row, in model units.
@@ -93,7 +98,7 @@ export class FieldEngine {
 
   // One frame, with the forces and changes of the user.
   advance(forces = [], changes = []) {
-    const { model, bodies, field, sleep } = this, start = this.frame * this.dt, end = start + this.dt;
+    const { model, bodies, field, sleep } = this, start = this.frame * this.dt, end = (this.frame + 1) * this.dt;
     const acting = [...this.given, ...this.modelForces(forces)], seconds = this.dt * field.time / field.steps;
     const all = [...this.changes.filter((c) => start <= c.start && c.start < end), ...changes];
     for (const change of all) this.change(change);

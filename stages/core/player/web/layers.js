@@ -94,13 +94,6 @@ export class Linear3 {
     ];
   }
 
-  static quaternion([a, b, c, d, e, f, g, h, i]) { // w x y z of a rotation: the largest component is the divisor
-    const rows = [[1 + a + e + i, h - f, c - g, d - b], [h - f, 1 + a - e - i, b + d, c + g], [c - g, b + d, 1 - a + e - i, f + h],
-      [d - b, c + g, f + h, 1 - a - e + i]];
-    const q = rows.reduce((best, row, k) => row[k] > best[0] ? [row[k], row] : best, [0, null])[1], n = Math.hypot(...q);
-    return q.map((x) => x / n);
-  }
-
   static rotated([w, x, y, z], r) { // a quaternion after a further rotation vector [rad]
     const half = Math.sqrt(r[0] * r[0] + r[1] * r[1] + r[2] * r[2] + 1e-24) / 2, s = Math.sin(half) / (2 * half);
     const c = Math.cos(half), a = s * r[0], b = s * r[1], d = s * r[2];

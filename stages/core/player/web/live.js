@@ -21,16 +21,17 @@ class Live {
     };
     player.overlay.addEventListener("pointermove", (event) => { this.pointer = [event.offsetX, event.offsetY]; });
     this.build();
-    if (local) this.post = startLocalEngine(player, (state, positions) => this.running && this.take(state, positions));
+    if (local) this.post = startLocalEngine(player, (state, positions) => this.running && this.take(state, positions), download);
     else this.connect();
   }
 
   // Go on from the present frame of the film, computed here.
   begin() {
-    const { player } = this, frame = Math.round(player.frame);
+    const { player } = this;
     player.play(false);
     this.running = true;
-    this.post({ do: "follow", frame, positions: player.filmPositions(frame).slice(), before: player.filmPositions(Math.max(frame - 1, 0)).slice() });
+    this.rate.textContent = "computing the motion up to here …";
+    this.post({ do: "take_over", frame: Math.round(player.frame) });
     document.getElementById("arrows").checked = true;
     player.showArrows(true);
     player.onchange();
@@ -150,6 +151,8 @@ class Live {
 
   drop() { for (const object of this.state?.lifted ?? []) this.act({ do: "drop", object }); }
 
+  save() { if (this.running) this.act({ do: "save" }); }
+
   pause() {
     if (this.running) this.act({ do: "pause", value: !this.state?.paused });
     else this.player.play(!this.player.playing);
@@ -165,8 +168,8 @@ class Live {
       ["g", "G", "let go of what is held", () => this.drop()],
       ["n", "N", "pin or unpin it", () => this.pin()],
       ["r", "R", `back to the start${this.local ? "" : ", with a new recording"}`, () => this.act({ do: "reset" })],
-      ...(this.local ? [["b", "B", "back to the film", () => this.end()]]
-        : [["b", "B", "save the recording", () => this.act({ do: "save" })]]),
+      ...(this.local ? [["b", "B", "back to the film", () => this.end()], ["x", "X", "save what was done, for ngff simulate --forces", () => this.save()]]
+        : [["b", "B", "save the recording", () => this.save()]]),
     ];
   }
 
@@ -189,11 +192,11 @@ class Live {
     const speed = make("select", { onchange: () => this.act({ do: "speed", value: Number(speed.value) }) },
       ...[1, 0.5, 0.25, 0.1].map((s) => new Option(`${s}×`, s)));
     this.rate = make("p", { id: "rate", style: "white-space: pre-line" }, this.local ? INVITATION : "connecting …");
-    const last = this.local ? button("film", "B", () => this.end()) : button("save", "B", () => this.act({ do: "save" }));
+    const last = [button("save", this.local ? "X" : "B", () => this.save()), ...(this.local ? [button("film", "B", () => this.end())] : [])];
     this.role = make("p");
     panel.append(
       make("div", { className: "buttons" }, this.pauseButton, button("step", ".", () => this.act({ do: "step" })),
-        button("start again", "R", () => this.act({ do: "reset" })), last, speed),
+        button("start again", "R", () => this.act({ do: "reset" })), ...last, speed),
       make("label", {}, "Gravity", this.gravity, this.gravityText), make("label", {}, "Friction", friction),
       make("label", {}, "Push", strength), this.rate, this.role,
     );
@@ -201,4 +204,11 @@ class Live {
       title: "material", onchange: ({ target }) => this.act({ do: "material", object: id, name: target.value }),
     }, ...[...new Set([settings.material[id], ...settings.materials])].map((name) => new Option(name, name)));
   }
+}
+
+// Save what was done in this page, as `ngff simulate --forces` reads it.
+function download(recording) {
+  const href = URL.createObjectURL(new Blob([JSON.stringify(recording)], { type: "application/json" }));
+  Object.assign(document.createElement("a"), { href, download: `${document.title}-forces.json` }).click();
+  setTimeout(() => URL.revokeObjectURL(href), 1000);
 }

@@ -16,7 +16,7 @@ export class Session {
   }
 
   begin() { // after the engine was set to a frame
-    Object.assign(this, { changes: [], pushes: [], pushArrows: [], arrows: [], dragged: null, lifted: new Map(), now: null });
+    Object.assign(this, { changes: [], pushes: [], pushArrows: [], arrows: [], record: [], dragged: null, lifted: new Map(), now: null });
     this.observe();
   }
 
@@ -52,9 +52,20 @@ export class Session {
     this.changes.push({ what, value, object_id });
   }
 
+  // What was done since `begin`, as `ngff simulate --forces` reads it (stages/core/physics/recording.py).
+  get recording() {
+    const { field, frame, forces } = this.engine;
+    return { options: field.options, frames: frame + 1, prompts: [...forces, ...this.record] };
+  }
+
   // One frame of the engine.
   advance() {
-    const forces = this.forces(), { changes } = this;
+    const forces = this.forces(), { changes, engine } = this;
+    for (const { object_id, force, start, end, keypoint: k } of forces) {
+      const at = k === undefined ? null : Array.from(engine.rest.subarray(3 * k, 3 * k + 3));
+      this.record.push({ kind: "force", object_id, force, start, end, at });
+    }
+    this.record.push(...changes.map((change) => ({ kind: "change", ...change, start: engine.frame * this.dt })));
     this.changes = [];
     this.pushes = [];
     this.engine.advance(forces, changes);
@@ -119,15 +130,20 @@ export class Clock {
   static RATE_TIME = 1; // over which the rate is measured [s]
   static IDLE = 100; // between turns while paused [ms]
 
-  constructor(engine, send) {
-    Object.assign(this, { engine, send, session: new Session(engine), paused: true, speed: 1, note: "", turns: [], ready: true, news: false });
+  // While the film, of `frames`, is shown, its motion is computed ahead for the moment when the user first acts.
+  constructor(engine, frames, send) {
+    Object.assign(this, { engine, frames, send, session: new Session(engine), ahead: true, paused: true, speed: 1, note: "", turns: [], ready: true, news: false });
   }
 
   take(message) {
     const now = performance.now() / 1000, act = {
-      follow: () => this.begin(() => this.engine.follow(message.frame, message.positions, message.before)),
+      take_over: () => this.begin(() => this.engine.goTo(message.frame)),
       reset: () => this.begin(() => this.engine.restart()),
-      stop: () => { this.paused = true; },
+      stop: () => {
+        this.paused = this.ahead = true;
+        this.engine.goTo(this.engine.kept.at(-1)?.frame ?? 0);
+      },
+      save: () => this.send({ recording: this.session.recording }),
       pause: () => { this.paused = message.value; this.due = now; this.turns = []; },
       step: () => { if (this.paused) this.advance(now); },
       speed: () => { this.speed = message.value; this.due = now; this.turns = []; },
@@ -140,7 +156,7 @@ export class Clock {
   begin(set) {
     set();
     this.session.begin();
-    Object.assign(this, { paused: false, note: "", due: performance.now() / 1000, turns: [], ready: true });
+    Object.assign(this, { ahead: false, paused: false, note: "", due: performance.now() / 1000, turns: [], ready: true });
   }
 
   turn() {
@@ -151,7 +167,12 @@ export class Clock {
       this.advance(now);
     }
     this.show();
-    this.timer = setTimeout(() => this.turn(), this.paused ? Clock.IDLE : Math.max(0, 1000 * (this.due - performance.now() / 1000)));
+    let wait = this.paused ? Clock.IDLE : Math.max(0, 1000 * (this.due - performance.now() / 1000));
+    if (this.ahead && this.engine.frame < this.frames - 1) {
+      this.engine.prepare();
+      wait = 1000 * (performance.now() / 1000 - now); // half of the time is left to the pictures
+    }
+    this.timer = setTimeout(() => this.turn(), wait);
   }
 
   advance(now) {

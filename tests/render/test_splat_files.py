@@ -13,7 +13,9 @@ import torch
 
 from stages.core.errors import InputError
 from stages.core.geometry.rotations import matrix
+from stages.core.geometry.similarity import Similarity
 from stages.core.physics.skinning import deform
+from stages.core.scene.gaussians import transformed
 from stages.core.scene.scene_ply import read_scene, write_scene
 from stages.core.scene.trajectory import SimulationInfo, TrajectoryWriter
 from stages.render.splat_files import _y_up
@@ -116,18 +118,57 @@ def test_spz_holds_the_scene_within_its_precision(scene, tmp_path):
     np.testing.assert_allclose(position / 4096, truth.means.numpy(), rtol=0, atol=1 / 8192 + 1e-6)
 
 
-def test_splat_transform_reads_spz(scene, tmp_path):
+@pytest.fixture
+def splat_transform():
+    """A function that converts a file by the program of that name, for which y is down in a PLY and up in others."""
     program = shutil.which("splat-transform")
     if program is None:
         pytest.skip("no splat-transform on this machine (npm install -g @playcanvas/splat-transform)")
+    return lambda source, out: subprocess.run([program, "-w", source, out], check=True, capture_output=True)
+
+
+def y_down(g, x):
+    """The Gaussians of a scene with z up, with y down and the x axis in the same direction (1) or the opposite (-1)."""
+    return transformed(_y_up(g), Similarity(1.0, torch.diag(torch.tensor([x, -1.0, -x])), torch.zeros(3)))
+
+
+def test_splat_transform_reads_spz(scene, tmp_path, splat_transform):
     run(tmp_path / "scene.ply", tmp_path / "scene.spz", render_options())
-    subprocess.run([program, "-w", tmp_path / "scene.spz", tmp_path / "back.ply"], check=True, capture_output=True)
-    back, truth = read_scene(tmp_path / "back.ply").gaussians, _y_up(scene.gaussians)
+    splat_transform(tmp_path / "scene.spz", tmp_path / "back.ply")
+    back, truth = read_scene(tmp_path / "back.ply").gaussians, y_down(scene.gaussians, 1.0)
     torch.testing.assert_close(back.means, truth.means, rtol=0, atol=2e-4)
     torch.testing.assert_close(back.scales.log(), truth.scales.log(), rtol=0, atol=0.04)
-    torch.testing.assert_close(matrix(back.quats), matrix(truth.quats), rtol=0, atol=5e-3)
+    torch.testing.assert_close(axes_like(back.quats, truth.quats), matrix(truth.quats), rtol=0, atol=5e-3)
     torch.testing.assert_close(back.opacities, truth.opacities, rtol=0, atol=3e-3)
     torch.testing.assert_close(back.sh[:, :4].clamp(-0.9, 0.9), truth.sh[:, :4].clamp(-0.9, 0.9), rtol=0, atol=0.04)
+
+
+def test_splat_transform_writes_the_same_glb(scene, tmp_path, splat_transform):
+    """It writes GLB with KHR_gaussian_splatting, but reads none."""
+    run(tmp_path / "scene.ply", tmp_path / "ours.glb", render_options())
+    write_scene(tmp_path / "turned.ply", replace(scene, gaussians=y_down(scene.gaussians, -1.0)))
+    splat_transform(tmp_path / "turned.ply", tmp_path / "theirs.glb")
+    ours, theirs = (attributes(tmp_path / name) for name in ("ours.glb", "theirs.glb"))
+    assert theirs.keys() <= ours.keys() and len(theirs) > 15
+    for name in theirs.keys() - {"COLOR_0"}:  # which they have in bytes
+        values, found = theirs[name], ours[name]
+        if name.endswith("ROTATION"):
+            values, found = values[:, [3, 0, 1, 2]], found[:, [3, 0, 1, 2]]
+            values, found = axes_like(values, found), matrix(found)
+        torch.testing.assert_close(found, values, rtol=1e-4, atol=1e-4, msg=lambda text, name=name: f"{name}: {text}")
+
+
+def axes_like(quats, others):
+    """The axes of ellipsoids as columns, each in the direction nearer to that of the others."""
+    R = matrix(quats)
+    return R * (R * matrix(others)).sum(1, keepdim=True).sign()
+
+
+def attributes(path):
+    """Those of the only primitive of a GLB."""
+    document, rows = read_glb(path)
+    (primitive,) = document["meshes"][0]["primitives"]
+    return {name: rows(number) for name, number in primitive["attributes"].items()}
 
 
 def test_what_a_file_cannot_hold_is_said(scene, tmp_path):

@@ -126,7 +126,7 @@ def _certainty(trajectory: Trajectory) -> str:
     notes.append(f"One unit is {scene.metres_per_unit:.4g} m: {scene.scale.get('source', 'not stated')}{known}.")
     options = next((facts.get("options", {}) for facts in _stages(trajectory) if facts["command"] == "segment"), None)
     if options is not None:
-        by = next((f"given (--{name})" for name in ("masks", "boxes") if options.get(name)), None)
+        by = next((f"given (--{name})" for name in ("masks", "boxes", "points") if options.get(name)), None)
         notes.append(f"The objects were {by or 'found by the segmenter, which may cut or merge things'}.")
     notes.append("Masses are volumes, with the unseen sides closed, times the density of the material.")
     return f'<p class="notes">{escape(" ".join(notes))}</p>'

@@ -71,15 +71,22 @@ def _objects(trajectory: Trajectory) -> str:
     unit = "m" if scene.has_known_scale else "units"
     factor = scene.metres_per_unit if scene.has_known_scale else 1.0
     rows = []
-    for o, volume in zip(scene.objects, _volumes(trajectory), strict=True):
+    for o, kilograms in zip(scene.objects, _masses(trajectory), strict=True):
         rest = trajectory.keypoints.rest[trajectory.keypoints.object_id == o.id]
         sides = (rest.amax(0) - rest.amin(0)).tolist() if len(rest) else [0.0] * 3
         size = " × ".join(f"{factor * side:.3g}" for side in sides)
-        mass = scene.mass_text(choices[o.id].material.density * volume)
+        mass = scene.mass_text(kilograms)
         cells = [f"{o.id} {o.name}", f"{size} {unit}", mass, choices[o.id].name, _source(o, choices[o.id], given)]
         rows.append("".join(f"<td>{escape(cell)}</td>" for cell in cells))
     head = "".join(f"<th>{name}</th>" for name in ("object", "size", "mass, about", "material", "which is"))
     return f"<table><tr>{head}</tr>{''.join(f'<tr>{row}</tr>' for row in rows)}</table>"
+
+
+def _masses(trajectory: Trajectory) -> list[float]:
+    """Mass of each object [kg], nan where its volume is not known."""
+    choices = _materials(trajectory)
+    return [choices[o.id].material.density * volume
+            for o, volume in zip(trajectory.scene.objects, _volumes(trajectory), strict=True)]  # fmt: skip
 
 
 def _volumes(trajectory: Trajectory) -> list[float]:
@@ -156,9 +163,13 @@ def _next_steps(trajectory: Trajectory, path: Path) -> str:
     """Commands that move the first objects in other ways."""
     inputs = trajectory.scene.provenance.get("inputs") or [{"name": "SCENE.ply"}]
     scene, ids = inputs[0]["name"], [o.id for o in trajectory.scene.objects] or [1]
+    weights = [9.81 * mass for mass in _masses(trajectory)]
+    pushes = [f'ngff simulate {scene} --force "object={o.id} force={2 * w:.3g},0,{w:.3g} to=0.2"'
+              for o, w in zip(trajectory.scene.objects, weights, strict=True) if 0 < w < math.inf]  # fmt: skip
     commands = [
         f"ngff simulate {scene} --lift {ids[0]}=0.3",
         f'ngff simulate {scene} --velocity "object={ids[-1]} 1,0,1"',
+        *pushes[:1],
         f"ngff simulate {scene} --live    # drag, push and throw the objects",
         f"ngff render {path.name} -o film.html    # this page's player, to be sent to others",
     ]

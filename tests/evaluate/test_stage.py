@@ -72,7 +72,8 @@ def test_report_shows_photos_objects_and_times(tmp_path, two_balls):
         run(true, true, None, EvaluateOptions(report=tmp_path / "report.html", photos=photos))
         html = (tmp_path / "report.html").read_text()
         assert re.findall(r'<img alt="([^"]*)"', html) == shown * 3
-    for text in ("reconstruct</td><td>130.2 s", "all</td><td>140.0 s", "were given (--masks)", "</span> red ball"):
+    for text in ("reconstruct</td><td>130.2 s", "all</td><td>140.0 s", "were given (--masks)", "</span> red ball",
+                 "--force &quot;object=1 force="):  # fmt: skip
         assert text in html
 
 

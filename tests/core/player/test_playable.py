@@ -104,6 +104,21 @@ def test_the_page_computes_the_motion_of_the_engine(tmp_path, open_page, device)
     assert max(page_and_engine(tmp_path, open_page, names, device, frames=16)) < LIMIT
 
 
+@pytest.mark.slow  # Firefox takes seconds to start
+def test_firefox_computes_the_motion_of_the_engine(tmp_path, open_firefox, device):
+    """Called directly, and as the page does in its worker."""
+    pages = []
+
+    def open_once(path):
+        pages.append(open_firefox(path))
+        return pages[0]
+
+    assert max(page_and_engine(tmp_path, open_once, ["two meet"], device, frames=16)) < LIMIT
+    until(pages[0], "window.player !== undefined")
+    pages[0].evaluate("player.live.act({ do: 'lift', object: 1, height: 0.2 })")
+    until(pages[0], f"() => ({RISE})() > 0.05")
+
+
 @pytest.mark.slow
 def test_ten_motions_agree_after_fifty_frames(tmp_path, open_page, device):
     distances = dict(zip(SCENES, page_and_engine(tmp_path, open_page, SCENES, device), strict=True))

@@ -14,9 +14,8 @@ from torch import Tensor
 from tqdm import tqdm
 
 from stages.core.errors import InputError
-from stages.core.scene.files import must_exist
 from stages.core.scene.formats import IMAGE_SUFFIXES, VIDEO_SUFFIXES
-from stages.core.scene.images import import_av, list_photos, open_video, read_8_bit, reduce_frame
+from stages.core.scene.images import image_data, import_av, list_photos, open_video, read_8_bit, reduce_frame
 from stages.core.scene.recordings import limit_size
 from stages.reconstruct.colmap import import_pycolmap
 from stages.reconstruct.photos import Photos
@@ -114,7 +113,7 @@ def _read_files(files: list[Path], side: int, unread: dict[str, str]) -> Iterato
     """Each readable photo with its index; the errors of the others are added to `unread`, by file name."""
     for i, file in enumerate(tqdm(files, desc="reading photos", unit="photo", leave=False)):
         try:
-            if _is_truncated(must_exist(file, "a photo")):
+            if _is_truncated(image_data(file, "a photo")):
                 raise InputError(f"{file}: is truncated; copy it again from its source")
             image = read_8_bit(file)
         except InputError as error:
@@ -126,12 +125,11 @@ def _read_files(files: list[Path], side: int, unread: dict[str, str]) -> Iterato
         yield i, LoadedImage(file.name, bounded, focal, (width, height))
 
 
-def _is_truncated(file: Path) -> bool:
+def _is_truncated(data: bytes) -> bool:
     """Whether a JPEG has no end marker, the rest of which decoders fill with grey, or a PNG no last chunk.
 
     The marker is searched for after the header segments, where thumbnails have one too; phones append videos after it.
     """
-    data = file.read_bytes()
     if data[:2] == b"\xff\xd8":
         at = 2
         while data[at : at + 1] == b"\xff" and data[at : at + 2] != b"\xff\xda":  # segments up to the first scan

@@ -20,9 +20,11 @@ from torch import Tensor
 from stages.core.errors import InputError, MissingPackage
 from stages.core.scene.files import must_exist, replacing
 from stages.core.scene.formats import IMAGE_SUFFIXES
+from stages.core.scene.image_header import MAX_PIXELS, read_image_header
 
 log = logging.getLogger(__name__)
 NOT_JUDGED = 255  # value of pixels of label images that are left out
+MAX_IMAGE_BYTES = 1 << 30  # of an image file
 MAX_VIDEO_PIXELS = 1 << 26  # of a frame; 8K has half as many
 ENCODER_THREADS = 4  # fixed, since the file depends on the number of threads
 MAX_PENDING_FRAMES = 8  # of a video, that wait for the encoder
@@ -51,7 +53,6 @@ def read_8_bit(path: Path) -> UInt8[Tensor, "h w 3"]:
 
 
 def _read_rgb(path: Path) -> np.ndarray:
-    must_exist(path, "an image")
     return cv2.cvtColor(_decode(path, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH), cv2.COLOR_BGR2RGB)
 
 
@@ -65,8 +66,7 @@ def _to_floats(path: Path, pixels: np.ndarray) -> Float[Tensor, "h w 3"]:
 
 def read_labels(path: Path, max_bits: int = 16) -> Int[Tensor, "h w"]:
     """A label image: one integer per pixel (8 bit, or 16 where `max_bits` allows). InputError for several channels."""
-    must_exist(path, "a label image")
-    pixels = _decode(path, cv2.IMREAD_UNCHANGED)
+    pixels = _decode(path, cv2.IMREAD_UNCHANGED, "a label image")
     if pixels.ndim != 2:
         raise InputError(f"{path}: has {pixels.shape[2]} channels; a label image has one, with the object's number")
     if 8 * pixels.itemsize > max_bits:
@@ -74,12 +74,32 @@ def read_labels(path: Path, max_bits: int = 16) -> Int[Tensor, "h w"]:
     return torch.from_numpy(pixels.astype(np.int64))
 
 
-def _decode(path: Path, flags: int) -> np.ndarray:
-    """Pixels of an image file, BGR. Raises InputError for files that OpenCV cannot decode."""
+def image_data(path: Path, what: str = "an image") -> bytes:
+    """The bytes of an image file; `what` is expected. InputError where it is absent, empty or too long."""
+    must_exist(path, what)
+    with Path(path).open("rb") as file:
+        data = file.read(MAX_IMAGE_BYTES + 1)
+    if len(data) > MAX_IMAGE_BYTES:
+        raise InputError(f"{path}: has more than {MAX_IMAGE_BYTES >> 20} MB; images of 4000 pixels or less will do")
+    return data
+
+
+def _decode(path: Path, flags: int, what: str = "an image") -> np.ndarray:
+    """Pixels of an image file, BGR. Raises InputError for others, and for more pixels than the file can hold."""
+    data = image_data(path, what)
     try:
-        pixels = cv2.imdecode(np.fromfile(path, np.uint8), flags)
-    except cv2.error as error:  # the header claims more than the 2^30 pixels that OpenCV accepts
-        raise InputError(f"{path}: is damaged, or far too large; images of 4000 pixels or less will do") from error
+        header = read_image_header(data)
+    except (ValueError, IndexError) as error:
+        raise InputError(f"{path}: is not an image that can be read; convert it to JPEG or PNG") from error
+    if header.width * header.height > MAX_PIXELS or header.stored > len(data):
+        raise InputError(f"{path}: is damaged, or far too large ({header.width}x{header.height} pixels in {len(data)} "
+                         "bytes); images of 4000 pixels or less will do")  # fmt: skip
+    try:
+        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except cv2.error as error:
+        if error.code == cv2.Error.STS_NO_MEM:
+            raise
+        raise InputError(f"{path}: is damaged; convert it to JPEG or PNG") from error
     if pixels is None:
         raise InputError(f"{path}: is not an image that can be read; convert it to JPEG or PNG")
     return pixels

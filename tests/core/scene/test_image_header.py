@@ -1,0 +1,114 @@
+"""Sizes in headers agree with the decoder's, and what a file cannot hold is refused before it is decoded."""
+
+import io
+import struct
+import zlib
+
+import cv2
+import numpy as np
+import pytest
+
+from stages.core.errors import InputError
+from stages.core.scene import images
+from stages.core.scene.image_header import read_image_header
+from stages.core.scene.images import read_image, read_labels
+
+FORMATS = {
+    ".png": [], ".jpg": [cv2.IMWRITE_JPEG_PROGRESSIVE, 1], ".jpeg": [cv2.IMWRITE_JPEG_RST_INTERVAL, 2], ".bmp": [],
+    ".webp": [cv2.IMWRITE_WEBP_QUALITY, 80], ".tif": [cv2.IMWRITE_TIFF_COMPRESSION, 1],
+    ".tiff": [cv2.IMWRITE_TIFF_COMPRESSION, 5],
+}  # fmt: skip
+
+
+def encode(suffix, pixels):
+    return cv2.imencode(suffix, pixels, FORMATS[suffix])[1].tobytes()
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+@pytest.mark.parametrize("channels", [1, 3])
+def test_sizes_are_those_of_the_decoder(suffix, channels):
+    pixels = np.random.default_rng(0).integers(0, 255, (37, 300, channels), np.uint8)
+    data = encode(suffix, pixels)
+    header = read_image_header(data)
+    assert (header.width, header.height) == (300, 37) and header.stored < len(data)
+
+
+@pytest.mark.parametrize(("format", "options"), [
+    ("PNG", {}), ("JPEG", {"comment": "x" * 60000, "exif": b"Exif\0\0" + b"\xff\xc0" * 900}), ("BMP", {}),
+    ("WEBP", {"lossless": True}), ("WEBP", {"exif": b"Exif\0\0"}), ("TIFF", {"big_tiff": True}),
+    ("TIFF", {"compression": "tiff_deflate"}),
+])  # fmt: skip
+def test_sizes_are_those_of_pillow(format, options):
+    image = pytest.importorskip("PIL.Image")
+    file = io.BytesIO()
+    image.new("RGB", (300, 37)).save(file, format, **options)
+    header = read_image_header(file.getvalue())
+    assert (header.width, header.height) == (300, 37)
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+@pytest.mark.parametrize("bits", [8, 16])
+def test_blank_images_can_be_held(suffix, bits):
+    pixels = np.zeros((5000, 6000), np.uint16 if bits == 16 and suffix in (".png", ".tif", ".tiff") else np.uint8)
+    data = encode(suffix, pixels)
+    assert read_image_header(data).stored < len(data)
+
+
+def with_size(suffix, side):
+    """A small image whose header declares `side` x `side` pixels."""
+    data = encode(suffix, np.zeros((8, 8, 3), np.uint8))
+    if suffix == ".png":
+        chunk = b"IHDR" + struct.pack(">II", side, side) + data[24:29]
+        return data[:12] + chunk + struct.pack(">I", zlib.crc32(chunk)) + data[33:]
+    if suffix in (".jpg", ".jpeg"):
+        at = data.index(b"\xff\xc2" if suffix == ".jpg" else b"\xff\xc0") + 5
+        return data[:at] + struct.pack(">HH", side, side) + data[at + 4 :]
+    if suffix == ".bmp":
+        return data[:18] + struct.pack("<ii", side, -side) + data[26:]
+    for tag in (256, 257):
+        at = data.index(struct.pack("<HHI", tag, 3, 1))
+        data = data[:at] + struct.pack("<HHII", tag, 4, 1, side) + data[at + 12 :]
+    return data
+
+
+@pytest.mark.parametrize("side", [5000, 40_000])
+@pytest.mark.parametrize("suffix", [suffix for suffix in FORMATS if suffix != ".webp"])
+def test_more_pixels_than_the_file_holds_are_refused_before_decoding(tmp_path, monkeypatch, suffix, side):
+    monkeypatch.setattr(images.cv2, "imdecode", lambda *_: pytest.fail("decoded"))
+    path = tmp_path / f"x{suffix}"
+    path.write_bytes(with_size(suffix, side))
+    for read in (read_image, read_labels):
+        with pytest.raises(InputError, match=rf"x{suffix}: is damaged, or far too large \({side}x{side} pixels in"):
+            read(path)
+
+
+def test_webp_of_too_many_pixels_and_tiles_that_are_too_large_are_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(images.cv2, "imdecode", lambda *_: pytest.fail("decoded"))
+    canvas = b"WEBPVP8X" + struct.pack("<II", 10, 0) + b"\xff\xff\x00" * 2 + b"VP8 " + bytes(20)
+    tags = [(256, 8), (257, 8), (258, 8), (322, 1 << 15), (323, 1 << 15)]
+    tiles = struct.pack(">IH", 8, len(tags)) + b"".join(struct.pack(">HHIHH", t, 3, 1, v, 0) for t, v in tags)
+    for name, data in (("a.webp", b"RIFF" + struct.pack("<I", len(canvas)) + canvas), ("b.tif", b"MM\0*" + tiles)):
+        (tmp_path / name).write_bytes(data)
+        with pytest.raises(InputError, match=f"{name}: is damaged, or far too large"):
+            read_image(tmp_path / name)
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_headers_that_break_off_are_refused(tmp_path, suffix):
+    data = encode(suffix, np.zeros((8, 8, 3), np.uint8))
+    for length in range(1, 30):
+        (tmp_path / "x").write_bytes(data[:length])
+        with pytest.raises(InputError, match="x: is (not an image|damaged)"):
+            read_image(tmp_path / "x")
+
+
+def test_files_of_other_kinds_and_of_any_length_are_refused(tmp_path, monkeypatch):
+    path = tmp_path / "x.png"
+    path.write_bytes(b"P5 8 8 255\n" + bytes(64))  # OpenCV would read it
+    with pytest.raises(InputError, match="x.png: is not an image that can be read; convert it"):
+        read_image(path)
+    with path.open("wb") as file:
+        file.truncate(images.MAX_IMAGE_BYTES + 1)
+    monkeypatch.setattr(images, "MAX_IMAGE_BYTES", 1 << 20)
+    with pytest.raises(InputError, match="x.png: has more than 1 MB"):
+        read_image(path)

@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from stages.core.scene.h5_schema import Dataset
+from stages.core.scene.h5_text import check_attributes
 from stages.core.scene.schema import number, numbers, quote, whole
 
 GROUP = "field"
@@ -96,6 +97,7 @@ def read_field_start(file: h5py.File, lengths: dict[str, int]) -> FieldStart | N
     read = {name: dataset.read(file, f"{GROUP}/{name}", lengths) for name, dataset in DATASETS.items()}
     values = {k: torch.from_numpy(v) if isinstance(v, np.ndarray) else tuple(quote(s, 40) for s in v)
               for k, v in read.items()}  # fmt: skip
+    check_attributes(file[GROUP])
     attributes = file[GROUP].attrs
     factors = {name: number(attributes[name], name, 1e-12, 1e12) for name in ("length", "scale", "time", "mass")}
     friction = number(attributes["friction"], "friction", 0, 100) if "friction" in attributes else None

@@ -41,8 +41,7 @@ def append_rows(data: h5py.Dataset, rows: np.ndarray) -> None:
 
 def read_compressed(data: h5py.Dataset) -> np.ndarray:
     """All values of a dataset; OSError where a chunk is damaged."""
-    filters = tuple(data.id.get_create_plist().get_filter(i)[0] for i in range(_filter_count(data)))
-    if data.chunks is None or data.dtype.kind not in "fiu" or filters != FILTERS or not data.size:
+    if data.chunks is None or data.dtype.kind not in "fiu" or filters_of(data) != FILTERS or not data.size:
         return data[()]
     infos = [data.id.get_chunk_info(i) for i in range(data.id.get_num_chunks())]
     if any(info.filter_mask for info in infos):
@@ -82,8 +81,10 @@ def _decoded(stored: bytes, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarr
     return np.frombuffer(raw, np.uint8).reshape(dtype.itemsize, -1).T.copy().view(dtype).reshape(shape)
 
 
-def _filter_count(data: h5py.Dataset) -> int:
-    return data.id.get_create_plist().get_nfilters()
+def filters_of(data: h5py.Dataset) -> tuple[int, ...]:
+    """The numbers of the filters of a dataset, in the order in which they are applied."""
+    properties = data.id.get_create_plist()
+    return tuple(properties.get_filter(i)[0] for i in range(properties.get_nfilters()))
 
 
 def _in_threads(function: Callable, items: Iterable) -> list[Any]:

@@ -2,13 +2,28 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 
 import h5py
 import numpy as np
 
 from stages.core.scene.h5_chunks import read_compressed
+from stages.core.scene.h5_text import check_attributes, check_texts
 from stages.core.scene.schema import LARGEST, MAX_DEFLATE_RATIO, Bound, quote
+
+MAX_CHUNK = 64 << 20  # bytes of a chunk, whatever it holds
+
+
+@contextmanager
+def open_h5(path: Path) -> Iterator[h5py.File]:
+    """An HDF5 file for reading, the texts among its attributes checked. Raises ValueError and as h5py does."""
+    with h5py.File(path, "r") as file:
+        check_attributes(file)
+        yield file
 
 
 @dataclass(frozen=True)
@@ -44,6 +59,8 @@ class Dataset:
         stored = data.id.get_storage_size()
         if data.size * data.dtype.itemsize > MAX_DEFLATE_RATIO * stored + 4096:
             raise ValueError(f"{name} declares {data.size} values, but the file stores only {stored} bytes of them")
+        if data.chunks and math.prod(data.chunks) * data.dtype.itemsize > max(MAX_DEFLATE_RATIO * stored, MAX_CHUNK):
+            raise ValueError(f"{name} has chunks of {data.chunks} values, but the file stores only {stored} bytes")
         lengths.update({s: n for s, n in zip(self.shape.split(), data.shape, strict=True) if s.isalpha()})
         return data
 
@@ -51,6 +68,8 @@ class Dataset:
         """The values as float32, int64 or text; ValueError where one is not finite or out of range."""
         data = self.open(file, name, lengths)
         if self.kind == "text":
+            if h5py.check_string_dtype(data.dtype).length is None:
+                check_texts(data)
             return [str(s) for s in data.asstr(errors="replace")[()]]
         return self.checked(read_compressed(data), name)
 

@@ -21,7 +21,7 @@ from stages.core.scene.field_start import FieldStart, read_field_start, write_fi
 from stages.core.scene.files import must_exist, replacing
 from stages.core.scene.gaussians import Gaussians
 from stages.core.scene.h5_chunks import COMPRESSED, append_rows, write_compressed
-from stages.core.scene.h5_schema import Dataset
+from stages.core.scene.h5_schema import Dataset, open_h5
 from stages.core.scene.prompt_rows import read_prompts
 from stages.core.scene.scene import Scene, read_metadata, read_objects
 from stages.core.scene.schema import MAX_OBJECT_ID, number, numbers, parse_json, quote, reason
@@ -270,7 +270,7 @@ def read_trajectory(path: Path) -> Trajectory:
     path = Path(path)
     must_exist(path, EXPECTED)
     try:
-        with h5py.File(path, "r") as file:
+        with open_h5(path) as file:
             kind = file.attrs.get("format", "")
             if kind != FORMAT:
                 kind = quote(repr(kind))

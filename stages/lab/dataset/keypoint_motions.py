@@ -27,7 +27,8 @@ from torch import Tensor
 from stages.core.errors import InputError
 from stages.core.models.initial_conditions import InitialConditions
 from stages.core.scene.files import must_exist, replacing
-from stages.core.scene.h5_schema import Dataset
+from stages.core.scene.h5_schema import Dataset, open_h5
+from stages.core.scene.h5_text import check_attributes
 from stages.core.scene.schema import MAX_OBJECT_ID, number, numbers, parse_json, quote, reason
 
 FORMAT, VERSION = "ngff-motions", 1
@@ -175,7 +176,7 @@ def read_provenance(path: Path) -> dict:
     """The provenance stored in a file of keypoint trajectories; raises InputError when the file is missing."""
     must_exist(path, FILE_KIND)
     try:
-        with h5py.File(path, "r") as file:
+        with open_h5(path) as file:
             found = parse_json(str(file.attrs.get("provenance", "{}")), finite=False)
     except (OSError, ValueError, RuntimeError) as error:
         raise InputError(f"{path}: cannot be read ({reason(error)}); {FILE_KIND} is expected") from error
@@ -186,7 +187,7 @@ def read_motions(path: Path) -> KeypointMotions:
     """Read a file of keypoint trajectories; raises InputError when it is missing or has another format."""
     must_exist(path, FILE_KIND)
     try:
-        with h5py.File(path, "r") as file:
+        with open_h5(path) as file:
             if file.attrs.get("format") != FORMAT:
                 raise InputError(f"{path}: its format attribute is {quote(repr(file.attrs.get('format')))}, not "
                                  f"{FORMAT!r}; {FILE_KIND} is expected")  # fmt: skip
@@ -198,6 +199,7 @@ def read_motions(path: Path) -> KeypointMotions:
                 raise ValueError(f"points has values of type {steps.dtype}, not int16")
             if not all(lengths.values()):
                 raise ValueError("it holds no scene, frame, object or keypoint")
+            check_attributes(file["points"])
             step = number(file["points"].attrs["step"], "the step of points", 1e-9, 1)
             tensors = {name: torch.from_numpy(rows[name]) for name in rows if name != "names"}
             tensors.setdefault("solidity", torch.ones(lengths["s"], lengths["o"]))

@@ -1,0 +1,136 @@
+"""Texts of variable length in HDF5 files, checked before HDF5 reads them.
+
+HDF5 takes memory by the length that a text's reference declares, before it looks where the text is, and does not end at
+a damaged heap (H5HG__cache_heap_deserialize). A reference has 16 bytes: the length, the address of a heap and the
+number of the text in it.
+Source: The HDF Group, "HDF5 File Format Specification Version 3.0", III.E, IV.A.1 and IV.A.2.
+"""
+
+from __future__ import annotations
+
+import mmap
+import struct
+import zlib
+from collections.abc import Iterator
+
+import h5py
+import numpy as np
+
+from stages.core.scene.h5_chunks import filters_of
+
+ATTRIBUTE, CONTINUATION = 0x0C, 0x10  # types of messages of an object header
+VARIABLE_LENGTH = 9  # class of datatypes
+HEAP = b"GCOL\x01\0\0\0"
+MAX_BLOCKS = 1000  # of an object header
+
+
+def check_texts(data: h5py.Dataset) -> None:
+    """ValueError where a text of a dataset of variable length is not where and as long as the file says."""
+    with _Bytes(data.file) as file:
+        for part in _stored(data, file):
+            file.check(part)
+
+
+def check_attributes(item: h5py.Group | h5py.Dataset) -> None:
+    """The same for the attributes of a file, group or dataset."""
+    with _Bytes(item.file) as file:
+        for attribute in _attributes(file, h5py.h5o.get_info(item.id).addr):
+            name, kind, space = (int.from_bytes(attribute[i : i + 2], "little") for i in (2, 4, 6))
+            start, to = (8, 8) if attribute[0] == 1 else (9 if attribute[0] == 3 else 8, 1)
+            after_name = start + -(-name // to) * to
+            values = after_name + -(-kind // to) * to + -(-space // to) * to
+            if attribute[after_name] & 15 == VARIABLE_LENGTH:
+                file.check(attribute[values : values + (len(attribute) - values) // 16 * 16])
+
+
+class _Bytes:
+    """The bytes of an open file; ValueError for those outside it."""
+
+    def __init__(self, file: h5py.File):
+        self._path = file.filename
+        self._checked: dict[int, dict[int, int]] = {}  # length of each text, by address of its heap and number
+
+    def __enter__(self) -> _Bytes:
+        with open(self._path, "rb") as file:
+            self._map = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+        return self
+
+    def __exit__(self, kind, error, trace) -> None:
+        self._map.close()
+
+    def read(self, at: int, size: int) -> bytes:
+        if at + size > len(self._map):
+            raise ValueError("a part of it is outside the file")
+        return self._map[at : at + size]
+
+    def number(self, at: int, size: int) -> int:
+        return int.from_bytes(self.read(at, size), "little")
+
+    def check(self, references: bytes) -> None:
+        """ValueError unless each reference is empty, or as long as its text in a sound heap."""
+        for at in range(0, len(references), 16):
+            length, heap, index = struct.unpack_from("<IQI", references, at)
+            if length and heap and length > self._lengths(heap).get(index, -1):
+                raise ValueError(f"a text of {length} bytes is not in the file")
+
+    def _lengths(self, heap: int) -> dict[int, int]:
+        if heap not in self._checked:
+            size = self.number(heap + 8, 8)
+            if self.read(heap, 8) != HEAP or heap + size > len(self._map):
+                raise ValueError("its texts are damaged")
+            found, at = {}, heap + 16
+            while at + 16 <= heap + size:
+                index, length = self.number(at, 2), self.number(at + 8, 8)
+                step = length if index == 0 else 16 + -(-length // 8) * 8  # 0: free space, with its header
+                if step < 16 or at + step > heap + size:
+                    raise ValueError("its texts are damaged")
+                found[index] = length
+                at += step
+            self._checked[heap] = found
+        return self._checked[heap]
+
+
+def _stored(data: h5py.Dataset, file: _Bytes) -> Iterator[bytes]:
+    """The references of a dataset; those that it does not store are empty."""
+    if data.id.get_storage_size() == 0:
+        return
+    if data.chunks is None:
+        if (at := data.id.get_offset()) is None:
+            raise ValueError("its texts are stored in an object header")
+        yield file.read(at, data.size * 16)
+        return
+    filters, size = filters_of(data), int(np.prod(data.chunks)) * 16
+    for info in (data.id.get_chunk_info(i) for i in range(data.id.get_num_chunks())):
+        part = file.read(info.byte_offset, info.size)
+        used = [code for i, code in enumerate(filters) if not info.filter_mask >> i & 1]
+        if used == [h5py.h5z.FILTER_DEFLATE]:
+            part = zlib.decompressobj().decompress(part, size + 1)
+        elif used:  # shuffle leaves texts as they are
+            raise ValueError("its texts are compressed by another filter than gzip")
+        if len(part) != size:
+            raise ValueError("its texts are damaged")
+        yield part
+
+
+def _attributes(file: _Bytes, at: int) -> Iterator[bytes]:
+    """The attribute messages of the object header at an address."""
+    new = file.read(at, 4) == b"OHDR"  # of version 2
+    flags = file.number(at + 5, 1) if new else 0
+    if new:
+        first, width = at + 6 + 16 * bool(flags & 32) + 4 * bool(flags & 16), 1 << (flags & 3)
+        blocks, before = [(first + width, file.number(first, width))], 4 + 2 * bool(flags & 4)
+    else:
+        blocks, before = [(at + 16, file.number(at + 8, 4))], 8
+    for start, size in blocks:
+        if len(blocks) > MAX_BLOCKS:
+            raise ValueError("its object header has too many parts")
+        position, end = start, start + size
+        while position + before <= end:
+            kind, length = file.number(position, 1 if new else 2), file.number(position + (1 if new else 2), 2)
+            message = file.read(position + before, length)
+            position += before + length
+            if kind == ATTRIBUTE and length > 8:
+                yield message
+            elif kind == CONTINUATION and length >= 16:
+                to, more = (int.from_bytes(message[i : i + 8], "little") for i in (0, 8))
+                blocks.append((to + 4, more - 8) if new else (to, more))  # version 2: between a signature and a sum

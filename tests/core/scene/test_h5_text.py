@@ -1,0 +1,120 @@
+"""Texts of variable length are read as HDF5 reads them; damaged ones are refused before HDF5 takes memory for them."""
+
+import struct
+
+import h5py
+import numpy as np
+import pytest
+
+from stages.core.scene.h5_schema import MAX_CHUNK, Dataset, open_h5
+from stages.core.scene.h5_text import check_attributes, check_texts
+
+NAMES = ["", "duck", "bowl ä", "x" * 300, "y"]
+STORED = [{}, {"chunks": (2,)}, {"chunks": (2,), "maxshape": (None,)}, {"compression": "gzip"},
+          {"compression": "gzip", "shuffle": True}]  # fmt: skip
+
+
+def write(path, libver="earliest", **stored):
+    """A file with texts in a dataset and in many attributes, in headers of the old or of the new version."""
+    with h5py.File(path, "w", libver=libver) as file:
+        for i in range(6):  # more do not stay in a header of the new version
+            file.attrs[f"{i}"] = "attribute " + i * "z"
+        file.attrs["matrix"], file.attrs["list"] = np.eye(3), ["a", "bc", ""]
+        file.create_dataset("names", data=NAMES, dtype=h5py.string_dtype(), **stored)
+        file["names"].attrs["unit"] = "none"
+
+
+@pytest.mark.parametrize("stored", STORED, ids=str)
+@pytest.mark.parametrize("libver", ["earliest", "latest"])
+def test_sound_texts_are_read(tmp_path, stored, libver):
+    write(tmp_path / "a.h5", libver, **stored)
+    with open_h5(tmp_path / "a.h5") as file:
+        assert Dataset("n", "text").read(file, "names", {}) == NAMES
+        check_attributes(file["names"])
+        assert file.attrs["5"] == "attribute zzzzz" and list(file.attrs["list"]) == ["a", "bc", ""]
+
+
+def test_datasets_that_store_nothing_and_texts_of_fixed_length_are_read(tmp_path):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file.create_dataset("names", (2,), h5py.string_dtype())
+        file.create_dataset("fixed", data=np.array([b"ab", b"c"]))
+    with open_h5(tmp_path / "a.h5") as file:
+        assert Dataset("n", "text").read(file, "names", {}) == ["", ""]
+        assert Dataset("n", "text").read(file, "fixed", {}) == ["ab", "c"]
+
+
+def reread(path):
+    with open_h5(path) as file:
+        check_attributes(file["names"])
+        Dataset("n", "text").read(file, "names", {})
+
+
+@pytest.mark.parametrize("libver", ["earliest", "latest"])
+@pytest.mark.parametrize("length", [len("duck"), len("attribute z"), len("none")], ids=["dataset", "file", "item"])
+def test_a_text_longer_than_its_heap_has_is_refused(tmp_path, libver, length):
+    path = tmp_path / "a.h5"
+    write(path, libver)
+    data = path.read_bytes()
+    heaps = [at for at in range(len(data)) if data[at : at + 4] == b"GCOL"]
+    places = [at for heap in heaps for at in all_of(data, struct.pack("<IQ", length, heap))]
+    assert places
+    for at in places:
+        path.write_bytes(data)
+        with h5py.File(path) as file:
+            names = file["names"]  # from here on the sums of the new version's headers have been checked
+            path.write_bytes(data[:at] + struct.pack("<I", 3 << 30) + data[at + 4 :])
+            with pytest.raises(ValueError, match="a text of 3221225472 bytes is not in the file"):
+                check_attributes(file)
+                check_attributes(names)
+                check_texts(names)
+
+
+def all_of(data, part):
+    return [at for at in range(len(data)) if data.startswith(part, at)]
+
+
+@pytest.mark.parametrize(("offset", "value"), [(8, 1 << 40), (8, 1 << 63), (0, 0)])
+def test_a_damaged_heap_is_refused(tmp_path, offset, value):
+    path = tmp_path / "a.h5"
+    write(path)
+    data = path.read_bytes()
+    at = data.index(b"GCOL") + offset
+    path.write_bytes(data[:at] + struct.pack("<Q", value) + data[at + 8 :])
+    with pytest.raises(ValueError, match="its texts are damaged"):
+        reread(path)
+
+
+def test_free_space_of_no_length_in_a_heap_is_refused(tmp_path):
+    """HDF5 2.0 would read it for ever."""
+    path = tmp_path / "a.h5"
+    write(path)
+    data = path.read_bytes()
+    at = data.index(b"GCOL") + 16
+    path.write_bytes(data[:at] + bytes(16) + data[at + 16 :])
+    with pytest.raises(ValueError, match="its texts are damaged"):
+        reread(path)
+
+
+def test_a_header_that_continues_in_itself_is_refused(tmp_path):
+    path = tmp_path / "a.h5"
+    write(path)
+    with h5py.File(path) as file:
+        at = h5py.h5o.get_info(file.id).addr
+    data = path.read_bytes()
+    message = struct.pack("<HHI", 0x10, 16, 0) + struct.pack("<QQ", at + 16, 24)
+    path.write_bytes(data[: at + 16] + message + data[at + 40 :])
+    with pytest.raises((ValueError, OSError)):
+        reread(path)
+
+
+@pytest.mark.parametrize("options", [{}, {"compression": "gzip"}, {"compression": "lzf"}])
+def test_a_chunk_of_gigabytes_is_refused(tmp_path, options):
+    side = MAX_CHUNK // 4 + 1
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        properties = {"maxshape": (None,), "chunks": (side,), **options}
+        file.create_dataset("x", (3,), "f4", **properties)
+        file.create_dataset("y", (3,), "f4", **{**properties, "chunks": (side - 1,)})
+    with open_h5(tmp_path / "a.h5") as file:
+        with pytest.raises(ValueError, match="x has chunks of"):
+            Dataset("n").read(file, "x", {})
+        assert not Dataset("n").read(file, "y", {}).any()

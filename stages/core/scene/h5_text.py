@@ -39,7 +39,7 @@ def check_attributes(item: h5py.Group | h5py.Dataset) -> None:
             start, to = (8, 8) if attribute[0] == 1 else (9 if attribute[0] == 3 else 8, 1)
             after_name = start + -(-name // to) * to
             values = after_name + -(-kind // to) * to + -(-space // to) * to
-            if attribute[after_name] & 15 == VARIABLE_LENGTH:
+            if attribute[after_name : after_name + 1] and attribute[after_name] & 15 == VARIABLE_LENGTH:
                 file.check(attribute[values : values + (len(attribute) - values) // 16 * 16])
 
 
@@ -47,6 +47,8 @@ class _Bytes:
     """The bytes of an open file; ValueError for those outside it."""
 
     def __init__(self, file: h5py.File):
+        if file.userblock_size:
+            raise ValueError("it begins with a user block, of another format")
         self._path = file.filename
         self._checked: dict[int, dict[int, int]] = {}  # length of each text, by address of its heap and number
 

@@ -46,15 +46,15 @@ def read_compressed(data: h5py.Dataset) -> np.ndarray:
     infos = [data.id.get_chunk_info(i) for i in range(data.id.get_num_chunks())]
     if any(info.filter_mask for info in infos):
         return data[()]
-    out = np.full(data.shape, data.fillvalue, data.dtype)
+    out, chunks, dtype = np.full(data.shape, data.fillvalue, data.dtype), data.chunks, data.dtype
 
-    def place(info) -> None:
-        stored = data.id.read_direct_chunk(info.chunk_offset)[1]
-        where = tuple(slice(a, a + b) for a, b in zip(info.chunk_offset, data.chunks, strict=True))
-        part = out[where]
-        part[...] = _decoded(stored, data.chunks, data.dtype)[tuple(slice(0, s) for s in part.shape)]
+    # Only this thread calls h5py: with several its lock may stay taken for ever (h5py issue 2920).
+    def place(chunk: tuple[tuple[int, ...], bytes]) -> None:
+        offset, stored = chunk
+        part = out[tuple(slice(a, a + b) for a, b in zip(offset, chunks, strict=True))]
+        part[...] = _decoded(stored, chunks, dtype)[tuple(slice(0, s) for s in part.shape)]
 
-    _in_threads(place, infos)
+    _in_threads(place, [(info.chunk_offset, data.id.read_direct_chunk(info.chunk_offset)[1]) for info in infos])
     return out
 
 

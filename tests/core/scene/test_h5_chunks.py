@@ -4,6 +4,7 @@ import h5py
 import numpy as np
 import pytest
 
+from stages.core.scene import h5_chunks
 from stages.core.scene.h5_chunks import CHUNK_BYTES, COMPRESSED, append_rows, read_compressed, write_compressed
 
 COUNT = CHUNK_BYTES // 12 + 1000  # rows of three floats: two chunks, the second one not full
@@ -48,3 +49,18 @@ def test_missing_chunks_hold_the_fill_value_and_damaged_ones_are_refused(tmp_pat
         data.id.write_direct_chunk((2, 0), b"not deflated")
         with pytest.raises(OSError, match="damaged"):
             read_compressed(data)
+
+
+def test_threads_that_decompress_do_not_call_h5py(tmp_path, monkeypatch):
+    values = np.random.default_rng(0).normal(size=(5000, 40)).astype("f4")
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        write_compressed(file, "x", values)
+    file = h5py.File(tmp_path / "a.h5")
+
+    def after_closing(function, items):
+        file.close()
+        assert len(items) > 1
+        return [function(item) for item in items]
+
+    monkeypatch.setattr(h5_chunks, "_in_threads", after_closing)
+    assert np.array_equal(read_compressed(file["x"]), values)

@@ -1,8 +1,24 @@
-"""The package pycolmap, imported so that it leaves the handling of signals as it was."""
+"""COLMAP through the package pycolmap, its long steps in a process of their own (colmap_worker.py).
 
+Where memory or disk space runs out, a thread of COLMAP's aborts its process: that ends the step with one error.
+"""
+
+from __future__ import annotations
+
+import json
 import signal
+import subprocess
+import sys
 import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from types import ModuleType
+
+from stages.core.errors import InputError
+
+WORKER = "import sys; sys.path[:] = sys.argv[1:]; from stages.reconstruct.colmap_worker import main; main()"
+_open: list[subprocess.Popen] = []  # the process of the context, if any
 
 
 def import_pycolmap() -> ModuleType:
@@ -13,3 +29,50 @@ def import_pycolmap() -> ModuleType:
     if handler is not None and threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, handler)
     return pycolmap
+
+
+@contextmanager
+def colmap_process() -> Iterator[subprocess.Popen]:
+    """Context, or decorator, with a process for `run_colmap`; within another such context its process."""
+    if _open:
+        yield _open[0]
+        return
+    process = subprocess.Popen([sys.executable, "-c", WORKER, *map(str, sys.path)], stdin=subprocess.PIPE,
+                               stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)  # fmt: skip
+    _open.append(process)
+    try:
+        yield process
+    finally:
+        _open.remove(process)
+        process.kill()
+        process.communicate()
+
+
+def run_colmap(task: str, folder: Path, progress: Callable[[int], object] | None = None, **arguments: object) -> None:
+    """Run a task of colmap_worker.TASKS, with arguments that JSON can hold, which writes its results to `folder`.
+
+    `progress` is called with the number of photos that are done. Raises RuntimeError where COLMAP fails, MemoryError,
+    and InputError where its process ends.
+    """
+    with colmap_process() as process:
+        try:
+            process.stdin.write(json.dumps([task, {"folder": str(folder), **arguments}]) + "\n")
+            process.stdin.flush()
+        except BrokenPipeError:
+            pass
+        for line in process.stdout:
+            kind, value = json.loads(line)
+            if kind == "done":
+                return
+            if kind == "progress" and progress is not None:
+                progress(value)
+            elif kind == "error":
+                raise MemoryError(value) if "bad_alloc" in value else RuntimeError(value)
+        raise InputError(
+            f"{folder}: COLMAP ended without a result ({_ending(process.wait())}); either memory or the disk is full: "
+            "close other programs, or set TMPDIR to a folder of a disk with more space"
+        )
+
+
+def _ending(status: int) -> str:
+    return f"signal {signal.Signals(-status).name}" if status < 0 else f"exit status {status}"

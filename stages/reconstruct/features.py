@@ -19,6 +19,7 @@ from tqdm import tqdm
 
 from stages.core.errors import InputError
 from stages.core.scene.schema import reason
+from stages.reconstruct.colmap import colmap_process, import_pycolmap, run_colmap
 from stages.reconstruct.photos import Photos
 
 MAX_SIDE = 1024  # longest side for feature extraction [px]
@@ -34,6 +35,7 @@ MAX_DESCRIPTOR_DISTANCE = 0.7  # of matching descriptors of unit length
 Feature = tuple[Tensor, Tensor]
 
 
+@colmap_process()
 def extract(photos: Photos, device: str = "cpu") -> list[Feature]:
     """SIFT keypoints and root-SIFT descriptors of every photo, the largest first; always on the CPU."""
     limit = MAX_FEATURES if len(photos) <= MAX_EXHAUSTIVE else MAX_FEATURES_MANY_PHOTOS
@@ -87,9 +89,7 @@ def _sift(images: list[np.ndarray]) -> list[tuple[np.ndarray, np.ndarray]]:
 
     Through files, since only COLMAP's own loop over files uses several threads.
     """
-    import pycolmap
-
-    options = pycolmap.FeatureExtractionOptions(use_gpu=False, num_threads=torch.get_num_threads())
+    pycolmap = import_pycolmap()
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         _check_space(folder, sum(image.nbytes + DATABASE_BYTES for image in images))
@@ -97,8 +97,7 @@ def _sift(images: list[np.ndarray]) -> list[tuple[np.ndarray, np.ndarray]]:
         for name, image in zip(names, images, strict=True):
             (folder / name).write_bytes(b"P5 %d %d 255\n" % image.shape[::-1] + image.tobytes())
         with writing_database(folder):
-            pycolmap.extract_features(folder / "features.db", folder, names, extraction_options=options,
-                                      device=pycolmap.Device.cpu)  # fmt: skip
+            run_colmap("extract", folder, names=names, threads=torch.get_num_threads())
         with pycolmap.Database.open(folder / "features.db") as database:
             ids = {image.name: image.image_id for image in database.read_all_images()}
             return [(database.read_keypoints(ids[name]), database.read_descriptors(ids[name]).data) for name in names]

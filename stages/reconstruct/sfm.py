@@ -21,8 +21,8 @@ from tqdm import tqdm
 
 from stages.core.errors import InputError, MissingPackage
 from stages.core.scene.cameras import Cameras, LensDistortion
-from stages.reconstruct import matching
-from stages.reconstruct.colmap import import_pycolmap
+from stages.reconstruct import features, matching
+from stages.reconstruct.colmap import colmap_process, import_pycolmap, run_colmap
 from stages.reconstruct.epipolar import EpipolarLines
 from stages.reconstruct.matching import MatchedPair, MatchingOptions
 from stages.reconstruct.photos import Photos
@@ -46,6 +46,7 @@ class SparseModel:
     dropped: dict[str, str] = field(default_factory=dict)  # photos left out -> reason
 
 
+@colmap_process()
 def estimate_cameras(
     photos: Photos, options: MatchingOptions = MatchingOptions(), steps: StepCache | None = None  # noqa: B008 -- frozen
 ) -> SparseModel:
@@ -55,8 +56,8 @@ def estimate_cameras(
     """
     steps = steps or StepCache()
     _load_pycolmap(options.seed)
-    database = matching.build_database(photos, matching.initial_cameras(photos), steps, options)
     types = (SparseModel, Cameras, LensDistortion)
+    database = matching.build_database(photos, matching.initial_cameras(photos), steps, options)
     return steps.cached("model", lambda: _run_mapper(photos, database, options.seed), types)
 
 
@@ -72,14 +73,12 @@ def _run_mapper(photos: Photos, database: Path, seed: int) -> SparseModel:
             f"{photos.source}: the camera hardly moved between the photos; walk around the objects, or, if they are "
             "on a turntable, put it in front of a plain backdrop, so that only the objects are matched"
         )
-    options = _mapper_options(photos, seed)
     with tempfile.TemporaryDirectory() as folder, tqdm(
         total=len(photos), desc="placing photos", unit="photo", leave=False
     ) as bar:
-        models = pycolmap.incremental_mapping(
-            database, folder, folder, options,
-            initial_image_pair_callback=lambda: bar.update(2), next_image_callback=lambda: bar.update(1),
-        )  # fmt: skip
+        with features.writing_database(Path(folder)):
+            run_colmap("map", folder, bar.update, database=str(database), photos=len(photos), seed=seed)
+        models = {int(path.name): pycolmap.Reconstruction(path) for path in sorted(Path(folder).iterdir())}
     best = max(models.values(), key=lambda m: (m.num_reg_images(), m.num_points3D()), default=None)
     if best is None or best.num_reg_images() < 2 or best.num_points3D() < 50:
         raise InputError(f"{photos.source}: {_failure_reason(len(photos), len(pairs))}")
@@ -89,16 +88,6 @@ def _run_mapper(photos: Photos, database: Path, seed: int) -> SparseModel:
         len(model.cameras), len(photos), len(model.points), best.compute_mean_reprojection_error(),
     )  # fmt: skip
     return model
-
-
-def _mapper_options(photos: Photos, seed: int):
-    """COLMAP's defaults, on one thread, and without minimum sizes for very few photos."""
-    import pycolmap
-
-    options = pycolmap.IncrementalPipelineOptions(random_seed=seed, num_threads=1, extract_colors=False)
-    options.min_model_size = min(3, len(photos))
-    options.triangulation.ignore_two_view_tracks = len(photos) > 3  # up to 3 photos have mostly these
-    return options
 
 
 def _failure_reason(photos: int, pairs: int) -> str:
@@ -142,6 +131,7 @@ def _drop_reasons(photos: Photos, pairs: list[MatchedPair], best, models: dict) 
     return reasons
 
 
+@colmap_process()
 def triangulate(
     photos: Photos, cameras: Cameras, lenses: LensDistortion,
     options: MatchingOptions = MatchingOptions(), steps: StepCache | None = None,  # noqa: B008 -- frozen
@@ -175,9 +165,10 @@ def triangulate(
         model.add_camera_with_trivial_rig(known[i])
         image = pycolmap.Image(name=name, keypoints=np.zeros((0, 2)), camera_id=i + 1, image_id=i + 1)
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(viewmat[:3].double().numpy()))
-    mapper = _mapper_options(photos, options.seed)
-    with tempfile.TemporaryDirectory() as folder, steps.timed("model"):
-        done = pycolmap.triangulate_points(model, database, folder, folder, options=mapper)
+    with tempfile.TemporaryDirectory() as folder, steps.timed("model"), features.writing_database(Path(folder)):
+        model.write(folder)
+        run_colmap("triangulate", folder, database=str(database), photos=len(photos), seed=options.seed)
+        done = pycolmap.Reconstruction(folder)
     if done.num_points3D() < 50:
         raise InputError(f"{photos.source}: the photos overlap too little to find depth; {CAPTURE_ADVICE}")
     log.info("%d points found with the given cameras, which fit %.0f %% of the matches to %.2f px", done.num_points3D(),

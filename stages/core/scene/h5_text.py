@@ -26,14 +26,14 @@ MAX_BLOCKS = 1000  # of an object header
 
 def check_texts(data: h5py.Dataset) -> None:
     """ValueError where a text of a dataset of variable length is not where and as long as the file says."""
-    with _Bytes(data.file) as file:
+    with _FileBytes(data.file) as file:
         for part in _stored(data, file):
             file.check(part)
 
 
 def check_attributes(item: h5py.Group | h5py.Dataset) -> None:
     """The same for the attributes of a file, group or dataset."""
-    with _Bytes(item.file) as file:
+    with _FileBytes(item.file) as file:
         for attribute in _attributes(file, h5py.h5o.get_info(item.id).addr):
             name, kind, space = (int.from_bytes(attribute[i : i + 2], "little") for i in (2, 4, 6))
             start, to = (8, 8) if attribute[0] == 1 else (9 if attribute[0] == 3 else 8, 1)
@@ -43,7 +43,7 @@ def check_attributes(item: h5py.Group | h5py.Dataset) -> None:
                 file.check(attribute[values : values + (len(attribute) - values) // 16 * 16])
 
 
-class _Bytes:
+class _FileBytes:
     """The bytes of an open file; ValueError for those outside it."""
 
     def __init__(self, file: h5py.File):
@@ -52,7 +52,7 @@ class _Bytes:
         self._path = file.filename
         self._checked: dict[int, dict[int, int]] = {}  # length of each text, by address of its heap and number
 
-    def __enter__(self) -> _Bytes:
+    def __enter__(self) -> _FileBytes:
         with open(self._path, "rb") as file:
             self._map = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
         return self
@@ -92,7 +92,7 @@ class _Bytes:
         return self._checked[heap]
 
 
-def _stored(data: h5py.Dataset, file: _Bytes) -> Iterator[bytes]:
+def _stored(data: h5py.Dataset, file: _FileBytes) -> Iterator[bytes]:
     """The references of a dataset; those that it does not store are empty."""
     if data.id.get_storage_size() == 0:
         return
@@ -114,7 +114,7 @@ def _stored(data: h5py.Dataset, file: _Bytes) -> Iterator[bytes]:
         yield part
 
 
-def _attributes(file: _Bytes, at: int) -> Iterator[bytes]:
+def _attributes(file: _FileBytes, at: int) -> Iterator[bytes]:
     """The attribute messages of the object header at an address."""
     new = file.read(at, 4) == b"OHDR"  # of version 2
     flags = file.number(at + 5, 1) if new else 0

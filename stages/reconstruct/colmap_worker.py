@@ -1,0 +1,90 @@
+"""The process that runs COLMAP's long steps for colmap.py.
+
+It reads requests from stdin, one in a line: [task, arguments] in JSON. To each it writes lines to stdout: ["progress",
+number of photos] as often as needed, then ["done", null] or ["error", text]. It ends with its stdin, as when the
+process that started it has been killed.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import queue
+import signal
+import sys
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+from stages.reconstruct.colmap import import_pycolmap
+
+Progress = Callable[[int], None]
+
+
+def extract_features(progress: Progress, folder: str, names: list[str], threads: int) -> None:
+    """Write the SIFT features of the images `names` in `folder` to features.db there."""
+    pycolmap = import_pycolmap()
+    options = pycolmap.FeatureExtractionOptions(use_gpu=False, num_threads=threads)
+    pycolmap.extract_features(Path(folder) / "features.db", folder, names, extraction_options=options,
+                              device=pycolmap.Device.cpu)  # fmt: skip
+
+
+def map_photos(progress: Progress, folder: str, database: str, photos: int, seed: int) -> None:
+    """Write the models that COLMAP's incremental mapper finds to the folders 0, 1, ... in `folder`."""
+    found = import_pycolmap().incremental_mapping(
+        database, folder, folder, _mapper_options(photos, seed), initial_image_pair_callback=lambda: progress(2),
+        next_image_callback=lambda: progress(1),
+    )  # fmt: skip
+    for number, model in found.items():
+        (Path(folder) / str(number)).mkdir(exist_ok=True)
+        model.write(Path(folder) / str(number))
+
+
+def triangulate(progress: Progress, folder: str, database: str, photos: int, seed: int) -> None:
+    """Replace the model in `folder`, which has cameras and images, by one with points."""
+    pycolmap = import_pycolmap()
+    model = pycolmap.Reconstruction(folder)
+    options = _mapper_options(photos, seed)
+    pycolmap.triangulate_points(model, database, folder, folder, options=options).write(folder)
+
+
+def _mapper_options(photos: int, seed: int):
+    """COLMAP's defaults, on one thread, and without minimum sizes for very few photos."""
+    options = import_pycolmap().IncrementalPipelineOptions(random_seed=seed, num_threads=1, extract_colors=False)
+    options.min_model_size = min(3, photos)
+    options.triangulation.ignore_two_view_tracks = photos > 3  # up to 3 photos have mostly these
+    return options
+
+
+TASKS = {"extract": extract_features, "map": map_photos, "triangulate": triangulate}
+
+
+def main() -> None:
+    """Run tasks until stdin ends."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to both; the other process ends this one
+    out = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)  # whatever COLMAP prints
+
+    def say(kind: str, value: object) -> None:
+        out.write(json.dumps([kind, value]) + "\n")
+        out.flush()
+
+    requests: queue.SimpleQueue = queue.SimpleQueue()
+    threading.Thread(target=_read, args=(requests,), daemon=True).start()
+    pycolmap = import_pycolmap()
+    pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
+    while True:
+        task, arguments = requests.get()
+        try:
+            pycolmap.set_random_seed(arguments.get("seed", 0))
+            TASKS[task](lambda count: say("progress", count), **arguments)
+        except Exception as error:
+            say("error", "bad_alloc" if isinstance(error, MemoryError) else str(error))
+        else:
+            say("done", None)
+
+
+def _read(requests: queue.SimpleQueue) -> None:
+    for line in sys.stdin:
+        requests.put(json.loads(line))
+    os._exit(0)

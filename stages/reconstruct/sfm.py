@@ -201,7 +201,7 @@ def _from_colmap(model, dropped: dict[str, str] | None = None) -> SparseModel:
         sizes.append([camera.width, camera.height])
         lenses.append([camera.params[3], 0, 0, 0, 0] if camera.model.name == "SIMPLE_RADIAL" else [0.0] * 5)
     points, point_index, view_index = [], [], []
-    for point in model.points3D.values():
+    for _, point in sorted(model.points3D.items()):  # COLMAP's own order depends on how its table was filled
         views = sorted({row[e.image_id] for e in point.track.elements})
         point_index += [len(points)] * len(views)
         view_index += views

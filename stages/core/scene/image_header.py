@@ -34,8 +34,14 @@ def read_image_header(data: bytes) -> ImageHeader:
 
 
 def _png(data: bytes) -> ImageHeader:
+    """Decoders take memory for each chunk by its length, which is checked too."""
     if data[12:16] != b"IHDR" or data[25] not in PNG_CHANNELS:
         raise ValueError("no image")
+    at = 8
+    while at < len(data) and data[at + 4 : at + 8] != b"IEND":
+        at += 12 + _big(data, at, 4)
+        if at > len(data):
+            raise ValueError("a chunk is longer than the file")
     width, height = _big(data, 16, 4), _big(data, 20, 4)
     return ImageHeader(width, height, height * (width * data[24] * PNG_CHANNELS[data[25]] / 8) / MAX_DEFLATE_RATIO)
 

@@ -93,6 +93,19 @@ def test_webp_of_too_many_pixels_and_tiles_that_are_too_large_are_refused(tmp_pa
             read_image(tmp_path / name)
 
 
+def test_a_chunk_of_a_png_that_is_longer_than_the_file_is_refused_before_decoding(tmp_path, monkeypatch):
+    data = encode(".png", np.zeros((8, 8), np.uint8))
+    at = data.index(b"IDAT") - 4
+    length = int.from_bytes(data[at : at + 4], "big")
+    (tmp_path / "a.png").write_bytes(data[:at] + struct.pack(">I", length) + data[at + 4 :] + b"after its end")
+    assert not read_image(tmp_path / "a.png").any()
+    monkeypatch.setattr(images.cv2, "imdecode", lambda *_: pytest.fail("decoded"))
+    for wrong in (len(data) - at - 11, 2_097_152_160):
+        (tmp_path / "b.png").write_bytes(data[:at] + struct.pack(">I", wrong) + data[at + 4 :])
+        with pytest.raises(InputError, match="b.png: is not an image that can be read"):
+            read_image(tmp_path / "b.png")
+
+
 @pytest.mark.parametrize("suffix", FORMATS)
 def test_headers_that_break_off_are_refused(tmp_path, suffix):
     data = encode(suffix, np.zeros((8, 8, 3), np.uint8))

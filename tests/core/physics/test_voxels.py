@@ -1,0 +1,231 @@
+"""The steps from points on a surface to voxels, and from voxels to convex hulls, each on cases done by hand."""
+
+import itertools
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy import ndimage
+
+from stages.core.physics import convex_parts, particles
+from stages.core.physics.convex_parts import Solid, divide
+from stages.core.physics.particles import MIN_PARTICLE_OPACITY, MIN_PARTICLES, scene_size, surface_points, usable
+from stages.core.scene.gaussians import concatenate
+from tests.core.physics.test_particles import scene, splats
+
+
+def block(*sides, low=(0, 0, 0)):
+    """Indices of the voxels of a box."""
+    return np.array(list(itertools.product(*(range(a, a + n) for a, n in zip(low, sides, strict=True)))))
+
+
+def filled(shape, *blocks):
+    out = np.zeros(shape, bool)
+    for cells in blocks:
+        out[tuple(cells.T)] = True
+    return out
+
+
+def grid(*sides, step):
+    return torch.from_numpy(block(*sides) * float(step)).float()
+
+
+def test_spacing_is_the_median_distance_to_the_nearest_other():
+    line = torch.tensor([0.0, 1.0, 3.0, 7.0, 15.0])[:, None] * torch.tensor([[0.6, 0.8, 0.0]])
+    assert particles._spacing(line) == pytest.approx(2.0)  # 1, 1, 2, 4, 8
+    assert particles._spacing(grid(20, 20, 20, step=0.3)) == pytest.approx(0.3)  # more points than are looked at
+    assert particles._spacing(torch.ones(1, 3)) == 0.0
+
+
+def test_gap_is_nine_tenths_of_the_distances_to_the_third_neighbour():
+    line = np.arange(2000.0)[:, None] * np.array([[0.0, 0.0, 0.5]])
+    assert particles._gap(line) == pytest.approx(1.0)  # neighbours at .5, .5 and 1 within a line
+    cluster = np.concatenate([line[:1700], 5000 * (1 + np.arange(300))[:, None] * np.ones((1, 3))])
+    assert particles._gap(cluster) > 1000  # 15 % of the points are alone
+
+
+def test_size_of_a_scene_leaves_out_one_percent_at_each_end_and_the_background():
+    x = torch.linspace(0, 10, 1001)
+    means = torch.stack([x, 0.1 * x, 0 * x], 1)
+    whole = scene(splats(means), splats(torch.full((5, 3), 4.0)))
+    far = splats(torch.full((3, 3), 900.0), id=0)
+    assert scene_size(whole) == pytest.approx(9.8, rel=0.01)
+    both = replace(whole, gaussians=concatenate([whole.gaussians, far]))
+    assert scene_size(both) == pytest.approx(9.8, rel=0.01)
+    assert scene_size(replace(whole, gaussians=far)) == 1.0
+    assert scene_size(scene(splats(torch.ones(3, 3)))) == 1e-6
+
+
+def test_usable_gaussians_are_finite_of_positive_size_turned_and_opaque():
+    g = splats(torch.zeros(9, 3))
+    g.means[1, 2], g.scales[2, 0], g.quats[3, 1] = math.nan, math.inf, math.nan
+    g.scales[4, 1], g.scales[5, 2], g.quats[6] = 0.0, -1.0, 0.0
+    g.opacities[7], g.opacities[8] = MIN_PARTICLE_OPACITY, MIN_PARTICLE_OPACITY + 1e-6
+    assert usable(g).tolist() == [True, *[False] * 7, True]
+
+
+def test_points_of_a_surface_fill_ellipsoids_of_seven_tenths_of_the_gaussians():
+    """Uniform in the ball of radius .7: the mean square of a coordinate is .7^2 / 5 of the squared deviation."""
+    quat = torch.tensor([0.5**0.5, 0.0, 0.0, 0.5**0.5])  # a quarter turn about z: local x becomes y
+    g = splats(grid(12, 12, 1, step=1.0))
+    g = replace(g, quats=quat.repeat(144, 1), scales=torch.tensor([2.0, 1.0, 0.01]).repeat(144, 1))
+    points = surface_points(scene(g), 1, seed=0)
+    each = 8  # 4 x the product of the larger deviations, in squares of the spacing of 1
+    assert len(points) == 144 * (1 + each)
+    away = points[144:].reshape(144, each, 3) - g.means.numpy()[:, None]
+    local = away[..., [1, 0, 2]] / np.array([2.0, 1.0, 0.01])
+    assert np.linalg.norm(local, axis=-1).max() < 0.7 and np.linalg.norm(local, axis=-1).max() > 0.69
+    np.testing.assert_allclose((local**2).mean((0, 1)), 0.7**2 / 5, rtol=0.15)
+    np.testing.assert_allclose(local.mean((0, 1)), 0, atol=0.04)
+    assert (surface_points(scene(g), 1, seed=0) == points).all()
+    assert not (surface_points(scene(g), 1, seed=1) == points).all()
+
+
+def test_small_gaussians_are_sampled_once():
+    points = surface_points(scene(splats(grid(12, 12, 1, step=1.0), scale=0.1)), 1, seed=0)
+    assert len(points) == 2 * 144
+
+
+def test_the_skin_of_a_cube_of_nine_voxels():
+    """The outer layer of each face, without what is more than 3 steps from the 5 voxels in the middle."""
+    cube = filled((13, 13, 13), block(9, 9, 9, low=(2, 2, 2)))
+    skin = particles._thick_skin(cube)
+    assert skin.sum() == 6 * (5 * 5 + 2 * 2 * 5) and not skin[3:10, 3:10, 3:10].any()
+    assert not particles._thick_skin(filled((13, 13, 13), block(9, 9, 4, low=(2, 2, 2)))).any()  # too thin
+
+
+def test_trimming_removes_the_skin_whose_points_are_inside_the_centres_of_its_voxels():
+    cube = filled((15, 15, 15), block(11, 11, 11, low=(2, 2, 2)))
+    outer = np.argwhere(cube & ~ndimage.binary_erosion(cube)) + 0.5
+    towards = np.sign(7.5 - outer) * (np.abs(outer - 7.5) == 5)
+    assert particles._trim(cube, outer + 0.3 * towards).sum() == cube.sum() - particles._thick_skin(cube).sum()
+    assert (particles._trim(cube, outer - 0.3 * towards) == cube).all()
+    elsewhere = np.array([[-3.0, 1.0, 1.0], [99.0, 1.0, 1.0]])  # outside the grid
+    assert (particles._trim(cube, np.concatenate([outer - 0.3 * towards, elsewhere])) == cube).all()
+
+
+def test_components_smaller_than_a_fiftieth_of_the_largest_are_removed():
+    large, small, smaller = block(10, 10, 1), block(2, 1, 1, low=(0, 0, 5)), block(1, 1, 1, low=(9, 9, 9))
+    touching = np.array([[9, 10, 1]])  # at a corner of the large one
+    body = filled((12, 12, 12), large, small, smaller, touching)
+    assert (particles._largest(body) == filled(body.shape, large, touching)).all()  # 101 / 50 > 2
+    body[9, 10, 1] = False
+    assert (particles._largest(body) == filled(body.shape, large, small)).all()
+    assert (particles._largest(filled(body.shape, smaller)) == filled(body.shape, smaller)).all()
+
+
+def test_what_is_outside_is_connected_with_a_face_of_the_grid():
+    free = ~filled((7, 7, 7), block(5, 5, 5, low=(1, 1, 1)))
+    free[3, 3, 3] = True
+    outside = particles._outside(free)
+    assert outside.sum() == 7**3 - 5**3 and not outside[3, 3, 3]
+    free[3, 3, 4] = free[3, 3, 5] = True
+    assert particles._outside(free)[3, 3, 3]
+
+
+def test_voxels_of_two_bodies_go_to_the_smaller_one():
+    a, b = block(6, 6, 6, low=(-3, 2, 5)), block(4, 4, 4, low=(1, 3, 9))
+    shared = set(map(tuple, a)) & set(map(tuple, b))
+    assert len(shared) == 2 * 4 * 2
+    kept_a, kept_b = particles._without_overlap([a, b])
+    assert set(map(tuple, kept_b)) == set(map(tuple, b)) and set(map(tuple, kept_a)) == set(map(tuple, a)) - shared
+    inner = block(4, 4, 3, low=(0, 0, 0))
+    same = particles._without_overlap([inner, inner])  # neither would keep MIN_PARTICLES but the first
+    assert len(inner) >= MIN_PARTICLES and [len(x) for x in same] == [48, 48]
+    left = particles._without_overlap([block(5, 8, 2), block(3, 8, 2)])
+    assert [len(x) for x in left] == [80, 48]  # 32 voxels would remain
+
+
+def test_directions_are_unit_vectors_spread_evenly():
+    d = convex_parts._fibonacci(200)
+    np.testing.assert_allclose(np.linalg.norm(d, axis=1), 1, atol=1e-12)
+    np.testing.assert_allclose(d.mean(0), 0, atol=0.01)
+    np.testing.assert_allclose(d.T @ d / 200, np.eye(3) / 3, atol=0.01)
+    np.testing.assert_allclose(d[:, 2], 1 - (2 * np.arange(200) + 1) / 200, atol=1e-12)
+    nearest = np.sort(d @ d.T, axis=1)[:, -2]
+    assert np.arccos(nearest).min() > 0.75 * math.sqrt(4 * math.pi / 200)
+
+
+def test_corners_of_voxels():
+    found = convex_parts._corners(np.array([[1.0, 2.0, 3.0], [0.0, 0.0, 0.0]]), 0.2)
+    expected = {tuple(np.round(c + 0.1 * np.array(s), 6)) for c in ([1, 2, 3], [0, 0, 0])
+                for s in itertools.product((-1, 1), repeat=3)}  # fmt: skip
+    assert len(found) == 16 and {tuple(np.round(c, 6)) for c in found} == expected
+
+
+def extreme(cells):
+    return cells[(cells @ convex_parts.SPREAD.T).argmax(0)]
+
+
+def test_volume_of_the_hull_of_a_block_of_voxels():
+    cells = block(4, 3, 2).astype(float)
+    assert convex_parts._volume(extreme(cells)) == pytest.approx(24)
+    assert convex_parts._volume(extreme(cells), 0.5) == pytest.approx(3.5 * 2.5 * 1.5)
+    assert convex_parts._volume(extreme(np.zeros((1, 3)))) == pytest.approx(1)
+    assert convex_parts._volume(extreme(cells), 0.0) == pytest.approx(3 * 2 * 1)
+
+
+def test_points_inside_a_block_count_against_its_hull():
+    cells = block(7, 7, 7).astype(float)
+    points = np.array([[3.0, 3, 3], [4.9, 3, 3], [6.8, 3, 3], [3, 3, 9]])
+    assert convex_parts._inside(extreme(cells), points @ convex_parts.SPREAD.T) == 2
+    cost = convex_parts._hull_cost(cells, points)
+    assert cost == pytest.approx(6.5**3 + 2 * convex_parts.OTHERS)
+    assert convex_parts._hull_cost(cells, points[2:]) == pytest.approx(6.5**3)
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_an_angle_is_divided_at_its_corner(axis):
+    roll = lambda cells: np.roll(cells, axis, axis=1)  # noqa: E731
+    cells = roll(np.concatenate([block(4, 4, 29), block(25, 4, 4, low=(4, 0, 0))])).astype(float)
+    part = divide(cells, np.empty((0, 3)))
+    assert part.max() == 1
+    for k in range(2):  # a part is a box
+        assert np.prod(np.ptp(cells[part == k], axis=0) + 1) == (part == k).sum()
+    assert divide(roll(block(9, 5, 7)).astype(float), np.empty((0, 3))).max() == 0
+
+
+def test_others_between_two_legs_are_left_out_of_the_hull():
+    """A bench is divided further where something is below it."""
+    bench = np.concatenate([block(30, 6, 4, low=(0, 0, 20)), block(4, 6, 20), block(4, 6, 20, low=(26, 0, 0))])
+    alone = divide(bench.astype(float), np.empty((0, 3)))
+    below = divide(bench.astype(float), block(16, 6, 16, low=(7, 0, 2)).astype(float))
+    assert below.max() >= alone.max() >= 2
+    points = block(16, 6, 16, low=(7, 0, 2)).astype(float) @ convex_parts.SPREAD.T
+    for k in range(below.max() + 1):
+        assert convex_parts._inside(extreme(bench[below == k].astype(float)), points) == 0
+
+
+def test_extreme_voxels_accumulate_slab_by_slab():
+    along = np.array([[1.0, 5.0], [2.0, 1.0], [3.0, 3.0]])
+    found = convex_parts._accumulated(along, [np.array([0, 0]), None, np.array([1, 1]), np.array([2, 2])])
+    assert [f.tolist() for f in found] == [[0, 0], [0, 0], [1, 0], [2, 0]]
+    empty_first = convex_parts._accumulated(along, [None, np.array([1, 1])])
+    assert empty_first[0] is None and empty_first[1].tolist() == [1, 1]
+
+
+def test_voxels_around_are_within_the_bounds_and_not_next_to_the_body():
+    own = block(5, 5, 5).astype(float) * 0.1
+    own = np.concatenate([own, own + [1.0, 0, 0]])  # a gap in between
+    other = np.array([[0.7, 0.2, 0.2], [0.45, 0.2, 0.2], [0.7, 0.2, 0.49], [0.7, 0.2, 0.51], [3.0, 0.2, 0.2]])
+    solids = [Solid(own, 0.1, own), Solid(other, 0.1, other)]
+    np.testing.assert_allclose(convex_parts._around(solids, 0), other[[0, 2]])
+
+
+def test_moments_of_the_hull_of_a_box_and_of_a_tetrahedron():
+    box = np.array(list(itertools.product((0.0, 2.0), (1.0, 4.0), (-1.0, 3.0))))
+    volume, com, inertia = convex_parts._solid_moments(convex_parts._hull(box))
+    assert volume == pytest.approx(24) and com.tolist() == pytest.approx([1, 2.5, 1])
+    np.testing.assert_allclose(inertia, 24 / 12 * np.diag([9 + 16, 4 + 16, 4 + 9]), rtol=1e-5, atol=1e-5)
+    corner = np.concatenate([np.zeros((1, 3)), np.eye(3)])
+    volume, com, inertia = convex_parts._solid_moments(convex_parts._hull(corner))
+    assert volume == pytest.approx(1 / 6) and com.tolist() == pytest.approx([0.25] * 3)
+    np.testing.assert_allclose(np.diag(inertia), 2 * (1 / 60 - 1 / 96), rtol=1e-5)  # integral of x^2 is 1 / 60
+    np.testing.assert_allclose(inertia[0, 1], -(1 / 120 - 1 / 96), rtol=1e-5)  # of x y 1 / 120
+
+
+def test_no_hull_of_points_in_a_plane():
+    assert convex_parts._hull(np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]])) is None
+    assert convex_parts._hull(np.zeros((2, 3))) is None

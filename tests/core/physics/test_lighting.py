@@ -6,6 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from stages.core.physics import lighting
 from stages.core.physics.lighting import _best_fit, _lamps, _surface_terms
 from stages.core.raster.shadows import Light
 
@@ -59,3 +60,41 @@ def test_lamps_are_all_around_above_the_horizon():
     assert len({(lamp.direction, lamp.spread) for lamp in _lamps()}) == len(_lamps()) == 2 * (4 * 12 + 1)
     around = torch.atan2(directions[elevations == 25, 1], directions[elevations == 25, 0]) % (2 * math.pi)
     assert sorted(torch.rad2deg(around).round().int().unique().tolist()) == list(range(0, 360, 30))
+
+
+def test_the_terms_of_a_surface_are_of_second_degree_in_place_and_chromaticity():
+    points = torch.tensor([[0.0, 0.0, 9.0], [2.0, 0.0, 9.0], [0.0, 4.0, 9.0], [2.0, 4.0, 9.0]])
+    colours = torch.tensor([[0.3, 0.0, 0.0], [0.0, 0.3, 0.0], [0.0, 0.0, 0.3], [0.3, 0.3, 0.3]])
+    brightness, terms = _surface_terms(points, colours)
+    torch.testing.assert_close(brightness, torch.tensor([0.1, 0.1, 0.1, 0.3]))
+    x, y = ((points[:, :2] - torch.tensor([1.0, 2.0])) / points[:, :2].std()).T
+    u, v = torch.tensor([0.2, -0.1, -0.1, 0.0]), torch.tensor([-0.1, 0.2, -0.1, 0.0])
+    u, v = u / u.std(), v / v.std()
+    expected = [x**0, x, y, x * x, x * y, y * y, u, v, u * u, u * v, v * v]
+    torch.testing.assert_close(terms, torch.stack(expected, 1))
+    _, grey = _surface_terms(points, colours[3:].expand(4, 3))
+    assert not grey[:, 6:].any()
+
+
+def test_weighted_least_squares():
+    """A line through three points, of which the second counts twice and the third not at all."""
+    A = torch.tensor([[1.0, 0.0], [1.0, 1.0], [1.0, 2.0]]).double().expand(2, -1, -1)
+    y = torch.tensor([[1.0, 3.0, 99.0], [1.0, 3.0, 5.0]]).double()
+    weights = torch.tensor([[1.0, 2.0, 0.0], [1.0, 1.0, 1.0]]).double()
+    expected = torch.tensor([[1.0, 2.0], [1.0, 2.0]]).double()
+    found = lighting._solve(A, y, weights)
+    torch.testing.assert_close(found, expected, rtol=0, atol=2e-5)
+    torch.testing.assert_close(lighting._times(A, found)[1], y[1], rtol=0, atol=2e-5)
+    y[1, 1] = 6.0  # the mean of the residuals is 0 and they are 2, 1 to 4 as 1, -2, 1
+    torch.testing.assert_close(lighting._times(A, lighting._solve(A, y, weights))[1] - y[1],
+                               torch.tensor([1.0, -2.0, 1.0]).double(), rtol=0, atol=1e-4)  # fmt: skip
+    singular = lighting._solve(torch.zeros(1, 3, 2).double(), y[:1], weights[:1])
+    assert not singular.any()  # by the ridge
+
+
+def test_shares_of_sky_and_lamp_stay_below_all_of_the_light():
+    (_, A), hidden, _ = surface()
+    y = A @ torch.zeros(A.shape[1]) + 3 * (1 - 0.99 * hidden[1].amax(1)).log()
+    fit = _best_fit(A, hidden, y, LAMPS)
+    assert fit.light.sky >= 0 and fit.light.lamp >= 0
+    assert fit.light.sky + fit.light.lamp == pytest.approx(lighting.MAX_SHARE, abs=1e-6)

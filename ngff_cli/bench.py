@@ -84,7 +84,12 @@ def bench_reconstruct(
 
 @app.command("chain")
 def bench_chain(
-    photos: Annotated[Path, typer.Argument(metavar="PHOTOS", help="folder of photos or a video")],
+    photos: Annotated[
+        Path | None, typer.Argument(metavar="PHOTOS", help="folder of photos or a video; not with --table")
+    ] = None,
+    table: Annotated[
+        bool, typer.Option("--table", help="the paper's table instead: rendered photos of 3 and of 6 toys")
+    ] = False,
     quality: Annotated[str, typer.Option(help="quality of the reconstruction")] = "normal",
     device: Device = "auto",
     steps: Annotated[int, typer.Option(help="frames of the film")] = 100,
@@ -96,7 +101,15 @@ def bench_chain(
 ) -> None:
     """All stages from photos to a film: seconds, busy share of the GPU, and whether repeated runs give equal files."""
     from stages.lab.bench.chain import ChainBenchOptions, run
+    from stages.lab.bench.chain_table import ChainTableOptions
+    from stages.lab.bench.chain_table import run as run_table
 
+    if table != (photos is None):
+        raise InputError("give PHOTOS or --table")
+    if table:
+        rows = ChainTableOptions(quality=quality, device=device, steps=steps, repeat=repeat)
+        print_results(lambda path: run_table(path, rows), out, as_json)
+        return
     options = ChainBenchOptions(
         quality=quality, device=device, steps=steps, refine=refine, repeat=repeat, commands=commands
     )

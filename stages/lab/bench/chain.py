@@ -94,7 +94,7 @@ def run(photos: Path, out: Path | None = None, options: ChainBenchOptions = Chai
         for i in range(options.repeat):
             folder = Path(temporary) / str(i)
             folder.mkdir()
-            rows.append({name: _timed(call, device) for name, call in stage_calls(photos, folder, options).items()})
+            rows.append({name: timed(call, device) for name, call in stage_calls(photos, folder, options).items()})
             files.append({path.name: sha256(path) for path in sorted(folder.iterdir()) if path.suffix != ".json"})
             objects.append(len(read_scene(folder / "labelled.ply").objects))
             yield from _lines(f"run {i + 1}, one process", rows[-1])
@@ -121,7 +121,7 @@ def _lines(title: str, row: dict[str, tuple[float, float | None]]) -> Iterator[s
         yield f"  {name:12s} {seconds:6.2f} s" + ("" if busy is None else f", GPU busy {100 * busy:3.0f} %")
 
 
-def _timed(call: Callable[[], object], device: str) -> tuple[float, float | None]:
+def timed(call: Callable[[], object], device: str) -> tuple[float, float | None]:
     """Seconds of a call and the share of them in which the GPU was busy; None on a CPU."""
     with _busy_samples(device) as samples:
         start = time.perf_counter()

@@ -6,6 +6,7 @@ covers one of the objects for some frames.
 
 from __future__ import annotations
 
+import json
 import random
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -25,7 +26,7 @@ from stages.core.physics.state import FrameState
 from stages.core.raster.rasterise import rasterise
 from stages.core.scene.cameras import Cameras
 from stages.core.scene.gaussians import Gaussians, concatenate, transformed
-from stages.core.scene.images import VideoWriter, write_labels
+from stages.core.scene.images import VideoWriter, write_jpeg, write_labels
 from stages.core.scene.scene import Scene, SceneObject
 from stages.core.scene.trajectory import Keypoints, SimulationInfo, TrajectoryWriter
 from stages.lab.assets.toys import falling_toys
@@ -124,6 +125,17 @@ def _cameras(options: StandInOptions, rng: random.Random) -> Cameras:
     return Cameras(viewmats, K, sizes, tuple(f"camera{i:02d}.mp4" for i in range(count)))
 
 
+def write_photos(options: StandInOptions, folder: Path) -> None:
+    """A photo of each camera at the release, with noise."""
+    scene, generator = _scene(options, random.Random(options.seed)), torch.Generator().manual_seed(options.seed)
+    folder.mkdir(parents=True, exist_ok=True)
+    views = zip(scene.cameras.viewmats, scene.cameras.Ks, scene.cameras.sizes.tolist(), strict=True)
+    for i, (V, K, size) in enumerate(views):
+        image = rasterise(scene.gaussians, V[None], K[None], *size, torch.tensor(scene.background)).rgb[0]
+        noisy = image + options.noise * torch.randn(image.shape, generator=generator)
+        write_jpeg(folder / f"{i:02d}.jpg", noisy.clamp(0, 1))
+
+
 def write_truth(stand_in: StandIn, out: Path) -> None:
     """The true motion from the release on, at the frame rate of the films."""
     o, scene = stand_in.options, stand_in.scene
@@ -208,3 +220,13 @@ def write_films(stand_in: StandIn, folder: Path) -> None:
         with VideoWriter(folder / name, stand_in.options.fps) as video:
             for image in film(stand_in, camera):
                 video.append(image)
+
+
+def write_cameras(stand_in: StandIn, path: Path) -> None:
+    """The true cameras, as a nerfstudio transforms.json."""
+    cameras, flip = stand_in.scene.cameras, torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
+    frames = [{"file_path": name, "transform_matrix": (torch.linalg.inv(V.double()) @ flip).tolist()}
+              for V, name in zip(cameras.viewmats, cameras.names, strict=True)]  # fmt: skip
+    K, (width, height) = cameras.Ks[0].tolist(), cameras.sizes[0].tolist()
+    lens = {"fl_x": K[0][0], "fl_y": K[1][1], "cx": K[0][2], "cy": K[1][2], "w": width, "h": height}
+    path.write_text(json.dumps({**lens, "frames": frames}))

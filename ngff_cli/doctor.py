@@ -129,8 +129,8 @@ def _own_weights() -> Iterator[Finding]:
 def _published_weights() -> Iterator[Finding]:
     """Weights of networks trained by others, found by file name only; loading verifies their content."""
     from stages.core.backends import load
+    from stages.core.models.matching import weights as matcher
     from stages.core.models.pi3 import weights as pi3
-    from stages.reconstruct import features_learned as matcher
 
     for name in pi3.PUBLISHED:
         yield _weights(name, partial(pi3.find, name), f"ngff reconstruct --backend {name} --download")

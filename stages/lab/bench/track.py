@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
@@ -15,8 +16,11 @@ from torch import Tensor
 
 from stages.core.backends import pick_device
 from stages.core.errors import InputError
+from stages.core.geometry.cameras import centres
 from stages.core.geometry.rotations import matrix, rotation_angle
-from stages.core.scene.scene_ply import write_scene
+from stages.core.geometry.similarity import Similarity, umeyama
+from stages.core.scene.scene import Scene
+from stages.core.scene.scene_ply import read_scene, write_scene
 from stages.core.scene.trajectory import Trajectory, read_trajectory
 from stages.lab.bench.common import write_results
 from stages.lab.track.options import TrackOptions
@@ -26,12 +30,18 @@ from stages.lab.track.stand_in import (
     StandIn,
     StandInOptions,
     make_stand_in,
+    write_cameras,
     write_films,
     write_truth,
 )
 from stages.lab.track.track import run as track
 from stages.reconstruct.filmed_sequence import read_sequence
-from stages.reconstruct.options import ReconstructOptions
+from stages.reconstruct.options import QUALITY_PRESETS, ReconstructOptions
+from stages.reconstruct.stage import run as reconstruct
+from stages.segment.options import SegmentOptions
+from stages.segment.stage import run as segment
+
+MATCHED = 0.06  # largest distance of an object that was found from the true one, at the release [m]
 
 
 @dataclass(frozen=True)
@@ -42,49 +52,114 @@ class TrackBenchOptions:
     first: int = 0  # seed of the first sequence
     width: int = 240  # of the films [px]
     frames: int = 50
+    quality: str = ""  # at which scenes are reconstructed from their films; empty: the true scene is tracked
     device: str = "auto"
 
     def __post_init__(self):
         if self.sequences < 1 or self.frames < 20 or not 64 <= self.width <= 4096:
             raise InputError("--sequences must be 1 or more, --frames 20 or more and --width 64 to 4096")
+        if self.quality and self.quality not in QUALITY_PRESETS:
+            raise InputError(f"--reconstructed {self.quality}: choose from {', '.join(QUALITY_PRESETS)}")
 
 
-def measure(stand_in: StandIn, folder: Path, device: str) -> dict:
-    """Errors of the track of a stand-in, which is filmed into the folder."""
+class PoseErrors(NamedTuple):
+    """Of each true object in each frame, and whether it was seen; nan and false for objects that were not found."""
+
+    distance: Float[Tensor, "t o"]  # of its middle [m]
+    angle: Float[Tensor, "t o"]  # of its rotation since the release [degrees]
+    seen: Bool[Tensor, "t o"]
+
+
+def measure(stand_in: StandIn, folder: Path, device: str, quality: str = "") -> dict:
+    """Errors of the track of a stand-in, which is filmed into the folder; see TrackBenchOptions for `quality`."""
     films, truth, out = folder / "films", folder / "truth.h5", folder / "track.h5"
     write_films(stand_in, films)
     write_truth(stand_in, truth)
     began = time.monotonic()
-    _, sequence = read_sequence(films, ReconstructOptions(sequence=True))
-    frames = min(sequence.frames, stand_in.options.frames)
-    write_scene(folder / "scene.ply", replace(stand_in.scene, sequence=replace(sequence, frames=frames)))
+    scene = reconstructed_scene(stand_in, folder, device, quality) if quality else true_scene(stand_in, folder)
+    starts = read_scene(scene).sequence.starts
     options = TrackOptions(resolution=stand_in.options.width, keypoints=KEYPOINTS, seed=stand_in.options.seed,
-                           device=device)  # fmt: skip
-    list(track(folder / "scene.ply", films, out, options))
-    seconds = time.monotonic() - began
-    tracked, true = read_trajectory(out), read_trajectory(truth)
-    error, angle = pose_errors(tracked, true)
-    seen, (covered, open_) = tracked.confidence > 0, _covered(stand_in, tracked.confidence.shape)
+                           frames=stand_in.options.frames, device=device)  # fmt: skip
+    list(track(scene, films, out, options))
+    return {**errors_of(stand_in, read_trajectory(out), read_trajectory(truth)),
+            "offset_frames": _offset_error(starts, stand_in.starts), "seconds": round(time.monotonic() - began, 1),
+            }  # fmt: skip
+
+
+def true_scene(stand_in: StandIn, folder: Path) -> Path:
+    """The scene file of a stand-in as it is, with the times that its films tell."""
+    _, sequence = read_sequence(folder / "films", ReconstructOptions(sequence=True))
+    write_scene(folder / "scene.ply", replace(stand_in.scene, sequence=sequence))
+    return folder / "scene.ply"
+
+
+def reconstructed_scene(stand_in: StandIn, folder: Path, device: str, quality: str) -> Path:
+    """The scene file that `reconstruct --sequence --cameras` and `segment` make from the films of a stand-in."""
+    write_cameras(stand_in, folder / "transforms.json")
+    options = ReconstructOptions(sequence=True, cameras=folder / "transforms.json", quality=quality, device=device)
+    reconstruct(folder / "films", folder / "scene.ply", options)
+    segment(folder / "scene.ply", folder / "labelled.ply", SegmentOptions(device=device))
+    return folder / "labelled.ply"
+
+
+def errors_of(stand_in: StandIn, tracked: Trajectory, true: Trajectory) -> dict:
+    """Errors of a track, and which objects and frames it flags, for all objects together and for each."""
+    errors, frames = pose_errors(tracked, true), len(tracked)
+    covered, open_ = _covered(stand_in, errors.seen.shape)
+    starts = tracked.scene.provenance["starts"]
+    objects = {}
+    for i, o in enumerate(true.scene.objects):
+        row = slice(None), slice(i, i + 1)
+        objects[f"{o.id} {o.name}"] = _summary(PoseErrors(*(e[row] for e in errors)), covered[row], open_[row])
     return {
-        "position_mm": 1000 * float(error[seen].median()), "position_mm_90": 1000 * float(error[seen].quantile(0.9)),
-        "rotation_deg": float(angle[seen].median()), "rotation_deg_90": float(angle[seen].quantile(0.9)),
-        "position_mm_max": 1000 * float(error[seen].max()), "rotation_deg_max": float(angle[seen].max()),
-        "covered": int(covered.sum()), "covered_flagged": int((covered & ~seen).sum()),
-        "others": int(open_.sum()), "others_flagged": int((open_ & ~seen).sum()),
-        "offset_frames": _offset_error(sequence.starts, stand_in.starts),
-        "refined_offset_frames": _offset_error(tracked.scene.provenance["starts"], stand_in.starts),
-        "release_frames": _release_error(tracked.scene.provenance["starts"], stand_in.starts), "frames": frames,
-        "seconds": round(seconds, 1),
+        **_summary(errors, covered, open_), "objects": objects,
+        "refined_offset_frames": _offset_error(starts, stand_in.starts),
+        "release_frames": _release_error(starts, stand_in.starts), "frames": frames,
     }  # fmt: skip
 
 
-def pose_errors(tracked: Trajectory, true: Trajectory) -> tuple[Float[Tensor, "t o"], Float[Tensor, "t o"]]:
-    """Distance of the objects' middles [scene units] and angle between their rotations [degrees]."""
-    frames, ids = len(tracked), tracked.keypoints.object_id
-    off = tracked.positions - true.positions[:frames]
-    middle = torch.stack([off[:, ids == o.id].mean(1) for o in tracked.scene.objects], 1)
-    turn = matrix(tracked.rotation) @ matrix(true.rotation[:frames]).mT
-    return middle.norm(dim=-1), rotation_angle(turn)
+def _summary(errors: PoseErrors, covered: Bool[Tensor, "t o"], open_: Bool[Tensor, "t o"]) -> dict:
+    """Quantiles of the errors where objects were seen, and numbers of frames."""
+    seen, row = errors.seen, {}
+    for name, values in (("position_mm", 1000 * errors.distance[seen]), ("rotation_deg", errors.angle[seen])):
+        known = values if len(values) else torch.tensor([torch.nan])
+        row |= {
+            name: float(known.median()),
+            f"{name}_90": float(known.quantile(0.9)),
+            f"{name}_max": float(known.max()),
+        }
+    return {**row, "covered": int(covered.sum()), "covered_flagged": int((covered & ~seen).sum()),
+            "others": int(open_.sum()), "others_flagged": int((open_ & ~seen).sum())}  # fmt: skip
+
+
+def pose_errors(tracked: Trajectory, true: Trajectory) -> PoseErrors:
+    """The motion since the first frame of the objects that were found, against the true one, in the true world.
+
+    A true object is the one found nearest to it in the first frame.
+    """
+    frames, shape = len(tracked), (len(tracked), len(true.scene.objects))
+    world = _world(tracked.scene, true.scene)
+    com, turn = world(tracked.com), world.rotation @ matrix(tracked.rotation) @ world.rotation.mT
+    distance, angle = torch.full(shape, torch.nan), torch.full(shape, torch.nan)
+    seen = torch.zeros(shape, dtype=torch.bool)
+    for i in range(shape[1]):
+        middle, spin = true.com[:frames, i], matrix(true.rotation[:frames, i])
+        off = (com[0] - middle[0]).norm(dim=1)
+        k = int(off.argmin())
+        if off[k] > MATCHED:
+            continue
+        spin, found = spin @ spin[0].mT, turn[:, k] @ turn[0, k].mT
+        distance[:, i] = (found @ (middle[0] - com[0, k]) + com[:, k] - middle).norm(dim=1)
+        angle[:, i] = rotation_angle(found @ spin.mT)
+        seen[:, i] = tracked.confidence[:, k] > 0
+    return PoseErrors(distance, angle, seen)
+
+
+def _world(found: Scene, true: Scene) -> Similarity:
+    """From the world of a scene that was found to the true one, by their cameras."""
+    names = {name: i for i, name in enumerate(true.cameras.names)}
+    rows = [names[name] for name in found.cameras.names]
+    return umeyama(centres(found.cameras.viewmats), centres(true.cameras.viewmats[rows]))
 
 
 def _covered(stand_in: StandIn, shape: tuple[int, int]) -> tuple[Bool[Tensor, "t o"], Bool[Tensor, "t o"]]:
@@ -120,11 +195,18 @@ def run(out: Path | None, options: TrackBenchOptions) -> Iterator[str]:
     for seed in range(options.first, options.first + options.sequences):
         with tempfile.TemporaryDirectory() as folder:
             stand_in = make_stand_in(StandInOptions(width=options.width, frames=options.frames, seed=seed))
-            row = results[str(seed)] = measure(stand_in, Path(folder), device)
-        yield (f"{seed:<10}{row['position_mm']:>11.2f}{row['rotation_deg']:>10.2f}"
-               f"{row['covered_flagged']:>12} of {row['covered']:<2}{row['others_flagged']:>5} of {row['others']:<4}"
+            row = results[str(seed)] = measure(stand_in, Path(folder), device, options.quality)
+        yield (f"{_line(str(seed), row)}"
                f"{row['offset_frames']:>9.3f}{row['refined_offset_frames']:>9.3f}{row['release_frames']:>9.3f}"
                )  # fmt: skip
-        write_results(out, "track", device, {"width": options.width, "sequences": results})
+        yield from (_line(f"  {name}", each) for name, each in row["objects"].items())
+        write_results(out, "track", device, {"width": options.width, "reconstructed": options.quality,
+                                             "sequences": results})  # fmt: skip
     yield (f"median of the sequences: {median(r['position_mm'] for r in results.values()):.2f} mm, "
            f"{median(r['rotation_deg'] for r in results.values()):.2f} degrees")  # fmt: skip
+
+
+def _line(name: str, row: dict) -> str:
+    return (f"{name:<10}{row['position_mm']:>11.2f}{row['rotation_deg']:>10.2f}"
+            f"{row['covered_flagged']:>12} of {row['covered']:<2}{row['others_flagged']:>5} of {row['others']:<4}"
+            )  # fmt: skip

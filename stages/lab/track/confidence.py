@@ -13,8 +13,9 @@ from stages.lab.track.poses import Poses
 from stages.lab.track.synthesis import Synthesiser
 
 MIN_PIXELS = 12  # of an object in a picture that says something about it
-MIN_TOLERANCE = 0.1  # difference of a colour below which a pixel confirms an object
-TOLERANCE_FACTOR = 3.0  # of that difference to the median where the objects are known to be
+MIN_SCALE = 0.1  # smallest scale of residuals: difference of a colour
+SCALE_FACTOR = 3.0  # of that difference to the median where the objects are known to be
+CHANCE = 0.25  # share of the pixels of an object at a wrong pose that may confirm it
 CONFIRMED = 0.6  # share of such pixels above which a picture confirms an object
 MIN_VIEWS = 2  # pictures that must confirm an object
 
@@ -32,10 +33,21 @@ def differences(
     return found
 
 
-def tolerances(found: list[list[Tensor]]) -> list[float]:
-    """For each object the difference up to which a pixel confirms it, from pictures in which its place is known."""
-    joined = [torch.cat(parts) for parts in zip(*found, strict=True)]
-    return [max(TOLERANCE_FACTOR * float(d.median()), MIN_TOLERANCE) if len(d) else MIN_TOLERANCE for d in joined]
+def scales(right: list[list[Tensor]]) -> list[float]:
+    """For each object the scale of its residuals, from differences where its pose is known."""
+    joined = [torch.cat(parts) for parts in zip(*right, strict=True)]
+    return [max(SCALE_FACTOR * float(d.median()), MIN_SCALE) if len(d) else MIN_SCALE for d in joined]
+
+
+def tolerances(wrong: list[list[Tensor]], scale: Sequence[float]) -> list[float]:
+    """For each object the difference up to which a pixel confirms it: that which CHANCE of its pixels have at wrong
+    poses, but at least the scale of its residuals.
+
+    Residuals at the release do not tell: the scene was fitted to these pictures. Other sides of an object, seen later,
+    are known less well.
+    """
+    joined = [torch.cat(parts) for parts in zip(*wrong, strict=True)]
+    return [max(float(d.quantile(CHANCE)), s) if len(d) else s for d, s in zip(joined, scale, strict=True)]
 
 
 def confidences(found: list[list[Tensor]], tolerance: Sequence[float]) -> tuple[Float[Tensor, "o"], Float[Tensor, "o"]]:

@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 import logging
+import math
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 from tqdm import tqdm
 
 from stages.core.scene.cameras import Cameras
 from stages.core.scene.scene import Scene
 from stages.lab.track.alignment import Observation, align, change_of, robust_weights
-from stages.lab.track.confidence import confidences, differences, tolerances
+from stages.lab.track.confidence import confidences, differences, scales, tolerances
 from stages.lab.track.film_masks import UNKNOWN
 from stages.lab.track.films import Film
 from stages.lab.track.poses import Poses
-from stages.lab.track.search import search
+from stages.lab.track.search import search, spread_rotations
 from stages.lab.track.synthesis import Camera, Synthesiser, reduced
 
 log = logging.getLogger(__name__)
@@ -26,7 +27,10 @@ REFINING = {4: 2, 2: 2}  # the same where both neighbours in time are known
 JUDGING = 2  # reduction of the pictures from which confidences are taken
 RETIMING = (4, 2)  # reduction of the pictures from which starts are corrected, before each later pass
 RETIMING_STEPS = 2
-CERTAIN = 0.85  # confidence from which a lost object counts as found
+CERTAIN = 0.85  # confidence from which a lost object counts as found, of that which is usual for it
+FOUND = 0.75  # the same of one that was searched, at a pose that is distinct
+LASTING = 3  # frames for which an object that was found again must be seen
+WRONG_TURNS, WRONG_VIEWS = 8, 3  # wrong rotations and pictures from which tolerances are taken
 FALLING = 6  # frames of a fall from which the time of the release is found
 MAX_MISFIT = 0.1  # of a free fall in them [frames]
 
@@ -53,7 +57,14 @@ class Tracker:
         self.still = torch.zeros(len(self.rest.centre), 6, device=device)
         self.gains = [self._gain(i) for i in range(len(films))]
         first = self.observe(0, JUDGING, self.still, self.still)
-        self.tolerance = tolerances(differences(self.synthesiser, first, self.rest))
+        self.scale = scales(differences(self.synthesiser, first, self.rest))
+        self.tolerance = tolerances(self._wrong(first[:: math.ceil(len(first) / WRONG_VIEWS)]), self.scale)
+
+    def _wrong(self, first: list[Observation]) -> list[list[Tensor]]:
+        """Differences to pictures of the release where all objects are turned wrongly."""
+        turns = spread_rotations(WRONG_TURNS).to(self.device)
+        turned = [Poses(turn.expand_as(self.rest.rotation), self.rest.centre) for turn in turns]
+        return [row for poses in turned for row in differences(self.synthesiser, first, poses)]
 
     def _gain(self, i: int) -> Float[Tensor, "3"]:
         """Brightness of a film's channels over those of the scene, at the release."""
@@ -93,7 +104,7 @@ class Tracker:
     ) -> Poses:  # fmt: skip
         """The poses in a frame from poses nearby; `fixed` objects stay."""
         levels = [(self.observe(frame, reduction, *motion), count) for reduction, count in steps.items()]
-        return align(self.synthesiser, levels, poses, self.tolerance, fixed)
+        return align(self.synthesiser, levels, poses, self.scale, fixed)
 
     def judge(self, frame: int, poses: Poses, motion: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
         """Confidence and number of pixels of each object in a frame."""
@@ -119,16 +130,18 @@ def first_pass(tracker: Tracker, frames: int, gravity: Float[Tensor, "3"]) -> Tr
     poses, shares, pixels = [rest], [share], [number]
     last, missing = rest, torch.zeros_like(velocity[:, 0])  # where last seen, and how many frames ago
     for frame in tqdm(range(1, frames), desc="tracking", unit="frame", leave=False):
-        away, motion = missing > 0, (velocity, velocity)
+        away, motion, usual = missing > 0, (velocity, velocity), _usual(torch.stack(shares))
         n = (missing + 1)[:, None]
         fall = n * missing[:, None] / 2 * torch.cat([torch.zeros_like(gravity), gravity])
         found = tracker.fit(frame, FIRST, last.moved(n * velocity + fall), motion)
         share, number = tracker.judge(frame, found, motion)
-        for i in (away.cpu() & (share < CERTAIN)).nonzero()[:, 0].tolist():
+        doubtful = away.cpu() & (share < CERTAIN * usual)
+        for i in doubtful.nonzero()[:, 0].tolist():
             again = search(tracker, frame, i, found, velocity, int(missing[i]))
             if again is not None:
-                found, (share, number) = again, tracker.judge(frame, again, motion)
-        share = _certain(share, away.cpu())
+                found, (share, number) = again.poses, tracker.judge(frame, again.poses, motion)
+                doubtful[i] = not again.distinct or bool(share[i] < FOUND * usual[i])
+        share = torch.where(doubtful, 0.0, share)
         lost = (share == 0).to(tracker.device)
         step = torch.where(away[:, None], 0.0, last.step_to(found))
         velocity = torch.where(lost[:, None], velocity, step)
@@ -136,7 +149,7 @@ def first_pass(tracker: Tracker, frames: int, gravity: Float[Tensor, "3"]) -> Tr
         shares.append(share)
         pixels.append(number)
         last, missing = poses[-1], torch.where(lost, missing + 1, 0.0)
-    return TrackedMotion(Poses.stack(poses), torch.stack(shares), torch.stack(pixels), {})
+    return TrackedMotion(Poses.stack(poses), lasting(torch.stack(shares)), torch.stack(pixels), {})
 
 
 def from_release(tracker: Tracker, track: TrackedMotion) -> TrackedMotion:
@@ -176,9 +189,24 @@ def _shifted(poses: Poses, late: float) -> Poses:
     return poses[at].moved(part * poses[at].step_to(poses[(at + 1).clamp(max=last)]))
 
 
-def _certain(share: Float[Tensor, "o"], was_lost: Bool[Tensor, "o"]) -> Float[Tensor, "o"]:
-    """The confidences, 0 for what was lost and is not found again with certainty: it may be turned wrongly."""
-    return torch.where(was_lost & (share < CERTAIN), 0.0, share)
+def _usual(shares: Float[Tensor, "t o"]) -> Float[Tensor, "o"]:
+    """The mean confidence of each object where it was seen; 1 where it never was."""
+    seen = shares > 0
+    return torch.where(seen.any(0), shares.sum(0) / seen.sum(0).clamp_min(1), 1.0)
+
+
+def lasting(shares: Float[Tensor, "t o"]) -> Float[Tensor, "t o"]:
+    """The confidences, 0 where an object was seen for fewer than LASTING frames between frames in which it was lost."""
+    kept = shares.clone()
+    for i in range(shares.shape[1]):
+        seen = (shares[:, i] > 0).tolist()
+        start = 0
+        for t in range(1, len(seen) + 1):
+            if t == len(seen) or seen[t] != seen[start]:
+                if seen[start] and start > 0 and t < len(seen) and t - start < LASTING:
+                    kept[start:t, i] = 0
+                start = t
+    return kept
 
 
 def _choose(mask: Tensor, yes: Poses, no: Poses) -> Poses:
@@ -187,7 +215,7 @@ def _choose(mask: Tensor, yes: Poses, no: Poses) -> Poses:
                  torch.where(mask[:, None], yes.centre, no.centre))  # fmt: skip
 
 
-def _motions(track: TrackedMotion, frame: int) -> tuple[Tensor, Tensor]:
+def motions(track: TrackedMotion, frame: int) -> tuple[Tensor, Tensor]:
     """The motions from the frame before, and to the frame after; at either end the same twice."""
     p, last = track.poses, len(track.poses.centre) - 1
     before = p[frame - 1].step_to(p[frame]) if frame > 0 else None
@@ -199,15 +227,16 @@ def refined(tracker: Tracker, track: TrackedMotion) -> TrackedMotion:
     """The track with every pose fitted again, with the motions between frames as they are known now."""
     rotation, centre = track.poses.rotation.clone(), track.poses.centre.clone()
     shares, pixels = track.confidence.clone(), track.pixels.clone()
-    now = replace(track, poses=Poses(rotation, centre))
+    now, usual = replace(track, poses=Poses(rotation, centre)), _usual(track.confidence)
     for frame in tqdm(range(1, len(centre)), desc="refining", unit="frame", leave=False):
-        motion = _motions(now, frame)
+        motion = motions(now, frame)
         found = tracker.fit(frame, REFINING, now.poses[frame], motion)
         share, pixels[frame] = tracker.judge(frame, found, motion)
-        shares[frame] = _certain(share, shares[frame] == 0)
+        doubtful = (shares[frame] == 0) & (share < CERTAIN * usual)  # it may be turned wrongly
+        shares[frame] = torch.where(doubtful, 0.0, share)
         found = _choose((shares[frame] == 0).to(tracker.device), now.poses[frame], found)
         rotation[frame], centre[frame] = found.rotation, found.centre
-    return replace(now, confidence=shares, pixels=pixels)
+    return replace(now, confidence=lasting(shares), pixels=pixels)
 
 
 def retimed(tracker: Tracker, track: TrackedMotion, reduction: int) -> list[Film]:
@@ -226,14 +255,14 @@ def _lateness(tracker: Tracker, track: TrackedMotion, reduction: int) -> Float[T
     """How much later each film's pictures were taken than assumed [frames], by a step of Gauss and Newton's method."""
     along, square = torch.zeros(len(tracker.films)), torch.full((len(tracker.films),), 1e-9)
     for frame in range(1, len(track.confidence)):
-        motion = _motions(track, frame)
+        motion = motions(track, frame)
         poses, seen = track.poses[frame], track.confidence[frame].to(tracker.device) > 0
         for o in tracker.observe(frame, reduction, *motion):
             change = change_of(o, o.draw(tracker.synthesiser, poses), poses.centre)
             keep = seen[change.row]
             speed = (motion[1] if o.late > 0 else motion[0])[change.row[keep]]
             r, by_time = change.residual[keep], torch.einsum("pci,pi->pc", change.jacobian[keep], speed)
-            w = robust_weights(r, max(tracker.tolerance))[:, None]
+            w = robust_weights(r, max(tracker.scale))[:, None]
             along[o.film] += float((w * by_time * r).sum())
             square[o.film] += float((w * by_time.square()).sum())
     return along / square

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from stages.core.geometry.cameras import depths, project
-from stages.core.geometry.rotations import matrix
+from stages.core.geometry.rotations import matrix, rotation_angle
 from stages.lab.track.alignment import Observation, robust_cost
 from stages.lab.track.poses import Poses
 from stages.lab.track.synthesis import MASK_CONTRAST
@@ -19,20 +19,29 @@ if TYPE_CHECKING:
     from stages.lab.track.follow import Tracker
 
 COARSE = 4  # reduction of the pictures
-SEARCHING = {4: 10}  # largest number of steps by reduction
+SEARCHING = {8: 10, 4: 5}  # largest number of steps by reduction, coarse to fine: starts are up to 30 degrees off
 MAX_REACH = 12  # half width of the grid of places [half sizes of the object]
 SPREAD = 0.15  # of that share below the highest
 MIN_VIEWS = 3  # pictures that must show a place
 MIN_SUPPORT = 0.7  # share of the pictures that must show something unexplained at a place
 ROTATIONS = 72  # that are tried
 STARTS = 4  # rotations from which the object is aligned, the best of all tried
+DISTINCT = 30.0  # angle from which two rotations are not the same [degrees]
+RIVAL = 0.7  # share of what the best pose explains that another rotation may explain, where the best is certain
 VIEWS = 3  # pictures in which rotations are compared
 LIKE = 0.15  # difference from the nearest colour of an object up to which a pixel may show it
 AWAY = 1e4  # where an object is not seen [scene units]
 
 
-def search(tracker: Tracker, frame: int, i: int, poses: Poses, velocity: Tensor, missing: int) -> Poses | None:
-    """The poses with object i, which was last seen `missing` frames ago, at its best pose; None if it is not seen."""
+class Sighting(NamedTuple):
+    """An object that was found again."""
+
+    poses: Poses  # of all objects
+    distinct: bool  # whether no other rotation explains the pictures nearly as well
+
+
+def search(tracker: Tracker, frame: int, i: int, poses: Poses, velocity: Tensor, missing: int) -> Sighting | None:
+    """Object i, which was last seen `missing` frames ago, at its best pose; None if it is not seen."""
     seen = tracker.observe(frame, COARSE, velocity, velocity)
     gone = Poses(poses.rotation, poses.centre.clone())
     gone.centre[i] = AWAY
@@ -49,13 +58,17 @@ def search(tracker: Tracker, frame: int, i: int, poses: Poses, velocity: Tensor,
     if starts[0][0] >= _cost(tracker, some, gone):  # the pictures are explained better without the object
         return None
     others = torch.arange(len(poses.centre), device=tracker.device) != i
-    motion = (velocity, velocity)
+    motion, without = (velocity, velocity), _cost(tracker, seen, gone)
     aligned = [tracker.fit(frame, SEARCHING, start, motion, others) for _, start in starts[:STARTS]]
-    return min(aligned, key=lambda p: _cost(tracker, seen, p))
+    explained = [without - _cost(tracker, seen, p) for p in aligned]
+    best = max(range(len(aligned)), key=lambda k: explained[k])
+    turned = [float(rotation_angle(p.rotation[i] @ aligned[best].rotation[i].mT)) for p in aligned]
+    rivals = [e for e, angle in zip(explained, turned, strict=True) if angle > DISTINCT]
+    return Sighting(aligned[best], max([0.0, *rivals]) < RIVAL * explained[best])
 
 
 def _cost(tracker: Tracker, seen: list[Observation], poses: Poses) -> float:
-    scale = max(tracker.tolerance)
+    scale = max(tracker.scale)
     return sum(robust_cost(o.difference(o.draw(tracker.synthesiser, poses)), scale) for o in seen)
 
 
@@ -63,7 +76,7 @@ def _places(
     tracker: Tracker, seen: list[Observation], gone: Poses, i: int, middle: Float[Tensor, "3"], missing: int
 ) -> Float[Tensor, "n 3"]:
     """Places around where an object is expected, at which most pictures show something unexplained in its colours."""
-    size, limit = tracker.synthesiser.sizes[i], tracker.tolerance[i]
+    size, limit = tracker.synthesiser.sizes[i], tracker.scale[i]
     reach = min(MAX_REACH, 4 + 2 * missing)
     steps = torch.arange(-reach, reach + 1, device=tracker.device) * size / 2
     places = middle + torch.cartesian_prod(steps, steps, steps)

@@ -20,7 +20,7 @@ from stages.lab.track.poses import Poses
 
 MIN_ALPHA = 0.5  # opacity above which a pixel shows an object
 FAR = 1e6  # depth where there is nothing [scene units]
-PALETTE = 12  # colours of an object
+PALETTE, PALETTE_ROUNDS = 24, 10  # clusters of an object's colours, and iterations in which they are found
 MASK_CONTRAST = 0.5  # between the label image of an object and its surroundings, where that of colours is 0 to 1
 BEHIND = 0.02  # how far an object may be behind the background's depth and still be drawn [of its depth]
 
@@ -122,8 +122,14 @@ def reduced(image: Float[Tensor, "h w c"], reduction: int) -> Float[Tensor, "h2 
 
 
 def _palette(colours: Float[Tensor, "n 3"]) -> Float[Tensor, "k 3"]:
-    """A few colours of an object, far from each other."""
-    return colours[farthest_points(colours, PALETTE).to(colours.device)].clamp(0, 1)
+    """The centres of a few clusters of an object's colours (k-means): single odd colours have no cluster."""
+    centre = colours[farthest_points(colours, PALETTE).to(colours.device)]
+    for _ in range(PALETTE_ROUNDS):
+        nearest = torch.cdist(colours, centre).argmin(1)
+        total = torch.zeros_like(centre).index_add_(0, nearest, colours)
+        count = torch.bincount(nearest, minlength=len(centre))[:, None]
+        centre = torch.where(count > 0, total / count.clamp_min(1), centre)
+    return centre[count[:, 0] >= len(colours) / len(centre) ** 2].clamp(0, 1)
 
 
 def spread_directions(count: int) -> Float[Tensor, "n 3"]:

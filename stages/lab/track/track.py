@@ -71,7 +71,7 @@ def report(world: Scene, track: TrackedMotion) -> Iterator[str]:
         line = f"{o.id} {o.name}: seen in {int(seen.sum())} of {len(seen)} frames, mean confidence "
         line += f"{float(share[seen].mean()):.2f}" if seen.any() else "0"
         for first, last in _runs((~seen).tolist()):
-            why = "hidden" if float(pixels[first : last + 1].median()) > 0 else "out of view"
+            why = "hidden or not recognised" if float(pixels[first : last + 1].median()) > 0 else "out of view"
             line += f"; lost in {first} to {last} ({why})" if last > first else f"; lost in {first} ({why})"
         yield line
 

@@ -1,7 +1,7 @@
 """Measures of implausible motion: penetration, energy gain, creep and spread, taken in every frame.
 
 penetration: deepest keypoint of an object inside another one or below the floor, beyond the depth at rest, relative to
-the smaller height of both.
+the smaller height of both. A keypoint more than a voxel outside its own body, as floaters are, counts by so much less.
 creep: speed in the last quarter of the time of an object that is slow in all of it [its size / s].
 spread: largest change of the root mean square distance of an object's keypoints from their mean, relative to rest.
 energy_gain: largest mechanical energy of all objects above that at the start, or after the last force, relative to the
@@ -16,13 +16,11 @@ from collections import deque
 from functools import cache
 
 import numpy as np
-from scipy import ndimage
 
 from stages.core.geometry.rotations import matrix
-from stages.core.physics.convex_parts import VOXELS_ALONG
 from stages.core.physics.forces import ForcePrompts
 from stages.core.physics.materials import MODELS, choose_materials
-from stages.core.physics.particles import filled_voxels
+from stages.core.physics.solid_surface import SolidSurface, solid_surface
 from stages.core.physics.state import FrameState
 from stages.core.scene.scene import Scene
 from stages.core.scene.trajectory import Keypoints
@@ -47,7 +45,7 @@ class PlausibilityMonitor:
         self._size = np.array([np.ptp(r, axis=0).max() if len(r) else np.inf for r in self._rest])
         self._height = np.array([np.ptp(r[:, 2]) if len(r) else np.inf for r in self._rest]).clip(1e-9)
         self._floor = options.floor if options.floor is not None else scene.floor
-        self._body = cache(self._depth_function)
+        self._surface, self._outside = cache(self._surface_of), cache(self._outside_of)
         self._at_rest = cache(self._rest_depth)
         count = len(scene.objects)
         self.penetration, self._partner = np.zeros(count), [""] * count
@@ -81,13 +79,15 @@ class PlausibilityMonitor:
         high = np.array([p.max(0) if len(p) else np.full(3, -np.inf) for p in points])
         for a in np.flatnonzero(moved):
             if self._floor is not None and len(points[a]):
-                seen = max(0.0, self._floor - self._rest[a][:, 2].min())
-                self._record(a, self._floor - low[a, 2] - seen, self._height[a], "the floor")
+                below, seen = (
+                    float((self._floor - p[:, 2] - self._outside(a)).max()) for p in (points[a], self._rest[a])
+                )
+                self._record(a, below - max(seen, 0.0), self._height[a], "the floor")
         near = ((low[:, None] < high) & (low < high[:, None])).all(-1) & (moved[:, None] | moved)
         for a, b in zip(*np.nonzero(near), strict=True):
             if a != b:
                 local = (points[a][self._few[a]] - com[b]) @ R[b] + self._origin[b]
-                depth = float(self._body(b)(local).max()) - self._at_rest(a, b)
+                depth = float(self._depth(a, b, local).max()) - self._at_rest(a, b)
                 smaller = min(self._height[a], self._height[b])
                 for i, other in ((a, b), (b, a)):
                     o = self._scene.objects[other]
@@ -98,17 +98,19 @@ class PlausibilityMonitor:
             self.penetration[row], self._partner[row] = depth / height, partner
 
     def _rest_depth(self, a: int, b: int) -> float:
-        return max(0.0, float(self._body(b)(self._rest[a][self._few[a]]).max()))
+        return max(0.0, float(self._depth(a, b, self._rest[a][self._few[a]]).max()))
 
-    def _depth_function(self, row: int):
-        """A function from points (k, 3), in the rest frame, to their depths below the surface of an object's body."""
-        voxels, h = filled_voxels(self._scene, self._scene.objects[row].id, VOXELS_ALONG, self._options.seed)
-        cells = np.floor(voxels.double().numpy() / h).astype(np.int64)
-        low = cells.min(0) - 2
-        full = np.zeros(cells.max(0) - low + 3, bool)
-        full[tuple((cells - low).T)] = True
-        depth = h * (ndimage.distance_transform_edt(full) - ndimage.distance_transform_edt(~full))
-        return lambda x: ndimage.map_coordinates(depth, (x / h - low - 0.5).T, order=1, mode="nearest") - h / 2
+    def _depth(self, a: int, b: int, x: np.ndarray) -> np.ndarray:
+        """Depths of some of the keypoints of object a, at x (k, 3) in the rest frame of object b, in that one."""
+        return self._surface(b).depth(x) - self._outside(a)[self._few[a]]
+
+    def _surface_of(self, row: int) -> SolidSurface:
+        return solid_surface(self._scene, self._scene.objects[row].id, self._options.seed)
+
+    def _outside_of(self, row: int) -> np.ndarray:
+        """By how much the keypoints (k,) of an object are more than a voxel outside its own body."""
+        body = self._surface(row)
+        return np.maximum(-body.depth(self._rest[row]) - body.h, 0)
 
     def _mechanical_energy(self, points: list[np.ndarray], before: list[np.ndarray], mass: np.ndarray) -> float:
         """Kinetic and potential energy per unit of mass between two frames, by the keypoints [units^2 / s^2]."""

@@ -1,10 +1,8 @@
 """Convex parts of an object, for rigid-body collision, and its volume, centre of mass and inertia.
 
-An object that fills its convex hull is one part. The filled voxels of others are cut by planes, one part at a time: the
-part whose hull has most empty space, along the plane after which the hulls of both sides together are smallest. Space
-of other objects counts OTHERS times, so that parts of different objects overlap at the start only where the objects do.
-The hulls are then those of each part's voxel centres and of the surface points at them. Lengths are in the unit of the
-Gaussians.
+An object that fills its convex hull is one part. The filled voxels of others are divided by planes (`convex_cuts.py`).
+The hulls are then those of the points of the surface (`solid_surface.py`) at each part's voxels, with their faces moved
+to the mean level of the surface under them. Lengths are in the unit of the Gaussians.
 """
 
 from __future__ import annotations
@@ -18,19 +16,13 @@ from jaxtyping import Float
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 from torch import Tensor
 
+from stages.core.physics.convex_cuts import EXTREMES, divide
 from stages.core.physics.keypoints import farthest_points
-from stages.core.physics.particles import filled_voxels, inliers, usable
+from stages.core.physics.solid_surface import solid_surface
 from stages.core.scene.cached import cached_in_scene
 from stages.core.scene.scene import Scene
 
-VOXELS_ALONG = 48  # voxels along the longest side of an object
 CONVEX = 0.9  # fraction of its hull that a convex object fills: voxels are accurate to about 5 %
-MAX_PARTS = 24  # of an object
-EMPTY, PART_EMPTY = 0.05, 0.1  # share of empty space in the hulls, of all parts together or of one, that is accepted
-OTHERS = 10  # weight of the space in a hull that belongs to other objects, relative to empty space
-MIN_VOXELS = 30  # of a part that is divided
-CUTS = 7  # planes tried along each of six axes: those of the world, and the principal ones of the part
-DIRECTIONS = 64  # in which a hull is measured; the hull of a ball in these has 91 % of its volume
 MAX_VERTICES = 200  # of a part: a ball is round to 1 %
 CORNERS = np.stack(np.meshgrid(*[[-0.5, 0.5]] * 3), -1).reshape(-1, 3)
 
@@ -42,6 +34,7 @@ class Solid:
     voxels: np.ndarray  # (m, 3), centres
     h: float  # edge of a voxel
     surface: np.ndarray  # (n, 3), points on it
+    seen: np.ndarray  # (k, 3), centres of its Gaussians
 
 
 @dataclass(frozen=True)
@@ -68,13 +61,10 @@ def convex_parts(scene: Scene, seed: int = 0, bottom: float = -np.inf) -> list[C
 
 
 def _solid(scene: Scene, object_id: int, seed: int, bottom: float) -> Solid:
-    voxels, h = filled_voxels(scene, object_id, VOXELS_ALONG, seed)
-    voxels = voxels[voxels[:, 2] > min(bottom, float(voxels[:, 2].max()) - h)].double().numpy()
-    g = scene.gaussians.to("cpu")[(scene.gaussians.object_id == object_id).cpu()]
-    surface = g.means[usable(g)]
-    surface = surface[inliers(surface)].double().numpy() if len(surface) else voxels.copy()
-    surface[:, 2] = surface[:, 2].clip(min=bottom)
-    return Solid(voxels, h, surface)
+    body = solid_surface(scene, object_id, seed)
+    voxels = body.voxels[body.voxels[:, 2] > min(bottom, float(body.voxels[:, 2].max()) - body.h)]
+    seen, surface = (np.column_stack([p[:, :2], p[:, 2].clip(min=bottom)]) for p in (body.seen, body.points))
+    return Solid(voxels, body.h, surface, seen if len(seen) else voxels)
 
 
 def _around(solids: list[Solid], row: int) -> np.ndarray:
@@ -88,7 +78,7 @@ def _around(solids: list[Solid], row: int) -> np.ndarray:
 
 def _parts(solid: Solid, others: np.ndarray, seed: int) -> ConvexParts:
     volume = len(solid.voxels) * solid.h**3
-    whole = _hull(solid.surface)
+    whole = _hull(solid.seen)
     if whole is not None and whole.volume * CONVEX < volume:
         volume, com, inertia = _solid_moments(whole)
         return ConvexParts((_vertices(whole, seed),), volume, com, inertia)
@@ -133,98 +123,47 @@ def _solid_moments(hull: ConvexHull) -> tuple[float, Float[Tensor, "3"], Float[T
 def _hulls(solid: Solid, part: np.ndarray) -> list[ConvexHull]:
     """The hull of each part: of the points of the surface at its voxels, and of its voxels that are away from these."""
     voxels, h, surface = solid.voxels, solid.h, solid.surface
-    near = cKDTree(voxels).query(surface, 8, distance_upper_bound=h)[1]
-    of = np.append(part, -1)[near]
+    of = np.append(part, -1)[cKDTree(voxels).query(surface, 8, distance_upper_bound=h)[1]]
+    inner = cKDTree(surface).query(voxels, distance_upper_bound=h)[0] == np.inf
     hulls = []
     for k in range(part.max() + 1):
-        points = np.concatenate([surface[(of == k).any(1)], voxels[part == k]])
-        hulls.append(_hull(points) or ConvexHull(_corners(voxels[part == k], h)))
+        own = surface[(of == k).any(1)]
+        hull = _hull(_extreme(np.concatenate([own, voxels[inner & (part == k)]])))
+        if hull is None:
+            hulls.append(ConvexHull(_corners(voxels[part == k], h)))
+        else:
+            hulls.append(_balanced(hull, own, h) if len(own) else hull)
     return hulls
+
+
+def _extreme(points: np.ndarray) -> np.ndarray:
+    """The points that are extreme in one of EXTREMES."""
+    return points[np.unique((points @ EXTREMES.T).argmax(0))] if len(points) > len(EXTREMES) else points
+
+
+def _balanced(hull: ConvexHull, surface: np.ndarray, h: float) -> ConvexHull:
+    """The hull with each face moved inwards to the mean depth of the surface under it, by at most h.
+
+    A convex part bridges the hollows of a surface. So it is as often above as below it, and its squared error is least.
+    """
+    normal, offset = hull.equations[:, :3], hull.equations[:, 3]
+    depth = -(surface @ normal.T + offset)
+    face = depth.argmin(1)
+    count = np.bincount(face, minlength=len(normal))
+    shift = np.bincount(face, depth.min(1), len(normal)) / count.clip(1)
+    shift = shift.clip(0, h)
+    # each vertex moves so that its faces do: least squares, weighted by their area
+    t = hull.points[hull.simplices]
+    area = np.linalg.norm(np.cross(t[:, 1] - t[:, 0], t[:, 2] - t[:, 0]), axis=1)
+    M, r = np.zeros((len(hull.points), 3, 3)), np.zeros((len(hull.points), 3))
+    for corner in hull.simplices.T:
+        np.add.at(M, corner, area[:, None, None] * normal[:, :, None] * normal[:, None, :])
+        np.add.at(r, corner, (area * shift)[:, None] * normal)
+    M, r = M[hull.vertices], r[hull.vertices]
+    M += 0.01 * np.trace(M, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+    return _hull(hull.points[hull.vertices] - np.linalg.solve(M, r[..., None])[..., 0]) or hull
 
 
 def _corners(voxels: np.ndarray, h: float) -> np.ndarray:
     """Corners (8 m, 3) of voxels (m, 3) of edge h."""
     return (voxels[:, None] + h * CORNERS).reshape(-1, 3)
-
-
-def divide(cells: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """The part, from 0, of each of the unit voxels at cells (m, 3) of a body; `others` (n, 3) are points outside it."""
-    part = np.zeros(len(cells), np.int64)
-    cost = {0: _hull_cost(cells, others) - len(cells)}  # volume of a part's hull that the part does not fill
-    while len(cost) < MAX_PARTS and sum(cost.values()) > EMPTY * len(cells):
-        worst = max(cost, key=lambda k: cost[k])
-        rows = np.flatnonzero(part == worst)
-        if cost[worst] <= PART_EMPTY * len(rows):
-            break
-        side = _best_cut(cells[rows], others) if len(rows) >= MIN_VOXELS else None
-        if side is None:
-            cost[worst] = 0.0
-            continue
-        part[rows[side]] = other = len(cost)
-        for k in (worst, other):
-            own = cells[part == k]
-            cost[k] = _hull_cost(own, others) - len(own)
-    return part
-
-
-def _hull_cost(cells: np.ndarray, others: np.ndarray) -> float:
-    """Volume of the hull of a body of voxels, which lies about half way between those of their centres and corners,
-    where the space of others counts OTHERS times.
-    """
-    extreme = cells[(cells @ SPREAD.T).argmax(0)]
-    return _volume(extreme, 0.5) + OTHERS * _inside(extreme, others @ SPREAD.T)
-
-
-def _inside(extreme: np.ndarray, along: np.ndarray) -> int:
-    """How many points, given (n, d) along SPREAD, are inside the hull of the extreme voxels by half a voxel or more."""
-    return int((along < (extreme * SPREAD).sum(1) - 0.5).all(1).sum())
-
-
-def _volume(extreme: np.ndarray, edge: float = 1.0) -> float:
-    """Volume of the hull of voxels of some edge of which these are the extreme ones in each direction of SPREAD."""
-    hull = _hull(extreme + edge / 2 * np.sign(SPREAD))
-    return 0.0 if hull is None else hull.volume
-
-
-def _best_cut(cells: np.ndarray, others: np.ndarray) -> np.ndarray | None:
-    """The side (m,) of each voxel of the plane after which the hulls of both sides are smallest; None without any."""
-    smallest, best = np.inf, None
-    along = cells @ SPREAD.T
-    outside = others @ SPREAD.T
-    outside = outside[(outside < along.max(0)).all(1)]
-    for axis in np.concatenate([np.eye(3), np.linalg.eigh(np.cov(cells.T))[1].T]):
-        x = cells @ axis
-        slab = np.searchsorted(np.linspace(x.min(), x.max(), CUTS + 2)[1:-1], x)
-        slabs = [np.flatnonzero(slab == k) for k in range(CUTS + 1)]
-        extreme = [rows[along[rows].argmax(0)] if len(rows) else None for rows in slabs]
-        below, above = _accumulated(along, extreme), _accumulated(along, extreme[::-1])[::-1]
-        for k in range(CUTS):
-            if below[k] is not None and above[k + 1] is not None:
-                volume = sum(_volume(e) + OTHERS * _inside(e, outside) for e in (cells[below[k]], cells[above[k + 1]]))
-                if volume < smallest:
-                    smallest, best = volume, slab <= k
-    return best
-
-
-def _accumulated(along: np.ndarray, extreme: list[np.ndarray | None]) -> list[np.ndarray | None]:
-    """The extreme voxels in each direction of the first slab, of the first two, and so on."""
-    out, now = [], None
-    for rows in extreme:
-        if now is None or rows is None:
-            now = rows if now is None else now
-        else:
-            direction = np.arange(along.shape[1])
-            now = np.where(along[rows, direction] > along[now, direction], rows, now)
-        out.append(now)
-    return out
-
-
-def _fibonacci(count: int) -> np.ndarray:
-    """Unit vectors (count, 3), spread evenly (Fibonacci lattice)."""
-    k = np.arange(count) + 0.5
-    z, turn = 1 - 2 * k / count, np.pi * (1 + 5**0.5) * k
-    r = np.sqrt(1 - z * z)
-    return np.stack([r * np.cos(turn), r * np.sin(turn), z], 1)
-
-
-SPREAD = _fibonacci(DIRECTIONS)

@@ -8,6 +8,7 @@ from scipy.spatial import ConvexHull, Delaunay
 from stages.core.physics.convex_parts import convex_parts, divide
 from stages.core.scene.scene import Scene, SceneObject
 from stages.lab.assets.shapes import Surface, box, ellipsoid, to_gaussians, union
+from stages.lab.bench.physics_experiments import bowl
 from tests.conftest import two_balls_scene
 
 
@@ -61,6 +62,7 @@ def test_a_sparse_ball_on_the_floor_is_filled():
 
 def test_a_concave_object_is_divided():
     """A dumb-bell: no part fills more than the bottom of the groove between its balls."""
+
     def sphere(x):
         centre = torch.tensor([x, 0.0, 0.0])
         return ellipsoid((0.1,) * 3, 2000).moved((x, 0.0, 0.0)), lambda p: (p - centre).norm(dim=1) < 0.0999
@@ -77,13 +79,31 @@ def test_a_concave_object_is_divided():
 
 
 def test_parts_leave_out_the_space_of_other_objects():
-    """A shallow arch over a plate: the plate is in the hull of the arch, but not in those of its parts."""
-    arch = np.stack(np.meshgrid(np.arange(-14, 15), np.arange(-6, 7), np.arange(40, 60)), -1).reshape(-1, 3)
-    arch = arch[np.hypot(arch[:, 0], arch[:, 2]) >= 45]
-    plate = np.stack(np.meshgrid(np.arange(-4, 5), np.arange(-4, 5), [43.5]), -1).reshape(-1, 3)
+    """A block with a shallow dent over a plate: the plate is in the hull of the block, but in none of its parts."""
+    block = np.stack(np.meshgrid(np.arange(-14, 15), np.arange(-6, 7), np.arange(40, 60)), -1).reshape(-1, 3)
+    block = block[(block[:, 2] > 41) | (np.abs(block[:, :2]) > 2).any(1)]
+    plate = np.stack(np.meshgrid(np.arange(-1, 1.1, 0.5), np.arange(-1, 1.1, 0.5), [40.3]), -1).reshape(-1, 3)
 
     def inside(part: np.ndarray) -> int:
-        hulls = [Delaunay(arch[part == k]) for k in range(part.max() + 1)]
+        hulls = [Delaunay(block[part == k]) for k in range(part.max() + 1)]
         return sum((hull.find_simplex(plate) >= 0).sum() for hull in hulls)
 
-    assert inside(divide(arch, np.empty((0, 3)))) == len(plate) and inside(divide(arch, plate)) == 0
+    assert inside(divide(block, np.empty((0, 3)))) == len(plate) and inside(divide(block, plate)) == 0
+
+
+def test_parts_of_a_shell_follow_its_inner_surface():
+    """Half a spherical shell: inner surface accurate to a third of a voxel on average, and nowhere a voxel inside."""
+    inner, outer = 0.25, 0.3
+    shell = scene(bowl(inner, outer))
+    hulls = convex_parts(shell)[0].hulls
+    rays = torch.nn.functional.normalize(torch.randn(400, 3, generator=torch.Generator().manual_seed(0)), dim=1).numpy()
+    rays, centre = rays[rays[:, 2] < -0.7], np.array([0.0, 0.0, outer])
+    first = np.full(len(rays), np.inf)
+    for hull in hulls:
+        faces = ConvexHull(hull.double().numpy()).equations
+        away, toward = -(faces[:, :3] @ centre + faces[:, 3]), rays @ faces[:, :3].T
+        enter = np.where(toward < 0, away / toward, -np.inf).max(1)
+        leave = np.where(toward > 0, away / toward, np.inf).min(1)
+        first = np.where(enter <= leave, np.minimum(first, enter), first)
+    h = 2 * outer / 48
+    assert abs(np.median(first) - inner) < h / 3 and first.min() > inner - h

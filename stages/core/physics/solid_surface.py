@@ -1,0 +1,75 @@
+"""The surface of an object's filled body, finer than its voxels.
+
+Samples are the object's Gaussians within a voxel of the surface of the voxels, with normals from the smoothed voxels,
+and faces of voxels where there are none, as at undersides. The signed distance is the mean of those to the tangent
+planes of the nearest samples. Source: Hoppe et al. 1992, "Surface reconstruction from unorganized points".
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import ndimage
+from scipy.spatial import cKDTree
+
+from stages.core.physics.particles import filled_voxels, inliers, usable
+from stages.core.scene.cached import cached_in_scene
+from stages.core.scene.scene import Scene
+
+VOXELS_ALONG = 48  # voxels along the longest side of an object
+BARE = 3.0  # distance to the samples beyond which faces of voxels are added [voxels], which are a third of the spacing
+NEAREST = 4  # samples that give a distance
+STEPS = np.concatenate([np.eye(3, dtype=np.int64), -np.eye(3, dtype=np.int64)])
+
+
+class SolidSurface:
+    """Voxels, samples and signed distance of an object's body, in scene units."""
+
+    def __init__(self, voxels: np.ndarray, h: float, points: np.ndarray):
+        """`voxels` (m, 3) are centres of edge h; `points` (n, 3) are about on the surface."""
+        self.voxels, self.h, self.seen = voxels, h, points
+        cells = np.floor(voxels / h).astype(np.int64)
+        self._low = cells.min(0) - 2
+        full = np.zeros(cells.max(0) - self._low + 3, bool)
+        full[tuple((cells - self._low).T)] = True
+        self._depth = h * (ndimage.distance_transform_edt(full) - ndimage.distance_transform_edt(~full))
+        near = points[np.abs(self._coarse_depth(points)) <= h]
+        smooth = ndimage.gaussian_filter(full.astype(np.float32), 1.0)
+        normals = -np.stack([self._at(slope, near) for slope in np.gradient(smooth)], 1)
+        length = np.linalg.norm(normals, axis=1, keepdims=True)
+        near, normals = near[length[:, 0] > 1e-3], (normals / length.clip(1e-3))[length[:, 0] > 1e-3]
+        open_ = np.stack([~full[tuple((cells - self._low + step).T)] for step in STEPS], 1)
+        row, side = np.nonzero(open_)
+        faces, outward = voxels[row] + h / 2 * STEPS[side], STEPS[side].astype(float)
+        if len(near):
+            bare = cKDTree(near).query(faces, distance_upper_bound=BARE * h)[0] == np.inf
+            faces, outward = faces[bare], outward[bare]
+        self.points, self.normals = np.concatenate([near, faces]), np.concatenate([normals, outward])
+        self._tree = cKDTree(self.points)
+
+    def depth(self, x: np.ndarray) -> np.ndarray:
+        """Depths (k,) of points (k, 3) below the surface, negative outside."""
+        out = self._coarse_depth(x)
+        close = np.flatnonzero(np.abs(out) < 2 * self.h)
+        if len(close):
+            distance, row = self._tree.query(x[close], NEAREST)
+            row = np.minimum(row, len(self.points) - 1)
+            fine = ((self.points[row] - x[close, None]) * self.normals[row]).sum(-1).mean(1)
+            known = distance[:, 0] < 2 * self.h
+            out[close[known]] = fine[known].clip(out[close[known]] - self.h, out[close[known]] + self.h)
+        return out
+
+    def _coarse_depth(self, x: np.ndarray) -> np.ndarray:
+        return self._at(self._depth, x) - self.h / 2
+
+    def _at(self, grid: np.ndarray, x: np.ndarray) -> np.ndarray:
+        return ndimage.map_coordinates(grid, (x / self.h - self._low - 0.5).T, order=1, mode="nearest")
+
+
+@cached_in_scene
+def solid_surface(scene: Scene, object_id: int, seed: int = 0) -> SolidSurface:
+    """The surface of an object. Raises InputError for one without any usable Gaussian."""
+    voxels, h = filled_voxels(scene, object_id, VOXELS_ALONG, seed)
+    g = scene.gaussians.to("cpu")[(scene.gaussians.object_id == object_id).cpu()]
+    means = g.means[usable(g)]
+    means = means[inliers(means)] if len(means) else means
+    return SolidSurface(voxels.double().numpy(), h, means.double().numpy())

@@ -1,7 +1,7 @@
 """Measures of implausible motion: penetration, energy gain, creep and spread, taken in every frame.
 
 penetration: deepest keypoint of an object inside another one or below the floor, beyond the depth at rest, relative to
-the smaller height of both. A keypoint more than a voxel outside its own body, as floaters are, counts by so much less.
+the smaller height of both. A keypoint outside its own mean surface, by noise or as a floater, counts by so much less.
 creep: speed in the last quarter of the time of an object that is slow in all of it [its size / s].
 spread: largest change of the root mean square distance of an object's keypoints from their mean, relative to rest.
 energy_gain: largest mechanical energy of all objects above that at the start, or after the last force, relative to the
@@ -108,9 +108,8 @@ class PlausibilityMonitor:
         return solid_surface(self._scene, self._scene.objects[row].id, self._options.seed)
 
     def _outside_of(self, row: int) -> np.ndarray:
-        """By how much the keypoints (k,) of an object are more than a voxel outside its own body."""
-        body = self._surface(row)
-        return np.maximum(-body.depth(self._rest[row]) - body.h, 0)
+        """How far the keypoints (k,) of an object are outside its own body."""
+        return np.maximum(-self._surface(row).depth(self._rest[row]), 0)
 
     def _mechanical_energy(self, points: list[np.ndarray], before: list[np.ndarray], mass: np.ndarray) -> float:
         """Kinetic and potential energy per unit of mass between two frames, by the keypoints [units^2 / s^2]."""

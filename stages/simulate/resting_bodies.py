@@ -1,11 +1,12 @@
 """Rigid bodies that are at rest in photos, and held until their equilibrium is disturbed.
 
 Photos show a static equilibrium, but not all that keeps it: undersides, the relief of the table and things that are
-no objects are missing. A body that touches nothing falls. Any other is held until one that it rests on is released,
-until a user acts on it, or until contact forces exceed what weight and friction can resist: a force F slides a body
-of mass m when |Fxy| > friction (m g - Fz), lifts it when Fz > m g, and tips it over when its moment about the base
-exceeds (m g - Fz) times half the shorter side. The excess must last until it would have given the body the speed
-RELEASE_SPEED. Held bodies are so heavy that contacts do not move them, and do not collide with each other.
+no objects are missing. So every body is held until one that it rests on is released (where it touches none: the
+highest one below it), until a user acts on it, or until contact forces exceed what weight and friction can resist: a
+force F slides a body of mass m when |Fxy| > friction (m g - Fz), lifts it when Fz > m g, and tips it over when its
+moment about the base exceeds (m g - Fz) times half the shorter side. The excess must last until it would have given
+the body the speed RELEASE_SPEED. Held bodies are so heavy that contacts do not move them, and do not collide with
+each other.
 """
 
 from __future__ import annotations
@@ -30,6 +31,8 @@ class Stance:
     height: float  # of the centre of mass above the lowest point
     half_width: float  # half the shorter horizontal side
     on_floor: bool
+    low: np.ndarray  # (3,), lower corner of the bounds
+    high: np.ndarray  # (3,), upper corner
 
 
 class RestingBodies:
@@ -44,9 +47,7 @@ class RestingBodies:
             np.array([getattr(s, name) for s in self._stances]) for name in ("friction", "height", "half_width")
         )
         self.resting_on = _supports(model, data, stances)
-        touching = set(model.geom_bodyid[data.contact.geom].flatten().tolist())
-        chosen = {i for i in at_rest if i in touching or stances[i - 1].on_floor}  # what touches nothing falls
-        self.held = np.array([int(i) in chosen for i in self._bodies], bool)
+        self.held = np.isin(self._bodies, list(at_rest))
         self.fixed = np.ones(model.nbody, bool)  # bodies that do not move
         self.fixed[self._bodies] = self.held
         self._impulse = np.zeros(len(self._bodies))
@@ -109,10 +110,23 @@ class RestingBodies:
 
 
 def _supports(model, data, stances: list[Stance]) -> dict[int, set[int]]:
-    """Body -> the bodies that rest on it, in contact from above and not on the floor."""
+    """Body -> the bodies that rest on it: in contact from above and not on the floor, or without contact over it."""
     found: dict[int, set[int]] = {}
     for pair, up in zip(model.geom_bodyid[data.contact.geom], data.contact.frame[:, 2], strict=True):
         lower, upper = pair if up > 0 else pair[::-1]  # the normal points from the first to the second
         if lower > 0 and upper > 0 and abs(up) > SUPPORT_COSINE and not stances[upper - 1].on_floor:
             found.setdefault(int(lower), set()).add(int(upper))
+    supported = set().union(*found.values())
+    for i, s in enumerate(stances):
+        if not s.on_floor and i + 1 not in supported and (lower := _below(stances, i)) is not None:
+            found.setdefault(lower + 1, set()).add(i + 1)
     return found
+
+
+def _below(stances: list[Stance], row: int) -> int | None:
+    """The stance with the highest top of those that the middle of one is over."""
+    own = stances[row]
+    middle = (own.low + own.high) / 2
+    under = [k for k, s in enumerate(stances) if k != row and s.high[2] < middle[2]
+             and (s.low[:2] < middle[:2]).all() and (middle[:2] < s.high[:2]).all()]  # fmt: skip
+    return max(under, key=lambda k: stances[k].high[2], default=None)

@@ -251,9 +251,10 @@ class _World:
         for i, b in enumerate(self._bodies):
             points = torch.cat(b.parts.hulls).double() * unit
             height = float(b.parts.com[2] * unit - points[:, 2].min())
-            bottom = float(b.start[2]) / self.units.length - lift[i, 2] - height - setup.box.low[2] * unit
-            width = float((points.amax(0) - points.amin(0))[:2].min())
-            stances.append(Stance(b.friction, height, width / 2, bottom < ON_FLOOR))
+            start = b.start.double().numpy() / self.units.length - lift[i] - b.parts.com.double().numpy() * unit
+            low, high = (start + corner.numpy() for corner in (points.amin(0), points.amax(0)))
+            on_floor = float(low[2]) - setup.box.low[2] * unit < ON_FLOOR
+            stances.append(Stance(b.friction, height, float((high - low)[:2].min()) / 2, on_floor, low, high))
         resting = RestingBodies(self.model, self.data, stances, [i + 1 for i in at_rest])
         self.model.geom_margin[:] = 0
         return resting

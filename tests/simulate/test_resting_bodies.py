@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import pytest
 
 from stages.simulate.resting_bodies import RELEASE_SPEED, RestingBodies, Stance
@@ -10,6 +11,13 @@ mujoco = pytest.importorskip("mujoco")
 MASS, G, STEP = 2.0, 9.81, 0.01
 WEIGHT = MASS * G
 HEIGHT, HALF_WIDTH = 0.5, 0.3
+
+
+def stance(friction: float, height: float, half_width: float, box: tuple) -> Stance:
+    """Of a box of half sides (half, half, half) at (x, y, z)."""
+    *centre, half = box
+    return Stance(friction, height, half_width, math.isclose(centre[2], half), np.array(centre) - half,
+                  np.array(centre) + half)  # fmt: skip
 
 
 def world(boxes: list[tuple], stances: list[Stance] | None = None):
@@ -24,13 +32,13 @@ def world(boxes: list[tuple], stances: list[Stance] | None = None):
     model = spec.compile()
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    stances = stances or [Stance(0.5, b[3], b[3], math.isclose(b[2], b[3])) for b in boxes]
+    stances = stances or [stance(0.5, b[3], b[3], b) for b in boxes]
     return model, data, RestingBodies(model, data, stances, range(1, len(boxes) + 1))
 
 
 def steps_until_released(wrench: tuple, friction: float, most: int = 300) -> int | None:
     """Substeps under contact forces and moments about the centre of mass until a body is released; None for never."""
-    _, data, resting = world([(0, 0, 0.5, 0.5)], [Stance(friction, HEIGHT, HALF_WIDTH, True)])
+    _, data, resting = world([(0, 0, 0.5, 0.5)], [stance(friction, HEIGHT, HALF_WIDTH, (0, 0, 0.5, 0.5))])
     for n in range(1, most + 1):
         data.qfrc_constraint[:6] = wrench
         if resting.release_disturbed(data):
@@ -86,16 +94,22 @@ def test_what_rests_on_a_released_body_is_released_with_it():
     tower = [(0, 0, 0.5, 0.1), (0, 0, 0.3, 0.1), (0, 0, 0.1, 0.1)]
     beside, floating = (0.2, 0, 0.105, 0.1), (2.0, 0, 0.5, 0.1)
     _, _, resting = world([*tower, beside, floating])
-    assert resting.held.tolist() == [True] * 4 + [False]  # what touches nothing falls
+    assert resting.held.all()  # what touches nothing too: its support is not seen
     assert resting.resting_on == {3: {2}, 2: {1}}
-    assert sorted(resting.release([2])) == [1, 2] and resting.held.tolist() == [False, False, True, True, False]
+    assert sorted(resting.release([2])) == [1, 2] and resting.held.tolist() == [False, False, True, True, True]
     assert resting.release([2]) == [] and sorted(resting.release([3])) == [3]
     _, _, resting = world([*tower[::-1], beside])
     assert resting.resting_on == {1: {2}, 2: {3}} and sorted(resting.release([1])) == [1, 2, 3]
 
 
+def test_what_touches_nothing_rests_on_the_highest_body_below_it():
+    _, _, resting = world([(0, 0, 0.1, 0.1), (0.08, 0, 0.35, 0.1), (0, 0.08, 0.6, 0.05), (2.0, 0, 0.6, 0.1)])
+    assert resting.resting_on == {1: {2}, 2: {3}} and sorted(resting.release([1])) == [1, 2, 3]
+
+
 def test_held_bodies_are_put_back_and_collide_only_with_what_moves():
     model, data, resting = world([(0, 0, 0.1, 0.1), (0.19, 0, 0.1, 0.1), (2.0, 0, 0.5, 0.1)])
+    assert resting.release([3]) == [3]
     start = data.qpos.reshape(-1, 7).copy()
     data.qpos.reshape(-1, 7)[:, 0] += 0.001
     data.qvel[:] = 1.0

@@ -94,10 +94,15 @@ def test_objects_of_photos_rest_until_something_disturbs_them(tmp_path):
     assert moved[2] == 0 and moved[0] > 0.2 and float(t.com[-1, 1, 2] - t.com[0, 1, 2]) < -0.05
 
 
-def test_what_touches_nothing_in_photos_falls(tmp_path):
-    t = roll(tmp_path, cube(0.1, -0.5, 0.3), cube(0.1, 0, 0.0), steps=30, made_by=PHOTOS)
-    moved = t.com[-1] - t.com[0]
-    assert abs(float(moved[0, 2]) + 0.3) < 0.01 and moved[1].abs().max() < 1e-6
+def test_what_touches_nothing_in_photos_rests_on_what_is_below(tmp_path):
+    """Photos show things at rest: the support is not seen. The upper cube falls once the one below it is taken away."""
+    floating, lower = cube(0.1, 0.02, 0.15), cube(0.1, 0, 0.0)
+    still = roll(tmp_path, floating, lower, steps=10, made_by=PHOTOS)
+    assert torch.equal(still.positions[-1], still.positions[0])
+    t = roll(tmp_path, floating, lower, steps=40, made_by=PHOTOS, velocity=("object=2 0,3,0",))
+    assert abs(float(t.com[-1, 0, 2] - t.com[0, 0, 2]) + 0.15) < 0.01
+    hit = roll(tmp_path, floating, cube(0.1, -0.3, 0.15), steps=40, made_by=PHOTOS, velocity=("object=2 4,0,0",))
+    assert float(hit.com[-1, 0, 2] - hit.com[0, 0, 2]) < -0.1
 
 
 @pytest.mark.parametrize(("speed", "moves"), [(0.05, False), (1.0, True)])

@@ -17,7 +17,8 @@ from stages.core.scene.scene import Scene
 
 VOXELS_ALONG = 48  # voxels along the longest side of an object
 BARE = 3.0  # distance to the samples beyond which faces of voxels are added [voxels], which are a third of the spacing
-NEAREST = 4  # samples that give a distance
+NEAREST = 8  # samples that give a distance, of which those count
+SAME_FACE = 0.8  # whose normals have at least this cosine to that of the nearest one
 STEPS = np.concatenate([np.eye(3, dtype=np.int64), -np.eye(3, dtype=np.int64)])
 
 
@@ -31,7 +32,8 @@ class SolidSurface:
         self._low = cells.min(0) - 2
         full = np.zeros(cells.max(0) - self._low + 3, bool)
         full[tuple((cells - self._low).T)] = True
-        self._depth = h * (ndimage.distance_transform_edt(full) - ndimage.distance_transform_edt(~full))
+        inside, outside = (ndimage.distance_transform_edt(part) - 0.5 for part in (full, ~full))
+        self._depth = h * np.where(full, inside, -outside)  # to the faces of the voxels
         near = points[np.abs(self._coarse_depth(points)) <= h]
         smooth = ndimage.gaussian_filter(full.astype(np.float32), 1.0)
         normals = -np.stack([self._at(slope, near) for slope in np.gradient(smooth)], 1)
@@ -53,13 +55,15 @@ class SolidSurface:
         if len(close):
             distance, row = self._tree.query(x[close], NEAREST)
             row = np.minimum(row, len(self.points) - 1)
-            fine = ((self.points[row] - x[close, None]) * self.normals[row]).sum(-1).mean(1)
+            normals = self.normals[row]
+            agree = (normals * normals[:, :1]).sum(-1) > SAME_FACE
+            fine = (((self.points[row] - x[close, None]) * normals).sum(-1) * agree).sum(1) / agree.sum(1)
             known = distance[:, 0] < 2 * self.h
             out[close[known]] = fine[known].clip(out[close[known]] - self.h, out[close[known]] + self.h)
         return out
 
     def _coarse_depth(self, x: np.ndarray) -> np.ndarray:
-        return self._at(self._depth, x) - self.h / 2
+        return self._at(self._depth, x)
 
     def _at(self, grid: np.ndarray, x: np.ndarray) -> np.ndarray:
         return ndimage.map_coordinates(grid, (x / self.h - self._low - 0.5).T, order=1, mode="nearest")

@@ -1,8 +1,9 @@
-"""The engine of `--engine auto`: by the materials of the objects."""
+"""The engine of `--engine auto`: by how far weight and impacts deform the objects."""
 
 from __future__ import annotations
 
 import logging
+import math
 from dataclasses import replace
 
 from stages.core.physics.forces import ForcePrompts
@@ -13,13 +14,18 @@ from stages.simulate.options import AUTO, SimulateOptions
 
 log = logging.getLogger(__name__)
 MAX_RIGID_SAG = 0.02  # largest compression under its own weight of a body that counts as rigid
+MAX_RIGID_IMPACT = 0.1  # largest compression by its own impact; that of which `plausibility.py` warns
+NO_PROMPTS = ForcePrompts()
 
 
-def with_engine(options: SimulateOptions, scene: Scene, keypoints: Keypoints) -> SimulateOptions:
+def with_engine(
+    options: SimulateOptions, scene: Scene, keypoints: Keypoints, prompts: ForcePrompts = NO_PROMPTS
+) -> SimulateOptions:
     """The options with an engine in place of `auto`.
 
-    MPM if an object yields or flows, or has parts of different materials; else the learned field if one is softer than
-    MAX_RIGID_SAG; else rigid bodies. Options of learned engines (weights, an integrator) select the learned field.
+    MPM if an object yields or flows, or has parts of different materials; else the learned field if the weight of one
+    compresses it by more than MAX_RIGID_SAG, or the speed that the prompts give it by more than MAX_RIGID_IMPACT; else
+    rigid bodies. Options of learned engines (weights, an integrator) select the learned field.
     """
     if options.engine != AUTO:
         return options
@@ -30,12 +36,16 @@ def with_engine(options: SimulateOptions, scene: Scene, keypoints: Keypoints) ->
     plastic = [o for o in scene.objects if MODELS[materials[o.id].material.model].plastic]
     soft = [o for o in scene.objects if sag(materials[o.id].material, _height(scene, keypoints, o.id), options.gravity)
             > MAX_RIGID_SAG]  # fmt: skip
+    crushed = [o for o in scene.objects if impact(materials[o.id].material, _speed(scene, o.id, prompts, options))
+               > MAX_RIGID_IMPACT]  # fmt: skip
     if plastic:
         engine, reason = "mpm", f"object {plastic[0].id} yields or flows"
     elif uneven:
         engine, reason = "mpm", f"object {uneven[0].id} has parts of different materials"
     elif soft:
         engine, reason = "ngff", f"object {soft[0].id} is compressed by more than {MAX_RIGID_SAG:.0%} by its own weight"
+    elif crushed:
+        engine, reason = "ngff", f"an impact compresses object {crushed[0].id} by more than {MAX_RIGID_IMPACT:.0%}"
     else:
         engine, reason = "rigid", "all objects are stiff"
     log.info("--engine %s, as %s", engine, reason)
@@ -61,6 +71,19 @@ def for_engine(prompts: ForcePrompts, scene: Scene, options: SimulateOptions) ->
 def sag(material: Material, height: float, gravity: float) -> float:
     """Compression of a body of some height [m] under its own weight, about; gravity in m/s^2."""
     return material.density * abs(gravity) * height / material.E
+
+
+def impact(material: Material, speed: float) -> float:
+    """Compression of a body that hits a rigid one at some speed [m/s], about: that behind the elastic wave in a rod."""
+    return speed * math.sqrt(material.density / material.E)
+
+
+def _speed(scene: Scene, object_id: int, prompts: ForcePrompts, options: SimulateOptions) -> float:
+    """Speed [m/s] of an object at the start and after the fall of its lift."""
+    unit = scene.metres_per_unit
+    lift = unit * max(prompts.lift.get(object_id, 0.0), 0.0)
+    thrown = unit * math.hypot(*prompts.velocity.get(object_id, (0.0,)))
+    return math.sqrt(thrown**2 + 2 * abs(options.gravity) * lift)
 
 
 def _height(scene: Scene, keypoints: Keypoints, object_id: int) -> float:

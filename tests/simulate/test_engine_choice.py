@@ -4,9 +4,10 @@ from dataclasses import replace
 
 import pytest
 
+from stages.core.physics.forces import ForcePrompts
 from stages.core.physics.keypoints import choose_keypoints
 from stages.core.physics.materials import Material
-from stages.simulate.engine_choice import sag, with_engine
+from stages.simulate.engine_choice import impact, sag, with_engine
 from stages.simulate.options import SimulateOptions
 from tests.conftest import two_balls_scene
 
@@ -29,6 +30,16 @@ def test_what_is_a_hundred_times_larger_is_softer():
     scene = two_balls_scene()
     large = replace(scene, scale={"metres_per_unit": 100.0})
     assert with_engine(SimulateOptions(), large, choose_keypoints(large, 32)).engine == "ngff"
+
+
+@pytest.mark.parametrize(("speed", "lift", "engine"), [(1.0, 0.0, "rigid"), (4.0, 0.0, "ngff"), (0.0, 0.7, "ngff")])
+def test_what_an_impact_compresses_is_soft(speed, lift, engine):
+    """Of E 8e5 and 600 kg/m^3: 3.65 m/s, or a fall of .68 m, compress it by a tenth. Its name does not matter."""
+    scene = two_balls_scene()
+    prompts = ForcePrompts(velocity={1: (0.0, speed, 0.0)}, lift={1: lift})
+    options = SimulateOptions(material=("1=ball",))
+    assert with_engine(options, scene, choose_keypoints(scene, 32), prompts).engine == engine
+    assert impact(Material(E=8e5, density=600.0), 3.651) == pytest.approx(0.1, rel=1e-3)
 
 
 def test_sag_of_a_column():

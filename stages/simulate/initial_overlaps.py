@@ -1,15 +1,16 @@
 """Overlaps of rigid bodies at the start, which are kept.
 
 Reconstructed objects overlap by the errors of their surfaces, which contacts would turn into speed. The overlap that
-two parts have at the start is therefore no contact: a contact begins where the overlap exceeds it, until they have been
-separated. Nothing is pushed apart, and what was once separated does not sink in again.
+two parts have at the start is therefore no contact: a contact begins where the overlap exceeds it. The overlap that is
+allowed follows the actual one down. So nothing is pushed apart, and what has left an overlap, by being lifted or by
+sliding, does not sink in again.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-APART = 20  # substeps without overlap after which two parts count as separated: the solver may miss a deep contact
+WINDOW = 20  # substeps of which the deepest overlap is taken: the solver may miss a deep contact
 
 
 class InitialOverlaps:
@@ -21,7 +22,7 @@ class InitialOverlaps:
         self._pairs, row = np.unique(np.sort(data.contact.geom[deep], 1), axis=0, return_inverse=True)
         self.allowed = np.zeros(len(self._pairs))
         np.maximum.at(self.allowed, row.ravel(), -data.contact.dist[deep])
-        self._apart = np.zeros(len(self._pairs), int)  # substeps since the last overlap
+        self._deepest, self._substeps = np.zeros(len(self._pairs)), 0  # in this window
         self._row = np.full((model.ngeom,) * 2, -1, np.int32)
         for a, b in ((0, 1), (1, 0)):
             self._row[self._pairs[:, a], self._pairs[:, b]] = np.arange(len(self._pairs))
@@ -37,10 +38,12 @@ class InitialOverlaps:
         contact = data.contact
         row = self._row[contact.geom[:, 0], contact.geom[:, 1]]
         known = np.flatnonzero(row >= 0)
-        free = ~fixed[self._bodies].all(1)
-        self._apart[free] += 1
-        self._apart[row[known[contact.dist[known] < 0]]] = 0
-        self.allowed[self._apart > APART] = 0.0
+        np.maximum.at(self._deepest, row[known], -contact.dist[known])
+        self._substeps += 1
+        if self._substeps % WINDOW == 0:
+            free = ~fixed[self._bodies].all(1)
+            self.allowed[free] = np.minimum(self.allowed, self._deepest)[free]
+            self._deepest[:] = 0.0
         address = contact.efc_address[known]
         active = address >= 0
         data.efc_pos[address[active]] += self.allowed[row[known[active]]]

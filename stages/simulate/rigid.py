@@ -253,7 +253,7 @@ class _World:
             height = float(b.parts.com[2] * unit - points[:, 2].min())
             start = b.start.double().numpy() / self.units.length - lift[i] - b.parts.com.double().numpy() * unit
             low, high = (start + corner.numpy() for corner in (points.amin(0), points.amax(0)))
-            on_floor = float(low[2]) - setup.box.low[2] * unit < ON_FLOOR
+            on_floor = bool(setup.on_floor_as_seen[i]) or float(low[2]) - setup.box.low[2] * unit < ON_FLOOR
             stances.append(Stance(b.friction, height, float((high - low)[:2].min()) / 2, on_floor, low, high))
         resting = RestingBodies(self.model, self.data, stances, [i + 1 for i in at_rest])
         self.model.geom_margin[:] = 0

@@ -161,7 +161,8 @@ def _balanced(hull: ConvexHull, surface: np.ndarray, h: float) -> ConvexHull:
         np.add.at(r, corner, (area * shift)[:, None] * normal)
     M, r = M[hull.vertices], r[hull.vertices]
     M += 0.01 * np.trace(M, axis1=1, axis2=2)[:, None, None] * np.eye(3)
-    return _hull(hull.points[hull.vertices] - np.linalg.solve(M, r[..., None])[..., 0]) or hull
+    moved = hull.points[hull.vertices] - np.linalg.solve(M, r[..., None])[..., 0]
+    return _hull(moved.clip(hull.min_bound, hull.max_bound)) or hull  # nothing below a floor
 
 
 def _corners(voxels: np.ndarray, h: float) -> np.ndarray:

@@ -92,7 +92,7 @@ def test_files_of_scenes_are_kept_and_trained_on(tmp_path: Path):
     )
     lines = list(train_segmenter.run([tmp_path / "noisy"], weights, training))
     assert "1 files" in lines[0]
-    ids = object_ids(truth, load_segmenter(weights), None)
+    ids = object_ids(truth, load_segmenter(weights))
     assert len(ids) == len(truth.gaussians)
 
 

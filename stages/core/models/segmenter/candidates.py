@@ -17,7 +17,7 @@ from torch import Tensor
 
 from stages.core.geometry.neighbours import knn
 from stages.core.models.segmenter.merge_tree import MergeTree, merge_tree
-from stages.core.models.segmenter.network import Level, Prediction, Segmenter
+from stages.core.models.segmenter.network import PAIR_FEATURES, Level, Prediction, Segmenter
 from stages.core.models.segmenter.voxels import VOXEL, VoxelGrid
 
 TOGETHER = 2.0  # log odds above which voxels of one cell of the next coarser grid are not parted
@@ -25,6 +25,8 @@ MAX_SURFACE = 0.5  # probability of surface, up to which a voxel may be of an ob
 MIN_VOXELS = 6  # of a candidate
 LINK_REACH, LINKS = 3.0, 8  # voxels and nearest voxels, within which links cross gaps of sparse Gaussians
 NO_PARENT = -6.0  # log odds of the merge above a root
+COLOUR, EMBEDDING = slice(21, 25), slice(25, 26 + PAIR_FEATURES)  # columns of the sums over voxels
+ALIKE, UNLIKE = 0.05, 3.0  # least difference from a sibling that counts, and the difference where there is none
 SMALL = 0.003  # of logarithms of distances [camera distance]
 
 
@@ -77,7 +79,8 @@ def find_candidates(grid: VoxelGrid, levels: list[Level], found: Prediction, mod
     offsets, points = found.offsets[voxels], grid.points[voxels]
     centres = points + offsets
     columns = [torch.ones_like(points[:, :1]), chance[voxels], points, points**2, centres, centres**2,
-               offsets.norm(dim=1, keepdim=True), log_chance[voxels], surface[:, None]]  # fmt: skip
+               offsets.norm(dim=1, keepdim=True), log_chance[voxels], surface[:, None],
+               _with_square(grid.lab[voxels]), _with_square(found.embedding[voxels])]  # fmt: skip
     each = torch.cat(columns, 1).double().cpu()
     leaves = torch.zeros(count, each.shape[1]).double().index_add_(0, leaf, each)
     top = torch.full((count, 6), -torch.inf).double()
@@ -124,6 +127,24 @@ def nearby_pairs(points: Float[Tensor, "v 3"], voxels: Int[Tensor, "m"]) -> Int[
     return pairs[pairs[:, 0] != pairs[:, 1]]
 
 
+def _with_square(values: Float[Tensor, "m d"]) -> Float[Tensor, "m d+1"]:
+    """The values and their squared norm, from whose means the spread follows."""
+    return torch.cat([values, (values**2).sum(1, keepdim=True)], 1)
+
+
+def _contrasts(tree: MergeTree, mean: np.ndarray) -> list[np.ndarray]:
+    """Spread of a quantity in each node, and logarithms of its distance from the sibling and between the two children.
+
+    `mean` has the quantity and last its squared norm. Parts of one object are often alike.
+    """
+    value, spread = mean[:, :-1], np.sqrt(np.maximum(mean[:, -1] - (mean[:, :-1] ** 2).sum(1), 0))
+    a, b = tree.children.T
+    between = np.concatenate([np.zeros(tree.count), np.linalg.norm(value[a] - value[b], axis=1)])
+    parents = tree.parents()
+    from_sibling = np.where(parents < 0, UNLIKE, between[parents])
+    return [spread, np.log(from_sibling + ALIKE), np.log(between + ALIKE)]
+
+
 def _features(tree: MergeTree, leaves: np.ndarray, corners: np.ndarray) -> np.ndarray:
     """(nodes, network.CANDIDATE_FEATURES) features from sums of `leaves` and maxima of `corners`, see above."""
     sums, top = tree.sums(leaves), tree.maxima(corners)
@@ -132,7 +153,7 @@ def _features(tree: MergeTree, leaves: np.ndarray, corners: np.ndarray) -> np.nd
     inner = np.concatenate([np.zeros((tree.count, 2)), links])  # sum and number of the links inside each node
     for node, (a, b) in enumerate(tree.children.tolist(), tree.count):
         inner[node] += inner[a] + inner[b]
-    border = sums[:, 21:] - 2 * inner
+    border = sums[:, -2:] - 2 * inner
     merged = np.concatenate([np.zeros(tree.count), links[:, 0] / np.maximum(links[:, 1], 1)])
     parents, sibling = tree.parents(), np.zeros(len(tree))
     sibling[tree.children[:, 0]], sibling[tree.children[:, 1]] = n[tree.children[:, 1]], n[tree.children[:, 0]]
@@ -148,5 +169,6 @@ def _features(tree: MergeTree, leaves: np.ndarray, corners: np.ndarray) -> np.nd
         border[:, 0] / np.maximum(border[:, 1], 1), np.log1p(border[:, 1]) - np.log(n), np.log1p(border[:, 1]),
         np.log1p(sums[:, 20]) - np.log(n), np.log1p(sibling) - np.log(n), -top[:, 5], top[:, 2], *mean[:, 17:20].T,
         np.log(n * VOXEL**3 / extent.prod(1)),
+        *_contrasts(tree, mean[:, COLOUR]), *_contrasts(tree, mean[:, EMBEDDING]),
     ]  # fmt: skip
     return np.stack(columns, 1)

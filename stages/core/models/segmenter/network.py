@@ -19,7 +19,7 @@ from stages.core.models.segmenter.voxels import FEATURES, VOXEL, coarser, neighb
 CLASSES = ("surface", "object", "clutter")
 OFFSET_UNIT = 0.1  # of predicted offsets [camera distance]
 PAIR_FEATURES = 24  # of the embedding
-CANDIDATE_FEATURES = 27  # of a candidate object, see candidates.py
+CANDIDATE_FEATURES = 33  # of a candidate object, see candidates.py
 
 
 @dataclass(frozen=True)

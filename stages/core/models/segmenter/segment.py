@@ -21,7 +21,7 @@ from stages.core.models.segmenter.outlines import cut_outlines
 from stages.core.models.segmenter.surfels import scene_surfels
 from stages.core.models.segmenter.voxels import SCALES, ScenePoints, VoxelGrid, voxelise
 from stages.core.perception.grouping import name_objects
-from stages.core.perception.support import Support, find_support, view_extent
+from stages.core.perception.support import find_support, view_extent
 from stages.core.perception.view_outlines import refine_outlines
 from stages.core.scene.files import must_exist
 from stages.core.scene.scene import Scene
@@ -30,8 +30,6 @@ from stages.core.scene.schema import whole
 WEIGHTS = Path(__file__).parent / "segmenter.safetensors"
 MAX_BLOCKS, MAX_LEVELS = 100, 12  # of a network
 MAX_VOXELS = 80_000  # nearest to the focus
-MAX_BASE_HEIGHT = 0.4  # of an object's lowest points above the surface [camera distance]
-MAX_BASE_DEPTH = 0.05  # of an object's lowest points below the surface; what stands on the floor is lower
 OBJECT_COST = 0.5  # least IoU that a candidate must be expected to have; chosen on simulated scenes
 SIZE_POWER = 0.45  # weight of n surfels: n**SIZE_POWER. 0 prefers parts, 1 merged objects; see results/segment.md
 MAX_SIZE = 0.6  # longest side of an object, as of the largest in the training [camera distance]
@@ -91,7 +89,7 @@ def segment_by_network(
     weights at `weights`.
     """
     support = find_support(scene, view_extent(scene), seed)
-    ids = object_ids(scene, load_segmenter(find(weights), device), support, options)
+    ids = object_ids(scene, load_segmenter(find(weights), device), options)
     return name_objects(replace(scene, gaussians=replace(scene.gaussians, object_id=ids)), support)
 
 
@@ -99,13 +97,9 @@ def segment_by_network(
 def object_ids(
     scene: Scene,
     model: Segmenter,
-    support: Support | None,
     options: SegmenterOptions = SegmenterOptions(),  # noqa: B008
 ) -> Int[Tensor, "n"]:
-    """Object number of each Gaussian; 0 for the rest.
-
-    With a supporting surface, objects are those that stand on it or on something that stands on it.
-    """
+    """Object number of each Gaussian; 0 for the rest."""
     ids = torch.zeros(len(scene.gaussians), dtype=torch.int64)
     surfels, index, _ = scene_surfels(scene)
     if len(surfels) < 20:
@@ -115,21 +109,8 @@ def object_ids(
     labels = torch.where(labels <= options.max_objects, labels, 0)
     ids[index] = outlined(surfels, labels, scored)
     ids = refine_outlines(scene, ids)
-    means = scene.gaussians.means
-    for number in range(1, int(ids.max()) + 1):
-        own = means[ids == number]
-        if len(own) < MIN_GAUSSIANS or (support is not None and not _stands_on(own, support)):
-            ids[ids == number] = 0
-    return ids
-
-
-def _stands_on(points: Float[Tensor, "m 3"], support: Support) -> bool:
-    """Whether the lowest points of an object are at the height of the surface, or of something that stands on it.
-
-    The surface may go on beyond the part of it that is visible.
-    """
-    low = float(support.heights(points).quantile(0.05)) / support.view.radius
-    return -MAX_BASE_DEPTH < low < MAX_BASE_HEIGHT
+    few = ids.bincount() < MIN_GAUSSIANS
+    return torch.where(few[ids], 0, ids)
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ SCALES = (1.0, 1.5, 2.25)  # by which scenes are enlarged in turn, so that objec
 REACH = 1.5  # Gaussians farther from the focus are left out [camera distance]
 MAX_SCALE = 0.1  # standard deviation above which a Gaussian is a backdrop [camera distance]
 NORMAL_NEIGHBOURS = 16
-FEATURES = 11  # of a voxel
+FEATURES, LAB = 11, slice(6, 9)  # of a voxel, and which of them are its colour
 
 
 @dataclass(frozen=True)
@@ -60,6 +60,11 @@ class VoxelGrid:
 
     def __len__(self) -> int:
         return len(self.cells)
+
+    @property
+    def lab(self) -> Float[Tensor, "v 3"]:
+        """Mean colours in CIELAB, scaled as the network takes them."""
+        return self.features[:, LAB]
 
 
 def shortest_axes(quats: Float[Tensor, "n 4"], scales: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:

@@ -232,7 +232,7 @@ def test_damaged_options_of_a_trajectory_are_refused(tmp_path, balls, name, valu
     with h5py.File(balls.with_name("traj.h5"), "a") as file:
         made_by = json.loads(file.attrs["provenance"])
         file.attrs["provenance"] = json.dumps({**made_by, "options": {**made_by["options"], name: value}})
-    with pytest.raises(InputError, match=f"options in its provenance are damaged.*{name}"):
+    with pytest.raises(InputError, match=f"its options of `ngff simulate` are damaged.*{name}"):
         run(balls, tmp_path / "again.h5", SimulateOptions(forces=balls.with_name("traj.h5")))
 
 

@@ -29,8 +29,8 @@ def refine_outlines(scene: Scene, ids: Int[Tensor, "n"], seed: int = 0) -> Int[T
     """The objects `ids` of the Gaussians, with their outlines cut in each view by colour and voted over the views.
 
     The pixels within BAND of an object's outline are assigned anew by GrabCut; those farther inside and outside are
-    the examples of its colours and of those around it. Gaussians that hardly any view shows keep their object, and without
-    cameras all do.
+    the examples of its colours and of those around it. Gaussians that hardly any view shows keep their object, and
+    without cameras all do.
     """
     if scene.cameras is None or not len(scene.cameras) or not bool((ids > 0).any()):
         return ids

@@ -10,7 +10,6 @@ import torch
 from scipy import ndimage
 
 from stages.core.physics import convex_parts, particles
-from stages.core.physics.convex_parts import Solid, divide
 from stages.core.physics.particles import MIN_PARTICLE_OPACITY, MIN_PARTICLES, scene_size, surface_points, usable
 from stages.core.scene.gaussians import concatenate
 from tests.core.physics.test_particles import scene, splats
@@ -138,80 +137,11 @@ def test_voxels_of_two_bodies_go_to_the_smaller_one():
     assert [len(x) for x in left] == [80, 48]  # 32 voxels would remain
 
 
-def test_directions_are_unit_vectors_spread_evenly():
-    d = convex_parts._fibonacci(200)
-    np.testing.assert_allclose(np.linalg.norm(d, axis=1), 1, atol=1e-12)
-    np.testing.assert_allclose(d.mean(0), 0, atol=0.01)
-    np.testing.assert_allclose(d.T @ d / 200, np.eye(3) / 3, atol=0.01)
-    np.testing.assert_allclose(d[:, 2], 1 - (2 * np.arange(200) + 1) / 200, atol=1e-12)
-    nearest = np.sort(d @ d.T, axis=1)[:, -2]
-    assert np.arccos(nearest).min() > 0.75 * math.sqrt(4 * math.pi / 200)
-
-
 def test_corners_of_voxels():
     found = convex_parts._corners(np.array([[1.0, 2.0, 3.0], [0.0, 0.0, 0.0]]), 0.2)
     expected = {tuple(np.round(c + 0.1 * np.array(s), 6)) for c in ([1, 2, 3], [0, 0, 0])
                 for s in itertools.product((-1, 1), repeat=3)}  # fmt: skip
     assert len(found) == 16 and {tuple(np.round(c, 6)) for c in found} == expected
-
-
-def extreme(cells):
-    return cells[(cells @ convex_parts.SPREAD.T).argmax(0)]
-
-
-def test_volume_of_the_hull_of_a_block_of_voxels():
-    cells = block(4, 3, 2).astype(float)
-    assert convex_parts._volume(extreme(cells)) == pytest.approx(24)
-    assert convex_parts._volume(extreme(cells), 0.5) == pytest.approx(3.5 * 2.5 * 1.5)
-    assert convex_parts._volume(extreme(np.zeros((1, 3)))) == pytest.approx(1)
-    assert convex_parts._volume(extreme(cells), 0.0) == pytest.approx(3 * 2 * 1)
-
-
-def test_points_inside_a_block_count_against_its_hull():
-    cells = block(7, 7, 7).astype(float)
-    points = np.array([[3.0, 3, 3], [4.9, 3, 3], [6.8, 3, 3], [3, 3, 9]])
-    assert convex_parts._inside(extreme(cells), points @ convex_parts.SPREAD.T) == 2
-    cost = convex_parts._hull_cost(cells, points)
-    assert cost == pytest.approx(6.5**3 + 2 * convex_parts.OTHERS)
-    assert convex_parts._hull_cost(cells, points[2:]) == pytest.approx(6.5**3)
-
-
-@pytest.mark.parametrize("axis", range(3))
-def test_an_angle_is_divided_at_its_corner(axis):
-    roll = lambda cells: np.roll(cells, axis, axis=1)  # noqa: E731
-    cells = roll(np.concatenate([block(4, 4, 29), block(25, 4, 4, low=(4, 0, 0))])).astype(float)
-    part = divide(cells, np.empty((0, 3)))
-    assert part.max() == 1
-    for k in range(2):  # a part is a box
-        assert np.prod(np.ptp(cells[part == k], axis=0) + 1) == (part == k).sum()
-    assert divide(roll(block(9, 5, 7)).astype(float), np.empty((0, 3))).max() == 0
-
-
-def test_others_between_two_legs_are_left_out_of_the_hull():
-    """A bench is divided further where something is below it."""
-    bench = np.concatenate([block(30, 6, 4, low=(0, 0, 20)), block(4, 6, 20), block(4, 6, 20, low=(26, 0, 0))])
-    alone = divide(bench.astype(float), np.empty((0, 3)))
-    below = divide(bench.astype(float), block(16, 6, 16, low=(7, 0, 2)).astype(float))
-    assert below.max() >= alone.max() >= 2
-    points = block(16, 6, 16, low=(7, 0, 2)).astype(float) @ convex_parts.SPREAD.T
-    for k in range(below.max() + 1):
-        assert convex_parts._inside(extreme(bench[below == k].astype(float)), points) == 0
-
-
-def test_extreme_voxels_accumulate_slab_by_slab():
-    along = np.array([[1.0, 5.0], [2.0, 1.0], [3.0, 3.0]])
-    found = convex_parts._accumulated(along, [np.array([0, 0]), None, np.array([1, 1]), np.array([2, 2])])
-    assert [f.tolist() for f in found] == [[0, 0], [0, 0], [1, 0], [2, 0]]
-    empty_first = convex_parts._accumulated(along, [None, np.array([1, 1])])
-    assert empty_first[0] is None and empty_first[1].tolist() == [1, 1]
-
-
-def test_voxels_around_are_within_the_bounds_and_not_next_to_the_body():
-    own = block(5, 5, 5).astype(float) * 0.1
-    own = np.concatenate([own, own + [1.0, 0, 0]])  # a gap in between
-    other = np.array([[0.7, 0.2, 0.2], [0.45, 0.2, 0.2], [0.7, 0.2, 0.49], [0.7, 0.2, 0.51], [3.0, 0.2, 0.2]])
-    solids = [Solid(own, 0.1, own), Solid(other, 0.1, other)]
-    np.testing.assert_allclose(convex_parts._around(solids, 0), other[[0, 2]])
 
 
 def test_moments_of_the_hull_of_a_box_and_of_a_tetrahedron():

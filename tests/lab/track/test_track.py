@@ -261,4 +261,5 @@ def test_the_report_says_where_objects_were_lost():
     pixels = torch.tensor([[50.0, 50.0], [50.0, 50.0], [50.0, 0.0], [50.0, 50.0]])
     poses = Poses(torch.eye(3).expand(4, 2, 3, 3), torch.zeros(4, 2, 3))
     lines = list(report(world, TrackedMotion(poses, share, pixels, {})))
-    assert lines[0].endswith("lost in 1 to 2 (hidden or not recognised)") and lines[1].endswith("lost in 2 (out of view)")
+    assert lines[0].endswith("lost in 1 to 2 (hidden or not recognised)")
+    assert lines[1].endswith("lost in 2 (out of view)")

@@ -184,30 +184,38 @@ def test_motion_goes_on_from_within_a_film(tmp_path, open_page):
 @pytest.mark.parametrize("first", [0, 6])
 @pytest.mark.usefixtures("device")
 def test_what_was_done_in_a_page_is_saved_and_repeated_by_the_engine(tmp_path, open_page, first):
-    """From a frame of the film on: a drag by the mouse, a push and a pin."""
+    """From a frame of the film on, step by step: a drag by the mouse, a push and a pin."""
     simulated(tmp_path, two_balls_scene(), frames=8, velocity=("object=2 -0.8,0,0",), box="-1,-1,0,1,1,1.5")
     page = open_page(render(tmp_path / "traj.h5", tmp_path / "film.html", RenderOptions(playable=True, view="input:0")))
     page.set_viewport_size({"width": 800, "height": 400})
     page.evaluate(f"player.play(false); player.seek({first} * player.film.dt)")
-    until(page, "!player.changed && !player.busy && player.drawn()")
-    drag_up(page, page.evaluate(FIND), 12, 8)
-    until(page, f"player.live.state?.arrows.length === 1 && ({RISE})() > 0.05")
-    page.keyboard.press("p")  # what is under the cursor, which holds object 1
+    still = "!player.changed && !player.busy && player.drawn()"
+    until(page, still, 60)
+    x, y = page.evaluate(FIND)
+    page.evaluate("player.live.act({ do: 'pause', value: true })")
+    until(page, "player.live.state?.paused")
+    page.mouse.move(x, y)
+    page.mouse.down()
+    frames = page.evaluate("player.live.state.frames") + 30
+    for i in range(30):
+        page.mouse.move(x, y - 5 * i)
+        page.keyboard.press(".")
     page.mouse.up()
-    page.keyboard.press("n")
-    page.keyboard.press("Space")
-    until(page, "player.live.state.paused")
-    page.wait_for_timeout(300)
+    until(page, f"player.live.state.frames === {frames} && {still}", 60)
+    assert page.evaluate(RISE) > 0.05
+    page.mouse.move(*page.evaluate(FIND))
+    for key in "p.n..":
+        page.keyboard.press(key)
+    until(page, f"player.live.state.frames === {frames + 3}", 60)
     with page.expect_download() as download:
         page.keyboard.press("x")
     download.value.save_as(tmp_path / "done.json")
     assert download.value.suggested_filename == "traj-forces.json"
-    shown, frames = page.evaluate("[Array.from(player.positions), player.live.state.frames]")
+    shown = torch.tensor(page.evaluate("Array.from(player.positions)")).view(-1, 3)
     simulate(tmp_path / "scene.ply", tmp_path / "again.h5", SimulateOptions(forces=tmp_path / "done.json"))
     again = read_trajectory(tmp_path / "again.h5")
-    assert len(again) == frames > first + 10
-    assert min(f["start"] for f in again.info.forces if f["kind"] == "force") > (first - 1) * 0.02
-    red = again.keypoints.object_id == 1
-    assert (again.positions[:, red] - again.positions[0, red]).mean(1)[:, 2].max() > 0.05
-    # in 50 frames page and engine part by LIMIT
-    assert (again.positions[-1] - torch.tensor(shown).view(-1, 3)).norm(dim=1).max() < LIMIT * max(1, frames / 50)
+    forces = [f for f in again.info.forces if f["kind"] == "force"]
+    assert len(again) == frames + 3 and len(forces) == 61  # the drag, with what balances the weight, and the push
+    assert min(f["start"] for f in forces) > first * 0.02
+    assert [f["what"] for f in again.info.forces if f["kind"] == "change"] == ["pinned"]
+    assert (again.positions[-1] - shown).norm(dim=1).max() < LIMIT

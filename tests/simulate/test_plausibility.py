@@ -4,10 +4,12 @@ import logging
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
-from stages.core.physics.forces import ForcePrompts
+from stages.core.geometry.rotations import matrix
+from stages.core.physics.forces import Force, ForcePrompts
 from stages.core.physics.keypoints import choose_keypoints
 from stages.core.physics.state import FrameState
 from stages.core.scene.gaussians import concatenate
@@ -84,3 +86,99 @@ def test_creep_spread_and_energy(scene, caplog):
     assert found["energy_gain"] > 1.0
     monitor.warn(found)
     assert "the objects gain" in caplog.text and "--engine rigid or mpm" in caplog.text
+
+
+def monitor_of(scene: Scene, prompts: ForcePrompts = ForcePrompts(), **options) -> PlausibilityMonitor:  # noqa: B008
+    return PlausibilityMonitor(scene, choose_keypoints(scene, 64), prompts, SimulateOptions(**options))
+
+
+def test_energy_is_that_of_the_keypoints_weighted_by_mass(scene):
+    monitor = monitor_of(replace(scene, scale={"metres_per_unit": 0.5, "source": "stated"}), dt=0.1)
+    before = [np.array([[0.0, 0, 1], [0, 0, 3]]), np.array([[0.0, 0, 5]])]
+    after = [np.array([[0.2, 0, 1], [0, 0, 3.4]]), np.array([[0.0, 0, 4]])]
+    g = G / 0.5  # units
+    first = (0.2**2 + 0.4**2) / 2 / (2 * 0.1**2) + g * 2.1
+    second = 1 / (2 * 0.1**2) + g * 4.5
+    assert monitor._mechanical_energy(after, before, np.array([1.0, 1.0])) == pytest.approx((first + second) / 2)
+    assert monitor._mechanical_energy(after, before, np.array([3.0, 1.0])) == pytest.approx((3 * first + second) / 4)
+    empty = [np.zeros((0, 3)), after[1]]
+    assert monitor._mechanical_energy(empty, empty, np.array([1.0, 1.0])) == pytest.approx(g * 4 / 2)
+
+
+@pytest.mark.parametrize(("energy", "gain"), [
+    ([5.0, 3.0, 2.0, 4.0, 6.5], 0.5), ([5.0, 3.0, 2.0, 4.0], 0.0), ([5.0, 6.0], 1 / (1e-3 * G * 0.2)), ([5.0], 0.0),
+    ([], 0.0),
+])  # fmt: skip
+def test_gain_of_energy_relative_to_what_was_converted(scene, energy, gain):
+    monitor = monitor_of(scene)
+    monitor._energy = energy
+    assert monitor._energy_gain() == pytest.approx(gain, rel=0.02)
+
+
+@pytest.mark.parametrize(("end", "gain"), [
+    (0.0, 0.5), (1.5 * DT, 3.0), (2 * DT, 3.0), (2.5 * DT, 0.0), (math.inf, 0.0),
+])  # fmt: skip
+def test_gain_of_energy_counts_from_the_last_force(scene, end, gain):
+    monitor = monitor_of(scene, ForcePrompts((Force(1, start=-1.0, end=-0.5), Force(1, start=-1.0, end=end))))
+    monitor._energy = [5.0, 3.0, 2.5, 2.0, 4.0 if end != 2.5 * DT else 1.0]
+    if end == 0.0:
+        monitor._energy = [5.0, 3.0, 2.0, 4.0, 6.5]
+    assert monitor._energy_gain() == pytest.approx(gain, rel=0.02)
+
+
+def test_depth_below_the_surface_of_a_cube(scene):
+    """Linear between voxels of 1/48 of its side; half a voxel is the surface's own."""
+    depth = monitor_of(scene)._body(0)
+    x = np.array([[0.0, 0.0, 0.1], [0.05, 0.0, 0.1], [0.0, -0.08, 0.1], [0.1, 0.0, 0.1], [0.15, 0.0, 0.1]])
+    np.testing.assert_allclose(depth(x)[:4], [0.1, 0.05, 0.02, 0.0], atol=0.008)
+    assert depth(x)[4] < -0.01
+
+
+def test_a_body_that_has_turned_is_measured_where_it_is(scene):
+    """Beside the lower cube, .03 in common with its corner; turned by 45 degrees about z it has a side there."""
+    keypoints = choose_keypoints(scene, 256)
+    upper = keypoints.object_id == 2
+    com = torch.stack([keypoints.rest[~upper].mean(0), keypoints.rest[upper].mean(0)])
+    turned = torch.tensor([math.cos(math.pi / 8), 0.0, 0.0, math.sin(math.pi / 8)])
+    for quat, low, high in ((turned, 0.0, 0.03), (torch.tensor([1.0, 0, 0, 0]), 0.07, 0.16)):
+        monitor = PlausibilityMonitor(scene, keypoints, ForcePrompts(), SimulateOptions())
+        for n in range(3):
+            x, moved = keypoints.rest.clone(), com.clone()
+            shift = torch.tensor([0.17, 0.17, -0.2]) * min(n, 1)
+            x[upper] += shift
+            moved[1] += shift
+            x[~upper] = (x[~upper] - com[0]) @ matrix(quat).T + com[0]
+            monitor.add(FrameState(x, moved, torch.stack([quat, torch.tensor([1.0, 0, 0, 0])])))
+        assert low <= monitor.penetration[1] <= high
+
+
+@pytest.mark.parametrize(("measure", "bound", "text"), [
+    ("penetration", 0.03, "sinks into the floor by 4 %"), ("creep", 0.01, "it creeps by 1.1 % of its size a second"),
+    ("spread", 0.1, "changes its size by 11 %"), ("energy_gain", 0.05, "gain 6 % of the energy"),
+])  # fmt: skip
+def test_warnings_begin_above_the_bounds(scene, caplog, measure, bound, text):
+    caplog.set_level(logging.WARNING)
+    monitor = monitor_of(scene)
+    monitor._partner = ["the floor"] * 2
+    for value, warned in ((bound, False), (bound + (0.001 if measure == "creep" else 0.01), True)):
+        caplog.clear()
+        row = dict.fromkeys(("penetration", "creep", "spread"), 0.0)
+        result = {"objects": {"1": dict(row), "2": dict(row)}, "energy_gain": 0.0}
+        if measure == "energy_gain":
+            result[measure] = value
+        else:
+            result["objects"]["2"][measure] = value
+        monitor.warn(result)
+        assert len(caplog.records) == warned and (text in caplog.text) == warned
+    assert ("object 2 (upper)" in caplog.text) == (measure != "energy_gain")
+
+
+def test_few_frames_do_not_creep_and_lifted_objects_start_where_they_were(scene):
+    for frames, creeps in ((7, False), (8, True)):
+        found, _ = measured(scene, lambda t: (0.02 * t, 0.0, 0.0), frames=frames)
+        assert (found["objects"]["2"]["creep"] > 0) == creeps
+    keypoints = choose_keypoints(scene, 64)
+    monitor = PlausibilityMonitor(scene, keypoints, ForcePrompts(lift={2: 0.5}), SimulateOptions())
+    com = torch.tensor([[0.0, 0.0, 0.1], [0.0, 0.0, 0.8]])
+    monitor.add(FrameState(keypoints.rest, com, torch.tensor([[1.0, 0, 0, 0]] * 2)))
+    np.testing.assert_allclose(monitor._origin, [[0, 0, 0.1], [0, 0, 0.3]], atol=1e-6)

@@ -24,6 +24,7 @@ from stages.reconstruct.options import FEATURE_EXTRACTORS as MATCHERS
 from stages.reconstruct.options import QUALITY_PRESETS, SYNCHRONISATIONS, ReconstructOptions
 from stages.refine.options import BACKENDS as REFINE
 from stages.refine.options import GENERATORS, RefineOptions
+from stages.refine.options import MATCHERS as REFINE_MATCHERS
 from stages.render.options import OUTPUT_FORMATS, VIEWS, RenderOptions
 from stages.segment.options import BACKENDS as SEGMENT
 from stages.segment.options import NETWORKS, SegmentOptions
@@ -196,6 +197,9 @@ def refine(
     download: Annotated[
         bool, Option("--download", help=f"for {GENERATORS}: download missing weights, after logging size and licence")
     ] = RefineOptions.download,
+    matcher: Annotated[
+        str, Option(help=f"to register whole objects, by a photo and renderings: {' | '.join(REFINE_MATCHERS)}")
+    ] = RefineOptions.matcher,
     keep_raw: Annotated[
         bool, Option("--keep-raw", help="also keep the K objects unrefined, with ids K+1 to 2K")
     ] = RefineOptions.keep_raw,
@@ -211,8 +215,8 @@ def refine(
 ) -> None:
     """Complete the objects and fill the table beneath them: LABELLED.ply -> REFINED.ply."""
     options = RefineOptions(
-        completer=completer, library=library, photos=photos, weights=weights, download=download, keep_raw=keep_raw,
-        outliers=outliers, background=background, resolution=resolution, seed=seed, device=device,
+        completer=completer, library=library, photos=photos, weights=weights, download=download, matcher=matcher,
+        keep_raw=keep_raw, outliers=outliers, background=background, resolution=resolution, seed=seed, device=device,
     )  # fmt: skip
     load("stages.refine.stage:run")(scene, out, options)
 

@@ -17,7 +17,7 @@ from stages.core.perception.support import Support
 from stages.core.scene.gaussians import SURFACE_OPACITY, Gaussians
 from stages.core.scene.scene import Scene
 from stages.refine.disc_gaussians import empty_like
-from stages.refine.library import opaque_gaussians, place_whole
+from stages.refine.library import matched_hints, opaque_gaussians, place_whole
 from stages.refine.object_crop import TRAINED_ELEVATIONS, crop_object
 from stages.refine.observed_space import ObservedSpace
 from stages.refine.options import RefineOptions
@@ -44,8 +44,9 @@ def complete(
     prompt = "" if name == f"object_{number}" else name.replace("_", " ")  # a number is not a prompt
     generated = model.generate(crop.image, crop.elevation, prompt, options.seed)
     generated = generated[generated.opacities > SURFACE_OPACITY]
+    hints = [crop.place, *matched_hints(options, crop, own, generated)]
     registration = (
-        register(own.to(device), generated.to(device), options.seed, crop.place)
+        register(own.to(device), generated.to(device), options.seed, hints)
         if len(generated) >= MIN_REGISTRATION_POINTS
         else None
     )

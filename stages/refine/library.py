@@ -17,11 +17,14 @@ from torch import Tensor
 from stages.core.backends import pick_device
 from stages.core.errors import InputError
 from stages.core.geometry.neighbours import knn
+from stages.core.geometry.similarity import Similarity
+from stages.core.models.matching.weights import Matcher, load_matcher
 from stages.core.perception.support import Support
 from stages.core.scene.gaussians import SURFACE_OPACITY, Gaussians, transformed
 from stages.core.scene.scene import Scene
 from stages.core.scene.scene_ply import read_scene
 from stages.refine.disc_gaussians import empty_like
+from stages.refine.object_crop import ObjectCrop, crop_object
 from stages.refine.observed_space import ObservedSpace
 from stages.refine.options import RefineOptions
 from stages.refine.registration import (
@@ -32,6 +35,7 @@ from stages.refine.registration import (
     fine_registration,
 )
 from stages.refine.registration_cloud import RegistrationCloud
+from stages.refine.registration_matches import SIDE, matched_place, view_of
 
 log = logging.getLogger(__name__)
 MIN_FIT = 0.8  # below it, the asset is another object
@@ -46,7 +50,9 @@ def complete(
 ) -> Gaussians:
     """The completer "library": Gaussians of the best asset where the object was not seen; none if no asset fits."""
     own = opaque_gaussians(scene, number)
-    found = best_asset(own, options) if len(own) >= MIN_REGISTRATION_POINTS else None
+    enough = len(own) >= MIN_REGISTRATION_POINTS
+    crop = crop_object(scene, own, SIDE, options.photos) if enough and options.matcher != "none" else None
+    found = best_asset(own, options, crop) if enough else None
     if found is None:
         log.info("  %d  %s: unchanged: too few Gaussians to compare with the library", number, scene.name_of(number))
         return empty_like(own)
@@ -103,11 +109,34 @@ def load_library(folder: Path, device: str) -> dict[str, tuple[Gaussians, Regist
     return out
 
 
-def best_asset(own: Gaussians, options: RefineOptions) -> tuple[str, Gaussians, Registration] | None:
-    """Name, Gaussians and registration of the asset that fits best: all coarsely, the best candidates accurately."""
+def matched_hints(
+    options: RefineOptions, crop: ObjectCrop | None, own: Gaussians, whole: Gaussians
+) -> list[Similarity]:
+    """The place of a whole by --matcher; empty without a matcher, an image of the object, or enough matches."""
+    if crop is None or options.matcher == "none":
+        return []
+    device = pick_device(options.device)
+    own, whole, image, V, K = (x.to(device) for x in (own, whole, crop.image, crop.viewmat, crop.K))
+    place = matched_place(_matcher(device), view_of(own, image, V, K), whole, options.seed)
+    return [] if place is None else [place]
+
+
+@lru_cache(maxsize=1)
+def _matcher(device: str) -> Matcher:
+    return load_matcher(device)
+
+
+def best_asset(
+    own: Gaussians, options: RefineOptions, crop: ObjectCrop | None = None
+) -> tuple[str, Gaussians, Registration] | None:
+    """Name, Gaussians and registration of the asset that fits best: all coarsely, the best candidates accurately.
+
+    With `crop`, an image of the object, --matcher matches it to each asset.
+    """
     device, seed = pick_device(options.device), options.seed
     assets, part = load_library(options.library, device), RegistrationCloud.of(own.to(device), seed)
-    coarse = {name: coarse_registration(part, cloud, seed) for name, (_, cloud) in assets.items()}
+    coarse = {name: coarse_registration(part, cloud, seed, matched_hints(options, crop, own, whole))
+              for name, (whole, cloud) in assets.items()}  # fmt: skip
     fits = {name: coarse_fit(poses, part, assets[name][1]) for name, poses in coarse.items() if len(poses)}
     candidates = sorted(fits, key=fits.get, reverse=True)[:FINE_CANDIDATES]
     fine = {name: fine_registration(coarse[name], part, assets[name][1], seed) for name in candidates}

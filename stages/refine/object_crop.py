@@ -38,6 +38,8 @@ class ObjectCrop:
     elevation: float  # of the camera above the horizontal, seen from the object [degrees]
     place: Similarity  # DiffSplat's frame to the scene, as estimated from the camera
     name: str  # of the photo
+    viewmat: Float[Tensor, "4 4"]  # of the camera, and its intrinsics
+    K: Float[Tensor, "3 3"]
 
 
 def crop_object(scene: Scene, own: Gaussians, side: int, photos: Path | None = None) -> ObjectCrop | None:
@@ -64,7 +66,7 @@ def crop_object(scene: Scene, own: Gaussians, side: int, photos: Path | None = N
     elevation = _elevation(eye, centre)
     scale = float((eye - centre).norm()) * FOCAL * side / float(K[0, 0]) / RADIUS
     place = Similarity(scale, viewmat[:3, :3].mT @ cameras(elevation)[0, :3, :3], centre)
-    return ObjectCrop(image * alone + 1 - alone, elevation, place, scene.cameras.names[view])
+    return ObjectCrop(image * alone + 1 - alone, elevation, place, scene.cameras.names[view], viewmat, K)
 
 
 def _files(photos: Path, scene: Scene) -> dict[int, Path]:

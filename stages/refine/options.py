@@ -19,6 +19,8 @@ BACKENDS = {
     "none": Backend("stages.refine.hull_completion:no_completion", "add nothing to objects"),
 }  # fmt: skip
 GENERATORS = with_weights(BACKENDS)
+MATCHERS = ("none", "aliked-lightglue")
+WHOLE_OBJECTS = ("library", "diffsplat")  # completers that register a whole object
 CONCURRENT = {"close", "none"}  # completers of which several run at a time: they use the CPU alone
 
 
@@ -31,6 +33,7 @@ class RefineOptions:
     photos: Path | None = None  # folder of the scene's photos, for generators; by default the scene is rendered
     weights: Path | None = None  # folder of a generator's weights; by default searched
     download: bool = False  # download missing weights
+    matcher: str = "none"  # of MATCHERS: poses of whole objects also by learned matches of images
     keep_raw: bool = False  # of K objects, keep the uncompleted ones as K + 1 to 2 K
     outliers: float = 3.0  # robust deviations beyond which a Gaussian is a floater; 0 keeps all
     background: bool = True  # fill the table under and behind objects
@@ -45,6 +48,10 @@ class RefineOptions:
             raise InputError(
                 f"--photos, --weights and --download only work with --completer {GENERATORS}; add it or drop them"
             )
+        if self.matcher not in MATCHERS:
+            raise InputError(f"--matcher {self.matcher}: choose from {', '.join(MATCHERS)}")
+        if self.matcher != "none" and self.chosen not in WHOLE_OBJECTS:
+            raise InputError(f"--matcher: only works with --library or --completer {GENERATORS}; add it or drop it")
         if not 0 <= self.outliers < 1000:
             raise InputError(f"--outliers {self.outliers}: give 0 to keep all, or robust deviations such as 3")
         if not 8 <= self.resolution <= 96:

@@ -7,6 +7,7 @@ tested for parts with 60 % of the surface, any rotation and scales 0.5 to 2. Com
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -42,30 +43,30 @@ class Registration:
     fit: float  # 1: all points of the part agree in position and colour; 0: none within 6 % of the diameter
 
 
-def register(part: Gaussians, whole: Gaussians, seed: int = 0, hint: Similarity | None = None) -> Registration | None:
-    """The similarity from `whole` to `part`, optionally near a `hint`; None without a hint or consistent features."""
-    return register_clouds(RegistrationCloud.of(part, seed), RegistrationCloud.of(whole, seed), seed, hint)
+def register(part: Gaussians, whole: Gaussians, seed: int = 0, hints: Sequence[Similarity] = ()) -> Registration | None:
+    """The similarity from `whole` to `part`, optionally near `hints`; None without hints or consistent features."""
+    return register_clouds(RegistrationCloud.of(part, seed), RegistrationCloud.of(whole, seed), seed, hints)
 
 
 def register_clouds(
-    part: RegistrationCloud, whole: RegistrationCloud, seed: int = 0, hint: Similarity | None = None
+    part: RegistrationCloud, whole: RegistrationCloud, seed: int = 0, hints: Sequence[Similarity] = ()
 ) -> Registration | None:
-    """As `register`, for clouds that exist already; `hint` maps the whole to the part."""
-    coarse = coarse_registration(part, whole, seed, hint)
+    """As `register`, for clouds that exist already; hints map the whole to the part."""
+    coarse = coarse_registration(part, whole, seed, hints)
     return fine_registration(coarse, part, whole, seed) if len(coarse) else None
 
 
 def coarse_registration(
-    part: RegistrationCloud, whole: RegistrationCloud, seed: int = 0, hint: Similarity | None = None
+    part: RegistrationCloud, whole: RegistrationCloud, seed: int = 0, hints: Sequence[Similarity] = ()
 ) -> PoseHypotheses:
     """At most 2 candidate poses, best first, accurate to about 3 degrees; empty where no features agree.
 
-    Poses around a `hint` (whole to part) are tried too.
+    Poses around `hints` (whole to part) are tried too.
     """
     if min(len(part.points), len(whole.points)) < MIN_REGISTRATION_POINTS:
         return PoseHypotheses(torch.zeros(0), torch.zeros(0, 3, 3), torch.zeros(0, 3))
     poses = pose_hypotheses(part, whole, seed)
-    if hint is not None:
+    for hint in hints:
         poses = PoseHypotheses.joined(
             to_normalised_frames(hint, part, whole).perturbed(HINT_PERTURBATIONS, seed), poses
         )

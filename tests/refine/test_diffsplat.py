@@ -116,7 +116,7 @@ def test_registration_of_a_featureless_object_with_a_hint():
     there = Similarity(0.4, matrix(torch.tensor([0.8, 0.2, -0.3, 0.1])), torch.tensor([0.2, 0.1, 0.3]))
     part = transformed(plain, there)[plain.means[:, 0] > -0.05]
     near = Similarity(0.4 * 1.05, there.rotation @ OFF.rotation, there.translation + 0.01)
-    found = register(part, plain, hint=near)
+    found = register(part, plain, hints=[near])
     assert found.similarity.scale == pytest.approx(0.4, rel=0.03)
     assert (found.similarity(plain.means) - there(plain.means)).norm(dim=1).mean() < 0.02 * RegistrationCloud.of(
         part

@@ -58,8 +58,8 @@ def test_brute_force_search_gives_the_same_registration(whole, monkeypatch):
 def test_registration_on_a_gpu(whole):
     given = make_trial(whole, 1, RegisterBenchOptions())
     near = given.truth._replace(scale=1.02 * given.truth.scale)  # on the CPU, as a camera would tell it
-    for hint in (None, near):
-        found = register(given.part.to("cuda"), whole.to("cuda"), hint=hint).similarity
+    for hints in ((), (near,)):
+        found = register(given.part.to("cuda"), whole.to("cuda"), hints=hints).similarity
         assert found.rotation.is_cuda and found.translation.is_cuda
         wrong = errors(found.to("cpu"), given, whole, revolved=False)
         assert wrong["rotation"] < 2 and wrong["scale"] < 2 and wrong["shift"] < 1

@@ -312,6 +312,9 @@ def track(
     masks: Annotated[
         Path | None, typer.Option(help="folder with a folder of label images for each film, one for each frame")
     ] = TrackOptions.masks,
+    soft: Annotated[
+        str, typer.Option(help="names of objects that deform, separated by commas; others are rigid")
+    ] = TrackOptions.soft,
     keypoints: Annotated[int, typer.Option(help="keypoints per object, in the trajectory")] = TrackOptions.keypoints,
     seed: Seed = TrackOptions.seed,
     device: Device = TrackOptions.device,
@@ -323,7 +326,7 @@ def track(
     """
     from stages.lab.track.track import run
 
-    options = TrackOptions(resolution=resolution, frames=frames, masks=masks, keypoints=keypoints, seed=seed,
+    options = TrackOptions(resolution=resolution, frames=frames, masks=masks, soft=soft, keypoints=keypoints, seed=seed,
                            device=device)  # fmt: skip
     for line in run(scene, films, out, options):
         print(line)

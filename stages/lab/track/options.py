@@ -13,6 +13,7 @@ class TrackOptions:
     resolution: int = 320  # longest side at which pictures are compared [px]
     frames: int = 0  # to track; 0: up to where the scene file says that everything rests
     masks: Path | None = None  # folder with a folder of label images for each film
+    soft: str = ""  # names of objects that deform, separated by commas
     keypoints: int = 256  # per object, in the trajectory
     seed: int = 0  # of the keypoints
     device: str = "auto"

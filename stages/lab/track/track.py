@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import repeat
 from pathlib import Path
 
 import torch
@@ -16,6 +17,7 @@ from stages.core.scene.files import provenance
 from stages.core.scene.scene import Scene
 from stages.core.scene.scene_ply import read_scene
 from stages.core.scene.trajectory import SimulationInfo, TrajectoryWriter
+from stages.lab.track.deform import deformations, followed, soft_rows
 from stages.lab.track.films import read_films
 from stages.lab.track.follow import TrackedMotion, Tracker, follow
 from stages.lab.track.options import TrackOptions
@@ -35,7 +37,8 @@ def run(scene: Path, folder: Path, out: Path, options: TrackOptions) -> Iterator
     cameras, films = read_films(world, folder, frames, options.resolution, options.masks)
     tracker = Tracker(world, cameras, films, device)
     fall = torch.tensor([0.0, 0.0, -GRAVITY / world.metres_per_unit], device=device)
-    track = follow(tracker, frames, fall / fps**2)
+    rows = soft_rows(world, options.soft)
+    track, bodies = deformations(tracker, follow(tracker, frames, fall / fps**2), rows)
     made_by = {**provenance("track", [scene, folder], options), "scene": world.provenance, "starts": track.starts}
     keypoints = choose_keypoints(world, options.keypoints, options.seed)
     info = SimulationInfo(1 / fps, tuple(fall.tolist()), "track")
@@ -43,10 +46,12 @@ def run(scene: Path, folder: Path, out: Path, options: TrackOptions) -> Iterator
     row = (keypoints.object_id[:, None] == torch.tensor([o.id for o in world.objects])).int().argmax(1)
     middle = torch.stack([keypoints.rest[row == i].mean(0) for i in range(len(world.objects))])
     poses, rest = track.poses.to("cpu"), tracker.rest.centre.cpu()
+    arm = keypoints.rest - rest[row]
+    bends = followed(bodies, row, arm) if bodies else repeat(torch.zeros_like(arm))
     with TrajectoryWriter(out, replace(world, provenance=made_by), info, keypoints, binding) as writer:
-        for frame in range(frames):
+        for frame, bend in zip(range(frames), bends, strict=False):
             R, centre = poses.rotation[frame], poses.centre[frame]
-            positions = (R[row] @ (keypoints.rest - rest[row])[..., None])[..., 0] + centre[row]
+            positions = (R[row] @ (arm + bend)[..., None])[..., 0] + centre[row]
             com = (R @ (middle - rest)[..., None])[..., 0] + centre
             writer.append(positions, com, poses[frame].quaternions())
         writer.store_confidence(track.confidence)

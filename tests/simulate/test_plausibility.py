@@ -127,8 +127,8 @@ def test_gain_of_energy_counts_from_the_last_force(scene, end, gain):
 
 
 def test_depth_below_the_surface_of_a_cube(scene):
-    """Linear between voxels of 1/48 of its side; half a voxel is the surface's own."""
-    depth = monitor_of(scene)._body(0)
+    """Linear towards the nearest face, negative outside."""
+    depth = monitor_of(scene)._surface(0).depth
     x = np.array([[0.0, 0.0, 0.1], [0.05, 0.0, 0.1], [0.0, -0.08, 0.1], [0.1, 0.0, 0.1], [0.15, 0.0, 0.1]])
     np.testing.assert_allclose(depth(x)[:4], [0.1, 0.05, 0.02, 0.0], atol=0.008)
     assert depth(x)[4] < -0.01

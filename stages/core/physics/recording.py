@@ -13,7 +13,7 @@ from stages.core.physics.forces import ForcePrompts, read_forces
 from stages.core.scene.files import read_json_file
 from stages.core.scene.formats import FORMATS, suffixes
 from stages.core.scene.scene import SceneObject
-from stages.core.scene.schema import number, reason, rows, text, texts, whole
+from stages.core.scene.schema import number, reason, rows, table, text, texts, whole
 
 # Options of `ngff simulate` that --forces repeats -> checks of their values; not those that name other files.
 OPTIONS: dict[str, Callable] = {
@@ -47,7 +47,7 @@ def read_recording(path: Path) -> Recording | None:
     if not isinstance(data, dict) or data.keys() != {"options", "frames", "prompts"}:
         return None
     try:
-        prompts = ForcePrompts.from_dicts(rows(data["prompts"], "prompts"))
+        prompts = ForcePrompts.from_dicts([table(row, "a prompt") for row in rows(data["prompts"], "prompts")])
         frames = whole(data["frames"], "frames", 1)
     except ValueError as error:
         raise InputError(f"{path}: {reason(error)}; save it from the page again") from error

@@ -95,6 +95,13 @@ def rows(values: object, what: str) -> list:
     return values
 
 
+def table(value: object, what: str) -> dict:
+    """A JSON object; ValueError for anything else."""
+    if not isinstance(value, dict):
+        raise ValueError(f"{what} is {quote(repr(value), 40)}, not a JSON object")
+    return value
+
+
 def parse_json(data: str, finite: bool = True) -> object:
     """The value of a JSON text of bounded depth; `finite` refuses NaN, infinities and integers beyond 64 bits."""
     try:

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import torch
 from jaxtyping import Float, Int, UInt8
+from scipy.ndimage import binary_fill_holes
 from torch import Tensor
 
 from stages.core.geometry.cameras import depths
@@ -71,7 +72,8 @@ def cut_outlines(
 ) -> Int[np.ndarray, "h w"]:
     """The label image with new outlines of the objects of `bands`, each within that many pixels of the one before.
 
-    No object takes pixels of another. Objects whose colours do not tell them from what is around them stay as they are.
+    Holes are filled: what is behind an object is seen beside it in other views, which outvote this one; the dark screen of
+    a monitor is not. No object takes pixels of another. Objects whose colours do not tell them from what is around them stay as they are.
     """
     out = np.zeros_like(labels)
     for number, band in bands.items():
@@ -86,5 +88,6 @@ def cut_outlines(
         disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
         inner, outer = (f(mine.astype(np.uint8), disc) > 0 for f in (cv2.erode, cv2.dilate))
         found = grabcut(image[window], outer & free, mine & ~inner, inner, seed)
-        out[window][found if found.sum() >= MIN_KEPT * mine.sum() else mine] = number
+        kept = found if found.sum() >= MIN_KEPT * mine.sum() else mine
+        out[window][binary_fill_holes(kept) & (free | mine)] = number
     return out

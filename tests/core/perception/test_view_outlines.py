@@ -44,6 +44,17 @@ def test_where_colours_say_nothing_the_outline_stays_within_the_band():
     assert not (found == 1)[~disc((80, 80), (40, 40), 20)].any()
 
 
+def test_holes_are_filled_but_for_other_objects():
+    true = disc((120, 160), (60, 80), 40)
+    image = np.where(true[..., None], [200, 40, 30], [180, 180, 175]).astype(np.uint8)
+    labels = np.where(true, 1, 0)
+    labels[disc((120, 160), (60, 70), 12)] = 0
+    labels[50:70, 90:100] = 2
+    found = cut_outlines(image, labels, {1: 3.0, 2: 3.0}, 0)
+    assert (found == 1)[disc((120, 160), (60, 70), 12)].all()
+    assert (found == 2)[labels == 2].all()
+
+
 def test_an_object_of_few_pixels_keeps_them():
     labels = np.zeros((40, 40), np.int64)
     labels[10:16, 10:16] = 1  # less than MIN_PIXELS

@@ -72,8 +72,9 @@ def cut_outlines(
 ) -> Int[np.ndarray, "h w"]:
     """The label image with new outlines of the objects of `bands`, each within that many pixels of the one before.
 
-    Holes are filled: what is behind an object is seen beside it in other views, which outvote this one; the dark screen of
-    a monitor is not. No object takes pixels of another. Objects whose colours do not tell them from what is around them stay as they are.
+    Holes are filled: what is behind an object is seen beside it in other views, which outvote this one; the dark
+    screen of a monitor is not. No object takes pixels of another. Objects whose colours do not tell them from what is
+    around them stay as they are.
     """
     out = np.zeros_like(labels)
     for number, band in bands.items():

@@ -178,3 +178,28 @@ def test_walls_hold_and_soft_or_plastic_bodies_are_warned_of(tmp_path, caplog):
 def test_motion_without_limit_is_an_error(tmp_path):
     with pytest.raises(InputError, match="ceased to be finite"):
         roll(tmp_path, cube(0.1, 0, 0.5), force=("object=1 force=9e8,0,0",), steps=9, dt=0.5)
+
+
+SUBSTEPS_OF_A_CUBE = [  # of side .1 m and .5 kg on the floor: sqrt(size / acceleration) / 200, or .05 size / speed
+    ({}, 39.6), ({"gravity": 4 * G}, 79.2), ({"gravity": 0.0}, 1), ({"velocity": ("object=1 12,0,5",)}, 57.6),
+    ({"force": ("object=1 force=30,40,0",)}, 126.5), ({"force": ("object=1 torque=0,0.6,0.8",)}, 56.6),
+    ({"force": ("object=1 force=30,40,0 from=0 to=0.01",)}, 39.6), ({"unit": 0.25}, 79.2),
+    ({"lift": ("body1=3.95",), "gravity": 0.1}, 4), ({"lift": ("body1=2.95",), "gravity": 9.81}, 39.6),
+    ({"lift": ("body1=7.95",), "gravity": 9.81}, 50.1), ({"velocity": ("object=1 0,0,2000",)}, 5000),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("options", "expected"), SUBSTEPS_OF_A_CUBE, ids=str)
+def test_substeps_follow_from_acceleration_and_speed(tmp_path, caplog, options, expected):
+    caplog.set_level(logging.INFO)
+    roll(tmp_path, cube(0.1, 0, 0.0), steps=1, **options)
+    (line,) = [r.getMessage() for r in caplog.records if "convex parts, substep" in r.getMessage()]
+    found = int(line.split("(")[1].split()[0])
+    assert found == pytest.approx(expected, abs=max(1.0, 0.02 * expected))
+    assert float(line.split("substep ")[1].split()[0]) == pytest.approx(0.02 / found, rel=0.01)
+
+
+def test_the_smallest_object_decides_on_the_substeps(tmp_path, caplog):
+    caplog.set_level(logging.INFO)
+    roll(tmp_path, cube(0.1, 0, 0.0), cube(0.025, 1.0, 0.0), cube(0.2, 2.0, 0.0), steps=1)
+    assert any("(80 per frame)" in r.getMessage() for r in caplog.records)

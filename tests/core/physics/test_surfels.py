@@ -160,10 +160,14 @@ def test_the_more_open_side_is_outside_and_sheets_are_open_at_both(above, below,
     torch.testing.assert_close(found.half_thickness, torch.full((81,), thickness).double())
 
 
-def test_equal_sides_face_away_from_the_middle():
-    points = plane() + torch.tensor([0.0, 0.0, -0.3], dtype=torch.float64)
+@pytest.mark.parametrize("openness", [0.0, 0.5])
+@pytest.mark.parametrize("height", [-0.3, 0.3])
+def test_equal_sides_face_away_from_the_middle(height, openness):
+    points = plane() + torch.tensor([0.0, 0.0, height], dtype=torch.float64)
     normals = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).repeat(81, 1)
     discs = Surfels(points, normals, torch.full((81,), 0.1).double(), torch.zeros(81).double())
     low, cell = torch.full((3,), -0.95).double(), torch.full((3,), 0.1).double()
-    found = signed_distance._oriented(discs, neighbour_index(points), torch.zeros(20, 20, 20), low, cell, 0.04)
-    assert (found.normal[:, 2] == -1).all() and not found.half_thickness.any()
+    around = torch.full((20, 20, 20), openness)
+    found = signed_distance._oriented(discs, neighbour_index(points), around, low, cell, 0.04)
+    assert (found.normal[:, 2] == math.copysign(1, height)).all()
+    assert (found.half_thickness == (0.02 if openness else 0.0)).all()

@@ -1,6 +1,7 @@
 """The prompts in a traj.h5 are checked, so that all who read them may rely on their fields."""
 
 import math
+import re
 
 import pytest
 
@@ -31,3 +32,19 @@ def test_fields_that_may_be_left_out_are_added():
 def test_others_are_refused(row, message):
     with pytest.raises(ValueError, match=message):
         read_prompts([row], [2])
+
+
+LIMITS = [  # a row, the field of its value, the least and the greatest value
+    (FORCE, "start", 0, 1e9), (FORCE, "object_id", 1, 65535), ({**CHANGE, "what": "friction"}, "value", 0, 100),
+    (CHANGE, "value", -1e9, 1e9), ({"kind": "lift", "object_id": 2, "height": 0}, "height", -1e9, 1e9),
+    (CHANGE, "start", 0, 1e9), ({"kind": "pin"}, "object_id", 1, 65535),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("row", "field", "low", "high"), LIMITS)
+def test_values_up_to_the_limits_are_read_and_no_others(row, field, low, high):
+    for value in (low, high):
+        assert read_prompts([{**row, field: value}])[0][field] == value
+    for value in (low - 1, high + 1):
+        with pytest.raises(ValueError, match=re.escape(f"not a number from {low:g} to {high:g}")):
+            read_prompts([{**row, field: value}])

@@ -147,6 +147,17 @@ def test_different_lengths_and_rates_need_an_option(tmp_path, two_balls):
     assert facts["overall"]["FPE"] == pytest.approx(0.11, abs=1e-6)  # both fall by 0.01 per frame: 22 frames against 11
 
 
+@pytest.mark.parametrize(("dt", "same"), [(0.0200019, True), (0.020003, False), (0.019997, False)])
+def test_rates_that_differ_by_a_ten_thousandth_are_the_same(tmp_path, two_balls, dt, same):
+    write_motion(tmp_path / "true.h5", two_balls, frames=3)
+    write_motion(tmp_path / "mine.h5", two_balls, frames=3, dt=dt)
+    if same:
+        assert evaluate(tmp_path)["overall"]["MSE"] == 0
+    else:
+        with pytest.raises(InputError, match="give --resample"):
+            evaluate(tmp_path)
+
+
 def test_resampling_takes_the_nearest_frames_before_and_after(tmp_path, two_balls):
     """Of a motion with acceleration, which other frames would not give: exact at its own frames, a mean in between."""
     def accelerated(dt: float, count: int):

@@ -124,3 +124,20 @@ def test_scene_without_cameras_is_refused(tmp_path):
     (tmp_path / "p.json").write_text('{"bbox": [[1, 1, 5, 5]]}')
     with pytest.raises(InputError, match="has no cameras"):
         segment(three_apart(cameras=False), SegmentOptions(boxes=tmp_path / "p.json"))
+
+
+def test_ratio_of_colours_is_that_of_their_frequencies():
+    """A red half and a blue one: frequencies count, not numbers of pixels."""
+    image = np.zeros((40, 80, 3), np.uint8)
+    image[:, :40, 0], image[:, 40:, 2] = 255, 255
+    inside, around = np.zeros((2, 40, 80), bool)
+    inside[:, :30], around[:, 50:] = True, True
+    ratio = boxes.colour_likelihood_ratio(image, inside, around)
+    assert ratio[20, 10] > 100 and ratio[20, 70] < 0.01
+    inside[:], around[:] = False, False
+    inside[:30, :30] = inside[:30, 50:] = around[30:33, :30] = around[30:33, 50:] = True  # ten times as many pixels
+    np.testing.assert_allclose(boxes.colour_likelihood_ratio(image, inside, around)[:, [10, 70]], 1, atol=0.01)
+    around[30:33, 50:] = False
+    ratio = boxes.colour_likelihood_ratio(image, inside, around)
+    np.testing.assert_allclose(ratio[:, 10], 0.5, atol=0.01)
+    assert (boxes.colour_likelihood_ratio(image, np.zeros_like(inside), around) == 0).all()

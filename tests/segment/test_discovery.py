@@ -143,3 +143,16 @@ def test_numbers_of_new_labels():
     # the second covers object 1 in the one photo that shows both; the others are new
     assert match_labels(fresh, old, new=3, count=2).tolist() == [0, 3, 1, 4]
     assert match_labels(fresh, {}, new=3, count=0).tolist() == [0, 1, 2, 3]
+
+
+@pytest.mark.parametrize(("covered", "known"), [(3, True), (2, False), (1, False)])
+def test_a_label_is_an_object_of_which_it_covers_more_than_half(covered, known):
+    """Of four pixels; in a view in which the object is not seen nothing is compared."""
+    labels = torch.ones(2, 2, dtype=torch.int64)
+    old = torch.zeros(4, dtype=torch.int64)
+    old[:covered] = 2
+    unseen = torch.zeros(2, 2, dtype=torch.int64)
+    found = match_labels({0: labels, 1: labels, 2: labels}, {0: old.reshape(2, 2), 1: unseen}, new=1, count=2)
+    assert found.tolist() == [0, 2 if known else 3]
+    one = torch.ones(1, 1, dtype=torch.int64)
+    assert match_labels({0: one}, {0: 2 * one}, new=1, count=2).tolist() == [0, 2]

@@ -203,3 +203,9 @@ def test_the_smallest_object_decides_on_the_substeps(tmp_path, caplog):
     caplog.set_level(logging.INFO)
     roll(tmp_path, cube(0.1, 0, 0.0), cube(0.025, 1.0, 0.0), cube(0.2, 2.0, 0.0), steps=1)
     assert any("(80 per frame)" in r.getMessage() for r in caplog.records)
+
+
+def test_the_fastest_object_decides_on_the_substeps(tmp_path, caplog):
+    caplog.set_level(logging.INFO)
+    roll(tmp_path, cube(0.1, 0, 0.0), cube(0.1, 1.0, 0.0), steps=1, velocity=("object=2 12,0,5",))
+    assert any("(58 per frame)" in r.getMessage() for r in caplog.records)

@@ -43,7 +43,7 @@ def test_photos_and_the_table_exclude_each_other(tmp_path):
 
 @pytest.mark.slow
 def test_three_toys_go_from_photos_to_films(tmp_path):
-    options = ChainTableOptions(objects=(3,), photos=10, width=256, quality="draft", steps=3, repeat=1, device="cpu")
+    options = ChainTableOptions(objects=(3,), photos=20, width=320, quality="draft", steps=3, repeat=1, device="cpu")
     lines = list(chain_table.run(tmp_path / "table.json", options))
     runs = json.loads((tmp_path / "table.json").read_text())["runs"]
     assert [run["refine"] for run in runs] == [True, False] and len(lines) == 6

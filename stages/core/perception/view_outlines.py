@@ -12,6 +12,7 @@ from scipy.ndimage import binary_fill_holes
 from torch import Tensor
 
 from stages.core.geometry.cameras import depths
+from stages.core.geometry.neighbours import knn
 from stages.core.perception.grabcut import grabcut
 from stages.core.perception.support import view_extent
 from stages.core.perception.voting import ViewFootprint, add_votes, damp_votes, voting_intrinsics
@@ -22,6 +23,7 @@ MAX_VIEWS = 16  # evenly chosen among the cameras
 BAND = 0.01  # distance from the outline so far within which the new one is looked for [camera distance]
 MIN_VOTES = 1.0  # of a Gaussian that changes its object; those hidden under something have less
 CONTEXT = 3.0  # width of the surroundings whose colours are compared with those of an object [BAND]
+REACH = 0.03  # of the Gaussians that an object may gain from those that it had [camera distance]
 MIN_PIXELS = 40  # of an object in a view
 MIN_KEPT = 0.4  # share of an object's pixels; where less is left, its colours are those of its surroundings
 
@@ -49,7 +51,12 @@ def refine_outlines(scene: Scene, ids: Int[Tensor, "n"], seed: int = 0) -> Int[T
             found.append((footprint, pool.submit(cut_outlines, image, labels, bands, seed)))
         for footprint, labels in found:
             votes = add_votes(votes, damp_votes(footprint.votes(torch.from_numpy(labels.result()))))
-    return torch.where(votes.sum(1) >= MIN_VOTES, votes.argmax(1), ids)
+    voted = torch.where(votes.sum(1) >= MIN_VOTES, votes.argmax(1), ids)
+    for number in numbers:  # not what is far behind an object, where its surface is missing
+        gained = torch.nonzero((voted == number) & (ids != number))[:, 0]
+        far = knn(means[ids == number], means[gained], 1)[0][:, 0] > REACH * view_extent(scene).radius
+        voted[gained[far]] = ids[gained[far]]
+    return voted
 
 
 def _label_image(scene: Scene, view: int, ids: Int[Tensor, "n"], numbers: list[int]) -> Int[np.ndarray, "h w"]:

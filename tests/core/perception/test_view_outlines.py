@@ -6,8 +6,13 @@ import numpy as np
 import pytest
 import torch
 
+from stages.core.geometry.cameras import intrinsics, look_at
+from stages.core.geometry.harmonics import C0
 from stages.core.perception.view_outlines import MIN_PIXELS, cut_outlines, refine_outlines
 from stages.core.raster.rasterise import visibility
+from stages.core.scene.cameras import Cameras
+from stages.core.scene.gaussians import Gaussians, concatenate
+from stages.core.scene.scene import Scene, SceneObject
 from stages.lab.assets.tabletops import tabletop
 
 
@@ -80,6 +85,29 @@ def test_a_ring_of_table_around_each_object_is_given_back(scene):
     assert wrong.sum() > 100
     assert (found == 0)[wrong].float().mean() > 0.6
     assert (found == g.object_id)[g.object_id > 0].float().mean() > 0.97
+
+
+def panel(x, z, y, rgb, number):
+    """Gaussians .03 apart on a plane across the viewing direction."""
+    means = torch.stack([x.flatten(), torch.full((x.numel(),), y), z.flatten()], 1)
+    n = len(means)
+    quats, scales = torch.tensor([1.0, 0, 0, 0]).expand(n, 4), torch.tensor([0.02, 0.002, 0.02]).expand(n, 3)
+    sh = ((torch.tensor(rgb) - 0.5) / C0).expand(n, 1, 3)
+    return Gaussians(means, quats, scales, torch.full((n,), 0.95), sh, torch.full((n,), number))
+
+
+def test_what_is_far_behind_a_hole_stays_there():
+    x, z = torch.meshgrid(torch.arange(-2, 2, 0.03), torch.arange(-2, 2, 0.03), indexing="xy")
+    wall = panel(x, z, 1.5, [0.7, 0.7, 0.7], 0)
+    ring = (x.abs() < 0.5) & (z.abs() < 0.5) & ((x.abs() > 0.2) | (z.abs() > 0.2))
+    thing = panel(x[ring], z[ring], 0.0, [0.8, 0.1, 0.1], 1)
+    eyes = torch.tensor([[-0.05, -3.0, 0.0], [0.0, -3.0, 0.05], [0.05, -3.0, 0.0]])
+    Ks = intrinsics(320, 240, 300.0).expand(3, 3, 3)
+    cameras = Cameras(look_at(eyes, torch.zeros(3, 3)), Ks, torch.tensor([[320, 240]] * 3), ("a", "b", "c"))
+    scene = Scene(concatenate([wall, thing]), (SceneObject(1, "ring"),), cameras)
+    found, ids = refine_outlines(scene, scene.gaussians.object_id), scene.gaussians.object_id
+    assert (found == 1)[ids == 1].float().mean() > 0.9
+    assert not (found == 1)[ids == 0].any()
 
 
 def test_without_cameras_or_objects_nothing_changes(scene):

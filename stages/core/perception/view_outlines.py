@@ -37,7 +37,7 @@ def refine_outlines(scene: Scene, ids: Int[Tensor, "n"], seed: int = 0) -> Int[T
     """
     if scene.cameras is None or not len(scene.cameras) or not bool((ids > 0).any()):
         return ids
-    count, means = len(scene.cameras), scene.gaussians.means
+    count, means, radius = len(scene.cameras), scene.gaussians.means, view_extent(scene).radius
     views = torch.linspace(0, count - 1, min(MAX_VIEWS, count)).round().long().tolist()
     numbers = ids[ids > 0].unique().tolist()
     middles = torch.stack([means[ids == number].nanmedian(0).values for number in numbers])
@@ -54,7 +54,7 @@ def refine_outlines(scene: Scene, ids: Int[Tensor, "n"], seed: int = 0) -> Int[T
     voted = torch.where(votes.sum(1) >= MIN_VOTES, votes.argmax(1), ids)
     for number in numbers:  # not what is far behind an object, where its surface is missing
         gained = torch.nonzero((voted == number) & (ids != number))[:, 0]
-        far = knn(means[ids == number], means[gained], 1)[0][:, 0] > REACH * view_extent(scene).radius
+        far = knn(means[ids == number], means[gained], 1)[0][:, 0] > REACH * radius
         voted[gained[far]] = ids[gained[far]]
     return voted
 

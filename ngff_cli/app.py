@@ -59,28 +59,37 @@ def ngff(
 @app.command()
 def reconstruct(
     imgs: Annotated[
-        Path, Argument(metavar="PHOTOS", help="folder of photos, or a video; with --sequence a folder of films",
-                       show_default=False)
+        Path,
+        Argument(
+            metavar="PHOTOS", help="folder of photos, or a video; with --sequence a folder of films", show_default=False
+        ),
     ],
     out: Annotated[Path, Option("-o", "--out", help="scene to write (.ply)")] = Path("scene.ply"),
     sequence: Annotated[
-        bool, Option("--sequence", help="PHOTOS has a video, or a folder of frames, for each of several fixed cameras: "
-                     "reconstruct the moment at which the objects are released")
+        bool,
+        Option(
+            "--sequence",
+            help="PHOTOS has a video, or a folder of frames, for each of several fixed cameras: "
+            "reconstruct the moment at which the objects are released",
+        ),
     ] = ReconstructOptions.sequence,
     sync: Annotated[
         str, Option(help="with --sequence, how films are aligned in time: " + " | ".join(SYNCHRONISATIONS))
     ] = ReconstructOptions.sync,
     offsets: Annotated[
-        str, Option(help='with --sequence, in place of --sync: the frame of each film at one moment, '
-                    '"A.mp4=0,B.mp4=3.33"')
+        str,
+        Option(help='with --sequence, in place of --sync: the frame of each film at one moment, "A.mp4=0,B.mp4=3.33"'),
     ] = ReconstructOptions.offsets,
     fps: Annotated[
         float, Option(help="with --sequence: frames a second of folders of frames")
     ] = ReconstructOptions.fps,
     backend: Annotated[str, Option(help=" | ".join(RECONSTRUCT))] = ReconstructOptions.backend,
     matcher: Annotated[
-        str, Option(help="features matched between photos: " + " | ".join(MATCHERS) + "; the learned ones match photos "
-                         "with little overlap")
+        str,
+        Option(
+            help="features matched between photos: " + " | ".join(MATCHERS) + "; the learned ones match photos "
+            "with little overlap"
+        ),
     ] = ReconstructOptions.matcher,
     cameras: Annotated[
         Path | None, Option(help="known cameras: transforms.json or a COLMAP model folder; default: estimated")
@@ -96,15 +105,21 @@ def reconstruct(
         str, Option(help="side of the photos that is up: auto (by the table or floor) | top | right | bottom | left")
     ] = ReconstructOptions.up,
     scale_reference: Annotated[
-        str, Option(help='a known length [m]: "photos=A.jpg,B.jpg distance=0.5" between two cameras, or "distance=0.6" '
-                         "from the cameras to the point they look at")
+        str,
+        Option(
+            help='a known length [m]: "photos=A.jpg,B.jpg distance=0.5" between two cameras, or "distance=0.6" '
+            "from the cameras to the point they look at"
+        ),
     ] = ReconstructOptions.scale_reference,
     resume: Annotated[
         bool, Option("--resume", help="continue an interrupted run after its last finished step")
     ] = ReconstructOptions.resume,
     weights: Annotated[
-        Path | None, Option(help="weights of pi3 or pi3-splat (.safetensors, .pth); default: searched in $NGFF_WEIGHTS "
-                            "and ~/.cache/ngff")
+        Path | None,
+        Option(
+            help="weights of pi3 or pi3-splat (.safetensors, .pth); default: searched in $NGFF_WEIGHTS "
+            "and ~/.cache/ngff"
+        ),
     ] = ReconstructOptions.weights,
     download: Annotated[
         bool, Option("--download", help="download missing weights (CC BY-NC; needs the extra hub)")
@@ -133,26 +148,37 @@ def segment(
     out: Annotated[Path, Option("-o", "--out", help="labelled scene to write (.ply)")] = Path("labelled.ply"),
     backend: Annotated[str, Option(help=describe(SEGMENT))] = SegmentOptions.backend,
     masks: Annotated[
-        Path | None, Option(help="folder of label images named as the photos: 0 background, 1... objects; 255 is "
-                            "ignored where its names.json does not name it")
+        Path | None,
+        Option(
+            help="folder of label images named as the photos: 0 background, 1... objects; 255 is "
+            "ignored where its names.json does not name it"
+        ),
     ] = SegmentOptions.masks,
     boxes: Annotated[
         Path | None, Option(help=f"prompts.json: boxes in the first photo [px] and names; for {NETWORKS} also points")
     ] = SegmentOptions.boxes,
     points: Annotated[
-        list[str] | None, Option(help='a point on an object in a photo [px]: "view=IMG.jpg xy=310,220 name=duck"; '
-                                 "repeatable; points of one name are on one object")
+        list[str] | None,
+        Option(
+            help='a point on an object in a photo [px]: "view=IMG.jpg xy=310,220 name=duck"; '
+            "repeatable; points of one name are on one object"
+        ),
     ] = None,
     photos: Annotated[
         Path | None, Option(help=f"for {NETWORKS}: folder of the scene's photos; default: rendered images")
     ] = SegmentOptions.photos,
     undistorted: Annotated[
-        bool, Option("--undistorted", help="masks, boxes and photos are of undistorted views; default: of the photos "
-                     "as taken")
+        bool,
+        Option(
+            "--undistorted", help="masks, boxes and photos are of undistorted views; default: of the photos as taken"
+        ),
     ] = SegmentOptions.undistorted,
     weights: Annotated[
-        Path | None, Option(help=f"for {NETWORKS}: file or folder of its weights; default: the folder of its name in "
-                            "$NGFF_WEIGHTS and ~/.cache/ngff; for learned: segmenter.safetensors, by default ours")
+        Path | None,
+        Option(
+            help=f"for {NETWORKS}: file or folder of its weights; default: the folder of its name in "
+            "$NGFF_WEIGHTS and ~/.cache/ngff; for learned: segmenter.safetensors, by default ours"
+        ),
     ] = SegmentOptions.weights,
     download: Annotated[
         bool, Option("--download", help=f"for {NETWORKS}: download missing weights, after logging size and licence")
@@ -238,8 +264,11 @@ def simulate(
         list[str] | None, Option(help='"object=2 force=0,0,8 from=0.1 to=0.3" [N, s]; also torque= and at=x,y,z')
     ] = None,
     forces: Annotated[
-        Path | None, Option(help="JSON of forces {scene: [{obj_id, start, end, force}]}; or a trajectory (.h5), or "
-                            "JSON saved by a playable page, whose forces, changes and options are repeated")
+        Path | None,
+        Option(
+            help="JSON of forces {scene: [{obj_id, start, end, force}]}; or a trajectory (.h5), or "
+            "JSON saved by a playable page, whose forces, changes and options are repeated"
+        ),
     ] = SimulateOptions.forces,
     pin: Annotated[list[str] | None, Option(help="object held fixed; repeatable")] = None,
     velocity: Annotated[
@@ -258,19 +287,28 @@ def simulate(
         str | None, Option(help="floor, walls and ceiling x0,y0,z0,x1,y1,z1 [scene units]; default: only a floor")
     ] = SimulateOptions.box,
     keypoints: Annotated[
-        int | None, Option(help=f"maximum number of keypoints per object; default: {DEFAULT_KEYPOINTS}, with --live "
-                           f"{LIVE_KEYPOINTS}")
+        int | None,
+        Option(
+            help=f"maximum number of keypoints per object; default: {DEFAULT_KEYPOINTS}, with --live {LIVE_KEYPOINTS}"
+        ),
     ] = SimulateOptions.keypoints,
     weights: Annotated[
-        Path | None, Option(help="weights of the learned engine (.safetensors with its card, or a published .pth); "
-                            "default: those in the package")
+        Path | None,
+        Option(
+            help="weights of the learned engine (.safetensors with its card, or a published .pth); "
+            "default: those in the package"
+        ),
     ] = SimulateOptions.weights,
     integrator: Annotated[
         str, Option(help="learned engine: step (the model's own) or an ODE solver: euler | rk4 | dopri5")
     ] = SimulateOptions.integrator,
     live: Annotated[
-        bool, Option("--live", help="simulate in real time and open a page to drag, push, lift and pin the objects; "
-                     "Ctrl-C ends and writes what was recorded")
+        bool,
+        Option(
+            "--live",
+            help="simulate in real time and open a page to drag, push, lift and pin the objects; "
+            "Ctrl-C ends and writes what was recorded",
+        ),
     ] = SimulateOptions.live,
     browser: Annotated[
         bool, Option("--browser/--no-browser", help="with --live: open the page, or only print its address")
@@ -293,18 +331,22 @@ def simulate(
 @app.command()
 def render(
     source: Annotated[
-        list[Path], Argument(metavar="TRAJ.h5|SCENE.ply", help="file to render; several with --side-by-side",
-                             show_default=False)
+        list[Path],
+        Argument(metavar="TRAJ.h5|SCENE.ply", help="file to render; several with --side-by-side", show_default=False),
     ],
     out: Annotated[
-        Path | None, Option("-o", "--out", help=f"file to write ({' '.join(OUTPUT_FORMATS)}); default: named after the "
-                            "input and the view")
+        Path | None,
+        Option(
+            "-o",
+            "--out",
+            help=f"file to write ({' '.join(OUTPUT_FORMATS)}); default: named after the input and the view",
+        ),
     ] = None,
     view: Annotated[str, Option(help=f"camera: {VIEWS}")] = RenderOptions.view,
     resolution: Annotated[int, Option(help="longest side of a view [px]")] = RenderOptions.resolution,
     fps: Annotated[
-        float | None, Option(help="frames per second, at unchanged speed of motion; default: the trajectory's, 30 for "
-                             "a scene")
+        float | None,
+        Option(help="frames per second, at unchanged speed of motion; default: the trajectory's, 30 for a scene"),
     ] = RenderOptions.fps,
     background: Annotated[
         str | None, Option(help="scene.ply, #rrggbb or a photo that replaces the scene's own background")
@@ -320,8 +362,12 @@ def render(
         bool, Option("--show-forces", help="draw an arrow for each active force prompt")
     ] = RenderOptions.show_forces,
     playable: Annotated[
-        bool, Option("--playable", help="with -o film.html: objects can be dragged, pushed and lifted in the page, "
-                     "which computes their motion (trajectories of the engine ngff)")
+        bool,
+        Option(
+            "--playable",
+            help="with -o film.html: objects can be dragged, pushed and lifted in the page, "
+            "which computes their motion (trajectories of the engine ngff)",
+        ),
     ] = RenderOptions.playable,
     frame: Annotated[
         int | None, Option(help="render this frame only, from 0; -1 is the last; default: all")
@@ -343,12 +389,21 @@ def render(
 @app.command()
 def evaluate(
     prediction: Annotated[
-        list[Path], Argument(metavar="PREDICTION", help=".h5, .ply, .mp4 or a folder of PNGs; with --judge one film or "
-                             "several, or folders of films", show_default=False)
+        list[Path],
+        Argument(
+            metavar="PREDICTION",
+            help=".h5, .ply, .mp4 or a folder of PNGs; with --judge one film or several, or folders of films",
+            show_default=False,
+        ),
     ],
     against: Annotated[
-        Path | None, Option("--against", help="ground truth, of the same kind; for a .ply also a folder of label "
-                            "images named as its photos, with names.json", show_default=False)
+        Path | None,
+        Option(
+            "--against",
+            help="ground truth, of the same kind; for a .ply also a folder of label "
+            "images named as its photos, with names.json",
+            show_default=False,
+        ),
     ] = None,
     out: Annotated[
         Path | None, Option("-o", "--out", help="JSON file to write; default: metrics.json next to the prediction")
@@ -375,16 +430,23 @@ def evaluate(
         Path | None, Option(help="HTML report with curves and images to write (.html)")
     ] = EvaluateOptions.report,
     judge: Annotated[
-        bool, Option("--judge", help="score films from 0 to 1 by a vision-language model: PhysR and PhotoR. Sends ten "
-                     "frames of each film (JPEG, at most 512 px) and nothing else, no names, to $OPENAI_BASE_URL with "
-                     "$OPENAI_API_KEY; without --judge nothing is sent anywhere")
+        bool,
+        Option(
+            "--judge",
+            help="score films from 0 to 1 by a vision-language model: PhysR and PhotoR. Sends ten "
+            "frames of each film (JPEG, at most 512 px) and nothing else, no names, to $OPENAI_BASE_URL with "
+            "$OPENAI_API_KEY; without --judge nothing is sent anywhere",
+        ),
     ] = EvaluateOptions.judge,
     model: Annotated[
         str, Option(help="with --judge: name of a model that accepts images; default: $OPENAI_MODEL")
     ] = EvaluateOptions.model,
     base_url: Annotated[
-        str, Option(help="with --judge: address of a server with OpenAI's protocol; default: $OPENAI_BASE_URL, else "
-                    "OpenAI's own")
+        str,
+        Option(
+            help="with --judge: address of a server with OpenAI's protocol; default: $OPENAI_BASE_URL, else "
+            "OpenAI's own"
+        ),
     ] = EvaluateOptions.base_url,
     repeats: Annotated[
         int, Option(help="with --judge: how often each film is scored; mean and standard deviation are given")

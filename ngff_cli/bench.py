@@ -61,9 +61,9 @@ def bench_raster(
 @app.command("reconstruct")
 def bench_reconstruct(
     sets: Annotated[list[Path], typer.Argument(metavar="PHOTOSET...", help="folders with images/ and cameras.json")],
-    out: Annotated[
-        Path, typer.Option("-o", "--out", help="JSON file of results; existing ones are kept")
-    ] = Path("reconstruct.json"),
+    out: Annotated[Path, typer.Option("-o", "--out", help="JSON file of results; existing ones are kept")] = Path(
+        "reconstruct.json"
+    ),
     quality: Annotated[str, typer.Option(help="quality of the reconstruction")] = "normal",
     holdout: Holdout = 8,
     device: Device = "auto",
@@ -76,9 +76,7 @@ def bench_reconstruct(
     """Reconstruction: camera errors against reference cameras, PSNR of held-out photos, time and memory."""
     from stages.lab.bench.reconstruct import ReconstructBenchOptions, run
 
-    options = ReconstructBenchOptions(
-        quality=quality, holdout=holdout, device=device, matcher=matcher, cameras=cameras
-    )
+    options = ReconstructBenchOptions(quality=quality, holdout=holdout, device=device, matcher=matcher, cameras=cameras)
     print_results(lambda path: run(sets, path, options), out, as_json)
 
 
@@ -141,9 +139,9 @@ def bench_track(
 @app.command("appearance")
 def bench_appearance(
     sets: Annotated[list[Path], typer.Argument(metavar="PHOTOSET...", help="folders of photos, or with images/")],
-    out: Annotated[
-        Path, typer.Option("-o", "--out", help="JSON file of results; existing ones are kept")
-    ] = Path("appearance.json"),
+    out: Annotated[Path, typer.Option("-o", "--out", help="JSON file of results; existing ones are kept")] = Path(
+        "appearance.json"
+    ),
     quality: Annotated[str, typer.Option(help="quality of the reconstruction")] = "high",
     holdout: Holdout = 8,
     models: Annotated[
@@ -178,19 +176,25 @@ def bench_pi3(
 @app.command("segment")
 def bench_segment(
     sets: Annotated[
-        list[Path] | None, typer.Argument(metavar="PHOTOSET...", show_default=False,
-                                          help="with --photos: folders of photos, or with images/")
+        list[Path] | None,
+        typer.Argument(
+            metavar="PHOTOSET...", show_default=False, help="with --photos: folders of photos, or with images/"
+        ),
     ] = None,
     photos: Annotated[
         bool, typer.Option("--photos", help="real photo sets with label images, instead of synthetic scenes")
     ] = False,
     labels: Annotated[
-        Path | None, typer.Option(help="with --photos: folder of label images, or of such folders named as the sets; "
-                                  "default: PHOTOSET/labels")
+        Path | None,
+        typer.Option(
+            help="with --photos: folder of label images, or of such folders named as the sets; default: PHOTOSET/labels"
+        ),
     ] = None,
     labelled: Annotated[
-        Path | None, typer.Option(help="with --photos: folder of labelled scenes PHOTOSET.ply; missing ones are made "
-                                  "and kept there")
+        Path | None,
+        typer.Option(
+            help="with --photos: folder of labelled scenes PHOTOSET.ply; missing ones are made and kept there"
+        ),
     ] = None,
     scenes: Annotated[int, typer.Option(help="scenes of each kind: objects apart, and touching")] = 4,
     views: Annotated[int, typer.Option(help="number of cameras per scene")] = 24,
@@ -339,9 +343,7 @@ def bench_rollout(
     ] = None,
     keypoints: Annotated[int, typer.Option(help="keypoints of each of the three objects")] = 2048,
     steps: Annotated[int, typer.Option(help="number of 0.02 s steps")] = 100,
-    scenes: Annotated[
-        list[int], typer.Option(help="scenes per batch; repeatable; default: 1, and 64 on a GPU")
-    ] = [],  # noqa: B006
+    scenes: Annotated[list[int], typer.Option(help="scenes per batch; repeatable; default: 1, and 64 on a GPU")] = [],  # noqa: B006
     repeat: Annotated[int, typer.Option(help="timed rollouts, of which the median counts")] = 5,
     device: Device = "auto",
     as_json: AsJson = False,

@@ -36,8 +36,13 @@ def dataset(
     groups: Annotated[
         str, typer.Option(help="groups of scenes; more_0..more_9 are further scenes of three objects")
     ] = "3_0..3_9,4,6",
-    only: Annotated[str, typer.Option(help="parts, separated by commas: motions, scenes, mpm, initial, dynamic, "
-                                      "objects, backgrounds, scene_configs")] = "motions",
+    only: Annotated[
+        str,
+        typer.Option(
+            help="parts, separated by commas: motions, scenes, mpm, initial, dynamic, "
+            "objects, backgrounds, scene_configs"
+        ),
+    ] = "motions",
     frames: Annotated[int, typer.Option(help="frames per scene, of 0.02 s each")] = 100,
     keypoints: Annotated[int, typer.Option(help="keypoints per object in motions")] = 2048,
     dx: Dx = 0.02,
@@ -46,8 +51,13 @@ def dataset(
     nudge: Annotated[
         float, typer.Option(help="shift of each object's initial position [m]; see `statistics --against`")
     ] = 0.0,
-    exact: Annotated[bool, typer.Option("--exact", help="bitwise identical results in every run on a GPU, in twice the "
-                                        "time; always on for mpm and dynamic")] = False,
+    exact: Annotated[
+        bool,
+        typer.Option(
+            "--exact",
+            help="bitwise identical results in every run on a GPU, in twice the time; always on for mpm and dynamic",
+        ),
+    ] = False,
     views: Annotated[str, typer.Option(help="views of the videos: some of 0,4,...,96, or all")] = "all",
     backgrounds: Annotated[
         str, typer.Option(help="backgrounds of the videos: some of table0,...,table7, or all")
@@ -56,8 +66,13 @@ def dataset(
     shard: Annotated[str, typer.Option(help="i/n: the i-th of n equal parts of the groups")] = "1/1",
     limit: Annotated[int, typer.Option(help="scenes of each group; 0: all")] = 0,
     check: Annotated[bool, typer.Option("--check", help="only compare all files with their checksums")] = False,
-    ray: Annotated[str, typer.Option(help="Ray cluster: local, auto or an address. All machines need the same ngff and "
-                                     "FOLDER at the same path; each makes one group at a time")] = "",
+    ray: Annotated[
+        str,
+        typer.Option(
+            help="Ray cluster: local, auto or an address. All machines need the same ngff and "
+            "FOLDER at the same path; each makes one group at a time"
+        ),
+    ] = "",
     device: Device = "auto",
 ) -> None:
     """Generate GSCollision: scenes, their motion, and videos, in the published layout."""
@@ -81,8 +96,9 @@ def dataset(
 def import_(
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="mpm/<group>/<scene> of GSCollision, with %04d.h5")],
     out: Annotated[Path, typer.Option("-o", "--out", help="trajectory to write (.h5)")] = Path("traj.h5"),
-    scene: Annotated[Path | None, typer.Option(help="its point_cloud.ply; default: searched in scenes/<group>/<scene>/ "
-                                               "next to mpm/")] = None,
+    scene: Annotated[
+        Path | None, typer.Option(help="its point_cloud.ply; default: searched in scenes/<group>/<scene>/ next to mpm/")
+    ] = None,
     keypoints: Annotated[int, typer.Option(help="maximum number of keypoints per object")] = 2048,
 ) -> None:
     """Convert a published scene of GSCollision to a trajectory for `ngff render` and `ngff evaluate`."""
@@ -97,8 +113,9 @@ def statistics(
     out: Annotated[Path | None, typer.Option("-o", "--out", help="JSON file to write the results to")] = None,
     groups: Groups = "3_0..3_9,4,6",
     keypoints: Annotated[int, typer.Option(help="maximum number of keypoints per object")] = 512,
-    against: Annotated[Path | None, typer.Option(help="the same scenes made with --nudge: report the predictability "
-                                                 "instead")] = None,
+    against: Annotated[
+        Path | None, typer.Option(help="the same scenes made with --nudge: report the predictability instead")
+    ] = None,
     sheet: Sheet = None,
     scenes: Annotated[int, typer.Option(help="rows of the contact sheet, one scene each")] = 10,
     device: Device = "auto",
@@ -139,8 +156,14 @@ def objects(
     only: Annotated[
         str, typer.Option(help="names of the objects, such as ball,duck; default: all ten")
     ] = ObjectsOptions.only,
-    meshes: Annotated[list[Path], typer.Option("--from", metavar="MESH", help="textured mesh (.obj .glb .ply ...), or "
-                                               "folder of meshes, to convert instead; repeatable")] = [],  # noqa: B006
+    meshes: Annotated[
+        list[Path],
+        typer.Option(
+            "--from",
+            metavar="MESH",
+            help="textured mesh (.obj .glb .ply ...), or folder of meshes, to convert instead; repeatable",
+        ),
+    ] = [],  # noqa: B006
     count: Annotated[int, typer.Option(help="approximate number of Gaussians of a mesh")] = ObjectsOptions.count,
     up: Annotated[str, typer.Option(help="up axis of a mesh: auto | x | y | z")] = ObjectsOptions.up,
     light: Annotated[bool, typer.Option(help="bake soft light into the colours of a mesh")] = ObjectsOptions.light,
@@ -169,8 +192,14 @@ def backgrounds(
 @app.command()
 def heldout(
     out: Annotated[Path, typer.Argument(metavar="FOLDER", help="folder of a data set; existing files are kept")],
-    meshes: Annotated[list[Path], typer.Option("--from", metavar="MESH", help="mesh (.obj .glb .ply ...), or folder of "
-                                               "meshes, that replaces the eight shapes; repeatable")] = [],  # noqa: B006
+    meshes: Annotated[
+        list[Path],
+        typer.Option(
+            "--from",
+            metavar="MESH",
+            help="mesh (.obj .glb .ply ...), or folder of meshes, that replaces the eight shapes; repeatable",
+        ),
+    ] = [],  # noqa: B006
     scenes: Annotated[int, typer.Option(help="number of scenes")] = 100,
     objects: Annotated[int, typer.Option(help="objects per scene")] = 3,
     frames: Annotated[int, typer.Option(help="frames per scene, of 0.02 s each")] = 100,

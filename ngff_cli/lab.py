@@ -88,16 +88,16 @@ def train(
     horizons: Annotated[str, typer.Option(help="rollout length of each phase [frames]")] = "8,20,40",
     loss: Annotated[
         str,
-        typer.Option(help="square: squared error | scene: RMSE per scene | axes: RMSE per object and axis | "
-                     "relative: axes, divided by the amount of motion"),
+        typer.Option(
+            help="square: squared error | scene: RMSE per scene | axes: RMSE per object and axis | "
+            "relative: axes, divided by the amount of motion"
+        ),
     ] = "scene",  # fmt: skip
     optimizer: Annotated[str, typer.Option(help="adamw | soap (extra `train`)")] = "adamw",
     velocity_weight: Annotated[
         float, typer.Option(help="weight of velocity errors relative to position errors [s]; 0: none")
     ] = 0.0,
-    gradient_discount: Annotated[
-        float, typer.Option(help="factor on the gradient per frame of backpropagation")
-    ] = 0.9,
+    gradient_discount: Annotated[float, typer.Option(help="factor on the gradient per frame of backpropagation")] = 0.9,
     groups: Annotated[
         str, typer.Option(help="groups to train on, also varied, solid, turned; the last 100 scenes are for validation")
     ] = "3_0..3_8",
@@ -149,12 +149,15 @@ def average(
 
 @app.command("train-splatter")
 def train_splatter(
-    data: Annotated[Path, typer.Argument(metavar="FOLDER", help="scenes (.ply), and folders of photos with their "
-                                         "cameras (transforms.json or a COLMAP model)")],
+    data: Annotated[
+        Path,
+        typer.Argument(
+            metavar="FOLDER",
+            help="scenes (.ply), and folders of photos with their cameras (transforms.json or a COLMAP model)",
+        ),
+    ],
     out: Annotated[Path, typer.Option("-o", "--out", help="weights of pi3-splat to write (.safetensors)")],
-    weights: Annotated[
-        Path | None, typer.Option(help="initial weights of pi3 or pi3-splat; default: searched")
-    ] = None,
+    weights: Annotated[Path | None, typer.Option(help="initial weights of pi3 or pi3-splat; default: searched")] = None,
     steps: Annotated[int, typer.Option(help="optimizer steps")] = 20_000,
     views: Annotated[int, typer.Option(help="input views per step; one more view is rendered")] = 4,
     side: Annotated[int, typer.Option(help="longest side of an image [px]")] = 448,
@@ -181,16 +184,32 @@ def train_splatter(
 @app.command()
 def clutter(
     out: Annotated[Path, typer.Argument(metavar="FOLDER", help="folder of scenes; finished ones are kept")],
-    meshes: Annotated[list[Path], typer.Option("--from", metavar="MESH", help="textured mesh (.obj .glb .ply ...), or "
-                                               "folder of meshes, that lie around too; repeatable")] = [],  # noqa: B006
+    meshes: Annotated[
+        list[Path],
+        typer.Option(
+            "--from",
+            metavar="MESH",
+            help="textured mesh (.obj .glb .ply ...), or folder of meshes, that lie around too; repeatable",
+        ),
+    ] = [],  # noqa: B006
     count: Annotated[int, typer.Option(help="number of scenes")] = 20,
     first: Annotated[int, typer.Option(help="number of the first scene")] = 0,
     photos: Annotated[int, typer.Option(help="photos of each scene")] = 12,
     size: Annotated[int, typer.Option(help="longest side of a photo [px]")] = 512,
-    observations: Annotated[int, typer.Option(help="write this many outcomes of a model of reconstruction noise per "
-                                              "scene in place of photos; 0: photos to reconstruct")] = 0,
-    reconstruct: Annotated[bool, typer.Option("--reconstruct", help="reconstruct the photos with their true cameras, "
-                                              "and write the labelled result in place of them")] = False,
+    observations: Annotated[
+        int,
+        typer.Option(
+            help="write this many outcomes of a model of reconstruction noise per "
+            "scene in place of photos; 0: photos to reconstruct"
+        ),
+    ] = 0,
+    reconstruct: Annotated[
+        bool,
+        typer.Option(
+            "--reconstruct",
+            help="reconstruct the photos with their true cameras, and write the labelled result in place of them",
+        ),
+    ] = False,
     exact: Annotated[bool, typer.Option("--exact", help="write the true Gaussians, labelled, not photos")] = False,
     seed: Seed = 0,
     device: Device = "auto",
@@ -265,16 +284,20 @@ def estimate_materials(
 @app.command()
 def fit(
     scene: SceneIn,
-    track: Annotated[Path, typer.Argument(metavar="TRACK.h5", help="trajectory of the scene's objects, of which the "
-                                          "first frame is the scene")],
+    track: Annotated[
+        Path,
+        typer.Argument(
+            metavar="TRACK.h5", help="trajectory of the scene's objects, of which the first frame is the scene"
+        ),
+    ],
     out: Annotated[
         Path, typer.Option("-o", "--out", help="materials for `ngff simulate --materials` to write (.json)")
     ] = Path("materials.json"),
     engine: Annotated[str, typer.Option(help="auto | rigid | mpm | ngff: through which motions are compared")] = "auto",
     quality: Annotated[str, typer.Option(help="of --engine mpm: draft | normal | high")] = MaterialFitOptions.quality,
     material: Annotated[
-        list[str], typer.Option(help="OBJECT=MATERIAL: initial values, kept where the motion does not determine "
-                                "them; repeatable")
+        list[str],
+        typer.Option(help="OBJECT=MATERIAL: initial values, kept where the motion does not determine them; repeatable"),
     ] = [],  # noqa: B006
     keypoints: Annotated[int, typer.Option(help="keypoints compared per object")] = MaterialFitOptions.keypoints,
     frames: Annotated[int, typer.Option(help="frames of the track; 0: all")] = MaterialFitOptions.frames,
@@ -334,11 +357,21 @@ def track(
 
 @app.command()
 def questionnaire(
-    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="folder of films, one folder for each model, in it "
-                                           "one for each split if there are several; with --answers: a study")],
+    folder: Annotated[
+        Path,
+        typer.Argument(
+            metavar="FOLDER",
+            help="folder of films, one folder for each model, in it "
+            "one for each split if there are several; with --answers: a study",
+        ),
+    ],
     out: Annotated[
-        Path | None, typer.Option("-o", "--out", help="folder of the study to write, default: study; with --answers: "
-                                  "JSON file to write the table to")
+        Path | None,
+        typer.Option(
+            "-o",
+            "--out",
+            help="folder of the study to write, default: study; with --answers: JSON file to write the table to",
+        ),
     ] = None,
     answers: Annotated[
         list[Path], typer.Option(help="file that a participant returned, or a folder of them; repeatable")

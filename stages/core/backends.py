@@ -9,6 +9,7 @@ from stages.core.errors import InputError
 
 MAX_SEED = 2**31 - 1  # which every library takes
 
+
 @dataclass(frozen=True)
 class Backend:
     """Row of a backend table; help, error messages and `ngff-lab doctor` are derived from it."""

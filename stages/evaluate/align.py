@@ -84,9 +84,7 @@ def check_same_reference_frame(prediction: ReferenceFrame, truth: ReferenceFrame
         )
 
 
-def _shared_cameras(
-    prediction: ReferenceFrame, truth: ReferenceFrame
-) -> tuple[Cameras, Cameras] | tuple[None, None]:
+def _shared_cameras(prediction: ReferenceFrame, truth: ReferenceFrame) -> tuple[Cameras, Cameras] | tuple[None, None]:
     """Cameras of both with equal photo names (without suffix), in the same order."""
     if prediction.cameras is None or truth.cameras is None:
         return None, None

@@ -81,9 +81,7 @@ def _compare(predictions: list[Path], truth: Path | None, options: EvaluateOptio
     return choose(COMPARISONS, kind)(prediction, truth, options), [prediction, truth]
 
 
-def _judge(
-    films: list[Path], truth: Path | None, out: Path, options: EvaluateOptions
-) -> tuple[Result, list[Path]]:
+def _judge(films: list[Path], truth: Path | None, out: Path, options: EvaluateOptions) -> tuple[Result, list[Path]]:
     """The scores of films, and their files."""
     from stages.evaluate.judge import find_films, judge
 

@@ -117,10 +117,15 @@ def _track(trajectory: Trajectory) -> Track:
 def _result(motion: MatchedMotion, fps: float, min_motion: float, notes: list[str]) -> Result:
     overall = _floats(all_metrics(motion.predicted, motion.truth, motion.mask, min_motion, motion.seen))
     parts = {
-        name: _floats(all_metrics(
-            motion.predicted[:, [i]], motion.truth[:, [i]], motion.mask[[i]], min_motion,
-            None if motion.seen is None else motion.seen[:, [i]],
-        ))  # fmt: skip
+        name: _floats(
+            all_metrics(
+                motion.predicted[:, [i]],
+                motion.truth[:, [i]],
+                motion.mask[[i]],
+                min_motion,
+                None if motion.seen is None else motion.seen[:, [i]],
+            )
+        )  # fmt: skip
         for i, name in enumerate(motion.names)
     }
     errors = error_over_time(motion.predicted, motion.truth, motion.mask)

@@ -68,8 +68,10 @@ def writing_database(folder: Path) -> Iterator[None]:
     """COLMAP's errors in writing its database, such as those of a full disk, as an InputError that names the folder."""
     length = len(os.fsencode(folder.absolute()))
     if length > MAX_FOLDER_PATH:
-        raise InputError(f"the path of the folder {folder.name} has {length} bytes; COLMAP's database can be in one of "
-                         f"at most {MAX_FOLDER_PATH}: write to a folder with a shorter path, or set TMPDIR to one")
+        raise InputError(
+            f"the path of the folder {folder.name} has {length} bytes; COLMAP's database can be in one of "
+            f"at most {MAX_FOLDER_PATH}: write to a folder with a shorter path, or set TMPDIR to one"
+        )
     try:
         yield
     except RuntimeError as error:

@@ -97,9 +97,7 @@ def fuse(observed: DepthViews) -> OrientedPoints:
     return cloud[violations <= 0.5 * cloud.support]
 
 
-def free_space_violations(
-    points: Float[Tensor, "n 3"], observed: DepthViews, min_support: int
-) -> Float[Tensor, "n"]:
+def free_space_violations(points: Float[Tensor, "n 3"], observed: DepthViews, min_support: int) -> Float[Tensor, "n"]:
     """Number of views that have a surface with `min_support` behind each point, so that the point is in free space."""
     count, cameras = torch.zeros_like(points[:, 0]), observed.views.cameras
     for K, viewmat, m in zip(cameras.Ks.to(points), cameras.viewmats.to(points), observed.maps, strict=True):

@@ -332,7 +332,11 @@ def _prune(fit: _Fit, views: Views, visible: Bool[Tensor, "n"]) -> Gaussians:
 
 
 def score_views(
-    gaussians: Gaussians, views: Views, index: list[int], device: str = "cpu", exposed: bool = False,
+    gaussians: Gaussians,
+    views: Views,
+    index: list[int],
+    device: str = "cpu",
+    exposed: bool = False,
     background: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> tuple[float, float]:
     """Mean PSNR [dB] and SSIM of the renders of the views `index` compared with their photos.

@@ -48,7 +48,9 @@ class SparseModel:
 
 @colmap_process()
 def estimate_cameras(
-    photos: Photos, options: MatchingOptions = MatchingOptions(), steps: StepCache | None = None  # noqa: B008 -- frozen
+    photos: Photos,
+    options: MatchingOptions = MatchingOptions(),  # noqa: B008 -- frozen
+    steps: StepCache | None = None,
 ) -> SparseModel:
     """Cameras of as many photos as can be registered.
 
@@ -73,9 +75,10 @@ def _run_mapper(photos: Photos, database: Path, seed: int) -> SparseModel:
             f"{photos.source}: the camera hardly moved between the photos; walk around the objects, or, if they are "
             "on a turntable, put it in front of a plain backdrop, so that only the objects are matched"
         )
-    with tempfile.TemporaryDirectory() as folder, tqdm(
-        total=len(photos), desc="placing photos", unit="photo", leave=False
-    ) as bar:
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        tqdm(total=len(photos), desc="placing photos", unit="photo", leave=False) as bar,
+    ):
         with features.writing_database(Path(folder)):
             run_colmap("map", folder, bar.update, database=str(database), photos=len(photos), seed=seed)
         models = {int(path.name): pycolmap.Reconstruction(path) for path in sorted(Path(folder).iterdir())}

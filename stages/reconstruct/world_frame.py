@@ -123,8 +123,8 @@ def refine_ground(ground: Ground, points: Float[Tensor, "n 3"], seed: int = 0) -
         return ground
     heights = ground.plane.heights(points) / ground.radius
     band = points[(heights > -BAND_BELOW) & (heights < BAND_ABOVE)]
-    _, patch, count = (band / (PATCH_SIZE * ground.radius)).floor().long().unique(
-        dim=0, return_inverse=True, return_counts=True
+    _, patch, count = (
+        (band / (PATCH_SIZE * ground.radius)).floor().long().unique(dim=0, return_inverse=True, return_counts=True)
     )
     weights = _focus_weights(band, ground.focus, ground.radius) / count[patch]
     found = ransac(band, 0.005 * ground.radius, weights, lambda n: n @ ground.up > 0.99, seed=seed)
@@ -136,9 +136,7 @@ def _focus_weights(points: Float[Tensor, "n 3"], focus: Float[Tensor, "3"], radi
     return 1 / (1 + ((points - focus).norm(dim=1) / (0.5 * radius)) ** 4)
 
 
-def _plausible_up(
-    normals: Float[Tensor, "k 3"], viewmats: Float[Tensor, "c 4 4"], min_up: float
-) -> Bool[Tensor, "k"]:
+def _plausible_up(normals: Float[Tensor, "k 3"], viewmats: Float[Tensor, "c 4 4"], min_up: float) -> Bool[Tensor, "k"]:
     """Mask of unit normals that are plausible up directions for most cameras.
 
     Cameras are mostly held without roll, so up is nearly orthogonal to their horizontal axes; its component along the

@@ -87,6 +87,4 @@ def interpolate_cameras(cameras: Cameras, frames: int) -> Cameras:
     viewmats = np.tile(np.eye(4), (frames, 1, 1))
     viewmats[:, :3, :3], viewmats[:, :3, 3] = R, -(R @ eyes[..., None])[..., 0]
     Ks = PchipInterpolator(knots, cameras.Ks.double().numpy())(index)
-    return Cameras(
-        torch.from_numpy(viewmats).float(), torch.from_numpy(Ks).float(), sizes, ("",) * frames
-    )
+    return Cameras(torch.from_numpy(viewmats).float(), torch.from_numpy(Ks).float(), sizes, ("",) * frames)

@@ -75,9 +75,7 @@ class Clip:
             return None
         from stages.core.physics.shadow_casting import find_shadows  # noqa: PLC0415 -- 0.3 s of scipy
 
-        return find_shadows(
-            self.animation.scene, trajectory.keypoints, not self.background.keep_scene, self.device
-        )
+        return find_shadows(self.animation.scene, trajectory.keypoints, not self.background.keep_scene, self.device)
 
     @cached_property
     def _rest_irradiance(self) -> Float[Tensor, "n"]:

@@ -18,7 +18,9 @@ MAX_FILES = 8  # side by side
 
 
 def run(
-    source: Path | Sequence[Path], out: Path | None = None, options: RenderOptions = RenderOptions()  # noqa: B008 -- frozen
+    source: Path | Sequence[Path],
+    out: Path | None = None,
+    options: RenderOptions = RenderOptions(),  # noqa: B008 -- frozen
 ) -> Path:
     """Render a trajectory or a scene, or several side by side, and print the path of the output.
 

@@ -127,8 +127,15 @@ def _change(solver: mpm.Solver, particles: mpm.Particles, new: mpm.Particles) ->
     now = solver.particles
     for name in ("mass", "stiffness", "friction", "held", "plastic"):
         setattr(particles, name, getattr(new, name))
-    solver.set(mass=new.mass, stiffness=new.stiffness, friction=new.friction, held=new.held, plastic=new.plastic,
-               v=now.v * ~stopped[:, None].to(now.v.device), C=now.C * ~stopped[:, None, None].to(now.C.device))
+    solver.set(
+        mass=new.mass,
+        stiffness=new.stiffness,
+        friction=new.friction,
+        held=new.held,
+        plastic=new.plastic,
+        v=now.v * ~stopped[:, None].to(now.v.device),
+        C=now.C * ~stopped[:, None, None].to(now.C.device),
+    )
 
 
 def _divergence(o: SceneObject, time: float) -> InputError:

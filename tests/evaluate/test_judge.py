@@ -76,7 +76,7 @@ def test_nothing_but_frames_and_letters_is_sent(chat_server, films, tmp_path, ca
     caplog.set_level(logging.INFO)
     chat_server.script = by_brightness
     judged([films / "cosmos/a.mp4", films / "ours/a.mp4"], tmp_path, repeats=1)
-    (_, body), = chat_server.asked
+    ((_, body),) = chat_server.asked
     texts = [part["text"] for part in body["messages"][0]["content"] if part["type"] == "text"]
     assert texts[1:] == ["Film A, 10 frames:", "Film B, 10 frames:"]
     assert "sending 20 frames of 2 films, 1 times, to judge" in caplog.text.replace(body["model"], "judge")

@@ -160,6 +160,7 @@ def test_rates_that_differ_by_a_ten_thousandth_are_the_same(tmp_path, two_balls,
 
 def test_resampling_takes_the_nearest_frames_before_and_after(tmp_path, two_balls):
     """Of a motion with acceleration, which other frames would not give: exact at its own frames, a mean in between."""
+
     def accelerated(dt: float, count: int):
         frames = iter(range(count))
         return lambda x: x + (next(frames) * dt) ** 2

@@ -21,8 +21,10 @@ UNUSED = {*COMPILERS, "gsplat", "torchdiffeq", "scipy.interpolate", "transformer
 
 # command line -> further packages that it must not import
 COMMANDS = {
-    "reconstruct set/images --cameras set/transforms.json --quality draft --iterations 0 -o out.ply":
-        {"h5py", "scipy.optimize"},
+    "reconstruct set/images --cameras set/transforms.json --quality draft --iterations 0 -o out.ply": {
+        "h5py",
+        "scipy.optimize",
+    },
     "segment scene.ply -o out.ply": {"h5py", "pycolmap"},
     "refine scene.ply -o out.ply": {"h5py", "pycolmap", "scipy.optimize"},
     "simulate scene.ply --quality draft --steps 3 -o out.h5": {"cv2", "pycolmap", "scipy.optimize"},

@@ -94,9 +94,9 @@ def test_only_uncovered_pixels_are_filled(block, device):
     assert len(more) > 50
     for i in range(3):
         before, after = (
-            initialise.covered_pixels(
-                block.views, i, initialise.to_gaussians(c, torch.full((len(c),), 0.8), 0)
-            ).float().mean()
+            initialise.covered_pixels(block.views, i, initialise.to_gaussians(c, torch.full((len(c),), 0.8), 0))
+            .float()
+            .mean()
             for c in (cloud, initialise.concatenate_points([cloud, more]))
         )
         assert after > max(0.95, float(before))

@@ -74,9 +74,7 @@ def test_exif_rotation_is_applied(folder):
     Image.fromarray(np.ascontiguousarray(np.rot90(pixels))).save(folder / "c.jpg", exif=exif, quality=95)
     photos = read_photos(folder)
     assert photos.size(2) == (96, 64)
-    torch.testing.assert_close(
-        mean_of_left(photos.images[2]), mean_of_left(torch.from_numpy(pixels)), rtol=0, atol=4.0
-    )
+    torch.testing.assert_close(mean_of_left(photos.images[2]), mean_of_left(torch.from_numpy(pixels)), rtol=0, atol=4.0)
 
 
 def test_mixed_sizes_and_focal_lengths_give_separate_cameras(folder):

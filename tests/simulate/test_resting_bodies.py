@@ -54,6 +54,7 @@ def steps_of(excess: float) -> int:
 @pytest.mark.parametrize("turn", [0.0, 1.0, 2.5])
 def test_a_push_slides_a_body_when_it_exceeds_friction(turn):
     """In any direction, and with what lifts the body taken off its weight."""
+
     def push(force, lift=0.0):
         # at the base, where it does not tip the body
         x, y = force * math.cos(turn), force * math.sin(turn)

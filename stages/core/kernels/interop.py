@@ -68,5 +68,13 @@ def launch(
     """
     _ready()
     stream = wp.stream_from_torch(torch.cuda.current_stream(device)) if device != "cpu" else None
-    wp.launch(kernel, dim=dim, inputs=list(inputs), outputs=list(outputs), device=device, stream=stream,
-              record_tape=False, block_dim=block_dim)
+    wp.launch(
+        kernel,
+        dim=dim,
+        inputs=list(inputs),
+        outputs=list(outputs),
+        device=device,
+        stream=stream,
+        record_tape=False,
+        block_dim=block_dim,
+    )

@@ -67,9 +67,7 @@ def _paths(
     _follow(wp.tid() // wp.static(THREADS), steps, lines, labels, step_penalty, jump_penalty, costs, total)
 
 
-def path_costs(
-    costs: Float[Tensor, "l m d"], step_penalty: float, jump_penalty: float
-) -> Float[Tensor, "l m d"]:
+def path_costs(costs: Float[Tensor, "l m d"], step_penalty: float, jump_penalty: float) -> Float[Tensor, "l m d"]:
     """Path costs of the d labels along the first dimension, forward plus backward.
 
     A change of the label by one costs `step_penalty`, any other `jump_penalty`.

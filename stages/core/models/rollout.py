@@ -92,7 +92,6 @@ class TimeStepper:
         torch._foreach_copy_([*self.state, self.points], [*new, self.model.points(self.scene, new)])
         self.step_count += 1
 
-
     def _captured_step(self) -> Callable[[], None]:
         """`_step` as a CUDA graph, with the state as before the capture, which takes some steps."""
         changing = *self.state, self.points, self.step_count

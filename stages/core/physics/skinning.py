@@ -75,9 +75,7 @@ class Skinning:
         return fit_rotations(self.rest, self.rest + u, self._body)
 
 
-def deform(
-    gaussians: Gaussians, binding: Binding, keypoints: Keypoints, positions: Float[Tensor, "p 3"]
-) -> Gaussians:
+def deform(gaussians: Gaussians, binding: Binding, keypoints: Keypoints, positions: Float[Tensor, "p 3"]) -> Gaussians:
     """The Gaussians of one frame; for several frames use Skinning."""
     return Skinning(gaussians, binding, keypoints)(positions)
 
@@ -99,9 +97,7 @@ def fit_rotations(
     return nearest_rotations(H).to(rest)
 
 
-def object_rotations(
-    keypoints: Keypoints, positions: Float[Tensor, "p 3"], ids: list[int]
-) -> Float[Tensor, "o 4"]:
+def object_rotations(keypoints: Keypoints, positions: Float[Tensor, "p 3"], ids: list[int]) -> Float[Tensor, "o 4"]:
     """Quaternions w x y z of the objects `ids` relative to rest, fitted to their keypoints."""
     of = torch.full((max([*ids, int(keypoints.object_id.max()) if len(keypoints.rest) else 0]) + 1,), len(ids))
     of[torch.tensor(ids, dtype=torch.int64)] = torch.arange(len(ids))

@@ -49,7 +49,10 @@ class Motion:
 
 
 def pack_film(
-    scene: Scene, motion: Motion | None = None, settings: Mapping = {}, shadows: ShadowCaster | None = None  # noqa: B006
+    scene: Scene,
+    motion: Motion | None = None,
+    settings: Mapping = {},
+    shadows: ShadowCaster | None = None,  # noqa: B006
 ) -> bytes:
     """The container of a scene at rest or in motion, without the Gaussians that no picture shows.
 

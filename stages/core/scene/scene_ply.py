@@ -73,8 +73,7 @@ def _activate(path: Path, raw: dict[str, np.ndarray] | np.ndarray) -> Gaussians:
     missing = [name for name in REQUIRED + COLOURS if name not in stored]
     if missing:
         raise InputError(
-            f"{path}: no vertex property {', '.join(missing)}; {EXPECTED} is expected "
-            "(this may be a plain point cloud)"
+            f"{path}: no vertex property {', '.join(missing)}; {EXPECTED} is expected (this may be a plain point cloud)"
         )
     rest = sorted((n for n in stored if re.fullmatch(r"f_rest_[0-9]{1,3}", n)), key=lambda n: int(n.rsplit("_", 1)[1]))
     if len(rest) not in (0, 9, 24, 45):

@@ -54,8 +54,9 @@ def run(folder: Path, out: Path, options: StudyOptions) -> list[str]:
             unusual.append(str(film.relative_to(folder)))
         rows[name] = {"model": model, "split": split, "file": str(film.relative_to(folder)), "sha256": sha256(film)}
     if unusual:
-        log.warning("%d films last less than 1 s or more than 10 s, such as %s; 2 to 3 s are usual",
-                    len(unusual), unusual[0])
+        log.warning(
+            "%d films last less than 1 s or more than 10 s, such as %s; 2 to 3 s are usual", len(unusual), unusual[0]
+        )
     cells = [f"{row['model']}/{row['split']}" for row in rows.values()]
     orders = assign_films(cells, options.participants, options.films, options.seed)
     width = len(str(options.participants))

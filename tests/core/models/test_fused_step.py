@@ -54,8 +54,13 @@ def step_all_ways(model: ForceField, initial, steps: int, prompt=None, pinned: b
     single = ForceField(**model.config).cuda()
     single.load_state_dict(model.state_dict())
     shape = replace(scene.shape, initial=scene.shape.initial.to(torch.float32), blur=half)
-    shape = replace(shape, **{k: getattr(shape, k).float() for k in
-                              ("arm", "normal", "spacing", "size", "inverse", "keypoint_inverse", "principal")})
+    shape = replace(
+        shape,
+        **{
+            k: getattr(shape, k).float()
+            for k in ("arm", "normal", "spacing", "size", "inverse", "keypoint_inverse", "principal")
+        },
+    )
     encoded = {k: getattr(scene, k).float() for k in ("embedding", "stiffness", "damping", "compliance_scale")}
     scene = replace(scene, shape=shape, **encoded)
     external = replace(external, **{k: getattr(external, k).float() for k in ("force", "torque", "start", "end")})

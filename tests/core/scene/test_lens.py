@@ -47,7 +47,7 @@ def photographed(cameras: Cameras, size: tuple[int, int]) -> torch.Tensor:
     at = grid(*size).reshape(-1, 1, 2)  # both the pixels and K have centres at +0.5
     invert = getattr(cv2, "undistortPointsIter", None)  # OpenCV 4
     lens = cameras.photos.distortion[0].double().numpy()
-    xy = (invert(at, K, lens, None, None, criteria) if invert else cv2.undistortPoints(at, K, lens, criteria=criteria))
+    xy = invert(at, K, lens, None, None, criteria) if invert else cv2.undistortPoints(at, K, lens, criteria=criteria)
     xy = xy.reshape(size[1], size[0], 2)
     return torch.from_numpy(scene_labels(xy[..., 0], xy[..., 1]))
 

@@ -241,12 +241,15 @@ def test_folders_are_searched_for_objects(tmp_path):
 @pytest.mark.parametrize("split", [False, True], ids=["shared", "split"])
 def test_inverted_faces_are_lit_as_right_ones(tmp_path, inverted, split):
     """Also where each face has its own vertices."""
+
     def box(name, faces):
         lines = obj_box(inverted=faces)
         if split:
             vertices = [line for line in lines if line[0] == "v"]
             quads = [[vertices[int(i) - 1] for i in line.split()[1:]] for line in lines if line[0] == "f"]
-            lines = [line for i, q in enumerate(quads) for line in (*q, f"f {4*i+1} {4*i+2} {4*i+3} {4*i+4}")]
+            lines = [
+                line for i, q in enumerate(quads) for line in (*q, f"f {4 * i + 1} {4 * i + 2} {4 * i + 3} {4 * i + 4}")
+            ]
         (tmp_path / name).write_text("\n".join(lines))
         return read_mesh(tmp_path / name, 3000)
 
@@ -259,6 +262,7 @@ def test_inverted_faces_are_lit_as_right_ones(tmp_path, inverted, split):
 
 def test_winding_of_open_and_twisted_surfaces():
     """An open strip follows the larger part of its area; a Moebius strip is kept; distant parts are independent."""
+
     def strip(n, twist, close):
         u = torch.linspace(0, 2 * torch.pi * (1 if close else 0.8), n + 1).double()
         half = twist * u / 2

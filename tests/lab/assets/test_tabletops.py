@@ -108,6 +108,7 @@ def test_segment_benchmark_finds_blocks_and_voting_repairs_wrong_masks(tmp_path,
 
 def test_reconstruction_is_measured_in_the_registered_photos(monkeypatch):
     pytest.importorskip("pycolmap")
+
     def perfect(photos, out, options):
         """The scene itself, transformed, without labels, with all cameras but the first."""
         assert len(list(photos.iterdir())) == 8

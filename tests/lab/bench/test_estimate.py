@@ -24,6 +24,7 @@ from tests.conftest import CliRunner
 
 GOOD = {"duck": {"material": "rubber", "E": 3e5, "density": 300}, "ball": {"material": "foam", "E": 1e5, "density": 50}}
 
+
 @pytest.fixture(scope="module")
 def video(tmp_path_factory):
     """40 frames, the n-th of brightness n / 40."""

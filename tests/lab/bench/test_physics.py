@@ -14,9 +14,7 @@ QUICK = ("slide/friction=0.3", "slope/25deg friction=0.3", "fall/gravity=1.62", 
 BOXES = [name for name in ALL if name.startswith("boxes/")]
 
 
-@pytest.mark.parametrize(
-    "name", [*QUICK, *(pytest.param(n, marks=pytest.mark.slow) for n in ALL if n not in QUICK)]
-)
+@pytest.mark.parametrize("name", [*QUICK, *(pytest.param(n, marks=pytest.mark.slow) for n in ALL if n not in QUICK)])
 def test_rigid_bodies_agree_with_theory(name):
     row = measure(ALL[name], "rigid", PhysicsBenchOptions())
     assert row["passes"], row

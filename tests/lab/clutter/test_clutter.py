@@ -18,9 +18,7 @@ from stages.lab.training import train_segmenter
 from stages.lab.training.segmenter_data import targets
 
 pytest.importorskip("mujoco")
-PERFECT = Degradation(
-    bend=0.0, fatten=0.0, drift=0.0, patch=8.0, grain=0.0, plain=0.0, holes=-1.0, merge=0.005
-)
+PERFECT = Degradation(bend=0.0, fatten=0.0, drift=0.0, patch=8.0, grain=0.0, plain=0.0, holes=-1.0, merge=0.005)
 
 
 @pytest.fixture(scope="module")

@@ -29,8 +29,16 @@ def _rotated(quat: wp.vec4, rotation: wp.vec3):
 
 
 @wp.kernel(enable_backward=False)
-def _drift(com: wp.array[wp.vec3], quat: wp.array[wp.vec4], velocity: wp.array[wp.vec3], momentum: wp.array[wp.vec3],
-           inverse: wp.array[wp.mat33], dt: float, new_com: wp.array[wp.vec3], new_quat: wp.array[wp.vec4]):
+def _drift(
+    com: wp.array[wp.vec3],
+    quat: wp.array[wp.vec4],
+    velocity: wp.array[wp.vec3],
+    momentum: wp.array[wp.vec3],
+    inverse: wp.array[wp.mat33],
+    dt: float,
+    new_com: wp.array[wp.vec3],
+    new_quat: wp.array[wp.vec4],
+):
     i = wp.tid()
     q, L = quat[i], momentum[i]
     spin = _spin(L, inverse[i], _matrix(q))

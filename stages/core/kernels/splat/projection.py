@@ -350,4 +350,3 @@ def project_reference(camera: Tensor, means: Tensor, quats: Tensor, scales: Tens
     columns = [*centre2d.unbind(-1), conic[:, 0, 0], conic[:, 0, 1], conic[:, 1, 1], opacities, *rgb.unbind(-1), z]
     columns += [opacities.detach().log2(), *extent.unbind(-1), zero, zero, zero]
     return torch.where(visible[:, None], torch.stack(columns, -1), zero[:, None])
-

@@ -33,9 +33,7 @@ class Click:
 
 
 @torch.no_grad()
-def clicked_ids(
-    scene: Scene, model: Segmenter, clicks: Sequence[Click], options: SegmenterOptions
-) -> Int[Tensor, "n"]:
+def clicked_ids(scene: Scene, model: Segmenter, clicks: Sequence[Click], options: SegmenterOptions) -> Int[Tensor, "n"]:
     """Object number of each Gaussian, that of the clicks on it; 0 for the rest.
 
     An object is the candidate with the largest expected IoU that has all clicks of the object and none of the others.

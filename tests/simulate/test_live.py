@@ -17,6 +17,7 @@ import pytest
 import torch
 
 from stages.core.backends import choose
+from stages.core.errors import InputError
 from stages.core.physics.forces import Change, ForcePrompts
 from stages.core.physics.keypoints import choose_keypoints, pull_range
 from stages.core.scene.scene_ply import write_scene
@@ -322,6 +323,19 @@ def test_two_hundred_connections_leave_nothing_behind(server):
 
 
 # --- a session as users have it ---
+
+
+def test_an_engine_that_fails_at_the_start_ends_the_command(tmp_path, monkeypatch):
+    def failing(*_):
+        raise InputError("no engine here")
+        yield
+
+    monkeypatch.setattr("stages.simulate.learned.rollout", failing)
+    write_scene(tmp_path / "scene.ply", two_balls_scene())
+    options = SimulateOptions(engine="ngff", live=True, browser=False, keypoints=32)
+    with pytest.raises(InputError, match="no engine here"):
+        run(tmp_path / "scene.ply", tmp_path / "traj.h5", options)
+    assert [p.name for p in tmp_path.iterdir()] == ["scene.ply"]
 
 
 def start_session(folder: Path, *options: str):

@@ -53,7 +53,8 @@ class LiveScene:
 def run_live(scene: LiveScene, out: Path, info: SimulationInfo, stop: threading.Event | None = None) -> None:
     """Simulate until Ctrl-C (or `stop`) and write what was recorded since the last start.
 
-    Raises InputError for unusable options, and MissingPackage without websockets.
+    Raises InputError for unusable options and where the engine fails at the start, and MissingPackage without
+    websockets.
     """
     stop = _stop_on_signals() if stop is None else stop
     setup = set_up_scene(scene.world, scene.prompts, scene.options)
@@ -129,10 +130,15 @@ class _Live:
                 self.session.handle(message)
 
     def advance(self) -> None:
-        """One frame; where the engine fails, pause with a note, as only a new start helps."""
+        """One frame; where the engine fails, pause with a note, as only a new start helps.
+
+        Raises InputError where it fails at the start.
+        """
         try:
             state = next(self.states)
         except InputError as error:
+            if self.session.state is None:  # nothing to show yet
+                raise
             log.warning("%s", error)
             self.note, self.paused = f"{error} Start again with R.", True
             return self.show()

@@ -32,7 +32,7 @@ NO_MEMORY = ("can't allocate memory", "Insufficient memory", "can't start new th
 
 
 def limit_threads(count: int | None) -> None:
-    """Use at most `count` CPU threads in PyTorch, OpenMP, OpenBLAS and our own kernels; None keeps their defaults.
+    """Use at most `count` CPU threads in PyTorch, OpenMP and our own kernels; None keeps their defaults.
 
     They read these variables when they are first imported, which no command has done yet.
     """
@@ -40,7 +40,7 @@ def limit_threads(count: int | None) -> None:
         return
     if count < 1:
         raise InputError(f"--threads {count}: give 1 or more")
-    for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+    for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ[name] = str(count)
 
 

@@ -1,4 +1,4 @@
-"""Threads wait passively: the variables are set before the libraries that read them are imported."""
+"""Threads wait passively and NumPy uses one: set before the libraries that read these variables are imported."""
 
 import json
 import os
@@ -9,7 +9,7 @@ import pytest
 
 from tests.pipeline.test_commands import ROOT
 
-VARIABLES = {"OMP_WAIT_POLICY": "PASSIVE", "OPENBLAS_THREAD_TIMEOUT": "4"}
+VARIABLES = {"OMP_WAIT_POLICY": "PASSIVE", "OPENBLAS_NUM_THREADS": "1"}
 RECORDER = """
 import json, os, sys
 
@@ -33,7 +33,7 @@ def environment_at_import(statement: str, **given: str) -> dict[str, str | None]
 
 @pytest.mark.parametrize("statement", ["import stages.core.scene.gaussians", "import ngff_cli.app, torch"],
                          ids=["library", "command line"])  # fmt: skip
-def test_passive_waiting_is_set_before_the_libraries_are_imported(statement):
+def test_they_are_set_before_the_libraries_are_imported(statement):
     assert environment_at_import(statement) == VARIABLES
 
 

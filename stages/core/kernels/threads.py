@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache, partial
 from queue import SimpleQueue
-from threading import Thread
+from threading import Barrier, Thread
 from typing import Any
 
 import torch
@@ -32,7 +32,10 @@ def run_parallel(tasks: Sequence[Task]) -> None:
     At most `torch.get_num_threads()` run at a time. The first exception of a task is raised after all have ended,
     since they may share memory.
     """
-    helpers = _helpers(max(0, torch.get_num_threads() - 1))[: len(tasks) - 1]
+    _run(tasks, _helpers(max(0, torch.get_num_threads() - 1))[: len(tasks) - 1])
+
+
+def _run(tasks: Sequence[Task], helpers: list[SimpleQueue[Batch]]) -> None:
     batch: Batch = deque(tasks), SimpleQueue()
     for inbox in helpers:
         inbox.put(batch)
@@ -45,14 +48,17 @@ def run_parallel(tasks: Sequence[Task]) -> None:
 def parallel_map(function: Callable[[Any], Any], items: Sequence[Any]) -> list[Any]:
     """Results of a function for independent items, in order, by `run_parallel`.
 
-    For functions that spend their time in NumPy, SciPy or PyTorch, which release Python's lock.
+    For functions that spend their time in NumPy, SciPy or PyTorch, which release Python's lock. PyTorch's operations
+    within run on one thread each, whichever thread takes the item, so that their sums do not depend on it.
     """
     results: list[Any] = [None] * len(items)
 
     def task(i: int) -> None:
         results[i] = function(items[i])
 
-    run_parallel([partial(task, i) for i in range(len(items))])
+    helpers = _helpers(max(0, torch.get_num_threads() - 1))[: max(0, len(items) - 1)]
+    with small_operations():
+        _run([partial(task, i) for i in range(len(items))], helpers)
     return results
 
 
@@ -75,13 +81,18 @@ def _work(batch: Batch) -> None:
 @cache
 def _helpers(count: int) -> list[SimpleQueue[Batch]]:
     """Inboxes of that many threads, which live as long as the process."""
+    threads, started = torch.get_num_threads(), Barrier(count + 1)
     inboxes: list[SimpleQueue[Batch]] = [SimpleQueue() for _ in range(count)]
     for inbox in inboxes:
-        Thread(target=_serve, args=(inbox,), name="kernels", daemon=True).start()
+        Thread(target=_serve, args=(inbox, started), name="kernels", daemon=True).start()
+    started.wait()
+    torch.set_num_threads(threads)  # of this thread as before, and of those to come
     return inboxes
 
 
-def _serve(inbox: SimpleQueue[Batch]) -> None:
+def _serve(inbox: SimpleQueue[Batch], started: Barrier) -> None:
+    torch.set_num_threads(1)  # of this thread
+    started.wait()
     while True:
         _work(inbox.get())
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -28,12 +29,14 @@ MIN_PIXELS = 40  # of an object in a view
 MIN_KEPT = 0.4  # share of an object's pixels; where less is left, its colours are those of its surroundings
 
 
-def refine_outlines(scene: Scene, ids: Int[Tensor, "n"], seed: int = 0) -> Int[Tensor, "n"]:
+def refine_outlines(
+    scene: Scene, ids: Int[Tensor, "n"], seed: int = 0, device: torch.device | str = "cpu"
+) -> Int[Tensor, "n"]:
     """The objects `ids` of the Gaussians, with their outlines cut in each view by colour and voted over the views.
 
     The pixels within BAND of an object's outline are assigned anew by GrabCut; those farther inside and outside are
     the examples of its colours and of those around it. Gaussians that hardly any view shows keep their object, and
-    without cameras all do.
+    without cameras all do. The views are drawn on `device`.
     """
     if scene.cameras is None or not len(scene.cameras) or not bool((ids > 0).any()):
         return ids
@@ -41,17 +44,17 @@ def refine_outlines(scene: Scene, ids: Int[Tensor, "n"], seed: int = 0) -> Int[T
     views = torch.linspace(0, count - 1, min(MAX_VIEWS, count)).round().long().tolist()
     numbers = ids[ids > 0].unique().tolist()
     middles = torch.stack([means[ids == number].nanmedian(0).values for number in numbers])
-    votes = torch.zeros(len(ids), 1)
+    drawn, votes = replace(scene, gaussians=scene.gaussians.to(device)), torch.zeros(len(ids), 1, device=device)
     with ThreadPoolExecutor(torch.get_num_threads()) as pool:
         found = []
         for view in views:
-            footprint, labels = ViewFootprint.of(scene, view), _label_image(scene, view, ids, numbers)
-            image = (255 * footprint.image.numpy()).round().astype(np.uint8)
+            footprint, labels = ViewFootprint.of(drawn, view), _label_image(drawn, view, ids, numbers)
+            image = (255 * footprint.image.cpu().numpy()).round().astype(np.uint8)
             bands = dict(zip(numbers, _bands(scene, view, middles), strict=True))
             found.append((footprint, pool.submit(cut_outlines, image, labels, bands, seed)))
         for footprint, labels in found:
             votes = add_votes(votes, damp_votes(footprint.votes(torch.from_numpy(labels.result()))))
-    voted = torch.where(votes.sum(1) >= MIN_VOTES, votes.argmax(1), ids)
+    voted = torch.where((votes.sum(1) >= MIN_VOTES).cpu(), votes.argmax(1).cpu(), ids)
     for number in numbers:  # not what is far behind an object, where its surface is missing
         gained = torch.nonzero((voted == number) & (ids != number))[:, 0]
         far = knn(means[ids == number], means[gained], 1)[0][:, 0] > REACH * radius
@@ -65,7 +68,7 @@ def _label_image(scene: Scene, view: int, ids: Int[Tensor, "n"], numbers: list[i
     own = (ids[:, None] == torch.tensor(numbers)).float()
     weight = rasterise_features(scene.gaussians, own, scene.cameras.viewmats[[view]], K[None], width, height)[0]
     most, which = weight.max(-1)
-    return torch.where(most > 1 - weight.sum(-1), torch.tensor(numbers)[which], 0).numpy()
+    return torch.where(most > 1 - weight.sum(-1), torch.tensor(numbers, device=most.device)[which], 0).cpu().numpy()
 
 
 def _bands(scene: Scene, view: int, middles: Float[Tensor, "k 3"]) -> list[float]:

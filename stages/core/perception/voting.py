@@ -40,11 +40,12 @@ class ViewFootprint:
 
     @classmethod
     def of(cls, scene: Scene, view: int) -> ViewFootprint:
-        """The footprint of view number `view`, rendered."""
+        """The footprint of view number `view`, rendered on the device of the Gaussians."""
         g, viewmat = scene.gaussians, scene.cameras.viewmats[view]
         width, height, K = voting_intrinsics(scene, view)
         front, weight = visibility(g, viewmat, K, width, height)
         rendered = rasterise(g, viewmat[None], K[None], width, height)
+        viewmat, K = viewmat.to(g.means), K.to(g.means)
         x, y = project(g.means, viewmat, K).nan_to_num(-1).floor().long().unbind(1)
         z = depths(g.means, viewmat)
         inside = torch.nonzero((z > 0.01) & (x >= 0) & (x < width) & (y >= 0) & (y < height))[:, 0]
@@ -59,12 +60,14 @@ class ViewFootprint:
         vote of the pixel at their centre, with their summed weight.
         """
         height, width = self.front.shape
+        device = self.front.device
         rows = ((torch.arange(height) + 0.5) * labels.shape[0] / height).long()
         columns = ((torch.arange(width) + 0.5) * labels.shape[1] / width).long()
-        labels = labels[rows][:, columns].long()
-        votes = torch.zeros(self.gaussians, int(labels.max()) + 1)
+        labels = labels[rows][:, columns].long().to(device)
+        votes = torch.zeros(self.gaussians, int(labels.max()) + 1, device=device)
         seen = self.front >= 0
-        votes.index_put_((self.front[seen].long(), labels[seen]), torch.ones(int(seen.sum())), accumulate=True)
+        one = torch.ones((), device=device)
+        votes.index_put_((self.front[seen].long(), labels[seen]), one, accumulate=True)
         votes.index_put_((self.on, labels.flatten()[self.pixels]), self.weights + 1e-3, accumulate=True)
         return votes
 

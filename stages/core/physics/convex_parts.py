@@ -7,7 +7,6 @@ to the mean level of the surface under them. Lengths are in the unit of the Gaus
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,6 +15,7 @@ from jaxtyping import Float
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 from torch import Tensor
 
+from stages.core.kernels.threads import parallel_map
 from stages.core.physics.convex_cuts import EXTREMES, divide
 from stages.core.physics.keypoints import farthest_points
 from stages.core.physics.solid_surface import solid_surface
@@ -55,9 +55,9 @@ def convex_parts(scene: Scene, seed: int = 0, bottom: float = -np.inf) -> list[C
     any usable Gaussian.
     """
     ids = [o.id for o in scene.objects]
-    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
-        solids = list(pool.map(lambda id: _solid(scene, id, seed, bottom), ids))
-        return list(pool.map(lambda row: _parts(solids[row], _around(solids, row), seed), range(len(solids))))
+    solids = parallel_map(lambda id: _solid(scene, id, seed, bottom), ids)
+    # on one thread: small arrays, during which Python holds its lock
+    return [_parts(solid, _around(solids, row), seed) for row, solid in enumerate(solids)]
 
 
 def _solid(scene: Scene, object_id: int, seed: int, bottom: float) -> Solid:

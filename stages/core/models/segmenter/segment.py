@@ -85,8 +85,8 @@ def segment_by_network(
 ) -> Scene:
     """The scene with an object_id for every Gaussian (0 for the background) and its objects, largest first.
 
-    `seed` is of the search for the supporting surface, `device` of the network. Raises InputError if there are no
-    weights at `weights`.
+    `seed` is of the search for the supporting surface; the network runs and the views are drawn on `device`. Raises
+    InputError if there are no weights at `weights`.
     """
     support = find_support(scene, view_extent(scene), seed)
     ids = object_ids(scene, load_segmenter(find(weights), device), options)
@@ -108,7 +108,7 @@ def object_ids(
     labels = best_objects([s.best(options) for s in scored])
     labels = torch.where(labels <= options.max_objects, labels, 0)
     ids[index] = outlined(surfels, labels, scored)
-    ids = refine_outlines(scene, ids)
+    ids = refine_outlines(scene, ids, device=model.input_projection.weight.device)
     few = ids.bincount() < MIN_GAUSSIANS
     return torch.where(few[ids], 0, ids)
 

@@ -33,11 +33,13 @@ class KDTree:
 class BruteForce:
     """Brute-force search by matrix products: for a few thousand points faster than a tree on a GPU.
 
-    Neighbours are ranked in float32 by |x|^2 - 2 q.x, so the order of points whose squared distances differ by less
-    than about 1e-6 |x|^2 is arbitrary, and points should be centred on the origin; the returned distances are exact.
+    Candidates are found in float32 by |x|^2 - 2 q.x, where the order of points whose squared distances differ by less
+    than about 1e-6 |x|^2 is arbitrary, so points should be centred on the origin. The k nearest of k + SPARE candidates
+    are then chosen by their exact distances; a single neighbour is taken as it is.
     """
 
     MAX_ENTRIES = 2**26  # of the distance matrix held at once, 256 MB
+    SPARE = 4  # candidates beyond k
 
     def __init__(self, points: Float[Tensor, "n d"]):
         self.points = points
@@ -49,8 +51,10 @@ class BruteForce:
         """Same as `KDTree.query`."""
         flat, have = points.reshape(-1, points.shape[-1]), min(k, len(self.points))
         chunks = flat.split(max(1, self.MAX_ENTRIES // len(self.points)))
-        index = torch.cat([self._nearest(chunk, have) for chunk in chunks])
-        distance, order = (flat[:, None] - self.points[index]).norm(dim=2).sort(1)
+        candidates = 1 if have == 1 else min(have + self.SPARE, len(self.points))
+        index = torch.cat([self._nearest(chunk, candidates) for chunk in chunks])
+        distance, order = (flat[:, None] - self.points[index]).norm(dim=2).sort(dim=1, stable=True)
+        distance, order = distance[:, :have], order[:, :have]
         distance = torch.nn.functional.pad(distance.where(distance < within, inf), (0, k - have), value=inf)
         index = torch.nn.functional.pad(index.gather(1, order), (0, k - have))
         return distance.view(*points.shape[:-1], k), index.view(*points.shape[:-1], k)

@@ -17,7 +17,6 @@ from torch import Tensor
 
 from stages.core.kernels.mpm.grid import BLOCK
 from stages.core.physics.mpm import solver as mpm
-from stages.core.physics.mpm.domain import MAX_NODES
 from stages.core.scene.scene import SceneObject
 
 log = logging.getLogger(__name__)
@@ -27,11 +26,10 @@ FRAMES = 10  # frames for which a new grid has room at the present speed
 
 @dataclass(frozen=True)
 class GridBodies:
-    """The bodies on a grid."""
+    """The bodies on a grid, each with its own velocity field."""
 
     body: Int[Tensor, "p"]  # row of each particle's object in `objects`; particles are in the order of their bodies
     objects: Sequence[SceneObject]
-    separate: bool  # each has its own velocity field (schedule `contact`); otherwise one grid sums exactly
 
 
 class MovingGrid:
@@ -39,9 +37,9 @@ class MovingGrid:
 
     def __init__(self, particles: mpm.Particles, box: mpm.Box, dx: float, device: str, bodies: GridBodies, fixed: bool):
         self.box, self._bodies, self._fixed = box, bodies, fixed
-        sizes = torch.bincount(bodies.body).tolist() if bodies.separate else None
-        self._copies = len(sizes) if bodies.separate else 1  # of the grid
-        options = mpm.SolverOptions(schedule="contact" if bodies.separate else "exact")
+        sizes = torch.bincount(bodies.body).tolist()
+        self._copies, self._max_nodes = len(sizes), mpm.max_contact_nodes(device)
+        options = mpm.SolverOptions(schedule="contact")
         self._build = lambda p, b: mpm.Solver(p, b, dx, device, options, sizes)
         self.solver = self._build(particles, box)
 
@@ -62,9 +60,9 @@ class MovingGrid:
         if not near and all(a + reach <= b for a, b in zip(high, self.box.high, strict=True)):
             return
         room = reach + FRAMES * duration * speed
-        while self._nodes(box := self._around(low, high, room)) > MAX_NODES / 2 and room > reach:
+        while self._nodes(box := self._around(low, high, room)) > self._max_nodes and room > reach:
             room *= 0.8
-        if self._nodes(box) > MAX_NODES / 2:
+        if self._nodes(box) > self._max_nodes:
             self._fixed = True
             log.warning("%s moves too far from the other objects for one grid, and is stopped at %s; use a coarser "
                         "--quality, or simulate it alone", self._farthest(), self._ends())  # fmt: skip

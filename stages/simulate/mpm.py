@@ -17,7 +17,6 @@ from torch import Tensor
 
 from stages.core.backends import pick_device
 from stages.core.errors import InputError
-from stages.core.geometry.neighbours import knn
 from stages.core.physics.forces import Force, ForcePrompts
 from stages.core.physics.keypoints import nearest_weights
 from stages.core.physics.material_parts import part_of_points
@@ -35,8 +34,6 @@ from stages.simulate.setup import SceneSetup, choose_for_bodies, set_up_scene
 
 log = logging.getLogger(__name__)
 PARTICLES_PER_KEYPOINT = 8  # particles whose motion a keypoint follows
-GRID_CONTACT_DISTANCE = 3.0  # particle spacings within which bodies are in contact on the grid
-MIN_STUCK_FRACTION = 0.1  # fraction of a body's particles in contact above which a push is reported to be hindered
 GPU_SUBSTEP = 2e-5  # shortest substep worth taking on a GPU [s]
 CFL_MARGIN = 0.85  # fraction of the stability limit that materials may use up
 
@@ -46,27 +43,19 @@ def rollout(
 ) -> Iterator[FrameState]:
     """One state per frame, the first being the start.
 
-    On a GPU the grid transfers are exact (fixed point), so that runs are reproducible there as on a CPU, and the
-    quality levels above draft use twice the resolution and stiffer materials. Raises InputError when a body leaves the
-    domain or its motion is no longer finite.
+    Each body has a velocity field of its own. On a GPU the quality levels above draft use twice the resolution and
+    stiffer materials. Raises InputError when a body leaves the domain or its motion is no longer finite.
     """
     unit, device = scene.metres_per_unit, pick_device(options.device)
     level, fine = options.level, device != "cpu" and options.quality != "draft"
     if fine:
         level = replace(level, substep=min(level.substep, GPU_SUBSTEP))
-    touch = device == "cpu"  # the schedule for GPUs has one velocity at a node
-    setup = set_up_scene(scene, prompts, options, fine, skin=touch)
+    setup = set_up_scene(scene, prompts, options, fine, skin=True)
     setup.warn_of_lifted(scene)
     body, dx = setup.bodies.body, 2 * setup.bodies.spacing * unit
     particles = _particles(scene, setup, prompts, options, level)
-    # without skin the floor is raised by the layer of voxels that is empty
-    low = (*setup.box.low[:2], setup.box.low[2] + (0.0 if touch else setup.bodies.spacing))
-    box = mpm.Box(tuple(unit * v for v in low), tuple(unit * v for v in setup.box.high))
-    grid = MovingGrid(
-        particles, box, dx, device, GridBodies(body, scene.objects, separate=touch), fixed=options.box is not None
-    )
-    if not touch:
-        _warn_stuck(scene, setup, prompts)
+    box = mpm.Box(tuple(unit * v for v in setup.box.low), tuple(unit * v for v in setup.box.high))
+    grid = MovingGrid(particles, box, dx, device, GridBodies(body, scene.objects), fixed=options.box is not None)
     ids = [o.id for o in scene.objects]
     attachment = _attach(scene, keypoints, setup.bodies)
     gravity = _gravity(particles, options)
@@ -192,23 +181,6 @@ def _stable_material(m: Material, length: float, h: float, level: MpmQuality) ->
     E = min(m.E, mpm.modulus_at_wave_speed(fastest, m.nu, m.density))
     viscosity = m.loss * E * length / (math.pi * math.sqrt(E / m.density))
     return E, min(viscosity, CFL_MARGIN * mpm.VISCOUS * m.density * (2 * h) ** 2 / level.substep)
-
-
-def _warn_stuck(scene: Scene, setup: SceneSetup, prompts: ForcePrompts) -> None:
-    """Warn of pushed objects in contact with others: a node has one velocity, so bodies on it stick to each other."""
-    x, body = setup.start, setup.bodies.body
-    pushed = {f.object_id for f in prompts.forces} | set(prompts.velocity)
-    for row, o in enumerate(scene.objects):
-        mine = body == row
-        if o.id not in pushed or bool(mine.all()):
-            continue
-        distance, nearest = knn(x[~mine], x[mine], 1)
-        touching = distance[:, 0] < GRID_CONTACT_DISTANCE * setup.bodies.spacing
-        if float(touching.float().mean()) > MIN_STUCK_FRACTION:
-            others = body[~mine][nearest[touching, 0]].unique().tolist()
-            log.warning("object %d (%s) touches %s: bodies in contact on the MPM grid hardly slide or separate, so a "
-                        "push may move them less than it should; compare with --engine ngff",
-                        o.id, o.name, ", ".join(str(scene.objects[i].id) for i in others))  # fmt: skip
 
 
 class _PromptedForce:

@@ -14,7 +14,7 @@ from stages.core.physics.keypoints import choose_keypoints
 from stages.core.scene.gaussians import concatenate
 from stages.core.scene.scene import Scene, SceneObject
 from stages.lab.assets.shapes import box, to_gaussians
-from stages.simulate.mpm import _PromptedForce, _warn_stuck
+from stages.simulate.mpm import _PromptedForce
 from stages.simulate.options import ENGINES, QUALITIES, MpmQuality, SimulateOptions
 from stages.simulate.setup import set_up_scene
 from tests.conftest import ball
@@ -117,18 +117,6 @@ def test_a_force_at_a_point_acts_on_the_particles_near_it():
     a = _PromptedForce(Force(1, (1.0, 0.0, 0.0), at=(0.0, 0.0, 0.0)), particles, small_setup(x, [0] * 4), 0)
     weight = torch.exp(-((torch.tensor([0.0, 0.4, 0.75]) / 0.4) ** 2) / 2)
     torch.testing.assert_close(a.acceleration(x, 0.0, 1.0)[:, 0], torch.cat([weight / weight.sum(), torch.zeros(1)]))
-
-
-def test_a_push_of_touching_bodies_is_warned_of_where_they_stick(caplog):
-    line = torch.arange(8)[:, None] * torch.tensor([0.1, 0.0, 0.0])
-    scene = SimpleNamespace(objects=[SceneObject(i, f"thing {i}") for i in (1, 2, 3)])
-    setup = small_setup(torch.cat([line[:4], line[4:], line[:2] + 9]), [0] * 4 + [1] * 4 + [2] * 2)
-    _warn_stuck(scene, setup, ForcePrompts((Force(3, (1.0, 0.0, 0.0)),)))
-    assert not caplog.text  # it touches nothing
-    _warn_stuck(scene, setup, ForcePrompts((Force(2, (1.0, 0.0, 0.0)),)))
-    assert "object 2 (thing 2) touches 1:" in caplog.text and len(caplog.records) == 1
-    _warn_stuck(scene, small_setup(line, [0] * 8), ForcePrompts((Force(1, (1.0, 0.0, 0.0)),)))
-    assert len(caplog.records) == 1  # alone
 
 
 @pytest.mark.parametrize("options", [{"port": 8000}, {"browser": False}])

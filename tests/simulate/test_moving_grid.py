@@ -22,14 +22,13 @@ def cube(at: tuple, velocity: tuple):
     return particles
 
 
-@pytest.mark.parametrize("touch", [False, True])
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_a_grid_that_follows_changes_nothing_and_keeps_its_margin(device, touch, sign):
+def test_a_grid_that_follows_changes_nothing_and_keeps_its_margin(device, sign):
     """Two bodies that fly apart, upwards, with 5 and 2 m/s."""
     particles = join_particles([cube((0.0, 0.0, 0.5), (4.0 * sign, 3.0 * sign, 2.0)), cube((0.3, 0, 0.5), (0, 0, 2.0))])
     body = torch.arange(2).repeat_interleave(27)
     small, large = Box((-0.5, -0.5, 0.0), (0.9, 0.9, 1.2)), Box((-0.5 - 10 * BLOCK * DX,) * 2 + (0.0,), (3.0, 3.0, 3.0))
-    bodies = GridBodies(body, OBJECTS, separate=touch)
+    bodies = GridBodies(body, OBJECTS)
     moving = MovingGrid(particles, small, DX, device, bodies, fixed=False)
     still = MovingGrid(particles, large, DX, device, bodies, fixed=True)
     boxes = {moving.box.low + moving.box.high}

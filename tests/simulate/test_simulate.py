@@ -209,7 +209,7 @@ def test_nothing_stops_what_slides_or_rises_but_the_box_that_was_asked_for(balls
 
 
 def test_what_flies_too_far_for_a_grid_is_named(balls, monkeypatch, caplog):
-    monkeypatch.setattr(moving_grid, "MAX_NODES", 400_000)
+    monkeypatch.setattr(moving_grid.mpm, "max_contact_nodes", lambda device: 200_000)
     t = roll(balls, steps=25, gravity=0.0, velocity=("object=2 8,0,0",))
     assert "(thing) moves too far from the other objects" in caplog.text
     assert float(mean_shift(t, 2)[0]) < 8 * 24 * 0.02

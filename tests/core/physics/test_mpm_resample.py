@@ -12,20 +12,22 @@ from tests.conftest import ball
 
 def sampled(count: int = 2000) -> Bodies:
     low, high = ball((0, 0, 0.15), 0.15, 600, (1, 0, 0), 1), ball((0.25, 0, 0.2), 0.12, 600, (0, 1, 0), 2, seed=1)
-    return sample_bodies(Scene(concatenate([low, high]), (SceneObject(1, "a"), SceneObject(2, "b")), None, 0.0), count)
+    return sample_bodies(
+        Scene(concatenate([low, high]), (SceneObject(1, "a"), SceneObject(2, "b")), None, 0.0), count, skin=True
+    )
 
 
 def test_mass_position_and_extent_are_kept():
     coarse = sampled()
     fine = subdivide(coarse)
-    assert fine.spacing == coarse.spacing / 2 and 6 * len(coarse.x) < len(fine.x) < 20 * len(coarse.x)
+    assert fine.spacing == coarse.spacing / 2 and len(fine.x) == 8 * len(coarse.x)
     for n in (0, 1):
         a, b = coarse.x[coarse.body == n], fine.x[fine.body == n]
         assert float(fine.volume[fine.body == n].sum()) == pytest.approx(float(coarse.volume[coarse.body == n].sum()))
         torch.testing.assert_close(a.mean(0), b.mean(0), rtol=0, atol=coarse.spacing / 4)
-        # the visible body extends one spacing beyond the voxels of its particles
-        seen = [x.amax(0) + 1.5 * h for x, h in ((a, coarse.spacing), (b, fine.spacing))]
-        torch.testing.assert_close(*seen, rtol=0, atol=0.6 * coarse.spacing)
+        # a particle is in the middle half of its voxel
+        seen = [x.amax(0) + 0.5 * h for x, h in ((a, coarse.spacing), (b, fine.spacing))]
+        torch.testing.assert_close(*seen, rtol=0, atol=0.4 * coarse.spacing)
 
 
 def test_at_most_one_particle_per_voxel():

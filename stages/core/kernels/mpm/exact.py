@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from stages.core.kernels.mpm.nodes import mat43
+from stages.core.kernels.mpm.nodes import mat43, scatter_nodes
 
 
 @wp.func_native("""
@@ -126,3 +126,28 @@ def gather_exact(
 """)
 def velocity_exact(momentum: wp.array[wp.vec4], node: int, scale: wp.vec2) -> wp.vec3:
     """Velocity [m/s] of one node in fixed point."""
+
+
+@wp.func_native("""
+    // For a row of four nodes: momentum in fixed point, which is cleared, to velocity and mass.
+    const float ratio = scale.c[1] / scale.c[0];
+    for (int n = 0; n < 4; ++n) {
+        long long* from = (long long*)momentum.data + 4 * ((long long)first + n);
+        float* to = (float*)(velocity.data + first + n);
+        const float mass = (float)from[3], inverse = mass > 0.0f ? ratio / mass : 0.0f;
+        for (int a = 0; a < 3; ++a) to[a] = inverse * (float)from[a];
+        to[3] = mass / scale.c[1];
+        for (int a = 0; a < 4; ++a) from[a] = 0;
+    }
+""")
+def velocity_from_exact(momentum: wp.array[wp.vec4], velocity: wp.array[wp.vec4], first: int, scale: wp.vec2):
+    """Velocities [m/s] and masses [kg] of a row of four nodes from momenta in fixed point, which are cleared."""
+
+
+@wp.func
+def scatter_float(
+    momentum: wp.array[wp.vec4], first: int, stride_x: int, stride_y: int, weight: wp.mat33, fx: wp.vec3,
+    affine: wp.mat44, scale: wp.vec2,
+):  # fmt: skip
+    """scatter_nodes with the signature of scatter_exact."""
+    scatter_nodes(momentum, first, stride_x, stride_y, weight, fx, affine)

@@ -15,7 +15,7 @@ from functools import cache
 import warp as wp
 
 from stages.core.kernels.mpm.constitutive import material_update, neo_hookean
-from stages.core.kernels.mpm.exact import gather_exact, scatter_exact, velocity_exact
+from stages.core.kernels.mpm.exact import gather_exact, scatter_exact, scatter_float, velocity_exact
 from stages.core.kernels.mpm.grid import (
     BLOCK,
     MpmGrid,
@@ -28,7 +28,7 @@ from stages.core.kernels.mpm.grid import (
     near_obstacles,
     near_walls,
 )
-from stages.core.kernels.mpm.nodes import gather_momentum, mat43, scatter_nodes
+from stages.core.kernels.mpm.nodes import gather_momentum, mat43
 from stages.core.kernels.mpm.transfers import (
     FREE,
     LOST,
@@ -172,15 +172,6 @@ def _at_sides(grid: MpmGrid, base: wp.vec3i) -> bool:
         base[1] + 2 >= grid.high[1] or base[2] + 2 >= grid.high[2]  # fmt: skip
 
 
-@wp.func
-def _scatter(
-    write: wp.array[wp.vec4], first: int, stride_x: int, stride_y: int, weight: wp.mat33, fx: wp.vec3, load: wp.mat44,
-    scale: wp.vec2,
-):  # fmt: skip
-    """scatter_nodes with the signature of scatter_exact."""
-    scatter_nodes(write, first, stride_x, stride_y, weight, fx, load)
-
-
 @cache
 def fused_step(plastic: bool, has_obstacles: bool, restitution: bool, exact: bool) -> wp.Kernel:
     """Build the kernel with the features needed, since each one costs registers.
@@ -190,7 +181,7 @@ def fused_step(plastic: bool, has_obstacles: bool, restitution: bool, exact: boo
 
     # 80 registers per thread instead of 94 and a quarter more threads at once; fixed point needs more registers
     bounds = {} if exact else {"launch_bounds": (THREADS_PER_BLOCK, 6)}
-    collect, add = (_gather_free_exact, scatter_exact) if exact else (_gather_free, _scatter)
+    collect, add = (_gather_free_exact, scatter_exact) if exact else (_gather_free, scatter_float)
     walled = near_walls if exact else _at_sides
 
     @wp.kernel(module="unique", enable_backward=False, **bounds)

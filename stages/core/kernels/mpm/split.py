@@ -2,7 +2,8 @@
 
 `particle_step` gathers velocities from the grid (G2P), moves the particles and scatters their momentum and stress for
 the next substep (P2G); `grid_step` divides momentum by mass and applies floor, walls and obstacles. Several CPU threads
-may scatter at once, each into its own copy of the momentum; each block lists the copies that it may occur in.
+may scatter at once, each into its own copy of the momentum; each block lists the copies that it may occur in. On a GPU
+momentum may be in fixed point (see `exact`), in a single copy.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from functools import cache
 import warp as wp
 
 from stages.core.kernels.mpm.constitutive import material_update, neo_hookean
+from stages.core.kernels.mpm.exact import scatter_exact, scatter_float, velocity_from_exact
 from stages.core.kernels.mpm.grid import (
     BLOCK,
     MpmGrid,
@@ -24,7 +26,7 @@ from stages.core.kernels.mpm.grid import (
     near_obstacles,
     near_walls,
 )
-from stages.core.kernels.mpm.nodes import gather_nodes, scatter_nodes, velocity_from_momentum
+from stages.core.kernels.mpm.nodes import gather_nodes, velocity_from_momentum
 from stages.core.kernels.mpm.transfers import (
     FREE,
     LOST,
@@ -38,14 +40,15 @@ from stages.core.kernels.mpm.transfers import (
 
 
 @cache
-def particle_step(plastic: bool, restitution: bool) -> wp.Kernel:
-    """Build the particle kernel; `plastic`: with material models other than neo-Hookean."""
+def particle_step(plastic: bool, restitution: bool, exact: bool) -> wp.Kernel:
+    """Build the particle kernel; `plastic`: with material models other than neo-Hookean; `exact`: in fixed point."""
+    add = scatter_exact if exact else scatter_float
 
     @wp.kernel(module="unique", enable_backward=False)
     def particle_step(
         grid: MpmGrid, rows: ParticleArrays, start: int, stop: int, gather: int, scatter: int, dt: float,
         damping: float, velocity: wp.array[wp.vec4], momentum: wp.array[wp.vec4], copy: int, stale: wp.array[int],
-        obstacles: wp.array[Obstacle], clock: wp.array[float],
+        obstacles: wp.array[Obstacle], clock: wp.array[float], scale: wp.vec2,
     ):  # fmt: skip
         """Particles start + tid. `gather` and `scatter` switch G2P and P2G; `copy` is the first node of the momentum
         copy to scatter into; `stale` is set when a particle moved beyond the marked blocks."""
@@ -104,47 +107,56 @@ def particle_step(plastic: bool, restitution: bool) -> wp.Kernel:
                                        rows.acceleration[i], held, dt, damping)  # fmt: skip
                 first = copy + window + base[0] * stride_x + base[1] * stride_y + base[2]
         if scatter > 0:
-            scatter_nodes(momentum, first, stride_x, stride_y, bspline_weights(fx), fx, load)
+            add(momentum, first, stride_x, stride_y, bspline_weights(fx), fx, load, scale)
 
     return particle_step
 
 
-@wp.kernel(enable_backward=False)
-def grid_step(
-    grid: MpmGrid, start: int, momentum: wp.array[wp.vec4], velocity: wp.array[wp.vec4], friction: wp.array[float],
-    blocks: wp.array[wp.vec2i], obstacles: wp.array[Obstacle], clock: wp.array[float], scenes: int,
-):  # fmt: skip
-    """One row of four nodes of an active block; `blocks` holds a block's first node and the bits of its copies.
+@cache
+def grid_step(exact: bool) -> wp.Kernel:
+    """Build the grid kernel; `exact`: momentum is in fixed point."""
 
-    clock: time since the start of the frame [s], for moving obstacles.
-    """
-    t = start + wp.tid()
-    block = blocks[t // (BLOCK * BLOCK)]
-    row = t % (BLOCK * BLOCK)
-    stride_y = grid.nodes[2]
-    stride_x = grid.nodes[1] * stride_y
-    window = (block[0] // grid.count) * grid.count
-    corner = block[0] - window
-    i = corner // stride_x + row // BLOCK
-    j = (corner // stride_y) % grid.nodes[1] + row % BLOCK
-    k = corner % stride_y
-    first = window + i * stride_x + j * stride_y + k
-    velocity_from_momentum(momentum, velocity, first, grid.count * scenes, block[1])
-    inside = i > grid.low[0] and i < grid.high[0] and j > grid.low[1] and j < grid.high[1]
-    inside = inside and k > grid.low[2] and k + BLOCK <= grid.high[2]
-    blocked = bool(False)  # noqa: UP018 -- a literal would be constant in Warp
-    if obstacles.shape[0] > 0:
-        middle = grid.origin + grid.dx * wp.vec3(float(i), float(j), float(k) + 1.5)
-        blocked = near_obstacles(middle, obstacles, clock[0], 2.0 * grid.dx)
-    if inside and not blocked:
-        return
-    for n in range(BLOCK):
-        u = velocity[first + n]
-        v = apply_walls(grid, wp.vec3i(i, j, k + n), wp.vec3(u[0], u[1], u[2]), friction[first + n])
-        if blocked:
-            place = grid.origin + grid.dx * wp.vec3(float(i), float(j), float(k + n))
-            v = apply_obstacles(place, v, obstacles, clock[0], grid.dx)
-        velocity[first + n] = wp.vec4(v[0], v[1], v[2], u[3])
+    @wp.kernel(module="unique", enable_backward=False)
+    def grid_step(
+        grid: MpmGrid, start: int, momentum: wp.array[wp.vec4], velocity: wp.array[wp.vec4], friction: wp.array[float],
+        blocks: wp.array[wp.vec2i], obstacles: wp.array[Obstacle], clock: wp.array[float], scenes: int, scale: wp.vec2,
+    ):  # fmt: skip
+        """One row of four nodes of an active block; `blocks` holds a block's first node and the bits of its copies.
+
+        clock: time since the start of the frame [s], for moving obstacles.
+        """
+        t = start + wp.tid()
+        block = blocks[t // (BLOCK * BLOCK)]
+        row = t % (BLOCK * BLOCK)
+        stride_y = grid.nodes[2]
+        stride_x = grid.nodes[1] * stride_y
+        window = (block[0] // grid.count) * grid.count
+        corner = block[0] - window
+        i = corner // stride_x + row // BLOCK
+        j = (corner // stride_y) % grid.nodes[1] + row % BLOCK
+        k = corner % stride_y
+        first = window + i * stride_x + j * stride_y + k
+        if wp.static(exact):
+            velocity_from_exact(momentum, velocity, first, scale)
+        else:
+            velocity_from_momentum(momentum, velocity, first, grid.count * scenes, block[1])
+        inside = i > grid.low[0] and i < grid.high[0] and j > grid.low[1] and j < grid.high[1]
+        inside = inside and k > grid.low[2] and k + BLOCK <= grid.high[2]
+        blocked = bool(False)  # noqa: UP018 -- a literal would be constant in Warp
+        if obstacles.shape[0] > 0:
+            middle = grid.origin + grid.dx * wp.vec3(float(i), float(j), float(k) + 1.5)
+            blocked = near_obstacles(middle, obstacles, clock[0], 2.0 * grid.dx)
+        if inside and not blocked:
+            return
+        for n in range(BLOCK):
+            u = velocity[first + n]
+            v = apply_walls(grid, wp.vec3i(i, j, k + n), wp.vec3(u[0], u[1], u[2]), friction[first + n])
+            if blocked:
+                place = grid.origin + grid.dx * wp.vec3(float(i), float(j), float(k + n))
+                v = apply_obstacles(place, v, obstacles, clock[0], grid.dx)
+            velocity[first + n] = wp.vec4(v[0], v[1], v[2], u[3])
+
+    return grid_step
 
 
 @wp.kernel(enable_backward=False)

@@ -35,6 +35,7 @@ SAFETY = 0.5  # fraction of a cell that a wave and a particle may cross in a sub
 VISCOUS = 0.15  # maximum of dt eta / (density dx^2); violent vibration diverges from 0.3
 FLOOR_GAP = mpm_grid.FLOOR_GAP
 SCHEDULES = ("auto", "split", "fused", "exact", "contact")
+CONTACT_NODE_BYTES = 52  # velocity, momentum in fixed point, and friction of a node of a body on a GPU
 SUBSTEP_MULTIPLE = 8  # on a GPU substeps per frame are a multiple of this, so that few CUDA graphs are captured
 
 
@@ -135,7 +136,7 @@ class SolverOptions:
                   follows from the stiffest material of the batch)
         contact   `split`, and the scenes are bodies in one space, each with its own velocity field, in contact with
                   Coulomb friction (kernels/mpm/contact.py); otherwise bodies in one scene share the velocity of a
-                  node, and stick to each other
+                  node, and stick to each other. On a GPU the sums are those of `exact`
 
     Raises ValueError for another schedule.
     """
@@ -166,7 +167,8 @@ class Solver:
         schedule = options.schedule
         if schedule == "auto":
             schedule = "split" if device == "cpu" else "fused"
-        exact, fused = schedule == "exact", schedule in ("fused", "exact")
+        fused = schedule in ("fused", "exact")
+        exact = schedule == "exact" or (schedule == "contact" and device != "cpu")
         self.device, self.dx, self.grid = device, dx, make_grid(box, dx)
         sizes = [len(particles)] if sizes is None else list(sizes)
         if sum(sizes) != len(particles) or min(sizes) < 1:
@@ -184,7 +186,7 @@ class Solver:
         shared = self.rows, plastic, bouncy, options.damping, self._obstacles
         quanta = self._quanta() if exact else None
         contact = self._body_contact(particles, sizes) if schedule == "contact" else None
-        self._substepper = FusedSubsteps(*shared, quanta) if fused else SplitSubsteps(*shared, contact)
+        self._substepper = FusedSubsteps(*shared, quanta) if fused else SplitSubsteps(*shared, contact, quanta)
         self._substep_multiple = SUBSTEP_MULTIPLE if fused and device != "cpu" else 1
 
     @property
@@ -276,6 +278,13 @@ class Solver:
 def max_batch_nodes(device: str) -> int:
     """Maximum number of grid nodes of all scenes of a batch: indices have 31 bits, and the CPU keeps several copies."""
     return 2 * MAX_NODES if device == "cpu" else 2**31 - 1
+
+
+def max_contact_nodes(device: str) -> int:
+    """Maximum number of grid nodes of all bodies in contact: on a GPU as many as half of its free memory holds."""
+    if device == "cpu":
+        return MAX_NODES // 2
+    return min(max_batch_nodes(device) // 4, int(0.5 * torch.cuda.mem_get_info(device)[0] / CONTACT_NODE_BYTES))
 
 
 def make_grid(box: Box, dx: float):

@@ -1,8 +1,9 @@
-"""MPM substeps as two kernel launches, particles and grid: the CPU schedule.
+"""MPM substeps as two kernel launches, particles and grid: the CPU schedule, and that of bodies in contact.
 
 The particles are split into a fixed number of parts, each of which scatters into its own copy of the momentum grid; the
 grid launch adds the copies in order. Threads launch the parts side by side, and since neither the parts nor the order
-of addition depend on the number of threads, neither does the result.
+of addition depend on the number of threads, neither does the result. On a GPU there is one part, and the sums are
+reproducible if they are in fixed point.
 """
 
 from __future__ import annotations
@@ -39,20 +40,23 @@ class SplitSubsteps:
 
     `plastic` compiles all material models instead of neo-Hookean alone, `bouncy` the restitution of surfaces;
     `damping` as in Solver; `obstacles` are the colliders as kernels read them. With `contact` the scenes of `rows` are
-    bodies in contact with each other.
+    bodies in contact with each other. `scale`: fixed-point units of momentum and mass for exact sums, see
+    core/kernels/mpm/exact.py.
     """
 
     def __init__(
         self, rows: ParticleRows, plastic: bool, bouncy: bool, damping: float, obstacles: wp.array,
-        contact: BodyContact | None = None,
+        contact: BodyContact | None = None, scale: tuple[float, float] | None = None,
     ):  # fmt: skip
         self._contact, self._contact_commands = contact, []
         self.rows, self.grid, self.device, self.damping = rows, rows.grid, rows.device, damping
-        self.parts = CPU_PARTS if self.device == "cpu" else 1
-        self._step, self._obstacles = kernels.particle_step(plastic, bouncy), obstacles
+        exact = scale is not None
+        self.parts = CPU_PARTS if self.device == "cpu" and not exact else 1
+        self._step, self._grid_step = kernels.particle_step(plastic, bouncy, exact), kernels.grid_step(exact)
+        self._obstacles, self._scale = obstacles, wp.vec2(*(scale or (0.0, 0.0)))
         self._count = rows.scenes * self.grid.count
         self._velocity = _lazy_zeros((self._count, 4), self.device)
-        self._momentum = _lazy_zeros((self.parts * self._count, 4), self.device)
+        self._momentum = _lazy_zeros((self.parts * self._count * (2 if exact else 1), 4), self.device)
         self._friction = _lazy_zeros((self._count,), self.device)
         shape = [n // kernels.BLOCK for n in self.grid.nodes]
         self._marks = torch.zeros(rows.scenes, *shape, dtype=torch.int32, device=self.device)
@@ -87,7 +91,7 @@ class SplitSubsteps:
         return [
             self._record(self._step, -(-(stop - start) // LAUNCH_MULTIPLE) * LAUNCH_MULTIPLE,
                          [self.grid, self.rows.struct, start, stop, gather, scatter, dt, self.damping, *grids,
-                          part * self._count, view(self._stale), self._obstacles, view(self._clock)])
+                          part * self._count, view(self._stale), self._obstacles, view(self._clock), self._scale])
             for part, (start, stop) in enumerate(self._ranges(len(self.rows)))
         ]  # fmt: skip
 
@@ -105,11 +109,12 @@ class SplitSubsteps:
         launch(kernels.mark_friction, len(self.rows), [self.grid, self.rows.struct, view(self._friction)],
                device=self.device)  # fmt: skip
         inputs = [view(self._momentum, wp.vec4), view(self._velocity, wp.vec4), view(self._friction),
-                  view(self._blocks, wp.vec2i), self._obstacles, view(self._clock), self.rows.scenes]  # fmt: skip
+                  view(self._blocks, wp.vec2i), self._obstacles, view(self._clock), self.rows.scenes,
+                  self._scale]  # fmt: skip
         rows = len(at) * B * B
         ranges = self._ranges(rows) if rows > MIN_SPLIT_ROWS else [(0, rows)]
         self._grid_commands = [
-            self._record(kernels.grid_step, stop - start, [self.grid, start, *inputs])
+            self._record(self._grid_step, stop - start, [self.grid, start, *inputs])
             for start, stop in ranges if stop > start  # nothing to do when all particles are lost
         ]  # fmt: skip
         if self._contact is not None:

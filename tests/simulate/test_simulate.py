@@ -125,20 +125,6 @@ def test_stiff_materials_are_softened_and_logged(balls, caplog):
     assert "object 2 (thing): steel" in caplog.text and "reduced from 2.1e+11 to" in caplog.text
 
 
-@pytest.mark.parametrize(("gap", "warned"), [(0.0, True), (0.3, False)])
-def test_pushing_an_object_in_contact_is_warned_of_on_a_gpu(tmp_path, caplog, device, gap, warned):
-    """Two boards back to back are in contact with half of their particles; 0.3 m apart they are not."""
-    u = torch.cartesian_prod(torch.linspace(-0.15, 0.15, 25), torch.linspace(0.02, 0.32, 25))
-    low, high = (ball((x, 0.0, 0.2), 0.1, len(u), (0.5, 0.5, 0.5), i) for i, x in ((1, 0.0), (2, 0.0)))
-    low.means[:] = torch.cat([torch.zeros(len(u), 1), u], 1)
-    high.means[:] = low.means + torch.tensor([0.05 + gap, 0.0, 0.0])
-    path = tmp_path / "boards.ply"
-    write_scene(path, Scene(concatenate([low, high]), (SceneObject(1, "a"), SceneObject(2, "b")), None, 0.0))
-    roll(path, steps=1, force=("object=2 force=1,0,0",))
-    warned = warned and device != "cpu"
-    assert ("object 2 (b) touches 1" in caplog.text) == warned and "object 1 (a) touches" not in caplog.text
-
-
 def test_a_scene_at_rest_gives_a_hint(balls, caplog):
     caplog.set_level(logging.INFO)
     roll(balls, steps=3, gravity=0.0)

@@ -103,7 +103,9 @@ def _unoriented(points: Float[Tensor, "m 3"], tree: KDTree | BruteForce) -> Surf
     local = points[index] - points[index].mean(1, keepdim=True)
     # on the CPU: the iterative batched solver of a GPU is less accurate, and slower for thousands of small matrices
     _, axes = torch.linalg.eigh((local.mT @ local).cpu())
-    return Surfels(points, axes[:, :, 0].to(points), distance[:, min(4, distance.shape[1] - 1)], torch.zeros_like(distance[:, 0]))
+    return Surfels(
+        points, axes[:, :, 0].to(points), distance[:, min(4, distance.shape[1] - 1)], torch.zeros_like(distance[:, 0])
+    )
 
 
 def _on_surface(surfels: Surfels, nodes: Tensor, index: Int[Tensor, "g k"], cell: Tensor) -> Bool[Tensor, "g"]:

@@ -211,7 +211,7 @@ def test_both_schedules_agree():
         solver = mpm.Solver(p, box, 0.025, options=options)
         roll(solver, 0.2, (0.0, 0.0, -9.81), substeps=80)
         ends.append(solver.particles.x)
-        grids = solver._substepper._grids if schedule == "fused" else [solver._substepper._momentum]
+        grids = solver._substepper._grids() if schedule == "fused" else [solver._substepper._momentum]
         assert not any(bool(g.any()) for g in grids), "a grid is not clean after a frame"
     torch.testing.assert_close(*ends, rtol=0, atol=2e-5)
 

@@ -42,7 +42,7 @@ def _flat_slope(fraction: float) -> float:
 
 
 @wp.func
-def _resolve_pair(
+def resolve_pair(
     velocity: wp.array[wp.vec4], first: int, second: int, stride_x: int, stride_y: int, full_a: float, full_b: float,
     friction: float,
 ) -> bool:  # fmt: skip
@@ -105,7 +105,7 @@ def contact_step(
                 one = bodies[p]
                 other = bodies[q]
                 mu = wp.max(friction[one], friction[other])
-                if _resolve_pair(velocity, one * grid.count + node, other * grid.count + node, stride_x, stride_y,
+                if resolve_pair(velocity, one * grid.count + node, other * grid.count + node, stride_x, stride_y,
                                  full[one], full[other], mu):  # fmt: skip
                     touched = True
     if touched:

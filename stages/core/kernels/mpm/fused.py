@@ -14,6 +14,7 @@ from functools import cache
 
 import warp as wp
 
+from stages.core.kernels.mpm.active import ActiveBlocks, activate_blocks, node_of_block
 from stages.core.kernels.mpm.constitutive import material_update, neo_hookean
 from stages.core.kernels.mpm.exact import gather_exact, scatter_exact, scatter_float, velocity_exact
 from stages.core.kernels.mpm.grid import (
@@ -41,50 +42,6 @@ from stages.core.kernels.mpm.transfers import (
 )
 
 THREADS_PER_BLOCK = 128
-
-
-@wp.struct
-class ActiveBlocks:
-    """Blocks that had particles since the start of the frame: `blocks[: total[0]]`, and a mark for every block."""
-
-    marks: wp.array[int]
-    blocks: wp.array[int]
-    total: wp.array[int]
-
-
-@wp.func
-def _node(grid: MpmGrid, block: int, n: int) -> int:
-    """Index of node n (0..63) of a block, over all scenes."""
-    nb = wp.vec3i(grid.nodes[0] // BLOCK, grid.nodes[1] // BLOCK, grid.nodes[2] // BLOCK)
-    a = block // (nb[1] * nb[2])  # scenes are consecutive along x
-    b = (block // nb[2]) % nb[1]
-    c = block % nb[2]
-    i = a * BLOCK + n // (BLOCK * BLOCK)
-    j = b * BLOCK + (n // BLOCK) % BLOCK
-    return (i * grid.nodes[1] + j) * grid.nodes[2] + c * BLOCK + n % BLOCK
-
-
-@wp.func
-def _activate(
-    grid: MpmGrid, rows: ParticleArrays, i: int, base: wp.vec3i, friction: wp.array[float], active: ActiveBlocks
-):
-    """Add the blocks of a stencil to the active ones, and update the friction coefficients of its nodes at walls."""
-    nb = wp.vec3i(grid.nodes[0] // BLOCK, grid.nodes[1] // BLOCK, grid.nodes[2] // BLOCK)
-    a0 = rows.scene[i] * nb[0]
-    for a in range(base[0] // BLOCK, (base[0] + 2) // BLOCK + 1):
-        for b in range(base[1] // BLOCK, (base[1] + 2) // BLOCK + 1):
-            for c in range(base[2] // BLOCK, (base[2] + 2) // BLOCK + 1):
-                block = ((a0 + a) * nb[1] + b) * nb[2] + c
-                if active.marks[block] == 0:  # noqa: SIM102 -- read before the atomic; Warp's `and` does not short-circuit
-                    if wp.atomic_max(active.marks, block, 1) == 0:
-                        active.blocks[wp.atomic_add(active.total, 0, 1)] = block
-    if near_walls(grid, base):
-        corner = rows.scene[i] * grid.count + (base[0] * grid.nodes[1] + base[1]) * grid.nodes[2] + base[2]
-        mu = rows.friction[i]
-        for n in range(27):
-            node = corner + ((n // 9) * grid.nodes[1] + (n // 3) % 3) * grid.nodes[2] + n % 3
-            if friction[node] < mu:
-                wp.atomic_max(friction, node, mu)
 
 
 @wp.func
@@ -202,7 +159,7 @@ def fused_step(plastic: bool, has_obstacles: bool, restitution: bool, exact: boo
                 nodes = active.total[0] * BLOCK * BLOCK * BLOCK
                 t = i - sweep_from
                 while t < nodes:
-                    node = _node(grid, active.blocks[t // 64], t % 64)
+                    node = node_of_block(grid, active.blocks[t // 64], t % 64)
                     if wp.static(exact):
                         stale[2 * node] = wp.vec4()
                         stale[2 * node + 1] = wp.vec4()
@@ -269,7 +226,7 @@ def fused_step(plastic: bool, has_obstacles: bool, restitution: bool, exact: boo
                 previous = rows.base_node[i]
                 if base[0] != previous[0] or base[1] != previous[1] or base[2] != previous[2]:
                     rows.base_node[i] = base
-                    _activate(grid, rows, i, base, friction, active)
+                    activate_blocks(grid, rows, i, base, friction, active)
                 if wp.static(restitution):  # noqa: SIM102 -- resolved when the kernel is built
                     if held == FREE:
                         now.v = apply_restitution(
@@ -282,23 +239,3 @@ def fused_step(plastic: bool, has_obstacles: bool, restitution: bool, exact: boo
             add(write, first, stride_x, stride_y, bspline_weights(fx), fx, load, scale)
 
     return fused_step
-
-
-@wp.kernel(enable_backward=False)
-def clear_active_blocks(
-    grid: MpmGrid, sweepers: int, a: wp.array[wp.vec4], b: wp.array[wp.vec4], c: wp.array[wp.vec4],
-    friction: wp.array[float], active: ActiveBlocks, width: int,
-):  # fmt: skip
-    """Clear all grids and marks at the end of a frame; the caller then resets the number of active blocks."""
-    t = wp.tid()
-    nodes = active.total[0] * BLOCK * BLOCK * BLOCK
-    while t < nodes:
-        block = active.blocks[t // 64]
-        node = _node(grid, block, t % 64)
-        for n in range(width):  # `width` vec4 per node
-            a[node * width + n] = wp.vec4()
-            b[node * width + n] = wp.vec4()
-            c[node * width + n] = wp.vec4()
-        friction[node] = 0.0
-        active.marks[block] = 0
-        t += sweepers

@@ -242,3 +242,26 @@ def apply_restitution(
             normal = wp.vec3(out[0], out[1], out[2])
             v = moving + _spring(v - moving, normal, touch - out[3], o.friction, o.restitution, grid, dt)
     return v
+
+
+@wp.func
+def apply_boundaries(
+    grid: MpmGrid, velocity: wp.array[wp.vec4], friction: wp.array[float], obstacles: wp.array[Obstacle], time: float,
+    first: int, at: wp.vec3i,
+):  # fmt: skip
+    """Apply walls and obstacles to the velocities of a row of four nodes, the first of which is `at`."""
+    inside = at[0] > grid.low[0] and at[0] < grid.high[0] and at[1] > grid.low[1] and at[1] < grid.high[1]
+    inside = inside and at[2] > grid.low[2] and at[2] + BLOCK <= grid.high[2]
+    blocked = bool(False)  # noqa: UP018 -- a literal would be constant in Warp
+    if obstacles.shape[0] > 0:
+        middle = grid.origin + grid.dx * wp.vec3(float(at[0]), float(at[1]), float(at[2]) + 1.5)
+        blocked = near_obstacles(middle, obstacles, time, 2.0 * grid.dx)
+    if inside and not blocked:
+        return
+    for n in range(BLOCK):
+        u = velocity[first + n]
+        v = apply_walls(grid, at + wp.vec3i(0, 0, n), wp.vec3(u[0], u[1], u[2]), friction[first + n])
+        if blocked:
+            place = grid.origin + grid.dx * wp.vec3(float(at[0]), float(at[1]), float(at[2] + n))
+            v = apply_obstacles(place, v, obstacles, time, grid.dx)
+        velocity[first + n] = wp.vec4(v[0], v[1], v[2], u[3])

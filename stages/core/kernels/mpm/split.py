@@ -3,7 +3,7 @@
 `particle_step` gathers velocities from the grid (G2P), moves the particles and scatters their momentum and stress for
 the next substep (P2G); `grid_step` divides momentum by mass and applies floor, walls and obstacles. Several CPU threads
 may scatter at once, each into its own copy of the momentum; each block lists the copies that it may occur in. On a GPU
-momentum may be in fixed point (see `exact`), in a single copy.
+the particle kernel sums in fixed point (see `exact`) and lists the active blocks itself (see `active`).
 """
 
 from __future__ import annotations
@@ -12,18 +12,17 @@ from functools import cache
 
 import warp as wp
 
+from stages.core.kernels.mpm.active import ActiveBlocks, activate_blocks
 from stages.core.kernels.mpm.constitutive import material_update, neo_hookean
-from stages.core.kernels.mpm.exact import scatter_exact, scatter_float, velocity_from_exact
+from stages.core.kernels.mpm.exact import scatter_exact, scatter_float
 from stages.core.kernels.mpm.grid import (
     BLOCK,
     MpmGrid,
     Obstacle,
-    apply_obstacles,
+    apply_boundaries,
     apply_restitution,
-    apply_walls,
     bspline_weights,
     first_node,
-    near_obstacles,
     near_walls,
 )
 from stages.core.kernels.mpm.nodes import gather_nodes, velocity_from_momentum
@@ -40,15 +39,19 @@ from stages.core.kernels.mpm.transfers import (
 
 
 @cache
-def particle_step(plastic: bool, restitution: bool, exact: bool) -> wp.Kernel:
-    """Build the particle kernel; `plastic`: with material models other than neo-Hookean; `exact`: in fixed point."""
+def particle_step(plastic: bool, restitution: bool, exact: bool = False) -> wp.Kernel:
+    """Build the particle kernel; `plastic`: with material models other than neo-Hookean.
+
+    `exact`: it scatters in fixed point, with the quanta `scale`, and lists active blocks instead of setting `stale`.
+    """
     add = scatter_exact if exact else scatter_float
 
     @wp.kernel(module="unique", enable_backward=False)
     def particle_step(
         grid: MpmGrid, rows: ParticleArrays, start: int, stop: int, gather: int, scatter: int, dt: float,
         damping: float, velocity: wp.array[wp.vec4], momentum: wp.array[wp.vec4], copy: int, stale: wp.array[int],
-        obstacles: wp.array[Obstacle], clock: wp.array[float], scale: wp.vec2,
+        obstacles: wp.array[Obstacle], clock: wp.array[float], scale: wp.vec2, friction: wp.array[float],
+        active: ActiveBlocks,
     ):  # fmt: skip
         """Particles start + tid. `gather` and `scatter` switch G2P and P2G; `copy` is the first node of the momentum
         copy to scatter into; `stale` is set when a particle moved beyond the marked blocks."""
@@ -98,7 +101,12 @@ def particle_step(plastic: bool, restitution: bool, exact: bool) -> wp.Kernel:
                 fx = wp.vec3(g[0] - float(base[0]), g[1] - float(base[1]), g[2] - float(base[2]))
                 previous = rows.base_node[i]
                 shift = wp.max(wp.abs(base[0] - previous[0]), wp.abs(base[1] - previous[1]))
-                if wp.max(shift, wp.abs(base[2] - previous[2])) > 1:
+                shift = wp.max(shift, wp.abs(base[2] - previous[2]))
+                if wp.static(exact):
+                    if shift > 0:
+                        rows.base_node[i] = base
+                        activate_blocks(grid, rows, i, base, friction, active)
+                elif shift > 1:
                     stale[0] = 1
                 if wp.static(restitution):  # noqa: SIM102 -- resolved when the kernel is built
                     if held == FREE:
@@ -112,51 +120,28 @@ def particle_step(plastic: bool, restitution: bool, exact: bool) -> wp.Kernel:
     return particle_step
 
 
-@cache
-def grid_step(exact: bool) -> wp.Kernel:
-    """Build the grid kernel; `exact`: momentum is in fixed point."""
+@wp.kernel(enable_backward=False)
+def grid_step(
+    grid: MpmGrid, start: int, momentum: wp.array[wp.vec4], velocity: wp.array[wp.vec4], friction: wp.array[float],
+    blocks: wp.array[wp.vec2i], obstacles: wp.array[Obstacle], clock: wp.array[float], scenes: int,
+):  # fmt: skip
+    """One row of four nodes of an active block; `blocks` holds a block's first node and the bits of its copies.
 
-    @wp.kernel(module="unique", enable_backward=False)
-    def grid_step(
-        grid: MpmGrid, start: int, momentum: wp.array[wp.vec4], velocity: wp.array[wp.vec4], friction: wp.array[float],
-        blocks: wp.array[wp.vec2i], obstacles: wp.array[Obstacle], clock: wp.array[float], scenes: int, scale: wp.vec2,
-    ):  # fmt: skip
-        """One row of four nodes of an active block; `blocks` holds a block's first node and the bits of its copies.
-
-        clock: time since the start of the frame [s], for moving obstacles.
-        """
-        t = start + wp.tid()
-        block = blocks[t // (BLOCK * BLOCK)]
-        row = t % (BLOCK * BLOCK)
-        stride_y = grid.nodes[2]
-        stride_x = grid.nodes[1] * stride_y
-        window = (block[0] // grid.count) * grid.count
-        corner = block[0] - window
-        i = corner // stride_x + row // BLOCK
-        j = (corner // stride_y) % grid.nodes[1] + row % BLOCK
-        k = corner % stride_y
-        first = window + i * stride_x + j * stride_y + k
-        if wp.static(exact):
-            velocity_from_exact(momentum, velocity, first, scale)
-        else:
-            velocity_from_momentum(momentum, velocity, first, grid.count * scenes, block[1])
-        inside = i > grid.low[0] and i < grid.high[0] and j > grid.low[1] and j < grid.high[1]
-        inside = inside and k > grid.low[2] and k + BLOCK <= grid.high[2]
-        blocked = bool(False)  # noqa: UP018 -- a literal would be constant in Warp
-        if obstacles.shape[0] > 0:
-            middle = grid.origin + grid.dx * wp.vec3(float(i), float(j), float(k) + 1.5)
-            blocked = near_obstacles(middle, obstacles, clock[0], 2.0 * grid.dx)
-        if inside and not blocked:
-            return
-        for n in range(BLOCK):
-            u = velocity[first + n]
-            v = apply_walls(grid, wp.vec3i(i, j, k + n), wp.vec3(u[0], u[1], u[2]), friction[first + n])
-            if blocked:
-                place = grid.origin + grid.dx * wp.vec3(float(i), float(j), float(k + n))
-                v = apply_obstacles(place, v, obstacles, clock[0], grid.dx)
-            velocity[first + n] = wp.vec4(v[0], v[1], v[2], u[3])
-
-    return grid_step
+    clock: time since the start of the frame [s], for moving obstacles.
+    """
+    t = start + wp.tid()
+    block = blocks[t // (BLOCK * BLOCK)]
+    row = t % (BLOCK * BLOCK)
+    stride_y = grid.nodes[2]
+    stride_x = grid.nodes[1] * stride_y
+    window = (block[0] // grid.count) * grid.count
+    corner = block[0] - window
+    i = corner // stride_x + row // BLOCK
+    j = (corner // stride_y) % grid.nodes[1] + row % BLOCK
+    k = corner % stride_y
+    first = window + i * stride_x + j * stride_y + k
+    velocity_from_momentum(momentum, velocity, first, grid.count * scenes, block[1])
+    apply_boundaries(grid, velocity, friction, obstacles, clock[0], first, wp.vec3i(i, j, k))
 
 
 @wp.kernel(enable_backward=False)

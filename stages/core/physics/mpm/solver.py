@@ -26,10 +26,11 @@ from stages.core.kernels.mpm import grid as mpm_grid
 from stages.core.kernels.mpm.constitutive import MAX_STIFFENING, NEO_HOOKEAN
 from stages.core.kernels.mpm.transfers import KINEMATIC_MASS_FACTOR
 from stages.core.physics.colliders import Collider, as_obstacles
+from stages.core.physics.mpm.contact import BodyContact, ContactSubsteps
 from stages.core.physics.mpm.domain import MAX_NODES, Box
 from stages.core.physics.mpm.fused import FusedSubsteps
 from stages.core.physics.mpm.particle_rows import NEVER, ParticleRows
-from stages.core.physics.mpm.split import BodyContact, SplitSubsteps
+from stages.core.physics.mpm.split import SplitSubsteps
 
 SAFETY = 0.5  # fraction of a cell that a wave and a particle may cross in a substep, see substep_rate
 VISCOUS = 0.15  # maximum of dt eta / (density dx^2); violent vibration diverges from 0.3
@@ -134,9 +135,9 @@ class SolverOptions:
         exact     `fused` with sums in fixed point: a GPU then gives the same bytes in every run at about twice the
                   time, and a scene the same result in any batch (unless a surface has restitution, whose stiffness
                   follows from the stiffest material of the batch)
-        contact   `split`, and the scenes are bodies in one space, each with its own velocity field, in contact with
-                  Coulomb friction (kernels/mpm/contact.py); otherwise bodies in one scene share the velocity of a
-                  node, and stick to each other. On a GPU the sums are those of `exact`
+        contact   `split`, or on a GPU contact.py with sums in fixed point; the scenes are bodies in one space, each
+                  with its own velocity field, in contact with Coulomb friction (kernels/mpm/contact.py); otherwise
+                  bodies in one scene share the velocity of a node, and stick to each other
 
     Raises ValueError for another schedule.
     """
@@ -186,8 +187,13 @@ class Solver:
         shared = self.rows, plastic, bouncy, options.damping, self._obstacles
         quanta = self._quanta() if exact else None
         contact = self._body_contact(particles, sizes) if schedule == "contact" else None
-        self._substepper = FusedSubsteps(*shared, quanta) if fused else SplitSubsteps(*shared, contact, quanta)
-        self._substep_multiple = SUBSTEP_MULTIPLE if fused and device != "cpu" else 1
+        if fused:
+            self._substepper = FusedSubsteps(*shared, quanta)
+        elif exact:
+            self._substepper = ContactSubsteps(*shared, contact, quanta)
+        else:
+            self._substepper = SplitSubsteps(*shared, contact)
+        self._substep_multiple = SUBSTEP_MULTIPLE if device != "cpu" and (fused or exact) else 1
 
     @property
     def particles(self) -> Particles:

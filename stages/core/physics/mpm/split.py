@@ -1,25 +1,23 @@
-"""MPM substeps as two kernel launches, particles and grid: the CPU schedule, and that of bodies in contact.
+"""MPM substeps as two kernel launches, particles and grid: the CPU schedule.
 
 The particles are split into a fixed number of parts, each of which scatters into its own copy of the momentum grid; the
 grid launch adds the copies in order. Threads launch the parts side by side, and since neither the parts nor the order
-of addition depend on the number of threads, neither does the result. On a GPU there is one part, and the sums are
-reproducible if they are in fixed point.
+of addition depend on the number of threads, neither does the result.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import torch
 import warp as wp
-from jaxtyping import Float
 from torch import Tensor
 
 from stages.core.kernels.interop import launch, view
 from stages.core.kernels.mpm import split as kernels
+from stages.core.kernels.mpm.active import ActiveBlocks
 from stages.core.kernels.mpm.contact import contact_step
 from stages.core.kernels.threads import run_parallel
+from stages.core.physics.mpm.contact import BodyContact
 from stages.core.physics.mpm.particle_rows import ParticleRows
 
 CPU_PARTS = 4  # parts that the particles are split into on the CPU
@@ -27,36 +25,25 @@ LAUNCH_MULTIPLE = 32  # particle launches are padded to a multiple of a GPU warp
 MIN_SPLIT_ROWS = 20_000  # grid rows of four nodes above which the grid launch is split; a split costs about 5,000 rows
 
 
-@dataclass(frozen=True)
-class BodyContact:
-    """What contact between bodies depends on, for each body."""
-
-    full_cell: Float[Tensor, "s"]  # mass of a filled grid cell, as it is on the grid [kg]
-    friction: Float[Tensor, "s"]  # Coulomb coefficient
-
-
 class SplitSubsteps:
     """Runs the substeps of a frame for the particles in `rows`.
 
     `plastic` compiles all material models instead of neo-Hookean alone, `bouncy` the restitution of surfaces;
     `damping` as in Solver; `obstacles` are the colliders as kernels read them. With `contact` the scenes of `rows` are
-    bodies in contact with each other. `scale`: fixed-point units of momentum and mass for exact sums, see
-    core/kernels/mpm/exact.py.
+    bodies in contact with each other.
     """
 
     def __init__(
         self, rows: ParticleRows, plastic: bool, bouncy: bool, damping: float, obstacles: wp.array,
-        contact: BodyContact | None = None, scale: tuple[float, float] | None = None,
+        contact: BodyContact | None = None,
     ):  # fmt: skip
         self._contact, self._contact_commands = contact, []
         self.rows, self.grid, self.device, self.damping = rows, rows.grid, rows.device, damping
-        exact = scale is not None
-        self.parts = CPU_PARTS if self.device == "cpu" and not exact else 1
-        self._step, self._grid_step = kernels.particle_step(plastic, bouncy, exact), kernels.grid_step(exact)
-        self._obstacles, self._scale = obstacles, wp.vec2(*(scale or (0.0, 0.0)))
+        self.parts = CPU_PARTS if self.device == "cpu" else 1
+        self._step, self._obstacles = kernels.particle_step(plastic, bouncy), obstacles
         self._count = rows.scenes * self.grid.count
         self._velocity = _lazy_zeros((self._count, 4), self.device)
-        self._momentum = _lazy_zeros((self.parts * self._count * (2 if exact else 1), 4), self.device)
+        self._momentum = _lazy_zeros((self.parts * self._count, 4), self.device)
         self._friction = _lazy_zeros((self._count,), self.device)
         shape = [n // kernels.BLOCK for n in self.grid.nodes]
         self._marks = torch.zeros(rows.scenes, *shape, dtype=torch.int32, device=self.device)
@@ -91,7 +78,8 @@ class SplitSubsteps:
         return [
             self._record(self._step, -(-(stop - start) // LAUNCH_MULTIPLE) * LAUNCH_MULTIPLE,
                          [self.grid, self.rows.struct, start, stop, gather, scatter, dt, self.damping, *grids,
-                          part * self._count, view(self._stale), self._obstacles, view(self._clock), self._scale])
+                          part * self._count, view(self._stale), self._obstacles, view(self._clock), wp.vec2(),
+                          view(self._friction), ActiveBlocks()])
             for part, (start, stop) in enumerate(self._ranges(len(self.rows)))
         ]  # fmt: skip
 
@@ -109,12 +97,11 @@ class SplitSubsteps:
         launch(kernels.mark_friction, len(self.rows), [self.grid, self.rows.struct, view(self._friction)],
                device=self.device)  # fmt: skip
         inputs = [view(self._momentum, wp.vec4), view(self._velocity, wp.vec4), view(self._friction),
-                  view(self._blocks, wp.vec2i), self._obstacles, view(self._clock), self.rows.scenes,
-                  self._scale]  # fmt: skip
+                  view(self._blocks, wp.vec2i), self._obstacles, view(self._clock), self.rows.scenes]  # fmt: skip
         rows = len(at) * B * B
         ranges = self._ranges(rows) if rows > MIN_SPLIT_ROWS else [(0, rows)]
         self._grid_commands = [
-            self._record(self._grid_step, stop - start, [self.grid, start, *inputs])
+            self._record(kernels.grid_step, stop - start, [self.grid, start, *inputs])
             for start, stop in ranges if stop > start  # nothing to do when all particles are lost
         ]  # fmt: skip
         if self._contact is not None:

@@ -29,6 +29,7 @@ OVERLAP = 2.0  # discs are extended by this factor, so that they cover random po
 SURFACE = 0.75  # a node this close to a disc stops rays [cells]
 PROBE = 1.5  # distance from a disc at which the rays of a side start [cells]
 FAR = 2.0  # distance from the surface at which the rays from a node decide on its side [cells]
+FLAT = 1e-6  # height above a disc, relative to the distance from it, up to which a node is in its plane
 MIN_DIFFERENCE = 1e-6  # of the openness of the sides of a disc, of which the more open one is outside
 OPEN = 0.06  # fraction of the rays that escape from an open side, at least
 DIRECTIONS = [d for d in product((-1, 0, 1), repeat=3) if any(d)]  # of the rays, in cells
@@ -75,9 +76,9 @@ def distance_grid(points: Float[Tensor, "n 3"], sheet: float, resolution: int = 
     surface[:, :, MARGIN] = True  # what a body stands on closes it: photos do not show its lower side
     openness = _openness(surface)
     surfels = _oriented(surfels, tree, openness, low, cell, sheet)
-    values = _distance(surfels, nodes, nearest)
+    side = torch.where(openness.flatten() > OPEN, 1.0, -1.0).to(nodes)
+    values = _distance(surfels, nodes, nearest, side)
     # the side of a single disc can be wrong where walls are thin; away from the surface rays decide
-    side = torch.where(openness.flatten() > OPEN, 1.0, -1.0)
     values = torch.where(values.abs() > FAR * cell.max(), side * values.abs(), values)
     return DistanceGrid(values.reshape((resolution,) * 3).float(), (low + middle).float(), cell.float())
 
@@ -101,8 +102,7 @@ def _unoriented(points: Float[Tensor, "m 3"], tree: KDTree | BruteForce) -> Surf
     """Discs at the points, with normals of either sign."""
     distance, index = tree.query(points, min(NORMAL_NEIGHBOURS, len(points)))
     local = points[index] - points[index].mean(1, keepdim=True)
-    # on the CPU: the iterative batched solver of a GPU is less accurate, and slower for thousands of small matrices
-    _, axes = torch.linalg.eigh((local.mT @ local).cpu())
+    _, axes = torch.linalg.eigh(local.mT @ local)
     return Surfels(
         points, axes[:, :, 0].to(points), distance[:, min(4, distance.shape[1] - 1)], torch.zeros_like(distance[:, 0])
     )
@@ -163,9 +163,13 @@ def _oriented(
 
 
 def _distance(
-    surfels: Surfels, x: Float[Tensor, "g 3"], nearest: tuple[Float[Tensor, "g k"], Int[Tensor, "g k"]]
-) -> Float[Tensor, "g"]:
-    """Signed distance of positions to their nearest discs."""
+    surfels: Surfels, x: Float[Tensor, "g 3"], nearest: tuple[Float[Tensor, "g k"], Int[Tensor, "g k"]],
+    side: Float[Tensor, "g"],
+) -> Float[Tensor, "g"]:  # fmt: skip
+    """Signed distance of positions to their nearest discs.
+
+    The sign is that of the mean height above the discs; in their plane, where rounding would decide, that of `side`.
+    """
     near, index = nearest
     offset, normal = x[:, None] - surfels.centre[index], surfels.normal[index]
     height = (offset * normal).sum(-1)
@@ -173,11 +177,15 @@ def _distance(
     beyond = beside - OVERLAP * surfels.radius[index]
     sheet = surfels.half_thickness[index]
     length = torch.hypot(height, beyond.clamp_min(0))
-    distance = torch.where(sheet > 0, length - sheet, torch.copysign(length, height))
     spread = surfels.radius[index[:, :1]].square().clamp_min(1e-24)
     weight = torch.exp((near[:, :1].square() - near.square()) / spread)
     along = (normal * normal[:, :1]).sum(-1)
     weight = weight * ((sheet > 0) | (along > SAME_FACE))
+    solid = weight * (sheet == 0)
+    above = (solid * height).sum(1)
+    clear = above.abs() > FLAT * (solid * length).sum(1)
+    sign = torch.where(clear, above.sign(), side)
+    distance = torch.where(sheet > 0, length - sheet, sign[:, None] * length)
     return (weight * distance).sum(1) / weight.sum(1)
 
 

@@ -84,3 +84,11 @@ def test_exchanged_axes_exchange_the_distances(device):
     different = (values - exchanged).abs() > 1e-4  # nodes in the plane of a disc beside it: either sign
     assert different.float().mean() < 1e-4
     assert (values.abs() * different).max() < 0.1 * 0.02
+
+
+def test_rounding_changes_no_distance(device):
+    """Faces on nodes of the grid, whose planes hold nodes beside the body: their distance must not depend on noise."""
+    points = box_surface((1.0, 0.6, 0.5), 2000).double()
+    noise = 1e-12 * torch.randn(points.shape, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    one, other = (distance_grid(p.to(device), 0.02).values for p in (points, points + noise))
+    torch.testing.assert_close(one, other, rtol=0, atol=1e-6)

@@ -92,9 +92,9 @@ def test_ransac_ignores_wrong_matches_and_refuses_few():
 
 
 @pytest.mark.slow
-def test_the_published_networks_place_a_duck():
+def test_the_published_networks_place_a_duck(device):
     try:
-        matcher = load_matcher("cpu")
+        matcher = load_matcher(device)
     except InputError as absent:
         pytest.skip(str(absent))
     g = falling_toys().gaussians

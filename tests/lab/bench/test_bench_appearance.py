@@ -48,7 +48,10 @@ def photographed(count: int = 6) -> tuple[Views, torch.Tensor]:
 
 
 def test_recipe_fits_photos_and_densifies():
-    """The start of a schedule of 1,500 steps: a higher SH degree every 50 steps, densification from step 30 on."""
+    """The start of a schedule of 1,500 steps: a higher SH degree every 50 steps, densification from step 30 on.
+
+    On the CPU, since `draw` stands in for gsplat's rasteriser where there is no GPU.
+    """
     torch.manual_seed(0)
     views, points = photographed()
     colours = torch.cat([_colours(views, i, part) for i, part in enumerate(points.split(100))])

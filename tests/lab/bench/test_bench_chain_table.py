@@ -10,7 +10,7 @@ from stages.lab.bench import chain_table
 from stages.lab.bench.chain_table import ChainTableOptions
 from tests.conftest import CliRunner, two_balls_scene
 
-SMALL = ChainTableOptions(objects=(3, 6), photos=4, width=64, repeat=1, device="cpu")
+SMALL = ChainTableOptions(objects=(3, 6), photos=4, width=64, repeat=1)
 
 
 def test_the_table_has_a_row_for_each_number_of_objects_and_refinement(tmp_path, monkeypatch):
@@ -42,8 +42,8 @@ def test_photos_and_the_table_exclude_each_other(tmp_path):
 
 
 @pytest.mark.slow
-def test_three_toys_go_from_photos_to_films(tmp_path):
-    options = ChainTableOptions(objects=(3,), photos=20, width=320, quality="draft", steps=3, repeat=1, device="cpu")
+def test_three_toys_go_from_photos_to_films(tmp_path, device):
+    options = ChainTableOptions(objects=(3,), photos=20, width=320, quality="draft", steps=3, repeat=1)
     lines = list(chain_table.run(tmp_path / "table.json", options))
     runs = json.loads((tmp_path / "table.json").read_text())["runs"]
     assert [run["refine"] for run in runs] == [True, False] and len(lines) == 6

@@ -259,7 +259,10 @@ def test_the_best_value_of_each_split_and_metric_is_bold():
 
 @pytest.fixture
 def simulated(tmp_path, monkeypatch):
-    """One group of two scenes with a ball and a duck and their assets; one scene has objects far outside the domain."""
+    """One group of two scenes with a ball and a duck and their assets; one scene has objects far outside the domain.
+
+    Simulated on the CPU, whose sums are the same in every run, as are the resimulations that repeat it.
+    """
     shapes = {0: (0.2, 0.2, 0.2), 7: (0.1, 0.1, 0.3)}
     points = {i: box_shell(half, seed=i) for i, half in shapes.items()}
     things = {i: Asset(i, 1.0, p, particle_volumes(p, COARSE.dx), 1e5, 500.0) for i, p in points.items()}
@@ -269,7 +272,7 @@ def simulated(tmp_path, monkeypatch):
         (tmp_path / "set" / folder).mkdir(parents=True)
     write_scene_configs(tmp_path / "set" / "scene_configs" / "3_9.json", configs)
     options = {"dx": COARSE.dx, "spacing": COARSE.spacing, "substep": COARSE.substep, "keypoints": 60}
-    settings = SimulationSettings(COARSE, 12, 60, "cpu")  # whose sums are the same in every run
+    settings = SimulationSettings(COARSE, 12, 60, "cpu")
     made = concatenate_motions(list(simulate(configs, things, settings)))
     write_motions(tmp_path / "set" / "motions" / "3_9.h5", made, {"options": options})
     monkeypatch.setattr(dynamics_baselines, "load_assets", lambda fineness, least, kept: things)

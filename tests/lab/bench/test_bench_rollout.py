@@ -23,27 +23,29 @@ def test_scene_has_contacts():
     assert end[..., 2].min() > float(start.floor[0, 0]) - 0.1
 
 
-def test_run_on_a_cpu_has_all_rows_and_keeps_those_of_a_gpu(tmp_path, monkeypatch):
+def test_run_has_all_rows_and_keeps_those_of_another_device(tmp_path, monkeypatch, device):
     torch.manual_seed(0)
     save(tmp_path / "small.safetensors", "ngff", build("ngff", hidden=8))
     small = build("ngff-paper", hidden=8, layers=1)
     monkeypatch.setattr(bench_rollout.weights, "build", lambda name: small)
-    monkeypatch.setattr(bench_rollout.weights, "load", lambda path, device: (build("ngff", hidden=8), {"sha256": "x"}))
+    ours = build("ngff", hidden=8).to(device).eval()
+    monkeypatch.setattr(bench_rollout.weights, "load", lambda path, device: (ours, {"sha256": "x"}))
     monkeypatch.setattr(bench_rollout.bench_mpm, "measure", lambda *a: {"particles": 30, "substep_us": 2.0})
     out = tmp_path / "rollout.json"
-    out.write_text(json.dumps({"cuda": {"machine": "a large one"}}))
-    options = RolloutBenchOptions(
-        tmp_path / "small.safetensors", keypoints=10, steps=3, scenes=(1, 2), repeat=1, device="cpu"
-    )
+    out.write_text(json.dumps({"another": {"machine": "a large one"}}))
+    options = RolloutBenchOptions(tmp_path / "small.safetensors", keypoints=10, steps=3, scenes=(1, 2), repeat=1)
     lines = list(run(out, options))
     facts = json.loads(out.read_text())
-    assert facts["cuda"] == {"machine": "a large one"}
-    rows = facts["cpu"]["rows"]
-    assert [row["scenes"] for row in rows] == [1, 1, 1, 2, 2, 2] and len(lines) == 8
-    assert {row["what"] for row in rows} == {"ngff, step by step", PEER, "MPM, 30 particles"}
-    assert all(row["processor_seconds"] > 0 for row in rows if "MPM" not in row["what"])
+    assert facts["another"] == {"machine": "a large one"}
+    rows = facts[device]["rows"]
+    names = ["ngff, step by step", PEER, "MPM, 30 particles"]
+    if device == "cuda":
+        names = [names[0], "ngff, replayed", "ngff, in tf32, replayed", PEER, "ngff-paper, replayed", names[2]]
+    assert [row["what"] for row in rows] == 2 * names and len(lines) == 2 + len(rows)
+    assert [row["scenes"] for row in rows] == len(names) * [1] + len(names) * [2]
+    assert all(row["processor_seconds"] > 0 for row in rows if device == "cpu" and "MPM" not in row["what"])
     assert all(0 < row["arithmetic"] < 1 for row in rows if row["what"].startswith("ngff, "))
-    assert rows[2]["seconds"] == pytest.approx(2e-6 * 200 * 3)  # 200 substeps for each of the steps
+    assert rows[len(names) - 1]["seconds"] == pytest.approx(2e-6 * 200 * 3)  # 200 substeps for each of the steps
 
 
 def test_ratios_are_relative_to_the_published_model():

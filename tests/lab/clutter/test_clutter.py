@@ -65,7 +65,7 @@ def test_offsets_lead_to_the_middle_of_the_object(scene):
 
 
 @pytest.mark.slow
-def test_files_of_scenes_are_kept_and_trained_on(tmp_path: Path):
+def test_files_of_scenes_are_kept_and_trained_on(tmp_path: Path, device: str):
     """Photos with cameras that a reconstruction can use; observations; weights that load and label a scene."""
     options = ClutterOptions(count=1, photos=4, size=96, first=6)
     assert len(list(run(tmp_path / "photos", options))) == 1
@@ -86,11 +86,11 @@ def test_files_of_scenes_are_kept_and_trained_on(tmp_path: Path):
 
     weights = tmp_path / "w.safetensors"
     training = train_segmenter.SegmenterTraining(
-        steps=2, voxels=2000, widths=(8, 12), blocks=1, score_scenes=2, score_steps=20, device="cpu"
+        steps=2, voxels=2000, widths=(8, 12), blocks=1, score_scenes=2, score_steps=20
     )
     lines = list(train_segmenter.run([tmp_path / "noisy"], weights, training))
     assert "1 files" in lines[0]
-    ids = object_ids(truth, load_segmenter(weights))
+    ids = object_ids(truth, load_segmenter(weights, device))
     assert len(ids) == len(truth.gaussians)
 
 

@@ -127,7 +127,7 @@ def test_gradients_match_autograd_of_the_rollout(name, device):
 
 
 @pytest.mark.parametrize(("broken", "why"), [(True, "fails"), (False, "not finite")])
-def test_failed_compilation_falls_back(monkeypatch, caplog, broken, why):
+def test_failed_compilation_falls_back(monkeypatch, caplog, broken, why, device):
     """Neither a failing compiler nor one with wrong gradients stops or spoils training."""
 
     def compile(function, **_):
@@ -140,8 +140,8 @@ def test_failed_compilation_falls_back(monkeypatch, caplog, broken, why):
         return wrong
 
     torch.manual_seed(0)
-    model = build("gcn", hidden=8).eval()
-    clip = ClipSampler(without_last(falling()), "cpu", model).take(torch.tensor([0]), torch.tensor([0]), 2)
+    model = build("gcn", hidden=8).to(device).eval()
+    clip = ClipSampler(without_last(falling()), device, model).take(torch.tensor([0]), torch.tensor([0]), 2)
     with monkeypatch.context() as patch:
         patch.setattr(torch, "compile", compile)
         loss, grads = RolloutLoss(model, DT, compiled=True)(clip)

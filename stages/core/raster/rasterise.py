@@ -2,8 +2,8 @@
 
 Pixel centres at +0.5, 0.3 px^2 of blur, splats sorted by camera depth, alpha from 1/255 to 0.999, a pixel finished at
 a transmittance of 1e-4. Differentiable in means, quats, scales, opacities, sh and features, not in cameras or
-background. Images and gradients are bit-identical when repeated on the same device; on the CPU
-the rounding of gradients depends on the number of threads.
+background. Images and gradients are bit-identical when repeated on the same device, on the CPU for any number
+of threads.
 
 A CPU for which Warp has no compiler leaves the work to a GPU; images are returned on the device of the Gaussians.
 """

@@ -102,7 +102,7 @@ class _Blend(torch.autograd.Function):
     @staticmethod
     def backward(ctx, v_image):
         splats, left, ends = ctx.saved_tensors
-        grads = torch.zeros(num_threads(), len(splats), GRADIENT_CHANNELS)  # one table per thread, as in our rasteriser
+        grads = torch.zeros(num_threads(), len(splats), GRADIENT_CHANNELS)  # one table per thread
         v_image = v_image.reshape(-1, 4).contiguous()
         _launch(_backward, splats, ctx.bins, view(v_image, wp.vec4), view(left), view(ends), view(grads))
         return torch.nn.functional.pad(grads.sum(0), (0, splats.shape[1] - GRADIENT_CHANNELS)), None

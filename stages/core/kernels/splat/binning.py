@@ -59,12 +59,16 @@ for (int i = bounds.data[piece]; i < bounds.data[piece + 1]; ++i) {
 
 # Filling pass: each part appends its range to the bins.
 _FILL = r"""
-int* at = counts.data + (long)piece * bins;
+int *at = counts.data + (long)piece * bins, slot = firsts.data[piece];
 for (int i = bounds.data[piece]; i < bounds.data[piece + 1]; ++i) {
     const int id = order.data[i];
     const short* r = rects.data + 4 * (long)id;
     for (int y = r[1]; y <= r[3]; ++y)
-        for (int x = r[0]; x <= r[2]; ++x) members.data[at[y * across + x]++] = id;
+        for (int x = r[0]; x <= r[2]; ++x) {
+            const int k = at[y * across + x]++;
+            members.data[k] = id;
+            slots.data[k] = slot++;
+        }
 }
 """
 
@@ -91,7 +95,7 @@ def _count_piece(
 @wp.func_native(_FILL)
 def _fill_piece(
     piece: int, bounds: wp.array[int], order: wp.array[int], rects: wp.array[wp.int16], across: int, bins: int,
-    counts: wp.array[int], members: wp.array[int],
+    counts: wp.array[int], firsts: wp.array[int], members: wp.array[int], slots: wp.array[int],
 ): ...  # fmt: skip
 
 
@@ -106,9 +110,9 @@ def _count(
 @wp.kernel
 def _fill(
     start: int, piece: int, bounds: wp.array[int], order: wp.array[int], rects: wp.array[wp.int16], across: int,
-    bins: int, counts: wp.array[int], members: wp.array[int],
+    bins: int, counts: wp.array[int], firsts: wp.array[int], members: wp.array[int], slots: wp.array[int],
 ):  # fmt: skip
-    _fill_piece(piece, bounds, order, rects, across, bins, counts, members)
+    _fill_piece(piece, bounds, order, rects, across, bins, counts, firsts, members, slots)
 
 
 @dataclass(frozen=True)
@@ -117,6 +121,11 @@ class Bins:
 
     members: Tensor  # (m,) int32, indices of splats
     starts: Tensor  # (bins + 1,) int32, bin b holds members[starts[b]:starts[b + 1]]
+    slots: Tensor  # (m,) int32, position of each member in the list by splat: nearest splat first, its bins row by row
+    order: Tensor  # (n,) int32, the visible splats by depth; the other entries are unused
+    bounds: Tensor  # (pieces + 1,) int32, ranges of this order
+    firsts: Tensor  # (pieces,) int32, slot of the first splat of each range
+    rects: Tensor  # (n, 4) int16, first column and row and last ones of the bins of each splat
     width: int  # [px]
     height: int
     side: int = BIN_SIZE
@@ -147,12 +156,13 @@ def bin_splats(keys: Tensor, rects: Tensor, width: int, height: int, side: int =
     counts = torch.empty(pieces, bins, dtype=torch.int32)
     arguments = [view(bounds), view(order), view(rects.view(-1)), across, bins, view(counts.view(-1))]
     launch_ranges(_count, list(range(pieces + 1)), arguments)
+    firsts = (counts.sum(1).cumsum(0) - counts.sum(1)).int()
     ends = counts.T.reshape(-1).cumsum(0, dtype=torch.int32)  # bin by bin, within it piece by piece
     starts = torch.cat([ends.new_zeros(1), ends[pieces - 1 :: pieces]])
     counts.copy_((ends - counts.T.reshape(-1)).view(bins, pieces).T)
-    members = torch.empty(int(ends[-1]), dtype=torch.int32)
-    launch_ranges(_fill, list(range(pieces + 1)), [*arguments, view(members)])
-    return Bins(members, starts, width, height, side)
+    members, slots = torch.empty(2, int(ends[-1]), dtype=torch.int32)
+    launch_ranges(_fill, list(range(pieces + 1)), [*arguments, view(firsts), view(members), view(slots)])
+    return Bins(members, starts, slots, order, bounds, firsts, rects, width, height, side)
 
 
 def depth_order_reference(splats: Tensor) -> Tensor:

@@ -30,7 +30,7 @@ wp.set_module_options({"enable_backward": False})
 _FORWARD = r"""
 F T[BLOCKS], colour[BLOCKS][4];
 I stop[BLOCKS];
-TRACK(F best[BLOCKS]; I which[BLOCKS]; float* total = totals.data + (long)piece * n;)
+TRACK(F best[BLOCKS]; I which[BLOCKS];)
 unsigned long long alive = 0;
 for (int b = 0; b < BLOCKS; ++b) {
     I in = inside(b);
@@ -67,7 +67,7 @@ for (const int end = starts.data[bin + 1]; k < end && alive; ++k) {
             if (!bits(T[b] > 0)) alive &= ~(1ull << b);
         }
     }
-    TRACK(for (int l = 0; l < 16; ++l) total[id] += sum[l];)
+    TRACK(float total = 0; for (int l = 0; l < 16; ++l) total += sum[l]; totals.data[k] = total;)
 }
 ends.data[bin] = k;
 for (int b = 0; b < BLOCKS; ++b) {
@@ -109,7 +109,7 @@ def _composite_bin(
 
 @wp.kernel
 def _composite(
-    start: int, piece: int, n: int, width: int, height: int, across: int, step: int, mean: int,
+    start: int, piece: int, width: int, height: int, across: int, step: int, mean: int,
     splats: wp.array[float], members: wp.array[int], starts: wp.array[int], behind: wp.array[float],
     left: wp.array[float], stops: wp.array[int], ends: wp.array[int],
     rgb: wp.array[float], fourth: wp.array[float], alphas: wp.array[float],
@@ -120,7 +120,7 @@ def _composite(
 
 @wp.func_native(_tracked(VECTORS + BIN_BLOCKS + _FORWARD, True))
 def _dominant_bin(
-    bin: int, piece: int, n: int, width: int, height: int, across: int, step: int, mean: int, splats: wp.array[float],
+    bin: int, width: int, height: int, across: int, step: int, mean: int, splats: wp.array[float],
     members: wp.array[int], starts: wp.array[int], behind: wp.array[float], left: wp.array[float],
     stops: wp.array[int], ends: wp.array[int], rgb: wp.array[float], fourth: wp.array[float], alphas: wp.array[float],
     index: wp.array[int], totals: wp.array[float],
@@ -129,13 +129,13 @@ def _dominant_bin(
 
 @wp.kernel
 def _dominant(
-    start: int, piece: int, n: int, width: int, height: int, across: int, step: int, mean: int,
+    start: int, piece: int, width: int, height: int, across: int, step: int, mean: int,
     splats: wp.array[float], members: wp.array[int], starts: wp.array[int], behind: wp.array[float],
     left: wp.array[float], stops: wp.array[int], ends: wp.array[int],
     rgb: wp.array[float], fourth: wp.array[float], alphas: wp.array[float],
     index: wp.array[int], totals: wp.array[float],
 ):  # fmt: skip
-    _dominant_bin(start + wp.tid(), piece, n, width, height, across, step, mean, splats, members, starts, behind,
+    _dominant_bin(start + wp.tid(), width, height, across, step, mean, splats, members, starts, behind,
                   left, stops, ends, rgb, fourth, alphas, index, totals)  # fmt: skip
 
 
@@ -148,11 +148,11 @@ def _outputs(bins: Bins) -> tuple[Tensor, ...]:
 
 
 def _arguments(splats: Tensor, bins: Bins, behind: Tensor, mean: bool, *tensors: Tensor) -> list:
-    """Kernel arguments, from the number of splats on."""
+    """Kernel arguments, from the width on."""
     flat = (splats, bins.members, bins.starts, behind, *tensors)
     step = 0 if behind.dim() == 1 else 3
     views = (view(t.view(-1)) for t in flat)
-    return [len(splats), bins.width, bins.height, bins.columns, step, int(mean), *views]
+    return [bins.width, bins.height, bins.columns, step, int(mean), *views]
 
 
 class _Composite(torch.autograd.Function):
@@ -193,10 +193,11 @@ def dominant_splats(splats: Tensor, bins: Bins | Tiles) -> tuple[Tensor, Tensor]
     """The splat with the largest weight in each pixel (h, w; -1: none), and each splat's total weight (n,) [px]."""
     if splats.is_cuda:
         return compositing_cuda.dominant_splats(splats, bins)
-    bounds = bins.balanced_bounds(num_threads())
-    index, totals = torch.empty(bins.height, bins.width, dtype=torch.int32), torch.zeros(len(bounds) - 1, len(splats))
-    launch_ranges(_dominant, bounds, _arguments(splats, bins, torch.zeros(3), False, *_outputs(bins), index, totals))
-    return index.long(), totals.sum(0)
+    index = torch.empty(bins.height, bins.width, dtype=torch.int32)
+    totals = torch.zeros(len(bins.members))  # of each pair of bin and splat
+    arguments = _arguments(splats, bins, torch.zeros(3), False, *_outputs(bins), index, totals)
+    launch_ranges(_dominant, bins.balanced_bounds(4 * num_threads()), arguments)
+    return index.long(), torch.bincount(bins.members, totals, len(splats)).float()
 
 
 def composite_reference(

@@ -13,15 +13,15 @@ from stages.core.kernels.interop import view
 from stages.core.kernels.splat.binning import Bins
 from stages.core.kernels.splat.pixel_blocks import BIN_BLOCKS, MAX_ALPHA, MIN_MEAN_ALPHA
 from stages.core.kernels.splat.projection import SPLAT_SIZE
-from stages.core.kernels.splat.simd import LANE_SUMS, VECTORS, even_bounds, launch_ranges, num_threads
+from stages.core.kernels.splat.simd import LANE_SUMS, VECTORS, launch_ranges, num_threads
+from stages.core.kernels.threads import small_operations
 
 wp.set_module_options({"enable_backward": False})
 
 # dL/dalpha = T (colour . v) - S / (1 - alpha), where S is the contribution from behind: the sum of w (colour . v) over
-# the later splats, minus T_end v_alpha. Sums over pixels are accumulated as moments of d and converted to gradients of
-# centre and covariance once, after all bins.
+# the later splats, minus T_end v_alpha. Sums over the pixels of a bin are stored as moments of d, a row for each pair
+# of bin and splat; after all bins they are added up and converted to gradients of centre and covariance.
 _BACKWARD = r"""
-if (first) __builtin_memset(moments.data + (long)piece * n * 16, 0, (long)n * 64);
 F T[BLOCKS], S[BLOCKS], v[BLOCKS][4];
 I stop[BLOCKS];  // index of the splat at which a pixel finished
 int last[BLOCKS];
@@ -50,6 +50,7 @@ for (int b = 0; b < BLOCKS; ++b) {
     }
     S[b] = -v_alpha * T[b];
 }
+for (int k = ends.data[bin]; k < starts.data[bin + 1]; ++k) store(moments.data + 16 * (long)slots.data[k], none);
 for (int k = ends.data[bin] - 1; k >= begin; --k) {
     __builtin_prefetch(splats.data + 16 * (long)members.data[k - 8 > begin ? k - 8 : begin]);
     const int id = members.data[k];
@@ -87,73 +88,84 @@ for (int k = ends.data[bin] - 1; k >= begin; --k) {
         sum[10] += __builtin_elementwise_abs(s[2] * gx + s[3] * gy);
         sum[11] += __builtin_elementwise_abs(s[3] * gx + s[4] * gy);
     }
-    if (any) {
-        float* to = moments.data + ((long)piece * n + id) * 16;
-        store(to, load(to) + sums(sum));
-    }
+    store(moments.data + 16 * (long)slots.data[k], any ? sums(sum) : none);
 }
 """.replace("MAX_ALPHA", f"{MAX_ALPHA}f").replace("MIN_MEAN_ALPHA", f"{MIN_MEAN_ALPHA}f")
 
-# Sum the moments over all parts, then convert them to the gradient of the splat's row.
+# Sum the moments of each splat over its bins, which have consecutive slots, and convert them to the gradient of the
+# splat's row. The order of the sum does not depend on the number of threads.
 _GRADIENT = r"""
-F m = load(moments.data + 16 * (long)i);
-for (int p = 1; p < pieces; ++p) m += load(moments.data + 16 * ((long)p * n + i));
-const float* s = splats.data + 16 * (long)i;
-F g = m;
-g[0] = s[2] * m[0] + s[3] * m[1];
-g[1] = s[3] * m[0] + s[4] * m[1];
-g[2] = -0.5f * m[2];
-g[3] = -m[3];
-g[4] = -0.5f * m[4];
-g[5] = s[5] > 0 ? m[5] / s[5] : 0.0f;
-store(grads.data + 16 * (long)i, g);
+long slot = firsts.data[piece];
+for (int i = bounds.data[piece], end = bounds.data[piece + 1]; i < end; ++i) {
+    const int id = order.data[i], later = order.data[i + 16 < end ? i + 16 : i];
+    __builtin_prefetch(rects.data + 4 * (long)later);
+    __builtin_prefetch(splats.data + 16 * (long)later);
+    __builtin_prefetch(grads.data + 16 * (long)later, 1);
+    const short* r = rects.data + 4 * (long)id;
+    F m = (F)(0.0f);
+    for (const long last = slot + (r[2] - r[0] + 1) * (r[3] - r[1] + 1); slot < last; ++slot)
+        m += load(moments.data + 16 * slot);
+    const float* s = splats.data + 16 * (long)id;
+    F g = m;
+    g[0] = s[2] * m[0] + s[3] * m[1];
+    g[1] = s[3] * m[0] + s[4] * m[1];
+    g[2] = -0.5f * m[2];
+    g[3] = -m[3];
+    g[4] = -0.5f * m[4];
+    g[5] = s[5] > 0 ? m[5] / s[5] : 0.0f;
+    store(grads.data + 16 * (long)id, g);
+}
 """
 
 
 @wp.func_native(VECTORS + LANE_SUMS + BIN_BLOCKS + _BACKWARD)
 def _adjoint_of_bin(
-    bin: int, first: bool, piece: int, n: int, width: int, height: int, across: int, step: int, mean: int,
+    bin: int, width: int, height: int, across: int, step: int, mean: int,
     splats: wp.array[float], members: wp.array[int], starts: wp.array[int], behind: wp.array[float],
     left: wp.array[float], stops: wp.array[int], ends: wp.array[int], fourth: wp.array[float], alphas: wp.array[float],
-    v_rgb: wp.array[float], v_fourth: wp.array[float], v_alphas: wp.array[float], moments: wp.array[float],
+    v_rgb: wp.array[float], v_fourth: wp.array[float], v_alphas: wp.array[float],
+    slots: wp.array[int], moments: wp.array[float],
 ): ...  # fmt: skip
 
 
 @wp.kernel
 def _composite_adjoint(
-    start: int, piece: int, n: int, width: int, height: int, across: int, step: int, mean: int,
+    start: int, piece: int, width: int, height: int, across: int, step: int, mean: int,
     splats: wp.array[float], members: wp.array[int], starts: wp.array[int], behind: wp.array[float],
     left: wp.array[float], stops: wp.array[int], ends: wp.array[int], fourth: wp.array[float], alphas: wp.array[float],
-    v_rgb: wp.array[float], v_fourth: wp.array[float], v_alphas: wp.array[float], moments: wp.array[float],
+    v_rgb: wp.array[float], v_fourth: wp.array[float], v_alphas: wp.array[float],
+    slots: wp.array[int], moments: wp.array[float],
 ):  # fmt: skip
-    _adjoint_of_bin(start + wp.tid(), wp.tid() == 0, piece, n, width, height, across, step, mean, splats, members,
-                    starts, behind, left, stops, ends, fourth, alphas, v_rgb, v_fourth, v_alphas, moments)  # fmt: skip
+    _adjoint_of_bin(start + wp.tid(), width, height, across, step, mean, splats, members, starts, behind,
+                    left, stops, ends, fourth, alphas, v_rgb, v_fourth, v_alphas, slots, moments)  # fmt: skip
 
 
 @wp.func_native(VECTORS + _GRADIENT)
-def _gradient_row(
-    i: int, n: int, pieces: int, splats: wp.array[float], moments: wp.array[float], grads: wp.array[float]
-): ...
+def _gradient_rows(
+    piece: int, bounds: wp.array[int], firsts: wp.array[int], order: wp.array[int], rects: wp.array[wp.int16],
+    splats: wp.array[float], moments: wp.array[float], grads: wp.array[float],
+): ...  # fmt: skip
 
 
 @wp.kernel
 def _gradients(
-    start: int, piece: int, n: int, pieces: int, splats: wp.array[float], moments: wp.array[float],
-    grads: wp.array[float],
+    start: int, piece: int, bounds: wp.array[int], firsts: wp.array[int], order: wp.array[int],
+    rects: wp.array[wp.int16], splats: wp.array[float], moments: wp.array[float], grads: wp.array[float],
 ):  # fmt: skip
-    _gradient_row(start + wp.tid(), n, pieces, splats, moments, grads)
+    _gradient_rows(piece, bounds, firsts, order, rects, splats, moments, grads)
 
 
 def composite_adjoint(splats: Tensor, bins: Bins, ends: Tensor, arguments: list) -> Tensor:
     """Gradient (n, 16) of the splats.
 
     `ends` (bins,): index of the member at which each bin's forward pass stopped. `arguments`: of the kernel, from the
-    number of splats on: those of the forward pass, its saved state, and the upstream gradients.
+    width on: those of the forward pass, its saved state, and the upstream gradients.
     """
-    n = len(splats)
-    bounds = bins.balanced_bounds(num_threads(), ends - bins.starts[:-1])
-    moments, grads = torch.empty(len(bounds) - 1, n, SPLAT_SIZE), torch.empty(n, SPLAT_SIZE)
-    launch_ranges(_composite_adjoint, bounds, [*arguments, view(moments.view(-1))])
-    flat = [view(t.view(-1)) for t in (splats, moments, grads)]
-    launch_ranges(_gradients, even_bounds(n, num_threads()), [n, len(moments), *flat])
+    bounds = bins.balanced_bounds(4 * num_threads(), ends - bins.starts[:-1])
+    moments = torch.empty(len(bins.members), SPLAT_SIZE)
+    with small_operations():  # waking a second thread takes longer than writing zeros
+        grads = torch.zeros(len(splats), SPLAT_SIZE)
+    launch_ranges(_composite_adjoint, bounds, [*arguments, view(bins.slots), view(moments.view(-1))])
+    flat = [view(t.view(-1)) for t in (bins.bounds, bins.firsts, bins.order, bins.rects, splats, moments, grads)]
+    launch_ranges(_gradients, list(range(len(bins.bounds))), flat)
     return grads

@@ -17,7 +17,7 @@ from stages.core.kernels.interop import launch
 from stages.core.kernels.threads import run_parallel
 
 LANES = 16
-MAX_THREADS = 8  # each thread needs a gradient buffer of its own
+MAX_THREADS = 8  # more have not been measured
 
 VECTORS = r"""
 typedef float F __attribute__((ext_vector_type(16)));
@@ -98,10 +98,7 @@ def _load(kernel: wp.Kernel) -> None:
 
 
 def num_threads() -> int:
-    """Number of parts that work is split into: torch's threads, at most MAX_THREADS.
-
-    Where sums over parts are taken, their order is fixed by this number and not by timing.
-    """
+    """Number of parts that work is split into: torch's threads, at most MAX_THREADS. Results do not depend on it."""
     return max(1, min(torch.get_num_threads(), MAX_THREADS))
 
 

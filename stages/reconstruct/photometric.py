@@ -25,6 +25,7 @@ from stages.core.kernels.splat.photometric_loss import LossTerms, photometric_lo
 from stages.core.kernels.splat.projection import pack_camera
 from stages.core.kernels.splat.ssim import ssim
 from stages.core.kernels.splat.tiles import Capacity
+from stages.core.kernels.threads import small_operations
 from stages.core.raster.rasterise import NEAR, count_pairs, rasterise, rasterise_packed
 from stages.core.scene.cameras import Cameras
 from stages.core.scene.gaussians import Gaussians
@@ -101,7 +102,9 @@ class _Fit:
         v = self.values
         sh = torch.cat([v["base"], v["rest"]], 1) if "rest" in v else v["base"]
         ids = torch.zeros(len(sh), dtype=torch.int64, device=sh.device)
-        return Gaussians(v["means"], v["quats"], v["scales"].exp(), v["opacities"].sigmoid(), sh, ids)
+        with small_operations():  # the last elements of each thread's part are rounded differently by these functions
+            scales, opacities = v["scales"].exp(), v["opacities"].sigmoid()
+        return Gaussians(v["means"], v["quats"], scales, opacities, sh, ids)
 
     def descend(self, grads: dict[str, Tensor], means_rate: Float[Tensor, "1"]) -> None:
         """One step of Adam."""
@@ -181,9 +184,11 @@ def fit_gaussians(
                 schedule.append((order.pop(), float(torch.rand((), generator=generator)), rates[step]))
             kind(fit, targets, schedule).run(bar)
             if last in splits:
-                _split(fit, generator)
+                with small_operations():  # as in `_Fit.gaussians`
+                    _split(fit, generator)
             first = last + 1
-    return _prune(fit, views, fit.gradients > 0)
+    with small_operations():
+        return _prune(fit, views, fit.gradients > 0)
 
 
 def _exposure_projection(cameras: Cameras) -> Float[Tensor, "c c"]:

@@ -36,14 +36,35 @@ def test_wrong_colours_are_corrected(target, device):
     assert after > before + 6
 
 
-def test_the_same_seed_gives_the_same_gaussians(target, device):
-    """Bit for bit, with two splits."""
+@pytest.fixture
+def with_threads():
+    """Calls a function with a number of threads of PyTorch."""
+    before = torch.get_num_threads()
+
+    def call(threads, function, *arguments):
+        torch.set_num_threads(threads)
+        return function(*arguments)
+
+    yield call
+    torch.set_num_threads(before)
+
+
+def test_the_same_seed_gives_the_same_gaussians(target, device, with_threads):
+    """Bit for bit, with two splits, and with any number of threads."""
     true, views = target
     options = FitOptions(photometric.DENSITY.min_iterations, 2.0, seed=3, device=device)
-    first, second = (photometric.fit_gaussians(true[:200], views, options) for _ in range(2))
+    first, second = (with_threads(n, photometric.fit_gaussians, true[:200], views, options) for n in (1, 2))
     assert len(first) > 200
     for name in ("means", "quats", "scales", "opacities", "sh"):
         assert torch.equal(getattr(first, name), getattr(second, name)), name
+
+
+def test_activations_do_not_depend_on_the_number_of_threads(with_threads):
+    """PyTorch splits tensors of more than 32,768 numbers among its threads."""
+    fit = photometric._Fit.start(random_gaussians(70_013), 3, 2.0)
+    first, *others = (with_threads(n, fit.gaussians) for n in (1, 2, 3, 4))
+    for other in others:
+        assert torch.equal(first.scales, other.scales) and torch.equal(first.opacities, other.opacities)
 
 
 @pytest.mark.gpu

@@ -18,7 +18,7 @@ from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
 from stages.core.backends import pick_device
 from stages.core.errors import InputError
-from stages.core.models.segmenter.network import OFFSET_UNIT, Prediction, Segmenter, pyramid
+from stages.core.models.segmenter.network import OFFSET_UNIT, SCORES, Prediction, Segmenter, pyramid
 from stages.core.models.segmenter.segment import load_segmenter
 from stages.core.models.segmenter.voxels import VOXEL, unique_cells
 from stages.core.scene.files import replacing, sha256
@@ -111,12 +111,13 @@ class Crops(IterableDataset):
 def run(folders: Sequence[Path], out: Path, options: SegmenterTraining, start: Path | None = None) -> Iterator[str]:
     """Train on the scenes of `folders`, write OUT (.safetensors) and its card; yields a line per REPORT_STEPS steps.
 
-    `start`: weights to continue from, with the widths and blocks of their card. Under `torchrun` every process draws
+    `start`: weights to continue from, with the widths and blocks of their card; scores of candidates by other features
+    than today's begin anew. Under `torchrun` every process draws
     its own crops, and the gradients are averaged.
     """
     torch.manual_seed(options.seed)
     files = find_examples(folders)
-    model = Segmenter(options.widths, options.blocks) if start is None else load_segmenter(start)
+    model = Segmenter(options.widths, options.blocks) if start is None else load_segmenter(start, new_scores=True)
     curve: list[dict] = []
     with process_group(pick_device(options.device)) as group:
         model = model.to(group.device).train()
@@ -135,7 +136,7 @@ def _train(
     model: Segmenter, files: Sequence[Path], options: SegmenterTraining, group: ProcessGroup, curve: list[dict]
 ) -> Iterator[str]:
     """Train in place; appends to `curve` and yields a line every REPORT_STEPS steps."""
-    trained = [p for name, p in model.named_parameters() if not name.startswith("candidate.")]
+    trained = [p for name, p in model.named_parameters() if not name.startswith(SCORES)]
     optimiser = torch.optim.AdamW(trained, options.rate, weight_decay=0.01)
     dataset = Crops(files, options.voxels, options.batch, options.seed, group.rank)
     crops = iter(DataLoader(dataset, batch_size=None, num_workers=options.workers))

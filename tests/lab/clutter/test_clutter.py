@@ -7,8 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import load_file, save_file
 
+from stages.core.errors import InputError
+from stages.core.models.segmenter.network import CANDIDATE_FEATURES, SCORES
 from stages.core.models.segmenter.segment import load_segmenter, object_ids
+from stages.core.scene.files import sha256
 from stages.core.scene.scene_ply import read_scene
 from stages.lab.clutter.composites import make_composite
 from stages.lab.clutter.examples import read_example
@@ -92,6 +96,27 @@ def test_files_of_scenes_are_kept_and_trained_on(tmp_path: Path, device: str):
     assert "1 files" in lines[0]
     ids = object_ids(truth, load_segmenter(weights, device))
     assert len(ids) == len(truth.gaussians)
+
+    old = _with_fewer_score_features(weights, tmp_path / "old.safetensors")
+    with pytest.raises(InputError, match="does not fit the segmentation network"):
+        load_segmenter(old)
+    again = tmp_path / "again.safetensors"
+    list(train_segmenter.run([tmp_path / "noisy"], again, replace(training, minutes=0), start=old))
+    before, after = load_file(old), load_file(again)
+    network = [name for name in before if not name.startswith(SCORES)]
+    assert len(network) > 10 and all(before[name].equal(after[name]) for name in network)
+    assert len(load_segmenter(again).feature_mean) == CANDIDATE_FEATURES
+
+
+def _with_fewer_score_features(weights: Path, out: Path) -> Path:
+    """A copy of weights whose scores of candidates take ten features."""
+    state = load_file(weights)
+    for name in ("feature_mean", "feature_scale", "candidate_head.0.weight"):
+        state[name] = state[name][..., :10].contiguous()
+    save_file(state, out)
+    card = json.loads(weights.with_suffix(".json").read_text())
+    out.with_suffix(".json").write_text(json.dumps({**card, "sha256": sha256(out)}))
+    return out
 
 
 def test_objects_of_several_parts_rest_in_each_others_concavities():

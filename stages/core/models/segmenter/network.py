@@ -20,6 +20,7 @@ CLASSES = ("surface", "object", "clutter")
 OFFSET_UNIT = 0.1  # of predicted offsets [camera distance]
 PAIR_FEATURES = 24  # of the embedding
 CANDIDATE_FEATURES = 33  # of a candidate object, see candidates.py
+SCORES = ("feature_", "candidate_head.")  # how the names of the weights of the scores of candidates begin
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from torch import Tensor
 from stages.core.errors import InputError
 from stages.core.models.checkpoints import MAX_CONFIG, read_card, read_state, unfit
 from stages.core.models.segmenter.candidates import MIN_VOXELS, Candidates, find_candidates
-from stages.core.models.segmenter.network import Segmenter, pyramid
+from stages.core.models.segmenter.network import SCORES, Segmenter, pyramid
 from stages.core.models.segmenter.outlines import cut_outlines
 from stages.core.models.segmenter.surfels import scene_surfels
 from stages.core.models.segmenter.voxels import SCALES, ScenePoints, VoxelGrid, voxelise
@@ -56,9 +56,10 @@ def find(given: Path | None = None) -> Path:
     return found
 
 
-def load_segmenter(path: Path, device: torch.device | str = "cpu") -> Segmenter:
+def load_segmenter(path: Path, device: torch.device | str = "cpu", new_scores: bool = False) -> Segmenter:
     """The network with its trained weights, in single precision.
 
+    `new_scores`: where the scores of candidates are of other features than today's they are begun anew, for training.
     Raises InputError for weights that are missing, damaged or do not fit their card.
     """
     must_exist(path, "weights (.safetensors) such as `ngff-lab train-segmenter` writes")
@@ -70,6 +71,9 @@ def load_segmenter(path: Path, device: torch.device | str = "cpu") -> Segmenter:
         if blocks * sum(w * w for w in widths) > sum(v.numel() for v in state.values()):  # before it takes memory
             raise ValueError("the card is of a larger network")
         model = Segmenter(widths, blocks)
+        own = {name: value for name, value in model.state_dict().items() if name.startswith(SCORES)}
+        if new_scores and any(name not in state or state[name].shape != own[name].shape for name in own):
+            state = {name: value for name, value in state.items() if not name.startswith(SCORES)} | own
         model.load_state_dict(state)
     except (KeyError, IndexError, TypeError, ValueError, RuntimeError) as error:
         raise unfit(path, "the segmentation network of its card", error) from error

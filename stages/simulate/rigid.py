@@ -7,6 +7,9 @@ A contact is a damped spring. Its damping ratio is half the loss factor of the m
 a stiff body on a soft one rebounds as the soft one does. Below REST_SPEED it is critically damped, since stacks that
 rebound at any speed never come to rest. The frequency is the highest that the substep resolves, so that resting bodies
 sink in by less than 1e-3 of the smallest object. The friction of a pair is the larger coefficient, as in the others.
+Friction aims at no slip at the end of a substep. A larger deceleration than Coulomb friction can give would lift a
+sliding body, as MuJoCo's friction cones couple slip to the normal, and with the smaller one that follows from the
+materials' damping friction would be viscous: bodies would creep on slopes, and keep their slip in collisions.
 Source: Todorov, Erez and Tassa 2012, "MuJoCo: a physics engine for model-based control"; restitution of a damped
 spring: Schwager and Poeschel 2007, "Coefficient of restitution and linear-dashpot model revisited".
 
@@ -46,6 +49,9 @@ CONTACT_SUBSTEPS = 12  # substeps during which bodies that collide touch
 REST_SPEED = 0.1  # normal speed below which contacts do not rebound [units]; a fall of 0.5 % of the smallest object
 PARTS_DAMPING = 0.4  # least damping ratio of bodies of several parts, of which contacts come and go during a collision
 IMPEDANCE = 0.99  # of a contact: 1 would be exact, but the forces between several contacts undetermined
+SLIP_LEVER = (
+    5  # a force accelerates the slip of a contact at most this much more than along its normal: 4 at a rod's end
+)
 MAX_SUBSTEPS = 5_000  # in a frame
 MAX_TRAVEL = 0.05  # of the smallest object's size in a substep, so that nothing passes through it
 ON_FLOOR = 0.02  # gap up to which a body stands on the floor [units]
@@ -279,18 +285,14 @@ class _World:
             self._step()
 
     def _step(self) -> None:
-        """A substep: mj_step with the damping of slow contacts added to their reference acceleration."""
+        """A substep: mj_step with other reference accelerations of contacts."""
         mujoco, model, data = self._mujoco, self.model, self.data
         mujoco.mj_fwdPosition(model, data)
         if data.ncon:
             self._overlaps.subtract(data, self._resting.fixed)
         mujoco.mj_fwdVelocity(model, data)
         if data.ncon:
-            normal = data.contact.efc_address
-            normal = normal[normal >= 0]
-            speed = data.efc_vel[normal]
-            missing = np.maximum(2 * self._omega - data.efc_KBIP[normal, 1], 0)
-            data.efc_aref[normal] -= missing * np.maximum(1 - np.abs(speed) / REST_SPEED, 0) * speed
+            self._set_references()
         mujoco.mj_fwdActuation(model, data)
         mujoco.mj_fwdAcceleration(model, data)
         mujoco.mj_fwdConstraint(model, data)
@@ -300,6 +302,20 @@ class _World:
         for k, pose in self._held.items():
             data.qpos[FREE * k : FREE * (k + 1)] = pose
             data.qvel[FALLING * k : FALLING * (k + 1)] = 0
+
+    def _set_references(self) -> None:
+        """Damp slow contacts critically, and let friction stop slip within a substep, by at most what it can."""
+        data = self.data
+        active = data.contact.efc_address >= 0
+        normal = data.contact.efc_address[active]
+        speed = data.efc_vel[normal]
+        missing = np.maximum(2 * self._omega - data.efc_KBIP[normal, 1], 0)
+        data.efc_aref[normal] -= missing * np.maximum(1 - np.abs(speed) / REST_SPEED, 0) * speed
+        along = normal[:, None] + [1, 2]
+        slip = data.efc_vel[along]
+        most = 1 + SLIP_LEVER * data.contact.friction[active, 0] * np.maximum(data.efc_aref[normal], 0)
+        rate = np.minimum(1 / self.model.opt.timestep, most / np.linalg.norm(slip, axis=1).clip(1e-12))
+        data.efc_aref[along] = -slip * rate[:, None]
 
     def _apply_forces(self, acting: list, time: float, step: float) -> None:
         """Set the mean force and torque on each body during a substep."""

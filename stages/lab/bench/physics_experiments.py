@@ -77,7 +77,8 @@ class Experiment:
 
 def experiments() -> dict[str, Experiment]:
     """All experiments by name."""
-    groups = (_slides, _slopes, _falls, _torques, _towers, _invariance, _collisions, _rebounds, _stacks, _piles, _boxes)
+    groups = (_slides, _slopes, _creep, _falls, _torques, _towers, _invariance, _collisions, _rebounds, _bounces,
+              _stacks, _piles, _boxes)  # fmt: skip
     return {e.name: e for group in groups for e in group()}
 
 
@@ -102,6 +103,13 @@ def tilted(surface: Surface, degrees: float) -> Surface:
     a = math.radians(degrees)
     R = torch.tensor([[math.cos(a), 0.0, math.sin(a)], [0.0, 1.0, 0.0], [-math.sin(a), 0.0, math.cos(a)]])
     return Surface(surface.points @ R.mT, surface.normals @ R.mT)
+
+
+def on_slope(degrees: float, loss: float, options: Mapping) -> Run:
+    """A box of .2 x .2 x .1 m on a pinned slope of 2 m."""
+    ramp = tilted(box((2.0, 0.6, 0.2), 0.025).moved((0, 0, -0.1)), degrees).moved((0, 0, 1.2))
+    slider = tilted(box((0.2, 0.2, 0.1), 0.008).moved((-0.5, 0, 0.05)), degrees).moved((0, 0, 1.2))
+    return Run((Specimen(ramp, loss=loss), Specimen(slider, loss=loss)), {"pin": ("1",), **options})
 
 
 def bowl(inner: float, outer: float) -> Surface:
@@ -176,17 +184,28 @@ def _slides() -> Iterator[Experiment]:
         yield Experiment(f"slide/friction={mu:g}", (run,), lambda t: float(path(t, 0)[-1, 0]), value,
                          "distance from 2 m/s in 2 s [m]", value, SLIDES)  # fmt: skip
 
+    body = replace(block((0.3, 0.3, 0.15), (0, 0, 0.075)), loss=0.01)
+    run = Run((body,), {"velocity": ("object=1 .3,0,0",), "friction": 0.1})  # the speed of a fall of 5 mm
+    value = 0.09 / (2 * 0.1 * G)
+    yield Experiment("slide/slow friction=0.1", (run,), lambda t: float(path(t, 0)[-1, 0]), value,
+                     "distance from .3 m/s [m]", value, SLIDES)  # fmt: skip
+
 
 def _slopes() -> Iterator[Experiment]:
     for degrees, mu in product((10, 25, 40), (0.0, 0.3, 0.8)):
         a, time = math.radians(degrees), 30 * 0.02
         pull = G * max(math.sin(a) - mu * math.cos(a), 0.0)
-        ramp = tilted(box((2.0, 0.6, 0.2), 0.025).moved((0, 0, -0.1)), degrees).moved((0, 0, 1.2))
-        slider = tilted(box((0.2, 0.2, 0.1), 0.008).moved((-0.5, 0, 0.05)), degrees).moved((0, 0, 1.2))
-        options = {"pin": ("1",), "friction": mu, "steps": 31}
-        yield Experiment(f"slope/{degrees}deg friction={mu:g}", (Run((Specimen(ramp), Specimen(slider)), options),),
-                         lambda t: float(path(t, 1)[-1].norm()), pull * time**2 / 2, "distance in .6 s [m]",
-                         G * math.sin(a) * time**2 / 2, SLIDES)  # fmt: skip
+        run = on_slope(degrees, 0.15, {"friction": mu, "steps": 31})
+        yield Experiment(f"slope/{degrees}deg friction={mu:g}", (run,), lambda t: float(path(t, 1)[-1].norm()),
+                         pull * time**2 / 2, "distance in .6 s [m]", G * math.sin(a) * time**2 / 2, SLIDES)  # fmt: skip
+
+
+def _creep() -> Iterator[Experiment]:
+    for loss in (0.02, 0.15):
+        run = on_slope(15, loss, {"friction": 0.3, "steps": 501})  # tan 15 degrees is .268
+        yield Experiment(f"creep/15deg friction=0.3 loss={loss:g}", (run,),
+                         lambda t: 1e4 * float((t.com[-1, 1] - t.com[25, 1]).norm()) / 0.2, 0.0,
+                         "distance from .5 to 10 s [1e-4 sides]", 1.0, dict.fromkeys(TOLERANCES, 1.0))  # fmt: skip
 
 
 def _falls() -> Iterator[Experiment]:
@@ -260,6 +279,17 @@ def _rebounds() -> Iterator[Experiment]:
         run = Run((replace(body, loss=loss),), {"lift": ("0.5",), "dt": 0.01, "steps": 100})
         yield Experiment(f"rebound/{name} loss={loss:g}", (run,), lambda t: rebound(t, 0.5),
                          math.exp(-math.pi * loss / 2), "restitution", 1.0, TOLERANCES)  # fmt: skip
+
+
+def _bounces() -> Iterator[Experiment]:
+    """A ball that falls .5 m while it flies sideways: friction takes mu (1 + e) of its normal speed, until it rolls."""
+    for loss, mu in product((0.02, 0.15), (0.1, 0.5)):
+        body = replace(ball(0.15, (0, 0, 0.15)), loss=loss)
+        run = Run((body,), {"lift": ("0.5",), "velocity": ("object=1 3,0,0",), "friction": mu, "dt": 0.01, "steps": 61})
+        lost = mu * (1 + math.exp(-math.pi * loss / 2)) * math.sqrt(2 * G * 0.5)
+        yield Experiment(f"bounce/friction={mu:g} loss={loss:g}", (run,),
+                         lambda t: float(path(t, 0)[-1, 0] - path(t, 0)[-11, 0]) / (10 * t.info.dt),
+                         max(3 - lost, 15 / 7), "horizontal speed, 3 before [m/s]", 3.0, TOLERANCES)  # fmt: skip
 
 
 def _stacks() -> Iterator[Experiment]:

@@ -22,9 +22,13 @@ from stages.core.physics.solid_surface import solid_surface
 from stages.core.scene.cached import cached_in_scene
 from stages.core.scene.scene import Scene
 
+FACING = 0.5  # least cosine between the normal of a surface and that of the face of a hull over it
 CONVEX = 0.9  # fraction of its hull that a convex object fills: voxels are accurate to about 5 %
 MAX_VERTICES = 200  # of a part: a ball is round to 1 %
 CORNERS = np.stack(np.meshgrid(*[[-0.5, 0.5]] * 3), -1).reshape(-1, 3)
+
+
+Moments = tuple[float, Float[Tensor, "3"], Float[Tensor, "3 3"]]  # volume, centre, inertia about it at density 1
 
 
 @dataclass(frozen=True)
@@ -32,9 +36,12 @@ class Solid:
     """The filled body of an object."""
 
     voxels: np.ndarray  # (m, 3), centres
+    depth: np.ndarray  # (m,), below the surface
     h: float  # edge of a voxel
     surface: np.ndarray  # (n, 3), points on it
+    normals: np.ndarray  # (n, 3), outwards
     seen: np.ndarray  # (k, 3), centres of its Gaussians
+    moments: Moments
 
 
 @dataclass(frozen=True)
@@ -62,9 +69,13 @@ def convex_parts(scene: Scene, seed: int = 0, bottom: float = -np.inf) -> list[C
 
 def _solid(scene: Scene, object_id: int, seed: int, bottom: float) -> Solid:
     body = solid_surface(scene, object_id, seed)
-    voxels = body.voxels[body.voxels[:, 2] > min(bottom, float(body.voxels[:, 2].max()) - body.h)]
+    voxels, depth, inside = body.body_voxels()
+    kept = voxels[:, 2] > min(bottom, float(voxels[inside, 2].max()) - body.h)
+    inside = inside[kept]
     seen, surface = (np.column_stack([p[:, :2], p[:, 2].clip(min=bottom)]) for p in (body.seen, body.points))
-    return Solid(voxels, body.h, surface, seen if len(seen) else voxels)
+    voxels, depth = voxels[kept], depth[kept]
+    moments = _voxel_moments(voxels, (depth / body.h + 0.5).clip(0, 1), body.h)
+    return Solid(voxels[inside], depth[inside], body.h, surface, body.normals, seen if len(seen) else voxels, moments)
 
 
 def _around(solids: list[Solid], row: int) -> np.ndarray:
@@ -77,18 +88,21 @@ def _around(solids: list[Solid], row: int) -> np.ndarray:
 
 
 def _parts(solid: Solid, others: np.ndarray, seed: int) -> ConvexParts:
-    volume = len(solid.voxels) * solid.h**3
     whole = _hull(solid.seen)
-    if whole is not None and whole.volume * CONVEX < volume:
-        volume, com, inertia = _solid_moments(whole)
-        return ConvexParts((_vertices(whole, seed),), volume, com, inertia)
+    if whole is not None and whole.volume * CONVEX < solid.moments[0]:
+        return ConvexParts((_vertices(whole, seed),), *_solid_moments(whole))
     hulls = _hulls(solid, divide(solid.voxels / solid.h, others / solid.h))
-    x = torch.from_numpy(solid.voxels)
-    com = x.mean(0)
+    return ConvexParts(tuple(_vertices(hull, seed) for hull in hulls), *solid.moments)
+
+
+def _voxel_moments(voxels: np.ndarray, share: np.ndarray, h: float) -> Moments:
+    """Those of voxels (m, 3) of edge h of which a share (m,) is filled."""
+    x, w = torch.from_numpy(voxels), torch.from_numpy(share / share.sum())
+    com = w @ x
     r = x - com
-    eye = torch.eye(3, dtype=torch.float64)
-    inertia = volume * ((r.square().sum(1).mean() + solid.h**2 / 6) * eye - r.mT @ r / len(r))
-    return ConvexParts(tuple(_vertices(hull, seed) for hull in hulls), volume, com.float(), inertia.float())
+    volume = float(share.sum()) * h**3
+    second = (w[:, None] * r).mT @ r + h**2 / 12 * torch.eye(3, dtype=torch.float64)
+    return volume, com.float(), (volume * (second.trace() * torch.eye(3, dtype=torch.float64) - second)).float()
 
 
 def _hull(points: np.ndarray) -> ConvexHull | None:
@@ -105,7 +119,7 @@ def _vertices(hull: ConvexHull, seed: int) -> Float[Tensor, "v 3"]:
     return corners[farthest_points(corners, MAX_VERTICES, seed)]
 
 
-def _solid_moments(hull: ConvexHull) -> tuple[float, Float[Tensor, "3"], Float[Tensor, "3 3"]]:
+def _solid_moments(hull: ConvexHull) -> Moments:
     """Volume, centre of mass and inertia about it of a hull, by the tetrahedra from its middle to its triangles."""
     middle = hull.points[hull.vertices].mean(0)
     t = hull.points[hull.simplices] - middle  # (m, 3, 3): corners of each triangle
@@ -124,15 +138,19 @@ def _hulls(solid: Solid, part: np.ndarray) -> list[ConvexHull]:
     """The hull of each part: of the points of the surface at its voxels, and of its voxels that are away from these."""
     voxels, h, surface = solid.voxels, solid.h, solid.surface
     of = np.append(part, -1)[cKDTree(voxels).query(surface, 8, distance_upper_bound=h)[1]]
-    inner = cKDTree(surface).query(voxels, distance_upper_bound=h)[0] == np.inf
+    bare = cKDTree(surface).query(voxels, distance_upper_bound=h)[0] == np.inf
+    deep = solid.depth > h * 3**0.5 / 2  # corners of the voxel are inside
     hulls = []
     for k in range(part.max() + 1):
-        own = surface[(of == k).any(1)]
-        hull = _hull(_extreme(np.concatenate([own, voxels[inner & (part == k)]])))
+        near = (of == k).any(1)
+        own = surface[near]
+        mine = part == k
+        inner = _corners(voxels[deep & mine], h), voxels[bare & mine]
+        hull = _hull(_extreme(np.concatenate([own, *inner])))
         if hull is None:
             hulls.append(ConvexHull(_corners(voxels[part == k], h)))
         else:
-            hulls.append(_balanced(hull, own, h) if len(own) else hull)
+            hulls.append(_balanced(hull, own, solid.normals[near], h) if len(own) else hull)
     return hulls
 
 
@@ -141,16 +159,18 @@ def _extreme(points: np.ndarray) -> np.ndarray:
     return points[np.unique((points @ EXTREMES.T).argmax(0))] if len(points) > len(EXTREMES) else points
 
 
-def _balanced(hull: ConvexHull, surface: np.ndarray, h: float) -> ConvexHull:
+def _balanced(hull: ConvexHull, surface: np.ndarray, normals: np.ndarray, h: float) -> ConvexHull:
     """The hull with each face moved inwards to the mean depth of the surface under it, by at most h.
 
     A convex part bridges the hollows of a surface. So it is as often above as below it, and its squared error is least.
     """
     normal, offset = hull.equations[:, :3], hull.equations[:, 3]
     depth = -(surface @ normal.T + offset)
-    face = depth.argmin(1)
+    depth[normals @ normal.T < FACING] = np.inf
+    face, depth = depth.argmin(1), depth.min(1)
+    face, depth = face[depth < np.inf], depth[depth < np.inf]
     count = np.bincount(face, minlength=len(normal))
-    shift = np.bincount(face, depth.min(1), len(normal)) / count.clip(1)
+    shift = np.bincount(face, depth, len(normal)) / count.clip(1)
     shift = shift.clip(0, h)
     # each vertex moves so that its faces do: least squares, weighted by their area
     t = hull.points[hull.simplices]

@@ -19,6 +19,7 @@ VOXELS_ALONG = 48  # voxels along the longest side of an object
 BARE = 3.0  # distance to the samples beyond which faces of voxels are added [voxels], which are a third of the spacing
 NEAREST = 8  # samples that give a distance, of which those count
 SAME_FACE = 0.8  # whose normals have at least this cosine to that of the nearest one
+AROUND = np.ones((3, 3, 3), bool)
 STEPS = np.concatenate([np.eye(3, dtype=np.int64), -np.eye(3, dtype=np.int64)])
 
 
@@ -32,6 +33,7 @@ class SolidSurface:
         self._low = cells.min(0) - 2
         full = np.zeros(cells.max(0) - self._low + 3, bool)
         full[tuple((cells - self._low).T)] = True
+        self._full = full
         inside, outside = (ndimage.distance_transform_edt(part) - 0.5 for part in (full, ~full))
         self._depth = h * np.where(full, inside, -outside)  # to the faces of the voxels
         near = points[np.abs(self._coarse_depth(points)) <= h]
@@ -61,6 +63,19 @@ class SolidSurface:
             known = distance[:, 0] < 2 * self.h
             out[close[known]] = fine[known].clip(out[close[known]] - self.h, out[close[known]] + self.h)
         return out
+
+    def body_voxels(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Centres (m, 3) of the voxels in and around the body, their depths (m,), and which (m,) make up the body.
+
+        Those are the ones inside, and in sheets thinner than a voxel those of the coarse body.
+        """
+        near = ndimage.binary_dilation(self._full, AROUND)
+        x = (np.argwhere(near) + self._low + 0.5) * self.h
+        depth = self.depth(x)
+        inside = np.zeros_like(near)
+        inside[near] = depth >= 0
+        inside |= self._full & ~ndimage.binary_dilation(inside, AROUND)
+        return x, depth, inside[near]
 
     def _coarse_depth(self, x: np.ndarray) -> np.ndarray:
         return self._at(self._depth, x)

@@ -46,7 +46,7 @@ def test_measured_rows_are_kept_and_the_page_marks_failures(tmp_path):
 
 
 def test_unknown_experiments_and_engines_are_errors():
-    with pytest.raises(InputError, match="groups are boxes, collision"):
+    with pytest.raises(InputError, match="groups are bounce, boxes, collision"):
         PhysicsBenchOptions(only=("jump",)).chosen()
     with pytest.raises(InputError, match="--engine warp"):
         PhysicsBenchOptions(engines=("warp",))

@@ -9,6 +9,8 @@ from stages.core.geometry.neighbours import neighbour_index
 from stages.core.physics import signed_distance
 from stages.core.physics.signed_distance import DIRECTIONS, DistanceGrid, Surfels, mass_properties
 
+INSIDE = -torch.ones(1, dtype=torch.float64)  # of a position, by its rays
+
 
 def grid_of(distance, low, cell, resolution=32):
     empty = DistanceGrid(torch.zeros((resolution,) * 3), torch.tensor(low), torch.tensor(cell))
@@ -115,9 +117,16 @@ def test_distance_to_a_disc_and_to_its_edge(x, expected):
     """Discs reach OVERLAP = 2 times as far as their radius of .2."""
     x = torch.tensor([x], dtype=torch.float64)
     nearest = (x.norm(dim=1, keepdim=True), torch.zeros(1, 1, dtype=torch.int64))
-    assert float(signed_distance._distance(disc(), x, nearest)) == pytest.approx(expected)
-    sheet = signed_distance._distance(disc(half_thickness=0.05), x, nearest)
+    assert float(signed_distance._distance(disc(), x, nearest, INSIDE)) == pytest.approx(expected)
+    sheet = signed_distance._distance(disc(half_thickness=0.05), x, nearest, INSIDE)
     assert float(sheet) == pytest.approx(abs(expected) - 0.05)
+
+
+def test_the_rays_decide_in_the_plane_of_a_disc():
+    x = torch.tensor([[0.7, 0.0, -1e-12]], dtype=torch.float64)
+    nearest = (x.norm(dim=1, keepdim=True), torch.zeros(1, 1, dtype=torch.int64))
+    for side in (INSIDE, -INSIDE):
+        assert float(signed_distance._distance(disc(), x, nearest, side)) == pytest.approx(0.3 * float(side))
 
 
 def test_distances_to_discs_are_averaged_by_their_nearness_but_not_across_an_edge():
@@ -126,12 +135,12 @@ def test_distances_to_discs_are_averaged_by_their_nearness_but_not_across_an_edg
     x = torch.tensor([[0, 0, 0.3]], dtype=torch.float64)
     nearest = torch.tensor([[0.3, 0.4]], dtype=torch.float64), torch.tensor([[0, 1]])
     weight = math.exp((0.3**2 - 0.4**2) / 0.2**2)
-    found = float(signed_distance._distance(two, x, nearest))
+    found = float(signed_distance._distance(two, x, nearest, INSIDE))
     assert found == pytest.approx((0.3 + weight * 0.4) / (1 + weight))
     two.normal[1] = torch.tensor([0, 0.9, math.sqrt(0.19)])  # its cosine with the first is .44
-    assert float(signed_distance._distance(two, x, nearest)) == pytest.approx(0.3)
+    assert float(signed_distance._distance(two, x, nearest, INSIDE)) == pytest.approx(0.3)
     two.normal[1] = torch.tensor([0, math.sqrt(1 - 0.6**2), 0.6])
-    assert float(signed_distance._distance(two, x, nearest)) != pytest.approx(0.3)
+    assert float(signed_distance._distance(two, x, nearest, INSIDE)) != pytest.approx(0.3)
 
 
 @pytest.mark.parametrize(("node", "on"), [

@@ -465,7 +465,7 @@ def evaluate(
 ) -> None:
     """Compare a prediction with the ground truth: PREDICTION and TRUTH -> a table and METRICS.json.
 
-    With --judge and without a truth: films -> PhysR and PhotoR, as a vision-language model sees them.
+    With --judge and without a truth: films -> PhysR and PhotoR, as rated by a vision-language model.
     """
     options = EvaluateOptions(
         align=align, frames=frames, resample=resample, objects=objects, undistorted=undistorted, photos=photos,

@@ -42,7 +42,7 @@ def bench_raster(
     device: Annotated[str, typer.Option(help="cpu, or cuda to compare with gsplat on a GPU")] = "cpu",
     out: Out = None,
     repeat: Annotated[int, typer.Option(help="timed calls of each; the fastest counts")] = 15,
-    shrink: Annotated[int, typer.Option(help="divide the numbers of Gaussians and pixels by this factor")] = 1,
+    shrink: Annotated[int, typer.Option(help="factor by which the numbers of Gaussians and pixels are reduced")] = 1,
     as_json: AsJson = False,
 ) -> None:
     """Rasteriser: on the CPU compared with a per-pixel rasteriser, on a GPU (--device cuda) with gsplat."""
@@ -86,18 +86,19 @@ def bench_chain(
         Path | None, typer.Argument(metavar="PHOTOS", help="folder of photos or a video; not with --table")
     ] = None,
     table: Annotated[
-        bool, typer.Option("--table", help="the paper's table instead: rendered photos of 3 and of 6 toys")
+        bool,
+        typer.Option("--table", help="instead of PHOTOS: the paper's table, from rendered photos of 3 and of 6 toys"),
     ] = False,
     quality: Annotated[str, typer.Option(help="quality of the reconstruction")] = "normal",
     device: Device = "auto",
-    steps: Annotated[int, typer.Option(help="frames of the film")] = 100,
+    steps: Annotated[int, typer.Option(help="frames of the video")] = 100,
     refine: Annotated[bool, typer.Option(help="complete the objects before they are simulated")] = True,
     repeat: Annotated[int, typer.Option(help="runs in one process; the first one loads kernels")] = 2,
     commands: Annotated[bool, typer.Option(help="also run each stage as a command")] = True,
     out: Out = None,
     as_json: AsJson = False,
 ) -> None:
-    """All stages from photos to a film: seconds, busy share of the GPU, and whether repeated runs give equal files."""
+    """All stages from photos to a video: time, GPU utilisation, and whether repeated runs give equal files."""
     from stages.lab.bench.chain import ChainBenchOptions, run
     from stages.lab.bench.chain_table import ChainTableOptions
     from stages.lab.bench.chain_table import run as run_table
@@ -118,16 +119,19 @@ def bench_chain(
 def bench_track(
     sequences: Annotated[int, typer.Option(help="number of sequences")] = 5,
     first: Annotated[int, typer.Option(help="seed of the first sequence")] = 0,
-    width: Annotated[int, typer.Option(help="width of the films [px]")] = 240,
+    width: Annotated[int, typer.Option(help="width of the videos [px]")] = 240,
     frames: Annotated[int, typer.Option(help="frames of motion")] = 50,
     reconstructed: Annotated[
-        str, typer.Option(help="track scenes that are reconstructed from the films at this quality, and segmented")
+        str,
+        typer.Option(
+            help="track scenes reconstructed from the videos at this quality and segmented; default: true scenes"
+        ),
     ] = "",
     device: Device = "auto",
     out: Out = None,
     as_json: AsJson = False,
 ) -> None:
-    """Tracking: errors of pose, time and lost frames, in rendered films of ten cameras with known motion."""
+    """Tracking: errors of pose and time, and lost frames, in rendered videos of ten cameras with known motion."""
     from stages.lab.bench.track import TrackBenchOptions, run
 
     options = TrackBenchOptions(
@@ -149,7 +153,7 @@ def bench_appearance(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Held-out photos rendered from our Gaussians and from those of gsplat's default recipe after equal time."""
+    """Novel views: held-out photos rendered from our Gaussians and from gsplat's default recipe after equal time."""
     from stages.lab.bench.appearance import AppearanceBenchOptions, run
 
     options = AppearanceBenchOptions(quality=quality, holdout=holdout, models=models)
@@ -196,7 +200,7 @@ def bench_segment(
             help="with --photos: folder of labelled scenes PHOTOSET.ply; missing ones are made and kept there"
         ),
     ] = None,
-    scenes: Annotated[int, typer.Option(help="scenes of each kind: objects apart, and touching")] = 4,
+    scenes: Annotated[int, typer.Option(help="scenes of each kind: separate objects, and objects in contact")] = 4,
     views: Annotated[int, typer.Option(help="number of cameras per scene")] = 24,
     weights: Annotated[
         Path | None, typer.Option(help="weights of network backends; default: searched; without any, they are skipped")
@@ -231,12 +235,12 @@ def bench_segment(
 
 @app.command("refine")
 def bench_refine(
-    scenes: Annotated[int, typer.Option(help="number of scenes, with objects apart")] = 4,
+    scenes: Annotated[int, typer.Option(help="number of scenes of separate objects")] = 4,
     views: Annotated[int, typer.Option(help="number of cameras per scene")] = 24,
     out: Out = None,
     as_json: AsJson = False,
 ) -> None:
-    """Filling of the table under removed objects: error against the true table in new views."""
+    """Inpainting of the table under removed objects: error against the true table in novel views."""
     from stages.lab.bench.refine import RefineBenchOptions, run
 
     options = RefineBenchOptions(scenes=scenes, views=views)
@@ -366,7 +370,7 @@ def bench_register(
     device: Device = "auto",
     as_json: AsJson = False,
 ) -> None:
-    """Registration of a partial to the complete object, compared with ICP and splatreg."""
+    """Registration of partial to complete objects, compared with ICP and splatreg."""
     from stages.lab.bench.register import RegisterBenchOptions, run
 
     options = RegisterBenchOptions(only=only, trials=trials, seed=seed, device=device)
@@ -393,7 +397,7 @@ def bench_complete(
 @app.command("fit")
 def bench_fit(
     scenes: Annotated[int, typer.Option(help="number of scenes")] = 20,
-    only: Annotated[str, typer.Option(help="slide | bounce | collision | soft; default: in turn")] = "",
+    only: Annotated[str, typer.Option(help="slide | bounce | collision | soft; default: all four, alternating")] = "",
     noise: Annotated[float, typer.Option(help="standard deviation of the tracks' errors [m]")] = 0.002,
     evaluations: Annotated[int, typer.Option(help="largest number of simulations of a scene")] = 1500,
     minutes: Annotated[float, typer.Option(help="longest time of a scene [min]")] = 10.0,
@@ -403,7 +407,7 @@ def bench_fit(
     device: Device = "auto",
     as_json: AsJson = False,
 ) -> None:
-    """Materials from motion: errors on scenes of known materials, and of the prediction of another motion."""
+    """Material estimation from motion: errors of the parameters and of the prediction of another motion."""
     from stages.lab.bench.fit import FitBenchOptions, run
 
     options = FitBenchOptions(

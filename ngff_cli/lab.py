@@ -63,7 +63,7 @@ def fuzz(
     seed: Annotated[int, typer.Option(help="random seed of the damage")] = 0,
     as_json: AsJson = False,
 ) -> None:
-    """Read randomly damaged files of every format, and keep those that end in anything but a clear error."""
+    """Fuzz the readers: read randomly damaged files of every format, and keep those that raise unexpected errors."""
     from stages.lab.fuzz.campaign import run
 
     print_results(lambda path: run(path, count, seed), out, as_json)
@@ -138,7 +138,7 @@ def card(
 def average(
     files: Annotated[list[Path], typer.Argument(metavar="WEIGHTS", help="two or more, of one model (.safetensors)")],
     out: Annotated[Path, typer.Option("-o", "--out", help="weights to write (.safetensors)")],
-    ratios: Annotated[str, typer.Option(help="weighting of each file, such as 0.7,0.3")],
+    ratios: Annotated[str, typer.Option(help="weight of each file, such as 0.7,0.3")],
     half: Half = False,
 ) -> None:
     """Average the weights of several training runs."""
@@ -189,7 +189,7 @@ def clutter(
         typer.Option(
             "--from",
             metavar="MESH",
-            help="textured mesh (.obj .glb .ply ...), or folder of meshes, that lie around too; repeatable",
+            help="textured mesh (.obj .glb .ply ...), or folder of meshes, added to the generated objects; repeatable",
         ),
     ] = [],  # noqa: B006
     count: Annotated[int, typer.Option(help="number of scenes")] = 20,
@@ -199,15 +199,14 @@ def clutter(
     observations: Annotated[
         int,
         typer.Option(
-            help="write this many outcomes of a model of reconstruction noise per "
-            "scene in place of photos; 0: photos to reconstruct"
+            help="write this many samples of a reconstruction-noise model per scene instead of photos; 0: write photos"
         ),
     ] = 0,
     reconstruct: Annotated[
         bool,
         typer.Option(
             "--reconstruct",
-            help="reconstruct the photos with their true cameras, and write the labelled result in place of them",
+            help="reconstruct the photos with their true cameras, and write the labelled result instead",
         ),
     ] = False,
     exact: Annotated[bool, typer.Option("--exact", help="write the true Gaussians, labelled, not photos")] = False,
@@ -233,7 +232,7 @@ def train_segmenter(
     data: Annotated[list[Path], typer.Argument(metavar="FOLDER", help="scenes of `ngff-lab clutter`; several folders")],
     out: Annotated[Path, typer.Option("-o", "--out", help="weights to write (.safetensors)")],
     minutes: Annotated[
-        float, typer.Option(help="training time of the network [min]; 0: only the scores of candidates")
+        float, typer.Option(help="training time of the network [min]; 0: train only the candidate scores")
     ] = 30.0,
     steps: Annotated[int, typer.Option(help="optimizer steps instead of --minutes; 0: use --minutes")] = 0,
     rate: Annotated[float, typer.Option(help="maximum learning rate")] = 2e-3,
@@ -248,7 +247,7 @@ def train_segmenter(
     seed: Seed = 0,
     device: Device = "auto",
 ) -> None:
-    """Train the network that `ngff segment` finds objects with."""
+    """Train the network of `ngff segment --backend learned`."""
     from stages.lab.training.train_segmenter import SegmenterTraining, run
 
     options = SegmenterTraining(
@@ -286,14 +285,14 @@ def fit(
     scene: SceneIn,
     track: Annotated[
         Path,
-        typer.Argument(
-            metavar="TRACK.h5", help="trajectory of the scene's objects, of which the first frame is the scene"
-        ),
+        typer.Argument(metavar="TRACK.h5", help="trajectory of the scene's objects; its first frame is the scene"),
     ],
     out: Annotated[
         Path, typer.Option("-o", "--out", help="materials for `ngff simulate --materials` to write (.json)")
     ] = Path("materials.json"),
-    engine: Annotated[str, typer.Option(help="auto | rigid | mpm | ngff: through which motions are compared")] = "auto",
+    engine: Annotated[
+        str, typer.Option(help="engine that simulates the candidates: auto | rigid | mpm | ngff")
+    ] = "auto",
     quality: Annotated[str, typer.Option(help="of --engine mpm: draft | normal | high")] = MaterialFitOptions.quality,
     material: Annotated[
         list[str],
@@ -310,7 +309,7 @@ def fit(
     seed: Seed = MaterialFitOptions.seed,
     device: Device = MaterialFitOptions.device,
 ) -> None:
-    """Find materials and start velocities of objects from their tracked motion."""
+    """Estimate materials and initial velocities of objects from their tracked motion."""
     from stages.lab.fit.fit import run
 
     options = MaterialFitOptions(
@@ -327,7 +326,7 @@ def track(
     films: Annotated[Path, typer.Argument(metavar="CAMERAS/", help="folder of the films that the scene was made from")],
     out: Annotated[Path, typer.Option("-o", "--out", help="trajectory to write (.h5)")] = Path("truth.h5"),
     resolution: Annotated[
-        int, typer.Option(help="longest side at which pictures and renderings are compared [px]")
+        int, typer.Option(help="longest side at which frames and renderings are compared [px]")
     ] = TrackOptions.resolution,
     frames: Annotated[
         int, typer.Option(help="frames from the release on; 0: until everything rests")
@@ -380,7 +379,7 @@ def questionnaire(
     films: Annotated[int, typer.Option(help="films per page")] = StudyOptions.films,
     seed: Seed = StudyOptions.seed,
 ) -> None:
-    """Write pages on which people judge films, or with --answers the table of what they answered."""
+    """Write the pages of a user study on which people rate videos, or with --answers the table of their ratings."""
     from stages.lab.questionnaire import answers as table
     from stages.lab.questionnaire import study
 

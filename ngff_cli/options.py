@@ -25,7 +25,7 @@ Threads = Annotated[int | None, typer.Option(
          "on an idle machine, slower beside other work", show_default=False)]  # fmt: skip
 AsJson = Annotated[bool, typer.Option("--json", help="print the results as JSON instead of a table")]
 SIZE_OPTIONS = ("quality", "resolution", "keypoints", "max_objects", "batch", "views", "side", "size", "particles",
-                "scenes")  # on which the memory of a command depends, the most effective first  # fmt: skip
+                "scenes")  # that determine the memory of a command, the most effective first  # fmt: skip
 INTERRUPTED = "interrupted; no incomplete file is left"
 NO_MEMORY = ("can't allocate memory", "Insufficient memory", "can't start new thread", "bad alloc", "bad_alloc",
              "failed to map segment")  # in messages of PyTorch, OpenCV, Python, C++ and the loader  # fmt: skip
@@ -67,9 +67,10 @@ def run_command_line(app: typer.Typer, words: list[str] | None = None) -> None:
 
 
 def interrupt(number: int, frame) -> None:
-    """Handler of signals: KeyboardInterrupt, but not inside the import system, where it would be lost with a lock held.
+    """Signal handler: raises KeyboardInterrupt, within the import system 10 ms later.
 
-    All threads that import would then wait forever (CPython's _get_module_lock). It comes 10 ms later instead.
+    There the exception could be lost with a lock held, which blocks all threads that import (CPython's
+    _get_module_lock).
     """
     if frame is None or not frame.f_code.co_filename.startswith("<frozen importlib"):
         raise KeyboardInterrupt
@@ -108,7 +109,7 @@ def print_results(run: Callable[[Path | None], Iterable[str]], out: Path | None,
 class CommandGroup(typer.core.TyperGroup):
     """Commands in the order of their definition.
 
-    An InputError or OSError exits with one line and status 2, memory that runs out with one line and status 1.
+    An InputError or OSError exits with one line and status 2, exhausted memory with one line and status 1.
     """
 
     def list_commands(self, ctx) -> list[str]:
@@ -152,7 +153,7 @@ def _is_gpu_out_of_memory(error: Exception) -> bool:
 
 
 def _is_out_of_memory(error: Exception) -> bool:
-    """Whether Python, NumPy, PyTorch, OpenCV, a new thread or a library that is loaded got no memory."""
+    """Whether an allocation failed in Python, NumPy, PyTorch, OpenCV, the start of a thread or the loader."""
     known = isinstance(error, MemoryError) or getattr(error, "errno", None) == errno.ENOMEM
     known = known or any(text in str(error) for text in NO_MEMORY)
     return known or isinstance(error.__cause__, Exception) and _is_out_of_memory(error.__cause__)

@@ -20,7 +20,7 @@ from tqdm import tqdm
 from stages.core.errors import InputError
 from stages.core.scene.cameras import Cameras
 from stages.core.scene.files import must_exist
-from stages.core.scene.images import NOT_JUDGED, read_labels
+from stages.core.scene.images import IGNORE_LABEL, read_labels
 from stages.core.scene.lens import Undistortion, photo_of
 from stages.core.scene.scene import Scene, SceneObject
 from stages.core.scene.scene_ply import read_scene
@@ -126,7 +126,7 @@ def compare(prediction: Path, truth: Path, options: EvaluateOptions) -> Result:
     overlap, views = LabelOverlap(), []
     for view, file in tqdm(files.items(), unit="photo", leave=False):
         labels, found = read_truth(file, scene.cameras, view, options.undistorted), found_objects(scene, view)
-        judged = (labels != NOT_JUDGED) & ~torch.isin(labels, spare)
+        judged = (labels != IGNORE_LABEL) & ~torch.isin(labels, spare)
         overlap.add(labels, found, judged)
         views += [LabelledView(view, labels, found, judged)] if options.report else []
     scores = overlap.scores()

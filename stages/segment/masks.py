@@ -11,7 +11,7 @@ from tqdm import tqdm
 
 from stages.core.errors import InputError
 from stages.core.perception.voting import apply_votes, collect_votes
-from stages.core.scene.images import NOT_JUDGED, read_labels
+from stages.core.scene.images import IGNORE_LABEL, read_labels
 from stages.core.scene.lens import Undistortion
 from stages.core.scene.scene import Scene
 from stages.core.scene.schema import numbered, read_json, reason, texts
@@ -32,7 +32,7 @@ def segment(scene: Scene, options: SegmentOptions) -> Scene:
     files, names = match_files(options.masks, scene.cameras.names, "label image", "--masks"), read_names(options.masks)
     bar, columns = tqdm(files.items(), unit="mask"), {0: 0}
     votes = collect_votes(scene, ((view, _columns(_labels(scene, view, file, options), columns)) for view, file in bar))
-    ignored = {NOT_JUDGED} if names and NOT_JUDGED not in names else set()
+    ignored = {IGNORE_LABEL} if names and IGNORE_LABEL not in names else set()
     order = sorted(columns.keys() - ignored)
     votes = votes[:, [columns[number] for number in order]]
     return apply_votes(scene, votes, names, str(options.masks), options.seed, order)

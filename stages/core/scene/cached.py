@@ -15,7 +15,7 @@ def cached_in_scene(function: Callable) -> Callable:
 
     @wraps(function)
     def call(scene, *args, **options):
-        held = scene.__dict__.setdefault("_cached", {})  # beside the fields, which are frozen
+        held = scene.__dict__.setdefault("_cached", {})  # apart from the fields, which are frozen
         key = (function, args, tuple(sorted(options.items())))
         if key not in held:
             held[key] = function(scene, *args, **options)

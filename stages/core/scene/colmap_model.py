@@ -49,7 +49,7 @@ def read_colmap(folder: Path) -> list[ColmapImage]:
 
 
 class _Bytes:
-    """Values read one after another; ValueError at the end of the file."""
+    """Sequential reader of packed little-endian values; ValueError at the end of the file."""
 
     def __init__(self, path: Path):
         self.name, self.data, self.at = path.name, path.read_bytes(), 0
@@ -57,7 +57,7 @@ class _Bytes:
     def take(self, layout: str) -> tuple:
         size = struct.calcsize("<" + layout)
         if self.at + size > len(self.data):
-            raise ValueError(f"{self.name} breaks off")
+            raise ValueError(f"{self.name} is truncated")
         self.at += size
         return struct.unpack_from("<" + layout, self.data, self.at - size)
 

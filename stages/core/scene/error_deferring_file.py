@@ -1,4 +1,4 @@
-"""A file for h5py that reports a full disk when asked, since HDF5 does not survive an exception in a write."""
+"""A file object for h5py that defers write errors, such as a full disk: HDF5 crashes if a write raises an exception."""
 
 import io
 
@@ -6,13 +6,14 @@ import io
 class ErrorDeferringFile(io.FileIO):
     """A file that stores write errors in `error` instead of raising them.
 
-    What could not be written is kept in memory and read from there: HDF5 crashes where it reads back other bytes.
+    Data that could not be written stay in memory and are read from there, since HDF5 also crashes if it reads back
+    other bytes than it wrote.
     """
 
     def __init__(self, *args):
         super().__init__(*args)
         self.error: OSError | None = None
-        self._unwritten: list[tuple[int, bytes]] = []  # position and bytes
+        self._unwritten: list[tuple[int, bytes]] = []  # offset and data
 
     def write(self, data) -> int:
         rest = memoryview(data).cast("B")

@@ -1,4 +1,4 @@
-"""The group `field` of a trajectory: what the learned engine started from, so that a page can go on simulating."""
+"""The group `field` of a trajectory: initial conditions of the learned engine, from which a page can simulate."""
 
 from __future__ import annotations
 
@@ -46,21 +46,21 @@ class UnitFactors:
 
 @dataclass(frozen=True)
 class FieldUnits(UnitFactors):
-    """Units of the model, and how it is stepped."""
+    """Unit conversion and time stepping of the learned model."""
 
     origin: tuple[float, float, float]  # scene point that becomes (0, 0, FLOOR) [scene units]
     gravity: float  # downwards, in model units [m/s^2]
-    steps: int  # of the model in a frame
+    steps: int  # time steps of the model per frame
     weights: str  # sha256 of the model's weights
-    friction: float | None = None  # of all objects, in place of each material's
+    friction: float | None = None  # of all objects, overrides the materials'
 
 
 @dataclass(frozen=True)
 class FieldStart:
-    """Keypoints, bodies and materials at the start, in model units; keypoints and objects in the file's order."""
+    """Initial keypoints, rigid-body states and materials in model units; keypoints and objects in the file's order."""
 
     points: Float[Tensor, "p 3"]  # [m]
-    mass_fraction: Float[Tensor, "p"]  # of each keypoint in its object's mass
+    mass_fraction: Float[Tensor, "p"]  # of each keypoint: its part of the object's mass
     mass: Float[Tensor, "o"]  # [kg]
     volume: Float[Tensor, "o"]  # not in model units [m^3]
     E: Float[Tensor, "o"]  # Young's modulus [Pa]
@@ -69,15 +69,15 @@ class FieldStart:
     friction: Float[Tensor, "o"]
     velocity: Float[Tensor, "o 3"]  # of the centre of mass [m/s]
     inertia: Float[Tensor, "o 3 3"]  # about the centre of mass, per unit of mass [m^2]
-    box: Float[Tensor, "o 2 3"]  # lower and upper corner of the room of each object [m]
-    awake: Int[Tensor, "o"]  # 0: at rest until touched
-    standing: Int[Tensor, "o"]  # 1: on the floor
+    box: Float[Tensor, "o 2 3"]  # lower and upper corner of each object's domain [m]
+    awake: Int[Tensor, "o"]  # 0: asleep until a contact wakes it
+    standing: Int[Tensor, "o"]  # 1: stands on the floor
     material: tuple[str, ...]  # names
     units: FieldUnits
 
 
 def write_field_start(file: h5py.File, start: FieldStart) -> None:
-    """Write the group, in place of one that is there."""
+    """Write the group; an existing one is replaced."""
     if GROUP in file:
         del file[GROUP]
     group = file.create_group(GROUP)

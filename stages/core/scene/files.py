@@ -56,7 +56,7 @@ def save_tensors(path: Path, values: object) -> None:
     with replacing(path) as part, part.open("wb") as file:  # a full disk is an OSError only with a file object
         try:
             torch.save(values, file)
-        except RuntimeError as error:  # it ends its archive also after a write that failed
+        except RuntimeError as error:  # torch.save closes its archive after a failed write, which fails too
             raise error.__context__ if isinstance(error.__context__, OSError) else error from None
 
 
@@ -82,7 +82,7 @@ def _is_running(pid: int) -> bool:
 
 
 def must_exist(path: Path, what: str) -> Path:
-    """The path of a readable, non-empty file; otherwise InputError, which names `what` is expected."""
+    """The path, if it is a readable, non-empty file; otherwise InputError, which says that `what` is expected."""
     path = Path(path)
     if path.is_dir():
         raise InputError(f"{path}: is a folder; {what} is expected")
@@ -98,7 +98,7 @@ def must_exist(path: Path, what: str) -> Path:
 
 
 def read_json_file(path: Path, what: str, kind: type | tuple[type, ...] = dict) -> Any:
-    """The value of a JSON file, an object or as `kind` says; InputError naming `what` is expected for anything else."""
+    """The value of a JSON file, of type `kind`; InputError, which says that `what` is expected, for anything else."""
     must_exist(path, what)
     try:
         data = read_json(path)

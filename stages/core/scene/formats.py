@@ -61,7 +61,7 @@ def suffixes(*kinds: str, writable: bool = False) -> list[str]:
 def format_of(path: Path, *kinds: str, writable: bool = False) -> Format:
     """The format of a file by its suffix; the file need not exist.
 
-    Raises InputError, naming the suffixes that would do, unless the format holds one of these kinds of data and,
+    Raises InputError, with the suffixes that are accepted, unless the format holds one of these kinds of data and,
     with `writable`, can be written.
     """
     suffix, allowed = path.suffix.lower(), suffixes(*kinds, writable=writable)

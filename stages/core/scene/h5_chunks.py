@@ -1,7 +1,7 @@
-"""Compressed datasets of HDF5 files, by several threads; HDF5 itself compresses and decompresses in one.
+"""Multithreaded compression and decompression of HDF5 datasets; HDF5 itself uses one thread.
 
-The files are as HDF5 writes them with its filters shuffle (the first bytes of all values, then the second ones, and so
-on) and gzip: chunks are filtered here, and passed to HDF5 or taken from it as stored.
+The files are those that HDF5 writes with its filters shuffle (the first bytes of all values, then the second ones, and
+so on) and gzip: chunks are encoded and decoded here, and written and read unfiltered (direct chunk I/O).
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def append_rows(data: h5py.Dataset, rows: np.ndarray) -> None:
 
 
 def read_compressed(data: h5py.Dataset) -> np.ndarray:
-    """All values of a dataset; OSError where a chunk is damaged."""
+    """All values of a dataset; OSError if a chunk is damaged."""
     if data.chunks is None or data.dtype.kind not in "fiu" or filters_of(data) != FILTERS or not data.size:
         return data[()]
     infos = [data.id.get_chunk_info(i) for i in range(data.id.get_num_chunks())]
@@ -48,7 +48,7 @@ def read_compressed(data: h5py.Dataset) -> np.ndarray:
         return data[()]
     out, chunks, dtype = np.full(data.shape, data.fillvalue, data.dtype), data.chunks, data.dtype
 
-    # Only this thread calls h5py: with several its lock may stay taken for ever (h5py issue 2920).
+    # h5py is called from this thread only: with several threads its lock can deadlock (h5py issue 2920).
     def place(chunk: tuple[tuple[int, ...], bytes]) -> None:
         offset, stored = chunk
         part = out[tuple(slice(a, a + b) for a, b in zip(offset, chunks, strict=True))]
@@ -70,7 +70,7 @@ def _encoded(values: np.ndarray) -> bytes:
 
 
 def _decoded(stored: bytes, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
-    """The values of a stored chunk; OSError where it is damaged."""
+    """The values of a stored chunk; OSError if it is damaged."""
     size = int(np.prod(shape)) * dtype.itemsize
     try:
         raw = zlib.decompressobj().decompress(stored, size + 1)
@@ -82,7 +82,7 @@ def _decoded(stored: bytes, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarr
 
 
 def filters_of(data: h5py.Dataset) -> tuple[int, ...]:
-    """The numbers of the filters of a dataset, in the order in which they are applied."""
+    """Identifiers of the filters of a dataset, in the order in which they are applied."""
     properties = data.id.get_create_plist()
     return tuple(properties.get_filter(i)[0] for i in range(properties.get_nfilters()))
 

@@ -1,4 +1,4 @@
-"""Checks of the datasets of an HDF5 file; apart from schema.py, so that only what reads trajectories imports h5py."""
+"""Validation of HDF5 datasets; separate from schema.py, so that only readers of trajectories import h5py."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from stages.core.scene.h5_chunks import read_compressed
 from stages.core.scene.h5_text import check_attributes, check_texts
 from stages.core.scene.schema import LARGEST, MAX_DEFLATE_RATIO, Bound, quote
 
-MAX_CHUNK = 64 << 20  # bytes of a chunk, whatever it holds
+MAX_CHUNK = 64 << 20  # bytes of a chunk that are always accepted
 
 
 @contextmanager
 def open_h5(path: Path) -> Iterator[h5py.File]:
-    """An HDF5 file for reading, the texts among its attributes checked. Raises ValueError and as h5py does."""
+    """Open an HDF5 file and check the strings in its attributes. Raises ValueError and the errors of h5py."""
     with h5py.File(path, "r") as file:
         check_attributes(file)
         yield file
@@ -28,7 +28,7 @@ def open_h5(path: Path) -> Iterator[h5py.File]:
 
 @dataclass(frozen=True)
 class Dataset:
-    """What an HDF5 dataset must be; its lengths are numbers, or letters that stand for the same number in all."""
+    """Expected shape, type and range of a dataset. A letter in the shape stands for the same length in all datasets."""
 
     shape: str
     kind: str = "float"  # float (of any width, or integers), int or text
@@ -36,9 +36,9 @@ class Dataset:
     high: Bound = LARGEST
 
     def open(self, file: h5py.File, name: str, lengths: dict[str, int]) -> h5py.Dataset:
-        """The dataset, checked but for its values; adds new letters to `lengths`. KeyError where there is none."""
+        """The dataset, shape and type checked; adds new letters to `lengths`. Raises KeyError if absent, ValueError."""
         parts = name.split("/")
-        for i in range(len(parts)):  # a soft link may be a loop, and an external one names any file of the machine
+        for i in range(len(parts)):  # soft links may be cyclic, and external links may refer to any file of the machine
             link = file.get("/".join(parts[: i + 1]), getlink=True)
             if link is None:
                 raise KeyError(name)
@@ -65,7 +65,7 @@ class Dataset:
         return data
 
     def read(self, file: h5py.File, name: str, lengths: dict[str, int]) -> np.ndarray | list[str]:
-        """The values as float32, int64 or text; ValueError where one is not finite or out of range."""
+        """The values as float32, int64 or strings; ValueError if one is not finite or out of range."""
         data = self.open(file, name, lengths)
         if self.kind == "text":
             if h5py.check_string_dtype(data.dtype).length is None:
@@ -74,7 +74,7 @@ class Dataset:
         return self.checked(read_compressed(data), name)
 
     def checked(self, values: np.ndarray, name: str) -> np.ndarray:
-        """Values in native byte order, float32 or int64; ValueError where one is not finite or out of range."""
+        """Values in native byte order, float32 or int64; ValueError if one is not finite or out of range."""
         if values.dtype.kind == "f" and values.dtype.itemsize < 4:
             values = values.astype(np.float32)
         if not ((values >= self.low) & (values <= self.high)).all():  # false for NaN

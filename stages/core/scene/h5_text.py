@@ -1,8 +1,8 @@
-"""Texts of variable length in HDF5 files, checked before HDF5 reads them.
+"""Variable-length strings in HDF5 files, checked before HDF5 reads them.
 
-HDF5 takes memory by the length that a text's reference declares, before it looks where the text is, and does not end at
-a damaged heap (H5HG__cache_heap_deserialize). A reference has 16 bytes: the length, the address of a heap and the
-number of the text in it.
+HDF5 allocates the length that a string's reference declares before it looks the string up, and loops for ever on a
+damaged global heap (H5HG__cache_heap_deserialize). A reference has 16 bytes: the length, the address of a heap and the
+index of the string in it.
 Source: The HDF Group, "HDF5 File Format Specification Version 3.0", III.E, IV.A.1 and IV.A.2.
 """
 
@@ -25,14 +25,14 @@ MAX_BLOCKS = 1000  # of an object header
 
 
 def check_texts(data: h5py.Dataset) -> None:
-    """ValueError where a text of a dataset of variable length is not where and as long as the file says."""
+    """ValueError unless all strings of a variable-length dataset lie within the file, with the declared lengths."""
     with _FileBytes(data.file) as file:
         for part in _stored(data, file):
             file.check(part)
 
 
 def check_attributes(item: h5py.Group | h5py.Dataset) -> None:
-    """The same for the attributes of a file, group or dataset."""
+    """The same for the attributes of a file, group or dataset (object header messages)."""
     with _FileBytes(item.file) as file:
         for attribute in _attributes(file, h5py.h5o.get_info(item.id).addr):
             name, kind, space = (int.from_bytes(attribute[i : i + 2], "little") for i in (2, 4, 6))
@@ -44,13 +44,13 @@ def check_attributes(item: h5py.Group | h5py.Dataset) -> None:
 
 
 class _FileBytes:
-    """The bytes of an open file; ValueError for those outside it."""
+    """Memory map of an open file; ValueError for reads beyond its end."""
 
     def __init__(self, file: h5py.File):
         if file.userblock_size:
             raise ValueError("it begins with a user block, of another format")
         self._path = file.filename
-        self._checked: dict[int, dict[int, int]] = {}  # length of each text, by address of its heap and number
+        self._checked: dict[int, dict[int, int]] = {}  # length of each string, by address of its heap and index
 
     def __enter__(self) -> _FileBytes:
         with open(self._path, "rb") as file:
@@ -69,7 +69,7 @@ class _FileBytes:
         return int.from_bytes(self.read(at, size), "little")
 
     def check(self, references: bytes) -> None:
-        """ValueError unless each reference is empty, or as long as its text in a sound heap."""
+        """ValueError unless each reference is empty, or no longer than its string in an intact heap."""
         for at in range(0, len(references), 16):
             length, heap, index = struct.unpack_from("<IQI", references, at)
             if length and heap and length > self._lengths(heap).get(index, -1):
@@ -93,7 +93,7 @@ class _FileBytes:
 
 
 def _stored(data: h5py.Dataset, file: _FileBytes) -> Iterator[bytes]:
-    """The references of a dataset; those that it does not store are empty."""
+    """The references of a dataset, chunk by chunk; chunks that are not allocated have none."""
     if data.id.get_storage_size() == 0:
         return
     if data.chunks is None:
@@ -107,7 +107,7 @@ def _stored(data: h5py.Dataset, file: _FileBytes) -> Iterator[bytes]:
         used = [code for i, code in enumerate(filters) if not info.filter_mask >> i & 1]
         if used == [h5py.h5z.FILTER_DEFLATE]:
             part = zlib.decompressobj().decompress(part, size + 1)
-        elif used:  # shuffle leaves texts as they are
+        elif used:  # shuffle does not apply to strings
             raise ValueError("its texts are compressed by another filter than gzip")
         if len(part) != size:
             raise ValueError("its texts are damaged")
@@ -135,4 +135,4 @@ def _attributes(file: _FileBytes, at: int) -> Iterator[bytes]:
                 yield message
             elif kind == CONTINUATION and length >= 16:
                 to, more = (int.from_bytes(message[i : i + 8], "little") for i in (0, 8))
-                blocks.append((to + 4, more - 8) if new else (to, more))  # version 2: between a signature and a sum
+                blocks.append((to + 4, more - 8) if new else (to, more))  # version 2: without signature and checksum

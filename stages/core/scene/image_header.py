@@ -1,4 +1,4 @@
-"""Size of an image from the header of its file, read before memory is taken for its pixels."""
+"""Size of an image from the header of its file, read before memory is allocated for its pixels."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from stages.core.scene.schema import MAX_DEFLATE_RATIO
 MAX_PIXELS = 1 << 27  # 134 million
 MAX_RATIO = 4096  # of uncompressed to stored bytes, in formats other than PNG; JPEG reaches 1500
 PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # by colour type
-JPEG_FRAMES = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}  # markers of frames: those left out have tables
-JPEG_ALONE = {0x01, *range(0xD0, 0xD9)}  # markers without a length
+JPEG_FRAMES = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}  # start-of-frame markers, without DHT, JPG and DAC
+JPEG_ALONE = {0x01, *range(0xD0, 0xD9)}  # markers without a length field
 TIFF_WIDTH, TIFF_HEIGHT, TIFF_TILE_WIDTH, TIFF_TILE_HEIGHT = 256, 257, 322, 323
 
 
@@ -19,7 +19,7 @@ class ImageHeader(NamedTuple):
 
     width: int  # [px]
     height: int
-    stored: float = 0.0  # least number of bytes that a file with these pixels has
+    stored: float = 0.0  # lower bound of the file's size [bytes]; 0: unknown
 
 
 def read_image_header(data: bytes) -> ImageHeader:
@@ -34,7 +34,7 @@ def read_image_header(data: bytes) -> ImageHeader:
 
 
 def _png(data: bytes) -> ImageHeader:
-    """Decoders take memory for each chunk by its length, which is checked too."""
+    """Also checks the length of each chunk, which decoders allocate."""
     if data[12:16] != b"IHDR" or data[25] not in PNG_CHANNELS:
         raise ValueError("no image")
     at = 8
@@ -59,7 +59,7 @@ def _jpeg(data: bytes) -> ImageHeader:
 
 
 def _webp(data: bytes) -> ImageHeader:
-    """Of one colour it may have any size: without a bound of the file's."""
+    """Without a bound of the file's size: an image of one colour has a few bytes at any resolution."""
     kind = data[12:16]
     if data[8:12] != b"WEBP" or len(data) < 30:
         raise ValueError("no image")
@@ -80,7 +80,7 @@ def _bmp(data: bytes) -> ImageHeader:
 
 
 def _tiff(data: bytes) -> ImageHeader:
-    """The first image; one of tiles may be smaller than a tile."""
+    """The first image, at least as large as a tile, which decoders allocate."""
     order = "little" if data[:2] == b"II" else "big"
 
     def number(at: int, length: int) -> int:

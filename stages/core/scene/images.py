@@ -23,11 +23,11 @@ from stages.core.scene.formats import IMAGE_SUFFIXES
 from stages.core.scene.image_header import MAX_PIXELS, read_image_header
 
 log = logging.getLogger(__name__)
-NOT_JUDGED = 255  # value of pixels of label images that are left out
+IGNORE_LABEL = 255  # pixels of label images that are not evaluated
 MAX_IMAGE_BYTES = 1 << 30  # of an image file
 MAX_VIDEO_PIXELS = 1 << 26  # of a frame; 8K has half as many
 ENCODER_THREADS = 4  # fixed, since the file depends on the number of threads
-MAX_PENDING_FRAMES = 8  # of a video, that wait for the encoder
+MAX_PENDING_FRAMES = 8  # of a video that wait for the encoder
 
 
 def list_photos(folder: Path) -> list[Path]:
@@ -47,7 +47,7 @@ def read_image(path: Path) -> Float[Tensor, "h w 3"]:
 
 
 def read_8_bit(path: Path) -> UInt8[Tensor, "h w 3"]:
-    """The same with 8 bits, without a copy of floats for a file of 8 bits."""
+    """As `read_image`, in 8 bits; 8-bit files are not converted to floats in between."""
     pixels = _read_rgb(path)
     return torch.from_numpy(pixels if pixels.dtype == np.uint8 else to_bytes(_to_floats(path, pixels)))
 
@@ -75,7 +75,7 @@ def read_labels(path: Path, max_bits: int = 16) -> Int[Tensor, "h w"]:
 
 
 def image_data(path: Path, what: str = "an image") -> bytes:
-    """The bytes of an image file; `what` is expected. InputError where it is absent, empty or too long."""
+    """The bytes of an image file. InputError, naming `what` is expected, if it is absent, empty or too long."""
     must_exist(path, what)
     with Path(path).open("rb") as file:
         data = file.read(MAX_IMAGE_BYTES + 1)
@@ -85,7 +85,7 @@ def image_data(path: Path, what: str = "an image") -> bytes:
 
 
 def _decode(path: Path, flags: int, what: str = "an image") -> np.ndarray:
-    """Pixels of an image file, BGR. Raises InputError for others, and for more pixels than the file can hold."""
+    """Pixels of an image file, BGR. Raises InputError for other files, and for more pixels than the file can hold."""
     data = image_data(path, what)
     try:
         header = read_image_header(data)
@@ -154,10 +154,10 @@ def _write_pixels(path: Path, pixels: np.ndarray) -> None:
 
 
 class VideoWriter:
-    """Context manager that writes an H.264 MP4 (yuv420p, index first, as browsers need it) frame by frame.
+    """Context manager that writes an H.264 MP4 frame by frame (yuv420p, index first, as browsers need it).
 
-    A thread encodes while the next frames are made. The file appears only on success. yuv420p needs even sizes: the
-    last row or column of odd ones is dropped.
+    A thread encodes while the next frames are computed. The file appears only on success. yuv420p needs even sizes: an
+    odd last row or column is dropped. `fps` is in frames per second.
     """
 
     def __init__(self, path: Path, fps: float):
@@ -220,9 +220,9 @@ def read_video(path: Path) -> Iterator[Float[Tensor, "h w 3"]]:
 
 
 def read_reduced_video(path: Path, side: int) -> Iterator[tuple[UInt8[Tensor, "h w 3"], tuple[int, int]]]:
-    """The frames of a video as it is shown, reduced to at most `side` pixels, and their width and height before.
+    """The frames of a video, upright and reduced to a longest side of `side` pixels, with their original (w, h).
 
-    Ends with a warning where the video breaks off.
+    Logs a warning and ends if the video is truncated.
     """
     with open_video(path) as file:
         file.streams.video[0].thread_type = "AUTO"
@@ -234,7 +234,7 @@ def read_reduced_video(path: Path, side: int) -> Iterator[tuple[UInt8[Tensor, "h
 
 
 def reduce_frame(frame: Any, side: int) -> tuple[UInt8[Tensor, "h w 3"], tuple[int, int]]:
-    """A frame of PyAV turned as it is shown and reduced to at most `side` pixels, and its width and height before."""
+    """A frame of PyAV, rotated upright and reduced to a longest side of `side` pixels, and its original (w, h)."""
     shrink = min(1.0, side / max(frame.width, frame.height))
     size = max(2, round(frame.width * shrink)), max(2, round(frame.height * shrink))
     pixels = frame.reformat(*size, format="rgb24", interpolation="AREA").to_ndarray()
@@ -250,7 +250,7 @@ def sample_frames(video: Path, count: int, longest: int) -> list[bytes]:
     """
     total = video_info(video)[0] or sum(1 for _ in read_video(video))
     jpegs, frames = _sample(video, total, count, longest)
-    if frames != total:  # the container declares another number than it holds
+    if frames != total:  # the container's frame count is wrong
         jpegs, _ = _sample(video, frames, count, longest)
     if not jpegs:
         raise InputError(f"{video}: holds no frames")
@@ -270,7 +270,7 @@ def _sample(video: Path, total: int, count: int, longest: int) -> tuple[list[byt
 
 
 def import_av(path: Path) -> ModuleType:
-    """PyAV, which only videos need; MissingPackage, for the video `path`, where it is not installed."""
+    """PyAV, which only videos need; MissingPackage, which names the video `path`, if it is not installed."""
     try:
         import av
     except ImportError as error:

@@ -48,7 +48,7 @@ class Undistortion:
     def image(
         self, image: Float[Tensor, "h w 3"] | UInt8[Tensor, "h w 3"]
     ) -> Float[Tensor, "h2 w2 3"] | UInt8[Tensor, "h2 w2 3"]:
-        """The view of an image, bilinear; as the view, or larger where the image is, so that no detail is lost."""
+        """Undistort an image by bilinear interpolation, at the size of the view or, if that is larger, of the image."""
         scale = max(1.0, self.size[0] / self.view_size[0])
         width, height = (round(side * scale) for side in self.view_size)
         K = resize(self.view_K, width / self.view_size[0], height / self.view_size[1])
@@ -58,12 +58,12 @@ class Undistortion:
         return torch.from_numpy(cv2.remap(image.numpy(), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
 
     def labels(self, labels: Int[Tensor, "h w"]) -> Int[Tensor, "h2 w2"]:
-        """The view of a label image, nearest neighbour, at the size of the view."""
+        """Undistort a label image by nearest neighbours, at the size of the view."""
         x, y = (torch.from_numpy(m).round().long() for m in self._map(self.view_K, self.view_size))
         return labels[y.clamp(0, self.size[1] - 1), x.clamp(0, self.size[0] - 1)]
 
     def points(self, points: Float[Tensor, "n 2"]) -> Float[Tensor, "n 2"]:
-        """Pixels of the view of pixels of the image; nan where the lens maps no direction to the pixel."""
+        """Undistort points of the image [px]; nan where the distortion has no inverse."""
         distorted = (points.double() - self.K[:2, 2].double()) / self.K.double()[[0, 1], [0, 1]]
         k1, k2, p1, p2, k3 = self.distortion.double()
         x = distorted
@@ -78,7 +78,7 @@ class Undistortion:
         return torch.where(found, out, torch.nan).float()
 
     def boxes(self, boxes: Float[Tensor, "n 4"]) -> Float[Tensor, "n 4"]:
-        """The smallest boxes x0 y0 x1 y1 of the view around boxes of the image; no area where they do not meet."""
+        """Bounding boxes x0 y0 x1 y1 in the view of boxes of the image [px]; empty where they lie outside the view."""
         size, view = (torch.tensor(s, dtype=torch.float32).repeat(2) for s in (self.size, self.view_size))
         inside = torch.minimum(boxes.clamp_min(0), size)
         t = torch.linspace(0, 1, BOX_EDGE_POINTS)
@@ -90,7 +90,7 @@ class Undistortion:
         return torch.minimum(torch.cat([low, high], 1).clamp_min(0), view)
 
     def _map(self, K: Float[Tensor, "3 3"], size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-        """x and y in the image, with pixel centres at 0, of each pixel of a view of this K and size."""
+        """Sampling positions x, y in the image (pixel centres at 0) for each pixel of a view with this K and size."""
         source, target = ((k.double() - HALF_PIXEL).numpy() for k in (self.K, K))
         return cv2.initUndistortRectifyMap(source, self.distortion.double().numpy(), None, target, size, cv2.CV_32FC1)
 

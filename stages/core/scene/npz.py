@@ -1,4 +1,4 @@
-"""NPZ files: arrays whose sizes are checked before memory is taken for them."""
+"""NPZ files: the sizes of arrays are checked before memory is allocated."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ MAX_BYTES = 16 << 30  # of all arrays
 
 
 def read_npz(path: Path, what: str) -> dict[str, np.ndarray]:
-    """The arrays of an NPZ file by name, without Python objects; `what` is expected, for errors.
+    """The arrays of an NPZ file by name, without Python objects; errors say that `what` is expected.
 
     Raises InputError for other files, damaged ones, and numbers that are not finite.
     """
@@ -42,7 +42,7 @@ def _size(path: Path) -> int:
 
 
 def _check_header(file: zipfile.ZipExtFile, info: zipfile.ZipInfo) -> None:
-    """ValueError where an array's shape needs another number of bytes than there are."""
+    """ValueError if an array of the declared shape is larger than its stored data."""
     version = np.lib.format.read_magic(file)
     read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     shape, _, dtype = read(file)

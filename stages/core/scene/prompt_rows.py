@@ -1,4 +1,4 @@
-"""The prompts in a traj.h5, one JSON object each: what a user asked of a simulation. The format is in README.md."""
+"""Prompts of a simulation (forces, pins, velocities, lifts, changes) as JSON objects in traj.h5; see README.md."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def _id(value: object, what: str) -> int:
     return whole(value, what, 1)
 
 
-CHANGES: dict[str, Callable] = {  # what changes during a simulation -> check of its value
+CHANGES: dict[str, Callable] = {  # quantity that changes during a simulation -> check of its value
     "gravity": number,  # downward acceleration [m/s^2]
     "friction": lambda value, what: number(value, what, 0, 100),  # Coulomb coefficient of all objects
     "material": text,  # name of an object's material

@@ -34,7 +34,7 @@ def _is_recording(path: Path) -> bool:
 
 
 def common_frame_rate(recordings: dict[str, Path], fps: float) -> float:
-    """Frames a second of all videos, and `fps` where there are only folders. Raises InputError where they differ."""
+    """Frame rate of all videos [1/s], or `fps` for folders of frames. Raises InputError if the rates differ."""
     rates = {name: video_info(path)[1] if path.is_file() else fps for name, path in recordings.items()}
     name, rate = next(iter(rates.items()))
     other = next((n for n, r in rates.items() if abs(r - rate) > 1e-3 * rate), None)
@@ -45,7 +45,7 @@ def common_frame_rate(recordings: dict[str, Path], fps: float) -> float:
 
 
 def read_recording(path: Path, side: int) -> Iterator[tuple[UInt8[Tensor, "h w 3"], tuple[int, int]]]:
-    """The frames of a recording in order, reduced to at most `side` pixels, and their width and height before."""
+    """The frames of a recording in order, reduced to a longest side of `side` pixels, with their original (w, h)."""
     if path.is_file():
         yield from read_reduced_video(path, side)
         return
@@ -55,7 +55,7 @@ def read_recording(path: Path, side: int) -> Iterator[tuple[UInt8[Tensor, "h w 3
 
 
 def limit_size(image: UInt8[Tensor, "h w 3"], side: int) -> UInt8[Tensor, "h2 w2 3"]:
-    """The image, reduced to at most `side` pixels by area averaging."""
+    """The image, reduced to a longest side of `side` pixels by area averaging."""
     height, width = image.shape[:2]
     shrink = min(1.0, side / max(height, width))
     if shrink == 1:

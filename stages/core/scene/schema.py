@@ -1,4 +1,4 @@
-"""Checks of what a file holds, made before memory is taken for it; each reader adds the table of its own format.
+"""Validation of files before memory is allocated for their contents; each reader adds the schema of its own format.
 
 They raise ValueError, which the reader turns into an InputError with the name of the file.
 """
@@ -24,13 +24,13 @@ PLY_WIDTHS = {"char": 1, "uchar": 1, "int8": 1, "uint8": 1, "short": 2, "ushort"
 
 
 def quote(value: object, limit: int = MAX_QUOTED) -> str:
-    """A value of a user's file for a message: printable, on one line, at most `limit` characters."""
+    """A value of a user's file for error messages: printable, on one line, at most `limit` characters."""
     line = "".join(c if c.isprintable() else "?" for c in str(value)[: limit + 1])
     return line if len(line) <= limit else f"{line[: limit - 3]}..."
 
 
 def reason(error: Exception) -> str:
-    """What an exception says, for a message: its type where that is needed to understand it, and its text."""
+    """The text of an exception for error messages; of a KeyError also its type."""
     return quote(repr(error) if isinstance(error, KeyError) else error, 120)
 
 
@@ -64,7 +64,7 @@ def text(value: object, what: str) -> str:
 
 
 def numbered(values: dict, what: str) -> dict[int, object]:
-    """The same values by whole number, as which their keys are written; ValueError for others, or one given twice."""
+    """The values by their keys, converted to integers; ValueError for other keys and for duplicates."""
     wrong = [key for key in values if not (key.isascii() and key.isdecimal() and len(key) < 10)]
     if wrong:
         raise ValueError(f"{what} is {quote(repr(wrong[0]), 40)}, not a whole number")
@@ -103,7 +103,7 @@ def table(value: object, what: str) -> dict:
 
 
 def parse_json(data: str, finite: bool = True) -> object:
-    """The value of a JSON text of bounded depth; `finite` refuses NaN, infinities and integers beyond 64 bits."""
+    """The value of a JSON text of bounded depth; `finite` rejects NaN, infinities and integers beyond 64 bits."""
     try:
         value = json.loads(data, **(FINITE if finite else {}))
     except RecursionError:
@@ -119,7 +119,7 @@ def parse_json(data: str, finite: bool = True) -> object:
 
 def read_json(path: Path) -> object:
     """The value of a JSON file (UTF-8) of bounded size and depth."""
-    if Path(path).exists() and not Path(path).is_file():  # a pipe would wait for ever
+    if Path(path).exists() and not Path(path).is_file():  # reading a pipe would block
         raise ValueError("it is not a file")
     size = Path(path).stat().st_size
     if size > MAX_JSON_BYTES:

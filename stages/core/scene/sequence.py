@@ -1,4 +1,4 @@
-"""When several fixed cameras filmed the motion of a scene."""
+"""Timing of the videos in which several fixed cameras filmed the motion of a scene."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ MAX_FRAMES = 10**6
 
 @dataclass(frozen=True)
 class FilmedSequence:
-    """The motion that begins with a scene, as filmed by cameras that do not move."""
+    """The motion whose first frame is a scene, filmed by several fixed cameras."""
 
-    fps: float  # frames a second, of all films
+    fps: float  # frame rate of all videos [1/s]
     frames: int  # from the release to rest, the first being the release
-    starts: dict[str, float]  # by camera: number of the frame that its film shows at the release, with fractions
+    starts: dict[str, float]  # by camera: frame number of its video at the release, with fractions
 
     def to_json(self) -> dict:
         """As stored in the header of scene.ply."""

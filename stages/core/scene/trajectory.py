@@ -45,7 +45,7 @@ DATASETS = {  # n Gaussians, k coefficients, o objects, p keypoints, t frames, c
     "keypoints/rest": Dataset("p 3"),
     "keypoints/object_id": Dataset("p", "int", 0, MAX_OBJECT_ID),
     "keypoints/positions": Dataset("t p 3"),
-    "binding/index": Dataset("b j", "int", -1),  # b is n, but where there are dense frames
+    "binding/index": Dataset("b j", "int", -1),  # b is n unless there are dense frames
     "binding/weight": Dataset("b j", low=-1e-3, high=1.001),
     "cameras/viewmats": Dataset("c 4 4"),
     "cameras/Ks": Dataset("c 3 3"),
@@ -58,7 +58,7 @@ DATASETS = {  # n Gaussians, k coefficients, o objects, p keypoints, t frames, c
 }
 SERIES = ("keypoints/positions", "objects/com", "objects/rotation")  # a row for each frame
 BUFFERED = 32  # frames that are compressed and written together
-ROUNDING = 1e-2  # of sums and lengths that are 1, as stored in 16-bit floats
+ROUNDING = 1e-2  # tolerance of weight sums and quaternion norms, which are stored in 16-bit floats
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,7 @@ class Trajectory:
     rotation: Float[Tensor, "t o 4"]  # w x y z, relative to the rest frame
     path: Path
     dense: bool = False  # whether the file has every Gaussian in every frame
-    field: FieldStart | None = None  # what the learned engine started from, where it made the motion
+    field: FieldStart | None = None  # initial conditions of the learned engine, if it simulated the motion
     confidence: Float[Tensor, "t o"] | None = None  # of a tracked motion, 0 where an object was lost; None: all certain
     plausibility: dict | None = None  # measures of the simulation, {"objects": {id: {name: x}}, name: x}
 
@@ -108,7 +108,7 @@ class Trajectory:
         return len(self.positions)
 
     def frame(self, t: int) -> Gaussians:
-        """All Gaussians in frame t, read from the file; only where `dense`."""
+        """All Gaussians in frame t, read from the file; requires `dense`. Raises InputError if the frame is damaged."""
         with h5py.File(self.path, "r") as file:
             names = [f"frames/{name}" for name in ("means", "quats", "scales")]
             try:
@@ -178,7 +178,7 @@ class TrajectoryWriter:
         self._file["forces/json"].resize(len(self._contents[1].forces), axis=0)
 
     def store_prompts(self, prompts: Sequence[dict]) -> None:
-        """Add to the applied prompts those that are new in this longer list, and write everything to the disk."""
+        """Append the prompts beyond those already stored, and flush the file."""
         self._write_buffer()
         self._raw.check()
         data = self._file["forces/json"]
@@ -190,23 +190,23 @@ class TrajectoryWriter:
         self._raw.check()
 
     def store_provenance(self, facts: dict) -> None:
-        """Write the provenance of the scene with what is known at the end."""
+        """Replace the provenance by one with facts that are known only at the end of the run."""
         self._file.attrs["provenance"] = json.dumps(facts)
         self._raw.check()
 
     def store_field(self, start: FieldStart | None) -> None:
-        """Write what the learned engine started from, if it did."""
+        """Write the initial conditions of the learned engine; None: another engine was used."""
         if start is not None:
             write_field_start(self._file, start)
             self._raw.check()
 
     def store_confidence(self, confidence: Float[Tensor, "t o"]) -> None:
-        """Store how certain a tracked motion is, as in Trajectory.confidence."""
+        """Store the confidence of a tracked motion, see Trajectory.confidence."""
         write_compressed(self._file, "objects/confidence", confidence.cpu().numpy())
         self._raw.check()
 
     def store_plausibility(self, measures: dict) -> None:
-        """Store what `ngff simulate` measured, a dict as in Trajectory.plausibility."""
+        """Store the plausibility measures of a simulation, see Trajectory.plausibility."""
         self._raw.check()
         self._file.attrs["plausibility"] = json.dumps(measures)
         self._raw.check()

@@ -19,7 +19,7 @@ from stages.core.backends import pick_device
 from stages.core.errors import InputError
 from stages.core.perception.voting import apply_votes, collect_votes
 from stages.core.scene.files import replacing
-from stages.core.scene.images import NOT_JUDGED, list_photos
+from stages.core.scene.images import IGNORE_LABEL, list_photos
 from stages.core.scene.scene import Scene
 from stages.core.scene.scene_ply import read_scene, write_scene
 from stages.evaluate.labels import compare, label_files, read_truth
@@ -111,7 +111,7 @@ def label_by_truth(scene: Scene, path: Path, labels: Path) -> Scene:
     blank = replace(scene, gaussians=blank, objects=())
     images = ((view, read_truth(file, scene.cameras, view)) for view, file in
               label_files(labels, path, scene.cameras).items())  # fmt: skip
-    votes = collect_votes(blank, ((view, torch.where(image == NOT_JUDGED, 0, image)) for view, image in images))
+    votes = collect_votes(blank, ((view, torch.where(image == IGNORE_LABEL, 0, image)) for view, image in images))
     return apply_votes(blank, votes, {}, str(labels))
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from stages.core.errors import InputError
 from stages.core.scene.cameras import Cameras
-from stages.core.scene.images import NOT_JUDGED, list_photos, read_labels
+from stages.core.scene.images import IGNORE_LABEL, list_photos, read_labels
 from stages.core.scene.lens import Undistortion
 from stages.core.scene.scene import Scene
 from stages.segment.masks import read_names
@@ -54,8 +54,8 @@ class FilmMasks:
 def find_film_masks(folder: Path, scene: Scene, films: list[str]) -> FilmMasks:
     """The label images of films. Numbers are ids of the scene's objects, or of names.json those of the same name.
 
-    Pixels of NOT_JUDGED say nothing, unless it is the number of an object. Raises InputError for a folder without label
-    images of any of the films.
+    Pixels of IGNORE_LABEL are unknown, unless it is the number of an object. Raises InputError for a folder without
+    label images of any of the films.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -63,7 +63,7 @@ def find_film_masks(folder: Path, scene: Scene, films: list[str]) -> FilmMasks:
     by_name, names = {o.name: row for row, o in enumerate(scene.objects)}, read_names(folder)
     rows = {o.id: row for row, o in enumerate(scene.objects)}
     rows |= {number: by_name[name] for number, name in names.items() if name in by_name}
-    masks = FilmMasks(folder, rows, frozenset({NOT_JUDGED} - rows.keys()))
+    masks = FilmMasks(folder, rows, frozenset({IGNORE_LABEL} - rows.keys()))
     if not any(masks.of_film(name) for name in films):
         raise InputError(f"{folder}: holds no folder of label images named as a film, such as {Path(films[0]).stem}")
     return masks

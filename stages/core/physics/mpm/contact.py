@@ -17,7 +17,7 @@ from stages.core.physics.mpm.particle_rows import ParticleRows
 
 
 class BodyContact(NamedTuple):
-    """What contact between bodies depends on, for each body."""
+    """Parameters of the contact between bodies, one value per body."""
 
     full_cell: Float[Tensor, "s"]  # mass of a filled grid cell, as it is on the grid [kg]
     friction: Float[Tensor, "s"]  # Coulomb coefficient

@@ -1,7 +1,7 @@
-"""The substeps of a frame as one CUDA graph, with a list of active grid blocks that the host never reads.
+"""The substeps of a frame as one CUDA graph: what the GPU schedules have in common.
 
-What the schedules for a GPU have in common. They also run on the CPU, on one thread, where tests compare them with the
-schedule for CPUs.
+The host does not synchronise with the device within a frame. The schedules also run on the CPU, on one thread, for
+comparison in tests.
 """
 
 from __future__ import annotations

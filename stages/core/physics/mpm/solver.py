@@ -125,7 +125,7 @@ def substep_rate(dx: float, speed: float, viscosity: float = 0.0) -> float:
 
 @dataclass(frozen=True)
 class SolverOptions:
-    """What moves in the box besides the particles, and how the solver computes.
+    """Colliders, damping and schedule of the solver.
 
     `damping` (0 to 1) removes that fraction of the symmetric part of C at every transfer (RPIC). `schedule` is one of
 
@@ -251,10 +251,10 @@ class Solver:
         return torch.where(self.rows.lost == NEVER, -1, self.rows.lost)
 
     def _body_contact(self, particles: Particles, sizes: Sequence[int]) -> BodyContact:
-        """Mass of a filled cell and friction of each body; the friction of its particles is equal.
+        """Mass of a filled cell and friction of each body, whose particles all have the same friction.
 
-        Where a body has several densities the mass is that of the lightest part: denser parts then count as full a
-        fraction of a cell outside their surface, and touch others there.
+        If a body has several densities, the mass is that of the lightest part: cells at the surface of denser parts
+        then count as filled a fraction of a cell further out, where contact begins.
         """
         density = particles.mass / particles.volume * torch.where(particles.held > 0, KINEMATIC_MASS_FACTOR, 1.0)
         full = torch.stack([part.min() for part in density.split(sizes)]) * self.dx**3

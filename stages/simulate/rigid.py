@@ -49,9 +49,7 @@ CONTACT_SUBSTEPS = 12  # substeps during which bodies that collide touch
 REST_SPEED = 0.1  # normal speed below which contacts do not rebound [units]; a fall of 0.5 % of the smallest object
 PARTS_DAMPING = 0.4  # least damping ratio of bodies of several parts, of which contacts come and go during a collision
 IMPEDANCE = 0.99  # of a contact: 1 would be exact, but the forces between several contacts undetermined
-SLIP_LEVER = (
-    5  # a force accelerates the slip of a contact at most this much more than along its normal: 4 at a rod's end
-)
+SLIP_LEVER = 5  # how much more a force may accelerate the slip of a contact than along its normal; 4 at a rod's end
 MAX_SUBSTEPS = 5_000  # in a frame
 MAX_TRAVEL = 0.05  # of the smallest object's size in a substep, so that nothing passes through it
 ON_FLOOR = 0.02  # gap up to which a body stands on the floor [units]

@@ -292,7 +292,9 @@ def bench_physics(
     only: Annotated[
         list[str], typer.Option(help="experiments by group or pattern, such as slide or 'boxes/0.3m*'; repeatable")
     ] = [],  # noqa: B006
-    engine: Annotated[list[str], typer.Option(help="rigid | mpm | ngff; repeatable; default: all")] = [],  # noqa: B006
+    engine: Annotated[
+        list[str], typer.Option(help="auto | rigid | mpm | ngff; repeatable; default: the last three")
+    ] = [],  # noqa: B006
     quality: Annotated[str, typer.Option(help="quality of MPM: draft | normal | high")] = "draft",
     keypoints: Annotated[int, typer.Option(help="keypoints per object")] = 256,
     weights: Annotated[

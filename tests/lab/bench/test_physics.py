@@ -45,6 +45,13 @@ def test_measured_rows_are_kept_and_the_page_marks_failures(tmp_path):
     assert "| fall/gravity=25 | fall [m] | 0.180 | (9.000) |" in page and "`rigid` 1 of 2" in page
 
 
+def test_auto_is_measured_with_the_engine_that_it_takes(tmp_path):
+    (line, total) = run(tmp_path / "p.json", PhysicsBenchOptions(only=("fall/gravity=25",), engines=("auto",)))
+    row = json.loads((tmp_path / "p.json").read_text())["rows"]["fall/gravity=25"]["auto"]
+    assert row["passes"] and row["engines"] == ["rigid"] and " auto rigid " in line and total.startswith("auto: 1 of 1")
+    assert "| `auto` |" in (tmp_path / "p.md").read_text()
+
+
 def test_unknown_experiments_and_engines_are_errors():
     with pytest.raises(InputError, match="groups are bounce, boxes, collision"):
         PhysicsBenchOptions(only=("jump",)).chosen()

@@ -5,15 +5,22 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from typer import Argument, Option
 
 from ngff_cli.options import AsJson, CommandGroup, Device, Seed, print_results
 from stages.core.errors import InputError
 
 app = typer.Typer(cls=CommandGroup, no_args_is_help=True, rich_markup_mode=None)
 
-Out = Annotated[Path | None, typer.Option("-o", "--out", help="JSON file to write the results to")]
-Holdout = Annotated[int, typer.Option(help="hold out every N-th photo")]
-Compiled = Annotated[bool, typer.Option("--compiled", help="compile the training step first; for GPUs")]
+Out = Annotated[Path | None, Option("-o", "--out", help="JSON file to write the results to")]
+OutKept = Annotated[Path, Option("-o", "--out", help="JSON file of results; existing ones are kept")]
+OutWithTable = Annotated[
+    Path, Option("-o", "--out", help="results (.json), existing ones are kept; also writes a table (.md)")
+]
+Holdout = Annotated[int, Option(help="hold out every N-th photo")]
+Views = Annotated[int, Option(help="number of cameras per scene")]
+Keypoints = Annotated[int, Option(help="keypoints per object")]
+Compiled = Annotated[bool, Option("--compiled", help="compile the training step first; for GPUs")]
 
 
 @app.callback()
@@ -24,9 +31,9 @@ def _bench() -> None:
 @app.command("mpm")
 def bench_mpm(
     device: Device = "auto",
-    particles: Annotated[list[int], typer.Option(help="particles per scene; repeatable")] = [6_144, 20_000, 250_000],  # noqa: B006
-    scenes: Annotated[int, typer.Option(help="scenes per batch; 0: chosen for the device")] = 0,
-    frames: Annotated[int, typer.Option(help="frames of 200 substeps to time")] = 10,
+    particles: Annotated[list[int], Option(help="particles per scene; repeatable")] = [6_144, 20_000, 250_000],  # noqa: B006
+    scenes: Annotated[int, Option(help="scenes per batch; 0: chosen for the device")] = 0,
+    frames: Annotated[int, Option(help="frames of 200 substeps to time")] = 10,
     out: Out = None,
     as_json: AsJson = False,
 ) -> None:
@@ -39,10 +46,10 @@ def bench_mpm(
 
 @app.command("raster")
 def bench_raster(
-    device: Annotated[str, typer.Option(help="cpu, or cuda to compare with gsplat on a GPU")] = "cpu",
+    device: Annotated[str, Option(help="cpu, or cuda to compare with gsplat on a GPU")] = "cpu",
     out: Out = None,
-    repeat: Annotated[int, typer.Option(help="timed calls of each; the fastest counts")] = 15,
-    shrink: Annotated[int, typer.Option(help="factor by which the numbers of Gaussians and pixels are reduced")] = 1,
+    repeat: Annotated[int, Option(help="timed calls of each; the fastest counts")] = 15,
+    shrink: Annotated[int, Option(help="factor by which the numbers of Gaussians and pixels are reduced")] = 1,
     as_json: AsJson = False,
 ) -> None:
     """Rasteriser: on the CPU compared with a per-pixel rasteriser, on a GPU (--device cuda) with gsplat."""
@@ -60,16 +67,14 @@ def bench_raster(
 
 @app.command("reconstruct")
 def bench_reconstruct(
-    sets: Annotated[list[Path], typer.Argument(metavar="PHOTOSET...", help="folders with images/ and cameras.json")],
-    out: Annotated[Path, typer.Option("-o", "--out", help="JSON file of results; existing ones are kept")] = Path(
-        "reconstruct.json"
-    ),
-    quality: Annotated[str, typer.Option(help="quality of the reconstruction")] = "normal",
+    sets: Annotated[list[Path], Argument(metavar="PHOTOSET...", help="folders with images/ and cameras.json")],
+    out: OutKept = Path("reconstruct.json"),
+    quality: Annotated[str, Option(help="quality of the reconstruction")] = "normal",
     holdout: Holdout = 8,
     device: Device = "auto",
-    matcher: Annotated[str, typer.Option(help="features matched between photos: sift | aliked-lightglue")] = "sift",
+    matcher: Annotated[str, Option(help="features matched between photos: sift | aliked-lightglue")] = "sift",
     cameras: Annotated[
-        bool, typer.Option("--cameras", help="stop after the cameras are estimated, to compare matchers")
+        bool, Option("--cameras", help="stop after the cameras are estimated, to compare matchers")
     ] = False,
     as_json: AsJson = False,
 ) -> None:
@@ -83,18 +88,18 @@ def bench_reconstruct(
 @app.command("chain")
 def bench_chain(
     photos: Annotated[
-        Path | None, typer.Argument(metavar="PHOTOS", help="folder of photos or a video; not with --table")
+        Path | None, Argument(metavar="PHOTOS", help="folder of photos or a video; not with --table")
     ] = None,
     table: Annotated[
         bool,
-        typer.Option("--table", help="instead of PHOTOS: the paper's table, from rendered photos of 3 and of 6 toys"),
+        Option("--table", help="instead of PHOTOS: the paper's table, from rendered photos of 3 and of 6 toys"),
     ] = False,
-    quality: Annotated[str, typer.Option(help="quality of the reconstruction")] = "normal",
+    quality: Annotated[str, Option(help="quality of the reconstruction")] = "normal",
     device: Device = "auto",
-    steps: Annotated[int, typer.Option(help="frames of the video")] = 100,
-    refine: Annotated[bool, typer.Option(help="complete the objects before they are simulated")] = True,
-    repeat: Annotated[int, typer.Option(help="runs in one process; the first one loads kernels")] = 2,
-    commands: Annotated[bool, typer.Option(help="also run each stage as a command")] = True,
+    steps: Annotated[int, Option(help="frames of the video")] = 100,
+    refine: Annotated[bool, Option(help="complete the objects before they are simulated")] = True,
+    repeat: Annotated[int, Option(help="runs in one process; the first one loads kernels")] = 2,
+    commands: Annotated[bool, Option(help="also run each stage as a command")] = True,
     out: Out = None,
     as_json: AsJson = False,
 ) -> None:
@@ -117,15 +122,13 @@ def bench_chain(
 
 @app.command("track")
 def bench_track(
-    sequences: Annotated[int, typer.Option(help="number of sequences")] = 5,
-    first: Annotated[int, typer.Option(help="seed of the first sequence")] = 0,
-    width: Annotated[int, typer.Option(help="width of the videos [px]")] = 240,
-    frames: Annotated[int, typer.Option(help="frames of motion")] = 50,
+    sequences: Annotated[int, Option(help="number of sequences")] = 5,
+    first: Annotated[int, Option(help="seed of the first sequence")] = 0,
+    width: Annotated[int, Option(help="width of the videos [px]")] = 240,
+    frames: Annotated[int, Option(help="frames of motion")] = 50,
     reconstructed: Annotated[
         str,
-        typer.Option(
-            help="track scenes reconstructed from the videos at this quality and segmented; default: true scenes"
-        ),
+        Option(help="track scenes reconstructed from the videos at this quality and segmented; default: true scenes"),
     ] = "",
     device: Device = "auto",
     out: Out = None,
@@ -142,14 +145,12 @@ def bench_track(
 
 @app.command("appearance")
 def bench_appearance(
-    sets: Annotated[list[Path], typer.Argument(metavar="PHOTOSET...", help="folders of photos, or with images/")],
-    out: Annotated[Path, typer.Option("-o", "--out", help="JSON file of results; existing ones are kept")] = Path(
-        "appearance.json"
-    ),
-    quality: Annotated[str, typer.Option(help="quality of the reconstruction")] = "high",
+    sets: Annotated[list[Path], Argument(metavar="PHOTOSET...", help="folders of photos, or with images/")],
+    out: OutKept = Path("appearance.json"),
+    quality: Annotated[str, Option(help="quality of the reconstruction")] = "high",
     holdout: Holdout = 8,
     models: Annotated[
-        Path | None, typer.Option(help="folder in which cameras and sparse points are cached between runs")
+        Path | None, Option(help="folder in which cameras and sparse points are cached between runs")
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -163,10 +164,10 @@ def bench_appearance(
 @app.command("pi3")
 def bench_pi3(
     device: Device = "auto",
-    views: Annotated[list[int], typer.Option(help="photos per pass; repeatable")] = [1, 8, 20, 50],  # noqa: B006
-    size: Annotated[int, typer.Option(help="side of the photos, a multiple of 14 [px]")] = 448,
-    repeat: Annotated[int, typer.Option(help="timed passes of each")] = 3,
-    splats: Annotated[bool, typer.Option("--splats", help="include the Gaussian head")] = False,
+    views: Annotated[list[int], Option(help="photos per pass; repeatable")] = [1, 8, 20, 50],  # noqa: B006
+    size: Annotated[int, Option(help="side of the photos, a multiple of 14 [px]")] = 448,
+    repeat: Annotated[int, Option(help="timed passes of each")] = 3,
+    splats: Annotated[bool, Option("--splats", help="include the Gaussian head")] = False,
     out: Out = None,
     as_json: AsJson = False,
 ) -> None:
@@ -181,33 +182,27 @@ def bench_pi3(
 def bench_segment(
     sets: Annotated[
         list[Path] | None,
-        typer.Argument(
-            metavar="PHOTOSET...", show_default=False, help="with --photos: folders of photos, or with images/"
-        ),
+        Argument(metavar="PHOTOSET...", show_default=False, help="with --photos: folders of photos, or with images/"),
     ] = None,
     photos: Annotated[
-        bool, typer.Option("--photos", help="real photo sets with label images, instead of synthetic scenes")
+        bool, Option("--photos", help="real photo sets with label images, instead of synthetic scenes")
     ] = False,
     labels: Annotated[
         Path | None,
-        typer.Option(
+        Option(
             help="with --photos: folder of label images, or of such folders named as the sets; default: PHOTOSET/labels"
         ),
     ] = None,
     labelled: Annotated[
         Path | None,
-        typer.Option(
-            help="with --photos: folder of labelled scenes PHOTOSET.ply; missing ones are made and kept there"
-        ),
+        Option(help="with --photos: folder of labelled scenes PHOTOSET.ply; missing ones are made and kept there"),
     ] = None,
-    scenes: Annotated[int, typer.Option(help="scenes of each kind: separate objects, and objects in contact")] = 4,
-    views: Annotated[int, typer.Option(help="number of cameras per scene")] = 24,
+    scenes: Annotated[int, Option(help="scenes of each kind: separate objects, and objects in contact")] = 4,
+    views: Views = 24,
     weights: Annotated[
-        Path | None, typer.Option(help="weights of network backends; default: searched; without any, they are skipped")
+        Path | None, Option(help="weights of network backends; default: searched; without any, they are skipped")
     ] = None,
-    reconstruct: Annotated[
-        bool, typer.Option("--reconstruct", help="also segment scenes reconstructed from photos")
-    ] = False,
+    reconstruct: Annotated[bool, Option("--reconstruct", help="also segment scenes reconstructed from photos")] = False,
     out: Out = None,
     device: Device = "auto",
     as_json: AsJson = False,
@@ -235,8 +230,8 @@ def bench_segment(
 
 @app.command("refine")
 def bench_refine(
-    scenes: Annotated[int, typer.Option(help="number of scenes of separate objects")] = 4,
-    views: Annotated[int, typer.Option(help="number of cameras per scene")] = 24,
+    scenes: Annotated[int, Option(help="number of scenes of separate objects")] = 4,
+    views: Views = 24,
     out: Out = None,
     as_json: AsJson = False,
 ) -> None:
@@ -249,23 +244,23 @@ def bench_refine(
 
 @app.command("dynamics")
 def bench_dynamics(
-    data: Annotated[Path | None, typer.Option(help="folder of motions, as `ngff-lab dataset` writes")] = None,
+    data: Annotated[Path | None, Option(help="folder of motions, as `ngff-lab dataset` writes")] = None,
     weights: Annotated[
-        Path | None, typer.Option(help="folder of weights to evaluate (.safetensors); default: those in the package")
+        Path | None, Option(help="folder of weights to evaluate (.safetensors); default: those in the package")
     ] = None,
     out: Annotated[
-        Path, typer.Option("-o", "--out", help="results (.json), existing ones are kept; also writes a table and plots")
+        Path, Option("-o", "--out", help="results (.json), existing ones are kept; also writes a table and plots")
     ] = Path("results.json"),
     nudged: Annotated[
-        Path | None, typer.Option(help="data set of the same scenes with initial positions shifted by 1 mm")
+        Path | None, Option(help="data set of the same scenes with initial positions shifted by 1 mm")
     ] = None,
     results: Annotated[
-        Path | None, typer.Option("--from", help="only draw the table and plots of these results (.json)")
+        Path | None, Option("--from", help="only draw the table and plots of these results (.json)")
     ] = None,
-    keypoints: Annotated[int, typer.Option(help="keypoints per object")] = 256,
-    limit: Annotated[int, typer.Option(help="scenes of each split; 0: all")] = 0,
+    keypoints: Keypoints = 256,
+    limit: Annotated[int, Option(help="scenes of each split; 0: all")] = 0,
     mpm: Annotated[
-        int, typer.Option(help="scenes of each split to simulate for the row mpm-estimated; 0: omit that row")
+        int, Option(help="scenes of each split to simulate for the row mpm-estimated; 0: omit that row")
     ] = 100,
     device: Device = "auto",
     as_json: AsJson = False,
@@ -286,20 +281,14 @@ def bench_dynamics(
 
 @app.command("physics")
 def bench_physics(
-    out: Annotated[
-        Path, typer.Option("-o", "--out", help="results (.json), existing ones are kept; also writes a table (.md)")
-    ] = Path("physics.json"),
+    out: OutWithTable = Path("physics.json"),
     only: Annotated[
-        list[str], typer.Option(help="experiments by group or pattern, such as slide or 'boxes/0.3m*'; repeatable")
+        list[str], Option(help="experiments by group or pattern, such as slide or 'boxes/0.3m*'; repeatable")
     ] = [],  # noqa: B006
-    engine: Annotated[
-        list[str], typer.Option(help="auto | rigid | mpm | ngff; repeatable; default: the last three")
-    ] = [],  # noqa: B006
-    quality: Annotated[str, typer.Option(help="quality of MPM: draft | normal | high")] = "draft",
-    keypoints: Annotated[int, typer.Option(help="keypoints per object")] = 256,
-    weights: Annotated[
-        Path | None, typer.Option(help="weights of the learned engine; default: those in the package")
-    ] = None,
+    engine: Annotated[list[str], Option(help="auto | rigid | mpm | ngff; repeatable; default: the last three")] = [],  # noqa: B006
+    quality: Annotated[str, Option(help="quality of MPM: draft | normal | high")] = "draft",
+    keypoints: Keypoints = 256,
+    weights: Annotated[Path | None, Option(help="weights of the learned engine; default: those in the package")] = None,
     device: Device = "auto",
     as_json: AsJson = False,
 ) -> None:
@@ -315,17 +304,15 @@ def bench_physics(
 
 @app.command("ablation")
 def bench_ablation(
-    data: Annotated[Path, typer.Option(help="folder of motions, as `ngff-lab dataset` writes")],
-    out: Annotated[
-        Path, typer.Option("-o", "--out", help="results (.json), existing ones are kept; also writes a table (.md)")
-    ] = Path("ablation.json"),
-    only: Annotated[str, typer.Option(help="names of the ablations, such as full,reaction; default: all")] = "",
-    steps: Annotated[int, typer.Option(help="training steps of each ablation")] = 1500,
-    batch: Annotated[int, typer.Option(help="scenes per training step")] = 64,
-    keypoints: Annotated[int, typer.Option(help="keypoints per object")] = 256,
-    horizons: Annotated[str, typer.Option(help="rollout length of each training phase [frames]")] = "8,20",
-    groups: Annotated[str, typer.Option(help="groups of scenes to train on")] = "3_0..3_8",
-    test: Annotated[str, typer.Option(help="group of scenes to test on")] = "3_9",
+    data: Annotated[Path, Option(help="folder of motions, as `ngff-lab dataset` writes")],
+    out: OutWithTable = Path("ablation.json"),
+    only: Annotated[str, Option(help="names of the ablations, such as full,reaction; default: all")] = "",
+    steps: Annotated[int, Option(help="training steps of each ablation")] = 1500,
+    batch: Annotated[int, Option(help="scenes per training step")] = 64,
+    keypoints: Keypoints = 256,
+    horizons: Annotated[str, Option(help="rollout length of each training phase [frames]")] = "8,20",
+    groups: Annotated[str, Option(help="groups of scenes to train on")] = "3_0..3_8",
+    test: Annotated[str, Option(help="group of scenes to test on")] = "3_9",
     compiled: Compiled = False,
     seed: Seed = 0,
     device: Device = "auto",
@@ -343,14 +330,14 @@ def bench_ablation(
 
 @app.command("rollout")
 def bench_rollout(
-    out: Annotated[Path, typer.Option("-o", "--out", help="JSON file to write the results to")] = Path("rollout.json"),
+    out: Annotated[Path, Option("-o", "--out", help="JSON file to write the results to")] = Path("rollout.json"),
     weights: Annotated[
-        Path | None, typer.Option(help="weights of the force field (.safetensors); default: those in the package")
+        Path | None, Option(help="weights of the force field (.safetensors); default: those in the package")
     ] = None,
-    keypoints: Annotated[int, typer.Option(help="keypoints of each of the three objects")] = 2048,
-    steps: Annotated[int, typer.Option(help="number of 0.02 s steps")] = 100,
-    scenes: Annotated[list[int], typer.Option(help="scenes per batch; repeatable; default: 1, and 64 on a GPU")] = [],  # noqa: B006
-    repeat: Annotated[int, typer.Option(help="timed rollouts, of which the median counts")] = 5,
+    keypoints: Annotated[int, Option(help="keypoints of each of the three objects")] = 2048,
+    steps: Annotated[int, Option(help="number of 0.02 s steps")] = 100,
+    scenes: Annotated[list[int], Option(help="scenes per batch; repeatable; default: 1, and 64 on a GPU")] = [],  # noqa: B006
+    repeat: Annotated[int, Option(help="timed rollouts, of which the median counts")] = 5,
     device: Device = "auto",
     as_json: AsJson = False,
 ) -> None:
@@ -365,9 +352,9 @@ def bench_rollout(
 
 @app.command("register")
 def bench_register(
-    only: Annotated[str, typer.Option(help="names of the objects, such as ball,duck; default: all ten")] = "",
-    trials: Annotated[int, typer.Option(help="partial views of each object")] = 10,
-    out: Annotated[Path | None, typer.Option("-o", "--out", help="JSON file to write all trials to")] = None,
+    only: Annotated[str, Option(help="names of the objects, such as ball,duck; default: all ten")] = "",
+    trials: Annotated[int, Option(help="partial views of each object")] = 10,
+    out: Out = None,
     seed: Seed = 0,
     device: Device = "auto",
     as_json: AsJson = False,
@@ -381,10 +368,12 @@ def bench_register(
 
 @app.command("complete")
 def bench_complete(
-    scene: Annotated[
-        list[str], typer.Option(help="names of the objects of a scene, separated by commas; repeatable")
-    ] = ["panda,duck", "can,miku", "bowl,phone"],  # noqa: B006
-    known: Annotated[str, typer.Option(help="names of the objects in the library; default: all ten")] = "",
+    scene: Annotated[list[str], Option(help="names of the objects of a scene, separated by commas; repeatable")] = [  # noqa: B006
+        "panda,duck",
+        "can,miku",
+        "bowl,phone",
+    ],
+    known: Annotated[str, Option(help="names of the objects in the library; default: all ten")] = "",
     out: Out = None,
     seed: Seed = 0,
     as_json: AsJson = False,
@@ -398,12 +387,12 @@ def bench_complete(
 
 @app.command("fit")
 def bench_fit(
-    scenes: Annotated[int, typer.Option(help="number of scenes")] = 20,
-    only: Annotated[str, typer.Option(help="slide | bounce | collision | soft; default: all four, alternating")] = "",
-    noise: Annotated[float, typer.Option(help="standard deviation of the tracks' errors [m]")] = 0.002,
-    evaluations: Annotated[int, typer.Option(help="largest number of simulations of a scene")] = 1500,
-    minutes: Annotated[float, typer.Option(help="longest time of a scene [min]")] = 10.0,
-    workers: Annotated[int, typer.Option(help="processes")] = 2,
+    scenes: Annotated[int, Option(help="number of scenes")] = 20,
+    only: Annotated[str, Option(help="slide | bounce | collision | soft; default: all four, alternating")] = "",
+    noise: Annotated[float, Option(help="standard deviation of the tracks' errors [m]")] = 0.002,
+    evaluations: Annotated[int, Option(help="largest number of simulations of a scene")] = 1500,
+    minutes: Annotated[float, Option(help="longest time of a scene [min]")] = 10.0,
+    workers: Annotated[int, Option(help="processes")] = 2,
     out: Out = None,
     seed: Seed = 0,
     device: Device = "auto",

@@ -1,28 +1,29 @@
-"""Commands of `ngff-lab` that make data: objects, backgrounds, the example, and the data set GSCollision."""
+"""Commands of `ngff-lab` that make data: objects, backgrounds, the example, the data set GSCollision, and clutter."""
 
 from pathlib import Path
 from typing import Annotated
 
 import typer
+from typer import Argument, Option
 
-from ngff_cli.options import AsJson, Device, print_results
+from ngff_cli.options import AsJson, Device, Seed, print_results
 from stages.lab.assets.objects import ObjectsOptions
 
 app = typer.Typer()
 
-Groups = Annotated[str, typer.Option(help="groups of scenes, such as 3_0..3_9,4")]
-Sheet = Annotated[Path | None, typer.Option(help="contact sheet to write (.jpg)")]
-Dx = Annotated[float, typer.Option(help="grid spacing [m]; published: 0.02")]
-ParticleSpacing = Annotated[float, typer.Option(help="spacing of particles on a surface [m]")]
+Groups = Annotated[str, Option(help="groups of scenes, such as 3_0..3_9,4")]
+Sheet = Annotated[Path | None, Option(help="contact sheet to write (.jpg)")]
+Dx = Annotated[float, Option(help="grid spacing [m]; published: 0.02")]
+ParticleSpacing = Annotated[float, Option(help="spacing of particles on a surface [m]")]
 Substep = Annotated[
-    float, typer.Option(help="longest simulation time step [s], shortened for stiff light objects; published: 1e-4")
+    float, Option(help="longest simulation time step [s], shortened for stiff light objects; published: 1e-4")
 ]
 
 
 @app.command()
 def example(
-    out: Annotated[Path, typer.Argument(metavar="FOLDER", help="folder for photos/, masks/ and the ground truth")],
-    photos: Annotated[int, typer.Option(help="number of photos")] = 26,
+    out: Annotated[Path, Argument(metavar="FOLDER", help="folder for photos/, masks/ and the ground truth")],
+    photos: Annotated[int, Option(help="number of photos")] = 26,
 ) -> None:
     """Generate the example: rendered photos of toys on a table, with true cameras, labels and motion."""
     from stages.lab.assets.example import make_example
@@ -32,43 +33,41 @@ def example(
 
 @app.command()
 def dataset(
-    out: Annotated[Path, typer.Argument(metavar="FOLDER", help="folder of the data set; existing files are kept")],
+    out: Annotated[Path, Argument(metavar="FOLDER", help="folder of the data set; existing files are kept")],
     groups: Annotated[
-        str, typer.Option(help="groups of scenes; more_0..more_9 are further scenes of three objects")
+        str, Option(help="groups of scenes; more_0..more_9 are further scenes of three objects")
     ] = "3_0..3_9,4,6",
     only: Annotated[
         str,
-        typer.Option(
+        Option(
             help="parts, separated by commas: motions, scenes, mpm, initial, dynamic, "
             "objects, backgrounds, scene_configs"
         ),
     ] = "motions",
-    frames: Annotated[int, typer.Option(help="frames per scene, of 0.02 s each")] = 100,
-    keypoints: Annotated[int, typer.Option(help="keypoints per object in motions")] = 2048,
+    frames: Annotated[int, Option(help="frames per scene, of 0.02 s each")] = 100,
+    keypoints: Annotated[int, Option(help="keypoints per object in motions")] = 2048,
     dx: Dx = 0.02,
     spacing: ParticleSpacing = 0.009,
     substep: Substep = 1e-4,
     nudge: Annotated[
-        float, typer.Option(help="shift of each object's initial position [m]; see `statistics --against`")
+        float, Option(help="shift of each object's initial position [m]; see `statistics --against`")
     ] = 0.0,
     exact: Annotated[
         bool,
-        typer.Option(
+        Option(
             "--exact",
             help="bitwise identical results in every run on a GPU, in twice the time; always on for mpm and dynamic",
         ),
     ] = False,
-    views: Annotated[str, typer.Option(help="views of the videos: some of 0,4,...,96, or all")] = "all",
-    backgrounds: Annotated[
-        str, typer.Option(help="backgrounds of the videos: some of table0,...,table7, or all")
-    ] = "all",
-    resolution: Annotated[int, typer.Option(help="side of the videos [px]")] = 448,
-    shard: Annotated[str, typer.Option(help="i/n: the i-th of n equal parts of the groups")] = "1/1",
-    limit: Annotated[int, typer.Option(help="scenes of each group; 0: all")] = 0,
-    check: Annotated[bool, typer.Option("--check", help="only compare all files with their checksums")] = False,
+    views: Annotated[str, Option(help="views of the videos: some of 0,4,...,96, or all")] = "all",
+    backgrounds: Annotated[str, Option(help="backgrounds of the videos: some of table0,...,table7, or all")] = "all",
+    resolution: Annotated[int, Option(help="side of the videos [px]")] = 448,
+    shard: Annotated[str, Option(help="i/n: the i-th of n equal parts of the groups")] = "1/1",
+    limit: Annotated[int, Option(help="scenes of each group; 0: all")] = 0,
+    check: Annotated[bool, Option("--check", help="only compare all files with their checksums")] = False,
     ray: Annotated[
         str,
-        typer.Option(
+        Option(
             help="Ray cluster: local, auto or an address. All machines need the same ngff and "
             "FOLDER at the same path; each makes one group at a time"
         ),
@@ -94,12 +93,12 @@ def dataset(
 
 @app.command("import")
 def import_(
-    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="mpm/<group>/<scene> of GSCollision, with %04d.h5")],
-    out: Annotated[Path, typer.Option("-o", "--out", help="trajectory to write (.h5)")] = Path("traj.h5"),
+    folder: Annotated[Path, Argument(metavar="FOLDER", help="mpm/<group>/<scene> of GSCollision, with %04d.h5")],
+    out: Annotated[Path, Option("-o", "--out", help="trajectory to write (.h5)")] = Path("traj.h5"),
     scene: Annotated[
-        Path | None, typer.Option(help="its point_cloud.ply; default: searched in scenes/<group>/<scene>/ next to mpm/")
+        Path | None, Option(help="its point_cloud.ply; default: searched in scenes/<group>/<scene>/ next to mpm/")
     ] = None,
-    keypoints: Annotated[int, typer.Option(help="maximum number of keypoints per object")] = 2048,
+    keypoints: Annotated[int, Option(help="maximum number of keypoints per object")] = 2048,
 ) -> None:
     """Convert a published scene of GSCollision to a trajectory for `ngff render` and `ngff evaluate`."""
     from stages.lab.dataset.importer import run
@@ -109,15 +108,15 @@ def import_(
 
 @app.command()
 def statistics(
-    data: Annotated[Path, typer.Argument(metavar="FOLDER", help="data set, as `ngff-lab dataset` writes")],
-    out: Annotated[Path | None, typer.Option("-o", "--out", help="JSON file to write the results to")] = None,
+    data: Annotated[Path, Argument(metavar="FOLDER", help="data set, as `ngff-lab dataset` writes")],
+    out: Annotated[Path | None, Option("-o", "--out", help="JSON file to write the results to")] = None,
     groups: Groups = "3_0..3_9,4,6",
-    keypoints: Annotated[int, typer.Option(help="maximum number of keypoints per object")] = 512,
+    keypoints: Annotated[int, Option(help="maximum number of keypoints per object")] = 512,
     against: Annotated[
-        Path | None, typer.Option(help="the same scenes made with --nudge: report the predictability instead")
+        Path | None, Option(help="the same scenes made with --nudge: report the predictability instead")
     ] = None,
     sheet: Sheet = None,
-    scenes: Annotated[int, typer.Option(help="rows of the contact sheet, one scene each")] = 10,
+    scenes: Annotated[int, Option(help="rows of the contact sheet, one scene each")] = 10,
     device: Device = "auto",
     as_json: AsJson = False,
 ) -> None:
@@ -139,8 +138,8 @@ def statistics(
 
 @app.command()
 def study(
-    out: Annotated[Path | None, typer.Option("-o", "--out", help="JSON file to write the results to")] = None,
-    scenes: Annotated[int, typer.Option(help="number of scenes")] = 24,
+    out: Annotated[Path | None, Option("-o", "--out", help="JSON file to write the results to")] = None,
+    scenes: Annotated[int, Option(help="number of scenes")] = 24,
     device: Device = "auto",
     as_json: AsJson = False,
 ) -> None:
@@ -152,21 +151,21 @@ def study(
 
 @app.command()
 def objects(
-    out: Annotated[Path, typer.Argument(metavar="FOLDER", help="output folder, with one folder per object")],
+    out: Annotated[Path, Argument(metavar="FOLDER", help="output folder, with one folder per object")],
     only: Annotated[
-        str, typer.Option(help="names of the objects, such as ball,duck; default: all ten")
+        str, Option(help="names of the objects, such as ball,duck; default: all ten")
     ] = ObjectsOptions.only,
     meshes: Annotated[
         list[Path],
-        typer.Option(
+        Option(
             "--from",
             metavar="MESH",
             help="textured mesh (.obj .glb .ply ...), or folder of meshes, to convert instead; repeatable",
         ),
     ] = [],  # noqa: B006
-    count: Annotated[int, typer.Option(help="approximate number of Gaussians of a mesh")] = ObjectsOptions.count,
-    up: Annotated[str, typer.Option(help="up axis of a mesh: auto | x | y | z")] = ObjectsOptions.up,
-    light: Annotated[bool, typer.Option(help="bake soft light into the colours of a mesh")] = ObjectsOptions.light,
+    count: Annotated[int, Option(help="approximate number of Gaussians of a mesh")] = ObjectsOptions.count,
+    up: Annotated[str, Option(help="up axis of a mesh: auto | x | y | z")] = ObjectsOptions.up,
+    light: Annotated[bool, Option(help="bake soft light into the colours of a mesh")] = ObjectsOptions.light,
     sheet: Sheet = None,
 ) -> None:
     """Generate the ten objects of the data set as Gaussians, or convert meshes to such objects."""
@@ -178,8 +177,8 @@ def objects(
 
 @app.command()
 def backgrounds(
-    out: Annotated[Path, typer.Argument(metavar="FOLDER", help="output folder, with one folder per background")],
-    only: Annotated[str, typer.Option(help="names of the backgrounds, such as table0,table3; default: all eight")] = "",
+    out: Annotated[Path, Argument(metavar="FOLDER", help="output folder, with one folder per background")],
+    only: Annotated[str, Option(help="names of the backgrounds, such as table0,table3; default: all eight")] = "",
     sheet: Sheet = None,
 ) -> None:
     """Generate the eight tables of the data set with their surroundings as Gaussians."""
@@ -191,29 +190,29 @@ def backgrounds(
 
 @app.command()
 def heldout(
-    out: Annotated[Path, typer.Argument(metavar="FOLDER", help="folder of a data set; existing files are kept")],
+    out: Annotated[Path, Argument(metavar="FOLDER", help="folder of a data set; existing files are kept")],
     meshes: Annotated[
         list[Path],
-        typer.Option(
+        Option(
             "--from",
             metavar="MESH",
             help="mesh (.obj .glb .ply ...), or folder of meshes, that replaces the eight shapes; repeatable",
         ),
     ] = [],  # noqa: B006
-    scenes: Annotated[int, typer.Option(help="number of scenes")] = 100,
-    objects: Annotated[int, typer.Option(help="objects per scene")] = 3,
-    frames: Annotated[int, typer.Option(help="frames per scene, of 0.02 s each")] = 100,
-    keypoints: Annotated[int, typer.Option(help="keypoints per object")] = 2048,
+    scenes: Annotated[int, Option(help="number of scenes")] = 100,
+    objects: Annotated[int, Option(help="objects per scene")] = 3,
+    frames: Annotated[int, Option(help="frames per scene, of 0.02 s each")] = 100,
+    keypoints: Annotated[int, Option(help="keypoints per object")] = 2048,
     dx: Dx = 0.02,
     spacing: ParticleSpacing = 0.009,
     substep: Substep = 1e-4,
-    size: Annotated[float, typer.Option(help="longest side of a mesh [m]")] = 0.5,
+    size: Annotated[float, Option(help="longest side of a mesh [m]")] = 0.5,
     shapes: Annotated[
-        int, typer.Option(help="number of random objects for training, written as the group varied; 0: none")
+        int, Option(help="number of random objects for training, written as the group varied; 0: none")
     ] = 0,
-    solid: Annotated[bool, typer.Option("--solid", help="fill the random objects: the group solid")] = False,
+    solid: Annotated[bool, Option("--solid", help="fill the random objects: the group solid")] = False,
     rotations: Annotated[
-        int, typer.Option(help="random rotations of the ten objects for training, written as the group turned; 0: none")
+        int, Option(help="random rotations of the ten objects for training, written as the group turned; 0: none")
     ] = 0,
     device: Device = "auto",
 ) -> None:
@@ -225,3 +224,49 @@ def heldout(
         size=size, shapes=shapes, solid=solid, rotations=rotations, device=device,
     )  # fmt: skip
     print(run(out, options, meshes))
+
+
+@app.command()
+def clutter(
+    out: Annotated[Path, Argument(metavar="FOLDER", help="folder of scenes; finished ones are kept")],
+    meshes: Annotated[
+        list[Path],
+        Option(
+            "--from",
+            metavar="MESH",
+            help="textured mesh (.obj .glb .ply ...), or folder of meshes, added to the generated objects; repeatable",
+        ),
+    ] = [],  # noqa: B006
+    count: Annotated[int, Option(help="number of scenes")] = 20,
+    first: Annotated[int, Option(help="number of the first scene")] = 0,
+    photos: Annotated[int, Option(help="photos of each scene")] = 12,
+    size: Annotated[int, Option(help="longest side of a photo [px]")] = 512,
+    observations: Annotated[
+        int,
+        Option(
+            help="write this many samples of a reconstruction-noise model per scene instead of photos; 0: write photos"
+        ),
+    ] = 0,
+    reconstruct: Annotated[
+        bool,
+        Option(
+            "--reconstruct",
+            help="reconstruct the photos with their true cameras, and write the labelled result instead",
+        ),
+    ] = False,
+    exact: Annotated[bool, Option("--exact", help="write the true Gaussians, labelled, not photos")] = False,
+    seed: Seed = 0,
+    device: Device = "auto",
+) -> None:
+    """Generate labelled scenes of objects on tables, desks, shelves and floors, to train the segmentation.
+
+    Without options, run `ngff reconstruct NNNN/photos --cameras NNNN/transforms.json -o NNNN/scene.ply` on each scene.
+    """
+    from stages.lab.clutter.scenes import ClutterOptions, run
+
+    options = ClutterOptions(
+        count=count, first=first, photos=photos, size=size, observations=observations, reconstruct=reconstruct,
+        exact=exact, seed=seed, device=device,
+    )  # fmt: skip
+    for line in run(out, options, meshes):
+        print(line, flush=True)

@@ -14,7 +14,9 @@ import typer
 
 from stages.core.backends import MAX_SEED
 from stages.core.errors import InputError
+from stages.reconstruct.options import QUALITY_PRESETS
 
+QUALITY_HELP = " | ".join(QUALITY_PRESETS)
 SceneIn = Annotated[Path, typer.Argument(metavar="SCENE.ply", help="scene to read (.ply)", show_default=False)]
 Device = Annotated[str, typer.Option(help="auto | cpu | cuda | cuda:N")]
 Seed = Annotated[

@@ -16,7 +16,8 @@ from stages.core.scene.schema import MAX_JSON_DEPTH, parse_json, quote, text
 from stages.core.scene.trajectory import read_trajectory
 from stages.lab.fuzz import campaign
 from stages.lab.fuzz.cases import GOOD, Examples, result_of, run_here
-from stages.lab.fuzz.kinds import KINDS, Kind, example_scene, write_trajectory
+from stages.lab.fuzz.examples import example_scene, write_trajectory
+from stages.lab.fuzz.kinds import KINDS, Kind
 
 
 def test_a_thousand_damaged_files(tmp_path):

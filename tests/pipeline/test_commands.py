@@ -56,7 +56,7 @@ def test_exactly_six_commands_in_the_order_of_the_pipeline():
 
 @pytest.mark.parametrize("command", PIPELINE)
 def test_every_field_of_the_options_class_is_an_option_with_the_same_default(command):
-    options = getattr(commands, f"{command.capitalize()}Options")
+    options = getattr(inspect.getmodule(getattr(commands, command)), f"{command.capitalize()}Options")
     given = {n: p for n, p in inspect.signature(getattr(commands, command)).parameters.items() if n not in NOT_OPTIONS}
     fields = {f.name: f.default for f in dataclasses.fields(options)}
     assert list(given) == list(fields)

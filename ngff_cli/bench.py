@@ -202,7 +202,10 @@ def bench_segment(
     weights: Annotated[
         Path | None, Option(help="weights of network backends; default: searched; without any, they are skipped")
     ] = None,
-    reconstruct: Annotated[bool, Option("--reconstruct", help="also segment scenes reconstructed from photos")] = False,
+    reconstruct: Annotated[
+        bool,
+        Option("--reconstruct", help="also segment scenes reconstructed from photos, by geometry and by the network"),
+    ] = False,
     out: Out = None,
     device: Device = "auto",
     as_json: AsJson = False,

@@ -3,12 +3,13 @@
 A scene has five of the ten objects on one of the eight tables, apart or touching; `segment` gets the true Gaussians
 without labels, and the cameras. Label images are the true ones or corrupted ones; the vote over views is compared with
 labels without a vote. SAM 2.1 is included where its weights are installed. On request rendered photos of each scene are
-reconstructed and segmented, and the IoU is measured in pixels.
+reconstructed and segmented by the backends without prompts, and the IoU is measured in pixels.
 """
 
 from __future__ import annotations
 
 import json
+import logging
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -29,10 +30,11 @@ from stages.lab.assets.tabletops import ARRANGEMENTS, tabletop
 from stages.lab.bench import common as bench
 from stages.lab.bench.reconstructed_scene import reconstruct_from_renders, visible_labels
 from stages.segment.boxes import segment as boxes_segment
-from stages.segment.geometric import segment
 from stages.segment.options import BACKENDS, SegmentOptions
 
+log = logging.getLogger(__name__)
 ERROR_RATES = (0.0, 0.2, 0.4)  # fraction of wrong objects and pixels in each photo
+AUTOMATIC = ("geometric", "learned")  # backends that need no prompts and no further weights
 MASK_SHIFT = 20  # standard deviation of the shift of masks at an error rate of 1 [px]
 
 
@@ -131,6 +133,11 @@ def segment_by_network(scene: Scene, name: str, options: SegmentBenchOptions) ->
     return choose(BACKENDS, name)(scene, chosen).gaussians.object_id
 
 
+def segment_without_prompts(scene: Scene, name: str, device: str) -> Scene:
+    """The scene with the objects that a backend of AUTOMATIC finds with its default options."""
+    return choose(BACKENDS, name)(scene, SegmentOptions(backend=name, device=device))
+
+
 def available_networks(options: SegmentBenchOptions) -> tuple[list[str], list[str]]:
     """Names of the network backends whose weights are present, and a message for each of the others.
 
@@ -155,8 +162,9 @@ def measure(kind: str, index: int, networks: list[str], options: SegmentBenchOpt
     scene = tabletop(kind, index, options.views)
     truth = scene.gaussians.object_id
     blank = replace(scene, gaussians=replace(scene.gaussians, object_id=torch.zeros_like(truth)), objects=())
-    methods = {"geometric": lambda: segment(blank, SegmentOptions()).gaussians.object_id,
-            "boxes": lambda: segment_by_boxes(blank, truth), **segment_by_masks(blank, truth, index)}  # fmt: skip
+    methods = {name: lambda name=name: segment_without_prompts(blank, name, options.device).gaussians.object_id
+               for name in AUTOMATIC}  # fmt: skip
+    methods |= {"boxes": lambda: segment_by_boxes(blank, truth), **segment_by_masks(blank, truth, index)}
     for name in networks:
         methods[name] = lambda name=name: segment_by_network(blank, name, options)
     rows = []
@@ -167,22 +175,30 @@ def measure(kind: str, index: int, networks: list[str], options: SegmentBenchOpt
     return rows
 
 
-def measure_reconstructed(kind: str, index: int, photos: int) -> dict:
-    """A row for geometric segmentation of a reconstruction: IoU in the pixels of the photos with cameras; total time.
+def measure_reconstructed(kind: str, index: int, options: SegmentBenchOptions) -> list[dict]:
+    """A row for each backend of AUTOMATIC on one reconstruction: IoU in the pixels of the photos with cameras.
 
-    The IoU is 0 where no camera could be estimated.
+    The seconds are without the reconstruction. The IoU is 0 where no camera could be estimated or nothing segmented.
     """
-    scene, start = tabletop(kind, index, photos), time.perf_counter()
+    scene, made, names = tabletop(kind, index, options.views), None, ()
     try:
         with tempfile.TemporaryDirectory() as folder:
-            found = segment(reconstruct_from_renders(scene, Path(folder)), SegmentOptions())
-        names, labels = found.cameras.names, visible_labels(found, found.cameras.names)
-        truth = visible_labels(scene, names)
-    except InputError:
-        names, truth = (), scene.gaussians.object_id
-        labels = torch.zeros_like(truth)
-    scores = _scores(scene, labels, truth, start)
-    return {"kind": kind, "scene": index, "way": "reconstructed", **scores, "placed": len(names)}
+            made = reconstruct_from_renders(scene, Path(folder))
+        names = made.cameras.names
+    except InputError as error:
+        log.warning("%s %d: %s", kind, index, error)
+    truth = visible_labels(scene, names) if names else scene.gaussians.object_id
+    rows = []
+    for name in AUTOMATIC:
+        start, labels = time.perf_counter(), torch.zeros_like(truth)
+        try:
+            if made is not None:
+                labels = visible_labels(segment_without_prompts(made, name, options.device), names)
+        except InputError as error:
+            log.warning("%s %d, %s: %s", kind, index, name, error)
+        scores = _scores(scene, labels, truth, start)
+        rows.append({"kind": kind, "scene": index, "way": f"reconstructed, {name}", **scores, "placed": len(names)})
+    return rows
 
 
 def _scores(scene: Scene, found: Tensor, truth: Tensor, start: float) -> dict:
@@ -201,7 +217,7 @@ def run(out: Path | None = None, options: SegmentBenchOptions = SegmentBenchOpti
     for kind in ARRANGEMENTS:
         for i in tqdm(range(options.scenes), desc=kind, unit="scene"):
             rows += measure(kind, i, networks, options)
-            rows += [measure_reconstructed(kind, i, options.views)] if options.reconstruct else []
+            rows += measure_reconstructed(kind, i, options) if options.reconstruct else []
             for row in rows[-len({r["way"] for r in rows}) :]:
                 listed = ", ".join(f"{n} {v:.2f}" for n, v in row["iou"].items())
                 yield f"{kind} {i}, {row['way']}: mean {row['mean']:.3f}; {listed}"

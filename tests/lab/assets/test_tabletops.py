@@ -120,8 +120,9 @@ def test_reconstruction_is_measured_in_the_registered_photos(monkeypatch):
         write_scene(out, Scene(g, cameras=scene.cameras[list(range(1, 8))].transformed(move), floor=0.0))
 
     monkeypatch.setattr(reconstructed_scene, "reconstruct", perfect)
-    row = bench_segment.measure_reconstructed("apart", 0, 8)
-    assert row["placed"] == 7 and row["mean"] > 0.9
+    rows = bench_segment.measure_reconstructed("apart", 0, bench_segment.SegmentBenchOptions(views=8))
+    assert [row["way"] for row in rows] == ["reconstructed, geometric", "reconstructed, learned"]
+    assert all(row["placed"] == 7 and row["mean"] > 0.9 for row in rows)
 
 
 def test_failed_reconstruction_finds_nothing(monkeypatch):
@@ -129,8 +130,8 @@ def test_failed_reconstruction_finds_nothing(monkeypatch):
         raise InputError(f"{photos}: no two photos overlap")
 
     monkeypatch.setattr(reconstructed_scene, "reconstruct", failing)
-    row = bench_segment.measure_reconstructed("apart", 0, 8)
-    assert row["placed"] == 0 and row["mean"] == 0.0 and len(row["iou"]) == OBJECTS_PER_SCENE
+    for row in bench_segment.measure_reconstructed("apart", 0, bench_segment.SegmentBenchOptions(views=8)):
+        assert row["placed"] == 0 and row["mean"] == 0.0 and len(row["iou"]) == OBJECTS_PER_SCENE
 
 
 def test_network_backends_with_weights_take_part(tmp_path, monkeypatch):

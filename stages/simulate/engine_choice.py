@@ -23,9 +23,11 @@ def with_engine(
 ) -> SimulateOptions:
     """The options with an engine in place of `auto`.
 
-    MPM if an object yields or flows, or has parts of different materials; else the learned field if the weight of one
-    compresses it by more than MAX_RIGID_SAG, or the speed that the prompts give it by more than MAX_RIGID_IMPACT; else
-    rigid bodies. Options of learned engines (weights, an integrator) select the learned field.
+    MPM if an object yields or flows, or has parts of different materials. Rigid bodies if no weight compresses an
+    object by more than MAX_RIGID_SAG, nor the speed that the prompts give it by more than MAX_RIGID_IMPACT. Of the two
+    engines for soft bodies MPM if the prompts move an object sideways or the impact is what compresses it, since the
+    learned field has next to no friction and rebound; else the learned field, which keeps bodies in contact better.
+    Options of learned engines (weights, an integrator) select it.
     """
     if options.engine != AUTO:
         return options
@@ -38,14 +40,17 @@ def with_engine(
             > MAX_RIGID_SAG]  # fmt: skip
     crushed = [o for o in scene.objects if impact(materials[o.id].material, _speed(scene, o.id, prompts, options))
                > MAX_RIGID_IMPACT]  # fmt: skip
+    sideways = _sideways(prompts) if soft or crushed else []
     if plastic:
         engine, reason = "mpm", f"object {plastic[0].id} yields or flows"
     elif uneven:
         engine, reason = "mpm", f"object {uneven[0].id} has parts of different materials"
+    elif sideways:
+        engine, reason = "mpm", f"object {(soft or crushed)[0].id} is soft, and friction acts on object {sideways[0]}"
     elif soft:
         engine, reason = "ngff", f"object {soft[0].id} is compressed by more than {MAX_RIGID_SAG:.0%} by its own weight"
     elif crushed:
-        engine, reason = "ngff", f"an impact compresses object {crushed[0].id} by more than {MAX_RIGID_IMPACT:.0%}"
+        engine, reason = "mpm", f"an impact compresses object {crushed[0].id} by more than {MAX_RIGID_IMPACT:.0%}"
     else:
         engine, reason = "rigid", "all objects are stiff"
     log.info("--engine %s, as %s", engine, reason)
@@ -84,6 +89,12 @@ def _speed(scene: Scene, object_id: int, prompts: ForcePrompts, options: Simulat
     lift = unit * max(prompts.lift.get(object_id, 0.0), 0.0)
     thrown = unit * math.hypot(*prompts.velocity.get(object_id, (0.0,)))
     return math.sqrt(thrown**2 + 2 * abs(options.gravity) * lift)
+
+
+def _sideways(prompts: ForcePrompts) -> list[int]:
+    """Ids of the objects that the prompts throw or push horizontally."""
+    pushes = [*prompts.velocity.items(), *((f.object_id, f.force) for f in prompts.forces)]
+    return [id for id, v in pushes if any(v[:2])]
 
 
 def _height(scene: Scene, keypoints: Keypoints, object_id: int) -> float:

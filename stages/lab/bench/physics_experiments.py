@@ -190,6 +190,13 @@ def _slides() -> Iterator[Experiment]:
     yield Experiment("slide/slow friction=0.1", (run,), lambda t: float(path(t, 0)[-1, 0]), value,
                      "distance from .3 m/s [m]", value, SLIDES)  # fmt: skip
 
+    for mu in (0.1, 0.3, 0.6):  # a body that its weight compresses by 2.1 %
+        run = Run((block((0.3, 0.2, 0.08), (0, 0, 0.04), E=1e5, density=2700.0),),
+                  {"velocity": ("object=1 1,0,0",), "friction": mu, "steps": 76})  # fmt: skip
+        value = 1 / (2 * mu * G)
+        yield Experiment(f"slide/soft friction={mu:g}", (run,), lambda t: float(path(t, 0)[-1, 0]), value,
+                         "distance from 1 m/s [m]", value, SLIDES)  # fmt: skip
+
 
 def _slopes() -> Iterator[Experiment]:
     for degrees, mu in product((10, 25, 40), (0.0, 0.3, 0.8)):
@@ -279,6 +286,11 @@ def _rebounds() -> Iterator[Experiment]:
         run = Run((replace(body, loss=loss),), {"lift": ("0.5",), "dt": 0.01, "steps": 100})
         yield Experiment(f"rebound/{name} loss={loss:g}", (run,), lambda t: rebound(t, 0.5),
                          math.exp(-math.pi * loss / 2), "restitution", 1.0, TOLERANCES)  # fmt: skip
+
+    soft = replace(ball(0.15, (0, 0, 0.15)), E=2e5, density=600.0)  # the impact compresses it by a sixth
+    run = Run((soft,), {"lift": ("0.5",), "dt": 0.01, "steps": 100})
+    yield Experiment("rebound/soft ball loss=0.15", (run,), lambda t: rebound(t, 0.5), math.exp(-math.pi * 0.15 / 2),
+                     "restitution", 1.0, TOLERANCES)  # fmt: skip
 
 
 def _bounces() -> Iterator[Experiment]:

@@ -1,7 +1,9 @@
 """Measures of implausible motion: penetration, energy gain, creep and spread, taken in every frame.
 
-penetration: deepest keypoint of an object inside another one or below the floor, beyond the depth at rest, relative to
-the smaller height of both. A keypoint outside its own mean surface, by noise or as a floater, counts by so much less.
+penetration: deepest keypoint of an object inside another one or below the floor, beyond the depth at rest and the one
+to which --lift put it there, of which a warning tells, relative to the smaller height of both. A keypoint outside its
+own mean surface, by noise or as a floater, counts by so much less; in other objects, so does one below the floor at
+rest, where bodies end.
 creep: speed in the last quarter of the time of an object that is slow in all of it [its size / s].
 spread: largest change of the root mean square distance of an object's keypoints from their mean, relative to rest.
 energy_gain: largest mechanical energy of all objects above that at the start, or after the last force, relative to the
@@ -49,6 +51,7 @@ class PlausibilityMonitor:
         self._at_rest = cache(self._rest_depth)
         count = len(scene.objects)
         self.penetration, self._partner = np.zeros(count), [""] * count
+        self._put_into: dict[tuple[int, int], float] = {}  # depth in the first frame, of rows
         self._spread = np.zeros(count)
         self._frames, self._com = 0, deque[np.ndarray](maxlen=max(2, options.steps // 4))  # of the last quarter
         self._energy: list[float] = []
@@ -87,7 +90,10 @@ class PlausibilityMonitor:
         for a, b in zip(*np.nonzero(near), strict=True):
             if a != b:
                 local = (points[a][self._few[a]] - com[b]) @ R[b] + self._origin[b]
-                depth = float(self._depth(a, b, local).max()) - self._at_rest(a, b)
+                depth = float(self._depth(a, b, local).max())
+                if self._frames == 1:  # where the prompts put it
+                    self._put_into[a, b] = depth
+                depth -= max(self._at_rest(a, b), self._put_into.get((a, b), 0.0))
                 smaller = min(self._height[a], self._height[b])
                 for i, other in ((a, b), (b, a)):
                     o = self._scene.objects[other]
@@ -102,7 +108,15 @@ class PlausibilityMonitor:
 
     def _depth(self, a: int, b: int, x: np.ndarray) -> np.ndarray:
         """Depths of some of the keypoints of object a, at x (k, 3) in the rest frame of object b, in that one."""
-        return self._surface(b).depth(x) - self._outside(a)[self._few[a]]
+        few = self._few[a]
+        outside = self._outside(a)[few] if self._floor is None else np.maximum(
+            self._outside(a)[few], self._floor - self._rest[a][few, 2])  # fmt: skip
+        return self._body_depth(b, x) - outside
+
+    def _body_depth(self, row: int, x: np.ndarray) -> np.ndarray:
+        """Depths of points (k, 3) in the body of an object at rest, which ends at the floor."""
+        depth = self._surface(row).depth(x)
+        return depth if self._floor is None else np.minimum(depth, x[:, 2] - self._floor)
 
     def _surface_of(self, row: int) -> SolidSurface:
         return solid_surface(self._scene, self._scene.objects[row].id, self._options.seed)
@@ -145,6 +159,13 @@ class PlausibilityMonitor:
         materials = choose_materials(self._scene.objects, self._options.material, self._options.materials)
         other = "rigid or mpm" if self._options.engine not in ("rigid", "mpm") else (
             "mpm" if self._options.engine == "rigid" else "rigid, or a higher --quality")  # fmt: skip
+        for a, b in sorted({(min(pair), max(pair)) for pair in self._put_into}):
+            depth = max(self._put_into.get(p, 0.0) - self._at_rest(*p) for p in ((a, b), (b, a)))
+            share = depth / min(self._height[a], self._height[b])
+            if share > BOUNDS["penetration"]:
+                one, into = self._scene.objects[a], self._scene.objects[b]
+                log.warning("--lift puts object %d (%s) and object %d (%s) into each other by %.0f %% of the smaller "
+                            "height", one.id, one.name, into.id, into.name, 100 * share)  # fmt: skip
         for row, o in enumerate(self._scene.objects):
             found = result["objects"][str(o.id)]
             what = f"object {o.id} ({o.name})"

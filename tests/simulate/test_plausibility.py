@@ -2,6 +2,7 @@
 
 import logging
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -63,6 +64,37 @@ def test_depth_of_penetration(scene, caplog):
     assert "object 2 (upper) sinks into object 1 (lower)" in caplog.text
     below, _ = measured(scene, ramp(0.5, 0.0, -0.25))
     assert below["objects"]["2"]["penetration"] == pytest.approx(0.25, abs=0.01)
+
+
+def test_overlap_by_a_lift_is_warned_of_and_not_counted(scene, caplog):
+    """The lower cube is lifted by .06 into the upper one, and sinks in by .03 more."""
+    keypoints = choose_keypoints(scene, 256)
+    lower = (keypoints.object_id == 1)[:, None]
+    monitor = PlausibilityMonitor(scene, keypoints, ForcePrompts(lift={1: 0.06}), SimulateOptions())
+    com = torch.tensor([[0.0, 0.0, 0.1], [0.0, 0.0, 0.3]])
+    for height in (0.06, 0.06, 0.09):
+        up = torch.tensor([0.0, 0.0, height])
+        shift = torch.stack([up, torch.zeros(3)])
+        monitor.add(FrameState(keypoints.rest + lower * up, com + shift, torch.tensor([[1.0, 0, 0, 0]] * 2)))
+        expected = 0.15 if height > 0.06 else 0.0
+        assert monitor.result()["objects"]["1"]["penetration"] == pytest.approx(expected, abs=0.03)
+    monitor.warn(monitor.result())
+    (text,) = re.findall(r"object 1 .lower. and object 2 .upper. into each other by (\d+) %", caplog.text)
+    assert int(text) == pytest.approx(30, abs=3)
+
+
+def test_bodies_end_at_the_floor(scene):
+    """The lower cube, below a floor in the middle of the upper one, rises into the lower half of that."""
+    keypoints = choose_keypoints(scene, 256)
+    lower = (keypoints.object_id == 1)[:, None]
+    com = torch.tensor([[0.0, 0.0, 0.1], [0.0, 0.0, 0.3]])
+    for floor, depth in ((0.3, 0.0), (0.0, 0.4)):
+        monitor = PlausibilityMonitor(scene, keypoints, ForcePrompts(), SimulateOptions(floor=floor))
+        for height in (0.0, 0.08):
+            up = torch.tensor([0.0, 0.0, height])
+            shift = torch.stack([up, torch.zeros(3)])
+            monitor.add(FrameState(keypoints.rest + lower * up, com + shift, torch.tensor([[1.0, 0, 0, 0]] * 2)))
+        assert monitor.result()["objects"]["2"]["penetration"] == pytest.approx(depth, abs=0.03)
 
 
 def test_overlap_at_rest_is_not_counted(scene):

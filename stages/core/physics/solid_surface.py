@@ -2,7 +2,8 @@
 
 Samples are the object's Gaussians within a voxel of the surface of the voxels, with normals from the smoothed voxels,
 and faces of voxels where there are none, as at undersides. The signed distance is the mean of those to the tangent
-planes of the nearest samples. Source: Hoppe et al. 1992, "Surface reconstruction from unorganized points".
+planes of the nearest samples, where its projection on the nearest one's is near that sample. Source: Hoppe et al. 1992,
+"Surface reconstruction from unorganized points".
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from stages.core.scene.cached import cached_in_scene
 from stages.core.scene.scene import Scene
 
 VOXELS_ALONG = 48  # voxels along the longest side of an object
+MOST_ALONG = 96  # of one that is larger than the others, so that it is as accurate as these
 BARE = 3.0  # distance to the samples beyond which faces of voxels are added [voxels], which are a third of the spacing
 NEAREST = 8  # samples that give a distance, of which those count
 SAME_FACE = 0.8  # whose normals have at least this cosine to that of the nearest one
@@ -49,6 +51,8 @@ class SolidSurface:
             faces, outward = faces[bare], outward[bare]
         self.points, self.normals = np.concatenate([near, faces]), np.concatenate([normals, outward])
         self._tree = cKDTree(self.points)
+        apart = self._tree.query(self.points[:: -(-len(self.points) // 2000)], 2)[0][:, 1]
+        self._spacing = max(h, float(np.median(apart)))  # of samples, within which a tangent plane is known to continue
 
     def depth(self, x: np.ndarray) -> np.ndarray:
         """Depths (k,) of points (k, 3) below the surface, negative outside."""
@@ -57,10 +61,12 @@ class SolidSurface:
         if len(close):
             distance, row = self._tree.query(x[close], NEAREST)
             row = np.minimum(row, len(self.points) - 1)
-            normals = self.normals[row]
+            normals, below = self.normals[row], self.points[row] - x[close, None]
             agree = (normals * normals[:, :1]).sum(-1) > SAME_FACE
-            fine = (((self.points[row] - x[close, None]) * normals).sum(-1) * agree).sum(1) / agree.sum(1)
-            known = distance[:, 0] < 2 * self.h
+            each = (below * normals).sum(-1)
+            fine = (each * agree).sum(1) / agree.sum(1)
+            beside = distance[:, 0] ** 2 - each[:, 0] ** 2  # squared distance of its projection to the nearest sample
+            known = (distance[:, 0] < 2 * self.h) & (beside < self._spacing**2)
             out[close[known]] = fine[known].clip(out[close[known]] - self.h, out[close[known]] + self.h)
         return out
 
@@ -87,8 +93,17 @@ class SolidSurface:
 @cached_in_scene
 def solid_surface(scene: Scene, object_id: int, seed: int = 0) -> SolidSurface:
     """The surface of an object. Raises InputError for one without any usable Gaussian."""
-    voxels, h = filled_voxels(scene, object_id, VOXELS_ALONG, seed)
+    size = {o.id: _size(scene, o.id) for o in scene.objects}
+    along = VOXELS_ALONG * size[object_id] / max(float(np.median(list(size.values()))), 1e-12)
+    voxels, h = filled_voxels(scene, object_id, round(min(max(along, VOXELS_ALONG), MOST_ALONG)), seed)
     g = scene.gaussians.to("cpu")[(scene.gaussians.object_id == object_id).cpu()]
     means = g.means[usable(g)]
     means = means[inliers(means)] if len(means) else means
     return SolidSurface(voxels.double().numpy(), h, means.double().numpy())
+
+
+def _size(scene: Scene, object_id: int) -> float:
+    """Longest side of an object's Gaussians, without the outermost percent."""
+    means = scene.gaussians.means[scene.gaussians.object_id == object_id].cpu().double().numpy()
+    means = means[np.isfinite(means).all(1)]
+    return float(np.subtract(*np.quantile(means, [0.99, 0.01], axis=0)).max()) if len(means) else 0.0

@@ -17,7 +17,7 @@ from stages.core.scene.cached import cached_in_scene
 from stages.core.scene.scene import Scene
 
 VOXELS_ALONG = 48  # voxels along the longest side of an object
-MOST_ALONG = 96  # of one that is larger than the others, so that it is as accurate as these
+MOST_ALONG = 96  # of one that is larger than the others, so that it is as accurate as these where it touches them
 BARE = 3.0  # distance to the samples beyond which faces of voxels are added [voxels], which are a third of the spacing
 NEAREST = 8  # samples that give a distance, of which those count
 SAME_FACE = 0.8  # whose normals have at least this cosine to that of the nearest one
@@ -93,17 +93,24 @@ class SolidSurface:
 @cached_in_scene
 def solid_surface(scene: Scene, object_id: int, seed: int = 0) -> SolidSurface:
     """The surface of an object. Raises InputError for one without any usable Gaussian."""
-    size = {o.id: _size(scene, o.id) for o in scene.objects}
-    along = VOXELS_ALONG * size[object_id] / max(float(np.median(list(size.values()))), 1e-12)
-    voxels, h = filled_voxels(scene, object_id, round(min(max(along, VOXELS_ALONG), MOST_ALONG)), seed)
+    voxels, h = filled_voxels(scene, object_id, _voxels_along(scene, object_id), seed)
     g = scene.gaussians.to("cpu")[(scene.gaussians.object_id == object_id).cpu()]
     means = g.means[usable(g)]
     means = means[inliers(means)] if len(means) else means
     return SolidSurface(voxels.double().numpy(), h, means.double().numpy())
 
 
-def _size(scene: Scene, object_id: int) -> float:
-    """Longest side of an object's Gaussians, without the outermost percent."""
-    means = scene.gaussians.means[scene.gaussians.object_id == object_id].cpu().double().numpy()
-    means = means[np.isfinite(means).all(1)]
-    return float(np.subtract(*np.quantile(means, [0.99, 0.01], axis=0)).max()) if len(means) else 0.0
+def _voxels_along(scene: Scene, object_id: int) -> int:
+    """Number of voxels along an object: more where it is larger than the others and its Gaussians are as dense."""
+    size, means = {}, {}
+    for o in scene.objects:
+        x = scene.gaussians.means[scene.gaussians.object_id == o.id].cpu().double().numpy()
+        means[o.id] = x[np.isfinite(x).all(1)]
+        ends = np.quantile(means[o.id], [0.99, 0.01], axis=0) if len(means[o.id]) else np.zeros((2, 3))
+        size[o.id] = max(float((ends[0] - ends[1]).max()), 1e-12)
+    own = means[object_id]
+    some = own[:: -(-max(len(own), 1) // 2000)]
+    spacing = float(np.median(cKDTree(own).query(some, 2)[0][:, 1])) if len(own) > 1 else np.inf
+    most = min(MOST_ALONG, size[object_id] / max(spacing, 1e-12))
+    ratio = size[object_id] / float(np.median(list(size.values())))
+    return round(max(VOXELS_ALONG, min(VOXELS_ALONG * ratio, most)))

@@ -6,6 +6,8 @@ import sys
 from collections import Counter
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).resolve().parents[2]
 CORE = ["errors", "backends", "geometry", "scene", "kernels", "raster", "perception", "physics", "models", "player"]
 STAGES = {"reconstruct", "segment", "refine", "simulate", "render", "evaluate"}
@@ -29,8 +31,11 @@ def imported_folders(tree: ast.Module) -> set[str]:
     return {folder(name) for name in names if name.startswith("stages.")}
 
 
-FILES = sorted(p for p in (ROOT / "stages").rglob("*.py") if p.parent not in (ROOT / "stages", ROOT / "stages/core"))
-TREES = {".".join(p.relative_to(ROOT).with_suffix("").parts): ast.parse(p.read_text()) for p in FILES}
+@pytest.fixture(scope="module")
+def trees() -> dict[str, ast.Module]:
+    """Syntax trees by module name."""
+    files = (p for p in (ROOT / "stages").rglob("*.py") if p.parent not in (ROOT / "stages", ROOT / "stages/core"))
+    return {".".join(p.relative_to(ROOT).with_suffix("").parts): ast.parse(p.read_text()) for p in sorted(files)}
 
 
 def allowed_imports(home: str) -> set[str]:
@@ -40,18 +45,18 @@ def allowed_imports(home: str) -> set[str]:
     return {*above, home, *(STAGES if home == "lab" else ())}
 
 
-def test_folders_import_only_from_folders_above_them():
-    violations = {module: extra for module, tree in TREES.items()
+def test_folders_import_only_from_folders_above_them(trees):
+    violations = {module: extra for module, tree in trees.items()
                   if (extra := imported_folders(tree) - allowed_imports(folder(module)))}  # fmt: skip
     assert not violations
 
 
-def test_no_file_outside_the_list_of_folders():
-    assert {folder(module) for module in TREES} <= {"lab", *STAGES, *(f"core.{name}" for name in CORE)}
+def test_no_file_outside_the_list_of_folders(trees):
+    assert {folder(module) for module in trees} <= {"lab", *STAGES, *(f"core.{name}" for name in CORE)}
 
 
-def test_class_names_are_unique():
-    names = Counter(node.name for tree in TREES.values() for node in tree.body if isinstance(node, ast.ClassDef))
+def test_class_names_are_unique(trees):
+    names = Counter(node.name for tree in trees.values() for node in tree.body if isinstance(node, ast.ClassDef))
     assert not [name for name, count in names.items() if count > 1]
 
 

@@ -106,7 +106,7 @@ def measure(case: FitCase, options: FitBenchOptions) -> dict:
     fit_options = MaterialFitOptions(engine=case.engine, keypoints=KEYPOINTS, evaluations=options.evaluations,
                              minutes=options.minutes, workers=options.workers, device=options.device)  # fmt: skip
     fit = solve(pose_problem(scene, truth, replace(case.seen, velocity={}), fit_options), fit_options)
-    found, _ = fitted(fit.problem.parameters, fit.accepted_point(), fit.problem.materials)
+    found, _ = fitted(fit.problem.parameters, fit.accepted, fit.problem.materials)
     other = _motion(scene, keypoints, case.other, case.materials, simulate)
     rmse = [float((_motion(scene, keypoints, case.other, m, simulate) - other).square().sum(-1).mean().sqrt())
             for m in (fit.problem.materials, found)]  # fmt: skip

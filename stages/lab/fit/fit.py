@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import logging
-from dataclasses import dataclass
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,11 +15,11 @@ from stages.core.scene.files import provenance, replacing
 from stages.lab.fit.options import MaterialFitOptions
 from stages.lab.fit.parameters import AXES, QUANTITIES, Parameter, as_json, fitted
 from stages.lab.fit.problem import Problem, read_problem
-from stages.lab.fit.search import deviations, search, simulations
+from stages.lab.fit.search import SMALLEST_ERROR, Estimate, search, settled, simulations
 
 log = logging.getLogger(__name__)
 NOISE_MARGIN = 1.1  # on the variance of the track's noise, which is estimated to a tenth
-SMALLEST_ERROR = 1e-3  # of a coordinate [tolerances]: the accuracy of the engines
+PROBABLE = 1.0  # squared distance of initial values from an estimate up to which they are kept [its covariance]
 
 
 @dataclass(frozen=True)
@@ -25,7 +27,8 @@ class Fit:
     """Parameters fitted to a track, and their uncertainty."""
 
     problem: Problem
-    x: np.ndarray  # best point [ranges]
+    x: np.ndarray  # most probable point [ranges]
+    accepted: np.ndarray  # the same, with initial values of what the motion does not determine
     half: np.ndarray  # half widths of 95 % intervals [ranges]
     rmse: tuple[float, float]  # of the motion before and after [scene units]
     evaluations: int
@@ -45,11 +48,6 @@ class Fit:
         name = self.problem.parameters[k].name
         return name in AXES or self.half_width(k) <= QUANTITIES[name].max_half_width
 
-    def accepted_point(self) -> np.ndarray:
-        """The best point, with parameters that are not identifiable at their initial values."""
-        return np.array([self.x[k] if self.is_identifiable(k) else p.coordinate(p.start)
-                         for k, p in enumerate(self.problem.parameters)])  # fmt: skip
-
 
 def run(scene: Path, track: Path, out: Path, options: MaterialFitOptions) -> list[str]:
     """Write OUT for `ngff simulate --materials OUT`, and OUT's name with .fit.json with intervals; lines of text.
@@ -57,7 +55,7 @@ def run(scene: Path, track: Path, out: Path, options: MaterialFitOptions) -> lis
     Raises InputError for a track that is not of the scene, and MissingPackage without the package cma.
     """
     fit = solve(read_problem(Path(scene), Path(track), options), options)
-    materials, velocity = fitted(fit.problem.parameters, fit.accepted_point(), fit.problem.materials)
+    materials, velocity = fitted(fit.problem.parameters, fit.accepted, fit.problem.materials)
     names = {o.id: o.name for o in fit.problem.scene.objects}
     with replacing(out) as part:
         part.write_text(json.dumps({str(i): as_json(materials[i]) for i in names}, indent=1) + "\n")
@@ -76,13 +74,34 @@ def solve(problem: Problem, options: MaterialFitOptions) -> Fit:
     """Search for the parameters, and estimate how accurately the motion determines them."""
     log.info("%d parameters of %d objects, --engine %s, %d frames", len(problem.parameters), len(problem.moving),
              problem.options.engine, len(problem.track))  # fmt: skip
-    start = np.array([p.coordinate(p.start) for p in problem.parameters])
-    frames = len(problem.track)
+    begun, frames = time.perf_counter(), len(problem.track)
     with simulations(problem, options.workers) as sims:
         found = search(sims, options)
-        before, after = (problem.errors(motion).mean() for motion in sims.motions([start, found.x], frames))
-        half = 1.96 * deviations(sims, frames, found.x, _error(problem, float(after) / 3))
-        return Fit(problem, found.x, half, (float(before) ** 0.5, float(after) ** 0.5), sims.count, found.seconds)
+        residual = float(problem.errors(sims.motions([found.x], frames)[0]).mean())
+        error = _error(problem, residual / 3)
+        found = settled(sims, frames, found, error)
+        before, after = (problem.errors(motion).mean() for motion in sims.motions([sims.start, found.x], frames))
+        fit = Fit(problem, found.x, found.x, 1.96 * found.deviations, (float(before) ** 0.5, float(after) ** 0.5),
+                  sims.count, 0.0)  # fmt: skip
+        unknown = [k for k in np.argsort(-fit.half) if not fit.is_identifiable(k)]
+        return replace(fit, accepted=with_initial(found, sims.start, unknown), seconds=time.perf_counter() - begun)
+
+
+def with_initial(found: Estimate, start: np.ndarray, unknown: Sequence[int]) -> np.ndarray:
+    """The estimate's point, with initial values of those `unknown` parameters that are probable to have them.
+
+    The others take their most probable values for these. Parameters that only act together keep what is known of both.
+    """
+    covariance, accepted = found.root @ found.root.T, found.x
+    reset: list[int] = []
+    for k in unknown:
+        rows = [*reset, k]
+        change = start[rows] - found.x[rows]
+        weighed = np.linalg.solve(covariance[np.ix_(rows, rows)], change)
+        if float(change @ weighed) < PROBABLE:
+            reset, accepted = rows, np.clip(found.x + covariance[:, rows] @ weighed, 0, 1)
+            accepted[rows] = start[rows]
+    return accepted
 
 
 def _error(problem: Problem, residual: float) -> float:

@@ -1,10 +1,12 @@
-"""The search for the parameters, over increasingly long initial segments of the track, and their intervals.
+"""The search for the parameters, over increasingly long initial segments of the track, and their uncertainty.
 
 Over the whole track at once, collisions give the cost many local minima; the first frames depend on few parameters.
-Each segment is fitted from the result of the one before: by Levenberg and Marquardt's method and, where residuals
-larger than the noise remain, by CMA-ES, which samples the parameters that the segment hardly determines over their
-whole range.
-Source of CMA-ES: Hansen 2016, "The CMA evolution strategy: a tutorial".
+Each segment is fitted from the result of the one before, as an iterated Kalman filter does: what it does not determine
+stays near its initial value, by a normal prior. Derivatives are by differences about as large as the uncertainty, in
+independent directions: contacts make the motion a rough function of the parameters. Where residuals larger than the
+noise remain, CMA-ES searches the region which the segments before have left.
+Source: Bell and Cathey 1993, "The iterated Kalman filter update as a Gauss-Newton method"; Sarkka 2013, "Bayesian
+filtering and smoothing", chapter 5 (statistical linearisation); Hansen 2016, "The CMA evolution strategy: a tutorial".
 """
 
 from __future__ import annotations
@@ -12,13 +14,14 @@ from __future__ import annotations
 import logging
 import multiprocessing
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from typing import NamedTuple
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from scipy.optimize import least_squares
 from tqdm import tqdm
 
@@ -27,22 +30,30 @@ from stages.lab.fit.options import MaterialFitOptions
 from stages.lab.fit.problem import Problem
 
 log = logging.getLogger(__name__)
-PRIOR = 1 / 12**0.5  # standard deviation of a uniform distribution over the range
-FIRST, GROWTH = 8, 1.25  # frames of the first segment, and factor from one to the next
-STEP, STEPS = 0.004, 10  # differences [ranges] and iterations of Levenberg and Marquardt's method
-REGULARISATION = 0.01  # weight of the distance from the start, for parameters that a segment does not determine
-PRECISION, FALL = 1e-3, 1e-3  # of CMA-ES: step [ranges] and change of the cost at which it ends
-GENERATIONS = 15  # of CMA-ES for a segment
-ENOUGH = 1.3, 0.0005  # cost at which a fit ends: a factor on that of the track's noise, and a constant
-SPANS = 0.01, (0.002, 0.1), 0.2  # first, second (bounds) and large differences for intervals [ranges]
+SMALLEST_ERROR = 1e-3  # of a coordinate [tolerances]: the accuracy of the engines
+PRIOR = 1 / 12**0.5  # standard deviation of the prior: that of a uniform distribution over the range
+FIRST, GROWTH = 4, 1.15  # frames of the first segment, and factor from one to the next
+NEAR, FAR = (0.7, 2.0), (0.7, 2.0, 5.0)  # differences [standard deviations], in the search and for intervals
+STEPS = 6  # iterations of Levenberg and Marquardt's method
+PRECISION, FALL = 1e-2, 1e-3  # step [standard deviations] and relative fall of the cost at which a method ends
+SPREADS = (0.5, 1.0, 0.2, 1.5)  # of CMA-ES, in turn [standard deviations]
+GENERATIONS = 15  # of CMA-ES at a time
+ENOUGH = 1.15, 0.0005  # cost at which a fit ends: a factor on that of the track's noise, and a constant
+SMALLEST = 0.002  # standard deviation of a parameter [ranges]
+SETTLING = 2  # times that the uncertainty is estimated at the end, each with differences of the size of the last
+WIDER = 3.0  # factor on that of the search, from which they start: what is rough looks known by small differences
 
 
-class Found(NamedTuple):
-    """The best point of a search."""
+class Estimate(NamedTuple):
+    """Parameters and their uncertainty [ranges]."""
 
-    x: np.ndarray
-    motions: int
-    seconds: float
+    x: Float[np.ndarray, "p"]
+    root: Float[np.ndarray, "p p"]  # of the covariance, root @ root.T; its columns are the directions of differences
+
+    @property
+    def deviations(self) -> Float[np.ndarray, "p"]:
+        """Standard deviations of the parameters, at most those of the prior."""
+        return np.minimum(np.linalg.norm(self.root, axis=1), PRIOR)
 
 
 class Simulations:
@@ -50,16 +61,22 @@ class Simulations:
 
     def __init__(self, problem: Problem, map_: Callable):
         self.problem, self._map, self.count = problem, map_, 0
+        self.start = np.array([p.coordinate(p.start) for p in problem.parameters])
 
     def motions(self, points: list[np.ndarray], frames: int) -> list[torch.Tensor]:
-        """Keypoints in the first frames."""
+        """Keypoints in the first frames, at points that are moved into the ranges."""
         self.count += len(points)
-        return list(self._map(_motion, points, [frames] * len(points)))
+        return list(self._map(_motion, [np.clip(x, 0, 1) for x in points], [frames] * len(points)))
 
     def costs(self, points: list[np.ndarray], frames: int) -> list[float]:
         """Costs of the first frames."""
         part = self.problem.first_frames(frames)
         return [part.cost(motion) for motion in self.motions(points, frames)]
+
+    @property
+    def noise(self) -> float:
+        """Standard deviation of a coordinate of the track [tolerances]."""
+        return max(self.problem.noise / float(self.problem.tolerance.mean()), SMALLEST_ERROR)
 
 
 _problem: Problem | None = None  # of this process
@@ -86,23 +103,41 @@ def simulations(problem: Problem, workers: int) -> Iterator[Simulations]:
         yield Simulations(problem, pool.map)
 
 
-def search(sims: Simulations, options: MaterialFitOptions) -> Found:
+def search(sims: Simulations, options: MaterialFitOptions) -> Estimate:
     """Fit increasingly long initial segments of the track. Raises MissingPackage without the package cma."""
-    begun, total = time.perf_counter(), len(sims.problem.track)
-    x = np.array([p.coordinate(p.start) for p in sims.problem.parameters])
-    lengths = [min(FIRST, total)]
+    total, until = len(sims.problem.track), time.perf_counter() + 60 * options.minutes
+    known = Estimate(sims.start, np.diag([p.step for p in sims.problem.parameters]))  # before the present segment
+    x, lengths = known.x, [min(FIRST, total)]
     while lengths[-1] < total:
-        lengths.append(min(total, int(GROWTH * lengths[-1])))
-    for frames in tqdm(lengths, unit="segment"):
-        left = 60 * options.minutes - (time.perf_counter() - begun)
-        if left <= 0 or sims.count > options.evaluations:
+        lengths.append(min(total, max(lengths[-1] + 1, int(GROWTH * lengths[-1]))))
+    for k, frames in enumerate(tqdm(lengths, unit="segment")):
+        if time.perf_counter() > until or sims.count > options.evaluations:
             break
-        if not _within_noise(sims, frames, x):
-            x = _descend(sims, frames, x)
-        if not _within_noise(sims, frames, x):
-            x = _descend(sims, frames, _evolve(sims, frames, x, left, options))
+        if _within_noise(sims, frames, x):
+            continue
+        x = descend(sims, frames, Estimate(x, known.root), sims.noise)
+        share = sims.count + 3 * (options.evaluations - sims.count) / (len(lengths) - k)  # few segments need it
+        attempt = 0
+        while not _within_noise(sims, frames, x) and sims.count < share and time.perf_counter() < until:
+            x = _evolve(sims, frames, x, known, attempt, options)
+            attempt += 1
+        if _within_noise(sims, frames, x):
+            known = narrowed(sims, frames, Estimate(x, known.root), sims.noise)
         log.debug("%d frames, cost %.3g, %d motions: %s", frames, sims.costs([x], frames)[0], sims.count, x.round(3))
-    return Found(_descend(sims, frames, x), sims.count, time.perf_counter() - begun)
+    return Estimate(x, known.root)
+
+
+def settled(sims: Simulations, frames: int, known: Estimate, error: float) -> Estimate:
+    """The estimate for an error of a coordinate [tolerances], with its uncertainty.
+
+    Differences are by one parameter at a time: directions of several, of which one changes the motion roughly and the
+    other steadily, tell nothing about each.
+    """
+    x, deviations = descend(sims, frames, known, error), WIDER * known.deviations
+    for _ in range(SETTLING):
+        known = narrowed(sims, frames, Estimate(x, np.diag(np.minimum(deviations, PRIOR))), error, FAR)
+        deviations = known.deviations
+    return known
 
 
 def _within_noise(sims: Simulations, frames: int, x: np.ndarray) -> bool:
@@ -111,68 +146,86 @@ def _within_noise(sims: Simulations, frames: int, x: np.ndarray) -> bool:
     return sims.costs([x], frames)[0] < ENOUGH[0] * float(expected) + ENOUGH[1]
 
 
-def _descend(sims: Simulations, frames: int, x: np.ndarray) -> np.ndarray:
-    """The minimum near `x`, by Levenberg and Marquardt's method with derivatives by differences, or `x` itself."""
-    part, start = sims.problem.first_frames(frames), x
-    damping = REGULARISATION * np.eye(len(x))
+def descend(sims: Simulations, frames: int, known: Estimate, error: float) -> np.ndarray:
+    """The minimum near `known`, by Levenberg and Marquardt's method, or `known.x` itself where the cost does not fall.
 
-    def errors(x: np.ndarray) -> np.ndarray:
-        return np.append(part.weighted(sims.motions([x], frames)[0] - part.track), REGULARISATION * (x - start))
+    `error` is the standard deviation of a coordinate [tolerances], against which the prior is weighed.
+    """
+    part, weight = sims.problem.first_frames(frames), error / PRIOR
 
-    found = least_squares(
-        errors, np.clip(x, 1e-6, 1 - 1e-6), lambda x: np.vstack([_derivatives(sims, frames, x, STEP), damping]),
-        bounds=(0, 1), max_nfev=STEPS, xtol=PRECISION / 10, ftol=FALL,
-    )  # fmt: skip
-    before, after = sims.costs([x, found.x], frames)
-    return found.x if after < before else x
+    def point(z: np.ndarray) -> np.ndarray:
+        return known.x + known.root @ z
+
+    def errors(z: np.ndarray) -> np.ndarray:
+        motion = sims.motions([point(z)], frames)[0]
+        return np.append(part.weighted(motion - part.track), weight * (point(z) - sims.start))
+
+    def derivatives(z: np.ndarray) -> np.ndarray:
+        return np.vstack([_derivatives(sims, frames, Estimate(point(z), known.root)), weight * known.root])
+
+    found = least_squares(errors, np.zeros(len(known.x)), derivatives, max_nfev=STEPS, xtol=PRECISION, ftol=FALL)
+    x = np.clip(point(found.x), 0, 1)
+    before, after = sims.costs([known.x, x], frames)
+    return x if after < before else known.x
 
 
-def _evolve(sims: Simulations, frames: int, x: np.ndarray, seconds: float, options: MaterialFitOptions) -> np.ndarray:
-    """The best of some generations of CMA-ES, whose initial spread is the uncertainty after the segment."""
+def _evolve(
+    sims: Simulations, frames: int, x: np.ndarray, known: Estimate, attempt: int, options: MaterialFitOptions
+) -> np.ndarray:
+    """The best of some generations of CMA-ES in units of the uncertainty, from `x` and from `known.x` in turn."""
     try:
         import cma  # noqa: PLC0415 -- only a fit needs it
     except ImportError as error:
         raise MissingPackage("a fit needs the package cma, which is not installed; `pip install cma`") from error
 
-    until = time.perf_counter() + seconds
     size = options.workers * -(-(4 + int(3 * np.log(len(x)))) // options.workers)  # the usual one, for all workers
-    spread = np.maximum(deviations(sims, frames, x, 1.0), 0.02)
-    strategy = cma.CMAEvolutionStrategy(x, 1.0, {
-        "CMA_stds": spread.tolist(), "bounds": [0, 1], "popsize": size, "seed": options.seed + 1, "verbose": -9,
-        "maxiter": GENERATIONS, "tolx": PRECISION, "tolfunhist": FALL, "tolfun": FALL,
+    middle = known.x if attempt % 2 else x
+    strategy = cma.CMAEvolutionStrategy(np.zeros(len(x)), SPREADS[attempt % len(SPREADS)], {
+        "popsize": size, "seed": options.seed + attempt + 1, "verbose": -9, "maxiter": GENERATIONS, "tolx": PRECISION,
+        "tolfunhist": FALL, "tolfun": FALL,
     })  # fmt: skip
     best, lowest = x, sims.costs([x], frames)[0]
-    while not strategy.stop() and time.perf_counter() < until and sims.count < options.evaluations:
-        points = strategy.ask()
+    while not strategy.stop():
+        steps = strategy.ask()
+        points = [np.clip(middle + known.root @ z, 0, 1) for z in steps]
         costs = sims.costs(points, frames)
-        strategy.tell(points, costs)
+        strategy.tell(steps, costs)
         if min(costs) < lowest:
-            best, lowest = np.array(points[int(np.argmin(costs))]), min(costs)
+            best, lowest = points[int(np.argmin(costs))], min(costs)
     return best
 
 
-def deviations(sims: Simulations, frames: int, x: np.ndarray, error: float) -> np.ndarray:
-    """Standard deviations of the parameters at `x` [ranges], by the curvature of the squared error (Gauss and Newton).
+def narrowed(
+    sims: Simulations, frames: int, known: Estimate, error: float, distances: Sequence[float] = NEAR
+) -> Estimate:
+    """The estimate with the uncertainty that is left after the first frames, and the prior.
 
     `error` is the standard deviation of a coordinate [tolerances]. Keypoints of one object in one frame count as one
-    observation, since their errors are not independent; the ranges count as a prior. Near a contact,
-    the derivatives for small differences may be larger than those for large ones; the deviation is increased by that
-    ratio.
+    observation, since their errors are not independent. Contacts make derivatives for small differences larger than
+    those for large ones: along each direction the smallest for the `distances` [standard deviations] counts.
     """
-    step = np.full(len(x), SPANS[0])
-    for _ in range(2):
-        near = _derivatives(sims, frames, x, step) / error
-        deviation = np.sqrt(np.diag(np.linalg.inv(near.T @ near + np.eye(len(x)) / PRIOR**2)))
-        step = np.clip(2 * deviation, *SPANS[1])
-    far = _derivatives(sims, frames, x, SPANS[2]) / error
-    weaker = np.linalg.norm(near, axis=0) / np.maximum(np.linalg.norm(far, axis=0), 1e-12)
-    return np.minimum(deviation * np.maximum(weaker, 1.0), PRIOR)
+    ends = [np.clip(known.x + sign * far * column, 0, 1)
+            for column in known.root.T for far in distances for sign in (1, -1)]  # fmt: skip
+    middle, *moved = (sims.problem.weighted(m) for m in sims.motions([known.x, *ends], frames))
+    moved = np.array(moved).reshape(len(known.x), -1, len(middle))
+    slopes = (moved[:, 0] - moved[:, 1]).T / (2 * distances[0])
+    steps = np.linalg.norm(np.array(ends) - known.x, axis=1).reshape(len(known.x), -1)
+    steps = steps / np.linalg.norm(known.root, axis=0)[:, None]  # shorter at the ends of the ranges
+    rises = np.linalg.norm(moved - middle, axis=2) / np.maximum(steps, 1e-9)
+    least = np.where(steps > distances[0] / 2, rises, np.inf).min(1)
+    slopes = slopes * np.minimum(1, least / np.maximum(np.linalg.norm(slopes, axis=0), 1e-12)) / error
+    covariance = np.linalg.inv(slopes.T @ slopes + known.root.T @ known.root / PRIOR**2)
+    square, directions = np.linalg.eigh(known.root @ covariance @ known.root.T)
+    return Estimate(known.x, directions * np.sqrt(square.clip(0) + SMALLEST**2))
 
 
-def _derivatives(sims: Simulations, frames: int, x: np.ndarray, step: np.ndarray | float) -> np.ndarray:
-    """Derivatives of the weighted coordinates by each parameter, central where the range allows it."""
-    ends = [np.clip(x + sign * step * unit, 0, 1) for unit in np.eye(len(x)) for sign in (1, -1)]
-    moved = sims.motions(ends, frames)
-    spans = [float((a - b).sum()) for a, b in zip(ends[::2], ends[1::2], strict=True)]
-    columns = [sims.problem.weighted((a - b) / span) for a, b, span in zip(moved[::2], moved[1::2], spans, strict=True)]
+def _derivatives(sims: Simulations, frames: int, known: Estimate) -> Float[np.ndarray, "n p"]:
+    """Derivatives of the weighted coordinates along the columns of the root, by differences within the ranges."""
+    ends = []
+    for step in NEAR[0] * known.root.T:
+        one, other = (np.clip(known.x + s, 0, 1) for s in (step, -step))
+        ends.append(step if np.linalg.norm(one - known.x) >= np.linalg.norm(other - known.x) else -step)
+    middle, *moved = sims.motions([known.x, *(known.x + step for step in ends)], frames)
+    signs = [np.sign(step @ column) for step, column in zip(ends, known.root.T, strict=True)]
+    columns = [sims.problem.weighted((m - middle) * (sign / NEAR[0])) for m, sign in zip(moved, signs, strict=True)]
     return np.stack(columns, 1)

@@ -15,11 +15,11 @@ from stages.core.physics.materials import Material, choose_materials
 from stages.core.scene.scene_ply import read_scene, write_scene
 from stages.core.scene.trajectory import TrajectoryWriter, read_trajectory
 from stages.lab.bench.physics_experiments import Run, ball, block
-from stages.lab.fit.fit import solve
+from stages.lab.fit.fit import solve, with_initial
 from stages.lab.fit.options import MaterialFitOptions
 from stages.lab.fit.parameters import fitted, material_parameters, velocity_parameters
 from stages.lab.fit.problem import estimate_noise, pose_problem, read_problem
-from stages.lab.fit.search import _evolve, simulations
+from stages.lab.fit.search import Estimate, _evolve, simulations
 from stages.simulate.options import SimulateOptions
 from stages.simulate.stage import run as simulate
 from tests.conftest import CliRunner
@@ -71,7 +71,7 @@ def test_a_slide_shows_friction_and_nothing_of_the_rebound(slide, device):
         assert fit.is_identifiable(k) and abs(fit.value(k) - true) < 2 * fit.half_width(k) < 0.05, name
     assert not fit.is_identifiable(of(fit, "loss"))
     assert fit.rmse[1] == pytest.approx(3**0.5 * NOISE, rel=0.1) and fit.rmse[0] > 0.02
-    materials, velocity = fitted(fit.problem.parameters, fit.accepted_point(), fit.problem.materials)
+    materials, velocity = fitted(fit.problem.parameters, fit.accepted, fit.problem.materials)
     assert materials[1].loss == pytest.approx(fit.problem.materials[1].loss)  # as the search started
 
 
@@ -101,7 +101,7 @@ def test_cma_es_comes_nearer_from_far_away(slide, device):
     problem = read_problem(slide / "scene.ply", slide / "track.h5", options)
     far = np.array([0.9, 0.5, 0.6, 0.4])
     with simulations(problem, 1) as sims:
-        near = _evolve(sims, 12, far, 60.0, options)
+        near = _evolve(sims, 12, far, Estimate(far, np.eye(4) / 4), 0, options)
         before, after = sims.costs([far, near], 12)
     assert after < before / 2
 
@@ -138,3 +138,12 @@ def test_noise_is_estimated_beside_motion_and_collisions():
     track = path + 0.003 * torch.randn(50, 20, 3, generator=rng)
     # 3,000 correlated third differences: a few per cent
     assert estimate_noise(track) == pytest.approx(0.003, rel=0.06)
+
+
+def test_parameters_that_act_together_keep_their_sum():
+    sum_known, difference = np.array([[1.0], [1.0]]) / 2**0.5, np.array([[1.0], [-1.0]]) / 2**0.5
+    found = Estimate(np.array([0.3, 0.4]), np.hstack([0.01 * sum_known, 0.3 * difference]))
+    accepted = with_initial(found, np.array([0.15, 0.15]), [0, 1])
+    assert accepted == pytest.approx([0.15, 0.55], abs=0.002)  # both at 0.15 would be wrong
+    alone = Estimate(found.x, np.diag([0.2, 0.01]))
+    assert with_initial(alone, np.array([0.15, 0.15]), [0]) == pytest.approx([0.15, 0.4])

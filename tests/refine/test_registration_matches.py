@@ -12,6 +12,7 @@ from stages.core.raster.rasterise import rasterise
 from stages.core.scene.gaussians import Gaussians, transformed
 from stages.lab.assets.shapes import ellipsoid
 from stages.lab.assets.toys import falling_toys
+from stages.refine import registration_matches
 from stages.refine.options import RefineOptions
 from stages.refine.registration_matches import matched_place, ransac_similarity, view_of
 from tests.refine.sample_objects import degrees_between, random_similarity
@@ -92,7 +93,9 @@ def test_ransac_ignores_wrong_matches_and_refuses_few():
 
 
 @pytest.mark.slow
-def test_the_published_networks_place_a_duck(device):
+def test_the_published_networks_place_a_duck(device, monkeypatch):
+    monkeypatch.setattr(registration_matches, "YAWS", 30)  # 12 renderings instead of 90, each matched for a second
+    monkeypatch.setattr(registration_matches, "PITCHES", (18.0,))
     try:
         matcher = load_matcher(device)
     except InputError as absent:

@@ -18,7 +18,7 @@ from stages.lab.track.confidence import confidences, differences, scales, tolera
 from stages.lab.track.film_masks import UNKNOWN
 from stages.lab.track.films import Film
 from stages.lab.track.poses import Poses
-from stages.lab.track.search import search, spread_rotations
+from stages.lab.track.search import search, spread_rotations, without
 from stages.lab.track.synthesis import Camera, Synthesiser, reduced
 
 log = logging.getLogger(__name__)
@@ -130,26 +130,51 @@ def first_pass(tracker: Tracker, frames: int, gravity: Float[Tensor, "3"]) -> Tr
     poses, shares, pixels = [rest], [share], [number]
     last, missing = rest, torch.zeros_like(velocity[:, 0])  # where last seen, and how many frames ago
     for frame in tqdm(range(1, frames), desc="tracking", unit="frame", leave=False):
-        away, motion, usual = missing > 0, (velocity, velocity), _usual(torch.stack(shares))
+        away, motion, usual = missing.cpu() > 0, (velocity, velocity), _usual(torch.stack(shares))
         n = (missing + 1)[:, None]
         fall = n * missing[:, None] / 2 * torch.cat([torch.zeros_like(gravity), gravity])
-        found = tracker.fit(frame, FIRST, last.moved(n * velocity + fall), motion)
-        share, number = tracker.judge(frame, found, motion)
-        doubtful = away.cpu() & (share < CERTAIN * usual)
-        for i in doubtful.nonzero()[:, 0].tolist():
-            again = search(tracker, frame, i, found, velocity, int(missing[i]))
-            if again is not None:
-                found, (share, number) = again.poses, tracker.judge(frame, again.poses, motion)
-                doubtful[i] = not again.distinct or bool(share[i] < FOUND * usual[i])
-        share = torch.where(doubtful, 0.0, share)
+        predicted = last.moved(n * velocity + fall)
+        found, share, number = fitted_seen(tracker, frame, FIRST, without(predicted, away), motion)
+        for i in away.nonzero()[:, 0].tolist():
+            mine = torch.arange(len(away), device=tracker.device) == i
+            again = tracker.fit(frame, FIRST, _choose(mine, predicted, found), motion, ~mine)
+            now, seen = tracker.judge(frame, again, motion)
+            certain = bool(now[i] >= CERTAIN * usual[i])
+            if not certain:
+                sighting = search(tracker, frame, i, _choose(mine, last, found), velocity, int(missing[i]))
+                if sighting is not None:
+                    again, (now, seen) = sighting.poses, tracker.judge(frame, sighting.poses, motion)
+                    certain = sighting.distinct and bool(now[i] >= FOUND * usual[i])
+            number[i] = seen[i]
+            if certain:
+                found, share = again, now
         lost = (share == 0).to(tracker.device)
-        step = torch.where(away[:, None], 0.0, last.step_to(found))
+        step = last.step_to(found) / n
+        step[missing > 0, :3] = 0  # how often it turned is not known
         velocity = torch.where(lost[:, None], velocity, step)
         poses.append(_choose(lost, last, found))
         shares.append(share)
         pixels.append(number)
         last, missing = poses[-1], torch.where(lost, missing + 1, 0.0)
     return TrackedMotion(Poses.stack(poses), lasting(torch.stack(shares)), torch.stack(pixels), {})
+
+
+def fitted_seen(
+    tracker: Tracker, frame: int, steps: dict[int, int], start: Poses, motion: tuple[Tensor, Tensor]
+) -> tuple[Poses, Tensor, Tensor]:
+    """The poses of the objects that are seen in a frame, from poses nearby, with confidences and numbers of pixels.
+
+    What the pictures do not confirm is taken out of sight and the others are fitted again: drawn at a wrong place, it
+    would hide them.
+    """
+    found = tracker.fit(frame, steps, start, motion)
+    share, number = tracker.judge(frame, found, motion)
+    hiding = (share == 0) & (number > 0)
+    if hiding.any():
+        found = tracker.fit(frame, steps, without(start, hiding), motion)
+        share, seen = tracker.judge(frame, found, motion)
+        number = torch.where(hiding, number, seen)
+    return found, share, number
 
 
 def from_release(tracker: Tracker, track: TrackedMotion) -> TrackedMotion:
@@ -230,8 +255,7 @@ def refined(tracker: Tracker, track: TrackedMotion) -> TrackedMotion:
     now, usual = replace(track, poses=Poses(rotation, centre)), _usual(track.confidence)
     for frame in tqdm(range(1, len(centre)), desc="refining", unit="frame", leave=False):
         motion = motions(now, frame)
-        found = tracker.fit(frame, REFINING, now.poses[frame], motion)
-        share, pixels[frame] = tracker.judge(frame, found, motion)
+        found, share, pixels[frame] = fitted_seen(tracker, frame, REFINING, now.poses[frame], motion)
         doubtful = (shares[frame] == 0) & (share < CERTAIN * usual)  # it may be turned wrongly
         shares[frame] = torch.where(doubtful, 0.0, share)
         found = _choose((shares[frame] == 0).to(tracker.device), now.poses[frame], found)
@@ -256,7 +280,8 @@ def _lateness(tracker: Tracker, track: TrackedMotion, reduction: int) -> Float[T
     along, square = torch.zeros(len(tracker.films)), torch.full((len(tracker.films),), 1e-9)
     for frame in range(1, len(track.confidence)):
         motion = motions(track, frame)
-        poses, seen = track.poses[frame], track.confidence[frame].to(tracker.device) > 0
+        seen = track.confidence[frame].to(tracker.device) > 0
+        poses = without(track.poses[frame], ~seen)
         for o in tracker.observe(frame, reduction, *motion):
             change = change_of(o, o.draw(tracker.synthesiser, poses), poses.centre)
             keep = seen[change.row]

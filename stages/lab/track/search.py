@@ -27,7 +27,9 @@ MIN_SUPPORT = 0.7  # share of the pictures that must show something unexplained 
 ROTATIONS = 72  # that are tried
 STARTS = 4  # rotations from which the object is aligned, the best of all tried
 DISTINCT = 30.0  # angle from which two rotations are not the same [degrees]
-RIVAL = 0.7  # share of what the best pose explains that another rotation may explain, where the best is certain
+DIFFERENT = 0.5  # difference of two poses' renderings from which a pixel tells them apart [scale of the residuals]
+MIN_DIFFERENT = 24  # such pixels of all pictures
+PREFERRED = 0.65  # share of them in which the best pose must be nearer to the picture than another rotation
 VIEWS = 3  # pictures in which rotations are compared
 LIKE = 0.15  # difference from the nearest colour of an object up to which a pixel may show it
 AWAY = 1e4  # where an object is not seen [scene units]
@@ -37,14 +39,16 @@ class Sighting(NamedTuple):
     """An object that was found again."""
 
     poses: Poses  # of all objects
-    distinct: bool  # whether no other rotation explains the pictures nearly as well
+    distinct: bool  # whether the pictures tell it from all other rotations that were tried
 
 
 def search(tracker: Tracker, frame: int, i: int, poses: Poses, velocity: Tensor, missing: int) -> Sighting | None:
-    """Object i, which was last seen `missing` frames ago, at its best pose; None if it is not seen."""
+    """Object i, which was last seen `missing` frames ago, at its best pose; None if it is not seen.
+
+    `poses` holds where it was last seen: where an object went of which the last frames saw little is not known.
+    """
     seen = tracker.observe(frame, COARSE, velocity, velocity)
-    gone = Poses(poses.rotation, poses.centre.clone())
-    gone.centre[i] = AWAY
+    gone = without(poses, torch.arange(len(poses.centre), device=tracker.device) == i)
     places = _places(tracker, seen, gone, i, poses.centre[i], missing)
     if not len(places):
         return None
@@ -58,18 +62,47 @@ def search(tracker: Tracker, frame: int, i: int, poses: Poses, velocity: Tensor,
     if starts[0][0] >= _cost(tracker, some, gone):  # the pictures are explained better without the object
         return None
     others = torch.arange(len(poses.centre), device=tracker.device) != i
-    motion, without = (velocity, velocity), _cost(tracker, seen, gone)
-    aligned = [tracker.fit(frame, SEARCHING, start, motion, others) for _, start in starts[:STARTS]]
-    explained = [without - _cost(tracker, seen, p) for p in aligned]
-    best = max(range(len(aligned)), key=lambda k: explained[k])
-    turned = [float(rotation_angle(p.rotation[i] @ aligned[best].rotation[i].mT)) for p in aligned]
-    rivals = [e for e, angle in zip(explained, turned, strict=True) if angle > DISTINCT]
-    return Sighting(aligned[best], max([0.0, *rivals]) < RIVAL * explained[best])
+    aligned = [tracker.fit(frame, SEARCHING, start, (velocity, velocity), others) for _, start in starts[:STARTS]]
+    likely = min(aligned, key=lambda p: _cost(tracker, seen, p))
+    for turn in half_turns(tracker.synthesiser.arm[tracker.synthesiser.row == i]):
+        start = Poses(likely.rotation.clone(), likely.centre)
+        start.rotation[i] = likely.rotation[i] @ turn
+        aligned.append(tracker.fit(frame, SEARCHING, start, (velocity, velocity), others))
+    aligned.sort(key=lambda p: _cost(tracker, seen, p))
+    best, rivals = aligned[0], [p for p in aligned[1:] if _turned(aligned[0], p, i) > DISTINCT]
+    return Sighting(best, all(_preferred(tracker, seen, best, p, tracker.scale[i]) >= PREFERRED for p in rivals))
+
+
+def half_turns(points: Float[Tensor, "n 3"]) -> Float[Tensor, "3 3 3"]:
+    """Half turns about the principal axes of points, which hardly change an elongated or flat object's outline."""
+    axes = torch.linalg.eigh(points.mT @ points).eigenvectors.mT[..., None]
+    return 2 * axes @ axes.mT - torch.eye(3).to(points)
+
+
+def _turned(a: Poses, b: Poses, i: int) -> float:
+    """The angle between two rotations of object i [degrees]."""
+    return float(rotation_angle(a.rotation[i] @ b.rotation[i].mT))
+
+
+def _preferred(tracker: Tracker, seen: list[Observation], best: Poses, rival: Poses, scale: float) -> float:
+    """Of the pixels that tell two poses apart, the share in which the first is nearer to the picture; 0 if few do."""
+    nearer, different = 0, 0
+    for o in seen:
+        one, other = (o.draw(tracker.synthesiser, p) for p in (best, rival))
+        apart = (one.image - other.image).nan_to_num().square().mean(-1).sqrt() > DIFFERENT * scale
+        closer = o.difference(one).square().mean(-1) < o.difference(other).square().mean(-1)
+        nearer, different = nearer + int((apart & closer).sum()), different + int(apart.sum())
+    return nearer / different if different >= MIN_DIFFERENT else 0.0
 
 
 def _cost(tracker: Tracker, seen: list[Observation], poses: Poses) -> float:
     scale = max(tracker.scale)
     return sum(robust_cost(o.difference(o.draw(tracker.synthesiser, poses)), scale) for o in seen)
+
+
+def without(poses: Poses, mask: Bool[Tensor, "o"]) -> Poses:
+    """The poses with the objects in the mask out of sight."""
+    return Poses(poses.rotation, torch.where(mask[:, None].to(poses.centre.device), AWAY, poses.centre))
 
 
 def _places(

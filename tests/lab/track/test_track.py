@@ -24,7 +24,7 @@ from stages.lab.track.films import Film, read_films
 from stages.lab.track.follow import TrackedMotion, Tracker, interpolated, lasting, release_time
 from stages.lab.track.options import TrackOptions
 from stages.lab.track.poses import Poses, rotation_of, rotation_vector
-from stages.lab.track.search import search, spread_rotations
+from stages.lab.track.search import half_turns, search, spread_rotations
 from stages.lab.track.stand_in import (
     KEYPOINTS,
     StandInOptions,
@@ -201,6 +201,14 @@ def test_spread_rotations_leave_no_gap():
     anywhere = matrix(torch.nn.functional.normalize(torch.randn(200, 4, generator=rng), dim=1))
     nearest = rotation_angle(rotations[:, None].mT @ anywhere[None]).amin(0)
     assert nearest.max() < 60
+
+
+def test_half_turns_are_about_the_principal_axes():
+    points = torch.randn(400, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([3.0, 2.0, 1.0])
+    turns = half_turns(points)
+    assert rotation_angle(turns).tolist() == pytest.approx([180.0] * 3, abs=0.1)
+    turned = points @ turns.mT
+    torch.testing.assert_close(turned.mT @ turned, (points.mT @ points).expand(3, 3, 3), rtol=1e-3, atol=1.0)
 
 
 def motion(height: list[float], confidence: list[float]) -> TrackedMotion:

@@ -28,6 +28,7 @@ test-gpu:
 
 lint: setup
 	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
 
 clean:
 	$(MAKE) -C examples/falling_toys clean

@@ -50,7 +50,7 @@ def rollout(
     level, fine = options.level, device != "cpu" and options.quality != "draft"
     if fine:
         level = replace(level, substep=min(level.substep, GPU_SUBSTEP))
-    setup = set_up_scene(scene, prompts, options, fine, skin=True)
+    setup = set_up_scene(scene, prompts, options, refinement=2 if fine else 1)
     setup.warn_of_lifted(scene)
     body, dx = setup.bodies.body, 2 * setup.bodies.spacing * unit
     particles = _particles(scene, setup, prompts, options, level)

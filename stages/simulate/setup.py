@@ -15,7 +15,7 @@ from stages.core.physics.forces import ForcePrompts, vector
 from stages.core.physics.material_parts import averaged, located, uneven_moments
 from stages.core.physics.materials import MaterialChoice, choose_materials
 from stages.core.physics.mpm.domain import MAX_NODES, Box
-from stages.core.physics.mpm.resample import subdivide
+from stages.core.physics.mpm.surface_particles import surface_particles
 from stages.core.physics.particles import Bodies, sample_bodies
 from stages.core.scene.scene import Scene
 from stages.core.scene.schema import LARGEST
@@ -56,27 +56,27 @@ class SceneSetup:
         return uneven_moments(list(self.materials.values())[row], self.bodies.x[mine], self.bodies.volume[mine])
 
 
-def set_up_scene(
-    scene: Scene, prompts: ForcePrompts, options: SimulateOptions, fine: bool = False, skin: bool = False
-) -> SceneSetup:
+def set_up_scene(scene: Scene, prompts: ForcePrompts, options: SimulateOptions, refinement: int = 0) -> SceneSetup:
     """Sample the particles, choose the materials and place the objects in the domain.
 
-    Objects whose bottom is within two particle spacings of the floor, or below it, are moved onto it. `fine` doubles
-    the resolution of the particles; with `skin` they fill the bodies up to the surface. Raises InputError for a --box
-    that does not contain the objects.
+    Objects whose bottom is within two particle spacings of the floor, or below it, are moved onto it. With a
+    `refinement` of 1 or more, particles fill the bodies up to the surface at the spacing of the quality level divided
+    by it; without, they leave the outermost layer empty. Raises InputError for a --box that does not contain the
+    objects.
     """
-    bodies = sample_bodies(scene, options.level.particles, options.seed, skin)
-    if fine:
-        bodies = subdivide(bodies, options.seed)
+    bodies = sample_bodies(scene, options.level.particles, options.seed, skin=refinement > 0)
+    if refinement:
+        bodies = surface_particles(scene, bodies, refinement, options.seed)
     materials = choose_for_bodies(scene, bodies, options)
     count, h = len(scene.objects), bodies.spacing
     lift = torch.zeros(count, 3)
     for row, o in enumerate(scene.objects):
         lift[row, 2] = prompts.lift.get(o.id, 0.0)
-    # a voxel ends half a spacing below its particle, and without skin the visible body one spacing further down
-    below = 0.5 if skin else 1.5
-    lowest = torch.stack([bodies.x[bodies.body == row, 2].quantile(0.01) for row in range(count)])
-    bottom = lowest - below * h
+    # a voxel ends half a spacing below its particle, less where only its upper part is filled; without the
+    # outermost layer the visible body ends one spacing further down
+    below = 0.5 if refinement else 1.5
+    ends = bodies.x[:, 2] - ((bodies.volume / h**3 - 0.5) * h if refinement else below * h)
+    bottom = torch.stack([ends[bodies.body == row].quantile(0.01) for row in range(count)])
     start = bottom + lift[:, 2]
     asked = parse_box(options.box) if options.box else None
     floor = _floor_height(scene, options, asked, start)

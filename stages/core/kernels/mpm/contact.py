@@ -19,15 +19,26 @@ CONTACT_GAP = 0.1  # gap at which bodies are in contact [cells]; particles are p
 MIN_FRACTION = 0.02  # volume fraction a cell outside a flat surface; normals at fewer are unreliable
 SWEEPS = 2  # over the pairs of a node with more than two bodies
 BLOCK_NODES = wp.constant(BLOCK**3)
+ACROSS = wp.constant(wp.vec2(10.0 / 16.0, 3.0 / 16.0))  # weights of differences in a row and in those beside it
 
 
 @wp.func
 def _slope(velocity: wp.array[wp.vec4], node: int, stride_x: int, stride_y: int, full: float) -> wp.vec3:
-    """Change of the volume fraction of a body per cell; `full` is the mass of a filled cell."""
-    half = 0.5 / full
-    return half * wp.vec3(velocity[node + stride_x][3] - velocity[node - stride_x][3],
-                          velocity[node + stride_y][3] - velocity[node - stride_y][3],
-                          velocity[node + 1][3] - velocity[node - 1][3])  # fmt: skip
+    """Change of the volume fraction of a body per cell; `full` is the mass of a filled cell.
+
+    Central differences, averaged across: normals of inclined planes are 1.5 degrees off at most, without it 2 to 8.
+    Source: Scharr 2000, "Optimale Operatoren in der digitalen Bildverarbeitung".
+    """
+    slope = wp.vec3()
+    for i in range(-1, 2):
+        for j in range(-1, 2):
+            for k in range(-1, 2):
+                x = wp.where(i == 0, ACROSS[0], ACROSS[1])
+                y = wp.where(j == 0, ACROSS[0], ACROSS[1])
+                z = wp.where(k == 0, ACROSS[0], ACROSS[1])
+                mass = velocity[node + i * stride_x + j * stride_y + k][3]
+                slope += mass * wp.vec3(float(i) * y * z, float(j) * x * z, float(k) * x * y)
+    return slope * (0.5 / full)
 
 
 @wp.func

@@ -101,10 +101,12 @@ def _quiet() -> Iterator[None]:
 def run(out: Path, options: PhysicsBenchOptions = PhysicsBenchOptions()) -> Iterator[str]:
     """Yield a line for each experiment and engine; rows that `out` has already are kept and not measured again.
 
-    Also writes the table beside it as Markdown.
+    Also writes the table beside it as Markdown. Raises InputError where `out` has rows of another quality.
     """
     table, device = experiments(), pick_device(options.device)
-    facts = _before(Path(out)) or {"command": "ngff-lab bench physics", "rows": {}}
+    facts = _before(Path(out)) or {"command": "ngff-lab bench physics", "rows": {}, "quality": options.quality}
+    if facts.get("quality") != options.quality:
+        raise InputError(f"{out}: has rows measured at --quality {facts.get('quality')}; name another file (-o)")
     facts |= {"machine": machine(device), "quality": options.quality}
     for experiment in options.chosen():
         row = facts["rows"].setdefault(experiment.name, {})

@@ -145,7 +145,7 @@ def _hulls(solid: Solid, part: np.ndarray) -> list[ConvexHull]:
         near = (of == k).any(1)
         own = surface[near]
         mine = part == k
-        inner = _corners(voxels[deep & mine], h), voxels[bare & mine]
+        inner = _corners(_extreme(voxels[deep & mine]), h), voxels[bare & mine]
         hull = _hull(_extreme(np.concatenate([own, *inner])))
         if hull is None:
             hulls.append(ConvexHull(_corners(voxels[part == k], h)))
@@ -156,7 +156,7 @@ def _hulls(solid: Solid, part: np.ndarray) -> list[ConvexHull]:
 
 def _extreme(points: np.ndarray) -> np.ndarray:
     """The points that are extreme in one of EXTREMES."""
-    return points[np.unique((points @ EXTREMES.T).argmax(0))] if len(points) > len(EXTREMES) else points
+    return points[np.unique((EXTREMES @ points.T).argmax(1))] if len(points) > len(EXTREMES) else points
 
 
 def _balanced(hull: ConvexHull, surface: np.ndarray, normals: np.ndarray, h: float) -> ConvexHull:

@@ -75,7 +75,7 @@ def run(out: Path, options: RolloutBenchOptions = RolloutBenchOptions()) -> Iter
         "keypoints": options.keypoints, "steps": options.steps, "rows": [],
     }  # fmt: skip
     rate, out = bench.float32_rate(device), Path(out)
-    facts |= {"float32_rate": rate, "operations": _operations(model, options)}
+    facts |= {"float32_rate": rate, "operations": _operations(model, options, device)}
     yield f"float32 matrix product {rate / 1e12:.3g} TFLOP/s"
     known = json.loads(out.read_text()) if out.is_file() else {}
     for scenes in options.scenes or ((1, 64) if device != "cpu" else (1,)):
@@ -119,10 +119,14 @@ def _measured(
     yield {"what": f"MPM, {mpm['particles']:,} particles", "scenes": scenes, "seconds": _rounded(seconds)}
 
 
-def _operations(model: Dynamics, options: RolloutBenchOptions) -> int:
-    """Operations of the matrix products in a rollout of one scene, counted in PyTorch on a CPU."""
-    with FlopCounterMode(display=False) as counter:
-        rollout_stepwise(copy.deepcopy(model).cpu(), ellipsoids(1, options.keypoints), options.steps + 1)
+def _operations(model: Dynamics, options: RolloutBenchOptions, device: str) -> int:
+    """Operations of the matrix products in a rollout of one scene.
+
+    With autograd on there are no fused kernels, whose operations PyTorch does not count; no graph is kept.
+    """
+    model, start = copy.deepcopy(model).requires_grad_(False), ellipsoids(1, options.keypoints).to(device)
+    with FlopCounterMode(display=False) as counter, torch.enable_grad():
+        model.rollout(start, options.steps + 1, FRAME)
     return counter.get_total_flops()
 
 

@@ -40,3 +40,22 @@ def test_depth_is_the_distance_along_the_viewing_axis_and_negative_behind():
     viewmat = look_at(torch.tensor([3.0, 0, 1]), torch.tensor([0.0, 0, 1]))
     points = torch.tensor([[1.0, 5, 2], [4.0, -2, 0]])
     torch.testing.assert_close(depths(points, viewmat), torch.tensor([2.0, -1.0]))
+
+
+def test_images_may_be_resized_by_two_factors():
+    K = resize(intrinsics(200, 100, 150.0), 0.5, 2.0)
+    torch.testing.assert_close(K, torch.tensor([[75.0, 0, 50], [0, 300, 100], [0, 0, 1]]))
+
+
+def test_an_arc_of_cameras_looks_at_its_centre_from_one_height():
+    centre = torch.tensor([1.0, 2, 3])
+    viewmats = orbit(4, centre, 2.0, 30.0, sweep=180.0)
+    offsets = centres(viewmats) - centre
+    torch.testing.assert_close(offsets.norm(dim=1), torch.full((4,), 2.0))
+    torch.testing.assert_close(offsets[:, 2], torch.full((4,), 1.0))  # 2 sin 30
+    torch.testing.assert_close(-offsets / 2, viewmats[:, 2, :3])
+    steps = torch.nn.functional.cosine_similarity(offsets[1:, :2], offsets[:-1, :2])
+    torch.testing.assert_close(steps, torch.full((3,), 0.5**0.5))  # 45 degrees apart
+    # azimuth 0 is (1, 1, 0) / sqrt 2, azimuth 90 is (1, -1, 0) / sqrt 2
+    ends = centres(orbit(4, centre, 2.0, 0.0, azimuth=0.0)) - centre
+    torch.testing.assert_close(ends[:2], torch.tensor([[2**0.5, 2**0.5, 0], [2**0.5, -(2**0.5), 0]]), atol=1e-6, rtol=0)

@@ -2,7 +2,7 @@ import pytest
 import torch
 from scipy.special import sph_harm_y
 
-from stages.core.geometry.harmonics import basis, evaluate_sh, rgb_to_sh, rotate_sh
+from stages.core.geometry.harmonics import basis, degree_of, evaluate_sh, rgb_to_sh, rotate_sh
 from stages.core.geometry.rotations import covariance, matrix
 from stages.core.geometry.similarity import Similarity
 from stages.core.scene.gaussians import transformed
@@ -52,3 +52,9 @@ def test_transformed_gaussians_have_their_colours_in_the_rotated_direction(degre
     torch.testing.assert_close(evaluate_sh(moved.sh, rotated), evaluate_sh(g.sh, dirs), atol=1e-5, rtol=1e-5)
     R, C = similarity.rotation, covariance(g.quats, g.scales)
     torch.testing.assert_close(covariance(moved.quats, moved.scales), 4 * R @ C @ R.T, atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("k", [0, 2, 3, 5, 15, 17, 25])
+def test_incomplete_or_higher_bands_are_refused(k):
+    with pytest.raises(ValueError, match=f"{k} coefficients"):
+        degree_of(k)

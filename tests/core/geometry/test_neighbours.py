@@ -72,3 +72,20 @@ def test_fewer_points_than_k_repeat_the_last():
 def test_spacing_of_a_line():
     line = torch.arange(5.0)[:, None] * torch.tensor([[0.1, 0, 0]])
     torch.testing.assert_close(spacing(line, 1), torch.full((5,), 0.1))
+
+
+def test_spacing_is_the_root_mean_square_of_three_distances():
+    line = torch.tensor([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [4, 0, 0], [100, 0, 0]])
+    torch.testing.assert_close(spacing(line)[0], torch.tensor(7.0).sqrt())  # 1, 2 and 4 away
+
+
+def test_a_tree_of_no_points_is_refused():
+    with pytest.raises(ValueError, match="at least one point"):
+        KDTree(torch.zeros(0, 3))
+
+
+@pytest.mark.parametrize("search", [KDTree, BruteForce])
+def test_a_single_point_is_the_nearest(search):
+    distance, index = search(torch.tensor([[3.0, 4, 0]])).query(torch.zeros(2, 3), 2)
+    torch.testing.assert_close(distance, torch.tensor([[5.0, inf]] * 2))
+    assert index[:, 0].tolist() == [0, 0]

@@ -73,3 +73,26 @@ def test_the_same_seed_gives_the_same_plane():
 @pytest.mark.parametrize("points", [torch.zeros(2, 3), torch.zeros(50, 3)], ids=["two points", "one place"])
 def test_no_plane_for_too_few_points(points):
     assert ransac(points, 0.01) is None
+
+
+def test_ransac_takes_the_plane_of_the_largest_weight():
+    low, high = (points_on([0.0, 0, 1], z, n, 0.0)[0] for z, n in ((0.0, 300), (1.0, 100)))
+    points = torch.cat([low, high])
+    for weight, expected in ((1.0, 0.0), (6.0, 1.0)):
+        plane, inside = ransac(points, 0.01, torch.cat([torch.ones(300), torch.full((100,), weight)]))
+        assert abs(plane.heights(torch.tensor([0.0, 0, expected]))) < 1e-4
+        assert torch.equal(inside, (points[:, 2] - expected).abs() < 0.01)
+
+
+def test_refined_plane_is_the_fit_to_its_inliers():
+    points, _ = points_on([1.0, -1, 4], -0.2, 2000, 0.01)
+    plane, inside = ransac(points, 0.02, allowed=lambda n: n[:, 2] < 0)
+    assert plane.normal[2] < 0
+    again = fit_plane(points[inside])
+    assert angle(plane.normal, again.normal) < 0.1 and abs(abs(again.offset) - abs(plane.offset)) < 1e-3
+    torch.testing.assert_close(plane.normal.norm(), torch.tensor(1.0))
+
+
+def test_no_plane_where_no_normal_is_allowed():
+    points, _ = points_on([0.0, 0, 1], 0.0, 100, 0.0)
+    assert ransac(points, 0.01, allowed=lambda n: n[:, 2] > 2) is None

@@ -11,7 +11,7 @@ import torch
 from stages.core.errors import InputError
 from stages.core.scene.images import write_png
 from stages.evaluate.options import EvaluateOptions
-from stages.evaluate.result import Result, format_table, to_json
+from stages.evaluate.result import Curve, Result, format_number, format_table, to_json
 from stages.evaluate.stage import run
 from tests.browser import until
 from tests.evaluate.motions import write_motion
@@ -101,3 +101,18 @@ def test_options_that_do_not_apply_are_errors(tmp_path, two_balls):
     (tmp_path / "a.png").write_bytes(b"x")
     with pytest.raises(InputError, match="--align: does not apply to files of kind image"):
         run(tmp_path / "a.png", tmp_path / "a.png", None, EvaluateOptions(align=True))
+
+
+@pytest.mark.parametrize(("value", "text"), [
+    (None, "-"), (math.nan, "-"), (7, "7"), (0.001, "0.0010"), (0.00099951, "0.0009995"), (-0.5, "-0.5000"),
+    (9999.5, "9999.5000"), (10000.0, "1e+04"), (math.inf, "inf"), (0.0, "0"),
+])  # fmt: skip
+def test_numbers_have_four_significant_digits(value, text):
+    assert format_number(value) == text
+
+
+def test_values_of_json_that_json_has_not():
+    found = to_json(Result("pictures", {"a": math.inf, "b": -math.inf, "c": math.nan, "d": 3}, {}, ["x"],
+                           [Curve("duck", [0.5, math.nan])]))  # fmt: skip
+    assert found == {"kind": "pictures", "overall": {"a": "inf", "b": "-inf", "c": None, "d": 3}, "objects": {},
+                     "notes": ["x"], "per_frame": {"duck": [0.5, None]}}  # fmt: skip

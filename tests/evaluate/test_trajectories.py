@@ -214,3 +214,17 @@ def test_suffixes_may_be_in_capitals(tmp_path, two_balls):
     assert facts["kind"] == "trajectories" and facts["overall"]["FPE"] == 0
     options = SimulateOptions(forces=tmp_path / "MINE.H5")
     assert with_recorded(options).steps == 12 and with_recorded(SimulateOptions()).steps == SimulateOptions().steps
+
+
+@pytest.mark.parametrize(("frames", "compared"), [(5, 3), (6, 4), (7, 5), (60, 5)])
+def test_resampling_ends_with_the_prediction_or_the_truth(tmp_path, two_balls, frames, compared):
+    """Of 5 frames at 0, 0.03, ... s, those up to the last of the prediction at 0, 0.02, ... s."""
+    still = {"spin": 0.0, "speed": 0.0, "count": 4}
+    write_motion(tmp_path / "true.h5", two_balls, frames=5, dt=0.03, **still)
+    write_motion(tmp_path / "mine.h5", two_balls, frames=frames, dt=0.02, **still)
+    if compared < 5:
+        with pytest.raises(InputError, match=f"{compared} frames, but .* has 5; give --frames {compared}"):
+            evaluate(tmp_path, resample=True)
+    facts = evaluate(tmp_path, resample=True, frames=compared)
+    # it falls by 0.01 per frame of its own, 0.015 per frame of the truth, which falls by 0.01
+    assert facts["per_frame"]["red ball"] == pytest.approx([0.005 * t for t in range(compared)], abs=1e-6)

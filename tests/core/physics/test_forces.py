@@ -6,7 +6,8 @@ import math
 import pytest
 
 from stages.core.errors import InputError
-from stages.core.physics.forces import Force, ForcePrompts, parse
+from stages.core.physics import forces
+from stages.core.physics.forces import Change, Force, ForcePrompts, number, parse, read_forces
 from stages.core.physics.recording import read_prompts_file
 from stages.core.scene.scene import SceneObject
 
@@ -84,3 +85,52 @@ def test_invalid_files(tmp_path, text, message):
     with pytest.raises(InputError, match=message) as error:
         read_prompts_file(file, "a", OBJECTS)
     assert str(file) in str(error.value)
+
+
+def test_prompts_come_back_from_their_rows():
+    push = Force(1, (0.0, 0.0, 8.0), (1.0, 2.0, 3.0), 0.1, 0.3, (0.5, 0.0, 0.0))
+    changes = Change("gravity", 1.6, 0.5), Change("pinned", True, 0.5, 2)
+    p = ForcePrompts((push, Force(2)), frozenset({1, 2}), {2: (0.0, 0.0, 2.0)}, {1: 0.3}, changes)
+    rows = json.loads(json.dumps(p.as_dicts()))
+    assert [row["kind"] for row in rows] == ["force", "force", "pin", "pin", "velocity", "lift", "change", "change"]
+    assert ForcePrompts.from_dicts(rows) == p
+
+
+@pytest.mark.parametrize("prompts", [ForcePrompts((Force(1),)), ForcePrompts(pinned=frozenset({1})),
+                                     ForcePrompts(velocity={1: (0.0, 0.0, 0.0)}), ForcePrompts(lift={1: 0.0}),
+                                     ForcePrompts(changes=(Change("gravity", 0.0, 1.0),))])  # fmt: skip
+def test_any_prompt_counts(prompts):
+    assert prompts and not ForcePrompts()
+
+
+def test_changes_take_effect_in_the_frame_in_which_they_begin():
+    changes = tuple(Change("gravity", 1.0, start) for start in (0.0, 0.1, 0.15, 0.2))
+    p = ForcePrompts((Force(1, start=5.0),), changes=changes)
+    assert p.during(0.1, 0.2) == (p.forces, changes[1:3]) and p.during(0.2, 0.3)[1] == changes[3:]
+
+
+def test_given_prompts_are_added_to_stored_ones():
+    stored = parse(OBJECTS, force=["object=1 torque=0,0,1"], pin=["1"], velocity=["object=1 1,0,0"], lift=["0.5"])
+    p = parse(OBJECTS, force=["object=2 force=0,0,1"], pin=["2"], velocity=["object=1 2,0,0"], lift=["duck=0.1"],
+              stored=stored)  # fmt: skip
+    assert [f.object_id for f in p.forces] == [2, 1] and p.pinned == {1, 2}
+    assert p.velocity == {1: (2.0, 0.0, 0.0)} and p.lift == {1: 0.1, 2: 0.5}
+
+
+def test_files_of_forces_are_lists_of_bounded_length(tmp_path, monkeypatch):
+    row, path = {"obj_id": 1, "start": 0, "end": 0.5, "torque": [0, 0, 1]}, tmp_path / "f.json"
+    path.write_text(json.dumps([row, row]))
+    assert read_forces(path, "any", OBJECTS) == [Force(2, torque=(0.0, 0.0, 1.0), end=0.5)] * 2
+    monkeypatch.setattr(forces, "MAX_ROWS", 1)
+    with pytest.raises(InputError, match="f.json: has 2 entries; at most 1 are read"):
+        read_forces(path, "any", OBJECTS)
+    path.write_text('{"any": {}}')
+    with pytest.raises(InputError, match="f.json: must be {scene name"):
+        read_forces(path, "any", OBJECTS)
+
+
+@pytest.mark.parametrize("text", ["1e9", "-1e9"])
+def test_numbers_up_to_a_billion(text):
+    assert number(text, "x") == float(text)
+    with pytest.raises(InputError, match="x: .* is not finite, or beyond 1e"):
+        number(text.replace("1", "1.1"), "x")

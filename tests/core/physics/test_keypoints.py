@@ -7,7 +7,14 @@ import pytest
 import torch
 
 from stages.core.physics import keypoints as module
-from stages.core.physics.keypoints import bind_gaussians, choose_keypoints, nearest_weights
+from stages.core.physics.keypoints import (
+    bind_gaussians,
+    choose_keypoints,
+    farthest_points,
+    nearest_weights,
+    pull_range,
+)
+from stages.core.scene.trajectory import Keypoints
 from tests.core.physics.test_particles import scene, splats
 
 
@@ -81,3 +88,20 @@ def test_gaussians_follow_keypoints_of_their_own_object():
             assert (keypoints.object_id[index[row]] == id).all() and float(weight[row].sum()) == pytest.approx(1)
     at = (keypoints.rest[0] == g.means).all(1).nonzero()[0, 0]
     assert int(index[at, 0]) == 0 and float(weight[at, 0]) == float(weight[at].max())
+
+
+def test_each_point_is_the_farthest_from_those_before_it():
+    points = torch.rand(200, 3, generator=torch.Generator().manual_seed(0))
+    rows = farthest_points(points, 20)
+    distance = torch.cdist(points, points)
+    for i in range(1, 20):
+        to_chosen = distance[rows[:i]].amin(0)
+        assert to_chosen[rows[i]] == to_chosen.max()
+    assert len(farthest_points(points[:7], 20).unique()) == 7 and len(farthest_points(points[:0], 5)) == 0
+    assert int(farthest_points(points, 1, seed=1)) != int(farthest_points(points, 1, seed=2))
+
+
+def test_users_pull_within_walls_with_a_margin_of_the_extent():
+    keypoints = Keypoints(torch.tensor([[0.0, 0, 0], [4, 1, 2]]), torch.tensor([1, 2]))
+    low, high = pull_range(keypoints, (-10.0, -10.0, 0.0), (10.0, 10.0, 20.0))
+    assert low == pytest.approx((-9.4, -9.4, 0.6)) and high == pytest.approx((9.4, 9.4, 19.4))  # 0.15 of 4

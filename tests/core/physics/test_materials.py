@@ -1,12 +1,21 @@
 """Material tables and the choice of a material for an object."""
 
 import json
+import math
 from pathlib import Path
 
 import pytest
 
 from stages.core.errors import InputError
-from stages.core.physics.materials import ALIASES, DEFAULT_MATERIAL, MATERIALS, choose_materials, find_object
+from stages.core.physics.materials import (
+    ALIASES,
+    DEFAULT_MATERIAL,
+    ELASTIC,
+    MATERIALS,
+    MODELS,
+    choose_materials,
+    find_object,
+)
 from stages.core.scene.scene import SceneObject
 
 README = Path(__file__).parents[3] / "stages/simulate/README.md"
@@ -76,3 +85,61 @@ def test_invalid_files(tmp_path, text, message):
 
 def test_objects_are_found_by_id_name_or_part_of_the_name():
     assert [find_object(key, OBJECTS, "").id for key in (2, "2", "Rubber Duck", "mug")] == [1 + 1, 2, 1, 3]
+
+
+def custom(tmp_path, **values):
+    file = tmp_path / "m.json"
+    file.write_text(json.dumps({"duck": {"E": 1e5, "density": 100, **values}}))
+    return choose_materials(OBJECTS, file=file)[1].material
+
+
+LIMITS = [("E", 1e-3, 9.9e12), ("density", 1e-3, 99_999), ("nu", -0.499, 0.489), ("friction", 0, 99.9), ("loss", 0, 2)]
+BEYOND = {
+    "E": (9e-4, 1e13),
+    "density": (9e-4, 1e5),
+    "nu": (-0.5, 0.49),
+    "friction": (-1e-3, 100),
+    "loss": (-1e-3, 2.001),
+}
+
+
+@pytest.mark.parametrize(("name", "low", "high"), LIMITS)
+def test_values_of_materials_up_to_their_limits(tmp_path, name, low, high):
+    for value in (low, high):
+        assert getattr(custom(tmp_path, **{name: value}), name) == value
+    for value in BEYOND[name]:
+        with pytest.raises(InputError, match="m.json: duck: .*(must be positive|friction must)"):
+            custom(tmp_path, **{name: value})
+
+
+def test_models_of_materials(tmp_path):
+    m = custom(tmp_path, model="von-mises", plastic=[1e3, -5, 2])
+    assert (m.model, m.plastic, m.source) == ("von-mises", (1e3, -5.0, 2.0), "given by the user")
+    assert custom(tmp_path).model == "neo-hookean" and custom(tmp_path, model="corotated").plastic == (0, 0, 0)
+    wrong = [
+        ({"model": "jello"}, "no material model called 'jello'; choose from neo-hookean"),
+        ({"model": 3}, "no material model called 3"), ({"plastic": [1, 2]}, "plastic three of them"),
+        ({"model": "sand"}, "the first of plastic must be positive for sand; .*angle of friction"),
+        ({"model": "snow", "plastic": [0, 1, 1]}, "must be positive for snow"), ({"source": "me"}, "with any of E"),
+    ]  # fmt: skip
+    for values, message in wrong:
+        with pytest.raises(InputError, match=message):
+            custom(tmp_path, **values)
+
+
+def test_a_softened_material_yields_at_the_same_strain():
+    """Stresses are reduced with E; strains, angles and viscosities are not."""
+    of = {name: model.solver_parameters((8.0, 4.0, 2.0), 0.25) for name, model in MODELS.items()}
+    assert of["von-mises"] == (2.0, 1.0, 2.0) and of["snow"] == of["corotated"] == (8.0, 4.0, 2.0)
+    slope = math.sqrt(2) * math.sin(math.radians(30)) / 3  # |dev tau| = sqrt(2) shear in plane strain
+    assert MODELS["sand"].solver_parameters((30.0, 1.0, 1.0), 0.25) == pytest.approx((slope, 0, 0))
+    assert {name for name, model in MODELS.items() if model.plastic} == {"von-mises", "sand", "snow"}
+    assert {"sand", "dough", "snow"}.isdisjoint(ELASTIC) and {"rubber", "steel"} < set(ELASTIC)
+
+
+def test_a_file_that_names_an_object_twice_or_by_part_of_its_name():
+    with pytest.raises(InputError, match="'' is not an object of this scene; there are: none"):
+        find_object(" ", [], "x")
+    assert find_object("3", (*OBJECTS, SceneObject(4, "cup 3")), "").id == 3  # the id before parts of names
+    with pytest.raises(InputError, match="'cup' fits 2 objects"):
+        find_object("cup", (SceneObject(1, "cup a"), SceneObject(2, "cup b")), "x")

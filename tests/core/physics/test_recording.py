@@ -43,3 +43,18 @@ def test_damaged_recordings(tmp_path, change, message):
 def test_the_format_of_ngff_is_no_recording(tmp_path):
     (tmp_path / "forces.json").write_text(json.dumps({"prompts": [{"obj_id": 0, "start": 0, "end": 1}]}))
     assert read_recording(tmp_path / "forces.json") is None
+
+
+@pytest.mark.parametrize(("prompts", "missing"), [
+    (ForcePrompts((Force(3),)), 3), (ForcePrompts(pinned=frozenset({1, 3})), 3), (ForcePrompts(lift={4: 0.1}), 4),
+    (ForcePrompts(velocity={3: (0.0, 0.0, 1.0)}), 3), (ForcePrompts(changes=(Change("pinned", True, 0.1, 5),)), 5),
+    (ForcePrompts((Force(1),), frozenset({2}), changes=(Change("gravity", 1.6, 0.5),)), None),
+])  # fmt: skip
+def test_prompts_act_on_objects_of_the_scene(tmp_path, prompts, missing):
+    file, objects = tmp_path / "done.json", (SceneObject(1, "duck"), SceneObject(2, "cup"))
+    file.write_text(json.dumps({**SAVED, "prompts": prompts.as_dicts()}))
+    if missing is None:
+        assert read_prompts_file(file, "scene", objects) == prompts
+    else:
+        with pytest.raises(InputError, match=f"done.json: acts on object {missing}, which"):
+            read_prompts_file(file, "scene", objects)

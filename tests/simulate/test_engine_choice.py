@@ -1,5 +1,6 @@
 """The engine that `--engine auto` stands for."""
 
+import json
 from dataclasses import replace
 
 import pytest
@@ -7,7 +8,8 @@ import pytest
 from stages.core.physics.forces import Force, ForcePrompts
 from stages.core.physics.keypoints import choose_keypoints
 from stages.core.physics.materials import Material
-from stages.simulate.engine_choice import impact, sag, with_engine
+from stages.simulate import engine_choice
+from stages.simulate.engine_choice import for_engine, impact, sag, with_engine
 from stages.simulate.options import SimulateOptions
 from tests.conftest import two_balls_scene
 
@@ -58,3 +60,29 @@ def test_soft_bodies_slide_by_the_engine_that_has_friction(material, prompts, en
 def test_sag_of_a_column():
     """A column of height h is compressed by rho g h / 2 E on average and rho g h / E at its base."""
     assert sag(Material(E=1e5, density=1000.0), 0.5, 10.0) == pytest.approx(0.05)
+
+
+def test_a_part_that_is_pinned_holds_the_whole_of_an_object_but_in_mpm(tmp_path, caplog):
+    file = tmp_path / "m.json"
+    parts = [{"below": 0.1, "material": "steel", "pinned": True}, {"material": "soft"}]
+    file.write_text(json.dumps({"1": {"parts": parts}, "2": {"parts": [{"below": 1, "material": "wood"}, parts[1]]}}))
+    scene, prompts = two_balls_scene(), ForcePrompts(pinned=frozenset({7}))
+    options = SimulateOptions(materials=file)
+    assert with_engine(options, scene, choose_keypoints(scene, 32)).engine == "mpm"  # for its parts
+    assert for_engine(prompts, scene, replace(options, engine="mpm")) == prompts and not caplog.text
+    assert for_engine(prompts, scene, replace(options, engine="rigid")).pinned == {1, 7}
+    first, second = caplog.messages
+    assert "object 1 (red ball): --engine rigid has one material" in first and "and pins it as a whole" in first
+    assert "object 2" in second and "pins" not in second
+    assert for_engine(prompts, scene, SimulateOptions(engine="rigid")) == prompts
+
+
+@pytest.mark.parametrize(("lift", "velocity", "unit", "speed"), [
+    (0.5, (0.0, 0.0, 0.0), 1.0, (2 * 9.81 * 0.5) ** 0.5), (-0.5, (3.0, 0.0, 4.0), 1.0, 5.0),
+    (0.5, (0.0, 3.0, 4.0), 2.0, (100 + 2 * 9.81) ** 0.5),
+])  # fmt: skip
+def test_speed_after_a_fall_in_metres(lift, velocity, unit, speed):
+    scene = replace(two_balls_scene(), scale={"metres_per_unit": unit})
+    prompts = ForcePrompts(lift={1: lift}, velocity={1: velocity})
+    assert engine_choice._speed(scene, 1, prompts, SimulateOptions()) == pytest.approx(speed)
+    assert engine_choice._speed(scene, 2, prompts, SimulateOptions()) == 0

@@ -1,0 +1,27 @@
+"""Options of `ngff evaluate`: the limits of their values."""
+
+from pathlib import Path
+
+import pytest
+
+from stages.core.errors import InputError
+from stages.evaluate.options import MAX_FILMS_PER_QUESTION, EvaluateOptions
+
+
+@pytest.mark.parametrize(("name", "accepted", "refused"), [
+    ("frames", (1, None), (0, -1)), ("repeats", (1, 9), (0,)),
+    ("films_per_question", (1, MAX_FILMS_PER_QUESTION), (0, MAX_FILMS_PER_QUESTION + 1)),
+    ("report", (Path("a.html"), Path("a.HTM"), None), (Path("a.pdf"), Path("html"))), ("photos", (None,), (Path("p"),)),
+])  # fmt: skip
+def test_limits_of_options(name, accepted, refused):
+    for value in accepted:
+        assert getattr(EvaluateOptions(**{name: value}), name) == value
+    for value in refused:
+        with pytest.raises(InputError, match="^--" + name.replace("_", "-")):
+            EvaluateOptions(**{name: value})
+
+
+def test_photos_are_for_the_report_and_objects_are_named():
+    assert EvaluateOptions(photos=Path("p"), report=Path("a.html")).photos == Path("p")
+    assert EvaluateOptions(objects=" duck, ,red ball,").object_names == ["duck", "red ball"]
+    assert EvaluateOptions().object_names == []

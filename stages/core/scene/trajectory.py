@@ -310,8 +310,10 @@ def _read(path: Path, file: h5py.File) -> Trajectory:
     binding = Binding(values("binding/index"), values("binding/weight"))
     if not dense and (len(binding.index) != lengths["n"] or bool((binding.index >= lengths["p"]).any())):
         raise InputError(f"{path}: the binding does not fit the {lengths['n']} Gaussians and {lengths['p']} keypoints")
-    sums = binding.weight.sum(1)
-    if not ((sums - 1).abs() < ROUNDING).logical_or((binding.index < 0).all(1) & (sums.abs() < ROUNDING)).all():
+    bound = binding.index >= 0
+    if not (bound | (binding.weight.abs() < ROUNDING)).all():
+        raise ValueError("binding/weight has a weight without a keypoint")
+    if not (((binding.weight.sum(1) - 1).abs() < ROUNDING) | ~bound.any(1)).all():
         raise ValueError("binding/weight has a row that does not sum to 1")
     ids = values("objects/id").tolist()
     materials = values("objects/material") if "objects/material" in file else [""] * len(ids)

@@ -1,4 +1,5 @@
 import os
+from contextlib import nullcontext
 from dataclasses import replace
 
 import h5py
@@ -145,3 +146,112 @@ def test_frame_rate_for_other_readers_is_the_inverse_of_the_time_step(tmp_path, 
     write(tmp_path / "t.h5", two_balls)
     with h5py.File(tmp_path / "t.h5") as file:
         assert file.attrs["dt"] == 0.02 and file.attrs["fps"] == pytest.approx(50)
+
+
+def change(path, scene, name: str, value) -> None:
+    """Write a trajectory with another attribute, or another dataset where the name has a slash; None deletes it."""
+    write(path, scene)
+    with h5py.File(path, "a") as file:
+        where = file if "/" in name else file.attrs
+        if name in where:
+            del where[name]
+        if value is not None:
+            where[name] = value
+
+
+@pytest.mark.parametrize(("name", "value", "message"), [
+    ("version", 2, "version 2 is newer than 1; upgrade"), ("version", -1, "version is"), ("dt", 0.0, "dt is"),
+    ("dt", None, "missing"), ("gravity", [0.0, 1.0], "gravity is"), ("floor", np.inf, "floor is"),
+    ("scale", "[1]", "scale or provenance"), ("scale", '{"metres_per_unit": 0}', "metres_per_unit"),
+    ("background", [0.1, 0.2], "background is"), ("provenance", "[]", "scale or provenance"),
+    ("plausibility", "[]", "plausibility is not"), ("plausibility", '{"objects": []}', "plausibility is not"),
+    ("plausibility", '{"objects": {"1": 3}}', "whose measures are not"),
+    ("plausibility", '{"energy_gain": -1}', "plausibility is"),
+    ("plausibility", '{"objects": {"1": {"creep": "x"}}}', "plausibility is"),
+    ("keypoints/positions", np.zeros((0, 10, 3), "f4"), "has no frames|other datasets"),
+    ("gaussians/sh", np.zeros((1700, 2, 3), "f4"), "has 2 coefficients, not 1, 4, 9 or 16"),
+    ("gaussians/scales", -np.ones((1700, 3), "f4"), "scales must be from 0"),
+    ("forces/json", ["[]"], "none of the kinds"),
+    ("forces/json", ['{"kind": "pin", "object_id": 3}'], "not among the objects"),
+    ("binding/index", np.full((1700, 8), -1, "i4"), "has a weight without a keypoint"),
+    ("binding/index", np.zeros((1699, 8), "i4"), "other datasets need|does not fit"),
+    ("objects/name", None, "a part of the trajectory is missing .objects/name"),
+    ("cameras/viewmats", np.zeros((6, 4, 4), "f4"), "viewmat that is not a rotation"),
+])  # fmt: skip
+def test_values_that_a_trajectory_cannot_have(tmp_path, two_balls, name, value, message):
+    change(tmp_path / "t.h5", two_balls, name, value)
+    with pytest.raises(InputError, match=message) as caught:
+        read_trajectory(tmp_path / "t.h5")
+    assert "t.h5" in str(caught.value)
+
+
+def test_what_a_trajectory_may_lack(tmp_path, two_balls):
+    for name in ("objects/material", "forces/json", "cameras/viewmats", "scale", "provenance", "floor"):
+        change(tmp_path / "t.h5", two_balls, name, None)
+        t = read_trajectory(tmp_path / "t.h5")
+        assert (t.info.forces == ()) == (name == "forces/json")
+        assert (t.scene.cameras is None) == (name == "cameras/viewmats")
+        assert (t.scene.floor is None) == (name == "floor")
+        assert [o.material for o in t.scene.objects] == (["", ""] if name == "objects/material" else ["rubber"] * 2)
+        assert t.scene.metres_per_unit == 1 and not t.scene.has_known_scale and t.plausibility is None
+
+
+def test_weights_and_quaternions_may_be_rounded_to_16_bits(tmp_path, two_balls):
+    write(tmp_path / "t.h5", two_balls)
+    for factor, right in ((1.009, True), (0.991, True), (1.02, False), (0.98, False)):
+        for name in ("binding/weight", "gaussians/quats", "objects/rotation"):
+            with h5py.File(tmp_path / "t.h5", "a") as file:
+                before = file[name][()]
+                file[name][...] = factor * before
+            with nullcontext() if right else pytest.raises(InputError, match=name):
+                read_trajectory(tmp_path / "t.h5")
+            with h5py.File(tmp_path / "t.h5", "a") as file:
+                file[name][...] = before
+
+
+def test_gaussians_that_follow_no_keypoint(tmp_path, two_balls):
+    info, keypoints, binding = parts(two_balls)
+    binding.index[:5], binding.weight[:5] = -1, 0
+    with TrajectoryWriter(tmp_path / "t.h5", two_balls, info, keypoints, binding) as writer:
+        writer.append(keypoints.rest, torch.zeros(2, 3), torch.eye(4)[[0, 0]])
+    assert torch.equal(read_trajectory(tmp_path / "t.h5").binding.index, binding.index)
+
+
+def test_dense_frames_are_read_one_by_one(tmp_path, two_balls):
+    path, n = tmp_path / "t.h5", len(two_balls.gaussians)
+    write(path, two_balls)
+    assert not read_trajectory(path).dense
+    with h5py.File(path, "a") as file:
+        for name, width in (("means", 3), ("quats", 4), ("scales", 3)):
+            rows = getattr(two_balls.gaussians, name).numpy()
+            file[f"frames/{name}"] = np.stack([rows, rows + (name == "means"), rows * (2 if name == "quats" else 1)])
+            assert file[f"frames/{name}"].shape == (3, n, width)
+        del file["binding/index"], file["binding/weight"]
+        file["binding/index"], file["binding/weight"] = np.zeros((0, 8), "i4"), np.zeros((0, 8), "f4")
+    t = read_trajectory(path)
+    assert t.dense and len(t) == 3
+    moved, g = t.frame(1), two_balls.gaussians
+    assert torch.equal(moved.means, g.means + 1) and torch.equal(moved.quats, g.quats)
+    assert torch.equal(moved.scales, g.scales) and torch.equal(moved.sh, g.sh)
+    with pytest.raises(InputError, match="t.h5: frame 2 is damaged .frames/quats has a quaternion"):
+        t.frame(2)
+    with h5py.File(path, "a") as file:
+        file["frames/scales"][0, 0, 0] = -1
+    with pytest.raises(InputError, match="frame 0 is damaged .frames/scales must be from 0"):
+        t.frame(0)
+    change(path, two_balls, "frames/means", np.zeros((2, n, 3), "f4"))
+    with pytest.raises(InputError, match="frames/means has shape"):
+        read_trajectory(path)
+
+
+def test_measures_and_facts_of_the_end_of_a_run_are_read_back(tmp_path, two_balls):
+    info, keypoints, binding = parts(two_balls)
+    measures = {"objects": {"1": {"creep": 0.5}, "2": {}}, "energy_gain": 0.25}
+    with TrajectoryWriter(tmp_path / "t.h5", two_balls, info, keypoints, binding) as writer:
+        writer.append(keypoints.rest, torch.zeros(2, 3), torch.eye(4)[[0, 0]])
+        writer.store_plausibility(measures)
+        writer.store_provenance({"command": "ngff simulate"})
+        writer.store_prompts([*info.forces, {"kind": "pin", "object_id": 2}])
+    t = read_trajectory(tmp_path / "t.h5")
+    assert t.plausibility == measures and t.scene.provenance == {"command": "ngff simulate"} and t.field is None
+    assert [f["object_id"] for f in t.info.forces] == [1, 2]

@@ -8,13 +8,21 @@ import pytest
 import torch
 
 from stages.core.errors import InputError, MissingPackage
+from stages.core.scene import images
 from stages.core.scene.images import (
     VideoWriter,
+    image_data,
     list_photos,
     read_8_bit,
     read_image,
     read_labels,
     read_video,
+    resize,
+    sample_frames,
+    to_jpeg,
+    video_info,
+    write_depth,
+    write_jpeg,
     write_labels,
     write_png,
 )
@@ -98,3 +106,67 @@ def test_8_bit_photos_are_those_of_read_image(tmp_path, pixels):
     pixels[..., 0] = 7
     cv2.imwrite(str(tmp_path / "a.png"), pixels)
     assert torch.equal(read_8_bit(tmp_path / "a.png"), (read_image(tmp_path / "a.png") * 255).round().byte())
+
+
+def test_depth_is_stored_in_thousandths(tmp_path):
+    write_depth(tmp_path / "d.png", torch.tensor([[0.0, 1.2344, 1.2346], [65.6, -1.0, 0.0004]]))
+    pixels = cv2.imread(str(tmp_path / "d.png"), cv2.IMREAD_UNCHANGED)
+    assert pixels.dtype == np.uint16 and pixels.tolist() == [[0, 1234, 1235], [65535, 0, 0]]
+    write_depth(tmp_path / "d.png", torch.tensor([[3.0]]), unit=0.5)
+    assert cv2.imread(str(tmp_path / "d.png"), cv2.IMREAD_UNCHANGED).tolist() == [[6]]
+
+
+def test_images_are_shrunk_by_areas_and_enlarged_bilinearly():
+    image = torch.arange(16.0).reshape(4, 4, 1)
+    torch.testing.assert_close(resize(image, 2, 2)[..., 0], torch.tensor([[2.5, 4.5], [10.5, 12.5]]))
+    wide = resize(torch.tensor([[[0.0, 1], [4, 5]]]), 4, 1)
+    torch.testing.assert_close(wide, torch.tensor([[[0.0, 1], [1, 2], [3, 4], [4, 5]]]))
+
+
+def test_jpegs_have_the_channels_and_the_quality_asked_for(tmp_path):
+    image = torch.zeros(16, 16, 3)
+    image[..., 0], image[..., 2] = 1.5, 0.25  # clamped
+    write_jpeg(tmp_path / "a.jpg", image)
+    expected = torch.tensor([1.0, 0.0, 0.25]).expand(16, 16, 3)
+    torch.testing.assert_close(read_image(tmp_path / "a.jpg"), expected, atol=0.02, rtol=0)
+    noise = torch.rand(64, 64, 3, generator=torch.Generator().manual_seed(0))
+    assert (tmp_path / "a.jpg").read_bytes() == to_jpeg(image) and len(to_jpeg(noise, 20)) < len(to_jpeg(noise)) / 2
+
+
+def test_label_images_have_one_channel_and_a_bounded_depth(tmp_path):
+    cv2.imwrite(str(tmp_path / "a.png"), np.zeros((3, 3, 3), np.uint8))
+    with pytest.raises(InputError, match="a.png: has 3 channels; a label image has one"):
+        read_labels(tmp_path / "a.png")
+    write_labels(tmp_path / "b.png", torch.tensor([[255, 0]]))
+    assert read_labels(tmp_path / "b.png", max_bits=8).tolist() == [[255, 0]]
+    write_labels(tmp_path / "b.png", torch.tensor([[256, 0]]))
+    assert read_labels(tmp_path / "b.png").tolist() == [[256, 0]]
+    with pytest.raises(InputError, match="b.png: has 16 bits per pixel; save the label image with 8"):
+        read_labels(tmp_path / "b.png", max_bits=8)
+
+
+def test_folders_without_photos_and_long_files_are_refused(tmp_path, monkeypatch):
+    with pytest.raises(InputError, match="no photos in it; these formats are read: .*.png"):
+        list_photos(tmp_path)
+    write_png(tmp_path / "a.png", torch.zeros(4, 4, 3))
+    with pytest.raises(InputError, match="a.png: is not a folder"):
+        list_photos(tmp_path / "a.png")
+    size = (tmp_path / "a.png").stat().st_size
+    monkeypatch.setattr(images, "MAX_IMAGE_BYTES", size)
+    assert len(image_data(tmp_path / "a.png")) == size
+    monkeypatch.setattr(images, "MAX_IMAGE_BYTES", size - 1)
+    with pytest.raises(InputError, match="a.png: has more than 0 MB"):
+        image_data(tmp_path / "a.png")
+
+
+def test_frames_are_sampled_evenly_with_both_ends(tmp_path):
+    pytest.importorskip("av")
+    with VideoWriter(tmp_path / "v.mp4", fps=10.0) as video:
+        for n in range(9):
+            video.append(torch.full((32, 64, 3), n / 8))
+    assert video_info(tmp_path / "v.mp4") == (9, 10.0)
+    for count, expected in ((3, [0, 4, 8]), (1, [0]), (20, list(range(9)))):
+        jpegs = sample_frames(tmp_path / "v.mp4", count, 32)
+        pixels = [cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR) for jpeg in jpegs]
+        assert [p.shape for p in pixels] == [(16, 32, 3)] * len(expected)
+        assert [round(p.mean() / 255 * 8) for p in pixels] == expected

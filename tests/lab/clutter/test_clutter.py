@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,21 +15,30 @@ from stages.core.models.segmenter.network import CANDIDATE_FEATURES, SCORES
 from stages.core.models.segmenter.segment import load_segmenter, object_ids
 from stages.core.scene.files import sha256
 from stages.core.scene.scene_ply import read_scene
+from stages.lab.clutter import scenes
 from stages.lab.clutter.composites import make_composite
 from stages.lab.clutter.examples import read_example
 from stages.lab.clutter.noise_model import Degradation, observed
 from stages.lab.clutter.scenes import ClutterOptions, Shelf, make_scene, run
 from stages.lab.training import train_segmenter
 from stages.lab.training.segmenter_data import targets
+from tests.conftest import random_gaussians
 
 pytest.importorskip("mujoco")
 PERFECT = Degradation(bend=0.0, fatten=0.0, drift=0.0, patch=8.0, grain=0.0, plain=0.0, holes=-1.0, merge=0.005)
+NUMBER = 26  # of a small scene
 
 
 @pytest.fixture(scope="module")
 def scene():
-    """A scene of a few things."""
-    return make_scene(6, Shelf((), 0), ClutterOptions(photos=6))[0]
+    """A scene of a few things, with one part and with several."""
+    return make_scene(NUMBER, Shelf((), 0), ClutterOptions(photos=4))[0]
+
+
+@pytest.fixture(scope="module")
+def exact(scene):
+    """An observation without noise: surfels and the object of each."""
+    return observed(scene, np.random.default_rng(0), PERFECT)
 
 
 def test_things_rest_on_the_furniture_and_do_not_reach_into_each_other(scene):
@@ -41,14 +51,22 @@ def test_things_rest_on_the_furniture_and_do_not_reach_into_each_other(scene):
     assert min(float(g.means[g.object_id == o.id, 2].min()) for o in scene.objects) < 0.02
 
 
+def test_objects_of_the_data_set_keep_their_area_when_thinned(monkeypatch):
+    g = random_gaussians(4 * scenes.DATA_SET_POINTS)
+    monkeypatch.setattr(scenes, "make_object", lambda name: g)
+    thinned = Shelf((), 0).pick(SimpleNamespace(uniform=lambda: 0.0, choice=lambda names: "thing")).gaussians
+    assert len(thinned) == scenes.DATA_SET_POINTS
+    assert float(thinned.scales.square().sum()) == pytest.approx(float(g.scales.square().sum()), rel=0.02)
+
+
 def test_a_scene_is_the_same_from_one_seed(scene):
-    again = make_scene(6, Shelf((), 0), ClutterOptions(photos=6))[0]
+    again = make_scene(NUMBER, Shelf((), 0), ClutterOptions(photos=4))[0]
     assert torch.equal(again.gaussians.means, scene.gaussians.means)
     assert torch.equal(again.cameras.viewmats, scene.cameras.viewmats)
 
 
-def test_an_observation_without_noise_lies_on_the_true_surface(scene):
-    surfels, labels = observed(scene, np.random.default_rng(0), PERFECT)
+def test_an_observation_without_noise_lies_on_the_true_surface(scene, exact):
+    surfels, labels = exact
     t = targets(surfels, labels)
     assert set(labels.unique().tolist()) <= set(scene.gaussians.object_id.unique().tolist())
     assert (t.classes == 1).any()
@@ -59,8 +77,8 @@ def test_an_observation_without_noise_lies_on_the_true_surface(scene):
     assert level > 1.2 * (noisy.points[noisy_labels == 0, 2].abs() < 0.006).float().mean()
 
 
-def test_offsets_lead_to_the_middle_of_the_object(scene):
-    t = targets(*observed(scene, np.random.default_rng(0), PERFECT))
+def test_offsets_lead_to_the_middle_of_the_object(exact):
+    t = targets(*exact)
     for label in t.labels.unique().tolist():
         if label > 0:
             own = t.labels == label

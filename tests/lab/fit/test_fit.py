@@ -85,7 +85,7 @@ def test_a_rebound_shows_the_loss_factor_and_nothing_of_friction(bounce, device)
 
 def test_the_command_writes_materials_that_simulate_takes(slide, tmp_path):
     done = CliRunner().invoke(app, ["fit", str(slide / "scene.ply"), str(slide / "track.h5"), "-o",
-                                    str(tmp_path / "m.json"), "--workers", "1", "--keypoints", "8"])  # fmt: skip
+                                    str(tmp_path / "m.json"), "--workers", "1", "--keypoints", "16"])  # fmt: skip
     assert done.exit_code == 0, done.output
     assert "not identifiable from the motion: loss" in done.stdout
     chosen = choose_materials(read_scene(slide / "scene.ply").objects, file=tmp_path / "m.json")

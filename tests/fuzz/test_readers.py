@@ -20,12 +20,13 @@ from stages.lab.fuzz.examples import example_scene, write_trajectory
 from stages.lab.fuzz.kinds import KINDS, Kind
 
 
-def test_a_thousand_damaged_files(tmp_path):
-    counts, failures = run_here(tmp_path, 1000)
+@pytest.mark.parametrize("count", [300, pytest.param(1000, marks=pytest.mark.slow)])
+def test_damaged_files(tmp_path, count):
+    counts, failures = run_here(tmp_path, count)
     assert not failures, "\n".join(failures[:5])
-    assert sum(counts.values()) == 1000 and {result for _, result in counts} == set(GOOD)
+    assert sum(counts.values()) == count and {result for _, result in counts} == set(GOOD)
     assert {kind for kind, _ in counts} == {kind.name for kind in KINDS}
-    assert sum(counts[kind.name, "right"] for kind in KINDS) > 100  # the changes are not all fatal
+    assert sum(counts[kind.name, "right"] for kind in KINDS) > count / 10  # the changes are not all fatal
 
 
 @pytest.fixture(scope="module")

@@ -221,8 +221,8 @@ def test_boxes_give_named_objects(scene_file, truth, tmp_path):
         (lambda p: (p / "b.json").write_text("{}") and {"boxes": p / "b.json"}, "is not a prompts file"),
         (lambda p: (p / "b.json").write_text('{"bbox": [[5, 5, 1, 1]], "text": ["x"]}') and {"boxes": p / "b.json"},
          "has no area"),
-        (lambda p: {"names": "9=duck"}, "there is no object 9"),
-        (lambda p: {"scale_reference": "object=9 height=0.1"}, "there is no object 9"),
+        (lambda p: {"names": "9=duck", "backend": "geometric"}, "there is no object 9"),
+        (lambda p: {"scale_reference": "object=9 height=0.1", "backend": "geometric"}, "there is no object 9"),
     ],
 )  # fmt: skip
 def test_invalid_inputs_are_refused_and_nothing_is_written(scene_file, tmp_path, prepare, message):

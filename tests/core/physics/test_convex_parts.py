@@ -135,7 +135,9 @@ SHEETS = {"plate 1/20": plate(0.015), "plate 1/80": plate(0.00375), "pan 1/15": 
           "bowl 1/12": half_ball(0.25), "bowl 1/30": half_ball(0.28)}  # fmt: skip
 
 
-@pytest.mark.parametrize("name", SHEETS)
+@pytest.mark.parametrize("name", [
+    pytest.param(name, marks=pytest.mark.slow) if name == "bowl 1/30" else name for name in SHEETS
+])  # fmt: skip
 def test_thin_walls_keep_their_volume(name):
     """Walls of a twelfth to an eightieth of the size: their parts, and the mass, are right to 10 %."""
     surface, true = SHEETS[name]

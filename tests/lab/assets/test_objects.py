@@ -34,9 +34,14 @@ from tests.lab.small_world import shrink
 
 
 @cache
+def full_size(name: str) -> Gaussians:
+    return make_object(name)
+
+
+@cache
 def made(name: str) -> Gaussians:
     """An object scaled to longest side 1."""
-    g, side = make_object(name), OBJECTS[name].side
+    g, side = full_size(name), OBJECTS[name].side
     return replace(g, means=g.means / side, scales=g.scales / side)
 
 
@@ -81,7 +86,7 @@ def test_registry_holds_the_published_ids_scales_and_materials():
     assert rows[11] == ("phone", 0.4, 2e7, 2600.0)
     assert rows[7] == ("duck", 0.3, 3e5, 300.0)
     assert OBJECTS["cloth"].prompt == "a yellow t-shirt with an owl"
-    can = make_object("can").means
+    can = full_size("can").means
     assert (can.amax(0) - can.amin(0)).max() == pytest.approx(0.4)
 
 
@@ -185,16 +190,14 @@ def test_miku_and_pillow_have_the_expected_colours():
 
 
 def test_objects_do_not_depend_on_the_number_of_threads():
-    before = torch.get_num_threads()
+    one, before = digest(full_size("duck")), torch.get_num_threads()
+    other = 2 if before == 1 else 1
     try:
-        digests = []
-        for threads in (1, 2):
-            torch.set_num_threads(threads)
-            digests.append(digest(make_object("duck")))
-            assert torch.get_num_threads() == threads
+        torch.set_num_threads(other)
+        assert digest(make_object("duck")) == one
+        assert torch.get_num_threads() == other
     finally:
         torch.set_num_threads(before)
-    assert digests[0] == digests[1] == digest(made("duck"))
 
 
 def test_unknown_object_lists_the_names():

@@ -28,15 +28,15 @@ class InitialOverlaps:
             self._row[self._pairs[:, a], self._pairs[:, b]] = np.arange(len(self._pairs))
         self._bodies = model.geom_bodyid[self._pairs]
 
-    def subtract(self, data, fixed: np.ndarray) -> None:
-        """Subtract the allowed overlaps from those of the contacts; `fixed` masks bodies that do not move.
+    def subtract(self, data, fixed: np.ndarray, count: int) -> None:
+        """Subtract the allowed overlaps from the first `count` contacts; `fixed` masks bodies that do not move.
 
         Between mj_fwdPosition, which finds the contacts, and mj_fwdVelocity. Pairs of fixed bodies keep theirs.
         """
         if not len(self._pairs):
             return
         contact = data.contact
-        row = self._row[contact.geom[:, 0], contact.geom[:, 1]]
+        row = self._row[contact.geom[:count, 0], contact.geom[:count, 1]]
         known = np.flatnonzero(row >= 0)
         np.maximum.at(self._deepest, row[known], -contact.dist[known])
         self._substeps += 1

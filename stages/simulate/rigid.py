@@ -32,6 +32,7 @@ from stages.core.geometry.rotations import matrix
 from stages.core.physics.convex_parts import ConvexParts, convex_parts
 from stages.core.physics.forces import Force, ForcePrompts
 from stages.core.physics.materials import MODELS, Material, MaterialChoice
+from stages.core.physics.solid_surface import solid_surface
 from stages.core.physics.state import FrameState
 from stages.core.scene.scene import Scene
 from stages.core.scene.trajectory import Keypoints
@@ -42,6 +43,7 @@ from stages.simulate.initial_overlaps import InitialOverlaps
 from stages.simulate.options import SimulateOptions
 from stages.simulate.resting_bodies import FALLING, FREE, SUPPORT_GAP, RestingBodies, Stance
 from stages.simulate.setup import SceneSetup, check_motion, choose_for_bodies, from_photos, set_up_scene
+from stages.simulate.surface_contacts import SurfaceContacts, surface_shape
 
 log = logging.getLogger(__name__)
 SUBSTEPS = 200  # substeps in a unit of time: that of falling half the size of the smallest object from rest
@@ -197,6 +199,7 @@ class _World:
         lift = setup.lift.double().numpy()[self._free] * scene.metres_per_unit / size
         mujoco.mj_fwdPosition(self.model, self.data)
         self._overlaps = InitialOverlaps(self.model, self.data)
+        self._surfaces = self._surface_contacts(setup, options) if any(len(b.parts.hulls) > 1 for b in bodies) else None
         self.data.qpos.reshape(-1, FREE)[:, :3] -= lift
         self._resting = self._resting_bodies(setup, at_rest)
         self.data.qpos.reshape(-1, FREE)[:, :3] += lift
@@ -245,6 +248,13 @@ class _World:
             return []
         return [i for i in self._free if not setup.lift[i].any() and not any(prompts.velocity.get(self._ids[i], ()))]
 
+    def _surface_contacts(self, setup: SceneSetup, options: SimulateOptions) -> SurfaceContacts:
+        scale = self._scene.metres_per_unit / self.units.length
+        shapes = [surface_shape(solid_surface(self._scene, id, options.seed), setup.box.low[2],
+                                b.parts.com.double().numpy(), scale, len(b.parts.hulls) == 1)
+                  for id, b in zip(self._ids, self._bodies, strict=True)]  # fmt: skip
+        return SurfaceContacts(self._mujoco, self.model, self.data, shapes)
+
     def _resting_bodies(self, setup: SceneSetup, at_rest: list[int]) -> RestingBodies:
         """`data` has the objects as they are in the photos, without lifts."""
         unit = self._scene.metres_per_unit / self.units.length
@@ -286,11 +296,14 @@ class _World:
         """A substep: mj_step with other reference accelerations of contacts."""
         mujoco, model, data = self._mujoco, self.model, self.data
         mujoco.mj_fwdPosition(model, data)
-        if data.ncon:
-            self._overlaps.subtract(data, self._resting.fixed)
+        count = data.ncon
+        if self._surfaces is not None:
+            self._surfaces.add(data, self._resting.fixed)
+        if count:
+            self._overlaps.subtract(data, self._resting.fixed, count)
         mujoco.mj_fwdVelocity(model, data)
         if data.ncon:
-            self._set_references()
+            self._set_references(count)
         mujoco.mj_fwdActuation(model, data)
         mujoco.mj_fwdAcceleration(model, data)
         mujoco.mj_fwdConstraint(model, data)
@@ -301,14 +314,20 @@ class _World:
             data.qpos[FREE * k : FREE * (k + 1)] = pose
             data.qvel[FALLING * k : FALLING * (k + 1)] = 0
 
-    def _set_references(self) -> None:
-        """Damp slow contacts critically, and let friction stop slip within a substep, by at most what it can."""
+    def _set_references(self, count: int) -> None:
+        """Damp slow contacts critically, and let friction stop slip within a substep, by at most what it can.
+
+        The contacts after the first `count` are those of surfaces: inelastic, and pushed apart slowly.
+        """
         data = self.data
         active = data.contact.efc_address >= 0
         normal = data.contact.efc_address[active]
         speed = data.efc_vel[normal]
         missing = np.maximum(2 * self._omega - data.efc_KBIP[normal, 1], 0)
         data.efc_aref[normal] -= missing * np.maximum(1 - np.abs(speed) / REST_SPEED, 0) * speed
+        soft = normal[active[:count].sum() :]
+        push = np.minimum(-(self._omega**2) * data.efc_pos[soft], 2 * self._omega * REST_SPEED)
+        data.efc_aref[soft] = push - 2 * self._omega * data.efc_vel[soft]
         along = normal[:, None] + [1, 2]
         slip = data.efc_vel[along]
         most = 1 + SLIP_LEVER * data.contact.friction[active, 0] * np.maximum(data.efc_aref[normal], 0)

@@ -83,6 +83,17 @@ class SolidSurface:
         inside |= self._full & ~ndimage.binary_dilation(inside, AROUND)
         return x, depth, inside[near]
 
+    def samples(self) -> tuple[np.ndarray, np.ndarray]:
+        """Points (s, 3) on the surface, one in each voxel that has any, and normals (s, 3), outwards."""
+        _, first = np.unique(np.floor(self.points / self.h), axis=0, return_index=True)
+        points, normals = self.points[first], self.normals[first]
+        return points + self.depth(points)[:, None] * normals, normals
+
+    def depth_grid(self) -> tuple[np.ndarray, np.ndarray]:
+        """Depths (x, y, z) below the surface at the centres of voxels in and around the body; the first centre."""
+        x = (np.indices(self._full.shape).reshape(3, -1).T + self._low + 0.5) * self.h
+        return self.depth(x).reshape(self._full.shape), x[0]
+
     def _coarse_depth(self, x: np.ndarray) -> np.ndarray:
         return self._at(self._depth, x)
 

@@ -1,0 +1,122 @@
+"""Contacts between surfaces: analytic distances, directions and gradients, and a small body on a rough one."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from stages.core.physics.convex_cuts import fibonacci
+from stages.core.physics.solid_surface import SolidSurface, solid_surface
+from stages.core.scene.scene_ply import read_scene
+from stages.lab.assets.shapes import Surface, box
+from stages.simulate.initial_overlaps import WINDOW
+from stages.simulate.surface_contacts import SurfaceContacts, SurfaceShape, _slope, _trilinear, surface_shape
+from tests.simulate.test_rigid import cube, roll
+
+mujoco = pytest.importorskip("mujoco")
+
+
+def ball(radius: float, convex: bool = False, count: int = 2000) -> SurfaceShape:
+    """A ball in a grid whose nodes are a twentieth of its radius apart."""
+    h, normals = radius / 20, fibonacci(count)
+    line = np.arange(-1.2 * radius, 1.2 * radius, h)
+    x = np.stack(np.meshgrid(line, line, line, indexing="ij"), -1)
+    return SurfaceShape(radius * normals, normals, radius - np.linalg.norm(x, axis=-1), x[0, 0, 0], h, convex)
+
+
+class Pair:
+    """Two balls of radii .1 and .2 of which MuJoCo knows only their middles, at a distance along x."""
+
+    def __init__(self, distance: float, convex: bool = False):
+        spec = mujoco.MjSpec()
+        spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+        for k, x in enumerate((0.0, distance)):
+            body = spec.worldbody.add_body(pos=[x, 0, 0])
+            body.add_freejoint()
+            body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.001, 0, 0], friction=[0.1 + 0.2 * k, 0, 0],
+                          solref=[-1000, -10.0 - k])  # fmt: skip
+        self.model = spec.compile()
+        self.data = mujoco.MjData(self.model)
+        mujoco.mj_fwdPosition(self.model, self.data)
+        shapes = [ball(0.1, convex), ball(0.2, convex)]
+        self.contacts = SurfaceContacts(mujoco, self.model, self.data, shapes)
+
+    def found(self, distance: float, substeps: int = 1, fixed: bool = False):
+        """The contacts after substeps at a distance, to which the second ball moves at once."""
+        for _ in range(substeps):
+            self.data.qvel[6] = abs(distance - self.data.qpos[7]) / self.model.opt.timestep
+            self.data.qpos[7] = distance
+            mujoco.mj_fwdPosition(self.model, self.data)
+            self.contacts.add(self.data, np.array([True, fixed, fixed]))
+        return self.data.contact
+
+
+def test_depth_and_direction_of_contacts_between_balls():
+    contact = Pair(0.5).found(0.28)
+    assert contact.dist.min() == pytest.approx(-0.02, abs=2e-4)
+    deepest = contact.dist.argmin()
+    # the normal points from the first geometry's body to the second one's
+    x = np.array([0.0, 0.28])[contact.geom[deepest]]
+    assert contact.frame[deepest, :3] @ [x[1] - x[0], 0, 0] == pytest.approx(0.28, rel=0.01)
+    frames = contact.frame.reshape(-1, 3, 3)
+    np.testing.assert_allclose(frames @ frames.transpose(0, 2, 1), np.broadcast_to(np.eye(3), frames.shape), atol=1e-12)
+    assert contact.pos[deepest] == pytest.approx([0.09, 0, 0], abs=0.01)
+    np.testing.assert_allclose(contact.friction[:, 0], 0.3)
+    np.testing.assert_allclose(contact.solref[:, 1], -11.0)
+    assert (contact.efc_address >= 0).all()
+
+
+def test_separate_fixed_and_convex_bodies_have_none():
+    assert len(Pair(0.5).found(0.301).dist) == 0
+    assert len(Pair(0.5).found(0.28, fixed=True).dist) == 0
+    assert len(Pair(0.5, convex=True).found(0.28).dist) == 0
+
+
+def test_the_overlap_at_the_start_is_no_contact_nor_the_least_one_since():
+    pair = Pair(0.26)
+    assert len(pair.found(0.26).dist) == 0
+    assert pair.found(0.25).dist.min() == pytest.approx(-0.01, abs=1e-3)
+    assert len(pair.found(0.31, substeps=2 * WINDOW).dist) == 0
+    assert len(pair.found(0.9).dist) == 0
+    assert pair.found(0.26).dist.min() == pytest.approx(-0.04, abs=1e-3)
+
+
+def test_gradient_of_the_interpolation():
+    rng = np.random.default_rng(0)
+    value, f, step = rng.normal(size=(50, 8)), rng.uniform(0.1, 0.9, (50, 3)), 1e-5
+    numeric = [(_trilinear(value, f + step * e) - _trilinear(value, f - step * e)) / (2 * step) for e in np.eye(3)]
+    np.testing.assert_allclose(_slope(value, f), np.stack(numeric, 1), atol=1e-8)
+
+
+def test_shape_of_a_box_that_ends_at_the_floor():
+    """A box of 1 x 1 x .5 whose lowest quarter is below the floor, in units of half its length about a point in it."""
+    points = box((1.0, 1.0, 0.5), 0.02).points.double().numpy()
+    line = np.arange(-0.49, 0.5, 0.02)
+    body = SolidSurface(np.stack(np.meshgrid(line, line, line[np.abs(line) < 0.25], indexing="ij"), -1).reshape(-1, 3),
+                        0.02, points)  # fmt: skip
+    com = np.array([0.1, 0.0, 0.05])
+    shape = surface_shape(body, -0.125, com, 2.0, convex=False)
+    at = np.round((2 * (np.array([0.0, 0.0, -0.09]) - com) - shape.low) / shape.h).astype(int)
+    assert shape.depth[tuple(at)] == pytest.approx(2 * 0.035, abs=0.03) and shape.h == pytest.approx(0.04)
+    assert (shape.points[:, 2] / 2 + com[2]).min() > -0.125
+    x = shape.points / 2 + com
+    top = x[(shape.normals[:, 2] > 0.9) & (np.abs(x[:, :2]) < 0.45).all(1)]  # edges are rounded
+    assert len(top) > 1000 and np.abs(top[:, 2] - 0.25).max() < 0.003
+
+
+def bumpy(side: float, height: float, bump: float) -> Surface:
+    """A slab with bumps on its faces, six along each side."""
+    s = box((side, side, height), side / 96)
+    wave = torch.sin(s.points[:, :2] * (12 * math.pi / side) + torch.tensor([0.3, 1.1])).prod(1, keepdim=True)
+    return Surface(s.points + bump * s.normals * wave, s.normals).moved((0, 0, height / 2 + bump))
+
+
+def test_a_small_body_does_not_enter_the_bumps_of_a_large_one(tmp_path):
+    """Bumps of half a voxel of the slab are a quarter of the cube's height, by .14 of which it sank into the parts."""
+    small = cube(0.04, 0.12, 0.15).moved((0.0, -0.05, 0.0))
+    t = roll(tmp_path, bumpy(1.0, 0.1, 0.01), small, steps=40, pin=("1",), keypoints=300)
+    slab = solid_surface(read_scene(tmp_path / "scene.ply"), 1)
+    mine = t.keypoints.object_id == 2
+    depth = [float(slab.depth(t.positions[k, mine].double().numpy()).max()) for k in range(0, 40, 3)]
+    assert max(depth) < 0.03 * 0.04 and depth[-1] > -0.05 * 0.04

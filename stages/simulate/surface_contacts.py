@@ -3,7 +3,8 @@
 The faces of convex parts lie at the mean level of the surface under them. What a rough surface has above it would enter
 other bodies, by up to a voxel of the rougher one: much of the height of a small body on a large one. So samples of each
 body's surface are looked up in the signed distance of the others, and those inside are contacts along its gradient,
-besides the contacts of the parts. Pairs that both fill their convex hull need none.
+besides the contacts of the parts; so are those beyond the floor and walls. Bodies that fill their convex hull need none
+with each other and with planes.
 
 These contacts are inelastic: critically damped, and pushed apart at no more than the speed at which contacts do not
 rebound, since a sample that meets an edge or a thin wall may be deep inside at once. The overlap of two bodies at the
@@ -21,6 +22,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy import ndimage
+from scipy.spatial import ConvexHull, QhullError
 
 from stages.core.physics.solid_surface import SolidSurface
 from stages.simulate.initial_overlaps import WINDOW
@@ -68,6 +70,10 @@ class SurfaceContacts:
         self._h = np.array([s.h for s in shapes])
         rough = ~np.array([s.convex for s in shapes])
         self._possible = (rough[:, None] | rough) & ~np.eye(count, dtype=bool)
+        self._planes = np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE)
+        lowest = [self._first[i] + _hull_corners(s.points) if rough[i] else [] for i, s in enumerate(shapes)]
+        self._corners = np.concatenate(lowest).astype(np.int64)  # the samples that can touch planes
+        self._corner_of = np.repeat(np.arange(count), [len(rows) for rows in lowest])
         # the first part of each, whose friction and damping are those of the body
         self._geom = np.array([np.flatnonzero(model.geom_bodyid == i + 1)[0] for i in range(count)])
         self._dof = model.body_dofadr[1 : count + 1]
@@ -80,6 +86,9 @@ class SurfaceContacts:
         self._update_lists(data, fixed)
         self._note(self._contacts(data)[2:], fixed)
         self._allowed, self._deepest[:] = np.maximum(self._deepest, self._deepest.T), 0.0
+        self._below = np.zeros((count, len(self._planes)))  # how far a body is beyond each plane at the start
+        _, depth = self._beyond_planes(data)
+        np.maximum.at(self._below, self._corner_of, depth)
 
     def add(self, data, fixed: np.ndarray) -> None:
         """Add the contacts to those found by mj_fwdPosition, and make the constraints again; `fixed` masks the bodies
@@ -95,8 +104,15 @@ class SurfaceContacts:
         self._note((depth, a, b), fixed)
         excess = depth - self._allowed[a, b]
         k = np.flatnonzero(excess > 0)
-        if len(k):
-            self._append(data, x[k] + depth[k, None] / 2 * normal[k], normal[k], excess[k], a[k], b[k])
+        one, two = self._geom[b[k]], self._geom[a[k]]
+        x, normal, excess = x[k] + depth[k, None] / 2 * normal[k], normal[k], excess[k]
+        at, depth = self._beyond_planes(data)
+        depth -= self._below[self._corner_of]
+        row, plane = np.nonzero((depth > 0) & ~fixed[self._corner_of, None])
+        if len(k) + len(row):
+            one, two = np.append(self._planes[plane], one), np.append(self._geom[self._corner_of[row]], two)
+            normal = np.concatenate([data.geom_xmat[self._planes[plane]][:, 2::3], normal])
+            self._append(data, np.concatenate([at[row], x]), normal, np.append(depth[row, plane], excess), one, two)
 
     def _note(self, contacts: tuple, fixed: np.ndarray) -> None:
         """Take the deepest samples of each pair; those of some substeps bound the overlap allowed from then on."""
@@ -164,8 +180,17 @@ class SurfaceContacts:
         own = (turn[a] @ self._normals[sample[k], :, None])[..., 0]
         return x, normal, depth * (-(own * normal).sum(1) / FACING).clip(0, 1), a, b
 
-    def _append(self, data, x, normal, excess, of, into) -> None:
-        """Add contacts at x (k, 3) and make the constraints again."""
+    def _beyond_planes(self, data) -> tuple[np.ndarray, np.ndarray]:
+        """Positions (k, 3) of the corners and how far (k, planes) they are beyond each plane."""
+        at, turn = data.xpos[1:], data.xmat[1:].reshape(-1, 3, 3)
+        x = (turn[self._corner_of] @ self._points[self._corners, :, None])[..., 0] + at[self._corner_of]
+        normal = data.geom_xmat[self._planes][:, 2::3]
+        return x, (data.geom_xpos[self._planes] * normal).sum(1) - x @ normal.T
+
+    def _append(self, data, x, normal, excess, one, two) -> None:
+        """Add contacts at x (k, 3) of geometries (k,), with normals from the first to the second one, and make the
+        constraints again.
+        """
         mujoco, model = self._mujoco, self._model
         contact, before = mujoco.MjContact(), data.ncon
         contact.dim = 3
@@ -174,7 +199,7 @@ class SurfaceContacts:
         for _ in range(len(x)):
             mujoco.mj_addContact(model, data, contact)
         added, new, kept = data.contact, slice(before, None), slice(data.ncon - before)  # fewer where memory is short
-        x, normal, excess, one, two = x[kept], normal[kept], excess[kept], self._geom[into[kept]], self._geom[of[kept]]
+        x, normal, excess, one, two = x[kept], normal[kept], excess[kept], one[kept], two[kept]
         added.geom1[new], added.geom2[new], added.geom[new] = one, two, np.stack([one, two], 1)
         added.dist[new], added.pos[new] = -excess, x
         side = np.cross(normal, np.eye(3)[np.abs(normal).argmin(1)])
@@ -187,6 +212,14 @@ class SurfaceContacts:
         mujoco.mj_makeConstraint(model, data)
         mujoco.mj_island(model, data)
         mujoco.mj_projectConstraint(model, data)
+
+
+def _hull_corners(points: np.ndarray) -> np.ndarray:
+    """Rows of the points at the corners of their convex hull; all of points in a plane."""
+    try:
+        return ConvexHull(points).vertices
+    except (QhullError, ValueError):
+        return np.arange(len(points))
 
 
 def _trilinear(value: np.ndarray, f: np.ndarray) -> np.ndarray:

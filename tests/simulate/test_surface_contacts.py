@@ -26,7 +26,7 @@ def ball(radius: float, convex: bool = False, count: int = 2000) -> SurfaceShape
 
 
 class Pair:
-    """Two balls of radii .1 and .2 of which MuJoCo knows only their middles, at a distance along x."""
+    """Two balls of radii .1 and .2, of which MuJoCo knows only their middles, at a distance along x over a plane."""
 
     def __init__(self, distance: float, convex: bool = False):
         spec = mujoco.MjSpec()
@@ -36,17 +36,20 @@ class Pair:
             body.add_freejoint()
             body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.001, 0, 0], friction=[0.1 + 0.2 * k, 0, 0],
                           solref=[-1000, -10.0 - k])  # fmt: skip
+        spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], pos=[0, 0, -0.19],
+                                friction=[0.2, 0, 0], solref=[-1000, 0])  # fmt: skip
         self.model = spec.compile()
         self.data = mujoco.MjData(self.model)
         mujoco.mj_fwdPosition(self.model, self.data)
         shapes = [ball(0.1, convex), ball(0.2, convex)]
         self.contacts = SurfaceContacts(mujoco, self.model, self.data, shapes)
 
-    def found(self, distance: float, substeps: int = 1, fixed: bool = False):
-        """The contacts after substeps at a distance, to which the second ball moves at once."""
+    def found(self, distance: float, substeps: int = 1, fixed: bool = False, height: float = 0.0):
+        """The contacts after substeps at a distance, to which the second ball moves at once, and both to a height."""
         for _ in range(substeps):
             self.data.qvel[6] = abs(distance - self.data.qpos[7]) / self.model.opt.timestep
             self.data.qpos[7] = distance
+            self.data.qpos[[2, 9]] = height
             mujoco.mj_fwdPosition(self.model, self.data)
             self.contacts.add(self.data, np.array([True, fixed, fixed]))
         return self.data.contact
@@ -57,7 +60,7 @@ def test_depth_and_direction_of_contacts_between_balls():
     assert contact.dist.min() == pytest.approx(-0.02, abs=2e-4)
     deepest = contact.dist.argmin()
     # the normal points from the first geometry's body to the second one's
-    x = np.array([0.0, 0.28])[contact.geom[deepest]]
+    x = np.array([np.nan, 0.0, 0.28])[contact.geom[deepest]]  # the plane is the first one
     assert contact.frame[deepest, :3] @ [x[1] - x[0], 0, 0] == pytest.approx(0.28, rel=0.01)
     frames = contact.frame.reshape(-1, 3, 3)
     np.testing.assert_allclose(frames @ frames.transpose(0, 2, 1), np.broadcast_to(np.eye(3), frames.shape), atol=1e-12)
@@ -80,6 +83,20 @@ def test_the_overlap_at_the_start_is_no_contact_nor_the_least_one_since():
     assert len(pair.found(0.31, substeps=2 * WINDOW).dist) == 0
     assert len(pair.found(0.9).dist) == 0
     assert pair.found(0.26).dist.min() == pytest.approx(-0.04, abs=1e-3)
+
+
+def test_contacts_with_a_plane_begin_at_the_overlap_of_the_start():
+    """The large ball is .01 below the plane at the start."""
+    contact = Pair(0.5).found(0.5, height=-0.03)
+    assert len(contact.dist) and contact.dist.min() == pytest.approx(-0.03, abs=1e-3)
+    assert (contact.geom == [0, 2]).all() and (contact.frame[:, :3] == [0, 0, 1]).all()
+    assert contact.pos[contact.dist.argmin()] == pytest.approx([0.5, 0, -0.23], abs=0.015)
+    np.testing.assert_allclose(contact.friction[:, 0], 0.3)
+    both = Pair(0.5).found(0.5, height=-0.11).geom
+    assert (both[:, 0] == 0).all() and set(both[:, 1]) == {1, 2}
+    assert len(Pair(0.5).found(0.5).dist) == 0
+    assert len(Pair(0.5).found(0.5, height=-0.03, fixed=True).dist) == 0
+    assert len(Pair(0.5, convex=True).found(0.5, height=-0.03).dist) == 0
 
 
 def test_gradient_of_the_interpolation():

@@ -3,17 +3,18 @@
 Units are those of the scene's own scales, so that no constant of the solver depends on size or gravity: the smallest
 object's longest side, the median mass, and SUBSTEPS substeps.
 
-A contact is a damped spring. Its damping ratio is half the loss factor of the materials, weighted by their compliance:
-a stiff body on a soft one rebounds as the soft one does. Below REST_SPEED it is critically damped, since stacks that
-rebound at any speed never come to rest. The frequency is the highest that the substep resolves, so that resting bodies
-sink in by less than 1e-3 of the smallest object. The friction of a pair is the larger coefficient, as in the others.
+A contact is a damped spring. Its damping ratio is half the larger loss factor of both materials. Below REST_SPEED it is
+critically damped, since stacks that rebound at any speed never come to rest. The frequency is the highest that the
+substep resolves, so that resting bodies sink in by less than 1e-3 of the smallest object. The friction of a pair is the
+larger coefficient, as in the others.
 Friction aims at no slip at the end of a substep. A larger deceleration than Coulomb friction can give would lift a
 sliding body, as MuJoCo's friction cones couple slip to the normal, and with the smaller one that follows from the
 materials' damping friction would be viscous: bodies would creep on slopes, and keep their slip in collisions.
 Source: Todorov, Erez and Tassa 2012, "MuJoCo: a physics engine for model-based control"; restitution of a damped
 spring: Schwager and Poeschel 2007, "Coefficient of restitution and linear-dashpot model revisited".
 
-Overlaps at the start are kept (`initial_overlaps.py`); objects of photos rest until disturbed (`resting_bodies.py`).
+Bodies of several parts also touch where their surfaces do (`surface_contacts.py`). Overlaps at the start are kept
+(`initial_overlaps.py`); objects of photos rest until disturbed (`resting_bodies.py`).
 """
 
 from __future__ import annotations
@@ -219,7 +220,6 @@ class _World:
         """Other materials, pins, friction and gravity from now on; objects pinned at the start stay so."""
         model = self.model
         model.opt.gravity[2] = -options.gravity * self.units.time**2 / self.units.length
-        softest = min(materials[id].material.E for id in self._ids)
         self.mass = self.mass.clone()  # frames that were yielded keep theirs
         for row, id in enumerate(self._ids):
             m, b = materials[id].material, self._bodies[row]
@@ -230,7 +230,6 @@ class _World:
             for geom in np.nonzero(model.geom_bodyid == row + 1)[0]:
                 model.geom_friction[geom, 0] = m.friction if options.friction is None else options.friction
                 model.geom_solref[geom, 1] = -2 * b.damping(m) * self._omega
-                model.geom_solmix[geom] = softest / m.E
         self._mujoco.mj_setConst(model, self._mujoco.MjData(model))
         free = {self._ids[i]: k for k, i in enumerate(self._free)}
         self._held = {k: self.data.qpos[FREE * k : FREE * (k + 1)].copy() for id, k in free.items() if id in pinned}
@@ -359,13 +358,12 @@ def _model(
     spec.option.impratio = 10  # friction this much firmer than the normal force, so that slopes hold
     if hasattr(mujoco.mjtEnableBit, "mjENBL_MULTICCD"):  # several contacts between two parts; always so from version 4
         spec.option.enableflags |= mujoco.mjtEnableBit.mjENBL_MULTICCD
-    softest = min(b.material.E for b in bodies)
     impedance = [IMPEDANCE, IMPEDANCE, 0.001, 0.5, 2.0]
     planes = [((0.0, 0.0, floor), (0.0, 0.0, 1.0))]
     if box:
         planes += [(box[side], tuple((-1.0 if side else 1.0) * (a == axis) for a in range(3)))
                    for axis in range(3) for side in (0, 1) if (axis, side) != (2, 0)]  # fmt: skip
-    fixed = {"condim": 3, "friction": [0, 0, 0], "solmix": 0, "solimp": impedance, "solref": [-(omega**2), 0]}
+    fixed = {"condim": 3, "friction": [0, 0, 0], "solimp": impedance, "solref": [-(omega**2), 0]}
     for at, normal in planes:
         quat = np.zeros(4)
         mujoco.mju_quatZ2Vec(quat, np.array(normal))
@@ -373,11 +371,11 @@ def _model(
     for low, high in around:
         spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=(high - low) / 2, pos=(low + high) / 2, **fixed)
     for i, b in enumerate(bodies):
-        _add_body(mujoco, spec, f"body{i}", b, units, omega, softest, impedance)
+        _add_body(mujoco, spec, f"body{i}", b, units, omega, impedance)
     return spec.compile()
 
 
-def _add_body(mujoco, spec, name: str, b: Body, units: Units, omega: float, softest: float, impedance: list) -> None:
+def _add_body(mujoco, spec, name: str, b: Body, units: Units, omega: float, impedance: list) -> None:
     unit = float(b.mass / (b.material.density * b.parts.volume)) ** (1 / 3)  # metres in a scene unit
     body = spec.worldbody.add_body(name=name, pos=(b.start / units.length).tolist())
     body.explicitinertial, body.mass, body.ipos = True, b.mass / units.mass, [0, 0, 0]
@@ -389,7 +387,6 @@ def _add_body(mujoco, spec, name: str, b: Body, units: Units, omega: float, soft
         vertices = (hull - b.parts.com).double() * unit / units.length
         mesh = spec.add_mesh(name=f"{name}_{n}", uservert=vertices.flatten().tolist())
         mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
-        # negative: stiffness and damping themselves, of which MuJoCo takes the mean, weighted by solmix
+        # negative: stiffness and damping themselves, of which MuJoCo takes the smaller numbers, the larger damping
         body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh.name, condim=3, friction=[b.friction, 0, 0],
-                      solref=[-(omega**2), -2 * b.damping(b.material) * omega], solimp=impedance,
-                      solmix=softest / b.material.E)  # fmt: skip
+                      solref=[-(omega**2), -2 * b.damping(b.material) * omega], solimp=impedance)  # fmt: skip

@@ -8,6 +8,7 @@ from scipy.ndimage import gaussian_filter
 
 from stages.core.errors import InputError
 from stages.core.scene.images import VideoWriter, write_png
+from stages.evaluate import images
 from stages.evaluate.images import psnr, ssim
 from stages.evaluate.options import EvaluateOptions
 from stages.evaluate.stage import run
@@ -117,3 +118,34 @@ def test_frames_compares_the_first_ones_and_says_so(tmp_path):
     assert evaluate(mine, true, tmp_path, frames=1)["overall"]["frames"] == 1
     with pytest.raises(InputError, match="both have only 3 frames; give 3 or fewer"):
         evaluate(mine, true, tmp_path, frames=4)
+
+
+def test_images_correspond_by_name_or_by_order(tmp_path):
+    true = folder(tmp_path / "true", [random_image(0), random_image(1)])
+    mine = folder(tmp_path / "mine", [random_image(0), random_image(1)])
+    assert evaluate(mine, true, tmp_path)["notes"] == ["images were matched by name"]
+    (mine / "000.png").rename(mine / "0.png")
+    assert evaluate(mine, true, tmp_path)["notes"] == ["images were matched by order, since names differ"]
+    assert evaluate(mine / "0.png", true / "000.png", tmp_path)["notes"] == []
+
+
+@pytest.mark.parametrize("side", [10, 11])
+def test_images_have_room_for_a_window(tmp_path, side):
+    write_png(tmp_path / "a.png", random_image(0, side, 30))
+    if side == 11:
+        assert evaluate(tmp_path / "a.png", tmp_path / "a.png", tmp_path)["overall"]["SSIM"] == pytest.approx(1)
+    else:
+        with pytest.raises(InputError, match="SSIM needs images of at least 11 pixels"):
+            evaluate(tmp_path / "a.png", tmp_path / "a.png", tmp_path)
+
+
+@pytest.mark.parametrize(("fps", "same"), [(25.02, True), (25.03, False), (24.97, False)])
+def test_rates_of_videos_may_differ_by_a_thousandth(tmp_path, monkeypatch, fps, same):
+    for name in ("mine.mp4", "true.mp4"):
+        (tmp_path / name).touch()
+    monkeypatch.setattr(images, "video_info", lambda path: (1, fps if path.stem == "mine" else 25.0))
+    if same:
+        assert images._check_rates(tmp_path / "mine.mp4", tmp_path / "true.mp4") == []
+    else:
+        with pytest.raises(InputError, match="frames a second, but .*ngff render --fps 25"):
+            images._check_rates(tmp_path / "mine.mp4", tmp_path / "true.mp4")

@@ -11,12 +11,20 @@ from stages.core.physics.materials import MATERIALS
 from stages.core.scene.scene import SceneObject
 from stages.core.scene.trajectory import read_trajectory
 from stages.evaluate import film_section
+from tests.conftest import two_balls_scene
 from tests.evaluate.motions import write_motion
 
 
+@pytest.fixture(scope="module")
+def trajectory(tmp_path_factory):
+    path = tmp_path_factory.mktemp("motion") / "t.h5"
+    return read_trajectory(write_motion(path, two_balls_scene(), frames=2))
+
+
 @pytest.fixture
-def trajectory(tmp_path, two_balls):
-    return read_trajectory(write_motion(tmp_path / "t.h5", two_balls, frames=2))
+def known_volumes(monkeypatch):
+    """Without sampling the objects."""
+    monkeypatch.setattr(film_section, "_volumes", lambda t: [0.5 * o.id for o in t.scene.objects])
 
 
 def with_scene(trajectory, **more):
@@ -43,7 +51,7 @@ def test_sizes_and_masses_are_in_metres_where_the_scale_is_known(trajectory):
     assert 0.2 < shares[0] < 1 and shares[1] == pytest.approx(shares[0], rel=0.02)
 
 
-def test_where_a_material_is_from(trajectory):
+def test_where_a_material_is_from(trajectory, known_volumes):
     objects = (SceneObject(1, "red ball"), SceneObject(2, "thing"))
     t = with_scene(trajectory, objects=objects, provenance={"options": {"material": ["2=steel"]}})
     assert [row[3:] for row in cells(film_section._objects(t))] == [
@@ -62,7 +70,7 @@ def test_where_a_material_is_from(trajectory):
     assert [row[3] for row in cells(film_section._objects(other))] == ["ball", "common"]  # of another tool
 
 
-def test_names_are_escaped(trajectory):
+def test_names_are_escaped(trajectory, known_volumes):
     t = with_scene(trajectory, objects=(SceneObject(1, "<script>"), SceneObject(2, "b")))
     assert "<script>" not in film_section._objects(t) + film_section._next_steps(t, trajectory.path)
 
@@ -92,10 +100,10 @@ def test_where_the_objects_are_from(trajectory, options, text):
     assert "0.25 m: given." in found and "The objects were" not in found
 
 
-def test_commands_to_try_next(trajectory):
+def test_commands_to_try_next(trajectory, known_volumes):
     text = html.unescape(film_section._next_steps(with_scene(trajectory, provenance=CHAIN), trajectory.path))
     assert "ngff simulate toys.ply --lift 1=0.3" in text and '--velocity "object=2 1,0,1"' in text
     assert "ngff render t.h5 -o film.html" in text
     x, y, z = map(float, re.search(r'--force "object=1 force=(\S+),(\S+),(\S+) to=0.2"', text).groups())
     assert (x, y) == (pytest.approx(2 * z, rel=0.01), 0)  # the object's weight upwards, and twice that sideways
-    assert z == pytest.approx(9.81 * film_section._masses(trajectory)[0], rel=0.01)
+    assert z == pytest.approx(9.81 * 0.5 * MATERIALS["rubber"].density, rel=0.01)

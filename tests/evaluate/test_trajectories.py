@@ -216,9 +216,10 @@ def test_suffixes_may_be_in_capitals(tmp_path, two_balls):
     assert with_recorded(options).steps == 12 and with_recorded(SimulateOptions()).steps == SimulateOptions().steps
 
 
-@pytest.mark.parametrize(("frames", "compared"), [(5, 3), (6, 4), (7, 5), (60, 5)])
+@pytest.mark.parametrize(("frames", "compared"), [(5, 3), (7, 5), (9, 5)])
 def test_resampling_ends_with_the_prediction_or_the_truth(tmp_path, two_balls, frames, compared):
     """Of 5 frames at 0, 0.03, ... s, those up to the last of the prediction at 0, 0.02, ... s."""
+    two_balls = replace(two_balls, gaussians=two_balls.gaussians[::50], cameras=None)
     still = {"spin": 0.0, "speed": 0.0, "count": 4}
     write_motion(tmp_path / "true.h5", two_balls, frames=5, dt=0.03, **still)
     write_motion(tmp_path / "mine.h5", two_balls, frames=frames, dt=0.02, **still)

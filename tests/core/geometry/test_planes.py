@@ -85,8 +85,8 @@ def test_ransac_takes_the_plane_of_the_largest_weight():
 
 
 def test_refined_plane_is_the_fit_to_its_inliers():
-    points, _ = points_on([1.0, -1, 4], -0.2, 2000, 0.01)
-    plane, inside = ransac(points, 0.02, allowed=lambda n: n[:, 2] < 0)
+    points, _ = points_on([1.0, -1, 4], -0.2, 300, 0.01)
+    plane, inside = ransac(points, 0.02, allowed=lambda n: n[:, 2] < 0, trials=500)
     assert plane.normal[2] < 0
     again = fit_plane(points[inside])
     assert angle(plane.normal, again.normal) < 0.1 and abs(abs(again.offset) - abs(plane.offset)) < 1e-3

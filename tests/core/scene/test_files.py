@@ -112,3 +112,24 @@ def test_what_a_full_disk_does_not_take_is_read_back_until_the_error_is_reported
         assert bytes(back) == b"6789abcdef" + bytes(4) + b"xyz" + bytes(3)
         with pytest.raises(OSError, match="File too large"):
             file.check()
+
+
+def test_provenance_names_inputs_with_their_hashes_and_options_as_text(tmp_path):
+    (tmp_path / "a.txt").write_bytes(b"abc")
+    facts = files.provenance("ngff x", [tmp_path / "a.txt", tmp_path], {"out": tmp_path, "steps": 3})
+    assert facts["command"] == "ngff x" and facts["options"] == {"out": str(tmp_path), "steps": 3}
+    digest = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"  # of FIPS 180-2, B.1
+    assert facts["inputs"] == [{"name": "a.txt", "sha256": digest}, {"name": tmp_path.name}]
+    assert files.provenance("x", [])["options"] == {} and facts["ngff"] == files.ngff_version()
+    with (tmp_path / "a.txt").open("rb") as file:
+        assert files._digest(file) == digest
+
+
+def test_what_must_exist_is_a_readable_file(tmp_path):
+    (tmp_path / "empty").touch()
+    for name, message in (("absent", "no such file; a toy is expected"), ("", "is a folder; a toy is expected"),
+                          ("empty", "is empty; a toy is expected")):  # fmt: skip
+        with pytest.raises(InputError, match=message):
+            must_exist(tmp_path / name, "a toy")
+    (tmp_path / "empty").write_text("x")
+    assert must_exist(tmp_path / "empty", "a toy") == tmp_path / "empty"

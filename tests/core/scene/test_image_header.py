@@ -125,3 +125,55 @@ def test_files_of_other_kinds_and_of_any_length_are_refused(tmp_path, monkeypatc
     monkeypatch.setattr(images, "MAX_IMAGE_BYTES", 1 << 20)
     with pytest.raises(InputError, match="x.png: has more than 1 MB"):
         read_image(path)
+
+
+def tiff(order: str, tags: dict[int, tuple[int, int]]) -> bytes:
+    """The header of a TIFF file with these tags: kind (3: 16 bits, 4: 32 bits) and value."""
+    entries = b"".join(struct.pack(order + ("HHIHxx" if kind == 3 else "HHII"), tag, kind, 1, value)
+                       for tag, (kind, value) in tags.items())  # fmt: skip
+    name = b"II*\0" if order == "<" else b"MM\0*"
+    return name + struct.pack(order + "I", 10) + b"\0\0" + struct.pack(order + "H", len(tags)) + entries + bytes(4)
+
+
+@pytest.mark.parametrize("order", "<>")
+def test_sizes_of_tiff_files_are_those_of_the_tags_or_of_a_larger_tile(order):
+    data = tiff(order, {255: (3, 9), 256: (3, 300), 257: (4, 70_000), 258: (3, 8)})
+    header = read_image_header(data)
+    assert header[:2] == (300, 70_000) and header.stored == pytest.approx(300 * 70_000 / 8 / 4096)
+    tiles = {256: (4, 300), 257: (4, 37), 322: (3, 512), 323: (3, 32)}
+    assert read_image_header(tiff(order, tiles))[:2] == (512, 37)
+    with pytest.raises(ValueError, match="no image"):
+        read_image_header(data[:2] + data[2:4][::-1] + data[4:])
+    with pytest.raises(ValueError, match="no image"):
+        read_image_header(data[:40])
+
+
+def test_sizes_of_bmp_files_of_both_kinds():
+    """Rows from the top down have a negative height; the older kind has 16 bits for each side."""
+    new = b"BM" + bytes(12) + struct.pack("<IiiHH", 40, 300, -37, 1, 24)
+    assert read_image_header(new) == (300, 37, pytest.approx(300 * 37 * 3 / 4096))
+    old = b"BM" + bytes(12) + struct.pack("<IHHHH", 12, 40_000, 37, 1, 8)
+    assert read_image_header(old) == (40_000, 37, pytest.approx(40_000 * 37 / 4096))
+
+
+@pytest.mark.parametrize("marker", [0xC4, 0xC8, 0xCC, 0xDB, 0xFE])
+def test_segments_of_a_jpeg_before_its_frame_are_skipped(marker):
+    """Also those whose markers are among the ones that begin frames."""
+    frame = b"\xff\xc2" + struct.pack(">HBHHB", 8, 8, 37, 300, 3)
+    between = bytes([0xFF, marker]) + struct.pack(">H", 12) + b"\xff\xc0" * 5
+    header = read_image_header(b"\xff\xd8" + between + b"\xff\xff\x01" + frame + bytes(9))
+    assert header == (300, 37, pytest.approx(300 * 37 * 3 / 4096))
+
+
+def test_bound_of_a_png_is_that_of_deflate():
+    """In 16 bits, with all channels of each colour type."""
+    for kind, channels in ((0, 1), (2, 3), (3, 1), (4, 2), (6, 4)):
+        body = b"IHDR" + struct.pack(">IIBBBBB", 300, 37, 16, kind, 0, 0, 0)
+        data = (
+            b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + body + bytes(4) + struct.pack(">I", 0) + b"IEND" + bytes(4)
+        )
+        assert read_image_header(data) == (300, 37, pytest.approx(37 * 300 * 2 * channels / 1100))
+        with pytest.raises(ValueError, match="a chunk is longer than the file"):
+            read_image_header(data.replace(b"IEND", b"IDAT")[:-5])
+    with pytest.raises(ValueError, match="no image"):
+        read_image_header(data[:25] + b"\x05" + data[26:])

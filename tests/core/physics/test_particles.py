@@ -3,11 +3,21 @@
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
 from stages.core.errors import InputError
-from stages.core.physics.particles import MIN_PARTICLES, inliers, sample_bodies, surface_points
+from stages.core.physics import particles
+from stages.core.physics.particles import (
+    MIN_PARTICLE_OPACITY,
+    MIN_PARTICLES,
+    inliers,
+    sample_bodies,
+    scene_size,
+    surface_points,
+    usable,
+)
 from stages.core.scene.gaussians import Gaussians, concatenate
 from stages.core.scene.scene import Scene, SceneObject
 from stages.lab.assets.objects import OBJECTS
@@ -204,3 +214,72 @@ def test_a_gaussian_much_larger_than_its_object_is_clamped():
     reach = float((points - g.means[0]).norm(dim=1).amax())
     assert float(points.norm(dim=1).max()) < 0.1 + 0.7 * size / 6 and reach > 0.1
     assert float(points.norm(dim=1).max()) > 0.1 + 0.7 * size / 14
+
+
+def test_size_of_a_scene_is_that_of_its_objects_without_a_hundredth_at_either_end():
+    line = torch.linspace(0, 1, 1001)[:, None] * torch.tensor([1.0, 3.0, 0.0])
+    line[0], line[1], line[2, 1] = 50.0, -50.0, math.inf
+    both = scene(splats(line), splats(line[5:6], 2))
+    assert scene_size(both) == pytest.approx(3 * 0.98, rel=0.01)
+    background = replace(both, gaussians=replace(both.gaussians, object_id=torch.zeros(len(both.gaussians), dtype=int)))
+    assert scene_size(background) == 1 and scene_size(scene(splats(torch.zeros(5, 3)))) == 1e-6
+
+
+def test_gaussians_of_any_wrong_value_are_not_usable():
+    g = splats(sphere(12))
+    g.means[0, 1], g.scales[1, 2], g.quats[2, 3], g.scales[3, 0] = math.nan, math.inf, math.nan, 0.0
+    g.quats[4], g.opacities[5], g.scales[6, 1] = 0.0, MIN_PARTICLE_OPACITY, -1.0
+    g.opacities[7] = 1.01 * MIN_PARTICLE_OPACITY
+    assert usable(g).tolist() == [False] * 7 + [True] * 5
+
+
+def voxels(shape, *blocks) -> np.ndarray:
+    """A grid with blocks, each by its first and last voxel."""
+    out = np.zeros(shape, bool)
+    for first, last in blocks:
+        out[tuple(slice(a, b + 1) for a, b in zip(first, last, strict=True))] = True
+    return out
+
+
+def test_specks_smaller_than_a_fiftieth_are_removed():
+    large, speck, single = ((1, 1, 1), (4, 5, 5)), ((8, 1, 1), (8, 1, 2)), ((8, 8, 8), (8, 8, 8))
+    body = voxels((10, 10, 10), large, speck, single)  # of 100, 2 and 1 voxels
+    assert np.array_equal(particles._largest(body), voxels(body.shape, large, speck))
+    touching = voxels((10, 10, 10), large, ((5, 6, 6), (5, 6, 6)))  # by a corner
+    assert np.array_equal(particles._largest(touching), touching)
+
+
+def test_smaller_bodies_have_the_voxels_that_bodies_share():
+    large, small = (np.argwhere(voxels((20, 20, 20), b)) for b in (((0, 0, 0), (9, 9, 9)), ((7, 7, 7), (12, 12, 12))))
+    first, second = particles._without_overlap([large - 5, small - 5])
+    assert np.array_equal(second, small - 5) and len(first) == 1000 - 27
+    assert not {*map(tuple, first)} & {*map(tuple, second)}
+    inner = large[:MIN_PARTICLES]
+    kept = particles._without_overlap([inner, inner[:-1]])  # nothing would remain of the larger one
+    assert np.array_equal(kept[0], inner) and np.array_equal(kept[1], inner[:-1])
+
+
+def test_skin_is_removed_where_a_body_is_five_voxels_thick():
+    for thick, removed in ((4, False), (5, True)):
+        slab = voxels((30, 30, thick + 6), ((0, 0, 3), (29, 29, 2 + thick)))
+        skin = particles._thick_skin(slab)[15, 15]
+        assert np.flatnonzero(skin).tolist() == ([3, 2 + thick] if removed else [])
+
+
+@pytest.mark.parametrize(("hole", "filled"), [(3, True), (9, True), (11, False)])
+def test_cavities_with_narrow_leaks_are_filled(hole, filled):
+    """A room of half width 8 with a square hole of half width 2, 5 or 6: at most two thirds of that of the room."""
+    walls = voxels((17, 17, 17), ((0, 0, 0), (16, 16, 16))) & ~voxels((17, 17, 17), ((1, 1, 1), (15, 15, 15)))
+    a = 8 - hole // 2
+    walls &= ~voxels(walls.shape, ((a, a, 16), (a + hole - 1, a + hole - 1, 16)))
+    found = particles._cavities(walls, particles.LEAK_RADII)
+    assert found[8, 8, 8] == filled and not (found & walls).any()
+    assert found[1:-1, 1:-1, 1:9].all() if filled else not found.any()
+
+
+def test_the_outside_reaches_in_through_holes():
+    free = voxels((9, 9, 9), ((0, 0, 0), (8, 8, 8))) & ~voxels((9, 9, 9), ((2, 2, 2), (6, 6, 6)))
+    free |= voxels((9, 9, 9), ((3, 3, 3), (5, 5, 5)))
+    assert not particles._outside(free)[4, 4, 4] and particles._outside(free)[0, 0, 0]
+    free[4, 4, 6] = True
+    assert np.array_equal(particles._outside(free), free)

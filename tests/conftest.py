@@ -1,5 +1,6 @@
 """Tiny scenes built in memory, the devices present, and skips for data that may be absent."""
 
+import gc
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -22,6 +23,14 @@ if "OMP_NUM_THREADS" not in os.environ:  # plugins import PyTorch before this fi
     torch.set_num_threads(1 if "PYTEST_XDIST_WORKER" in os.environ else 2)
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 SHARED = Path(__file__).resolve().parents[1].parent / "shared"
+
+gc.disable()  # until the tests are collected: the millions of objects of imported modules and tests stay for good
+
+
+def pytest_collection_finish() -> None:
+    """From here on garbage is collected again, without a look at what is there already."""
+    gc.freeze()
+    gc.enable()
 
 
 def pytest_collection_modifyitems(items) -> None:

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 import torch
 
-from stages.evaluate.report import write_report
+from stages.evaluate.label_pictures import RED, LabelColours
+from stages.evaluate.report import _round_up, write_report
 from stages.evaluate.result import Curve, Pictures, Result
 
 RIGHT, TOP, FLOOR, LEFT = 710, 16, 244, 60  # the frame of the plot [px]
@@ -86,3 +87,19 @@ def test_the_title_names_both_files_and_markup_in_names_is_text(tmp_path):
     html = page(tmp_path, curves, pictures=[Pictures("<i>", {"<s>": torch.zeros(2, 2, 3)})], legend={"<u>": (0, 0, 0)})
     assert "<h1>mine against true</h1>" in html and "<title>mine against true</title>" in html
     assert not any(tag in html for tag in ("<b>", "<i>", "<s>", "<u>"))
+
+
+@pytest.mark.parametrize(("value", "top"), [(0.0, 1.0), (-1.0, 1.0), (1.0, 1.0), (1.01, 2.0), (2.0, 2.0), (3.0, 5.0),
+                                            (5.1, 10.0), (0.037, 0.05), (1234.0, 2000.0)])  # fmt: skip
+def test_axes_end_at_the_next_1_2_or_5_times_a_power_of_ten(value, top):
+    assert _round_up(value) == pytest.approx(top)
+
+
+def test_objects_have_colours_that_differ_and_are_not_that_of_false_ones():
+    colours = torch.tensor(list(LabelColours.of(dict.fromkeys(range(12), 1.0), {}).truth.values()))
+    assert colours.min() >= 0 and colours.max() == 1 and colours.unique(dim=0).shape == (12, 3)
+    distance = torch.cdist(colours, colours) + 9 * torch.eye(12)
+    assert distance.min() > 0.05 and distance.diagonal(1).min() > 0.5  # neighbours are far apart
+    assert (colours - torch.tensor(RED)).norm(dim=1).min() > 0.2
+    of = LabelColours.of({5: 1.0, 7: 1.0}, {7: 3})
+    assert of.found == {3: of.truth[7]} and of.truth[5] != of.truth[7]

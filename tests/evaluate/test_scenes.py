@@ -67,3 +67,10 @@ def test_scenes_without_objects_have_no_overlap_and_alignment_is_noted(tmp_path,
     facts = evaluate(tmp_path, replace(two_balls, gaussians=blank, objects=()), two_balls, align=True)
     assert "IoU" not in facts["overall"] and not facts["objects"]
     assert any("aligned by" in note for note in facts["notes"])
+
+
+def test_overlap_of_a_single_object(tmp_path, two_balls):
+    g = two_balls.gaussians
+    one = replace(two_balls, gaussians=replace(g, object_id=g.object_id.clamp(max=1)), objects=two_balls.objects[:1])
+    facts = evaluate(tmp_path, one, one)
+    assert facts["overall"]["IoU"] == 1 and list(facts["objects"]) == ["red ball"]

@@ -16,7 +16,7 @@ from stages.evaluate.label_pictures import draw_objects
 from stages.evaluate.options import EvaluateOptions
 from stages.evaluate.result import Result
 from stages.evaluate.stage import run
-from stages.evaluate.trajectories import transfer_motion
+from stages.evaluate.trajectories import compare, transfer_motion
 from stages.simulate.options import SimulateOptions
 from stages.simulate.stage import with_recorded
 from tests.conftest import ring
@@ -229,3 +229,12 @@ def test_resampling_ends_with_the_prediction_or_the_truth(tmp_path, two_balls, f
     facts = evaluate(tmp_path, resample=True, frames=compared)
     # it falls by 0.01 per frame of its own, 0.015 per frame of the truth, which falls by 0.01
     assert facts["per_frame"]["red ball"] == pytest.approx([0.005 * t for t in range(compared)], abs=1e-6)
+
+
+def test_curves_have_the_rate_of_the_truth_and_equal_keypoints_are_compared_as_they_are(tmp_path, two_balls):
+    small = replace(two_balls, gaussians=two_balls.gaussians[::20], cameras=None)
+    for name in ("mine.h5", "true.h5"):
+        write_motion(tmp_path / name, small, frames=3, dt=0.04)
+    result = compare(tmp_path / "mine.h5", tmp_path / "true.h5", EvaluateOptions())
+    assert result.fps == pytest.approx(25) and result.notes == ["objects were matched by name"]
+    assert result.overall["frames"] == 3 and len(result.curves[0].values) == 3

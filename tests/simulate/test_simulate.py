@@ -2,6 +2,7 @@
 
 import json
 import logging
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import torch
 
 from stages.core.errors import InputError
 from stages.core.physics.forces import ForcePrompts
-from stages.core.physics.materials import DEFAULT_MATERIAL
+from stages.core.physics.materials import DEFAULT_MATERIAL, Material
 from stages.core.scene.gaussians import concatenate
 from stages.core.scene.scene import Scene, SceneObject
 from stages.core.scene.scene_ply import read_scene, write_scene
@@ -19,6 +20,7 @@ from stages.core.scene.trajectory import Trajectory, read_trajectory
 from stages.segment.stage import run as segment
 from stages.simulate import moving_grid
 from stages.simulate import mpm as engine
+from stages.simulate.mpm import _stable_material
 from stages.simulate.options import QUALITIES, MpmQuality, SimulateOptions
 from stages.simulate.setup import set_up_scene
 from stages.simulate.stage import run, with_objects
@@ -278,3 +280,21 @@ def test_plastic_materials_fall_freely_and_sand_slumps(balls, material):
     t = roll(balls, material=(f"thing={material}", "1=sand"), steps=15)
     assert float(mean_shift(t, 2, 5)[2]) == pytest.approx(-9.81 * 0.1**2 / 2, rel=0.03)
     assert float(t.com[-1, 0, 2]) < 0.8 * float(t.com[0, 0, 2])  # the ball of sand collapses
+
+
+def test_viscosity_gives_the_slowest_vibration_the_loss_factor_of_the_material():
+    """Of a bar of length L: omega = pi c / L, and loss = viscosity omega / E for a Kelvin-Voigt solid."""
+    soft = Material(E=1e5, density=400.0, loss=0.2)
+    E, viscosity = _stable_material(soft, 0.5, 0.01, MpmQuality(1000, 1e-4))
+    omega = math.pi * math.sqrt(E / 400.0) / 0.5
+    assert E == 1e5 and viscosity * omega / E == pytest.approx(0.2)
+
+
+@pytest.mark.parametrize(("h", "substep"), [(0.01, 1e-4), (0.02, 1e-4), (0.01, 5e-5)])
+def test_stiff_materials_are_softened_until_waves_cross_a_part_of_a_cell_in_a_substep(h, substep):
+    E, viscosity = _stable_material(Material(E=1e11, density=2500.0, nu=0.25), 0.5, h, MpmQuality(1000, substep))
+    speed = math.sqrt(1.2 * E / 2500.0)  # (1 - nu) / ((1 + nu) (1 - 2 nu)) = 1.2
+    assert 0.2 < speed * substep / (2 * h) < 1
+    first, _ = _stable_material(Material(E=1e11, density=2500.0, nu=0.25), 0.5, 0.01, MpmQuality(1000, 1e-4))
+    assert pytest.approx((h / substep / 100) ** 2) == E / first
+    assert viscosity * substep / (2500.0 * (2 * h) ** 2) < 1  # explicit diffusion is stable

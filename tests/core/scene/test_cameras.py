@@ -188,10 +188,11 @@ def test_real_reference_cameras_are_read(shared):
     assert len(cameras) == 20 and cameras.sizes[0].tolist() == [640, 480]
 
 
-@pytest.mark.parametrize("text", ["{}", '{"frames": []}', "[1]", "nonsense"])
-def test_other_json_is_refused(tmp_path, text):
+@pytest.mark.parametrize(("text", "reason"), [("{}", "frames"), ('{"frames": []}', "no frames"), ("[1]", ""),
+                                              ("nonsense", "Expecting value")])  # fmt: skip
+def test_other_json_is_refused(tmp_path, text, reason):
     (tmp_path / "c.json").write_text(text)
-    with pytest.raises(InputError, match="not a nerfstudio transforms file"):
+    with pytest.raises(InputError, match=f"not a nerfstudio transforms file .*{reason}"):
         read_cameras(tmp_path / "c.json")
 
 

@@ -177,3 +177,9 @@ def test_bound_of_a_png_is_that_of_deflate():
             read_image_header(data.replace(b"IEND", b"IDAT")[:-5])
     with pytest.raises(ValueError, match="no image"):
         read_image_header(data[:25] + b"\x05" + data[26:])
+
+
+def test_sizes_of_extended_webp_files_have_24_bits():
+    header = b"RIFF" + bytes(4) + b"WEBPVP8X" + bytes(8)
+    data = header + (300_000 - 1).to_bytes(3, "little") + (70_000 - 1).to_bytes(3, "little")
+    assert read_image_header(data)[:2] == (300_000, 70_000)

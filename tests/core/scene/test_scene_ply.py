@@ -11,6 +11,7 @@ from stages.core.errors import InputError
 from stages.core.geometry.rotations import covariance
 from stages.core.scene.scene import Scene
 from stages.core.scene.scene_ply import read_scene, write_scene
+from stages.core.scene.schema import MAX_OBJECT_ID
 from stages.core.scene.sequence import FilmedSequence
 from tests.conftest import random_gaussians
 from tests.core.scene.test_cameras import with_photos
@@ -206,3 +207,12 @@ def test_an_object_that_is_there_twice_is_refused(tmp_path, two_balls):
     write_scene(tmp_path / "s.ply", replace(two_balls, objects=two_balls.objects[:1] * 2))
     with pytest.raises(InputError, match="object 1 is there twice"):
         read_scene(tmp_path / "s.ply")
+
+
+@pytest.mark.parametrize("id", [0, MAX_OBJECT_ID])
+def test_ids_of_objects_up_to_the_largest_are_read(tmp_path, two_balls, id):
+    g = two_balls.gaussians
+    write_scene(
+        tmp_path / "s.ply", replace(two_balls, gaussians=replace(g, object_id=torch.full_like(g.object_id, id)))
+    )
+    assert read_scene(tmp_path / "s.ply").gaussians.object_id.unique().tolist() == [id]

@@ -6,9 +6,12 @@ from dataclasses import replace
 import pytest
 import torch
 
+from stages.core.perception.support import find_support
 from stages.core.physics import lighting
 from stages.core.physics.lighting import _best_fit, _lamps, _surface_terms
-from stages.core.raster.shadows import Light
+from stages.core.raster.shadows import Light, Spheres
+from stages.core.scene.gaussians import concatenate
+from tests.conftest import two_balls_scene
 
 
 def surface(count: int = 600):
@@ -98,3 +101,26 @@ def test_shares_of_sky_and_lamp_stay_below_all_of_the_light():
     fit = _best_fit(A, hidden, y, LAMPS)
     assert fit.light.sky >= 0 and fit.light.lamp >= 0
     assert fit.light.sky + fit.light.lamp == pytest.approx(lighting.MAX_SHARE, abs=1e-6)
+
+
+def test_cells_are_of_opaque_background_near_the_objects():
+    """The floor of two balls, with bright Gaussians that must not count: transparent, above it, or of an object."""
+    scene = two_balls_scene()
+    g = scene.gaussians
+    near = Spheres(torch.tensor([[0.0, 0, 0.15]]), torch.tensor([0.15]), torch.ones(1), torch.tensor([1]))
+    support = find_support(scene)
+    points, colours = lighting._surface_cells(scene, support, near)
+    assert len(points) > 20 and float(points[:, :2].norm(dim=1).max()) < 0.15 * 4 + 0.1  # 1 + 3 radii, and a cell
+    torch.testing.assert_close(colours, torch.full_like(colours, lighting.GAMMA * math.log(0.5)), atol=1e-3, rtol=0)
+    floor = (g.object_id == 0).nonzero()[:, 0]
+    for change in ({"opacities": 0.01}, {"object_id": 2}, {"means": 0.3}):
+        more = g[floor]
+        more.sh[:] = 1.0
+        for name, value in change.items():
+            if name == "means":
+                more.means[:, 2] += value
+            else:
+                getattr(more, name)[:] = value
+        both = replace(scene, gaussians=concatenate([g, more, more, more]))
+        again = lighting._surface_cells(both, support, near)
+        torch.testing.assert_close(again, (points, colours))

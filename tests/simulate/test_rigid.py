@@ -112,12 +112,21 @@ def test_only_a_hard_enough_hit_moves_an_object_at_rest(tmp_path, speed, moves):
     assert (float(t.com[-1, 1, 0] - t.com[0, 1, 0]) > 0.05) == moves
 
 
-def test_a_body_of_several_parts_gains_no_energy_on_the_floor(tmp_path):
-    """Springs of contacts that come and go during a collision would make a tumbling cross bounce ever higher."""
+def cross() -> Surface:
     bar = (torch.tensor([0.15, 0.025, 0.025]), box((0.3, 0.05, 0.05), 0.01))
     post = (torch.tensor([0.025, 0.15, 0.025]), box((0.05, 0.3, 0.05), 0.01))
-    cross = union(*((s, lambda p, half=half: (p.abs() < half - 1e-4).all(1)) for half, s in (bar, post)))
-    t = roll(tmp_path, cross.moved((0, 0, 0.5)), loss=0.1, steps=100, velocity=("object=1 1,0,0",),
+    return union(*((s, lambda p, half=half: (p.abs() < half - 1e-4).all(1)) for half, s in (bar, post)))
+
+
+def test_a_body_of_several_parts_slides_by_v2_over_2_mu_g(tmp_path):
+    t = roll(tmp_path, cross().moved((0, 0, 0.025)), velocity=("object=1 1,0,0",), friction=0.3, steps=40)
+    assert float(t.com[-1, 0, 0] - t.com[0, 0, 0]) == pytest.approx(1 / (2 * 0.3 * G), rel=0.03)
+    assert torch.equal(t.com[-1], t.com[-2]) or float((t.com[-1] - t.com[-2]).norm()) < 1e-5
+
+
+def test_a_body_of_several_parts_gains_no_energy_on_the_floor(tmp_path):
+    """Springs of contacts that come and go during a collision would make a tumbling cross bounce ever higher."""
+    t = roll(tmp_path, cross().moved((0, 0, 0.5)), loss=0.1, steps=100, velocity=("object=1 1,0,0",),
              force=("object=1 force=0,0,0 torque=.3,.2,0 to=0.04",))  # fmt: skip
     assert float(t.com[60:, 0, 2].max()) < 0.2
 

@@ -1,0 +1,35 @@
+"""Motions of scenes in memory: what an engine derives from a scene is computed once for all tests that share it."""
+
+from dataclasses import dataclass
+
+from jaxtyping import Float
+from torch import Tensor, stack
+
+from stages.core.backends import choose
+from stages.core.physics import forces
+from stages.core.physics.keypoints import choose_keypoints
+from stages.core.scene.field_start import FieldStart
+from stages.core.scene.scene import Scene
+from stages.core.scene.trajectory import Keypoints
+from stages.simulate.options import ENGINES, SimulateOptions
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Frames of a rollout, in scene units; names as in `Trajectory`."""
+
+    keypoints: Keypoints
+    positions: Float[Tensor, "t k 3"]
+    com: Float[Tensor, "t o 3"]
+    rotation: Float[Tensor, "t o 4"]
+    field: FieldStart | None
+
+
+def roll_out(scene: Scene, options: SimulateOptions) -> Motion:
+    """The motion that `ngff simulate` would write of a labelled scene, with an engine named in the options."""
+    keypoints = choose_keypoints(scene, options.keypoint_count, options.seed)
+    prompts = forces.parse(scene.objects, options.force, options.pin, options.velocity, options.lift)
+    rollout = choose({name: engine.rollout for name, engine in ENGINES.items()}, options.engine)
+    states = list(rollout(scene, keypoints, prompts, options))
+    frames = (stack([getattr(s, name) for s in states]).cpu() for name in ("positions", "com", "rotation"))
+    return Motion(keypoints, *frames, states[0].start)

@@ -7,11 +7,10 @@ import torch
 
 from stages.core.models.checkpoints import SHIPPED, find
 from stages.core.models.initial_conditions import FLOOR, InitialConditions
-from stages.core.scene.scene_ply import write_scene
-from stages.core.scene.trajectory import read_trajectory
 from stages.simulate.options import SimulateOptions
 from stages.simulate.sleep import INITIAL_CONTACT_DISTANCE, SleepState
-from stages.simulate.stage import run
+from tests.conftest import two_balls_scene
+from tests.simulate.motion import roll_out
 
 SIDE = 0.3
 
@@ -60,48 +59,48 @@ def test_only_fast_and_heavy_impacts_wake(speed, height, mass, wakes, device):
     assert state.asleep.tolist() == [not wakes, False]
 
 
-def test_an_object_slightly_above_the_floor_falls(two_balls, tmp_path):
+@pytest.fixture(scope="module")
+def two_balls():
+    return two_balls_scene()
+
+
+def of_learned_engine(**chosen) -> SimulateOptions:
+    """With the shipped weights."""
+    return SimulateOptions(engine="ngff", weights=find("ngff", SHIPPED), keypoints=64, quality="draft", **chosen)
+
+
+def test_an_object_slightly_above_the_floor_falls(two_balls):
     """With both engines: standing means within two particle spacings of the floor."""
     red = two_balls.gaussians.object_id == 1
     means = two_balls.gaussians.means + 0.06 * red[:, None] * torch.tensor([0.0, 0.0, 1.0])
-    write_scene(tmp_path / "scene.ply", replace(two_balls, gaussians=replace(two_balls.gaussians, means=means)))
+    scene = replace(two_balls, gaussians=replace(two_balls.gaussians, means=means))
     for engine in ("ngff", "mpm"):
-        chosen = SimulateOptions(steps=8, engine=engine, keypoints=64, quality="draft")
-        run(tmp_path / "scene.ply", tmp_path / "t.h5", chosen)
-        t = read_trajectory(tmp_path / "t.h5")
+        t = roll_out(scene, SimulateOptions(steps=5, engine=engine, keypoints=64, quality="draft"))
         assert float(t.com[0, 0, 2] - t.com[-1, 0, 2]) > 0.02
 
 
-def test_an_object_at_rest_moves_only_after_an_impact(two_balls, tmp_path):
-    """The red ball is at rest; the green one is released beside it, then above it. With the shipped weights."""
-    write_scene(tmp_path / "scene.ply", two_balls)
-    chosen = SimulateOptions(steps=16, weights=find("ngff", SHIPPED), keypoints=64, quality="draft")
-    run(tmp_path / "scene.ply", tmp_path / "t.h5", chosen)
-    beside = read_trajectory(tmp_path / "t.h5")
+def test_an_object_at_rest_moves_only_after_an_impact(two_balls):
+    """The red ball is at rest; the green one is released beside it, then above it."""
+    beside = roll_out(two_balls, of_learned_engine(steps=16))
     moved = (beside.positions - beside.positions[0]).norm(dim=-1)
     assert moved[:, beside.keypoints.object_id == 1].max() == 0 < moved[:, beside.keypoints.object_id == 2].max()
     green = two_balls.gaussians.object_id == 2
     means = two_balls.gaussians.means.clone()
     red = means[two_balls.gaussians.object_id == 1].mean(0)
     means[green] += red + torch.tensor([0.0, 0, 0.45]) - means[green].mean(0)
-    write_scene(tmp_path / "above.ply", replace(two_balls, gaussians=replace(two_balls.gaussians, means=means)))
-    run(tmp_path / "above.ply", tmp_path / "t.h5", chosen)
-    hit = read_trajectory(tmp_path / "t.h5")
+    above = replace(two_balls, gaussians=replace(two_balls.gaussians, means=means))
+    hit = roll_out(above, of_learned_engine(steps=16))
     moved = (hit.positions - hit.positions[0])[:, hit.keypoints.object_id == 1].norm(dim=-1).amax(1)
     assert moved[3] == 0 < moved[-1]
 
 
-def test_a_later_push_gives_the_same_motion_later(two_balls, tmp_path):
+def test_a_later_push_gives_the_same_motion_later(two_balls):
     red = two_balls.gaussians.object_id == 1
     alone = replace(two_balls, gaussians=two_balls.gaussians[red], objects=two_balls.objects[:1])
-    write_scene(tmp_path / "scene.ply", alone)
-    chosen = SimulateOptions(steps=16, weights=find("ngff", SHIPPED), keypoints=64, quality="draft")
-    runs = []
-    for start in (0.0, 0.2):
-        push = f"object=1 force=2,0,0 from={start} to={start + 0.1}"
-        run(tmp_path / "scene.ply", tmp_path / "t.h5", replace(chosen, force=(push,)))
-        runs.append(read_trajectory(tmp_path / "t.h5").positions)
-    at_once, later = runs
+    at_once, later = (
+        roll_out(alone, of_learned_engine(steps=16, force=(f"object=1 force=2,0,0 from={t} to={t + 0.1}",))).positions
+        for t in (0.0, 0.2)
+    )
     assert torch.equal(later[:11], later[:1].expand(11, -1, -1))
     torch.testing.assert_close(later[10:], at_once[:6], rtol=0, atol=1e-6)
     assert (at_once[5] - at_once[0]).norm(dim=1).max() > 1e-3

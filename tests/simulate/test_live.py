@@ -73,10 +73,14 @@ def test_other_messages_are_refused(text):
 # --- recording ---
 
 
-def prompts_of_a_session(engine, monkeypatch, actions, frames=26, box="-1,-1,0,1,1,2"):
-    """Keypoints of a session with messages at some frames, and of its record, in one engine."""
+@pytest.fixture(scope="module")
+def world():
+    return two_balls_scene()
+
+
+def live_session(world, engine, monkeypatch, actions, frames=26, box="-1,-1,0,1,1,2"):
+    """Keypoints of a session with messages at some frames, the session, and the motion of its prompts."""
     monkeypatch.setitem(QUALITIES, "draft", MpmQuality(particles=800, substep=1e-3))
-    world = two_balls_scene()
     options = SimulateOptions(engine=engine, quality="draft", steps=frames, keypoints=32, box=box)
     keypoints = choose_keypoints(world, 32)
     rollout = choose({name: e.rollout for name, e in ENGINES.items()}, engine)
@@ -90,9 +94,12 @@ def prompts_of_a_session(engine, monkeypatch, actions, frames=26, box="-1,-1,0,1
         session.observe(state)
         for message in actions(n, state):
             session.handle(message)
-    record = ForcePrompts.from_dicts(json.loads(json.dumps(session.record)))
-    again = [state.positions for state in rollout(world, keypoints, record, options)]
-    return torch.stack(live), torch.stack(again), keypoints, session
+    return (
+        torch.stack(live),
+        keypoints,
+        session,
+        lambda prompts: torch.stack([state.positions for state in rollout(world, keypoints, prompts, options)]),
+    )
 
 
 def a_busy_user(n, state):
@@ -110,22 +117,23 @@ def a_busy_user(n, state):
 
 
 @pytest.mark.parametrize("engine", ["ngff", "mpm", "rigid"])
-def test_a_record_repeats_the_motion_exactly(engine, monkeypatch):
-    live, again, keypoints, session = prompts_of_a_session(engine, monkeypatch, a_busy_user)
-    assert torch.equal(live, again)
+def test_a_record_repeats_the_motion_exactly(world, engine, monkeypatch):
+    live, keypoints, session, motion_of = live_session(world, engine, monkeypatch, a_busy_user)
+    record = ForcePrompts.from_dicts(json.loads(json.dumps(session.record)))
+    assert torch.equal(live, motion_of(record))
     red = keypoints.object_id == 1
     assert (live[14, red] - live[2, red]).mean(0)[2] > 0.05  # dragged up
     assert (live[20:, red] - live[21, red]).norm(dim=-1)[1:].max() < 1e-5  # pinned
     assert {row.get("what") for row in session.record} == {None, "gravity", "friction", "material", "pinned"}
 
 
-def test_what_is_held_hangs_where_the_cursor_is(monkeypatch):
+def test_what_is_held_hangs_where_the_cursor_is(world, monkeypatch):
     goal = torch.tensor([-0.3, 0.0, 0.5])
 
     def hold(n, state):
         return [{"do": "grab", "object": 1, "point": [-0.3, 0.0, 0.3], "target": goal.tolist()}] if n == 0 else []
 
-    live, _, keypoints, session = prompts_of_a_session("ngff", monkeypatch, hold, frames=45)
+    live, _, session, _ = live_session(world, "ngff", monkeypatch, hold, frames=45)
     _, k = session.dragged
     assert (live[-1, k] - goal).norm() < 0.03
 
@@ -143,14 +151,14 @@ PAGE_SESSION = """async ([frames, actions]) => {
 
 
 @pytest.mark.usefixtures("device")
-def test_a_page_without_server_answers_alike(tmp_path, monkeypatch, open_page):
+def test_a_page_without_server_answers_alike(world, tmp_path, monkeypatch, open_page):
     """The same messages move the same objects, whether the engine or the page of a playable film takes them."""
-    live, _, _, _ = prompts_of_a_session("ngff", monkeypatch, a_busy_user)
+    live, *_ = live_session(world, "ngff", monkeypatch, a_busy_user)
     assert (page_session(tmp_path, open_page, a_busy_user) - live[-1]).norm(dim=1).max() < 1e-3
 
 
 def page_session(folder, open_page, actions, frames=26, box="-1,-1,0,1,1,2"):
-    """Keypoints after a session like that of `prompts_of_a_session` in a page without server."""
+    """Keypoints after a session like `live_session` in a page without server."""
     write_scene(folder / "scene.ply", two_balls_scene())
     options = SimulateOptions(engine="ngff", quality="draft", steps=2, keypoints=32, box=box)
     run(folder / "scene.ply", folder / "traj.h5", options)
@@ -169,9 +177,9 @@ def a_user_against_the_walls(n, state):
 
 
 @pytest.mark.usefixtures("device")
-def test_walls_stop_what_is_pulled_and_pushed_in_the_page_as_in_the_engine(tmp_path, monkeypatch, open_page):
+def test_walls_stop_what_is_pulled_and_pushed_in_the_page_as_in_the_engine(world, tmp_path, monkeypatch, open_page):
     box = "-0.7,-0.5,0,0.7,0.5,1"
-    live, _, keypoints, _ = prompts_of_a_session("ngff", monkeypatch, a_user_against_the_walls, 51, box)
+    live, keypoints, *_ = live_session(world, "ngff", monkeypatch, a_user_against_the_walls, 51, box)
     end = page_session(tmp_path, open_page, a_user_against_the_walls, 51, box)
     assert (end - live[-1]).norm(dim=1).max() < 1e-3
     radius, walls = 0.15, parse_box(box)

@@ -1,6 +1,7 @@
 """Particles of bodies with smooth surfaces."""
 
 import math
+from functools import cache
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from tests.conftest import ball
 SIDES = torch.tensor([0.4, 0.3, 0.2])
 
 
+@cache
 def inclined_box(degrees: float) -> Scene:
     surface = tilted(box(tuple(SIDES.tolist()), 0.008), degrees)
     g = to_gaussians(surface, torch.full((len(surface.points), 3), 0.5), 1, widest=math.inf)

@@ -7,6 +7,8 @@ import torch
 
 from stages.core.errors import InputError
 from stages.core.geometry.cameras import project
+from stages.core.models.segmenter import clicks
+from stages.core.models.segmenter.voxels import SCALES
 from stages.core.scene.scene import Scene
 from stages.segment.options import SegmentOptions
 from stages.segment.points import parse_points, segment
@@ -43,7 +45,8 @@ def test_points_of_one_name_are_on_one_object():
     assert best_overlap(found.gaussians.object_id, scene.gaussians.object_id)[2] > 0.85
 
 
-def test_a_point_without_an_object_is_logged_and_the_others_are_found(caplog):
+def test_a_point_without_an_object_is_logged_and_the_others_are_found(caplog, monkeypatch):
+    monkeypatch.setattr(clicks, "SCALES", SCALES[:1])  # of three, each of which takes a second
     scene = three_apart()
     nothing = "xy=3,150"  # the table's corner
     found = segment(unlabelled(scene), SegmentOptions(points=(nothing, at(scene, 2, 0, "egg"))))

@@ -2,7 +2,7 @@
 
 import json
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 
 import numpy as np
 import pytest
@@ -12,6 +12,8 @@ from scipy.spatial import cKDTree
 from stages.core.errors import InputError
 from stages.core.geometry.rotations import matrix
 from stages.core.geometry.similarity import Similarity
+from stages.core.models.segmenter import segment as network_segmenter
+from stages.core.models.segmenter.voxels import SCALES
 from stages.core.scene.gaussians import Gaussians, transformed
 from stages.core.scene.scene import Scene
 from stages.core.scene.scene_ply import write_scene
@@ -108,11 +110,13 @@ def test_segment_benchmark_finds_blocks_and_voting_repairs_wrong_masks(tmp_path,
 
 def test_reconstruction_is_measured_in_the_registered_photos(monkeypatch):
     pytest.importorskip("pycolmap")
+    monkeypatch.setattr(network_segmenter, "SCALES", SCALES[:1])  # of three, each of which takes a second
+    monkeypatch.setattr(bench_segment, "tabletop", cache(tabletop))
 
     def perfect(photos, out, options):
         """The scene itself, transformed, without labels, with all cameras but the first."""
         assert len(list(photos.iterdir())) == 8
-        scene = tabletop("apart", 0, 8)
+        scene = bench_segment.tabletop("apart", 0, 8)
         move = Similarity(
             0.5, matrix(torch.tensor([0.8, 0.0, 0.0, 0.6])), torch.tensor([0.1, 0.2, -0.5 * TABLE_HEIGHT])
         )

@@ -11,6 +11,8 @@ import pytest
 import torch
 
 from stages.core.errors import InputError
+from stages.core.models.segmenter import segment as network_segmenter
+from stages.core.models.segmenter.voxels import SCALES
 from stages.core.physics.forces import ForcePrompts
 from stages.core.physics.materials import DEFAULT_MATERIAL, Material
 from stages.core.scene.gaussians import concatenate
@@ -26,6 +28,7 @@ from stages.simulate.setup import set_up_scene
 from stages.simulate.stage import run, with_objects
 from tests.conftest import ball
 from tests.segment.tabletop import three_apart
+from tests.simulate.motion import Motion, roll_out
 
 # A ball of 9 kg in point contact indents by 5 mm (Hertz), twice that when set down suddenly, and by a few tenths of a
 # cell (here 5 cm) until enough particles carry it.
@@ -38,33 +41,45 @@ def small_draft(monkeypatch):
     monkeypatch.setitem(QUALITIES, "draft", MpmQuality(particles=1200, substep=8e-4))
 
 
-@pytest.fixture
-def balls(tmp_path) -> Path:
+@pytest.fixture(scope="module")
+def balls() -> Scene:
     """A ball on the floor, one in the air, and background Gaussians."""
     patch = ball((0.0, 0.0, -0.3), 0.05, 50, (0.5, 0.5, 0.5), 0)
     low = ball((-0.3, 0.0, 0.15), 0.15, 600, (0.9, 0.1, 0.1), 1)
     high = ball((0.3, 0.0, 0.50), 0.12, 600, (0.1, 0.8, 0.1), 2, seed=1)
-    objects = (SceneObject(1, "red ball"), SceneObject(2, "thing"))
-    path = tmp_path / "scene.ply"
-    write_scene(path, Scene(concatenate([patch, low, high]), objects, None, 0.0))
-    return path
+    return Scene(concatenate([patch, low, high]), (SceneObject(1, "red ball"), SceneObject(2, "thing")), None, 0.0)
 
 
-def roll(scene: Path, **options) -> Trajectory:
-    out = scene.with_name("traj.h5")
+@pytest.fixture
+def file(balls, tmp_path) -> Path:
+    write_scene(tmp_path / "scene.ply", balls)
+    return tmp_path / "scene.ply"
+
+
+def options_with(**options) -> SimulateOptions:
     chosen = {"engine": "mpm", "quality": "draft", "steps": 6, "keypoints": 64}
-    run(scene, out, SimulateOptions(**{**chosen, **options}))
+    return SimulateOptions(**{**chosen, **options})
+
+
+def command(file: Path, **options) -> Trajectory:
+    """By the stage, from file to file."""
+    out = file.with_name("traj.h5")
+    run(file, out, options_with(**options))
     return read_trajectory(out)
 
 
-def mean_shift(t: Trajectory, id: int, frame: int = -1) -> torch.Tensor:
+def roll(scene: Scene, **options) -> Motion:
+    return roll_out(scene, options_with(**options))
+
+
+def mean_shift(t: Motion | Trajectory, id: int, frame: int = -1) -> torch.Tensor:
     mine = t.keypoints.object_id == id
     return (t.positions[frame, mine] - t.keypoints.rest[mine]).mean(0)
 
 
-def test_first_frame_is_the_scene_and_free_fall_is_a_parabola(balls, caplog):
+def test_first_frame_is_the_scene_and_free_fall_is_a_parabola(file, caplog):
     caplog.set_level(logging.INFO)
-    t = roll(balls)
+    t = command(file)
     assert len(t) == 6 and t.info.gravity == (0.0, 0.0, pytest.approx(-9.81))
     assert torch.equal(t.positions[0], t.keypoints.rest)
     assert torch.allclose(t.rotation[0], torch.tensor([1.0, 0, 0, 0]), atol=1e-5)
@@ -77,23 +92,20 @@ def test_first_frame_is_the_scene_and_free_fall_is_a_parabola(balls, caplog):
     assert t.scene.provenance["command"] == "simulate"
 
 
-def test_same_seed_gives_the_same_bytes(balls, device):
-    first, second = (roll(balls, steps=4, device=device).positions for _ in range(2))
+def test_same_seed_gives_the_same_bytes(file, device):
+    first, second = (command(file, steps=4, device=device).positions for _ in range(2))
     assert torch.equal(first, second)
 
 
 def test_scene_units_other_than_metres(balls, caplog):
     caplog.set_level(logging.INFO)
-    scene = read_scene(balls)
-    write_scene(balls, replace(scene, scale={"metres_per_unit": 0.5, "source": "test"}))
-    t = roll(balls)
+    t = roll(replace(balls, scale={"metres_per_unit": 0.5, "source": "test"}))
     assert " kg" in caplog.text and "one unit is 1 m" not in caplog.text
-    assert t.info.gravity[2] == pytest.approx(-2 * 9.81)
     assert float(mean_shift(t, 2)[2]) == pytest.approx(-2 * 9.81 * 0.1**2 / 2, rel=0.02)
 
 
-def test_lift_velocity_and_pin(balls):
-    t = roll(balls, lift=("0.2",), velocity=("object=thing 1,0,0",), pin=("1",))
+def test_lift_velocity_and_pin(file):
+    t = command(file, lift=("0.2",), velocity=("object=thing 1,0,0",), pin=("1",))
     assert torch.allclose(mean_shift(t, 1, 0), torch.tensor([0, 0, 0.2]), atol=1e-6)
     assert torch.equal(t.positions[0][t.keypoints.object_id == 1], t.positions[-1][t.keypoints.object_id == 1])
     assert float(mean_shift(t, 2)[0]) == pytest.approx(0.1, rel=0.01)
@@ -127,19 +139,18 @@ def test_stiff_materials_are_softened_and_logged(balls, caplog):
     assert "object 2 (thing): steel" in caplog.text and "reduced from 2.1e+11 to" in caplog.text
 
 
-def test_a_scene_at_rest_gives_a_hint(balls, caplog):
+def test_a_scene_at_rest_gives_a_hint(file, caplog):
     caplog.set_level(logging.INFO)
-    roll(balls, steps=3, gravity=0.0)
+    command(file, steps=3, gravity=0.0)
     assert "everything is at rest" in caplog.text and "--lift 0.3" in caplog.text
     caplog.clear()
-    roll(balls, steps=5)  # a ball falls by 3 cm, 3.5 % of the extent of the objects
+    command(file, steps=5)  # a ball falls by 3 cm, 3.5 % of the extent of the objects
     assert "everything is at rest" not in caplog.text
 
 
 def test_a_scene_without_floor_gets_one_under_the_lowest_object(balls, caplog):
     caplog.set_level(logging.INFO)
-    write_scene(balls, replace(read_scene(balls), floor=None))
-    assert mean_shift(roll(balls, steps=4), 1).norm() < SAG
+    assert mean_shift(roll(replace(balls, floor=None), steps=4), 1).norm() < SAG
     assert "no floor" in caplog.text
 
 
@@ -149,16 +160,15 @@ def test_objects_near_the_floor_are_placed_on_it_without_a_jump(balls):
         assert mean_shift(t, 1).norm() < SAG and torch.equal(t.positions[0], t.keypoints.rest)
 
 
-def test_overlapping_objects_do_not_explode(tmp_path):
+def test_overlapping_objects_do_not_explode():
     a, b = ball((0, 0, 0.15), 0.15, 600, (1, 0, 0), 1), ball((0.1, 0, 0.15), 0.15, 600, (0, 1, 0), 2, seed=1)
-    path = tmp_path / "overlap.ply"
-    write_scene(path, Scene(concatenate([a, b]), (SceneObject(1, "duck"), SceneObject(2, "phone")), None, 0.0))
-    t = roll(path, steps=15)
+    scene = Scene(concatenate([a, b]), (SceneObject(1, "duck"), SceneObject(2, "phone")), None, 0.0)
+    t = roll(scene, steps=15)
     speed = (t.positions[1:] - t.positions[:-1]).norm(dim=2) / 0.02
     assert float(speed.max()) < 1.5  # they collapse under gravity (v^2 < 2 g x 0.15 m)
 
 
-def test_divergence_names_object_time_and_remedy_and_keeps_the_frames(balls, monkeypatch):
+def test_divergence_names_object_time_and_remedy_and_keeps_the_frames(file, monkeypatch):
     advance = engine.mpm.Solver.advance
 
     def fails_later(self, duration, acceleration):
@@ -169,9 +179,9 @@ def test_divergence_names_object_time_and_remedy_and_keeps_the_frames(balls, mon
 
     monkeypatch.setattr(engine.mpm.Solver, "advance", fails_later)
     with pytest.raises(InputError, match=r"object 2 \(thing\).* at 0.04 s.*--quality"):
-        roll(balls)
-    assert not balls.with_name("traj.h5").exists()
-    assert len(read_trajectory(balls.with_name("traj.partial.h5"))) == 3
+        command(file)
+    assert not file.with_name("traj.h5").exists()
+    assert len(read_trajectory(file.with_name("traj.partial.h5"))) == 3
 
 
 @pytest.mark.parametrize("box, message", [
@@ -214,49 +224,50 @@ def test_invalid_options(options, message):
         SimulateOptions(**options)
 
 
-@pytest.mark.parametrize(("name", "value"), [("dt", "abc"), ("material", 5), ("seed", 1e99), ("engine", ["mpm"])])
-def test_damaged_options_of_a_trajectory_are_refused(tmp_path, balls, name, value):
-    roll(balls, steps=2)
-    with h5py.File(balls.with_name("traj.h5"), "a") as file:
-        made_by = json.loads(file.attrs["provenance"])
-        file.attrs["provenance"] = json.dumps({**made_by, "options": {**made_by["options"], name: value}})
-    with pytest.raises(InputError, match=f"its options of `ngff simulate` are damaged.*{name}"):
-        run(balls, tmp_path / "again.h5", SimulateOptions(forces=balls.with_name("traj.h5")))
+def test_damaged_options_of_a_trajectory_are_refused(tmp_path, file):
+    command(file, steps=2)
+    trajectory = file.with_name("traj.h5")
+    with h5py.File(trajectory, "a") as stored:
+        made_by = json.loads(stored.attrs["provenance"])
+    for name, value in (("dt", "abc"), ("material", 5), ("seed", 1e99), ("engine", ["mpm"])):
+        with h5py.File(trajectory, "a") as stored:
+            stored.attrs["provenance"] = json.dumps({**made_by, "options": {**made_by["options"], name: value}})
+        with pytest.raises(InputError, match=f"its options of `ngff simulate` are damaged.*{name}"):
+            run(file, tmp_path / "again.h5", SimulateOptions(forces=trajectory))
 
 
 def test_objects_without_extent_are_left_out(balls, caplog):
-    scene = read_scene(balls)
-    means = torch.where((scene.gaussians.object_id == 2)[:, None], torch.tensor([0.3, 0.0, 0.5]), scene.gaussians.means)
-    scene = replace(scene, gaussians=replace(scene.gaussians, means=means))
-    assert [o.id for o in with_objects(scene, balls).objects] == [1]
+    means = torch.where((balls.gaussians.object_id == 2)[:, None], torch.tensor([0.3, 0.0, 0.5]), balls.gaussians.means)
+    scene = replace(balls, gaussians=replace(balls.gaussians, means=means))
+    assert [o.id for o in with_objects(scene, Path("scene.ply")).objects] == [1]
     assert "object 2 (thing) is a point (600 Gaussians) and is skipped" in caplog.text
     only = scene.gaussians[scene.gaussians.object_id == 2]
     with pytest.raises(InputError, match="its objects are points"):
-        with_objects(replace(scene, gaussians=only), balls)
+        with_objects(replace(scene, gaussians=only), Path("scene.ply"))
 
 
 def test_frames_of_thousands_of_steps_of_the_learned_field_are_refused(balls):
-    scene = read_scene(balls)
-    g = scene.gaussians
-    write_scene(balls, replace(scene, gaussians=replace(g, means=1e-6 * g.means, scales=1e-6 * g.scales)))
+    g = balls.gaussians
+    tiny = replace(balls, gaussians=replace(g, means=1e-6 * g.means, scales=1e-6 * g.scales))
     with pytest.raises(InputError, match="steps of the learned field.*smaller --dt"):
-        roll(balls, engine="ngff")
+        roll(tiny, engine="ngff")
 
 
-def test_unknown_engine(balls):
+def test_unknown_engine(file):
     with pytest.raises(InputError, match="--engine magic: choose from auto, ngff, mpm"):
-        roll(balls, engine="magic")
+        command(file, engine="magic")
 
 
-def test_doubled_resolution_keeps_bodies_on_the_floor(balls):
-    scene, options = with_objects(read_scene(balls), balls), SimulateOptions(quality="draft")
+def test_doubled_resolution_keeps_bodies_on_the_floor(file):
+    scene, options = with_objects(read_scene(file), file), SimulateOptions(quality="draft")
     coarse, fine = (set_up_scene(scene, ForcePrompts(), options, refinement) for refinement in (1, 2))
     assert fine.bodies.spacing == coarse.bodies.spacing / 2 and len(fine.start) > 5 * len(coarse.start)
     for s in (coarse, fine):
         assert float(s.start[s.bodies.body == 0, 2].quantile(0.01)) == pytest.approx(0.5 * s.bodies.spacing, rel=0.5)
 
 
-def test_objects_of_a_scene_without_labels_are_those_of_segment(tmp_path):
+def test_objects_of_a_scene_without_labels_are_those_of_segment(tmp_path, monkeypatch):
+    monkeypatch.setattr(network_segmenter, "SCALES", SCALES[:1])  # of three, each of which takes a second
     scene = three_apart(noise=0.002)
     blank = replace(scene.gaussians, object_id=torch.zeros_like(scene.gaussians.object_id))
     write_scene(tmp_path / "scene.ply", replace(scene, gaussians=blank))

@@ -15,6 +15,7 @@ from stages.core.physics.materials import Material, choose_materials
 from stages.core.scene.scene_ply import read_scene, write_scene
 from stages.core.scene.trajectory import TrajectoryWriter, read_trajectory
 from stages.lab.bench.physics_experiments import Run, ball, block
+from stages.lab.fit import search
 from stages.lab.fit.fit import solve, with_initial
 from stages.lab.fit.options import MaterialFitOptions
 from stages.lab.fit.parameters import fitted, material_parameters, velocity_parameters
@@ -57,13 +58,26 @@ def bounce(tmp_path_factory):
     return make_track(folder, ball(0.1, (0.0, 0.0, 0.1)), lift=("0.2",), steps=25)
 
 
+@pytest.fixture(scope="module")
+def slide_fit(slide, device):
+    """The fit of the slide, made by the command; what that prints, and its file of materials."""
+    fits, out = [], slide / "m.json"
+    words = ["fit", slide / "scene.ply", slide / "track.h5", "-o", out, "--workers", 1, "--keypoints", 16,
+             "--evaluations", OPTIONS.evaluations, "--device", device]  # fmt: skip
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("stages.lab.fit.fit.solve", lambda *problem: fits.append(solve(*problem)) or fits[0])
+        done = CliRunner().invoke(app, [str(word) for word in words])
+    assert done.exit_code == 0, done.output
+    return fits[0], done.stdout, out
+
+
 def of(fit, name):
     """Index of a parameter."""
     return [p.name for p in fit.problem.parameters].index(name)
 
 
-def test_a_slide_shows_friction_and_nothing_of_the_rebound(slide, device):
-    fit = solve(read_problem(slide / "scene.ply", slide / "track.h5", OPTIONS), OPTIONS)
+def test_a_slide_shows_friction_and_nothing_of_the_rebound(slide_fit):
+    fit, *_ = slide_fit
     assert fit.problem.options.engine == "rigid"
     assert fit.problem.noise == pytest.approx(NOISE, rel=0.1)
     for name, true in (("friction", 0.3), ("x", 2.0), ("y", 0.5)):
@@ -83,20 +97,19 @@ def test_a_rebound_shows_the_loss_factor_and_nothing_of_friction(bounce, device)
     assert len(fit.problem.parameters) == 2  # neither a velocity, as it is released from rest, nor a density
 
 
-def test_the_command_writes_materials_that_simulate_takes(slide, tmp_path):
-    done = CliRunner().invoke(app, ["fit", str(slide / "scene.ply"), str(slide / "track.h5"), "-o",
-                                    str(tmp_path / "m.json"), "--workers", "1", "--keypoints", "16"])  # fmt: skip
-    assert done.exit_code == 0, done.output
-    assert "not identifiable from the motion: loss" in done.stdout
-    chosen = choose_materials(read_scene(slide / "scene.ply").objects, file=tmp_path / "m.json")
+def test_the_command_writes_materials_that_simulate_takes(slide, slide_fit):
+    _, printed, out = slide_fit
+    assert "not identifiable from the motion: loss" in printed
+    chosen = choose_materials(read_scene(slide / "scene.ply").objects, file=out)
     assert chosen[1].material.friction == pytest.approx(0.3, abs=0.01)
-    rows = json.loads((tmp_path / "m.fit.json").read_text())["parameters"]
+    rows = json.loads(out.with_suffix(".fit.json").read_text())["parameters"]
     assert [row["quantity"] for row in rows if row["identifiable"]] == ["friction", "x", "y"]
-    assert f"--materials {tmp_path / 'm.json'} --velocity" in done.stdout
+    assert f"--materials {out} --velocity" in printed
 
 
 @pytest.mark.skipif(find_spec("cma") is None, reason="cma is not installed")
-def test_cma_es_comes_nearer_from_far_away(slide, device):
+def test_cma_es_comes_nearer_from_far_away(slide, device, monkeypatch):
+    monkeypatch.setattr(search, "GENERATIONS", 5)
     options = replace(OPTIONS, frames=12)
     problem = read_problem(slide / "scene.ply", slide / "track.h5", options)
     far = np.array([0.9, 0.5, 0.6, 0.4])

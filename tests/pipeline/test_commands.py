@@ -15,7 +15,7 @@ from ngff_cli import app as commands
 from ngff_cli.app import app
 from ngff_cli.lab import app as lab_app
 from ngff_cli.options import print_results
-from stages.core.scene.scene_ply import read_scene, write_scene
+from stages.core.scene.scene_ply import read_scene
 from stages.core.scene.trajectory import read_trajectory
 from stages.reconstruct.options import QUALITY_PRESETS
 from tests.conftest import CliRunner
@@ -98,25 +98,6 @@ def test_shell_completion(name, script, monkeypatch):
     assert done.exit_code == 0 and done.stdout.split() == expected
 
 
-@pytest.mark.usefixtures("device")
-def test_simulate_render_evaluate_in_a_row(tmp_path, two_balls):
-    write_scene(tmp_path / "scene.ply", two_balls)
-    few = ("--steps", 4, "--quality", "draft")
-    status, _, err = call("simulate", tmp_path / "scene.ply", "-o", tmp_path / "t.h5", *few)
-    assert status == 0, err
-    trajectory = read_trajectory(tmp_path / "t.h5")
-    assert len(trajectory) == 4
-    # the green ball starts in the air: after 3 frames of 0.02 s it has fallen g t^2 / 2 = 1.8 cm
-    fallen = float(trajectory.com[0, 1, 2] - trajectory.com[3, 1, 2])
-    assert fallen == pytest.approx(9.81 * 0.06**2 / 2, rel=0.1)
-    status, out, err = call("render", tmp_path / "t.h5", "--resolution", 64)
-    assert status == 0 and "t_novel.mp4" in out, err
-    status, out, err = call("evaluate", tmp_path / "t.h5", "--against", tmp_path / "t.h5")
-    assert status == 0 and out.split()[:2] == ["MSE", "RMSE"], err
-    status, out, err = call("evaluate", tmp_path / "t.h5", "--against", tmp_path / "t.h5", "--json")
-    assert status == 0 and json.loads(out) == json.loads((tmp_path / "metrics.json").read_text()), err
-
-
 def test_six_commands_in_a_row(tmp_path, monkeypatch, device):
     """Each on the output of the one before, on a named device."""
     draft = dataclasses.replace(QUALITY_PRESETS["draft"], gaussians=2000)
@@ -127,13 +108,20 @@ def test_six_commands_in_a_row(tmp_path, monkeypatch, device):
     for words in (
         ("reconstruct", tmp_path / "images", "-o", scene, "--cameras", cameras, *quick, "--iterations", 2),
         ("segment", scene, "-o", labelled), ("refine", labelled, "-o", refined),
-        ("simulate", refined, "-o", motion, *quick, "--steps", 3, "--lift", 0.3),
+        ("simulate", refined, "-o", motion, *quick, "--steps", 4, "--lift", 0.3),
         ("render", motion, "--view", "input:0", "--resolution", 64),
     ):  # fmt: skip
         status, out, err = call(*words, "--device", device)
         assert status == 0, err
     assert "t_input_0.mp4" in out
+    trajectory = read_trajectory(motion)
+    assert len(trajectory) == 4
+    fallen = float(trajectory.com[0, 0, 2] - trajectory.com[3, 0, 2])  # in 3 frames of 0.02 s
+    assert fallen == pytest.approx(-trajectory.info.gravity[2] * 0.06**2 / 2, rel=0.1)
+    status, out, err = call("evaluate", motion, "--against", motion, "--json")
+    assert status == 0 and json.loads(out) == json.loads((tmp_path / "metrics.json").read_text()), err
     status, out, err = call("evaluate", motion, "--against", motion)
+    assert out.split()[:2] == ["MSE", "RMSE"]
     (found,) = read_scene(labelled).objects  # the block; its texture is noise, which has no certain colour
     assert status == 0 and found.name in out, err
 

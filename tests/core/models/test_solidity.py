@@ -59,13 +59,13 @@ def test_solid_body_is_encoded_as_a_stiffer_one_up_to_the_trained_range():
     ) and encoded_E / compliance_scale == pytest.approx(7e10, rel=1e-4)
 
 
-def dropped(solidity, method="step", E=3e4):
+def dropped(solidity, method="step", E=3e4, frames=40):
     """Height of a soft ball relative to its initial height, in each frame after a drop from 0.3 m."""
     p = torch.nn.functional.normalize(torch.randn(1, 1, 200, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
     points = 0.25 * p + torch.tensor([0.0, 0.0, 0.3 + 0.25 - 0.94])
     initial = InitialConditions.of(points, E=torch.tensor(E), mass=torch.tensor(8.0), solidity=torch.tensor(solidity))
     with torch.inference_mode():
-        z = load(find("ngff", SHIPPED))[0].rollout(initial, 40, integration=Integration(method))[0, :, 0, :, 2]
+        z = load(find("ngff", SHIPPED))[0].rollout(initial, frames, integration=Integration(method))[0, :, 0, :, 2]
     height = z.amax(1) - z.amin(1)
     return height / height[0]
 
@@ -78,5 +78,5 @@ def test_solid_ball_deforms_on_landing_and_recovers():
 
 
 def test_springs_of_very_stiff_solid_bodies_are_stable_with_explicit_steps():
-    height = dropped(1e3, "rk4", E=1e10)
+    height = dropped(1e3, "rk4", E=1e10, frames=25)  # it lands in the 13th
     assert height.isfinite().all() and (height - 1).abs().max() < 0.1

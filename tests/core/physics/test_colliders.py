@@ -23,7 +23,7 @@ def tilted(slope: float) -> tuple[float, float, float, float]:
 
 def along_slope(slope: float, friction: float = 0.5, surface: str = "separate", finer: int = 1) -> float:
     """Acceleration of a flat block on a tilted plane [m/s^2]; the block lies aligned with it, gravity is rotated."""
-    p = block((0.4, 0.4, 0.1), 1 / 60, E=5e5, viscosity=200.0)
+    p = block((0.4, 0.2, 0.1), 1 / 60, E=5e5, viscosity=200.0)
     ground = Collider("plane", PLANE, surface=surface, friction=friction)
     box, angle = mpm.Box((-1, -1, -0.5), (2, 1.4, 1)), math.atan(slope)
     solver = mpm.Solver(p, box, 1 / 30, options=mpm.SolverOptions((ground,)))

@@ -18,6 +18,7 @@ from stages.core.scene.scene_ply import write_scene
 from stages.core.scene.sequence import FilmedSequence
 from stages.core.scene.trajectory import read_trajectory
 from stages.lab.bench.track import measure, pose_errors
+from stages.lab.track import stand_in as stand_in_films
 from stages.lab.track.confidence import confidences, scales, tolerances
 from stages.lab.track.film_masks import UNKNOWN, find_film_masks
 from stages.lab.track.films import Film, read_films
@@ -45,8 +46,11 @@ LATE = (0.2, -0.2, 0.1, -0.1)  # of the films' times in the scene file [frames]
 def small(tmp_path_factory):
     """A folder with films of which one breaks off, the scene with wrong times, and the true motion."""
     folder = tmp_path_factory.mktemp("stand-in")
-    stand_in = make_stand_in(SMALL)
-    write_films(stand_in, folder / "films")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(stand_in_films, "BEFORE", (2, 4))
+        patch.setattr(stand_in_films, "AFTER", 2)
+        stand_in = make_stand_in(SMALL)
+        write_films(stand_in, folder / "films")
     write_truth(stand_in, folder / "truth.h5")
     starts = {name: start + late for (name, start), late in zip(stand_in.starts.items(), LATE, strict=True)}
     write_scene(folder / "scene.ply", replace(stand_in.scene, sequence=FilmedSequence(SMALL.fps, SMALL.frames, starts)))

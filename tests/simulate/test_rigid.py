@@ -113,12 +113,12 @@ def test_objects_of_photos_rest_until_something_disturbs_them(tmp_path):
 
 def test_what_touches_nothing_in_photos_rests_on_what_is_below(tmp_path):
     """Photos show things at rest: the support is not seen. The upper cube falls once the one below it is taken away."""
-    floating, lower = cube(0.1, 0.02, 0.15), cube(0.1, 0, 0.0)
-    still = roll(tmp_path, floating, lower, steps=10, photos=True)
+    cubes = cube(0.1, 0.02, 0.15), cube(0.1, 0, 0.0), cube(0.1, -0.3, 0.15)
+    still = roll(tmp_path, *cubes, steps=10, photos=True)
     assert torch.equal(still.positions[-1], still.positions[0])
-    t = roll(tmp_path, floating, lower, steps=40, photos=True, velocity=("object=2 0,3,0",))
+    t = roll(tmp_path, *cubes, steps=40, photos=True, velocity=("object=2 0,3,0",))
     assert abs(float(t.com[-1, 0, 2] - t.com[0, 0, 2]) + 0.15) < 0.01
-    hit = roll(tmp_path, floating, cube(0.1, -0.3, 0.15), steps=40, photos=True, velocity=("object=2 4,0,0",))
+    hit = roll(tmp_path, *cubes, steps=40, photos=True, velocity=("object=3 4,0,0",))
     assert float(hit.com[-1, 0, 2] - hit.com[0, 0, 2]) < -0.1
 
 

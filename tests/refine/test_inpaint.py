@@ -42,7 +42,7 @@ def test_checker_pattern_continues(shade):
     assert psnr(filled(rgb, middle())[middle()], rgb[middle()]) > 27
 
 
-@pytest.mark.parametrize("slope", [-0.6, 0.3], ids=["falling", "rising"])
+@pytest.mark.parametrize("slope", [-0.6, pytest.param(0.3, marks=pytest.mark.slow)], ids=["falling", "rising"])
 def test_straight_edges_continue(slope):
     """Across a wide round hole runs a strip of table between two woven mats: no mean of all three, and no bulge."""
     side, colours = 160, np.float32([[0.85, 0.5, 0.45], [0.55, 0.4, 0.2], [0.35, 0.4, 0.45]])

@@ -1,6 +1,7 @@
 """Convex parts: moments of solids, concave objects, and the surface of voxels."""
 
 import math
+from functools import cache
 
 import numpy as np
 import pytest
@@ -14,7 +15,9 @@ from stages.lab.bench.physics_experiments import bowl
 from tests.conftest import two_balls_scene
 
 
+@cache
 def scene(surface: Surface) -> Scene:
+    """Surfaces are told apart by identity."""
     g = to_gaussians(surface, torch.full((len(surface.points), 3), 0.5), 1)
     return Scene(g, (SceneObject(1, "thing"),))
 
@@ -80,8 +83,8 @@ def test_a_concave_object_is_divided():
     torch.testing.assert_close(parts.com, torch.zeros(3), rtol=0, atol=0.002)
 
 
-def volume(hulls, count: int = 100_000) -> float:
-    """Of the union of hulls, by random points: accurate to about 1 %."""
+def volume(hulls, count: int = 30_000) -> float:
+    """Of the union of hulls, by random points: accurate to about 2 %."""
     faces = [ConvexHull(hull.double().numpy()).equations for hull in hulls]
     corners = torch.cat(hulls).double().numpy()
     low, size = corners.min(0), np.ptp(corners, axis=0)
@@ -136,7 +139,7 @@ SHEETS = {"plate 1/20": plate(0.015), "plate 1/80": plate(0.00375), "pan 1/15": 
 
 
 @pytest.mark.parametrize("name", [
-    pytest.param(name, marks=pytest.mark.slow) if name == "bowl 1/30" else name for name in SHEETS
+    pytest.param(name, marks=pytest.mark.slow) if name in ("bowl 1/30", "pan 1/15") else name for name in SHEETS
 ])  # fmt: skip
 def test_thin_walls_keep_their_volume(name):
     """Walls of a twelfth to an eightieth of the size: their parts, and the mass, are right to 10 %."""
@@ -167,8 +170,7 @@ def test_parts_leave_out_the_space_of_other_objects():
 def test_parts_of_a_shell_follow_its_inner_surface():
     """Half a spherical shell: inner surface accurate to a third of a voxel on average, and nowhere a voxel inside."""
     inner, outer = 0.25, 0.3
-    shell = scene(bowl(inner, outer))
-    hulls = convex_parts(shell)[0].hulls
+    hulls = convex_parts(scene(SHEETS["bowl 1/12"][0]))[0].hulls
     rays = torch.nn.functional.normalize(torch.randn(400, 3, generator=torch.Generator().manual_seed(0)), dim=1).numpy()
     rays, centre = rays[rays[:, 2] < -0.7], np.array([0.0, 0.0, outer])
     first = np.full(len(rays), np.inf)

@@ -8,11 +8,11 @@ import torch
 
 from stages.core.physics.convex_cuts import fibonacci
 from stages.core.physics.solid_surface import SolidSurface, solid_surface
-from stages.core.scene.scene_ply import read_scene
 from stages.lab.assets.shapes import Surface, box
 from stages.simulate.initial_overlaps import WINDOW
 from stages.simulate.surface_contacts import SurfaceContacts, SurfaceShape, _slope, _trilinear, surface_shape
-from tests.simulate.test_rigid import cube, roll
+from tests.simulate.motion import roll_out
+from tests.simulate.test_rigid import cube, options_of, scene_of
 
 mujoco = pytest.importorskip("mujoco")
 
@@ -131,9 +131,9 @@ def bumpy(side: float, height: float, bump: float) -> Surface:
 
 def test_a_small_body_does_not_enter_the_bumps_of_a_large_one(tmp_path):
     """Bumps of half a voxel of the slab are a quarter of the cube's height, by .14 of which it sank into the parts."""
-    small = cube(0.04, 0.12, 0.15).moved((0.0, -0.05, 0.0))
-    t = roll(tmp_path, bumpy(1.0, 0.1, 0.01), small, steps=40, pin=("1",), keypoints=300)
-    slab = solid_surface(read_scene(tmp_path / "scene.ply"), 1)
+    scene = scene_of((bumpy(1.0, 0.1, 0.01), cube(0.04, 0.12, 0.15).moved((0.0, -0.05, 0.0))))
+    t = roll_out(scene, options_of(scene, tmp_path, steps=40, pin=("1",), keypoints=300))
+    slab = solid_surface(scene, 1)
     mine = t.keypoints.object_id == 2
     depth = [float(slab.depth(t.positions[k, mine].double().numpy()).max()) for k in range(0, 40, 3)]
     assert max(depth) < 0.03 * 0.04 and depth[-1] > -0.05 * 0.04

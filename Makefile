@@ -2,6 +2,8 @@
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
+# half as many again as processors, since tests that drive a browser wait for it
+WORKERS ?= $(shell $(PYTHON) -c 'import os; print(len(getattr(os, "sched_getaffinity", lambda _: range(os.cpu_count()))(0)) * 3 // 2 or 1)')
 
 .PHONY: setup demo test test-slow test-all test-gpu lint clean
 
@@ -16,7 +18,7 @@ demo: setup
 	$(MAKE) -C examples/falling_toys NGFF=$(abspath $(BIN))/ngff
 
 test: setup
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto -m "not slow"
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) -m "not slow"
 
 test-slow: setup
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto -m slow

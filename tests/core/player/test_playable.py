@@ -181,7 +181,7 @@ def test_motion_goes_on_from_within_a_film(tmp_path, open_page):
     assert (end - t.positions[-1]).norm(dim=1).max() < LIMIT
 
 
-@pytest.mark.parametrize("first", [0, 6])
+@pytest.mark.parametrize("first", [pytest.param(0, marks=pytest.mark.slow), 6])
 @pytest.mark.usefixtures("device")
 def test_what_was_done_in_a_page_is_saved_and_repeated_by_the_engine(tmp_path, open_page, first):
     """From a frame of the film on, step by step: a drag by the mouse, a push and a pin."""

@@ -56,6 +56,7 @@ def ball_on_table() -> Example:
     return Example(surfels, (torch.arange(4500) < 1500).long())
 
 
+@pytest.mark.slow
 def test_training_learns_what_only_the_mask_shows(device):
     model, examples = Segmenter((8, 8)).to(device), cubes_and_halves(8).to(device)
     model.add_mask_scorer()

@@ -148,32 +148,3 @@ def train_segmenter(
     )  # fmt: skip
     for line in run(data, out, options, start):
         print(line, flush=True)
-
-
-@app.command("train-mask-scorer")
-def train_mask_scorer(
-    data: Annotated[
-        list[Path], Argument(metavar="FOLDER", help="scenes of `ngff-lab clutter`; new ones go to the first")
-    ],
-    out: Annotated[Path, Option("-o", "--out", help="weights of the whole segmenter to write (.safetensors)")],
-    scene_minutes: Annotated[
-        float, Option(help="time to make and reconstruct scenes [min]; 0: only those that are there")
-    ] = 0.0,
-    minutes: Annotated[float, Option(help="time of the training [min]")] = 10.0,
-    steps: Annotated[int, Option(help="optimizer steps instead of --minutes; 0: use --minutes")] = 0,
-    workers: Annotated[
-        int, Option(help="processes that make scenes and examples, in turn on each GPU; 0: this one")
-    ] = 0,
-    copies: Annotated[int, Option(help="turned copies of each scene, whose candidates are examples too")] = 1,
-    batch: Annotated[tuple[int, int], Option(help="scenes of a step, and candidates of each")] = (12, 40),
-    meshes: Annotated[list[Path] | None, Option("--from", help="meshes that lie in the scenes too")] = None,
-    weights: Annotated[Path | None, Option(help="weights of the segmenter; default: those in the package")] = None,
-    seed: Seed = 0,
-    device: Device = "auto",
-) -> None:
-    """Train a network that sees the masks of candidate objects and corrects their scores."""
-    from stages.lab.training.train_mask_scorer import MaskTraining, run
-
-    options = MaskTraining(scene_minutes, minutes, steps, workers, copies, batch, seed, device)
-    for line in run(data, out, options, meshes or (), weights):
-        print(line, flush=True)

@@ -46,7 +46,7 @@ def clicked_ids(scene: Scene, model: Segmenter, clicks: Sequence[Click], options
         raise InputError(f"--points {clicks[0].text!r}: the scene has no surface in reach of its cameras")
     means = scene.gaussians.means[index]
     found: dict[int, tuple[float, Int[Tensor, "n"]]] = {}
-    scored = [score_at(surfels, scale, model, options.min_size) for scale in SCALES]
+    scored = [score_at(surfels, scale, model) for scale in SCALES]
     for at_scale in scored:
         paths = [_path(at_scale, (means - click.point).norm(dim=1) / view.radius) for click in clicks]
         usable = at_scale.usable(options.min_size).numpy()

@@ -33,16 +33,6 @@ class MergeTree:
         out[self.children] = np.arange(self.count, len(self))[:, None]
         return out
 
-    def spans(self) -> np.ndarray:
-        """(nodes, 2) first and last place + 1 of the leaves of each node, in an order that keeps them together."""
-        count = self.sums(np.ones((self.count, 1)))[:, 0].astype(np.int64)
-        roots, first = np.nonzero(self.parents() < 0)[0], np.zeros(len(self), np.int64)
-        first[roots] = np.cumsum(count[roots]) - count[roots]
-        for node in range(len(self) - 1, self.count - 1, -1):
-            a, b = self.children[node - self.count]
-            first[a], first[b] = first[node], first[node] + count[a]
-        return np.stack([first, first + count], 1)
-
     def sums(self, leaves: np.ndarray) -> np.ndarray:
         """(nodes, d) sums over the leaves of each node, of values (count, d) in float64."""
         return self._accumulated(leaves.astype(np.float64), np.add)

@@ -14,18 +14,13 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from stages.core.models.segmenter.mask_scorer import MaskScorer
 from stages.core.models.segmenter.voxels import FEATURES, VOXEL, coarser, neighbour_table
 
 CLASSES = ("surface", "object", "clutter")
 OFFSET_UNIT = 0.1  # of predicted offsets [camera distance]
 PAIR_FEATURES = 24  # of the embedding
 CANDIDATE_FEATURES = 33  # of a candidate object, see candidates.py
-SCORES = (
-    "feature_",
-    "candidate_head.",
-    "mask_scorer.",
-)  # how the names of the weights of the scores of candidates begin
+SCORES = ("feature_", "candidate_head.")  # how the names of the weights of the scores of candidates begin
 
 
 @dataclass(frozen=True)
@@ -122,7 +117,7 @@ class Prediction:
 class Segmenter(nn.Module):
     """The network, and the affinity of pairs of voxels. Attribute names are the keys of the shipped weights."""
 
-    def __init__(self, widths: tuple[int, ...] = (32, 48, 64, 96), blocks: int = 1, masks: bool = False):
+    def __init__(self, widths: tuple[int, ...] = (32, 48, 64, 96), blocks: int = 1):
         super().__init__()
         self.config = {"widths": list(widths), "blocks": blocks}
         self.input_projection = nn.Linear(FEATURES, widths[0])
@@ -140,9 +135,6 @@ class Segmenter(nn.Module):
         self.candidate_head = nn.Sequential(
             nn.Linear(CANDIDATE_FEATURES, width), nn.GELU(), nn.Linear(width, width), nn.GELU(), nn.Linear(width, 1)
         )
-        self.mask_scorer: MaskScorer | None = None  # corrects the scores of plausible candidates
-        if masks:
-            self.add_mask_scorer()
 
     def forward(self, features: Float[Tensor, "v f"], levels: list[Level]) -> Prediction:
         """Predictions for the voxels of the finest level."""
@@ -176,13 +168,5 @@ class Segmenter(nn.Module):
 
     def score(self, features: Float[Tensor, "k f"]) -> Float[Tensor, "k"]:
         """Log odds of the IoU of candidates with the object that they fit best."""
-        return self.candidate_head(self.normalised(features))[:, 0]
-
-    def normalised(self, features: Float[Tensor, "k f"]) -> Float[Tensor, "k f"]:
-        """Features of candidates as the heads take them."""
-        return ((features - self.feature_mean) / self.feature_scale).clamp(-4, 4)
-
-    def add_mask_scorer(self) -> None:
-        """An untrained mask scorer, which changes no score."""
-        self.mask_scorer = MaskScorer().to(self.feature_mean.device)
-        self.config["masks"] = True
+        x = ((features - self.feature_mean) / self.feature_scale).clamp(-4, 4)
+        return self.candidate_head(x)[:, 0]

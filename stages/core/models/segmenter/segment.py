@@ -16,7 +16,6 @@ from torch import Tensor
 from stages.core.errors import InputError
 from stages.core.models.checkpoints import MAX_CONFIG, read_card, read_state, unfit
 from stages.core.models.segmenter.candidates import MIN_VOXELS, Candidates, find_candidates
-from stages.core.models.segmenter.crops import boxes, corrected, plausible, surroundings
 from stages.core.models.segmenter.network import SCORES, Segmenter, pyramid
 from stages.core.models.segmenter.outlines import cut_outlines
 from stages.core.models.segmenter.surfels import scene_surfels
@@ -71,7 +70,7 @@ def load_segmenter(path: Path, device: torch.device | str = "cpu", new_scores: b
         widths = tuple(whole(width, "widths", 1, MAX_CONFIG) for width in widths[:MAX_LEVELS])
         if blocks * sum(w * w for w in widths) > sum(v.numel() for v in state.values()):  # before it takes memory
             raise ValueError("the card is of a larger network")
-        model = Segmenter(widths, blocks, bool(card["config"].get("masks", False)))
+        model = Segmenter(widths, blocks)
         own = {name: value for name, value in model.state_dict().items() if name.startswith(SCORES)}
         if new_scores and any(name not in state or state[name].shape != own[name].shape for name in own):
             state = {name: value for name, value in state.items() if not name.startswith(SCORES)} | own
@@ -109,7 +108,7 @@ def object_ids(
     surfels, index, _ = scene_surfels(scene)
     if len(surfels) < 20:
         return ids
-    scored = [score_at(surfels, scale, model, options.min_size) for scale in SCALES]
+    scored = [score_at(surfels, scale, model) for scale in SCALES]
     labels = best_objects([s.best(options) for s in scored])
     labels = torch.where(labels <= options.max_objects, labels, 0)
     ids[index] = outlined(surfels, labels, scored)
@@ -164,11 +163,8 @@ class ScoredCandidates:
         return Segmentation(labels, gain[nodes], torch.bincount(labels[labels >= 0], minlength=len(nodes)))
 
 
-def score_at(surfels: ScenePoints, scale: float, model: Segmenter, min_size: float) -> ScoredCandidates:
-    """Candidate objects among the surfels enlarged by `scale`, those nearest to the focus where there are many.
-
-    With a mask scorer only plausible ones of at least `min_size` have an expected IoU, which is 0 for the rest.
-    """
+def score_at(surfels: ScenePoints, scale: float, model: Segmenter) -> ScoredCandidates:
+    """Candidate objects among the surfels enlarged by `scale`, those nearest to the focus where there are many."""
     scaled = surfels.enlarged(scale).to(model.input_projection.weight.device)
     near = torch.ones(len(surfels), dtype=torch.bool)
     grid = voxelise(scaled)
@@ -183,12 +179,7 @@ def score_at(surfels: ScenePoints, scale: float, model: Segmenter, min_size: flo
     owner, chance = torch.full((len(surfels),), -1), torch.full((len(surfels), 3), torch.nan)
     owner[near] = grid.owner.cpu()
     chance[near] = found.logits.softmax(1).cpu()[owner[near]]
-    scored = ScoredCandidates(candidates, ious, candidates.extents / scale, owner, chance)
-    if model.mask_scorer is None:
-        return scored
-    nodes, seen = plausible(candidates, ious, scored.usable(min_size)), surroundings(grid, found, candidates)
-    odds = corrected(seen, boxes(candidates, seen, nodes, model, scale), model)
-    return replace(scored, ious=torch.zeros_like(ious).index_copy_(0, nodes, odds.sigmoid()))
+    return ScoredCandidates(candidates, ious, candidates.extents / scale, owner, chance)
 
 
 def outlined(surfels: ScenePoints, labels: Int[Tensor, "n"], scored: Sequence[ScoredCandidates]) -> Int[Tensor, "n"]:

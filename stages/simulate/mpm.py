@@ -34,7 +34,7 @@ from stages.simulate.setup import SceneSetup, choose_for_bodies, set_up_scene
 
 log = logging.getLogger(__name__)
 PARTICLES_PER_KEYPOINT = 8  # particles whose motion a keypoint follows
-GPU_SUBSTEP = 2e-5  # shortest substep worth taking on a GPU [s]
+GPU_STEP = 8e-4  # shortest substep worth taking on a GPU, as MpmQuality.step
 CFL_MARGIN = 0.85  # fraction of the stability limit that materials may use up
 
 
@@ -49,7 +49,7 @@ def rollout(
     unit, device = scene.metres_per_unit, pick_device(options.device)
     level, fine = options.level, device != "cpu" and options.quality != "draft"
     if fine:
-        level = replace(level, substep=min(level.substep, GPU_SUBSTEP))
+        level = replace(level, step=min(level.step, GPU_STEP))
     setup = set_up_scene(scene, prompts, options, refinement=2 if fine else 1)
     setup.warn_of_lifted(scene)
     body, dx = setup.bodies.body, 2 * setup.bodies.spacing * unit
@@ -177,10 +177,11 @@ def _stable_material(m: Material, length: float, h: float, level: MpmQuality) ->
     The viscosity gives the slowest longitudinal vibration of a bar of the body's `length` [m], omega = pi c / L, the
     material's loss factor; damping E loss / omega is that of a Kelvin-Voigt solid. `h` is the particle spacing [m].
     """
-    fastest = CFL_MARGIN * mpm.SAFETY * 2 * h / level.substep
+    substep = level.substep(h)
+    fastest = CFL_MARGIN * mpm.SAFETY * 2 * h / substep
     E = min(m.E, mpm.modulus_at_wave_speed(fastest, m.nu, m.density))
     viscosity = m.loss * E * length / (math.pi * math.sqrt(E / m.density))
-    return E, min(viscosity, CFL_MARGIN * mpm.VISCOUS * m.density * (2 * h) ** 2 / level.substep)
+    return E, min(viscosity, CFL_MARGIN * mpm.VISCOUS * m.density * (2 * h) ** 2 / substep)
 
 
 class _PromptedForce:

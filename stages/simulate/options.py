@@ -19,6 +19,7 @@ class Engine:
 
 
 AUTO = "auto"  # see engine_choice.py
+STANDARD_GRAVITY = 9.81  # [m/s^2]
 ENGINES = {
     "ngff": Engine("stages.simulate.learned:rollout", "learned force field, for soft elastic bodies", weights="ngff"),
     "mpm": Engine("stages.simulate.mpm:rollout", "material point method, for any material"),
@@ -35,13 +36,21 @@ class MpmQuality:
     """Resolution of the MPM engine."""
 
     particles: int  # of all objects together; the grid spacing follows from eight particles in a full cell
-    substep: float  # shortest substep taken [s]; materials too stiff for it are softened
+    step: float  # shortest substep taken [sqrt(particle spacing / g)]; materials too stiff for it are softened
+
+    def substep(self, spacing: float) -> float:
+        """Shortest substep [s] for a particle `spacing` [m].
+
+        In proportion to the time in which a body falls by the spacing, so that a scene of another size is softened
+        alike: E / (density g size) is the same.
+        """
+        return self.step * math.sqrt(spacing / STANDARD_GRAVITY)
 
 
 QUALITIES = {
-    "draft": MpmQuality(particles=6_000, substep=3e-4),
-    "normal": MpmQuality(particles=20_000, substep=1.5e-4),
-    "high": MpmQuality(particles=120_000, substep=2e-5),
+    "draft": MpmQuality(particles=6_000, step=7e-3),
+    "normal": MpmQuality(particles=20_000, step=4.4e-3),
+    "high": MpmQuality(particles=120_000, step=8e-4),
 }
 
 
@@ -52,7 +61,7 @@ class SimulateOptions:
     steps: int = 100  # frames, the first being the start
     dt: float = 0.02  # time between frames [s]
     engine: str = AUTO
-    gravity: float = 9.81  # downwards [m/s^2]
+    gravity: float = STANDARD_GRAVITY  # downwards [m/s^2]
     quality: str = "normal"
     material: tuple[str, ...] = ()  # OBJECT=MATERIAL
     materials: Path | None = None  # JSON {object name or id: material name or {E, nu, density, friction}}

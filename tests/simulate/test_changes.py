@@ -25,7 +25,7 @@ DT = 0.02
 
 @pytest.fixture(autouse=True)
 def small_draft(monkeypatch):
-    monkeypatch.setitem(QUALITIES, "draft", MpmQuality(particles=800, substep=8e-4))
+    monkeypatch.setitem(QUALITIES, "draft", MpmQuality(particles=800, step=0.014))
 
 
 def frames(scene: Scene, prompts: ForcePrompts, **chosen) -> list:
@@ -73,7 +73,7 @@ def test_the_first_frame_is_the_lifted_scene(apart, engine):
 @pytest.mark.parametrize("engine", ["rigid", "mpm"])
 def test_the_centre_of_mass_of_an_uneven_bar(tmp_path, monkeypatch, engine):
     """The half at x < 0 of a bar of length .4 is four times as dense: the centre is at -3/20 of the length."""
-    monkeypatch.setitem(QUALITIES, "draft", MpmQuality(particles=6000, substep=8e-4))
+    monkeypatch.setitem(QUALITIES, "draft", MpmQuality(particles=6000, step=0.027))
     bar = box((0.4, 0.1, 0.1), 0.0125).moved((0, 0, 1.0))
     bar = to_gaussians(bar, torch.full((len(bar.points), 3), 0.5), 1)
     scene = Scene(bar, (SceneObject(1, "bar"),), None, 0.0)

@@ -80,7 +80,7 @@ def world():
 
 def live_session(world, engine, monkeypatch, actions, frames=26, box="-1,-1,0,1,1,2"):
     """Keypoints of a session with messages at some frames, the session, and the motion of its prompts."""
-    monkeypatch.setitem(QUALITIES, "draft", MpmQuality(particles=800, substep=1e-3))
+    monkeypatch.setitem(QUALITIES, "draft", MpmQuality(particles=800, step=0.017))
     options = SimulateOptions(engine=engine, quality="draft", steps=frames, keypoints=32, box=box)
     keypoints = choose_keypoints(world, 32)
     rollout = choose({name: e.rollout for name, e in ENGINES.items()}, engine)

@@ -50,7 +50,7 @@ def test_a_live_session_has_fewer_keypoints_unless_they_are_given():
     assert SimulateOptions(live=True, keypoints=500).keypoint_count == 500
     levels = [SimulateOptions(quality=name).level for name in ("draft", "normal", "high")]
     assert levels == sorted(levels, key=lambda level: level.particles)
-    assert levels == sorted(levels, key=lambda level: -level.substep)
+    assert levels == sorted(levels, key=lambda level: -level.step)
 
 
 def test_changes_hold_from_then_on():

@@ -69,8 +69,6 @@ def run_live(scene: LiveScene, out: Path, info: SimulationInfo, stop: threading.
         live = _Live(scene, setup, server, writer, out)
         while not stop.is_set():
             live.turn()
-        if not writer.frames:
-            live.advance()
         writer.store_prompts(live.session.record)
     log.info("%s: %d frames; the same motion again: ngff simulate SCENE.ply --forces %s", out, writer.frames, out)
 

@@ -36,24 +36,22 @@ class SleepState:
         self.standing, self.asleep = standing, ~awake
         self._wake_unsupported()
 
-    def wake_on_impact(self, points: Float[Tensor, "1 o n 3"], speed: Float[Tensor, "1 o n 3"]) -> bool:
-        """Wake objects hit by an awake object, and those that they supported; returns whether any woke.
+    def wake_on_impact(self, points: Float[Tensor, "1 o n 3"], speed: Float[Tensor, "1 o n 3"]) -> None:
+        """Wake objects hit by an awake object, and those that they supported.
 
         `points` [m] and their velocities `speed` [m/s] in model units.
         """
         if not bool(self.asleep.any()):
-            return False
+            return
         ratio = self.mass[:, None] / (self.mass[:, None] + self.mass)
         fast = speed[0].norm(dim=-1)[:, None] * ratio[..., None] > WAKE_SPEED
         hit = (self._near(points, CONTACT_DISTANCE) & fast).any(-1).cpu() & ~self.asleep[:, None]
-        return self.wake(hit.any(0))
+        self.wake(hit.any(0))
 
-    def wake(self, rows: Bool[Tensor, "o"]) -> bool:
-        """Wake these objects and those that they supported; whether any woke."""
-        before = int(self.asleep.sum())
+    def wake(self, rows: Bool[Tensor, "o"]) -> None:
+        """Wake these objects and those that they supported."""
         self.asleep = self.asleep & ~rows
         self._wake_unsupported()
-        return int(self.asleep.sum()) < before
 
     def _near(self, points: Float[Tensor, "1 o n 3"], gap: float) -> Bool[Tensor, "o o n"]:
         """Mask of the keypoints of object i (first) that touch object j (second)."""

@@ -55,7 +55,7 @@ def test_only_fast_and_heavy_impacts_wake(speed, height, mass, wakes, device):
     points = world.points.clone().to(device)
     points[0, 1, :, 2] += height - 3 * SIDE
     velocity = torch.tensor([[0.0, -speed]], device=device)[..., None, None].expand_as(points)
-    assert state.wake_on_impact(points, velocity) is wakes
+    state.wake_on_impact(points, velocity)
     assert state.asleep.tolist() == [not wakes, False]
 
 

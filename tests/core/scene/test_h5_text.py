@@ -43,6 +43,17 @@ def test_datasets_that_store_nothing_and_texts_of_fixed_length_are_read(tmp_path
         assert Dataset("n", "text").read(file, "fixed", {}) == ["ab", "c"]
 
 
+def test_texts_within_an_object_header_are_refused(tmp_path):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        layout = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+        layout.set_layout(h5py.h5d.COMPACT)
+        kind = h5py.h5t.py_create(h5py.string_dtype(), logical=True)
+        h5py.h5d.create(file.id, b"names", kind, h5py.h5s.create_simple((2,)), layout)
+        file["names"][:] = ["a", "bc"]
+    with pytest.raises(ValueError, match="its texts are stored in an object header"):
+        reread(tmp_path / "a.h5")
+
+
 def reread(path):
     with open_h5(path) as file:
         check_attributes(file["names"])

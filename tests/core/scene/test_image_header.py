@@ -158,11 +158,13 @@ def test_sizes_of_bmp_files_of_both_kinds():
 
 @pytest.mark.parametrize("marker", [0xC4, 0xC8, 0xCC, 0xDB, 0xFE])
 def test_segments_of_a_jpeg_before_its_frame_are_skipped(marker):
-    """Also those whose markers are among the ones that begin frames."""
+    """Also those whose markers are among the ones that begin frames; the file may end after the number of channels."""
     frame = b"\xff\xc2" + struct.pack(">HBHHB", 8, 8, 37, 300, 3)
     between = bytes([0xFF, marker]) + struct.pack(">H", 12) + b"\xff\xc0" * 5
-    header = read_image_header(b"\xff\xd8" + between + b"\xff\xff\x01" + frame + bytes(9))
-    assert header == (300, 37, pytest.approx(300 * 37 * 3 / 4096))
+    data = b"\xff\xd8" + between + b"\xff\xff\x01" + frame
+    assert read_image_header(data) == (300, 37, pytest.approx(300 * 37 * 3 / 4096))
+    with pytest.raises(ValueError, match="no image"):
+        read_image_header(data[:-1])
 
 
 def test_bound_of_a_png_is_that_of_deflate():

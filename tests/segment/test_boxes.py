@@ -87,6 +87,19 @@ def test_where_boxes_overlap_the_smaller_is_on_top(order, monkeypatch):
     assert (labels[:, 24:] == order.index(1) + 1).all() and (labels[:20, :24] == order.index(0) + 1).all()
 
 
+@pytest.mark.parametrize("turns", range(4))
+def test_what_continues_beside_a_box_on_any_side_is_not_likely(turns, monkeypatch):
+    """A stripe of the background runs into the box from one side, past an object of another colour."""
+    likely = []
+    monkeypatch.setattr(boxes, "grabcut", lambda image, unlikely, mask, *_: likely.append(mask) or mask)
+    picture = np.full((80, 80, 3), 40, np.uint8)
+    picture[24:56, 24:56] = (200, 40, 40)
+    picture[36:44, 50:] = (40, 40, 200)
+    segment_prompted_view(np.rot90(picture, turns).copy(), torch.tensor([[0.3, 0.3, 0.7, 0.7]]), 0)
+    found = np.rot90(likely[0], -turns)
+    assert found[26:54, 26:48].all() and not found[37:43, 51:56].any()
+
+
 def test_small_pieces_and_small_holes_are_removed():
     mask = np.zeros((40, 40), dtype=bool)
     mask[5:35, 5:35] = True

@@ -122,6 +122,12 @@ def test_is_on_support(truth, support):
     assert not is_on_support(truth, torch.nonzero(ids == 1)[:5, 0], support, SegmentOptions())  # a few pixels
     assert not is_on_support(truth, torch.nonzero(ids == 1)[:, 0], support, SegmentOptions(min_size=0.5))
     assert not is_on_support(truth, torch.full((100,), -1), support, SegmentOptions())  # empty pixels
+    for distance, near in ((0.75, True), (0.85, False)):  # without a table, within .8 of the cameras' distance
+        moved = replace(truth.gaussians, means=truth.gaussians.means.clone())
+        rows = torch.nonzero(ids == 1)[:, 0]
+        side = moved.means[rows] - moved.means[rows].median(0).values
+        moved.means[rows] = support.view.focus + torch.tensor([distance * support.view.radius, 0, 0]) + 0.1 * side
+        assert is_on_support(replace(truth, gaussians=moved), rows, None, SegmentOptions(min_size=1e-3)) == near
     lifted = truth.gaussians.means + torch.tensor([0, 0, 0.6]) * (ids == 1)[:, None]
     high = replace(truth, gaussians=replace(truth.gaussians, means=lifted))
     assert not is_on_support(high, torch.nonzero(ids == 1)[:, 0], support, SegmentOptions())

@@ -8,7 +8,7 @@ import pytest
 import torch
 from scipy.spatial import ConvexHull, Delaunay
 
-from stages.core.physics.convex_parts import convex_parts, divide
+from stages.core.physics.convex_parts import _voxel_moments, convex_parts, divide
 from stages.core.scene.scene import Scene, SceneObject
 from stages.lab.assets.shapes import Surface, box, ellipsoid, to_gaussians, union
 from stages.lab.bench.physics_experiments import bowl
@@ -48,6 +48,22 @@ def test_inertia_of_two_cubes_that_are_one_object():
     own = side**2 / 6
     expected = torch.diag(torch.tensor([own, own + 0.04, own + 0.04]))
     torch.testing.assert_close(parts.inertia / parts.volume, expected, rtol=0.02, atol=0.02 * own)
+
+
+@pytest.mark.parametrize("counts", [(1, 1, 1), (2, 3, 1)])
+def test_moments_of_full_voxels_are_those_of_their_box(counts):
+    """V / 12 (b^2 + c^2) about the axis across sides b and c, and a half-full voxel counts half."""
+    h, first = 0.1, np.array([1.0, 2.0, 3.0])
+    x = first + h * np.stack(np.meshgrid(*map(np.arange, counts), indexing="ij"), -1).reshape(-1, 3)
+    volume, com, inertia = _voxel_moments(x, np.ones(len(x)), h)
+    sides = h * torch.tensor(counts)
+    assert volume == pytest.approx(float(sides.prod()))
+    torch.testing.assert_close(com, torch.from_numpy(x.mean(0)).float())
+    expected = volume / 12 * (sides.square().sum() - sides.square())
+    torch.testing.assert_close(inertia, torch.diag(expected), rtol=1e-5, atol=1e-9)
+    pair = np.stack([first, first + [3 * h, 0, 0]])
+    volume, com, _ = _voxel_moments(pair, np.array([1.0, 0.5]), h)
+    assert volume == pytest.approx(1.5 * h**3) and float(com[0]) == pytest.approx(1.0 + h)
 
 
 def test_what_is_below_the_floor_is_cut_off():

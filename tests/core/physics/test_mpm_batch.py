@@ -73,6 +73,29 @@ def test_failed_scenes_are_named_and_others_finish(device):
         torch.testing.assert_close(last.of(name).x, expected.of(name).x, rtol=0, atol=2e-5)
 
 
+def test_a_loss_of_the_first_particle_is_a_failure_at_its_first_frame():
+    made = {"one": block((0.1, 0.1, 0.1), 0.05, low=(0, 0, 0.2)), "two": block((0.1, 0.1, 0.1), 0.05, low=(0, 0, 0.2))}
+    made["one"].v[0, 2] = -2000.0
+    made["two"].v[[3, 5]] = torch.nan
+    batch = Batch(made, BOX, DX, "cpu")
+    list(batch.frames(3, 0.02, SUBSTEPS, GRAVITY))
+    particle, frame = batch.lost()
+    assert particle.tolist() == [0, 3] and frame.tolist() == [1, 1]
+    assert {name: text.split(" left")[0] for name, text in batch.failures().items()} == {
+        "one": "particle 0", "two": "particle 3"
+    }  # fmt: skip
+
+
+def test_number_of_scenes_that_fit_into_the_memory_of_a_gpu(monkeypatch):
+    """A device of twice the memory has room for twice the scenes; one without room is still given one."""
+    fits = []
+    for free in (0, 1 << 30, 1 << 31, 1 << 50):
+        monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device, free=free: (free, free))
+        fits.append(Batch.fits(BOX, DX, 100_000, "cuda"))
+    assert fits[0] == 1 < fits[1] and fits[2] == pytest.approx(2 * fits[1], abs=1)
+    assert fits[3] == (2**31 - 1) // mpm.make_grid(BOX, DX).count  # indices have 31 bits
+
+
 def test_number_of_scenes_that_fit_on_a_cpu():
     count = mpm.make_grid(BOX, DX).count
     fits = Batch.fits(BOX, DX, 1000, "cpu")

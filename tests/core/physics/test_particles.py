@@ -10,8 +10,8 @@ import torch
 from stages.core.errors import InputError
 from stages.core.physics import particles
 from stages.core.physics.particles import (
-    MIN_PARTICLE_OPACITY,
     MIN_PARTICLES,
+    filled_voxels,
     inliers,
     sample_bodies,
     scene_size,
@@ -228,8 +228,8 @@ def test_size_of_a_scene_is_that_of_its_objects_without_a_hundredth_at_either_en
 def test_gaussians_of_any_wrong_value_are_not_usable():
     g = splats(sphere(12))
     g.means[0, 1], g.scales[1, 2], g.quats[2, 3], g.scales[3, 0] = math.nan, math.inf, math.nan, 0.0
-    g.quats[4], g.opacities[5], g.scales[6, 1] = 0.0, MIN_PARTICLE_OPACITY, -1.0
-    g.opacities[7] = 1.01 * MIN_PARTICLE_OPACITY
+    g.quats[4], g.opacities[5], g.scales[6, 1] = 0.0, 0.0199, -1.0
+    g.opacities[7] = 0.0201  # the published limit is .02
     assert usable(g).tolist() == [False] * 7 + [True] * 5
 
 
@@ -266,15 +266,21 @@ def test_skin_is_removed_where_a_body_is_five_voxels_thick():
         assert np.flatnonzero(skin).tolist() == ([3, 2 + thick] if removed else [])
 
 
-@pytest.mark.parametrize(("hole", "filled"), [(3, True), (9, True), (11, False)])
-def test_cavities_with_narrow_leaks_are_filled(hole, filled):
-    """A room of half width 8 with a square hole of half width 2, 5 or 6: at most two thirds of that of the room."""
-    walls = voxels((17, 17, 17), ((0, 0, 0), (16, 16, 16))) & ~voxels((17, 17, 17), ((1, 1, 1), (15, 15, 15)))
-    a = 8 - hole // 2
-    walls &= ~voxels(walls.shape, ((a, a, 16), (a + hole - 1, a + hole - 1, 16)))
+@pytest.mark.parametrize(("room", "hole", "filled"), [
+    (3, 3, True), (5, 5, True), (6, 7, True), (8, 9, True), (9, 11, True), (12, 15, True),
+    (6, 9, False), (8, 11, False), (12, 17, False),
+])  # fmt: skip
+def test_cavities_with_narrow_leaks_are_filled(room, hole, filled):
+    """A room of half width 3 to 12 with a square hole, of a half width of at most two thirds of that of the room."""
+    assert filled == ((hole + 1) / 2 <= room / 1.5)
+    last = 2 * room
+    walls = np.ones((last + 1,) * 3, bool)
+    walls[1:-1, 1:-1, 1:-1] = False
+    a = room - hole // 2
+    walls &= ~voxels(walls.shape, ((a, a, last), (a + hole - 1, a + hole - 1, last)))
     found = particles._cavities(walls, particles.LEAK_RADII)
-    assert found[8, 8, 8] == filled and not (found & walls).any()
-    assert found[1:-1, 1:-1, 1:9].all() if filled else not found.any()
+    assert found[room, room, room] == filled and not (found & walls).any()
+    assert found[1:-1, 1:-1, 1 : room + 1].all() if filled else not found.any()
 
 
 def test_the_outside_reaches_in_through_holes():
@@ -283,3 +289,14 @@ def test_the_outside_reaches_in_through_holes():
     assert not particles._outside(free)[4, 4, 4] and particles._outside(free)[0, 0, 0]
     free[4, 4, 6] = True
     assert np.array_equal(particles._outside(free), free)
+
+
+def test_the_voxels_of_a_body_do_not_depend_on_sparser_neighbours():
+    """Nor on transparent Gaussians: a ball alone, and within a large sparse one and a cloud."""
+    small, large, cloud = splats(sphere(1000)), splats(sphere(2000, 3.0), 2), splats(sphere(2000, 5.0))
+    transparent = replace(cloud, opacities=torch.zeros(2000))
+    alone = filled_voxels(scene(small), 1, 20)
+    together = filled_voxels(scene(concatenate([small, transparent]), large), 1, 20)
+    torch.testing.assert_close(together, alone)
+    assert alone[1] == pytest.approx(0.2 / 20, rel=0.03)
+    assert len(alone[0]) * alone[1] ** 3 == pytest.approx(4 / 3 * math.pi * 0.1**3, rel=0.15)

@@ -11,9 +11,11 @@ from stages.core.backends import choose
 from stages.core.errors import InputError
 from stages.core.physics.forces import Change, Force, ForcePrompts
 from stages.core.physics.keypoints import choose_keypoints
+from stages.core.physics.particles import Bodies
 from stages.core.scene.gaussians import concatenate
 from stages.core.scene.scene import Scene, SceneObject
 from stages.lab.assets.shapes import box, to_gaussians
+from stages.simulate.learned import _woken
 from stages.simulate.mpm import _PromptedForce
 from stages.simulate.options import ENGINES, QUALITIES, MpmQuality, SimulateOptions
 from stages.simulate.setup import set_up_scene
@@ -89,6 +91,32 @@ def test_a_fine_setup_has_half_the_spacing_and_the_same_mass(apart):
                     for refinement in (1, 2))  # fmt: skip
     assert fine.spacing == coarse.spacing / 2 and len(fine.x) > 4 * len(coarse.x)
     torch.testing.assert_close(fine.volume.sum(), coarse.volume.sum(), rtol=0.03, atol=0)
+
+
+def test_bodies_end_where_their_lowest_voxels_are_filled(apart, monkeypatch):
+    """Columns of voxels of edge .1, of the lowest of which the upper 30 % are filled, end .03 above the floor."""
+    h = 0.1
+    x = h * torch.cartesian_prod(torch.arange(4.0), torch.arange(4.0), torch.arange(5.0))
+    volume = h**3 * torch.where(x[:, 2] == 0, 0.3, 1.0)
+    x[:, 2] += 0.03 + (0.3 - 0.5) * h  # what is filled is below the upper face, half an edge above the centre
+    body = Bodies(x, torch.zeros(len(x), dtype=torch.int64), volume, h)
+    monkeypatch.setattr("stages.simulate.setup.sample_bodies", lambda *_, **__: body)
+    monkeypatch.setattr("stages.simulate.setup.surface_particles", lambda *_, **__: body)
+    one = replace(apart, gaussians=apart.gaussians[apart.gaussians.object_id == 1], objects=apart.objects[:1])
+    placed = set_up_scene(one, ForcePrompts(), SimulateOptions(quality="draft"), refinement=1)
+    assert placed.floor_offset[0].tolist() == pytest.approx([0.0, 0.0, -0.03], abs=1e-6)
+
+
+def test_mpm_refuses_another_material_model_during_a_simulation(apart):
+    with pytest.raises(InputError, match=r"object 2 \(b\) cannot become snow.*its material model is another"):
+        frames(apart, ForcePrompts(changes=(Change("material", "snow", 0.0, 2),)), engine="mpm", steps=2)
+
+
+def test_gravity_wakes_all_objects_and_other_changes_their_own():
+    ids = [3, 5, 8]
+    assert _woken((Change("gravity", 1.0, 0.0),), ids).tolist() == [True, True, True]
+    changes = (Change("material", "jelly", 0.0, 5), Change("pinned", False, 0.0, 8))
+    assert _woken(changes, ids).tolist() == [False, True, True] and not _woken((), ids).any()
 
 
 def small_setup(x: torch.Tensor, body: list[int]) -> SimpleNamespace:

@@ -311,3 +311,20 @@ def test_stiff_materials_are_softened_until_waves_cross_a_part_of_a_cell_in_a_su
     first, _ = _stable_material(Material(E=1e11, density=2500.0, nu=0.25), 0.5, 0.01, MpmQuality(1000, 3e-3))
     assert E / first == pytest.approx(h / 0.01 * (3e-3 / step) ** 2)  # E / (density g h) hangs on the step alone
     assert viscosity * substep / (2500.0 * (2 * h) ** 2) < 1  # explicit diffusion is stable
+
+
+def test_particles_are_the_same_in_any_unit(balls):
+    """The same scene in metres and in half metres: masses, stiffness, viscosity and places agree."""
+    options, material = options_with(material=("thing=jelly",), quality="draft"), []
+    for unit in (1.0, 0.5):
+        g = balls.gaussians
+        scene = replace(
+            balls, gaussians=replace(g, means=g.means / unit, scales=g.scales / unit),
+            scale={"metres_per_unit": unit, "source": "test"},
+        )  # fmt: skip
+        setup = set_up_scene(scene, ForcePrompts(), options)
+        material.append(engine._particles(scene, setup, ForcePrompts(), options, options.level))
+    one, other = material
+    for name in ("x", "mass", "volume", "stiffness", "friction"):
+        torch.testing.assert_close(getattr(one, name), getattr(other, name), rtol=1e-4, atol=1e-6)
+    assert float(one.stiffness[:, 2].min()) > 0

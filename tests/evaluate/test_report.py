@@ -99,6 +99,8 @@ def test_objects_have_colours_that_differ_and_are_not_that_of_false_ones():
     colours = torch.tensor(list(LabelColours.of(dict.fromkeys(range(12), 1.0), {}).truth.values()))
     assert colours.min() >= 0 and colours.max() == 1 and colours.unique(dim=0).shape == (12, 3)
     distance = torch.cdist(colours, colours) + 9 * torch.eye(12)
+    pale = colours.amin(1) > 0  # every other one: white is mixed in
+    assert pale.tolist() == 6 * [True, False]
     assert distance.min() > 0.05 and distance.diagonal(1).min() > 0.5  # neighbours are far apart
     assert (colours - torch.tensor(RED)).norm(dim=1).min() > 0.2
     of = LabelColours.of({5: 1.0, 7: 1.0}, {7: 3})

@@ -11,6 +11,7 @@ import torch
 
 from stages.core.errors import InputError
 from stages.core.models.checkpoints import SHIPPED, build, find, save
+from stages.core.models.dynamics import FRAME
 from stages.core.models.field.solidity import box_sides
 from stages.core.models.initial_conditions import FLOOR, InitialConditions
 from stages.core.scene.gaussians import concatenate
@@ -104,6 +105,10 @@ def test_pinned_objects_stay_and_frame_rate_does_not_matter(two_balls, untrained
     assert com_shift(t, 0).norm() < 1e-5
     coarse = roll(two_balls, untrained, lift=("2=2",), pin=("1",), dt=0.05, steps=3)
     assert float(com_shift(coarse, 1)[2]) == pytest.approx(float(com_shift(t, 1)[2]), rel=0.01)
+    fine = roll(two_balls, untrained, lift=("2=2",), dt=0.002, steps=1)
+    for motion, dt in ((t, SimulateOptions().dt), (coarse, 0.05), (fine, 0.002)):  # the fewest of at most FRAME
+        frame, steps = dt * motion.field.units.time, motion.field.units.steps
+        assert steps - 1 < frame / FRAME <= steps * (1 + 1e-5)
 
 
 def test_objects_below_the_floor_are_not_lifted_into_others():

@@ -300,3 +300,10 @@ def test_the_voxels_of_a_body_do_not_depend_on_sparser_neighbours():
     torch.testing.assert_close(together, alone)
     assert alone[1] == pytest.approx(0.2 / 20, rel=0.03)
     assert len(alone[0]) * alone[1] ** 3 == pytest.approx(4 / 3 * math.pi * 0.1**3, rel=0.15)
+
+
+def test_gaussians_in_the_same_places_are_sampled_as_densely():
+    """Each of a ball's Gaussians twice, so that the nearest other one is at no distance."""
+    single = splats(sphere(500), scale=0.05)
+    counts = [len(surface_points(scene(g), 1, 0)) for g in (single, concatenate([single, single]))]
+    assert counts[0] > 20 * 500 and counts[1] == 2 * counts[0]

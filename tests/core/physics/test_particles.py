@@ -307,3 +307,9 @@ def test_gaussians_in_the_same_places_are_sampled_as_densely():
     single = splats(sphere(500), scale=0.05)
     counts = [len(surface_points(scene(g), 1, 0)) for g in (single, concatenate([single, single]))]
     assert counts[0] > 20 * 500 and counts[1] == 2 * counts[0]
+
+
+@pytest.mark.parametrize(("along", "edge"), [(20, 0.9 / 20), (100, 0.1 / 3)])
+def test_voxels_are_a_part_of_the_object_or_a_third_of_the_spacing_of_its_gaussians(along, edge):
+    grid = torch.cartesian_prod(*[0.1 * torch.arange(10.0)] * 2, torch.zeros(1))
+    assert filled_voxels(scene(splats(grid, scale=1e-4)), 1, along)[1] == pytest.approx(edge, rel=1e-3)

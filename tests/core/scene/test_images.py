@@ -1,5 +1,7 @@
+import os
 import struct
 import sys
+import wave
 import zlib
 
 import cv2
@@ -89,6 +91,28 @@ def test_image_with_too_many_pixels_is_refused(tmp_path, reader):
     path.write_bytes(data[:12] + header + struct.pack(">I", zlib.crc32(header)) + data[33:])
     with pytest.raises(InputError, match="x.png: is damaged, or far too large"):
         reader(path)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="open files are listed in /proc")
+def test_refused_videos_are_closed(tmp_path, monkeypatch):
+    """Sound alone, and frames of too many pixels; the errors are kept, and no file stays open with them."""
+    pytest.importorskip("av")
+    with wave.open(str(tmp_path / "sound.wav"), "wb") as sound:
+        sound.setparams((1, 2, 8000, 0, "NONE", None))
+        sound.writeframes(bytes(1600))
+    with VideoWriter(tmp_path / "film.mp4", fps=10.0) as video:
+        video.append(torch.zeros(32, 64, 3))
+    monkeypatch.setattr(images, "MAX_VIDEO_PIXELS", 32 * 64 - 1)
+    before, errors = os.listdir("/proc/self/fd"), []
+    for name in ("sound.wav", "film.mp4"):
+        with pytest.raises(InputError) as error:
+            next(read_video(tmp_path / name))
+        errors.append(error)
+    assert "sound.wav: holds no video stream" in str(errors[0].value)
+    assert "film.mp4: has frames of 64x32 pixels; at most" in str(errors[1].value)
+    assert os.listdir("/proc/self/fd") == before
+    monkeypatch.setattr(images, "MAX_VIDEO_PIXELS", 32 * 64)
+    assert next(read_video(tmp_path / "film.mp4")).shape == (32, 64, 3)
 
 
 def test_absent_av_is_reported_for_videos(tmp_path, monkeypatch):

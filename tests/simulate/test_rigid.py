@@ -83,6 +83,13 @@ def test_a_ball_rebounds_by_its_loss_factor(tmp_path, loss):
     assert restitution == pytest.approx(math.exp(-math.pi * loss / 2), abs=0.03)  # half an oscillation at low damping
 
 
+def test_a_fall_of_half_a_percent_of_the_size_ends_without_a_rebound(tmp_path):
+    """Also of a material that loses nothing: it would bounce for seconds."""
+    t = roll(tmp_path, FLAT, lift=("0.001",), loss=0.0, dt=0.005, steps=24)
+    assert float((t.com[8:, 0, 2] - t.com[-1, 0, 2]).abs().max()) < 2e-6
+    assert float(t.com[-1, 0, 2] - t.com[0, 0, 2]) == pytest.approx(-0.001, abs=1e-4)
+
+
 def test_a_tower_stands(tmp_path):
     t = roll(tmp_path, *(cube(0.1, 0, 0.1 * i) for i in range(5)), steps=60, loss=0.15)
     assert float((t.com[-1] - t.com[0]).norm(dim=1).max()) < 1e-3
@@ -139,6 +146,14 @@ def test_a_body_of_several_parts_slides_by_v2_over_2_mu_g(tmp_path):
     t = roll(tmp_path, cross().moved((0, 0, 0.025)), velocity=("object=1 1,0,0",), friction=0.3, steps=40)
     assert float(t.com[-1, 0, 0] - t.com[0, 0, 0]) == pytest.approx(1 / (2 * 0.3 * G), rel=0.03)
     assert torch.equal(t.com[-1], t.com[-2]) or float((t.com[-1] - t.com[-2]).norm()) < 1e-5
+
+
+def test_bodies_of_several_parts_do_not_rebound_from_each_other(tmp_path):
+    """The contacts of their surfaces are inelastic: a cross that falls onto another by .12 stays on it."""
+    t = roll(tmp_path, cross().moved((0, 0, 0.025)), cross().moved((0, 0, 0.2)), loss=0.1, steps=18)
+    z, height = t.com[:, 1, 2], 0.075 + 0.15 * 0.05  # what is thicker than its Gaussians' centres
+    hit = int((z < height).nonzero()[0])
+    assert hit < 12 and float(z[hit:].max()) < height and float(z[-1]) > 0.07
 
 
 def test_a_body_of_several_parts_gains_no_energy_on_the_floor(tmp_path):

@@ -111,6 +111,13 @@ def test_pinned_objects_stay_and_frame_rate_does_not_matter(two_balls, untrained
         assert steps - 1 < frame / FRAME <= steps * (1 + 1e-5)
 
 
+def test_an_object_far_below_the_floor_is_named(untrained, caplog):
+    sunk = Scene(ball((0, 0, -0.5), 0.15, 600, (1, 0, 0), 1), (SceneObject(1, "ball"),), None, 0.0)
+    roll(sunk, untrained, steps=1)
+    raised = float(re.search(r"object 1 \(ball\) extends ([\d.]+) below the floor; it is placed on", caplog.text)[1])
+    assert raised == pytest.approx(0.65, abs=0.05)
+
+
 def test_objects_below_the_floor_are_not_lifted_into_others():
     """A ball 12 cm below the plane (as on a sagging seat), under the side of a larger one; small forces wake both."""
     high, low = ball((0, 0, 0.15), 0.15, 600, (1, 0, 0), 1), ball((0.2, 0, -0.02), 0.1, 600, (0, 1, 0), 2, seed=1)

@@ -108,12 +108,12 @@ def test_a_pause_lasts_until_it_is_ended_but_for_steps(play):
 
 
 def test_a_slow_engine_is_followed_by_a_quarter_of_a_second_at_most(play):
-    """Frames that take thrice their time for a while: then the clock is MAX_LAG and a frame behind, not 39 frames."""
+    """Frames that take thrice their time for a while: then the clock is .25 s and a frame behind, not 39 frames."""
     played = play(cost=lambda n: 3 * DT if n < 40 else 0.0)
     frames = played.go_on(39 * 3 * DT)
     assert frames == pytest.approx(39, abs=1)
     assert max(played.waited) <= DT
-    assert played.go_on(0.4) == pytest.approx((0.4 + loop.MAX_LAG + 3 * DT) / DT, abs=1)
+    assert played.go_on(0.4) == pytest.approx((0.4 + 0.25 + 3 * DT) / DT, abs=1)
     assert played.go_on(0.4) == pytest.approx(0.4 / DT, abs=1)
 
 

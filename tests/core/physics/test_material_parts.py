@@ -7,7 +7,7 @@ import torch
 
 from stages.core.errors import InputError
 from stages.core.physics.material_parts import averaged, located, part_of_points, segment_files, uneven_moments
-from stages.core.physics.materials import choose_materials
+from stages.core.physics.materials import MATERIALS, choose_materials
 from stages.core.scene.gaussians import Gaussians
 from stages.core.scene.scene import Scene, SceneObject
 from stages.core.scene.scene_ply import write_scene
@@ -51,6 +51,15 @@ def test_averages_and_moments_of_a_column(tmp_path):
     about = sum(w * (10.5 + k - com) ** 2 for k, w in enumerate(weights)) / mass
     uniform = sum((10.5 + k - 14) ** 2 for k in range(8)) / 8
     torch.testing.assert_close(inertia, torch.diag(torch.tensor([about - uniform, about - uniform, 0.0])))
+
+
+def test_a_plastic_part_gives_its_model_to_the_whole(tmp_path):
+    for lower, upper in (("sand", LEAF), (LEAF, "sand")):
+        choice = choose(tmp_path, [{"below": 2, "material": lower}, {"material": upper}])
+        m = averaged(choice, column(), torch.ones(8)).material
+        assert (m.model, m.plastic) == ("sand", MATERIALS["sand"].plastic)
+    elastic = choose(tmp_path, [{"below": 2, "material": POT}, {"material": LEAF}])
+    assert averaged(elastic, column(), torch.ones(8)).material.model == "neo-hookean"
 
 
 def gaussians_at(x: torch.Tensor, object_id: list[int]) -> Gaussians:

@@ -194,6 +194,32 @@ def test_values_that_a_trajectory_cannot_have(tmp_path, intact, name, value, mes
     assert "t.h5" in str(caught.value)
 
 
+@pytest.mark.parametrize(("name", "low", "high", "step"), [
+    ("gaussians/scales", 0, None, 1e-6), ("gaussians/opacities", -0.001, 1.001, 1e-5),
+    ("gaussians/object_id", 0, 65535, 1), ("objects/id", 1, 65535, 1), ("keypoints/object_id", 0, 65535, 1),
+    ("objects/confidence", 0, 1, 1e-5), ("binding/index", -1, None, 1), ("binding/weight", -0.001, 1.001, 1e-5),
+    ("cameras/sizes", 1, 65536, 1),
+])  # fmt: skip
+def test_values_up_to_the_limits_of_a_dataset_are_read(tmp_path, intact, name, low, high, step):
+    """Those of the file format; what other checks say of a value within them does not matter here."""
+    path = tmp_path / "t.h5"
+    path.write_bytes(intact)
+    with h5py.File(path, "a") as file:
+        if name not in file:
+            file[name] = np.ones((3, 2), "f4")
+    for limit, sign in ((low, -1), (high, 1)):
+        for value, right in () if limit is None else ((limit, True), (limit + sign * step, False)):
+            with h5py.File(path, "a") as file:
+                data = file[name]
+                data[(0,) * data.ndim] = value
+            try:
+                read_trajectory(path)
+                refused = False
+            except InputError as error:
+                refused = f"{name} must be" in str(error)
+            assert refused is not right, (value, right)
+
+
 def test_what_a_trajectory_may_lack(tmp_path, intact):
     for name in ("objects/material", "forces/json", "cameras/viewmats", "scale", "provenance", "floor"):
         change(tmp_path / "t.h5", intact, name, None)

@@ -1,6 +1,7 @@
 """Conditions that change during a simulation, uneven bodies and options, with every engine."""
 
 import json
+import math
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -15,7 +16,7 @@ from stages.core.physics.particles import Bodies
 from stages.core.scene.gaussians import concatenate
 from stages.core.scene.scene import Scene, SceneObject
 from stages.lab.assets.shapes import box, to_gaussians
-from stages.simulate.learned import _woken
+from stages.simulate.learned import _starts_awake, _woken
 from stages.simulate.mpm import _PromptedForce
 from stages.simulate.options import ENGINES, QUALITIES, MpmQuality, SimulateOptions
 from stages.simulate.setup import set_up_scene
@@ -117,6 +118,29 @@ def test_gravity_wakes_all_objects_and_other_changes_their_own():
     assert _woken((Change("gravity", 1.0, 0.0),), ids).tolist() == [True, True, True]
     changes = (Change("material", "jelly", 0.0, 5), Change("pinned", False, 0.0, 8))
     assert _woken(changes, ids).tolist() == [False, True, True] and not _woken((), ids).any()
+
+
+@pytest.mark.parametrize("gravity", [-1.0, 0.0, 0.5, 9.81])
+def test_what_moves_at_the_start_or_is_not_held_down_is_awake(gravity):
+    """Four objects: at rest, with a velocity, lifted, and with both of one unit."""
+    velocity, lift = torch.zeros(1, 4, 3), torch.zeros(4, 3)
+    velocity[0, 1, 2], lift[2, 2], velocity[0, 3], lift[3] = -0.3, 0.2, 1.0, 1.0
+    awake = _starts_awake(SimpleNamespace(velocity=velocity), SimpleNamespace(gravity=gravity),
+                          SimpleNamespace(lift=lift))  # fmt: skip
+    assert awake.tolist() == [gravity <= 0, True, True, True]
+
+
+def test_a_sliding_body_has_the_friction_of_its_new_material():
+    """Two boxes slide on the floor by v^2 / 2 mu g; the second becomes rubber at the start."""
+    flat = [box((0.2, 0.2, 0.1), 0.02).moved((x, 0.0, 0.05)) for x in (-0.5, 0.5)]
+    g = concatenate([to_gaussians(s, torch.full((len(s.points), 3), 0.5), i, widest=math.inf)
+                     for i, s in enumerate(flat, 1)])  # fmt: skip
+    scene = Scene(g, (SceneObject(1, "a", "common"), SceneObject(2, "b", "common")), None, 0.0)
+    prompts = ForcePrompts(velocity={1: (0.0, 1.0, 0.0), 2: (0.0, 1.0, 0.0)},
+                           changes=(Change("material", "rubber", 0.0, 2),))  # fmt: skip
+    states = frames(scene, prompts, engine="rigid", steps=14)
+    way = (states[-1].com - states[0].com)[:, 1].tolist()
+    assert way == pytest.approx([1 / (2 * mu * 9.81) for mu in (0.5, 0.8)], rel=0.05)
 
 
 def small_setup(x: torch.Tensor, body: list[int]) -> SimpleNamespace:

@@ -220,6 +220,13 @@ def test_values_up_to_the_limits_of_a_dataset_are_read(tmp_path, intact, name, l
             assert refused is not right, (value, right)
 
 
+@pytest.mark.parametrize(("dt", "right"), [(1e-6, True), (9.9e-7, False), (1e4, True), (10_001.0, False)])
+def test_times_between_frames_are_a_microsecond_to_hours(tmp_path, intact, dt, right):
+    change(tmp_path / "t.h5", intact, "dt", dt)
+    with nullcontext() if right else pytest.raises(InputError, match="dt is"):
+        assert read_trajectory(tmp_path / "t.h5").info.dt == dt
+
+
 def test_what_a_trajectory_may_lack(tmp_path, intact):
     for name in ("objects/material", "forces/json", "cameras/viewmats", "scale", "provenance", "floor"):
         change(tmp_path / "t.h5", intact, name, None)

@@ -10,10 +10,13 @@ import torch
 from stages.core.errors import InputError
 from stages.core.geometry.cameras import project
 from stages.core.perception.grabcut import clean_mask
+from stages.core.scene.scene import Scene
 from stages.segment import boxes
 from stages.segment.boxes import MAX_VIEWS, nearest_first, segment, segment_prompted_view
 from stages.segment.options import SegmentOptions
+from stages.segment.prompted import segment_with
 from stages.segment.prompts import read_prompts
+from tests.conftest import random_gaussians
 from tests.segment.tabletop import WOOD, block, egg, orbit_cameras, scene_of, table_gaussians, three_apart
 
 
@@ -133,10 +136,13 @@ def test_box_coordinates_are_scaled_from_their_image_size(tmp_path):
         read_prompts(tmp_path / "p.json", cameras)
 
 
-def test_scene_without_cameras_is_refused(tmp_path):
+@pytest.mark.parametrize("backend", ["boxes", "network"])
+@pytest.mark.parametrize("cameras", [None, orbit_cameras(1)[[]]], ids=["none", "empty"])
+def test_scene_without_cameras_is_refused(tmp_path, backend, cameras):
     (tmp_path / "p.json").write_text('{"bbox": [[1, 1, 5, 5]]}')
+    options, scene = SegmentOptions(boxes=tmp_path / "p.json"), Scene(random_gaussians(5), cameras=cameras)
     with pytest.raises(InputError, match="has no cameras"):
-        segment(three_apart(cameras=False), SegmentOptions(boxes=tmp_path / "p.json"))
+        segment(scene, options) if backend == "boxes" else segment_with(pytest.fail, scene, options)
 
 
 def test_ratio_of_colours_is_that_of_their_frequencies():

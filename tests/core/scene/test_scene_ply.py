@@ -216,3 +216,12 @@ def test_ids_of_objects_up_to_the_largest_are_read(tmp_path, two_balls, id):
         tmp_path / "s.ply", replace(two_balls, gaussians=replace(g, object_id=torch.full_like(g.object_id, id)))
     )
     assert read_scene(tmp_path / "s.ply").gaussians.object_id.unique().tolist() == [id]
+
+
+def test_more_gaussians_than_the_file_holds_are_refused_before_they_are_read(tmp_path, monkeypatch):
+    write_scene(tmp_path / "s.ply", Scene(random_gaussians(50)))
+    data = (tmp_path / "s.ply").read_bytes()
+    (tmp_path / "s.ply").write_bytes(data.replace(b"element vertex 50", b"element vertex 51", 1))
+    monkeypatch.setattr(PlyData, "read", lambda *_: pytest.fail("read"))
+    with pytest.raises(InputError, match=r"s.ply: is not a readable PLY file .*declares \d+ bytes or more; it has"):
+        read_scene(tmp_path / "s.ply")

@@ -70,6 +70,21 @@ def test_other_messages_are_refused(text):
         parse_message(text)
 
 
+@pytest.mark.parametrize(("do", "name", "low", "high"), [
+    ("push", "strength", 0, 100), ("lift", "height", -100, 100), ("gravity", "value", -100, 100),
+    ("friction", "value", 0, 10), ("speed", "value", 0.01, 4),
+])  # fmt: skip
+def test_numbers_of_messages_up_to_their_limits(do, name, low, high):
+    others = {"push": {"object": 1, "point": [0, 0, 1e4], "direction": [0, 0, -1e4]}, "lift": {"object": 2**31 - 1}}
+    for limit, beyond in ((low, low - 0.001), (high, high + 0.001)):
+        assert parse_message(json.dumps({"do": do, **others.get(do, {}), name: limit}))[name] == limit
+        with pytest.raises(BadMessage, match="a number from"):
+            parse_message(json.dumps({"do": do, **others.get(do, {}), name: beyond}))
+    for wrong in ({"object": 0}, {"object": 2**31}):
+        with pytest.raises(BadMessage, match="number of an object"):
+            parse_message(json.dumps({"do": "drop", **wrong}))
+
+
 # --- recording ---
 
 

@@ -123,7 +123,7 @@ def test_the_start_of_a_field_is_read_back(file, friction):
 
 
 @pytest.mark.parametrize(("name", "value"), [
-    ("length", 0.0), ("time", 2e12), ("friction", -1.0), ("friction", 101.0), ("origin", [1.0, 2.0]),
+    ("length", 9.9e-13), ("time", 1.01e12), ("friction", -0.01), ("friction", 100.1), ("origin", [1.0, 2.0]),
     ("gravity", np.nan), ("steps", 0), ("steps", 10_001), ("steps", 1.5),
 ])  # fmt: skip
 def test_units_of_a_field_out_of_range_are_refused(file, name, value):
@@ -132,6 +132,17 @@ def test_units_of_a_field_out_of_range_are_refused(file, name, value):
     file.flush()
     with pytest.raises(ValueError, match=name):
         read_field_start(file, {})
+
+
+@pytest.mark.parametrize(("name", "low", "high"), [
+    ("length", 1e-12, 1e12), ("mass", 1e-12, 1e12), ("friction", 0.0, 100.0), ("steps", 1, 10_000),
+])  # fmt: skip
+def test_units_of_a_field_up_to_their_limits_are_read(file, name, low, high):
+    write_field_start(file, start_of(UNITS))
+    for value in (low, high):
+        file["field"].attrs[name] = value
+        file.flush()
+        assert getattr(read_field_start(file, {}).units, name) == value
 
 
 def test_a_file_is_opened_for_reading(tmp_path):

@@ -152,7 +152,8 @@ METADATA = {"floor": 0.5, "scale": {"metres_per_unit": 0.1}, "provenance": {"opt
 
 @pytest.mark.parametrize(("name", "value"), [
     ("floor", "0"), ("floor", math.inf), ("scale", [1]), ("scale", {"metres_per_unit": 0}),
-    ("scale", {"metres_per_unit": 2e6}), ("provenance", None), ("provenance", {"options": []}),
+    ("scale", {"metres_per_unit": 9.9e-7}), ("scale", {"metres_per_unit": 1.01e6}),
+    ("provenance", None), ("provenance", {"options": []}),
     ("provenance", {"inputs": {}}), ("provenance", {"inputs": [{"name": 3}]}), ("provenance", {"inputs": ["a"]}),
     ("background", [0, 0]), ("background", [0, 0, "1"]),
 ])  # fmt: skip
@@ -160,6 +161,11 @@ def test_metadata_of_other_types_are_refused(name, value):
     assert read_metadata(**METADATA) == METADATA
     with pytest.raises(ValueError, match="."):
         read_metadata(**{**METADATA, name: value})
+
+
+def test_scales_of_micrometres_to_thousands_of_kilometres_are_read():
+    for unit in (1e-6, 1e6):
+        assert read_metadata(None, {"metres_per_unit": unit}, {}, None)["scale"] == {"metres_per_unit": unit}
 
 
 def test_metadata_that_may_be_absent():
@@ -185,7 +191,7 @@ SEQUENCE = {"fps": 30.0, "frames": 2, "starts": {"a": -0.5, "b": 7.25}}
 
 
 @pytest.mark.parametrize("wrong", [
-    {"fps": 0}, {"fps": 2e6}, {"frames": 0}, {"frames": 1.5}, {"frames": MAX_FRAMES + 1}, {"starts": None},
+    {"fps": 9.9e-4}, {"fps": 1.01e6}, {"frames": 0}, {"frames": 1.5}, {"frames": MAX_FRAMES + 1}, {"starts": None},
     {"starts": {"a": "x"}}, {"starts": {"a": -MAX_FRAMES - 1}}, {"starts": {"a": MAX_FRAMES + 1}}, {"starts": [1]},
 ], ids=str)  # fmt: skip
 def test_sequences_are_read_back_and_others_refused(wrong):

@@ -2,6 +2,7 @@
 
 import json
 import struct
+from contextlib import ExitStack
 from types import SimpleNamespace
 
 import pytest
@@ -30,7 +31,7 @@ def still():
 class Played:
     """A session whose server hands over `messages[i]` in turn i, and whose frames take `cost` [s]."""
 
-    def __init__(self, still, folder, monkeypatch, cost=lambda n: 0.0, fail_at=None):
+    def __init__(self, files, still, folder, monkeypatch, cost=lambda n: 0.0, fail_at=None):
         scene, self.keypoints, binding = still
         self.now, self.waited, self.sent, self.messages = 100.0, [], [], []
         monkeypatch.setattr(loop, "time", SimpleNamespace(monotonic=lambda: self.now))
@@ -47,8 +48,8 @@ class Played:
         self.out = folder / "traj.h5"
         options = SimulateOptions(dt=DT, keypoints=16)
         info = SimulationInfo(DT, (0.0, 0.0, -9.81), "ngff")
-        self.writer = TrajectoryWriter(self.out, scene, info, self.keypoints, binding)
-        self.writer.__enter__()
+        self.files = files
+        self.writer = files.enter_context(TrajectoryWriter(self.out, scene, info, self.keypoints, binding))
         live = loop.LiveScene(scene, self.keypoints, ForcePrompts(), options, rollout)
         self.live = loop._Live(live, None, SimpleNamespace(messages=self.take, publish=self.publish), self.writer,
                                self.out)  # fmt: skip
@@ -79,7 +80,8 @@ class Played:
 
 @pytest.fixture
 def play(still, tmp_path, monkeypatch):
-    return lambda **options: Played(still, tmp_path, monkeypatch, **options)
+    with ExitStack() as files:
+        yield lambda **options: Played(files, still, tmp_path, monkeypatch, **options)
 
 
 def test_frames_follow_the_clock_at_the_speed_that_is_chosen(play):
@@ -141,7 +143,7 @@ def test_what_the_user_does_is_recorded_and_saved_copies_are_numbered(play):
     assert played.header["lifted"] == [] and played.header["pinned"] == [1]
     assert not read_trajectory(played.out.with_name("traj-2.h5")).info.forces  # a new recording
     played.writer.store_prompts(played.live.session.record)
-    played.writer.__exit__(None, None, None)
+    played.files.close()
     whole = read_trajectory(played.out)
     assert len(whole) == played.header["frames"] and whole.info.forces[0]["what"] == "pinned"
     torch.testing.assert_close(whole.positions[-1], played.sent[-1][1])

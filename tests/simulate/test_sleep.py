@@ -38,6 +38,12 @@ def test_a_stack_sleeps_and_a_floating_object_does_not(device):
     assert sleep_state(stacked(0.0, SIDE, SIDE + high), none(3), device).asleep.tolist() == [True, True, False]
 
 
+@pytest.mark.parametrize(("gap", "touches"), [(0.1, True), (0.13, False)])
+def test_objects_touch_at_the_start_up_to_a_tenth_of_a_metre_and_half_their_spacing(gap, touches):
+    """512 keypoints on cubes of side .3 are .032 apart, as if all were on their faces."""
+    assert sleep_state(stacked(0.0, SIDE + gap), none(2)).asleep.tolist() == [True, touches]
+
+
 def test_objects_that_lose_their_support_wake():
     stack = stacked(0.0, SIDE, 2 * SIDE)
     assert sleep_state(stack, torch.tensor([True, False, False])).asleep.tolist() == [False, False, False]

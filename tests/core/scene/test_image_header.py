@@ -161,7 +161,8 @@ def test_segments_of_a_jpeg_before_its_frame_are_skipped(marker):
     """Also those whose markers are among the ones that begin frames; the file may end after the number of channels."""
     frame = b"\xff\xc2" + struct.pack(">HBHHB", 8, 8, 37, 300, 3)
     between = bytes([0xFF, marker]) + struct.pack(">H", 12) + b"\xff\xc0" * 5
-    data = b"\xff\xd8" + between + b"\xff\xff\x01" + frame
+    alone = b"\xff\xff\x01\xff\xd0\xff\xd7"  # filling, and markers without a length
+    data = b"\xff\xd8" + between + alone + frame
     assert read_image_header(data) == (300, 37, pytest.approx(300 * 37 * 3 / 4096))
     with pytest.raises(ValueError, match="no image"):
         read_image_header(data[:-1])

@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from stages.core.kernels.mpm.transfers import KINEMATIC_MASS_FACTOR
 from stages.core.physics.mpm.contact import ContactSubsteps
 from stages.core.physics.mpm.solver import (
     Box,
@@ -99,6 +100,17 @@ def test_the_schedule_for_gpus_gives_the_same_motion_and_repeats_to_the_bit(devi
     fast = run(ContactSubsteps)
     torch.testing.assert_close(fast, run(SplitSubsteps), rtol=0, atol=2e-5)
     assert torch.equal(fast, run(ContactSubsteps))
+
+
+def test_a_filled_cell_has_the_mass_of_the_lightest_part_as_it_is_on_the_grid():
+    """Eight particles in a cell; held ones weigh more on the grid, so that what is free gives way."""
+    free, held = block((0, 0, 0.5), (0.1, 0.1, 0.6)), block((0.2, 0, 0.5), (0.3, 0.1, 0.6), friction=0.7, held=True)
+    free.mass[:4] *= 3
+    sizes, both = [len(free), len(held)], join_particles([free, held])
+    contact = Solver(both, BOX, DX, "cpu", SolverOptions(schedule="contact"), sizes)._body_contact(both, sizes)
+    cell = 500 * DX**3
+    assert contact.full_cell.tolist() == pytest.approx([cell, KINEMATIC_MASS_FACTOR * cell])
+    assert contact.friction.tolist() == pytest.approx([0.3, 0.7])
 
 
 def test_unknown_schedules_are_refused():

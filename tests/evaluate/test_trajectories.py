@@ -216,7 +216,7 @@ def test_suffixes_may_be_in_capitals(tmp_path, two_balls):
     assert with_recorded(options).steps == 12 and with_recorded(SimulateOptions()).steps == SimulateOptions().steps
 
 
-@pytest.mark.parametrize(("frames", "compared"), [(5, 3), (7, 5), (9, 5)])
+@pytest.mark.parametrize(("frames", "compared"), [(1, 1), (5, 3), (7, 5), (9, 5)])
 def test_resampling_ends_with_the_prediction_or_the_truth(tmp_path, two_balls, frames, compared):
     """Of 5 frames at 0, 0.03, ... s, those up to the last of the prediction at 0, 0.02, ... s."""
     two_balls = replace(two_balls, gaussians=two_balls.gaussians[::50], cameras=None)

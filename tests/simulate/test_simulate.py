@@ -15,6 +15,7 @@ from stages.core.models.segmenter import segment as network_segmenter
 from stages.core.models.segmenter.voxels import SCALES
 from stages.core.physics.forces import ForcePrompts
 from stages.core.physics.materials import DEFAULT_MATERIAL, Material
+from stages.core.physics.mpm.domain import MAX_NODES
 from stages.core.scene.gaussians import concatenate
 from stages.core.scene.scene import Scene, SceneObject
 from stages.core.scene.scene_ply import read_scene, write_scene
@@ -24,7 +25,7 @@ from stages.simulate import moving_grid
 from stages.simulate import mpm as engine
 from stages.simulate.mpm import _stable_material
 from stages.simulate.options import QUALITIES, MpmQuality, SimulateOptions
-from stages.simulate.setup import set_up_scene
+from stages.simulate.setup import MIN_ROOM, _default_box, set_up_scene
 from stages.simulate.stage import run, with_objects
 from tests.conftest import ball
 from tests.segment.tabletop import three_apart
@@ -328,3 +329,19 @@ def test_particles_are_the_same_in_any_unit(balls):
     for name in ("x", "mass", "volume", "stiffness", "friction"):
         torch.testing.assert_close(getattr(one, name), getattr(other, name), rtol=1e-4, atol=1e-6)
     assert float(one.stiffness[:, 2].min()) > 0
+
+
+@pytest.mark.parametrize("along", [200, 250, 400, 1000])
+def test_the_default_domain_is_reduced_until_its_grid_fits(along):
+    """Of a cube of side 1 on the floor: twice as large at best, and never less than MIN_ROOM around it."""
+    h = 1 / along
+    box = _default_box(torch.tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]]), 0.0, h)
+    room = -box.low[0]
+    assert box.low == (-room, -room, 0.0) and box.high == pytest.approx((1 + room,) * 3)
+
+    def nodes(room: float) -> float:
+        return ((1 + 2 * room) / (2 * h) + 16) ** 2 * ((1 + room) / (2 * h) + 16)
+
+    assert nodes(room) < MAX_NODES / 2 or room <= MIN_ROOM * h
+    assert room == 1 or (nodes(room / 0.8) > MAX_NODES / 2 and room > 0.8 * MIN_ROOM * h)
+    assert (room == 1) == (along == 200)

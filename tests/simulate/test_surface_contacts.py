@@ -122,6 +122,19 @@ def test_shape_of_a_box_that_ends_at_the_floor():
     assert len(top) > 1000 and np.abs(top[:, 2] - 0.25).max() < 0.003
 
 
+def test_voxels_around_a_symmetric_body_are_symmetric():
+    """A slab of 9 x 9 x 5 voxels of edge .1 and points on its faces: one voxel around it, and itself inside."""
+    line = 0.1 * np.arange(-4, 4.5)
+    slab = np.stack(np.meshgrid(line, line, line[2:-2], indexing="ij"), -1).reshape(-1, 3)
+    body = SolidSurface(slab + 0.05, 0.1, box((0.9, 0.9, 0.5), 0.03).points.double().numpy() + 0.05)
+    x, depth, inside = body.body_voxels()
+    cells = np.round((x - 0.05) / 0.1).astype(int)
+    assert len(x) == 11 * 11 * 7 and np.abs(cells).max(0).tolist() == [5, 5, 3]
+    kept = {tuple(c) for c in cells[inside]}
+    assert kept == {tuple(np.round((p) / 0.1).astype(int)) for p in slab}
+    assert (depth[inside] > 0).all() and depth.max() == pytest.approx(0.25, abs=0.02)
+
+
 def bumpy(side: float, height: float, bump: float) -> Surface:
     """A slab with bumps on its faces, six along each side."""
     s = box((side, side, height), side / 96)

@@ -191,6 +191,14 @@ def test_outliers_are_far_from_the_median():
     assert inliers(points).tolist() == [True] * 1000 + [False] * 3
 
 
+def test_outliers_lie_three_and_a_half_robust_deviations_beyond_the_median_distance():
+    """A median of 1.1 and a median deviation of .2: up to 1.1 + 3.5 x .2 / .6745 = 2.138."""
+    distances = torch.tensor([0.8, 0.9, 1.0, 1.1, 1.2, 2.13, 2.15])
+    line = torch.cat([torch.zeros(1), distances, -distances])
+    kept = inliers(line[:, None] * torch.tensor([0.0, 0.6, 0.8]))
+    assert kept.tolist() == (line.abs() < 2.138).tolist()
+
+
 @pytest.mark.parametrize(("photographed", "extended"), [(True, True), (False, False)])
 def test_toppling_objects_of_photos_are_extended_to_the_floor(photographed, extended, caplog):
     """A slab that leans by twice its thickness: its centre is not above its base."""

@@ -15,8 +15,12 @@ STORED = [{}, {"chunks": (2,)}, {"chunks": (2,), "maxshape": (None,)}, {"compres
 
 
 def write(path, libver="earliest", **stored):
-    """A file with texts in a dataset and in many attributes, in headers of the old or of the new version."""
-    with h5py.File(path, "w", libver=libver) as file:
+    """A file with texts in a dataset and in many attributes, in headers of the old or of the new version.
+
+    Those of "tracked" also have the order in which attributes were made.
+    """
+    tracked = libver == "tracked"
+    with h5py.File(path, "w", libver="latest" if tracked else libver, track_order=tracked) as file:
         for i in range(6):  # more do not stay in a header of the new version
             file.attrs[f"{i}"] = "attribute " + i * "z"
         file.attrs["matrix"], file.attrs["list"] = np.eye(3), ["a", "bc", ""]
@@ -25,7 +29,7 @@ def write(path, libver="earliest", **stored):
 
 
 @pytest.mark.parametrize("stored", STORED, ids=str)
-@pytest.mark.parametrize("libver", ["earliest", "latest"])
+@pytest.mark.parametrize("libver", ["earliest", "latest", "tracked"])
 def test_sound_texts_are_read(tmp_path, stored, libver):
     write(tmp_path / "a.h5", libver, **stored)
     with open_h5(tmp_path / "a.h5") as file:
@@ -60,7 +64,7 @@ def reread(path):
         Dataset("n", "text").read(file, "names", {})
 
 
-@pytest.mark.parametrize("libver", ["earliest", "latest"])
+@pytest.mark.parametrize("libver", ["earliest", "latest", "tracked"])
 @pytest.mark.parametrize("length", [len("duck"), len("attribute z"), len("none")], ids=["dataset", "file", "item"])
 def test_a_text_longer_than_its_heap_has_is_refused(tmp_path, libver, length):
     path = tmp_path / "a.h5"

@@ -45,11 +45,13 @@ def test_identical_scenes(tmp_path, two_balls):
 def test_transparent_gaussians_are_ignored_and_colour_is_compared(tmp_path, two_balls):
     g = two_balls.gaussians
     opacities, means, sh = g.opacities.clone(), g.means.clone(), g.sh.clone()
-    opacities[:100], means[:100] = 0.05, means[:100] + 5.0  # transparent and far away
+    opacities[:100], means[:100] = 0.099, means[:100] + 5.0  # transparent and far away
+    opacities[100:200] = 0.101
     sh += 0.1 / 0.28209479177387814  # brighter by 0.1 everywhere
     mine = replace(two_balls, gaussians=replace(g, opacities=opacities, means=means, sh=sh))
     true = replace(two_balls, gaussians=g)
     overall = evaluate(tmp_path, mine, true)["overall"]
+    assert overall["Gaussians"] == 1600
     assert overall["to_truth"] == 0 and 0 < overall["to_prediction"] < 0.1
     assert overall["colour"] == pytest.approx(0.1, abs=1e-4)
 

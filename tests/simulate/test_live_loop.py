@@ -147,3 +147,21 @@ def test_what_the_user_does_is_recorded_and_saved_copies_are_numbered(play):
     whole = read_trajectory(played.out)
     assert len(whole) == played.header["frames"] and whole.info.forces[0]["what"] == "pinned"
     torch.testing.assert_close(whole.positions[-1], played.sent[-1][1])
+
+
+def test_a_push_acts_for_a_frame_and_its_arrow_is_shown_for_two_fifths_of_a_second(play):
+    played = play()
+    tip = played.keypoints.rest[(played.keypoints.object_id == 1).nonzero()[0, 0]]
+    push = {"do": "push", "object": 1, "point": tip.tolist(), "direction": (0.0, 1.0, 0.0), "strength": 2.0}
+    played.go_on(0.1)
+    first = len(played.sent)
+    played.go_on(1.0, push)
+    arrows = [header["arrows"] for header, _ in played.sent[first:]]
+    shown = [a[0] for a in arrows if a]
+    assert len(shown) == pytest.approx(0.4 / DT, abs=1) and not arrows[-1]
+    tail, end = torch.tensor(shown[0])
+    torch.testing.assert_close(end - tail, torch.tensor([0.0, 0.5, 0.0]))  # .25 for each unit per second
+    torch.testing.assert_close(end, tip + (first - 1) * UP, atol=2e-3, rtol=0)
+    (force,) = [row for row in played.live.session.record if row["kind"] == "force"]
+    impulse = force["force"][1] * (force["end"] - force["start"])
+    assert impulse == pytest.approx(2.0, rel=1e-3)  # 2 units per second for 1 kg

@@ -11,6 +11,7 @@ from stages.core.physics.keypoints import bind_gaussians, choose_keypoints, fart
 from stages.core.physics.skinning import Skinning, deform, fit_rotations, object_rotations
 from stages.core.scene.gaussians import Gaussians, concatenate
 from stages.core.scene.scene import Scene, SceneObject
+from stages.core.scene.trajectory import Binding, Keypoints
 from tests.conftest import random_gaussians
 
 TURN = matrix(torch.tensor([0.3, 0.5, -0.2, 0.7]))
@@ -149,3 +150,12 @@ def test_a_body_without_points_has_the_identity_rotation():
 def test_a_scene_without_objects_has_no_keypoints():
     keypoints = choose_keypoints(replace(scene_of("cloud"), objects=()), 8)
     assert keypoints.rest.shape == (0, 3) and keypoints.object_id.shape == (0,)
+
+
+def test_a_gaussian_follows_a_single_keypoint():
+    """The first of all; the others of its row are padding."""
+    g, u = random_gaussians(3), torch.tensor([[0.1, -0.2, 0.3]])
+    keypoints = Keypoints(torch.zeros(1, 3), torch.ones(1, dtype=torch.int64))
+    binding = Binding(torch.tensor([[0, -1], [-1, -1], [0, -1]]), torch.tensor([[1.0, 0], [0, 0], [1, 0]]))
+    moved = deform(g, binding, keypoints, keypoints.rest + u)
+    torch.testing.assert_close(moved.means, g.means + u * torch.tensor([[1.0], [0.0], [1.0]]))

@@ -125,7 +125,7 @@ def test_provenance_names_inputs_with_their_hashes_and_options_as_text(tmp_path)
         assert files._digest(file) == digest
 
 
-def test_what_must_exist_is_a_readable_file(tmp_path):
+def test_what_must_exist_is_a_readable_file(tmp_path, monkeypatch):
     (tmp_path / "empty").touch()
     for name, message in (("absent", "no such file; a toy is expected"), ("", "is a folder; a toy is expected"),
                           ("empty", "is empty; a toy is expected")):  # fmt: skip
@@ -133,3 +133,6 @@ def test_what_must_exist_is_a_readable_file(tmp_path):
             must_exist(tmp_path / name, "a toy")
     (tmp_path / "empty").write_text("x")
     assert must_exist(tmp_path / "empty", "a toy") == tmp_path / "empty"
+    monkeypatch.setattr(files.os, "access", lambda path, mode: False)  # file permissions do not hold for root
+    with pytest.raises(InputError, match="empty: cannot be read; check its permissions"):
+        must_exist(tmp_path / "empty", "a toy")

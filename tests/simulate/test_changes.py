@@ -12,15 +12,17 @@ from stages.core.backends import choose
 from stages.core.errors import InputError
 from stages.core.physics.forces import Change, Force, ForcePrompts
 from stages.core.physics.keypoints import choose_keypoints
+from stages.core.physics.mpm.solver import Box, Solver
 from stages.core.physics.particles import Bodies
 from stages.core.scene.gaussians import concatenate
 from stages.core.scene.scene import Scene, SceneObject
 from stages.lab.assets.shapes import box, to_gaussians
 from stages.simulate.learned import _starts_awake, _woken
-from stages.simulate.mpm import _PromptedForce
+from stages.simulate.mpm import _change, _PromptedForce
 from stages.simulate.options import ENGINES, QUALITIES, MpmQuality, SimulateOptions
 from stages.simulate.setup import set_up_scene
 from tests.conftest import ball
+from tests.core.physics.test_mpm import block
 
 pytestmark = pytest.mark.usefixtures("device")
 DT = 0.02
@@ -141,6 +143,22 @@ def test_a_sliding_body_has_the_friction_of_its_new_material():
     states = frames(scene, prompts, engine="rigid", steps=14)
     way = (states[-1].com - states[0].com)[:, 1].tolist()
     assert way == pytest.approx([1 / (2 * mu * 9.81) for mu in (0.5, 0.8)], rel=0.05)
+
+
+def test_new_materials_and_pins_reach_the_solver_of_mpm():
+    particles = block((0.1, 0.1, 0.1), 0.05, low=(0, 0, 0.2))
+    particles.v[:], particles.C[:] = torch.tensor([1.0, -2.0, 3.0]), torch.eye(3)
+    half = torch.arange(len(particles)) < len(particles) // 2
+    new = replace(particles, mass=2 * particles.mass, stiffness=3 * particles.stiffness, held=half.to(torch.int8),
+                  friction=particles.friction + 0.1, plastic=particles.plastic + 0.2)  # fmt: skip
+    solver = Solver(particles, Box((-0.5, -0.5, 0.0), (0.5, 0.5, 0.5)), 0.05)
+    _change(solver, particles, new)
+    for name in ("mass", "stiffness", "held", "friction", "plastic"):
+        assert torch.equal(getattr(solver.particles, name), getattr(new, name)), name
+        assert getattr(particles, name) is getattr(new, name)
+    moving = (~half).float()[:, None]  # what is pinned stops
+    assert torch.equal(solver.particles.v, moving * torch.tensor([1.0, -2.0, 3.0]))
+    assert torch.equal(solver.particles.C, moving[..., None] * torch.eye(3))
 
 
 def small_setup(x: torch.Tensor, body: list[int]) -> SimpleNamespace:

@@ -110,6 +110,17 @@ def test_bodies_end_where_their_lowest_voxels_are_filled(apart, monkeypatch):
     assert placed.floor_offset[0].tolist() == pytest.approx([0.0, 0.0, -0.03], abs=1e-6)
 
 
+def test_only_what_is_below_the_floor_after_a_lift_is_placed_on_it(apart):
+    """Balls that end .85 above the floor: one is lowered by .95, the other lifted by 1.2."""
+    setup = set_up_scene(apart, ForcePrompts(lift={1: -0.95, 2: 1.2}), SimulateOptions(quality="draft"))
+    h, body = setup.bodies.spacing, setup.bodies.body
+    assert setup.floor_offset[0].tolist() == pytest.approx([0.0, 0.0, 0.1], abs=0.5 * h)
+    assert not setup.floor_offset[1].any() and setup.on_floor.tolist() == [True, False]
+    assert not setup.on_floor_as_seen.any()
+    assert float(setup.start[body == 0, 2].quantile(0.01)) == pytest.approx(1.5 * h, abs=0.1 * h)
+    torch.testing.assert_close(setup.start[body == 1], setup.bodies.x[body == 1] + torch.tensor([0.0, 0.0, 1.2]))
+
+
 def test_mpm_refuses_another_material_model_during_a_simulation(apart):
     with pytest.raises(InputError, match=r"object 2 \(b\) cannot become snow.*its material model is another"):
         frames(apart, ForcePrompts(changes=(Change("material", "snow", 0.0, 2),)), engine="mpm", steps=2)

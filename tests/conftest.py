@@ -2,7 +2,7 @@
 
 import gc
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -84,6 +84,19 @@ def one_thread() -> Iterator[None]:
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture
+def with_threads() -> Iterator[Callable]:
+    """Calls a function with a number of threads of PyTorch."""
+    before = torch.get_num_threads()
+
+    def call(threads, function, *arguments):
+        torch.set_num_threads(threads)
+        return function(*arguments)
+
+    yield call
     torch.set_num_threads(before)
 
 

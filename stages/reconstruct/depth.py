@@ -21,6 +21,7 @@ from tqdm import tqdm
 from stages.core.geometry.cameras import centres, depths, resize
 from stages.core.geometry.planes import Plane
 from stages.core.kernels.semi_global import path_costs
+from stages.core.kernels.threads import parallel_map
 from stages.reconstruct.photos import Views
 from stages.reconstruct.sfm import SparseModel
 
@@ -30,7 +31,7 @@ MAX_LABELS = 192  # depth hypotheses per pixel
 STEP_PENALTY, JUMP_PENALTY = 0.03, 0.25  # P1 and P2 of semi-global matching, for costs 0..1
 DEPTH_TOLERANCE, PIXEL_TOLERANCE = 0.01, 1.5  # of consistent depths: relative, and reprojected [px]
 REFINE_STEPS = (0.5, 0.2)  # of the two refinement rounds [steps of the hypothesis grid]
-CPU_CHUNK, CUDA_CHUNK = 8, 64  # hypotheses warped at once: few that stay in the cache, or few launches
+CPU_PIXELS, CUDA_CHUNK = 1 << 17, 64  # warped at once: pixels that stay in the cache, or hypotheses in few launches
 MOVE_COST = 0.02  # cost added per refinement step away from the current depth
 
 
@@ -146,11 +147,14 @@ class _Stereo:
 
         The point may be occluded in the other half.
         """
-        out = []
-        for part in depth.split(CUDA_CHUNK if depth.is_cuda else CPU_CHUNK):
+
+        def cost_of(part: Float[Tensor, "c h w"]) -> Float[Tensor, "c h w"]:
             scores = [self._correlation(part, *source) for source in self.sources]
-            out.append(1 - _mean_of_better_half(scores).clamp(0, 1))
-        return torch.cat(out)
+            return 1 - _mean_of_better_half(scores).clamp(0, 1)
+
+        if depth.is_cuda:
+            return torch.cat([cost_of(part) for part in depth.split(CUDA_CHUNK)])
+        return torch.cat(parallel_map(cost_of, depth.split(max(1, CPU_PIXELS // depth[0].numel()))))
 
     def _correlation(self, depth, image, rotated, shift) -> Float[Tensor, "d h w"]:
         """Normalised cross-correlation of windows; 0 where the point is outside the source image."""

@@ -44,6 +44,13 @@ def test_consistent_depth_is_accurate(block, device):
         assert (error < 0.02).float().mean() > 0.97
 
 
+def test_depth_does_not_depend_on_the_number_of_threads(block, with_threads):
+    views, _, model = block
+    plane = Plane(torch.tensor([0.0, 0, 1]), 0.0)
+    first, second = (with_threads(n, stereo._match_view, views, model, 2, [1, 3], plane, "cpu") for n in (1, 2))
+    assert torch.equal(first, second)
+
+
 def test_sources_are_the_neighbours(block):
     _, _, model = block
     sources = stereo.select_sources(model, 2)

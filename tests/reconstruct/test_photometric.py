@@ -46,19 +46,6 @@ def test_the_same_seed_gives_the_same_gaussians(target, device):
         assert torch.equal(getattr(first, name), getattr(second, name)), name
 
 
-@pytest.fixture
-def with_threads():
-    """Calls a function with a number of threads of PyTorch."""
-    before = torch.get_num_threads()
-
-    def call(threads, function, *arguments):
-        torch.set_num_threads(threads)
-        return function(*arguments)
-
-    yield call
-    torch.set_num_threads(before)
-
-
 def test_the_number_of_threads_changes_nothing(target, with_threads):
     true, views = target
     first, second = (with_threads(n, photometric.fit_gaussians, true, views, FitOptions(8, 2.0)) for n in (1, 2))

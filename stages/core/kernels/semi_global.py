@@ -1,7 +1,7 @@
 """Path costs of semi-global matching along one dimension, forward plus backward.
 
-On CUDA a block of threads follows each line, a thread for each label. On the CPU the steps along all lines are PyTorch
-operations, which also specify the kernel.
+On CUDA a block of threads follows each line, a thread for each label. On the CPU each thread takes some of the lines;
+the steps along them are PyTorch operations, which also specify the kernel.
 
 Source: Hirschmueller 2008, "Stereo processing by semiglobal matching and mutual information", eq. 13.
 """
@@ -16,10 +16,12 @@ from torch import Tensor
 
 from stages.core.kernels.interop import device_of, launch, view
 from stages.core.kernels.splat.simd import by_device
+from stages.core.kernels.threads import parallel_map
 
 wp.set_module_options({"enable_backward": False})
 
 THREADS = 256
+GRAIN_SIZE = 32768  # elements per thread below which PyTorch does not use another one (at::internal::GRAIN_SIZE)
 
 _FOLLOW = r"""
 __shared__ float before[258], lowest_of_warp[8];
@@ -73,7 +75,10 @@ def path_costs(costs: Float[Tensor, "l m d"], step_penalty: float, jump_penalty:
     A change of the label by one costs `step_penalty`, any other `jump_penalty`.
     """
     steps, lines, labels = costs.shape
-    if not costs.is_cuda or labels > THREADS:
+    if not costs.is_cuda:
+        parts = costs.chunk(min(torch.get_num_threads(), -(-lines * labels // GRAIN_SIZE)), dim=1)
+        return torch.cat(parallel_map(lambda part: path_costs_reference(part, step_penalty, jump_penalty), parts), 1)
+    if labels > THREADS:
         return path_costs_reference(costs, step_penalty, jump_penalty)
     costs = costs.contiguous()
     total = torch.empty_like(costs)

@@ -13,6 +13,12 @@ def test_path_costs_equal_the_reference(shape, device):
     assert torch.equal(ours, reference)
 
 
+def test_path_costs_do_not_depend_on_the_number_of_threads(with_threads):
+    costs = torch.rand(5, 601, 150, generator=torch.Generator().manual_seed(0))
+    reference = path_costs_reference(costs, 0.03, 0.25)
+    assert all(torch.equal(with_threads(n, path_costs, costs, 0.03, 0.25), reference) for n in (1, 2, 3))
+
+
 def test_path_cost_of_a_line_without_changes_is_the_sum_of_its_costs(device):
     """With penalties above any saving, the best path keeps its label: forward plus backward counts each step twice."""
     costs = torch.zeros(6, 1, 4, device=device)

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import torch
-from diffusers.models.attention_processor import AttnProcessor2_0
 from jaxtyping import Float
 from torch import Tensor
 from tqdm import tqdm
@@ -28,6 +27,8 @@ class MultiViewAttention:
     """Self-attention over the tokens of all `views` of an object: (b v) n d as b (v n) d."""
 
     def __init__(self, views: int):
+        from diffusers.models.attention_processor import AttnProcessor2_0
+
         self.views, self.plain = views, AttnProcessor2_0()
 
     def __call__(self, attn, hidden_states: Tensor, encoder_hidden_states: Tensor | None = None, **more) -> Tensor:
@@ -37,6 +38,8 @@ class MultiViewAttention:
 
 def share_attention(unet: UNet2DConditionModel, views: int = VIEWS + 1) -> None:
     """Make every self-attention of a U-Net multi-view; cross-attention to the text remains per view."""
+    from diffusers.models.attention_processor import AttnProcessor2_0
+
     unet.set_attn_processor({
         name: MultiViewAttention(views) if name.endswith("attn1.processor") else AttnProcessor2_0()
         for name in unet.attn_processors

@@ -6,7 +6,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from diffusers import DPMSolverMultistepScheduler
 
 from stages.core.models.diffsplat.maps import cameras, plucker
 from stages.core.models.diffsplat.network import STEPS, VIEWS, share_attention, triangle
@@ -62,6 +61,8 @@ def test_guidance_is_triangular_over_the_views():
 
 def test_scheduler_equals_the_public_code():
     """The public code changes configuration entries after the scheduler has read them: some have no effect."""
+    from diffusers import DPMSolverMultistepScheduler
+
     reference, actual = DPMSolverMultistepScheduler.from_config(SCHEDULER), sampler(SCHEDULER)
     reference.config.algorithm_type = "sde-dpmsolver++"
     reference.config.timestep_spacing = "trailing"

@@ -9,7 +9,6 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from diffusers import UNet2DConditionModel
 from safetensors.torch import load_file, save_file
 
 from stages.core.errors import InputError
@@ -97,6 +96,8 @@ def test_missing_package_is_named(folder, monkeypatch):
 
 def test_published_parameter_counts():
     """The hub lists 3.44 GB for the U-Net; its autoencoder's first and last layer are those of the public code."""
+    from diffusers import UNet2DConditionModel
+
     with torch.device("meta"):
         network = UNet2DConditionModel(in_channels=11, cross_attention_dim=768)
     count = sum(p.numel() for p in network.parameters())

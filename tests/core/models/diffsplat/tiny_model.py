@@ -1,14 +1,18 @@
 """A small DiffSplat with random weights, in the published layout of folders and names."""
 
+from __future__ import annotations
+
 import json
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import torch
-from diffusers import AutoencoderKL, UNet2DConditionModel
 from safetensors.torch import save_file
-from transformers import CLIPTextConfig, CLIPTextModel
 
 from stages.core.models.diffsplat.weights import BASE, GSVAE, UNET
+
+if TYPE_CHECKING:
+    from diffusers import AutoencoderKL, UNet2DConditionModel
 
 SIDE = 32  # of the images [px]; latents have half of it
 WIDTHS = (8, 16)
@@ -28,6 +32,8 @@ UNET_CONFIG = {
 
 def unet() -> UNet2DConditionModel:
     """The U-Net that UNET_CONFIG describes, built directly."""
+    from diffusers import UNet2DConditionModel
+
     torch.manual_seed(0)
     return UNet2DConditionModel(
         sample_size=SIDE // 2, in_channels=11, out_channels=4, block_out_channels=WIDTHS, layers_per_block=1,
@@ -38,6 +44,8 @@ def unet() -> UNet2DConditionModel:
 
 def autoencoder(channels: int) -> AutoencoderKL:
     """Small autoencoder of `channels` channels with random weights."""
+    from diffusers import AutoencoderKL
+
     torch.manual_seed(channels)
     return AutoencoderKL(
         in_channels=channels, out_channels=channels, down_block_types=("DownEncoderBlock2D",) * 2, layers_per_block=1,
@@ -47,6 +55,8 @@ def autoencoder(channels: int) -> AutoencoderKL:
 
 def save_tiny_model(folder: Path) -> Path:
     """Write U-Net, Gaussian autoencoder and Stable Diffusion parts into a folder."""
+    from transformers import CLIPTextConfig, CLIPTextModel
+
     ema = folder / UNET / "checkpoints/013020/unet_ema"
     ema.mkdir(parents=True)
     (ema / "config.json").write_text(json.dumps(UNET_CONFIG))

@@ -252,17 +252,24 @@ def _cavities(walls: np.ndarray, leaks: Sequence[int]) -> np.ndarray:
     Reconstructed shells have holes; left hollow, they would crumple like paper bags. `leaks` are the half widths of the
     holes to close [voxels], increasing.
     """
-    room = leaks[-1]  # margin, so that leaks lead outside
-    walls = np.pad(walls, room)
-    away = ndimage.distance_transform_edt(~walls)
-    filled = np.zeros_like(walls)
+    if not walls.any():
+        return walls
+    box = ndimage.find_objects(walls.view(np.uint8))[0]
+    room = leaks[-1] + 1  # margin, so that leaks lead outside and the faces of the grid are free
+    inner = np.pad(walls[box], room)
+    away = ndimage.distance_transform_edt(~inner)
+    filled = np.zeros_like(inner)
     for leak in leaks:
-        free = away > leak
+        free, wide = away > leak, away >= MIN_CAVITY_RATIO * leak
         outside = _outside(free)
-        hollow = _components_with(free & ~outside & ~filled, away >= MIN_CAVITY_RATIO * leak)
-        if hollow.any():  # grow back to the walls, but not through the leaks
-            filled |= _components_with(~walls & (ndimage.distance_transform_edt(~outside) > leak + 1), hollow)
-    return filled[room:-room, room:-room, room:-room]
+        hollow = free & ~outside & ~filled
+        if (hollow & wide).any():
+            hollow = _components_with(hollow, wide)
+            # grow back to the walls, but not through the leaks
+            filled |= _components_with(~inner & (ndimage.distance_transform_edt(~outside) > leak + 1), hollow)
+    out = np.zeros_like(walls)
+    out[box] = filled[room:-room, room:-room, room:-room]
+    return out
 
 
 def _components_with(free: np.ndarray, seeds: np.ndarray) -> np.ndarray:
@@ -275,9 +282,13 @@ def _components_with(free: np.ndarray, seeds: np.ndarray) -> np.ndarray:
 
 def _outside(free: np.ndarray) -> np.ndarray:
     """The free voxels connected to the faces of the grid."""
-    faces = np.ones_like(free)
-    faces[1:-1, 1:-1, 1:-1] = False
-    return _components_with(free, faces)
+    labels, count = ndimage.label(free)
+    kept = np.zeros(count + 1, bool)
+    for axis in range(3):
+        for end in (0, -1):
+            kept[labels.take(end, axis)] = True
+    kept[0] = False
+    return kept[labels]
 
 
 def _trim(body: np.ndarray, points: np.ndarray) -> np.ndarray:

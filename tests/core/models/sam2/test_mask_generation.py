@@ -1,17 +1,20 @@
 """Automatic masks equal those of the image model for the same points, filtered and without duplicates."""
 
+import pytest
 import torch
 
-from stages.core.models.sam2.mask_generation import (
-    MaskGenerationOptions,
-    mask_stability,
-    propose_masks,
-    suppress_duplicates,
-)
 from tests.core.models.sam2.tiny_model import SIDE, random_model
 
 
-def test_masks_equal_those_of_the_image_model():
+@pytest.fixture(scope="module")
+def generation():
+    """The module, which imports transformers' models: that takes a second."""
+    from stages.core.models.sam2 import mask_generation
+
+    return mask_generation
+
+
+def test_masks_equal_those_of_the_image_model(generation):
     from transformers import Sam2Config, Sam2Model
 
     video = random_model()
@@ -25,31 +28,33 @@ def test_masks_equal_those_of_the_image_model():
     with torch.no_grad():
         expected = image(pixel_values=pixels[None], input_points=points[None, :, None],
                        input_labels=torch.ones(1, 16, 1, dtype=torch.int32), multimask_output=True)  # fmt: skip
-    unfiltered = MaskGenerationOptions(grid=4, batch=5, min_iou=-9.0, min_stability=0.0, max_iou=1.0)
-    proposals = propose_masks(video, pixels, unfiltered)
+    unfiltered = generation.MaskGenerationOptions(grid=4, batch=5, min_iou=-9.0, min_stability=0.0, max_iou=1.0)
+    proposals = generation.propose_masks(video, pixels, unfiltered)
     masks, scores = expected.pred_masks.flatten(0, 2) > 0, expected.iou_scores.flatten()
-    order = suppress_duplicates(masks, scores, 1.0)
+    order = generation.suppress_duplicates(masks, scores, 1.0)
     assert len(order) > 10 and torch.equal(proposals.masks, masks[order])
     torch.testing.assert_close(proposals.scores, scores[order], rtol=1e-5, atol=1e-5)
     median = float(scores.median())
-    filtered = MaskGenerationOptions(grid=4, batch=16, min_iou=median, min_stability=0.0, max_iou=1.0)
-    selected = propose_masks(video, pixels, filtered)
+    filtered = generation.MaskGenerationOptions(grid=4, batch=16, min_iou=median, min_stability=0.0, max_iou=1.0)
+    selected = generation.propose_masks(video, pixels, filtered)
     assert 0 < len(selected.masks) < len(proposals.masks) and float(selected.scores.min()) >= median
 
 
-def test_stability_of_known_logits():
+def test_stability_of_known_logits(generation):
     row = torch.tensor([[-3.0, -0.5, 0.5, 0.9, 2.0, 3.0]])  # above 1: two; above -1: five
     soft, hard = row[None], torch.tensor([[[-9.0, -9, 9, 9, 9, 9]]])
-    torch.testing.assert_close(mask_stability(torch.cat([soft, hard, hard - 100])), torch.tensor([0.4, 1.0, 0.0]))
+    torch.testing.assert_close(
+        generation.mask_stability(torch.cat([soft, hard, hard - 100])), torch.tensor([0.4, 1.0, 0.0])
+    )
 
 
-def test_duplicate_with_the_lower_score_is_removed():
+def test_duplicate_with_the_lower_score_is_removed(generation):
     masks = torch.zeros(5, 1, 20, dtype=torch.bool)
     masks[0, 0, :10] = True
     masks[1, 0, 1:11] = True  # 9 of 11 shared with the first: 0.82
     masks[2, 0, :5] = True  # a part of the first: 0.5
     masks[3, 0, 12:] = True
     scores = torch.tensor([0.8, 0.9, 0.95, 0.7, 1.0])  # the fifth mask is empty
-    assert suppress_duplicates(masks, scores, 0.7).tolist() == [2, 1, 3]
-    assert suppress_duplicates(masks, scores, 0.9).tolist() == [2, 1, 0, 3]
-    assert suppress_duplicates(masks[:0], scores[:0], 0.7).tolist() == []
+    assert generation.suppress_duplicates(masks, scores, 0.7).tolist() == [2, 1, 3]
+    assert generation.suppress_duplicates(masks, scores, 0.9).tolist() == [2, 1, 0, 3]
+    assert generation.suppress_duplicates(masks[:0], scores[:0], 0.7).tolist() == []

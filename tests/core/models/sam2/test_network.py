@@ -5,12 +5,18 @@ import pytest
 import torch
 
 from stages.core.models.promptable import PointPrompts
-from stages.core.models.sam2 import network
-from stages.core.models.sam2.network import StreamingSession, pixel_values, propagate_masks
 from tests.core.models.sam2.tiny_model import SIDE, random_model
 
 COUNT, START = 13, 4
 BOX, POINT = torch.tensor([0.1, 0.1, 0.5, 0.6]), torch.tensor([0.7, 0.4])
+
+
+@pytest.fixture(scope="module")
+def network():
+    """The module, which subclasses a class of transformers: importing it takes a second."""
+    from stages.core.models.sam2 import network
+
+    return network
 
 
 @pytest.fixture(scope="module")
@@ -62,8 +68,8 @@ def add_mask(session) -> list[int]:
     [([PointPrompts.box(BOX), PointPrompts.inside(POINT)], add_clicks), (example_mask()[None], add_mask)],
     ids=["clicks", "mask"],
 )
-def test_propagation_equals_transformers_with_full_memory(model, video, prompts, add_prompts):
-    actual = dict(propagate_masks(model, lambda i: video[i], COUNT, prompts, START))
+def test_propagation_equals_transformers_with_full_memory(network, model, video, prompts, add_prompts):
+    actual = dict(network.propagate_masks(model, lambda i: video[i], COUNT, prompts, START))
     assert list(actual) == [*range(START, COUNT), *range(START - 1, -1, -1)]
     for t, masks in reference_masks(model, video, add_prompts).items():
         torch.testing.assert_close(actual[t], masks, rtol=0, atol=0)
@@ -71,21 +77,21 @@ def test_propagation_equals_transformers_with_full_memory(model, video, prompts,
     assert float(spread.mean()) > 1e-3  # the frames differ, so the comparison is not trivial
 
 
-def test_masks_depend_on_earlier_frames(model, video):
+def test_masks_depend_on_earlier_frames(network, model, video):
     """A change of the second frame changes the masks of the third through the memory."""
     changed = video.clone()
     changed[1] = changed[1].flip(-1)
     original, altered = (
-        [m for _, m in propagate_masks(model, lambda i, v=v: v[i], 3, [PointPrompts.box(BOX)])]
+        [m for _, m in network.propagate_masks(model, lambda i, v=v: v[i], 3, [PointPrompts.box(BOX)])]
         for v in (video, changed)
     )
     assert torch.equal(original[0], altered[0]) and float((original[2] - altered[2]).abs().max()) > 1e-3
 
 
-def test_memory_is_bounded_and_each_frame_is_read_once(model, monkeypatch):
+def test_memory_is_bounded_and_each_frame_is_read_once(network, model, monkeypatch):
     sessions, read = [], []
 
-    class RecordingSession(StreamingSession):
+    class RecordingSession(network.StreamingSession):
         def __init__(self, *args):
             super().__init__(*args)
             sessions.append(self)
@@ -102,18 +108,18 @@ def test_memory_is_bounded_and_each_frame_is_read_once(model, monkeypatch):
         )
 
     monkeypatch.setattr(network, "StreamingSession", RecordingSession)
-    sizes = [memory_bytes() for _ in propagate_masks(model, frame, 40, [PointPrompts.box(BOX)])]
+    sizes = [memory_bytes() for _ in network.propagate_masks(model, frame, 40, [PointPrompts.box(BOX)])]
     assert sorted(read) == list(range(40))
     assert sizes[39] <= sizes[14] and sizes[14] > 0
     assert sessions[-1].processed_frames is None
 
 
-def test_pixel_values_equal_pillow_resize_and_published_normalisation():
+def test_pixel_values_equal_pillow_resize_and_published_normalisation(network):
     Image = pytest.importorskip("PIL.Image")
     pixels = (torch.rand(90, 210, 3, generator=torch.Generator().manual_seed(0)) * 255).round()
     pillow = Image.fromarray(pixels.numpy().astype(np.uint8)).resize((64, 64), Image.BILINEAR)
     expected = (torch.from_numpy(np.array(pillow)).float() / 255 - torch.tensor([0.485, 0.456, 0.406])) / torch.tensor(
         [0.229, 0.224, 0.225]
     )
-    actual = pixel_values(pixels / 255, 64).permute(1, 2, 0)
+    actual = network.pixel_values(pixels / 255, 64).permute(1, 2, 0)
     torch.testing.assert_close(actual, expected, rtol=0, atol=1.01 / 255 / 0.224)  # Pillow rounds twice to 8 bits

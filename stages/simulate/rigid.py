@@ -7,11 +7,13 @@ A contact is a damped spring. Its damping ratio is half the larger loss factor o
 critically damped, since stacks that rebound at any speed never come to rest. The frequency is the highest that the
 substep resolves, so that resting bodies sink in by less than 1e-3 of the smallest object. The friction of a pair is the
 larger coefficient, as in the others.
-Friction aims at no slip at the end of a substep. A larger deceleration than Coulomb friction can give would lift a
-sliding body, as MuJoCo's friction cones couple slip to the normal, and with the smaller one that follows from the
-materials' damping friction would be viscous: bodies would creep on slopes, and keep their slip in collisions.
-Source: Todorov, Erez and Tassa 2012, "MuJoCo: a physics engine for model-based control"; restitution of a damped
-spring: Schwager and Poeschel 2007, "Coefficient of restitution and linear-dashpot model revisited".
+Friction aims at no slip at the end of a substep; with the smaller deceleration that follows from the materials' damping
+it would be viscous: bodies would creep on slopes, and keep their slip in collisions. MuJoCo's friction cones are a
+convex relaxation, in which a contact that slides at speed s also separates at friction s, which lifts bodies and gives
+them energy. So that speed, known from the previous pass, is subtracted and the forces are solved for again.
+Sources: Todorov, Erez and Tassa 2012, "MuJoCo: a physics engine for model-based control"; restitution of a damped
+spring: Schwager and Poeschel 2007, "Coefficient of restitution and linear-dashpot model revisited"; exact friction from
+the relaxed one: De Saxce and Feng 1998, "The bipotential method"; Le Lidec et al. 2024, "Contact models in robotics".
 
 Bodies of several parts also touch where their surfaces do (`surface_contacts.py`). Overlaps at the start are kept
 (`initial_overlaps.py`); objects of photos rest until disturbed (`resting_bodies.py`).
@@ -52,7 +54,8 @@ CONTACT_SUBSTEPS = 12  # substeps during which bodies that collide touch
 REST_SPEED = 0.1  # normal speed below which contacts do not rebound [units]; a fall of 0.5 % of the smallest object
 PARTS_DAMPING = 0.4  # least damping ratio of bodies of several parts, of which contacts come and go during a collision
 IMPEDANCE = 0.99  # of a contact: 1 would be exact, but the forces between several contacts undetermined
-SLIP_LEVER = 5  # how much more a force may accelerate the slip of a contact than along its normal; 4 at a rod's end
+MAX_PASSES = 8  # of the solver for exact friction; in each the error of a sliding box shrinks by mu^2 / (1 + mu^2)
+SLIP_TOLERANCE = 0.01  # error of a contact's normal acceleration with which they end, relative to gravity plus itself
 MAX_SUBSTEPS = 5_000  # in a frame
 MAX_TRAVEL = 0.05  # of the smallest object's size in a substep, so that nothing passes through it
 ON_FLOOR = 0.02  # gap up to which a body stands on the floor [units]
@@ -301,11 +304,12 @@ class _World:
         if count:
             self._overlaps.subtract(data, self._resting.fixed, count)
         mujoco.mj_fwdVelocity(model, data)
-        if data.ncon:
-            self._set_references(count)
         mujoco.mj_fwdActuation(model, data)
         mujoco.mj_fwdAcceleration(model, data)
-        mujoco.mj_fwdConstraint(model, data)
+        if data.ncon:
+            self._solve(*self._set_references(count))
+        else:
+            mujoco.mj_fwdConstraint(model, data)
         mujoco.mj_Euler(model, data)
         self._resting.restore(data, self._start)
         self._resting.release_disturbed(data)
@@ -313,8 +317,9 @@ class _World:
             data.qpos[FREE * k : FREE * (k + 1)] = pose
             data.qvel[FALLING * k : FALLING * (k + 1)] = 0
 
-    def _set_references(self, count: int) -> None:
-        """Damp slow contacts critically, and let friction stop slip within a substep, by at most what it can.
+    def _set_references(self, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """Damp slow contacts critically, and let friction stop slip within a substep. Returns the constraint rows (k,)
+        of the contacts' normals, and the friction coefficients (k,).
 
         The contacts after the first `count` are those of surfaces: inelastic, and pushed apart slowly.
         """
@@ -328,10 +333,25 @@ class _World:
         push = np.minimum(-(self._omega**2) * data.efc_pos[soft], 2 * self._omega * REST_SPEED)
         data.efc_aref[soft] = push - 2 * self._omega * data.efc_vel[soft]
         along = normal[:, None] + [1, 2]
-        slip = data.efc_vel[along]
-        most = 1 + SLIP_LEVER * data.contact.friction[active, 0] * np.maximum(data.efc_aref[normal], 0)
-        rate = np.minimum(1 / self.model.opt.timestep, most / np.linalg.norm(slip, axis=1).clip(1e-12))
-        data.efc_aref[along] = -slip * rate[:, None]
+        data.efc_aref[along] = -data.efc_vel[along] / self.model.opt.timestep
+        return normal, data.contact.friction[active, 0]
+
+    def _solve(self, normal: np.ndarray, friction: np.ndarray) -> None:
+        """Find the contact forces with exact Coulomb friction, by passes that know the slip after the previous one."""
+        mujoco, model, data = self._mujoco, self.model, self.data
+        along, wanted = normal[:, None] + [1, 2], data.efc_aref[normal]
+        slip = np.linalg.norm(data.efc_aref[along], axis=1)  # after the substep, divided by it
+        slip = np.maximum(slip - friction * np.maximum(wanted + 1, 0), 0)  # a box that slides with this normal force
+        rate = np.zeros(data.nefc)
+        for _ in range(MAX_PASSES):
+            data.efc_aref[normal] = wanted - friction * slip
+            mujoco.mj_fwdConstraint(model, data)
+            mujoco.mj_mulJacVec(model, data, rate, data.qacc)
+            before, slip = slip, np.linalg.norm(rate[along] - data.efc_aref[along], axis=1)
+            error = friction * np.abs(slip - before)
+            touching = (data.efc_force[normal] > 0) | (rate[normal] < wanted)
+            if not (touching & (error > SLIP_TOLERANCE * (1 + np.abs(wanted)))).any():
+                break
 
     def _apply_forces(self, acting: list, time: float, step: float) -> None:
         """Set the mean force and torque on each body during a substep."""

@@ -3,7 +3,7 @@
 import json
 import logging
 import math
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import pytest
@@ -249,3 +249,48 @@ def test_the_fastest_object_decides_on_the_substeps(tmp_path, caplog):
     caplog.set_level(logging.INFO)
     roll(tmp_path, cube(0.1, 0, 0.0), cube(0.1, 1.0, 0.0), steps=1, velocity=("object=2 12,0,5",))
     assert any("(58 per frame)" in r.getMessage() for r in caplog.records)
+
+
+def rail() -> Surface:
+    """A bar of several convex parts along x, 1.2 x .2 x .04, with a rim at its left end; its top is at 0."""
+    pieces = ((1.2, 0.2, 0.04), (0.0, 0.0, -0.02)), ((0.04, 0.2, 0.1), (-0.58, 0.0, 0.01))
+    return union(*((box(sides, 0.01).moved(at), partial(strictly_inside, sides=sides, at=at)) for sides, at in pieces))
+
+
+def strictly_inside(points: torch.Tensor, sides: tuple, at: tuple) -> torch.Tensor:
+    return ((points - torch.tensor(at)).abs() < torch.tensor(sides) / 2 - 1e-4).all(1)
+
+
+@pytest.mark.parametrize("friction", [0.2, 0.6])
+def test_bodies_of_several_parts_slide_on_each_other_by_v2_over_2_mu_g(tmp_path, friction):
+    t = roll(tmp_path, rail().moved((0.0, 0.0, 0.3)), cross().moved((-0.3, 0, 0.325)), pin=("1",), friction=friction,
+             velocity=("object=2 1,0,0",), steps=20 + math.ceil(1 / (friction * G * 0.02)))  # fmt: skip
+    assert float(t.com[-1, 1, 0] - t.com[0, 1, 0]) == pytest.approx(1 / (2 * friction * G), rel=0.05)
+    assert float((t.com[-1] - t.com[-3]).norm()) < 1e-4
+
+
+@pytest.mark.parametrize("friction", [0.3, 0.9])
+def test_a_force_a_little_beyond_friction_accelerates_a_box_by_the_difference(tmp_path, friction):
+    """Contacts that push a sliding body up would let it slide faster. Its mass is measured without friction."""
+    free = roll(tmp_path, FLAT, friction=0.0, force=("object=1 force=1,0,0",), steps=31)
+    mass = 0.6**2 / 2 / float(free.com[-1, 0, 0] - free.com[0, 0, 0])
+    t = roll(tmp_path, FLAT, friction=friction, force=(f"object=1 force={mass * G * (friction + 0.03)},0,0",), steps=31)
+    assert float(t.com[-1, 0, 0] - t.com[0, 0, 0]) == pytest.approx(0.03 * G * 0.6**2 / 2, rel=0.05)
+
+
+def test_friction_adds_no_energy_to_tumbling_bodies(tmp_path):
+    """Two crosses meet and tumble on a floor of friction 1, where sliding contacts must not push bodies up."""
+    t = roll(tmp_path, cross().moved((-0.3, 0, 0.3)), cross().moved((0.3, 0.05, 0.3)), loss=0.1, friction=1.0,
+             velocity=("object=1 3,0,0", "object=2 -3,0,0"), steps=60, keypoints=400)  # fmt: skip
+    x = t.positions.double()
+    energy = ((x[1:] - x[:-1]) ** 2).sum(-1).mean(1) / (2 * 0.02**2) + G * ((x[1:] + x[:-1]) / 2)[..., 2].mean(1)
+    least = torch.cummin(energy, 0).values
+    assert float((energy - least).max()) < 0.01 * float(energy[0] - energy.min())
+
+
+def test_a_dropped_body_of_several_parts_rests_when_its_rebounds_are_over(tmp_path):
+    """Rebounds of restitution e after a fall of time T last T (1 + e) / (1 - e) in all."""
+    e, fall = math.exp(-math.pi * 0.4 / math.sqrt(1 - 0.4**2)), math.sqrt(2 * 0.1 / G)
+    t = roll(tmp_path, cross().moved((0, 0, 0.025)), lift=("1=0.1",), loss=0.1, dt=0.01, steps=60)
+    last = math.ceil(fall * (1 + e) / (1 - e) / 0.01)
+    assert float((t.positions[last + 2 :] - t.positions[last + 1]).norm(dim=-1).max()) < 1e-3 * 0.3

@@ -112,7 +112,9 @@ class RestingBodies:
 def _supports(model, data, stances: list[Stance]) -> dict[int, set[int]]:
     """Body -> the bodies that rest on it: in contact from above and not on the floor, or without contact over it."""
     found: dict[int, set[int]] = {}
-    for pair, up in zip(model.geom_bodyid[data.contact.geom], data.contact.frame[:, 2], strict=True):
+    of = model.geom_bodyid[data.contact.geom]
+    of[of > len(stances)] = 0  # fixed, as the world
+    for pair, up in zip(of, data.contact.frame[:, 2], strict=True):
         lower, upper = pair if up > 0 else pair[::-1]  # the normal points from the first to the second
         if lower > 0 and upper > 0 and abs(up) > SUPPORT_COSINE and not stances[upper - 1].on_floor:
             found.setdefault(int(lower), set()).add(int(upper))

@@ -16,7 +16,8 @@ spring: Schwager and Poeschel 2007, "Coefficient of restitution and linear-dashp
 the relaxed one: De Saxce and Feng 1998, "The bipotential method"; Le Lidec et al. 2024, "Contact models in robotics".
 
 Bodies of several parts also touch where their surfaces do (`surface_contacts.py`). Overlaps at the start are kept
-(`initial_overlaps.py`); objects of photos rest until disturbed (`resting_bodies.py`).
+(`initial_overlaps.py`); objects of photos rest until disturbed (`resting_bodies.py`). An object of which more than half
+is below the floor stands on something else, such as the ground beside a table: a plane under it, which only it touches.
 """
 
 from __future__ import annotations
@@ -85,6 +86,7 @@ class Body:
     mass: float
     start: Float[Tensor, "3"]  # centre of mass at the start
     pinned: bool
+    ground: float  # height of the plane under it [m]
 
     def damping(self, material: Material) -> float:
         """Ratio to critical of a contact's damping. The energy lost in a cycle is 4 pi damping of that stored."""
@@ -134,17 +136,23 @@ def _states(
 
 
 def _bodies(scene: Scene, setup: SceneSetup, prompts: ForcePrompts, options: SimulateOptions) -> list[Body]:
-    """The bodies where the scene has them; what lies below the floor is cut off."""
+    """The bodies where the scene has them; what lies below the floor is cut off, if most is above it."""
     unit, bodies = scene.metres_per_unit, []
-    divided = convex_parts(scene, options.seed, setup.box.low[2])
+    floor = setup.box.low[2]
+    divided = convex_parts(scene, options.seed, floor)
     for row, (o, parts) in enumerate(zip(scene.objects, divided, strict=True)):
         choice, (shift, inertia) = setup.materials[o.id], setup.uneven_moments(row)
+        ground, own = floor, scene.gaussians.object_id == o.id
+        if float(scene.gaussians.means[own, 2].median()) < floor:
+            (parts,) = convex_parts(replace(scene, gaussians=scene.gaussians[own], objects=(o,)), options.seed)
+            ground = float(torch.cat(parts.hulls)[:, 2].min())
+            log.info("object %d (%s) is below the floor; it stands at %.3g", o.id, o.name, ground)
         parts = replace(parts, com=parts.com + shift, inertia=parts.inertia + parts.volume * inertia)
         m, pinned = choice.material, o.id in prompts.pinned
         mass = m.density * parts.volume * unit**3
         friction = m.friction if options.friction is None else options.friction
         start = unit * (parts.com + setup.lift[row])
-        bodies.append(Body(parts, m, friction, mass, start, pinned))
+        bodies.append(Body(parts, m, friction, mass, start, pinned, unit * ground))
         guess = f"; material not known, taking {choice.name} (--material {o.id}=... changes it)" * choice.guessed
         log.info("object %d (%s): %s, %s%s%s", o.id, o.name, choice.name, scene.mass_text(mass), ", pinned" * pinned,
                  guess)  # fmt: skip
@@ -252,7 +260,7 @@ class _World:
 
     def _surface_contacts(self, setup: SceneSetup, options: SimulateOptions) -> SurfaceContacts:
         scale = self._scene.metres_per_unit / self.units.length
-        shapes = [surface_shape(solid_surface(self._scene, id, options.seed), setup.box.low[2],
+        shapes = [surface_shape(solid_surface(self._scene, id, options.seed), b.ground / self._scene.metres_per_unit,
                                 b.parts.com.double().numpy(), scale, len(b.parts.hulls) == 1)
                   for id, b in zip(self._ids, self._bodies, strict=True)]  # fmt: skip
         return SurfaceContacts(self._mujoco, self.model, self.data, shapes)
@@ -369,7 +377,7 @@ def _model(
     mujoco, bodies: list[Body], units: Units, options: SimulateOptions, box, floor: float, around: list, omega: float
 ):
     """MuJoCo's model: a body for each object, a mesh for each convex part, a plane for the floor and each wall, and the
-    fixed boxes `around`, as pairs of corners.
+    fixed boxes `around`, as pairs of corners; then a body for the ground under each object that is below the floor.
     """
     spec = mujoco.MjSpec()
     spec.option.timestep = 1 / SUBSTEPS
@@ -392,6 +400,13 @@ def _model(
         spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=(high - low) / 2, pos=(low + high) / 2, **fixed)
     for i, b in enumerate(bodies):
         _add_body(mujoco, spec, f"body{i}", b, units, omega, impedance)
+    for i, b in enumerate(bodies):
+        if b.ground / units.length < floor:
+            ground = spec.worldbody.add_body(name=f"ground{i}", pos=[0, 0, b.ground / units.length])
+            ground.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], **fixed)
+            others = [f"body{k}" for k in range(len(bodies)) if k != i]
+            for one, two in [("world", f"body{i}"), *((ground.name, other) for other in others)]:
+                spec.add_exclude(bodyname1=one, bodyname2=two)
     return spec.compile()
 
 

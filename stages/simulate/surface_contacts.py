@@ -71,9 +71,13 @@ class SurfaceContacts:
         rough = ~np.array([s.convex for s in shapes])
         self._possible = (rough[:, None] | rough) & ~np.eye(count, dtype=bool)
         self._planes = np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE)
+        of = model.geom_bodyid[self._planes]
+        pairs = np.arange(1, count + 1)[:, None]
+        apart = np.isin((np.minimum(of, pairs) << 16) + np.maximum(of, pairs), model.exclude_signature)
         lowest = [self._first[i] + _hull_corners(s.points) if rough[i] else [] for i, s in enumerate(shapes)]
         self._corners = np.concatenate(lowest).astype(np.int64)  # the samples that can touch planes
         self._corner_of = np.repeat(np.arange(count), [len(rows) for rows in lowest])
+        self._beyond = np.where(apart, -np.inf, 0.0)[self._corner_of]  # added to how far each corner is beyond a plane
         # the first part of each, whose friction and damping are those of the body
         self._geom = np.array([np.flatnonzero(model.geom_bodyid == i + 1)[0] for i in range(count)])
         self._dof = model.body_dofadr[1 : count + 1]
@@ -94,7 +98,7 @@ class SurfaceContacts:
         """Add the contacts to those found by mj_fwdPosition, and make the constraints again; `fixed` masks the bodies
         that do not move.
         """
-        fixed = fixed[1:]
+        fixed = fixed[1 : len(self._path) + 1]
         free = np.flatnonzero(~fixed & (self._dof >= 0))
         velocity = data.qvel[self._dof[free, None] + np.arange(6)]
         speed = np.linalg.norm(velocity[:, :3], axis=1) + np.linalg.norm(velocity[:, 3:], axis=1) * self._radius[free]
@@ -185,7 +189,7 @@ class SurfaceContacts:
         at, turn = data.xpos[1:], data.xmat[1:].reshape(-1, 3, 3)
         x = (turn[self._corner_of] @ self._points[self._corners, :, None])[..., 0] + at[self._corner_of]
         normal = data.geom_xmat[self._planes][:, 2::3]
-        return x, (data.geom_xpos[self._planes] * normal).sum(1) - x @ normal.T
+        return x, (data.geom_xpos[self._planes] * normal).sum(1) - x @ normal.T + self._beyond
 
     def _append(self, data, x, normal, excess, one, two) -> None:
         """Add contacts at x (k, 3) of geometries (k,), with normals from the first to the second one, and make the

@@ -305,10 +305,18 @@ class _World:
     def _step(self) -> None:
         """A substep: mj_step with other reference accelerations of contacts."""
         mujoco, model, data = self._mujoco, self.model, self.data
-        mujoco.mj_fwdPosition(model, data)
-        count = data.ncon
-        if self._surfaces is not None:
+        if self._surfaces is None:
+            mujoco.mj_fwdPosition(model, data)
+            count = data.ncon
+        else:
+            for stage in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_makeM, mujoco.mj_factorM,
+                          mujoco.mj_collision):  # fmt: skip
+                stage(model, data)
+            count = data.ncon
+            self._surfaces.thin(data, self._overlaps.distances(data))
             self._surfaces.add(data, self._resting.fixed)
+            for stage in (mujoco.mj_makeConstraint, mujoco.mj_island, mujoco.mj_projectConstraint):
+                stage(model, data)
         if count:
             self._overlaps.subtract(data, self._resting.fixed, count)
         mujoco.mj_fwdVelocity(model, data)

@@ -10,7 +10,10 @@ These contacts are inelastic: critically damped, and pushed apart at no more tha
 rebound, since a sample that meets an edge or a thin wall may be deep inside at once. The overlap of two bodies at the
 start is no contact, nor the least one since (`initial_overlaps.py`).
 
-Samples that can soon touch are kept in a list for each pair, until both bodies may have moved by its margin.
+Samples that can soon touch are kept in a list for each pair, until both bodies may have moved by its margin, or by the
+distance of the nearest sample. Samples are grouped by place, and of groups that are far away none is looked at. Of the
+contacts between parts of two bodies, of which many meet where their surfaces do, only the deepest takes part of those
+that are close together and of about one direction; the others would only share its force.
 Sources: point contacts in signed distances: Xu, Zhao and Barbic 2014, "Implicit multibody penalty-based distributed
 contact"; lists: Verlet 1967, "Computer experiments on classical fluids".
 """
@@ -18,7 +21,7 @@ contact"; lists: Verlet 1967, "Computer experiments on classical fluids".
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import ndimage
@@ -28,6 +31,7 @@ from stages.core.physics.solid_surface import SolidSurface
 from stages.simulate.initial_overlaps import WINDOW
 
 MARGIN = 0.05  # distance up to which samples are in a list [units of the simulation]
+GROUPS_ALONG = 6  # groups of samples along the longest side of a body
 FACING = 0.5  # cosine of the angle between a surface and the one it faces up to which all of a depth counts
 CORNERS = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), -1).reshape(-1, 3)  # of a cell
 
@@ -60,14 +64,24 @@ class SurfaceContacts:
     def __init__(self, mujoco, model, data, shapes: Sequence[SurfaceShape]):
         self._mujoco, self._model = mujoco, model
         count = len(shapes)
+        groups = [_groups(s.points) for s in shapes]
+        shapes = [replace(s, points=s.points[order], normals=s.normals[order])
+                  for s, (order, *_) in zip(shapes, groups, strict=True)]  # fmt: skip
         self._points, self._normals = (np.concatenate([getattr(s, n) for s in shapes]) for n in ("points", "normals"))
         self._first = np.cumsum([0, *(len(s.points) for s in shapes)])
+        self._first_group = np.cumsum([0, *(len(g[1]) for g in groups)])
+        self._begin = np.concatenate([first + g[1] for first, g in zip(self._first, groups, strict=False)])
+        self._ends = np.append(self._begin[1:], len(self._points))
+        self._middle, self._reach = (np.concatenate([g[k] for g in groups]) for k in (2, 3))
         self._radius = np.array([np.linalg.norm(s.points, axis=1).max(initial=0) for s in shapes])
         self._depth = np.concatenate([s.depth.ravel() for s in shapes])
         self._smooth = np.concatenate([ndimage.gaussian_filter(s.depth, 1.0).ravel() for s in shapes])
         self._grid = np.cumsum([0, *(s.depth.size for s in shapes)])[:-1]
         self._shape, self._low = np.array([s.depth.shape for s in shapes]), np.array([s.low for s in shapes])
         self._h = np.array([s.h for s in shapes])
+        self._high = self._low + self._h[:, None] * (self._shape - 1)
+        self._stride = np.stack([self._shape[:, 1] * self._shape[:, 2], self._shape[:, 2], np.ones(count, np.int64)], 1)
+        self._to_corners = self._stride @ CORNERS.T
         rough = ~np.array([s.convex for s in shapes])
         self._possible = (rough[:, None] | rough) & ~np.eye(count, dtype=bool)
         self._planes = np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE)
@@ -77,27 +91,30 @@ class SurfaceContacts:
         lowest = [self._first[i] + _hull_corners(s.points) if rough[i] else [] for i, s in enumerate(shapes)]
         self._corners = np.concatenate(lowest).astype(np.int64)  # the samples that can touch planes
         self._corner_of = np.repeat(np.arange(count), [len(rows) for rows in lowest])
-        self._beyond = np.where(apart, -np.inf, 0.0)[self._corner_of]  # added to how far each corner is beyond a plane
+        self._first_corner = np.cumsum([0, *(len(rows) for rows in lowest)])
+        self._apart = np.where(apart, -np.inf, 0.0)  # added to how far a body is beyond a plane
         # the first part of each, whose friction and damping are those of the body
         self._geom = np.array([np.flatnonzero(model.geom_bodyid == i + 1)[0] for i in range(count)])
+        self._body = np.where(model.geom_bodyid > count, 0, model.geom_bodyid) - 1  # -1: fixed
+        self._rough = np.append(rough, False)
+        self._edge = np.append([np.ptp(s.points, axis=0).max(initial=0) / GROUPS_ALONG for s in shapes], np.inf)
         self._dof = model.body_dofadr[1 : count + 1]
         self._path = np.zeros(count)  # the way that any point of a body has gone at most
         self._due = np.full((count, count), -np.inf)  # sum of both paths at which the list of a pair must be made again
         self._lists: dict[tuple[int, int], np.ndarray] = {}
-        self._sample = self._of = self._into = np.zeros(0, np.int64)  # all lists; sample of a body into another one
+        self._pairs, self._pair = np.zeros((0, 2), np.int64), np.zeros(0, np.int64)  # with lists; row of each sample
+        self._sample = np.zeros(0, np.int64)  # all lists
         self._allowed, self._deepest, self._substeps = np.full((count, count), np.inf), np.zeros((count, count)), 0
         fixed = np.zeros(count, bool)
         self._update_lists(data, fixed)
         self._note(self._contacts(data)[2:], fixed)
         self._allowed, self._deepest[:] = np.maximum(self._deepest, self._deepest.T), 0.0
         self._below = np.zeros((count, len(self._planes)))  # how far a body is beyond each plane at the start
-        _, depth = self._beyond_planes(data)
-        np.maximum.at(self._below, self._corner_of, depth)
+        row, plane, depth = self._beyond_planes(data, fixed)
+        np.maximum.at(self._below, (self._corner_of[row], plane), depth)
 
     def add(self, data, fixed: np.ndarray) -> None:
-        """Add the contacts to those found by mj_fwdPosition, and make the constraints again; `fixed` masks the bodies
-        that do not move.
-        """
+        """Add the contacts to those found by mj_collision; `fixed` masks the bodies that do not move."""
         fixed = fixed[1 : len(self._path) + 1]
         free = np.flatnonzero(~fixed & (self._dof >= 0))
         velocity = data.qvel[self._dof[free, None] + np.arange(6)]
@@ -110,13 +127,31 @@ class SurfaceContacts:
         k = np.flatnonzero(excess > 0)
         one, two = self._geom[b[k]], self._geom[a[k]]
         x, normal, excess = x[k] + depth[k, None] / 2 * normal[k], normal[k], excess[k]
-        at, depth = self._beyond_planes(data)
-        depth -= self._below[self._corner_of]
-        row, plane = np.nonzero((depth > 0) & ~fixed[self._corner_of, None])
+        row, plane, depth = self._beyond_planes(data, fixed)
         if len(k) + len(row):
-            one, two = np.append(self._planes[plane], one), np.append(self._geom[self._corner_of[row]], two)
+            of = self._corner_of[row]
+            one, two = np.append(self._planes[plane], one), np.append(self._geom[of], two)
             normal = np.concatenate([data.geom_xmat[self._planes[plane]][:, 2::3], normal])
-            self._append(data, np.concatenate([at[row], x]), normal, np.append(depth[row, plane], excess), one, two)
+            turn = data.xmat[1 + of].reshape(-1, 3, 3)
+            at = _turned(turn, self._points[self._corners[row]]) + data.xpos[1 + of]
+            self._append(data, np.concatenate([at, x]), normal, np.append(depth, excess), one, two)
+
+    def thin(self, data, distance: np.ndarray) -> None:
+        """Exclude those of the contacts (k,) of parts that are beside deeper ones, by their distances (k,)."""
+        body = self._body[data.contact.geom]
+        rough = np.flatnonzero(self._rough[body].any(1))
+        if not len(rough):
+            return
+        body, normal = body[rough], data.contact.frame[rough, :3]
+        small = np.where(self._edge[body[:, 0]] < self._edge[body[:, 1]], *body.T)
+        turn = data.xmat[1 + small].reshape(-1, 3, 3)
+        local = ((data.contact.pos[rough] - data.xpos[1 + small])[:, None] @ turn)[:, 0]
+        cell = np.floor(local / self._edge[small, None]).astype(np.int64)
+        axis = np.abs(normal).argmax(1)
+        key = np.column_stack([body, cell, 2 * axis + (normal[np.arange(len(rough)), axis] > 0)])
+        order = np.lexsort((-distance[rough], *key.T))
+        beside = (key[order[1:]] == key[order[:-1]]).all(1)
+        data.contact.exclude[rough[order[:-1][beside]]] = 1
 
     def _note(self, contacts: tuple, fixed: np.ndarray) -> None:
         """Take the deepest samples of each pair; those of some substeps bound the overlap allowed from then on."""
@@ -131,70 +166,114 @@ class SurfaceContacts:
     def _update_lists(self, data, fixed: np.ndarray) -> None:
         path = self._path[:, None] + self._path
         due = np.argwhere(self._possible & ~(fixed[:, None] & fixed) & (path >= self._due))
+        if not len(due):
+            return
+        a, b = due.T
+        apart = np.linalg.norm(data.xpos[a + 1] - data.xpos[b + 1], axis=1) - self._radius[a] - self._radius[b]
+        gap = np.maximum(apart, MARGIN)
+        close = np.flatnonzero(apart < MARGIN)
+        near, gap[close] = self._near(data, due[close])
+        self._due[a, b] = path[a, b] + gap
+        found = dict(zip(map(tuple, due[close].tolist()), near, strict=True))
         changed = False
-        for a, b in due.tolist():
-            gap = np.linalg.norm(data.xpos[a + 1] - data.xpos[b + 1]) - self._radius[a] - self._radius[b]
-            self._due[a, b] = path[a, b] + max(MARGIN, gap)
-            near = self._near(data, a, b) if gap < MARGIN else ()
-            changed |= bool(len(near)) or (a, b) in self._lists
-            self._lists.pop((a, b), None)
-            if len(near):
-                self._lists[a, b] = near
+        for pair in map(tuple, due.tolist()):
+            rows = found.get(pair, ())
+            changed |= self._lists.pop(pair, None) is not None or bool(len(rows))
+            if len(rows):
+                self._lists[pair] = rows
         if changed:
-            count = [len(rows) for rows in self._lists.values()]
-            pair = np.array(list(self._lists), np.int64).reshape(-1, 2)
-            self._of, self._into = np.repeat(pair, count, axis=0).T
+            self._pairs = np.array(list(self._lists), np.int64).reshape(-1, 2)
+            self._pair = np.repeat(np.arange(len(self._pairs)), [len(rows) for rows in self._lists.values()])
             self._sample = np.concatenate([np.zeros(0, np.int64), *self._lists.values()])
 
-    def _near(self, data, a: int, b: int) -> np.ndarray:
-        """The samples of body a that are less than MARGIN outside body b."""
-        R, S = (data.xmat[i + 1].reshape(3, 3) for i in (a, b))
-        mine = slice(*self._first[a : a + 2])
-        x = self._points[mine] @ (S.T @ R).T + (data.xpos[a + 1] - data.xpos[b + 1]) @ S
-        low, high = self._low[b], self._low[b] + self._h[b] * (self._shape[b] - 1)
-        rows = np.flatnonzero(((x > low - MARGIN) & (x < high + MARGIN)).all(1))
-        inside = x[rows].clip(low, high)
-        beyond = np.linalg.norm(x[rows] - inside, axis=1)
-        node, f = self._cells(np.full(len(rows), b), inside)
-        return self._first[a] + rows[beyond - _trilinear(self._depth[node], f) < MARGIN]
+    def _relative(self, data, pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Rotations (k, 3, 3) and translations (k, 3) from the frames of the first bodies of pairs to the second's."""
+        turn, at = data.xmat[1:].reshape(-1, 3, 3), data.xpos[1:]
+        a, b = pairs.T
+        back = turn[b].transpose(0, 2, 1)
+        return back @ turn[a], _turned(back, at[a] - at[b])
+
+    def _near(self, data, pairs: np.ndarray) -> tuple[list[np.ndarray], np.ndarray]:
+        """For each of some pairs (k, 2) the samples of the first body that are less than MARGIN outside the second one,
+        and a way (k,) that both can move until others are inside.
+        """
+        R, t = self._relative(data, pairs)
+        a, b = pairs.T
+        group, of = _ranges(self._first_group[a], self._first_group[a + 1])
+        distance = self._distances(b[of], _turned(R[of], self._middle[group]) + t[of]) - self._reach[group]
+        close, gap = distance < MARGIN, np.full(len(pairs), np.inf)
+        np.minimum.at(gap, of[~close], distance[~close])
+        group, of = group[close], of[close]
+        sample, row = _ranges(self._begin[group], self._ends[group])
+        of = of[row]
+        distance = self._distances(b[of], _turned(R[of], self._points[sample]) + t[of])
+        np.minimum.at(gap, of, distance)
+        k = np.flatnonzero(distance < MARGIN)
+        lists = np.split(sample[k], np.searchsorted(of[k], np.arange(1, len(pairs)))) if len(pairs) else []
+        return lists, np.maximum(gap, MARGIN)
+
+    def _distances(self, b: np.ndarray, x: np.ndarray) -> np.ndarray:
+        """Distances (k,) of points (k, 3) in the frames of bodies b (k,) from these, at least; negative inside."""
+        inside = np.minimum(np.maximum(x, self._low[b]), self._high[b])
+        node, f = self._cells(b, inside)
+        distance = -_trilinear(self._depth[node], f)
+        beyond = ((x - inside) ** 2).sum(1)
+        # the body is in the box of its grid, so the angle at the nearest point of the box is at least a right one
+        return np.where(beyond > 0, np.sqrt(beyond + np.maximum(distance, 0) ** 2), distance)
 
     def _cells(self, b: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Rows (k, 8) of the nodes around points (k, 3) in the frames of bodies b (k,), and the places (k, 3) between
         them, beyond 0..1 for points outside of the grid.
         """
         u = (x - self._low[b]) / self._h[b, None]
-        shape = self._shape[b]
-        cell = u.astype(np.int64).clip(0, shape - 2)
-        stride = np.stack([shape[:, 1] * shape[:, 2], shape[:, 2], np.ones_like(b)], 1)
-        return ((self._grid[b] + (cell * stride).sum(1))[:, None] + stride @ CORNERS.T), u - cell
+        cell = np.minimum(np.maximum(u.astype(np.int64), 0), self._shape[b] - 2)
+        return self._node(b, cell)[:, None] + self._to_corners[b], u - cell
+
+    def _node(self, b: np.ndarray, cell: np.ndarray) -> np.ndarray:
+        """Rows (k,) of nodes, given by their numbers (k, 3) along the axes of the grids of bodies b (k,)."""
+        x, y, z = cell.T
+        stride = self._stride[b]
+        return self._grid[b] + x * stride[:, 0] + y * stride[:, 1] + z
 
     def _contacts(self, data) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Of the listed samples inside another body: positions (k, 3), outward normals (k, 3) of that body, depths (k,)
         in it, less where the surfaces do not face each other, and the rows (k,) of both bodies.
         """
-        a, b, sample = self._of, self._into, self._sample
+        R, t = self._relative(data, self._pairs)
+        a, b = self._pairs[self._pair].T
+        local = _turned(R[self._pair], self._points[self._sample]) + t[self._pair]
+        # the nearest node is at most half the diagonal of a cell away
+        nearest = ((local - self._low[b]) / self._h[b, None] + 0.5).astype(np.int64)
+        nearest = np.minimum(np.maximum(nearest, 0), self._shape[b] - 1)
+        k = np.flatnonzero(self._depth[self._node(b, nearest)] > -0.87 * self._h[b])
+        node, f = self._cells(b[k], local[k])
+        x, y, z = (np.abs(f - 0.5) <= 0.5).T
+        depth = np.where(x & y & z, _trilinear(self._depth[node], f), 0.0)
+        inside = np.flatnonzero(depth > 0)
+        k, node, f, depth = k[inside], node[inside], f[inside], depth[inside]
+        a, b, sample = a[k], b[k], self._sample[k]
         at, turn = data.xpos[1:], data.xmat[1:].reshape(-1, 3, 3)
-        x = (turn[a] @ self._points[sample, :, None])[..., 0] + at[a]
-        node, f = self._cells(b, ((x - at[b])[:, None] @ turn[b])[:, 0])
-        depth = np.where(((f >= 0) & (f <= 1)).all(1), _trilinear(self._depth[node], f), 0.0)
-        k = np.flatnonzero(depth > 0)
-        a, b, x, depth = a[k], b[k], x[k], depth[k]
-        normal = -(turn[b] @ _slope(self._smooth[node[k]], f[k])[..., None])[..., 0]
+        normal = -_turned(turn[b], _slope(self._smooth[node], f))
         normal /= np.linalg.norm(normal, axis=1, keepdims=True).clip(1e-12)
-        own = (turn[a] @ self._normals[sample[k], :, None])[..., 0]
+        own = _turned(turn[a], self._normals[sample])
+        x = _turned(turn[b], local[k]) + at[b]
         return x, normal, depth * (-(own * normal).sum(1) / FACING).clip(0, 1), a, b
 
-    def _beyond_planes(self, data) -> tuple[np.ndarray, np.ndarray]:
-        """Positions (k, 3) of the corners and how far (k, planes) they are beyond each plane."""
-        at, turn = data.xpos[1:], data.xmat[1:].reshape(-1, 3, 3)
-        x = (turn[self._corner_of] @ self._points[self._corners, :, None])[..., 0] + at[self._corner_of]
+    def _beyond_planes(self, data, fixed: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Corners (k,), planes (k,), by their rows, and how far (k,) those are beyond these, more than at the start."""
         normal = data.geom_xmat[self._planes][:, 2::3]
-        return x, (data.geom_xpos[self._planes] * normal).sum(1) - x @ normal.T + self._beyond
+        count = len(self._radius)
+        at, turn = data.xpos[1 : count + 1], data.xmat[1 : count + 1].reshape(-1, 3, 3)
+        middle = (data.geom_xpos[self._planes] * normal).sum(1) - at @ normal.T + self._apart - self._below
+        low = np.flatnonzero((middle + self._radius[:, None] > 0).any(1) & ~fixed)
+        row, _ = _ranges(self._first_corner[low], self._first_corner[low + 1])
+        of = self._corner_of[row]
+        depth = middle[of] - np.einsum("ki,kpi->kp", self._points[self._corners[row]], (normal @ turn)[of])
+        k, plane = np.nonzero(depth > 0)
+        return row[k], plane, depth[k, plane]
 
     def _append(self, data, x, normal, excess, one, two) -> None:
-        """Add contacts at x (k, 3) of geometries (k,), with normals from the first to the second one, and make the
-        constraints again.
-        """
+        """Add contacts at x (k, 3) of geometries (k,), with normals from the first to the second one."""
         mujoco, model = self._mujoco, self._model
         contact, before = mujoco.MjContact(), data.ncon
         contact.dim = 3
@@ -213,9 +292,32 @@ class SurfaceContacts:
         added.friction[new] = np.maximum(model.geom_friction[one], model.geom_friction[two])[:, [0, 0, 1, 2, 2]]
         added.solref[new] = np.minimum(model.geom_solref[one], model.geom_solref[two])
         added.solimp[new] = model.geom_solimp[one]
-        mujoco.mj_makeConstraint(model, data)
-        mujoco.mj_island(model, data)
-        mujoco.mj_projectConstraint(model, data)
+
+
+def _groups(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """An order of points (s, 3) by place; and of each of its groups the first row, the middle and the largest distance
+    from it.
+    """
+    edge = max(float(np.ptp(points, axis=0).max(initial=0)) / GROUPS_ALONG, 1e-12) if len(points) else 1.0
+    _, of = np.unique(np.floor(points / edge), axis=0, return_inverse=True)
+    order = np.argsort(of.ravel(), kind="stable")
+    first = np.flatnonzero(np.diff(of.ravel()[order], prepend=-1))
+    parts = np.split(points[order], first[1:]) if len(points) else []
+    middle = np.array([(g.min(0) + g.max(0)) / 2 for g in parts]).reshape(-1, 3)
+    reach = np.array([np.linalg.norm(g - m, axis=1).max() for g, m in zip(parts, middle, strict=True)])
+    return order, first, middle, reach
+
+
+def _ranges(begin: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The numbers (n,) of ranges, one after the other, and the row (n,) of the range of each."""
+    length = end - begin
+    row = np.repeat(np.arange(len(length)), length)
+    return np.arange(len(row)) + (begin - np.cumsum(length) + length)[row], row
+
+
+def _turned(R: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Points (k, 3), each turned by its matrix (k, 3, 3)."""
+    return np.einsum("kij,kj->ki", R, x)
 
 
 def _hull_corners(points: np.ndarray) -> np.ndarray:
@@ -228,15 +330,20 @@ def _hull_corners(points: np.ndarray) -> np.ndarray:
 
 def _trilinear(value: np.ndarray, f: np.ndarray) -> np.ndarray:
     """Values (k,) between the corners (k, 8) of cells."""
-    v = value[:, :4] + (value[:, 4:] - value[:, :4]) * f[:, :1]
-    v = v[:, :2] + (v[:, 2:] - v[:, :2]) * f[:, 1:2]
-    return v[:, 0] + (v[:, 1] - v[:, 0]) * f[:, 2]
+    x, y, z = f.T
+    v = np.ascontiguousarray(value.T)
+    v = v[:4] + (v[4:] - v[:4]) * x
+    v = v[:2] + (v[2:] - v[:2]) * y
+    return v[0] + (v[1] - v[0]) * z
 
 
 def _slope(value: np.ndarray, f: np.ndarray) -> np.ndarray:
     """Gradients (k, 3) of `_trilinear` [per edge of a cell]."""
-    v = value.reshape(-1, 2, 2, 2)
-    w = np.stack([1 - f, f], -1)  # (k, axis, side)
-    d = (np.diff(v, axis=axis).reshape(-1, 2, 2) for axis in (1, 2, 3))
-    return np.stack([((each @ w[:, k, :, None])[..., 0] * w[:, j]).sum(1)
-                     for each, (j, k) in zip(d, ((1, 2), (0, 2), (0, 1)), strict=True)], 1)  # fmt: skip
+    x, y, z = f.T
+    v = np.ascontiguousarray(value.T)
+    dx = v[4:] - v[:4]
+    v = v[:4] + dx * x
+    dx = dx[:2] + (dx[2:] - dx[:2]) * y
+    dy = v[2:] - v[:2]
+    v = v[:2] + dy * y
+    return np.stack([dx[0] + (dx[1] - dx[0]) * z, dy[0] + (dy[1] - dy[0]) * z, v[1] - v[0]], 1)

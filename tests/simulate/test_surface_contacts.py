@@ -52,6 +52,7 @@ class Pair:
             self.data.qpos[[2, 9]] = height
             mujoco.mj_fwdPosition(self.model, self.data)
             self.contacts.add(self.data, np.array([True, fixed, fixed]))
+            mujoco.mj_makeConstraint(self.model, self.data)
         return self.data.contact
 
 
@@ -68,6 +69,22 @@ def test_depth_and_direction_of_contacts_between_balls():
     np.testing.assert_allclose(contact.friction[:, 0], 0.3)
     np.testing.assert_allclose(contact.solref[:, 1], -11.0)
     assert (contact.efc_address >= 0).all()
+
+
+def test_of_contacts_side_by_side_only_the_deepest_takes_part():
+    """In cells of a sixth of the small ball's size; those with the floor have another direction."""
+    pair = Pair(0.5)
+    contact = pair.found(0.28, height=-0.03)
+    pair.contacts.thin(pair.data, contact.dist.copy())
+    kept, floor = contact.exclude == 0, contact.geom[:, 0] == 0
+    for mine in (floor, ~floor):
+        rows = np.flatnonzero(mine)
+        assert 1 <= kept[rows].sum() < len(rows) / 2 and kept[rows[contact.dist[rows].argmin()]]
+    assert set(contact.exclude) == {0, 1}
+    convex = Pair(0.5, convex=True)
+    convex.found(0.28)
+    convex.contacts.thin(convex.data, convex.data.contact.dist)
+    assert not convex.data.contact.exclude.any()
 
 
 def test_separate_fixed_and_convex_bodies_have_none():

@@ -11,9 +11,10 @@ rebound, since a sample that meets an edge or a thin wall may be deep inside at 
 start is no contact, nor the least one since (`initial_overlaps.py`).
 
 Samples that can soon touch are kept in a list for each pair, until both bodies may have moved by its margin, or by the
-distance of the nearest sample. Samples are grouped by place, and of groups that are far away none is looked at. Of the
-contacts between parts of two bodies, of which many meet where their surfaces do, only the deepest takes part of those
-that are close together and of about one direction; the others would only share its force.
+distance of the nearest sample, and are looked at once they may be inside. Samples are grouped by place, and of groups
+that are far away none is looked at. Of the contacts between parts of two bodies, of which many meet where their
+surfaces do, only the deepest takes part of those that are close together and of about one direction; the others would
+only share its force.
 Sources: point contacts in signed distances: Xu, Zhao and Barbic 2014, "Implicit multibody penalty-based distributed
 contact"; lists: Verlet 1967, "Computer experiments on classical fluids".
 """
@@ -33,6 +34,8 @@ from stages.simulate.initial_overlaps import WINDOW
 MARGIN = 0.05  # distance up to which samples are in a list [units of the simulation]
 GROUPS_ALONG = 6  # groups of samples along the longest side of a body
 FACING = 0.5  # cosine of the angle between a surface and the one it faces up to which all of a depth counts
+STEEPEST = 2  # largest slope of depths on a grid: fine ones meet coarse ones, which differ by up to a voxel
+NONE = np.zeros(0, np.int64), np.zeros(0)
 CORNERS = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), -1).reshape(-1, 3)  # of a cell
 
 
@@ -101,9 +104,10 @@ class SurfaceContacts:
         self._dof = model.body_dofadr[1 : count + 1]
         self._path = np.zeros(count)  # the way that any point of a body has gone at most
         self._due = np.full((count, count), -np.inf)  # sum of both paths at which the list of a pair must be made again
-        self._lists: dict[tuple[int, int], np.ndarray] = {}
+        self._way = np.zeros((count, count))  # sum of both paths
+        self._lists: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]] = {}
         self._pairs, self._pair = np.zeros((0, 2), np.int64), np.zeros(0, np.int64)  # with lists; row of each sample
-        self._sample = np.zeros(0, np.int64)  # all lists
+        self._sample, self._from = NONE  # all lists; way from which on a sample may be inside
         self._allowed, self._deepest, self._substeps = np.full((count, count), np.inf), np.zeros((count, count)), 0
         fixed = np.zeros(count, bool)
         self._update_lists(data, fixed)
@@ -164,7 +168,7 @@ class SurfaceContacts:
             self._deepest[:] = 0.0
 
     def _update_lists(self, data, fixed: np.ndarray) -> None:
-        path = self._path[:, None] + self._path
+        self._way = path = self._path[:, None] + self._path
         due = np.argwhere(self._possible & ~(fixed[:, None] & fixed) & (path >= self._due))
         if not len(due):
             return
@@ -172,19 +176,19 @@ class SurfaceContacts:
         apart = np.linalg.norm(data.xpos[a + 1] - data.xpos[b + 1], axis=1) - self._radius[a] - self._radius[b]
         gap = np.maximum(apart, MARGIN)
         close = np.flatnonzero(apart < MARGIN)
-        near, gap[close] = self._near(data, due[close])
+        near, gap[close] = self._near(data, due[close], path[a, b][close])
         self._due[a, b] = path[a, b] + gap
         found = dict(zip(map(tuple, due[close].tolist()), near, strict=True))
         changed = False
         for pair in map(tuple, due.tolist()):
-            rows = found.get(pair, ())
+            rows, _ = new = found.get(pair, NONE)
             changed |= self._lists.pop(pair, None) is not None or bool(len(rows))
             if len(rows):
-                self._lists[pair] = rows
+                self._lists[pair] = new
         if changed:
             self._pairs = np.array(list(self._lists), np.int64).reshape(-1, 2)
-            self._pair = np.repeat(np.arange(len(self._pairs)), [len(rows) for rows in self._lists.values()])
-            self._sample = np.concatenate([np.zeros(0, np.int64), *self._lists.values()])
+            self._pair = np.repeat(np.arange(len(self._pairs)), [len(rows) for rows, _ in self._lists.values()])
+            self._sample, self._from = (np.concatenate(each) for each in zip(NONE, *self._lists.values(), strict=True))
 
     def _relative(self, data, pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Rotations (k, 3, 3) and translations (k, 3) from the frames of the first bodies of pairs to the second's."""
@@ -193,9 +197,10 @@ class SurfaceContacts:
         back = turn[b].transpose(0, 2, 1)
         return back @ turn[a], _turned(back, at[a] - at[b])
 
-    def _near(self, data, pairs: np.ndarray) -> tuple[list[np.ndarray], np.ndarray]:
-        """For each of some pairs (k, 2) the samples of the first body that are less than MARGIN outside the second one,
-        and a way (k,) that both can move until others are inside.
+    def _near(self, data, pairs: np.ndarray, way: np.ndarray) -> tuple[list[tuple[np.ndarray, np.ndarray]], np.ndarray]:
+        """For each of some pairs (k, 2) that have gone a way (k,) the samples of the first body that are less than
+        MARGIN outside the second one, each with the way from which on it may be inside; and a way (k,) that both can
+        move until others are.
         """
         R, t = self._relative(data, pairs)
         a, b = pairs.T
@@ -209,8 +214,9 @@ class SurfaceContacts:
         distance = self._distances(b[of], _turned(R[of], self._points[sample]) + t[of])
         np.minimum.at(gap, of, distance)
         k = np.flatnonzero(distance < MARGIN)
-        lists = np.split(sample[k], np.searchsorted(of[k], np.arange(1, len(pairs)))) if len(pairs) else []
-        return lists, np.maximum(gap, MARGIN)
+        begin = np.searchsorted(of[k], np.arange(1, len(pairs)))
+        lists = (np.split(each, begin) for each in (sample[k], way[of[k]] + distance[k] / STEEPEST))
+        return list(zip(*lists, strict=True))[: len(pairs)], np.maximum(gap, MARGIN)
 
     def _distances(self, b: np.ndarray, x: np.ndarray) -> np.ndarray:
         """Distances (k,) of points (k, 3) in the frames of bodies b (k,) from these, at least; negative inside."""
@@ -227,36 +233,30 @@ class SurfaceContacts:
         """
         u = (x - self._low[b]) / self._h[b, None]
         cell = np.minimum(np.maximum(u.astype(np.int64), 0), self._shape[b] - 2)
-        return self._node(b, cell)[:, None] + self._to_corners[b], u - cell
-
-    def _node(self, b: np.ndarray, cell: np.ndarray) -> np.ndarray:
-        """Rows (k,) of nodes, given by their numbers (k, 3) along the axes of the grids of bodies b (k,)."""
-        x, y, z = cell.T
-        stride = self._stride[b]
-        return self._grid[b] + x * stride[:, 0] + y * stride[:, 1] + z
+        node = self._grid[b] + np.einsum("ki,ki->k", cell, self._stride[b])
+        return node[:, None] + self._to_corners[b], u - cell
 
     def _contacts(self, data) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Of the listed samples inside another body: positions (k, 3), outward normals (k, 3) of that body, depths (k,)
         in it, less where the surfaces do not face each other, and the rows (k,) of both bodies.
         """
         R, t = self._relative(data, self._pairs)
-        a, b = self._pairs[self._pair].T
-        local = _turned(R[self._pair], self._points[self._sample]) + t[self._pair]
-        # the nearest node is at most half the diagonal of a cell away
-        nearest = ((local - self._low[b]) / self._h[b, None] + 0.5).astype(np.int64)
-        nearest = np.minimum(np.maximum(nearest, 0), self._shape[b] - 1)
-        k = np.flatnonzero(self._depth[self._node(b, nearest)] > -0.87 * self._h[b])
-        node, f = self._cells(b[k], local[k])
+        pair, sample = self._pair, self._sample
+        k = np.flatnonzero(self._way[tuple(self._pairs.T)][pair] >= self._from)
+        pair, sample = pair[k], sample[k]
+        a, b = self._pairs[pair].T
+        local = _turned(R[pair], self._points[sample]) + t[pair]
+        node, f = self._cells(b, local)
         x, y, z = (np.abs(f - 0.5) <= 0.5).T
         depth = np.where(x & y & z, _trilinear(self._depth[node], f), 0.0)
         inside = np.flatnonzero(depth > 0)
-        k, node, f, depth = k[inside], node[inside], f[inside], depth[inside]
-        a, b, sample = a[k], b[k], self._sample[k]
+        node, f, depth, local = node[inside], f[inside], depth[inside], local[inside]
+        a, b, sample = a[inside], b[inside], sample[inside]
         at, turn = data.xpos[1:], data.xmat[1:].reshape(-1, 3, 3)
         normal = -_turned(turn[b], _slope(self._smooth[node], f))
         normal /= np.linalg.norm(normal, axis=1, keepdims=True).clip(1e-12)
         own = _turned(turn[a], self._normals[sample])
-        x = _turned(turn[b], local[k]) + at[b]
+        x = _turned(turn[b], local) + at[b]
         return x, normal, depth * (-(own * normal).sum(1) / FACING).clip(0, 1), a, b
 
     def _beyond_planes(self, data, fixed: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -1,5 +1,6 @@
 """Material tables and the choice of a material for an object."""
 
+import itertools
 import json
 import math
 from pathlib import Path
@@ -30,8 +31,11 @@ def test_every_material_is_plausible_and_has_a_source():
 
 
 def test_the_table_of_the_documentation_is_that_of_the_code():
-    rows = [line.strip("| ").split(" | ") for line in README.read_text().splitlines() if line.count("|") == 7]
-    values = {row[0]: [float(v) for v in row[1:]] for row in rows[2:]}
+    lines = README.read_text().splitlines()
+    first = next(n for n, line in enumerate(lines) if line.startswith("| name | E "))
+    table = itertools.takewhile(lambda line: line.startswith("|"), lines[first + 2 :])
+    rows = [line.strip("| ").split(" | ") for line in table]
+    values = {row[0]: [float(v) for v in row[1:]] for row in rows}
     assert values == {n: [m.E, m.density, m.nu, m.friction, m.loss] for n, m in MATERIALS.items()}
 
 

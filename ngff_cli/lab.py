@@ -1,5 +1,6 @@
 """`ngff-lab`: its commands, of which training.py, data.py and bench.py define most."""
 
+import math
 from pathlib import Path
 from typing import Annotated
 
@@ -60,12 +61,13 @@ def fuzz(
     out: Annotated[Path, Option("-o", "--out", help="report to write (.json)")] = Path("fuzz.json"),
     count: Annotated[int, Option(help="number of damaged files")] = 10_000,
     seed: Annotated[int, Option(help="random seed of the damage")] = 0,
+    minutes: Annotated[float, Option(help="stop after this time, and report on the files so far [min]")] = math.inf,
     as_json: AsJson = False,
 ) -> None:
     """Fuzz the readers: read randomly damaged files of every format, and keep those that raise unexpected errors."""
     from stages.lab.fuzz.campaign import run
 
-    print_results(lambda path: run(path, count, seed), out, as_json)
+    print_results(lambda path: run(path, count, seed, minutes), out, as_json)
 
 
 @app.command("estimate-materials")

@@ -81,6 +81,13 @@ def test_campaign_survives_crashes_and_hangs(tmp_path, monkeypatch):
     assert all(list(Path(failure["files"]).iterdir()) for failure in report["failures"])
 
 
+@pytest.mark.slow
+def test_a_campaign_ends_in_time_with_a_report(tmp_path):
+    list(campaign.run(tmp_path / "r.json", 10**6, minutes=1e-6))
+    report = json.loads((tmp_path / "r.json").read_text())
+    assert report["count"] == sum(report["total"].values()) == 1
+
+
 @pytest.mark.parametrize("dtype", ["f2", "f8", ">f4", ">f8"])
 def test_other_float_types_are_converted(tmp_path, dtype):
     write_trajectory(tmp_path / "t.h5")

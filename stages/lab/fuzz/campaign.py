@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import multiprocessing
 import os
 import resource
@@ -12,6 +13,7 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import closing
 from multiprocessing.connection import Connection
 from pathlib import Path
 
@@ -27,27 +29,33 @@ MAX_MEMORY = 2 << 30  # more than before the case [bytes]
 START = 120.0  # allowed to a process for imports and for writing the examples [s]
 
 
-def run(out: Path, count: int, seed: int = 0) -> Iterator[str]:
+def run(out: Path, count: int, seed: int = 0, minutes: float = math.inf) -> Iterator[str]:
     """Run cases 0 to `count` - 1 of a seed and write OUT (.json); the files of failures go to OUT's folder NAME.cases.
 
-    Yields the lines of a table. Raises InputError for a count below 1.
+    After `minutes` no more cases begin; `count` of the report is the number of those that ran. Yields the lines of a
+    table. Raises InputError for a count below 1 and for no time.
     """
     if count < 1:
         raise InputError(f"--count must be 1 or more, got {count}")
+    if not minutes > 0:
+        raise InputError(f"--minutes must be above 0, got {minutes:g}")
     kept, begun = out.with_suffix(".cases"), time.monotonic()
     counts: dict[str, Counter] = {kind.name: Counter() for kind in KINDS}
     failures = []
     with replacing(out) as part, tempfile.TemporaryDirectory(prefix="ngff-fuzz-") as folder:
-        cases = tqdm(_results(Path(folder), count, seed), total=count, unit="case")
-        for number, kind, result, why, files in cases:
-            counts[kind][result] += 1
-            if result not in GOOD:
-                place = kept / f"{kind}-{seed}-{number}"
-                shutil.copytree(files, place, dirs_exist_ok=True)
-                failures.append({"kind": kind, "case": number, "result": result, "why": why, "files": str(place)})
-                cases.set_postfix(failures=len(failures))
+        with closing(_results(Path(folder), count, seed)) as results, tqdm(results, total=count, unit="case") as cases:
+            for number, kind, result, why, files in cases:
+                counts[kind][result] += 1
+                if result not in GOOD:
+                    place = kept / f"{kind}-{seed}-{number}"
+                    shutil.copytree(files, place, dirs_exist_ok=True)
+                    failures.append({"kind": kind, "case": number, "result": result, "why": why, "files": str(place)})
+                    cases.set_postfix(failures=len(failures))
+                if time.monotonic() - begun > 60 * minutes:
+                    break
         total = sum(counts.values(), Counter())
-        report = {"ngff": ngff_version(), "seed": seed, "count": count, "seconds": round(time.monotonic() - begun, 1),
+        seconds = round(time.monotonic() - begun, 1)
+        report = {"ngff": ngff_version(), "seed": seed, "count": total.total(), "seconds": seconds,
                   "total": {r: total[r] for r in RESULTS}, "counts": counts, "failures": failures}  # fmt: skip
         part.write_text(json.dumps(report, indent=1) + "\n")
     for name, of_kind in [*counts.items(), ("total", total)]:
@@ -85,9 +93,10 @@ def _results(folder: Path, count: int, seed: int) -> Iterator[tuple[int, str, st
             yield number, files.name, "signal", f"exit status {process.exitcode}", files
             number += 1
         finally:
+            ours.close()  # at which it ends, unless it hangs
+            process.join(1)
             process.kill()
             process.join()
-            ours.close()
         failed += 1
         shutil.rmtree(place, ignore_errors=True)
 
@@ -106,4 +115,7 @@ def _work(parent: Connection, folder: Path, seed: int, start: int, stop: int) ->
             _, result, why = examples.run(seed, number)
             grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) << 10
             parent.send(("more than 2 GB", f"{grown >> 20} MB") if grown > MAX_MEMORY else (result, why))
-            parent.recv()
+            try:
+                parent.recv()
+            except (EOFError, ConnectionError):
+                return

@@ -19,7 +19,9 @@ import numpy as np
 from stages.core.scene.h5_chunks import filters_of
 
 ATTRIBUTE, CONTINUATION = 0x0C, 0x10  # types of messages of an object header
-VARIABLE_LENGTH = 9  # class of datatypes
+# Classes of datatypes: numbers, texts of fixed length, and enumerations such as booleans; texts of variable length are
+# VARIABLE_LENGTH with the bits TEXT. On damaged attributes of the other classes HDF5 may crash; ngff writes none.
+NUMBER, FLOAT, FIXED_TEXT, ENUMERATION, VARIABLE_LENGTH, TEXT = 0, 1, 3, 8, 9, 1
 HEAP = b"GCOL\x01\0\0\0"
 MAX_BLOCKS = 1000  # of an object header
 
@@ -32,15 +34,23 @@ def check_texts(data: h5py.Dataset) -> None:
 
 
 def check_attributes(item: h5py.Group | h5py.Dataset) -> None:
-    """The same for the attributes of a file, group or dataset (object header messages)."""
+    """The same for the attributes of a file, group or dataset (object header messages).
+
+    ValueError as well for attributes that are neither numbers nor texts.
+    """
     with _FileBytes(item.file) as file:
         for attribute in _attributes(file, h5py.h5o.get_info(item.id).addr):
             name, kind, space = (int.from_bytes(attribute[i : i + 2], "little") for i in (2, 4, 6))
             start, to = (8, 8) if attribute[0] == 1 else (9 if attribute[0] == 3 else 8, 1)
             after_name = start + -(-name // to) * to
             values = after_name + -(-kind // to) * to + -(-space // to) * to
-            if attribute[after_name : after_name + 1] and attribute[after_name] & 15 == VARIABLE_LENGTH:
+            if after_name + 1 >= len(attribute) or attribute[1] & 3:  # its type or shape is elsewhere
+                raise ValueError("an attribute of it is damaged")
+            datatype, bits = attribute[after_name] & 15, attribute[after_name + 1] & 15
+            if datatype == VARIABLE_LENGTH and bits == TEXT:
                 file.check(attribute[values : values + (len(attribute) - values) // 16 * 16])
+            elif datatype not in (NUMBER, FLOAT, FIXED_TEXT, ENUMERATION):
+                raise ValueError("an attribute of it is neither a number nor a text")
 
 
 class _FileBytes:

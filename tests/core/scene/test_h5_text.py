@@ -84,6 +84,25 @@ def test_a_text_longer_than_its_heap_has_is_refused(tmp_path, libver, length):
                 check_texts(names)
 
 
+@pytest.mark.parametrize("libver", ["earliest", "latest", "tracked"])
+def test_attributes_that_are_neither_numbers_nor_texts_are_refused(tmp_path, libver):
+    path = tmp_path / "a.h5"
+    for value in (1, 2.5, "duck", b"duck", True, [1.0, 2.0], ["a", "b"]):
+        write(path, libver)
+        with h5py.File(path, "a") as file:
+            file["names"].attrs["more"] = value
+        reread(path)
+    sequence, compound = np.empty(1, h5py.vlen_dtype(np.int64)), np.zeros(1, [("x", "f4"), ("y", "i4")])
+    sequence[0] = np.arange(3)
+    for value, committed in ((sequence, False), (compound, False), (np.zeros(1, "f4"), True)):
+        write(path, libver)
+        with h5py.File(path, "a") as file:
+            file["type"] = value.dtype
+            file["names"].attrs.create("more", value, dtype=file["type"] if committed else value.dtype)
+        with pytest.raises(ValueError, match="damaged" if committed else "neither a number nor a text"):
+            reread(path)
+
+
 def all_of(data, part):
     return [at for at in range(len(data)) if data.startswith(part, at)]
 

@@ -69,12 +69,15 @@ def run_command_line(app: typer.Typer, words: list[str] | None = None) -> None:
 
 
 def interrupt(number: int, frame) -> None:
-    """Signal handler: raises KeyboardInterrupt, within the import system 10 ms later.
+    """Signal handler: raises KeyboardInterrupt, during an import 10 ms later.
 
-    There the exception could be lost with a lock held, which blocks all threads that import (CPython's
-    _get_module_lock).
+    In the import system the exception could be lost with a lock held, which blocks all threads that import (CPython's
+    _get_module_lock), and a library that is interrupted while it is imported may report that it is not installed.
     """
-    if frame is None or not frame.f_code.co_filename.startswith("<frozen importlib"):
+    imports = frame
+    while imports is not None and not imports.f_code.co_filename.startswith("<frozen importlib"):
+        imports = imports.f_back
+    if imports is None:
         raise KeyboardInterrupt
     if hasattr(signal, "setitimer"):
         signal.signal(signal.SIGALRM, interrupt)
@@ -130,6 +133,8 @@ class CommandGroup(typer.core.TyperGroup):
         try:
             return super().invoke(ctx)
         except InputError as error:
+            if isinstance(error.__cause__, Exception) and _is_out_of_memory(error.__cause__):
+                fail(_less_memory("the machine", self.commands[ctx.invoked_subcommand], []), 1)  # not the file's fault
             fail(str(error), 2)
         except KeyboardInterrupt:
             fail(INTERRUPTED, 130)

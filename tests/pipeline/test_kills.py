@@ -201,12 +201,14 @@ def test_nothing_is_left_in_parts(inputs, tmp_path):
 def test_an_interrupt_waits_until_an_import_has_ended():
     """Raised in a callback of the import system it would be ignored, and the lock of imports would stay taken."""
     before = signal.getsignal(signal.SIGALRM)
-    importing = SimpleNamespace(f_code=SimpleNamespace(co_filename="<frozen importlib._bootstrap>"))
+    importing = SimpleNamespace(f_code=SimpleNamespace(co_filename="<frozen importlib._bootstrap>"), f_back=None)
+    imported = SimpleNamespace(f_code=SimpleNamespace(co_filename="library.py"), f_back=importing)
     try:
         with pytest.raises(KeyboardInterrupt):
             interrupt(signal.SIGINT, sys._getframe())
-        interrupt(signal.SIGINT, importing)
-        with pytest.raises(KeyboardInterrupt):
-            time.sleep(10)
+        for frame in (importing, imported):
+            interrupt(signal.SIGINT, frame)
+            with pytest.raises(KeyboardInterrupt):
+                time.sleep(10)
     finally:
         signal.signal(signal.SIGALRM, before)

@@ -147,6 +147,12 @@ def test_out_of_memory_gives_one_line_and_status_1(input_files, monkeypatch, all
     assert line.endswith("the machine is out of memory: close other programs that use it, lower --resolution")
 
 
+def test_out_of_memory_while_a_file_is_read_is_not_reported_as_a_damaged_file(input_files, monkeypatch):
+    monkeypatch.setattr(import_module("stages.core.scene.trajectory"), "_read", lambda *_: np.empty(1 << 50))
+    line = fails_cleanly(input_files, ("render", "{}/good.h5", "-o", "{}/o.mp4"), expected=1)
+    assert "the machine is out of memory" in line and "good.h5" not in line
+
+
 def test_other_runtime_errors_are_not_reported_as_out_of_memory(input_files, monkeypatch):
     def broken(*_, **__):
         raise RuntimeError("a mistake of ours")

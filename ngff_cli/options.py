@@ -29,6 +29,7 @@ AsJson = Annotated[bool, typer.Option("--json", help="print the results as JSON 
 SIZE_OPTIONS = ("quality", "resolution", "keypoints", "max_objects", "batch", "views", "side", "size", "particles",
                 "scenes")  # that determine the memory of a command, the most effective first  # fmt: skip
 INTERRUPTED = "interrupted; no incomplete file is left"
+OUT_OF_MEMORY = "{} is out of memory: close other programs that use it"
 NO_MEMORY = ("can't allocate memory", "Insufficient memory", "can't start new thread", "bad alloc", "bad_alloc",
              "failed to map segment")  # in messages of PyTorch, OpenCV, Python, C++ and the loader  # fmt: skip
 
@@ -66,6 +67,10 @@ def run_command_line(app: typer.Typer, words: list[str] | None = None) -> None:
         app(words)
     except KeyboardInterrupt:  # before the command has begun
         fail(INTERRUPTED, 130)
+    except Exception as error:  # as well
+        if _is_out_of_memory(error):
+            fail(OUT_OF_MEMORY.format("the machine"), 1)
+        raise
 
 
 def interrupt(number: int, frame) -> None:
@@ -172,7 +177,7 @@ def _less_memory(what: str, command, remedies: list[str]) -> str:
     sizes = ["--" + name.replace("_", "-") for name in SIZE_OPTIONS if name in names]
     lower = [f"lower {' or '.join(sizes)}"] if sizes else []
     remedies = remedies if "device" in names else []
-    return ", ".join([f"{what} is out of memory: close other programs that use it", *lower, *remedies])
+    return ", ".join([OUT_OF_MEMORY.format(what), *lower, *remedies])
 
 
 def fail(message: str, status: int) -> None:

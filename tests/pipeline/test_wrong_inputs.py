@@ -1,6 +1,7 @@
 """Errors of the command line: one line on stderr, exit status 2, and no incomplete file."""
 
 import resource
+import signal
 from contextlib import contextmanager
 from importlib import import_module
 
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from ngff_cli.options import run_command_line
 from stages.core.scene.scene_ply import write_scene
 from stages.simulate.options import SimulateOptions
 from stages.simulate.stage import run
@@ -145,6 +147,21 @@ def test_out_of_memory_gives_one_line_and_status_1(input_files, monkeypatch, all
     args = ("render", "{}/good.h5", "-o", "{}/o.mp4")
     line = fails_cleanly(input_files, args, expected=1)
     assert line.endswith("the machine is out of memory: close other programs that use it, lower --resolution")
+
+
+def test_out_of_memory_before_a_command_begins_gives_one_line(capsys):
+    def app(words):
+        raise ImportError("x.so: failed to map segment from shared object")
+
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        with pytest.raises(SystemExit) as ended:
+            run_command_line(app, [])
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    line = capsys.readouterr().err
+    assert ended.value.code == 1 and line == "ngff: the machine is out of memory: close other programs that use it\n"
 
 
 def test_out_of_memory_while_a_file_is_read_is_not_reported_as_a_damaged_file(input_files, monkeypatch):

@@ -21,7 +21,7 @@ from tqdm import tqdm
 
 from stages.core.errors import InputError
 from stages.core.scene.files import ngff_version, replacing
-from stages.lab.fuzz.cases import GOOD, KINDS, Examples, quiet
+from stages.lab.fuzz.cases import GOOD, KINDS, Examples, quiet, result_of
 
 RESULTS = (*GOOD, "nonsense", "traceback", "signal", "more than 10 s", "more than 2 GB")
 MAX_SECONDS = 10.0
@@ -106,6 +106,8 @@ def _work(parent: Connection, folder: Path, seed: int, start: int, stop: int) ->
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends this process
     os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # libraries for images and videos write there
     examples = Examples(folder)
+    for kind in KINDS:  # libraries that are loaded below the limit may crash instead of saying that they lack memory
+        result_of(kind, examples.place(kind))
     size = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
     resource.setrlimit(resource.RLIMIT_AS, (size + 2 * MAX_MEMORY,) * 2)  # the machine is not ours
     parent.send("ready")

@@ -79,10 +79,10 @@ def interrupt(number: int, frame) -> None:
     In the import system the exception could be lost with a lock held, which blocks all threads that import (CPython's
     _get_module_lock), and a library that is interrupted while it is imported may report that it is not installed.
     """
-    imports = frame
-    while imports is not None and not imports.f_code.co_filename.startswith("<frozen importlib"):
-        imports = imports.f_back
-    if imports is None:
+    while frame is not None and not frame.f_code.co_filename.startswith("<frozen importlib"):
+        # a script may run the command while it is imported itself
+        frame = None if frame.f_code is run_command_line.__code__ else frame.f_back
+    if frame is None:
         raise KeyboardInterrupt
     if hasattr(signal, "setitimer"):
         signal.signal(signal.SIGALRM, interrupt)

@@ -203,9 +203,11 @@ def test_an_interrupt_waits_until_an_import_has_ended():
     before = signal.getsignal(signal.SIGALRM)
     importing = SimpleNamespace(f_code=SimpleNamespace(co_filename="<frozen importlib._bootstrap>"), f_back=None)
     imported = SimpleNamespace(f_code=SimpleNamespace(co_filename="library.py"), f_back=importing)
+    running = SimpleNamespace(f_code=run_command_line.__code__, f_back=importing)  # within a script that is imported
     try:
-        with pytest.raises(KeyboardInterrupt):
-            interrupt(signal.SIGINT, sys._getframe())
+        for frame in (sys._getframe(), running):
+            with pytest.raises(KeyboardInterrupt):
+                interrupt(signal.SIGINT, frame)
         for frame in (importing, imported):
             interrupt(signal.SIGINT, frame)
             with pytest.raises(KeyboardInterrupt):

@@ -25,7 +25,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Collection, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -33,9 +33,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from stages.core.geometry.rotations import matrix
-from stages.core.physics.convex_parts import ConvexParts, convex_parts
+from stages.core.physics.convex_parts import convex_parts
 from stages.core.physics.forces import Force, ForcePrompts
-from stages.core.physics.materials import MODELS, Material, MaterialChoice
+from stages.core.physics.materials import MODELS, MaterialChoice
 from stages.core.physics.solid_surface import solid_surface
 from stages.core.physics.state import FrameState
 from stages.core.scene.scene import Scene
@@ -46,51 +46,17 @@ from stages.simulate.engine_choice import MAX_RIGID_SAG, sag
 from stages.simulate.initial_overlaps import InitialOverlaps
 from stages.simulate.options import SimulateOptions
 from stages.simulate.resting_bodies import FALLING, FREE, SUPPORT_GAP, RestingBodies, Stance
+from stages.simulate.rigid_model import OMEGA, SUBSTEPS, Body, Units, mujoco_model
 from stages.simulate.setup import SceneSetup, check_motion, choose_for_bodies, from_photos, set_up_scene
 from stages.simulate.surface_contacts import SurfaceContacts, surface_shape
 
 log = logging.getLogger(__name__)
-SUBSTEPS = 200  # substeps in a unit of time: that of falling half the size of the smallest object from rest
-CONTACT_SUBSTEPS = 12  # substeps during which bodies that collide touch
 REST_SPEED = 0.1  # normal speed below which contacts do not rebound [units]; a fall of 0.5 % of the smallest object
-PARTS_DAMPING = 0.4  # least damping ratio of bodies of several parts, of which contacts come and go during a collision
-IMPEDANCE = 0.99  # of a contact: 1 would be exact, but the forces between several contacts undetermined
 MAX_PASSES = 8  # of the solver for exact friction; in each the error of a sliding box shrinks by mu^2 / (1 + mu^2)
 SLIP_TOLERANCE = 0.01  # error of a contact's normal acceleration with which they end, relative to gravity plus itself
 MAX_SUBSTEPS = 5_000  # in a frame
 MAX_TRAVEL = 0.05  # of the smallest object's size in a substep, so that nothing passes through it
 ON_FLOOR = 0.02  # gap up to which a body stands on the floor [units]
-
-
-@dataclass(frozen=True)
-class Units:
-    """Units of the simulation."""
-
-    length: float  # [m]
-    time: float  # [s]
-    mass: float  # [kg]
-
-    @property
-    def force(self) -> float:
-        """Unit of force [N]."""
-        return self.mass * self.length / self.time**2
-
-
-@dataclass(frozen=True)
-class Body:
-    """An object as a rigid body, in metres and kilograms."""
-
-    parts: ConvexParts  # in scene units, where reconstructed
-    material: Material
-    friction: float
-    mass: float
-    start: Float[Tensor, "3"]  # centre of mass at the start
-    pinned: bool
-    ground: float  # height of the plane under it [m]
-
-    def damping(self, material: Material) -> float:
-        """Ratio to critical of a contact's damping. The energy lost in a cycle is 4 pi damping of that stored."""
-        return max(material.loss / 2, PARTS_DAMPING if len(self.parts.hulls) > 1 else 0.0)
 
 
 def rollout(
@@ -180,7 +146,6 @@ class _World:
         self._scene, self._ids = scene, [o.id for o in scene.objects]
         self._held: dict[int, np.ndarray] = {}  # free bodies that are held during the simulation -> their pose
         self.mass = torch.tensor([b.mass for b in bodies])  # [kg]
-        self._omega = math.pi * SUBSTEPS / CONTACT_SUBSTEPS
         unit = scene.metres_per_unit
         velocity = [unit * torch.tensor(prompts.velocity.get(o.id, (0.0, 0.0, 0.0))) for o in scene.objects]
         size = min(unit * float((p.amax(0) - p.amin(0)).max()) for p in (torch.cat(b.parts.hulls) for b in bodies))
@@ -199,8 +164,8 @@ class _World:
         box = [[unit * v / size for v in corner] for corner in (setup.box.low, setup.box.high)]
         around = background_boxes(scene, setup.box.low[2]) if from_photos(scene) else []
         around = [np.array(corners) * unit / size for corners in around]
-        self.model = _model(mujoco, bodies, self.units, options, box if options.box else None, floor / size, around,
-                            self._omega)  # fmt: skip
+        gravity = options.gravity * self.units.time**2 / size
+        self.model = mujoco_model(bodies, self.units, gravity, floor / size, box if options.box else None, around)
         self.data = mujoco.MjData(self.model)
         self._free = [i for i, b in enumerate(bodies) if not b.pinned]
         for k, i in enumerate(self._free):
@@ -240,7 +205,7 @@ class _World:
             self.mass[row] = b.mass * m.density / b.material.density
             for geom in np.nonzero(model.geom_bodyid == row + 1)[0]:
                 model.geom_friction[geom, 0] = m.friction if options.friction is None else options.friction
-                model.geom_solref[geom, 1] = -2 * b.damping(m) * self._omega
+                model.geom_solref[geom, 1] = -2 * b.damping(m) * OMEGA
         self._mujoco.mj_setConst(model, self._mujoco.MjData(model))
         free = {self._ids[i]: k for k, i in enumerate(self._free)}
         self._held = {k: self.data.qpos[FREE * k : FREE * (k + 1)].copy() for id, k in free.items() if id in pinned}
@@ -343,11 +308,11 @@ class _World:
         active = data.contact.efc_address >= 0
         normal = data.contact.efc_address[active]
         speed = data.efc_vel[normal]
-        missing = np.maximum(2 * self._omega - data.efc_KBIP[normal, 1], 0)
+        missing = np.maximum(2 * OMEGA - data.efc_KBIP[normal, 1], 0)
         data.efc_aref[normal] -= missing * np.maximum(1 - np.abs(speed) / REST_SPEED, 0) * speed
         soft = normal[active[:count].sum() :]
-        push = np.minimum(-(self._omega**2) * data.efc_pos[soft], 2 * self._omega * REST_SPEED)
-        data.efc_aref[soft] = push - 2 * self._omega * data.efc_vel[soft]
+        push = np.minimum(-(OMEGA**2) * data.efc_pos[soft], 2 * OMEGA * REST_SPEED)
+        data.efc_aref[soft] = push - 2 * OMEGA * data.efc_vel[soft]
         along = normal[:, None] + [1, 2]
         data.efc_aref[along] = -data.efc_vel[along] / self.model.opt.timestep
         return normal, data.contact.friction[active, 0]
@@ -379,57 +344,3 @@ class _World:
             if arm is not None:
                 torque = torque + np.cross(self.data.xmat[row + 1].reshape(3, 3) @ arm, force)
             self.data.xfrc_applied[row + 1] += np.concatenate([force, torque])
-
-
-def _model(
-    mujoco, bodies: list[Body], units: Units, options: SimulateOptions, box, floor: float, around: list, omega: float
-):
-    """MuJoCo's model: a body for each object, a mesh for each convex part, a plane for the floor and each wall, and the
-    fixed boxes `around`, as pairs of corners; then a body for the ground under each object that is below the floor.
-    """
-    spec = mujoco.MjSpec()
-    spec.option.timestep = 1 / SUBSTEPS
-    spec.option.gravity = [0, 0, -options.gravity * units.time**2 / units.length]
-    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-    spec.option.impratio = 10  # friction this much firmer than the normal force, so that slopes hold
-    if hasattr(mujoco.mjtEnableBit, "mjENBL_MULTICCD"):  # several contacts between two parts; always so from version 4
-        spec.option.enableflags |= mujoco.mjtEnableBit.mjENBL_MULTICCD
-    impedance = [IMPEDANCE, IMPEDANCE, 0.001, 0.5, 2.0]
-    planes = [((0.0, 0.0, floor), (0.0, 0.0, 1.0))]
-    if box:
-        planes += [(box[side], tuple((-1.0 if side else 1.0) * (a == axis) for a in range(3)))
-                   for axis in range(3) for side in (0, 1) if (axis, side) != (2, 0)]  # fmt: skip
-    fixed = {"condim": 3, "friction": [0, 0, 0], "solimp": impedance, "solref": [-(omega**2), 0]}
-    for at, normal in planes:
-        quat = np.zeros(4)
-        mujoco.mju_quatZ2Vec(quat, np.array(normal))
-        spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], pos=at, quat=quat, **fixed)
-    for low, high in around:
-        spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=(high - low) / 2, pos=(low + high) / 2, **fixed)
-    for i, b in enumerate(bodies):
-        _add_body(mujoco, spec, f"body{i}", b, units, omega, impedance)
-    for i, b in enumerate(bodies):
-        if b.ground / units.length < floor:
-            ground = spec.worldbody.add_body(name=f"ground{i}", pos=[0, 0, b.ground / units.length])
-            ground.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], **fixed)
-            others = [f"body{k}" for k in range(len(bodies)) if k != i]
-            for one, two in [("world", f"body{i}"), *((ground.name, other) for other in others)]:
-                spec.add_exclude(bodyname1=one, bodyname2=two)
-    return spec.compile()
-
-
-def _add_body(mujoco, spec, name: str, b: Body, units: Units, omega: float, impedance: list) -> None:
-    unit = float(b.mass / (b.material.density * b.parts.volume)) ** (1 / 3)  # metres in a scene unit
-    body = spec.worldbody.add_body(name=name, pos=(b.start / units.length).tolist())
-    body.explicitinertial, body.mass, body.ipos = True, b.mass / units.mass, [0, 0, 0]
-    inertia = b.parts.inertia.double() * b.material.density * unit**5 / (units.mass * units.length**2)
-    body.fullinertia = [float(inertia[r, c]) for r, c in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))]
-    if not b.pinned:
-        body.add_freejoint()
-    for n, hull in enumerate(b.parts.hulls):
-        vertices = (hull - b.parts.com).double() * unit / units.length
-        mesh = spec.add_mesh(name=f"{name}_{n}", uservert=vertices.flatten().tolist())
-        mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
-        # negative: stiffness and damping themselves, of which MuJoCo takes the smaller numbers, the larger damping
-        body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh.name, condim=3, friction=[b.friction, 0, 0],
-                      solref=[-(omega**2), -2 * b.damping(b.material) * omega], solimp=impedance)  # fmt: skip

@@ -1,0 +1,107 @@
+"""MuJoCo's model of rigid bodies, and the units in which it is simulated."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from torch import Tensor
+
+from stages.core.physics.convex_parts import ConvexParts
+from stages.core.physics.materials import Material
+
+SUBSTEPS = 200  # substeps in a unit of time: that of falling half the size of the smallest object from rest
+CONTACT_SUBSTEPS = 12  # substeps during which bodies that collide touch
+PARTS_DAMPING = 0.4  # least damping ratio of bodies of several parts, of which contacts come and go during a collision
+IMPEDANCE = 0.99  # of a contact: 1 would be exact, but the forces between several contacts undetermined
+OMEGA = math.pi * SUBSTEPS / CONTACT_SUBSTEPS  # angular frequency of contacts [1 / unit of time]
+
+
+@dataclass(frozen=True)
+class Units:
+    """Units of the simulation."""
+
+    length: float  # [m]
+    time: float  # [s]
+    mass: float  # [kg]
+
+    @property
+    def force(self) -> float:
+        """Unit of force [N]."""
+        return self.mass * self.length / self.time**2
+
+
+@dataclass(frozen=True)
+class Body:
+    """An object as a rigid body, in metres and kilograms."""
+
+    parts: ConvexParts  # in scene units, where reconstructed
+    material: Material
+    friction: float
+    mass: float
+    start: Float[Tensor, "3"]  # centre of mass at the start
+    pinned: bool
+    ground: float  # height of the plane under it [m]
+
+    def damping(self, material: Material) -> float:
+        """Ratio to critical of a contact's damping. The energy lost in a cycle is 4 pi damping of that stored."""
+        return max(material.loss / 2, PARTS_DAMPING if len(self.parts.hulls) > 1 else 0.0)
+
+
+def mujoco_model(bodies: Sequence[Body], units: Units, gravity: float, floor: float, box: Sequence | None,
+                 around: Sequence):  # fmt: skip
+    """MuJoCo's model: a body for each object, a mesh for each convex part, a plane for the floor and each wall of `box`
+    (its low and high corner), and the fixed boxes `around`, as pairs of corners; then a body for the ground under each
+    object that is below the floor. `gravity`, the height of the `floor` and the corners are in `units`.
+    """
+    import mujoco  # noqa: PLC0415 -- slow to import
+
+    spec = mujoco.MjSpec()
+    spec.option.timestep = 1 / SUBSTEPS
+    spec.option.gravity = [0, 0, -gravity]
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    spec.option.impratio = 10  # friction this much firmer than the normal force, so that slopes hold
+    if hasattr(mujoco.mjtEnableBit, "mjENBL_MULTICCD"):  # several contacts between two parts; always so from version 4
+        spec.option.enableflags |= mujoco.mjtEnableBit.mjENBL_MULTICCD
+    impedance = [IMPEDANCE, IMPEDANCE, 0.001, 0.5, 2.0]
+    planes = [((0.0, 0.0, floor), (0.0, 0.0, 1.0))]
+    if box:
+        planes += [(box[side], tuple((-1.0 if side else 1.0) * (a == axis) for a in range(3)))
+                   for axis in range(3) for side in (0, 1) if (axis, side) != (2, 0)]  # fmt: skip
+    fixed = {"condim": 3, "friction": [0, 0, 0], "solimp": impedance, "solref": [-(OMEGA**2), 0]}
+    for at, normal in planes:
+        quat = np.zeros(4)
+        mujoco.mju_quatZ2Vec(quat, np.array(normal))
+        spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], pos=at, quat=quat, **fixed)
+    for low, high in around:
+        spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=(high - low) / 2, pos=(low + high) / 2, **fixed)
+    for i, b in enumerate(bodies):
+        _add_body(mujoco, spec, f"body{i}", b, units, impedance)
+    for i, b in enumerate(bodies):
+        if b.ground / units.length < floor:
+            ground = spec.worldbody.add_body(name=f"ground{i}", pos=[0, 0, b.ground / units.length])
+            ground.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], **fixed)
+            others = [f"body{k}" for k in range(len(bodies)) if k != i]
+            for one, two in [("world", f"body{i}"), *((ground.name, other) for other in others)]:
+                spec.add_exclude(bodyname1=one, bodyname2=two)
+    return spec.compile()
+
+
+def _add_body(mujoco, spec, name: str, b: Body, units: Units, impedance: list) -> None:
+    unit = float(b.mass / (b.material.density * b.parts.volume)) ** (1 / 3)  # metres in a scene unit
+    body = spec.worldbody.add_body(name=name, pos=(b.start / units.length).tolist())
+    body.explicitinertial, body.mass, body.ipos = True, b.mass / units.mass, [0, 0, 0]
+    inertia = b.parts.inertia.double() * b.material.density * unit**5 / (units.mass * units.length**2)
+    body.fullinertia = [float(inertia[r, c]) for r, c in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))]
+    if not b.pinned:
+        body.add_freejoint()
+    for n, hull in enumerate(b.parts.hulls):
+        vertices = (hull - b.parts.com).double() * unit / units.length
+        mesh = spec.add_mesh(name=f"{name}_{n}", uservert=vertices.flatten().tolist())
+        mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
+        # negative: stiffness and damping themselves, of which MuJoCo takes the smaller numbers, the larger damping
+        body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh.name, condim=3, friction=[b.friction, 0, 0],
+                      solref=[-(OMEGA**2), -2 * b.damping(b.material) * OMEGA], solimp=impedance)  # fmt: skip

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from stages.core.geometry.eigenvectors import eigh
 from stages.core.geometry.harmonics import C0
 from stages.core.geometry.neighbours import BruteForce, KDTree, neighbour_index
 from stages.core.scene.gaussians import Gaussians
@@ -84,7 +85,7 @@ def smooth_points(
     count = near.sum(1)
     middle = (points[index] * near).sum(1) / count
     centred = (points[index] - middle[:, None]) * near
-    normals = torch.linalg.eigh(centred.mT @ centred).eigenvectors[..., 0]
+    normals = eigh(centred.mT @ centred)[1][..., 0]
     at = points[picked]
     moved = at + ((middle - at) * normals).sum(1, keepdim=True) * normals
     colour = (colours[index] * near).sum(1) / count

@@ -17,6 +17,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from stages.core.geometry.eigenvectors import eigh
 from stages.core.geometry.neighbours import BruteForce, KDTree, neighbour_index
 
 RESOLUTION = 36  # nodes of the grid along each axis
@@ -102,7 +103,7 @@ def _unoriented(points: Float[Tensor, "m 3"], tree: KDTree | BruteForce) -> Surf
     """Discs at the points, with normals of either sign."""
     distance, index = tree.query(points, min(NORMAL_NEIGHBOURS, len(points)))
     local = points[index] - points[index].mean(1, keepdim=True)
-    _, axes = torch.linalg.eigh(local.mT @ local)
+    _, axes = eigh(local.mT @ local)
     return Surfels(
         points, axes[:, :, 0].to(points), distance[:, min(4, distance.shape[1] - 1)], torch.zeros_like(distance[:, 0])
     )

@@ -7,6 +7,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from stages.core.geometry.eigenvectors import eigh
 from stages.core.geometry.rotations import multiply, quaternion
 from stages.core.models.pi3.config import Pi3Config
 from stages.core.models.pi3.feature_head import FeatureHead
@@ -81,7 +82,7 @@ def band_factors(device=None) -> Float[Tensor, "k"]:
 
 def decompose(covariances: Float[Tensor, "n 3 3"]) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 4"]]:
     """Scales, largest first, and quaternions w x y z of covariances; variances are clamped to at least 1e-8."""
-    variances, axes = torch.linalg.eigh(covariances)
+    variances, axes = eigh(covariances)
     variances, axes = variances.flip(-1), axes.flip(-1)
     axes = torch.cat([axes[..., :2], axes[..., 2:] * torch.det(axes)[..., None, None]], -1)
     return variances.clamp_min(1e-8).sqrt(), quaternion(axes)

@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from stages.core.geometry.eigenvectors import eigh
 from stages.core.geometry.neighbours import knn
 from stages.core.geometry.rotations import matrix
 from stages.core.scene.gaussians import SURFACE_OPACITY
@@ -102,7 +103,7 @@ def _normals(points: Tensor, axes: Float[Tensor, "v 3 3"], toward: Float[Tensor,
     centred = around - around.mean(1, keepdim=True)
     spread = centred.mT @ centred
     spread = spread / spread.diagonal(dim1=1, dim2=2).sum(1).clamp_min(1e-12)[:, None, None]
-    normals = torch.linalg.eigh(axes + torch.eye(3).to(axes) - 2 * spread).eigenvectors[:, :, -1]
+    normals = eigh(axes + torch.eye(3).to(axes) - 2 * spread)[1][:, :, -1]
     outward = torch.where(toward.norm(dim=1, keepdim=True) > 1e-6, toward, toward.new_tensor([0.0, 0, 1]))
     return normals * torch.where((normals * outward).sum(1, keepdim=True) < 0, -1.0, 1.0)
 

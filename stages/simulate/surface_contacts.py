@@ -25,18 +25,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import ndimage
 from scipy.spatial import ConvexHull, QhullError
 
+from stages.core.kernels.depth_lookup import depth_lookup, turned
 from stages.core.physics.solid_surface import SolidSurface
 from stages.simulate.initial_overlaps import WINDOW
 
 MARGIN = 0.05  # distance up to which samples are in a list [units of the simulation]
 GROUPS_ALONG = 6  # groups of samples along the longest side of a body
-FACING = 0.5  # cosine of the angle between a surface and the one it faces up to which all of a depth counts
 STEEPEST = 2  # largest slope of depths on a grid: fine ones meet coarse ones, which differ by up to a voxel
 NONE = np.zeros(0, np.int64), np.zeros(0)
-CORNERS = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), -1).reshape(-1, 3)  # of a cell
 
 
 @dataclass(frozen=True)
@@ -77,14 +75,8 @@ class SurfaceContacts:
         self._ends = np.append(self._begin[1:], len(self._points))
         self._middle, self._reach = (np.concatenate([g[k] for g in groups]) for k in (2, 3))
         self._radius = np.array([np.linalg.norm(s.points, axis=1).max(initial=0) for s in shapes])
-        self._depth = np.concatenate([s.depth.ravel() for s in shapes])
-        self._smooth = np.concatenate([ndimage.gaussian_filter(s.depth, 1.0).ravel() for s in shapes])
-        self._grid = np.cumsum([0, *(s.depth.size for s in shapes)])[:-1]
-        self._shape, self._low = np.array([s.depth.shape for s in shapes]), np.array([s.low for s in shapes])
-        self._h = np.array([s.h for s in shapes])
-        self._high = self._low + self._h[:, None] * (self._shape - 1)
-        self._stride = np.stack([self._shape[:, 1] * self._shape[:, 2], self._shape[:, 2], np.ones(count, np.int64)], 1)
-        self._to_corners = self._stride @ CORNERS.T
+        self._lookup = depth_lookup([s.depth for s in shapes], np.array([s.low for s in shapes]),
+                                    np.array([s.h for s in shapes]))  # fmt: skip
         rough = ~np.array([s.convex for s in shapes])
         self._possible = (rough[:, None] | rough) & ~np.eye(count, dtype=bool)
         self._planes = np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE)
@@ -92,9 +84,9 @@ class SurfaceContacts:
         pairs = np.arange(1, count + 1)[:, None]
         apart = np.isin((np.minimum(of, pairs) << 16) + np.maximum(of, pairs), model.exclude_signature)
         lowest = [self._first[i] + _hull_corners(s.points) if rough[i] else [] for i, s in enumerate(shapes)]
-        self._corners = np.concatenate(lowest).astype(np.int64)  # the samples that can touch planes
-        self._corner_of = np.repeat(np.arange(count), [len(rows) for rows in lowest])
         self._first_corner = np.cumsum([0, *(len(rows) for rows in lowest)])
+        self._corner_of = np.repeat(np.arange(count), [len(rows) for rows in lowest])
+        self._corners = self._points[np.concatenate(lowest).astype(np.int64)]  # those that can touch planes
         self._apart = np.where(apart, -np.inf, 0.0)  # added to how far a body is beyond a plane
         # the first part of each, whose friction and damping are those of the body
         self._geom = np.array([np.flatnonzero(model.geom_bodyid == i + 1)[0] for i in range(count)])
@@ -137,7 +129,7 @@ class SurfaceContacts:
             one, two = np.append(self._planes[plane], one), np.append(self._geom[of], two)
             normal = np.concatenate([data.geom_xmat[self._planes[plane]][:, 2::3], normal])
             turn = data.xmat[1 + of].reshape(-1, 3, 3)
-            at = _turned(turn, self._points[self._corners[row]]) + data.xpos[1 + of]
+            at = turned(turn, self._corners[row]) + data.xpos[1 + of]
             self._append(data, np.concatenate([at, x]), normal, np.append(depth, excess), one, two)
 
     def thin(self, data, distance: np.ndarray) -> None:
@@ -190,74 +182,41 @@ class SurfaceContacts:
             self._pair = np.repeat(np.arange(len(self._pairs)), [len(rows) for rows, _ in self._lists.values()])
             self._sample, self._from = (np.concatenate(each) for each in zip(NONE, *self._lists.values(), strict=True))
 
-    def _relative(self, data, pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Rotations (k, 3, 3) and translations (k, 3) from the frames of the first bodies of pairs to the second's."""
-        turn, at = data.xmat[1:].reshape(-1, 3, 3), data.xpos[1:]
-        a, b = pairs.T
-        back = turn[b].transpose(0, 2, 1)
-        return back @ turn[a], _turned(back, at[a] - at[b])
-
     def _near(self, data, pairs: np.ndarray, way: np.ndarray) -> tuple[list[tuple[np.ndarray, np.ndarray]], np.ndarray]:
         """For each of some pairs (k, 2) that have gone a way (k,) the samples of the first body that are less than
         MARGIN outside the second one, each with the way from which on it may be inside; and a way (k,) that both can
         move until others are.
         """
-        R, t = self._relative(data, pairs)
         a, b = pairs.T
+        poses = self._poses(data)
         group, of = _ranges(self._first_group[a], self._first_group[a + 1])
-        distance = self._distances(b[of], _turned(R[of], self._middle[group]) + t[of]) - self._reach[group]
+        distance = self._lookup.distances(self._middle[group], a[of], b[of], *poses) - self._reach[group]
         close, gap = distance < MARGIN, np.full(len(pairs), np.inf)
         np.minimum.at(gap, of[~close], distance[~close])
         group, of = group[close], of[close]
         sample, row = _ranges(self._begin[group], self._ends[group])
         of = of[row]
-        distance = self._distances(b[of], _turned(R[of], self._points[sample]) + t[of])
+        distance = self._lookup.distances(self._points[sample], a[of], b[of], *poses)
         np.minimum.at(gap, of, distance)
         k = np.flatnonzero(distance < MARGIN)
         begin = np.searchsorted(of[k], np.arange(1, len(pairs)))
         lists = (np.split(each, begin) for each in (sample[k], way[of[k]] + distance[k] / STEEPEST))
         return list(zip(*lists, strict=True))[: len(pairs)], np.maximum(gap, MARGIN)
 
-    def _distances(self, b: np.ndarray, x: np.ndarray) -> np.ndarray:
-        """Distances (k,) of points (k, 3) in the frames of bodies b (k,) from these, at least; negative inside."""
-        inside = np.minimum(np.maximum(x, self._low[b]), self._high[b])
-        node, f = self._cells(b, inside)
-        distance = -_trilinear(self._depth[node], f)
-        beyond = ((x - inside) ** 2).sum(1)
-        # the body is in the box of its grid, so the angle at the nearest point of the box is at least a right one
-        return np.where(beyond > 0, np.sqrt(beyond + np.maximum(distance, 0) ** 2), distance)
-
-    def _cells(self, b: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Rows (k, 8) of the nodes around points (k, 3) in the frames of bodies b (k,), and the places (k, 3) between
-        them, beyond 0..1 for points outside of the grid.
-        """
-        u = (x - self._low[b]) / self._h[b, None]
-        cell = np.minimum(np.maximum(u.astype(np.int64), 0), self._shape[b] - 2)
-        node = self._grid[b] + np.einsum("ki,ki->k", cell, self._stride[b])
-        return node[:, None] + self._to_corners[b], u - cell
-
     def _contacts(self, data) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Of the listed samples inside another body: positions (k, 3), outward normals (k, 3) of that body, depths (k,)
         in it, less where the surfaces do not face each other, and the rows (k,) of both bodies.
         """
-        R, t = self._relative(data, self._pairs)
-        pair, sample = self._pair, self._sample
-        k = np.flatnonzero(self._way[tuple(self._pairs.T)][pair] >= self._from)
-        pair, sample = pair[k], sample[k]
-        a, b = self._pairs[pair].T
-        local = _turned(R[pair], self._points[sample]) + t[pair]
-        node, f = self._cells(b, local)
-        x, y, z = (np.abs(f - 0.5) <= 0.5).T
-        depth = np.where(x & y & z, _trilinear(self._depth[node], f), 0.0)
-        inside = np.flatnonzero(depth > 0)
-        node, f, depth, local = node[inside], f[inside], depth[inside], local[inside]
-        a, b, sample = a[inside], b[inside], sample[inside]
-        at, turn = data.xpos[1:], data.xmat[1:].reshape(-1, 3, 3)
-        normal = -_turned(turn[b], _slope(self._smooth[node], f))
-        normal /= np.linalg.norm(normal, axis=1, keepdims=True).clip(1e-12)
-        own = _turned(turn[a], self._normals[sample])
-        x = _turned(turn[b], local) + at[b]
-        return x, normal, depth * (-(own * normal).sum(1) / FACING).clip(0, 1), a, b
+        k = np.flatnonzero(self._way[tuple(self._pairs.T)][self._pair] >= self._from)
+        a, b = self._pairs[self._pair[k]].T.copy()
+        sample = self._sample[k]
+        k, x, normal, depth = self._lookup.contacts(self._points[sample], self._normals[sample], a, b,
+                                                    *self._poses(data))  # fmt: skip
+        return x, normal, depth, a[k], b[k]
+
+    def _poses(self, data) -> tuple[np.ndarray, np.ndarray]:
+        """Rotations (o, 3, 3) and positions (o, 3) of the bodies."""
+        return data.xmat[1:].reshape(-1, 3, 3), data.xpos[1:]
 
     def _beyond_planes(self, data, fixed: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Corners (k,), planes (k,), by their rows, and how far (k,) those are beyond these, more than at the start."""
@@ -268,7 +227,7 @@ class SurfaceContacts:
         low = np.flatnonzero((middle + self._radius[:, None] > 0).any(1) & ~fixed)
         row, _ = _ranges(self._first_corner[low], self._first_corner[low + 1])
         of = self._corner_of[row]
-        depth = middle[of] - np.einsum("ki,kpi->kp", self._points[self._corners[row]], (normal @ turn)[of])
+        depth = middle[of] - np.einsum("ki,kpi->kp", self._corners[row], (normal @ turn)[of])
         k, plane = np.nonzero(depth > 0)
         return row[k], plane, depth[k, plane]
 
@@ -315,35 +274,9 @@ def _ranges(begin: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     return np.arange(len(row)) + (begin - np.cumsum(length) + length)[row], row
 
 
-def _turned(R: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Points (k, 3), each turned by its matrix (k, 3, 3)."""
-    return np.einsum("kij,kj->ki", R, x)
-
-
 def _hull_corners(points: np.ndarray) -> np.ndarray:
     """Rows of the points at the corners of their convex hull; all of points in a plane."""
     try:
         return ConvexHull(points).vertices
     except (QhullError, ValueError):
         return np.arange(len(points))
-
-
-def _trilinear(value: np.ndarray, f: np.ndarray) -> np.ndarray:
-    """Values (k,) between the corners (k, 8) of cells."""
-    x, y, z = f.T
-    v = np.ascontiguousarray(value.T)
-    v = v[:4] + (v[4:] - v[:4]) * x
-    v = v[:2] + (v[2:] - v[:2]) * y
-    return v[0] + (v[1] - v[0]) * z
-
-
-def _slope(value: np.ndarray, f: np.ndarray) -> np.ndarray:
-    """Gradients (k, 3) of `_trilinear` [per edge of a cell]."""
-    x, y, z = f.T
-    v = np.ascontiguousarray(value.T)
-    dx = v[4:] - v[:4]
-    v = v[:4] + dx * x
-    dx = dx[:2] + (dx[2:] - dx[:2]) * y
-    dy = v[2:] - v[:2]
-    v = v[:2] + dy * y
-    return np.stack([dx[0] + (dx[1] - dx[0]) * z, dy[0] + (dy[1] - dy[0]) * z, v[1] - v[0]], 1)

@@ -10,7 +10,7 @@ from stages.core.physics.convex_cuts import fibonacci
 from stages.core.physics.solid_surface import SolidSurface, solid_surface
 from stages.lab.assets.shapes import Surface, box
 from stages.simulate.initial_overlaps import WINDOW
-from stages.simulate.surface_contacts import SurfaceContacts, SurfaceShape, _slope, _trilinear, surface_shape
+from stages.simulate.surface_contacts import SurfaceContacts, SurfaceShape, surface_shape
 from tests.simulate.motion import roll_out
 from tests.simulate.test_rigid import cube, options_of, scene_of
 
@@ -114,13 +114,6 @@ def test_contacts_with_a_plane_begin_at_the_overlap_of_the_start():
     assert len(Pair(0.5).found(0.5).dist) == 0
     assert len(Pair(0.5).found(0.5, height=-0.03, fixed=True).dist) == 0
     assert len(Pair(0.5, convex=True).found(0.5, height=-0.03).dist) == 0
-
-
-def test_gradient_of_the_interpolation():
-    rng = np.random.default_rng(0)
-    value, f, step = rng.normal(size=(50, 8)), rng.uniform(0.1, 0.9, (50, 3)), 1e-5
-    numeric = [(_trilinear(value, f + step * e) - _trilinear(value, f - step * e)) / (2 * step) for e in np.eye(3)]
-    np.testing.assert_allclose(_slope(value, f), np.stack(numeric, 1), atol=1e-8)
 
 
 def test_shape_of_a_box_that_ends_at_the_floor():

@@ -33,6 +33,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from stages.core.geometry.rotations import matrix
+from stages.core.kernels.threads import parallel_map
 from stages.core.physics.convex_parts import convex_parts
 from stages.core.physics.forces import Force, ForcePrompts
 from stages.core.physics.materials import MODELS, MaterialChoice
@@ -48,7 +49,7 @@ from stages.simulate.options import SimulateOptions
 from stages.simulate.resting_bodies import FALLING, FREE, SUPPORT_GAP, RestingBodies, Stance
 from stages.simulate.rigid_model import OMEGA, SUBSTEPS, Body, Units, mujoco_model
 from stages.simulate.setup import SceneSetup, check_motion, choose_for_bodies, from_photos, set_up_scene
-from stages.simulate.surface_contacts import SurfaceContacts, surface_shape
+from stages.simulate.surface_contacts import SurfaceContacts, SurfaceShape, surface_shape
 
 log = logging.getLogger(__name__)
 REST_SPEED = 0.1  # normal speed below which contacts do not rebound [units]; a fall of 0.5 % of the smallest object
@@ -225,10 +226,13 @@ class _World:
 
     def _surface_contacts(self, setup: SceneSetup, options: SimulateOptions) -> SurfaceContacts:
         scale = self._scene.metres_per_unit / self.units.length
-        shapes = [surface_shape(solid_surface(self._scene, id, options.seed), b.ground / self._scene.metres_per_unit,
-                                b.parts.com.double().numpy(), scale, len(b.parts.hulls) == 1)
-                  for id, b in zip(self._ids, self._bodies, strict=True)]  # fmt: skip
-        return SurfaceContacts(self._mujoco, self.model, self.data, shapes)
+
+        def shape(row: int) -> SurfaceShape:
+            b, surface = self._bodies[row], solid_surface(self._scene, self._ids[row], options.seed)
+            ground = b.ground / self._scene.metres_per_unit
+            return surface_shape(surface, ground, b.parts.com.double().numpy(), scale, len(b.parts.hulls) == 1)
+
+        return SurfaceContacts(self._mujoco, self.model, self.data, parallel_map(shape, range(len(self._bodies))))
 
     def _resting_bodies(self, setup: SceneSetup, at_rest: list[int]) -> RestingBodies:
         """`data` has the objects as they are in the photos, without lifts."""

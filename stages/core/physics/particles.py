@@ -157,8 +157,8 @@ def filled_voxels(scene: Scene, object_id: int, along: int, seed: int = 0) -> tu
     spacing = _spacing(g.means[(g.object_id == object_id) & usable(g)].double())
     h = max(float((points.max(0) - points.min(0)).max()) / along, gap / 8, spacing / 3, 1e-9)
     # as an object that stands, closed by the floor, or as one that hangs, with wider leaks: what fills more
-    floors = (scene.floor, None) if scene.floor is not None else (None,)
-    bodies = [_closed_body(points, h, gap, floor, photographed=False)[:2] for floor in floors]
+    ways = (True, False) if _stands(points, h, scene.floor) else (False,)
+    bodies = [_closed_body(points, h, gap, standing, photographed=False)[:2] for standing in ways]
     body, low = max(bodies, key=lambda found: found[0].sum())
     return torch.from_numpy((np.argwhere(body) + low + 0.5) * h).float(), h
 
@@ -169,20 +169,25 @@ def _solid(
     """Voxels of an object: indices (m, 3) of voxels of edge h in its closed and filled body, and the number of voxels
     of volume that each represents; the last value as in _closed_body.
     """
-    body, low, extended = _closed_body(points, h, gap, floor, photographed)
+    body, low, extended = _closed_body(points, h, gap, _stands(points, h, floor), photographed)
     inside = body if skin else body & ~_thick_skin(body)
     if inside.sum() < MIN_PARTICLES:
         inside = body
     return np.argwhere(inside) + low, float(body.sum() / inside.sum()), extended
 
 
+def _stands(points: np.ndarray, h: float, floor: float | None) -> bool:
+    """Whether an object with these points ends within four voxels of edge h of the floor."""
+    return floor is not None and abs(math.floor(float(points[:, 2].min()) / h) - floor / h) < 4
+
+
 def _closed_body(
-    points: np.ndarray, h: float, gap: float, floor: float | None, photographed: bool
+    points: np.ndarray, h: float, gap: float, standing: bool, photographed: bool
 ) -> tuple[np.ndarray, np.ndarray, bool]:
     """The closed and filled body of an object as voxels of edge h, and the index of its first voxel.
 
-    A body that would tip over although it stood on the floor when `photographed` is extended down to the floor; the
-    last value is whether it was.
+    That of a `standing` object is closed by the floor. One that would tip over although it stood when `photographed`
+    is extended down to the floor; the last value is whether it was.
     """
     cells = np.floor(points / h).astype(np.int64)
     margin = 6  # room for closing
@@ -191,7 +196,6 @@ def _closed_body(
     shell = np.zeros(shape, bool)
     shell[tuple((cells - low)[(cells - low < shape - margin).all(1)].T)] = True
     bridge = min(max(math.ceil(gap / h / 2), 1), 4)
-    standing = floor is not None and abs(float(low[2]) + margin - floor / h) < 4
     body = _largest(_fill(shell, bridge, standing))
     body = _trim(body, points / h - low)
     at = torch.from_numpy(np.argwhere(body)).float()

@@ -113,15 +113,26 @@ def solid_surface(scene: Scene, object_id: int, seed: int = 0) -> SolidSurface:
 
 def _voxels_along(scene: Scene, object_id: int) -> int:
     """Number of voxels along an object: more where it is larger than the others and its Gaussians are as dense."""
-    size, means = {}, {}
-    for o in scene.objects:
-        x = scene.gaussians.means[scene.gaussians.object_id == o.id].cpu().double().numpy()
-        means[o.id] = x[np.isfinite(x).all(1)]
-        ends = np.quantile(means[o.id], [0.99, 0.01], axis=0) if len(means[o.id]) else np.zeros((2, 3))
-        size[o.id] = max(float((ends[0] - ends[1]).max()), 1e-12)
-    own = means[object_id]
+    own, sizes = _means(scene, object_id), _sizes(scene)
     some = own[:: -(-max(len(own), 1) // 2000)]
     spacing = float(np.median(cKDTree(own).query(some, 2)[0][:, 1])) if len(own) > 1 else np.inf
-    most = min(MOST_ALONG, size[object_id] / max(spacing, 1e-12))
-    ratio = size[object_id] / float(np.median(list(size.values())))
+    most = min(MOST_ALONG, sizes[object_id] / max(spacing, 1e-12))
+    ratio = sizes[object_id] / float(np.median(list(sizes.values())))
     return round(max(VOXELS_ALONG, min(VOXELS_ALONG * ratio, most)))
+
+
+@cached_in_scene
+def _sizes(scene: Scene) -> dict[int, float]:
+    """Longest side of each object without outliers, by its id."""
+    sizes = {}
+    for o in scene.objects:
+        means = _means(scene, o.id)
+        ends = np.quantile(means, [0.99, 0.01], axis=0) if len(means) else np.zeros((2, 3))
+        sizes[o.id] = max(float((ends[0] - ends[1]).max()), 1e-12)
+    return sizes
+
+
+def _means(scene: Scene, object_id: int) -> np.ndarray:
+    """Centres of an object's Gaussians (n, 3) that are finite."""
+    x = scene.gaussians.means[scene.gaussians.object_id == object_id].cpu().double().numpy()
+    return x[np.isfinite(x).all(1)]

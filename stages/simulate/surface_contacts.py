@@ -33,6 +33,7 @@ from stages.simulate.initial_overlaps import WINDOW
 
 MARGIN = 0.05  # distance up to which samples are in a list [units of the simulation]
 GROUPS_ALONG = 6  # groups of samples along the longest side of a body
+CELLS = 2 * GROUPS_ALONG  # cells of that size on each side of a body's centre of mass
 STEEPEST = 2  # largest slope of depths on a grid: fine ones meet coarse ones, which differ by up to a voxel
 NONE = np.zeros(0, np.int64), np.zeros(0)
 
@@ -93,6 +94,7 @@ class SurfaceContacts:
         self._body = np.where(model.geom_bodyid > count, 0, model.geom_bodyid) - 1  # -1: fixed
         self._rough = np.append(rough, False)
         self._edge = np.append([np.ptp(s.points, axis=0).max(initial=0) / GROUPS_ALONG for s in shapes], np.inf)
+        self._keys = (count + 1, count + 1, 2 * CELLS, 2 * CELLS, 2 * CELLS, 6)  # of contacts in `thin`
         self._dof = model.body_dofadr[1 : count + 1]
         self._path = np.zeros(count)  # the way that any point of a body has gone at most
         self._due = np.full((count, count), -np.inf)  # sum of both paths at which the list of a pair must be made again
@@ -144,9 +146,10 @@ class SurfaceContacts:
         local = ((data.contact.pos[rough] - data.xpos[1 + small])[:, None] @ turn)[:, 0]
         cell = np.floor(local / self._edge[small, None]).astype(np.int64)
         axis = np.abs(normal).argmax(1)
-        key = np.column_stack([body, cell, 2 * axis + (normal[np.arange(len(rough)), axis] > 0)])
-        order = np.lexsort((-distance[rough], *key.T))
-        beside = (key[order[1:]] == key[order[:-1]]).all(1)
+        side = 2 * axis + (normal[np.arange(len(rough)), axis] > 0)
+        key = np.ravel_multi_index((*(body.T + 1), *(cell.T + CELLS), side), self._keys, mode="clip")
+        order = np.lexsort((-distance[rough], key))
+        beside = key[order[1:]] == key[order[:-1]]
         data.contact.exclude[rough[order[:-1][beside]]] = 1
 
     def _note(self, contacts: tuple, fixed: np.ndarray) -> None:
@@ -244,9 +247,7 @@ class SurfaceContacts:
         x, normal, excess, one, two = x[kept], normal[kept], excess[kept], one[kept], two[kept]
         added.geom1[new], added.geom2[new], added.geom[new] = one, two, np.stack([one, two], 1)
         added.dist[new], added.pos[new] = -excess, x
-        side = np.cross(normal, np.eye(3)[np.abs(normal).argmin(1)])
-        side /= np.linalg.norm(side, axis=1, keepdims=True)
-        added.frame[new] = np.concatenate([normal, side, np.cross(normal, side)], 1)
+        added.frame[new] = _frames(normal)
         # as MuJoCo combines those of two geometries
         added.friction[new] = np.maximum(model.geom_friction[one], model.geom_friction[two])[:, [0, 0, 1, 2, 2]]
         added.solref[new] = np.minimum(model.geom_solref[one], model.geom_solref[two])
@@ -265,6 +266,18 @@ def _groups(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.
     middle = np.array([(g.min(0) + g.max(0)) / 2 for g in parts]).reshape(-1, 3)
     reach = np.array([np.linalg.norm(g - m, axis=1).max() for g, m in zip(parts, middle, strict=True)])
     return order, first, middle, reach
+
+
+def _frames(normal: np.ndarray) -> np.ndarray:
+    """Unit normals (k, 3) and two directions across each: frames (k, 9).
+
+    Source: Duff et al. 2017, "Building an orthonormal basis, revisited".
+    """
+    x, y, z = normal.T
+    sign = np.where(z < 0, -1.0, 1.0)
+    a = -1 / (sign + z)
+    b = x * y * a
+    return np.stack([x, y, z, 1 + sign * x * x * a, sign * b, -sign * x, b, sign + y * y * a, -y], 1)
 
 
 def _ranges(begin: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -1,6 +1,7 @@
 """Damaged and hostile files end in a right result or one clear sentence."""
 
 import json
+import multiprocessing
 import os
 import signal
 import time
@@ -10,7 +11,7 @@ from pathlib import Path
 import h5py
 import pytest
 
-from stages.core.errors import InputError
+from stages.core.errors import InputError, MissingPackage
 from stages.core.scene.scene_ply import read_scene, write_scene
 from stages.core.scene.schema import MAX_JSON_DEPTH, parse_json, quote, text
 from stages.core.scene.trajectory import read_trajectory
@@ -156,3 +157,19 @@ def test_what_is_bound_to_nothing_has_no_weights(tmp_path, weight, right):
 def test_files_that_are_absent_are_named(tmp_path):
     with pytest.raises(InputError, match="absent.h5: no such file; a trajectory"):
         read_trajectory(tmp_path / "absent.h5")
+
+
+def test_a_worker_that_cannot_start_says_why(tmp_path, monkeypatch):
+    def examples(folder):
+        raise MissingPackage("videos need PyAV; `pip install av`")
+
+    monkeypatch.setattr(campaign, "Examples", examples)
+    monkeypatch.setattr(campaign.os, "dup2", lambda *_: None)
+    monkeypatch.setattr(campaign.signal, "signal", lambda *_: None)
+    ours, theirs = multiprocessing.Pipe()
+    campaign._work(theirs, tmp_path, 0, 0, 1)
+    with pytest.raises(InputError, match="needs all packages: videos need PyAV"):
+        campaign._await_start(ours)
+    theirs.close()
+    with pytest.raises(InputError, match="ended before it was ready"):
+        campaign._await_start(ours)

@@ -13,13 +13,13 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import closing, suppress
 from multiprocessing.connection import Connection
 from pathlib import Path
 
 from tqdm import tqdm
 
-from stages.core.errors import InputError
+from stages.core.errors import InputError, MissingPackage
 from stages.core.scene.files import ngff_version, replacing
 from stages.lab.fuzz.cases import GOOD, KINDS, Examples, quiet, result_of
 
@@ -74,8 +74,7 @@ def _results(folder: Path, count: int, seed: int) -> Iterator[tuple[int, str, st
         process.start()
         theirs.close()
         try:
-            if not ours.poll(START) or ours.recv() != "ready":
-                raise InputError("the process that reads the files did not start")
+            _await_start(ours)
             while number < count:
                 if not ours.poll(MAX_SECONDS):
                     result, why = "more than 10 s", ""
@@ -101,11 +100,24 @@ def _results(folder: Path, count: int, seed: int) -> Iterator[tuple[int, str, st
         shutil.rmtree(place, ignore_errors=True)
 
 
+def _await_start(worker: Connection) -> None:
+    """Wait until the process that reads the files is ready. Raises InputError with what it says instead."""
+    answer = "has not started" if not worker.poll(START) else ""
+    with suppress(EOFError):
+        answer = answer or worker.recv()
+    if answer != "ready":
+        raise InputError(f"the process that reads the files {answer or 'ended before it was ready'}")
+
+
 def _work(parent: Connection, folder: Path, seed: int, start: int, stop: int) -> None:
     """Run cases and send the result of each; wait for an answer, so that its files are left as they are."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends this process
     os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # libraries for images and videos write there
-    examples = Examples(folder)
+    try:
+        examples = Examples(folder)
+    except MissingPackage as error:
+        parent.send(f"needs all packages: {error}")
+        return
     for kind in KINDS:  # libraries that are loaded below the limit may crash instead of saying that they lack memory
         result_of(kind, examples.place(kind))
     size = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")

@@ -47,6 +47,7 @@ class Dataset:
         data = file[name]
         if not isinstance(data, h5py.Dataset) or data.is_virtual or data.external or data.shape is None:
             raise ValueError(f"{name} is not a dataset with values of its own")
+        data.id.get_create_plist().fill_value_defined()  # ValueError for a damaged fill value, which crashes HDF5 later
         expected = tuple(lengths.get(s, -1) if s.isalpha() else int(s) for s in self.shape.split())
         fits = len(expected) == len(data.shape) and all(e in (-1, s) for e, s in zip(expected, data.shape, strict=True))
         if not fits:

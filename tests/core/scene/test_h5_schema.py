@@ -7,6 +7,7 @@ import torch
 
 from stages.core.scene import h5_schema
 from stages.core.scene.field_start import FieldStart, FieldUnits, read_field_start, write_field_start
+from stages.core.scene.h5_chunks import write_compressed
 from stages.core.scene.h5_schema import Dataset, open_h5
 
 
@@ -150,3 +151,17 @@ def test_a_file_is_opened_for_reading(tmp_path):
         file.attrs["name"] = "duck"
     with open_h5(tmp_path / "b.h5") as file:
         assert file.attrs["name"] == "duck" and file.mode == "r"
+
+
+def test_a_damaged_fill_value_is_refused(tmp_path):
+    """HDF5 crashes where it is asked for a fill value of a negative size."""
+    path = tmp_path / "a.h5"
+    with h5py.File(path, "w") as file:
+        write_compressed(file, "points", np.ones((7, 3), np.float32))
+    message = bytes([5, 0, 8, 0, 1, 0, 0, 0, 2, 3, 2, 1])  # type 5, 8 bytes: version, times, whether defined
+    data = bytearray(path.read_bytes())
+    size = data.index(message) + len(message)
+    data[size + 3] = 0x9D
+    path.write_bytes(data)
+    with h5py.File(path) as file, pytest.raises(ValueError, match="fill"):
+        Dataset("p 3").read(file, "points", {})

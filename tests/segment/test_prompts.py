@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from stages.core.errors import InputError
+from stages.core.scene.cameras import PhotoIntrinsics
 from stages.segment import masks, prompts, view_images
 from stages.segment.boxes import MAX_VIEWS, nearest_first
 from stages.segment.masks import read_names
@@ -46,6 +47,17 @@ def test_rows_of_prompts_and_their_names(tmp_path):
 def test_other_prompts_are_refused(tmp_path, data, message):
     with pytest.raises(InputError, match=f"p.json: .*{message}|{message}"):
         read_prompts(prompts_file(tmp_path, **data), ring(count=1))
+
+
+def test_points_where_the_lens_shows_nothing_are_refused(tmp_path):
+    """r (1 - r^2 / 4) is 0.77 at most: no direction is seen at the corners of a wide photo."""
+    cameras = ring(count=1)
+    K = torch.tensor([[[30.0, 0, 32], [0, 30, 32], [0, 0, 1]]])
+    barrel = PhotoIntrinsics(K, cameras.sizes, torch.tensor([[-0.25, 0, 0, 0, 0]]))
+    cameras = replace(cameras, photos=barrel)
+    assert read_prompts(prompts_file(tmp_path, center_point=[[40, 32]]), cameras).points.isfinite().all()
+    with pytest.raises(InputError, match="p.json: a center_point is where the lens of 00.png shows nothing"):
+        read_prompts(prompts_file(tmp_path, center_point=[[40, 32], [1, 1]]), cameras)
 
 
 def test_the_number_of_prompts_is_bounded(tmp_path, monkeypatch):

@@ -33,7 +33,7 @@ def fit_plane(points: Float[Tensor, "n 3"], weights: Float[Tensor, "n"] | None =
 def planes_through(triples: Float[Tensor, "k 3 3"]) -> tuple[Float[Tensor, "k 3"], Float[Tensor, "k"]]:
     """Unit normals and offsets of the planes through three points each; collinear points give a zero normal."""
     a, b, c = triples.unbind(1)
-    normals = torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=1)
+    normals = torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a))
     return normals, (normals * a).sum(1)
 
 

@@ -51,8 +51,7 @@ def estimate_light(scene: Scene, spheres: Spheres, device: str = "cpu") -> Light
     lamps = _lamps()
     best = _best_fit(A, torch.stack([_hidden(seen, spheres, lamp) for lamp in lamps]), y, lamps)
     reach = float((seen[:, :2] - seen[:, :2].mean(0)).norm(dim=1).mean())
-    turns = [2 * math.pi * i / CONTROLS for i in range(CONTROLS)]
-    shifts = [CONTROL_SHIFT * reach * seen.new_tensor([math.cos(a), math.sin(a), 0.0]) for a in turns]
+    shifts = CONTROL_SHIFT * reach * seen.new_tensor([(x, y, 0.0) for x, y in _all_around(CONTROLS)])
     displaced = torch.stack([_hidden(seen + shift, spheres, best.light) for shift in shifts])
     chance = _best_fit(A, displaced, y, [best.light] * CONTROLS)
     if best.odds < max(MIN_ODDS, MIN_RATIO * chance.odds):
@@ -105,13 +104,18 @@ def _surface_terms(points: Tensor, colours: Tensor) -> tuple[Float[Tensor, "n"],
     return brightness, torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y, u, v, u * u, u * v, v * v], 1)
 
 
+def _all_around(count: int) -> list[tuple[float, float]]:
+    """Unit vectors at equal angles."""
+    angles = [2 * math.pi * i / count for i in range(count)]
+    return [(math.cos(a), math.sin(a)) for a in angles]
+
+
 def _lamps() -> list[Light]:
     """The lamps that are tried, with any strength."""
     directions = [(0.0, 0.0, 1.0)]
     for elevation in map(math.radians, ELEVATIONS):
-        angles = [2 * math.pi * i / AZIMUTHS for i in range(AZIMUTHS)]
         level = math.cos(elevation)
-        directions += [(level * math.cos(a), level * math.sin(a), math.sin(elevation)) for a in angles]
+        directions += [(level * x, level * y, math.sin(elevation)) for x, y in _all_around(AZIMUTHS)]
     return [Light(0.0, 0.0, d, spread, in_colours=True) for d in directions for spread in SPREADS]
 
 

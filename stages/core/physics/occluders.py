@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import replace
+from itertools import product
 
 import torch
 from jaxtyping import Float
@@ -24,9 +25,9 @@ PARTICLES = 4000  # of all objects, from which the spheres are made
 SPHERES = 8  # for each object
 MAX_SPHERES = 480  # for all objects
 LLOYD_STEPS = 8
-_VIEWS = torch.nn.functional.normalize(torch.tensor(  # axes, face and space diagonals of a cube
-    [[1.0, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0], [1, -1, 0], [1, 0, 1], [1, 0, -1], [0, 1, 1], [0, 1, -1],
-     [1, 1, 1], [1, -1, 1], [1, 1, -1], [-1, 1, 1]]), dim=1)  # fmt: skip
+_VIEWS = torch.nn.functional.normalize(  # axes, face and space diagonals of a cube
+    torch.tensor([view for view in product((1.0, 0.0, -1.0), repeat=3) if view > (0.0, 0.0, 0.0)])
+)
 
 
 class Occluders:

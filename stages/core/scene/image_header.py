@@ -97,8 +97,10 @@ def _tiff(data: bytes) -> ImageHeader:
     for at in range(first, first + entry * number(start, first - start), entry):
         if number(at, 2) in (TIFF_WIDTH, TIFF_HEIGHT, TIFF_TILE_WIDTH, TIFF_TILE_HEIGHT):
             tags[number(at, 2)] = number(at + 4 + word, {3: 2, 4: 4}.get(number(at + 2, 2), word))
-    width = max(tags.get(TIFF_WIDTH, 0), tags.get(TIFF_TILE_WIDTH, 0))
-    height = max(tags.get(TIFF_HEIGHT, 0), tags.get(TIFF_TILE_HEIGHT, 0))
+    if TIFF_WIDTH not in tags or TIFF_HEIGHT not in tags:
+        raise ValueError("no image")
+    width = max(tags[tag] for tag in (TIFF_WIDTH, TIFF_TILE_WIDTH) if tag in tags)
+    height = max(tags[tag] for tag in (TIFF_HEIGHT, TIFF_TILE_HEIGHT) if tag in tags)
     return ImageHeader(width, height, width * height / 8 / MAX_RATIO)
 
 

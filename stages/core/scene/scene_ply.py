@@ -115,7 +115,14 @@ def _with_header(path: Path, gaussians: Gaussians, comments: list[str]) -> Scene
             if comment.startswith("ngff:"):
                 key, value = comment[5:].split(" ", 1)
                 metadata.setdefault(key, []).append(parse_json(value, finite=key != "provenance"))
-        version = number(metadata.get("version", [VERSION])[0], "version", 0)
+
+        def only(key: str, default: object = None) -> object:
+            *more, value = metadata.get(key, [default])
+            if more:
+                raise ValueError(f"ngff:{key} is there more than once")
+            return value
+
+        version = number(only("version", VERSION), "version", 0)
         if version > VERSION:
             raise InputError(f"{path}: format version {version:g} is newer than {VERSION}; upgrade ngff")
         ids = gaussians.object_id.unique().tolist()
@@ -127,12 +134,12 @@ def _with_header(path: Path, gaussians: Gaussians, comments: list[str]) -> Scene
             tuple(o for _, o in sorted((named | unnamed).items())),
             camera_json.from_json(metadata.get("camera", [])),
             **read_metadata(
-                metadata.get("floor", [None])[0],
-                metadata.get("scale", [{"metres_per_unit": 1.0, "source": "not stated in the file"}])[0],
-                metadata.get("provenance", [{}])[0],
-                metadata.get("background", [None])[0],
+                only("floor"),
+                only("scale", {"metres_per_unit": 1.0, "source": "not stated in the file"}),
+                only("provenance", {}),
+                only("background"),
             ),
-            sequence=read_sequence_json(metadata.get("sequence", [None])[0]),
+            sequence=read_sequence_json(only("sequence")),
         )
     except (ValueError, KeyError, TypeError, AttributeError, RuntimeError) as error:
         why = reason(error)

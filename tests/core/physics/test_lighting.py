@@ -40,6 +40,14 @@ def test_the_lamp_and_the_shares_of_sky_and_lamp_are_found(shares, outliers):
     assert fit.odds > 20
 
 
+@pytest.mark.parametrize(("share", "found"), [(0.07, False), (0.14, True)])
+def test_shadows_of_less_than_a_tenth_of_the_light_are_texture(share, found):
+    (_, A), hidden, noise = surface()
+    y = (1 - hidden[1] @ torch.tensor([0.0, share])).log() + 0.1 * noise
+    fit = _best_fit(A, hidden, y, LAMPS)
+    assert (fit.odds > 5) == found and (fit.odds == 0) == (not found)
+
+
 def test_brightness_without_shadows_has_no_odds():
     (_, A), hidden, noise = surface()
     assert _best_fit(A, hidden, A @ torch.ones(A.shape[1]) + noise, LAMPS).odds < 0.05

@@ -8,6 +8,7 @@ import torch
 
 from stages.core.physics.keypoints import bind_gaussians, choose_keypoints
 from stages.core.physics.lighting import estimate_light
+from stages.core.physics.occluders import _VIEWS
 from stages.core.physics.shadow_casting import find_shadows
 from stages.core.physics.skinning import deform
 from stages.core.raster.rasterise import rasterise
@@ -126,6 +127,14 @@ def test_spheres_have_the_volume_and_the_outline_of_their_object(world):
         assert float((4 / 3 * math.pi * rest.radii[own] ** 3).sum()) == pytest.approx(volume, rel=0.25)
         area = float((rest.weights[own] * math.pi * rest.radii[own].square()).sum())
         assert area == pytest.approx(outline, rel=0.25)  # a quarter of a convex body's surface (Cauchy)
+
+
+def test_outlines_are_seen_from_all_around():
+    """Along the axes and the face and space diagonals of a cube: 13 axes, no direction being preferred."""
+    assert len(_VIEWS) == 13
+    torch.testing.assert_close(_VIEWS.norm(dim=1), torch.ones(13))
+    torch.testing.assert_close(_VIEWS.mT @ _VIEWS, 13 / 3 * torch.eye(3))
+    assert ((_VIEWS @ _VIEWS.mT).abs() - 2 * torch.eye(13) < 0.9).all()
 
 
 def test_another_background_holds_no_shadows(world):

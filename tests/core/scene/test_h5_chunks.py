@@ -28,6 +28,9 @@ def test_both_ways_agree_with_hdf5(tmp_path, name):
         assert np.array_equal(file["ours"][()], values) and file["ours"].dtype == values.dtype
         for data in file.values():
             assert np.array_equal(read_compressed(data), values)
+        if values.nbytes > CHUNK_BYTES:  # several threads encode several chunks
+            rows = file["ours"].chunks[0]
+            assert file["ours"].chunks[1:] == values.shape[1:] and rows == CHUNK_BYTES // values[0].nbytes
         assert file["ours"].id.get_storage_size() < 1.1 * file["theirs"].id.get_storage_size() + 100
 
 

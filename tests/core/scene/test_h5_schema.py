@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from stages.core.scene import h5_schema
-from stages.core.scene.field_start import FieldStart, FieldUnits, read_field_start, write_field_start
+from stages.core.scene.field_start import DATASETS, FieldStart, FieldUnits, read_field_start, write_field_start
 from stages.core.scene.h5_chunks import write_compressed
 from stages.core.scene.h5_schema import Dataset, open_h5
 
@@ -133,6 +133,26 @@ def test_units_of_a_field_out_of_range_are_refused(file, name, value):
     file.flush()
     with pytest.raises(ValueError, match=name):
         read_field_start(file, {})
+
+
+@pytest.mark.parametrize("name", [name for name, dataset in DATASETS.items() if dataset.kind != "text"])
+def test_values_of_a_field_out_of_range_are_refused(file, name):
+    """No mass, stiffness or friction is negative, and materials are elastic: nu is between -1 and 0.5."""
+    low = {"solidity": 1, "nu": -1, **dict.fromkeys(("points", "velocity", "inertia", "box"), -1e9)}.get(name, 0)
+    high = {"mass_fraction": 1.001, "nu": 0.5, "awake": 1, "standing": 1,
+            **dict.fromkeys(("mass", "volume", "E", "solidity"), 1e30)}.get(name, 1e9)  # fmt: skip
+    write_field_start(file, start_of(UNITS))
+    file.flush()
+    data, step = file[f"field/{name}"], 1 if name in ("awake", "standing") else 1e-3
+    before = data[()]
+    below, above = low - step * max(1, abs(low)), high * 1.001 + step
+    for value, right in ((low, True), (high, True), (below, False), (above, False)):
+        data[()] = np.where(np.arange(before.size).reshape(before.shape) == 1, value, before)
+        if right:
+            read_field_start(file, {})
+        else:
+            with pytest.raises(ValueError, match=f"field/{name}"):
+                read_field_start(file, {})
 
 
 @pytest.mark.parametrize(("name", "low", "high"), [

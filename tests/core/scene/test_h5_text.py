@@ -129,14 +129,19 @@ def test_free_space_of_no_length_in_a_heap_is_refused(tmp_path):
         reread(path)
 
 
-def test_a_header_that_continues_in_itself_is_refused(tmp_path):
+@pytest.mark.parametrize("where", ["itself", "outside"])
+def test_a_header_that_continues_in_itself_or_outside_the_file_is_refused(tmp_path, where):
     path = tmp_path / "a.h5"
     write(path)
+    data = path.read_bytes()
     with h5py.File(path) as file:
         at = h5py.h5o.get_info(file.id).addr
-    data = path.read_bytes()
-    message = struct.pack("<HHI", 0x10, 16, 0) + struct.pack("<QQ", at + 16, 24)
-    path.write_bytes(data[: at + 16] + message + data[at + 40 :])
+        to = at + 16 if where == "itself" else len(data) + 1000
+        message = struct.pack("<HHI", 0x10, 16, 0) + struct.pack("<QQ", to, 24)
+        path.write_bytes(data[: at + 16] + message + data[at + 40 :])
+        why = "its object header has too many parts" if where == "itself" else "a part of it is outside the file"
+        with pytest.raises(ValueError, match=why):  # HDF5 has read the header before
+            check_attributes(file)
     with pytest.raises((ValueError, OSError)):
         reread(path)
 

@@ -142,6 +142,9 @@ def test_sizes_of_tiff_files_are_those_of_the_tags_or_of_a_larger_tile(order):
     assert header[:2] == (300, 70_000) and header.stored == pytest.approx(300 * 70_000 / 8 / 4096)
     tiles = {256: (4, 300), 257: (4, 37), 322: (3, 512), 323: (3, 32)}
     assert read_image_header(tiff(order, tiles))[:2] == (512, 37)
+    for size in ({256: (3, 300)}, {257: (3, 37), 322: (3, 512), 323: (3, 32)}, {}):
+        with pytest.raises(ValueError, match="no image"):
+            read_image_header(tiff(order, size))
     with pytest.raises(ValueError, match="no image"):
         read_image_header(data[:2] + data[2:4][::-1] + data[4:])
     with pytest.raises(ValueError, match="no image"):

@@ -45,6 +45,12 @@ def test_grey_alpha_and_16_bit_images_are_read_as_rgb(tmp_path, pixels):
     torch.testing.assert_close(read_image(tmp_path / "a.png"), torch.full((3, 3, 3), 128 / 255))
 
 
+def test_values_of_float_images_are_kept(tmp_path):
+    pixels = np.random.default_rng(0).random((3, 4, 3), np.float32)
+    cv2.imwrite(str(tmp_path / "a.tiff"), pixels[..., ::-1])
+    assert torch.equal(read_image(tmp_path / "a.tiff"), torch.from_numpy(pixels))
+
+
 @pytest.mark.parametrize("largest", [256, 300, 65535])
 def test_label_round_trip_with_16_bits(tmp_path, largest):
     labels = torch.tensor([[0, 1], [largest, 2]])

@@ -83,6 +83,17 @@ def test_image_and_labels_agree():
     assert lens.image(torch.full((120, 160, 3), 7, dtype=torch.uint8)).unique().tolist() == [7]
 
 
+def test_beyond_the_edges_of_a_photo_its_outermost_pixels_continue():
+    """The lens bends the edges inwards, so that the corners of the view are not on the photo."""
+    image = torch.full((240, 320, 3), 0.75)
+    image[:, :160] = 0.25
+    lens = Undistortion.of(camera([0.25, 0, 0, 0, 0]), 0, SIZE)
+    x, y = lens._map(lens.view_K, lens.view_size)
+    assert (x < -1).any() and (y < -1).any() and (x > 321).any()
+    seen = lens.image(image)
+    assert (seen[:, :40] == 0.25).all() and (seen[:, -40:] == 0.75).all()
+
+
 def test_photos_larger_than_the_view_keep_their_resolution():
     cameras = camera(LENSES["barrel"])
     assert Undistortion.of(cameras, 0, (640, 480)).image(torch.zeros(480, 640, 3)).shape == (480, 640, 3)

@@ -1,4 +1,5 @@
 import dataclasses
+import math
 import os
 from dataclasses import replace
 
@@ -180,6 +181,30 @@ def test_invalid_files_are_refused_in_one_line(tmp_path, name, message):
     with pytest.raises(InputError, match=message) as caught:
         read_scene(write_invalid_files(tmp_path) / name)
     assert "\n" not in str(caught.value) and str(tmp_path) in str(caught.value)
+
+
+@pytest.mark.parametrize("key", ["version", "scale", "floor", "background", "sequence", "provenance"])
+def test_what_a_scene_has_once_is_in_one_comment(tmp_path, two_balls, key):
+    sequence = FilmedSequence(50.0, 40, {"a.mp4": 12.25})
+    write_scene(tmp_path / "s.ply", replace(two_balls, background=(0.2, 0.4, 0.6), sequence=sequence))
+    data = (tmp_path / "s.ply").read_bytes()
+    begin = data.index(f"comment ngff:{key} ".encode())
+    end = data.index(b"\n", begin) + 1
+    (tmp_path / "s.ply").write_bytes(data[:end] + data[begin:end] + data[end:])
+    with pytest.raises(InputError, match=f"is damaged .*ngff:{key} is there more than once"):
+        read_scene(tmp_path / "s.ply")
+
+
+def test_only_provenance_may_have_values_that_are_not_finite(tmp_path, two_balls):
+    """The options of a run may be infinite; a camera or an object may not."""
+    write_scene(tmp_path / "s.ply", replace(two_balls, provenance={"options": {"limit": math.inf}}))
+    assert read_scene(tmp_path / "s.ply").provenance == {"options": {"limit": math.inf}}
+    data = (tmp_path / "s.ply").read_bytes()
+    first = b"comment ngff:"
+    for more in (b'object {"id": 1, "name": "a", "weight": NaN}', b'camera {"weight": Infinity}'):
+        (tmp_path / "s.ply").write_bytes(data.replace(first, first + more + b"\n" + first, 1))
+        with pytest.raises(InputError, match="is damaged .*(NaN|Infinity)"):
+            read_scene(tmp_path / "s.ply")
 
 
 def test_failed_write_keeps_the_old_file(tmp_path, two_balls, monkeypatch):

@@ -77,6 +77,14 @@ def test_input_error_keeps_the_written_frames(tmp_path, two_balls):
     assert len(read_trajectory(tmp_path / "t.partial.h5")) == 1
 
 
+def test_a_written_file_is_not_kept_open(tmp_path, two_balls):
+    with TrajectoryWriter(tmp_path / "t.h5", two_balls, *parts(two_balls)) as writer:
+        pass
+    assert writer.frames == 0
+    open_files = [os.path.realpath(f"/proc/self/fd/{name}") for name in os.listdir("/proc/self/fd")]
+    assert not [name for name in open_files if name.startswith(str(tmp_path))]
+
+
 def test_interrupted_write_leaves_no_file(tmp_path, two_balls):
     info, keypoints, binding = parts(two_balls)
     with (

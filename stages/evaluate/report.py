@@ -132,8 +132,7 @@ def _png(image: Float[Tensor, "h w 3"]) -> str:
     """Base64 of a PNG, reduced to MAX_IMAGE_SIDE."""
     h, w = image.shape[:2]
     factor = min(1.0, MAX_IMAGE_SIDE / max(h, w))
-    if factor < 1:
-        image = resize(image, max(1, round(w * factor)), max(1, round(h * factor)))
+    image = resize(image, max(1, round(w * factor)), max(1, round(h * factor)))
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "image.png"
         write_png(path, image)

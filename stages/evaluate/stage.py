@@ -75,7 +75,7 @@ def _compare(predictions: list[Path], truth: Path | None, options: EvaluateOptio
         raise InputError(f"{predictions[0]}: name the truth with --against, or have films scored with --judge")
     if len(predictions) > 1:
         raise InputError(f"{predictions[1]}: is a second prediction; with --against give one")
-    prediction, truth = predictions[0], Path(truth)
+    (prediction,), truth = predictions, Path(truth)
     kind = _common_kind(prediction, truth)
     _check_options(kind, options)
     return choose(COMPARISONS, kind)(prediction, truth, options), [prediction, truth]

@@ -105,8 +105,7 @@ def rollout(
 
     def states() -> Iterator[FrameState]:
         current, held, acting, dt = options, prompts.pinned, prompts.forces, options.dt * units.time / steps
-        external = replace(forces, pinned=forces.pinned | sleep.asleep)
-        stepper = TimeStepper(model, initial.to(device), dt, external.to(device), options.integrator)
+        stepper = TimeStepper(model, initial.to(device), dt, forces.to(device), options.integrator)
         first, mass = stepper.points.clone(), initial.mass[0]
         before = first
         for n in range(options.steps):

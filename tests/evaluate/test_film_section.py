@@ -7,11 +7,13 @@ from dataclasses import replace
 
 import pytest
 
+from stages.core.errors import InputError
 from stages.core.physics.materials import MATERIALS
 from stages.core.scene.scene import SceneObject
 from stages.core.scene.trajectory import read_trajectory
 from stages.evaluate import film_section
 from tests.conftest import two_balls_scene
+from tests.core.scene.test_h5_schema import UNITS, start_of
 from tests.evaluate.motions import write_motion
 
 
@@ -68,6 +70,34 @@ def test_where_a_material_is_from(trajectory, known_volumes):
     ]  # fmt: skip
     other = with_scene(trajectory, objects=(SceneObject(1, "red ball", "cheese"), SceneObject(2, "x", "cheese")))
     assert [row[3] for row in cells(film_section._objects(other))] == ["ball", "common"]  # of another tool
+
+
+@pytest.mark.parametrize("dense", [False, True])
+def test_the_film_is_of_keypoints(trajectory, known_volumes, monkeypatch, dense):
+    """A trajectory of another tool, with every Gaussian in every frame, is shown without it."""
+    monkeypatch.setattr(film_section, "read_trajectory", lambda path: replace(trajectory, dense=dense))
+    monkeypatch.setattr(film_section, "_player", lambda trajectory, title: f"<iframe>{title}</iframe>")
+    html = film_section.film_section(trajectory.path)
+    assert ("<iframe>t</iframe>" in html) == (not dense) and "--lift 1=0.3" in html
+
+
+def test_a_motion_of_the_learned_engine_can_be_played_on(trajectory, monkeypatch):
+    """By the field in the page; where that is of other weights, the film is shown alone."""
+    shown = []
+    monkeypatch.setattr(film_section, "find_shadows", lambda scene, keypoints: None)
+    monkeypatch.setattr(film_section, "pack_film", lambda scene, motion, settings, shadows: shown.append(motion.field))
+    monkeypatch.setattr(film_section, "film_page", lambda film, title: "")
+    monkeypatch.setattr(film_section, "playable_parts", lambda t: {"of": t.field})
+    start = start_of(UNITS)
+    for field in (None, start):
+        film_section._player(replace(trajectory, field=field), "t")
+
+    def of_other_weights(trajectory):
+        raise InputError("its weights are others")
+
+    monkeypatch.setattr(film_section, "playable_parts", of_other_weights)
+    film_section._player(replace(trajectory, field=start), "t")
+    assert shown == [None, {"of": start}, None]
 
 
 def test_names_are_escaped(trajectory, known_volumes):

@@ -99,6 +99,18 @@ def test_objects_are_matched_by_id_or_by_centre(tmp_path, two_balls):
     assert any("nearest centre" in note and "b = red ball" in note for note in facts["notes"])
 
 
+def test_objects_are_matched_by_their_centres_after_the_alignment(tmp_path, two_balls):
+    """The prediction is turned by half a turn and has other names and numbers."""
+    half = torch.diag(torch.tensor([-1.0, -1.0, 1.0]))
+    g, still = two_balls.gaussians, {"frames": 2, "spin": 0.0, "speed": 0.0}
+    other = renamed(replace(two_balls, gaussians=replace(g, object_id=torch.tensor([0, 2, 1])[g.object_id])), "ab")
+    write_motion(tmp_path / "true.h5", two_balls, **still)
+    write_motion(tmp_path / "mine.h5", transformed_scene(other, Similarity(2.0, half, torch.zeros(3))), **still)
+    facts = evaluate(tmp_path, align=True)
+    assert any("nearest centre" in note and "b = red ball" in note for note in facts["notes"])
+    assert facts["overall"]["FPE"] < 0.05
+
+
 @pytest.mark.parametrize("cameras", [True, False], ids=["cameras", "objects"])
 def test_align_inverts_a_similarity(tmp_path, two_balls, cameras):
     # A rotation about the vertical: two objects determine no other; cameras would determine any.

@@ -234,11 +234,12 @@ def _high_contrast(P: Float[np.ndarray, "t p 3"], W: Float[np.ndarray, "t p"], w
 
 def _nearest(P: Float[np.ndarray, "t p 3"], W: Float[np.ndarray, "t p"], Q: Float[np.ndarray, "s d"]) -> np.ndarray:
     """Index of the row of Q nearest to each patch, by squared distance weighted by W."""
-    squares, nearest = (Q * Q).T, []
+    squares = (Q * Q).reshape(len(Q), -1, 3).sum(2)
+    sources, nearest = np.concatenate([squares, -2 * Q], 1).T, []
     for i in range(0, len(P), 512):
-        weight = np.repeat(W[i : i + 512], 3, axis=1)
-        weighted = weight * P[i : i + 512].reshape(len(weight), -1)
-        nearest.append(np.argmin(weight @ squares - 2 * weighted @ Q.T, 1))
+        weight = W[i : i + 512]
+        weighted = (weight[..., None] * P[i : i + 512]).reshape(len(weight), -1)
+        nearest.append(np.argmin(np.concatenate([weight, weighted], 1) @ sources, 1))
     return np.concatenate(nearest)
 
 

@@ -210,9 +210,9 @@ def test_a_folder_gets_a_ply_file_for_each_frame(scene, tmp_path):
     motion, path = write_motion(tmp_path / "traj.h5", scene)
     folder = tmp_path / "frames"
     with pytest.raises(InputError, match="or an existing folder"):
-        run(path, folder, render_options(shadows="off"))
+        run(path, folder, render_options())
     folder.mkdir()
-    run(path, folder, render_options(shadows="off"))
+    run(path, folder, render_options())
     names = sorted(file.name for file in folder.iterdir())
     assert names == ["frame.ply.json", "frame_0000.ply", "frame_0001.ply", "frame_0002.ply"]
     for frame in range(3):
@@ -220,7 +220,7 @@ def test_a_folder_gets_a_ply_file_for_each_frame(scene, tmp_path):
         truth = deform(scene.gaussians, motion.binding, motion.keypoints, motion.positions[frame])
         torch.testing.assert_close(found.gaussians.means, truth.means, rtol=0, atol=1e-5)
         assert found.objects == scene.objects
-    run(path, tmp_path / "last.ply", render_options(frame=-1))
+    run(path, tmp_path / "last.ply", render_options(frame=-1, shadows="on"))
     last = read_scene(tmp_path / "last.ply").gaussians
     torch.testing.assert_close(last.means, truth.means, rtol=0, atol=1e-5)
     assert not torch.equal(last.sh, truth.sh)  # shaded

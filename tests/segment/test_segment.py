@@ -44,7 +44,7 @@ def write_masks(folder, scene, masks):
 def test_geometric_writes_labels_names_cameras_and_provenance(scene_file, truth, tmp_path, caplog):
     out = tmp_path / "labelled.ply"
     with caplog.at_level(logging.INFO):
-        run(scene_file, out, SegmentOptions(names="1=tower of jelly"))
+        run(scene_file, out, SegmentOptions(backend="geometric", names="1=tower of jelly"))
     labelled = read_scene(out)
     assert min(best_overlap(labelled.gaussians.object_id, truth.gaussians.object_id).values()) >= 0.9
     assert labelled.objects[0].name == "tower of jelly"
@@ -253,7 +253,7 @@ def test_invalid_options_are_refused(wrong, message):
 def test_empty_table_has_no_objects(truth, tmp_path, caplog):
     bare = replace(truth, gaussians=truth.gaussians[truth.gaussians.object_id == 0])
     write_scene(tmp_path / "bare.ply", bare)
-    run(tmp_path / "bare.ply", tmp_path / "out.ply")
+    run(tmp_path / "bare.ply", tmp_path / "out.ply", SegmentOptions(backend="geometric"))
     assert read_scene(tmp_path / "out.ply").objects == ()
     assert "no objects were found" in caplog.text
 

@@ -11,6 +11,7 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -131,9 +132,16 @@ def a_busy_user(n, state):
     }.get(n, [])
 
 
+@pytest.fixture(scope="module")
+def busy_session(world):
+    """Makes the session of a busy user, once for each engine."""
+    with pytest.MonkeyPatch.context() as patch:
+        yield cache(lambda engine: live_session(world, engine, patch, a_busy_user))
+
+
 @pytest.mark.parametrize("engine", ["ngff", "mpm", "rigid"])
-def test_a_record_repeats_the_motion_exactly(world, engine, monkeypatch):
-    live, keypoints, session, motion_of = live_session(world, engine, monkeypatch, a_busy_user)
+def test_a_record_repeats_the_motion_exactly(busy_session, engine):
+    live, keypoints, session, motion_of = busy_session(engine)
     record = ForcePrompts.from_dicts(json.loads(json.dumps(session.record)))
     assert torch.equal(live, motion_of(record))
     red = keypoints.object_id == 1
@@ -166,9 +174,9 @@ PAGE_SESSION = """async ([frames, actions]) => {
 
 
 @pytest.mark.usefixtures("device")
-def test_a_page_without_server_answers_alike(world, tmp_path, monkeypatch, open_page):
+def test_a_page_without_server_answers_alike(busy_session, tmp_path, open_page):
     """The same messages move the same objects, whether the engine or the page of a playable film takes them."""
-    live, *_ = live_session(world, "ngff", monkeypatch, a_busy_user)
+    live, *_ = busy_session("ngff")
     assert (page_session(tmp_path, open_page, a_busy_user) - live[-1]).norm(dim=1).max() < 1e-3
 
 

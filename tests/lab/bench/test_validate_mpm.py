@@ -10,6 +10,7 @@ from stages.lab import plot
 from stages.lab.bench import validate_mpm as validate
 
 
+@pytest.mark.slow
 def test_a_pressure_pulse_travels_at_the_speed_of_sound():
     # quadratic splines with 8 cells in its half width: dispersion of less than a percent
     start, *_, end = validate.pressure_pulse()
@@ -22,6 +23,7 @@ def test_the_frequency_of_a_bar_converges_with_the_square_of_the_spacing():
     assert math.log2(errors[0] / errors[1]) == pytest.approx(2, abs=0.3)
 
 
+@pytest.mark.slow
 def test_cantilever_sag_matches_timoshenko():
     # four cells in its height; the clamp is soft by a part of a cell, and 1 % of the length is 4 % of the sag
     measured, exact = validate.cantilever_deflection(0.3)
@@ -53,6 +55,7 @@ def test_motion_is_insensitive_to_the_substep():
     assert float((a - b).square().sum(1).mean().sqrt()) < 0.01 * motion
 
 
+@pytest.mark.slow
 def test_momentum_drift_over_ten_thousand_steps():
     steps, linear, angular = validate.momentum_drift()[-1]
     # rounding of 6e-8 a step: 6e-4 if always of one sign, 6e-6 if random

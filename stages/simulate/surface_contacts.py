@@ -218,8 +218,9 @@ class SurfaceContacts:
         return x, normal, depth, a[k], b[k]
 
     def _poses(self, data) -> tuple[np.ndarray, np.ndarray]:
-        """Rotations (o, 3, 3) and positions (o, 3) of the bodies."""
-        return data.xmat[1:].reshape(-1, 3, 3), data.xpos[1:]
+        """Rotations (o, 3, 3) and positions (o, 3) of the bodies; the model has others after them."""
+        end = len(self._path) + 1
+        return data.xmat[1:end].reshape(-1, 3, 3), data.xpos[1:end]
 
     def _beyond_planes(self, data, fixed: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Corners (k,), planes (k,), by their rows, and how far (k,) those are beyond these, more than at the start."""

@@ -27,6 +27,7 @@ from stages.core.geometry.neighbours import knn
 from stages.core.geometry.rotations import matrix
 from stages.core.kernels.threads import parallel_map
 from stages.core.perception.support import topples
+from stages.core.physics.morphology import dilated, eroded, opened, squared_distances, surrounded
 from stages.core.scene.cached import cached_in_scene
 from stages.core.scene.gaussians import Gaussians
 from stages.core.scene.scene import Scene
@@ -40,9 +41,6 @@ MAX_VOXELS_ALONG = 300  # maximum number of voxels along an object
 MAX_SURFACE_SAMPLES = 1_000_000  # maximum number of points sampled from the Gaussians of an object
 LEAK_RADII = (2, 3, 4, 5, 6, 8)  # half widths of the holes in shells that are closed [voxels]
 MIN_CAVITY_RATIO = 1.5  # minimum half width of a cavity relative to that of its leaks
-CROSS = ndimage.generate_binary_structure(3, 1)
-CUBE = np.ones((2, 2, 2), bool)
-SURROUNDINGS = np.ones((3, 3, 3), bool)
 
 
 @dataclass(frozen=True)
@@ -204,14 +202,14 @@ def _closed_body(
         bottom = int(np.flatnonzero(body.any((0, 1)))[0])
         body = np.flip(np.logical_or.accumulate(np.flip(body, 2), 2), 2)  # all voxels below the body
         body[:, :, :bottom] = False
-    thick = ndimage.binary_opening(body, CUBE)
+    thick = opened(body)
     thin = body & ~thick
-    fringe = thin & ndimage.binary_dilation(thick, SURROUNDINGS)  # what trimming left at edges, not a sheet
+    fringe = thin & surrounded(thick)  # what trimming left at edges, not a sheet
     body, thin = body & ~fringe, thin & ~fringe
     if thin.any():
-        body |= ndimage.binary_dilation(thin, CROSS)
+        body |= dilated(thin)
     while body.sum() < MIN_PARTICLES:
-        body = ndimage.binary_dilation(np.pad(body, 1), CROSS)
+        body = dilated(np.pad(body, 1))
         low = low - 1
     return body, low, extended
 
@@ -232,16 +230,16 @@ def _gap(points: np.ndarray) -> float:
 
 def _fill(shell: np.ndarray, gap: int, standing: bool) -> np.ndarray:
     """The shell with gaps closed and the enclosed volume filled; the floor closes the bottom of standing objects."""
-    wide = ndimage.binary_dilation(shell, CROSS, iterations=gap)
+    wide = dilated(shell, gap)
     layers = np.flatnonzero(shell.any((0, 1)))
     sealed = wide.copy()
     if standing:
         sealed[:, :, : layers[0] + 1] = True
     outside = _outside(~sealed)
     enclosed = ~(outside | sealed)
-    grown = ndimage.binary_dilation(enclosed, CROSS, iterations=gap) & wide if enclosed.any() else enclosed
-    closed = ndimage.binary_erosion(wide, CROSS, iterations=gap)
-    body = shell | closed | enclosed | (grown & ~ndimage.binary_dilation(outside, CROSS, iterations=gap))
+    grown = dilated(enclosed, gap) & wide if enclosed.any() else enclosed
+    closed = eroded(wide, gap)
+    body = shell | closed | enclosed | (grown & ~dilated(outside, gap))
     if not standing:
         return body | _cavities(body, LEAK_RADII)
     # gaps that closing just misses leak too, but a cloth on the floor has folds that look like cavities with wide leaks
@@ -261,16 +259,16 @@ def _cavities(walls: np.ndarray, leaks: Sequence[int]) -> np.ndarray:
     box = ndimage.find_objects(walls.view(np.uint8))[0]
     room = leaks[-1] + 1  # margin, so that leaks lead outside and the faces of the grid are free
     inner = np.pad(walls[box], room)
-    away = ndimage.distance_transform_edt(~inner)
+    away = squared_distances(inner, math.ceil(MIN_CAVITY_RATIO * leaks[-1]))
     filled = np.zeros_like(inner)
     for leak in leaks:
-        free, wide = away > leak, away >= MIN_CAVITY_RATIO * leak
+        free, wide = away > leak**2, away >= (MIN_CAVITY_RATIO * leak) ** 2
         outside = _outside(free)
         hollow = free & ~outside & ~filled
         if (hollow & wide).any():
             hollow = _components_with(hollow, wide)
             # grow back to the walls, but not through the leaks
-            filled |= _components_with(~inner & (ndimage.distance_transform_edt(~outside) > leak + 1), hollow)
+            filled |= _components_with(~inner & (squared_distances(outside, leak + 1) > (leak + 1) ** 2), hollow)
     out = np.zeros_like(walls)
     out[box] = filled[room:-room, room:-room, room:-room]
     return out
@@ -311,8 +309,8 @@ def _trim(body: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 def _thick_skin(body: np.ndarray) -> np.ndarray:
     """The outermost voxels where the body is at least five voxels thick."""
-    core = ndimage.binary_erosion(body, CROSS, iterations=2)
-    return body & ~ndimage.binary_erosion(body, CROSS) & ndimage.binary_dilation(core, CROSS, iterations=3)
+    core = eroded(body, 2)
+    return body & ~eroded(body) & dilated(core, 3)
 
 
 def _largest(body: np.ndarray) -> np.ndarray:

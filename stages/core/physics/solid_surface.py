@@ -12,6 +12,7 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
+from stages.core.physics.morphology import surrounded
 from stages.core.physics.particles import filled_voxels, inliers, usable
 from stages.core.scene.cached import cached_in_scene
 from stages.core.scene.scene import Scene
@@ -21,7 +22,6 @@ MOST_ALONG = 96  # of one that is larger than the others, so that it is as accur
 BARE = 3.0  # distance to the samples beyond which faces of voxels are added [voxels], which are a third of the spacing
 NEAREST = 8  # samples that give a distance, of which those count
 SAME_FACE = 0.8  # whose normals have at least this cosine to that of the nearest one
-AROUND = np.ones((3, 3, 3), bool)
 STEPS = np.concatenate([np.eye(3, dtype=np.int64), -np.eye(3, dtype=np.int64)])
 
 
@@ -75,12 +75,12 @@ class SolidSurface:
 
         Those are the ones inside, and in sheets thinner than a voxel those of the coarse body.
         """
-        near = ndimage.binary_dilation(self._full, AROUND)
+        near = surrounded(self._full)
         x = (np.argwhere(near) + self._low + 0.5) * self.h
         depth = self.depth(x)
         inside = np.zeros_like(near)
         inside[near] = depth >= 0
-        inside |= self._full & ~ndimage.binary_dilation(inside, AROUND)
+        inside |= self._full & ~surrounded(inside)
         return x, depth, inside[near]
 
     def samples(self) -> tuple[np.ndarray, np.ndarray]:

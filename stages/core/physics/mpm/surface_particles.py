@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from scipy import ndimage
 
+from stages.core.physics.morphology import surrounded
 from stages.core.physics.particles import Bodies
-from stages.core.physics.solid_surface import AROUND, SolidSurface, solid_surface
+from stages.core.physics.solid_surface import SolidSurface, solid_surface
 from stages.core.scene.scene import Scene
 
 MIN_FRACTION = 0.1  # filled fraction of a voxel below which it has no particle
@@ -48,10 +48,10 @@ def _filled(voxels: np.ndarray, refinement: int, h: float, surface: SolidSurface
     for axis in range(3):
         body = body.repeat(refinement, axis)
     low = low * refinement
-    near = ndimage.binary_dilation(body, AROUND, iterations=refinement)
+    near = surrounded(body, refinement)
     depth = np.full(body.shape, -np.inf)
     depth[near] = surface.depth((np.argwhere(near) + low + 0.5) * h) / h
-    thick = ndimage.binary_dilation(depth > THICK, AROUND, iterations=2 + refinement)
+    thick = surrounded(depth > THICK, 2 + refinement)
     fraction = np.where(thick, (depth + 0.5).clip(0, 1), body)
     fraction[fraction < MIN_FRACTION] = 0
     cells = np.argwhere(fraction)

@@ -28,8 +28,9 @@ gc.disable()  # until the tests are collected: the millions of objects of import
 
 
 def pytest_collection_finish() -> None:
-    """From here on garbage is collected again, without a look at what is there already."""
+    """From here on garbage is collected again, seldom and without a look at what is there already."""
     gc.freeze()
+    gc.set_threshold(100_000, 20, 20)
     gc.enable()
 
 

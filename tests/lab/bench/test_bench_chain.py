@@ -38,6 +38,6 @@ def test_functions_and_commands_are_the_same_stages(tmp_path, refine):
     assert (str(tmp_path / "refined.ply") in lines["simulate"]) == refine
 
 
-def test_a_failing_command_is_named(tmp_path):
-    with pytest.raises(InputError, match="ngff segment failed: .*no such file"):
-        chain._command_seconds(["segment", str(tmp_path / "none.ply"), "-o", str(tmp_path / "out.ply")])
+def test_a_failing_command_is_named():
+    with pytest.raises(InputError, match="(?s)ngff segment failed: .*No such option: --colour"):
+        chain._command_seconds(["segment", "--colour"])  # refused before the stage is imported

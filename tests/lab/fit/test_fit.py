@@ -16,11 +16,11 @@ from stages.core.scene.scene_ply import read_scene, write_scene
 from stages.core.scene.trajectory import TrajectoryWriter, read_trajectory
 from stages.lab.bench.physics_experiments import Run, ball, block
 from stages.lab.fit import search
-from stages.lab.fit.fit import solve, with_initial
+from stages.lab.fit.fit import Fit, _command, solve, with_initial
 from stages.lab.fit.options import MaterialFitOptions
 from stages.lab.fit.parameters import fitted, material_parameters, velocity_parameters
 from stages.lab.fit.problem import estimate_noise, pose_problem, read_problem
-from stages.lab.fit.search import Estimate, _evolve, simulations
+from stages.lab.fit.search import PRIOR, Estimate, _evolve, descend, narrowed, simulations
 from stages.simulate.options import SimulateOptions
 from stages.simulate.stage import run as simulate
 from tests.conftest import CliRunner
@@ -59,10 +59,10 @@ def bounce(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def slide_fit(slide, device):
-    """The fit of the slide, made by the command; what that prints, and its file of materials."""
-    fits, out = [], slide / "m.json"
-    words = ["fit", slide / "scene.ply", slide / "track.h5", "-o", out, "--workers", 1, "--keypoints", 16,
+def bounce_fit(bounce, device):
+    """The fit of the bounce, made by the command; what that prints, and its file of materials."""
+    fits, out = [], bounce / "m.json"
+    words = ["fit", bounce / "scene.ply", bounce / "track.h5", "-o", out, "--workers", 1, "--keypoints", 16,
              "--evaluations", OPTIONS.evaluations, "--device", device]  # fmt: skip
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("stages.lab.fit.fit.solve", lambda *problem: fits.append(solve(*problem)) or fits[0])
@@ -76,8 +76,10 @@ def of(fit, name):
     return [p.name for p in fit.problem.parameters].index(name)
 
 
-def test_a_slide_shows_friction_and_nothing_of_the_rebound(slide_fit):
-    fit, *_ = slide_fit
+@pytest.mark.slow
+def test_a_slide_shows_friction_and_nothing_of_the_rebound(slide, device):
+    problem = read_problem(slide / "scene.ply", slide / "track.h5", OPTIONS)
+    fit = solve(problem, OPTIONS)
     assert fit.problem.options.engine == "rigid"
     assert fit.problem.noise == pytest.approx(NOISE, rel=0.1)
     for name, true in (("friction", 0.3), ("x", 2.0), ("y", 0.5)):
@@ -89,22 +91,44 @@ def test_a_slide_shows_friction_and_nothing_of_the_rebound(slide_fit):
     assert materials[1].loss == pytest.approx(fit.problem.materials[1].loss)  # as the search started
 
 
-def test_a_rebound_shows_the_loss_factor_and_nothing_of_friction(bounce, device):
-    fit = solve(read_problem(bounce / "scene.ply", bounce / "track.h5", OPTIONS), OPTIONS)
+def test_friction_is_found_from_near_and_its_uncertainty_is_small(slide, device):
+    """By Levenberg and Marquardt's method alone; the slide shows nothing of the rebound."""
+    problem = read_problem(slide / "scene.ply", slide / "track.h5", OPTIONS)
+    true = {"friction": 0.3, "loss": problem.materials[1].loss, "x": 2.0, "y": 0.5}
+    exact = np.array([p.coordinate(true[p.name]) for p in problem.parameters])
+    with simulations(problem, 1) as sims:
+        near = Estimate(exact + [0.05, 0.0, 0.02, -0.02], np.diag([0.05, 0.05, 0.02, 0.02]))
+        x = descend(sims, len(problem.track), near, sims.noise)
+        known = narrowed(sims, len(problem.track), Estimate(x, near.root), sims.noise)
+    found = dict(zip(true, [p.value(v) for p, v in zip(problem.parameters, x, strict=True)], strict=True))
+    assert found["friction"] == pytest.approx(0.3, abs=0.025) and found["x"] == pytest.approx(2.0, abs=0.05)
+    friction, loss, *_ = known.deviations
+    assert friction < 0.02 and loss > 0.9 * PRIOR
+
+
+def test_a_rebound_shows_the_loss_factor_and_nothing_of_friction(bounce_fit):
+    fit, *_ = bounce_fit
     k = of(fit, "loss")
     assert fit.is_identifiable(k) and abs(fit.value(k) - 0.35) < 2 * fit.half_width(k) < 0.05
     assert not fit.is_identifiable(of(fit, "friction"))
     assert len(fit.problem.parameters) == 2  # neither a velocity, as it is released from rest, nor a density
 
 
-def test_the_command_writes_materials_that_simulate_takes(slide, slide_fit):
-    _, printed, out = slide_fit
-    assert "not identifiable from the motion: loss" in printed
-    chosen = choose_materials(read_scene(slide / "scene.ply").objects, file=out)
-    assert chosen[1].material.friction == pytest.approx(0.3, abs=0.01)
+def test_the_command_writes_materials_that_simulate_takes(bounce, bounce_fit):
+    _, printed, out = bounce_fit
+    assert "not identifiable from the motion: friction" in printed
+    chosen = choose_materials(read_scene(bounce / "scene.ply").objects, file=out)
+    assert chosen[1].material.loss == pytest.approx(0.35, abs=0.05)
     rows = json.loads(out.with_suffix(".fit.json").read_text())["parameters"]
-    assert [row["quantity"] for row in rows if row["identifiable"]] == ["friction", "x", "y"]
-    assert f"--materials {out} --velocity" in printed
+    assert [row["quantity"] for row in rows if row["identifiable"]] == ["loss"]
+    assert f"--materials {out} --lift 1=0.2" in printed
+
+
+def test_the_command_that_repeats_the_motion_has_the_velocity(slide):
+    problem = read_problem(slide / "scene.ply", slide / "track.h5", OPTIONS)
+    fit = Fit(problem, np.zeros(4), np.zeros(4), np.zeros(4), (0.0, 0.0), 0, 0.0)
+    words = _command(slide / "scene.ply", slide / "m.json", fit, {1: (2.0, 0.5, 0.0)})
+    assert words.endswith(f'--materials {slide / "m.json"} --velocity "object=1 2,0.5,0"')
 
 
 @pytest.mark.skipif(find_spec("cma") is None, reason="cma is not installed")

@@ -38,7 +38,7 @@ from stages.lab.track.synthesis import _palette
 from stages.lab.track.track import report, run
 from tests.conftest import CliRunner, two_balls_scene
 
-SMALL = StandInOptions(objects=2, cameras=4, width=160, frames=7, hidden=0, seed=8)
+SMALL = StandInOptions(objects=2, cameras=4, width=160, frames=5, hidden=0, seed=8)
 LATE = (0.2, -0.2, 0.1, -0.1)  # of the films' times in the scene file [frames]
 
 
@@ -85,7 +85,7 @@ def test_times_of_the_films_are_corrected(small, tracked):
 
 
 def test_every_object_has_a_line(tracked):
-    assert tracked[1].count("seen in 7 of 7 frames") == 2
+    assert tracked[1].count("seen in 5 of 5 frames") == 2
 
 
 def test_evaluate_takes_the_track_as_truth(small, tracked):

@@ -10,6 +10,7 @@ import torch
 from stages.core.errors import InputError
 from stages.core.geometry.cameras import project
 from stages.core.perception.grabcut import clean_mask
+from stages.core.perception.voting import ViewFootprint
 from stages.core.scene.scene import Scene
 from stages.segment import boxes
 from stages.segment.boxes import MAX_VIEWS, nearest_first, segment, segment_prompted_view
@@ -18,6 +19,8 @@ from stages.segment.prompted import segment_with
 from stages.segment.prompts import read_prompts
 from tests.conftest import random_gaussians
 from tests.segment.tabletop import WOOD, block, egg, orbit_cameras, scene_of, table_gaussians, three_apart
+
+NOTHING = np.zeros((8, 16), np.int64)  # labels of a view
 
 
 def prompts_of(path, scene, numbers, grow=1.0):
@@ -101,6 +104,32 @@ def test_what_continues_beside_a_box_on_any_side_is_not_likely(turns, monkeypatc
     segment_prompted_view(np.rot90(picture, turns).copy(), torch.tensor([[0.3, 0.3, 0.7, 0.7]]), 0)
     found = np.rot90(likely[0], -turns)
     assert found[26:54, 26:48].all() and not found[37:43, 51:56].any()
+
+
+def test_boxes_are_in_pixels_of_the_first_view(tmp_path, monkeypatch):
+    """The other views have other sizes."""
+    cameras = orbit_cameras(2)
+    cameras = replace(cameras, sizes=torch.tensor([[160, 80], [40, 30]]))
+    (tmp_path / "p.json").write_text('{"bbox": [[16, 8, 80, 40]]}')
+    fractions = []
+    monkeypatch.setattr(boxes, "segment_prompted_view", lambda image, box, seed: fractions.append(box) or NOTHING)
+    monkeypatch.setattr(boxes, "segment_next_view", lambda image, footprint, votes, seed: NOTHING)
+    segment(Scene(random_gaussians(5), cameras=cameras), SegmentOptions(boxes=tmp_path / "p.json"))
+    torch.testing.assert_close(fractions, [torch.tensor([[0.1, 0.1, 0.5, 0.5]])])
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_another_view_starts_from_the_labels_of_its_front_most_gaussians(first, monkeypatch):
+    """Of two, one of the object and one of the background; the sky has none."""
+    monkeypatch.setattr(boxes, "grabcut", lambda image, unlikely, likely, sure, seed: sure)
+    front = torch.full((30, 40), -1, dtype=torch.int32)
+    front[10:, :20], front[10:, 20:] = first, 1 - first
+    none = torch.zeros(0, dtype=torch.int64)
+    footprint = ViewFootprint(front, none, none, torch.zeros(0), 2, torch.zeros(30, 40, 3))
+    votes = torch.tensor([[5.0, 0.0], [5.0, 0.0]])
+    votes[first] = torch.tensor([0.0, 3.0])
+    labels = boxes.segment_next_view(np.zeros((30, 40, 3), np.uint8), footprint, votes, 0)
+    assert (labels[12:, :18] == 1).all() and not labels[:10].any() and not labels[:, 20:].any()
 
 
 def test_small_pieces_and_small_holes_are_removed():

@@ -17,6 +17,7 @@ from stages.core.physics.particles import Bodies
 from stages.core.scene.gaussians import concatenate
 from stages.core.scene.scene import Scene, SceneObject
 from stages.lab.assets.shapes import box, to_gaussians
+from stages.simulate import rigid
 from stages.simulate.learned import _starts_awake, _woken
 from stages.simulate.mpm import _change, _PromptedForce
 from stages.simulate.options import ENGINES, QUALITIES, MpmQuality, SimulateOptions
@@ -63,6 +64,27 @@ def test_a_denser_material_slows_a_push_and_a_pin_stops_a_body(apart, engine):
     assert float(speed[5:, 1, :2].abs().max()) < 0.01  # a released body starts from rest
     fall = (speed[13, :, 2] - speed[10, :, 2]) / (3 * DT)
     assert fall.tolist() == pytest.approx([-2.0, -2.0], rel=0.03)
+
+
+def test_what_rests_in_photos_moves_when_its_material_or_gravity_changes(apart, monkeypatch):
+    """What holds the balls is not seen. Ball 1 gets another material at .04 s, which has it fall; later both fall."""
+    monkeypatch.setattr(rigid, "from_photos", lambda scene: True)
+    changes = Change("material", "rubber", 0.04, 1), Change("gravity", 5.0, 0.1)
+    z = torch.stack([s.com[:, 2] for s in frames(apart, ForcePrompts(changes=changes), engine="rigid", steps=9)])
+    fallen = (z < z[0] - 1e-4).T.tolist()
+    assert fallen == [[False] * 3 + [True] * 6, [False] * 6 + [True] * 3]
+
+
+def test_a_ball_rebounds_by_the_loss_of_the_material_that_it_has_become(apart):
+    """From the floor, without gravity; of another material from the start, it rebounds alike."""
+    speeds = {}
+    steel = Change("material", "steel", 0.04, 1)
+    for name, given, changes in (("before", (), ()), ("after", ("1=steel",), ()), ("changed", (), (steel,))):
+        prompts = ForcePrompts(velocity={1: (0.0, 0.0, -8.0)}, changes=changes)
+        z = [float(s.com[0, 2]) for s in frames(apart, prompts, engine="rigid", gravity=0.0, steps=9, material=given)]
+        speeds[name] = (z[8] - z[7]) / DT
+    assert speeds["changed"] == pytest.approx(speeds["after"], rel=0.02)
+    assert speeds["after"] > 1.2 * speeds["before"] > 0
 
 
 @pytest.mark.parametrize("engine", ["rigid", "mpm", "ngff"])

@@ -7,6 +7,7 @@ from stages.core.kernels.mpm.grid import BLOCK
 from stages.core.physics.mpm.domain import Box
 from stages.core.physics.mpm.solver import ParticleMaterial, at_rest, join_particles
 from stages.core.scene.scene import SceneObject
+from stages.simulate import moving_grid
 from stages.simulate.moving_grid import MARGIN, GridBodies, MovingGrid
 
 DX, DT, STEPS = 0.05, 0.02, 20
@@ -44,3 +45,15 @@ def test_a_grid_that_follows_changes_nothing_and_keeps_its_margin(device, sign):
     assert 2 <= len(boxes) <= 3  # each new one has room for ten frames
     moved = (torch.tensor(moving.box.low) - torch.tensor(small.low))[:2] / (BLOCK * DX)
     torch.testing.assert_close(moved, moved.round(), rtol=0, atol=1e-3)  # on the same lattice
+
+
+def test_what_flies_away_is_the_object_farthest_from_the_others(device, monkeypatch, caplog):
+    """Not the one farthest from the origin."""
+    monkeypatch.setattr(moving_grid.mpm, "max_contact_nodes", lambda device: 40_000)
+    particles = join_particles([cube((x, 2.0, 0.5), (-v, 0.0, 0.0)) for x, v in ((2.0, 0), (0.8, 20), (2.3, 0))])
+    objects = (*OBJECTS[1:], OBJECTS[0], SceneObject(3, "third"))
+    bodies = GridBodies(torch.arange(3).repeat_interleave(27), objects)
+    moving = MovingGrid(particles, Box((0.4, 1.5, 0.0), (2.8, 2.5, 1.0)), DX, device, bodies, fixed=False)
+    moving.advance(DT, torch.zeros(81, 3))
+    assert "object 1 (fast) moves too far from the other objects" in caplog.text
+    assert moving.box.low == (0.4, 1.5, 0.0)  # and it stays there

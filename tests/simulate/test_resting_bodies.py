@@ -104,8 +104,11 @@ def test_what_rests_on_a_released_body_is_released_with_it():
 
 
 def test_what_touches_nothing_rests_on_the_highest_body_below_it():
-    _, _, resting = world([(0, 0, 0.1, 0.1), (0.08, 0, 0.35, 0.1), (0, 0.08, 0.6, 0.05), (2.0, 0, 0.6, 0.1)])
+    boxes = [(0, 0, 0.1, 0.1), (0.08, 0, 0.35, 0.1), (0, 0.08, 0.6, 0.05), (2.0, 0, 0.6, 0.1)]
+    _, _, resting = world(boxes)
     assert resting.resting_on == {1: {2}, 2: {3}} and sorted(resting.release([1])) == [1, 2, 3]
+    _, _, resting = world(boxes[::-1])
+    assert resting.resting_on == {4: {3}, 3: {2}} and sorted(resting.release([4])) == [2, 3, 4]
 
 
 def test_held_bodies_are_put_back_and_collide_only_with_what_moves():

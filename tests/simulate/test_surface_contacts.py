@@ -26,13 +26,17 @@ def ball(radius: float, convex: bool = False, count: int = 2000) -> SurfaceShape
 
 
 class Pair:
-    """Two balls of radii .1 and .2, of which MuJoCo knows only their middles, at a distance along x over a plane."""
+    """Two balls of radii .1 and .2, of which MuJoCo knows only their middles, at a distance along x over a plane.
 
-    def __init__(self, distance: float, convex: bool = False):
+    The first is at `x`; `others` are at these places along x.
+    """
+
+    def __init__(self, distance: float, convex: bool = False, x: float = 0.0, others: tuple = ()):
+        self.x = x
         spec = mujoco.MjSpec()
         spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-        for k, x in enumerate((0.0, distance)):
-            body = spec.worldbody.add_body(pos=[x, 0, 0])
+        for k, at in enumerate((x, x + distance, *others)):
+            body = spec.worldbody.add_body(pos=[at, 0, 0])
             body.add_freejoint()
             body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.001, 0, 0], friction=[0.1 + 0.2 * k, 0, 0],
                           solref=[-1000, -10.0 - k])  # fmt: skip
@@ -41,17 +45,17 @@ class Pair:
         self.model = spec.compile()
         self.data = mujoco.MjData(self.model)
         mujoco.mj_fwdPosition(self.model, self.data)
-        shapes = [ball(0.1, convex), ball(0.2, convex)]
+        shapes = [ball(0.1, convex), ball(0.2, convex), *(ball(0.1, convex) for _ in others)]
         self.contacts = SurfaceContacts(mujoco, self.model, self.data, shapes)
 
     def found(self, distance: float, substeps: int = 1, fixed: bool = False, height: float = 0.0):
         """The contacts after substeps at a distance, to which the second ball moves at once, and both to a height."""
         for _ in range(substeps):
-            self.data.qvel[6] = abs(distance - self.data.qpos[7]) / self.model.opt.timestep
-            self.data.qpos[7] = distance
+            self.data.qvel[6] = abs(self.x + distance - self.data.qpos[7]) / self.model.opt.timestep
+            self.data.qpos[7] = self.x + distance
             self.data.qpos[[2, 9]] = height
             mujoco.mj_fwdPosition(self.model, self.data)
-            self.contacts.add(self.data, np.array([True, fixed, fixed]))
+            self.contacts.add(self.data, np.array([True] + [fixed] * (self.model.nbody - 1)))
             mujoco.mj_makeConstraint(self.model, self.data)
         return self.data.contact
 
@@ -69,6 +73,16 @@ def test_depth_and_direction_of_contacts_between_balls():
     np.testing.assert_allclose(contact.friction[:, 0], 0.3)
     np.testing.assert_allclose(contact.solref[:, 1], -11.0)
     assert (contact.efc_address >= 0).all()
+
+
+def test_distances_are_those_of_each_pair():
+    """Away from the origin, with a third ball far away before and behind."""
+    alone = Pair(0.5).found(0.28)
+    for others in ((-5.0,), (9.0,)):
+        pair = Pair(0.5, x=3.0, others=others)
+        contact = pair.found(0.28)
+        assert pair.contacts._path == pytest.approx([0.0, 0.22, 0.0])  # only the second one has moved
+        assert contact.dist.min() == pytest.approx(alone.dist.min(), abs=1e-9) and len(contact.dist) == len(alone.dist)
 
 
 def test_of_contacts_side_by_side_only_the_deepest_takes_part():
@@ -143,6 +157,18 @@ def test_voxels_around_a_symmetric_body_are_symmetric():
     kept = {tuple(c) for c in cells[inside]}
     assert kept == {tuple(np.round((p) / 0.1).astype(int)) for p in slab}
     assert (depth[inside] > 0).all() and depth.max() == pytest.approx(0.25, abs=0.02)
+
+
+def test_a_tangent_plane_continues_as_far_as_its_samples_are_apart():
+    """Samples .4 voxels above the voxels' top, on its left half: to the right that of the voxels counts."""
+    line = 0.1 * np.arange(-9, 10)
+    slab = np.stack(np.meshgrid(line, line, line[7:-7], indexing="ij"), -1).reshape(-1, 3)
+    x, y = np.meshgrid(np.arange(-0.94, 0.0, 0.03), np.arange(-0.94, 0.95, 0.03))
+    top = slab[:, 2].max() + 0.1
+    points = np.stack([x.ravel(), y.ravel(), np.full(x.size, top + 0.04)], 1)
+    body = SolidSurface(slab + 0.05, 0.1, points)
+    at = np.array([[-0.5, 0.0, top], [-0.5, 0.2, top + 0.1], [0.13, 0.0, top], [0.15, 0.2, top + 0.05]])
+    np.testing.assert_allclose(body.depth(at), [0.04, -0.06, 0.0, -0.05], atol=0.004)
 
 
 def bumpy(side: float, height: float, bump: float) -> Surface:

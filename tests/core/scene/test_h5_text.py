@@ -6,7 +6,7 @@ import h5py
 import numpy as np
 import pytest
 
-from stages.core.scene.h5_schema import MAX_CHUNK, Dataset, open_h5
+from stages.core.scene.h5_schema import Dataset, open_h5
 from stages.core.scene.h5_text import check_attributes, check_texts
 
 NAMES = ["", "duck", "bowl ä", "x" * 300, "y"]
@@ -148,7 +148,7 @@ def test_a_header_that_continues_in_itself_or_outside_the_file_is_refused(tmp_pa
 
 @pytest.mark.parametrize("options", [{}, {"compression": "gzip"}, {"compression": "lzf"}])
 def test_a_chunk_of_gigabytes_is_refused(tmp_path, options):
-    side = MAX_CHUNK // 4 + 1
+    side = (64 << 20) // 4 + 1  # floats of 64 MiB, and one more
     with h5py.File(tmp_path / "a.h5", "w") as file:
         properties = {"maxshape": (None,), "chunks": (side,), **options}
         file.create_dataset("x", (3,), "f4", **properties)

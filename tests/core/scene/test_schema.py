@@ -76,6 +76,16 @@ def test_lists_of_users_are_bounded(monkeypatch):
         rows([1, 2, 3], "r")
 
 
+def test_no_list_has_more_than_a_million_values_and_no_json_file_more_than_256_mib(tmp_path):
+    assert len(rows([0] * 10**6, "r")) == 10**6
+    with pytest.raises(ValueError, match="not a list of at most 1000000 values"):
+        rows([0] * (10**6 + 1), "r")
+    with open(tmp_path / "a.json", "wb") as file:
+        file.truncate((256 << 20) + 1)
+    with pytest.raises(ValueError, match="it has 256 MB; at most 256 are read"):
+        read_json(tmp_path / "a.json")
+
+
 def test_quoted_text_is_cut_at_its_limit():
     assert quote("a" * 80) == "a" * 80 and quote("a" * 81) == "a" * 77 + "..."
     assert quote("abcdef", 5) == "ab..." and quote("abcde", 5) == "abcde"

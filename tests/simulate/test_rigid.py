@@ -15,11 +15,17 @@ from stages.core.scene.scene import Scene, SceneObject
 from stages.core.scene.scene_ply import write_scene
 from stages.core.scene.trajectory import read_trajectory
 from stages.lab.assets.shapes import Surface, box, ellipsoid, to_gaussians, union
-from stages.simulate.options import SimulateOptions
+from stages.simulate.options import QUALITIES, MpmQuality, SimulateOptions
 from stages.simulate.stage import run
 from tests.simulate.motion import Motion, roll_out
 
 G = 9.81
+
+
+@pytest.fixture(autouse=True)
+def few_particles(monkeypatch):
+    """Those of a body decide on whether it stands on the floor; its mass and contacts have other sources."""
+    monkeypatch.setitem(QUALITIES, "draft", MpmQuality(particles=1200, step=0.015))
 
 
 @cache

@@ -1,9 +1,51 @@
-"""While tests run, `jaxtyping` checks the shapes in annotations, if `beartype` is installed."""
+"""While tests run, `jaxtyping` checks the shapes in annotations, if `beartype` is installed.
 
+Of the calls of a function in one test the first are checked and then every so many: checks of all of them would take a
+third of the time of a simulation. Functions within functions count as one, however often they are made.
+"""
+
+from collections import Counter
+from collections.abc import Callable
+from functools import wraps
 from importlib.util import find_spec
+from types import CodeType
 
-from jaxtyping import install_import_hook
+import jaxtyping
+
+FIRST, EVERY = 10, 20  # calls
+calls: Counter[CodeType] = Counter()  # in this test
+made: Counter[CodeType] = Counter()  # functions within functions, in this test
+check_all = jaxtyping.jaxtyped
+
+
+def _is_sampled(count: int) -> bool:
+    return count <= FIRST or count % EVERY == 0
+
+
+def check_some(*, typechecker: Callable) -> Callable:
+    """Instead of `jaxtyping.jaxtyped`, which decorates the functions and classes of the modules that are checked."""
+
+    def decorate(function):
+        if isinstance(function, type):
+            return check_all(function, typechecker=typechecker)
+        code = function.__code__
+        if "<locals>" in function.__qualname__:
+            made[code] += 1
+            if not _is_sampled(made[code]):
+                return function
+        checked = check_all(function, typechecker=typechecker)
+
+        @wraps(function)
+        def call(*args, **options):
+            calls[code] += 1
+            return (checked if _is_sampled(calls[code]) else function)(*args, **options)
+
+        return call
+
+    return decorate
+
 
 if find_spec("beartype"):
-    checked = [f"stages.core.{folder}" for folder in ("geometry", "scene", "physics", "models")]
-    install_import_hook(checked, "beartype.beartype")
+    jaxtyping.jaxtyped = check_some
+    folders = [f"stages.core.{folder}" for folder in ("geometry", "scene", "physics", "models")]
+    jaxtyping.install_import_hook(folders, "beartype.beartype")

@@ -15,6 +15,7 @@ from stages.core.geometry.cameras import intrinsics, orbit
 from stages.core.scene.cameras import Cameras
 from stages.core.scene.gaussians import Gaussians, concatenate
 from stages.core.scene.scene import Scene, SceneObject
+from tests import calls, made
 from tests.browser import chromium, open_page  # noqa: F401 -- fixtures
 from tests.chat_server import chat_server  # noqa: F401 -- a fixture
 from tests.firefox import open_firefox  # noqa: F401 -- fixture
@@ -69,6 +70,8 @@ class CliRunner(testing.CliRunner):
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_setup():
+    calls.clear()
+    made.clear()
     with skipped_without_package():
         return (yield)
 

@@ -1,0 +1,28 @@
+"""Shapes in annotations are checked while tests run: first, and from time to time."""
+
+from importlib.util import find_spec
+
+import pytest
+import torch
+from jaxtyping import TypeCheckError
+
+from stages.core.geometry.rotations import matrix
+from tests import EVERY, FIRST
+
+pytestmark = pytest.mark.skipif(find_spec("beartype") is None, reason="beartype is not installed")
+UNIT, WRONG = torch.tensor([1.0, 0, 0, 0]), torch.zeros(3)
+
+
+def test_the_first_calls_and_some_of_the_others_are_checked():
+    for _ in range(FIRST):
+        with pytest.raises(TypeCheckError):
+            matrix(WRONG)
+    for _ in range(FIRST + 1, EVERY):
+        matrix(UNIT)
+    with pytest.raises(TypeCheckError):
+        matrix(WRONG)
+
+
+def test_counts_begin_with_the_test():
+    with pytest.raises(TypeCheckError):
+        matrix(WRONG)

@@ -4,6 +4,8 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 # half as many again as processors, since tests that drive a browser wait for it
 WORKERS ?= $(shell $(PYTHON) -c 'import os; print(len(getattr(os, "sched_getaffinity", lambda _: range(os.cpu_count()))(0)) * 3 // 2 or 1)')
+# threads that wait do not spin, compiled modules are kept, and a worker runs files as a whole for as long as others do
+PYTEST := OMP_NUM_THREADS=1 OMP_WAIT_POLICY=PASSIVE PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest --dist worksteal
 
 .PHONY: setup demo test test-slow test-all test-gpu lint clean
 
@@ -18,10 +20,10 @@ demo: setup
 	$(MAKE) -C examples/falling_toys NGFF=$(abspath $(BIN))/ngff
 
 test: setup
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) -m "not slow"
+	$(PYTEST) -n $(WORKERS) -m "not slow"
 
 test-slow: setup
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto -m slow
+	$(PYTEST) -n auto -m slow
 
 test-all: test test-slow
 

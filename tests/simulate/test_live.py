@@ -332,6 +332,18 @@ def test_hostile_clients_are_closed_and_others_go_on(server):
     assert eventually(lambda: server.clients == 0)
 
 
+def test_a_message_that_is_too_long_ends_the_connection_before_it_is_read(server):
+    with client(server) as page:
+        page.recv(timeout=5)
+        page.send('{"do": "drawn"}'.ljust(2048))
+        server.publish(b"frame")
+        assert page.recv(timeout=5) == b"frame"
+        page.send('{"do": "drawn"}'.ljust(2049))
+        with pytest.raises(exceptions.ConnectionClosed) as closed:
+            page.recv(timeout=5)
+        assert closed.value.rcvd.code == 1009
+
+
 def test_two_hundred_connections_leave_nothing_behind(server):
     before = len(os.listdir("/proc/self/fd")) if Path("/proc/self/fd").exists() else 0
 

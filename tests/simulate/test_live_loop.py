@@ -3,14 +3,17 @@
 import json
 import struct
 from contextlib import ExitStack
+from pathlib import Path
 from types import SimpleNamespace
 
+import h5py
 import pytest
 import torch
 
 from stages.core.errors import InputError
 from stages.core.physics.forces import ForcePrompts
 from stages.core.physics.keypoints import bind_gaussians, choose_keypoints
+from stages.core.physics.materials import MATERIALS, MaterialChoice
 from stages.core.physics.state import FrameState
 from stages.core.scene.trajectory import SimulationInfo, TrajectoryWriter, read_trajectory
 from stages.simulate.live import loop
@@ -147,6 +150,31 @@ def test_what_the_user_does_is_recorded_and_saved_copies_are_numbered(play):
     whole = read_trajectory(played.out)
     assert len(whole) == played.header["frames"] and whole.info.forces[0]["what"] == "pinned"
     torch.testing.assert_close(whole.positions[-1], played.sent[-1][1])
+
+
+def test_the_recording_is_on_the_disk_within_a_second(play):
+    played = play()
+    played.go_on(1.2)
+    with h5py.File(played.writer.part) as file:
+        assert len(file["keypoints/positions"]) == pytest.approx(1 / DT, abs=2)
+
+
+def test_the_page_begins_with_the_scene_at_rest(still, monkeypatch):
+    scene, keypoints, binding = still
+    films = []
+    monkeypatch.setattr(loop, "pack_film", lambda world, motion, settings, shadows: films.append((motion, settings)))
+    monkeypatch.setattr(loop, "film_page", lambda film, title: title)
+    monkeypatch.setattr(loop, "find_shadows", lambda world, keypoints: None)
+    options = SimulateOptions(dt=DT, keypoints=16, engine="rigid", gravity=3.0)
+    live = loop.LiveScene(scene, keypoints, ForcePrompts(), options, None)
+    materials = {o.id: MaterialChoice(f"m{o.id}", MATERIALS["wood"]) for o in scene.objects}
+    assert loop._page(live, binding, SimpleNamespace(materials=materials), Path("a/traj.h5")) == "traj live"
+    ((motion, settings),) = films
+    assert torch.equal(motion.positions, keypoints.rest[None]) and motion.dt == DT
+    assert motion.com.shape == (1, 2, 3) and motion.rotation.shape == (1, 2, 4)
+    live = settings["live"]
+    assert (live["dt"], live["gravity"], live["engine"], live["out"]) == (DT, 3.0, "rigid", "a/traj.h5")
+    assert live["material"] == {1: "m1", 2: "m2"}
 
 
 def test_a_push_acts_for_a_frame_and_its_arrow_is_shown_for_two_fifths_of_a_second(play):

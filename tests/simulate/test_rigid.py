@@ -5,7 +5,9 @@ import logging
 import math
 from functools import cache, partial
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 
@@ -16,6 +18,8 @@ from stages.core.scene.scene_ply import write_scene
 from stages.core.scene.trajectory import read_trajectory
 from stages.lab.assets.shapes import Surface, box, ellipsoid, to_gaussians, union
 from stages.simulate.options import QUALITIES, MpmQuality, SimulateOptions
+from stages.simulate.rigid import MAX_PASSES, REST_SPEED, _World
+from stages.simulate.rigid_model import OMEGA
 from stages.simulate.stage import run
 from tests.simulate.motion import Motion, roll_out
 
@@ -314,3 +318,54 @@ def test_a_dropped_body_of_several_parts_rests_when_its_rebounds_are_over(tmp_pa
     t = roll(tmp_path, cross().moved((0, 0, 0.025)), lift=("1=0.1",), loss=0.1, dt=0.01, steps=60)
     last = math.ceil(fall * (1 + e) / (1 - e) / 0.01)
     assert float((t.positions[last + 2 :] - t.positions[last + 1]).norm(dim=-1).max()) < 1e-3 * 0.3
+
+
+def contacts_at(speed: list[float], distance: list[float], damping: float) -> SimpleNamespace:
+    """MuJoCo's data of contacts with a normal speed, a slip of (1, -2) and a distance each."""
+    n = len(speed)
+    velocity = np.stack([np.array(speed), np.ones(n), np.full(n, -2.0)], 1).ravel()
+    contact = SimpleNamespace(efc_address=3 * np.arange(n), friction=np.full((n, 5), 0.4))
+    return SimpleNamespace(contact=contact, efc_vel=velocity, efc_KBIP=np.full((3 * n, 4), damping),
+                           efc_aref=np.full(3 * n, 7.0), efc_pos=np.repeat(distance, 3))  # fmt: skip
+
+
+def test_slow_contacts_are_damped_critically_and_fast_ones_as_their_materials():
+    """a = -k x - 2 omega v at rest, and MuJoCo's own from REST_SPEED on; slip ends at once."""
+    world, v = object.__new__(_World), REST_SPEED
+    world.model = SimpleNamespace(opt=SimpleNamespace(timestep=0.01))
+    world.data = contacts_at([0.0, -v / 2, -v, -3 * v], [0.0] * 4, damping=3.0)
+    normal, friction = world._set_references(4)
+    assert normal.tolist() == [0, 3, 6, 9] and friction.tolist() == [0.4] * 4
+    assert world.data.efc_aref[normal] == pytest.approx([7.0, 7.0 + (2 * OMEGA - 3.0) * v / 4, 7.0, 7.0])
+    assert world.data.efc_aref[normal + 1].tolist() == [-100.0] * 4 and (world.data.efc_aref[normal + 2] == 200.0).all()
+    world.data = contacts_at([-v / 2], [0.0], damping=3 * OMEGA)  # more than critical
+    assert world.data.efc_aref[world._set_references(1)[0]].tolist() == [7.0]
+
+
+def test_contacts_of_surfaces_do_not_rebound_and_push_bodies_apart_slowly():
+    """Deep ones at the speed below which nothing rebounds, however deep; the contact before them is left alone."""
+    world, v = object.__new__(_World), REST_SPEED
+    world.model = SimpleNamespace(opt=SimpleNamespace(timestep=0.01))
+    depth = [0.0, 1e-5, 1.0, 5.0, 0.0]
+    world.data = contacts_at([-v, 0.0, v, v, -10 * v], [-d for d in depth], damping=0.0)
+    normal, _ = world._set_references(1)
+    expected = [7.0, OMEGA**2 * 1e-5, 0.0, 0.0, 2 * OMEGA * 10 * v]
+    assert world.data.efc_aref[normal] == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(("slips", "passes"), [([3.0] * 9, 2), ([3.0, 2.0, 1.5, 1.5, 1.5, 1.5, 1.5, 1.5, 1.5], 4),
+                                               (list(range(1, 10)), MAX_PASSES)])  # fmt: skip
+def test_passes_of_the_solver_end_when_the_slip_is_known(slips, passes):
+    """A contact that slides at these speeds after the passes; each takes friction times the last one's slip off."""
+    world, taken = object.__new__(_World), []
+
+    def solve(model, data):
+        taken.append(float(data.efc_aref[0]))
+
+    def rates(model, data, rate, qacc):
+        rate[1:] = 0.6 * slips[len(taken) - 1], 0.8 * slips[len(taken) - 1]
+
+    world._mujoco, world.model = SimpleNamespace(mj_fwdConstraint=solve, mj_mulJacVec=rates), None
+    world.data = SimpleNamespace(efc_aref=np.array([2.0, 0.0, 0.0]), efc_force=np.ones(3), nefc=3, qacc=None)
+    world._solve(np.array([0]), np.array([0.5]))
+    assert taken == pytest.approx([2.0, *(2.0 - 0.5 * s for s in slips[: passes - 1])])

@@ -314,6 +314,15 @@ def test_stiff_materials_are_softened_until_waves_cross_a_part_of_a_cell_in_a_su
     assert viscosity * substep / (2500.0 * (2 * h) ** 2) < 1  # explicit diffusion is stable
 
 
+@pytest.mark.parametrize("density", [40.0, 2500.0])
+def test_the_viscosity_of_lossy_materials_is_as_large_as_the_substep_allows(density):
+    level = MpmQuality(1000, 3e-3)
+    material = Material(E=1e11, density=density, nu=0.25, loss=2.0)
+    _, viscosity = _stable_material(material, 5.0, 0.01, level)
+    rate = engine.mpm.substep_rate(0.02, 0.0, viscosity / density)
+    assert rate * level.substep(0.01) == pytest.approx(engine.CFL_MARGIN)
+
+
 def test_particles_are_the_same_in_any_unit(balls):
     """The same scene in metres and in half metres: masses, stiffness, viscosity and places agree."""
     options, material = options_with(material=("thing=jelly",), quality="draft"), []

@@ -140,7 +140,10 @@ def test_stiff_materials_are_softened_and_logged(balls, caplog):
     assert "object 2 (thing): steel" in caplog.text and "reduced from 2.1e+11 to" in caplog.text
 
 
-def test_a_scene_at_rest_gives_a_hint(file, caplog):
+def test_a_scene_at_rest_gives_a_hint(balls, file, caplog):
+    """Wherever it is."""
+    g = balls.gaussians
+    write_scene(file, replace(balls, gaussians=replace(g, means=g.means + torch.tensor([20.0, 0.0, 0.0]))))
     caplog.set_level(logging.INFO)
     command(file, steps=3, gravity=0.0)
     assert "everything is at rest" in caplog.text and "--lift 0.3" in caplog.text

@@ -21,7 +21,7 @@ Vector = tuple[float | int, float | int, float | int]
 
 @dataclass(frozen=True)
 class Collider:
-    """A rigid obstacle. Raises InputError for an unknown kind or surface and for coefficients out of range.
+    """A rigid obstacle. Raises InputError for an unknown kind or surface, without a size, and for wrong coefficients.
 
     Bodies in contact may `separate` again, with Coulomb friction; `slip` without friction or separation; or stick to a
     `sticky` surface.
@@ -41,6 +41,8 @@ class Collider:
         for what, value, table in (("kind", self.kind, KINDS), ("surface", self.surface, SURFACES)):
             if value not in table:
                 raise InputError(f"a collider's {what} is one of {', '.join(table)}, not {value!r}")
+        if min(self.size[: {"plane": 0, "sphere": 1, "box": 3}[self.kind]], default=1) <= 0:
+            raise InputError(f"a collider that is a {self.kind} needs a positive size")
         if self.friction < 0 or not 0 <= self.restitution <= 1:
             raise InputError("a collider's friction must be 0 or more, and restitution 0 to 1")
 

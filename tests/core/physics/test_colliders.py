@@ -143,6 +143,8 @@ def test_prescribed_motion_of_colliders():
 @pytest.mark.parametrize("wrong, message", [
     ({"kind": "cone"}, "plane, sphere, box, not 'cone'"), ({"surface": "wet"}, "separate, slip, sticky"),
     ({"friction": -1.0}, "0 or more"), ({"restitution": 2.0}, "0 to 1"),
+    *(({"kind": kind, **size}, f"a {kind} needs a positive size") for kind, size in (
+        ("sphere", {}), ("box", {}), ("sphere", {"size": (-1.0, 1.0, 1.0)}), ("box", {"size": (1.0, 1.0, 0.0)}))),
 ])  # fmt: skip
 def test_invalid_colliders(wrong, message):
     with pytest.raises(InputError, match=message):
@@ -150,7 +152,7 @@ def test_invalid_colliders(wrong, message):
 
 
 def test_rotations_of_colliders_need_not_have_length_1():
-    longer, unit = (as_obstacles([Collider("box", PLANE, rotation=r)], "cpu").numpy()
+    longer, unit = (as_obstacles([Collider("box", PLANE, (1, 1, 1), rotation=r)], "cpu").numpy()
                     for r in ((0.0, 3.0, 0.0, 4.0), (0.0, 0.6, 0.0, 0.8)))  # fmt: skip
     np.testing.assert_allclose(longer["turn"], unit["turn"])
     np.testing.assert_allclose(unit["turn"][0], [0.6, 0.0, 0.8, 0.0])  # x y z w

@@ -47,7 +47,7 @@ def test_gap_is_nine_tenths_of_the_distances_to_the_third_neighbour():
 
 def test_size_of_a_scene_leaves_out_one_percent_at_each_end_and_the_background():
     x = torch.linspace(0, 10, 1001)
-    means = torch.stack([x, 0.1 * x, 0 * x], 1)
+    means = torch.stack([x, 0.1 * x, 0 * x + 50], 1)
     whole = scene(splats(means), splats(torch.full((5, 3), 4.0)))
     far = splats(torch.full((3, 3), 900.0), id=0)
     assert scene_size(whole) == pytest.approx(9.8, rel=0.01)

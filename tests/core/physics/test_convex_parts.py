@@ -8,6 +8,7 @@ import pytest
 import torch
 from scipy.spatial import ConvexHull, Delaunay
 
+from stages.core.physics.convex_cuts import Part
 from stages.core.physics.convex_parts import _voxel_moments, convex_parts, divide
 from stages.core.scene.scene import Scene, SceneObject
 from stages.lab.assets.shapes import Surface, box, ellipsoid, to_gaussians, union
@@ -29,6 +30,13 @@ def test_a_box_is_one_part_with_its_own_volume_and_inertia():
     torch.testing.assert_close(parts.com, torch.tensor([1.0, 2.0, 3.0]), rtol=0, atol=1e-4)
     expected = parts.volume / 12 * torch.diag(torch.tensor([b * b + c * c, a * a + c * c, a * a + b * b]))
     torch.testing.assert_close(parts.inertia, expected, rtol=0.02, atol=1e-6)
+
+
+@pytest.mark.parametrize(("shell", "cost", "accepted"), [(16, 0.8, True), (16, 0.81, False), (15, 9.0, True)])
+def test_parts_are_divided_that_are_neither_convex_nor_small(shell, cost, accepted):
+    """Convex up to a cost of .05 for each voxel of the surface; small with fewer of these than twice eight."""
+    rows = np.arange(20)
+    assert Part(rows, rows[:shell], rows, cost).accepted == accepted
 
 
 def test_a_ball_is_round_to_one_percent():

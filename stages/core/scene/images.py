@@ -225,12 +225,16 @@ def read_reduced_video(path: Path, side: int) -> Iterator[tuple[UInt8[Tensor, "h
     Logs a warning and ends if the video is truncated.
     """
     with open_video(path) as file:
-        file.streams.video[0].thread_type = "AUTO"
+        stream, count = file.streams.video[0], 0
+        stream.thread_type = "AUTO"
         try:
-            for frame in file.decode(video=0):
+            for count, frame in enumerate(file.decode(video=0), 1):  # noqa: B007 -- counted
                 yield reduce_frame(frame, side)
         except import_av(path).FFmpegError as error:
             log.warning("%s: is truncated or damaged (%s); the frames before are used", path, error.strerror)
+            return
+    if count < stream.frames:  # threads report no error at the end of a file
+        log.warning("%s: is truncated or damaged; %d of its %d frames are used", path, count, stream.frames)
 
 
 def reduce_frame(frame: Any, side: int) -> tuple[UInt8[Tensor, "h w 3"], tuple[int, int]]:

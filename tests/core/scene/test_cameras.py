@@ -196,6 +196,8 @@ def test_other_json_is_refused(tmp_path, text, reason):
         read_cameras(tmp_path / "c.json")
 
 
-def test_folder_without_a_colmap_model_is_refused(tmp_path):
+def test_a_folder_without_a_colmap_model_and_an_absent_file_are_refused(tmp_path):
+    with pytest.raises(InputError, match="none.json: no such file; give a transforms.json or a COLMAP model folder"):
+        read_cameras(tmp_path / "none.json")
     with pytest.raises(InputError, match="no COLMAP model"):
         read_cameras(tmp_path)

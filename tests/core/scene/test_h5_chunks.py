@@ -1,5 +1,7 @@
 """Datasets that are compressed here can be read by HDF5, and the reverse."""
 
+import zlib
+
 import h5py
 import numpy as np
 import pytest
@@ -49,6 +51,9 @@ def test_missing_chunks_hold_the_fill_value_and_damaged_ones_are_refused(tmp_pat
         data = file.create_dataset("rows", (4, 3), "f4", chunks=(1, 3), fillvalue=2.0, **COMPRESSED)
         data[1] = 1.0
         assert np.array_equal(read_compressed(data), data[()])
+        data.id.write_direct_chunk((2, 0), zlib.compress(bytes(11)))
+        with pytest.raises(OSError, match="a damaged chunk: its size is wrong"):
+            read_compressed(data)
         data.id.write_direct_chunk((2, 0), b"not deflated")
         with pytest.raises(OSError, match="damaged"):
             read_compressed(data)

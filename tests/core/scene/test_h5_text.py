@@ -1,6 +1,7 @@
 """Texts of variable length are read as HDF5 reads them; damaged ones are refused before HDF5 takes memory for them."""
 
 import struct
+import zlib
 
 import h5py
 import numpy as np
@@ -45,6 +46,27 @@ def test_datasets_that_store_nothing_and_texts_of_fixed_length_are_read(tmp_path
     with open_h5(tmp_path / "a.h5") as file:
         assert Dataset("n", "text").read(file, "names", {}) == ["", ""]
         assert Dataset("n", "text").read(file, "fixed", {}) == ["ab", "c"]
+
+
+def test_texts_of_other_filters_and_files_within_others_are_refused(tmp_path):
+    write(tmp_path / "a.h5", compression="lzf")
+    with pytest.raises(ValueError, match="its texts are compressed by another filter than gzip"):
+        reread(tmp_path / "a.h5")
+    with h5py.File(tmp_path / "b.h5", "w", userblock_size=512) as file:
+        file.attrs["name"] = "duck"
+    with pytest.raises(ValueError, match="it begins with a user block, of another format"), open_h5(tmp_path / "b.h5"):
+        pass
+
+
+def test_compressed_texts_of_another_length_are_refused(tmp_path):
+    """The chunk of 5 references, of which 4 are stored."""
+    write(tmp_path / "a.h5", compression="gzip")
+    with h5py.File(tmp_path / "a.h5", "a") as file:
+        names = file["names"]
+        part = zlib.decompress(names.id.read_direct_chunk((0,))[1])
+        names.id.write_direct_chunk((0,), zlib.compress(part[:-16]))
+    with pytest.raises(ValueError, match="its texts are damaged"):
+        reread(tmp_path / "a.h5")
 
 
 def test_texts_within_an_object_header_are_refused(tmp_path):

@@ -1,4 +1,5 @@
 import os
+import re
 import struct
 import sys
 import wave
@@ -18,6 +19,7 @@ from stages.core.scene.images import (
     read_8_bit,
     read_image,
     read_labels,
+    read_reduced_video,
     read_video,
     resize,
     sample_frames,
@@ -200,3 +202,54 @@ def test_frames_are_sampled_evenly_with_both_ends(tmp_path):
         pixels = [cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR) for jpeg in jpegs]
         assert [p.shape for p in pixels] == [(16, 32, 3)] * len(expected)
         assert [round(p.mean() / 255 * 8) for p in pixels] == expected
+
+
+def test_a_film_of_another_number_of_frames_than_it_states(tmp_path, monkeypatch):
+    """The container counts 9 or none; of these 9 both ends are taken, of none none."""
+    pytest.importorskip("av")
+    with VideoWriter(tmp_path / "v.mp4", fps=10.0) as video:
+        for n in range(9):
+            video.append(torch.full((16, 16, 3), n / 8))
+    for stated in (0, 5, 30):
+        monkeypatch.setattr(images, "video_info", lambda path, stated=stated: (stated, 10.0))
+        assert len(sample_frames(tmp_path / "v.mp4", 3, 16)) == 3
+    monkeypatch.setattr(images, "read_video", lambda path: iter(()))
+    with pytest.raises(InputError, match="v.mp4: holds no frames"):
+        sample_frames(tmp_path / "v.mp4", 3, 16)
+
+
+def test_a_film_that_breaks_off_is_refused_or_used_up_to_there(tmp_path, caplog):
+    pytest.importorskip("av")
+    with VideoWriter(tmp_path / "v.mp4", fps=10.0) as video:
+        for n in range(9):
+            video.append(torch.rand(64, 64, 3, generator=torch.Generator().manual_seed(n)))
+    data = (tmp_path / "v.mp4").read_bytes()
+    (tmp_path / "cut.mp4").write_bytes(data[: len(data) * 2 // 3])
+    (tmp_path / "zeros.mp4").write_bytes(data[: len(data) // 2] + bytes(len(data) // 4) + data[-len(data) // 4 :])
+    assert len(list(read_reduced_video(tmp_path / "v.mp4", 32))) == 9 and not caplog.text
+    for name, message in (
+        ("cut.mp4", r"; \d of its 9 frames are used"),
+        ("zeros.mp4", ".*; the frames before are used"),
+    ):
+        assert 0 < len(list(read_reduced_video(tmp_path / name, 32))) < 9
+        assert re.search(f"{name}: is truncated or damaged{message}", caplog.text)
+        with pytest.raises(InputError, match=f"{name}: the video breaks off or is damaged"):
+            list(read_video(tmp_path / name))
+
+
+def test_damaged_pixels_are_refused(tmp_path, monkeypatch):
+    cv2.imwrite(str(tmp_path / "a.tiff"), np.full((3, 4, 3), np.nan, np.float32))
+    with pytest.raises(InputError, match="a.tiff: has values that are not finite; convert it"):
+        read_image(tmp_path / "a.tiff")
+    write_png(tmp_path / "b.png", torch.zeros(4, 4, 3))
+
+    def failing(*_):
+        raise cv2.error("damaged")
+
+    monkeypatch.setattr(images.cv2, "imdecode", failing)
+    with pytest.raises(InputError, match="b.png: is damaged; convert it to JPEG or PNG"):
+        read_image(tmp_path / "b.png")
+    monkeypatch.setattr(images.cv2, "imencode", lambda *_: (False, None))
+    with pytest.raises(InputError, match="c.png: the image could not be encoded as PNG"):
+        write_png(tmp_path / "c.png", torch.zeros(4, 4, 3))
+    assert not (tmp_path / "c.png").exists()

@@ -207,6 +207,25 @@ def test_only_provenance_may_have_values_that_are_not_finite(tmp_path, two_balls
             read_scene(tmp_path / "s.ply")
 
 
+def test_files_without_gaussians_or_of_another_degree_or_version_are_refused(tmp_path, two_balls):
+    names = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", *(f"scale_{i}" for i in range(3)),
+             *(f"rot_{i}" for i in range(4))]  # fmt: skip
+    for count, more, element, message in (
+        (0, [], "vertex", "holds no Gaussians"), (2, [], "vertex", "holds no Gaussians"),  # of quaternions of length 0
+        (2, [], "points", "has no element called vertex"),
+        (2, [f"f_rest_{i}" for i in range(8)], "vertex", "8 f_rest properties; SH of degree 1, 2 or 3"),
+    ):  # fmt: skip
+        rows = np.zeros(count, [(name, "f4") for name in names + more])
+        PlyData([PlyElement.describe(rows, element)]).write(str(tmp_path / "o.ply"))
+        with pytest.raises(InputError, match=f"o.ply: .*{message}|o.ply: {message}"):
+            read_scene(tmp_path / "o.ply")
+    write_scene(tmp_path / "s.ply", two_balls)
+    data = (tmp_path / "s.ply").read_bytes()
+    (tmp_path / "s.ply").write_bytes(data.replace(b"ngff:version 1", b"ngff:version 2", 1))
+    with pytest.raises(InputError, match="s.ply: format version 2 is newer than 1; upgrade ngff"):
+        read_scene(tmp_path / "s.ply")
+
+
 def test_failed_write_keeps_the_old_file(tmp_path, two_balls, monkeypatch):
     path = tmp_path / "s.ply"
     write_scene(path, two_balls)

@@ -85,6 +85,15 @@ def test_a_written_file_is_not_kept_open(tmp_path, two_balls):
     assert not [name for name in open_files if name.startswith(str(tmp_path))]
 
 
+def test_a_trajectory_has_frames_and_gaussians(tmp_path, two_balls):
+    write(tmp_path / "t.h5", two_balls, frames=0)
+    with pytest.raises(InputError, match="t.h5: has no frames"):
+        read_trajectory(tmp_path / "t.h5")
+    write(tmp_path / "t.h5", replace(two_balls, gaussians=two_balls.gaussians[:0]))
+    with pytest.raises(InputError, match="t.h5: has no Gaussians"):
+        read_trajectory(tmp_path / "t.h5")
+
+
 def test_interrupted_write_leaves_no_file(tmp_path, two_balls):
     info, keypoints, binding = parts(two_balls)
     with (

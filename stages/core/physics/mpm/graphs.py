@@ -81,8 +81,8 @@ class GraphedFrames(ABC):
         self._substeps(dt, steps)
         self._last_total.copy_(self._total)
         grids = self._grids()
-        width = len(grids[0]) // self._count
         a, b, c = (view(grids[min(k, len(grids) - 1)], wp.vec4) for k in range(3))
+        width = a.size // self._count
         inputs = [self.grid, self._sweepers, a, b, c, view(self._friction), self._active, width]
         launch(clear_active_blocks, self._sweepers, inputs, device=self.device)
         self._total.zero_()

@@ -45,6 +45,14 @@ def test_shared_cameras_a_tenth_of_their_radius_apart_are_in_another_frame(shift
         check_same_reference_frame(mine, truth, [(BALL, BALL)])
 
 
+def test_cameras_of_other_names_are_not_shared():
+    frame = ReferenceFrame("a", ring(count=3), (), {})
+    other = replace(frame, cameras=replace(frame.cameras, names=("x.png", "y.png", "z.png")))
+    check_same_reference_frame(frame, other, [])  # nothing to tell them apart by
+    with pytest.raises(InputError, match="fewer than two camera names and fewer than two object names in common"):
+        find_alignment(frame, other)
+
+
 def test_cameras_correspond_by_name_without_suffix():
     true = ring(count=3)
     other = replace(true[[2, 0, 1]], names=("02.jpg", "00.jpg", "else.jpg"))

@@ -71,6 +71,13 @@ def test_scenes_without_objects_have_no_overlap_and_alignment_is_noted(tmp_path,
     assert any("aligned by" in note for note in facts["notes"])
 
 
+def test_scenes_without_a_surface_are_refused(tmp_path, two_balls):
+    g = two_balls.gaussians
+    faint = replace(two_balls, gaussians=replace(g, opacities=g.opacities * 0 + 0.01))
+    with pytest.raises(InputError, match="no Gaussian has an opacity above .* so there is no surface to compare"):
+        evaluate(tmp_path, faint, two_balls)
+
+
 def test_overlap_of_a_single_object(tmp_path, two_balls):
     g = two_balls.gaussians
     one = replace(two_balls, gaussians=replace(g, object_id=g.object_id.clamp(max=1)), objects=two_balls.objects[:1])

@@ -93,6 +93,13 @@ def test_wrong_files_give_one_line_and_write_nothing(tmp_path, two_balls, name, 
     assert "\n" not in str(caught.value) and not (tmp_path / "metrics.json").exists()
 
 
+def test_one_prediction_is_compared_with_one_truth():
+    with pytest.raises(InputError, match="a.ply: name the truth with --against"):
+        run([Path("a.ply")], None, None, EvaluateOptions())
+    with pytest.raises(InputError, match="b.ply: is a second prediction; with --against give one"):
+        run([Path("a.ply"), Path("b.ply")], Path("c.ply"), None, EvaluateOptions())
+
+
 def test_options_that_do_not_apply_are_errors(tmp_path, two_balls):
     with pytest.raises(InputError, match="--frames 0"):
         EvaluateOptions(frames=0)

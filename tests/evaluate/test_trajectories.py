@@ -12,7 +12,7 @@ from stages.core.errors import InputError
 from stages.core.geometry.similarity import Similarity
 from stages.core.scene.scene import SceneObject
 from stages.evaluate.align import ReferenceFrame, check_same_reference_frame, find_alignment
-from stages.evaluate.label_pictures import draw_objects
+from stages.evaluate.label_pictures import draw_objects, found_objects
 from stages.evaluate.options import EvaluateOptions
 from stages.evaluate.result import Result
 from stages.evaluate.stage import run
@@ -217,6 +217,16 @@ def test_report_draws_the_first_the_middle_and_the_last_view(two_balls):
     drawn = draw_objects(Result("trajectories", {}, {}, []), scene, EvaluateOptions())
     assert [p.caption for p in drawn.pictures] == [scene.cameras.names[i] for i in (0, 2, 4)]
     assert drawn.legend.keys() == {"red ball", "green ball"}
+
+
+def test_scenes_without_cameras_or_objects_are_drawn_as_they_are(two_balls):
+    result = Result("trajectories", {}, {}, [])
+    for cameras in (None, ring(count=2)[[]]):
+        assert draw_objects(result, replace(two_balls, cameras=cameras), EvaluateOptions()) is result
+    blank = replace(two_balls.gaussians, object_id=torch.zeros_like(two_balls.gaussians.object_id))
+    cameras = ring(count=1, size=16)
+    assert not found_objects(replace(two_balls, gaussians=blank, cameras=cameras), 0).any()
+    assert set(found_objects(replace(two_balls, cameras=cameras), 0).unique().tolist()) == {0, 1, 2}
 
 
 def test_suffixes_may_be_in_capitals(tmp_path, two_balls):

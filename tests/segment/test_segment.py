@@ -15,6 +15,7 @@ from stages.core.raster.rasterise import visibility
 from stages.core.scene.images import write_labels
 from stages.core.scene.scene import Scene, SceneObject
 from stages.core.scene.scene_ply import read_scene, write_scene
+from stages.segment import masks
 from stages.segment.masks import read_names
 from stages.segment.options import SegmentOptions
 from stages.segment.stage import log_objects, run
@@ -248,6 +249,14 @@ def test_masks_of_another_aspect_ratio_are_refused(scene_file, truth, tmp_path):
 def test_invalid_options_are_refused(wrong, message):
     with pytest.raises(InputError, match=message):
         SegmentOptions(**wrong)
+
+
+def test_masks_need_cameras_and_objects_without_gaussians_are_logged(truth, tmp_path, caplog):
+    with pytest.raises(InputError, match="--masks: the scene has no cameras; use one that `ngff reconstruct` wrote"):
+        masks.segment(replace(truth, cameras=None), SegmentOptions(masks=tmp_path))
+    caplog.set_level(logging.INFO)
+    log_objects(replace(truth, objects=(*truth.objects, SceneObject(9, "ghost"))))
+    assert "  9  ghost: no Gaussians" in caplog.text
 
 
 def test_empty_table_has_no_objects(truth, tmp_path, caplog):

@@ -140,7 +140,9 @@ def test_an_interrupted_run_continues(chat_server, films, tmp_path):
     chat_server.script, chat_server.asked = [json.dumps(GOOD)] * 2, []
     assert judged([films / "ours/a.mp4"], tmp_path, resume=True)["overall"]["repeats"] == 3
     assert len(chat_server.asked) == 2
-    for text, says in (("{", "is damaged"), ("[]", "is of other")):
+    changed = json.loads((tmp_path / "m.replies.json").read_text())
+    changed["replies"]["1"] = "seven"
+    for text, says in (("{", "is damaged"), ("[]", "is of other"), (json.dumps(changed), "reply 1 was changed; ask")):
         (tmp_path / "m.replies.json").write_text(text)
         with pytest.raises(InputError, match=says):
             judged([films / "ours/a.mp4"], tmp_path, resume=True)

@@ -18,7 +18,7 @@ import pytest
 import torch
 
 from stages.core.backends import choose
-from stages.core.errors import InputError
+from stages.core.errors import InputError, MissingPackage
 from stages.core.physics.forces import Change, ForcePrompts
 from stages.core.physics.keypoints import choose_keypoints, pull_range
 from stages.core.scene.scene_ply import write_scene
@@ -285,6 +285,14 @@ def test_socket_needs_token_and_origin(server):
         assert refused.value.response.status_code in (403, 404)
     with client(server) as good:
         assert json.loads(good.recv(timeout=5)) == {"control": True}
+
+
+def test_a_port_that_is_taken_and_an_absent_package_are_named(server, monkeypatch):
+    with pytest.raises(InputError, match=f"--port {server.port}: cannot listen on it .*; choose another"):
+        LiveServer("<p>page</p>", server.port)
+    monkeypatch.setitem(sys.modules, "websockets.asyncio.server", None)
+    with pytest.raises(MissingPackage, match="--live needs the package websockets: `pip install websockets`"):
+        LiveServer("<p>page</p>")
 
 
 def test_one_client_controls_and_the_next_takes_over(server):

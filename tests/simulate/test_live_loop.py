@@ -3,6 +3,7 @@
 import json
 import struct
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -131,6 +132,14 @@ def test_a_failing_engine_pauses_with_a_note_and_a_new_start_helps(play):
     assert played.header["frames"] == 1 and played.header["note"] == ""
     with pytest.raises(InputError, match="it diverged"):
         play(fail_at=0)
+
+
+def test_engines_that_tell_no_masses_are_refused(play):
+    played = play()
+    state = played.live.session.state
+    with pytest.raises(InputError, match="--live: this engine does not tell the masses of the objects"):
+        played.live.session.observe(replace(state, mass=None))
+    assert played.live.session.state is state
 
 
 def test_what_the_user_does_is_recorded_and_saved_copies_are_numbered(play):

@@ -357,3 +357,14 @@ def test_the_default_domain_is_reduced_until_its_grid_fits(along):
     assert nodes(room) < MAX_NODES / 2 or room <= MIN_ROOM * h
     assert room == 1 or (nodes(room / 0.8) > MAX_NODES / 2 and room > 0.8 * MIN_ROOM * h)
     assert (room == 1) == (along == 200)
+
+
+def test_a_scene_in_which_no_object_is_found_is_refused(balls, monkeypatch, tmp_path):
+    blank = replace(
+        balls, gaussians=replace(balls.gaussians, object_id=torch.zeros(1250, dtype=torch.int64)), objects=()
+    )
+    found = {"none": blank, "without Gaussians": replace(blank, objects=balls.objects)}
+    for grouped in found.values():
+        monkeypatch.setattr(network_segmenter, "segment_by_network", lambda scene, device, grouped=grouped: grouped)
+        with pytest.raises(InputError, match="s.ply: no objects were found in it; label them with `ngff segment`"):
+            with_objects(blank, tmp_path / "s.ply")

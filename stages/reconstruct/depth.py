@@ -79,7 +79,7 @@ def select_sources(model: SparseModel, count: int) -> list[list[int]]:
             score[j] = torch.exp(-((angle - 10) ** 2) / (2 * width**2)).sum()
         best = score.topk(min(count, c - 1))
         chosen = [j for j, s in zip(best.indices.tolist(), best.values.tolist(), strict=True) if s > 0]
-        near = (eyes - eyes[i]).norm(dim=1).argsort().tolist()
+        near = (eyes - eyes[i]).norm(dim=1).argsort(stable=True).tolist()
         out.append(chosen or [j for j in near if j != i][:count])
     return out
 

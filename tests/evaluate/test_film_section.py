@@ -6,9 +6,11 @@ import re
 from dataclasses import replace
 
 import pytest
+import torch
 
 from stages.core.errors import InputError
 from stages.core.physics.materials import MATERIALS
+from stages.core.physics.particles import Bodies
 from stages.core.scene.scene import SceneObject
 from stages.core.scene.trajectory import read_trajectory
 from stages.evaluate import film_section
@@ -51,6 +53,20 @@ def test_sizes_and_masses_are_in_metres_where_the_scale_is_known(trajectory):
         shares.append(mass / (MATERIALS["rubber"].density * ball))
         assert red[2].endswith("kg if one unit is 1 m" if unit == "units" else "kg")
     assert 0.2 < shares[0] < 1 and shares[1] == pytest.approx(shares[0], rel=0.02)
+
+
+def test_volumes_are_those_of_the_engine_or_of_what_it_would_sample(trajectory, monkeypatch):
+    t = with_scene(trajectory, scale={"metres_per_unit": 2.0, "source": "given"})
+    bodies = Bodies(torch.zeros(3, 3), torch.tensor([0, 0, 1]), torch.tensor([1.0, 2.0, 4.0]), 0.1)
+    monkeypatch.setattr(film_section, "sample_bodies", lambda scene, count: bodies)
+    assert film_section._volumes(t) == [24.0, 32.0]
+    assert film_section._volumes(replace(t, field=start_of(UNITS))) == [2.0, 2.125]
+
+    def unusable(scene, count):
+        raise InputError("none of its Gaussians is usable")
+
+    monkeypatch.setattr(film_section, "sample_bodies", unusable)
+    assert [math.isnan(v) for v in film_section._volumes(t)] == [True, True]
 
 
 def test_where_a_material_is_from(trajectory, known_volumes):

@@ -53,7 +53,7 @@ class BruteForce:
         chunks = flat.split(max(1, self.MAX_ENTRIES // len(self.points)))
         candidates = 1 if have == 1 else min(have + self.SPARE, len(self.points))
         index = torch.cat([self._nearest(chunk, candidates) for chunk in chunks])
-        distance, order = (flat[:, None] - self.points[index]).norm(dim=2).sort(dim=1, stable=True)
+        distance, order = (flat[:, None] - self.points[index]).norm(dim=2).sort(dim=1)
         distance, order = distance[:, :have], order[:, :have]
         distance = torch.nn.functional.pad(distance.where(distance < within, inf), (0, k - have), value=inf)
         index = torch.nn.functional.pad(index.gather(1, order), (0, k - have))

@@ -95,7 +95,7 @@ def _fill_hulls(
     standard deviation along each direction.
     """
     counts = torch.bincount(ids)
-    for number in [i for i in counts.argsort().tolist() if i > 0 and counts[i] >= 8]:
+    for number in [i for i in counts.argsort(stable=True).tolist() if i > 0 and counts[i] >= 8]:
         rest = free[ids[free] == 0]
         own = g.means[(ids == number) & g.means.isfinite().all(1)]
         if support is not None and float(support.heights(own).quantile(0.02)) < 3 * support.tolerance:

@@ -152,7 +152,7 @@ def _merged(views: _Points, side: float, rng: np.random.Generator) -> tuple[Scen
         return torch.zeros(len(count), x.shape[1]).index_add_(0, owner, x)
 
     votes = torch.stack([owner, labels], 1).unique(dim=0, return_counts=True)
-    order = votes[1].argsort()
+    order = votes[1].argsort(stable=True)
     own = torch.zeros(len(count), dtype=torch.int64)
     own[votes[0][order, 0]] = votes[0][order, 1]  # the largest count is written last
     middle, n = total(points) / count[:, None], len(count)

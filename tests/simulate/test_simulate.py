@@ -368,3 +368,14 @@ def test_a_scene_in_which_no_object_is_found_is_refused(balls, monkeypatch, tmp_
         monkeypatch.setattr(network_segmenter, "segment_by_network", lambda scene, device, grouped=grouped: grouped)
         with pytest.raises(InputError, match="s.ply: no objects were found in it; label them with `ngff segment`"):
             with_objects(blank, tmp_path / "s.ply")
+
+
+def test_a_part_in_which_nothing_is_is_named(balls, tmp_path, caplog):
+    caplog.set_level(logging.INFO)
+    parts = [{"box": [7, 7, 7, 8, 8, 8], "material": "wood"}, {"material": "rubber"}]
+    (tmp_path / "m.json").write_text(json.dumps({"thing": {"parts": parts}}))
+    options = options_with(materials=tmp_path / "m.json")
+    particles = engine._particles(balls, set_up_scene(balls, ForcePrompts(), options), ForcePrompts(), options,
+                                  options.level)  # fmt: skip
+    assert "object 2 (thing): nothing of it is in the part of wood" in caplog.text
+    assert "object 2 (thing): rubber, " in caplog.text and bool((particles.mass > 0).all())

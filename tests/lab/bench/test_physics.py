@@ -7,6 +7,7 @@ import pytest
 from stages.core.errors import InputError
 from stages.lab.bench.physics import PhysicsBenchOptions, measure, run
 from stages.lab.bench.physics_experiments import experiments
+from stages.simulate.options import QUALITIES, MpmQuality
 
 ALL = experiments()
 QUICK = (
@@ -21,6 +22,12 @@ QUICK = (
     "bounce/friction=0.5 loss=0.15",
 )  # what tests/simulate/test_rigid.py does not show in small
 BOXES = [name for name in ALL if name.startswith("boxes/")]
+
+
+@pytest.fixture(autouse=True)
+def few_particles(monkeypatch):
+    """Those of a body decide on whether it stands on the floor; the rigid engine needs no others."""
+    monkeypatch.setitem(QUALITIES, "draft", MpmQuality(particles=1200, step=0.015))
 
 
 @pytest.mark.parametrize("name", [*QUICK, *(pytest.param(n, marks=pytest.mark.slow) for n in ALL if n not in QUICK)])

@@ -17,7 +17,7 @@ from stages.core.kernels.threads import parallel_map
 from stages.core.perception.region_growing import grow_objects
 from stages.core.perception.support import Support, find_support, view_extent
 from stages.core.perception.wall import find_wall, rotate_wall_to_floor
-from stages.core.scene.files import provenance, seconds_since
+from stages.core.scene.files import check_output, provenance, seconds_since
 from stages.core.scene.gaussians import Gaussians, concatenate, transformed
 from stages.core.scene.scene import Scene
 from stages.core.scene.scene_ply import read_scene, write_scene
@@ -40,6 +40,7 @@ def run(scene: Path, out: Path, options: RefineOptions = RefineOptions()) -> Non
     whole = read_scene(scene)
     if not bool((whole.gaussians.object_id > 0).any()):
         raise InputError(f"{scene}: has no objects; label them with `ngff segment {scene} -o labelled.ply` first")
+    check_output(Path(out))
     refined = refine(whole, options)
     facts = {**provenance("refine", [Path(scene)], options), **seconds_since(began), "scene": whole.provenance}
     write_scene(out, replace(refined, provenance=facts))

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from stages.core.backends import choose, pick_device
 from stages.core.errors import InputError
-from stages.core.scene.files import provenance, seconds_since
+from stages.core.scene.files import check_output, provenance, seconds_since
 from stages.core.scene.scene import Scene
 from stages.core.scene.scene_ply import read_scene, write_scene
 from stages.core.scene.schema import quote, text
@@ -27,6 +27,7 @@ def run(scene: Path, out: Path, options: SegmentOptions = SegmentOptions()) -> N
     began, segment = time.monotonic(), choose(BACKENDS, options.chosen)
     pick_device(options.device)  # raises for an absent GPU; only networks use one
     whole = read_scene(scene)
+    check_output(Path(out))
     labelled = rename_objects(segment(whole, options), options)
     reference = parse_object_scale(options.scale_reference)
     labelled = reference.applied(labelled) if reference else labelled

@@ -17,7 +17,7 @@ from stages.core.physics.keypoints import bind_gaussians, choose_keypoints
 from stages.core.physics.material_parts import segment_files
 from stages.core.physics.materials import choose_materials
 from stages.core.physics.recording import read_prompts_file, read_recording
-from stages.core.scene.files import provenance, seconds_since
+from stages.core.scene.files import check_output, provenance, seconds_since
 from stages.core.scene.scene import Scene
 from stages.core.scene.scene_ply import read_scene
 from stages.core.scene.trajectory import SimulationInfo, TrajectoryWriter
@@ -40,6 +40,7 @@ def run(scene: Path, out: Path, options: SimulateOptions = SimulateOptions()) ->
     if options.engine not in (AUTO, *ENGINES):
         raise InputError(f"--engine {options.engine}: choose from {', '.join((AUTO, *ENGINES))}")
     pick_device(options.device)  # a wrong name is an error with every engine
+    check_output(Path(out))
     world = with_objects(read_scene(scene), scene, options.device)
     stored = forces.ForcePrompts()
     if options.forces is not None:

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from ngff_cli.options import run_command_line
+from stages.core.errors import InputError
 from stages.core.scene.scene_ply import write_scene
 from stages.simulate.options import SimulateOptions
 from stages.simulate.stage import run
@@ -89,6 +90,19 @@ def fails_cleanly(folder, args, command=call, expected=2) -> str:
 @pytest.mark.parametrize("args", WRONG, ids=lambda a: " ".join(a).replace("{}/", ""))
 def test_wrong_input_gives_one_line_and_status_2(input_files, args):
     fails_cleanly(input_files, args)
+
+
+def work(*_, **__):
+    pytest.fail("the work has begun")
+
+
+@pytest.mark.parametrize(("stage", "name", "value"), [
+    ("segment", "choose", lambda *_: work), ("refine", "refine", work), ("simulate", "with_objects", work),
+])  # fmt: skip
+def test_a_missing_folder_is_reported_before_the_work(input_files, stage, name, value, monkeypatch):
+    monkeypatch.setattr(f"stages.{stage}.stage.{name}", value)
+    with pytest.raises(InputError, match="no folder"):
+        import_module(f"stages.{stage}.stage").run(input_files / "good.ply", input_files / "nowhere/o.ply")
 
 
 @contextmanager

@@ -22,6 +22,16 @@ _count = itertools.count()
 _swept: set[Path] = set()  # folders in which this process has looked for files of killed processes
 
 
+def check_output(path: Path) -> None:
+    """Raises InputError where `path` is a folder or a device, or its folder is missing: to be said before long work."""
+    if path.is_dir():
+        raise InputError(f"{path}: is a folder; name the file to write")
+    if path.exists() and not path.is_file():
+        raise InputError(f"{path}: is no file, but a device or a pipe, which cannot be replaced; name another")
+    if not path.parent.is_dir():
+        raise InputError(f"{path}: there is no folder {path.parent}; create it first")
+
+
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """A temporary path next to `path`, with the same suffix, that replaces it on success and is deleted on failure.
@@ -32,12 +42,7 @@ def replacing(path: Path) -> Iterator[Path]:
     Raises InputError where `path` is a folder, its folder is missing, or the file cannot be written.
     """
     path = Path(path)
-    if path.is_dir():
-        raise InputError(f"{path}: is a folder; name the file to write")
-    if path.exists() and not path.is_file():
-        raise InputError(f"{path}: is no file, but a device or a pipe, which cannot be replaced; name another")
-    if not path.parent.is_dir():
-        raise InputError(f"{path}: there is no folder {path.parent}; create it first")
+    check_output(path)
     _sweep(path.parent)
     part = path.with_name(f".part-{_HOST}-{os.getpid()}-{next(_count)}-{path.name[-KEPT_OF_NAME:]}")
     try:

@@ -95,11 +95,8 @@ def main(out: Path) -> dict:
 
     video = render(out / "mpm.h5", out / "mpm.mp4", RenderOptions(view="orbit", resolution=96))
     assert json.loads(video.with_name("mpm.mp4.json").read_text())["frames"] == 6
-    render(
-        out / "mpm.h5",
-        out / "sheet.png",
-        RenderOptions(view="novel", resolution=96, background="#ffffff", shadows="off"),
-    )
+    white = RenderOptions(view="novel", resolution=96, background="#ffffff", shadows="off")
+    render(out / "mpm.h5", out / "sheet.png", white)
 
     metrics = evaluate(out / "ngff.h5", out / "mpm.h5", out / "metrics.json", EvaluateOptions())
     assert metrics["overall"]["FPE"] < 0.02  # both engines predict the same free fall [m]

@@ -245,7 +245,7 @@ def imperfect(labels: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return found
 
 
-@pytest.mark.parametrize("name", ["tum_fr2_desk", "kitchen", "kermit", "banana"])
+@pytest.mark.parametrize("name", [pytest.param("tum_fr2_desk", marks=pytest.mark.slow), "kitchen", "kermit", "banana"])
 def test_figures_agree_with_an_independent_scorer(shared, tmp_path, name, capsys, monkeypatch):
     """score.py beside the label images, on views of the size that `ngff reconstruct` gives them by default."""
     folder, rng = shared / "labels" / name, np.random.default_rng(0)

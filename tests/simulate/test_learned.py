@@ -55,7 +55,7 @@ def com_shift(t, row, frame=-1):
     return t.com[frame, row] - t.com[0, row]
 
 
-@pytest.mark.parametrize("unit", [1.0, 0.1])
+@pytest.mark.parametrize("unit", [pytest.param(1.0, marks=pytest.mark.slow), 0.1])
 def test_free_fall_at_any_scale(two_balls, tmp_path, untrained, unit):
     """By the command."""
     write_scene(tmp_path / "scene.ply", replace(two_balls, scale={"metres_per_unit": unit, "source": "test"}))
@@ -78,7 +78,7 @@ def test_velocity_and_force_in_flight(two_balls, untrained, caplog):
     assert "untrained" in caplog.text and " kg if one unit is 1 m" in caplog.text
 
 
-@pytest.mark.parametrize("unit", [1.0, 0.1])
+@pytest.mark.parametrize("unit", [pytest.param(1.0, marks=pytest.mark.slow), 0.1])
 def test_newtons_kilograms_and_velocities_at_any_scale(untrained, caplog, unit):
     """F t^2 / 2 m of a ball of 540 kg/m^3, and a velocity in scene units per second, without gravity."""
     caplog.set_level(logging.INFO)
@@ -183,7 +183,7 @@ def test_size_and_unit_of_mass_do_not_matter(two_balls, tmp_path):
 
     here = motion(1.0, 1.0)
     assert here.norm(dim=-1).max() > 0.1
-    for size, mass in ((0.01, 1.0), (128.0, 1.0), (1.0, 16.0)):
+    for size, mass in ((0.01, 1.0), (128.0, 16.0)):
         torch.testing.assert_close(motion(size, mass), here, rtol=0, atol=2e-3)
 
 

@@ -77,7 +77,7 @@ FLAT = box((0.3, 0.2, 0.1), 0.02).moved((0.0, 0.0, 0.05))
 BALL = ellipsoid((0.1,) * 3, 2000).moved((0, 0, 0.1))
 
 
-@pytest.mark.parametrize("friction", [0.1, 0.3, 0.6])
+@pytest.mark.parametrize("friction", [pytest.param(0.1, marks=pytest.mark.slow), 0.3, 0.6])
 def test_a_box_slides_by_v2_over_2_mu_g(tmp_path, friction):
     time = 2 / (friction * G)
     t = roll(tmp_path, FLAT, velocity=("object=1 2,0,0",), friction=friction, steps=10 + math.ceil(time / 0.02))
@@ -173,7 +173,7 @@ def test_a_body_of_several_parts_gains_no_energy_on_the_floor(tmp_path):
     assert float(t.com[60:, 0, 2].max()) < 0.2
 
 
-@pytest.mark.parametrize("unit", [1.0, 0.5])
+@pytest.mark.parametrize("unit", [pytest.param(1.0, marks=pytest.mark.slow), 0.5])
 def test_force_torque_and_pin(tmp_path, unit):
     """Newtons and newton metres in scenes of any scale; velocities and places are in scene units."""
     boxes = cube(0.2, 0, 0.5), cube(0.2, 1, 0.5)
@@ -285,7 +285,7 @@ def strictly_inside(points: torch.Tensor, sides: tuple, at: tuple) -> torch.Tens
     return ((points - torch.tensor(at)).abs() < torch.tensor(sides) / 2 - 1e-4).all(1)
 
 
-@pytest.mark.parametrize("friction", [0.2, 0.6])
+@pytest.mark.parametrize("friction", [pytest.param(0.2, marks=pytest.mark.slow), 0.6])
 def test_bodies_of_several_parts_slide_on_each_other_by_v2_over_2_mu_g(tmp_path, friction):
     t = roll(tmp_path, rail().moved((0.0, 0.0, 0.3)), cross().moved((-0.3, 0, 0.325)), pin=("1",), friction=friction,
              velocity=("object=2 1,0,0",), steps=20 + math.ceil(1 / (friction * G * 0.02)))  # fmt: skip
@@ -293,7 +293,7 @@ def test_bodies_of_several_parts_slide_on_each_other_by_v2_over_2_mu_g(tmp_path,
     assert float((t.com[-1] - t.com[-3]).norm()) < 1e-4
 
 
-@pytest.mark.parametrize("friction", [0.3, 0.9])
+@pytest.mark.parametrize("friction", [0.3, pytest.param(0.9, marks=pytest.mark.slow)])
 def test_a_force_a_little_beyond_friction_accelerates_a_box_by_the_difference(tmp_path, friction):
     """Contacts that push a sliding body up would let it slide faster. Its mass is measured without friction."""
     free = roll(tmp_path, FLAT, friction=0.0, force=("object=1 force=1,0,0",), steps=31)

@@ -302,7 +302,8 @@ def test_highlight_is_at_the_reflection_and_keeps_the_mean_colour():
     assert abs(float(seen.mean())) < 0.01  # 20,000 directions of spread 0.15: 0.001
 
 
-def test_command_writes_the_published_layout(tmp_path):
+def test_command_writes_the_published_layout(tmp_path, monkeypatch):
+    monkeypatch.setattr("stages.lab.assets.objects.make_object", full_size)  # made once
     done = CliRunner().invoke(app, ["objects", str(tmp_path), "--only", "duck", "--sheet", str(tmp_path / "sheet.jpg")])
     assert done.exit_code == 0, done.output
     assert "duck: 50000 Gaussians" in done.output

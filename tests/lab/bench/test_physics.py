@@ -12,7 +12,6 @@ from stages.simulate.options import QUALITIES, MpmQuality
 ALL = experiments()
 QUICK = (
     "slope/25deg friction=0.3",
-    "fall/gravity=1.62",
     "torque/ball",
     "collision/momentum",
     "stack/heavy on soft",

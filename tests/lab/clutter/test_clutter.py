@@ -153,7 +153,7 @@ def test_objects_of_several_parts_rest_in_each_others_concavities():
     assert np.abs(at[1, :2]).max() < 0.01
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (2, 3))])
 def test_composites_are_one_normalised_object_of_several_parts(seed):
     prop = make_composite(seed)
     g = prop.gaussians

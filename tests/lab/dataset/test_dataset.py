@@ -31,6 +31,7 @@ from stages.lab.dataset.scene_configs import (
 )
 from stages.lab.dataset.simulation import SimulationSettings, simulate, simulation_batches, stable_substep
 from stages.lab.training.data import read_groups
+from tests.lab.assets.test_objects import full_size
 from tests.lab.small_world import COARSE, box_shell
 
 
@@ -230,6 +231,7 @@ def test_interrupted_run_resumes_to_the_same_bytes(tmp_path, assets, monkeypatch
 
 def test_particles_are_cached(tmp_path, monkeypatch):
     monkeypatch.setattr(object_particles, "OBJECTS", {"duck": object_particles.OBJECTS["duck"]})
+    monkeypatch.setattr(object_particles, "make_object", full_size)  # made once
     discretisation = Discretisation(dx=0.03, spacing=0.03)
     made = object_particles.load_assets(discretisation, 64, tmp_path / "p.npz")
     monkeypatch.setattr(object_particles, "make_object", None)  # must not be called

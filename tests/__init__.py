@@ -33,12 +33,16 @@ def check_some(*, typechecker: Callable) -> Callable:
             made[code] += 1
             if not _is_sampled(made[code]):
                 return function
-        checked = check_all(function, typechecker=typechecker)
+        checked = None  # until the first call: most functions are never called
 
         @wraps(function)
         def call(*args, **options):
+            nonlocal checked
             calls[code] += 1
-            return (checked if _is_sampled(calls[code]) else function)(*args, **options)
+            if not _is_sampled(calls[code]):
+                return function(*args, **options)
+            checked = checked or check_all(function, typechecker=typechecker)
+            return checked(*args, **options)
 
         return call
 

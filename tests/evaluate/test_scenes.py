@@ -7,9 +7,10 @@ import torch
 
 from stages.core.errors import InputError
 from stages.core.geometry.similarity import Similarity
+from stages.core.scene.scene import SceneObject
 from stages.core.scene.scene_ply import write_scene
 from stages.evaluate.options import EvaluateOptions
-from stages.evaluate.scenes import chamfer, label_iou, nearest_neighbours
+from stages.evaluate.scenes import chamfer, label_iou, nearest_neighbours, scene_reference_frame
 from stages.evaluate.stage import run
 from tests.evaluate.motions import rotation, transformed_scene
 
@@ -76,6 +77,18 @@ def test_scenes_without_a_surface_are_refused(tmp_path, two_balls):
     faint = replace(two_balls, gaussians=replace(g, opacities=g.opacities * 0 + 0.01))
     with pytest.raises(InputError, match="no Gaussian has an opacity above .* so there is no surface to compare"):
         evaluate(tmp_path, faint, two_balls)
+
+
+def test_scenes_without_cameras_are_aligned_by_their_objects(tmp_path, two_balls):
+    quarter = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    alone = replace(two_balls, cameras=None, objects=(*two_balls.objects, SceneObject(9, "ghost")))
+    moved = replace(transformed_scene(two_balls, Similarity(2.0, quarter, torch.tensor([1.0, 2.0, 0.5]))), cameras=None)
+    facts = evaluate(tmp_path, moved, alone, align=True)
+    assert facts["overall"]["chamfer"] < 1e-5
+    assert "aligned by the centres of red ball, green ball, keeping the vertical" in facts["notes"]
+    frame = scene_reference_frame(tmp_path / "s.ply", alone)
+    assert [o.id for o in frame.objects] == [1, 2] and frame.cameras is None
+    assert torch.equal(frame.points[2], two_balls.gaussians.means[two_balls.gaussians.object_id == 2])
 
 
 def test_overlap_of_a_single_object(tmp_path, two_balls):

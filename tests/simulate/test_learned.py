@@ -18,7 +18,7 @@ from stages.core.scene.gaussians import concatenate
 from stages.core.scene.scene import Scene, SceneObject
 from stages.core.scene.scene_ply import write_scene
 from stages.core.scene.trajectory import read_trajectory
-from stages.simulate.learned import _model_stiffness, _warn_extrapolation
+from stages.simulate.learned import MAX_SPEED, _model_stiffness, _warn_extrapolation
 from stages.simulate.model_units import TYPICAL_MASS, TYPICAL_SIZE, ModelUnits
 from stages.simulate.options import SimulateOptions
 from stages.simulate.stage import run
@@ -214,6 +214,7 @@ class WithoutGravity:
 
 @pytest.mark.parametrize(("change", "message"), [
     ({"count": 7}, "7 objects; the model was tested with up to 6"), ({"speed": 9.0}, "faster than any in training"),
+    ({"speed": 0.7 * MAX_SPEED, "along": (1.0, 1.0, -1.0)}, "faster than any in training"),
     ({"flat": 0.05}, "thinner than any in training"), ({"grow": 8.0}, "times as long as the smallest"),
     ({}, "does not take the gravity"),
 ])  # fmt: skip
@@ -224,7 +225,7 @@ def test_extrapolation_is_warned_of(caplog, change, message):
     points[:, 1, :2] = points[:, 0, :2]
     points[:, 0] *= change.get("grow", 1.0)
     points[:, 1, :, 2] *= change.get("flat", 1.0)
-    velocity = torch.tensor([change.get("speed", 0.0), 0, 0])
+    velocity = torch.tensor(change.get("along", (1.0, 0, 0))) * change.get("speed", 0.0)
     _warn_extrapolation(InitialConditions.of(points, velocity=velocity), WithoutGravity())
     assert len(caplog.records) == (1 if not change else 2)
     assert message in caplog.text

@@ -41,10 +41,11 @@ def check_attributes(item: h5py.Group | h5py.Dataset) -> None:
     with _FileBytes(item.file) as file:
         for attribute in _attributes(file, h5py.h5o.get_info(item.id).addr):
             name, kind, space = (int.from_bytes(attribute[i : i + 2], "little") for i in (2, 4, 6))
-            start, to = (8, 8) if attribute[0] == 1 else (9 if attribute[0] == 3 else 8, 1)
+            start, to = (8, 8) if attribute[0] == 1 else (9, 1)
             after_name = start + -(-name // to) * to
             values = after_name + -(-kind // to) * to + -(-space // to) * to
-            if after_name + 1 >= len(attribute) or attribute[1] & 3:  # its type or shape is elsewhere
+            # its type or shape is elsewhere, as with all of version 2
+            if attribute[0] not in (1, 3) or after_name + 1 >= len(attribute) or attribute[1] & 3:
                 raise ValueError("an attribute of it is damaged")
             datatype, bits = attribute[after_name] & 15, attribute[after_name + 1] & 15
             if datatype == VARIABLE_LENGTH and bits == TEXT:

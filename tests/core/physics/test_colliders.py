@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from stages.core.errors import InputError
+from stages.core.geometry.rotations import multiply
 from stages.core.physics.colliders import Collider, as_obstacles
 from stages.core.physics.mpm import solver as mpm
 from tests.conftest import DEVICES
@@ -138,6 +139,18 @@ def test_prescribed_motion_of_colliders():
     c = Collider("box", (1.0, 0, 0), (1, 1, 1), velocity=(0, 2.0, 0), angular_velocity=(0, 0, math.pi)).advanced(0.5)
     assert c.centre == pytest.approx((1.0, 1.0, 0.0))
     assert c.rotation == pytest.approx((math.sqrt(0.5), 0, 0, math.sqrt(0.5)))
+
+
+def test_colliders_turn_about_an_axis_of_the_world():
+    """By 1.2 rad about (1, 2, 2) / 3, from any rotation, in one step or in many."""
+    start, rate = (0.8, -0.36, 0.48, 0.0), (0.4, 0.8, 0.8)
+    once = Collider("box", PLANE, (1, 1, 1), rotation=start, angular_velocity=rate).advanced(1.0)
+    turn = torch.tensor([math.cos(0.6), *(math.sin(0.6) * v / 1.2 for v in rate)])
+    torch.testing.assert_close(torch.tensor(once.rotation), multiply(turn, torch.tensor(start)))
+    often = Collider("box", PLANE, (1, 1, 1), rotation=start, angular_velocity=rate)
+    for _ in range(10):
+        often = often.advanced(0.1)
+    assert often.rotation == pytest.approx(once.rotation)
 
 
 @pytest.mark.parametrize("wrong, message", [

@@ -44,6 +44,16 @@ def test_text_is_read_with_its_comments_and_empty_lines(tmp_path):
     np.testing.assert_allclose(second.viewmat, [[0, 0, 1, 1], [1, 0, 0, 2], [0, 1, 0, 3], [0, 0, 0, 1]], atol=1e-12)
 
 
+@pytest.mark.parametrize(("value", "right"), [(1e9, True), (-1e9, True), (1.001e9, False), (-1.001e9, False)])
+def test_parameters_and_poses_are_bounded(tmp_path, value, right):
+    far = (*POSE[:4], value, 2.0, 3.0)
+    wide = binary(cameras=((1, 1, 64, 48, (50.0, 51.0, value, 24.0)),))[0], GOOD[1]
+    for cameras, images in (wide, (GOOD[0], binary(images=((far, 1, b"a.jpg", 0),))[1])):
+        write(tmp_path, cameras, images, "bin")
+        with nullcontext() if right else pytest.raises(ValueError, match="not finite"):
+            assert len(read_colmap(tmp_path)) == 1
+
+
 def test_binary_is_read_before_text(tmp_path):
     images = ((POSE, 1, b"x/b.jpg", 2), ((1, 0, 0, 0, 0, 0, 0), 3, b"a.jpg", 0))
     cameras = ((1, 1, 64, 48, (50.0, 51, 32, 24)), (3, 4, 8, 6, (5.0, 6, 4, 3, 0.1, 0.2, 0.3, 0.4)))

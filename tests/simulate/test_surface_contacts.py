@@ -1,13 +1,14 @@
 """Contacts between surfaces: analytic distances, directions and gradients, and a small body on a rough one."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
 from stages.core.physics.convex_cuts import fibonacci
-from stages.core.physics.solid_surface import SolidSurface, solid_surface
+from stages.core.physics.solid_surface import SolidSurface, _voxels_along, solid_surface
 from stages.lab.assets.shapes import Surface, box
 from stages.simulate.initial_overlaps import WINDOW
 from stages.simulate.surface_contacts import SurfaceContacts, SurfaceShape, surface_shape
@@ -169,6 +170,14 @@ def test_a_tangent_plane_continues_as_far_as_its_samples_are_apart():
     body = SolidSurface(slab + 0.05, 0.1, points)
     at = np.array([[-0.5, 0.0, top], [-0.5, 0.2, top + 0.1], [0.13, 0.0, top], [0.15, 0.2, top + 0.05]])
     np.testing.assert_allclose(body.depth(at), [0.04, -0.06, 0.0, -0.05], atol=0.004)
+
+
+def test_objects_are_measured_beside_one_without_finite_gaussians():
+    scene = scene_of((cube(0.1, 0.0, 0.0), cube(0.1, 0.5, 0.0)))
+    means = scene.gaussians.means.clone()
+    means[scene.gaussians.object_id == 2] = torch.nan
+    broken = replace(scene, gaussians=replace(scene.gaussians, means=means))
+    assert _voxels_along(broken, 1) >= _voxels_along(scene, 1) == 48
 
 
 def bumpy(side: float, height: float, bump: float) -> Surface:

@@ -17,6 +17,7 @@ from stages.core.scene.trajectory import (
     read_trajectory,
 )
 from tests.conftest import two_balls_scene
+from tests.core.scene.test_h5_schema import UNITS, start_of
 
 
 def parts(scene, p: int = 10):
@@ -92,6 +93,23 @@ def test_a_trajectory_has_frames_and_gaussians(tmp_path, two_balls):
     write(tmp_path / "t.h5", replace(two_balls, gaussians=two_balls.gaussians[:0]))
     with pytest.raises(InputError, match="t.h5: has no Gaussians"):
         read_trajectory(tmp_path / "t.h5")
+
+
+STORED = {"prompts": [], "provenance": {}, "field": start_of(UNITS), "confidence": torch.ones(1, 2), "plausibility": {}}
+
+
+@pytest.mark.parametrize("what", STORED)
+def test_a_disk_that_is_full_ends_the_run_at_the_next_write(tmp_path, two_balls, what):
+    """HDF5 itself would not tell."""
+    with (
+        pytest.raises(InputError, match="t.h5: cannot be written .No space left on device."),
+        TrajectoryWriter(tmp_path / "t.h5", two_balls, *parts(two_balls)) as writer,
+    ):
+        raw = writer._raw
+        raw.error = OSError(28, "No space left on device")
+        getattr(writer, f"store_{what}")(STORED[what])
+        pytest.fail("nothing was raised")
+    assert os.listdir(tmp_path) == [] and raw.closed
 
 
 def test_interrupted_write_leaves_no_file(tmp_path, two_balls):

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from stages.core.kernels.mpm.grid import BLOCK
 from stages.core.physics.mpm import solver as mpm
+from stages.core.physics.mpm.body_shapes import BodyShape
 from stages.core.scene.scene import SceneObject
 
 log = logging.getLogger(__name__)
@@ -30,6 +31,7 @@ class GridBodies:
 
     body: Int[Tensor, "p"]  # row of each particle's object in `objects`; particles are in the order of their bodies
     objects: Sequence[SceneObject]
+    shapes: Sequence[BodyShape] | None = None  # by default of voxels, see Solver
 
 
 class MovingGrid:
@@ -40,7 +42,7 @@ class MovingGrid:
         sizes = torch.bincount(bodies.body).tolist()
         self._copies, self._max_nodes = len(sizes), mpm.max_contact_nodes(device)
         options = mpm.SolverOptions(schedule="contact")
-        self._build = lambda p, b: mpm.Solver(p, b, dx, device, options, sizes)
+        self._build = lambda p, b: mpm.Solver(p, b, dx, device, options, sizes, bodies.shapes)
         self.solver = self._build(particles, box)
 
     def advance(self, duration: float, acceleration: Float[Tensor, "p 3"]) -> None:

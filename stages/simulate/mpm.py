@@ -22,8 +22,10 @@ from stages.core.physics.keypoints import nearest_weights
 from stages.core.physics.material_parts import part_of_points
 from stages.core.physics.materials import MODELS, Material
 from stages.core.physics.mpm import solver as mpm
+from stages.core.physics.mpm.body_shapes import BodyShape, shape_of_voxels
 from stages.core.physics.particles import Bodies
 from stages.core.physics.skinning import object_rotations
+from stages.core.physics.solid_surface import solid_surface
 from stages.core.physics.state import FrameState
 from stages.core.scene.scene import Scene, SceneObject
 from stages.core.scene.trajectory import Keypoints
@@ -55,7 +57,10 @@ def rollout(
     body, dx = setup.bodies.body, 2 * setup.bodies.spacing * unit
     particles = _particles(scene, setup, prompts, options, level)
     box = mpm.Box(tuple(unit * v for v in setup.box.low), tuple(unit * v for v in setup.box.high))
-    grid = MovingGrid(particles, box, dx, device, GridBodies(body, scene.objects), fixed=options.box is not None)
+    shapes = [_shape(scene, o.id, setup.bodies.x[body == row], setup.bodies.spacing, options.seed).scaled(unit)
+              for row, o in enumerate(scene.objects)]  # fmt: skip
+    bodies = GridBodies(body, scene.objects, shapes)
+    grid = MovingGrid(particles, box, dx, device, bodies, fixed=options.box is not None)
     ids = [o.id for o in scene.objects]
     attachment = _attach(scene, keypoints, setup.bodies)
     gravity = _gravity(particles, options)
@@ -88,6 +93,11 @@ def rollout(
                     raise _divergence(scene.objects[int(body[error.particle])], t) from error
 
     return states()
+
+
+def _shape(scene: Scene, object_id: int, x: Float[Tensor, "p 3"], h: float, seed: int) -> BodyShape:
+    """The undeformed shape of an object with particles at x and the spacing h, in scene units."""
+    return shape_of_voxels(x.double().numpy(), h, solid_surface(scene, object_id, seed))
 
 
 def _gravity(particles: mpm.Particles, options: SimulateOptions) -> Float[Tensor, "p 3"]:
@@ -167,6 +177,7 @@ def _particles(
     E, density, nu, viscosity, friction, model = columns[:, :6].unbind(1)
     particles = mpm.at_rest(setup.start * unit, volume, mpm.ParticleMaterial(E, nu, density, viscosity, friction))
     particles.model, particles.plastic = model.to(torch.int8), columns[:, 6:].contiguous()
+    particles.rest = x * unit
     particles.v, particles.held = velocity * (held == 0)[:, None], held
     return particles
 

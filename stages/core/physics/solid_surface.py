@@ -52,7 +52,7 @@ class SolidSurface:
         self.points, self.normals = np.concatenate([near, faces]), np.concatenate([normals, outward])
         self._tree = cKDTree(self.points)
         apart = self._tree.query(self.points[:: -(-len(self.points) // 2000)], 2)[0][:, 1]
-        self._spacing = max(h, float(np.median(apart)))  # of samples, within which a tangent plane is known to continue
+        self.spacing = max(h, float(np.median(apart)))  # of samples, within which a tangent plane is known to continue
 
     def depth(self, x: np.ndarray) -> np.ndarray:
         """Depths (k,) of points (k, 3) below the surface, negative outside."""
@@ -66,9 +66,13 @@ class SolidSurface:
             each = (below * normals).sum(-1)
             fine = (each * agree).sum(1) / agree.sum(1)
             beside = distance[:, 0] ** 2 - each[:, 0] ** 2  # squared distance of its projection to the nearest sample
-            known = (distance[:, 0] < 2 * self.h) & (beside < self._spacing**2)
+            known = (distance[:, 0] < 2 * self.h) & (beside < self.spacing**2)
             out[close[known]] = fine[known].clip(out[close[known]] - self.h, out[close[known]] + self.h)
         return out
+
+    def deeper_than(self, depth: float) -> np.ndarray:
+        """Centres (k, 3) of the voxels at more than this depth."""
+        return self.voxels[self._coarse_depth(self.voxels) > depth]
 
     def body_voxels(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Centres (m, 3) of the voxels in and around the body, their depths (m,), and which (m,) make up the body.

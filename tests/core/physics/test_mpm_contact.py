@@ -1,9 +1,11 @@
 """Bodies with a velocity field each: they neither stick nor pass through, and rub by Coulomb's law."""
 
+import math
+
 import pytest
 import torch
 
-from stages.core.kernels.mpm.transfers import KINEMATIC_MASS_FACTOR
+from stages.core.kernels.mpm.constitutive import SAND
 from stages.core.physics.mpm.contact import ContactSubsteps
 from stages.core.physics.mpm.solver import (
     Box,
@@ -77,6 +79,46 @@ def test_a_block_rests_on_another_with_a_gap_of_at_most_a_quarter_cell(solve):
     assert abs(gap) < 0.25 * DX and float(v[1].norm(dim=1).mean()) < 0.02
 
 
+def rise(x: torch.Tensor, start: torch.Tensor) -> torch.Tensor:
+    """Mean vertical displacement of the particles at the lower and the upper end of a block along x."""
+    ends = [start[:, 0] < start[:, 0].min() + DX, start[:, 0] > start[:, 0].max() - DX]
+    return torch.stack([(x - start)[end, 2].mean() for end in ends])
+
+
+def test_a_block_thrown_on_another_lands_flat(solve):
+    """Its leading edge touches as early as its face does, and it sinks in by at most 3 % of its height."""
+    upper = block((0.05, 0.1, 0.34), (0.35, 0.4, 0.64), speed=0.5)
+    start = upper.x.clone()
+    x, _ = solve([block((0, 0, 0), (0.5, 0.5, 0.3)), upper], 15, G)
+    low, high = rise(x[1], start).tolist()
+    assert abs(math.degrees(math.atan2(high - low, 0.3))) < 2
+    assert (low + high) / 2 == pytest.approx(-0.04, abs=0.03 * 0.3)
+
+
+@pytest.mark.parametrize("friction", [0.1, 0.6])
+def test_a_block_slides_on_the_floor_by_v2_over_2_mu_g(solve, friction):
+    slider = block((0, 0, 0), (0.3, 0.3, 0.15), friction, speed=1.0)
+    x, _ = solve([slider], 20, G)
+    stop = min(1.0 / (friction * G), 0.4)
+    assert float(x[0][:, 0].mean()) - 0.15 == pytest.approx(stop - friction * G * stop**2 / 2, rel=0.1)
+
+
+def test_a_block_that_falls_on_the_floor_rests_on_it_and_stays_level(solve):
+    fallen = block((0, 0, 0.02), (0.3, 0.3, 0.32))
+    start = fallen.x.clone()
+    x, _ = solve([fallen], 40, G)
+    low, high = rise(x[0], start).tolist()
+    assert (low + high) / 2 == pytest.approx(-0.02, abs=0.15 * DX) and abs(high - low) < 0.01
+
+
+def test_sand_rests_on_a_held_block(solve):
+    """Grains have no surface of the body that they were filled from: they touch at the distance of their radius."""
+    slab, heap = block((0, 0, 0.2), (0.5, 0.5, 0.3), held=True), block((0.15, 0.15, 0.3), (0.35, 0.35, 0.4))
+    heap.model[:], heap.plastic[:, 0] = SAND, 0.4
+    x, _ = solve([slab, heap], 10, G)
+    assert float(x[1][:, 2].min()) > 0.3 - 0.25 * DX and float(x[1][:, 2].min()) < 0.3 + DX
+
+
 def test_three_blocks_at_one_place_keep_their_momentum(solve):
     blocks = [block((0, 0, 0.5), (0.2, 0.2, 0.7), speed=1.0), block((0.22, 0, 0.5), (0.42, 0.2, 0.7)),
               block((0.22, 0.2, 0.5), (0.42, 0.4, 0.7))]  # fmt: skip
@@ -93,24 +135,13 @@ def test_the_schedule_for_gpus_gives_the_same_motion_and_repeats_to_the_bit(devi
 
     def run(kind):
         solver = Solver(joined, BOX, DX, device, SolverOptions(schedule="contact"), sizes)
-        shared = solver.rows, False, False, 0.0, solver._obstacles, solver._body_contact(joined, sizes)
+        shared = solver.rows, False, False, 0.0, solver._obstacles, solver._body_contact(joined, sizes, None)
         solver._substepper = kind(*shared, solver._quanta()) if kind is ContactSubsteps else kind(*shared)
         return torch.cat(moved(solver, sizes, 10, G)[0])
 
     fast = run(ContactSubsteps)
     torch.testing.assert_close(fast, run(SplitSubsteps), rtol=0, atol=2e-5)
     assert torch.equal(fast, run(ContactSubsteps))
-
-
-def test_a_filled_cell_has_the_mass_of_the_lightest_part_as_it_is_on_the_grid():
-    """Eight particles in a cell; held ones weigh more on the grid, so that what is free gives way."""
-    free, held = block((0, 0, 0.5), (0.1, 0.1, 0.6)), block((0.2, 0, 0.5), (0.3, 0.1, 0.6), friction=0.7, held=True)
-    free.mass[:4] *= 3
-    sizes, both = [len(free), len(held)], join_particles([free, held])
-    contact = Solver(both, BOX, DX, "cpu", SolverOptions(schedule="contact"), sizes)._body_contact(both, sizes)
-    cell = 500 * DX**3
-    assert contact.full_cell.tolist() == pytest.approx([cell, KINEMATIC_MASS_FACTOR * cell])
-    assert contact.friction.tolist() == pytest.approx([0.3, 0.7])
 
 
 def test_unknown_schedules_are_refused():

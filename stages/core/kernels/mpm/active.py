@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import warp as wp
 
-from stages.core.kernels.mpm.contact import SWEEPS, resolve_pair
+from stages.core.kernels.mpm.contact import BLOCK_NODES, ContactBodies, may_touch, resolve_node
 from stages.core.kernels.mpm.exact import velocity_from_exact
-from stages.core.kernels.mpm.grid import BLOCK, MpmGrid, Obstacle, apply_boundaries, apply_walls, near_walls
+from stages.core.kernels.mpm.grid import BLOCK, MpmGrid, Obstacle, apply_boundaries, near_walls
 from stages.core.kernels.mpm.transfers import ParticleArrays
 
 
@@ -21,6 +21,7 @@ class ActiveBlocks:
     marks: wp.array[int]
     blocks: wp.array[int]
     total: wp.array[int]
+    sharers: wp.array[int]  # number of scenes for which a block is active
 
 
 @wp.func
@@ -49,6 +50,7 @@ def activate_blocks(
                 if active.marks[block] == 0:  # noqa: SIM102 -- read before the atomic; Warp's `and` does not short-circuit
                     if wp.atomic_max(active.marks, block, 1) == 0:
                         active.blocks[wp.atomic_add(active.total, 0, 1)] = block
+                        wp.atomic_add(active.sharers, block % (grid.count // BLOCK_NODES), 1)
     if near_walls(grid, base):
         corner = rows.scene[i] * grid.count + (base[0] * grid.nodes[1] + base[1]) * grid.nodes[2] + base[2]
         mu = rows.friction[i]
@@ -84,61 +86,30 @@ def grid_sweep(
         t += sweepers
 
 
-@wp.func
-def _resolve_node(
-    grid: MpmGrid, velocity: wp.array[wp.vec4], full: wp.array[float], body_friction: wp.array[float],
-    friction: wp.array[float], marks: wp.array[int], first: int, block: int, node: int,
-):  # fmt: skip
-    """Contact at a node of a block of the bodies that are active in it, of which `first` is the first."""
-    blocks = grid.count // (BLOCK * BLOCK * BLOCK)
-    bodies = full.shape[0]
-    at = _position(grid, node)
-    for axis in range(3):
-        if at[axis] == 0 or at[axis] + 1 >= grid.nodes[axis]:
-            return
-    stride_y = grid.nodes[2]
-    stride_x = grid.nodes[1] * stride_y
-    here = int(0)  # noqa: UP018 -- a literal would be constant in Warp
-    for p in range(first, bodies):
-        here += wp.where(marks[p * blocks + block] > 0, 1, 0)
-    touched = bool(False)  # noqa: UP018
-    for _ in range(wp.where(here > 2, SWEEPS, wp.where(here > 1, 1, 0))):
-        for p in range(first, bodies):
-            if marks[p * blocks + block] > 0:
-                for q in range(p + 1, bodies):
-                    if marks[q * blocks + block] > 0:  # noqa: SIM102 -- Warp's `and` does not short-circuit
-                        if resolve_pair(velocity, p * grid.count + node, q * grid.count + node, stride_x, stride_y,
-                                        full[p], full[q], wp.max(body_friction[p], body_friction[q])):  # fmt: skip
-                            touched = True
-    if touched:
-        for p in range(first, bodies):
-            if marks[p * blocks + block] > 0:
-                own = p * grid.count + node
-                w = velocity[own]
-                inside = apply_walls(grid, at, wp.vec3(w[0], w[1], w[2]), friction[own])
-                velocity[own] = wp.vec4(inside[0], inside[1], inside[2], w[3])
-
-
 @wp.kernel(enable_backward=False)
 def contact_sweep(
-    grid: MpmGrid, sweepers: int, velocity: wp.array[wp.vec4], full: wp.array[float], body_friction: wp.array[float],
-    friction: wp.array[float], active: ActiveBlocks,
+    grid: MpmGrid, sweepers: int, rows: ParticleArrays, bodies: ContactBodies, velocity: wp.array[wp.vec4],
+    nearest: wp.array[wp.int64], present: wp.array[int], friction: wp.array[float], active: ActiveBlocks,
+    dt: wp.array[float], clear: int,
 ):  # fmt: skip
-    """Contact at the nodes of blocks that several bodies have in common; the thread of the first body acts for all.
+    """Contact at the nodes of blocks that may have it; the thread of the first body in a block acts for all.
 
-    Arguments as `contact.contact_step`.
+    `present` lists all bodies; other arguments as `contact.contact_step`.
     """
     t = wp.tid()
-    blocks = grid.count // (BLOCK * BLOCK * BLOCK)  # of a body
-    while t < active.total[0] * BLOCK * BLOCK * BLOCK:
-        block = active.blocks[t // (BLOCK * BLOCK * BLOCK)]
+    blocks = grid.count // BLOCK_NODES  # of a body
+    while t < active.total[0] * BLOCK_NODES:
+        block = active.blocks[t // BLOCK_NODES]
         here = block % blocks
-        first = int(0)  # noqa: UP018 -- a literal would be constant in Warp
-        while active.marks[first * blocks + here] == 0:
-            first += 1
-        if first == block // blocks:
-            node = node_of_block(grid, here, t % (BLOCK * BLOCK * BLOCK))
-            _resolve_node(grid, velocity, full, body_friction, friction, active.marks, first, here, node)
+        node = node_of_block(grid, here, t % BLOCK_NODES)
+        at = _position(grid, node)
+        if may_touch(grid, active.sharers, at[0], at[1], at[2]):
+            first = int(0)  # noqa: UP018 -- a literal would be constant in Warp
+            while active.marks[first * blocks + here] == 0:
+                first += 1
+            if first == block // blocks:
+                resolve_node(grid, rows, bodies, velocity, nearest, present, first, present.shape[0], at[0], at[1],
+                             at[2], friction, dt[0], clear)  # fmt: skip
         t += sweepers
 
 
@@ -159,4 +130,5 @@ def clear_active_blocks(
             c[node * width + n] = wp.vec4()
         friction[node] = 0.0
         active.marks[block] = 0
+        active.sharers[block % (grid.count // BLOCK_NODES)] = 0
         t += sweepers

@@ -1,127 +1,269 @@
 """Contact of bodies that have a velocity field each: no approach, Coulomb friction, free separation.
 
 Each body is scattered to a window of its own, as scenes of a batch are. Where windows overlap, bodies may have mass at
-the same node although they are a cell apart. With quadratic B-splines the volume fractions of two bodies add up to 1 at
-every node across a common surface, and to less across a gap, by the slope of the fractions times its width in cells; so
-bodies touch where 1 - f_a - f_b is at most CONTACT_GAP times that slope.
-Sources: Bardenhagen et al. 2001, "An improved contact algorithm for the material point method"; Huang et al. 2011,
-"Contact algorithms for the material point method in impact and penetration simulation" (common normal); Nairn 2013,
-"Modeling imperfect interfaces in the material point method using multimaterial methods" (normal of one body).
+the same node although they are a cell apart. Their gap there follows from the signed distance to the surface of each
+undeformed body at the node's material coordinates, which the nearest particle gives: X + F^-1 (place - x). A node
+on one body is moved to the nearest point of that body's surface, whose distance from the other is the gap; the smaller
+of both such gaps counts, so that an edge touches as early as a face. Bodies approach by at most the gap in a substep.
+The floor is a plane in contact with every body.
+Sources: Bardenhagen et al. 2001, "An improved contact algorithm for the material point method" (velocity fields);
+Kamrin, Rycroft and Nave 2012, "Reference map technique for finite-strain elasticity and fluid-solid interaction"
+(distances by material coordinates); Nairn, Hammerquist and Smith 2020, "New material point method contact algorithms
+for improved accuracy, large-deformation problems, and proper null-space filtering" (gaps from particles, not masses).
 """
 
 from __future__ import annotations
 
 import warp as wp
 
-from stages.core.kernels.mpm.grid import BLOCK, MpmGrid, apply_walls, coulomb_contact
+from stages.core.kernels.mpm.constitutive import SAND
+from stages.core.kernels.mpm.grid import BLOCK, MpmGrid, apply_walls, coulomb_contact, first_node
+from stages.core.kernels.mpm.transfers import FREE, LOST, ParticleArrays
 
-CONTACT_GAP = 0.1  # gap at which bodies are in contact [cells]; particles are placed with a jitter of this size
-MIN_FRACTION = 0.02  # volume fraction a cell outside a flat surface; normals at fewer are unreliable
+# Height above the floor or a held body up to which nodes stop [cells]. Stopping higher ones takes more of the energy of
+# an impact, lower ones alone let bodies sink further. With CONTACT_FLOOR_GAP (solver.py) chosen on a tower of six, the
+# rebound of a box and a slide.
+STATIC_REACH = 0.25
+CLEARLY = 1e-3  # difference of lengths of normals that rounding does not decide
+REFRESH = (
+    4  # substeps for which the nearest particles of nodes are kept; a particle moves a small part of a cell in one
+)
+FLOOR_REST = 0.1  # gap at which bodies stop at the floor [cells], into which balls in a heap then sink by .17
 SWEEPS = 2  # over the pairs of a node with more than two bodies
 BLOCK_NODES = wp.constant(BLOCK**3)
-ACROSS = wp.constant(wp.vec2(10.0 / 16.0, 3.0 / 16.0))  # weights of differences in a row and in those beside it
+NONE = wp.constant(wp.int64(2**62))  # key of a node without particles
+ROW = wp.constant(wp.int64(2**32))  # a key is the squared distance of the nearest particle, times ROW, and its row
+FINENESS = 2.0**24  # units of squared distance in a cell
+
+
+@wp.struct
+class ContactBodies:
+    """Signed distances to the surfaces of undeformed bodies, each on a lattice of its own, and their friction."""
+
+    texels: wp.array[wp.vec4]  # gradient and signed distance [m], of all bodies
+    first: wp.array[int]  # texel of each body
+    size: wp.array[wp.vec3i]
+    origin: wp.array[wp.vec3]  # material coordinates of the first texel [m]
+    spacing: wp.array[float]  # [m]
+    friction: wp.array[float]  # Coulomb coefficient
+
+
+@wp.struct
+class ContactPatch:
+    """A body near one of its particles."""
+
+    body: int
+    held: bool
+    x: wp.vec3  # the particle [m]
+    X: wp.vec3  # its material coordinates [m]
+    inverse: wp.mat33  # of its deformation gradient
+    radius: float  # of a grain [m]; 0 where the body keeps its surface
 
 
 @wp.func
-def _slope(velocity: wp.array[wp.vec4], node: int, stride_x: int, stride_y: int, full: float) -> wp.vec3:
-    """Change of the volume fraction of a body per cell; `full` is the mass of a filled cell.
-
-    Central differences, averaged across: normals of inclined planes are 1.5 degrees off at most, without it 2 to 8.
-    Source: Scharr 2000, "Optimale Operatoren in der digitalen Bildverarbeitung".
-    """
-    slope = wp.vec3()
-    for i in range(-1, 2):
-        for j in range(-1, 2):
-            for k in range(-1, 2):
-                x = wp.where(i == 0, ACROSS[0], ACROSS[1])
-                y = wp.where(j == 0, ACROSS[0], ACROSS[1])
-                z = wp.where(k == 0, ACROSS[0], ACROSS[1])
-                mass = velocity[node + i * stride_x + j * stride_y + k][3]
-                slope += mass * wp.vec3(float(i) * y * z, float(j) * x * z, float(k) * x * y)
-    return slope * (0.5 / full)
+def _patch(rows: ParticleArrays, key: wp.int64, body: int) -> ContactPatch:
+    p = int(key % ROW)
+    out = ContactPatch()
+    out.body = body
+    out.held = int(rows.held[p]) != FREE
+    out.x = rows.x[p]
+    out.X = rows.rest[p]
+    out.inverse = wp.inverse(rows.F[p])
+    if int(rows.model[p]) >= SAND:  # sand and snow flow and break, so that any particle may come to the surface
+        out.radius = wp.pow(0.75 / wp.pi * rows.volume[p], 1.0 / 3.0)
+    return out
 
 
 @wp.func
-def _flat_slope(fraction: float) -> float:
-    """Slope per cell of the volume fraction across a flat surface, where it is `fraction`; less at a convex edge."""
-    f = wp.clamp(wp.min(fraction, 1.0 - fraction), MIN_FRACTION, 0.5)
-    if f < 1.0 / 6.0:  # farther than half a cell from the surface
-        return 0.5 * wp.pow(6.0 * f, 2.0 / 3.0)
-    d = (0.5 - f) / 0.75
-    d += d * d * d / 2.25  # inverts f = 1/2 - 3 d / 4 + d^3 / 3 to 3 %
-    return 0.75 - d * d
+def shape_at(bodies: ContactBodies, body: int, X: wp.vec3) -> wp.vec4:
+    """Gradient and signed distance [m] of an undeformed body at material coordinates X [m]."""
+    n = bodies.size[body]
+    h = bodies.spacing[body]
+    g = (X - bodies.origin[body]) / h
+    c = wp.vec3()
+    f = wp.vec3i()
+    for axis in range(3):
+        c[axis] = wp.clamp(g[axis], 0.0, float(n[axis] - 1))
+        f[axis] = wp.min(int(c[axis]), n[axis] - 2)
+    out = wp.vec4()
+    for corner in range(8):
+        a = corner // 4
+        b = (corner // 2) % 2
+        d = corner % 2
+        w = wp.abs(float(1 - a) - c[0] + float(f[0])) * wp.abs(float(1 - b) - c[1] + float(f[1]))
+        w *= wp.abs(float(1 - d) - c[2] + float(f[2]))
+        out += w * bodies.texels[bodies.first[body] + ((f[0] + a) * n[1] + f[1] + b) * n[2] + f[2] + d]
+    out[3] += h * wp.length(g - c)
+    return out
 
 
 @wp.func
-def resolve_pair(
-    velocity: wp.array[wp.vec4], first: int, second: int, stride_x: int, stride_y: int, full_a: float, full_b: float,
-    friction: float,
+def surface_at(bodies: ContactBodies, near: ContactPatch, place: wp.vec3) -> wp.vec4:
+    """Outward normal and signed distance [m] of a body at `place`; the normal is shorter at edges than at faces."""
+    arm = place - near.x
+    if near.radius > 0.0:
+        length = wp.length(arm)
+        normal = 0.5 * arm / wp.max(length, 1e-12)  # as at an edge, so that a body with a surface gives the normal
+        return wp.vec4(normal[0], normal[1], normal[2], length - near.radius)
+    s = shape_at(bodies, near.body, near.X + near.inverse * arm)
+    gradient = wp.vec3(s[0], s[1], s[2])
+    turned = wp.transpose(near.inverse) * gradient
+    stretch = wp.max(wp.length(turned) / wp.max(wp.length(gradient), 1e-12), 1e-12)
+    turned = turned / stretch
+    return wp.vec4(turned[0], turned[1], turned[2], s[3] / stretch)
+
+
+@wp.func
+def _on_surface(s: wp.vec4, place: wp.vec3) -> wp.vec3:
+    """The nearest point of the surface, whose normal and distance are `s`."""
+    return place - s[3] * wp.normalize(wp.vec3(s[0], s[1], s[2]))
+
+
+@wp.func
+def _resolve_pair(
+    grid: MpmGrid, bodies: ContactBodies, velocity: wp.array[wp.vec4], a: ContactPatch, b: ContactPatch, node: int,
+    place: wp.vec3, dt: float,
 ) -> bool:  # fmt: skip
-    """Stop the approach of two bodies at a node where they touch, with friction; momentum is kept."""
+    """Limit the approach of two bodies at a node to their gap, with friction; momentum is kept."""
+    first = a.body * grid.count + node
+    second = b.body * grid.count + node
     u = velocity[first]
     v = velocity[second]
-    fa = u[3] / full_a
-    fb = v[3] / full_b
-    if fa < MIN_FRACTION or fb < MIN_FRACTION:
+    if u[3] <= 0.0 or v[3] <= 0.0:
         return False
-    slope_a = _slope(velocity, first, stride_x, stride_y, full_a)
-    slope_b = _slope(velocity, second, stride_x, stride_y, full_b)
-    steep_a = wp.length(slope_a)
-    steep_b = wp.length(slope_b)
-    if 1.0 - wp.min(fa, 1.0) - wp.min(fb, 1.0) > 0.5 * CONTACT_GAP * (steep_a + steep_b):
+    of_a = surface_at(bodies, a, place)
+    of_b = surface_at(bodies, b, place)
+    if (a.held and of_a[3] > STATIC_REACH * grid.dx) or (b.held and of_b[3] > STATIC_REACH * grid.dx):
         return False
-    # from the first body to the second, by the flatter surface: at the edge of a block that slides on another the mean
-    # of both would be tilted against the motion
-    flatter = steep_a * _flat_slope(fb) > steep_b * _flat_slope(fa)
-    normal = wp.normalize(wp.where(flatter, -slope_a, slope_b))
-    relative = wp.vec3(u[0] - v[0], u[1] - v[1], u[2] - v[2])
-    change = relative - coulomb_contact(relative, -normal, friction)
+    at_a = surface_at(bodies, a, _on_surface(of_b, place))
+    at_b = surface_at(bodies, b, _on_surface(of_a, place))
+    out_a = wp.vec3(at_a[0], at_a[1], at_a[2])
+    out_b = wp.vec3(at_b[0], at_b[1], at_b[2])
+    normal = wp.normalize(wp.where(wp.length(out_a) > wp.length(out_b) + CLEARLY, out_a, -out_b))
+    free = wp.max(wp.min(at_a[3], at_b[3]), 0.0) / dt * normal
+    relative = wp.vec3(u[0] - v[0], u[1] - v[1], u[2] - v[2]) - free
+    change = relative - coulomb_contact(relative, -normal, wp.max(bodies.friction[a.body], bodies.friction[b.body]))
     if wp.dot(change, normal) <= 0.0:
         return False
-    a = v[3] / (u[3] + v[3])
-    b = 1.0 - a
-    velocity[first] = wp.vec4(u[0] - a * change[0], u[1] - a * change[1], u[2] - a * change[2], u[3])
-    velocity[second] = wp.vec4(v[0] + b * change[0], v[1] + b * change[1], v[2] + b * change[2], v[3])
+    share = v[3] / (u[3] + v[3])
+    more = 1.0 - share
+    velocity[first] = wp.vec4(u[0] - share * change[0], u[1] - share * change[1], u[2] - share * change[2], u[3])
+    velocity[second] = wp.vec4(v[0] + more * change[0], v[1] + more * change[1], v[2] + more * change[2], v[3])
     return True
+
+
+@wp.func
+def _resolve_floor(
+    grid: MpmGrid,
+    bodies: ContactBodies,
+    velocity: wp.array[wp.vec4],
+    a: ContactPatch,
+    node: int,
+    place: wp.vec3,
+    dt: float,
+):
+    """Limit the approach of a body to the floor at a node, with friction."""
+    of_a = surface_at(bodies, a, place)
+    at_a = surface_at(bodies, a, wp.vec3(place[0], place[1], grid.face_low[2]))
+    gap = wp.min(at_a[3], _on_surface(of_a, place)[2] - grid.face_low[2]) - FLOOR_REST * grid.dx
+    u = velocity[a.body * grid.count + node]
+    free = wp.vec3(0.0, 0.0, -wp.max(gap, 0.0) / dt)
+    v = free + coulomb_contact(wp.vec3(u[0], u[1], u[2]) - free, wp.vec3(0.0, 0.0, 1.0), bodies.friction[a.body])
+    velocity[a.body * grid.count + node] = wp.vec4(v[0], v[1], v[2], u[3])
+
+
+@wp.func
+def may_touch(grid: MpmGrid, sharers: wp.array[int], i: int, j: int, k: int) -> bool:
+    """Whether the block of a node may have contact: of several bodies (`sharers` of each block), or at the floor."""
+    at = ((i // BLOCK) * (grid.nodes[1] // BLOCK) + j // BLOCK) * (grid.nodes[2] // BLOCK) + k // BLOCK
+    return sharers[at] > 1 or float(k - k % BLOCK) <= (grid.face_low[2] - grid.origin[2]) / grid.dx + STATIC_REACH
+
+
+@wp.func
+def resolve_node(
+    grid: MpmGrid, rows: ParticleArrays, bodies: ContactBodies, velocity: wp.array[wp.vec4],
+    nearest: wp.array[wp.int64], present: wp.array[int], start: int, stop: int, i: int, j: int, k: int,
+    wall_friction: wp.array[float], dt: float, clear: int,
+):  # fmt: skip
+    """Contact at a node between those of the bodies `present[start:stop]` that reach it; `clear` clears their keys."""
+    node = (i * grid.nodes[1] + j) * grid.nodes[2] + k
+    place = grid.origin + grid.dx * wp.vec3(float(i), float(j), float(k))
+    here = int(0)  # noqa: UP018 -- a literal would be constant in Warp
+    for p in range(start, stop):
+        here += wp.where(nearest[present[p] * grid.count + node] < NONE, 1, 0)
+    for _ in range(wp.where(here > 2, SWEEPS, wp.where(here > 1, 1, 0))):
+        for p in range(start, stop):
+            key = nearest[present[p] * grid.count + node]
+            if key < NONE:
+                a = _patch(rows, key, present[p])
+                for q in range(p + 1, stop):
+                    other = nearest[present[q] * grid.count + node]
+                    if other < NONE:
+                        _resolve_pair(grid, bodies, velocity, a, _patch(rows, other, present[q]), node, place, dt)
+    at_floor = place[2] - grid.face_low[2] <= STATIC_REACH * grid.dx
+    for p in range(start, stop):
+        own = present[p] * grid.count + node
+        key = nearest[own]
+        if key < NONE:
+            if clear > 0:
+                nearest[own] = NONE
+            if at_floor:
+                _resolve_floor(grid, bodies, velocity, _patch(rows, key, present[p]), node, place, dt)
+            if here > 1:
+                w = velocity[own]
+                inside = apply_walls(grid, wp.vec3i(i, j, k), wp.vec3(w[0], w[1], w[2]), wall_friction[own])
+                velocity[own] = wp.vec4(inside[0], inside[1], inside[2], w[3])
+
+
+@wp.kernel(enable_backward=False)
+def find_nearest(grid: MpmGrid, rows: ParticleArrays, sharers: wp.array[int], nearest: wp.array[wp.int64]):
+    """The nearest particle of each body at the nodes of blocks that may have contact.
+
+    Lowers the keys `nearest` of the nodes to that of the particle; the order of the particles does not matter.
+    """
+    p = wp.tid()
+    if int(rows.held[p]) == LOST:
+        return
+    g = (rows.x[p] - grid.origin) / grid.dx
+    base = first_node(g)
+    block = wp.vec3i(base[0] // BLOCK, base[1] // BLOCK, base[2] // BLOCK)
+    last = wp.vec3i((base[0] + 2) // BLOCK, (base[1] + 2) // BLOCK, (base[2] + 2) // BLOCK)
+    near = int(0)  # noqa: UP018 -- a literal would be constant in Warp; a bit for each of up to eight blocks
+    for a in range(block[0], last[0] + 1):
+        for b in range(block[1], last[1] + 1):
+            for c in range(block[2], last[2] + 1):
+                if may_touch(grid, sharers, a * BLOCK, b * BLOCK, c * BLOCK):
+                    near |= 1 << (4 * (a - block[0]) + 2 * (b - block[1]) + c - block[2])
+    if near == 0:
+        return
+    window = rows.scene[p] * grid.count
+    for n in range(27):
+        i = base[0] + n // 9
+        j = base[1] + (n // 3) % 3
+        k = base[2] + n % 3
+        bit = 4 * (i // BLOCK - block[0]) + 2 * (j // BLOCK - block[1]) + k // BLOCK - block[2]
+        if (near >> bit) & 1 > 0:
+            d = g - wp.vec3(float(i), float(j), float(k))
+            key = wp.int64(int(wp.dot(d, d) * FINENESS)) * ROW + wp.int64(p)
+            wp.atomic_min(nearest, window + (i * grid.nodes[1] + j) * grid.nodes[2] + k, key)
 
 
 @wp.kernel(enable_backward=False)
 def contact_step(
-    grid: MpmGrid, velocity: wp.array[wp.vec4], corners: wp.array[int], starts: wp.array[int], bodies: wp.array[int],
-    full: wp.array[float], friction: wp.array[float], wall_friction: wp.array[float],
+    grid: MpmGrid, rows: ParticleArrays, bodies: ContactBodies, velocity: wp.array[wp.vec4],
+    nearest: wp.array[wp.int64], corners: wp.array[int], starts: wp.array[int], present: wp.array[int],
+    wall_friction: wp.array[float], dt: wp.array[float], clear: int,
 ):  # fmt: skip
-    """One node of a block that several bodies share: `bodies[starts[b] : starts[b + 1]]` of the block at `corners[b]`.
+    """One node of a block with the bodies `present[starts[b] : starts[b + 1]]`; `corners[b]` is its first node.
 
-    `velocity` holds velocity and mass of the nodes of each body; `full` the mass of a filled cell and `friction` the
-    Coulomb coefficient of each body; the larger of two coefficients acts.
+    `clear`: forget the nearest particles, so that find_nearest follows.
     """
-    t = wp.tid()
-    b = t // BLOCK_NODES
-    n = t % BLOCK_NODES
+    b = wp.tid() // BLOCK_NODES
+    n = wp.tid() % BLOCK_NODES
     stride_y = grid.nodes[2]
     stride_x = grid.nodes[1] * stride_y
     i = corners[b] // stride_x + n // (BLOCK * BLOCK)
     j = (corners[b] // stride_y) % grid.nodes[1] + (n // BLOCK) % BLOCK
     k = corners[b] % stride_y + n % BLOCK
-    node = i * stride_x + j * stride_y + k
-    start = starts[b]
-    stop = starts[b + 1]
-    if i == 0 or j == 0 or k == 0 or i + 1 >= grid.nodes[0] or j + 1 >= grid.nodes[1] or k + 1 >= grid.nodes[2]:
-        return
-    sweeps = wp.where(stop - start > 2, SWEEPS, 1)
-    touched = bool(False)  # noqa: UP018 -- a literal would be constant in Warp
-    for _ in range(sweeps):
-        for p in range(start, stop):
-            for q in range(p + 1, stop):
-                one = bodies[p]
-                other = bodies[q]
-                mu = wp.max(friction[one], friction[other])
-                if resolve_pair(velocity, one * grid.count + node, other * grid.count + node, stride_x, stride_y,
-                                 full[one], full[other], mu):  # fmt: skip
-                    touched = True
-    if touched:
-        for p in range(start, stop):
-            at = bodies[p] * grid.count + node
-            w = velocity[at]
-            inside = apply_walls(grid, wp.vec3i(i, j, k), wp.vec3(w[0], w[1], w[2]), wall_friction[at])
-            velocity[at] = wp.vec4(inside[0], inside[1], inside[2], w[3])
+    resolve_node(grid, rows, bodies, velocity, nearest, present, starts[b], starts[b + 1], i, j, k, wall_friction,
+                 dt[0], clear)  # fmt: skip

@@ -29,6 +29,7 @@ class ParticleArrays:
 
     count: int
     x: wp.array[wp.vec3]  # [m]
+    rest: wp.array[wp.vec3]  # material coordinates: position in the undeformed body [m]
     v: wp.array[wp.vec3]  # [m/s]
     C: wp.array[wp.mat33]  # APIC velocity gradient [1/s]
     F: wp.array[wp.mat33]  # deformation gradient, elastic part

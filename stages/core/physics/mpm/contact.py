@@ -1,26 +1,21 @@
-"""MPM substeps of bodies in contact as three kernel launches each, particles, grid and contact: the GPU schedule."""
+"""MPM substeps of bodies in contact as four kernel launches each: the schedule for a GPU.
+
+These are particles, grid, the nearest particles at nodes, and contact.
+"""
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import torch
 import warp as wp
-from jaxtyping import Float
 from torch import Tensor
 
 from stages.core.kernels.interop import launch, view
 from stages.core.kernels.mpm.active import contact_sweep, grid_sweep
+from stages.core.kernels.mpm.contact import NONE, REFRESH, find_nearest
 from stages.core.kernels.mpm.split import particle_step
+from stages.core.physics.mpm.body_shapes import BodyContact
 from stages.core.physics.mpm.graphs import CLEAR_ALIGNMENT, SORT_INTERVAL, GraphedFrames
 from stages.core.physics.mpm.particle_rows import ParticleRows
-
-
-class BodyContact(NamedTuple):
-    """Parameters of the contact between bodies, one value per body."""
-
-    full_cell: Float[Tensor, "s"]  # mass of a filled grid cell, as it is on the grid [kg]
-    friction: Float[Tensor, "s"]  # Coulomb coefficient
 
 
 class ContactSubsteps(GraphedFrames):
@@ -34,6 +29,9 @@ class ContactSubsteps(GraphedFrames):
         self._step, self._contact = particle_step(plastic, bouncy, exact=True), contact
         self._velocity = torch.zeros(self._count, 4, device=self.device)
         self._momentum = torch.zeros(2 * self._count, 4, device=self.device)
+        self._nearest = torch.full((self._count,), int(NONE), dtype=torch.int64, device=self.device)
+        self._present = torch.arange(rows.scenes, dtype=torch.int32, device=self.device)
+        self._lengths: dict[float, Tensor] = {}  # of substeps [s]; the graphs read them
         self._stale = torch.zeros(1, dtype=torch.int32, device=self.device)  # unused
         self._times: dict[tuple[float, int], Tensor] = {}  # of the substeps [s]; the graphs read them
 
@@ -43,9 +41,12 @@ class ContactSubsteps(GraphedFrames):
     def _substeps(self, dt: float, steps: int) -> None:
         if (dt, steps) not in self._times:
             self._times[dt, steps] = dt * torch.arange(-1, steps, device=self.device, dtype=torch.float32)
+        if dt not in self._lengths:
+            self._lengths[dt] = torch.full((1,), dt, device=self.device)
         times = self._times[dt, steps]
         self._particles(dt, times, 0, 1)
         active, velocity, friction = self._active, view(self._velocity, wp.vec4), view(self._friction)
+        nearest = view(self._nearest)
         for step in range(steps):
             if step and step % SORT_INTERVAL == 0:
                 self.rows.sort()
@@ -53,10 +54,13 @@ class ContactSubsteps(GraphedFrames):
             inputs = [self.grid, self._sweepers, view(self._momentum, wp.vec4), velocity, friction, active,
                       self._obstacles, view(clock), self._scale]  # fmt: skip
             launch(grid_sweep, self._sweepers, inputs, device=self.device)
-            if self.rows.scenes > 1:
-                full, mu = (view(t) for t in self._contact)
-                inputs = [self.grid, self._sweepers, velocity, full, mu, friction, active]
-                launch(contact_sweep, self._sweepers, inputs, device=self.device)
+            if step % REFRESH == 0:
+                inputs = [self.grid, self.rows.struct, view(self._sharers), nearest]
+                launch(find_nearest, len(self.rows), inputs, device=self.device)
+            inputs = [self.grid, self._sweepers, self.rows.struct, self._contact.bodies, velocity, nearest,
+                      view(self._present), friction, active, view(self._lengths[dt]),
+                      int((step + 1) % REFRESH == 0 or step == steps - 1)]  # fmt: skip
+            launch(contact_sweep, self._sweepers, inputs, device=self.device)
             self._particles(dt, clock, 1, int(step < steps - 1))
 
     def _particles(self, dt: float, clock: Tensor, gather: int, scatter: int) -> None:

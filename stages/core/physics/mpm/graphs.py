@@ -37,6 +37,8 @@ class GraphedFrames(ABC):
         self._active = ActiveBlocks()
         self._active.marks, self._active.blocks = view(self._marks), view(self._blocks)
         self._active.total = view(self._total)
+        self._sharers = torch.zeros(self.grid.count // BLOCK**3, **ints)
+        self._active.sharers = view(self._sharers)
         self._last_total = torch.zeros(1, **ints)
         self._sweepers = -(-len(rows) // CLEAR_ALIGNMENT) * CLEAR_ALIGNMENT
         self._graphs: dict[tuple[float, int], torch.cuda.CUDAGraph | None] = {}

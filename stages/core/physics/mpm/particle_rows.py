@@ -13,7 +13,7 @@ from stages.core.kernels.mpm import transfers as kernels
 
 NEVER = 2**31 - 1  # value of `lost` for a scene without lost particles
 _TYPES = {
-    "x": wp.vec3, "v": wp.vec3, "C": wp.mat33, "F": wp.mat33, "stiffness": wp.vec3, "plastic": wp.vec3,
+    "x": wp.vec3, "rest": wp.vec3, "v": wp.vec3, "C": wp.mat33, "F": wp.mat33, "stiffness": wp.vec3, "plastic": wp.vec3,
     "acceleration": wp.vec3, "base_node": wp.vec3i,
 }  # fmt: skip
 

@@ -24,9 +24,9 @@ from torch import Tensor
 
 from stages.core.kernels.mpm import grid as mpm_grid
 from stages.core.kernels.mpm.constitutive import MAX_STIFFENING, NEO_HOOKEAN
-from stages.core.kernels.mpm.transfers import KINEMATIC_MASS_FACTOR
 from stages.core.physics.colliders import Collider, as_obstacles
-from stages.core.physics.mpm.contact import BodyContact, ContactSubsteps
+from stages.core.physics.mpm.body_shapes import BodyContact, BodyShape, shape_of_voxels
+from stages.core.physics.mpm.contact import ContactSubsteps
 from stages.core.physics.mpm.domain import MAX_NODES, Box
 from stages.core.physics.mpm.fused import FusedSubsteps
 from stages.core.physics.mpm.particle_rows import NEVER, ParticleRows
@@ -36,7 +36,10 @@ SAFETY = 0.5  # fraction of a cell that a wave and a particle may cross in a sub
 VISCOUS = 0.15  # maximum of dt eta / (density dx^2); violent vibration diverges from 0.3
 FLOOR_GAP = mpm_grid.FLOOR_GAP
 SCHEDULES = ("auto", "split", "fused", "exact", "contact")
-CONTACT_NODE_BYTES = 52  # velocity, momentum in fixed point, and friction of a node of a body on a GPU
+CONTACT_FLOOR_GAP = (
+    0.7  # as FLOOR_GAP, where the floor is in contact with bodies; see STATIC_REACH in kernels/mpm/contact.py
+)
+CONTACT_NODE_BYTES = 60  # velocity, momentum in fixed point, friction and nearest particle of a node on a GPU
 SUBSTEP_MULTIPLE = 8  # on a GPU substeps per frame are a multiple of this, so that few CUDA graphs are captured
 
 
@@ -54,6 +57,7 @@ class Particles:
 
     x: Float[Tensor, "p 3"]  # positions [m]
     v: Float[Tensor, "p 3"]  # velocities [m/s]
+    rest: Float[Tensor, "p 3"]  # material coordinates: positions in the undeformed body [m]
     C: Float[Tensor, "p 3 3"]  # affine velocity: dv/dx [1/s]
     F: Float[Tensor, "p 3 3"]  # deformation gradient; its elastic part for plastic materials
     mass: Float[Tensor, "p"]  # [kg]
@@ -92,8 +96,8 @@ def at_rest(
     still, identity = torch.zeros(p, 3, 3), torch.eye(3).repeat(p, 1, 1)
     stiffness = torch.stack([E / (2 * (1 + nu)), E * nu / ((1 + nu) * (1 - 2 * nu)), viscosity], -1)
     held, models = torch.zeros(p, dtype=torch.int8), torch.full((p,), model, dtype=torch.int8)
-    return Particles(x, torch.zeros(p, 3), still, identity, density * volume, volume, stiffness, friction, held,
-                     models, torch.tensor(plastic).repeat(p, 1), torch.zeros(p))  # fmt: skip
+    return Particles(x, torch.zeros(p, 3), x.clone(), still, identity, density * volume, volume, stiffness, friction,
+                     held, models, torch.tensor(plastic).repeat(p, 1), torch.zeros(p))  # fmt: skip
 
 
 def join_particles(parts: Sequence[Particles]) -> Particles:
@@ -158,19 +162,21 @@ class Solver:
     """Particles in a box with grid spacing `dx` [m]; `advance` moves them through one frame.
 
     `sizes` gives the number of particles of each scene of a batch; scenes have the same box and colliders and do not
-    interact. Raises ValueError for sizes that do not fit the particles and for grids that are too large.
+    interact, except by the schedule `contact`. Their surfaces are then those of `shapes`, by default those of voxels of
+    half a grid cell with a particle each. Raises ValueError for sizes that do not
+    fit the particles and for grids that are too large.
     """
 
     def __init__(
         self, particles: Particles, box: Box, dx: float, device: str = "cpu", options: SolverOptions = DEFAULTS,
-        sizes: Sequence[int] | None = None,
+        sizes: Sequence[int] | None = None, shapes: Sequence[BodyShape] | None = None,
     ):  # fmt: skip
         schedule = options.schedule
         if schedule == "auto":
             schedule = "split" if device == "cpu" else "fused"
         fused = schedule in ("fused", "exact")
         exact = schedule == "exact" or (schedule == "contact" and device != "cpu")
-        self.device, self.dx, self.grid = device, dx, make_grid(box, dx)
+        self.device, self.dx, self.grid = device, dx, make_grid(box, dx, floor_contact=schedule == "contact")
         sizes = [len(particles)] if sizes is None else list(sizes)
         if sum(sizes) != len(particles) or min(sizes) < 1:
             raise ValueError(f"{len(particles)} particles cannot be split into scenes of {sizes}")
@@ -186,7 +192,7 @@ class Solver:
         bouncy = any(surface.restitution > 0 for surface in (box, *self.colliders))
         shared = self.rows, plastic, bouncy, options.damping, self._obstacles
         quanta = self._quanta() if exact else None
-        contact = self._body_contact(particles, sizes) if schedule == "contact" else None
+        contact = self._body_contact(particles, sizes, shapes) if schedule == "contact" else None
         if fused:
             self._substepper = FusedSubsteps(*shared, quanta)
         elif exact:
@@ -250,16 +256,16 @@ class Solver:
         """First lost particle of each scene, or -1."""
         return torch.where(self.rows.lost == NEVER, -1, self.rows.lost)
 
-    def _body_contact(self, particles: Particles, sizes: Sequence[int]) -> BodyContact:
-        """Mass of a filled cell and friction of each body, whose particles all have the same friction.
-
-        If a body has several densities, the mass is that of the lightest part: cells at the surface of denser parts
-        then count as filled a fraction of a cell further out, where contact begins.
-        """
-        density = particles.mass / particles.volume * torch.where(particles.held > 0, KINEMATIC_MASS_FACTOR, 1.0)
-        full = torch.stack([part.min() for part in density.split(sizes)]) * self.dx**3
-        friction = torch.stack([part[0] for part in particles.friction.split(sizes)])
-        return BodyContact(*(t.float().to(self.device).contiguous() for t in (full, friction)))
+    def _body_contact(
+        self, particles: Particles, sizes: Sequence[int], shapes: Sequence[BodyShape] | None
+    ) -> BodyContact:
+        """Shape and friction of each body, whose particles all have the same friction."""
+        if shapes is None:
+            parts = particles.rest.cpu().double().split(list(sizes))
+            shapes = [shape_of_voxels(x.numpy(), self.dx / 2) for x in parts]
+        return BodyContact(
+            shapes, torch.stack([part[0] for part in particles.friction.split(list(sizes))]), self.device
+        )
 
     def _quanta(self) -> tuple[float, float]:
         """Fixed-point units per kg m/s and per kg: powers of two that depend on dx alone, not on the batch.
@@ -293,11 +299,11 @@ def max_contact_nodes(device: str) -> int:
     return min(max_batch_nodes(device) // 4, int(0.5 * torch.cuda.mem_get_info(device)[0] / CONTACT_NODE_BYTES))
 
 
-def make_grid(box: Box, dx: float):
+def make_grid(box: Box, dx: float, floor_contact: bool = False):
     """A grid whose boundary nodes lie FLOOR_GAP cells outside the box, so that bodies rest on its faces.
 
-    Exact for the lower faces, the floor among them; the upper ones are moved out to the next node. Raises ValueError
-    when it has more than MAX_NODES nodes.
+    Exact for the lower faces, the floor among them; the upper ones are moved out to the next node. With
+    `floor_contact` the floor is left to the contact of bodies. Raises ValueError when it has more than MAX_NODES nodes.
     """
     grid, n = mpm_grid.MpmGrid(), []
     for low, high in zip(box.low, box.high, strict=True):
@@ -306,11 +312,14 @@ def make_grid(box: Box, dx: float):
     grid.count = math.prod(total for _, total in n)
     if grid.count > MAX_NODES:
         raise ValueError(f"a grid of {' x '.join(str(total) for _, total in n)} nodes is too large")
-    grid.origin = wp.vec3(*(low - (mpm_grid.GRID_PADDING + FLOOR_GAP) * dx for low in box.low))
+    gaps = FLOOR_GAP, FLOOR_GAP, CONTACT_FLOOR_GAP if floor_contact else FLOOR_GAP
+    outside = [dx * (mpm_grid.GRID_PADDING + gap) for gap in gaps]
+    grid.origin = wp.vec3(*(low - out for low, out in zip(box.low, outside, strict=True)))
     grid.dx = dx
     grid.nodes = wp.vec3i(*(total for _, total in n))
     soft = round(mpm_grid.RESTITUTION_MARGIN) if box.restitution > 0 else 0
-    grid.low = wp.vec3i(*[mpm_grid.GRID_PADDING - soft] * 3)
+    low = mpm_grid.GRID_PADDING - soft
+    grid.low = wp.vec3i(low, low, 1 if floor_contact else low)
     grid.high = wp.vec3i(*(mpm_grid.GRID_PADDING + inside + soft for inside, _ in n))
     grid.face_low, grid.face_high = wp.vec3(*box.low), wp.vec3(*box.high)
     grid.restitution, grid.tangential_retention = box.restitution, box.tangential_retention

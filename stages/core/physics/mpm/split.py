@@ -15,9 +15,9 @@ from torch import Tensor
 from stages.core.kernels.interop import launch, view
 from stages.core.kernels.mpm import split as kernels
 from stages.core.kernels.mpm.active import ActiveBlocks
-from stages.core.kernels.mpm.contact import contact_step
+from stages.core.kernels.mpm.contact import NONE, REFRESH, STATIC_REACH, contact_step, find_nearest
 from stages.core.kernels.threads import run_parallel
-from stages.core.physics.mpm.contact import BodyContact
+from stages.core.physics.mpm.body_shapes import BodyContact
 from stages.core.physics.mpm.particle_rows import ParticleRows
 
 CPU_PARTS = 4  # parts that the particles are split into on the CPU
@@ -37,7 +37,7 @@ class SplitSubsteps:
         self, rows: ParticleRows, plastic: bool, bouncy: bool, damping: float, obstacles: wp.array,
         contact: BodyContact | None = None,
     ):  # fmt: skip
-        self._contact, self._contact_commands = contact, []
+        self._contact, self._contact_commands, self._refresh = contact, [], True
         self.rows, self.grid, self.device, self.damping = rows, rows.grid, rows.device, damping
         self.parts = CPU_PARTS if self.device == "cpu" else 1
         self._step, self._obstacles = kernels.particle_step(plastic, bouncy), obstacles
@@ -49,6 +49,9 @@ class SplitSubsteps:
         self._marks = torch.zeros(rows.scenes, *shape, dtype=torch.int32, device=self.device)
         self._stale = torch.zeros(1, dtype=torch.int32, device=self.device)
         self._clock = torch.zeros(1, device=self.device)
+        self._dt = torch.zeros(1, device=self.device)
+        keys = self._count if contact is not None else 0
+        self._nearest = torch.full((keys,), int(NONE), dtype=torch.int64, device=self.device)
         self._blocks = torch.zeros(0, 2, dtype=torch.int32, device=self.device)
 
     def frame(self, dt: float, steps: int) -> None:
@@ -56,15 +59,17 @@ class SplitSubsteps:
         self._clear_friction()
         self.rows.sort()
         self._clock.fill_(-dt)
+        self._dt.fill_(dt)
         self._run(self._particles(dt, gather=0, scatter=1))
         self._list_blocks()
         between, last = self._particles(dt, 1, 1), self._particles(dt, 1, 0)
         for step in range(steps):
             if int(self._stale[0]):
+                self._nearest.fill_(int(NONE))
                 self._list_blocks()
             self._clock.fill_(step * dt)
             self._run(self._grid_commands)
-            self._run(self._contact_commands)
+            self._contact_step(step, step == steps - 1)
             self._run(last if step == steps - 1 else between)
 
     @property
@@ -105,21 +110,38 @@ class SplitSubsteps:
             for start, stop in ranges if stop > start  # nothing to do when all particles are lost
         ]  # fmt: skip
         if self._contact is not None:
-            self._contact_commands = self._shared_blocks(at[:, 0].int(), first - at[:, 0] * self.grid.count)
+            self._contact_commands = self._contact_launches(at[:, 0].int(), first - at[:, 0] * self.grid.count)
 
-    def _shared_blocks(self, body: Tensor, corner: Tensor) -> list[wp.Launch]:
-        """The launch for the blocks that are active for several bodies; `corner` is the first node of each block."""
+    def _contact_step(self, step: int, last: bool) -> None:
+        if self._contact_commands:
+            find, keep, clear = self._contact_commands
+            if self._refresh or step % REFRESH == 0:
+                self._run([find])
+            self._run([clear if last or (step + 1) % REFRESH == 0 else keep])
+        self._refresh = False
+
+    def _contact_launches(self, body: Tensor, corner: Tensor) -> list[wp.Launch]:
+        """The launches for contact; `body` has an active block, whose first node is `corner`."""
+        self._refresh = True
+        self._sharers = (self._marks > 0).sum(0, dtype=torch.int32).contiguous()
+        floor = (self.grid.face_low[2] - self.grid.origin[2]) / self.grid.dx + STATIC_REACH
         corners, block, count = corner.unique(return_inverse=True, return_counts=True)
-        mine = (count[block] > 1).nonzero()[:, 0]
+        touch = (count > 1) | (corners % self.grid.nodes[2] <= floor)
+        mine = touch[block].nonzero()[:, 0]
         if not len(mine):
             return []
         mine = mine[block[mine].argsort(stable=True)]
-        corners, count = corners[count > 1].int(), count[count > 1]
+        corners, count = corners[touch].int(), count[touch]
         starts = torch.cat([torch.zeros(1, dtype=torch.int64, device=count.device), count.cumsum(0)]).int()
-        self._shared = corners.contiguous(), starts.contiguous(), body[mine].contiguous()
-        inputs = [self.grid, view(self._velocity, wp.vec4), *map(view, self._shared), view(self._contact.full_cell),
-                  view(self._contact.friction), view(self._friction)]  # fmt: skip
-        return [self._record(contact_step, len(corners) * kernels.BLOCK**3, inputs)]
+        self._touching = corners.contiguous(), starts.contiguous(), body[mine].contiguous()
+        near = [self.grid, self.rows.struct, view(self._sharers.flatten()), view(self._nearest)]
+        inputs = [self.grid, self.rows.struct, self._contact.bodies, view(self._velocity, wp.vec4),
+                  view(self._nearest), *map(view, self._touching), view(self._friction), view(self._dt)]  # fmt: skip
+        nodes = len(corners) * kernels.BLOCK**3
+        return [
+            self._record(find_nearest, len(self.rows), near),
+            *(self._record(contact_step, nodes, [*inputs, clear]) for clear in (0, 1)),
+        ]
 
     def _clear_friction(self) -> None:
         rows = len(self._blocks) * kernels.BLOCK**2

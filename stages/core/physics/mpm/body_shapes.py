@@ -1,0 +1,111 @@
+"""Signed distances to the surfaces of undeformed bodies, which decide where bodies of the solver touch."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+import warp as wp
+from jaxtyping import Float
+from scipy import ndimage
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from stages.core.kernels.interop import view
+from stages.core.kernels.mpm.contact import ContactBodies
+from stages.core.physics.solid_surface import AROUND, NEAREST, SAME_FACE, SolidSurface
+
+SHEET = 0.5  # depth of the middle of what is thicker than a texel, whose surface the lattice resolves [texels]
+MARGIN = 5  # texels around a body, whose particles reach nodes within 1.5 cells of two texels
+NEIGHBOURS = 16  # samples to which a tangent plane is fitted, of which those on the same face count
+MIN_ON_FACE = 6  # samples on the same face below which the normal is kept
+PATCH = 0.75  # radius of the part of a tangent plane that belongs to a sample [spacings of samples], about sqrt(1/2)
+
+
+class BodyShape(NamedTuple):
+    """Signed distance to the surface of a body on a lattice in its material coordinates."""
+
+    distance: np.ndarray  # (x, y, z), negative inside [m]
+    origin: np.ndarray  # (3,) of the first texel [m]
+    spacing: float  # of the texels [m]
+
+    def scaled(self, unit: float) -> BodyShape:
+        """The same shape, `unit` times as large."""
+        return BodyShape(self.distance * unit, self.origin * unit, self.spacing * unit)
+
+
+def shape_of_voxels(x: np.ndarray, h: float, surface: SolidSurface | None = None) -> BodyShape:
+    """The shape of a body with a particle in each voxel of edge h, at positions x (p, 3).
+
+    Where it is thick its surface is that of `surface`, by planes fitted to the samples: at a flat face of exact samples
+    the normal is then .2 degrees off, instead of 4 with the normals of voxels. Elsewhere it is that of the voxels.
+    """
+    cells = np.floor(x / h).astype(np.int64)
+    low = cells.min(0) - MARGIN
+    full = np.zeros(cells.max(0) - low + 1 + MARGIN, bool)
+    full[tuple((cells - low).T)] = True
+    outside, nearest = ndimage.distance_transform_edt(~full, return_indices=True)
+    distance = h * np.where(full, 0.5 - ndimage.distance_transform_edt(full), outside - 0.5)
+    if surface is not None:
+        centres = (np.indices(full.shape).reshape(3, -1).T + low + 0.5) * h
+        deep = np.floor(surface.deeper_than(SHEET * h) / h).astype(np.int64) - low
+        thick = np.zeros(full.shape, bool)
+        thick[tuple(deep[((deep >= 0) & (deep < full.shape)).all(1)].T)] = True
+        thick = ndimage.binary_dilation(thick, AROUND, iterations=3)[tuple(nearest)]
+        x = centres[thick.ravel()]
+        distance[thick] = _distance(surface, x, surface.depth(x) > 0)
+    return BodyShape(distance, (low + 0.5) * h, h)
+
+
+def _distance(surface: SolidSurface, x: np.ndarray, inside: np.ndarray) -> np.ndarray:
+    """Signed distances (k,) of points x (k, 3): to the planes of the nearest samples, beside those to the samples."""
+    points, normals = _fitted(surface.points, surface.normals)
+    away, row = cKDTree(points).query(x, NEAREST)
+    row = np.minimum(row, len(points) - 1)
+    above = ((x[:, None] - points[row]) * normals[row]).sum(-1)
+    agree = (normals[row] * normals[row[:, :1]]).sum(-1) > SAME_FACE
+    beside = np.sqrt((away[:, 0] ** 2 - above[:, 0] ** 2).clip(0)) - PATCH * surface.spacing
+    corner = np.where(inside, -1, 1) * np.hypot(above[:, 0], beside)
+    return np.where(beside < 0, (above * agree).sum(1) / agree.sum(1), corner)
+
+
+def _fitted(points: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Samples (n, 3) and normals (n, 3) of the planes that fit the neighbours of each sample on the same face."""
+    row = np.minimum(cKDTree(points).query(points, NEIGHBOURS)[1], len(points) - 1)
+    weight = ((normals[row] * normals[:, None]).sum(-1) > SAME_FACE).astype(float)
+    middle = (weight[..., None] * points[row]).sum(1) / weight.sum(1, keepdims=True)
+    arm = (points[row] - middle[:, None]) * weight[..., None]
+    fitted = np.linalg.eigh(np.einsum("nka,nkb->nab", arm, arm))[1][:, :, 0]
+    fitted *= np.where((fitted * normals).sum(1, keepdims=True) < 0, -1, 1)
+    good = ((weight.sum(1) >= MIN_ON_FACE) & ((fitted * normals).sum(1) > SAME_FACE))[:, None]
+    moved = points + ((middle - points) * fitted).sum(1, keepdims=True) * fitted
+    return np.where(good, moved, points), np.where(good, fitted, normals)
+
+
+class BodyContact:
+    """The shapes and friction coefficients of bodies in contact, as the kernels read them (`bodies`)."""
+
+    def __init__(self, shapes: Sequence[BodyShape], friction: Float[Tensor, "s"], device: str):
+        self.count = len(shapes)
+        texels = [_texels(s) for s in shapes]
+        first = np.cumsum([0, *map(len, texels)])[:-1]
+        columns = {
+            "texels": (np.concatenate(texels), wp.vec4),
+            "first": (first.astype(np.int32), None),
+            "size": (np.array([s.distance.shape for s in shapes], np.int32), wp.vec3i),
+            "origin": (np.array([s.origin for s in shapes], np.float32), wp.vec3),
+            "spacing": (np.array([s.spacing for s in shapes], np.float32), None),
+            "friction": (friction.float().cpu().numpy(), None),
+        }
+        self.bodies, self._tensors = ContactBodies(), {}
+        for name, (values, kind) in columns.items():
+            self._tensors[name] = torch.from_numpy(values).to(device).contiguous()
+            setattr(self.bodies, name, view(self._tensors[name], kind))
+
+
+def _texels(shape: BodyShape) -> np.ndarray:
+    """Gradient and distance (x y z, 4)."""
+    slope = np.stack(np.gradient(shape.distance, shape.spacing), -1)
+    return np.concatenate([slope, shape.distance[..., None]], -1).reshape(-1, 4).astype(np.float32)

@@ -15,7 +15,8 @@ from torch import Tensor
 
 from stages.core.kernels.interop import view
 from stages.core.kernels.mpm.contact import ContactBodies
-from stages.core.physics.solid_surface import AROUND, NEAREST, SAME_FACE, SolidSurface
+from stages.core.physics.morphology import surrounded
+from stages.core.physics.solid_surface import NEAREST, SAME_FACE, SolidSurface
 
 SHEET = 0.5  # depth of the middle of what is thicker than a texel, whose surface the lattice resolves [texels]
 MARGIN = 5  # texels around a body, whose particles reach nodes within 1.5 cells of two texels
@@ -53,7 +54,7 @@ def shape_of_voxels(x: np.ndarray, h: float, surface: SolidSurface | None = None
         deep = np.floor(surface.deeper_than(SHEET * h) / h).astype(np.int64) - low
         thick = np.zeros(full.shape, bool)
         thick[tuple(deep[((deep >= 0) & (deep < full.shape)).all(1)].T)] = True
-        thick = ndimage.binary_dilation(thick, AROUND, iterations=3)[tuple(nearest)]
+        thick = surrounded(thick, 3)[tuple(nearest)]
         x = centres[thick.ravel()]
         distance[thick] = _distance(surface, x, surface.depth(x) > 0)
     return BodyShape(distance, (low + 0.5) * h, h)

@@ -70,7 +70,7 @@ def test_the_number_of_prompts_is_bounded(tmp_path, monkeypatch):
 
 
 def test_networks_take_fractions_of_the_first_view(two_balls):
-    sizes = torch.tensor([[80, 40]] * 6)
+    sizes = torch.tensor([[80, 40]] + [[30, 30]] * 5)
     scene = replace(two_balls, cameras=replace(two_balls.cameras, sizes=sizes))
     (box,) = point_prompts(ObjectPrompts(torch.tensor([[8.0, 4, 16, 20]]), torch.tensor([[9.0, 9]]), ("a",)), scene)
     torch.testing.assert_close(box.points, torch.tensor([[0.1, 0.1], [0.2, 0.5]]))

@@ -66,6 +66,11 @@ def test_depth_of_penetration(scene, caplog):
     assert below["objects"]["2"]["penetration"] == pytest.approx(0.25, abs=0.01)
 
 
+def test_depth_of_penetration_without_a_floor(scene):
+    found, _ = measured(replace(scene, floor=None), ramp(0.0, 0.0, -0.03))
+    assert found["objects"]["2"]["penetration"] == pytest.approx(0.15, abs=0.03)
+
+
 def test_overlap_by_a_lift_is_warned_of_and_not_counted(scene, caplog):
     """The lower cube is lifted by .06 into the upper one, and sinks in by .03 more."""
     keypoints = choose_keypoints(scene, 256)

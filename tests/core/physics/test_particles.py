@@ -321,3 +321,19 @@ def test_gaussians_in_the_same_places_are_sampled_as_densely():
 def test_voxels_are_a_part_of_the_object_or_a_third_of_the_spacing_of_its_gaussians(along, edge):
     grid = torch.cartesian_prod(*[0.1 * torch.arange(10.0)] * 2, torch.zeros(1))
     assert filled_voxels(scene(splats(grid, scale=1e-4)), 1, along)[1] == pytest.approx(edge, rel=1e-3)
+
+
+def test_a_body_of_few_voxels_grows_about_its_place():
+    """A single Gaussian beside a ball, of which the voxels are coarse."""
+    at = torch.tensor([[0.5, -0.3, 0.2]])
+    bodies = sample_bodies(scene(splats(sphere(2000)), splats(at, 2)), 1000)
+    x = bodies.x[bodies.body == 1]
+    assert len(x) >= MIN_PARTICLES and bodies.spacing < 0.03
+    assert float((x.mean(0) - at[0]).abs().max()) < 0.75 * bodies.spacing
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1e3])
+def test_particles_do_not_depend_on_the_unit_of_length(unit):
+    one, other = (sample_bodies(scene(splats(u * sphere(2000), scale=0.003 * u)), 1000) for u in (1.0, unit))
+    assert other.spacing / unit == pytest.approx(one.spacing, rel=1e-3)
+    assert float(other.volume.sum()) / unit**3 == pytest.approx(float(one.volume.sum()), rel=0.05)

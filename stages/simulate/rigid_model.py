@@ -87,7 +87,12 @@ def mujoco_model(bodies: Sequence[Body], units: Units, gravity: float, floor: fl
             others = [f"body{k}" for k in range(len(bodies)) if k != i]
             for one, two in [("world", f"body{i}"), *((ground.name, other) for other in others)]:
                 spec.add_exclude(bodyname1=one, bodyname2=two)
-    return spec.compile()
+    try:
+        return spec.compile()
+    except RuntimeError as error:
+        if "unknown exception" in str(error):  # which is what its Python bindings make of std::bad_alloc
+            raise MemoryError("MuJoCo cannot compile the model") from error
+        raise
 
 
 def _add_body(mujoco, spec, name: str, b: Body, units: Units, impedance: list) -> None:

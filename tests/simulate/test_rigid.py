@@ -369,3 +369,14 @@ def test_passes_of_the_solver_end_when_the_slip_is_known(slips, passes):
     world.data = SimpleNamespace(efc_aref=np.array([2.0, 0.0, 0.0]), efc_force=np.ones(3), nefc=3, qacc=None)
     world._solve(np.array([0]), np.array([0.5]))
     assert taken == pytest.approx([2.0, *(2.0 - 0.5 * s for s in slips[: passes - 1])])
+
+
+def test_a_model_for_which_memory_is_short_is_out_of_memory(tmp_path, monkeypatch):
+    """MuJoCo raises RuntimeError for any exception of C++ that it does not know."""
+
+    def compile(spec):
+        raise RuntimeError("Caught an unknown exception!")
+
+    monkeypatch.setattr(pytest.importorskip("mujoco").MjSpec, "compile", compile)
+    with pytest.raises(MemoryError):
+        roll(tmp_path, cube(0.1, 0.0, 0.0), steps=2)

@@ -25,9 +25,8 @@ from stages.core.kernels.mpm.transfers import FREE, LOST, ParticleArrays
 # rebound of a box and a slide.
 STATIC_REACH = 0.25
 CLEARLY = 1e-3  # difference of lengths of normals that rounding does not decide
-REFRESH = (
-    4  # substeps for which the nearest particles of nodes are kept; a particle moves a small part of a cell in one
-)
+# substeps for which the nearest particles of nodes are kept; a particle moves a small part of a cell in one
+REFRESH = 4
 FLOOR_REST = 0.1  # gap at which bodies stop at the floor [cells], into which balls in a heap then sink by .17
 SWEEPS = 2  # over the pairs of a node with more than two bodies
 BLOCK_NODES = wp.constant(BLOCK**3)

@@ -36,9 +36,8 @@ SAFETY = 0.5  # fraction of a cell that a wave and a particle may cross in a sub
 VISCOUS = 0.15  # maximum of dt eta / (density dx^2); violent vibration diverges from 0.3
 FLOOR_GAP = mpm_grid.FLOOR_GAP
 SCHEDULES = ("auto", "split", "fused", "exact", "contact")
-CONTACT_FLOOR_GAP = (
-    0.7  # as FLOOR_GAP, where the floor is in contact with bodies; see STATIC_REACH in kernels/mpm/contact.py
-)
+# as FLOOR_GAP, where the floor is in contact with bodies; see STATIC_REACH in kernels/mpm/contact.py
+CONTACT_FLOOR_GAP = 0.7
 CONTACT_NODE_BYTES = 60  # velocity, momentum in fixed point, friction and nearest particle of a node on a GPU
 SUBSTEP_MULTIPLE = 8  # on a GPU substeps per frame are a multiple of this, so that few CUDA graphs are captured
 

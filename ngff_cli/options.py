@@ -74,12 +74,16 @@ def run_command_line(app: typer.Typer, words: list[str] | None = None) -> None:
 
 
 def interrupt(number: int, frame) -> None:
-    """Signal handler: raises KeyboardInterrupt, during an import 10 ms later.
+    """Signal handler: raises KeyboardInterrupt, during an import or a write by HDF5 10 ms later.
 
     In the import system the exception could be lost with a lock held, which blocks all threads that import (CPython's
-    _get_module_lock), and a library that is interrupted while it is imported may report that it is not installed.
+    _get_module_lock), and a library that is interrupted while it is imported may report that it is not installed. HDF5
+    loses exceptions of the file object that it writes to, and with them what was to be written.
     """
-    while frame is not None and not frame.f_code.co_filename.startswith("<frozen importlib"):
+    while frame is not None and not (
+        frame.f_code.co_filename.startswith("<frozen importlib")
+        or frame.f_code.co_filename.endswith("error_deferring_file.py")
+    ):
         # a script may run the command while it is imported itself
         frame = None if frame.f_code is run_command_line.__code__ else frame.f_back
     if frame is None:

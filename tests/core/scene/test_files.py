@@ -2,15 +2,18 @@
 
 import os
 import resource
+import signal
 import subprocess
 import sys
+import time
 from contextlib import contextmanager
 
 import pytest
 import torch
 
+from ngff_cli.options import interrupt
 from stages.core.errors import InputError
-from stages.core.scene import files
+from stages.core.scene import error_deferring_file, files
 from stages.core.scene.error_deferring_file import ErrorDeferringFile
 from stages.core.scene.files import must_exist, replacing, save_tensors, seconds_since
 from stages.core.scene.schema import read_json
@@ -136,3 +139,22 @@ def test_what_must_exist_is_a_readable_file(tmp_path, monkeypatch):
     monkeypatch.setattr(files.os, "access", lambda path, mode: False)  # file permissions do not hold for root
     with pytest.raises(InputError, match="empty: cannot be read; check its permissions"):
         must_exist(tmp_path / "empty", "a toy")
+
+
+def test_an_interrupt_waits_until_hdf5_has_written(tmp_path, monkeypatch):
+    """HDF5 loses exceptions of the file object that it calls."""
+
+    def interrupted(data):
+        interrupt(signal.SIGINT, sys._getframe())
+        return memoryview(data)
+
+    before = signal.getsignal(signal.SIGALRM)
+    with ErrorDeferringFile(tmp_path / "f", "w+b") as file:
+        monkeypatch.setattr(error_deferring_file, "memoryview", interrupted, raising=False)
+        try:
+            with pytest.raises(KeyboardInterrupt):
+                assert file.write(b"abc") == 3
+                time.sleep(5)
+        finally:
+            signal.signal(signal.SIGALRM, before)
+    assert (tmp_path / "f").read_bytes() == b"abc"

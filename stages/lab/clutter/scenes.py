@@ -31,6 +31,7 @@ from stages.core.scene.scene_ply import write_scene
 from stages.lab.assets.mesh_files import find_objects, object_name
 from stages.lab.assets.objects import OBJECTS, make_object
 from stages.lab.clutter.composites import make_composite
+from stages.lab.clutter.drapes import random_drapes
 from stages.lab.clutter.examples import Example, labelled, write_example
 from stages.lab.clutter.noise_model import observed
 from stages.lab.clutter.props import Prop, make_prop, mesh_prop, placed, random_turn, recoloured
@@ -158,6 +159,9 @@ def make_scene(index: int, shelf: Shelf, options: ClutterOptions) -> tuple[Scene
     """A scene with true labels, and how many things are in it."""
     rng = np.random.default_rng([options.seed, index])
     furniture = random_furniture(rng)
+    _, x1, _, y1, _ = furniture.areas[0]
+    drapes = random_drapes((x1, y1), np.random.default_rng([options.seed, index, 4]))
+    furniture = replace(furniture, drapes=tuple(drapes))
     wanted = int(round(math.exp(rng.uniform(math.log(2), math.log(40)))))
     props = [shelf.pick(rng) for _ in range(wanted)]
     size = [math.exp(rng.uniform(*np.log(prop.sizes))) for prop in props]
@@ -201,7 +205,9 @@ def _row_of_books(shelf: Shelf, furniture: Furniture, rng: Rng) -> list[_Start]:
                    torch.zeros(3))  # fmt: skip
         reach = g.means[:, :2] @ torch.from_numpy(along).float()
         at = at - along * float(reach.min())
-        out.append(_Start(prop, g, (*at, z + 0.004 - float(g.means[:, 2].min()))))
+        low, high = g.means.amin(0), g.means.amax(0)
+        rise = furniture.rise(*((at + end[:2].numpy()).tolist() for end in (low, high)))
+        out.append(_Start(prop, g, (*at, z + rise + 0.004 - float(low[2]))))
         at = at + along * (float(reach.max()) + 0.015 * rng.uniform() ** 2 + 0.001)
     return out
 
@@ -230,6 +236,8 @@ def _arranged(
         cell = (round(x / 0.2), round(y / 0.2), area is furniture.areas[0])
         around = [height.get((cell[0] + a, cell[1] + b, cell[2]), z) for a in (-1, 0, 1) for b in (-1, 0, 1)]
         base = max(around) if rng.uniform() < 0.75 or area is not furniture.areas[0] else z
+        if area is furniture.areas[0]:
+            base = max(base, z + furniture.rise((x + low[0], y + low[1]), (x + high[0], y + high[1])))
         height[cell] = base + high[2] - low[2]
         falling.append(_Start(props[i], g, (x, y, base + 0.012 - low[2])))
     if not falling:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from scipy.spatial import ConvexHull
 from torch import Tensor
@@ -45,6 +47,14 @@ def settle(furniture: Furniture, hulls: list[list[np.ndarray]], starts: np.ndarr
         spec.worldbody.add_geom(
             type=mujoco.mjtGeom.mjGEOM_BOX, size=block.half, pos=block.centre, friction=[0.8, 0.01, 0.001]
         )
+    for i, drape in enumerate(furniture.drapes):
+        top = float(drape.heights.max())
+        spec.add_hfield(name=f"d{i}", size=[*drape.half, top, 0.05], nrow=len(drape.heights), ncol=len(drape.heights),
+                        userdata=(drape.heights / top).flatten().tolist())  # fmt: skip
+        spec.worldbody.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname=f"d{i}", pos=[*drape.at, 0], friction=[0.8, 0.01, 0.001],
+            quat=[math.cos(drape.yaw / 2), 0, 0, math.sin(drape.yaw / 2)],
+        )  # fmt: skip
     for i, (parts, start) in enumerate(zip(hulls, starts, strict=True)):
         body = spec.worldbody.add_body(pos=start)
         body.add_freejoint()

@@ -14,7 +14,8 @@ from torch import Tensor
 from stages.core.scene.gaussians import Gaussians, concatenate
 from stages.lab.assets import background_paint as paint
 from stages.lab.assets.shapes import box, noise, to_gaussians
-from stages.lab.clutter.props import random_colour
+from stages.lab.clutter.drapes import Drape
+from stages.lab.clutter.props import random_colour, random_paint
 
 Rng = np.random.Generator
 SPACING, COARSE = 0.008, 0.035  # of Gaussians on faces near the objects, and on the room [camera distance]
@@ -39,6 +40,12 @@ class Furniture:
     blocks: list[StaticBox]
     areas: list[tuple[float, float, float, float, float]]  # x0 x1 y0 y1 z of each surface that things stand on
     open_sides: tuple[float, float]  # range of azimuths without walls [rad]
+    drapes: tuple[Drape, ...] = ()  # on the first area
+
+    def rise(self, low: tuple[float, float], high: tuple[float, float]) -> float:
+        """The highest that a drape is in a rectangle of the first area."""
+        x, y = (torch.linspace(a, b, 9) for a, b in zip(low, high, strict=True))
+        return max((float(d.height(torch.cartesian_prod(x, y)).max()) for d in self.drapes), default=0.0)
 
 
 def random_furniture(rng: Rng) -> Furniture:
@@ -99,6 +106,11 @@ def painted(furniture: Furniture, rng: Rng) -> Gaussians:
         surface = surface.kept(keep)
         rgb = random_face(rng)(surface.points) * _daylight(surface.normals)[:, None]
         parts.append(to_gaussians(surface.moved(block.centre), rgb, 0, width=0.7, widest=3 * block.spacing))
+    for drape in furniture.drapes:
+        surface = drape.surface(SPACING)
+        rgb = (random_face if rng.uniform() < 0.5 else random_paint)(rng)(surface.points)
+        rgb = rgb * _daylight(surface.normals)[:, None]
+        parts.append(to_gaussians(surface, rgb, 0, width=0.7, widest=3 * SPACING))
     return concatenate(parts)
 
 

@@ -153,6 +153,45 @@ def test_objects_of_several_parts_rest_in_each_others_concavities():
     assert np.abs(at[1, :2]).max() < 0.01
 
 
+def test_things_rest_on_a_drape_where_its_gaussians_are():
+    """Blocks over the raised and over the low quadrant of a turned and shifted drape."""
+    from stages.lab.clutter.drapes import CELLS, Drape
+    from stages.lab.clutter.settle import settle
+    from stages.lab.clutter.supports import Furniture, StaticBox, painted
+
+    heights = torch.zeros(CELLS, CELLS)
+    heights[CELLS // 2 :, CELLS // 2 :] = 0.08  # y and x above the middle
+    drape = Drape(heights, (0.4, 0.3), (0.1, -0.05), 0.7)
+    floor = Furniture([StaticBox((0, 0, -0.05), (1, 1, 0.05))], [(-1, 1, -1, 1, 0)], (0, 6.28), (drape,))
+    c, s = np.cos(0.7), np.sin(0.7)
+    spots = np.array([[0.2, 0.15], [-0.2, 0.15]]) @ np.array([[c, s], [-s, c]]) + [0.1, -0.05]
+    assert np.allclose(drape.height(torch.from_numpy(spots).float()), [0.08, 0], atol=1e-6)
+    half = np.array([0.03, 0.03, 0.02])
+    block = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * half
+    at, _ = settle(floor, [[block], [block]], np.column_stack([spots, [0.11, 0.11]]))
+    np.testing.assert_allclose(at[:, 2] - half[2], [0.08, 0], atol=0.004)
+    low, high = spots - 0.03, spots + 0.03
+    assert [floor.rise(tuple(a), tuple(b)) for a, b in zip(low, high, strict=True)] == pytest.approx(
+        [0.08, 0], abs=1e-6
+    )
+    g = painted(floor, np.random.default_rng(0))
+    raised = g.means[g.means[:, 2] > 0.079]
+    assert len(raised) > 500 and not g.object_id.any()
+    assert (drape.local(raised[:, :2]) > -0.05).all()
+
+
+def test_random_drapes_lie_in_a_share_of_the_scenes():
+    from stages.lab.clutter.drapes import DRAPE_SHARE, random_drapes
+
+    drapes = [random_drapes((0.5, 0.4), np.random.default_rng(k)) for k in range(60)]
+    assert abs(np.mean([bool(d) for d in drapes]) - DRAPE_SHARE) < 0.2
+    for d in (d for some in drapes for d in some):
+        assert 0.006 < float(d.heights.max()) < 0.2 and float(d.heights.min()) >= 0
+        surface = d.surface(0.01)
+        np.testing.assert_allclose(surface.points[:, 2], d.height(surface.points[:, :2]), atol=1e-6)
+        assert len(surface.points) > 0.2 * 4 * d.half[0] * d.half[1] / 0.01**2
+
+
 @pytest.mark.parametrize("seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (2, 3))])
 def test_composites_are_one_normalised_object_of_several_parts(seed):
     prop = make_composite(seed)

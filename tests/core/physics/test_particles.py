@@ -289,6 +289,8 @@ def test_cavities_with_narrow_leaks_are_filled(room, hole, filled):
     found = particles._cavities(walls, particles.LEAK_RADII)
     assert found[room, room, room] == filled and not (found & walls).any()
     assert found[1:-1, 1:-1, 1 : room + 1].all() if filled else not found.any()
+    if filled:  # up to the radius that closes the hole, and a voxel more, below it
+        assert np.flatnonzero(found[room, room]).max() == last - (hole + 1) // 2 - 1
 
 
 def test_the_outside_reaches_in_through_holes():

@@ -1,4 +1,5 @@
-"""Objects of several parts, often of several colours: figures, vehicles of bricks, stands, devices, plants, boards.
+"""Objects of several parts, often of several colours: figures, soft toys, vehicles of bricks, stands, devices, plants,
+boards.
 
 They teach the segmentation network that what is joined by thin, bent or differently coloured parts can be one object.
 Shapes from one field (props.py) are mostly convex and of one texture.
@@ -8,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -26,9 +28,9 @@ UPRIGHT = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # the y axis of a 
 def make_composite(seed: int) -> Prop:
     """A random object of several parts; deterministic."""
     rng = np.random.default_rng([seed, 11])
-    names = list(FAMILIES)
-    name = names[rng.integers(len(names))]
-    make, sizes, flat = FAMILIES[name]
+    names, shares = list(FAMILIES), np.array([family.share for family in FAMILIES.values()])
+    name = names[rng.choice(len(names), p=shares / shares.sum())]
+    make, sizes, flat, _ = FAMILIES[name]
     return composite_prop(f"{name}{seed}", make(rng), sizes, flat)
 
 
@@ -83,6 +85,47 @@ def _figure(rng: Rng) -> list[PaintedPart]:
         if rng.uniform() < 0.5:
             ear = (head + [side * 0.7 * skull, 0, 0.7 * skull]).tolist()
             parts.append(PaintedPart(ellipsoid(ear, (rng.uniform(0.02, 0.05, 3)).tolist()), paint()))
+    return parts
+
+
+def _soft_toy(rng: Rng) -> list[PaintedPart]:
+    """A plush animal that sits or sprawls: long limbs of one fabric, a large head with muzzle, mouth and eyes."""
+    fabric = random_paint(rng) if rng.uniform() < 0.6 else _plain(rng)
+    other = fabric if rng.uniform() < 0.6 else _plain(rng)
+    trunk = np.array([rng.uniform(0.08, 0.15), rng.uniform(0.07, 0.13), rng.uniform(0.11, 0.2)])
+    skull = rng.uniform(0.08, 0.15) * np.exp(rng.normal(0, 0.12, 3))
+    head = np.array([rng.normal(0, 0.03), rng.uniform(-0.06, 0.03), trunk[2] + 0.8 * skull[2]])
+    muzzle = head + [0, -0.8 * skull[1], -0.2 * skull[2]]
+    parts = [PaintedPart(ellipsoid((0, 0, 0), trunk.tolist()), fabric),
+             PaintedPart(ellipsoid(head.tolist(), skull.tolist()), fabric)]  # fmt: skip
+    if rng.uniform() < 0.7:
+        wide = skull * rng.uniform([0.5, 0.4, 0.3], [1.0, 0.9, 0.6])
+        parts.append(PaintedPart(ellipsoid(muzzle.tolist(), wide.tolist()), fabric if rng.uniform() < 0.6 else other))
+        inside = (muzzle - [0, 0.45 * wide[1], 0.1 * wide[2]]).tolist()
+        parts.append(PaintedPart(ellipsoid(inside, (wide * [0.8, 0.6, 0.5]).tolist()), _plain(rng)))
+    if rng.uniform() < 0.4:
+        collar = [trunk[0] * 0.9, trunk[1] * 0.9, 0.02]
+        parts.append(PaintedPart(ellipsoid((0, 0, 0.8 * trunk[2]), collar), _plain(rng)))
+    thick, arm, leg = rng.uniform(0.02, 0.05), rng.uniform(0.2, 0.4), rng.uniform(0.25, 0.5)
+    tip = other if rng.uniform() < 0.5 else fabric
+    for side in (-1, 1):
+        eye = (head + skull * [0.45 * side, -0.3, 0.85]).tolist()
+        parts.append(PaintedPart(ellipsoid(eye, (rng.uniform(0.015, 0.04, 3)).tolist()), _plain(rng)))
+        if rng.uniform() < 0.5:
+            ear = (head + skull * [0.9 * side, 0.2, 0.7]).tolist()
+            parts.append(PaintedPart(ellipsoid(ear, (rng.uniform(0.02, 0.07, 3)).tolist()), other))
+        for start, length, toward in (
+            (trunk * [0.8 * side, 0, 0.6], arm, rng.normal([0.7 * side, -0.4, -0.3], 0.5)),
+            (trunk * [0.6 * side, 0, -0.8], leg, rng.normal([0.4 * side, -0.9, 0.0], 0.4)),
+        ):
+            at = start
+            for _ in range(3):  # bends at a knee and an ankle
+                end = np.clip(at + length / 3 * toward / np.linalg.norm(toward), -FIT, FIT)
+                parts.append(
+                    PaintedPart(capsule(at.tolist(), end.tolist(), thick, thick * rng.uniform(0.8, 1.0)), fabric)
+                )
+                at, toward = end, toward + rng.normal(0, 0.5, 3) * np.linalg.norm(toward)
+            parts.append(PaintedPart(ellipsoid(at.tolist(), (thick * rng.uniform(0.8, 2.4, 3)).tolist()), tip))
     return parts
 
 
@@ -190,8 +233,18 @@ def _board(rng: Rng) -> list[PaintedPart]:
     return parts
 
 
-FAMILIES: dict[str, tuple[Callable[[Rng], list[PaintedPart]], tuple[float, float], bool]] = {  # parts, sizes, flat
-    "figure": (_figure, (0.15, 0.6), False), "bricks": (_bricks, (0.1, 0.6), False),
-    "stand": (_stand, (0.15, 0.5), False), "device": (_device, (0.1, 0.4), False),
-    "plant": (_plant, (0.15, 0.5), False), "board": (_board, (0.12, 0.4), False),
+class Family(NamedTuple):
+    """Objects of one kind."""
+
+    make: Callable[[Rng], list[PaintedPart]]
+    sizes: tuple[float, float]  # [camera distance]
+    flat: bool
+    share: float  # of the objects
+
+
+FAMILIES = {
+    "figure": Family(_figure, (0.15, 0.6), False, 1), "soft toy": Family(_soft_toy, (0.15, 0.6), False, 2),
+    "bricks": Family(_bricks, (0.1, 0.6), False, 1), "stand": Family(_stand, (0.15, 0.5), False, 1),
+    "device": Family(_device, (0.1, 0.4), False, 1), "plant": Family(_plant, (0.15, 0.5), False, 1),
+    "board": Family(_board, (0.12, 0.4), False, 1),
 }  # fmt: skip

@@ -4,8 +4,9 @@ Each body is scattered to a window of its own, as scenes of a batch are. Where w
 the same node although they are a cell apart. Their gap there follows from the signed distance to the surface of each
 undeformed body at the node's material coordinates, which the nearest particle gives: X + F^-1 (place - x). A node
 on one body is moved to the nearest point of that body's surface, whose distance from the other is the gap; the smaller
-of both such gaps counts, so that an edge touches as early as a face. Bodies approach by at most the gap in a substep.
-The floor is a plane in contact with every body.
+of both such gaps counts, so that an edge touches as early as a face. The normal is taken at the same point, from the
+body that has a face there: elsewhere the nearest face may be one that does not touch. Bodies approach by at most the
+gap in a substep. The floor is a plane in contact with every body.
 Sources: Bardenhagen et al. 2001, "An improved contact algorithm for the material point method" (velocity fields);
 Kamrin, Rycroft and Nave 2012, "Reference map technique for finite-strain elasticity and fluid-solid interaction"
 (distances by material coordinates); Nairn, Hammerquist and Smith 2020, "New material point method contact algorithms
@@ -119,6 +120,17 @@ def _on_surface(s: wp.vec4, place: wp.vec3) -> wp.vec3:
 
 
 @wp.func
+def _contact_normal(other: wp.vec4, own: wp.vec4) -> wp.vec3:
+    """Unit normal out of the other body at a point on the own one; that of the own one where it is on less of an edge.
+
+    `other` and `own` are the normals and distances of both bodies at that point.
+    """
+    out = wp.vec3(other[0], other[1], other[2])
+    back = wp.vec3(own[0], own[1], own[2])
+    return wp.normalize(wp.where(wp.length(back) > wp.length(out) + CLEARLY, -back, out))
+
+
+@wp.func
 def _resolve_pair(
     grid: MpmGrid, bodies: ContactBodies, velocity: wp.array[wp.vec4], a: ContactPatch, b: ContactPatch, node: int,
     place: wp.vec3, dt: float,
@@ -134,11 +146,15 @@ def _resolve_pair(
     of_b = surface_at(bodies, b, place)
     if (a.held and of_a[3] > STATIC_REACH * grid.dx) or (b.held and of_b[3] > STATIC_REACH * grid.dx):
         return False
-    at_a = surface_at(bodies, a, _on_surface(of_b, place))
-    at_b = surface_at(bodies, b, _on_surface(of_a, place))
-    out_a = wp.vec3(at_a[0], at_a[1], at_a[2])
-    out_b = wp.vec3(at_b[0], at_b[1], at_b[2])
-    normal = wp.normalize(wp.where(wp.length(out_a) > wp.length(out_b) + CLEARLY, out_a, -out_b))
+    on_a = _on_surface(of_a, place)
+    on_b = _on_surface(of_b, place)
+    at_a = surface_at(bodies, a, on_b)
+    at_b = surface_at(bodies, b, on_a)
+    normal = wp.vec3()
+    if at_a[3] <= at_b[3]:
+        normal = _contact_normal(at_a, surface_at(bodies, b, on_b))
+    else:
+        normal = -_contact_normal(at_b, surface_at(bodies, a, on_a))
     free = wp.max(wp.min(at_a[3], at_b[3]), 0.0) / dt * normal
     relative = wp.vec3(u[0] - v[0], u[1] - v[1], u[2] - v[2]) - free
     change = relative - coulomb_contact(relative, -normal, wp.max(bodies.friction[a.body], bodies.friction[b.body]))

@@ -77,12 +77,10 @@ def solve(problem: Problem, options: MaterialFitOptions) -> Fit:
     begun, frames = time.perf_counter(), len(problem.track)
     with simulations(problem, options.workers) as sims:
         found = search(sims, options)
-        residual = float(problem.errors(sims.motions([found.x], frames)[0]).mean())
-        error = _error(problem, residual / 3)
+        error = _error(problem, sims.residuals([found.x], frames)[0])
         found = settled(sims, frames, found, error)
-        before, after = (problem.errors(motion).mean() for motion in sims.motions([sims.start, found.x], frames))
-        fit = Fit(problem, found.x, found.x, 1.96 * found.deviations, (float(before) ** 0.5, float(after) ** 0.5),
-                  sims.count, 0.0)  # fmt: skip
+        before, after = (problem.rmse(r) for r in sims.residuals([sims.start, found.x], frames))
+        fit = Fit(problem, found.x, found.x, 1.96 * found.deviations, (before, after), sims.count, 0.0)
         unknown = [k for k in np.argsort(-fit.half) if not fit.is_identifiable(k)]
         return replace(fit, accepted=with_initial(found, sims.start, unknown), seconds=time.perf_counter() - begun)
 
@@ -104,15 +102,15 @@ def with_initial(found: Estimate, start: np.ndarray, unknown: Sequence[int]) -> 
     return accepted
 
 
-def _error(problem: Problem, residual: float) -> float:
-    """Standard deviation of a coordinate [tolerances] for intervals, from the mean squared residual of a fit.
+def _error(problem: Problem, residuals: np.ndarray) -> float:
+    """Standard deviation of a residual [tolerances] for intervals, from those of a fit.
 
     The noise of the track is independent from frame to frame. Residuals beyond it are taken as fully correlated: they
     count as one observation.
     """
-    excess = max(0.0, residual - NOISE_MARGIN * problem.noise**2)
-    tolerance = float(problem.tolerance.mean())
-    return max((problem.noise**2 + len(problem.track) * excess) ** 0.5 / tolerance, SMALLEST_ERROR)
+    noise = problem.noise_level**2
+    excess = max(0.0, float(problem.errors(residuals).mean()) / 3 - NOISE_MARGIN * noise)
+    return max((noise + len(problem.track) * excess) ** 0.5, SMALLEST_ERROR)
 
 
 def describe(fit: Fit) -> list[str]:

@@ -82,32 +82,42 @@ class Problem:
             finally:
                 logging.disable(logging.NOTSET)
 
-    def errors(self, motion: Float[Tensor, "t k 3"]) -> Float[Tensor, "t o"]:
-        """Mean squared distance of each moving object's keypoints from the track [scene units^2]."""
-        squared = (motion - self.track).square().sum(-1)
-        return torch.stack([squared[:, self.keypoints.object_id == i].mean(1) for i in self.moving], 1)
-
     @property
     def tolerance(self) -> Float[Tensor, "o"]:
         """Error of each moving object that counts as one [scene units]."""
         return TOLERANCE * torch.stack([_size(self.keypoints, i) for i in self.moving])
 
-    def cost(self, motion: Float[Tensor, "t k 3"]) -> float:
+    def residuals(self, motion: Float[Tensor, "t k 3"]) -> np.ndarray:
+        """Coordinates of the moving objects less those of the track [tolerances], nan where the motion diverges.
+
+        They are scaled so that an object has the weight of one point in a frame.
+        """
+        parts = [(motion - self.track)[:, self.keypoints.object_id == i] for i in self.moving]
+        return torch.cat([(part / t / part.shape[1] ** 0.5).flatten()
+                          for part, t in zip(parts, self.tolerance, strict=True)]).double().numpy()  # fmt: skip
+
+    def errors(self, residuals: np.ndarray) -> Float[Tensor, "t o"]:
+        """Mean squared distance of each moving object's keypoints from the track [tolerances^2]."""
+        counts = [3 * len(self.track) * int((self.keypoints.object_id == i).sum()) for i in self.moving]
+        parts = torch.from_numpy(residuals).split(counts)
+        return torch.stack([part.reshape(len(self.track), -1).square().sum(1) for part in parts], 1)
+
+    def rmse(self, residuals: np.ndarray) -> float:
+        """Root mean squared distance of the keypoints from the track [scene units]."""
+        return float((self.errors(residuals) * self.tolerance**2).mean()) ** 0.5
+
+    @property
+    def noise_level(self) -> float:
+        """Standard deviation of a coordinate of the track [tolerances]."""
+        return self.noise * float(self.tolerance.pow(-2).mean()) ** 0.5
+
+    def cost(self, residuals: np.ndarray) -> float:
         """Mean of log(1 + squared error / tolerance^2) over frames and objects.
 
         After a collision motions diverge from each other; the logarithm keeps such frames from outweighing the others.
         """
-        cost = float(torch.log1p(self.errors(motion) / self.tolerance**2).mean())
+        cost = float(torch.log1p(self.errors(residuals)).mean())
         return cost if math.isfinite(cost) else FAILED
-
-    def weighted(self, motion: Float[Tensor, "t k 3"]) -> np.ndarray:
-        """All coordinates of the moving objects [tolerances], so that an object has the weight of one point in a frame.
-
-        Values that are not finite are set to 0: a diverged motion carries no information.
-        """
-        parts = [motion.nan_to_num()[:, self.keypoints.object_id == i] for i in self.moving]
-        return torch.cat([(part / t / part.shape[1] ** 0.5).flatten()
-                          for part, t in zip(parts, self.tolerance, strict=True)]).double().numpy()  # fmt: skip
 
     def first_frames(self, frames: int) -> Problem:
         """The same problem for the first frames of the track only."""

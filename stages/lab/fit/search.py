@@ -30,7 +30,7 @@ from stages.lab.fit.options import MaterialFitOptions
 from stages.lab.fit.problem import Problem
 
 log = logging.getLogger(__name__)
-SMALLEST_ERROR = 1e-3  # of a coordinate [tolerances]: the accuracy of the engines
+SMALLEST_ERROR = 1e-3  # of a residual [tolerances]: the accuracy of the engines
 PRIOR = 1 / 12**0.5  # standard deviation of the prior: that of a uniform distribution over the range
 FIRST, GROWTH = 4, 1.15  # frames of the first segment, and factor from one to the next
 NEAR, FAR = (0.7, 2.0), (0.7, 2.0, 5.0)  # differences [standard deviations], in the search and for intervals
@@ -63,20 +63,20 @@ class Simulations:
         self.problem, self._map, self.count = problem, map_, 0
         self.start = np.array([p.coordinate(p.start) for p in problem.parameters])
 
-    def motions(self, points: list[np.ndarray], frames: int) -> list[torch.Tensor]:
-        """Keypoints in the first frames, at points that are moved into the ranges."""
+    def residuals(self, points: list[np.ndarray], frames: int) -> list[np.ndarray]:
+        """Residuals in the first frames, at points that are moved into the ranges."""
         self.count += len(points)
-        return list(self._map(_motion, [np.clip(x, 0, 1) for x in points], [frames] * len(points)))
+        return list(self._map(_residuals, [np.clip(x, 0, 1) for x in points], [frames] * len(points)))
 
     def costs(self, points: list[np.ndarray], frames: int) -> list[float]:
         """Costs of the first frames."""
         part = self.problem.first_frames(frames)
-        return [part.cost(motion) for motion in self.motions(points, frames)]
+        return [part.cost(residuals) for residuals in self.residuals(points, frames)]
 
     @property
     def noise(self) -> float:
-        """Standard deviation of a coordinate of the track [tolerances]."""
-        return max(self.problem.noise / float(self.problem.tolerance.mean()), SMALLEST_ERROR)
+        """Standard deviation of a residual at the true parameters [tolerances]."""
+        return max(self.problem.noise_level, SMALLEST_ERROR)
 
 
 _problem: Problem | None = None  # of this process
@@ -88,8 +88,9 @@ def _set_problem(problem: Problem, threads: int) -> None:
     torch.set_num_threads(threads)
 
 
-def _motion(x: np.ndarray, frames: int) -> torch.Tensor:
-    return _problem.first_frames(frames).motion(x)
+def _residuals(x: np.ndarray, frames: int) -> np.ndarray:
+    part = _problem.first_frames(frames)
+    return part.residuals(part.motion(x))
 
 
 @contextmanager
@@ -128,7 +129,7 @@ def search(sims: Simulations, options: MaterialFitOptions) -> Estimate:
 
 
 def settled(sims: Simulations, frames: int, known: Estimate, error: float) -> Estimate:
-    """The estimate for an error of a coordinate [tolerances], with its uncertainty.
+    """The estimate for an error of a residual [tolerances], with its uncertainty.
 
     Differences are by one parameter at a time: directions of several, of which one changes the motion roughly and the
     other steadily, tell nothing about each.
@@ -149,16 +150,16 @@ def _within_noise(sims: Simulations, frames: int, x: np.ndarray) -> bool:
 def descend(sims: Simulations, frames: int, known: Estimate, error: float) -> np.ndarray:
     """The minimum near `known`, by Levenberg and Marquardt's method, or `known.x` itself where the cost does not fall.
 
-    `error` is the standard deviation of a coordinate [tolerances], against which the prior is weighed.
+    `error` is the standard deviation of a residual [tolerances], against which the prior is weighed.
     """
-    part, weight = sims.problem.first_frames(frames), error / PRIOR
+    weight = error / PRIOR
 
     def point(z: np.ndarray) -> np.ndarray:
         return known.x + known.root @ z
 
     def errors(z: np.ndarray) -> np.ndarray:
-        motion = sims.motions([point(z)], frames)[0]
-        return np.append(part.weighted(motion - part.track), weight * (point(z) - sims.start))
+        residuals = np.nan_to_num(sims.residuals([point(z)], frames)[0])
+        return np.append(residuals, weight * (point(z) - sims.start))
 
     def derivatives(z: np.ndarray) -> np.ndarray:
         return np.vstack([_derivatives(sims, frames, Estimate(point(z), known.root)), weight * known.root])
@@ -200,18 +201,18 @@ def narrowed(
 ) -> Estimate:
     """The estimate with the uncertainty that is left after the first frames, and the prior.
 
-    `error` is the standard deviation of a coordinate [tolerances]. Keypoints of one object in one frame count as one
+    `error` is the standard deviation of a residual [tolerances]. Keypoints of one object in one frame count as one
     observation, since their errors are not independent. Contacts make derivatives for small differences larger than
     those for large ones: along each direction the smallest for the `distances` [standard deviations] counts.
     """
     ends = [np.clip(known.x + sign * far * column, 0, 1)
             for column in known.root.T for far in distances for sign in (1, -1)]  # fmt: skip
-    middle, *moved = (sims.problem.weighted(m) for m in sims.motions([known.x, *ends], frames))
-    moved = np.array(moved).reshape(len(known.x), -1, len(middle))
+    middle, *moved = sims.residuals([known.x, *ends], frames)
+    moved = np.nan_to_num(np.array(moved) - middle).reshape(len(known.x), -1, len(middle))
     slopes = (moved[:, 0] - moved[:, 1]).T / (2 * distances[0])
     steps = np.linalg.norm(np.array(ends) - known.x, axis=1).reshape(len(known.x), -1)
     steps = steps / np.linalg.norm(known.root, axis=0)[:, None]  # shorter at the ends of the ranges
-    rises = np.linalg.norm(moved - middle, axis=2) / np.maximum(steps, 1e-9)
+    rises = np.linalg.norm(moved, axis=2) / np.maximum(steps, 1e-9)
     least = np.where(steps > distances[0] / 2, rises, np.inf).min(1)
     slopes = slopes * np.minimum(1, least / np.maximum(np.linalg.norm(slopes, axis=0), 1e-12)) / error
     covariance = np.linalg.inv(slopes.T @ slopes + known.root.T @ known.root / PRIOR**2)
@@ -220,12 +221,12 @@ def narrowed(
 
 
 def _derivatives(sims: Simulations, frames: int, known: Estimate) -> Float[np.ndarray, "n p"]:
-    """Derivatives of the weighted coordinates along the columns of the root, by differences within the ranges."""
+    """Derivatives of the residuals along the columns of the root, by differences within the ranges."""
     ends = []
     for step in NEAR[0] * known.root.T:
         one, other = (np.clip(known.x + s, 0, 1) for s in (step, -step))
         ends.append(step if np.linalg.norm(one - known.x) >= np.linalg.norm(other - known.x) else -step)
-    middle, *moved = sims.motions([known.x, *(known.x + step for step in ends)], frames)
+    middle, *moved = sims.residuals([known.x, *(known.x + step for step in ends)], frames)
     signs = [np.sign(step @ column) for step, column in zip(ends, known.root.T, strict=True)]
-    columns = [sims.problem.weighted((m - middle) * (sign / NEAR[0])) for m, sign in zip(moved, signs, strict=True)]
+    columns = [np.nan_to_num(m - middle) * (sign / NEAR[0]) for m, sign in zip(moved, signs, strict=True)]
     return np.stack(columns, 1)

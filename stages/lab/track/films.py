@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -34,21 +35,28 @@ class Film:
     labels: Int16[Tensor, "t h w"] | None = None  # of the objects in each pixel, as FilmMasks.read gives them
 
 
+def list_films(scene: Scene, folder: Path) -> dict[str, Path]:
+    """The films in a folder of the scene's cameras, by name. Raises InputError where there are none."""
+    recordings, starts = list_recordings(folder), scene.sequence.starts
+    timed = [name for name in scene.cameras.names if name in starts]
+    if missing := [name for name in timed if name not in recordings]:
+        log.warning("%s: holds no film named %s; tracking goes on without", folder, ", ".join(missing))
+    if len(missing) == len(timed):
+        names = ", ".join(scene.cameras.names[:3])
+        raise InputError(f"{folder}: holds no film of the scene's cameras ({names}, ...)")
+    return {name: recordings[name] for name in timed if name in recordings}
+
+
 def read_films(
-    scene: Scene, folder: Path, frames: int, resolution: int, masks: Path | None = None
+    scene: Scene, recordings: Mapping[str, Path], frames: int, resolution: int, masks: Path | None = None
 ) -> tuple[Cameras, list[Film]]:
-    """The cameras of the scene that have films in the folder, at the resolution of the films, and these films.
+    """The cameras of these recordings, at the resolution at which these are read, and their films.
 
     Films are read until `frames` after the release, with their label images in the folder `masks`. Raises InputError
-    where fewer than one camera has a film, and for a film of more frames than label images.
+    for a film without frames, or of more frames than label images.
     """
-    recordings = list_recordings(folder)
     cameras, starts = scene.cameras, scene.sequence.starts
-    rows = [i for i, name in enumerate(cameras.names) if name in recordings and name in starts]
-    if missing := [name for name in cameras.names if name in starts and name not in recordings]:
-        log.warning("%s: holds no film named %s; tracking goes on without", folder, ", ".join(missing))
-    if not rows:
-        raise InputError(f"{folder}: holds no film of the scene's cameras ({', '.join(cameras.names[:3])}, ...)")
+    rows = [i for i, name in enumerate(cameras.names) if name in recordings]
     reduced = _reduced_cameras(cameras[rows], resolution)
     labelled = None if masks is None else find_film_masks(masks, scene, [cameras.names[row] for row in rows])
     films = []
@@ -68,10 +76,9 @@ def read_films(
                 labels.append(labelled.read(files[len(labels)], cameras, row, size))
             if len(pictures) > last:
                 break
-        if pictures:
-            films.append(Film(name, torch.stack(pictures), starts[name], torch.stack(labels) if labels else None))
-    if len(films) < len(rows):
-        raise InputError(f"{folder}: a film has no frames; remove it")
+        if not pictures:
+            raise InputError(f"{recordings[name]}: has no frames; remove it")
+        films.append(Film(name, torch.stack(pictures), starts[name], torch.stack(labels) if labels else None))
     return reduced, films
 
 

@@ -112,14 +112,21 @@ class Tracker:
         return confidences(found, self.tolerance)
 
 
-def follow(tracker: Tracker, frames: int, gravity: Float[Tensor, "3"]) -> TrackedMotion:
-    """The motion of all objects from rest, with confidences. `gravity` is in scene units / frame^2."""
+def follow(tracker: Tracker, frames: int, gravity: Float[Tensor, "3"], timed: bool = False) -> TrackedMotion:
+    """The motion of all objects from their places in the scene, with confidences.
+
+    `gravity` is in scene units / frame^2. Objects are released from rest, which tells when each film starts, unless
+    this is known (`timed`).
+    """
     track = first_pass(tracker, frames, gravity)
-    for reduction in RETIMING:
+    if timed:
+        track = refined(tracker, replace(track, poses=interpolated(track)))
+    else:
+        for reduction in RETIMING:
+            track = from_release(tracker, track)
+            tracker.films = retimed(tracker, track, reduction)
+            track = refined(tracker, track)
         track = from_release(tracker, track)
-        tracker.films = retimed(tracker, track, reduction)
-        track = refined(tracker, track)
-    track = from_release(tracker, track)
     return replace(track, starts={film.name: film.start for film in tracker.films})
 
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from stages.core.geometry.rotations import matrix, quaternion
@@ -23,6 +23,10 @@ class Poses:
     def __getitem__(self, index) -> Poses:
         """The poses of some frames."""
         return Poses(self.rotation[index], self.centre[index])
+
+    def place(self, arm: Float[Tensor, "*b p 3"], row: Int[Tensor, "p"]) -> Float[Tensor, "*b p 3"]:
+        """Points of the objects `row`, given by their offsets from the centres at rest."""
+        return (self.rotation[..., row, :, :] @ arm[..., None])[..., 0] + self.centre[..., row, :]
 
     def to(self, device: str) -> Poses:
         """The same poses on a device."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from stages.core.geometry.cameras import centres, resize
@@ -38,6 +38,13 @@ class Camera:
     def size(self) -> tuple[int, int]:
         """Width and height [px]."""
         return self.background.shape[1], self.background.shape[0]
+
+    def in_front(
+        self, rgb: Float[Tensor, "h w 3"], alpha: Float[Tensor, "h w"], depth: Float[Tensor, "h w"]
+    ) -> tuple[Float[Tensor, "h w 3"], Bool[Tensor, "h w"]]:
+        """The picture with objects that were drawn over black, and where the background does not hide them."""
+        front = (alpha > 0) & (depth < self.background_depth * (1 + BEHIND))
+        return torch.where(front[..., None], rgb + (1 - alpha)[..., None] * self.background, self.background), front
 
 
 @dataclass(frozen=True)
@@ -91,8 +98,7 @@ class Synthesiser:
 
     def objects(self, poses: Poses) -> Gaussians:
         """The Gaussians of all objects at these poses."""
-        g, R = self.rest_gaussians, poses.rotation[self.row]
-        means = (R @ self.arm[..., None])[..., 0] + poses.centre[self.row]
+        g, R, means = self.rest_gaussians, poses.rotation[self.row], poses.place(self.arm, self.row)
         sh = g.sh if g.sh.shape[1] == 1 else rotate_sh(g.sh, R)
         return replace(g, means=means, quats=multiply(quaternion(poses.rotation)[self.row], g.quats), sh=sh)
 
@@ -100,8 +106,7 @@ class Synthesiser:
         """What a camera sees of the objects at these poses, at a whole fraction of its resolution."""
         g, (width, height) = self.objects(poses), camera.size
         rgb, alpha, depth, index = rasterise_with_index(g, camera.viewmat, camera.K, width, height)
-        front = (alpha > 0) & (depth < camera.background_depth * (1 + BEHIND))
-        image = torch.where(front[..., None], rgb + (1 - alpha)[..., None] * camera.background, camera.background)
+        image, front = camera.in_front(rgb, alpha, depth)
         seen = front & (alpha > MIN_ALPHA) & (index >= 0)
         label = torch.where(seen, self.row[index.clamp_min(0)], -1)
         image = image if self.paint is None else torch.cat([image, self.painted(label)], -1)

@@ -9,6 +9,8 @@ from itertools import repeat
 from pathlib import Path
 
 import torch
+from jaxtyping import Int
+from torch import Tensor
 
 from stages.core.backends import pick_device
 from stages.core.errors import InputError
@@ -16,9 +18,9 @@ from stages.core.physics.keypoints import bind_gaussians, choose_keypoints
 from stages.core.scene.files import provenance
 from stages.core.scene.scene import Scene
 from stages.core.scene.scene_ply import read_scene
-from stages.core.scene.trajectory import SimulationInfo, TrajectoryWriter
+from stages.core.scene.trajectory import Keypoints, SimulationInfo, TrajectoryWriter
 from stages.lab.track.deform import deformations, followed, soft_rows
-from stages.lab.track.films import read_films
+from stages.lab.track.films import list_films, read_films
 from stages.lab.track.follow import TrackedMotion, Tracker, follow
 from stages.lab.track.options import TrackOptions
 
@@ -32,9 +34,11 @@ def run(scene: Path, folder: Path, out: Path, options: TrackOptions) -> Iterator
     Raises InputError for a scene without objects or films, films of other cameras, and label images of other films.
     """
     world, device = read_scene(scene), pick_device(options.device)
-    _check(world, scene)
+    if world.sequence is None or world.cameras is None:
+        raise InputError(f"{scene}: does not say when its cameras filmed; make it with `ngff reconstruct --sequence`")
+    check_objects(world, scene)
     fps, frames = world.sequence.fps, options.frames or world.sequence.frames
-    cameras, films = read_films(world, folder, frames, options.resolution, options.masks)
+    cameras, films = read_films(world, list_films(world, folder), frames, options.resolution, options.masks)
     tracker = Tracker(world, cameras, films, device)
     fall = torch.tensor([0.0, 0.0, -GRAVITY / world.metres_per_unit], device=device)
     rows = soft_rows(world, options.soft)
@@ -43,25 +47,27 @@ def run(scene: Path, folder: Path, out: Path, options: TrackOptions) -> Iterator
     keypoints = choose_keypoints(world, options.keypoints, options.seed)
     info = SimulationInfo(1 / fps, tuple(fall.tolist()), "track")
     binding = bind_gaussians(world, keypoints)
-    row = (keypoints.object_id[:, None] == torch.tensor([o.id for o in world.objects])).int().argmax(1)
-    middle = torch.stack([keypoints.rest[row == i].mean(0) for i in range(len(world.objects))])
+    row, each = rows_of(world, keypoints), torch.arange(len(world.objects))
+    middle = torch.stack([keypoints.rest[row == i].mean(0) for i in each])
     poses, rest = track.poses.to("cpu"), tracker.rest.centre.cpu()
     arm = keypoints.rest - rest[row]
     bends = followed(bodies, row, arm) if bodies else repeat(torch.zeros_like(arm))
     with TrajectoryWriter(out, replace(world, provenance=made_by), info, keypoints, binding) as writer:
         for frame, bend in zip(range(frames), bends, strict=False):
-            R, centre = poses.rotation[frame], poses.centre[frame]
-            positions = (R[row] @ (arm + bend)[..., None])[..., 0] + centre[row]
-            com = (R @ (middle - rest)[..., None])[..., 0] + centre
-            writer.append(positions, com, poses[frame].quaternions())
+            now = poses[frame]
+            writer.append(now.place(arm + bend, row), now.place(middle - rest, each), now.quaternions())
         writer.store_confidence(track.confidence)
     log.info("%s: %d frames of %d objects from %d films", out, frames, len(world.objects), len(films))
     yield from report(world, track)
 
 
-def _check(world: Scene, path: Path) -> None:
-    if world.sequence is None or world.cameras is None:
-        raise InputError(f"{path}: does not say when its cameras filmed; make it with `ngff reconstruct --sequence`")
+def rows_of(world: Scene, keypoints: Keypoints) -> Int[Tensor, "k"]:
+    """The row of each keypoint's object in the scene."""
+    return (keypoints.object_id[:, None] == torch.tensor([o.id for o in world.objects])).int().argmax(1)
+
+
+def check_objects(world: Scene, path: Path) -> None:
+    """Raise InputError for a scene without objects, or with one that has no Gaussians."""
     present = set(world.gaussians.object_id.unique().tolist())
     if not world.objects or (empty := [o.name for o in world.objects if o.id not in present]):
         what = f"{empty[0]} has no Gaussians" if world.objects else "it has no objects"

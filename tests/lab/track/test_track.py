@@ -21,7 +21,7 @@ from stages.lab.bench.track import measure, pose_errors
 from stages.lab.track import stand_in as stand_in_films
 from stages.lab.track.confidence import confidences, scales, tolerances
 from stages.lab.track.film_masks import UNKNOWN, find_film_masks
-from stages.lab.track.films import Film, read_films
+from stages.lab.track.films import Film, list_films, read_films
 from stages.lab.track.follow import TrackedMotion, Tracker, interpolated, lasting, release_time
 from stages.lab.track.options import TrackOptions
 from stages.lab.track.poses import Poses, rotation_of, rotation_vector
@@ -119,7 +119,7 @@ def test_scenes_without_films_or_objects_are_refused(small, tmp_path):
 def small_tracker(small, device) -> Tracker:
     folder, stand_in = small
     scene = replace(stand_in.scene, sequence=FilmedSequence(SMALL.fps, SMALL.frames, stand_in.starts))
-    return Tracker(scene, *read_films(scene, folder / "films", 2, SMALL.width), device)
+    return Tracker(scene, *read_films(scene, list_films(scene, folder / "films"), 2, SMALL.width), device)
 
 
 def test_alignment_returns_to_the_true_pose(small, device):

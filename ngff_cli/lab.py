@@ -95,9 +95,13 @@ def estimate_materials(
 @app.command()
 def fit(
     scene: SceneIn,
-    track: Annotated[
-        Path,
-        Argument(metavar="TRACK.h5", help="trajectory of the scene's objects; its first frame is the scene"),
+    motion: Annotated[
+        list[Path],
+        Argument(
+            metavar="TRACK.h5|FILM.mp4...",
+            help="trajectory of the scene's objects, or films of its cameras, each named as its camera; "
+            "the first frame is the scene",
+        ),
     ],
     out: Annotated[
         Path, Option("-o", "--out", help="materials for `ngff simulate --materials` to write (.json)")
@@ -109,7 +113,10 @@ def fit(
         Option(help="OBJECT=MATERIAL: initial values, kept where the motion does not determine them; repeatable"),
     ] = [],  # noqa: B006
     keypoints: Annotated[int, Option(help="keypoints compared per object")] = MaterialFitOptions.keypoints,
-    frames: Annotated[int, Option(help="frames of the track; 0: all")] = MaterialFitOptions.frames,
+    frames: Annotated[int, Option(help="frames of the motion; 0: all")] = MaterialFitOptions.frames,
+    resolution: Annotated[
+        int, Option(help="longest side at which pictures of films are compared [px]")
+    ] = MaterialFitOptions.resolution,
     noise: Annotated[
         float, Option(help="standard deviation of the track's errors [scene units]; 0: estimated from it")
     ] = MaterialFitOptions.noise,
@@ -119,14 +126,21 @@ def fit(
     seed: Seed = MaterialFitOptions.seed,
     device: Device = MaterialFitOptions.device,
 ) -> None:
-    """Estimate materials and initial velocities of objects from their tracked motion."""
+    """Estimate materials and initial velocities of objects from a tracked motion, or from films: SCENE.ply and TRACK.h5
+    or FILM.mp4... -> MATERIALS.json.
+
+    Films are of fixed cameras that the scene has, and named as these: camera03.mp4, or IMG_3.mp4 of a photo IMG_3.jpg.
+    They start with the scene, and have one frame rate; those of `ngff reconstruct CAMERAS/ --sequence` start when the
+    scene says. Several films are better than one, which hardly shows how far away a thing is.
+    """
     from stages.lab.fit.fit import run
 
     options = MaterialFitOptions(
-        engine=engine, quality=quality, material=tuple(material), keypoints=keypoints, frames=frames, noise=noise,
-        evaluations=evaluations, minutes=minutes, workers=workers, seed=seed, device=device,
+        engine=engine, quality=quality, material=tuple(material), keypoints=keypoints, frames=frames,
+        resolution=resolution, noise=noise, evaluations=evaluations, minutes=minutes, workers=workers, seed=seed,
+        device=device,
     )  # fmt: skip
-    for line in run(scene, track, out, options):
+    for line in run(scene, motion, out, options):
         print(line)
 
 

@@ -1,4 +1,4 @@
-"""`ngff-lab fit`: scene.ply and a track -> materials.json."""
+"""`ngff-lab fit`: scene.ply and a track or films -> materials.json."""
 
 from __future__ import annotations
 
@@ -11,7 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
+from stages.core.errors import InputError
 from stages.core.scene.files import provenance, replacing
+from stages.core.scene.formats import format_of
+from stages.lab.fit.film import read_film_problem
 from stages.lab.fit.options import MaterialFitOptions
 from stages.lab.fit.parameters import AXES, QUANTITIES, Parameter, as_json, fitted
 from stages.lab.fit.problem import Problem, read_problem
@@ -30,7 +33,7 @@ class Fit:
     x: np.ndarray  # most probable point [ranges]
     accepted: np.ndarray  # the same, with initial values of what the motion does not determine
     half: np.ndarray  # half widths of 95 % intervals [ranges]
-    rmse: tuple[float, float]  # of the motion before and after [scene units]
+    rmse: tuple[float, float]  # of the motion before and after [unit of the problem]
     evaluations: int
     seconds: float
 
@@ -49,12 +52,20 @@ class Fit:
         return name in AXES or self.half_width(k) <= QUANTITIES[name].max_half_width
 
 
-def run(scene: Path, track: Path, out: Path, options: MaterialFitOptions) -> list[str]:
+def run(scene: Path, motion: Sequence[Path], out: Path, options: MaterialFitOptions) -> list[str]:
     """Write OUT for `ngff simulate --materials OUT`, and OUT's name with .fit.json with intervals; lines of text.
 
-    Raises InputError for a track that is not of the scene, and MissingPackage without the package cma.
+    `motion` is one trajectory, or films. Raises InputError for a motion that is not of the scene, and MissingPackage
+    without the package cma.
     """
-    fit = solve(read_problem(Path(scene), Path(track), options), options)
+    kinds = [format_of(path, "trajectory", "video").kind for path in motion]
+    if kinds.count("trajectory") and len(kinds) > 1:
+        raise InputError(f"{motion[kinds.index('trajectory')]}: a track is fitted alone; give it, or films")
+    if kinds == ["trajectory"]:
+        problem = read_problem(scene, motion[0], options)
+    else:
+        problem = read_film_problem(scene, motion, options)
+    fit = solve(problem, options)
     materials, velocity = fitted(fit.problem.parameters, fit.accepted, fit.problem.materials)
     names = {o.id: o.name for o in fit.problem.scene.objects}
     with replacing(out) as part:
@@ -62,12 +73,12 @@ def run(scene: Path, track: Path, out: Path, options: MaterialFitOptions) -> lis
     rows = [{"object": p.object_id, "name": names[p.object_id], "quantity": p.name, "log10": _is_log(p),
              "value": fit.value(k), "half_width": fit.half_width(k), "identifiable": fit.is_identifiable(k)}
             for k, p in enumerate(fit.problem.parameters)]  # fmt: skip
-    facts = {**provenance("fit", [scene, track], options), "engine": fit.problem.options.engine, "parameters": rows,
-             "velocity": velocity, "rmse_before": fit.rmse[0], "rmse": fit.rmse[1], "evaluations": fit.evaluations,
-             "seconds": round(fit.seconds, 1)}  # fmt: skip
+    facts = {**provenance("fit", [scene, *motion], options), "engine": fit.problem.options.engine, "parameters": rows,
+             "velocity": velocity, "rmse_before": fit.rmse[0], "rmse": fit.rmse[1], "rmse_unit": fit.problem.unit,
+             "evaluations": fit.evaluations, "seconds": round(fit.seconds, 1)}  # fmt: skip
     with replacing(out.with_suffix(".fit.json")) as part:
         part.write_text(json.dumps(facts, indent=1) + "\n")
-    return [*describe(fit), _command(Path(scene), out, fit, velocity)]
+    return [*describe(fit), _command(scene, out, fit, velocity)]
 
 
 def solve(problem: Problem, options: MaterialFitOptions) -> Fit:
@@ -75,12 +86,13 @@ def solve(problem: Problem, options: MaterialFitOptions) -> Fit:
     log.info("%d parameters of %d objects, --engine %s, %d frames", len(problem.parameters), len(problem.moving),
              problem.options.engine, len(problem.track))  # fmt: skip
     begun, frames = time.perf_counter(), len(problem.track)
+    with simulations(problem.tracked, options.workers) as sims:
+        found, searched = search(sims, options), sims.count
     with simulations(problem, options.workers) as sims:
-        found = search(sims, options)
         error = _error(problem, sims.residuals([found.x], frames)[0])
         found = settled(sims, frames, found, error)
         before, after = (problem.rmse(r) for r in sims.residuals([sims.start, found.x], frames))
-        fit = Fit(problem, found.x, found.x, 1.96 * found.deviations, (before, after), sims.count, 0.0)
+        fit = Fit(problem, found.x, found.x, 1.96 * found.deviations, (before, after), searched + sims.count, 0.0)
         unknown = [k for k in np.argsort(-fit.half) if not fit.is_identifiable(k)]
         return replace(fit, accepted=with_initial(found, sims.start, unknown), seconds=time.perf_counter() - begun)
 
@@ -105,12 +117,12 @@ def with_initial(found: Estimate, start: np.ndarray, unknown: Sequence[int]) -> 
 def _error(problem: Problem, residuals: np.ndarray) -> float:
     """Standard deviation of a residual [tolerances] for intervals, from those of a fit.
 
-    The noise of the track is independent from frame to frame. Residuals beyond it are taken as fully correlated: they
+    Noise is independent from frame to frame. Residuals beyond it are taken as fully correlated: they
     count as one observation.
     """
     noise = problem.noise_level**2
-    excess = max(0.0, float(problem.errors(residuals).mean()) / 3 - NOISE_MARGIN * noise)
-    return max((noise + len(problem.track) * excess) ** 0.5, SMALLEST_ERROR)
+    excess = max(0.0, problem.mean_square(residuals) - NOISE_MARGIN * noise)
+    return max((noise + problem.observations * excess) ** 0.5, SMALLEST_ERROR)
 
 
 def describe(fit: Fit) -> list[str]:
@@ -124,8 +136,8 @@ def describe(fit: Fit) -> list[str]:
                 (found if fit.is_identifiable(k) else unknown).append(_text(fit, k, p))
         line = f"object {i} ({names[i]}): {', '.join(found) or 'nothing is identifiable from the motion'}"
         lines.append(line + (f"; not identifiable from the motion: {', '.join(unknown)}" if unknown else ""))
-    lines.append(f"RMSE {fit.rmse[0]:.3g} before, {fit.rmse[1]:.3g} after [scene units]; {fit.evaluations} motions in "
-                 f"{fit.seconds:.0f} s")  # fmt: skip
+    lines.append(f"RMSE {fit.rmse[0]:.3g} before, {fit.rmse[1]:.3g} after [{fit.problem.unit}]; {fit.evaluations} "
+                 f"motions in {fit.seconds:.0f} s")  # fmt: skip
     return lines
 
 

@@ -14,7 +14,8 @@ class MaterialFitOptions:
     quality: str = "draft"  # of the MPM engine
     material: tuple[str, ...] = ()  # OBJECT=MATERIAL: initial values, kept where not identifiable
     keypoints: int = 48  # of the track that are compared, for each object
-    frames: int = 0  # of the track; 0: all
+    frames: int = 0  # of the motion; 0: all
+    resolution: int = 320  # longest side at which pictures of films are compared [px]
     noise: float = 0.0  # standard deviation of the track's errors [scene units]; 0: the residual of the fit
     evaluations: int = 1500  # largest number of simulations of the search
     minutes: float = 10.0  # longest time of the search [min]
@@ -25,5 +26,7 @@ class MaterialFitOptions:
     def __post_init__(self):
         if self.keypoints < 8 or self.evaluations < 1 or self.workers < 1 or self.frames < 0:
             raise InputError("--keypoints must be 8 or more, --evaluations and --workers 1 or more, --frames 0 or more")
+        if not 64 <= self.resolution <= 4096:
+            raise InputError(f"--resolution {self.resolution}: the longest side must be 64 to 4096 pixels")
         if not (0 <= self.noise < math.inf and self.minutes > 0):
             raise InputError("--noise must be 0 or more and --minutes positive")

@@ -59,6 +59,18 @@ class Problem:
     parameters: tuple[Parameter, ...]
     noise: float  # standard deviation of a coordinate of the track [scene units]
 
+    unit = "scene units"  # of `rmse`
+
+    @property
+    def tracked(self) -> Problem:
+        """The problem on which the search starts."""
+        return self
+
+    @property
+    def observations(self) -> float:
+        """How many there are whose noise is independent: frames."""
+        return len(self.track)
+
     @property
     def moving(self) -> list[int]:
         """Ids of the objects that are compared: those that have parameters."""
@@ -101,6 +113,10 @@ class Problem:
         counts = [3 * len(self.track) * int((self.keypoints.object_id == i).sum()) for i in self.moving]
         parts = torch.from_numpy(residuals).split(counts)
         return torch.stack([part.reshape(len(self.track), -1).square().sum(1) for part in parts], 1)
+
+    def mean_square(self, residuals: np.ndarray) -> float:
+        """Of a coordinate of a keypoint less that of the track [tolerances^2]."""
+        return float(self.errors(residuals).mean()) / 3
 
     def rmse(self, residuals: np.ndarray) -> float:
         """Root mean squared distance of the keypoints from the track [scene units]."""

@@ -409,3 +409,25 @@ def bench_fit(
         device=device,
     )  # fmt: skip
     print_results(lambda path: run(path, options), out, as_json)
+
+
+@app.command("fit-films")
+def bench_fit_films(
+    scenes: Annotated[int, Option(help="number of scenes")] = 6,
+    only: Annotated[str, Option(help="slide | throw; default: both, alternating")] = "",
+    cameras: Annotated[int, Option(help="films per scene")] = 2,
+    width: Annotated[int, Option(help="of the films [px]")] = 320,
+    frames: Annotated[int, Option(help="of each film")] = 25,
+    workers: Annotated[int, Option(help="processes")] = 2,
+    out: Out = None,
+    seed: Seed = 0,
+    device: Device = "auto",
+    as_json: AsJson = False,
+) -> None:
+    """Material estimation from films: errors of the parameters, beside those from the motion as it was tracked."""
+    from stages.lab.bench.fit_films import FilmBenchOptions, run
+
+    options = FilmBenchOptions(
+        scenes=scenes, only=only, cameras=cameras, width=width, frames=frames, workers=workers, seed=seed, device=device
+    )
+    print_results(lambda path: run(path, options), out, as_json)

@@ -35,13 +35,14 @@ from stages.lab.fit.problem import FAILED, Problem, pose_problem
 from stages.lab.track.confidence import MIN_PIXELS
 from stages.lab.track.films import read_films
 from stages.lab.track.follow import TrackedMotion, Tracker, follow, motions
-from stages.lab.track.synthesis import Camera, Synthesiser
+from stages.lab.track.synthesis import Camera, Synthesiser, reduced
 from stages.lab.track.track import GRAVITY, check_objects, report, rows_of
 
 log = logging.getLogger(__name__)
 PICTURES = 24  # of each film that are compared, evenly spread over the motion
-MARGIN = 3  # of the pixels compared around an object [px]: poses were fitted to a fraction of a pixel
-BLOCK = 64  # number of pixels that count as one observation
+REDUCTION = 2  # of the pictures that are compared: that at which poses were fitted
+MARGIN = 2  # of the pixels compared around an object [reduced px]: poses were fitted to a fraction of a pixel
+BLOCK = 16  # number of reduced pixels that count as one observation
 FOLLOWED = 0.5  # error of the track up to which the search goes on [px]: pictures tell what is nearer
 
 
@@ -95,7 +96,7 @@ class FilmProblem(Problem):
         g = self.skinning(torch.lerp(motion[first], motion[first + 1], picture.time - first))
         drawn = rasterise(g, camera.viewmat[None], camera.K[None], *camera.size)
         image, _ = camera.in_front(drawn.rgb[0], drawn.alpha[0], drawn.depth[0])
-        return (image[picture.window] - picture.colours) / self.scale
+        return (reduced(image, REDUCTION)[picture.window] - picture.colours) / self.scale
 
     def mean_square(self, residuals: np.ndarray) -> float:
         """Of the robust difference of a channel [scales^2]."""
@@ -232,7 +233,7 @@ def _all_pictures(tracker: Tracker, track: TrackedMotion, moving: Sequence[int])
     last = len(track.confidence) - 1
     for frame in range(last + 1):
         rows = [i for i in moving if track.confidence[frame, i] > 0]
-        for o in tracker.observe(frame, 1, *motions(track, frame)):
+        for o in tracker.observe(frame, REDUCTION, *motions(track, frame)):
             label = o.draw(tracker.synthesiser, track.poses[frame]).label
             shows = torch.isin(label, torch.tensor(rows, device=label.device))
             if 0 <= frame + o.late <= last and int(shows.sum()) >= MIN_PIXELS:

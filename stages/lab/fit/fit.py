@@ -14,11 +14,19 @@ import numpy as np
 from stages.core.errors import InputError
 from stages.core.scene.files import provenance, replacing
 from stages.core.scene.formats import format_of
-from stages.lab.fit.film import read_film_problem
+from stages.lab.fit.film import FilmProblem, read_film_problem
 from stages.lab.fit.options import MaterialFitOptions
 from stages.lab.fit.parameters import AXES, QUANTITIES, Parameter, as_json, fitted
 from stages.lab.fit.problem import Problem, read_problem
-from stages.lab.fit.search import SMALLEST_ERROR, Estimate, search, settled, simulations
+from stages.lab.fit.search import (
+    SMALLEST_ERROR,
+    Estimate,
+    Simulations,
+    descend,
+    search,
+    settled,
+    simulations,
+)
 
 log = logging.getLogger(__name__)
 NOISE_MARGIN = 1.1  # on the variance of the track's noise, which is estimated to a tenth
@@ -30,16 +38,20 @@ class Fit:
     """Parameters fitted to a track, and their uncertainty."""
 
     problem: Problem
-    x: np.ndarray  # most probable point [ranges]
-    accepted: np.ndarray  # the same, with initial values of what the motion does not determine
-    half: np.ndarray  # half widths of 95 % intervals [ranges]
+    found: Estimate  # the most probable point
+    accepted: np.ndarray  # the same, with initial values of what the motion does not determine [ranges]
     rmse: tuple[float, float]  # of the motion before and after [unit of the problem]
     evaluations: int
     seconds: float
 
+    @property
+    def half(self) -> np.ndarray:
+        """Half widths of 95 % intervals [ranges]."""
+        return 1.96 * self.found.deviations
+
     def value(self, k: int) -> float:
         """Of the k-th parameter; log10 of it where it is searched so."""
-        return self.problem.parameters[k].value(float(self.x[k]))
+        return self.problem.parameters[k].value(float(self.found.x[k]))
 
     def half_width(self, k: int) -> float:
         """Of its 95 % interval."""
@@ -82,19 +94,31 @@ def run(scene: Path, motion: Sequence[Path], out: Path, options: MaterialFitOpti
 
 
 def solve(problem: Problem, options: MaterialFitOptions) -> Fit:
-    """Search for the parameters, and estimate how accurately the motion determines them."""
+    """Search for the parameters, and estimate how accurately the motion determines them.
+
+    Films are compared from the fit of the track on, which was followed through them.
+    """
     log.info("%d parameters of %d objects, --engine %s, %d frames", len(problem.parameters), len(problem.moving),
              problem.options.engine, len(problem.track))  # fmt: skip
-    begun, frames = time.perf_counter(), len(problem.track)
+    begun = time.perf_counter()
     with simulations(problem.tracked, options.workers) as sims:
-        found, searched = search(sims, options), sims.count
-    with simulations(problem, options.workers) as sims:
-        error = _error(problem, sims.residuals([found.x], frames)[0])
-        found = settled(sims, frames, found, error)
-        before, after = (problem.rmse(r) for r in sims.residuals([sims.start, found.x], frames))
-        fit = Fit(problem, found.x, found.x, 1.96 * found.deviations, (before, after), searched + sims.count, 0.0)
-        unknown = [k for k in np.argsort(-fit.half) if not fit.is_identifiable(k)]
-        return replace(fit, accepted=with_initial(found, sims.start, unknown), seconds=time.perf_counter() - begun)
+        fit = _settled(sims, search(sims, options))
+    if isinstance(problem, FilmProblem):
+        with simulations(problem, options.workers) as sims:
+            near = fit.found._replace(x=descend(sims, len(problem.track), fit.found, sims.noise))
+            fit = replace(_settled(sims, near), evaluations=fit.evaluations + sims.count)
+    return replace(fit, seconds=time.perf_counter() - begun)
+
+
+def _settled(sims: Simulations, found: Estimate) -> Fit:
+    """The fit near an estimate, with its uncertainty."""
+    problem, frames = sims.problem, len(sims.problem.track)
+    error = _error(problem, sims.residuals([found.x], frames)[0])
+    found = settled(sims, frames, found, error)
+    before, after = (problem.rmse(r) for r in sims.residuals([sims.start, found.x], frames))
+    fit = Fit(problem, found, found.x, (before, after), sims.count, 0.0)
+    unknown = [k for k in np.argsort(-fit.half) if not fit.is_identifiable(k)]
+    return replace(fit, accepted=with_initial(found, sims.start, unknown))
 
 
 def with_initial(found: Estimate, start: np.ndarray, unknown: Sequence[int]) -> np.ndarray:

@@ -88,12 +88,12 @@ def make_stand_in(options: StandInOptions) -> StandIn:
 def _scene(options: StandInOptions, rng: random.Random) -> Scene:
     """Toys of random kinds, turned at random, above each other and beside each other."""
     toys = falling_toys()
-    parts, objects = [_thinned(toys.gaussians[toys.gaussians.object_id == 0])], []
+    parts, objects = [thinned(toys.gaussians[toys.gaussians.object_id == 0])], []
     kinds = rng.sample(STIFF_TOYS, min(options.objects, len(STIFF_TOYS)))
     generator = torch.Generator().manual_seed(options.seed)
     for id in range(1, options.objects + 1):
         kind = toys.objects[kinds[(id - 1) % len(kinds)] - 1]
-        toy = _thinned(toys.gaussians[toys.gaussians.object_id == kind.id])
+        toy = thinned(toys.gaussians[toys.gaussians.object_id == kind.id])
         centre = (toy.means.amin(0) + toy.means.amax(0)) / 2
         turn = matrix(torch.nn.functional.normalize(torch.randn(4, generator=generator), dim=0))
         # columns of two, so that objects collide in the air and on the table
@@ -104,18 +104,24 @@ def _scene(options: StandInOptions, rng: random.Random) -> Scene:
         parts.append(replace(placed, object_id=torch.full((len(placed),), id)))
         objects.append(SceneObject(id, kind.name, "wood"))
     scale = {"metres_per_unit": 1.0, "source": "made in code"}
-    return Scene(concatenate(parts), tuple(objects), _cameras(options, rng), 0.0, scale, background=(0.5, 0.5, 0.5))
+    return Scene(
+        concatenate(parts),
+        tuple(objects),
+        cameras_around(options.cameras, options.width, rng),
+        0.0,
+        scale,
+        background=(0.5, 0.5, 0.5),
+    )
 
 
-def _thinned(g: Gaussians) -> Gaussians:
+def thinned(g: Gaussians) -> Gaussians:
     """Fewer Gaussians, as much larger."""
     part = g[torch.arange(0, len(g), THINNED)]
     return replace(part, scales=part.scales * torch.tensor([THINNED**0.5, THINNED**0.5, 1.0]))
 
 
-def _cameras(options: StandInOptions, rng: random.Random) -> Cameras:
-    """Cameras around the table, at different heights."""
-    count, width = options.cameras, options.width
+def cameras_around(count: int, width: int, rng: random.Random) -> Cameras:
+    """Cameras around the table, at different heights, for pictures of this width [px] and three quarters of it."""
     azimuth = torch.tensor([2 * torch.pi * (i + rng.uniform(-0.2, 0.2)) / count for i in range(count)])
     height = torch.tensor([rng.uniform(0.25, 0.75) for _ in range(count)])
     eyes = torch.stack([1.1 * azimuth.cos(), 1.1 * azimuth.sin(), height], 1)

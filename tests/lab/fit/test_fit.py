@@ -126,7 +126,7 @@ def test_the_command_writes_materials_that_simulate_takes(bounce, bounce_fit):
 
 def test_the_command_that_repeats_the_motion_has_the_velocity(slide):
     problem = read_problem(slide / "scene.ply", slide / "track.h5", OPTIONS)
-    fit = Fit(problem, np.zeros(4), np.zeros(4), np.zeros(4), (0.0, 0.0), 0, 0.0)
+    fit = Fit(problem, Estimate(np.zeros(4), np.eye(4)), np.zeros(4), (0.0, 0.0), 0, 0.0)
     words = _command(slide / "scene.ply", slide / "m.json", fit, {1: (2.0, 0.5, 0.0)})
     assert words.endswith(f'--materials {slide / "m.json"} --velocity "object=1 2,0.5,0"')
 

@@ -25,6 +25,7 @@ from stages.core.physics.forces import ForcePrompts
 from stages.core.physics.keypoints import bind_gaussians, choose_keypoints
 from stages.core.physics.skinning import Skinning
 from stages.core.raster.rasterise import rasterise
+from stages.core.scene.files import must_exist
 from stages.core.scene.recordings import common_frame_rate
 from stages.core.scene.scene import Scene
 from stages.core.scene.scene_ply import read_scene
@@ -35,14 +36,16 @@ from stages.lab.fit.problem import FAILED, Problem, pose_problem
 from stages.lab.track.confidence import MIN_PIXELS
 from stages.lab.track.films import read_films
 from stages.lab.track.follow import TrackedMotion, Tracker, follow, motions
+from stages.lab.track.search import without
 from stages.lab.track.synthesis import Camera, Synthesiser, reduced
 from stages.lab.track.track import GRAVITY, check_objects, report, rows_of
 
 log = logging.getLogger(__name__)
 PICTURES = 24  # of each film that are compared, evenly spread over the motion
-REDUCTION = 2  # of the pictures that are compared: that at which poses were fitted
+REDUCTIONS = (4, 2)  # of the pictures that are compared, coarse to fine: those at which poses were fitted
 MARGIN = 2  # of the pixels compared around an object [reduced px]: poses were fitted to a fraction of a pixel
-BLOCK = 16  # number of reduced pixels that count as one observation
+BLOCK = 64  # number of pixels, before they are reduced, that count as one observation
+CLEARLY = 0.5  # difference of pictures to renderings with an object, of that without it, up to which they show it
 FOLLOWED = 0.5  # error of the track up to which the search goes on [px]: pictures tell what is nearer
 
 
@@ -52,8 +55,8 @@ class Picture:
 
     film: int  # its number
     time: float  # since the first frame [frames]
+    image: Float[Tensor, "h w 3"]  # at the brightness of the scene
     window: Bool[Tensor, "h w"]
-    colours: Float[Tensor, "p 3"]  # in the window, at the brightness of the scene
 
 
 @dataclass(frozen=True)
@@ -64,8 +67,12 @@ class FilmProblem(Problem):
     skinning: Skinning  # of the Gaussians of the objects
     pictures: tuple[Picture, ...]
     scale: float  # of the residuals of pixels, above which they have less and less weight [colours from 0 to 1]
+    reduction: int  # of the pictures
 
     unit = "colours from 0 to 1"  # of `rmse`
+    noise_margin = (
+        1.02  # true motions had at most 1.005 of the mean square of tracked ones (`bench fit-films`, 100 to 102)
+    )
 
     @property
     def tracked(self) -> Problem:
@@ -73,9 +80,18 @@ class FilmProblem(Problem):
         return Problem(**{f.name: getattr(self, f.name) for f in fields(Problem)})
 
     @property
+    def levels(self) -> list[FilmProblem]:
+        """The problem with coarse to fine pictures; the last is this one."""
+        return [*(self.coarser(r // self.reduction) for r in REDUCTIONS[:-1]), self]
+
+    @property
     def observations(self) -> float:
         """Number of blocks of pixels."""
-        return sum(len(p.colours) for p in self.pictures) / BLOCK
+        return sum(int(p.window.sum()) for p in self.pictures) / self._block
+
+    @property
+    def _block(self) -> float:
+        return BLOCK / self.reduction**2
 
     @property
     def noise_level(self) -> float:
@@ -87,16 +103,17 @@ class FilmProblem(Problem):
 
         They are scaled so that a block of pixels has the weight of one: those of neighbours are not independent.
         """
-        rows = [self._differences(motion, p) if motion.isfinite().all() else torch.full_like(p.colours, torch.nan)
-                for p in self.pictures]  # fmt: skip
-        return (robust(torch.cat(rows)).flatten() / (3 * BLOCK) ** 0.5).double().numpy()
+        if not motion.isfinite().all():
+            return np.full(3 * sum(int(p.window.sum()) for p in self.pictures), np.nan)
+        rows = torch.cat([self._differences(motion, p) for p in self.pictures])
+        return (robust(rows).flatten() / (3 * self._block) ** 0.5).double().numpy()
 
     def _differences(self, motion: Float[Tensor, "t k 3"], picture: Picture) -> Float[Tensor, "p 3"]:
         camera, first = self.cameras[picture.film], min(int(picture.time), len(motion) - 2)
         g = self.skinning(torch.lerp(motion[first], motion[first + 1], picture.time - first))
         drawn = rasterise(g, camera.viewmat[None], camera.K[None], *camera.size)
         image, _ = camera.in_front(drawn.rgb[0], drawn.alpha[0], drawn.depth[0])
-        return (reduced(image, REDUCTION)[picture.window] - picture.colours) / self.scale
+        return (reduced(image, self.reduction) - picture.image)[picture.window] / self.scale
 
     def mean_square(self, residuals: np.ndarray) -> float:
         """Of the robust difference of a channel [scales^2]."""
@@ -115,6 +132,15 @@ class FilmProblem(Problem):
         """The same problem for the first frames only."""
         part = super().first_frames(frames)
         return replace(part, pictures=tuple(p for p in self.pictures if p.time <= frames - 1))
+
+    def coarser(self, factor: int) -> FilmProblem:
+        """The same problem with pictures that are further reduced by a whole factor."""
+        coarse = [replace(p, image=reduced(p.image, factor), window=_shrunk(p.window, factor)) for p in self.pictures]
+        return replace(self, pictures=tuple(coarse), reduction=factor * self.reduction)
+
+
+def _shrunk(window: Bool[Tensor, "h w"], factor: int) -> Bool[Tensor, "h2 w2"]:
+    return F.max_pool2d(window[None, None].float(), factor)[0, 0] > 0
 
 
 def robust(difference: Float[Tensor, "p 3"]) -> Float[Tensor, "p 3"]:
@@ -139,15 +165,28 @@ def read_film_problem(scene: Path, films: Sequence[Path], options: MaterialFitOp
         raise InputError(f"{films[0]}: has {max(frames, 0)} frames from the start of the motion on; motion is seen in "
                          "three or more")  # fmt: skip
     tracker = Tracker(world, cameras, read, pick_device(options.device))
+    if not shown(tracker).any():
+        raise InputError(f"{films[0]}: shows no object where {scene} has it in the first frame; the film must be of a "
+                         "camera of the scene, and start with it")  # fmt: skip
     fall = torch.tensor([0.0, 0.0, -GRAVITY / world.metres_per_unit])
     track = follow(tracker, frames, fall.to(tracker.device) / world.sequence.fps**2, timed)
     for line in report(world, track):
         log.info(line)
-    if not (track.confidence[0] > 0).any():
-        raise InputError(f"{films[0]}: shows no object where {scene} has it in the first frame; the film must be of a "
-                         "camera of the scene, and start with it")  # fmt: skip
     return film_problem(world, tracker, track, SimulationInfo(1 / world.sequence.fps, tuple(fall.tolist()), "track"),
                         options, str(films[0]))  # fmt: skip
+
+
+def shown(tracker: Tracker) -> Bool[Tensor, "o"]:
+    """Which objects the first pictures show where the scene has them: clearly nearer to its renderings than without."""
+    with_it, without_it = [], []
+    gone = without(tracker.rest, torch.ones(len(tracker.rest.centre), dtype=torch.bool, device=tracker.device))
+    for o in tracker.observe(0, REDUCTIONS[-1], tracker.still, tracker.still):
+        drawn, bare = o.draw(tracker.synthesiser, tracker.rest), o.draw(tracker.synthesiser, gone)
+        for found, picture in ((with_it, drawn), (without_it, bare)):
+            off = o.difference(picture).square().mean(-1).sqrt()
+            found.append([off[drawn.label == i] for i in range(len(gone.centre))])
+    pairs = zip(zip(*with_it, strict=True), zip(*without_it, strict=True), strict=True)
+    return torch.stack([torch.cat(near).median() < CLEARLY * torch.cat(far).median() for near, far in pairs])
 
 
 def by_camera(world: Scene, scene: Path, films: Sequence[Path]) -> dict[str, Path]:
@@ -174,6 +213,8 @@ def timing(world: Scene, scene: Path, recordings: dict[str, Path], frames: int) 
 
     Raises InputError for other frame rates than that of the scene's films, and for films that start at unknown times.
     """
+    for path in recordings.values():
+        must_exist(path, "a video")
     rate, known = common_frame_rate(recordings, 0.0), world.sequence
     film = next(iter(recordings.values()))
     if rate <= 0:
@@ -211,6 +252,7 @@ def film_problem(
         cameras=tuple(synthesiser.camera(c.viewmat.cpu(), c.K.cpu(), *c.size) for c in tracker.cameras),
         skinning=Skinning(objects.gaussians, bind_gaussians(objects, posed.keypoints), posed.keypoints),
         pictures=tuple(pictures(tracker, track, moving)), scale=max(tracker.scale[i] for i in moving),
+        reduction=REDUCTIONS[-1],
     )  # fmt: skip
 
 
@@ -233,9 +275,9 @@ def _all_pictures(tracker: Tracker, track: TrackedMotion, moving: Sequence[int])
     last = len(track.confidence) - 1
     for frame in range(last + 1):
         rows = [i for i in moving if track.confidence[frame, i] > 0]
-        for o in tracker.observe(frame, REDUCTION, *motions(track, frame)):
+        for o in tracker.observe(frame, REDUCTIONS[-1], *motions(track, frame)):
             label = o.draw(tracker.synthesiser, track.poses[frame]).label
             shows = torch.isin(label, torch.tensor(rows, device=label.device))
             if 0 <= frame + o.late <= last and int(shows.sum()) >= MIN_PIXELS:
                 window = F.max_pool2d(shows[None, None].float(), 2 * MARGIN + 1, 1, MARGIN)[0, 0] > 0
-                yield Picture(o.film, frame + o.late, window.cpu(), o.image[..., :3][window].cpu())
+                yield Picture(o.film, frame + o.late, o.image[..., :3].cpu(), window.cpu())

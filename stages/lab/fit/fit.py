@@ -14,7 +14,7 @@ import numpy as np
 from stages.core.errors import InputError
 from stages.core.scene.files import provenance, replacing
 from stages.core.scene.formats import format_of
-from stages.lab.fit.film import FilmProblem, read_film_problem
+from stages.lab.fit.film import read_film_problem
 from stages.lab.fit.options import MaterialFitOptions
 from stages.lab.fit.parameters import AXES, QUANTITIES, Parameter, as_json, fitted
 from stages.lab.fit.problem import Problem, read_problem
@@ -29,7 +29,6 @@ from stages.lab.fit.search import (
 )
 
 log = logging.getLogger(__name__)
-NOISE_MARGIN = 1.1  # on the variance of the track's noise, which is estimated to a tenth
 PROBABLE = 1.0  # squared distance of initial values from an estimate up to which they are kept [its covariance]
 
 
@@ -103,11 +102,14 @@ def solve(problem: Problem, options: MaterialFitOptions) -> Fit:
     begun = time.perf_counter()
     with simulations(problem.tracked, options.workers) as sims:
         fit = _settled(sims, search(sims, options))
-    if isinstance(problem, FilmProblem):
-        with simulations(problem, options.workers) as sims:
-            near = fit.found._replace(x=descend(sims, len(problem.track), fit.found, sims.noise))
-            fit = replace(_settled(sims, near), evaluations=fit.evaluations + sims.count)
-    return replace(fit, seconds=time.perf_counter() - begun)
+    found, count = fit.found, fit.evaluations
+    for level in problem.levels:
+        with simulations(level, options.workers) as sims:
+            found = found._replace(x=descend(sims, len(problem.track), found, sims.noise))
+            if level is problem:
+                fit = _settled(sims, found)
+            count += sims.count
+    return replace(fit, evaluations=count, seconds=time.perf_counter() - begun)
 
 
 def _settled(sims: Simulations, found: Estimate) -> Fit:
@@ -145,7 +147,7 @@ def _error(problem: Problem, residuals: np.ndarray) -> float:
     count as one observation.
     """
     noise = problem.noise_level**2
-    excess = max(0.0, problem.mean_square(residuals) - NOISE_MARGIN * noise)
+    excess = max(0.0, problem.mean_square(residuals) - problem.noise_margin * noise)
     return max((noise + problem.observations * excess) ** 0.5, SMALLEST_ERROR)
 
 

@@ -60,11 +60,17 @@ class Problem:
     noise: float  # standard deviation of a coordinate of the track [scene units]
 
     unit = "scene units"  # of `rmse`
+    noise_margin = 1.1  # on the variance of the track's noise, which is estimated to a tenth
 
     @property
     def tracked(self) -> Problem:
         """The problem on which the search starts."""
         return self
+
+    @property
+    def levels(self) -> Sequence[Problem]:
+        """Problems that are solved from its solution on, in turn."""
+        return ()
 
     @property
     def observations(self) -> float:

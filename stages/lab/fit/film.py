@@ -70,9 +70,7 @@ class FilmProblem(Problem):
     reduction: int  # of the pictures
 
     unit = "colours from 0 to 1"  # of `rmse`
-    noise_margin = (
-        1.02  # true motions had at most 1.005 of the mean square of tracked ones (`bench fit-films`, 100 to 102)
-    )
+    noise_margin = 1.02  # mean squares of true motions were at most 1.006 of those of tracks (bench, seeds 100 to 102)
 
     @property
     def tracked(self) -> Problem:

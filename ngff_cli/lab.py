@@ -98,7 +98,7 @@ def fit(
     motion: Annotated[
         list[Path],
         Argument(
-            metavar="TRACK.h5|FILM.mp4...",
+            metavar="TRACK.h5|FILM.mp4",
             help="trajectory of the scene's objects, or films of its cameras, each named as its camera; "
             "the first frame is the scene",
         ),
@@ -115,7 +115,7 @@ def fit(
     keypoints: Annotated[int, Option(help="keypoints compared per object")] = MaterialFitOptions.keypoints,
     frames: Annotated[int, Option(help="frames of the motion; 0: all")] = MaterialFitOptions.frames,
     resolution: Annotated[
-        int, Option(help="longest side at which pictures of films are compared [px]")
+        int, Option(help="longest side to which films are reduced [px]")
     ] = MaterialFitOptions.resolution,
     noise: Annotated[
         float, Option(help="standard deviation of the track's errors [scene units]; 0: estimated from it")

@@ -15,7 +15,7 @@ class MaterialFitOptions:
     material: tuple[str, ...] = ()  # OBJECT=MATERIAL: initial values, kept where not identifiable
     keypoints: int = 48  # of the track that are compared, for each object
     frames: int = 0  # of the motion; 0: all
-    resolution: int = 320  # longest side at which pictures of films are compared [px]
+    resolution: int = 320  # longest side to which films are reduced [px]
     noise: float = 0.0  # standard deviation of the track's errors [scene units]; 0: the residual of the fit
     evaluations: int = 1500  # largest number of simulations of the search
     minutes: float = 10.0  # longest time of the search [min]

@@ -44,8 +44,8 @@ log = logging.getLogger(__name__)
 PICTURES = 24  # of each film that are compared, evenly spread over the motion
 REDUCTIONS = (4, 2)  # of the pictures that are compared, coarse to fine: those at which poses were fitted
 MARGIN = 2  # of the pixels compared around an object [reduced px]: poses were fitted to a fraction of a pixel
-# number of pixels, before they are reduced, that count as one observation: residuals of true motions are correlated over
-# 50 to 75 (`ngff-lab bench fit-films`, seeds 100 to 102)
+# pixels, before they are reduced, that count as one observation: residuals of true motions are correlated over 50 to 75
+# of them (`ngff-lab bench fit-films`, seeds 100 to 102)
 BLOCK = 64
 CLEARLY = 0.5  # difference of pictures to renderings with an object, of that without it, up to which they show it
 FOLLOWED = 0.5  # error of the track up to which the search goes on [px]: pictures tell what is nearer
@@ -157,7 +157,7 @@ def read_film_problem(scene: Path, films: Sequence[Path], options: MaterialFitOp
     world = read_scene(scene)
     check_objects(world, scene)
     recordings = by_camera(world, scene, films)
-    timed = world.sequence is None  # otherwise starts are those of an audio track or of motion, and are corrected
+    timed = world.sequence is None  # otherwise starts are estimates, which are corrected
     world = replace(world, sequence=timing(world, scene, recordings, options.frames))
     cameras, read = read_films(world, recordings, world.sequence.frames, options.resolution)
     frames = min(world.sequence.frames, max(int(len(film.frames) - film.start) for film in read))

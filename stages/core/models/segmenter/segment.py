@@ -30,8 +30,8 @@ from stages.core.scene.schema import whole
 WEIGHTS = Path(__file__).parent / "segmenter.safetensors"
 MAX_BLOCKS, MAX_LEVELS = 100, 12  # of a network
 MAX_VOXELS = 80_000  # nearest to the focus
-OBJECT_COST = 0.5  # least IoU that a candidate must be expected to have; chosen on simulated scenes
-SIZE_POWER = 0.45  # weight of n surfels: n**SIZE_POWER. 0 prefers parts, 1 merged objects; see results/segment.md
+OBJECT_COST = 0.4  # least IoU that a candidate must be expected to have; chosen on simulated scenes
+SIZE_POWER = 0.85  # weight of n surfels: n**SIZE_POWER. 0 prefers parts, 1 merged objects; see results/segment.md
 MAX_SIZE = 0.6  # longest side of an object, as of the largest in the training [camera distance]
 MIN_GAUSSIANS = 30  # of an object
 MAX_OVERLAP = 0.25  # of two objects, of the smaller

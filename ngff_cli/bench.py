@@ -231,6 +231,31 @@ def bench_segment(
     print_results(lambda path: run_photos(sets or [], path, chosen), out, as_json)
 
 
+@app.command("segment-ablation")
+def bench_segment_ablation(
+    train: Annotated[
+        list[Path],
+        Argument(metavar="FOLDER...", help="scenes to train on, of `clutter --reconstruct --exact`"),
+    ],
+    scores: Annotated[list[Path], Option(help="other scenes, for the scores of candidates; repeatable")],
+    judge: Annotated[list[Path], Option(help="reconstructed scenes to judge on; repeatable")],
+    out: OutWithTable = Path("segment_ablation.json"),
+    only: Annotated[list[str], Option(help="name of an ablation, such as colour; repeatable; default: all")] = [],  # noqa: B006
+    steps: Annotated[int, Option(help="training steps of each network")] = 1500,
+    batch: Annotated[int, Option(help="crops per step")] = 4,
+    workers: Annotated[int, Option(help="processes that prepare crops; 0: the training process itself")] = 0,
+    seed: Seed = 0,
+    device: Device = "auto",
+    as_json: AsJson = False,
+) -> None:
+    """Ablation: retrain the segmentation network without one of its inputs, classes or kinds of data at a time."""
+    from stages.lab.bench.segment_ablation import SegmentAblationData, SegmentAblationOptions, run
+
+    options = SegmentAblationOptions(steps=steps, batch=batch, workers=workers, seed=seed, device=device)
+    data = SegmentAblationData(train, scores, judge)
+    print_results(lambda path: run(data, path, options, only), out, as_json)
+
+
 @app.command("refine")
 def bench_refine(
     scenes: Annotated[int, Option(help="number of scenes of separate objects")] = 4,

@@ -135,6 +135,9 @@ def train_segmenter(
     workers: Annotated[int, Option(help="processes that prepare crops; 0: the training process itself")] = 0,
     blocks: Annotated[int, Option(help="residual blocks of each level, down and up")] = 2,
     score_scenes: Annotated[int, Option(help="augmented scenes whose candidates train the scores")] = 200,
+    scores_from: Annotated[
+        list[Path], Option(help="scenes whose candidates train the scores; repeatable; default: those of FOLDER")
+    ] = [],  # noqa: B006
     start: Annotated[Path | None, Option("--from", help="initial weights (.safetensors); default: random")] = None,
     seed: Seed = 0,
     device: Device = "auto",
@@ -146,5 +149,5 @@ def train_segmenter(
         minutes=minutes, steps=steps, rate=rate, voxels=voxels, batch=batch, workers=workers, blocks=blocks,
         score_scenes=score_scenes, seed=seed, device=device,
     )  # fmt: skip
-    for line in run(data, out, options, start):
+    for line in run(data, out, options, start, scores_from):
         print(line, flush=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -108,34 +108,49 @@ class Crops(IterableDataset):
         return with_pairs(targets(surfels[near], labels[near], shift), rng)
 
 
-def run(folders: Sequence[Path], out: Path, options: SegmenterTraining, start: Path | None = None) -> Iterator[str]:
+def run(
+    folders: Sequence[Path],
+    out: Path,
+    options: SegmenterTraining,
+    start: Path | None = None,
+    score_folders: Sequence[Path] = (),
+) -> Iterator[str]:
     """Train on the scenes of `folders`, write OUT (.safetensors) and its card; yields a line per REPORT_STEPS steps.
 
-    `start`: weights to continue from, with the widths and blocks of their card; scores of candidates by other features
-    than today's begin anew. Under `torchrun` every process draws
+    `score_folders`: scenes whose candidates train the scores, in place of `folders`; on scenes that the network was
+    trained on, candidates fit better than on others. `start`: weights to continue from, with the widths and blocks of
+    their card; scores of candidates by other features than today's begin anew. Under `torchrun` every process draws
     its own crops, and the gradients are averaged.
     """
     torch.manual_seed(options.seed)
-    files = find_examples(folders)
+    files, score_files = find_examples(folders), find_examples(score_folders or folders)
     model = Segmenter(options.widths, options.blocks) if start is None else load_segmenter(start, new_scores=True)
     curve: list[dict] = []
     with process_group(pick_device(options.device)) as group:
         model = model.to(group.device).train()
-        for line in _train(model, files, options, group, curve):
+        for line in fit_network(model, files, options, group, curve):
             if group.is_main:
                 yield line
                 _save(out, model, options, len(files), curve)
         if not group.is_main:
             return
-    scores = fit_scores(model, files, options.score_scenes, options.score_steps, options.seed, options.workers)
+    scores = fit_scores(model, score_files, options.score_scenes, options.score_steps, options.seed, options.workers)
     yield ", ".join(f"{k} {v}" for k, v in scores.items())
     _save(out, model, options, len(files), curve, scores)
 
 
-def _train(
-    model: Segmenter, files: Sequence[Path], options: SegmenterTraining, group: ProcessGroup, curve: list[dict]
+def fit_network(
+    model: Segmenter,
+    files: Sequence[Path],
+    options: SegmenterTraining,
+    group: ProcessGroup,
+    curve: list[dict],
+    change: Callable[[Targets], Targets] = lambda t: t,
 ) -> Iterator[str]:
-    """Train in place; appends to `curve` and yields a line every REPORT_STEPS steps."""
+    """Train all but the scores, in place; appends to `curve` and yields a line every REPORT_STEPS steps.
+
+    `change`: of each batch before its losses, for ablations.
+    """
     trained = [p for name, p in model.named_parameters() if not name.startswith(SCORES)]
     optimiser = torch.optim.AdamW(trained, options.rate, weight_decay=0.01)
     dataset = Crops(files, options.voxels, options.batch, options.seed, group.rank)
@@ -146,7 +161,7 @@ def _train(
         for settings in optimiser.param_groups:
             warm, decay = min(1, (step + 1) / 50), 0.5 * (1 + math.cos(math.pi * part))
             settings["lr"] = options.rate * warm * (0.02 + 0.98 * decay)
-        found = losses(model, next(crops))
+        found = losses(model, change(next(crops)))
         gradients = torch.autograd.grad(sum(found.values()), trained, materialize_grads=True)
         for p, gradient in zip(trained, group.mean(list(gradients)), strict=True):
             p.grad = gradient

@@ -1,0 +1,196 @@
+"""Ablation of the segmentation network: trained anew without one of its inputs, classes or kinds of data.
+
+Each network is trained from scratch on the same scenes for the same number of steps, its scores on other scenes, and
+the objects that it finds in a third set are compared with the true ones, surfel by surfel, before outlines are cut.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from tqdm import tqdm
+
+from stages.core.backends import pick_device
+from stages.core.errors import InputError
+from stages.core.models.segmenter.network import CANDIDATE_FEATURES, Level, Prediction, Segmenter
+from stages.core.models.segmenter.segment import SegmenterOptions, best_objects, score_at
+from stages.core.models.segmenter.voxels import FEATURES, LAB, SCALES
+from stages.core.scene.files import replacing
+from stages.evaluate.labels import LabelOverlap, PanopticScores
+from stages.lab.bench import common as bench
+from stages.lab.clutter.examples import Example, read_example
+from stages.lab.clutter.scenes import EXACT, OBSERVED, RECONSTRUCTED
+from stages.lab.training.distributed import ProcessGroup
+from stages.lab.training.segmenter_data import Targets, find_examples
+from stages.lab.training.segmenter_scores import MIN_SURFELS, fit_scores
+from stages.lab.training.train_segmenter import SegmenterTraining, fit_network
+
+log = logging.getLogger(__name__)
+COLOUR_INPUTS = tuple(range(FEATURES))[LAB]
+SHAPE_INPUTS = tuple(i for i in range(FEATURES) if i not in COLOUR_INPUTS)
+COLOUR_CONTRASTS = (CANDIDATE_FEATURES - 6, CANDIDATE_FEATURES - 5, CANDIDATE_FEATURES - 4)  # before the embedding's
+TRAINING = {"score_scenes": 150, "score_steps": 3000}  # settings of all trainings
+HEADINGS = ["without", "recall", "PQ", "SQ", "RQ", "objects", "found", "pair loss"]
+
+
+class _MaskedSegmenter(Segmenter):
+    """The network with some inputs of voxels, and some features of candidates, set to 0."""
+
+    def __init__(self, inputs: Sequence[int], features: Sequence[int], widths: tuple[int, ...], blocks: int):
+        super().__init__(widths, blocks)
+        self.inputs, self.features = list(inputs), list(features)
+
+    def forward(self, features: Float[Tensor, "v f"], levels: list[Level]) -> Prediction:
+        """Predictions without the inputs that are left out."""
+        return super().forward(_without(features, self.inputs), levels)
+
+    def score(self, features: Float[Tensor, "k f"]) -> Float[Tensor, "k"]:
+        """Scores without the features that are left out."""
+        return super().score(_without(features, self.features))
+
+
+def _without(x: Float[Tensor, "n f"], columns: Sequence[int]) -> Float[Tensor, "n f"]:
+    kept = torch.ones(x.shape[1], device=x.device)
+    kept[list(columns)] = 0
+    return x * kept
+
+
+def _clutter_as_surface(t: Targets) -> Targets:
+    """Targets with two classes: what is clutter counts as surface."""
+    return replace(t, classes=torch.where(t.classes == 2, 0, t.classes))
+
+
+@dataclass(frozen=True)
+class Ablation:
+    """What a network is trained without."""
+
+    without: str  # for the table
+    inputs: tuple[int, ...] = ()  # of voxels
+    features: tuple[int, ...] = ()  # of candidates
+    observation: str = RECONSTRUCTED  # kind of the training's examples
+    change: Callable[[Targets], Targets] = lambda t: t
+
+
+ABLATIONS = {
+    "full": Ablation("nothing"),
+    "colour": Ablation("colour", inputs=COLOUR_INPUTS, features=COLOUR_CONTRASTS),
+    "shape": Ablation("normals, heights and places in the voxel (only which voxels are occupied, and colour)",
+                      inputs=SHAPE_INPUTS),
+    "noise": Ablation("noise of reconstruction (trained on the true Gaussians of the same scenes)", observation=EXACT),
+    "clutter": Ablation("the class of clutter (taught as surface)", change=_clutter_as_surface),
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class SegmentAblationOptions:
+    """Length of the trainings."""
+
+    steps: int = 1500
+    voxels: int = 14_000
+    batch: int = 4
+    workers: int = 0
+    seed: int = 0
+    device: str = "auto"
+
+    def training(self) -> SegmenterTraining:
+        """Options of each network's training."""
+        return SegmenterTraining(**TRAINING, **asdict(self))
+
+
+@dataclass(frozen=True)
+class SegmentAblationData:
+    """Folders of scenes as `ngff-lab clutter --reconstruct` and `--exact` write; no scene may be in two of them."""
+
+    train: Sequence[Path]  # with reconstructions, and the true Gaussians of the same scenes
+    scores: Sequence[Path]
+    judge: Sequence[Path]
+
+
+def run(
+    data: SegmentAblationData,
+    out: Path,
+    options: SegmentAblationOptions = SegmentAblationOptions(),  # noqa: B008 -- frozen
+    only: Sequence[str] = (),
+) -> Iterator[str]:
+    """Train each ablation, or those named in `only`; yields a line about each. OUT is JSON, with a table beside it."""
+    names = list(only) or list(ABLATIONS)
+    if unknown := [name for name in names if name not in ABLATIONS]:
+        raise InputError(f"--only {', '.join(unknown)}: choose from {', '.join(ABLATIONS)}")
+    device = pick_device(options.device)
+    facts = {"options": asdict(options), "machine": bench.machine(device), "rows": {}}
+    for name in names:
+        facts["rows"][name] = measured(ABLATIONS[name], data, options.training(), device)
+        bench.write_json(out, facts)
+        with replacing(out.with_suffix(".md")) as part:
+            part.write_text("\n".join(_markdown(facts)) + "\n")
+        yield _row(facts["rows"][name])
+
+
+def measured(choice: Ablation, data: SegmentAblationData, options: SegmenterTraining, device: str) -> dict:
+    """Train one ablation and judge it."""
+    torch.manual_seed(options.seed)
+    model = _MaskedSegmenter(choice.inputs, choice.features, options.widths, options.blocks).to(device).train()
+    curve: list[dict] = []
+    train, scores = (_examples(folders, choice.observation) for folders in (data.train, data.scores))
+    for line in fit_network(model, train, options, ProcessGroup(device=device), curve, choice.change):
+        log.info("%s: %s", choice.without, line)
+    fit_scores(model, scores, options.score_scenes, options.score_steps, options.seed, options.workers)
+    found = panoptic_scores(model.to(device).eval(), _examples(data.judge, RECONSTRUCTED)).summary()
+    kept = {key: found[key] for key in ("recall", "PQ", "SQ", "RQ", "objects", "found")}
+    return {"without": choice.without, **kept, "pair": curve[-1]["pair"] if curve else None, "files": len(train)}
+
+
+def panoptic_scores(model: Segmenter, files: Sequence[Path]) -> PanopticScores:
+    """Recall, PQ and so on of all objects of MIN_SURFELS or more in the examples `files`, in surfels."""
+    overlap = LabelOverlap()
+    for k, file in enumerate(tqdm(files, desc="judged", unit="scene")):
+        example = read_example(file)
+        truth, found = _known(example), found_objects(model, example)
+        first = 10_000 * k  # objects of different scenes are different
+        overlap.add(*(torch.where(x > 0, first + x, 0) for x in (truth, found)), example.labels >= 0)
+    return overlap.scores()
+
+
+def _known(example: Example) -> Tensor:
+    """True object of each surfel, 0 for none and for objects of few surfels."""
+    labels = example.labels.clamp_min(0)
+    return torch.where(labels.bincount()[labels] >= MIN_SURFELS, labels, 0)
+
+
+@torch.no_grad()
+def found_objects(model: Segmenter, example: Example) -> Tensor:
+    """Object of each surfel that the network finds, 0 for none, before outlines are cut."""
+    scored = [score_at(example.surfels, scale, model) for scale in SCALES]
+    return best_objects([s.best(SegmenterOptions()) for s in scored])
+
+
+def _examples(folders: Sequence[Path], observation: str) -> list[Path]:
+    name = OBSERVED.format(observation)
+    files = [file for file in find_examples(folders) if file.name == name]
+    if not files:
+        raise InputError(f"{folders[0]}: no scene has {name}; make it with `ngff-lab clutter "
+                         f"--{'exact' if observation == EXACT else 'reconstruct'}`")  # fmt: skip
+    return files
+
+
+def _row(row: dict) -> str:
+    cells = [row["without"], *(f"{row[k]:.3f}" for k in ("recall", "PQ", "SQ", "RQ")), row["objects"], row["found"],
+             row["pair"]]  # fmt: skip
+    return f"| {' | '.join(map(str, cells))} |"
+
+
+def _markdown(facts: dict) -> Iterator[str]:
+    o = facts["options"]
+    yield "# Ablation of the segmentation network"
+    yield ""
+    yield f"`ngff-lab bench segment-ablation`, {facts['machine']}. Each row: {o['steps']} steps of {o['batch']} crops."
+    yield ""
+    yield f"| {' | '.join(HEADINGS)} |"
+    yield f"| {' | '.join('---' for _ in HEADINGS)} |"
+    yield from map(_row, facts["rows"].values())

@@ -1,6 +1,7 @@
 """Bodies with a velocity field each: they neither stick nor pass through, and rub by Coulomb's law."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -163,19 +164,28 @@ def test_three_blocks_at_one_place_keep_their_momentum(solve):
 
 
 def test_the_schedule_for_gpus_gives_the_same_motion_and_repeats_to_the_bit(device):
-    """Three bodies, of which two meet; frames of two lengths, so that graphs are captured and replayed."""
+    """Three bodies, of which two meet; frames of two lengths, so that graphs are captured and replayed.
+
+    Contact amplifies rounding, so the motions may differ by a few times what last bits of the start do to one of them.
+    """
     bodies = [block((0, 0, 0), (0.5, 0.5, 0.3)), block((0.1, 0.1, 0.4), (0.4, 0.4, 0.7), speed=1.0),
               block((0.6, 0.1, 0.4), (0.8, 0.3, 0.6), speed=-1.0)]  # fmt: skip
     joined, sizes = join_particles(bodies), [len(b) for b in bodies]
 
-    def run(kind):
-        solver = Solver(joined, BOX, DX, device, SolverOptions(schedule="contact"), sizes)
-        shared = solver.rows, False, False, 0.0, solver._obstacles, solver._body_contact(joined, sizes, None)
+    def run(kind, seed=None):
+        start = joined
+        if seed is not None:
+            toward = torch.randn(joined.x.shape, generator=torch.Generator().manual_seed(seed)).sign() * torch.inf
+            start = replace(joined, x=torch.nextafter(joined.x, toward))
+        solver = Solver(start, BOX, DX, device, SolverOptions(schedule="contact"), sizes)
+        shared = solver.rows, False, False, 0.0, solver._obstacles, solver._body_contact(start, sizes, None)
         solver._substepper = kind(*shared, solver._quanta()) if kind is ContactSubsteps else kind(*shared)
         return torch.cat(moved(solver, sizes, 10, G)[0])
 
-    fast = run(ContactSubsteps)
-    torch.testing.assert_close(fast, run(SplitSubsteps), rtol=0, atol=2e-5)
+    fast, split = run(ContactSubsteps), run(SplitSubsteps)
+    rounding = float((run(SplitSubsteps, seed=0) - split).abs().max())
+    assert rounding < 1e-4
+    torch.testing.assert_close(fast, split, rtol=0, atol=3 * rounding)
     assert torch.equal(fast, run(ContactSubsteps))
 
 

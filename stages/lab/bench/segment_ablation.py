@@ -35,7 +35,7 @@ log = logging.getLogger(__name__)
 COLOUR_INPUTS = tuple(range(FEATURES))[LAB]
 SHAPE_INPUTS = tuple(i for i in range(FEATURES) if i not in COLOUR_INPUTS)
 COLOUR_CONTRASTS = (CANDIDATE_FEATURES - 6, CANDIDATE_FEATURES - 5, CANDIDATE_FEATURES - 4)  # before the embedding's
-TRAINING = {"score_scenes": 150, "score_steps": 3000}  # settings of all trainings
+TRAINING = {"score_scenes": 100, "score_steps": 3000}  # settings of all trainings
 HEADINGS = ["without", "recall", "PQ", "SQ", "RQ", "objects", "found", "pair loss"]
 
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+from torch.nn.functional import threshold_
 
 from stages.core.kernels.compilers import TRITON
 from stages.core.kernels.field.normals import invert_spd, normals_and_spacing
@@ -17,6 +19,7 @@ if TRITON:
 
 NEIGHBOURHOOD_RADII = (0.12, 0.4)  # of Gaussian neighbourhoods [radii of gyration]; hand-chosen, no source
 MIN_NEIGHBOUR_WEIGHT = 1e-20  # smaller weights become 0: a CPU is several times slower with subnormal numbers
+MIN_EXPONENT = math.log(MIN_NEIGHBOUR_WEIGHT) - 1  # that the exponential function sees: it also slows down for them
 
 
 @dataclass(frozen=True)
@@ -71,8 +74,8 @@ def _neighbourhoods(
     for c in arm.unbind(-1):
         gap = c[..., :, None] - c[..., None, :]
         squared.addcmul_(gap, gap)
-    weight = (squared[:, :, None] * (-1 / radii.square())[..., None, None]).exp_()
-    weight.mul_(weight > MIN_NEIGHBOUR_WEIGHT).mul_(mass_fraction[:, :, None, None])
+    exponent = (squared[:, :, None] * (-1 / radii.square())[..., None, None]).clamp_min_(MIN_EXPONENT)
+    weight = threshold_(exponent.exp_(), MIN_NEIGHBOUR_WEIGHT, 0.0).mul_(mass_fraction[:, :, None, None])
     return weight.mul_(valid[:, :, None, :, None] / weight.sum(-1, keepdim=True).clamp_min_(1e-12))
 
 

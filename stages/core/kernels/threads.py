@@ -49,12 +49,15 @@ def parallel_map(function: Callable[[Any], Any], items: Sequence[Any]) -> list[A
     """Results of a function for independent items, in order, by `run_parallel`.
 
     For functions that spend their time in NumPy, SciPy or PyTorch, which release Python's lock. PyTorch's operations
-    within run on one thread each, whichever thread takes the item, so that their sums do not depend on it.
+    within run on one thread each, whichever thread takes the item, so that their sums do not depend on it, and with
+    gradients only if the caller has them.
     """
     results: list[Any] = [None] * len(items)
+    gradients, inference = torch.is_grad_enabled(), torch.is_inference_mode_enabled()
 
     def task(i: int) -> None:
-        results[i] = function(items[i])
+        with torch.inference_mode(inference), torch.set_grad_enabled(gradients):
+            results[i] = function(items[i])
 
     helpers = _helpers(max(0, torch.get_num_threads() - 1))[: max(0, len(items) - 1)]
     with small_operations():

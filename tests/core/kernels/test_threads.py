@@ -30,6 +30,19 @@ def test_results_are_in_the_order_of_the_items(threads):
     assert parallel_map(str, []) == []
 
 
+@pytest.mark.parametrize("mode", [torch.enable_grad, torch.no_grad, torch.inference_mode])
+def test_tasks_have_the_gradient_mode_of_the_caller(threads, mode):
+    with mode():
+        expected = torch.is_grad_enabled(), torch.is_inference_mode_enabled()
+        barrier = threading.Barrier(threads, timeout=10)  # so that every thread takes a task
+
+        def task(_) -> tuple[bool, bool]:
+            barrier.wait()
+            return torch.is_grad_enabled(), torch.is_inference_mode_enabled()
+
+        assert parallel_map(task, range(threads)) == [expected] * threads
+
+
 def test_an_exception_is_raised_after_all_tasks_have_ended(threads):
     done = []
 

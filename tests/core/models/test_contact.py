@@ -5,7 +5,7 @@ import itertools
 import pytest
 import torch
 
-from stages.core.models.field.narrow_phase import _all_pairs, _culled, near_walls, nearest
+from stages.core.models.field.narrow_phase import _all_pairs, _argmin, _culled, near_walls, nearest
 from tests.core.models.dynamics_fixtures import add_padding, overlapping_objects
 
 
@@ -34,12 +34,18 @@ def test_only_points_within_the_radius_are_found():
     assert torch.equal(near.isfinite(), distance < 0.05) and near.isfinite().any()
 
 
-def test_culled_search_equals_all_pairs():
-    initial = overlapping_objects(2, 3, 300)
+@pytest.mark.parametrize("keypoints", [200, 300])  # one object after the other, and in parallel
+def test_culled_search_equals_all_pairs(keypoints):
+    initial = overlapping_objects(2, 3, keypoints)
     (a, i), (b, j) = (f(initial.points, initial.valid, 0.1) for f in (nearest, _all_pairs))
     b = b.masked_fill(b >= 0.1, torch.inf)
     torch.testing.assert_close(a, b)
     assert torch.equal(i[a.isfinite()], j[a.isfinite()])
+
+
+def test_of_equally_near_points_the_first_is_found_and_nan_is_smallest():
+    rows = torch.tensor([[3.0, 1.0, 2.0, 1.0], [torch.inf] * 4, [1.0, torch.nan, -1.0, torch.nan]])
+    assert _argmin(rows).tolist() == rows.argmin(-1).tolist() == [1, 0, 1]
 
 
 def test_accuracy_does_not_depend_on_the_distance_to_the_origin():

@@ -7,10 +7,13 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from stages.core.kernels.compilers import TRITON
+from stages.core.kernels.threads import large_operation, parallel_map
 
 if TRITON:
     from stages.core.kernels.field.nearest import nearest_between_objects as nearest_triton
 
+BLOCK_POINTS = 64  # rows of the distance matrix at a time, which stay in the cache; 32 to 128 take the same time
+PARALLEL_MIN_DISTANCES = 1 << 20  # below, the search takes at most 0.4 ms, and waking a thread 0.1 ms (Intel Xeon)
 CULLING_MIN_POINTS = 500  # keypoints of a scene from which culling by bounding boxes is faster on a CPU; measured
 
 Nearest = tuple[Float[Tensor, "b o o n"], Int[Tensor, "b o o n"]]
@@ -41,7 +44,7 @@ def _all_pairs(points: Float[Tensor, "b o n 3"], valid: Bool[Tensor, "b o n"], r
     with torch.autocast(x.device.type, enabled=False):
         half = torch.where(valid, x.float().square().sum(-1) / 2, torch.inf)
         gap = half[:, None, :, None] - torch.einsum("bind,bjmd->bijnm", x.float(), x.float())
-    index = gap.argmin(-1)
+    index = _argmin(gap)
     scene = torch.arange(len(x), device=x.device)[:, None, None, None]
     other = torch.arange(o, device=x.device)[None, None, :, None]
     distance = (x[:, :, None] - x[scene, other, index]).norm(dim=-1)
@@ -59,23 +62,39 @@ def _culled(points: Float[Tensor, "b o n 3"], valid: Bool[Tensor, "b o n"], radi
     high = points.masked_fill(~valid[..., None], -torch.inf).amax(2) + radius
     inside = ((points[:, :, None] > low[:, None, :, None]) & (points[:, :, None] < high[:, None, :, None])).all(-1)
     inside &= valid[:, :, None]
-    for s, i, j in inside.any(-1).triu(1).nonzero().tolist():
-        own, other = inside[s, i, j].nonzero()[:, 0], inside[s, j, i].nonzero()[:, 0]
-        if not len(other):
-            continue
-        x, y = points[s, i, own], points[s, j, other]
-        which = _nearest_index(x, y)
-        distance[s, i, j, own], index[s, i, j, own] = (x - y[which]).norm(dim=-1), other[which]
-        which = _nearest_index(y, x)
-        distance[s, j, i, other], index[s, j, i, other] = (y - x[which]).norm(dim=-1), own[which]
+    near = inside.any(-1)
+    pairs = (near & near.mT & ~torch.eye(o, dtype=torch.bool)).nonzero().tolist()
+    queries = [(s, i, j, inside[s, i, j].nonzero()[:, 0], inside[s, j, i].nonzero()[:, 0]) for s, i, j in pairs]
+
+    def search(query: tuple) -> Tensor:
+        s, i, j, own, other = query
+        return _nearest_index(points[s, i, own], points[s, j, other])
+
+    if sum(len(own) * len(other) for *_, own, other in queries) < PARALLEL_MIN_DISTANCES:
+        found = [search(query) for query in queries]
+    else:
+        with large_operation():
+            found = parallel_map(search, queries)
+    for (s, i, j, own, other), which in zip(queries, found, strict=True):
+        distance[s, i, j, own] = (points[s, i, own] - points[s, j, other[which]]).norm(dim=-1)
+        index[s, i, j, own] = other[which]
     return distance, index
 
 
 def _nearest_index(x: Float[Tensor, "p 3"], y: Float[Tensor, "q 3"]) -> Int[Tensor, "p"]:
-    """Index of the nearest y to each x, by |y|^2 / 2 - x.y = (|x - y|^2 - |x|^2) / 2 from one matrix product."""
+    """Index of the nearest y to each x, by |y|^2 / 2 - x.y = (|x - y|^2 - |x|^2) / 2 from matrix products."""
     centre = y.mean(0)
     x, y = x - centre, y - centre
-    return torch.addmm(y.square().sum(-1) / 2, x, y.T, alpha=-1).argmin(-1)
+    half = y.square().sum(-1) / 2
+    return torch.cat([_argmin(torch.addmm(half, block, y.T, alpha=-1)) for block in x.split(BLOCK_POINTS)])
+
+
+def _argmin(x: Float[Tensor, "*b n"]) -> Int[Tensor, "*b"]:
+    """Index of the smallest entry of each row, of equal ones the first.
+
+    On a CPU by NumPy, whose search uses vector instructions: 2048 x 2048 take 0.6 ms, by PyTorch 5.5 ms (Intel Xeon).
+    """
+    return x.argmin(-1) if x.is_cuda else torch.from_numpy(x.numpy().argmin(-1))
 
 
 def near_walls(

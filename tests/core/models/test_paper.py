@@ -7,9 +7,12 @@ import pytest
 import torch
 
 from stages.core.models.baselines.ngff_paper import (
+    BLOCK_POINTS,
     CONTACT_RADIUS,
+    ObjectEncoder,
     PaperForceField,
     PaperState,
+    StressNet,
     euler_matrix,
     world_points,
 )
@@ -119,6 +122,20 @@ def test_a_public_checkpoint_loads(tmp_path, wrapped):
     assert loaded.config == {"hidden": 24, "layers": 3, "deform": True, "padding_encoded": False}
     assert card["model"] == "ngff-paper"
     assert all(torch.equal(v, loaded.state_dict()[k]) for k, v in state.items())
+
+
+@pytest.mark.parametrize("network, width", [(ObjectEncoder(16, 2), 3), (StressNet(16), 12)])
+def test_blocks_of_points_on_any_number_of_threads_equal_all_points(network, width, with_threads):
+    rng = torch.Generator().manual_seed(0)
+    x = torch.randn(2, 3, 300, width, generator=rng)
+    counts = torch.rand(2, 3, 300, generator=rng) < 0.5
+    counts[1, 2] = False
+    assert x[..., 0].numel() > 2 * BLOCK_POINTS
+    whole = network(x, counts).detach()
+    with torch.no_grad():
+        one, two = (with_threads(threads, network, x, counts) for threads in (1, 2))
+    assert torch.equal(one, two)
+    torch.testing.assert_close(one, whole, **CLOSE)
 
 
 def test_rigid_variant_preserves_shapes():

@@ -7,12 +7,15 @@ no cap, and padding does not enter the object encoder (`padding_encoded` restore
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Shaped
 from torch import Tensor, nn
+from torch.nn.functional import linear
 
+from stages.core.kernels.threads import large_operation, parallel_map, small_operations
 from stages.core.models.dynamics import Dynamics
 from stages.core.models.external_forces import ExternalForces
 from stages.core.models.field.narrow_phase import near_walls, nearest
@@ -21,6 +24,7 @@ from stages.core.models.initial_conditions import GRAVITY, InitialConditions, ce
 
 MASS = 0.1  # of every object [kg]
 CONTACT_RADIUS = 0.05  # closer points are in contact [m]
+BLOCK_POINTS = 768  # that a CPU thread computes at a time: of 512 to 1536 the fastest (Intel Xeon, two cores)
 
 
 class PaperState(NamedTuple):
@@ -37,8 +41,17 @@ class PaperState(NamedTuple):
 def blocks(count: int, inner: int, outer: int) -> list[nn.Module]:
     """Layers Linear, LayerNorm, ReLU, repeated `count` times."""
     widths = [inner] + [outer] * count
-    layers = [(nn.Linear(a, b), nn.LayerNorm(b), nn.ReLU()) for a, b in zip(widths[:-1], widths[1:], strict=True)]
+    pairs = zip(widths[:-1], widths[1:], strict=True)
+    layers = [(nn.Linear(a, b), nn.LayerNorm(b), nn.ReLU(inplace=True)) for a, b in pairs]
     return [layer for block in layers for layer in block]
+
+
+def _perceptron(inner: int, hidden: int, outer: int) -> nn.Sequential:
+    """Three linear layers with ReLU between them."""
+    return nn.Sequential(
+        nn.Linear(inner, hidden), nn.ReLU(inplace=True), nn.Linear(hidden, hidden), nn.ReLU(inplace=True),
+        nn.Linear(hidden, outer),
+    )  # fmt: skip
 
 
 def euler_matrix(angle: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
@@ -67,6 +80,30 @@ def angle_rates(angle: Float[Tensor, "*b 3"], spin: Float[Tensor, "*b 3"]) -> Fl
     return torch.stack([roll, about_y, spin[..., 2] + sy * roll], -1)
 
 
+def _blocks(x: Shaped[Tensor, "b o n *c"]) -> tuple[Tensor, ...]:
+    """All points or, on a CPU without gradients, about BLOCK_POINTS at a time."""
+    if x.is_cuda or torch.is_grad_enabled():
+        return (x,)
+    return x.split(max(1, BLOCK_POINTS // max(1, x.shape[0] * x.shape[1])), 2)
+
+
+def _map_blocks(function: Callable, *blocks: Sequence) -> list:
+    """Results of a function for each block of points, which several CPU threads compute in parallel.
+
+    PyTorch's own threads would wait for each other after each operation.
+    """
+    arguments = list(zip(*blocks, strict=True))
+    if len(arguments) == 1:
+        return [function(*arguments[0])]
+    with large_operation():
+        return parallel_map(lambda block: function(*block), arguments)
+
+
+def _maximum(x: Float[Tensor, "b o m h"], counts: Bool[Tensor, "b o m"]) -> Float[Tensor, "b o h"]:
+    """Maximum over the points in `counts`, -inf where there are none."""
+    return x.masked_fill(~counts[..., None], -torch.inf).amax(2)
+
+
 class ResidualLinear(nn.Module):
     """x + ReLU(LayerNorm(Linear x))."""
 
@@ -90,11 +127,15 @@ class ObjectEncoder(nn.Module):
 
     def forward(self, local: Float[Tensor, "b o n 3"], counts: Bool[Tensor, "b o n"]) -> Float[Tensor, "b o h"]:
         """Maximum-pooled embedding of the `local` points [m] in `counts`; objects without points pool to 0."""
+        maxima = _map_blocks(self._block_maximum, _blocks(local), _blocks(counts))
+        maximum = torch.stack(maxima).amax(0)
+        return self.global_features(torch.where(counts.any(2, keepdim=True), maximum, 0.0))
+
+    def _block_maximum(self, local: Float[Tensor, "b o m 3"], counts: Bool[Tensor, "b o m"]) -> Float[Tensor, "b o h"]:
         x = self.input_embedding(local)
         for block in self.extraction_blocks:
             x = block(x)
-        x = x.masked_fill(~counts[..., None], -torch.inf).amax(2)
-        return self.global_features(torch.where(counts.any(2, keepdim=True), x, 0.0))
+        return _maximum(x, counts)
 
 
 class StressNet(nn.Module):
@@ -103,15 +144,31 @@ class StressNet(nn.Module):
     def __init__(self, hidden: int):
         super().__init__()
         h = hidden
-        self.feature_layer = nn.Sequential(nn.Linear(12, h), nn.ReLU(), nn.Linear(h, h), nn.ReLU(), nn.Linear(h, h))
-        self.output_layer = nn.Sequential(nn.Linear(2 * h, h), nn.ReLU(), nn.Linear(h, h), nn.ReLU(), nn.Linear(h, 3))
+        self.feature_layer = _perceptron(12, h, h)
+        self.output_layer = _perceptron(2 * h, h, 3)  # of a point's features and their maximum over the object
 
     def forward(self, x: Float[Tensor, "b o n 12"], counts: Bool[Tensor, "b o n"]) -> Float[Tensor, "b o n 3"]:
         """Accelerations [m/s^2] from each point's features and their maximum over the points in `counts`."""
+        blocks = _map_blocks(self._features, _blocks(x), _blocks(counts))
+        maximum = torch.stack([maximum for _, maximum in blocks]).amax(0)
+        maximum = torch.where(counts.any(2, keepdim=True), maximum, 0.0)
+        first, *others = self.output_layer
+        own, shared = first.weight.chunk(2, 1)
+        offset = linear(maximum, shared, first.bias)[:, :, None]  # once for an object instead of for each point
+
+        def output(x: Tensor, _: Tensor) -> Tensor:
+            x = linear(x, own).add_(offset)
+            for layer in others:
+                x = layer(x)
+            return x
+
+        return torch.cat(_map_blocks(output, *zip(*blocks, strict=True)), 2)
+
+    def _features(
+        self, x: Float[Tensor, "b o m 12"], counts: Bool[Tensor, "b o m"]
+    ) -> tuple[Float[Tensor, "b o m h"], Float[Tensor, "b o h"]]:
         x = self.feature_layer(x)
-        maximum = x.masked_fill(~counts[..., None], -torch.inf).amax(2, keepdim=True)
-        maximum = torch.where(counts.any(2)[..., None, None], maximum, 0.0)
-        return self.output_layer(torch.cat([x, maximum.expand_as(x)], -1))
+        return x, _maximum(x, counts)
 
 
 class Predictor(nn.Module):
@@ -220,6 +277,14 @@ class PaperForceField(Dynamics):
         self, initial: InitialConditions, t: Tensor | float, state: PaperState, external: ExternalForces
     ) -> PaperState:
         """Rates of the state from predicted and external forces and gravity; 0 for padding and pinned objects."""
+        if initial.points.is_cuda or torch.is_grad_enabled():
+            return self._rates(initial, t, state, external)
+        with small_operations():  # all but those on blocks of points
+            return self._rates(initial, t, state, external)
+
+    def _rates(
+        self, initial: InitialConditions, t: Tensor | float, state: PaperState, external: ExternalForces
+    ) -> PaperState:
         force, torque, stress = self.predictor(initial, state, _rest(initial))
         applied, twist = external.wrench(world_points(state), state.com, t)
         # the external torque is divided by the mass twice, as published

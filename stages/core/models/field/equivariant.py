@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torch.nn.functional import silu
 
 from stages.core.kernels.compilers import TRITON
-from stages.core.models.field.kernel_choice import triton_allowed
+from stages.core.models.field.kernel_choice import kernels_allowed, triton_allowed
 
 if TRITON:
     from stages.core.kernels.field.perceptron import MAX_LAYER_WIDTH, perceptron
@@ -28,7 +28,14 @@ def inner_products(vectors: Float[Tensor, "*b k 3"]) -> Float[Tensor, "*b g"]:
         return torch.asinh((vectors.index_select(-2, row) * vectors.index_select(-2, column)).sum(-1))
     xyz = vectors.reshape(-1, k, 3).permute(2, 1, 0).contiguous()  # a CPU copies long rows faster than rows of three
     inner = sum(x.index_select(0, row) * x.index_select(0, column) for x in xyz)
-    return torch.asinh(inner).mT.reshape(*vectors.shape[:-2], len(row))
+    return _asinh(inner).mT.reshape(*vectors.shape[:-2], len(row))
+
+
+def _asinh(x: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
+    """asinh; without gradients by the formula of the GPU kernels: 0.8 instead of 3.6 ms for 480,000 (Intel Xeon)."""
+    if not kernels_allowed(x):
+        return torch.asinh(x)
+    return x.square().add_(1).sqrt_().add_(x.abs()).log_().copysign_(x)
 
 
 def weighted_sum(weights: Float[Tensor, "*b k"], vectors: Float[Tensor, "*b k 3"]) -> Float[Tensor, "*b 3"]:

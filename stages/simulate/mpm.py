@@ -159,7 +159,7 @@ def _particles(
         part_of = part_of_points(choice, x[mine])
         for k, part in enumerate(choice.parts):
             m, rows = part.material, mine[part_of == k]
-            E, viscosity = _stable_material(m, length, h, level)
+            E, viscosity, loss = _stable_material(m, length, h, level)
             model = MODELS[m.model]
             columns[rows] = torch.tensor([E, m.density, m.nu, viscosity, friction, model.kernel,
                                           *model.solver_parameters(m.plastic, E / m.E)])  # fmt: skip
@@ -170,6 +170,8 @@ def _particles(
                 message += f"; material not known, taking {choice.name} (--material {o.id}=... changes it)"
             if m.E > E:
                 message += f"; Young's modulus reduced from {m.E:.2g} to {E:.2g} Pa for --quality {options.quality}"
+            if m.loss > 1.05 * loss:
+                message += f"; loss factor reduced from {m.loss:.2g} to {loss:.2g} for --quality {options.quality}"
             if not len(rows):
                 message = f"object {o.id} ({o.name}): nothing of it is in the part of {part.name}"
             log.info("%s", message)
@@ -182,8 +184,8 @@ def _particles(
     return particles
 
 
-def _stable_material(m: Material, length: float, h: float, level: MpmQuality) -> tuple[float, float]:
-    """Young's modulus [Pa] and viscosity [Pa s] of a body, as large as the substep allows.
+def _stable_material(m: Material, length: float, h: float, level: MpmQuality) -> tuple[float, float, float]:
+    """Young's modulus [Pa], viscosity [Pa s] and loss factor of a body, as large as the substep allows.
 
     The viscosity gives the slowest longitudinal vibration of a bar of the body's `length` [m], omega = pi c / L, the
     material's loss factor; damping E loss / omega is that of a Kelvin-Voigt solid. `h` is the particle spacing [m].
@@ -191,8 +193,9 @@ def _stable_material(m: Material, length: float, h: float, level: MpmQuality) ->
     substep = level.substep(h)
     fastest = CFL_MARGIN * mpm.SAFETY * 2 * h / substep
     E = min(m.E, mpm.modulus_at_wave_speed(fastest, m.nu, m.density))
-    viscosity = m.loss * E * length / (math.pi * math.sqrt(E / m.density))
-    return E, min(viscosity, CFL_MARGIN * mpm.VISCOUS * m.density * (2 * h) ** 2 / substep)
+    per_loss = E * length / (math.pi * math.sqrt(E / m.density))
+    viscosity = min(m.loss * per_loss, CFL_MARGIN * mpm.VISCOUS * m.density * (2 * h) ** 2 / substep)
+    return E, viscosity, viscosity / per_loss
 
 
 class _PromptedForce:

@@ -3,10 +3,11 @@
 Units are those of the scene's own scales, so that no constant of the solver depends on size or gravity: the smallest
 object's longest side, the median mass, and SUBSTEPS substeps.
 
-A contact is a damped spring. Its damping ratio is half the larger loss factor of both materials. Below REST_SPEED it is
-critically damped, since stacks that rebound at any speed never come to rest. The frequency is the highest that the
-substep resolves, so that resting bodies sink in by less than 1e-3 of the smallest object. The friction of a pair is the
-larger coefficient, as in the others.
+A contact is a damped spring. Its damping ratio follows from the larger loss factor of both materials. Below REST_SPEED
+it is critically damped, since stacks that rebound at any speed never come to rest. The frequency is the highest that
+the substep resolves, so that resting bodies sink in by less than 1e-3 of the smallest object. The friction of a pair is
+the larger coefficient, as in the others. Round bodies are balls, which a loss of energy in the contact slows down as
+they roll.
 Friction aims at no slip at the end of a substep; with the smaller deceleration that follows from the materials' damping
 it would be viscous: bodies would creep on slopes, and keep their slip in collisions. MuJoCo's friction cones are a
 convex relaxation, in which a contact that slides at speed s also separates at friction s, which lifts bodies and gives

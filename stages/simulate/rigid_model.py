@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
-from stages.core.physics.convex_parts import ConvexParts
+from stages.core.physics.convex_parts import ConvexParts, fitted_ball
 from stages.core.physics.materials import Material
 
 SUBSTEPS = 200  # substeps in a unit of time: that of falling half the size of the smallest object from rest
@@ -47,15 +47,44 @@ class Body:
     ground: float  # height of the plane under it [m]
 
     def damping(self, material: Material) -> float:
-        """Ratio to critical of a contact's damping. The energy lost in a cycle is 4 pi damping of that stored."""
-        return max(material.loss / 2, PARTS_DAMPING if len(self.parts.hulls) > 1 else 0.0)
+        """Ratio to critical of a contact's damping."""
+        return max(damping_ratio(material.loss), PARTS_DAMPING if len(self.parts.hulls) > 1 else 0.0)
+
+    def rolling_arm(self, radius: float, gravity: float) -> float:
+        """Moment that resists rolling on a rigid plane, of a ball of this radius [m] under its weight, per weight [m].
+
+        3/16 of the radius of contact and of the fraction of the energy that a cycle of compression loses: Johnson 1985,
+        "Contact mechanics", section 9.4, with the radius of contact by Hertz. `gravity` in m/s^2.
+        """
+        m = self.material
+        contact = (0.75 * self.mass * abs(gravity) * radius * (1 - m.nu**2) / m.E) ** (1 / 3)
+        return 3 / 16 * contact * (1 - math.exp(-math.pi * m.loss))
+
+
+def damping_ratio(loss: float) -> float:
+    """Ratio to critical of the damping of a contact that restores exp(-pi loss / 2) of the speed; at most 1.
+
+    That is what half an oscillation of a spring with this loss factor leaves. A contact cannot pull, so that it ends
+    before: with z for the ratio, -log restitution = 2 z acos(z) / sqrt(1 - z^2) (Schwager and Poeschel 2007). Solved by
+    Newton's method; the right side is concave in z, so that it approaches from below.
+    """
+    target, z = math.pi * loss / 2, 0.0
+    if target >= 2:  # the limit at z = 1
+        return 1.0
+    for _ in range(30):
+        root = math.sqrt(1 - z * z)
+        value = 2 * z * math.acos(z) / root
+        slope = 2 * (math.acos(z) / root**3 - z / root**2)
+        z = min(z + (target - value) / slope, 1 - 1e-9)
+    return z
 
 
 def mujoco_model(bodies: Sequence[Body], units: Units, gravity: float, floor: float, box: Sequence | None,
                  around: Sequence):  # fmt: skip
-    """MuJoCo's model: a body for each object, a mesh for each convex part, a plane for the floor and each wall of `box`
-    (its low and high corner), and the fixed boxes `around`, as pairs of corners; then a body for the ground under each
-    object that is below the floor. `gravity`, the height of the `floor` and the corners are in `units`.
+    """MuJoCo's model: a body for each object, with a mesh for each convex part or a ball for a round one; a plane for
+    the floor and each wall of `box` (its low and high corner), and the fixed boxes `around`, as pairs of corners; then
+    a body for the ground under each object that is below the floor. `gravity`, the height of the `floor` and the
+    corners are in `units`.
     """
     import mujoco  # noqa: PLC0415 -- slow to import
 
@@ -79,7 +108,7 @@ def mujoco_model(bodies: Sequence[Body], units: Units, gravity: float, floor: fl
     for low, high in around:
         spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=(high - low) / 2, pos=(low + high) / 2, **fixed)
     for i, b in enumerate(bodies):
-        _add_body(mujoco, spec, f"body{i}", b, units, impedance)
+        _add_body(mujoco, spec, f"body{i}", b, units, gravity, impedance)
     for i, b in enumerate(bodies):
         if b.ground / units.length < floor:
             ground = spec.worldbody.add_body(name=f"ground{i}", pos=[0, 0, b.ground / units.length])
@@ -95,7 +124,7 @@ def mujoco_model(bodies: Sequence[Body], units: Units, gravity: float, floor: fl
         raise
 
 
-def _add_body(mujoco, spec, name: str, b: Body, units: Units, impedance: list) -> None:
+def _add_body(mujoco, spec, name: str, b: Body, units: Units, gravity: float, impedance: list) -> None:
     unit = float(b.mass / (b.material.density * b.parts.volume)) ** (1 / 3)  # metres in a scene unit
     body = spec.worldbody.add_body(name=name, pos=(b.start / units.length).tolist())
     body.explicitinertial, body.mass, body.ipos = True, b.mass / units.mass, [0, 0, 0]
@@ -103,10 +132,19 @@ def _add_body(mujoco, spec, name: str, b: Body, units: Units, impedance: list) -
     body.fullinertia = [float(inertia[r, c]) for r, c in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))]
     if not b.pinned:
         body.add_freejoint()
+    # negative: stiffness and damping themselves, of which MuJoCo takes the smaller numbers, the larger damping
+    contact = {"solref": [-(OMEGA**2), -2 * b.damping(b.material) * OMEGA], "solimp": impedance}
     for n, hull in enumerate(b.parts.hulls):
+        ball = fitted_ball(hull)
+        if ball is not None:  # a polyhedron loses energy where it rolls over its edges
+            centre, radius = ball
+            arm = b.rolling_arm(radius * unit, gravity * units.length / units.time**2)
+            at = (centre - b.parts.com).double() * unit / units.length
+            body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[radius * unit / units.length, 0, 0], pos=at.tolist(),
+                          condim=6, friction=[b.friction, 0, arm / units.length], **contact)  # fmt: skip
+            continue
         vertices = (hull - b.parts.com).double() * unit / units.length
         mesh = spec.add_mesh(name=f"{name}_{n}", uservert=vertices.flatten().tolist())
         mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
-        # negative: stiffness and damping themselves, of which MuJoCo takes the smaller numbers, the larger damping
         body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh.name, condim=3, friction=[b.friction, 0, 0],
-                      solref=[-(OMEGA**2), -2 * b.damping(b.material) * OMEGA], solimp=impedance)  # fmt: skip
+                      **contact)  # fmt: skip

@@ -19,7 +19,7 @@ from stages.core.scene.trajectory import read_trajectory
 from stages.lab.assets.shapes import Surface, box, ellipsoid, to_gaussians, union
 from stages.simulate.options import QUALITIES, MpmQuality, SimulateOptions
 from stages.simulate.rigid import MAX_PASSES, REST_SPEED, _World
-from stages.simulate.rigid_model import OMEGA
+from stages.simulate.rigid_model import OMEGA, damping_ratio
 from stages.simulate.stage import run
 from tests.simulate.motion import Motion, roll_out
 
@@ -84,6 +84,17 @@ def test_a_box_slides_by_v2_over_2_mu_g(tmp_path, friction):
     assert float(t.com[-1, 0, 0]) == pytest.approx(4 / (2 * friction * G), rel=0.03)
 
 
+@pytest.mark.parametrize("loss", [0.0, 0.05, 0.3, 0.6, 1.2, 2.0])
+def test_the_damping_of_a_contact_that_cannot_pull_restores_what_the_loss_factor_leaves(loss):
+    """Against the motion of the damped spring until its force is 0; from a loss of 1.27 on it is critically damped."""
+    z, dt = damping_ratio(loss), 1e-4
+    x, v = 0.0, 1.0
+    while x == 0 or x + 2 * z * v > 0:
+        v -= dt * (x + 2 * z * v)
+        x += dt * v
+    assert -v == pytest.approx(math.exp(-min(math.pi * loss / 2, 2)), abs=1e-3)
+
+
 @pytest.mark.parametrize("loss", [0.1, 0.4])
 def test_a_ball_rebounds_by_its_loss_factor(tmp_path, loss):
     t = roll(tmp_path, BALL, loss=loss, lift=("0.5",), dt=0.01, steps=70)
@@ -91,6 +102,18 @@ def test_a_ball_rebounds_by_its_loss_factor(tmp_path, loss):
     hit = int((z < 0.02).nonzero()[0])
     restitution = math.sqrt(float(z[hit:].max()) / 0.5)
     assert restitution == pytest.approx(math.exp(-math.pi * loss / 2), abs=0.03)  # half an oscillation at low damping
+
+
+def test_a_ball_that_slid_rolls_on_and_is_slowed_by_the_loss_of_its_material_alone(tmp_path):
+    """Once 5/7 of the speed are left it rolls (inertia 2/5 m r^2); then it slows down by 5/7 g arm / r."""
+    t = roll(tmp_path, BALL, velocity=("object=1 1,0,0",), friction=0.5, loss=0.15, density=540.0, steps=60)
+    speed = (t.com[1:, 0, 0] - t.com[:-1, 0, 0]) / 0.02
+    assert float(speed[9]) == pytest.approx(5 / 7, rel=0.03)
+    load = 540.0 * 4 / 3 * math.pi * 0.1**3 * G
+    contact = (0.75 * load * 0.1 * (1 - 0.3**2) / 1e7) ** (1 / 3)
+    arm = 3 / 16 * contact * (1 - math.exp(-math.pi * 0.15))
+    slowing = float(speed[9] - speed[-1]) / (49 * 0.02)
+    assert slowing == pytest.approx(5 / 7 * G * arm / 0.1, rel=0.1)
 
 
 def test_a_fall_of_half_a_percent_of_the_size_ends_without_a_rebound(tmp_path):

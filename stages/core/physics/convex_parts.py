@@ -25,6 +25,9 @@ from stages.core.scene.scene import Scene
 FACING = 0.5  # least cosine between the normal of a surface and that of the face of a hull over it
 CONVEX = 0.9  # fraction of its hull that a convex object fills: voxels are accurate to about 5 %
 MAX_VERTICES = 200  # of a part: a ball is round to 1 %
+ROUND = (
+    0.03  # largest distance of a ball's support planes from those of its hull [radius]: 1 % by MAX_VERTICES, and noise
+)
 CORNERS = np.stack(np.meshgrid(*[[-0.5, 0.5]] * 3), -1).reshape(-1, 3)
 
 
@@ -52,6 +55,17 @@ class ConvexParts:
     volume: float
     com: Float[Tensor, "3"]
     inertia: Float[Tensor, "3 3"]  # about the centre of mass [unit^5]
+
+
+def fitted_ball(hull: Float[Tensor, "v 3"]) -> tuple[Float[Tensor, "3"], float] | None:
+    """Centre and radius of the ball whose support planes are those of a hull to within ROUND; None where none is."""
+    x = hull.double()
+    A = torch.cat([2 * x, torch.ones(len(x), 1, dtype=x.dtype)], 1)  # |x|^2 = 2 x.c + r^2 - |c|^2
+    solution = torch.linalg.lstsq(A, x.square().sum(1, keepdim=True), driver="gelsd").solution[:, 0]
+    centre = solution[:3]
+    radius = float((solution[3] + centre.square().sum()).clamp_min(0).sqrt())
+    support = ((x - centre) @ torch.from_numpy(EXTREMES).double().mT).amax(0)
+    return (centre.float(), radius) if bool(((support - radius).abs() <= ROUND * radius).all()) else None
 
 
 @cached_in_scene

@@ -77,8 +77,8 @@ class Experiment:
 
 def experiments() -> dict[str, Experiment]:
     """All experiments by name."""
-    groups = (_slides, _slopes, _creep, _falls, _torques, _towers, _invariance, _collisions, _rebounds, _bounces,
-              _stacks, _piles, _boxes)  # fmt: skip
+    groups = (_slides, _slopes, _rolls, _rocking, _creep, _falls, _torques, _towers, _invariance, _collisions,
+              _rebounds, _bounces, _stacks, _piles, _boxes)  # fmt: skip
     return {e.name: e for group in groups for e in group()}
 
 
@@ -105,11 +105,12 @@ def tilted(surface: Surface, degrees: float) -> Surface:
     return Surface(surface.points @ R.mT, surface.normals @ R.mT)
 
 
-def on_slope(degrees: float, loss: float, options: Mapping) -> Run:
-    """A box of .2 x .2 x .1 m on a pinned slope of 2 m."""
+def on_slope(degrees: float, loss: float, options: Mapping, body: Surface | None = None) -> Run:
+    """A body at rest at the origin, else a box of .2 x .2 x .1 m, on a pinned slope of 2 m."""
     ramp = tilted(box((2.0, 0.6, 0.2), 0.025).moved((0, 0, -0.1)), degrees).moved((0, 0, 1.2))
-    slider = tilted(box((0.2, 0.2, 0.1), 0.008).moved((-0.5, 0, 0.05)), degrees).moved((0, 0, 1.2))
-    return Run((Specimen(ramp, loss=loss), Specimen(slider, loss=loss)), {"pin": ("1",), **options})
+    body = box((0.2, 0.2, 0.1), 0.008).moved((0, 0, 0.05)) if body is None else body
+    body = tilted(body.moved((-0.5, 0, 0)), degrees).moved((0, 0, 1.2))
+    return Run((Specimen(ramp, loss=loss), Specimen(body, loss=loss)), {"pin": ("1",), **options})
 
 
 def bowl(inner: float, outer: float) -> Surface:
@@ -205,6 +206,48 @@ def _slopes() -> Iterator[Experiment]:
         run = on_slope(degrees, 0.15, {"friction": mu, "steps": 31})
         yield Experiment(f"slope/{degrees}deg friction={mu:g}", (run,), lambda t: float(path(t, 1)[-1].norm()),
                          pull * time**2 / 2, "distance in .6 s [m]", G * math.sin(a) * time**2 / 2, SLIDES)  # fmt: skip
+
+
+def _rolls() -> Iterator[Experiment]:
+    """A solid ball on a slope that grips: a = 5/7 g sin(slope), as its inertia is 2/5 m r^2."""
+    radius, time = 0.1, 30 * 0.02
+    for degrees in (10, 25):
+        distance = 5 / 7 * G * math.sin(math.radians(degrees)) * time**2 / 2
+        run = on_slope(
+            degrees, 0.15, {"friction": 0.8, "steps": 31}, ellipsoid((radius,) * 3, 1500).moved((0, 0, radius))
+        )
+        yield Experiment(f"roll/{degrees}deg", (run,), lambda t: float(path(t, 1)[-1].norm()), distance,
+                         "distance in .6 s [m]", distance, TOLERANCES)  # fmt: skip
+
+
+def _rocking() -> Iterator[Experiment]:
+    """A block let go while it leans on a lower edge: it turns about the edge as a pendulum upside down."""
+    width, height, start, time = 0.2, 0.3, math.radians(12), 0.14
+    # the corners of a sampled box are half a spacing inside it, here 3 % of the lever arm of its weight
+    leaning = tilted(box((width, height, height), 0.004).moved((-width / 2, 0, height / 2)), math.degrees(start))
+    left = leaning_angle(width, height, start, time)
+    run = Run((Specimen(leaning),), {"friction": 1.0, "dt": 0.01, "steps": 15})
+
+    def angle(t: Trajectory) -> float:
+        return math.degrees(start + 2 * math.atan2(*t.rotation[-1, 0, [2, 0]].tolist()))
+
+    yield Experiment("rocking/12deg", (run,), angle, math.degrees(left), "angle after .14 s [degrees]",
+                     math.degrees(start - left), TOLERANCES)  # fmt: skip
+
+
+def leaning_angle(width: float, height: float, start: float, time: float) -> float:
+    """Angle [rad] of a rigid block that leans on an edge, `time` [s] after it was let go at the angle `start`.
+
+    Housner 1963, "The behavior of inverted pendulum structures during earthquakes", equation 2:
+    4/3 m R^2 angle'' = -m g R sin(slenderness - angle), with the half diagonal R; integrated by small leapfrog steps.
+    """
+    slenderness, half_diagonal = math.atan2(width, height), math.hypot(width, height) / 2
+    steps = 10_000
+    dt, angle, rate = time / steps, start, 0.0
+    for k in range(steps):
+        rate -= dt * (0.5 if k == 0 else 1) * 0.75 * G / half_diagonal * math.sin(slenderness - angle)
+        angle += dt * rate
+    return angle
 
 
 def _creep() -> Iterator[Experiment]:

@@ -8,8 +8,8 @@ import pytest
 import torch
 from scipy.spatial import ConvexHull, Delaunay
 
-from stages.core.physics.convex_cuts import Part
-from stages.core.physics.convex_parts import _voxel_moments, convex_parts, divide
+from stages.core.physics.convex_cuts import Part, fibonacci
+from stages.core.physics.convex_parts import _voxel_moments, convex_parts, divide, fitted_ball
 from stages.core.scene.scene import Scene, SceneObject
 from stages.lab.assets.shapes import Surface, box, ellipsoid, to_gaussians, union
 from stages.lab.bench.physics_experiments import bowl
@@ -206,3 +206,14 @@ def test_parts_of_a_shell_follow_its_inner_surface():
         first = np.where(enter <= leave, np.minimum(first, enter), first)
     h = 2 * outer / 48
     assert abs(np.median(first) - inner) < h / 3 and first.min() > inner - h
+
+
+def test_balls_are_recognised_by_their_support_planes():
+    sphere = torch.from_numpy(fibonacci(150)).float()
+    noise = 1 + 0.01 * torch.randn(len(sphere), 1, generator=torch.Generator().manual_seed(0)).clamp(-1, 1)
+    centre, radius = fitted_ball(0.2 * noise * sphere + torch.tensor([1.0, -2.0, 3.0]))
+    torch.testing.assert_close(centre, torch.tensor([1.0, -2.0, 3.0]), rtol=0, atol=2e-3)
+    assert radius == pytest.approx(0.2, rel=0.01)
+    dome, egg = sphere[sphere[:, 2] > -0.6], sphere * torch.tensor([1.0, 1.0, 1.1])
+    cube = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0])] * 3)
+    assert fitted_ball(dome) is None and fitted_ball(egg) is None and fitted_ball(cube) is None

@@ -1,12 +1,13 @@
 """Textbook experiments: the rigid engine agrees with theory, and the bench keeps rows and writes a page."""
 
 import json
+import math
 
 import pytest
 
 from stages.core.errors import InputError
 from stages.lab.bench.physics import PhysicsBenchOptions, measure, run
-from stages.lab.bench.physics_experiments import experiments
+from stages.lab.bench.physics_experiments import experiments, leaning_angle
 from stages.simulate.options import QUALITIES, MpmQuality
 
 ALL = experiments()
@@ -14,6 +15,8 @@ QUICK = (
     "slope/25deg friction=0.3",
     "torque/ball",
     "collision/momentum",
+    "roll/25deg",
+    "rocking/12deg",
     "stack/heavy on soft",
     "slide/slow friction=0.1",
     "creep/15deg friction=0.3 loss=0.02",
@@ -41,6 +44,13 @@ def test_names_say_the_case_and_tolerances_exclude_failures():
     assert slide.value == pytest.approx(2**2 / (2 * 0.3 * 9.81))
     assert boxes.passes("ngff", 0.04) and not boxes.passes("ngff", -0.04) and not boxes.passes("rigid", 0.06)
     assert slide.passes("rigid", 1.04 * slide.value) and not slide.passes("rigid", 1.06 * slide.value)
+
+
+def test_a_slightly_leaning_block_turns_as_a_linear_pendulum_upside_down():
+    """slenderness - angle = (slenderness - start) cosh(p t), with p^2 = 3 g / (4 R) for small angles."""
+    slender, p = math.atan2(0.01, 1.0), math.sqrt(0.75 * 9.81 / (math.hypot(0.01, 1.0) / 2))
+    expected = slender - (slender - 0.005) * math.cosh(0.2 * p)
+    assert leaning_angle(0.01, 1.0, 0.005, 0.2) == pytest.approx(expected, abs=1e-6)
 
 
 def test_measured_rows_are_kept_and_the_page_marks_failures(tmp_path):

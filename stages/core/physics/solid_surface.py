@@ -8,6 +8,9 @@ planes of the nearest samples, where its projection on the nearest one's is near
 
 from __future__ import annotations
 
+import copy
+from functools import cached_property
+
 import numpy as np
 from scipy import ndimage
 from scipy.spatial import cKDTree
@@ -22,6 +25,8 @@ MOST_ALONG = 96  # of one that is larger than the others, so that it is as accur
 BARE = 3.0  # distance to the samples beyond which faces of voxels are added [voxels], which are a third of the spacing
 NEAREST = 8  # samples that give a distance, of which those count
 SAME_FACE = 0.8  # whose normals have at least this cosine to that of the nearest one
+NEIGHBOURS = 16  # samples to which a tangent plane is fitted, of which those on the same face count
+MIN_ON_FACE = 6  # samples on the same face below which the normal is kept
 STEPS = np.concatenate([np.eye(3, dtype=np.int64), -np.eye(3, dtype=np.int64)])
 
 
@@ -53,6 +58,25 @@ class SolidSurface:
         self._tree = cKDTree(self.points)
         apart = self._tree.query(self.points[:: -(-len(self.points) // 2000)], 2)[0][:, 1]
         self.spacing = max(h, float(np.median(apart)))  # of samples, within which a tangent plane is known to continue
+
+    @cached_property
+    def fitted(self) -> SolidSurface:
+        """The same with the planes that fit the neighbours of each sample on the same face.
+
+        At a flat face of exact samples the normals are then .2 degrees off, instead of 4 with the normals of voxels.
+        """
+        out = copy.copy(self)
+        row = np.minimum(self._tree.query(self.points, NEIGHBOURS)[1], len(self.points) - 1)
+        weight = ((self.normals[row] * self.normals[:, None]).sum(-1) > SAME_FACE).astype(float)
+        middle = (weight[..., None] * self.points[row]).sum(1) / weight.sum(1, keepdims=True)
+        arm = (self.points[row] - middle[:, None]) * weight[..., None]
+        normals = np.linalg.eigh(np.einsum("nka,nkb->nab", arm, arm))[1][:, :, 0]
+        normals *= np.where((normals * self.normals).sum(1, keepdims=True) < 0, -1, 1)
+        good = ((weight.sum(1) >= MIN_ON_FACE) & ((normals * self.normals).sum(1) > SAME_FACE))[:, None]
+        moved = self.points + ((middle - self.points) * normals).sum(1, keepdims=True) * normals
+        out.points, out.normals = np.where(good, moved, self.points), np.where(good, normals, self.normals)
+        out._tree = cKDTree(out.points)
+        return out
 
     def depth(self, x: np.ndarray) -> np.ndarray:
         """Depths (k,) of points (k, 3) below the surface, negative outside."""

@@ -20,8 +20,6 @@ from stages.core.physics.solid_surface import NEAREST, SAME_FACE, SolidSurface
 
 SHEET = 0.5  # depth of the middle of what is thicker than a texel, whose surface the lattice resolves [texels]
 MARGIN = 5  # texels around a body, whose particles reach nodes within 1.5 cells of two texels
-NEIGHBOURS = 16  # samples to which a tangent plane is fitted, of which those on the same face count
-MIN_ON_FACE = 6  # samples on the same face below which the normal is kept
 PATCH = 0.75  # radius of the part of a tangent plane that belongs to a sample [spacings of samples], about sqrt(1/2)
 
 
@@ -40,8 +38,7 @@ class BodyShape(NamedTuple):
 def shape_of_voxels(x: np.ndarray, h: float, surface: SolidSurface | None = None) -> BodyShape:
     """The shape of a body with a particle in each voxel of edge h, at positions x (p, 3).
 
-    Where it is thick its surface is that of `surface`, by planes fitted to the samples: at a flat face of exact samples
-    the normal is then .2 degrees off, instead of 4 with the normals of voxels. Elsewhere it is that of the voxels.
+    Where it is thick its surface is that of `surface`, by planes fitted to the samples, elsewhere that of the voxels.
     """
     cells = np.floor(x / h).astype(np.int64)
     low = cells.min(0) - MARGIN
@@ -62,7 +59,7 @@ def shape_of_voxels(x: np.ndarray, h: float, surface: SolidSurface | None = None
 
 def _distance(surface: SolidSurface, x: np.ndarray, inside: np.ndarray) -> np.ndarray:
     """Signed distances (k,) of points x (k, 3): to the planes of the nearest samples, beside those to the samples."""
-    points, normals = _fitted(surface.points, surface.normals)
+    points, normals = surface.fitted.points, surface.fitted.normals
     away, row = cKDTree(points).query(x, NEAREST)
     row = np.minimum(row, len(points) - 1)
     above = ((x[:, None] - points[row]) * normals[row]).sum(-1)
@@ -70,19 +67,6 @@ def _distance(surface: SolidSurface, x: np.ndarray, inside: np.ndarray) -> np.nd
     beside = np.sqrt((away[:, 0] ** 2 - above[:, 0] ** 2).clip(0)) - PATCH * surface.spacing
     corner = np.where(inside, -1, 1) * np.hypot(above[:, 0], beside)
     return np.where(beside < 0, (above * agree).sum(1) / agree.sum(1), corner)
-
-
-def _fitted(points: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Samples (n, 3) and normals (n, 3) of the planes that fit the neighbours of each sample on the same face."""
-    row = np.minimum(cKDTree(points).query(points, NEIGHBOURS)[1], len(points) - 1)
-    weight = ((normals[row] * normals[:, None]).sum(-1) > SAME_FACE).astype(float)
-    middle = (weight[..., None] * points[row]).sum(1) / weight.sum(1, keepdims=True)
-    arm = (points[row] - middle[:, None]) * weight[..., None]
-    fitted = np.linalg.eigh(np.einsum("nka,nkb->nab", arm, arm))[1][:, :, 0]
-    fitted *= np.where((fitted * normals).sum(1, keepdims=True) < 0, -1, 1)
-    good = ((weight.sum(1) >= MIN_ON_FACE) & ((fitted * normals).sum(1) > SAME_FACE))[:, None]
-    moved = points + ((middle - points) * fitted).sum(1, keepdims=True) * fitted
-    return np.where(good, moved, points), np.where(good, fitted, normals)
 
 
 class BodyContact:

@@ -1,8 +1,9 @@
 """Particles of bodies with smooth surfaces, at the same or a finer spacing.
 
 Where the voxels of a thick body end at its surface, particles carry the volume of the filled part of their voxel, which
-follows from the signed distance to the surface (`solid_surface.py`). With whole voxels an inclined surface would be a
-staircase, and two of them would interlock. Sheets and what is reconstructed only as voxels keep whole voxels.
+follows from the signed distance to the surface, by planes fitted to its samples (`solid_surface.py`). With whole voxels
+an inclined surface would be a staircase, and two of them would interlock. Sheets and what is reconstructed only as
+voxels keep whole voxels.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ def surface_particles(scene: Scene, bodies: Bodies, refinement: int = 1, seed: i
     voxels = np.floor(bodies.x.double().numpy() / bodies.spacing).astype(np.int64)
     filled = _without_overlap(
         [
-            _filled(voxels[(bodies.body == row).numpy()], refinement, h, solid_surface(scene, o.id, seed))
+            _filled(voxels[(bodies.body == row).numpy()], refinement, h, solid_surface(scene, o.id, seed).fitted)
             for row, o in enumerate(scene.objects)
         ]
     )

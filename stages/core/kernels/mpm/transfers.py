@@ -20,7 +20,9 @@ from stages.core.kernels.mpm.grid import BLOCK, MpmGrid, first_node, stencil_ins
 from stages.core.kernels.mpm.nodes import mat43
 
 KINEMATIC_MASS_FACTOR = 1e4  # mass factor of kinematic particles on the grid, so that they impose their velocity
-FREE, KINEMATIC, LOST = 0, 1, 2  # values of `held`: moved by the grid, by its own velocity, or outside the grid
+# values of `held`: moved by the grid, by its own velocity, or outside the grid; or as KINEMATIC, but not on the grid,
+# where the velocities of nodes are set instead (pins.py)
+FREE, KINEMATIC, LOST, PINNED = 0, 1, 2, 3
 
 
 @wp.struct
@@ -120,7 +122,7 @@ def affine_momentum(
     m = mass
     q = m * (now.v + dt * acceleration)
     if held != FREE:
-        m = m * KINEMATIC_MASS_FACTOR
+        m = wp.where(held == PINNED, 0.0, m * KINEMATIC_MASS_FACTOR)
         q = m * now.v
         A = wp.mat33()
     return wp.mat44(q[0], q[1], q[2], m, A[0, 0], A[1, 0], A[2, 0], 0.0, A[0, 1], A[1, 1], A[2, 1], 0.0,

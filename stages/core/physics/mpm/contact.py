@@ -1,6 +1,7 @@
 """MPM substeps of bodies in contact as four kernel launches each: the schedule for a GPU.
 
-These are particles, grid, the nearest particles at nodes, and contact.
+These are particles, grid, the nearest particles at nodes, and contact; and where parts of bodies are pinned, the nodes
+at their faces.
 """
 
 from __future__ import annotations
@@ -12,10 +13,12 @@ from torch import Tensor
 from stages.core.kernels.interop import launch, view
 from stages.core.kernels.mpm.active import contact_sweep, grid_sweep
 from stages.core.kernels.mpm.contact import NONE, REFRESH, find_nearest
+from stages.core.kernels.mpm.pins import pin_nodes
 from stages.core.kernels.mpm.split import particle_step
 from stages.core.physics.mpm.body_shapes import BodyContact
 from stages.core.physics.mpm.graphs import CLEAR_ALIGNMENT, SORT_INTERVAL, GraphedFrames
 from stages.core.physics.mpm.particle_rows import ParticleRows
+from stages.core.physics.mpm.pins import Pins
 
 
 class ContactSubsteps(GraphedFrames):
@@ -34,6 +37,12 @@ class ContactSubsteps(GraphedFrames):
         self._lengths: dict[float, Tensor] = {}  # of substeps [s]; the graphs read them
         self._stale = torch.zeros(1, dtype=torch.int32, device=self.device)  # unused
         self._times: dict[tuple[float, int], Tensor] = {}  # of the substeps [s]; the graphs read them
+        self._pins: Pins | None = None
+
+    def pin(self, pins: Pins) -> None:
+        """Let these pins act from the next frame on."""
+        self._pins = pins
+        self._graphs.clear()  # they read the pins before
 
     def _grids(self) -> list[Tensor]:
         return [self._velocity]
@@ -54,6 +63,8 @@ class ContactSubsteps(GraphedFrames):
             inputs = [self.grid, self._sweepers, view(self._momentum, wp.vec4), velocity, friction, active,
                       self._obstacles, view(clock), self._scale]  # fmt: skip
             launch(grid_sweep, self._sweepers, inputs, device=self.device)
+            if self._pins is not None and self._pins.count:
+                launch(pin_nodes, self._pins.count, [self._pins.nodes, velocity], device=self.device)
             if step % REFRESH == 0:
                 inputs = [self.grid, self.rows.struct, view(self._sharers), nearest]
                 launch(find_nearest, len(self.rows), inputs, device=self.device)

@@ -24,12 +24,14 @@ from torch import Tensor
 
 from stages.core.kernels.mpm import grid as mpm_grid
 from stages.core.kernels.mpm.constitutive import MAX_STIFFENING, NEO_HOOKEAN
+from stages.core.kernels.mpm.transfers import KINEMATIC, PINNED
 from stages.core.physics.colliders import Collider, as_obstacles
 from stages.core.physics.mpm.body_shapes import BodyContact, BodyShape, shape_of_voxels
 from stages.core.physics.mpm.contact import ContactSubsteps
 from stages.core.physics.mpm.domain import MAX_NODES, Box
 from stages.core.physics.mpm.fused import FusedSubsteps
 from stages.core.physics.mpm.particle_rows import NEVER, ParticleRows
+from stages.core.physics.mpm.pins import Pins
 from stages.core.physics.mpm.split import SplitSubsteps
 
 SAFETY = 0.5  # fraction of a cell that a wave and a particle may cross in a substep, see substep_rate
@@ -198,12 +200,16 @@ class Solver:
             self._substepper = ContactSubsteps(*shared, contact, quanta)
         else:
             self._substepper = SplitSubsteps(*shared, contact)
+        self._bodies = schedule == "contact"
+        self._pin()
         self._substep_multiple = SUBSTEP_MULTIPLE if device != "cpu" and (fused or exact) else 1
 
     @property
     def particles(self) -> Particles:
         """The current state in the original order of the particles, on the solver's device."""
-        return Particles(*(self.rows.get(f.name) for f in fields(Particles)))
+        out = Particles(*(self.rows.get(f.name) for f in fields(Particles)))
+        out.held[out.held == PINNED] = KINEMATIC
+        return out
 
     @property
     def active_nodes(self) -> int:
@@ -216,6 +222,8 @@ class Solver:
             self.rows.put(name, value)
         if {"mass", "stiffness", "held"} & changes.keys():
             self._rates = self._max_rates()
+        if "held" in changes:
+            self._pin()
 
     def substeps(self, duration: float, acceleration: Float[Tensor, "p 3"]) -> int:
         """Number of substeps that are stable (substep_rate). Raises Diverged when a velocity is not finite."""
@@ -254,6 +262,11 @@ class Solver:
     def lost(self) -> Int[Tensor, "s"]:
         """First lost particle of each scene, or -1."""
         return torch.where(self.rows.lost == NEVER, -1, self.rows.lost)
+
+    def _pin(self) -> None:
+        """Find the nodes at the faces of pinned parts of bodies."""
+        if self._bodies:
+            self._substepper.pin(Pins(self.rows))
 
     def _body_contact(
         self, particles: Particles, sizes: Sequence[int], shapes: Sequence[BodyShape] | None

@@ -16,9 +16,11 @@ from stages.core.kernels.interop import launch, view
 from stages.core.kernels.mpm import split as kernels
 from stages.core.kernels.mpm.active import ActiveBlocks
 from stages.core.kernels.mpm.contact import NONE, REFRESH, STATIC_REACH, contact_step, find_nearest
+from stages.core.kernels.mpm.pins import pin_nodes
 from stages.core.kernels.threads import run_parallel
 from stages.core.physics.mpm.body_shapes import BodyContact
 from stages.core.physics.mpm.particle_rows import ParticleRows
+from stages.core.physics.mpm.pins import Pins
 
 CPU_PARTS = 4  # parts that the particles are split into on the CPU
 LAUNCH_MULTIPLE = 32  # particle launches are padded to a multiple of a GPU warp
@@ -38,6 +40,7 @@ class SplitSubsteps:
         contact: BodyContact | None = None,
     ):  # fmt: skip
         self._contact, self._contact_commands, self._refresh = contact, [], True
+        self._pins, self._pin_commands = None, []
         self.rows, self.grid, self.device, self.damping = rows, rows.grid, rows.device, damping
         self.parts = CPU_PARTS if self.device == "cpu" else 1
         self._step, self._obstacles = kernels.particle_step(plastic, bouncy), obstacles
@@ -69,8 +72,15 @@ class SplitSubsteps:
                 self._list_blocks()
             self._clock.fill_(step * dt)
             self._run(self._grid_commands)
+            self._run(self._pin_commands)
             self._contact_step(step, step == steps - 1)
             self._run(last if step == steps - 1 else between)
+
+    def pin(self, pins: Pins) -> None:
+        """Let these pins act from the next frame on."""
+        self._pins = pins  # whose memory the launch reads
+        inputs = [pins.nodes, view(self._velocity, wp.vec4)]
+        self._pin_commands = [self._record(pin_nodes, pins.count, inputs)] if pins.count else []
 
     @property
     def blocks(self) -> int:

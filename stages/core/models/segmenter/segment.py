@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,10 +16,10 @@ from torch import Tensor
 from stages.core.errors import InputError
 from stages.core.models.checkpoints import MAX_CONFIG, read_card, read_state, unfit
 from stages.core.models.segmenter.candidates import MIN_VOXELS, Candidates, find_candidates
-from stages.core.models.segmenter.network import SCORES, Segmenter, pyramid
+from stages.core.models.segmenter.network import SCORES, Level, Prediction, Segmenter, pyramid
 from stages.core.models.segmenter.outlines import cut_outlines
 from stages.core.models.segmenter.surfels import scene_surfels
-from stages.core.models.segmenter.voxels import SCALES, ScenePoints, VoxelGrid, voxelise
+from stages.core.models.segmenter.voxels import SCALES, VOXEL, ScenePoints, VoxelGrid, voxelise
 from stages.core.perception.grouping import name_objects
 from stages.core.perception.support import find_support, view_extent
 from stages.core.perception.view_outlines import refine_outlines
@@ -30,11 +30,13 @@ from stages.core.scene.schema import whole
 WEIGHTS = Path(__file__).parent / "segmenter.safetensors"
 MAX_BLOCKS, MAX_LEVELS = 100, 12  # of a network
 MAX_VOXELS = 80_000  # nearest to the focus
-OBJECT_COST = 0.4  # least IoU that a candidate must be expected to have; chosen on simulated scenes
-SIZE_POWER = 0.85  # weight of n surfels: n**SIZE_POWER. 0 prefers parts, 1 merged objects; see results/segment.md
+OBJECT_COST = 0.45  # least IoU that a candidate must be expected to have; chosen on simulated scenes
 MAX_SIZE = 0.6  # longest side of an object, as of the largest in the training [camera distance]
 MIN_GAUSSIANS = 30  # of an object
 MAX_OVERLAP = 0.25  # of two objects, of the smaller
+TURNS = (((1, 0, 0), (0, 1, 0), (0, 0, 1)), ((0, 1, 0), (1, 0, 0), (0, 0, 1)),
+         ((-1, 0, 0), (0, -1, 0), (0, 0, 1)), ((0, -1, 0), (-1, 0, 0), (0, 0, 1)))  # fmt: skip
+COPIES = len(TURNS)  # of the scene whose predictions are averaged
 
 
 @dataclass(frozen=True)
@@ -122,7 +124,7 @@ class Segmentation:
     """The best choice of objects at one scale."""
 
     labels: Int[Tensor, "n"]  # of surfels: row of `gains`, -1 for none
-    gains: Float[Tensor, "k"]  # expected IoU less OBJECT_COST, weighted by size
+    gains: Float[Tensor, "k"]  # expected IoU less OBJECT_COST, times surfels
     sizes: Int[Tensor, "k"]  # surfels
 
 
@@ -148,15 +150,14 @@ class ScoredCandidates:
         return own[self.owner]
 
     def best(self, options: SegmenterOptions) -> Segmentation:
-        """The disjoint candidates with the largest sum of expected IoU less OBJECT_COST, weighted by size.
+        """The disjoint candidates with the largest sum of expected IoU less OBJECT_COST, weighted by surfels.
 
-        Weighted by surfels this is the segmentation covering of Arbelaez et al. 2011, "Contour detection and
-        hierarchical image segmentation"; without weights two parts of an object, each half as good, count as much as
-        the object.
+        That is the segmentation covering of Arbelaez et al. 2011, "Contour detection and hierarchical image
+        segmentation"; without weights two parts of an object, each half as good, count as much as the object.
         """
         count = int(self.owner.max()) + 1
         surfels = torch.bincount(self.owner[self.owner >= 0], minlength=count)
-        weight = torch.from_numpy(self.candidates.sums(surfels[:, None])[:, 0]) ** SIZE_POWER
+        weight = torch.from_numpy(self.candidates.sums(surfels[:, None])[:, 0])
         gain = weight * (self.ious - OBJECT_COST)
         nodes = self.candidates.tree.best(torch.where(self.usable(options.min_size), gain, -1.0).double().numpy())
         labels = self.labels(nodes)
@@ -171,15 +172,32 @@ def score_at(surfels: ScenePoints, scale: float, model: Segmenter) -> ScoredCand
     if len(grid) > MAX_VOXELS:
         distance = grid.points.norm(dim=1)
         within = (distance <= distance.kthvalue(MAX_VOXELS).values)[grid.owner]
-        grid, near = voxelise(scaled[within]), within.cpu()
-    levels = pyramid(grid.cells, len(model.config["widths"]))
-    found = model(grid.features, levels)
+        scaled, near = scaled[within], within.cpu()
+        grid = voxelise(scaled)
+    levels, found = averaged_prediction(scaled, grid, model)
     candidates = find_candidates(grid, levels, found, model)
     ious = model.score(candidates.features.to(grid.points.device)).sigmoid().cpu()
     owner, chance = torch.full((len(surfels),), -1), torch.full((len(surfels), 3), torch.nan)
     owner[near] = grid.owner.cpu()
     chance[near] = found.logits.softmax(1).cpu()[owner[near]]
     return ScoredCandidates(candidates, ious, candidates.extents / scale, owner, chance)
+
+
+def averaged_prediction(surfels: ScenePoints, grid: VoxelGrid, model: Segmenter) -> tuple[list[Level], Prediction]:
+    """The levels of the voxels `grid` of the surfels, and the mean of the predictions for COPIES of the scene.
+
+    The copies are mirrored in both diagonals or given a half turn, and moved by parts of a voxel. The network is
+    trained on such, but neither it nor the division into voxels is symmetric.
+    """
+    levels = pyramid(grid.cells, len(model.config["widths"]))
+    parts = [model(grid.features, levels)]
+    for k in range(1, COPIES):
+        R = torch.tensor(TURNS[k], dtype=torch.float32, device=grid.points.device)
+        copy = voxelise(surfels.turned(R), torch.full((3,), VOXEL * k / COPIES, device=grid.points.device))
+        p = model(copy.features, pyramid(copy.cells, len(model.config["widths"])))
+        back = [grid.means(x[copy.owner]) for x in (p.logits, p.offsets @ R, p.embedding)]
+        parts.append(Prediction(*back))
+    return levels, Prediction(*(torch.stack([getattr(p, f.name) for p in parts]).mean(0) for f in fields(Prediction)))
 
 
 def outlined(surfels: ScenePoints, labels: Int[Tensor, "n"], scored: Sequence[ScoredCandidates]) -> Int[Tensor, "n"]:

@@ -49,6 +49,11 @@ class ScenePoints:
         """The same with `scale` times the lengths."""
         return replace(self, points=scale * self.points)
 
+    def turned(self, R: Float[Tensor, "3 3"]) -> ScenePoints:
+        """The same turned or mirrored about the focus."""
+        points, normals, toward = (v @ R.mT for v in (self.points, self.normals, self.toward))
+        return replace(self, points=points, normals=normals, toward=toward)
+
 
 @dataclass(frozen=True)
 class VoxelGrid:
@@ -61,6 +66,10 @@ class VoxelGrid:
 
     def __len__(self) -> int:
         return len(self.cells)
+
+    def means(self, values: Float[Tensor, "n *c"]) -> Float[Tensor, "v *c"]:
+        """Means over the surfels of each voxel."""
+        return _means(values, self.owner.argsort(stable=True), torch.bincount(self.owner, minlength=len(self)))
 
     @property
     def lab(self) -> Float[Tensor, "v 3"]:
@@ -77,19 +86,21 @@ def voxelise(surfels: ScenePoints, shift: Float[Tensor, "3"] | None = None) -> V
     """The voxels of a scene; `shift` moves the grid, for training."""
     cell = (surfels.points + (0 if shift is None else shift)).div(VOXEL).floor().long()
     cells, owner, count = unique_cells(cell)
-    order = owner.argsort(stable=True)  # sums in a fixed order, on a GPU too
-
-    def mean(values: Tensor) -> Tensor:
-        total = torch.segment_reduce(values[order].flatten(1), "sum", lengths=count, axis=0)
-        return (total / count[:, None]).reshape(-1, *values.shape[1:])
-
-    points, lab, toward = mean(surfels.points), mean(surfels.lab), mean(surfels.toward)
-    normals = _normals(points, mean(surfels.flatness[:, None, None] * _outer(surfels.normals)), toward)
+    order = owner.argsort(stable=True)
+    axes = surfels.flatness[:, None, None] * _outer(surfels.normals)
+    points, lab, toward, axes = (_means(v, order, count) for v in (surfels.points, surfels.lab, surfels.toward, axes))
+    normals = _normals(points, axes, toward)
     within = (points + (0 if shift is None else shift)) / VOXEL - cells - 0.5
     z = points[:, 2:]
     lab = lab / 50 - lab.new_tensor([1.0, 0, 0])
     columns = [within, normals, lab, (z / 0.02).tanh(), (z / 0.15).tanh()]
     return VoxelGrid(cells, points, torch.cat(columns, 1), owner)
+
+
+def _means(values: Float[Tensor, "n *c"], order: Int[Tensor, "n"], count: Int[Tensor, "v"]) -> Float[Tensor, "v *c"]:
+    """Means over groups of rows, those of one group together in `order`; summed in this order, on a GPU too."""
+    total = torch.segment_reduce(values[order].flatten(1), "sum", lengths=count, axis=0)
+    return (total / count[:, None]).reshape(-1, *values.shape[1:])
 
 
 def _outer(v: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3 3"]:

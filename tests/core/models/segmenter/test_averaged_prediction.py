@@ -1,0 +1,42 @@
+"""Predictions averaged over turned and mirrored copies of a scene."""
+
+import torch
+from torch.testing import assert_close
+
+from stages.core.models.segmenter.network import PAIR_FEATURES, Prediction, Segmenter
+from stages.core.models.segmenter.segment import COPIES, averaged_prediction
+from stages.core.models.segmenter.voxels import LAB, ScenePoints, voxelise
+
+
+class _Vectors(Segmenter):
+    """Says normals for offsets, colours for classes, and the number of the call for the embedding."""
+
+    def __init__(self):
+        super().__init__((4,))
+        self.calls = 0
+
+    def forward(self, features, levels) -> Prediction:
+        """Predictions for the voxels."""
+        call = torch.full((len(features), PAIR_FEATURES), float(self.calls))
+        self.calls += 1
+        return Prediction(features[:, LAB], features[:, 3:6], call)
+
+
+def test_offsets_are_turned_back_and_all_copies_count_alike():
+    surfels = ball()
+    grid, model = voxelise(surfels), _Vectors()
+    levels, found = averaged_prediction(surfels, grid, model)
+    assert model.calls == COPIES == 4 and len(levels) == 1
+    assert_close(found.embedding, torch.full_like(found.embedding, 1.5))  # the mean of 0 to 3
+    outward = torch.nn.functional.normalize(grid.points, dim=1)
+    turned = torch.nn.functional.normalize(found.offsets, dim=1)
+    assert float((turned * outward).sum(1).min()) > 0.98
+    assert float((found.logits - grid.lab).abs().mean()) < 0.05
+
+
+def ball() -> ScenePoints:
+    """Points of a ball with outward normals, red above and blue below."""
+    up = torch.randn(4000, 3, generator=torch.Generator().manual_seed(0))
+    up = torch.nn.functional.normalize(up, dim=1)
+    lab = torch.where(up[:, 2:] > 0, torch.tensor([50.0, 60, 40]), torch.tensor([40.0, 10, -50]))
+    return ScenePoints(0.15 * up, lab, up, torch.full((4000,), 0.9), up)

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from stages.core.errors import InputError
+from stages.core.kernels.threads import parallel_map
 from stages.core.models.checkpoints import MAX_CONFIG, read_card, read_state, unfit
 from stages.core.models.segmenter.candidates import MIN_VOXELS, Candidates, find_candidates
 from stages.core.models.segmenter.network import SCORES, Level, Prediction, Segmenter, pyramid
@@ -189,14 +190,18 @@ def averaged_prediction(surfels: ScenePoints, grid: VoxelGrid, model: Segmenter)
     The copies are mirrored in both diagonals or given a half turn, and moved by parts of a voxel. The network is
     trained on such, but neither it nor the division into voxels is symmetric.
     """
-    levels = pyramid(grid.cells, len(model.config["widths"]))
-    parts = [model(grid.features, levels)]
-    for k in range(1, COPIES):
-        R = torch.tensor(TURNS[k], dtype=torch.float32, device=grid.points.device)
-        copy = voxelise(surfels.turned(R), torch.full((3,), VOXEL * k / COPIES, device=grid.points.device))
-        p = model(copy.features, pyramid(copy.cells, len(model.config["widths"])))
-        back = [grid.means(x[copy.owner]) for x in (p.logits, p.offsets @ R, p.embedding)]
-        parts.append(Prediction(*back))
+    count, device = len(model.config["widths"]), grid.points.device
+    levels = pyramid(grid.cells, count)
+
+    def predict(k: int) -> Prediction:
+        if k == 0:
+            return model(grid.features, levels)
+        R = torch.tensor(TURNS[k], dtype=torch.float32, device=device)
+        copy = voxelise(surfels.turned(R), torch.full((3,), VOXEL * k / COPIES, device=device))
+        p = model(copy.features, pyramid(copy.cells, count))
+        return Prediction(*(grid.means(x[copy.owner]) for x in (p.logits, p.offsets @ R, p.embedding)))
+
+    parts = [predict(k) for k in range(COPIES)] if device.type == "cuda" else parallel_map(predict, range(COPIES))
     return levels, Prediction(*(torch.stack([getattr(p, f.name) for p in parts]).mean(0) for f in fields(Prediction)))
 
 

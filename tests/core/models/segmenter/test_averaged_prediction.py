@@ -1,5 +1,7 @@
 """Predictions averaged over turned and mirrored copies of a scene."""
 
+import itertools
+
 import torch
 from torch.testing import assert_close
 
@@ -13,12 +15,11 @@ class _Vectors(Segmenter):
 
     def __init__(self):
         super().__init__((4,))
-        self.calls = 0
+        self.calls = itertools.count()  # by several threads
 
     def forward(self, features, levels) -> Prediction:
         """Predictions for the voxels."""
-        call = torch.full((len(features), PAIR_FEATURES), float(self.calls))
-        self.calls += 1
+        call = torch.full((len(features), PAIR_FEATURES), float(next(self.calls)))
         return Prediction(features[:, LAB], features[:, 3:6], call)
 
 
@@ -26,7 +27,7 @@ def test_offsets_are_turned_back_and_all_copies_count_alike():
     surfels = ball()
     grid, model = voxelise(surfels), _Vectors()
     levels, found = averaged_prediction(surfels, grid, model)
-    assert model.calls == COPIES == 4 and len(levels) == 1
+    assert next(model.calls) == COPIES == 4 and len(levels) == 1
     assert_close(found.embedding, torch.full_like(found.embedding, 1.5))  # the mean of 0 to 3
     outward = torch.nn.functional.normalize(grid.points, dim=1)
     turned = torch.nn.functional.normalize(found.offsets, dim=1)

@@ -26,7 +26,9 @@ def test_objects_apart_on_a_table_are_found():
 
 
 def test_a_bare_table_has_no_objects():
-    assert not segment(scene_of(table_gaussians()), SegmentOptions(backend="learned")).objects
+    table = table_gaussians()
+    table = table[table.means[:, :2].abs().amax(1) < 0.35]  # the time is that of its voxels
+    assert not segment(scene_of(table), SegmentOptions(backend="learned")).objects
 
 
 def test_weights_that_do_not_exist_are_named(tmp_path):

@@ -67,7 +67,7 @@ def _clutter_as_surface(t: Targets) -> Targets:
 
 
 @dataclass(frozen=True)
-class Ablation:
+class Variant:
     """What a network is trained without."""
 
     without: str  # for the table
@@ -78,12 +78,12 @@ class Ablation:
 
 
 ABLATIONS = {
-    "full": Ablation("nothing"),
-    "colour": Ablation("colour", inputs=COLOUR_INPUTS, features=COLOUR_CONTRASTS),
-    "shape": Ablation("normals, heights and places in the voxel (only which voxels are occupied, and colour)",
+    "full": Variant("nothing"),
+    "colour": Variant("colour", inputs=COLOUR_INPUTS, features=COLOUR_CONTRASTS),
+    "shape": Variant("normals, heights and places in the voxel (only which voxels are occupied, and colour)",
                       inputs=SHAPE_INPUTS),
-    "noise": Ablation("noise of reconstruction (trained on the true Gaussians of the same scenes)", observation=EXACT),
-    "clutter": Ablation("the class of clutter (taught as surface)", change=_clutter_as_surface),
+    "noise": Variant("noise of reconstruction (trained on the true Gaussians of the same scenes)", observation=EXACT),
+    "clutter": Variant("the class of clutter (taught as surface)", change=_clutter_as_surface),
 }  # fmt: skip
 
 
@@ -132,7 +132,7 @@ def run(
         yield _row(facts["rows"][name])
 
 
-def measured(choice: Ablation, data: SegmentAblationData, options: SegmenterTraining, device: str) -> dict:
+def measured(choice: Variant, data: SegmentAblationData, options: SegmenterTraining, device: str) -> dict:
     """Train one ablation and judge it."""
     torch.manual_seed(options.seed)
     model = _MaskedSegmenter(choice.inputs, choice.features, options.widths, options.blocks).to(device).train()

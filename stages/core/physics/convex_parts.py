@@ -15,7 +15,7 @@ from jaxtyping import Float
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 from torch import Tensor
 
-from stages.core.kernels.threads import parallel_map
+from stages.core.kernels.threads import parallel_map, small_operations
 from stages.core.physics.convex_cuts import EXTREMES, divide
 from stages.core.physics.keypoints import farthest_points
 from stages.core.physics.solid_surface import solid_surface
@@ -57,8 +57,12 @@ class ConvexParts:
     inertia: Float[Tensor, "3 3"]  # about the centre of mass [unit^5]
 
 
+@small_operations()
 def fitted_ball(hull: Float[Tensor, "v 3"]) -> tuple[Float[Tensor, "3"], float] | None:
-    """Centre and radius of the ball whose support planes are those of a hull to within ROUND; None where none is."""
+    """Centre and radius of the ball whose support planes are those of a hull to within ROUND; None where none is.
+
+    On one thread, so that its last bits do not depend on their number.
+    """
     x = hull.double()
     A = torch.cat([2 * x, torch.ones(len(x), 1, dtype=x.dtype)], 1)  # |x|^2 = 2 x.c + r^2 - |c|^2
     solution = torch.linalg.lstsq(A, x.square().sum(1, keepdim=True), driver="gelsd").solution[:, 0]

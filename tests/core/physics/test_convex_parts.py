@@ -217,3 +217,9 @@ def test_balls_are_recognised_by_their_support_planes():
     dome, egg = sphere[sphere[:, 2] > -0.6], sphere * torch.tensor([1.0, 1.0, 1.1])
     cube = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0])] * 3)
     assert fitted_ball(dome) is None and fitted_ball(egg) is None and fitted_ball(cube) is None
+
+
+def test_a_ball_does_not_depend_on_the_number_of_threads(with_threads):
+    hull = 0.1 * torch.from_numpy(fibonacci(100)).float() + 0.3  # last bits differ if threads share the sums
+    (one, r), (two, q) = (with_threads(count, fitted_ball, hull) for count in (1, 2))
+    assert torch.equal(one, two) and r == q
